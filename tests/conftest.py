@@ -1,0 +1,44 @@
+"""Fixtures shared by the suite."""
+
+import importlib.util
+import pathlib
+
+import pytest
+import torch
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+SHARED = ROOT.parent / "shared"
+
+
+@pytest.fixture(autouse=True)
+def restore_threads():
+    """Tests that change the thread count leave no trace."""
+    threads = torch.get_num_threads()
+    yield
+    torch.set_num_threads(threads)
+
+
+@pytest.fixture(scope="session")
+def plant():
+    """A trained scene that does not ship with the project: (inputs float32, list of views)."""
+    data, reader = SHARED / "data", SHARED / "tools" / "qsplat.py"
+    if not (reader.exists() and (data / "plant_sh3.npz").exists()):
+        pytest.skip("needs the optional ../shared scenes next to the project")
+    import json
+
+    spec = importlib.util.spec_from_file_location("qsplat", reader)
+    qsplat = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(qsplat)
+    means, log_scales, quats, logit_opacity, sh = (
+        torch.as_tensor(value) for value in qsplat.load(str(data / "plant_sh3.npz"))
+    )
+    inputs = {
+        "means3D": means,
+        "means2D": torch.zeros_like(means),
+        "opacities": torch.sigmoid(logit_opacity)[:, None],
+        "shs": sh,
+        "scales": torch.exp(log_scales),
+        "rotations": quats,
+    }
+    views = json.loads((data / "plant_sh3_lo.json").read_text())
+    return {name: value.float().contiguous() for name, value in inputs.items()}, views

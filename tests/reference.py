@@ -1,0 +1,483 @@
+"""The rasterizer written down a second time: slow, plain, float64, straight from the equations.
+
+Nothing here is shared with the library. Gradients come from torch.autograd, so that what the library
+derives by hand is compared with what is derived by machine. Pixels are vectorised, Gaussians are a
+Python loop in depth order. Sources: [AS, Eq. n] is the supplement of Analytic-Splatting; the cumulant
+weight, the box pattern and the frozen frame follow the project's numerics notes; the rest is the
+published image formation of 3D Gaussian Splatting.
+
+Conventions: pixel centres at integers; offset = pixel centre - projected mean [px]; a 2x2 covariance is
+(..., 3) = (xx, xy, yy) [px^2]; a 3x3 covariance is (..., 6) = (xx, xy, xz, yy, yz, zz); view and
+projection matrices are transposed, as 3DGS passes them.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+
+NEAR = 0.2
+ALPHA_MIN = 1 / 255
+ALPHA_MAX = 0.99
+TRANSMITTANCE_MIN = 1e-4
+FRUSTUM_CLAMP = 1.3
+
+DEFAULT_OPTIONS = {
+    "point": {"dilation": 0.3},
+    "mip": {"variance": 0.1},
+    "analytic": {"frame_gradient": "frozen"},
+    "cumulant": {},
+    "box": {"samples": 4},
+}
+
+
+# --- one splat, one pixel -----------------------------------------------------------------------
+
+
+def determinant(cov2d):
+    """Determinant of (..., 3) covariances, [px^4]."""
+    xx, xy, yy = cov2d.unbind(-1)
+    return xx * yy - xy * xy
+
+
+def add_variance(cov2d, variance):
+    """Sigma + variance * I."""
+    return cov2d + variance * cov2d.new_tensor([1.0, 0.0, 1.0])
+
+
+def quadratic(offset, cov2d):
+    """d^T Sigma^-1 d."""
+    x, y = offset.unbind(-1)
+    xx, xy, yy = cov2d.unbind(-1)
+    return (yy * x * x - 2 * xy * x * y + xx * y * y) / determinant(cov2d)
+
+
+def gaussian(offset, cov2d):
+    """exp(-q/2): the splat itself, peak 1."""
+    return torch.exp(-quadratic(offset, cov2d) / 2)
+
+
+def blurred(offset, cov2d, variance):
+    """The splat convolved with a round Gaussian of the given variance: an exact convolution."""
+    wider = add_variance(cov2d, variance)
+    amplitude = torch.sqrt(determinant(cov2d) / determinant(wider))
+    return amplitude * gaussian(offset, wider)
+
+
+def cumulant(offset, cov2d):
+    """The pixel box through its cumulants of order 2, 4 and 6 ("Q6" of the numerics notes)."""
+    x, y = offset.unbind(-1)
+    wider = add_variance(cov2d, 1 / 12)
+    xx, xy, yy = wider.unbind(-1)
+    det = determinant(wider)
+    a, b, c = yy / det, -xy / det, xx / det
+
+    def axis(p, t):
+        square, x = p * p, t / 12
+        c4 = 1 + (20 / 7) * x + 0.4366 * x * x
+        k2 = 1 + (10 / 7) * x + 0.6240 * x * x
+        k0 = 1 + (20 / 21) * x + 0.6975 * x * x
+        c6 = torch.clamp(1 - x, min=1e-6) / 63
+        capped = torch.minimum(square, c4 / (2 * c6))
+        return square**2 * (c4 - c6 * capped) - 6 * square * t * k2 + 3 * t * t * k0
+
+    correction = (axis(a * x + b * y, a) + axis(b * x + c * y, c)) / 2880
+    amplitude = torch.sqrt(determinant(cov2d) / det)
+    return amplitude * torch.exp(-quadratic(offset, wider) / 2 - correction)
+
+
+def logistic_cdf(x):
+    """S(x), the paper's stand-in for the normal CDF [AS, Eq. 5]."""
+    return torch.sigmoid(1.6 * x + 0.07 * x**3)
+
+
+def logistic_pdf(x):
+    """dS/dx [AS, Eq. 10]."""
+    s = logistic_cdf(-x.abs())
+    return (1.6 + 0.21 * x * x) * s * (1 - s)
+
+
+def normal_cdf(x):
+    """The CDF that S stands in for."""
+    return torch.special.ndtr(x)
+
+
+def normal_pdf(x):
+    """Its density."""
+    return torch.exp(-x * x / 2) / math.sqrt(2 * math.pi)
+
+
+def window(u, sigma, cdf):
+    """Integral of the 1D density over [u - 1/2, u + 1/2] [AS, Eq. 7].
+
+    Taken on the negative side, where both CDF values are small and their difference loses nothing.
+    """
+    u = -u.abs()
+    return cdf((u + 0.5) / sigma) - cdf((u - 0.5) / sigma)
+
+
+def rotated_window(offset, cov2d, frame_gradient="paper", cdf=logistic_cdf, pdf=logistic_pdf):
+    """The pixel turned into the splat's eigenframe, where the integral separates [AS, Eq. 2-9].
+
+    The value does not depend on frame_gradient. "paper" differentiates the formula, so the pixel turns
+    with the eigenvectors. "frozen" differentiates the integral over a window that stays where it is
+    while Sigma changes. In that fixed frame Sigma gets an off-diagonal entry B (zero here), and
+    because a Gaussian solves the heat equation, dI/dB = d2I/(du dv), which separates at B = 0.
+    """
+    xx, xy, yy = cov2d.unbind(-1)
+    matrix = torch.stack([torch.stack([xx, xy], -1), torch.stack([xy, yy], -1)], -2)
+    if frame_gradient == "paper":
+        (l2, l1), axes = (t.movedim(-1, 0) for t in torch.linalg.eigh(matrix))
+        v2, v1 = axes
+        cross = None
+    else:
+        axes = torch.linalg.eigh(matrix.detach()).eigenvectors
+        v2, v1 = axes[..., 0], axes[..., 1]
+
+        def form(p, q):
+            return torch.einsum("...i,...ij,...j->...", p, matrix, q)
+
+        l1, l2, cross = form(v1, v1), form(v2, v2), form(v1, v2)
+    u, v = (offset * v1).sum(-1), (offset * v2).sum(-1)
+    s1, s2 = torch.sqrt(l1), torch.sqrt(l2)
+    weight = 2 * math.pi * s1 * s2 * window(u, s1, cdf) * window(v, s2, cdf)
+    if cross is not None:
+        # s dF/du of each axis; only the derivative of `cross` matters, its value is zero.
+        du = pdf((u + 0.5) / s1) - pdf((u - 0.5) / s1)
+        dv = pdf((v + 0.5) / s2) - pdf((v - 0.5) / s2)
+        weight = weight + (cross - cross.detach()) * (2 * math.pi * du * dv).detach()
+    return weight
+
+
+def box_nodes(samples):
+    """Nodes (S, 2) [px] of the `box` footprint, from the numerics notes."""
+    pattern = {
+        1: ([(0, 0)], 1),
+        2: ([(1, 1), (-1, -1)], 4),
+        4: ([(-1, -3), (3, -1), (1, 3), (-3, 1)], 8),
+        8: ([(1, -3), (-1, 3), (5, 1), (-3, -5), (-5, 5), (-7, -1), (3, 7), (7, -7)], 16),
+        16: ([(2 * i - 15, 2 * ((5 * i) % 16) - 15) for i in range(16)], 32),
+    }
+    numerators, denominator = pattern[samples]
+    return torch.tensor(numerators, dtype=torch.float64) / denominator
+
+
+def box_variance(samples):
+    """Variance v = 1/(12 S^2) [px^2] of each of the S small Gaussians."""
+    return 1 / (12 * samples**2)
+
+
+def sample_weights(offset, cov2d, footprint, **options):
+    """Weights (S, ...) of the samples that are composited on their own; S = 1 for all but `box`."""
+    options = DEFAULT_OPTIONS[footprint] | options
+    if footprint == "point":
+        return gaussian(offset, add_variance(cov2d, options["dilation"]))[None]
+    if footprint == "mip":
+        return blurred(offset, cov2d, options["variance"])[None]
+    if footprint == "analytic":
+        return rotated_window(offset, cov2d, options["frame_gradient"])[None]
+    if footprint == "cumulant":
+        return cumulant(offset, cov2d)[None]
+    if footprint == "box":
+        samples = options["samples"]
+        nodes = box_nodes(samples)
+        shifted = offset[None] + nodes.reshape(samples, *[1] * (offset.dim() - 1), 2)
+        return blurred(shifted, cov2d[None], box_variance(samples))
+    raise ValueError(f"footprint must be one of {tuple(DEFAULT_OPTIONS)}, got {footprint!r}")
+
+
+def weight(offset, cov2d, footprint, **options):
+    """Weight I (...) of one splat in one pixel: offset (..., 2), cov2d (..., 3), broadcast."""
+    return sample_weights(offset, cov2d, footprint, **options).mean(0)
+
+
+def exact_weight(offset, cov2d, panels=64, order=10):
+    """Integral of exp(-q/2) over the unit pixel: composite Gauss-Legendre times erf.
+
+    The outer axis is the one with the larger variance, so that nothing varies faster along it than the
+    conditional deviation of the other axis; 64 panels of 10 nodes resolve deviations down to 0.01 px
+    to 1e-13. Differentiable in both arguments.
+    """
+    offset, cov2d = torch.broadcast_tensors(
+        torch.nn.functional.pad(offset, (0, 1)), cov2d
+    )  # (..., 3)
+    x, y, _ = offset.unbind(-1)
+    xx, xy, yy = cov2d.unbind(-1)
+    swap = yy > xx
+    x, y = torch.where(swap, y, x), torch.where(swap, x, y)
+    wide = torch.where(swap, yy, xx)
+    deviation = torch.sqrt(determinant(cov2d) / wide)
+
+    reach = 9 * torch.sqrt(wide.detach())  # exp(-40) and less beyond
+    low = torch.clamp(x.detach() - 0.5, -reach, reach)
+    high = torch.clamp(x.detach() + 0.5, -reach, reach)
+    nodes, node_weights = legendre(order)
+    step = (high - low) / panels
+    starts = low[..., None] + step[..., None] * torch.arange(panels, dtype=torch.float64)
+    outer = starts[..., None] + step[..., None, None] * (nodes + 1) / 2
+    # Nodes move with the pixel when x is differentiated: t is constant in x - t.
+    outer = outer + (x - x.detach())[..., None, None]
+
+    def expand(t):
+        return t[..., None, None]
+
+    centre = expand(xy / wide) * outer
+    scale = math.sqrt(2) * expand(deviation)
+    strip = torch.erf((expand(y) + 0.5 - centre) / scale) - torch.erf(
+        (expand(y) - 0.5 - centre) / scale
+    )
+    values = torch.exp(-outer * outer / (2 * expand(wide))) * strip
+    total = (values * node_weights / 2).sum((-1, -2)) * step
+    return total * deviation * math.sqrt(math.pi / 2)
+
+
+def legendre(order):
+    """Gauss-Legendre nodes and weights on [-1, 1] (Golub-Welsch)."""
+    k = torch.arange(1, order, dtype=torch.float64)
+    off_diagonal = k / torch.sqrt(4 * k * k - 1)
+    jacobi = torch.diag(off_diagonal, 1) + torch.diag(off_diagonal, -1)
+    nodes, vectors = torch.linalg.eigh(jacobi)
+    return nodes, 2 * vectors[0] ** 2
+
+
+# --- from the Gaussian to the splat -------------------------------------------------------------
+
+
+def rotation_matrix(quaternion):
+    """Rotation (P, 3, 3) of quaternions (P, 4) = (w, x, y, z); normalised here, zero is identity."""
+    norm = quaternion.detach().norm(dim=-1, keepdim=True)
+    identity = quaternion.new_tensor([1.0, 0.0, 0.0, 0.0])
+    safe = torch.where(norm > 0, quaternion, identity)
+    w, x, y, z = (safe / safe.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def covariance_3d(scales, rotations, scale_modifier):
+    """R S S R^T (P, 3, 3) with S = scale_modifier * diag(scales)."""
+    axes = rotation_matrix(rotations) * (scale_modifier * scales)[:, None, :]
+    return axes @ axes.transpose(-1, -2)
+
+
+def unpack_covariance(packed):
+    """(P, 6) = (xx, xy, xz, yy, yz, zz) to (P, 3, 3)."""
+    xx, xy, xz, yy, yz, zz = packed.unbind(-1)
+    rows = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def spherical_harmonics(degree, direction):
+    """Real basis (P, (degree + 1)^2) with the signs and the order of 3DGS; direction of unit length."""
+    x, y, z = direction.unbind(-1)
+
+    def factor(value):
+        return math.sqrt(value / math.pi)
+
+    basis = [torch.full_like(x, factor(1 / 4))]
+    if degree >= 1:
+        basis += [-factor(3 / 4) * y, factor(3 / 4) * z, -factor(3 / 4) * x]
+    if degree >= 2:
+        basis += [
+            factor(15 / 4) * x * y,
+            -factor(15 / 4) * y * z,
+            factor(5 / 16) * (2 * z * z - x * x - y * y),
+            -factor(15 / 4) * x * z,
+            factor(15 / 16) * (x * x - y * y),
+        ]
+    if degree >= 3:
+        basis += [
+            -factor(35 / 32) * y * (3 * x * x - y * y),
+            factor(105 / 4) * x * y * z,
+            -factor(21 / 32) * y * (4 * z * z - x * x - y * y),
+            factor(7 / 16) * z * (2 * z * z - 3 * x * x - 3 * y * y),
+            -factor(21 / 32) * x * (4 * z * z - x * x - y * y),
+            factor(105 / 16) * z * (x * x - y * y),
+            -factor(35 / 32) * x * (x * x - 3 * y * y),
+        ]
+    return torch.stack(basis, -1)
+
+
+def sh_color(degree, shs, means, camera_position):
+    """max(0, SH + 1/2) (P, 3), seen from camera_position; shs (P, M, 3) with M >= (degree + 1)^2."""
+    direction = torch.nn.functional.normalize(means - camera_position, dim=-1)
+    basis = spherical_harmonics(degree, direction)
+    color = (basis[:, :, None] * shs[:, : basis.shape[1]]).sum(1) + 0.5
+    return torch.clamp(color, min=0)
+
+
+class Projection(NamedTuple):
+    """Every Gaussian in the image plane: mean [px], covariance [px^2], depth [world units]."""
+
+    means2d: torch.Tensor
+    cov2d: torch.Tensor
+    depths: torch.Tensor
+
+
+def project(settings, means, covariance):
+    """EWA projection of means (P, 3) and 3D covariances (P, 3, 3)."""
+    size = means.new_tensor([settings.image_width, settings.image_height])
+    viewmatrix, projmatrix = settings.viewmatrix.double(), settings.projmatrix.double()
+    homogeneous = torch.cat([means, torch.ones_like(means[:, :1])], -1)
+    view = homogeneous @ viewmatrix
+    clip = homogeneous @ projmatrix
+    means2d = ((clip[:, :2] / clip[:, 3:] + 1) * size - 1) / 2
+
+    tangent = means.new_tensor([float(settings.tanfovx), float(settings.tanfovy)])
+    focal = size / (2 * tangent)
+    z = view[:, 2]
+    limit = FRUSTUM_CLAMP * tangent
+    slope = torch.minimum(torch.maximum(view[:, :2] / z[:, None], -limit), limit)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack(
+        [
+            torch.stack([focal[0] / z, zero, -focal[0] * slope[:, 0] / z], -1),
+            torch.stack([zero, focal[1] / z, -focal[1] * slope[:, 1] / z], -1),
+        ],
+        -2,
+    )
+    to_image = jacobian @ viewmatrix[:3, :3].T
+    full = to_image @ covariance @ to_image.transpose(-1, -2)
+    cov2d = torch.stack([full[:, 0, 0], full[:, 0, 1], full[:, 1, 1]], -1)
+    return Projection(means2d, cov2d, z)
+
+
+# --- the image ----------------------------------------------------------------------------------
+
+
+class Rendered(NamedTuple):
+    """What render() returns. P Gaussians, image (3, H, W).
+
+    `margin` is the smallest relative distance of any alpha or transmittance that was compared with a
+    threshold from that threshold: finite differences and float32 are meaningful only well inside it.
+    `pixel_margin` (H, W) is the same per pixel. `offsets` maps a Gaussian to its (H, W, 2) offsets,
+    whose gradient (kept) is minus the gradient of the mean, pixel by pixel.
+    """
+
+    color: torch.Tensor
+    radii: torch.Tensor
+    projection: Projection
+    margin: float
+    pixel_margin: torch.Tensor
+    offsets: dict
+
+
+def radius_covariance(cov2d, footprint, **options):
+    """The covariance whose largest eigenvalue decides the radius."""
+    options = DEFAULT_OPTIONS[footprint] | options
+    added = {
+        "point": options.get("dilation"),
+        "mip": options.get("variance"),
+        "analytic": 0.0,
+        "cumulant": 1 / 12,
+        "box": 1 / 12,
+    }[footprint]
+    return add_variance(cov2d, added)
+
+
+def three_sigma(cov2d, footprint, **options):
+    """3 sqrt(largest eigenvalue) [px], before rounding up."""
+    xx, xy, yy = radius_covariance(cov2d, footprint, **options).unbind(-1)
+    largest = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)
+    return 3 * torch.sqrt(largest)
+
+
+def peak(cov2d, footprint, **options):
+    """The weight at offset zero; for `box` that of a sample, which is what is compared with 1/255."""
+    zero = torch.zeros(2, dtype=cov2d.dtype)
+    if footprint == "box":
+        return blurred(zero, cov2d, box_variance((DEFAULT_OPTIONS["box"] | options)["samples"]))
+    return weight(zero, cov2d, footprint, **options)
+
+
+def render(
+    settings,
+    means3D,
+    means2D,
+    opacities,
+    shs=None,
+    colors_precomp=None,
+    scales=None,
+    rotations=None,
+    cov3D_precomp=None,
+    *,
+    footprint,
+    keep_offsets=False,
+    **options,
+):
+    """Render P Gaussians; arguments as the library's rasterizer takes them, all float64.
+
+    means2D (P, 2 or more) or None: its value is ignored, its gradient is dL/d(mean in px) * (W, H) / 2.
+    """
+    height, width = settings.image_height, settings.image_width
+    half = torch.tensor([width / 2, height / 2], dtype=torch.float64)
+    if cov3D_precomp is None:
+        covariance = covariance_3d(scales, rotations, settings.scale_modifier)
+    else:
+        covariance = unpack_covariance(cov3D_precomp)
+    projection = project(settings, means3D, covariance)
+    means2d, cov2d, depths = projection
+    if means2D is not None:
+        means2d = means2d + (means2D[:, :2] - means2D[:, :2].detach()) * half
+    if colors_precomp is None:
+        colors = sh_color(settings.sh_degree, shs, means3D, settings.campos.double())
+    else:
+        colors = colors_precomp
+    opacities = opacities.reshape(-1)
+
+    rows, columns = torch.meshgrid(
+        torch.arange(height, dtype=torch.float64),
+        torch.arange(width, dtype=torch.float64),
+        indexing="ij",
+    )
+    pixels = torch.stack([columns, rows], -1)
+    samples = (DEFAULT_OPTIONS[footprint] | options).get("samples", 1)
+    transmittance = torch.ones(samples, height, width, dtype=torch.float64)
+    stopped = torch.zeros(samples, height, width, dtype=torch.bool)
+    color = torch.zeros(3, height, width, dtype=torch.float64)
+    pixel_margin = torch.full((height, width), math.inf, dtype=torch.float64)
+    offsets, touched = {}, torch.zeros(len(means3D), dtype=torch.bool)
+
+    def keep_away(value, threshold, where):
+        distance = torch.where(where, (value.detach() / threshold - 1).abs(), math.inf)
+        torch.minimum(pixel_margin, distance.amin(0), out=pixel_margin)
+
+    for i in torch.argsort(depths.detach(), stable=True).tolist():
+        if depths[i] <= NEAR or determinant(cov2d[i]) <= 0:
+            continue
+        if opacities[i] * peak(cov2d[i], footprint, **options) < ALPHA_MIN:
+            continue
+        offset = pixels - means2d[i]
+        if keep_offsets and offset.requires_grad:
+            offset.retain_grad()
+            offsets[i] = offset
+        response = opacities[i] * sample_weights(offset, cov2d[i], footprint, **options)
+        keep_away(response, ALPHA_MIN, ~stopped)
+        keep_away(response, ALPHA_MAX, ~stopped)
+        alpha = torch.where(response < ALPHA_MAX, response, ALPHA_MAX)
+        blended = (alpha >= ALPHA_MIN) & ~stopped
+        touched[i] = (alpha >= ALPHA_MIN).any()
+        alpha = torch.where(blended, alpha, 0.0)
+        following = transmittance * (1 - alpha)
+        keep_away(following, TRANSMITTANCE_MIN, blended)
+        stopped = stopped | (following.detach() < TRANSMITTANCE_MIN)
+        alpha = torch.where(stopped, 0.0, alpha)
+        color = color + (transmittance * alpha).mean(0) * colors[i][:, None, None]
+        transmittance = transmittance * (1 - alpha)
+    color = color + transmittance.mean(0) * settings.bg.double()[:, None, None]
+    radii = torch.ceil(three_sigma(cov2d.detach(), footprint, **options)) * touched
+    return Rendered(
+        color, radii.int(), projection, pixel_margin.min().item(), pixel_margin, offsets
+    )
+
+
+def absolute_gradient(rendered, count, settings):
+    """Columns 2:4 of a (P, 4) means2D gradient: sum over pixels of |dL/d(mean)| * (W, H) / 2."""
+    out = torch.zeros(count, 2, dtype=torch.float64)
+    for i, offset in rendered.offsets.items():
+        if offset.grad is not None:
+            out[i] = offset.grad.abs().sum((0, 1))
+    return out * torch.tensor([settings.image_width / 2, settings.image_height / 2])
