@@ -179,10 +179,9 @@ def sample_weights(offset, cov2d, footprint, **options):
     if footprint == "cumulant":
         return cumulant(offset, cov2d)[None]
     if footprint == "box":
-        samples = options["samples"]
-        nodes = box_nodes(samples)
-        shifted = offset[None] + nodes.reshape(samples, *[1] * (offset.dim() - 1), 2)
-        return blurred(shifted, cov2d[None], box_variance(samples))
+        variance = box_variance(options["samples"])
+        nodes = box_nodes(options["samples"])
+        return torch.stack([blurred(offset + node, cov2d, variance) for node in nodes])
     raise ValueError(f"footprint must be one of {tuple(DEFAULT_OPTIONS)}, got {footprint!r}")
 
 

@@ -1,0 +1,528 @@
+"""Scenes and views in and out.
+
+A *scene* is a set of Gaussians, read from the files that 3DGS tools write. A *view* is a pinhole
+camera with an image size; its axes are OpenCV's (x right, y down, z forward). Reading and writing
+scenes needs the libraries of `pip install analytic_rasterizer[cli]`; they are imported on first
+use.
+"""
+
+from __future__ import annotations
+
+import importlib
+import json
+import math
+import re
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from .rasterizer import GaussianRasterizationSettings
+
+ZNEAR, ZFAR = 0.01, 100.0  # of the 3DGS projection; the depth they shape is not used
+
+
+class SceneError(ValueError):
+    """A scene or views file that cannot be used; the message names the file and what is wrong."""
+
+
+def optional_import(name: str):
+    """The module `name`; ImportError naming the extra that installs it when it is missing."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        package = name.split(".")[0]
+        raise ImportError(
+            f"this needs {package}: pip install analytic_rasterizer[cli] ({error})"
+        ) from None
+
+
+# ------------------------------------------------------------------------------------- scenes
+
+
+class Scene(NamedTuple):
+    """Gaussians ready for the rasterizer. float32, one row each, all on one device."""
+
+    means: torch.Tensor  # (N, 3) world units
+    scales: torch.Tensor  # (N, 3) standard deviations, world units (not their logarithm)
+    rotations: torch.Tensor  # (N, 4) quaternions (w, x, y, z)
+    opacities: torch.Tensor  # (N, 1) in [0, 1] (not their logit)
+    shs: torch.Tensor  # (N, K, 3) spherical harmonics, K = (sh_degree + 1)^2
+    sh_degree: int
+
+    def to(self, device) -> Scene:
+        """The same scene on another device."""
+        return Scene(*(field.to(device) for field in self[:-1]), self.sh_degree)
+
+    def arguments(self) -> dict[str, torch.Tensor]:
+        """The keywords that `GaussianRasterizer` and `render_stages` know these tensors by."""
+        return {
+            "means3D": self.means,
+            "opacities": self.opacities,
+            "shs": self.shs,
+            "scales": self.scales,
+            "rotations": self.rotations,
+        }
+
+
+def load_scene(path) -> Scene:
+    """Reads a 3DGS `.ply`, a compressed `.ply` (PlayCanvas) or an `.spz` (Niantic) on the CPU.
+
+    Scales and opacities come back activated. Axes are those stored in the file: tools that make
+    `.spz` may have turned the scene (y and z negated), and nothing in the file says so.
+
+    Raises SceneError for anything but a complete file with finite values, ImportError without the
+    `cli` extra.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise SceneError(f"{path}: no such file")
+    gsply = optional_import("gsply")
+    try:
+        if path.suffix == ".spz":
+            data = gsply.read_spz(path)
+        elif path.suffix in (".ply", ".ply_compressed"):
+            _check_ply_header(path)
+            data = gsply.plyread(path)
+        else:
+            raise SceneError(f"expected a .ply or .spz file, got {path.suffix or 'no suffix'!r}")
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from None
+    except (ValueError, OSError) as error:
+        raise SceneError(f"{path}: unreadable or cut short ({_first_line(error)})") from None
+
+    tensors = [
+        torch.tensor(field, dtype=torch.float32).contiguous()  # a view of the file's rows
+        for field in (data.means, data.scales, data.quats, data.opacities, data.sh0)
+    ]
+    means, log_scales, rotations, logits, sh0 = tensors
+    count = len(means)
+    shs = sh0[:, None]
+    if data.shN is not None and data.shN.size:
+        shs = torch.cat([shs, torch.tensor(data.shN, dtype=torch.float32)], dim=1)
+    scene = Scene(
+        means,
+        log_scales.exp(),
+        rotations,
+        logits.reshape(count, 1).sigmoid(),
+        shs.contiguous(),
+        math.isqrt(shs.shape[1]) - 1,
+    )
+    for name, field in zip(Scene._fields[:-1], scene[:-1], strict=True):
+        bad = count - int(field.flatten(1).isfinite().all(1).sum())
+        if bad:
+            raise SceneError(f"{path}: {name} must be finite, got {bad} of {count} rows not")
+    return scene
+
+
+def save_scene(path, scene: Scene) -> None:
+    """Writes a scene as `.ply`, `.compressed.ply` or `.spz`, by its name.
+
+    The two small formats round: see their own documentation. Opacities are kept off 0 and 1 by
+    1e-6, where their logit is infinite. Raises SceneError for another suffix.
+    """
+    path = Path(path)
+    if path.suffix not in (".ply", ".spz"):
+        raise SceneError(f"{path}: expected a .ply or .spz name, got {path.suffix!r}")
+    gsply = optional_import("gsply")
+    cpu = scene.to("cpu")
+    data = gsply.GSData.from_arrays(
+        means=cpu.means.numpy(),
+        scales=cpu.scales.log().numpy(),
+        quats=torch.nn.functional.normalize(cpu.rotations, dim=1).numpy(),
+        opacities=cpu.opacities.reshape(-1).logit(eps=1e-6).numpy(),
+        sh0=cpu.shs[:, 0].numpy(),
+        shN=cpu.shs[:, 1:].numpy(),
+        format="ply",
+    )
+    (gsply.write_spz if path.suffix == ".spz" else gsply.plywrite)(path, data)
+
+
+PLY_COLUMNS = (
+    ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+    + [f"scale_{i}" for i in range(3)]
+    + [f"rot_{i}" for i in range(4)]
+)
+
+
+def _check_ply_header(path: Path) -> None:
+    """Says what is wrong with a .ply that gsply would refuse without a reason, or misread: it
+    takes every vertex property for a float, whatever the header says."""
+    lines = _ply_header(path)
+    if any(line.startswith("element chunk") for line in lines):
+        return  # compressed: gsply checks the layout
+    layout = next((line.split()[1:2] for line in lines if line.startswith("format")), [])
+    if layout != ["binary_little_endian"]:
+        raise SceneError(f"expected format binary_little_endian, got {' '.join(layout) or 'none'}")
+    elements = [i for i, line in enumerate(lines) if line.startswith("element")]
+    if not elements or not lines[elements[0]].startswith("element vertex "):
+        raise SceneError("expected the vertices as the first element of the .ply")
+    end = elements[1] if len(elements) > 1 else len(lines)
+    kinds = {}
+    for line in lines[elements[0] + 1 : end]:
+        if line.startswith("property "):
+            words = line.split()
+            kinds[words[-1]] = words[1]
+    missing = [name for name in PLY_COLUMNS if name not in kinds]
+    if missing:
+        raise SceneError(f"missing vertex properties {', '.join(missing)}; is it a 3DGS scene?")
+    for name, kind in kinds.items():
+        if kind != "float":
+            raise SceneError(f"vertex property {name} must be float, got {kind}")
+    rest = sum(name.startswith("f_rest_") for name in kinds)
+    if rest not in (0, 9, 24, 45):
+        raise SceneError(
+            f"expected 0, 9, 24 or 45 f_rest properties (SH degree 0 to 3), got {rest}"
+        )
+
+
+def _ply_header(path: Path) -> list[str]:
+    lines = []
+    with path.open("rb") as file:
+        if file.readline(8).strip() != b"ply":
+            raise SceneError("not a PLY file: it does not begin with 'ply'")
+        for _ in range(1000):  # a .ply that never ends its header is not read whole
+            line = file.readline(1000).decode("latin-1").strip()
+            if line == "end_header":
+                return lines
+            lines.append(line)
+    raise SceneError("the PLY header has no end_header")
+
+
+# -------------------------------------------------------------------------------------- views
+
+
+@dataclass(frozen=True)
+class View:
+    """A pinhole camera. Lengths in pixels; the image spans [0, width] x [0, height]."""
+
+    name: str  # of the picture, without directory and suffix
+    width: int
+    height: int
+    fx: float
+    fy: float
+    w2c: torch.Tensor  # (4, 4) float64, world to camera, OpenCV axes
+    cx: float | None = None  # principal point; None is the centre
+    cy: float | None = None
+
+    def size(self, scale: float = 1.0) -> tuple[int, int]:
+        """(width, height) of the picture at `scale`: rounded, at least 1."""
+        return max(1, round(self.width * scale)), max(1, round(self.height * scale))
+
+    def settings(
+        self,
+        scale: float = 1.0,
+        background=(0.0, 0.0, 0.0),
+        sh_degree: int = 3,
+        footprint: str | None = None,
+        *,
+        device="cpu",
+        **options,
+    ) -> GaussianRasterizationSettings:
+        """Settings that render this view with `size(scale)` pixels over the same field of view.
+
+        `footprint` and `options` are those of GaussianRasterizationSettings; None leaves the
+        default footprint. Raises ValueError for a scale that is not positive, and what the
+        settings raise.
+        """
+        if not (math.isfinite(scale) and scale > 0):
+            raise ValueError(f"scale must be positive and finite, got {scale}")
+        width, height = self.size(scale)
+        tanfovx = self.width / (2 * self.fx)
+        tanfovy = self.height / (2 * self.fy)
+        cx = self.width / 2 if self.cx is None else self.cx
+        cy = self.height / 2 if self.cy is None else self.cy
+        projection = torch.zeros(4, 4, dtype=torch.float64)
+        projection[0, 0] = 1 / tanfovx
+        projection[1, 1] = 1 / tanfovy
+        projection[0, 2] = 2 * cx / self.width - 1  # ndc of the principal point
+        projection[1, 2] = 2 * cy / self.height - 1
+        projection[2, 2] = ZFAR / (ZFAR - ZNEAR)
+        projection[2, 3] = -ZFAR * ZNEAR / (ZFAR - ZNEAR)
+        projection[3, 2] = 1
+        if footprint is not None:
+            options["footprint"] = footprint
+        to_float = {"dtype": torch.float32, "device": device}
+        return GaussianRasterizationSettings(
+            image_height=height,
+            image_width=width,
+            tanfovx=tanfovx,
+            tanfovy=tanfovy,
+            bg=torch.tensor(background, **to_float),
+            scale_modifier=1.0,
+            viewmatrix=self.w2c.T.to(**to_float).contiguous(),
+            projmatrix=(projection @ self.w2c).T.to(**to_float).contiguous(),
+            sh_degree=sh_degree,
+            campos=torch.linalg.inv(self.w2c)[:3, 3].to(**to_float),
+            prefiltered=False,
+            debug=False,
+            **options,
+        )
+
+
+def load_views(path, size: tuple[int, int] | None = None) -> list[View]:
+    """Reads the cameras of a JSON file, in any of three forms:
+
+    - 3DGS `cameras.json`: a list of {id, img_name, width, height, position, rotation, fx, fy} with
+      the camera-to-world rotation;
+    - Blender or nerfstudio `transforms.json`: {frames: [{file_path, transform_matrix}]}, camera to
+      world with OpenGL axes; camera_angle_x, or fl_x with fl_y, cx, cy, w, h, globally or by frame;
+    - a list of {width, height, fx, fy, w2c} with w2c world-to-camera, 16 numbers by rows or 4 x 4.
+
+    cx, cy are optional everywhere (the image spans [0, width]; the centre is width / 2), lens
+    distortion is ignored. A transforms file that states no image size takes `size` = (width,
+    height), or that of the first of its pictures that exists.
+
+    Raises SceneError, naming the file and the entry, for what is missing, malformed, not finite or
+    not positive, and for an empty list.
+    """
+    path = Path(path)
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        views = _views(data, path.parent, size)
+    except OSError as error:
+        raise SceneError(f"{path}: {error.strerror}") from None
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise SceneError(f"{path}: not valid JSON: {_first_line(error)}") from None
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from None
+    return _with_distinct_names(views)
+
+
+def save_views(path, views: list[View]) -> None:
+    """Writes views as the plain list of `load_views`."""
+    entries = []
+    for view in views:
+        entry = {key: getattr(view, key) for key in ("name", "width", "height", "fx", "fy")}
+        entry |= {k: getattr(view, k) for k in ("cx", "cy") if getattr(view, k) is not None}
+        entries.append(entry | {"w2c": view.w2c.flatten().tolist()})
+    Path(path).write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
+
+
+def _views(data, folder: Path, size) -> list[View]:
+    if isinstance(data, dict) and "frames" in data:
+        frames = _entries(data["frames"], "frames")
+        _check_camera_model(data.get("camera_model"))
+        if size is None and not any("w" in frame for frame in [data, *frames]):
+            size = _picture_size(folder, frames)
+        return [_transforms_view(i, frame, data, size) for i, frame in enumerate(frames)]
+    if not isinstance(data, list):
+        raise SceneError(f"expected a list of views or an object with 'frames', got {_kind(data)}")
+    return [_listed_view(i, entry) for i, entry in enumerate(_entries(data, "the list of views"))]
+
+
+def _entries(data, name: str) -> list[dict]:
+    if not isinstance(data, list) or not data:
+        got = "an empty list" if data == [] else _kind(data)
+        raise SceneError(f"{name} must be a list with at least one view, got {got}")
+    for i, entry in enumerate(data):
+        if not isinstance(entry, dict):
+            raise SceneError(f"view {i} must be an object, got {_kind(entry)}")
+    return data
+
+
+def _listed_view(i: int, entry: dict) -> View:
+    """A view of cameras.json or of the plain list."""
+    where = f"view {i}"
+    if "w2c" in entry:
+        w2c = _pose(entry["w2c"], f"{where}: w2c")
+    elif "rotation" in entry:
+        w2c = torch.eye(4, dtype=torch.float64)
+        w2c[:3, :3] = _numbers(entry["rotation"], (3, 3), f"{where}: rotation").T
+        position = _numbers(_get(entry, "position", where), (3,), f"{where}: position")
+        w2c[:3, 3] = -w2c[:3, :3] @ position
+        _check_rotation(w2c, f"{where}: rotation")
+    else:
+        raise SceneError(
+            f"{where}: expected 'w2c', or 'rotation' and 'position', got {', '.join(entry) or '{}'}"
+        )
+    name = entry.get("img_name", entry.get("name", ""))
+    return View(
+        name=_picture_name(name, i),
+        width=_pixels(_get(entry, "width", where), f"{where}: width"),
+        height=_pixels(_get(entry, "height", where), f"{where}: height"),
+        fx=_positive(_get(entry, "fx", where), f"{where}: fx"),
+        fy=_positive(_get(entry, "fy", where), f"{where}: fy"),
+        w2c=w2c,
+        cx=_optional(entry, "cx", where),
+        cy=_optional(entry, "cy", where),
+    )
+
+
+def _transforms_view(i: int, frame: dict, shared: dict, size) -> View:
+    where = f"frame {i}"
+    entry = shared | frame  # a frame's own intrinsics go before the shared ones
+    _check_camera_model(entry.get("camera_model"))
+    if "w" in entry or "h" in entry:
+        width = _pixels(_get(entry, "w", where), f"{where}: w")
+        height = _pixels(_get(entry, "h", where), f"{where}: h")
+    elif size is not None:
+        width, height = (_pixels(number, "size") for number in size)
+    else:
+        raise SceneError(
+            f"{where}: no image size: expected 'w' and 'h', a picture at 'file_path', "
+            "or a size given by the caller (--size)"
+        )
+    fx = _focal(entry, "fl_x", "camera_angle_x", width, where)
+    if fx is None:
+        raise SceneError(f"{where}: expected 'fl_x' or 'camera_angle_x'")
+    fy = _focal(entry, "fl_y", "camera_angle_y", height, where)
+    matrix = f"{where}: transform_matrix"
+    c2w = _pose(_get(entry, "transform_matrix", where), matrix)
+    c2w[:3, 1:3] *= -1  # OpenGL looks along -z with y up
+    return View(
+        name=_picture_name(entry.get("file_path", ""), i),
+        width=width,
+        height=height,
+        fx=fx,
+        fy=fx if fy is None else fy,
+        w2c=torch.linalg.inv(c2w),
+        cx=_optional(entry, "cx", where),
+        cy=_optional(entry, "cy", where),
+    )
+
+
+def _focal(entry: dict, length: str, angle: str, extent: int, where: str) -> float | None:
+    """Focal length in pixels, from itself or from the angle that `extent` pixels span."""
+    if length in entry:
+        return _positive(entry[length], f"{where}: {length}")
+    if angle not in entry:
+        return None
+    value = _positive(entry[angle], f"{where}: {angle}")
+    if value >= math.pi:
+        raise SceneError(f"{where}: {angle} must be below pi (radians), got {value}")
+    return extent / (2 * math.tan(value / 2))
+
+
+def _check_camera_model(model) -> None:
+    if model not in (None, "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"):
+        raise SceneError(f"camera_model must be a pinhole camera, got {model!r}")
+
+
+def _picture_size(folder: Path, frames: list[dict]) -> tuple[int, int] | None:
+    """Size of the first picture that a frame names and that exists."""
+    for frame in frames:
+        name = frame.get("file_path")
+        if not isinstance(name, str):
+            continue
+        for picture in (folder / name, folder / f"{name}.png"):
+            if picture.is_file():
+                image = optional_import("PIL.Image")
+                try:
+                    with image.open(picture) as opened:
+                        return opened.size
+                except OSError as error:
+                    raise SceneError(f"{picture}: {_first_line(error)}") from None
+    return None
+
+
+def _picture_name(name, i: int) -> str:
+    """A file name without directory and picture suffix, whatever the views file says."""
+    if isinstance(name, str):
+        last = re.split(r"[/\\]", name)[-1]
+        last = re.sub(r"\.(png|jpe?g|webp|exr|tiff?|bmp)$", "", last, flags=re.IGNORECASE)
+        last = re.sub(r"[^\w.-]+", "_", last).strip(".")
+        if last:
+            return last
+    return f"view_{i:03d}"
+
+
+def _with_distinct_names(views: list[View]) -> list[View]:
+    """Appends _2, _3, ... to names met before, so that no picture overwrites another."""
+    taken: set[str] = set()
+    for i, view in enumerate(views):
+        name, n = view.name, 1
+        while name in taken:
+            n += 1
+            name = f"{view.name}_{n}"
+        taken.add(name)
+        views[i] = replace(view, name=name)
+    return views
+
+
+def _pose(value, where: str) -> torch.Tensor:
+    """A rigid transform: 4 x 4, or 16 numbers by rows."""
+    flat = isinstance(value, list) and len(value) == 16
+    pose = _numbers(value, (16,) if flat else (4, 4), where).reshape(4, 4)
+    if not torch.allclose(pose[3], pose.new_tensor([0, 0, 0, 1]), atol=1e-4):
+        raise SceneError(f"{where}: the last row must be 0 0 0 1, got {pose[3].tolist()}")
+    _check_rotation(pose, where)
+    return pose
+
+
+def _check_rotation(pose: torch.Tensor, where: str) -> None:
+    rotation = pose[:3, :3]
+    error = (rotation @ rotation.T - torch.eye(3, dtype=pose.dtype)).abs().max().item()
+    if error > 1e-2 or torch.linalg.det(rotation) < 0:  # files are rounded to a few digits
+        raise SceneError(f"{where} must hold a rotation, got {rotation.tolist()}")
+
+
+def _numbers(value, shape: tuple[int, ...], where: str) -> torch.Tensor:
+    """A nested list of finite numbers as a float64 tensor of exactly this shape."""
+
+    def fits(part, shape) -> bool:
+        if not shape:
+            return _is_number(part)
+        return (
+            isinstance(part, list)
+            and len(part) == shape[0]
+            and all(fits(item, shape[1:]) for item in part)
+        )
+
+    if not fits(value, shape):
+        size = " x ".join(map(str, shape))
+        raise SceneError(f"{where} must hold {size} finite numbers, got {_shorten(value)}")
+    return torch.tensor(value, dtype=torch.float64)
+
+
+def _is_number(value) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _positive(value, where: str) -> float:
+    if not _is_number(value) or value <= 0:
+        raise SceneError(f"{where} must be a positive finite number, got {_shorten(value)}")
+    return float(value)
+
+
+def _pixels(value, where: str) -> int:
+    if not _is_number(value) or value < 1 or value != int(value):
+        raise SceneError(f"{where} must be a positive whole number, got {_shorten(value)}")
+    return int(value)
+
+
+def _optional(entry: dict, key: str, where: str) -> float | None:
+    value = entry.get(key)
+    if value is not None and not _is_number(value):
+        raise SceneError(f"{where}: {key} must be a finite number, got {_shorten(value)}")
+    return value
+
+
+def _get(entry: dict, key: str, where: str):
+    if key not in entry:
+        raise SceneError(f"{where}: missing '{key}', got {', '.join(entry) or '{}'}")
+    return entry[key]
+
+
+def _kind(value) -> str:
+    kinds = {dict: "an object", list: "a list", str: "a string", type(None): "null"}
+    return kinds.get(type(value), _shorten(value))
+
+
+def _shorten(value) -> str:
+    text = json.dumps(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).partition("\n")[0]
+
+
+# ----------------------------------------------------------------------------------- pictures
+
+
+def to_image(color: torch.Tensor):
+    """A Pillow image of color (3, H, W): clamped to [0, 1], rounded to 8 bits."""
+    pixels = color.detach().clamp(0, 1).mul(255).round().to("cpu", torch.uint8)
+    return optional_import("PIL.Image").fromarray(pixels.permute(1, 2, 0).contiguous().numpy())

@@ -1,0 +1,88 @@
+// Which pixels and tiles a splat can touch: exact extents of its support ellipse.
+#pragma once
+
+#include "core/params.h"
+
+namespace ar {
+
+/// The ellipse |w (x - mean)|^2 <= level, grown by `reach` px in x and y so that it covers every
+/// sample of a pixel, and the numbers its extents need.
+template <typename T> struct Support {
+  Vec2<T> mean;
+  T level, reach;
+  T half_width, half_height;  ///< of the ellipse's bounding box, without reach [px]
+  T tip;                      ///< y - mean.y at the rightmost point
+  T slope;                    ///< of the chord centres: x - mean.x = slope (y - mean.y)
+  T inv_a;                    ///< half chord at y: sqrt((level - (det (y - mean.y))^2 / a) / a), a = |column 1 of w|^2
+  T det2;
+};
+
+template <typename T> AR_HD Support<T> make_support(Vec2<T> mean, const Mat2<T>& w, T level, T reach) {
+  const T a = w.xx * w.xx + w.yx * w.yx, b = w.xx * w.xy + w.yx * w.yy, c = w.xy * w.xy + w.yy * w.yy;
+  // det w without cancellation: one entry of a Cholesky factor is zero, eigenframes are orthogonal
+  const T det = difference_of_products(w.xx, w.yy, w.xy, w.yx);
+  const T l = level + T(kLevelSlack);
+  const T scale = sqrt(l) / abs(det);
+  return {mean, l, reach, scale * sqrt(c), scale * sqrt(a), -scale * b / sqrt(c), -b / a, T(1) / a, det * det};
+}
+
+template <class F, typename T> AR_HD Support<T> support_of(const Splat<F, T>& splat) {
+  return make_support(splat.mean, F::ellipse(splat.shape), splat.level, T(F::kReach));
+}
+
+/// Closed interval of pixel coordinates; empty where hi < lo.
+template <class V> struct Span { V lo, hi; };
+
+/// Pixel rows whose centres the support reaches, before clamping to the image.
+template <typename T> AR_HD Span<T> rows_of(const Support<T>& s) {
+  const T half = s.half_height + s.reach;
+  return {s.mean.y - half, s.mean.y + half};
+}
+
+/// Extent in x of the part of the support with y in [y0, y1] (pixel centres). Exact, because the
+/// intersection of an ellipse and a band is convex: its extremes are at the ellipse's tips or, where
+/// those lie outside the band, at the band's edge towards them.
+template <typename T, class V> AR_HD Span<V> columns_of(const Support<T>& s, V y0, V y1) {
+  const V height = V(s.half_height), zero = V(T(0));
+  const V lo = max(y0 - V(s.mean.y + s.reach), -height), hi = min(y1 - V(s.mean.y - s.reach), height);
+  const V right = min(max(V(s.tip), lo), hi), left = min(max(V(-s.tip), lo), hi);
+  const V ia = V(s.inv_a), level = V(s.level), det2 = V(s.det2);
+  const V half_right = sqrt(max(level - det2 * right * right * ia, zero) * ia);
+  const V half_left = sqrt(max(level - det2 * left * left * ia, zero) * ia);
+  const V slope = V(s.slope), x = V(s.mean.x), reach = V(s.reach);
+  const V far = V(T(1e9));
+  return {select(hi < lo, far, x + slope * left - half_left - reach),
+          select(hi < lo, -far, x + slope * right + half_right + reach)};
+}
+
+/// Integers in [lo, hi] that lie in [0, n), as [first, last]; empty where last < first.
+struct Range { int first, last; };
+template <typename T> AR_HD Range clamp_range(Span<T> span, int n) {
+  // Clamped before the conversion: a float beyond the range of int has no conversion.
+  const T lo = max(span.lo, T(0)), hi = min(span.hi, T(n - 1));
+  if (!(lo <= hi)) return {0, -1};
+  return {int(std::ceil(lo)), int(std::floor(hi))};
+}
+
+/// Whether the bounding box of the support holds the centre of a pixel's row and column.
+template <typename T> AR_HD bool touches_image(const Support<T>& s, TileGrid grid) {
+  const T half = s.half_width + s.reach;
+  const Range rows = clamp_range(rows_of(s), grid.height);
+  const Range columns = clamp_range(Span<T>{s.mean.x - half, s.mean.x + half}, grid.width);
+  return rows.first <= rows.last && columns.first <= columns.last;
+}
+
+/// Calls visit(tile index) for every tile the support touches, rows first, columns ascending.
+template <typename T, class Visit> AR_HD void for_each_tile(const Support<T>& s, TileGrid grid, Visit&& visit) {
+  const Range rows = clamp_range(rows_of(s), grid.height);
+  for (int row = rows.first / kTile; row <= rows.last / kTile && rows.first <= rows.last; ++row) {
+    const T y0 = T(max(row * kTile, rows.first)), y1 = T(min(row * kTile + kTile - 1, rows.last));
+    const Range columns = clamp_range(columns_of(s, y0, y1), grid.width);
+    if (columns.last < columns.first) continue;
+    for (int column = columns.first / kTile; column <= columns.last / kTile; ++column) {
+      visit(int64_t(row) * grid.columns() + column);
+    }
+  }
+}
+
+}  // namespace ar

@@ -1,0 +1,57 @@
+// Front-to-back compositing of one splat into one sample, and back.
+#pragma once
+
+#include "core/constants.h"
+#include "core/lanes.h"
+
+namespace ar {
+
+/// A sample's transmittance, positive while it is open. A sample that has stopped keeps the value it
+/// stopped at, negated: it then fails every test for being open, and loses nothing.
+template <class V> AR_HD V stopped(V transmittance) { return -abs(transmittance); }
+
+/// Result of compositing one splat into one sample.
+template <class V> struct Blended {
+  MaskOf<V> mask;        ///< the splat was composited
+  MaskOf<V> closed;      ///< it stopped the sample instead
+  V contribution;        ///< T alpha, zero outside mask
+};
+
+/// T <- T (1 - alpha). raw = opacity * weight. A splat that would take T below the minimum is not
+/// composited and stops the sample, as in 3DGS.
+template <class V> AR_HD Blended<V> blend_sample(V raw, V& transmittance) {
+  using T = ScalarOf<V>;
+  const V alpha = min(raw, V(T(kAlphaMax)));
+  const V contribution = transmittance * alpha;
+  const V next = transmittance * (V(T(1)) - alpha);
+  const MaskOf<V> hit = alpha >= V(T(kAlphaMin));
+  const MaskOf<V> open = next >= V(T(kTransmittanceMin));
+  const MaskOf<V> mask = hit & open;
+  const MaskOf<V> closed = hit & !open & (transmittance > V(T(0)));
+  transmittance = select(mask, next, select(closed, stopped(transmittance), transmittance));
+  return {mask, closed, select(mask, contribution, V(T(0)))};
+}
+
+/// Adjoint of one step, walked from the last splat to the first.
+template <class V> struct BlendGrad {
+  V contribution;  ///< T alpha, zero outside the mask: dL/dcolor is this times the pixel's gradient
+  V dL_dalpha;     ///< zero outside the mask and where alpha is capped
+};
+
+/// `mask` says which samples the forward pass composited this splat into. On entry `transmittance`
+/// is the value behind the splat, on exit the value in front of it. `behind` is the gradient-weighted
+/// colour of everything behind the splat as seen through it alone, dL_dpixel . (colour of the rest,
+/// background included); `g_color` = dL_dpixel . colour of the splat. This recursion from the back
+/// never forms the difference of total and prefix, which cancels in deep stacks.
+template <class V> AR_HD BlendGrad<V> blend_sample_vjp(MaskOf<V> mask, V raw, V g_color, V& transmittance, V& behind) {
+  using T = ScalarOf<V>;
+  const V zero = V(T(0)), cap = V(T(kAlphaMax));
+  const V alpha = select(mask, min(raw, cap), zero);
+  transmittance = transmittance / (V(T(1)) - alpha);
+  const V difference = g_color - behind;
+  behind = madd(alpha, difference, behind);
+  const MaskOf<V> free = mask & (raw <= cap);
+  return {transmittance * alpha, select(free, transmittance * difference, zero)};
+}
+
+}  // namespace ar

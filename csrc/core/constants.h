@@ -1,0 +1,41 @@
+// The constants of 3D Gaussian Splatting that the whole pipeline shares.
+#pragma once
+
+namespace ar {
+
+/// Edge of a square tile [px].
+inline constexpr int kTile = 16;
+
+/// A Gaussian is culled unless the camera-space z of its mean exceeds this [world units].
+inline constexpr double kNear = 0.2;
+
+/// x/z and y/z are clamped to this many tan(fov) in the Jacobian of the projection.
+inline constexpr double kFrustumClamp = 1.3;
+
+/// A splat is skipped where its alpha is below this.
+inline constexpr double kAlphaMin = 1.0 / 255.0;
+
+/// Alpha never exceeds this.
+inline constexpr double kAlphaMax = 0.99;
+
+/// A sample stops before its transmittance would fall below this.
+inline constexpr double kTransmittanceMin = 1e-4;
+
+/// Variance of the unit pixel along each axis [px^2].
+inline constexpr double kPixelVariance = 1.0 / 12.0;
+
+/// Added to the level of every support ellipse. It exceeds the float32 rounding error of |W d|^2 at
+/// the level (7e-3 for a needle 1000 px long, docs/numerics.md), so rounding never drops a pair.
+inline constexpr double kLevelSlack = 1e-2;
+
+/// A splat is culled where det Sigma [px^4] is not below this, so that nothing derived from it
+/// overflows a float: standard deviations up to 3e7 px pass.
+inline constexpr double kMaxDet = 1e30;
+
+/// A splat is culled where its whitening matrix [1/px] exceeds this, for the same reason. Only
+/// `point` without dilation can get there: every other footprint's ellipse is wider than 1/56 px.
+inline constexpr double kMaxWhitening = 1e7;
+
+inline constexpr double kPi = 3.14159265358979323846;
+
+}  // namespace ar

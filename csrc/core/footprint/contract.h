@@ -1,0 +1,56 @@
+// What a footprint is: the model that turns a projected Gaussian into its weight I in a pixel.
+//
+// A footprint F is a struct of static functions:
+//
+//   kName                                key in the registry: the public name and what its options fix
+//   kSamples                             samples of a pixel, each with its own transmittance
+//   kReach                               largest |coordinate| of a sample's node [px]
+//   Shape<T>                             what a splat carries; an aggregate of T only
+//   prepare(Cov2d<T>, FootprintOptions)  -> Shape<T>            once per splat
+//   radius_variance(FootprintOptions)    variance added to Sigma for the radius that 3DGS reports [px^2]
+//   ellipse(Shape<T>) -> Mat2<T>         w, and
+//   level(Shape<T>, opacity) -> T        such that opacity * I(d + node) < 1/255 wherever
+//                                        |w (d + node)|^2 > level; level <= 0 where it holds everywhere
+//   terms(Shape<T>) -> Terms<T>          numbers that all pixels share, derived per (tile, splat)
+//   weight(Terms<T>, Vec2<V> d, s) -> V  I at sample s; d = pixel centre - mean [px]
+//   weight_vjp(Terms<T>, d, s, weight, dL_dweight) -> ShapeGrad<V>   per pixel: sums of plain products
+//   mean_map(Shape<T>) -> Mat2<T>        m with dL/dmean = m^T sums.offset [dL/dpx]
+//   prepare_vjp(Cov2d<T>, Shape<T>, ShapeGrad<T> sums, weighted) -> SplatGrad<T>         once per splat
+//
+// T is float or double, V a scalar or a pack of lanes (lanes.h). The five numbers of ShapeGrad are
+// summed over pixels and samples in whatever coordinates make them cheap; prepare_vjp gives them
+// meaning. `weighted` is the sum of I dL_dI, which the gradient of the opacity needs anyway.
+#pragma once
+
+#include "core/constants.h"
+#include "core/vec.h"
+
+namespace ar {
+
+/// Projected covariance [px^2]. det is carried because recomputing it from the entries cancels:
+/// a needle of 30 x 1e-3 px has det <= 0 in float32 more often than not (docs/numerics.md).
+template <typename T> struct Cov2d { T xx, xy, yy, det; };
+
+/// Cov2d after convolution with an isotropic Gaussian of variance v.
+template <typename T> AR_HD Cov2d<T> blur(Cov2d<T> c, T v) {
+  return {c.xx + v, c.xy, c.yy + v, c.det + v * (c.xx + c.yy) + v * v};
+}
+
+/// Run-time options. What changes the code of a pixel is a template parameter instead.
+struct FootprintOptions {
+  double variance;  ///< `dilation` of point, `variance` of mip [px^2]; others ignore it
+};
+
+/// Five sums over pixels; see prepare_vjp of each footprint.
+template <class V> struct ShapeGrad { Vec2<V> offset; Sym2<V> shape; };
+
+/// Gradient of one splat. dL = dL_dmean . dmean + tr(dL_dcov dSigma) + dL_dlog_det d(log det Sigma).
+/// The part along log det stays apart: its matrix Sigma^-1 does not exist for needles, but its pull
+/// back to the factors of Sigma does (project.h).
+template <typename T> struct SplatGrad {
+  Vec2<T> dL_dmean;
+  Sym2<T> dL_dcov;
+  T dL_dlog_det;
+};
+
+}  // namespace ar

@@ -1,0 +1,118 @@
+// The footprints that are Gaussians themselves: point, mip, box, and what cumulant shares with them.
+//
+// A Gaussian is kept as a whitening matrix w with w^T w = (Sigma + v I)^-1, so that the exponent is
+// -|w d|^2 / 2. Unlike the conic form a dx^2 + 2 b dx dy + c dy^2 it cannot turn positive, and it
+// does not cancel for long needles (docs/numerics.md, "q', length 1000").
+#pragma once
+
+#include "core/footprint/contract.h"
+
+namespace ar {
+
+template <typename T> struct GaussianShape {
+  Mat2<T> w;  ///< whitening matrix [1/px]
+  T amp;      ///< peak: sqrt(det Sigma / det Sigma'), 1 without compensation
+};
+
+/// Whitening matrix of c: Cholesky factor with the narrow axis conditioned on the wide one.
+template <typename T> AR_HD Mat2<T> whiten(Cov2d<T> c) {
+  const bool wide_x = c.xx >= c.yy;
+  const T wide = wide_x ? c.xx : c.yy;
+  const T along = T(1) / sqrt(wide);
+  const T across = sqrt(wide / c.det);  // 1 / std. dev. of the narrow axis given the wide one
+  const T slope = -across * (c.xy / wide);
+  return wide_x ? Mat2<T>{along, T(0), slope, across} : Mat2<T>{T(0), along, across, slope};
+}
+
+/// Level outside which amp * opacity * exp(-|w d|^2 / 2) < 1/255.
+template <typename T> AR_HD T gaussian_level(T amp, T opacity) {
+  return T(2) * std::log(T(1 / kAlphaMin) * opacity * amp);
+}
+
+/// Gradient of a sum of Gaussians from sums in whitened coordinates z = w d: `offset` = sum g I z,
+/// `shape` = sum g I z z^T. `weighted` = sum g I, zero where the amplitude does not depend on Sigma.
+template <typename T>
+AR_HD SplatGrad<T> gaussian_vjp(const Mat2<T>& w, ShapeGrad<T> sums, T weighted) {
+  // d log I = z.w dmu + tr(w^T z z^T w dSigma)/2 + (d log det Sigma - tr(w^T w dSigma))/2
+  const Sym2<T> half = {T(0.5) * (sums.shape.xx - weighted), T(0.5) * sums.shape.xy,
+                        T(0.5) * (sums.shape.yy - weighted)};
+  return {transform_transposed(w, sums.offset), congruence_transposed(w, half), T(0.5) * weighted};
+}
+
+/// Node s of the box footprint with S samples, in units of 1/(2 S) px: one per row and column of an
+/// S x S grid, so that with the variance of each component the mixture has the pixel's mean and
+/// second moment.
+template <int S> AR_HD constexpr Vec2<int> box_node(int s) {
+  if constexpr (S == 1) {
+    return {0, 0};
+  } else if constexpr (S == 16) {
+    return {2 * s - 15, 2 * (5 * s % 16) - 15};
+  } else {
+    constexpr Vec2<int> kNodes2[] = {{1, 1}, {-1, -1}};
+    constexpr Vec2<int> kNodes4[] = {{-1, -3}, {3, -1}, {1, 3}, {-3, 1}};
+    constexpr Vec2<int> kNodes8[] = {{1, -3}, {-1, 3}, {5, 1}, {-3, -5}, {-5, 5}, {-7, -1}, {3, 7}, {7, -7}};
+    static_assert(S == 2 || S == 4 || S == 8, "box has 1, 2, 4, 8 or 16 samples");
+    return S == 2 ? kNodes2[s % 2] : S == 4 ? kNodes4[s % 4] : kNodes8[s % 8];
+  }
+}
+
+/// S Gaussians that stand for one pixel. kCompensated: the amplitude keeps the mass of the splat.
+template <int S, bool kCompensated> struct GaussianFootprint {
+  static constexpr int kSamples = S;
+  static constexpr double kReach = (S - 1) / (2.0 * S);
+  template <typename T> using Shape = GaussianShape<T>;
+
+  template <typename T> struct Terms {
+    Mat2<T> w;
+    T amp;
+    Vec2<T> node[S];  ///< whitened nodes
+  };
+
+  template <typename T> AR_HD static Shape<T> prepare_with(Cov2d<T> cov, T variance) {
+    const Cov2d<T> blurred = blur(cov, variance);
+    return {whiten(blurred), kCompensated ? sqrt(cov.det / blurred.det) : T(1)};
+  }
+
+  template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& shape) { return shape.w; }
+
+  template <typename T> AR_HD static T level(const Shape<T>& shape, T opacity) {
+    return gaussian_level(shape.amp, opacity);
+  }
+
+  template <typename T> AR_HD static Terms<T> terms(const Shape<T>& shape) {
+    Terms<T> t{shape.w, shape.amp, {}};
+AR_UNROLL
+    for (int s = 0; s < S; ++s) {
+      const Vec2<int> n = box_node<S>(s);
+      t.node[s] = transform(shape.w, Vec2<T>{T(n.x) / T(2 * S), T(n.y) / T(2 * S)});
+    }
+    return t;
+  }
+
+  template <typename T, class V> AR_HD static Vec2<V> whitened(const Terms<T>& t, Vec2<V> d, int s) {
+    const Vec2<V> z = transform(t.w, d);
+    if (S == 1) return z;
+    return {z.x + V(t.node[s].x), z.y + V(t.node[s].y)};
+  }
+
+  template <typename T, class V> AR_HD static V weight(const Terms<T>& t, Vec2<V> d, int s) {
+    const Vec2<V> z = whitened(t, d, s);
+    return V(t.amp) * exp(V(T(-0.5)) * madd(z.x, z.x, z.y * z.y));
+  }
+
+  template <typename T, class V>
+  AR_HD static ShapeGrad<V> weight_vjp(const Terms<T>& t, Vec2<V> d, int s, V weight, V dL_dweight) {
+    const Vec2<V> z = whitened(t, d, s);
+    const V gx = dL_dweight * weight * z.x, gy = dL_dweight * weight * z.y;
+    return {{gx, gy}, {gx * z.x, gx * z.y, gy * z.y}};
+  }
+
+  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return shape.w; }
+
+  template <typename T>
+  AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& shape, ShapeGrad<T> sums, T weighted) {
+    return gaussian_vjp(shape.w, sums, kCompensated ? weighted : T(0));
+  }
+};
+
+}  // namespace ar

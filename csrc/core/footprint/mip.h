@@ -1,0 +1,19 @@
+// Mip-Splatting's 2D filter: the Gaussian convolved with a Gaussian pixel of the given variance.
+#pragma once
+
+#include "core/footprint/gaussian.h"
+
+namespace ar {
+
+/// I = sqrt(det Sigma / det Sigma') exp(-d^T Sigma'^-1 d / 2), Sigma' = Sigma + variance I.
+struct Mip : GaussianFootprint<1, true> {
+  static constexpr const char* kName = "mip";
+
+  AR_HD static double radius_variance(FootprintOptions options) { return options.variance; }
+
+  template <typename T> AR_HD static Shape<T> prepare(Cov2d<T> cov, FootprintOptions options) {
+    return prepare_with(cov, T(options.variance));
+  }
+};
+
+}  // namespace ar

@@ -1,0 +1,20 @@
+// The Gaussian at the pixel's centre, widened by `dilation`: 3D Gaussian Splatting as of 2023.
+#pragma once
+
+#include "core/footprint/gaussian.h"
+
+namespace ar {
+
+/// I = exp(-d^T (Sigma + dilation I)^-1 d / 2). The amplitude is not compensated, so a splat gains
+/// mass as it shrinks.
+struct Point : GaussianFootprint<1, false> {
+  static constexpr const char* kName = "point";
+
+  AR_HD static double radius_variance(FootprintOptions options) { return options.variance; }
+
+  template <typename T> AR_HD static Shape<T> prepare(Cov2d<T> cov, FootprintOptions options) {
+    return prepare_with(cov, T(options.variance));
+  }
+};
+
+}  // namespace ar

@@ -1,0 +1,25 @@
+// Every footprint the library knows. A new one is a header and a line here.
+#pragma once
+
+#include <string_view>
+
+#include "core/footprint/analytic.h"
+#include "core/footprint/box.h"
+#include "core/footprint/cumulant.h"
+#include "core/footprint/mip.h"
+#include "core/footprint/point.h"
+
+namespace ar {
+
+template <class... F> struct FootprintList {};
+
+using Footprints = FootprintList<Point, Mip, Analytic<FrameGradient::kFrozen>, Analytic<FrameGradient::kPaper>,
+                                 Cumulant, Box<1>, Box<2>, Box<4>, Box<8>, Box<16>>;
+
+/// Calls f(F{}) for the footprint whose kName is `name`; false if there is none.
+template <class Function, class... F>
+bool visit_footprint(std::string_view name, FootprintList<F...>, Function&& f) {
+  return ((name == F::kName ? (f(F{}), true) : false) || ...);
+}
+
+}  // namespace ar

@@ -1,0 +1,86 @@
+// The functions that a value type V must support to run through the per-pixel formulas. Here for the
+// scalars float and double; cpu/pack.h adds packs of floats. A formula written with these names and
+// the arithmetic operators serves a CUDA thread (V = float), a CPU row (V = Pack) and a test (V =
+// double). `ScalarOf<V>` is the element type, `V::Mask` or bool the result of comparisons.
+#pragma once
+
+#include <cmath>
+#include <cstdint>
+
+#include "core/platform.h"
+
+namespace ar {
+
+template <class V> struct LaneTraits {
+  using Scalar = typename V::Scalar;
+  using Mask = typename V::Mask;
+  using Index = typename V::Index;
+};
+template <> struct LaneTraits<float> {
+  using Scalar = float;
+  using Mask = bool;
+  using Index = int32_t;
+};
+template <> struct LaneTraits<double> {
+  using Scalar = double;
+  using Mask = bool;
+  using Index = int32_t;
+};
+template <class V> using ScalarOf = typename LaneTraits<V>::Scalar;
+template <class V> using MaskOf = typename LaneTraits<V>::Mask;
+template <class V> using IndexOf = typename LaneTraits<V>::Index;
+
+AR_HD float select(bool m, float a, float b) { return m ? a : b; }
+AR_HD double select(bool m, double a, double b) { return m ? a : b; }
+AR_HD int32_t select(bool m, int32_t a, int32_t b) { return m ? a : b; }
+AR_HD bool any(bool m) { return m; }
+
+template <typename T> AR_HD T min(T a, T b) { return b < a ? b : a; }
+template <typename T> AR_HD T max(T a, T b) { return a < b ? b : a; }
+
+/// a * b + c. Written out where the hot loops need one rounding less and one instruction less: the
+/// build turns contraction off, so that forward and backward round alike.
+AR_HD float madd(float a, float b, float c) {
+#if defined(__CUDA_ARCH__) || defined(__FMA__)
+  return std::fma(a, b, c);
+#else
+  return a * b + c;
+#endif
+}
+AR_HD double madd(double a, double b, double c) {
+#if defined(__CUDA_ARCH__) || defined(__FMA__)
+  return std::fma(a, b, c);
+#else
+  return a * b + c;
+#endif
+}
+
+AR_HD float abs(float x) { return std::fabs(x); }
+AR_HD double abs(double x) { return std::fabs(x); }
+AR_HD float exp(float x) { return std::exp(x); }
+AR_HD double exp(double x) { return std::exp(x); }
+AR_HD float sqrt(float x) { return std::sqrt(x); }
+AR_HD double sqrt(double x) { return std::sqrt(x); }
+
+/// a b - c d with one rounding of each product recovered: within 1.5 ulp of the exact difference
+/// where nothing under- or overflows (Kahan). For determinants of nearly singular matrices.
+template <typename T> AR_HD T difference_of_products(T a, T b, T c, T d) {
+  const T cd = c * d;
+  return std::fma(a, b, -cd) + std::fma(-c, d, cd);
+}
+
+/// False for NaN.
+template <typename T> AR_HD bool within(T x, double bound) { return abs(x) <= T(bound); }
+
+/// (1 - exp(-x)) for x >= 0, given e = exp(-x): the difference where it is well conditioned, its
+/// Taylor series below 1/2 (remainder < 1e-8 relative in float, 5e-17 in double).
+template <class V> AR_HD V one_minus_exp(V x, V e) {
+  using T = ScalarOf<V>;
+  constexpr int kTerms = sizeof(T) == 4 ? 8 : 15;
+  V series(T(1));
+AR_UNROLL
+  for (int k = kTerms; k >= 2; --k) series = madd(x * V(T(-1) / T(k)), series, V(T(1)));
+  return select(x < V(T(0.5)), x * series, V(T(1)) - e);
+}
+
+}  // namespace ar

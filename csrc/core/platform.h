@@ -1,0 +1,19 @@
+// What differs between the compilers and devices that the core is built for.
+#pragma once
+
+#if defined(__CUDACC__)
+#define AR_HD __host__ __device__ __forceinline__
+#else
+// Always inlined, so that a translation unit compiled for a newer instruction set never leaves a
+// copy of a core function behind for the linker to hand to one compiled for an older set.
+#define AR_HD inline __attribute__((always_inline))
+#endif
+
+/// Before a loop of few, constant iterations, whose body should see the index as a constant.
+#if defined(__CUDA_ARCH__)
+#define AR_UNROLL _Pragma("unroll")
+#elif defined(__CUDACC__)
+#define AR_UNROLL
+#else
+#define AR_UNROLL _Pragma("GCC unroll 16")
+#endif

@@ -1,0 +1,350 @@
+// One Gaussian to one splat: cov3d, EWA projection [EWA, Eq. 29-31], colour; and back.
+#pragma once
+
+#include "core/bin.h"
+#include "core/params.h"
+#include "core/sh.h"
+
+namespace ar {
+
+/// Row r of a matrix stored transposed, as (x, y, z) and the translation w.
+template <typename T> AR_HD Vec4<T> matrix_row(const T* m, int r) { return {m[r], m[4 + r], m[8 + r], m[12 + r]}; }
+template <typename T> AR_HD Vec3<T> xyz(Vec4<T> v) { return {v.x, v.y, v.z}; }
+template <typename T> AR_HD T apply_row(Vec4<T> row, Vec3<T> p) { return dot(xyz(row), p) + row.w; }
+
+/// The mean in the image, and what the chain rule needs of the way there.
+template <typename T> struct ProjectedMean {
+  Vec3<T> view;  ///< camera space; z is the depth
+  Vec2<T> ndc;
+  T clip_w;
+  Vec2<T> pixel;
+  bool valid;  ///< in front of the near plane, and finite
+};
+
+template <typename T> AR_HD ProjectedMean<T> project_mean(const Camera<T>& camera, Vec3<T> mean) {
+  ProjectedMean<T> p;
+  p.view = {apply_row(matrix_row(camera.view, 0), mean), apply_row(matrix_row(camera.view, 1), mean),
+            apply_row(matrix_row(camera.view, 2), mean)};
+  p.clip_w = apply_row(matrix_row(camera.proj, 3), mean);
+  const T inv_w = T(1) / p.clip_w;
+  p.ndc = {inv_w * apply_row(matrix_row(camera.proj, 0), mean), inv_w * apply_row(matrix_row(camera.proj, 1), mean)};
+  p.pixel = {T(0.5) * ((p.ndc.x + T(1)) * T(camera.width) - T(1)),
+             T(0.5) * ((p.ndc.y + T(1)) * T(camera.height) - T(1))};
+  p.valid = p.view.z > T(kNear) && p.clip_w > T(0) && within(p.view.x, 1e18) && within(p.view.y, 1e18) &&
+            within(p.view.z, 1e18) && within(p.pixel.x, 1e9) && within(p.pixel.y, 1e9);
+  return p;
+}
+
+template <typename T>
+AR_HD Vec3<T> project_mean_vjp(const Camera<T>& camera, const ProjectedMean<T>& p, Vec2<T> dL_dpixel, Vec3<T> dL_dview) {
+  const Vec3<T> px = xyz(matrix_row(camera.proj, 0)), py = xyz(matrix_row(camera.proj, 1)), pw = xyz(matrix_row(camera.proj, 3));
+  const T gx = T(0.5) * T(camera.width) * dL_dpixel.x / p.clip_w, gy = T(0.5) * T(camera.height) * dL_dpixel.y / p.clip_w;
+  return gx * px + gy * py - (gx * p.ndc.x + gy * p.ndc.y) * pw + dL_dview.x * xyz(matrix_row(camera.view, 0)) +
+         dL_dview.y * xyz(matrix_row(camera.view, 1)) + dL_dview.z * xyz(matrix_row(camera.view, 2));
+}
+
+/// Whether a Gaussian may touch the image, from its mean and a bound on its largest standard
+/// deviation: cheap, and never false for one that project() keeps. `blur` is the largest variance a
+/// footprint adds.
+template <typename T>
+AR_HD bool may_be_visible(const Camera<T>& camera, Vec3<T> mean, T max_sigma, T opacity, T blur) {
+  const ProjectedMean<T> p = project_mean(camera, mean);
+  if (!p.valid) return false;
+  const T limit_x = T(kFrustumClamp) * camera.tan_half_fov_x, limit_y = T(kFrustumClamp) * camera.tan_half_fov_y;
+  const T focal_x = T(camera.width) / (T(2) * camera.tan_half_fov_x), focal_y = T(camera.height) / (T(2) * camera.tan_half_fov_y);
+  // |J| <= f/z |(1, 0, -x/z; 0, 1, -y/z)| <= f/z sqrt(1 + (x/z)^2 + (y/z)^2), with x/z and y/z clamped
+  const T stretch = max(focal_x, focal_y) / p.view.z * sqrt(T(1) + limit_x * limit_x + limit_y * limit_y);
+  const T sigma = sqrt(stretch * stretch * max_sigma * max_sigma + blur);
+  // Support: level <= 2 ln(255 opacity) + 6.2 for every footprint; 3DGS's radius: 3 sigma, rounded up.
+  const T reach = T(2) + sigma * sqrt(max(T(9), T(2) * std::log(T(1 / kAlphaMin) * opacity) + T(6.5)));
+  return p.pixel.x + reach >= T(0) && p.pixel.x - reach <= T(camera.width - 1) && p.pixel.y + reach >= T(0) &&
+         p.pixel.y - reach <= T(camera.height - 1);
+}
+
+/// The linear part of the projection at a mean: rows of A = J W, world units to px.
+template <typename T> struct Jacobian {
+  Vec3<T> x, y;
+  T ratio_x, ratio_y;        ///< x/z and y/z, clamped
+  bool clamped_x, clamped_y;
+  T focal_x, focal_y;
+};
+
+template <typename T> AR_HD Jacobian<T> make_jacobian(const Camera<T>& camera, Vec3<T> view) {
+  Jacobian<T> j;
+  const T limit_x = T(kFrustumClamp) * camera.tan_half_fov_x, limit_y = T(kFrustumClamp) * camera.tan_half_fov_y;
+  const T rx = view.x / view.z, ry = view.y / view.z;
+  j.ratio_x = min(max(rx, -limit_x), limit_x);
+  j.ratio_y = min(max(ry, -limit_y), limit_y);
+  j.clamped_x = j.ratio_x != rx;
+  j.clamped_y = j.ratio_y != ry;
+  j.focal_x = T(camera.width) / (T(2) * camera.tan_half_fov_x);
+  j.focal_y = T(camera.height) / (T(2) * camera.tan_half_fov_y);
+  const Vec3<T> depth = xyz(matrix_row(camera.view, 2));
+  j.x = (j.focal_x / view.z) * (xyz(matrix_row(camera.view, 0)) - j.ratio_x * depth);
+  j.y = (j.focal_y / view.z) * (xyz(matrix_row(camera.view, 1)) - j.ratio_y * depth);
+  return j;
+}
+
+template <typename T>
+AR_HD Vec3<T> jacobian_vjp(const Camera<T>& camera, const Jacobian<T>& j, Vec3<T> view, Vec3<T> dL_dx, Vec3<T> dL_dy) {
+  const Vec3<T> depth = xyz(matrix_row(camera.view, 2));
+  const T by_ratio_x = -(j.focal_x / view.z) * dot(dL_dx, depth), by_ratio_y = -(j.focal_y / view.z) * dot(dL_dy, depth);
+  Vec3<T> g = {T(0), T(0), -(dot(dL_dx, j.x) + dot(dL_dy, j.y)) / view.z};
+  // Where the ratio is clamped it is constant: its gradient is zero, in z too.
+  if (!j.clamped_x) {
+    g.x += by_ratio_x / view.z;
+    g.z -= by_ratio_x * j.ratio_x / view.z;
+  }
+  if (!j.clamped_y) {
+    g.y += by_ratio_y / view.z;
+    g.z -= by_ratio_y * j.ratio_y / view.z;
+  }
+  return g;
+}
+
+/// A unit quaternion, and what normalising it divided by.
+template <typename T> struct UnitQuaternion {
+  T w, x, y, z;
+  T inv_norm;  ///< 0 for a zero quaternion, which stands for the identity and gets no gradient
+};
+
+/// Deviates from 3DGS, which expects unit quaternions from the caller: any length survives.
+template <typename T> AR_HD UnitQuaternion<T> normalize_quaternion(Vec4<T> q) {
+  // Vec4 (x, y, z, w) holds the quaternion's (w, x, y, z). Dividing by the largest first keeps the
+  // squares of tiny and huge ones in range.
+  const T largest = max(max(abs(q.x), abs(q.y)), max(abs(q.z), abs(q.w)));
+  if (largest == T(0)) return {T(1), T(0), T(0), T(0), T(0)};
+  const T w = q.x / largest, x = q.y / largest, y = q.z / largest, z = q.w / largest;
+  const T inv = T(1) / sqrt(w * w + x * x + y * y + z * z);
+  return {w * inv, x * inv, y * inv, z * inv, inv / largest};
+}
+
+template <typename T> AR_HD Mat3<T> rotation_matrix(UnitQuaternion<T> q) {
+  const T two = T(2), one = T(1);
+  return {{{one - two * (q.y * q.y + q.z * q.z), two * (q.x * q.y - q.w * q.z), two * (q.x * q.z + q.w * q.y)},
+           {two * (q.x * q.y + q.w * q.z), one - two * (q.x * q.x + q.z * q.z), two * (q.y * q.z - q.w * q.x)},
+           {two * (q.x * q.z - q.w * q.y), two * (q.y * q.z + q.w * q.x), one - two * (q.x * q.x + q.y * q.y)}}};
+}
+
+/// Gradient by the quaternion as given, stored like it. Has no component along the quaternion.
+template <typename T> AR_HD Vec4<T> rotation_vjp(UnitQuaternion<T> q, const Mat3<T>& g) {
+  const Vec3<T>&a = g.row[0], &b = g.row[1], &c = g.row[2];
+  const T two = T(2);
+  const T gw = two * (q.x * (c.y - b.z) + q.y * (a.z - c.x) + q.z * (b.x - a.y));
+  const T gx = two * (q.y * (a.y + b.x) + q.z * (a.z + c.x) + q.w * (c.y - b.z) - two * q.x * (b.y + c.z));
+  const T gy = two * (q.x * (a.y + b.x) + q.z * (b.z + c.y) + q.w * (a.z - c.x) - two * q.y * (a.x + c.z));
+  const T gz = two * (q.x * (a.z + c.x) + q.y * (b.z + c.y) + q.w * (b.x - a.y) - two * q.z * (a.x + b.y));
+  const T radial = gw * q.w + gx * q.x + gy * q.y + gz * q.z;
+  return {q.inv_norm * (gw - radial * q.w), q.inv_norm * (gx - radial * q.x), q.inv_norm * (gy - radial * q.y),
+          q.inv_norm * (gz - radial * q.z)};
+}
+
+/// Factors of the projected covariance of one Gaussian. From scale and rotation: Sigma = V V^T with
+/// V = A R S. From cov3d: Sigma = A cov3d A^T.
+template <typename T> struct Factors {
+  Jacobian<T> jacobian;
+  UnitQuaternion<T> quaternion;
+  Mat3<T> rotation;
+  Vec3<T> scale;               ///< with the scale modifier
+  Vec3<T> turned_x, turned_y;  ///< rows of A R
+  Vec3<T> row_x, row_y;        ///< rows of V
+  Vec3<T> normal;              ///< row_x x row_y: det Sigma = |normal|^2, without cancellation
+  Cov2d<T> cov;
+};
+
+template <typename T> AR_HD Vec3<T> adjugate_times(const Sym3<T>& m, Vec3<T> v) {
+  const Sym3<T> adj = {difference_of_products(m.yy, m.zz, m.yz, m.yz), difference_of_products(m.xz, m.yz, m.xy, m.zz),
+                       difference_of_products(m.xy, m.yz, m.xz, m.yy), difference_of_products(m.xx, m.zz, m.xz, m.xz),
+                       difference_of_products(m.xy, m.xz, m.xx, m.yz), difference_of_products(m.xx, m.yy, m.xy, m.xy)};
+  return adj * v;
+}
+
+template <typename T>
+AR_HD Factors<T> project_covariance(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, Vec3<T> view) {
+  Factors<T> f;
+  f.jacobian = make_jacobian(camera, view);
+  const Vec3<T>&ax = f.jacobian.x, &ay = f.jacobian.y;
+  if (g.cov3ds) {
+    const Sym3<T>& c = g.cov3ds[i];
+    const Vec3<T> cx = c * ax, cy = c * ay, n = cross(ax, ay);
+    f.cov = {dot(ax, cx), dot(ax, cy), dot(ay, cy), dot(n, adjugate_times(c, n))};
+  } else {
+    f.quaternion = normalize_quaternion(g.rotations[i]);
+    f.rotation = rotation_matrix(f.quaternion);
+    f.scale = g.scale_modifier * g.scales[i];
+    f.turned_x = combine_rows(ax, f.rotation);
+    f.turned_y = combine_rows(ay, f.rotation);
+    f.row_x = mul(f.turned_x, f.scale);
+    f.row_y = mul(f.turned_y, f.scale);
+    f.normal = cross(f.row_x, f.row_y);
+    f.cov = {dot(f.row_x, f.row_x), dot(f.row_x, f.row_y), dot(f.row_y, f.row_y), dot(f.normal, f.normal)};
+  }
+  return f;
+}
+
+/// Writes the gradients of scale and rotation, or of cov3d, and returns that of the camera-space mean.
+template <typename T>
+AR_HD Vec3<T> project_covariance_vjp(const Camera<T>& camera, const Gaussians<T>& g, const GaussianGrads<T>& out, int64_t i,
+                                     Vec3<T> view, const Factors<T>& f, const SplatGrad<T>& grad) {
+  const Vec3<T>&ax = f.jacobian.x, &ay = f.jacobian.y;
+  Vec3<T> dL_dax, dL_day;
+  if (g.cov3ds) {
+    // Here Sigma has no factors to carry log det, so Sigma^-1 = adj(Sigma) / det it is.
+    const T l = grad.dL_dlog_det == T(0) ? T(0) : grad.dL_dlog_det / f.cov.det;
+    const Sym2<T> s = {grad.dL_dcov.xx + l * f.cov.yy, grad.dL_dcov.xy - l * f.cov.xy, grad.dL_dcov.yy + l * f.cov.xx};
+    const Vec3<T> u = s.xx * ax + s.xy * ay, v = s.xy * ax + s.yy * ay;  // s A
+    const Sym3<T>& c = g.cov3ds[i];
+    dL_dax = T(2) * (c * u);
+    dL_day = T(2) * (c * v);
+    if (out.cov3ds) {
+      out.cov3ds[i] = {u.x * ax.x + v.x * ay.x,
+                       u.x * ax.y + u.y * ax.x + v.x * ay.y + v.y * ay.x,
+                       u.x * ax.z + u.z * ax.x + v.x * ay.z + v.z * ay.x,
+                       u.y * ax.y + v.y * ay.y,
+                       u.y * ax.z + u.z * ax.y + v.y * ay.z + v.z * ay.y,
+                       u.z * ax.z + v.z * ay.z};
+    }
+  } else {
+    // d log det = 2 d|n| / |n|, d|n| / d row_x = row_y x n / |n|
+    const T nn = dot(f.normal, f.normal);
+    const T l = grad.dL_dlog_det == T(0) ? T(0) : T(2) * grad.dL_dlog_det / nn;
+    const Sym2<T>& s = grad.dL_dcov;
+    const Vec3<T> dL_drow_x = T(2) * (s.xx * f.row_x + s.xy * f.row_y) + l * cross(f.row_y, f.normal);
+    const Vec3<T> dL_drow_y = T(2) * (s.xy * f.row_x + s.yy * f.row_y) + l * cross(f.normal, f.row_x);
+    const Vec3<T> dL_dturned_x = mul(dL_drow_x, f.scale), dL_dturned_y = mul(dL_drow_y, f.scale);
+    dL_dax = f.rotation * dL_dturned_x;
+    dL_day = f.rotation * dL_dturned_y;
+    if (out.scales) {
+      out.scales[i] = g.scale_modifier * (mul(dL_drow_x, f.turned_x) + mul(dL_drow_y, f.turned_y));
+    }
+    if (out.rotations) {
+      const Mat3<T> dL_drotation = {{ax.x * dL_dturned_x + ay.x * dL_dturned_y, ax.y * dL_dturned_x + ay.y * dL_dturned_y,
+                                     ax.z * dL_dturned_x + ay.z * dL_dturned_y}};
+      out.rotations[i] = rotation_vjp(f.quaternion, dL_drotation);
+    }
+  }
+  return jacobian_vjp(camera, f.jacobian, view, dL_dax, dL_day);
+}
+
+/// Direction from the camera to the mean, and 1 / distance.
+template <typename T> struct Direction {
+  Vec3<T> unit;
+  T inv_length;
+};
+template <typename T> AR_HD Direction<T> view_direction(const Camera<T>& camera, Vec3<T> mean) {
+  const Vec3<T> d = mean - Vec3<T>{camera.position[0], camera.position[1], camera.position[2]};
+  const T inv = T(1) / sqrt(dot(d, d));
+  return {inv * d, inv};
+}
+
+template <typename T> AR_HD Vec3<T> splat_color(const Camera<T>& camera, const Gaussians<T>& g, int64_t i) {
+  if (g.colors) return g.colors[i];
+  T basis[kMaxShCount];
+  sh_basis(g.sh_degree, view_direction(camera, g.means[i]).unit, basis);
+  const Vec3<T> c = sh_color(g.sh_degree, basis, g.shs + i * g.sh_stride);
+  return {max(c.x, T(0)), max(c.y, T(0)), max(c.z, T(0))};
+}
+
+/// Writes the gradient of the colour's parameters and returns its part in that of the mean.
+template <typename T>
+AR_HD Vec3<T> splat_color_vjp(const Camera<T>& camera, const Gaussians<T>& g, const GaussianGrads<T>& out, int64_t i, Vec3<T> dL_dcolor) {
+  if (g.colors) {
+    if (out.colors) out.colors[i] = dL_dcolor;
+    return {T(0), T(0), T(0)};
+  }
+  T basis[kMaxShCount], weight[kMaxShCount];
+  const Direction<T> d = view_direction(camera, g.means[i]);
+  const Vec3<T>* sh = g.shs + i * g.sh_stride;
+  sh_basis(g.sh_degree, d.unit, basis);
+  const Vec3<T> c = sh_color(g.sh_degree, basis, sh);
+  const Vec3<T> free = {c.x > T(0) ? dL_dcolor.x : T(0), c.y > T(0) ? dL_dcolor.y : T(0), c.z > T(0) ? dL_dcolor.z : T(0)};
+  const int used = sh_count(g.sh_degree);
+  if (out.shs) {
+    Vec3<T>* dL_dsh = out.shs + i * g.sh_stride;
+    for (int k = 0; k < used; ++k) dL_dsh[k] = basis[k] * free;
+    for (int k = used; k < g.sh_stride; ++k) dL_dsh[k] = {T(0), T(0), T(0)};
+  }
+  if (g.sh_degree == 0) return {T(0), T(0), T(0)};
+  for (int k = 0; k < used; ++k) weight[k] = dot(free, sh[k]);
+  const Vec3<T> by_unit = sh_basis_vjp(g.sh_degree, d.unit, weight);
+  return d.inv_length * (by_unit - dot(by_unit, d.unit) * d.unit);
+}
+
+/// ceil(3 sigma) along the major axis: the radius that 3DGS reports [px].
+template <typename T> AR_HD int splat_radius(Cov2d<T> cov, T variance) {
+  const T largest = T(0.5) * (cov.xx + cov.yy + std::hypot(cov.xx - cov.yy, T(2) * cov.xy)) + variance;
+  return int(min(std::ceil(T(3) * sqrt(largest)), T(1e9)));
+}
+
+/// Projects Gaussian i. Returns 3DGS's radius, 0 if it is culled: behind the near plane, off the
+/// image, not finite, or degenerate. A splat that is kept may still touch no tile (level <= 0).
+template <class F, typename T>
+AR_HD int project(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options, Splat<F, T>& splat, T& depth) {
+  const ProjectedMean<T> mean = project_mean(camera, g.means[i]);
+  splat.level = T(0);
+  if (!mean.valid) return 0;
+  const Cov2d<T> cov = project_covariance(camera, g, i, mean.view).cov;
+  if (!(cov.det >= T(0) && cov.det < T(kMaxDet)) || !within(cov.xx, 1e18) || !within(cov.yy, 1e18)) return 0;
+  splat.shape = F::prepare(cov, options);
+  const Mat2<T> w = F::ellipse(splat.shape);
+  if (!within(w.xx, kMaxWhitening) || !within(w.xy, kMaxWhitening) || !within(w.yx, kMaxWhitening) || !within(w.yy, kMaxWhitening)) return 0;
+  const T opacity = g.opacities[i], level = F::level(splat.shape, opacity);
+  if (!within(level, 1e6)) return 0;  // zero, negative or non-finite opacity, zero determinant
+  const int radius = splat_radius(cov, T(F::radius_variance(options)));
+  const bool on_image = mean.pixel.x + T(radius) >= T(0) && mean.pixel.x - T(radius) <= T(camera.width - 1) &&
+                        mean.pixel.y + T(radius) >= T(0) && mean.pixel.y - T(radius) <= T(camera.height - 1);
+  splat.mean = mean.pixel;
+  splat.opacity = opacity;
+  depth = mean.view.z;
+  splat.level = level;
+  const bool touches = level > T(0) && touches_image(support_of(splat), TileGrid{camera.width, camera.height});
+  if (!touches) splat.level = T(0);
+  if (!touches && !on_image) return 0;
+  if (touches) {
+    splat.color = splat_color(camera, g, i);
+    if (!within(splat.color.x, 1e18) || !within(splat.color.y, 1e18) || !within(splat.color.z, 1e18)) {
+      splat.level = T(0);
+      return 0;
+    }
+  }
+  return radius;
+}
+
+/// Writes every gradient of Gaussian i, from the sums over its pairs.
+template <class F, typename T>
+AR_HD void project_vjp(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options, const PairGrad<T>& sums,
+                       const GaussianGrads<T>& out) {
+  const ProjectedMean<T> mean = project_mean(camera, g.means[i]);
+  const Factors<T> factors = project_covariance(camera, g, i, mean.view);
+  const SplatGrad<T> grad = F::prepare_vjp(factors.cov, F::prepare(factors.cov, options), sums.shape, sums.weighted);
+  const Vec3<T> dL_dview = project_covariance_vjp(camera, g, out, i, mean.view, factors, grad);
+  Vec3<T> dL_dmean = project_mean_vjp(camera, mean, grad.dL_dmean, dL_dview);
+  dL_dmean += splat_color_vjp(camera, g, out, i, sums.color);
+  if (out.means) out.means[i] = dL_dmean;
+  if (out.opacities) out.opacities[i] = sums.weighted / g.opacities[i];
+  if (out.means2d) {
+    T* row = out.means2d + i * out.means2d_stride;
+    row[0] = T(0.5) * T(camera.width) * grad.dL_dmean.x;
+    row[1] = T(0.5) * T(camera.height) * grad.dL_dmean.y;
+    row[2] = T(0);
+  }
+}
+
+/// Zero gradient, for a Gaussian that touched no pixel.
+template <typename T> AR_HD void zero_grads(const Gaussians<T>& g, int64_t i, const GaussianGrads<T>& out) {
+  const Vec3<T> zero = {T(0), T(0), T(0)};
+  if (out.means) out.means[i] = zero;
+  if (out.scales) out.scales[i] = zero;
+  if (out.rotations) out.rotations[i] = {T(0), T(0), T(0), T(0)};
+  if (out.cov3ds) out.cov3ds[i] = {T(0), T(0), T(0), T(0), T(0), T(0)};
+  if (out.opacities) out.opacities[i] = T(0);
+  if (out.colors) out.colors[i] = zero;
+  if (out.shs) {
+    for (int k = 0; k < g.sh_stride; ++k) out.shs[i * g.sh_stride + k] = zero;
+  }
+  if (out.means2d) {
+    for (int k = 0; k < out.means2d_stride; ++k) out.means2d[i * out.means2d_stride + k] = T(0);
+  }
+}
+
+}  // namespace ar

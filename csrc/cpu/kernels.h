@@ -1,0 +1,32 @@
+// All loops of the CPU path for one instruction set: kernels_*.cpp include this.
+#pragma once
+
+#include "core/footprint/registry.h"
+#include "cpu/bin.h"
+#include "cpu/blend.h"
+#include "cpu/project.h"
+#include "cpu/weight.h"
+
+namespace ar::AR_ISA {
+
+template <class F, typename T> inline constexpr cpu::Stages<T> kStages = {
+    int(sizeof(Splat<F, T>) / sizeof(T)),
+    F::kSamples,
+    count_candidates<T>,
+    project<F, T>,
+    count_pairs<F, T>,
+    scatter_pairs<F, T>,
+    blend<F, T>,
+    blend_vjp<F, T>,
+    project_vjp<F, T>,
+    weight<F, T>,
+    weight_vjp<F, T>,
+};
+
+template <typename T> const cpu::Stages<T>* stages(std::string_view footprint) {
+  const cpu::Stages<T>* found = nullptr;
+  visit_footprint(footprint, Footprints{}, [&](auto f) { found = &kStages<decltype(f), T>; });
+  return found;
+}
+
+}  // namespace ar::AR_ISA

@@ -1,0 +1,25 @@
+// The CPU path for AVX512.
+#if defined(__x86_64__)
+#include "cpu/kernels_std.h"
+
+#if defined(__clang__)
+#pragma clang attribute push(__attribute__((target("avx2,fma,bmi,bmi2,avx512f,avx512dq,avx512vl,avx512bw"))), apply_to = function)
+#else
+#pragma GCC push_options
+#pragma GCC target("avx2,fma,bmi,bmi2,avx512f,avx512dq,avx512vl,avx512bw")
+#endif
+
+#define AR_ISA avx512
+#define AR_LANES 16
+#include "cpu/kernels.h"
+
+namespace ar::avx512 {
+template const cpu::Stages<float>* stages<float>(std::string_view);
+}
+
+#if defined(__clang__)
+#pragma clang attribute pop
+#else
+#pragma GCC pop_options
+#endif
+#endif

@@ -1,0 +1,168 @@
+// Packs of float lanes: the value type V of the per-pixel formulas on the CPU.
+//
+// Built on the vector extensions of GCC and Clang, with intrinsics where those lack an operation.
+// The width is that of the instruction set this translation unit is compiled for; the type lives in
+// that instruction set's namespace, so two widths never meet.
+#pragma once
+
+#include "core/lanes.h"
+#include "cpu/isa.h"
+
+namespace ar::AR_ISA {
+
+// The scalar forms stay visible beside the packs'.
+using ar::abs;
+using ar::any;
+using ar::exp;
+using ar::madd;
+using ar::max;
+using ar::min;
+using ar::select;
+using ar::sqrt;
+
+/// kLanes 32-bit integers.
+struct PackIndex {
+  typedef int32_t Raw __attribute__((vector_size(4 * kLanes)));
+  Raw v;
+
+  PackIndex() = default;
+  AR_HD explicit PackIndex(Raw raw) : v(raw) {}
+  AR_HD explicit PackIndex(int32_t x) : v(Raw{} + x) {}
+  AR_HD static PackIndex load(const int32_t* p) {
+    Raw r;
+    __builtin_memcpy(&r, p, sizeof r);
+    return PackIndex(r);
+  }
+  AR_HD void store(int32_t* p) const { __builtin_memcpy(p, &v, sizeof v); }
+};
+
+/// All bits of a lane set or clear.
+struct PackMask {
+  PackIndex::Raw v;
+
+  AR_HD PackMask operator&(PackMask o) const { return {v & o.v}; }
+  AR_HD PackMask operator|(PackMask o) const { return {v | o.v}; }
+  AR_HD PackMask operator!() const { return {~v}; }
+};
+
+struct Pack {
+  using Scalar = float;
+  using Mask = PackMask;
+  using Index = PackIndex;
+  typedef float Raw __attribute__((vector_size(4 * kLanes)));
+  Raw v;
+
+  Pack() = default;
+  AR_HD explicit Pack(Raw raw) : v(raw) {}
+  AR_HD explicit Pack(float x) : v(x - Raw{}) {}
+  AR_HD static Pack load(const float* p) {
+    Raw r;
+    __builtin_memcpy(&r, p, sizeof r);
+    return Pack(r);
+  }
+  AR_HD void store(float* p) const { __builtin_memcpy(p, &v, sizeof v); }
+
+  AR_HD Pack operator+(Pack o) const { return Pack(v + o.v); }
+  AR_HD Pack operator-(Pack o) const { return Pack(v - o.v); }
+  AR_HD Pack operator*(Pack o) const { return Pack(v * o.v); }
+  AR_HD Pack operator/(Pack o) const { return Pack(v / o.v); }
+  AR_HD Pack operator-() const { return Pack(-v); }
+  AR_HD PackMask operator<(Pack o) const { return {v < o.v}; }
+  AR_HD PackMask operator>(Pack o) const { return {v > o.v}; }
+  AR_HD PackMask operator<=(Pack o) const { return {v <= o.v}; }
+  AR_HD PackMask operator>=(Pack o) const { return {v >= o.v}; }
+};
+
+AR_HD PackMask operator<(PackIndex a, PackIndex b) { return {a.v < b.v}; }
+AR_HD Pack select(PackMask m, Pack a, Pack b) { return Pack(m.v ? a.v : b.v); }
+AR_HD PackIndex select(PackMask m, PackIndex a, PackIndex b) { return PackIndex(m.v ? a.v : b.v); }
+
+#if AR_LANES == 16
+AR_HD bool any(PackMask m) { return _mm512_movepi32_mask((__m512i)m.v) != 0; }
+AR_HD Pack madd(Pack a, Pack b, Pack c) { return Pack((Pack::Raw)_mm512_fmadd_ps(a.v, b.v, c.v)); }
+AR_HD Pack min(Pack a, Pack b) { return Pack((Pack::Raw)_mm512_min_ps(a.v, b.v)); }
+AR_HD Pack max(Pack a, Pack b) { return Pack((Pack::Raw)_mm512_max_ps(a.v, b.v)); }
+AR_HD Pack sqrt(Pack a) { return Pack((Pack::Raw)_mm512_sqrt_ps(a.v)); }
+#elif AR_LANES == 8
+AR_HD bool any(PackMask m) { return _mm256_movemask_ps((__m256)m.v) != 0; }
+AR_HD Pack madd(Pack a, Pack b, Pack c) { return Pack((Pack::Raw)_mm256_fmadd_ps(a.v, b.v, c.v)); }
+AR_HD Pack min(Pack a, Pack b) { return Pack((Pack::Raw)_mm256_min_ps(a.v, b.v)); }
+AR_HD Pack max(Pack a, Pack b) { return Pack((Pack::Raw)_mm256_max_ps(a.v, b.v)); }
+AR_HD Pack sqrt(Pack a) { return Pack((Pack::Raw)_mm256_sqrt_ps(a.v)); }
+#else
+AR_HD bool any(PackMask m) {
+  typedef int64_t Halves __attribute__((vector_size(16)));
+  const Halves h = (Halves)m.v;
+  return (h[0] | h[1]) != 0;
+}
+AR_HD Pack madd(Pack a, Pack b, Pack c) { return Pack(a.v * b.v + c.v); }
+AR_HD Pack min(Pack a, Pack b) { return Pack(b.v < a.v ? b.v : a.v); }
+AR_HD Pack max(Pack a, Pack b) { return Pack(a.v < b.v ? b.v : a.v); }
+AR_HD Pack sqrt(Pack a) {
+  Pack r;
+  for (int i = 0; i < kLanes; ++i) r.v[i] = std::sqrt(a.v[i]);
+  return r;
+}
+#endif
+
+AR_HD Pack abs(Pack a) { return Pack((Pack::Raw)((PackIndex::Raw)a.v & 0x7fffffff)); }
+
+/// exp(x) to 2e-7 relative for x in [-87, 88]; clamped outside, so never 0 or inf (tests/cpp/pack_test.cpp).
+/// x = n ln 2 + f, |f| <= ln 2 / 2; exp(f) by a minimax polynomial of relative error 4e-9.
+AR_HD Pack exp(Pack x) {
+  const Pack clamped = min(max(x, Pack(-87.0f)), Pack(88.0f));
+  // Adding 1.5 * 2^23 rounds to an integer, which then sits in the low bits of the sum.
+  const Pack magic(12582912.0f);
+  const Pack shifted = madd(clamped, Pack(1.44269504f), magic);
+  const Pack n = shifted - magic;
+  const Pack f = madd(n, Pack(-1.42860677e-6f), madd(n, Pack(-0.693145752f), clamped));
+  Pack p(1.38145963e-3f);
+  p = madd(p, f, Pack(8.36871685e-3f));
+  p = madd(p, f, Pack(4.16683881e-2f));
+  p = madd(p, f, Pack(1.66665206e-1f));
+  p = madd(p, f, Pack(4.99999934e-1f));
+  p = madd(p, f, Pack(1.0f));
+  p = madd(p, f, Pack(1.0f));
+  return Pack((Pack::Raw)((PackIndex::Raw)p.v + ((PackIndex::Raw)shifted.v << 23)));
+}
+
+/// Sum of the lanes, in a fixed order.
+AR_HD float sum(Pack a) {
+#if AR_LANES == 16
+  const __m256 half = _mm256_add_ps(_mm512_castps512_ps256(a.v), _mm512_extractf32x8_ps(a.v, 1));
+#elif AR_LANES == 8
+  const __m256 half = a.v;
+#endif
+#if AR_LANES >= 8
+  __m128 q = _mm_add_ps(_mm256_castps256_ps128(half), _mm256_extractf128_ps(half, 1));
+  q = _mm_add_ps(q, _mm_movehl_ps(q, q));
+  return _mm_cvtss_f32(_mm_add_ss(q, _mm_movehdup_ps(q)));
+#else
+  return (a.v[0] + a.v[2]) + (a.v[1] + a.v[3]);
+#endif
+}
+AR_HD float sum(float a) { return a; }
+AR_HD double sum(double a) { return a; }
+
+/// The lanes a scalar type is processed in: packs of floats, doubles one by one (they serve tests
+/// and gradcheck, where speed does not matter).
+template <typename T> struct LanesOf;
+template <> struct LanesOf<float> {
+  using Type = Pack;
+  static constexpr int kCount = kLanes;
+};
+template <> struct LanesOf<double> {
+  using Type = double;
+  static constexpr int kCount = 1;
+};
+
+AR_HD Pack load(const float* p, Pack) { return Pack::load(p); }
+AR_HD double load(const double* p, double) { return *p; }
+AR_HD void store(float* p, Pack v) { v.store(p); }
+AR_HD void store(double* p, double v) { *p = v; }
+AR_HD PackIndex load_index(const int32_t* p, Pack) { return PackIndex::load(p); }
+AR_HD int32_t load_index(const int32_t* p, double) { return *p; }
+AR_HD void store_index(int32_t* p, PackIndex v) { v.store(p); }
+AR_HD void store_index(int32_t* p, int32_t v) { *p = v; }
+
+}  // namespace ar::AR_ISA

@@ -1,0 +1,89 @@
+// Loops of project and project_vjp, over chunks of Gaussians.
+#pragma once
+
+#include <algorithm>
+
+#include "core/project.h"
+#include "cpu/isa.h"
+#include "cpu/parallel.h"
+#include "cpu/tasks.h"
+
+namespace ar::AR_ISA {
+
+template <typename T> AR_HD T max_sigma(const Gaussians<T>& g, int64_t i) {
+  if (g.cov3ds) return std::sqrt(g.cov3ds[i].xx + g.cov3ds[i].yy + g.cov3ds[i].zz);
+  const Vec3<T> s = g.scales[i];
+  return g.scale_modifier * ar::max(std::abs(s.x), ar::max(std::abs(s.y), std::abs(s.z)));
+}
+
+template <typename T> AR_HD bool is_candidate(const cpu::ProjectTask<T>& task, int64_t i) {
+  const Gaussians<T>& g = task.gaussians;
+  const T blur = T(std::max(task.options.variance, kPixelVariance));
+  return may_be_visible(task.camera, g.means[i], max_sigma(g, i), g.opacities[i], blur);
+}
+
+/// First pass: how many Gaussians of each chunk may be visible, so that splats can be written
+/// densely and in input order.
+template <typename T> void count_candidates(const cpu::ProjectTask<T>& task) {
+  const int64_t n = task.gaussians.n;
+  cpu::parallel_for(cpu::chunks_of(n), task.threads, [&](int64_t chunk) {
+    const int64_t begin = chunk * cpu::kChunk, end = std::min(n, begin + cpu::kChunk);
+    int64_t count = 0;
+    for (int64_t i = begin; i < end; ++i) count += is_candidate(task, i);
+    task.chunk_offsets[chunk] = count;
+  });
+}
+
+template <class F, typename T> void project(const cpu::ProjectTask<T>& task) {
+  const int64_t n = task.gaussians.n;
+  auto* splats = reinterpret_cast<Splat<F, T>*>(task.splats);
+  cpu::parallel_for(cpu::chunks_of(n), task.threads, [&](int64_t chunk) {
+    const int64_t begin = chunk * cpu::kChunk, end = std::min(n, begin + cpu::kChunk);
+    int64_t j = task.chunk_offsets[chunk];
+    for (int64_t i = begin; i < end; ++i) {
+      task.radii[i] = 0;
+      if (!is_candidate(task, i)) continue;
+      splats[j] = {};
+      task.depths[j] = T(0);
+      task.ids[j] = int32_t(i);
+      task.radii[i] = ar::project<F, T>(task.camera, task.gaussians, i, task.options, splats[j], task.depths[j]);
+      ++j;
+    }
+  });
+}
+
+template <class F, typename T> void project_vjp(const cpu::ProjectVjpTask<T>& task) {
+  const int64_t n = task.gaussians.n;
+  cpu::parallel_for(cpu::chunks_of(n), task.threads, [&](int64_t chunk) {
+    const int64_t begin = chunk * cpu::kChunk, end = std::min(n, begin + cpu::kChunk);
+    int64_t j = std::lower_bound(task.ids, task.ids + task.n_splats, begin) - task.ids;
+    for (int64_t i = begin; i < end; ++i) {
+      const bool is_splat = j < task.n_splats && task.ids[j] == i;
+      const int64_t first = is_splat ? task.splat_offsets[j] : 0, last = is_splat ? task.splat_offsets[j + 1] : 0;
+      j += is_splat;
+      if (first == last) {
+        zero_grads(task.gaussians, i, task.grads);
+        continue;
+      }
+      PairGrad<T> sums = {};
+      Vec2<T> abs2d = {};
+      for (int64_t k = first; k < last; ++k) {
+        const PairGrad<T>& g = task.pair_grads[task.positions[k]];
+        sums.shape.offset = sums.shape.offset + g.shape.offset;
+        sums.shape.shape = {sums.shape.shape.xx + g.shape.shape.xx, sums.shape.shape.xy + g.shape.shape.xy,
+                            sums.shape.shape.yy + g.shape.shape.yy};
+        sums.weighted += g.weighted;
+        sums.color += g.color;
+        if (task.pair_abs) abs2d = abs2d + task.pair_abs[task.positions[k]];
+      }
+      ar::project_vjp<F, T>(task.camera, task.gaussians, i, task.options, sums, task.grads);
+      if (task.grads.means2d && task.grads.means2d_stride == 4) {
+        T* row = task.grads.means2d + i * 4;
+        row[2] = T(0.5) * T(task.camera.width) * abs2d.x;
+        row[3] = T(0.5) * T(task.camera.height) * abs2d.y;
+      }
+    }
+  });
+}
+
+}  // namespace ar::AR_ISA

@@ -1,0 +1,50 @@
+// What the ops accept. Checked once, before anything is touched, for every backend alike. Messages
+// say which argument, what was expected and what came: `means3D must have shape (P, 3), got (5, 2)`.
+#pragma once
+
+#include <torch/library.h>
+#include <ATen/ATen.h>
+
+#include <cmath>
+#include <optional>
+#include <string>
+#include <vector>
+
+namespace ar::ops {
+
+using at::Tensor;
+using OptionalTensor = std::optional<Tensor>;
+
+/// Arguments of rasterize, as given; check() brings the tensors into the form the kernels read.
+struct Inputs {
+  Tensor means3D, opacities;
+  OptionalTensor means2D, shs, colors_precomp, scales, rotations, cov3D_precomp;
+  Tensor background, viewmatrix, projmatrix, campos;
+  int64_t image_height, image_width;
+  double tanfovx, tanfovy, scale_modifier;
+  int64_t sh_degree;
+  std::string footprint;
+  double variance;
+
+  int64_t count() const { return means3D.size(0); }
+
+  /// Raises TypeError for a wrong dtype and ValueError for anything else. Afterwards every tensor is
+  /// contiguous, and the matrices are 4x4.
+  void check();
+};
+
+std::string shape_of(const Tensor& t);
+
+/// dtype float32 or float64.
+void check_floating(const Tensor& t, const char* name);
+
+/// Same dtype and device as `like`, which is called `like_name` in the message.
+void check_like(const Tensor& t, const char* name, const Tensor& like, const char* like_name);
+
+/// Every element is finite. CPU tensors only: elsewhere it would wait for the device.
+void check_finite(const Tensor& t, const char* name);
+
+/// Sizes that tensors and tiles can be indexed with.
+void check_image_size(int64_t height, int64_t width);
+
+}  // namespace ar::ops

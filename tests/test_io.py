@@ -1,0 +1,515 @@
+"""Scenes and views: what is read is what the file's own conventions say, and faults are named."""
+
+import json
+import math
+import sys
+
+import numpy as np
+import pytest
+import torch
+from conftest import SHARED
+
+from analytic_rasterizer import io
+
+gsply = pytest.importorskip("gsply", reason="needs the cli extra")
+image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
+
+
+# ------------------------------------------------------------------------------------- scenes
+
+
+def ply_columns(degree, extra=()):
+    """Vertex properties in the order that 3DGS training writes them."""
+    rest = 3 * ((degree + 1) ** 2 - 1)
+    return [
+        *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
+        *(f"f_rest_{i}" for i in range(rest)),
+        *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
+        *extra,
+    ]
+
+
+def write_ply(path, columns, rows, kinds=None, form="binary_little_endian", after=""):
+    """A .ply by hand. `kinds` maps a column to its type where that is not float."""
+    kinds = kinds or {}
+    types = {"float": "<f4", "double": "<f8", "uchar": "u1"}
+    data = np.zeros(len(rows), [(name, types[kinds.get(name, "float")]) for name in columns])
+    for i, name in enumerate(columns):
+        data[name] = rows[:, i]
+    properties = "".join(f"property {kinds.get(name, 'float')} {name}\n" for name in columns)
+    header = f"ply\nformat {form} 1.0\nelement vertex {len(rows)}\n{properties}{after}end_header\n"
+    path.write_bytes(header.encode() + data.tobytes())
+    return path
+
+
+def random_rows(columns, count=5, seed=0):
+    return np.random.default_rng(seed).normal(size=(count, len(columns))).astype(np.float32)
+
+
+def random_scene(count=300, degree=3, seed=0):
+    g = torch.Generator().manual_seed(seed)
+    return io.Scene(
+        torch.randn(count, 3, generator=g),
+        (0.5 * torch.randn(count, 3, generator=g) - 3).exp(),
+        torch.nn.functional.normalize(torch.randn(count, 4, generator=g), dim=1),
+        torch.rand(count, 1, generator=g),
+        0.2 * torch.randn(count, (degree + 1) ** 2, 3, generator=g),
+        degree,
+    )
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_ply_by_hand(tmp_path, degree):
+    columns = ply_columns(degree)
+    rows = random_rows(columns)
+    scene = io.load_scene(write_ply(tmp_path / "scene.ply", columns, rows))
+    column = {name: torch.from_numpy(rows[:, i]) for i, name in enumerate(columns)}
+
+    def stack(*names):
+        return torch.stack([column[name] for name in names], 1)
+
+    bands = (degree + 1) ** 2 - 1
+    assert scene.sh_degree == degree
+    assert scene.shs.shape == (5, bands + 1, 3)
+    assert all(field.dtype == torch.float32 and field.is_contiguous() for field in scene[:-1])
+    torch.testing.assert_close(scene.means, stack("x", "y", "z"), rtol=0, atol=0)
+    torch.testing.assert_close(scene.scales, stack("scale_0", "scale_1", "scale_2").exp())
+    torch.testing.assert_close(scene.rotations, stack("rot_0", "rot_1", "rot_2", "rot_3"))
+    torch.testing.assert_close(scene.opacities, stack("opacity").sigmoid())
+    torch.testing.assert_close(scene.shs[:, 0], stack("f_dc_0", "f_dc_1", "f_dc_2"))
+    for channel in range(3):  # f_rest runs through all bands of red, then of green, then of blue
+        for band in range(bands):
+            expected = column[f"f_rest_{channel * bands + band}"]
+            torch.testing.assert_close(scene.shs[:, 1 + band, channel], expected)
+
+
+def test_ply_in_another_order_with_other_floats(tmp_path):
+    columns = ply_columns(1, extra=("confidence",))
+    rows = random_rows(columns)
+    straight = io.load_scene(write_ply(tmp_path / "a.ply", columns, rows))
+    turned = io.load_scene(write_ply(tmp_path / "b.ply", columns[::-1], rows[:, ::-1]))
+    for left, right in zip(straight[:-1], turned[:-1], strict=True):
+        assert torch.equal(left, right)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_ply_round_trip(tmp_path, degree):
+    scene = random_scene(degree=degree)
+    io.save_scene(tmp_path / "scene.ply", scene)
+    loaded = io.load_scene(tmp_path / "scene.ply")
+    assert loaded.sh_degree == degree
+    assert torch.equal(loaded.means, scene.means)
+    assert torch.equal(loaded.shs, scene.shs)
+    torch.testing.assert_close(loaded.scales, scene.scales)
+    torch.testing.assert_close(loaded.rotations, scene.rotations)
+    torch.testing.assert_close(loaded.opacities, scene.opacities)
+
+
+def turned_by(a, b):
+    """Largest 1 - |cos| between quaternions: their sign does not matter."""
+    return (1 - (a * b).sum(1).abs()).max().item()
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_compressed_ply_round_trip(tmp_path, degree):
+    scene = random_scene(degree=degree)
+    io.save_scene(tmp_path / "scene.compressed.ply", scene)
+    assert (tmp_path / "scene.compressed.ply").read_bytes().count(b"packed_position") == 1
+    loaded = io.load_scene(tmp_path / "scene.compressed.ply")
+    assert loaded.sh_degree == degree
+    # Half a step of the fewest bits that a component gets, over the range of all Gaussians.
+    extent = (scene.means.amax() - scene.means.amin()).item()
+    assert (loaded.means - scene.means).abs().max() <= 0.5 / 1023 * extent * 1.001
+    logs = scene.scales.log()
+    extent = (logs.amax() - logs.amin()).item()
+    assert (loaded.scales.log() - logs).abs().max() <= 0.5 / 1023 * extent * 1.001
+    assert (loaded.opacities - scene.opacities).abs().max() <= 0.5 / 255 * 1.001
+    # Three components at 10 bits over sqrt(2); the fourth follows from the unit length.
+    assert turned_by(loaded.rotations, scene.rotations) <= 3 * (0.5 / 1023 * math.sqrt(2)) ** 2 * 4
+    # Colours at 8 bits over the range of a chunk; higher bands in steps of 1/32.
+    extent = (scene.shs[:, 0].amax() - scene.shs[:, 0].amin()).item()
+    assert (loaded.shs[:, 0] - scene.shs[:, 0]).abs().max() <= 0.5 / 255 * extent * 1.001
+    if degree:
+        assert (loaded.shs[:, 1:] - scene.shs[:, 1:]).abs().max() <= 1.001 / 32
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_spz_round_trip(tmp_path, degree):
+    scene = random_scene(degree=degree)
+    io.save_scene(tmp_path / "scene.spz", scene)
+    loaded = io.load_scene(tmp_path / "scene.spz")
+    assert loaded.sh_degree == degree
+    assert (loaded.means - scene.means).abs().max() <= 0.501 / 2**12
+    assert (loaded.scales.log() - scene.scales.log()).abs().max() <= 0.501 / 16
+    assert (loaded.opacities - scene.opacities).abs().max() <= 0.501 / 255
+    # Three components at 9 bits and a sign over sqrt(1/2); the fourth follows.
+    assert turned_by(loaded.rotations, scene.rotations) <= 3 * (0.5 / 511 * math.sqrt(0.5)) ** 2 * 4
+    assert (loaded.shs[:, 0] - scene.shs[:, 0]).abs().max() <= 0.501 / (0.15 * 255)
+    if degree:
+        assert (loaded.shs[:, 1:] - scene.shs[:, 1:]).abs().max() <= 0.501 / 128
+
+
+@pytest.mark.parametrize("name", ["scene.ply", "scene.compressed.ply", "scene.spz"])
+def test_scene_without_gaussians(tmp_path, name):
+    io.save_scene(tmp_path / name, io.Scene(*(f[:0] for f in random_scene(degree=0)[:-1]), 0))
+    loaded = io.load_scene(tmp_path / name)
+    assert [tuple(f.shape) for f in loaded[:-1]] == [(0, 3), (0, 3), (0, 4), (0, 1), (0, 1, 3)]
+
+
+def test_save_scene_keeps_opaque_gaussians_finite(tmp_path):
+    scene = random_scene(degree=0, count=3)
+    scene = scene._replace(opacities=torch.tensor([[0.0], [1.0], [0.5]]))
+    io.save_scene(tmp_path / "scene.ply", scene)
+    loaded = io.load_scene(tmp_path / "scene.ply")
+    torch.testing.assert_close(loaded.opacities, scene.opacities, rtol=0, atol=2e-6)
+
+
+def test_save_scene_refuses_other_suffixes(tmp_path):
+    with pytest.raises(io.SceneError, match="expected a .ply or .spz name, got '.obj'"):
+        io.save_scene(tmp_path / "scene.obj", random_scene())
+
+
+def broken(name, write):
+    return pytest.param(write, id=name)
+
+
+def cut(path, keep):
+    path.write_bytes(path.read_bytes()[:keep])
+    return path
+
+
+def hand_written(tmp_path, **change):
+    columns = change.pop("columns", ply_columns(0))
+    rows = change.pop("rows", random_rows(columns))
+    return write_ply(tmp_path / "scene.ply", columns, rows, **change)
+
+
+def with_value(tmp_path, column, value):
+    columns = ply_columns(1)
+    rows = random_rows(columns)
+    rows[[1, 3], columns.index(column)] = value
+    return hand_written(tmp_path, columns=columns, rows=rows)
+
+
+def saved(tmp_path, name):
+    io.save_scene(tmp_path / name, random_scene())
+    return tmp_path / name
+
+
+def text_file(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    return tmp_path / name
+
+
+POINT_CLOUD = ["x", "y", "z", "nx", "ny", "nz"]
+COLOURED = [*ply_columns(0)[:9], "red", *ply_columns(0)[9:]]
+
+
+@pytest.mark.parametrize(
+    ("write", "message"),
+    [
+        (lambda d: d / "none.ply", "no such file"),
+        (lambda d: d, "no such file"),
+        (lambda d: text_file(d, "a.obj", "ply\n"), "expected a .ply or .spz file, got '.obj'"),
+        (lambda d: text_file(d, "a.ply", ""), "does not begin with 'ply'"),
+        (lambda d: text_file(d, "a.ply", "plyx\nformat"), "does not begin with 'ply'"),
+        (lambda d: text_file(d, "a.ply", "ply\nformat ascii 1.0\n"), "no end_header"),
+        (lambda d: text_file(d, "a.ply", "ply\nend_header\n"), "got none"),
+        (lambda d: hand_written(d, form="ascii"), "binary_little_endian, got ascii"),
+        (
+            lambda d: text_file(d, "a.ply", "ply\nformat binary_little_endian 1.0\nend_header\n"),
+            "vertices as the first element",
+        ),
+        (
+            lambda d: hand_written(d, columns=POINT_CLOUD),
+            "missing vertex properties f_dc_0, f_dc_1, f_dc_2, opacity, scale_0, .*rot_3",
+        ),
+        (
+            lambda d: hand_written(d, columns=[c for c in ply_columns(0) if c != "opacity"]),
+            "missing vertex properties opacity;",
+        ),
+        (
+            lambda d: hand_written(d, columns=[*ply_columns(0), "f_rest_0"]),
+            "0, 9, 24 or 45 f_rest properties .*got 1",
+        ),
+        (lambda d: hand_written(d, kinds={"x": "double"}), "x must be float, got double"),
+        (
+            lambda d: hand_written(d, columns=COLOURED, kinds={"red": "uchar"}),
+            "red must be float, got uchar",
+        ),
+        (lambda d: cut(hand_written(d), -1), "cut short"),
+        (lambda d: cut(saved(d, "a.compressed.ply"), -1), "cut short"),
+        (lambda d: cut(saved(d, "a.compressed.ply"), 3000), "cut short"),
+        (lambda d: cut(saved(d, "a.spz"), -20), "cut short .Could not gunzip"),
+        (lambda d: text_file(d, "a.spz", "not a scene"), "Not an SPZ file"),
+        (lambda d: with_value(d, "y", np.nan), "means must be finite, got 2 of 5"),
+        (lambda d: with_value(d, "scale_1", 1000), "scales must be finite, got 2 of 5"),
+        (lambda d: with_value(d, "rot_2", np.inf), "rotations must be finite, got 2 of 5"),
+        (lambda d: with_value(d, "opacity", np.nan), "opacities must be finite, got 2 of 5"),
+        (lambda d: with_value(d, "f_rest_8", np.nan), "shs must be finite, got 2 of 5"),
+    ],
+)
+def test_scenes_that_cannot_be_used(tmp_path, write, message):
+    path = write(tmp_path)
+    with pytest.raises(io.SceneError, match=message) as caught:
+        io.load_scene(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("logit", "opacity"), [(np.inf, 1.0), (-np.inf, 0.0)])
+def test_infinite_logits_are_opacities(tmp_path, logit, opacity):
+    scene = io.load_scene(with_value(tmp_path, "opacity", logit))
+    assert scene.opacities[1] == opacity
+
+
+def test_missing_library_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsply", None)
+    with pytest.raises(ImportError, match=r"gsply: pip install analytic_rasterizer\[cli\]"):
+        io.load_scene(hand_written(tmp_path))
+
+
+# -------------------------------------------------------------------------------------- views
+
+ROTATION = torch.linalg.matrix_exp(
+    torch.tensor([[0.0, -0.3, 0.5], [0.3, 0.0, 0.2], [-0.5, -0.2, 0.0]], dtype=torch.float64)
+)  # camera to world
+POSITION = torch.tensor([0.4, -1.2, 2.5], dtype=torch.float64)
+OPENGL = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+
+
+def world_to_camera():
+    w2c = torch.eye(4, dtype=torch.float64)
+    w2c[:3, :3], w2c[:3, 3] = ROTATION.T, -ROTATION.T @ POSITION
+    return w2c
+
+
+def opengl_to_world():
+    c2w = torch.eye(4, dtype=torch.float64)
+    c2w[:3, :3], c2w[:3, 3] = ROTATION @ OPENGL, POSITION
+    return c2w
+
+
+LISTED = {"width": 120, "height": 80, "fx": 110.0, "fy": 105.0, "w2c": world_to_camera().tolist()}
+CAMERA = {
+    "id": 0,
+    "img_name": "left/0001.jpg",
+    "width": 120,
+    "height": 80,
+    "position": POSITION.tolist(),
+    "rotation": ROTATION.tolist(),
+    "fx": 110.0,
+    "fy": 105.0,
+}
+FRAME = {"file_path": "./train/r_0", "transform_matrix": opengl_to_world().tolist()}
+TRANSFORMS = {"w": 120, "h": 80, "fl_x": 110.0, "fl_y": 105.0, "frames": [FRAME]}
+
+
+def write_json(tmp_path, data):
+    path = tmp_path / "views.json"
+    path.write_text(data if isinstance(data, str) else json.dumps(data))
+    return path
+
+
+def without(entry, *keys):
+    return {key: value for key, value in entry.items() if key not in keys}
+
+
+@pytest.mark.parametrize(
+    ("data", "name"),
+    [
+        ([LISTED], "view_000"),
+        ([LISTED | {"w2c": world_to_camera().flatten().tolist()}], "view_000"),
+        ([LISTED | {"name": "front"}], "front"),
+        ([CAMERA], "0001"),
+        (TRANSFORMS, "r_0"),
+        ({"frames": [without(TRANSFORMS, "frames") | FRAME]}, "r_0"),
+        (TRANSFORMS | {"w": 7, "fl_x": 3, "frames": [FRAME | {"w": 120, "fl_x": 110}]}, "r_0"),
+        (
+            without(TRANSFORMS, "fl_x", "fl_y")
+            | {
+                "camera_angle_x": 2 * math.atan(120 / 2 / 110),
+                "camera_angle_y": 2 * math.atan(80 / 2 / 105),
+            },
+            "r_0",
+        ),
+    ],
+)
+def test_every_form_gives_the_same_view(tmp_path, data, name):
+    (view,) = io.load_views(write_json(tmp_path, data))
+    assert (view.name, view.width, view.height) == (name, 120, 80)
+    assert (view.fx, view.fy) == pytest.approx((110.0, 105.0), rel=1e-12)
+    assert (view.cx, view.cy) == (None, None)
+    assert view.w2c.dtype == torch.float64
+    torch.testing.assert_close(view.w2c, world_to_camera(), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("data", [[LISTED], [CAMERA], TRANSFORMS])
+def test_principal_point_is_read(tmp_path, data):
+    centre = {"cx": 50.5, "cy": 44}
+    data = [data[0] | centre] if isinstance(data, list) else data | centre
+    (view,) = io.load_views(write_json(tmp_path, data))
+    assert (view.cx, view.cy) == (50.5, 44)
+
+
+def test_focal_length_of_one_angle_serves_both_axes(tmp_path):
+    data = without(TRANSFORMS, "fl_x", "fl_y") | {"camera_angle_x": 0.7}
+    (view,) = io.load_views(write_json(tmp_path, data))
+    assert view.fx == view.fy == pytest.approx(60 / math.tan(0.35))
+
+
+@pytest.mark.parametrize("picture", ["train/r_0", "train/r_0.png"])
+def test_size_from_the_first_picture_there_is(tmp_path, picture):
+    (tmp_path / "train").mkdir()
+    image.new("RGBA", (31, 17)).save(tmp_path / picture, format="PNG")
+    frames = [FRAME | {"file_path": "./train/missing"}, FRAME]
+    data = {"camera_angle_x": 0.7, "frames": frames}
+    views = io.load_views(write_json(tmp_path, data))
+    assert [(view.width, view.height) for view in views] == [(31, 17)] * 2
+    views = io.load_views(write_json(tmp_path, data), size=(62, 34))
+    assert [(view.width, view.height, view.fx) for view in views] == [
+        (62, 34, pytest.approx(31 / math.tan(0.35)))
+    ] * 2
+
+
+def test_stated_size_goes_before_the_callers(tmp_path):
+    (view,) = io.load_views(write_json(tmp_path, TRANSFORMS), size=(7, 5))
+    assert (view.width, view.height) == (120, 80)
+
+
+def test_names_are_safe_and_distinct(tmp_path):
+    names = ["a/b.png", "b.JPG", "..", "../..\\x y.png", "", None, 3, "frame.0001", "b"]
+    views = io.load_views(write_json(tmp_path, [LISTED | {"name": name} for name in names]))
+    assert [view.name for view in views] == [
+        *("b", "b_2", "view_002", "x_y", "view_004", "view_005", "view_006", "frame.0001", "b_3")
+    ]
+
+
+def test_views_round_trip(tmp_path):
+    views = io.load_views(write_json(tmp_path, [CAMERA, LISTED | {"cx": 3.25, "cy": 80}]))
+    io.save_views(tmp_path / "again.json", views)
+    for left, right in zip(views, io.load_views(tmp_path / "again.json"), strict=True):
+        assert torch.equal(left.w2c, right.w2c)
+        fields = [f for f in left.__dataclass_fields__ if f != "w2c"]
+        assert [getattr(left, f) for f in fields] == [getattr(right, f) for f in fields]
+
+
+@pytest.mark.parametrize("scale", [1.0, 0.5, 2.0, 1 / 3])
+@pytest.mark.parametrize("centre", [(None, None), (47.0, 51.5)])
+def test_settings_project_as_the_pinhole_does(scale, centre):
+    view = io.View("v", 120, 80, 110.0, 105.0, world_to_camera(), *centre)
+    settings = view.settings(scale, (0.1, 0.2, 0.3), 2, "box", samples=2)
+    width, height = settings.image_width, settings.image_height
+    assert (width, height) == (round(120 * scale), round(80 * scale))
+    assert settings.bg.tolist() == pytest.approx([0.1, 0.2, 0.3])
+    assert settings.sh_degree == 2
+    assert settings.campos.tolist() == pytest.approx(POSITION.tolist(), rel=1e-6)
+
+    camera = torch.tensor([[0.3, -0.2, 4.0], [-1.0, 0.7, 3.0], [0.0, 0.0, 2.0]]).double()
+    world = camera @ ROTATION.T + POSITION
+    world = torch.cat([world, torch.ones(3, 1).double()], 1)
+    clip = world @ settings.projmatrix.double()
+    assert torch.allclose(clip[:, 3], camera[:, 2], rtol=1e-5)
+    assert torch.allclose((world @ settings.viewmatrix.double())[:, :3], camera, atol=1e-5)
+    size = torch.tensor([width, height]).double()
+    pixel = ((clip[:, :2] / clip[:, 3:] + 1) * size - 1) / 2  # 3DGS: centres at integers
+    full = torch.tensor([120.0, 80.0]).double()
+    focal = torch.tensor([110.0, 105.0]).double()
+    principal = full / 2 if centre[0] is None else torch.tensor(centre).double()
+    spanned = (focal * camera[:, :2] / camera[:, 2:] + principal) * size / full  # in [0, size]
+    assert torch.allclose(pixel, spanned - 0.5, atol=1e-3)
+
+
+def test_settings_never_vanish():
+    view = io.View("v", 120, 80, 110.0, 105.0, world_to_camera())
+    assert view.size(1e-6) == (1, 1)
+    for scale in (0, -1, math.nan, math.inf):
+        with pytest.raises(ValueError, match="scale must be positive and finite"):
+            view.settings(scale)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ("{", "not valid JSON: Expecting"),
+        ("", "not valid JSON"),
+        ("[" * 100_000, "not valid JSON"),
+        ("3", "expected a list of views or an object with 'frames', got 3"),
+        ("{}", "expected a list of views or an object with 'frames', got an object"),
+        ("[]", "must be a list with at least one view, got an empty list"),
+        ({"frames": []}, "frames must be a list with at least one view, got an empty list"),
+        ({"frames": 3}, "frames must be a list with at least one view, got 3"),
+        ([LISTED, [1]], "view 1 must be an object, got a list"),
+        ([{"width": 3}], "view 0: expected 'w2c', or 'rotation' and 'position', got width"),
+        ([without(CAMERA, "position")], "view 0: missing 'position', got id, img_name"),
+        ([without(LISTED, "fy")], "view 0: missing 'fy'"),
+        ([LISTED, without(LISTED, "width")], "view 1: missing 'width'"),
+        ([LISTED | {"width": 0}], "view 0: width must be a positive whole number, got 0"),
+        ([LISTED | {"height": 80.5}], "height must be a positive whole number, got 80.5"),
+        ([LISTED | {"height": "80"}], 'height must be a positive whole number, got "80"'),
+        ([LISTED | {"height": True}], "height must be a positive whole number, got true"),
+        ([LISTED | {"fx": 0}], "fx must be a positive finite number, got 0"),
+        ([LISTED | {"fx": math.nan}], "fx must be a positive finite number, got NaN"),
+        ([LISTED | {"fy": math.inf}], "fy must be a positive finite number, got Infinity"),
+        ([LISTED | {"cx": math.nan}], "cx must be a finite number, got NaN"),
+        ([LISTED | {"w2c": [1.0] * 15}], "w2c must hold 4 x 4 finite numbers"),
+        ([LISTED | {"w2c": [[1.0] * 4] * 3}], "w2c must hold 4 x 4 finite numbers"),
+        ([LISTED | {"w2c": [math.nan] * 16}], "w2c must hold 16 finite numbers"),
+        ([LISTED | {"w2c": [None] * 16}], "w2c must hold 16 finite numbers, got .null, "),
+        ([LISTED | {"w2c": [1.0] * 16}], "w2c: the last row must be 0 0 0 1"),
+        ([LISTED | {"w2c": [0.0] * 15 + [1.0]}], "w2c must hold a rotation"),
+        ([LISTED | {"w2c": torch.diag(torch.tensor([1.0, 1, -1, 1])).tolist()}], "a rotation"),
+        ([CAMERA | {"rotation": [1, 2, 3]}], "rotation must hold 3 x 3 finite numbers, got .1, 2"),
+        ([CAMERA | {"rotation": [[2, 0, 0], [0, 2, 0], [0, 0, 2]]}], "must hold a rotation"),
+        ([CAMERA | {"position": [1, 2]}], "position must hold 3 finite numbers, got .1, 2"),
+        (without(TRANSFORMS, "fl_x"), "frame 0: expected 'fl_x' or 'camera_angle_x'"),
+        (without(TRANSFORMS, "fl_x") | {"camera_angle_x": 4}, "below pi .radians., got 4"),
+        (without(TRANSFORMS, "h"), "frame 0: missing 'h'"),
+        (without(TRANSFORMS, "w", "h"), "no image size: expected 'w' and 'h', a picture at"),
+        (TRANSFORMS | {"camera_model": "OPENCV_FISHEYE"}, "pinhole camera, got 'OPENCV_FISHEYE'"),
+        (TRANSFORMS | {"frames": [FRAME, {}]}, "frame 1: missing 'transform_matrix'"),
+        (TRANSFORMS | {"frames": [{"transform_matrix": 1}]}, "must hold 4 x 4 finite numbers"),
+    ],
+)
+def test_views_that_cannot_be_used(tmp_path, data, message):
+    path = write_json(tmp_path, data)
+    with pytest.raises(io.SceneError, match=message) as caught:
+        io.load_views(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+def test_views_file_that_is_not_there(tmp_path):
+    with pytest.raises(io.SceneError, match="none.json: No such file"):
+        io.load_views(tmp_path / "none.json")
+    with pytest.raises(io.SceneError, match="Is a directory"):
+        io.load_views(tmp_path)
+
+
+def test_size_of_an_unreadable_picture(tmp_path):
+    (tmp_path / "train").mkdir()
+    (tmp_path / "train" / "r_0.png").write_text("no picture")
+    with pytest.raises(io.SceneError, match="r_0.png: cannot identify image file"):
+        io.load_views(write_json(tmp_path, {"camera_angle_x": 0.7, "frames": [FRAME]}))
+
+
+def test_views_of_the_shared_data():
+    files = sorted((SHARED / "data").glob("*.json"))
+    files += sorted((SHARED / "data").glob("*/transforms_*.json"))
+    if not files:
+        pytest.skip("needs the optional ../shared data next to the project")
+    for file in files:
+        data = json.loads(file.read_text())
+        views = io.load_views(file)
+        assert len(views) == len(data if isinstance(data, list) else data["frames"])
+        assert len({view.name for view in views}) == len(views)
+
+
+# ----------------------------------------------------------------------------------- pictures
+
+
+def test_pictures_are_clamped_and_rounded():
+    color = torch.tensor([-1.0, 0.0, 0.49 / 255, 0.51 / 255, 1.0, 7.0]).expand(3, 2, 6)
+    picture = np.asarray(io.to_image(color))
+    assert picture.shape == (2, 6, 3)
+    assert picture[1, :, 2].tolist() == [0, 0, 0, 1, 255, 255]

@@ -1,0 +1,471 @@
+"""Whole images and all gradients, float64, against the reference renderer.
+
+The two share no code and take their gradients in different ways, so agreement to rounding means that
+both follow the equations. What remains between them is float64 rounding amplified by the condition of
+the scene: 1e-10 of the largest value leaves four digits for that.
+"""
+
+import math
+
+import analytic_rasterizer as ar
+import pytest
+import reference
+import scenes
+import torch
+from scenes import KINDS, VARIANTS, Camera, name_of
+
+IMAGE_TOLERANCE = 1e-10
+GRADIENT_TOLERANCE = 1e-8  # of the largest entry; second derivatives of the weights are ~100 times larger
+
+every_footprint = pytest.mark.parametrize("variant", VARIANTS, ids=name_of)
+each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
+
+
+def render(camera, scene, variant, dtype=torch.float64):
+    """(color, radii) of the library."""
+    footprint, options = variant
+    settings = camera.settings(dtype, footprint=footprint, **options)
+    return ar.GaussianRasterizer(settings)(**scene)
+
+
+def render_reference(camera, scene, variant, **kwargs):
+    footprint, options = variant
+    return reference.render(
+        camera.settings(), **scene, footprint=footprint, **kwargs, **options
+    )
+
+
+def probe(camera, seed=99):
+    """Weights of the scalar loss whose gradient is compared."""
+    g = torch.Generator().manual_seed(seed)
+    return scenes.rand(g, 3, camera.image_height, camera.image_width, low=-1.0)
+
+
+def relative_error(actual, expected):
+    scale = expected.abs().max().clamp_min(1e-30)
+    return ((actual - expected).abs().max() / scale).item()
+
+
+def compare(camera, scene, variant, record=None):
+    """Assert that image, radii and every gradient agree."""
+    ours, theirs = scenes.leaves(scene), scenes.leaves(scene)
+    color, radii = render(camera, ours, variant)
+    expected = render_reference(camera, theirs, variant)
+    # Rounding (1e-13) must not decide a comparison with a threshold.
+    assert expected.margin > 1e-10, "unlucky scene: choose another seed"
+    assert color.shape == (3, camera.image_height, camera.image_width)
+    errors = {"image": (color - expected.color).abs().max().item()}
+
+    loss = probe(camera)
+    (color * loss).sum().backward()
+    (expected.color * loss).sum().backward()
+    for name in scene:
+        assert ours[name].grad is not None, f"no gradient for {name}"
+        assert ours[name].grad.shape == scene[name].shape
+        errors[name] = relative_error(ours[name].grad, theirs[name].grad)
+        assert theirs[name].grad.abs().max() > 0, f"the scene does not exercise {name}"
+    print(name_of(variant), {name: f"{error:.1e}" for name, error in errors.items()})
+    assert errors.pop("image") < IMAGE_TOLERANCE
+    for name, error in errors.items():
+        assert error < GRADIENT_TOLERANCE, (name, error)
+    assert_radii(camera, radii, expected, variant)
+    return expected
+
+
+def assert_radii(camera, radii, expected, variant):
+    """ceil(3 sigma) wherever a pixel is touched; 0 behind the camera and far off screen."""
+    footprint, options = variant
+    assert radii.dtype == torch.int32
+    means2d, cov2d, depths = (t.detach() for t in expected.projection)
+    size = reference.three_sigma(cov2d, footprint, **options)
+    touched = expected.radii > 0
+    decided = (size - size.round()).abs() > 1e-9
+    assert torch.equal(radii[touched & decided], torch.ceil(size).int()[touched & decided])
+    assert touched.any()
+    # Four radii outside the image no alpha reaches exp(-72).
+    limits = torch.tensor([camera.image_width, camera.image_height])
+    far = ((means2d < -4 * size[:, None] - 1) | (means2d > limits + 4 * size[:, None])).any(-1)
+    assert (radii[(depths <= reference.NEAR) | far] == 0).all()
+    # Where it is not 0 it is the one value it may have.
+    shown = (radii > 0) & decided
+    assert torch.equal(radii[shown], torch.ceil(size).int()[shown])
+
+
+def hard_scene(seed=11, degree=0):
+    """Everything at once: opaque and faint, small and large, behind, off screen, beyond the clamp."""
+    scene = scenes.random_scene(seed, count=44, degree=degree, sigma=(0.005, 0.6))
+    scene["opacities"][::5] = 1.0  # capped at 0.99 near their centres
+    scene["opacities"][1::9] = 0.003  # below 1/255 everywhere
+    # Beside the camera: behind it, in front of the near plane, and far outside the frustum but large.
+    means, scales = scene["means3D"], scene["scales"]
+    means[0] = torch.tensor([0.3, 0.1, -5.0])
+    means[1] = torch.tensor([0.3, -0.2, -3.9])
+    means[2] = torch.tensor([40.0, 0.0, 0.0])
+    means[3], scales[3] = torch.tensor([3.6, 0.4, -1.0]), torch.tensor([0.9, 1.1, 0.8])
+    means[4], scales[4] = torch.tensor([-0.2, -3.4, -1.2]), torch.tensor([0.8, 0.9, 1.3])
+    scene["opacities"][3:5] = 0.8
+    return scene
+
+
+CAMERA = Camera(bg=(0.2, 0.5, 0.9), scale_modifier=1.15, shift=(2.3, -4.1))
+
+
+@every_footprint
+def test_everything_at_once(variant):
+    """44 Gaussians, 45x37 px, off-centre projection, background, scale modifier, clamp, cap."""
+    expected = compare(CAMERA, hard_scene(), variant)
+    view = torch.cat([hard_scene()["means3D"], torch.ones(44, 1).double()], -1)
+    view = view @ CAMERA.settings().viewmatrix
+    slope = (view[:, :2] / view[:, 2:3]).abs()
+    limit = reference.FRUSTUM_CLAMP * torch.tensor([CAMERA.tanfovx, CAMERA.tanfovy])
+    clamped = (slope > limit).any(-1) & (expected.radii > 0)
+    assert clamped.any(), "no visible splat beyond the frustum clamp"
+
+
+@each_kind
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_spherical_harmonics(variant, degree):
+    compare(
+        Camera(sh_degree=degree), scenes.random_scene(20 + degree, 20, degree), variant
+    )
+
+
+def test_spherical_harmonics_below_the_stored_degree():
+    """M = 16 rows, degree 1 in use: the other rows change nothing and get zero gradient."""
+    scene = scenes.random_scene(30, 20, degree=3)
+    camera = Camera(sh_degree=1)
+    compare(camera, scene, ("point", {}))
+    ours = scenes.leaves(scene)
+    render(camera, ours, ("point", {}))[0].sum().backward()
+    assert (ours["shs"].grad[:, 4:] == 0).all()
+    truncated = dict(scene, shs=scene["shs"][:, :4].contiguous())
+    assert torch.equal(
+        render(camera, scene, ("point", {}))[0], render(camera, truncated, ("point", {}))[0]
+    )
+
+
+@every_footprint
+def test_precomputed(variant):
+    """colors_precomp (negative and above one too: they are not clamped) and cov3D_precomp."""
+    scene = scenes.with_precomputed(hard_scene(12))
+    scene["colors_precomp"] = scene["colors_precomp"] * 3 - 1
+    compare(CAMERA, scene, variant)
+
+
+def test_scale_modifier_acts_on_scales_only():
+    plain = scenes.random_scene(31)
+    scaled = dict(plain, scales=plain["scales"] * 1.7)
+    by_modifier = render(Camera(scale_modifier=1.7), plain, ("mip", {}))[0]
+    assert (by_modifier - render(Camera(), scaled, ("mip", {}))[0]).abs().max() < 1e-12
+    fixed = scenes.with_precomputed(plain)
+    assert torch.equal(
+        render(Camera(scale_modifier=1.7), fixed, ("mip", {}))[0],
+        render(Camera(), fixed, ("mip", {}))[0],
+    )
+
+
+@each_kind
+@pytest.mark.parametrize("size", [(1, 1), (16, 16), (17, 15), (33, 48), (5, 100)], ids=str)
+def test_image_sizes(variant, size):
+    camera = Camera(image_width=size[0], image_height=size[1], bg=(0.1, 0.2, 0.3))
+    scene = scenes.random_scene(32, 15, opacity=(0.3, 0.9), sigma=(0.3, 0.9), spread=0.5)
+    compare(camera, scene, variant)
+
+
+@every_footprint
+def test_deep_stack(variant):
+    """Opaque layers: samples stop, the splat that would pass 1e-4 is not blended, T keeps its value."""
+    camera = Camera(bg=(1.0, 0.0, 0.5))
+    scene = scenes.random_scene(33, 60, opacity=(0.5, 1.0), sigma=(0.4, 1.5), spread=0.6)
+    expected = compare(camera, scene, variant)
+    # The scene does stop: without the last Gaussians (in depth order) the image is the same somewhere.
+    order = torch.argsort(expected.projection.depths)
+    fewer = {name: value[order[:40]] for name, value in scene.items()}
+    assert (render_reference(camera, fewer, variant).color == expected.color.detach()).any()
+
+
+def test_unnormalised_and_zero_quaternions():
+    """Normalised inside; gradient through the normalisation; zero is identity with zero gradient."""
+    scene = scenes.random_scene(34, 20)
+    scene["rotations"] = scene["rotations"] * torch.logspace(-3, 3, 20).double()[:, None]
+    scene["rotations"][7] = 0
+    # Gradients scale with 1/|q|: compare them times |q|.
+    ours, theirs = scenes.leaves(scene), scenes.leaves(scene)
+    loss = probe(Camera())
+    (render(Camera(), ours, ("mip", {}))[0] * loss).sum().backward()
+    (render_reference(Camera(), theirs, ("mip", {})).color * loss).sum().backward()
+    size = scene["rotations"].norm(dim=-1, keepdim=True)
+    assert (
+        relative_error(ours["rotations"].grad * size, theirs["rotations"].grad * size)
+        < GRADIENT_TOLERANCE
+    )
+    assert (ours["rotations"].grad[7] == 0).all()
+    assert ours["scales"].grad[7].abs().max() > 0
+
+
+@pytest.mark.parametrize("length", [1e-30, 1e-23, 1e15])
+def test_extreme_quaternions_float32(length):
+    """The direction of a quaternion counts, whatever its length (its square leaves float32's range)."""
+    scene = scenes.cast(scenes.random_scene(35, 10), torch.float32)
+    scene["rotations"] = scene["rotations"] / scene["rotations"].norm(dim=-1, keepdim=True)
+    expected, _ = render(Camera(), scene, ("mip", {}), torch.float32)
+    scene["rotations"] = scene["rotations"] * length
+    ours = scenes.leaves(scene)
+    color, _ = render(Camera(), ours, ("mip", {}), torch.float32)
+    assert (color - expected).abs().max() < 1e-5
+    color.sum().backward()
+    assert torch.isfinite(ours["scales"].grad).all()
+
+
+@every_footprint
+def test_absolute_gradients(variant):
+    """means2D (P, 4): columns 0:2 as ever, 2:4 the sum over pixels of |gx|, |gy|."""
+    camera = CAMERA
+    scene = dict(hard_scene(13), means2D=torch.zeros(44, 4).double())
+    ours, theirs = scenes.leaves(scene), scenes.leaves(scene)
+    loss = probe(camera)
+    (render(camera, ours, variant)[0] * loss).sum().backward()
+    expected = render_reference(camera, theirs, variant, keep_offsets=True)
+    (expected.color * loss).sum().backward()
+    absolute = reference.absolute_gradient(expected, 44, camera.settings())
+    assert relative_error(ours["means2D"].grad[:, :2], theirs["means2D"].grad[:, :2]) < 1e-8
+    assert relative_error(ours["means2D"].grad[:, 2:], absolute) < GRADIENT_TOLERANCE
+
+
+@each_kind
+def test_means2d_forms_agree(variant):
+    """None, (P, 3) and (P, 4) change nothing else; the third column of (P, 3) stays 0."""
+    scene = scenes.random_scene(36, 25)
+    results = []
+    for means2d in (None, torch.zeros(25, 3).double(), torch.full((25, 4), 7.0).double()):
+        ours = scenes.leaves({k: v for k, v in scene.items() if k != "means2D"})
+        leaf = None if means2d is None else means2d.requires_grad_()
+        color, radii = render(Camera(), ours | {"means2D": leaf}, variant)
+        (color * probe(Camera())).sum().backward()
+        results.append((color, radii, ours["means3D"].grad, leaf))
+    for color, radii, by_mean, _ in results[1:]:
+        assert torch.equal(color, results[0][0])
+        assert torch.equal(radii, results[0][1])
+        assert torch.equal(by_mean, results[0][2])
+    three, four = results[1][3].grad, results[2][3].grad
+    assert (three[:, 2] == 0).all()
+    assert torch.equal(three[:, :2], four[:, :2])
+    assert (four[:, 2:] >= three[:, :2].abs() * (1 - 1e-12)).all()
+
+
+def test_cap_has_zero_gradient():
+    """One splat with opacity 1 over its centre pixel: alpha = 0.99 whatever the input does."""
+    camera = Camera(image_height=1, image_width=1).facing_z()
+    scene = scenes.splat_scene(
+        camera,
+        torch.zeros(1, 2).double(),
+        torch.tensor([[25.0, 3.0, 16.0]]).double(),
+        torch.ones(1).double(),
+        torch.tensor([2.0]).double(),
+    )
+    ours = scenes.leaves(scene)
+    color, _ = render(camera, ours, ("point", {}))
+    assert torch.equal(color, torch.full((3, 1, 1), 0.99).double())
+    color.sum().backward()
+    for name in ("means3D", "means2D", "opacities", "cov3D_precomp"):
+        assert (ours[name].grad == 0).all(), name
+    assert (ours["colors_precomp"].grad == 0.99).all()
+
+
+# --- gradcheck ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "variant", [v for v in VARIANTS if v[1].get("frame_gradient") != "frozen"], ids=name_of
+)
+@pytest.mark.parametrize("precomputed", [False, True], ids=["scales-sh", "precomputed"])
+def test_gradcheck(variant, precomputed):
+    """Finite differences of the whole rasterizer, in a scene that no threshold touches.
+
+    means2D is left out: its value is ignored by definition, so its gradient is no derivative (it is
+    compared with the reference above). Step 1e-6 against the margin asserted below.
+    """
+    camera = Camera(image_width=19, image_height=17, sh_degree=1, shift=(1.2, -0.7))
+    scene = scenes.smooth_scene(40, degree=1)
+    scene["shs"] = scene["shs"] * 0.3  # colours away from the clamp at zero
+    if precomputed:
+        scene = scenes.with_precomputed(scene)
+    assert render_reference(camera, scene, variant).margin > 1e-2
+    del scene["means2D"]
+    weights = probe(camera)
+
+    def loss(*values):
+        inputs = dict(zip(scene, values, strict=True), means2D=None)
+        return (render(camera, inputs, variant)[0] * weights).sum()
+
+    leaves = tuple(scenes.leaves(scene).values())
+    # Noise of the difference quotient: 1e-16 * |loss| (~100) / 1e-6.
+    assert torch.autograd.gradcheck(loss, leaves, eps=1e-6, atol=1e-6, rtol=1e-6)
+
+
+def test_gradcheck_of_the_frozen_default_where_it_is_a_derivative():
+    """Opacity, colour: `frozen` differs from `paper` only in how Sigma turns."""
+    camera = Camera(image_width=19, image_height=17)
+    scene = scenes.smooth_scene(41)
+    fixed = {name: scene.pop(name) for name in ("means3D", "scales", "rotations", "means2D")}
+
+    def loss(opacities, shs):
+        inputs = fixed | {"opacities": opacities, "shs": shs}
+        return (render(camera, inputs, ("analytic", {}))[0] * probe(camera)).sum()
+
+    leaves = scenes.leaves(scene)
+    assert torch.autograd.gradcheck(loss, (leaves["opacities"], leaves["shs"]), atol=1e-6)
+
+
+# --- one footprint through another -------------------------------------------------------------
+
+
+@pytest.mark.parametrize("samples", [1, 2, 4, 8, 16])
+def test_box_is_the_average_of_shifted_renders(samples):
+    """S renders with `mip` of variance 1/(12 S^2), the principal point moved by each node.
+
+    A sample at pixel + n sees the splat at offset d + n, as the pixel does when every splat moves by
+    -n. Image, and gradients of all inputs (of means2D too: both divide by the same image size).
+    """
+    camera = Camera(bg=(0.3, 0.1, 0.8), shift=(1.7, -2.2), sh_degree=2)
+    scene = hard_scene(14, degree=2)
+    weights = probe(camera)
+    ours = scenes.leaves(scene)
+    color, _ = render(camera, ours, ("box", {"samples": samples}))
+    (color * weights).sum().backward()
+
+    theirs = scenes.leaves(scene)
+    mip = ("mip", {"variance": reference.box_variance(samples)})
+    renders = [
+        render(camera.shifted(-x, -y), theirs, mip)[0]
+        for x, y in reference.box_nodes(samples).tolist()
+    ]
+    average = torch.stack(renders).mean(0)
+    (average * weights).sum().backward()
+    # 60 additions of numbers below 1 on either side, plus 1e-15 px of projection rounding.
+    assert (color - average).abs().max() < 1e-12
+    for name in scene:
+        assert relative_error(ours[name].grad, theirs[name].grad) < 1e-10, name
+
+
+@each_kind
+def test_depth_order_not_input_order(variant):
+    """Shuffled input, same image and shuffled gradients, up to the order of additions."""
+    scene = scenes.random_scene(42, 30)
+    order = torch.randperm(30, generator=torch.Generator().manual_seed(0))
+    shuffled = {name: value[order] for name, value in scene.items()}
+    ours, theirs = scenes.leaves(scene), scenes.leaves(shuffled)
+    loss = probe(Camera())
+    color, radii = render(Camera(), ours, variant)
+    other, other_radii = render(Camera(), theirs, variant)
+    assert torch.equal(color, other)
+    assert torch.equal(radii[order], other_radii)
+    (color * loss).sum().backward()
+    (other * loss).sum().backward()
+    for name in scene:
+        assert relative_error(ours[name].grad[order], theirs[name].grad) < 1e-13, name
+
+
+def test_equal_depths_keep_input_order():
+    camera = Camera(image_height=1, image_width=1).facing_z()
+    colors = torch.eye(3).double()
+    scene = scenes.splat_scene(
+        camera,
+        torch.zeros(3, 2).double(),
+        torch.tensor([[25.0, 0, 25.0]]).double().expand(3, 3),
+        torch.tensor([0.5, 0.5, 0.5]).double(),
+        torch.tensor([2.0, 2.0, 2.0]).double(),
+        colors,
+    )
+    color, _ = render(camera, scene, ("point", {}))
+    expected = torch.tensor([0.5, 0.25, 0.125]).double()
+    assert (color[:, 0, 0] - expected).abs().max() < 1e-15
+
+
+# --- float32 -----------------------------------------------------------------------------------
+
+
+@every_footprint
+def test_float32_image(variant):
+    """Float32 against float64 of the same float32 numbers; pixels at a threshold counted apart.
+
+    Budget: positions are computed to ~8 eps * 40 px = 4e-5 px, where a splat of deviation s changes by
+    0.6/s per px; the conic errs by 8 eps cond (anisotropy below 10 in 3D: cond <= 100, +1/12 for small
+    ones) = 1e-4 and the weight by 0.37 of that. s >= 0.3 px for all but dilation 0, so one weight errs
+    by < 2e-4, and blending is a convex combination of colours below 2 with ~4 splats that matter.
+    """
+    camera = Camera(bg=(0.2, 0.5, 0.9))
+    scene = scenes.random_scene(50, 40, sigma=(0.05, 0.5))
+    single = scenes.cast(scene, torch.float32)
+    color, radii = render(camera, single, variant, torch.float32)
+    assert color.dtype == torch.float32
+    # The matrices are the same float32 numbers too.
+    exact = camera.fields(torch.float32)
+    exact = {k: v.double() if torch.is_tensor(v) else v for k, v in exact.items()}
+    footprint, options = variant
+    settings = ar.GaussianRasterizationSettings(**exact, footprint=footprint, **options)
+    expected = reference.render(
+        settings, **scenes.cast(single, torch.float64), footprint=footprint, **options
+    )
+    clear = expected.pixel_margin > 1e-3
+    error = (color - expected.color).abs().amax(0)
+    print(name_of(variant), f"max {error[clear].max():.1e}, {(~clear).sum()} pixels at a threshold")
+    assert error[clear].max() < 4 * 2e-4
+    assert (~clear).float().mean() < 0.1
+    # A flipped alpha is 1/255 of a colour; a flipped stop loses what was left, 1e-4.
+    assert error.max() < 2 * 2 / 255
+    size = reference.three_sigma(expected.projection.cov2d, footprint, **options)
+    decided = ((size - size.round()).abs() > 1e-3) & (expected.radii > 0)
+    assert torch.equal(radii[decided], expected.radii[decided])
+
+
+@every_footprint
+def test_float32_gradients(variant):
+    """In a scene that no threshold touches. Well-conditioned splats: 64 eps cond (9) ~ 1e-4."""
+    camera = Camera(image_width=33, image_height=21, sh_degree=1)
+    scene = scenes.smooth_scene(51, degree=1)
+    scene["shs"] = scene["shs"] * 0.3
+    assert render_reference(camera, scene, variant).margin > 1e-2
+    grads = []
+    for dtype in (torch.float32, torch.float64):
+        ours = scenes.leaves(scenes.cast(scenes.cast(scene, torch.float32), dtype))
+        color, _ = render(camera, ours, variant, dtype)
+        (color * probe(camera).to(dtype)).sum().backward()
+        grads.append({name: value.grad.double() for name, value in ours.items()})
+    errors = {name: relative_error(grads[0][name], grads[1][name]) for name in scene}
+    print(name_of(variant), {name: f"{error:.1e}" for name, error in errors.items()})
+    for name, error in errors.items():
+        assert error < 64 * torch.finfo(torch.float32).eps * 9, (name, error)
+
+
+# --- a trained scene (optional) ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("variant", [("analytic", {}), ("box", {"samples": 4})], ids=name_of)
+def test_trained_scene(plant, variant):
+    """1500 Gaussians of a trained plant, 48x27 px: real scales, opacities and SH, float64."""
+    inputs, views = plant
+    view = views[0]
+    g = torch.Generator().manual_seed(0)
+    chosen = torch.randperm(len(inputs["means3D"]), generator=g)[:1500]
+    scene = {name: value[chosen].double() for name, value in inputs.items()}
+    scene["scales"] = scene["scales"] * 4  # fewer Gaussians, so larger ones
+    world_to_camera = torch.tensor(view["w2c"], dtype=torch.float64).reshape(4, 4)
+    tangent = [view["width"] / (2 * view["fx"]), view["height"] / (2 * view["fy"])]
+    camera = Camera(image_width=48, image_height=27, tanfovx=tangent[0], tanfovy=tangent[1])
+    fields = camera.fields() | {
+        "sh_degree": 3,
+        "viewmatrix": world_to_camera.T.contiguous(),
+        "projmatrix": (camera.perspective() @ world_to_camera).T.contiguous(),
+        "campos": torch.linalg.inv(world_to_camera)[:3, 3].contiguous(),
+    }
+    footprint, options = variant
+    settings = ar.GaussianRasterizationSettings(**fields, footprint=footprint, **options)
+    color, _ = ar.GaussianRasterizer(settings)(**scene)
+    expected = reference.render(settings, **scene, footprint=footprint, **options)
+    clear = expected.pixel_margin > 1e-10
+    assert clear.float().mean() > 0.99
+    error = (color - expected.color).abs().amax(0)[clear].max()
+    print(f"trained scene, {name_of(variant)}: {error:.1e}")
+    assert error < IMAGE_TOLERANCE
+    assert math.isfinite(error)
