@@ -1,0 +1,40 @@
+"""Gaussian splatting with every Gaussian integrated over the pixel, not sampled at its centre.
+
+A drop-in replacement for `diff_gaussian_rasterization`. See the README for how to choose a footprint.
+"""
+
+import torch  # noqa: F401  (its libraries must be loaded before the extension's)
+
+from .footprints import (
+    FOOTPRINTS,
+    Footprint,
+    footprint_weight,
+    get_default_footprint,
+    resolve_footprint,
+    set_default_footprint,
+)
+from .ops import TILE
+from .rasterizer import (
+    GaussianRasterizationSettings,
+    GaussianRasterizer,
+    Stages,
+    rasterize_gaussians,
+    render_stages,
+)
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "FOOTPRINTS",
+    "TILE",
+    "Footprint",
+    "GaussianRasterizationSettings",
+    "GaussianRasterizer",
+    "Stages",
+    "footprint_weight",
+    "get_default_footprint",
+    "rasterize_gaussians",
+    "render_stages",
+    "resolve_footprint",
+    "set_default_footprint",
+]

@@ -1,0 +1,128 @@
+"""The ops' fake kernels and autograd formulas. Nothing else."""
+
+from __future__ import annotations
+
+import torch
+
+from . import _C  # noqa: F401  (loads the ops)
+from .footprints import BOX_SAMPLES
+
+TILE = 16
+"""Edge of a square tile, px."""
+
+_SAMPLES = {f"box{s}": s for s in BOX_SAMPLES}
+# Scalars per splat: mean 2, shape, opacity, level, colour 3.
+_SPLAT_WIDTH = {"analytic": 11, "analytic_paper": 11}
+
+# Positions of the differentiable inputs of rasterize, in the order of the vjp's outputs.
+_DIFFERENTIABLE = 8
+
+
+def _tiles(height: int, width: int) -> int:
+    return ((height + TILE - 1) // TILE) * ((width + TILE - 1) // TILE)
+
+
+@torch.library.register_fake("analytic_rasterizer::rasterize")
+def _(
+    means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
+    viewmatrix, projmatrix, campos, image_height, image_width, tanfovx, tanfovy, scale_modifier,
+    sh_degree, footprint, variance, keep,
+):  # fmt: skip
+    context = torch.library.get_ctx()
+    splats, pairs = context.new_dynamic_size(), context.new_dynamic_size()
+    samples = _SAMPLES.get(footprint, 1) if keep else 0
+    ints, longs = {"dtype": torch.int32}, {"dtype": torch.int64}
+    return (
+        means3D.new_empty(3, image_height, image_width),
+        means3D.new_empty(means3D.shape[0], **ints),
+        means3D.new_empty(splats, _SPLAT_WIDTH.get(footprint, 12)),
+        means3D.new_empty(splats, **ints),
+        means3D.new_empty(pairs, **ints),
+        means3D.new_empty(_tiles(image_height, image_width) + 1, **longs),
+        means3D.new_empty(splats + 1 if keep else 0, **longs),
+        means3D.new_empty(pairs if keep else 0, **longs),
+        means3D.new_empty(samples, image_height, image_width),
+        means3D.new_empty(samples, image_height, image_width, **ints),
+    )
+
+
+@torch.library.register_fake("analytic_rasterizer::rasterize_vjp")
+def _(dL_dcolor, means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, *rest):
+    inputs = (means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
+    return tuple(
+        means3D.new_empty(tensor.shape) if need and tensor is not None else means3D.new_empty(0)
+        for tensor, need in zip(inputs, rest[-1])
+    )
+
+
+@torch.library.register_fake("analytic_rasterizer::rasterize_stages")
+def _(
+    means3D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg, viewmatrix,
+    projmatrix, campos, image_height, image_width, *rest,
+):  # fmt: skip
+    context = torch.library.get_ctx()
+    splats, pairs = context.new_dynamic_size(), context.new_dynamic_size()
+    ints, longs = {"dtype": torch.int32}, {"dtype": torch.int64}
+    return (
+        means3D.new_empty(3, image_height, image_width),
+        means3D.new_empty(means3D.shape[0], **ints),
+        means3D.new_empty(splats, **ints),
+        means3D.new_empty(splats),
+        means3D.new_empty(splats, 2),
+        means3D.new_empty(pairs, **ints),
+        means3D.new_empty(_tiles(image_height, image_width) + 1, **longs),
+        torch.empty(3, dtype=torch.float64),
+    )
+
+
+@torch.library.register_fake("analytic_rasterizer::footprint_weight")
+def _(offset, cov2d, footprint, variance):
+    return offset.new_empty(offset.shape[:-1])
+
+
+@torch.library.register_fake("analytic_rasterizer::footprint_weight_vjp")
+def _(dL_dweight, offset, cov2d, footprint, variance):
+    return offset.new_empty(offset.shape), cov2d.new_empty(cov2d.shape)
+
+
+def _rasterize_setup(ctx, inputs, output):
+    color, radii, *saved = output
+    ctx.mark_non_differentiable(radii, *saved)
+    tensors, (*ctx.settings, keep) = inputs[:12], inputs[12:]
+    ctx.has_saved = keep
+    if keep:
+        ctx.save_for_backward(*tensors, *saved)
+
+
+def _rasterize_backward(ctx, dL_dcolor, *_):
+    if not ctx.has_saved:
+        raise RuntimeError("rasterize was called with keep=False and cannot be differentiated")
+    tensors, saved = ctx.saved_tensors[:12], ctx.saved_tensors[12:]
+    needs = list(ctx.needs_input_grad[:_DIFFERENTIABLE])
+    grads = torch.ops.analytic_rasterizer.rasterize_vjp(
+        dL_dcolor, *tensors, *ctx.settings, *saved, needs
+    )
+    wanted = (g if need and t is not None else None for g, need, t in zip(grads, needs, tensors))
+    return (*wanted, *[None] * (len(ctx.needs_input_grad) - _DIFFERENTIABLE))
+
+
+torch.library.register_autograd(
+    "analytic_rasterizer::rasterize", _rasterize_backward, setup_context=_rasterize_setup
+)
+
+
+def _weight_setup(ctx, inputs, output):
+    offset, cov2d, *ctx.settings = inputs
+    ctx.save_for_backward(offset, cov2d)
+
+
+def _weight_backward(ctx, dL_dweight):
+    grads = torch.ops.analytic_rasterizer.footprint_weight_vjp(
+        dL_dweight, *ctx.saved_tensors, *ctx.settings
+    )
+    return (*grads, None, None)
+
+
+torch.library.register_autograd(
+    "analytic_rasterizer::footprint_weight", _weight_backward, setup_context=_weight_setup
+)

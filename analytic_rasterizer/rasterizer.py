@@ -1,0 +1,295 @@
+"""The drop-in API of diff_gaussian_rasterization: settings, rasterizer, and what stands behind them."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any, NamedTuple
+
+import torch
+
+from . import ops  # noqa: F401  (registers fake kernels and autograd)
+from .footprints import Footprint, get_default_footprint, resolve_footprint
+
+
+class _Fields(NamedTuple):
+    image_height: int
+    image_width: int
+    tanfovx: float
+    tanfovy: float
+    bg: torch.Tensor
+    scale_modifier: float
+    viewmatrix: torch.Tensor
+    projmatrix: torch.Tensor
+    sh_degree: int
+    campos: torch.Tensor
+    prefiltered: bool
+    debug: bool
+
+
+class GaussianRasterizationSettings(_Fields):
+    """How to render: the 12 fields of 3DGS 2023, in its order, as a tuple; and the footprint.
+
+    Args:
+        image_height, image_width: Size of the image, px.
+        tanfovx, tanfovy: Tangent of half the field of view.
+        bg: (3,) background colour.
+        scale_modifier: Factor on all scales.
+        viewmatrix: (4, 4) or (1, 4, 4) world to camera, transposed (for row vectors).
+        projmatrix: (4, 4) or (1, 4, 4) world to clip space, transposed. The principal point is wherever
+            it puts it.
+        sh_degree: Degree of the spherical harmonics in use, 0 to 3.
+        campos: (3,) camera centre, world units.
+        prefiltered: Accepted for compatibility; culling does not depend on it.
+        debug: On failure write the arguments to snapshot_fw.dump or snapshot_bw.dump and re-raise.
+        footprint: One of `FOOTPRINTS`, optionally with options (`"box:samples=8"`). None: the default at
+            the time of rendering, see `set_default_footprint`.
+        **options: Options of the footprint, see `resolve_footprint`.
+
+    Attributes:
+        footprint: The settled `Footprint`, or None.
+
+    Raises:
+        ValueError: Unknown footprint or option.
+    """
+
+    footprint: Footprint | None
+
+    def __new__(cls, *args: Any, footprint: str | Footprint | None = None, **kwargs: Any):
+        fields = {k: kwargs.pop(k) for k in _Fields._fields[len(args) :] if k in kwargs}
+        self = super().__new__(cls, *args, **fields)
+        if footprint is None:
+            if kwargs:
+                known = ", ".join((*cls._fields, "footprint"))
+                raise TypeError(f"settings must be among: {known}; got {', '.join(kwargs)}")
+            self.footprint = None
+        else:
+            self.footprint = resolve_footprint(str(footprint), **kwargs)
+        return self
+
+    def _replace(self, **kwargs: Any) -> GaussianRasterizationSettings:
+        merged = {**self._asdict(), "footprint": self.footprint, **kwargs}
+        return type(self)(**merged)
+
+    def __reduce__(self):
+        return _unpickle_settings, (tuple(self), None if self.footprint is None else str(self.footprint))
+
+    def __repr__(self) -> str:
+        fields = ", ".join(f"{k}={v!r}" for k, v in self._asdict().items())
+        return f"{type(self).__name__}({fields}, footprint={str(self.footprint)!r})"
+
+
+# Downstream code probes the signature to tell dialects apart: it must be 3DGS 2023's.
+GaussianRasterizationSettings.__signature__ = inspect.signature(_Fields)
+
+
+def _unpickle_settings(fields: tuple, footprint: str | None) -> GaussianRasterizationSettings:
+    return GaussianRasterizationSettings(*fields, footprint=footprint)
+
+
+def _present(tensor: torch.Tensor | None) -> torch.Tensor | None:
+    """3DGS passes missing inputs as empty tensors, on whatever device."""
+    return None if tensor is None or (tensor.dim() == 1 and tensor.numel() == 0) else tensor
+
+
+def _check_tensors(**tensors: Any) -> None:
+    for name, tensor in tensors.items():
+        if not isinstance(tensor, torch.Tensor):
+            raise TypeError(f"{name} must be a tensor, got {type(tensor).__name__}")
+
+
+def _op_arguments(settings: GaussianRasterizationSettings) -> tuple:
+    """What the ops take after the Gaussians."""
+    s = settings
+    _check_tensors(bg=s.bg, viewmatrix=s.viewmatrix, projmatrix=s.projmatrix, campos=s.campos)
+    footprint = s.footprint or get_default_footprint()
+    return (
+        s.bg, s.viewmatrix, s.projmatrix, s.campos, int(s.image_height), int(s.image_width),
+        float(s.tanfovx), float(s.tanfovy), float(s.scale_modifier), int(s.sh_degree),
+        footprint.key, footprint.variance,
+    )  # fmt: skip
+
+
+def rasterize_gaussians(
+    means3D: torch.Tensor,
+    means2D: torch.Tensor | None,
+    sh: torch.Tensor | None,
+    colors_precomp: torch.Tensor | None,
+    opacities: torch.Tensor,
+    scales: torch.Tensor | None,
+    rotations: torch.Tensor | None,
+    cov3Ds_precomp: torch.Tensor | None,
+    raster_settings: GaussianRasterizationSettings,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Renders Gaussians. The functional form of `GaussianRasterizer.forward`, which says more."""
+    _check_tensors(means3D=means3D, opacities=opacities)
+    gaussians = (
+        means3D,
+        _present(means2D),
+        opacities,
+        _present(sh),
+        _present(colors_precomp),
+        _present(scales),
+        _present(rotations),
+        _present(cov3Ds_precomp),
+    )
+    keep = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in gaussians)
+    arguments = (*gaussians, *_op_arguments(raster_settings), keep)
+    if not raster_settings.debug:
+        return torch.ops.analytic_rasterizer.rasterize(*arguments)[:2]
+    try:
+        color, radii = torch.ops.analytic_rasterizer.rasterize(*arguments)[:2]
+    except Exception:
+        _write_snapshot("snapshot_fw.dump", arguments)
+        raise
+    return _SnapshotOnFailure.apply(color, arguments) if keep else color, radii
+
+
+def _write_snapshot(path: str, arguments: tuple) -> None:
+    copies = tuple(a.detach().cpu() if isinstance(a, torch.Tensor) else a for a in arguments)
+    torch.save(copies, path)
+
+
+class _SnapshotOnFailure(torch.autograd.Function):
+    """Identity. Watches the gradient that enters the rasterizer's backward pass in debug mode."""
+
+    @staticmethod
+    def forward(ctx, color, arguments):
+        ctx.arguments = arguments
+        return color.view_as(color)
+
+    @staticmethod
+    def backward(ctx, dL_dcolor):
+        if not torch.isfinite(dL_dcolor).all():
+            _write_snapshot("snapshot_bw.dump", (dL_dcolor, *ctx.arguments))
+            index = tuple(torch.nonzero(~torch.isfinite(dL_dcolor))[0].tolist())
+            raise ValueError(
+                f"the gradient of the image must be finite, got {dL_dcolor[index].item()} at {index}"
+            )
+        return dL_dcolor, None
+
+
+class GaussianRasterizer(torch.nn.Module):
+    """Renders 3D Gaussians with the settings it holds."""
+
+    def __init__(self, raster_settings: GaussianRasterizationSettings):
+        super().__init__()
+        self.raster_settings = raster_settings
+
+    def markVisible(self, positions: torch.Tensor) -> torch.Tensor:
+        """Which positions lie in front of the near plane, camera-space z > 0.2.
+
+        Args:
+            positions: (P, 3) world units.
+
+        Returns:
+            (P,) bool.
+
+        Raises:
+            TypeError: Not a tensor, or not of the dtype of the settings' viewmatrix.
+            ValueError: Wrong shape.
+        """
+        _check_tensors(positions=positions)
+        if positions.dim() != 2 or positions.shape[1] != 3:
+            raise ValueError(f"positions must have shape (P, 3), got {tuple(positions.shape)}")
+        view = self.raster_settings.viewmatrix.reshape(4, 4)
+        if positions.dtype != view.dtype:
+            raise TypeError(f"positions must have dtype {view.dtype}, got {positions.dtype}")
+        with torch.no_grad():
+            return positions @ view[:3, 2] + view[3, 2] > 0.2
+
+    def forward(
+        self,
+        means3D: torch.Tensor,
+        means2D: torch.Tensor | None,
+        opacities: torch.Tensor,
+        shs: torch.Tensor | None = None,
+        colors_precomp: torch.Tensor | None = None,
+        scales: torch.Tensor | None = None,
+        rotations: torch.Tensor | None = None,
+        cov3D_precomp: torch.Tensor | None = None,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Renders an image. Differentiable in all eight inputs.
+
+        All floating tensors share one dtype (float32; float64 on the CPU) and device. Missing inputs
+        are None or empty tensors.
+
+        Args:
+            means3D: (P, 3) centres, world units.
+            means2D: (P, 3) or (P, 4) whose values are ignored, or None. Its gradient's first two columns
+                are dL/d(projected mean) per (0.5 W, 0.5 H) px, the third is zero, and columns 2 and 3 of
+                a (P, 4) input are sums over pixels of the absolute values instead.
+            opacities: (P, 1) or (P,).
+            shs: (P, M, 3) spherical harmonics, M >= (sh_degree + 1)^2; or colors_precomp.
+            colors_precomp: (P, 3) RGB.
+            scales: (P, 3) standard deviations, world units, with rotations; or cov3D_precomp.
+            rotations: (P, 4) quaternions (w, x, y, z) of any length; zero is the identity.
+            cov3D_precomp: (P, 6) covariances (xx, xy, xz, yy, yz, zz).
+
+        Returns:
+            color: (3, H, W) image.
+            radii: (P,) int32, 3 standard deviations of the projected Gaussian in px, rounded up; 0 for
+                a Gaussian that was culled.
+
+        Raises:
+            TypeError: Not a tensor, or a wrong dtype.
+            ValueError: Wrong shape, device or value. The message names the argument, what was expected
+                and what came.
+        """
+        return rasterize_gaussians(
+            means3D,
+            means2D,
+            shs,
+            colors_precomp,
+            opacities,
+            scales,
+            rotations,
+            cov3D_precomp,
+            self.raster_settings,
+        )
+
+
+class Stages(NamedTuple):
+    """What the stages of one rendering produced.
+
+    Attributes:
+        color: (3, H, W) image.
+        radii: (P,) int32, as `GaussianRasterizer` returns.
+        ids: (V,) int32, the Gaussian of each splat, ascending.
+        depths: (V,) camera-space z, world units.
+        means2d: (V, 2) px.
+        pairs: (N,) int32, the splat of each (tile, splat) pair, by tile, then front to back.
+        tile_offsets: (tiles + 1,) int64, first pair of each 16x16 tile, tiles row by row.
+        seconds: Time per stage: "project", "bin", "blend".
+    """
+
+    color: torch.Tensor
+    radii: torch.Tensor
+    ids: torch.Tensor
+    depths: torch.Tensor
+    means2d: torch.Tensor
+    pairs: torch.Tensor
+    tile_offsets: torch.Tensor
+    seconds: dict[str, float]
+
+
+@torch.no_grad()
+def render_stages(
+    settings: GaussianRasterizationSettings,
+    means3D: torch.Tensor,
+    opacities: torch.Tensor,
+    shs: torch.Tensor | None = None,
+    colors_precomp: torch.Tensor | None = None,
+    scales: torch.Tensor | None = None,
+    rotations: torch.Tensor | None = None,
+    cov3D_precomp: torch.Tensor | None = None,
+) -> Stages:
+    """Renders without gradient, keeping and timing what each stage makes. For inspection.
+
+    Arguments and errors are those of `GaussianRasterizer.forward`.
+    """
+    _check_tensors(means3D=means3D, opacities=opacities)
+    optional = map(_present, (shs, colors_precomp, scales, rotations, cov3D_precomp))
+    *tensors, seconds = torch.ops.analytic_rasterizer.rasterize_stages(
+        means3D, opacities, *optional, *_op_arguments(settings)
+    )
+    return Stages(*tensors, dict(zip(("project", "bin", "blend"), seconds.tolist())))
