@@ -55,6 +55,14 @@ template <typename T, class V> AR_HD Span<V> columns_of(const Support<T>& s, V y
           select(hi < lo, -far, x + slope * right + half_right + reach)};
 }
 
+/// The same for the single row of pixel centres at y and a support without reach.
+template <typename T, class V> AR_HD Span<V> chord_of(const Support<T>& s, V y) {
+  const V dy = y - V(s.mean.y), zero = V(T(0)), far = V(T(1e9));
+  const V square = (V(s.level) - V(s.det2 * s.inv_a) * dy * dy) * V(s.inv_a);
+  const V half = sqrt(max(square, zero)), centre = madd(V(s.slope), dy, V(s.mean.x));
+  return {select(square < zero, far, centre - half), select(square < zero, -far, centre + half)};
+}
+
 /// Integers in [lo, hi] that lie in [0, n), as [first, last]; empty where last < first.
 struct Range { int first, last; };
 template <typename T> AR_HD Range clamp_range(Span<T> span, int n) {

@@ -6,30 +6,26 @@
 
 namespace ar {
 
-/// A sample's transmittance, positive while it is open. A sample that has stopped keeps the value it
-/// stopped at, negated: it then fails every test for being open, and loses nothing.
-template <class V> AR_HD V stopped(V transmittance) { return -abs(transmittance); }
+// A sample's transmittance is positive while the sample is open. A sample that has stopped keeps the
+// value it stopped at, negated: it then fails every test for being open, and loses nothing.
 
 /// Result of compositing one splat into one sample.
 template <class V> struct Blended {
-  MaskOf<V> mask;        ///< the splat was composited
-  MaskOf<V> closed;      ///< it stopped the sample instead
-  V contribution;        ///< T alpha, zero outside mask
+  MaskOf<V> mask;  ///< the splat was composited
+  V contribution;  ///< T alpha, zero outside mask
 };
 
-/// T <- T (1 - alpha). raw = opacity * weight. A splat that would take T below the minimum is not
-/// composited and stops the sample, as in 3DGS.
+/// T <- T (1 - alpha); `raw` is alpha before the cap. A splat that would take T below the minimum is
+/// not composited and stops the sample, as in 3DGS.
 template <class V> AR_HD Blended<V> blend_sample(V raw, V& transmittance) {
   using T = ScalarOf<V>;
   const V alpha = min(raw, V(T(kAlphaMax)));
   const V contribution = transmittance * alpha;
-  const V next = transmittance * (V(T(1)) - alpha);
-  const MaskOf<V> hit = alpha >= V(T(kAlphaMin));
-  const MaskOf<V> open = next >= V(T(kTransmittanceMin));
+  const V next = transmittance - contribution;
+  const MaskOf<V> hit = alpha >= V(T(kAlphaMin)), open = next >= V(T(kTransmittanceMin));
   const MaskOf<V> mask = hit & open;
-  const MaskOf<V> closed = hit & !open & (transmittance > V(T(0)));
-  transmittance = select(mask, next, select(closed, stopped(transmittance), transmittance));
-  return {mask, closed, select(mask, contribution, V(T(0)))};
+  transmittance = make_negative(hit & !open, select(mask, next, transmittance));
+  return {mask, select(mask, contribution, V(T(0)))};
 }
 
 /// Adjoint of one step, walked from the last splat to the first.

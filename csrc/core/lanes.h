@@ -33,7 +33,6 @@ template <class V> using IndexOf = typename LaneTraits<V>::Index;
 AR_HD float select(bool m, float a, float b) { return m ? a : b; }
 AR_HD double select(bool m, double a, double b) { return m ? a : b; }
 AR_HD int32_t select(bool m, int32_t a, int32_t b) { return m ? a : b; }
-AR_HD bool any(bool m) { return m; }
 
 template <typename T> AR_HD T min(T a, T b) { return b < a ? b : a; }
 template <typename T> AR_HD T max(T a, T b) { return a < b ? b : a; }
@@ -57,8 +56,13 @@ AR_HD double madd(double a, double b, double c) {
 
 AR_HD float abs(float x) { return std::fabs(x); }
 AR_HD double abs(double x) { return std::fabs(x); }
+/// -|x| where m, else x.
+AR_HD float make_negative(bool m, float x) { return m ? -std::fabs(x) : x; }
+AR_HD double make_negative(bool m, double x) { return m ? -std::fabs(x) : x; }
 AR_HD float exp(float x) { return std::exp(x); }
 AR_HD double exp(double x) { return std::exp(x); }
+AR_HD float exp2(float x) { return std::exp2(x); }
+AR_HD double exp2(double x) { return std::exp2(x); }
 AR_HD float sqrt(float x) { return std::sqrt(x); }
 AR_HD double sqrt(double x) { return std::sqrt(x); }
 

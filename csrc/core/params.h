@@ -13,12 +13,31 @@
 
 namespace ar {
 
-template <typename T> struct Camera {
+/// The grid of tiles over an image.
+struct TileGrid {
+  int width, height;  ///< px
+  AR_HD int columns() const { return (width + kTile - 1) / kTile; }
+  AR_HD int rows() const { return (height + kTile - 1) / kTile; }
+  AR_HD int64_t tiles() const { return int64_t(columns()) * rows(); }
+};
+
+template <typename T> struct CameraView {
   const T* view;      ///< [16] world to camera, transposed
   const T* proj;      ///< [16] world to clip space, transposed
   const T* position;  ///< [3] camera centre, world units
   int width, height;  ///< px
   T tan_half_fov_x, tan_half_fov_y;
+};
+
+/// A camera by value: rows of its matrices, loaded once per thread.
+template <typename T> struct Camera {
+  Vec4<T> view_x, view_y, view_z;  ///< world to camera
+  Vec4<T> clip_x, clip_y, clip_w;  ///< world to clip space
+  Vec3<T> position;
+  Vec2<T> size;    ///< px
+  Vec2<T> focal;   ///< px
+  Vec2<T> limit;   ///< of |x/z| and |y/z| in the Jacobian
+  TileGrid grid;
 };
 
 /// Scene parameters. Either scales and rotations or cov3ds, either shs or colors; the others null.
@@ -63,14 +82,6 @@ template <typename T> struct PairGrad {
   ShapeGrad<T> shape;
   T weighted;      ///< sum of alpha dL/dalpha
   Vec3<T> color;
-};
-
-/// The grid of tiles over an image.
-struct TileGrid {
-  int width, height;  ///< px
-  AR_HD int columns() const { return (width + kTile - 1) / kTile; }
-  AR_HD int rows() const { return (height + kTile - 1) / kTile; }
-  AR_HD int64_t tiles() const { return int64_t(columns()) * rows(); }
 };
 
 }  // namespace ar

@@ -7,8 +7,20 @@
 
 namespace ar {
 
-/// Row r of a matrix stored transposed, as (x, y, z) and the translation w.
+/// Row r of a matrix stored transposed.
 template <typename T> AR_HD Vec4<T> matrix_row(const T* m, int r) { return {m[r], m[4 + r], m[8 + r], m[12 + r]}; }
+
+template <typename T> AR_HD Camera<T> load_camera(const CameraView<T>& c) {
+  const T two = T(2), clamp = T(kFrustumClamp);
+  return {matrix_row(c.view, 0), matrix_row(c.view, 1), matrix_row(c.view, 2),
+          matrix_row(c.proj, 0), matrix_row(c.proj, 1), matrix_row(c.proj, 3),
+          {c.position[0], c.position[1], c.position[2]},
+          {T(c.width), T(c.height)},
+          {T(c.width) / (two * c.tan_half_fov_x), T(c.height) / (two * c.tan_half_fov_y)},
+          {clamp * c.tan_half_fov_x, clamp * c.tan_half_fov_y},
+          {c.width, c.height}};
+}
+
 template <typename T> AR_HD Vec3<T> xyz(Vec4<T> v) { return {v.x, v.y, v.z}; }
 template <typename T> AR_HD T apply_row(Vec4<T> row, Vec3<T> p) { return dot(xyz(row), p) + row.w; }
 
@@ -23,13 +35,13 @@ template <typename T> struct ProjectedMean {
 
 template <typename T> AR_HD ProjectedMean<T> project_mean(const Camera<T>& camera, Vec3<T> mean) {
   ProjectedMean<T> p;
-  p.view = {apply_row(matrix_row(camera.view, 0), mean), apply_row(matrix_row(camera.view, 1), mean),
-            apply_row(matrix_row(camera.view, 2), mean)};
-  p.clip_w = apply_row(matrix_row(camera.proj, 3), mean);
+  p.view = {apply_row(camera.view_x, mean), apply_row(camera.view_y, mean),
+            apply_row(camera.view_z, mean)};
+  p.clip_w = apply_row(camera.clip_w, mean);
   const T inv_w = T(1) / p.clip_w;
-  p.ndc = {inv_w * apply_row(matrix_row(camera.proj, 0), mean), inv_w * apply_row(matrix_row(camera.proj, 1), mean)};
-  p.pixel = {T(0.5) * ((p.ndc.x + T(1)) * T(camera.width) - T(1)),
-             T(0.5) * ((p.ndc.y + T(1)) * T(camera.height) - T(1))};
+  p.ndc = {inv_w * apply_row(camera.clip_x, mean), inv_w * apply_row(camera.clip_y, mean)};
+  p.pixel = {T(0.5) * ((p.ndc.x + T(1)) * camera.size.x - T(1)),
+             T(0.5) * ((p.ndc.y + T(1)) * camera.size.y - T(1))};
   p.valid = p.view.z > T(kNear) && p.clip_w > T(0) && within(p.view.x, 1e18) && within(p.view.y, 1e18) &&
             within(p.view.z, 1e18) && within(p.pixel.x, 1e9) && within(p.pixel.y, 1e9);
   return p;
@@ -37,10 +49,10 @@ template <typename T> AR_HD ProjectedMean<T> project_mean(const Camera<T>& camer
 
 template <typename T>
 AR_HD Vec3<T> project_mean_vjp(const Camera<T>& camera, const ProjectedMean<T>& p, Vec2<T> dL_dpixel, Vec3<T> dL_dview) {
-  const Vec3<T> px = xyz(matrix_row(camera.proj, 0)), py = xyz(matrix_row(camera.proj, 1)), pw = xyz(matrix_row(camera.proj, 3));
-  const T gx = T(0.5) * T(camera.width) * dL_dpixel.x / p.clip_w, gy = T(0.5) * T(camera.height) * dL_dpixel.y / p.clip_w;
-  return gx * px + gy * py - (gx * p.ndc.x + gy * p.ndc.y) * pw + dL_dview.x * xyz(matrix_row(camera.view, 0)) +
-         dL_dview.y * xyz(matrix_row(camera.view, 1)) + dL_dview.z * xyz(matrix_row(camera.view, 2));
+  const Vec3<T> px = xyz(camera.clip_x), py = xyz(camera.clip_y), pw = xyz(camera.clip_w);
+  const T gx = T(0.5) * camera.size.x * dL_dpixel.x / p.clip_w, gy = T(0.5) * camera.size.y * dL_dpixel.y / p.clip_w;
+  return gx * px + gy * py - (gx * p.ndc.x + gy * p.ndc.y) * pw + dL_dview.x * xyz(camera.view_x) +
+         dL_dview.y * xyz(camera.view_y) + dL_dview.z * xyz(camera.view_z);
 }
 
 /// Whether a Gaussian may touch the image, from its mean and a bound on its largest standard
@@ -50,15 +62,14 @@ template <typename T>
 AR_HD bool may_be_visible(const Camera<T>& camera, Vec3<T> mean, T max_sigma, T opacity, T blur) {
   const ProjectedMean<T> p = project_mean(camera, mean);
   if (!p.valid) return false;
-  const T limit_x = T(kFrustumClamp) * camera.tan_half_fov_x, limit_y = T(kFrustumClamp) * camera.tan_half_fov_y;
-  const T focal_x = T(camera.width) / (T(2) * camera.tan_half_fov_x), focal_y = T(camera.height) / (T(2) * camera.tan_half_fov_y);
   // |J| <= f/z |(1, 0, -x/z; 0, 1, -y/z)| <= f/z sqrt(1 + (x/z)^2 + (y/z)^2), with x/z and y/z clamped
-  const T stretch = max(focal_x, focal_y) / p.view.z * sqrt(T(1) + limit_x * limit_x + limit_y * limit_y);
+  const T stretch = max(camera.focal.x, camera.focal.y) / p.view.z *
+                    sqrt(T(1) + camera.limit.x * camera.limit.x + camera.limit.y * camera.limit.y);
   const T sigma = sqrt(stretch * stretch * max_sigma * max_sigma + blur);
-  // Support: level <= 2 ln(255 opacity) + 6.2 for every footprint; 3DGS's radius: 3 sigma, rounded up.
-  const T reach = T(2) + sigma * sqrt(max(T(9), T(2) * std::log(T(1 / kAlphaMin) * opacity) + T(6.5)));
-  return p.pixel.x + reach >= T(0) && p.pixel.x - reach <= T(camera.width - 1) && p.pixel.y + reach >= T(0) &&
-         p.pixel.y - reach <= T(camera.height - 1);
+  const T level = T(kMaxLevel) + (opacity > T(1) ? T(2) * std::log(opacity) : T(0));
+  const T reach = T(2) + sigma * sqrt(level);
+  return p.pixel.x + reach >= T(0) && p.pixel.x - reach <= camera.size.x - T(1) && p.pixel.y + reach >= T(0) &&
+         p.pixel.y - reach <= camera.size.y - T(1);
 }
 
 /// The linear part of the projection at a mean: rows of A = J W, world units to px.
@@ -66,29 +77,25 @@ template <typename T> struct Jacobian {
   Vec3<T> x, y;
   T ratio_x, ratio_y;        ///< x/z and y/z, clamped
   bool clamped_x, clamped_y;
-  T focal_x, focal_y;
 };
 
 template <typename T> AR_HD Jacobian<T> make_jacobian(const Camera<T>& camera, Vec3<T> view) {
   Jacobian<T> j;
-  const T limit_x = T(kFrustumClamp) * camera.tan_half_fov_x, limit_y = T(kFrustumClamp) * camera.tan_half_fov_y;
   const T rx = view.x / view.z, ry = view.y / view.z;
-  j.ratio_x = min(max(rx, -limit_x), limit_x);
-  j.ratio_y = min(max(ry, -limit_y), limit_y);
+  j.ratio_x = min(max(rx, -camera.limit.x), camera.limit.x);
+  j.ratio_y = min(max(ry, -camera.limit.y), camera.limit.y);
   j.clamped_x = j.ratio_x != rx;
   j.clamped_y = j.ratio_y != ry;
-  j.focal_x = T(camera.width) / (T(2) * camera.tan_half_fov_x);
-  j.focal_y = T(camera.height) / (T(2) * camera.tan_half_fov_y);
-  const Vec3<T> depth = xyz(matrix_row(camera.view, 2));
-  j.x = (j.focal_x / view.z) * (xyz(matrix_row(camera.view, 0)) - j.ratio_x * depth);
-  j.y = (j.focal_y / view.z) * (xyz(matrix_row(camera.view, 1)) - j.ratio_y * depth);
+  const Vec3<T> depth = xyz(camera.view_z);
+  j.x = (camera.focal.x / view.z) * (xyz(camera.view_x) - j.ratio_x * depth);
+  j.y = (camera.focal.y / view.z) * (xyz(camera.view_y) - j.ratio_y * depth);
   return j;
 }
 
 template <typename T>
 AR_HD Vec3<T> jacobian_vjp(const Camera<T>& camera, const Jacobian<T>& j, Vec3<T> view, Vec3<T> dL_dx, Vec3<T> dL_dy) {
-  const Vec3<T> depth = xyz(matrix_row(camera.view, 2));
-  const T by_ratio_x = -(j.focal_x / view.z) * dot(dL_dx, depth), by_ratio_y = -(j.focal_y / view.z) * dot(dL_dy, depth);
+  const Vec3<T> depth = xyz(camera.view_z);
+  const T by_ratio_x = -(camera.focal.x / view.z) * dot(dL_dx, depth), by_ratio_y = -(camera.focal.y / view.z) * dot(dL_dy, depth);
   Vec3<T> g = {T(0), T(0), -(dot(dL_dx, j.x) + dot(dL_dy, j.y)) / view.z};
   // Where the ratio is clamped it is constant: its gradient is zero, in z too.
   if (!j.clamped_x) {
@@ -232,7 +239,7 @@ template <typename T> struct Direction {
   T inv_length;
 };
 template <typename T> AR_HD Direction<T> view_direction(const Camera<T>& camera, Vec3<T> mean) {
-  const Vec3<T> d = mean - Vec3<T>{camera.position[0], camera.position[1], camera.position[2]};
+  const Vec3<T> d = mean - camera.position;
   const T inv = T(1) / sqrt(dot(d, d));
   return {inv * d, inv};
 }
@@ -272,7 +279,8 @@ AR_HD Vec3<T> splat_color_vjp(const Camera<T>& camera, const Gaussians<T>& g, co
 
 /// ceil(3 sigma) along the major axis: the radius that 3DGS reports [px].
 template <typename T> AR_HD int splat_radius(Cov2d<T> cov, T variance) {
-  const T largest = T(0.5) * (cov.xx + cov.yy + std::hypot(cov.xx - cov.yy, T(2) * cov.xy)) + variance;
+  const T dx = cov.xx - cov.yy, dy = T(2) * cov.xy;
+  const T largest = T(0.5) * (cov.xx + cov.yy + sqrt(dx * dx + dy * dy)) + variance;
   return int(min(std::ceil(T(3) * sqrt(largest)), T(1e9)));
 }
 
@@ -291,13 +299,13 @@ AR_HD int project(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, Foo
   const T opacity = g.opacities[i], level = F::level(splat.shape, opacity);
   if (!within(level, 1e6)) return 0;  // zero, negative or non-finite opacity, zero determinant
   const int radius = splat_radius(cov, T(F::radius_variance(options)));
-  const bool on_image = mean.pixel.x + T(radius) >= T(0) && mean.pixel.x - T(radius) <= T(camera.width - 1) &&
-                        mean.pixel.y + T(radius) >= T(0) && mean.pixel.y - T(radius) <= T(camera.height - 1);
+  const bool on_image = mean.pixel.x + T(radius) >= T(0) && mean.pixel.x - T(radius) <= camera.size.x - T(1) &&
+                        mean.pixel.y + T(radius) >= T(0) && mean.pixel.y - T(radius) <= camera.size.y - T(1);
   splat.mean = mean.pixel;
   splat.opacity = opacity;
   depth = mean.view.z;
   splat.level = level;
-  const bool touches = level > T(0) && touches_image(support_of(splat), TileGrid{camera.width, camera.height});
+  const bool touches = level > T(0) && touches_image(support_of(splat), camera.grid);
   if (!touches) splat.level = T(0);
   if (!touches && !on_image) return 0;
   if (touches) {
@@ -324,8 +332,8 @@ AR_HD void project_vjp(const Camera<T>& camera, const Gaussians<T>& g, int64_t i
   if (out.opacities) out.opacities[i] = sums.weighted / g.opacities[i];
   if (out.means2d) {
     T* row = out.means2d + i * out.means2d_stride;
-    row[0] = T(0.5) * T(camera.width) * grad.dL_dmean.x;
-    row[1] = T(0.5) * T(camera.height) * grad.dL_dmean.y;
+    row[0] = T(0.5) * camera.size.x * grad.dL_dmean.x;
+    row[1] = T(0.5) * camera.size.y * grad.dL_dmean.y;
     row[2] = T(0);
   }
 }

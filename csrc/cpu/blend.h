@@ -36,29 +36,6 @@ template <typename T> void store_tile(const TileView& view, TileGrid grid, const
   for (int y = 0; y < view.rows; ++y) std::memcpy(image + view.pixel(grid, y), tile + y * kTile, view.columns * sizeof(T));
 }
 
-/// Which lanes of which rows of a tile a splat can reach.
-template <typename T> struct TileSpans {
-  int first_row, last_row;
-  alignas(64) T lo[kTile], hi[kTile];  ///< columns of each row, relative to the tile, clamped to it
-};
-
-template <class F, typename T> AR_HD void find_spans(const Splat<F, T>& splat, const TileView& view, const T* lane_index, TileSpans<T>& spans) {
-  using V = typename LanesOf<T>::Type;
-  constexpr int kCount = LanesOf<T>::kCount;
-  const Support<T> support = support_of(splat);
-  const Span<T> rows = rows_of(support);
-  spans.first_row = int(std::ceil(ar::max(rows.lo - T(view.y0), T(0))));
-  spans.last_row = int(std::floor(ar::min(rows.hi - T(view.y0), T(view.rows - 1))));
-  if (rows.hi < T(view.y0)) spans.last_row = -1;
-  for (int row = spans.first_row / kCount * kCount; row <= spans.last_row; row += kCount) {
-    const V y = V(T(view.y0 + row)) + load(lane_index, V());
-    const Span<V> columns = columns_of(support, y, y);
-    const V x0 = V(T(view.x0));
-    store(spans.lo + row, max(columns.lo - x0, V(T(0))));
-    store(spans.hi + row, min(columns.hi - x0, V(T(kTile - 1))));
-  }
-}
-
 /// 0, 1, 2, ... as scalars, to be loaded as lanes.
 template <typename T> struct LaneIndex {
   alignas(64) T value[kTile];
@@ -66,6 +43,47 @@ template <typename T> struct LaneIndex {
     for (int i = 0; i < kTile; ++i) value[i] = T(i);
   }
 };
+
+/// The packs of a tile that a splat can reach: bit r of rows[c] for pack c of row r.
+template <typename T> struct TileMask {
+  static constexpr int kCount = LanesOf<T>::kCount, kPacks = kTile / kCount;
+  uint32_t rows[kPacks];
+};
+
+template <class F, typename T> AR_HD TileMask<T> reach_of(const Splat<F, T>& splat, const TileView& view, const LaneIndex<T>& lanes) {
+  using V = typename LanesOf<T>::Type;
+  constexpr int kCount = TileMask<T>::kCount, kPacks = TileMask<T>::kPacks;
+  const Support<T> support = support_of(splat);
+  TileMask<T> mask = {};
+  AR_UNROLL
+  for (int row = 0; row < kTile; row += kCount) {
+    const V y = V(T(view.y0)) + load(lanes.value + row, V());
+    const Span<V> span = F::kReach == 0 ? chord_of(support, y) : columns_of(support, y, y);
+    AR_UNROLL
+    for (int c = 0; c < kPacks; ++c) {
+      const V first = V(T(view.x0 + c * kCount)), last = V(T(view.x0 + c * kCount + kCount - 1));
+      mask.rows[c] |= bits((span.lo <= last) & (span.hi >= first)) << row;
+    }
+  }
+  return mask;
+}
+
+/// Rows of a tile with an open sample.
+template <int kSamples, typename T> uint32_t find_open_rows(const T (&transmittance)[kSamples][kTilePixels]) {
+  using V = typename LanesOf<T>::Type;
+  uint32_t open = 0;
+  for (int row = 0; row < kTile; ++row) {
+    V largest(T(0));
+    for (int s = 0; s < kSamples; ++s) {
+      for (int x = 0; x < kTile; x += LanesOf<T>::kCount) largest = max(largest, load(transmittance[s] + row * kTile + x, V()));
+    }
+    open |= uint32_t(bits(largest > V(T(0))) != 0) << row;
+  }
+  return open;
+}
+
+/// How many splats pass between two looks at which rows are still open.
+inline constexpr int64_t kLook = 16;
 
 template <class F, typename T> void blend_tile(const cpu::BlendTask<T>& task, int64_t tile) {
   using V = typename LanesOf<T>::Type;
@@ -79,48 +97,39 @@ template <class F, typename T> void blend_tile(const cpu::BlendTask<T>& task, in
   for (int s = 0; s < kSamples; ++s) {
     for (int i = 0; i < kTilePixels; ++i) transmittance[s][i] = i % kTile < view.columns ? T(1) : T(-1);
   }
-  uint32_t open_rows = (1u << view.rows) - 1;
+  const uint32_t rows_in_image = (1u << view.rows) - 1;
+  uint32_t open_rows = rows_in_image;
   const int64_t begin = task.tile_offsets[tile], end = task.tile_offsets[tile + 1];
-  TileSpans<T> spans;
-  for (int64_t k = begin; k < end && open_rows != 0; ++k) {
+  for (int64_t k = begin; k < end; ++k) {
+    if ((k - begin) % kLook == kLook - 1) {
+      open_rows = rows_in_image & find_open_rows<kSamples, T>(transmittance);
+      if (open_rows == 0) break;
+    }
     if (k + 4 < end) __builtin_prefetch(&splats[task.pairs[k + 4]]);
     const Splat<F, T>& splat = splats[task.pairs[k]];
-    find_spans(splat, view, lanes.value, spans);
-    const auto terms = F::terms(splat.shape);
-    const V opacity(splat.opacity);
+    const TileMask<T> reach = reach_of(splat, view, lanes);
+    const auto terms = F::terms(splat.shape, splat.opacity);
+    const Vec3<V> splat_color = {V(splat.color.x), V(splat.color.y), V(splat.color.z)};
     const IndexOf<V> index(int32_t(k - begin + 1));
-    for (int row = spans.first_row; row <= spans.last_row; ++row) {
-      if (!(open_rows >> row & 1) || spans.hi[row] < spans.lo[row]) continue;
-      const V dy(T(view.y0 + row) - splat.mean.y);
-      bool row_closed = false;
-      for (int x = int(spans.lo[row]) / kCount * kCount; x <= int(spans.hi[row]); x += kCount) {
-        const Vec2<V> d = {load(lanes.value + x, V()) + V(T(view.x0) - splat.mean.x), dy};
-        const int pixel = row * kTile + x;
+    for (int c = 0; c < TileMask<T>::kPacks; ++c) {
+      const V dx = load(lanes.value + c * kCount, V()) + V(T(view.x0) - splat.mean.x);
+      for (uint32_t rows = reach.rows[c] & open_rows; rows != 0; rows &= rows - 1) {
+        const int row = __builtin_ctz(rows), pixel = row * kTile + c * kCount;
+        const Vec2<V> d = {dx, V(T(view.y0 + row) - splat.mean.y)};
         V contribution(T(0));
-        MaskOf<V> closed{};
         AR_UNROLL
         for (int s = 0; s < kSamples; ++s) {
-          const V raw = opacity * F::weight(terms, d, s);
           V t = load(transmittance[s] + pixel, V());
-          const Blended<V> blended = blend_sample(raw, t);
+          const Blended<V> blended = blend_sample(F::alpha(terms, d, s), t);
           store(transmittance[s] + pixel, t);
           contribution = contribution + blended.contribution;
-          closed = closed | blended.closed;
           if (task.last) {
             store_index(last[s] + pixel, select(blended.mask, index, load_index(last[s] + pixel, V())));
           }
         }
-        store(color[0] + pixel, madd(contribution, V(splat.color.x), load(color[0] + pixel, V())));
-        store(color[1] + pixel, madd(contribution, V(splat.color.y), load(color[1] + pixel, V())));
-        store(color[2] + pixel, madd(contribution, V(splat.color.z), load(color[2] + pixel, V())));
-        row_closed |= any(closed);
-      }
-      if (row_closed) {
-        bool open = false;
-        for (int s = 0; s < kSamples; ++s) {
-          for (int i = 0; i < kTile; ++i) open |= transmittance[s][row * kTile + i] > T(0);
-        }
-        if (!open) open_rows &= ~(1u << row);
+        store(color[0] + pixel, madd(contribution, splat_color.x, load(color[0] + pixel, V())));
+        store(color[1] + pixel, madd(contribution, splat_color.y, load(color[1] + pixel, V())));
+        store(color[2] + pixel, madd(contribution, splat_color.z, load(color[2] + pixel, V())));
       }
     }
   }
@@ -170,44 +179,45 @@ template <class F, typename T, bool kAbs> void blend_vjp_tile(const cpu::BlendVj
     }
   }
   for (int row = 0; row < kTile; ++row) tile_last = std::max(tile_last, row_last[row]);
+  const uint32_t rows_in_image = (1u << view.rows) - 1;
   const int64_t begin = task.tile_offsets[tile], end = task.tile_offsets[tile + 1];
   std::fill(task.pair_grads + begin + tile_last, task.pair_grads + end, PairGrad<T>{});
   if (kAbs) std::fill(task.pair_abs + begin + tile_last, task.pair_abs + end, Vec2<T>{});
-  TileSpans<T> spans;
   for (int32_t k = tile_last - 1; k >= 0; --k) {
     if (k >= 4) __builtin_prefetch(&splats[task.pairs[begin + k - 4]]);
     const Splat<F, T>& splat = splats[task.pairs[begin + k]];
-    find_spans(splat, view, lanes.value, spans);
-    const auto terms = F::terms(splat.shape);
-    const V opacity(splat.opacity), zero = V(T(0));
+    const TileMask<T> reach = reach_of(splat, view, lanes);
+    const auto terms = F::terms(splat.shape, splat.opacity);
+    const V zero = V(T(0));
+    const Vec3<V> splat_color = {V(splat.color.x), V(splat.color.y), V(splat.color.z)};
     const IndexOf<V> index(k);
     ShapeGrad<V> shape = {{zero, zero}, {zero, zero, zero}};
     V weighted = zero;
     Vec3<V> color = {zero, zero, zero};
     Vec2<V> abs2d = {zero, zero};
-    for (int row = spans.first_row; row <= spans.last_row; ++row) {
-      if (k >= row_last[row] || spans.hi[row] < spans.lo[row]) continue;
-      const V dy(T(view.y0 + row) - splat.mean.y);
-      for (int x = int(spans.lo[row]) / kCount * kCount; x <= int(spans.hi[row]); x += kCount) {
-        const Vec2<V> d = {load(lanes.value + x, V()) + V(T(view.x0) - splat.mean.x), dy};
-        const int pixel = row * kTile + x;
+    for (int c = 0; c < TileMask<T>::kPacks; ++c) {
+      const V dx = load(lanes.value + c * kCount, V()) + V(T(view.x0) - splat.mean.x);
+      for (uint32_t rows = reach.rows[c] & rows_in_image; rows != 0; rows &= rows - 1) {
+        const int row = __builtin_ctz(rows), pixel = row * kTile + c * kCount;
+        if (k >= row_last[row]) continue;
+        const Vec2<V> d = {dx, V(T(view.y0 + row) - splat.mean.y)};
         const Vec3<V> gp = {load(g[0] + pixel, V()), load(g[1] + pixel, V()), load(g[2] + pixel, V())};
-        const V g_color = madd(gp.x, V(splat.color.x), madd(gp.y, V(splat.color.y), gp.z * V(splat.color.z)));
+        const V g_color = madd(gp.x, splat_color.x, madd(gp.y, splat_color.y, gp.z * splat_color.z));
         V contribution = zero;
         Vec2<V> offset = {zero, zero};
         AR_UNROLL
         for (int s = 0; s < kSamples; ++s) {
-          const V weight = F::weight(terms, d, s), raw = opacity * weight;
-          const MaskOf<V> mask = (raw >= V(T(kAlphaMin))) & (index < load_index(last[s] + pixel, V()));
+          const V alpha = F::alpha(terms, d, s);
+          const MaskOf<V> mask = (alpha >= V(T(kAlphaMin))) & (index < load_index(last[s] + pixel, V()));
           V t = load(transmittance[s] + pixel, V()), b = load(behind[s] + pixel, V());
-          const BlendGrad<V> grad = blend_sample_vjp(mask, raw, g_color, t, b);
+          const BlendGrad<V> grad = blend_sample_vjp(mask, alpha, g_color, t, b);
           store(transmittance[s] + pixel, t);
           store(behind[s] + pixel, b);
           contribution = contribution + grad.contribution;
-          weighted = madd(grad.dL_dalpha, raw, weighted);
-          const ShapeGrad<V> sg = F::weight_vjp(terms, d, s, weight, grad.dL_dalpha * opacity);
-          offset = offset + sg.offset;
-          shape.shape = {shape.shape.xx + sg.shape.xx, shape.shape.xy + sg.shape.xy, shape.shape.yy + sg.shape.yy};
+          weighted = madd(grad.dL_dalpha, alpha, weighted);
+          const ShapeGrad<V> one = F::alpha_vjp(terms, d, s, alpha, grad.dL_dalpha);
+          offset = offset + one.offset;
+          shape.shape = {shape.shape.xx + one.shape.xx, shape.shape.xy + one.shape.xy, shape.shape.yy + one.shape.yy};
         }
         shape.offset = shape.offset + offset;
         color = {madd(contribution, gp.x, color.x), madd(contribution, gp.y, color.y), madd(contribution, gp.z, color.z)};

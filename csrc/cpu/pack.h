@@ -5,6 +5,7 @@
 // that instruction set's namespace, so two widths never meet.
 #pragma once
 
+#include "core/constants.h"
 #include "core/lanes.h"
 #include "cpu/isa.h"
 
@@ -12,9 +13,10 @@ namespace ar::AR_ISA {
 
 // The scalar forms stay visible beside the packs'.
 using ar::abs;
-using ar::any;
 using ar::exp;
+using ar::exp2;
 using ar::madd;
+using ar::make_negative;
 using ar::max;
 using ar::min;
 using ar::select;
@@ -78,22 +80,20 @@ AR_HD Pack select(PackMask m, Pack a, Pack b) { return Pack(m.v ? a.v : b.v); }
 AR_HD PackIndex select(PackMask m, PackIndex a, PackIndex b) { return PackIndex(m.v ? a.v : b.v); }
 
 #if AR_LANES == 16
-AR_HD bool any(PackMask m) { return _mm512_movepi32_mask((__m512i)m.v) != 0; }
+AR_HD uint32_t bits(PackMask m) { return _mm512_movepi32_mask((__m512i)m.v); }
 AR_HD Pack madd(Pack a, Pack b, Pack c) { return Pack((Pack::Raw)_mm512_fmadd_ps(a.v, b.v, c.v)); }
 AR_HD Pack min(Pack a, Pack b) { return Pack((Pack::Raw)_mm512_min_ps(a.v, b.v)); }
 AR_HD Pack max(Pack a, Pack b) { return Pack((Pack::Raw)_mm512_max_ps(a.v, b.v)); }
 AR_HD Pack sqrt(Pack a) { return Pack((Pack::Raw)_mm512_sqrt_ps(a.v)); }
 #elif AR_LANES == 8
-AR_HD bool any(PackMask m) { return _mm256_movemask_ps((__m256)m.v) != 0; }
+AR_HD uint32_t bits(PackMask m) { return _mm256_movemask_ps((__m256)m.v); }
 AR_HD Pack madd(Pack a, Pack b, Pack c) { return Pack((Pack::Raw)_mm256_fmadd_ps(a.v, b.v, c.v)); }
 AR_HD Pack min(Pack a, Pack b) { return Pack((Pack::Raw)_mm256_min_ps(a.v, b.v)); }
 AR_HD Pack max(Pack a, Pack b) { return Pack((Pack::Raw)_mm256_max_ps(a.v, b.v)); }
 AR_HD Pack sqrt(Pack a) { return Pack((Pack::Raw)_mm256_sqrt_ps(a.v)); }
 #else
-AR_HD bool any(PackMask m) {
-  typedef int64_t Halves __attribute__((vector_size(16)));
-  const Halves h = (Halves)m.v;
-  return (h[0] | h[1]) != 0;
+AR_HD uint32_t bits(PackMask m) {
+  return (m.v[0] & 1) | (m.v[1] & 2) | (m.v[2] & 4) | (m.v[3] & 8);
 }
 AR_HD Pack madd(Pack a, Pack b, Pack c) { return Pack(a.v * b.v + c.v); }
 AR_HD Pack min(Pack a, Pack b) { return Pack(b.v < a.v ? b.v : a.v); }
@@ -105,16 +105,44 @@ AR_HD Pack sqrt(Pack a) {
 }
 #endif
 
+/// Lane i in bit i.
+AR_HD uint32_t bits(bool m) { return m; }
+
 AR_HD Pack abs(Pack a) { return Pack((Pack::Raw)((PackIndex::Raw)a.v & 0x7fffffff)); }
 
-/// exp(x) to 2e-7 relative for x in [-87, 88]; clamped outside, so never 0 or inf (tests/cpp/pack_test.cpp).
-/// x = n ln 2 + f, |f| <= ln 2 / 2; exp(f) by a minimax polynomial of relative error 4e-9.
+AR_HD Pack make_negative(PackMask m, Pack x) {
+  return Pack((Pack::Raw)((PackIndex::Raw)x.v | (m.v & int32_t(0x80000000))));
+}
+
+/// 2^n times 1 + f p(f); `shifted` holds the integer n in its low bits.
+AR_HD Pack scale_by_power(Pack p, Pack shifted) {
+  return Pack((Pack::Raw)((PackIndex::Raw)p.v + ((PackIndex::Raw)shifted.v << 23)));
+}
+
+/// Adding 1.5 * 2^23 rounds to an integer, which then sits in the low bits of the sum.
+inline constexpr float kRound = 12582912.0f;
+
+/// 2^x to 2e-7 relative for x in [-126, 127]; clamped below, so that it never underflows
+/// (tests/cpp/pack_test.cpp). x = n + f, |f| <= 1/2; minimax polynomial of relative error 2e-8.
+AR_HD Pack exp2(Pack x) {
+  const Pack clamped = max(x, Pack(-126.0f)), shifted = clamped + Pack(kRound);
+  const Pack f = clamped - (shifted - Pack(kRound));
+  Pack p(1.5353356e-4f);
+  p = madd(p, f, Pack(1.33988811e-3f));
+  p = madd(p, f, Pack(9.61843743e-3f));
+  p = madd(p, f, Pack(5.55033246e-2f));
+  p = madd(p, f, Pack(2.40226479e-1f));
+  p = madd(p, f, Pack(6.93147203e-1f));
+  p = madd(p, f, Pack(1.0f));
+  return scale_by_power(p, shifted);
+}
+
+/// exp(x) to 2e-7 relative for x in [-87, 88]; clamped outside, so never 0 or inf. The argument is
+/// reduced by ln 2 in two parts, so that large arguments lose nothing.
 AR_HD Pack exp(Pack x) {
   const Pack clamped = min(max(x, Pack(-87.0f)), Pack(88.0f));
-  // Adding 1.5 * 2^23 rounds to an integer, which then sits in the low bits of the sum.
-  const Pack magic(12582912.0f);
-  const Pack shifted = madd(clamped, Pack(1.44269504f), magic);
-  const Pack n = shifted - magic;
+  const Pack shifted = madd(clamped, Pack(float(kLog2e)), Pack(kRound));
+  const Pack n = shifted - Pack(kRound);
   const Pack f = madd(n, Pack(-1.42860677e-6f), madd(n, Pack(-0.693145752f), clamped));
   Pack p(1.38145963e-3f);
   p = madd(p, f, Pack(8.36871685e-3f));
@@ -123,7 +151,7 @@ AR_HD Pack exp(Pack x) {
   p = madd(p, f, Pack(4.99999934e-1f));
   p = madd(p, f, Pack(1.0f));
   p = madd(p, f, Pack(1.0f));
-  return Pack((Pack::Raw)((PackIndex::Raw)p.v + ((PackIndex::Raw)shifted.v << 23)));
+  return scale_by_power(p, shifted);
 }
 
 /// Sum of the lanes, in a fixed order.

@@ -16,20 +16,20 @@ template <typename T> AR_HD T max_sigma(const Gaussians<T>& g, int64_t i) {
   return g.scale_modifier * ar::max(std::abs(s.x), ar::max(std::abs(s.y), std::abs(s.z)));
 }
 
-template <typename T> AR_HD bool is_candidate(const cpu::ProjectTask<T>& task, int64_t i) {
+/// First pass: which Gaussians may be visible, and how many of each chunk, so that splats can be
+/// written densely and in input order.
+template <typename T> void count_candidates(const cpu::ProjectTask<T>& task) {
   const Gaussians<T>& g = task.gaussians;
   const T blur = T(std::max(task.options.variance, kPixelVariance));
-  return may_be_visible(task.camera, g.means[i], max_sigma(g, i), g.opacities[i], blur);
-}
-
-/// First pass: how many Gaussians of each chunk may be visible, so that splats can be written
-/// densely and in input order.
-template <typename T> void count_candidates(const cpu::ProjectTask<T>& task) {
-  const int64_t n = task.gaussians.n;
-  cpu::parallel_for(cpu::chunks_of(n), task.threads, [&](int64_t chunk) {
-    const int64_t begin = chunk * cpu::kChunk, end = std::min(n, begin + cpu::kChunk);
+  cpu::parallel_for(cpu::chunks_of(g.n), task.threads, [&](int64_t chunk) {
+    const Camera<T> camera = load_camera(task.camera);
+    const int64_t begin = chunk * cpu::kChunk, end = std::min(g.n, begin + cpu::kChunk);
     int64_t count = 0;
-    for (int64_t i = begin; i < end; ++i) count += is_candidate(task, i);
+    for (int64_t i = begin; i < end; ++i) {
+      const bool candidate = may_be_visible(camera, g.means[i], max_sigma(g, i), g.opacities[i], blur);
+      task.candidates[i] = candidate;
+      count += candidate;
+    }
     task.chunk_offsets[chunk] = count;
   });
 }
@@ -38,15 +38,18 @@ template <class F, typename T> void project(const cpu::ProjectTask<T>& task) {
   const int64_t n = task.gaussians.n;
   auto* splats = reinterpret_cast<Splat<F, T>*>(task.splats);
   cpu::parallel_for(cpu::chunks_of(n), task.threads, [&](int64_t chunk) {
+    const Camera<T> camera = load_camera(task.camera);
     const int64_t begin = chunk * cpu::kChunk, end = std::min(n, begin + cpu::kChunk);
     int64_t j = task.chunk_offsets[chunk];
     for (int64_t i = begin; i < end; ++i) {
       task.radii[i] = 0;
-      if (!is_candidate(task, i)) continue;
-      splats[j] = {};
-      task.depths[j] = T(0);
+      if (!task.candidates[i]) continue;
+      Splat<F, T> splat = {};
+      T depth = T(0);
+      task.radii[i] = ar::project<F, T>(camera, task.gaussians, i, task.options, splat, depth);
+      splats[j] = splat;
+      task.depths[j] = depth;
       task.ids[j] = int32_t(i);
-      task.radii[i] = ar::project<F, T>(task.camera, task.gaussians, i, task.options, splats[j], task.depths[j]);
       ++j;
     }
   });
@@ -55,6 +58,7 @@ template <class F, typename T> void project(const cpu::ProjectTask<T>& task) {
 template <class F, typename T> void project_vjp(const cpu::ProjectVjpTask<T>& task) {
   const int64_t n = task.gaussians.n;
   cpu::parallel_for(cpu::chunks_of(n), task.threads, [&](int64_t chunk) {
+    const Camera<T> camera = load_camera(task.camera);
     const int64_t begin = chunk * cpu::kChunk, end = std::min(n, begin + cpu::kChunk);
     int64_t j = std::lower_bound(task.ids, task.ids + task.n_splats, begin) - task.ids;
     for (int64_t i = begin; i < end; ++i) {
@@ -76,11 +80,11 @@ template <class F, typename T> void project_vjp(const cpu::ProjectVjpTask<T>& ta
         sums.color += g.color;
         if (task.pair_abs) abs2d = abs2d + task.pair_abs[task.positions[k]];
       }
-      ar::project_vjp<F, T>(task.camera, task.gaussians, i, task.options, sums, task.grads);
+      ar::project_vjp<F, T>(camera, task.gaussians, i, task.options, sums, task.grads);
       if (task.grads.means2d && task.grads.means2d_stride == 4) {
         T* row = task.grads.means2d + i * 4;
-        row[2] = T(0.5) * T(task.camera.width) * abs2d.x;
-        row[3] = T(0.5) * T(task.camera.height) * abs2d.y;
+        row[2] = T(0.5) * camera.size.x * abs2d.x;
+        row[3] = T(0.5) * camera.size.y * abs2d.y;
       }
     }
   });

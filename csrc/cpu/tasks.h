@@ -15,10 +15,11 @@ inline constexpr int64_t kChunk = 4096;
 AR_HD int64_t chunks_of(int64_t n) { return (n + kChunk - 1) / kChunk; }
 
 template <typename T> struct ProjectTask {
-  Camera<T> camera;
+  CameraView<T> camera;
   Gaussians<T> gaussians;
   FootprintOptions options;
   int threads;
+  uint8_t* candidates;     ///< [n] whether each Gaussian may be visible, written by count_candidates
   int64_t* chunk_offsets;  ///< [chunks + 1]: counts from count_candidates, then their prefix sums
   T* splats;               ///< [candidates] Splat<F, T>
   int32_t* ids;            ///< [candidates] Gaussian of each splat, ascending
@@ -69,7 +70,7 @@ template <typename T> struct BlendVjpTask {
 };
 
 template <typename T> struct ProjectVjpTask {
-  Camera<T> camera;
+  CameraView<T> camera;
   Gaussians<T> gaussians;
   FootprintOptions options;
   int threads;

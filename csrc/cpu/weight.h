@@ -18,9 +18,9 @@ template <typename T> AR_HD Cov2d<T> with_det(Sym2<T> c) {
 template <class F, typename T> void weight(const cpu::WeightTask<T>& task) {
   cpu::parallel_for(cpu::chunks_of(task.n), task.threads, [&](int64_t chunk) {
     for (int64_t i = chunk * cpu::kChunk; i < std::min(task.n, (chunk + 1) * cpu::kChunk); ++i) {
-      const auto terms = F::terms(F::prepare(with_det(task.covs[i]), task.options));
+      const auto terms = F::terms(F::prepare(with_det(task.covs[i]), task.options), T(1));
       T total = T(0);
-      for (int s = 0; s < F::kSamples; ++s) total += F::weight(terms, task.offsets[i], s);
+      for (int s = 0; s < F::kSamples; ++s) total += F::alpha(terms, task.offsets[i], s);
       task.weights[i] = total / T(F::kSamples);
     }
   });
@@ -31,13 +31,13 @@ template <class F, typename T> void weight_vjp(const cpu::WeightTask<T>& task) {
     for (int64_t i = chunk * cpu::kChunk; i < std::min(task.n, (chunk + 1) * cpu::kChunk); ++i) {
       const Cov2d<T> cov = with_det(task.covs[i]);
       const auto shape = F::prepare(cov, task.options);
-      const auto terms = F::terms(shape);
+      const auto terms = F::terms(shape, T(1));
       const T g = task.dL_dweights[i] / T(F::kSamples);
       ShapeGrad<T> sums = {};
       T weighted = T(0);
       for (int s = 0; s < F::kSamples; ++s) {
-        const T w = F::weight(terms, task.offsets[i], s);
-        const ShapeGrad<T> one = F::weight_vjp(terms, task.offsets[i], s, w, g);
+        const T w = F::alpha(terms, task.offsets[i], s);
+        const ShapeGrad<T> one = F::alpha_vjp(terms, task.offsets[i], s, w, g);
         sums.offset = sums.offset + one.offset;
         sums.shape = {sums.shape.xx + one.shape.xx, sums.shape.xy + one.shape.xy, sums.shape.yy + one.shape.yy};
         weighted += g * w;

@@ -24,7 +24,7 @@ template <class Element, typename T> const Element* rows_of(const OptionalTensor
   return t ? reinterpret_cast<const Element*>(t->const_data_ptr<T>()) : nullptr;
 }
 
-template <typename T> Camera<T> camera_of(const Inputs& in) {
+template <typename T> CameraView<T> camera_of(const Inputs& in) {
   return {in.viewmatrix.const_data_ptr<T>(), in.projmatrix.const_data_ptr<T>(), in.campos.const_data_ptr<T>(), int(in.image_width),
           int(in.image_height), T(in.tanfovx), T(in.tanfovy)};
 }
@@ -61,7 +61,8 @@ template <typename T> Projected project(const Inputs& in, const Stages<T>& stage
   const auto options = in.means3D.options();
   const int64_t chunks = cpu::chunks_of(in.count());
   std::vector<int64_t> offsets(chunks + 1, 0);
-  cpu::ProjectTask<T> task{camera_of<T>(in), gaussians_of<T>(in), {in.variance}, at::get_num_threads(), offsets.data(), {}, {}, {}, {}};
+  std::vector<uint8_t> flags(in.count());
+  cpu::ProjectTask<T> task{camera_of<T>(in), gaussians_of<T>(in), {in.variance}, at::get_num_threads(), flags.data(), offsets.data(), {}, {}, {}, {}};
   stages.count_candidates(task);
   int64_t candidates = 0;
   for (int64_t& offset : offsets) candidates += std::exchange(offset, candidates);

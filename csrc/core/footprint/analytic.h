@@ -85,7 +85,7 @@ template <FrameGradient kFrame> struct Analytic {
   };
   template <typename T> struct Terms {
     Shape<T> shape;
-    T area;  ///< 2 pi s1 s2
+    T mass;  ///< opacity * 2 pi s1 s2
   };
 
   AR_HD static double radius_variance(FootprintOptions) { return 0; }
@@ -120,26 +120,26 @@ template <FrameGradient kFrame> struct Analytic {
   template <typename T> AR_HD static T level(const Shape<T>& g, T opacity) {
     const T w1 = widened(g.inv_sigma.x), w2 = widened(g.inv_sigma.y);
     const T slack = (w1 * w1 * w1 * w1 + w2 * w2 * w2 * w2) / T(48) + T(0.1);
-    const T peak = weight(terms(g), Vec2<T>{T(0), T(0)}, 0);
-    return T(2) * std::log(T(1 / kAlphaMin) * opacity * peak) + slack;
+    const T peak = alpha(terms(g, opacity), Vec2<T>{T(0), T(0)}, 0);
+    return T(2) * std::log(T(1 / kAlphaMin) * peak) + slack;
   }
 
-  template <typename T> AR_HD static Terms<T> terms(const Shape<T>& g) {
-    return {g, T(2 * kPi) / (g.inv_sigma.x * g.inv_sigma.y)};
+  template <typename T> AR_HD static Terms<T> terms(const Shape<T>& g, T opacity) {
+    return {g, opacity * T(2 * kPi) / (g.inv_sigma.x * g.inv_sigma.y)};
   }
 
-  template <typename T, class V> AR_HD static V weight(const Terms<T>& t, Vec2<V> d, int) {
+  template <typename T, class V> AR_HD static V alpha(const Terms<T>& t, Vec2<V> d, int) {
     const Vec2<V> e = in_frame(t.shape, d);
-    return V(t.area) * LogisticWindow<V>(e.x, t.shape.inv_sigma.x).value *
+    return V(t.mass) * LogisticWindow<V>(e.x, t.shape.inv_sigma.x).value *
            LogisticWindow<V>(e.y, t.shape.inv_sigma.y).value;
   }
 
   /// offset = (g_u, g_v); shape = (g_s1, the frame term, g_s2).
   template <typename T, class V>
-  AR_HD static ShapeGrad<V> weight_vjp(const Terms<T>& t, Vec2<V> d, int, V, V dL_dweight) {
+  AR_HD static ShapeGrad<V> alpha_vjp(const Terms<T>& t, Vec2<V> d, int, V, V dL_dalpha) {
     const Vec2<V> e = in_frame(t.shape, d);
     const LogisticWindow<V> f(e.x, t.shape.inv_sigma.x), g(e.y, t.shape.inv_sigma.y);
-    const V scale = dL_dweight * V(t.area);
+    const V scale = dL_dalpha * V(t.mass);
     const V f_u = f.by_u(), g_v = g.by_u();
     const V by_u = scale * f_u * g.value, by_v = scale * f.value * g_v;
     // Frozen: I_u I_v / I, the pull of the covariance between u and v at a window that stays put.
@@ -170,7 +170,8 @@ template <FrameGradient kFrame> struct Analytic {
     return {madd(V(g.axis.x), d.x, V(g.axis.y) * d.y), madd(V(g.axis.x), d.y, V(-g.axis.y) * d.x)};
   }
   template <typename T> AR_HD static T eigenvalue_gap(Cov2d<T> cov) {
-    return std::hypot(cov.xx - cov.yy, T(2) * cov.xy);
+    const T dx = cov.xx - cov.yy, dy = T(2) * cov.xy;
+    return sqrt(dx * dx + dy * dy);
   }
   /// 1 / sqrt(sigma^2 + 1/12).
   template <typename T> AR_HD static T widened(T inv_sigma) {

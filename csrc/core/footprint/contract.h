@@ -11,15 +11,15 @@
 //   ellipse(Shape<T>) -> Mat2<T>         w, and
 //   level(Shape<T>, opacity) -> T        such that opacity * I(d + node) < 1/255 wherever
 //                                        |w (d + node)|^2 > level; level <= 0 where it holds everywhere
-//   terms(Shape<T>) -> Terms<T>          numbers that all pixels share, derived per (tile, splat)
-//   weight(Terms<T>, Vec2<V> d, s) -> V  I at sample s; d = pixel centre - mean [px]
-//   weight_vjp(Terms<T>, d, s, weight, dL_dweight) -> ShapeGrad<V>   per pixel: sums of plain products
+//   terms(Shape<T>, opacity) -> Terms<T> numbers that all pixels share, derived per (tile, splat)
+//   alpha(Terms<T>, Vec2<V> d, s) -> V   opacity * I at sample s; d = pixel centre - mean [px]
+//   alpha_vjp(Terms<T>, d, s, alpha, dL_dalpha) -> ShapeGrad<V>      per pixel: sums of plain products
 //   mean_map(Shape<T>) -> Mat2<T>        m with dL/dmean = m^T sums.offset [dL/dpx]
 //   prepare_vjp(Cov2d<T>, Shape<T>, ShapeGrad<T> sums, weighted) -> SplatGrad<T>         once per splat
 //
 // T is float or double, V a scalar or a pack of lanes (lanes.h). The five numbers of ShapeGrad are
 // summed over pixels and samples in whatever coordinates make them cheap; prepare_vjp gives them
-// meaning. `weighted` is the sum of I dL_dI, which the gradient of the opacity needs anyway.
+// meaning. `weighted` is the sum of alpha dL_dalpha, which the gradient of the opacity needs anyway.
 #pragma once
 
 #include "core/constants.h"

@@ -62,10 +62,13 @@ template <int S, bool kCompensated> struct GaussianFootprint {
   static constexpr double kReach = (S - 1) / (2.0 * S);
   template <typename T> using Shape = GaussianShape<T>;
 
+  /// Exponents are taken to base 2: kBase2^2 = log2(e) / 2 turns |w d|^2 into -log2 of the Gaussian.
+  static constexpr double kBase2 = 0.84932180028801904272;
+
   template <typename T> struct Terms {
-    Mat2<T> w;
-    T amp;
-    Vec2<T> node[S];  ///< whitened nodes
+    Mat2<T> w;        ///< whitening matrix times kBase2
+    T peak;           ///< opacity * amp
+    Vec2<T> node[S];  ///< w times each node
   };
 
   template <typename T> AR_HD static Shape<T> prepare_with(Cov2d<T> cov, T variance) {
@@ -79,12 +82,14 @@ template <int S, bool kCompensated> struct GaussianFootprint {
     return gaussian_level(shape.amp, opacity);
   }
 
-  template <typename T> AR_HD static Terms<T> terms(const Shape<T>& shape) {
-    Terms<T> t{shape.w, shape.amp, {}};
-AR_UNROLL
+  template <typename T> AR_HD static Terms<T> terms(const Shape<T>& shape, T opacity) {
+    const T scale = T(kBase2);
+    const Mat2<T> w = {scale * shape.w.xx, scale * shape.w.xy, scale * shape.w.yx, scale * shape.w.yy};
+    Terms<T> t{w, opacity * shape.amp, {}};
+    AR_UNROLL
     for (int s = 0; s < S; ++s) {
       const Vec2<int> n = box_node<S>(s);
-      t.node[s] = transform(shape.w, Vec2<T>{T(n.x) / T(2 * S), T(n.y) / T(2 * S)});
+      t.node[s] = transform(w, Vec2<T>{T(n.x) / T(2 * S), T(n.y) / T(2 * S)});
     }
     return t;
   }
@@ -95,23 +100,29 @@ AR_UNROLL
     return {z.x + V(t.node[s].x), z.y + V(t.node[s].y)};
   }
 
-  template <typename T, class V> AR_HD static V weight(const Terms<T>& t, Vec2<V> d, int s) {
+  template <typename T, class V> AR_HD static V alpha(const Terms<T>& t, Vec2<V> d, int s) {
     const Vec2<V> z = whitened(t, d, s);
-    return V(t.amp) * exp(V(T(-0.5)) * madd(z.x, z.x, z.y * z.y));
+    return V(t.peak) * exp2(-madd(z.x, z.x, z.y * z.y));
   }
 
   template <typename T, class V>
-  AR_HD static ShapeGrad<V> weight_vjp(const Terms<T>& t, Vec2<V> d, int s, V weight, V dL_dweight) {
+  AR_HD static ShapeGrad<V> alpha_vjp(const Terms<T>& t, Vec2<V> d, int s, V alpha, V dL_dalpha) {
     const Vec2<V> z = whitened(t, d, s);
-    const V gx = dL_dweight * weight * z.x, gy = dL_dweight * weight * z.y;
+    const V g = dL_dalpha * alpha, gx = g * z.x, gy = g * z.y;
     return {{gx, gy}, {gx * z.x, gx * z.y, gy * z.y}};
   }
 
-  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return shape.w; }
+  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) {
+    const T scale = T(1 / kBase2);
+    return {scale * shape.w.xx, scale * shape.w.xy, scale * shape.w.yx, scale * shape.w.yy};
+  }
 
   template <typename T>
   AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& shape, ShapeGrad<T> sums, T weighted) {
-    return gaussian_vjp(shape.w, sums, kCompensated ? weighted : T(0));
+    const T scale = T(1 / kBase2), square = T(1 / (kBase2 * kBase2));
+    const ShapeGrad<T> whitened_sums = {{scale * sums.offset.x, scale * sums.offset.y},
+                                        {square * sums.shape.xx, square * sums.shape.xy, square * sums.shape.yy}};
+    return gaussian_vjp(shape.w, whitened_sums, kCompensated ? weighted : T(0));
   }
 };
 
