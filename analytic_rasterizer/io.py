@@ -109,7 +109,7 @@ def load_scene(path) -> Scene:
         shs.contiguous(),
         math.isqrt(shs.shape[1]) - 1,
     )
-    for name, field in zip(Scene._fields[:-1], scene[:-1], strict=True):
+    for name, field in zip(Scene._fields[:-1], scene[:-1]):
         bad = count - int(field.flatten(1).isfinite().all(1).sum())
         if bad:
             raise SceneError(f"{path}: {name} must be finite, got {bad} of {count} rows not")
@@ -280,11 +280,12 @@ def load_views(path, size: tuple[int, int] | None = None) -> list[View]:
     path = Path(path)
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-        views = _views(data, path.parent, size)
     except OSError as error:
         raise SceneError(f"{path}: {error.strerror}") from None
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:
         raise SceneError(f"{path}: not valid JSON: {_first_line(error)}") from None
+    try:
+        views = _views(data, path.parent, size)
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from None
     return _with_distinct_names(views)
@@ -477,18 +478,19 @@ def _numbers(value, shape: tuple[int, ...], where: str) -> torch.Tensor:
 
 
 def _is_number(value) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    """A JSON number that float32 can hold, with room to multiply; not NaN, nor infinite."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e30
 
 
 def _positive(value, where: str) -> float:
-    if not _is_number(value) or value <= 0:
+    if not _is_number(value) or value < 1e-6:
         raise SceneError(f"{where} must be a positive finite number, got {_shorten(value)}")
     return float(value)
 
 
 def _pixels(value, where: str) -> int:
-    if not _is_number(value) or value < 1 or value != int(value):
-        raise SceneError(f"{where} must be a positive whole number, got {_shorten(value)}")
+    if not _is_number(value) or value < 1 or value != int(value) or value > 2**20:
+        raise SceneError(f"{where} must be a whole number from 1 to 2^20, got {_shorten(value)}")
     return int(value)
 
 
