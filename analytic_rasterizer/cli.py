@@ -11,12 +11,11 @@ import argparse
 import math
 import sys
 import tempfile
-from importlib import metadata
 from pathlib import Path
 
 import torch
 
-from . import demo, io
+from . import __version__, demo, io
 from .footprints import FOOTPRINTS
 from .rasterizer import render_stages
 
@@ -51,11 +50,7 @@ def build_parser() -> Parser:
     parser = Parser(
         prog=PROGRAM, description="Render 3D Gaussians with pixels that integrate, not sample."
     )
-    parser.add_argument(
-        "--version",
-        action="version",
-        version=f"analytic_rasterizer {metadata.version('analytic_rasterizer')}",
-    )
+    parser.add_argument("--version", action="version", version=f"analytic_rasterizer {__version__}")
     subcommands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for add_command in COMMANDS:
         add_command(subcommands)
@@ -136,7 +131,7 @@ def render(args) -> None:
             counts = [len(scene.means), len(stages.ids), len(stages.pairs)]
             size = f"{settings.image_width}x{settings.image_height}"
             rows.append([view.name, size, *counts, *seconds, sum(seconds)])
-    mean = [sum(column) / len(rows) for column in list(zip(*rows, strict=True))[2:]]
+    mean = [sum(column) / len(rows) for column in list(zip(*rows))[2:]]
     rows.append(["mean", "", *(round(value) for value in mean[:3]), *mean[3:]])
     header = ["view", "size", "Gaussians", "visible", "pairs"]
     print(format_table([*header, *(f"{stage} [s]" for stage in STAGES), "total [s]"], rows))
@@ -207,7 +202,7 @@ def format_table(header: list[str], rows: list[list]) -> str:
     return "\n".join(
         "  ".join(
             cell.rjust(width) if i else cell.ljust(width)
-            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+            for i, (cell, width) in enumerate(zip(row, widths))
         ).rstrip()
         for row in cells
     )

@@ -1,0 +1,296 @@
+"""The command line: what it writes, what it prints, and how it fails."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+import torch
+from conftest import ROOT, SHARED
+
+import analytic_rasterizer as ar
+from analytic_rasterizer import cli, io
+
+pytest.importorskip("gsply", reason="needs the cli extra")
+image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
+
+FOOTPRINT_ARGUMENTS = {
+    "default": ([], {}),
+    "point": (["--footprint", "point"], {"footprint": "point"}),
+    "dilation": (["--footprint", "point:dilation=0"], {"footprint": "point", "dilation": 0.0}),
+    "box": (["--footprint", "box:samples=2"], {"footprint": "box", "samples": 2}),
+    "samples": (["--footprint", "box", "--samples", "8"], {"footprint": "box", "samples": 8}),
+}
+
+
+@pytest.fixture
+def files(tmp_path):
+    """A small scene and two views of it, one with its principal point off centre."""
+    g = torch.Generator().manual_seed(0)
+    count = 30
+    scene = io.Scene(
+        2 * torch.rand(count, 3, generator=g) + torch.tensor([-1.0, -1.0, 3.0]),
+        0.3 * torch.rand(count, 3, generator=g) + 0.01,
+        torch.randn(count, 4, generator=g),
+        torch.rand(count, 1, generator=g),
+        0.5 * torch.randn(count, 9, 3, generator=g),
+        2,
+    )
+    eye = torch.eye(4, dtype=torch.float64)
+    views = [
+        io.View("front", 64, 48, 70.0, 70.0, eye),
+        io.View("off centre", 50, 40, 60.0, 65.0, eye, cx=20.0, cy=25.0),
+    ]
+    io.save_scene(tmp_path / "scene.ply", scene)
+    io.save_views(tmp_path / "views.json", views)
+    return tmp_path
+
+
+def arguments(files, *extra):
+    scene, views, out = files / "scene.ply", files / "views.json", files / "out"
+    return ["render", str(scene), "--views", str(views), "--out", str(out), *extra]
+
+
+def run(*args, **options):
+    """`python -m analytic_rasterizer` in its own process."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    return subprocess.run(
+        [sys.executable, "-m", "analytic_rasterizer", *map(str, args)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        env=environment,
+        **options,
+    )
+
+
+@pytest.mark.parametrize("which", FOOTPRINT_ARGUMENTS)
+def test_render_writes_what_the_library_renders(files, which, capsys):
+    flags, options = FOOTPRINT_ARGUMENTS[which]
+    extra = ["--scale", "0.5", "--background", "0.2", "0.4", "1"]
+    assert cli.main(arguments(files, *flags, *extra)) == 0
+    scene = io.load_scene(files / "scene.ply")
+    views = io.load_views(files / "views.json")
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()]
+    for view, name, row in zip(views, ["front", "off_centre"], rows[1:]):
+        settings = view.settings(0.5, (0.2, 0.4, 1.0), scene.sh_degree, **options)
+        color, _ = ar.GaussianRasterizer(settings)(means2D=None, **scene.arguments())
+        expected = (color.clamp(0, 1) * 255).round().permute(1, 2, 0).numpy()
+        written = np.asarray(image.open(files / "out" / f"{name}.png")).astype(float)
+        # The two calls may differ in the last bit of float32, and so at a rounding boundary.
+        assert written.shape == expected.shape
+        assert np.abs(written - expected).max() <= 1
+        assert (written != expected).mean() < 1e-3
+        stages = ar.render_stages(settings, **scene.arguments())
+        counts = [len(scene.means), len(stages.ids), len(stages.pairs)]
+        size = f"{view.size(0.5)[0]}x{view.size(0.5)[1]}"
+        assert row[:5] == [name, size, *map(str, counts)]
+        project, bin_, blend, total = map(float, row[5:])
+        assert total == pytest.approx(project + bin_ + blend, rel=1e-2)
+    assert rows[0][:5] == ["view", "size", "Gaussians", "visible", "pairs"]
+    assert rows[3][:2] == ["mean", "30"]
+    assert len(rows) == 4
+
+
+def test_render_in_a_process(files):
+    done = run(*arguments(files, "--threads", "1"))
+    assert (done.returncode, done.stderr) == (0, "")
+    assert [line.split()[0] for line in done.stdout.splitlines()] == [
+        *("view", "front", "off_centre", "mean")
+    ]
+
+
+def test_size_for_views_that_state_none(files):
+    frame = {
+        "file_path": "a",
+        "transform_matrix": torch.diag(torch.tensor([1, -1, -1, 1])).tolist(),
+    }
+    (files / "views.json").write_text(json.dumps({"camera_angle_x": 0.8, "frames": [frame]}))
+    assert cli.main(arguments(files, "--size", "40", "30")) == 0
+    assert image.open(files / "out" / "a.png").size == (40, 30)
+
+
+def unwritable(files):
+    (files / "out").write_text("a file where the folder should be")
+
+
+def scene_text(text):
+    return lambda files: (files / "scene.ply").write_text(text)
+
+
+def views_text(text):
+    return lambda files: (files / "views.json").write_text(text)
+
+
+def leave(args):
+    """The exit code of a command line."""
+    try:
+        return cli.main(args)
+    except SystemExit as stop:  # how argparse leaves
+        return stop.code
+
+
+def check_error(args, capsys, message):
+    assert leave(args) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("error: ")
+    assert message in captured.err
+    assert captured.err.count("\n") == 1
+
+
+PLY_OF_X = """ply
+format binary_little_endian 1.0
+element vertex 0
+property float x
+end_header
+"""
+
+
+@pytest.mark.parametrize(
+    ("prepare", "extra", "message"),
+    [
+        (lambda files: (files / "scene.ply").unlink(), [], "scene.ply: no such file"),
+        (scene_text("ply\nformat"), [], "scene.ply: the PLY header has no end_header"),
+        (scene_text("jpeg"), [], "scene.ply: not a PLY file"),
+        (
+            scene_text(PLY_OF_X),
+            [],
+            "scene.ply: missing vertex properties y, z, f_dc_0",
+        ),
+        (lambda files: (files / "views.json").unlink(), [], "views.json: No such file"),
+        (views_text("[]"), [], "views.json: the list of views must be a list with at least one"),
+        (views_text("{"), [], "views.json: not valid JSON"),
+        (unwritable, [], "out: File exists"),
+        (None, ["--footprint", "circle"], "circle"),
+        (None, ["--footprint", "box:samples=3"], "samples"),
+        (None, ["--footprint", "box:colour=3"], "colour"),
+        (None, ["--footprint", "box:samples"], "samples"),
+        (None, ["--footprint", "mip", "--samples", "4"], "samples"),
+        (None, ["--samples", "x"], "argument --samples: invalid int value: 'x'"),
+        (None, ["--scale", "0"], "argument --scale: must be a positive number, got 0"),
+        (None, ["--scale", "nan"], "argument --scale: must be a positive number, got nan"),
+        (None, ["--background", "0", "0"], "argument --background: expected 3 arguments"),
+        (None, ["--background", "0", "0", "2"], "must be a number from 0 to 1, got 2"),
+        (None, ["--threads", "0"], "must be a positive whole number, got 0"),
+        (None, ["--size", "3", "-3"], "must be a positive whole number, got -3"),
+        (None, ["--device", "abacus"], "argument --device: invalid choice: 'abacus'"),
+        (None, ["--frobnicate"], "unrecognized arguments: --frobnicate"),
+    ],
+)
+def test_errors_are_one_line(files, capsys, prepare, extra, message):
+    if prepare:
+        prepare(files)
+    check_error(arguments(files, *extra), capsys, message)
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        ([], "the following arguments are required: COMMAND"),
+        (["paint"], "invalid choice: 'paint'"),
+        (["render"], "the following arguments are required: SCENE, --views, --out"),
+        (["demo", "--out", "{}", "--size", "30", "20"], "size must be positive multiples of 8"),
+    ],
+)
+def test_wrong_commands_are_one_line(tmp_path, capsys, args, message):
+    check_error([arg.format(tmp_path) for arg in args], capsys, message)
+
+
+def test_errors_of_a_process(tmp_path):
+    done = run("render", "none.ply", "--views", "none.json", "--out", ".", cwd=tmp_path)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == "error: none.json: No such file or directory\n"
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_folder_without_permission(files, capsys):
+    (files / "out").mkdir(mode=0o500)
+    assert cli.main(arguments(files)) == 2
+    assert "Permission denied" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
+def test_device_that_is_not_there(files, capsys):
+    assert cli.main(arguments(files, "--device", "cuda")) == 2
+    assert "no CUDA device" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_render_on_cuda_agrees_with_the_cpu(files):
+    assert cli.main(arguments(files)) == 0
+    pictures = [np.asarray(image.open(path)) for path in sorted((files / "out").glob("*.png"))]
+    assert cli.main(arguments(files, "--device", "cuda")) == 0
+    for left, path in zip(pictures, sorted((files / "out").glob("*.png"))):
+        right = np.asarray(image.open(path))
+        # Thresholds (alpha < 1/255) may flip by the last bit of float32.
+        assert np.abs(left.astype(int) - right).max() <= 2
+
+
+@pytest.mark.parametrize("module", ["gsply", "PIL.Image", "tqdm"])
+def test_missing_library_names_the_extra(files, capsys, monkeypatch, module):
+    monkeypatch.setitem(sys.modules, module, None)
+    assert cli.main(arguments(files)) == 2
+    assert "pip install analytic_rasterizer[cli]" in capsys.readouterr().err
+
+
+def test_interrupt_is_quiet(files, capsys, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(io, "load_scene", interrupted)
+    assert cli.main(arguments(files)) == 130
+    assert capsys.readouterr() == ("", "")
+
+
+@pytest.mark.skipif(os.name != "posix", reason="sends a POSIX signal")
+def test_interrupt_of_a_process_is_quiet(tmp_path):
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "analytic_rasterizer", "demo", "--out", str(tmp_path)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
+    deadline = time.monotonic() + 60
+    while not (tmp_path / "views.json").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert (process.returncode, out, err) == (130, "", "")
+
+
+def test_version_and_help(capsys):
+    assert leave(["--version"]) == 0
+    assert capsys.readouterr().out == f"analytic_rasterizer {ar.__version__}\n"
+    for args in (["--help"], ["render", "--help"], ["demo", "--help"]):
+        assert leave(args) == 0
+        text = capsys.readouterr().out
+        assert text.startswith("usage: python -m analytic_rasterizer")
+        if args[0] == "render":
+            assert all(footprint in text for footprint in ar.FOOTPRINTS)
+
+
+def test_shared_views(tmp_path, plant):
+    inputs, _ = plant
+    scene = io.Scene(
+        *(inputs[name] for name in ("means3D", "scales", "rotations", "opacities", "shs")), 3
+    )
+    io.save_scene(tmp_path / "scene.ply", scene)
+    views = SHARED / "data" / "plant_sh3_lo.json"
+    args = ["render", str(tmp_path / "scene.ply"), "--views", str(views), "--out", str(tmp_path)]
+    assert cli.main([*args, "--footprint", "box"]) == 0
+    names = sorted(path.name for path in tmp_path.glob("*.png"))
+    assert names == ["view_000.png", "view_001.png", "view_002.png"]
+    for name in names:
+        picture = np.asarray(image.open(tmp_path / name))
+        assert picture.shape == (135, 240, 3)
+        # The mean radiance of the integrated plant is 0.0300, averaged over the views.
+    mean = np.mean([np.asarray(image.open(tmp_path / name)).mean() for name in names]) / 255
+    assert mean == pytest.approx(0.0300, abs=0.002)
