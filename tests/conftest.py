@@ -29,16 +29,14 @@ def plant():
     spec = importlib.util.spec_from_file_location("qsplat", reader)
     qsplat = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(qsplat)
-    means, log_scales, quats, logit_opacity, sh = (
-        torch.as_tensor(value) for value in qsplat.load(str(data / "plant_sh3.npz"))
-    )
+    stored = {k: torch.from_numpy(v) for k, v in qsplat.load(str(data / "plant_sh3.npz")).items()}
     inputs = {
-        "means3D": means,
-        "means2D": torch.zeros_like(means),
-        "opacities": torch.sigmoid(logit_opacity)[:, None],
-        "shs": sh,
-        "scales": torch.exp(log_scales),
-        "rotations": quats,
+        "means3D": stored["means"],
+        "means2D": torch.zeros_like(stored["means"]),
+        "opacities": torch.sigmoid(stored["logit_opacity"])[:, None],
+        "shs": stored["sh"],
+        "scales": torch.exp(stored["log_scales"]),
+        "rotations": stored["quats"],
     }
     views = json.loads((data / "plant_sh3_lo.json").read_text())
     return {name: value.float().contiguous() for name, value in inputs.items()}, views

@@ -1,14 +1,14 @@
 """The rasterizer written down a second time: slow, plain, float64, straight from the equations.
 
-Nothing here is shared with the library. Gradients come from torch.autograd, so that what the library
-derives by hand is compared with what is derived by machine. Pixels are vectorised, Gaussians are a
-Python loop in depth order. Sources: [AS, Eq. n] is the supplement of Analytic-Splatting; the cumulant
-weight, the box pattern and the frozen frame follow the project's numerics notes; the rest is the
-published image formation of 3D Gaussian Splatting.
+Nothing here is shared with the library. Gradients come from torch.autograd, so that what the
+library derives by hand is compared with what is derived by machine. Pixels are vectorised,
+Gaussians are a Python loop in depth order. Sources: [AS, Eq. n] is the supplement of
+Analytic-Splatting; the cumulant weight, the box pattern and the frozen frame follow the project's
+numerics notes; the rest is the published image formation of 3D Gaussian Splatting.
 
-Conventions: pixel centres at integers; offset = pixel centre - projected mean [px]; a 2x2 covariance is
-(..., 3) = (xx, xy, yy) [px^2]; a 3x3 covariance is (..., 6) = (xx, xy, xz, yy, yz, zz); view and
-projection matrices are transposed, as 3DGS passes them.
+Conventions: pixel centres at integers; offset = pixel centre - projected mean [px]; a 2x2
+covariance is (..., 3) = (xx, xy, yy) [px^2]; a 3x3 covariance is (..., 6) = (xx, xy, xz, yy, yz,
+zz); view and projection matrices are transposed, as 3DGS passes them.
 """
 
 import math
@@ -107,22 +107,32 @@ def normal_pdf(x):
     return torch.exp(-x * x / 2) / math.sqrt(2 * math.pi)
 
 
-def window(u, sigma, cdf):
-    """Integral of the 1D density over [u - 1/2, u + 1/2] [AS, Eq. 7].
+def logistic_window(u, sigma):
+    """S((u + 1/2)/sigma) - S((u - 1/2)/sigma), the paper's 1D window [AS, Eq. 7].
 
-    Taken on the negative side, where both CDF values are small and their difference loses nothing.
+    With S(x) = sigmoid(f(x)): S(b) - S(a) = S(b) (1 - S(a)) (1 - exp(f(a) - f(b))), and f(b) - f(a)
+    is expanded, so that nothing cancels however wide or narrow the Gaussian. test_reference.py
+    compares it with the plain difference.
     """
+    centre, half = u / sigma, 0.5 / sigma
+    high, low = centre + half, centre - half
+    rise = 3.2 * half + 0.07 * half * (6 * centre**2 + 2 * half**2)
+    return logistic_cdf(high) * logistic_cdf(-low) * -torch.expm1(-rise)
+
+
+def normal_window(u, sigma):
+    """The same with the exact CDF, on the side where both values are small."""
     u = -u.abs()
-    return cdf((u + 0.5) / sigma) - cdf((u - 0.5) / sigma)
+    return normal_cdf((u + 0.5) / sigma) - normal_cdf((u - 0.5) / sigma)
 
 
-def rotated_window(offset, cov2d, frame_gradient="paper", cdf=logistic_cdf, pdf=logistic_pdf):
+def rotated_window(offset, cov2d, frame_gradient="paper", window=logistic_window, pdf=logistic_pdf):
     """The pixel turned into the splat's eigenframe, where the integral separates [AS, Eq. 2-9].
 
-    The value does not depend on frame_gradient. "paper" differentiates the formula, so the pixel turns
-    with the eigenvectors. "frozen" differentiates the integral over a window that stays where it is
-    while Sigma changes. In that fixed frame Sigma gets an off-diagonal entry B (zero here), and
-    because a Gaussian solves the heat equation, dI/dB = d2I/(du dv), which separates at B = 0.
+    The value does not depend on frame_gradient. "paper" differentiates the formula, so the pixel
+    turns with the eigenvectors. "frozen" differentiates the integral over a window that stays where
+    it is while Sigma changes. In that fixed frame Sigma gets an off-diagonal entry B (zero here),
+    and because a Gaussian solves the heat equation, dI/dB = d2I/(du dv), which separates at B = 0.
     """
     xx, xy, yy = cov2d.unbind(-1)
     matrix = torch.stack([torch.stack([xx, xy], -1), torch.stack([xy, yy], -1)], -2)
@@ -140,7 +150,7 @@ def rotated_window(offset, cov2d, frame_gradient="paper", cdf=logistic_cdf, pdf=
         l1, l2, cross = form(v1, v1), form(v2, v2), form(v1, v2)
     u, v = (offset * v1).sum(-1), (offset * v2).sum(-1)
     s1, s2 = torch.sqrt(l1), torch.sqrt(l2)
-    weight = 2 * math.pi * s1 * s2 * window(u, s1, cdf) * window(v, s2, cdf)
+    weight = 2 * math.pi * s1 * s2 * window(u, s1) * window(v, s2)
     if cross is not None:
         # s dF/du of each axis; only the derivative of `cross` matters, its value is zero.
         du = pdf((u + 0.5) / s1) - pdf((u - 0.5) / s1)
@@ -193,9 +203,9 @@ def weight(offset, cov2d, footprint, **options):
 def exact_weight(offset, cov2d, panels=64, order=10):
     """Integral of exp(-q/2) over the unit pixel: composite Gauss-Legendre times erf.
 
-    The outer axis is the one with the larger variance, so that nothing varies faster along it than the
-    conditional deviation of the other axis; 64 panels of 10 nodes resolve deviations down to 0.01 px
-    to 1e-13. Differentiable in both arguments.
+    The outer axis is the one with the larger variance, so that nothing varies faster along it than
+    the conditional deviation of the other axis; 64 panels of 10 nodes resolve deviations down to
+    0.01 px to 1e-13. Differentiable in both arguments.
     """
     offset, cov2d = torch.broadcast_tensors(
         torch.nn.functional.pad(offset, (0, 1)), cov2d
@@ -243,7 +253,7 @@ def legendre(order):
 
 
 def rotation_matrix(quaternion):
-    """Rotation (P, 3, 3) of quaternions (P, 4) = (w, x, y, z); normalised here, zero is identity."""
+    """(P, 3, 3) of quaternions (P, 4) = (w, x, y, z); normalised here, zero is identity."""
     norm = quaternion.detach().norm(dim=-1, keepdim=True)
     identity = quaternion.new_tensor([1.0, 0.0, 0.0, 0.0])
     safe = torch.where(norm > 0, quaternion, identity)
@@ -270,7 +280,7 @@ def unpack_covariance(packed):
 
 
 def spherical_harmonics(degree, direction):
-    """Real basis (P, (degree + 1)^2) with the signs and the order of 3DGS; direction of unit length."""
+    """Real basis (P, (degree + 1)^2), signs and order of 3DGS; direction (P, 3) of unit length."""
     x, y, z = direction.unbind(-1)
 
     def factor(value):
@@ -301,7 +311,7 @@ def spherical_harmonics(degree, direction):
 
 
 def sh_color(degree, shs, means, camera_position):
-    """max(0, SH + 1/2) (P, 3), seen from camera_position; shs (P, M, 3) with M >= (degree + 1)^2."""
+    """max(0, SH + 1/2) (P, 3) seen from camera_position; shs (P, M, 3), M >= (degree + 1)^2."""
     direction = torch.nn.functional.normalize(means - camera_position, dim=-1)
     basis = spherical_harmonics(degree, direction)
     color = (basis[:, :, None] * shs[:, : basis.shape[1]]).sum(1) + 0.5
@@ -350,10 +360,10 @@ def project(settings, means, covariance):
 class Rendered(NamedTuple):
     """What render() returns. P Gaussians, image (3, H, W).
 
-    `margin` is the smallest relative distance of any alpha or transmittance that was compared with a
-    threshold from that threshold: finite differences and float32 are meaningful only well inside it.
-    `pixel_margin` (H, W) is the same per pixel. `offsets` maps a Gaussian to its (H, W, 2) offsets,
-    whose gradient (kept) is minus the gradient of the mean, pixel by pixel.
+    `margin` is the smallest relative distance of any alpha or transmittance that was compared with
+    a threshold from that threshold: finite differences and float32 are meaningful only well inside
+    it. `pixel_margin` (H, W) is the same per pixel. `offsets` maps a Gaussian to its (H, W, 2)
+    offsets, whose gradient (kept) is minus the gradient of the mean, pixel by pixel.
     """
 
     color: torch.Tensor
@@ -385,7 +395,7 @@ def three_sigma(cov2d, footprint, **options):
 
 
 def peak(cov2d, footprint, **options):
-    """The weight at offset zero; for `box` that of a sample, which is what is compared with 1/255."""
+    """Weight at offset zero; for `box` that of a sample, which is what is compared with 1/255."""
     zero = torch.zeros(2, dtype=cov2d.dtype)
     if footprint == "box":
         return blurred(zero, cov2d, box_variance((DEFAULT_OPTIONS["box"] | options)["samples"]))
@@ -409,7 +419,8 @@ def render(
 ):
     """Render P Gaussians; arguments as the library's rasterizer takes them, all float64.
 
-    means2D (P, 2 or more) or None: its value is ignored, its gradient is dL/d(mean in px) * (W, H) / 2.
+    means2D (P, 2 or more) or None: its value is ignored, its gradient is dL/d(mean in px) * (W, H)
+    / 2.
     """
     height, width = settings.image_height, settings.image_width
     half = torch.tensor([width / 2, height / 2], dtype=torch.float64)

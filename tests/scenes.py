@@ -67,7 +67,7 @@ class Camera:
         return matrix
 
     def perspective(self, near=0.01, far=100.0):
-        """3DGS projection matrix (4, 4), column-vector form, principal point moved by `shift` px."""
+        """3DGS projection (4, 4) for column vectors, principal point moved by `shift` px."""
         matrix = torch.zeros(4, 4, dtype=torch.float64)
         matrix[0, 0], matrix[1, 1] = 1 / self.tanfovx, 1 / self.tanfovy
         matrix[0, 2] = 2 * self.shift[0] / self.image_width
@@ -167,8 +167,9 @@ def with_precomputed(scene, seed=0, scale_modifier=1.0):
 def splat_scene(camera, means2d, cov2d, opacities, depths, colors=None):
     """Gaussians that project to exactly these splats under an AxisCamera.
 
-    Their covariance has no extent along z, so the projection Jacobian's third column multiplies zero
-    and cov2d = (focal / z)^2 * cov3d_xy wherever the splat is. means2d (P, 2) px, cov2d (P, 3) px^2.
+    Their covariance has no extent along z, so the projection Jacobian's third column multiplies
+    zero and cov2d = (focal / z)^2 * cov3d_xy wherever the splat is. means2d (P, 2) px, cov2d (P, 3)
+    px^2.
     """
     size = torch.tensor([camera.image_width, camera.image_height], dtype=torch.float64)
     tangent = torch.tensor([camera.tanfovx, camera.tanfovy], dtype=torch.float64)

@@ -5,10 +5,9 @@ The rest of the suite trusts reference.py; this file says why. None of it import
 
 import math
 
-import torch
-
 import reference
 import scenes
+import torch
 
 
 def generic_splats(seed, count=200, sigma=(0.1, 5.0), ratio=(1.2, 50.0)):
@@ -66,14 +65,14 @@ def test_exact_weight_derivatives_are_heat_equation():
 def test_frozen_window_is_the_integral_over_a_window_that_stays():
     """With the exact CDF, the frozen derivative is that of a bivariate integral.
 
-    The window is the pixel turned by the eigenframe of the *unperturbed* Sigma; in that frame the pixel
-    is axis-aligned and the perturbed Sigma correlated: exactly exact_weight.
+    The window is the pixel turned by the eigenframe of the *unperturbed* Sigma; in that frame the
+    pixel is axis-aligned and the perturbed Sigma correlated: exactly exact_weight.
     """
     offset, cov2d = generic_splats(3)
     cov2d.requires_grad_()
     offset.requires_grad_()
     frozen = reference.rotated_window(
-        offset, cov2d, "frozen", reference.normal_cdf, reference.normal_pdf
+        offset, cov2d, "frozen", reference.normal_window, reference.normal_pdf
     )
     matrix = torch.stack([cov2d[:, [0, 1]], cov2d[:, [1, 2]]], -2)
     axes = torch.linalg.eigh(matrix.detach()).eigenvectors
@@ -94,7 +93,7 @@ def test_frozen_window_by_finite_differences_of_the_correlated_integral():
     offset = torch.tensor([0.4, -0.7], dtype=torch.float64)
     cov2d = torch.tensor([0.81, 0.0, 0.25], dtype=torch.float64, requires_grad=True)
     frozen = reference.rotated_window(
-        offset, cov2d, "frozen", reference.normal_cdf, reference.normal_pdf
+        offset, cov2d, "frozen", reference.normal_window, reference.normal_pdf
     )
     slope = torch.autograd.grad(frozen, cov2d)[0][1].item()
     step = torch.tensor([0.0, 1e-4, 0.0], dtype=torch.float64)
@@ -110,6 +109,14 @@ def test_logistic_cdf_is_within_the_papers_error():
     assert (reference.logistic_cdf(x) - reference.normal_cdf(x)).abs().max() < 4e-4
     slope = torch.autograd.grad(reference.logistic_cdf(x.requires_grad_()).sum(), x)[0]
     assert (slope - reference.logistic_pdf(x)).abs().max() < 1e-14
+
+
+def test_logistic_window_is_the_difference_of_the_cdf():
+    g = torch.Generator().manual_seed(4)
+    sigma = torch.exp(scenes.rand(g, 2000, low=-3.0, high=2.0))
+    u = scenes.rand(g, 2000, low=-4.0, high=4.0) * (sigma + 0.5)
+    plain = reference.logistic_cdf((u + 0.5) / sigma) - reference.logistic_cdf((u - 0.5) / sigma)
+    assert (reference.logistic_window(u, sigma) - plain).abs().max() < 1e-15
 
 
 def test_spherical_harmonics_are_orthonormal():
