@@ -1,0 +1,738 @@
+"""The contract with code that was written for other rasterizers, and with wrong input."""
+
+import copy
+import inspect
+import math
+import os
+import pathlib
+import pickle
+import subprocess
+import sys
+
+import pytest
+import reference
+import scenes
+import torch
+from scenes import KINDS, VARIANTS, Camera, name_of
+
+import analytic_rasterizer as ar
+
+FIELDS = (
+    "image_height",
+    "image_width",
+    "tanfovx",
+    "tanfovy",
+    "bg",
+    "scale_modifier",
+    "viewmatrix",
+    "projmatrix",
+    "sh_degree",
+    "campos",
+    "prefiltered",
+    "debug",
+)
+CAMERA = Camera(bg=(0.2, 0.5, 0.9), sh_degree=1)
+Settings = ar.GaussianRasterizationSettings
+
+each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
+
+
+@pytest.fixture(autouse=True)
+def no_default_footprint(monkeypatch):
+    monkeypatch.delenv("ANALYTIC_RASTERIZER_FOOTPRINT", raising=False)
+    ar.set_default_footprint(None)
+    yield
+    ar.set_default_footprint(None)
+
+
+def scene32(seed=1, count=20, degree=1):
+    return scenes.cast(scenes.random_scene(seed, count, degree), torch.float32)
+
+
+def render(scene, settings=None):
+    return ar.GaussianRasterizer(settings or CAMERA.settings(torch.float32))(**scene)
+
+
+def gradients(scene, settings=None):
+    """(color, radii, gradients by name) of sum(color * fixed weights)."""
+    leaves = scenes.leaves(scene)
+    color, radii = render(leaves, settings)
+    g = torch.Generator().manual_seed(2)
+    (color * scenes.rand(g, *color.shape, low=-1.0).to(color.dtype)).sum().backward()
+    return color.detach(), radii, {name: leaf.grad for name, leaf in leaves.items()}
+
+
+# --- names and settings ------------------------------------------------------------------------
+
+
+def test_public_names():
+    expected = {
+        "FOOTPRINTS",
+        "TILE",
+        "GaussianRasterizationSettings",
+        "GaussianRasterizer",
+        "footprint_weight",
+        "get_default_footprint",
+        "rasterize_gaussians",
+        "render_stages",
+        "set_default_footprint",
+    }
+    assert expected <= set(ar.__all__)
+    assert all(hasattr(ar, name) for name in ar.__all__)
+
+
+def test_import_under_the_name_existing_code_uses():
+    import diff_gaussian_rasterization as drop_in
+
+    assert drop_in.GaussianRasterizationSettings is ar.GaussianRasterizationSettings
+    assert drop_in.GaussianRasterizer is ar.GaussianRasterizer
+    assert drop_in.rasterize_gaussians is ar.rasterize_gaussians
+    # Its mere presence makes 3DGS take another code path.
+    assert not hasattr(drop_in, "SparseGaussianAdam")
+
+
+def test_settings_look_like_those_of_3dgs_2023():
+    """Downstream code probes _fields and the signature: neither may show more."""
+    assert Settings._fields == FIELDS
+    assert tuple(inspect.signature(Settings).parameters) == FIELDS
+    assert all(
+        p.default is inspect.Parameter.empty
+        for p in inspect.signature(Settings).parameters.values()
+    )
+
+
+@pytest.mark.parametrize("extra", [{}, {"footprint": "box", "samples": 8}], ids=["plain", "box"])
+def test_settings_are_a_tuple(extra):
+    fields = CAMERA.fields()
+    by_keyword = Settings(**fields, **extra)
+    by_position = Settings(*fields.values(), **extra)
+    for settings in (by_keyword, by_position):
+        assert isinstance(settings, tuple)
+        assert len(settings) == 12
+        assert [*settings] == [*fields.values()]
+        assert settings[1] == settings.image_width == 45
+        assert settings._asdict() == fields
+        height, width, *rest = settings
+        assert (height, width, len(rest)) == (37, 45, 10)
+    assert by_keyword.footprint == by_position.footprint
+
+
+def test_missing_and_unknown_fields():
+    fields = CAMERA.fields()
+    with pytest.raises(TypeError):
+        Settings(**{k: v for k, v in fields.items() if k != "debug"})
+    with pytest.raises(TypeError, match="antialias"):
+        Settings(**fields, antialias=True)
+    with pytest.raises(TypeError):
+        Settings(*fields.values(), False)
+    with pytest.raises((TypeError, ValueError), match="samples"):
+        Settings(**fields, samples=4)  # an option without its footprint
+
+
+BOX8 = {"footprint": "box", "samples": 8}
+
+
+def assert_same_footprint(settings, expected):
+    scene = scene32()
+    assert torch.equal(render(scene, settings)[0], render(scene, expected)[0])
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        lambda s: s._replace(bg=s.bg),
+        copy.copy,
+        copy.deepcopy,
+        lambda s: pickle.loads(pickle.dumps(s)),
+        lambda s: Settings(*s, footprint=s.footprint),
+    ],
+    ids=["_replace", "copy", "deepcopy", "pickle", "rebuilt"],
+)
+def test_copies_keep_the_footprint(how):
+    settings = CAMERA.settings(torch.float32, **BOX8)
+    duplicate = how(settings)
+    assert type(duplicate) is Settings
+    assert duplicate._fields == FIELDS
+    assert str(duplicate.footprint) == str(settings.footprint)
+    assert_same_footprint(duplicate, settings)
+
+
+def test_replace():
+    settings = CAMERA.settings(torch.float32, **BOX8)
+    smaller = settings._replace(image_height=10)
+    assert smaller.image_height == 10
+    assert settings.image_height == 37
+    assert render(scene32(), smaller)[0].shape == (3, 10, 45)
+    assert_same_footprint(
+        settings._replace(footprint="mip"), CAMERA.settings(torch.float32, footprint="mip")
+    )
+    with pytest.raises((TypeError, ValueError), match="nonsense"):
+        settings._replace(nonsense=1)
+
+
+def test_make():
+    """NamedTuple's other constructor."""
+    settings = Settings._make(CAMERA.fields(torch.float32).values())
+    assert type(settings) is Settings
+    assert_same_footprint(settings, CAMERA.settings(torch.float32))
+    assert "image_height=37" in repr(settings)
+
+
+def test_settings_without_footprint_follow_the_default():
+    """The default is looked up when rendering, so set_default_footprint works on existing code."""
+    settings = CAMERA.settings(torch.float32)
+    expected = {
+        name_of(v): render(scene32(), CAMERA.settings(torch.float32, footprint=v[0], **v[1]))[0]
+        for v in VARIANTS
+    }
+    assert torch.equal(render(scene32(), settings)[0], expected["analytic-frozen"])
+    ar.set_default_footprint("box", samples=2)
+    assert torch.equal(render(scene32(), settings)[0], expected["box-2"])
+    ar.set_default_footprint("point:dilation=0")
+    assert str(ar.get_default_footprint()).startswith("point")
+    assert torch.equal(render(scene32(), settings)[0], expected["point-0.0"])
+    with pytest.raises(ValueError, match=r"footprint must .*'nonsense'"):
+        ar.set_default_footprint("nonsense")
+    assert torch.equal(render(scene32(), settings)[0], expected["point-0.0"])
+    # An explicit footprint is not touched by the default.
+    explicit = CAMERA.settings(torch.float32, footprint="mip")
+    assert torch.equal(render(scene32(), explicit)[0], expected["mip"])
+    assert not torch.equal(expected["mip"], expected["point-0.0"])
+
+
+def test_environment_variable(monkeypatch):
+    variable = "ANALYTIC_RASTERIZER_FOOTPRINT"
+    monkeypatch.setenv(variable, "box:samples=2")
+    assert str(ar.get_default_footprint()) == "box:samples=2"
+    assert_same_footprint(
+        CAMERA.settings(torch.float32), CAMERA.settings(torch.float32, footprint="box", samples=2)
+    )
+    ar.set_default_footprint("mip")  # the call wins over the variable
+    assert ar.get_default_footprint().name == "mip"
+    ar.set_default_footprint(None)
+    monkeypatch.setenv(variable, "")
+    assert ar.get_default_footprint().name == "analytic"
+    monkeypatch.setenv(variable, "bocks")
+    with pytest.raises(ValueError, match=r"ANALYTIC_RASTERIZER_FOOTPRINT.*bocks"):
+        ar.get_default_footprint()
+
+
+def test_environment_variable_of_a_new_process():
+    """As a user sets it: outside, for a script that only knows the old import."""
+    code = (
+        "import diff_gaussian_rasterization, analytic_rasterizer as ar;"
+        "print(ar.get_default_footprint())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        cwd=pathlib.Path(__file__).resolve().parent.parent,
+        env=os.environ | {"ANALYTIC_RASTERIZER_FOOTPRINT": "cumulant"},
+        check=False,
+    )
+    assert done.stdout.strip() == "cumulant", done.stderr
+
+
+# --- what is accepted --------------------------------------------------------------------------
+
+
+def test_call_forms_agree():
+    """Keywords, positions, the function, with and without gradients."""
+    scene = scene32()
+    settings = CAMERA.settings(torch.float32)
+    expected, radii = render(scene, settings)
+    assert expected.dtype == torch.float32
+    assert radii.dtype == torch.int32
+    rasterizer = ar.GaussianRasterizer(raster_settings=settings)
+    assert isinstance(rasterizer, torch.nn.Module)
+    positional = rasterizer(
+        scene["means3D"], scene["means2D"], scene["opacities"], scene["shs"], None,
+        scene["scales"], scene["rotations"],
+    )  # fmt: skip
+    functional = ar.rasterize_gaussians(
+        scene["means3D"], scene["means2D"], scene["shs"], None, scene["opacities"],
+        scene["scales"], scene["rotations"], None, settings,
+    )  # fmt: skip
+    with torch.no_grad():
+        inference = render(scenes.leaves(scene), settings)
+    tracked = render(scenes.leaves(scene), settings)
+    assert tracked[0].requires_grad
+    assert not tracked[1].requires_grad
+    assert not inference[0].requires_grad
+    for result in (positional, functional, inference, tracked):
+        assert len(result) == 2
+        assert torch.equal(result[0], expected)
+        assert torch.equal(result[1], radii)
+
+
+def test_some_inputs_without_gradient():
+    scene = scene32()
+    _, _, full = gradients(scene)
+    for name in scene:
+        leaves = {k: v.clone().requires_grad_(k == name) for k, v in scene.items()}
+        color, _ = render(leaves)
+        g = torch.Generator().manual_seed(2)
+        (color * scenes.rand(g, *color.shape, low=-1.0).float()).sum().backward()
+        assert torch.equal(leaves[name].grad, full[name]), name
+        assert all(leaf.grad is None for k, leaf in leaves.items() if k != name)
+
+
+def test_gradients_accumulate_and_the_graph_can_be_kept():
+    leaves = scenes.leaves(scene32())
+    color, _ = render(leaves)
+    color.sum().backward(retain_graph=True)
+    once = {name: leaf.grad.clone() for name, leaf in leaves.items()}
+    color.sum().backward()
+    for name, leaf in leaves.items():
+        assert torch.equal(leaf.grad, 2 * once[name]), name
+
+
+def test_image_gradients_of_any_layout():
+    """An expanded gradient (sum), a strided one (transpose), and a partial one (slice)."""
+    scene = scene32()
+    leaves = scenes.leaves(scene)
+    color, _ = render(leaves)
+    by_sum = torch.autograd.grad(color.sum(), leaves["means3D"], retain_graph=True)[0]
+    ones = torch.ones(37, 3, 45).transpose(0, 1)
+    assert not ones.is_contiguous()
+    by_strided = torch.autograd.grad(color, leaves["means3D"], ones, retain_graph=True)[0]
+    assert torch.equal(by_sum, by_strided)
+    parts = [
+        torch.autograd.grad(color[:, rows].sum(), leaves["means3D"], retain_graph=True)[0]
+        for rows in (slice(0, 20), slice(20, 37))
+    ]
+    # Two float32 sums in another order: 37 * 45 terms, far from cancelling to 1e-3.
+    assert (sum(parts) - by_sum).abs().max() < 1e-4 * by_sum.abs().max()
+
+
+def test_a_second_derivative_is_refused():
+    """Not implemented: it must say so, not return something."""
+    leaves = scenes.leaves(scene32())
+    color, _ = render(leaves)
+    first = torch.autograd.grad((color**2).sum(), leaves["means3D"], create_graph=True)[0]
+    with pytest.raises(RuntimeError):
+        first.sum().backward()
+    offset = torch.tensor([0.3, 0.2], requires_grad=True)
+    value = ar.footprint_weight(offset, torch.tensor([1.0, 0.0, 2.0]))
+    first = torch.autograd.grad(value**2, offset, create_graph=True)[0]
+    with pytest.raises(RuntimeError):
+        first.sum().backward()
+
+
+def test_strided_inputs():
+    """Columns of a larger tensor, transposed matrices: everything as if contiguous."""
+    scene = scene32()
+    expected = gradients(scene)
+    strided = {}
+    for name, value in scene.items():
+        wide = torch.stack([value, value + 1], -1)[..., 0]
+        assert not wide.is_contiguous() or wide.numel() == 0
+        strided[name] = wide
+    fields = CAMERA.fields(torch.float32)
+    for name in ("viewmatrix", "projmatrix"):
+        fields[name] = fields[name].T.contiguous().T
+        assert not fields[name].is_contiguous()
+    fields["bg"] = torch.stack([fields["bg"]] * 2, -1)[:, 0]
+    fields["campos"] = torch.stack([fields["campos"]] * 2, -1)[:, 0]
+    leaves = {name: value.detach().requires_grad_() for name, value in strided.items()}
+    color, radii = render(leaves, Settings(**fields))
+    g = torch.Generator().manual_seed(2)
+    (color * scenes.rand(g, *color.shape, low=-1.0).float()).sum().backward()
+    assert torch.equal(color, expected[0])
+    assert torch.equal(radii, expected[1])
+    for name, leaf in leaves.items():
+        assert torch.equal(leaf.grad, expected[2][name]), name
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda f: {"viewmatrix": f["viewmatrix"][None], "projmatrix": f["projmatrix"][None]},
+        lambda f: {"tanfovx": torch.tensor(f["tanfovx"]).double()},
+        lambda f: {"tanfovx": torch.tensor(f["tanfovx"]).double(), "tanfovy": torch.tensor(0.5)},
+        lambda f: {"scale_modifier": 1},
+        lambda f: {"prefiltered": True},
+    ],
+    ids=["batched matrices", "0-dim tanfov", "0-dim tanfovs", "int modifier", "prefiltered"],
+)
+def test_settings_in_other_forms(change):
+    fields = CAMERA.fields(torch.float32)
+    expected = render(scene32(), Settings(**fields))
+    actual = render(scene32(), Settings(**(fields | change(fields))))
+    assert torch.equal(actual[0], expected[0])
+    assert torch.equal(actual[1], expected[1])
+
+
+def test_flat_opacities():
+    scene = scene32()
+    column, flat = gradients(scene), gradients(dict(scene, opacities=scene["opacities"][:, 0]))
+    assert torch.equal(column[0], flat[0])
+    assert flat[2]["opacities"].shape == (20,)
+    assert torch.equal(flat[2]["opacities"], column[2]["opacities"][:, 0])
+
+
+@pytest.mark.parametrize(
+    "empty",
+    [None, torch.Tensor([]), torch.zeros(0, dtype=torch.float64), torch.zeros(0, device="meta")],
+    ids=["None", "Tensor([])", "other dtype", "other device"],
+)
+def test_missing_inputs(empty):
+    """3DGS passes torch.Tensor([]), on the CPU and in float32 whatever the rest is."""
+    scene = scene32()
+    expected, _ = render(scene)
+    assert torch.equal(render(dict(scene, colors_precomp=empty, cov3D_precomp=empty))[0], expected)
+    precomputed = scenes.cast(scenes.with_precomputed(scenes.random_scene(1, 20)), torch.float32)
+    expected, _ = render(precomputed)
+    missing = {"shs": empty, "scales": empty, "rotations": empty, "means2D": empty}
+    assert torch.equal(render(precomputed | missing)[0], expected)
+
+
+def test_mark_visible():
+    """In front of the near plane z > 0.2, wherever in the image."""
+    settings = CAMERA.settings(torch.float32)
+    g = torch.Generator().manual_seed(5)
+    positions = scenes.rand(g, 500, 3, low=-8.0, high=8.0).float()
+    visible = ar.GaussianRasterizer(settings).markVisible(positions)
+    assert visible.dtype == torch.bool
+    assert visible.shape == (500,)
+    z = (
+        torch.cat([positions.double(), torch.ones(500, 1).double()], -1)
+        @ CAMERA.fields()["viewmatrix"]
+    )
+    z = z[:, 2]
+    clear = (z - reference.NEAR).abs() > 1e-4
+    assert torch.equal(visible[clear], (z > reference.NEAR)[clear])
+    assert 0 < visible.sum() < 500
+    assert not visible.requires_grad
+    tracked = ar.GaussianRasterizer(settings).markVisible(positions.requires_grad_())
+    assert torch.equal(tracked, visible)
+    batched = settings._replace(viewmatrix=settings.viewmatrix[None])
+    assert torch.equal(ar.GaussianRasterizer(batched).markVisible(positions), visible)
+    assert ar.GaussianRasterizer(settings).markVisible(positions[:0]).shape == (0,)
+
+
+def test_inputs_are_left_alone():
+    scene = scene32()
+    before = {name: value.clone() for name, value in scene.items()}
+    gradients(scene)
+    for name, value in scene.items():
+        assert torch.equal(value, before[name])
+
+
+# --- Gaussians that are no Gaussians -----------------------------------------------------------
+
+NUMBERS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
+
+
+@each_kind
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@pytest.mark.parametrize("number", NUMBERS)
+@pytest.mark.parametrize("precomputed", [False, True], ids=["scales-sh", "precomputed"])
+def test_non_finite_gaussians_are_culled(variant, dtype, number, precomputed):
+    """Radius 0, zero gradient, and every other Gaussian as if they were not there, to the bit."""
+    footprint, options = variant
+    settings = CAMERA.settings(dtype, footprint=footprint, **options)
+    scene = scenes.random_scene(1, 40, degree=1)
+    if precomputed:
+        scene = scenes.with_precomputed(scene)
+    scene = scenes.cast(scene, dtype)
+    broken = {name: value.clone() for name, value in scene.items()}
+    bad = []
+    for name, value in broken.items():
+        if name == "means2D":  # its values are ignored
+            continue
+        for column in range(value[0].numel()):
+            if len(bad) < 30:
+                value[len(bad)].view(-1)[column] = NUMBERS[number]
+                bad.append(len(bad))
+    good = torch.tensor([i for i in range(40) if i not in bad])
+    expected = gradients({name: value[good] for name, value in scene.items()}, settings)
+    actual = gradients(broken, settings)
+    assert torch.equal(actual[0], expected[0])
+    assert (actual[1][bad] == 0).all()
+    assert torch.equal(actual[1][good], expected[1])
+    for name in scene:
+        assert torch.equal(actual[2][name][good], expected[2][name]), name
+        assert (actual[2][name][bad] == 0).all(), name
+
+
+@each_kind
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_degenerate_gaussians_are_harmless(variant, dtype):
+    """Zero, negative and huge scales, indefinite covariances, absurd opacities: finite, always.
+
+    Nothing but finiteness (and a sane image) is asked: what such a Gaussian looks like is
+    undefined.
+    """
+    footprint, options = variant
+    settings = CAMERA.settings(dtype, footprint=footprint, **options)
+    scene = scenes.random_scene(1, 30, degree=1)
+    values = [0.0, 1e-30, 1e-12, 1e-6, 1e6, 1e12, 1e30, -0.3]
+    for i, value in enumerate(values):
+        scene["scales"][i] = value
+        scene["scales"][8 + i, 0] = value
+    scene["opacities"][16:22, 0] = torch.tensor([-1.0, 0.0, 1.0, 1.5, 1e30, -1e30])
+    scene["means3D"][22] = torch.tensor([1e30, 0.0, 0.0])
+    scene["means3D"][23] = torch.tensor(CAMERA.eye)  # z = 0 in camera space
+    scene["means3D"][24] = torch.tensor([1e-30, 1e-38, -1e-30])
+    for case in (scene, scenes.with_precomputed(scene)):
+        if "cov3D_precomp" in case:
+            case["cov3D_precomp"] = torch.nan_to_num(case["cov3D_precomp"].to(dtype)).double()
+            case["cov3D_precomp"][25] = torch.tensor([1.0, 2, 0, 1, 0, 1])  # indefinite
+            case["cov3D_precomp"][26] = torch.tensor([-1.0, 0, 0, -1, 0, -1])
+            case["cov3D_precomp"][27] = 0.0
+        color, _, grads = gradients(scenes.cast(case, dtype), settings)
+        assert torch.isfinite(color).all()
+        for name, gradient in grads.items():
+            assert torch.isfinite(gradient).all(), (name, torch.nonzero(~torch.isfinite(gradient)))
+
+
+# --- errors ------------------------------------------------------------------------------------
+
+
+def t(*shape, **kwargs):
+    return torch.ones(*shape, **kwargs)
+
+
+DOUBLE, HALF, LONG = (
+    f"got ({name})" for name in ("Double|torch.float64", "Half|torch.float16", "Long|torch.int64")
+)
+META = torch.device("meta")
+NAN_4X4 = t(4, 4) * math.nan
+
+# P = 20 Gaussians with 4 SH rows; what is changed, and the message that is due.
+WRONG_SHAPES = {
+    "means3D": [
+        ({"means3D": t(20, 2)}, r"means3D must have shape \(P, 3\), got \(20, 2\)"),
+        ({"means3D": t(3)}, r"means3D must .*got \(3,?\)"),
+    ],
+    "means2D": [
+        ({"means2D": t(20, 2)}, r"means2D must .*got \(20, 2\)"),
+        ({"means2D": t(19, 3)}, r"means2D must .*got \(19, 3\)"),
+    ],
+    "opacities": [
+        ({"opacities": t(19, 1)}, r"opacities must .*got \(19, 1\)"),
+        ({"opacities": t(20, 2)}, r"opacities must .*got \(20, 2\)"),
+    ],
+    "shs": [
+        ({"shs": t(20, 4, 2)}, r"shs must .*got \(20, 4, 2\)"),
+        ({"shs": t(20, 12)}, r"shs must .*got \(20, 12\)"),
+        ({"shs": t(20, 3, 3)}, r"shs must .*got .*3"),
+    ],
+    "scales": [
+        ({"scales": t(20, 2)}, r"scales must .*got \(20, 2\)"),
+        ({"scales": t(21, 3)}, r"scales must .*got \(21, 3\)"),
+    ],
+    "rotations": [({"rotations": t(20, 3)}, r"rotations must .*got \(20, 3\)")],
+    "colors_precomp": [
+        ({"shs": None, "colors_precomp": t(20, 4)}, r"colors_precomp must .*got \(20, 4\)"),
+    ],
+    "cov3D_precomp": [
+        (
+            {"scales": None, "rotations": None, "cov3D_precomp": t(20, 3, 3)},
+            r"cov3D_precomp must .*got \(20, 3, 3\)",
+        ),
+    ],
+    "which inputs": [
+        ({"shs": None}, r"shs.*colors_precomp|colors_precomp.*shs"),
+        ({"colors_precomp": t(20, 3)}, r"shs.*colors_precomp|colors_precomp.*shs"),
+        ({"scales": None, "rotations": None}, r"scales.*cov3D_precomp|cov3D_precomp.*scales"),
+        ({"rotations": None}, r"rotations"),
+        ({"cov3D_precomp": t(20, 6)}, r"cov3D_precomp"),
+    ],
+    "devices": [
+        ({"scales": t(20, 3, device=META)}, r"scales must .*got .*meta"),
+        ({"means3D": t(20, 3, device=META)}, r"must .*got .*"),
+        ({"bg": t(3, device=META)}, r"bg must .*got .*meta"),
+    ],
+    "bg": [({"bg": t(4)}, r"bg must .*got \(4,?\)")],
+    "viewmatrix": [
+        ({"viewmatrix": t(3, 4)}, r"viewmatrix must .*got \(3, 4\)"),
+        ({"viewmatrix": t(2, 4, 4)}, r"viewmatrix must .*got \(2, 4, 4\)"),
+        ({"viewmatrix": NAN_4X4}, r"viewmatrix must .*finite.*got"),
+    ],
+    "projmatrix": [
+        ({"projmatrix": t(16)}, r"projmatrix must .*got \(16,?\)"),
+        ({"projmatrix": t(4, 4) * math.inf}, r"projmatrix must .*finite.*got"),
+    ],
+    "campos": [
+        ({"campos": t(2)}, r"campos must .*got \(2,?\)"),
+        ({"campos": t(3) * math.nan}, r"campos must .*finite.*got"),
+    ],
+    "numbers": [
+        ({"image_height": -1}, r"image_height must .*got -1"),
+        ({"image_width": 0}, r"image_width must .*got 0"),
+        ({"tanfovx": 0.0}, r"tanfovx must .*got 0"),
+        ({"tanfovy": math.nan}, r"tanfovy must .*got nan"),
+        ({"scale_modifier": math.nan}, r"scale_modifier must .*got nan"),
+        ({"sh_degree": 4}, r"sh_degree must .*got 4"),
+        ({"sh_degree": -1}, r"sh_degree must .*got -1"),
+    ],
+}
+WRONG_TYPES = {
+    "no tensor": [
+        ({"means3D": [[0, 0, 0]]}, r"means3D must .*got list"),
+        ({"means3D": None}, r"means3D must .*got NoneType"),
+        ({"opacities": None}, r"opacities must .*got NoneType"),
+        ({"scales": "big"}, r"scales must .*got str"),
+        ({"bg": [0, 0, 0]}, r"bg must .*got list"),
+        ({"viewmatrix": None}, r"viewmatrix must .*got NoneType"),
+    ],
+    "dtype": [
+        ({"means3D": t(20, 3).half()}, rf"means3D must .*{HALF}"),
+        ({"means3D": t(20, 3).long()}, rf"means3D must .*{LONG}"),
+        ({"opacities": t(20, 1).double()}, rf"opacities must .*{DOUBLE}"),
+        ({"shs": t(20, 4, 3).double()}, rf"shs must .*{DOUBLE}"),
+        ({"bg": t(3).double()}, rf"bg must .*{DOUBLE}"),
+        ({"viewmatrix": t(4, 4).double()}, rf"viewmatrix must .*{DOUBLE}"),
+    ],
+}
+WRONG = [
+    pytest.param(error, changes, pattern, id=f"{group} {i}")
+    for error, table in ((ValueError, WRONG_SHAPES), (TypeError, WRONG_TYPES))
+    for group, cases in table.items()
+    for i, (changes, pattern) in enumerate(cases)
+]
+
+
+@pytest.mark.parametrize("stages", [False, True], ids=["rasterizer", "stages"])
+@pytest.mark.parametrize("error, changes, pattern", WRONG)
+def test_errors(error, changes, pattern, stages):
+    """NAME must EXPECTATION, got ACTUAL: before anything is computed."""
+    if stages and "means2D" in changes:
+        pytest.skip("render_stages takes no means2D")
+    fields = CAMERA.fields(torch.float32)
+    settings = Settings(**fields | {k: v for k, v in changes.items() if k in FIELDS})
+    scene = scene32() | {k: v for k, v in changes.items() if k not in FIELDS}
+    with pytest.raises(error, match=pattern):
+        if stages:
+            del scene["means2D"]
+            ar.render_stages(settings, **scene)
+        else:
+            render(scene, settings)
+
+
+@pytest.mark.parametrize(
+    "keywords, pattern",
+    [
+        ({"footprint": "gauss"}, r"footprint must .*got 'gauss'"),
+        ({"footprint": ""}, r"footprint must .*got ''"),
+        ({"footprint": "box", "samples": 3}, r"samples must .*got 3"),
+        ({"footprint": "box:samples=0"}, r"samples must .*got '?0"),
+        ({"footprint": "box:sample=4"}, r"'sample'"),
+        ({"footprint": "box:4"}, r"'4'"),
+        ({"footprint": "mip", "samples": 4}, r"'samples'"),
+        ({"footprint": "mip", "variance": -0.1}, r"variance must .*got -0.1"),
+        ({"footprint": "mip", "variance": "wide"}, r"variance must .*got 'wide'"),
+        ({"footprint": "point", "dilation": math.inf}, r"dilation must .*got inf"),
+        ({"footprint": "analytic", "frame_gradient": "thawed"}, r"frame_gradient must .*'thawed'"),
+    ],
+    ids=str,
+)
+def test_wrong_footprints(keywords, pattern):
+    """Refused when the settings are made, not when they are used."""
+    with pytest.raises(ValueError, match=pattern):
+        CAMERA.settings(torch.float32, **keywords)
+
+
+def test_mark_visible_errors():
+    rasterizer = ar.GaussianRasterizer(CAMERA.settings(torch.float32))
+    with pytest.raises(ValueError, match=r"positions must .*got \(5, 2\)"):
+        rasterizer.markVisible(t(5, 2))
+    with pytest.raises(TypeError, match=r"positions must .*got"):
+        rasterizer.markVisible(t(5, 3).long())
+    with pytest.raises(TypeError, match=r"positions must .*got"):
+        rasterizer.markVisible([[0.0, 0.0, 0.0]])
+
+
+def test_debug_writes_a_snapshot_on_failure(tmp_path, monkeypatch):
+    """A failing forward pass leaves its arguments behind and raises what it raised."""
+    monkeypatch.chdir(tmp_path)
+    settings = CAMERA.settings(torch.float32)._replace(debug=True)
+    render(scene32(), settings)
+    gradients(scene32(), settings)
+    assert not [*tmp_path.iterdir()]
+    with pytest.raises(ValueError, match="scales must"):
+        render(dict(scene32(), scales=t(20, 2)), settings)
+    saved = torch.load(tmp_path / "snapshot_fw.dump", weights_only=False)
+    assert any(torch.is_tensor(a) and a.shape == (20, 2) for a in saved)
+    with pytest.raises(ValueError, match="scales must"):
+        render(dict(scene32(), scales=t(20, 2)))  # without debug: no file
+    assert [path.name for path in tmp_path.iterdir()] == ["snapshot_fw.dump"]
+
+
+def test_debug_changes_no_bit():
+    plain = gradients(scene32())
+    debug = gradients(scene32(), CAMERA.settings(torch.float32)._replace(debug=True))
+    assert torch.equal(plain[0], debug[0])
+    for name, gradient in plain[2].items():
+        assert torch.equal(gradient, debug[2][name])
+
+
+# --- torch.library -----------------------------------------------------------------------------
+
+
+def op_arguments(variant, keep, gradient):
+    """Arguments of the `rasterize` op, as its schema orders them."""
+    footprint = ar.resolve_footprint(variant[0], **variant[1])
+    fields = CAMERA.fields(torch.float32)
+    scene = scene32()
+    if gradient:
+        scene = scenes.leaves(scene)
+    gaussians = [scene.get(name) for name in scenes.INPUTS]
+    tensors = [fields[k] for k in ("bg", "viewmatrix", "projmatrix", "campos")]
+    numbers = [fields[k] for k in ("image_height", "image_width", "tanfovx", "tanfovy")]
+    numbers += [fields["scale_modifier"], fields["sh_degree"], footprint.key, footprint.variance]
+    return [*gaussians, *tensors, *numbers, keep]
+
+
+OPS = {
+    "rasterize": lambda v: op_arguments(v, True, True),
+    "rasterize (inference)": lambda v: op_arguments(v, False, False),
+    "rasterize_stages": lambda v: [  # no means2D, no keep
+        a for i, a in enumerate(op_arguments(v, False, False)) if i not in (1, 20)
+    ],
+    "rasterize_vjp": lambda v: vjp_arguments(v),
+    "footprint_weight": lambda v: weight_arguments(v, True),
+    "footprint_weight_vjp": lambda v: [torch.ones(7), *weight_arguments(v, False)],
+}
+
+
+def vjp_arguments(variant):
+    arguments = op_arguments(variant, True, False)
+    color, _, *saved = torch.ops.analytic_rasterizer.rasterize(*arguments)
+    needs = [a is not None for a in arguments[:8]]
+    return [torch.ones_like(color), *arguments[:-1], *saved, needs]
+
+
+def weight_arguments(variant, gradient):
+    footprint = ar.resolve_footprint(variant[0], **variant[1])
+    g = torch.Generator().manual_seed(0)
+    offset = scenes.rand(g, 7, 2).float().requires_grad_(gradient)
+    cov2d = scenes.random_cov2d(g, 7, (0.5, 2.0)).float().requires_grad_(gradient)
+    return [offset, cov2d, footprint.key, footprint.variance]
+
+
+def test_every_op_is_checked():
+    registered = {
+        name.split("::")[1].split(".")[0]
+        for name in torch._C._dispatch_get_all_op_names()
+        if name.startswith("analytic_rasterizer::")
+    }
+    assert registered == {name.split(" ")[0] for name in OPS}
+
+
+@each_kind
+@pytest.mark.parametrize("op", OPS)
+def test_opcheck(op, variant):
+    """Schema, fake kernel, autograd registration, and dispatch under tracing.
+
+    rasterize_stages returns how long it took, so two runs of it are never equal, which is what the
+    tracing test asks.
+    """
+    overload = getattr(torch.ops.analytic_rasterizer, op.split(" ")[0]).default
+    checks = ("test_schema", "test_autograd_registration", "test_faketensor")
+    if op != "rasterize_stages":
+        checks = (*checks, "test_aot_dispatch_dynamic")
+    torch.library.opcheck(overload, tuple(OPS[op](variant)), test_utils=checks)
