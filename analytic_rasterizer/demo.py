@@ -1,7 +1,7 @@
 """A resolution target made of Gaussians, rendered with every footprint and compared with the truth.
 
 `make_target()` draws, with 3D Gaussians, what is hard to sample: rings and spokes that grow finer,
-strokes of text, hair, grains smaller than a pixel, and translucent blobs in front of a fabric.
+strokes of text, needles, a bush of leaves in many layers, and translucent blobs over a fabric.
 `run()` renders it at four resolutions, measures each footprint against a supersampled reference,
 and draws a sheet that shows all of it.
 """
@@ -93,8 +93,8 @@ def make_target() -> tuple[Scene, View]:
     _fabric(brush, centre=(192, 72), radius=54)
     _star(brush, centre=(317, 72), radius=50)
     _text(brush, top=150)
-    _grains(brush, random, centre=(245, 196), radius=46)
-    _hair(brush, random, left=300, top=150)
+    _leaves(brush, random, centre=(245, 196), radius=46)
+    _needles(brush, random, left=300, top=150)
     view = View("target", *CANVAS, FOCAL, FOCAL, torch.eye(4, dtype=torch.float64))
     return brush.scene(), view
 
@@ -188,8 +188,8 @@ LETTERS = {  # strokes on a grid 4 wide and 6 high, y down
 }
 
 
-def _grains(brush: Brush, random, centre, radius) -> None:
-    """A bush of opaque grains, most of them smaller than a pixel, in several layers."""
+def _leaves(brush: Brush, random, centre, radius) -> None:
+    """A bush of small opaque leaves, each at a depth of its own."""
     count = 1300
     r = radius * torch.rand(count, generator=random).sqrt()
     angle = 2 * math.pi * torch.rand(count, generator=random)
@@ -208,7 +208,7 @@ def _grains(brush: Brush, random, centre, radius) -> None:
     )
 
 
-def _hair(brush: Brush, random, left, top) -> None:
+def _needles(brush: Brush, random, left, top) -> None:
     """Needles of 2 units, in two crossing sweeps at different depths."""
     for sweep, (depth, color) in enumerate(((3.6, (0.55, 0.16, 0.42)), (4.2, (0.93, 0.55, 0.16)))):
         for i in range(22):
