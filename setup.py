@@ -34,6 +34,12 @@ COMPILE_ARGS = ["-O3", "-fopenmp", "-ffp-contract=off", "-fno-math-errno", "-fno
 class Build(BuildExtension):
     """Builds on every core unless MAX_JOBS says otherwise."""
 
+    def finalize_options(self):
+        super().finalize_options()
+        if self.editable_mode or self.inplace:
+            # One place for objects, so that a rebuild compiles only what changed.
+            self.build_temp = str(ROOT / "build" / f"temp-{sys.implementation.cache_tag}")
+
     def build_extensions(self):
         os.environ.setdefault("MAX_JOBS", str(os.cpu_count() or 1))
         super().build_extensions()

@@ -5,6 +5,7 @@ A drop-in replacement for `diff_gaussian_rasterization`. See the README for how 
 
 import torch  # noqa: F401  (its libraries must be loaded before the extension's)
 
+from ._C import instruction_set
 from .footprints import (
     FOOTPRINTS,
     Footprint,
@@ -33,6 +34,7 @@ __all__ = [
     "Stages",
     "footprint_weight",
     "get_default_footprint",
+    "instruction_set",
     "rasterize_gaussians",
     "render_stages",
     "resolve_footprint",

@@ -88,6 +88,7 @@ def _(dL_dweight, offset, cov2d, footprint, variance):
 def _rasterize_setup(ctx, inputs, output):
     color, radii, *saved = output
     ctx.mark_non_differentiable(radii, *saved)
+    ctx.set_materialize_grads(False)  # no zeros the size of everything saved
     tensors, (*ctx.settings, keep) = inputs[:12], inputs[12:]
     ctx.has_saved = keep
     if keep:
@@ -97,6 +98,8 @@ def _rasterize_setup(ctx, inputs, output):
 def _rasterize_backward(ctx, dL_dcolor, *_):
     if not ctx.has_saved:
         raise RuntimeError("rasterize was called with keep=False and cannot be differentiated")
+    if dL_dcolor is None:
+        return (None,) * len(ctx.needs_input_grad)
     tensors, saved = ctx.saved_tensors[:12], ctx.saved_tensors[12:]
     needs = list(ctx.needs_input_grad[:_DIFFERENTIABLE])
     grads = torch.ops.analytic_rasterizer.rasterize_vjp(

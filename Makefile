@@ -1,0 +1,74 @@
+# make demo: sets up what is needed and renders the demonstration.
+# make test: sets up what is needed and runs every test.
+# Set-up lives in a virtual environment, VENV. Nothing outside it is touched, except that on Debian as root
+# missing build tools are installed with apt-get.
+
+PYTHON ?= python3
+VENV ?= .venv
+# The torch to install where VENV has none. Any torch >= 2.4 will do: `make demo TORCH=torch==2.8.0`.
+TORCH ?= torch==2.13.0
+OUT ?= out
+BUILD ?= build
+
+BIN := $(VENV)/bin
+JOBS := $(shell nproc 2>/dev/null || echo 2)
+SOURCES := $(shell find csrc -name '*.h' -o -name '*.cpp' -o -name '*.cuh' -o -name '*.cu') setup.py pyproject.toml
+CPP_SOURCES := $(shell git ls-files 'csrc/*' 'tests/cpp/*' 2>/dev/null)
+# The system's cmake, or else one from PyPI.
+CMAKE = $(shell command -v cmake || echo $(BIN)/cmake)
+
+.PHONY: demo test test-cpp test-python test-sanitized bench format lint clean
+
+demo: $(VENV)/.installed
+	$(BIN)/python -m analytic_rasterizer demo --out $(OUT)
+
+test: test-cpp test-python
+
+test-cpp: $(VENV)/.tools
+	$(CMAKE) -S . -B $(BUILD)/cpp -DCMAKE_BUILD_TYPE=Release
+	$(CMAKE) --build $(BUILD)/cpp -j $(JOBS)
+	cd $(BUILD)/cpp && $(dir $(CMAKE))ctest --output-on-failure -j $(JOBS)
+
+# The C++ tests again, under AddressSanitizer and UndefinedBehaviorSanitizer.
+test-sanitized: $(VENV)/.tools
+	$(CMAKE) -S . -B $(BUILD)/sanitized -DAR_SANITIZE=ON
+	$(CMAKE) --build $(BUILD)/sanitized -j $(JOBS)
+	cd $(BUILD)/sanitized && $(dir $(CMAKE))ctest --output-on-failure -j $(JOBS)
+
+test-python: $(VENV)/.installed
+	$(BIN)/python -m pytest -q
+
+bench: $(VENV)/.installed
+	$(BIN)/python benchmarks/speed.py
+
+format: $(VENV)/.tools
+	$(BIN)/clang-format -i $(CPP_SOURCES)
+	$(BIN)/ruff check --fix . && $(BIN)/ruff format .
+
+lint: $(VENV)/.tools
+	$(BIN)/clang-format --dry-run -Werror $(CPP_SOURCES)
+	$(BIN)/ruff check . && $(BIN)/ruff format --check .
+
+$(VENV)/.venv:
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	touch $@
+
+# The versions of the formatters are pinned: others format differently.
+$(VENV)/.tools: $(VENV)/.venv
+	$(BIN)/python -m pip install --quiet clang-format==23.1.5 ruff==0.17.5
+	command -v cmake > /dev/null || $(BIN)/python -m pip install --quiet cmake
+	@if command -v apt-get > /dev/null && [ "$$(id -u)" = 0 ] && ! [ -e /usr/include/gtest/gtest.h ]; then \
+	  apt-get update -qq && apt-get install -y -qq g++ libgtest-dev > /dev/null; fi
+	touch $@
+
+$(VENV)/.torch: $(VENV)/.venv
+	$(BIN)/python -c "import torch" 2> /dev/null || $(BIN)/python -m pip install --quiet "$(TORCH)"
+	touch $@
+
+$(VENV)/.installed: $(VENV)/.torch $(SOURCES)
+	$(BIN)/python -m pip install --quiet --editable ".[test]"
+	touch $@
+
+clean:
+	rm -rf $(VENV) $(BUILD) $(OUT) analytic_rasterizer/*.so *.egg-info
