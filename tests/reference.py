@@ -394,14 +394,6 @@ def three_sigma(cov2d, footprint, **options):
     return 3 * torch.sqrt(largest)
 
 
-def peak(cov2d, footprint, **options):
-    """Weight at offset zero; for `box` that of a sample, which is what is compared with 1/255."""
-    zero = torch.zeros(2, dtype=cov2d.dtype)
-    if footprint == "box":
-        return blurred(zero, cov2d, box_variance((DEFAULT_OPTIONS["box"] | options)["samples"]))
-    return weight(zero, cov2d, footprint, **options)
-
-
 def render(
     settings,
     means3D,
@@ -457,8 +449,6 @@ def render(
 
     for i in torch.argsort(depths.detach(), stable=True).tolist():
         if depths[i] <= NEAR or determinant(cov2d[i]) <= 0:
-            continue
-        if opacities[i] * peak(cov2d[i], footprint, **options) < ALPHA_MIN:
             continue
         offset = pixels - means2d[i]
         if keep_offsets and offset.requires_grad:

@@ -174,7 +174,9 @@ def splat_scene(camera, means2d, cov2d, opacities, depths, colors=None):
     size = torch.tensor([camera.image_width, camera.image_height], dtype=torch.float64)
     tangent = torch.tensor([camera.tanfovx, camera.tanfovy], dtype=torch.float64)
     focal = size / (2 * tangent)
-    slope = ((2 * means2d + 1 - 2 * torch.tensor(camera.shift)) / size - 1) * tangent
+    slope = (
+        (2 * means2d + 1 - 2 * torch.tensor(camera.shift, dtype=torch.float64)) / size - 1
+    ) * tangent
     scale = depths[:, None] / focal
     count = len(means2d)
     cov3d = torch.zeros(count, 6, dtype=torch.float64)

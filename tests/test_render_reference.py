@@ -275,6 +275,24 @@ def test_cap_has_zero_gradient():
     assert (ours["colors_precomp"].grad == 0.99).all()
 
 
+@each_kind
+def test_near_plane(variant):
+    """z <= 0.2 is culled, z just beyond is not, whatever it covers."""
+    camera = Camera().facing_z()
+    depths = torch.tensor([-1.0, 1e-3, 0.199, 0.2, 0.201], dtype=torch.float64)
+    count = len(depths)
+    g = torch.Generator().manual_seed(0)
+    means = torch.tensor([22.0, 18.0]) + scenes.rand(g, count, 2, low=-9.0, high=9.0)
+    cov2d = scenes.random_cov2d(g, count, (2.0, 5.0), (1.0, 2.0))
+    opacities = torch.full((count,), 0.5, dtype=torch.float64)
+    scene = scenes.splat_scene(camera, means, cov2d, opacities, depths)
+    expected = compare(camera, scene, variant)
+    assert expected.radii.tolist()[:4] == [0] * 4
+    assert render(camera, scene, variant)[1].tolist()[:4] == [0] * 4
+    last = {name: value[4:] for name, value in scene.items()}
+    assert torch.equal(render(camera, scene, variant)[0], render(camera, last, variant)[0])
+
+
 # --- gradcheck ---------------------------------------------------------------------------------
 
 
@@ -439,6 +457,51 @@ def test_float32_gradients(variant):
     print(name_of(variant), {name: f"{error:.1e}" for name, error in errors.items()})
     for name, error in errors.items():
         assert error < 64 * torch.finfo(torch.float32).eps * 9, (name, error)
+
+
+@pytest.mark.parametrize("ratio", [100, 1000])
+@each_kind
+def test_needles_float32(variant, ratio):
+    """One needle of `ratio` with the area of a pixel-sized splat, in float32 against float64.
+
+    The numerics notes state 2e-6 for the weight and 9e-3 for the gradient of the shape of the
+    cumulant and its kin, whose amplitude avoids det and Sigma^-1. `analytic` divides by the small
+    deviation in a frame that is known to eps * ratio: its shape gradient errs by eps * ratio^2.
+    """
+    camera = Camera(image_width=64, image_height=48, tanfovx=0.5, tanfovy=0.4)
+    exact = {
+        name: value.double() if torch.is_tensor(value) else value
+        for name, value in camera.fields(torch.float32).items()
+    }
+    footprint, options = variant
+    settings = ar.GaussianRasterizationSettings(**exact, footprint=footprint, **options)
+    long = ratio**0.5
+    drawn = 0
+    for seed in range(6):
+        scene = scenes.random_scene(seed, 1, spread=0.3)
+        # 16 px per unit at the centre of the scene.
+        scene["scales"] = torch.tensor([[long, 1 / long, 1 / long]], dtype=torch.float64) / 16
+        scene["opacities"][:], scene["shs"][:] = 0.9, 1.0
+        single = scenes.leaves(scenes.cast(scene, torch.float32))
+        double = scenes.leaves(scenes.cast(scenes.cast(scene, torch.float32), torch.float64))
+        color, _ = render(camera, single, variant, torch.float32)
+        expected, _ = ar.GaussianRasterizer(settings)(**double)
+        # A threshold crossed by rounding is 1/255 and no matter of precision.
+        if ((color > 0) != (expected > 0)).any() or not (expected > 0).any():
+            continue
+        drawn += 1
+        # Beside the weight's 2e-6: 4 roundings of 64 px at a slope of 0.6/0.29 per px and peak.
+        assert (color - expected).abs().max() < 2e-6 + 3.2e-5 * expected.max()
+        loss = probe(camera)
+        (color * loss.float()).sum().backward()
+        (expected * loss).sum().backward()
+        limit = 9e-3
+        if footprint == "analytic":
+            limit = max(limit, torch.finfo(torch.float32).eps * ratio**2)
+        for name in scene:
+            error = relative_error(single[name].grad.double(), double[name].grad)
+            assert error < limit, (seed, name, error)
+    assert drawn >= 4
 
 
 # --- a trained scene (optional) ----------------------------------------------------------------
