@@ -31,7 +31,9 @@ template <class F, typename T> AR_HD Support<T> support_of(const Splat<F, T>& sp
 }
 
 /// Closed interval of pixel coordinates; empty where hi < lo.
-template <class V> struct Span { V lo, hi; };
+template <class V> struct Span {
+  V lo, hi;
+};
 
 /// Pixel rows whose centres the support reaches, before clamping to the image.
 template <typename T> AR_HD Span<T> rows_of(const Support<T>& s) {
@@ -64,7 +66,9 @@ template <typename T, class V> AR_HD Span<V> chord_of(const Support<T>& s, V y) 
 }
 
 /// Integers in [lo, hi] that lie in [0, n), as [first, last]; empty where last < first.
-struct Range { int first, last; };
+struct Range {
+  int first, last;
+};
 template <typename T> AR_HD Range clamp_range(Span<T> span, int n) {
   // Clamped before the conversion: a float beyond the range of int has no conversion.
   const T lo = max(span.lo, T(0)), hi = min(span.hi, T(n - 1));

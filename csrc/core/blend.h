@@ -19,13 +19,14 @@ template <class V> struct Blended {
 /// not composited and stops the sample, as in 3DGS.
 template <class V> AR_HD Blended<V> blend_sample(V raw, V& transmittance) {
   using T = ScalarOf<V>;
-  const V alpha = min(raw, V(T(kAlphaMax)));
+  const V zero = V(T(0));
+  const MaskOf<V> hit = raw >= V(T(kAlphaMin));
+  const V alpha = select(hit, min(raw, V(T(kAlphaMax))), zero);
   const V contribution = transmittance * alpha;
   const V next = transmittance - contribution;
-  const MaskOf<V> hit = alpha >= V(T(kAlphaMin)), open = next >= V(T(kTransmittanceMin));
-  const MaskOf<V> mask = hit & open;
-  transmittance = make_negative(hit & !open, select(mask, next, transmittance));
-  return {mask, select(mask, contribution, V(T(0)))};
+  const MaskOf<V> open = next >= V(T(kTransmittanceMin));
+  transmittance = select(open, next, -abs(transmittance));
+  return {MaskOf<V>(hit & open), select(open, contribution, zero)};
 }
 
 /// Adjoint of one step, walked from the last splat to the first.

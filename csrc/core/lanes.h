@@ -56,11 +56,10 @@ AR_HD double madd(double a, double b, double c) {
 
 AR_HD float abs(float x) { return std::fabs(x); }
 AR_HD double abs(double x) { return std::fabs(x); }
-/// -|x| where m, else x.
-AR_HD float make_negative(bool m, float x) { return m ? -std::fabs(x) : x; }
-AR_HD double make_negative(bool m, double x) { return m ? -std::fabs(x) : x; }
 AR_HD float exp(float x) { return std::exp(x); }
 AR_HD double exp(double x) { return std::exp(x); }
+AR_HD float log2(float x) { return std::log2(x); }
+AR_HD double log2(double x) { return std::log2(x); }
 AR_HD float exp2(float x) { return std::exp2(x); }
 AR_HD double exp2(double x) { return std::exp2(x); }
 AR_HD float sqrt(float x) { return std::sqrt(x); }
@@ -82,7 +81,7 @@ template <class V> AR_HD V one_minus_exp(V x, V e) {
   using T = ScalarOf<V>;
   constexpr int kTerms = sizeof(T) == 4 ? 8 : 15;
   V series(T(1));
-AR_UNROLL
+  AR_UNROLL
   for (int k = kTerms; k >= 2; --k) series = madd(x * V(T(-1) / T(k)), series, V(T(1)));
   return select(x < V(T(0.5)), x * series, V(T(1)) - e);
 }

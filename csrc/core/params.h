@@ -34,9 +34,9 @@ template <typename T> struct Camera {
   Vec4<T> view_x, view_y, view_z;  ///< world to camera
   Vec4<T> clip_x, clip_y, clip_w;  ///< world to clip space
   Vec3<T> position;
-  Vec2<T> size;    ///< px
-  Vec2<T> focal;   ///< px
-  Vec2<T> limit;   ///< of |x/z| and |y/z| in the Jacobian
+  Vec2<T> size;   ///< px
+  Vec2<T> focal;  ///< px
+  Vec2<T> limit;  ///< of |x/z| and |y/z| in the Jacobian
   TileGrid grid;
 };
 
@@ -64,23 +64,23 @@ template <typename T> struct GaussianGrads {
   T* opacities;
   Vec3<T>* shs;
   Vec3<T>* colors;
-  T* means2d;         ///< [n, means2d_stride], in 3DGS's units: per (0.5 W, 0.5 H) px
-  int means2d_stride; ///< 3, or 4 with the sums of absolute values in columns 2 and 3
+  T* means2d;          ///< [n, means2d_stride], in 3DGS's units: per (0.5 W, 0.5 H) px
+  int means2d_stride;  ///< 3, or 4 with the sums of absolute values in columns 2 and 3
 };
 
 /// A projected Gaussian. Scalars only, so that an array of them is a matrix of T.
 template <class F, typename T> struct Splat {
-  Vec2<T> mean;                      ///< px
+  Vec2<T> mean;  ///< px
   typename F::template Shape<T> shape;
   T opacity;
-  T level;                           ///< of the support ellipse; <= 0: touches no pixel
+  T level;  ///< of the support ellipse; <= 0: touches no pixel
   Vec3<T> color;
 };
 
 /// What blend_vjp sums for one splat in one tile.
 template <typename T> struct PairGrad {
   ShapeGrad<T> shape;
-  T weighted;      ///< sum of alpha dL/dalpha
+  T weighted;  ///< sum of alpha dL/dalpha
   Vec3<T> color;
 };
 

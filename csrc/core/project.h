@@ -12,8 +12,12 @@ template <typename T> AR_HD Vec4<T> matrix_row(const T* m, int r) { return {m[r]
 
 template <typename T> AR_HD Camera<T> load_camera(const CameraView<T>& c) {
   const T two = T(2), clamp = T(kFrustumClamp);
-  return {matrix_row(c.view, 0), matrix_row(c.view, 1), matrix_row(c.view, 2),
-          matrix_row(c.proj, 0), matrix_row(c.proj, 1), matrix_row(c.proj, 3),
+  return {matrix_row(c.view, 0),
+          matrix_row(c.view, 1),
+          matrix_row(c.view, 2),
+          matrix_row(c.proj, 0),
+          matrix_row(c.proj, 1),
+          matrix_row(c.proj, 3),
           {c.position[0], c.position[1], c.position[2]},
           {T(c.width), T(c.height)},
           {T(c.width) / (two * c.tan_half_fov_x), T(c.height) / (two * c.tan_half_fov_y)},
@@ -35,20 +39,19 @@ template <typename T> struct ProjectedMean {
 
 template <typename T> AR_HD ProjectedMean<T> project_mean(const Camera<T>& camera, Vec3<T> mean) {
   ProjectedMean<T> p;
-  p.view = {apply_row(camera.view_x, mean), apply_row(camera.view_y, mean),
-            apply_row(camera.view_z, mean)};
+  p.view = {apply_row(camera.view_x, mean), apply_row(camera.view_y, mean), apply_row(camera.view_z, mean)};
   p.clip_w = apply_row(camera.clip_w, mean);
   const T inv_w = T(1) / p.clip_w;
   p.ndc = {inv_w * apply_row(camera.clip_x, mean), inv_w * apply_row(camera.clip_y, mean)};
-  p.pixel = {T(0.5) * ((p.ndc.x + T(1)) * camera.size.x - T(1)),
-             T(0.5) * ((p.ndc.y + T(1)) * camera.size.y - T(1))};
+  p.pixel = {T(0.5) * ((p.ndc.x + T(1)) * camera.size.x - T(1)), T(0.5) * ((p.ndc.y + T(1)) * camera.size.y - T(1))};
   p.valid = p.view.z > T(kNear) && p.clip_w > T(0) && within(p.view.x, 1e18) && within(p.view.y, 1e18) &&
             within(p.view.z, 1e18) && within(p.pixel.x, 1e9) && within(p.pixel.y, 1e9);
   return p;
 }
 
 template <typename T>
-AR_HD Vec3<T> project_mean_vjp(const Camera<T>& camera, const ProjectedMean<T>& p, Vec2<T> dL_dpixel, Vec3<T> dL_dview) {
+AR_HD Vec3<T> project_mean_vjp(const Camera<T>& camera, const ProjectedMean<T>& p, Vec2<T> dL_dpixel,
+                               Vec3<T> dL_dview) {
   const Vec3<T> px = xyz(camera.clip_x), py = xyz(camera.clip_y), pw = xyz(camera.clip_w);
   const T gx = T(0.5) * camera.size.x * dL_dpixel.x / p.clip_w, gy = T(0.5) * camera.size.y * dL_dpixel.y / p.clip_w;
   return gx * px + gy * py - (gx * p.ndc.x + gy * p.ndc.y) * pw + dL_dview.x * xyz(camera.view_x) +
@@ -58,8 +61,7 @@ AR_HD Vec3<T> project_mean_vjp(const Camera<T>& camera, const ProjectedMean<T>& 
 /// Whether a Gaussian may touch the image, from its mean and a bound on its largest standard
 /// deviation: cheap, and never false for one that project() keeps. `blur` is the largest variance a
 /// footprint adds.
-template <typename T>
-AR_HD bool may_be_visible(const Camera<T>& camera, Vec3<T> mean, T max_sigma, T opacity, T blur) {
+template <typename T> AR_HD bool may_be_visible(const Camera<T>& camera, Vec3<T> mean, T max_sigma, T opacity, T blur) {
   const ProjectedMean<T> p = project_mean(camera, mean);
   if (!p.valid) return false;
   // |J| <= f/z |(1, 0, -x/z; 0, 1, -y/z)| <= f/z sqrt(1 + (x/z)^2 + (y/z)^2), with x/z and y/z clamped
@@ -75,7 +77,7 @@ AR_HD bool may_be_visible(const Camera<T>& camera, Vec3<T> mean, T max_sigma, T 
 /// The linear part of the projection at a mean: rows of A = J W, world units to px.
 template <typename T> struct Jacobian {
   Vec3<T> x, y;
-  T ratio_x, ratio_y;        ///< x/z and y/z, clamped
+  T ratio_x, ratio_y;  ///< x/z and y/z, clamped
   bool clamped_x, clamped_y;
 };
 
@@ -95,7 +97,8 @@ template <typename T> AR_HD Jacobian<T> make_jacobian(const Camera<T>& camera, V
 template <typename T>
 AR_HD Vec3<T> jacobian_vjp(const Camera<T>& camera, const Jacobian<T>& j, Vec3<T> view, Vec3<T> dL_dx, Vec3<T> dL_dy) {
   const Vec3<T> depth = xyz(camera.view_z);
-  const T by_ratio_x = -(camera.focal.x / view.z) * dot(dL_dx, depth), by_ratio_y = -(camera.focal.y / view.z) * dot(dL_dy, depth);
+  const T by_ratio_x = -(camera.focal.x / view.z) * dot(dL_dx, depth),
+          by_ratio_y = -(camera.focal.y / view.z) * dot(dL_dy, depth);
   Vec3<T> g = {T(0), T(0), -(dot(dL_dx, j.x) + dot(dL_dy, j.y)) / view.z};
   // Where the ratio is clamped it is constant: its gradient is zero, in z too.
   if (!j.clamped_x) {
@@ -191,8 +194,8 @@ AR_HD Factors<T> project_covariance(const Camera<T>& camera, const Gaussians<T>&
 
 /// Writes the gradients of scale and rotation, or of cov3d, and returns that of the camera-space mean.
 template <typename T>
-AR_HD Vec3<T> project_covariance_vjp(const Camera<T>& camera, const Gaussians<T>& g, const GaussianGrads<T>& out, int64_t i,
-                                     Vec3<T> view, const Factors<T>& f, const SplatGrad<T>& grad) {
+AR_HD Vec3<T> project_covariance_vjp(const Camera<T>& camera, const Gaussians<T>& g, const GaussianGrads<T>& out,
+                                     int64_t i, Vec3<T> view, const Factors<T>& f, const SplatGrad<T>& grad) {
   const Vec3<T>&ax = f.jacobian.x, &ay = f.jacobian.y;
   Vec3<T> dL_dax, dL_day;
   if (g.cov3ds) {
@@ -225,7 +228,8 @@ AR_HD Vec3<T> project_covariance_vjp(const Camera<T>& camera, const Gaussians<T>
       out.scales[i] = g.scale_modifier * (mul(dL_drow_x, f.turned_x) + mul(dL_drow_y, f.turned_y));
     }
     if (out.rotations) {
-      const Mat3<T> dL_drotation = {{ax.x * dL_dturned_x + ay.x * dL_dturned_y, ax.y * dL_dturned_x + ay.y * dL_dturned_y,
+      const Mat3<T> dL_drotation = {{ax.x * dL_dturned_x + ay.x * dL_dturned_y,
+                                     ax.y * dL_dturned_x + ay.y * dL_dturned_y,
                                      ax.z * dL_dturned_x + ay.z * dL_dturned_y}};
       out.rotations[i] = rotation_vjp(f.quaternion, dL_drotation);
     }
@@ -254,7 +258,8 @@ template <typename T> AR_HD Vec3<T> splat_color(const Camera<T>& camera, const G
 
 /// Writes the gradient of the colour's parameters and returns its part in that of the mean.
 template <typename T>
-AR_HD Vec3<T> splat_color_vjp(const Camera<T>& camera, const Gaussians<T>& g, const GaussianGrads<T>& out, int64_t i, Vec3<T> dL_dcolor) {
+AR_HD Vec3<T> splat_color_vjp(const Camera<T>& camera, const Gaussians<T>& g, const GaussianGrads<T>& out, int64_t i,
+                              Vec3<T> dL_dcolor) {
   if (g.colors) {
     if (out.colors) out.colors[i] = dL_dcolor;
     return {T(0), T(0), T(0)};
@@ -264,7 +269,8 @@ AR_HD Vec3<T> splat_color_vjp(const Camera<T>& camera, const Gaussians<T>& g, co
   const Vec3<T>* sh = g.shs + i * g.sh_stride;
   sh_basis(g.sh_degree, d.unit, basis);
   const Vec3<T> c = sh_color(g.sh_degree, basis, sh);
-  const Vec3<T> free = {c.x > T(0) ? dL_dcolor.x : T(0), c.y > T(0) ? dL_dcolor.y : T(0), c.z > T(0) ? dL_dcolor.z : T(0)};
+  const Vec3<T> free = {c.x > T(0) ? dL_dcolor.x : T(0), c.y > T(0) ? dL_dcolor.y : T(0),
+                        c.z > T(0) ? dL_dcolor.z : T(0)};
   const int used = sh_count(g.sh_degree);
   if (out.shs) {
     Vec3<T>* dL_dsh = out.shs + i * g.sh_stride;
@@ -287,7 +293,8 @@ template <typename T> AR_HD int splat_radius(Cov2d<T> cov, T variance) {
 /// Projects Gaussian i. Returns 3DGS's radius, 0 if it is culled: behind the near plane, off the
 /// image, not finite, or degenerate. A splat that is kept may still touch no tile (level <= 0).
 template <class F, typename T>
-AR_HD int project(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options, Splat<F, T>& splat, T& depth) {
+AR_HD int project(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options,
+                  Splat<F, T>& splat, T& depth) {
   const ProjectedMean<T> mean = project_mean(camera, g.means[i]);
   splat.level = T(0);
   if (!mean.valid) return 0;
@@ -295,7 +302,9 @@ AR_HD int project(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, Foo
   if (!(cov.det >= T(0) && cov.det < T(kMaxDet)) || !within(cov.xx, 1e18) || !within(cov.yy, 1e18)) return 0;
   splat.shape = F::prepare(cov, options);
   const Mat2<T> w = F::ellipse(splat.shape);
-  if (!within(w.xx, kMaxWhitening) || !within(w.xy, kMaxWhitening) || !within(w.yx, kMaxWhitening) || !within(w.yy, kMaxWhitening)) return 0;
+  if (!within(w.xx, kMaxWhitening) || !within(w.xy, kMaxWhitening) || !within(w.yx, kMaxWhitening) ||
+      !within(w.yy, kMaxWhitening))
+    return 0;
   const T opacity = g.opacities[i], level = F::level(splat.shape, opacity);
   if (!within(level, 1e6)) return 0;  // zero, negative or non-finite opacity, zero determinant
   const int radius = splat_radius(cov, T(F::radius_variance(options)));
@@ -320,8 +329,8 @@ AR_HD int project(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, Foo
 
 /// Writes every gradient of Gaussian i, from the sums over its pairs.
 template <class F, typename T>
-AR_HD void project_vjp(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options, const PairGrad<T>& sums,
-                       const GaussianGrads<T>& out) {
+AR_HD void project_vjp(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options,
+                       const PairGrad<T>& sums, const GaussianGrads<T>& out) {
   const ProjectedMean<T> mean = project_mean(camera, g.means[i]);
   const Factors<T> factors = project_covariance(camera, g, i, mean.view);
   const SplatGrad<T> grad = F::prepare_vjp(factors.cov, F::prepare(factors.cov, options), sums.shape, sums.weighted);

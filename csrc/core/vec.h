@@ -5,21 +5,35 @@
 
 namespace ar {
 
-template <class V> struct Vec2 { V x, y; };
-template <class V> struct Vec3 { V x, y, z; };
-template <class V> struct Vec4 { V x, y, z, w; };
+template <class V> struct Vec2 {
+  V x, y;
+};
+template <class V> struct Vec3 {
+  V x, y, z;
+};
+template <class V> struct Vec4 {
+  V x, y, z, w;
+};
 
 /// [xx xy; yx yy], rows first.
-template <typename T> struct Mat2 { T xx, xy, yx, yy; };
+template <typename T> struct Mat2 {
+  T xx, xy, yx, yy;
+};
 
 /// Symmetric 2x2. As a gradient G it means dL = tr(G dSigma): xy is the matrix entry, so the
 /// derivative by the one number that fills both off-diagonal entries is 2 xy.
-template <typename T> struct Sym2 { T xx, xy, yy; };
+template <typename T> struct Sym2 {
+  T xx, xy, yy;
+};
 
 /// Symmetric 3x3, in 3DGS's storage order.
-template <typename T> struct Sym3 { T xx, xy, xz, yy, yz, zz; };
+template <typename T> struct Sym3 {
+  T xx, xy, xz, yy, yz, zz;
+};
 
-template <typename T> struct Mat3 { Vec3<T> row[3]; };
+template <typename T> struct Mat3 {
+  Vec3<T> row[3];
+};
 
 template <class V> AR_HD Vec2<V> operator+(Vec2<V> a, Vec2<V> b) { return {a.x + b.x, a.y + b.y}; }
 

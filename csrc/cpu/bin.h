@@ -16,7 +16,8 @@ namespace ar::AR_ISA {
 inline constexpr int64_t kAhead = 12;
 
 /// visit(splat index, tile) for the pairs of part p of the splats, in depth order.
-template <class F, typename T, class Visit> AR_HD void for_each_pair(const cpu::BinTask<T>& task, int64_t p, const Visit& visit) {
+template <class F, typename T, class Visit>
+AR_HD void for_each_pair(const cpu::BinTask<T>& task, int64_t p, const Visit& visit) {
   const auto* splats = reinterpret_cast<const Splat<F, T>*>(task.splats);
   const cpu::Part part = cpu::part_of(task.n, task.parts, p);
   for (int64_t k = part.begin; k < part.end; ++k) {

@@ -30,10 +30,12 @@ struct TileView {
 
 /// Copies the part of a tile that lies in the image, rows of `columns`, between image and tile.
 template <typename T> void load_tile(const TileView& view, TileGrid grid, const T* image, T* tile) {
-  for (int y = 0; y < view.rows; ++y) std::memcpy(tile + y * kTile, image + view.pixel(grid, y), view.columns * sizeof(T));
+  for (int y = 0; y < view.rows; ++y)
+    std::memcpy(tile + y * kTile, image + view.pixel(grid, y), view.columns * sizeof(T));
 }
 template <typename T> void store_tile(const TileView& view, TileGrid grid, const T* tile, T* image) {
-  for (int y = 0; y < view.rows; ++y) std::memcpy(image + view.pixel(grid, y), tile + y * kTile, view.columns * sizeof(T));
+  for (int y = 0; y < view.rows; ++y)
+    std::memcpy(image + view.pixel(grid, y), tile + y * kTile, view.columns * sizeof(T));
 }
 
 /// 0, 1, 2, ... as scalars, to be loaded as lanes.
@@ -50,7 +52,8 @@ template <typename T> struct TileMask {
   uint32_t rows[kPacks];
 };
 
-template <class F, typename T> AR_HD TileMask<T> reach_of(const Splat<F, T>& splat, const TileView& view, const LaneIndex<T>& lanes) {
+template <class F, typename T>
+AR_HD TileMask<T> reach_of(const Splat<F, T>& splat, const TileView& view, const LaneIndex<T>& lanes) {
   using V = typename LanesOf<T>::Type;
   constexpr int kCount = TileMask<T>::kCount, kPacks = TileMask<T>::kPacks;
   const Support<T> support = support_of(splat);
@@ -75,7 +78,8 @@ template <int kSamples, typename T> uint32_t find_open_rows(const T (&transmitta
   for (int row = 0; row < kTile; ++row) {
     V largest(T(0));
     for (int s = 0; s < kSamples; ++s) {
-      for (int x = 0; x < kTile; x += LanesOf<T>::kCount) largest = max(largest, load(transmittance[s] + row * kTile + x, V()));
+      for (int x = 0; x < kTile; x += LanesOf<T>::kCount)
+        largest = max(largest, load(transmittance[s] + row * kTile + x, V()));
     }
     open |= uint32_t(bits(largest > V(T(0))) != 0) << row;
   }
@@ -111,11 +115,12 @@ template <class F, typename T> void blend_tile(const cpu::BlendTask<T>& task, in
     const auto terms = F::terms(splat.shape, splat.opacity);
     const Vec3<V> splat_color = {V(splat.color.x), V(splat.color.y), V(splat.color.z)};
     const IndexOf<V> index(int32_t(k - begin + 1));
+    const T left = T(view.x0) - splat.mean.x, top = T(view.y0) - splat.mean.y;
     for (int c = 0; c < TileMask<T>::kPacks; ++c) {
-      const V dx = load(lanes.value + c * kCount, V()) + V(T(view.x0) - splat.mean.x);
+      const V dx = load(lanes.value + c * kCount, V()) + V(left);
       for (uint32_t rows = reach.rows[c] & open_rows; rows != 0; rows &= rows - 1) {
         const int row = __builtin_ctz(rows), pixel = row * kTile + c * kCount;
-        const Vec2<V> d = {dx, V(T(view.y0 + row) - splat.mean.y)};
+        const Vec2<V> d = {dx, V(lanes.value[row] + top)};
         V contribution(T(0));
         AR_UNROLL
         for (int s = 0; s < kSamples; ++s) {
@@ -195,12 +200,13 @@ template <class F, typename T, bool kAbs> void blend_vjp_tile(const cpu::BlendVj
     V weighted = zero;
     Vec3<V> color = {zero, zero, zero};
     Vec2<V> abs2d = {zero, zero};
+    const T left = T(view.x0) - splat.mean.x, top = T(view.y0) - splat.mean.y;
     for (int c = 0; c < TileMask<T>::kPacks; ++c) {
-      const V dx = load(lanes.value + c * kCount, V()) + V(T(view.x0) - splat.mean.x);
+      const V dx = load(lanes.value + c * kCount, V()) + V(left);
       for (uint32_t rows = reach.rows[c] & rows_in_image; rows != 0; rows &= rows - 1) {
         const int row = __builtin_ctz(rows), pixel = row * kTile + c * kCount;
         if (k >= row_last[row]) continue;
-        const Vec2<V> d = {dx, V(T(view.y0 + row) - splat.mean.y)};
+        const Vec2<V> d = {dx, V(lanes.value[row] + top)};
         const Vec3<V> gp = {load(g[0] + pixel, V()), load(g[1] + pixel, V()), load(g[2] + pixel, V())};
         const V g_color = madd(gp.x, splat_color.x, madd(gp.y, splat_color.y, gp.z * splat_color.z));
         V contribution = zero;
@@ -220,17 +226,18 @@ template <class F, typename T, bool kAbs> void blend_vjp_tile(const cpu::BlendVj
           shape.shape = {shape.shape.xx + one.shape.xx, shape.shape.xy + one.shape.xy, shape.shape.yy + one.shape.yy};
         }
         shape.offset = shape.offset + offset;
-        color = {madd(contribution, gp.x, color.x), madd(contribution, gp.y, color.y), madd(contribution, gp.z, color.z)};
+        color = {madd(contribution, gp.x, color.x), madd(contribution, gp.y, color.y),
+                 madd(contribution, gp.z, color.z)};
         if (kAbs) {
           const Vec2<V> by_mean = transform_transposed(F::mean_map(splat.shape), offset);
           abs2d = abs2d + Vec2<V>{abs(by_mean.x), abs(by_mean.y)};
         }
       }
     }
-    task.pair_grads[begin + k] = {{{sum(shape.offset.x), sum(shape.offset.y)},
-                                   {sum(shape.shape.xx), sum(shape.shape.xy), sum(shape.shape.yy)}},
-                                  sum(weighted),
-                                  {sum(color.x), sum(color.y), sum(color.z)}};
+    task.pair_grads[begin + k] = {
+        {{sum(shape.offset.x), sum(shape.offset.y)}, {sum(shape.shape.xx), sum(shape.shape.xy), sum(shape.shape.yy)}},
+        sum(weighted),
+        {sum(color.x), sum(color.y), sum(color.z)}};
     if (kAbs) task.pair_abs[begin + k] = {sum(abs2d.x), sum(abs2d.y)};
   }
 }

@@ -16,7 +16,9 @@ template <class Body> void parallel_for(int64_t items, int threads, const Body& 
 }
 
 /// Bounds of part `p` of `parts` near-equal parts of [0, n).
-struct Part { int64_t begin, end; };
+struct Part {
+  int64_t begin, end;
+};
 AR_HD Part part_of(int64_t n, int64_t parts, int64_t p) { return {n * p / parts, n * (p + 1) / parts}; }
 
 }  // namespace ar::cpu

@@ -33,10 +33,10 @@ template <typename T> struct BinTask {
   int64_t n;
   TileGrid grid;
   int threads;
-  int64_t* tile_offsets;     ///< [tiles + 1] into pairs
-  int64_t* splat_offsets;    ///< [n + 1] into positions, or null
-  int32_t* pairs;            ///< [tile_offsets[tiles]] splat of each pair, by tile, then depth
-  int64_t* positions;        ///< [same] places of a splat's pairs, by splat, or null
+  int64_t* tile_offsets;   ///< [tiles + 1] into pairs
+  int64_t* splat_offsets;  ///< [n + 1] into positions, or null
+  int32_t* pairs;          ///< [tile_offsets[tiles]] splat of each pair, by tile, then depth
+  int64_t* positions;      ///< [same] places of a splat's pairs, by splat, or null
   // Kept from count_pairs to scatter_pairs:
   std::vector<int32_t> order;    ///< splats by depth, ties in input order
   std::vector<int64_t> cursors;  ///< [parts, tiles] next place in pairs

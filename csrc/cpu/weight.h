@@ -45,7 +45,8 @@ template <class F, typename T> void weight_vjp(const cpu::WeightTask<T>& task) {
       const SplatGrad<T> grad = F::prepare_vjp(cov, shape, sums, weighted);
       const T l = grad.dL_dlog_det == T(0) ? T(0) : grad.dL_dlog_det / cov.det;  // Sigma^-1 = adj(Sigma) / det
       task.dL_doffsets[i] = {-grad.dL_dmean.x, -grad.dL_dmean.y};
-      task.dL_dcovs[i] = {grad.dL_dcov.xx + l * cov.yy, T(2) * (grad.dL_dcov.xy - l * cov.xy), grad.dL_dcov.yy + l * cov.xx};
+      task.dL_dcovs[i] = {grad.dL_dcov.xx + l * cov.yy, T(2) * (grad.dL_dcov.xy - l * cov.xy),
+                          grad.dL_dcov.yy + l * cov.xx};
     }
   });
 }

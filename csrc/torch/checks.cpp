@@ -8,9 +8,12 @@ namespace ar::ops {
 namespace {
 
 /// -1 stands for P, any number of Gaussians.
-void check_shape(const Tensor& t, const char* name, int64_t count, std::initializer_list<int64_t> rest, const char* expected) {
-  const bool ok = t.dim() == int64_t(1 + rest.size()) && t.size(0) == count && std::equal(rest.begin(), rest.end(), t.sizes().begin() + 1);
-  TORCH_CHECK_VALUE(ok, name, " must have shape ", expected, count >= 0 ? " with P = " + std::to_string(count) : "", ", got ", shape_of(t));
+void check_shape(const Tensor& t, const char* name, int64_t count, std::initializer_list<int64_t> rest,
+                 const char* expected) {
+  const bool ok = t.dim() == int64_t(1 + rest.size()) && t.size(0) == count &&
+                  std::equal(rest.begin(), rest.end(), t.sizes().begin() + 1);
+  TORCH_CHECK_VALUE(ok, name, " must have shape ", expected, count >= 0 ? " with P = " + std::to_string(count) : "",
+                    ", got ", shape_of(t));
 }
 
 void check_matrix(Tensor& t, const char* name) {
@@ -20,8 +23,8 @@ void check_matrix(Tensor& t, const char* name) {
 }
 
 void check_vector(Tensor& t, const char* name) {
-  TORCH_CHECK_VALUE(t.numel() == 3 && (t.dim() == 1 || (t.dim() == 2 && t.size(0) == 1)), name, " must have shape (3,) or (1, 3), got ",
-                    shape_of(t));
+  TORCH_CHECK_VALUE(t.numel() == 3 && (t.dim() == 1 || (t.dim() == 2 && t.size(0) == 1)), name,
+                    " must have shape (3,) or (1, 3), got ", shape_of(t));
   t = t.reshape({3}).contiguous();
 }
 
@@ -40,14 +43,15 @@ std::string shape_of(const Tensor& t) {
 }
 
 void check_floating(const Tensor& t, const char* name) {
-  TORCH_CHECK_TYPE(t.scalar_type() == at::kFloat || t.scalar_type() == at::kDouble, name, " must have dtype float32 or float64, got ",
-                   t.scalar_type());
+  TORCH_CHECK_TYPE(t.scalar_type() == at::kFloat || t.scalar_type() == at::kDouble, name,
+                   " must have dtype float32 or float64, got ", t.scalar_type());
 }
 
 void check_like(const Tensor& t, const char* name, const Tensor& like, const char* like_name) {
-  TORCH_CHECK_TYPE(t.scalar_type() == like.scalar_type(), name, " must have the dtype of ", like_name, ", ", like.scalar_type(), ", got ",
-                   t.scalar_type());
-  TORCH_CHECK_VALUE(t.device() == like.device(), name, " must be on the device of ", like_name, ", ", like.device(), ", got ", t.device());
+  TORCH_CHECK_TYPE(t.scalar_type() == like.scalar_type(), name, " must have the dtype of ", like_name, ", ",
+                   like.scalar_type(), ", got ", t.scalar_type());
+  TORCH_CHECK_VALUE(t.device() == like.device(), name, " must be on the device of ", like_name, ", ", like.device(),
+                    ", got ", t.device());
 }
 
 void check_finite(const Tensor& t, const char* name) {
@@ -62,12 +66,14 @@ void check_image_size(int64_t height, int64_t width) {
 }
 
 void Inputs::check() {
-  TORCH_CHECK_VALUE(means3D.dim() == 2 && means3D.size(1) == 3, "means3D must have shape (P, 3), got ", shape_of(means3D));
+  TORCH_CHECK_VALUE(means3D.dim() == 2 && means3D.size(1) == 3, "means3D must have shape (P, 3), got ",
+                    shape_of(means3D));
   check_floating(means3D, "means3D");
   const int64_t p = count();
   TORCH_CHECK_VALUE(p < (int64_t(1) << 31), "means3D must have fewer than 2^31 rows, got ", p);
 
-  const auto check_per_gaussian = [&](Tensor& t, const char* name, std::initializer_list<int64_t> rest, const char* expected) {
+  const auto check_per_gaussian = [&](Tensor& t, const char* name, std::initializer_list<int64_t> rest,
+                                      const char* expected) {
     check_like(t, name, means3D, "means3D");
     check_shape(t, name, p, rest, expected);
     t = t.contiguous();
@@ -85,21 +91,24 @@ void Inputs::check() {
       check_per_gaussian(*means2D, "means2D", {3}, "(P, 3) or (P, 4)");
     }
   }
-  TORCH_CHECK_VALUE(shs.has_value() != colors_precomp.has_value(), "exactly one of shs and colors_precomp must be given, got ",
-                    shs ? "both" : "neither");
-  TORCH_CHECK_VALUE(sh_degree >= 0 && sh_degree <= kMaxShDegree, "sh_degree must be 0 to ", kMaxShDegree, ", got ", sh_degree);
+  TORCH_CHECK_VALUE(shs.has_value() != colors_precomp.has_value(),
+                    "exactly one of shs and colors_precomp must be given, got ", shs ? "both" : "neither");
+  TORCH_CHECK_VALUE(sh_degree >= 0 && sh_degree <= kMaxShDegree, "sh_degree must be 0 to ", kMaxShDegree, ", got ",
+                    sh_degree);
   if (shs) {
     const int64_t needed = sh_count(int(sh_degree));
     TORCH_CHECK_VALUE(shs->dim() == 3 && shs->size(0) == p && shs->size(1) >= needed && shs->size(2) == 3,
-                      "shs must have shape (P, M, 3) with P = ", p, " and M >= ", needed, " for sh_degree ", sh_degree, ", got ", shape_of(*shs));
+                      "shs must have shape (P, M, 3) with P = ", p, " and M >= ", needed, " for sh_degree ", sh_degree,
+                      ", got ", shape_of(*shs));
     check_like(*shs, "shs", means3D, "means3D");
     shs = shs->contiguous();
   } else {
     check_per_gaussian(*colors_precomp, "colors_precomp", {3}, "(P, 3)");
   }
-  TORCH_CHECK_VALUE(scales.has_value() == rotations.has_value(), "scales and rotations must be given together, got only ",
-                    scales ? "scales" : "rotations");
-  TORCH_CHECK_VALUE(scales.has_value() != cov3D_precomp.has_value(), "exactly one of scales with rotations and cov3D_precomp must be given, got ",
+  TORCH_CHECK_VALUE(scales.has_value() == rotations.has_value(),
+                    "scales and rotations must be given together, got only ", scales ? "scales" : "rotations");
+  TORCH_CHECK_VALUE(scales.has_value() != cov3D_precomp.has_value(),
+                    "exactly one of scales with rotations and cov3D_precomp must be given, got ",
                     scales ? "both" : "neither");
   if (scales) {
     check_per_gaussian(*scales, "scales", {3}, "(P, 3)");
@@ -120,7 +129,8 @@ void Inputs::check() {
   check_positive(tanfovx, "tanfovx");
   check_positive(tanfovy, "tanfovy");
   check_positive(scale_modifier, "scale_modifier");
-  TORCH_CHECK_VALUE(std::isfinite(variance) && variance >= 0, "variance must be finite and not negative, got ", variance);
+  TORCH_CHECK_VALUE(std::isfinite(variance) && variance >= 0, "variance must be finite and not negative, got ",
+                    variance);
 }
 
 }  // namespace ar::ops

@@ -2,8 +2,8 @@
 // say which argument, what was expected and what came: `means3D must have shape (P, 3), got (5, 2)`.
 #pragma once
 
-#include <torch/library.h>
 #include <ATen/ATen.h>
+#include <torch/library.h>
 
 #include <cmath>
 #include <optional>

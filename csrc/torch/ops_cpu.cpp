@@ -16,7 +16,8 @@ using cpu::Stages;
 
 template <typename T> const Stages<T>& stages_of(const std::string& footprint) {
   const Stages<T>* stages = cpu::find_stages<T>(footprint);
-  TORCH_CHECK_VALUE(stages != nullptr, "footprint must be one of those in csrc/core/footprint/registry.h, got '", footprint, "'");
+  TORCH_CHECK_VALUE(stages != nullptr, "footprint must be one of those in csrc/core/footprint/registry.h, got '",
+                    footprint, "'");
   return *stages;
 }
 
@@ -25,8 +26,13 @@ template <class Element, typename T> const Element* rows_of(const OptionalTensor
 }
 
 template <typename T> CameraView<T> camera_of(const Inputs& in) {
-  return {in.viewmatrix.const_data_ptr<T>(), in.projmatrix.const_data_ptr<T>(), in.campos.const_data_ptr<T>(), int(in.image_width),
-          int(in.image_height), T(in.tanfovx), T(in.tanfovy)};
+  return {in.viewmatrix.const_data_ptr<T>(),
+          in.projmatrix.const_data_ptr<T>(),
+          in.campos.const_data_ptr<T>(),
+          int(in.image_width),
+          int(in.image_height),
+          T(in.tanfovx),
+          T(in.tanfovy)};
 }
 
 template <typename T> Gaussians<T> gaussians_of(const Inputs& in) {
@@ -62,7 +68,16 @@ template <typename T> Projected project(const Inputs& in, const Stages<T>& stage
   const int64_t chunks = cpu::chunks_of(in.count());
   std::vector<int64_t> offsets(chunks + 1, 0);
   std::vector<uint8_t> flags(in.count());
-  cpu::ProjectTask<T> task{camera_of<T>(in), gaussians_of<T>(in), {in.variance}, at::get_num_threads(), flags.data(), offsets.data(), {}, {}, {}, {}};
+  cpu::ProjectTask<T> task{camera_of<T>(in),
+                           gaussians_of<T>(in),
+                           {in.variance},
+                           at::get_num_threads(),
+                           flags.data(),
+                           offsets.data(),
+                           {},
+                           {},
+                           {},
+                           {}};
   stages.count_candidates(task);
   int64_t candidates = 0;
   for (int64_t& offset : offsets) candidates += std::exchange(offset, candidates);
@@ -110,27 +125,33 @@ struct BlendedImage {
 };
 
 template <typename T>
-BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& binned, const Stages<T>& stages, bool keep) {
+BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& binned, const Stages<T>& stages,
+                   bool keep) {
   const auto options = in.means3D.options();
   const int64_t samples = keep ? stages.samples : 0;
   BlendedImage out{at::empty({3, in.image_height, in.image_width}, options),
                    at::empty({samples, in.image_height, in.image_width}, options),
                    at::empty({samples, in.image_height, in.image_width}, options.dtype(at::kInt))};
-  stages.blend({projected.splats.template const_data_ptr<T>(), binned.pairs.const_data_ptr<int32_t>(), binned.tile_offsets.const_data_ptr<int64_t>(),
-                grid_of(in), at::get_num_threads(), in.background.const_data_ptr<T>(), out.color.template data_ptr<T>(),
-                keep ? out.transmittance.template data_ptr<T>() : nullptr, keep ? out.last.template data_ptr<int32_t>() : nullptr});
+  stages.blend({projected.splats.template const_data_ptr<T>(), binned.pairs.const_data_ptr<int32_t>(),
+                binned.tile_offsets.const_data_ptr<int64_t>(), grid_of(in), at::get_num_threads(),
+                in.background.const_data_ptr<T>(), out.color.template data_ptr<T>(),
+                keep ? out.transmittance.template data_ptr<T>() : nullptr,
+                keep ? out.last.template data_ptr<int32_t>() : nullptr});
   return out;
 }
 
 using RasterizeOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
-RasterizeOutput rasterize_cpu(const Tensor& means3D, const OptionalTensor& means2D, const Tensor& opacities, const OptionalTensor& shs,
-                              const OptionalTensor& colors_precomp, const OptionalTensor& scales, const OptionalTensor& rotations,
-                              const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix, const Tensor& projmatrix,
-                              const Tensor& campos, int64_t image_height, int64_t image_width, double tanfovx, double tanfovy,
-                              double scale_modifier, int64_t sh_degree, std::string footprint, double variance, bool keep) {
-  Inputs in{means3D, opacities, means2D, shs, colors_precomp, scales, rotations, cov3D_precomp, bg, viewmatrix, projmatrix, campos,
-            image_height, image_width, tanfovx, tanfovy, scale_modifier, sh_degree, footprint, variance};
+RasterizeOutput rasterize_cpu(const Tensor& means3D, const OptionalTensor& means2D, const Tensor& opacities,
+                              const OptionalTensor& shs, const OptionalTensor& colors_precomp,
+                              const OptionalTensor& scales, const OptionalTensor& rotations,
+                              const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
+                              const Tensor& projmatrix, const Tensor& campos, int64_t image_height, int64_t image_width,
+                              double tanfovx, double tanfovy, double scale_modifier, int64_t sh_degree,
+                              std::string footprint, double variance, bool keep) {
+  Inputs in{means3D,       opacities, means2D,        shs,        colors_precomp, scales,       rotations,
+            cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
+            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      variance};
   check_cpu(in);
   RasterizeOutput out;
   AT_DISPATCH_FLOATING_TYPES(in.means3D.scalar_type(), "rasterize", [&] {
@@ -138,21 +159,24 @@ RasterizeOutput rasterize_cpu(const Tensor& means3D, const OptionalTensor& means
     const Projected projected = project(in, stages);
     const Binned binned = bin(in, projected, stages, keep);
     const BlendedImage image = blend(in, projected, binned, stages, keep);
-    out = {image.color, projected.radii, projected.splats, projected.ids, binned.pairs, binned.tile_offsets,
-           binned.splat_offsets, binned.positions, image.transmittance, image.last};
+    out = {image.color,         projected.radii,      projected.splats, projected.ids,       binned.pairs,
+           binned.tile_offsets, binned.splat_offsets, binned.positions, image.transmittance, image.last};
   });
   return out;
 }
 
 using StagesOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
-StagesOutput rasterize_stages_cpu(const Tensor& means3D, const Tensor& opacities, const OptionalTensor& shs, const OptionalTensor& colors_precomp,
-                                  const OptionalTensor& scales, const OptionalTensor& rotations, const OptionalTensor& cov3D_precomp,
-                                  const Tensor& bg, const Tensor& viewmatrix, const Tensor& projmatrix, const Tensor& campos,
-                                  int64_t image_height, int64_t image_width, double tanfovx, double tanfovy, double scale_modifier,
-                                  int64_t sh_degree, std::string footprint, double variance) {
-  Inputs in{means3D, opacities, std::nullopt, shs, colors_precomp, scales, rotations, cov3D_precomp, bg, viewmatrix, projmatrix, campos,
-            image_height, image_width, tanfovx, tanfovy, scale_modifier, sh_degree, footprint, variance};
+StagesOutput rasterize_stages_cpu(const Tensor& means3D, const Tensor& opacities, const OptionalTensor& shs,
+                                  const OptionalTensor& colors_precomp, const OptionalTensor& scales,
+                                  const OptionalTensor& rotations, const OptionalTensor& cov3D_precomp,
+                                  const Tensor& bg, const Tensor& viewmatrix, const Tensor& projmatrix,
+                                  const Tensor& campos, int64_t image_height, int64_t image_width, double tanfovx,
+                                  double tanfovy, double scale_modifier, int64_t sh_degree, std::string footprint,
+                                  double variance) {
+  Inputs in{means3D,       opacities, std::nullopt,   shs,        colors_precomp, scales,       rotations,
+            cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
+            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      variance};
   check_cpu(in);
   StagesOutput out;
   AT_DISPATCH_FLOATING_TYPES(in.means3D.scalar_type(), "rasterize_stages", [&] {
@@ -170,42 +194,46 @@ StagesOutput rasterize_stages_cpu(const Tensor& means3D, const Tensor& opacities
     const double values[3] = {elapsed(t0, t1), elapsed(t1, t2), elapsed(t2, t3)};
     std::copy(values, values + 3, seconds.data_ptr<double>());
     // A splat begins with its mean.
-    out = {image.color, projected.radii, projected.ids, projected.depths, projected.splats.narrow(1, 0, 2).clone(), binned.pairs,
-           binned.tile_offsets, seconds};
+    out = {image.color,  projected.radii,     projected.ids, projected.depths, projected.splats.narrow(1, 0, 2).clone(),
+           binned.pairs, binned.tile_offsets, seconds};
   });
   return out;
 }
 
 /// The tensors that rasterize hands to its vjp must fit each other. Their contents are rasterize's own.
-void check_saved(const Inputs& in, const Tensor& splats, const Tensor& ids, const Tensor& pairs, const Tensor& tile_offsets,
-                 const Tensor& splat_offsets, const Tensor& positions, const Tensor& transmittance, const Tensor& last, int64_t width,
-                 int64_t samples) {
+void check_saved(const Inputs& in, const Tensor& splats, const Tensor& ids, const Tensor& pairs,
+                 const Tensor& tile_offsets, const Tensor& splat_offsets, const Tensor& positions,
+                 const Tensor& transmittance, const Tensor& last, int64_t width, int64_t samples) {
   const int64_t v = ids.numel(), n = pairs.numel();
   const std::vector<int64_t> image = {samples, in.image_height, in.image_width};
-  TORCH_CHECK_VALUE(splats.dim() == 2 && splats.size(0) == v && splats.size(1) == width && splat_offsets.numel() == v + 1 &&
-                        positions.numel() == n && tile_offsets.numel() == grid_of(in).tiles() + 1 && transmittance.sizes() == image &&
-                        last.sizes() == image,
-                    "splats ... last must be the outputs of rasterize with keep=True for the same arguments, got splats of shape ",
-                    shape_of(splats), " and transmittance of shape ", shape_of(transmittance));
+  TORCH_CHECK_VALUE(
+      splats.dim() == 2 && splats.size(0) == v && splats.size(1) == width && splat_offsets.numel() == v + 1 &&
+          positions.numel() == n && tile_offsets.numel() == grid_of(in).tiles() + 1 && transmittance.sizes() == image &&
+          last.sizes() == image,
+      "splats ... last must be the outputs of rasterize with keep=True for the same arguments, got splats of shape ",
+      shape_of(splats), " and transmittance of shape ", shape_of(transmittance));
   TORCH_CHECK_VALUE(splats.is_contiguous() && transmittance.is_contiguous() && last.is_contiguous(),
                     "splats, transmittance and last must be contiguous, got strided ones");
 }
 
 using Grads = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
-Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const OptionalTensor& means2D, const Tensor& opacities,
-                        const OptionalTensor& shs, const OptionalTensor& colors_precomp, const OptionalTensor& scales,
-                        const OptionalTensor& rotations, const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
-                        const Tensor& projmatrix, const Tensor& campos, int64_t image_height, int64_t image_width, double tanfovx,
-                        double tanfovy, double scale_modifier, int64_t sh_degree, std::string footprint, double variance,
-                        const Tensor& splats, const Tensor& ids, const Tensor& pairs, const Tensor& tile_offsets, const Tensor& splat_offsets,
-                        const Tensor& positions, const Tensor& transmittance, const Tensor& last, std::array<bool, 8> needs) {
-  Inputs in{means3D, opacities, means2D, shs, colors_precomp, scales, rotations, cov3D_precomp, bg, viewmatrix, projmatrix, campos,
-            image_height, image_width, tanfovx, tanfovy, scale_modifier, sh_degree, footprint, variance};
+Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const OptionalTensor& means2D,
+                        const Tensor& opacities, const OptionalTensor& shs, const OptionalTensor& colors_precomp,
+                        const OptionalTensor& scales, const OptionalTensor& rotations,
+                        const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
+                        const Tensor& projmatrix, const Tensor& campos, int64_t image_height, int64_t image_width,
+                        double tanfovx, double tanfovy, double scale_modifier, int64_t sh_degree, std::string footprint,
+                        double variance, const Tensor& splats, const Tensor& ids, const Tensor& pairs,
+                        const Tensor& tile_offsets, const Tensor& splat_offsets, const Tensor& positions,
+                        const Tensor& transmittance, const Tensor& last, std::array<bool, 8> needs) {
+  Inputs in{means3D,       opacities, means2D,        shs,        colors_precomp, scales,       rotations,
+            cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
+            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      variance};
   in.check();
   check_like(dL_dcolor, "dL_dcolor", means3D, "means3D");
-  TORCH_CHECK_VALUE(dL_dcolor.sizes() == at::IntArrayRef({3, image_height, image_width}), "dL_dcolor must have shape (3, ", image_height,
-                    ", ", image_width, "), got ", shape_of(dL_dcolor));
+  TORCH_CHECK_VALUE(dL_dcolor.sizes() == at::IntArrayRef({3, image_height, image_width}),
+                    "dL_dcolor must have shape (3, ", image_height, ", ", image_width, "), got ", shape_of(dL_dcolor));
   // An empty tensor stands for a gradient that is not wanted.
   const auto make = [&](const OptionalTensor& like, bool needed) {
     return needed && like ? at::empty_like(*like, at::MemoryFormat::Contiguous) : at::empty({0}, means3D.options());
@@ -216,7 +244,8 @@ Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const Op
   AT_DISPATCH_FLOATING_TYPES(means3D.scalar_type(), "rasterize_vjp", [&] {
     using T = scalar_t;
     const Stages<T>& stages = stages_of<T>(footprint);
-    check_saved(in, splats, ids, pairs, tile_offsets, splat_offsets, positions, transmittance, last, stages.splat_width, stages.samples);
+    check_saved(in, splats, ids, pairs, tile_offsets, splat_offsets, positions, transmittance, last, stages.splat_width,
+                stages.samples);
     const auto pointer = [](const Tensor& t) { return t.numel() ? t.data_ptr<T>() : nullptr; };
     GaussianGrads<T> grads{};
     grads.means = reinterpret_cast<Vec3<T>*>(pointer(std::get<0>(out)));
@@ -237,22 +266,36 @@ Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const Op
     auto* abs2d = absolute ? reinterpret_cast<Vec2<T>*>(pair_abs.data_ptr<T>()) : nullptr;
     const Tensor g = dL_dcolor.contiguous();
     const int threads = at::get_num_threads();
-    stages.blend_vjp({splats.const_data_ptr<T>(), pairs.const_data_ptr<int32_t>(), tile_offsets.const_data_ptr<int64_t>(), grid_of(in), threads,
-                      in.background.const_data_ptr<T>(), transmittance.const_data_ptr<T>(), last.const_data_ptr<int32_t>(),
-                      g.const_data_ptr<T>(), sums, abs2d});
-    stages.project_vjp({camera_of<T>(in), gaussians_of<T>(in), {variance}, threads, ids.const_data_ptr<int32_t>(), ids.size(0),
-                        splat_offsets.const_data_ptr<int64_t>(), positions.const_data_ptr<int64_t>(), sums, abs2d, grads});
+    stages.blend_vjp({splats.const_data_ptr<T>(), pairs.const_data_ptr<int32_t>(),
+                      tile_offsets.const_data_ptr<int64_t>(), grid_of(in), threads, in.background.const_data_ptr<T>(),
+                      transmittance.const_data_ptr<T>(), last.const_data_ptr<int32_t>(), g.const_data_ptr<T>(), sums,
+                      abs2d});
+    stages.project_vjp({camera_of<T>(in),
+                        gaussians_of<T>(in),
+                        {variance},
+                        threads,
+                        ids.const_data_ptr<int32_t>(),
+                        ids.size(0),
+                        splat_offsets.const_data_ptr<int64_t>(),
+                        positions.const_data_ptr<int64_t>(),
+                        sums,
+                        abs2d,
+                        grads});
   });
   return out;
 }
 
 void check_weight_arguments(const Tensor& offset, const Tensor& cov2d, double variance) {
   check_floating(offset, "offset");
-  TORCH_CHECK_VALUE(offset.dim() >= 1 && offset.size(-1) == 2, "offset must have shape (..., 2), got ", shape_of(offset));
+  TORCH_CHECK_VALUE(offset.dim() >= 1 && offset.size(-1) == 2, "offset must have shape (..., 2), got ",
+                    shape_of(offset));
   check_like(cov2d, "cov2d", offset, "offset");
-  TORCH_CHECK_VALUE(cov2d.dim() == offset.dim() && cov2d.size(-1) == 3 && cov2d.sizes().slice(0, cov2d.dim() - 1) == offset.sizes().slice(0, offset.dim() - 1),
-                    "cov2d must have shape (..., 3) with the leading sizes of offset ", shape_of(offset), ", got ", shape_of(cov2d));
-  TORCH_CHECK_VALUE(std::isfinite(variance) && variance >= 0, "variance must be finite and not negative, got ", variance);
+  TORCH_CHECK_VALUE(cov2d.dim() == offset.dim() && cov2d.size(-1) == 3 &&
+                        cov2d.sizes().slice(0, cov2d.dim() - 1) == offset.sizes().slice(0, offset.dim() - 1),
+                    "cov2d must have shape (..., 3) with the leading sizes of offset ", shape_of(offset), ", got ",
+                    shape_of(cov2d));
+  TORCH_CHECK_VALUE(std::isfinite(variance) && variance >= 0, "variance must be finite and not negative, got ",
+                    variance);
 }
 
 template <typename T> cpu::WeightTask<T> weight_task(const Tensor& offset, const Tensor& cov2d, double variance) {
@@ -277,14 +320,16 @@ Tensor footprint_weight_cpu(const Tensor& offset, const Tensor& cov2d, std::stri
   return out;
 }
 
-std::tuple<Tensor, Tensor> footprint_weight_vjp_cpu(const Tensor& dL_dweight, const Tensor& offset, const Tensor& cov2d, std::string footprint,
-                                                    double variance) {
+std::tuple<Tensor, Tensor> footprint_weight_vjp_cpu(const Tensor& dL_dweight, const Tensor& offset, const Tensor& cov2d,
+                                                    std::string footprint, double variance) {
   check_weight_arguments(offset, cov2d, variance);
   check_like(dL_dweight, "dL_dweight", offset, "offset");
-  TORCH_CHECK_VALUE(dL_dweight.sizes() == offset.sizes().slice(0, offset.dim() - 1), "dL_dweight must have the leading sizes of offset ",
-                    shape_of(offset), ", got ", shape_of(dL_dweight));
+  TORCH_CHECK_VALUE(dL_dweight.sizes() == offset.sizes().slice(0, offset.dim() - 1),
+                    "dL_dweight must have the leading sizes of offset ", shape_of(offset), ", got ",
+                    shape_of(dL_dweight));
   const Tensor g = dL_dweight.contiguous(), d = offset.contiguous(), c = cov2d.contiguous();
-  const Tensor dL_doffset = at::empty(offset.sizes(), offset.options()), dL_dcov = at::empty(cov2d.sizes(), cov2d.options());
+  const Tensor dL_doffset = at::empty(offset.sizes(), offset.options()),
+               dL_dcov = at::empty(cov2d.sizes(), cov2d.options());
   AT_DISPATCH_FLOATING_TYPES(offset.scalar_type(), "footprint_weight_vjp", [&] {
     auto task = weight_task<scalar_t>(d, c, variance);
     task.dL_dweights = g.const_data_ptr<scalar_t>();

@@ -151,8 +151,7 @@ template <FrameGradient kFrame> struct Analytic {
     return {-g.axis.x, -g.axis.y, g.axis.y, -g.axis.x};
   }
 
-  template <typename T>
-  AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T> cov, const Shape<T>& g, ShapeGrad<T> sums, T) {
+  template <typename T> AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T> cov, const Shape<T>& g, ShapeGrad<T> sums, T) {
     const T cx = g.axis.x, cy = g.axis.y;
     // Rotation of the frame per off-diagonal of Sigma is 1/(l1 - l2). At l1 = l2 the frame is
     // arbitrary and the formula has no derivative; zero is as good as any and finite.
@@ -160,8 +159,7 @@ template <FrameGradient kFrame> struct Analytic {
     const T turn = kFrame == FrameGradient::kFrozen ? T(1) : (gap > T(0) ? T(1) / gap : T(0));
     const Sym2<T> along_axes = {T(0.5) * sums.shape.xx * g.inv_sigma.x, T(0.5) * sums.shape.xy * turn,
                                 T(0.5) * sums.shape.yy * g.inv_sigma.y};
-    return {transform_transposed(mean_map(g), sums.offset),
-            congruence_transposed(Mat2<T>{cx, cy, -cy, cx}, along_axes),
+    return {transform_transposed(mean_map(g), sums.offset), congruence_transposed(Mat2<T>{cx, cy, -cy, cx}, along_axes),
             T(0)};
   }
 

@@ -29,7 +29,9 @@ namespace ar {
 
 /// Projected covariance [px^2]. det is carried because recomputing it from the entries cancels:
 /// a needle of 30 x 1e-3 px has det <= 0 in float32 more often than not (docs/numerics.md).
-template <typename T> struct Cov2d { T xx, xy, yy, det; };
+template <typename T> struct Cov2d {
+  T xx, xy, yy, det;
+};
 
 /// Cov2d after convolution with an isotropic Gaussian of variance v.
 template <typename T> AR_HD Cov2d<T> blur(Cov2d<T> c, T v) {
@@ -42,7 +44,10 @@ struct FootprintOptions {
 };
 
 /// Five sums over pixels; see prepare_vjp of each footprint.
-template <class V> struct ShapeGrad { Vec2<V> offset; Sym2<V> shape; };
+template <class V> struct ShapeGrad {
+  Vec2<V> offset;
+  Sym2<V> shape;
+};
 
 /// Gradient of one splat. dL = dL_dmean . dmean + tr(dL_dcov dSigma) + dL_dlog_det d(log det Sigma).
 /// The part along log det stays apart: its matrix Sigma^-1 does not exist for needles, but its pull

@@ -10,8 +10,8 @@ namespace ar {
 /// + 3 t^2 k0 with P = p^2 and t the conic's diagonal entry: fourth and sixth cumulant of the box.
 /// The min() keeps the P^2 term non-negative; without it the far tail diverges.
 template <typename T> struct CumulantAxis {
-  T c4, c6, cap;       // of P^2
-  T linear, constant;  // 6 t k2, 3 t^2 k0
+  T c4, c6, cap;                   // of P^2
+  T linear, constant;              // 6 t k2, 3 t^2 k0
   T dc4, dc6, dlinear, dconstant;  // derivatives by t
 
   AR_HD static CumulantAxis at(T t) {
@@ -81,7 +81,8 @@ struct Cumulant {
   }
 
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& shape, T opacity) {
-    return {shape.w, opacity * shape.amp, CumulantAxis<T>::at(conic_xx(shape.w)), CumulantAxis<T>::at(conic_yy(shape.w))};
+    return {shape.w, opacity * shape.amp, CumulantAxis<T>::at(conic_xx(shape.w)),
+            CumulantAxis<T>::at(conic_yy(shape.w))};
   }
 
   template <typename T, class V> AR_HD static V alpha(const Terms<T>& t, Vec2<V> d, int) {

@@ -31,8 +31,7 @@ template <typename T> AR_HD T gaussian_level(T amp, T opacity) {
 
 /// Gradient of a sum of Gaussians from sums in whitened coordinates z = w d: `offset` = sum g I z,
 /// `shape` = sum g I z z^T. `weighted` = sum g I, zero where the amplitude does not depend on Sigma.
-template <typename T>
-AR_HD SplatGrad<T> gaussian_vjp(const Mat2<T>& w, ShapeGrad<T> sums, T weighted) {
+template <typename T> AR_HD SplatGrad<T> gaussian_vjp(const Mat2<T>& w, ShapeGrad<T> sums, T weighted) {
   // d log I = z.w dmu + tr(w^T z z^T w dSigma)/2 + (d log det Sigma - tr(w^T w dSigma))/2
   const Sym2<T> half = {T(0.5) * (sums.shape.xx - weighted), T(0.5) * sums.shape.xy,
                         T(0.5) * (sums.shape.yy - weighted)};
@@ -67,7 +66,7 @@ template <int S, bool kCompensated> struct GaussianFootprint {
 
   template <typename T> struct Terms {
     Mat2<T> w;        ///< whitening matrix times kBase2
-    T peak;           ///< opacity * amp
+    T log_peak;       ///< log2(opacity * amp)
     Vec2<T> node[S];  ///< w times each node
   };
 
@@ -85,7 +84,7 @@ template <int S, bool kCompensated> struct GaussianFootprint {
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& shape, T opacity) {
     const T scale = T(kBase2);
     const Mat2<T> w = {scale * shape.w.xx, scale * shape.w.xy, scale * shape.w.yx, scale * shape.w.yy};
-    Terms<T> t{w, opacity * shape.amp, {}};
+    Terms<T> t{w, log2(opacity * shape.amp), {}};
     AR_UNROLL
     for (int s = 0; s < S; ++s) {
       const Vec2<int> n = box_node<S>(s);
@@ -102,7 +101,7 @@ template <int S, bool kCompensated> struct GaussianFootprint {
 
   template <typename T, class V> AR_HD static V alpha(const Terms<T>& t, Vec2<V> d, int s) {
     const Vec2<V> z = whitened(t, d, s);
-    return V(t.peak) * exp2(-madd(z.x, z.x, z.y * z.y));
+    return exp2(madd(-z.x, z.x, madd(-z.y, z.y, V(t.log_peak))));
   }
 
   template <typename T, class V>

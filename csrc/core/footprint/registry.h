@@ -17,8 +17,7 @@ using Footprints = FootprintList<Point, Mip, Analytic<FrameGradient::kFrozen>, A
                                  Cumulant, Box<1>, Box<2>, Box<4>, Box<8>, Box<16>>;
 
 /// Calls f(F{}) for the footprint whose kName is `name`; false if there is none.
-template <class Function, class... F>
-bool visit_footprint(std::string_view name, FootprintList<F...>, Function&& f) {
+template <class Function, class... F> bool visit_footprint(std::string_view name, FootprintList<F...>, Function&& f) {
   return ((name == F::kName ? (f(F{}), true) : false) || ...);
 }
 
