@@ -10,7 +10,7 @@ from setuptools import setup
 # pip builds in an isolated environment that does not see the host's packages but keeps sys.prefix:
 # the host's torch is found by adding its folder, for as long as setup.py runs.
 try:
-    import torch  # noqa: F401
+    import torch
 except ImportError:
     sys.path += [sysconfig.get_path("purelib"), sysconfig.get_path("platlib")]
     try:
@@ -21,7 +21,7 @@ except ImportError:
             "your installer hides it (uv, python -m build), use --no-build-isolation."
         )
 
-from torch.utils.cpp_extension import BuildExtension, CppExtension  # noqa: E402
+from torch.utils.cpp_extension import BuildExtension, CppExtension
 
 ROOT = Path(__file__).parent
 SOURCES = sorted(str(p.relative_to(ROOT)) for d in ("cpu", "torch") for p in ROOT.glob(f"csrc/{d}/*.cpp"))

@@ -47,9 +47,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def build_parser() -> Parser:
-    parser = Parser(
-        prog=PROGRAM, description="Render 3D Gaussians with pixels that integrate, not sample."
-    )
+    parser = Parser(prog=PROGRAM, description="Render 3D Gaussians with pixels that integrate, not sample.")
     parser.add_argument("--version", action="version", version=f"analytic_rasterizer {__version__}")
     subcommands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for add_command in COMMANDS:
@@ -73,8 +71,7 @@ def add_render(subcommands) -> None:
     parser.add_argument(
         "--views",
         required=True,
-        help="3DGS cameras.json, Blender or nerfstudio transforms.json, "
-        "or a list of {width, height, fx, fy, w2c}",
+        help="3DGS cameras.json, Blender or nerfstudio transforms.json, or a list of {width, height, fx, fy, w2c}",
     )
     parser.add_argument("--out", required=True, metavar="DIR", help="folder for the pictures")
     parser.add_argument(
@@ -83,9 +80,7 @@ def add_render(subcommands) -> None:
         help="how a pixel sees a splat (default: the library's, analytic)",
     )
     parser.add_argument("--samples", type=int, help="samples of the box footprint: 1, 2, 4, 8, 16")
-    parser.add_argument(
-        "--scale", type=_positive, default=1.0, help="resolution, as a factor (default: 1)"
-    )
+    parser.add_argument("--scale", type=_positive, default=1.0, help="resolution, as a factor (default: 1)")
     parser.add_argument(
         "--background",
         nargs=3,
@@ -195,14 +190,11 @@ COMMANDS = (add_render, add_demo)
 
 def format_table(header: list[str], rows: list[list]) -> str:
     """Columns of text: the first left-aligned, the others right-aligned; floats to 4 digits."""
-    cells = [header] + [
-        [f"{cell:.4g}" if isinstance(cell, float) else str(cell) for cell in row] for row in rows
-    ]
+    cells = [header] + [[f"{cell:.4g}" if isinstance(cell, float) else str(cell) for cell in row] for row in rows]
     widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
     return "\n".join(
         "  ".join(
-            cell.rjust(width) if i else cell.ljust(width)
-            for i, (cell, width) in enumerate(zip(row, widths))
+            cell.rjust(width) if i else cell.ljust(width) for i, (cell, width) in enumerate(zip(row, widths))
         ).rstrip()
         for row in cells
     )

@@ -129,9 +129,7 @@ def _fabric(brush: Brush, centre, radius) -> None:
             half = math.sqrt(max(radius**2 - offset**2, 0.0))
             middle = torch.tensor(centre) + offset * normal
             if half > 2:
-                brush.line(
-                    torch.stack([middle - half * along, middle + half * along]), 2.5, depth, color
-                )
+                brush.line(torch.stack([middle - half * along, middle + half * along]), 2.5, depth, color)
     for turn, depth, color in (
         (-0.5, 3.0, (0.93, 0.25, 0.45)),
         (1.6, 3.2, (0.16, 0.62, 0.93)),
@@ -214,11 +212,7 @@ def _needles(brush: Brush, random, left, top) -> None:
         for i in range(22):
             bend = torch.linspace(0, 1, 9)
             x = left + 78 * bend
-            y = top + 92 * (
-                i / 21 * (1 - 0.8 * bend)
-                + sweep * 0.8 * bend
-                + 0.02 * torch.rand(1, generator=random)
-            )
+            y = top + 92 * (i / 21 * (1 - 0.8 * bend) + sweep * 0.8 * bend + 0.02 * torch.rand(1, generator=random))
             brush.line(torch.stack([x, y], 1), 2.0, depth, color)
 
 
@@ -288,8 +282,7 @@ def run(out, size: tuple[int, int] = CANVAS, device="cpu") -> dict:
             "residual_rmse": {str(r): value for r, value in residual.items()},
         },
         "pictures": [
-            {key: value for key, value in picture._asdict().items() if key != "color"}
-            for picture in pictures
+            {key: value for key, value in picture._asdict().items() if key != "color"} for picture in pictures
         ],
     }
     (out / "results.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
@@ -324,10 +317,7 @@ def _converged_reference(scene: Scene, view: View, renders: dict):
             truth = _reduced(_supersampled(scene, view, density))
             bar.update()
             residual = {r: _errors(coarse[r], truth[r])[1] for r in REDUCTIONS}
-            smallest = {
-                r: min(_errors(renders[name, r][0], truth[r])[1] for name in COLUMNS)
-                for r in REDUCTIONS
-            }
+            smallest = {r: min(_errors(renders[name, r][0], truth[r])[1] for name in COLUMNS) for r in REDUCTIONS}
             converged = all(residual[r] <= RMSE_SHARE * smallest[r] for r in REDUCTIONS)
             if converged or density >= MAX_DENSITY:
                 return truth, density, residual
@@ -353,9 +343,7 @@ def _supersampled(scene: Scene, view: View, density: int) -> torch.Tensor:
     for i in range(shifts**2):
         column, row = ((n + 0.5) / shifts - 0.5 for n in (i % shifts, i // shifts))
         shifted = replace(view, cx=view.width / 2 - column / fine, cy=view.height / 2 - row / fine)
-        settings = shifted.settings(
-            fine, PAPER, 0, "point", dilation=0.0, device=scene.means.device
-        )
+        settings = shifted.settings(fine, PAPER, 0, "point", dilation=0.0, device=scene.means.device)
         color = render_stages(settings, **scene.arguments()).color
         total += torch.nn.functional.avg_pool2d(color[None].double(), fine)[0].cpu()
     return total / shifts**2
@@ -373,9 +361,7 @@ def draw_sheet(pictures: list[Picture], truth: dict, results: dict):
 
     Every picture is shown at the size of the full one, without smoothing, over its error map.
     """
-    image, draw_module, font_module = (
-        optional_import(f"PIL.{name}") for name in ("Image", "ImageDraw", "ImageFont")
-    )
+    image, draw_module, font_module = (optional_import(f"PIL.{name}") for name in ("Image", "ImageDraw", "ImageFont"))
     width, height = results["size"]
     unit = width / 24  # lengths below are in these, so that the sheet scales with its pictures
     gap, label, notes = round(unit), round(6 * unit), height // 2
@@ -399,9 +385,7 @@ def draw_sheet(pictures: list[Picture], truth: dict, results: dict):
     title = "One scene at four resolutions, as each footprint renders it"
     write(gap, 4 * unit, title, 3.2, anchor="ls", bold=True)
     threads = "" if results["device"] != "cpu" else f" on {results['threads']} CPU threads"
-    notes_on = (
-        f"below each picture: its error map, its PSNR against the reference, its time{threads}"
-    )
+    notes_on = f"below each picture: its error map, its PSNR against the reference, its time{threads}"
     write(right - width - 9 * unit, 4 * unit, notes_on, 1.8, MUTED, "rs")
     ramp = ERROR_SPAN * torch.linspace(0, 1, 256).expand(3, 1, 256)
     paste(_error_colors(ramp, 0), right - width, gap, (width, round(1.6 * unit)))

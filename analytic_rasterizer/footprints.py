@@ -100,9 +100,7 @@ def resolve_footprint(name: str, **options: Any) -> Footprint:
         key = "analytic" if settled["frame_gradient"] == "frozen" else "analytic_paper"
     elif name == "box":
         if str(settled["samples"]) not in map(str, BOX_SAMPLES):
-            raise ValueError(
-                f"samples must be one of {', '.join(map(str, BOX_SAMPLES))}, got {settled['samples']!r}"
-            )
+            raise ValueError(f"samples must be one of {', '.join(map(str, BOX_SAMPLES))}, got {settled['samples']!r}")
         settled["samples"] = int(settled["samples"])
         key = f"box{settled['samples']}"
     return Footprint(name, tuple(settled.items()), key, variance)

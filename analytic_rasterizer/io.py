@@ -33,9 +33,7 @@ def optional_import(name: str):
         return importlib.import_module(name)
     except ImportError as error:
         package = name.split(".")[0]
-        raise ImportError(
-            f"this needs {package}: pip install analytic_rasterizer[cli] ({error})"
-        ) from None
+        raise ImportError(f"this needs {package}: pip install analytic_rasterizer[cli] ({error})") from None
 
 
 # ------------------------------------------------------------------------------------- scenes
@@ -172,9 +170,7 @@ def _check_ply_header(path: Path) -> None:
             raise SceneError(f"vertex property {name} must be float, got {kind}")
     rest = sum(name.startswith("f_rest_") for name in kinds)
     if rest not in (0, 9, 24, 45):
-        raise SceneError(
-            f"expected 0, 9, 24 or 45 f_rest properties (SH degree 0 to 3), got {rest}"
-        )
+        raise SceneError(f"expected 0, 9, 24 or 45 f_rest properties (SH degree 0 to 3), got {rest}")
 
 
 def _ply_header(path: Path) -> list[str]:
@@ -335,9 +331,7 @@ def _listed_view(i: int, entry: dict) -> View:
         w2c[:3, 3] = -w2c[:3, :3] @ position
         _check_rotation(w2c, f"{where}: rotation")
     else:
-        raise SceneError(
-            f"{where}: expected 'w2c', or 'rotation' and 'position', got {', '.join(entry) or '{}'}"
-        )
+        raise SceneError(f"{where}: expected 'w2c', or 'rotation' and 'position', got {', '.join(entry) or '{}'}")
     name = entry.get("img_name", entry.get("name", ""))
     return View(
         name=_picture_name(name, i),
@@ -465,11 +459,7 @@ def _numbers(value, shape: tuple[int, ...], where: str) -> torch.Tensor:
     def fits(part, shape) -> bool:
         if not shape:
             return _is_number(part)
-        return (
-            isinstance(part, list)
-            and len(part) == shape[0]
-            and all(fits(item, shape[1:]) for item in part)
-        )
+        return isinstance(part, list) and len(part) == shape[0] and all(fits(item, shape[1:]) for item in part)
 
     if not fits(value, shape):
         size = " x ".join(map(str, shape))

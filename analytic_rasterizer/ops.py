@@ -86,7 +86,7 @@ def _(dL_dweight, offset, cov2d, footprint, variance):
 
 
 def _rasterize_setup(ctx, inputs, output):
-    color, radii, *saved = output
+    _, radii, *saved = output
     ctx.mark_non_differentiable(radii, *saved)
     ctx.set_materialize_grads(False)  # no zeros the size of everything saved
     tensors, (*ctx.settings, keep) = inputs[:12], inputs[12:]
@@ -102,16 +102,12 @@ def _rasterize_backward(ctx, dL_dcolor, *_):
         return (None,) * len(ctx.needs_input_grad)
     tensors, saved = ctx.saved_tensors[:12], ctx.saved_tensors[12:]
     needs = list(ctx.needs_input_grad[:_DIFFERENTIABLE])
-    grads = torch.ops.analytic_rasterizer.rasterize_vjp(
-        dL_dcolor, *tensors, *ctx.settings, *saved, needs
-    )
+    grads = torch.ops.analytic_rasterizer.rasterize_vjp(dL_dcolor, *tensors, *ctx.settings, *saved, needs)
     wanted = (g if need and t is not None else None for g, need, t in zip(grads, needs, tensors))
     return (*wanted, *[None] * (len(ctx.needs_input_grad) - _DIFFERENTIABLE))
 
 
-torch.library.register_autograd(
-    "analytic_rasterizer::rasterize", _rasterize_backward, setup_context=_rasterize_setup
-)
+torch.library.register_autograd("analytic_rasterizer::rasterize", _rasterize_backward, setup_context=_rasterize_setup)
 
 
 def _weight_setup(ctx, inputs, output):
@@ -120,12 +116,8 @@ def _weight_setup(ctx, inputs, output):
 
 
 def _weight_backward(ctx, dL_dweight):
-    grads = torch.ops.analytic_rasterizer.footprint_weight_vjp(
-        dL_dweight, *ctx.saved_tensors, *ctx.settings
-    )
+    grads = torch.ops.analytic_rasterizer.footprint_weight_vjp(dL_dweight, *ctx.saved_tensors, *ctx.settings)
     return (*grads, None, None)
 
 
-torch.library.register_autograd(
-    "analytic_rasterizer::footprint_weight", _weight_backward, setup_context=_weight_setup
-)
+torch.library.register_autograd("analytic_rasterizer::footprint_weight", _weight_backward, setup_context=_weight_setup)

@@ -162,9 +162,7 @@ class _SnapshotOnFailure(torch.autograd.Function):
         if not torch.isfinite(dL_dcolor).all():
             _write_snapshot("snapshot_bw.dump", (dL_dcolor, *ctx.arguments))
             index = tuple(torch.nonzero(~torch.isfinite(dL_dcolor))[0].tolist())
-            raise ValueError(
-                f"the gradient of the image must be finite, got {dL_dcolor[index].item()} at {index}"
-            )
+            raise ValueError(f"the gradient of the image must be finite, got {dL_dcolor[index].item()} at {index}")
         return dL_dcolor, None
 
 

@@ -40,13 +40,9 @@ def main() -> None:
     parser.add_argument("scene", help="trained scene: .ply, compressed .ply or .spz")
     parser.add_argument("--views", required=True, help="file of views")
     parser.add_argument("--footprints", nargs="+", default=FOOTPRINTS, metavar="NAME[:k=v]")
-    parser.add_argument(
-        "--rounds", type=int, default=5, help="timed rounds after one to warm up (default 5)"
-    )
+    parser.add_argument("--rounds", type=int, default=5, help="timed rounds after one to warm up (default 5)")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument(
-        "--shuffle", action="store_true", help="randomise the order of the Gaussians"
-    )
+    parser.add_argument("--shuffle", action="store_true", help="randomise the order of the Gaussians")
     parser.add_argument("--json", help="also write everything measured to this file")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
@@ -54,9 +50,7 @@ def main() -> None:
     scene = io.load_scene(args.scene)
     if args.shuffle:
         order = torch.randperm(len(scene.means), generator=torch.Generator().manual_seed(0))
-        scene = scene._replace(
-            **{k: v[order] for k, v in scene._asdict().items() if torch.is_tensor(v)}
-        )
+        scene = scene._replace(**{k: v[order] for k, v in scene._asdict().items() if torch.is_tensor(v)})
     views = io.load_views(args.views)
 
     samples = {name: [[] for _ in views] for name in args.footprints}
@@ -103,18 +97,14 @@ def main() -> None:
     print("B/budget: extra memory over 120 B per Gaussian + 64 B per pair + 64 B per pixel")
     if args.json:
         with open(args.json, "w") as f:
-            json.dump(
-                {"machine": machine(), "arguments": vars(args), "results": results}, f, indent=2
-            )
+            json.dump({"machine": machine(), "arguments": vars(args), "results": results}, f, indent=2)
 
 
 def machine() -> str:
     cpu = platform.processor() or platform.machine()
     if sys.platform == "linux":
         with open("/proc/cpuinfo") as f:
-            cpu = next(
-                (line.split(":")[1].strip() for line in f if line.startswith("model name")), cpu
-            )
+            cpu = next((line.split(":")[1].strip() for line in f if line.startswith("model name")), cpu)
     threads = torch.get_num_threads()
     return f"{cpu}, {threads} threads, {ar.instruction_set()}, torch {torch.__version__}"
 
@@ -137,9 +127,7 @@ def measure(scene: io.Scene, view: io.View, footprint: str) -> dict:
     }
 
 
-def forward_backward(
-    scene: io.Scene, settings: ar.GaussianRasterizationSettings
-) -> list[torch.Tensor]:
+def forward_backward(scene: io.Scene, settings: ar.GaussianRasterizationSettings) -> list[torch.Tensor]:
     """Renders, differentiates the sum of the image, and returns everything that went in or came out."""
     dL_dcolor = torch.ones(3, settings.image_height, settings.image_width)
     inputs = {k: v.detach().requires_grad_() for k, v in scene.arguments().items()}
@@ -163,9 +151,7 @@ def extra_memory(scene: io.Scene, view: io.View, footprint: str) -> tuple[int, f
 
 def summarize(per_view: list[list[dict]]) -> dict:
     keys = per_view[0][0]
-    return {
-        k: statistics.mean(statistics.median(m[k] for m in view) for view in per_view) for k in keys
-    }
+    return {k: statistics.mean(statistics.median(m[k] for m in view) for view in per_view) for k in keys}
 
 
 def return_freed_memory() -> None:

@@ -248,12 +248,12 @@ template <typename T> AR_HD Direction<T> view_direction(const Camera<T>& camera,
   return {inv * d, inv};
 }
 
-template <typename T> AR_HD Vec3<T> splat_color(const Camera<T>& camera, const Gaussians<T>& g, int64_t i) {
+/// The colour before the clamp that spherical harmonics get.
+template <typename T> AR_HD Vec3<T> unclamped_color(const Camera<T>& camera, const Gaussians<T>& g, int64_t i) {
   if (g.colors) return g.colors[i];
   T basis[kMaxShCount];
   sh_basis(g.sh_degree, view_direction(camera, g.means[i]).unit, basis);
-  const Vec3<T> c = sh_color(g.sh_degree, basis, g.shs + i * g.sh_stride);
-  return {max(c.x, T(0)), max(c.y, T(0)), max(c.z, T(0))};
+  return sh_color(g.sh_degree, basis, g.shs + i * g.sh_stride);
 }
 
 /// Writes the gradient of the colour's parameters and returns its part in that of the mean.
@@ -318,11 +318,12 @@ AR_HD int project(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, Foo
   if (!touches) splat.level = T(0);
   if (!touches && !on_image) return 0;
   if (touches) {
-    splat.color = splat_color(camera, g, i);
-    if (!within(splat.color.x, 1e18) || !within(splat.color.y, 1e18) || !within(splat.color.z, 1e18)) {
+    const Vec3<T> c = unclamped_color(camera, g, i);
+    if (!within(c.x, 1e18) || !within(c.y, 1e18) || !within(c.z, 1e18)) {
       splat.level = T(0);
       return 0;
     }
+    splat.color = g.colors ? c : Vec3<T>{max(c.x, T(0)), max(c.y, T(0)), max(c.z, T(0))};
   }
   return radius;
 }

@@ -74,10 +74,10 @@ struct Cumulant {
 
   template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& shape) { return shape.w; }
 
-  /// The correction adds at most (a^2 + c^2)/125 to the level (docs/numerics.md, "Support").
+  /// The correction adds at most (a^2 + c^2)/124 to the level (docs/numerics.md, "Support").
   template <typename T> AR_HD static T level(const Shape<T>& shape, T opacity) {
     const T a = conic_xx(shape.w), c = conic_yy(shape.w);
-    return gaussian_level(shape.amp, opacity) + (a * a + c * c) / T(125);
+    return gaussian_level(shape.amp, opacity) + (a * a + c * c) / T(124);
   }
 
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& shape, T opacity) {
