@@ -52,18 +52,16 @@ class GaussianRasterizationSettings(_Fields):
         ValueError: Unknown footprint or option.
     """
 
-    footprint: Footprint | None
+    footprint: Footprint | None = None  # also where a tuple method makes an instance without __new__
 
     def __new__(cls, *args: Any, footprint: str | Footprint | None = None, **kwargs: Any):
         fields = {k: kwargs.pop(k) for k in _Fields._fields[len(args) :] if k in kwargs}
         self = super().__new__(cls, *args, **fields)
-        if footprint is None:
-            if kwargs:
-                known = ", ".join((*cls._fields, "footprint"))
-                raise TypeError(f"settings must be among: {known}; got {', '.join(kwargs)}")
-            self.footprint = None
-        else:
+        if footprint is not None:
             self.footprint = resolve_footprint(str(footprint), **kwargs)
+        elif kwargs:
+            known = ", ".join((*cls._fields, "footprint"))
+            raise TypeError(f"settings must be among: {known}; got {', '.join(kwargs)}")
         return self
 
     def _replace(self, **kwargs: Any) -> GaussianRasterizationSettings:
