@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from torch.autograd.function import once_differentiable
 
 from . import _C  # noqa: F401  (loads the ops)
 from .footprints import BOX_SAMPLES
@@ -95,6 +96,7 @@ def _rasterize_setup(ctx, inputs, output):
         ctx.save_for_backward(*tensors, *saved)
 
 
+@once_differentiable
 def _rasterize_backward(ctx, dL_dcolor, *_):
     if not ctx.has_saved:
         raise RuntimeError("rasterize was called with keep=False and cannot be differentiated")
@@ -115,6 +117,7 @@ def _weight_setup(ctx, inputs, output):
     ctx.save_for_backward(offset, cov2d)
 
 
+@once_differentiable
 def _weight_backward(ctx, dL_dweight):
     grads = torch.ops.analytic_rasterizer.footprint_weight_vjp(dL_dweight, *ctx.saved_tensors, *ctx.settings)
     return (*grads, None, None)

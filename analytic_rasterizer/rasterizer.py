@@ -84,21 +84,31 @@ def _unpickle_settings(fields: tuple, footprint: str | None) -> GaussianRasteriz
     return GaussianRasterizationSettings(*fields, footprint=footprint)
 
 
-def _present(tensor: torch.Tensor | None) -> torch.Tensor | None:
-    """3DGS passes missing inputs as empty tensors, on whatever device."""
-    return None if tensor is None or (tensor.dim() == 1 and tensor.numel() == 0) else tensor
-
-
-def _check_tensors(**tensors: Any) -> None:
+def _check_tensors(device: torch.device | None, **tensors: Any) -> None:
+    """Raises unless all are tensors, and on `device` if it is given."""
     for name, tensor in tensors.items():
         if not isinstance(tensor, torch.Tensor):
             raise TypeError(f"{name} must be a tensor, got {type(tensor).__name__}")
+        if device is not None and tensor.device != device:
+            raise ValueError(f"{name} must be on the device of means3D, {device}, got {tensor.device}")
 
 
-def _op_arguments(settings: GaussianRasterizationSettings) -> tuple:
+def _optional(device: torch.device, **tensors: Any) -> list[torch.Tensor | None]:
+    """The same for inputs that may be missing, which 3DGS passes as empty tensors on whatever device."""
+    present = []
+    for name, tensor in tensors.items():
+        if isinstance(tensor, torch.Tensor) and tensor.dim() == 1 and tensor.numel() == 0:
+            tensor = None
+        if tensor is not None:
+            _check_tensors(device, **{name: tensor})
+        present.append(tensor)
+    return present
+
+
+def _settings_arguments(settings: GaussianRasterizationSettings, device: torch.device) -> tuple:
     """What the ops take after the Gaussians."""
     s = settings
-    _check_tensors(bg=s.bg, viewmatrix=s.viewmatrix, projmatrix=s.projmatrix, campos=s.campos)
+    _check_tensors(device, bg=s.bg, viewmatrix=s.viewmatrix, projmatrix=s.projmatrix, campos=s.campos)
     footprint = s.footprint or get_default_footprint()
     return (
         s.bg, s.viewmatrix, s.projmatrix, s.campos, int(s.image_height), int(s.image_width),
@@ -119,19 +129,21 @@ def rasterize_gaussians(
     raster_settings: GaussianRasterizationSettings,
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Renders Gaussians. The functional form of `GaussianRasterizer.forward`, which says more."""
-    _check_tensors(means3D=means3D, opacities=opacities)
-    gaussians = (
-        means3D,
-        _present(means2D),
-        opacities,
-        _present(sh),
-        _present(colors_precomp),
-        _present(scales),
-        _present(rotations),
-        _present(cov3Ds_precomp),
+    _check_tensors(None, means3D=means3D)
+    device = means3D.device
+    _check_tensors(device, opacities=opacities)
+    means2D, *rest = _optional(
+        device,
+        means2D=means2D,
+        shs=sh,
+        colors_precomp=colors_precomp,
+        scales=scales,
+        rotations=rotations,
+        cov3D_precomp=cov3Ds_precomp,
     )
+    gaussians = (means3D, means2D, opacities, *rest)
     keep = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in gaussians)
-    arguments = (*gaussians, *_op_arguments(raster_settings), keep)
+    arguments = (*gaussians, *_settings_arguments(raster_settings, device), keep)
     if not raster_settings.debug:
         return torch.ops.analytic_rasterizer.rasterize(*arguments)[:2]
     try:
@@ -184,7 +196,7 @@ class GaussianRasterizer(torch.nn.Module):
             TypeError: Not a tensor, or not of the dtype of the settings' viewmatrix.
             ValueError: Wrong shape.
         """
-        _check_tensors(positions=positions)
+        _check_tensors(None, positions=positions)
         if positions.dim() != 2 or positions.shape[1] != 3:
             raise ValueError(f"positions must have shape (P, 3), got {tuple(positions.shape)}")
         view = self.raster_settings.viewmatrix.reshape(4, 4)
@@ -283,9 +295,13 @@ def render_stages(
 
     Arguments and errors are those of `GaussianRasterizer.forward`.
     """
-    _check_tensors(means3D=means3D, opacities=opacities)
-    optional = map(_present, (shs, colors_precomp, scales, rotations, cov3D_precomp))
+    _check_tensors(None, means3D=means3D)
+    device = means3D.device
+    _check_tensors(device, opacities=opacities)
+    optional = _optional(
+        device, shs=shs, colors_precomp=colors_precomp, scales=scales, rotations=rotations, cov3D_precomp=cov3D_precomp
+    )
     *tensors, seconds = torch.ops.analytic_rasterizer.rasterize_stages(
-        means3D, opacities, *optional, *_op_arguments(settings)
+        means3D, opacities, *optional, *_settings_arguments(settings, device)
     )
     return Stages(*tensors, dict(zip(("project", "bin", "blend"), seconds.tolist())))
