@@ -1,0 +1,164 @@
+// Compositing of one sample against a plain loop, differences and long double.
+#include "core/blend.h"
+
+#include <algorithm>
+
+#include "support.h"
+
+namespace ar::test {
+namespace {
+
+/// Front to back, as the definition reads: skip below 1/255, cap, stop before T falls below 1e-4.
+template <typename T> struct Composited {
+  T color = 0, transmittance = 1;
+  T error = 0;            ///< of the transmittance, relative, in roundings: T - T alpha cancels
+  std::vector<int> used;  ///< splats composited
+};
+template <typename T, typename S> Composited<T> plain_loop(const std::vector<S>& alphas, const std::vector<S>& colors) {
+  Composited<T> out;
+  for (size_t k = 0; k < alphas.size(); ++k) {
+    const T alpha = std::min(alphas[k], S(kAlphaMax));
+    if (alpha < S(kAlphaMin)) continue;
+    if (out.transmittance * (1 - alpha) < T(kTransmittanceMin)) break;
+    out.color += out.transmittance * alpha * T(colors[k]);
+    out.transmittance *= 1 - alpha;
+    out.error += 2 / (1 - alpha);
+    out.used.push_back(int(k));
+  }
+  return out;
+}
+
+template <typename T> Composited<T> blend_all(const std::vector<T>& alphas, const std::vector<T>& colors) {
+  Composited<T> out;
+  for (size_t k = 0; k < alphas.size(); ++k) {
+    const Blended<T> b = blend_sample(alphas[k], out.transmittance);
+    out.color += b.contribution * colors[k];
+    EXPECT_TRUE(b.mask || b.contribution == 0);
+    if (b.mask) out.used.push_back(int(k));
+  }
+  out.transmittance = std::abs(out.transmittance);
+  return out;
+}
+
+/// Gradients by alpha and colour of g . color + background . transmittance, walked from the back.
+template <typename T> struct Gradients {
+  std::vector<T> alphas, colors;
+  T transmittance;  ///< at the front
+};
+template <typename T>
+Gradients<T> blend_all_vjp(const std::vector<T>& alphas, const std::vector<T>& colors, const Composited<T>& forward,
+                           T g, T background) {
+  Gradients<T> out = {std::vector<T>(alphas.size()), std::vector<T>(alphas.size()), forward.transmittance};
+  T behind = background;
+  for (int k = int(alphas.size()) - 1; k >= 0; --k) {
+    const bool mask = std::binary_search(forward.used.begin(), forward.used.end(), k);
+    const BlendGrad<T> b = blend_sample_vjp(mask, alphas[k], g * colors[k], out.transmittance, behind);
+    out.alphas[k] = b.dL_dalpha;
+    out.colors[k] = g * b.contribution;
+  }
+  return out;
+}
+
+template <typename T> std::vector<T> randoms(Random& random, int n, double lo, double hi) {
+  std::vector<T> x(n);
+  for (T& v : x) v = T(random.uniform(lo, hi));
+  return x;
+}
+
+template <typename T> class BlendTest : public ::testing::Test {};
+using Scalars = ::testing::Types<float, double>;
+TYPED_TEST_SUITE(BlendTest, Scalars);
+
+// n steps of three roundings each, against long double. No stack here comes so close to the stop
+// rule that rounding decides.
+TYPED_TEST(BlendTest, MatchesAPlainLoop) {
+  using T = TypeParam;
+  Random random(1);
+  for (int trial = 0; trial < 2000; ++trial) {
+    const int n = random.below(60);
+    std::vector<T> alphas = randoms<T>(random, n, 0, trial % 2 ? 0.2 : 0.95);
+    for (T& a : alphas) a *= random.below(4) ? T(1) : T(0.01);  // some below the threshold
+    if (n > 0) alphas[random.below(n)] = T(1.5);                // one above the cap: two make an exact tie at the stop
+    const std::vector<T> colors = randoms<T>(random, n, 0, 1);
+    const Composited<T> actual = blend_all(alphas, colors);
+    const auto expected = plain_loop<long double>(alphas, colors);
+    ASSERT_EQ(actual.used, expected.used);
+    ASSERT_NEAR(actual.color, double(expected.color), 3 * n * kEps<T>);
+    ASSERT_NEAR(actual.transmittance, double(expected.transmittance),
+                kEps<T> * double(expected.error * expected.transmittance));
+  }
+}
+
+TYPED_TEST(BlendTest, ThresholdCapAndStop) {
+  using T = TypeParam;
+  const T least = T(kAlphaMin), below = std::nextafter(least, T(0)), cap = T(kAlphaMax);
+  const std::vector<T> one = {1};
+  EXPECT_EQ(blend_all<T>({least}, one).used.size(), 1u);
+  EXPECT_EQ(blend_all<T>({below}, one).used.size(), 0u);
+  EXPECT_EQ(blend_all<T>({T(5)}, one).color, cap);
+  // 0.01 is left behind a capped splat; the second would leave 1e-4 but for rounding, the third is
+  // beyond doubt. What comes after a stop is never drawn, however thin.
+  const Composited<T> stopped = blend_all<T>({T(1), T(0.5), T(1), T(0.01)}, {1, 1, 1, 1});
+  EXPECT_EQ(stopped.used, (std::vector<int>{0, 1}));
+  EXPECT_NEAR(stopped.transmittance, 0.005, 0.005 * 100 * kEps<T>);
+}
+
+// Differences: the loss is linear in each alpha, so any step is exact but for rounding.
+TEST(BlendVjp, MatchesDifferences) {
+  Random random(2);
+  for (int trial = 0; trial < 200; ++trial) {
+    std::vector<double> alphas = randoms<double>(random, 25, 0.01, 0.3), colors = randoms<double>(random, 25, 0, 1);
+    alphas[random.below(25)] = 1.2;    // capped: no gradient
+    alphas[random.below(25)] = 0.003;  // not drawn: no gradient
+    const double g = random.normal(), background = random.normal();
+    const auto loss = [&] {
+      const auto c = plain_loop<double>(alphas, colors);
+      return g * c.color + background * c.transmittance;
+    };
+    const auto used = blend_all(alphas, colors);
+    const auto grads = blend_all_vjp(alphas, colors, used, g, background);
+    ASSERT_NEAR(grads.transmittance, 1, kEps<double> * 2 * plain_loop<double>(alphas, colors).error);  // there and back
+    for (int k = 0; k < 25; ++k) {
+      for (const bool by_alpha : {true, false}) {
+        double& x = (by_alpha ? alphas : colors)[k];
+        const double at = x, h = 1e-4;
+        const double numeric = derivative(
+            [&](double t) {
+              x = at + t;
+              const double l = loss();
+              x = at;
+              return l;
+            },
+            h);
+        // Where a step crosses the stop rule there is no derivative to compare with.
+        if (by_alpha && (std::abs(used.transmittance - kTransmittanceMin) < 1e-4 || used.used.size() < 20)) continue;
+        ASSERT_NEAR((by_alpha ? grads.alphas : grads.colors)[k], numeric, 1e-10);
+      }
+    }
+  }
+}
+
+// Deep stacks in float. T has passed 2 n roundings forward and 3 n back, `behind` 3 n; each is a mean
+// of colours of at most 1.
+TEST(BlendVjp, KeepsDeepStacksAccurate) {
+  Random random(3);
+  for (const int n : {60, 400, 1500}) {
+    const std::vector<float> alphas = randoms<float>(random, n, 0.0045, 15.0 / n - 0.0045),
+                             colors = randoms<float>(random, n, 0, 1);
+    const auto used = blend_all(alphas, colors);
+    ASSERT_EQ(used.used.size(), size_t(n));
+    const auto grads = blend_all_vjp(alphas, colors, used, 1.0f, 0.5f);
+    std::vector<long double> front(n), behind(n + 1, 0.5L);
+    for (int k = 0; k < n; ++k) front[k] = k ? front[k - 1] * (1 - (long double)alphas[k - 1]) : 1.0L;
+    for (int k = n; k-- > 0;)
+      behind[k] = alphas[k] * (long double)colors[k] + (1 - (long double)alphas[k]) * behind[k + 1];
+    for (int k = 0; k < n; ++k) {
+      const double bound = 8 * n * kEps<float> * double(front[k]);
+      ASSERT_NEAR(grads.alphas[k], double(front[k] * (colors[k] - behind[k + 1])), bound) << n << " " << k;
+      ASSERT_NEAR(grads.colors[k], double(front[k] * alphas[k]), bound);
+    }
+  }
+}
+
+}  // namespace
+}  // namespace ar::test

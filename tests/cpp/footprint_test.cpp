@@ -1,0 +1,260 @@
+// Every footprint against differences, integrals and its own stated bounds.
+#include <algorithm>
+
+#include "support.h"
+
+namespace ar::test {
+namespace {
+
+template <class F> class FootprintTest : public ::testing::Test {};
+TYPED_TEST_SUITE(FootprintTest, AllFootprints, FootprintName);
+
+template <typename T> struct Adjoint {
+  SplatGrad<T> splat;
+  T weighted;
+};
+
+template <class F, typename T> Adjoint<T> weight_vjp(Cov2d<T> cov, Vec2<T> d, T opacity, const T* g) {
+  const auto shape = F::prepare(cov, options_of<F>());
+  const auto terms = F::terms(shape, opacity);
+  ShapeGrad<T> sums = {};
+  T weighted = 0;
+  for (int s = 0; s < F::kSamples; ++s) {
+    const T alpha = F::alpha(terms, d, s);
+    add(F::alpha_vjp(terms, d, s, alpha, g[s]), sums);
+    weighted += g[s] * alpha;
+  }
+  const SplatGrad<T> grad = F::prepare_vjp(cov, shape, sums, weighted);
+  // mean_map says the same; the two columns of a needle's map cancel, hence the norms.
+  const Mat2<T> m = F::mean_map(shape);
+  const Vec2<T> by_mean = transform_transposed(m, sums.offset);
+  const T size = std::hypot(std::hypot(m.xx, m.xy), std::hypot(m.yx, m.yy)) * std::hypot(sums.offset.x, sums.offset.y);
+  EXPECT_NEAR(by_mean.x, grad.dL_dmean.x, 8 * kEps<T> * size + std::numeric_limits<T>::min());
+  EXPECT_NEAR(by_mean.y, grad.dL_dmean.y, 8 * kEps<T> * size + std::numeric_limits<T>::min());
+  return {grad, weighted};
+}
+
+// In the eigenframe of Sigma, in units of l1, s1 s2 and l2, where every derivative is of the order
+// of the weight. The differences are good to 1e-10 of it.
+TYPED_TEST(FootprintTest, GradientsMatchDifferences) {
+  using F = TypeParam;
+  Random random(1);
+  for (int trial = 0; trial < 500; ++trial) {
+    const double s2 = random.log_uniform(0.05, 10), s1 = s2 * random.log_uniform(1.05, 30), l1 = s1 * s1, l2 = s2 * s2;
+    const double angle = random.uniform(0, 2 * kPi), opacity = random.uniform(0.01, 1), h = 1e-3 * s2;
+    const Mat2<double> axes = {std::cos(angle), -std::sin(angle), std::sin(angle), std::cos(angle)};  // in columns
+    const Cov2d<double> cov = covariance(s1, s2, angle);
+    // Within 3 standard deviations, where the kinks of cumulant's tail (q' > 23.6) are far.
+    const Mat2<double> w = F::ellipse(F::prepare(cov, options_of<F>()));
+    const Vec2<double> d = unwhiten(w, on_circle(random.uniform(0, 3), random.uniform(0, 2 * kPi)));
+    double g[16];
+    for (double& x : g) x = random.uniform(0.5, 1);
+
+    const auto moved = [&](double u, double v) {
+      return weight<F>(cov, d + transform(axes, Vec2<double>{u, v}), opacity, g);
+    };
+    const auto changed = [&](double l11, double l12, double l22) {
+      return weight<F>(turned(l1 + l11, l12, l2 + l22, angle), d, opacity, g);
+    };
+    // Frozen: the window keeps still, so that d/dSigma12 is d2/du dv as for any convolution.
+    const auto mixed = [&](double u) { return derivative([&](double v) { return moved(u, v); }, 2 * h); };
+    const auto across = [&](double t) { return changed(0, t, 0); };
+    const double expected[5] = {
+        s2 * derivative([&](double t) { return -moved(t, 0); }, h),
+        s2 * derivative([&](double t) { return -moved(0, t); }, h),
+        l1 * derivative([&](double t) { return changed(t, 0, 0); }, h * s1),
+        s1 * s2 * (kIsFrozen<F> ? derivative(mixed, 2e-3 * s1) : derivative(across, h * std::min(s1, (l1 - l2) / s1))),
+        l2 * derivative([&](double t) { return changed(0, 0, t); }, h * s2)};
+
+    const double value = weight<F>(cov, d, opacity, g);
+    const Adjoint<double> adjoint = weight_vjp<F>(cov, d, opacity, g);
+    const Vec2<double> by_mean = transform_transposed(axes, adjoint.splat.dL_dmean);
+    const Sym2<double> by_cov = congruence_transposed(axes, adjoint.splat.dL_dcov);
+    const double actual[5] = {s2 * by_mean.x, s2 * by_mean.y, l1 * by_cov.xx + adjoint.splat.dL_dlog_det,
+                              s1 * s2 * 2 * by_cov.xy, l2 * by_cov.yy + adjoint.splat.dL_dlog_det};
+    EXPECT_NEAR(adjoint.weighted, value, 1e-14 * value);  // alpha is linear in opacity
+    for (int k = 0; k < 5; ++k) {
+      ASSERT_NEAR(actual[k], expected[k], 1e-6 * std::abs(expected[k]) + 1e-9 * value)
+          << k << ": sigma " << s1 << " " << s2 << " turned " << angle;
+    }
+  }
+}
+
+// The trapezoidal rule with step h errs by exp(-2 pi^2 (sigma/h)^2) for a Gaussian and, for the
+// logistic, whose poles lie 2.7 sigma off the real axis, by exp(-2 pi 2.7 sigma/h): both below 1e-7
+// at h <= sigma. From sigma = 1 on, h = 1: the sum over the pixels themselves.
+TYPED_TEST(FootprintTest, MassIsConserved) {
+  using F = TypeParam;
+  const double sigmas[][2] = {{0.05, 0.05}, {0.2, 0.06}, {0.5, 0.3}, {1, 1}, {3, 1}, {8, 2}};
+  for (const auto& [s1, s2] : sigmas) {
+    for (const double angle : {0.0, 0.4, kPi / 4, kPi / 2, 2.2}) {
+      const Cov2d<double> cov = covariance(s1, s2, angle);
+      const double step = 1 / std::ceil(1 / s2);
+      const int n = int((1.5 + 8 * std::hypot(s1, 0.3)) / step);
+      double total = 0;
+      for (int y = -n; y <= n; ++y) {
+        for (int x = -n; x <= n; ++x) total += step * step * weight<F>(cov, {x * step, y * step}, 1.0);
+      }
+      // Without compensation the dilated Gaussian keeps its peak instead.
+      const Cov2d<double> mass = std::is_same_v<F, Point> ? blur(cov, options_of<F>().variance) : cov;
+      const double expected = 2 * kPi * std::sqrt(mass.det);
+      // `cumulant` truncates a series: 1/(240000 l^4) of the amplitude (docs/numerics.md) in each of some
+      // 2 pi 9 s1' s2' pixels, against a mass of 2 pi s1 s2; 6.6% in the limit sigma = 0 (measured).
+      const double l = s2 * s2 + kPixelVariance;
+      const double truncation =
+          kIsCumulant<F> ? std::min(0.066, 9 * (s1 * s1 + kPixelVariance) / (s1 * s2) / (240000 * l * l * l * l)) : 0;
+      EXPECT_NEAR(total / expected, 1, 1e-6 + truncation) << s1 << " " << s2 << " " << angle;
+    }
+  }
+}
+
+// Widening by a variance v changes the weight by at most v/2 max|Laplacian| = v / l2; dilation,
+// which keeps the peak, by less. The logistic's density is 1.6^2 2 pi / 16 - 1 = 5.3e-3 too high.
+TYPED_TEST(FootprintTest, WideSplatsAreTheGaussianItself) {
+  using F = TypeParam;
+  Random random(2);
+  for (int trial = 0; trial < 2000; ++trial) {
+    const double s2 = random.log_uniform(20, 1000), s1 = s2 * random.log_uniform(1, 100), u = random.uniform(0, 4),
+                 turn = random.uniform(0, 2 * kPi);
+    const Cov2d<double> cov = covariance(s1, s2, random.uniform(0, kPi));
+    const Vec2<double> d = unwhiten(whiten(cov), on_circle(u, turn));
+    const double v = std::max(options_of<F>().variance, kPixelVariance);
+    ASSERT_NEAR(weight<F>(cov, d, 1.0), std::exp(-u * u / 2), v / (s2 * s2) + (kIsAnalytic<F> ? 5.4e-3 : 0));
+  }
+}
+
+template <int S> void expect_moments_of_the_pixel() {
+  int sum_x = 0, sum_y = 0, sum_xx = 0, sum_yy = 0;
+  unsigned columns = 0, rows = 0;
+  for (int s = 0; s < S; ++s) {
+    const Vec2<int> n = box_node<S>(s);
+    sum_x += n.x;
+    sum_y += n.y;
+    sum_xx += n.x * n.x;
+    sum_yy += n.y * n.y;
+    columns |= 1u << ((n.x + S - 1) / 2);
+    rows |= 1u << ((n.y + S - 1) / 2);
+    EXPECT_LE(std::max(std::abs(n.x), std::abs(n.y)) / (2.0 * S), Box<S>::kReach);
+  }
+  EXPECT_EQ(columns, (1u << S) - 1);  // one per column and row
+  EXPECT_EQ(rows, (1u << S) - 1);
+  EXPECT_EQ(sum_x, 0);
+  EXPECT_EQ(sum_y, 0);
+  // Their mean square / (2 S)^2, plus the variance 1/(12 S^2) of a component, is 1/12.
+  EXPECT_EQ(3 * sum_xx, S * (S * S - 1));
+  EXPECT_EQ(3 * sum_yy, S * (S * S - 1));
+}
+TEST(BoxNodes, HaveTheMomentsOfThePixel) {
+  expect_moments_of_the_pixel<1>();
+  expect_moments_of_the_pixel<2>();
+  expect_moments_of_the_pixel<4>();
+  expect_moments_of_the_pixel<8>();
+  expect_moments_of_the_pixel<16>();
+}
+
+// Random search outside the ellipse.
+TYPED_TEST(FootprintTest, SupportIsConservative) {
+  using F = TypeParam;
+  Random random(3);
+  for (int trial = 0; trial < 30000; ++trial) {
+    const double s2 = random.log_uniform(0.01, 100), s1 = std::min(100.0, s2 * random.log_uniform(1, 1000));
+    const double opacity = random.log_uniform(0.004, 1);
+    const auto shape = F::prepare(covariance(s1, s2, random.uniform(0, kPi)), options_of<F>());
+    const double level = F::level(shape, opacity);
+    ASSERT_LE(F::level(shape, 1.0) + kLevelSlack, kMaxLevel) << s1 << " " << s2;
+    const auto terms = F::terms(shape, opacity);
+    for (int k = 0; k < 12; ++k) {
+      const double beyond =
+          std::max(level, 0.0) * (1 + random.log_uniform(1e-9, 2)) + (level > 0 ? 0 : random.uniform(0, 1));
+      const Vec2<double> z = unwhiten(F::ellipse(shape), on_circle(std::sqrt(beyond), random.uniform(0, 2 * kPi)));
+      for (int s = 0; s < F::kSamples; ++s) {
+        Vec2<double> node = {0, 0};
+        if constexpr (F::kSamples > 1)
+          node = {box_node<F::kSamples>(s).x / (2.0 * F::kSamples), box_node<F::kSamples>(s).y / (2.0 * F::kSamples)};
+        ASSERT_LT(F::alpha(terms, Vec2<double>{z.x - node.x, z.y - node.y}, s), kAlphaMin)
+            << "sigma " << s1 << " " << s2 << " opacity " << opacity << " level " << level << " |w d|^2 " << beyond;
+      }
+    }
+  }
+}
+
+// The bound in the comment of Analytic::level.
+TEST(AnalyticLevel, HoldsAlongOneAxis) {
+  for (double sigma = 0.005; sigma < 200; sigma *= 1.01) {
+    const double r = 1 / sigma, ww = 1 / (sigma * sigma + kPixelVariance), peak = LogisticWindow<double>(0, r).value;
+    for (double u = 0; u * u * ww < 40; u += 0.002 / std::sqrt(ww)) {
+      const double ratio = LogisticWindow<double>(u, r).value / peak;
+      if (ratio <= kAlphaMin) break;
+      ASSERT_GE(-2 * std::log(ratio), u * u * ww - ww * ww / 48 - 0.05) << "sigma " << sigma << " u " << u;
+    }
+  }
+}
+
+// The bound in the comment of Cumulant::level, per axis, and that the tail falls.
+TEST(CumulantLevel, HoldsAlongOneAxis) {
+  for (double t = 1e-6; t <= 12; t = std::min(t * 1.02 + 1e-12, t < 12 ? 12.0 : 13.0)) {
+    const auto axis = CumulantAxis<double>::at(t);
+    for (double p = 0; p < 100; p += 0.01)
+      ASSERT_GE(2 * Cumulant::kOrder4 * axis.value(p), -t * t / 124) << "t " << t << " p " << p;
+  }
+}
+
+template <typename T> bool all_finite(const SplatGrad<T>& g) {
+  return std::isfinite(g.dL_dmean.x) && std::isfinite(g.dL_dmean.y) && std::isfinite(g.dL_dcov.xx) &&
+         std::isfinite(g.dL_dcov.xy) && std::isfinite(g.dL_dcov.yy) && std::isfinite(g.dL_dlog_det);
+}
+
+// Discs, needles along the axes and across them, invisible and immense ones, near and far.
+TYPED_TEST(FootprintTest, HardInputsStayFiniteInFloat) {
+  using F = TypeParam;
+  float g[16];
+  std::fill(g, g + 16, 1.0f);
+  for (double s1 = 1e-6; s1 < 2e6; s1 *= 10) {
+    for (double s2 = std::max(1e-6, s1 * 1e-6); s2 <= s1 * 1.5; s2 *= 10) {
+      for (const double angle : {0.0, kPi / 2, kPi / 4, 0.3, 1e-4}) {
+        const Cov2d<float> cov = rounded<float>(covariance(s1, s2, angle));
+        for (const double distance : {0.0, 0.5, s2, s1, 30.0, 1e3, 1e5}) {
+          for (const double direction : {angle, angle + kPi / 2, 0.0, 1.0}) {
+            const Vec2<double> d = on_circle(distance, direction);
+            const Adjoint<float> a = weight_vjp<F>(cov, {float(d.x), float(d.y)}, 1.0f, g);
+            ASSERT_TRUE(std::isfinite(a.weighted) && all_finite(a.splat))
+                << "sigma " << s1 << " " << s2 << " turned " << angle << " d " << d.x << " " << d.y;
+            ASSERT_GE(a.weighted, 0);
+            ASSERT_LE(a.weighted, 1.01f * F::kSamples);
+          }
+        }
+      }
+    }
+  }
+}
+
+// To first order: every quantity that alpha depends on carries a few roundings, so the error is a
+// few eps times |dI/dd| (|d| + half a pixel) + I. Twelve is the longest chain (eigenframe, window).
+TYPED_TEST(FootprintTest, FloatAgreesWithDouble) {
+  using F = TypeParam;
+  Random random(5);
+  for (int trial = 0; trial < 20000; ++trial) {
+    const double s2 = random.log_uniform(1e-2, 100), s1 = std::min(1000.0, s2 * random.log_uniform(1, 1e4));
+    const Cov2d<float> cov = rounded<float>(covariance(s1, s2, random.uniform(0, kPi)));
+    const Cov2d<double> same = {cov.xx, cov.xy, cov.yy, cov.det};
+    const Mat2<double> w = F::ellipse(F::prepare(same, options_of<F>()));
+    const Vec2<double> at = unwhiten(w, on_circle(random.uniform(0, 4), random.uniform(0, 2 * kPi)));
+    const Vec2<float> d = {float(at.x), float(at.y)};
+    const Vec2<double> dd = {d.x, d.y};
+    for (int s = 0; s < F::kSamples; ++s) {
+      float pick[16] = {};
+      double pick_too[16] = {};
+      pick[s] = 1;
+      pick_too[s] = 1;
+      const Adjoint<double> adjoint = weight_vjp<F>(same, dd, 1.0, pick_too);
+      const double condition =
+          std::hypot(adjoint.splat.dL_dmean.x, adjoint.splat.dL_dmean.y) * (std::hypot(dd.x, dd.y) + 0.5) +
+          adjoint.weighted;
+      ASSERT_NEAR(weight<F>(cov, d, 1.0f, pick), adjoint.weighted, 12 * kEps<float> * condition + 1e-37)
+          << s1 << " " << s2;
+    }
+  }
+}
+
+}  // namespace
+}  // namespace ar::test

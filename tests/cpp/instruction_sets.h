@@ -1,0 +1,34 @@
+// The instruction sets that the CPU path is compiled for, and what the tests call in each.
+#pragma once
+
+#include <cstdint>
+#include <ostream>
+#include <string_view>
+#include <vector>
+
+#include "cpu/tasks.h"
+
+namespace ar::test {
+
+/// Operations of one instruction set's Pack on `lanes` floats.
+struct PackOps {
+  using Map = void (*)(const float* a, const float* b, const float* c, float* out);
+  int lanes;
+  Map exp, exp2, sqrt, abs, min, max, madd;
+  Map select;  ///< a < b ? b : c
+  float (*sum)(const float* a);
+  uint32_t (*bits)(const float* a, const float* b);  ///< of a < b
+};
+
+struct InstructionSet {
+  const char* name;
+  bool supported;  ///< by this CPU
+  PackOps ops;
+  const cpu::Stages<float>* (*stages)(std::string_view footprint);
+};
+
+inline void PrintTo(const InstructionSet& set, std::ostream* out) { *out << set.name; }
+
+const std::vector<InstructionSet>& instruction_sets();
+
+}  // namespace ar::test

@@ -1,0 +1,28 @@
+// PackOps of one instruction set: pack_ops_*.cpp include this with the target switched.
+#pragma once
+
+#include "cpu/pack.h"
+#include "instruction_sets.h"
+
+namespace ar::AR_ISA {
+
+extern const test::PackOps kPackOps;
+const test::PackOps kPackOps = {
+    kLanes,
+    [](const float* a, const float*, const float*, float* out) { exp(Pack::load(a)).store(out); },
+    [](const float* a, const float*, const float*, float* out) { exp2(Pack::load(a)).store(out); },
+    [](const float* a, const float*, const float*, float* out) { sqrt(Pack::load(a)).store(out); },
+    [](const float* a, const float*, const float*, float* out) { abs(Pack::load(a)).store(out); },
+    [](const float* a, const float* b, const float*, float* out) { min(Pack::load(a), Pack::load(b)).store(out); },
+    [](const float* a, const float* b, const float*, float* out) { max(Pack::load(a), Pack::load(b)).store(out); },
+    [](const float* a, const float* b, const float* c, float* out) {
+      madd(Pack::load(a), Pack::load(b), Pack::load(c)).store(out);
+    },
+    [](const float* a, const float* b, const float* c, float* out) {
+      select(Pack::load(a) < Pack::load(b), Pack::load(b), Pack::load(c)).store(out);
+    },
+    [](const float* a) { return sum(Pack::load(a)); },
+    [](const float* a, const float* b) { return bits(Pack::load(a) < Pack::load(b)); },
+};
+
+}  // namespace ar::AR_ISA

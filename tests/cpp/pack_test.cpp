@@ -1,0 +1,117 @@
+// Packs of every instruction set against the standard library: the bounds that cpu/pack.h states.
+#include <algorithm>
+#include <cmath>
+#include <functional>
+
+#include "instruction_sets.h"
+#include "support.h"
+
+namespace ar::test {
+namespace {
+
+class PackTest : public ::testing::TestWithParam<InstructionSet> {
+ protected:
+  void SetUp() override {
+    if (!GetParam().supported) GTEST_SKIP() << "this CPU lacks " << GetParam().name;
+  }
+
+  using Check = std::function<void(float a, float b, float c, float result)>;
+
+  /// check(a[i], b[i], c[i], result) for every i; sizes are filled up with zeros.
+  static void for_each_result(PackOps::Map map, std::vector<float> a, std::vector<float> b, std::vector<float> c,
+                              const Check& check) {
+    const size_t lanes = GetParam().ops.lanes, size = (a.size() + lanes - 1) / lanes * lanes;
+    a.resize(size);
+    b.resize(size);
+    c.resize(size);
+    std::vector<float> out(lanes);
+    for (size_t i = 0; i < size; i += lanes) {
+      map(&a[i], &b[i], &c[i], out.data());
+      for (size_t k = 0; k < lanes; ++k) check(a[i + k], b[i + k], c[i + k], out[k]);
+    }
+  }
+};
+
+INSTANTIATE_TEST_SUITE_P(, PackTest, ::testing::ValuesIn(instruction_sets()),
+                         [](const auto& info) { return info.param.name; });
+
+std::vector<float> ramp(double lo, double hi, int n) {
+  std::vector<float> x(n);
+  for (int i = 0; i < n; ++i) x[i] = float(lo + (hi - lo) * i / (n - 1));
+  return x;
+}
+
+std::vector<float> randoms(uint64_t seed, int n) {
+  Random random(seed);
+  std::vector<float> x(n);
+  for (float& v : x) v = float(random.normal() * random.log_uniform(1e-20, 1e18));
+  return x;
+}
+
+/// The stated bounds, relative.
+constexpr double kExpError = 2e-7, kExp2Error = 3e-7;
+
+TEST_P(PackTest, ExpIsWithinItsBound) {
+  for_each_result(GetParam().ops.exp, ramp(-87, 88, 2000003), {}, {},
+                  [](float x, float, float, float r) { ASSERT_NEAR(r / std::exp(double(x)), 1, kExpError) << x; });
+}
+
+TEST_P(PackTest, Exp2IsWithinItsBound) {
+  for_each_result(GetParam().ops.exp2, ramp(-126, 127, 2000003), {}, {},
+                  [](float x, float, float, float r) { ASSERT_NEAR(r / std::exp2(double(x)), 1, kExp2Error) << x; });
+}
+
+TEST_P(PackTest, ExponentialsAreClamped) {
+  const float inf = std::numeric_limits<float>::infinity();
+  for_each_result(GetParam().ops.exp, {-inf, -1e30f, -87.1f, 88.1f, 1e30f, inf}, {}, {},
+                  [](float x, float, float, float r) {
+                    ASSERT_NEAR(r / std::exp(std::clamp(double(x), -87.0, 88.0)), 1, kExpError) << x;
+                  });
+  for_each_result(GetParam().ops.exp2, {-inf, -1e30f, -127.0f, -126.5f}, {}, {}, [](float x, float, float, float r) {
+    ASSERT_NEAR(r / std::exp2(std::max(double(x), -126.0)), 1, kExp2Error) << x;
+  });
+}
+
+TEST_P(PackTest, ExactOperations) {
+  const PackOps& ops = GetParam().ops;
+  const std::vector<float> a = randoms(1, 999), b = randoms(2, 999), c = randoms(3, 999);
+  for_each_result(ops.min, a, b, c, [](float a, float b, float, float r) { ASSERT_EQ(r, std::min(a, b)); });
+  for_each_result(ops.max, a, b, c, [](float a, float b, float, float r) { ASSERT_EQ(r, std::max(a, b)); });
+  for_each_result(ops.abs, a, b, c, [](float a, float, float, float r) { ASSERT_EQ(r, std::abs(a)); });
+  for_each_result(ops.select, a, b, c, [](float a, float b, float c, float r) { ASSERT_EQ(r, a < b ? b : c); });
+  std::vector<float> positive = a;
+  for (float& x : positive) x = std::abs(x);
+  for_each_result(ops.sqrt, positive, b, c, [](float a, float, float, float r) { ASSERT_EQ(r, std::sqrt(a)); });
+}
+
+TEST_P(PackTest, MaddRoundsAtMostTwice) {
+  for_each_result(GetParam().ops.madd, randoms(1, 999), randoms(2, 999), randoms(3, 999),
+                  [](float a, float b, float c, float r) {
+                    const double product = double(a) * b, exact = product + c;
+                    // One rounding of the product and one of the sum, or only the latter.
+                    ASSERT_LE(std::abs(r - exact), 1.001 * kEps<float> * (std::abs(product) + std::abs(exact)) + 1e-44)
+                        << a << " " << b << " " << c;
+                  });
+}
+
+TEST_P(PackTest, SumAndBits) {
+  const int lanes = GetParam().ops.lanes;
+  Random random(4);
+  for (int trial = 0; trial < 200; ++trial) {
+    std::vector<float> a(lanes), zero(lanes, 0.0f);
+    double exact = 0, size = 0;
+    uint32_t negative = 0;
+    for (int i = 0; i < lanes; ++i) {
+      a[i] = float(random.normal());
+      exact += a[i];
+      size += std::abs(a[i]);
+      negative |= uint32_t(a[i] < 0) << i;
+    }
+    ASSERT_EQ(GetParam().ops.bits(a.data(), zero.data()), negative);
+    // Pairwise: each term passes log2(lanes) <= 4 roundings.
+    ASSERT_NEAR(GetParam().ops.sum(a.data()), exact, 4.001 * kEps<float> * size);
+  }
+}
+
+}  // namespace
+}  // namespace ar::test

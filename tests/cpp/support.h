@@ -1,0 +1,125 @@
+// What the tests share: footprints as a typed list, random numbers, differences, a camera.
+#pragma once
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <limits>
+#include <random>
+#include <vector>
+
+#include "core/footprint/registry.h"
+#include "core/project.h"
+
+namespace ar::test {
+
+template <class List> struct TypesOf;
+template <class... F> struct TypesOf<FootprintList<F...>> {
+  using Type = ::testing::Types<F...>;
+};
+using AllFootprints = TypesOf<Footprints>::Type;
+
+struct FootprintName {
+  template <class F> static std::string GetName(int) { return F::kName; }
+};
+
+template <class F> inline constexpr bool kIsFrozen = std::is_same_v<F, Analytic<FrameGradient::kFrozen>>;
+template <class F>
+inline constexpr bool kIsAnalytic = kIsFrozen<F> || std::is_same_v<F, Analytic<FrameGradient::kPaper>>;
+template <class F> inline constexpr bool kIsCumulant = std::is_same_v<F, Cumulant>;
+
+/// The public defaults of the options.
+template <class F> FootprintOptions options_of() { return {std::is_same_v<F, Point> ? 0.3 : 0.1}; }
+
+/// Rounding error of one operation, relative.
+template <typename T> inline constexpr T kEps = std::numeric_limits<T>::epsilon() / 2;
+
+struct Random {
+  std::mt19937_64 engine;
+  explicit Random(uint64_t seed) : engine(seed) {}
+  double uniform(double lo, double hi) { return lo + (hi - lo) * std::generate_canonical<double, 53>(engine); }
+  double log_uniform(double lo, double hi) { return std::exp(uniform(std::log(lo), std::log(hi))); }
+  double normal() { return std::normal_distribution<double>()(engine); }
+  int below(int n) { return int(uniform(0, n)); }
+};
+
+/// f'(0) from five points: error h^4 f^(5) / 30 and rounding eps |f| / h.
+template <class Function> double derivative(const Function& f, double h) {
+  return (8 * (f(h) - f(-h)) - (f(2 * h) - f(-2 * h))) / (12 * h);
+}
+
+/// Sum over the samples of g[s] alpha at d; g null: their mean.
+template <class F, typename T> T weight(Cov2d<T> cov, Vec2<T> d, T opacity, const T* g = nullptr) {
+  const auto terms = F::terms(F::prepare(cov, options_of<F>()), opacity);
+  T total = 0;
+  for (int s = 0; s < F::kSamples; ++s) total += (g ? g[s] : T(1) / F::kSamples) * F::alpha(terms, d, s);
+  return total;
+}
+
+template <typename T> void add(const ShapeGrad<T>& one, ShapeGrad<T>& sums) {
+  sums.offset = sums.offset + one.offset;
+  sums.shape = {sums.shape.xx + one.shape.xx, sums.shape.xy + one.shape.xy, sums.shape.yy + one.shape.yy};
+}
+
+/// [l1 l12; l12 l2] turned by an angle, its determinant without cancellation.
+inline Cov2d<double> turned(double l1, double l12, double l2, double angle) {
+  const double c = std::cos(angle), s = std::sin(angle);
+  return {c * c * l1 - 2 * c * s * l12 + s * s * l2, c * s * (l1 - l2) + (c * c - s * s) * l12,
+          s * s * l1 + 2 * c * s * l12 + c * c * l2, l1 * l2 - l12 * l12};
+}
+
+/// A needle or a disc of standard deviations s1, s2 along the axes of an angle.
+inline Cov2d<double> covariance(double s1, double s2, double angle) { return turned(s1 * s1, 0, s2 * s2, angle); }
+
+template <typename T> Cov2d<T> rounded(Cov2d<double> c) { return {T(c.xx), T(c.xy), T(c.yy), T(c.det)}; }
+
+/// d with w d = z.
+template <typename T> Vec2<T> unwhiten(const Mat2<T>& w, Vec2<T> z) {
+  const T det = w.xx * w.yy - w.xy * w.yx;
+  return {(w.yy * z.x - w.xy * z.y) / det, (w.xx * z.y - w.yx * z.x) / det};
+}
+
+inline Vec2<double> on_circle(double radius, double angle) {
+  return {radius * std::cos(angle), radius * std::sin(angle)};
+}
+
+/// Matrices of a camera turned about x and y, moved, and with its principal point off the centre.
+template <typename T> struct TestCamera {
+  int width, height;
+  T tan_x, tan_y;
+  T view[16], proj[16], position[3];
+
+  TestCamera(int w, int h, double fov_tan, Vec3<double> turn_and_shift, Vec2<double> principal)
+      : width(w), height(h), tan_x(T(fov_tan)), tan_y(T(fov_tan * h / w)) {
+    const double a = turn_and_shift.x, b = turn_and_shift.y, shift = turn_and_shift.z;
+    const double near = 0.01, far = 100;
+    const double m[4][4] = {{std::cos(b), 0, std::sin(b), shift},
+                            {std::sin(a) * std::sin(b), std::cos(a), -std::sin(a) * std::cos(b), -shift},
+                            {-std::cos(a) * std::sin(b), std::sin(a), std::cos(a) * std::cos(b), 0.5 * shift},
+                            {0, 0, 0, 1}};
+    const double p[4][4] = {{1 / double(tan_x), 0, principal.x, 0},
+                            {0, 1 / double(tan_y), principal.y, 0},
+                            {0, 0, far / (far - near), -far * near / (far - near)},
+                            {0, 0, 1, 0}};
+    for (int r = 0; r < 4; ++r) {
+      for (int c = 0; c < 4; ++c) {
+        double sum = 0;
+        for (int k = 0; k < 4; ++k) sum += p[r][k] * m[k][c];
+        view[4 * c + r] = T(m[r][c]);
+        proj[4 * c + r] = T(sum);
+      }
+    }
+    for (int c = 0; c < 3; ++c) position[c] = T(-(m[0][c] * m[0][3] + m[1][c] * m[1][3] + m[2][c] * m[2][3]));
+  }
+
+  CameraView<T> look() const { return {view, proj, position, width, height, tan_x, tan_y}; }
+
+  /// The world point at camera-space x, y, z.
+  Vec3<T> world(double x, double y, double z) const {
+    const double v[3] = {x - view[12], y - view[13], z - view[14]};
+    const auto at = [&](int c) { return T(view[4 * c] * v[0] + view[4 * c + 1] * v[1] + view[4 * c + 2] * v[2]); };
+    return {at(0), at(1), at(2)};
+  }
+};
+
+}  // namespace ar::test

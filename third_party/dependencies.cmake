@@ -1,0 +1,18 @@
+# Finds what the CMake build needs on the system. Nothing is downloaded, nothing is vendored.
+
+find_package(OpenMP REQUIRED COMPONENTS CXX)
+
+if(BUILD_TESTING)
+  find_package(GTest QUIET)
+  if(NOT GTest_FOUND)
+    message(FATAL_ERROR
+      "GoogleTest was not found. Install it (Debian, Ubuntu: libgtest-dev; Fedora: gtest-devel; conda: gtest; "
+      "macOS: googletest) or leave the tests out with -DBUILD_TESTING=OFF.")
+  endif()
+
+  # The CUDA toolkit is optional and no GPU is needed: a test compiles the core for devices.
+  find_program(AR_NVCC nvcc HINTS ENV CUDA_HOME ENV CUDA_PATH PATHS /usr/local/cuda PATH_SUFFIXES bin)
+  if(NOT AR_NVCC)
+    message(STATUS "nvcc was not found: the test core_cuda, which compiles the core for devices, is left out.")
+  endif()
+endif()
