@@ -11,9 +11,11 @@ SHARED = ROOT.parent / "shared"
 
 
 @pytest.fixture(autouse=True)
-def restore_threads():
-    """Tests that change the thread count leave no trace."""
+def one_thread():
+    """Tests run on one thread unless they say otherwise; test_determinism.py proves that this decides
+    no bit. Small tensors on waiting threads make the suite ten times slower on a busy machine."""
     threads = torch.get_num_threads()
+    torch.set_num_threads(1)
     yield
     torch.set_num_threads(threads)
 

@@ -207,9 +207,7 @@ def exact_weight(offset, cov2d, panels=64, order=10):
     the conditional deviation of the other axis; 64 panels of 10 nodes resolve deviations down to
     0.01 px to 1e-13. Differentiable in both arguments.
     """
-    offset, cov2d = torch.broadcast_tensors(
-        torch.nn.functional.pad(offset, (0, 1)), cov2d
-    )  # (..., 3)
+    offset, cov2d = torch.broadcast_tensors(torch.nn.functional.pad(offset, (0, 1)), cov2d)  # (..., 3)
     x, y, _ = offset.unbind(-1)
     xx, xy, yy = cov2d.unbind(-1)
     swap = yy > xx
@@ -232,9 +230,7 @@ def exact_weight(offset, cov2d, panels=64, order=10):
 
     centre = expand(xy / wide) * outer
     scale = math.sqrt(2) * expand(deviation)
-    strip = torch.erf((expand(y) + 0.5 - centre) / scale) - torch.erf(
-        (expand(y) - 0.5 - centre) / scale
-    )
+    strip = torch.erf((expand(y) + 0.5 - centre) / scale) - torch.erf((expand(y) - 0.5 - centre) / scale)
     values = torch.exp(-outer * outer / (2 * expand(wide))) * strip
     total = (values * node_weights / 2).sum((-1, -2)) * step
     return total * deviation * math.sqrt(math.pi / 2)
@@ -469,9 +465,7 @@ def render(
         transmittance = transmittance * (1 - alpha)
     color = color + transmittance.mean(0) * settings.bg.double()[:, None, None]
     radii = torch.ceil(three_sigma(cov2d.detach(), footprint, **options)) * touched
-    return Rendered(
-        color, radii.int(), projection, pixel_margin.min().item(), pixel_margin, offsets
-    )
+    return Rendered(color, radii.int(), projection, pixel_margin.min().item(), pixel_margin, offsets)
 
 
 def absolute_gradient(rendered, count, settings):

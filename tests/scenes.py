@@ -55,9 +55,7 @@ class Camera:
     def world_to_camera(self):
         """w2c (4, 4): camera looks along +z (OpenCV axes)."""
         eye = torch.tensor(self.eye, dtype=torch.float64)
-        forward = torch.nn.functional.normalize(
-            torch.tensor(self.target, dtype=torch.float64) - eye, dim=0
-        )
+        forward = torch.nn.functional.normalize(torch.tensor(self.target, dtype=torch.float64) - eye, dim=0)
         # Tilted, so that no axis of the camera is an axis of the world.
         up = torch.tensor([0.2, -1.0, 0.1], dtype=torch.float64)
         right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
@@ -174,9 +172,7 @@ def splat_scene(camera, means2d, cov2d, opacities, depths, colors=None):
     size = torch.tensor([camera.image_width, camera.image_height], dtype=torch.float64)
     tangent = torch.tensor([camera.tanfovx, camera.tanfovy], dtype=torch.float64)
     focal = size / (2 * tangent)
-    slope = (
-        (2 * means2d + 1 - 2 * torch.tensor(camera.shift, dtype=torch.float64)) / size - 1
-    ) * tangent
+    slope = ((2 * means2d + 1 - 2 * torch.tensor(camera.shift, dtype=torch.float64)) / size - 1) * tangent
     scale = depths[:, None] / focal
     count = len(means2d)
     cov3d = torch.zeros(count, 6, dtype=torch.float64)
@@ -195,9 +191,7 @@ def splat_scene(camera, means2d, cov2d, opacities, depths, colors=None):
 def random_cov2d(generator, count, sigma, ratio=(1.0, 100.0)):
     """Covariances (count, 3) [px^2]: smaller deviation and anisotropy log-uniform, any rotation."""
     small = torch.exp(rand(generator, count, low=math.log(sigma[0]), high=math.log(sigma[1])))
-    large = small * torch.exp(
-        rand(generator, count, low=math.log(ratio[0]), high=math.log(ratio[1]))
-    )
+    large = small * torch.exp(rand(generator, count, low=math.log(ratio[0]), high=math.log(ratio[1])))
     return covariance_2d(large, small, rand(generator, count, high=math.pi))
 
 

@@ -95,10 +95,7 @@ def test_settings_look_like_those_of_3dgs_2023():
     """Downstream code probes _fields and the signature: neither may show more."""
     assert Settings._fields == FIELDS
     assert tuple(inspect.signature(Settings).parameters) == FIELDS
-    assert all(
-        p.default is inspect.Parameter.empty
-        for p in inspect.signature(Settings).parameters.values()
-    )
+    assert all(p.default is inspect.Parameter.empty for p in inspect.signature(Settings).parameters.values())
 
 
 @pytest.mark.parametrize("extra", [{}, {"footprint": "box", "samples": 8}], ids=["plain", "box"])
@@ -163,9 +160,7 @@ def test_replace():
     assert smaller.image_height == 10
     assert settings.image_height == 37
     assert render(scene32(), smaller)[0].shape == (3, 10, 45)
-    assert_same_footprint(
-        settings._replace(footprint="mip"), CAMERA.settings(torch.float32, footprint="mip")
-    )
+    assert_same_footprint(settings._replace(footprint="mip"), CAMERA.settings(torch.float32, footprint="mip"))
     with pytest.raises((TypeError, ValueError), match="nonsense"):
         settings._replace(nonsense=1)
 
@@ -182,8 +177,7 @@ def test_settings_without_footprint_follow_the_default():
     """The default is looked up when rendering, so set_default_footprint works on existing code."""
     settings = CAMERA.settings(torch.float32)
     expected = {
-        name_of(v): render(scene32(), CAMERA.settings(torch.float32, footprint=v[0], **v[1]))[0]
-        for v in VARIANTS
+        name_of(v): render(scene32(), CAMERA.settings(torch.float32, footprint=v[0], **v[1]))[0] for v in VARIANTS
     }
     assert torch.equal(render(scene32(), settings)[0], expected["analytic-frozen"])
     ar.set_default_footprint("box", samples=2)
@@ -204,9 +198,7 @@ def test_environment_variable(monkeypatch):
     variable = "ANALYTIC_RASTERIZER_FOOTPRINT"
     monkeypatch.setenv(variable, "box:samples=2")
     assert str(ar.get_default_footprint()) == "box:samples=2"
-    assert_same_footprint(
-        CAMERA.settings(torch.float32), CAMERA.settings(torch.float32, footprint="box", samples=2)
-    )
+    assert_same_footprint(CAMERA.settings(torch.float32), CAMERA.settings(torch.float32, footprint="box", samples=2))
     ar.set_default_footprint("mip")  # the call wins over the variable
     assert ar.get_default_footprint().name == "mip"
     ar.set_default_footprint(None)
@@ -219,10 +211,7 @@ def test_environment_variable(monkeypatch):
 
 def test_environment_variable_of_a_new_process():
     """As a user sets it: outside, for a script that only knows the old import."""
-    code = (
-        "import diff_gaussian_rasterization, analytic_rasterizer as ar;"
-        "print(ar.get_default_footprint())"
-    )
+    code = "import diff_gaussian_rasterization, analytic_rasterizer as ar;print(ar.get_default_footprint())"
     done = subprocess.run(
         [sys.executable, "-c", code],
         capture_output=True,
@@ -396,10 +385,7 @@ def test_mark_visible():
     visible = ar.GaussianRasterizer(settings).markVisible(positions)
     assert visible.dtype == torch.bool
     assert visible.shape == (500,)
-    z = (
-        torch.cat([positions.double(), torch.ones(500, 1).double()], -1)
-        @ CAMERA.fields()["viewmatrix"]
-    )
+    z = torch.cat([positions.double(), torch.ones(500, 1).double()], -1) @ CAMERA.fields()["viewmatrix"]
     z = z[:, 2]
     clear = (z - reference.NEAR).abs() > 1e-4
     assert torch.equal(visible[clear], (z > reference.NEAR)[clear])
@@ -495,9 +481,7 @@ def t(*shape, **kwargs):
     return torch.ones(*shape, **kwargs)
 
 
-DOUBLE, HALF, LONG = (
-    f"got ({name})" for name in ("Double|torch.float64", "Half|torch.float16", "Long|torch.int64")
-)
+DOUBLE, HALF, LONG = (f"got ({name})" for name in ("Double|torch.float64", "Half|torch.float16", "Long|torch.int64"))
 META = torch.device("meta")
 NAN_4X4 = t(4, 4) * math.nan
 

@@ -75,9 +75,7 @@ def largest_alpha_per_tile(settings, scene, variant, block=20):
     covariance = reference.unpack_covariance(scene["cov3D_precomp"].double())
     means, cov2d, _ = reference.project(settings, scene["means3D"].double(), covariance)
     rows, columns = tile_grid()
-    padded = torch.meshgrid(
-        torch.arange(rows * ar.TILE), torch.arange(columns * ar.TILE), indexing="ij"
-    )
+    padded = torch.meshgrid(torch.arange(rows * ar.TILE), torch.arange(columns * ar.TILE), indexing="ij")
     inside = (padded[0] < CAMERA.image_height) & (padded[1] < CAMERA.image_width)
     pixels = torch.stack([padded[1], padded[0]], -1).double()
     out = []
@@ -87,9 +85,9 @@ def largest_alpha_per_tile(settings, scene, variant, block=20):
         scene["opacities"].double().split(block),
         strict=True,
     ):
-        weights = reference.sample_weights(
-            pixels - mean[:, None, None], cov[:, None, None], footprint, **options
-        ).amax(0)
+        weights = reference.sample_weights(pixels - mean[:, None, None], cov[:, None, None], footprint, **options).amax(
+            0
+        )
         alpha = torch.where(inside, opacity[:, :, None] * weights, 0.0)
         tiles = alpha.reshape(len(mean), rows, ar.TILE, columns, ar.TILE)
         out.append(tiles.amax((2, 4)))
@@ -124,9 +122,7 @@ def test_no_visible_pixel_is_missed_float32(variant, size):
     16 eps cond = 1.7e-3 relative to the peak (and the 1/255 threshold by the same factor of q):
     alphas within 2 % of the threshold may be on either side.
     """
-    scene = scenes.cast(
-        splats(20 + list(SIZES).index(size), 160, SIZES[size], (1.0, 30.0)), torch.float32
-    )
+    scene = scenes.cast(splats(20 + list(SIZES).index(size), 160, SIZES[size], (1.0, 30.0)), torch.float32)
     result, settings = stages(scene, variant, torch.float32)
     alpha = largest_alpha_per_tile(settings, scene, variant)
     missed = (alpha >= 1.02 / 255) & ~in_tile(result, len(alpha))

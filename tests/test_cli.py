@@ -99,9 +99,7 @@ def test_render_writes_what_the_library_renders(files, which, capsys):
 def test_render_in_a_process(files):
     done = run(*arguments(files, "--threads", "1"))
     assert (done.returncode, done.stderr) == (0, "")
-    assert [line.split()[0] for line in done.stdout.splitlines()] == [
-        *("view", "front", "off_centre", "mean")
-    ]
+    assert [line.split()[0] for line in done.stdout.splitlines()] == [*("view", "front", "off_centre", "mean")]
 
 
 def test_size_for_views_that_state_none(files):
@@ -279,9 +277,7 @@ def test_version_and_help(capsys):
 
 def test_shared_views(tmp_path, plant):
     inputs, _ = plant
-    scene = io.Scene(
-        *(inputs[name] for name in ("means3D", "scales", "rotations", "opacities", "shs")), 3
-    )
+    scene = io.Scene(*(inputs[name] for name in ("means3D", "scales", "rotations", "opacities", "shs")), 3)
     io.save_scene(tmp_path / "scene.ply", scene)
     views = SHARED / "data" / "plant_sh3_lo.json"
     args = ["render", str(tmp_path / "scene.ply"), "--views", str(views), "--out", str(tmp_path)]

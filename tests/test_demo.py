@@ -40,9 +40,7 @@ def test_target_is_always_the_same():
 
 def test_stamps_land_where_they_are_drawn():
     brush = demo.Brush()
-    brush.stamp(
-        torch.tensor([100.0, 300.0]), 60.0, 6.0, 2.0, 0.5, torch.tensor([3.0, 5.0]), (0, 0, 0), 0.9
-    )
+    brush.stamp(torch.tensor([100.0, 300.0]), 60.0, 6.0, 2.0, 0.5, torch.tensor([3.0, 5.0]), (0, 0, 0), 0.9)
     scene, view = brush.scene(), demo.make_target()[1]
     stages = render_stages(view.settings(1, (1, 1, 1), 0, "point"), **scene.arguments())
     # The canvas spans [0, W], pixel centres are at integers.
@@ -55,8 +53,7 @@ def test_stamps_land_where_they_are_drawn():
     columns, rows = columns - 99.5, rows - 59.5
     weight = dark * (columns.abs() < 40)
     sxx, sxy, syy = (
-        ((a * b * weight).sum() / weight.sum()).item()
-        for a, b in ((columns, columns), (columns, rows), (rows, rows))
+        ((a * b * weight).sum() / weight.sum()).item() for a, b in ((columns, columns), (columns, rows), (rows, rows))
     )
     turn = 0.5 * np.arctan2(2 * sxy, sxx - syy)
     assert turn == pytest.approx(0.5, abs=0.02)  # x towards y
@@ -96,14 +93,11 @@ def test_errors_are_those_of_the_written_pictures(demo_run):
         reduction = entry["reduction"]
         name = entry["footprint"].replace(":samples=", "")
         picture, truth = (
-            np.asarray(image.open(out / f"{stem}_{reduction}.png")) / 255.0
-            for stem in (name, "reference")
+            np.asarray(image.open(out / f"{stem}_{reduction}.png")) / 255.0 for stem in (name, "reference")
         )
         assert picture.shape == (SIZE[1] // reduction, SIZE[0] // reduction, 3)
         rounding = 1 / 255  # of both pictures, half a step each
-        assert np.sqrt(np.square(picture - truth).mean()) == pytest.approx(
-            entry["rmse"], abs=rounding
-        )
+        assert np.sqrt(np.square(picture - truth).mean()) == pytest.approx(entry["rmse"], abs=rounding)
         assert np.abs(picture - truth).max() == pytest.approx(entry["max"], abs=rounding)
         assert entry["psnr"] == pytest.approx(-20 * np.log10(entry["rmse"]))
         assert entry["seconds"] > 0
@@ -118,9 +112,7 @@ def test_footprints_rank_as_they_should():
     truth = demo._reduced(demo._supersampled(scene, view, 8))
     for reduction in (1, 2):
         psnr = {
-            name: demo._errors(demo._render(scene, view, 1 / reduction, name)[0], truth[reduction])[
-                0
-            ]
+            name: demo._errors(demo._render(scene, view, 1 / reduction, name)[0], truth[reduction])[0]
             for name in demo.COLUMNS
         }
         single = {psnr[name] for name in ("mip", "analytic", "cumulant", "box:samples=1")}
@@ -152,9 +144,7 @@ def test_table_of_the_command(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(demo, "REPEATS", 1)
     assert cli.main(["demo", "--out", str(tmp_path / "new"), "--size", "48", "32"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[0].split() == [
-        *("scale", "footprint", "PSNR", "[dB]", "RMSE", "max", "time", "[s]")
-    ]
+    assert lines[0].split() == [*("scale", "footprint", "PSNR", "[dB]", "RMSE", "max", "time", "[s]")]
     assert len(lines) == 1 + len(demo.COLUMNS) * len(demo.REDUCTIONS) + 2
     assert lines[-1] == f"see {tmp_path / 'new' / 'contact_sheet.png'}"
 

@@ -48,6 +48,7 @@ def test_thread_count_changes_no_bit(variant, dtype):
 
 @each_kind
 def test_repeated_runs_are_identical(variant):
+    torch.set_num_threads(7)
     scene = scenes.random_scene(2, 300, degree=2, sigma=(0.01, 0.4))
     first = everything(CAMERA, scene, variant, torch.float32)
     for _ in range(3):

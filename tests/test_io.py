@@ -367,9 +367,7 @@ def test_size_from_the_first_picture_there_is(tmp_path, picture):
     views = io.load_views(write_json(tmp_path, data))
     assert [(view.width, view.height) for view in views] == [(31, 17)] * 2
     views = io.load_views(write_json(tmp_path, data), size=(62, 34))
-    assert [(view.width, view.height, view.fx) for view in views] == [
-        (62, 34, pytest.approx(31 / math.tan(0.35)))
-    ] * 2
+    assert [(view.width, view.height, view.fx) for view in views] == [(62, 34, pytest.approx(31 / math.tan(0.35)))] * 2
 
 
 def test_stated_size_goes_before_the_callers(tmp_path):

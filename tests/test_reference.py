@@ -71,9 +71,7 @@ def test_frozen_window_is_the_integral_over_a_window_that_stays():
     offset, cov2d = generic_splats(3)
     cov2d.requires_grad_()
     offset.requires_grad_()
-    frozen = reference.rotated_window(
-        offset, cov2d, "frozen", reference.normal_window, reference.normal_pdf
-    )
+    frozen = reference.rotated_window(offset, cov2d, "frozen", reference.normal_window, reference.normal_pdf)
     matrix = torch.stack([cov2d[:, [0, 1]], cov2d[:, [1, 2]]], -2)
     axes = torch.linalg.eigh(matrix.detach()).eigenvectors
     turned = axes.transpose(-1, -2) @ matrix @ axes
@@ -92,9 +90,7 @@ def test_frozen_window_by_finite_differences_of_the_correlated_integral():
     """The same once more without autograd: perturb S12 in the eigenframe, integrate, subtract."""
     offset = torch.tensor([0.4, -0.7], dtype=torch.float64)
     cov2d = torch.tensor([0.81, 0.0, 0.25], dtype=torch.float64, requires_grad=True)
-    frozen = reference.rotated_window(
-        offset, cov2d, "frozen", reference.normal_window, reference.normal_pdf
-    )
+    frozen = reference.rotated_window(offset, cov2d, "frozen", reference.normal_window, reference.normal_pdf)
     slope = torch.autograd.grad(frozen, cov2d)[0][1].item()
     step = torch.tensor([0.0, 1e-4, 0.0], dtype=torch.float64)
     plus = reference.exact_weight(offset, cov2d.detach() + step)

@@ -139,9 +139,7 @@ def test_spherical_harmonics_below_the_stored_degree():
     render(camera, ours, ("point", {}))[0].sum().backward()
     assert (ours["shs"].grad[:, 4:] == 0).all()
     truncated = dict(scene, shs=scene["shs"][:, :4].contiguous())
-    assert torch.equal(
-        render(camera, scene, ("point", {}))[0], render(camera, truncated, ("point", {}))[0]
-    )
+    assert torch.equal(render(camera, scene, ("point", {}))[0], render(camera, truncated, ("point", {}))[0])
 
 
 @every_footprint
@@ -165,9 +163,7 @@ def test_scale_modifier_acts_on_scales_only():
 
 
 @each_kind
-@pytest.mark.parametrize(
-    "size", [(1, 1), (16, 16), (17, 15), (33, 48), (4000, 1), (1, 4000)], ids=str
-)
+@pytest.mark.parametrize("size", [(1, 1), (16, 16), (17, 15), (33, 48), (4000, 1), (1, 4000)], ids=str)
 def test_image_sizes(variant, size):
     camera = Camera(image_width=size[0], image_height=size[1], bg=(0.1, 0.2, 0.3))
     scene = scenes.random_scene(32, 15, opacity=(0.3, 0.9), sigma=(0.3, 0.9), spread=0.5)
@@ -198,10 +194,7 @@ def test_unnormalised_and_zero_quaternions():
     (render(Camera(), ours, ("mip", {}))[0] * loss).sum().backward()
     (render_reference(Camera(), theirs, ("mip", {})).color * loss).sum().backward()
     size = scene["rotations"].norm(dim=-1, keepdim=True)
-    assert (
-        relative_error(ours["rotations"].grad * size, theirs["rotations"].grad * size)
-        < GRADIENT_TOLERANCE
-    )
+    assert relative_error(ours["rotations"].grad * size, theirs["rotations"].grad * size) < GRADIENT_TOLERANCE
     assert (ours["rotations"].grad[7] == 0).all()
     assert ours["scales"].grad[7].abs().max() > 0
 
@@ -296,9 +289,7 @@ def test_near_plane(variant):
 # --- gradcheck ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "variant", [v for v in VARIANTS if v[1].get("frame_gradient") != "frozen"], ids=name_of
-)
+@pytest.mark.parametrize("variant", [v for v in VARIANTS if v[1].get("frame_gradient") != "frozen"], ids=name_of)
 @pytest.mark.parametrize("precomputed", [False, True], ids=["scales-sh", "precomputed"])
 def test_gradcheck(variant, precomputed):
     """Finite differences of the whole rasterizer, in a scene that no threshold touches.
@@ -357,10 +348,7 @@ def test_box_is_the_average_of_shifted_renders(samples):
 
     theirs = scenes.leaves(scene)
     mip = ("mip", {"variance": reference.box_variance(samples)})
-    renders = [
-        render(camera.shifted(-x, -y), theirs, mip)[0]
-        for x, y in reference.box_nodes(samples).tolist()
-    ]
+    renders = [render(camera.shifted(-x, -y), theirs, mip)[0] for x, y in reference.box_nodes(samples).tolist()]
     average = torch.stack(renders).mean(0)
     (average * weights).sum().backward()
     # 60 additions of numbers below 1 on either side, plus 1e-15 px of projection rounding.
@@ -425,9 +413,7 @@ def test_float32_image(variant):
     exact = {k: v.double() if torch.is_tensor(v) else v for k, v in exact.items()}
     footprint, options = variant
     settings = ar.GaussianRasterizationSettings(**exact, footprint=footprint, **options)
-    expected = reference.render(
-        settings, **scenes.cast(single, torch.float64), footprint=footprint, **options
-    )
+    expected = reference.render(settings, **scenes.cast(single, torch.float64), footprint=footprint, **options)
     clear = expected.pixel_margin > 1e-3
     error = (color - expected.color).abs().amax(0)
     print(name_of(variant), f"max {error[clear].max():.1e}, {(~clear).sum()} pixels at a threshold")
