@@ -210,7 +210,6 @@ TYPED_TEST(BinTest, NoPixelAtTheThresholdIsLost) {
     splat.opacity = float(kAlphaMin) / alpha(1);
     while (alpha(splat.opacity) < float(kAlphaMin)) splat.opacity = std::nextafter(splat.opacity, 2.0f);
     splat.level = F::level(splat.shape, splat.opacity);
-    if (splat.level <= 0) printf("LEVEL %g %s alpha %g\n", splat.level, F::kName, alpha(splat.opacity) * 255);
     ++checked;
     ASSERT_TRUE(reaches(splat, grid, x, y)) << "trial " << trial << " opacity " << splat.opacity;
   }
