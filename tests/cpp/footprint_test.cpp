@@ -190,12 +190,29 @@ TEST(AnalyticLevel, HoldsAlongOneAxis) {
   }
 }
 
-// The bound in the comment of Cumulant::level, per axis, and that the tail falls.
-TEST(CumulantLevel, HoldsAlongOneAxis) {
-  for (double t = 1e-6; t <= 12; t = std::min(t * 1.02 + 1e-12, t < 12 ? 12.0 : 13.0)) {
-    const auto axis = CumulantAxis<double>::at(t);
-    for (double p = 0; p < 100; p += 0.01)
+// The bound in the comment of Cumulant::level, per axis.
+TEST(CumulantAxisTest, LowersTheExponentByItsBoundAtMost) {
+  for (double t = 0.01; t < 12.005; t += 0.01) {
+    const auto axis = CumulantAxis<double>::at(std::min(t, 12.0));
+    for (double p = 0; p < 100; p += 0.01) {
       ASSERT_GE(2 * Cumulant::kOrder4 * axis.value(p), -t * t / 124) << "t " << t << " p " << p;
+    }
+  }
+}
+
+// On both sides of the kink in the tail, and of the floor under 1 - x.
+TEST(CumulantAxisTest, DerivativesMatchDifferences) {
+  Random random(4);
+  for (int trial = 0; trial < 10000; ++trial) {
+    const double t = random.log_uniform(0.01, 12.1), p = random.uniform(-30, 30);
+    const auto axis = CumulantAxis<double>::at(t);
+    if (std::abs(p * p / axis.cap - 1) < 0.01 || std::abs(t - 12) < 0.01) continue;
+    const double by_p = derivative([&](double h) { return axis.value(p + h); }, 1e-3);
+    const double by_t = derivative([&](double h) { return CumulantAxis<double>::at(t + h).value(p); }, 1e-4 * t);
+    // The terms stay below 10 c4 (p^2 + t)^2; the differences round them by eps / h.
+    const double size = 10 * axis.c4 * (p * p + t) * (p * p + t);
+    ASSERT_NEAR(axis.by_p(p), by_p, 1e-10 * size) << "t " << t << " p " << p;
+    ASSERT_NEAR(axis.by_t(p), by_t, 1e-10 * size / t) << "t " << t << " p " << p;
   }
 }
 

@@ -113,5 +113,35 @@ TEST_P(PackTest, SumAndBits) {
   }
 }
 
+template <typename T> class LanesTest : public ::testing::Test {};
+using Scalars = ::testing::Types<float, double>;
+TYPED_TEST_SUITE(LanesTest, Scalars);
+
+// c d is made to cancel a b down to a few units in the last place; long double holds float's products.
+TYPED_TEST(LanesTest, DifferenceOfProductsKeepsItsBound) {
+  using T = TypeParam;
+  Random random(5);
+  for (int trial = 0; trial < 100000; ++trial) {
+    const T a = T(random.normal()), b = T(random.normal()), c = T(random.normal());
+    T d = a * b / c;
+    for (int k = random.below(4); k > 0; --k) d = std::nextafter(d, T(1e9));
+    // Exact: the rounding of each product, then their difference, all by fma in twice the precision.
+    const long double ab = (long double)a * b, cd = (long double)c * d;
+    const T rest_ab = std::fma(a, b, -T(ab)), rest_cd = std::fma(c, d, -T(cd));
+    const long double exact = ((long double)T(ab) - T(cd)) + ((long double)rest_ab - rest_cd);
+    ASSERT_NEAR(difference_of_products(a, b, c, d), double(exact), 3 * kEps<T> * std::abs(double(exact)));
+  }
+}
+
+// The stated remainders, and the roundings of at most three operations.
+TYPED_TEST(LanesTest, OneMinusExpKeepsItsBound) {
+  using T = TypeParam;
+  const double remainder = sizeof(T) == 4 ? 1e-8 : 5e-17;
+  for (double y = 1e-12; y < 90; y *= 1.01) {
+    const T x = T(y);
+    ASSERT_NEAR(one_minus_exp(x, std::exp(-x)) / double(-std::expm1(-(long double)x)), 1, remainder + 6 * kEps<T>) << y;
+  }
+}
+
 }  // namespace
 }  // namespace ar::test
