@@ -164,6 +164,8 @@ def footprint_weight(
     for name, tensor, last in (("offset", offset, 2), ("cov2d", cov2d, 3)):
         if not isinstance(tensor, torch.Tensor):
             raise TypeError(f"{name} must be a tensor, got {type(tensor).__name__}")
+        if tensor.device != offset.device:
+            raise ValueError(f"{name} must be on the device of offset, {offset.device}, got {tensor.device}")
         if tensor.dim() < 1 or tensor.shape[-1] != last:
             raise ValueError(f"{name} must have shape (..., {last}), got {tuple(tensor.shape)}")
     try:
