@@ -86,7 +86,7 @@ def _(dL_dweight, offset, cov2d, footprint, variance):
     return offset.new_empty(offset.shape), cov2d.new_empty(cov2d.shape)
 
 
-def _rasterize_setup(ctx, inputs, output):
+def rasterize_setup(ctx, inputs, output):
     _, radii, *saved = output
     ctx.mark_non_differentiable(radii, *saved)
     ctx.set_materialize_grads(False)  # no zeros the size of everything saved
@@ -97,7 +97,7 @@ def _rasterize_setup(ctx, inputs, output):
 
 
 @once_differentiable
-def _rasterize_backward(ctx, dL_dcolor, *_):
+def rasterize_backward(ctx, dL_dcolor, *_):
     if not ctx.has_saved:
         raise RuntimeError("rasterize was called with keep=False and cannot be differentiated")
     if dL_dcolor is None:
@@ -109,7 +109,7 @@ def _rasterize_backward(ctx, dL_dcolor, *_):
     return (*wanted, *[None] * (len(ctx.needs_input_grad) - _DIFFERENTIABLE))
 
 
-torch.library.register_autograd("analytic_rasterizer::rasterize", _rasterize_backward, setup_context=_rasterize_setup)
+torch.library.register_autograd("analytic_rasterizer::rasterize", rasterize_backward, setup_context=rasterize_setup)
 
 
 def _weight_setup(ctx, inputs, output):

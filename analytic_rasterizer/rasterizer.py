@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from . import ops  # noqa: F401  (registers fake kernels and autograd)
+from . import ops
 from .footprints import Footprint, get_default_footprint, resolve_footprint
 
 
@@ -144,36 +144,36 @@ def rasterize_gaussians(
     gaussians = (means3D, means2D, opacities, *rest)
     keep = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in gaussians)
     arguments = (*gaussians, *_settings_arguments(raster_settings, device), keep)
-    if not raster_settings.debug:
-        return torch.ops.analytic_rasterizer.rasterize(*arguments)[:2]
-    try:
-        color, radii = torch.ops.analytic_rasterizer.rasterize(*arguments)[:2]
-    except Exception:
-        _write_snapshot("snapshot_fw.dump", arguments)
-        raise
-    return _SnapshotOnFailure.apply(color, arguments) if keep else color, radii
+    if raster_settings.debug:
+        return _DebugRasterize.apply(*arguments)[:2]
+    return torch.ops.analytic_rasterizer.rasterize(*arguments)[:2]
+
+
+class _DebugRasterize(torch.autograd.Function):
+    """The op and its gradient, writing their arguments to a file where they fail, as 3DGS does."""
+
+    @staticmethod
+    def forward(ctx, *arguments):
+        try:
+            output = torch.ops.analytic_rasterizer.rasterize(*arguments)
+        except Exception:
+            _write_snapshot("snapshot_fw.dump", arguments)
+            raise
+        ops.rasterize_setup(ctx, arguments, output)
+        return output
+
+    @staticmethod
+    def backward(ctx, *dL_doutput):
+        try:
+            return ops.rasterize_backward(ctx, *dL_doutput)
+        except Exception:
+            _write_snapshot("snapshot_bw.dump", (dL_doutput[0], *ctx.saved_tensors, *ctx.settings))
+            raise
 
 
 def _write_snapshot(path: str, arguments: tuple) -> None:
     copies = tuple(a.detach().cpu() if isinstance(a, torch.Tensor) else a for a in arguments)
     torch.save(copies, path)
-
-
-class _SnapshotOnFailure(torch.autograd.Function):
-    """Identity. Watches the gradient that enters the rasterizer's backward pass in debug mode."""
-
-    @staticmethod
-    def forward(ctx, color, arguments):
-        ctx.arguments = arguments
-        return color.view_as(color)
-
-    @staticmethod
-    def backward(ctx, dL_dcolor):
-        if not torch.isfinite(dL_dcolor).all():
-            _write_snapshot("snapshot_bw.dump", (dL_dcolor, *ctx.arguments))
-            index = tuple(torch.nonzero(~torch.isfinite(dL_dcolor))[0].tolist())
-            raise ValueError(f"the gradient of the image must be finite, got {dL_dcolor[index].item()} at {index}")
-        return dL_dcolor, None
 
 
 class GaussianRasterizer(torch.nn.Module):

@@ -646,6 +646,23 @@ def test_debug_writes_a_snapshot_on_failure(tmp_path, monkeypatch):
     assert [path.name for path in tmp_path.iterdir()] == ["snapshot_fw.dump"]
 
 
+def test_debug_writes_a_snapshot_when_the_backward_pass_fails(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def fail(ctx, *gradients):
+        raise RuntimeError("out of something")
+
+    monkeypatch.setattr("analytic_rasterizer.ops.rasterize_backward", fail)
+    leaves = scenes.leaves(scene32())
+    color, _ = render(leaves, CAMERA.settings(torch.float32)._replace(debug=True))
+    with pytest.raises(RuntimeError, match="out of something"):
+        (2 * color).sum().backward()
+    saved = torch.load(tmp_path / "snapshot_bw.dump", weights_only=False)
+    assert torch.equal(saved[0], torch.full_like(color, 2))
+    assert torch.equal(saved[1], leaves["means3D"].detach())
+    assert [path.name for path in tmp_path.iterdir()] == ["snapshot_bw.dump"]
+
+
 def test_debug_changes_no_bit():
     plain = gradients(scene32())
     debug = gradients(scene32(), CAMERA.settings(torch.float32)._replace(debug=True))
