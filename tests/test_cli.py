@@ -255,6 +255,8 @@ def test_interrupt_of_a_process_is_quiet(tmp_path):
         stderr=subprocess.PIPE,
         text=True,
         env=environment,
+        # A job in the background of a script ignores SIGINT, and its children with it.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 60
     while not (tmp_path / "views.json").exists() and time.monotonic() < deadline:
