@@ -39,8 +39,8 @@ template <typename T> AR_HD SplatGrad<T> gaussian_vjp(const Mat2<T>& w, ShapeGra
 }
 
 /// Node s of the box footprint with S samples, in units of 1/(2 S) px: one per row and column of an
-/// S x S grid, so that with the variance of each component the mixture has the pixel's mean and
-/// second moment.
+/// S x S grid, so that with the variance of each component the mixture has the pixel's mean and its
+/// variance along each axis.
 template <int S> AR_HD constexpr Vec2<int> box_node(int s) {
   if constexpr (S == 1) {
     return {0, 0};
