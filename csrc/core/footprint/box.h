@@ -13,7 +13,8 @@ template <> inline constexpr const char* kBoxName<8> = "box8";
 template <> inline constexpr const char* kBoxName<16> = "box16";
 
 /// S equal Gaussians of variance 1/(12 S^2) at the nodes of box_node<S>: their mixture has the unit
-/// pixel's mean and variance along each axis for every S (their covariance vanishes for 1 and 4 only). The pixel's colour is the mean over the samples.
+/// pixel's mean and variance along each axis for every S (their covariance vanishes for 1 and 4 only). The pixel's
+/// colour is the mean over the samples.
 template <int S> struct Box : GaussianFootprint<S, true> {
   static constexpr const char* kName = kBoxName<S>;
 
