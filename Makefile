@@ -8,6 +8,9 @@ VENV ?= .venv
 # The torch to install where VENV has none. Any torch >= 2.4 will do: `make demo TORCH=torch==2.8.0`.
 TORCH ?= torch==2.13.0
 OUT ?= out
+# What make bench measures; by default the demo's target.
+SCENE ?= $(OUT)/target.ply
+VIEWS ?= $(OUT)/views.json
 BUILD ?= build
 
 BIN := $(VENV)/bin
@@ -39,7 +42,8 @@ test-python: $(VENV)/.installed
 	$(BIN)/python -m pytest -q
 
 bench: $(VENV)/.installed
-	$(BIN)/python benchmarks/speed.py
+	[ -e $(SCENE) ] || $(MAKE) demo
+	$(BIN)/python benchmarks/speed.py $(SCENE) --views $(VIEWS)
 
 format: $(VENV)/.tools
 	$(BIN)/clang-format -i $(CPP_SOURCES)
