@@ -1,4 +1,10 @@
-"""Builds the C++ extension against the torch of the environment that pip installs into."""
+"""Builds the extension against the torch of the environment that pip installs into.
+
+CUDA is built when torch was built with CUDA and a toolkit is found; no GPU need be visible.
+ANALYTIC_RASTERIZER_CUDA=0 leaves it out, ANALYTIC_RASTERIZER_CUDA=1 or FORCE_CUDA=1 insists on it.
+TORCH_CUDA_ARCH_LIST chooses the architectures; without it, those of the visible GPUs or, where there is
+none, a list that covers what the toolkit supports.
+"""
 
 import os
 import sys
@@ -14,21 +20,53 @@ try:
 except ImportError:
     sys.path += [sysconfig.get_path("purelib"), sysconfig.get_path("platlib")]
     try:
-        import torch  # noqa: F401
+        import torch
     except ImportError:
         sys.exit(
             "analytic_rasterizer needs torch >= 2.4 to build and found none: install torch first, and if "
             "your installer hides it (uv, python -m build), use --no-build-isolation."
         )
 
-from torch.utils.cpp_extension import BuildExtension, CppExtension
+from torch.utils.cpp_extension import CUDA_HOME, BuildExtension, CppExtension, CUDAExtension
 
 ROOT = Path(__file__).parent
+
+
+def wants_cuda() -> bool:
+    choice = os.environ.get("ANALYTIC_RASTERIZER_CUDA", "")
+    if choice not in ("", "0", "1"):
+        sys.exit(f"ANALYTIC_RASTERIZER_CUDA must be 0 or 1, got {choice!r}")
+    forced = choice == "1" or (choice == "" and os.environ.get("FORCE_CUDA") == "1")
+    possible = torch.version.cuda is not None and CUDA_HOME is not None
+    if forced and not possible:
+        missing = "a toolkit (CUDA_HOME)" if CUDA_HOME is None else "a torch built with CUDA"
+        sys.exit(f"analytic_rasterizer was told to build CUDA but found no {missing.removeprefix('a ')}")
+    return forced or (possible and choice != "0")
+
+
+def default_architectures() -> str:
+    """Machine code for what this toolkit's users have, and PTX for what comes after."""
+    version = tuple(int(v) for v in torch.version.cuda.split(".")[:2])
+    known = ["7.5", "8.0", "8.6"]
+    known += ["8.9", "9.0"] if version >= (11, 8) else []
+    known += ["10.0", "12.0"] if version >= (12, 8) else []
+    return ";".join(known) + "+PTX"
+
+
+WITH_CUDA = wants_cuda()
+if WITH_CUDA and not torch.cuda.is_available():
+    os.environ.setdefault("TORCH_CUDA_ARCH_LIST", default_architectures())
+
 SOURCES = sorted(str(p.relative_to(ROOT)) for d in ("cpu", "torch") for p in ROOT.glob(f"csrc/{d}/*.cpp"))
+if WITH_CUDA:
+    SOURCES += sorted(str(p.relative_to(ROOT)) for p in ROOT.glob("csrc/cuda/*.cu"))
+else:
+    SOURCES.remove(str(Path("csrc/torch/ops_cuda.cpp")))
 
 # No -std: torch sets the standard that its headers need. No contraction: forward and backward must
 # round alike (csrc/core/lanes.h), and bits must not depend on the compiler's choices.
 COMPILE_ARGS = ["-O3", "-fopenmp", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi"]
+NVCC_ARGS = ["-O3", "--fmad=false", "--expt-relaxed-constexpr", "-Xcompiler", "-fno-gnu-unique"]
 
 
 class Build(BuildExtension):
@@ -47,11 +85,12 @@ class Build(BuildExtension):
 
 setup(
     ext_modules=[
-        CppExtension(
+        (CUDAExtension if WITH_CUDA else CppExtension)(
             "analytic_rasterizer._C",
             SOURCES,
             include_dirs=[str(ROOT / "csrc")],
-            extra_compile_args=COMPILE_ARGS,
+            define_macros=[("AR_WITH_CUDA", None)] if WITH_CUDA else [],
+            extra_compile_args={"cxx": COMPILE_ARGS, "nvcc": NVCC_ARGS},
             # libgomp by name only: the loader takes the copy that torch has already loaded.
             extra_link_args=["-fopenmp"],
         )

@@ -12,8 +12,7 @@ TILE = 16
 """Edge of a square tile, px."""
 
 _SAMPLES = {f"box{s}": s for s in BOX_SAMPLES}
-# Scalars per splat: mean 2, shape, opacity, level, colour 3.
-_SPLAT_WIDTH = {"analytic": 11, "analytic_paper": 11}
+_SPLAT_WIDTH = 12
 
 # Positions of the differentiable inputs of rasterize, in the order of the vjp's outputs.
 _DIFFERENTIABLE = 8
@@ -27,16 +26,34 @@ def _tiles(height: int, width: int) -> int:
 def _(
     means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
     viewmatrix, projmatrix, campos, image_height, image_width, tanfovx, tanfovy, scale_modifier,
-    sh_degree, footprint, variance, keep,
+    sh_degree, footprint, variance, keep, debug,
 ):  # fmt: skip
     context = torch.library.get_ctx()
-    splats, pairs = context.new_dynamic_size(), context.new_dynamic_size()
     samples = _SAMPLES.get(footprint, 1) if keep else 0
     ints, longs = {"dtype": torch.int32}, {"dtype": torch.int64}
+    if means3D.device.type == "cuda":
+        kept = means3D.shape[0] if keep else 0
+        room = context.new_dynamic_size() if keep else 0
+        checkpoints = (context.new_dynamic_size(), samples, TILE * TILE, 4) if keep else (0,)
+        return (
+            means3D.new_empty(3, image_height, image_width),
+            means3D.new_empty(means3D.shape[0], **ints),
+            means3D.new_empty((kept, _SPLAT_WIDTH) if keep else (0,)),
+            means3D.new_empty(kept, **ints),
+            means3D.new_empty(room, **ints),
+            means3D.new_empty(_tiles(image_height, image_width) + 1 if keep else 0, **longs),
+            means3D.new_empty((kept, 2) if keep else (0,), **ints),
+            means3D.new_empty(room, **ints),
+            means3D.new_empty(samples, image_height, image_width),
+            means3D.new_empty(samples, image_height, image_width, **ints),
+            means3D.new_empty(checkpoints),
+            means3D.new_empty(1, **longs),
+        )
+    splats, pairs = context.new_dynamic_size(), context.new_dynamic_size()
     return (
         means3D.new_empty(3, image_height, image_width),
         means3D.new_empty(means3D.shape[0], **ints),
-        means3D.new_empty(splats, _SPLAT_WIDTH.get(footprint, 12)),
+        means3D.new_empty(splats, _SPLAT_WIDTH),
         means3D.new_empty(splats, **ints),
         means3D.new_empty(pairs, **ints),
         means3D.new_empty(_tiles(image_height, image_width) + 1, **longs),
@@ -44,6 +61,8 @@ def _(
         means3D.new_empty(pairs if keep else 0, **longs),
         means3D.new_empty(samples, image_height, image_width),
         means3D.new_empty(samples, image_height, image_width, **ints),
+        means3D.new_empty(0),
+        means3D.new_empty(0, **longs),
     )
 
 
@@ -52,7 +71,7 @@ def _(dL_dcolor, means3D, means2D, opacities, shs, colors_precomp, scales, rotat
     inputs = (means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
     return tuple(
         means3D.new_empty(tensor.shape) if need and tensor is not None else means3D.new_empty(0)
-        for tensor, need in zip(inputs, rest[-1])
+        for tensor, need in zip(inputs, rest[-2])
     )
 
 
@@ -90,7 +109,7 @@ def rasterize_setup(ctx, inputs, output):
     _, radii, *saved = output
     ctx.mark_non_differentiable(radii, *saved)
     ctx.set_materialize_grads(False)  # no zeros the size of everything saved
-    tensors, (*ctx.settings, keep) = inputs[:12], inputs[12:]
+    tensors, (*ctx.settings, keep, ctx.debug) = inputs[:12], inputs[12:]
     ctx.has_saved = keep
     if keep:
         ctx.save_for_backward(*tensors, *saved)
@@ -104,7 +123,7 @@ def rasterize_backward(ctx, dL_dcolor, *_):
         return (None,) * len(ctx.needs_input_grad)
     tensors, saved = ctx.saved_tensors[:12], ctx.saved_tensors[12:]
     needs = list(ctx.needs_input_grad[:_DIFFERENTIABLE])
-    grads = torch.ops.analytic_rasterizer.rasterize_vjp(dL_dcolor, *tensors, *ctx.settings, *saved, needs)
+    grads = torch.ops.analytic_rasterizer.rasterize_vjp(dL_dcolor, *tensors, *ctx.settings, *saved, needs, ctx.debug)
     wanted = (g if need and t is not None else None for g, need, t in zip(grads, needs, tensors))
     return (*wanted, *[None] * (len(ctx.needs_input_grad) - _DIFFERENTIABLE))
 

@@ -143,7 +143,7 @@ def rasterize_gaussians(
     )
     gaussians = (means3D, means2D, opacities, *rest)
     keep = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in gaussians)
-    arguments = (*gaussians, *_settings_arguments(raster_settings, device), keep)
+    arguments = (*gaussians, *_settings_arguments(raster_settings, device), keep, bool(raster_settings.debug))
     if raster_settings.debug:
         return _DebugRasterize.apply(*arguments)[:2]
     return torch.ops.analytic_rasterizer.rasterize(*arguments)[:2]

@@ -685,14 +685,14 @@ def op_arguments(variant, keep, gradient):
     tensors = [fields[k] for k in ("bg", "viewmatrix", "projmatrix", "campos")]
     numbers = [fields[k] for k in ("image_height", "image_width", "tanfovx", "tanfovy")]
     numbers += [fields["scale_modifier"], fields["sh_degree"], footprint.key, footprint.variance]
-    return [*gaussians, *tensors, *numbers, keep]
+    return [*gaussians, *tensors, *numbers, keep, False]
 
 
 OPS = {
     "rasterize": lambda v: op_arguments(v, True, True),
     "rasterize (inference)": lambda v: op_arguments(v, False, False),
-    "rasterize_stages": lambda v: [  # no means2D, no keep
-        a for i, a in enumerate(op_arguments(v, False, False)) if i not in (1, 20)
+    "rasterize_stages": lambda v: [  # no means2D, no keep, no debug
+        a for i, a in enumerate(op_arguments(v, False, False)) if i not in (1, 20, 21)
     ],
     "rasterize_vjp": lambda v: vjp_arguments(v),
     "footprint_weight": lambda v: weight_arguments(v, True),
@@ -704,7 +704,7 @@ def vjp_arguments(variant):
     arguments = op_arguments(variant, True, False)
     color, _, *saved = torch.ops.analytic_rasterizer.rasterize(*arguments)
     needs = [a is not None for a in arguments[:8]]
-    return [torch.ones_like(color), *arguments[:-1], *saved, needs]
+    return [torch.ones_like(color), *arguments[:-2], *saved, needs, False]
 
 
 def weight_arguments(variant, gradient):

@@ -49,8 +49,8 @@ template <typename T, class V> AR_HD Span<V> columns_of(const Support<T>& s, V y
   const V lo = max(y0 - V(s.mean.y + s.reach), -height), hi = min(y1 - V(s.mean.y - s.reach), height);
   const V right = min(max(V(s.tip), lo), hi), left = min(max(V(-s.tip), lo), hi);
   const V ia = V(s.inv_a), level = V(s.level), det2 = V(s.det2);
-  const V half_right = sqrt(max(level - det2 * right * right * ia, zero) * ia);
-  const V half_left = sqrt(max(level - det2 * left * left * ia, zero) * ia);
+  const V half_right = approx_sqrt(max(level - det2 * right * right * ia, zero) * ia);
+  const V half_left = approx_sqrt(max(level - det2 * left * left * ia, zero) * ia);
   const V slope = V(s.slope), x = V(s.mean.x), reach = V(s.reach);
   const V far = V(T(1e9));
   return {select(hi < lo, far, x + slope * left - half_left - reach),
@@ -61,7 +61,7 @@ template <typename T, class V> AR_HD Span<V> columns_of(const Support<T>& s, V y
 template <typename T, class V> AR_HD Span<V> chord_of(const Support<T>& s, V y) {
   const V dy = y - V(s.mean.y), zero = V(T(0)), far = V(T(1e9));
   const V square = (V(s.level) - V(s.det2 * s.inv_a) * dy * dy) * V(s.inv_a);
-  const V half = sqrt(max(square, zero)), centre = madd(V(s.slope), dy, V(s.mean.x));
+  const V half = approx_sqrt(max(square, zero)), centre = madd(V(s.slope), dy, V(s.mean.x));
   return {select(square < zero, far, centre - half), select(square < zero, -far, centre + half)};
 }
 
@@ -84,17 +84,29 @@ template <typename T> AR_HD bool touches_image(const Support<T>& s, TileGrid gri
   return rows.first <= rows.last && columns.first <= columns.last;
 }
 
+/// Tiles that hold a range of pixels.
+AR_HD Range tiles_of(Range pixels) {
+  return pixels.first <= pixels.last ? Range{pixels.first / kTile, pixels.last / kTile} : Range{0, -1};
+}
+
+/// Columns of the tiles that the support touches in a row of tiles; `rows` are its rows of pixels.
+template <typename T>
+AR_HD Range tile_columns_of(const Support<T>& s, TileGrid grid, Range rows, int tile_row) {
+  const T y0 = T(max(tile_row * kTile, rows.first)), y1 = T(min(tile_row * kTile + kTile - 1, rows.last));
+  return tiles_of(clamp_range(columns_of(s, y0, y1), grid.width));
+}
+
+/// Calls visit(tile row, range of tile columns) for every row of tiles that the support may touch.
+template <typename T, class Visit> AR_HD void for_each_tile_row(const Support<T>& s, TileGrid grid, Visit&& visit) {
+  const Range rows = clamp_range(rows_of(s), grid.height), tile_rows = tiles_of(rows);
+  for (int row = tile_rows.first; row <= tile_rows.last; ++row) visit(row, tile_columns_of(s, grid, rows, row));
+}
+
 /// Calls visit(tile index) for every tile the support touches, rows first, columns ascending.
 template <typename T, class Visit> AR_HD void for_each_tile(const Support<T>& s, TileGrid grid, Visit&& visit) {
-  const Range rows = clamp_range(rows_of(s), grid.height);
-  for (int row = rows.first / kTile; row <= rows.last / kTile && rows.first <= rows.last; ++row) {
-    const T y0 = T(max(row * kTile, rows.first)), y1 = T(min(row * kTile + kTile - 1, rows.last));
-    const Range columns = clamp_range(columns_of(s, y0, y1), grid.width);
-    if (columns.last < columns.first) continue;
-    for (int column = columns.first / kTile; column <= columns.last / kTile; ++column) {
-      visit(int64_t(row) * grid.columns() + column);
-    }
-  }
+  for_each_tile_row(s, grid, [&](int row, Range columns) {
+    for (int column = columns.first; column <= columns.last; ++column) visit(int64_t(row) * grid.columns() + column);
+  });
 }
 
 }  // namespace ar

@@ -44,7 +44,7 @@ template <class V> AR_HD BlendGrad<V> blend_sample_vjp(MaskOf<V> mask, V raw, V 
   using T = ScalarOf<V>;
   const V zero = V(T(0)), cap = V(T(kAlphaMax));
   const V alpha = select(mask, min(raw, cap), zero);
-  transmittance = transmittance / (V(T(1)) - alpha);
+  transmittance = divide(transmittance, V(T(1)) - alpha);
   const V difference = g_color - behind;
   behind = madd(alpha, difference, behind);
   const MaskOf<V> free = mask & (raw <= cap);

@@ -60,10 +60,41 @@ AR_HD float exp(float x) { return std::exp(x); }
 AR_HD double exp(double x) { return std::exp(x); }
 AR_HD float log2(float x) { return std::log2(x); }
 AR_HD double log2(double x) { return std::log2(x); }
-AR_HD float exp2(float x) { return std::exp2(x); }
+/// On a device within 2 ulp; results below 2^-126 are zero.
+AR_HD float exp2(float x) {
+#if defined(__CUDA_ARCH__)
+  float y;
+  asm("ex2.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+#else
+  return std::exp2(x);
+#endif
+}
 AR_HD double exp2(double x) { return std::exp2(x); }
 AR_HD float sqrt(float x) { return std::sqrt(x); }
 AR_HD double sqrt(double x) { return std::sqrt(x); }
+
+/// a / b. On a device within 2 ulp, for |b| < 2^126; elsewhere exact.
+AR_HD float divide(float a, float b) {
+#if defined(__CUDA_ARCH__)
+  return __fdividef(a, b);
+#else
+  return a / b;
+#endif
+}
+AR_HD double divide(double a, double b) { return a / b; }
+
+/// Square root, within 1 ulp on a device; elsewhere exact.
+AR_HD float approx_sqrt(float x) {
+#if defined(__CUDA_ARCH__)
+  float y;
+  asm("sqrt.approx.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+#else
+  return std::sqrt(x);
+#endif
+}
+AR_HD double approx_sqrt(double x) { return std::sqrt(x); }
 
 /// a b - c d with one rounding of each product recovered: within 1.5 ulp of the exact difference
 /// where nothing under- or overflows (Kahan). For determinants of nearly singular matrices.

@@ -68,8 +68,11 @@ template <typename T> struct GaussianGrads {
   int means2d_stride;  ///< 3, or 4 with the sums of absolute values in columns 2 and 3
 };
 
+/// Scalars per Splat, whatever the footprint: the alignment rounds all of them up to this.
+inline constexpr int kSplatWidth = 12;
+
 /// A projected Gaussian. Scalars only, so that an array of them is a matrix of T.
-template <class F, typename T> struct Splat {
+template <class F, typename T> struct alignas(16) Splat {
   Vec2<T> mean;  ///< px
   typename F::template Shape<T> shape;
   T opacity;
@@ -83,5 +86,8 @@ template <typename T> struct PairGrad {
   T weighted;  ///< sum of alpha dL/dalpha
   Vec3<T> color;
 };
+template <typename T> AR_HD PairGrad<T> operator+(const PairGrad<T>& a, const PairGrad<T>& b) {
+  return {a.shape + b.shape, a.weighted + b.weighted, a.color + b.color};
+}
 
 }  // namespace ar

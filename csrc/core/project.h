@@ -58,16 +58,23 @@ AR_HD Vec3<T> project_mean_vjp(const Camera<T>& camera, const ProjectedMean<T>& 
          dL_dview.y * xyz(camera.view_y) + dL_dview.z * xyz(camera.view_z);
 }
 
-/// Whether a Gaussian may touch the image, from its mean and a bound on its largest standard
-/// deviation: cheap, and never false for one that project() keeps. `blur` is the largest variance a
-/// footprint adds.
-template <typename T> AR_HD bool may_be_visible(const Camera<T>& camera, Vec3<T> mean, T max_sigma, T opacity, T blur) {
-  const ProjectedMean<T> p = project_mean(camera, mean);
+/// No smaller than the largest standard deviation of Gaussian i.
+template <typename T> AR_HD T max_sigma(const Gaussians<T>& g, int64_t i) {
+  if (g.cov3ds) return sqrt(g.cov3ds[i].xx + g.cov3ds[i].yy + g.cov3ds[i].zz);
+  const Vec3<T> s = g.scales[i];
+  return g.scale_modifier * max(abs(s.x), max(abs(s.y), abs(s.z)));
+}
+
+/// Whether Gaussian i may touch the image, from its mean and its largest standard deviation: cheap,
+/// and never false for one that project() keeps. `blur` is the largest variance a footprint adds.
+template <typename T> AR_HD bool may_be_visible(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, T blur) {
+  const ProjectedMean<T> p = project_mean(camera, g.means[i]);
   if (!p.valid) return false;
   // |J| <= f/z |(1, 0, -x/z; 0, 1, -y/z)| <= f/z sqrt(1 + (x/z)^2 + (y/z)^2), with x/z and y/z clamped
   const T stretch = max(camera.focal.x, camera.focal.y) / p.view.z *
                     sqrt(T(1) + camera.limit.x * camera.limit.x + camera.limit.y * camera.limit.y);
-  const T sigma = sqrt(stretch * stretch * max_sigma * max_sigma + blur);
+  const T largest = max_sigma(g, i), opacity = g.opacities[i];
+  const T sigma = sqrt(stretch * stretch * largest * largest + blur);
   const T level = T(kMaxLevel) + (opacity > T(1) ? T(2) * std::log(opacity) : T(0));
   const T reach = T(2) + sigma * sqrt(level);
   return p.pixel.x + reach >= T(0) && p.pixel.x - reach <= camera.size.x - T(1) && p.pixel.y + reach >= T(0) &&
@@ -248,52 +255,62 @@ template <typename T> AR_HD Direction<T> view_direction(const Camera<T>& camera,
   return {inv * d, inv};
 }
 
-/// The colour before the clamp that spherical harmonics get.
-template <typename T> AR_HD Vec3<T> unclamped_color(const Camera<T>& camera, const Gaussians<T>& g, int64_t i) {
-  if (g.colors) return g.colors[i];
-  T basis[kMaxShCount];
-  sh_basis(g.sh_degree, view_direction(camera, g.means[i]).unit, basis);
-  return sh_color(g.sh_degree, basis, g.shs + i * g.sh_stride);
+/// Colour of Gaussian i, whose coefficients are `sh`. False if it is not finite.
+template <typename T>
+AR_HD bool splat_color(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, const Vec3<T>* sh, Vec3<T>& color) {
+  if (g.colors) {
+    color = g.colors[i];
+  } else {
+    T basis[kMaxShCount];
+    sh_basis(g.sh_degree, view_direction(camera, g.means[i]).unit, basis);
+    color = sh_color(g.sh_degree, basis, sh);
+  }
+  const bool finite = within(color.x, 1e18) && within(color.y, 1e18) && within(color.z, 1e18);
+  if (!g.colors) color = {max(color.x, T(0)), max(color.y, T(0)), max(color.z, T(0))};
+  return finite;
 }
 
-/// Writes the gradient of the colour's parameters and returns its part in that of the mean.
+/// Writes the gradient of the colour's parameters and returns its part in that of the mean. `sh` are
+/// the coefficients, `dL_dsh` takes their gradient, or is null; they may be the same memory.
 template <typename T>
 AR_HD Vec3<T> splat_color_vjp(const Camera<T>& camera, const Gaussians<T>& g, const GaussianGrads<T>& out, int64_t i,
-                              Vec3<T> dL_dcolor) {
+                              const Vec3<T>* sh, Vec3<T>* dL_dsh, Vec3<T> dL_dcolor) {
   if (g.colors) {
     if (out.colors) out.colors[i] = dL_dcolor;
     return {T(0), T(0), T(0)};
   }
   T basis[kMaxShCount], weight[kMaxShCount];
   const Direction<T> d = view_direction(camera, g.means[i]);
-  const Vec3<T>* sh = g.shs + i * g.sh_stride;
   sh_basis(g.sh_degree, d.unit, basis);
   const Vec3<T> c = sh_color(g.sh_degree, basis, sh);
   const Vec3<T> free = {c.x > T(0) ? dL_dcolor.x : T(0), c.y > T(0) ? dL_dcolor.y : T(0),
                         c.z > T(0) ? dL_dcolor.z : T(0)};
   const int used = sh_count(g.sh_degree);
-  if (out.shs) {
-    Vec3<T>* dL_dsh = out.shs + i * g.sh_stride;
-    for (int k = 0; k < used; ++k) dL_dsh[k] = basis[k] * free;
+  AR_UNROLL
+  for (int k = 0; k < kMaxShCount; ++k) weight[k] = k < used ? dot(free, sh[k]) : T(0);
+  if (dL_dsh) {
+    AR_UNROLL
+    for (int k = 0; k < kMaxShCount; ++k) {
+      if (k < used) dL_dsh[k] = basis[k] * free;
+    }
     for (int k = used; k < g.sh_stride; ++k) dL_dsh[k] = {T(0), T(0), T(0)};
   }
   if (g.sh_degree == 0) return {T(0), T(0), T(0)};
-  for (int k = 0; k < used; ++k) weight[k] = dot(free, sh[k]);
   const Vec3<T> by_unit = sh_basis_vjp(g.sh_degree, d.unit, weight);
   return d.inv_length * (by_unit - dot(by_unit, d.unit) * d.unit);
 }
 
 /// ceil(3 sigma) along the major axis: the radius that 3DGS reports [px].
 template <typename T> AR_HD int splat_radius(Cov2d<T> cov, T variance) {
-  const T dx = cov.xx - cov.yy, dy = T(2) * cov.xy;
-  const T largest = T(0.5) * (cov.xx + cov.yy + sqrt(dx * dx + dy * dy)) + variance;
+  const T largest = T(0.5) * (cov.xx + cov.yy + eigenvalue_gap(cov)) + variance;
   return int(min(std::ceil(T(3) * sqrt(largest)), T(1e9)));
 }
 
-/// Projects Gaussian i. Returns 3DGS's radius, 0 if it is culled: behind the near plane, off the
-/// image, not finite, or degenerate. A splat that is kept may still touch no tile (level <= 0).
+/// Projects Gaussian i, all but its colour. Returns 3DGS's radius, 0 if it is culled: behind the near
+/// plane, off the image, not finite, or degenerate. A splat that is kept may still touch no tile
+/// (level <= 0) and then needs no colour.
 template <class F, typename T>
-AR_HD int project(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options,
+AR_HD int project_shape(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options,
                   Splat<F, T>& splat, T& depth) {
   const ProjectedMean<T> mean = project_mean(camera, g.means[i]);
   splat.level = T(0);
@@ -316,28 +333,31 @@ AR_HD int project(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, Foo
   splat.level = level;
   const bool touches = level > T(0) && touches_image(support_of(splat), camera.grid);
   if (!touches) splat.level = T(0);
-  if (!touches && !on_image) return 0;
-  if (touches) {
-    const Vec3<T> c = unclamped_color(camera, g, i);
-    if (!within(c.x, 1e18) || !within(c.y, 1e18) || !within(c.z, 1e18)) {
-      splat.level = T(0);
-      return 0;
-    }
-    splat.color = g.colors ? c : Vec3<T>{max(c.x, T(0)), max(c.y, T(0)), max(c.z, T(0))};
-  }
-  return radius;
+  return touches || on_image ? radius : 0;
 }
 
-/// Writes every gradient of Gaussian i, from the sums over its pairs.
+/// Projects Gaussian i. Culls it too where its colour is not finite.
+template <class F, typename T>
+AR_HD int project(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options,
+                  Splat<F, T>& splat, T& depth) {
+  const int radius = project_shape(camera, g, i, options, splat, depth);
+  if (!(splat.level > T(0))) return radius;
+  if (splat_color(camera, g, i, g.shs ? g.shs + i * g.sh_stride : nullptr, splat.color)) return radius;
+  splat.level = T(0);
+  return 0;
+}
+
+/// Writes every gradient of Gaussian i, from the sums over its pairs. `sh` and `dL_dsh` as for
+/// splat_color_vjp; out.shs is not touched.
 template <class F, typename T>
 AR_HD void project_vjp(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options,
-                       const PairGrad<T>& sums, const GaussianGrads<T>& out) {
+                       const PairGrad<T>& sums, const Vec3<T>* sh, Vec3<T>* dL_dsh, const GaussianGrads<T>& out) {
   const ProjectedMean<T> mean = project_mean(camera, g.means[i]);
   const Factors<T> factors = project_covariance(camera, g, i, mean.view);
   const SplatGrad<T> grad = F::prepare_vjp(factors.cov, F::prepare(factors.cov, options), sums.shape, sums.weighted);
   const Vec3<T> dL_dview = project_covariance_vjp(camera, g, out, i, mean.view, factors, grad);
   Vec3<T> dL_dmean = project_mean_vjp(camera, mean, grad.dL_dmean, dL_dview);
-  dL_dmean += splat_color_vjp(camera, g, out, i, sums.color);
+  dL_dmean += splat_color_vjp(camera, g, out, i, sh, dL_dsh, sums.color);
   if (out.means) out.means[i] = dL_dmean;
   if (out.opacities) out.opacities[i] = sums.weighted / g.opacities[i];
   if (out.means2d) {
@@ -348,8 +368,16 @@ AR_HD void project_vjp(const Camera<T>& camera, const Gaussians<T>& g, int64_t i
   }
 }
 
-/// Zero gradient, for a Gaussian that touched no pixel.
-template <typename T> AR_HD void zero_grads(const Gaussians<T>& g, int64_t i, const GaussianGrads<T>& out) {
+/// The same with all coefficients in their place.
+template <class F, typename T>
+AR_HD void project_vjp(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options,
+                       const PairGrad<T>& sums, const GaussianGrads<T>& out) {
+  project_vjp<F>(camera, g, i, options, sums, g.shs ? g.shs + i * g.sh_stride : nullptr,
+                 out.shs ? out.shs + i * g.sh_stride : nullptr, out);
+}
+
+/// Zero gradient, for a Gaussian that touched no pixel. out.shs is not touched.
+template <typename T> AR_HD void zero_grads(int64_t i, const GaussianGrads<T>& out) {
   const Vec3<T> zero = {T(0), T(0), T(0)};
   if (out.means) out.means[i] = zero;
   if (out.scales) out.scales[i] = zero;
@@ -357,12 +385,13 @@ template <typename T> AR_HD void zero_grads(const Gaussians<T>& g, int64_t i, co
   if (out.cov3ds) out.cov3ds[i] = {T(0), T(0), T(0), T(0), T(0), T(0)};
   if (out.opacities) out.opacities[i] = T(0);
   if (out.colors) out.colors[i] = zero;
-  if (out.shs) {
-    for (int k = 0; k < g.sh_stride; ++k) out.shs[i * g.sh_stride + k] = zero;
-  }
   if (out.means2d) {
     for (int k = 0; k < out.means2d_stride; ++k) out.means2d[i * out.means2d_stride + k] = T(0);
   }
+}
+template <typename T> AR_HD void zero_grads(const Gaussians<T>& g, int64_t i, const GaussianGrads<T>& out) {
+  zero_grads(i, out);
+  for (int k = 0; out.shs && k < g.sh_stride; ++k) out.shs[i * g.sh_stride + k] = {T(0), T(0), T(0)};
 }
 
 }  // namespace ar

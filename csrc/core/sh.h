@@ -67,7 +67,10 @@ template <typename T> AR_HD Vec3<T> sh_basis_vjp(int degree, Vec3<T> d, const T*
 /// Colour before the clamp at zero: sum of coefficients times basis, plus 1/2.
 template <typename T> AR_HD Vec3<T> sh_color(int degree, const T* basis, const Vec3<T>* coefficients) {
   Vec3<T> color = {T(0.5), T(0.5), T(0.5)};
-  for (int k = 0; k < sh_count(degree); ++k) color += basis[k] * coefficients[k];
+  AR_UNROLL
+  for (int k = 0; k < kMaxShCount; ++k) {
+    if (k < sh_count(degree)) color += basis[k] * coefficients[k];
+  }
   return color;
 }
 

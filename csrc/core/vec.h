@@ -36,6 +36,7 @@ template <typename T> struct Mat3 {
 };
 
 template <class V> AR_HD Vec2<V> operator+(Vec2<V> a, Vec2<V> b) { return {a.x + b.x, a.y + b.y}; }
+template <class V> AR_HD Sym2<V> operator+(Sym2<V> a, Sym2<V> b) { return {a.xx + b.xx, a.xy + b.xy, a.yy + b.yy}; }
 
 template <typename T> AR_HD Vec3<T> operator+(Vec3<T> a, Vec3<T> b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
 template <typename T> AR_HD Vec3<T> operator-(Vec3<T> a, Vec3<T> b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
@@ -62,6 +63,10 @@ template <typename T> AR_HD Vec3<T> operator*(const Sym3<T>& m, Vec3<T> v) {
 /// m v with scalar m and lanes v.
 template <typename T, class V> AR_HD Vec2<V> transform(const Mat2<T>& m, Vec2<V> v) {
   return {madd(V(m.xx), v.x, V(m.xy) * v.y), madd(V(m.yx), v.x, V(m.yy) * v.y)};
+}
+/// m v + c with scalar m and c.
+template <typename T, class V> AR_HD Vec2<V> transform(const Mat2<T>& m, Vec2<V> v, Vec2<T> c) {
+  return {madd(V(m.xx), v.x, madd(V(m.xy), v.y, V(c.x))), madd(V(m.yx), v.x, madd(V(m.yy), v.y, V(c.y)))};
 }
 /// m^T v.
 template <typename T, class V> AR_HD Vec2<V> transform_transposed(const Mat2<T>& m, Vec2<V> v) {

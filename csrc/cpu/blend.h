@@ -112,20 +112,20 @@ template <class F, typename T> void blend_tile(const cpu::BlendTask<T>& task, in
     if (k + 4 < end) __builtin_prefetch(&splats[task.pairs[k + 4]]);
     const Splat<F, T>& splat = splats[task.pairs[k]];
     const TileMask<T> reach = reach_of(splat, view, lanes);
-    const auto terms = F::terms(splat.shape, splat.opacity);
+    const Vec2<T> origin = {T(view.x0) - splat.mean.x, T(view.y0) - splat.mean.y};
+    const auto terms = F::terms(splat.shape, splat.opacity, origin);
     const Vec3<V> splat_color = {V(splat.color.x), V(splat.color.y), V(splat.color.z)};
     const IndexOf<V> index(int32_t(k - begin + 1));
-    const T left = T(view.x0) - splat.mean.x, top = T(view.y0) - splat.mean.y;
     for (int c = 0; c < TileMask<T>::kPacks; ++c) {
-      const V dx = load(lanes.value + c * kCount, V()) + V(left);
+      const V x = load(lanes.value + c * kCount, V());
       for (uint32_t rows = reach.rows[c] & open_rows; rows != 0; rows &= rows - 1) {
         const int row = __builtin_ctz(rows), pixel = row * kTile + c * kCount;
-        const Vec2<V> d = {dx, V(lanes.value[row] + top)};
+        const Vec2<V> p = {x, V(lanes.value[row])};
         V contribution(T(0));
         AR_UNROLL
         for (int s = 0; s < kSamples; ++s) {
           V t = load(transmittance[s] + pixel, V());
-          const Blended<V> blended = blend_sample(F::alpha(terms, d, s), t);
+          const Blended<V> blended = blend_sample(F::alpha(terms, p, s), t);
           store(transmittance[s] + pixel, t);
           contribution = contribution + blended.contribution;
           if (task.last) {
@@ -192,7 +192,8 @@ template <class F, typename T, bool kAbs> void blend_vjp_tile(const cpu::BlendVj
     if (k >= 4) __builtin_prefetch(&splats[task.pairs[begin + k - 4]]);
     const Splat<F, T>& splat = splats[task.pairs[begin + k]];
     const TileMask<T> reach = reach_of(splat, view, lanes);
-    const auto terms = F::terms(splat.shape, splat.opacity);
+    const Vec2<T> origin = {T(view.x0) - splat.mean.x, T(view.y0) - splat.mean.y};
+    const auto terms = F::terms(splat.shape, splat.opacity, origin);
     const V zero = V(T(0));
     const Vec3<V> splat_color = {V(splat.color.x), V(splat.color.y), V(splat.color.z)};
     const IndexOf<V> index(k);
@@ -200,20 +201,19 @@ template <class F, typename T, bool kAbs> void blend_vjp_tile(const cpu::BlendVj
     V weighted = zero;
     Vec3<V> color = {zero, zero, zero};
     Vec2<V> abs2d = {zero, zero};
-    const T left = T(view.x0) - splat.mean.x, top = T(view.y0) - splat.mean.y;
     for (int c = 0; c < TileMask<T>::kPacks; ++c) {
-      const V dx = load(lanes.value + c * kCount, V()) + V(left);
+      const V x = load(lanes.value + c * kCount, V());
       for (uint32_t rows = reach.rows[c] & rows_in_image; rows != 0; rows &= rows - 1) {
         const int row = __builtin_ctz(rows), pixel = row * kTile + c * kCount;
         if (k >= row_last[row]) continue;
-        const Vec2<V> d = {dx, V(lanes.value[row] + top)};
+        const Vec2<V> p = {x, V(lanes.value[row])};
         const Vec3<V> gp = {load(g[0] + pixel, V()), load(g[1] + pixel, V()), load(g[2] + pixel, V())};
         const V g_color = madd(gp.x, splat_color.x, madd(gp.y, splat_color.y, gp.z * splat_color.z));
         V contribution = zero;
         Vec2<V> offset = {zero, zero};
         AR_UNROLL
         for (int s = 0; s < kSamples; ++s) {
-          const V alpha = F::alpha(terms, d, s);
+          const V alpha = F::alpha(terms, p, s);
           const MaskOf<V> mask = (alpha >= V(T(kAlphaMin))) & (index < load_index(last[s] + pixel, V()));
           V t = load(transmittance[s] + pixel, V()), b = load(behind[s] + pixel, V());
           const BlendGrad<V> grad = blend_sample_vjp(mask, alpha, g_color, t, b);
@@ -221,9 +221,9 @@ template <class F, typename T, bool kAbs> void blend_vjp_tile(const cpu::BlendVj
           store(behind[s] + pixel, b);
           contribution = contribution + grad.contribution;
           weighted = madd(grad.dL_dalpha, alpha, weighted);
-          const ShapeGrad<V> one = F::alpha_vjp(terms, d, s, alpha, grad.dL_dalpha);
+          const ShapeGrad<V> one = F::alpha_vjp(terms, p, s, alpha, grad.dL_dalpha);
           offset = offset + one.offset;
-          shape.shape = {shape.shape.xx + one.shape.xx, shape.shape.xy + one.shape.xy, shape.shape.yy + one.shape.yy};
+          shape.shape = shape.shape + one.shape;
         }
         shape.offset = shape.offset + offset;
         color = {madd(contribution, gp.x, color.x), madd(contribution, gp.y, color.y),

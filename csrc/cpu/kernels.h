@@ -11,7 +11,6 @@ namespace ar::AR_ISA {
 
 template <class F, typename T>
 inline constexpr cpu::Stages<T> kStages = {
-    int(sizeof(Splat<F, T>) / sizeof(T)),
     F::kSamples,
     count_candidates<T>,
     project<F, T>,

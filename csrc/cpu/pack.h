@@ -42,7 +42,6 @@ struct PackMask {
   PackIndex::Raw v;
 
   AR_HD PackMask operator&(PackMask o) const { return {v & o.v}; }
-  AR_HD PackMask operator|(PackMask o) const { return {v | o.v}; }
   AR_HD PackMask operator!() const { return {~v}; }
 };
 
@@ -101,6 +100,9 @@ AR_HD Pack sqrt(Pack a) {
   return r;
 }
 #endif
+
+AR_HD Pack divide(Pack a, Pack b) { return a / b; }
+AR_HD Pack approx_sqrt(Pack a) { return sqrt(a); }
 
 /// Lane i in bit i.
 AR_HD uint32_t bits(bool m) { return m; }

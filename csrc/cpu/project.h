@@ -10,12 +10,6 @@
 
 namespace ar::AR_ISA {
 
-template <typename T> AR_HD T max_sigma(const Gaussians<T>& g, int64_t i) {
-  if (g.cov3ds) return std::sqrt(g.cov3ds[i].xx + g.cov3ds[i].yy + g.cov3ds[i].zz);
-  const Vec3<T> s = g.scales[i];
-  return g.scale_modifier * ar::max(std::abs(s.x), ar::max(std::abs(s.y), std::abs(s.z)));
-}
-
 /// First pass: which Gaussians may be visible, and how many of each chunk, so that splats can be
 /// written densely and in input order.
 template <typename T> void count_candidates(const cpu::ProjectTask<T>& task) {
@@ -26,7 +20,7 @@ template <typename T> void count_candidates(const cpu::ProjectTask<T>& task) {
     const int64_t begin = chunk * cpu::kChunk, end = std::min(g.n, begin + cpu::kChunk);
     int64_t count = 0;
     for (int64_t i = begin; i < end; ++i) {
-      const bool candidate = may_be_visible(camera, g.means[i], max_sigma(g, i), g.opacities[i], blur);
+      const bool candidate = may_be_visible(camera, g, i, blur);
       task.candidates[i] = candidate;
       count += candidate;
     }
@@ -72,12 +66,7 @@ template <class F, typename T> void project_vjp(const cpu::ProjectVjpTask<T>& ta
       PairGrad<T> sums = {};
       Vec2<T> abs2d = {};
       for (int64_t k = first; k < last; ++k) {
-        const PairGrad<T>& g = task.pair_grads[task.positions[k]];
-        sums.shape.offset = sums.shape.offset + g.shape.offset;
-        sums.shape.shape = {sums.shape.shape.xx + g.shape.shape.xx, sums.shape.shape.xy + g.shape.shape.xy,
-                            sums.shape.shape.yy + g.shape.shape.yy};
-        sums.weighted += g.weighted;
-        sums.color += g.color;
+        sums = sums + task.pair_grads[task.positions[k]];
         if (task.pair_abs) abs2d = abs2d + task.pair_abs[task.positions[k]];
       }
       ar::project_vjp<F, T>(camera, task.gaussians, i, task.options, sums, task.grads);

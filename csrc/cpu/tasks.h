@@ -98,7 +98,6 @@ template <typename T> struct WeightTask {
 
 /// The stages of one footprint.
 template <typename T> struct Stages {
-  int splat_width;  ///< scalars per splat
   int samples;
   void (*count_candidates)(const ProjectTask<T>&);
   void (*project)(const ProjectTask<T>&);

@@ -32,6 +32,10 @@ void check_positive(double value, const char* name) {
   TORCH_CHECK_VALUE(std::isfinite(value) && value > 0, name, " must be positive and finite, got ", value);
 }
 
+void check_finite(const Tensor& t, const char* name) {
+  TORCH_CHECK_VALUE(at::isfinite(t).all().item<bool>(), name, " must be finite, got ", t);
+}
+
 }  // namespace
 
 std::string shape_of(const Tensor& t) {
@@ -54,8 +58,17 @@ void check_like(const Tensor& t, const char* name, const Tensor& like, const cha
                     ", got ", t.device());
 }
 
-void check_finite(const Tensor& t, const char* name) {
-  TORCH_CHECK_VALUE(at::isfinite(t).all().item<bool>(), name, " must be finite, got ", t);
+void check_weight_arguments(const Tensor& offset, const Tensor& cov2d, double variance) {
+  check_floating(offset, "offset");
+  TORCH_CHECK_VALUE(offset.dim() >= 1 && offset.size(-1) == 2, "offset must have shape (..., 2), got ",
+                    shape_of(offset));
+  check_like(cov2d, "cov2d", offset, "offset");
+  TORCH_CHECK_VALUE(cov2d.dim() == offset.dim() && cov2d.size(-1) == 3 &&
+                        cov2d.sizes().slice(0, cov2d.dim() - 1) == offset.sizes().slice(0, offset.dim() - 1),
+                    "cov2d must have shape (..., 3) with the leading sizes of offset ", shape_of(offset), ", got ",
+                    shape_of(cov2d));
+  TORCH_CHECK_VALUE(std::isfinite(variance) && variance >= 0, "variance must be finite and not negative, got ",
+                    variance);
 }
 
 void check_image_size(int64_t height, int64_t width) {
@@ -131,6 +144,20 @@ void Inputs::check() {
   check_positive(scale_modifier, "scale_modifier");
   TORCH_CHECK_VALUE(std::isfinite(variance) && variance >= 0, "variance must be finite and not negative, got ",
                     variance);
+}
+
+void check_weight_gradient(const Tensor& dL_dweight, const Tensor& offset) {
+  check_like(dL_dweight, "dL_dweight", offset, "offset");
+  TORCH_CHECK_VALUE(dL_dweight.sizes() == offset.sizes().slice(0, offset.dim() - 1),
+                    "dL_dweight must have the leading sizes of offset ", shape_of(offset), ", got ",
+                    shape_of(dL_dweight));
+}
+
+void Inputs::check_camera() const {
+  check_finite(background, "bg");
+  check_finite(viewmatrix, "viewmatrix");
+  check_finite(projmatrix, "projmatrix");
+  check_finite(campos, "campos");
 }
 
 }  // namespace ar::ops

@@ -31,6 +31,9 @@ struct Inputs {
   /// Raises TypeError for a wrong dtype and ValueError for anything else. Afterwards every tensor is
   /// contiguous, and the matrices are 4x4.
   void check();
+
+  /// Background, matrices and camera centre are finite. On a device this waits for it.
+  void check_camera() const;
 };
 
 std::string shape_of(const Tensor& t);
@@ -41,8 +44,9 @@ void check_floating(const Tensor& t, const char* name);
 /// Same dtype and device as `like`, which is called `like_name` in the message.
 void check_like(const Tensor& t, const char* name, const Tensor& like, const char* like_name);
 
-/// Every element is finite. CPU tensors only: elsewhere it would wait for the device.
-void check_finite(const Tensor& t, const char* name);
+/// Arguments of footprint_weight.
+void check_weight_arguments(const Tensor& offset, const Tensor& cov2d, double variance);
+void check_weight_gradient(const Tensor& dL_dweight, const Tensor& offset);
 
 /// Sizes that tensors and tiles can be indexed with.
 void check_image_size(int64_t height, int64_t width);

@@ -4,11 +4,20 @@
 
 #include "cpu/tasks.h"
 
-// A splat, pair and tile order that only rasterize and its vjp share travel as tensors of their own:
-// `splats` (V, K) rows of Splat<F, T>, `ids` (V,) the Gaussian of each, `pairs` (N,) splats by tile and
-// depth, `tile_offsets` (tiles + 1,), and for the backward pass `splat_offsets` (V + 1,) and
-// `positions` (N,), the places in pairs of each splat, `transmittance` and `last` (samples, H, W).
-// Without `keep` those that only the backward pass reads are empty.
+#if defined(AR_WITH_CUDA)
+namespace ar::ops {
+void force_pair_capacity(int64_t capacity);
+}
+#endif
+
+// What only rasterize and its vjp share travels as tensors of its own. On the CPU: `splats` (V, 12) rows of
+// Splat<F, T>, `ids` (V,) the Gaussian of each, `pairs` (N,) splats by tile and depth, `tile_offsets`
+// (tiles + 1,), and for the backward pass `splat_offsets` (V + 1,) and `positions` (N,), the places in
+// pairs of each splat, `transmittance` and `last` (samples, H, W). On CUDA every Gaussian has a row of
+// splats, ids are in the order of depth, pairs and positions have room for more than there are,
+// `splat_offsets` (P, 2) are the first pair and the number of pairs, and there are `checkpoints`
+// (n, samples, 256, 4) and the `pair_count` (1,). Without `keep` what only the backward pass reads is
+// empty. `debug` waits for every stage, so that an error is raised by the stage that caused it.
 TORCH_LIBRARY(analytic_rasterizer, m) {
   m.def(
       "rasterize(Tensor means3D, Tensor? means2D, Tensor opacities, Tensor? shs, Tensor? colors_precomp, Tensor? "
@@ -16,9 +25,10 @@ TORCH_LIBRARY(analytic_rasterizer, m) {
       "Tensor? rotations, Tensor? cov3D_precomp, Tensor bg, Tensor viewmatrix, Tensor projmatrix, Tensor campos, "
       "int image_height, int image_width, float tanfovx, float tanfovy, float scale_modifier, int sh_degree, str "
       "footprint, "
-      "float variance, bool keep) -> (Tensor color, Tensor radii, Tensor splats, Tensor ids, Tensor pairs, Tensor "
+      "float variance, bool keep, bool debug) -> (Tensor color, Tensor radii, Tensor splats, Tensor ids, Tensor pairs, Tensor "
       "tile_offsets, "
-      "Tensor splat_offsets, Tensor positions, Tensor transmittance, Tensor last)");
+      "Tensor splat_offsets, Tensor positions, Tensor transmittance, Tensor last, Tensor checkpoints, Tensor "
+      "pair_count)");
   m.def(
       "rasterize_vjp(Tensor dL_dcolor, Tensor means3D, Tensor? means2D, Tensor opacities, Tensor? shs, Tensor? "
       "colors_precomp, "
@@ -27,7 +37,8 @@ TORCH_LIBRARY(analytic_rasterizer, m) {
       "sh_degree, "
       "str footprint, float variance, Tensor splats, Tensor ids, Tensor pairs, Tensor tile_offsets, Tensor "
       "splat_offsets, "
-      "Tensor positions, Tensor transmittance, Tensor last, bool[8] needs) -> (Tensor means3D, Tensor means2D, Tensor "
+      "Tensor positions, Tensor transmittance, Tensor last, Tensor checkpoints, Tensor pair_count, bool[8] needs, bool "
+      "debug) -> (Tensor means3D, Tensor means2D, Tensor "
       "opacities, "
       "Tensor shs, Tensor colors_precomp, Tensor scales, Tensor rotations, Tensor cov3D_precomp)");
   m.def(
@@ -46,5 +57,12 @@ TORCH_LIBRARY(analytic_rasterizer, m) {
 
 PYBIND11_MODULE(_C, m) {
   m.doc() = "Loads the ops of analytic_rasterizer into torch.ops.analytic_rasterizer.";
+#if defined(AR_WITH_CUDA)
+  m.attr("has_cuda") = true;
+  m.def("force_pair_capacity", &ar::ops::force_pair_capacity,
+        "For tests: room for so many pairs on CUDA, whatever comes; 0 to guess again.");
+#else
+  m.attr("has_cuda") = false;
+#endif
   m.def("instruction_set", &ar::cpu::instruction_set, "Instruction set that the CPU path runs on.");
 }

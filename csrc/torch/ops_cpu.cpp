@@ -8,6 +8,7 @@
 
 #include "cpu/tasks.h"
 #include "torch/checks.h"
+#include "torch/views.h"
 
 namespace ar::ops {
 namespace {
@@ -19,44 +20,6 @@ template <typename T> const Stages<T>& stages_of(const std::string& footprint) {
   TORCH_CHECK_VALUE(stages != nullptr, "footprint must be one of those in csrc/core/footprint/registry.h, got '",
                     footprint, "'");
   return *stages;
-}
-
-template <class Element, typename T> const Element* rows_of(const OptionalTensor& t) {
-  return t ? reinterpret_cast<const Element*>(t->const_data_ptr<T>()) : nullptr;
-}
-
-template <typename T> CameraView<T> camera_of(const Inputs& in) {
-  return {in.viewmatrix.const_data_ptr<T>(),
-          in.projmatrix.const_data_ptr<T>(),
-          in.campos.const_data_ptr<T>(),
-          int(in.image_width),
-          int(in.image_height),
-          T(in.tanfovx),
-          T(in.tanfovy)};
-}
-
-template <typename T> Gaussians<T> gaussians_of(const Inputs& in) {
-  return {in.count(),
-          reinterpret_cast<const Vec3<T>*>(in.means3D.const_data_ptr<T>()),
-          rows_of<Vec3<T>, T>(in.scales),
-          rows_of<Vec4<T>, T>(in.rotations),
-          rows_of<Sym3<T>, T>(in.cov3D_precomp),
-          in.opacities.const_data_ptr<T>(),
-          rows_of<Vec3<T>, T>(in.shs),
-          rows_of<Vec3<T>, T>(in.colors_precomp),
-          in.shs ? int(in.shs->size(1)) : 0,
-          int(in.sh_degree),
-          T(in.scale_modifier)};
-}
-
-TileGrid grid_of(const Inputs& in) { return {int(in.image_width), int(in.image_height)}; }
-
-void check_cpu(Inputs& in) {
-  in.check();
-  check_finite(in.background, "bg");
-  check_finite(in.viewmatrix, "viewmatrix");
-  check_finite(in.projmatrix, "projmatrix");
-  check_finite(in.campos, "campos");
 }
 
 struct Projected {
@@ -81,7 +44,7 @@ template <typename T> Projected project(const Inputs& in, const Stages<T>& stage
   stages.count_candidates(task);
   int64_t candidates = 0;
   for (int64_t& offset : offsets) candidates += std::exchange(offset, candidates);
-  Projected out{at::empty({candidates, stages.splat_width}, options), at::empty({candidates}, options.dtype(at::kInt)),
+  Projected out{at::empty({candidates, kSplatWidth}, options), at::empty({candidates}, options.dtype(at::kInt)),
                 at::empty({candidates}, options), at::empty({in.count()}, options.dtype(at::kInt))};
   task.splats = out.splats.data_ptr<T>();
   task.ids = out.ids.data_ptr<int32_t>();
@@ -140,19 +103,18 @@ BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& b
   return out;
 }
 
-using RasterizeOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
-
 RasterizeOutput rasterize_cpu(const Tensor& means3D, const OptionalTensor& means2D, const Tensor& opacities,
                               const OptionalTensor& shs, const OptionalTensor& colors_precomp,
                               const OptionalTensor& scales, const OptionalTensor& rotations,
                               const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
                               const Tensor& projmatrix, const Tensor& campos, int64_t image_height, int64_t image_width,
                               double tanfovx, double tanfovy, double scale_modifier, int64_t sh_degree,
-                              std::string footprint, double variance, bool keep) {
+                              std::string footprint, double variance, bool keep, bool) {
   Inputs in{means3D,       opacities, means2D,        shs,        colors_precomp, scales,       rotations,
             cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
             tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      variance};
-  check_cpu(in);
+  in.check();
+  in.check_camera();
   RasterizeOutput out;
   AT_DISPATCH_FLOATING_TYPES(in.means3D.scalar_type(), "rasterize", [&] {
     const Stages<scalar_t>& stages = stages_of<scalar_t>(footprint);
@@ -160,12 +122,11 @@ RasterizeOutput rasterize_cpu(const Tensor& means3D, const OptionalTensor& means
     const Binned binned = bin(in, projected, stages, keep);
     const BlendedImage image = blend(in, projected, binned, stages, keep);
     out = {image.color,         projected.radii,      projected.splats, projected.ids,       binned.pairs,
-           binned.tile_offsets, binned.splat_offsets, binned.positions, image.transmittance, image.last};
+           binned.tile_offsets, binned.splat_offsets, binned.positions, image.transmittance, image.last,
+           at::empty({0}, in.means3D.options()), at::empty({0}, binned.tile_offsets.options())};
   });
   return out;
 }
-
-using StagesOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 
 StagesOutput rasterize_stages_cpu(const Tensor& means3D, const Tensor& opacities, const OptionalTensor& shs,
                                   const OptionalTensor& colors_precomp, const OptionalTensor& scales,
@@ -177,7 +138,8 @@ StagesOutput rasterize_stages_cpu(const Tensor& means3D, const Tensor& opacities
   Inputs in{means3D,       opacities, std::nullopt,   shs,        colors_precomp, scales,       rotations,
             cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
             tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      variance};
-  check_cpu(in);
+  in.check();
+  in.check_camera();
   StagesOutput out;
   AT_DISPATCH_FLOATING_TYPES(in.means3D.scalar_type(), "rasterize_stages", [&] {
     using Clock = std::chrono::steady_clock;
@@ -216,8 +178,6 @@ void check_saved(const Inputs& in, const Tensor& splats, const Tensor& ids, cons
                     "splats, transmittance and last must be contiguous, got strided ones");
 }
 
-using Grads = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
-
 Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const OptionalTensor& means2D,
                         const Tensor& opacities, const OptionalTensor& shs, const OptionalTensor& colors_precomp,
                         const OptionalTensor& scales, const OptionalTensor& rotations,
@@ -226,7 +186,8 @@ Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const Op
                         double tanfovx, double tanfovy, double scale_modifier, int64_t sh_degree, std::string footprint,
                         double variance, const Tensor& splats, const Tensor& ids, const Tensor& pairs,
                         const Tensor& tile_offsets, const Tensor& splat_offsets, const Tensor& positions,
-                        const Tensor& transmittance, const Tensor& last, std::array<bool, 8> needs) {
+                        const Tensor& transmittance, const Tensor& last, const Tensor&, const Tensor&,
+                        std::array<bool, 8> needs, bool) {
   Inputs in{means3D,       opacities, means2D,        shs,        colors_precomp, scales,       rotations,
             cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
             tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      variance};
@@ -234,30 +195,13 @@ Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const Op
   check_like(dL_dcolor, "dL_dcolor", means3D, "means3D");
   TORCH_CHECK_VALUE(dL_dcolor.sizes() == at::IntArrayRef({3, image_height, image_width}),
                     "dL_dcolor must have shape (3, ", image_height, ", ", image_width, "), got ", shape_of(dL_dcolor));
-  // An empty tensor stands for a gradient that is not wanted.
-  const auto make = [&](const OptionalTensor& like, bool needed) {
-    return needed && like ? at::empty_like(*like, at::MemoryFormat::Contiguous) : at::empty({0}, means3D.options());
-  };
-  const Grads out = {make(in.means3D, needs[0]),   make(in.means2D, needs[1]),        make(in.opacities, needs[2]),
-                     make(in.shs, needs[3]),       make(in.colors_precomp, needs[4]), make(in.scales, needs[5]),
-                     make(in.rotations, needs[6]), make(in.cov3D_precomp, needs[7])};
+  const Grads out = make_grads(in, needs);
   AT_DISPATCH_FLOATING_TYPES(means3D.scalar_type(), "rasterize_vjp", [&] {
     using T = scalar_t;
     const Stages<T>& stages = stages_of<T>(footprint);
-    check_saved(in, splats, ids, pairs, tile_offsets, splat_offsets, positions, transmittance, last, stages.splat_width,
+    check_saved(in, splats, ids, pairs, tile_offsets, splat_offsets, positions, transmittance, last, kSplatWidth,
                 stages.samples);
-    const auto pointer = [](const Tensor& t) { return t.numel() ? t.data_ptr<T>() : nullptr; };
-    GaussianGrads<T> grads{};
-    grads.means = reinterpret_cast<Vec3<T>*>(pointer(std::get<0>(out)));
-    grads.means2d = pointer(std::get<1>(out));
-    grads.means2d_stride = in.means2D ? int(in.means2D->size(1)) : 0;
-    grads.opacities = pointer(std::get<2>(out));
-    grads.shs = reinterpret_cast<Vec3<T>*>(pointer(std::get<3>(out)));
-    grads.colors = reinterpret_cast<Vec3<T>*>(pointer(std::get<4>(out)));
-    grads.scales = reinterpret_cast<Vec3<T>*>(pointer(std::get<5>(out)));
-    grads.rotations = reinterpret_cast<Vec4<T>*>(pointer(std::get<6>(out)));
-    grads.cov3ds = reinterpret_cast<Sym3<T>*>(pointer(std::get<7>(out)));
-
+    const GaussianGrads<T> grads = grads_of<T>(in, out);
     const int64_t n = pairs.size(0);
     const Tensor pair_grads = at::empty({n, int64_t(sizeof(PairGrad<T>) / sizeof(T))}, means3D.options());
     const bool absolute = grads.means2d && grads.means2d_stride == 4;
@@ -285,19 +229,6 @@ Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const Op
   return out;
 }
 
-void check_weight_arguments(const Tensor& offset, const Tensor& cov2d, double variance) {
-  check_floating(offset, "offset");
-  TORCH_CHECK_VALUE(offset.dim() >= 1 && offset.size(-1) == 2, "offset must have shape (..., 2), got ",
-                    shape_of(offset));
-  check_like(cov2d, "cov2d", offset, "offset");
-  TORCH_CHECK_VALUE(cov2d.dim() == offset.dim() && cov2d.size(-1) == 3 &&
-                        cov2d.sizes().slice(0, cov2d.dim() - 1) == offset.sizes().slice(0, offset.dim() - 1),
-                    "cov2d must have shape (..., 3) with the leading sizes of offset ", shape_of(offset), ", got ",
-                    shape_of(cov2d));
-  TORCH_CHECK_VALUE(std::isfinite(variance) && variance >= 0, "variance must be finite and not negative, got ",
-                    variance);
-}
-
 template <typename T> cpu::WeightTask<T> weight_task(const Tensor& offset, const Tensor& cov2d, double variance) {
   cpu::WeightTask<T> task{};
   task.n = offset.numel() / 2;
@@ -323,10 +254,7 @@ Tensor footprint_weight_cpu(const Tensor& offset, const Tensor& cov2d, std::stri
 std::tuple<Tensor, Tensor> footprint_weight_vjp_cpu(const Tensor& dL_dweight, const Tensor& offset, const Tensor& cov2d,
                                                     std::string footprint, double variance) {
   check_weight_arguments(offset, cov2d, variance);
-  check_like(dL_dweight, "dL_dweight", offset, "offset");
-  TORCH_CHECK_VALUE(dL_dweight.sizes() == offset.sizes().slice(0, offset.dim() - 1),
-                    "dL_dweight must have the leading sizes of offset ", shape_of(offset), ", got ",
-                    shape_of(dL_dweight));
+  check_weight_gradient(dL_dweight, offset);
   const Tensor g = dL_dweight.contiguous(), d = offset.contiguous(), c = cov2d.contiguous();
   const Tensor dL_doffset = at::empty(offset.sizes(), offset.options()),
                dL_dcov = at::empty(cov2d.sizes(), cov2d.options());

@@ -21,8 +21,8 @@ template <typename T> struct Buffers {
 template <class F, typename T> __global__ void run_core(Buffers<T> b, Splat<F, T>* splats) {
   const int64_t i = blockIdx.x * blockDim.x + threadIdx.x;
   const Camera<T> camera = load_camera(b.camera);
-  if (!may_be_visible(camera, b.gaussians.means[i], b.gaussians.scales[i].x, b.gaussians.opacities[i], T(1))) {
-    zero_grads(b.gaussians, i, b.grads);
+  if (!may_be_visible(camera, b.gaussians, i, T(1))) {
+    zero_grads(i, b.grads);
     return;
   }
   T depth;
@@ -45,7 +45,7 @@ template <class F, typename T> __global__ void run_core(Buffers<T> b, Splat<F, T
     sums.weighted += grad.contribution;
   }
   b.pixels[i] = transform_transposed(F::mean_map(splats[i].shape), sums.shape.offset);
-  project_vjp<F>(camera, b.gaussians, i, b.options, sums, b.grads);
+  project_vjp<F>(camera, b.gaussians, i, b.options, sums, b.gaussians.shs, b.grads.shs, b.grads);
 }
 
 template <typename T> void launch(const char* footprint, const Buffers<T>& b) {

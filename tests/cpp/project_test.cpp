@@ -124,7 +124,7 @@ template <class F> struct Loss {
         if constexpr (kIsFrozen<F>) {
           // This adjoint is deliberately not the formula's. Give it the formula's own frame term.
           using Paper = Analytic<FrameGradient::kPaper>;
-          const auto paper = Paper::terms(Paper::Shape<double>{splat.shape.inv_sigma, splat.shape.axis}, splat.opacity);
+          const auto paper = Paper::terms(Paper::Shape<double>{splat.shape.inv_sigma, splat.shape.axis, splat.shape.mass}, splat.opacity);
           one.shape.xy = Paper::alpha_vjp(paper, d, s, alpha, g[k]).shape.xy / gap;
         }
         add(one, sums.shape);
@@ -326,9 +326,8 @@ TYPED_TEST(ProjectTest, NeverKeepsWhatMayNotBeVisible) {
     float depth;
     if (project(camera, p.view({false, -1}), 0, options, splat, depth) == 0) continue;
     ++kept;
-    const float sigma = std::max({std::abs(p.scale.x), std::abs(p.scale.y), std::abs(p.scale.z)});
     const float blur = float(std::max(options.variance, kPixelVariance));
-    ASSERT_TRUE(may_be_visible(camera, p.mean, sigma, p.opacity, blur)) << trial;
+    ASSERT_TRUE(may_be_visible(camera, p.view({false, -1}), 0, blur)) << trial;
   }
   EXPECT_GT(kept, 1000);
 }

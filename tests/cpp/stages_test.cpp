@@ -91,7 +91,7 @@ Rendered<T> run_stages(const cpu::Stages<T>& stages, const Scene<T>& scene, Foot
   stages.count_candidates(project);
   int64_t n = 0;
   for (int64_t& offset : chunk_offsets) n += std::exchange(offset, n);
-  std::vector<T> splats(n * stages.splat_width), depths(n);
+  std::vector<T> splats(n * kSplatWidth), depths(n);
   std::vector<int32_t> ids(n);
   project.splats = splats.data();
   project.depths = depths.data();

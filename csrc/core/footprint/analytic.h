@@ -35,7 +35,7 @@ template <class V> struct LogisticWindow {
     lower = exp(min(logistic((distance - half) * r), V(T(40))));
     upper = exp(-logistic((distance + half) * r));
     const V y2 = r * madd(V(T(kLogistic3)), madd(V(T(3)) * t, t, V(T(0.25)) * r * r), V(T(kLogistic1)));
-    inverse = one / ((one + lower) * (one + upper));
+    inverse = divide(one, (one + lower) * (one + upper));
     value = one_minus_exp(y2, lower * upper) * inverse;
   }
 
@@ -82,10 +82,12 @@ template <FrameGradient kFrame> struct Analytic {
   template <typename T> struct Shape {
     Vec2<T> inv_sigma;  ///< 1 / standard deviations along the major and the minor axis [1/px]
     Vec2<T> axis;       ///< (cos, sin) of the major axis
+    T mass;             ///< 2 pi s1 s2 [px^2]
   };
   template <typename T> struct Terms {
     Shape<T> shape;
-    T mass;  ///< opacity * 2 pi s1 s2
+    Vec2<T> origin;  ///< in the frame
+    T mass;          ///< opacity * 2 pi s1 s2
   };
 
   AR_HD static double radius_variance(FootprintOptions) { return 0; }
@@ -105,7 +107,7 @@ template <FrameGradient kFrame> struct Analytic {
       const T sine = sqrt(T(0.5) * (T(1) - dx / gap));
       axis = {abs(dy) / (T(2) * gap * sine), dy < T(0) ? -sine : sine};
     }
-    return {{T(1) / s1, T(1) / s2}, axis};
+    return {{T(1) / s1, T(1) / s2}, axis, T(2 * kPi) * s1 * s2};
   }
 
   /// Ellipse of Sigma + I/12.
@@ -124,20 +126,20 @@ template <FrameGradient kFrame> struct Analytic {
     return T(2) * std::log(T(1 / kAlphaMin) * peak) + slack;
   }
 
-  template <typename T> AR_HD static Terms<T> terms(const Shape<T>& g, T opacity) {
-    return {g, opacity * T(2 * kPi) / (g.inv_sigma.x * g.inv_sigma.y)};
+  template <typename T> AR_HD static Terms<T> terms(const Shape<T>& g, T opacity, Vec2<T> origin = {T(0), T(0)}) {
+    return {g, transform(frame(g), origin), opacity * g.mass};
   }
 
-  template <typename T, class V> AR_HD static V alpha(const Terms<T>& t, Vec2<V> d, int) {
-    const Vec2<V> e = in_frame(t.shape, d);
+  template <typename T, class V> AR_HD static V alpha(const Terms<T>& t, Vec2<V> p, int) {
+    const Vec2<V> e = transform(frame(t.shape), p, t.origin);
     return V(t.mass) * LogisticWindow<V>(e.x, t.shape.inv_sigma.x).value *
            LogisticWindow<V>(e.y, t.shape.inv_sigma.y).value;
   }
 
   /// offset = (g_u, g_v); shape = (g_s1, the frame term, g_s2).
   template <typename T, class V>
-  AR_HD static ShapeGrad<V> alpha_vjp(const Terms<T>& t, Vec2<V> d, int, V, V dL_dalpha) {
-    const Vec2<V> e = in_frame(t.shape, d);
+  AR_HD static ShapeGrad<V> alpha_vjp(const Terms<T>& t, Vec2<V> p, int, V, V dL_dalpha) {
+    const Vec2<V> e = transform(frame(t.shape), p, t.origin);
     const LogisticWindow<V> f(e.x, t.shape.inv_sigma.x), g(e.y, t.shape.inv_sigma.y);
     const V scale = dL_dalpha * V(t.mass);
     const V f_u = f.by_u(), g_v = g.by_u();
@@ -152,24 +154,20 @@ template <FrameGradient kFrame> struct Analytic {
   }
 
   template <typename T> AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T> cov, const Shape<T>& g, ShapeGrad<T> sums, T) {
-    const T cx = g.axis.x, cy = g.axis.y;
     // Rotation of the frame per off-diagonal of Sigma is 1/(l1 - l2). At l1 = l2 the frame is
     // arbitrary and the formula has no derivative; zero is as good as any and finite.
     const T gap = eigenvalue_gap(cov);
     const T turn = kFrame == FrameGradient::kFrozen ? T(1) : (gap > T(0) ? T(1) / gap : T(0));
     const Sym2<T> along_axes = {T(0.5) * sums.shape.xx * g.inv_sigma.x, T(0.5) * sums.shape.xy * turn,
                                 T(0.5) * sums.shape.yy * g.inv_sigma.y};
-    return {transform_transposed(mean_map(g), sums.offset), congruence_transposed(Mat2<T>{cx, cy, -cy, cx}, along_axes),
+    return {transform_transposed(mean_map(g), sums.offset), congruence_transposed(frame(g), along_axes),
             T(0)};
   }
 
  private:
-  template <typename T, class V> AR_HD static Vec2<V> in_frame(const Shape<T>& g, Vec2<V> d) {
-    return {madd(V(g.axis.x), d.x, V(g.axis.y) * d.y), madd(V(g.axis.x), d.y, V(-g.axis.y) * d.x)};
-  }
-  template <typename T> AR_HD static T eigenvalue_gap(Cov2d<T> cov) {
-    const T dx = cov.xx - cov.yy, dy = T(2) * cov.xy;
-    return sqrt(dx * dx + dy * dy);
+  /// Rows: the axes.
+  template <typename T> AR_HD static Mat2<T> frame(const Shape<T>& g) {
+    return {g.axis.x, g.axis.y, -g.axis.y, g.axis.x};
   }
   /// 1 / sqrt(sigma^2 + 1/12).
   template <typename T> AR_HD static T widened(T inv_sigma) {

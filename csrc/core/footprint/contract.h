@@ -11,9 +11,10 @@
 //   ellipse(Shape<T>) -> Mat2<T>         w, and
 //   level(Shape<T>, opacity) -> T        such that opacity * I(d + node) < 1/255 wherever
 //                                        |w (d + node)|^2 > level; level <= 0 where it holds everywhere
-//   terms(Shape<T>, opacity) -> Terms<T> numbers that all pixels share, derived per (tile, splat)
-//   alpha(Terms<T>, Vec2<V> d, s) -> V   opacity * I at sample s; d = pixel centre - mean [px]
-//   alpha_vjp(Terms<T>, d, s, alpha, dL_dalpha) -> ShapeGrad<V>      per pixel: sums of plain products
+//   terms(Shape<T>, opacity, Vec2<T> origin) -> Terms<T>    numbers that all pixels share, derived per
+//                                        (tile, splat); origin = a point of the tile - mean [px], by default 0
+//   alpha(Terms<T>, Vec2<V> p, s) -> V   opacity * I at sample s; p = pixel centre - that point [px]
+//   alpha_vjp(Terms<T>, p, s, alpha, dL_dalpha) -> ShapeGrad<V>      per pixel: sums of plain products
 //   mean_map(Shape<T>) -> Mat2<T>        m with dL/dmean = m^T sums.offset [dL/dpx]
 //   prepare_vjp(Cov2d<T>, Shape<T>, ShapeGrad<T> sums, weighted) -> SplatGrad<T>         once per splat
 //
@@ -38,6 +39,12 @@ template <typename T> AR_HD Cov2d<T> blur(Cov2d<T> c, T v) {
   return {c.xx + v, c.xy, c.yy + v, c.det + v * (c.xx + c.yy) + v * v};
 }
 
+/// Difference of the eigenvalues.
+template <typename T> AR_HD T eigenvalue_gap(Cov2d<T> c) {
+  const T dx = c.xx - c.yy, dy = T(2) * c.xy;
+  return sqrt(dx * dx + dy * dy);
+}
+
 /// Run-time options. What changes the code of a pixel is a template parameter instead.
 struct FootprintOptions {
   double variance;  ///< `dilation` of point, `variance` of mip [px^2]; others ignore it
@@ -48,6 +55,9 @@ template <class V> struct ShapeGrad {
   Vec2<V> offset;
   Sym2<V> shape;
 };
+template <class V> AR_HD ShapeGrad<V> operator+(ShapeGrad<V> a, ShapeGrad<V> b) {
+  return {a.offset + b.offset, a.shape + b.shape};
+}
 
 /// Gradient of one splat. dL = dL_dmean . dmean + tr(dL_dcov dSigma) + dL_dlog_det d(log det Sigma).
 /// The part along log det stays apart: its matrix Sigma^-1 does not exist for needles, but its pull

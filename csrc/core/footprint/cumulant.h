@@ -61,7 +61,8 @@ struct Cumulant {
 
   template <typename T> struct Terms {
     Mat2<T> w;
-    T peak;  ///< opacity * amp
+    Vec2<T> origin;  ///< whitened
+    T peak;          ///< opacity * amp
     CumulantAxis<T> x, y;
   };
 
@@ -80,13 +81,13 @@ struct Cumulant {
     return gaussian_level(shape.amp, opacity) + (a * a + c * c) / T(124);
   }
 
-  template <typename T> AR_HD static Terms<T> terms(const Shape<T>& shape, T opacity) {
-    return {shape.w, opacity * shape.amp, CumulantAxis<T>::at(conic_xx(shape.w)),
+  template <typename T> AR_HD static Terms<T> terms(const Shape<T>& shape, T opacity, Vec2<T> origin = {T(0), T(0)}) {
+    return {shape.w, transform(shape.w, origin), opacity * shape.amp, CumulantAxis<T>::at(conic_xx(shape.w)),
             CumulantAxis<T>::at(conic_yy(shape.w))};
   }
 
-  template <typename T, class V> AR_HD static V alpha(const Terms<T>& t, Vec2<V> d, int) {
-    const Vec2<V> z = transform(t.w, d), p = transform_transposed(t.w, z);
+  template <typename T, class V> AR_HD static V alpha(const Terms<T>& t, Vec2<V> pixel, int) {
+    const Vec2<V> z = transform(t.w, pixel, t.origin), p = transform_transposed(t.w, z);
     const V correction = t.x.value(p.x) + t.y.value(p.y);
     const V q = madd(z.x, z.x, z.y * z.y);
     return V(t.peak) * exp2(madd(correction, V(T(-kOrder4 * kLog2e)), V(T(-0.5 * kLog2e)) * q));
@@ -95,8 +96,8 @@ struct Cumulant {
   /// With h the correction, p = C d and e = w dh/dp, in whitened coordinates:
   /// d log I = (z + e).w dmu + tr(w^T (z z^T / 2 + sym(e z^T) + w diag(dh/da, dh/dc) w^T) w dSigma).
   template <typename T, class V>
-  AR_HD static ShapeGrad<V> alpha_vjp(const Terms<T>& t, Vec2<V> d, int, V alpha, V dL_dalpha) {
-    const Vec2<V> z = transform(t.w, d), p = transform_transposed(t.w, z);
+  AR_HD static ShapeGrad<V> alpha_vjp(const Terms<T>& t, Vec2<V> pixel, int, V alpha, V dL_dalpha) {
+    const Vec2<V> z = transform(t.w, pixel, t.origin), p = transform_transposed(t.w, z);
     const V scale = V(T(kOrder4)), twice = V(T(2 * kOrder4));
     const Vec2<V> e = transform(t.w, Vec2<V>{scale * t.x.by_p(p.x), scale * t.y.by_p(p.y)});
     const V ha = twice * t.x.by_t(p.x), hc = twice * t.y.by_t(p.y);

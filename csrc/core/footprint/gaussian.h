@@ -67,7 +67,7 @@ template <int S, bool kCompensated> struct GaussianFootprint {
   template <typename T> struct Terms {
     Mat2<T> w;        ///< whitening matrix times kBase2
     T log_peak;       ///< log2(opacity * amp)
-    Vec2<T> node[S];  ///< w times each node
+    Vec2<T> node[S];  ///< each sample's node in whitened coordinates, seen from the mean
   };
 
   template <typename T> AR_HD static Shape<T> prepare_with(Cov2d<T> cov, T variance) {
@@ -81,32 +81,32 @@ template <int S, bool kCompensated> struct GaussianFootprint {
     return gaussian_level(shape.amp, opacity);
   }
 
-  template <typename T> AR_HD static Terms<T> terms(const Shape<T>& shape, T opacity) {
+  template <typename T> AR_HD static Terms<T> terms(const Shape<T>& shape, T opacity, Vec2<T> origin = {T(0), T(0)}) {
     const T scale = T(kBase2);
     const Mat2<T> w = {scale * shape.w.xx, scale * shape.w.xy, scale * shape.w.yx, scale * shape.w.yy};
     Terms<T> t{w, log2(opacity * shape.amp), {}};
     AR_UNROLL
     for (int s = 0; s < S; ++s) {
       const Vec2<int> n = box_node<S>(s);
-      t.node[s] = transform(w, Vec2<T>{T(n.x) / T(2 * S), T(n.y) / T(2 * S)});
+      t.node[s] = transform(w, Vec2<T>{origin.x + T(n.x) / T(2 * S), origin.y + T(n.y) / T(2 * S)});
     }
     return t;
   }
 
-  template <typename T, class V> AR_HD static Vec2<V> whitened(const Terms<T>& t, Vec2<V> d, int s) {
-    const Vec2<V> z = transform(t.w, d);
-    if (S == 1) return z;
+  template <typename T, class V> AR_HD static Vec2<V> whitened(const Terms<T>& t, Vec2<V> p, int s) {
+    if (S == 1) return transform(t.w, p, t.node[0]);
+    const Vec2<V> z = transform(t.w, p);  // shared by the samples
     return {z.x + V(t.node[s].x), z.y + V(t.node[s].y)};
   }
 
-  template <typename T, class V> AR_HD static V alpha(const Terms<T>& t, Vec2<V> d, int s) {
-    const Vec2<V> z = whitened(t, d, s);
+  template <typename T, class V> AR_HD static V alpha(const Terms<T>& t, Vec2<V> p, int s) {
+    const Vec2<V> z = whitened(t, p, s);
     return exp2(madd(-z.x, z.x, madd(-z.y, z.y, V(t.log_peak))));
   }
 
   template <typename T, class V>
-  AR_HD static ShapeGrad<V> alpha_vjp(const Terms<T>& t, Vec2<V> d, int s, V alpha, V dL_dalpha) {
-    const Vec2<V> z = whitened(t, d, s);
+  AR_HD static ShapeGrad<V> alpha_vjp(const Terms<T>& t, Vec2<V> p, int s, V alpha, V dL_dalpha) {
+    const Vec2<V> z = whitened(t, p, s);
     const V g = dL_dalpha * alpha, gx = g * z.x, gy = g * z.y;
     return {{gx, gy}, {gx * z.x, gx * z.y, gy * z.y}};
   }

@@ -1,0 +1,46 @@
+// The weight of one splat in one pixel, and its adjoint: footprint_weight, one element at a time.
+#pragma once
+
+#include "core/footprint/contract.h"
+
+namespace ar {
+
+template <typename T> AR_HD Cov2d<T> with_det(Sym2<T> c) {
+  return {c.xx, c.xy, c.yy, difference_of_products(c.xx, c.yy, c.xy, c.xy)};
+}
+
+/// The weight of several samples is their mean. `d` = pixel centre - mean [px].
+template <class F, typename T> AR_HD T weight(Sym2<T> cov, Vec2<T> d, FootprintOptions options) {
+  const auto terms = F::terms(F::prepare(with_det(cov), options), T(1));
+  T total = T(0);
+  AR_UNROLL
+  for (int s = 0; s < F::kSamples; ++s) total += F::alpha(terms, d, s);
+  return total / T(F::kSamples);
+}
+
+template <typename T> struct WeightGrad {
+  Vec2<T> offset;
+  Sym2<T> cov;  ///< xy: derivative by the one number that fills both places
+};
+
+template <class F, typename T>
+AR_HD WeightGrad<T> weight_vjp(Sym2<T> entries, Vec2<T> d, FootprintOptions options, T dL_dweight) {
+  const Cov2d<T> cov = with_det(entries);
+  const auto shape = F::prepare(cov, options);
+  const auto terms = F::terms(shape, T(1));
+  const T g = dL_dweight / T(F::kSamples);
+  ShapeGrad<T> sums = {};
+  T weighted = T(0);
+  AR_UNROLL
+  for (int s = 0; s < F::kSamples; ++s) {
+    const T w = F::alpha(terms, d, s);
+    sums = sums + F::alpha_vjp(terms, d, s, w, g);
+    weighted += g * w;
+  }
+  const SplatGrad<T> grad = F::prepare_vjp(cov, shape, sums, weighted);
+  const T l = grad.dL_dlog_det == T(0) ? T(0) : grad.dL_dlog_det / cov.det;  // Sigma^-1 = adj(Sigma) / det
+  return {{-grad.dL_dmean.x, -grad.dL_dmean.y},
+          {grad.dL_dcov.xx + l * cov.yy, T(2) * (grad.dL_dcov.xy - l * cov.xy), grad.dL_dcov.yy + l * cov.xx}};
+}
+
+}  // namespace ar

@@ -1,0 +1,566 @@
+// Kernels of blend and blend_vjp.
+//
+// A tile's 16x16 pixels are eight subtiles of 8x4, a warp of lanes each: subtile b at column b % 2 and
+// row b / 2, lane l at column l % 8 and row l / 8 of it. A splat is tested against the subtiles once
+// per tile; warps skip those that do not reach them.
+//
+// Lists are cut into chunks. blend_front goes through a tile's first chunks in order and knows when
+// all pixels have stopped. Where pairs are left, blend_rest blends the other chunks all at once, each
+// as if nothing were in front of it, and blend_merge composes them. A pixel that stops inside a chunk
+// is blended again there, from what is in front. So few tiles with long lists, as in small images of
+// large scenes, still fill the device, and the last bits depend on nothing but the lists.
+#pragma once
+
+#include "core/bin.h"
+#include "core/blend.h"
+#include "cuda/tasks.h"
+#include "cuda/warp.cuh"
+
+namespace ar::cuda {
+
+inline constexpr int kTilePixels = kTile * kTile;
+inline constexpr int kSubtiles = 8;
+inline constexpr int kBlendThreads = 32 * kSubtiles;
+
+/// A lane's pixel of subtile b, relative to the tile's first.
+__device__ inline Vec2<float> pixel_of(int b, int lane) {
+  return {float((b & 1) * 8 + (lane & 7)), float((b >> 1) * 4 + (lane >> 3))};
+}
+
+/// A tile and its list of splats, front to back.
+struct TileList {
+  int x0, y0;
+  const int32_t* splats;
+  int count;
+  int64_t first;  ///< place of the list in pairs
+  bool overflow;  ///< the list is all splats
+};
+
+__device__ inline TileList list_of(const TileLists& lists, TileGrid grid, int tile) {
+  TileList list;
+  list.x0 = tile % grid.columns() * kTile;
+  list.y0 = tile / grid.columns() * kTile;
+  list.overflow = *lists.pair_count > lists.capacity;
+  list.first = list.overflow ? 0 : lists.tile_offsets[tile];
+  list.splats = list.overflow ? lists.order : lists.pairs + list.first;
+  list.count = int(list.overflow ? lists.n : lists.tile_offsets[tile + 1] - list.first);
+  return list;
+}
+
+/// Bit b: the support reaches subtile b.
+__device__ inline uint32_t subtile_reach(const Support<float>& support, int x0, int y0) {
+  uint32_t reach = 0;
+#pragma unroll
+  for (int band = 0; band < 4; ++band) {
+    const Span<float> span = columns_of(support, float(y0 + 4 * band), float(y0 + 4 * band + 3));
+    reach |= uint32_t(span.lo <= float(x0 + 7) && span.hi >= float(x0)) << (2 * band);
+    reach |= uint32_t(span.lo <= float(x0 + 15) && span.hi >= float(x0 + 8)) << (2 * band + 1);
+  }
+  return reach;
+}
+
+/// What the pixels of a tile need of a splat.
+template <class F> struct alignas(16) TileSplat {
+  typename F::template Terms<float> terms;
+  Vec3<float> color;
+};
+
+template <class F> __device__ TileSplat<F> tile_splat(const Splat<F, float>& splat, const TileList& list) {
+  return {F::terms(splat.shape, splat.opacity, {float(list.x0) - splat.mean.x, float(list.y0) - splat.mean.y}),
+          splat.color};
+}
+
+/// What compositing carries from splat to splat. kColors: 1, or one per sample where checkpoints need it.
+template <int S, int kColors> struct PixelState {
+  float transmittance[S];
+  Vec3<float> color[kColors];
+  int last[S];
+
+  __device__ void start(bool open) {
+#pragma unroll
+    for (int s = 0; s < S; ++s) transmittance[s] = open ? 1.0f : -1.0f, last[s] = 0;
+    clear_color();
+  }
+  __device__ void clear_color() {
+#pragma unroll
+    for (int c = 0; c < kColors; ++c) color[c] = {0, 0, 0};
+  }
+  __device__ Vec3<float> total_color() const {
+    Vec3<float> total = color[0];
+#pragma unroll
+    for (int c = 1; c < kColors; ++c) total += color[c];
+    return total;
+  }
+  __device__ bool open() const {
+    bool any = false;
+#pragma unroll
+    for (int s = 0; s < S; ++s) any |= transmittance[s] > 0;
+    return any;
+  }
+};
+
+/// Composites the splats in `mask` of a group of 32; `index` = place of the first in the tile's list.
+template <class F, int kColors>
+__device__ __forceinline__ void composite(const TileSplat<F>* splats, uint32_t mask, int index, Vec2<float> p,
+                                          PixelState<F::kSamples, kColors>& state) {
+  for (; mask != 0; mask &= mask - 1) {
+    const int j = __ffs(mask) - 1;
+    const TileSplat<F>& splat = splats[j];
+    float contribution = 0;
+#pragma unroll
+    for (int s = 0; s < F::kSamples; ++s) {
+      const Blended<float> b = blend_sample(F::alpha(splat.terms, p, s), state.transmittance[s]);
+      if (kColors > 1) {
+        state.color[s % kColors] = {madd(b.contribution, splat.color.x, state.color[s % kColors].x),
+                                    madd(b.contribution, splat.color.y, state.color[s % kColors].y),
+                                    madd(b.contribution, splat.color.z, state.color[s % kColors].z)};
+      } else {
+        contribution += b.contribution;
+      }
+      state.last[s] = b.mask ? index + j + 1 : state.last[s];
+    }
+    if (kColors == 1) {
+      state.color[0] = {madd(contribution, splat.color.x, state.color[0].x),
+                        madd(contribution, splat.color.y, state.color[0].y),
+                        madd(contribution, splat.color.z, state.color[0].z)};
+    }
+  }
+}
+
+/// The splats of a tile that a block looks at together.
+template <class F> struct Stage {
+  TileSplat<F> splats[kBlendThreads];
+  uint8_t reach[kBlendThreads];
+
+  /// Loads splats [k, k + kBlendThreads) of the list; returns how many there are before `end`.
+  __device__ int load(const Splat<F, float>* splats_in, const TileList& list, int k, int end) {
+    const int t = threadIdx.x;
+    uint32_t bits = 0;
+    if (k + t < end) {
+      const Splat<F, float> splat = splats_in[list.splats[k + t]];
+      if (splat.level > 0) bits = subtile_reach(support_of(splat), list.x0, list.y0);
+      if (bits) splats[t] = tile_splat(splat, list);
+    }
+    reach[t] = uint8_t(bits);
+    return min(end - k, kBlendThreads);
+  }
+
+  template <int kColors>
+  __device__ void composite_all(int count, int index, Vec2<float> p, PixelState<F::kSamples, kColors>& state) const {
+    const int warp = threadIdx.x / 32;
+    for (int k = 0; k < count; k += 32) {
+      if (!__any_sync(kAllLanes, state.open())) return;
+      const uint32_t mask = __ballot_sync(kAllLanes, reach[k + lane_id()] >> warp & 1);
+      composite<F>(splats + k, mask, index + k, p, state);
+    }
+  }
+};
+
+/// Checkpoints of a thread's pixel.
+template <int S> struct PixelCheckpoints {
+  Checkpoint* base;  // of the tile's first
+
+  __device__ PixelCheckpoints(const BlendTask& task, int tile, int pixel)
+      : base(task.checkpoints + int64_t(task.plan.checkpoint_offsets[tile]) * S * kTilePixels + pixel) {}
+  __device__ Checkpoint& at(int chunk, int s) const { return base[(int64_t(chunk) * S + s) * kTilePixels]; }
+};
+
+/// Writes the results of a pixel whose samples are done. `total` is the sum of their colours.
+template <int S, int kColors>
+__device__ void store_pixel(const BlendTask& task, int x, int y, Vec3<float> total,
+                            const PixelState<S, kColors>& state) {
+  if (x >= task.grid.width || y >= task.grid.height) return;
+  const int64_t plane = int64_t(task.grid.width) * task.grid.height, i = int64_t(y) * task.grid.width + x;
+  float through = 0;
+#pragma unroll
+  for (int s = 0; s < S; ++s) {
+    through += abs(state.transmittance[s]);
+    if (task.transmittance) task.transmittance[s * plane + i] = abs(state.transmittance[s]);
+    if (task.last) task.last[s * plane + i] = state.last[s];
+  }
+  const float scale = 1.0f / S;
+  task.image[i] = scale * total.x + scale * through * task.background[0];
+  task.image[plane + i] = scale * total.y + scale * through * task.background[1];
+  task.image[2 * plane + i] = scale * total.z + scale * through * task.background[2];
+}
+
+/// Turns the colours of the first `n` chunks of a pixel, all of them composited, into the colour of
+/// everything behind each: what blend_vjp starts from. Sums of positive terms, which cannot cancel.
+template <int S, int kColors>
+__device__ void accumulate_behind(const PixelCheckpoints<S>& checkpoints, int n, const float* background,
+                                  const PixelState<S, kColors>& state) {
+  static_assert(kColors == S);
+  const Vec3<float> bg = {background[0], background[1], background[2]};
+#pragma unroll
+  for (int s = 0; s < S; ++s) {
+    Vec3<float> behind = abs(state.transmittance[s]) * bg + state.color[s];
+    for (int c = n - 1; c >= 0; --c) {
+      Checkpoint& checkpoint = checkpoints.at(c, s);
+      const Vec3<float> own = checkpoint.color;
+      checkpoint.color = behind;
+      behind += own;
+    }
+  }
+}
+
+/// A block per tile.
+template <class F, bool kKeep> __global__ void __launch_bounds__(kBlendThreads) blend_front_kernel(const BlendTask task) {
+  constexpr int S = F::kSamples, kLength = chunk_length(S), kColors = kKeep ? S : 1;
+  __shared__ Stage<F> stage;
+  const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.lists.splats);
+  const int tile = blockIdx.x, warp = threadIdx.x / 32;
+  const TileList list = list_of(task.lists, task.grid, tile);
+  const Vec2<float> p = pixel_of(warp, lane_id());
+  const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
+  const int front = list.overflow ? list.count : min(list.count, kFrontChunks * kLength);
+  const bool several = !list.overflow && list.count > kLength;
+  const PixelCheckpoints<S> checkpoints(task, tile, threadIdx.x);
+  PixelState<S, kColors> state;
+  state.start(x < task.grid.width && y < task.grid.height);
+  Vec3<float> total = {0, 0, 0};
+  int k = 0, written = 0;
+  while (k < front && __syncthreads_or(state.open())) {
+    const int count = stage.load(splats, list, k, front);
+    __syncthreads();
+    stage.composite_all(count, k, p, state);
+    k += count;
+    if (kKeep && several && k % kLength == 0 && k < list.count) {
+#pragma unroll
+      for (int s = 0; s < S; ++s) checkpoints.at(written, s) = {state.color[s], state.transmittance[s]};
+      total += state.total_color();
+      state.clear_color();
+      ++written;
+    }
+  }
+  const bool more = k == front && front < list.count && __syncthreads_or(state.open());
+  if (threadIdx.x == 0) task.tile_open[tile] = more;
+  if (!more) {
+    store_pixel(task, x, y, total + state.total_color(), state);
+    if constexpr (kKeep) accumulate_behind(checkpoints, written, task.background, state);
+    return;
+  }
+  // blend_merge goes on from the last front chunk's checkpoint.
+  if (!kKeep) {
+#pragma unroll
+    for (int s = 0; s < S; ++s) {
+      checkpoints.at(kFrontChunks - 1, s) = {s == 0 ? state.color[0] : Vec3<float>{0, 0, 0}, state.transmittance[s]};
+    }
+  }
+  if (kKeep && x < task.grid.width && y < task.grid.height) {
+    const int64_t plane = int64_t(task.grid.width) * task.grid.height, i = int64_t(y) * task.grid.width + x;
+#pragma unroll
+    for (int s = 0; s < S; ++s) task.last[s * plane + i] = state.last[s];
+  }
+}
+
+/// Blocks share the chunks behind the front ones.
+template <class F> __global__ void __launch_bounds__(kBlendThreads) blend_rest_kernel(const BlendTask task) {
+  constexpr int S = F::kSamples, kLength = chunk_length(S);
+  __shared__ Stage<F> stage;
+  if (*task.lists.pair_count > task.lists.capacity) return;
+  const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.lists.splats);
+  const Vec2<float> p = pixel_of(threadIdx.x / 32, lane_id());
+  const int items = *task.plan.rest_count;
+  for (int item = blockIdx.x; item < items; item += gridDim.x) {
+    const int id = task.plan.rest[item], tile = task.plan.chunk_tiles[id], chunk = id - task.plan.chunk_offsets[tile];
+    if (!task.tile_open[tile]) continue;
+    const TileList list = list_of(task.lists, task.grid, tile);
+    const PixelCheckpoints<S> checkpoints(task, tile, threadIdx.x);
+    const int end = min(list.count, (chunk + 1) * kLength);
+    PixelState<S, S> state;
+    state.start(true);
+#pragma unroll
+    for (int s = 0; s < S; ++s) {
+      if (checkpoints.at(kFrontChunks - 1, s).transmittance < 0) state.transmittance[s] = -1;
+    }
+    int k = chunk * kLength;
+    while (k < end && __syncthreads_or(state.open())) {
+      const int count = stage.load(splats, list, k, end);
+      __syncthreads();
+      stage.composite_all(count, k, p, state);
+      k += count;
+    }
+#pragma unroll
+    for (int s = 0; s < S; ++s) checkpoints.at(chunk, s) = {state.color[s], state.transmittance[s]};
+    __syncthreads();
+  }
+}
+
+/// A warp per subtile of the tiles that the front left open.
+template <class F, bool kKeep> __global__ void __launch_bounds__(kBlendThreads) blend_merge_kernel(const BlendTask task) {
+  constexpr int S = F::kSamples, kLength = chunk_length(S), kAhead = 8;
+  __shared__ TileSplat<F> stage[kSubtiles][32];
+  const int tile = blockIdx.x, warp = threadIdx.x / 32, lane = lane_id();
+  if (!task.tile_open[tile]) return;
+  const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.lists.splats);
+  const TileList list = list_of(task.lists, task.grid, tile);
+  const Vec2<float> p = pixel_of(warp, lane);
+  const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
+  const PixelCheckpoints<S> checkpoints(task, tile, threadIdx.x);
+  const int chunks = (list.count + kLength - 1) / kLength;
+  PixelState<S, S> state;
+  state.start(false);
+  Vec3<float> total = {0, 0, 0};
+#pragma unroll
+  for (int s = 0; s < S; ++s) {
+    for (int c = kKeep ? 0 : kFrontChunks - 1; c < kFrontChunks; ++c) total += checkpoints.at(c, s).color;
+    state.transmittance[s] = checkpoints.at(kFrontChunks - 1, s).transmittance;
+    if (kKeep && x < task.grid.width && y < task.grid.height) {
+      const int64_t plane = int64_t(task.grid.width) * task.grid.height;
+      state.last[s] = task.last[s * plane + int64_t(y) * task.grid.width + x];
+    }
+  }
+  int c = kFrontChunks;
+  for (; c < chunks && __any_sync(kAllLanes, state.open()); ++c) {
+    Checkpoint part[S];
+    bool stops = false;
+#pragma unroll
+    for (int s = 0; s < S; ++s) {
+      if (c + kAhead < chunks) asm volatile("prefetch.global.L1 [%0];" ::"l"(&checkpoints.at(c + kAhead, s)));
+      part[s] = checkpoints.at(c, s);
+      stops |= state.transmittance[s] > 0 && !(state.transmittance[s] * part[s].transmittance >= float(kTransmittanceMin));
+    }
+    const int end = min(list.count, (c + 1) * kLength);
+    state.clear_color();
+    if (__any_sync(kAllLanes, stops)) {
+      PixelState<S, S> run = state;
+      if (!stops) run.start(false);
+      for (int k = c * kLength; k < end && __any_sync(kAllLanes, run.open()); k += 32) {
+        bool reached = false;
+        __syncwarp();
+        if (k + lane < end) {
+          const Splat<F, float> splat = splats[list.splats[k + lane]];
+          reached = subtile_reach(support_of(splat), list.x0, list.y0) >> warp & 1;
+          if (reached) stage[warp][lane] = tile_splat(splat, list);
+        }
+        __syncwarp();
+        composite<F>(stage[warp], __ballot_sync(kAllLanes, reached), k, p, run);
+      }
+      if (stops) state = run;
+    }
+    if (!stops) {
+#pragma unroll
+      for (int s = 0; s < S; ++s) {
+        if (!(state.transmittance[s] > 0)) continue;
+        state.color[s] = state.transmittance[s] * part[s].color;
+        state.transmittance[s] *= part[s].transmittance;
+        state.last[s] = end;  // not the last splat composited, but none behind it is
+      }
+    }
+    total += state.total_color();
+    if (kKeep && c + 1 < chunks) {
+#pragma unroll
+      for (int s = 0; s < S; ++s) checkpoints.at(c, s) = {state.color[s], state.transmittance[s]};
+    }
+  }
+  store_pixel(task, x, y, total, state);
+  if (kKeep) {
+    // The last chunk's colour is not in a checkpoint; where the loop ended early, it is in both.
+    if (c < chunks) state.clear_color();
+    accumulate_behind(checkpoints, min(c, chunks - 1), task.background, state);
+  }
+}
+
+/// Blocks that fill any device.
+inline constexpr int kRestBlocks = 132 * 8;
+
+template <class F, bool kKeep> void blend_kernels(const BlendTask& task, cudaStream_t stream) {
+  const unsigned tiles = unsigned(task.grid.tiles());
+  blend_front_kernel<F, kKeep><<<tiles, kBlendThreads, 0, stream>>>(task);
+  blend_rest_kernel<F><<<kRestBlocks, kBlendThreads, 0, stream>>>(task);
+  blend_merge_kernel<F, kKeep><<<tiles, kBlendThreads, 0, stream>>>(task);
+}
+template <class F> void blend(const BlendTask& task, cudaStream_t stream) {
+  if (task.transmittance) {
+    blend_kernels<F, true>(task, stream);
+  } else {
+    blend_kernels<F, false>(task, stream);
+  }
+}
+
+/// A warp's share of shared memory in blend_vjp: a tile's pixels and a group of splats.
+template <class F> struct VjpStage {
+  static constexpr int S = F::kSamples;
+  struct Sample {
+    float transmittance, behind;
+  };
+  TileSplat<F> splats[32];
+  float4 g[kTilePixels];  // dL/d(one sample's colour), and sample 0's last as bits
+  Sample samples[S][kTilePixels];
+  int last[S > 1 ? S - 1 : 1][S > 1 ? kTilePixels : 1];
+
+  __device__ int last_of(int s, int pixel, const float4& g_pixel) const {
+    return s == 0 ? __float_as_int(g_pixel.w) : last[s > 0 ? s - 1 : 0][pixel];
+  }
+};
+
+/// Warps of a block of blend_vjp: as many as leave room for a few blocks in shared memory.
+template <class F> inline constexpr int kVjpWarps = F::kSamples <= 2 ? 4 : F::kSamples <= 8 ? 2 : 1;
+
+/// A warp per chunk, back to front, over all pixels of the tile: every pair is summed by one warp, so
+/// the sums need no atomics, whose order would change from run to run.
+template <class F, bool kAbs> __global__ void __launch_bounds__(32 * kVjpWarps<F>) blend_vjp_kernel(const BlendVjpTask task) {
+  constexpr int S = F::kSamples, kLength = chunk_length(S);
+  extern __shared__ float4 shared[];
+  VjpStage<F>& stage = reinterpret_cast<VjpStage<F>*>(shared)[threadIdx.x / 32];
+  const int lane = lane_id();
+  const int64_t item = int64_t(blockIdx.x) * kVjpWarps<F> + threadIdx.x / 32;
+  if (item >= task.plan.chunk_offsets[task.grid.tiles()]) return;
+  const int tile = task.plan.chunk_tiles[item], chunk = int(item) - task.plan.chunk_offsets[tile];
+  const TileList list = list_of(task.lists, task.grid, tile);
+  const int begin = chunk * kLength, end = list.overflow ? list.count : min(list.count, begin + kLength);
+  const int64_t plane = int64_t(task.grid.width) * task.grid.height;
+  const auto pixel_index = [&](int b) {  // in the image; -1 outside
+    const Vec2<float> p = pixel_of(b, lane);
+    const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
+    return x < task.grid.width && y < task.grid.height ? int64_t(y) * task.grid.width + x : int64_t(-1);
+  };
+
+  int subtile_last[kSubtiles], tile_last = 0;
+#pragma unroll
+  for (int b = 0; b < kSubtiles; ++b) {
+    const int64_t i = pixel_index(b);
+    int last = 0;
+#pragma unroll
+    for (int s = 0; s < S; ++s) last = max(last, i < 0 ? 0 : task.last[s * plane + i]);
+    subtile_last[b] = warp_max(last);
+    tile_last = max(tile_last, subtile_last[b]);
+  }
+  if (!list.overflow) {  // pairs that nothing reached
+    float4* rows = reinterpret_cast<float4*>(task.pair_grads + list.first * kPairGradWidth);
+    const int first = max(begin, min(tile_last, end)) * (kPairGradWidth / 4);
+    for (int e = first + lane; e < end * (kPairGradWidth / 4); e += 32) rows[e] = {0, 0, 0, 0};
+  }
+  if (begin >= tile_last) return;
+
+  const bool final = tile_last <= end;
+  const Checkpoint* checkpoints =
+      task.checkpoints + (int64_t(task.plan.checkpoint_offsets[tile]) + chunk) * S * kTilePixels;
+#pragma unroll
+  for (int b = 0; b < kSubtiles; ++b) {
+    const int64_t i = pixel_index(b);
+    const int q = b * 32 + lane;
+    const float scale = i < 0 ? 0 : 1.0f / S;
+    const int64_t j = max(i, int64_t(0));
+    const Vec3<float> g = {scale * task.dL_dimage[j], scale * task.dL_dimage[plane + j],
+                           scale * task.dL_dimage[2 * plane + j]};
+#pragma unroll
+    for (int s = 0; s < S; ++s) {
+      const int last = i < 0 ? 0 : task.last[s * plane + i];
+      float transmittance = 1, behind = 0;
+      if (final) {
+        transmittance = i < 0 ? 1.0f : task.transmittance[s * plane + i];
+        behind = g.x * task.background[0] + g.y * task.background[1] + g.z * task.background[2];
+      } else {
+        const Checkpoint c = checkpoints[s * kTilePixels + q];
+        transmittance = abs(c.transmittance);
+        behind = dot(g, c.color) / transmittance;
+      }
+      stage.samples[s][q] = {transmittance, behind};
+      if (s == 0) stage.g[q] = {g.x, g.y, g.z, __int_as_float(last)};
+      if (s > 0) stage.last[s > 0 ? s - 1 : 0][q] = last;
+    }
+  }
+
+  const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.lists.splats);
+  for (int k1 = min(end, tile_last); k1 > begin; k1 -= 32) {
+    const int k0 = max(k1 - 32, begin), k = k0 + lane;
+    uint32_t reach = 0;
+    int32_t id = 0;
+    Mat2<float> mean_map = {0, 0, 0, 0};
+    __syncwarp();
+    if (k < k1) {
+      id = list.splats[k];
+      const Splat<F, float> splat = splats[id];
+      if (splat.level > 0) reach = subtile_reach(support_of(splat), list.x0, list.y0);
+#pragma unroll
+      for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= subtile_last[b]) << b);
+      if (reach) stage.splats[lane] = tile_splat(splat, list);
+      if (kAbs) mean_map = F::mean_map(splat.shape);
+    }
+    __syncwarp();
+    for (int j = k1 - k0 - 1; j >= 0; --j) {
+      uint32_t hit = __shfl_sync(kAllLanes, reach, j);
+      const TileSplat<F>& splat = stage.splats[j];
+      const Mat2<float> m = !kAbs ? mean_map
+                                  : Mat2<float>{__shfl_sync(kAllLanes, mean_map.xx, j), __shfl_sync(kAllLanes, mean_map.xy, j),
+                                                __shfl_sync(kAllLanes, mean_map.yx, j), __shfl_sync(kAllLanes, mean_map.yy, j)};
+      ShapeGrad<float> shape = {{0, 0}, {0, 0, 0}};
+      float weighted = 0;
+      Vec3<float> color = {0, 0, 0};
+      Vec2<float> abs2d = {0, 0};
+      for (; hit != 0; hit &= hit - 1) {
+        const int b = __ffs(hit) - 1, q = b * 32 + lane;
+        const Vec2<float> p = pixel_of(b, lane);
+        const float4 g = stage.g[q];
+        const float g_color = madd(g.x, splat.color.x, madd(g.y, splat.color.y, g.z * splat.color.z));
+        float contribution = 0;
+        Vec2<float> offset = {0, 0};
+#pragma unroll
+        for (int s = 0; s < S; ++s) {
+          const float alpha = F::alpha(splat.terms, p, s);
+          const bool mask = alpha >= float(kAlphaMin) && k0 + j < stage.last_of(s, q, g);
+          if (!__any_sync(kAllLanes, mask)) continue;
+          auto sample = stage.samples[s][q];
+          const BlendGrad<float> grad = blend_sample_vjp(mask, alpha, g_color, sample.transmittance, sample.behind);
+          stage.samples[s][q] = sample;
+          contribution += grad.contribution;
+          weighted += grad.dL_dalpha * alpha;
+          const ShapeGrad<float> one = F::alpha_vjp(splat.terms, p, s, alpha, grad.dL_dalpha);
+          offset = offset + one.offset;
+          shape.shape = shape.shape + one.shape;
+        }
+        shape.offset = shape.offset + offset;
+        color = {madd(contribution, g.x, color.x), madd(contribution, g.y, color.y), madd(contribution, g.z, color.z)};
+        if (kAbs) {
+          const Vec2<float> by_mean = transform_transposed(m, offset);
+          abs2d = abs2d + Vec2<float>{abs(by_mean.x), abs(by_mean.y)};
+        }
+      }
+      const float values[9] = {shape.offset.x, shape.offset.y, shape.shape.xx, shape.shape.xy, shape.shape.yy,
+                               weighted,       color.x,        color.y,        color.z};
+      const float sum = sum_nine(values);
+      const int value = lane % 4 == 0 ? lane / 4 : lane == 2 ? 8 : -1;
+      const int32_t splat_id = __shfl_sync(kAllLanes, id, j);
+      float* row = task.pair_grads + (list.overflow ? int64_t(splat_id) : list.first + k0 + j) * kPairGradWidth;
+      const auto put = [&](int v, float x) {
+        if (list.overflow) {
+          atomicAdd(row + v, x);
+        } else {
+          row[v] = x;
+        }
+      };
+      if (value >= 0) put(value, sum);
+      if (kAbs) {
+        const Vec2<float> total = {warp_sum(abs2d.x), warp_sum(abs2d.y)};
+        if (lane == 1) put(9, total.x);
+        if (lane == 3) put(10, total.y);
+      }
+    }
+  }
+}
+
+/// With too many pairs there is a row per splat that all tiles add to.
+template <class F> __global__ void clear_splat_grads_kernel(const BlendVjpTask task) {
+  if (*task.lists.pair_count <= task.lists.capacity) return;
+  const int64_t n = task.lists.n * kPairGradWidth;
+  for (int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x; i < n; i += int64_t(gridDim.x) * blockDim.x)
+    task.pair_grads[i] = 0;
+}
+
+template <class F, bool kAbs> void launch_blend_vjp(const BlendVjpTask& task, cudaStream_t stream) {
+  const size_t bytes = sizeof(VjpStage<F>) * kVjpWarps<F>;
+  cudaFuncSetAttribute(blend_vjp_kernel<F, kAbs>, cudaFuncAttributeMaxDynamicSharedMemorySize, int(bytes));
+  clear_splat_grads_kernel<F><<<kRestBlocks, kBlendThreads, 0, stream>>>(task);
+  blend_vjp_kernel<F, kAbs>
+      <<<blocks_of(task.max_chunks, kVjpWarps<F>), 32 * kVjpWarps<F>, bytes, stream>>>(task);
+}
+template <class F> void blend_vjp(const BlendVjpTask& task, cudaStream_t stream) {
+  if (task.absolute) {
+    launch_blend_vjp<F, true>(task, stream);
+  } else {
+    launch_blend_vjp<F, false>(task, stream);
+  }
+}
+
+}  // namespace ar::cuda

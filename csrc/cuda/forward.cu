@@ -1,0 +1,20 @@
+// Kernels of the forward pass, for every footprint.
+#include "core/footprint/registry.h"
+#include "cuda/bin.cuh"
+#include "cuda/blend.cuh"
+#include "cuda/project.cuh"
+#include "cuda/weight.cuh"
+
+namespace ar::cuda {
+
+template <class F>
+inline constexpr ForwardStages kForward = {F::kSamples, project<F>,       emit_pairs<F>,
+                                           blend<F>,    weight<F, float>, weight<F, double>};
+
+const ForwardStages* find_forward(std::string_view footprint) {
+  const ForwardStages* found = nullptr;
+  visit_footprint(footprint, Footprints{}, [&](auto f) { found = &kForward<decltype(f)>; });
+  return found;
+}
+
+}  // namespace ar::cuda

@@ -1,0 +1,162 @@
+// Kernels of project and project_vjp: a thread per Gaussian.
+#pragma once
+
+#include "core/project.h"
+#include "cuda/tasks.h"
+#include "cuda/warp.cuh"
+
+namespace ar::cuda {
+
+inline constexpr int kProjectThreads = 128;
+
+/// Rows of spherical harmonics of a warp's Gaussians. Rows go between here and memory with
+/// neighbouring lanes at neighbouring addresses; 49 floats a row keep the lanes on different banks.
+struct ShRows {
+  static constexpr int kStride = 3 * kMaxShCount + 1;
+  float value[32][kStride];
+
+  /// Loads `count` coefficients of the rows of the lanes in `lanes`; base is lane 0's row.
+  __device__ void load(const Vec3<float>* base, int stride, int count, uint32_t lanes) {
+    for (; lanes != 0; lanes &= lanes - 1) {
+      const int row = __ffs(lanes) - 1;
+      const float* from = &base[int64_t(row) * stride].x;
+      for (int e = lane_id(); e < 3 * count; e += 32) value[row][e] = from[e];
+    }
+    __syncwarp();
+  }
+  /// Stores rows [0, rows) of `stride` coefficients.
+  __device__ void store(Vec3<float>* base, int stride, int rows) const {
+    __syncwarp();
+    const int width = 3 * stride;
+    float* to = &base->x;
+    for (int row = 0; row < rows; ++row) {
+      for (int e = lane_id(); e < width; e += 32) to[row * width + e] = value[row][e];
+    }
+  }
+  __device__ Vec3<float>* row() { return reinterpret_cast<Vec3<float>*>(value[lane_id()]); }
+};
+
+template <class F> __global__ void __launch_bounds__(kProjectThreads) project_kernel(const ProjectTask task) {
+  __shared__ ShRows sh_rows[kProjectThreads / 32];
+  const Gaussians<float>& g = task.gaussians;
+  const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
+  const Camera<float> camera = load_camera(task.camera);
+  Splat<F, float> splat = {};
+  float depth = 0;
+  int radius = 0;
+  const float blur = float(max(task.options.variance, kPixelVariance));
+  if (i < g.n && may_be_visible(camera, g, i, blur)) radius = project_shape(camera, g, i, task.options, splat, depth);
+  ShRows& rows = sh_rows[threadIdx.x / 32];
+  const uint32_t lit = __ballot_sync(kAllLanes, splat.level > 0);
+  if (g.shs && lit) rows.load(g.shs + (i - lane_id()) * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
+  int count = 0;
+  if (splat.level > 0) {
+    if (splat_color(camera, g, i, rows.row(), splat.color)) {
+      for_each_tile_row(support_of(splat), camera.grid,
+                        [&](int, Range columns) { count += columns.last - columns.first + 1; });
+    } else {
+      radius = 0;
+      splat.level = 0;
+    }
+  }
+  if (i >= g.n) return;
+  auto* splats = reinterpret_cast<Splat<F, float>*>(task.splats);
+  if (radius > 0) {
+    splats[i] = splat;
+  } else {
+    splats[i].level = 0;
+  }
+  // A splat that touches a tile has a radius: it is at least as wide as its pixel.
+  task.keys[i] = count > 0 ? __float_as_uint(depth) : kCulledKey;
+  task.ids[i] = int32_t(i);
+  task.ranges[i] = {0, count};
+  task.radii[i] = radius;
+}
+
+template <class F> void project(const ProjectTask& task, cudaStream_t stream) {
+  if (task.gaussians.n == 0) return;
+  project_kernel<F><<<blocks_of(task.gaussians.n, kProjectThreads), kProjectThreads, 0, stream>>>(task);
+}
+
+/// Gradients summed for one splat.
+struct SplatSums {
+  float value[kPairGradWidth];
+
+  __device__ void add(const float* row) {
+    const float4* quads = reinterpret_cast<const float4*>(row);
+#pragma unroll
+    for (int q = 0; q < kPairGradWidth / 4; ++q) {
+      const float4 v = quads[q];
+      value[4 * q] += v.x, value[4 * q + 1] += v.y, value[4 * q + 2] += v.z, value[4 * q + 3] += v.w;
+    }
+  }
+  __device__ PairGrad<float> grad() const {
+    return {{{value[0], value[1]}, {value[2], value[3], value[4]}}, value[5], {value[6], value[7], value[8]}};
+  }
+};
+
+/// A splat with more pairs than this is summed by its whole warp.
+inline constexpr int kManyPairs = 64;
+
+/// Sums the pairs of each lane's splat, always in the same order.
+__device__ inline SplatSums sum_pairs(const ProjectVjpTask& task, PairRange range) {
+  SplatSums sums = {};
+  const auto add_pair = [&](SplatSums& to, int q) {
+    to.add(task.pair_grads + int64_t(task.positions[q]) * kPairGradWidth);
+  };
+  if (range.count <= kManyPairs) {
+    for (int q = range.first; q < range.first + range.count; ++q) add_pair(sums, q);
+  }
+  for (uint32_t many = __ballot_sync(kAllLanes, range.count > kManyPairs); many != 0; many &= many - 1) {
+    const int source = __ffs(many) - 1;
+    const int first = __shfl_sync(kAllLanes, range.first, source), count = __shfl_sync(kAllLanes, range.count, source);
+    SplatSums part = {};
+    for (int q = lane_id(); q < count; q += 32) add_pair(part, first + q);
+#pragma unroll
+    for (int v = 0; v < kPairGradWidth; ++v) {
+      const float total = warp_sum(part.value[v]);
+      if (lane_id() == source) sums.value[v] = total;
+    }
+  }
+  return sums;
+}
+
+template <class F> __global__ void __launch_bounds__(kProjectThreads) project_vjp_kernel(const ProjectVjpTask task) {
+  __shared__ ShRows sh_rows[kProjectThreads / 32];
+  const Gaussians<float>& g = task.gaussians;
+  const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
+  const int64_t first = i - lane_id();  // of the warp
+  if (first >= g.n) return;
+  const Camera<float> camera = load_camera(task.camera);
+  const PairRange range = i < g.n ? task.ranges[i] : PairRange{0, 0};
+  SplatSums sums = {};
+  if (*task.pair_count <= task.capacity) {
+    sums = sum_pairs(task, range);
+  } else if (range.count > 0) {
+    sums.add(task.pair_grads + i * kPairGradWidth);
+  }
+  ShRows& rows = sh_rows[threadIdx.x / 32];
+  const uint32_t lit = __ballot_sync(kAllLanes, range.count > 0);
+  if (g.shs && lit) rows.load(g.shs + first * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
+  // Longer rows than the largest degree's hold coefficients without influence.
+  const bool staged = task.grads.shs && g.sh_stride <= kMaxShCount;
+  Vec3<float>* dL_dsh = staged ? rows.row() : task.grads.shs ? task.grads.shs + i * g.sh_stride : nullptr;
+  if (range.count > 0) {
+    ar::project_vjp<F>(camera, g, i, task.options, sums.grad(), rows.row(), dL_dsh, task.grads);
+    if (task.grads.means2d && task.grads.means2d_stride == 4) {
+      task.grads.means2d[i * 4 + 2] = 0.5f * camera.size.x * sums.value[9];
+      task.grads.means2d[i * 4 + 3] = 0.5f * camera.size.y * sums.value[10];
+    }
+  } else if (i < g.n) {
+    zero_grads(i, task.grads);
+    for (int k = 0; dL_dsh && k < g.sh_stride; ++k) dL_dsh[k] = {0, 0, 0};
+  }
+  if (staged) rows.store(task.grads.shs + first * g.sh_stride, g.sh_stride, int(min(int64_t(32), g.n - first)));
+}
+
+template <class F> void project_vjp(const ProjectVjpTask& task, cudaStream_t stream) {
+  if (task.gaussians.n == 0) return;
+  project_vjp_kernel<F><<<blocks_of(task.gaussians.n, kProjectThreads), kProjectThreads, 0, stream>>>(task);
+}
+
+}  // namespace ar::cuda

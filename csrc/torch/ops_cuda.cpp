@@ -1,0 +1,459 @@
+// The ops on CUDA tensors: check, sizes, allocate, launch. Nothing here waits for the device, except
+// where there is no earlier frame to guess sizes from, in deterministic mode, and with debug.
+#include <ATen/Context.h>
+#include <c10/cuda/CUDAException.h>
+#include <c10/cuda/CUDAGuard.h>
+#include <c10/cuda/CUDAStream.h>
+#include <torch/library.h>
+
+#include <algorithm>
+#include <map>
+#include <mutex>
+
+#include "cuda/tasks.h"
+#include "torch/views.h"
+
+namespace ar::ops {
+namespace {
+
+using c10::cuda::CUDAStream;
+
+template <class Stages> const Stages& found(const Stages* stages, const std::string& footprint) {
+  TORCH_CHECK_VALUE(stages != nullptr, "footprint must be one of those in csrc/core/footprint/registry.h, got '",
+                    footprint, "'");
+  return *stages;
+}
+
+/// Raises what a launch left behind; with debug waits for the stage to end first.
+void check_stage(const char* stage, const CUDAStream& stream, bool debug) {
+  cudaError_t error = cudaGetLastError();
+  if (debug && error == cudaSuccess) error = cudaStreamSynchronize(stream);
+  TORCH_CHECK(error == cudaSuccess, "CUDA error in ", stage, ": ", cudaGetErrorString(error));
+}
+
+void check_cuda(Inputs& in, bool debug) {
+  TORCH_CHECK_TYPE(in.means3D.scalar_type() != at::kDouble,
+                   "means3D must have dtype float32 on CUDA, got Double; float64 runs on the CPU");
+  in.check();
+  if (debug) in.check_camera();
+}
+
+/// How many pairs the next frame may have: remembered from earlier frames of the same size, whose
+/// count the device writes to host memory when it gets there.
+class PairGuess {
+ public:
+  static PairGuess& of(int device, TileGrid grid) {
+    static auto* guesses = new std::map<std::tuple<int, int, int>, PairGuess>;  // outlives the CUDA context
+    return (*guesses)[{device, grid.width, grid.height}];
+  }
+  static std::mutex& mutex() {
+    static auto* m = new std::mutex;
+    return *m;
+  }
+
+  /// 0: no idea.
+  int64_t capacity(int64_t gaussians) {
+    if (!feedback_.defined()) return 0;
+    const int64_t seen = *const_cast<const volatile int64_t*>(feedback());
+    high_ = std::max(high_, seen);
+    // After pruning start over; densification brings more pairs along.
+    if (gaussians < gaussians_ / 2) return 0;
+    const double growth = std::max(1.0, double(gaussians) / double(std::max<int64_t>(gaussians_, 1)));
+    return with_reserve(int64_t(double(high_) * growth));
+  }
+  void exact(int64_t gaussians, int64_t pairs) {
+    if (!feedback_.defined()) feedback_ = at::zeros({1}, at::TensorOptions().dtype(at::kLong).pinned_memory(true));
+    gaussians_ = gaussians;
+    high_ = *feedback() = pairs;
+  }
+  int64_t* feedback() { return feedback_.defined() ? feedback_.data_ptr<int64_t>() : nullptr; }
+
+  static int64_t with_reserve(int64_t pairs) { return std::min<int64_t>(pairs + pairs / 4 + (1 << 16), kMaxCapacity); }
+  static constexpr int64_t kMaxCapacity = (int64_t(1) << 31) - (1 << 16);
+
+ private:
+  at::Tensor feedback_;
+  int64_t gaussians_ = 0, high_ = 0;
+};
+
+/// For tests: capacity of the next frames instead of a guess; 0 for guesses again.
+int64_t forced_capacity = 0;
+
+struct Projected {
+  Tensor splats, keys, ids, ranges, radii;
+};
+
+Projected project(const Inputs& in, const cuda::ForwardStages& stages, const CUDAStream& stream, bool debug) {
+  const int64_t n = in.count();
+  const auto floats = in.means3D.options(), ints = floats.dtype(at::kInt);
+  Projected out{at::empty({n, kSplatWidth}, floats), at::empty({n}, ints), at::empty({n}, ints),
+                at::empty({n, 2}, ints), at::empty({n}, ints)};
+  stages.project({camera_of<float>(in),
+                  gaussians_of<float>(in),
+                  {in.variance},
+                  out.splats.data_ptr<float>(),
+                  reinterpret_cast<uint32_t*>(out.keys.data_ptr<int32_t>()),
+                  out.ids.data_ptr<int32_t>(),
+                  reinterpret_cast<cuda::PairRange*>(out.ranges.data_ptr<int32_t>()),
+                  out.radii.data_ptr<int32_t>()},
+                 stream);
+  check_stage("project", stream, debug);
+  return out;
+}
+
+struct Binned {
+  Tensor order, pairs, tile_offsets, positions, pair_count;
+  int64_t capacity;
+};
+
+/// `exact`: make room for the pairs there are, not for a guess. `feedback` receives where the device
+/// is to leave their number for the guess of the next frame.
+Binned bin(const Inputs& in, const Projected& projected, const cuda::ForwardStages& stages, const CUDAStream& stream,
+           bool keep, bool exact, bool debug, int64_t*& feedback) {
+  const int64_t n = in.count();
+  const TileGrid grid = grid_of(in);
+  const auto ints = projected.ids.options(), longs = ints.dtype(at::kLong), bytes = ints.dtype(at::kByte);
+  auto* ranges = reinterpret_cast<cuda::PairRange*>(projected.ranges.data_ptr<int32_t>());
+  int64_t capacity = 0;
+  {
+    std::lock_guard lock(PairGuess::mutex());
+    PairGuess& guess = PairGuess::of(in.means3D.get_device(), grid);
+    if (!exact) capacity = forced_capacity ? forced_capacity : guess.capacity(n);
+    feedback = guess.feedback();
+  }
+  const size_t early = cuda::workspace_size(n, std::max<int64_t>(capacity, 1), grid);
+  Tensor workspace = at::empty({int64_t(early)}, bytes);
+  const Tensor offsets = at::empty({n + 1}, longs), sorted_keys = at::empty({n}, ints);
+  Binned out;
+  out.order = at::empty({n}, ints);
+  cuda::sort_by_depth(reinterpret_cast<const uint32_t*>(projected.keys.const_data_ptr<int32_t>()),
+                      projected.ids.const_data_ptr<int32_t>(), ranges, n,
+                      reinterpret_cast<uint32_t*>(sorted_keys.data_ptr<int32_t>()), out.order.data_ptr<int32_t>(),
+                      offsets.data_ptr<int64_t>(), workspace.data_ptr(), early, stream);
+  out.pair_count = at::empty({1}, longs);
+  C10_CUDA_CHECK(cudaMemcpyAsync(out.pair_count.data_ptr(), offsets.const_data_ptr<int64_t>() + n, sizeof(int64_t),
+                                 cudaMemcpyDeviceToDevice, stream));
+  check_stage("the sort by depth", stream, debug);
+  if (capacity == 0) {
+    const int64_t pairs = out.pair_count.item<int64_t>();
+    std::lock_guard lock(PairGuess::mutex());
+    PairGuess& guess = PairGuess::of(in.means3D.get_device(), grid);
+    guess.exact(n, pairs);
+    feedback = guess.feedback();
+    capacity = std::clamp<int64_t>(pairs, 1, PairGuess::kMaxCapacity);
+    const size_t late = cuda::workspace_size(n, capacity, grid);
+    if (late > early) workspace = at::empty({int64_t(late)}, bytes);
+  }
+  out.capacity = capacity;
+  const Tensor tiles = at::empty({2, capacity}, ints), values = at::empty({2, capacity}, ints);
+  const Tensor owners = at::empty({keep ? capacity : 0}, ints);
+  out.tile_offsets = at::empty({grid.tiles() + 1}, longs);
+  out.positions = at::empty({keep ? capacity : 0}, ints);
+  auto* unsorted_tiles = reinterpret_cast<uint32_t*>(tiles.data_ptr<int32_t>());
+  auto* unsorted_values = values.data_ptr<int32_t>();
+  auto* owner = keep ? owners.data_ptr<int32_t>() : nullptr;
+  stages.emit_pairs({projected.splats.const_data_ptr<float>(), n, grid, capacity, out.order.const_data_ptr<int32_t>(),
+                     offsets.const_data_ptr<int64_t>(), ranges, unsorted_tiles, unsorted_values, owner},
+                    stream);
+  check_stage("emit_pairs", stream, debug);
+  out.pairs = keep ? at::empty({capacity}, ints) : values[1];
+  cuda::sort_by_tile({grid, capacity, out.pair_count.const_data_ptr<int64_t>(), unsorted_tiles,
+                      unsorted_tiles + capacity, unsorted_values, owner, unsorted_values + capacity,
+                      keep ? out.pairs.data_ptr<int32_t>() : nullptr, keep ? out.positions.data_ptr<int32_t>() : nullptr,
+                      out.tile_offsets.data_ptr<int64_t>()},
+                     workspace.data_ptr(), size_t(workspace.numel()), stream);
+  check_stage("the sort by tile", stream, debug);
+  return out;
+}
+
+cuda::TileLists lists_of(const Tensor& splats, const Tensor& order, const Tensor& pairs, const Tensor& tile_offsets,
+                         const Tensor& pair_count) {
+  return {splats.const_data_ptr<float>(), pairs.const_data_ptr<int32_t>(),      tile_offsets.const_data_ptr<int64_t>(),
+          order.const_data_ptr<int32_t>(), pair_count.const_data_ptr<int64_t>(), order.size(0),
+          pairs.size(0)};
+}
+
+/// Memory of a plan.
+struct Plan {
+  Tensor tiles, chunks, rest;
+  int64_t max_chunks, max_checkpoints;
+  cuda::ChunkPlan view;
+
+  Plan(TileGrid grid, int64_t capacity, int samples, const at::TensorOptions& ints) {
+    const int64_t n = grid.tiles(), full = capacity / cuda::chunk_length(samples);
+    max_chunks = full + n;
+    max_checkpoints = std::min(full + n, 2 * full);  // tiles with a single chunk have none
+    tiles = at::empty({2 * n + 1}, ints);
+    chunks = at::empty({max_chunks}, ints);
+    rest = at::empty({full + 1}, ints);
+    view = {tiles.data_ptr<int32_t>(), chunks.data_ptr<int32_t>(), tiles.data_ptr<int32_t>() + n + 1,
+            rest.data_ptr<int32_t>() + 1, rest.data_ptr<int32_t>()};
+  }
+};
+
+struct BlendedImage {
+  Tensor color, transmittance, last, checkpoints;
+};
+
+BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& binned,
+                   const cuda::ForwardStages& stages, const CUDAStream& stream, bool keep, bool debug,
+                   int64_t* feedback) {
+  const auto floats = in.means3D.options(), ints = floats.dtype(at::kInt);
+  const TileGrid grid = grid_of(in);
+  const int64_t samples = keep ? stages.samples : 0;
+  const Plan plan(grid, binned.capacity, stages.samples, ints);
+  const cuda::TileLists lists =
+      lists_of(projected.splats, binned.order, binned.pairs, binned.tile_offsets, binned.pair_count);
+  cuda::plan_chunks(lists, grid, stages.samples, plan.view, feedback, stream);
+  check_stage("plan_chunks", stream, debug);
+  const Tensor tile_open = at::empty({grid.tiles()}, ints);
+  BlendedImage out{at::empty({3, in.image_height, in.image_width}, floats),
+                   at::empty({samples, in.image_height, in.image_width}, floats),
+                   at::empty({samples, in.image_height, in.image_width}, ints),
+                   at::empty({plan.max_checkpoints, stages.samples, kTile * kTile, 4}, floats)};
+  stages.blend({lists, plan.view, grid, in.background.const_data_ptr<float>(), tile_open.data_ptr<int32_t>(),
+                reinterpret_cast<cuda::Checkpoint*>(out.checkpoints.data_ptr<float>()), out.color.data_ptr<float>(),
+                keep ? out.transmittance.data_ptr<float>() : nullptr, keep ? out.last.data_ptr<int32_t>() : nullptr},
+               stream);
+  check_stage("blend", stream, debug);
+  return out;
+}
+
+RasterizeOutput rasterize_cuda(const Tensor& means3D, const OptionalTensor& means2D, const Tensor& opacities,
+                               const OptionalTensor& shs, const OptionalTensor& colors_precomp,
+                               const OptionalTensor& scales, const OptionalTensor& rotations,
+                               const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
+                               const Tensor& projmatrix, const Tensor& campos, int64_t image_height,
+                               int64_t image_width, double tanfovx, double tanfovy, double scale_modifier,
+                               int64_t sh_degree, std::string footprint, double variance, bool keep, bool debug) {
+  Inputs in{means3D,       opacities, means2D,        shs,        colors_precomp, scales,       rotations,
+            cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
+            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      variance};
+  check_cuda(in, debug);
+  const auto& stages = found(cuda::find_forward(footprint), footprint);
+  const c10::cuda::CUDAGuard guard(means3D.device());
+  const CUDAStream stream = c10::cuda::getCurrentCUDAStream();
+  const bool exact = at::globalContext().deterministicAlgorithms();
+  int64_t* feedback = nullptr;
+  const Projected projected = project(in, stages, stream, debug);
+  const Binned binned = bin(in, projected, stages, stream, keep, exact, debug, feedback);
+  const BlendedImage image = blend(in, projected, binned, stages, stream, keep, debug, feedback);
+  const auto kept = [&](const Tensor& t) { return keep ? t : at::empty({0}, t.options()); };
+  return {image.color,
+          projected.radii,
+          kept(projected.splats),
+          kept(binned.order),
+          kept(binned.pairs),
+          kept(binned.tile_offsets),
+          kept(projected.ranges),
+          binned.positions,
+          image.transmittance,
+          image.last,
+          kept(image.checkpoints),
+          binned.pair_count};
+}
+
+/// Time between stages, in seconds.
+class StageTimer {
+ public:
+  explicit StageTimer(const CUDAStream& stream) : stream_(stream) {
+    for (cudaEvent_t& event : events_) C10_CUDA_CHECK(cudaEventCreate(&event));
+    mark();
+  }
+  ~StageTimer() {
+    for (cudaEvent_t event : events_) cudaEventDestroy(event);
+  }
+  void mark() { C10_CUDA_CHECK(cudaEventRecord(events_[marks_++], stream_)); }
+  Tensor seconds() const {
+    C10_CUDA_CHECK(cudaEventSynchronize(events_[3]));
+    const Tensor out = at::empty({3}, at::kDouble);
+    for (int i = 0; i < 3; ++i) {
+      float milliseconds = 0;
+      C10_CUDA_CHECK(cudaEventElapsedTime(&milliseconds, events_[i], events_[i + 1]));
+      out.data_ptr<double>()[i] = milliseconds * 1e-3;
+    }
+    return out;
+  }
+
+ private:
+  CUDAStream stream_;
+  cudaEvent_t events_[4] = {};
+  int marks_ = 0;
+};
+
+StagesOutput rasterize_stages_cuda(const Tensor& means3D, const Tensor& opacities, const OptionalTensor& shs,
+                                   const OptionalTensor& colors_precomp, const OptionalTensor& scales,
+                                   const OptionalTensor& rotations, const OptionalTensor& cov3D_precomp,
+                                   const Tensor& bg, const Tensor& viewmatrix, const Tensor& projmatrix,
+                                   const Tensor& campos, int64_t image_height, int64_t image_width, double tanfovx,
+                                   double tanfovy, double scale_modifier, int64_t sh_degree, std::string footprint,
+                                   double variance) {
+  Inputs in{means3D,       opacities, std::nullopt,   shs,        colors_precomp, scales,       rotations,
+            cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
+            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      variance};
+  check_cuda(in, false);
+  const auto& stages = found(cuda::find_forward(footprint), footprint);
+  const c10::cuda::CUDAGuard guard(means3D.device());
+  const CUDAStream stream = c10::cuda::getCurrentCUDAStream();
+  int64_t* feedback = nullptr;
+  StageTimer timer(stream);
+  const Projected projected = project(in, stages, stream, false);
+  timer.mark();
+  Binned binned = bin(in, projected, stages, stream, false, false, false, feedback);
+  timer.mark();
+  const BlendedImage image = blend(in, projected, binned, stages, stream, false, false, feedback);
+  timer.mark();
+  const Tensor seconds = timer.seconds();
+  const int64_t pairs = binned.pair_count.item<int64_t>();
+  if (pairs > binned.capacity) binned = bin(in, projected, stages, stream, false, true, false, feedback);
+  // As on the CPU: only the Gaussians that were kept, and splats counted among those.
+  const Tensor kept = projected.radii.gt(0);
+  const Tensor ids = kept.nonzero().select(1, 0), place = kept.cumsum(0, at::kLong).sub(1);
+  const Tensor view = viewmatrix.reshape({4, 4});
+  const Tensor depths = (means3D.matmul(view.slice(0, 0, 3).select(1, 2)) + view[3][2]).index_select(0, ids);
+  const Tensor splats = projected.splats.index_select(0, ids);
+  const Tensor compact = place.index_select(0, binned.pairs.slice(0, 0, pairs).to(at::kLong)).to(at::kInt);
+  return {image.color, projected.radii, ids.to(at::kInt), depths, splats.narrow(1, 0, 2).clone(), compact,
+          binned.tile_offsets, seconds};
+}
+
+/// The tensors that rasterize hands to its vjp must fit each other. Their contents are rasterize's own.
+void check_saved(const Inputs& in, const Tensor& splats, const Tensor& order, const Tensor& pairs,
+                 const Tensor& tile_offsets, const Tensor& ranges, const Tensor& positions, const Tensor& transmittance,
+                 const Tensor& last, const Tensor& checkpoints, const Tensor& pair_count, int64_t samples) {
+  const int64_t n = in.count();
+  const std::vector<int64_t> image = {samples, in.image_height, in.image_width};
+  bool ok = splats.sizes() == at::IntArrayRef({n, kSplatWidth}) && order.sizes() == at::IntArrayRef({n}) &&
+            pairs.dim() == 1 && positions.sizes() == pairs.sizes() && pairs.numel() > 0 &&
+            tile_offsets.numel() == grid_of(in).tiles() + 1 && ranges.sizes() == at::IntArrayRef({n, 2}) &&
+            transmittance.sizes() == image && last.sizes() == image && checkpoints.dim() == 4 &&
+            checkpoints.size(1) == samples && pair_count.numel() == 1;
+  for (const Tensor* t : {&splats, &order, &pairs, &tile_offsets, &ranges, &positions, &transmittance, &last,
+                          &checkpoints, &pair_count})
+    ok = ok && t->is_contiguous() && t->device() == in.means3D.device();
+  TORCH_CHECK_VALUE(ok,
+                    "splats ... pair_count must be the outputs of rasterize with keep=True for the same arguments, got "
+                    "splats of shape ",
+                    shape_of(splats), " and transmittance of shape ", shape_of(transmittance));
+}
+
+Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const Tensor& means3D, const OptionalTensor& means2D,
+                         const Tensor& opacities, const OptionalTensor& shs, const OptionalTensor& colors_precomp,
+                         const OptionalTensor& scales, const OptionalTensor& rotations,
+                         const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
+                         const Tensor& projmatrix, const Tensor& campos, int64_t image_height, int64_t image_width,
+                         double tanfovx, double tanfovy, double scale_modifier, int64_t sh_degree,
+                         std::string footprint, double variance, const Tensor& splats, const Tensor& order,
+                         const Tensor& pairs, const Tensor& tile_offsets, const Tensor& ranges, const Tensor& positions,
+                         const Tensor& transmittance, const Tensor& last, const Tensor& checkpoints,
+                         const Tensor& pair_count, std::array<bool, 8> needs, bool debug) {
+  Inputs in{means3D,       opacities, means2D,        shs,        colors_precomp, scales,       rotations,
+            cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
+            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      variance};
+  check_cuda(in, debug);
+  check_like(dL_dcolor, "dL_dcolor", means3D, "means3D");
+  TORCH_CHECK_VALUE(dL_dcolor.sizes() == at::IntArrayRef({3, image_height, image_width}),
+                    "dL_dcolor must have shape (3, ", image_height, ", ", image_width, "), got ", shape_of(dL_dcolor));
+  const auto& forward = found(cuda::find_forward(footprint), footprint);
+  const auto& stages = found(cuda::find_backward(footprint), footprint);
+  check_saved(in, splats, order, pairs, tile_offsets, ranges, positions, transmittance, last, checkpoints, pair_count,
+              forward.samples);
+  const c10::cuda::CUDAGuard guard(means3D.device());
+  const CUDAStream stream = c10::cuda::getCurrentCUDAStream();
+  const Grads out = make_grads(in, needs);
+  const GaussianGrads<float> grads = grads_of<float>(in, out);
+  const TileGrid grid = grid_of(in);
+  const Plan plan(grid, pairs.size(0), forward.samples, order.options());
+  const cuda::TileLists lists = lists_of(splats, order, pairs, tile_offsets, pair_count);
+  cuda::plan_chunks(lists, grid, forward.samples, plan.view, nullptr, stream);
+  check_stage("plan_chunks", stream, debug);
+  const Tensor pair_grads = at::empty({std::max(pairs.size(0), in.count()), cuda::kPairGradWidth}, means3D.options());
+  const Tensor g = dL_dcolor.contiguous();
+  stages.blend_vjp({lists, plan.view, grid, plan.max_chunks, in.background.const_data_ptr<float>(),
+                    reinterpret_cast<const cuda::Checkpoint*>(checkpoints.const_data_ptr<float>()),
+                    transmittance.const_data_ptr<float>(), last.const_data_ptr<int32_t>(), g.const_data_ptr<float>(),
+                    pair_grads.data_ptr<float>(), grads.means2d && grads.means2d_stride == 4},
+                   stream);
+  check_stage("blend_vjp", stream, debug);
+  stages.project_vjp({camera_of<float>(in),
+                      gaussians_of<float>(in),
+                      {variance},
+                      reinterpret_cast<const cuda::PairRange*>(ranges.const_data_ptr<int32_t>()),
+                      positions.const_data_ptr<int32_t>(),
+                      pair_count.const_data_ptr<int64_t>(),
+                      pairs.size(0),
+                      pair_grads.const_data_ptr<float>(),
+                      grads},
+                     stream);
+  check_stage("project_vjp", stream, debug);
+  return out;
+}
+
+template <typename T> cuda::WeightTask<T> weight_task(const Tensor& offset, const Tensor& cov2d, double variance) {
+  cuda::WeightTask<T> task{};
+  task.n = offset.numel() / 2;
+  task.options = {variance};
+  task.offsets = reinterpret_cast<const Vec2<T>*>(offset.const_data_ptr<T>());
+  task.covs = reinterpret_cast<const Sym2<T>*>(cov2d.const_data_ptr<T>());
+  return task;
+}
+
+Tensor footprint_weight_cuda(const Tensor& offset, const Tensor& cov2d, std::string footprint, double variance) {
+  check_weight_arguments(offset, cov2d, variance);
+  const auto& stages = found(cuda::find_forward(footprint), footprint);
+  const c10::cuda::CUDAGuard guard(offset.device());
+  const CUDAStream stream = c10::cuda::getCurrentCUDAStream();
+  const Tensor d = offset.contiguous(), c = cov2d.contiguous();
+  const Tensor out = at::empty(offset.sizes().slice(0, offset.dim() - 1), offset.options());
+  const auto run = [&](auto task, auto launch) {
+    task.weights = out.data_ptr<std::remove_pointer_t<decltype(task.weights)>>();
+    launch(task, stream);
+  };
+  if (offset.scalar_type() == at::kFloat) {
+    run(weight_task<float>(d, c, variance), stages.weight_float);
+  } else {
+    run(weight_task<double>(d, c, variance), stages.weight_double);
+  }
+  check_stage("footprint_weight", stream, false);
+  return out;
+}
+
+std::tuple<Tensor, Tensor> footprint_weight_vjp_cuda(const Tensor& dL_dweight, const Tensor& offset,
+                                                     const Tensor& cov2d, std::string footprint, double variance) {
+  check_weight_arguments(offset, cov2d, variance);
+  check_weight_gradient(dL_dweight, offset);
+  const auto& stages = found(cuda::find_backward(footprint), footprint);
+  const c10::cuda::CUDAGuard guard(offset.device());
+  const CUDAStream stream = c10::cuda::getCurrentCUDAStream();
+  const Tensor g = dL_dweight.contiguous(), d = offset.contiguous(), c = cov2d.contiguous();
+  const Tensor dL_doffset = at::empty(offset.sizes(), offset.options()),
+               dL_dcov = at::empty(cov2d.sizes(), cov2d.options());
+  const auto run = [&](auto task, auto launch) {
+    using T = std::remove_pointer_t<decltype(task.weights)>;
+    task.dL_dweights = g.const_data_ptr<T>();
+    task.dL_doffsets = reinterpret_cast<Vec2<T>*>(dL_doffset.data_ptr<T>());
+    task.dL_dcovs = reinterpret_cast<Sym2<T>*>(dL_dcov.data_ptr<T>());
+    launch(task, stream);
+  };
+  if (offset.scalar_type() == at::kFloat) {
+    run(weight_task<float>(d, c, variance), stages.weight_vjp_float);
+  } else {
+    run(weight_task<double>(d, c, variance), stages.weight_vjp_double);
+  }
+  check_stage("footprint_weight_vjp", stream, false);
+  return {dL_doffset, dL_dcov};
+}
+
+TORCH_LIBRARY_IMPL(analytic_rasterizer, CUDA, m) {
+  m.impl("rasterize", rasterize_cuda);
+  m.impl("rasterize_vjp", rasterize_vjp_cuda);
+  m.impl("rasterize_stages", rasterize_stages_cuda);
+  m.impl("footprint_weight", footprint_weight_cuda);
+  m.impl("footprint_weight_vjp", footprint_weight_vjp_cuda);
+}
+
+}  // namespace
+
+void force_pair_capacity(int64_t capacity) { forced_capacity = capacity; }
+
+}  // namespace ar::ops

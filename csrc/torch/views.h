@@ -1,0 +1,74 @@
+// Tensors as the views that the stages take. The same on every device.
+#pragma once
+
+#include <array>
+#include <tuple>
+
+#include "core/params.h"
+#include "torch/checks.h"
+
+namespace ar::ops {
+
+template <class Element, typename T> const Element* rows_of(const OptionalTensor& t) {
+  return t ? reinterpret_cast<const Element*>(t->const_data_ptr<T>()) : nullptr;
+}
+
+template <typename T> CameraView<T> camera_of(const Inputs& in) {
+  return {in.viewmatrix.const_data_ptr<T>(),
+          in.projmatrix.const_data_ptr<T>(),
+          in.campos.const_data_ptr<T>(),
+          int(in.image_width),
+          int(in.image_height),
+          T(in.tanfovx),
+          T(in.tanfovy)};
+}
+
+template <typename T> Gaussians<T> gaussians_of(const Inputs& in) {
+  return {in.count(),
+          reinterpret_cast<const Vec3<T>*>(in.means3D.const_data_ptr<T>()),
+          rows_of<Vec3<T>, T>(in.scales),
+          rows_of<Vec4<T>, T>(in.rotations),
+          rows_of<Sym3<T>, T>(in.cov3D_precomp),
+          in.opacities.const_data_ptr<T>(),
+          rows_of<Vec3<T>, T>(in.shs),
+          rows_of<Vec3<T>, T>(in.colors_precomp),
+          in.shs ? int(in.shs->size(1)) : 0,
+          int(in.sh_degree),
+          T(in.scale_modifier)};
+}
+
+inline TileGrid grid_of(const Inputs& in) { return {int(in.image_width), int(in.image_height)}; }
+
+/// What rasterize returns: color, radii, and what its vjp needs (schemas in ops.cpp).
+using RasterizeOutput =
+    std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+using StagesOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+/// Gradients of means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp.
+using Grads = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+
+/// Room for the gradients that are wanted; an empty tensor stands for one that is not.
+inline Grads make_grads(const Inputs& in, const std::array<bool, 8>& needs) {
+  const auto make = [&](const OptionalTensor& like, bool needed) {
+    return needed && like ? at::empty_like(*like, at::MemoryFormat::Contiguous) : at::empty({0}, in.means3D.options());
+  };
+  return {make(in.means3D, needs[0]),   make(in.means2D, needs[1]),        make(in.opacities, needs[2]),
+          make(in.shs, needs[3]),       make(in.colors_precomp, needs[4]), make(in.scales, needs[5]),
+          make(in.rotations, needs[6]), make(in.cov3D_precomp, needs[7])};
+}
+
+template <typename T> GaussianGrads<T> grads_of(const Inputs& in, const Grads& grads) {
+  const auto pointer = [](const Tensor& t) { return t.numel() ? t.data_ptr<T>() : nullptr; };
+  GaussianGrads<T> out{};
+  out.means = reinterpret_cast<Vec3<T>*>(pointer(std::get<0>(grads)));
+  out.means2d = pointer(std::get<1>(grads));
+  out.means2d_stride = in.means2D ? int(in.means2D->size(1)) : 0;
+  out.opacities = pointer(std::get<2>(grads));
+  out.shs = reinterpret_cast<Vec3<T>*>(pointer(std::get<3>(grads)));
+  out.colors = reinterpret_cast<Vec3<T>*>(pointer(std::get<4>(grads)));
+  out.scales = reinterpret_cast<Vec3<T>*>(pointer(std::get<5>(grads)));
+  out.rotations = reinterpret_cast<Vec4<T>*>(pointer(std::get<6>(grads)));
+  out.cov3ds = reinterpret_cast<Sym3<T>*>(pointer(std::get<7>(grads)));
+  return out;
+}
+
+}  // namespace ar::ops
