@@ -40,14 +40,14 @@ def _(
             means3D.new_empty(means3D.shape[0], **ints),
             means3D.new_empty((kept, _SPLAT_WIDTH) if keep else (0,)),
             means3D.new_empty(kept, **ints),
-            means3D.new_empty(room, **ints),
+            means3D.new_empty((room, 2) if keep else (0,), **ints),
             means3D.new_empty(_tiles(image_height, image_width) + 1 if keep else 0, **longs),
             means3D.new_empty((kept, 2) if keep else (0,), **ints),
-            means3D.new_empty(room, **ints),
+            means3D.new_empty(0, **ints),
             means3D.new_empty(samples, image_height, image_width),
             means3D.new_empty(samples, image_height, image_width, **ints),
             means3D.new_empty(checkpoints),
-            means3D.new_empty(1, **longs),
+            means3D.new_empty(2, **longs),
         )
     splats, pairs = context.new_dynamic_size(), context.new_dynamic_size()
     return (

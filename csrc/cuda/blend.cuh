@@ -4,11 +4,12 @@
 // row b / 2, lane l at column l % 8 and row l / 8 of it. A splat is tested against the subtiles once
 // per tile; warps skip those that do not reach them.
 //
-// Lists are cut into chunks. blend_front goes through a tile's first chunks in order and knows when
-// all pixels have stopped. Where pairs are left, blend_rest blends the other chunks all at once, each
-// as if nothing were in front of it, and blend_merge composes them. A pixel that stops inside a chunk
-// is blended again there, from what is in front. So few tiles with long lists, as in small images of
-// large scenes, still fill the device, and the last bits depend on nothing but the lists.
+// Lists are cut into chunks. blend_front goes through a tile's first chunks in order and knows when all
+// pixels have stopped. Where pairs are left, the other chunks are done all at once: rest_through finds
+// how much light each lets through, rest_scan from that the transmittance in front of each, with which
+// rest_blend composites each exactly as if the chunks before had just been, and rest_sum adds up. So
+// few tiles with long lists, as in small images of large scenes, still fill the device, and the last
+// bits depend on nothing but the lists.
 #pragma once
 
 #include "core/bin.h"
@@ -30,20 +31,23 @@ __device__ inline Vec2<float> pixel_of(int b, int lane) {
 /// A tile and its list of splats, front to back.
 struct TileList {
   int x0, y0;
-  const int32_t* splats;
-  int count;
-  int64_t first;  ///< place of the list in pairs
+  const int32_t* pairs;
+  int stride, count;
   bool overflow;  ///< the list is all splats
+
+  __device__ int32_t splat(int k) const { return pairs[int64_t(k) * stride]; }
+  __device__ int32_t slot(int k) const { return pairs[int64_t(k) * stride + 1]; }
 };
 
 __device__ inline TileList list_of(const TileLists& lists, TileGrid grid, int tile) {
   TileList list;
   list.x0 = tile % grid.columns() * kTile;
   list.y0 = tile / grid.columns() * kTile;
-  list.overflow = *lists.pair_count > lists.capacity;
-  list.first = list.overflow ? 0 : lists.tile_offsets[tile];
-  list.splats = list.overflow ? lists.order : lists.pairs + list.first;
-  list.count = int(list.overflow ? lists.n : lists.tile_offsets[tile + 1] - list.first);
+  list.overflow = lists.counts->pairs > lists.capacity;
+  list.stride = list.overflow ? 1 : lists.stride;
+  const int64_t first = list.overflow ? 0 : lists.tile_offsets[tile];
+  list.pairs = list.overflow ? lists.order : lists.pairs + first * lists.stride;
+  list.count = int(list.overflow ? lists.counts->splats : lists.tile_offsets[tile + 1] - first);
   return list;
 }
 
@@ -137,12 +141,27 @@ template <class F> struct Stage {
     const int t = threadIdx.x;
     uint32_t bits = 0;
     if (k + t < end) {
-      const Splat<F, float> splat = splats_in[list.splats[k + t]];
-      if (splat.level > 0) bits = subtile_reach(support_of(splat), list.x0, list.y0);
+      const Splat<F, float> splat = splats_in[list.splat(k + t)];
+      bits = subtile_reach(support_of(splat), list.x0, list.y0);
       if (bits) splats[t] = tile_splat(splat, list);
     }
     reach[t] = uint8_t(bits);
     return min(end - k, kBlendThreads);
+  }
+
+  /// Multiplies the transmittance by what the splats let through.
+  __device__ void pass_all(int count, Vec2<float> p, float (&transmittance)[F::kSamples]) const {
+    const int warp = threadIdx.x / 32;
+    for (int k = 0; k < count; k += 32) {
+      for (uint32_t mask = __ballot_sync(kAllLanes, reach[k + lane_id()] >> warp & 1); mask != 0; mask &= mask - 1) {
+        const TileSplat<F>& splat = splats[k + __ffs(mask) - 1];
+#pragma unroll
+        for (int s = 0; s < F::kSamples; ++s) {
+          const float alpha = F::alpha(splat.terms, p, s);
+          if (alpha >= float(kAlphaMin)) transmittance[s] -= transmittance[s] * min(alpha, float(kAlphaMax));
+        }
+      }
+    }
   }
 
   template <int kColors>
@@ -165,41 +184,39 @@ template <int S> struct PixelCheckpoints {
   __device__ Checkpoint& at(int chunk, int s) const { return base[(int64_t(chunk) * S + s) * kTilePixels]; }
 };
 
-/// Writes the results of a pixel whose samples are done. `total` is the sum of their colours.
-template <int S, int kColors>
-__device__ void store_pixel(const BlendTask& task, int x, int y, Vec3<float> total,
-                            const PixelState<S, kColors>& state) {
+/// Writes a pixel whose samples are done. `total` is the sum of their colours.
+template <int S>
+__device__ void store_color(const BlendTask& task, int x, int y, Vec3<float> total, const float (&transmittance)[S]) {
   if (x >= task.grid.width || y >= task.grid.height) return;
   const int64_t plane = int64_t(task.grid.width) * task.grid.height, i = int64_t(y) * task.grid.width + x;
   float through = 0;
 #pragma unroll
   for (int s = 0; s < S; ++s) {
-    through += abs(state.transmittance[s]);
-    if (task.transmittance) task.transmittance[s * plane + i] = abs(state.transmittance[s]);
-    if (task.last) task.last[s * plane + i] = state.last[s];
+    through += abs(transmittance[s]);
+    if (task.transmittance) task.transmittance[s * plane + i] = abs(transmittance[s]);
   }
   const float scale = 1.0f / S;
   task.image[i] = scale * total.x + scale * through * task.background[0];
   task.image[plane + i] = scale * total.y + scale * through * task.background[1];
   task.image[2 * plane + i] = scale * total.z + scale * through * task.background[2];
 }
-
-/// Turns the colours of the first `n` chunks of a pixel, all of them composited, into the colour of
-/// everything behind each: what blend_vjp starts from. Sums of positive terms, which cannot cancel.
-template <int S, int kColors>
-__device__ void accumulate_behind(const PixelCheckpoints<S>& checkpoints, int n, const float* background,
-                                  const PixelState<S, kColors>& state) {
-  static_assert(kColors == S);
-  const Vec3<float> bg = {background[0], background[1], background[2]};
+template <int S> __device__ void store_last(const BlendTask& task, int x, int y, const int (&last)[S]) {
+  if (x >= task.grid.width || y >= task.grid.height) return;
+  const int64_t plane = int64_t(task.grid.width) * task.grid.height, i = int64_t(y) * task.grid.width + x;
 #pragma unroll
-  for (int s = 0; s < S; ++s) {
-    Vec3<float> behind = abs(state.transmittance[s]) * bg + state.color[s];
-    for (int c = n - 1; c >= 0; --c) {
-      Checkpoint& checkpoint = checkpoints.at(c, s);
-      const Vec3<float> own = checkpoint.color;
-      checkpoint.color = behind;
-      behind += own;
-    }
+  for (int s = 0; s < S; ++s) task.last[s * plane + i] = last[s];
+}
+
+/// Turns the colours of a sample's first `n` chunks into the colour of everything behind each: what
+/// blend_vjp starts from. `behind`: of what is behind them all. Sums of positive terms do not cancel.
+template <int S>
+__device__ void accumulate_behind(const PixelCheckpoints<S>& checkpoints, int n, int s, Vec3<float> behind) {
+#pragma unroll 4
+  for (int c = n - 1; c >= 0; --c) {
+    Checkpoint& checkpoint = checkpoints.at(c, s);
+    const Vec3<float> own = checkpoint.color;
+    checkpoint.color = behind;
+    behind += own;
   }
 }
 
@@ -212,7 +229,7 @@ template <class F, bool kKeep> __global__ void __launch_bounds__(kBlendThreads) 
   const TileList list = list_of(task.lists, task.grid, tile);
   const Vec2<float> p = pixel_of(warp, lane_id());
   const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
-  const int front = list.overflow ? list.count : min(list.count, kFrontChunks * kLength);
+  const int front = list.overflow ? list.count : min(list.count, task.plan.front * kLength);
   const bool several = !list.overflow && list.count > kLength;
   const PixelCheckpoints<S> checkpoints(task, tile, threadIdx.x);
   PixelState<S, kColors> state;
@@ -234,141 +251,166 @@ template <class F, bool kKeep> __global__ void __launch_bounds__(kBlendThreads) 
   }
   const bool more = k == front && front < list.count && __syncthreads_or(state.open());
   if (threadIdx.x == 0) task.tile_open[tile] = more;
+  if (kKeep) store_last(task, x, y, state.last);
   if (!more) {
-    store_pixel(task, x, y, total + state.total_color(), state);
-    if constexpr (kKeep) accumulate_behind(checkpoints, written, task.background, state);
+    store_color(task, x, y, total + state.total_color(), state.transmittance);
+    if constexpr (kKeep) {
+      const Vec3<float> bg = {task.background[0], task.background[1], task.background[2]};
+#pragma unroll
+      for (int s = 0; s < S; ++s)
+        accumulate_behind(checkpoints, written, s, abs(state.transmittance[s]) * bg + state.color[s]);
+    }
     return;
   }
-  // blend_merge goes on from the last front chunk's checkpoint.
+  // The rest goes on from the last front chunk's checkpoint.
   if (!kKeep) {
 #pragma unroll
     for (int s = 0; s < S; ++s) {
-      checkpoints.at(kFrontChunks - 1, s) = {s == 0 ? state.color[0] : Vec3<float>{0, 0, 0}, state.transmittance[s]};
+      checkpoints.at(task.plan.front - 1, s) = {s == 0 ? state.color[0] : Vec3<float>{0, 0, 0}, state.transmittance[s]};
     }
-  }
-  if (kKeep && x < task.grid.width && y < task.grid.height) {
-    const int64_t plane = int64_t(task.grid.width) * task.grid.height, i = int64_t(y) * task.grid.width + x;
-#pragma unroll
-    for (int s = 0; s < S; ++s) task.last[s * plane + i] = state.last[s];
   }
 }
 
-/// Blocks share the chunks behind the front ones.
-template <class F> __global__ void __launch_bounds__(kBlendThreads) blend_rest_kernel(const BlendTask task) {
+/// A chunk behind the front ones of a tile that is still open; false if it is not.
+struct RestChunk {
+  int tile, chunk;
+
+  __device__ bool find(const BlendTask& task, int item) {
+    const int id = task.plan.rest[item];
+    tile = task.plan.chunk_tiles[id];
+    chunk = id - task.plan.chunk_offsets[tile];
+    return task.tile_open[tile];
+  }
+};
+
+/// Blocks share the chunks. Writes the transmittance of each chunk alone.
+template <class F> __global__ void __launch_bounds__(kBlendThreads) rest_through_kernel(const BlendTask task) {
   constexpr int S = F::kSamples, kLength = chunk_length(S);
   __shared__ Stage<F> stage;
-  if (*task.lists.pair_count > task.lists.capacity) return;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.lists.splats);
   const Vec2<float> p = pixel_of(threadIdx.x / 32, lane_id());
   const int items = *task.plan.rest_count;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
-    const int id = task.plan.rest[item], tile = task.plan.chunk_tiles[id], chunk = id - task.plan.chunk_offsets[tile];
-    if (!task.tile_open[tile]) continue;
-    const TileList list = list_of(task.lists, task.grid, tile);
-    const PixelCheckpoints<S> checkpoints(task, tile, threadIdx.x);
-    const int end = min(list.count, (chunk + 1) * kLength);
-    PixelState<S, S> state;
-    state.start(true);
+    RestChunk rest;
+    if (!rest.find(task, item)) continue;
+    const TileList list = list_of(task.lists, task.grid, rest.tile);
+    const int end = min(list.count, (rest.chunk + 1) * kLength);
+    float transmittance[S];
+#pragma unroll
+    for (int s = 0; s < S; ++s) transmittance[s] = 1;
+    for (int k = rest.chunk * kLength; k < end; k += kBlendThreads) {
+      __syncthreads();
+      const int count = stage.load(splats, list, k, end);
+      __syncthreads();
+      stage.pass_all(count, p, transmittance);
+    }
+    const PixelCheckpoints<S> checkpoints(task, rest.tile, threadIdx.x);
+#pragma unroll
+    for (int s = 0; s < S; ++s) checkpoints.at(rest.chunk, s).transmittance = transmittance[s];
+  }
+}
+
+/// A sample with less transmittance than this would be stopped by any splat it meets: it may count as
+/// stopped before. The reserve over the minimum absorbs that products of chunks round differently.
+inline constexpr float kNearlyStopped = float(kTransmittanceMin * (1 + kAlphaMin / 2));
+
+/// Turns the transmittance of each chunk into the one in front of it, negative where a sample has
+/// stopped before.
+template <int S> __global__ void __launch_bounds__(kTilePixels) rest_scan_kernel(const BlendTask task) {
+  const int tile = blockIdx.x / S, s = blockIdx.x % S;
+  if (!task.tile_open[tile]) return;
+  const PixelCheckpoints<S> checkpoints(task, tile, threadIdx.x);
+  const int chunks = task.plan.chunk_offsets[tile + 1] - task.plan.chunk_offsets[tile];
+  float transmittance = checkpoints.at(task.plan.front - 1, s).transmittance;
+#pragma unroll 8
+  for (int c = task.plan.front; c < chunks; ++c) {
+    const float through = checkpoints.at(c, s).transmittance;
+    checkpoints.at(c, s).transmittance = transmittance;
+    if (transmittance > 0) transmittance *= through;
+    if (transmittance < kNearlyStopped) transmittance = -abs(transmittance);
+  }
+}
+
+/// Blocks share the chunks. Writes the colour of each, and the transmittance at its end; zero where
+/// the sample had stopped before.
+template <class F, bool kKeep> __global__ void __launch_bounds__(kBlendThreads) rest_blend_kernel(const BlendTask task) {
+  constexpr int S = F::kSamples, kLength = chunk_length(S), kColors = kKeep ? S : 1;
+  __shared__ Stage<F> stage;
+  const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.lists.splats);
+  const Vec2<float> p = pixel_of(threadIdx.x / 32, lane_id());
+  const int items = *task.plan.rest_count;
+  for (int item = blockIdx.x; item < items; item += gridDim.x) {
+    RestChunk rest;
+    if (!rest.find(task, item)) continue;
+    const TileList list = list_of(task.lists, task.grid, rest.tile);
+    const int end = min(list.count, (rest.chunk + 1) * kLength);
+    const PixelCheckpoints<S> checkpoints(task, rest.tile, threadIdx.x);
+    PixelState<S, kColors> state;
+    state.start(false);
+    bool started[S];
 #pragma unroll
     for (int s = 0; s < S; ++s) {
-      if (checkpoints.at(kFrontChunks - 1, s).transmittance < 0) state.transmittance[s] = -1;
+      const float transmittance = checkpoints.at(rest.chunk, s).transmittance;
+      started[s] = transmittance > 0;
+      if (started[s]) state.transmittance[s] = transmittance;
     }
-    int k = chunk * kLength;
+    int k = rest.chunk * kLength;
     while (k < end && __syncthreads_or(state.open())) {
       const int count = stage.load(splats, list, k, end);
       __syncthreads();
       stage.composite_all(count, k, p, state);
       k += count;
     }
+    const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
+    const bool inside = x < task.grid.width && y < task.grid.height;
+    const int64_t plane = int64_t(task.grid.width) * task.grid.height, i = int64_t(y) * task.grid.width + x;
 #pragma unroll
-    for (int s = 0; s < S; ++s) checkpoints.at(chunk, s) = {state.color[s], state.transmittance[s]};
+    for (int s = 0; s < S; ++s) {
+      const Vec3<float> color = s < kColors ? state.color[s % kColors] : Vec3<float>{0, 0, 0};
+      checkpoints.at(rest.chunk, s) = {color, started[s] ? state.transmittance[s] : 0};
+      if (kKeep && inside && state.last[s] > 0) atomicMax(&task.last[s * plane + i], state.last[s]);
+    }
     __syncthreads();
   }
 }
 
-/// A warp per subtile of the tiles that the front left open.
-template <class F, bool kKeep> __global__ void __launch_bounds__(kBlendThreads) blend_merge_kernel(const BlendTask task) {
-  constexpr int S = F::kSamples, kLength = chunk_length(S), kAhead = 8;
-  __shared__ TileSplat<F> stage[kSubtiles][32];
-  const int tile = blockIdx.x, warp = threadIdx.x / 32, lane = lane_id();
+/// Adds the chunks of the tiles that the front left open.
+template <int S, bool kKeep> __global__ void __launch_bounds__(kTilePixels) rest_sum_kernel(const BlendTask task) {
+  const int tile = blockIdx.x;
   if (!task.tile_open[tile]) return;
-  const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.lists.splats);
-  const TileList list = list_of(task.lists, task.grid, tile);
-  const Vec2<float> p = pixel_of(warp, lane);
-  const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
   const PixelCheckpoints<S> checkpoints(task, tile, threadIdx.x);
-  const int chunks = (list.count + kLength - 1) / kLength;
-  PixelState<S, S> state;
+  const int chunks = task.plan.chunk_offsets[tile + 1] - task.plan.chunk_offsets[tile];
+  const Vec3<float> bg = {task.background[0], task.background[1], task.background[2]};
+  PixelState<S, 1> state;
   state.start(false);
-  Vec3<float> total = {0, 0, 0};
 #pragma unroll
   for (int s = 0; s < S; ++s) {
-    for (int c = kKeep ? 0 : kFrontChunks - 1; c < kFrontChunks; ++c) total += checkpoints.at(c, s).color;
-    state.transmittance[s] = checkpoints.at(kFrontChunks - 1, s).transmittance;
-    if (kKeep && x < task.grid.width && y < task.grid.height) {
-      const int64_t plane = int64_t(task.grid.width) * task.grid.height;
-      state.last[s] = task.last[s * plane + int64_t(y) * task.grid.width + x];
+    float transmittance = -1;
+#pragma unroll 8
+    for (int c = kKeep ? 0 : task.plan.front - 1; c < chunks; ++c) {
+      const Checkpoint checkpoint = checkpoints.at(c, s);
+      state.color[0] += checkpoint.color;
+      if (checkpoint.transmittance != 0) transmittance = checkpoint.transmittance;
     }
+    state.transmittance[s] = transmittance;
+    if (kKeep) accumulate_behind(checkpoints, chunks, s, abs(transmittance) * bg);
   }
-  int c = kFrontChunks;
-  for (; c < chunks && __any_sync(kAllLanes, state.open()); ++c) {
-    Checkpoint part[S];
-    bool stops = false;
-#pragma unroll
-    for (int s = 0; s < S; ++s) {
-      if (c + kAhead < chunks) asm volatile("prefetch.global.L1 [%0];" ::"l"(&checkpoints.at(c + kAhead, s)));
-      part[s] = checkpoints.at(c, s);
-      stops |= state.transmittance[s] > 0 && !(state.transmittance[s] * part[s].transmittance >= float(kTransmittanceMin));
-    }
-    const int end = min(list.count, (c + 1) * kLength);
-    state.clear_color();
-    if (__any_sync(kAllLanes, stops)) {
-      PixelState<S, S> run = state;
-      if (!stops) run.start(false);
-      for (int k = c * kLength; k < end && __any_sync(kAllLanes, run.open()); k += 32) {
-        bool reached = false;
-        __syncwarp();
-        if (k + lane < end) {
-          const Splat<F, float> splat = splats[list.splats[k + lane]];
-          reached = subtile_reach(support_of(splat), list.x0, list.y0) >> warp & 1;
-          if (reached) stage[warp][lane] = tile_splat(splat, list);
-        }
-        __syncwarp();
-        composite<F>(stage[warp], __ballot_sync(kAllLanes, reached), k, p, run);
-      }
-      if (stops) state = run;
-    }
-    if (!stops) {
-#pragma unroll
-      for (int s = 0; s < S; ++s) {
-        if (!(state.transmittance[s] > 0)) continue;
-        state.color[s] = state.transmittance[s] * part[s].color;
-        state.transmittance[s] *= part[s].transmittance;
-        state.last[s] = end;  // not the last splat composited, but none behind it is
-      }
-    }
-    total += state.total_color();
-    if (kKeep && c + 1 < chunks) {
-#pragma unroll
-      for (int s = 0; s < S; ++s) checkpoints.at(c, s) = {state.color[s], state.transmittance[s]};
-    }
-  }
-  store_pixel(task, x, y, total, state);
-  if (kKeep) {
-    // The last chunk's colour is not in a checkpoint; where the loop ended early, it is in both.
-    if (c < chunks) state.clear_color();
-    accumulate_behind(checkpoints, min(c, chunks - 1), task.background, state);
-  }
+  const Vec2<float> p = pixel_of(threadIdx.x / 32, lane_id());
+  const int x = tile % task.grid.columns() * kTile + int(p.x), y = tile / task.grid.columns() * kTile + int(p.y);
+  store_color(task, x, y, state.color[0], state.transmittance);
 }
 
 /// Blocks that fill any device.
 inline constexpr int kRestBlocks = 132 * 8;
 
 template <class F, bool kKeep> void blend_kernels(const BlendTask& task, cudaStream_t stream) {
+  constexpr int S = F::kSamples;
   const unsigned tiles = unsigned(task.grid.tiles());
   blend_front_kernel<F, kKeep><<<tiles, kBlendThreads, 0, stream>>>(task);
-  blend_rest_kernel<F><<<kRestBlocks, kBlendThreads, 0, stream>>>(task);
-  blend_merge_kernel<F, kKeep><<<tiles, kBlendThreads, 0, stream>>>(task);
+  rest_through_kernel<F><<<kRestBlocks, kBlendThreads, 0, stream>>>(task);
+  rest_scan_kernel<S><<<tiles * S, kTilePixels, 0, stream>>>(task);
+  rest_blend_kernel<F, kKeep><<<kRestBlocks, kBlendThreads, 0, stream>>>(task);
+  rest_sum_kernel<S, kKeep><<<tiles, kTilePixels, 0, stream>>>(task);
 }
 template <class F> void blend(const BlendTask& task, cudaStream_t stream) {
   if (task.transmittance) {
@@ -426,10 +468,12 @@ template <class F, bool kAbs> __global__ void __launch_bounds__(32 * kVjpWarps<F
     subtile_last[b] = warp_max(last);
     tile_last = max(tile_last, subtile_last[b]);
   }
-  if (!list.overflow) {  // pairs that nothing reached
-    float4* rows = reinterpret_cast<float4*>(task.pair_grads + list.first * kPairGradWidth);
-    const int first = max(begin, min(tile_last, end)) * (kPairGradWidth / 4);
-    for (int e = first + lane; e < end * (kPairGradWidth / 4); e += 32) rows[e] = {0, 0, 0, 0};
+  if (!list.overflow) {
+    for (int k = max(begin, min(tile_last, end)) + lane; k < end; k += 32) {  // pairs that nothing reached
+      auto* row = reinterpret_cast<float4*>(task.pair_grads + int64_t(list.slot(k)) * kPairGradWidth);
+#pragma unroll
+      for (int q = 0; q < kPairGradWidth / 4; ++q) row[q] = {0, 0, 0, 0};
+    }
   }
   if (begin >= tile_last) return;
 
@@ -466,13 +510,14 @@ template <class F, bool kAbs> __global__ void __launch_bounds__(32 * kVjpWarps<F
   for (int k1 = min(end, tile_last); k1 > begin; k1 -= 32) {
     const int k0 = max(k1 - 32, begin), k = k0 + lane;
     uint32_t reach = 0;
-    int32_t id = 0;
+    int32_t row_index = 0;
     Mat2<float> mean_map = {0, 0, 0, 0};
     __syncwarp();
     if (k < k1) {
-      id = list.splats[k];
+      const int32_t id = list.splat(k);
+      row_index = list.overflow ? id : list.slot(k);
       const Splat<F, float> splat = splats[id];
-      if (splat.level > 0) reach = subtile_reach(support_of(splat), list.x0, list.y0);
+      reach = subtile_reach(support_of(splat), list.x0, list.y0);
 #pragma unroll
       for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= subtile_last[b]) << b);
       if (reach) stage.splats[lane] = tile_splat(splat, list);
@@ -521,8 +566,7 @@ template <class F, bool kAbs> __global__ void __launch_bounds__(32 * kVjpWarps<F
                                weighted,       color.x,        color.y,        color.z};
       const float sum = sum_nine(values);
       const int value = lane % 4 == 0 ? lane / 4 : lane == 2 ? 8 : -1;
-      const int32_t splat_id = __shfl_sync(kAllLanes, id, j);
-      float* row = task.pair_grads + (list.overflow ? int64_t(splat_id) : list.first + k0 + j) * kPairGradWidth;
+      float* row = task.pair_grads + int64_t(__shfl_sync(kAllLanes, row_index, j)) * kPairGradWidth;
       const auto put = [&](int v, float x) {
         if (list.overflow) {
           atomicAdd(row + v, x);
@@ -542,7 +586,7 @@ template <class F, bool kAbs> __global__ void __launch_bounds__(32 * kVjpWarps<F
 
 /// With too many pairs there is a row per splat that all tiles add to.
 template <class F> __global__ void clear_splat_grads_kernel(const BlendVjpTask task) {
-  if (*task.lists.pair_count <= task.lists.capacity) return;
+  if (task.lists.counts->pairs <= task.lists.capacity) return;
   const int64_t n = task.lists.n * kPairGradWidth;
   for (int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x; i < n; i += int64_t(gridDim.x) * blockDim.x)
     task.pair_grads[i] = 0;

@@ -15,8 +15,28 @@ struct ShRows {
   static constexpr int kStride = 3 * kMaxShCount + 1;
   float value[32][kStride];
 
+  /// Moves the first 4 kQuads numbers of all 32 rows of 4 `quads` in memory, all at once.
+  template <int kQuads> __device__ void load_quads(const float4* base, int quads, uint32_t lanes) {
+    const int lane = lane_id();
+#pragma unroll
+    for (int e = 0; e < kQuads; ++e) {
+      const int k = e * 32 + lane, row = k / kQuads, q = k % kQuads;
+      if (!(lanes >> row & 1)) continue;
+      const float4 v = base[row * quads + q];
+      float* to = value[row] + 4 * q;
+      to[0] = v.x, to[1] = v.y, to[2] = v.z, to[3] = v.w;
+    }
+    __syncwarp();
+  }
+
   /// Loads `count` coefficients of the rows of the lanes in `lanes`; base is lane 0's row.
   __device__ void load(const Vec3<float>* base, int stride, int count, uint32_t lanes) {
+    if (3 * stride % 4 == 0 && reinterpret_cast<uintptr_t>(base) % 16 == 0) {
+      const auto* quads = reinterpret_cast<const float4*>(base);
+      if (count == 16) return load_quads<12>(quads, 3 * stride / 4, lanes);
+      if (count == 9) return load_quads<7>(quads, 3 * stride / 4, lanes);
+      if (count == 4) return load_quads<3>(quads, 3 * stride / 4, lanes);
+    }
     for (; lanes != 0; lanes &= lanes - 1) {
       const int row = __ffs(lanes) - 1;
       const float* from = &base[int64_t(row) * stride].x;
@@ -27,6 +47,16 @@ struct ShRows {
   /// Stores rows [0, rows) of `stride` coefficients.
   __device__ void store(Vec3<float>* base, int stride, int rows) const {
     __syncwarp();
+    if (stride == 16 && reinterpret_cast<uintptr_t>(base) % 16 == 0) {
+      auto* to = reinterpret_cast<float4*>(base);
+#pragma unroll
+      for (int e = 0; e < 12; ++e) {
+        const int k = e * 32 + lane_id(), row = k / 12;
+        const float* from = value[row] + 4 * (k % 12);
+        if (row < rows) to[k] = {from[0], from[1], from[2], from[3]};
+      }
+      return;
+    }
     const int width = 3 * stride;
     float* to = &base->x;
     for (int row = 0; row < rows; ++row) {
@@ -68,7 +98,6 @@ template <class F> __global__ void __launch_bounds__(kProjectThreads) project_ke
   }
   // A splat that touches a tile has a radius: it is at least as wide as its pixel.
   task.keys[i] = count > 0 ? __float_as_uint(depth) : kCulledKey;
-  task.ids[i] = int32_t(i);
   task.ranges[i] = {0, count};
   task.radii[i] = radius;
 }
@@ -101,9 +130,7 @@ inline constexpr int kManyPairs = 64;
 /// Sums the pairs of each lane's splat, always in the same order.
 __device__ inline SplatSums sum_pairs(const ProjectVjpTask& task, PairRange range) {
   SplatSums sums = {};
-  const auto add_pair = [&](SplatSums& to, int q) {
-    to.add(task.pair_grads + int64_t(task.positions[q]) * kPairGradWidth);
-  };
+  const auto add_pair = [&](SplatSums& to, int q) { to.add(task.pair_grads + int64_t(q) * kPairGradWidth); };
   if (range.count <= kManyPairs) {
     for (int q = range.first; q < range.first + range.count; ++q) add_pair(sums, q);
   }
@@ -130,7 +157,7 @@ template <class F> __global__ void __launch_bounds__(kProjectThreads) project_vj
   const Camera<float> camera = load_camera(task.camera);
   const PairRange range = i < g.n ? task.ranges[i] : PairRange{0, 0};
   SplatSums sums = {};
-  if (*task.pair_count <= task.capacity) {
+  if (task.counts->pairs <= task.capacity) {
     sums = sum_pairs(task, range);
   } else if (range.count > 0) {
     sums.add(task.pair_grads + i * kPairGradWidth);

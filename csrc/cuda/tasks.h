@@ -22,16 +22,30 @@ inline constexpr int kPairGradWidth = 12;
 /// checkpoints. Checkpoints hold a sample each, so many samples get longer chunks.
 inline constexpr int chunk_length(int samples) { return samples <= 4 ? 256 : 64 * samples; }
 
-/// Chunks of a tile that blend goes through one after the other, knowing which pixels have stopped.
-/// The rest is blended side by side and merged.
-inline constexpr int kFrontChunks = 2;
+/// Chunks of a tile that blend goes through one after the other, which reads no pair behind the point
+/// where all pixels have stopped. The rest is blended side by side. With many tiles there is enough to
+/// do side by side; with few, a long list must not keep a single block busy.
+inline int front_chunks(TileGrid grid, int samples) {
+  const int pairs = grid.tiles() >= 2048 ? 2048 : 256;
+  return pairs > chunk_length(samples) ? pairs / chunk_length(samples) : 1;
+}
 
 /// Depth keys of splats without pairs: after all others.
 inline constexpr uint32_t kCulledKey = 0x7fffffff;
 
-/// Where the pairs of a splat are, in order of emission.
+/// Where the pairs of a splat are, in the order in which they are emitted.
 struct PairRange {
   int32_t first, count;
+};
+
+/// A pair, and its place in that order: where blend_vjp leaves its gradient.
+struct alignas(8) SlotPair {
+  int32_t splat, slot;
+};
+
+/// What the device finds out.
+struct Counts {
+  int64_t pairs, splats;  ///< splats: with pairs
 };
 
 /// Color and transmittance of a pixel's sample at the end of a chunk.
@@ -46,36 +60,38 @@ struct ProjectTask {
   FootprintOptions options;
   float* splats;      ///< [n] Splat<F, float>; only the level of those with radius 0
   uint32_t* keys;     ///< [n] in the order of depth
-  int32_t* ids;       ///< [n] 0, 1, 2, ...
   PairRange* ranges;  ///< [n] count
   int32_t* radii;     ///< [n]
 };
 
-struct BinTask {
+struct EmitTask {
   const float* splats;
   int64_t n;
   TileGrid grid;
   int64_t capacity;
-  const int32_t* order;    ///< [n] splats by depth
-  const int64_t* offsets;  ///< [n + 1] first pair of each, in that order
-  PairRange* ranges;       ///< [n] first, by splat, written with `owners`
-  uint32_t* tiles;         ///< [capacity] tile of each pair
-  int32_t* values;         ///< [capacity] splat of each pair; with `owners` the pair itself
-  int32_t* owners;         ///< [capacity] splat of each pair, or null
+  const Counts* counts;
+  const int32_t* order;  ///< [counts->splats] splats by depth
+  PairRange* ranges;     ///< [n] first
+  uint32_t* status;      ///< emit_scratch(n) bytes
+  uint32_t* tiles;       ///< [capacity] tile of each pair
+  int32_t* splat_pairs;  ///< [capacity] splat of each pair, or null:
+  SlotPair* slot_pairs;  ///< [capacity] the same with its slot, for a backward pass
 };
 
 /// The lists of splats that blend walks.
 struct TileLists {
   const float* splats;
-  const int32_t* pairs;         ///< [capacity] splats by tile, then depth
+  const int32_t* pairs;         ///< [capacity, stride] splats by tile, then depth, and their slots
+  int stride;                   ///< 1, or 2 with slots
   const int64_t* tile_offsets;  ///< [tiles + 1]
-  const int32_t* order;         ///< [n] all splats by depth
-  const int64_t* pair_count;
+  const int32_t* order;         ///< [counts->splats] all splats with pairs by depth
+  const Counts* counts;
   int64_t n, capacity;
 };
 
 /// How the lists are cut into chunks; made by plan_chunks.
 struct ChunkPlan {
+  int front;                    ///< front_chunks
   int32_t* chunk_offsets;       ///< [tiles + 1] first chunk of each tile
   int32_t* chunk_tiles;         ///< [chunks] tile of each chunk
   int32_t* checkpoint_offsets;  ///< [tiles] place of a tile's first checkpoint, if it has several chunks
@@ -105,7 +121,7 @@ struct BlendVjpTask {
   const float* transmittance;
   const int32_t* last;
   const float* dL_dimage;
-  float* pair_grads;  ///< [max(capacity, n), kPairGradWidth] by pair, or by splat if there are too many pairs
+  float* pair_grads;  ///< [max(capacity, n), kPairGradWidth] by slot, or by splat if there are too many pairs
   bool absolute;      ///< sum |dL/dmean| too
 };
 
@@ -114,8 +130,7 @@ struct ProjectVjpTask {
   Gaussians<float> gaussians;
   FootprintOptions options;
   const PairRange* ranges;
-  const int32_t* positions;  ///< [capacity] place in pairs of each pair, in order of emission
-  const int64_t* pair_count;
+  const Counts* counts;
   int64_t capacity;
   const float* pair_grads;
   GaussianGrads<float> grads;
@@ -135,7 +150,7 @@ template <typename T> struct WeightTask {
 struct ForwardStages {
   int samples;
   void (*project)(const ProjectTask&, cudaStream_t);
-  void (*emit_pairs)(const BinTask&, cudaStream_t);
+  void (*emit_pairs)(const EmitTask&, cudaStream_t);
   void (*blend)(const BlendTask&, cudaStream_t);
   void (*weight_float)(const WeightTask<float>&, cudaStream_t);
   void (*weight_double)(const WeightTask<double>&, cudaStream_t);
@@ -153,24 +168,38 @@ const BackwardStages* find_backward(std::string_view footprint);
 
 // The parts of binning that no footprint changes (bin.cu).
 
-/// Bytes of workspace for the sorts and the scan.
-size_t workspace_size(int64_t n, int64_t capacity, TileGrid grid);
+/// Most pairs that can be sorted.
+int64_t max_pairs();
 
-/// Sorts `ids` by `keys`, stably; sorted_keys is scratch. Then offsets[r + 1] = pairs of the first r + 1 splats.
-void sort_by_depth(const uint32_t* keys, const int32_t* ids, const PairRange* ranges, int64_t n, uint32_t* sorted_keys,
-                   int32_t* order, int64_t* offsets, void* workspace, size_t bytes, cudaStream_t stream);
+/// Bytes of scratch memory.
+int64_t depth_sort_scratch(int64_t n);
+int64_t tile_sort_scratch(int64_t capacity, TileGrid grid);
+inline constexpr int kEmitThreads = 256;
+inline int64_t emit_scratch(int64_t n) { return (1 + (n + kEmitThreads - 1) / kEmitThreads) * int64_t(sizeof(uint32_t)); }
 
-/// Sorts pairs by tile, stably, and finds each tile's. With `owners`, writes pairs and positions.
-struct SortTask {
-  TileGrid grid;
+/// Splats by depth, ties in input order. The result is order[0].
+struct DepthSort {
+  int64_t n;
+  uint32_t* keys[2];   ///< [n]; both are overwritten
+  int32_t* order[2];   ///< [n]
+  const PairRange* ranges;
+  Counts* counts;
+};
+/// First writes the counts, then sorts.
+void count_depths(const DepthSort& task, void* scratch, cudaStream_t stream);
+void sort_by_depth(const DepthSort& task, void* scratch, cudaStream_t stream);
+
+/// Pairs by tile, stably. The result is values[tile_sort_result(grid)].
+template <class Value> struct TileSort {
   int64_t capacity;
-  const int64_t* pair_count;
-  uint32_t *tiles, *sorted_tiles;
-  const int32_t *values, *owners;
-  int32_t *sorted_values, *pairs, *positions;
+  const Counts* counts;
+  uint32_t* tiles[2];  ///< [capacity]; both are overwritten
+  Value* values[2];
   int64_t* tile_offsets;
 };
-void sort_by_tile(const SortTask& task, void* workspace, size_t bytes, cudaStream_t stream);
+int tile_sort_result(TileGrid grid);
+void sort_by_tile(const TileSort<int32_t>& task, TileGrid grid, void* scratch, cudaStream_t stream);
+void sort_by_tile(const TileSort<SlotPair>& task, TileGrid grid, void* scratch, cudaStream_t stream);
 
 /// `feedback` receives the number of pairs: host memory that the device can write, or null.
 void plan_chunks(const TileLists& lists, TileGrid grid, int samples, const ChunkPlan& plan, int64_t* feedback,

@@ -12,7 +12,7 @@ __device__ inline int lane_id() { return threadIdx.x % 32; }
 inline unsigned blocks_of(int64_t n, int threads) { return unsigned((n + threads - 1) / threads); }
 
 /// Sum over the lanes, in every lane, in a fixed order.
-__device__ inline float warp_sum(float v) {
+template <typename T> __device__ T warp_sum(T v) {
 #pragma unroll
   for (int offset = 16; offset > 0; offset /= 2) v += __shfl_xor_sync(kAllLanes, v, offset);
   return v;

@@ -68,8 +68,7 @@ class PairGuess {
   }
   int64_t* feedback() { return feedback_.defined() ? feedback_.data_ptr<int64_t>() : nullptr; }
 
-  static int64_t with_reserve(int64_t pairs) { return std::min<int64_t>(pairs + pairs / 4 + (1 << 16), kMaxCapacity); }
-  static constexpr int64_t kMaxCapacity = (int64_t(1) << 31) - (1 << 16);
+  static int64_t with_reserve(int64_t pairs) { return std::min<int64_t>(pairs + pairs / 4 + (1 << 16), cuda::max_pairs()); }
 
  private:
   at::Tensor feedback_;
@@ -80,20 +79,19 @@ class PairGuess {
 int64_t forced_capacity = 0;
 
 struct Projected {
-  Tensor splats, keys, ids, ranges, radii;
+  Tensor splats, keys, ranges, radii;
 };
 
 Projected project(const Inputs& in, const cuda::ForwardStages& stages, const CUDAStream& stream, bool debug) {
   const int64_t n = in.count();
   const auto floats = in.means3D.options(), ints = floats.dtype(at::kInt);
-  Projected out{at::empty({n, kSplatWidth}, floats), at::empty({n}, ints), at::empty({n}, ints),
-                at::empty({n, 2}, ints), at::empty({n}, ints)};
+  Projected out{at::empty({n, kSplatWidth}, floats), at::empty({2, n}, ints), at::empty({n, 2}, ints),
+                at::empty({n}, ints)};
   stages.project({camera_of<float>(in),
                   gaussians_of<float>(in),
                   {in.variance},
                   out.splats.data_ptr<float>(),
                   reinterpret_cast<uint32_t*>(out.keys.data_ptr<int32_t>()),
-                  out.ids.data_ptr<int32_t>(),
                   reinterpret_cast<cuda::PairRange*>(out.ranges.data_ptr<int32_t>()),
                   out.radii.data_ptr<int32_t>()},
                  stream);
@@ -102,9 +100,24 @@ Projected project(const Inputs& in, const cuda::ForwardStages& stages, const CUD
 }
 
 struct Binned {
-  Tensor order, pairs, tile_offsets, positions, pair_count;
+  Tensor order, pairs, tile_offsets, counts;
   int64_t capacity;
 };
+
+/// Emits and sorts pairs of a splat, or of a splat and its slot.
+template <class Value>
+void make_pairs(cuda::EmitTask emit, Value* const (&values)[2], int64_t* tile_offsets, Tensor& tiles,
+                const cuda::ForwardStages& stages, const CUDAStream& stream, bool debug) {
+  auto* tile = reinterpret_cast<uint32_t*>(tiles.data_ptr<int32_t>());
+  emit.tiles = tile;
+  stages.emit_pairs(emit, stream);
+  check_stage("emit_pairs", stream, debug);
+  const Tensor scratch = at::empty({cuda::tile_sort_scratch(emit.capacity, emit.grid)}, tiles.options().dtype(at::kByte));
+  cuda::sort_by_tile(cuda::TileSort<Value>{emit.capacity, emit.counts, {tile, tile + emit.capacity},
+                                           {values[0], values[1]}, tile_offsets},
+                     emit.grid, scratch.data_ptr(), stream);
+  check_stage("sort_by_tile", stream, debug);
+}
 
 /// `exact`: make room for the pairs there are, not for a guess. `feedback` receives where the device
 /// is to leave their number for the guess of the next frame.
@@ -112,7 +125,7 @@ Binned bin(const Inputs& in, const Projected& projected, const cuda::ForwardStag
            bool keep, bool exact, bool debug, int64_t*& feedback) {
   const int64_t n = in.count();
   const TileGrid grid = grid_of(in);
-  const auto ints = projected.ids.options(), longs = ints.dtype(at::kLong), bytes = ints.dtype(at::kByte);
+  const auto ints = projected.radii.options(), longs = ints.dtype(at::kLong), bytes = ints.dtype(at::kByte);
   auto* ranges = reinterpret_cast<cuda::PairRange*>(projected.ranges.data_ptr<int32_t>());
   int64_t capacity = 0;
   {
@@ -121,55 +134,63 @@ Binned bin(const Inputs& in, const Projected& projected, const cuda::ForwardStag
     if (!exact) capacity = forced_capacity ? forced_capacity : guess.capacity(n);
     feedback = guess.feedback();
   }
-  const size_t early = cuda::workspace_size(n, std::max<int64_t>(capacity, 1), grid);
-  Tensor workspace = at::empty({int64_t(early)}, bytes);
-  const Tensor offsets = at::empty({n + 1}, longs), sorted_keys = at::empty({n}, ints);
   Binned out;
-  out.order = at::empty({n}, ints);
-  cuda::sort_by_depth(reinterpret_cast<const uint32_t*>(projected.keys.const_data_ptr<int32_t>()),
-                      projected.ids.const_data_ptr<int32_t>(), ranges, n,
-                      reinterpret_cast<uint32_t*>(sorted_keys.data_ptr<int32_t>()), out.order.data_ptr<int32_t>(),
-                      offsets.data_ptr<int64_t>(), workspace.data_ptr(), early, stream);
-  out.pair_count = at::empty({1}, longs);
-  C10_CUDA_CHECK(cudaMemcpyAsync(out.pair_count.data_ptr(), offsets.const_data_ptr<int64_t>() + n, sizeof(int64_t),
-                                 cudaMemcpyDeviceToDevice, stream));
-  check_stage("the sort by depth", stream, debug);
+  const Tensor order = at::empty({2, n}, ints), scratch = at::empty({cuda::depth_sort_scratch(n)}, bytes);
+  out.order = order[0];
+  out.counts = at::empty({2}, longs);
+  auto* counts = reinterpret_cast<cuda::Counts*>(out.counts.data_ptr<int64_t>());
+  auto* keys = reinterpret_cast<uint32_t*>(projected.keys.data_ptr<int32_t>());
+  const cuda::DepthSort by_depth = {
+      n, {keys, keys + n}, {order.data_ptr<int32_t>(), order.data_ptr<int32_t>() + n}, ranges, counts};
+  cuda::count_depths(by_depth, scratch.data_ptr(), stream);
+  check_stage("count_depths", stream, debug);
   if (capacity == 0) {
-    const int64_t pairs = out.pair_count.item<int64_t>();
+    const int64_t pairs = out.counts[0].item<int64_t>();
     std::lock_guard lock(PairGuess::mutex());
     PairGuess& guess = PairGuess::of(in.means3D.get_device(), grid);
     guess.exact(n, pairs);
     feedback = guess.feedback();
-    capacity = std::clamp<int64_t>(pairs, 1, PairGuess::kMaxCapacity);
-    const size_t late = cuda::workspace_size(n, capacity, grid);
-    if (late > early) workspace = at::empty({int64_t(late)}, bytes);
+    capacity = std::clamp<int64_t>(pairs, 1, cuda::max_pairs());
   }
   out.capacity = capacity;
-  const Tensor tiles = at::empty({2, capacity}, ints), values = at::empty({2, capacity}, ints);
-  const Tensor owners = at::empty({keep ? capacity : 0}, ints);
+  cuda::sort_by_depth(by_depth, scratch.data_ptr(), stream);
+  check_stage("sort_by_depth", stream, debug);
+  const Tensor status = at::empty({cuda::emit_scratch(n)}, bytes);
+  cuda::EmitTask emit{};
+  emit.splats = projected.splats.const_data_ptr<float>();
+  emit.n = n;
+  emit.grid = grid;
+  emit.capacity = capacity;
+  emit.counts = counts;
+  emit.order = out.order.const_data_ptr<int32_t>();
+  emit.ranges = ranges;
+  emit.status = reinterpret_cast<uint32_t*>(status.data_ptr());
+  Tensor tiles = at::empty({2, capacity}, ints);
   out.tile_offsets = at::empty({grid.tiles() + 1}, longs);
-  out.positions = at::empty({keep ? capacity : 0}, ints);
-  auto* unsorted_tiles = reinterpret_cast<uint32_t*>(tiles.data_ptr<int32_t>());
-  auto* unsorted_values = values.data_ptr<int32_t>();
-  auto* owner = keep ? owners.data_ptr<int32_t>() : nullptr;
-  stages.emit_pairs({projected.splats.const_data_ptr<float>(), n, grid, capacity, out.order.const_data_ptr<int32_t>(),
-                     offsets.const_data_ptr<int64_t>(), ranges, unsorted_tiles, unsorted_values, owner},
-                    stream);
-  check_stage("emit_pairs", stream, debug);
-  out.pairs = keep ? at::empty({capacity}, ints) : values[1];
-  cuda::sort_by_tile({grid, capacity, out.pair_count.const_data_ptr<int64_t>(), unsorted_tiles,
-                      unsorted_tiles + capacity, unsorted_values, owner, unsorted_values + capacity,
-                      keep ? out.pairs.data_ptr<int32_t>() : nullptr, keep ? out.positions.data_ptr<int32_t>() : nullptr,
-                      out.tile_offsets.data_ptr<int64_t>()},
-                     workspace.data_ptr(), size_t(workspace.numel()), stream);
-  check_stage("the sort by tile", stream, debug);
+  const Tensor first = at::empty({capacity, keep ? 2 : 1}, ints), second = at::empty_like(first);
+  if (keep) {
+    cuda::SlotPair* values[2] = {reinterpret_cast<cuda::SlotPair*>(first.data_ptr<int32_t>()),
+                                 reinterpret_cast<cuda::SlotPair*>(second.data_ptr<int32_t>())};
+    emit.slot_pairs = values[0];
+    make_pairs(emit, values, out.tile_offsets.data_ptr<int64_t>(), tiles, stages, stream, debug);
+  } else {
+    int32_t* values[2] = {first.data_ptr<int32_t>(), second.data_ptr<int32_t>()};
+    emit.splat_pairs = values[0];
+    make_pairs(emit, values, out.tile_offsets.data_ptr<int64_t>(), tiles, stages, stream, debug);
+  }
+  out.pairs = cuda::tile_sort_result(grid) == 0 ? first : second;
   return out;
 }
 
 cuda::TileLists lists_of(const Tensor& splats, const Tensor& order, const Tensor& pairs, const Tensor& tile_offsets,
-                         const Tensor& pair_count) {
-  return {splats.const_data_ptr<float>(), pairs.const_data_ptr<int32_t>(),      tile_offsets.const_data_ptr<int64_t>(),
-          order.const_data_ptr<int32_t>(), pair_count.const_data_ptr<int64_t>(), order.size(0),
+                         const Tensor& counts) {
+  return {splats.const_data_ptr<float>(),
+          pairs.const_data_ptr<int32_t>(),
+          int(pairs.size(1)),
+          tile_offsets.const_data_ptr<int64_t>(),
+          order.const_data_ptr<int32_t>(),
+          reinterpret_cast<const cuda::Counts*>(counts.const_data_ptr<int64_t>()),
+          order.size(0),
           pairs.size(0)};
 }
 
@@ -186,7 +207,7 @@ struct Plan {
     tiles = at::empty({2 * n + 1}, ints);
     chunks = at::empty({max_chunks}, ints);
     rest = at::empty({full + 1}, ints);
-    view = {tiles.data_ptr<int32_t>(), chunks.data_ptr<int32_t>(), tiles.data_ptr<int32_t>() + n + 1,
+    view = {cuda::front_chunks(grid, samples), tiles.data_ptr<int32_t>(), chunks.data_ptr<int32_t>(), tiles.data_ptr<int32_t>() + n + 1,
             rest.data_ptr<int32_t>() + 1, rest.data_ptr<int32_t>()};
   }
 };
@@ -203,7 +224,7 @@ BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& b
   const int64_t samples = keep ? stages.samples : 0;
   const Plan plan(grid, binned.capacity, stages.samples, ints);
   const cuda::TileLists lists =
-      lists_of(projected.splats, binned.order, binned.pairs, binned.tile_offsets, binned.pair_count);
+      lists_of(projected.splats, binned.order, binned.pairs, binned.tile_offsets, binned.counts);
   cuda::plan_chunks(lists, grid, stages.samples, plan.view, feedback, stream);
   check_stage("plan_chunks", stream, debug);
   const Tensor tile_open = at::empty({grid.tiles()}, ints);
@@ -246,11 +267,11 @@ RasterizeOutput rasterize_cuda(const Tensor& means3D, const OptionalTensor& mean
           kept(binned.pairs),
           kept(binned.tile_offsets),
           kept(projected.ranges),
-          binned.positions,
+          at::empty({0}, binned.pairs.options()),
           image.transmittance,
           image.last,
           kept(image.checkpoints),
-          binned.pair_count};
+          binned.counts};
 }
 
 /// Time between stages, in seconds.
@@ -304,7 +325,7 @@ StagesOutput rasterize_stages_cuda(const Tensor& means3D, const Tensor& opacitie
   const BlendedImage image = blend(in, projected, binned, stages, stream, false, false, feedback);
   timer.mark();
   const Tensor seconds = timer.seconds();
-  const int64_t pairs = binned.pair_count.item<int64_t>();
+  const int64_t pairs = binned.counts[0].item<int64_t>();
   if (pairs > binned.capacity) binned = bin(in, projected, stages, stream, false, true, false, feedback);
   // As on the CPU: only the Gaussians that were kept, and splats counted among those.
   const Tensor kept = projected.radii.gt(0);
@@ -312,27 +333,27 @@ StagesOutput rasterize_stages_cuda(const Tensor& means3D, const Tensor& opacitie
   const Tensor view = viewmatrix.reshape({4, 4});
   const Tensor depths = (means3D.matmul(view.slice(0, 0, 3).select(1, 2)) + view[3][2]).index_select(0, ids);
   const Tensor splats = projected.splats.index_select(0, ids);
-  const Tensor compact = place.index_select(0, binned.pairs.slice(0, 0, pairs).to(at::kLong)).to(at::kInt);
+  const Tensor compact = place.index_select(0, binned.pairs.select(1, 0).slice(0, 0, pairs).to(at::kLong)).to(at::kInt);
   return {image.color, projected.radii, ids.to(at::kInt), depths, splats.narrow(1, 0, 2).clone(), compact,
           binned.tile_offsets, seconds};
 }
 
 /// The tensors that rasterize hands to its vjp must fit each other. Their contents are rasterize's own.
 void check_saved(const Inputs& in, const Tensor& splats, const Tensor& order, const Tensor& pairs,
-                 const Tensor& tile_offsets, const Tensor& ranges, const Tensor& positions, const Tensor& transmittance,
-                 const Tensor& last, const Tensor& checkpoints, const Tensor& pair_count, int64_t samples) {
+                 const Tensor& tile_offsets, const Tensor& ranges, const Tensor& transmittance,
+                 const Tensor& last, const Tensor& checkpoints, const Tensor& counts, int64_t samples) {
   const int64_t n = in.count();
   const std::vector<int64_t> image = {samples, in.image_height, in.image_width};
   bool ok = splats.sizes() == at::IntArrayRef({n, kSplatWidth}) && order.sizes() == at::IntArrayRef({n}) &&
-            pairs.dim() == 1 && positions.sizes() == pairs.sizes() && pairs.numel() > 0 &&
+            pairs.dim() == 2 && pairs.size(1) == 2 && pairs.numel() > 0 &&
             tile_offsets.numel() == grid_of(in).tiles() + 1 && ranges.sizes() == at::IntArrayRef({n, 2}) &&
             transmittance.sizes() == image && last.sizes() == image && checkpoints.dim() == 4 &&
-            checkpoints.size(1) == samples && pair_count.numel() == 1;
-  for (const Tensor* t : {&splats, &order, &pairs, &tile_offsets, &ranges, &positions, &transmittance, &last,
-                          &checkpoints, &pair_count})
+            checkpoints.size(1) == samples && counts.numel() == 2;
+  for (const Tensor* t : {&splats, &order, &pairs, &tile_offsets, &ranges, &transmittance, &last,
+                          &checkpoints, &counts})
     ok = ok && t->is_contiguous() && t->device() == in.means3D.device();
   TORCH_CHECK_VALUE(ok,
-                    "splats ... pair_count must be the outputs of rasterize with keep=True for the same arguments, got "
+                    "splats ... counts must be the outputs of rasterize with keep=True for the same arguments, got "
                     "splats of shape ",
                     shape_of(splats), " and transmittance of shape ", shape_of(transmittance));
 }
@@ -344,9 +365,9 @@ Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const Tensor& means3D, const O
                          const Tensor& projmatrix, const Tensor& campos, int64_t image_height, int64_t image_width,
                          double tanfovx, double tanfovy, double scale_modifier, int64_t sh_degree,
                          std::string footprint, double variance, const Tensor& splats, const Tensor& order,
-                         const Tensor& pairs, const Tensor& tile_offsets, const Tensor& ranges, const Tensor& positions,
+                         const Tensor& pairs, const Tensor& tile_offsets, const Tensor& ranges, const Tensor&,
                          const Tensor& transmittance, const Tensor& last, const Tensor& checkpoints,
-                         const Tensor& pair_count, std::array<bool, 8> needs, bool debug) {
+                         const Tensor& counts, std::array<bool, 8> needs, bool debug) {
   Inputs in{means3D,       opacities, means2D,        shs,        colors_precomp, scales,       rotations,
             cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
             tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      variance};
@@ -356,7 +377,7 @@ Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const Tensor& means3D, const O
                     "dL_dcolor must have shape (3, ", image_height, ", ", image_width, "), got ", shape_of(dL_dcolor));
   const auto& forward = found(cuda::find_forward(footprint), footprint);
   const auto& stages = found(cuda::find_backward(footprint), footprint);
-  check_saved(in, splats, order, pairs, tile_offsets, ranges, positions, transmittance, last, checkpoints, pair_count,
+  check_saved(in, splats, order, pairs, tile_offsets, ranges, transmittance, last, checkpoints, counts,
               forward.samples);
   const c10::cuda::CUDAGuard guard(means3D.device());
   const CUDAStream stream = c10::cuda::getCurrentCUDAStream();
@@ -364,7 +385,7 @@ Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const Tensor& means3D, const O
   const GaussianGrads<float> grads = grads_of<float>(in, out);
   const TileGrid grid = grid_of(in);
   const Plan plan(grid, pairs.size(0), forward.samples, order.options());
-  const cuda::TileLists lists = lists_of(splats, order, pairs, tile_offsets, pair_count);
+  const cuda::TileLists lists = lists_of(splats, order, pairs, tile_offsets, counts);
   cuda::plan_chunks(lists, grid, forward.samples, plan.view, nullptr, stream);
   check_stage("plan_chunks", stream, debug);
   const Tensor pair_grads = at::empty({std::max(pairs.size(0), in.count()), cuda::kPairGradWidth}, means3D.options());
@@ -379,8 +400,7 @@ Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const Tensor& means3D, const O
                       gaussians_of<float>(in),
                       {variance},
                       reinterpret_cast<const cuda::PairRange*>(ranges.const_data_ptr<int32_t>()),
-                      positions.const_data_ptr<int32_t>(),
-                      pair_count.const_data_ptr<int64_t>(),
+                      reinterpret_cast<const cuda::Counts*>(counts.const_data_ptr<int64_t>()),
                       pairs.size(0),
                       pair_grads.const_data_ptr<float>(),
                       grads},
