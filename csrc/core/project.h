@@ -68,12 +68,12 @@ template <typename T> AR_HD T max_sigma(const Gaussians<T>& g, int64_t i) {
 /// Whether Gaussian i may touch the image, from its mean and its largest standard deviation: cheap,
 /// and never false for one that project() keeps. `blur` is the largest variance a footprint adds.
 template <typename T> AR_HD bool may_be_visible(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, T blur) {
+  const T largest = max_sigma(g, i), opacity = g.opacities[i];  // loads first: they wait together
   const ProjectedMean<T> p = project_mean(camera, g.means[i]);
   if (!p.valid) return false;
   // |J| <= f/z |(1, 0, -x/z; 0, 1, -y/z)| <= f/z sqrt(1 + (x/z)^2 + (y/z)^2), with x/z and y/z clamped
   const T stretch = max(camera.focal.x, camera.focal.y) / p.view.z *
                     sqrt(T(1) + camera.limit.x * camera.limit.x + camera.limit.y * camera.limit.y);
-  const T largest = max_sigma(g, i), opacity = g.opacities[i];
   const T sigma = sqrt(stretch * stretch * largest * largest + blur);
   const T level = T(kMaxLevel) + (opacity > T(1) ? T(2) * std::log(opacity) : T(0));
   const T reach = T(2) + sigma * sqrt(level);

@@ -68,19 +68,27 @@ __global__ void __launch_bounds__(kCountThreads)
   }
 }
 
-constexpr int kRangeThreads = 256;
+constexpr int kRangeThreads = 128;
 
-/// Thread k looks at the sorted pairs k - 1 and k: where the tile changes, lists end and begin.
+/// Each tile finds its first pair.
 __global__ void __launch_bounds__(kRangeThreads)
     tile_offsets_kernel(const uint32_t* tiles, const Counts* counts, int64_t capacity, int64_t tile_count,
                         int64_t* tile_offsets) {
-  const int64_t k = int64_t(blockIdx.x) * kRangeThreads + threadIdx.x, total = counts->pairs;
-  if (total > capacity || k > total) return;
-  const int64_t before = k > 0 ? int64_t(tiles[k - 1]) : -1, here = k < total ? tiles[k] : tile_count;
-  for (int64_t tile = before + 1; tile <= here; ++tile) tile_offsets[tile] = k;
+  const int64_t tile = int64_t(blockIdx.x) * kRangeThreads + threadIdx.x;
+  if (counts->pairs > capacity || tile > tile_count) return;
+  int64_t low = 0, high = counts->pairs;
+  while (low < high) {
+    const int64_t middle = (low + high) / 2;
+    if (tiles[middle] < tile) {
+      low = middle + 1;
+    } else {
+      high = middle;
+    }
+  }
+  tile_offsets[tile] = low;
 }
 
-constexpr int kPlanThreads = 1024;
+constexpr int kPlanThreads = 1024, kPlanTiles = 8;  // tiles per thread and round
 
 struct PlanSums {
   int chunks, checkpoints, rest;
@@ -92,38 +100,90 @@ struct AddPlanSums {
   __device__ PlanSums operator()(PlanSums a, PlanSums b) const { return a + b; }
 };
 
-/// One block walks over all tiles, a thread each: three running sums.
+/// Work is handed out longest first, so that no block starts on a long piece when the others are
+/// done. Sizes are classed by powers of two; within a class the order does not matter.
+struct WorkClasses {
+  static constexpr int kCount = 33;
+  int next[kCount];  ///< sizes, then places
+
+  __device__ static int of(int length) { return __clz(length); }  // longer first
+  /// Takes a place for a piece of this length; counts pieces before finish(). Lanes of one class go
+  /// together: atomics to one place are slow.
+  __device__ int take(int length) {
+    const uint32_t peers = __match_any_sync(__activemask(), of(length));
+    const int leader = __ffs(peers) - 1;
+    int first = 0;
+    if (lane_id() == leader) first = atomicAdd(&next[of(length)], __popc(peers));
+    return __shfl_sync(peers, first, leader) + __popc(peers & ((1u << lane_id()) - 1));
+  }
+  __device__ int take_many(int length, int pieces) { return atomicAdd(&next[of(length)], pieces); }
+  __device__ void finish() {
+    for (int c = 0, sum = 0; c < kCount; ++c) {
+      const int n = next[c];
+      next[c] = sum;
+      sum += n;
+    }
+  }
+};
+
+/// One block walks over all tiles: three running sums, and two orders of work.
 __global__ void __launch_bounds__(kPlanThreads)
     plan_kernel(const TileLists lists, int64_t tiles, int length, const ChunkPlan plan, int64_t* feedback) {
   using Scan = cub::BlockScan<PlanSums, kPlanThreads>;
   __shared__ typename Scan::TempStorage storage;
+  __shared__ WorkClasses tile_classes, chunk_classes;
   const int64_t total = lists.counts->pairs;
   const bool overflow = total > lists.capacity;
+  for (int c = threadIdx.x; c < WorkClasses::kCount; c += kPlanThreads) tile_classes.next[c] = chunk_classes.next[c] = 0;
+  __syncthreads();
+  const auto count_of = [&](int64_t tile) {
+    if (tile >= tiles) return 0;
+    return overflow ? 1 : int(lists.tile_offsets[tile + 1] - lists.tile_offsets[tile]);
+  };
   PlanSums base = {0, 0, 0};
-  for (int64_t first = 0; first < tiles; first += kPlanThreads) {
-    const int64_t tile = first + threadIdx.x;
-    PlanSums own = {0, 0, 0}, before, all;
-    if (tile < tiles) {
-      const int64_t n = overflow ? 1 : lists.tile_offsets[tile + 1] - lists.tile_offsets[tile];
-      own.chunks = int((n + length - 1) / length);
-      own.checkpoints = own.chunks > 1 ? own.chunks : 0;
-      own.rest = max(own.chunks - plan.front, 0);
+  for (int64_t round = 0; round < tiles; round += kPlanThreads * kPlanTiles) {
+    const int64_t first = round + threadIdx.x * kPlanTiles;
+    PlanSums own[kPlanTiles], sum = {0, 0, 0}, before, all;
+#pragma unroll
+    for (int t = 0; t < kPlanTiles; ++t) {
+      const int n = count_of(first + t), chunks = (n + length - 1) / length;
+      own[t] = {chunks, chunks > 1 ? chunks : 0, max(chunks - plan.front, 0)};
+      sum = sum + own[t];
+      if (first + t < tiles) tile_classes.take(n);
+      if (n >= length) chunk_classes.take_many(length, n / length);
+      if (n % length) chunk_classes.take(n % length);
     }
-    Scan(storage).ExclusiveScan(own, before, PlanSums{0, 0, 0}, AddPlanSums(), all);
+    Scan(storage).ExclusiveScan(sum, before, PlanSums{0, 0, 0}, AddPlanSums(), all);
     __syncthreads();
     before = before + base;
     base = base + all;
-    if (tile < tiles) {
-      plan.chunk_offsets[tile] = before.chunks;
-      plan.checkpoint_offsets[tile] = before.checkpoints;
+#pragma unroll
+    for (int t = 0; t < kPlanTiles; ++t) {
+      if (first + t < tiles) {
+        plan.chunk_offsets[first + t] = before.chunks;
+        plan.checkpoint_offsets[first + t] = before.checkpoints;
+      }
+      for (int c = 0; c < own[t].rest; ++c) {
+        plan.rest[before.rest + c] = {int32_t(first + t), plan.front + c};
+      }
+      before = before + own[t];
     }
-    for (int c = 0; c < own.chunks; ++c) plan.chunk_tiles[before.chunks + c] = int32_t(tile);
-    for (int c = 0; c < own.rest; ++c) plan.rest[before.rest + c] = before.chunks + plan.front + c;
   }
   if (threadIdx.x == 0) {
     plan.chunk_offsets[tiles] = base.chunks;
     *plan.rest_count = base.rest;
     if (feedback) *feedback = total;
+    tile_classes.finish();
+    chunk_classes.finish();
+  }
+  __syncthreads();
+  for (int64_t tile = threadIdx.x; tile < tiles; tile += kPlanThreads) {
+    const int n = count_of(tile);
+    const int whole = n / length;
+    plan.tile_order[tile_classes.take(n)] = int32_t(tile);
+    const int place = whole > 0 ? chunk_classes.take_many(length, whole) : 0;
+    for (int c = 0; c < whole; ++c) plan.chunk_order[place + c] = {int32_t(tile), c};
+    if (n % length) plan.chunk_order[chunk_classes.take(n % length)] = {int32_t(tile), whole};
   }
 }
 
@@ -147,7 +207,7 @@ void sort_values(const TileSort<Value>& task, TileGrid grid, uint32_t* memory, c
         scratch, pass, 0, 0, task.tiles[pass % 2], task.tiles[1 - pass % 2], task.values[pass % 2],
         task.values[1 - pass % 2]);
   }
-  tile_offsets_kernel<<<blocks_of(task.capacity + 1, kRangeThreads), kRangeThreads, 0, stream>>>(
+  tile_offsets_kernel<<<blocks_of(grid.tiles() + 1, kRangeThreads), kRangeThreads, 0, stream>>>(
       task.tiles[passes % 2], task.counts, task.capacity, grid.tiles(), task.tile_offsets);
 }
 

@@ -52,8 +52,7 @@ template <class F> __global__ void __launch_bounds__(kEmitThreads) emit_pairs_ke
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.splats);
   const int32_t i = r < n ? task.order[r] : 0;
   const int count = r < n ? task.ranges[i].count : 0;
-  Splat<F, float> splat = {};
-  if (count > 0) splat = splats[i];
+  const Splat<F, float> splat = splats[i];
   uint32_t before, sum;
   Scan(storage).ExclusiveSum(uint32_t(count), before, sum);
   uint32_t* status = task.status + 1;

@@ -221,11 +221,12 @@ __device__ void accumulate_behind(const PixelCheckpoints<S>& checkpoints, int n,
 }
 
 /// A block per tile.
-template <class F, bool kKeep> __global__ void __launch_bounds__(kBlendThreads) blend_front_kernel(const BlendTask task) {
+template <class F, bool kKeep>
+__global__ void __launch_bounds__(kBlendThreads, F::kSamples == 1 ? 5 : 1) blend_front_kernel(const BlendTask task) {
   constexpr int S = F::kSamples, kLength = chunk_length(S), kColors = kKeep ? S : 1;
   __shared__ Stage<F> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.lists.splats);
-  const int tile = blockIdx.x, warp = threadIdx.x / 32;
+  const int tile = task.plan.tile_order[blockIdx.x], warp = threadIdx.x / 32;
   const TileList list = list_of(task.lists, task.grid, tile);
   const Vec2<float> p = pixel_of(warp, lane_id());
   const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
@@ -271,18 +272,6 @@ template <class F, bool kKeep> __global__ void __launch_bounds__(kBlendThreads) 
   }
 }
 
-/// A chunk behind the front ones of a tile that is still open; false if it is not.
-struct RestChunk {
-  int tile, chunk;
-
-  __device__ bool find(const BlendTask& task, int item) {
-    const int id = task.plan.rest[item];
-    tile = task.plan.chunk_tiles[id];
-    chunk = id - task.plan.chunk_offsets[tile];
-    return task.tile_open[tile];
-  }
-};
-
 /// Blocks share the chunks. Writes the transmittance of each chunk alone.
 template <class F> __global__ void __launch_bounds__(kBlendThreads) rest_through_kernel(const BlendTask task) {
   constexpr int S = F::kSamples, kLength = chunk_length(S);
@@ -291,8 +280,8 @@ template <class F> __global__ void __launch_bounds__(kBlendThreads) rest_through
   const Vec2<float> p = pixel_of(threadIdx.x / 32, lane_id());
   const int items = *task.plan.rest_count;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
-    RestChunk rest;
-    if (!rest.find(task, item)) continue;
+    const TileChunk rest = task.plan.rest[item];
+    if (!task.tile_open[rest.tile]) continue;
     const TileList list = list_of(task.lists, task.grid, rest.tile);
     const int end = min(list.count, (rest.chunk + 1) * kLength);
     float transmittance[S];
@@ -340,8 +329,8 @@ template <class F, bool kKeep> __global__ void __launch_bounds__(kBlendThreads) 
   const Vec2<float> p = pixel_of(threadIdx.x / 32, lane_id());
   const int items = *task.plan.rest_count;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
-    RestChunk rest;
-    if (!rest.find(task, item)) continue;
+    const TileChunk rest = task.plan.rest[item];
+    if (!task.tile_open[rest.tile]) continue;
     const TileList list = list_of(task.lists, task.grid, rest.tile);
     const int end = min(list.count, (rest.chunk + 1) * kLength);
     const PixelCheckpoints<S> checkpoints(task, rest.tile, threadIdx.x);
@@ -448,7 +437,7 @@ template <class F, bool kAbs> __global__ void __launch_bounds__(32 * kVjpWarps<F
   const int lane = lane_id();
   const int64_t item = int64_t(blockIdx.x) * kVjpWarps<F> + threadIdx.x / 32;
   if (item >= task.plan.chunk_offsets[task.grid.tiles()]) return;
-  const int tile = task.plan.chunk_tiles[item], chunk = int(item) - task.plan.chunk_offsets[tile];
+  const auto [tile, chunk] = task.plan.chunk_order[item];
   const TileList list = list_of(task.lists, task.grid, tile);
   const int begin = chunk * kLength, end = list.overflow ? list.count : min(list.count, begin + kLength);
   const int64_t plane = int64_t(task.grid.width) * task.grid.height;

@@ -148,23 +148,32 @@ __device__ inline SplatSums sum_pairs(const ProjectVjpTask& task, PairRange rang
   return sums;
 }
 
-template <class F> __global__ void __launch_bounds__(kProjectThreads) project_vjp_kernel(const ProjectVjpTask task) {
+template <class F> __global__ void __launch_bounds__(kProjectThreads, 5) project_vjp_kernel(const ProjectVjpTask task) {
   __shared__ ShRows sh_rows[kProjectThreads / 32];
   const Gaussians<float>& g = task.gaussians;
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
   const int64_t first = i - lane_id();  // of the warp
   if (first >= g.n) return;
-  const Camera<float> camera = load_camera(task.camera);
   const PairRange range = i < g.n ? task.ranges[i] : PairRange{0, 0};
+  const uint32_t lit = __ballot_sync(kAllLanes, range.count > 0);
+  if (lit == 0) {
+    if (i < g.n) zero_grads(i, task.grads);
+    if (task.grads.shs) {
+      float* shs = &task.grads.shs[first * g.sh_stride].x;
+      const int64_t width = 3 * g.sh_stride * min(int64_t(32), g.n - first);
+      for (int64_t e = lane_id(); e < width; e += 32) shs[e] = 0;
+    }
+    return;
+  }
+  ShRows& rows = sh_rows[threadIdx.x / 32];
+  if (g.shs) rows.load(g.shs + first * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
   SplatSums sums = {};
   if (task.counts->pairs <= task.capacity) {
     sums = sum_pairs(task, range);
   } else if (range.count > 0) {
     sums.add(task.pair_grads + i * kPairGradWidth);
   }
-  ShRows& rows = sh_rows[threadIdx.x / 32];
-  const uint32_t lit = __ballot_sync(kAllLanes, range.count > 0);
-  if (g.shs && lit) rows.load(g.shs + first * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
+  const Camera<float> camera = load_camera(task.camera);
   // Longer rows than the largest degree's hold coefficients without influence.
   const bool staged = task.grads.shs && g.sh_stride <= kMaxShCount;
   Vec3<float>* dL_dsh = staged ? rows.row() : task.grads.shs ? task.grads.shs + i * g.sh_stride : nullptr;

@@ -89,13 +89,18 @@ struct TileLists {
   int64_t n, capacity;
 };
 
-/// How the lists are cut into chunks; made by plan_chunks.
+struct alignas(8) TileChunk {
+  int32_t tile, chunk;
+};
+
+/// How the lists are cut into chunks, and in which order work is begun; made by plan_chunks.
 struct ChunkPlan {
   int front;                    ///< front_chunks
   int32_t* chunk_offsets;       ///< [tiles + 1] first chunk of each tile
-  int32_t* chunk_tiles;         ///< [chunks] tile of each chunk
+  TileChunk* chunk_order;       ///< [chunks]
+  int32_t* tile_order;          ///< [tiles]
   int32_t* checkpoint_offsets;  ///< [tiles] place of a tile's first checkpoint, if it has several chunks
-  int32_t* rest;                ///< [rest_count] chunks behind the front ones
+  TileChunk* rest;              ///< [rest_count] chunks behind the front ones
   int32_t* rest_count;
 };
 

@@ -204,11 +204,17 @@ struct Plan {
     const int64_t n = grid.tiles(), full = capacity / cuda::chunk_length(samples);
     max_chunks = full + n;
     max_checkpoints = std::min(full + n, 2 * full);  // tiles with a single chunk have none
-    tiles = at::empty({2 * n + 1}, ints);
-    chunks = at::empty({max_chunks}, ints);
-    rest = at::empty({full + 1}, ints);
-    view = {cuda::front_chunks(grid, samples), tiles.data_ptr<int32_t>(), chunks.data_ptr<int32_t>(), tiles.data_ptr<int32_t>() + n + 1,
-            rest.data_ptr<int32_t>() + 1, rest.data_ptr<int32_t>()};
+    tiles = at::empty({3 * n + 2}, ints);
+    chunks = at::empty({max_chunks, 2}, ints);
+    rest = at::empty({full, 2}, ints);
+    auto* per_tile = tiles.data_ptr<int32_t>();
+    view = {cuda::front_chunks(grid, samples),
+            per_tile,
+            reinterpret_cast<cuda::TileChunk*>(chunks.data_ptr<int32_t>()),
+            per_tile + n + 1,
+            per_tile + 2 * n + 1,
+            reinterpret_cast<cuda::TileChunk*>(rest.data_ptr<int32_t>()),
+            per_tile + 3 * n + 1};
   }
 };
 
