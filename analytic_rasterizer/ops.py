@@ -47,7 +47,8 @@ def _(
             means3D.new_empty(samples, image_height, image_width),
             means3D.new_empty(samples, image_height, image_width, **ints),
             means3D.new_empty(checkpoints),
-            means3D.new_empty(2, **longs),
+            means3D.new_empty((context.new_dynamic_size(), 3) if keep else (0,), **ints),
+            means3D.new_empty(4 if keep else 0, **longs),
         )
     splats, pairs = context.new_dynamic_size(), context.new_dynamic_size()
     return (
@@ -62,6 +63,7 @@ def _(
         means3D.new_empty(samples, image_height, image_width),
         means3D.new_empty(samples, image_height, image_width, **ints),
         means3D.new_empty(0),
+        means3D.new_empty(0, **ints),
         means3D.new_empty(0, **longs),
     )
 

@@ -74,10 +74,12 @@ AR_HD double exp2(double x) { return std::exp2(x); }
 AR_HD float sqrt(float x) { return std::sqrt(x); }
 AR_HD double sqrt(double x) { return std::sqrt(x); }
 
-/// a / b. On a device within 2 ulp, for |b| < 2^126; elsewhere exact.
+/// a / b. On a device within 2 ulp, for |b| in [2^-126, 2^126]; elsewhere exact.
 AR_HD float divide(float a, float b) {
 #if defined(__CUDA_ARCH__)
-  return __fdividef(a, b);
+  float reciprocal;
+  asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(reciprocal) : "f"(b));
+  return a * reciprocal;
 #else
   return a / b;
 #endif

@@ -376,8 +376,9 @@ AR_HD void project_vjp(const Camera<T>& camera, const Gaussians<T>& g, int64_t i
                  out.shs ? out.shs + i * g.sh_stride : nullptr, out);
 }
 
-/// Zero gradient, for a Gaussian that touched no pixel. out.shs is not touched.
-template <typename T> AR_HD void zero_grads(int64_t i, const GaussianGrads<T>& out) {
+/// Zero gradient, for a Gaussian that touched no pixel. Coefficients go to `dL_dsh`, if not null.
+template <typename T>
+AR_HD void zero_grads(const Gaussians<T>& g, int64_t i, const GaussianGrads<T>& out, Vec3<T>* dL_dsh) {
   const Vec3<T> zero = {T(0), T(0), T(0)};
   if (out.means) out.means[i] = zero;
   if (out.scales) out.scales[i] = zero;
@@ -388,10 +389,10 @@ template <typename T> AR_HD void zero_grads(int64_t i, const GaussianGrads<T>& o
   if (out.means2d) {
     for (int k = 0; k < out.means2d_stride; ++k) out.means2d[i * out.means2d_stride + k] = T(0);
   }
+  for (int k = 0; dL_dsh && k < g.sh_stride; ++k) dL_dsh[k] = zero;
 }
 template <typename T> AR_HD void zero_grads(const Gaussians<T>& g, int64_t i, const GaussianGrads<T>& out) {
-  zero_grads(i, out);
-  for (int k = 0; out.shs && k < g.sh_stride; ++k) out.shs[i * g.sh_stride + k] = {T(0), T(0), T(0)};
+  zero_grads(g, i, out, out.shs ? out.shs + i * g.sh_stride : nullptr);
 }
 
 }  // namespace ar

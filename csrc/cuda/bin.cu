@@ -88,102 +88,85 @@ __global__ void __launch_bounds__(kRangeThreads)
   tile_offsets[tile] = low;
 }
 
-constexpr int kPlanThreads = 1024, kPlanTiles = 8;  // tiles per thread and round
-
-struct PlanSums {
-  int chunks, checkpoints, rest;
-  __device__ friend PlanSums operator+(PlanSums a, PlanSums b) {
-    return {a.chunks + b.chunks, a.checkpoints + b.checkpoints, a.rest + b.rest};
-  }
-};
-struct AddPlanSums {
-  __device__ PlanSums operator()(PlanSums a, PlanSums b) const { return a + b; }
-};
+constexpr int kPlanThreads = 256;
 
 /// Work is handed out longest first, so that no block starts on a long piece when the others are
-/// done. Sizes are classed by powers of two; within a class the order does not matter.
+/// done. Lengths are classed by powers of two; within a class the order does not matter.
 struct WorkClasses {
   static constexpr int kCount = 33;
-  int next[kCount];  ///< sizes, then places
 
   __device__ static int of(int length) { return __clz(length); }  // longer first
-  /// Takes a place for a piece of this length; counts pieces before finish(). Lanes of one class go
+  /// Adds a piece of this length to its class and returns how many were there. Lanes of one class go
   /// together: atomics to one place are slow.
-  __device__ int take(int length) {
+  __device__ static int take(int32_t* classes, int length) {
     const uint32_t peers = __match_any_sync(__activemask(), of(length));
     const int leader = __ffs(peers) - 1;
     int first = 0;
-    if (lane_id() == leader) first = atomicAdd(&next[of(length)], __popc(peers));
+    if (lane_id() == leader) first = atomicAdd(&classes[of(length)], __popc(peers));
     return __shfl_sync(peers, first, leader) + __popc(peers & ((1u << lane_id()) - 1));
-  }
-  __device__ int take_many(int length, int pieces) { return atomicAdd(&next[of(length)], pieces); }
-  __device__ void finish() {
-    for (int c = 0, sum = 0; c < kCount; ++c) {
-      const int n = next[c];
-      next[c] = sum;
-      sum += n;
-    }
   }
 };
 
-/// One block walks over all tiles: three running sums, and two orders of work.
+/// Counters of a plan, zero before use.
+struct PlanCounters {
+  int32_t tile_sizes[WorkClasses::kCount], chunk_sizes[WorkClasses::kCount];  // pieces per class
+  int32_t tile_places[WorkClasses::kCount], chunk_places[WorkClasses::kCount];
+};
+static_assert(sizeof(PlanCounters) == kPlanCounters * sizeof(int32_t));
+
+__device__ int list_length(const TileLists& lists, int64_t tile) {
+  if (lists.counts->pairs > lists.capacity) return 1;
+  return int(lists.tile_offsets[tile + 1] - lists.tile_offsets[tile]);
+}
+
 __global__ void __launch_bounds__(kPlanThreads)
-    plan_kernel(const TileLists lists, int64_t tiles, int length, const ChunkPlan plan, int64_t* feedback) {
-  using Scan = cub::BlockScan<PlanSums, kPlanThreads>;
-  __shared__ typename Scan::TempStorage storage;
-  __shared__ WorkClasses tile_classes, chunk_classes;
-  const int64_t total = lists.counts->pairs;
-  const bool overflow = total > lists.capacity;
-  for (int c = threadIdx.x; c < WorkClasses::kCount; c += kPlanThreads) tile_classes.next[c] = chunk_classes.next[c] = 0;
-  __syncthreads();
-  const auto count_of = [&](int64_t tile) {
-    if (tile >= tiles) return 0;
-    return overflow ? 1 : int(lists.tile_offsets[tile + 1] - lists.tile_offsets[tile]);
-  };
-  PlanSums base = {0, 0, 0};
-  for (int64_t round = 0; round < tiles; round += kPlanThreads * kPlanTiles) {
-    const int64_t first = round + threadIdx.x * kPlanTiles;
-    PlanSums own[kPlanTiles], sum = {0, 0, 0}, before, all;
-#pragma unroll
-    for (int t = 0; t < kPlanTiles; ++t) {
-      const int n = count_of(first + t), chunks = (n + length - 1) / length;
-      own[t] = {chunks, chunks > 1 ? chunks : 0, max(chunks - plan.front, 0)};
-      sum = sum + own[t];
-      if (first + t < tiles) tile_classes.take(n);
-      if (n >= length) chunk_classes.take_many(length, n / length);
-      if (n % length) chunk_classes.take(n % length);
+    count_work_kernel(const TileLists lists, int64_t tiles, int length, PlanCounters* counters) {
+  const int64_t tile = int64_t(blockIdx.x) * kPlanThreads + threadIdx.x;
+  if (tile >= tiles) return;
+  const int n = list_length(lists, tile);
+  WorkClasses::take(counters->tile_sizes, n);
+  if (n >= length) atomicAdd(&counters->chunk_sizes[WorkClasses::of(length)], n / length);
+  if (n % length) WorkClasses::take(counters->chunk_sizes, n % length);
+}
+
+/// Places come from atomics: which tile gets which differs from run to run, and changes no result.
+__global__ void __launch_bounds__(kPlanThreads)
+    plan_kernel(const TileLists lists, int64_t tiles, int length, PlanCounters* counters, const ChunkPlan plan,
+                int64_t* feedback) {
+  __shared__ int tile_base[WorkClasses::kCount], chunk_base[WorkClasses::kCount];
+  if (threadIdx.x < 2) {
+    const int32_t* sizes = threadIdx.x == 0 ? counters->tile_sizes : counters->chunk_sizes;
+    int* base = threadIdx.x == 0 ? tile_base : chunk_base;
+    int sum = 0;
+    for (int c = 0; c < WorkClasses::kCount; ++c) {
+      base[c] = sum;
+      sum += sizes[c];
     }
-    Scan(storage).ExclusiveScan(sum, before, PlanSums{0, 0, 0}, AddPlanSums(), all);
-    __syncthreads();
-    before = before + base;
-    base = base + all;
-#pragma unroll
-    for (int t = 0; t < kPlanTiles; ++t) {
-      if (first + t < tiles) {
-        plan.chunk_offsets[first + t] = before.chunks;
-        plan.checkpoint_offsets[first + t] = before.checkpoints;
-      }
-      for (int c = 0; c < own[t].rest; ++c) {
-        plan.rest[before.rest + c] = {int32_t(first + t), plan.front + c};
-      }
-      before = before + own[t];
+    if (blockIdx.x == 0 && threadIdx.x == 1) {
+      lists.counts->chunks = sum;
+      if (feedback) *feedback = lists.counts->pairs;
     }
   }
-  if (threadIdx.x == 0) {
-    plan.chunk_offsets[tiles] = base.chunks;
-    *plan.rest_count = base.rest;
-    if (feedback) *feedback = total;
-    tile_classes.finish();
-    chunk_classes.finish();
-  }
   __syncthreads();
-  for (int64_t tile = threadIdx.x; tile < tiles; tile += kPlanThreads) {
-    const int n = count_of(tile);
-    const int whole = n / length;
-    plan.tile_order[tile_classes.take(n)] = int32_t(tile);
-    const int place = whole > 0 ? chunk_classes.take_many(length, whole) : 0;
-    for (int c = 0; c < whole; ++c) plan.chunk_order[place + c] = {int32_t(tile), c};
-    if (n % length) plan.chunk_order[chunk_classes.take(n % length)] = {int32_t(tile), whole};
+  const int64_t tile = int64_t(blockIdx.x) * kPlanThreads + threadIdx.x;
+  if (tile >= tiles) return;
+  const int n = list_length(lists, tile), whole = n / length, chunks = (n + length - 1) / length;
+  plan.tile_order[tile_base[WorkClasses::of(n)] + WorkClasses::take(counters->tile_places, n)] = int32_t(tile);
+  const int checkpoint = chunks > 1 ? atomicAdd(&lists.counts->checkpoints, chunks) : 0;
+  plan.checkpoint_offsets[tile] = checkpoint;
+  const auto part = [&](int chunk) { return TileChunk{int32_t(tile), chunk, checkpoint + chunk}; };
+  if (whole > 0) {
+    const int c = WorkClasses::of(length);
+    TileChunk* order = plan.chunk_order + chunk_base[c] + atomicAdd(&counters->chunk_places[c], whole);
+    for (int chunk = 0; chunk < whole; ++chunk) order[chunk] = part(chunk);
+  }
+  if (n % length) {
+    const int c = WorkClasses::of(n % length);
+    plan.chunk_order[chunk_base[c] + WorkClasses::take(counters->chunk_places, n % length)] = part(whole);
+  }
+  if (chunks > plan.front) {
+    TileChunk* rest = plan.rest + atomicAdd(&lists.counts->rest, chunks - plan.front);
+    for (int chunk = plan.front; chunk < chunks; ++chunk) rest[chunk - plan.front] = part(chunk);
   }
 }
 
@@ -191,7 +174,6 @@ template <class Value>
 void sort_values(const TileSort<Value>& task, TileGrid grid, uint32_t* memory, cudaStream_t stream) {
   const int passes = tile_passes(grid);
   const SortScratch scratch(memory, task.capacity, passes);
-  cudaMemsetAsync(memory, 0, SortScratch::words(task.capacity, passes) * sizeof *memory, stream);
   const auto count = [&](auto kernel) {
     kernel<<<kCountBlocks, kCountThreads, 0, stream>>>(task.tiles[0], task.counts, task.capacity, scratch.histograms);
   };
@@ -225,8 +207,6 @@ int tile_sort_result(TileGrid grid) { return tile_passes(grid) % 2; }
 
 void count_depths(const DepthSort& task, void* memory, cudaStream_t stream) {
   const SortScratch scratch(static_cast<uint32_t*>(memory), task.n, kDepthPasses);
-  cudaMemsetAsync(memory, 0, depth_sort_scratch(task.n), stream);
-  cudaMemsetAsync(task.counts, 0, sizeof *task.counts, stream);
   if (task.n == 0) return;
   count_depths_kernel<<<kCountBlocks, kCountThreads, 0, stream>>>(task.keys[0], task.ranges, task.n,
                                                                    scratch.histograms, task.counts);
@@ -254,7 +234,12 @@ void sort_by_tile(const TileSort<SlotPair>& task, TileGrid grid, void* scratch, 
 
 void plan_chunks(const TileLists& lists, TileGrid grid, int samples, const ChunkPlan& plan, int64_t* feedback,
                  cudaStream_t stream) {
-  plan_kernel<<<1, kPlanThreads, 0, stream>>>(lists, grid.tiles(), chunk_length(samples), plan, feedback);
+  const int64_t tiles = grid.tiles();
+  const int length = chunk_length(samples);
+  auto* counters = reinterpret_cast<PlanCounters*>(plan.counters);
+  count_work_kernel<<<blocks_of(tiles, kPlanThreads), kPlanThreads, 0, stream>>>(lists, tiles, length, counters);
+  plan_kernel<<<blocks_of(tiles, kPlanThreads), kPlanThreads, 0, stream>>>(lists, tiles, length, counters, plan,
+                                                                            feedback);
 }
 
 }  // namespace ar::cuda

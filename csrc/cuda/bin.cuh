@@ -97,7 +97,6 @@ template <class F> __global__ void __launch_bounds__(kEmitThreads) emit_pairs_ke
 
 template <class F> void emit_pairs(const EmitTask& task, cudaStream_t stream) {
   if (task.n == 0) return;
-  cudaMemsetAsync(task.status, 0, emit_scratch(task.n), stream);
   emit_pairs_kernel<F><<<blocks_of(task.n, kEmitThreads), kEmitThreads, 0, stream>>>(task);
 }
 

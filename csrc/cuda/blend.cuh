@@ -12,6 +12,8 @@
 // bits depend on nothing but the lists.
 #pragma once
 
+#include <type_traits>
+
 #include "core/bin.h"
 #include "core/blend.h"
 #include "cuda/tasks.h"
@@ -69,6 +71,10 @@ template <class F> struct alignas(16) TileSplat {
   Vec3<float> color;
 };
 
+/// A splat while pixels are at it: copied to registers, unless it has too many numbers.
+template <class F>
+using Held = std::conditional_t<sizeof(TileSplat<F>) <= 96, const TileSplat<F>, const TileSplat<F>&>;
+
 template <class F> __device__ TileSplat<F> tile_splat(const Splat<F, float>& splat, const TileList& list) {
   return {F::terms(splat.shape, splat.opacity, {float(list.x0) - splat.mean.x, float(list.y0) - splat.mean.y}),
           splat.color};
@@ -109,7 +115,7 @@ __device__ __forceinline__ void composite(const TileSplat<F>* splats, uint32_t m
                                           PixelState<F::kSamples, kColors>& state) {
   for (; mask != 0; mask &= mask - 1) {
     const int j = __ffs(mask) - 1;
-    const TileSplat<F>& splat = splats[j];
+    Held<F> splat = splats[j];
     float contribution = 0;
 #pragma unroll
     for (int s = 0; s < F::kSamples; ++s) {
@@ -119,7 +125,7 @@ __device__ __forceinline__ void composite(const TileSplat<F>* splats, uint32_t m
                                     madd(b.contribution, splat.color.y, state.color[s % kColors].y),
                                     madd(b.contribution, splat.color.z, state.color[s % kColors].z)};
       } else {
-        contribution += b.contribution;
+        contribution = s == 0 ? b.contribution : contribution + b.contribution;
       }
       state.last[s] = b.mask ? index + j + 1 : state.last[s];
     }
@@ -154,7 +160,7 @@ template <class F> struct Stage {
     const int warp = threadIdx.x / 32;
     for (int k = 0; k < count; k += 32) {
       for (uint32_t mask = __ballot_sync(kAllLanes, reach[k + lane_id()] >> warp & 1); mask != 0; mask &= mask - 1) {
-        const TileSplat<F>& splat = splats[k + __ffs(mask) - 1];
+        Held<F> splat = splats[k + __ffs(mask) - 1];
 #pragma unroll
         for (int s = 0; s < F::kSamples; ++s) {
           const float alpha = F::alpha(splat.terms, p, s);
@@ -278,7 +284,7 @@ template <class F> __global__ void __launch_bounds__(kBlendThreads) rest_through
   __shared__ Stage<F> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.lists.splats);
   const Vec2<float> p = pixel_of(threadIdx.x / 32, lane_id());
-  const int items = *task.plan.rest_count;
+  const int items = task.lists.counts->rest;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const TileChunk rest = task.plan.rest[item];
     if (!task.tile_open[rest.tile]) continue;
@@ -303,13 +309,17 @@ template <class F> __global__ void __launch_bounds__(kBlendThreads) rest_through
 /// stopped before. The reserve over the minimum absorbs that products of chunks round differently.
 inline constexpr float kNearlyStopped = float(kTransmittanceMin * (1 + kAlphaMin / 2));
 
+__device__ inline int chunks_of(const BlendTask& task, int tile, int length) {
+  return int((task.lists.tile_offsets[tile + 1] - task.lists.tile_offsets[tile] + length - 1) / length);
+}
+
 /// Turns the transmittance of each chunk into the one in front of it, negative where a sample has
 /// stopped before.
 template <int S> __global__ void __launch_bounds__(kTilePixels) rest_scan_kernel(const BlendTask task) {
   const int tile = blockIdx.x / S, s = blockIdx.x % S;
   if (!task.tile_open[tile]) return;
   const PixelCheckpoints<S> checkpoints(task, tile, threadIdx.x);
-  const int chunks = task.plan.chunk_offsets[tile + 1] - task.plan.chunk_offsets[tile];
+  const int chunks = chunks_of(task, tile, chunk_length(S));
   float transmittance = checkpoints.at(task.plan.front - 1, s).transmittance;
 #pragma unroll 8
   for (int c = task.plan.front; c < chunks; ++c) {
@@ -327,7 +337,7 @@ template <class F, bool kKeep> __global__ void __launch_bounds__(kBlendThreads) 
   __shared__ Stage<F> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.lists.splats);
   const Vec2<float> p = pixel_of(threadIdx.x / 32, lane_id());
-  const int items = *task.plan.rest_count;
+  const int items = task.lists.counts->rest;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const TileChunk rest = task.plan.rest[item];
     if (!task.tile_open[rest.tile]) continue;
@@ -368,7 +378,7 @@ template <int S, bool kKeep> __global__ void __launch_bounds__(kTilePixels) rest
   const int tile = blockIdx.x;
   if (!task.tile_open[tile]) return;
   const PixelCheckpoints<S> checkpoints(task, tile, threadIdx.x);
-  const int chunks = task.plan.chunk_offsets[tile + 1] - task.plan.chunk_offsets[tile];
+  const int chunks = chunks_of(task, tile, chunk_length(S));
   const Vec3<float> bg = {task.background[0], task.background[1], task.background[2]};
   PixelState<S, 1> state;
   state.start(false);
@@ -436,8 +446,8 @@ template <class F, bool kAbs> __global__ void __launch_bounds__(32 * kVjpWarps<F
   VjpStage<F>& stage = reinterpret_cast<VjpStage<F>*>(shared)[threadIdx.x / 32];
   const int lane = lane_id();
   const int64_t item = int64_t(blockIdx.x) * kVjpWarps<F> + threadIdx.x / 32;
-  if (item >= task.plan.chunk_offsets[task.grid.tiles()]) return;
-  const auto [tile, chunk] = task.plan.chunk_order[item];
+  if (item >= task.lists.counts->chunks) return;
+  const auto [tile, chunk, checkpoint] = task.chunk_order[item];
   const TileList list = list_of(task.lists, task.grid, tile);
   const int begin = chunk * kLength, end = list.overflow ? list.count : min(list.count, begin + kLength);
   const int64_t plane = int64_t(task.grid.width) * task.grid.height;
@@ -467,8 +477,7 @@ template <class F, bool kAbs> __global__ void __launch_bounds__(32 * kVjpWarps<F
   if (begin >= tile_last) return;
 
   const bool final = tile_last <= end;
-  const Checkpoint* checkpoints =
-      task.checkpoints + (int64_t(task.plan.checkpoint_offsets[tile]) + chunk) * S * kTilePixels;
+  const Checkpoint* checkpoints = task.checkpoints + int64_t(checkpoint) * S * kTilePixels;
 #pragma unroll
   for (int b = 0; b < kSubtiles; ++b) {
     const int64_t i = pixel_index(b);
@@ -496,6 +505,9 @@ template <class F, bool kAbs> __global__ void __launch_bounds__(32 * kVjpWarps<F
   }
 
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.lists.splats);
+  const Vec2<float> p0 = pixel_of(0, lane);
+  constexpr int kTwo23 = 0x4b000000;
+  const int value = lane % 4 == 0 ? lane / 4 : lane == 2 ? 8 : -1;  // that sum_nine leaves here
   for (int k1 = min(end, tile_last); k1 > begin; k1 -= 32) {
     const int k0 = max(k1 - 32, begin), k = k0 + lane;
     uint32_t reach = 0;
@@ -515,7 +527,7 @@ template <class F, bool kAbs> __global__ void __launch_bounds__(32 * kVjpWarps<F
     __syncwarp();
     for (int j = k1 - k0 - 1; j >= 0; --j) {
       uint32_t hit = __shfl_sync(kAllLanes, reach, j);
-      const TileSplat<F>& splat = stage.splats[j];
+      Held<F> splat = stage.splats[j];
       const Mat2<float> m = !kAbs ? mean_map
                                   : Mat2<float>{__shfl_sync(kAllLanes, mean_map.xx, j), __shfl_sync(kAllLanes, mean_map.xy, j),
                                                 __shfl_sync(kAllLanes, mean_map.yx, j), __shfl_sync(kAllLanes, mean_map.yy, j)};
@@ -525,7 +537,10 @@ template <class F, bool kAbs> __global__ void __launch_bounds__(32 * kVjpWarps<F
       Vec2<float> abs2d = {0, 0};
       for (; hit != 0; hit &= hit - 1) {
         const int b = __ffs(hit) - 1, q = b * 32 + lane;
-        const Vec2<float> p = pixel_of(b, lane);
+        // pixel_of(b, lane); an integer below 2^23 set into the mantissa of 2^23 is a float to be
+        const float column = __int_as_float(kTwo23 | (b & 1)) - 8388608.0f;
+        const float band = __int_as_float(kTwo23 | (b >> 1)) - 8388608.0f;
+        const Vec2<float> p = {madd(8.0f, column, p0.x), madd(4.0f, band, p0.y)};
         const float4 g = stage.g[q];
         const float g_color = madd(g.x, splat.color.x, madd(g.y, splat.color.y, g.z * splat.color.z));
         float contribution = 0;
@@ -534,14 +549,14 @@ template <class F, bool kAbs> __global__ void __launch_bounds__(32 * kVjpWarps<F
         for (int s = 0; s < S; ++s) {
           const float alpha = F::alpha(splat.terms, p, s);
           const bool mask = alpha >= float(kAlphaMin) && k0 + j < stage.last_of(s, q, g);
-          if (!__any_sync(kAllLanes, mask)) continue;
+          if (s == 0 && S == 1 && !__any_sync(kAllLanes, mask)) break;
           auto sample = stage.samples[s][q];
           const BlendGrad<float> grad = blend_sample_vjp(mask, alpha, g_color, sample.transmittance, sample.behind);
           stage.samples[s][q] = sample;
-          contribution += grad.contribution;
-          weighted += grad.dL_dalpha * alpha;
           const ShapeGrad<float> one = F::alpha_vjp(splat.terms, p, s, alpha, grad.dL_dalpha);
-          offset = offset + one.offset;
+          contribution = s == 0 ? grad.contribution : contribution + grad.contribution;
+          weighted += grad.dL_dalpha * alpha;
+          offset = s == 0 ? one.offset : offset + one.offset;
           shape.shape = shape.shape + one.shape;
         }
         shape.offset = shape.offset + offset;
@@ -554,7 +569,6 @@ template <class F, bool kAbs> __global__ void __launch_bounds__(32 * kVjpWarps<F
       const float values[9] = {shape.offset.x, shape.offset.y, shape.shape.xx, shape.shape.xy, shape.shape.yy,
                                weighted,       color.x,        color.y,        color.z};
       const float sum = sum_nine(values);
-      const int value = lane % 4 == 0 ? lane / 4 : lane == 2 ? 8 : -1;
       float* row = task.pair_grads + int64_t(__shfl_sync(kAllLanes, row_index, j)) * kPairGradWidth;
       const auto put = [&](int v, float x) {
         if (list.overflow) {
@@ -583,7 +597,8 @@ template <class F> __global__ void clear_splat_grads_kernel(const BlendVjpTask t
 
 template <class F, bool kAbs> void launch_blend_vjp(const BlendVjpTask& task, cudaStream_t stream) {
   const size_t bytes = sizeof(VjpStage<F>) * kVjpWarps<F>;
-  cudaFuncSetAttribute(blend_vjp_kernel<F, kAbs>, cudaFuncAttributeMaxDynamicSharedMemorySize, int(bytes));
+  if (bytes > 48 * 1024)
+    cudaFuncSetAttribute(blend_vjp_kernel<F, kAbs>, cudaFuncAttributeMaxDynamicSharedMemorySize, int(bytes));
   clear_splat_grads_kernel<F><<<kRestBlocks, kBlendThreads, 0, stream>>>(task);
   blend_vjp_kernel<F, kAbs>
       <<<blocks_of(task.max_chunks, kVjpWarps<F>), 32 * kVjpWarps<F>, bytes, stream>>>(task);

@@ -91,12 +91,7 @@ template <class F> __global__ void __launch_bounds__(kProjectThreads) project_ke
   }
   if (i >= g.n) return;
   auto* splats = reinterpret_cast<Splat<F, float>*>(task.splats);
-  if (radius > 0) {
-    splats[i] = splat;
-  } else {
-    splats[i].level = 0;
-  }
-  // A splat that touches a tile has a radius: it is at least as wide as its pixel.
+  if (radius > 0) splats[i] = splat;
   task.keys[i] = count > 0 ? __float_as_uint(depth) : kCulledKey;
   task.ranges[i] = {0, count};
   task.radii[i] = radius;
@@ -148,6 +143,11 @@ __device__ inline SplatSums sum_pairs(const ProjectVjpTask& task, PairRange rang
   return sums;
 }
 
+/// Zeros, with neighbouring lanes at neighbouring addresses.
+__device__ inline void zero_rows(float* to, int count) {
+  for (int e = lane_id(); e < count; e += 32) to[e] = 0;
+}
+
 template <class F> __global__ void __launch_bounds__(kProjectThreads, 5) project_vjp_kernel(const ProjectVjpTask task) {
   __shared__ ShRows sh_rows[kProjectThreads / 32];
   const Gaussians<float>& g = task.gaussians;
@@ -156,13 +156,17 @@ template <class F> __global__ void __launch_bounds__(kProjectThreads, 5) project
   if (first >= g.n) return;
   const PairRange range = i < g.n ? task.ranges[i] : PairRange{0, 0};
   const uint32_t lit = __ballot_sync(kAllLanes, range.count > 0);
+  const int n = int(min(int64_t(32), g.n - first));
+  const GaussianGrads<float>& out = task.grads;
   if (lit == 0) {
-    if (i < g.n) zero_grads(i, task.grads);
-    if (task.grads.shs) {
-      float* shs = &task.grads.shs[first * g.sh_stride].x;
-      const int64_t width = 3 * g.sh_stride * min(int64_t(32), g.n - first);
-      for (int64_t e = lane_id(); e < width; e += 32) shs[e] = 0;
-    }
+    if (out.means) zero_rows(&out.means[first].x, 3 * n);
+    if (out.scales) zero_rows(&out.scales[first].x, 3 * n);
+    if (out.rotations) zero_rows(&out.rotations[first].x, 4 * n);
+    if (out.cov3ds) zero_rows(&out.cov3ds[first].xx, 6 * n);
+    if (out.opacities) zero_rows(out.opacities + first, n);
+    if (out.colors) zero_rows(&out.colors[first].x, 3 * n);
+    if (out.means2d) zero_rows(out.means2d + first * out.means2d_stride, out.means2d_stride * n);
+    if (out.shs) zero_rows(&out.shs[first * g.sh_stride].x, 3 * g.sh_stride * n);
     return;
   }
   ShRows& rows = sh_rows[threadIdx.x / 32];
@@ -175,19 +179,18 @@ template <class F> __global__ void __launch_bounds__(kProjectThreads, 5) project
   }
   const Camera<float> camera = load_camera(task.camera);
   // Longer rows than the largest degree's hold coefficients without influence.
-  const bool staged = task.grads.shs && g.sh_stride <= kMaxShCount;
-  Vec3<float>* dL_dsh = staged ? rows.row() : task.grads.shs ? task.grads.shs + i * g.sh_stride : nullptr;
+  const bool staged = out.shs && g.sh_stride <= kMaxShCount;
+  Vec3<float>* dL_dsh = staged ? rows.row() : out.shs ? out.shs + i * g.sh_stride : nullptr;
   if (range.count > 0) {
-    ar::project_vjp<F>(camera, g, i, task.options, sums.grad(), rows.row(), dL_dsh, task.grads);
-    if (task.grads.means2d && task.grads.means2d_stride == 4) {
-      task.grads.means2d[i * 4 + 2] = 0.5f * camera.size.x * sums.value[9];
-      task.grads.means2d[i * 4 + 3] = 0.5f * camera.size.y * sums.value[10];
+    ar::project_vjp<F>(camera, g, i, task.options, sums.grad(), rows.row(), dL_dsh, out);
+    if (out.means2d && out.means2d_stride == 4) {
+      out.means2d[i * 4 + 2] = 0.5f * camera.size.x * sums.value[9];
+      out.means2d[i * 4 + 3] = 0.5f * camera.size.y * sums.value[10];
     }
   } else if (i < g.n) {
-    zero_grads(i, task.grads);
-    for (int k = 0; dL_dsh && k < g.sh_stride; ++k) dL_dsh[k] = {0, 0, 0};
+    zero_grads(g, i, out, dL_dsh);
   }
-  if (staged) rows.store(task.grads.shs + first * g.sh_stride, g.sh_stride, int(min(int64_t(32), g.n - first)));
+  if (staged) rows.store(out.shs + first * g.sh_stride, g.sh_stride, n);
 }
 
 template <class F> void project_vjp(const ProjectVjpTask& task, cudaStream_t stream) {

@@ -45,7 +45,9 @@ struct alignas(8) SlotPair {
 
 /// What the device finds out.
 struct Counts {
-  int64_t pairs, splats;  ///< splats: with pairs
+  int64_t pairs, splats;               ///< splats: with pairs
+  int32_t chunks, checkpoints, rest;   ///< of the plan
+  int32_t unused;
 };
 
 /// Color and transmittance of a pixel's sample at the end of a chunk.
@@ -58,7 +60,7 @@ struct ProjectTask {
   CameraView<float> camera;
   Gaussians<float> gaussians;
   FootprintOptions options;
-  float* splats;      ///< [n] Splat<F, float>; only the level of those with radius 0
+  float* splats;      ///< [n] Splat<F, float>; nothing of those with radius 0
   uint32_t* keys;     ///< [n] in the order of depth
   PairRange* ranges;  ///< [n] count
   int32_t* radii;     ///< [n]
@@ -72,7 +74,7 @@ struct EmitTask {
   const Counts* counts;
   const int32_t* order;  ///< [counts->splats] splats by depth
   PairRange* ranges;     ///< [n] first
-  uint32_t* status;      ///< emit_scratch(n) bytes
+  uint32_t* status;      ///< emit_scratch(n) bytes, zero
   uint32_t* tiles;       ///< [capacity] tile of each pair
   int32_t* splat_pairs;  ///< [capacity] splat of each pair, or null:
   SlotPair* slot_pairs;  ///< [capacity] the same with its slot, for a backward pass
@@ -85,23 +87,25 @@ struct TileLists {
   int stride;                   ///< 1, or 2 with slots
   const int64_t* tile_offsets;  ///< [tiles + 1]
   const int32_t* order;         ///< [counts->splats] all splats with pairs by depth
-  const Counts* counts;
+  Counts* counts;
   int64_t n, capacity;
 };
 
-struct alignas(8) TileChunk {
+inline constexpr int kPlanCounters = 4 * 33;
+
+struct TileChunk {
   int32_t tile, chunk;
+  int32_t checkpoint;  ///< place of the chunk's checkpoint, if the tile has several chunks
 };
 
 /// How the lists are cut into chunks, and in which order work is begun; made by plan_chunks.
 struct ChunkPlan {
   int front;                    ///< front_chunks
-  int32_t* chunk_offsets;       ///< [tiles + 1] first chunk of each tile
-  TileChunk* chunk_order;       ///< [chunks]
+  TileChunk* chunk_order;       ///< [counts->chunks]
   int32_t* tile_order;          ///< [tiles]
   int32_t* checkpoint_offsets;  ///< [tiles] place of a tile's first checkpoint, if it has several chunks
-  TileChunk* rest;              ///< [rest_count] chunks behind the front ones
-  int32_t* rest_count;
+  TileChunk* rest;              ///< [counts->rest] chunks behind the front ones
+  int32_t* counters;            ///< [kPlanCounters] scratch, zero
 };
 
 struct BlendTask {
@@ -118,7 +122,7 @@ struct BlendTask {
 
 struct BlendVjpTask {
   TileLists lists;
-  ChunkPlan plan;
+  const TileChunk* chunk_order;
   TileGrid grid;
   int64_t max_chunks;
   const float* background;
@@ -176,7 +180,7 @@ const BackwardStages* find_backward(std::string_view footprint);
 /// Most pairs that can be sorted.
 int64_t max_pairs();
 
-/// Bytes of scratch memory.
+/// Bytes of scratch memory, all of which must be zero.
 int64_t depth_sort_scratch(int64_t n);
 int64_t tile_sort_scratch(int64_t capacity, TileGrid grid);
 inline constexpr int kEmitThreads = 256;
@@ -190,7 +194,7 @@ struct DepthSort {
   const PairRange* ranges;
   Counts* counts;
 };
-/// First writes the counts, then sorts.
+/// First adds to the counts, then sorts.
 void count_depths(const DepthSort& task, void* scratch, cudaStream_t stream);
 void sort_by_depth(const DepthSort& task, void* scratch, cudaStream_t stream);
 

@@ -123,7 +123,8 @@ RasterizeOutput rasterize_cpu(const Tensor& means3D, const OptionalTensor& means
     const BlendedImage image = blend(in, projected, binned, stages, keep);
     out = {image.color,         projected.radii,      projected.splats, projected.ids,       binned.pairs,
            binned.tile_offsets, binned.splat_offsets, binned.positions, image.transmittance, image.last,
-           at::empty({0}, in.means3D.options()), at::empty({0}, binned.tile_offsets.options())};
+           at::empty({0}, in.means3D.options()), at::empty({0}, binned.pairs.options()),
+           at::empty({0}, binned.tile_offsets.options())};
   });
   return out;
 }
@@ -186,7 +187,7 @@ Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const Op
                         double tanfovx, double tanfovy, double scale_modifier, int64_t sh_degree, std::string footprint,
                         double variance, const Tensor& splats, const Tensor& ids, const Tensor& pairs,
                         const Tensor& tile_offsets, const Tensor& splat_offsets, const Tensor& positions,
-                        const Tensor& transmittance, const Tensor& last, const Tensor&, const Tensor&,
+                        const Tensor& transmittance, const Tensor& last, const Tensor&, const Tensor&, const Tensor&,
                         std::array<bool, 8> needs, bool) {
   Inputs in{means3D,       opacities, means2D,        shs,        colors_precomp, scales,       rotations,
             cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,

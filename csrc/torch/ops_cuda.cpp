@@ -78,6 +78,24 @@ class PairGuess {
 /// For tests: capacity of the next frames instead of a guess; 0 for guesses again.
 int64_t forced_capacity = 0;
 
+/// Memory that must be zero, cleared in one go; and what the device counts.
+struct Scratch {
+  Tensor memory, counts;
+  std::byte *depth_sort, *emit, *plan;
+
+  Scratch(int64_t n, const Tensor& like, const CUDAStream& stream) {
+    const int64_t sort = cuda::depth_sort_scratch(n), total = sort + cuda::emit_scratch(n) + cuda::kPlanCounters * 4;
+    memory = at::empty({total}, like.options().dtype(at::kByte));
+    counts = at::empty({int64_t(sizeof(cuda::Counts) / sizeof(int64_t))}, like.options().dtype(at::kLong));
+    depth_sort = static_cast<std::byte*>(memory.data_ptr());
+    emit = depth_sort + sort;
+    plan = emit + cuda::emit_scratch(n);
+    C10_CUDA_CHECK(cudaMemsetAsync(memory.data_ptr(), 0, total, stream));
+    C10_CUDA_CHECK(cudaMemsetAsync(counts.data_ptr(), 0, sizeof(cuda::Counts), stream));
+  }
+  cuda::Counts* counts_view() const { return reinterpret_cast<cuda::Counts*>(counts.data_ptr<int64_t>()); }
+};
+
 struct Projected {
   Tensor splats, keys, ranges, radii;
 };
@@ -100,7 +118,7 @@ Projected project(const Inputs& in, const cuda::ForwardStages& stages, const CUD
 }
 
 struct Binned {
-  Tensor order, pairs, tile_offsets, counts;
+  Tensor order, pairs, tile_offsets;
   int64_t capacity;
 };
 
@@ -112,7 +130,9 @@ void make_pairs(cuda::EmitTask emit, Value* const (&values)[2], int64_t* tile_of
   emit.tiles = tile;
   stages.emit_pairs(emit, stream);
   check_stage("emit_pairs", stream, debug);
-  const Tensor scratch = at::empty({cuda::tile_sort_scratch(emit.capacity, emit.grid)}, tiles.options().dtype(at::kByte));
+  const int64_t bytes = cuda::tile_sort_scratch(emit.capacity, emit.grid);
+  const Tensor scratch = at::empty({bytes}, tiles.options().dtype(at::kByte));
+  C10_CUDA_CHECK(cudaMemsetAsync(scratch.data_ptr(), 0, bytes, stream));
   cuda::sort_by_tile(cuda::TileSort<Value>{emit.capacity, emit.counts, {tile, tile + emit.capacity},
                                            {values[0], values[1]}, tile_offsets},
                      emit.grid, scratch.data_ptr(), stream);
@@ -122,10 +142,10 @@ void make_pairs(cuda::EmitTask emit, Value* const (&values)[2], int64_t* tile_of
 /// `exact`: make room for the pairs there are, not for a guess. `feedback` receives where the device
 /// is to leave their number for the guess of the next frame.
 Binned bin(const Inputs& in, const Projected& projected, const cuda::ForwardStages& stages, const CUDAStream& stream,
-           bool keep, bool exact, bool debug, int64_t*& feedback) {
+           const Scratch& scratch, bool keep, bool exact, bool debug, int64_t*& feedback) {
   const int64_t n = in.count();
   const TileGrid grid = grid_of(in);
-  const auto ints = projected.radii.options(), longs = ints.dtype(at::kLong), bytes = ints.dtype(at::kByte);
+  const auto ints = projected.radii.options(), longs = ints.dtype(at::kLong);
   auto* ranges = reinterpret_cast<cuda::PairRange*>(projected.ranges.data_ptr<int32_t>());
   int64_t capacity = 0;
   {
@@ -135,17 +155,16 @@ Binned bin(const Inputs& in, const Projected& projected, const cuda::ForwardStag
     feedback = guess.feedback();
   }
   Binned out;
-  const Tensor order = at::empty({2, n}, ints), scratch = at::empty({cuda::depth_sort_scratch(n)}, bytes);
-  out.order = order[0];
-  out.counts = at::empty({2}, longs);
-  auto* counts = reinterpret_cast<cuda::Counts*>(out.counts.data_ptr<int64_t>());
+  out.order = at::empty({n}, ints);
+  const Tensor other = at::empty({n}, ints);
+  auto* counts = scratch.counts_view();
   auto* keys = reinterpret_cast<uint32_t*>(projected.keys.data_ptr<int32_t>());
   const cuda::DepthSort by_depth = {
-      n, {keys, keys + n}, {order.data_ptr<int32_t>(), order.data_ptr<int32_t>() + n}, ranges, counts};
-  cuda::count_depths(by_depth, scratch.data_ptr(), stream);
+      n, {keys, keys + n}, {out.order.data_ptr<int32_t>(), other.data_ptr<int32_t>()}, ranges, counts};
+  cuda::count_depths(by_depth, scratch.depth_sort, stream);
   check_stage("count_depths", stream, debug);
   if (capacity == 0) {
-    const int64_t pairs = out.counts[0].item<int64_t>();
+    const int64_t pairs = scratch.counts[0].item<int64_t>();
     std::lock_guard lock(PairGuess::mutex());
     PairGuess& guess = PairGuess::of(in.means3D.get_device(), grid);
     guess.exact(n, pairs);
@@ -153,9 +172,8 @@ Binned bin(const Inputs& in, const Projected& projected, const cuda::ForwardStag
     capacity = std::clamp<int64_t>(pairs, 1, cuda::max_pairs());
   }
   out.capacity = capacity;
-  cuda::sort_by_depth(by_depth, scratch.data_ptr(), stream);
+  cuda::sort_by_depth(by_depth, scratch.depth_sort, stream);
   check_stage("sort_by_depth", stream, debug);
-  const Tensor status = at::empty({cuda::emit_scratch(n)}, bytes);
   cuda::EmitTask emit{};
   emit.splats = projected.splats.const_data_ptr<float>();
   emit.n = n;
@@ -164,7 +182,7 @@ Binned bin(const Inputs& in, const Projected& projected, const cuda::ForwardStag
   emit.counts = counts;
   emit.order = out.order.const_data_ptr<int32_t>();
   emit.ranges = ranges;
-  emit.status = reinterpret_cast<uint32_t*>(status.data_ptr());
+  emit.status = reinterpret_cast<uint32_t*>(scratch.emit);
   Tensor tiles = at::empty({2, capacity}, ints);
   out.tile_offsets = at::empty({grid.tiles() + 1}, longs);
   const Tensor first = at::empty({capacity, keep ? 2 : 1}, ints), second = at::empty_like(first);
@@ -189,55 +207,55 @@ cuda::TileLists lists_of(const Tensor& splats, const Tensor& order, const Tensor
           int(pairs.size(1)),
           tile_offsets.const_data_ptr<int64_t>(),
           order.const_data_ptr<int32_t>(),
-          reinterpret_cast<const cuda::Counts*>(counts.const_data_ptr<int64_t>()),
+          reinterpret_cast<cuda::Counts*>(counts.data_ptr<int64_t>()),
           order.size(0),
           pairs.size(0)};
 }
 
-/// Memory of a plan.
+/// Memory of a plan. The backward pass goes on with the chunks that the forward pass made: (n, 3) tile,
+/// chunk and checkpoint, longest first.
 struct Plan {
-  Tensor tiles, chunks, rest;
-  int64_t max_chunks, max_checkpoints;
+  Tensor chunks, checkpoint_offsets, tile_order, rest;
+  int64_t max_checkpoints;
   cuda::ChunkPlan view;
 
-  Plan(TileGrid grid, int64_t capacity, int samples, const at::TensorOptions& ints) {
+  Plan(TileGrid grid, int64_t capacity, int samples, const at::TensorOptions& ints, std::byte* counters) {
     const int64_t n = grid.tiles(), full = capacity / cuda::chunk_length(samples);
-    max_chunks = full + n;
     max_checkpoints = std::min(full + n, 2 * full);  // tiles with a single chunk have none
-    tiles = at::empty({3 * n + 2}, ints);
-    chunks = at::empty({max_chunks, 2}, ints);
-    rest = at::empty({full, 2}, ints);
-    auto* per_tile = tiles.data_ptr<int32_t>();
+    chunks = at::empty({full + n, 3}, ints);
+    checkpoint_offsets = at::empty({n}, ints);
+    tile_order = at::empty({n}, ints);
+    rest = at::empty({full + 1, 3}, ints);
     view = {cuda::front_chunks(grid, samples),
-            per_tile,
             reinterpret_cast<cuda::TileChunk*>(chunks.data_ptr<int32_t>()),
-            per_tile + n + 1,
-            per_tile + 2 * n + 1,
+            tile_order.data_ptr<int32_t>(),
+            checkpoint_offsets.data_ptr<int32_t>(),
             reinterpret_cast<cuda::TileChunk*>(rest.data_ptr<int32_t>()),
-            per_tile + 3 * n + 1};
+            reinterpret_cast<int32_t*>(counters)};
   }
 };
 
 struct BlendedImage {
-  Tensor color, transmittance, last, checkpoints;
+  Tensor color, transmittance, last, checkpoints, chunks;
 };
 
 BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& binned,
-                   const cuda::ForwardStages& stages, const CUDAStream& stream, bool keep, bool debug,
-                   int64_t* feedback) {
+                   const cuda::ForwardStages& stages, const CUDAStream& stream, const Scratch& scratch, bool keep,
+                   bool debug, int64_t* feedback) {
   const auto floats = in.means3D.options(), ints = floats.dtype(at::kInt);
   const TileGrid grid = grid_of(in);
   const int64_t samples = keep ? stages.samples : 0;
-  const Plan plan(grid, binned.capacity, stages.samples, ints);
+  const Plan plan(grid, binned.capacity, stages.samples, ints, scratch.plan);
   const cuda::TileLists lists =
-      lists_of(projected.splats, binned.order, binned.pairs, binned.tile_offsets, binned.counts);
+      lists_of(projected.splats, binned.order, binned.pairs, binned.tile_offsets, scratch.counts);
   cuda::plan_chunks(lists, grid, stages.samples, plan.view, feedback, stream);
   check_stage("plan_chunks", stream, debug);
   const Tensor tile_open = at::empty({grid.tiles()}, ints);
   BlendedImage out{at::empty({3, in.image_height, in.image_width}, floats),
                    at::empty({samples, in.image_height, in.image_width}, floats),
                    at::empty({samples, in.image_height, in.image_width}, ints),
-                   at::empty({plan.max_checkpoints, stages.samples, kTile * kTile, 4}, floats)};
+                   at::empty({plan.max_checkpoints, stages.samples, kTile * kTile, 4}, floats),
+                   plan.chunks};
   stages.blend({lists, plan.view, grid, in.background.const_data_ptr<float>(), tile_open.data_ptr<int32_t>(),
                 reinterpret_cast<cuda::Checkpoint*>(out.checkpoints.data_ptr<float>()), out.color.data_ptr<float>(),
                 keep ? out.transmittance.data_ptr<float>() : nullptr, keep ? out.last.data_ptr<int32_t>() : nullptr},
@@ -262,9 +280,10 @@ RasterizeOutput rasterize_cuda(const Tensor& means3D, const OptionalTensor& mean
   const CUDAStream stream = c10::cuda::getCurrentCUDAStream();
   const bool exact = at::globalContext().deterministicAlgorithms();
   int64_t* feedback = nullptr;
+  const Scratch scratch(in.count(), means3D, stream);
   const Projected projected = project(in, stages, stream, debug);
-  const Binned binned = bin(in, projected, stages, stream, keep, exact, debug, feedback);
-  const BlendedImage image = blend(in, projected, binned, stages, stream, keep, debug, feedback);
+  const Binned binned = bin(in, projected, stages, stream, scratch, keep, exact, debug, feedback);
+  const BlendedImage image = blend(in, projected, binned, stages, stream, scratch, keep, debug, feedback);
   const auto kept = [&](const Tensor& t) { return keep ? t : at::empty({0}, t.options()); };
   return {image.color,
           projected.radii,
@@ -273,11 +292,12 @@ RasterizeOutput rasterize_cuda(const Tensor& means3D, const OptionalTensor& mean
           kept(binned.pairs),
           kept(binned.tile_offsets),
           kept(projected.ranges),
-          at::empty({0}, binned.pairs.options()),
+          at::empty({0}, projected.radii.options()),
           image.transmittance,
           image.last,
           kept(image.checkpoints),
-          binned.counts};
+          kept(image.chunks),
+          kept(scratch.counts)};
 }
 
 /// Time between stages, in seconds.
@@ -324,15 +344,21 @@ StagesOutput rasterize_stages_cuda(const Tensor& means3D, const Tensor& opacitie
   const CUDAStream stream = c10::cuda::getCurrentCUDAStream();
   int64_t* feedback = nullptr;
   StageTimer timer(stream);
+  const Scratch scratch(in.count(), means3D, stream);
   const Projected projected = project(in, stages, stream, false);
   timer.mark();
-  Binned binned = bin(in, projected, stages, stream, false, false, false, feedback);
+  const bool exact = forced_capacity != 0;  // the lists are wanted whole
+  const Binned binned = bin(in, projected, stages, stream, scratch, false, exact, false, feedback);
   timer.mark();
-  const BlendedImage image = blend(in, projected, binned, stages, stream, false, false, feedback);
+  const BlendedImage image = blend(in, projected, binned, stages, stream, scratch, false, false, feedback);
   timer.mark();
   const Tensor seconds = timer.seconds();
-  const int64_t pairs = binned.counts[0].item<int64_t>();
-  if (pairs > binned.capacity) binned = bin(in, projected, stages, stream, false, true, false, feedback);
+  const int64_t pairs = scratch.counts[0].item<int64_t>();
+  if (pairs > binned.capacity) {  // by now the device has left a better guess
+    return rasterize_stages_cuda(means3D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
+                                 viewmatrix, projmatrix, campos, image_height, image_width, tanfovx, tanfovy,
+                                 scale_modifier, sh_degree, footprint, variance);
+  }
   // As on the CPU: only the Gaussians that were kept, and splats counted among those.
   const Tensor kept = projected.radii.gt(0);
   const Tensor ids = kept.nonzero().select(1, 0), place = kept.cumsum(0, at::kLong).sub(1);
@@ -347,16 +373,16 @@ StagesOutput rasterize_stages_cuda(const Tensor& means3D, const Tensor& opacitie
 /// The tensors that rasterize hands to its vjp must fit each other. Their contents are rasterize's own.
 void check_saved(const Inputs& in, const Tensor& splats, const Tensor& order, const Tensor& pairs,
                  const Tensor& tile_offsets, const Tensor& ranges, const Tensor& transmittance,
-                 const Tensor& last, const Tensor& checkpoints, const Tensor& counts, int64_t samples) {
+                 const Tensor& last, const Tensor& checkpoints, const Tensor& chunks, const Tensor& counts, int64_t samples) {
   const int64_t n = in.count();
   const std::vector<int64_t> image = {samples, in.image_height, in.image_width};
   bool ok = splats.sizes() == at::IntArrayRef({n, kSplatWidth}) && order.sizes() == at::IntArrayRef({n}) &&
             pairs.dim() == 2 && pairs.size(1) == 2 && pairs.numel() > 0 &&
             tile_offsets.numel() == grid_of(in).tiles() + 1 && ranges.sizes() == at::IntArrayRef({n, 2}) &&
             transmittance.sizes() == image && last.sizes() == image && checkpoints.dim() == 4 &&
-            checkpoints.size(1) == samples && counts.numel() == 2;
+            checkpoints.size(1) == samples && chunks.dim() == 2 && chunks.size(1) == 3 && counts.numel() == 4;
   for (const Tensor* t : {&splats, &order, &pairs, &tile_offsets, &ranges, &transmittance, &last,
-                          &checkpoints, &counts})
+                          &checkpoints, &chunks, &counts})
     ok = ok && t->is_contiguous() && t->device() == in.means3D.device();
   TORCH_CHECK_VALUE(ok,
                     "splats ... counts must be the outputs of rasterize with keep=True for the same arguments, got "
@@ -372,8 +398,8 @@ Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const Tensor& means3D, const O
                          double tanfovx, double tanfovy, double scale_modifier, int64_t sh_degree,
                          std::string footprint, double variance, const Tensor& splats, const Tensor& order,
                          const Tensor& pairs, const Tensor& tile_offsets, const Tensor& ranges, const Tensor&,
-                         const Tensor& transmittance, const Tensor& last, const Tensor& checkpoints,
-                         const Tensor& counts, std::array<bool, 8> needs, bool debug) {
+                                                 const Tensor& transmittance, const Tensor& last, const Tensor& checkpoints,
+                         const Tensor& chunks, const Tensor& counts, std::array<bool, 8> needs, bool debug) {
   Inputs in{means3D,       opacities, means2D,        shs,        colors_precomp, scales,       rotations,
             cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
             tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      variance};
@@ -383,20 +409,18 @@ Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const Tensor& means3D, const O
                     "dL_dcolor must have shape (3, ", image_height, ", ", image_width, "), got ", shape_of(dL_dcolor));
   const auto& forward = found(cuda::find_forward(footprint), footprint);
   const auto& stages = found(cuda::find_backward(footprint), footprint);
-  check_saved(in, splats, order, pairs, tile_offsets, ranges, transmittance, last, checkpoints, counts,
+  check_saved(in, splats, order, pairs, tile_offsets, ranges, transmittance, last, checkpoints, chunks, counts,
               forward.samples);
   const c10::cuda::CUDAGuard guard(means3D.device());
   const CUDAStream stream = c10::cuda::getCurrentCUDAStream();
   const Grads out = make_grads(in, needs);
   const GaussianGrads<float> grads = grads_of<float>(in, out);
   const TileGrid grid = grid_of(in);
-  const Plan plan(grid, pairs.size(0), forward.samples, order.options());
   const cuda::TileLists lists = lists_of(splats, order, pairs, tile_offsets, counts);
-  cuda::plan_chunks(lists, grid, forward.samples, plan.view, nullptr, stream);
-  check_stage("plan_chunks", stream, debug);
   const Tensor pair_grads = at::empty({std::max(pairs.size(0), in.count()), cuda::kPairGradWidth}, means3D.options());
   const Tensor g = dL_dcolor.contiguous();
-  stages.blend_vjp({lists, plan.view, grid, plan.max_chunks, in.background.const_data_ptr<float>(),
+  stages.blend_vjp({lists, reinterpret_cast<const cuda::TileChunk*>(chunks.const_data_ptr<int32_t>()), grid,
+                    chunks.size(0), in.background.const_data_ptr<float>(),
                     reinterpret_cast<const cuda::Checkpoint*>(checkpoints.const_data_ptr<float>()),
                     transmittance.const_data_ptr<float>(), last.const_data_ptr<int32_t>(), g.const_data_ptr<float>(),
                     pair_grads.data_ptr<float>(), grads.means2d && grads.means2d_stride == 4},
@@ -406,7 +430,7 @@ Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const Tensor& means3D, const O
                       gaussians_of<float>(in),
                       {variance},
                       reinterpret_cast<const cuda::PairRange*>(ranges.const_data_ptr<int32_t>()),
-                      reinterpret_cast<const cuda::Counts*>(counts.const_data_ptr<int64_t>()),
+                      lists.counts,
                       pairs.size(0),
                       pair_grads.const_data_ptr<float>(),
                       grads},

@@ -41,7 +41,7 @@ inline TileGrid grid_of(const Inputs& in) { return {int(in.image_width), int(in.
 
 /// What rasterize returns: color, radii, and what its vjp needs (schemas in ops.cpp).
 using RasterizeOutput =
-    std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+    std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 using StagesOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 /// Gradients of means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp.
 using Grads = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;

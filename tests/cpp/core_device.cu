@@ -22,7 +22,7 @@ template <class F, typename T> __global__ void run_core(Buffers<T> b, Splat<F, T
   const int64_t i = blockIdx.x * blockDim.x + threadIdx.x;
   const Camera<T> camera = load_camera(b.camera);
   if (!may_be_visible(camera, b.gaussians, i, T(1))) {
-    zero_grads(i, b.grads);
+    zero_grads(b.gaussians, i, b.grads);
     return;
   }
   T depth;
