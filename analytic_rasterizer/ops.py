@@ -1,9 +1,8 @@
-"""The ops' fake kernels and autograd formulas. Nothing else."""
+"""The ops' fake kernels. Their gradients are in csrc/torch/autograd.cpp."""
 
 from __future__ import annotations
 
 import torch
-from torch.autograd.function import once_differentiable
 
 from . import _C  # noqa: F401  (loads the ops)
 from .footprints import BOX_SAMPLES
@@ -13,9 +12,6 @@ TILE = 16
 
 _SAMPLES = {f"box{s}": s for s in BOX_SAMPLES}
 _SPLAT_WIDTH = 12
-
-# Positions of the differentiable inputs of rasterize, in the order of the vjp's outputs.
-_DIFFERENTIABLE = 8
 
 
 def _tiles(height: int, width: int) -> int:
@@ -105,43 +101,3 @@ def _(offset, cov2d, footprint, variance):
 @torch.library.register_fake("analytic_rasterizer::footprint_weight_vjp")
 def _(dL_dweight, offset, cov2d, footprint, variance):
     return offset.new_empty(offset.shape), cov2d.new_empty(cov2d.shape)
-
-
-def rasterize_setup(ctx, inputs, output):
-    _, radii, *saved = output
-    ctx.mark_non_differentiable(radii, *saved)
-    ctx.set_materialize_grads(False)  # no zeros the size of everything saved
-    tensors, (*ctx.settings, keep, ctx.debug) = inputs[:12], inputs[12:]
-    ctx.has_saved = keep
-    if keep:
-        ctx.save_for_backward(*tensors, *saved)
-
-
-@once_differentiable
-def rasterize_backward(ctx, dL_dcolor, *_):
-    if not ctx.has_saved:
-        raise RuntimeError("rasterize was called with keep=False and cannot be differentiated")
-    if dL_dcolor is None:
-        return (None,) * len(ctx.needs_input_grad)
-    tensors, saved = ctx.saved_tensors[:12], ctx.saved_tensors[12:]
-    needs = list(ctx.needs_input_grad[:_DIFFERENTIABLE])
-    grads = torch.ops.analytic_rasterizer.rasterize_vjp(dL_dcolor, *tensors, *ctx.settings, *saved, needs, ctx.debug)
-    wanted = (g if need and t is not None else None for g, need, t in zip(grads, needs, tensors))
-    return (*wanted, *[None] * (len(ctx.needs_input_grad) - _DIFFERENTIABLE))
-
-
-torch.library.register_autograd("analytic_rasterizer::rasterize", rasterize_backward, setup_context=rasterize_setup)
-
-
-def _weight_setup(ctx, inputs, output):
-    offset, cov2d, *ctx.settings = inputs
-    ctx.save_for_backward(offset, cov2d)
-
-
-@once_differentiable
-def _weight_backward(ctx, dL_dweight):
-    grads = torch.ops.analytic_rasterizer.footprint_weight_vjp(dL_dweight, *ctx.saved_tensors, *ctx.settings)
-    return (*grads, None, None)
-
-
-torch.library.register_autograd("analytic_rasterizer::footprint_weight", _weight_backward, setup_context=_weight_setup)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from . import ops
+from . import ops  # noqa: F401  (loads the ops)
 from .footprints import Footprint, get_default_footprint, resolve_footprint
 
 
@@ -143,8 +143,9 @@ def rasterize_gaussians(
     )
     gaussians = (means3D, means2D, opacities, *rest)
     keep = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in gaussians)
-    arguments = (*gaussians, *_settings_arguments(raster_settings, device), keep, bool(raster_settings.debug))
-    if raster_settings.debug:
+    debug = bool(raster_settings.debug)
+    arguments = (*gaussians, *_settings_arguments(raster_settings, device), keep, debug)
+    if debug:
         return _DebugRasterize.apply(*arguments)[:2]
     return torch.ops.analytic_rasterizer.rasterize(*arguments)[:2]
 
@@ -159,16 +160,27 @@ class _DebugRasterize(torch.autograd.Function):
         except Exception:
             _write_snapshot("snapshot_fw.dump", arguments)
             raise
-        ops.rasterize_setup(ctx, arguments, output)
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(*output[1:])
+        tensors, (*ctx.settings, _, ctx.debug) = arguments[:12], arguments[12:]
+        ctx.save_for_backward(*tensors, *output[2:])
         return output
 
     @staticmethod
-    def backward(ctx, *dL_doutput):
+    @torch.autograd.function.once_differentiable
+    def backward(ctx, dL_dcolor, *_):
+        missing = [None] * (len(ctx.needs_input_grad) - 8)
+        if dL_dcolor is None:
+            return (*[None] * 8, *missing)
+        tensors, saved = ctx.saved_tensors[:12], ctx.saved_tensors[12:]
+        needs = [need and t is not None for need, t in zip(ctx.needs_input_grad, tensors[:8])]
+        arguments = (dL_dcolor, *tensors, *ctx.settings, *saved, needs, ctx.debug)
         try:
-            return ops.rasterize_backward(ctx, *dL_doutput)
+            grads = torch.ops.analytic_rasterizer.rasterize_vjp(*arguments)
         except Exception:
-            _write_snapshot("snapshot_bw.dump", (dL_doutput[0], *ctx.saved_tensors, *ctx.settings))
+            _write_snapshot("snapshot_bw.dump", arguments)
             raise
+        return (*(g if need else None for g, need in zip(grads, needs)), *missing)
 
 
 def _write_snapshot(path: str, arguments: tuple) -> None:

@@ -649,10 +649,10 @@ def test_debug_writes_a_snapshot_on_failure(tmp_path, monkeypatch):
 def test_debug_writes_a_snapshot_when_the_backward_pass_fails(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
-    def fail(ctx, *gradients):
+    def fail(*arguments):
         raise RuntimeError("out of something")
 
-    monkeypatch.setattr("analytic_rasterizer.ops.rasterize_backward", fail)
+    monkeypatch.setattr(torch.ops.analytic_rasterizer, "rasterize_vjp", fail)
     leaves = scenes.leaves(scene32())
     color, _ = render(leaves, CAMERA.settings(torch.float32)._replace(debug=True))
     with pytest.raises(RuntimeError, match="out of something"):
