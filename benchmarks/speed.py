@@ -1,10 +1,22 @@
-"""What each footprint costs: time per stage and memory, on any scene and views.
+"""What each footprint costs: time per stage and memory, on any scene and views, on the CPU or with CUDA.
 
-    python benchmarks/speed.py SCENE --views VIEWS [--footprints box:samples=1 analytic ...]
+    python benchmarks/speed.py SCENE --views VIEWS [--footprints box:samples=1 analytic ...] [--device cuda]
 
-Footprints are timed in turn, round after round, so that a machine that slows down slows them all;
-the table gives medians over rounds, averaged over views, and the ratio to the first footprint.
-"extra" is the memory that a forward and backward pass needs beyond inputs, image and gradients.
+The table gives medians over rounds, averaged over views, and the ratio to the first footprint.
+"forward" is without gradient; "forward+backward" differentiates sum(image * w) for fixed random w in
+all inputs, means2D among them. "extra" is the memory that a forward and backward pass needs beyond
+inputs, image and gradients: peak less what is there before, less image and gradients.
+
+On the CPU footprints are timed in turn, round after round, so that a machine that slows down slows
+them all, and memory is the resident memory of the process.
+
+With CUDA every footprint is warmed up on all views, then timed view by view. Times are between two
+events around a call on an idle device: the longer of launching and computing. Stages are those of
+`render_stages`, without gradient; "backward" is forward+backward less forward, so it also holds what
+forward does only for its sake. "host" is the time until a call returns, without waiting for the device:
+the op itself and `GaussianRasterizer`, both without gradient, and forward and backward of the latter.
+Memory is what torch's allocator handed out; room for pairs follows the largest of the footprint's views
+of one size, with reserve.
 """
 
 from __future__ import annotations
@@ -16,8 +28,10 @@ import platform
 import statistics
 import sys
 import time
+from collections.abc import Callable
 
 import torch
+from scene_files import load_scene
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
@@ -33,74 +47,76 @@ FOOTPRINTS = [
     "box:samples=4",
 ]
 STAGES = ("project", "bin", "blend")
+HOST = ("host op", "host rasterizer", "host f+b")
+ROUNDS = {"cpu": 5, "cuda": 30}
+UNITS = {"cpu": ("s", 1.0), "cuda": ("ms", 1e3)}
+WARM_UP = 5
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("scene", help="trained scene: .ply, compressed .ply or .spz")
-    parser.add_argument("--views", required=True, help="file of views")
-    parser.add_argument("--footprints", nargs="+", default=FOOTPRINTS, metavar="NAME[:k=v]")
-    parser.add_argument("--rounds", type=int, default=5, help="timed rounds after one to warm up (default 5)")
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
-    parser.add_argument("--shuffle", action="store_true", help="randomise the order of the Gaussians")
-    parser.add_argument("--json", help="also write everything measured to this file")
-    args = parser.parse_args()
+    args = parse_arguments()
     torch.set_num_threads(args.threads)
-
-    scene = io.load_scene(args.scene)
+    scene = pad_sh(load_scene(args.scene), args.sh_degree)
     if args.shuffle:
         order = torch.randperm(len(scene.means), generator=torch.Generator().manual_seed(0))
         scene = scene._replace(**{k: v[order] for k, v in scene._asdict().items() if torch.is_tensor(v)})
+    scene = scene.to(args.device)
     views = io.load_views(args.views)
+    cases = {name: [Case(scene, view, name) for view in views] for name in args.footprints}
 
-    samples = {name: [[] for _ in views] for name in args.footprints}
-    for round_ in range(args.rounds + 1):
-        for name in args.footprints:
-            for i, view in enumerate(views):
-                measured = measure(scene, view, name)
-                if round_ > 0:
-                    samples[name][i].append(measured)
-
-    results = {name: summarize(per_view) for name, per_view in samples.items()}
-    for name, result in results.items():
-        extra, share = zip(*(extra_memory(scene, view, name) for view in views))
-        result.update(extra_bytes=statistics.mean(extra), extra_share=max(share))
-    base = results[args.footprints[0]]
-    header = [
-        "footprint",
-        "forward s",
-        "forward+backward s",
-        "ratio",
-        "ratio f+b",
-        *STAGES,
-        "pairs",
-        "extra MiB",
-        "B/budget",
-    ]
-    rows = [
-        [
-            name,
-            f"{r['forward']:.3f}",
-            f"{r['forward_backward']:.3f}",
-            f"{r['forward'] / base['forward']:.2f}",
-            f"{r['forward_backward'] / base['forward_backward']:.2f}",
-            *(f"{r[s]:.3f}" for s in STAGES),
-            f"{r['pairs']:.0f}",
-            f"{r['extra_bytes'] / 2**20:.0f}",
-            f"{r['extra_share']:.2f}",
-        ]
-        for name, r in results.items()
-    ]
+    measured = (measure_cuda if args.device == "cuda" else measure_cpu)(cases, args.rounds)
+    results = {name: summarize(per_view) for name, per_view in measured.items()}
     size = f"{views[0].width}x{views[0].height}"
-    print(f"{len(scene.means)} Gaussians, {len(views)} views of {size}, {machine()}")
-    print(format_table(header, rows))
+    machine = describe_machine(args.device)
+    gaussians = f"{len(scene.means)} Gaussians of SH degree {scene.sh_degree}"
+    print(f"{gaussians}, {len(views)} views of {size}, {machine}")
+    print(format_results(results, args.device))
     print("B/budget: extra memory over 120 B per Gaussian + 64 B per pair + 64 B per pixel")
     if args.json:
         with open(args.json, "w") as f:
-            json.dump({"machine": machine(), "arguments": vars(args), "results": results}, f, indent=2)
+            report = {"machine": machine, "arguments": vars(args), "results": results, "per_view": measured}
+            json.dump(report, f, indent=2)
 
 
-def machine() -> str:
+def parse_arguments() -> argparse.Namespace:
+    has_cuda = torch.cuda.is_available() and ar._C.has_cuda
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("scene", help="trained scene: .ply, compressed .ply, .spz, or .npz (see scene_files.py)")
+    parser.add_argument("--views", required=True, help="file of views")
+    parser.add_argument("--footprints", nargs="+", default=FOOTPRINTS, metavar="NAME[:k=v]")
+    parser.add_argument(
+        "--device", choices=("cpu", "cuda"), default="cuda" if has_cuda else "cpu", help="(default here: %(default)s)"
+    )
+    parser.add_argument("--rounds", type=int, help="timed rounds after warming up (default: 5, with CUDA 30)")
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads(), help="of the CPU")
+    parser.add_argument("--shuffle", action="store_true", help="randomise the order of the Gaussians")
+    parser.add_argument(
+        "--sh-degree", type=int, choices=range(4), help="pad the SH with zeros to this degree, as trainers hold them"
+    )
+    parser.add_argument("--json", help="also write everything measured to this file")
+    args = parser.parse_args()
+    if args.device == "cuda" and not has_cuda:
+        parser.error("--device cuda: no CUDA device, or analytic_rasterizer was built without CUDA")
+    args.rounds = args.rounds or ROUNDS[args.device]
+    return args
+
+
+def pad_sh(scene: io.Scene, degree: int | None) -> io.Scene:
+    """The scene with zeros for its missing coefficients up to `degree`; None leaves it alone."""
+    if degree is None or degree == scene.sh_degree:
+        return scene
+    if degree < scene.sh_degree:
+        raise SystemExit(f"--sh-degree {degree} is below the scene's, {scene.sh_degree}")
+    missing = (degree + 1) ** 2 - scene.shs.shape[1]
+    shs = torch.nn.functional.pad(scene.shs, (0, 0, 0, missing))
+    return scene._replace(shs=shs, sh_degree=degree)
+
+
+def describe_machine(device: str) -> str:
+    if device == "cuda":
+        gpu = torch.cuda.get_device_properties(0)
+        memory = f"{gpu.multi_processor_count} SMs, {gpu.total_memory / 2**30:.0f} GiB"
+        return f"{gpu.name} ({gpu.major}.{gpu.minor}, {memory}), CUDA {torch.version.cuda}, torch {torch.__version__}"
     cpu = platform.processor() or platform.machine()
     if sys.platform == "linux":
         with open("/proc/cpuinfo") as f:
@@ -109,16 +125,103 @@ def machine() -> str:
     return f"{cpu}, {threads} threads, {ar.instruction_set()}, torch {torch.__version__}"
 
 
-def measure(scene: io.Scene, view: io.View, footprint: str) -> dict:
+def format_results(results: dict[str, dict], device: str) -> str:
+    base = next(iter(results.values()))
+    unit, per_second = UNITS[device]
+    parts = [*STAGES, "backward", *HOST] if device == "cuda" else STAGES
+    header = ["footprint", f"forward {unit}", f"forward+backward {unit}", "ratio", "ratio f+b"]
+    header += [*parts, "pairs", "extra MiB", "B/budget"]
+    rows = [
+        [
+            name,
+            f"{r['forward'] * per_second:.3f}",
+            f"{r['forward_backward'] * per_second:.3f}",
+            f"{r['forward'] / base['forward']:.2f}",
+            f"{r['forward_backward'] / base['forward_backward']:.2f}",
+            *(f"{r[part] * per_second:.3f}" for part in parts),
+            f"{r['pairs']:.0f}",
+            f"{r['extra_bytes'] / 2**20:.0f}",
+            f"{r['extra_share']:.2f}",
+        ]
+        for name, r in results.items()
+    ]
+    return format_table(header, rows)
+
+
+class Case:
+    """One view of a scene, ready to render with one footprint."""
+
+    def __init__(self, scene: io.Scene, view: io.View, footprint: str):
+        device = scene.means.device
+        self.settings = view.settings(sh_degree=scene.sh_degree, footprint=footprint, device=device)
+        self.rasterizer = ar.GaussianRasterizer(self.settings)
+        self.gaussians = scene.arguments()
+        self.inputs = {k: v.detach().requires_grad_() for k, v in self.gaussians.items()}
+        self.inputs["means2D"] = torch.zeros_like(scene.means, requires_grad=True)
+        size = (3, self.settings.image_height, self.settings.image_width)
+        self.dL_dcolor = torch.rand(size, generator=torch.Generator().manual_seed(0)).to(device)
+        footprint = self.settings.footprint
+        given = {**self.gaussians, **self.settings._asdict(), "footprint": footprint.key, "keep": False}
+        given["variance"] = footprint.variance
+        schema = torch.ops.analytic_rasterizer.rasterize.default._schema
+        self.op_arguments = [given.get(argument.name) for argument in schema.arguments]
+
+    def stages(self) -> ar.Stages:
+        return ar.render_stages(self.settings, **self.gaussians)
+
+    @torch.no_grad()
+    def op(self) -> None:
+        torch.ops.analytic_rasterizer.rasterize(*self.op_arguments)
+
+    @torch.no_grad()
+    def forward(self) -> None:
+        self.rasterizer(means2D=None, **self.gaussians)
+
+    def forward_backward(self) -> list[torch.Tensor]:
+        """The image, and the gradients of sum(image * dL_dcolor)."""
+        color, _ = self.rasterizer(**self.inputs)
+        return [color, *torch.autograd.grad(color, list(self.inputs.values()), self.dL_dcolor)]
+
+    def extra_memory(self, pairs: int) -> dict:
+        """Bytes that forward and backward need beyond what goes in and comes out, and their share of
+        120 B per Gaussian + 64 B per pair + 64 B per pixel."""
+        device = self.dL_dcolor.device
+        before = reset_peak_memory(device)
+        results = self.forward_backward()
+        extra = peak_memory(device) - before - sum(t.numel() * t.element_size() for t in results)
+        pixels = self.settings.image_height * self.settings.image_width
+        budget = 120 * len(self.gaussians["means3D"]) + 64 * pairs + 64 * pixels
+        return {"extra_bytes": extra, "extra_share": extra / budget}
+
+
+# --------------------------------------------------------------------------------- times, CPU
+
+
+def measure_cpu(cases: dict[str, list[Case]], rounds: int) -> dict[str, list[dict]]:
+    """Seconds and bytes by footprint and view."""
+    samples = {name: [[] for _ in of_name] for name, of_name in cases.items()}
+    for round_ in range(rounds + 1):
+        for name, of_name in cases.items():
+            for case, taken in zip(of_name, samples[name]):
+                measured = time_round(case)
+                if round_ > 0:
+                    taken.append(measured)
+    medians = {name: [median_of(taken) for taken in of_name] for name, of_name in samples.items()}
+    for name, of_name in cases.items():
+        for case, result in zip(of_name, medians[name]):
+            result.update(case.extra_memory(result["pairs"]))
+    return medians
+
+
+def time_round(case: Case) -> dict:
     """Seconds of one forward pass without gradient, by stage, and of one with its backward pass."""
-    settings = view.settings(sh_degree=scene.sh_degree, footprint=footprint)
     start = time.perf_counter()
-    stages = ar.render_stages(settings, **scene.arguments())
+    stages = case.stages()
     forward = time.perf_counter() - start
     pairs, seconds = len(stages.pairs), stages.seconds
     del stages
     start = time.perf_counter()
-    forward_backward(scene, settings)
+    case.forward_backward()
     return {
         "forward": forward,
         "forward_backward": time.perf_counter() - start,
@@ -127,31 +230,96 @@ def measure(scene: io.Scene, view: io.View, footprint: str) -> dict:
     }
 
 
-def forward_backward(scene: io.Scene, settings: ar.GaussianRasterizationSettings) -> list[torch.Tensor]:
-    """Renders, differentiates the sum of the image, and returns everything that went in or came out."""
-    dL_dcolor = torch.ones(3, settings.image_height, settings.image_width)
-    inputs = {k: v.detach().requires_grad_() for k, v in scene.arguments().items()}
-    means2d = torch.zeros_like(scene.means, requires_grad=True)
-    color, _ = ar.GaussianRasterizer(settings)(means2D=means2d, **inputs)
-    color.backward(dL_dcolor)
-    return [dL_dcolor, color, means2d, means2d.grad, *(v.grad for v in inputs.values())]
+# -------------------------------------------------------------------------------- times, CUDA
 
 
-def extra_memory(scene: io.Scene, view: io.View, footprint: str) -> tuple[int, float]:
-    """Bytes that forward and backward need beyond what goes in and comes out, and their share of
-    120 B per Gaussian + 64 B per pair + 64 B per pixel."""
-    settings = view.settings(sh_degree=scene.sh_degree, footprint=footprint)
-    pairs = len(ar.render_stages(settings, **scene.arguments()).pairs)
-    before = reset_peak_memory()
-    results = forward_backward(scene, settings)
-    extra = peak_memory() - before - sum(t.numel() * t.element_size() for t in results)
-    budget = 120 * len(scene.means) + 64 * pairs + 64 * settings.image_height * settings.image_width
-    return extra, extra / budget
+def measure_cuda(cases: dict[str, list[Case]], rounds: int) -> dict[str, list[dict]]:
+    """Seconds and bytes by footprint and view."""
+    results = {}
+    for name, of_name in cases.items():
+        forget_other_frames(of_name[0])
+        for _ in range(WARM_UP):
+            for case in of_name:
+                case.forward()
+                case.forward_backward()
+        results[name] = [time_case(case, rounds) for case in of_name]
+    return results
 
 
-def summarize(per_view: list[list[dict]]) -> dict:
-    keys = per_view[0][0]
-    return {k: statistics.mean(statistics.median(m[k] for m in view) for view in per_view) for k in keys}
+def forget_other_frames(case: Case) -> None:
+    """The rasterizer makes room for pairs by the largest frame it has seen, which may have been another
+    footprint's; in deterministic mode it counts them anew."""
+    before = torch.are_deterministic_algorithms_enabled()
+    torch.use_deterministic_algorithms(True)
+    try:
+        case.forward()
+    finally:
+        torch.use_deterministic_algorithms(before)
+
+
+def time_case(case: Case, rounds: int) -> dict:
+    for _ in range(WARM_UP):
+        case.forward()
+        case.forward_backward()
+    forward = median_seconds(event_seconds, case.forward, rounds)
+    forward_backward = median_seconds(event_seconds, case.forward_backward, rounds)
+    calls = (case.op, case.forward, case.forward_backward)
+    host = {key: median_seconds(host_seconds, call, rounds) for key, call in zip(HOST, calls)}
+    stages = []
+    for _ in range(min(rounds, 10) + 1):
+        made = case.stages()
+        stages.append({**made.seconds, "pairs": len(made.pairs)})
+        del made
+    by_stage = median_of(stages[1:])
+    return {
+        "forward": forward,
+        "forward_backward": forward_backward,
+        "backward": forward_backward - forward,
+        **host,
+        **by_stage,
+        **case.extra_memory(by_stage["pairs"]),
+    }
+
+
+def event_seconds(call: Callable[[], object]) -> float:
+    """Time on the device from before a call to after it."""
+    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    start.record()
+    call()
+    end.record()
+    torch.cuda.synchronize()
+    return start.elapsed_time(end) * 1e-3
+
+
+def host_seconds(call: Callable[[], object]) -> float:
+    """Time until a call returns, of a device that has nothing else to do."""
+    start = time.perf_counter()
+    call()
+    seconds = time.perf_counter() - start
+    torch.cuda.synchronize()
+    return seconds
+
+
+def median_seconds(clock: Callable[[Callable], float], call: Callable[[], object], rounds: int) -> float:
+    torch.cuda.synchronize()
+    clock(call)
+    return statistics.median(clock(call) for _ in range(rounds))
+
+
+# --------------------------------------------------------------------------- medians and means
+
+
+def median_of(samples: list[dict]) -> dict:
+    return {key: statistics.median(sample[key] for sample in samples) for key in samples[0]}
+
+
+def summarize(per_view: list[dict]) -> dict:
+    """Means over views; of the share of the memory budget the worst."""
+    means = {key: statistics.mean(view[key] for view in per_view) for key in per_view[0]}
+    return {**means, "extra_share": max(view["extra_share"] for view in per_view)}
+
+
+# -------------------------------------------------------------------------------------- memory
 
 
 def return_freed_memory() -> None:
@@ -162,8 +330,12 @@ def return_freed_memory() -> None:
         libc.malloc_trim(0)
 
 
-def reset_peak_memory() -> int:
-    """Resident memory now, bytes, from which the peak starts again. Linux only; elsewhere 0."""
+def reset_peak_memory(device: torch.device) -> int:
+    """Memory in use now, bytes, from which the peak starts again. On the CPU Linux only; elsewhere 0."""
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+        torch.cuda.reset_peak_memory_stats()
+        return torch.cuda.memory_allocated()
     return_freed_memory()
     try:
         with open("/proc/self/clear_refs", "w") as f:
@@ -173,8 +345,10 @@ def reset_peak_memory() -> int:
     return _status("VmRSS")
 
 
-def peak_memory() -> int:
-    """Highest resident memory since the last reset, bytes."""
+def peak_memory(device: torch.device) -> int:
+    """Highest memory in use since the last reset, bytes."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated()
     return _status("VmHWM")
 
 

@@ -6,8 +6,37 @@ import pathlib
 import pytest
 import torch
 
+from analytic_rasterizer import _C
+
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared"
+
+needs_cuda = pytest.mark.skipif(
+    not (_C.has_cuda and torch.cuda.is_available()),
+    reason="needs a CUDA device and an extension that was built for CUDA",
+)
+
+# For tests of both dtypes, in place of the fixture `device`: the rasterizer has no float64 on CUDA.
+each_precision = pytest.mark.parametrize(
+    "device, dtype",
+    [
+        pytest.param("cpu", torch.float32, id="torch.float32"),
+        pytest.param("cpu", torch.float64, id="torch.float64"),
+        pytest.param("cuda", torch.float32, id="cuda-torch.float32", marks=needs_cuda),
+    ],
+)
+
+
+@pytest.fixture(params=[pytest.param("cpu", id=pytest.HIDDEN_PARAM), pytest.param("cuda", marks=needs_cuda)])
+def device(request):
+    """A test that takes it runs once per device, on the CPU under the name it would have without."""
+    return request.param
+
+
+@pytest.fixture
+def best(device):
+    """The most precise dtype in which the device renders."""
+    return torch.float64 if device == "cpu" else torch.float32
 
 
 @pytest.fixture(autouse=True)

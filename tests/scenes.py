@@ -74,10 +74,10 @@ class Camera:
         matrix[3, 2] = 1.0
         return matrix
 
-    def fields(self, dtype=torch.float64):
+    def fields(self, dtype=torch.float64, device="cpu"):
         """The twelve settings as a dict, matrices in row-vector form."""
         view = self.world_to_camera()
-        return {
+        fields = {
             "image_height": self.image_height,
             "image_width": self.image_width,
             "tanfovx": self.tanfovx,
@@ -91,12 +91,13 @@ class Camera:
             "prefiltered": False,
             "debug": False,
         }
+        return to(fields, device)
 
-    def settings(self, dtype=torch.float64, **footprint):
+    def settings(self, dtype=torch.float64, device="cpu", **footprint):
         """ar.GaussianRasterizationSettings of this camera."""
         import analytic_rasterizer as ar
 
-        return ar.GaussianRasterizationSettings(**self.fields(dtype), **footprint)
+        return ar.GaussianRasterizationSettings(**self.fields(dtype, device), **footprint)
 
     def shifted(self, x, y):
         """The same camera with every splat moved by (x, y) px in the image."""
@@ -113,8 +114,8 @@ class AxisCamera(Camera):
     def world_to_camera(self):
         return torch.eye(4, dtype=torch.float64)
 
-    def fields(self, dtype=torch.float64):
-        return super().fields(dtype) | {"campos": torch.zeros(3, dtype=dtype)}
+    def fields(self, dtype=torch.float64, device="cpu"):
+        return super().fields(dtype, device) | {"campos": torch.zeros(3, dtype=dtype, device=device)}
 
 
 def rand(generator, *shape, low=0.0, high=1.0):
@@ -215,9 +216,19 @@ def random_offsets(generator, cov2d, reach=3.0):
     return torch.stack([l11 * p, l21 * p + l22 * q], -1)
 
 
-def cast(scene, dtype):
-    """The scene in another dtype."""
-    return {name: value.to(dtype) for name, value in scene.items()}
+def cast(scene, dtype, device="cpu"):
+    """The scene in another dtype, on another device."""
+    return to({name: value.to(dtype) for name, value in scene.items()}, device)
+
+
+def to(named, device):
+    """A dict of inputs or settings with its tensors on another device."""
+    return {name: value.to(device) if torch.is_tensor(value) else value for name, value in named.items()}
+
+
+def settings_to(settings, device):
+    """ar.GaussianRasterizationSettings with their tensors on another device."""
+    return settings._replace(**to(settings._asdict(), device))
 
 
 def leaves(scene):

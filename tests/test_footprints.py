@@ -21,6 +21,13 @@ every_true_derivative = pytest.mark.parametrize(
 closed_form = pytest.mark.parametrize("variant", [v for v in VARIANTS if v[0] in ("point", "mip", "box")], ids=name_of)
 
 
+def weight(device, offset, cov2d, **options):
+    """ar.footprint_weight computed on `device`, from and to tensors on the CPU; differentiable."""
+    value = ar.footprint_weight(offset.to(device), cov2d.to(device), **options)
+    assert value.device.type == device
+    return value.cpu()
+
+
 def generator(seed):
     return torch.Generator().manual_seed(seed)
 
@@ -85,41 +92,41 @@ def test_every_registered_footprint_is_tested():
 
 
 @every_footprint
-def test_weight_matches_reference(variant):
+def test_weight_matches_reference(device, variant):
     footprint, options = variant
     offset, cov2d = splats(0)
-    actual = ar.footprint_weight(offset, cov2d, footprint=footprint, **options)
+    actual = weight(device, offset, cov2d, footprint=footprint, **options)
     expected = reference.weight(offset, cov2d, footprint, **options)
     excess = (actual - expected).abs() / rounding_bound(offset, cov2d, variant, EPS64)
     assert excess.max() < 1, (actual - expected).abs().max()
 
 
 @every_footprint
-def test_default_options(variant):
+def test_default_options(device, variant):
     footprint, _ = variant
     offset, cov2d = splats(1, count=20)
-    explicit = ar.footprint_weight(offset, cov2d, footprint=footprint, **reference.DEFAULT_OPTIONS[footprint])
-    assert torch.equal(ar.footprint_weight(offset, cov2d, footprint=footprint), explicit)
+    explicit = weight(device, offset, cov2d, footprint=footprint, **reference.DEFAULT_OPTIONS[footprint])
+    assert torch.equal(weight(device, offset, cov2d, footprint=footprint), explicit)
 
 
 @every_footprint
-def test_options_in_the_name(variant):
+def test_options_in_the_name(device, variant):
     footprint, options = variant
     offset, cov2d = splats(1, count=20)
     spelled = ":".join([footprint, ",".join(f"{k}={v}" for k, v in options.items())]).rstrip(":")
-    keywords = ar.footprint_weight(offset, cov2d, footprint=footprint, **options)
-    assert torch.equal(ar.footprint_weight(offset, cov2d, footprint=spelled), keywords)
+    keywords = weight(device, offset, cov2d, footprint=footprint, **options)
+    assert torch.equal(weight(device, offset, cov2d, footprint=spelled), keywords)
 
 
 @every_footprint
-def test_vjp_matches_autograd_of_reference(variant):
+def test_vjp_matches_autograd_of_reference(device, variant):
     """Includes `frozen`, whose reference is the window that does not turn."""
     footprint, options = variant
     offset, cov2d = splats(2, sigma=(0.1, 10.0), ratio=(1.1, 30.0))
     g = scenes.rand(generator(3), len(offset), low=-1.0)
     results = []
     for call in (
-        lambda d, c: ar.footprint_weight(d, c, footprint=footprint, **options),
+        lambda d, c: weight(device, d, c, footprint=footprint, **options),
         lambda d, c: reference.weight(d, c, footprint, **options),
     ):
         d, c = offset.clone().requires_grad_(), cov2d.clone().requires_grad_()
@@ -147,12 +154,12 @@ def test_vjp_matches_central_differences(variant):
     )
 
 
-def test_frozen_and_paper_share_value_and_mean_gradient():
+def test_frozen_and_paper_share_value_and_mean_gradient(device):
     offset, cov2d = splats(5)
     results = []
     for frame_gradient in ("frozen", "paper"):
         d, c = offset.clone().requires_grad_(), cov2d.clone().requires_grad_()
-        value = ar.footprint_weight(d, c, footprint="analytic", frame_gradient=frame_gradient)
+        value = weight(device, d, c, footprint="analytic", frame_gradient=frame_gradient)
         results.append((value, *torch.autograd.grad(value.sum(), (d, c))))
     (value, by_offset, by_cov), (paper_value, paper_by_offset, paper_by_cov) = results
     assert torch.equal(value, paper_value)
@@ -171,7 +178,7 @@ def test_frozen_and_paper_share_value_and_mean_gradient():
     assert (difference.norm(dim=-1) > 1e-3 * size).any()
 
 
-def test_frozen_gradient_is_near_the_true_derivative():
+def test_frozen_gradient_is_near_the_true_derivative(device):
     """dI/dS12 in the frozen eigenframe against the bivariate integral itself.
 
     That derivative is 2 pi (s1 dF/du)(s2 dG/dv), each factor a difference of two densities. With
@@ -185,7 +192,7 @@ def test_frozen_gradient_is_near_the_true_derivative():
     offset = scenes.random_offsets(g, cov2d, 2.5)
     truth, ours = (cov2d.clone().requires_grad_() for _ in range(2))
     reference.exact_weight(offset, truth).sum().backward()
-    ar.footprint_weight(offset, ours, footprint="analytic").sum().backward()
+    weight(device, offset, ours, footprint="analytic").sum().backward()
 
     def factor(u, s):
         low, high = (u - 0.5) / s, (u + 0.5) / s
@@ -214,7 +221,7 @@ def lattice_splats(seed, count, sigma, ratio=(1.1, 4.0)):
 
 
 @closed_form
-def test_mass_is_conserved_exactly(variant):
+def test_mass_is_conserved_exactly(device, variant):
     """Sum over all pixels, against Poisson's summation formula, aliasing terms included.
 
     sum_n exp(-q(n - mu)/2) = 2 pi sqrt(det) sum_k exp(-2 pi^2 k.Sigma k) cos(2 pi k.mu); the term
@@ -237,12 +244,12 @@ def test_mass_is_conserved_exactly(variant):
     aliased = (torch.exp(-2 * math.pi**2 * form) * phase).sum(-1)
     expected = 2 * math.pi * torch.sqrt(reference.determinant(mass_of)) * aliased
     pixels = lattice()
-    weights = ar.footprint_weight(pixels - means[:, None], cov2d[:, None], footprint=footprint, **options)
+    weights = weight(device, pixels - means[:, None], cov2d[:, None], footprint=footprint, **options)
     assert ((weights.sum(-1) - expected).abs() / expected).max() < 1e-12
 
 
 @pytest.mark.parametrize("frame_gradient", ["frozen", "paper"])
-def test_analytic_mass(frame_gradient):
+def test_analytic_mass(device, frame_gradient):
     """The paper's window tiles the plane only when it is axis-aligned.
 
     Rotated, the sum over pixels is again Poisson's: the transform of the logistic density S'
@@ -264,7 +271,8 @@ def test_analytic_mass(frame_gradient):
     phase = torch.cos(2 * math.pi * means @ k.T)
     mass = 2 * math.pi * torch.sqrt(reference.determinant(cov2d))
     expected = mass * (factors[0] * factors[1] * phase).sum(-1)
-    weights = ar.footprint_weight(
+    weights = weight(
+        device,
         lattice() - means[:, None],
         cov2d[:, None],
         footprint="analytic",
@@ -273,22 +281,22 @@ def test_analytic_mass(frame_gradient):
     assert ((weights.sum(-1) - expected).abs() / expected).max() < 1e-11
 
 
-def test_analytic_mass_axis_aligned():
+def test_analytic_mass_axis_aligned(device):
     """Without a turn the differences of S telescope, at any sigma."""
     s1 = torch.tensor([0.02, 0.1, 0.5, 1.0, 3.0], dtype=torch.float64)
     s2 = torch.tensor([0.5, 0.05, 0.02, 2.0, 0.3], dtype=torch.float64)
     cov2d = torch.stack([s1**2, torch.zeros_like(s1), s2**2], -1)
     mean = torch.tensor([0.2, -0.4], dtype=torch.float64)
-    weights = ar.footprint_weight(lattice() - mean, cov2d[:, None], footprint="analytic")
+    weights = weight(device, lattice() - mean, cov2d[:, None], footprint="analytic")
     expected = 2 * math.pi * s1 * s2
     assert ((weights.sum(-1) - expected).abs() / expected).max() < 1e-12
 
 
-def test_cumulant_mass():
+def test_cumulant_mass(device):
     """Exact weights conserve mass; Q6 differs from them by 1/(240000 l'^4) per pixel (NUMERICS)."""
     cov2d, means = lattice_splats(9, 12, (0.7, 2.0), ratio=(1.0, 2.0))
     offset = lattice() - means[:, None]
-    weights = ar.footprint_weight(offset, cov2d[:, None], footprint="cumulant")
+    weights = weight(device, offset, cov2d[:, None], footprint="cumulant")
     _, smaller = eigenvalues(cov2d)
     per_pixel = 1.05 / (240000 * (smaller + 1 / 12) ** 4)
     wider = reference.add_variance(cov2d, 1 / 12)
@@ -298,7 +306,7 @@ def test_cumulant_mass():
 
 
 @every_footprint
-def test_moments(variant):
+def test_moments(device, variant):
     """First moment zero; second moment Sigma plus what the footprint adds.
 
     This is how the pattern of `box` is checked without looking inside: nodes and their variance
@@ -307,7 +315,7 @@ def test_moments(variant):
     footprint, options = variant
     cov2d, means = lattice_splats(10, 12, (1.2, 2.0), ratio=(1.1, 1.5))
     offset = lattice() - means[:, None]
-    weights = ar.footprint_weight(offset, cov2d[:, None], footprint=footprint, **options)
+    weights = weight(device, offset, cov2d[:, None], footprint=footprint, **options)
     weights = weights / weights.sum(-1, keepdim=True)
     first = (weights[..., None] * offset).sum(1)
     products = torch.stack([offset[..., 0] ** 2, offset.prod(-1), offset[..., 1] ** 2], -1)
@@ -332,7 +340,7 @@ def test_moments(variant):
 
 @every_footprint
 @pytest.mark.parametrize("sigma", [30.0, 1e3, 1e5])
-def test_wide_splats_are_sampled(variant, sigma):
+def test_wide_splats_are_sampled(device, variant, sigma):
     """As sigma grows the weight becomes exp(-q/2).
 
     Added variance v changes q by at most v/l q and the amplitude by v/l: 0.74 v/l + v/l in all;
@@ -343,7 +351,7 @@ def test_wide_splats_are_sampled(variant, sigma):
     g = generator(11)
     cov2d = scenes.random_cov2d(g, 200, (sigma, sigma * 1.001), (1.05, 10.0))
     offset = scenes.random_offsets(g, cov2d)
-    actual = ar.footprint_weight(offset, cov2d, footprint=footprint, **options)
+    actual = weight(device, offset, cov2d, footprint=footprint, **options)
     bound = 2 * max(added_variance(variant), 1 / 12) / sigma**2
     if footprint == "analytic":
         x = torch.linspace(-10, 10, 100001, dtype=torch.float64)
@@ -430,26 +438,26 @@ def test_documented_gradient_accuracy(shape):
     [(("box", {"samples": 1}), 2, 480), (("cumulant", {}), 4, 240000)],
     ids=["box-1", "cumulant"],
 )
-def test_safe_bound(variant, power, constant):
+def test_safe_bound(device, variant, power, constant):
     """|weight - exact| <= 1/(constant l'^power), the bounds offered for choosing a footprint."""
     footprint, options = variant
     offset, cov2d = splats(13, count=4000, sigma=(0.05, 3.0), ratio=(1.0, 100.0), reach=3.0)
     _, smaller = eigenvalues(cov2d)
     truth = reference.exact_weight(offset, cov2d)
-    error = (ar.footprint_weight(offset, cov2d, footprint=footprint, **options) - truth).abs()
+    error = (weight(device, offset, cov2d, footprint=footprint, **options) - truth).abs()
     bound = 1 / (constant * (smaller + 1 / 12) ** power)
     assert (error <= 1.05 * bound + 2e-12).all(), (error / bound).max()
 
 
 @pytest.mark.parametrize("samples", [1, 2, 4, 8, 16])
-def test_box_is_the_mean_of_shifted_mips(samples):
+def test_box_is_the_mean_of_shifted_mips(device, samples):
     offset, cov2d = splats(14)
     variance = reference.box_variance(samples)
     shifted = [
-        ar.footprint_weight(offset + node, cov2d, footprint="mip", variance=variance)
+        weight(device, offset + node, cov2d, footprint="mip", variance=variance)
         for node in reference.box_nodes(samples)
     ]
-    actual = ar.footprint_weight(offset, cov2d, footprint="box", samples=samples)
+    actual = weight(device, offset, cov2d, footprint="box", samples=samples)
     excess = (actual - torch.stack(shifted).mean(0)).abs()
     bound = rounding_bound(offset, cov2d, ("box", {"samples": samples}), EPS64)
     assert (excess / bound).max() < 1
@@ -459,21 +467,21 @@ def test_box_is_the_mean_of_shifted_mips(samples):
 
 
 @every_footprint
-def test_float32_weight(variant):
+def test_float32_weight(device, variant):
     """The same float32 inputs in both precisions; see rounding_bound."""
     footprint, options = variant
     offset, cov2d = splats(15, sigma=(0.05, 50.0), ratio=(1.1, 10.0))
     offset, cov2d = offset.float(), cov2d.float()
-    single = ar.footprint_weight(offset, cov2d, footprint=footprint, **options)
+    single = weight(device, offset, cov2d, footprint=footprint, **options)
     assert single.dtype == torch.float32
     offset, cov2d = offset.double(), cov2d.double()
-    double = ar.footprint_weight(offset, cov2d, footprint=footprint, **options)
+    double = weight(device, offset, cov2d, footprint=footprint, **options)
     excess = (single.double() - double).abs() / rounding_bound(offset, cov2d, variant, EPS32)
     assert excess.max() < 1, (single.double() - double).abs().max()
 
 
 @every_footprint
-def test_float32_vjp(variant):
+def test_float32_vjp(device, variant):
     """Condition number below 9: rounding 64 eps cond = 7e-5 of the largest gradient."""
     footprint, options = variant
     offset, cov2d = splats(16, sigma=(0.3, 5.0), ratio=(1.3, 3.0))
@@ -483,7 +491,7 @@ def test_float32_vjp(variant):
         # The double computation starts from the same float32 numbers.
         d = offset.float().to(dtype).requires_grad_()
         c = cov2d.float().to(dtype).requires_grad_()
-        value = ar.footprint_weight(d, c, footprint=footprint, **options)
+        value = weight(device, d, c, footprint=footprint, **options)
         grads.append([t.double() for t in torch.autograd.grad(value.sum(), (d, c))])
     for single, double, unit in zip(*grads, (smaller**-0.5, 1 / smaller), strict=True):
         assert ((single - double).abs() / unit[:, None]).max() < 64 * EPS32 * 9
@@ -504,7 +512,7 @@ HARD = {
 @every_footprint
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 @pytest.mark.parametrize("case", HARD)
-def test_hard_inputs_stay_finite(variant, dtype, case):
+def test_hard_inputs_stay_finite(device, variant, dtype, case):
     """sigma 1e-6 .. 1e6 px; the weight is a weight, the gradient is finite ("paper" too: at exactly
     equal eigenvalues it takes no turn).
 
@@ -524,7 +532,7 @@ def test_hard_inputs_stay_finite(variant, dtype, case):
     offset = torch.tensor(
         [[0, 0], [0.5, 0.5], [0.5, 0], [-0.3, 0.2], [3, -2], [1e3, 1e3], [-1e4, 7]], dtype=dtype
     ).requires_grad_()
-    value = ar.footprint_weight(offset, cov2d, footprint=footprint, **options)
+    value = weight(device, offset, cov2d, footprint=footprint, **options)
     assert torch.isfinite(value).all()
     # analytic overshoots by its density error (5.3e-3), others by rounding alone.
     assert (value >= 0).all()
@@ -536,7 +544,7 @@ def test_hard_inputs_stay_finite(variant, dtype, case):
 
 @every_footprint
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-def test_hard_inputs_stay_accurate(variant, dtype):
+def test_hard_inputs_stay_accurate(device, variant, dtype):
     """Diagonal covariances are well conditioned whatever their size: full accuracy is due.
 
     Each eigenvalue is an input, so the weight errs by a few eps of its exponent's slope (0.74)
@@ -547,16 +555,16 @@ def test_hard_inputs_stay_accurate(variant, dtype):
     s = 10 ** scenes.rand(g, 400, 2, low=-6.0, high=6.0)
     cov2d = torch.stack([s[:, 0] ** 2, torch.zeros(400).double(), s[:, 1] ** 2], -1).to(dtype)
     offset = scenes.random_offsets(g, cov2d.double()).to(dtype)
-    value = ar.footprint_weight(offset, cov2d, footprint=footprint, **options)
+    value = weight(device, offset, cov2d, footprint=footprint, **options)
     expected = reference.weight(offset.double(), cov2d.double(), footprint, **options)
     assert (value.double() - expected).abs().max() < 64 * torch.finfo(dtype).eps
 
 
-def test_isotropic_analytic_uses_the_pixel_axes():
+def test_isotropic_analytic_uses_the_pixel_axes(device):
     """Where the eigenvectors are arbitrary, the pixel's own axes are the only sensible choice."""
     cov2d = torch.tensor([0.09, 0.0, 0.09], dtype=torch.float64)
     offset = torch.tensor([[0.4, 0.1], [-0.2, 0.6]], dtype=torch.float64)
-    value = ar.footprint_weight(offset, cov2d, footprint="analytic")
+    value = weight(device, offset, cov2d, footprint="analytic")
     one = 0.3 * math.sqrt(2 * math.pi) * reference.logistic_window(offset, 0.3)
     assert (value - one.prod(-1)).abs().max() < 1e-14
 
@@ -565,24 +573,25 @@ def test_isotropic_analytic_uses_the_pixel_axes():
 
 
 @every_footprint
-def test_broadcasting(variant):
+def test_broadcasting(device, variant):
     footprint, options = variant
     offset, cov2d = splats(18, count=5)
     offset, cov2d = offset[:, None].requires_grad_(), cov2d[:4].requires_grad_()
-    value = ar.footprint_weight(offset, cov2d, footprint=footprint, **options)
+    value = weight(device, offset, cov2d, footprint=footprint, **options)
     assert value.shape == (5, 4)
     value.sum().backward()
     assert offset.grad.shape == (5, 1, 2)
     assert cov2d.grad.shape == (4, 3)
-    one = ar.footprint_weight(offset[3, 0], cov2d[2], footprint=footprint, **options)
+    one = weight(device, offset[3, 0], cov2d[2], footprint=footprint, **options)
     assert one.shape == ()
     assert abs(one - value[3, 2]) < 1e-14
 
 
-def test_empty_and_strided():
-    empty = ar.footprint_weight(torch.zeros(0, 2), torch.ones(3))
+def test_empty_and_strided(device):
+    empty = ar.footprint_weight(torch.zeros(0, 2, device=device), torch.ones(3, device=device))
     assert empty.shape == (0,)
     offset, cov2d = splats(19, count=10)
+    offset, cov2d = offset.to(device), cov2d.to(device)
     packed = torch.cat([offset, cov2d], -1).T.contiguous().T
     assert not packed[:, :2].is_contiguous()
     strided = ar.footprint_weight(packed[:, :2], packed[:, 2:])

@@ -34,7 +34,7 @@ AR_HD WeightGrad<T> weight_vjp(Sym2<T> entries, Vec2<T> d, FootprintOptions opti
   AR_UNROLL
   for (int s = 0; s < F::kSamples; ++s) {
     const T w = F::alpha(terms, d, s);
-    sums = sums + F::alpha_vjp(terms, d, s, w, g);
+    F::add_alpha_vjp(terms, d, s, w, g, sums);
     weighted += g * w;
   }
   const SplatGrad<T> grad = F::prepare_vjp(cov, shape, sums, weighted);

@@ -210,7 +210,7 @@ template <class F, typename T, bool kAbs> void blend_vjp_tile(const cpu::BlendVj
         const Vec3<V> gp = {load(g[0] + pixel, V()), load(g[1] + pixel, V()), load(g[2] + pixel, V())};
         const V g_color = madd(gp.x, splat_color.x, madd(gp.y, splat_color.y, gp.z * splat_color.z));
         V contribution = zero;
-        Vec2<V> offset = {zero, zero};
+        ShapeGrad<V> pixel_shape = {{zero, zero}, {zero, zero, zero}};
         AR_UNROLL
         for (int s = 0; s < kSamples; ++s) {
           const V alpha = F::alpha(terms, p, s);
@@ -221,15 +221,13 @@ template <class F, typename T, bool kAbs> void blend_vjp_tile(const cpu::BlendVj
           store(behind[s] + pixel, b);
           contribution = contribution + grad.contribution;
           weighted = madd(grad.dL_dalpha, alpha, weighted);
-          const ShapeGrad<V> one = F::alpha_vjp(terms, p, s, alpha, grad.dL_dalpha);
-          offset = offset + one.offset;
-          shape.shape = shape.shape + one.shape;
+          F::add_alpha_vjp(terms, p, s, alpha, grad.dL_dalpha, kAbs ? pixel_shape : shape);
         }
-        shape.offset = shape.offset + offset;
         color = {madd(contribution, gp.x, color.x), madd(contribution, gp.y, color.y),
                  madd(contribution, gp.z, color.z)};
         if (kAbs) {
-          const Vec2<V> by_mean = transform_transposed(F::mean_map(splat.shape), offset);
+          shape = shape + pixel_shape;
+          const Vec2<V> by_mean = transform_transposed(F::mean_map(splat.shape), pixel_shape.offset);
           abs2d = abs2d + Vec2<V>{abs(by_mean.x), abs(by_mean.y)};
         }
       }

@@ -217,12 +217,19 @@ template <int S> __device__ void store_last(const BlendTask& task, int x, int y,
 /// blend_vjp starts from. `behind`: of what is behind them all. Sums of positive terms do not cancel.
 template <int S>
 __device__ void accumulate_behind(const PixelCheckpoints<S>& checkpoints, int n, int s, Vec3<float> behind) {
-#pragma unroll 4
-  for (int c = n - 1; c >= 0; --c) {
-    Checkpoint& checkpoint = checkpoints.at(c, s);
-    const Vec3<float> own = checkpoint.color;
-    checkpoint.color = behind;
-    behind += own;
+  constexpr int kBatch = 8;  // loads before stores, so that they wait together
+  for (int last = n - 1; last >= 0; last -= kBatch) {
+    Vec3<float> own[kBatch];
+#pragma unroll
+    for (int k = 0; k < kBatch; ++k) {
+      if (last >= k) own[k] = checkpoints.at(last - k, s).color;
+    }
+#pragma unroll
+    for (int k = 0; k < kBatch; ++k) {
+      if (last < k) continue;
+      checkpoints.at(last - k, s).color = behind;
+      behind += own[k];
+    }
   }
 }
 
@@ -257,7 +264,10 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples == 1 ? 5 : 1) blend
     }
   }
   const bool more = k == front && front < list.count && __syncthreads_or(state.open());
-  if (threadIdx.x == 0) task.tile_open[tile] = more;
+  if (threadIdx.x == 0) {
+    task.tile_open[tile] = more;
+    if (more) task.open_tiles[atomicAdd(&task.lists.counts->open_tiles, 1)] = tile;
+  }
   if (kKeep) store_last(task, x, y, state.last);
   if (!more) {
     store_color(task, x, y, total + state.total_color(), state.transmittance);
@@ -314,19 +324,28 @@ __device__ inline int chunks_of(const BlendTask& task, int tile, int length) {
 }
 
 /// Turns the transmittance of each chunk into the one in front of it, negative where a sample has
-/// stopped before.
+/// stopped before. Blocks share the open tiles.
 template <int S> __global__ void __launch_bounds__(kTilePixels) rest_scan_kernel(const BlendTask task) {
-  const int tile = blockIdx.x / S, s = blockIdx.x % S;
-  if (!task.tile_open[tile]) return;
-  const PixelCheckpoints<S> checkpoints(task, tile, threadIdx.x);
-  const int chunks = chunks_of(task, tile, chunk_length(S));
-  float transmittance = checkpoints.at(task.plan.front - 1, s).transmittance;
-#pragma unroll 8
-  for (int c = task.plan.front; c < chunks; ++c) {
-    const float through = checkpoints.at(c, s).transmittance;
-    checkpoints.at(c, s).transmittance = transmittance;
-    if (transmittance > 0) transmittance *= through;
-    if (transmittance < kNearlyStopped) transmittance = -abs(transmittance);
+  constexpr int kBatch = 16;
+  const int items = task.lists.counts->open_tiles * S;
+  for (int item = blockIdx.x; item < items; item += gridDim.x) {
+    const int tile = task.open_tiles[item / S], s = item % S, chunks = chunks_of(task, tile, chunk_length(S));
+    const PixelCheckpoints<S> checkpoints(task, tile, threadIdx.x);
+    float transmittance = checkpoints.at(task.plan.front - 1, s).transmittance;
+    for (int first = task.plan.front; first < chunks; first += kBatch) {
+      float through[kBatch];
+#pragma unroll
+      for (int k = 0; k < kBatch; ++k) {
+        if (first + k < chunks) through[k] = checkpoints.at(first + k, s).transmittance;
+      }
+#pragma unroll
+      for (int k = 0; k < kBatch; ++k) {
+        if (first + k >= chunks) break;
+        checkpoints.at(first + k, s).transmittance = transmittance;
+        if (transmittance > 0) transmittance *= through[k];
+        if (transmittance < kNearlyStopped) transmittance = -abs(transmittance);
+      }
+    }
   }
 }
 
@@ -373,30 +392,31 @@ template <class F, bool kKeep> __global__ void __launch_bounds__(kBlendThreads) 
   }
 }
 
-/// Adds the chunks of the tiles that the front left open.
+/// Adds the chunks of the open tiles. Blocks share the tiles.
 template <int S, bool kKeep> __global__ void __launch_bounds__(kTilePixels) rest_sum_kernel(const BlendTask task) {
-  const int tile = blockIdx.x;
-  if (!task.tile_open[tile]) return;
-  const PixelCheckpoints<S> checkpoints(task, tile, threadIdx.x);
-  const int chunks = chunks_of(task, tile, chunk_length(S));
   const Vec3<float> bg = {task.background[0], task.background[1], task.background[2]};
-  PixelState<S, 1> state;
-  state.start(false);
-#pragma unroll
-  for (int s = 0; s < S; ++s) {
-    float transmittance = -1;
-#pragma unroll 8
-    for (int c = kKeep ? 0 : task.plan.front - 1; c < chunks; ++c) {
-      const Checkpoint checkpoint = checkpoints.at(c, s);
-      state.color[0] += checkpoint.color;
-      if (checkpoint.transmittance != 0) transmittance = checkpoint.transmittance;
-    }
-    state.transmittance[s] = transmittance;
-    if (kKeep) accumulate_behind(checkpoints, chunks, s, abs(transmittance) * bg);
-  }
   const Vec2<float> p = pixel_of(threadIdx.x / 32, lane_id());
-  const int x = tile % task.grid.columns() * kTile + int(p.x), y = tile / task.grid.columns() * kTile + int(p.y);
-  store_color(task, x, y, state.color[0], state.transmittance);
+  const int items = task.lists.counts->open_tiles;
+  for (int item = blockIdx.x; item < items; item += gridDim.x) {
+    const int tile = task.open_tiles[item], chunks = chunks_of(task, tile, chunk_length(S));
+    const PixelCheckpoints<S> checkpoints(task, tile, threadIdx.x);
+    Vec3<float> color = {0, 0, 0};
+    float transmittance[S];
+#pragma unroll
+    for (int s = 0; s < S; ++s) {
+      float last = -1;
+#pragma unroll 16
+      for (int c = kKeep ? 0 : task.plan.front - 1; c < chunks; ++c) {
+        const Checkpoint checkpoint = checkpoints.at(c, s);
+        color += checkpoint.color;
+        if (checkpoint.transmittance != 0) last = checkpoint.transmittance;
+      }
+      transmittance[s] = last;
+      if (kKeep) accumulate_behind(checkpoints, chunks, s, abs(last) * bg);
+    }
+    const int x = tile % task.grid.columns() * kTile + int(p.x), y = tile / task.grid.columns() * kTile + int(p.y);
+    store_color(task, x, y, color, transmittance);
+  }
 }
 
 /// Blocks that fill any device.
@@ -407,9 +427,9 @@ template <class F, bool kKeep> void blend_kernels(const BlendTask& task, cudaStr
   const unsigned tiles = unsigned(task.grid.tiles());
   blend_front_kernel<F, kKeep><<<tiles, kBlendThreads, 0, stream>>>(task);
   rest_through_kernel<F><<<kRestBlocks, kBlendThreads, 0, stream>>>(task);
-  rest_scan_kernel<S><<<tiles * S, kTilePixels, 0, stream>>>(task);
+  rest_scan_kernel<S><<<kRestBlocks, kTilePixels, 0, stream>>>(task);
   rest_blend_kernel<F, kKeep><<<kRestBlocks, kBlendThreads, 0, stream>>>(task);
-  rest_sum_kernel<S, kKeep><<<tiles, kTilePixels, 0, stream>>>(task);
+  rest_sum_kernel<S, kKeep><<<kRestBlocks, kTilePixels, 0, stream>>>(task);
 }
 template <class F> void blend(const BlendTask& task, cudaStream_t stream) {
   if (task.transmittance) {
@@ -544,7 +564,7 @@ template <class F, bool kAbs> __global__ void __launch_bounds__(32 * kVjpWarps<F
         const float4 g = stage.g[q];
         const float g_color = madd(g.x, splat.color.x, madd(g.y, splat.color.y, g.z * splat.color.z));
         float contribution = 0;
-        Vec2<float> offset = {0, 0};
+        ShapeGrad<float> pixel_shape = {{0, 0}, {0, 0, 0}};
 #pragma unroll
         for (int s = 0; s < S; ++s) {
           const float alpha = F::alpha(splat.terms, p, s);
@@ -553,16 +573,14 @@ template <class F, bool kAbs> __global__ void __launch_bounds__(32 * kVjpWarps<F
           auto sample = stage.samples[s][q];
           const BlendGrad<float> grad = blend_sample_vjp(mask, alpha, g_color, sample.transmittance, sample.behind);
           stage.samples[s][q] = sample;
-          const ShapeGrad<float> one = F::alpha_vjp(splat.terms, p, s, alpha, grad.dL_dalpha);
+          F::add_alpha_vjp(splat.terms, p, s, alpha, grad.dL_dalpha, kAbs ? pixel_shape : shape);
           contribution = s == 0 ? grad.contribution : contribution + grad.contribution;
           weighted += grad.dL_dalpha * alpha;
-          offset = s == 0 ? one.offset : offset + one.offset;
-          shape.shape = shape.shape + one.shape;
         }
-        shape.offset = shape.offset + offset;
         color = {madd(contribution, g.x, color.x), madd(contribution, g.y, color.y), madd(contribution, g.z, color.z)};
         if (kAbs) {
-          const Vec2<float> by_mean = transform_transposed(m, offset);
+          shape = shape + pixel_shape;
+          const Vec2<float> by_mean = transform_transposed(m, pixel_shape.offset);
           abs2d = abs2d + Vec2<float>{abs(by_mean.x), abs(by_mean.y)};
         }
       }

@@ -47,7 +47,7 @@ struct alignas(8) SlotPair {
 struct Counts {
   int64_t pairs, splats;               ///< splats: with pairs
   int32_t chunks, checkpoints, rest;   ///< of the plan
-  int32_t unused;
+  int32_t open_tiles;                  ///< that the front chunks left with an open sample and pairs
 };
 
 /// Color and transmittance of a pixel's sample at the end of a chunk.
@@ -113,7 +113,8 @@ struct BlendTask {
   ChunkPlan plan;
   TileGrid grid;
   const float* background;  ///< [3]
-  int32_t* tile_open;       ///< [tiles] whether the front chunks left an open sample and pairs
+  int32_t* tile_open;       ///< [tiles] whether the tile is one of the open ones
+  int32_t* open_tiles;      ///< [counts->open_tiles]
   Checkpoint* checkpoints;  ///< [checkpoints, samples, 256]
   float* image;             ///< [3, height, width]
   float* transmittance;     ///< [samples, height, width], or null without backward pass

@@ -250,13 +250,14 @@ BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& b
       lists_of(projected.splats, binned.order, binned.pairs, binned.tile_offsets, scratch.counts);
   cuda::plan_chunks(lists, grid, stages.samples, plan.view, feedback, stream);
   check_stage("plan_chunks", stream, debug);
-  const Tensor tile_open = at::empty({grid.tiles()}, ints);
+  const Tensor tile_open = at::empty({2, grid.tiles()}, ints);
   BlendedImage out{at::empty({3, in.image_height, in.image_width}, floats),
                    at::empty({samples, in.image_height, in.image_width}, floats),
                    at::empty({samples, in.image_height, in.image_width}, ints),
                    at::empty({plan.max_checkpoints, stages.samples, kTile * kTile, 4}, floats),
                    plan.chunks};
   stages.blend({lists, plan.view, grid, in.background.const_data_ptr<float>(), tile_open.data_ptr<int32_t>(),
+                tile_open.data_ptr<int32_t>() + grid.tiles(),
                 reinterpret_cast<cuda::Checkpoint*>(out.checkpoints.data_ptr<float>()), out.color.data_ptr<float>(),
                 keep ? out.transmittance.data_ptr<float>() : nullptr, keep ? out.last.data_ptr<int32_t>() : nullptr},
                stream);

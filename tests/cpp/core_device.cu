@@ -39,9 +39,7 @@ template <class F, typename T> __global__ void run_core(Buffers<T> b, Splat<F, T
     const T alpha = F::alpha(terms, d, s);
     const Blended<T> blended = blend_sample(alpha, transmittance);
     const BlendGrad<T> grad = blend_sample_vjp(blended.mask, alpha, splats[i].color.x, transmittance, behind);
-    const ShapeGrad<T> one = F::alpha_vjp(terms, d, s, alpha, grad.dL_dalpha);
-    sums.shape.offset = sums.shape.offset + one.offset;
-    sums.shape.shape.xx += one.shape.xx + one.shape.xy + one.shape.yy;
+    F::add_alpha_vjp(terms, d, s, alpha, grad.dL_dalpha, sums.shape);
     sums.weighted += grad.contribution;
   }
   b.pixels[i] = transform_transposed(F::mean_map(splats[i].shape), sums.shape.offset);

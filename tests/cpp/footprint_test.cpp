@@ -21,7 +21,7 @@ template <class F, typename T> Adjoint<T> weight_vjp(Cov2d<T> cov, Vec2<T> d, T 
   T weighted = 0;
   for (int s = 0; s < F::kSamples; ++s) {
     const T alpha = F::alpha(terms, d, s);
-    add(F::alpha_vjp(terms, d, s, alpha, g[s]), sums);
+    F::add_alpha_vjp(terms, d, s, alpha, g[s], sums);
     weighted += g[s] * alpha;
   }
   const SplatGrad<T> grad = F::prepare_vjp(cov, shape, sums, weighted);

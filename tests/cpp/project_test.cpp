@@ -120,12 +120,15 @@ template <class F> struct Loss {
       const Vec2<double> d = offset(k, splat);
       for (int s = 0; s < F::kSamples; ++s) {
         const double alpha = F::alpha(terms, d, s);
-        ShapeGrad<double> one = F::alpha_vjp(terms, d, s, alpha, g[k]);
+        ShapeGrad<double> one = {};
+        F::add_alpha_vjp(terms, d, s, alpha, g[k], one);
         if constexpr (kIsFrozen<F>) {
           // This adjoint is deliberately not the formula's. Give it the formula's own frame term.
           using Paper = Analytic<FrameGradient::kPaper>;
           const auto paper = Paper::terms(Paper::Shape<double>{splat.shape.inv_sigma, splat.shape.axis, splat.shape.mass}, splat.opacity);
-          one.shape.xy = Paper::alpha_vjp(paper, d, s, alpha, g[k]).shape.xy / gap;
+          ShapeGrad<double> turned = {};
+          Paper::add_alpha_vjp(paper, d, s, alpha, g[k], turned);
+          one.shape.xy = turned.shape.xy / gap;
         }
         add(one, sums.shape);
         sums.weighted += g[k] * alpha;

@@ -180,7 +180,8 @@ template <class F> Rendered<double> render_plainly(const Scene<double>& scene) {
         const BlendGrad<double> b =
             blend_sample_vjp(masks[k], alphas[k], dot(gp, splats[i].color), transmittance, behind);
         const Vec2<double> d = {pixel % width - splats[i].mean.x, pixel / width - splats[i].mean.y};
-        const ShapeGrad<double> one = F::alpha_vjp(terms[i], d, s, alphas[k], b.dL_dalpha);
+        ShapeGrad<double> one = {};
+        F::add_alpha_vjp(terms[i], d, s, alphas[k], b.dL_dalpha, one);
         add(one, sums[i].shape);
         offset[i] = offset[i] + one.offset;
         sums[i].weighted += alphas[k] * b.dL_dalpha;

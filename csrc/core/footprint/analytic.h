@@ -138,7 +138,7 @@ template <FrameGradient kFrame> struct Analytic {
 
   /// offset = (g_u, g_v); shape = (g_s1, the frame term, g_s2).
   template <typename T, class V>
-  AR_HD static ShapeGrad<V> alpha_vjp(const Terms<T>& t, Vec2<V> p, int, V, V dL_dalpha) {
+  AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> p, int, V, V dL_dalpha, ShapeGrad<V>& sums) {
     const Vec2<V> e = transform(frame(t.shape), p, t.origin);
     const LogisticWindow<V> f(e.x, t.shape.inv_sigma.x), g(e.y, t.shape.inv_sigma.y);
     const V scale = dL_dalpha * V(t.mass);
@@ -146,7 +146,9 @@ template <FrameGradient kFrame> struct Analytic {
     const V by_u = scale * f_u * g.value, by_v = scale * f.value * g_v;
     // Frozen: I_u I_v / I, the pull of the covariance between u and v at a window that stays put.
     const V frame = kFrame == FrameGradient::kFrozen ? scale * f_u * g_v : by_u * e.y - by_v * e.x;
-    return {{by_u, by_v}, {scale * f.by_sigma() * g.value, frame, scale * f.value * g.by_sigma()}};
+    sums.offset = sums.offset + Vec2<V>{by_u, by_v};
+    sums.shape = {madd(scale * g.value, f.by_sigma(), sums.shape.xx), sums.shape.xy + frame,
+                  madd(scale * f.value, g.by_sigma(), sums.shape.yy)};
   }
 
   template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& g) {

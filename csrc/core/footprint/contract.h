@@ -14,7 +14,7 @@
 //   terms(Shape<T>, opacity, Vec2<T> origin) -> Terms<T>    numbers that all pixels share, derived per
 //                                        (tile, splat); origin = a point of the tile - mean [px], by default 0
 //   alpha(Terms<T>, Vec2<V> p, s) -> V   opacity * I at sample s; p = pixel centre - that point [px]
-//   alpha_vjp(Terms<T>, p, s, alpha, dL_dalpha) -> ShapeGrad<V>      per pixel: sums of plain products
+//   add_alpha_vjp(Terms<T>, p, s, alpha, dL_dalpha, ShapeGrad<V>& sums)    per pixel: plain products
 //   mean_map(Shape<T>) -> Mat2<T>        m with dL/dmean = m^T sums.offset [dL/dpx]
 //   prepare_vjp(Cov2d<T>, Shape<T>, ShapeGrad<T> sums, weighted) -> SplatGrad<T>         once per splat
 //

@@ -96,17 +96,18 @@ struct Cumulant {
   /// With h the correction, p = C d and e = w dh/dp, in whitened coordinates:
   /// d log I = (z + e).w dmu + tr(w^T (z z^T / 2 + sym(e z^T) + w diag(dh/da, dh/dc) w^T) w dSigma).
   template <typename T, class V>
-  AR_HD static ShapeGrad<V> alpha_vjp(const Terms<T>& t, Vec2<V> pixel, int, V alpha, V dL_dalpha) {
+  AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> pixel, int, V alpha, V dL_dalpha, ShapeGrad<V>& sums) {
     const Vec2<V> z = transform(t.w, pixel, t.origin), p = transform_transposed(t.w, z);
     const V scale = V(T(kOrder4)), twice = V(T(2 * kOrder4));
     const Vec2<V> e = transform(t.w, Vec2<V>{scale * t.x.by_p(p.x), scale * t.y.by_p(p.y)});
     const V ha = twice * t.x.by_t(p.x), hc = twice * t.y.by_t(p.y);
     const V g = dL_dalpha * alpha;
     const Mat2<T>& w = t.w;
-    return {{g * (z.x + e.x), g * (z.y + e.y)},
-            {g * (z.x * (z.x + e.x + e.x) + V(w.xx * w.xx) * ha + V(w.xy * w.xy) * hc),
-             g * (z.x * z.y + e.x * z.y + z.x * e.y + V(w.xx * w.yx) * ha + V(w.xy * w.yy) * hc),
-             g * (z.y * (z.y + e.y + e.y) + V(w.yx * w.yx) * ha + V(w.yy * w.yy) * hc)}};
+    const V xx = madd(z.x, z.x + e.x + e.x, madd(V(w.xx * w.xx), ha, V(w.xy * w.xy) * hc));
+    const V xy = madd(z.x, z.y + e.y, madd(e.x, z.y, madd(V(w.xx * w.yx), ha, V(w.xy * w.yy) * hc)));
+    const V yy = madd(z.y, z.y + e.y + e.y, madd(V(w.yx * w.yx), ha, V(w.yy * w.yy) * hc));
+    sums.offset = {madd(g, z.x + e.x, sums.offset.x), madd(g, z.y + e.y, sums.offset.y)};
+    sums.shape = {madd(g, xx, sums.shape.xx), madd(g, xy, sums.shape.xy), madd(g, yy, sums.shape.yy)};
   }
 
   template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return shape.w; }

@@ -105,10 +105,11 @@ template <int S, bool kCompensated> struct GaussianFootprint {
   }
 
   template <typename T, class V>
-  AR_HD static ShapeGrad<V> alpha_vjp(const Terms<T>& t, Vec2<V> p, int s, V alpha, V dL_dalpha) {
+  AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> p, int s, V alpha, V dL_dalpha, ShapeGrad<V>& sums) {
     const Vec2<V> z = whitened(t, p, s);
     const V g = dL_dalpha * alpha, gx = g * z.x, gy = g * z.y;
-    return {{gx, gy}, {gx * z.x, gx * z.y, gy * z.y}};
+    sums.offset = sums.offset + Vec2<V>{gx, gy};
+    sums.shape = {madd(gx, z.x, sums.shape.xx), madd(gx, z.y, sums.shape.xy), madd(gy, z.y, sums.shape.yy)};
   }
 
   template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) {
