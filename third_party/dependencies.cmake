@@ -10,9 +10,9 @@ if(BUILD_TESTING)
       "macOS: googletest) or leave the tests out with -DBUILD_TESTING=OFF.")
   endif()
 
-  # The CUDA toolkit is optional and no GPU is needed: a test compiles the core for devices.
+  # The CUDA toolkit is optional and no GPU is needed: a test compiles the kernels.
   find_program(AR_NVCC nvcc HINTS ENV CUDA_HOME ENV CUDA_PATH PATHS /usr/local/cuda PATH_SUFFIXES bin)
   if(NOT AR_NVCC)
-    message(STATUS "nvcc was not found: the test core_cuda, which compiles the core for devices, is left out.")
+    message(STATUS "nvcc was not found: the test cuda_kernels, which compiles them, is left out.")
   endif()
 endif()

@@ -7,6 +7,7 @@
 #include <cmath>
 #include <cstdint>
 
+#include "core/constants.h"
 #include "core/platform.h"
 
 namespace ar {
@@ -56,8 +57,6 @@ AR_HD double madd(double a, double b, double c) {
 
 AR_HD float abs(float x) { return std::fabs(x); }
 AR_HD double abs(double x) { return std::fabs(x); }
-AR_HD float exp(float x) { return std::exp(x); }
-AR_HD double exp(double x) { return std::exp(x); }
 AR_HD float log2(float x) { return std::log2(x); }
 AR_HD double log2(double x) { return std::log2(x); }
 /// On a device within 2 ulp; results below 2^-126 are zero.
@@ -71,6 +70,15 @@ AR_HD float exp2(float x) {
 #endif
 }
 AR_HD double exp2(double x) { return std::exp2(x); }
+/// On a device within 2 ulp + |x| 2^-24 relative: the product with log2(e) is rounded once.
+AR_HD float exp(float x) {
+#if defined(__CUDA_ARCH__)
+  return exp2(x * float(kLog2e));
+#else
+  return std::exp(x);
+#endif
+}
+AR_HD double exp(double x) { return std::exp(x); }
 AR_HD float sqrt(float x) { return std::sqrt(x); }
 AR_HD double sqrt(double x) { return std::sqrt(x); }
 
@@ -112,10 +120,15 @@ template <typename T> AR_HD bool within(T x, double bound) { return abs(x) <= T(
 /// Taylor series below 1/2 (remainder < 1e-8 relative in float, 5e-17 in double).
 template <class V> AR_HD V one_minus_exp(V x, V e) {
   using T = ScalarOf<V>;
+  // (-1)^k / (k + 1)!
+  constexpr double kCoefficients[] = {
+      1.0,           -1.0 / 2,       1.0 / 6,         -1.0 / 24,        1.0 / 120,
+      -1.0 / 720,    1.0 / 5040,     -1.0 / 40320,    1.0 / 362880,     -1.0 / 3628800,
+      1.0 / 39916800, -1.0 / 479001600, 1.0 / 6227020800, -1.0 / 87178291200, 1.0 / 1307674368000};
   constexpr int kTerms = sizeof(T) == 4 ? 8 : 15;
-  V series(T(1));
+  V series = V(T(kCoefficients[kTerms - 1]));
   AR_UNROLL
-  for (int k = kTerms; k >= 2; --k) series = madd(x * V(T(-1) / T(k)), series, V(T(1)));
+  for (int k = kTerms - 2; k >= 0; --k) series = madd(series, x, V(T(kCoefficients[k])));
   return select(x < V(T(0.5)), x * series, V(T(1)) - e);
 }
 

@@ -210,7 +210,7 @@ template <class F, typename T, bool kAbs> void blend_vjp_tile(const cpu::BlendVj
         const Vec3<V> gp = {load(g[0] + pixel, V()), load(g[1] + pixel, V()), load(g[2] + pixel, V())};
         const V g_color = madd(gp.x, splat_color.x, madd(gp.y, splat_color.y, gp.z * splat_color.z));
         V contribution = zero;
-        ShapeGrad<V> pixel_shape = {{zero, zero}, {zero, zero, zero}};
+        ShapeGrad<V> of_pixel = {{zero, zero}, {zero, zero, zero}};
         AR_UNROLL
         for (int s = 0; s < kSamples; ++s) {
           const V alpha = F::alpha(terms, p, s);
@@ -221,13 +221,13 @@ template <class F, typename T, bool kAbs> void blend_vjp_tile(const cpu::BlendVj
           store(behind[s] + pixel, b);
           contribution = contribution + grad.contribution;
           weighted = madd(grad.dL_dalpha, alpha, weighted);
-          F::add_alpha_vjp(terms, p, s, alpha, grad.dL_dalpha, kAbs ? pixel_shape : shape);
+          F::add_alpha_vjp(terms, p, s, alpha, grad.dL_dalpha, shape);
+          if (kAbs) F::add_alpha_vjp(terms, p, s, alpha, grad.dL_dalpha, of_pixel);
         }
         color = {madd(contribution, gp.x, color.x), madd(contribution, gp.y, color.y),
                  madd(contribution, gp.z, color.z)};
         if (kAbs) {
-          shape = shape + pixel_shape;
-          const Vec2<V> by_mean = transform_transposed(F::mean_map(splat.shape), pixel_shape.offset);
+          const Vec2<V> by_mean = transform_transposed(F::mean_map(splat.shape), of_pixel.offset);
           abs2d = abs2d + Vec2<V>{abs(by_mean.x), abs(by_mean.y)};
         }
       }

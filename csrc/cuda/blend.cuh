@@ -235,7 +235,7 @@ __device__ void accumulate_behind(const PixelCheckpoints<S>& checkpoints, int n,
 
 /// A block per tile.
 template <class F, bool kKeep>
-__global__ void __launch_bounds__(kBlendThreads, F::kSamples == 1 ? 5 : 1) blend_front_kernel(const BlendTask task) {
+__global__ void __launch_bounds__(kBlendThreads, F::kSamples > 1 ? 1 : sizeof(TileSplat<F>) > 64 ? 4 : 5) blend_front_kernel(const BlendTask task) {
   constexpr int S = F::kSamples, kLength = chunk_length(S), kColors = kKeep ? S : 1;
   __shared__ Stage<F> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.lists.splats);
@@ -564,7 +564,7 @@ template <class F, bool kAbs> __global__ void __launch_bounds__(32 * kVjpWarps<F
         const float4 g = stage.g[q];
         const float g_color = madd(g.x, splat.color.x, madd(g.y, splat.color.y, g.z * splat.color.z));
         float contribution = 0;
-        ShapeGrad<float> pixel_shape = {{0, 0}, {0, 0, 0}};
+        ShapeGrad<float> of_pixel = {{0, 0}, {0, 0, 0}};
 #pragma unroll
         for (int s = 0; s < S; ++s) {
           const float alpha = F::alpha(splat.terms, p, s);
@@ -573,14 +573,14 @@ template <class F, bool kAbs> __global__ void __launch_bounds__(32 * kVjpWarps<F
           auto sample = stage.samples[s][q];
           const BlendGrad<float> grad = blend_sample_vjp(mask, alpha, g_color, sample.transmittance, sample.behind);
           stage.samples[s][q] = sample;
-          F::add_alpha_vjp(splat.terms, p, s, alpha, grad.dL_dalpha, kAbs ? pixel_shape : shape);
+          F::add_alpha_vjp(splat.terms, p, s, alpha, grad.dL_dalpha, shape);
+          if (kAbs) F::add_alpha_vjp(splat.terms, p, s, alpha, grad.dL_dalpha, of_pixel);
           contribution = s == 0 ? grad.contribution : contribution + grad.contribution;
           weighted += grad.dL_dalpha * alpha;
         }
         color = {madd(contribution, g.x, color.x), madd(contribution, g.y, color.y), madd(contribution, g.z, color.z)};
         if (kAbs) {
-          shape = shape + pixel_shape;
-          const Vec2<float> by_mean = transform_transposed(m, pixel_shape.offset);
+          const Vec2<float> by_mean = transform_transposed(m, of_pixel.offset);
           abs2d = abs2d + Vec2<float>{abs(by_mean.x), abs(by_mean.y)};
         }
       }

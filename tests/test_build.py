@@ -1,0 +1,26 @@
+"""The binding of the CUDA kernels to torch compiles, also where torch has no CUDA and there is no GPU."""
+
+import pathlib
+import shutil
+import subprocess
+
+import pytest
+from torch.utils import cpp_extension
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+NVCC = shutil.which("nvcc") or shutil.which("nvcc", path="/usr/local/cuda/bin")
+
+
+def test_the_cuda_ops_compile(tmp_path):
+    if NVCC is None:
+        pytest.skip("needs nvcc")
+    # A CPU build of torch ships its CUDA headers without the one that its CUDA build generates.
+    generated = tmp_path / "include" / "c10" / "cuda" / "impl" / "cuda_cmake_macros.h"
+    generated.parent.mkdir(parents=True)
+    generated.touch()
+    include = [str(ROOT / "csrc"), *cpp_extension.include_paths(), str(tmp_path / "include")]
+    include = [path for path in include if pathlib.Path(path).is_dir()]
+    command = [NVCC, "-std=c++20", "-c", str(ROOT / "csrc/torch/ops_cuda.cpp"), "-o", str(tmp_path / "ops_cuda.o")]
+    command += [f"-I{path}" for path in include]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-4000:]
