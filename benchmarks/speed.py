@@ -23,6 +23,7 @@ from __future__ import annotations
 
 import argparse
 import ctypes
+import functools
 import json
 import platform
 import statistics
@@ -148,6 +149,11 @@ def format_results(results: dict[str, dict], device: str) -> str:
     return format_table(header, rows)
 
 
+@functools.cache
+def fixed_weights(height: int, width: int, device: torch.device) -> torch.Tensor:
+    return torch.rand(3, height, width, generator=torch.Generator().manual_seed(0)).to(device)
+
+
 class Case:
     """One view of a scene, ready to render with one footprint."""
 
@@ -158,8 +164,7 @@ class Case:
         self.gaussians = scene.arguments()
         self.inputs = {k: v.detach().requires_grad_() for k, v in self.gaussians.items()}
         self.inputs["means2D"] = torch.zeros_like(scene.means, requires_grad=True)
-        size = (3, self.settings.image_height, self.settings.image_width)
-        self.dL_dcolor = torch.rand(size, generator=torch.Generator().manual_seed(0)).to(device)
+        self.dL_dcolor = fixed_weights(self.settings.image_height, self.settings.image_width, device)
         footprint = self.settings.footprint
         given = {**self.gaussians, **self.settings._asdict(), "footprint": footprint.key, "keep": False}
         given["variance"] = footprint.variance

@@ -27,9 +27,9 @@ each_precision = pytest.mark.parametrize(
 )
 
 
-@pytest.fixture(params=[pytest.param("cpu", id=pytest.HIDDEN_PARAM), pytest.param("cuda", marks=needs_cuda)])
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=needs_cuda)])
 def device(request):
-    """A test that takes it runs once per device, on the CPU under the name it would have without."""
+    """A test that takes it runs once per device."""
     return request.param
 
 

@@ -13,6 +13,7 @@ import pytest
 import reference
 import scenes
 import torch
+from conftest import each_precision
 from scenes import KINDS, VARIANTS, Camera, name_of
 
 import analytic_rasterizer as ar
@@ -45,12 +46,13 @@ def no_default_footprint(monkeypatch):
     ar.set_default_footprint(None)
 
 
-def scene32(seed=1, count=20, degree=1):
-    return scenes.cast(scenes.random_scene(seed, count, degree), torch.float32)
+def scene32(device="cpu", seed=1, count=20, degree=1):
+    return scenes.cast(scenes.random_scene(seed, count, degree), torch.float32, device)
 
 
 def render(scene, settings=None):
-    return ar.GaussianRasterizer(settings or CAMERA.settings(torch.float32))(**scene)
+    settings = settings or CAMERA.settings(torch.float32, scene["means3D"].device)
+    return ar.GaussianRasterizer(settings)(**scene)
 
 
 def gradients(scene, settings=None):
@@ -58,7 +60,7 @@ def gradients(scene, settings=None):
     leaves = scenes.leaves(scene)
     color, radii = render(leaves, settings)
     g = torch.Generator().manual_seed(2)
-    (color * scenes.rand(g, *color.shape, low=-1.0).to(color.dtype)).sum().backward()
+    (color * scenes.rand(g, *color.shape, low=-1.0).to(color)).sum().backward()
     return color.detach(), radii, {name: leaf.grad for name, leaf in leaves.items()}
 
 
@@ -226,13 +228,14 @@ def test_environment_variable_of_a_new_process():
 # --- what is accepted --------------------------------------------------------------------------
 
 
-def test_call_forms_agree():
+def test_call_forms_agree(device):
     """Keywords, positions, the function, with and without gradients."""
-    scene = scene32()
-    settings = CAMERA.settings(torch.float32)
+    scene = scene32(device)
+    settings = CAMERA.settings(torch.float32, device)
     expected, radii = render(scene, settings)
     assert expected.dtype == torch.float32
     assert radii.dtype == torch.int32
+    assert expected.device == radii.device == scene["means3D"].device
     rasterizer = ar.GaussianRasterizer(raster_settings=settings)
     assert isinstance(rasterizer, torch.nn.Module)
     positional = rasterizer(
@@ -255,20 +258,20 @@ def test_call_forms_agree():
         assert torch.equal(result[1], radii)
 
 
-def test_some_inputs_without_gradient():
-    scene = scene32()
+def test_some_inputs_without_gradient(device):
+    scene = scene32(device)
     _, _, full = gradients(scene)
     for name in scene:
         leaves = {k: v.clone().requires_grad_(k == name) for k, v in scene.items()}
         color, _ = render(leaves)
         g = torch.Generator().manual_seed(2)
-        (color * scenes.rand(g, *color.shape, low=-1.0).float()).sum().backward()
+        (color * scenes.rand(g, *color.shape, low=-1.0).to(color)).sum().backward()
         assert torch.equal(leaves[name].grad, full[name]), name
         assert all(leaf.grad is None for k, leaf in leaves.items() if k != name)
 
 
-def test_gradients_accumulate_and_the_graph_can_be_kept():
-    leaves = scenes.leaves(scene32())
+def test_gradients_accumulate_and_the_graph_can_be_kept(device):
+    leaves = scenes.leaves(scene32(device))
     color, _ = render(leaves)
     color.sum().backward(retain_graph=True)
     once = {name: leaf.grad.clone() for name, leaf in leaves.items()}
@@ -277,13 +280,13 @@ def test_gradients_accumulate_and_the_graph_can_be_kept():
         assert torch.equal(leaf.grad, 2 * once[name]), name
 
 
-def test_image_gradients_of_any_layout():
+def test_image_gradients_of_any_layout(device):
     """An expanded gradient (sum), a strided one (transpose), and a partial one (slice)."""
-    scene = scene32()
+    scene = scene32(device)
     leaves = scenes.leaves(scene)
     color, _ = render(leaves)
     by_sum = torch.autograd.grad(color.sum(), leaves["means3D"], retain_graph=True)[0]
-    ones = torch.ones(37, 3, 45).transpose(0, 1)
+    ones = torch.ones(37, 3, 45, device=device).transpose(0, 1)
     assert not ones.is_contiguous()
     by_strided = torch.autograd.grad(color, leaves["means3D"], ones, retain_graph=True)[0]
     assert torch.equal(by_sum, by_strided)
@@ -295,30 +298,30 @@ def test_image_gradients_of_any_layout():
     assert (sum(parts) - by_sum).abs().max() < 1e-4 * by_sum.abs().max()
 
 
-def test_a_second_derivative_is_refused():
+def test_a_second_derivative_is_refused(device):
     """Not implemented: it must say so, not return something."""
-    leaves = scenes.leaves(scene32())
+    leaves = scenes.leaves(scene32(device))
     color, _ = render(leaves)
     first = torch.autograd.grad((color**2).sum(), leaves["means3D"], create_graph=True)[0]
     with pytest.raises(RuntimeError):
         first.sum().backward()
-    offset = torch.tensor([0.3, 0.2], requires_grad=True)
-    value = ar.footprint_weight(offset, torch.tensor([1.0, 0.0, 2.0]))
+    offset = torch.tensor([0.3, 0.2], device=device, requires_grad=True)
+    value = ar.footprint_weight(offset, torch.tensor([1.0, 0.0, 2.0], device=device))
     first = torch.autograd.grad(value**2, offset, create_graph=True)[0]
     with pytest.raises(RuntimeError):
         first.sum().backward()
 
 
-def test_strided_inputs():
+def test_strided_inputs(device):
     """Columns of a larger tensor, transposed matrices: everything as if contiguous."""
-    scene = scene32()
+    scene = scene32(device)
     expected = gradients(scene)
     strided = {}
     for name, value in scene.items():
         wide = torch.stack([value, value + 1], -1)[..., 0]
         assert not wide.is_contiguous() or wide.numel() == 0
         strided[name] = wide
-    fields = CAMERA.fields(torch.float32)
+    fields = CAMERA.fields(torch.float32, device)
     for name in ("viewmatrix", "projmatrix"):
         fields[name] = fields[name].T.contiguous().T
         assert not fields[name].is_contiguous()
@@ -327,7 +330,7 @@ def test_strided_inputs():
     leaves = {name: value.detach().requires_grad_() for name, value in strided.items()}
     color, radii = render(leaves, Settings(**fields))
     g = torch.Generator().manual_seed(2)
-    (color * scenes.rand(g, *color.shape, low=-1.0).float()).sum().backward()
+    (color * scenes.rand(g, *color.shape, low=-1.0).to(color)).sum().backward()
     assert torch.equal(color, expected[0])
     assert torch.equal(radii, expected[1])
     for name, leaf in leaves.items():
@@ -345,16 +348,16 @@ def test_strided_inputs():
     ],
     ids=["batched matrices", "0-dim tanfov", "0-dim tanfovs", "int modifier", "prefiltered"],
 )
-def test_settings_in_other_forms(change):
-    fields = CAMERA.fields(torch.float32)
-    expected = render(scene32(), Settings(**fields))
-    actual = render(scene32(), Settings(**(fields | change(fields))))
+def test_settings_in_other_forms(device, change):
+    fields = CAMERA.fields(torch.float32, device)
+    expected = render(scene32(device), Settings(**fields))
+    actual = render(scene32(device), Settings(**(fields | change(fields))))
     assert torch.equal(actual[0], expected[0])
     assert torch.equal(actual[1], expected[1])
 
 
-def test_flat_opacities():
-    scene = scene32()
+def test_flat_opacities(device):
+    scene = scene32(device)
     column, flat = gradients(scene), gradients(dict(scene, opacities=scene["opacities"][:, 0]))
     assert torch.equal(column[0], flat[0])
     assert flat[2]["opacities"].shape == (20,)
@@ -366,29 +369,30 @@ def test_flat_opacities():
     [None, torch.Tensor([]), torch.zeros(0, dtype=torch.float64), torch.zeros(0, device="meta")],
     ids=["None", "Tensor([])", "other dtype", "other device"],
 )
-def test_missing_inputs(empty):
+def test_missing_inputs(device, empty):
     """3DGS passes torch.Tensor([]), on the CPU and in float32 whatever the rest is."""
-    scene = scene32()
+    scene = scene32(device)
     expected, _ = render(scene)
     assert torch.equal(render(dict(scene, colors_precomp=empty, cov3D_precomp=empty))[0], expected)
-    precomputed = scenes.cast(scenes.with_precomputed(scenes.random_scene(1, 20)), torch.float32)
+    precomputed = scenes.cast(scenes.with_precomputed(scenes.random_scene(1, 20)), torch.float32, device)
     expected, _ = render(precomputed)
     missing = {"shs": empty, "scales": empty, "rotations": empty, "means2D": empty}
     assert torch.equal(render(precomputed | missing)[0], expected)
 
 
-def test_mark_visible():
+def test_mark_visible(device):
     """In front of the near plane z > 0.2, wherever in the image."""
-    settings = CAMERA.settings(torch.float32)
+    settings = CAMERA.settings(torch.float32, device)
     g = torch.Generator().manual_seed(5)
-    positions = scenes.rand(g, 500, 3, low=-8.0, high=8.0).float()
+    positions = scenes.rand(g, 500, 3, low=-8.0, high=8.0).float().to(device)
     visible = ar.GaussianRasterizer(settings).markVisible(positions)
     assert visible.dtype == torch.bool
     assert visible.shape == (500,)
-    z = torch.cat([positions.double(), torch.ones(500, 1).double()], -1) @ CAMERA.fields()["viewmatrix"]
+    assert visible.device == positions.device
+    z = torch.cat([positions.double().cpu(), torch.ones(500, 1).double()], -1) @ CAMERA.fields()["viewmatrix"]
     z = z[:, 2]
     clear = (z - reference.NEAR).abs() > 1e-4
-    assert torch.equal(visible[clear], (z > reference.NEAR)[clear])
+    assert torch.equal(visible.cpu()[clear], (z > reference.NEAR)[clear])
     assert 0 < visible.sum() < 500
     assert not visible.requires_grad
     tracked = ar.GaussianRasterizer(settings).markVisible(positions.requires_grad_())
@@ -398,8 +402,8 @@ def test_mark_visible():
     assert ar.GaussianRasterizer(settings).markVisible(positions[:0]).shape == (0,)
 
 
-def test_inputs_are_left_alone():
-    scene = scene32()
+def test_inputs_are_left_alone(device):
+    scene = scene32(device)
     before = {name: value.clone() for name, value in scene.items()}
     gradients(scene)
     for name, value in scene.items():
@@ -412,13 +416,13 @@ NUMBERS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 
 
 @each_kind
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+@each_precision
 @pytest.mark.parametrize("number", NUMBERS)
 @pytest.mark.parametrize("precomputed", [False, True], ids=["scales-sh", "precomputed"])
-def test_non_finite_gaussians_are_culled(variant, dtype, number, precomputed):
+def test_non_finite_gaussians_are_culled(variant, device, dtype, number, precomputed):
     """Radius 0, zero gradient, and every other Gaussian as if they were not there, to the bit."""
     footprint, options = variant
-    settings = CAMERA.settings(dtype, footprint=footprint, **options)
+    settings = CAMERA.settings(dtype, device, footprint=footprint, **options)
     scene = scenes.random_scene(1, 40, degree=1)
     if precomputed:
         scene = scenes.with_precomputed(scene)
@@ -433,8 +437,9 @@ def test_non_finite_gaussians_are_culled(variant, dtype, number, precomputed):
                 value[len(bad)].view(-1)[column] = NUMBERS[number]
                 bad.append(len(bad))
     good = torch.tensor([i for i in range(40) if i not in bad])
-    expected = gradients({name: value[good] for name, value in scene.items()}, settings)
-    actual = gradients(broken, settings)
+    expected = gradients({name: value[good].to(device) for name, value in scene.items()}, settings)
+    actual = gradients(scenes.to(broken, device), settings)
+    good = good.to(device)
     assert torch.equal(actual[0], expected[0])
     assert (actual[1][bad] == 0).all()
     assert torch.equal(actual[1][good], expected[1])
@@ -444,15 +449,15 @@ def test_non_finite_gaussians_are_culled(variant, dtype, number, precomputed):
 
 
 @each_kind
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
-def test_degenerate_gaussians_are_harmless(variant, dtype):
+@each_precision
+def test_degenerate_gaussians_are_harmless(variant, device, dtype):
     """Zero, negative and huge scales, indefinite covariances, absurd opacities: finite, always.
 
     Nothing but finiteness (and a sane image) is asked: what such a Gaussian looks like is
     undefined.
     """
     footprint, options = variant
-    settings = CAMERA.settings(dtype, footprint=footprint, **options)
+    settings = CAMERA.settings(dtype, device, footprint=footprint, **options)
     scene = scenes.random_scene(1, 30, degree=1)
     values = [0.0, 1e-30, 1e-12, 1e-6, 1e6, 1e12, 1e30, -0.3]
     for i, value in enumerate(values):
@@ -468,7 +473,7 @@ def test_degenerate_gaussians_are_harmless(variant, dtype):
             case["cov3D_precomp"][25] = torch.tensor([1.0, 2, 0, 1, 0, 1])  # indefinite
             case["cov3D_precomp"][26] = torch.tensor([-1.0, 0, 0, -1, 0, -1])
             case["cov3D_precomp"][27] = 0.0
-        color, _, grads = gradients(scenes.cast(case, dtype), settings)
+        color, _, grads = gradients(scenes.cast(case, dtype, device), settings)
         assert torch.isfinite(color).all()
         for name, gradient in grads.items():
             assert torch.isfinite(gradient).all(), (name, torch.nonzero(~torch.isfinite(gradient)))
@@ -582,13 +587,22 @@ WRONG = [
 
 @pytest.mark.parametrize("stages", [False, True], ids=["rasterizer", "stages"])
 @pytest.mark.parametrize("error, changes, pattern", WRONG)
-def test_errors(error, changes, pattern, stages):
-    """NAME must EXPECTATION, got ACTUAL: before anything is computed."""
+def test_errors(device, error, changes, pattern, stages, tmp_path, monkeypatch):
+    """NAME must EXPECTATION, got ACTUAL: before anything is computed.
+
+    On CUDA the numbers in a camera are looked at with debug only: that waits for the device.
+    """
     if stages and "means2D" in changes:
         pytest.skip("render_stages takes no means2D")
-    fields = CAMERA.fields(torch.float32)
+    changes = {k: v.to(device) if torch.is_tensor(v) and v.device != META else v for k, v in changes.items()}
+    if device == "cuda" and "finite" in pattern:
+        if stages:
+            pytest.skip("render_stages has no debug")
+        monkeypatch.chdir(tmp_path)  # where the snapshot goes
+        changes["debug"] = True
+    fields = CAMERA.fields(torch.float32, device)
     settings = Settings(**fields | {k: v for k, v in changes.items() if k in FIELDS})
-    scene = scene32() | {k: v for k, v in changes.items() if k not in FIELDS}
+    scene = scene32(device) | {k: v for k, v in changes.items() if k not in FIELDS}
     with pytest.raises(error, match=pattern):
         if stages:
             del scene["means2D"]
@@ -620,52 +634,52 @@ def test_wrong_footprints(keywords, pattern):
         CAMERA.settings(torch.float32, **keywords)
 
 
-def test_mark_visible_errors():
-    rasterizer = ar.GaussianRasterizer(CAMERA.settings(torch.float32))
+def test_mark_visible_errors(device):
+    rasterizer = ar.GaussianRasterizer(CAMERA.settings(torch.float32, device))
     with pytest.raises(ValueError, match=r"positions must .*got \(5, 2\)"):
-        rasterizer.markVisible(t(5, 2))
+        rasterizer.markVisible(t(5, 2, device=device))
     with pytest.raises(TypeError, match=r"positions must .*got"):
-        rasterizer.markVisible(t(5, 3).long())
+        rasterizer.markVisible(t(5, 3, device=device).long())
     with pytest.raises(TypeError, match=r"positions must .*got"):
         rasterizer.markVisible([[0.0, 0.0, 0.0]])
 
 
-def test_debug_writes_a_snapshot_on_failure(tmp_path, monkeypatch):
+def test_debug_writes_a_snapshot_on_failure(device, tmp_path, monkeypatch):
     """A failing forward pass leaves its arguments behind and raises what it raised."""
     monkeypatch.chdir(tmp_path)
-    settings = CAMERA.settings(torch.float32)._replace(debug=True)
-    render(scene32(), settings)
-    gradients(scene32(), settings)
+    settings = CAMERA.settings(torch.float32, device)._replace(debug=True)
+    render(scene32(device), settings)
+    gradients(scene32(device), settings)
     assert not [*tmp_path.iterdir()]
     with pytest.raises(ValueError, match="scales must"):
-        render(dict(scene32(), scales=t(20, 2)), settings)
+        render(dict(scene32(device), scales=t(20, 2, device=device)), settings)
     saved = torch.load(tmp_path / "snapshot_fw.dump", weights_only=False)
     assert any(torch.is_tensor(a) and a.shape == (20, 2) for a in saved)
     with pytest.raises(ValueError, match="scales must"):
-        render(dict(scene32(), scales=t(20, 2)))  # without debug: no file
+        render(dict(scene32(device), scales=t(20, 2, device=device)))  # without debug: no file
     assert [path.name for path in tmp_path.iterdir()] == ["snapshot_fw.dump"]
 
 
-def test_debug_writes_a_snapshot_when_the_backward_pass_fails(tmp_path, monkeypatch):
+def test_debug_writes_a_snapshot_when_the_backward_pass_fails(device, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
     def fail(*arguments):
         raise RuntimeError("out of something")
 
     monkeypatch.setattr(torch.ops.analytic_rasterizer, "rasterize_vjp", fail)
-    leaves = scenes.leaves(scene32())
-    color, _ = render(leaves, CAMERA.settings(torch.float32)._replace(debug=True))
+    leaves = scenes.leaves(scene32(device))
+    color, _ = render(leaves, CAMERA.settings(torch.float32, device)._replace(debug=True))
     with pytest.raises(RuntimeError, match="out of something"):
         (2 * color).sum().backward()
     saved = torch.load(tmp_path / "snapshot_bw.dump", weights_only=False)
-    assert torch.equal(saved[0], torch.full_like(color, 2))
-    assert torch.equal(saved[1], leaves["means3D"].detach())
+    assert torch.equal(saved[0], torch.full_like(color, 2).cpu())
+    assert torch.equal(saved[1], leaves["means3D"].detach().cpu())
     assert [path.name for path in tmp_path.iterdir()] == ["snapshot_bw.dump"]
 
 
-def test_debug_changes_no_bit():
-    plain = gradients(scene32())
-    debug = gradients(scene32(), CAMERA.settings(torch.float32)._replace(debug=True))
+def test_debug_changes_no_bit(device):
+    plain = gradients(scene32(device))
+    debug = gradients(scene32(device), CAMERA.settings(torch.float32, device)._replace(debug=True))
     assert torch.equal(plain[0], debug[0])
     for name, gradient in plain[2].items():
         assert torch.equal(gradient, debug[2][name])
@@ -674,11 +688,11 @@ def test_debug_changes_no_bit():
 # --- torch.library -----------------------------------------------------------------------------
 
 
-def op_arguments(variant, keep, gradient):
+def op_arguments(variant, device, keep, gradient):
     """Arguments of the `rasterize` op, as its schema orders them."""
     footprint = ar.resolve_footprint(variant[0], **variant[1])
-    fields = CAMERA.fields(torch.float32)
-    scene = scene32()
+    fields = CAMERA.fields(torch.float32, device)
+    scene = scene32(device)
     if gradient:
         scene = scenes.leaves(scene)
     gaussians = [scene.get(name) for name in scenes.INPUTS]
@@ -689,29 +703,29 @@ def op_arguments(variant, keep, gradient):
 
 
 OPS = {
-    "rasterize": lambda v: op_arguments(v, True, True),
-    "rasterize (inference)": lambda v: op_arguments(v, False, False),
-    "rasterize_stages": lambda v: [  # no means2D, no keep, no debug
-        a for i, a in enumerate(op_arguments(v, False, False)) if i not in (1, 20, 21)
+    "rasterize": lambda v, d: op_arguments(v, d, True, True),
+    "rasterize (inference)": lambda v, d: op_arguments(v, d, False, False),
+    "rasterize_stages": lambda v, d: [  # no means2D, no keep, no debug
+        a for i, a in enumerate(op_arguments(v, d, False, False)) if i not in (1, 20, 21)
     ],
-    "rasterize_vjp": lambda v: vjp_arguments(v),
-    "footprint_weight": lambda v: weight_arguments(v, True),
-    "footprint_weight_vjp": lambda v: [torch.ones(7), *weight_arguments(v, False)],
+    "rasterize_vjp": lambda v, d: vjp_arguments(v, d),
+    "footprint_weight": lambda v, d: weight_arguments(v, d, True),
+    "footprint_weight_vjp": lambda v, d: [torch.ones(7, device=d), *weight_arguments(v, d, False)],
 }
 
 
-def vjp_arguments(variant):
-    arguments = op_arguments(variant, True, False)
+def vjp_arguments(variant, device):
+    arguments = op_arguments(variant, device, True, False)
     color, _, *saved = torch.ops.analytic_rasterizer.rasterize(*arguments)
     needs = [a is not None for a in arguments[:8]]
     return [torch.ones_like(color), *arguments[:-2], *saved, needs, False]
 
 
-def weight_arguments(variant, gradient):
+def weight_arguments(variant, device, gradient):
     footprint = ar.resolve_footprint(variant[0], **variant[1])
     g = torch.Generator().manual_seed(0)
-    offset = scenes.rand(g, 7, 2).float().requires_grad_(gradient)
-    cov2d = scenes.random_cov2d(g, 7, (0.5, 2.0)).float().requires_grad_(gradient)
+    offset = scenes.rand(g, 7, 2).float().to(device).requires_grad_(gradient)
+    cov2d = scenes.random_cov2d(g, 7, (0.5, 2.0)).float().to(device).requires_grad_(gradient)
     return [offset, cov2d, footprint.key, footprint.variance]
 
 
@@ -726,14 +740,16 @@ def test_every_op_is_checked():
 
 @each_kind
 @pytest.mark.parametrize("op", OPS)
-def test_opcheck(op, variant):
+def test_opcheck(op, device, variant):
     """Schema, fake kernel, autograd registration, and dispatch under tracing.
 
     rasterize_stages returns how long it took, so two runs of it are never equal, which is what the
-    tracing test asks.
+    tracing test asks. Nor are two runs of rasterize on CUDA that keep what the backward pass reads:
+    there is room for more pairs than there are, how much depends on earlier frames, and it is not
+    cleared.
     """
     overload = getattr(torch.ops.analytic_rasterizer, op.split(" ")[0]).default
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")
-    if op != "rasterize_stages":
+    if op != "rasterize_stages" and (device, op) != ("cuda", "rasterize"):
         checks = (*checks, "test_aot_dispatch_dynamic")
-    torch.library.opcheck(overload, tuple(OPS[op](variant)), test_utils=checks)
+    torch.library.opcheck(overload, tuple(OPS[op](variant, device)), test_utils=checks)

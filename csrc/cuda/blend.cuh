@@ -255,9 +255,9 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 1 ? 1 : sizeof(Ti
     __syncthreads();
     stage.composite_all(count, k, p, state);
     k += count;
-    if (kKeep && several && k % kLength == 0 && k < list.count) {
+    if (several && k % kLength == 0 && k < list.count) {
 #pragma unroll
-      for (int s = 0; s < S; ++s) checkpoints.at(written, s) = {state.color[s], state.transmittance[s]};
+      for (int s = 0; kKeep && s < S; ++s) checkpoints.at(written, s) = {state.color[s % kColors], state.transmittance[s]};
       total += state.total_color();
       state.clear_color();
       ++written;
@@ -283,7 +283,7 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 1 ? 1 : sizeof(Ti
   if (!kKeep) {
 #pragma unroll
     for (int s = 0; s < S; ++s) {
-      checkpoints.at(task.plan.front - 1, s) = {s == 0 ? state.color[0] : Vec3<float>{0, 0, 0}, state.transmittance[s]};
+      checkpoints.at(task.plan.front - 1, s) = {s == 0 ? total : Vec3<float>{0, 0, 0}, state.transmittance[s]};
     }
   }
 }

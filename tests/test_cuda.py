@@ -1,0 +1,596 @@
+"""CUDA against the CPU in float32, and what only a device can get wrong: sizes that are guessed, streams,
+waiting, memory.
+
+Both paths round differently (fused operations, exp2 within 2 ulp), so a threshold may fall the other way in
+rare pixels. Everything else agrees closely, and CUDA agrees with itself to the bit.
+"""
+
+import math
+import threading
+from dataclasses import replace
+from typing import NamedTuple
+
+import pytest
+import scenes
+import torch
+from conftest import needs_cuda
+from scenes import KINDS, VARIANTS, Camera, name_of
+
+import analytic_rasterizer as ar
+from analytic_rasterizer import _C
+
+pytestmark = needs_cuda
+
+CAMERA = Camera(image_height=150, image_width=201, bg=(0.2, 0.5, 0.9), sh_degree=2)
+SCENES = {
+    "few": {"seed": 0, "count": 40},
+    "some": {"seed": 1, "count": 3000, "sigma": (0.005, 0.3)},
+    "many": {"seed": 2, "count": 20000, "sigma": (0.002, 0.05)},
+}
+
+every_footprint = pytest.mark.parametrize("variant", VARIANTS, ids=name_of)
+each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
+
+
+class Result(NamedTuple):
+    """One rendering, on the CPU wherever it was computed."""
+
+    color: torch.Tensor
+    radii: torch.Tensor
+    grads: dict
+
+
+def scene32(name="some"):
+    return scenes.cast(scenes.random_scene(degree=2, **SCENES[name]), torch.float32)
+
+
+def settings_for(variant, camera=CAMERA, device="cpu"):
+    footprint, options = variant
+    return camera.settings(torch.float32, device, footprint=footprint, **options)
+
+
+def backward(color):
+    """Of sum(color * fixed weights)."""
+    g = torch.Generator().manual_seed(3)
+    (color * scenes.rand(g, *color.shape, low=-1.0).to(color)).sum().backward()
+
+
+def run(scene, settings, device):
+    leaves = scenes.leaves(scenes.to(scene, device))
+    color, radii = ar.GaussianRasterizer(scenes.settings_to(settings, device))(**leaves)
+    backward(color)
+    return Result(color.detach().cpu(), radii.cpu(), {name: leaf.grad.cpu() for name, leaf in leaves.items()})
+
+
+def run_without_gradient(scene, settings, device):
+    with torch.no_grad():
+        return ar.GaussianRasterizer(scenes.settings_to(settings, device))(**scenes.to(scene, device))[0].cpu()
+
+
+def compare(scene, settings, flips=1e-4, scale=1.0):
+    """Asserts that CUDA agrees with the CPU, and returns its image.
+
+    The image to 1e-4 but for a share `flips` of the samples, where an alpha of 1/255 comes or goes; the
+    radii; gradients to 1e-3 of the largest entry, of a loss that leaves out the pixels with a flip. `scale`
+    is the largest number that colours reach.
+    """
+    leaves = [scenes.leaves(scenes.to(scene, device)) for device in ("cuda", "cpu")]
+    (color, radii), (expected, expected_radii) = (
+        ar.GaussianRasterizer(scenes.settings_to(settings, device))(**inputs)
+        for device, inputs in zip(("cuda", "cpu"), leaves, strict=True)
+    )
+    error = (color.cpu() - expected).detach().abs().amax(0)
+    same = error < 1e-5 * scale
+    backward(color * same.to(color.device))
+    backward(expected * same)
+    grads = {name: relative_error(ours.grad.cpu(), leaves[1][name].grad) for name, ours in leaves[0].items()}
+    over = (error > 1e-4 * scale).sum().item()
+    print(f"image {error.max():.1e}, {over} pixels over", {name: f"{value:.1e}" for name, value in grads.items()})
+    samples = dict(settings.footprint.options).get("samples", 1)
+    assert over <= math.ceil(flips * samples * error.numel())
+    assert error.max() < 0.02 * scale
+    assert same.float().mean() > 0.9
+    assert torch.equal(radii.cpu(), expected_radii)
+    for name, value in grads.items():
+        assert value < 1e-3, (name, value)
+    return color.detach().cpu()
+
+
+def assert_same_without_gradient(scene, settings, color):
+    """The image does not depend on whether a backward pass may come: to the bit with one sample. Of several
+    samples the backward pass needs the colour of each, so that they are added up in another order."""
+    actual = run_without_gradient(scene, settings, "cuda")
+    if dict(settings.footprint.options).get("samples", 1) == 1:
+        assert torch.equal(actual, color)
+    else:
+        assert (actual - color).abs().max() < 4e-6 * color.abs().max().clamp_min(1)
+
+
+def relative_error(actual, expected):
+    return ((actual - expected).abs().max() / expected.abs().max().clamp_min(1e-30)).item() if len(expected) else 0.0
+
+
+def assert_identical(first, second):
+    assert torch.equal(first.color, second.color)
+    assert torch.equal(first.radii, second.radii)
+    for name, grad in first.grads.items():
+        assert torch.equal(grad, second.grads[name]), name
+
+
+# --- the same as the CPU -----------------------------------------------------------------------
+
+
+@every_footprint
+@pytest.mark.parametrize("name", SCENES)
+def test_random_scenes(name, variant):
+    scene, settings = scene32(name), settings_for(variant)
+    color = compare(scene, settings)
+    assert_same_without_gradient(scene, settings, color)
+
+
+@each_kind
+def test_absolute_gradients(variant):
+    """means2D (P, 4): sums of absolute values go another way through the backward pass."""
+    scene = dict(scene32(), means2D=torch.zeros(3000, 4))
+    compare(scene, settings_for(variant))
+
+
+@each_kind
+def test_precomputed(variant):
+    scene = scenes.with_precomputed(scenes.random_scene(1, 3000, sigma=(0.005, 0.3)))
+    scene = scenes.cast(scene, torch.float32)
+    compare(scene, settings_for(variant))
+
+
+@pytest.mark.parametrize("variant", [("analytic", {}), ("cumulant", {}), ("box", {"samples": 4})], ids=name_of)
+def test_trained_scene(plant, variant):
+    """Real scales and opacities, at the scene's low resolution."""
+    scene, views = plant
+    for view in views[:2]:
+        world_to_camera = torch.tensor(view["w2c"], dtype=torch.float64).reshape(4, 4)
+        camera = Camera(
+            image_width=view["width"],
+            image_height=view["height"],
+            tanfovx=view["width"] / (2 * view["fx"]),
+            tanfovy=view["height"] / (2 * view["fy"]),
+            sh_degree=3,
+        )
+        settings = settings_for(variant, camera)._replace(
+            viewmatrix=world_to_camera.T.float().contiguous(),
+            projmatrix=(camera.perspective() @ world_to_camera).T.float().contiguous(),
+            campos=torch.linalg.inv(world_to_camera)[:3, 3].float().contiguous(),
+        )
+        compare(scene, settings)
+
+
+LONG_LISTS = {
+    "opaque": {"opacity": (0.05, 0.98), "sigma": (0.05, 0.3)},
+    "faint": {"opacity": (0.0045, 0.008), "sigma": (0.05, 0.15)},
+    "faint behind opaque": {"opacity": (0.002, 0.02), "sigma": (0.05, 0.3)},
+}
+
+
+@every_footprint
+@pytest.mark.parametrize("kind", LONG_LISTS)
+@pytest.mark.parametrize("bg", [(0.0, 0.0, 0.0), (-40.0, 7.0, 300.0)], ids=["black", "far"])
+def test_long_lists(variant, kind, bg):
+    """30000 Gaussians in six tiles: lists are split along depth, where all stop, some do, and none does.
+
+    What is left of a far background multiplies every error. A pixel sees hundreds of thresholds, so
+    flips are a hundred times as frequent as elsewhere.
+    """
+    camera = Camera(image_height=24, image_width=40, bg=bg)
+    scene = scenes.random_scene(4, 30000, **LONG_LISTS[kind])
+    if kind == "faint behind opaque":
+        scene["opacities"][::50] = 0.9
+    scene = scenes.cast(scene, torch.float32)
+    settings = settings_for(variant, camera)
+    color = compare(scene, settings, flips=1e-2, scale=max(1.0, *map(abs, bg)))
+    assert_same_without_gradient(scene, settings, color)
+
+
+@each_kind
+@pytest.mark.parametrize("size", [(300, 1), (1, 300), (1, 1), (97, 61), (16, 16), (2048, 2048)], ids=str)
+def test_image_sizes(variant, size):
+    camera = replace(CAMERA, image_width=size[0], image_height=size[1])
+    scene = scenes.cast(scenes.random_scene(5, 60, degree=2, sigma=(0.01, 0.3), spread=0.9), torch.float32)
+    settings = settings_for(variant, camera)
+    compare(scene, settings)
+
+
+@every_footprint
+def test_a_splat_that_fills_the_screen(variant):
+    """One Gaussian with a pair in every tile among thousands with one or two."""
+    scene = scene32()
+    scene["scales"][7], scene["opacities"][7] = 30.0, 0.6
+    scene["scales"][1234], scene["opacities"][1234] = 8.0, 0.05
+    settings = settings_for(variant)
+    compare(scene, settings)
+
+
+# --- room for pairs that is guessed ------------------------------------------------------------
+
+
+@pytest.fixture
+def little_room():
+    """Room for 64 pairs, whatever comes."""
+    _C.force_pair_capacity(64)
+    yield
+    _C.force_pair_capacity(0)
+
+
+@every_footprint
+def test_too_many_pairs(variant, little_room):
+    """No list is written then: every tile goes through all splats."""
+    for scene, camera in ((scene32(), CAMERA), (scene32("few"), replace(CAMERA, image_width=50, image_height=40))):
+        settings = settings_for(variant, camera)
+        color = compare(scene, settings)
+        first = run(scene, settings, "cuda")
+        assert torch.equal(first.color, color)
+        # Gradients are added by atomics here: the one case in which their last bits may differ.
+        assert torch.equal(run(scene, settings, "cuda").color, color)
+        assert_same_without_gradient(scene, settings, color)
+
+
+@each_kind
+def test_many_more_pairs_than_in_the_frame_before(variant):
+    """The same Gaussians, forty times as large: the guess is wrong once."""
+    camera = replace(CAMERA, image_width=333, image_height=222)
+    scene = scenes.cast(scenes.random_scene(6, 20000, degree=2, sigma=(0.002, 0.02)), torch.float32)
+    small = settings_for(variant, replace(camera, scale_modifier=0.5))
+    large = settings_for(variant, replace(camera, scale_modifier=40.0))
+    gaussians = {name: value for name, value in scene.items() if name != "means2D"}
+    counts = [len(ar.render_stages(settings, **gaussians).pairs) for settings in (small, large)]
+    assert counts[1] > 50 * counts[0]
+    assert counts[1] > 4 * (1.25 * counts[0] + 2**16), "the reserve would do"
+    compare(scene, small)
+    for _ in range(3):
+        compare(scene, large, flips=1e-3)
+    compare(scene, small)
+
+
+@each_kind
+def test_other_numbers_of_gaussians_in_between(variant):
+    """None, none visible, few, many, few: each frame is guessed from the one before."""
+    camera = replace(CAMERA, image_width=187, image_height=131)
+    settings = settings_for(variant, camera)
+    many = scene32()
+    none = {name: value[:0] for name, value in many.items()}
+    behind = dict(many, means3D=many["means3D"] + torch.tensor([0.0, 0.0, -50.0]))
+    few = {name: value[:100] for name, value in many.items()}
+    background = torch.tensor(camera.bg)[:, None, None].expand(3, 131, 187)
+    for scene in (none, behind, few, many, few, behind, many, none):
+        if scene is none or scene is behind:
+            actual = run(scene, settings, "cuda")
+            assert torch.equal(actual.color, background)
+            assert (actual.radii == 0).all()
+            assert all((grad == 0).all() for grad in actual.grads.values())
+            assert torch.equal(run_without_gradient(scene, settings, "cuda"), background)
+        else:
+            compare(scene, settings)
+
+
+# --- the same bits every time ------------------------------------------------------------------
+
+
+@every_footprint
+def test_repeated_runs_are_identical(variant):
+    """Whatever order the blocks run in, and with or without a backward pass."""
+    scene, settings = scene32(), settings_for(variant)
+    first = run(scene, settings, "cuda")
+    for _ in range(4):
+        assert_identical(run(scene, settings, "cuda"), first)
+        assert_same_without_gradient(scene, settings, first.color)
+
+
+@pytest.fixture
+def deterministic():
+    before = torch.are_deterministic_algorithms_enabled()
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(before)
+
+
+@each_kind
+def test_deterministic_mode(variant, deterministic):
+    """It never guesses, and changes no bit; memory that is not written must not show (torch fills it)."""
+    scene, settings = scene32(), settings_for(variant)
+    first = run(scene, settings, "cuda")
+    for _ in range(4):
+        assert_identical(run(scene, settings, "cuda"), first)
+    torch.use_deterministic_algorithms(False)
+    assert_identical(run(scene, settings, "cuda"), first)
+
+
+@each_kind
+def test_debug_changes_no_bit(variant):
+    scene, settings = scene32(), settings_for(variant)
+    assert_identical(run(scene, settings._replace(debug=True), "cuda"), run(scene, settings, "cuda"))
+
+
+# --- streams, devices and threads --------------------------------------------------------------
+
+
+@each_kind
+def test_current_stream(variant):
+    """Inputs are written late on another stream: work on any other than that reads zeros."""
+    scene, settings = scene32(), settings_for(variant)
+    expected = run(scene, settings, "cuda")  # also leaves a guess, so that nothing waits below
+    source = scenes.to(scene, "cuda")
+    leaves = {name: torch.zeros_like(value).requires_grad_() for name, value in source.items()}
+    rasterizer = ar.GaussianRasterizer(scenes.settings_to(settings, "cuda"))
+    weights = scenes.rand(torch.Generator().manual_seed(3), *expected.color.shape, low=-1.0).float().cuda()
+    torch.cuda.synchronize()
+    stream = torch.cuda.Stream()
+    with torch.cuda.stream(stream):
+        torch.cuda._sleep(50_000_000)
+        with torch.no_grad():
+            for name, leaf in leaves.items():
+                leaf.copy_(source[name])
+        color, radii = rasterizer(**leaves)
+        (color * weights).sum().backward()
+    stream.synchronize()
+    actual = Result(color.detach().cpu(), radii.cpu(), {name: leaf.grad.cpu() for name, leaf in leaves.items()})
+    assert_identical(actual, expected)
+
+
+@each_kind
+def test_two_streams(variant):
+    """Frames in flight at once share nothing."""
+    settings = settings_for(variant)
+    both = [scene32(), dict(scene32("few"))]
+    expected = [run(scene, settings, "cuda") for scene in both]
+    rasterizer = ar.GaussianRasterizer(scenes.settings_to(settings, "cuda"))
+    leaves = [[scenes.leaves(scenes.to(scene, "cuda")) for _ in range(5)] for scene in both]
+    weights = scenes.rand(torch.Generator().manual_seed(3), *expected[0].color.shape, low=-1.0).float().cuda()
+    streams = [torch.cuda.Stream() for _ in both]
+    outputs = [[], []]
+    torch.cuda.synchronize()
+    for turn in range(5):
+        for i, stream in enumerate(streams):
+            with torch.cuda.stream(stream):
+                color, radii = rasterizer(**leaves[i][turn])
+                (color * weights).sum().backward()
+                outputs[i].append((color.detach(), radii))
+    torch.cuda.synchronize()
+    for i, results in enumerate(outputs):
+        for turn, (color, radii) in enumerate(results):
+            grads = {name: leaf.grad.cpu() for name, leaf in leaves[i][turn].items()}
+            assert_identical(Result(color.cpu(), radii.cpu(), grads), expected[i])
+
+
+@each_kind
+def test_threads(variant):
+    """Four threads, each on its own stream, give the bits of one after the other."""
+    settings = settings_for(variant)
+    names = ["few", "some", "few", "some"]
+    both = {name: scene32(name) for name in SCENES}
+    expected = {name: run(both[name], settings, "cuda") for name in set(names)}
+    results = [[] for _ in names]
+    torch.cuda.synchronize()
+
+    def work(i):
+        with torch.cuda.stream(torch.cuda.Stream()):
+            results[i].extend(run(both[names[i]], settings, "cuda") for _ in range(5))
+
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(len(names))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for name, several in zip(names, results, strict=True):
+        assert len(several) == 5
+        for result in several:
+            assert_identical(result, expected[name])
+
+
+@each_kind
+def test_a_device_that_is_not_the_current_one(variant):
+    if torch.cuda.device_count() < 2:
+        pytest.skip("needs two CUDA devices")
+    scene, settings = scene32(), settings_for(variant)
+    with torch.cuda.device(0):
+        expected = run(scene, settings, "cuda:0")
+        for _ in range(2):  # the second with a guess
+            assert_identical(run(scene, settings, "cuda:1"), expected)
+        assert torch.cuda.current_device() == 0
+        g = torch.Generator().manual_seed(0)
+        cov2d = scenes.random_cov2d(g, 50, (0.3, 3.0)).float()
+        offset = scenes.random_offsets(g, cov2d.double()).float()
+        footprint, options = variant
+        first, second = (
+            ar.footprint_weight(offset.to(device), cov2d.to(device), footprint, **options).cpu()
+            for device in ("cuda:0", "cuda:1")
+        )
+        assert torch.equal(first, second)
+    fields = scenes.to(scene, "cuda:0") | {"scales": scene["scales"].to("cuda:1")}
+    with pytest.raises(ValueError, match=r"scales must .*cuda:0, got cuda:1"):
+        ar.GaussianRasterizer(scenes.settings_to(settings, "cuda:0"))(**fields)
+
+
+# --- waiting, graphs and memory ----------------------------------------------------------------
+
+WAITING = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize", "cudaMemcpy")
+
+
+def frames(variant, name="some"):
+    """A function that renders one frame and its gradients on CUDA, keeping nothing, warmed up."""
+    scene, settings = scene32(name), settings_for(variant)
+    leaves = scenes.leaves(scenes.to(scene, "cuda"))
+    rasterizer = ar.GaussianRasterizer(scenes.settings_to(settings, "cuda"))
+    weights = torch.ones(3, CAMERA.image_height, CAMERA.image_width, device="cuda")
+
+    def frame():
+        color, _ = rasterizer(**leaves)
+        (color * weights).sum().backward()
+        for leaf in leaves.values():
+            leaf.grad = None
+        with torch.no_grad():
+            rasterizer(**leaves)
+
+    for _ in range(2):
+        frame()
+    torch.cuda.synchronize()
+    return frame
+
+
+@pytest.fixture
+def waiting_is_an_error():
+    """A function, because a warm-up may wait."""
+    yield lambda: torch.cuda.set_sync_debug_mode("error")
+    torch.cuda.set_sync_debug_mode("default")
+
+
+@each_kind
+def test_nothing_waits_for_the_device(variant, waiting_is_an_error):
+    """From the third frame on. torch reports the waiting that it does itself."""
+    frame = frames(variant)
+    waiting_is_an_error()
+    for _ in range(3):
+        frame()
+
+
+@each_kind
+def test_nothing_waits_for_the_device_behind_the_back_of_torch(variant):
+    """The same by the calls that the driver's profiler sees."""
+    from torch.profiler import ProfilerActivity, profile, record_function
+
+    frame = frames(variant)
+    with profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA]) as recorded:
+        with record_function("three frames"):
+            for _ in range(3):
+                frame()
+        torch.cuda.synchronize()
+    events = [event for event in recorded.events() if event.device_type == torch.autograd.DeviceType.CPU]
+    bracket = next(event.time_range for event in events if event.name == "three frames")
+    names = {e.name for e in events if bracket.start <= e.time_range.start <= bracket.end}
+    if not any(name.startswith("cudaLaunchKernel") for name in names):
+        pytest.skip("the profiler sees no CUDA calls on this machine")
+    assert not names & set(WAITING)
+
+
+@each_kind
+def test_cuda_graph(variant):
+    """A captured frame renders what its inputs hold when it is replayed."""
+    scene, settings = scene32(), settings_for(variant)
+    static = scenes.to(scene, "cuda")
+    rasterizer = ar.GaussianRasterizer(scenes.settings_to(settings, "cuda"))
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.no_grad(), torch.cuda.stream(side):
+        for _ in range(3):
+            rasterizer(**static)
+    torch.cuda.current_stream().wait_stream(side)
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with torch.no_grad(), torch.cuda.graph(graph):
+        color, radii = rasterizer(**static)
+    changed = dict(scene, means3D=scene["means3D"] * 0.9, opacities=scene["opacities"] * 0.7)
+    for case in (scene, changed, scene):
+        for name, value in case.items():
+            static[name].copy_(value)
+        graph.replay()
+        torch.cuda.synchronize()
+        expected = run(case, settings, "cuda")
+        assert torch.equal(color.cpu(), expected.color)
+        assert torch.equal(radii.cpu(), expected.radii)
+
+
+@each_kind
+def test_memory_does_not_grow(variant):
+    frame = frames(variant)
+    allocated = []
+    for count in (1, 17):  # after two in the warm-up
+        for _ in range(count):
+            frame()
+        torch.cuda.synchronize()
+        allocated.append(torch.cuda.memory_allocated())
+    assert allocated[0] == allocated[1]
+
+
+@pytest.fixture
+def little_memory():
+    """A function that leaves 256 MiB to torch."""
+
+    def limit():
+        torch.cuda.empty_cache()
+        total = torch.cuda.get_device_properties(0).total_memory
+        torch.cuda.set_per_process_memory_fraction((torch.cuda.memory_reserved() + 2**28) / total)
+
+    yield limit
+    torch.cuda.set_per_process_memory_fraction(1.0)
+    torch.cuda.empty_cache()
+
+
+@pytest.mark.parametrize("keep", [False, True], ids=["inference", "training"])
+def test_out_of_memory(keep, little_memory):
+    """torch's own error, and nothing is left behind by the frame that failed."""
+    scene, settings = scene32(), settings_for(("analytic", {}))
+    expected = run(scene, settings, "cuda")
+    inputs = scenes.to(scene, "cuda")
+    if keep:
+        inputs = scenes.leaves(inputs)
+    huge = scenes.settings_to(settings, "cuda")._replace(image_height=8192, image_width=8192)
+    torch.cuda.synchronize()
+    before = torch.cuda.memory_allocated()
+    little_memory()
+    with pytest.raises(torch.cuda.OutOfMemoryError):
+        ar.GaussianRasterizer(huge)(**inputs)
+    assert torch.cuda.memory_allocated() == before
+    assert_identical(run(scene, settings, "cuda"), expected)
+    torch.cuda.set_per_process_memory_fraction(1.0)
+    color, _ = ar.GaussianRasterizer(huge)(**inputs)
+    assert torch.isfinite(color).all()
+
+
+# --- errors ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["opacities", "means2D", "shs", "scales", "rotations"])
+def test_inputs_on_the_cpu_are_refused(name):
+    scene = scene32("few")
+    mixed = scenes.to(scene, "cuda") | {name: scene[name]}
+    with pytest.raises(ValueError, match=rf"{name} must .*cuda.*got cpu"):
+        ar.GaussianRasterizer(settings_for(("mip", {}), device="cuda"))(**mixed)
+
+
+@pytest.mark.parametrize("name", ["bg", "viewmatrix", "projmatrix", "campos"])
+def test_settings_on_the_cpu_are_refused(name):
+    settings = settings_for(("mip", {}), device="cuda")
+    mixed = settings._replace(**{name: getattr(settings, name).cpu()})
+    with pytest.raises(ValueError, match=rf"{name} must .*cuda.*got cpu"):
+        ar.GaussianRasterizer(mixed)(**scenes.to(scene32("few"), "cuda"))
+
+
+def test_other_mixtures_are_refused():
+    scene, settings = scene32("few"), settings_for(("mip", {}), device="cuda")
+    with pytest.raises(ValueError, match=r"opacities must .*cpu, got cuda"):
+        ar.GaussianRasterizer(settings)(**scenes.to(scene, "cuda") | {"means3D": scene["means3D"]})
+    with pytest.raises(ValueError, match=r"bg must .*cpu, got cuda"):
+        ar.GaussianRasterizer(settings)(**scene)
+    with pytest.raises(ValueError, match=r"cov2d must .*cuda.*got cpu"):
+        ar.footprint_weight(torch.ones(5, 2, device="cuda"), torch.ones(5, 3))
+
+
+def test_float64_is_refused():
+    settings = CAMERA.settings(torch.float64, "cuda")
+    scene = scenes.cast(scenes.random_scene(0, 10, degree=2), torch.float64, "cuda")
+    with pytest.raises(TypeError, match=r"means3D must .*float32.*got"):
+        ar.GaussianRasterizer(settings)(**scene)
+    del scene["means2D"]
+    with pytest.raises(TypeError, match=r"means3D must .*float32.*got"):
+        ar.render_stages(settings, **scene)
+
+
+@pytest.mark.parametrize("name", ["bg", "viewmatrix", "projmatrix", "campos"])
+def test_a_camera_that_is_not_finite(name, tmp_path, monkeypatch):
+    """Looked at with debug only, because that waits; without, the frame is undefined but no error, and the
+    next one is right."""
+    monkeypatch.chdir(tmp_path)  # where the snapshot goes
+    scene, settings = scene32("few"), settings_for(("mip", {}))
+    expected = run(scene, settings, "cuda")
+    broken = settings._replace(**{name: torch.full_like(getattr(settings, name), math.nan)})
+    with pytest.raises(ValueError, match=rf"{name} must be finite, got"):
+        run(scene, broken._replace(debug=True), "cuda")
+    run(scene, broken, "cuda")
+    assert_identical(run(scene, settings, "cuda"), expected)
