@@ -238,13 +238,12 @@ def random_gaussians(count: int, sh_degree: int, seed: int, device: str) -> Gaus
 
 def neighbour_distance(points: Tensor, neighbours: int = 3, rows: int = 1024) -> Tensor:
     """Mean distance of each point to its nearest neighbours, (P,)."""
-    means = []
+    means, points = [], points.double()  # cdist multiplies matrices: float32 would lose near neighbours
     for chunk in points.split(rows):
-        # Without matrix products, whose rounding is as large as the distance of near points.
-        distances = torch.cdist(chunk, points, compute_mode="donot_use_mm_for_euclid_dist")
+        distances = torch.cdist(chunk, points)
         nearest = distances.topk(neighbours + 1, largest=False).values
         means.append(nearest[:, 1:].mean(1))  # the nearest is the point itself
-    return torch.cat(means).clamp_min(1e-7)
+    return torch.cat(means).float().clamp_min(1e-7)
 
 
 # ------------------------------------------------------------------------------------ training

@@ -300,7 +300,9 @@ def test_cap_has_zero_gradient(device, best):
     color.sum().backward()
     for name in ("means3D", "means2D", "opacities", "cov3D_precomp"):
         assert (ours[name].grad == 0).all(), name
-    assert (ours["colors_precomp"].grad == cap).all()
+    # The backward pass gets alpha T back as alpha T (1 - alpha) / (1 - alpha): on CUDA with a division to 2 ulp.
+    slack = 0 if device == "cpu" else 3 * torch.finfo(best).eps
+    assert (ours["colors_precomp"].grad - cap).abs().max() <= slack
 
 
 @each_kind

@@ -90,8 +90,7 @@ AR_HD Range tiles_of(Range pixels) {
 }
 
 /// Columns of the tiles that the support touches in a row of tiles; `rows` are its rows of pixels.
-template <typename T>
-AR_HD Range tile_columns_of(const Support<T>& s, TileGrid grid, Range rows, int tile_row) {
+template <typename T> AR_HD Range tile_columns_of(const Support<T>& s, TileGrid grid, Range rows, int tile_row) {
   const T y0 = T(max(tile_row * kTile, rows.first)), y1 = T(min(tile_row * kTile + kTile - 1, rows.last));
   return tiles_of(clamp_range(columns_of(s, y0, y1), grid.width));
 }

@@ -121,10 +121,21 @@ template <typename T> AR_HD bool within(T x, double bound) { return abs(x) <= T(
 template <class V> AR_HD V one_minus_exp(V x, V e) {
   using T = ScalarOf<V>;
   // (-1)^k / (k + 1)!
-  constexpr double kCoefficients[] = {
-      1.0,           -1.0 / 2,       1.0 / 6,         -1.0 / 24,        1.0 / 120,
-      -1.0 / 720,    1.0 / 5040,     -1.0 / 40320,    1.0 / 362880,     -1.0 / 3628800,
-      1.0 / 39916800, -1.0 / 479001600, 1.0 / 6227020800, -1.0 / 87178291200, 1.0 / 1307674368000};
+  constexpr double kCoefficients[] = {1.0,
+                                      -1.0 / 2,
+                                      1.0 / 6,
+                                      -1.0 / 24,
+                                      1.0 / 120,
+                                      -1.0 / 720,
+                                      1.0 / 5040,
+                                      -1.0 / 40320,
+                                      1.0 / 362880,
+                                      -1.0 / 3628800,
+                                      1.0 / 39916800,
+                                      -1.0 / 479001600,
+                                      1.0 / 6227020800,
+                                      -1.0 / 87178291200,
+                                      1.0 / 1307674368000};
   constexpr int kTerms = sizeof(T) == 4 ? 8 : 15;
   V series = V(T(kCoefficients[kTerms - 1]));
   AR_UNROLL

@@ -311,7 +311,7 @@ template <typename T> AR_HD int splat_radius(Cov2d<T> cov, T variance) {
 /// (level <= 0) and then needs no colour.
 template <class F, typename T>
 AR_HD int project_shape(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options,
-                  Splat<F, T>& splat, T& depth) {
+                        Splat<F, T>& splat, T& depth) {
   const ProjectedMean<T> mean = project_mean(camera, g.means[i]);
   splat.level = T(0);
   if (!mean.valid) return 0;

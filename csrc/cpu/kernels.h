@@ -11,16 +11,8 @@ namespace ar::AR_ISA {
 
 template <class F, typename T>
 inline constexpr cpu::Stages<T> kStages = {
-    F::kSamples,
-    count_candidates<T>,
-    project<F, T>,
-    count_pairs<F, T>,
-    scatter_pairs<F, T>,
-    blend<F, T>,
-    blend_vjp<F, T>,
-    project_vjp<F, T>,
-    weight<F, T>,
-    weight_vjp<F, T>,
+    F::kSamples, count_candidates<T>, project<F, T>,     count_pairs<F, T>, scatter_pairs<F, T>,
+    blend<F, T>, blend_vjp<F, T>,     project_vjp<F, T>, weight<F, T>,      weight_vjp<F, T>,
 };
 
 template <typename T> const cpu::Stages<T>* stages(std::string_view footprint) {

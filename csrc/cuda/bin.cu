@@ -22,8 +22,8 @@ constexpr int kCountThreads = 512, kCountBlocks = 132 * 2;
 
 /// Histograms of all digits of the depth keys of splats with pairs; how many of these there are, and
 /// how many pairs.
-__global__ void __launch_bounds__(kCountThreads)
-    count_depths_kernel(const uint32_t* keys, const PairRange* ranges, int64_t n, uint32_t* histograms, Counts* counts) {
+__global__ void __launch_bounds__(kCountThreads) count_depths_kernel(const uint32_t* keys, const PairRange* ranges,
+                                                                     int64_t n, uint32_t* histograms, Counts* counts) {
   __shared__ uint32_t local[kDepthPasses][kBins];
   for (int b = threadIdx.x; b < kDepthPasses * kBins; b += kCountThreads) local[0][b] = 0;
   __syncthreads();
@@ -178,10 +178,18 @@ void sort_values(const TileSort<Value>& task, TileGrid grid, uint32_t* memory, c
     kernel<<<kCountBlocks, kCountThreads, 0, stream>>>(task.tiles[0], task.counts, task.capacity, scratch.histograms);
   };
   switch (passes) {
-    case 1: count(count_tiles_kernel<1>); break;
-    case 2: count(count_tiles_kernel<2>); break;
-    case 3: count(count_tiles_kernel<3>); break;
-    default: count(count_tiles_kernel<4>); break;
+    case 1:
+      count(count_tiles_kernel<1>);
+      break;
+    case 2:
+      count(count_tiles_kernel<2>);
+      break;
+    case 3:
+      count(count_tiles_kernel<3>);
+      break;
+    default:
+      count(count_tiles_kernel<4>);
+      break;
   }
   for (int pass = 0; pass < passes; ++pass) {
     // After an overflow the histograms are empty, and with them the sort.
@@ -208,20 +216,20 @@ int tile_sort_result(TileGrid grid) { return tile_passes(grid) % 2; }
 void count_depths(const DepthSort& task, void* memory, cudaStream_t stream) {
   const SortScratch scratch(static_cast<uint32_t*>(memory), task.n, kDepthPasses);
   if (task.n == 0) return;
-  count_depths_kernel<<<kCountBlocks, kCountThreads, 0, stream>>>(task.keys[0], task.ranges, task.n,
-                                                                   scratch.histograms, task.counts);
+  count_depths_kernel<<<kCountBlocks, kCountThreads, 0, stream>>>(task.keys[0], task.ranges, task.n, scratch.histograms,
+                                                                  task.counts);
 }
 
 void sort_by_depth(const DepthSort& task, void* memory, cudaStream_t stream) {
   if (task.n == 0) return;
   const SortScratch scratch(static_cast<uint32_t*>(memory), task.n, kDepthPasses);
   const auto blocks = unsigned(scratch.blocks);
-  sort_pass_kernel<int32_t, true><<<blocks, kSortThreads, 0, stream>>>(
-      scratch, 0, task.n, kCulledKey, task.keys[0], task.keys[1], nullptr, task.order[1]);
+  sort_pass_kernel<int32_t, true><<<blocks, kSortThreads, 0, stream>>>(scratch, 0, task.n, kCulledKey, task.keys[0],
+                                                                       task.keys[1], nullptr, task.order[1]);
   for (int pass = 1; pass < kDepthPasses; ++pass) {
-    sort_pass_kernel<int32_t, false><<<blocks, kSortThreads, 0, stream>>>(
-        scratch, pass, 0, 0, task.keys[pass % 2], task.keys[1 - pass % 2], task.order[pass % 2],
-        task.order[1 - pass % 2]);
+    sort_pass_kernel<int32_t, false><<<blocks, kSortThreads, 0, stream>>>(scratch, pass, 0, 0, task.keys[pass % 2],
+                                                                          task.keys[1 - pass % 2], task.order[pass % 2],
+                                                                          task.order[1 - pass % 2]);
   }
 }
 
@@ -239,7 +247,7 @@ void plan_chunks(const TileLists& lists, TileGrid grid, int samples, const Chunk
   auto* counters = reinterpret_cast<PlanCounters*>(plan.counters);
   count_work_kernel<<<blocks_of(tiles, kPlanThreads), kPlanThreads, 0, stream>>>(lists, tiles, length, counters);
   plan_kernel<<<blocks_of(tiles, kPlanThreads), kPlanThreads, 0, stream>>>(lists, tiles, length, counters, plan,
-                                                                            feedback);
+                                                                           feedback);
 }
 
 }  // namespace ar::cuda

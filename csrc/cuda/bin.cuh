@@ -28,8 +28,7 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
     const int other = last - lane_id();
     uint32_t s = kUpToBlock;
     if (other >= 0) {
-      while ((s = read_status(status + other)) == 0) {
-      }
+      while ((s = read_status(status + other)) == 0) {}
     }
     const uint32_t complete = __ballot_sync(kAllLanes, s & kUpToBlock);
     const int nearest = complete ? __ffs(complete) - 1 : 31;

@@ -72,8 +72,7 @@ template <class F> struct alignas(16) TileSplat {
 };
 
 /// A splat while pixels are at it: copied to registers, unless it has too many numbers.
-template <class F>
-using Held = std::conditional_t<sizeof(TileSplat<F>) <= 96, const TileSplat<F>, const TileSplat<F>&>;
+template <class F> using Held = std::conditional_t<sizeof(TileSplat<F>) <= 96, const TileSplat<F>, const TileSplat<F>&>;
 
 template <class F> __device__ TileSplat<F> tile_splat(const Splat<F, float>& splat, const TileList& list) {
   return {F::terms(splat.shape, splat.opacity, {float(list.x0) - splat.mean.x, float(list.y0) - splat.mean.y}),
@@ -235,7 +234,10 @@ __device__ void accumulate_behind(const PixelCheckpoints<S>& checkpoints, int n,
 
 /// A block per tile.
 template <class F, bool kKeep>
-__global__ void __launch_bounds__(kBlendThreads, F::kSamples > 1 ? 1 : sizeof(TileSplat<F>) > 64 ? 4 : 5) blend_front_kernel(const BlendTask task) {
+__global__ void __launch_bounds__(kBlendThreads, F::kSamples > 1             ? 1
+                                                 : sizeof(TileSplat<F>) > 64 ? 4
+                                                                             : 5)
+    blend_front_kernel(const BlendTask task) {
   constexpr int S = F::kSamples, kLength = chunk_length(S), kColors = kKeep ? S : 1;
   __shared__ Stage<F> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.lists.splats);
@@ -257,7 +259,8 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 1 ? 1 : sizeof(Ti
     k += count;
     if (several && k % kLength == 0 && k < list.count) {
 #pragma unroll
-      for (int s = 0; kKeep && s < S; ++s) checkpoints.at(written, s) = {state.color[s % kColors], state.transmittance[s]};
+      for (int s = 0; kKeep && s < S; ++s)
+        checkpoints.at(written, s) = {state.color[s % kColors], state.transmittance[s]};
       total += state.total_color();
       state.clear_color();
       ++written;
@@ -351,7 +354,8 @@ template <int S> __global__ void __launch_bounds__(kTilePixels) rest_scan_kernel
 
 /// Blocks share the chunks. Writes the colour of each, and the transmittance at its end; zero where
 /// the sample had stopped before.
-template <class F, bool kKeep> __global__ void __launch_bounds__(kBlendThreads) rest_blend_kernel(const BlendTask task) {
+template <class F, bool kKeep>
+__global__ void __launch_bounds__(kBlendThreads) rest_blend_kernel(const BlendTask task) {
   constexpr int S = F::kSamples, kLength = chunk_length(S), kColors = kKeep ? S : 1;
   __shared__ Stage<F> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.lists.splats);
@@ -460,7 +464,8 @@ template <class F> inline constexpr int kVjpWarps = F::kSamples <= 2 ? 4 : F::kS
 
 /// A warp per chunk, back to front, over all pixels of the tile: every pair is summed by one warp, so
 /// the sums need no atomics, whose order would change from run to run.
-template <class F, bool kAbs> __global__ void __launch_bounds__(32 * kVjpWarps<F>) blend_vjp_kernel(const BlendVjpTask task) {
+template <class F, bool kAbs>
+__global__ void __launch_bounds__(32 * kVjpWarps<F>) blend_vjp_kernel(const BlendVjpTask task) {
   constexpr int S = F::kSamples, kLength = chunk_length(S);
   extern __shared__ float4 shared[];
   VjpStage<F>& stage = reinterpret_cast<VjpStage<F>*>(shared)[threadIdx.x / 32];
@@ -548,9 +553,10 @@ template <class F, bool kAbs> __global__ void __launch_bounds__(32 * kVjpWarps<F
     for (int j = k1 - k0 - 1; j >= 0; --j) {
       uint32_t hit = __shfl_sync(kAllLanes, reach, j);
       Held<F> splat = stage.splats[j];
-      const Mat2<float> m = !kAbs ? mean_map
-                                  : Mat2<float>{__shfl_sync(kAllLanes, mean_map.xx, j), __shfl_sync(kAllLanes, mean_map.xy, j),
-                                                __shfl_sync(kAllLanes, mean_map.yx, j), __shfl_sync(kAllLanes, mean_map.yy, j)};
+      const Mat2<float> m =
+          !kAbs ? mean_map
+                : Mat2<float>{__shfl_sync(kAllLanes, mean_map.xx, j), __shfl_sync(kAllLanes, mean_map.xy, j),
+                              __shfl_sync(kAllLanes, mean_map.yx, j), __shfl_sync(kAllLanes, mean_map.yy, j)};
       ShapeGrad<float> shape = {{0, 0}, {0, 0, 0}};
       float weighted = 0;
       Vec3<float> color = {0, 0, 0};
@@ -618,8 +624,7 @@ template <class F, bool kAbs> void launch_blend_vjp(const BlendVjpTask& task, cu
   if (bytes > 48 * 1024)
     cudaFuncSetAttribute(blend_vjp_kernel<F, kAbs>, cudaFuncAttributeMaxDynamicSharedMemorySize, int(bytes));
   clear_splat_grads_kernel<F><<<kRestBlocks, kBlendThreads, 0, stream>>>(task);
-  blend_vjp_kernel<F, kAbs>
-      <<<blocks_of(task.max_chunks, kVjpWarps<F>), 32 * kVjpWarps<F>, bytes, stream>>>(task);
+  blend_vjp_kernel<F, kAbs><<<blocks_of(task.max_chunks, kVjpWarps<F>), 32 * kVjpWarps<F>, bytes, stream>>>(task);
 }
 template <class F> void blend_vjp(const BlendVjpTask& task, cudaStream_t stream) {
   if (task.absolute) {

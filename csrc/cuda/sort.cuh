@@ -131,8 +131,7 @@ __global__ void __launch_bounds__(kSortThreads)
   if (block_id > 0) {
     for (const uint32_t* other = status - kBins;; other -= kBins) {
       uint32_t s;
-      while ((s = read_status(other)) == 0) {
-      }
+      while ((s = read_status(other)) == 0) {}
       earlier += s & kCountMask;
       if (s & kUpToBlock) break;
     }

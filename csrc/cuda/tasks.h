@@ -45,9 +45,9 @@ struct alignas(8) SlotPair {
 
 /// What the device finds out.
 struct Counts {
-  int64_t pairs, splats;               ///< splats: with pairs
-  int32_t chunks, checkpoints, rest;   ///< of the plan
-  int32_t open_tiles;                  ///< that the front chunks left with an open sample and pairs
+  int64_t pairs, splats;              ///< splats: with pairs
+  int32_t chunks, checkpoints, rest;  ///< of the plan
+  int32_t open_tiles;                 ///< that the front chunks left with an open sample and pairs
 };
 
 /// Color and transmittance of a pixel's sample at the end of a chunk.
@@ -185,13 +185,15 @@ int64_t max_pairs();
 int64_t depth_sort_scratch(int64_t n);
 int64_t tile_sort_scratch(int64_t capacity, TileGrid grid);
 inline constexpr int kEmitThreads = 256;
-inline int64_t emit_scratch(int64_t n) { return (1 + (n + kEmitThreads - 1) / kEmitThreads) * int64_t(sizeof(uint32_t)); }
+inline int64_t emit_scratch(int64_t n) {
+  return (1 + (n + kEmitThreads - 1) / kEmitThreads) * int64_t(sizeof(uint32_t));
+}
 
 /// Splats by depth, ties in input order. The result is order[0].
 struct DepthSort {
   int64_t n;
-  uint32_t* keys[2];   ///< [n]; both are overwritten
-  int32_t* order[2];   ///< [n]
+  uint32_t* keys[2];  ///< [n]; both are overwritten
+  int32_t* order[2];  ///< [n]
   const PairRange* ranges;
   Counts* counts;
 };

@@ -30,8 +30,15 @@ struct Settings {
   static Settings load(AutogradContext* ctx) {
     const auto ints = ctx->saved_data["ints"].toIntVector();
     const auto doubles = ctx->saved_data["doubles"].toDoubleVector();
-    return {ints[0],    ints[1], doubles[0], doubles[1], doubles[2], ints[2], ctx->saved_data["footprint"].toStringRef(),
-            doubles[3], ctx->saved_data["debug"].toBool()};
+    return {ints[0],
+            ints[1],
+            doubles[0],
+            doubles[1],
+            doubles[2],
+            ints[2],
+            ctx->saved_data["footprint"].toStringRef(),
+            doubles[3],
+            ctx->saved_data["debug"].toBool()};
   }
 };
 
@@ -63,25 +70,33 @@ constexpr size_t kDifferentiable = 8, kInputs = 12, kOutputs = std::tuple_size_v
 /// The derivative of a derivative must fail, not be zero: rasterize_vjp has none, and says so.
 struct Rasterize : torch::autograd::Function<Rasterize> {
   static variable_list forward(AutogradContext* ctx, const Tensor& means3D, const OptionalTensor& means2D,
-                               const Tensor& opacities, const OptionalTensor& shs,
-                               const OptionalTensor& colors_precomp, const OptionalTensor& scales,
-                               const OptionalTensor& rotations, const OptionalTensor& cov3D_precomp, const Tensor& bg,
-                               const Tensor& viewmatrix, const Tensor& projmatrix, const Tensor& campos,
-                               const Settings& s, bool keep) {
+                               const Tensor& opacities, const OptionalTensor& shs, const OptionalTensor& colors_precomp,
+                               const OptionalTensor& scales, const OptionalTensor& rotations,
+                               const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
+                               const Tensor& projmatrix, const Tensor& campos, const Settings& s, bool keep) {
     static const auto op = find_op<RasterizeSignature>("analytic_rasterizer::rasterize");
     const at::AutoDispatchBelowADInplaceOrView guard;
-    const variable_list out = list_of(op.call(means3D, means2D, opacities, shs, colors_precomp, scales, rotations,
-                                              cov3D_precomp, bg, viewmatrix, projmatrix, campos, s.image_height,
-                                              s.image_width, s.tanfovx, s.tanfovy, s.scale_modifier, s.sh_degree,
-                                              s.footprint, s.variance, keep, s.debug));
+    const variable_list out =
+        list_of(op.call(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
+                        viewmatrix, projmatrix, campos, s.image_height, s.image_width, s.tanfovx, s.tanfovy,
+                        s.scale_modifier, s.sh_degree, s.footprint, s.variance, keep, s.debug));
     ctx->set_materialize_grads(false);  // no zeros the size of everything saved
     ctx->mark_non_differentiable({out.begin() + 1, out.end()});
     ctx->saved_data["keep"] = keep;
     if (keep) {
       const auto given = [](const OptionalTensor& t) { return t ? *t : Tensor(); };
-      variable_list saved = {means3D,       given(means2D),       opacities,     given(shs), given(colors_precomp),
-                             given(scales), given(rotations),     given(cov3D_precomp), bg,  viewmatrix,
-                             projmatrix,    campos};
+      variable_list saved = {means3D,
+                             given(means2D),
+                             opacities,
+                             given(shs),
+                             given(colors_precomp),
+                             given(scales),
+                             given(rotations),
+                             given(cov3D_precomp),
+                             bg,
+                             viewmatrix,
+                             projmatrix,
+                             campos};
       saved.insert(saved.end(), out.begin() + 2, out.end());
       ctx->save_for_backward(std::move(saved));
       s.save(ctx);
@@ -90,8 +105,7 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
   }
 
   static variable_list backward(AutogradContext* ctx, variable_list dL_doutputs) {
-    TORCH_CHECK(ctx->saved_data["keep"].toBool(),
-                "rasterize was called with keep=False and cannot be differentiated");
+    TORCH_CHECK(ctx->saved_data["keep"].toBool(), "rasterize was called with keep=False and cannot be differentiated");
     variable_list grads(kInputs + 2);  // settings and keep have none
     if (!dL_doutputs[0].defined()) return grads;
     static const auto op = find_op<RasterizeVjpSignature>("analytic_rasterizer::rasterize_vjp");
@@ -102,11 +116,11 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
     size_t edge = 0;  // counts the tensors that were given
     for (size_t i = 0; i < kDifferentiable; ++i) needs[i] = t[i].defined() && ctx->needs_input_grad(edge++);
     const auto saved = t.begin() + kInputs;
-    const variable_list out = list_of(op.call(
-        dL_doutputs[0], t[0], given(t[1]), t[2], given(t[3]), given(t[4]), given(t[5]), given(t[6]), given(t[7]), t[8],
-        t[9], t[10], t[11], s.image_height, s.image_width, s.tanfovx, s.tanfovy, s.scale_modifier, s.sh_degree,
-        s.footprint, s.variance, saved[0], saved[1], saved[2], saved[3], saved[4], saved[5], saved[6], saved[7],
-        saved[8], saved[9], saved[10], needs, s.debug));
+    const variable_list out =
+        list_of(op.call(dL_doutputs[0], t[0], given(t[1]), t[2], given(t[3]), given(t[4]), given(t[5]), given(t[6]),
+                        given(t[7]), t[8], t[9], t[10], t[11], s.image_height, s.image_width, s.tanfovx, s.tanfovy,
+                        s.scale_modifier, s.sh_degree, s.footprint, s.variance, saved[0], saved[1], saved[2], saved[3],
+                        saved[4], saved[5], saved[6], saved[7], saved[8], saved[9], saved[10], needs, s.debug));
     for (size_t i = 0; i < kDifferentiable; ++i) {
       if (needs[i]) grads[i] = out[i];
     }
@@ -124,9 +138,8 @@ RasterizeOutput rasterize_autograd(const Tensor& means3D, const OptionalTensor& 
                                    int64_t sh_degree, std::string footprint, double variance, bool keep, bool debug) {
   const Settings settings = {image_height, image_width, tanfovx,  tanfovy, scale_modifier,
                              sh_degree,    footprint,   variance, debug};
-  const variable_list out =
-      Rasterize::apply(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
-                       viewmatrix, projmatrix, campos, settings, keep);
+  const variable_list out = Rasterize::apply(means3D, means2D, opacities, shs, colors_precomp, scales, rotations,
+                                             cov3D_precomp, bg, viewmatrix, projmatrix, campos, settings, keep);
   return {out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7], out[8], out[9], out[10], out[11], out[12]};
 }
 

@@ -16,7 +16,8 @@ void force_pair_capacity(int64_t capacity);
 // pairs of each splat, `transmittance` and `last` (samples, H, W). On CUDA every Gaussian has a row of
 // splats, ids are in the order of depth, pairs (room, 2) are splats and slots, `splat_offsets` (P, 2) the
 // first slot and the number of them, positions is empty, and there are `checkpoints` (n, samples, 256, 4),
-// `chunks` (m, 3) and `counts` (4,), see csrc/cuda/tasks.h. Without `keep` what only the backward pass reads is empty. `debug` waits for every stage, so that an error is raised by the stage that caused it.
+// `chunks` (m, 3) and `counts` (4,), see csrc/cuda/tasks.h. Without `keep` what only the backward pass reads is empty.
+// `debug` waits for every stage, so that an error is raised by the stage that caused it.
 TORCH_LIBRARY(analytic_rasterizer, m) {
   m.def(
       "rasterize(Tensor means3D, Tensor? means2D, Tensor opacities, Tensor? shs, Tensor? colors_precomp, Tensor? "
@@ -24,7 +25,8 @@ TORCH_LIBRARY(analytic_rasterizer, m) {
       "Tensor? rotations, Tensor? cov3D_precomp, Tensor bg, Tensor viewmatrix, Tensor projmatrix, Tensor campos, "
       "int image_height, int image_width, float tanfovx, float tanfovy, float scale_modifier, int sh_degree, str "
       "footprint, "
-      "float variance, bool keep, bool debug) -> (Tensor color, Tensor radii, Tensor splats, Tensor ids, Tensor pairs, Tensor "
+      "float variance, bool keep, bool debug) -> (Tensor color, Tensor radii, Tensor splats, Tensor ids, Tensor pairs, "
+      "Tensor "
       "tile_offsets, "
       "Tensor splat_offsets, Tensor positions, Tensor transmittance, Tensor last, Tensor checkpoints, Tensor "
       "chunks, Tensor counts)");
@@ -36,7 +38,8 @@ TORCH_LIBRARY(analytic_rasterizer, m) {
       "sh_degree, "
       "str footprint, float variance, Tensor splats, Tensor ids, Tensor pairs, Tensor tile_offsets, Tensor "
       "splat_offsets, "
-      "Tensor positions, Tensor transmittance, Tensor last, Tensor checkpoints, Tensor chunks, Tensor counts, bool[8] needs, bool "
+      "Tensor positions, Tensor transmittance, Tensor last, Tensor checkpoints, Tensor chunks, Tensor counts, bool[8] "
+      "needs, bool "
       "debug) -> (Tensor means3D, Tensor means2D, Tensor "
       "opacities, "
       "Tensor shs, Tensor colors_precomp, Tensor scales, Tensor rotations, Tensor cov3D_precomp)");

@@ -121,9 +121,18 @@ RasterizeOutput rasterize_cpu(const Tensor& means3D, const OptionalTensor& means
     const Projected projected = project(in, stages);
     const Binned binned = bin(in, projected, stages, keep);
     const BlendedImage image = blend(in, projected, binned, stages, keep);
-    out = {image.color,         projected.radii,      projected.splats, projected.ids,       binned.pairs,
-           binned.tile_offsets, binned.splat_offsets, binned.positions, image.transmittance, image.last,
-           at::empty({0}, in.means3D.options()), at::empty({0}, binned.pairs.options()),
+    out = {image.color,
+           projected.radii,
+           projected.splats,
+           projected.ids,
+           binned.pairs,
+           binned.tile_offsets,
+           binned.splat_offsets,
+           binned.positions,
+           image.transmittance,
+           image.last,
+           at::empty({0}, in.means3D.options()),
+           at::empty({0}, binned.pairs.options()),
            at::empty({0}, binned.tile_offsets.options())};
   });
   return out;

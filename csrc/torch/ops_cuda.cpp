@@ -68,7 +68,9 @@ class PairGuess {
   }
   int64_t* feedback() { return feedback_.defined() ? feedback_.data_ptr<int64_t>() : nullptr; }
 
-  static int64_t with_reserve(int64_t pairs) { return std::min<int64_t>(pairs + pairs / 4 + (1 << 16), cuda::max_pairs()); }
+  static int64_t with_reserve(int64_t pairs) {
+    return std::min<int64_t>(pairs + pairs / 4 + (1 << 16), cuda::max_pairs());
+  }
 
  private:
   at::Tensor feedback_;
@@ -133,9 +135,10 @@ void make_pairs(cuda::EmitTask emit, Value* const (&values)[2], int64_t* tile_of
   const int64_t bytes = cuda::tile_sort_scratch(emit.capacity, emit.grid);
   const Tensor scratch = at::empty({bytes}, tiles.options().dtype(at::kByte));
   C10_CUDA_CHECK(cudaMemsetAsync(scratch.data_ptr(), 0, bytes, stream));
-  cuda::sort_by_tile(cuda::TileSort<Value>{emit.capacity, emit.counts, {tile, tile + emit.capacity},
-                                           {values[0], values[1]}, tile_offsets},
-                     emit.grid, scratch.data_ptr(), stream);
+  cuda::sort_by_tile(
+      cuda::TileSort<Value>{
+          emit.capacity, emit.counts, {tile, tile + emit.capacity}, {values[0], values[1]}, tile_offsets},
+      emit.grid, scratch.data_ptr(), stream);
   check_stage("sort_by_tile", stream, debug);
 }
 
@@ -254,8 +257,7 @@ BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& b
   BlendedImage out{at::empty({3, in.image_height, in.image_width}, floats),
                    at::empty({samples, in.image_height, in.image_width}, floats),
                    at::empty({samples, in.image_height, in.image_width}, ints),
-                   at::empty({plan.max_checkpoints, stages.samples, kTile * kTile, 4}, floats),
-                   plan.chunks};
+                   at::empty({plan.max_checkpoints, stages.samples, kTile * kTile, 4}, floats), plan.chunks};
   stages.blend({lists, plan.view, grid, in.background.const_data_ptr<float>(), tile_open.data_ptr<int32_t>(),
                 tile_open.data_ptr<int32_t>() + grid.tiles(),
                 reinterpret_cast<cuda::Checkpoint*>(out.checkpoints.data_ptr<float>()), out.color.data_ptr<float>(),
@@ -367,14 +369,14 @@ StagesOutput rasterize_stages_cuda(const Tensor& means3D, const Tensor& opacitie
   const Tensor depths = (means3D.matmul(view.slice(0, 0, 3).select(1, 2)) + view[3][2]).index_select(0, ids);
   const Tensor splats = projected.splats.index_select(0, ids);
   const Tensor compact = place.index_select(0, binned.pairs.select(1, 0).slice(0, 0, pairs).to(at::kLong)).to(at::kInt);
-  return {image.color, projected.radii, ids.to(at::kInt), depths, splats.narrow(1, 0, 2).clone(), compact,
-          binned.tile_offsets, seconds};
+  return {image.color, projected.radii,     ids.to(at::kInt), depths, splats.narrow(1, 0, 2).clone(),
+          compact,     binned.tile_offsets, seconds};
 }
 
 /// The tensors that rasterize hands to its vjp must fit each other. Their contents are rasterize's own.
 void check_saved(const Inputs& in, const Tensor& splats, const Tensor& order, const Tensor& pairs,
-                 const Tensor& tile_offsets, const Tensor& ranges, const Tensor& transmittance,
-                 const Tensor& last, const Tensor& checkpoints, const Tensor& chunks, const Tensor& counts, int64_t samples) {
+                 const Tensor& tile_offsets, const Tensor& ranges, const Tensor& transmittance, const Tensor& last,
+                 const Tensor& checkpoints, const Tensor& chunks, const Tensor& counts, int64_t samples) {
   const int64_t n = in.count();
   const std::vector<int64_t> image = {samples, in.image_height, in.image_width};
   bool ok = splats.sizes() == at::IntArrayRef({n, kSplatWidth}) && order.sizes() == at::IntArrayRef({n}) &&
@@ -382,8 +384,8 @@ void check_saved(const Inputs& in, const Tensor& splats, const Tensor& order, co
             tile_offsets.numel() == grid_of(in).tiles() + 1 && ranges.sizes() == at::IntArrayRef({n, 2}) &&
             transmittance.sizes() == image && last.sizes() == image && checkpoints.dim() == 4 &&
             checkpoints.size(1) == samples && chunks.dim() == 2 && chunks.size(1) == 3 && counts.numel() == 4;
-  for (const Tensor* t : {&splats, &order, &pairs, &tile_offsets, &ranges, &transmittance, &last,
-                          &checkpoints, &chunks, &counts})
+  for (const Tensor* t :
+       {&splats, &order, &pairs, &tile_offsets, &ranges, &transmittance, &last, &checkpoints, &chunks, &counts})
     ok = ok && t->is_contiguous() && t->device() == in.means3D.device();
   TORCH_CHECK_VALUE(ok,
                     "splats ... counts must be the outputs of rasterize with keep=True for the same arguments, got "
@@ -399,7 +401,7 @@ Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const Tensor& means3D, const O
                          double tanfovx, double tanfovy, double scale_modifier, int64_t sh_degree,
                          std::string footprint, double variance, const Tensor& splats, const Tensor& order,
                          const Tensor& pairs, const Tensor& tile_offsets, const Tensor& ranges, const Tensor&,
-                                                 const Tensor& transmittance, const Tensor& last, const Tensor& checkpoints,
+                         const Tensor& transmittance, const Tensor& last, const Tensor& checkpoints,
                          const Tensor& chunks, const Tensor& counts, std::array<bool, 8> needs, bool debug) {
   Inputs in{means3D,       opacities, means2D,        shs,        colors_precomp, scales,       rotations,
             cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,

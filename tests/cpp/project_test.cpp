@@ -125,7 +125,8 @@ template <class F> struct Loss {
         if constexpr (kIsFrozen<F>) {
           // This adjoint is deliberately not the formula's. Give it the formula's own frame term.
           using Paper = Analytic<FrameGradient::kPaper>;
-          const auto paper = Paper::terms(Paper::Shape<double>{splat.shape.inv_sigma, splat.shape.axis, splat.shape.mass}, splat.opacity);
+          const auto paper = Paper::terms(
+              Paper::Shape<double>{splat.shape.inv_sigma, splat.shape.axis, splat.shape.mass}, splat.opacity);
           ShapeGrad<double> turned = {};
           Paper::add_alpha_vjp(paper, d, s, alpha, g[k], turned);
           one.shape.xy = turned.shape.xy / gap;

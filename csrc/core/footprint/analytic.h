@@ -162,8 +162,7 @@ template <FrameGradient kFrame> struct Analytic {
     const T turn = kFrame == FrameGradient::kFrozen ? T(1) : (gap > T(0) ? T(1) / gap : T(0));
     const Sym2<T> along_axes = {T(0.5) * sums.shape.xx * g.inv_sigma.x, T(0.5) * sums.shape.xy * turn,
                                 T(0.5) * sums.shape.yy * g.inv_sigma.y};
-    return {transform_transposed(mean_map(g), sums.offset), congruence_transposed(frame(g), along_axes),
-            T(0)};
+    return {transform_transposed(mean_map(g), sums.offset), congruence_transposed(frame(g), along_axes), T(0)};
   }
 
  private:
