@@ -70,15 +70,6 @@ AR_HD float exp2(float x) {
 #endif
 }
 AR_HD double exp2(double x) { return std::exp2(x); }
-/// On a device within 2 ulp + |x| 2^-24 relative: the product with log2(e) is rounded once.
-AR_HD float exp(float x) {
-#if defined(__CUDA_ARCH__)
-  return exp2(x * float(kLog2e));
-#else
-  return std::exp(x);
-#endif
-}
-AR_HD double exp(double x) { return std::exp(x); }
 AR_HD float sqrt(float x) { return std::sqrt(x); }
 AR_HD double sqrt(double x) { return std::sqrt(x); }
 

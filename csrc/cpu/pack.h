@@ -13,7 +13,6 @@ namespace ar::AR_ISA {
 
 // The scalar forms stay visible beside the packs'.
 using ar::abs;
-using ar::exp;
 using ar::exp2;
 using ar::madd;
 using ar::max;
@@ -127,23 +126,6 @@ AR_HD Pack exp2(Pack x) {
   p = madd(p, f, Pack(5.55073382e-2f));
   p = madd(p, f, Pack(2.4022242e-1f));
   p = madd(p, f, Pack(6.93146978e-1f));
-  p = madd(p, f, Pack(1.0f));
-  return scale_by_power(p, shifted);
-}
-
-/// exp(x) to 2e-7 relative for x in [-87, 88]; clamped outside, so never 0 or inf. The argument is
-/// reduced by ln 2 in two parts, so that large arguments lose nothing.
-AR_HD Pack exp(Pack x) {
-  const Pack clamped = min(max(x, Pack(-87.0f)), Pack(88.0f));
-  const Pack shifted = madd(clamped, Pack(float(kLog2e)), Pack(kRound));
-  const Pack n = shifted - Pack(kRound);
-  const Pack f = madd(n, Pack(-1.42860677e-6f), madd(n, Pack(-0.693145752f), clamped));
-  Pack p(1.38145963e-3f);
-  p = madd(p, f, Pack(8.36871685e-3f));
-  p = madd(p, f, Pack(4.16683881e-2f));
-  p = madd(p, f, Pack(1.66665206e-1f));
-  p = madd(p, f, Pack(4.99999934e-1f));
-  p = madd(p, f, Pack(1.0f));
   p = madd(p, f, Pack(1.0f));
   return scale_by_power(p, shifted);
 }

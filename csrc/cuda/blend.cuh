@@ -459,13 +459,16 @@ template <class F> struct VjpStage {
   }
 };
 
+/// Blocks of blend_vjp that an SM should hold: bounds the registers.
+template <class F> inline constexpr int kVjpBlocks = F::kSamples > 1 ? 1 : sizeof(TileSplat<F>) <= 48 ? 7 : 6;
+
 /// Warps of a block of blend_vjp: as many as leave room for a few blocks in shared memory.
 template <class F> inline constexpr int kVjpWarps = F::kSamples <= 2 ? 4 : F::kSamples <= 8 ? 2 : 1;
 
 /// A warp per chunk, back to front, over all pixels of the tile: every pair is summed by one warp, so
 /// the sums need no atomics, whose order would change from run to run.
 template <class F, bool kAbs>
-__global__ void __launch_bounds__(32 * kVjpWarps<F>) blend_vjp_kernel(const BlendVjpTask task) {
+__global__ void __launch_bounds__(32 * kVjpWarps<F>, kVjpBlocks<F>) blend_vjp_kernel(const BlendVjpTask task) {
   constexpr int S = F::kSamples, kLength = chunk_length(S);
   extern __shared__ float4 shared[];
   VjpStage<F>& stage = reinterpret_cast<VjpStage<F>*>(shared)[threadIdx.x / 32];

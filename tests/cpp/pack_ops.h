@@ -9,7 +9,6 @@ namespace ar::AR_ISA {
 extern const test::PackOps kPackOps;
 const test::PackOps kPackOps = {
     kLanes,
-    [](const float* a, const float*, const float*, float* out) { exp(Pack::load(a)).store(out); },
     [](const float* a, const float*, const float*, float* out) { exp2(Pack::load(a)).store(out); },
     [](const float* a, const float*, const float*, float* out) { sqrt(Pack::load(a)).store(out); },
     [](const float* a, const float*, const float*, float* out) { abs(Pack::load(a)).store(out); },

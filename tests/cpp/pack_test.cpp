@@ -48,25 +48,16 @@ std::vector<float> randoms(uint64_t seed, int n) {
   return x;
 }
 
-/// The stated bounds, relative.
-constexpr double kExpError = 2e-7, kExp2Error = 3e-7;
-
-TEST_P(PackTest, ExpIsWithinItsBound) {
-  for_each_result(GetParam().ops.exp, ramp(-87, 88, 2000003), {}, {},
-                  [](float x, float, float, float r) { ASSERT_NEAR(r / std::exp(double(x)), 1, kExpError) << x; });
-}
+/// The stated bound, relative.
+constexpr double kExp2Error = 3e-7;
 
 TEST_P(PackTest, Exp2IsWithinItsBound) {
   for_each_result(GetParam().ops.exp2, ramp(-126, 127, 2000003), {}, {},
                   [](float x, float, float, float r) { ASSERT_NEAR(r / std::exp2(double(x)), 1, kExp2Error) << x; });
 }
 
-TEST_P(PackTest, ExponentialsAreClamped) {
+TEST_P(PackTest, Exp2IsClamped) {
   const float inf = std::numeric_limits<float>::infinity();
-  for_each_result(GetParam().ops.exp, {-inf, -1e30f, -87.1f, 88.1f, 1e30f, inf}, {}, {},
-                  [](float x, float, float, float r) {
-                    ASSERT_NEAR(r / std::exp(std::clamp(double(x), -87.0, 88.0)), 1, kExpError) << x;
-                  });
   for_each_result(GetParam().ops.exp2, {-inf, -1e30f, -127.0f, -126.5f}, {}, {}, [](float x, float, float, float r) {
     ASSERT_NEAR(r / std::exp2(std::max(double(x), -126.0)), 1, kExp2Error) << x;
   });

@@ -29,12 +29,12 @@ template <class V> struct LogisticWindow {
     const V zero = V(T(0)), one = V(T(1)), half = V(T(0.5));
     side = select(u < zero, V(T(-1)), one);
     r = V(inv_sigma);
-    const V distance = abs(u);
+    const V distance = abs(u), half_r = half * r;
     t = distance * r;
-    // The clamp at 40 keeps products of two such factors finite; F is then below 1e-17.
-    lower = exp(min(logistic((distance - half) * r), V(T(40))));
-    upper = exp(-logistic((distance + half) * r));
-    const V y2 = r * madd(V(T(kLogistic3)), madd(V(T(3)) * t, t, V(T(0.25)) * r * r), V(T(kLogistic1)));
+    // The clamp keeps products of two such factors finite; F is then below 1e-17.
+    lower = exp2(min(logistic_base2(madd(distance, r, -half_r)), V(T(40 * kLog2e))));
+    upper = exp2(-logistic_base2(madd(distance, r, half_r)));
+    const V y2 = r * madd(V(T(kLogistic3)), madd(V(T(3)) * t, t, half_r * half_r), V(T(kLogistic1)));
     inverse = divide(one, (one + lower) * (one + upper));
     value = one_minus_exp(y2, lower * upper) * inverse;
   }
@@ -64,7 +64,8 @@ template <class V> struct LogisticWindow {
   }
 
  private:
-  AR_HD static V logistic(V z) { return z * madd(V(T(kLogistic3)) * z, z, V(T(kLogistic1))); }
+  /// f(z) log2(e)
+  AR_HD static V logistic_base2(V z) { return z * madd(V(T(kLogistic3 * kLog2e)) * z, z, V(T(kLogistic1 * kLog2e))); }
 };
 
 /// Which derivative of the frame the adjoint takes.
