@@ -51,7 +51,7 @@ STAGES = ("project", "bin", "blend")
 HOST = ("host op", "host rasterizer", "host f+b")
 ROUNDS = {"cpu": 5, "cuda": 30}
 UNITS = {"cpu": ("s", 1.0), "cuda": ("ms", 1e3)}
-WARM_UP = 5
+WARM_UP = 15
 
 
 def main() -> None:
@@ -242,24 +242,13 @@ def measure_cuda(cases: dict[str, list[Case]], rounds: int) -> dict[str, list[di
     """Seconds and bytes by footprint and view."""
     results = {}
     for name, of_name in cases.items():
-        forget_other_frames(of_name[0])
+        ar._C.force_pair_capacity(0)  # room for pairs follows the frames of this footprint alone
         for _ in range(WARM_UP):
             for case in of_name:
                 case.forward()
                 case.forward_backward()
         results[name] = [time_case(case, rounds) for case in of_name]
     return results
-
-
-def forget_other_frames(case: Case) -> None:
-    """The rasterizer makes room for pairs by the largest frame it has seen, which may have been another
-    footprint's; in deterministic mode it counts them anew."""
-    before = torch.are_deterministic_algorithms_enabled()
-    torch.use_deterministic_algorithms(True)
-    try:
-        case.forward()
-    finally:
-        torch.use_deterministic_algorithms(before)
 
 
 def time_case(case: Case, rounds: int) -> dict:

@@ -261,7 +261,7 @@ AR_HD bool splat_color(const Camera<T>& camera, const Gaussians<T>& g, int64_t i
   if (g.colors) {
     color = g.colors[i];
   } else {
-    T basis[kMaxShCount];
+    T basis[kMaxShCount] = {};
     sh_basis(g.sh_degree, view_direction(camera, g.means[i]).unit, basis);
     color = sh_color(g.sh_degree, basis, sh);
   }
@@ -279,7 +279,7 @@ AR_HD Vec3<T> splat_color_vjp(const Camera<T>& camera, const Gaussians<T>& g, co
     if (out.colors) out.colors[i] = dL_dcolor;
     return {T(0), T(0), T(0)};
   }
-  T basis[kMaxShCount], weight[kMaxShCount];
+  T basis[kMaxShCount] = {}, weight[kMaxShCount];
   const Direction<T> d = view_direction(camera, g.means[i]);
   sh_basis(g.sh_degree, d.unit, basis);
   const Vec3<T> c = sh_color(g.sh_degree, basis, sh);

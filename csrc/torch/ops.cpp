@@ -62,7 +62,7 @@ PYBIND11_MODULE(_C, m) {
 #if defined(AR_WITH_CUDA)
   m.attr("has_cuda") = true;
   m.def("force_pair_capacity", &ar::ops::force_pair_capacity,
-        "For tests: room for so many pairs on CUDA, whatever comes; 0 to guess again.");
+        "For tests: room for so many pairs on CUDA, whatever comes; 0 to guess anew, from the frames that follow.");
 #else
   m.attr("has_cuda") = false;
 #endif

@@ -10,6 +10,7 @@
 #include <map>
 #include <mutex>
 
+#include "cuda/pair_guess.h"
 #include "cuda/tasks.h"
 #include "torch/views.h"
 
@@ -38,47 +39,63 @@ void check_cuda(Inputs& in, bool debug) {
   if (debug) in.check_camera();
 }
 
-/// How many pairs the next frame may have: remembered from earlier frames of the same size, whose
-/// count the device writes to host memory when it gets there.
-class PairGuess {
+/// The guesses of all image sizes. The device writes each frame's number of pairs to host memory when it
+/// gets there; nobody waits for it.
+class PairGuesses {
  public:
-  static PairGuess& of(int device, TileGrid grid) {
-    static auto* guesses = new std::map<std::tuple<int, int, int>, PairGuess>;  // outlives the CUDA context
-    return (*guesses)[{device, grid.width, grid.height}];
-  }
-  static std::mutex& mutex() {
-    static auto* m = new std::mutex;
-    return *m;
+  static PairGuesses& instance() {
+    static auto* guesses = new PairGuesses;  // outlives the CUDA context
+    return *guesses;
   }
 
-  /// 0: no idea.
-  int64_t capacity(int64_t gaussians) {
-    if (!feedback_.defined()) return 0;
-    const int64_t seen = *const_cast<const volatile int64_t*>(feedback());
-    high_ = std::max(high_, seen);
-    // After pruning start over; densification brings more pairs along.
-    if (gaussians < gaussians_ / 2) return 0;
-    const double growth = std::max(1.0, double(gaussians) / double(std::max<int64_t>(gaussians_, 1)));
-    return with_reserve(int64_t(double(high_) * growth));
+  /// Room for a frame, or 0: count its pairs.
+  int64_t capacity(int device, TileGrid grid, int64_t gaussians, bool may_wait) {
+    const std::lock_guard lock(mutex_);
+    if (forced_ > 0) return forced_;
+    Entry& entry = of(device, grid);
+    return entry.guess.capacity(gaussians, *static_cast<const volatile int64_t*>(entry.seen()), may_wait);
   }
-  void exact(int64_t gaussians, int64_t pairs) {
-    if (!feedback_.defined()) feedback_ = at::zeros({1}, at::TensorOptions().dtype(at::kLong).pinned_memory(true));
-    gaussians_ = gaussians;
-    high_ = *feedback() = pairs;
+  void counted(int device, TileGrid grid, int64_t gaussians, int64_t pairs) {
+    const std::lock_guard lock(mutex_);
+    of(device, grid).guess.counted(gaussians, pairs);
   }
-  int64_t* feedback() { return feedback_.defined() ? feedback_.data_ptr<int64_t>() : nullptr; }
-
-  static int64_t with_reserve(int64_t pairs) {
-    return std::min<int64_t>(pairs + pairs / 4 + (1 << 16), cuda::max_pairs());
+  /// Where the device is to leave the number of pairs.
+  int64_t* feedback(int device, TileGrid grid) {
+    const std::lock_guard lock(mutex_);
+    return of(device, grid).seen();
+  }
+  void force(int64_t capacity) {
+    const std::lock_guard lock(mutex_);
+    forced_ = capacity;
+    for (auto& [key, entry] : entries_) {
+      entry.guess = cuda::PairGuess(cuda::max_pairs());
+      *entry.seen() = 0;
+    }
   }
 
  private:
-  at::Tensor feedback_;
-  int64_t gaussians_ = 0, high_ = 0;
+  struct Entry {
+    Tensor feedback;
+    cuda::PairGuess guess{cuda::max_pairs()};
+    int64_t* seen() { return feedback.data_ptr<int64_t>(); }
+  };
+  Entry& of(int device, TileGrid grid) {
+    Entry& entry = entries_[{device, grid.width, grid.height}];
+    if (!entry.feedback.defined())
+      entry.feedback = at::zeros({1}, at::TensorOptions().dtype(at::kLong).pinned_memory(true));
+    return entry;
+  }
+
+  std::mutex mutex_;
+  std::map<std::tuple<int, int, int>, Entry> entries_;
+  int64_t forced_ = 0;
 };
 
-/// For tests: capacity of the next frames instead of a guess; 0 for guesses again.
-int64_t forced_capacity = 0;
+bool is_capturing(const CUDAStream& stream) {
+  cudaStreamCaptureStatus status = cudaStreamCaptureStatusNone;
+  C10_CUDA_CHECK(cudaStreamIsCapturing(stream, &status));
+  return status != cudaStreamCaptureStatusNone;
+}
 
 /// Memory that must be zero, cleared in one go; and what the device counts.
 struct Scratch {
@@ -150,13 +167,14 @@ Binned bin(const Inputs& in, const Projected& projected, const cuda::ForwardStag
   const TileGrid grid = grid_of(in);
   const auto ints = projected.radii.options(), longs = ints.dtype(at::kLong);
   auto* ranges = reinterpret_cast<cuda::PairRange*>(projected.ranges.data_ptr<int32_t>());
-  int64_t capacity = 0;
-  {
-    std::lock_guard lock(PairGuess::mutex());
-    PairGuess& guess = PairGuess::of(in.means3D.get_device(), grid);
-    if (!exact) capacity = forced_capacity ? forced_capacity : guess.capacity(n);
-    feedback = guess.feedback();
-  }
+  PairGuesses& guesses = PairGuesses::instance();
+  const int device = in.means3D.get_device();
+  const bool capturing = is_capturing(stream);
+  int64_t capacity = exact ? 0 : guesses.capacity(device, grid, n, !capturing);
+  TORCH_CHECK(capacity > 0 || !capturing,
+              "a frame of this size must have been rendered before it is captured in a CUDA graph, without "
+              "torch.use_deterministic_algorithms");
+  feedback = guesses.feedback(device, grid);
   Binned out;
   out.order = at::empty({n}, ints);
   const Tensor other = at::empty({n}, ints);
@@ -168,10 +186,7 @@ Binned bin(const Inputs& in, const Projected& projected, const cuda::ForwardStag
   check_stage("count_depths", stream, debug);
   if (capacity == 0) {
     const int64_t pairs = scratch.counts[0].item<int64_t>();
-    std::lock_guard lock(PairGuess::mutex());
-    PairGuess& guess = PairGuess::of(in.means3D.get_device(), grid);
-    guess.exact(n, pairs);
-    feedback = guess.feedback();
+    guesses.counted(device, grid, n, pairs);
     capacity = std::clamp<int64_t>(pairs, 1, cuda::max_pairs());
   }
   out.capacity = capacity;
@@ -350,18 +365,12 @@ StagesOutput rasterize_stages_cuda(const Tensor& means3D, const Tensor& opacitie
   const Scratch scratch(in.count(), means3D, stream);
   const Projected projected = project(in, stages, stream, false);
   timer.mark();
-  const bool exact = forced_capacity != 0;  // the lists are wanted whole
-  const Binned binned = bin(in, projected, stages, stream, scratch, false, exact, false, feedback);
+  const Binned binned = bin(in, projected, stages, stream, scratch, false, true, false, feedback);
   timer.mark();
   const BlendedImage image = blend(in, projected, binned, stages, stream, scratch, false, false, feedback);
   timer.mark();
   const Tensor seconds = timer.seconds();
   const int64_t pairs = scratch.counts[0].item<int64_t>();
-  if (pairs > binned.capacity) {  // by now the device has left a better guess
-    return rasterize_stages_cuda(means3D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
-                                 viewmatrix, projmatrix, campos, image_height, image_width, tanfovx, tanfovy,
-                                 scale_modifier, sh_degree, footprint, variance);
-  }
   // As on the CPU: only the Gaussians that were kept, and splats counted among those.
   const Tensor kept = projected.radii.gt(0);
   const Tensor ids = kept.nonzero().select(1, 0), place = kept.cumsum(0, at::kLong).sub(1);
@@ -507,6 +516,6 @@ TORCH_LIBRARY_IMPL(analytic_rasterizer, CUDA, m) {
 
 }  // namespace
 
-void force_pair_capacity(int64_t capacity) { forced_capacity = capacity; }
+void force_pair_capacity(int64_t capacity) { PairGuesses::instance().force(capacity); }
 
 }  // namespace ar::ops
