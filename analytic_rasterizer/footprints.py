@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from . import _C  # noqa: F401  (loads the ops)
+from . import _C  # loads the ops
 
 FOOTPRINTS = ("point", "mip", "analytic", "cumulant", "box")
 """Public names of the footprints, in the order of the documentation's table."""
@@ -136,6 +136,15 @@ def get_default_footprint() -> Footprint:
         raise ValueError(f"environment variable {ENVIRONMENT_VARIABLE}={name!r}: {error}") from None
 
 
+def check_device(device: torch.device) -> None:
+    """Raises RuntimeError for CUDA tensors where the extension was built without CUDA."""
+    if device.type == "cuda" and not _C.has_cuda:
+        raise RuntimeError(
+            f"tensors are on {device}, but analytic_rasterizer was built without CUDA: install it again where "
+            "torch has CUDA and the CUDA toolkit is found (CUDA_HOME)"
+        )
+
+
 def footprint_weight(
     offset: torch.Tensor, cov2d: torch.Tensor, footprint: str = "analytic", **options: Any
 ) -> torch.Tensor:
@@ -175,6 +184,7 @@ def footprint_weight(
             "offset and cov2d must have leading sizes that broadcast, got "
             f"{tuple(offset.shape)} and {tuple(cov2d.shape)}"
         ) from None
+    check_device(offset.device)
     return torch.ops.analytic_rasterizer.footprint_weight(
         offset.expand(*shape, 2), cov2d.expand(*shape, 3), spec.key, spec.variance
     )

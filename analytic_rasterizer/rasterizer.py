@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import torch
 
-from . import ops  # noqa: F401  (loads the ops)
-from .footprints import Footprint, get_default_footprint, resolve_footprint
+from . import ops  # noqa: F401  (registers the fake kernels)
+from .footprints import Footprint, check_device, get_default_footprint, resolve_footprint
 
 
 class _Fields(NamedTuple):
@@ -40,7 +40,9 @@ class GaussianRasterizationSettings(_Fields):
         sh_degree: Degree of the spherical harmonics in use, 0 to 3.
         campos: (3,) camera centre, world units.
         prefiltered: Accepted for compatibility; culling does not depend on it.
-        debug: On failure write the arguments to snapshot_fw.dump or snapshot_bw.dump and re-raise.
+        debug: On failure write the arguments to snapshot_fw.dump or snapshot_bw.dump and re-raise. On CUDA
+            wait for every stage, so that the stage that failed is the one that raises, and check that
+            the camera is finite, which otherwise is not looked at there.
         footprint: One of `FOOTPRINTS`, optionally with options (`"box:samples=8"`). None: the default at
             the time of rendering, see `set_default_footprint`.
         **options: Options of the footprint, see `resolve_footprint`.
@@ -131,6 +133,7 @@ def rasterize_gaussians(
     """Renders Gaussians. The functional form of `GaussianRasterizer.forward`, which says more."""
     _check_tensors(None, means3D=means3D)
     device = means3D.device
+    check_device(device)
     _check_tensors(device, opacities=opacities)
     means2D, *rest = _optional(
         device,
@@ -231,7 +234,8 @@ class GaussianRasterizer(torch.nn.Module):
         """Renders an image. Differentiable in all eight inputs.
 
         All floating tensors share one dtype (float32; float64 on the CPU) and device. Missing inputs
-        are None or empty tensors.
+        are None or empty tensors. On CUDA the work is queued on the current stream and nothing waits for
+        it once 32 frames of an image size have been rendered.
 
         Args:
             means3D: (P, 3) centres, world units.
@@ -254,6 +258,8 @@ class GaussianRasterizer(torch.nn.Module):
             TypeError: Not a tensor, or a wrong dtype.
             ValueError: Wrong shape, device or value. The message names the argument, what was expected
                 and what came.
+            RuntimeError: CUDA tensors, and an extension without CUDA; or an error of CUDA.
+            torch.OutOfMemoryError: No room for splats, pairs or gradients on the device.
         """
         return rasterize_gaussians(
             means3D,
@@ -309,6 +315,7 @@ def render_stages(
     """
     _check_tensors(None, means3D=means3D)
     device = means3D.device
+    check_device(device)
     _check_tensors(device, opacities=opacities)
     optional = _optional(
         device, shs=shs, colors_precomp=colors_precomp, scales=scales, rotations=rotations, cov3D_precomp=cov3D_precomp

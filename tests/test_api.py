@@ -17,6 +17,8 @@ from conftest import each_precision
 from scenes import KINDS, VARIANTS, Camera, name_of
 
 import analytic_rasterizer as ar
+from analytic_rasterizer import _C
+from analytic_rasterizer.footprints import check_device
 
 FIELDS = (
     "image_height",
@@ -675,6 +677,13 @@ def test_debug_writes_a_snapshot_when_the_backward_pass_fails(device, tmp_path, 
     assert torch.equal(saved[0], torch.full_like(color, 2).cpu())
     assert torch.equal(saved[1], leaves["means3D"].detach().cpu())
     assert [path.name for path in tmp_path.iterdir()] == ["snapshot_bw.dump"]
+
+
+@pytest.mark.skipif(_C.has_cuda, reason="needs an extension that was built without CUDA")
+def test_cuda_tensors_without_cuda_say_what_to_do():
+    with pytest.raises(RuntimeError, match="built without CUDA"):
+        check_device(torch.device("cuda:0"))
+    check_device(torch.device("cpu"))
 
 
 def test_debug_changes_no_bit(device):
