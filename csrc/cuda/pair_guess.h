@@ -14,6 +14,8 @@ class PairGuess {
  public:
   /// Frames that are counted at the start, after an overflow, and after a change of scene.
   static constexpr int kCountedFrames = 32;
+  /// Frames that are counted after a smaller change, as by densification.
+  static constexpr int kRecountedFrames = 8;
 
   explicit PairGuess(int64_t most = std::numeric_limits<int64_t>::max() / 2) : most_(most) {}
 
@@ -25,18 +27,16 @@ class PairGuess {
       counted_frames_ = 0;
       promised_ = std::numeric_limits<int64_t>::max();
     }
-    if (gaussians < gaussians_ / 2) *this = PairGuess(most_);
+    if (gaussians / 2 > gaussians_ || gaussians < gaussians_ / 2) *this = PairGuess(most_);
+    if (gaussians != gaussians_) counted_frames_ = std::min(counted_frames_, kCountedFrames - kRecountedFrames);
     if (gaussians_ < 0 || (may_wait && counted_frames_ < kCountedFrames)) return 0;
-    // Densification brings pairs along before they have been seen.
-    const double growth = std::max(1.0, double(gaussians) / double(std::max<int64_t>(gaussians_, 1)));
-    const double room = 1.25 * growth * double(high_) + (1 << 16);
-    promised_ = room < double(most_) ? int64_t(room) : most_;
+    promised_ = std::min(high_ + high_ / 4 + (1 << 16), most_);
     return promised_;
   }
 
   /// What counting gave.
   void counted(int64_t gaussians, int64_t pairs) {
-    gaussians_ = std::max(gaussians_, gaussians);
+    gaussians_ = gaussians;
     high_ = std::max(high_, pairs);
     ++counted_frames_;
   }

@@ -42,9 +42,13 @@ TEST(PairGuessTest, CountsAgainAfterAnOverflow) {
 TEST(PairGuessTest, FollowsTheNumberOfGaussians) {
   PairGuess guess;
   count_frames(guess, 1000, 1000000);
-  EXPECT_GE(guess.capacity(1900, 1000000, true), 1.9 * 1250000) << "densification";
+  EXPECT_EQ(count_frames(guess, 1900, 1200000), PairGuess::kRecountedFrames) << "densification";
+  EXPECT_GE(guess.capacity(1900, 10, true), 1500000);
+  EXPECT_EQ(count_frames(guess, 1000, 300), PairGuess::kRecountedFrames) << "pruning";
+  EXPECT_GE(guess.capacity(1000, 10, true), 1500000) << "views differ more than that";
   EXPECT_EQ(count_frames(guess, 400, 300), PairGuess::kCountedFrames) << "another scene";
   EXPECT_LE(guess.capacity(400, 300, true), 375 + (1 << 16));
+  EXPECT_EQ(count_frames(guess, 4000, 3000), PairGuess::kCountedFrames) << "another scene";
 }
 
 TEST(PairGuessTest, WaitsOnlyWhereItMay) {
@@ -57,8 +61,8 @@ TEST(PairGuessTest, WaitsOnlyWhereItMay) {
 
 TEST(PairGuessTest, NeverExceedsTheMost) {
   PairGuess guess(1 << 20);
-  EXPECT_EQ(count_frames(guess, 0, int64_t(1) << 40), PairGuess::kCountedFrames);
-  EXPECT_EQ(guess.capacity(0, int64_t(1) << 40, false), 1 << 20);
+  EXPECT_EQ(count_frames(guess, 10, int64_t(1) << 40), PairGuess::kCountedFrames);
+  EXPECT_EQ(guess.capacity(10, int64_t(1) << 40, false), 1 << 20);
 }
 
 }  // namespace
