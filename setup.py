@@ -39,8 +39,8 @@ def wants_cuda() -> bool:
     forced = choice == "1" or (choice == "" and os.environ.get("FORCE_CUDA") == "1")
     possible = torch.version.cuda is not None and CUDA_HOME is not None
     if forced and not possible:
-        missing = "a toolkit (CUDA_HOME)" if CUDA_HOME is None else "a torch built with CUDA"
-        sys.exit(f"analytic_rasterizer was told to build CUDA but found no {missing.removeprefix('a ')}")
+        missing = "torch built with CUDA" if torch.version.cuda is None else "toolkit (CUDA_HOME)"
+        sys.exit(f"analytic_rasterizer was told to build CUDA but found no {missing}")
     return forced or (possible and choice != "0")
 
 
