@@ -9,6 +9,12 @@ namespace ar {
 // A sample's transmittance is positive while the sample is open. A sample that has stopped keeps the
 // value it stopped at, negated: it then fails every test for being open, and loses nothing.
 
+/// Alpha of a splat in a sample: none below the minimum, no more than the cap. `raw` = opacity * weight.
+template <class V> AR_HD V effective_alpha(V raw) {
+  using T = ScalarOf<V>;
+  return select(raw >= V(T(kAlphaMin)), min(raw, V(T(kAlphaMax))), V(T(0)));
+}
+
 /// Result of compositing one splat into one sample.
 template <class V> struct Blended {
   MaskOf<V> mask;  ///< the splat was composited
@@ -21,8 +27,7 @@ template <class V> AR_HD Blended<V> blend_sample(V raw, V& transmittance) {
   using T = ScalarOf<V>;
   const V zero = V(T(0));
   const MaskOf<V> hit = raw >= V(T(kAlphaMin));
-  const V alpha = select(hit, min(raw, V(T(kAlphaMax))), zero);
-  const V contribution = transmittance * alpha;
+  const V contribution = transmittance * effective_alpha(raw);
   const V next = transmittance - contribution;
   const MaskOf<V> open = next >= V(T(kTransmittanceMin));
   transmittance = select(open, next, -abs(transmittance));

@@ -5,6 +5,18 @@
 
 namespace ar {
 
+/// Arguments of footprint_weight and its adjoint, elementwise.
+template <typename T> struct WeightTask {
+  int64_t n;
+  FootprintOptions options;
+  const Vec2<T>* offsets;
+  const Sym2<T>* covs;
+  const T* dL_dweights;  ///< vjp only
+  T* weights;            ///< forward only
+  Vec2<T>* dL_doffsets;  ///< vjp only
+  Sym2<T>* dL_dcovs;     ///< vjp only; xy: derivative by the one number that fills both places
+};
+
 template <typename T> AR_HD Cov2d<T> with_det(Sym2<T> c) {
   return {c.xx, c.xy, c.yy, difference_of_products(c.xx, c.yy, c.xy, c.xy)};
 }

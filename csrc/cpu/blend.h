@@ -222,6 +222,7 @@ template <class F, typename T, bool kAbs> void blend_vjp_tile(const cpu::BlendVj
           contribution = contribution + grad.contribution;
           weighted = madd(grad.dL_dalpha, alpha, weighted);
           F::add_alpha_vjp(terms, p, s, alpha, grad.dL_dalpha, shape);
+          // Again for the pixel alone: to ask for it must not change the other sums by a bit.
           if (kAbs) F::add_alpha_vjp(terms, p, s, alpha, grad.dL_dalpha, of_pixel);
         }
         color = {madd(contribution, gp.x, color.x), madd(contribution, gp.y, color.y),

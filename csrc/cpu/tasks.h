@@ -7,6 +7,7 @@
 #include <vector>
 
 #include "core/params.h"
+#include "core/weight.h"
 
 namespace ar::cpu {
 
@@ -83,17 +84,8 @@ template <typename T> struct ProjectVjpTask {
   GaussianGrads<T> grads;
 };
 
-/// footprint_weight and its adjoint, elementwise.
-template <typename T> struct WeightTask {
-  int64_t n;
+template <typename T> struct WeightTask : ar::WeightTask<T> {
   int threads;
-  FootprintOptions options;
-  const Vec2<T>* offsets;
-  const Sym2<T>* covs;
-  const T* dL_dweights;  ///< vjp only
-  T* weights;            ///< forward only
-  Vec2<T>* dL_doffsets;  ///< vjp only
-  Sym2<T>* dL_dcovs;     ///< vjp only; xy: derivative by the one number that fills both places
 };
 
 /// The stages of one footprint.

@@ -144,7 +144,7 @@ __global__ void __launch_bounds__(kPlanThreads)
     }
     if (blockIdx.x == 0 && threadIdx.x == 1) {
       lists.counts->chunks = sum;
-      if (feedback) *feedback = lists.counts->pairs;
+      *feedback = lists.counts->pairs;
     }
   }
   __syncthreads();

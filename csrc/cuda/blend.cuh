@@ -161,10 +161,8 @@ template <class F> struct Stage {
       for (uint32_t mask = __ballot_sync(kAllLanes, reach[k + lane_id()] >> warp & 1); mask != 0; mask &= mask - 1) {
         Held<F> splat = splats[k + __ffs(mask) - 1];
 #pragma unroll
-        for (int s = 0; s < F::kSamples; ++s) {
-          const float alpha = F::alpha(splat.terms, p, s);
-          if (alpha >= float(kAlphaMin)) transmittance[s] -= transmittance[s] * min(alpha, float(kAlphaMax));
-        }
+        for (int s = 0; s < F::kSamples; ++s)
+          transmittance[s] -= transmittance[s] * effective_alpha(F::alpha(splat.terms, p, s));
       }
     }
   }
@@ -583,6 +581,7 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F>, kVjpBlocks<F>) blend_vjp_ke
           const BlendGrad<float> grad = blend_sample_vjp(mask, alpha, g_color, sample.transmittance, sample.behind);
           stage.samples[s][q] = sample;
           F::add_alpha_vjp(splat.terms, p, s, alpha, grad.dL_dalpha, shape);
+          // Again for the pixel alone: to ask for it must not change the other sums by a bit.
           if (kAbs) F::add_alpha_vjp(splat.terms, p, s, alpha, grad.dL_dalpha, of_pixel);
           contribution = s == 0 ? grad.contribution : contribution + grad.contribution;
           weighted += grad.dL_dalpha * alpha;

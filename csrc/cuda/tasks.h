@@ -12,6 +12,7 @@
 #include <string_view>
 
 #include "core/params.h"
+#include "core/weight.h"
 
 namespace ar::cuda {
 
@@ -146,17 +147,6 @@ struct ProjectVjpTask {
   GaussianGrads<float> grads;
 };
 
-template <typename T> struct WeightTask {
-  int64_t n;
-  FootprintOptions options;
-  const Vec2<T>* offsets;
-  const Sym2<T>* covs;
-  const T* dL_dweights;  ///< vjp only
-  T* weights;            ///< forward only
-  Vec2<T>* dL_doffsets;  ///< vjp only
-  Sym2<T>* dL_dcovs;     ///< vjp only
-};
-
 struct ForwardStages {
   int samples;
   void (*project)(const ProjectTask&, cudaStream_t);
@@ -213,7 +203,7 @@ int tile_sort_result(TileGrid grid);
 void sort_by_tile(const TileSort<int32_t>& task, TileGrid grid, void* scratch, cudaStream_t stream);
 void sort_by_tile(const TileSort<SlotPair>& task, TileGrid grid, void* scratch, cudaStream_t stream);
 
-/// `feedback` receives the number of pairs: host memory that the device can write, or null.
+/// `feedback` receives the number of pairs: host memory that the device can write.
 void plan_chunks(const TileLists& lists, TileGrid grid, int samples, const ChunkPlan& plan, int64_t* feedback,
                  cudaStream_t stream);
 

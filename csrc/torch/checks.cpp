@@ -153,6 +153,12 @@ void check_weight_gradient(const Tensor& dL_dweight, const Tensor& offset) {
                     shape_of(dL_dweight));
 }
 
+void Inputs::check_gradient(const Tensor& dL_dcolor) const {
+  check_like(dL_dcolor, "dL_dcolor", means3D, "means3D");
+  TORCH_CHECK_VALUE(dL_dcolor.sizes() == at::IntArrayRef({3, image_height, image_width}),
+                    "dL_dcolor must have shape (3, ", image_height, ", ", image_width, "), got ", shape_of(dL_dcolor));
+}
+
 void Inputs::check_camera() const {
   check_finite(background, "bg");
   check_finite(viewmatrix, "viewmatrix");

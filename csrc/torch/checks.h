@@ -32,6 +32,9 @@ struct Inputs {
   /// contiguous, and the matrices are 4x4.
   void check();
 
+  /// dL_dcolor is the gradient of an image of these arguments.
+  void check_gradient(const Tensor& dL_dcolor) const;
+
   /// Background, matrices and camera centre are finite. On a device this waits for it.
   void check_camera() const;
 };
@@ -43,6 +46,13 @@ void check_floating(const Tensor& t, const char* name);
 
 /// Same dtype and device as `like`, which is called `like_name` in the message.
 void check_like(const Tensor& t, const char* name, const Tensor& like, const char* like_name);
+
+/// What `find` gave for a footprint; raises ValueError if that is nothing.
+template <class Stages> const Stages& found(const Stages* stages, const std::string& footprint) {
+  TORCH_CHECK_VALUE(stages != nullptr, "footprint must be one of those in csrc/core/footprint/registry.h, got '",
+                    footprint, "'");
+  return *stages;
+}
 
 /// Arguments of footprint_weight.
 void check_weight_arguments(const Tensor& offset, const Tensor& cov2d, double variance);

@@ -16,10 +16,7 @@ namespace {
 using cpu::Stages;
 
 template <typename T> const Stages<T>& stages_of(const std::string& footprint) {
-  const Stages<T>* stages = cpu::find_stages<T>(footprint);
-  TORCH_CHECK_VALUE(stages != nullptr, "footprint must be one of those in csrc/core/footprint/registry.h, got '",
-                    footprint, "'");
-  return *stages;
+  return found(cpu::find_stages<T>(footprint), footprint);
 }
 
 struct Projected {
@@ -202,9 +199,7 @@ Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const Op
             cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
             tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      variance};
   in.check();
-  check_like(dL_dcolor, "dL_dcolor", means3D, "means3D");
-  TORCH_CHECK_VALUE(dL_dcolor.sizes() == at::IntArrayRef({3, image_height, image_width}),
-                    "dL_dcolor must have shape (3, ", image_height, ", ", image_width, "), got ", shape_of(dL_dcolor));
+  in.check_gradient(dL_dcolor);
   const Grads out = make_grads(in, needs);
   AT_DISPATCH_FLOATING_TYPES(means3D.scalar_type(), "rasterize_vjp", [&] {
     using T = scalar_t;
@@ -239,22 +234,13 @@ Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const Op
   return out;
 }
 
-template <typename T> cpu::WeightTask<T> weight_task(const Tensor& offset, const Tensor& cov2d, double variance) {
-  cpu::WeightTask<T> task{};
-  task.n = offset.numel() / 2;
-  task.threads = at::get_num_threads();
-  task.options = {variance};
-  task.offsets = reinterpret_cast<const Vec2<T>*>(offset.const_data_ptr<T>());
-  task.covs = reinterpret_cast<const Sym2<T>*>(cov2d.const_data_ptr<T>());
-  return task;
-}
-
 Tensor footprint_weight_cpu(const Tensor& offset, const Tensor& cov2d, std::string footprint, double variance) {
   check_weight_arguments(offset, cov2d, variance);
   const Tensor d = offset.contiguous(), c = cov2d.contiguous();
   const Tensor out = at::empty(offset.sizes().slice(0, offset.dim() - 1), offset.options());
   AT_DISPATCH_FLOATING_TYPES(offset.scalar_type(), "footprint_weight", [&] {
-    auto task = weight_task<scalar_t>(d, c, variance);
+    auto task = weight_task<cpu::WeightTask<scalar_t>, scalar_t>(d, c, variance);
+    task.threads = at::get_num_threads();
     task.weights = out.data_ptr<scalar_t>();
     stages_of<scalar_t>(footprint).weight(task);
   });
@@ -269,7 +255,8 @@ std::tuple<Tensor, Tensor> footprint_weight_vjp_cpu(const Tensor& dL_dweight, co
   const Tensor dL_doffset = at::empty(offset.sizes(), offset.options()),
                dL_dcov = at::empty(cov2d.sizes(), cov2d.options());
   AT_DISPATCH_FLOATING_TYPES(offset.scalar_type(), "footprint_weight_vjp", [&] {
-    auto task = weight_task<scalar_t>(d, c, variance);
+    auto task = weight_task<cpu::WeightTask<scalar_t>, scalar_t>(d, c, variance);
+    task.threads = at::get_num_threads();
     task.dL_dweights = g.const_data_ptr<scalar_t>();
     task.dL_doffsets = reinterpret_cast<Vec2<scalar_t>*>(dL_doffset.data_ptr<scalar_t>());
     task.dL_dcovs = reinterpret_cast<Sym2<scalar_t>*>(dL_dcov.data_ptr<scalar_t>());

@@ -19,12 +19,6 @@ namespace {
 
 using c10::cuda::CUDAStream;
 
-template <class Stages> const Stages& found(const Stages* stages, const std::string& footprint) {
-  TORCH_CHECK_VALUE(stages != nullptr, "footprint must be one of those in csrc/core/footprint/registry.h, got '",
-                    footprint, "'");
-  return *stages;
-}
-
 /// Raises what a launch left behind; with debug waits for the stage to end first.
 void check_stage(const char* stage, const CUDAStream& stream, bool debug) {
   cudaError_t error = cudaGetLastError();
@@ -159,10 +153,9 @@ void make_pairs(cuda::EmitTask emit, Value* const (&values)[2], int64_t* tile_of
   check_stage("sort_by_tile", stream, debug);
 }
 
-/// `exact`: make room for the pairs there are, not for a guess. `feedback` receives where the device
-/// is to leave their number for the guess of the next frame.
+/// `exact`: make room for the pairs there are, not for a guess.
 Binned bin(const Inputs& in, const Projected& projected, const cuda::ForwardStages& stages, const CUDAStream& stream,
-           const Scratch& scratch, bool keep, bool exact, bool debug, int64_t*& feedback) {
+           const Scratch& scratch, bool keep, bool exact, bool debug) {
   const int64_t n = in.count();
   const TileGrid grid = grid_of(in);
   const auto ints = projected.radii.options(), longs = ints.dtype(at::kLong);
@@ -174,7 +167,6 @@ Binned bin(const Inputs& in, const Projected& projected, const cuda::ForwardStag
   TORCH_CHECK(capacity > 0 || !capturing,
               "a frame of this size must have been rendered before it is captured in a CUDA graph, without "
               "torch.use_deterministic_algorithms");
-  feedback = guesses.feedback(device, grid);
   Binned out;
   out.order = at::empty({n}, ints);
   const Tensor other = at::empty({n}, ints);
@@ -259,13 +251,14 @@ struct BlendedImage {
 
 BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& binned,
                    const cuda::ForwardStages& stages, const CUDAStream& stream, const Scratch& scratch, bool keep,
-                   bool debug, int64_t* feedback) {
+                   bool debug) {
   const auto floats = in.means3D.options(), ints = floats.dtype(at::kInt);
   const TileGrid grid = grid_of(in);
   const int64_t samples = keep ? stages.samples : 0;
   const Plan plan(grid, binned.capacity, stages.samples, ints, scratch.plan);
   const cuda::TileLists lists =
       lists_of(projected.splats, binned.order, binned.pairs, binned.tile_offsets, scratch.counts);
+  int64_t* feedback = PairGuesses::instance().feedback(in.means3D.get_device(), grid);  // for the next frame's guess
   cuda::plan_chunks(lists, grid, stages.samples, plan.view, feedback, stream);
   check_stage("plan_chunks", stream, debug);
   const Tensor tile_open = at::empty({2, grid.tiles()}, ints);
@@ -297,11 +290,10 @@ RasterizeOutput rasterize_cuda(const Tensor& means3D, const OptionalTensor& mean
   const c10::cuda::CUDAGuard guard(means3D.device());
   const CUDAStream stream = c10::cuda::getCurrentCUDAStream();
   const bool exact = at::globalContext().deterministicAlgorithms();
-  int64_t* feedback = nullptr;
   const Scratch scratch(in.count(), means3D, stream);
   const Projected projected = project(in, stages, stream, debug);
-  const Binned binned = bin(in, projected, stages, stream, scratch, keep, exact, debug, feedback);
-  const BlendedImage image = blend(in, projected, binned, stages, stream, scratch, keep, debug, feedback);
+  const Binned binned = bin(in, projected, stages, stream, scratch, keep, exact, debug);
+  const BlendedImage image = blend(in, projected, binned, stages, stream, scratch, keep, debug);
   const auto kept = [&](const Tensor& t) { return keep ? t : at::empty({0}, t.options()); };
   return {image.color,
           projected.radii,
@@ -360,14 +352,13 @@ StagesOutput rasterize_stages_cuda(const Tensor& means3D, const Tensor& opacitie
   const auto& stages = found(cuda::find_forward(footprint), footprint);
   const c10::cuda::CUDAGuard guard(means3D.device());
   const CUDAStream stream = c10::cuda::getCurrentCUDAStream();
-  int64_t* feedback = nullptr;
   StageTimer timer(stream);
   const Scratch scratch(in.count(), means3D, stream);
   const Projected projected = project(in, stages, stream, false);
   timer.mark();
-  const Binned binned = bin(in, projected, stages, stream, scratch, false, true, false, feedback);
+  const Binned binned = bin(in, projected, stages, stream, scratch, false, true, false);
   timer.mark();
-  const BlendedImage image = blend(in, projected, binned, stages, stream, scratch, false, false, feedback);
+  const BlendedImage image = blend(in, projected, binned, stages, stream, scratch, false, false);
   timer.mark();
   const Tensor seconds = timer.seconds();
   const int64_t pairs = scratch.counts[0].item<int64_t>();
@@ -416,9 +407,7 @@ Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const Tensor& means3D, const O
             cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
             tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      variance};
   check_cuda(in, debug);
-  check_like(dL_dcolor, "dL_dcolor", means3D, "means3D");
-  TORCH_CHECK_VALUE(dL_dcolor.sizes() == at::IntArrayRef({3, image_height, image_width}),
-                    "dL_dcolor must have shape (3, ", image_height, ", ", image_width, "), got ", shape_of(dL_dcolor));
+  in.check_gradient(dL_dcolor);
   const auto& forward = found(cuda::find_forward(footprint), footprint);
   const auto& stages = found(cuda::find_backward(footprint), footprint);
   check_saved(in, splats, order, pairs, tile_offsets, ranges, transmittance, last, checkpoints, chunks, counts,
@@ -451,15 +440,6 @@ Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const Tensor& means3D, const O
   return out;
 }
 
-template <typename T> cuda::WeightTask<T> weight_task(const Tensor& offset, const Tensor& cov2d, double variance) {
-  cuda::WeightTask<T> task{};
-  task.n = offset.numel() / 2;
-  task.options = {variance};
-  task.offsets = reinterpret_cast<const Vec2<T>*>(offset.const_data_ptr<T>());
-  task.covs = reinterpret_cast<const Sym2<T>*>(cov2d.const_data_ptr<T>());
-  return task;
-}
-
 Tensor footprint_weight_cuda(const Tensor& offset, const Tensor& cov2d, std::string footprint, double variance) {
   check_weight_arguments(offset, cov2d, variance);
   const auto& stages = found(cuda::find_forward(footprint), footprint);
@@ -472,9 +452,9 @@ Tensor footprint_weight_cuda(const Tensor& offset, const Tensor& cov2d, std::str
     launch(task, stream);
   };
   if (offset.scalar_type() == at::kFloat) {
-    run(weight_task<float>(d, c, variance), stages.weight_float);
+    run(weight_task<WeightTask<float>, float>(d, c, variance), stages.weight_float);
   } else {
-    run(weight_task<double>(d, c, variance), stages.weight_double);
+    run(weight_task<WeightTask<double>, double>(d, c, variance), stages.weight_double);
   }
   check_stage("footprint_weight", stream, false);
   return out;
@@ -498,9 +478,9 @@ std::tuple<Tensor, Tensor> footprint_weight_vjp_cuda(const Tensor& dL_dweight, c
     launch(task, stream);
   };
   if (offset.scalar_type() == at::kFloat) {
-    run(weight_task<float>(d, c, variance), stages.weight_vjp_float);
+    run(weight_task<WeightTask<float>, float>(d, c, variance), stages.weight_vjp_float);
   } else {
-    run(weight_task<double>(d, c, variance), stages.weight_vjp_double);
+    run(weight_task<WeightTask<double>, double>(d, c, variance), stages.weight_vjp_double);
   }
   check_stage("footprint_weight_vjp", stream, false);
   return {dL_doffset, dL_dcov};

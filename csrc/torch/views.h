@@ -39,6 +39,16 @@ template <typename T> Gaussians<T> gaussians_of(const Inputs& in) {
 
 inline TileGrid grid_of(const Inputs& in) { return {int(in.image_width), int(in.image_height)}; }
 
+/// Arguments of footprint_weight, contiguous, without results.
+template <class Task, typename T> Task weight_task(const Tensor& offset, const Tensor& cov2d, double variance) {
+  Task task{};
+  task.n = offset.numel() / 2;
+  task.options = {variance};
+  task.offsets = reinterpret_cast<const Vec2<T>*>(offset.const_data_ptr<T>());
+  task.covs = reinterpret_cast<const Sym2<T>*>(cov2d.const_data_ptr<T>());
+  return task;
+}
+
 /// What rasterize returns: color, radii, and what its vjp needs (schemas in ops.cpp).
 using RasterizeOutput =
     std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
