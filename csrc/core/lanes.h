@@ -107,31 +107,43 @@ template <typename T> AR_HD T difference_of_products(T a, T b, T c, T d) {
 /// False for NaN.
 template <typename T> AR_HD bool within(T x, double bound) { return abs(x) <= T(bound); }
 
-/// (1 - exp(-x)) for x >= 0, given e = exp(-x): the difference where it is well conditioned, its
-/// Taylor series below 1/2 (remainder < 1e-8 relative in float, 5e-17 in double).
+/// (1 - exp(-x)) / x on [0, 1/2]. Float: the minimax polynomial of degree 4, relative error 8e-8.
+/// Double: the Taylor series, relative error 5e-17.
+template <class V> AR_HD V one_minus_exp_ratio(V x) {
+  using T = ScalarOf<V>;
+  constexpr double kMinimax[] = {0.9999999227245566, -0.4999924984750279, 0.16654815152216923, -0.041001278881188354,
+                                 0.006771038053309816};
+  // (-1)^k / (k + 1)!
+  constexpr double kTaylor[] = {1.0,
+                                -1.0 / 2,
+                                1.0 / 6,
+                                -1.0 / 24,
+                                1.0 / 120,
+                                -1.0 / 720,
+                                1.0 / 5040,
+                                -1.0 / 40320,
+                                1.0 / 362880,
+                                -1.0 / 3628800,
+                                1.0 / 39916800,
+                                -1.0 / 479001600,
+                                1.0 / 6227020800,
+                                -1.0 / 87178291200,
+                                1.0 / 1307674368000};
+  V sum = V(T(0));
+  if constexpr (sizeof(T) == 4) {
+    AR_UNROLL
+    for (int k = 4; k >= 0; --k) sum = madd(sum, x, V(T(kMinimax[k])));
+  } else {
+    AR_UNROLL
+    for (int k = 14; k >= 0; --k) sum = madd(sum, x, V(T(kTaylor[k])));
+  }
+  return sum;
+}
+
+/// (1 - exp(-x)) for x >= 0, given e = exp(-x): the difference where it is well conditioned.
 template <class V> AR_HD V one_minus_exp(V x, V e) {
   using T = ScalarOf<V>;
-  // (-1)^k / (k + 1)!
-  constexpr double kCoefficients[] = {1.0,
-                                      -1.0 / 2,
-                                      1.0 / 6,
-                                      -1.0 / 24,
-                                      1.0 / 120,
-                                      -1.0 / 720,
-                                      1.0 / 5040,
-                                      -1.0 / 40320,
-                                      1.0 / 362880,
-                                      -1.0 / 3628800,
-                                      1.0 / 39916800,
-                                      -1.0 / 479001600,
-                                      1.0 / 6227020800,
-                                      -1.0 / 87178291200,
-                                      1.0 / 1307674368000};
-  constexpr int kTerms = sizeof(T) == 4 ? 8 : 15;
-  V series = V(T(kCoefficients[kTerms - 1]));
-  AR_UNROLL
-  for (int k = kTerms - 2; k >= 0; --k) series = madd(series, x, V(T(kCoefficients[k])));
-  return select(x < V(T(0.5)), x * series, V(T(1)) - e);
+  return select(x < V(T(0.5)), x * one_minus_exp_ratio(x), V(T(1)) - e);
 }
 
 }  // namespace ar

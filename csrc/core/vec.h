@@ -60,6 +60,9 @@ template <typename T> AR_HD Vec3<T> operator*(const Sym3<T>& m, Vec3<T> v) {
           m.xz * v.x + m.yz * v.y + m.zz * v.z};
 }
 
+template <typename T> AR_HD Mat2<T> operator*(T s, const Mat2<T>& m) {
+  return {s * m.xx, s * m.xy, s * m.yx, s * m.yy};
+}
 /// m v with scalar m and lanes v.
 template <typename T, class V> AR_HD Vec2<V> transform(const Mat2<T>& m, Vec2<V> v) {
   return {madd(V(m.xx), v.x, V(m.xy) * v.y), madd(V(m.yx), v.x, V(m.yy) * v.y)};

@@ -181,13 +181,22 @@ TYPED_TEST(FootprintTest, SupportIsConservative) {
 // The bound in the comment of Analytic::level.
 TEST(AnalyticLevel, HoldsAlongOneAxis) {
   for (double sigma = 0.005; sigma < 200; sigma *= 1.01) {
-    const double r = 1 / sigma, ww = 1 / (sigma * sigma + kPixelVariance), peak = LogisticWindow<double>(0, r).value;
+    const double ww = 1 / (sigma * sigma + kPixelVariance);
+    const auto axis = LogisticAxis<double>::at(1 / sigma);
+    const auto window = [&](double u) {
+      const LogisticWindow<double> f(u / sigma, axis);
+      return f.numerator / f.denominator;
+    };
     for (double u = 0; u * u * ww < 40; u += 0.002 / std::sqrt(ww)) {
-      const double ratio = LogisticWindow<double>(u, r).value / peak;
+      const double ratio = window(u) / window(0);
       if (ratio <= kAlphaMin) break;
       ASSERT_GE(-2 * std::log(ratio), u * u * ww - ww * ww / 48 - 0.05) << "sigma " << sigma << " u " << u;
     }
   }
+}
+
+double correction(const CumulantAxis<double>& axis, double p) {
+  return axis.constant - axis.subtract_from(0.0, axis.capped(p));
 }
 
 // The bound in the comment of Cumulant::level, per axis.
@@ -195,24 +204,38 @@ TEST(CumulantAxisTest, LowersTheExponentByItsBoundAtMost) {
   for (double t = 0.01; t < 12.005; t += 0.01) {
     const auto axis = CumulantAxis<double>::at(std::min(t, 12.0));
     for (double p = 0; p < 100; p += 0.01) {
-      ASSERT_GE(2 * Cumulant::kOrder4 * axis.value(p), -t * t / 124) << "t " << t << " p " << p;
+      ASSERT_GE(2 * Cumulant::kOrder4 * correction(axis, p), -t * t / 124) << "t " << t << " p " << p;
     }
   }
 }
 
-// On both sides of the kink in the tail, and of the floor under 1 - x.
+// On both sides of the cap, where the second derivative jumps, and of the floor under 1 - x, where the first does.
 TEST(CumulantAxisTest, DerivativesMatchDifferences) {
   Random random(4);
   for (int trial = 0; trial < 10000; ++trial) {
     const double t = random.log_uniform(0.01, 12.1), p = random.uniform(-30, 30);
     const auto axis = CumulantAxis<double>::at(t);
     if (std::abs(p * p / axis.cap - 1) < 0.01 || std::abs(t - 12) < 0.01) continue;
-    const double by_p = derivative([&](double h) { return axis.value(p + h); }, 1e-3);
-    const double by_t = derivative([&](double h) { return CumulantAxis<double>::at(t + h).value(p); }, 1e-4 * t);
+    const double by_p = derivative([&](double h) { return correction(axis, p + h); }, 1e-3);
+    const double by_t = derivative([&](double h) { return correction(CumulantAxis<double>::at(t + h), p); }, 1e-4 * t);
+    const double capped = axis.capped(p);
     // The terms stay below 10 c4 (p^2 + t)^2; the differences round them by eps / h.
     const double size = 10 * axis.c4 * (p * p + t) * (p * p + t);
-    ASSERT_NEAR(axis.by_p(p), by_p, 1e-10 * size) << "t " << t << " p " << p;
-    ASSERT_NEAR(axis.by_t(p), by_t, 1e-10 * size / t) << "t " << t << " p " << p;
+    ASSERT_NEAR(2 * axis.half_by_p(p, capped), by_p, 1e-10 * size) << "t " << t << " p " << p;
+    ASSERT_NEAR(axis.by_t(capped), by_t, 1e-10 * size / t) << "t " << t << " p " << p;
+  }
+}
+
+// In other coordinates it is the same correction, with the derivatives of those coordinates.
+TEST(CumulantAxisTest, Scales) {
+  Random random(5);
+  for (int trial = 0; trial < 1000; ++trial) {
+    const double t = random.log_uniform(0.01, 11.9), p = random.uniform(-10, 10), unit = 0.3, scale = 1.7;
+    const auto plain = CumulantAxis<double>::at(t), scaled = CumulantAxis<double>::at(t / scale, unit, scale);
+    const double P = plain.capped(p), Q = scaled.capped(p / scale), tiny = 1e-13 * (1 + P * P * P * plain.c4);
+    ASSERT_NEAR(correction(scaled, p / scale), unit * correction(plain, p), tiny);
+    ASSERT_NEAR(scaled.half_by_p(p / scale, Q), unit * scale * plain.half_by_p(p, P), 10 * tiny);
+    ASSERT_NEAR(scaled.by_t(Q), unit * scale * plain.by_t(P), 10 * tiny);
   }
 }
 
@@ -246,7 +269,9 @@ TYPED_TEST(FootprintTest, HardInputsStayFiniteInFloat) {
 }
 
 // To first order: every quantity that alpha depends on carries a few roundings, so the error is a
-// few eps times |dI/dd| (|d| + half a pixel) + I. Twelve is the longest chain (eigenframe, window).
+// few eps times |dI/dd| (|d| + half a pixel) + I. Twelve is the longest chain (eigenframe, window). Those
+// that sum up a logarithm to base 2 round each partial sum, which lies between the peak's and the
+// weight's, by half an eps of it: six sums at most (the peak, two squares, cumulant's constants and axes).
 TYPED_TEST(FootprintTest, FloatAgreesWithDouble) {
   using F = TypeParam;
   Random random(5);
@@ -267,7 +292,10 @@ TYPED_TEST(FootprintTest, FloatAgreesWithDouble) {
       const double condition =
           std::hypot(adjoint.splat.dL_dmean.x, adjoint.splat.dL_dmean.y) * (std::hypot(dd.x, dd.y) + 0.5) +
           adjoint.weighted;
-      ASSERT_NEAR(weight<F>(cov, d, 1.0f, pick), adjoint.weighted, 12 * kEps<float> * condition + 1e-37)
+      const double peak = F::alpha(F::terms(F::prepare(same, options_of<F>()), 1.0), Vec2<double>{0, 0}, 0);
+      const double exponent = kIsAnalytic<F> ? 0 : std::abs(std::log(peak)) + std::abs(std::log(adjoint.weighted));
+      ASSERT_NEAR(weight<F>(cov, d, 1.0f, pick), adjoint.weighted,
+                  kEps<float> * (12 * condition + 3 * exponent * adjoint.weighted) + 1e-37)
           << s1 << " " << s2;
     }
   }

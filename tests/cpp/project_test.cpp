@@ -129,7 +129,7 @@ template <class F> struct Loss {
               Paper::Shape<double>{splat.shape.inv_sigma, splat.shape.axis, splat.shape.mass}, splat.opacity);
           ShapeGrad<double> turned = {};
           Paper::add_alpha_vjp(paper, d, s, alpha, g[k], turned);
-          one.shape.xy = turned.shape.xy / gap;
+          one.shape.xy = turned.shape.xy / (gap * splat.shape.inv_sigma.x * splat.shape.inv_sigma.y);
         }
         add(one, sums.shape);
         sums.weighted += g[k] * alpha;

@@ -309,15 +309,16 @@ TYPED_TEST(StagesTest, WeightAndItsAdjoint) {
     covs[i] = {c.xx, c.xy, c.yy};
     offsets[i] = {random.normal(), random.normal()};
   }
-  const cpu::WeightTask<double> task = {n,
-                                        2,
-                                        options_of<F>(),
-                                        offsets.data(),
-                                        covs.data(),
-                                        ones.data(),
-                                        weights.data(),
-                                        dL_doffsets.data(),
-                                        dL_dcovs.data()};
+  cpu::WeightTask<double> task{};
+  task.n = n;
+  task.threads = 2;
+  task.options = options_of<F>();
+  task.offsets = offsets.data();
+  task.covs = covs.data();
+  task.dL_dweights = ones.data();
+  task.weights = weights.data();
+  task.dL_doffsets = dL_doffsets.data();
+  task.dL_dcovs = dL_dcovs.data();
   stages.weight(task);
   stages.weight_vjp(task);
   for (int64_t i = 0; i < n; i += 50) {

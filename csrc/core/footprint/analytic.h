@@ -14,58 +14,62 @@ inline constexpr double kLogistic3 = 0.07;
 /// of so thin a splat is below 2.6e-6, far under the threshold of 1/255.
 inline constexpr double kMinSigma = 1e-6;
 
-/// One axis: F = S((u + 1/2) r) - S((u - 1/2) r), r = 1/sigma, without the cancellation of the
-/// difference: F = (1 - exp(-2 y)) / ((1 + exp(f(a))) (1 + exp(-f(b)))), a, b = (|u| -+ 1/2) r,
-/// 2 y = f(b) - f(a) factored by r. (The sinh form of docs/numerics.md, scaled to stay finite.)
+/// What the pixels of a splat share of one axis of its frame. Coordinates are t = u/sigma.
+template <typename T> struct LogisticAxis {
+  T half;              // half a pixel, 1/(2 sigma)
+  T constant, square;  // f(b) - f(a) = constant + square t^2, see LogisticWindow
+
+  AR_HD static LogisticAxis at(T inv_sigma) {
+    const T r = inv_sigma;
+    return {T(0.5) * r, r * (T(kLogistic1) + T(0.25 * kLogistic3) * r * r), T(3 * kLogistic3) * r};
+  }
+};
+
+/// One axis: F = S(t + half) - S(t - half), without the cancellation of the difference:
+/// F = (1 - exp(f(a) - f(b))) / ((1 + exp(f(a))) (1 + exp(-f(b)))), a, b = |t| -+ half. (The sinh form
+/// of docs/numerics.md, scaled to stay finite.)
 template <class V> struct LogisticWindow {
   using T = ScalarOf<V>;
-  V side;          // +-1: sign of u
-  V t, r;          // |u| r and 1/sigma
   V lower, upper;  // exp(f(a)), exp(-f(b))
-  V value;         // F
-  V inverse;       // 1 / ((1 + lower) (1 + upper))
+  V numerator, denominator;
 
-  AR_HD LogisticWindow(V u, T inv_sigma) {
-    const V zero = V(T(0)), one = V(T(1)), half = V(T(0.5));
-    side = select(u < zero, V(T(-1)), one);
-    r = V(inv_sigma);
-    const V distance = abs(u), half_r = half * r;
-    t = distance * r;
-    // The clamp keeps products of two such factors finite; F is then below 1e-17.
-    lower = exp2(min(logistic_base2(madd(distance, r, -half_r)), V(T(40 * kLog2e))));
-    upper = exp2(-logistic_base2(madd(distance, r, half_r)));
-    const V y2 = r * madd(V(T(kLogistic3)), madd(V(T(3)) * t, t, half_r * half_r), V(T(kLogistic1)));
-    inverse = divide(one, (one + lower) * (one + upper));
-    value = one_minus_exp(y2, lower * upper) * inverse;
-  }
-
-  /// dF/dx and dF/dy of F = sinh y / (cosh x + cosh y), x and y the half sum and half difference of
-  /// f(b) and f(a); both without cancellation.
-  AR_HD V by_half_sum() const { return -value * (lower - upper) * inverse; }
-  AR_HD V by_half_difference() const {
-    const V product = lower * upper;
-    return madd(V(T(4)), product, (lower + upper) * (V(T(1)) + product)) * inverse * inverse;
-  }
-
-  /// dF/du.
-  AR_HD V by_u() const {
-    const V rr = r * r, tt = t * t;
-    const V dx = r * madd(V(T(3 * kLogistic3)), madd(V(T(0.25)), rr, tt), V(T(kLogistic1)));
-    const V dy = V(T(3 * kLogistic3)) * t * rr;
-    return side * madd(by_half_sum(), dx, by_half_difference() * dy);
-  }
-
-  /// d(sigma F)/dsigma / sigma.
-  AR_HD V by_sigma() const {
-    const V rr = r * r, tt = t * t;
-    const V dx = t * madd(V(T(3 * kLogistic3)), madd(V(T(0.75)), rr, tt), V(T(kLogistic1)));
-    const V dy = r * madd(V(T(1.5 * kLogistic3)), madd(V(T(3)), tt, V(T(0.25)) * rr), V(T(0.5 * kLogistic1)));
-    return r * (value - by_half_sum() * dx - by_half_difference() * dy);
+  AR_HD LogisticWindow(V t, const LogisticAxis<T>& axis) {
+    const V one = V(T(1)), distance = abs(t);
+    // The clamp keeps products of four such factors finite; F is then below 1e-17.
+    lower = exp2(min(logistic_base2(distance - V(axis.half)), V(T(40 * kLog2e))));
+    upper = exp2(-logistic_base2(distance + V(axis.half)));
+    numerator = one_minus_exp(madd(V(axis.square) * t, t, V(axis.constant)), lower * upper);
+    denominator = (one + lower) * (one + upper);
   }
 
  private:
   /// f(z) log2(e)
   AR_HD static V logistic_base2(V z) { return z * madd(V(T(kLogistic3 * kLog2e)) * z, z, V(T(kLogistic1 * kLog2e))); }
+};
+
+/// F and its derivatives. `inverse` = 1 / window.denominator.
+template <class V> struct LogisticValue {
+  using T = ScalarOf<V>;
+  V value;     // F
+  V by_t;      // dF/dt
+  V by_sigma;  // d(sigma F)/dsigma
+
+  AR_HD LogisticValue(const LogisticWindow<V>& f, V inverse, V t, const LogisticAxis<T>& axis) {
+    const V one = V(T(1)), distance = abs(t), tt = t * t;
+    value = f.numerator * inverse;
+    // dF/dx and dF/dy of F = sinh y / (cosh x + cosh y), x and y the half sum and half difference of
+    // f(b) and f(a); both without cancellation.
+    const V product = f.lower * f.upper;
+    const V by_x = value * (f.upper - f.lower) * inverse;
+    const V by_y = madd(V(T(4)), product, (f.lower + f.upper) * (one + product)) * inverse * inverse;
+    const T cubic = T(3 * kLogistic3), hh = axis.half * axis.half, linear = T(kLogistic1) + cubic * hh;
+    const V dx = madd(V(cubic), tt, V(linear)), dy = V(axis.square) * distance;
+    const V by_distance = madd(by_x, dx, by_y * dy);
+    by_t = select(t < V(T(0)), -by_distance, by_distance);
+    const V sigma_dx = distance * (dx + V(T(2) * cubic * hh));
+    const V sigma_dy = madd(V(T(1.5) * axis.square), tt, V(axis.half * linear));
+    by_sigma = value - madd(by_x, sigma_dx, by_y * sigma_dy);
+  }
 };
 
 /// Which derivative of the frame the adjoint takes.
@@ -86,9 +90,10 @@ template <FrameGradient kFrame> struct Analytic {
     T mass;             ///< 2 pi s1 s2 [px^2]
   };
   template <typename T> struct Terms {
-    Shape<T> shape;
-    Vec2<T> origin;  ///< in the frame
+    Mat2<T> frame;   ///< rows: the axes over their sigma
+    Vec2<T> origin;  ///< in that frame
     T mass;          ///< opacity * 2 pi s1 s2
+    LogisticAxis<T> u, v;
   };
 
   AR_HD static double radius_variance(FootprintOptions) { return 0; }
@@ -128,41 +133,48 @@ template <FrameGradient kFrame> struct Analytic {
   }
 
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& g, T opacity, Vec2<T> origin = {T(0), T(0)}) {
-    return {g, transform(frame(g), origin), opacity * g.mass};
+    const Mat2<T> frame = scaled_frame(g);
+    return {frame, transform(frame, origin), opacity * g.mass, LogisticAxis<T>::at(g.inv_sigma.x),
+            LogisticAxis<T>::at(g.inv_sigma.y)};
   }
 
   template <typename T, class V> AR_HD static V alpha(const Terms<T>& t, Vec2<V> p, int) {
-    const Vec2<V> e = transform(frame(t.shape), p, t.origin);
-    return V(t.mass) * LogisticWindow<V>(e.x, t.shape.inv_sigma.x).value *
-           LogisticWindow<V>(e.y, t.shape.inv_sigma.y).value;
+    const Vec2<V> e = transform(t.frame, p, t.origin);
+    const LogisticWindow<V> f(e.x, t.u), g(e.y, t.v);
+    return V(t.mass) * (f.numerator * g.numerator) * divide(V(T(1)), f.denominator * g.denominator);
   }
 
-  /// offset = (g_u, g_v); shape = (g_s1, the frame term, g_s2).
+  /// With I = mass F(u/s1) G(v/s2): offset = mass (F' G, F G'), shape = the derivatives by log s1, the frame
+  /// term, by log s2; all of mass F G with one division.
   template <typename T, class V>
   AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> p, int, V, V dL_dalpha, ShapeGrad<V>& sums) {
-    const Vec2<V> e = transform(frame(t.shape), p, t.origin);
-    const LogisticWindow<V> f(e.x, t.shape.inv_sigma.x), g(e.y, t.shape.inv_sigma.y);
-    const V scale = dL_dalpha * V(t.mass);
-    const V f_u = f.by_u(), g_v = g.by_u();
-    const V by_u = scale * f_u * g.value, by_v = scale * f.value * g_v;
-    // Frozen: I_u I_v / I, the pull of the covariance between u and v at a window that stays put.
-    const V frame = kFrame == FrameGradient::kFrozen ? scale * f_u * g_v : by_u * e.y - by_v * e.x;
-    sums.offset = sums.offset + Vec2<V>{by_u, by_v};
-    sums.shape = {madd(scale * g.value, f.by_sigma(), sums.shape.xx), sums.shape.xy + frame,
-                  madd(scale * f.value, g.by_sigma(), sums.shape.yy)};
+    const Vec2<V> e = transform(t.frame, p, t.origin);
+    const LogisticWindow<V> fw(e.x, t.u), gw(e.y, t.v);
+    const V inverse = divide(V(T(1)), fw.denominator * gw.denominator);
+    const LogisticValue<V> f(fw, inverse * gw.denominator, e.x, t.u), g(gw, inverse * fw.denominator, e.y, t.v);
+    const V scale = dL_dalpha * V(t.mass), scaled_f = scale * f.value, scaled_g = scale * g.value;
+    sums.offset = {madd(scaled_g, f.by_t, sums.offset.x), madd(scaled_f, g.by_t, sums.offset.y)};
+    sums.shape.xx = madd(scaled_g, f.by_sigma, sums.shape.xx);
+    sums.shape.yy = madd(scaled_f, g.by_sigma, sums.shape.yy);
+    if (kFrame == FrameGradient::kFrozen) {
+      // I_u I_v / I: the pull of the covariance between u and v at a window that stays put.
+      sums.shape.xy = madd(scale * f.by_t, g.by_t, sums.shape.xy);
+    } else {
+      const T ratio = t.u.half / t.v.half;  // s2 / s1
+      sums.shape.xy = sums.shape.xy + (scaled_g * f.by_t * (V(ratio) * e.y) - scaled_f * g.by_t * (e.x / V(ratio)));
+    }
   }
 
-  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& g) {
-    return {-g.axis.x, -g.axis.y, g.axis.y, -g.axis.x};
-  }
+  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& g) { return T(-1) * scaled_frame(g); }
 
   template <typename T> AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T> cov, const Shape<T>& g, ShapeGrad<T> sums, T) {
+    const Vec2<T> r = g.inv_sigma;
     // Rotation of the frame per off-diagonal of Sigma is 1/(l1 - l2). At l1 = l2 the frame is
     // arbitrary and the formula has no derivative; zero is as good as any and finite.
     const T gap = eigenvalue_gap(cov);
-    const T turn = kFrame == FrameGradient::kFrozen ? T(1) : (gap > T(0) ? T(1) / gap : T(0));
-    const Sym2<T> along_axes = {T(0.5) * sums.shape.xx * g.inv_sigma.x, T(0.5) * sums.shape.xy * turn,
-                                T(0.5) * sums.shape.yy * g.inv_sigma.y};
+    const T turn = kFrame == FrameGradient::kFrozen ? r.x * r.y : (gap > T(0) ? T(1) / gap : T(0));
+    const Sym2<T> along_axes = {T(0.5) * sums.shape.xx * r.x * r.x, T(0.5) * sums.shape.xy * turn,
+                                T(0.5) * sums.shape.yy * r.y * r.y};
     return {transform_transposed(mean_map(g), sums.offset), congruence_transposed(frame(g), along_axes), T(0)};
   }
 
@@ -170,6 +182,9 @@ template <FrameGradient kFrame> struct Analytic {
   /// Rows: the axes.
   template <typename T> AR_HD static Mat2<T> frame(const Shape<T>& g) {
     return {g.axis.x, g.axis.y, -g.axis.y, g.axis.x};
+  }
+  template <typename T> AR_HD static Mat2<T> scaled_frame(const Shape<T>& g) {
+    return {g.inv_sigma.x * g.axis.x, g.inv_sigma.x * g.axis.y, -g.inv_sigma.y * g.axis.y, g.inv_sigma.y * g.axis.x};
   }
   /// 1 / sqrt(sigma^2 + 1/12).
   template <typename T> AR_HD static T widened(T inv_sigma) {

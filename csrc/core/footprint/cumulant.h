@@ -6,49 +6,43 @@
 
 namespace ar {
 
-/// One axis of the correction to the exponent, s(p, t) = P^2 (c4 - c6 min(P, c4 / (2 c6))) - 6 P t k2
-/// + 3 t^2 k0 with P = p^2 and t the conic's diagonal entry: fourth and sixth cumulant of the box.
-/// The min() keeps the P^2 term non-negative; without it the far tail diverges.
+/// One axis of the correction to the exponent, for the diagonal entry t of the conic: a cubic
+///   h(p, t) = P (P (c4 - c6 P) - 6 t k2) + 3 t^2 k0,  P = min(p^2, cap),
+/// from the fourth and sixth cumulant of the box. P stops where the cubic has its maximum: beyond, the
+/// truncated series would fall and the weight diverge. Weights there are below 2e-6.
 template <typename T> struct CumulantAxis {
-  T c4, c6, cap;                   // of P^2
-  T linear, constant;              // 6 t k2, 3 t^2 k0
+  T c4, c6, linear, constant, cap;
   T dc4, dc6, dlinear, dconstant;  // derivatives by t
 
-  AR_HD static CumulantAxis at(T t) {
-    const T x = t * T(kPixelVariance), dx = T(kPixelVariance);
-    CumulantAxis a;
-    a.c4 = T(1) + T(20.0 / 7) * x + T(0.4366) * x * x;
-    a.dc4 = (T(20.0 / 7) + T(2 * 0.4366) * x) * dx;
-    const T k2 = T(1) + T(10.0 / 7) * x + T(0.6240) * x * x;
-    const T dk2 = (T(10.0 / 7) + T(2 * 0.6240) * x) * dx;
-    const T k0 = T(1) + T(20.0 / 21) * x + T(0.6975) * x * x;
-    const T dk0 = (T(20.0 / 21) + T(2 * 0.6975) * x) * dx;
+  /// `unit` times h, of p and t in coordinates where the conic's entries are 1 / `scale` of what they are in pixels.
+  AR_HD static CumulantAxis at(T t, T unit = T(1), T scale = T(1)) {
+    const T dx = scale * T(kPixelVariance), x = t * dx;
     const bool floored = T(1) - x < T(1e-6);
-    a.c6 = (floored ? T(1e-6) : T(1) - x) / T(63);
-    a.dc6 = floored ? T(0) : -dx / T(63);
-    a.cap = a.c4 / (T(2) * a.c6);
-    a.linear = T(6) * t * k2;
-    a.dlinear = T(6) * (k2 + t * dk2);
-    a.constant = T(3) * t * t * k0;
-    a.dconstant = T(3) * t * (T(2) * k0 + t * dk0);
+    const T u2 = unit * scale * scale, u3 = u2 * scale, u4 = u3 * scale, u6 = u4 * scale * scale;
+    CumulantAxis a;
+    a.c4 = u4 * (T(1) + x * (T(20.0 / 7) + x * T(0.4366)));
+    a.dc4 = u4 * dx * (T(20.0 / 7) + x * T(2 * 0.4366));
+    a.c6 = u6 * (floored ? T(1e-6) : T(1) - x) / T(63);
+    a.dc6 = floored ? T(0) : -u6 * dx / T(63);
+    a.linear = u3 * T(6) * t * (T(1) + x * (T(10.0 / 7) + x * T(0.6240)));
+    a.dlinear = u3 * T(6) * (T(1) + x * (T(2 * 10.0 / 7) + x * T(3 * 0.6240)));
+    a.constant = u2 * T(3) * t * t * (T(1) + x * (T(20.0 / 21) + x * T(0.6975)));
+    a.dconstant = u2 * T(3) * t * (T(2) + x * (T(3 * 20.0 / 21) + x * T(4 * 0.6975)));
+    a.cap = (a.c4 + sqrt(a.c4 * a.c4 - T(3) * a.c6 * a.linear)) / (T(3) * a.c6);
     return a;
   }
 
-  template <class V> AR_HD V value(V p) const {
-    const V P = p * p;
-    const V quartic = V(c4) - V(c6) * min(P, V(cap));
-    return madd(P, madd(P, quartic, V(-linear)), V(constant));
+  template <class V> AR_HD V capped(V p) const { return min(p * p, V(cap)); }
+  /// v - h, but for h's constant, where P = capped(p).
+  template <class V> AR_HD V subtract_from(V v, V P) const {
+    return madd(-P, madd(P, madd(V(-c6), P, V(c4)), V(-linear)), v);
   }
-  template <class V> AR_HD V by_p(V p) const {
-    const V P = p * p;
-    const V quartic = V(c4) - V(c6) * min(P, V(cap));
-    const V falling = select(P < V(cap), V(c6) * P, V(T(0)));  // -dquartic/dP * P
-    return V(T(2)) * p * (P * (quartic + quartic - falling) - V(linear));
+  /// dh/dp / 2.
+  template <class V> AR_HD V half_by_p(V p, V P) const {
+    return p * madd(P, madd(V(T(-3) * c6), P, V(c4 + c4)), V(-linear));
   }
-  template <class V> AR_HD V by_t(V p) const {
-    const V P = p * p;
-    const V dquartic = select(P < V(cap), V(dc4) - V(dc6) * P, V(T(0.5) * dc4));
-    return madd(P, madd(P, dquartic, V(-dlinear)), V(dconstant));
+  template <class V> AR_HD V by_t(V P) const {
+    return madd(P, madd(P, madd(V(-dc6), P, V(dc4)), V(-dlinear)), V(dconstant));
   }
 };
 
@@ -60,10 +54,10 @@ struct Cumulant {
   template <typename T> using Shape = GaussianShape<T>;
 
   template <typename T> struct Terms {
-    Mat2<T> w;
-    Vec2<T> origin;  ///< whitened
-    T peak;          ///< opacity * amp
-    CumulantAxis<T> x, y;
+    Mat2<T> w;             ///< whitening matrix times kBase2
+    Vec2<T> origin;        ///< whitened
+    T log_peak;            ///< log2(opacity * amp) less the constants of x and y
+    CumulantAxis<T> x, y;  ///< of the exponent to base 2, with the conic w^T w
   };
 
   AR_HD static double radius_variance(FootprintOptions) { return kPixelVariance; }
@@ -82,35 +76,36 @@ struct Cumulant {
   }
 
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& shape, T opacity, Vec2<T> origin = {T(0), T(0)}) {
-    return {shape.w, transform(shape.w, origin), opacity * shape.amp, CumulantAxis<T>::at(conic_xx(shape.w)),
-            CumulantAxis<T>::at(conic_yy(shape.w))};
+    const Mat2<T> w = T(kBase2) * shape.w;
+    const T unit = T(kOrder4 * kLog2e), scale = T(1 / (kBase2 * kBase2));
+    const auto x = CumulantAxis<T>::at(conic_xx(w), unit, scale), y = CumulantAxis<T>::at(conic_yy(w), unit, scale);
+    return {w, transform(w, origin), log2(opacity * shape.amp) - (x.constant + y.constant), x, y};
   }
 
   template <typename T, class V> AR_HD static V alpha(const Terms<T>& t, Vec2<V> pixel, int) {
     const Vec2<V> z = transform(t.w, pixel, t.origin), p = transform_transposed(t.w, z);
-    const V correction = t.x.value(p.x) + t.y.value(p.y);
-    const V q = madd(z.x, z.x, z.y * z.y);
-    return V(t.peak) * exp2(madd(correction, V(T(-kOrder4 * kLog2e)), V(T(-0.5 * kLog2e)) * q));
+    const V gaussian = madd(-z.x, z.x, madd(-z.y, z.y, V(t.log_peak)));
+    return exp2(t.x.subtract_from(t.y.subtract_from(gaussian, t.y.capped(p.y)), t.x.capped(p.x)));
   }
 
-  /// With h the correction, p = C d and e = w dh/dp, in whitened coordinates:
-  /// d log I = (z + e).w dmu + tr(w^T (z z^T / 2 + sym(e z^T) + w diag(dh/da, dh/dc) w^T) w dSigma).
+  /// With -log2 I = |z|^2 + h(p_x, a) + h(p_y, c), z = w d, p = w^T z, e = w dh/dp / 2 and E = dw w^-1:
+  /// -d log2 I / 2 = -(z + e).w dmu + tr(E (z z^T + e z^T + z e^T + w diag(dh/da, dh/dc) w^T)).
   template <typename T, class V>
   AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> pixel, int, V alpha, V dL_dalpha, ShapeGrad<V>& sums) {
-    const Vec2<V> z = transform(t.w, pixel, t.origin), p = transform_transposed(t.w, z);
-    const V scale = V(T(kOrder4)), twice = V(T(2 * kOrder4));
-    const Vec2<V> e = transform(t.w, Vec2<V>{scale * t.x.by_p(p.x), scale * t.y.by_p(p.y)});
-    const V ha = twice * t.x.by_t(p.x), hc = twice * t.y.by_t(p.y);
-    const V g = dL_dalpha * alpha;
     const Mat2<T>& w = t.w;
-    const V xx = madd(z.x, z.x + e.x + e.x, madd(V(w.xx * w.xx), ha, V(w.xy * w.xy) * hc));
-    const V xy = madd(z.x, z.y + e.y, madd(e.x, z.y, madd(V(w.xx * w.yx), ha, V(w.xy * w.yy) * hc)));
-    const V yy = madd(z.y, z.y + e.y + e.y, madd(V(w.yx * w.yx), ha, V(w.yy * w.yy) * hc));
-    sums.offset = {madd(g, z.x + e.x, sums.offset.x), madd(g, z.y + e.y, sums.offset.y)};
+    const Vec2<V> z = transform(w, pixel, t.origin), p = transform_transposed(w, z);
+    const V px = t.x.capped(p.x), py = t.y.capped(p.y);
+    const Vec2<V> e = transform(w, Vec2<V>{t.x.half_by_p(p.x, px), t.y.half_by_p(p.y, py)});
+    const V ha = t.x.by_t(px), hc = t.y.by_t(py), g = dL_dalpha * alpha;
+    const Vec2<V> u = {z.x + e.x, z.y + e.y};
+    const V xx = madd(z.x, u.x + e.x, madd(V(w.xx * w.xx), ha, V(w.xy * w.xy) * hc));
+    const V xy = madd(z.x, u.y, madd(e.x, z.y, madd(V(w.xx * w.yx), ha, V(w.xy * w.yy) * hc)));
+    const V yy = madd(z.y, u.y + e.y, madd(V(w.yx * w.yx), ha, V(w.yy * w.yy) * hc));
+    sums.offset = {madd(g, u.x, sums.offset.x), madd(g, u.y, sums.offset.y)};
     sums.shape = {madd(g, xx, sums.shape.xx), madd(g, xy, sums.shape.xy), madd(g, yy, sums.shape.yy)};
   }
 
-  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return shape.w; }
+  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return T(1 / kBase2) * shape.w; }
 
   template <typename T>
   AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& shape, ShapeGrad<T> sums, T weighted) {

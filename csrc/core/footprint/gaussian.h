@@ -24,18 +24,22 @@ template <typename T> AR_HD Mat2<T> whiten(Cov2d<T> c) {
   return wide_x ? Mat2<T>{along, T(0), slope, across} : Mat2<T>{T(0), along, across, slope};
 }
 
+/// Exponents are taken to base 2: kBase2^2 = log2(e) / 2 turns |w d|^2 into -log2 of the Gaussian.
+inline constexpr double kBase2 = 0.84932180028801904272;
+
 /// Level outside which amp * opacity * exp(-|w d|^2 / 2) < 1/255.
 template <typename T> AR_HD T gaussian_level(T amp, T opacity) {
   return T(2) * std::log(T(1 / kAlphaMin) * opacity * amp);
 }
 
-/// Gradient of a sum of Gaussians from sums in whitened coordinates z = w d: `offset` = sum g I z,
+/// Gradient of a sum of Gaussians from sums in whitened coordinates z = kBase2 w d: `offset` = sum g I z,
 /// `shape` = sum g I z z^T. `weighted` = sum g I, zero where the amplitude does not depend on Sigma.
 template <typename T> AR_HD SplatGrad<T> gaussian_vjp(const Mat2<T>& w, ShapeGrad<T> sums, T weighted) {
-  // d log I = z.w dmu + tr(w^T z z^T w dSigma)/2 + (d log det Sigma - tr(w^T w dSigma))/2
-  const Sym2<T> half = {T(0.5) * (sums.shape.xx - weighted), T(0.5) * sums.shape.xy,
-                        T(0.5) * (sums.shape.yy - weighted)};
-  return {transform_transposed(w, sums.offset), congruence_transposed(w, half), T(0.5) * weighted};
+  // With kBase2 = 1: d log I = z.w dmu + tr(w^T z z^T w dSigma)/2 + (d log det Sigma - tr(w^T w dSigma))/2
+  const T square = T(1 / (kBase2 * kBase2));
+  const Sym2<T> half = {T(0.5) * (square * sums.shape.xx - weighted), T(0.5) * square * sums.shape.xy,
+                        T(0.5) * (square * sums.shape.yy - weighted)};
+  return {transform_transposed(T(1 / kBase2) * w, sums.offset), congruence_transposed(w, half), T(0.5) * weighted};
 }
 
 /// Node s of the box footprint with S samples, in units of 1/(2 S) px: one per row and column of an
@@ -61,9 +65,6 @@ template <int S, bool kCompensated> struct GaussianFootprint {
   static constexpr double kReach = (S - 1) / (2.0 * S);
   template <typename T> using Shape = GaussianShape<T>;
 
-  /// Exponents are taken to base 2: kBase2^2 = log2(e) / 2 turns |w d|^2 into -log2 of the Gaussian.
-  static constexpr double kBase2 = 0.84932180028801904272;
-
   template <typename T> struct Terms {
     Mat2<T> w;        ///< whitening matrix times kBase2
     T log_peak;       ///< log2(opacity * amp)
@@ -82,8 +83,7 @@ template <int S, bool kCompensated> struct GaussianFootprint {
   }
 
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& shape, T opacity, Vec2<T> origin = {T(0), T(0)}) {
-    const T scale = T(kBase2);
-    const Mat2<T> w = {scale * shape.w.xx, scale * shape.w.xy, scale * shape.w.yx, scale * shape.w.yy};
+    const Mat2<T> w = T(kBase2) * shape.w;
     Terms<T> t{w, log2(opacity * shape.amp), {}};
     AR_UNROLL
     for (int s = 0; s < S; ++s) {
@@ -112,17 +112,11 @@ template <int S, bool kCompensated> struct GaussianFootprint {
     sums.shape = {madd(gx, z.x, sums.shape.xx), madd(gx, z.y, sums.shape.xy), madd(gy, z.y, sums.shape.yy)};
   }
 
-  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) {
-    const T scale = T(1 / kBase2);
-    return {scale * shape.w.xx, scale * shape.w.xy, scale * shape.w.yx, scale * shape.w.yy};
-  }
+  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return T(1 / kBase2) * shape.w; }
 
   template <typename T>
   AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& shape, ShapeGrad<T> sums, T weighted) {
-    const T scale = T(1 / kBase2), square = T(1 / (kBase2 * kBase2));
-    const ShapeGrad<T> whitened_sums = {{scale * sums.offset.x, scale * sums.offset.y},
-                                        {square * sums.shape.xx, square * sums.shape.xy, square * sums.shape.yy}};
-    return gaussian_vjp(shape.w, whitened_sums, kCompensated ? weighted : T(0));
+    return gaussian_vjp(shape.w, sums, kCompensated ? weighted : T(0));
   }
 };
 
