@@ -37,6 +37,16 @@ AR_HD int32_t select(bool m, int32_t a, int32_t b) { return m ? a : b; }
 
 template <typename T> AR_HD T min(T a, T b) { return b < a ? b : a; }
 template <typename T> AR_HD T max(T a, T b) { return a < b ? b : a; }
+/// One instruction where there is one that keeps NaN.
+AR_HD float min(float a, float b) {
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+  float y;
+  asm("min.NaN.f32 %0, %1, %2;" : "=f"(y) : "f"(a), "f"(b));
+  return y;
+#else
+  return b < a ? b : a;
+#endif
+}
 
 /// a * b + c. Written out where the hot loops need one rounding less and one instruction less: the
 /// build turns contraction off, so that forward and backward round alike.
@@ -129,15 +139,17 @@ template <class V> AR_HD V one_minus_exp_ratio(V x) {
                                 1.0 / 6227020800,
                                 -1.0 / 87178291200,
                                 1.0 / 1307674368000};
-  V sum = V(T(0));
   if constexpr (sizeof(T) == 4) {
+    V sum = V(T(kMinimax[4]));
     AR_UNROLL
-    for (int k = 4; k >= 0; --k) sum = madd(sum, x, V(T(kMinimax[k])));
+    for (int k = 3; k >= 0; --k) sum = madd(sum, x, V(T(kMinimax[k])));
+    return sum;
   } else {
+    V sum = V(T(kTaylor[14]));
     AR_UNROLL
-    for (int k = 14; k >= 0; --k) sum = madd(sum, x, V(T(kTaylor[k])));
+    for (int k = 13; k >= 0; --k) sum = madd(sum, x, V(T(kTaylor[k])));
+    return sum;
   }
-  return sum;
 }
 
 /// (1 - exp(-x)) for x >= 0, given e = exp(-x): the difference where it is well conditioned.

@@ -72,7 +72,8 @@ template <class F> struct alignas(16) TileSplat {
 };
 
 /// A splat while pixels are at it: copied to registers, unless it has too many numbers.
-template <class F> using Held = std::conditional_t<sizeof(TileSplat<F>) <= 96, const TileSplat<F>, const TileSplat<F>&>;
+template <class F>
+using Held = std::conditional_t<sizeof(TileSplat<F>) <= 112, const TileSplat<F>, const TileSplat<F>&>;
 
 template <class F> __device__ TileSplat<F> tile_splat(const Splat<F, float>& splat, const TileList& list) {
   return {F::terms(splat.shape, splat.opacity, {float(list.x0) - splat.mean.x, float(list.y0) - splat.mean.y}),
@@ -233,7 +234,7 @@ __device__ void accumulate_behind(const PixelCheckpoints<S>& checkpoints, int n,
 /// A block per tile.
 template <class F, bool kKeep>
 __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 1             ? 1
-                                                 : sizeof(TileSplat<F>) > 64 ? 4
+                                                 : sizeof(TileSplat<F>) > 96 ? 4
                                                                              : 5)
     blend_front_kernel(const BlendTask task) {
   constexpr int S = F::kSamples, kLength = chunk_length(S), kColors = kKeep ? S : 1;
@@ -458,7 +459,7 @@ template <class F> struct VjpStage {
 };
 
 /// Blocks of blend_vjp that an SM should hold: bounds the registers.
-template <class F> inline constexpr int kVjpBlocks = F::kSamples > 1 ? 1 : sizeof(TileSplat<F>) <= 48 ? 7 : 6;
+template <class F> inline constexpr int kVjpBlocks = F::kSamples > 1 ? 1 : sizeof(TileSplat<F>) <= 48 ? 7 : 5;
 
 /// Warps of a block of blend_vjp: as many as leave room for a few blocks in shared memory.
 template <class F> inline constexpr int kVjpWarps = F::kSamples <= 2 ? 4 : F::kSamples <= 8 ? 2 : 1;

@@ -195,16 +195,16 @@ TEST(AnalyticLevel, HoldsAlongOneAxis) {
   }
 }
 
-double correction(const CumulantAxis<double>& axis, double p) {
-  return axis.constant - axis.subtract_from(0.0, axis.capped(p));
+double correction(double t, double p, double unit = 1, double scale = 1) {
+  const auto axis = CumulantAxis<double>::at(t, unit, scale);
+  return CumulantAxis<double>::constant(t, unit, scale) - axis.subtract_from(0.0, axis.capped(p));
 }
 
 // The bound in the comment of Cumulant::level, per axis.
 TEST(CumulantAxisTest, LowersTheExponentByItsBoundAtMost) {
   for (double t = 0.01; t < 12.005; t += 0.01) {
-    const auto axis = CumulantAxis<double>::at(std::min(t, 12.0));
     for (double p = 0; p < 100; p += 0.01) {
-      ASSERT_GE(2 * Cumulant::kOrder4 * correction(axis, p), -t * t / 124) << "t " << t << " p " << p;
+      ASSERT_GE(2 * Cumulant::kOrder4 * correction(std::min(t, 12.0), p), -t * t / 124) << "t " << t << " p " << p;
     }
   }
 }
@@ -216,8 +216,8 @@ TEST(CumulantAxisTest, DerivativesMatchDifferences) {
     const double t = random.log_uniform(0.01, 12.1), p = random.uniform(-30, 30);
     const auto axis = CumulantAxis<double>::at(t);
     if (std::abs(p * p / axis.cap - 1) < 0.01 || std::abs(t - 12) < 0.01) continue;
-    const double by_p = derivative([&](double h) { return correction(axis, p + h); }, 1e-3);
-    const double by_t = derivative([&](double h) { return correction(CumulantAxis<double>::at(t + h), p); }, 1e-4 * t);
+    const double by_p = derivative([&](double h) { return correction(t, p + h); }, 1e-3);
+    const double by_t = derivative([&](double h) { return correction(t + h, p); }, 1e-4 * t);
     const double capped = axis.capped(p);
     // The terms stay below 10 c4 (p^2 + t)^2; the differences round them by eps / h.
     const double size = 10 * axis.c4 * (p * p + t) * (p * p + t);
@@ -233,7 +233,7 @@ TEST(CumulantAxisTest, Scales) {
     const double t = random.log_uniform(0.01, 11.9), p = random.uniform(-10, 10), unit = 0.3, scale = 1.7;
     const auto plain = CumulantAxis<double>::at(t), scaled = CumulantAxis<double>::at(t / scale, unit, scale);
     const double P = plain.capped(p), Q = scaled.capped(p / scale), tiny = 1e-13 * (1 + P * P * P * plain.c4);
-    ASSERT_NEAR(correction(scaled, p / scale), unit * correction(plain, p), tiny);
+    ASSERT_NEAR(correction(t / scale, p / scale, unit, scale), unit * correction(t, p), tiny);
     ASSERT_NEAR(scaled.half_by_p(p / scale, Q), unit * scale * plain.half_by_p(p, P), 10 * tiny);
     ASSERT_NEAR(scaled.by_t(Q), unit * scale * plain.by_t(P), 10 * tiny);
   }

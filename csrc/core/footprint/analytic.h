@@ -25,6 +25,17 @@ template <typename T> struct LogisticAxis {
   }
 };
 
+/// What their derivatives need besides: with x and y of LogisticValue and t without its sign, dx/dt = linear +
+/// cubic t^2, dy/dt = square t; t dx/dt + half dx/dhalf = t (dx/dt + spread), of y mixed + steep t^2.
+template <typename T> struct LogisticSlopes {
+  T linear, spread, mixed, steep;
+
+  AR_HD static LogisticSlopes at(const LogisticAxis<T>& axis) {
+    const T h = axis.half, linear = T(kLogistic1) + T(3 * kLogistic3) * h * h;
+    return {linear, T(6 * kLogistic3) * h * h, h * linear, T(1.5) * axis.square};
+  }
+};
+
 /// One axis: F = S(t + half) - S(t - half), without the cancellation of the difference:
 /// F = (1 - exp(f(a) - f(b))) / ((1 + exp(f(a))) (1 + exp(-f(b)))), a, b = |t| -+ half. (The sinh form
 /// of docs/numerics.md, scaled to stay finite.)
@@ -54,7 +65,8 @@ template <class V> struct LogisticValue {
   V by_t;      // dF/dt
   V by_sigma;  // d(sigma F)/dsigma
 
-  AR_HD LogisticValue(const LogisticWindow<V>& f, V inverse, V t, const LogisticAxis<T>& axis) {
+  AR_HD LogisticValue(const LogisticWindow<V>& f, V inverse, V t, const LogisticAxis<T>& axis,
+                      const LogisticSlopes<T>& slopes) {
     const V one = V(T(1)), distance = abs(t), tt = t * t;
     value = f.numerator * inverse;
     // dF/dx and dF/dy of F = sinh y / (cosh x + cosh y), x and y the half sum and half difference of
@@ -62,13 +74,11 @@ template <class V> struct LogisticValue {
     const V product = f.lower * f.upper;
     const V by_x = value * (f.upper - f.lower) * inverse;
     const V by_y = madd(V(T(4)), product, (f.lower + f.upper) * (one + product)) * inverse * inverse;
-    const T cubic = T(3 * kLogistic3), hh = axis.half * axis.half, linear = T(kLogistic1) + cubic * hh;
-    const V dx = madd(V(cubic), tt, V(linear)), dy = V(axis.square) * distance;
+    const V dx = madd(V(T(3 * kLogistic3)), tt, V(slopes.linear)), dy = V(axis.square) * distance;
     const V by_distance = madd(by_x, dx, by_y * dy);
     by_t = select(t < V(T(0)), -by_distance, by_distance);
-    const V sigma_dx = distance * (dx + V(T(2) * cubic * hh));
-    const V sigma_dy = madd(V(T(1.5) * axis.square), tt, V(axis.half * linear));
-    by_sigma = value - madd(by_x, sigma_dx, by_y * sigma_dy);
+    by_sigma =
+        value - madd(by_x, distance * (dx + V(slopes.spread)), by_y * madd(V(slopes.steep), tt, V(slopes.mixed)));
   }
 };
 
@@ -90,6 +100,7 @@ template <FrameGradient kFrame> struct Analytic {
     T mass;             ///< 2 pi s1 s2 [px^2]
   };
   template <typename T> struct Terms {
+    LogisticSlopes<T> du, dv;
     Mat2<T> frame;   ///< rows: the axes over their sigma
     Vec2<T> origin;  ///< in that frame
     T mass;          ///< opacity * 2 pi s1 s2
@@ -134,8 +145,9 @@ template <FrameGradient kFrame> struct Analytic {
 
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& g, T opacity, Vec2<T> origin = {T(0), T(0)}) {
     const Mat2<T> frame = scaled_frame(g);
-    return {frame, transform(frame, origin), opacity * g.mass, LogisticAxis<T>::at(g.inv_sigma.x),
-            LogisticAxis<T>::at(g.inv_sigma.y)};
+    const auto u = LogisticAxis<T>::at(g.inv_sigma.x), v = LogisticAxis<T>::at(g.inv_sigma.y);
+    return {
+        LogisticSlopes<T>::at(u), LogisticSlopes<T>::at(v), frame, transform(frame, origin), opacity * g.mass, u, v};
   }
 
   template <typename T, class V> AR_HD static V alpha(const Terms<T>& t, Vec2<V> p, int) {
@@ -151,7 +163,8 @@ template <FrameGradient kFrame> struct Analytic {
     const Vec2<V> e = transform(t.frame, p, t.origin);
     const LogisticWindow<V> fw(e.x, t.u), gw(e.y, t.v);
     const V inverse = divide(V(T(1)), fw.denominator * gw.denominator);
-    const LogisticValue<V> f(fw, inverse * gw.denominator, e.x, t.u), g(gw, inverse * fw.denominator, e.y, t.v);
+    const LogisticValue<V> f(fw, inverse * gw.denominator, e.x, t.u, t.du),
+        g(gw, inverse * fw.denominator, e.y, t.v, t.dv);
     const V scale = dL_dalpha * V(t.mass), scaled_f = scale * f.value, scaled_g = scale * g.value;
     sums.offset = {madd(scaled_g, f.by_t, sums.offset.x), madd(scaled_f, g.by_t, sums.offset.y)};
     sums.shape.xx = madd(scaled_g, f.by_sigma, sums.shape.xx);

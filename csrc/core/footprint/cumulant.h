@@ -11,7 +11,7 @@ namespace ar {
 /// from the fourth and sixth cumulant of the box. P stops where the cubic has its maximum: beyond, the
 /// truncated series would fall and the weight diverge. Weights there are below 2e-6.
 template <typename T> struct CumulantAxis {
-  T c4, c6, linear, constant, cap;
+  T c4, c6, linear, cap;
   T dc4, dc6, dlinear, dconstant;  // derivatives by t
 
   /// `unit` times h, of p and t in coordinates where the conic's entries are 1 / `scale` of what they are in pixels.
@@ -26,24 +26,29 @@ template <typename T> struct CumulantAxis {
     a.dc6 = floored ? T(0) : -u6 * dx / T(63);
     a.linear = u3 * T(6) * t * (T(1) + x * (T(10.0 / 7) + x * T(0.6240)));
     a.dlinear = u3 * T(6) * (T(1) + x * (T(2 * 10.0 / 7) + x * T(3 * 0.6240)));
-    a.constant = u2 * T(3) * t * t * (T(1) + x * (T(20.0 / 21) + x * T(0.6975)));
     a.dconstant = u2 * T(3) * t * (T(2) + x * (T(3 * 20.0 / 21) + x * T(4 * 0.6975)));
     a.cap = (a.c4 + sqrt(a.c4 * a.c4 - T(3) * a.c6 * a.linear)) / (T(3) * a.c6);
     return a;
   }
 
+  /// The part of h without p: 3 t^2 k0.
+  AR_HD static T constant(T t, T unit = T(1), T scale = T(1)) {
+    const T x = t * scale * T(kPixelVariance);
+    return unit * scale * scale * T(3) * t * t * (T(1) + x * (T(20.0 / 21) + x * T(0.6975)));
+  }
+
   template <class V> AR_HD V capped(V p) const { return min(p * p, V(cap)); }
-  /// v - h, but for h's constant, where P = capped(p).
-  template <class V> AR_HD V subtract_from(V v, V P) const {
-    return madd(-P, madd(P, madd(V(-c6), P, V(c4)), V(-linear)), v);
-  }
+  /// v - (h - constant), where P = capped(p).
+  template <class V> AR_HD V subtract_from(V v, V P) const { return madd(-P, inner(P), v); }
   /// dh/dp / 2.
-  template <class V> AR_HD V half_by_p(V p, V P) const {
-    return p * madd(P, madd(V(T(-3) * c6), P, V(c4 + c4)), V(-linear));
-  }
+  template <class V> AR_HD V half_by_p(V p, V P) const { return p * madd(P, madd(V(-c6), P, quartic(P)), inner(P)); }
   template <class V> AR_HD V by_t(V P) const {
     return madd(P, madd(P, madd(V(-dc6), P, V(dc4)), V(-dlinear)), V(dconstant));
   }
+
+ private:
+  template <class V> AR_HD V quartic(V P) const { return madd(V(-c6), P, V(c4)); }
+  template <class V> AR_HD V inner(V P) const { return madd(P, quartic(P), V(-linear)); }
 };
 
 struct Cumulant {
@@ -55,9 +60,9 @@ struct Cumulant {
 
   template <typename T> struct Terms {
     Mat2<T> w;             ///< whitening matrix times kBase2
+    CumulantAxis<T> x, y;  ///< of the exponent to base 2, with the conic w^T w
     Vec2<T> origin;        ///< whitened
     T log_peak;            ///< log2(opacity * amp) less the constants of x and y
-    CumulantAxis<T> x, y;  ///< of the exponent to base 2, with the conic w^T w
   };
 
   AR_HD static double radius_variance(FootprintOptions) { return kPixelVariance; }
@@ -78,8 +83,10 @@ struct Cumulant {
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& shape, T opacity, Vec2<T> origin = {T(0), T(0)}) {
     const Mat2<T> w = T(kBase2) * shape.w;
     const T unit = T(kOrder4 * kLog2e), scale = T(1 / (kBase2 * kBase2));
-    const auto x = CumulantAxis<T>::at(conic_xx(w), unit, scale), y = CumulantAxis<T>::at(conic_yy(w), unit, scale);
-    return {w, transform(w, origin), log2(opacity * shape.amp) - (x.constant + y.constant), x, y};
+    const T a = conic_xx(w), c = conic_yy(w);
+    const T constant = CumulantAxis<T>::constant(a, unit, scale) + CumulantAxis<T>::constant(c, unit, scale);
+    return {w, CumulantAxis<T>::at(a, unit, scale), CumulantAxis<T>::at(c, unit, scale), transform(w, origin),
+            log2(opacity * shape.amp) - constant};
   }
 
   template <typename T, class V> AR_HD static V alpha(const Terms<T>& t, Vec2<V> pixel, int) {
@@ -97,10 +104,10 @@ struct Cumulant {
     const V px = t.x.capped(p.x), py = t.y.capped(p.y);
     const Vec2<V> e = transform(w, Vec2<V>{t.x.half_by_p(p.x, px), t.y.half_by_p(p.y, py)});
     const V ha = t.x.by_t(px), hc = t.y.by_t(py), g = dL_dalpha * alpha;
-    const Vec2<V> u = {z.x + e.x, z.y + e.y};
-    const V xx = madd(z.x, u.x + e.x, madd(V(w.xx * w.xx), ha, V(w.xy * w.xy) * hc));
-    const V xy = madd(z.x, u.y, madd(e.x, z.y, madd(V(w.xx * w.yx), ha, V(w.xy * w.yy) * hc)));
-    const V yy = madd(z.y, u.y + e.y, madd(V(w.yx * w.yx), ha, V(w.yy * w.yy) * hc));
+    const Vec2<V> u = {z.x + e.x, z.y + e.y}, ax = {V(w.xx) * ha, V(w.xy) * hc}, ay = {V(w.yx) * ha, V(w.yy) * hc};
+    const V xx = madd(z.x, u.x + e.x, madd(ax.x, V(w.xx), ax.y * V(w.xy)));
+    const V xy = madd(z.x, u.y, madd(e.x, z.y, madd(ax.x, V(w.yx), ax.y * V(w.yy))));
+    const V yy = madd(z.y, u.y + e.y, madd(ay.x, V(w.yx), ay.y * V(w.yy)));
     sums.offset = {madd(g, u.x, sums.offset.x), madd(g, u.y, sums.offset.y)};
     sums.shape = {madd(g, xx, sums.shape.xx), madd(g, xy, sums.shape.xy), madd(g, yy, sums.shape.yy)};
   }
