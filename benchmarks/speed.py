@@ -32,7 +32,6 @@ from scene_files import load_scene
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
-from analytic_rasterizer.cli import format_table
 from analytic_rasterizer.measure import (
     Case,
     describe_machine,
@@ -42,6 +41,7 @@ from analytic_rasterizer.measure import (
     median_seconds,
     warm_up_cuda,
 )
+from analytic_rasterizer.report import format_table
 
 FOOTPRINTS = [
     "box:samples=1",
