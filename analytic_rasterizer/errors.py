@@ -36,7 +36,7 @@ PAPER_GRADIENT = "analytic:frame_gradient=paper"
 GRADIENTS = {"offset": "dI/d offset", "cov2d": "dI/d covariance"}
 
 
-def run(out, samples: int = SAMPLES, monte_carlo: int = MONTE_CARLO, rotation_samples: int = ROTATION_SAMPLES) -> dict:
+def run(out, samples: int = SAMPLES, monte_carlo: int = MONTE_CARLO, rotation_samples: int | None = None) -> dict:
     """Measures all three and writes CSV, PNG and SVG files and summary.md to `out`, a folder that exists.
 
     Args:
@@ -44,7 +44,7 @@ def run(out, samples: int = SAMPLES, monte_carlo: int = MONTE_CARLO, rotation_sa
         samples: Splats of each deviation, for the footprints. Maxima are over these splats, and so lower
             bounds.
         monte_carlo: Samples in a pixel.
-        rotation_samples: Splats of each deviation, for the rotation.
+        rotation_samples: Splats of each deviation, for the rotation; None is ROTATION_SAMPLES.
 
     Returns:
         {"window": rows, "rotation": rows, "footprints": rows, "summary": Markdown}.
@@ -53,13 +53,14 @@ def run(out, samples: int = SAMPLES, monte_carlo: int = MONTE_CARLO, rotation_sa
         ImportError: Without the `analysis` extra.
         ValueError: This build has no `exact` or `erf` footprint.
     """
-    optional_import("matplotlib", "analysis")  # now rather than after the first measurement
+    for module in ("matplotlib.figure", "scipy.special"):
+        optional_import(module, "analysis")  # now rather than after the first measurement
     out = Path(out)
     cases = all_cases()
     with optional_import("tqdm").tqdm(total=2 + len(cases), desc="errors", disable=None) as bar:
         window = window_errors()
         bar.update()
-        rotation = rotation_errors(rotation_samples, monte_carlo)
+        rotation = rotation_errors(rotation_samples or ROTATION_SAMPLES, monte_carlo)
         bar.update()
         footprints = footprint_errors(cases, samples, bar.update)
     results = {"window": window, "rotation": rotation, "footprints": footprints}
@@ -334,7 +335,7 @@ def _by_threshold(rows: list[dict]) -> str:
 
 
 def _plot_window(rows: list[dict]):
-    figure, axes = report.new_figure(10, 4.2, 2, sharex=True)
+    figure, axes = report.new_figure(10, 4.2, 2, sharex=True, sharey=True)
     sigma = [row["sigma"] for row in rows]
     for ax, key, title in zip(
         axes[0],
@@ -343,7 +344,8 @@ def _plot_window(rows: list[dict]):
     ):
         ax.plot(sigma, [row[f"{key}_max"] for row in rows], color=report.COLORS["analytic"], label="maximum")
         ax.plot(sigma, [row[f"{key}_rms"] for row in rows], color=report.COLORS["analytic"], ls="--", label="RMS")
-        ax.set(yscale="log", xlabel="standard deviation [px]", ylabel="absolute error", title=title)
+        ax.set(yscale="log", ylim=(5e-5, 5e-3), title=title)
+        ax.set(xlabel="standard deviation [px]", ylabel="absolute error")
         report.plain_log_ticks(ax)
         ax.title.set_fontsize(10)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside right center", frameon=False)

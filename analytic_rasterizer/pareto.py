@@ -122,7 +122,7 @@ def run(
     for what, given in (("views", [view.name for view in views]), ("methods", names), ("scales", list(scales))):
         if not given or len(set(given)) < len(given):
             raise ValueError(f"{what} must be given, and each once, got {', '.join(map(str, given)) or 'none'}")
-    for module in ("matplotlib", "torchmetrics"):
+    for module in ("matplotlib.figure", "torchmetrics.functional.image"):
         optional_import(module, "analysis")  # now rather than after the first scale
     out = Path(out)
     device = scene.means.device.type
@@ -309,7 +309,7 @@ def pareto_front(points: list[tuple[float, float]]) -> list[bool]:
 
 
 def _ssim(color: torch.Tensor, truth: torch.Tensor) -> float | None:
-    """Structural similarity with a Gaussian window of 1.5 px, for colours in 0 to 1."""
+    """Structural similarity with a Gaussian window of 1.5 px, the border mirrored, for colours in 0 to 1."""
     if min(color.shape[1:]) < SSIM_WINDOW:
         return None
     ssim = optional_import("torchmetrics.functional.image", "analysis").structural_similarity_index_measure
@@ -464,10 +464,14 @@ def _psnr_of(rmse: float) -> float:
 def _rmse_axis(ax) -> None:
     """The same scale as RMSE, at the right."""
     low, high = ax.get_ylim()
-    ticks = [(_psnr_of(m * 10.0**-e), f"{m}e-{e}") for e in range(1, 12) for m in (1, 3)]
+    for digits in ((1, 3), (1, 1.5, 2, 3, 5, 7)):  # the second where the first gives too few
+        ticks = [(_psnr_of(d * 10.0**-e), f"{d:g}e-{e}") for e in range(12) for d in digits]
+        ticks = [tick for tick in ticks if low <= tick[0] <= high]
+        if len(ticks) > 2:
+            break
     right = ax.twinx()
     right.set_ylim(low, high)
-    right.set_yticks(*zip(*(tick for tick in ticks if low <= tick[0] <= high)))
+    right.set_yticks([place for place, _ in ticks], [text for _, text in ticks])
     right.spines[["top", "left"]].set_visible(False)
     right.set_ylabel("RMSE")
 
