@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import torch
 
@@ -50,9 +51,21 @@ def supersampled(
     return total / shifts**2
 
 
+class Refined(NamedTuple):
+    """Pictures at the last density, at half of it, and the RMSE between every density and its half, by key."""
+
+    pictures: dict[Any, torch.Tensor]
+    half: dict[Any, torch.Tensor]
+    residuals: dict[int, dict[Any, float]]
+
+    @property
+    def density(self) -> int:
+        return max(self.residuals)
+
+
 def refine(
     sample: Callable[[int], dict], smallest_error: Callable[[dict], dict], start: int = 4, limit: int | None = None
-) -> tuple[dict, dict[int, dict]]:
+) -> Refined:
     """Doubles a density until the pictures settle: what doubling changes is RMSE_SHARE of the smallest error.
 
     A midpoint grid's error falls with the density, so that the change bounds the error that is left.
@@ -63,9 +76,7 @@ def refine(
         start: The coarsest density.
         limit: Density beyond which pictures are left as they are; None is MAX_DENSITY.
 
-    Returns:
-        (pictures, residuals): at the last density; and, by density, the RMSE against half that density,
-        by key. The caller says which errors the last residual does not resolve.
+    The caller says which errors the last residual does not resolve.
     """
     limit = MAX_DENSITY if limit is None else limit
     density, coarse, residuals = start, sample(start), {}
@@ -78,7 +89,7 @@ def refine(
             smallest = smallest_error(truth)
             settled = all(residuals[density][key] <= RMSE_SHARE * smallest[key] for key in truth)
             if settled or 2 * density > limit:
-                return truth, residuals
+                return Refined(truth, coarse, residuals)
             coarse = truth
 
 

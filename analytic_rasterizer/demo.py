@@ -303,12 +303,11 @@ def _errors(color: torch.Tensor, truth: torch.Tensor) -> tuple[float, float, flo
 
 def _converged_reference(scene: Scene, view: View, renders: dict):
     """({reduction: reference}, density, {reduction: RMSE against half the density})."""
-    truth, residuals = refine(
+    refined = refine(
         lambda density: _reduced(supersampled(scene, view, density, background=PAPER)),
         lambda truth: {r: min(_errors(renders[name, r][0], truth[r])[1] for name in COLUMNS) for r in REDUCTIONS},
     )
-    density = max(residuals)
-    return truth, density, residuals[density]
+    return refined.pictures, refined.density, refined.residuals[refined.density]
 
 
 def _reduced(color: torch.Tensor) -> dict[int, torch.Tensor]:

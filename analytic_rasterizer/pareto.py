@@ -17,7 +17,7 @@ from pathlib import Path
 import torch
 
 from . import measure, report
-from .accuracy import RMSE_SHARE, UNFILTERED, image_errors, refine, supersampled
+from .accuracy import RMSE_SHARE, UNFILTERED, Refined, image_errors, refine, supersampled
 from .footprints import BOX_SAMPLES, FOOTPRINTS, resolve_footprint
 from .io import Scene, View, optional_import
 
@@ -26,7 +26,7 @@ BASE = "box:samples=1"  # times on the CPU are ratios to this
 SECOND_ESTIMATE = "box:samples=16"  # another way to the reference's limit
 SUPERSAMPLING = (2, 3, 4)
 ROUNDS = {"cpu": 3, "cuda": 20}
-WARM_UP = 15  # passes over the views before timing on CUDA
+WARM_UP = 20  # passes over the views before timing on CUDA: 40 frames, the first 32 of a size wait for the device
 SSIM_WINDOW = 11  # px; smaller pictures have no SSIM
 PASSES = {"forward": "forward", "forward_backward": "forward + backward"}
 
@@ -45,8 +45,8 @@ class Method:
     @property
     def has_single_weight(self) -> bool:
         """Whether a pixel sees each splat through one number, so that `exact` is its ideal."""
-        name, options = (spec := resolve_footprint(self.footprint)).name, dict(spec.options)
-        many = name == "adaptive" or (name == "box" and options["samples"] > 1)
+        spec = resolve_footprint(self.footprint)
+        many = spec.name == "adaptive" or (spec.name == "box" and dict(spec.options)["samples"] > 1)
         return self.supersampling == 1 and not many
 
 
@@ -172,7 +172,7 @@ def _measure_scale(scene, views, methods, background, rounds, max_density, base)
         if exact is None:
             exact = {v.name: measure.Case(scene, v, EXACT, 1, background).forward().cpu() for v in views}
 
-    truth, residuals = refine(
+    refined = refine(
         lambda density: {v.name: supersampled(scene, v, density, background=background) for v in views},
         lambda truth: {
             v.name: min(image_errors(of_name[v.name], truth[v.name])["rmse"] for of_name in pictures.values())
@@ -180,7 +180,8 @@ def _measure_scale(scene, views, methods, background, rounds, max_density, base)
         },
         limit=max_density,
     )
-    reference = _describe_reference(scene, views, background, truth, residuals)
+    truth = refined.pictures
+    reference = _describe_reference(scene, views, background, refined)
     times = _times(cases, rounds, base)
     rows = []
     for method in methods:
@@ -196,7 +197,7 @@ def _measure_scale(scene, views, methods, background, rounds, max_density, base)
             **_split(method, of_name, exact, truth),
             "per_view": {v.name: image_errors(of_name[v.name], truth[v.name]) for v in views},
         }
-        row["resolved"] = reference["residual_rmse"] <= RMSE_SHARE * row["rmse"]
+        row["resolved"] = reference["residual"]["rmse"] <= RMSE_SHARE * row["rmse"]
         rows.append(row)
     for passes in PASSES:
         front = pareto_front([(row[f"{passes}_ratio"], row["rmse"]) for row in rows])
@@ -205,18 +206,18 @@ def _measure_scale(scene, views, methods, background, rounds, max_density, base)
     return {"reference": reference, "methods": rows}
 
 
-def _describe_reference(scene, views, background, truth: dict, residuals: dict[int, dict]) -> dict:
-    """How the reference was made, and three estimates of its own error (RMSE over all views).
+def _describe_reference(scene, views, background, refined: Refined) -> dict:
+    """How the reference was made, and three estimates of its own error, over all views.
 
-    residual_rmse: change from half the density, which bounds the error where halving it more than halves
-    the error. expected_rmse: the error that follows from the order seen over the last two doublings
+    residual: change from half the density, which bounds the error where halving more than halves the
+    error. expected_rmse: the error that follows from the order seen over the last two doublings
     (Richardson), if it is positive. second_estimate: distance from another sampler with the same limit.
     """
-    density = max(residuals)
+    density, truth = refined.density, refined.pictures
     sizes = {v.name: v.width * v.height for v in views}
-    pooled = {n: _pool(by_view, sizes) for n, by_view in residuals.items()}
-    residual, before = pooled[density], pooled.get(density // 2)
-    order = math.log2(before / residual) if before and residual else None
+    pooled = {n: _pool(by_view, sizes) for n, by_view in refined.residuals.items()}
+    before, last = pooled.get(density // 2), pooled[density]
+    order = math.log2(before / last) if before and last else None
     # A sample of the second estimate is a square of 1/16 of its pixel: a quarter of the density suffices.
     second = max(1, density // 4)
     other = {v.name: supersampled(scene, v, second, SECOND_ESTIMATE, background) for v in views}
@@ -224,16 +225,16 @@ def _describe_reference(scene, views, background, truth: dict, residuals: dict[i
         "footprint": UNFILTERED,
         "density": density,
         "samples_per_pixel": density**2,
-        "residual_rmse": residual,
-        "residuals": {str(n): value for n, value in pooled.items()},
+        "residual": image_errors(_flat(refined.half), _flat(truth)),
+        "residual_rmse": {str(n): value for n, value in pooled.items()},
         "order": order,
-        "expected_rmse": residual / (2**order - 1) if order is not None and order > 0 else None,
+        "expected_rmse": last / (2**order - 1) if order is not None and order > 0 else None,
         "second_estimate": {
             "footprint": SECOND_ESTIMATE,
             "density": second,
             "rmse": image_errors(_flat(other), _flat(truth))["rmse"],
         },
-        "resolves_rmse_from": residual / RMSE_SHARE,
+        "resolves_rmse_from": last / RMSE_SHARE,
     }
 
 
@@ -370,12 +371,13 @@ def describe(results: dict, at_scale: dict) -> list[str]:
     if results["device"] != "cuda":
         seconds = " / ".join(f"{1e3 * row[f'{passes}_seconds']:.1f}" for passes in PASSES)
         lines.append(f"times are ratios to {base}, {seconds} ms; medians of {results['rounds']} rounds in turn")
-    second = reference["second_estimate"]
+    residual, second = reference["residual"], reference["second_estimate"]
+    order = "" if reference["order"] is None else f" (order {reference['order']:.1f})"
     lines.append(
-        f"reference: {reference['density']}x{reference['density']} unfiltered samples per pixel; changes by RMSE "
-        f"{reference['residual_rmse']:.1e} from half that density"
-        + ("" if reference["order"] is None else f" (order {reference['order']:.1f})")
-        + f", differs by {second['rmse']:.1e} from {second['footprint']} at {second['density']}x{second['density']}"
+        "reference: {0}x{0} unfiltered samples per pixel; from half that density it changes by RMSE {rmse:.1e}{order}, "
+        "bias {bias:.0e}, at most {max:.1e}; from {1} at {2}x{2} it differs by RMSE {3:.1e}".format(
+            reference["density"], second["footprint"], second["density"], second["rmse"], order=order, **residual
+        )
     )
     unresolved = [row["method"] for row in at_scale["methods"] if not row["resolved"]]
     if unresolved:

@@ -97,19 +97,21 @@ def halving(error_at_one=1.0):
 
 def test_refinement_stops_when_the_change_is_a_tenth_of_the_smallest_error():
     sample, asked = halving()
-    truth, residuals = accuracy.refine(sample, lambda truth: {"a": 0.7}, start=2, limit=1024)
+    refined = accuracy.refine(sample, lambda truth: {"a": 0.7}, start=2, limit=1024)
     # From n/2 to n the picture changes by 1/n: 1/8 is too much, 1/16 is not.
     assert asked == [2, 4, 8, 16]
-    assert residuals[16] == {"a": pytest.approx(1 / 16)}
-    assert list(residuals) == [4, 8, 16]
-    assert truth["a"][0, 0, 0].item() == 1 / 16
+    assert refined.residuals[16] == {"a": pytest.approx(1 / 16)}
+    assert list(refined.residuals) == [4, 8, 16]
+    assert refined.density == 16
+    assert refined.pictures["a"][0, 0, 0].item() == 1 / 16
+    assert refined.half["a"][0, 0, 0].item() == 1 / 8
 
 
 def test_refinement_that_does_not_settle_stops_at_its_limit():
     sample, asked = halving()
-    _, residuals = accuracy.refine(sample, lambda truth: {"a": 1e-9}, start=2, limit=9)
+    refined = accuracy.refine(sample, lambda truth: {"a": 1e-9}, start=2, limit=9)
     assert asked == [2, 4, 8]
-    assert max(residuals) == 8
+    assert refined.density == 8
 
 
 def test_errors_of_a_picture():

@@ -207,10 +207,11 @@ def test_reference_is_converged(measured):
     for at_scale in results["scales"]:
         reference = at_scale["reference"]
         smallest = min(row["rmse"] for row in at_scale["methods"])
-        assert reference["residual_rmse"] <= 0.1 * smallest
+        assert reference["residual"]["rmse"] <= 0.1 * smallest
         assert reference["second_estimate"]["rmse"] <= 0.1 * smallest
         assert all(row["resolved"] for row in at_scale["methods"])
-        residuals = list(reference["residuals"].values())
+        residuals = list(reference["residual_rmse"].values())
+        assert reference["residual"]["rmse"] == pytest.approx(residuals[-1])
         assert reference["order"] == pytest.approx(math.log2(residuals[-2] / residuals[-1]))
         assert reference["expected_rmse"] == pytest.approx(residuals[-1] / (2 ** reference["order"] - 1))
         assert not any("~" in line for line in pareto.describe(results, at_scale))
