@@ -175,9 +175,9 @@ def add_pareto(subcommands) -> None:
         help="measure accuracy against time of every footprint on a trained scene",
         description="Render SCENE with every footprint and with supersampling at several scales, compare with the "
         "converged integral of the image over every pixel, time them, and write DIR/pareto_SCALE.png and .svg, "
-        "pareto.md and pareto.json. On the CPU times are ratios within interleaved rounds. Errors are of colours in "
-        "0 to 1, not clamped; ~ marks a PSNR that the reference does not resolve; front: F and B mark methods that no "
-        "other beats forward and with backward.",
+        "pareto.md and pareto.json. On the CPU times are ratios, of the fastest of interleaved rounds. Errors are of "
+        "colours in 0 to 1, not clamped. ~ marks a PSNR that the reference does not resolve; F and B under front mark "
+        "methods that no other beats, forward and with backward.",
     )
     parser.add_argument("scene", metavar="SCENE", help="3DGS .ply, compressed .ply or .spz")
     parser.add_argument("--views", required=True, help="file of views, as for render")
@@ -206,7 +206,7 @@ def add_pareto(subcommands) -> None:
         metavar=("W", "H"),
         help="only the middle W x H pixels of the picture, at every scale (default: all of it)",
     )
-    parser.add_argument("--rounds", type=_count, metavar="N", help="timed rounds (default: 3, with CUDA 20)")
+    parser.add_argument("--rounds", type=_count, metavar="N", help="timed rounds (default: 5, with CUDA 20)")
     parser.add_argument(
         "--max-density",
         type=_count,

@@ -25,7 +25,7 @@ EXACT = "exact"  # the footprint without a weight error: what remains is blendin
 BASE = "box:samples=1"  # times on the CPU are ratios to this
 SECOND_ESTIMATE = "box:samples=16"  # another way to the reference's limit
 SUPERSAMPLING = (2, 3, 4)
-ROUNDS = {"cpu": 3, "cuda": 20}
+ROUNDS = {"cpu": 5, "cuda": 20}
 WARM_UP = 20  # passes over the views before timing on CUDA: 40 frames, the first 32 of a size wait for the device
 SSIM_WINDOW = 11  # px; smaller pictures have no SSIM
 PASSES = {"forward": "forward", "forward_backward": "forward + backward"}
@@ -252,21 +252,21 @@ def _split(method: Method, pictures: dict, exact: dict | None, truth: dict) -> d
 
 
 def _times(cases: dict[str, list[measure.Case]], rounds: int, base: str) -> dict[str, dict]:
-    """Seconds per view of both passes, their ratio to the base, and the range of that over the rounds.
+    """Seconds per view of both passes, and their ratio to the base.
 
-    On the CPU methods take turns, and the ratio is the median of the ratios within a round, which a
-    machine that slows down disturbs least. On CUDA a method's frames are timed by themselves, because
-    the room for its pairs follows the frames before.
+    On the CPU methods take turns, and the fastest of a view's rounds counts: what else the machine does
+    only ever adds. `_usual` is the median instead, which tells how much. On CUDA a method's
+    frames are timed by themselves, because the room for its pairs follows the frames before, and the
+    median counts.
     """
     device = next(iter(cases.values()))[0].dL_dcolor.device
     total = len(cases) if device.type == "cuda" else (rounds + 1) * sum(len(of_name) for of_name in cases.values())
     with optional_import("tqdm").tqdm(total=total, desc="time", unit="call", disable=None) as bar:
         if device.type == "cuda":
-            by_round = {}
+            samples = {}
             for name, of_name in cases.items():
                 measure.warm_up_cuda(of_name, WARM_UP)
-                medians = [_cuda_medians(case, rounds) for case in of_name]
-                by_round[name] = {passes: [_mean([m[passes] for m in medians])] for passes in PASSES}
+                samples[name] = [[_cuda_medians(case, rounds)] for case in of_name]
                 bar.update()
         else:
 
@@ -275,18 +275,15 @@ def _times(cases: dict[str, list[measure.Case]], rounds: int, base: str) -> dict
                 return {passes: _wall_seconds(getattr(case, passes)) for passes in PASSES}
 
             samples = measure.in_turn(cases, clock, range(rounds + 1))
-            by_round = {
-                name: {passes: [_mean([s[passes] for s in views]) for views in zip(*of_name)] for passes in PASSES}
-                for name, of_name in samples.items()
-            }
-    times = {}
-    for name, of_name in by_round.items():
-        times[name] = {}
-        for passes, seconds in of_name.items():
-            ratios = [s / b for s, b in zip(seconds, by_round[base][passes])]
-            times[name][f"{passes}_seconds"] = statistics.median(seconds)
-            times[name][f"{passes}_ratio"] = statistics.median(ratios)
-            times[name][f"{passes}_ratio_range"] = [min(ratios), max(ratios)]
+    times = {name: {} for name in samples}
+    for passes in PASSES:
+        for kind, choose in (("", min), ("_usual", statistics.median)):
+            for name, of_name in samples.items():
+                seconds = _mean([choose(sample[passes] for sample in taken) for taken in of_name])
+                times[name][f"{passes}{kind}_seconds"] = seconds
+        for of_name in times.values():
+            for kind in ("", "_usual"):
+                of_name[f"{passes}{kind}_ratio"] = of_name[f"{passes}{kind}_seconds"] / times[base][f"{passes}_seconds"]
     return times
 
 
@@ -370,7 +367,7 @@ def describe(results: dict, at_scale: dict) -> list[str]:
     row = next(row for row in at_scale["methods"] if row["method"] == base)
     if results["device"] != "cuda":
         seconds = " / ".join(f"{1e3 * row[f'{passes}_seconds']:.1f}" for passes in PASSES)
-        lines.append(f"times are ratios to {base}, {seconds} ms; medians of {results['rounds']} rounds in turn")
+        lines.append(f"times are ratios to {base}, {seconds} ms; the fastest of {results['rounds']} rounds in turn")
     residual, second = reference["residual"], reference["second_estimate"]
     order = "" if reference["order"] is None else f" (order {reference['order']:.1f})"
     lines.append(
@@ -422,7 +419,7 @@ def _plot(results: dict, at_scale: dict):
             for row in members:
                 x, y = points[row["method"]]
                 if key == "ratio":
-                    ax.plot(row[f"{time_key}_range"], [y, y], color=look["color"], linewidth=1.2, alpha=0.5, zorder=2)
+                    ax.plot([x, row[f"{passes}_usual_ratio"]], [y, y], color=look["color"], linewidth=1, alpha=0.5)
                 faded = {} if row["resolved"] else {"markerfacecolor": "white"}
                 (dot,) = ax.plot(x, y, **{**look, "linestyle": ""}, markersize=8, zorder=3, **faded)
                 ax.annotate(_short_label(row), (x, y), (0, 7), textcoords="offset points", fontsize=8, ha="center")
@@ -434,7 +431,7 @@ def _plot(results: dict, at_scale: dict):
         _plot_limits(ax, at_scale)
     axes[0, 0].set_ylabel("PSNR against the pixel integral [dB]")
     _rmse_axis(axes[0, 1])
-    bars = "" if key == "seconds" else f"; bars span {results['rounds']} rounds"
+    bars = "" if key == "seconds" else f"; bars: from the fastest to the median of {results['rounds']} rounds"
     figure.suptitle(f"{results['scene']} at {_what(at_scale)} px: accuracy against time{bars}", fontsize=11)
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right center", frameon=False, fontsize=9)

@@ -46,6 +46,12 @@ def test_footprints_of_the_analysis_are_the_suites_formulas(name):
         offset, cov2d = errors._splats(errors._unit_samples(128), sigma, blur=1 / 12)
         expected = STAND_INS[name](offset, cov2d)
         assert (ar.footprint_weight(offset, cov2d, name) - expected).abs().max() < 1e-9
+        gradients = []
+        for function in (STAND_INS[name], lambda d, c: ar.footprint_weight(d, c, name)):
+            inputs = offset.clone().requires_grad_(), cov2d.clone().requires_grad_()
+            gradients.append(torch.autograd.grad(function(*inputs).sum(), inputs))
+        for wanted, found in zip(*gradients):
+            assert (found - wanted).abs().max() < 1e-6 * wanted.abs().max()
 
 
 # ------------------------------------------------------------------------------- (a) one axis
