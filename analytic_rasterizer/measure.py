@@ -84,7 +84,7 @@ def in_turn(
 ) -> dict[str, list[list[dict]]]:
     """What `measure` says of every case, round after round, by name, view and round.
 
-    A machine that slows down slows all of them. Round 0 warms up and is left out.
+    A machine that slows down slows all of them. Round 0, if it is among them, warms up and is left out.
     """
     samples = {name: [[] for _ in of_name] for name, of_name in cases.items()}
     for round_ in rounds:

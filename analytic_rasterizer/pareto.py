@@ -26,6 +26,7 @@ BASE = "box:samples=1"  # times on the CPU are ratios to this
 SECOND_ESTIMATE = "box:samples=16"  # another way to the reference's limit
 SUPERSAMPLING = (2, 3, 4)
 ROUNDS = {"cpu": 5, "cuda": 20}
+SLOW = 20  # times as long as the base, and the CPU times a method only once
 WARM_UP = 20  # passes over the views before timing on CUDA: 40 frames, the first 32 of a size wait for the device
 SSIM_WINDOW = 11  # px; smaller pictures have no SSIM
 PASSES = {"forward": "forward", "forward_backward": "forward + backward"}
@@ -255,26 +256,34 @@ def _times(cases: dict[str, list[measure.Case]], rounds: int, base: str) -> dict
     """Seconds per view of both passes, and their ratio to the base.
 
     On the CPU methods take turns, and the fastest of a view's rounds counts: what else the machine does
-    only ever adds. `_usual` is the median instead, which tells how much. On CUDA a method's
+    only ever adds. A method that is SLOW in the round that warms up is not timed again. On CUDA a method's
     frames are timed by themselves, because the room for its pairs follows the frames before, and the
-    median counts.
+    median counts. `_usual` is the median round, which tells how much is added.
     """
     device = next(iter(cases.values()))[0].dL_dcolor.device
-    total = len(cases) if device.type == "cuda" else (rounds + 1) * sum(len(of_name) for of_name in cases.values())
-    with optional_import("tqdm").tqdm(total=total, desc="time", unit="call", disable=None) as bar:
-        if device.type == "cuda":
-            samples = {}
-            for name, of_name in cases.items():
+    with optional_import("tqdm").tqdm(desc="time", unit="case", disable=None) as bar:
+
+        def clock(case):
+            bar.update()
+            if device.type == "cuda":
+                seconds = (measure.median_seconds(measure.event_seconds, call, rounds) for call in _calls(case))
+            else:
+                seconds = (_wall_seconds(call) for call in _calls(case))
+            return dict(zip(PASSES, seconds))
+
+        samples = {}
+        for name, of_name in cases.items():
+            if device.type == "cuda":
                 measure.warm_up_cuda(of_name, WARM_UP)
-                samples[name] = [[_cuda_medians(case, rounds)] for case in of_name]
-                bar.update()
-        else:
-
-            def clock(case):
-                bar.update()
-                return {passes: _wall_seconds(getattr(case, passes)) for passes in PASSES}
-
-            samples = measure.in_turn(cases, clock, range(rounds + 1))
+            samples[name] = [[clock(case)] for case in of_name]
+        if device.type != "cuda":  # that was the round that warms up
+            slowest = SLOW * sum(taken[0]["forward_backward"] for taken in samples[base])
+            quick = {
+                name: of_name
+                for name, of_name in cases.items()
+                if sum(taken[0]["forward_backward"] for taken in samples[name]) <= slowest
+            }
+            samples |= measure.in_turn(quick, clock, range(1, rounds + 1))
     times = {name: {} for name in samples}
     for passes in PASSES:
         for kind, choose in (("", min), ("_usual", statistics.median)):
@@ -287,8 +296,8 @@ def _times(cases: dict[str, list[measure.Case]], rounds: int, base: str) -> dict
     return times
 
 
-def _cuda_medians(case: measure.Case, rounds: int) -> dict:
-    return {passes: measure.median_seconds(measure.event_seconds, getattr(case, passes), rounds) for passes in PASSES}
+def _calls(case: measure.Case) -> list:
+    return [getattr(case, passes) for passes in PASSES]
 
 
 def _wall_seconds(call) -> float:

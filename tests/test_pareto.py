@@ -269,6 +269,21 @@ def test_times_are_those_of_the_fastest_round_in_turn(monkeypatch):
     assert times["analytic"]["forward_usual_ratio"] == 9
 
 
+def test_slow_methods_are_timed_once(monkeypatch):
+    scene, views = target()
+    cases = {name: [measure.Case(scene, views[0], name)] for name in ("mip", "analytic")}
+    calls = []
+
+    def clock(call):
+        calls.append(name := call.__self__.settings.footprint.name)
+        return {"mip": 1.0, "analytic": pareto.SLOW + 1.0}[name]
+
+    monkeypatch.setattr(pareto, "_wall_seconds", clock)
+    times = pareto._times(cases, 3, "mip")
+    assert (calls.count("mip"), calls.count("analytic")) == (4 * 2, 2)
+    assert times["analytic"]["forward_ratio"] == times["analytic"]["forward_usual_ratio"] == pareto.SLOW + 1
+
+
 def test_files_of_a_run(measured):
     out, results = measured
     assert json.loads((out / "pareto.json").read_text()) == results
