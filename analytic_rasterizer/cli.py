@@ -209,7 +209,7 @@ def add_pareto(subcommands) -> None:
     parser.add_argument("--rounds", type=_count, metavar="N", help="timed rounds (default: 5, with CUDA 20)")
     parser.add_argument(
         "--max-density",
-        type=_count,
+        type=_density,
         metavar="N",
         help=f"samples of the reference along a pixel's side, at most (default: {accuracy.MAX_DENSITY})",
     )
@@ -341,6 +341,7 @@ def _number(kind, accepts, expected: str):
 
 _positive = _number(float, lambda v: math.isfinite(v) and v > 0, "a positive number")
 _intensity = _number(float, lambda v: 0 <= v <= 1, "a number from 0 to 1")
+_density = _number(int, lambda v: v >= 8, "a whole number from 8")
 _count = _number(int, lambda v: v >= 1, "a positive whole number")
 
 

@@ -378,6 +378,7 @@ def test_command_prints_a_table_for_every_scale(files, capsys):
         (["--scales", "0"], "argument --scales: must be a positive whole number, got 0"),
         (["--scales", "1.5"], "argument --scales: must be a positive whole number, got 1.5"),
         (["--crop", "20"], "argument --crop: expected 2 arguments"),
+        (["--max-density", "4"], "argument --max-density: must be a whole number from 8, got 4"),
         (["--limit-views", "0"], "must be a positive whole number, got 0"),
     ],
 )
