@@ -330,7 +330,7 @@ def _by_threshold(rows: list[dict]) -> str:
             above = [row["sigma"] for row in of_name if row["weight_max"] > threshold]
             later = [row["sigma"] for row in of_name if not above or row["sigma"] > max(above)]
             whole = len(later) == len(of_name)
-            table[-1].append("never" if not later else f"{'<= ' * whole}{later[0]:.2g}")
+            table[-1].append(f"{'<= ' * whole}{later[0]:.2g}" if later else f"> {SIGMAS[1]:.2g}")
     return report.markdown_table(["footprint", *(f"{t:.0e}" for t in THRESHOLDS)], table)
 
 
