@@ -208,6 +208,11 @@ def add_pareto(subcommands) -> None:
     )
     parser.add_argument("--rounds", type=_count, metavar="N", help="timed rounds (default: 5, with CUDA 20)")
     parser.add_argument(
+        "--cpu-time",
+        action="store_true",
+        help="count CPU seconds instead of the wall clock's: on a shared machine, with --threads 1",
+    )
+    parser.add_argument(
         "--max-density",
         type=_density,
         metavar="N",
@@ -235,6 +240,7 @@ def run_pareto(args) -> None:
         background=tuple(args.background),
         rounds=args.rounds,
         max_density=args.max_density,
+        cpu_time=args.cpu_time,
         name=Path(args.scene).stem,
     )
     print(f"{results['gaussians']} Gaussians of SH degree {results['sh_degree']}, {results['machine']}")

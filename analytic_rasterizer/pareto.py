@@ -95,6 +95,7 @@ def run(
     background=(0.0, 0.0, 0.0),
     rounds: int | None = None,
     max_density: int | None = None,
+    cpu_time: bool = False,
     name: str = "scene",
 ) -> dict:
     """Measures every method at every scale and writes `out`/pareto.json, pareto.md and pareto_SCALE.png, .svg.
@@ -109,6 +110,8 @@ def run(
         background: RGB.
         rounds: Timed rounds after one that warms up; None is ROUNDS of the device.
         max_density: Of the reference, see `refine`.
+        cpu_time: On the CPU count the seconds that the process computed, of all threads together, not those
+            that went by: on a machine that others use too, and with one thread.
         name: Of the scene, for the titles.
 
     Returns:
@@ -138,12 +141,13 @@ def run(
         "device": device,
         "machine": measure.describe_machine(device),
         "rounds": rounds,
+        "clock": "CUDA events" if device == "cuda" else "CPU time" if cpu_time else "wall",
         "base": BASE if BASE in names else names[0],
         "scales": [],
     }
     for scale in scales:
         small = [framed(view, scale, crop) for view in views]
-        measured = _measure_scale(scene, small, methods, background, rounds, max_density, results["base"])
+        measured = _measure_scale(scene, small, methods, background, rounds, max_density, cpu_time, results["base"])
         results["scales"].append({"scale": scale, "sizes": [[v.width, v.height] for v in small], **measured})
         report.save_figure(_plot(results, results["scales"][-1]), out, f"pareto_{scale}")
         # After every scale, so that a long run that is stopped leaves what it has.
@@ -155,7 +159,7 @@ def run(
 # ---------------------------------------------------------------------------------- measuring
 
 
-def _measure_scale(scene, views, methods, background, rounds, max_density, base) -> dict:
+def _measure_scale(scene, views, methods, background, rounds, max_density, cpu_time, base) -> dict:
     """Reference and methods at one scale."""
     tqdm = optional_import("tqdm").tqdm
     cases = {
@@ -183,7 +187,7 @@ def _measure_scale(scene, views, methods, background, rounds, max_density, base)
     )
     truth = refined.pictures
     reference = _describe_reference(scene, views, background, refined)
-    times = _times(cases, rounds, base)
+    times = _times(cases, rounds, base, time.process_time if cpu_time else time.perf_counter)
     rows = []
     for method in methods:
         of_name = pictures[method.name]
@@ -252,7 +256,7 @@ def _split(method: Method, pictures: dict, exact: dict | None, truth: dict) -> d
     return {"weight_rmse": weight_rmse, "blending_rmse": blending_rmse, "correlation": correlation}
 
 
-def _times(cases: dict[str, list[measure.Case]], rounds: int, base: str) -> dict[str, dict]:
+def _times(cases: dict[str, list[measure.Case]], rounds: int, base: str, timer=time.perf_counter) -> dict[str, dict]:
     """Seconds per view of both passes, and their ratio to the base.
 
     On the CPU methods take turns, and the fastest of a view's rounds counts: what else the machine does
@@ -268,7 +272,7 @@ def _times(cases: dict[str, list[measure.Case]], rounds: int, base: str) -> dict
             if device.type == "cuda":
                 seconds = (measure.median_seconds(measure.event_seconds, call, rounds) for call in _calls(case))
             else:
-                seconds = (_wall_seconds(call) for call in _calls(case))
+                seconds = (_seconds(call, timer) for call in _calls(case))
             return dict(zip(PASSES, seconds))
 
         samples = {}
@@ -300,10 +304,10 @@ def _calls(case: measure.Case) -> list:
     return [getattr(case, passes) for passes in PASSES]
 
 
-def _wall_seconds(call) -> float:
-    start = time.perf_counter()
+def _seconds(call, timer) -> float:
+    start = timer()
     call()
-    return time.perf_counter() - start
+    return timer() - start
 
 
 def pareto_front(points: list[tuple[float, float]]) -> list[bool]:
@@ -376,7 +380,10 @@ def describe(results: dict, at_scale: dict) -> list[str]:
     row = next(row for row in at_scale["methods"] if row["method"] == base)
     if results["device"] != "cuda":
         seconds = " / ".join(f"{1e3 * row[f'{passes}_seconds']:.1f}" for passes in PASSES)
-        lines.append(f"times are ratios to {base}, {seconds} ms; the fastest of {results['rounds']} rounds in turn")
+        clock = " of CPU time" if results["clock"] == "CPU time" else ""
+        lines.append(
+            f"times are ratios to {base}, {seconds} ms{clock}; the fastest of {results['rounds']} rounds in turn"
+        )
     residual, second = reference["residual"], reference["second_estimate"]
     order = "" if reference["order"] is None else f" (order {reference['order']:.1f})"
     lines.append(

@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+import time
 
 import numpy as np
 import pytest
@@ -249,7 +250,7 @@ def test_times_are_those_of_the_fastest_round_in_turn(monkeypatch):
     cases = {name: [measure.Case(scene, view, name) for view in views] for name in ("mip", "analytic")}
     calls = []
 
-    def clock(call):
+    def clock(call, timer):
         case = call.__self__
         name, second_view = case.settings.footprint.name, case.settings.image_width != SIZE[0]
         calls.append((name, second_view, call.__name__))
@@ -258,7 +259,7 @@ def test_times_are_those_of_the_fastest_round_in_turn(monkeypatch):
         seconds = slower * {"mip": 1.0, "analytic": 3.0}[name] * (3.0 if second_view else 1.0)
         return seconds * (5.0 if call.__name__ == "forward_backward" else 1.0)
 
-    monkeypatch.setattr(pareto, "_wall_seconds", clock)
+    monkeypatch.setattr(pareto, "_seconds", clock)
     times = pareto._times(cases, 4, "mip")
     assert len(calls) == 5 * 8
     assert [name for name, *_ in calls[:8]] == ["mip"] * 4 + ["analytic"] * 4
@@ -269,16 +270,22 @@ def test_times_are_those_of_the_fastest_round_in_turn(monkeypatch):
     assert times["analytic"]["forward_usual_ratio"] == 9
 
 
+def test_cpu_time_leaves_out_what_others_take():
+    start = time.perf_counter()
+    assert pareto._seconds(lambda: time.sleep(0.2), time.process_time) < 0.1
+    assert 0.2 <= pareto._seconds(lambda: time.sleep(0.2), time.perf_counter) <= time.perf_counter() - start
+
+
 def test_slow_methods_are_timed_once(monkeypatch):
     scene, views = target()
     cases = {name: [measure.Case(scene, views[0], name)] for name in ("mip", "analytic")}
     calls = []
 
-    def clock(call):
+    def clock(call, timer):
         calls.append(name := call.__self__.settings.footprint.name)
         return {"mip": 1.0, "analytic": pareto.SLOW + 1.0}[name]
 
-    monkeypatch.setattr(pareto, "_wall_seconds", clock)
+    monkeypatch.setattr(pareto, "_seconds", clock)
     times = pareto._times(cases, 3, "mip")
     assert (calls.count("mip"), calls.count("analytic")) == (4 * 2, 2)
     assert times["analytic"]["forward_ratio"] == times["analytic"]["forward_usual_ratio"] == pareto.SLOW + 1
@@ -355,7 +362,7 @@ def arguments(files, *extra):
 
 def test_command_prints_a_table_for_every_scale(files, capsys):
     extra = ["--scales", "2", "4", "--footprints", "box:samples=1", "mip@2", "--limit-views", "1"]
-    extra += ["--crop", "30", "20", "--rounds", "1", "--max-density", "8", "--background", "1", "1", "1"]
+    extra += ["--crop", "30", "20", "--rounds", "1", "--max-density", "8", "--background", "1", "1", "1", "--cpu-time"]
     assert cli.main(arguments(files, *extra)) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("10991 Gaussians of SH degree 0")
@@ -365,6 +372,8 @@ def test_command_prints_a_table_for_every_scale(files, capsys):
     results = json.loads((files / "out" / "pareto.json").read_text())
     assert (results["views"], results["crop"], results["rounds"]) == (["straight"], [30, 20], 1)
     assert results["background"] == [1, 1, 1]
+    assert results["clock"] == "CPU time"
+    assert any("ms of CPU time; the fastest of 1 rounds" in line for line in lines)
     assert results["scene"] == "scene"
 
 
