@@ -428,8 +428,8 @@ def _plot(results: dict, at_scale: dict):
         time_key = f"{passes}_{key}"
         points = {row["method"]: (row[time_key] * factor, row["psnr"]) for row in rows}
         _plot_front(ax, sorted(points[row["method"]] for row in rows if row[f"{passes}_front"]))
-        for family, members in _families(rows).items():
-            look, label = _family_look(family)
+        for label, members in _families(rows).items():
+            look = _family_look(members)
             if len(members) > 1:
                 ax.plot(*zip(*(points[row["method"]] for row in members)), color=look["color"], linewidth=1, zorder=2)
             for row in members:
@@ -491,30 +491,27 @@ def _rmse_axis(ax) -> None:
     right.set_ylabel("RMSE")
 
 
-def _families(rows: list[dict]) -> dict[tuple, list[dict]]:
-    """Methods that differ only in how many samples they take, in order."""
+def _families(rows: list[dict]) -> dict[str, list[dict]]:
+    """Methods that differ only in how many samples they take, in order, by label."""
     families = {}
     for row in rows:
-        name = row["footprint"].partition(":")[0]
+        footprint = row["method"].partition("@")[0]
+        label = "box, S samples" if footprint.startswith("box") else footprint
         if row["supersampling"] > 1:
-            key = (row["footprint"], "supersampled")
-        elif name == "box":
-            key = ("box:samples=4", "box")
-        else:
-            key = (row["footprint"], row["method"])
-        families.setdefault(key, []).append(row)
+            label = f"{footprint}, supersampled"
+        families.setdefault(label, []).append(row)
     return families
 
 
-def _family_look(family: tuple) -> tuple[dict, str]:
-    footprint, kind = family
-    look = report.style(footprint)
-    if kind == "supersampled":
-        color = "#343a40" if resolve_footprint(footprint).variance == 0 else "#adb5bd"
-        plain = footprint == str(resolve_footprint("point"))
-        name = "point" if plain else footprint
-        return {**look, "color": color, "marker": "X"}, f"{name}, supersampled"
-    return look, "box, S samples" if kind == "box" else kind
+def _family_look(members: list[dict]) -> dict:
+    """Colour and marker of a family; supersampled ones have crosses, dark where they are not dilated."""
+    if members[0]["supersampling"] == 1:
+        many = members[0]["footprint"].startswith("box")
+        return report.style("box:samples=4" if many else members[0]["footprint"])
+    look = {**report.style(members[0]["footprint"]), "marker": "X"}
+    if members[0]["footprint"].startswith("point"):
+        look["color"] = "#adb5bd" if resolve_footprint(members[0]["footprint"]).variance else "#343a40"
+    return look
 
 
 def _short_label(row: dict) -> str:
