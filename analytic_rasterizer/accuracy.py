@@ -9,13 +9,14 @@ from typing import Any, NamedTuple
 
 import torch
 
+from .footprints import resolve_footprint
 from .io import Scene, View, optional_import
 from .rasterizer import render_stages
 
 UNFILTERED = "point:dilation=0"  # samples of the scene itself, without any filter
 RMSE_SHARE = 0.1  # a reference is refined until it moves by this share of the smallest error
 MAX_DENSITY = 64  # samples along a pixel's side beyond which a reference is left as it is
-MAX_PIXELS = 2**23  # of one render of a reference; more samples become more renders
+MAX_PIXELS = 2**23  # of one render of unfiltered samples; more become more renders
 
 
 def supersampled(
@@ -23,8 +24,9 @@ def supersampled(
 ) -> torch.Tensor:
     """Mean of density x density renders of every pixel of a view, equally spaced inside it.
 
-    The samples come from a picture `fine` times larger, or from `shifts` x `shifts` such pictures
-    whose principal point is moved by a part of a pixel: memory stays bounded.
+    The samples come from a picture `fine` times larger. Unfiltered samples come from `shifts` x `shifts`
+    such pictures whose principal point is moved by a part of a pixel, so that memory stays bounded; a
+    footprint with a filter is as wide as the pixels it is rendered in, and shifted ones would overlap.
 
     Args:
         scene: On any device.
@@ -36,8 +38,10 @@ def supersampled(
     Returns:
         (3, H, W) float64 on the CPU.
     """
-    fits = [n for n in range(1, density + 1) if density % n == 0 and n * n * view.width * view.height <= MAX_PIXELS]
-    fine = max(fits, default=1)
+    fine = density
+    if resolve_footprint(footprint) == resolve_footprint(UNFILTERED):
+        divisors = [n for n in range(1, density + 1) if density % n == 0]
+        fine = max((n for n in divisors if n * n * view.width * view.height <= MAX_PIXELS), default=1)
     shifts = density // fine
     cx = view.width / 2 if view.cx is None else view.cx
     cy = view.height / 2 if view.cy is None else view.cy

@@ -24,6 +24,7 @@ from .io import Scene, View, optional_import
 EXACT = "exact"  # the footprint without a weight error: what remains is blending's
 BASE = "box:samples=1"  # times on the CPU are ratios to this
 SECOND_ESTIMATE = "box:samples=16"  # another way to the reference's limit
+MAX_FILTERED_PIXELS = 2**25  # of its pictures, which come in one piece
 SUPERSAMPLING = (2, 3, 4)
 ROUNDS = {"cpu": 5, "cuda": 20}
 SLOW = 20  # times as long as the base, and the CPU times a method only once
@@ -225,6 +226,8 @@ def _describe_reference(scene, views, background, refined: Refined) -> dict:
     order = math.log2(before / last) if before and last else None
     # A sample of the second estimate is a square of 1/16 of its pixel: a quarter of the density suffices.
     second = max(1, density // 4)
+    while second > 1 and second**2 * max(sizes.values()) > MAX_FILTERED_PIXELS:
+        second //= 2
     other = {v.name: supersampled(scene, v, second, SECOND_ESTIMATE, background) for v in views}
     return {
         "footprint": UNFILTERED,

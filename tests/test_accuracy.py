@@ -76,6 +76,15 @@ def test_reference_from_shifted_renders_is_that_of_one_large_render(monkeypatch,
     assert (whole - parts).abs().mean() < 1e-5
 
 
+def test_filtered_samples_are_rendered_in_one_piece(monkeypatch):
+    """A footprint with a filter is as wide as a pixel of the picture it is in: shifted pictures would overlap."""
+    scene, view = one_gaussian(0.6, (11.3, 8.85), 0.9, (0.8, 0.5, 0.25))
+    whole = accuracy.supersampled(scene, view, 4, "box:samples=16")
+    monkeypatch.setattr(accuracy, "MAX_PIXELS", view.width * view.height)
+    assert torch.equal(accuracy.supersampled(scene, view, 4, "box:samples=16"), whole)
+    assert (accuracy.supersampled(scene, view, 16) - whole).abs().max() < 2 / 255
+
+
 def test_denser_samples_approach_the_integral():
     scene, view = one_gaussian(0.3, (11.3, 8.85), 0.9, (1.0, 1.0, 1.0))
     total = 2 * math.pi * 0.09 * (0.9 - 1 / 255)
