@@ -15,9 +15,10 @@ from pathlib import Path
 
 import torch
 
-from . import __version__, demo, io
+from . import __version__, accuracy, demo, errors, io, pareto
 from .footprints import FOOTPRINTS
 from .rasterizer import render_stages
+from .report import format_table
 
 STAGES = ("project", "bin", "blend")
 PROGRAM = "python -m analytic_rasterizer"
@@ -81,21 +82,7 @@ def add_render(subcommands) -> None:
     )
     parser.add_argument("--samples", type=int, help="samples of the box footprint: 1, 2, 4, 8, 16")
     parser.add_argument("--scale", type=_positive, default=1.0, help="resolution, as a factor (default: 1)")
-    parser.add_argument(
-        "--background",
-        nargs=3,
-        type=_intensity,
-        default=(0.0, 0.0, 0.0),
-        metavar=("R", "G", "B"),
-        help="colour behind the scene, 0 to 1 (default: black)",
-    )
-    parser.add_argument(
-        "--size",
-        nargs=2,
-        type=_count,
-        metavar=("W", "H"),
-        help="image size for a views file that does not state one",
-    )
+    _add_view_options(parser)
     _add_machine_options(parser)
     parser.set_defaults(run=render)
 
@@ -182,21 +169,144 @@ def run_demo(args) -> None:
     print(f"see {out / 'contact_sheet.png'}")
 
 
-COMMANDS = (add_render, add_demo)
+def add_pareto(subcommands) -> None:
+    parser = subcommands.add_parser(
+        "pareto",
+        help="measure accuracy against time of every footprint on a trained scene",
+        description="Render SCENE with every footprint and with supersampling at several scales, compare with the "
+        "converged integral of the image over every pixel, time them, and write DIR/pareto_SCALE.png and .svg, "
+        "pareto.md and pareto.json. On the CPU times are ratios, of the fastest of interleaved rounds. Errors are of "
+        "colours in 0 to 1, not clamped. ~ marks a PSNR that the reference does not resolve; F and B under front mark "
+        "methods that no other beats, forward and with backward.",
+    )
+    parser.add_argument("scene", metavar="SCENE", help="3DGS .ply, compressed .ply or .spz")
+    parser.add_argument("--views", required=True, help="file of views, as for render")
+    parser.add_argument("--out", default="pareto", metavar="DIR", help="folder for the results (default: %(default)s)")
+    parser.add_argument(
+        "--scales",
+        nargs="+",
+        type=_count,
+        default=[1, 2, 4, 8],
+        metavar="N",
+        help="1/N of the views' size; a remainder is cut off (default: 1 2 4 8)",
+    )
+    parser.add_argument(
+        "--footprints",
+        nargs="+",
+        metavar="NAME[:k=v,..][@N]",
+        help="methods; @N renders N x N times the pixels and averages (default: {})".format(
+            " ".join(method.name for method in pareto.default_methods())
+        ),
+    )
+    parser.add_argument("--limit-views", type=_count, metavar="N", help="only the first N views")
+    parser.add_argument(
+        "--crop",
+        nargs=2,
+        type=_count,
+        metavar=("W", "H"),
+        help="only the middle W x H pixels of the picture, at every scale (default: all of it)",
+    )
+    parser.add_argument("--rounds", type=_count, metavar="N", help="timed rounds (default: 5, with CUDA 20)")
+    parser.add_argument(
+        "--cpu-time",
+        action="store_true",
+        help="count CPU seconds instead of the wall clock's: on a shared machine, with --threads 1",
+    )
+    parser.add_argument(
+        "--max-density",
+        type=_density,
+        metavar="N",
+        help=f"samples of the reference along a pixel's side, at most (default: {accuracy.MAX_DENSITY})",
+    )
+    _add_view_options(parser)
+    _add_machine_options(parser)
+    parser.set_defaults(run=run_pareto)
+
+
+def run_pareto(args) -> None:
+    """Runs the measurement and prints a table for every scale."""
+    _use_machine(args)
+    methods = None if args.footprints is None else [pareto.parse_method(text) for text in args.footprints]
+    views = io.load_views(args.views, args.size)[: args.limit_views]
+    out = _writable_folder(args.out)
+    scene = io.load_scene(args.scene).to(args.device)
+    results = pareto.run(
+        out,
+        scene,
+        views,
+        args.scales,
+        methods,
+        crop=args.crop and tuple(args.crop),
+        background=tuple(args.background),
+        rounds=args.rounds,
+        max_density=args.max_density,
+        cpu_time=args.cpu_time,
+        name=Path(args.scene).stem,
+    )
+    print(f"{results['gaussians']} Gaussians of SH degree {results['sh_degree']}, {results['machine']}")
+    for at_scale in results["scales"]:
+        title, *notes = pareto.describe(results, at_scale)
+        print(f"\n{title}\n{format_table(*pareto.to_table(results, at_scale))}")
+        print("\n".join(notes))
+    print(f"\nsee {out / 'pareto.md'} and the plots beside it")
+
+
+def add_errors(subcommands) -> None:
+    parser = subcommands.add_parser(
+        "errors",
+        help="measure the error of every footprint's weight and gradients",
+        description="The paper's error analysis: the logistic window against erf, the turned pixel against Monte Carlo "
+        "and the exact integral, and both errors of every footprint from 0.02 to 20 px. Writes plots (.png, .svg), "
+        ".csv files and summary.md to DIR, and prints the summary.",
+    )
+    parser.add_argument("--out", required=True, metavar="DIR", help="folder for the results")
+    parser.add_argument(
+        "--samples",
+        type=_count,
+        default=errors.SAMPLES,
+        metavar="N",
+        help="splats of each standard deviation (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--monte-carlo",
+        type=_count,
+        default=errors.MONTE_CARLO,
+        metavar="N",
+        help="samples in a pixel (default: %(default)s, as in the paper)",
+    )
+    parser.add_argument("--threads", type=_count, metavar="N", help="CPU threads (default: all)")
+    parser.set_defaults(run=run_errors, device="cpu")
+
+
+def run_errors(args) -> None:
+    """Runs the analysis and prints its summary."""
+    _use_machine(args)
+    out = _writable_folder(args.out)
+    print(errors.run(out, args.samples, args.monte_carlo)["summary"])
+    print(f"see the plots and tables in {out}")
+
+
+COMMANDS = (add_render, add_demo, add_errors, add_pareto)
 
 
 # ------------------------------------------------------------------ shared by commands
 
 
-def format_table(header: list[str], rows: list[list]) -> str:
-    """Columns of text: the first left-aligned, the others right-aligned; floats to 4 digits."""
-    cells = [header] + [[f"{cell:.4g}" if isinstance(cell, float) else str(cell) for cell in row] for row in rows]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(header))]
-    return "\n".join(
-        "  ".join(
-            cell.rjust(width) if i else cell.ljust(width) for i, (cell, width) in enumerate(zip(row, widths))
-        ).rstrip()
-        for row in cells
+def _add_view_options(parser) -> None:
+    parser.add_argument(
+        "--background",
+        nargs=3,
+        type=_intensity,
+        default=(0.0, 0.0, 0.0),
+        metavar=("R", "G", "B"),
+        help="colour behind the scene, 0 to 1 (default: black)",
+    )
+    parser.add_argument(
+        "--size",
+        nargs=2,
+        type=_count,
+        metavar=("W", "H"),
+        help="image size for a views file that does not state one",
     )
 
 
@@ -237,6 +347,7 @@ def _number(kind, accepts, expected: str):
 
 _positive = _number(float, lambda v: math.isfinite(v) and v > 0, "a positive number")
 _intensity = _number(float, lambda v: 0 <= v <= 1, "a number from 0 to 1")
+_density = _number(int, lambda v: v >= 8, "a whole number from 8")
 _count = _number(int, lambda v: v >= 1, "a positive whole number")
 
 

@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import torch
 
+from .accuracy import UNFILTERED, image_errors, refine, supersampled
 from .io import Scene, View, optional_import, save_scene, save_views, to_image
 from .rasterizer import render_stages
 
@@ -218,9 +219,6 @@ def _needles(brush: Brush, random, left, top) -> None:
 
 # ---------------------------------------------------------------------------------- measuring
 
-RMSE_SHARE = 0.1  # the reference is refined until it moves by this share of the smallest error
-MAX_DENSITY = 64  # samples along a pixel's side beyond which the reference is left as it is
-MAX_PIXELS = 2**23  # of one render of the reference; more samples become more renders
 REPEATS = 7  # renders of which the fastest is reported
 
 
@@ -277,7 +275,7 @@ def run(out, size: tuple[int, int] = CANVAS, device="cpu") -> dict:
         "device": str(device),
         "threads": torch.get_num_threads(),
         "reference": {
-            "footprint": "point:dilation=0",
+            "footprint": UNFILTERED,
             "samples_per_pixel": {str(r): (density * r) ** 2 for r in REDUCTIONS},
             "residual_rmse": {str(r): value for r, value in residual.items()},
         },
@@ -299,54 +297,22 @@ def _render(scene: Scene, view: View, scale: float, footprint: str):
 
 def _errors(color: torch.Tensor, truth: torch.Tensor) -> tuple[float, float, float]:
     """(PSNR, RMSE, largest error)."""
-    error = color.double() - truth
-    mse = error.square().mean().item()
-    return -10 * math.log10(max(mse, 1e-30)), math.sqrt(mse), error.abs().max().item()
+    errors = image_errors(color, truth)
+    return errors["psnr"], errors["rmse"], errors["max"]
 
 
 def _converged_reference(scene: Scene, view: View, renders: dict):
-    """({reduction: reference}, density, {reduction: RMSE against half the density}).
-
-    The density doubles until that residual is small beside the errors of all renders.
-    """
-    density = 4
-    coarse = _reduced(_supersampled(scene, view, density))
-    with optional_import("tqdm").tqdm(desc="reference", unit=" densities", disable=None) as bar:
-        while True:
-            density *= 2
-            truth = _reduced(_supersampled(scene, view, density))
-            bar.update()
-            residual = {r: _errors(coarse[r], truth[r])[1] for r in REDUCTIONS}
-            smallest = {r: min(_errors(renders[name, r][0], truth[r])[1] for name in COLUMNS) for r in REDUCTIONS}
-            converged = all(residual[r] <= RMSE_SHARE * smallest[r] for r in REDUCTIONS)
-            if converged or density >= MAX_DENSITY:
-                return truth, density, residual
-            coarse = truth
+    """({reduction: reference}, density, {reduction: RMSE against half the density})."""
+    refined = refine(
+        lambda density: _reduced(supersampled(scene, view, density, background=PAPER)),
+        lambda truth: {r: min(_errors(renders[name, r][0], truth[r])[1] for name in COLUMNS) for r in REDUCTIONS},
+    )
+    return refined.pictures, refined.density, refined.residuals[refined.density]
 
 
 def _reduced(color: torch.Tensor) -> dict[int, torch.Tensor]:
     """The picture at every reduction: a pixel of 1/n is the mean of the n x n that it covers."""
     return {n: torch.nn.functional.avg_pool2d(color[None], n)[0] for n in REDUCTIONS}
-
-
-def _supersampled(scene: Scene, view: View, density: int) -> torch.Tensor:
-    """Mean (3, H, W) float64 of density x density point samples in every pixel.
-
-    The samples come from a picture `fine` times larger, or from `shifts` x `shifts` such pictures
-    whose principal point is moved by a part of a pixel: memory stays bounded.
-    """
-    fine = density
-    while fine > 1 and fine**2 * view.width * view.height > MAX_PIXELS:
-        fine //= 2
-    shifts = density // fine
-    total = torch.zeros(3, view.height, view.width, dtype=torch.float64)
-    for i in range(shifts**2):
-        column, row = ((n + 0.5) / shifts - 0.5 for n in (i % shifts, i // shifts))
-        shifted = replace(view, cx=view.width / 2 - column / fine, cy=view.height / 2 - row / fine)
-        settings = shifted.settings(fine, PAPER, 0, "point", dilation=0.0, device=scene.means.device)
-        color = render_stages(settings, **scene.arguments()).color
-        total += torch.nn.functional.avg_pool2d(color[None].double(), fine)[0].cpu()
-    return total / shifts**2
 
 
 # -------------------------------------------------------------------------------------- sheet

@@ -27,13 +27,13 @@ class SceneError(ValueError):
     """A scene or views file that cannot be used; the message names the file and what is wrong."""
 
 
-def optional_import(name: str):
+def optional_import(name: str, extra: str = "cli"):
     """The module `name`; ImportError naming the extra that installs it when it is missing."""
     try:
         return importlib.import_module(name)
     except ImportError as error:
         package = name.split(".")[0]
-        raise ImportError(f"this needs {package}: pip install analytic_rasterizer[cli] ({error})") from None
+        raise ImportError(f"this needs {package}: pip install analytic_rasterizer[{extra}] ({error})") from None
 
 
 # ------------------------------------------------------------------------------------- scenes

@@ -22,12 +22,8 @@ of one size, with reserve.
 from __future__ import annotations
 
 import argparse
-import ctypes
-import functools
 import json
-import platform
 import statistics
-import sys
 import time
 from collections.abc import Callable
 
@@ -36,7 +32,16 @@ from scene_files import load_scene
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
-from analytic_rasterizer.cli import format_table
+from analytic_rasterizer.measure import (
+    Case,
+    describe_machine,
+    event_seconds,
+    in_turn,
+    median_of,
+    median_seconds,
+    warm_up_cuda,
+)
+from analytic_rasterizer.report import format_table
 
 FOOTPRINTS = [
     "box:samples=1",
@@ -63,7 +68,7 @@ def main() -> None:
         scene = scene._replace(**{k: v[order] for k, v in scene._asdict().items() if torch.is_tensor(v)})
     scene = scene.to(args.device)
     views = io.load_views(args.views)
-    cases = {name: [Case(scene, view, name) for view in views] for name in args.footprints}
+    cases = {name: [SpeedCase(scene, view, name) for view in views] for name in args.footprints}
 
     measured = (measure_cuda if args.device == "cuda" else measure_cpu)(cases, args.rounds)
     results = {name: summarize(per_view) for name, per_view in measured.items()}
@@ -113,19 +118,6 @@ def pad_sh(scene: io.Scene, degree: int | None) -> io.Scene:
     return scene._replace(shs=shs, sh_degree=degree)
 
 
-def describe_machine(device: str) -> str:
-    if device == "cuda":
-        gpu = torch.cuda.get_device_properties(0)
-        memory = f"{gpu.multi_processor_count} SMs, {gpu.total_memory / 2**30:.0f} GiB"
-        return f"{gpu.name} ({gpu.major}.{gpu.minor}, {memory}), CUDA {torch.version.cuda}, torch {torch.__version__}"
-    cpu = platform.processor() or platform.machine()
-    if sys.platform == "linux":
-        with open("/proc/cpuinfo") as f:
-            cpu = next((line.split(":")[1].strip() for line in f if line.startswith("model name")), cpu)
-    threads = torch.get_num_threads()
-    return f"{cpu}, {threads} threads, {ar.instruction_set()}, torch {torch.__version__}"
-
-
 def format_results(results: dict[str, dict], device: str) -> str:
     base = next(iter(results.values()))
     unit, per_second = UNITS[device]
@@ -149,22 +141,11 @@ def format_results(results: dict[str, dict], device: str) -> str:
     return format_table(header, rows)
 
 
-@functools.cache
-def fixed_weights(height: int, width: int, device: torch.device) -> torch.Tensor:
-    return torch.rand(3, height, width, generator=torch.Generator().manual_seed(0)).to(device)
-
-
-class Case:
-    """One view of a scene, ready to render with one footprint."""
+class SpeedCase(Case):
+    """A case whose stages and op can be run by themselves."""
 
     def __init__(self, scene: io.Scene, view: io.View, footprint: str):
-        device = scene.means.device
-        self.settings = view.settings(sh_degree=scene.sh_degree, footprint=footprint, device=device)
-        self.rasterizer = ar.GaussianRasterizer(self.settings)
-        self.gaussians = scene.arguments()
-        self.inputs = {k: v.detach().requires_grad_() for k, v in self.gaussians.items()}
-        self.inputs["means2D"] = torch.zeros_like(scene.means, requires_grad=True)
-        self.dL_dcolor = fixed_weights(self.settings.image_height, self.settings.image_width, device)
+        super().__init__(scene, view, footprint)
         footprint = self.settings.footprint
         given = {**self.gaussians, **self.settings._asdict(), "footprint": footprint.key, "keep": False}
         given["variance"] = footprint.variance
@@ -178,22 +159,10 @@ class Case:
     def op(self) -> None:
         torch.ops.analytic_rasterizer.rasterize(*self.op_arguments)
 
-    @torch.no_grad()
-    def forward(self) -> None:
-        self.rasterizer(means2D=None, **self.gaussians)
-
-    def forward_backward(self) -> list[torch.Tensor]:
-        """The image, and the gradients of sum(image * dL_dcolor)."""
-        color, _ = self.rasterizer(**self.inputs)
-        return [color, *torch.autograd.grad(color, list(self.inputs.values()), self.dL_dcolor)]
-
     def extra_memory(self, pairs: int) -> dict:
         """Bytes that forward and backward need beyond what goes in and comes out, and their share of
         120 B per Gaussian + 64 B per pair + 64 B per pixel."""
-        device = self.dL_dcolor.device
-        before = reset_peak_memory(device)
-        results = self.forward_backward()
-        extra = peak_memory(device) - before - sum(t.numel() * t.element_size() for t in results)
+        extra = self.extra_bytes()
         pixels = self.settings.image_height * self.settings.image_width
         budget = 120 * len(self.gaussians["means3D"]) + 64 * pairs + 64 * pixels
         return {"extra_bytes": extra, "extra_share": extra / budget}
@@ -202,15 +171,9 @@ class Case:
 # --------------------------------------------------------------------------------- times, CPU
 
 
-def measure_cpu(cases: dict[str, list[Case]], rounds: int) -> dict[str, list[dict]]:
+def measure_cpu(cases: dict[str, list[SpeedCase]], rounds: int) -> dict[str, list[dict]]:
     """Seconds and bytes by footprint and view."""
-    samples = {name: [[] for _ in of_name] for name, of_name in cases.items()}
-    for round_ in range(rounds + 1):
-        for name, of_name in cases.items():
-            for case, taken in zip(of_name, samples[name]):
-                measured = time_round(case)
-                if round_ > 0:
-                    taken.append(measured)
+    samples = in_turn(cases, time_round, range(rounds + 1))
     medians = {name: [median_of(taken) for taken in of_name] for name, of_name in samples.items()}
     for name, of_name in cases.items():
         for case, result in zip(of_name, medians[name]):
@@ -218,7 +181,7 @@ def measure_cpu(cases: dict[str, list[Case]], rounds: int) -> dict[str, list[dic
     return medians
 
 
-def time_round(case: Case) -> dict:
+def time_round(case: SpeedCase) -> dict:
     """Seconds of one forward pass without gradient, by stage, and of one with its backward pass."""
     start = time.perf_counter()
     stages = case.stages()
@@ -238,20 +201,16 @@ def time_round(case: Case) -> dict:
 # -------------------------------------------------------------------------------- times, CUDA
 
 
-def measure_cuda(cases: dict[str, list[Case]], rounds: int) -> dict[str, list[dict]]:
+def measure_cuda(cases: dict[str, list[SpeedCase]], rounds: int) -> dict[str, list[dict]]:
     """Seconds and bytes by footprint and view."""
     results = {}
     for name, of_name in cases.items():
-        ar._C.force_pair_capacity(0)  # room for pairs follows the frames of this footprint alone
-        for _ in range(WARM_UP):
-            for case in of_name:
-                case.forward()
-                case.forward_backward()
+        warm_up_cuda(of_name, WARM_UP)
         results[name] = [time_case(case, rounds) for case in of_name]
     return results
 
 
-def time_case(case: Case, rounds: int) -> dict:
+def time_case(case: SpeedCase, rounds: int) -> dict:
     for _ in range(WARM_UP):
         case.forward()
         case.forward_backward()
@@ -275,16 +234,6 @@ def time_case(case: Case, rounds: int) -> dict:
     }
 
 
-def event_seconds(call: Callable[[], object]) -> float:
-    """Time on the device from before a call to after it."""
-    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-    start.record()
-    call()
-    end.record()
-    torch.cuda.synchronize()
-    return start.elapsed_time(end) * 1e-3
-
-
 def host_seconds(call: Callable[[], object]) -> float:
     """Time until a call returns, of a device that has nothing else to do."""
     start = time.perf_counter()
@@ -294,64 +243,13 @@ def host_seconds(call: Callable[[], object]) -> float:
     return seconds
 
 
-def median_seconds(clock: Callable[[Callable], float], call: Callable[[], object], rounds: int) -> float:
-    torch.cuda.synchronize()
-    clock(call)
-    return statistics.median(clock(call) for _ in range(rounds))
-
-
-# --------------------------------------------------------------------------- medians and means
-
-
-def median_of(samples: list[dict]) -> dict:
-    return {key: statistics.median(sample[key] for sample in samples) for key in samples[0]}
+# -------------------------------------------------------------------------------------- means
 
 
 def summarize(per_view: list[dict]) -> dict:
     """Means over views; of the share of the memory budget the worst."""
     means = {key: statistics.mean(view[key] for view in per_view) for key in per_view[0]}
     return {**means, "extra_share": max(view["extra_share"] for view in per_view)}
-
-
-# -------------------------------------------------------------------------------------- memory
-
-
-def return_freed_memory() -> None:
-    """Makes glibc hand freed blocks back to the system, so that peaks can be compared."""
-    if sys.platform == "linux":
-        libc = ctypes.CDLL(None)
-        libc.mallopt(-3, 1 << 16)  # M_MMAP_THRESHOLD: blocks above 64 KiB go back when freed
-        libc.malloc_trim(0)
-
-
-def reset_peak_memory(device: torch.device) -> int:
-    """Memory in use now, bytes, from which the peak starts again. On the CPU Linux only; elsewhere 0."""
-    if device.type == "cuda":
-        torch.cuda.synchronize()
-        torch.cuda.reset_peak_memory_stats()
-        return torch.cuda.memory_allocated()
-    return_freed_memory()
-    try:
-        with open("/proc/self/clear_refs", "w") as f:
-            f.write("5")
-    except OSError:
-        return 0
-    return _status("VmRSS")
-
-
-def peak_memory(device: torch.device) -> int:
-    """Highest memory in use since the last reset, bytes."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated()
-    return _status("VmHWM")
-
-
-def _status(key: str) -> int:
-    try:
-        with open("/proc/self/status") as f:
-            return next(1024 * int(line.split()[1]) for line in f if line.startswith(key))
-    except OSError:
-        return 0
 
 
 if __name__ == "__main__":

@@ -269,11 +269,12 @@ def test_interrupt_of_a_process_is_quiet(tmp_path):
 def test_version_and_help(capsys):
     assert leave(["--version"]) == 0
     assert capsys.readouterr().out == f"analytic_rasterizer {ar.__version__}\n"
-    for args in (["--help"], ["render", "--help"], ["demo", "--help"]):
+    for args in ([], ["render"], ["demo"], ["errors"], ["pareto"]):
+        args = [*args, "--help"]
         assert leave(args) == 0
         text = capsys.readouterr().out
         assert text.startswith("usage: python -m analytic_rasterizer")
-        if args[0] == "render":
+        if args[0] in ("render", "pareto"):
             assert all(footprint in text for footprint in ar.FOOTPRINTS)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from analytic_rasterizer import cli, demo
+from analytic_rasterizer import accuracy, cli, demo
 from analytic_rasterizer.rasterizer import render_stages
 
 pytest.importorskip("gsply", reason="needs the cli extra")
@@ -59,21 +59,11 @@ def test_stamps_land_where_they_are_drawn():
     assert turn == pytest.approx(0.5, abs=0.02)  # x towards y
 
 
-def test_reference_from_shifted_renders_is_that_of_one_large_render(monkeypatch):
-    scene, view = small_view()
-    whole = demo._supersampled(scene, view, 8)
-    monkeypatch.setattr(demo, "MAX_PIXELS", 4 * SIZE[0] * SIZE[1])  # 2 x 2 pictures, 4 x 4 shifts
-    parts = demo._supersampled(scene, view, 8)
-    # The same samples; a coordinate that rounds differently can cross the 1/255 cut of a splat.
-    assert (whole - parts).abs().max() < 2 / 255
-    assert (whole - parts).abs().mean() < 1e-5
-
-
 def test_reference_of_a_reduction_is_aligned_with_its_render():
     scene, view = small_view()
     half = replace(view, width=SIZE[0] // 2, height=SIZE[1] // 2, fx=view.fx / 2, fy=view.fy / 2)
-    direct = demo._supersampled(scene, half, 8)
-    reduced = demo._reduced(demo._supersampled(scene, view, 4))[2]
+    direct = accuracy.supersampled(scene, half, 8, background=demo.PAPER)
+    reduced = demo._reduced(accuracy.supersampled(scene, view, 4, background=demo.PAPER))[2]
     assert (direct - reduced).abs().max() < 2 / 255
     assert (direct - reduced).abs().mean() < 1e-5
 
@@ -82,7 +72,7 @@ def test_reference_is_converged(demo_run):
     _, results = demo_run
     for reduction, residual in results["reference"]["residual_rmse"].items():
         errors = [p["rmse"] for p in results["pictures"] if str(p["reduction"]) == reduction]
-        assert residual <= demo.RMSE_SHARE * min(errors)
+        assert residual <= accuracy.RMSE_SHARE * min(errors)
 
 
 def test_errors_are_those_of_the_written_pictures(demo_run):
@@ -109,7 +99,7 @@ def test_footprints_rank_as_they_should():
     That holds where the pixels resolve the target; far below (1/8) four samples alias.
     """
     scene, view = demo.make_target()
-    truth = demo._reduced(demo._supersampled(scene, view, 8))
+    truth = demo._reduced(accuracy.supersampled(scene, view, 8, background=demo.PAPER))
     for reduction in (1, 2):
         psnr = {
             name: demo._errors(demo._render(scene, view, 1 / reduction, name)[0], truth[reduction])[0]
@@ -140,7 +130,7 @@ def test_render_command_repeats_the_demo(demo_run, tmp_path):
 
 
 def test_table_of_the_command(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(demo, "MAX_DENSITY", 8)
+    monkeypatch.setattr(accuracy, "MAX_DENSITY", 8)
     monkeypatch.setattr(demo, "REPEATS", 1)
     assert cli.main(["demo", "--out", str(tmp_path / "new"), "--size", "48", "32"]) == 0
     lines = capsys.readouterr().out.splitlines()

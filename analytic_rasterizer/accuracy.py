@@ -1,0 +1,115 @@
+"""What an image should be, the integral over every pixel, and how far a picture is from it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+
+from .footprints import resolve_footprint
+from .io import Scene, View, optional_import
+from .rasterizer import render_stages
+
+UNFILTERED = "point:dilation=0"  # samples of the scene itself, without any filter
+RMSE_SHARE = 0.1  # a reference is refined until it moves by this share of the smallest error
+MAX_DENSITY = 64  # samples along a pixel's side beyond which a reference is left as it is
+MAX_PIXELS = 2**23  # of one render of unfiltered samples; more become more renders
+
+
+def supersampled(
+    scene: Scene, view: View, density: int, footprint: str = UNFILTERED, background=(0.0, 0.0, 0.0)
+) -> torch.Tensor:
+    """Mean of density x density renders of every pixel of a view, equally spaced inside it.
+
+    The samples come from a picture `fine` times larger. Unfiltered samples come from `shifts` x `shifts`
+    such pictures whose principal point is moved by a part of a pixel, so that memory stays bounded; a
+    footprint with a filter is as wide as the pixels it is rendered in, and shifted ones would overlap.
+
+    Args:
+        scene: On any device.
+        view: Its size is the size of the result.
+        density: Samples along a pixel's side, at least 1.
+        footprint: How a sample sees a splat, in pixels of its own: see `resolve_footprint`.
+        background: RGB.
+
+    Returns:
+        (3, H, W) float64 on the CPU.
+    """
+    fine = density
+    if resolve_footprint(footprint) == resolve_footprint(UNFILTERED):
+        divisors = [n for n in range(1, density + 1) if density % n == 0]
+        fine = max((n for n in divisors if n * n * view.width * view.height <= MAX_PIXELS), default=1)
+    shifts = density // fine
+    cx = view.width / 2 if view.cx is None else view.cx
+    cy = view.height / 2 if view.cy is None else view.cy
+    total = torch.zeros(3, view.height, view.width, dtype=torch.float64)
+    for i in range(shifts**2):
+        column, row = ((n + 0.5) / shifts - 0.5 for n in (i % shifts, i // shifts))
+        shifted = replace(view, cx=cx - column / fine, cy=cy - row / fine)
+        settings = shifted.settings(fine, background, scene.sh_degree, footprint, device=scene.means.device)
+        color = render_stages(settings, **scene.arguments()).color
+        total += torch.nn.functional.avg_pool2d(color[None].double(), fine)[0].cpu()
+    return total / shifts**2
+
+
+class Refined(NamedTuple):
+    """Pictures at the last density, at half of it, and the RMSE between every density and its half, by key."""
+
+    pictures: dict[Any, torch.Tensor]
+    half: dict[Any, torch.Tensor]
+    residuals: dict[int, dict[Any, float]]
+
+    @property
+    def density(self) -> int:
+        return max(self.residuals)
+
+
+def refine(
+    sample: Callable[[int], dict], smallest_error: Callable[[dict], dict], start: int = 4, limit: int | None = None
+) -> Refined:
+    """Doubles a density until the pictures settle: what doubling changes is RMSE_SHARE of the smallest error.
+
+    A midpoint grid's error falls with the density, so that the change bounds the error that is left.
+
+    Args:
+        sample: The pictures at a density, by any key.
+        smallest_error: Given the pictures as truth, the smallest RMSE that will be reported, by key.
+        start: The coarsest density.
+        limit: Density beyond which pictures are left as they are; None is MAX_DENSITY.
+
+    The caller says which errors the last residual does not resolve.
+    """
+    limit = MAX_DENSITY if limit is None else limit
+    density, coarse, residuals = start, sample(start), {}
+    with optional_import("tqdm").tqdm(desc="reference", unit=" densities", disable=None) as bar:
+        while True:
+            density *= 2
+            truth = sample(density)
+            bar.update()
+            residuals[density] = {key: image_errors(coarse[key], truth[key])["rmse"] for key in truth}
+            smallest = smallest_error(truth)
+            settled = all(residuals[density][key] <= RMSE_SHARE * smallest[key] for key in truth)
+            if settled or 2 * density > limit:
+                return Refined(truth, coarse, residuals)
+            coarse = truth
+
+
+def image_errors(color: torch.Tensor, truth: torch.Tensor) -> dict[str, float]:
+    """How far a picture is from the truth, over all channels of all pixels, for colours in 0 to 1.
+
+    Nothing is clamped. Returns psnr (dB, peak 1; 300 where the mean square is below 1e-30), rmse, bias
+    (mean of color - truth), p999 (the absolute error that 99.9% do not exceed) and max.
+    """
+    error = (color.double() - truth).flatten()
+    mse = error.square().mean().item()
+    size = error.abs()
+    return {
+        "psnr": -10 * math.log10(max(mse, 1e-30)),
+        "rmse": math.sqrt(mse),
+        "bias": error.mean().item(),
+        "p999": size.kthvalue(math.ceil(0.999 * size.numel())).values.item(),
+        "max": size.max().item(),
+    }
