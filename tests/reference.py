@@ -28,6 +28,8 @@ DEFAULT_OPTIONS = {
     "analytic": {"frame_gradient": "frozen"},
     "cumulant": {},
     "box": {"samples": 4},
+    "erf": {},
+    "exact": {},
 }
 
 
@@ -121,9 +123,16 @@ def logistic_window(u, sigma):
 
 
 def normal_window(u, sigma):
-    """The same with the exact CDF, on the side where both values are small."""
+    """The same with the exact CDF.
+
+    The difference of two values, on the side where both are small; and where it would cancel,
+    beyond one pixel of deviation, eight Gauss-Legendre nodes on the density (error 3e-17).
+    """
     u = -u.abs()
-    return normal_cdf((u + 0.5) / sigma) - normal_cdf((u - 0.5) / sigma)
+    wide = torch.clamp(sigma, min=1.0)  # keeps what is not selected harmless
+    density = sum(w / 2 * normal_pdf((u + x / 2) / wide) / wide for x, w in zip(*legendre(8), strict=True))
+    difference = normal_cdf((u + 0.5) / sigma) - normal_cdf((u - 0.5) / sigma)
+    return torch.where(sigma > 1, density, difference)
 
 
 def rotated_window(offset, cov2d, frame_gradient="paper", window=logistic_window, pdf=logistic_pdf):
@@ -188,6 +197,10 @@ def sample_weights(offset, cov2d, footprint, **options):
         return rotated_window(offset, cov2d, options["frame_gradient"])[None]
     if footprint == "cumulant":
         return cumulant(offset, cov2d)[None]
+    if footprint == "erf":
+        return rotated_window(offset, cov2d, "frozen", normal_window, normal_pdf)[None]
+    if footprint == "exact":
+        return exact_weight(offset, cov2d, panels=16)[None]
     if footprint == "box":
         variance = box_variance(options["samples"])
         nodes = box_nodes(options["samples"])
@@ -201,11 +214,11 @@ def weight(offset, cov2d, footprint, **options):
 
 
 def exact_weight(offset, cov2d, panels=64, order=10):
-    """Integral of exp(-q/2) over the unit pixel: composite Gauss-Legendre times erf.
+    """Integral of exp(-q/2) over the unit pixel: composite Gauss-Legendre times the normal CDF.
 
     The outer axis is the one with the larger variance, so that nothing varies faster along it than
     the conditional deviation of the other axis; 64 panels of 10 nodes resolve deviations down to
-    0.01 px to 1e-13. Differentiable in both arguments.
+    0.01 px to 1e-13, and 16 down to 0.04 px. Differentiable in both arguments.
     """
     offset, cov2d = torch.broadcast_tensors(torch.nn.functional.pad(offset, (0, 1)), cov2d)  # (..., 3)
     x, y, _ = offset.unbind(-1)
@@ -228,12 +241,10 @@ def exact_weight(offset, cov2d, panels=64, order=10):
     def expand(t):
         return t[..., None, None]
 
-    centre = expand(xy / wide) * outer
-    scale = math.sqrt(2) * expand(deviation)
-    strip = torch.erf((expand(y) + 0.5 - centre) / scale) - torch.erf((expand(y) - 0.5 - centre) / scale)
+    strip = normal_window(expand(y) - expand(xy / wide) * outer, expand(deviation))
     values = torch.exp(-outer * outer / (2 * expand(wide))) * strip
     total = (values * node_weights / 2).sum((-1, -2)) * step
-    return total * deviation * math.sqrt(math.pi / 2)
+    return total * deviation * math.sqrt(2 * math.pi)
 
 
 def legendre(order):
@@ -379,6 +390,8 @@ def radius_covariance(cov2d, footprint, **options):
         "analytic": 0.0,
         "cumulant": 1 / 12,
         "box": 1 / 12,
+        "erf": 0.0,
+        "exact": 1 / 12,
     }[footprint]
     return add_variance(cov2d, added)
 

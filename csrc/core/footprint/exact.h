@@ -95,7 +95,7 @@ struct Exact {
   /// Longest panel, in deviations of the integrand along it, for kManyNodes.
   static constexpr double kPanel = 3.3;
   /// 1 + 2 kTail sqrt(2) / kPanel.
-  static constexpr double kMaxPanels = 11;
+  static constexpr int kMaxPanels = 11;
   /// Keeps the crossings of a ridge along the axis finite: it moves none by more than kTail * this.
   static constexpr double kMinTilt = 1e-6;
 
@@ -117,19 +117,26 @@ struct Exact {
     return blur(cov, T(kPixelVariance));
   }
 
-  /// The pixel, seen from its point next to the mean. From there rounding leaves the edges that
-  /// matter where they are, however small or far the Gaussian.
+  /// Where the pixel begins and ends along an axis, seen from its point next to the mean: [-1, 0], [0, 1] or
+  /// in between [px]. From there rounding leaves the edges that matter where they are, however small or
+  /// far the Gaussian.
+  template <class V> struct Edges {
+    V begin, end;
+    AR_HD V middle() const { return V(ScalarOf<V>(0.5)) * (begin + end); }
+  };
   template <class V> struct Pixel {
-    Vec2<V> z;       ///< that point, whitened
-    V wide, narrow;  ///< where the pixel begins along the wide and along the other axis, in [-1, 0] [px]
+    Vec2<V> z;  ///< that point, whitened
+    Edges<V> wide, narrow;
   };
 
   template <typename T, class V> AR_HD static Moments<V> moments(const Terms<T>& t, Vec2<V> p) {
-    const V half = V(T(0.5)), zero = V(T(0)), minus = V(T(-1));
-    const Vec2<V> corner = {p.x + V(t.origin.x) - half, p.y + V(t.origin.y) - half};
-    const Vec2<V> begin = {clamp(corner.x, minus, zero), clamp(corner.y, minus, zero)};
-    const Pixel<V> pixel = {transform(t.w, Vec2<V>{corner.x - begin.x, corner.y - begin.y}),
-                            t.wide_x ? begin.x : begin.y, t.wide_x ? begin.y : begin.x};
+    const V half = V(T(0.5)), zero = V(T(0)), one = V(T(1));
+    const Vec2<V> d = {p.x + V(t.origin.x), p.y + V(t.origin.y)};
+    const Vec2<V> lo = {d.x - half, d.y - half}, hi = {d.x + half, d.y + half};
+    const Vec2<V> nearest = {max(lo.x, zero) + min(hi.x, zero), max(lo.y, zero) + min(hi.y, zero)};
+    const Edges<V> x = {clamp(lo.x, -one, zero), clamp(hi.x, zero, one)};
+    const Edges<V> y = {clamp(lo.y, -one, zero), clamp(hi.y, zero, one)};
+    const Pixel<V> pixel = {transform(t.w, nearest), t.wide_x ? x : y, t.wide_x ? y : x};
     if (t.across <= T(0.5)) return by_product_rule<kFewNodes<T>>(t, pixel);
     if (t.across <= T(2)) return by_product_rule<kManyNodes<T>>(t, pixel);
     return by_strips(t, pixel);
@@ -138,11 +145,11 @@ struct Exact {
   template <int N, typename T, class V>
   AR_HD static Moments<V> by_product_rule(const Terms<T>& t, const Pixel<V>& pixel) {
     using Rule = GaussLegendre<N, T>;
-    const V zero = V(T(0)), half = V(T(0.5)), across = V(t.across);
+    const V zero = V(T(0)), across = V(t.across);
     Moments<V> m = {zero, {zero, zero}, {zero, zero, zero}};
     for (int i = 0; i < N; ++i) {
-      const V step = V(t.along) * (pixel.wide + V(T(0.5) + Rule::node(i))), x = pixel.z.x + step;
-      const V middle = madd(across, pixel.narrow + half, madd(V(-t.tilt), step, pixel.z.y));
+      const V step = V(t.along) * (pixel.wide.middle() + V(Rule::node(i))), x = pixel.z.x + step;
+      const V middle = madd(across, pixel.narrow.middle(), madd(V(-t.tilt), step, pixel.z.y));
       NormalMoments<V> line = {zero, zero, zero};
       AR_UNROLL
       for (int j = 0; j < N; ++j) {
@@ -155,14 +162,14 @@ struct Exact {
   }
 
   template <typename T, class V> AR_HD static Moments<V> by_strips(const Terms<T>& t, const Pixel<V>& pixel) {
-    const V zero = V(T(0)), one = V(T(1)), half = V(T(0.5)), tail = V(T(kTail<T>)), crossing = V(t.crossing);
+    const V zero = V(T(0)), tail = V(T(kTail<T>)), crossing = V(t.crossing);
     const V along = V(t.along), across = V(t.across), scale = V(T(1) / max(t.tilt, T(kMinTilt)));
     // Steps in z.x: to two edges of the pixel, and to where the ridge crosses the other two.
-    const V edge = along * pixel.wide, opposite = along * (pixel.wide + one);
+    const V edge = along * pixel.wide.begin, opposite = along * pixel.wide.end;
     const V first = min(edge, opposite), last = max(edge, opposite);
-    const V enters = madd(across, pixel.narrow, pixel.z.y) * scale;
-    const V middle = madd(across, pixel.narrow + half, pixel.z.y) * scale;
-    const V leaves = madd(across, pixel.narrow + one, pixel.z.y) * scale;
+    const V enters = madd(across, pixel.narrow.begin, pixel.z.y) * scale;
+    const V middle = madd(across, pixel.narrow.middle(), pixel.z.y) * scale;
+    const V leaves = madd(across, pixel.narrow.end, pixel.z.y) * scale;
     const V begin = max(max(first, -tail), clamp(enters, first, last) - crossing);
     const V end = max(begin, min(min(last, tail), clamp(leaves, first, last) + crossing));
     const V inside = clamp(min(enters + crossing, middle), begin, end);
@@ -174,7 +181,7 @@ struct Exact {
       // In between, the pixel holds all of the ridge's width.
       const V from = pixel.z.x + inside, to = pixel.z.x + outside;
       const NormalMoments<V> ridge = abs(t.along) <= T(0.5)
-                                         ? short_interval_moments(half * (from + to), outside - inside)
+                                         ? short_interval_moments(V(T(0.5)) * (from + to), outside - inside)
                                          : interval_moments(from, to);
       const V all = V(T(2.5066282746310005024));
       m.value = madd(all, ridge.value, m.value);
@@ -192,14 +199,14 @@ struct Exact {
   template <typename T, class V>
   AR_HD static void add_strip(const Terms<T>& t, const Pixel<V>& pixel, V from, V to, Moments<V>& m) {
     using Rule = GaussLegendre<kManyNodes<T>, T>;
-    const V length = (to - from) * V(T(1) / T(t.panels)), across = V(t.across), one = V(T(1));
+    const V length = (to - from) * V(T(1) / T(t.panels)), across = V(t.across);
     for (int k = 0; k < t.panels; ++k) {
       const V middle = madd(length, V(T(k) + T(0.5)), from);
       for (int i = 0; i < kManyNodes<T>; ++i) {
         const V step = madd(length, V(Rule::node(i)), middle), x = pixel.z.x + step;
         const V y = madd(V(-t.tilt), step, pixel.z.y);
         const NormalMoments<V> line =
-            interval_moments(madd(across, pixel.narrow, y), madd(across, pixel.narrow + one, y));
+            interval_moments(madd(across, pixel.narrow.begin, y), madd(across, pixel.narrow.end, y));
         add(length * V(Rule::weight(i)) * normal(x), x, line, m);
       }
     }
