@@ -152,10 +152,11 @@ def footprint_weight(
 ) -> torch.Tensor:
     """Weight I(d, Sigma) of a splat of peak 1 in one pixel. Differentiable.
 
-    `exact` is the true integral over the pixel: to 12 roundings times 3 + 0.74 s1/s2, of the
-    Gaussian it is given: up to an anisotropy s1/s2 of 10 within 1.4e-14 in float64 and 7.5e-6 in float32. It
-    costs 16 or 64 exponentials, and for splats narrower than half a pixel up to 224 values of erfc. `erf` is the window of
-    `analytic` with the exact CDF; its gradient holds the frame, as that of `analytic` does by default.
+    `exact` is the true integral over the pixel, of the Gaussian it is given, within 12 (3 + 0.74 s1/s2)
+    roundings: 1.4e-14 in float64 and 7.5e-6 in float32 up to an anisotropy s1/s2 of 10. It costs 20 or
+    72 exponentials, and for splats narrower than half a pixel up to 224 values of erfc. `erf` is the
+    window of `analytic` with the exact CDF; its gradient holds the frame, as that of `analytic` does by
+    default.
 
     For `box` the weight is the mean over its samples; in an image each sample is composited on its
     own, which the mean of the weights does not show.
