@@ -129,6 +129,8 @@ def normal_window(u, sigma):
     beyond one pixel of deviation, eight Gauss-Legendre nodes on the density (error 3e-17).
     """
     u = -u.abs()
+    if (sigma <= 1).all():
+        return normal_cdf((u + 0.5) / sigma) - normal_cdf((u - 0.5) / sigma)
     wide = torch.clamp(sigma, min=1.0)  # keeps what is not selected harmless
     density = sum(w / 2 * normal_pdf((u + x / 2) / wide) / wide for x, w in zip(*legendre(8), strict=True))
     difference = normal_cdf((u + 0.5) / sigma) - normal_cdf((u - 0.5) / sigma)
@@ -200,7 +202,11 @@ def sample_weights(offset, cov2d, footprint, **options):
     if footprint == "erf":
         return rotated_window(offset, cov2d, "frozen", normal_window, normal_pdf)[None]
     if footprint == "exact":
-        return exact_weight(offset, cov2d, panels=16)[None]
+        # As many panels per deviation as exact_weight() has by default at 0.01 px.
+        xx, xy, yy = cov2d.detach().unbind(-1)
+        larger = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)
+        smallest = torch.sqrt(determinant(cov2d.detach()) / larger).min().item()
+        return exact_weight(offset, cov2d, panels=min(64, math.ceil(0.64 / smallest)))[None]
     if footprint == "box":
         variance = box_variance(options["samples"])
         nodes = box_nodes(options["samples"])
@@ -218,7 +224,7 @@ def exact_weight(offset, cov2d, panels=64, order=10):
 
     The outer axis is the one with the larger variance, so that nothing varies faster along it than
     the conditional deviation of the other axis; 64 panels of 10 nodes resolve deviations down to
-    0.01 px to 1e-13, and 16 down to 0.04 px. Differentiable in both arguments.
+    0.01 px to 1e-13. Differentiable in both arguments.
     """
     offset, cov2d = torch.broadcast_tensors(torch.nn.functional.pad(offset, (0, 1)), cov2d)  # (..., 3)
     x, y, _ = offset.unbind(-1)
