@@ -206,7 +206,13 @@ def sample_weights(offset, cov2d, footprint, **options):
         xx, xy, yy = cov2d.detach().unbind(-1)
         larger = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)
         smallest = torch.sqrt(determinant(cov2d.detach()) / larger).min().item()
-        return exact_weight(offset, cov2d, panels=min(64, math.ceil(0.64 / smallest)))[None]
+        # Beyond, the weight is below 10.5 exp(-50) (docs/numerics.md, "Support").
+        near = quadratic(offset.detach(), add_variance(cov2d.detach(), 1 / 12)) < 100
+        value = offset.new_zeros(near.shape)
+        if near.any():
+            d, c = (t.expand(*near.shape, -1)[near] for t in (offset, cov2d))
+            value = value.masked_scatter(near, exact_weight(d, c, panels=min(64, math.ceil(0.64 / smallest))))
+        return value[None]
     if footprint == "box":
         variance = box_variance(options["samples"])
         nodes = box_nodes(options["samples"])
