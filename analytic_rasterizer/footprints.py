@@ -10,7 +10,7 @@ import torch
 
 from . import _C  # loads the ops
 
-FOOTPRINTS = ("point", "mip", "analytic", "cumulant", "box")
+FOOTPRINTS = ("point", "mip", "analytic", "cumulant", "box", "erf", "exact")
 """Public names of the footprints, in the order of the documentation's table."""
 
 BOX_SAMPLES = (1, 2, 4, 8, 16)
@@ -23,6 +23,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "analytic": {"frame_gradient": "frozen"},
     "cumulant": {},
     "box": {"samples": 4},
+    "erf": {},
+    "exact": {},
 }
 
 ENVIRONMENT_VARIABLE = "ANALYTIC_RASTERIZER_FOOTPRINT"
@@ -150,6 +152,12 @@ def footprint_weight(
 ) -> torch.Tensor:
     """Weight I(d, Sigma) of a splat of peak 1 in one pixel. Differentiable.
 
+    `exact` is the true integral over the pixel, of the Gaussian it is given, within 12 (3 + 0.74 s1/s2)
+    roundings: 1.4e-14 in float64 and 7.5e-6 in float32 up to an anisotropy s1/s2 of 10. It costs 20 or
+    72 exponentials, and for splats narrower than half a pixel up to 224 values of erfc. `erf` is the
+    window of `analytic` with the exact CDF; its gradient holds the frame, as that of `analytic` does by
+    default.
+
     For `box` the weight is the mean over its samples; in an image each sample is composited on its
     own, which the mean of the weights does not show.
 
@@ -167,7 +175,7 @@ def footprint_weight(
         TypeError: Wrong or unequal dtypes.
         ValueError: Wrong shape, device, footprint or option.
 
-    Source: point, mip, cumulant, box: docs/numerics.md; analytic: [AS, Eq. 2-9].
+    Source: point, mip, cumulant, box, exact: docs/numerics.md; analytic, erf: [AS, Eq. 2-9].
     """
     spec = resolve_footprint(footprint, **options)
     for name, tensor, last in (("offset", offset, 2), ("cov2d", cov2d, 3)):

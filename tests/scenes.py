@@ -16,9 +16,19 @@ VARIANTS = [
     ("analytic", {"frame_gradient": "paper"}),
     ("cumulant", {}),
     *[("box", {"samples": samples}) for samples in (1, 2, 4, 8, 16)],
+    ("erf", {}),
+    ("exact", {}),
 ]
 # One of each kind, for tests where the options do not matter.
-KINDS = [("point", {}), ("mip", {}), ("analytic", {}), ("cumulant", {}), ("box", {"samples": 4})]
+KINDS = [
+    ("point", {}),
+    ("mip", {}),
+    ("analytic", {}),
+    ("cumulant", {}),
+    ("box", {"samples": 4}),
+    ("erf", {}),
+    ("exact", {}),
+]
 INPUTS = (
     "means3D",
     "means2D",

@@ -80,6 +80,9 @@ AR_HD float exp2(float x) {
 #endif
 }
 AR_HD double exp2(double x) { return std::exp2(x); }
+/// Complement of the error function, relative to itself within 4 ulp while it is a normal number.
+AR_HD float erfc(float x) { return std::erfc(x); }
+AR_HD double erfc(double x) { return std::erfc(x); }
 AR_HD float sqrt(float x) { return std::sqrt(x); }
 AR_HD double sqrt(double x) { return std::sqrt(x); }
 

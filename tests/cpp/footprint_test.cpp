@@ -239,6 +239,104 @@ TEST(CumulantAxisTest, Scales) {
   }
 }
 
+/// A Gauss-Legendre rule of N nodes in double, against moments x^k: exact up to k = 2N - 1.
+template <int N> void expect_rule() {
+  using Rule = GaussLegendre<N, double>;
+  for (int k = 0; k < 2 * N + 1; ++k) {
+    double sum = 0;
+    for (int i = 0; i < N; ++i) sum += Rule::weight(i) * std::pow(2 * Rule::node(i), k);
+    const double exact = k % 2 ? 0 : 1.0 / (k + 1);
+    if (k < 2 * N) {
+      EXPECT_NEAR(sum, exact, 4 * kEps<double>) << N << " nodes, x^" << k;
+    } else {
+      EXPECT_GT(std::abs(sum - exact), 1e-8) << N;  // the check can fail
+    }
+  }
+}
+TEST(GaussLegendreRule, IntegratesPolynomials) {
+  expect_rule<4>();
+  expect_rule<6>();
+  expect_rule<8>();
+  expect_rule<12>();
+}
+
+// Against the closed form in long double, on both sides of the switch.
+TEST(NormalMomentsTest, MatchTheClosedForm) {
+  Random random(7);
+  for (int trial = 0; trial < 100000; ++trial) {
+    const double width = random.log_uniform(1e-3, 100), z = random.uniform(-4, 4) * std::max(1.0, width / 2);
+    const NormalMoments<double> m =
+        width <= 0.5 ? short_interval_moments(z, width) : interval_moments(z - width / 2, z + width / 2);
+    const long double a = std::abs(z) - width / 2.0L, b = std::abs(z) + width / 2.0L;
+    const long double ea = std::exp(-a * a / 2), eb = std::exp(-b * b / 2), root = std::sqrt(0.5L);
+    const long double value = std::sqrt(acosl(-1) / 2) * (std::erfc(a * root) - std::erfc(b * root));
+    const long double first = (z < 0 ? -1 : 1) * (ea - eb), second = value + a * ea - b * eb;
+    // Roundings of the ends, which the exponent multiplies, and of differences that lose a factor of 3
+    // at width 1/2. The six nodes err by (6!)^4 / (13 (12!)^3) = 1.9e-16 times width^13 and a twelfth
+    // derivative: 10395 for the value, 12 times as much for the second moment.
+    const double nodes = width <= 0.5 ? 1.9e-16 * 12 * 10395 * std::pow(width, 13) : 0;
+    const double size = std::abs(z) + 1, bound = 16 * kEps<double> * std::max(double(value), 1e-30) * size * size;
+    ASSERT_NEAR(m.value, double(value), bound) << "z " << z << " width " << width;
+    ASSERT_NEAR(m.first, double(first), bound * size + nodes) << "z " << z << " width " << width;
+    ASSERT_NEAR(m.second, double(second), bound * size * size + nodes) << "z " << z << " width " << width;
+  }
+}
+
+// box_excess() along one axis, and that it is not wildly loose: the ratio comes within a third.
+TEST(BoxExcess, HoldsAlongOneAxis) {
+  for (double sigma = 1e-3; sigma < 100; sigma *= 1.01) {
+    const double t = 1 / (sigma * sigma + kPixelVariance), amp = sigma * std::sqrt(t);
+    double most = -100;
+    for (double u = 0; u * u * t < 40; u += 0.002 / std::sqrt(t)) {
+      const double integral = sigma * interval_moments((u - 0.5) / sigma, (u + 0.5) / sigma).value;
+      if (integral < 1e-280) break;
+      most = std::max(most, 2 * std::log(integral / amp) + u * u * t);
+    }
+    ASSERT_LE(most, box_excess(t) + 1e-12) << sigma;
+    if (sigma < 0.02) {
+      ASSERT_GE(most, 2.0 / 3 * box_excess(t)) << sigma;
+    }
+  }
+}
+
+// The same for the pixel itself, in any direction.
+TEST(BoxExcess, HoldsForThePixel) {
+  Random random(8);
+  for (int trial = 0; trial < 20000; ++trial) {
+    const double s2 = random.log_uniform(1e-3, 3), s1 = s2 * random.log_uniform(1, 1000);
+    const Cov2d<double> cov = covariance(s1, s2, random.uniform(0, kPi)), wide = blur(cov, kPixelVariance);
+    const Mat2<double> w = whiten(wide);
+    const double excess = box_excess(wide.yy / wide.det) + box_excess(wide.xx / wide.det);
+    for (int k = 0; k < 20; ++k) {
+      const double radius = random.uniform(0, 4);
+      const Vec2<double> d = unwhiten(w, on_circle(radius, random.uniform(0, 2 * kPi)));
+      const double bound = std::sqrt(cov.det / wide.det) * std::exp((excess - radius * radius) / 2);
+      ASSERT_LE(weight<Exact>(cov, d, 1.0), bound * (1 + 1e-9)) << s1 << " " << s2 << " d " << d.x << " " << d.y;
+    }
+  }
+}
+
+// The branches of `exact` meet: across each switch the weight changes by no more than it must.
+TEST(ExactBranches, AgreeWhereTheyMeet) {
+  Random random(9);
+  for (int trial = 0; trial < 20000; ++trial) {
+    const double across = random.below(2) ? 0.5 : 2.0, ratio = random.log_uniform(1, 100);
+    const double angle = random.uniform(0, kPi);
+    // The narrow deviation of which 1/across is what is left given the wide axis.
+    const Cov2d<double> unit = covariance(ratio, 1, angle);
+    const double s2 = std::sqrt(std::max(unit.xx, unit.yy) / unit.det) / across;
+    const Vec2<double> at = on_circle(random.uniform(0, 3), random.uniform(0, 2 * kPi));
+    double value[2];
+    for (int side = 0; side < 2; ++side) {
+      const double s = s2 * (side ? 1 + 1e-13 : 1 - 1e-13);
+      const Cov2d<double> cov = covariance(ratio * s, s, angle);
+      value[side] = weight<Exact>(cov, unwhiten(whiten(blur(cov, kPixelVariance)), at), 1.0);
+    }
+    // 2e-13 of sigma, and of d with it, times a slope of at most 3 ratio per deviation.
+    ASSERT_NEAR(value[0], value[1], 1e-12 * (1 + ratio)) << ratio << " " << angle;
+  }
+}
+
 template <typename T> bool all_finite(const SplatGrad<T>& g) {
   return std::isfinite(g.dL_dmean.x) && std::isfinite(g.dL_dmean.y) && std::isfinite(g.dL_dcov.xx) &&
          std::isfinite(g.dL_dcov.xy) && std::isfinite(g.dL_dcov.yy) && std::isfinite(g.dL_dlog_det);
@@ -283,6 +381,8 @@ TYPED_TEST(FootprintTest, FloatAgreesWithDouble) {
     const Vec2<double> at = unwhiten(w, on_circle(random.uniform(0, 4), random.uniform(0, 2 * kPi)));
     const Vec2<float> d = {float(at.x), float(at.y)};
     const Vec2<double> dd = {d.x, d.y};
+    // `exact` cuts the Gaussian off at 7 deviations, exp(-24.5) = 2.3e-11 of its peak.
+    const double floor = std::is_same_v<F, Exact> ? 5e-11 : 1e-37;
     for (int s = 0; s < F::kSamples; ++s) {
       float pick[16] = {};
       double pick_too[16] = {};
@@ -293,9 +393,10 @@ TYPED_TEST(FootprintTest, FloatAgreesWithDouble) {
           std::hypot(adjoint.splat.dL_dmean.x, adjoint.splat.dL_dmean.y) * (std::hypot(dd.x, dd.y) + 0.5) +
           adjoint.weighted;
       const double peak = F::alpha(F::terms(F::prepare(same, options_of<F>()), 1.0), Vec2<double>{0, 0}, 0);
-      const double exponent = kIsAnalytic<F> ? 0 : std::abs(std::log(peak)) + std::abs(std::log(adjoint.weighted));
+      const bool in_exponent = !kIsAnalytic<F> && !kIsNormal<F>;
+      const double exponent = in_exponent ? std::abs(std::log(peak)) + std::abs(std::log(adjoint.weighted)) : 0;
       ASSERT_NEAR(weight<F>(cov, d, 1.0f, pick), adjoint.weighted,
-                  kEps<float> * (12 * condition + 3 * exponent * adjoint.weighted) + 1e-37)
+                  kEps<float> * (12 * condition + 3 * exponent * adjoint.weighted) + floor)
           << s1 << " " << s2;
     }
   }

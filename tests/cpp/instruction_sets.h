@@ -14,7 +14,7 @@ namespace ar::test {
 struct PackOps {
   using Map = void (*)(const float* a, const float* b, const float* c, float* out);
   int lanes;
-  Map exp2, sqrt, abs, min, max, madd;
+  Map exp2, erfc, sqrt, abs, min, max, madd;
   Map select;  ///< a < b ? b : c
   float (*sum)(const float* a);
   uint32_t (*bits)(const float* a, const float* b);  ///< of a < b

@@ -10,6 +10,7 @@ extern const test::PackOps kPackOps;
 const test::PackOps kPackOps = {
     kLanes,
     [](const float* a, const float*, const float*, float* out) { exp2(Pack::load(a)).store(out); },
+    [](const float* a, const float*, const float*, float* out) { erfc(Pack::load(a)).store(out); },
     [](const float* a, const float*, const float*, float* out) { sqrt(Pack::load(a)).store(out); },
     [](const float* a, const float*, const float*, float* out) { abs(Pack::load(a)).store(out); },
     [](const float* a, const float* b, const float*, float* out) { min(Pack::load(a), Pack::load(b)).store(out); },

@@ -63,6 +63,24 @@ TEST_P(PackTest, Exp2IsClamped) {
   });
 }
 
+// The stated bound, relative.
+TEST_P(PackTest, ErfcIsWithinItsBound) {
+  for_each_result(GetParam().ops.erfc, ramp(-9, 9, 2000003), {}, {}, [](float x, float, float, float r) {
+    const double tail = x > 0 ? double(x) * x : 0;
+    ASSERT_NEAR(r / std::erfc(double(x)), 1, 1e-6 + 1.5e-7 * tail) << x;
+  });
+}
+
+TEST_P(PackTest, ErfcStaysInRangeBeyond) {
+  const float inf = std::numeric_limits<float>::infinity();
+  for_each_result(GetParam().ops.erfc, {9.0f, 9.5f, 20.0f, 1e6f, 1e18f, -9.0f, -20.0f, -1e18f, -inf}, {}, {},
+                  [](float x, float, float, float r) {
+                    if (x == 0) return;  // filled up
+                    ASSERT_GE(r, x > 0 ? 0 : 2 - 1e-6) << x;
+                    ASSERT_LE(r, x > 0 ? 1e-36 : 2) << x;
+                  });
+}
+
 TEST_P(PackTest, ExactOperations) {
   const PackOps& ops = GetParam().ops;
   const std::vector<float> a = randoms(1, 999), b = randoms(2, 999), c = randoms(3, 999);
@@ -121,6 +139,15 @@ TYPED_TEST(LanesTest, DifferenceOfProductsKeepsItsBound) {
     const T rest_ab = std::fma(a, b, -T(ab)), rest_cd = std::fma(c, d, -T(cd));
     const long double exact = ((long double)T(ab) - T(cd)) + ((long double)rest_ab - rest_cd);
     ASSERT_NEAR(difference_of_products(a, b, c, d), double(exact), 3 * kEps<T> * std::abs(double(exact)));
+  }
+}
+
+// Four units in the last place, where it is a normal number.
+TYPED_TEST(LanesTest, ErfcKeepsItsBound) {
+  using T = TypeParam;
+  for (double y = -6; y < (sizeof(T) == 4 ? 9.1 : 26); y += 1e-4) {
+    const T x = T(y);
+    ASSERT_NEAR(double(erfc(x) / erfcl(x)), 1, 8 * kEps<T>) << y;
   }
 }
 

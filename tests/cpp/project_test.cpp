@@ -122,8 +122,12 @@ template <class F> struct Loss {
         const double alpha = F::alpha(terms, d, s);
         ShapeGrad<double> one = {};
         F::add_alpha_vjp(terms, d, s, alpha, g[k], one);
-        if constexpr (kIsFrozen<F>) {
-          // This adjoint is deliberately not the formula's. Give it the formula's own frame term.
+        // A frozen adjoint is deliberately not the formula's. Give it the formula's own frame term.
+        if constexpr (std::is_same_v<F, Erf>) {
+          // (dI/du v - dI/dv u) / gap, whitened
+          const Vec2<double> z = transform(terms.w, d), r = splat.shape.inv_sigma;
+          one.shape.xy = (r.y / r.x * one.offset.y * z.x - r.x / r.y * one.offset.x * z.y) / (gap * r.x * r.y);
+        } else if constexpr (kIsFrozen<F>) {
           using Paper = Analytic<FrameGradient::kPaper>;
           const auto paper = Paper::terms(
               Paper::Shape<double>{splat.shape.inv_sigma, splat.shape.axis, splat.shape.mass}, splat.opacity);

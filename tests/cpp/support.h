@@ -23,9 +23,12 @@ struct FootprintName {
   template <class F> static std::string GetName(int) { return F::kName; }
 };
 
-template <class F> inline constexpr bool kIsFrozen = std::is_same_v<F, Analytic<FrameGradient::kFrozen>>;
 template <class F>
-inline constexpr bool kIsAnalytic = kIsFrozen<F> || std::is_same_v<F, Analytic<FrameGradient::kPaper>>;
+inline constexpr bool kIsAnalytic =
+    std::is_same_v<F, Analytic<FrameGradient::kFrozen>> || std::is_same_v<F, Analytic<FrameGradient::kPaper>>;
+template <class F>
+inline constexpr bool kIsFrozen = std::is_same_v<F, Analytic<FrameGradient::kFrozen>> || std::is_same_v<F, Erf>;
+template <class F> inline constexpr bool kIsNormal = std::is_same_v<F, Erf> || std::is_same_v<F, Exact>;
 template <class F> inline constexpr bool kIsCumulant = std::is_same_v<F, Cumulant>;
 
 /// The public defaults of the options.

@@ -6,6 +6,8 @@
 #include "core/footprint/analytic.h"
 #include "core/footprint/box.h"
 #include "core/footprint/cumulant.h"
+#include "core/footprint/erf.h"
+#include "core/footprint/exact.h"
 #include "core/footprint/mip.h"
 #include "core/footprint/point.h"
 
@@ -14,7 +16,7 @@ namespace ar {
 template <class... F> struct FootprintList {};
 
 using Footprints = FootprintList<Point, Mip, Analytic<FrameGradient::kFrozen>, Analytic<FrameGradient::kPaper>,
-                                 Cumulant, Box<1>, Box<2>, Box<4>, Box<8>, Box<16>>;
+                                 Cumulant, Box<1>, Box<2>, Box<4>, Box<8>, Box<16>, Erf, Exact>;
 
 /// Calls f(F{}) for the footprint whose kName is `name`; false if there is none.
 template <class Function, class... F> bool visit_footprint(std::string_view name, FootprintList<F...>, Function&& f) {

@@ -1,0 +1,91 @@
+// The window of `analytic` with the exact normal distribution in place of the logistic.
+#pragma once
+
+#include "core/footprint/gaussian.h"
+#include "core/footprint/normal.h"
+
+namespace ar {
+
+/// I = 2 pi s1 s2 [Phi]_u [Phi]_v, [Phi]_u = Phi((u + 1/2) / s1) - Phi((u - 1/2) / s1), (u, v) = d in
+/// the eigenframe of Sigma. The adjoint holds the frame fixed, as that of `analytic` does by default.
+struct Erf {
+  static constexpr const char* kName = "erf";
+  static constexpr int kSamples = 1;
+  static constexpr double kReach = 0;
+
+  /// Standard deviations below this [px] are raised to it, so that their reciprocals stay finite.
+  static constexpr double kMinSigma = 1e-9;
+
+  template <typename T> struct Shape {
+    Vec2<T> inv_sigma;  ///< along the major and the minor axis [1/px]
+    Vec2<T> axis;       ///< (cos, sin) of the major axis
+  };
+  template <typename T> struct Terms {
+    Mat2<T> w;       ///< whitening matrix, rows along the axes
+    Vec2<T> origin;  ///< whitened
+    Vec2<T> width;   ///< of the window, in standard deviations
+    T mass;          ///< opacity * s1 s2 [px^2]
+  };
+
+  AR_HD static double radius_variance(FootprintOptions) { return 0; }
+
+  template <typename T> AR_HD static Shape<T> prepare(Cov2d<T> cov, FootprintOptions) {
+    const Eigenframe<T> frame = eigenframe(cov);
+    return {{T(1) / max(frame.sigma.x, T(kMinSigma)), T(1) / max(frame.sigma.y, T(kMinSigma))}, frame.axis};
+  }
+
+  /// Ellipse of Sigma + I/12.
+  template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& g) {
+    const T w1 = widened(g.inv_sigma.x), w2 = widened(g.inv_sigma.y);
+    return {w1 * g.axis.x, w1 * g.axis.y, -w2 * g.axis.y, w2 * g.axis.x};
+  }
+
+  /// See box_excess(), which holds along either axis.
+  template <typename T> AR_HD static T level(const Shape<T>& g, T opacity) {
+    const T w1 = widened(g.inv_sigma.x), w2 = widened(g.inv_sigma.y);
+    return gaussian_level(w1 * w2 / (g.inv_sigma.x * g.inv_sigma.y), opacity) + box_excess(w1 * w1) +
+           box_excess(w2 * w2);
+  }
+
+  template <typename T> AR_HD static Terms<T> terms(const Shape<T>& g, T opacity, Vec2<T> origin = {T(0), T(0)}) {
+    const Mat2<T> w = mean_map(g);
+    return {w, transform(w, origin), g.inv_sigma, opacity / (g.inv_sigma.x * g.inv_sigma.y)};
+  }
+
+  template <typename T, class V> AR_HD static V alpha(const Terms<T>& t, Vec2<V> p, int) {
+    const Vec2<V> z = transform(t.w, p, t.origin);
+    return V(t.mass) * along(z.x, t.width.x).value * along(z.y, t.width.y).value;
+  }
+
+  /// The moments of z = w d over the window: sums as those of `point`.
+  template <typename T, class V>
+  AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> p, int, V, V dL_dalpha, ShapeGrad<V>& sums) {
+    const Vec2<V> z = transform(t.w, p, t.origin);
+    const NormalMoments<V> f = along(z.x, t.width.x), g = along(z.y, t.width.y);
+    const V scale = dL_dalpha * V(t.mass), of_f = scale * g.value, of_g = scale * f.value;
+    sums.offset = {madd(of_f, f.first, sums.offset.x), madd(of_g, g.first, sums.offset.y)};
+    sums.shape = {madd(of_f, f.second, sums.shape.xx), madd(scale * f.first, g.first, sums.shape.xy),
+                  madd(of_g, g.second, sums.shape.yy)};
+  }
+
+  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& g) {
+    const T r1 = g.inv_sigma.x, r2 = g.inv_sigma.y;
+    return {r1 * g.axis.x, r1 * g.axis.y, -r2 * g.axis.y, r2 * g.axis.x};
+  }
+
+  template <typename T> AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& g, ShapeGrad<T> sums, T) {
+    return moments_vjp(mean_map(g), sums);
+  }
+
+ private:
+  template <typename T, class V> AR_HD static NormalMoments<V> along(V z, T width) {
+    if (width <= T(0.5)) return short_interval_moments(z, V(width));
+    return interval_moments(z - V(T(0.5) * width), z + V(T(0.5) * width));
+  }
+  /// 1 / sqrt(sigma^2 + 1/12).
+  template <typename T> AR_HD static T widened(T inv_sigma) {
+    return inv_sigma / sqrt(T(1) + T(kPixelVariance) * inv_sigma * inv_sigma);
+  }
+};
+
+}  // namespace ar

@@ -1,0 +1,226 @@
+// The integral of one Gaussian over the axis-aligned unit pixel.
+#pragma once
+
+#include "core/footprint/gaussian.h"
+#include "core/footprint/normal.h"
+
+namespace ar {
+
+/// I = integral of exp(-|w d|^2 / 2) over the pixel. Both the integral and its adjoint are moments
+/// of z = w d, the average over the pixel of what `point` without dilation sums, by quadrature with
+/// positive weights (docs/numerics.md, "The exact integral").
+///
+/// z.x depends on one image axis alone, that of the larger variance; along it z.y falls at the rate
+/// `tilt`. Where the other axis is wide, given this one, a product rule over the pixel; else the
+/// other axis in closed form, and this one cut where the pixel's edges cross the Gaussian's ridge.
+struct Exact {
+  static constexpr const char* kName = "exact";
+  static constexpr int kSamples = 1;
+  static constexpr double kReach = 0;
+
+  template <typename T> struct Shape {
+    Mat2<T> w;  ///< whitening matrix of Sigma as of whiten(), the sign of its first row chosen so that tilt >= 0
+  };
+
+  template <typename T> struct Terms {
+    Mat2<T> w;
+    Vec2<T> origin;
+    T opacity;
+    bool wide_x;
+    T along, across, tilt;  ///< dz.x per pixel along the wide axis, dz.y along the other; -dz.y / dz.x
+    T crossing;             ///< half the width in z.x of the strip where an edge crosses the ridge z.y = 0
+    int panels;             ///< of such a strip
+  };
+
+  AR_HD static double radius_variance(FootprintOptions) { return kPixelVariance; }
+
+  template <typename T> AR_HD static Shape<T> prepare(Cov2d<T> cov, FootprintOptions) {
+    Mat2<T> w = whiten(cov);
+    if (slope(w) * along(w) > T(0)) {
+      w.xx = -w.xx;
+      w.xy = -w.xy;
+    }
+    return {w};
+  }
+
+  /// Ellipse of Sigma + I/12.
+  template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& g) { return whiten(widened(g)); }
+
+  /// See box_excess().
+  template <typename T> AR_HD static T level(const Shape<T>& g, T opacity) {
+    const Cov2d<T> wide = widened(g);
+    const T det = T(1) / square(along(g.w) * across(g.w));
+    return gaussian_level(sqrt(det / wide.det), opacity) + box_excess(wide.yy / wide.det) +
+           box_excess(wide.xx / wide.det);
+  }
+
+  template <typename T> AR_HD static Terms<T> terms(const Shape<T>& g, T opacity, Vec2<T> origin = {T(0), T(0)}) {
+    const T edge = along(g.w), tilt = -slope(g.w) / edge, steep = max(tilt, T(kMinTilt)), tail = T(kTail<T>);
+    // A strip is no longer than the Gaussian, the crossing or the pixel; sqrt(1 + tilt^2) is the rate
+    // at which the integrand varies along it.
+    const T length = min(T(2) * min(tail, tail / steep), abs(edge)) * sqrt(T(1) + tilt * tilt);
+    const T panels = min(max(T(1), T(1) + length / T(kPanel)), T(kMaxPanels));
+    return {g.w, origin, opacity, wide_x(g.w), edge, across(g.w), tilt, tail / steep, int(panels)};
+  }
+
+  template <typename T, class V> AR_HD static V alpha(const Terms<T>& t, Vec2<V> p, int) {
+    return V(t.opacity) * moments(t, p).value;
+  }
+
+  template <typename T, class V>
+  AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> p, int, V, V dL_dalpha, ShapeGrad<V>& sums) {
+    const Moments<V> m = moments(t, p);
+    const V g = dL_dalpha * V(t.opacity);
+    sums.offset = {madd(g, m.first.x, sums.offset.x), madd(g, m.first.y, sums.offset.y)};
+    sums.shape = {madd(g, m.second.xx, sums.shape.xx), madd(g, m.second.xy, sums.shape.xy),
+                  madd(g, m.second.yy, sums.shape.yy)};
+  }
+
+  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& g) { return g.w; }
+
+  template <typename T> AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& g, ShapeGrad<T> sums, T) {
+    return moments_vjp(g.w, sums);
+  }
+
+ private:
+  /// Integrals over the pixel [px^2] of f = exp(-|z|^2 / 2), f z and f z z^T.
+  template <class V> struct Moments {
+    V value;
+    Vec2<V> first;
+    Sym2<V> second;
+  };
+
+  /// Deviations from the ridge beyond which the Gaussian counts as zero: exp(-z^2 / 2) is 2e-11, 5e-32.
+  template <typename T> static constexpr double kTail = sizeof(T) == 4 ? 7 : 12;
+  /// Longest panel, in deviations of the integrand along it, for kManyNodes.
+  static constexpr double kPanel = 3.3;
+  /// 1 + 2 kTail sqrt(2) / kPanel.
+  static constexpr int kMaxPanels = 11;
+  /// Keeps the crossings of a ridge along the axis finite: it moves none by more than kTail * this.
+  static constexpr double kMinTilt = 1e-6;
+
+  template <typename T> AR_HD static T square(T x) { return x * x; }
+
+  // The parts of w: one entry of its first row is zero.
+  template <typename T> AR_HD static bool wide_x(const Mat2<T>& w) { return w.xx != T(0); }
+  template <typename T> AR_HD static T along(const Mat2<T>& w) { return w.xx + w.xy; }
+  template <typename T> AR_HD static T across(const Mat2<T>& w) { return wide_x(w) ? w.yy : w.yx; }
+  template <typename T> AR_HD static T slope(const Mat2<T>& w) { return wide_x(w) ? w.yx : w.yy; }
+
+  /// Sigma + I/12, as sums of squares.
+  template <typename T> AR_HD static Cov2d<T> widened(const Shape<T>& g) {
+    const T wide = T(1) / square(along(g.w)), deviation = T(1) / across(g.w);
+    const T rate = -slope(g.w) * deviation;
+    const T other = square(deviation) + rate * rate * wide;
+    const Cov2d<T> cov = {wide_x(g.w) ? wide : other, rate * wide, wide_x(g.w) ? other : wide,
+                          wide * square(deviation)};
+    return blur(cov, T(kPixelVariance));
+  }
+
+  /// Where the pixel begins and ends along an axis, seen from its point next to the mean: [-1, 0], [0, 1] or
+  /// in between [px]. From there rounding leaves the edges that matter where they are, however small or
+  /// far the Gaussian.
+  template <class V> struct Edges {
+    V begin, end;
+    AR_HD V middle() const { return V(ScalarOf<V>(0.5)) * (begin + end); }
+  };
+  template <class V> struct Pixel {
+    Vec2<V> z;  ///< that point, whitened
+    Edges<V> wide, narrow;
+  };
+
+  template <typename T, class V> AR_HD static Moments<V> moments(const Terms<T>& t, Vec2<V> p) {
+    const V half = V(T(0.5)), zero = V(T(0)), one = V(T(1));
+    const Vec2<V> d = {p.x + V(t.origin.x), p.y + V(t.origin.y)};
+    const Vec2<V> lo = {d.x - half, d.y - half}, hi = {d.x + half, d.y + half};
+    const Vec2<V> nearest = {max(lo.x, zero) + min(hi.x, zero), max(lo.y, zero) + min(hi.y, zero)};
+    const Edges<V> x = {clamp(lo.x, -one, zero), clamp(hi.x, zero, one)};
+    const Edges<V> y = {clamp(lo.y, -one, zero), clamp(hi.y, zero, one)};
+    const Pixel<V> pixel = {transform(t.w, nearest), t.wide_x ? x : y, t.wide_x ? y : x};
+    if (t.across <= T(0.5)) return by_product_rule<kFewNodes<T>>(t, pixel);
+    if (t.across <= T(2)) return by_product_rule<kManyNodes<T>>(t, pixel);
+    return by_strips(t, pixel);
+  }
+
+  template <int N, typename T, class V>
+  AR_HD static Moments<V> by_product_rule(const Terms<T>& t, const Pixel<V>& pixel) {
+    using Rule = GaussLegendre<N, T>;
+    const V zero = V(T(0)), across = V(t.across);
+    Moments<V> m = {zero, {zero, zero}, {zero, zero, zero}};
+    for (int i = 0; i < N; ++i) {
+      const V step = V(t.along) * (pixel.wide.middle() + V(Rule::node(i))), x = pixel.z.x + step;
+      const V middle = madd(across, pixel.narrow.middle(), madd(V(-t.tilt), step, pixel.z.y));
+      NormalMoments<V> line = {zero, zero, zero};
+      AR_UNROLL
+      for (int j = 0; j < N; ++j) {
+        const V y = madd(across, V(Rule::node(j)), middle), f = V(Rule::weight(j)) * normal(y);
+        line = {line.value + f, madd(f, y, line.first), madd(f * y, y, line.second)};
+      }
+      add(V(Rule::weight(i)) * normal(x), x, line, m);
+    }
+    return m;
+  }
+
+  template <typename T, class V> AR_HD static Moments<V> by_strips(const Terms<T>& t, const Pixel<V>& pixel) {
+    const V zero = V(T(0)), tail = V(T(kTail<T>)), crossing = V(t.crossing);
+    const V along = V(t.along), across = V(t.across), scale = V(T(1) / max(t.tilt, T(kMinTilt)));
+    // Steps in z.x: to two edges of the pixel, and to where the ridge crosses the other two.
+    const V edge = along * pixel.wide.begin, opposite = along * pixel.wide.end;
+    const V first = min(edge, opposite), last = max(edge, opposite);
+    const V enters = madd(across, pixel.narrow.begin, pixel.z.y) * scale;
+    const V middle = madd(across, pixel.narrow.middle(), pixel.z.y) * scale;
+    const V leaves = madd(across, pixel.narrow.end, pixel.z.y) * scale;
+    const V begin = max(max(first, -tail), clamp(enters, first, last) - crossing);
+    const V end = max(begin, min(min(last, tail), clamp(leaves, first, last) + crossing));
+    const V inside = clamp(min(enters + crossing, middle), begin, end);
+    const V outside = clamp(max(leaves - crossing, middle), begin, end);
+    Moments<V> m = {zero, {zero, zero}, {zero, zero, zero}};
+    add_strip(t, pixel, begin, inside, m);
+    add_strip(t, pixel, outside, end, m);
+    if (t.across > T(2 * kTail<T>)) {
+      // In between, the pixel holds all of the ridge's width.
+      const V from = pixel.z.x + inside, to = pixel.z.x + outside;
+      const NormalMoments<V> ridge = abs(t.along) <= T(0.5)
+                                         ? short_interval_moments(V(T(0.5)) * (from + to), outside - inside)
+                                         : interval_moments(from, to);
+      const V all = V(T(2.5066282746310005024));
+      m.value = madd(all, ridge.value, m.value);
+      m.first.x = madd(all, ridge.first, m.first.x);
+      m.second.xx = madd(all, ridge.second, m.second.xx);
+      m.second.yy = madd(all, ridge.value, m.second.yy);
+    }
+    const V area = V(T(1) / abs(t.along * t.across));
+    return {area * m.value,
+            {area * m.first.x, area * m.first.y},
+            {area * m.second.xx, area * m.second.xy, area * m.second.yy}};
+  }
+
+  /// Adds the part between two steps.
+  template <typename T, class V>
+  AR_HD static void add_strip(const Terms<T>& t, const Pixel<V>& pixel, V from, V to, Moments<V>& m) {
+    using Rule = GaussLegendre<kManyNodes<T>, T>;
+    const V length = (to - from) * V(T(1) / T(t.panels)), across = V(t.across);
+    for (int k = 0; k < t.panels; ++k) {
+      const V middle = madd(length, V(T(k) + T(0.5)), from);
+      for (int i = 0; i < kManyNodes<T>; ++i) {
+        const V step = madd(length, V(Rule::node(i)), middle), x = pixel.z.x + step;
+        const V y = madd(V(-t.tilt), step, pixel.z.y);
+        const NormalMoments<V> line =
+            interval_moments(madd(across, pixel.narrow.begin, y), madd(across, pixel.narrow.end, y));
+        add(length * V(Rule::weight(i)) * normal(x), x, line, m);
+      }
+    }
+  }
+
+  /// Adds w times the moments along the line z.x = x.
+  template <class V> AR_HD static void add(V w, V x, const NormalMoments<V>& line, Moments<V>& m) {
+    const V wx = w * x, value = wx * line.value;
+    m.value = madd(w, line.value, m.value);
+    m.first = {m.first.x + value, madd(w, line.first, m.first.y)};
+    m.second = {madd(value, x, m.second.xx), madd(wx, line.first, m.second.xy), madd(w, line.second, m.second.yy)};
+  }
+
+  template <class V> AR_HD static V clamp(V x, V lo, V hi) { return min(max(x, lo), hi); }
+};
+
+}  // namespace ar

@@ -1,0 +1,124 @@
+// What the footprints with the exact normal distribution share: Gauss-Legendre rules, moments of the
+// normal density over an interval, the eigenframe.
+#pragma once
+
+#include "core/footprint/contract.h"
+
+namespace ar {
+
+/// Gauss-Legendre rule with N nodes on [-1/2, 1/2]; the weights add up to 1. For exp(-x^2 / (2 s^2))
+/// it errs by at most (N!)^4 / ((2N + 1) (2N)! N! 2^N s^(2N)) / (2N)!.
+template <int N, typename T> struct GaussLegendre {
+  AR_HD static constexpr T node(int i) { return i < N / 2 ? -positive(N / 2 - 1 - i).x : positive(i - N / 2).x; }
+  AR_HD static constexpr T weight(int i) { return i < N / 2 ? positive(N / 2 - 1 - i).y : positive(i - N / 2).y; }
+
+ private:
+  /// Half of the node and of the weight on [-1, 1], from the centre outwards.
+  AR_HD static constexpr Vec2<T> positive(int i) {
+    static_assert(N == 4 || N == 6 || N == 8 || N == 12, "rules of 4, 6, 8 and 12 nodes");
+    if constexpr (N == 4) {
+      constexpr Vec2<T> k[] = {{T(0.3399810435848562648 / 2), T(0.65214515486254614263 / 2)},
+                               {T(0.86113631159405257522 / 2), T(0.34785484513745385737 / 2)}};
+      return k[i];
+    } else if constexpr (N == 6) {
+      constexpr Vec2<T> k[] = {{T(0.23861918608319690863 / 2), T(0.46791393457269104739 / 2)},
+                               {T(0.66120938646626451366 / 2), T(0.36076157304813860757 / 2)},
+                               {T(0.93246951420315202781 / 2), T(0.17132449237917034504 / 2)}};
+      return k[i];
+    } else if constexpr (N == 8) {
+      constexpr Vec2<T> k[] = {{T(0.18343464249564980494 / 2), T(0.36268378337836198297 / 2)},
+                               {T(0.52553240991632898582 / 2), T(0.31370664587788728734 / 2)},
+                               {T(0.79666647741362673959 / 2), T(0.22238103445337447054 / 2)},
+                               {T(0.96028985649753623168 / 2), T(0.10122853629037625915 / 2)}};
+      return k[i];
+    } else {
+      constexpr Vec2<T> k[] = {{T(0.12523340851146891547 / 2), T(0.249147045813402785 / 2)},
+                               {T(0.36783149899818019375 / 2), T(0.23349253653835480876 / 2)},
+                               {T(0.5873179542866174473 / 2), T(0.20316742672306592175 / 2)},
+                               {T(0.76990267419430468704 / 2), T(0.16007832854334622633 / 2)},
+                               {T(0.90411725637047485668 / 2), T(0.10693932599531843096 / 2)},
+                               {T(0.98156063424671925069 / 2), T(0.047175336386511827195 / 2)}};
+      return k[i];
+    }
+  }
+};
+
+/// Nodes on an interval of at most half a standard deviation, and of at most two.
+template <typename T> inline constexpr int kFewNodes = sizeof(T) == 4 ? 4 : 6;
+template <typename T> inline constexpr int kManyNodes = sizeof(T) == 4 ? 8 : 12;
+
+/// exp(-z^2 / 2).
+template <class V> AR_HD V normal(V z) {
+  using T = ScalarOf<V>;
+  return exp2(V(T(-0.5 * kLog2e)) * z * z);
+}
+
+/// Integrals of exp(-z^2 / 2), z exp(-z^2 / 2) and z^2 exp(-z^2 / 2) over an interval.
+template <class V> struct NormalMoments {
+  V value, first, second;
+};
+
+/// Over [a, b], in closed form. The differences lose digits where b - a is below 1/2.
+template <class V> AR_HD NormalMoments<V> interval_moments(V a, V b) {
+  using T = ScalarOf<V>;
+  const V zero = V(T(0)), root_half = V(T(0.70710678118654752440)), root_half_pi = V(T(1.2533141373155002512));
+  // On the side where both values of erfc are small.
+  const MaskOf<V> mirrored = a + b < zero;
+  const V lo = select(mirrored, -b, a), hi = select(mirrored, -a, b);
+  const V at_lo = normal(lo), at_hi = normal(hi), first = at_lo - at_hi;
+  const V value = root_half_pi * max(erfc(lo * root_half) - erfc(hi * root_half), zero);
+  return {value, select(mirrored, -first, first), max(madd(lo, at_lo, value - hi * at_hi), zero)};
+}
+
+/// Over [z - width / 2, z + width / 2] with width <= 1/2, by quadrature.
+template <class V> AR_HD NormalMoments<V> short_interval_moments(V z, V width) {
+  using T = ScalarOf<V>;
+  using Rule = GaussLegendre<kFewNodes<T>, T>;
+  const V zero = V(T(0));
+  NormalMoments<V> m = {zero, zero, zero};
+  AR_UNROLL
+  for (int i = 0; i < kFewNodes<T>; ++i) {
+    const V x = madd(width, V(Rule::node(i)), z), w = width * V(Rule::weight(i)) * normal(x);
+    m = {m.value + w, madd(w, x, m.first), madd(w * x, x, m.second)};
+  }
+  return m;
+}
+
+/// Gradient from the sums of g f z and g f z z^T over a pixel, f = exp(-|z|^2 / 2), z = w d: like that
+/// of `point`, f has no amplitude that depends on Sigma, so that df = f (z . w dmean + tr(w^T z z^T w dSigma) / 2).
+template <typename T> AR_HD SplatGrad<T> moments_vjp(const Mat2<T>& w, const ShapeGrad<T>& sums) {
+  const Sym2<T> half = {T(0.5) * sums.shape.xx, T(0.5) * sums.shape.xy, T(0.5) * sums.shape.yy};
+  return {transform_transposed(w, sums.offset), congruence_transposed(w, half), T(0)};
+}
+
+/// What integrating over the pixel adds at most, along one axis, to the level of the Gaussian of
+/// variance 1/t = sigma^2 + 1/12 that stands for it. At sigma = 0 the ratio of the two densities is
+/// greatest at the pixel's edge, 2 ln(sqrt(2 pi / 12) exp(3/2)) = 2.353 < 144/61, and convolving both
+/// with the splat cannot raise it: 144/61 is safe for every splat. That it falls as t^2 is checked
+/// numerically in the tests.
+template <typename T> AR_HD T box_excess(T t) { return t * t / T(61); }
+
+/// Standard deviations along the axes of a covariance, and (cos, sin) of the major one.
+template <typename T> struct Eigenframe {
+  Vec2<T> sigma;
+  Vec2<T> axis;
+};
+
+/// By the half angle, from whichever of its sine and cosine is larger, and det / l1: neither 0/0 for
+/// diagonal covariances nor a difference of eigenvalues (docs/numerics.md, "Eigenframe").
+template <typename T> AR_HD Eigenframe<T> eigenframe(Cov2d<T> cov) {
+  const T dx = cov.xx - cov.yy, dy = T(2) * cov.xy;
+  const T gap = eigenvalue_gap(cov);
+  const T major = T(0.5) * (cov.xx + cov.yy + gap);
+  Vec2<T> axis = {T(1), T(0)};
+  if (dx > T(0)) {
+    axis.x = sqrt(T(0.5) * (T(1) + dx / gap));
+    axis.y = dy / (T(2) * gap * axis.x);
+  } else if (gap > T(0)) {
+    const T sine = sqrt(T(0.5) * (T(1) - dx / gap));
+    axis = {abs(dy) / (T(2) * gap * sine), dy < T(0) ? -sine : sine};
+  }
+  return {{sqrt(major), sqrt(max(cov.det / major, T(0)))}, axis};
+}
+
+}  // namespace ar
