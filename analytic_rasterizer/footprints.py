@@ -10,7 +10,7 @@ import torch
 
 from . import _C  # loads the ops
 
-FOOTPRINTS = ("point", "mip", "analytic", "cumulant", "box", "erf", "exact")
+FOOTPRINTS = ("point", "mip", "analytic", "cumulant", "box", "adaptive", "erf", "exact")
 """Public names of the footprints, in the order of the documentation's table."""
 
 BOX_SAMPLES = (1, 2, 4, 8, 16)
@@ -23,6 +23,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "analytic": {"frame_gradient": "frozen"},
     "cumulant": {},
     "box": {"samples": 4},
+    "adaptive": {"tolerance": 1 / 255},
     "erf": {},
     "exact": {},
 }
@@ -38,13 +39,13 @@ class Footprint:
         name: One of `FOOTPRINTS`.
         options: Every option of that footprint, as a tuple of (name, value) pairs.
         key: Name of the kernel that computes it.
-        variance: Variance added to the projected covariance, px^2; 0 where there is no such option.
+        option: The number that the kernel takes: dilation, variance or tolerance; 0 where there is none.
     """
 
     name: str
     options: tuple[tuple[str, Any], ...]
     key: str
-    variance: float
+    option: float
 
     def __str__(self) -> str:
         options = ",".join(f"{k}={v}" for k, v in self.options)
@@ -72,6 +73,8 @@ def resolve_footprint(name: str, **options: Any) -> Footprint:
             mip: `variance` (px^2, default 0.1).
             analytic: `frame_gradient`, `"frozen"` (default) or `"paper"`.
             box: `samples`, 1, 2, 4 (default), 8 or 16.
+            adaptive: `tolerance`, of the image, in units of colour (default 1/255): `box` with 1, 4, 8 or 16
+                samples, chosen for every tile of 16x16 pixels.
 
     Raises:
         ValueError: Unknown name, unknown option, or a value outside its domain.
@@ -89,11 +92,11 @@ def resolve_footprint(name: str, **options: Any) -> Footprint:
             known = ", ".join(settled) or "no options"
             raise ValueError(f"options of footprint {name} must be among: {known}; got {option!r}")
         settled[option] = value
-    key, variance = name, 0.0
+    key, number = name, 0.0
     if name == "point":
-        variance = settled["dilation"] = _number("dilation", settled["dilation"])
+        number = settled["dilation"] = _number("dilation", settled["dilation"])
     elif name == "mip":
-        variance = settled["variance"] = _number("variance", settled["variance"])
+        number = settled["variance"] = _number("variance", settled["variance"])
     elif name == "analytic":
         if settled["frame_gradient"] not in FRAME_GRADIENTS:
             raise ValueError(
@@ -105,7 +108,9 @@ def resolve_footprint(name: str, **options: Any) -> Footprint:
             raise ValueError(f"samples must be one of {', '.join(map(str, BOX_SAMPLES))}, got {settled['samples']!r}")
         settled["samples"] = int(settled["samples"])
         key = f"box{settled['samples']}"
-    return Footprint(name, tuple(settled.items()), key, variance)
+    elif name == "adaptive":
+        number = settled["tolerance"] = _number("tolerance", settled["tolerance"])
+    return Footprint(name, tuple(settled.items()), key, number)
 
 
 _default: Footprint | None = None
@@ -194,5 +199,5 @@ def footprint_weight(
         ) from None
     check_device(offset.device)
     return torch.ops.analytic_rasterizer.footprint_weight(
-        offset.expand(*shape, 2), cov2d.expand(*shape, 3), spec.key, spec.variance
+        offset.expand(*shape, 2), cov2d.expand(*shape, 3), spec.key, spec.option
     )

@@ -10,7 +10,7 @@ from .footprints import BOX_SAMPLES
 TILE = 16
 """Edge of a square tile, px."""
 
-_SAMPLES = {f"box{s}": s for s in BOX_SAMPLES}
+_SAMPLES = {f"box{s}": s for s in BOX_SAMPLES} | {"adaptive": max(BOX_SAMPLES)}
 _SPLAT_WIDTH = 12
 
 
@@ -22,15 +22,17 @@ def _tiles(height: int, width: int) -> int:
 def _(
     means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
     viewmatrix, projmatrix, campos, image_height, image_width, tanfovx, tanfovy, scale_modifier,
-    sh_degree, footprint, variance, keep, debug,
+    sh_degree, footprint, option, keep, debug,
 ):  # fmt: skip
     context = torch.library.get_ctx()
     samples = _SAMPLES.get(footprint, 1) if keep else 0
     ints, longs = {"dtype": torch.int32}, {"dtype": torch.int64}
+    chosen = _tiles(image_height, image_width) if footprint == "adaptive" else 0
+    tile_samples = means3D.new_empty(chosen, **ints)
     if means3D.device.type == "cuda":
         kept = means3D.shape[0] if keep else 0
         room = context.new_dynamic_size() if keep else 0
-        checkpoints = (context.new_dynamic_size(), samples, TILE * TILE, 4) if keep else (0,)
+        checkpoints = (context.new_dynamic_size(), TILE * TILE, 4) if keep else (0,)
         return (
             means3D.new_empty(3, image_height, image_width),
             means3D.new_empty(means3D.shape[0], **ints),
@@ -45,6 +47,7 @@ def _(
             means3D.new_empty(checkpoints),
             means3D.new_empty((context.new_dynamic_size(), 3) if keep else (0,), **ints),
             means3D.new_empty(4 if keep else 0, **longs),
+            tile_samples,
         )
     splats, pairs = context.new_dynamic_size(), context.new_dynamic_size()
     return (
@@ -61,6 +64,7 @@ def _(
         means3D.new_empty(0),
         means3D.new_empty(0, **ints),
         means3D.new_empty(0, **longs),
+        tile_samples,
     )
 
 
@@ -94,10 +98,10 @@ def _(
 
 
 @torch.library.register_fake("analytic_rasterizer::footprint_weight")
-def _(offset, cov2d, footprint, variance):
+def _(offset, cov2d, footprint, option):
     return offset.new_empty(offset.shape[:-1])
 
 
 @torch.library.register_fake("analytic_rasterizer::footprint_weight_vjp")
-def _(dL_dweight, offset, cov2d, footprint, variance):
+def _(dL_dweight, offset, cov2d, footprint, option):
     return offset.new_empty(offset.shape), cov2d.new_empty(cov2d.shape)

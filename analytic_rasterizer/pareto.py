@@ -513,7 +513,7 @@ def _family_look(members: list[dict]) -> dict:
         return report.style("box:samples=4" if many else members[0]["footprint"])
     look = {**report.style(members[0]["footprint"]), "marker": "X"}
     if members[0]["footprint"].startswith("point"):
-        look["color"] = "#adb5bd" if resolve_footprint(members[0]["footprint"]).variance else "#343a40"
+        look["color"] = "#adb5bd" if resolve_footprint(members[0]["footprint"]).option else "#343a40"
     return look
 
 

@@ -115,7 +115,7 @@ def _settings_arguments(settings: GaussianRasterizationSettings, device: torch.d
     return (
         s.bg, s.viewmatrix, s.projmatrix, s.campos, int(s.image_height), int(s.image_width),
         float(s.tanfovx), float(s.tanfovy), float(s.scale_modifier), int(s.sh_degree),
-        footprint.key, footprint.variance,
+        footprint.key, footprint.option,
     )  # fmt: skip
 
 

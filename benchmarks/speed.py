@@ -148,7 +148,7 @@ class SpeedCase(Case):
         super().__init__(scene, view, footprint)
         footprint = self.settings.footprint
         given = {**self.gaussians, **self.settings._asdict(), "footprint": footprint.key, "keep": False}
-        given["variance"] = footprint.variance
+        given["option"] = footprint.option
         schema = torch.ops.analytic_rasterizer.rasterize.default._schema
         self.op_arguments = [given.get(argument.name) for argument in schema.arguments]
 

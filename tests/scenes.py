@@ -16,6 +16,7 @@ VARIANTS = [
     ("analytic", {"frame_gradient": "paper"}),
     ("cumulant", {}),
     *[("box", {"samples": samples}) for samples in (1, 2, 4, 8, 16)],
+    ("adaptive", {"tolerance": 1 / 255}),
     ("erf", {}),
     ("exact", {}),
 ]
@@ -26,6 +27,7 @@ KINDS = [
     ("analytic", {}),
     ("cumulant", {}),
     ("box", {"samples": 4}),
+    ("adaptive", {}),
     ("erf", {}),
     ("exact", {}),
 ]
@@ -239,6 +241,18 @@ def to(named, device):
 def settings_to(settings, device):
     """ar.GaussianRasterizationSettings with their tensors on another device."""
     return settings._replace(**to(settings._asdict(), device))
+
+
+def tile_samples(settings, scene):
+    """What `adaptive` chooses (tile rows, tile columns), by the op itself."""
+
+    footprint = settings.footprint
+    numbers = [settings.image_height, settings.image_width, settings.tanfovx, settings.tanfovy]
+    numbers += [settings.scale_modifier, settings.sh_degree, footprint.key, footprint.option]
+    tensors = [settings.bg, settings.viewmatrix, settings.projmatrix, settings.campos]
+    gaussians = [None if scene.get(name) is None else scene[name].detach() for name in INPUTS]
+    chosen = torch.ops.analytic_rasterizer.rasterize(*gaussians, *tensors, *numbers, False, False)[-1]
+    return chosen.reshape(-(-settings.image_height // 16), -1).cpu()
 
 
 def leaves(scene):

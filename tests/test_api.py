@@ -707,7 +707,7 @@ def op_arguments(variant, device, keep, gradient):
     gaussians = [scene.get(name) for name in scenes.INPUTS]
     tensors = [fields[k] for k in ("bg", "viewmatrix", "projmatrix", "campos")]
     numbers = [fields[k] for k in ("image_height", "image_width", "tanfovx", "tanfovy")]
-    numbers += [fields["scale_modifier"], fields["sh_degree"], footprint.key, footprint.variance]
+    numbers += [fields["scale_modifier"], fields["sh_degree"], footprint.key, footprint.option]
     return [*gaussians, *tensors, *numbers, keep, False]
 
 
@@ -735,7 +735,7 @@ def weight_arguments(variant, device, gradient):
     g = torch.Generator().manual_seed(0)
     offset = scenes.rand(g, 7, 2).float().to(device).requires_grad_(gradient)
     cov2d = scenes.random_cov2d(g, 7, (0.5, 2.0)).float().to(device).requires_grad_(gradient)
-    return [offset, cov2d, footprint.key, footprint.variance]
+    return [offset, cov2d, footprint.key, footprint.option]
 
 
 def test_every_op_is_checked():

@@ -7,6 +7,8 @@
 
 #include "core/bin.h"
 #include "core/blend.h"
+#include "core/choose.h"
+#include "core/footprint/registry.h"
 #include "cpu/pack.h"
 #include "cpu/parallel.h"
 #include "cpu/tasks.h"
@@ -154,8 +156,35 @@ template <class F, typename T> void blend_tile(const cpu::BlendTask<T>& task, in
   }
 }
 
+/// Calls f(F{}) for what a tile is blended with: F itself, or for `adaptive` what was chosen.
+template <class F, class Function> void visit_tile_footprint(const int32_t* tile_samples, int64_t tile, Function&& f) {
+  if constexpr (std::is_same_v<F, Adaptive>) {
+    visit_samples(tile_samples[tile], AdaptiveBoxes{}, f);
+  } else {
+    f(F{});
+  }
+}
+
+template <class F, typename T> void choose(const cpu::ChooseTask<T>& task) {
+  const auto* splats = reinterpret_cast<const Splat<F, T>*>(task.splats);
+  const SampleLimits<T> limits = sample_limits<T>(task.options.tolerance);
+  cpu::parallel_for(task.grid.tiles(), task.threads, [&](int64_t tile) {
+    const Vec2<T> center = tile_center<T>(task.grid, tile);
+    SampleEstimate<T> estimate;
+    for (int64_t k = task.tile_offsets[tile]; k < task.tile_offsets[tile + 1] && !estimate.dark(); ++k) {
+      const Splat<F, T>& splat = splats[task.pairs[k]];
+      const Vec2<T> d = {center.x - splat.mean.x, center.y - splat.mean.y};
+      estimate.add(tile_share(splat.shape, splat.opacity, d), splat.color);
+    }
+    task.tile_samples[tile] =
+        limits.choose(estimate.value({task.background[0], task.background[1], task.background[2]}));
+  });
+}
+
 template <class F, typename T> void blend(const cpu::BlendTask<T>& task) {
-  cpu::parallel_for(task.grid.tiles(), task.threads, [&](int64_t tile) { blend_tile<F, T>(task, tile); });
+  cpu::parallel_for(task.grid.tiles(), task.threads, [&](int64_t tile) {
+    visit_tile_footprint<F>(task.tile_samples, tile, [&](auto f) { blend_tile<decltype(f), T>(task, tile); });
+  });
 }
 
 template <class F, typename T, bool kAbs> void blend_vjp_tile(const cpu::BlendVjpTask<T>& task, int64_t tile) {
@@ -233,21 +262,24 @@ template <class F, typename T, bool kAbs> void blend_vjp_tile(const cpu::BlendVj
         }
       }
     }
+    const ShapeGrad<T> total = {{sum(shape.offset.x), sum(shape.offset.y)},
+                                {sum(shape.shape.xx), sum(shape.shape.xy), sum(shape.shape.yy)}};
+    const T total_weighted = sum(weighted);
     task.pair_grads[begin + k] = {
-        {{sum(shape.offset.x), sum(shape.offset.y)}, {sum(shape.shape.xx), sum(shape.shape.xy), sum(shape.shape.yy)}},
-        sum(weighted),
-        {sum(color.x), sum(color.y), sum(color.z)}};
+        F::collect(terms, total, total_weighted), total_weighted, {sum(color.x), sum(color.y), sum(color.z)}};
     if (kAbs) task.pair_abs[begin + k] = {sum(abs2d.x), sum(abs2d.y)};
   }
 }
 
 template <class F, typename T> void blend_vjp(const cpu::BlendVjpTask<T>& task) {
   cpu::parallel_for(task.grid.tiles(), task.threads, [&](int64_t tile) {
-    if (task.pair_abs) {
-      blend_vjp_tile<F, T, true>(task, tile);
-    } else {
-      blend_vjp_tile<F, T, false>(task, tile);
-    }
+    visit_tile_footprint<F>(task.tile_samples, tile, [&](auto f) {
+      if (task.pair_abs) {
+        blend_vjp_tile<decltype(f), T, true>(task, tile);
+      } else {
+        blend_vjp_tile<decltype(f), T, false>(task, tile);
+      }
+    });
   });
 }
 

@@ -9,9 +9,17 @@
 
 namespace ar::AR_ISA {
 
+template <class F, typename T> constexpr auto choose_stage() -> decltype(cpu::Stages<T>::choose) {
+  if constexpr (std::is_same_v<F, Adaptive>) {
+    return choose<F, T>;
+  } else {
+    return nullptr;
+  }
+}
+
 template <class F, typename T>
 inline constexpr cpu::Stages<T> kStages = {
-    F::kSamples, count_candidates<T>, project<F, T>,     count_pairs<F, T>, scatter_pairs<F, T>,
+    F::kSamples, count_candidates<T>, project<F, T>,     count_pairs<F, T>, scatter_pairs<F, T>, choose_stage<F, T>(),
     blend<F, T>, blend_vjp<F, T>,     project_vjp<F, T>, weight<F, T>,      weight_vjp<F, T>,
 };
 

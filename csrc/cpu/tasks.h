@@ -44,16 +44,28 @@ template <typename T> struct BinTask {
   int64_t parts;
 };
 
+template <typename T> struct ChooseTask {
+  const T* splats;
+  const int32_t* pairs;
+  const int64_t* tile_offsets;
+  TileGrid grid;
+  int threads;
+  const T* background;
+  FootprintOptions options;
+  int32_t* tile_samples;  ///< [tiles]
+};
+
 template <typename T> struct BlendTask {
   const T* splats;
   const int32_t* pairs;
   const int64_t* tile_offsets;
   TileGrid grid;
   int threads;
-  const T* background;  ///< [3]
-  T* image;             ///< [3, height, width]
-  T* transmittance;     ///< [samples, height, width], or null
-  int32_t* last;        ///< [samples, height, width] pairs of the tile up to the last one composited, or null
+  const int32_t* tile_samples;  ///< [tiles] samples in use, or null: all
+  const T* background;          ///< [3]
+  T* image;                     ///< [3, height, width]
+  T* transmittance;             ///< [samples, height, width], or null
+  int32_t* last;                ///< [samples, height, width] pairs of the tile up to the last one composited, or null
 };
 
 template <typename T> struct BlendVjpTask {
@@ -62,6 +74,7 @@ template <typename T> struct BlendVjpTask {
   const int64_t* tile_offsets;
   TileGrid grid;
   int threads;
+  const int32_t* tile_samples;
   const T* background;
   const T* transmittance;
   const int32_t* last;
@@ -95,6 +108,7 @@ template <typename T> struct Stages {
   void (*project)(const ProjectTask<T>&);
   void (*count_pairs)(BinTask<T>&);
   void (*scatter_pairs)(BinTask<T>&);
+  void (*choose)(const ChooseTask<T>&);  ///< null where all tiles have the same samples
   void (*blend)(const BlendTask<T>&);
   void (*blend_vjp)(const BlendVjpTask<T>&);
   void (*project_vjp)(const ProjectVjpTask<T>&);

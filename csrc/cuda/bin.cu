@@ -119,11 +119,15 @@ __device__ int list_length(const TileLists& lists, int64_t tile) {
   return int(lists.tile_offsets[tile + 1] - lists.tile_offsets[tile]);
 }
 
+__device__ int samples_of(const TileLists& lists, int64_t tile, int most) {
+  return lists.tile_samples ? lists.tile_samples[tile] : most;
+}
+
 __global__ void __launch_bounds__(kPlanThreads)
-    count_work_kernel(const TileLists lists, int64_t tiles, int length, PlanCounters* counters) {
+    count_work_kernel(const TileLists lists, int64_t tiles, int samples, PlanCounters* counters) {
   const int64_t tile = int64_t(blockIdx.x) * kPlanThreads + threadIdx.x;
   if (tile >= tiles) return;
-  const int n = list_length(lists, tile);
+  const int n = list_length(lists, tile), length = chunk_length(samples_of(lists, tile, samples));
   WorkClasses::take(counters->tile_sizes, n);
   if (n >= length) atomicAdd(&counters->chunk_sizes[WorkClasses::of(length)], n / length);
   if (n % length) WorkClasses::take(counters->chunk_sizes, n % length);
@@ -131,7 +135,7 @@ __global__ void __launch_bounds__(kPlanThreads)
 
 /// Places come from atomics: which tile gets which differs from run to run, and changes no result.
 __global__ void __launch_bounds__(kPlanThreads)
-    plan_kernel(const TileLists lists, int64_t tiles, int length, PlanCounters* counters, const ChunkPlan plan,
+    plan_kernel(const TileLists lists, TileGrid grid, int most_samples, PlanCounters* counters, const ChunkPlan plan,
                 int64_t* feedback) {
   __shared__ int tile_base[WorkClasses::kCount], chunk_base[WorkClasses::kCount];
   if (threadIdx.x < 2) {
@@ -149,12 +153,13 @@ __global__ void __launch_bounds__(kPlanThreads)
   }
   __syncthreads();
   const int64_t tile = int64_t(blockIdx.x) * kPlanThreads + threadIdx.x;
-  if (tile >= tiles) return;
+  if (tile >= grid.tiles()) return;
+  const int samples = samples_of(lists, tile, most_samples), length = chunk_length(samples);
   const int n = list_length(lists, tile), whole = n / length, chunks = (n + length - 1) / length;
   plan.tile_order[tile_base[WorkClasses::of(n)] + WorkClasses::take(counters->tile_places, n)] = int32_t(tile);
-  const int checkpoint = chunks > 1 ? atomicAdd(&lists.counts->checkpoints, chunks) : 0;
-  plan.checkpoint_offsets[tile] = checkpoint;
-  const auto part = [&](int chunk) { return TileChunk{int32_t(tile), chunk, checkpoint + chunk}; };
+  const int plane = chunks > 1 ? atomicAdd(&lists.counts->planes, chunks * samples) : 0;
+  plan.tile_planes[tile] = plane;
+  const auto part = [&](int chunk) { return TileChunk{int32_t(tile), chunk, plane + chunk * samples}; };
   if (whole > 0) {
     const int c = WorkClasses::of(length);
     TileChunk* order = plan.chunk_order + chunk_base[c] + atomicAdd(&counters->chunk_places[c], whole);
@@ -164,9 +169,10 @@ __global__ void __launch_bounds__(kPlanThreads)
     const int c = WorkClasses::of(n % length);
     plan.chunk_order[chunk_base[c] + WorkClasses::take(counters->chunk_places, n % length)] = part(whole);
   }
-  if (chunks > plan.front) {
-    TileChunk* rest = plan.rest + atomicAdd(&lists.counts->rest, chunks - plan.front);
-    for (int chunk = plan.front; chunk < chunks; ++chunk) rest[chunk - plan.front] = part(chunk);
+  const int front = front_chunks(grid, samples);
+  if (chunks > front) {
+    TileChunk* rest = plan.rest + atomicAdd(&lists.counts->rest, chunks - front);
+    for (int chunk = front; chunk < chunks; ++chunk) rest[chunk - front] = part(chunk);
   }
 }
 
@@ -243,10 +249,9 @@ void sort_by_tile(const TileSort<SlotPair>& task, TileGrid grid, void* scratch, 
 void plan_chunks(const TileLists& lists, TileGrid grid, int samples, const ChunkPlan& plan, int64_t* feedback,
                  cudaStream_t stream) {
   const int64_t tiles = grid.tiles();
-  const int length = chunk_length(samples);
   auto* counters = reinterpret_cast<PlanCounters*>(plan.counters);
-  count_work_kernel<<<blocks_of(tiles, kPlanThreads), kPlanThreads, 0, stream>>>(lists, tiles, length, counters);
-  plan_kernel<<<blocks_of(tiles, kPlanThreads), kPlanThreads, 0, stream>>>(lists, tiles, length, counters, plan,
+  count_work_kernel<<<blocks_of(tiles, kPlanThreads), kPlanThreads, 0, stream>>>(lists, tiles, samples, counters);
+  plan_kernel<<<blocks_of(tiles, kPlanThreads), kPlanThreads, 0, stream>>>(lists, grid, samples, counters, plan,
                                                                            feedback);
 }
 

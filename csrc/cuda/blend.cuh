@@ -16,6 +16,8 @@
 
 #include "core/bin.h"
 #include "core/blend.h"
+#include "core/footprint/registry.h"
+#include "cuda/side_streams.h"
 #include "cuda/tasks.h"
 #include "cuda/warp.cuh"
 
@@ -179,12 +181,17 @@ template <class F> struct Stage {
   }
 };
 
+/// Whether a tile is blended with S samples.
+template <int S> __device__ bool has_samples(const TileLists& lists, int tile) {
+  return !lists.tile_samples || lists.tile_samples[tile] == S;
+}
+
 /// Checkpoints of a thread's pixel.
 template <int S> struct PixelCheckpoints {
   Checkpoint* base;  // of the tile's first
 
   __device__ PixelCheckpoints(const BlendTask& task, int tile, int pixel)
-      : base(task.checkpoints + int64_t(task.plan.checkpoint_offsets[tile]) * S * kTilePixels + pixel) {}
+      : base(task.checkpoints + int64_t(task.plan.tile_planes[tile]) * kTilePixels + pixel) {}
   __device__ Checkpoint& at(int chunk, int s) const { return base[(int64_t(chunk) * S + s) * kTilePixels]; }
 };
 
@@ -240,11 +247,12 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 1             ? 1
   constexpr int S = F::kSamples, kLength = chunk_length(S), kColors = kKeep ? S : 1;
   __shared__ Stage<F> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.lists.splats);
-  const int tile = task.plan.tile_order[blockIdx.x], warp = threadIdx.x / 32;
+  const int tile = task.plan.tile_order[blockIdx.x], warp = threadIdx.x / 32, front_length = front_chunks(task.grid, S);
+  if (!has_samples<S>(task.lists, tile)) return;
   const TileList list = list_of(task.lists, task.grid, tile);
   const Vec2<float> p = pixel_of(warp, lane_id());
   const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
-  const int front = list.overflow ? list.count : min(list.count, task.plan.front * kLength);
+  const int front = list.overflow ? list.count : min(list.count, front_length * kLength);
   const bool several = !list.overflow && list.count > kLength;
   const PixelCheckpoints<S> checkpoints(task, tile, threadIdx.x);
   PixelState<S, kColors> state;
@@ -285,7 +293,7 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 1             ? 1
   if (!kKeep) {
 #pragma unroll
     for (int s = 0; s < S; ++s) {
-      checkpoints.at(task.plan.front - 1, s) = {s == 0 ? total : Vec3<float>{0, 0, 0}, state.transmittance[s]};
+      checkpoints.at(front_length - 1, s) = {s == 0 ? total : Vec3<float>{0, 0, 0}, state.transmittance[s]};
     }
   }
 }
@@ -299,7 +307,7 @@ template <class F> __global__ void __launch_bounds__(kBlendThreads) rest_through
   const int items = task.lists.counts->rest;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const TileChunk rest = task.plan.rest[item];
-    if (!task.tile_open[rest.tile]) continue;
+    if (!has_samples<S>(task.lists, rest.tile) || !task.tile_open[rest.tile]) continue;
     const TileList list = list_of(task.lists, task.grid, rest.tile);
     const int end = min(list.count, (rest.chunk + 1) * kLength);
     float transmittance[S];
@@ -332,9 +340,11 @@ template <int S> __global__ void __launch_bounds__(kTilePixels) rest_scan_kernel
   const int items = task.lists.counts->open_tiles * S;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const int tile = task.open_tiles[item / S], s = item % S, chunks = chunks_of(task, tile, chunk_length(S));
+    if (!has_samples<S>(task.lists, tile)) continue;
     const PixelCheckpoints<S> checkpoints(task, tile, threadIdx.x);
-    float transmittance = checkpoints.at(task.plan.front - 1, s).transmittance;
-    for (int first = task.plan.front; first < chunks; first += kBatch) {
+    const int front = front_chunks(task.grid, S);
+    float transmittance = checkpoints.at(front - 1, s).transmittance;
+    for (int first = front; first < chunks; first += kBatch) {
       float through[kBatch];
 #pragma unroll
       for (int k = 0; k < kBatch; ++k) {
@@ -362,7 +372,7 @@ __global__ void __launch_bounds__(kBlendThreads) rest_blend_kernel(const BlendTa
   const int items = task.lists.counts->rest;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const TileChunk rest = task.plan.rest[item];
-    if (!task.tile_open[rest.tile]) continue;
+    if (!has_samples<S>(task.lists, rest.tile) || !task.tile_open[rest.tile]) continue;
     const TileList list = list_of(task.lists, task.grid, rest.tile);
     const int end = min(list.count, (rest.chunk + 1) * kLength);
     const PixelCheckpoints<S> checkpoints(task, rest.tile, threadIdx.x);
@@ -402,6 +412,7 @@ template <int S, bool kKeep> __global__ void __launch_bounds__(kTilePixels) rest
   const int items = task.lists.counts->open_tiles;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const int tile = task.open_tiles[item], chunks = chunks_of(task, tile, chunk_length(S));
+    if (!has_samples<S>(task.lists, tile)) continue;
     const PixelCheckpoints<S> checkpoints(task, tile, threadIdx.x);
     Vec3<float> color = {0, 0, 0};
     float transmittance[S];
@@ -409,7 +420,7 @@ template <int S, bool kKeep> __global__ void __launch_bounds__(kTilePixels) rest
     for (int s = 0; s < S; ++s) {
       float last = -1;
 #pragma unroll 16
-      for (int c = kKeep ? 0 : task.plan.front - 1; c < chunks; ++c) {
+      for (int c = kKeep ? 0 : front_chunks(task.grid, S) - 1; c < chunks; ++c) {
         const Checkpoint checkpoint = checkpoints.at(c, s);
         color += checkpoint.color;
         if (checkpoint.transmittance != 0) last = checkpoint.transmittance;
@@ -434,12 +445,31 @@ template <class F, bool kKeep> void blend_kernels(const BlendTask& task, cudaStr
   rest_blend_kernel<F, kKeep><<<kRestBlocks, kBlendThreads, 0, stream>>>(task);
   rest_sum_kernel<S, kKeep><<<kRestBlocks, kTilePixels, 0, stream>>>(task);
 }
-template <class F> void blend(const BlendTask& task, cudaStream_t stream) {
+template <class F> void blend_tiles(const BlendTask& task, cudaStream_t stream) {
   if (task.transmittance) {
     blend_kernels<F, true>(task, stream);
   } else {
     blend_kernels<F, false>(task, stream);
   }
+}
+
+/// Calls f(F{}, stream) for every footprint that tiles of F are blended with: those of `adaptive` side by
+/// side, as a few tiles of many samples would else keep the device waiting.
+/// Not ready: the rest kernels of one footprint read open_tiles while another's front kernel appends to it. Each
+/// needs a list of its own before ops_cuda.cpp may let `adaptive` through.
+template <class F, class Function> void for_each_tile_footprint(cudaStream_t stream, Function&& f) {
+  if constexpr (std::is_same_v<F, Adaptive>) {
+    SideStreams sides(stream);
+    int k = 0;
+    for_each_footprint(AdaptiveBoxes{}, [&](auto tile_footprint) { f(tile_footprint, sides.stream(k++)); });
+    sides.join();
+  } else {
+    f(F{}, stream);
+  }
+}
+
+template <class F> void blend(const BlendTask& task, cudaStream_t stream) {
+  for_each_tile_footprint<F>(stream, [&](auto f, cudaStream_t side) { blend_tiles<decltype(f)>(task, side); });
 }
 
 /// A warp's share of shared memory in blend_vjp: a tile's pixels and a group of splats.
@@ -474,10 +504,11 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F>, kVjpBlocks<F>) blend_vjp_ke
   const int lane = lane_id();
   const int64_t item = int64_t(blockIdx.x) * kVjpWarps<F> + threadIdx.x / 32;
   if (item >= task.lists.counts->chunks) return;
-  const auto [tile, chunk, checkpoint] = task.chunk_order[item];
+  const auto [tile, chunk, plane] = task.chunk_order[item];
+  if (!has_samples<S>(task.lists, tile)) return;
   const TileList list = list_of(task.lists, task.grid, tile);
   const int begin = chunk * kLength, end = list.overflow ? list.count : min(list.count, begin + kLength);
-  const int64_t plane = int64_t(task.grid.width) * task.grid.height;
+  const int64_t image = int64_t(task.grid.width) * task.grid.height;
   const auto pixel_index = [&](int b) {  // in the image; -1 outside
     const Vec2<float> p = pixel_of(b, lane);
     const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
@@ -490,7 +521,7 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F>, kVjpBlocks<F>) blend_vjp_ke
     const int64_t i = pixel_index(b);
     int last = 0;
 #pragma unroll
-    for (int s = 0; s < S; ++s) last = max(last, i < 0 ? 0 : task.last[s * plane + i]);
+    for (int s = 0; s < S; ++s) last = max(last, i < 0 ? 0 : task.last[s * image + i]);
     subtile_last[b] = warp_max(last);
     tile_last = max(tile_last, subtile_last[b]);
   }
@@ -504,21 +535,21 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F>, kVjpBlocks<F>) blend_vjp_ke
   if (begin >= tile_last) return;
 
   const bool final = tile_last <= end;
-  const Checkpoint* checkpoints = task.checkpoints + int64_t(checkpoint) * S * kTilePixels;
+  const Checkpoint* checkpoints = task.checkpoints + int64_t(plane) * kTilePixels;
 #pragma unroll
   for (int b = 0; b < kSubtiles; ++b) {
     const int64_t i = pixel_index(b);
     const int q = b * 32 + lane;
     const float scale = i < 0 ? 0 : 1.0f / S;
     const int64_t j = max(i, int64_t(0));
-    const Vec3<float> g = {scale * task.dL_dimage[j], scale * task.dL_dimage[plane + j],
-                           scale * task.dL_dimage[2 * plane + j]};
+    const Vec3<float> g = {scale * task.dL_dimage[j], scale * task.dL_dimage[image + j],
+                           scale * task.dL_dimage[2 * image + j]};
 #pragma unroll
     for (int s = 0; s < S; ++s) {
-      const int last = i < 0 ? 0 : task.last[s * plane + i];
+      const int last = i < 0 ? 0 : task.last[s * image + i];
       float transmittance = 1, behind = 0;
       if (final) {
-        transmittance = i < 0 ? 1.0f : task.transmittance[s * plane + i];
+        transmittance = i < 0 ? 1.0f : task.transmittance[s * image + i];
         behind = g.x * task.background[0] + g.y * task.background[1] + g.z * task.background[2];
       } else {
         const Checkpoint c = checkpoints[s * kTilePixels + q];
@@ -593,6 +624,7 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F>, kVjpBlocks<F>) blend_vjp_ke
           abs2d = abs2d + Vec2<float>{abs(by_mean.x), abs(by_mean.y)};
         }
       }
+      shape = F::collect(splat.terms, shape, weighted);
       const float values[9] = {shape.offset.x, shape.offset.y, shape.shape.xx, shape.shape.xy, shape.shape.yy,
                                weighted,       color.x,        color.y,        color.z};
       const float sum = sum_nine(values);
@@ -626,15 +658,17 @@ template <class F, bool kAbs> void launch_blend_vjp(const BlendVjpTask& task, cu
   const size_t bytes = sizeof(VjpStage<F>) * kVjpWarps<F>;
   if (bytes > 48 * 1024)
     cudaFuncSetAttribute(blend_vjp_kernel<F, kAbs>, cudaFuncAttributeMaxDynamicSharedMemorySize, int(bytes));
-  clear_splat_grads_kernel<F><<<kRestBlocks, kBlendThreads, 0, stream>>>(task);
   blend_vjp_kernel<F, kAbs><<<blocks_of(task.max_chunks, kVjpWarps<F>), 32 * kVjpWarps<F>, bytes, stream>>>(task);
 }
 template <class F> void blend_vjp(const BlendVjpTask& task, cudaStream_t stream) {
-  if (task.absolute) {
-    launch_blend_vjp<F, true>(task, stream);
-  } else {
-    launch_blend_vjp<F, false>(task, stream);
-  }
+  clear_splat_grads_kernel<F><<<kRestBlocks, kBlendThreads, 0, stream>>>(task);
+  for_each_tile_footprint<F>(stream, [&](auto f, cudaStream_t side) {
+    if (task.absolute) {
+      launch_blend_vjp<decltype(f), true>(task, side);
+    } else {
+      launch_blend_vjp<decltype(f), false>(task, side);
+    }
+  });
 }
 
 }  // namespace ar::cuda

@@ -2,13 +2,22 @@
 #include "core/footprint/registry.h"
 #include "cuda/bin.cuh"
 #include "cuda/blend.cuh"
+#include "cuda/choose.cuh"
 #include "cuda/project.cuh"
 #include "cuda/weight.cuh"
 
 namespace ar::cuda {
 
+template <class F> constexpr auto choose_stage() -> decltype(ForwardStages::choose) {
+  if constexpr (std::is_same_v<F, Adaptive>) {
+    return choose<F>;
+  } else {
+    return nullptr;
+  }
+}
+
 template <class F>
-inline constexpr ForwardStages kForward = {F::kSamples, project<F>,       emit_pairs<F>,
+inline constexpr ForwardStages kForward = {F::kSamples, project<F>,       emit_pairs<F>,    choose_stage<F>(),
                                            blend<F>,    weight<F, float>, weight<F, double>};
 
 const ForwardStages* find_forward(std::string_view footprint) {

@@ -26,7 +26,7 @@ inline constexpr int chunk_length(int samples) { return samples <= 4 ? 256 : 64 
 /// Chunks of a tile that blend goes through one after the other, which reads no pair behind the point
 /// where all pixels have stopped. The rest is blended side by side. With many tiles there is enough to
 /// do side by side; with few, a long list must not keep a single block busy.
-inline int front_chunks(TileGrid grid, int samples) {
+AR_HD int front_chunks(TileGrid grid, int samples) {
   const int pairs = grid.tiles() >= 2048 ? 2048 : 256;
   return pairs > chunk_length(samples) ? pairs / chunk_length(samples) : 1;
 }
@@ -46,9 +46,9 @@ struct alignas(8) SlotPair {
 
 /// What the device finds out.
 struct Counts {
-  int64_t pairs, splats;              ///< splats: with pairs
-  int32_t chunks, checkpoints, rest;  ///< of the plan
-  int32_t open_tiles;                 ///< that the front chunks left with an open sample and pairs
+  int64_t pairs, splats;         ///< splats: with pairs
+  int32_t chunks, planes, rest;  ///< of the plan
+  int32_t open_tiles;            ///< that the front chunks left with an open sample and pairs
 };
 
 /// Color and transmittance of a pixel's sample at the end of a chunk.
@@ -90,23 +90,30 @@ struct TileLists {
   const int32_t* order;         ///< [counts->splats] all splats with pairs by depth
   Counts* counts;
   int64_t n, capacity;
+  int32_t* tile_samples;  ///< [tiles] samples in use, or null: all
 };
 
 inline constexpr int kPlanCounters = 4 * 33;
 
 struct TileChunk {
   int32_t tile, chunk;
-  int32_t checkpoint;  ///< place of the chunk's checkpoint, if the tile has several chunks
+  int32_t plane;  ///< place of its first checkpoint plane, if the tile has several chunks
+};
+
+struct ChooseTask {
+  TileLists lists;
+  TileGrid grid;
+  const float* background;
+  FootprintOptions options;
 };
 
 /// How the lists are cut into chunks, and in which order work is begun; made by plan_chunks.
 struct ChunkPlan {
-  int front;                    ///< front_chunks
-  TileChunk* chunk_order;       ///< [counts->chunks]
-  int32_t* tile_order;          ///< [tiles]
-  int32_t* checkpoint_offsets;  ///< [tiles] place of a tile's first checkpoint, if it has several chunks
-  TileChunk* rest;              ///< [counts->rest] chunks behind the front ones
-  int32_t* counters;            ///< [kPlanCounters] scratch, zero
+  TileChunk* chunk_order;  ///< [counts->chunks]
+  int32_t* tile_order;     ///< [tiles]
+  int32_t* tile_planes;    ///< [tiles] place of a tile's first checkpoint plane, if it has several chunks
+  TileChunk* rest;         ///< [counts->rest] chunks behind the front ones
+  int32_t* counters;       ///< [kPlanCounters] scratch, zero
 };
 
 struct BlendTask {
@@ -116,7 +123,7 @@ struct BlendTask {
   const float* background;  ///< [3]
   int32_t* tile_open;       ///< [tiles] whether the tile is one of the open ones
   int32_t* open_tiles;      ///< [counts->open_tiles]
-  Checkpoint* checkpoints;  ///< [checkpoints, samples, 256]
+  Checkpoint* checkpoints;  ///< [planes, 256]: a plane per chunk and sample
   float* image;             ///< [3, height, width]
   float* transmittance;     ///< [samples, height, width], or null without backward pass
   int32_t* last;            ///< [samples, height, width], or null; the splats up to which a sample composited
@@ -151,6 +158,7 @@ struct ForwardStages {
   int samples;
   void (*project)(const ProjectTask&, cudaStream_t);
   void (*emit_pairs)(const EmitTask&, cudaStream_t);
+  void (*choose)(const ChooseTask&, cudaStream_t);  ///< null where all tiles have the same samples
   void (*blend)(const BlendTask&, cudaStream_t);
   void (*weight_float)(const WeightTask<float>&, cudaStream_t);
   void (*weight_double)(const WeightTask<double>&, cudaStream_t);

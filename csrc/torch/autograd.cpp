@@ -18,12 +18,12 @@ struct Settings {
   double tanfovx, tanfovy, scale_modifier;
   int64_t sh_degree;
   std::string footprint;
-  double variance;
+  double option;
   bool debug;
 
   void save(AutogradContext* ctx) const {
     ctx->saved_data["ints"] = std::vector<int64_t>{image_height, image_width, sh_degree};
-    ctx->saved_data["doubles"] = std::vector<double>{tanfovx, tanfovy, scale_modifier, variance};
+    ctx->saved_data["doubles"] = std::vector<double>{tanfovx, tanfovy, scale_modifier, option};
     ctx->saved_data["footprint"] = footprint;
     ctx->saved_data["debug"] = debug;
   }
@@ -53,7 +53,7 @@ using RasterizeVjpSignature = Grads(const Tensor&, const Tensor&, const Optional
                                     const Tensor&, const Tensor&, int64_t, int64_t, double, double, double, int64_t,
                                     std::string, double, const Tensor&, const Tensor&, const Tensor&, const Tensor&,
                                     const Tensor&, const Tensor&, const Tensor&, const Tensor&, const Tensor&,
-                                    const Tensor&, const Tensor&, std::array<bool, 8>, bool);
+                                    const Tensor&, const Tensor&, const Tensor&, std::array<bool, 8>, bool);
 using WeightSignature = Tensor(const Tensor&, const Tensor&, std::string, double);
 using WeightVjpSignature = std::tuple<Tensor, Tensor>(const Tensor&, const Tensor&, const Tensor&, std::string, double);
 
@@ -79,7 +79,7 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
     const variable_list out =
         list_of(op.call(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
                         viewmatrix, projmatrix, campos, s.image_height, s.image_width, s.tanfovx, s.tanfovy,
-                        s.scale_modifier, s.sh_degree, s.footprint, s.variance, keep, s.debug));
+                        s.scale_modifier, s.sh_degree, s.footprint, s.option, keep, s.debug));
     ctx->set_materialize_grads(false);  // no zeros the size of everything saved
     ctx->mark_non_differentiable({out.begin() + 1, out.end()});
     ctx->saved_data["keep"] = keep;
@@ -116,18 +116,18 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
     size_t edge = 0;  // counts the tensors that were given
     for (size_t i = 0; i < kDifferentiable; ++i) needs[i] = t[i].defined() && ctx->needs_input_grad(edge++);
     const auto saved = t.begin() + kInputs;
-    const variable_list out =
-        list_of(op.call(dL_doutputs[0], t[0], given(t[1]), t[2], given(t[3]), given(t[4]), given(t[5]), given(t[6]),
-                        given(t[7]), t[8], t[9], t[10], t[11], s.image_height, s.image_width, s.tanfovx, s.tanfovy,
-                        s.scale_modifier, s.sh_degree, s.footprint, s.variance, saved[0], saved[1], saved[2], saved[3],
-                        saved[4], saved[5], saved[6], saved[7], saved[8], saved[9], saved[10], needs, s.debug));
+    const variable_list out = list_of(
+        op.call(dL_doutputs[0], t[0], given(t[1]), t[2], given(t[3]), given(t[4]), given(t[5]), given(t[6]),
+                given(t[7]), t[8], t[9], t[10], t[11], s.image_height, s.image_width, s.tanfovx, s.tanfovy,
+                s.scale_modifier, s.sh_degree, s.footprint, s.option, saved[0], saved[1], saved[2], saved[3], saved[4],
+                saved[5], saved[6], saved[7], saved[8], saved[9], saved[10], saved[11], needs, s.debug));
     for (size_t i = 0; i < kDifferentiable; ++i) {
       if (needs[i]) grads[i] = out[i];
     }
     return grads;
   }
 };
-static_assert(kOutputs == 13, "backward passes all that forward saves");
+static_assert(kOutputs == 14, "backward passes all that forward saves");
 
 RasterizeOutput rasterize_autograd(const Tensor& means3D, const OptionalTensor& means2D, const Tensor& opacities,
                                    const OptionalTensor& shs, const OptionalTensor& colors_precomp,
@@ -135,35 +135,36 @@ RasterizeOutput rasterize_autograd(const Tensor& means3D, const OptionalTensor& 
                                    const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
                                    const Tensor& projmatrix, const Tensor& campos, int64_t image_height,
                                    int64_t image_width, double tanfovx, double tanfovy, double scale_modifier,
-                                   int64_t sh_degree, std::string footprint, double variance, bool keep, bool debug) {
-  const Settings settings = {image_height, image_width, tanfovx,  tanfovy, scale_modifier,
-                             sh_degree,    footprint,   variance, debug};
+                                   int64_t sh_degree, std::string footprint, double option, bool keep, bool debug) {
+  const Settings settings = {image_height, image_width, tanfovx, tanfovy, scale_modifier,
+                             sh_degree,    footprint,   option,  debug};
   const variable_list out = Rasterize::apply(means3D, means2D, opacities, shs, colors_precomp, scales, rotations,
                                              cov3D_precomp, bg, viewmatrix, projmatrix, campos, settings, keep);
-  return {out[0], out[1], out[2], out[3], out[4], out[5], out[6], out[7], out[8], out[9], out[10], out[11], out[12]};
+  return {out[0], out[1], out[2], out[3],  out[4],  out[5],  out[6],
+          out[7], out[8], out[9], out[10], out[11], out[12], out[13]};
 }
 
 struct Weight : torch::autograd::Function<Weight> {
   static Tensor forward(AutogradContext* ctx, const Tensor& offset, const Tensor& cov2d, const std::string& footprint,
-                        double variance) {
+                        double option) {
     static const auto op = find_op<WeightSignature>("analytic_rasterizer::footprint_weight");
     const at::AutoDispatchBelowADInplaceOrView guard;
     ctx->save_for_backward({offset, cov2d});
     ctx->saved_data["footprint"] = footprint;
-    ctx->saved_data["variance"] = variance;
-    return op.call(offset, cov2d, footprint, variance);
+    ctx->saved_data["option"] = option;
+    return op.call(offset, cov2d, footprint, option);
   }
   static variable_list backward(AutogradContext* ctx, variable_list dL_dweight) {
     static const auto op = find_op<WeightVjpSignature>("analytic_rasterizer::footprint_weight_vjp");
     const variable_list t = ctx->get_saved_variables();
     const auto [dL_doffset, dL_dcov] = op.call(dL_dweight[0], t[0], t[1], ctx->saved_data["footprint"].toStringRef(),
-                                               ctx->saved_data["variance"].toDouble());
+                                               ctx->saved_data["option"].toDouble());
     return {dL_doffset, dL_dcov, Tensor(), Tensor()};
   }
 };
 
-Tensor footprint_weight_autograd(const Tensor& offset, const Tensor& cov2d, std::string footprint, double variance) {
-  return Weight::apply(offset, cov2d, footprint, variance);
+Tensor footprint_weight_autograd(const Tensor& offset, const Tensor& cov2d, std::string footprint, double option) {
+  return Weight::apply(offset, cov2d, footprint, option);
 }
 
 TORCH_LIBRARY_IMPL(analytic_rasterizer, Autograd, m) {

@@ -58,7 +58,7 @@ void check_like(const Tensor& t, const char* name, const Tensor& like, const cha
                     ", got ", t.device());
 }
 
-void check_weight_arguments(const Tensor& offset, const Tensor& cov2d, double variance) {
+void check_weight_arguments(const Tensor& offset, const Tensor& cov2d, double option) {
   check_floating(offset, "offset");
   TORCH_CHECK_VALUE(offset.dim() >= 1 && offset.size(-1) == 2, "offset must have shape (..., 2), got ",
                     shape_of(offset));
@@ -67,8 +67,7 @@ void check_weight_arguments(const Tensor& offset, const Tensor& cov2d, double va
                         cov2d.sizes().slice(0, cov2d.dim() - 1) == offset.sizes().slice(0, offset.dim() - 1),
                     "cov2d must have shape (..., 3) with the leading sizes of offset ", shape_of(offset), ", got ",
                     shape_of(cov2d));
-  TORCH_CHECK_VALUE(std::isfinite(variance) && variance >= 0, "variance must be finite and not negative, got ",
-                    variance);
+  TORCH_CHECK_VALUE(std::isfinite(option) && option >= 0, "option must be finite and not negative, got ", option);
 }
 
 void check_image_size(int64_t height, int64_t width) {
@@ -142,8 +141,7 @@ void Inputs::check() {
   check_positive(tanfovx, "tanfovx");
   check_positive(tanfovy, "tanfovy");
   check_positive(scale_modifier, "scale_modifier");
-  TORCH_CHECK_VALUE(std::isfinite(variance) && variance >= 0, "variance must be finite and not negative, got ",
-                    variance);
+  TORCH_CHECK_VALUE(std::isfinite(option) && option >= 0, "option must be finite and not negative, got ", option);
 }
 
 void check_weight_gradient(const Tensor& dL_dweight, const Tensor& offset) {

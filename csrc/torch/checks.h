@@ -24,7 +24,7 @@ struct Inputs {
   double tanfovx, tanfovy, scale_modifier;
   int64_t sh_degree;
   std::string footprint;
-  double variance;
+  double option;
 
   int64_t count() const { return means3D.size(0); }
 
@@ -55,7 +55,7 @@ template <class Stages> const Stages& found(const Stages* stages, const std::str
 }
 
 /// Arguments of footprint_weight.
-void check_weight_arguments(const Tensor& offset, const Tensor& cov2d, double variance);
+void check_weight_arguments(const Tensor& offset, const Tensor& cov2d, double option);
 void check_weight_gradient(const Tensor& dL_dweight, const Tensor& offset);
 
 /// Sizes that tensors and tiles can be indexed with.

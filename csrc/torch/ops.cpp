@@ -25,20 +25,21 @@ TORCH_LIBRARY(analytic_rasterizer, m) {
       "Tensor? rotations, Tensor? cov3D_precomp, Tensor bg, Tensor viewmatrix, Tensor projmatrix, Tensor campos, "
       "int image_height, int image_width, float tanfovx, float tanfovy, float scale_modifier, int sh_degree, str "
       "footprint, "
-      "float variance, bool keep, bool debug) -> (Tensor color, Tensor radii, Tensor splats, Tensor ids, Tensor pairs, "
+      "float option, bool keep, bool debug) -> (Tensor color, Tensor radii, Tensor splats, Tensor ids, Tensor pairs, "
       "Tensor "
       "tile_offsets, "
       "Tensor splat_offsets, Tensor positions, Tensor transmittance, Tensor last, Tensor checkpoints, Tensor "
-      "chunks, Tensor counts)");
+      "chunks, Tensor counts, Tensor tile_samples)");
   m.def(
       "rasterize_vjp(Tensor dL_dcolor, Tensor means3D, Tensor? means2D, Tensor opacities, Tensor? shs, Tensor? "
       "colors_precomp, "
       "Tensor? scales, Tensor? rotations, Tensor? cov3D_precomp, Tensor bg, Tensor viewmatrix, Tensor projmatrix, "
       "Tensor campos, int image_height, int image_width, float tanfovx, float tanfovy, float scale_modifier, int "
       "sh_degree, "
-      "str footprint, float variance, Tensor splats, Tensor ids, Tensor pairs, Tensor tile_offsets, Tensor "
+      "str footprint, float option, Tensor splats, Tensor ids, Tensor pairs, Tensor tile_offsets, Tensor "
       "splat_offsets, "
-      "Tensor positions, Tensor transmittance, Tensor last, Tensor checkpoints, Tensor chunks, Tensor counts, bool[8] "
+      "Tensor positions, Tensor transmittance, Tensor last, Tensor checkpoints, Tensor chunks, Tensor counts, Tensor "
+      "tile_samples, bool[8] "
       "needs, bool "
       "debug) -> (Tensor means3D, Tensor means2D, Tensor "
       "opacities, "
@@ -48,12 +49,12 @@ TORCH_LIBRARY(analytic_rasterizer, m) {
       "rotations, "
       "Tensor? cov3D_precomp, Tensor bg, Tensor viewmatrix, Tensor projmatrix, Tensor campos, int image_height, "
       "int image_width, float tanfovx, float tanfovy, float scale_modifier, int sh_degree, str footprint, float "
-      "variance) -> "
+      "option) -> "
       "(Tensor color, Tensor radii, Tensor ids, Tensor depths, Tensor means2d, Tensor pairs, Tensor tile_offsets, "
       "Tensor seconds)");
-  m.def("footprint_weight(Tensor offset, Tensor cov2d, str footprint, float variance) -> Tensor");
+  m.def("footprint_weight(Tensor offset, Tensor cov2d, str footprint, float option) -> Tensor");
   m.def(
-      "footprint_weight_vjp(Tensor dL_dweight, Tensor offset, Tensor cov2d, str footprint, float variance) -> "
+      "footprint_weight_vjp(Tensor dL_dweight, Tensor offset, Tensor cov2d, str footprint, float option) -> "
       "(Tensor offset, Tensor cov2d)");
 }
 

@@ -30,7 +30,7 @@ template <typename T> Projected project(const Inputs& in, const Stages<T>& stage
   std::vector<uint8_t> flags(in.count());
   cpu::ProjectTask<T> task{camera_of<T>(in),
                            gaussians_of<T>(in),
-                           {in.variance},
+                           footprint_options(in.option),
                            at::get_num_threads(),
                            flags.data(),
                            offsets.data(),
@@ -80,21 +80,41 @@ template <typename T> Binned bin(const Inputs& in, const Projected& projected, c
   return out;
 }
 
+/// Samples of every tile; empty where all have the same.
+template <typename T>
+Tensor choose(const Inputs& in, const Projected& projected, const Binned& binned, const Stages<T>& stages) {
+  const TileGrid grid = grid_of(in);
+  const Tensor out = at::empty({stages.choose ? grid.tiles() : 0}, binned.pairs.options());
+  if (stages.choose) {
+    stages.choose({projected.splats.template const_data_ptr<T>(), binned.pairs.const_data_ptr<int32_t>(),
+                   binned.tile_offsets.const_data_ptr<int64_t>(), grid, at::get_num_threads(),
+                   in.background.const_data_ptr<T>(), footprint_options(in.option), out.data_ptr<int32_t>()});
+  }
+  return out;
+}
+const int32_t* samples_or_null(const Tensor& tile_samples) {
+  return tile_samples.numel() ? tile_samples.const_data_ptr<int32_t>() : nullptr;
+}
+
 struct BlendedImage {
   Tensor color, transmittance, last;
 };
 
 template <typename T>
-BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& binned, const Stages<T>& stages,
-                   bool keep) {
+BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& binned, const Tensor& tile_samples,
+                   const Stages<T>& stages, bool keep) {
   const auto options = in.means3D.options();
   const int64_t samples = keep ? stages.samples : 0;
-  BlendedImage out{at::empty({3, in.image_height, in.image_width}, options),
-                   at::empty({samples, in.image_height, in.image_width}, options),
-                   at::empty({samples, in.image_height, in.image_width}, options.dtype(at::kInt))};
+  const std::vector<int64_t> planes = {samples, in.image_height, in.image_width};
+  // Where samples are chosen not every tile writes all planes.
+  const auto make = [&](const at::TensorOptions& o) {
+    return stages.choose ? at::zeros(planes, o) : at::empty(planes, o);
+  };
+  BlendedImage out{at::empty({3, in.image_height, in.image_width}, options), make(options),
+                   make(options.dtype(at::kInt))};
   stages.blend({projected.splats.template const_data_ptr<T>(), binned.pairs.const_data_ptr<int32_t>(),
                 binned.tile_offsets.const_data_ptr<int64_t>(), grid_of(in), at::get_num_threads(),
-                in.background.const_data_ptr<T>(), out.color.template data_ptr<T>(),
+                samples_or_null(tile_samples), in.background.const_data_ptr<T>(), out.color.template data_ptr<T>(),
                 keep ? out.transmittance.template data_ptr<T>() : nullptr,
                 keep ? out.last.template data_ptr<int32_t>() : nullptr});
   return out;
@@ -106,10 +126,10 @@ RasterizeOutput rasterize_cpu(const Tensor& means3D, const OptionalTensor& means
                               const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
                               const Tensor& projmatrix, const Tensor& campos, int64_t image_height, int64_t image_width,
                               double tanfovx, double tanfovy, double scale_modifier, int64_t sh_degree,
-                              std::string footprint, double variance, bool keep, bool) {
+                              std::string footprint, double option, bool keep, bool) {
   Inputs in{means3D,       opacities, means2D,        shs,        colors_precomp, scales,       rotations,
             cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
-            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      variance};
+            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      option};
   in.check();
   in.check_camera();
   RasterizeOutput out;
@@ -117,7 +137,8 @@ RasterizeOutput rasterize_cpu(const Tensor& means3D, const OptionalTensor& means
     const Stages<scalar_t>& stages = stages_of<scalar_t>(footprint);
     const Projected projected = project(in, stages);
     const Binned binned = bin(in, projected, stages, keep);
-    const BlendedImage image = blend(in, projected, binned, stages, keep);
+    const Tensor tile_samples = choose(in, projected, binned, stages);
+    const BlendedImage image = blend(in, projected, binned, tile_samples, stages, keep);
     out = {image.color,
            projected.radii,
            projected.splats,
@@ -130,7 +151,8 @@ RasterizeOutput rasterize_cpu(const Tensor& means3D, const OptionalTensor& means
            image.last,
            at::empty({0}, in.means3D.options()),
            at::empty({0}, binned.pairs.options()),
-           at::empty({0}, binned.tile_offsets.options())};
+           at::empty({0}, binned.tile_offsets.options()),
+           tile_samples};
   });
   return out;
 }
@@ -141,10 +163,10 @@ StagesOutput rasterize_stages_cpu(const Tensor& means3D, const Tensor& opacities
                                   const Tensor& bg, const Tensor& viewmatrix, const Tensor& projmatrix,
                                   const Tensor& campos, int64_t image_height, int64_t image_width, double tanfovx,
                                   double tanfovy, double scale_modifier, int64_t sh_degree, std::string footprint,
-                                  double variance) {
+                                  double option) {
   Inputs in{means3D,       opacities, std::nullopt,   shs,        colors_precomp, scales,       rotations,
             cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
-            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      variance};
+            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      option};
   in.check();
   in.check_camera();
   StagesOutput out;
@@ -156,7 +178,7 @@ StagesOutput rasterize_stages_cpu(const Tensor& means3D, const Tensor& opacities
     const auto t1 = Clock::now();
     const Binned binned = bin(in, projected, stages, false);
     const auto t2 = Clock::now();
-    const BlendedImage image = blend(in, projected, binned, stages, false);
+    const BlendedImage image = blend(in, projected, binned, choose(in, projected, binned, stages), stages, false);
     const auto t3 = Clock::now();
     const Tensor seconds = at::empty({3}, at::kDouble);
     const auto elapsed = [](auto from, auto to) { return std::chrono::duration<double>(to - from).count(); };
@@ -172,17 +194,19 @@ StagesOutput rasterize_stages_cpu(const Tensor& means3D, const Tensor& opacities
 /// The tensors that rasterize hands to its vjp must fit each other. Their contents are rasterize's own.
 void check_saved(const Inputs& in, const Tensor& splats, const Tensor& ids, const Tensor& pairs,
                  const Tensor& tile_offsets, const Tensor& splat_offsets, const Tensor& positions,
-                 const Tensor& transmittance, const Tensor& last, int64_t width, int64_t samples) {
+                 const Tensor& transmittance, const Tensor& last, const Tensor& tile_samples, int64_t width,
+                 int64_t samples, bool chosen) {
   const int64_t v = ids.numel(), n = pairs.numel();
   const std::vector<int64_t> image = {samples, in.image_height, in.image_width};
   TORCH_CHECK_VALUE(
       splats.dim() == 2 && splats.size(0) == v && splats.size(1) == width && splat_offsets.numel() == v + 1 &&
           positions.numel() == n && tile_offsets.numel() == grid_of(in).tiles() + 1 && transmittance.sizes() == image &&
-          last.sizes() == image,
+          last.sizes() == image && tile_samples.numel() == (chosen ? grid_of(in).tiles() : 0),
       "splats ... last must be the outputs of rasterize with keep=True for the same arguments, got splats of shape ",
       shape_of(splats), " and transmittance of shape ", shape_of(transmittance));
-  TORCH_CHECK_VALUE(splats.is_contiguous() && transmittance.is_contiguous() && last.is_contiguous(),
-                    "splats, transmittance and last must be contiguous, got strided ones");
+  TORCH_CHECK_VALUE(
+      splats.is_contiguous() && transmittance.is_contiguous() && last.is_contiguous() && tile_samples.is_contiguous(),
+      "splats, transmittance, last and tile_samples must be contiguous, got strided ones");
 }
 
 Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const OptionalTensor& means2D,
@@ -191,21 +215,21 @@ Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const Op
                         const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
                         const Tensor& projmatrix, const Tensor& campos, int64_t image_height, int64_t image_width,
                         double tanfovx, double tanfovy, double scale_modifier, int64_t sh_degree, std::string footprint,
-                        double variance, const Tensor& splats, const Tensor& ids, const Tensor& pairs,
+                        double option, const Tensor& splats, const Tensor& ids, const Tensor& pairs,
                         const Tensor& tile_offsets, const Tensor& splat_offsets, const Tensor& positions,
                         const Tensor& transmittance, const Tensor& last, const Tensor&, const Tensor&, const Tensor&,
-                        std::array<bool, 8> needs, bool) {
+                        const Tensor& tile_samples, std::array<bool, 8> needs, bool) {
   Inputs in{means3D,       opacities, means2D,        shs,        colors_precomp, scales,       rotations,
             cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
-            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      variance};
+            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      option};
   in.check();
   in.check_gradient(dL_dcolor);
   const Grads out = make_grads(in, needs);
   AT_DISPATCH_FLOATING_TYPES(means3D.scalar_type(), "rasterize_vjp", [&] {
     using T = scalar_t;
     const Stages<T>& stages = stages_of<T>(footprint);
-    check_saved(in, splats, ids, pairs, tile_offsets, splat_offsets, positions, transmittance, last, kSplatWidth,
-                stages.samples);
+    check_saved(in, splats, ids, pairs, tile_offsets, splat_offsets, positions, transmittance, last, tile_samples,
+                kSplatWidth, stages.samples, stages.choose != nullptr);
     const GaussianGrads<T> grads = grads_of<T>(in, out);
     const int64_t n = pairs.size(0);
     const Tensor pair_grads = at::empty({n, int64_t(sizeof(PairGrad<T>) / sizeof(T))}, means3D.options());
@@ -216,30 +240,22 @@ Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const Op
     const Tensor g = dL_dcolor.contiguous();
     const int threads = at::get_num_threads();
     stages.blend_vjp({splats.const_data_ptr<T>(), pairs.const_data_ptr<int32_t>(),
-                      tile_offsets.const_data_ptr<int64_t>(), grid_of(in), threads, in.background.const_data_ptr<T>(),
-                      transmittance.const_data_ptr<T>(), last.const_data_ptr<int32_t>(), g.const_data_ptr<T>(), sums,
-                      abs2d});
-    stages.project_vjp({camera_of<T>(in),
-                        gaussians_of<T>(in),
-                        {variance},
-                        threads,
-                        ids.const_data_ptr<int32_t>(),
-                        ids.size(0),
-                        splat_offsets.const_data_ptr<int64_t>(),
-                        positions.const_data_ptr<int64_t>(),
-                        sums,
-                        abs2d,
-                        grads});
+                      tile_offsets.const_data_ptr<int64_t>(), grid_of(in), threads, samples_or_null(tile_samples),
+                      in.background.const_data_ptr<T>(), transmittance.const_data_ptr<T>(),
+                      last.const_data_ptr<int32_t>(), g.const_data_ptr<T>(), sums, abs2d});
+    stages.project_vjp({camera_of<T>(in), gaussians_of<T>(in), footprint_options(option), threads,
+                        ids.const_data_ptr<int32_t>(), ids.size(0), splat_offsets.const_data_ptr<int64_t>(),
+                        positions.const_data_ptr<int64_t>(), sums, abs2d, grads});
   });
   return out;
 }
 
-Tensor footprint_weight_cpu(const Tensor& offset, const Tensor& cov2d, std::string footprint, double variance) {
-  check_weight_arguments(offset, cov2d, variance);
+Tensor footprint_weight_cpu(const Tensor& offset, const Tensor& cov2d, std::string footprint, double option) {
+  check_weight_arguments(offset, cov2d, option);
   const Tensor d = offset.contiguous(), c = cov2d.contiguous();
   const Tensor out = at::empty(offset.sizes().slice(0, offset.dim() - 1), offset.options());
   AT_DISPATCH_FLOATING_TYPES(offset.scalar_type(), "footprint_weight", [&] {
-    auto task = weight_task<cpu::WeightTask<scalar_t>, scalar_t>(d, c, variance);
+    auto task = weight_task<cpu::WeightTask<scalar_t>, scalar_t>(d, c, option);
     task.threads = at::get_num_threads();
     task.weights = out.data_ptr<scalar_t>();
     stages_of<scalar_t>(footprint).weight(task);
@@ -248,14 +264,14 @@ Tensor footprint_weight_cpu(const Tensor& offset, const Tensor& cov2d, std::stri
 }
 
 std::tuple<Tensor, Tensor> footprint_weight_vjp_cpu(const Tensor& dL_dweight, const Tensor& offset, const Tensor& cov2d,
-                                                    std::string footprint, double variance) {
-  check_weight_arguments(offset, cov2d, variance);
+                                                    std::string footprint, double option) {
+  check_weight_arguments(offset, cov2d, option);
   check_weight_gradient(dL_dweight, offset);
   const Tensor g = dL_dweight.contiguous(), d = offset.contiguous(), c = cov2d.contiguous();
   const Tensor dL_doffset = at::empty(offset.sizes(), offset.options()),
                dL_dcov = at::empty(cov2d.sizes(), cov2d.options());
   AT_DISPATCH_FLOATING_TYPES(offset.scalar_type(), "footprint_weight_vjp", [&] {
-    auto task = weight_task<cpu::WeightTask<scalar_t>, scalar_t>(d, c, variance);
+    auto task = weight_task<cpu::WeightTask<scalar_t>, scalar_t>(d, c, option);
     task.threads = at::get_num_threads();
     task.dL_dweights = g.const_data_ptr<scalar_t>();
     task.dL_doffsets = reinterpret_cast<Vec2<scalar_t>*>(dL_doffset.data_ptr<scalar_t>());

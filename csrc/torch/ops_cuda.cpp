@@ -29,6 +29,9 @@ void check_stage(const char* stage, const CUDAStream& stream, bool debug) {
 void check_cuda(Inputs& in, bool debug) {
   TORCH_CHECK_TYPE(in.means3D.scalar_type() != at::kDouble,
                    "means3D must have dtype float32 on CUDA, got Double; float64 runs on the CPU");
+  TORCH_CHECK_NOT_IMPLEMENTED(in.footprint != "adaptive",
+                              "footprint 'adaptive' does not run on CUDA yet: blending its tiles side by side is not "
+                              "ready. It runs on the CPU");
   in.check();
   if (debug) in.check_camera();
 }
@@ -118,13 +121,9 @@ Projected project(const Inputs& in, const cuda::ForwardStages& stages, const CUD
   const auto floats = in.means3D.options(), ints = floats.dtype(at::kInt);
   Projected out{at::empty({n, kSplatWidth}, floats), at::empty({2, n}, ints), at::empty({n, 2}, ints),
                 at::empty({n}, ints)};
-  stages.project({camera_of<float>(in),
-                  gaussians_of<float>(in),
-                  {in.variance},
-                  out.splats.data_ptr<float>(),
-                  reinterpret_cast<uint32_t*>(out.keys.data_ptr<int32_t>()),
-                  reinterpret_cast<cuda::PairRange*>(out.ranges.data_ptr<int32_t>()),
-                  out.radii.data_ptr<int32_t>()},
+  stages.project({camera_of<float>(in), gaussians_of<float>(in), footprint_options(in.option),
+                  out.splats.data_ptr<float>(), reinterpret_cast<uint32_t*>(out.keys.data_ptr<int32_t>()),
+                  reinterpret_cast<cuda::PairRange*>(out.ranges.data_ptr<int32_t>()), out.radii.data_ptr<int32_t>()},
                  stream);
   check_stage("project", stream, debug);
   return out;
@@ -211,7 +210,7 @@ Binned bin(const Inputs& in, const Projected& projected, const cuda::ForwardStag
 }
 
 cuda::TileLists lists_of(const Tensor& splats, const Tensor& order, const Tensor& pairs, const Tensor& tile_offsets,
-                         const Tensor& counts) {
+                         const Tensor& counts, const Tensor& tile_samples) {
   return {splats.const_data_ptr<float>(),
           pairs.const_data_ptr<int32_t>(),
           int(pairs.size(1)),
@@ -219,28 +218,30 @@ cuda::TileLists lists_of(const Tensor& splats, const Tensor& order, const Tensor
           order.const_data_ptr<int32_t>(),
           reinterpret_cast<cuda::Counts*>(counts.data_ptr<int64_t>()),
           order.size(0),
-          pairs.size(0)};
+          pairs.size(0),
+          tile_samples.numel() ? tile_samples.data_ptr<int32_t>() : nullptr};
 }
 
 /// Memory of a plan. The backward pass goes on with the chunks that the forward pass made: (n, 3) tile,
 /// chunk and checkpoint, longest first.
 struct Plan {
-  Tensor chunks, checkpoint_offsets, tile_order, rest;
-  int64_t max_checkpoints;
+  Tensor chunks, tile_planes, tile_order, rest;
+  int64_t max_planes;
   cuda::ChunkPlan view;
 
-  Plan(TileGrid grid, int64_t capacity, int samples, const at::TensorOptions& ints, std::byte* counters) {
-    const int64_t n = grid.tiles(), full = capacity / cuda::chunk_length(samples);
-    max_checkpoints = std::min(full + n, 2 * full);  // tiles with a single chunk have none
-    chunks = at::empty({full + n, 3}, ints);
-    checkpoint_offsets = at::empty({n}, ints);
+  /// A tile has `samples` or, where they are chosen, fewer: then in more chunks, but no more planes.
+  Plan(TileGrid grid, int64_t capacity, int samples, bool chosen, const at::TensorOptions& ints, std::byte* counters) {
+    const int64_t n = grid.tiles(), most = capacity / cuda::chunk_length(chosen ? 1 : samples),
+                  full = capacity / cuda::chunk_length(samples);
+    // Tiles with a single chunk have none; of the others less than a chunk is not full. No number of
+    // samples takes more planes per pair than the largest.
+    max_planes = chosen ? 2 * capacity * samples / cuda::chunk_length(samples) : std::min(full + n, 2 * full) * samples;
+    chunks = at::empty({most + n, 3}, ints);
+    tile_planes = at::empty({n}, ints);
     tile_order = at::empty({n}, ints);
-    rest = at::empty({full + 1, 3}, ints);
-    view = {cuda::front_chunks(grid, samples),
-            reinterpret_cast<cuda::TileChunk*>(chunks.data_ptr<int32_t>()),
-            tile_order.data_ptr<int32_t>(),
-            checkpoint_offsets.data_ptr<int32_t>(),
-            reinterpret_cast<cuda::TileChunk*>(rest.data_ptr<int32_t>()),
+    rest = at::empty({most + 1, 3}, ints);
+    view = {reinterpret_cast<cuda::TileChunk*>(chunks.data_ptr<int32_t>()), tile_order.data_ptr<int32_t>(),
+            tile_planes.data_ptr<int32_t>(), reinterpret_cast<cuda::TileChunk*>(rest.data_ptr<int32_t>()),
             reinterpret_cast<int32_t*>(counters)};
   }
 };
@@ -249,15 +250,29 @@ struct BlendedImage {
   Tensor color, transmittance, last, checkpoints, chunks;
 };
 
-BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& binned,
+/// Samples of every tile; empty where all have the same.
+Tensor choose(const Inputs& in, const Projected& projected, const Binned& binned, const cuda::ForwardStages& stages,
+              const CUDAStream& stream, const Scratch& scratch, bool debug) {
+  const TileGrid grid = grid_of(in);
+  const Tensor out = at::empty({stages.choose ? grid.tiles() : 0}, projected.radii.options());
+  if (stages.choose) {
+    stages.choose({lists_of(projected.splats, binned.order, binned.pairs, binned.tile_offsets, scratch.counts, out),
+                   grid, in.background.const_data_ptr<float>(), footprint_options(in.option)},
+                  stream);
+    check_stage("choose", stream, debug);
+  }
+  return out;
+}
+
+BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& binned, const Tensor& tile_samples,
                    const cuda::ForwardStages& stages, const CUDAStream& stream, const Scratch& scratch, bool keep,
                    bool debug) {
   const auto floats = in.means3D.options(), ints = floats.dtype(at::kInt);
   const TileGrid grid = grid_of(in);
   const int64_t samples = keep ? stages.samples : 0;
-  const Plan plan(grid, binned.capacity, stages.samples, ints, scratch.plan);
+  const Plan plan(grid, binned.capacity, stages.samples, tile_samples.numel() > 0, ints, scratch.plan);
   const cuda::TileLists lists =
-      lists_of(projected.splats, binned.order, binned.pairs, binned.tile_offsets, scratch.counts);
+      lists_of(projected.splats, binned.order, binned.pairs, binned.tile_offsets, scratch.counts, tile_samples);
   int64_t* feedback = PairGuesses::instance().feedback(in.means3D.get_device(), grid);  // for the next frame's guess
   cuda::plan_chunks(lists, grid, stages.samples, plan.view, feedback, stream);
   check_stage("plan_chunks", stream, debug);
@@ -265,7 +280,7 @@ BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& b
   BlendedImage out{at::empty({3, in.image_height, in.image_width}, floats),
                    at::empty({samples, in.image_height, in.image_width}, floats),
                    at::empty({samples, in.image_height, in.image_width}, ints),
-                   at::empty({plan.max_checkpoints, stages.samples, kTile * kTile, 4}, floats), plan.chunks};
+                   at::empty({plan.max_planes, kTile * kTile, 4}, floats), plan.chunks};
   stages.blend({lists, plan.view, grid, in.background.const_data_ptr<float>(), tile_open.data_ptr<int32_t>(),
                 tile_open.data_ptr<int32_t>() + grid.tiles(),
                 reinterpret_cast<cuda::Checkpoint*>(out.checkpoints.data_ptr<float>()), out.color.data_ptr<float>(),
@@ -281,10 +296,10 @@ RasterizeOutput rasterize_cuda(const Tensor& means3D, const OptionalTensor& mean
                                const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
                                const Tensor& projmatrix, const Tensor& campos, int64_t image_height,
                                int64_t image_width, double tanfovx, double tanfovy, double scale_modifier,
-                               int64_t sh_degree, std::string footprint, double variance, bool keep, bool debug) {
+                               int64_t sh_degree, std::string footprint, double option, bool keep, bool debug) {
   Inputs in{means3D,       opacities, means2D,        shs,        colors_precomp, scales,       rotations,
             cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
-            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      variance};
+            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      option};
   check_cuda(in, debug);
   const auto& stages = found(cuda::find_forward(footprint), footprint);
   const c10::cuda::CUDAGuard guard(means3D.device());
@@ -293,7 +308,8 @@ RasterizeOutput rasterize_cuda(const Tensor& means3D, const OptionalTensor& mean
   const Scratch scratch(in.count(), means3D, stream);
   const Projected projected = project(in, stages, stream, debug);
   const Binned binned = bin(in, projected, stages, stream, scratch, keep, exact, debug);
-  const BlendedImage image = blend(in, projected, binned, stages, stream, scratch, keep, debug);
+  const Tensor tile_samples = choose(in, projected, binned, stages, stream, scratch, debug);
+  const BlendedImage image = blend(in, projected, binned, tile_samples, stages, stream, scratch, keep, debug);
   const auto kept = [&](const Tensor& t) { return keep ? t : at::empty({0}, t.options()); };
   return {image.color,
           projected.radii,
@@ -307,7 +323,8 @@ RasterizeOutput rasterize_cuda(const Tensor& means3D, const OptionalTensor& mean
           image.last,
           kept(image.checkpoints),
           kept(image.chunks),
-          kept(scratch.counts)};
+          kept(scratch.counts),
+          tile_samples};
 }
 
 /// Time between stages, in seconds.
@@ -344,10 +361,10 @@ StagesOutput rasterize_stages_cuda(const Tensor& means3D, const Tensor& opacitie
                                    const Tensor& bg, const Tensor& viewmatrix, const Tensor& projmatrix,
                                    const Tensor& campos, int64_t image_height, int64_t image_width, double tanfovx,
                                    double tanfovy, double scale_modifier, int64_t sh_degree, std::string footprint,
-                                   double variance) {
+                                   double option) {
   Inputs in{means3D,       opacities, std::nullopt,   shs,        colors_precomp, scales,       rotations,
             cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
-            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      variance};
+            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      option};
   check_cuda(in, false);
   const auto& stages = found(cuda::find_forward(footprint), footprint);
   const c10::cuda::CUDAGuard guard(means3D.device());
@@ -358,7 +375,8 @@ StagesOutput rasterize_stages_cuda(const Tensor& means3D, const Tensor& opacitie
   timer.mark();
   const Binned binned = bin(in, projected, stages, stream, scratch, false, true, false);
   timer.mark();
-  const BlendedImage image = blend(in, projected, binned, stages, stream, scratch, false, false);
+  const Tensor tile_samples = choose(in, projected, binned, stages, stream, scratch, false);
+  const BlendedImage image = blend(in, projected, binned, tile_samples, stages, stream, scratch, false, false);
   timer.mark();
   const Tensor seconds = timer.seconds();
   const int64_t pairs = scratch.counts[0].item<int64_t>();
@@ -376,16 +394,18 @@ StagesOutput rasterize_stages_cuda(const Tensor& means3D, const Tensor& opacitie
 /// The tensors that rasterize hands to its vjp must fit each other. Their contents are rasterize's own.
 void check_saved(const Inputs& in, const Tensor& splats, const Tensor& order, const Tensor& pairs,
                  const Tensor& tile_offsets, const Tensor& ranges, const Tensor& transmittance, const Tensor& last,
-                 const Tensor& checkpoints, const Tensor& chunks, const Tensor& counts, int64_t samples) {
+                 const Tensor& checkpoints, const Tensor& chunks, const Tensor& counts, const Tensor& tile_samples,
+                 const cuda::ForwardStages& stages) {
   const int64_t n = in.count();
-  const std::vector<int64_t> image = {samples, in.image_height, in.image_width};
+  const std::vector<int64_t> image = {stages.samples, in.image_height, in.image_width};
+  const int64_t tiles = grid_of(in).tiles();
   bool ok = splats.sizes() == at::IntArrayRef({n, kSplatWidth}) && order.sizes() == at::IntArrayRef({n}) &&
-            pairs.dim() == 2 && pairs.size(1) == 2 && pairs.numel() > 0 &&
-            tile_offsets.numel() == grid_of(in).tiles() + 1 && ranges.sizes() == at::IntArrayRef({n, 2}) &&
-            transmittance.sizes() == image && last.sizes() == image && checkpoints.dim() == 4 &&
-            checkpoints.size(1) == samples && chunks.dim() == 2 && chunks.size(1) == 3 && counts.numel() == 4;
-  for (const Tensor* t :
-       {&splats, &order, &pairs, &tile_offsets, &ranges, &transmittance, &last, &checkpoints, &chunks, &counts})
+            pairs.dim() == 2 && pairs.size(1) == 2 && pairs.numel() > 0 && tile_offsets.numel() == tiles + 1 &&
+            ranges.sizes() == at::IntArrayRef({n, 2}) && transmittance.sizes() == image && last.sizes() == image &&
+            checkpoints.dim() == 3 && chunks.dim() == 2 && chunks.size(1) == 3 && counts.numel() == 4 &&
+            tile_samples.numel() == (stages.choose ? tiles : 0);
+  for (const Tensor* t : {&splats, &order, &pairs, &tile_offsets, &ranges, &transmittance, &last, &checkpoints, &chunks,
+                          &counts, &tile_samples})
     ok = ok && t->is_contiguous() && t->device() == in.means3D.device();
   TORCH_CHECK_VALUE(ok,
                     "splats ... counts must be the outputs of rasterize with keep=True for the same arguments, got "
@@ -399,25 +419,26 @@ Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const Tensor& means3D, const O
                          const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
                          const Tensor& projmatrix, const Tensor& campos, int64_t image_height, int64_t image_width,
                          double tanfovx, double tanfovy, double scale_modifier, int64_t sh_degree,
-                         std::string footprint, double variance, const Tensor& splats, const Tensor& order,
+                         std::string footprint, double option, const Tensor& splats, const Tensor& order,
                          const Tensor& pairs, const Tensor& tile_offsets, const Tensor& ranges, const Tensor&,
                          const Tensor& transmittance, const Tensor& last, const Tensor& checkpoints,
-                         const Tensor& chunks, const Tensor& counts, std::array<bool, 8> needs, bool debug) {
+                         const Tensor& chunks, const Tensor& counts, const Tensor& tile_samples,
+                         std::array<bool, 8> needs, bool debug) {
   Inputs in{means3D,       opacities, means2D,        shs,        colors_precomp, scales,       rotations,
             cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
-            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      variance};
+            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      option};
   check_cuda(in, debug);
   in.check_gradient(dL_dcolor);
   const auto& forward = found(cuda::find_forward(footprint), footprint);
   const auto& stages = found(cuda::find_backward(footprint), footprint);
   check_saved(in, splats, order, pairs, tile_offsets, ranges, transmittance, last, checkpoints, chunks, counts,
-              forward.samples);
+              tile_samples, forward);
   const c10::cuda::CUDAGuard guard(means3D.device());
   const CUDAStream stream = c10::cuda::getCurrentCUDAStream();
   const Grads out = make_grads(in, needs);
   const GaussianGrads<float> grads = grads_of<float>(in, out);
   const TileGrid grid = grid_of(in);
-  const cuda::TileLists lists = lists_of(splats, order, pairs, tile_offsets, counts);
+  const cuda::TileLists lists = lists_of(splats, order, pairs, tile_offsets, counts, tile_samples);
   const Tensor pair_grads = at::empty({std::max(pairs.size(0), in.count()), cuda::kPairGradWidth}, means3D.options());
   const Tensor g = dL_dcolor.contiguous();
   stages.blend_vjp({lists, reinterpret_cast<const cuda::TileChunk*>(chunks.const_data_ptr<int32_t>()), grid,
@@ -427,21 +448,16 @@ Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const Tensor& means3D, const O
                     pair_grads.data_ptr<float>(), grads.means2d && grads.means2d_stride == 4},
                    stream);
   check_stage("blend_vjp", stream, debug);
-  stages.project_vjp({camera_of<float>(in),
-                      gaussians_of<float>(in),
-                      {variance},
-                      reinterpret_cast<const cuda::PairRange*>(ranges.const_data_ptr<int32_t>()),
-                      lists.counts,
-                      pairs.size(0),
-                      pair_grads.const_data_ptr<float>(),
-                      grads},
+  stages.project_vjp({camera_of<float>(in), gaussians_of<float>(in), footprint_options(option),
+                      reinterpret_cast<const cuda::PairRange*>(ranges.const_data_ptr<int32_t>()), lists.counts,
+                      pairs.size(0), pair_grads.const_data_ptr<float>(), grads},
                      stream);
   check_stage("project_vjp", stream, debug);
   return out;
 }
 
-Tensor footprint_weight_cuda(const Tensor& offset, const Tensor& cov2d, std::string footprint, double variance) {
-  check_weight_arguments(offset, cov2d, variance);
+Tensor footprint_weight_cuda(const Tensor& offset, const Tensor& cov2d, std::string footprint, double option) {
+  check_weight_arguments(offset, cov2d, option);
   const auto& stages = found(cuda::find_forward(footprint), footprint);
   const c10::cuda::CUDAGuard guard(offset.device());
   const CUDAStream stream = c10::cuda::getCurrentCUDAStream();
@@ -452,17 +468,17 @@ Tensor footprint_weight_cuda(const Tensor& offset, const Tensor& cov2d, std::str
     launch(task, stream);
   };
   if (offset.scalar_type() == at::kFloat) {
-    run(weight_task<WeightTask<float>, float>(d, c, variance), stages.weight_float);
+    run(weight_task<WeightTask<float>, float>(d, c, option), stages.weight_float);
   } else {
-    run(weight_task<WeightTask<double>, double>(d, c, variance), stages.weight_double);
+    run(weight_task<WeightTask<double>, double>(d, c, option), stages.weight_double);
   }
   check_stage("footprint_weight", stream, false);
   return out;
 }
 
 std::tuple<Tensor, Tensor> footprint_weight_vjp_cuda(const Tensor& dL_dweight, const Tensor& offset,
-                                                     const Tensor& cov2d, std::string footprint, double variance) {
-  check_weight_arguments(offset, cov2d, variance);
+                                                     const Tensor& cov2d, std::string footprint, double option) {
+  check_weight_arguments(offset, cov2d, option);
   check_weight_gradient(dL_dweight, offset);
   const auto& stages = found(cuda::find_backward(footprint), footprint);
   const c10::cuda::CUDAGuard guard(offset.device());
@@ -478,9 +494,9 @@ std::tuple<Tensor, Tensor> footprint_weight_vjp_cuda(const Tensor& dL_dweight, c
     launch(task, stream);
   };
   if (offset.scalar_type() == at::kFloat) {
-    run(weight_task<WeightTask<float>, float>(d, c, variance), stages.weight_vjp_float);
+    run(weight_task<WeightTask<float>, float>(d, c, option), stages.weight_vjp_float);
   } else {
-    run(weight_task<WeightTask<double>, double>(d, c, variance), stages.weight_vjp_double);
+    run(weight_task<WeightTask<double>, double>(d, c, option), stages.weight_vjp_double);
   }
   check_stage("footprint_weight_vjp", stream, false);
   return {dL_doffset, dL_dcov};

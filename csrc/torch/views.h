@@ -39,19 +39,22 @@ template <typename T> Gaussians<T> gaussians_of(const Inputs& in) {
 
 inline TileGrid grid_of(const Inputs& in) { return {int(in.image_width), int(in.image_height)}; }
 
+/// A footprint has one number; each reads it under its own name.
+inline FootprintOptions footprint_options(double option) { return {option, option}; }
+
 /// Arguments of footprint_weight, contiguous, without results.
-template <class Task, typename T> Task weight_task(const Tensor& offset, const Tensor& cov2d, double variance) {
+template <class Task, typename T> Task weight_task(const Tensor& offset, const Tensor& cov2d, double option) {
   Task task{};
   task.n = offset.numel() / 2;
-  task.options = {variance};
+  task.options = footprint_options(option);
   task.offsets = reinterpret_cast<const Vec2<T>*>(offset.const_data_ptr<T>());
   task.covs = reinterpret_cast<const Sym2<T>*>(cov2d.const_data_ptr<T>());
   return task;
 }
 
 /// What rasterize returns: color, radii, and what its vjp needs (schemas in ops.cpp).
-using RasterizeOutput =
-    std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+using RasterizeOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
+                                   Tensor, Tensor, Tensor, Tensor>;
 using StagesOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 /// Gradients of means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp.
 using Grads = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;

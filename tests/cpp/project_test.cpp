@@ -135,7 +135,7 @@ template <class F> struct Loss {
           Paper::add_alpha_vjp(paper, d, s, alpha, g[k], turned);
           one.shape.xy = turned.shape.xy / (gap * splat.shape.inv_sigma.x * splat.shape.inv_sigma.y);
         }
-        add(one, sums.shape);
+        add(F::collect(terms, one, g[k] * alpha), sums.shape);
         sums.weighted += g[k] * alpha;
       }
     }

@@ -118,13 +118,16 @@ Rendered<T> run_stages(const cpu::Stages<T>& stages, const Scene<T>& scene, Foot
   out.image.resize(3 * plane);
   std::vector<T> transmittance(stages.samples * plane);
   std::vector<int32_t> last(stages.samples * plane);
-  stages.blend({splats.data(), pairs.data(), tile_offsets.data(), grid, threads, scene.background, out.image.data(),
-                transmittance.data(), last.data()});
+  // As many samples as the definition below takes; what `adaptive` chooses is tested from Python.
+  const std::vector<int32_t> samples(grid.tiles(), stages.samples);
+  const int32_t* tile_samples = stages.choose ? samples.data() : nullptr;
+  stages.blend({splats.data(), pairs.data(), tile_offsets.data(), grid, threads, tile_samples, scene.background,
+                out.image.data(), transmittance.data(), last.data()});
 
   std::vector<PairGrad<T>> pair_grads(out.pairs);
   std::vector<Vec2<T>> pair_abs(out.pairs);
   GradArrays<T> grads(gaussians.n);
-  stages.blend_vjp({splats.data(), pairs.data(), tile_offsets.data(), grid, threads, scene.background,
+  stages.blend_vjp({splats.data(), pairs.data(), tile_offsets.data(), grid, threads, tile_samples, scene.background,
                     transmittance.data(), last.data(), scene.dL_dimage.data(), pair_grads.data(), pair_abs.data()});
   stages.project_vjp({scene.camera.look(), gaussians, options, threads, ids.data(), n, splat_offsets.data(),
                       positions.data(), pair_grads.data(), pair_abs.data(), grads.views});
@@ -182,7 +185,7 @@ template <class F> Rendered<double> render_plainly(const Scene<double>& scene) {
         const Vec2<double> d = {pixel % width - splats[i].mean.x, pixel / width - splats[i].mean.y};
         ShapeGrad<double> one = {};
         F::add_alpha_vjp(terms[i], d, s, alphas[k], b.dL_dalpha, one);
-        add(one, sums[i].shape);
+        add(F::collect(terms[i], one, alphas[k] * b.dL_dalpha), sums[i].shape);
         offset[i] = offset[i] + one.offset;
         sums[i].weighted += alphas[k] * b.dL_dalpha;
         sums[i].color += b.contribution * gp;

@@ -89,7 +89,7 @@ enum class FrameGradient {
 };
 
 /// I = 2 pi s1 s2 F(u / s1) F(v / s2), (u, v) = d in the eigenframe of Sigma. |S - CDF| < 4e-4.
-template <FrameGradient kFrame> struct Analytic {
+template <FrameGradient kFrame> struct Analytic : PlainSums {
   static constexpr const char* kName = kFrame == FrameGradient::kFrozen ? "analytic" : "analytic_paper";
   static constexpr int kSamples = 1;
   static constexpr double kReach = 0;

@@ -12,16 +12,14 @@ template <> inline constexpr const char* kBoxName<4> = "box4";
 template <> inline constexpr const char* kBoxName<8> = "box8";
 template <> inline constexpr const char* kBoxName<16> = "box16";
 
-/// S equal Gaussians of variance 1/(12 S^2) at the nodes of box_node<S>: their mixture has the unit
-/// pixel's mean and variance along each axis for every S (their covariance vanishes for 1 and 4 only). The pixel's
-/// colour is the mean over the samples.
+/// S equal Gaussians at the nodes of box_node<S>. The pixel's colour is the mean over the samples.
 template <int S> struct Box : GaussianFootprint<S, true> {
   static constexpr const char* kName = kBoxName<S>;
 
   AR_HD static double radius_variance(FootprintOptions) { return kPixelVariance; }
 
   template <typename T> AR_HD static GaussianShape<T> prepare(Cov2d<T> cov, FootprintOptions) {
-    return GaussianFootprint<S, true>::prepare_with(cov, T(kPixelVariance / (S * S)));
+    return GaussianFootprint<S, true>::prepare_with(cov, T(kBoxVariance<S>));
   }
 };
 

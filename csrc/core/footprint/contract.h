@@ -5,7 +5,8 @@
 //   kName                                key in the registry: the public name and what its options fix
 //   kSamples                             samples of a pixel, each with its own transmittance
 //   kReach                               largest |coordinate| of a sample's node [px]
-//   Shape<T>                             what a splat carries; an aggregate of T only
+//   Shape<T>                             what a splat carries; an aggregate of five T, which leave a Splat
+//                                        no padding: arrays of splats are matrices that torch sees
 //   prepare(Cov2d<T>, FootprintOptions)  -> Shape<T>            once per splat
 //   radius_variance(FootprintOptions)    variance added to Sigma for the radius that 3DGS reports [px^2]
 //   ellipse(Shape<T>) -> Mat2<T>         w, and
@@ -16,6 +17,8 @@
 //   alpha(Terms<T>, Vec2<V> p, s) -> V   opacity * I at sample s; p = pixel centre - that point [px]
 //   add_alpha_vjp(Terms<T>, p, s, alpha, dL_dalpha, ShapeGrad<V>& sums)    per pixel: plain products
 //   mean_map(Shape<T>) -> Mat2<T>        m with dL/dmean = m^T sums.offset [dL/dpx]
+//   collect(Terms<T>, ShapeGrad<T> sums, weighted) -> ShapeGrad<T>    per (tile, splat), linear: what is
+//                                        added up over tiles; PlainSums leaves the sums as they are
 //   prepare_vjp(Cov2d<T>, Shape<T>, ShapeGrad<T> sums, weighted) -> SplatGrad<T>         once per splat
 //
 // T is float or double, V a scalar or a pack of lanes (lanes.h). The five numbers of ShapeGrad are
@@ -45,9 +48,12 @@ template <typename T> AR_HD T eigenvalue_gap(Cov2d<T> c) {
   return sqrt(dx * dx + dy * dy);
 }
 
+template <class... F> struct FootprintList {};
+
 /// Run-time options. What changes the code of a pixel is a template parameter instead.
 struct FootprintOptions {
-  double variance;  ///< `dilation` of point, `variance` of mip [px^2]; others ignore it
+  double variance;       ///< `dilation` of point, `variance` of mip [px^2]; others ignore it
+  double tolerance = 0;  ///< of adaptive; others ignore it
 };
 
 /// Five sums over pixels; see prepare_vjp of each footprint.
@@ -58,6 +64,13 @@ template <class V> struct ShapeGrad {
 template <class V> AR_HD ShapeGrad<V> operator+(ShapeGrad<V> a, ShapeGrad<V> b) {
   return {a.offset + b.offset, a.shape + b.shape};
 }
+
+/// Base of the footprints whose sums over a tile can be added up as they are.
+struct PlainSums {
+  template <class Terms, typename T> AR_HD static ShapeGrad<T> collect(const Terms&, const ShapeGrad<T>& sums, T) {
+    return sums;
+  }
+};
 
 /// Gradient of one splat. dL = dL_dmean . dmean + tr(dL_dcov dSigma) + dL_dlog_det d(log det Sigma).
 /// The part along log det stays apart: its matrix Sigma^-1 does not exist for needles, but its pull

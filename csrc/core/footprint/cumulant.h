@@ -51,7 +51,7 @@ template <typename T> struct CumulantAxis {
   template <class V> AR_HD V inner(V P) const { return madd(P, quartic(P), V(-linear)); }
 };
 
-struct Cumulant {
+struct Cumulant : PlainSums {
   static constexpr const char* kName = "cumulant";
   static constexpr int kSamples = 1;
   static constexpr double kReach = 0;

@@ -8,7 +8,7 @@ namespace ar {
 
 /// I = 2 pi s1 s2 [Phi]_u [Phi]_v, [Phi]_u = Phi((u + 1/2) / s1) - Phi((u - 1/2) / s1), (u, v) = d in
 /// the eigenframe of Sigma. The adjoint holds the frame fixed, as that of `analytic` does by default.
-struct Erf {
+struct Erf : PlainSums {
   static constexpr const char* kName = "erf";
   static constexpr int kSamples = 1;
   static constexpr double kReach = 0;
@@ -19,6 +19,7 @@ struct Erf {
   template <typename T> struct Shape {
     Vec2<T> inv_sigma;  ///< along the major and the minor axis [1/px]
     Vec2<T> axis;       ///< (cos, sin) of the major axis
+    T area;             ///< s1 s2 [px^2]
   };
   template <typename T> struct Terms {
     Mat2<T> w;       ///< whitening matrix, rows along the axes
@@ -31,7 +32,8 @@ struct Erf {
 
   template <typename T> AR_HD static Shape<T> prepare(Cov2d<T> cov, FootprintOptions) {
     const Eigenframe<T> frame = eigenframe(cov);
-    return {{T(1) / max(frame.sigma.x, T(kMinSigma)), T(1) / max(frame.sigma.y, T(kMinSigma))}, frame.axis};
+    const T s1 = max(frame.sigma.x, T(kMinSigma)), s2 = max(frame.sigma.y, T(kMinSigma));
+    return {{T(1) / s1, T(1) / s2}, frame.axis, s1 * s2};
   }
 
   /// Ellipse of Sigma + I/12.
@@ -43,13 +45,12 @@ struct Erf {
   /// See box_excess(), which holds along either axis.
   template <typename T> AR_HD static T level(const Shape<T>& g, T opacity) {
     const T w1 = widened(g.inv_sigma.x), w2 = widened(g.inv_sigma.y);
-    return gaussian_level(w1 * w2 / (g.inv_sigma.x * g.inv_sigma.y), opacity) + box_excess(w1 * w1) +
-           box_excess(w2 * w2);
+    return gaussian_level(w1 * w2 * g.area, opacity) + box_excess(w1 * w1) + box_excess(w2 * w2);
   }
 
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& g, T opacity, Vec2<T> origin = {T(0), T(0)}) {
     const Mat2<T> w = mean_map(g);
-    return {w, transform(w, origin), g.inv_sigma, opacity / (g.inv_sigma.x * g.inv_sigma.y)};
+    return {w, transform(w, origin), g.inv_sigma, opacity * g.area};
   }
 
   template <typename T, class V> AR_HD static V alpha(const Terms<T>& t, Vec2<V> p, int) {

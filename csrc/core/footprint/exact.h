@@ -13,14 +13,14 @@ namespace ar {
 /// z.x depends on one image axis alone, that of the larger variance; along it z.y falls at the rate
 /// `tilt`. Where the other axis is wide, given this one, a product rule over the pixel; else the
 /// other axis in closed form, and this one cut where the pixel's edges cross the Gaussian's ridge.
-struct Exact {
+struct Exact : PlainSums {
   static constexpr const char* kName = "exact";
   static constexpr int kSamples = 1;
   static constexpr double kReach = 0;
 
-  template <typename T> struct Shape {
-    Mat2<T> w;  ///< whitening matrix of Sigma as of whiten(), the sign of its first row chosen so that tilt >= 0
-  };
+  /// w: as of whiten(), the sign of its first row chosen so that tilt >= 0. amp: of the Gaussian of
+  /// Sigma + I/12 that bounds the weight.
+  template <typename T> using Shape = GaussianShape<T>;
 
   template <typename T> struct Terms {
     Mat2<T> w;
@@ -40,7 +40,7 @@ struct Exact {
       w.xx = -w.xx;
       w.xy = -w.xy;
     }
-    return {w};
+    return {w, sqrt(cov.det / blur(cov, T(kPixelVariance)).det)};
   }
 
   /// Ellipse of Sigma + I/12.
@@ -49,9 +49,7 @@ struct Exact {
   /// See box_excess().
   template <typename T> AR_HD static T level(const Shape<T>& g, T opacity) {
     const Cov2d<T> wide = widened(g);
-    const T det = T(1) / square(along(g.w) * across(g.w));
-    return gaussian_level(sqrt(det / wide.det), opacity) + box_excess(wide.yy / wide.det) +
-           box_excess(wide.xx / wide.det);
+    return gaussian_level(g.amp, opacity) + box_excess(wide.yy / wide.det) + box_excess(wide.xx / wide.det);
   }
 
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& g, T opacity, Vec2<T> origin = {T(0), T(0)}) {

@@ -15,14 +15,14 @@ template <typename T> struct GaussianShape {
 };
 
 /// Whitening matrix of c: Cholesky factor with the narrow axis conditioned on the wide one.
-template <typename T> AR_HD Mat2<T> whiten(Cov2d<T> c) {
-  const bool wide_x = c.xx >= c.yy;
+template <typename T> AR_HD Mat2<T> whiten(Cov2d<T> c, bool wide_x) {
   const T wide = wide_x ? c.xx : c.yy;
   const T along = T(1) / sqrt(wide);
   const T across = sqrt(wide / c.det);  // 1 / std. dev. of the narrow axis given the wide one
   const T slope = -across * (c.xy / wide);
   return wide_x ? Mat2<T>{along, T(0), slope, across} : Mat2<T>{T(0), along, across, slope};
 }
+template <typename T> AR_HD Mat2<T> whiten(Cov2d<T> c) { return whiten(c, c.xx >= c.yy); }
 
 /// Exponents are taken to base 2: kBase2^2 = log2(e) / 2 turns |w d|^2 into -log2 of the Gaussian.
 inline constexpr double kBase2 = 0.84932180028801904272;
@@ -42,27 +42,44 @@ template <typename T> AR_HD SplatGrad<T> gaussian_vjp(const Mat2<T>& w, ShapeGra
   return {transform_transposed(T(1 / kBase2) * w, sums.offset), congruence_transposed(w, half), T(0.5) * weighted};
 }
 
-/// Node s of the box footprint with S samples, in units of 1/(2 S) px: one per row and column of an
-/// S x S grid, so that with the variance of each component the mixture has the pixel's mean and its
-/// variance along each axis.
-template <int S> AR_HD constexpr Vec2<int> box_node(int s) {
-  if constexpr (S == 1) {
-    return {0, 0};
-  } else if constexpr (S == 16) {
-    return {2 * s - 15, 2 * (5 * s % 16) - 15};
-  } else {
-    constexpr Vec2<int> kNodes2[] = {{1, 1}, {-1, -1}};
-    constexpr Vec2<int> kNodes4[] = {{-1, -3}, {3, -1}, {1, 3}, {-3, 1}};
-    constexpr Vec2<int> kNodes8[] = {{1, -3}, {-1, 3}, {5, 1}, {-3, -5}, {-5, 5}, {-7, -1}, {3, 7}, {7, -7}};
-    static_assert(S == 2 || S == 4 || S == 8, "box has 1, 2, 4, 8 or 16 samples");
-    return S == 2 ? kNodes2[s % 2] : S == 4 ? kNodes4[s % 4] : kNodes8[s % 8];
+/// Variance of each of the S Gaussians of the box footprint [px^2].
+template <int S>
+inline constexpr double kBoxVariance = S == 1   ? kPixelVariance
+                                       : S == 2 ? kPixelVariance / 4
+                                                : 1.0 / (24 * S);
+
+/// Node s of the box footprint with S samples [px]. With the variance of its Gaussians the mixture has the
+/// mean and, but for two samples, the covariance of the pixel. From 4 on found by search on trained and
+/// random scenes (docs/numerics.md, "Nodes").
+template <int S> AR_HD constexpr Vec2<double> box_node(int s) {
+  constexpr Vec2<double> kNodes2[] = {{0.25, 0.25}};
+  constexpr Vec2<double> kNodes4[] = {{-0.12083, -0.36226}, {0.36226, -0.12083}};
+  constexpr Vec2<double> kNodes8[] = {{0.23261, 0.40079}, {0.39744, 0.06586}, {0.31083, -0.35497}, {0.06179, -0.14672}};
+  constexpr Vec2<double> kNodes16[] = {{0.26975, -0.14597}, {0.14427, -0.43939}, {0.06200, -0.14646},
+                                       {0.18749, 0.14720},  {0.43551, -0.31294}, {0.39499, 0.06396},
+                                       {0.10473, 0.35640},  {0.39573, 0.39912}};
+  static_assert(S == 1 || S == 2 || S == 4 || S == 8 || S == 16, "box has 1, 2, 4, 8 or 16 samples");
+  if (S == 1) return {0, 0};
+  // The other half is opposite.
+  const int k = s % (S / 2 > 0 ? S / 2 : 1);
+  const Vec2<double> n = S == 2 ? kNodes2[k % 1] : S == 4 ? kNodes4[k % 2] : S == 8 ? kNodes8[k % 4] : kNodes16[k % 8];
+  return s < S / 2 ? n : Vec2<double>{-n.x, -n.y};
+}
+
+/// Largest coordinate of the nodes [px].
+template <int S> constexpr double box_reach() {
+  double reach = 0;
+  for (int s = 0; s < S; ++s) {
+    const Vec2<double> n = box_node<S>(s);
+    for (const double x : {n.x, -n.x, n.y, -n.y}) reach = x > reach ? x : reach;
   }
+  return reach;
 }
 
 /// S Gaussians that stand for one pixel. kCompensated: the amplitude keeps the mass of the splat.
-template <int S, bool kCompensated> struct GaussianFootprint {
+template <int S, bool kCompensated> struct GaussianFootprint : PlainSums {
   static constexpr int kSamples = S;
-  static constexpr double kReach = (S - 1) / (2.0 * S);
+  static constexpr double kReach = box_reach<S>();
   template <typename T> using Shape = GaussianShape<T>;
 
   template <typename T> struct Terms {
@@ -87,8 +104,8 @@ template <int S, bool kCompensated> struct GaussianFootprint {
     Terms<T> t{w, log2(opacity * shape.amp), {}};
     AR_UNROLL
     for (int s = 0; s < S; ++s) {
-      const Vec2<int> n = box_node<S>(s);
-      t.node[s] = transform(w, Vec2<T>{origin.x + T(n.x) / T(2 * S), origin.y + T(n.y) / T(2 * S)});
+      const Vec2<double> n = box_node<S>(s);
+      t.node[s] = transform(w, Vec2<T>{origin.x + T(n.x), origin.y + T(n.y)});
     }
     return t;
   }
