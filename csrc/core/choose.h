@@ -13,9 +13,6 @@
 
 namespace ar {
 
-/// The sample counts to choose from.
-inline constexpr int kSampleChoices[] = {1, 4, 8, 16};
-
 /// Largest estimates for which 1, 4 and 8 samples do.
 template <typename T> struct SampleLimits {
   T of[3];
@@ -84,8 +81,8 @@ template <typename T> AR_HD Vec2<T> tile_center(TileGrid grid, int64_t tile) {
   return {T(tile % grid.columns() * kTile) + half, T(tile / grid.columns() * kTile) + half};
 }
 
-/// Limits that keep the image within `tolerance` of 16 samples for 99% of the pixels: measured at the
-/// tolerances of the rows, powers between them, in proportion beyond.
+/// Limits fitted so that 99% of the pixels are within `tolerance` of 16 samples, at the tolerances of the
+/// columns; powers between them, in proportion beyond.
 template <typename T> SampleLimits<T> sample_limits(double tolerance) {
   constexpr int kRows = 5;
   constexpr double kTolerances[kRows] = {0.25 / 255, 0.5 / 255, 1.0 / 255, 2.0 / 255, 4.0 / 255};
