@@ -173,7 +173,7 @@ def _measure_scale(scene, views, methods, background, rounds, max_density, cpu_t
             pictures[name] = {view.name: case.forward().cpu() for view, case in zip(views, of_name)}
             bar.update()
     exact = None
-    if EXACT in FOOTPRINTS and any(method.has_single_weight for method in methods):
+    if any(method.has_single_weight for method in methods):
         exact = pictures.get(EXACT)
         if exact is None:
             exact = {v.name: measure.Case(scene, v, EXACT, 1, background).forward().cpu() for v in views}

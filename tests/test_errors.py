@@ -22,32 +22,17 @@ def erf_weight(offset, cov2d):
     return reference.rotated_window(offset, cov2d, "frozen", reference.normal_window, reference.normal_pdf)
 
 
-STAND_INS = {"exact": reference.exact_weight, "erf": erf_weight}
+FORMULAS = {"exact": reference.exact_weight, "erf": erf_weight}
 
 
-def weight(offset, cov2d, name):
-    """ar.footprint_weight, or the suite's own formula of a footprint that this build lacks."""
-    if name in ar.FOOTPRINTS or name not in STAND_INS:
-        return ar.footprint_weight(offset, cov2d, name)
-    return STAND_INS[name](offset, cov2d)
-
-
-@pytest.fixture
-def truth(monkeypatch):
-    monkeypatch.setattr(errors, "footprint_weight", weight)
-    return monkeypatch
-
-
-@pytest.mark.parametrize("name", STAND_INS)
+@pytest.mark.parametrize("name", FORMULAS)
 def test_footprints_of_the_analysis_are_the_suites_formulas(name):
-    if name not in ar.FOOTPRINTS:
-        pytest.skip(f"this build has no footprint {name}")
     for sigma in (0.02, 0.3, 3.0):
         offset, cov2d = errors._splats(errors._unit_samples(128), sigma, blur=1 / 12)
-        expected = STAND_INS[name](offset, cov2d)
+        expected = FORMULAS[name](offset, cov2d)
         assert (ar.footprint_weight(offset, cov2d, name) - expected).abs().max() < 1e-9
         gradients = []
-        for function in (STAND_INS[name], lambda d, c: ar.footprint_weight(d, c, name)):
+        for function in (FORMULAS[name], lambda d, c: ar.footprint_weight(d, c, name)):
             inputs = offset.clone().requires_grad_(), cov2d.clone().requires_grad_()
             gradients.append(torch.autograd.grad(function(*inputs).sum(), inputs))
         for wanted, found in zip(*gradients):
@@ -94,7 +79,7 @@ def test_window_is_that_of_the_analytic_footprint():
 # ------------------------------------------------------------------------------- (b) rotation
 
 
-def test_the_two_references_agree_within_the_monte_carlo_error(truth):
+def test_the_two_references_agree_within_the_monte_carlo_error():
     rows = errors.rotation_errors(samples=32, monte_carlo=4096, sigmas=8)
     z = math.sqrt(sum(row["z_rms"] ** 2 for row in rows) / len(rows))
     assert 0.85 < z < 1.15  # of 256 splats; the standard deviation of this number is about 0.05
@@ -104,15 +89,17 @@ def test_the_two_references_agree_within_the_monte_carlo_error(truth):
     assert turned == sorted(turned, reverse=True)
 
 
-def test_a_wrong_reference_is_noticed(truth):
-    truth.setattr(
-        errors, "footprint_weight", lambda d, c, name: weight(d, c, name) * (1.02 if name == "exact" else 1.0)
+def test_a_wrong_reference_is_noticed(monkeypatch):
+    monkeypatch.setattr(
+        errors,
+        "footprint_weight",
+        lambda d, c, name: ar.footprint_weight(d, c, name) * (1.02 if name == "exact" else 1.0),
     )
     rows = errors.rotation_errors(samples=32, monte_carlo=4096, sigmas=4)
     assert max(row["z_rms"] for row in rows) > 2
 
 
-def test_rotation_errors_are_those_of_the_splats(truth):
+def test_rotation_errors_are_those_of_the_splats():
     row = errors.rotation_errors(samples=16, monte_carlo=64, sigmas=3)[0]
     offset, cov2d = errors._splats(errors._unit_samples(16), 0.3, blur=0.0)
     difference = (erf_weight(offset, cov2d) - reference.exact_weight(offset, cov2d)).abs()
@@ -136,7 +123,7 @@ def test_splats_are_what_they_are_said_to_be():
     assert (q < 1.5).double().mean().item() == pytest.approx(0.25, abs=0.03)  # uniform in area
 
 
-def test_errors_of_a_footprint_by_hand(truth):
+def test_errors_of_a_footprint_by_hand():
     rows = errors.footprint_errors(["cumulant"], samples=64)
     row = rows[10]
     assert row["sigma"] == pytest.approx(0.2)
@@ -170,7 +157,7 @@ def test_whitened_gradient_is_the_derivative_along_relative_changes():
         torch.testing.assert_close((up - down) / 2e-6, expected, rtol=1e-5, atol=1e-8)
 
 
-def test_the_truth_has_no_error_and_cases_cover_the_footprints(truth):
+def test_the_truth_has_no_error_and_cases_cover_the_footprints():
     for row in errors.footprint_errors(["exact"], samples=8):
         assert row["weight_max"] == row["offset_max"] == row["cov2d_max"] == 0
     named = {case.partition(":")[0] for case in errors.all_cases()}
@@ -181,9 +168,9 @@ def test_the_truth_has_no_error_and_cases_cover_the_footprints(truth):
 
 
 @pytest.fixture
-def small(truth, tmp_path):
+def small(monkeypatch, tmp_path):
     """(folder, results) of a run on few splats."""
-    truth.setattr(errors, "all_cases", lambda: ["point", "analytic", errors.PAPER_GRADIENT, "cumulant"])
+    monkeypatch.setattr(errors, "all_cases", lambda: ["point", "analytic", errors.PAPER_GRADIENT, "cumulant"])
     return tmp_path, errors.run(tmp_path, samples=32, monte_carlo=128, rotation_samples=4)
 
 
@@ -229,9 +216,9 @@ def test_plots_are_the_same_every_time(tmp_path):
         assert first.read_bytes() == second.read_bytes()
 
 
-def test_command_prints_the_summary(truth, tmp_path, capsys):
-    truth.setattr(errors, "all_cases", lambda: ["cumulant"])
-    truth.setattr(errors, "ROTATION_SAMPLES", 2)
+def test_command_prints_the_summary(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(errors, "all_cases", lambda: ["cumulant"])
+    monkeypatch.setattr(errors, "ROTATION_SAMPLES", 2)
     out = tmp_path / "new"
     assert cli.main(["errors", "--out", str(out), "--samples", "8", "--monte-carlo", "64"]) == 0
     printed = capsys.readouterr().out
@@ -240,17 +227,11 @@ def test_command_prints_the_summary(truth, tmp_path, capsys):
 
 
 @pytest.mark.parametrize("module", ["matplotlib.figure", "scipy.special"])
-def test_missing_library_names_the_extra(truth, tmp_path, capsys, module):
-    truth.setitem(sys.modules, module, None)
+def test_missing_library_names_the_extra(monkeypatch, tmp_path, capsys, module):
+    monkeypatch.setitem(sys.modules, module, None)
     assert cli.main(["errors", "--out", str(tmp_path)]) == 2
     assert "pip install analytic_rasterizer[analysis]" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.skipif("exact" in ar.FOOTPRINTS, reason="this build has what the analysis needs")
-def test_build_without_the_truth(tmp_path, capsys):
-    assert cli.main(["errors", "--out", str(tmp_path), "--samples", "8"]) == 2
-    assert capsys.readouterr().err.startswith("error: footprint must be one of")
 
 
 @pytest.mark.parametrize(

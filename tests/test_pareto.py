@@ -33,15 +33,12 @@ def target(width=SIZE[0], height=SIZE[1]):
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
-    """(folder, results) of two scales, with `cumulant` in the place of `exact` where there is none."""
+    """(folder, results) of two scales."""
     out = tmp_path_factory.mktemp("pareto")
     scene, views = target()
-    with pytest.MonkeyPatch.context() as patch:
-        if "exact" not in ar.FOOTPRINTS:
-            patch.setattr(pareto, "EXACT", "cumulant")
-        methods = [pareto.parse_method(text) for text in METHODS]
-        torch.set_num_threads(1)
-        return out, pareto.run(out, scene, views, [1, 2], methods, background=PAPER, rounds=1, name="target")
+    methods = [pareto.parse_method(text) for text in METHODS]
+    torch.set_num_threads(1)
+    return out, pareto.run(out, scene, views, [1, 2], methods, background=PAPER, rounds=1, name="target")
 
 
 def rendered(scene, view, footprint):
@@ -53,7 +50,6 @@ def rendered(scene, view, footprint):
 
 
 def test_methods_cover_every_footprint():
-    """Also those that do not exist yet, `adaptive` among them."""
     methods = pareto.default_methods()
     names = [method.name for method in methods]
     assert {method.footprint.partition(":")[0] for method in methods} == set(ar.FOOTPRINTS)
@@ -183,9 +179,8 @@ def ssim(left, right):
 
 def test_split_into_weight_and_blending_is_consistent(measured):
     _, results = measured
-    exact = "exact" if "exact" in ar.FOOTPRINTS else "cumulant"
     scene, views = target()
-    pictures = {name: [rendered(scene, view, name) for view in views] for name in ("mip", exact)}
+    pictures = {name: [rendered(scene, view, name) for view in views] for name in ("mip", "exact")}
     expected = torch.cat([(a - b).flatten() for a, b in zip(*pictures.values())]).square().mean().sqrt().item()
     for at_scale in results["scales"]:
         split = {row["method"]: row for row in at_scale["methods"]}
@@ -231,7 +226,7 @@ def test_coarse_reference_is_called_unresolved(tmp_path):
     assert pareto.describe(results, at_scale)[-1].startswith("~ not converged")
     assert pareto.describe(results, at_scale)[-1].endswith("uncertain: point:dilation=0@4")
     assert [row[1][0] == "~" for row in pareto.to_table(results, at_scale)[1]] == [False, True]
-    assert dilated["weight_rmse"] is None or "exact" in ar.FOOTPRINTS
+    assert dilated["weight_rmse"] is not None
 
 
 def test_ranking_is_that_of_the_demo(measured):
