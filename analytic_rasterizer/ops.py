@@ -46,7 +46,7 @@ def _(
             means3D.new_empty(samples, image_height, image_width, **ints),
             means3D.new_empty(checkpoints),
             means3D.new_empty((context.new_dynamic_size(), 3) if keep else (0,), **ints),
-            means3D.new_empty(4 if keep else 0, **longs),
+            means3D.new_empty(12 if keep else 0, **longs),
             tile_samples,
         )
     splats, pairs = context.new_dynamic_size(), context.new_dynamic_size()

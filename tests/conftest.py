@@ -33,16 +33,6 @@ def device(request):
     return request.param
 
 
-@pytest.fixture(autouse=True)
-def adaptive_waits_for_cuda(request):
-    """`adaptive` refuses CUDA until its kernels have passed these tests on a device."""
-    call = getattr(request.node, "callspec", None)
-    variant = call.params.get("variant") if call else None
-    on_cuda = (call and call.params.get("device") == "cuda") or request.node.path.name == "test_cuda.py"
-    if on_cuda and (request.node.path.name == "test_adaptive.py" or (variant and variant[0] == "adaptive")):
-        pytest.skip("adaptive does not run on CUDA yet")
-
-
 @pytest.fixture
 def best(device):
     """The most precise dtype in which the device renders."""

@@ -35,12 +35,14 @@ template <typename T> AR_HD TileShare<T> tile_share(const AdaptiveShape<T>& shap
   const T variance = T(kBoxVariance<8>), deviations = shape.deviations;
   const Cov2d<T> fine = blur(cov, variance), pixel = blur(cov, T(kPixelVariance)),
                  tile = blur(cov, T(kTile * kTile / 12.0));
-  const T q = (tile.yy * d.x * d.x - T(2) * tile.xy * d.x * d.y + tile.xx * d.y * d.y) / tile.det;
-  const T alpha = opacity * (deviations / sqrt(tile.det)) * exp2(T(-0.5 * kLog2e) * q);
-  const T detail = opacity * (deviations / sqrt(fine.det)) * variance * ((fine.xx + fine.yy) / fine.det);
+  // One division and one root for each.
+  const T of_tile = T(1) / tile.det, of_fine = T(1) / fine.det, mass = opacity * deviations;
+  const T q = (tile.yy * d.x * d.x - T(2) * tile.xy * d.x * d.y + tile.xx * d.y * d.y) * of_tile;
+  const T alpha = mass * sqrt(of_tile) * exp2(T(-0.5 * kLog2e) * q);
+  const T detail = mass * sqrt(of_fine) * variance * ((fine.xx + fine.yy) * of_fine);
   // The length of the ellipse on which alpha is the minimum, over the splat's mass.
   const T level = max(T(0), gaussian_level(deviations / sqrt(pixel.det), opacity));
-  const T ring = sqrt(level * T(0.5) * (pixel.xx + pixel.yy)) / (opacity * deviations);
+  const T ring = sqrt(level * T(0.5) * (pixel.xx + pixel.yy)) / mass;
   return {min(alpha, T(kAlphaMax)), detail, T(0.03 * kAlphaMin * kAlphaMin) * min(ring, T(1e4))};
 }
 

@@ -156,10 +156,11 @@ template <class F, typename T> void blend_tile(const cpu::BlendTask<T>& task, in
   }
 }
 
-/// Calls f(F{}) for what a tile is blended with: F itself, or for `adaptive` what was chosen.
-template <class F, class Function> void visit_tile_footprint(const int32_t* tile_samples, int64_t tile, Function&& f) {
+/// Calls f(F{}) for what a tile is blended with: F itself, or for `adaptive` the one of Boxes that was chosen.
+template <class F, class Boxes, class Function>
+void visit_tile_footprint(const int32_t* tile_samples, int64_t tile, Function&& f) {
   if constexpr (std::is_same_v<F, Adaptive>) {
-    visit_samples(tile_samples[tile], AdaptiveBoxes{}, f);
+    visit_samples(tile_samples[tile], Boxes{}, f);
   } else {
     f(F{});
   }
@@ -183,7 +184,8 @@ template <class F, typename T> void choose(const cpu::ChooseTask<T>& task) {
 
 template <class F, typename T> void blend(const cpu::BlendTask<T>& task) {
   cpu::parallel_for(task.grid.tiles(), task.threads, [&](int64_t tile) {
-    visit_tile_footprint<F>(task.tile_samples, tile, [&](auto f) { blend_tile<decltype(f), T>(task, tile); });
+    visit_tile_footprint<F, AdaptiveBoxes>(task.tile_samples, tile,
+                                           [&](auto f) { blend_tile<decltype(f), T>(task, tile); });
   });
 }
 
@@ -273,7 +275,7 @@ template <class F, typename T, bool kAbs> void blend_vjp_tile(const cpu::BlendVj
 
 template <class F, typename T> void blend_vjp(const cpu::BlendVjpTask<T>& task) {
   cpu::parallel_for(task.grid.tiles(), task.threads, [&](int64_t tile) {
-    visit_tile_footprint<F>(task.tile_samples, tile, [&](auto f) {
+    visit_tile_footprint<F, AdaptiveBoxesVjp>(task.tile_samples, tile, [&](auto f) {
       if (task.pair_abs) {
         blend_vjp_tile<decltype(f), T, true>(task, tile);
       } else {

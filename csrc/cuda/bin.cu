@@ -90,19 +90,19 @@ __global__ void __launch_bounds__(kRangeThreads)
 
 constexpr int kPlanThreads = 256;
 
-/// Work is handed out longest first, so that no block starts on a long piece when the others are
-/// done. Lengths are classed by powers of two; within a class the order does not matter.
+/// Work is handed out by samples, and of those longest first, so that no block starts on a long piece
+/// when the others are done. Lengths are classed by powers of two; within a class the order does not matter.
 struct WorkClasses {
-  static constexpr int kCount = 33;
+  static constexpr int kLengths = 33, kCount = kSampleClasses * kLengths;
 
-  __device__ static int of(int length) { return __clz(length); }  // longer first
-  /// Adds a piece of this length to its class and returns how many were there. Lanes of one class go
-  /// together: atomics to one place are slow.
-  __device__ static int take(int32_t* classes, int length) {
-    const uint32_t peers = __match_any_sync(__activemask(), of(length));
+  __device__ static int of(int samples, int length) { return sample_class(samples) * kLengths + __clz(length); }
+  /// Adds a piece to its class and returns how many were there. Lanes of one class go together: atomics
+  /// to one place are slow.
+  __device__ static int take(int32_t* classes, int of) {
+    const uint32_t peers = __match_any_sync(__activemask(), of);
     const int leader = __ffs(peers) - 1;
     int first = 0;
-    if (lane_id() == leader) first = atomicAdd(&classes[of(length)], __popc(peers));
+    if (lane_id() == leader) first = atomicAdd(&classes[of], __popc(peers));
     return __shfl_sync(peers, first, leader) + __popc(peers & ((1u << lane_id()) - 1));
   }
 };
@@ -124,50 +124,53 @@ __device__ int samples_of(const TileLists& lists, int64_t tile, int most) {
 }
 
 __global__ void __launch_bounds__(kPlanThreads)
-    count_work_kernel(const TileLists lists, int64_t tiles, int samples, PlanCounters* counters) {
+    count_work_kernel(const TileLists lists, int64_t tiles, int most_samples, PlanCounters* counters) {
   const int64_t tile = int64_t(blockIdx.x) * kPlanThreads + threadIdx.x;
   if (tile >= tiles) return;
-  const int n = list_length(lists, tile), length = chunk_length(samples_of(lists, tile, samples));
-  WorkClasses::take(counters->tile_sizes, n);
-  if (n >= length) atomicAdd(&counters->chunk_sizes[WorkClasses::of(length)], n / length);
-  if (n % length) WorkClasses::take(counters->chunk_sizes, n % length);
+  const int samples = samples_of(lists, tile, most_samples), length = chunk_length(samples);
+  const int n = list_length(lists, tile);
+  WorkClasses::take(counters->tile_sizes, WorkClasses::of(samples, n));
+  if (n >= length) atomicAdd(&counters->chunk_sizes[WorkClasses::of(samples, length)], n / length);
+  if (n % length) WorkClasses::take(counters->chunk_sizes, WorkClasses::of(samples, n % length));
 }
 
 /// Places come from atomics: which tile gets which differs from run to run, and changes no result.
 __global__ void __launch_bounds__(kPlanThreads)
     plan_kernel(const TileLists lists, TileGrid grid, int most_samples, PlanCounters* counters, const ChunkPlan plan,
                 int64_t* feedback) {
+  using Scan = cub::BlockScan<int, kPlanThreads>;
+  static_assert(WorkClasses::kCount < kPlanThreads);
+  __shared__ typename Scan::TempStorage storage;
   __shared__ int tile_base[WorkClasses::kCount], chunk_base[WorkClasses::kCount];
-  if (threadIdx.x < 2) {
-    const int32_t* sizes = threadIdx.x == 0 ? counters->tile_sizes : counters->chunk_sizes;
-    int* base = threadIdx.x == 0 ? tile_base : chunk_base;
-    int sum = 0;
-    for (int c = 0; c < WorkClasses::kCount; ++c) {
-      base[c] = sum;
-      sum += sizes[c];
-    }
-    if (blockIdx.x == 0 && threadIdx.x == 1) {
-      lists.counts->chunks = sum;
-      *feedback = lists.counts->pairs;
-    }
-  }
-  __syncthreads();
+  const auto find_bases = [&](const int32_t* sizes, int* base, SampleParts& parts) {
+    const int c = threadIdx.x;
+    int first = c < WorkClasses::kCount ? sizes[c] : 0;
+    Scan(storage).ExclusiveSum(first, first);
+    if (c < WorkClasses::kCount) base[c] = first;
+    if (blockIdx.x == 0 && c <= WorkClasses::kCount && c % WorkClasses::kLengths == 0)
+      parts.first[c / WorkClasses::kLengths] = first;
+    __syncthreads();
+  };
+  find_bases(counters->tile_sizes, tile_base, lists.counts->tiles);
+  find_bases(counters->chunk_sizes, chunk_base, lists.counts->chunks);
+  if (blockIdx.x == 0 && threadIdx.x == 0) *feedback = lists.counts->pairs;
   const int64_t tile = int64_t(blockIdx.x) * kPlanThreads + threadIdx.x;
   if (tile >= grid.tiles()) return;
   const int samples = samples_of(lists, tile, most_samples), length = chunk_length(samples);
   const int n = list_length(lists, tile), whole = n / length, chunks = (n + length - 1) / length;
-  plan.tile_order[tile_base[WorkClasses::of(n)] + WorkClasses::take(counters->tile_places, n)] = int32_t(tile);
+  const int tile_class = WorkClasses::of(samples, n);
+  plan.tile_order[tile_base[tile_class] + WorkClasses::take(counters->tile_places, tile_class)] = int32_t(tile);
   const int plane = chunks > 1 ? atomicAdd(&lists.counts->planes, chunks * samples) : 0;
   plan.tile_planes[tile] = plane;
   const auto part = [&](int chunk) { return TileChunk{int32_t(tile), chunk, plane + chunk * samples}; };
   if (whole > 0) {
-    const int c = WorkClasses::of(length);
+    const int c = WorkClasses::of(samples, length);
     TileChunk* order = plan.chunk_order + chunk_base[c] + atomicAdd(&counters->chunk_places[c], whole);
     for (int chunk = 0; chunk < whole; ++chunk) order[chunk] = part(chunk);
   }
   if (n % length) {
-    const int c = WorkClasses::of(n % length);
-    plan.chunk_order[chunk_base[c] + WorkClasses::take(counters->chunk_places, n % length)] = part(whole);
+    const int c = WorkClasses::of(samples, n % length);
+    plan.chunk_order[chunk_base[c] + WorkClasses::take(counters->chunk_places, c)] = part(whole);
   }
   const int front = front_chunks(grid, samples);
   if (chunks > front) {

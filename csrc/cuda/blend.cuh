@@ -186,6 +186,11 @@ template <int S> __device__ bool has_samples(const TileLists& lists, int tile) {
   return !lists.tile_samples || lists.tile_samples[tile] == S;
 }
 
+/// Those of S samples that the front chunks left open.
+template <int S> __device__ int32_t* open_tiles(const BlendTask& task) {
+  return task.open_tiles + sample_class(S) * task.grid.tiles();
+}
+
 /// Checkpoints of a thread's pixel.
 template <int S> struct PixelCheckpoints {
   Checkpoint* base;  // of the tile's first
@@ -247,8 +252,13 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 1             ? 1
   constexpr int S = F::kSamples, kLength = chunk_length(S), kColors = kKeep ? S : 1;
   __shared__ Stage<F> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.lists.splats);
-  const int tile = task.plan.tile_order[blockIdx.x], warp = threadIdx.x / 32, front_length = front_chunks(task.grid, S);
-  if (!has_samples<S>(task.lists, tile)) return;
+  int place = int(blockIdx.x);
+  if (task.lists.tile_samples) {
+    const SampleParts& tiles = task.lists.counts->tiles;
+    place += tiles.first[sample_class(S)];
+    if (place >= tiles.first[sample_class(S) + 1]) return;
+  }
+  const int tile = task.plan.tile_order[place], warp = threadIdx.x / 32, front_length = front_chunks(task.grid, S);
   const TileList list = list_of(task.lists, task.grid, tile);
   const Vec2<float> p = pixel_of(warp, lane_id());
   const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
@@ -276,7 +286,7 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 1             ? 1
   const bool more = k == front && front < list.count && __syncthreads_or(state.open());
   if (threadIdx.x == 0) {
     task.tile_open[tile] = more;
-    if (more) task.open_tiles[atomicAdd(&task.lists.counts->open_tiles, 1)] = tile;
+    if (more) open_tiles<S>(task)[atomicAdd(&task.lists.counts->open_tiles[sample_class(S)], 1)] = tile;
   }
   if (kKeep) store_last(task, x, y, state.last);
   if (!more) {
@@ -337,10 +347,9 @@ __device__ inline int chunks_of(const BlendTask& task, int tile, int length) {
 /// stopped before. Blocks share the open tiles.
 template <int S> __global__ void __launch_bounds__(kTilePixels) rest_scan_kernel(const BlendTask task) {
   constexpr int kBatch = 16;
-  const int items = task.lists.counts->open_tiles * S;
+  const int items = task.lists.counts->open_tiles[sample_class(S)] * S;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
-    const int tile = task.open_tiles[item / S], s = item % S, chunks = chunks_of(task, tile, chunk_length(S));
-    if (!has_samples<S>(task.lists, tile)) continue;
+    const int tile = open_tiles<S>(task)[item / S], s = item % S, chunks = chunks_of(task, tile, chunk_length(S));
     const PixelCheckpoints<S> checkpoints(task, tile, threadIdx.x);
     const int front = front_chunks(task.grid, S);
     float transmittance = checkpoints.at(front - 1, s).transmittance;
@@ -409,10 +418,9 @@ __global__ void __launch_bounds__(kBlendThreads) rest_blend_kernel(const BlendTa
 template <int S, bool kKeep> __global__ void __launch_bounds__(kTilePixels) rest_sum_kernel(const BlendTask task) {
   const Vec3<float> bg = {task.background[0], task.background[1], task.background[2]};
   const Vec2<float> p = pixel_of(threadIdx.x / 32, lane_id());
-  const int items = task.lists.counts->open_tiles;
+  const int items = task.lists.counts->open_tiles[sample_class(S)];
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
-    const int tile = task.open_tiles[item], chunks = chunks_of(task, tile, chunk_length(S));
-    if (!has_samples<S>(task.lists, tile)) continue;
+    const int tile = open_tiles<S>(task)[item], chunks = chunks_of(task, tile, chunk_length(S));
     const PixelCheckpoints<S> checkpoints(task, tile, threadIdx.x);
     Vec3<float> color = {0, 0, 0};
     float transmittance[S];
@@ -453,15 +461,13 @@ template <class F> void blend_tiles(const BlendTask& task, cudaStream_t stream) 
   }
 }
 
-/// Calls f(F{}, stream) for every footprint that tiles of F are blended with: those of `adaptive` side by
-/// side, as a few tiles of many samples would else keep the device waiting.
-/// Not ready: the rest kernels of one footprint read open_tiles while another's front kernel appends to it. Each
-/// needs a list of its own before ops_cuda.cpp may let `adaptive` through.
-template <class F, class Function> void for_each_tile_footprint(cudaStream_t stream, Function&& f) {
+/// Calls f(F{}, stream) for every footprint that tiles of F are blended with: those of `adaptive`, Boxes, side
+/// by side, as a few tiles of many samples would else keep the device waiting.
+template <class F, class Boxes, class Function> void for_each_tile_footprint(cudaStream_t stream, Function&& f) {
   if constexpr (std::is_same_v<F, Adaptive>) {
     SideStreams sides(stream);
     int k = 0;
-    for_each_footprint(AdaptiveBoxes{}, [&](auto tile_footprint) { f(tile_footprint, sides.stream(k++)); });
+    for_each_footprint(Boxes{}, [&](auto tile_footprint) { f(tile_footprint, sides.stream(k++)); });
     sides.join();
   } else {
     f(F{}, stream);
@@ -469,12 +475,20 @@ template <class F, class Function> void for_each_tile_footprint(cudaStream_t str
 }
 
 template <class F> void blend(const BlendTask& task, cudaStream_t stream) {
-  for_each_tile_footprint<F>(stream, [&](auto f, cudaStream_t side) { blend_tiles<decltype(f)>(task, side); });
+  for_each_tile_footprint<F, AdaptiveBoxes>(stream,
+                                            [&](auto f, cudaStream_t side) { blend_tiles<decltype(f)>(task, side); });
 }
 
-/// A warp's share of shared memory in blend_vjp: a tile's pixels and a group of splats.
-template <class F> struct VjpStage {
-  static constexpr int S = F::kSamples;
+/// What a kernel of blend_vjp sums: gradients, |dL/dmean| of each pixel, or both at once.
+enum class Sums { kGrads, kAbs, kBoth };
+
+/// Samples of a pixel that blend_vjp goes through together. The state of many leaves room for few warps, so
+/// gradients go through their chunk several times; only the absolute values need a pixel's sum at once.
+template <class F, Sums kSums>
+inline constexpr int kVjpSamples = F::kSamples <= 4 || kSums == Sums::kAbs ? F::kSamples : 4;
+
+/// A warp's share of shared memory in blend_vjp: a tile's pixels, S samples of each, and a group of splats.
+template <class F, int S> struct VjpStage {
   struct Sample {
     float transmittance, behind;
   };
@@ -492,20 +506,25 @@ template <class F> struct VjpStage {
 template <class F> inline constexpr int kVjpBlocks = F::kSamples > 1 ? 1 : sizeof(TileSplat<F>) <= 48 ? 7 : 5;
 
 /// Warps of a block of blend_vjp: as many as leave room for a few blocks in shared memory.
-template <class F> inline constexpr int kVjpWarps = F::kSamples <= 2 ? 4 : F::kSamples <= 8 ? 2 : 1;
+inline constexpr int vjp_warps(int samples) { return samples <= 2 ? 4 : samples <= 8 ? 2 : 1; }
 
 /// A warp per chunk, back to front, over all pixels of the tile: every pair is summed by one warp, so
 /// the sums need no atomics, whose order would change from run to run.
-template <class F, bool kAbs>
-__global__ void __launch_bounds__(32 * kVjpWarps<F>, kVjpBlocks<F>) blend_vjp_kernel(const BlendVjpTask task) {
-  constexpr int S = F::kSamples, kLength = chunk_length(S);
+template <class F, Sums kSums>
+__global__ void __launch_bounds__(32 * vjp_warps(kVjpSamples<F, kSums>), kVjpBlocks<F>)
+    blend_vjp_kernel(const BlendVjpTask task) {
+  constexpr int S = F::kSamples, kLength = chunk_length(S), kTogether = kVjpSamples<F, kSums>;
+  constexpr int kWarps = vjp_warps(kTogether);
+  constexpr bool kGrads = kSums != Sums::kAbs, kAbs = kSums != Sums::kGrads;
+  // A sample's number is not known when the code is compiled if there are several passes: keep it indexable.
+  using VjpSplat = std::conditional_t<kTogether == S, Held<F>, const TileSplat<F>&>;
   extern __shared__ float4 shared[];
-  VjpStage<F>& stage = reinterpret_cast<VjpStage<F>*>(shared)[threadIdx.x / 32];
+  auto& stage = reinterpret_cast<VjpStage<F, kTogether>*>(shared)[threadIdx.x / 32];
   const int lane = lane_id();
-  const int64_t item = int64_t(blockIdx.x) * kVjpWarps<F> + threadIdx.x / 32;
-  if (item >= task.lists.counts->chunks) return;
+  const SampleParts& chunks = task.lists.counts->chunks;
+  const int64_t item = chunks.first[sample_class(S)] + int64_t(blockIdx.x) * kWarps + threadIdx.x / 32;
+  if (item >= chunks.first[sample_class(S) + 1]) return;
   const auto [tile, chunk, plane] = task.chunk_order[item];
-  if (!has_samples<S>(task.lists, tile)) return;
   const TileList list = list_of(task.lists, task.grid, tile);
   const int begin = chunk * kLength, end = list.overflow ? list.count : min(list.count, begin + kLength);
   const int64_t image = int64_t(task.grid.width) * task.grid.height;
@@ -525,7 +544,7 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F>, kVjpBlocks<F>) blend_vjp_ke
     subtile_last[b] = warp_max(last);
     tile_last = max(tile_last, subtile_last[b]);
   }
-  if (!list.overflow) {
+  if (kGrads && !list.overflow) {
     for (int k = max(begin, min(tile_last, end)) + lane; k < end; k += 32) {  // pairs that nothing reached
       auto* row = reinterpret_cast<float4*>(task.pair_grads + int64_t(list.slot(k)) * kPairGradWidth);
 #pragma unroll
@@ -536,111 +555,119 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F>, kVjpBlocks<F>) blend_vjp_ke
 
   const bool final = tile_last <= end;
   const Checkpoint* checkpoints = task.checkpoints + int64_t(plane) * kTilePixels;
-#pragma unroll
-  for (int b = 0; b < kSubtiles; ++b) {
-    const int64_t i = pixel_index(b);
-    const int q = b * 32 + lane;
-    const float scale = i < 0 ? 0 : 1.0f / S;
-    const int64_t j = max(i, int64_t(0));
-    const Vec3<float> g = {scale * task.dL_dimage[j], scale * task.dL_dimage[image + j],
-                           scale * task.dL_dimage[2 * image + j]};
-#pragma unroll
-    for (int s = 0; s < S; ++s) {
-      const int last = i < 0 ? 0 : task.last[s * image + i];
-      float transmittance = 1, behind = 0;
-      if (final) {
-        transmittance = i < 0 ? 1.0f : task.transmittance[s * image + i];
-        behind = g.x * task.background[0] + g.y * task.background[1] + g.z * task.background[2];
-      } else {
-        const Checkpoint c = checkpoints[s * kTilePixels + q];
-        transmittance = abs(c.transmittance);
-        behind = dot(g, c.color) / transmittance;
-      }
-      stage.samples[s][q] = {transmittance, behind};
-      if (s == 0) stage.g[q] = {g.x, g.y, g.z, __int_as_float(last)};
-      if (s > 0) stage.last[s > 0 ? s - 1 : 0][q] = last;
-    }
-  }
-
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.lists.splats);
   const Vec2<float> p0 = pixel_of(0, lane);
   constexpr int kTwo23 = 0x4b000000;
   const int value = lane % 4 == 0 ? lane / 4 : lane == 2 ? 8 : -1;  // that sum_nine leaves here
-  for (int k1 = min(end, tile_last); k1 > begin; k1 -= 32) {
-    const int k0 = max(k1 - 32, begin), k = k0 + lane;
-    uint32_t reach = 0;
-    int32_t row_index = 0;
-    Mat2<float> mean_map = {0, 0, 0, 0};
+#pragma unroll 1
+  for (int pass = 0; pass < S; pass += kTogether) {
     __syncwarp();
-    if (k < k1) {
-      const int32_t id = list.splat(k);
-      row_index = list.overflow ? id : list.slot(k);
-      const Splat<F, float> splat = splats[id];
-      reach = subtile_reach(support_of(splat), list.x0, list.y0);
 #pragma unroll
-      for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= subtile_last[b]) << b);
-      if (reach) stage.splats[lane] = tile_splat(splat, list);
-      if (kAbs) mean_map = F::mean_map(splat.shape);
-    }
-    __syncwarp();
-    for (int j = k1 - k0 - 1; j >= 0; --j) {
-      uint32_t hit = __shfl_sync(kAllLanes, reach, j);
-      Held<F> splat = stage.splats[j];
-      const Mat2<float> m =
-          !kAbs ? mean_map
-                : Mat2<float>{__shfl_sync(kAllLanes, mean_map.xx, j), __shfl_sync(kAllLanes, mean_map.xy, j),
-                              __shfl_sync(kAllLanes, mean_map.yx, j), __shfl_sync(kAllLanes, mean_map.yy, j)};
-      ShapeGrad<float> shape = {{0, 0}, {0, 0, 0}};
-      float weighted = 0;
-      Vec3<float> color = {0, 0, 0};
-      Vec2<float> abs2d = {0, 0};
-      for (; hit != 0; hit &= hit - 1) {
-        const int b = __ffs(hit) - 1, q = b * 32 + lane;
-        // pixel_of(b, lane); an integer below 2^23 set into the mantissa of 2^23 is a float to be
-        const float column = __int_as_float(kTwo23 | (b & 1)) - 8388608.0f;
-        const float band = __int_as_float(kTwo23 | (b >> 1)) - 8388608.0f;
-        const Vec2<float> p = {madd(8.0f, column, p0.x), madd(4.0f, band, p0.y)};
-        const float4 g = stage.g[q];
-        const float g_color = madd(g.x, splat.color.x, madd(g.y, splat.color.y, g.z * splat.color.z));
-        float contribution = 0;
-        ShapeGrad<float> of_pixel = {{0, 0}, {0, 0, 0}};
+    for (int b = 0; b < kSubtiles; ++b) {
+      const int64_t i = pixel_index(b);
+      const int q = b * 32 + lane;
+      const float scale = i < 0 ? 0 : 1.0f / S;
+      const int64_t j = max(i, int64_t(0));
+      const Vec3<float> g = {scale * task.dL_dimage[j], scale * task.dL_dimage[image + j],
+                             scale * task.dL_dimage[2 * image + j]};
 #pragma unroll
-        for (int s = 0; s < S; ++s) {
-          const float alpha = F::alpha(splat.terms, p, s);
-          const bool mask = alpha >= float(kAlphaMin) && k0 + j < stage.last_of(s, q, g);
-          if (s == 0 && S == 1 && !__any_sync(kAllLanes, mask)) break;
-          auto sample = stage.samples[s][q];
-          const BlendGrad<float> grad = blend_sample_vjp(mask, alpha, g_color, sample.transmittance, sample.behind);
-          stage.samples[s][q] = sample;
-          F::add_alpha_vjp(splat.terms, p, s, alpha, grad.dL_dalpha, shape);
-          // Again for the pixel alone: to ask for it must not change the other sums by a bit.
-          if (kAbs) F::add_alpha_vjp(splat.terms, p, s, alpha, grad.dL_dalpha, of_pixel);
-          contribution = s == 0 ? grad.contribution : contribution + grad.contribution;
-          weighted += grad.dL_dalpha * alpha;
-        }
-        color = {madd(contribution, g.x, color.x), madd(contribution, g.y, color.y), madd(contribution, g.z, color.z)};
-        if (kAbs) {
-          const Vec2<float> by_mean = transform_transposed(m, of_pixel.offset);
-          abs2d = abs2d + Vec2<float>{abs(by_mean.x), abs(by_mean.y)};
-        }
-      }
-      shape = F::collect(splat.terms, shape, weighted);
-      const float values[9] = {shape.offset.x, shape.offset.y, shape.shape.xx, shape.shape.xy, shape.shape.yy,
-                               weighted,       color.x,        color.y,        color.z};
-      const float sum = sum_nine(values);
-      float* row = task.pair_grads + int64_t(__shfl_sync(kAllLanes, row_index, j)) * kPairGradWidth;
-      const auto put = [&](int v, float x) {
-        if (list.overflow) {
-          atomicAdd(row + v, x);
+      for (int s = 0; s < kTogether; ++s) {
+        const int last = i < 0 ? 0 : task.last[(pass + s) * image + i];
+        float transmittance = 1, behind = 0;
+        if (final) {
+          transmittance = i < 0 ? 1.0f : task.transmittance[(pass + s) * image + i];
+          behind = g.x * task.background[0] + g.y * task.background[1] + g.z * task.background[2];
         } else {
-          row[v] = x;
+          const Checkpoint c = checkpoints[(pass + s) * kTilePixels + q];
+          transmittance = abs(c.transmittance);
+          behind = dot(g, c.color) / transmittance;
         }
-      };
-      if (value >= 0) put(value, sum);
-      if (kAbs) {
-        const Vec2<float> total = {warp_sum(abs2d.x), warp_sum(abs2d.y)};
-        if (lane == 1) put(9, total.x);
-        if (lane == 3) put(10, total.y);
+        stage.samples[s][q] = {transmittance, behind};
+        if (s == 0) stage.g[q] = {g.x, g.y, g.z, __int_as_float(last)};
+        if (s > 0) stage.last[s > 0 ? s - 1 : 0][q] = last;
+      }
+    }
+
+    for (int k1 = min(end, tile_last); k1 > begin; k1 -= 32) {
+      const int k0 = max(k1 - 32, begin), k = k0 + lane;
+      uint32_t reach = 0;
+      int32_t row_index = 0;
+      Mat2<float> mean_map = {0, 0, 0, 0};
+      __syncwarp();
+      if (k < k1) {
+        const int32_t id = list.splat(k);
+        row_index = list.overflow ? id : list.slot(k);
+        const Splat<F, float> splat = splats[id];
+        reach = subtile_reach(support_of(splat), list.x0, list.y0);
+#pragma unroll
+        for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= subtile_last[b]) << b);
+        if (reach) stage.splats[lane] = tile_splat(splat, list);
+        if (kAbs) mean_map = F::mean_map(splat.shape);
+      }
+      __syncwarp();
+      for (int j = k1 - k0 - 1; j >= 0; --j) {
+        const uint32_t reached = __shfl_sync(kAllLanes, reach, j);
+        VjpSplat splat = stage.splats[j];
+        const Mat2<float> m =
+            !kAbs ? mean_map
+                  : Mat2<float>{__shfl_sync(kAllLanes, mean_map.xx, j), __shfl_sync(kAllLanes, mean_map.xy, j),
+                                __shfl_sync(kAllLanes, mean_map.yx, j), __shfl_sync(kAllLanes, mean_map.yy, j)};
+        ShapeGrad<float> shape = {{0, 0}, {0, 0, 0}};
+        float weighted = 0;
+        Vec3<float> color = {0, 0, 0};
+        Vec2<float> abs2d = {0, 0};
+        for (uint32_t hit = reached; hit != 0; hit &= hit - 1) {
+          const int b = __ffs(hit) - 1, q = b * 32 + lane;
+          // pixel_of(b, lane); an integer below 2^23 set into the mantissa of 2^23 is a float to be
+          const float column = __int_as_float(kTwo23 | (b & 1)) - 8388608.0f;
+          const float band = __int_as_float(kTwo23 | (b >> 1)) - 8388608.0f;
+          const Vec2<float> p = {madd(8.0f, column, p0.x), madd(4.0f, band, p0.y)};
+          const float4 g = stage.g[q];
+          const float g_color = madd(g.x, splat.color.x, madd(g.y, splat.color.y, g.z * splat.color.z));
+          float contribution = 0;
+          ShapeGrad<float> of_pixel = {{0, 0}, {0, 0, 0}};
+#pragma unroll
+          for (int s = 0; s < kTogether; ++s) {
+            const int node = kTogether == S ? s : pass + s;
+            const float alpha = F::alpha(splat.terms, p, node);
+            const bool mask = alpha >= float(kAlphaMin) && k0 + j < stage.last_of(s, q, g);
+            if (s == 0 && S == 1 && !__any_sync(kAllLanes, mask)) break;
+            auto sample = stage.samples[s][q];
+            const BlendGrad<float> grad = blend_sample_vjp(mask, alpha, g_color, sample.transmittance, sample.behind);
+            stage.samples[s][q] = sample;
+            if (kGrads) F::add_alpha_vjp(splat.terms, p, node, alpha, grad.dL_dalpha, shape);
+            // Again for the pixel alone: to ask for it must not change the other sums by a bit.
+            if (kAbs) F::add_alpha_vjp(splat.terms, p, node, alpha, grad.dL_dalpha, of_pixel);
+            contribution = s == 0 ? grad.contribution : contribution + grad.contribution;
+            weighted += grad.dL_dalpha * alpha;
+          }
+          color = {madd(contribution, g.x, color.x), madd(contribution, g.y, color.y),
+                   madd(contribution, g.z, color.z)};
+          if (kAbs) {
+            const Vec2<float> by_mean = transform_transposed(m, of_pixel.offset);
+            abs2d = abs2d + Vec2<float>{abs(by_mean.x), abs(by_mean.y)};
+          }
+        }
+        float* row = task.pair_grads + int64_t(__shfl_sync(kAllLanes, row_index, j)) * kPairGradWidth;
+        const auto put = [&](int v, float x) {
+          if (list.overflow) {
+            atomicAdd(row + v, x);
+          } else {
+            row[v] = kTogether == S || pass == 0 ? x : row[v] + x;
+          }
+        };
+        if (kGrads) {
+          if (reached) shape = F::collect(splat.terms, shape, weighted);  // else there are no terms
+          const float values[9] = {shape.offset.x, shape.offset.y, shape.shape.xx, shape.shape.xy, shape.shape.yy,
+                                   weighted,       color.x,        color.y,        color.z};
+          const float sum = sum_nine(values);
+          if (value >= 0) put(value, sum);
+        }
+        if (kAbs) {
+          const Vec2<float> total = {warp_sum(abs2d.x), warp_sum(abs2d.y)};
+          if (lane == 1) put(9, total.x);
+          if (lane == 3) put(10, total.y);
+        }
       }
     }
   }
@@ -654,20 +681,20 @@ template <class F> __global__ void clear_splat_grads_kernel(const BlendVjpTask t
     task.pair_grads[i] = 0;
 }
 
-template <class F, bool kAbs> void launch_blend_vjp(const BlendVjpTask& task, cudaStream_t stream) {
-  const size_t bytes = sizeof(VjpStage<F>) * kVjpWarps<F>;
-  if (bytes > 48 * 1024)
-    cudaFuncSetAttribute(blend_vjp_kernel<F, kAbs>, cudaFuncAttributeMaxDynamicSharedMemorySize, int(bytes));
-  blend_vjp_kernel<F, kAbs><<<blocks_of(task.max_chunks, kVjpWarps<F>), 32 * kVjpWarps<F>, bytes, stream>>>(task);
+template <class F, Sums kSums> void launch_blend_vjp(const BlendVjpTask& task, cudaStream_t stream) {
+  constexpr int kTogether = kVjpSamples<F, kSums>, kWarps = vjp_warps(kTogether);
+  const size_t bytes = sizeof(VjpStage<F, kTogether>) * kWarps;
+  const auto kernel = blend_vjp_kernel<F, kSums>;
+  if (bytes > 48 * 1024) cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, int(bytes));
+  kernel<<<blocks_of(task.max_chunks, kWarps), 32 * kWarps, bytes, stream>>>(task);
 }
 template <class F> void blend_vjp(const BlendVjpTask& task, cudaStream_t stream) {
   clear_splat_grads_kernel<F><<<kRestBlocks, kBlendThreads, 0, stream>>>(task);
-  for_each_tile_footprint<F>(stream, [&](auto f, cudaStream_t side) {
-    if (task.absolute) {
-      launch_blend_vjp<decltype(f), true>(task, side);
-    } else {
-      launch_blend_vjp<decltype(f), false>(task, side);
-    }
+  for_each_tile_footprint<F, AdaptiveBoxesVjp>(stream, [&](auto f, cudaStream_t side) {
+    using Tile = decltype(f);
+    constexpr bool kAtOnce = kVjpSamples<Tile, Sums::kGrads> == Tile::kSamples;
+    if (!kAtOnce || !task.absolute) launch_blend_vjp<Tile, Sums::kGrads>(task, side);
+    if (task.absolute) launch_blend_vjp<Tile, kAtOnce ? Sums::kBoth : Sums::kAbs>(task, side);
   });
 }
 

@@ -6,38 +6,46 @@
 
 namespace ar::cuda {
 
-/// Running product and sum over the threads of a block, exclusive, in a fixed order.
-template <int kThreads> struct BlockScan {
-  static constexpr int kWarps = kThreads / 32;
-  struct Pair {
-    float product, sum;
-  };
-  Pair warps[kWarps];
+/// Running product and sum, in a fixed order.
+struct Passed {
+  float product, sum;
+};
+__device__ inline Passed operator+(Passed front, Passed behind) {
+  return {front.product * behind.product, front.sum + behind.sum};
+}
+__device__ inline Passed shuffle_up(Passed p, int offset) {
+  return {__shfl_up_sync(kAllLanes, p.product, offset), __shfl_up_sync(kAllLanes, p.sum, offset)};
+}
 
-  /// What is in front of this thread; `all`: of all threads.
-  __device__ Pair exclusive(Pair own, Pair& all) {
-    const int lane = lane_id(), warp = threadIdx.x / 32;
-    Pair scan = own;
+/// What is in front of each of the threads of kWarps warps; `all`: of all of them. Several are a whole block.
+template <int kWarps> __device__ Passed passed_before(Passed own, Passed& all) {
+  Passed scan = own;
 #pragma unroll
-    for (int offset = 1; offset < 32; offset *= 2) {
-      const Pair before = {__shfl_up_sync(kAllLanes, scan.product, offset),
-                           __shfl_up_sync(kAllLanes, scan.sum, offset)};
-      if (lane >= offset) scan = {scan.product * before.product, scan.sum + before.sum};
-    }
+  for (int offset = 1; offset < 32; offset *= 2) {
+    const Passed front = shuffle_up(scan, offset);
+    if (lane_id() >= offset) scan = front + scan;
+  }
+  Passed before = shuffle_up(scan, 1);
+  if (lane_id() == 0) before = {1, 0};
+  if constexpr (kWarps == 1) {
+    all = {__shfl_sync(kAllLanes, scan.product, 31), __shfl_sync(kAllLanes, scan.sum, 31)};
+    return before;
+  } else {
+    __shared__ Passed warps[kWarps];
+    const int warp = threadIdx.x / 32;
     __syncthreads();  // the last call's reading
-    if (lane == 31) warps[warp] = scan;
+    if (lane_id() == 31) warps[warp] = scan;
     __syncthreads();
-    Pair front = {1, 0};
+    Passed front = {1, 0};
     all = {1, 0};
 #pragma unroll
     for (int w = 0; w < kWarps; ++w) {
       if (w == warp) front = all;
-      all = {all.product * warps[w].product, all.sum + warps[w].sum};
+      all = all + warps[w];
     }
-    const Pair before = {__shfl_up_sync(kAllLanes, scan.product, 1), __shfl_up_sync(kAllLanes, scan.sum, 1)};
-    return lane == 0 ? front : Pair{front.product * before.product, front.sum + before.sum};
+    return front + before;
   }
-};
+}
 
 /// The emit kernel's test, for lists that hold all splats.
 template <class F> __device__ bool reaches_tile(const Splat<F, float>& splat, const TileList& list) {
@@ -47,40 +55,42 @@ template <class F> __device__ bool reaches_tile(const Splat<F, float>& splat, co
 
 __device__ inline Vec3<float> warp_sum(Vec3<float> v) { return {warp_sum(v.x), warp_sum(v.y), warp_sum(v.z)}; }
 
-/// A block per tile. SampleEstimate goes through a list in order; here each thread adds one splat of a
-/// group, with what is in front of it from a scan.
-template <class F, int kThreads>
-__global__ void __launch_bounds__(kThreads) choose_kernel(const ChooseTask task, SampleLimits<float> limits) {
-  using Scan = BlockScan<kThreads>;
-  __shared__ Scan scan;
-  __shared__ SampleEstimate<float> parts[Scan::kWarps];
+inline constexpr int kChooseThreads = 256;
+
+/// kWarps warps per tile: one, or a whole block. SampleEstimate goes through a list in order; here each
+/// thread adds one splat of a group, with what is in front of it from a scan.
+template <class F, int kWarps>
+__global__ void __launch_bounds__(kChooseThreads, 4) choose_kernel(const ChooseTask task, SampleLimits<float> limits) {
+  constexpr int kThreads = 32 * kWarps;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.lists.splats);
-  const int tile = blockIdx.x;
-  const TileList list = list_of(task.lists, task.grid, tile);
+  const int64_t tile = (int64_t(blockIdx.x) * kChooseThreads + threadIdx.x) / kThreads;
+  if (tile >= task.grid.tiles()) return;
+  const int rank = int(threadIdx.x) % kThreads;
+  const TileList list = list_of(task.lists, task.grid, int(tile));
   const Vec2<float> center = tile_center<float>(task.grid, tile);
   SampleEstimate<float> own = {};
-  typename Scan::Pair passed = {1, 0};
-  float behind = 1;  // transmittance behind the last splat that counts
-  for (int k = 0; k < list.count && passed.product >= float(SampleEstimate<float>::kDark); k += kThreads) {
+  Passed passed = {1, 0};
+  float behind = 1;           // transmittance behind the last splat that counts
+  Splat<F, float> next = {};  // loaded while the one before is worked on
+  if (rank < list.count) next = splats[list.splat(rank)];
+  for (int k = rank; k - rank < list.count && passed.product >= float(SampleEstimate<float>::kDark); k += kThreads) {
+    const Splat<F, float> splat = next;
+    if (k + kThreads < list.count) next = splats[list.splat(k + kThreads)];
     TileShare<float> share = {0, 0, 0};
-    Vec3<float> color = {0, 0, 0};
-    if (k + int(threadIdx.x) < list.count) {
-      const Splat<F, float> splat = splats[list.splat(k + threadIdx.x)];
-      color = splat.color;
-      if (!list.overflow || reaches_tile(splat, list))
-        share = tile_share(splat.shape, splat.opacity, {center.x - splat.mean.x, center.y - splat.mean.y});
-    }
+    if (k < list.count && (!list.overflow || reaches_tile(splat, list)))
+      share = tile_share(splat.shape, splat.opacity, {center.x - splat.mean.x, center.y - splat.mean.y});
+    const Vec3<float> color = k < list.count ? splat.color : Vec3<float>{0, 0, 0};
     SampleEstimate<float> alone = {};
     alone.add(share, color);
-    typename Scan::Pair all;
-    const typename Scan::Pair before = scan.exclusive({alone.transmittance, alone.front}, all);
-    own.transmittance = passed.product * before.product;
-    own.front = passed.sum + before.sum;
+    Passed all;
+    const Passed front = passed + passed_before<kWarps>({alone.transmittance, alone.front}, all);
+    own.transmittance = front.product;
+    own.front = front.sum;
     if (!own.dark()) {
       own.add(share, color);
       behind = own.transmittance;
     }
-    passed = {passed.product * all.product, passed.sum + all.sum};
+    passed = passed + all;
   }
   SampleEstimate<float> part = {};
   part.total = warp_sum(own.total);
@@ -90,16 +100,19 @@ __global__ void __launch_bounds__(kThreads) choose_kernel(const ChooseTask task,
 #pragma unroll
   for (int offset = 16; offset > 0; offset /= 2) behind = min(behind, __shfl_xor_sync(kAllLanes, behind, offset));
   part.transmittance = behind;
-  if (lane_id() == 0) parts[threadIdx.x / 32] = part;
-  __syncthreads();
-  if (threadIdx.x > 0) return;
-  for (int w = 1; w < Scan::kWarps; ++w) {
-    part.total += parts[w].total;
-    part.first += parts[w].first;
-    part.second += parts[w].second;
-    part.color += parts[w].color;
-    part.transmittance = min(part.transmittance, parts[w].transmittance);
+  if constexpr (kWarps > 1) {
+    __shared__ SampleEstimate<float> parts[kWarps];
+    if (lane_id() == 0) parts[threadIdx.x / 32] = part;
+    __syncthreads();
+    for (int w = 1; w < kWarps && rank == 0; ++w) {
+      part.total += parts[w].total;
+      part.first += parts[w].first;
+      part.second += parts[w].second;
+      part.color += parts[w].color;
+      part.transmittance = min(part.transmittance, parts[w].transmittance);
+    }
   }
+  if (rank > 0) return;
   task.lists.tile_samples[tile] =
       limits.choose(part.value({task.background[0], task.background[1], task.background[2]}));
 }
@@ -107,12 +120,13 @@ __global__ void __launch_bounds__(kThreads) choose_kernel(const ChooseTask task,
 /// Few tiles have long lists and leave the device empty: a block for each. Many have short ones, of which the
 /// front is enough: a warp.
 template <class F> void choose(const ChooseTask& task, cudaStream_t stream) {
+  constexpr int kWarps = kChooseThreads / 32;
   const SampleLimits<float> limits = sample_limits<float>(task.options.tolerance);
-  const auto tiles = unsigned(task.grid.tiles());
+  const int64_t tiles = task.grid.tiles();
   if (tiles >= 2048) {
-    choose_kernel<F, 32><<<tiles, 32, 0, stream>>>(task, limits);
+    choose_kernel<F, 1><<<blocks_of(tiles, kWarps), kChooseThreads, 0, stream>>>(task, limits);
   } else {
-    choose_kernel<F, 256><<<tiles, 256, 0, stream>>>(task, limits);
+    choose_kernel<F, kWarps><<<unsigned(tiles), kChooseThreads, 0, stream>>>(task, limits);
   }
 }
 

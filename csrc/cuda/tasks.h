@@ -44,11 +44,27 @@ struct alignas(8) SlotPair {
   int32_t splat, slot;
 };
 
+/// 1, 2, 4, 8 or 16 samples.
+inline constexpr int kSampleClasses = 5;
+AR_HD constexpr int sample_class(int samples) {
+  int c = 0;
+  for (; samples > 1; samples /= 2) ++c;
+  return c;
+}
+
+/// Where the work of a plan is by sample_class: [first[c], first[c + 1]).
+struct SampleParts {
+  int32_t first[kSampleClasses + 1];
+};
+
 /// What the device finds out.
-struct Counts {
-  int64_t pairs, splats;         ///< splats: with pairs
-  int32_t chunks, planes, rest;  ///< of the plan
-  int32_t open_tiles;            ///< that the front chunks left with an open sample and pairs
+struct alignas(8) Counts {
+  int64_t pairs, splats;      ///< splats: with pairs
+  int32_t planes, rest;       ///< of the plan
+  SampleParts tiles, chunks;  ///< of the plan's orders
+  /// Tiles that the front chunks left with an open sample and pairs, by sample_class: those of different
+  /// samples are blended side by side.
+  int32_t open_tiles[kSampleClasses];
 };
 
 /// Color and transmittance of a pixel's sample at the end of a chunk.
@@ -93,7 +109,7 @@ struct TileLists {
   int32_t* tile_samples;  ///< [tiles] samples in use, or null: all
 };
 
-inline constexpr int kPlanCounters = 4 * 33;
+inline constexpr int kPlanCounters = 4 * 33 * kSampleClasses;
 
 struct TileChunk {
   int32_t tile, chunk;
@@ -109,8 +125,8 @@ struct ChooseTask {
 
 /// How the lists are cut into chunks, and in which order work is begun; made by plan_chunks.
 struct ChunkPlan {
-  TileChunk* chunk_order;  ///< [counts->chunks]
-  int32_t* tile_order;     ///< [tiles]
+  TileChunk* chunk_order;  ///< [chunks] by samples
+  int32_t* tile_order;     ///< [tiles] by samples
   int32_t* tile_planes;    ///< [tiles] place of a tile's first checkpoint plane, if it has several chunks
   TileChunk* rest;         ///< [counts->rest] chunks behind the front ones
   int32_t* counters;       ///< [kPlanCounters] scratch, zero
@@ -122,7 +138,7 @@ struct BlendTask {
   TileGrid grid;
   const float* background;  ///< [3]
   int32_t* tile_open;       ///< [tiles] whether the tile is one of the open ones
-  int32_t* open_tiles;      ///< [counts->open_tiles]
+  int32_t* open_tiles;      ///< [kSampleClasses, tiles]
   Checkpoint* checkpoints;  ///< [planes, 256]: a plane per chunk and sample
   float* image;             ///< [3, height, width]
   float* transmittance;     ///< [samples, height, width], or null without backward pass

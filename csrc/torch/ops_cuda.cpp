@@ -29,9 +29,6 @@ void check_stage(const char* stage, const CUDAStream& stream, bool debug) {
 void check_cuda(Inputs& in, bool debug) {
   TORCH_CHECK_TYPE(in.means3D.scalar_type() != at::kDouble,
                    "means3D must have dtype float32 on CUDA, got Double; float64 runs on the CPU");
-  TORCH_CHECK_NOT_IMPLEMENTED(in.footprint != "adaptive",
-                              "footprint 'adaptive' does not run on CUDA yet: blending its tiles side by side is not "
-                              "ready. It runs on the CPU");
   in.check();
   if (debug) in.check_camera();
 }
@@ -94,6 +91,9 @@ bool is_capturing(const CUDAStream& stream) {
   return status != cudaStreamCaptureStatusNone;
 }
 
+/// Of Counts, in numbers of 64 bits.
+constexpr int64_t kCountsWidth = sizeof(cuda::Counts) / sizeof(int64_t);
+
 /// Memory that must be zero, cleared in one go; and what the device counts.
 struct Scratch {
   Tensor memory, counts;
@@ -102,7 +102,7 @@ struct Scratch {
   Scratch(int64_t n, const Tensor& like, const CUDAStream& stream) {
     const int64_t sort = cuda::depth_sort_scratch(n), total = sort + cuda::emit_scratch(n) + cuda::kPlanCounters * 4;
     memory = at::empty({total}, like.options().dtype(at::kByte));
-    counts = at::empty({int64_t(sizeof(cuda::Counts) / sizeof(int64_t))}, like.options().dtype(at::kLong));
+    counts = at::empty({kCountsWidth}, like.options().dtype(at::kLong));
     depth_sort = static_cast<std::byte*>(memory.data_ptr());
     emit = depth_sort + sort;
     plan = emit + cuda::emit_scratch(n);
@@ -276,7 +276,7 @@ BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& b
   int64_t* feedback = PairGuesses::instance().feedback(in.means3D.get_device(), grid);  // for the next frame's guess
   cuda::plan_chunks(lists, grid, stages.samples, plan.view, feedback, stream);
   check_stage("plan_chunks", stream, debug);
-  const Tensor tile_open = at::empty({2, grid.tiles()}, ints);
+  const Tensor tile_open = at::empty({1 + cuda::kSampleClasses, grid.tiles()}, ints);
   BlendedImage out{at::empty({3, in.image_height, in.image_width}, floats),
                    at::empty({samples, in.image_height, in.image_width}, floats),
                    at::empty({samples, in.image_height, in.image_width}, ints),
@@ -402,7 +402,7 @@ void check_saved(const Inputs& in, const Tensor& splats, const Tensor& order, co
   bool ok = splats.sizes() == at::IntArrayRef({n, kSplatWidth}) && order.sizes() == at::IntArrayRef({n}) &&
             pairs.dim() == 2 && pairs.size(1) == 2 && pairs.numel() > 0 && tile_offsets.numel() == tiles + 1 &&
             ranges.sizes() == at::IntArrayRef({n, 2}) && transmittance.sizes() == image && last.sizes() == image &&
-            checkpoints.dim() == 3 && chunks.dim() == 2 && chunks.size(1) == 3 && counts.numel() == 4 &&
+            checkpoints.dim() == 3 && chunks.dim() == 2 && chunks.size(1) == 3 && counts.numel() == kCountsWidth &&
             tile_samples.numel() == (stages.choose ? tiles : 0);
   for (const Tensor* t : {&splats, &order, &pairs, &tile_offsets, &ranges, &transmittance, &last, &checkpoints, &chunks,
                           &counts, &tile_samples})
