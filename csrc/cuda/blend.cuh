@@ -482,17 +482,23 @@ template <class F> void blend(const BlendTask& task, cudaStream_t stream) {
 /// What a kernel of blend_vjp sums: gradients, |dL/dmean| of each pixel, or both at once.
 enum class Sums { kGrads, kAbs, kBoth };
 
-/// Samples of a pixel that blend_vjp goes through together. The state of many leaves room for few warps, so
-/// gradients go through their chunk several times; only the absolute values need a pixel's sum at once.
+/// Samples of a pixel that a warp of blend_vjp takes. More are shared out to the warps of a block: one warp
+/// would be busy for long with their chunk. Only the absolute values need a pixel's sum at once.
 template <class F, Sums kSums>
 inline constexpr int kVjpSamples = F::kSamples <= 4 || kSums == Sums::kAbs ? F::kSamples : 4;
 
-/// A warp's share of shared memory in blend_vjp: a tile's pixels, S samples of each, and a group of splats.
-template <class F, int S> struct VjpStage {
+/// Splats in blend_vjp, and what each of the warps that share them sums.
+template <class F, int kGroup> struct VjpGroup {
+  TileSplat<F> splats[32];
+  int32_t rows[kGroup > 1 ? 32 : 1];
+  float sums[kGroup > 1 ? kGroup : 1][kGroup > 1 ? 32 : 1][9];
+};
+
+/// A warp's pixels in blend_vjp, S samples of each.
+template <int S> struct VjpPixels {
   struct Sample {
     float transmittance, behind;
   };
-  TileSplat<F> splats[32];
   float4 g[kTilePixels];  // dL/d(one sample's colour), and sample 0's last as bits
   Sample samples[S][kTilePixels];
   int last[S > 1 ? S - 1 : 1][S > 1 ? kTilePixels : 1];
@@ -506,23 +512,36 @@ template <class F, int S> struct VjpStage {
 template <class F> inline constexpr int kVjpBlocks = F::kSamples > 1 ? 1 : sizeof(TileSplat<F>) <= 48 ? 7 : 5;
 
 /// Warps of a block of blend_vjp: as many as leave room for a few blocks in shared memory.
-inline constexpr int vjp_warps(int samples) { return samples <= 2 ? 4 : samples <= 8 ? 2 : 1; }
-
-/// A warp per chunk, back to front, over all pixels of the tile: every pair is summed by one warp, so
-/// the sums need no atomics, whose order would change from run to run.
 template <class F, Sums kSums>
-__global__ void __launch_bounds__(32 * vjp_warps(kVjpSamples<F, kSums>), kVjpBlocks<F>)
-    blend_vjp_kernel(const BlendVjpTask task) {
-  constexpr int S = F::kSamples, kLength = chunk_length(S), kTogether = kVjpSamples<F, kSums>;
-  constexpr int kWarps = vjp_warps(kTogether);
+inline constexpr int kVjpWarps = F::kSamples > kVjpSamples<F, kSums> ? F::kSamples / kVjpSamples<F, kSums>
+                                 : F::kSamples <= 2                  ? 4
+                                 : F::kSamples <= 8                  ? 2
+                                                                     : 1;
+
+/// A warp per chunk, for many samples a block, back to front, over all pixels of the tile: every pair is
+/// summed in one place, so the sums need no atomics, whose order would change from run to run.
+template <class F, Sums kSums>
+__global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F>) blend_vjp_kernel(const BlendVjpTask task) {
+  constexpr int S = F::kSamples, kLength = chunk_length(S), kWarps = kVjpWarps<F, kSums>;
+  constexpr int kOwn = kVjpSamples<F, kSums>, kGroup = S / kOwn;  // samples of a warp, warps of a chunk
   constexpr bool kGrads = kSums != Sums::kAbs, kAbs = kSums != Sums::kGrads;
-  // A sample's number is not known when the code is compiled if there are several passes: keep it indexable.
-  using VjpSplat = std::conditional_t<kTogether == S, Held<F>, const TileSplat<F>&>;
+  // A shared-out sample's number is not known when the code is compiled: keep its node indexable.
+  using VjpSplat = std::conditional_t<kGroup == 1, Held<F>, const TileSplat<F>&>;
+  using Pixels = VjpPixels<kOwn>;
+  using Group = VjpGroup<F, kGroup>;
   extern __shared__ float4 shared[];
-  auto& stage = reinterpret_cast<VjpStage<F, kTogether>*>(shared)[threadIdx.x / 32];
-  const int lane = lane_id();
+  const int lane = lane_id(), warp = threadIdx.x / 32, first = warp % kGroup * kOwn;
+  Pixels& stage = reinterpret_cast<Pixels*>(shared)[warp];
+  Group& group = reinterpret_cast<Group*>(reinterpret_cast<Pixels*>(shared) + kWarps)[warp / kGroup];
+  const auto group_sync = [] {
+    if constexpr (kGroup > 1) {
+      __syncthreads();
+    } else {
+      __syncwarp();
+    }
+  };
   const SampleParts& chunks = task.lists.counts->chunks;
-  const int64_t item = chunks.first[sample_class(S)] + int64_t(blockIdx.x) * kWarps + threadIdx.x / 32;
+  const int64_t item = chunks.first[sample_class(S)] + (int64_t(blockIdx.x) * kWarps + warp) / kGroup;
   if (item >= chunks.first[sample_class(S) + 1]) return;
   const auto [tile, chunk, plane] = task.chunk_order[item];
   const TileList list = list_of(task.lists, task.grid, tile);
@@ -559,115 +578,128 @@ __global__ void __launch_bounds__(32 * vjp_warps(kVjpSamples<F, kSums>), kVjpBlo
   const Vec2<float> p0 = pixel_of(0, lane);
   constexpr int kTwo23 = 0x4b000000;
   const int value = lane % 4 == 0 ? lane / 4 : lane == 2 ? 8 : -1;  // that sum_nine leaves here
-#pragma unroll 1
-  for (int pass = 0; pass < S; pass += kTogether) {
-    __syncwarp();
 #pragma unroll
-    for (int b = 0; b < kSubtiles; ++b) {
-      const int64_t i = pixel_index(b);
-      const int q = b * 32 + lane;
-      const float scale = i < 0 ? 0 : 1.0f / S;
-      const int64_t j = max(i, int64_t(0));
-      const Vec3<float> g = {scale * task.dL_dimage[j], scale * task.dL_dimage[image + j],
-                             scale * task.dL_dimage[2 * image + j]};
+  for (int b = 0; b < kSubtiles; ++b) {
+    const int64_t i = pixel_index(b);
+    const int q = b * 32 + lane;
+    const float scale = i < 0 ? 0 : 1.0f / S;
+    const int64_t j = max(i, int64_t(0));
+    const Vec3<float> g = {scale * task.dL_dimage[j], scale * task.dL_dimage[image + j],
+                           scale * task.dL_dimage[2 * image + j]};
 #pragma unroll
-      for (int s = 0; s < kTogether; ++s) {
-        const int last = i < 0 ? 0 : task.last[(pass + s) * image + i];
-        float transmittance = 1, behind = 0;
-        if (final) {
-          transmittance = i < 0 ? 1.0f : task.transmittance[(pass + s) * image + i];
-          behind = g.x * task.background[0] + g.y * task.background[1] + g.z * task.background[2];
-        } else {
-          const Checkpoint c = checkpoints[(pass + s) * kTilePixels + q];
-          transmittance = abs(c.transmittance);
-          behind = dot(g, c.color) / transmittance;
+    for (int s = 0; s < kOwn; ++s) {
+      const int last = i < 0 ? 0 : task.last[(first + s) * image + i];
+      float transmittance = 1, behind = 0;
+      if (final) {
+        transmittance = i < 0 ? 1.0f : task.transmittance[(first + s) * image + i];
+        behind = g.x * task.background[0] + g.y * task.background[1] + g.z * task.background[2];
+      } else {
+        const Checkpoint c = checkpoints[(first + s) * kTilePixels + q];
+        transmittance = abs(c.transmittance);
+        behind = dot(g, c.color) / transmittance;
+      }
+      stage.samples[s][q] = {transmittance, behind};
+      if (s == 0) stage.g[q] = {g.x, g.y, g.z, __int_as_float(last)};
+      if (s > 0) stage.last[s > 0 ? s - 1 : 0][q] = last;
+    }
+  }
+
+  const auto put = [&](int32_t row, int v, float x) {
+    float* place = task.pair_grads + int64_t(row) * kPairGradWidth + v;
+    if (list.overflow) {
+      atomicAdd(place, x);
+    } else {
+      *place = x;
+    }
+  };
+  for (int k1 = min(end, tile_last); k1 > begin; k1 -= 32) {
+    const int k0 = max(k1 - 32, begin), k = k0 + lane;
+    uint32_t reach = 0;
+    int32_t row_index = 0;
+    Mat2<float> mean_map = {0, 0, 0, 0};
+    group_sync();
+    if (k < k1) {
+      const int32_t id = list.splat(k);
+      row_index = list.overflow ? id : list.slot(k);
+      const Splat<F, float> splat = splats[id];
+      reach = subtile_reach(support_of(splat), list.x0, list.y0);
+#pragma unroll
+      for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= subtile_last[b]) << b);
+      if (reach && first == 0) group.splats[lane] = tile_splat(splat, list);
+      if (kAbs) mean_map = F::mean_map(splat.shape);
+      if (kGroup > 1 && first == 0) group.rows[lane] = row_index;
+    }
+    group_sync();
+    for (int j = k1 - k0 - 1; j >= 0; --j) {
+      const uint32_t reached = __shfl_sync(kAllLanes, reach, j);
+      VjpSplat splat = group.splats[j];
+      const Mat2<float> m =
+          !kAbs ? mean_map
+                : Mat2<float>{__shfl_sync(kAllLanes, mean_map.xx, j), __shfl_sync(kAllLanes, mean_map.xy, j),
+                              __shfl_sync(kAllLanes, mean_map.yx, j), __shfl_sync(kAllLanes, mean_map.yy, j)};
+      ShapeGrad<float> shape = {{0, 0}, {0, 0, 0}};
+      float weighted = 0;
+      Vec3<float> color = {0, 0, 0};
+      Vec2<float> abs2d = {0, 0};
+      for (uint32_t hit = reached; hit != 0; hit &= hit - 1) {
+        const int b = __ffs(hit) - 1, q = b * 32 + lane;
+        // pixel_of(b, lane); an integer below 2^23 set into the mantissa of 2^23 is a float to be
+        const float column = __int_as_float(kTwo23 | (b & 1)) - 8388608.0f;
+        const float band = __int_as_float(kTwo23 | (b >> 1)) - 8388608.0f;
+        const Vec2<float> p = {madd(8.0f, column, p0.x), madd(4.0f, band, p0.y)};
+        const float4 g = stage.g[q];
+        const float g_color = madd(g.x, splat.color.x, madd(g.y, splat.color.y, g.z * splat.color.z));
+        float contribution = 0;
+        ShapeGrad<float> of_pixel = {{0, 0}, {0, 0, 0}};
+#pragma unroll
+        for (int s = 0; s < kOwn; ++s) {
+          const int node = kGroup == 1 ? s : first + s;
+          const float alpha = F::alpha(splat.terms, p, node);
+          const bool mask = alpha >= float(kAlphaMin) && k0 + j < stage.last_of(s, q, g);
+          if (s == 0 && S == 1 && !__any_sync(kAllLanes, mask)) break;
+          auto sample = stage.samples[s][q];
+          const BlendGrad<float> grad = blend_sample_vjp(mask, alpha, g_color, sample.transmittance, sample.behind);
+          stage.samples[s][q] = sample;
+          if (kGrads) F::add_alpha_vjp(splat.terms, p, node, alpha, grad.dL_dalpha, shape);
+          // Again for the pixel alone: to ask for it must not change the other sums by a bit.
+          if (kAbs) F::add_alpha_vjp(splat.terms, p, node, alpha, grad.dL_dalpha, of_pixel);
+          contribution = s == 0 ? grad.contribution : contribution + grad.contribution;
+          weighted += grad.dL_dalpha * alpha;
         }
-        stage.samples[s][q] = {transmittance, behind};
-        if (s == 0) stage.g[q] = {g.x, g.y, g.z, __int_as_float(last)};
-        if (s > 0) stage.last[s > 0 ? s - 1 : 0][q] = last;
+        color = {madd(contribution, g.x, color.x), madd(contribution, g.y, color.y), madd(contribution, g.z, color.z)};
+        if (kAbs) {
+          const Vec2<float> by_mean = transform_transposed(m, of_pixel.offset);
+          abs2d = abs2d + Vec2<float>{abs(by_mean.x), abs(by_mean.y)};
+        }
+      }
+      const int32_t row = __shfl_sync(kAllLanes, row_index, j);
+      if (kGrads) {
+        if (reached) shape = F::collect(splat.terms, shape, weighted);  // else there are no terms
+        const float values[9] = {shape.offset.x, shape.offset.y, shape.shape.xx, shape.shape.xy, shape.shape.yy,
+                                 weighted,       color.x,        color.y,        color.z};
+        const float sum = sum_nine(values);
+        if (value >= 0) {
+          if constexpr (kGroup == 1) {
+            put(row, value, sum);
+          } else {
+            group.sums[warp][j][value] = sum;
+          }
+        }
+      }
+      if (kAbs) {
+        const Vec2<float> total = {warp_sum(abs2d.x), warp_sum(abs2d.y)};
+        if (lane == 1) put(row, 9, total.x);
+        if (lane == 3) put(row, 10, total.y);
       }
     }
-
-    for (int k1 = min(end, tile_last); k1 > begin; k1 -= 32) {
-      const int k0 = max(k1 - 32, begin), k = k0 + lane;
-      uint32_t reach = 0;
-      int32_t row_index = 0;
-      Mat2<float> mean_map = {0, 0, 0, 0};
-      __syncwarp();
-      if (k < k1) {
-        const int32_t id = list.splat(k);
-        row_index = list.overflow ? id : list.slot(k);
-        const Splat<F, float> splat = splats[id];
-        reach = subtile_reach(support_of(splat), list.x0, list.y0);
+    if constexpr (kGroup > 1) {
+      __syncthreads();
+      for (int t = threadIdx.x; t < 9 * (k1 - k0); t += 32 * kGroup) {
+        const int j = t / 9, v = t % 9;
+        float sum = group.sums[0][j][v];
 #pragma unroll
-        for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= subtile_last[b]) << b);
-        if (reach) stage.splats[lane] = tile_splat(splat, list);
-        if (kAbs) mean_map = F::mean_map(splat.shape);
-      }
-      __syncwarp();
-      for (int j = k1 - k0 - 1; j >= 0; --j) {
-        const uint32_t reached = __shfl_sync(kAllLanes, reach, j);
-        VjpSplat splat = stage.splats[j];
-        const Mat2<float> m =
-            !kAbs ? mean_map
-                  : Mat2<float>{__shfl_sync(kAllLanes, mean_map.xx, j), __shfl_sync(kAllLanes, mean_map.xy, j),
-                                __shfl_sync(kAllLanes, mean_map.yx, j), __shfl_sync(kAllLanes, mean_map.yy, j)};
-        ShapeGrad<float> shape = {{0, 0}, {0, 0, 0}};
-        float weighted = 0;
-        Vec3<float> color = {0, 0, 0};
-        Vec2<float> abs2d = {0, 0};
-        for (uint32_t hit = reached; hit != 0; hit &= hit - 1) {
-          const int b = __ffs(hit) - 1, q = b * 32 + lane;
-          // pixel_of(b, lane); an integer below 2^23 set into the mantissa of 2^23 is a float to be
-          const float column = __int_as_float(kTwo23 | (b & 1)) - 8388608.0f;
-          const float band = __int_as_float(kTwo23 | (b >> 1)) - 8388608.0f;
-          const Vec2<float> p = {madd(8.0f, column, p0.x), madd(4.0f, band, p0.y)};
-          const float4 g = stage.g[q];
-          const float g_color = madd(g.x, splat.color.x, madd(g.y, splat.color.y, g.z * splat.color.z));
-          float contribution = 0;
-          ShapeGrad<float> of_pixel = {{0, 0}, {0, 0, 0}};
-#pragma unroll
-          for (int s = 0; s < kTogether; ++s) {
-            const int node = kTogether == S ? s : pass + s;
-            const float alpha = F::alpha(splat.terms, p, node);
-            const bool mask = alpha >= float(kAlphaMin) && k0 + j < stage.last_of(s, q, g);
-            if (s == 0 && S == 1 && !__any_sync(kAllLanes, mask)) break;
-            auto sample = stage.samples[s][q];
-            const BlendGrad<float> grad = blend_sample_vjp(mask, alpha, g_color, sample.transmittance, sample.behind);
-            stage.samples[s][q] = sample;
-            if (kGrads) F::add_alpha_vjp(splat.terms, p, node, alpha, grad.dL_dalpha, shape);
-            // Again for the pixel alone: to ask for it must not change the other sums by a bit.
-            if (kAbs) F::add_alpha_vjp(splat.terms, p, node, alpha, grad.dL_dalpha, of_pixel);
-            contribution = s == 0 ? grad.contribution : contribution + grad.contribution;
-            weighted += grad.dL_dalpha * alpha;
-          }
-          color = {madd(contribution, g.x, color.x), madd(contribution, g.y, color.y),
-                   madd(contribution, g.z, color.z)};
-          if (kAbs) {
-            const Vec2<float> by_mean = transform_transposed(m, of_pixel.offset);
-            abs2d = abs2d + Vec2<float>{abs(by_mean.x), abs(by_mean.y)};
-          }
-        }
-        float* row = task.pair_grads + int64_t(__shfl_sync(kAllLanes, row_index, j)) * kPairGradWidth;
-        const auto put = [&](int v, float x) {
-          if (list.overflow) {
-            atomicAdd(row + v, x);
-          } else {
-            row[v] = kTogether == S || pass == 0 ? x : row[v] + x;
-          }
-        };
-        if (kGrads) {
-          if (reached) shape = F::collect(splat.terms, shape, weighted);  // else there are no terms
-          const float values[9] = {shape.offset.x, shape.offset.y, shape.shape.xx, shape.shape.xy, shape.shape.yy,
-                                   weighted,       color.x,        color.y,        color.z};
-          const float sum = sum_nine(values);
-          if (value >= 0) put(value, sum);
-        }
-        if (kAbs) {
-          const Vec2<float> total = {warp_sum(abs2d.x), warp_sum(abs2d.y)};
-          if (lane == 1) put(9, total.x);
-          if (lane == 3) put(10, total.y);
-        }
+        for (int w = 1; w < kGroup; ++w) sum += group.sums[w][j][v];
+        put(group.rows[j], v, sum);
       }
     }
   }
@@ -682,11 +714,11 @@ template <class F> __global__ void clear_splat_grads_kernel(const BlendVjpTask t
 }
 
 template <class F, Sums kSums> void launch_blend_vjp(const BlendVjpTask& task, cudaStream_t stream) {
-  constexpr int kTogether = kVjpSamples<F, kSums>, kWarps = vjp_warps(kTogether);
-  const size_t bytes = sizeof(VjpStage<F, kTogether>) * kWarps;
+  constexpr int kOwn = kVjpSamples<F, kSums>, kWarps = kVjpWarps<F, kSums>, kGroup = F::kSamples / kOwn;
+  const size_t bytes = kWarps * sizeof(VjpPixels<kOwn>) + kWarps / kGroup * sizeof(VjpGroup<F, kGroup>);
   const auto kernel = blend_vjp_kernel<F, kSums>;
   if (bytes > 48 * 1024) cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, int(bytes));
-  kernel<<<blocks_of(task.max_chunks, kWarps), 32 * kWarps, bytes, stream>>>(task);
+  kernel<<<blocks_of(task.max_chunks, kWarps / kGroup), 32 * kWarps, bytes, stream>>>(task);
 }
 template <class F> void blend_vjp(const BlendVjpTask& task, cudaStream_t stream) {
   clear_splat_grads_kernel<F><<<kRestBlocks, kBlendThreads, 0, stream>>>(task);
