@@ -19,7 +19,9 @@ the learning rate and the end of growth follow the share of time that is over, s
 complete schedule. (Reading equal times off the curves of equal steps would compare trainings that were cut off.) The
 clock is read after 10 steps and then every 100, where the host waits for the device; in between the share grows at the
 pace of the steps before. Periods of the density control stay in steps, as they are there to gather gradients from many
-views.
+views; a training by time should therefore last for thousands of steps.
+
+The table gives means over seeds, and ± the standard deviation over seeds of the mean over scales.
 
 DIR receives pictures/FOOTPRINT_SCALE_VIEW.png of the first seed, the rendering on the left and the truth on the
 right, and results.json, rewritten after every run. Its "runs" hold
