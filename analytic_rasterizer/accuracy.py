@@ -11,7 +11,7 @@ import torch
 
 from .footprints import resolve_footprint
 from .io import Scene, View, optional_import
-from .rasterizer import render_stages
+from .rasterizer import GaussianRasterizer
 
 UNFILTERED = "point:dilation=0"  # samples of the scene itself, without any filter
 RMSE_SHARE = 0.1  # a reference is refined until it moves by this share of the smallest error
@@ -36,7 +36,7 @@ def supersampled(
         background: RGB.
 
     Returns:
-        (3, H, W) float64 on the CPU.
+        (3, H, W) float64 on the scene's device.
     """
     fine = density
     if resolve_footprint(footprint) == resolve_footprint(UNFILTERED):
@@ -45,13 +45,14 @@ def supersampled(
     shifts = density // fine
     cx = view.width / 2 if view.cx is None else view.cx
     cy = view.height / 2 if view.cy is None else view.cy
-    total = torch.zeros(3, view.height, view.width, dtype=torch.float64)
+    total = torch.zeros(3, view.height, view.width, dtype=torch.float64, device=scene.means.device)
     for i in range(shifts**2):
         column, row = ((n + 0.5) / shifts - 0.5 for n in (i % shifts, i // shifts))
         shifted = replace(view, cx=cx - column / fine, cy=cy - row / fine)
         settings = shifted.settings(fine, background, scene.sh_degree, footprint, device=scene.means.device)
-        color = render_stages(settings, **scene.arguments()).color
-        total += torch.nn.functional.avg_pool2d(color[None].double(), fine)[0].cpu()
+        with torch.no_grad():
+            color, _ = GaussianRasterizer(settings)(means2D=None, **scene.arguments())
+        total += torch.nn.functional.avg_pool2d(color[None].double(), fine)[0]
     return total / shifts**2
 
 

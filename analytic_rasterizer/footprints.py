@@ -10,23 +10,23 @@ import torch
 
 from . import _C  # loads the ops
 
-FOOTPRINTS = ("point", "mip", "analytic", "cumulant", "box", "adaptive", "erf", "exact")
-"""Public names of the footprints, in the order of the documentation's table."""
-
 BOX_SAMPLES = (1, 2, 4, 8, 16)
 FRAME_GRADIENTS = ("frozen", "paper")
 
-# Options of each footprint and their defaults.
+# Options of the footprints that have any, and their defaults.
 OPTIONS: dict[str, dict[str, Any]] = {
     "point": {"dilation": 0.3},
     "mip": {"variance": 0.1},
     "analytic": {"frame_gradient": "frozen"},
-    "cumulant": {},
     "box": {"samples": 4},
     "adaptive": {"tolerance": 1 / 255},
-    "erf": {},
-    "exact": {},
 }
+
+# Kernels that an option chooses.
+_CHOSEN = {"analytic_paper": "analytic", **{f"box{samples}": "box" for samples in BOX_SAMPLES}}
+
+FOOTPRINTS = tuple(dict.fromkeys(_CHOSEN.get(key, key) for key in _C.footprints()))
+"""Public names of the footprints, in the order of the registry: those of csrc/core/footprint/registry.h."""
 
 ENVIRONMENT_VARIABLE = "ANALYTIC_RASTERIZER_FOOTPRINT"
 
@@ -82,9 +82,9 @@ def resolve_footprint(name: str, **options: Any) -> Footprint:
     if not isinstance(name, str):
         raise ValueError(f"footprint must be one of {', '.join(FOOTPRINTS)}, got {name!r}")
     name, _, text = name.partition(":")
-    if name not in OPTIONS:
+    if name not in FOOTPRINTS:
         raise ValueError(f"footprint must be one of {', '.join(FOOTPRINTS)}, got {name!r}")
-    settled = dict(OPTIONS[name])
+    settled = dict(OPTIONS.get(name, {}))
     given = dict(item.partition("=")[::2] for item in text.split(",")) if text else {}
     given.update(options)
     for option, value in given.items():

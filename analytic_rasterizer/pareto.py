@@ -170,13 +170,13 @@ def _measure_scale(scene, views, methods, background, rounds, max_density, cpu_t
     with tqdm(total=len(methods), desc="render", unit="method", disable=None) as bar:
         pictures = {}
         for name, of_name in cases.items():
-            pictures[name] = {view.name: case.forward().cpu() for view, case in zip(views, of_name)}
+            pictures[name] = {view.name: case.forward() for view, case in zip(views, of_name)}
             bar.update()
     exact = None
     if any(method.has_single_weight for method in methods):
         exact = pictures.get(EXACT)
         if exact is None:
-            exact = {v.name: measure.Case(scene, v, EXACT, 1, background).forward().cpu() for v in views}
+            exact = {v.name: measure.Case(scene, v, EXACT, 1, background).forward() for v in views}
 
     refined = refine(
         lambda density: {v.name: supersampled(scene, v, density, background=background) for v in views},

@@ -5,32 +5,20 @@ from dataclasses import dataclass, replace
 
 import torch
 
-# Every footprint with every option value that changes the code path. test_footprints.py checks that
-# this table covers ar.FOOTPRINTS, so a new footprint cannot stay untested.
-VARIANTS = [
-    ("point", {}),
-    ("point", {"dilation": 0.0}),
-    ("mip", {}),
-    ("mip", {"variance": 0.25}),
-    ("analytic", {"frame_gradient": "frozen"}),
-    ("analytic", {"frame_gradient": "paper"}),
-    ("cumulant", {}),
-    *[("box", {"samples": samples}) for samples in (1, 2, 4, 8, 16)],
-    ("adaptive", {"tolerance": 1 / 255}),
-    ("erf", {}),
-    ("exact", {}),
-]
+from analytic_rasterizer import FOOTPRINTS
+
+# Option values that change the code path; test_footprints.py checks that no footprint with options is missing.
+OPTIONS = {
+    "point": [{}, {"dilation": 0.0}],
+    "mip": [{}, {"variance": 0.25}],
+    "analytic": [{"frame_gradient": "frozen"}, {"frame_gradient": "paper"}],
+    "box": [{"samples": samples} for samples in (1, 2, 4, 8, 16)],
+    "adaptive": [{"tolerance": 1 / 255}],
+}
+# Every registered footprint with these: a new one is tested without a change here.
+VARIANTS = [(footprint, options) for footprint in FOOTPRINTS for options in OPTIONS.get(footprint, [{}])]
 # One of each kind, for tests where the options do not matter.
-KINDS = [
-    ("point", {}),
-    ("mip", {}),
-    ("analytic", {}),
-    ("cumulant", {}),
-    ("box", {"samples": 4}),
-    ("adaptive", {}),
-    ("erf", {}),
-    ("exact", {}),
-]
+KINDS = [(footprint, {"samples": 4} if footprint == "box" else {}) for footprint in FOOTPRINTS]
 INPUTS = (
     "means3D",
     "means2D",

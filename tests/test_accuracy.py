@@ -63,9 +63,11 @@ def test_reference_from_shifted_renders_is_that_of_one_large_render(monkeypatch,
     view = io.View("part", 96, 64, 115.0, 115.0, torch.eye(4, dtype=torch.float64), *centre)
     whole = accuracy.supersampled(scene, view, density)
     sizes = []
-    render = accuracy.render_stages
+    rasterizer = accuracy.GaussianRasterizer
     monkeypatch.setattr(
-        accuracy, "render_stages", lambda s, **k: sizes.append((s.image_width, s.image_height)) or render(s, **k)
+        accuracy,
+        "GaussianRasterizer",
+        lambda s: sizes.append((s.image_width, s.image_height)) or rasterizer(s),
     )
     monkeypatch.setattr(accuracy, "MAX_PIXELS", (density**2 // pieces) * 96 * 64)
     parts = accuracy.supersampled(scene, view, density)

@@ -1,7 +1,12 @@
 // Schemas of the ops, and the Python module that loads them.
 #include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
 #include <torch/library.h>
 
+#include <string>
+#include <vector>
+
+#include "core/footprint/registry.h"
 #include "cpu/tasks.h"
 
 #if defined(AR_WITH_CUDA)
@@ -16,7 +21,7 @@ void force_pair_capacity(int64_t capacity);
 // pairs of each splat, `transmittance` and `last` (samples, H, W). On CUDA every Gaussian has a row of
 // splats, ids are in the order of depth, pairs (room, 2) are splats and slots, `splat_offsets` (P, 2) the
 // first slot and the number of them, positions is empty, and there are `checkpoints` (n, samples, 256, 4),
-// `chunks` (m, 3) and `counts` (4,), see csrc/cuda/tasks.h. Without `keep` what only the backward pass reads is empty.
+// `chunks` (m, 3) and `counts` (12,), see csrc/cuda/tasks.h. Without `keep` what only the backward pass reads is empty.
 // `debug` waits for every stage, so that an error is raised by the stage that caused it.
 TORCH_LIBRARY(analytic_rasterizer, m) {
   m.def(
@@ -67,5 +72,13 @@ PYBIND11_MODULE(_C, m) {
 #else
   m.attr("has_cuda") = false;
 #endif
+  m.def(
+      "footprints",
+      [] {
+        std::vector<std::string> names;
+        ar::for_each_footprint(ar::Footprints{}, [&](auto f) { names.emplace_back(decltype(f)::kName); });
+        return names;
+      },
+      "Keys of all footprints, in the order of the registry.");
   m.def("instruction_set", &ar::cpu::instruction_set, "Instruction set that the CPU path runs on.");
 }
