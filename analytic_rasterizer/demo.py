@@ -312,7 +312,7 @@ def _converged_reference(scene: Scene, view: View, renders: dict):
 
 def _reduced(color: torch.Tensor) -> dict[int, torch.Tensor]:
     """The picture at every reduction: a pixel of 1/n is the mean of the n x n that it covers."""
-    return {n: torch.nn.functional.avg_pool2d(color[None], n)[0] for n in REDUCTIONS}
+    return {n: torch.nn.functional.avg_pool2d(color[None], n)[0].cpu() for n in REDUCTIONS}
 
 
 # -------------------------------------------------------------------------------------- sheet
