@@ -6,6 +6,7 @@ A drop-in replacement for `diff_gaussian_rasterization`. See the README for how 
 import torch  # noqa: F401  (its libraries must be loaded before the extension's)
 
 from ._C import instruction_set
+from .effects import Effects, Outputs, normalized
 from .footprints import (
     FOOTPRINTS,
     Footprint,
@@ -28,13 +29,16 @@ __version__ = "0.1.0"
 __all__ = [
     "FOOTPRINTS",
     "TILE",
+    "Effects",
     "Footprint",
     "GaussianRasterizationSettings",
     "GaussianRasterizer",
+    "Outputs",
     "Stages",
     "footprint_weight",
     "get_default_footprint",
     "instruction_set",
+    "normalized",
     "rasterize_gaussians",
     "render_stages",
     "resolve_footprint",

@@ -97,6 +97,20 @@ def _(
     )
 
 
+@torch.library.register_fake("analytic_rasterizer::rasterize_channels")
+def _(colors, bg, image_height, image_width, footprint, option, splats, ids, pairs, tile_offsets, counts, *rest):
+    on_cuda = colors.device.type == "cuda"
+    ints = {"dtype": torch.int32}
+    context = torch.library.get_ctx()
+    return (
+        colors.new_empty(3, image_height, image_width),
+        splats.new_empty(splats.shape),
+        colors.new_empty((context.new_dynamic_size(), TILE * TILE, 4) if on_cuda else (0,)),
+        colors.new_empty((context.new_dynamic_size(), 3) if on_cuda else (0,), **ints),
+        counts.new_empty(counts.shape),
+    )
+
+
 @torch.library.register_fake("analytic_rasterizer::footprint_weight")
 def _(offset, cov2d, footprint, option):
     return offset.new_empty(offset.shape[:-1])

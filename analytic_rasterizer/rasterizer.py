@@ -7,7 +7,9 @@ from typing import Any, NamedTuple
 
 import torch
 
+from . import effects as _effects
 from . import ops  # noqa: F401  (registers the fake kernels)
+from .effects import Effects
 from .footprints import Footprint, check_device, get_default_footprint, resolve_footprint
 
 
@@ -27,12 +29,12 @@ class _Fields(NamedTuple):
 
 
 class GaussianRasterizationSettings(_Fields):
-    """How to render: the 12 fields of 3DGS 2023, in its order, as a tuple; and the footprint.
+    """How to render: the 12 fields of 3DGS 2023, in its order, as a tuple; and the footprint and the effects.
 
     Args:
         image_height, image_width: Size of the image, px.
         tanfovx, tanfovy: Tangent of half the field of view.
-        bg: (3,) background colour.
+        bg: (3,) background colour; (C,) of C channels; or (C, H, W), an image, differentiable.
         scale_modifier: Factor on all scales.
         viewmatrix: (4, 4) or (1, 4, 4) world to camera, transposed (for row vectors).
         projmatrix: (4, 4) or (1, 4, 4) world to clip space, transposed. The principal point is wherever
@@ -45,45 +47,60 @@ class GaussianRasterizationSettings(_Fields):
             the camera is finite, which otherwise is not looked at there.
         footprint: One of `FOOTPRINTS`, optionally with options (`"box:samples=8"`). None: the default at
             the time of rendering, see `set_default_footprint`.
+        effects: What to render beside the colours, see `Effects`. None: nothing.
         **options: Options of the footprint, see `resolve_footprint`.
 
     Attributes:
         footprint: The settled `Footprint`, or None.
+        effects: The `Effects`, or None.
 
     Raises:
         ValueError: Unknown footprint or option.
+        TypeError: effects is no `Effects`.
     """
 
-    footprint: Footprint | None = None  # also where a tuple method makes an instance without __new__
+    # Also where a tuple method makes an instance without __new__.
+    footprint: Footprint | None = None
+    effects: Effects | None = None
 
-    def __new__(cls, *args: Any, footprint: str | Footprint | None = None, **kwargs: Any):
+    def __new__(
+        cls, *args: Any, footprint: str | Footprint | None = None, effects: Effects | None = None, **kwargs: Any
+    ):
         fields = {k: kwargs.pop(k) for k in _Fields._fields[len(args) :] if k in kwargs}
         self = super().__new__(cls, *args, **fields)
         if footprint is not None:
             self.footprint = resolve_footprint(str(footprint), **kwargs)
         elif kwargs:
-            known = ", ".join((*cls._fields, "footprint"))
+            known = ", ".join((*cls._fields, "footprint", "effects"))
             raise TypeError(f"settings must be among: {known}; got {', '.join(kwargs)}")
+        if effects is not None:
+            if not isinstance(effects, Effects):
+                raise TypeError(f"effects must be an Effects, got {effects!r}")
+            self.effects = effects
         return self
 
     def _replace(self, **kwargs: Any) -> GaussianRasterizationSettings:
-        merged = {**self._asdict(), "footprint": self.footprint, **kwargs}
+        merged = {**self._asdict(), "footprint": self.footprint, "effects": self.effects, **kwargs}
         return type(self)(**merged)
 
     def __reduce__(self):
-        return _unpickle_settings, (tuple(self), None if self.footprint is None else str(self.footprint))
+        footprint = None if self.footprint is None else str(self.footprint)
+        return _unpickle_settings, (tuple(self), footprint, self.effects)
 
     def __repr__(self) -> str:
         fields = ", ".join(f"{k}={v!r}" for k, v in self._asdict().items())
-        return f"{type(self).__name__}({fields}, footprint={str(self.footprint)!r})"
+        effects = "" if self.effects is None else f", effects={self.effects}"
+        return f"{type(self).__name__}({fields}, footprint={str(self.footprint)!r}{effects})"
 
 
 # Downstream code probes the signature to tell dialects apart: it must be 3DGS 2023's.
 GaussianRasterizationSettings.__signature__ = inspect.signature(_Fields)
 
 
-def _unpickle_settings(fields: tuple, footprint: str | None) -> GaussianRasterizationSettings:
-    return GaussianRasterizationSettings(*fields, footprint=footprint)
+def _unpickle_settings(
+    fields: tuple, footprint: str | None, effects: Effects | None = None
+) -> GaussianRasterizationSettings:
+    return GaussianRasterizationSettings(*fields, footprint=footprint, effects=effects)
 
 
 def _check_tensors(device: torch.device | None, **tensors: Any) -> None:
@@ -129,7 +146,7 @@ def rasterize_gaussians(
     rotations: torch.Tensor | None,
     cov3Ds_precomp: torch.Tensor | None,
     raster_settings: GaussianRasterizationSettings,
-) -> tuple[torch.Tensor, torch.Tensor]:
+) -> tuple[torch.Tensor, ...]:
     """Renders Gaussians. The functional form of `GaussianRasterizer.forward`, which says more."""
     _check_tensors(None, means3D=means3D)
     device = means3D.device
@@ -145,8 +162,13 @@ def rasterize_gaussians(
         cov3D_precomp=cov3Ds_precomp,
     )
     gaussians = (means3D, means2D, opacities, *rest)
+    debug, effects = bool(raster_settings.debug), raster_settings.effects
+    if not _effects.is_plain(effects, rest[1], raster_settings.bg):
+        rasterize = _DebugRasterize.apply if debug else torch.ops.analytic_rasterizer.rasterize
+        settings = _settings_arguments(raster_settings, device)
+        color, radii, outputs = _effects.render(rasterize, gaussians, settings, effects or Effects(), debug)
+        return (color, radii, outputs) if effects is not None and effects.any else (color, radii)
     keep = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in gaussians)
-    debug = bool(raster_settings.debug)
     arguments = (*gaussians, *_settings_arguments(raster_settings, device), keep, debug)
     if debug:
         return _DebugRasterize.apply(*arguments)[:2]
@@ -230,7 +252,7 @@ class GaussianRasterizer(torch.nn.Module):
         scales: torch.Tensor | None = None,
         rotations: torch.Tensor | None = None,
         cov3D_precomp: torch.Tensor | None = None,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    ) -> tuple[torch.Tensor, ...]:
         """Renders an image. Differentiable in all eight inputs.
 
         All floating tensors share one dtype (float32; float64 on the CPU) and device. Missing inputs
@@ -244,15 +266,16 @@ class GaussianRasterizer(torch.nn.Module):
                 a (P, 4) input are sums over pixels of the absolute values instead.
             opacities: (P, 1) or (P,).
             shs: (P, M, 3) spherical harmonics, M >= (sh_degree + 1)^2; or colors_precomp.
-            colors_precomp: (P, 3) RGB.
+            colors_precomp: (P, 3) RGB, or (P, C) features of 1 to 512 channels.
             scales: (P, 3) standard deviations, world units, with rotations; or cov3D_precomp.
             rotations: (P, 4) quaternions (w, x, y, z) of any length; zero is the identity.
             cov3D_precomp: (P, 6) covariances (xx, xy, xz, yy, yz, zz).
 
         Returns:
-            color: (3, H, W) image.
+            color: (3, H, W) image; (C, H, W) of C channels.
             radii: (P,) int32, 3 standard deviations of the projected Gaussian in px, rounded up; 0 for
                 a Gaussian that was culled.
+            outputs: `Outputs`, only where the settings ask for effects.
 
         Raises:
             TypeError: Not a tensor, or a wrong dtype.

@@ -70,6 +70,8 @@ template <typename T> struct GaussianGrads {
 
 /// Scalars per Splat, whatever the footprint: the alignment rounds all of them up to this.
 inline constexpr int kSplatWidth = 12;
+/// Where its colour begins.
+inline constexpr int kSplatColor = 9;
 
 /// A projected Gaussian. Scalars only, so that an array of them is a matrix of T.
 template <class F, typename T> struct alignas(16) Splat {

@@ -171,6 +171,7 @@ TORCH_LIBRARY_IMPL(analytic_rasterizer, Autograd, m) {
   m.impl("rasterize", rasterize_autograd);
   m.impl("footprint_weight", footprint_weight_autograd);
   m.impl("rasterize_vjp", torch::autograd::autogradNotImplementedFallback());
+  m.impl("rasterize_channels", torch::autograd::autogradNotImplementedFallback());
   m.impl("footprint_weight_vjp", torch::autograd::autogradNotImplementedFallback());
 }
 

@@ -57,6 +57,12 @@ TORCH_LIBRARY(analytic_rasterizer, m) {
       "option) -> "
       "(Tensor color, Tensor radii, Tensor ids, Tensor depths, Tensor means2d, Tensor pairs, Tensor tile_offsets, "
       "Tensor seconds)");
+  // Other colours (P, 3) for the same splats: what rasterize with keep=True returned, blended again. `splats`,
+  // `checkpoints`, `chunks` and `counts` are rasterize_vjp's for an image of these colours.
+  m.def(
+      "rasterize_channels(Tensor colors, Tensor bg, int image_height, int image_width, str footprint, float option, "
+      "Tensor splats, Tensor ids, Tensor pairs, Tensor tile_offsets, Tensor counts, Tensor tile_samples, bool keep, "
+      "bool debug) -> (Tensor color, Tensor splats, Tensor checkpoints, Tensor chunks, Tensor counts)");
   m.def("footprint_weight(Tensor offset, Tensor cov2d, str footprint, float option) -> Tensor");
   m.def(
       "footprint_weight_vjp(Tensor dL_dweight, Tensor offset, Tensor cov2d, str footprint, float option) -> "

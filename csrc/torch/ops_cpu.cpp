@@ -250,6 +250,31 @@ Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const Op
   return out;
 }
 
+ChannelsOutput rasterize_channels_cpu(const Tensor& colors, const Tensor& bg, int64_t image_height, int64_t image_width,
+                                      std::string footprint, double, const Tensor& splats, const Tensor& ids,
+                                      const Tensor& pairs, const Tensor& tile_offsets, const Tensor& counts,
+                                      const Tensor& tile_samples, bool, bool) {
+  check_channels(colors, bg, splats, {ids, pairs, tile_offsets, counts, tile_samples});
+  check_image_size(image_height, image_width);
+  const TileGrid grid = {int(image_width), int(image_height)};
+  Tensor own = splats.clone();
+  own.narrow(1, kSplatColor, 3).copy_(colors.index_select(0, ids));
+  const Tensor background = bg.contiguous(), image = at::empty({3, image_height, image_width}, colors.options());
+  AT_DISPATCH_FLOATING_TYPES(colors.scalar_type(), "rasterize_channels", [&] {
+    const Stages<scalar_t>& stages = stages_of<scalar_t>(footprint);
+    TORCH_CHECK_VALUE(ids.numel() == splats.size(0) && tile_offsets.numel() == grid.tiles() + 1 &&
+                          tile_samples.numel() == (stages.choose ? grid.tiles() : 0),
+                      "ids, tile_offsets and tile_samples must be outputs of rasterize for these splats and this image "
+                      "size, got ids of shape ",
+                      shape_of(ids), " and tile_offsets of shape ", shape_of(tile_offsets));
+    stages.blend({own.const_data_ptr<scalar_t>(), pairs.const_data_ptr<int32_t>(),
+                  tile_offsets.const_data_ptr<int64_t>(), grid, at::get_num_threads(), samples_or_null(tile_samples),
+                  background.const_data_ptr<scalar_t>(), image.data_ptr<scalar_t>(), nullptr, nullptr});
+  });
+  const auto none = [](const Tensor& like) { return at::empty({0}, like.options()); };
+  return {image, own, none(colors), none(pairs), none(tile_offsets)};
+}
+
 Tensor footprint_weight_cpu(const Tensor& offset, const Tensor& cov2d, std::string footprint, double option) {
   check_weight_arguments(offset, cov2d, option);
   const Tensor d = offset.contiguous(), c = cov2d.contiguous();
@@ -285,6 +310,7 @@ TORCH_LIBRARY_IMPL(analytic_rasterizer, CPU, m) {
   m.impl("rasterize", rasterize_cpu);
   m.impl("rasterize_vjp", rasterize_vjp_cpu);
   m.impl("rasterize_stages", rasterize_stages_cpu);
+  m.impl("rasterize_channels", rasterize_channels_cpu);
   m.impl("footprint_weight", footprint_weight_cpu);
   m.impl("footprint_weight_vjp", footprint_weight_vjp_cpu);
 }

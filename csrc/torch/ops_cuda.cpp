@@ -264,30 +264,34 @@ Tensor choose(const Inputs& in, const Projected& projected, const Binned& binned
   return out;
 }
 
-BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& binned, const Tensor& tile_samples,
-                   const cuda::ForwardStages& stages, const CUDAStream& stream, const Scratch& scratch, bool keep,
+/// `lists.counts` has pairs and splats, and zeros. `plan_counters` are zero.
+BlendedImage blend(const cuda::TileLists& lists, TileGrid grid, const Tensor& background,
+                   const cuda::ForwardStages& stages, const CUDAStream& stream, std::byte* plan_counters, bool keep,
                    bool debug) {
-  const auto floats = in.means3D.options(), ints = floats.dtype(at::kInt);
-  const TileGrid grid = grid_of(in);
-  const int64_t samples = keep ? stages.samples : 0;
-  const Plan plan(grid, binned.capacity, stages.samples, tile_samples.numel() > 0, ints, scratch.plan);
-  const cuda::TileLists lists =
-      lists_of(projected.splats, binned.order, binned.pairs, binned.tile_offsets, scratch.counts, tile_samples);
-  int64_t* feedback = PairGuesses::instance().feedback(in.means3D.get_device(), grid);  // for the next frame's guess
+  const auto floats = background.options(), ints = floats.dtype(at::kInt);
+  const int64_t samples = keep ? stages.samples : 0, height = grid.height, width = grid.width;
+  const Plan plan(grid, lists.capacity, stages.samples, lists.tile_samples != nullptr, ints, plan_counters);
+  int64_t* feedback = PairGuesses::instance().feedback(background.get_device(), grid);  // for the next frame's guess
   cuda::plan_chunks(lists, grid, stages.samples, plan.view, feedback, stream);
   check_stage("plan_chunks", stream, debug);
   const Tensor tile_open = at::empty({1 + cuda::kSampleClasses, grid.tiles()}, ints);
-  BlendedImage out{at::empty({3, in.image_height, in.image_width}, floats),
-                   at::empty({samples, in.image_height, in.image_width}, floats),
-                   at::empty({samples, in.image_height, in.image_width}, ints),
-                   at::empty({plan.max_planes, kTile * kTile, 4}, floats), plan.chunks};
-  stages.blend({lists, plan.view, grid, in.background.const_data_ptr<float>(), tile_open.data_ptr<int32_t>(),
+  BlendedImage out{at::empty({3, height, width}, floats), at::empty({samples, height, width}, floats),
+                   at::empty({samples, height, width}, ints), at::empty({plan.max_planes, kTile * kTile, 4}, floats),
+                   plan.chunks};
+  stages.blend({lists, plan.view, grid, background.const_data_ptr<float>(), tile_open.data_ptr<int32_t>(),
                 tile_open.data_ptr<int32_t>() + grid.tiles(),
                 reinterpret_cast<cuda::Checkpoint*>(out.checkpoints.data_ptr<float>()), out.color.data_ptr<float>(),
                 keep ? out.transmittance.data_ptr<float>() : nullptr, keep ? out.last.data_ptr<int32_t>() : nullptr},
                stream);
   check_stage("blend", stream, debug);
   return out;
+}
+BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& binned, const Tensor& tile_samples,
+                   const cuda::ForwardStages& stages, const CUDAStream& stream, const Scratch& scratch, bool keep,
+                   bool debug) {
+  return blend(
+      lists_of(projected.splats, binned.order, binned.pairs, binned.tile_offsets, scratch.counts, tile_samples),
+      grid_of(in), in.background, stages, stream, scratch.plan, keep, debug);
 }
 
 RasterizeOutput rasterize_cuda(const Tensor& means3D, const OptionalTensor& means2D, const Tensor& opacities,
@@ -389,6 +393,38 @@ StagesOutput rasterize_stages_cuda(const Tensor& means3D, const Tensor& opacitie
   const Tensor compact = place.index_select(0, binned.pairs.select(1, 0).slice(0, 0, pairs).to(at::kLong)).to(at::kInt);
   return {image.color, projected.radii,     ids.to(at::kInt), depths, splats.narrow(1, 0, 2).clone(),
           compact,     binned.tile_offsets, seconds};
+}
+
+ChannelsOutput rasterize_channels_cuda(const Tensor& colors, const Tensor& bg, int64_t image_height,
+                                       int64_t image_width, std::string footprint, double, const Tensor& splats,
+                                       const Tensor& order, const Tensor& pairs, const Tensor& tile_offsets,
+                                       const Tensor& counts, const Tensor& tile_samples, bool keep, bool debug) {
+  TORCH_CHECK_TYPE(colors.scalar_type() != at::kDouble,
+                   "colors must have dtype float32 on CUDA, got Double; float64 runs on the CPU");
+  check_channels(colors, bg, splats, {order, pairs, tile_offsets, counts, tile_samples});
+  check_image_size(image_height, image_width);
+  const auto& stages = found(cuda::find_forward(footprint), footprint);
+  const TileGrid grid = {int(image_width), int(image_height)};
+  const int64_t n = colors.size(0);
+  TORCH_CHECK_VALUE(splats.size(0) == n && order.numel() == n && pairs.dim() == 2 && pairs.size(1) == 2 &&
+                        pairs.numel() > 0 && tile_offsets.numel() == grid.tiles() + 1 &&
+                        counts.numel() == kCountsWidth && tile_samples.numel() == (stages.choose ? grid.tiles() : 0),
+                    "splats ... tile_samples must be the outputs of rasterize with keep=True for ", n,
+                    " Gaussians and this image size, got splats of shape ", shape_of(splats),
+                    " and tile_offsets of shape ", shape_of(tile_offsets));
+  const c10::cuda::CUDAGuard guard(colors.device());
+  const CUDAStream stream = c10::cuda::getCurrentCUDAStream();
+  Tensor own = splats.clone();
+  own.narrow(1, kSplatColor, 3).copy_(colors);
+  Tensor own_counts = at::zeros_like(counts);
+  constexpr int64_t kFound =
+      offsetof(cuda::Counts, planes) / sizeof(int64_t);  // pairs and splats; the rest is of a plan
+  own_counts.narrow(0, 0, kFound).copy_(counts.narrow(0, 0, kFound));
+  const Tensor plan_counters = at::zeros({cuda::kPlanCounters}, order.options());
+  const BlendedImage image =
+      blend(lists_of(own, order, pairs, tile_offsets, own_counts, tile_samples), grid, bg.contiguous(), stages, stream,
+            static_cast<std::byte*>(plan_counters.data_ptr()), keep, debug);
+  return {image.color, own, image.checkpoints, image.chunks, own_counts};
 }
 
 /// The tensors that rasterize hands to its vjp must fit each other. Their contents are rasterize's own.
@@ -506,6 +542,7 @@ TORCH_LIBRARY_IMPL(analytic_rasterizer, CUDA, m) {
   m.impl("rasterize", rasterize_cuda);
   m.impl("rasterize_vjp", rasterize_vjp_cuda);
   m.impl("rasterize_stages", rasterize_stages_cuda);
+  m.impl("rasterize_channels", rasterize_channels_cuda);
   m.impl("footprint_weight", footprint_weight_cuda);
   m.impl("footprint_weight_vjp", footprint_weight_vjp_cuda);
 }

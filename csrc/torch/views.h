@@ -55,6 +55,9 @@ template <class Task, typename T> Task weight_task(const Tensor& offset, const T
 /// What rasterize returns: color, radii, and what its vjp needs (schemas in ops.cpp).
 using RasterizeOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
                                    Tensor, Tensor, Tensor, Tensor>;
+/// An image of other colours, and what takes the place of the same outputs of rasterize in its vjp: splats,
+/// checkpoints, chunks, counts.
+using ChannelsOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
 using StagesOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 /// Gradients of means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp.
 using Grads = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;

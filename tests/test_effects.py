@@ -1,0 +1,268 @@
+"""Channels, backgrounds and outputs beside the colours, on every device."""
+
+import pickle
+
+import pytest
+import reference
+import scenes
+import torch
+from scenes import KINDS, Camera, name_of
+
+import analytic_rasterizer as ar
+
+each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
+CAMERA = Camera(image_height=29, image_width=37, sh_degree=1)
+ALL = ar.Effects(alpha=True, depth=True, inverse_depth=True)
+
+
+def render(scene, camera=CAMERA, dtype=torch.float64, device="cpu", **settings):
+    """What the rasterizer returns, on the device."""
+    rasterizer = ar.GaussianRasterizer(camera.settings(dtype, device, **settings))
+    return rasterizer(**scenes.to(scene, device))
+
+
+def colored(scene, channels, seed=0):
+    """The scene with random colours of so many channels in place of harmonics."""
+    g = torch.Generator().manual_seed(seed)
+    colors = torch.rand(len(scene["means3D"]), channels, generator=g, dtype=scene["means3D"].dtype)
+    return {**{k: v for k, v in scene.items() if k != "shs"}, "colors_precomp": colors}
+
+
+def with_bg(settings, bg):
+    return settings._replace(bg=bg)
+
+
+def depths(scene, camera=CAMERA):
+    view = camera.fields(torch.float64)["viewmatrix"].reshape(4, 4)
+    return scene["means3D"].double() @ view[:3, 2] + view[3, 2]
+
+
+# --- values ---------------------------------------------------------------------------------------
+
+
+@each_kind
+@pytest.mark.parametrize("channels", [1, 2, 4, 8])
+def test_channels_are_colors_three_at_a_time(device, best, variant, channels):
+    """Bit for bit what rendering those three colours alone gives: the same splats, lists and kernels."""
+    footprint, options = variant
+    scene = scenes.cast(colored(scenes.random_scene(3, 50), channels), best)
+    bg = torch.linspace(0.1, 0.9, channels, dtype=best)
+    settings = with_bg(CAMERA.settings(best, footprint=footprint, **options), bg)
+    if footprint == "adaptive":  # chosen by the first three channels
+        settings = settings._replace(footprint="adaptive:tolerance=1e-9")
+    inputs = scenes.leaves(scenes.to(scene, device))
+    color, radii = ar.GaussianRasterizer(scenes.settings_to(settings, device))(**inputs)
+    assert color.shape == (channels, 29, 37)
+    for i in range(0, channels, 3):
+        pad = torch.nn.functional.pad
+        three = pad(scene["colors_precomp"][:, i : i + 3], (0, max(0, i + 3 - channels)))
+        alone = scenes.settings_to(with_bg(settings, pad(bg[i : i + 3], (0, max(0, i + 3 - channels)))), device)
+        single = scenes.leaves(scenes.to({**scene, "colors_precomp": three}, device))
+        expected, expected_radii = ar.GaussianRasterizer(alone)(**single)
+        assert torch.equal(color[i : i + 3], expected[: channels - i])
+        assert torch.equal(radii, expected_radii)
+
+
+@each_kind
+def test_outputs_match_the_reference(device, best, variant):
+    """alpha, depth and 1/depth are colours that the reference blends too."""
+    footprint, options = variant
+    scene = scenes.random_scene(5, 30, degree=1)
+    z = depths(scene)
+    colors = torch.stack([torch.ones_like(z), z, 1 / z], 1)
+    color, radii, outputs = render(scenes.cast(scene, best), dtype=best, device=device, footprint=footprint,
+                                   effects=ALL, **options)  # fmt: skip
+    plain = render(scenes.cast(scene, best), dtype=best, device=device, footprint=footprint, **options)
+    assert torch.equal(radii, plain[1])
+    assert (color - plain[0]).abs().max() <= (1e-6 if device == "cuda" else 0)  # one is ready for a backward pass
+    settings = CAMERA.settings(footprint=footprint, **options)
+    kwargs = dict(options)
+    if footprint == "adaptive":
+        kwargs["tile_samples"] = scenes.tile_samples(scenes.settings_to(settings, "cpu"), scene)
+    geometry = {k: v for k, v in scene.items() if k != "shs"}
+    expected = reference.render(
+        settings, **geometry, colors_precomp=torch.where(z[:, None] > 0.2, colors, 1), footprint=footprint, **kwargs
+    ).color
+    # Rounding of the dtype times what adds up in a pixel; depths here are below 8.
+    bound = {torch.float64: 1e-11, torch.float32: 2e-5}[best]
+    for name, plane in zip(("alpha", "depth", "inverse_depth"), expected):
+        assert (getattr(outputs, name)[0].cpu() - plane).abs().max() < 8 * bound, name
+
+
+def test_alpha_is_what_the_background_does_not_show(device, best):
+    scene = scenes.cast(scenes.random_scene(6, 30, degree=1), best)
+    black = render(scene, dtype=best, device=device, footprint="box:samples=4")[0]
+    settings = with_bg(CAMERA.settings(best, footprint="box:samples=4", effects=ALL), torch.ones(3, dtype=best))
+    white, _, outputs = ar.GaussianRasterizer(scenes.settings_to(settings, device))(**scenes.to(scene, device))
+    assert torch.allclose(1 - outputs.alpha.expand_as(black), white - black, atol=4e-6)
+
+
+def test_normalized_depth_lies_between_the_nearest_and_the_farthest(device, best):
+    scene = scenes.cast(scenes.random_scene(7, 60, degree=1, sigma=(0.2, 0.5)), best)
+    _, radii, outputs = render(scene, dtype=best, device=device, effects=ALL)
+    mean = ar.normalized(outputs.depth, outputs.alpha)
+    z = depths(scene)[radii.cpu() > 0]
+    seen = mean[outputs.alpha > 1e-3]
+    assert len(seen) > 100
+    assert z.min() - 1e-4 < seen.min() and seen.max() < z.max() + 1e-4
+    assert (mean[outputs.alpha <= 1e-6] == 0).all()
+
+
+def test_background_image(device, best):
+    """Every pixel sees its own background through what the splats leave."""
+    scene = scenes.cast(scenes.random_scene(8, 40, degree=1), best)
+    image = torch.rand(3, 29, 37, generator=torch.Generator().manual_seed(1), dtype=best)
+    settings = CAMERA.settings(best, footprint="box:samples=4")
+    color, _ = ar.GaussianRasterizer(scenes.settings_to(with_bg(settings, image), device))(**scenes.to(scene, device))
+    for value in (image.new_tensor([0.2, 0.5, 0.7]), image.new_zeros(3)):
+        constant = value[:, None, None].expand(3, 29, 37).contiguous()
+        one = ar.GaussianRasterizer(scenes.settings_to(with_bg(settings, value), device))(**scenes.to(scene, device))[0]
+        other = ar.GaussianRasterizer(scenes.settings_to(with_bg(settings, constant), device))(
+            **scenes.to(scene, device)
+        )[0]
+        assert torch.allclose(one, other, atol=1e-6)
+    black = render(scene, dtype=best, device=device, footprint="box:samples=4", effects=ar.Effects(alpha=True))
+    assert torch.allclose(color, black[0] + (1 - black[2].alpha) * image.to(device), atol=1e-6)
+
+
+# --- gradients ------------------------------------------------------------------------------------
+
+
+@each_kind
+def test_gradients_add_up_over_the_groups(device, best, variant):
+    """d/d(all channels) is the sum of what each group of three gives alone."""
+    footprint, options = variant
+    scene = scenes.cast(colored(scenes.random_scene(9, 60), 7), best)
+    settings = with_bg(CAMERA.settings(best, footprint=footprint, **options), torch.linspace(0, 1, 7, dtype=best))
+    if footprint == "adaptive":
+        settings = settings._replace(footprint="adaptive:tolerance=1e-9")
+    g = torch.rand(7, 29, 37, generator=torch.Generator().manual_seed(2), dtype=best)
+    whole = scenes.leaves(scenes.to(scene, device))
+    ar.GaussianRasterizer(scenes.settings_to(settings, device))(**whole)[0].backward(g.to(device))
+    parts = scenes.leaves(scenes.to(scene, device))
+    for i in range(0, 7, 3):
+        colors = torch.nn.functional.pad(parts["colors_precomp"][:, i : i + 3], (0, max(0, i - 4)))
+        bg = torch.nn.functional.pad(settings.bg[i : i + 3], (0, max(0, i - 4)))
+        image, _ = ar.GaussianRasterizer(scenes.settings_to(with_bg(settings, bg), device))(
+            **{**parts, "colors_precomp": colors}
+        )
+        (image[: 7 - i] * g[i : i + 3].to(device)).sum().backward()
+    for name, leaf in whole.items():
+        expected = parts[name].grad
+        if expected is not None:
+            assert (leaf.grad - expected).abs().max() <= 8 * torch.finfo(best).eps * expected.abs().max(), name
+
+
+@pytest.mark.parametrize("footprint", ["cumulant", "box:samples=4", "exact"])
+def test_gradcheck(footprint):
+    camera = Camera(image_height=9, image_width=11, bg=(0.3, 0.6, 0.1))
+    scene = scenes.with_precomputed(scenes.smooth_scene(2, 4))
+    scene = {**scene, "colors_precomp": torch.rand(4, 5, dtype=torch.float64)}
+    bg = torch.rand(5, 9, 11, dtype=torch.float64, requires_grad=True)
+    names = ["means3D", "opacities", "colors_precomp", "cov3D_precomp"]
+    settings = camera.settings(footprint=footprint, effects=ALL)
+
+    def run(bg, *values):
+        given = dict(zip(names, values))
+        color, _, outputs = ar.GaussianRasterizer(with_bg(settings, bg))(means2D=None, **given)
+        return (color, *outputs)
+
+    inputs = [scene[name].clone().requires_grad_() for name in names]
+    assert torch.autograd.gradcheck(run, (bg, *inputs), eps=1e-6, atol=1e-7, rtol=1e-5, nondet_tol=0)
+
+
+def test_depth_gradient_of_a_culled_gaussian_is_zero(device, best):
+    """One on the camera, where 1/z is infinite, and one behind it."""
+    scene = scenes.cast(scenes.random_scene(10, 12, degree=1), best)
+    camera = CAMERA.facing_z()
+    scene["means3D"][:, 2] += 5
+    scene["means3D"][3] = 0
+    scene["means3D"][4, 2] = -3
+    leaves = scenes.leaves(scenes.to(scene, device))
+    settings = camera.settings(best, device, footprint="box", effects=ALL)
+    color, _, outputs = ar.GaussianRasterizer(settings)(**leaves)
+    (color.sum() + sum(o.sum() for o in outputs)).backward()
+    for name, leaf in leaves.items():
+        assert leaf.grad.isfinite().all(), name
+    assert (leaves["means3D"].grad[3:5] == 0).all()
+
+
+# --- what must not change, and what must be refused -------------------------------------------------
+
+
+@each_kind
+def test_asking_for_outputs_changes_no_bit_of_the_colors(device, best, variant):
+    footprint, options = variant
+    scene = scenes.cast(scenes.random_scene(11, 60, degree=1), best)
+    results = []
+    for effects in (None, ar.Effects(), ar.Effects(alpha=True), ar.Effects(depth=True), ALL):
+        leaves = scenes.leaves(scenes.to(scene, device))
+        settings = CAMERA.settings(best, device, footprint=footprint, effects=effects, **options)
+        color, radii, *outputs = ar.GaussianRasterizer(settings)(**leaves)
+        assert len(outputs) == (effects is not None and effects.any)
+        color.square().sum().backward()
+        results.append([color.detach(), radii, *(leaf.grad for leaf in leaves.values())])
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+
+
+def test_plain_path_calls_one_op(device, best):
+    """Nothing of the effects runs, or takes memory, where none is asked for."""
+    scene = scenes.to(scenes.cast(scenes.random_scene(12, 20, degree=1), best), device)
+    for effects, extra in ((None, 0), (ar.Effects(), 0), (ar.Effects(depth=True), 1), (ALL, 1)):
+        settings = CAMERA.settings(best, device, effects=effects)
+        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
+            ar.GaussianRasterizer(settings)(**scene)
+        calls = [event.key for event in profile.key_averages() for _ in range(event.count)]
+        ours = [key for key in calls if key.startswith("analytic_rasterizer::")]
+        assert ours.count("analytic_rasterizer::rasterize") == 1
+        assert ours.count("analytic_rasterizer::rasterize_channels") == extra
+        if not extra:
+            assert not any(key in calls for key in ("aten::cat", "aten::where", "aten::matmul", "aten::constant_pad_nd"))
+
+
+def test_a_feature_that_is_not_finite_culls_its_gaussian_alone(device, best):
+    scene = scenes.cast(colored(scenes.random_scene(13, 30), 6), best)
+    settings = with_bg(CAMERA.settings(best, footprint="box"), torch.zeros(6, dtype=best))
+    without = {k: torch.cat([v[:4], v[5:]]) for k, v in scene.items()}
+    scene["colors_precomp"][4, 5] = torch.nan
+    leaves = scenes.leaves(scenes.to(scene, device))
+    rasterizer = ar.GaussianRasterizer(scenes.settings_to(settings, device))
+    color, radii = rasterizer(**leaves)
+    expected, _ = rasterizer(**scenes.leaves(scenes.to(without, device)))
+    assert torch.equal(color, expected)
+    assert radii[4] == 0
+    color.sum().backward()
+    for name, leaf in leaves.items():
+        assert leaf.grad.isfinite().all(), name
+        assert (leaf.grad[4] == 0).all(), name
+
+
+@pytest.mark.parametrize(
+    "colors, bg, message",
+    [
+        ((30, 0), (0,), r"colors_precomp must have shape \(30, C\) with C from 1 to 512, got \(30, 0\)"),
+        ((30, 513), (513,), r"colors_precomp must have shape \(30, C\) with C from 1 to 512, got \(30, 513\)"),
+        ((29, 4), (4,), r"colors_precomp must have shape \(30, C\) with C from 1 to 512, got \(29, 4\)"),
+        ((30, 4), (3,), r"bg must have shape \(4,\) or that of the image, got \(3,\)"),
+        ((30, 3), (3, 29, 36), r"bg must have shape \(3, 29, 37\), got \(3, 29, 36\)"),
+    ],
+)
+def test_wrong_shapes(device, colors, bg, message):
+    scene = {k: v for k, v in scenes.cast(scenes.random_scene(1, 30), torch.float32).items() if k != "shs"}
+    scene["colors_precomp"] = torch.rand(*colors)
+    settings = with_bg(CAMERA.settings(torch.float32), torch.zeros(bg))
+    with pytest.raises(ValueError, match=message):
+        ar.GaussianRasterizer(scenes.settings_to(settings, device))(**scenes.to(scene, device))
+
+
+def test_effects_and_settings():
+    settings = CAMERA.settings(effects=ALL, footprint="box")
+    assert settings._replace(sh_degree=0).effects == ALL
+    assert pickle.loads(pickle.dumps(settings)).effects == ALL
+    assert "inverse_depth=True" in repr(settings)
+    assert not ar.Effects().any and ALL.any
+    with pytest.raises(TypeError, match="depth must be a bool, got 1"):
+        ar.Effects(depth=1)
+    with pytest.raises(TypeError, match="effects must be an Effects, got 'depth'"):
+        CAMERA.settings(effects="depth")
