@@ -6,7 +6,8 @@ A drop-in replacement for `diff_gaussian_rasterization`. See the README for how 
 import torch  # noqa: F401  (its libraries must be loaded before the extension's)
 
 from ._C import instruction_set
-from .effects import Effects, Outputs, normalized
+from .effects import Effects, GaussianStats, Outputs, normalized
+from .filters import apply_3d_filter, compute_3d_filter
 from .footprints import (
     FOOTPRINTS,
     Footprint,
@@ -33,8 +34,11 @@ __all__ = [
     "Footprint",
     "GaussianRasterizationSettings",
     "GaussianRasterizer",
+    "GaussianStats",
     "Outputs",
     "Stages",
+    "apply_3d_filter",
+    "compute_3d_filter",
     "footprint_weight",
     "get_default_footprint",
     "instruction_set",

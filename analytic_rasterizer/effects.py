@@ -14,6 +14,7 @@ import torch
 MAX_CHANNELS = 512
 NEAR = 0.2  # camera-space z up to which everything is culled
 _GROUP = 3  # channels that are blended at once
+_UNIT = 2.0**-32  # of sums of weights
 
 
 @dataclass(frozen=True)
@@ -24,11 +25,17 @@ class Effects:
         alpha: How much of each pixel is covered, 1 - transmittance.
         depth: Expected depth: camera-space z of the Gaussians' centres, blended like a colour on zero.
         inverse_depth: The same of 1/z.
+        median_depth: z of the Gaussian behind which less than half of a pixel's light is left.
+        dominant_index: Which Gaussian a pixel shows most of.
+        gaussian_stats: How much of every Gaussian is seen, for pruning.
     """
 
     alpha: bool = False
     depth: bool = False
     inverse_depth: bool = False
+    median_depth: bool = False
+    dominant_index: bool = False
+    gaussian_stats: bool = False
 
     def __post_init__(self):
         for name, value in vars(self).items():
@@ -41,18 +48,38 @@ class Effects:
         return any(vars(self).values())
 
 
+class GaussianStats(NamedTuple):
+    """How much of every Gaussian a picture shows. Its weight in a pixel is what its colour is multiplied with there.
+
+    Attributes:
+        pixels: (P,) int32, pixels in which its weight is not zero.
+        max_weight: (P,) largest weight, 0 to 1, float32.
+        sum_weight: (P,) sum of weights over all pixels, in steps of 2^-32.
+    """
+
+    pixels: torch.Tensor
+    max_weight: torch.Tensor
+    sum_weight: torch.Tensor
+
+
 class Outputs(NamedTuple):
-    """What `Effects` asked for; None for the rest. All are differentiable in every input of the rasterizer.
+    """What `Effects` asked for; None for the rest. The first three are differentiable in every input of the rasterizer.
 
     Attributes:
         alpha: (1, H, W) in 0 to 1.
         depth: (1, H, W) sum of weight times z, world units; divided by alpha it is the mean depth of what is seen.
         inverse_depth: (1, H, W) sum of weight over z, 1 / world units.
+        median_depth: (1, H, W) world units; 0 where half of the light gets through.
+        dominant_index: (1, H, W) int32, the Gaussian of the largest weight, of equal ones the nearest; -1 for none.
+        gaussian_stats: `GaussianStats`.
     """
 
     alpha: torch.Tensor | None = None
     depth: torch.Tensor | None = None
     inverse_depth: torch.Tensor | None = None
+    median_depth: torch.Tensor | None = None
+    dominant_index: torch.Tensor | None = None
+    gaussian_stats: GaussianStats | None = None
 
 
 def normalized(blended: torch.Tensor, alpha: torch.Tensor, smallest: float = 1e-6) -> torch.Tensor:
@@ -107,10 +134,10 @@ def render(rasterize, gaussians: tuple, settings: tuple, effects: Effects, debug
     extra_bg.append(bg.new_zeros(len(features)))
 
     inputs = (means3D, means2D, opacities, shs, first, *shape)
-    keep = bool(extra) or torch.is_grad_enabled()
-    grad = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
+    looks = effects.median_depth or effects.dominant_index or effects.gaussian_stats
+    keep = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in inputs)
     main_bg = _padded(bg[None, :_GROUP])[0].contiguous()
-    color, radii, *saved = rasterize(*inputs, main_bg, view, *rest, keep and (grad or bool(extra)), debug)
+    color, radii, *saved = rasterize(*inputs, main_bg, view, *rest, keep or bool(extra) or looks, debug)
     planes = [color[:channels]]
     if extra:
         table, table_bg = _padded(torch.cat(extra, 1)), _padded(torch.cat(extra_bg)[None])[0]
@@ -122,7 +149,35 @@ def render(rasterize, gaussians: tuple, settings: tuple, effects: Effects, debug
     color, values = image[:channels], dict(zip(features, image[channels:].split(1)))
     if bg_image is not None:
         color = color + (1 - values["alpha"]) * bg_image
-    return color, radii, Outputs(**{name: values[name] for name in features if getattr(effects, name)})
+    outputs = {name: values[name] for name in features if getattr(effects, name)}
+    if looks:
+        outputs |= _look(effects, means3D, view, saved, height, width, footprint=rest[-2])
+    return color, radii, Outputs(**outputs)
+
+
+@torch.no_grad()
+def _look(effects: Effects, means3D: torch.Tensor, view: torch.Tensor, saved: list, height, width, footprint) -> dict:
+    """The outputs without a gradient, by name."""
+    splats, ids, pairs, offsets, *_, counts, samples = saved
+    median, dominant, pixels, largest, total = torch.ops.analytic_rasterizer.inspect(
+        splats, ids, pairs, offsets, counts, samples, len(means3D), height, width, footprint
+    )
+    outputs = {}
+    if effects.median_depth:
+        z = _depths(means3D, view)
+        of_pixel = z[median.clamp_min(0).long()] if len(z) else z.new_zeros(median.shape)
+        outputs["median_depth"] = torch.where(median < 0, 0, of_pixel)[None]
+    if effects.dominant_index:
+        outputs["dominant_index"] = dominant[None]
+    if effects.gaussian_stats:
+        outputs["gaussian_stats"] = GaussianStats(pixels, largest, (total.double() * _UNIT).to(means3D.dtype))
+    return outputs
+
+
+def _depths(means3D: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
+    """Camera-space z, (P,)."""
+    view = view.detach().reshape(4, 4)
+    return means3D @ view[:3, 2] + view[3, 2]
 
 
 def _features(effects: Effects, means3D: torch.Tensor, view: torch.Tensor, with_alpha: bool) -> dict:
@@ -131,8 +186,7 @@ def _features(effects: Effects, means3D: torch.Tensor, view: torch.Tensor, with_
     if effects.alpha or with_alpha:
         features["alpha"] = torch.ones_like(means3D[:, :1])
     if effects.depth or effects.inverse_depth:
-        view = view.detach().reshape(4, 4)
-        z = means3D @ view[:3, 2:3] + view[3, 2]
+        z = _depths(means3D, view)[:, None]
         z = torch.where(z > NEAR, z, 1)  # the others are culled, and 0 times infinity would not be
         features |= {"depth": z} if effects.depth else {}
         features |= {"inverse_depth": 1 / z} if effects.inverse_depth else {}

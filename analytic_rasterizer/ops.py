@@ -111,6 +111,17 @@ def _(colors, bg, image_height, image_width, footprint, option, splats, ids, pai
     )
 
 
+@torch.library.register_fake("analytic_rasterizer::inspect")
+def _(splats, ids, pairs, tile_offsets, counts, tile_samples, count, image_height, image_width, footprint):
+    return (
+        ids.new_empty(image_height, image_width),
+        ids.new_empty(image_height, image_width),
+        ids.new_empty(count),
+        splats.new_empty(count, dtype=torch.float32),
+        tile_offsets.new_empty(count),
+    )
+
+
 @torch.library.register_fake("analytic_rasterizer::footprint_weight")
 def _(offset, cov2d, footprint, option):
     return offset.new_empty(offset.shape[:-1])

@@ -165,7 +165,7 @@ def test_gradcheck(footprint):
     def run(bg, *values):
         given = dict(zip(names, values))
         color, _, outputs = ar.GaussianRasterizer(with_bg(settings, bg))(means2D=None, **given)
-        return (color, *outputs)
+        return (color, *outputs[:3])
 
     inputs = [scene[name].clone().requires_grad_() for name in names]
     assert torch.autograd.gradcheck(run, (bg, *inputs), eps=1e-6, atol=1e-7, rtol=1e-5, nondet_tol=0)
@@ -181,7 +181,7 @@ def test_depth_gradient_of_a_culled_gaussian_is_zero(device, best):
     leaves = scenes.leaves(scenes.to(scene, device))
     settings = camera.settings(best, device, footprint="box", effects=ALL)
     color, _, outputs = ar.GaussianRasterizer(settings)(**leaves)
-    (color.sum() + sum(o.sum() for o in outputs)).backward()
+    (color.sum() + sum(output.sum() for output in outputs[:3])).backward()
     for name, leaf in leaves.items():
         assert leaf.grad.isfinite().all(), name
     assert (leaves["means3D"].grad[3:5] == 0).all()
@@ -218,7 +218,9 @@ def test_plain_path_calls_one_op(device, best):
         assert ours.count("analytic_rasterizer::rasterize") == 1
         assert ours.count("analytic_rasterizer::rasterize_channels") == extra
         if not extra:
-            assert not any(key in calls for key in ("aten::cat", "aten::where", "aten::matmul", "aten::constant_pad_nd"))
+            assert not any(
+                key in calls for key in ("aten::cat", "aten::where", "aten::matmul", "aten::constant_pad_nd")
+            )
 
 
 def test_a_feature_that_is_not_finite_culls_its_gaussian_alone(device, best):
@@ -266,3 +268,69 @@ def test_effects_and_settings():
         ar.Effects(depth=1)
     with pytest.raises(TypeError, match="effects must be an Effects, got 'depth'"):
         CAMERA.settings(effects="depth")
+
+
+# --- what pixels show ------------------------------------------------------------------------------
+
+
+@each_kind
+def test_looks_match_the_weights(device, best, variant):
+    """Weights of all Gaussians from one channel each: the largest, the one at half of the light, sums over pixels."""
+    footprint, options = variant
+    count = 24
+    scene = scenes.cast(colored(scenes.random_scene(14, count, opacity=(0.3, 0.98), sigma=(0.15, 0.6)), 3), best)
+    scene["colors_precomp"] = torch.eye(count, dtype=best)
+    looks = ar.Effects(median_depth=True, dominant_index=True, gaussian_stats=True)
+    settings = CAMERA.settings(best, device, footprint=footprint, effects=looks, **options)
+    if footprint == "adaptive":  # chosen by colours: the same for all
+        settings = settings._replace(footprint="adaptive:tolerance=1e-9")
+    settings = with_bg(settings, torch.zeros(count, dtype=best, device=device))
+    weights, _, outputs = ar.GaussianRasterizer(settings)(**scenes.to(scene, device))
+    weights, eps = weights.cpu(), 32 * torch.finfo(best).eps
+    assert outputs.alpha is outputs.depth is None
+
+    dominant = outputs.dominant_index[0].cpu()
+    assert dominant.dtype == torch.int32
+    largest = weights.amax(0)
+    assert torch.equal(dominant < 0, largest == 0)
+    seen = dominant >= 0
+    of_dominant = weights.gather(0, dominant.clamp_min(0).long()[None])[0]
+    assert (largest - of_dominant)[seen].max() <= eps
+
+    stats = outputs.gaussian_stats
+    assert torch.equal(stats.pixels.cpu().long(), (weights > 0).sum((1, 2)))
+    assert (stats.max_weight.cpu() - weights.amax((1, 2))).abs().max() <= max(eps, 1e-7)
+    total = weights.double().sum((1, 2))
+    assert (stats.sum_weight.cpu().double() - total).abs().max() <= 29 * 37 * (eps + 2**-33)
+
+    z = depths(scene)
+    order = torch.argsort(z)
+    through = 1 - weights[order].double().cumsum(0)  # behind each, front to back
+    median = outputs.median_depth[0].cpu().double()
+    below = (through < 0.5) & (weights[order] > 0)
+    first = below.double().argmax(0)
+    expected = torch.where(below.any(0), z[order][first], 0)
+    clear = ((through - 0.5).abs() > 1e-5).all(0)  # rounding may decide the others
+    assert clear.double().mean() > 0.98 and below.any(0).double().mean() > 0.2
+    assert (median - expected)[clear].abs().max() < 1e-5
+
+
+def test_looks_do_not_depend_on_threads_or_runs():
+    scene = scenes.random_scene(15, 200, degree=1)
+    looks = ar.Effects(median_depth=True, dominant_index=True, gaussian_stats=True)
+    results = []
+    for threads in (1, 2, 5, 2):
+        torch.set_num_threads(threads)
+        _, _, outputs = render(scene, footprint="box:samples=4", effects=looks)
+        results.append([outputs.median_depth, outputs.dominant_index, *outputs.gaussian_stats])
+    for other in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+
+
+def test_looks_of_an_empty_picture(device, best):
+    scene = {k: v[:0] for k, v in scenes.cast(scenes.random_scene(1, 5, degree=1), best).items()}
+    looks = ar.Effects(median_depth=True, dominant_index=True, gaussian_stats=True, alpha=True, depth=True)
+    color, _, outputs = render(scene, dtype=best, device=device, effects=looks)
+    assert color.abs().max() == 0 and outputs.alpha.abs().max() == 0 and outputs.median_depth.abs().max() == 0
+    assert (outputs.dominant_index == -1).all()
+    assert all(len(field) == 0 for field in outputs.gaussian_stats)

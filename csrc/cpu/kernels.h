@@ -4,6 +4,7 @@
 #include "core/footprint/registry.h"
 #include "cpu/bin.h"
 #include "cpu/blend.h"
+#include "cpu/inspect.h"
 #include "cpu/project.h"
 #include "cpu/weight.h"
 
@@ -20,7 +21,7 @@ template <class F, typename T> constexpr auto choose_stage() -> decltype(cpu::St
 template <class F, typename T>
 inline constexpr cpu::Stages<T> kStages = {
     F::kSamples, count_candidates<T>, project<F, T>,     count_pairs<F, T>, scatter_pairs<F, T>, choose_stage<F, T>(),
-    blend<F, T>, blend_vjp<F, T>,     project_vjp<F, T>, weight<F, T>,      weight_vjp<F, T>,
+    blend<F, T>, blend_vjp<F, T>,     project_vjp<F, T>, weight<F, T>,      weight_vjp<F, T>,    inspect<F, T>,
 };
 
 template <typename T> const cpu::Stages<T>* stages(std::string_view footprint) {

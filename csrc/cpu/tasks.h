@@ -68,6 +68,21 @@ template <typename T> struct BlendTask {
   int32_t* last;                ///< [samples, height, width] pairs of the tile up to the last one composited, or null
 };
 
+template <typename T> struct InspectTask {
+  const T* splats;
+  const int32_t* ids;  ///< Gaussian of each splat
+  const int32_t* pairs;
+  const int64_t* tile_offsets;
+  TileGrid grid;
+  int threads;
+  const int32_t* tile_samples;
+  int32_t* median;    ///< [height, width] Gaussians, or -1; see PixelLook
+  int32_t* dominant;  ///< [height, width]
+  int32_t* touched;   ///< [n] pixels, to add to
+  int32_t* largest;   ///< [n] largest weight, as the bits of a float; to raise
+  int64_t* units;     ///< [n] sum of weights in units of kWeightUnit, to add to
+};
+
 template <typename T> struct BlendVjpTask {
   const T* splats;
   const int32_t* pairs;
@@ -114,6 +129,7 @@ template <typename T> struct Stages {
   void (*project_vjp)(const ProjectVjpTask<T>&);
   void (*weight)(const WeightTask<T>&);
   void (*weight_vjp)(const WeightTask<T>&);
+  void (*inspect)(const InspectTask<T>&);
 };
 
 /// Stages of the footprint whose kName is `footprint`, for the best instruction set that this

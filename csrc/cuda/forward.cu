@@ -3,6 +3,7 @@
 #include "cuda/bin.cuh"
 #include "cuda/blend.cuh"
 #include "cuda/choose.cuh"
+#include "cuda/inspect.cuh"
 #include "cuda/project.cuh"
 #include "cuda/weight.cuh"
 
@@ -17,8 +18,8 @@ template <class F> constexpr auto choose_stage() -> decltype(ForwardStages::choo
 }
 
 template <class F>
-inline constexpr ForwardStages kForward = {F::kSamples, project<F>,       emit_pairs<F>,    choose_stage<F>(),
-                                           blend<F>,    weight<F, float>, weight<F, double>};
+inline constexpr ForwardStages kForward = {F::kSamples, project<F>,       emit_pairs<F>,     choose_stage<F>(),
+                                           blend<F>,    weight<F, float>, weight<F, double>, inspect<F>};
 
 const ForwardStages* find_forward(std::string_view footprint) {
   const ForwardStages* found = nullptr;

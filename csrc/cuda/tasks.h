@@ -145,6 +145,16 @@ struct BlendTask {
   int32_t* last;            ///< [samples, height, width], or null; the splats up to which a sample composited
 };
 
+struct InspectTask {
+  TileLists lists;
+  TileGrid grid;
+  int32_t* median;    ///< [height, width] Gaussians, or -1; see PixelLook
+  int32_t* dominant;  ///< [height, width]
+  int32_t* touched;   ///< [n] pixels, to add to
+  int32_t* largest;   ///< [n] largest weight, as the bits of a float; to raise
+  int64_t* units;     ///< [n] sum of weights in units of kWeightUnit, to add to
+};
+
 struct BlendVjpTask {
   TileLists lists;
   const TileChunk* chunk_order;
@@ -178,6 +188,7 @@ struct ForwardStages {
   void (*blend)(const BlendTask&, cudaStream_t);
   void (*weight_float)(const WeightTask<float>&, cudaStream_t);
   void (*weight_double)(const WeightTask<double>&, cudaStream_t);
+  void (*inspect)(const InspectTask&, cudaStream_t);
 };
 struct BackwardStages {
   void (*blend_vjp)(const BlendVjpTask&, cudaStream_t);

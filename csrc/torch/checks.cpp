@@ -72,19 +72,22 @@ void check_weight_arguments(const Tensor& offset, const Tensor& cov2d, double op
   TORCH_CHECK_VALUE(std::isfinite(option) && option >= 0, "option must be finite and not negative, got ", option);
 }
 
-void check_channels(const Tensor& colors, const Tensor& bg, const Tensor& splats, const std::vector<Tensor>& lists) {
-  check_floating(colors, "colors");
-  TORCH_CHECK_VALUE(colors.dim() == 2 && colors.size(1) == 3, "colors must have shape (P, 3), got ", shape_of(colors));
-  check_like(bg, "bg", colors, "colors");
-  TORCH_CHECK_VALUE(bg.dim() == 1 && bg.size(0) == 3, "bg must have shape (3,), got ", shape_of(bg));
-  check_like(splats, "splats", colors, "colors");
+void check_lists(const Tensor& splats, const std::vector<Tensor>& lists) {
+  check_floating(splats, "splats");
   TORCH_CHECK_VALUE(splats.dim() == 2 && splats.size(1) == kSplatWidth && splats.is_contiguous(),
                     "splats must be an output of rasterize with keep=True, got shape ", shape_of(splats));
   for (const Tensor& t : lists) {
-    TORCH_CHECK_VALUE(t.device() == colors.device() && t.is_contiguous(),
-                      "ids ... tile_samples must be contiguous, on the device of colors, ", colors.device(),
+    TORCH_CHECK_VALUE(t.device() == splats.device() && t.is_contiguous(),
+                      "ids ... tile_samples must be contiguous, on the device of splats, ", splats.device(),
                       ", got a tensor of shape ", shape_of(t), " on ", t.device());
   }
+}
+
+void check_channels(const Tensor& colors, const Tensor& bg, const Tensor& splats) {
+  check_like(colors, "colors", splats, "splats");
+  TORCH_CHECK_VALUE(colors.dim() == 2 && colors.size(1) == 3, "colors must have shape (P, 3), got ", shape_of(colors));
+  check_like(bg, "bg", splats, "splats");
+  TORCH_CHECK_VALUE(bg.dim() == 1 && bg.size(0) == 3, "bg must have shape (3,), got ", shape_of(bg));
 }
 
 void check_image_size(int64_t height, int64_t width) {

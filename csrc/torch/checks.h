@@ -58,9 +58,11 @@ template <class Stages> const Stages& found(const Stages* stages, const std::str
 void check_weight_arguments(const Tensor& offset, const Tensor& cov2d, double option);
 void check_weight_gradient(const Tensor& dL_dweight, const Tensor& offset);
 
-/// Arguments of rasterize_channels. `lists`: what rasterize with keep=True returned for as many Gaussians, row of
-/// splats by row.
-void check_channels(const Tensor& colors, const Tensor& bg, const Tensor& splats, const std::vector<Tensor>& lists);
+/// `splats` and the other `lists` look like outputs of rasterize with keep=True.
+void check_lists(const Tensor& splats, const std::vector<Tensor>& lists);
+
+/// Arguments of rasterize_channels.
+void check_channels(const Tensor& colors, const Tensor& bg, const Tensor& splats);
 
 /// Sizes that tensors and tiles can be indexed with.
 void check_image_size(int64_t height, int64_t width);

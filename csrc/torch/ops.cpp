@@ -63,6 +63,12 @@ TORCH_LIBRARY(analytic_rasterizer, m) {
       "rasterize_channels(Tensor colors, Tensor bg, int image_height, int image_width, str footprint, float option, "
       "Tensor splats, Tensor ids, Tensor pairs, Tensor tile_offsets, Tensor counts, Tensor tile_samples, bool keep, "
       "bool debug) -> (Tensor color, Tensor splats, Tensor checkpoints, Tensor chunks, Tensor counts)");
+  // What every pixel shows of rasterize's splats, and every one of the `count` Gaussians of the pixels. `total` is in
+  // units of 2^-32.
+  m.def(
+      "inspect(Tensor splats, Tensor ids, Tensor pairs, Tensor tile_offsets, Tensor counts, Tensor tile_samples, int "
+      "count, int image_height, int image_width, str footprint) -> (Tensor median, Tensor dominant, Tensor touched, "
+      "Tensor largest, Tensor total)");
   m.def("footprint_weight(Tensor offset, Tensor cov2d, str footprint, float option) -> Tensor");
   m.def(
       "footprint_weight_vjp(Tensor dL_dweight, Tensor offset, Tensor cov2d, str footprint, float option) -> "

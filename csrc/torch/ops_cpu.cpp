@@ -250,29 +250,57 @@ Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const Op
   return out;
 }
 
+/// The lists of rasterize must fit each other and the image size.
+void check_fit(const Tensor& splats, const Tensor& ids, const Tensor& tile_offsets, const Tensor& tile_samples,
+               TileGrid grid, bool chosen) {
+  TORCH_CHECK_VALUE(ids.numel() == splats.size(0) && tile_offsets.numel() == grid.tiles() + 1 &&
+                        tile_samples.numel() == (chosen ? grid.tiles() : 0),
+                    "ids, tile_offsets and tile_samples must be outputs of rasterize for these splats and this image "
+                    "size, got ids of shape ",
+                    shape_of(ids), " and tile_offsets of shape ", shape_of(tile_offsets));
+}
+
 ChannelsOutput rasterize_channels_cpu(const Tensor& colors, const Tensor& bg, int64_t image_height, int64_t image_width,
                                       std::string footprint, double, const Tensor& splats, const Tensor& ids,
                                       const Tensor& pairs, const Tensor& tile_offsets, const Tensor& counts,
                                       const Tensor& tile_samples, bool, bool) {
-  check_channels(colors, bg, splats, {ids, pairs, tile_offsets, counts, tile_samples});
+  check_lists(splats, {ids, pairs, tile_offsets, tile_samples});
+  check_channels(colors, bg, splats);
   check_image_size(image_height, image_width);
   const TileGrid grid = {int(image_width), int(image_height)};
   Tensor own = splats.clone();
-  own.narrow(1, kSplatColor, 3).copy_(colors.index_select(0, ids));
   const Tensor background = bg.contiguous(), image = at::empty({3, image_height, image_width}, colors.options());
   AT_DISPATCH_FLOATING_TYPES(colors.scalar_type(), "rasterize_channels", [&] {
     const Stages<scalar_t>& stages = stages_of<scalar_t>(footprint);
-    TORCH_CHECK_VALUE(ids.numel() == splats.size(0) && tile_offsets.numel() == grid.tiles() + 1 &&
-                          tile_samples.numel() == (stages.choose ? grid.tiles() : 0),
-                      "ids, tile_offsets and tile_samples must be outputs of rasterize for these splats and this image "
-                      "size, got ids of shape ",
-                      shape_of(ids), " and tile_offsets of shape ", shape_of(tile_offsets));
+    check_fit(splats, ids, tile_offsets, tile_samples, grid, stages.choose != nullptr);
+    own.narrow(1, kSplatColor, 3).copy_(colors.index_select(0, ids));
     stages.blend({own.const_data_ptr<scalar_t>(), pairs.const_data_ptr<int32_t>(),
                   tile_offsets.const_data_ptr<int64_t>(), grid, at::get_num_threads(), samples_or_null(tile_samples),
                   background.const_data_ptr<scalar_t>(), image.data_ptr<scalar_t>(), nullptr, nullptr});
   });
   const auto none = [](const Tensor& like) { return at::empty({0}, like.options()); };
   return {image, own, none(colors), none(pairs), none(tile_offsets)};
+}
+
+InspectOutput inspect_cpu(const Tensor& splats, const Tensor& ids, const Tensor& pairs, const Tensor& tile_offsets,
+                          const Tensor&, const Tensor& tile_samples, int64_t count, int64_t image_height,
+                          int64_t image_width, std::string footprint) {
+  check_lists(splats, {ids, pairs, tile_offsets, tile_samples});
+  check_image_size(image_height, image_width);
+  const TileGrid grid = {int(image_width), int(image_height)};
+  const auto ints = ids.options();
+  const Tensor median = at::empty({image_height, image_width}, ints), dominant = at::empty_like(median),
+               touched = at::zeros({count}, ints), largest = at::zeros({count}, ints),
+               total = at::zeros({count}, ints.dtype(at::kLong));
+  AT_DISPATCH_FLOATING_TYPES(splats.scalar_type(), "inspect", [&] {
+    const Stages<scalar_t>& stages = stages_of<scalar_t>(footprint);
+    check_fit(splats, ids, tile_offsets, tile_samples, grid, stages.choose != nullptr);
+    stages.inspect({splats.const_data_ptr<scalar_t>(), ids.const_data_ptr<int32_t>(), pairs.const_data_ptr<int32_t>(),
+                    tile_offsets.const_data_ptr<int64_t>(), grid, at::get_num_threads(), samples_or_null(tile_samples),
+                    median.data_ptr<int32_t>(), dominant.data_ptr<int32_t>(), touched.data_ptr<int32_t>(),
+                    largest.data_ptr<int32_t>(), total.data_ptr<int64_t>()});
+  });
+  return {median, dominant, touched, largest.view(at::kFloat), total};
 }
 
 Tensor footprint_weight_cpu(const Tensor& offset, const Tensor& cov2d, std::string footprint, double option) {
@@ -311,6 +339,7 @@ TORCH_LIBRARY_IMPL(analytic_rasterizer, CPU, m) {
   m.impl("rasterize_vjp", rasterize_vjp_cpu);
   m.impl("rasterize_stages", rasterize_stages_cpu);
   m.impl("rasterize_channels", rasterize_channels_cpu);
+  m.impl("inspect", inspect_cpu);
   m.impl("footprint_weight", footprint_weight_cpu);
   m.impl("footprint_weight_vjp", footprint_weight_vjp_cpu);
 }

@@ -395,23 +395,51 @@ StagesOutput rasterize_stages_cuda(const Tensor& means3D, const Tensor& opacitie
           compact,     binned.tile_offsets, seconds};
 }
 
+/// The lists of rasterize must fit each other, the Gaussians and the image size.
+void check_fit(const Tensor& splats, const Tensor& order, const Tensor& pairs, const Tensor& tile_offsets,
+               const Tensor& counts, const Tensor& tile_samples, int64_t n, TileGrid grid, bool chosen) {
+  TORCH_CHECK_TYPE(splats.scalar_type() == at::kFloat, "splats must have dtype float32 on CUDA, got ",
+                   splats.scalar_type());
+  TORCH_CHECK_VALUE(splats.size(0) == n && order.numel() == n && pairs.dim() == 2 && pairs.size(1) == 2 &&
+                        pairs.numel() > 0 && tile_offsets.numel() == grid.tiles() + 1 &&
+                        counts.numel() == kCountsWidth && tile_samples.numel() == (chosen ? grid.tiles() : 0),
+                    "splats ... tile_samples must be the outputs of rasterize with keep=True for ", n,
+                    " Gaussians and this image size, got splats of shape ", shape_of(splats),
+                    " and tile_offsets of shape ", shape_of(tile_offsets));
+}
+
+InspectOutput inspect_cuda(const Tensor& splats, const Tensor& order, const Tensor& pairs, const Tensor& tile_offsets,
+                           const Tensor& counts, const Tensor& tile_samples, int64_t count, int64_t image_height,
+                           int64_t image_width, std::string footprint) {
+  check_lists(splats, {order, pairs, tile_offsets, counts, tile_samples});
+  check_image_size(image_height, image_width);
+  const auto& stages = found(cuda::find_forward(footprint), footprint);
+  const TileGrid grid = {int(image_width), int(image_height)};
+  check_fit(splats, order, pairs, tile_offsets, counts, tile_samples, count, grid, stages.choose != nullptr);
+  const c10::cuda::CUDAGuard guard(splats.device());
+  const CUDAStream stream = c10::cuda::getCurrentCUDAStream();
+  const auto ints = order.options();
+  const Tensor median = at::empty({image_height, image_width}, ints), dominant = at::empty_like(median),
+               touched = at::zeros({count}, ints), largest = at::zeros({count}, ints),
+               total = at::zeros({count}, ints.dtype(at::kLong));
+  stages.inspect({lists_of(splats, order, pairs, tile_offsets, counts, tile_samples), grid, median.data_ptr<int32_t>(),
+                  dominant.data_ptr<int32_t>(), touched.data_ptr<int32_t>(), largest.data_ptr<int32_t>(),
+                  total.data_ptr<int64_t>()},
+                 stream);
+  check_stage("inspect", stream, false);
+  return {median, dominant, touched, largest.view(at::kFloat), total};
+}
+
 ChannelsOutput rasterize_channels_cuda(const Tensor& colors, const Tensor& bg, int64_t image_height,
                                        int64_t image_width, std::string footprint, double, const Tensor& splats,
                                        const Tensor& order, const Tensor& pairs, const Tensor& tile_offsets,
                                        const Tensor& counts, const Tensor& tile_samples, bool keep, bool debug) {
-  TORCH_CHECK_TYPE(colors.scalar_type() != at::kDouble,
-                   "colors must have dtype float32 on CUDA, got Double; float64 runs on the CPU");
-  check_channels(colors, bg, splats, {order, pairs, tile_offsets, counts, tile_samples});
+  check_lists(splats, {order, pairs, tile_offsets, counts, tile_samples});
+  check_channels(colors, bg, splats);
   check_image_size(image_height, image_width);
   const auto& stages = found(cuda::find_forward(footprint), footprint);
   const TileGrid grid = {int(image_width), int(image_height)};
-  const int64_t n = colors.size(0);
-  TORCH_CHECK_VALUE(splats.size(0) == n && order.numel() == n && pairs.dim() == 2 && pairs.size(1) == 2 &&
-                        pairs.numel() > 0 && tile_offsets.numel() == grid.tiles() + 1 &&
-                        counts.numel() == kCountsWidth && tile_samples.numel() == (stages.choose ? grid.tiles() : 0),
-                    "splats ... tile_samples must be the outputs of rasterize with keep=True for ", n,
-                    " Gaussians and this image size, got splats of shape ", shape_of(splats),
-                    " and tile_offsets of shape ", shape_of(tile_offsets));
+  check_fit(splats, order, pairs, tile_offsets, counts, tile_samples, colors.size(0), grid, stages.choose != nullptr);
   const c10::cuda::CUDAGuard guard(colors.device());
   const CUDAStream stream = c10::cuda::getCurrentCUDAStream();
   Tensor own = splats.clone();
@@ -543,6 +571,7 @@ TORCH_LIBRARY_IMPL(analytic_rasterizer, CUDA, m) {
   m.impl("rasterize_vjp", rasterize_vjp_cuda);
   m.impl("rasterize_stages", rasterize_stages_cuda);
   m.impl("rasterize_channels", rasterize_channels_cuda);
+  m.impl("inspect", inspect_cuda);
   m.impl("footprint_weight", footprint_weight_cuda);
   m.impl("footprint_weight_vjp", footprint_weight_vjp_cuda);
 }

@@ -58,6 +58,9 @@ using RasterizeOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
 /// An image of other colours, and what takes the place of the same outputs of rasterize in its vjp: splats,
 /// checkpoints, chunks, counts.
 using ChannelsOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
+/// Of inspect: median and dominant Gaussian of every pixel; pixels, largest weight and sum of weights of every
+/// Gaussian.
+using InspectOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
 using StagesOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
 /// Gradients of means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp.
 using Grads = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;

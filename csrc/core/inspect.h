@@ -1,0 +1,47 @@
+// What a pixel shows besides its colour: which splats, and how much of each.
+#pragma once
+
+#include "core/blend.h"
+#include "core/vec.h"
+
+namespace ar {
+
+/// Weights are added up as whole numbers of 2^-32, so that the order in which pixels come changes no bit.
+inline constexpr double kWeightUnit = 1.0 / (int64_t(1) << 32);
+template <typename T> AR_HD int64_t weight_units(T weight) { return int64_t(double(weight) / kWeightUnit + 0.5); }
+
+/// Composites the splats of a pixel front to back, and remembers two of them.
+template <typename T, int S> struct PixelLook {
+  T transmittance[S];
+  T largest = T(0);
+  int32_t dominant = -1;  ///< the splat of the largest weight, of equal ones the nearest
+  int32_t median = -1;    ///< the first behind which less than half of the light is left
+
+  AR_HD void start(bool inside) {
+    for (int s = 0; s < S; ++s) transmittance[s] = inside ? T(1) : T(-1);
+  }
+  AR_HD bool open() const {
+    bool any = false;
+    for (int s = 0; s < S; ++s) any |= transmittance[s] > T(0);
+    return any;
+  }
+
+  /// The weight of splat `id` in the pixel: the mean over the samples of transmittance times alpha.
+  template <class F> AR_HD T add(const typename F::template Terms<T>& terms, Vec2<T> p, int32_t id) {
+    T weight = T(0), through = T(0);
+    AR_UNROLL
+    for (int s = 0; s < S; ++s) {
+      weight += blend_sample(F::alpha(terms, p, s), transmittance[s]).contribution;
+      through += abs(transmittance[s]);
+    }
+    weight *= T(1.0 / S);
+    if (weight > largest) {
+      largest = weight;
+      dominant = id;
+    }
+    if (median < 0 && weight > T(0) && through < T(0.5 * S)) median = id;
+    return weight;
+  }
+};
+
+}  // namespace ar

@@ -1,0 +1,86 @@
+"""The 3D smoothing filter."""
+
+import math
+
+import pytest
+import scenes
+import torch
+from scenes import Camera
+
+import analytic_rasterizer as ar
+
+F64 = torch.float64
+
+
+def camera(distance, size=(64, 48), tan=0.5):
+    """Settings of a camera on the z axis that looks at the origin."""
+    base = Camera(image_width=size[0], image_height=size[1], tanfovx=tan, tanfovy=tan * size[1] / size[0],
+                  eye=(0, 0, -distance))  # fmt: skip
+    return base.settings(F64)
+
+
+def test_filter_is_the_finest_interval_of_the_cameras_that_see_a_point():
+    points = torch.tensor([[0.0, 0, 0], [0, 0, 4.0], [100.0, 0, 0]], dtype=F64)
+    near, far = camera(8), camera(20, size=(640, 480))
+    focal = {"near": 64 / (2 * 0.5), "far": 640 / (2 * 0.5)}
+    intervals = torch.tensor([min(8 / focal["near"], 20 / focal["far"]), min(12 / focal["near"], 24 / focal["far"])])
+    both = ar.compute_3d_filter(points, [near, far])
+    assert torch.allclose(both[:2], intervals.to(F64) * math.sqrt(0.2))
+    assert both[2] == both[:2].max()  # seen by none
+    alone = ar.compute_3d_filter(points, [near])
+    assert torch.allclose(alone[:2], torch.tensor([8, 12], dtype=F64) / focal["near"] * math.sqrt(0.2))
+
+
+def test_points_behind_and_beside_a_camera_do_not_count():
+    front, behind = [0.0, 0, 0], [0, 0, -9.0]
+    right = camera(8).viewmatrix[:3, 0]  # the camera is tilted
+    edge = 8 * 0.5 * 1.29 * right  # within the margin of 15% of the width on either side
+    beside = 8 * 0.5 * 1.32 * right
+    points = torch.stack([torch.tensor(front, dtype=F64), torch.tensor(behind, dtype=F64), edge, beside])
+    wide = camera(80)  # sees all of them, coarsely
+    filters = ar.compute_3d_filter(points, [camera(8), wide])
+    fine, coarse = 8 / 64 * math.sqrt(0.2), 80 / 64 * math.sqrt(0.2)
+    assert torch.allclose(filters, torch.tensor([fine, 71 / 64 * math.sqrt(0.2), fine, coarse], dtype=F64))
+
+
+def test_filtered_gaussians_keep_their_mass_and_gain_variance():
+    scene = scenes.random_scene(1, 50)
+    width = torch.rand(50, dtype=F64) * 0.2
+    scales, opacities = ar.apply_3d_filter(scene["scales"], scene["opacities"], width)
+    assert torch.allclose(scales**2, scene["scales"] ** 2 + width[:, None] ** 2)
+    assert torch.allclose(opacities[:, 0] * scales.prod(1), scene["opacities"][:, 0] * scene["scales"].prod(1))
+    same = ar.apply_3d_filter(scene["scales"], scene["opacities"], torch.zeros(50, dtype=F64))
+    assert torch.equal(same[0], scene["scales"]) and torch.equal(same[1], scene["opacities"])
+
+
+def test_gradients_are_right_and_finite_where_scales_vanish():
+    scene = scenes.random_scene(2, 6)
+    width = torch.tensor([0.1, 0, 0.3, 1e-6, 0, 2.0], dtype=F64)
+    inputs = (scene["scales"].clone().requires_grad_(), scene["opacities"].clone().requires_grad_())
+    assert torch.autograd.gradcheck(lambda s, o: ar.apply_3d_filter(s, o, width), inputs)
+    scales = torch.zeros(6, 3, requires_grad=True)
+    opacities = torch.full((6,), 0.5, requires_grad=True)
+    filtered, faded = ar.apply_3d_filter(scales, opacities, width.float())
+    (filtered.sum() + faded.sum()).backward()
+    assert scales.grad.isfinite().all() and opacities.grad.isfinite().all()
+    assert (filtered[0] == 0.1).all() and faded[0] == 0
+
+
+def test_filter_removes_what_only_a_finer_camera_could_show():
+    """From twice as near a filtered splat is as wide as the training view could tell."""
+    point = torch.zeros(1, 3, dtype=F64)
+    width = ar.compute_3d_filter(point, [camera(8)])
+    scales, opacities = ar.apply_3d_filter(torch.full((1, 3), 1e-4, dtype=F64), torch.ones(1, 1, dtype=F64), width)
+    pixels = scales[0, 0] / (8 / 64)
+    assert abs(pixels - math.sqrt(0.2)) < 1e-3 and opacities < 1e-6
+
+
+def test_errors():
+    with pytest.raises(ValueError, match=r"cameras must hold .* got none"):
+        ar.compute_3d_filter(torch.zeros(2, 3), [])
+    with pytest.raises(ValueError, match=r"means3D must have shape \(P, 3\), got \(2, 2\)"):
+        ar.compute_3d_filter(torch.zeros(2, 2), [camera(8)])
+    with pytest.raises(ValueError, match=r"filter_3d \(P,\), got \(2, 3\) and \(3,\)"):
+        ar.apply_3d_filter(torch.ones(2, 3), torch.ones(2, 1), torch.ones(3))
+    with pytest.raises(ValueError, match=r"opacities must have shape \(P, 1\) or \(P,\), got \(3, 1\)"):
+        ar.apply_3d_filter(torch.ones(2, 3), torch.ones(3, 1), torch.ones(2))
