@@ -87,6 +87,8 @@ def random_case(seed):
         for _ in range(pick((1, 1, 3))):
             field, value = pick(fields), pick(NOT_FINITE if pick((False, True)) else EXTREME)
             entries = scene[field][row].view(-1)
+            if pick(range(4)) == 0:  # of several bad numbers one may hide another
+                entries[:] = pick(EXTREME)
             column = pick(range(len(entries)))
             entries[column] = value
             read = field != "shs" or column < 3 * (camera.sh_degree + 1) ** 2

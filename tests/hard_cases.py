@@ -202,9 +202,9 @@ def scales_of(value):
 
 
 def quaternions():
-    """From 1e-30 to 1e15 times a unit one, and the zero one."""
+    """From 1e-40 to 1e15 times a unit one, and the zero one."""
     scene = splats(SPOTS * 2, [[3, 1]] * 10, torch.arange(10.0) * 0.3, 0.5, torch.linspace(2, 3, 10))
-    length = tensor(1e-30, 1e-23, 1e-10, 1e-3, 0.5, 2, 1e3, 1e10, 1e15, 0)
+    length = tensor(1e-40, 1e-23, 1e-10, 1e-3, 0.5, 2, 1e3, 1e10, 1e15, 0)
     scene["rotations"] = (scene["rotations"] + tensor(0.0, 0.3, -0.2, 0.0)) * length[:, None]
     return CAMERA, scene
 
@@ -323,7 +323,7 @@ CASES = [
         Case(f"scale_{label}", f"scales of {label}", scales_of(float(label)))
         for label in ("0", "1e-40", "1e-20", "1e30", "3e38")
     ],
-    Case("quaternions", "quaternions of length 1e-30 to 1e15, and zero", quaternions),
+    Case("quaternions", "quaternions of length 1e-40 to 1e15, and zero", quaternions),
     Case("opacity_0_1", "opacities 0 and 1", opacities([0.0, 1.0, 1e-40, 1 - 2**-24, 0.5])),
     Case("opacity_outside", "opacities outside [0, 1]", opacities([-1.0, 1.5, 1e30, -1e30, 0.5])),
     Case("capped", "alpha at the cap of 0.99", capped, reference=True),

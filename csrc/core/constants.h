@@ -44,6 +44,9 @@ inline constexpr double kSingular = 1e-6;
 /// `point` without dilation can get there: every other footprint's ellipse is wider than 1/56 px.
 inline constexpr double kMaxWhitening = 1e7;
 
+/// The gradient by a quaternion grows as 1/|q|. It is held at this, which fits a float, and 1/|q| is too.
+inline constexpr double kMaxQuaternionGrad = 1e38;
+
 inline constexpr double kPi = 3.14159265358979323846;
 inline constexpr double kLog2e = 1.44269504088896340736;
 

@@ -124,7 +124,7 @@ AR_HD Vec3<T> jacobian_vjp(const Camera<T>& camera, const Jacobian<T>& j, Vec3<T
 /// A unit quaternion, and what normalising it divided by.
 template <typename T> struct UnitQuaternion {
   T w, x, y, z;
-  T inv_norm;  ///< 0 for a zero quaternion, which stands for the identity and gets no gradient
+  T inv_norm;  ///< no more than kMaxQuaternionGrad; 0 for a zero quaternion: the identity, without gradient
 };
 
 /// Deviates from 3DGS, which expects unit quaternions from the caller: any length survives.
@@ -136,7 +136,7 @@ template <typename T> AR_HD UnitQuaternion<T> normalize_quaternion(Vec4<T> q) {
   if (abs(q.x) + abs(q.y) + abs(q.z) + abs(q.w) == T(0)) return {T(1), T(0), T(0), T(0), T(0)};
   const T w = q.x / largest, x = q.y / largest, y = q.z / largest, z = q.w / largest;
   const T inv = T(1) / sqrt(w * w + x * x + y * y + z * z);
-  return {w * inv, x * inv, y * inv, z * inv, inv / largest};
+  return {w * inv, x * inv, y * inv, z * inv, min(inv / largest, T(kMaxQuaternionGrad))};
 }
 
 template <typename T> AR_HD Mat3<T> rotation_matrix(UnitQuaternion<T> q) {
@@ -149,7 +149,9 @@ template <typename T> AR_HD Mat3<T> rotation_matrix(UnitQuaternion<T> q) {
 /// Gradient by the quaternion as given, stored like it, from that by a turn about the axes it turns to:
 /// R <- R exp([turn]x). It has no component along the quaternion.
 template <typename T> AR_HD Vec4<T> rotation_vjp(UnitQuaternion<T> q, Vec3<T> dL_dturn) {
-  const Vec3<T> t = (T(2) * q.inv_norm) * dL_dturn;
+  const Vec3<T> raw = (T(2) * q.inv_norm) * dL_dturn;
+  const T limit = T(kMaxQuaternionGrad);
+  const Vec3<T> t = {max(min(raw.x, limit), -limit), max(min(raw.y, limit), -limit), max(min(raw.z, limit), -limit)};
   return {-q.x * t.x - q.y * t.y - q.z * t.z, q.w * t.x + q.y * t.z - q.z * t.y, q.w * t.y + q.z * t.x - q.x * t.z,
           q.w * t.z + q.x * t.y - q.y * t.x};
 }
