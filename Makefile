@@ -8,6 +8,8 @@ VENV ?= .venv
 # The torch to install where VENV has none. Any torch >= 2.4 will do: `make demo TORCH=torch==2.8.0`.
 TORCH ?= torch==2.13.0
 OUT ?= out
+# How long make fuzz runs, s.
+FUZZ_SECONDS ?= 600
 # What make bench measures; by default the demo's target.
 SCENE ?= $(OUT)/target.ply
 VIEWS ?= $(OUT)/views.json
@@ -20,7 +22,7 @@ CPP_SOURCES := $(shell git ls-files 'csrc/*' 'tests/cpp/*' 2>/dev/null)
 # The system's cmake, or else one from PyPI.
 CMAKE = $(shell command -v cmake || echo $(BIN)/cmake)
 
-.PHONY: demo test test-cpp test-python test-sanitized bench format lint clean
+.PHONY: demo test test-cpp test-python test-sanitized fuzz bench format lint clean
 
 demo: $(VENV)/.installed
 	$(BIN)/python -m analytic_rasterizer demo --out $(OUT)
@@ -40,6 +42,10 @@ test-sanitized: $(VENV)/.tools
 
 test-python: $(VENV)/.installed
 	$(BIN)/python -m pytest -q
+
+# Random scenes with bad numbers in them, until one breaks a promise of docs/stability.md.
+fuzz: $(VENV)/.installed
+	$(BIN)/python tests/fuzz.py --seconds $(FUZZ_SECONDS)
 
 bench: $(VENV)/.installed
 	[ -e $(SCENE) ] || $(MAKE) demo

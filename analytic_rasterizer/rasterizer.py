@@ -42,9 +42,11 @@ class GaussianRasterizationSettings(_Fields):
         sh_degree: Degree of the spherical harmonics in use, 0 to 3.
         campos: (3,) camera centre, world units.
         prefiltered: Accepted for compatibility; culling does not depend on it.
-        debug: On failure write the arguments to snapshot_fw.dump or snapshot_bw.dump and re-raise. On CUDA
-            wait for every stage, so that the stage that failed is the one that raises, and check that
-            the camera is finite, which otherwise is not looked at there.
+        debug: Raise for a Gaussian that is not finite, has an opacity outside [0, 1] or a negative scale or
+            variance, naming tensor, index and value; otherwise such a Gaussian is culled or taken as it is. On
+            failure write the arguments to snapshot_fw.dump or snapshot_bw.dump and re-raise. On CUDA wait
+            for every stage, so that the stage that failed is the one that raises, and check that the
+            camera is finite, which otherwise is not looked at there.
         footprint: One of `FOOTPRINTS`, optionally with options (`"box:samples=8"`). None: the default at
             the time of rendering, see `set_default_footprint`.
         effects: What to render beside the colours, see `Effects`. None: nothing.
@@ -175,12 +177,44 @@ def rasterize_gaussians(
     return torch.ops.analytic_rasterizer.rasterize(*arguments)[:2]
 
 
+def _check_gaussians(
+    means3D: torch.Tensor,
+    means2D: torch.Tensor | None,
+    opacities: torch.Tensor,
+    shs: torch.Tensor | None,
+    colors_precomp: torch.Tensor | None,
+    scales: torch.Tensor | None,
+    rotations: torch.Tensor | None,
+    cov3D_precomp: torch.Tensor | None,
+) -> None:
+    """Raises ValueError for the first value that no Gaussian should have. Without debug its Gaussian is culled."""
+    tensors = {"means3D": means3D, "opacities": opacities, "shs": shs, "colors_precomp": colors_precomp}
+    tensors |= {"scales": scales, "rotations": rotations, "cov3D_precomp": cov3D_precomp}
+    tensors = {name: tensor.detach() for name, tensor in tensors.items() if tensor is not None}
+    for name, tensor in tensors.items():
+        _check_values(name, tensor, torch.isfinite(tensor), "be finite")
+    _check_values("opacities", opacities, (opacities >= 0) & (opacities <= 1), "be in [0, 1]")
+    if scales is not None:
+        _check_values("scales", scales, scales >= 0, "not be negative")
+    elif cov3D_precomp is not None and cov3D_precomp.shape[1:] == (6,):  # else the op says what shape it must have
+        valid = cov3D_precomp >= 0
+        valid[:, [1, 2, 4]] = True
+        _check_values("cov3D_precomp", cov3D_precomp, valid, "not have negative variances")
+
+
+def _check_values(name: str, tensor: torch.Tensor, valid: torch.Tensor, expectation: str) -> None:
+    if not valid.all():
+        index = tuple(torch.nonzero(~valid)[0].tolist())
+        raise ValueError(f"{name} must {expectation}, got {tensor[index].item()} at {index}")
+
+
 class _DebugRasterize(torch.autograd.Function):
     """The op and its gradient, writing their arguments to a file where they fail, as 3DGS does."""
 
     @staticmethod
     def forward(ctx, *arguments):
         try:
+            _check_gaussians(*arguments[:8])
             output = torch.ops.analytic_rasterizer.rasterize(*arguments)
         except Exception:
             _write_snapshot("snapshot_fw.dump", arguments)

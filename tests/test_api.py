@@ -517,7 +517,7 @@ WRONG_SHAPES = {
     ],
     "rotations": [({"rotations": t(20, 3)}, r"rotations must .*got \(20, 3\)")],
     "colors_precomp": [
-        ({"shs": None, "colors_precomp": t(20, 4)}, r"colors_precomp must .*got \(20, 4\)"),
+        ({"shs": None, "colors_precomp": t(20, 513)}, r"colors_precomp must .*got \(20, 513\)"),
     ],
     "cov3D_precomp": [
         (
@@ -718,6 +718,8 @@ OPS = {
         a for i, a in enumerate(op_arguments(v, d, False, False)) if i not in (1, 20, 21)
     ],
     "rasterize_vjp": lambda v, d: vjp_arguments(v, d),
+    "rasterize_channels": lambda v, d: channels_arguments(v, d),
+    "inspect": lambda v, d: inspect_arguments(v, d),
     "footprint_weight": lambda v, d: weight_arguments(v, d, True),
     "footprint_weight_vjp": lambda v, d: [torch.ones(7, device=d), *weight_arguments(v, d, False)],
 }
@@ -728,6 +730,25 @@ def vjp_arguments(variant, device):
     color, _, *saved = torch.ops.analytic_rasterizer.rasterize(*arguments)
     needs = [a is not None for a in arguments[:8]]
     return [torch.ones_like(color), *arguments[:-2], *saved, needs, False]
+
+
+def kept_lists(variant, device):
+    """(arguments of rasterize, the lists that it keeps for other colours)."""
+    arguments = op_arguments(variant, device, True, False)
+    splats, ids, pairs, offsets, *_, counts, samples = torch.ops.analytic_rasterizer.rasterize(*arguments)[2:]
+    return arguments, (splats, ids, pairs, offsets, counts, samples)
+
+
+def channels_arguments(variant, device):
+    arguments, lists = kept_lists(variant, device)
+    colors = torch.rand(len(arguments[0]), 3, generator=torch.Generator().manual_seed(0)).to(device)
+    height, width, footprint, option = (arguments[i] for i in (12, 13, 18, 19))
+    return [colors, arguments[8], height, width, footprint, option, *lists, True, False]
+
+
+def inspect_arguments(variant, device):
+    arguments, lists = kept_lists(variant, device)
+    return [*lists, len(arguments[0]), arguments[12], arguments[13], arguments[18]]
 
 
 def weight_arguments(variant, device, gradient):
@@ -753,12 +774,12 @@ def test_opcheck(op, device, variant):
     """Schema, fake kernel, autograd registration, and dispatch under tracing.
 
     rasterize_stages returns how long it took, so two runs of it are never equal, which is what the
-    tracing test asks. Nor are two runs of rasterize on CUDA that keep what the backward pass reads:
-    there is room for more pairs than there are, how much depends on earlier frames, and it is not
-    cleared.
+    tracing test asks. Nor are two runs of rasterize or rasterize_channels on CUDA that keep what the
+    backward pass reads: there is room for more pairs than there are, how much depends on earlier
+    frames, and it is not cleared.
     """
     overload = getattr(torch.ops.analytic_rasterizer, op.split(" ")[0]).default
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")
-    if op != "rasterize_stages" and (device, op) != ("cuda", "rasterize"):
+    if op != "rasterize_stages" and (device, op) not in (("cuda", "rasterize"), ("cuda", "rasterize_channels")):
         checks = (*checks, "test_aot_dispatch_dynamic")
     torch.library.opcheck(overload, tuple(OPS[op](variant, device)), test_utils=checks)

@@ -36,9 +36,16 @@ inline constexpr double kMaxLevel = 17.3;
 /// overflows a float: standard deviations up to 3e7 px pass.
 inline constexpr double kMaxDet = 1e30;
 
+/// A negative det Sigma counts as zero where it is at most so much of Sigma_xx Sigma_yy, what rounding the entries of
+/// a cov3d to float can do (16 2^-24); beyond, the splat is culled.
+inline constexpr double kSingular = 1e-6;
+
 /// A splat is culled where its whitening matrix [1/px] exceeds this, for the same reason. Only
 /// `point` without dilation can get there: every other footprint's ellipse is wider than 1/56 px.
 inline constexpr double kMaxWhitening = 1e7;
+
+/// The gradient by a quaternion grows as 1/|q|. It is held at this, which fits a float, and 1/|q| is too.
+inline constexpr double kMaxQuaternionGrad = 1e38;
 
 inline constexpr double kPi = 3.14159265358979323846;
 inline constexpr double kLog2e = 1.44269504088896340736;

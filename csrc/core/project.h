@@ -101,12 +101,14 @@ template <typename T> AR_HD Jacobian<T> make_jacobian(const Camera<T>& camera, V
   return j;
 }
 
+/// `dL_dlog_size` = dL_dx . j.x + dL_dy . j.y, the gradient by the logarithm of all of J.
 template <typename T>
-AR_HD Vec3<T> jacobian_vjp(const Camera<T>& camera, const Jacobian<T>& j, Vec3<T> view, Vec3<T> dL_dx, Vec3<T> dL_dy) {
+AR_HD Vec3<T> jacobian_vjp(const Camera<T>& camera, const Jacobian<T>& j, Vec3<T> view, Vec3<T> dL_dx, Vec3<T> dL_dy,
+                           T dL_dlog_size) {
   const Vec3<T> depth = xyz(camera.view_z);
   const T by_ratio_x = -(camera.focal.x / view.z) * dot(dL_dx, depth),
           by_ratio_y = -(camera.focal.y / view.z) * dot(dL_dy, depth);
-  Vec3<T> g = {T(0), T(0), -(dot(dL_dx, j.x) + dot(dL_dy, j.y)) / view.z};
+  Vec3<T> g = {T(0), T(0), -dL_dlog_size / view.z};
   // Where the ratio is clamped it is constant: its gradient is zero, in z too.
   if (!j.clamped_x) {
     g.x += by_ratio_x / view.z;
@@ -122,7 +124,7 @@ AR_HD Vec3<T> jacobian_vjp(const Camera<T>& camera, const Jacobian<T>& j, Vec3<T
 /// A unit quaternion, and what normalising it divided by.
 template <typename T> struct UnitQuaternion {
   T w, x, y, z;
-  T inv_norm;  ///< 0 for a zero quaternion, which stands for the identity and gets no gradient
+  T inv_norm;  ///< no more than kMaxQuaternionGrad; 0 for a zero quaternion: the identity, without gradient
 };
 
 /// Deviates from 3DGS, which expects unit quaternions from the caller: any length survives.
@@ -130,10 +132,11 @@ template <typename T> AR_HD UnitQuaternion<T> normalize_quaternion(Vec4<T> q) {
   // Vec4 (x, y, z, w) holds the quaternion's (w, x, y, z). Dividing by the largest first keeps the
   // squares of tiny and huge ones in range.
   const T largest = max(max(abs(q.x), abs(q.y)), max(abs(q.z), abs(q.w)));
-  if (largest == T(0)) return {T(1), T(0), T(0), T(0), T(0)};
+  // max() may drop a NaN; the sum does not.
+  if (abs(q.x) + abs(q.y) + abs(q.z) + abs(q.w) == T(0)) return {T(1), T(0), T(0), T(0), T(0)};
   const T w = q.x / largest, x = q.y / largest, y = q.z / largest, z = q.w / largest;
   const T inv = T(1) / sqrt(w * w + x * x + y * y + z * z);
-  return {w * inv, x * inv, y * inv, z * inv, inv / largest};
+  return {w * inv, x * inv, y * inv, z * inv, min(inv / largest, T(kMaxQuaternionGrad))};
 }
 
 template <typename T> AR_HD Mat3<T> rotation_matrix(UnitQuaternion<T> q) {
@@ -143,17 +146,14 @@ template <typename T> AR_HD Mat3<T> rotation_matrix(UnitQuaternion<T> q) {
            {two * (q.x * q.z - q.w * q.y), two * (q.y * q.z + q.w * q.x), one - two * (q.x * q.x + q.y * q.y)}}};
 }
 
-/// Gradient by the quaternion as given, stored like it. Has no component along the quaternion.
-template <typename T> AR_HD Vec4<T> rotation_vjp(UnitQuaternion<T> q, const Mat3<T>& g) {
-  const Vec3<T>&a = g.row[0], &b = g.row[1], &c = g.row[2];
-  const T two = T(2);
-  const T gw = two * (q.x * (c.y - b.z) + q.y * (a.z - c.x) + q.z * (b.x - a.y));
-  const T gx = two * (q.y * (a.y + b.x) + q.z * (a.z + c.x) + q.w * (c.y - b.z) - two * q.x * (b.y + c.z));
-  const T gy = two * (q.x * (a.y + b.x) + q.z * (b.z + c.y) + q.w * (a.z - c.x) - two * q.y * (a.x + c.z));
-  const T gz = two * (q.x * (a.z + c.x) + q.y * (b.z + c.y) + q.w * (b.x - a.y) - two * q.z * (a.x + b.y));
-  const T radial = gw * q.w + gx * q.x + gy * q.y + gz * q.z;
-  return {q.inv_norm * (gw - radial * q.w), q.inv_norm * (gx - radial * q.x), q.inv_norm * (gy - radial * q.y),
-          q.inv_norm * (gz - radial * q.z)};
+/// Gradient by the quaternion as given, stored like it, from that by a turn about the axes it turns to:
+/// R <- R exp([turn]x). It has no component along the quaternion.
+template <typename T> AR_HD Vec4<T> rotation_vjp(UnitQuaternion<T> q, Vec3<T> dL_dturn) {
+  const Vec3<T> raw = (T(2) * q.inv_norm) * dL_dturn;
+  const T limit = T(kMaxQuaternionGrad);
+  const Vec3<T> t = {max(min(raw.x, limit), -limit), max(min(raw.y, limit), -limit), max(min(raw.z, limit), -limit)};
+  return {-q.x * t.x - q.y * t.y - q.z * t.z, q.w * t.x + q.y * t.z - q.z * t.y, q.w * t.y + q.z * t.x - q.x * t.z,
+          q.w * t.z + q.x * t.y - q.y * t.x};
 }
 
 /// Factors of the projected covariance of one Gaussian. From scale and rotation: Sigma = V V^T with
@@ -185,6 +185,8 @@ AR_HD Factors<T> project_covariance(const Camera<T>& camera, const Gaussians<T>&
     const Sym3<T>& c = g.cov3ds[i];
     const Vec3<T> cx = c * ax, cy = c * ay, n = cross(ax, ay);
     f.cov = {dot(ax, cx), dot(ax, cy), dot(ay, cy), dot(n, adjugate_times(c, n))};
+    // The entries of a needle, rounded to float, make no covariance any more but by this little.
+    if (f.cov.det < T(0) && f.cov.det >= T(-kSingular) * f.cov.xx * f.cov.yy) f.cov.det = T(0);
   } else {
     f.quaternion = normalize_quaternion(g.rotations[i]);
     f.rotation = rotation_matrix(f.quaternion);
@@ -199,20 +201,74 @@ AR_HD Factors<T> project_covariance(const Camera<T>& camera, const Gaussians<T>&
   return f;
 }
 
+/// H_kl = t_k . dL/dSigma t_l of the columns t_k of A R, which hold the gradient of all that Sigma = A R S^2 R^T A^T is
+/// made of; and dL/dSigma t_k, as two rows.
+template <typename T> struct TurnedGrad {
+  Vec3<T> diagonal, off;  ///< H_kk; H_12, H_20, H_01
+  Vec3<T> x, y;
+  Vec3<T> pull_x, pull_y;  ///< another part of x and y, times s_k
+};
+
+/// Every product is taken in coordinates, whitened or of the factors, where its terms do not cancel: errors grow
+/// neither with the length of a needle outside the image nor with the size of a splat.
+template <typename T> AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad) {
+  const Vec3<T>&tx = f.turned_x, &ty = f.turned_y, zero = {T(0), T(0), T(0)};
+  const Mat2<T>& w = grad.w;
+  const Sym2<T>& g = grad.dL_dwhite;
+  // b_k = adj(Sigma) t_k, a sum of two terms: across a needle's long axis t_k it is as small as the needle is thin.
+  const Vec3<T> square = mul(f.scale, f.scale), m = cross(tx, ty);
+  const Vec3<T> bx = cross(mul(square, ty), m), by = cross(m, mul(square, tx));
+  const T v = grad.variance;
+  Vec3<T> qx, qy;  // w t_k
+  if (grad.triangular) {
+    // The second row of whiten() takes from one row of V its projection on the other, (b + v t) / wide.
+    const bool wide_x = w.xx != T(0);
+    const T along = w.xx + w.xy, across = (wide_x ? w.yy : w.yx) * along * along;
+    qx = along * (wide_x ? tx : ty);
+    qy = across * (wide_x ? by + v * ty : bx + v * tx);
+  } else {
+    qx = w.xx * tx + w.xy * ty;
+    qy = w.yx * tx + w.yy * ty;
+  }
+  const Vec3<T> ex = g.xx * qx + g.xy * qy, ey = g.xy * qx + g.yy * qy;
+  TurnedGrad<T> h = {mul(qx, ex) + mul(qy, ey), zero, zero, zero, zero, zero};
+  if (!grad.triangular) {
+    // (w t_k).(w t_l) = t_k . Sigma^-1 t_l is known without w. A window that holds all of a thin needle's width
+    // gives much of it, g.yy, which no turn changes: products of w would leave eps (s1/s2)^2 of it.
+    const T c = f.cov.det > T(0) ? g.yy / f.cov.det : T(0);
+    const Vec3<T> rx = (g.xx - g.yy) * qx + g.xy * qy, ry = g.xy * qx;
+    h.off = shifted_products(qx, rx) + shifted_products(qy, ry) - c * mul(square, shifted_products(m, m));
+    h.x = w.xx * rx + w.yx * ry;
+    h.y = w.xy * rx + w.yy * ry;
+    h.pull_x = c * cross(f.row_y, f.normal);
+    h.pull_y = c * cross(f.normal, f.row_x);
+    return h;
+  }
+  h.off = shifted_products(qx, ex) + shifted_products(qy, ey);
+  h.x = w.xx * ex + w.yx * ey;
+  h.y = w.xy * ex + w.yy * ey;
+  if (grad.dL_dlog_amp == T(0) || v == T(0)) return h;
+  // log amp: v adj(Sigma) (adj(Sigma) + v) / (2 det det')
+  const T l = T(0.5) * grad.dL_dlog_amp * v / blur(f.cov, v).det, inv = T(1) / sqrt(f.cov.det);
+  const Vec3<T> n = inv * m, nn = mul(n, n), cx = inv * bx, cy = inv * by;
+  const Vec3<T> own = {square.y * nn.z + square.z * nn.y, square.z * nn.x + square.x * nn.z,
+                       square.x * nn.y + square.y * nn.x};
+  h.diagonal += l * (mul(cx, cx) + mul(cy, cy) + v * own);
+  h.off += l * (shifted_products(cx, cx) + shifted_products(cy, cy) - v * mul(square, shifted_products(n, n)));
+  h.x += (l * inv) * ((f.cov.yy + v) * cx - f.cov.xy * cy);
+  h.y += (l * inv) * ((f.cov.xx + v) * cy - f.cov.xy * cx);
+  return h;
+}
+
 /// Writes the gradients of scale and rotation, or of cov3d, and returns that of the camera-space mean.
 template <typename T>
 AR_HD Vec3<T> project_covariance_vjp(const Camera<T>& camera, const Gaussians<T>& g, const GaussianGrads<T>& out,
                                      int64_t i, Vec3<T> view, const Factors<T>& f, const SplatGrad<T>& grad) {
   const Vec3<T>&ax = f.jacobian.x, &ay = f.jacobian.y;
-  Vec3<T> dL_dax, dL_day;
   if (g.cov3ds) {
-    // Here Sigma has no factors to carry log det, so Sigma^-1 = adj(Sigma) / det it is.
-    const T l = grad.dL_dlog_det == T(0) ? T(0) : grad.dL_dlog_det / f.cov.det;
-    const Sym2<T> s = {grad.dL_dcov.xx + l * f.cov.yy, grad.dL_dcov.xy - l * f.cov.xy, grad.dL_dcov.yy + l * f.cov.xx};
+    const Sym2<T> s = cov_grad(f.cov, grad);
     const Vec3<T> u = s.xx * ax + s.xy * ay, v = s.xy * ax + s.yy * ay;  // s A
     const Sym3<T>& c = g.cov3ds[i];
-    dL_dax = T(2) * (c * u);
-    dL_day = T(2) * (c * v);
     if (out.cov3ds) {
       out.cov3ds[i] = {u.x * ax.x + v.x * ay.x,
                        u.x * ax.y + u.y * ax.x + v.x * ay.y + v.y * ay.x,
@@ -221,27 +277,20 @@ AR_HD Vec3<T> project_covariance_vjp(const Camera<T>& camera, const Gaussians<T>
                        u.y * ax.z + u.z * ax.y + v.y * ay.z + v.z * ay.y,
                        u.z * ax.z + v.z * ay.z};
     }
-  } else {
-    // d log det = 2 d|n| / |n|, d|n| / d row_x = row_y x n / |n|
-    const T nn = dot(f.normal, f.normal);
-    const T l = grad.dL_dlog_det == T(0) ? T(0) : T(2) * grad.dL_dlog_det / nn;
-    const Sym2<T>& s = grad.dL_dcov;
-    const Vec3<T> dL_drow_x = T(2) * (s.xx * f.row_x + s.xy * f.row_y) + l * cross(f.row_y, f.normal);
-    const Vec3<T> dL_drow_y = T(2) * (s.xy * f.row_x + s.yy * f.row_y) + l * cross(f.normal, f.row_x);
-    const Vec3<T> dL_dturned_x = mul(dL_drow_x, f.scale), dL_dturned_y = mul(dL_drow_y, f.scale);
-    dL_dax = f.rotation * dL_dturned_x;
-    dL_day = f.rotation * dL_dturned_y;
-    if (out.scales) {
-      out.scales[i] = g.scale_modifier * (mul(dL_drow_x, f.turned_x) + mul(dL_drow_y, f.turned_y));
-    }
-    if (out.rotations) {
-      const Mat3<T> dL_drotation = {{ax.x * dL_dturned_x + ay.x * dL_dturned_y,
-                                     ax.y * dL_dturned_x + ay.y * dL_dturned_y,
-                                     ax.z * dL_dturned_x + ay.z * dL_dturned_y}};
-      out.rotations[i] = rotation_vjp(f.quaternion, dL_drotation);
-    }
+    const Vec3<T> dL_dax = T(2) * (c * u), dL_day = T(2) * (c * v);
+    return jacobian_vjp(camera, f.jacobian, view, dL_dax, dL_day, dot(dL_dax, ax) + dot(dL_day, ay));
   }
-  return jacobian_vjp(camera, f.jacobian, view, dL_dax, dL_day);
+  const TurnedGrad<T> h = turned_vjp(f, grad);
+  const Vec3<T>& s = f.scale;
+  const Vec3<T> by_scale = T(2) * mul(s, h.diagonal);
+  if (out.scales) out.scales[i] = g.scale_modifier * by_scale;
+  if (out.rotations) {
+    // A turn about an axis mixes the other two, as far as they differ.
+    const Vec3<T> gap = {(s.y - s.z) * (s.y + s.z), (s.z - s.x) * (s.z + s.x), (s.x - s.y) * (s.x + s.y)};
+    out.rotations[i] = rotation_vjp(f.quaternion, T(2) * mul(gap, h.off));
+  }
+  const Vec3<T> by_x = T(2) * mul(s, mul(s, h.x) + h.pull_x), by_y = T(2) * mul(s, mul(s, h.y) + h.pull_y);
+  return jacobian_vjp(camera, f.jacobian, view, f.rotation * by_x, f.rotation * by_y, dot(s, by_scale));
 }
 
 /// Direction from the camera to the mean, and 1 / distance.
@@ -283,8 +332,8 @@ AR_HD Vec3<T> splat_color_vjp(const Camera<T>& camera, const Gaussians<T>& g, co
   const Direction<T> d = view_direction(camera, g.means[i]);
   sh_basis(g.sh_degree, d.unit, basis);
   const Vec3<T> c = sh_color(g.sh_degree, basis, sh);
-  const Vec3<T> free = {c.x > T(0) ? dL_dcolor.x : T(0), c.y > T(0) ? dL_dcolor.y : T(0),
-                        c.z > T(0) ? dL_dcolor.z : T(0)};
+  const Vec3<T> free = {c.x >= T(0) ? dL_dcolor.x : T(0), c.y >= T(0) ? dL_dcolor.y : T(0),
+                        c.z >= T(0) ? dL_dcolor.z : T(0)};
   const int used = sh_count(g.sh_degree);
   AR_UNROLL
   for (int k = 0; k < kMaxShCount; ++k) weight[k] = k < used ? dot(free, sh[k]) : T(0);
@@ -316,7 +365,9 @@ AR_HD int project_shape(const Camera<T>& camera, const Gaussians<T>& g, int64_t 
   splat.level = T(0);
   if (!mean.valid) return 0;
   const Cov2d<T> cov = project_covariance(camera, g, i, mean.view).cov;
-  if (!(cov.det >= T(0) && cov.det < T(kMaxDet)) || !within(cov.xx, 1e18) || !within(cov.yy, 1e18)) return 0;
+  if (!(cov.det >= T(0) && cov.det < T(kMaxDet) && cov.xx >= T(0) && cov.yy >= T(0)) || !within(cov.xx, 1e18) ||
+      !within(cov.yy, 1e18))
+    return 0;
   splat.shape = F::prepare(cov, options);
   const Mat2<T> w = F::ellipse(splat.shape);
   if (!within(w.xx, kMaxWhitening) || !within(w.xy, kMaxWhitening) || !within(w.yx, kMaxWhitening) ||
@@ -354,7 +405,8 @@ AR_HD void project_vjp(const Camera<T>& camera, const Gaussians<T>& g, int64_t i
                        const PairGrad<T>& sums, const Vec3<T>* sh, Vec3<T>* dL_dsh, const GaussianGrads<T>& out) {
   const ProjectedMean<T> mean = project_mean(camera, g.means[i]);
   const Factors<T> factors = project_covariance(camera, g, i, mean.view);
-  const SplatGrad<T> grad = F::prepare_vjp(factors.cov, F::prepare(factors.cov, options), sums.shape, sums.weighted);
+  const SplatGrad<T> grad =
+      F::prepare_vjp(factors.cov, F::prepare(factors.cov, options), sums.shape, sums.weighted, options);
   const Vec3<T> dL_dview = project_covariance_vjp(camera, g, out, i, mean.view, factors, grad);
   Vec3<T> dL_dmean = project_mean_vjp(camera, mean, grad.dL_dmean, dL_dview);
   dL_dmean += splat_color_vjp(camera, g, out, i, sh, dL_dsh, sums.color);

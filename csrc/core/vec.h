@@ -47,6 +47,8 @@ template <typename T> AR_HD Vec3<T> cross(Vec3<T> a, Vec3<T> b) {
   return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
 template <typename T> AR_HD Vec3<T> mul(Vec3<T> a, Vec3<T> b) { return {a.x * b.x, a.y * b.y, a.z * b.z}; }
+/// (a_1 b_2, a_2 b_0, a_0 b_1).
+template <typename T> AR_HD Vec3<T> shifted_products(Vec3<T> a, Vec3<T> b) { return {a.y * b.z, a.z * b.x, a.x * b.y}; }
 
 /// v^T m: the combination of m's rows with the weights v.
 template <typename T> AR_HD Vec3<T> combine_rows(Vec3<T> v, const Mat3<T>& m) {

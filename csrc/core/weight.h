@@ -49,10 +49,9 @@ AR_HD WeightGrad<T> weight_vjp(Sym2<T> entries, Vec2<T> d, FootprintOptions opti
     F::add_alpha_vjp(terms, d, s, w, g, sums);
     weighted += g * w;
   }
-  const SplatGrad<T> grad = F::prepare_vjp(cov, shape, F::collect(terms, sums, weighted), weighted);
-  const T l = grad.dL_dlog_det == T(0) ? T(0) : grad.dL_dlog_det / cov.det;  // Sigma^-1 = adj(Sigma) / det
-  return {{-grad.dL_dmean.x, -grad.dL_dmean.y},
-          {grad.dL_dcov.xx + l * cov.yy, T(2) * (grad.dL_dcov.xy - l * cov.xy), grad.dL_dcov.yy + l * cov.xx}};
+  const SplatGrad<T> grad = F::prepare_vjp(cov, shape, F::collect(terms, sums, weighted), weighted, options);
+  const Sym2<T> dL_dcov = cov_grad(cov, grad);
+  return {{-grad.dL_dmean.x, -grad.dL_dmean.y}, {dL_dcov.xx, T(2) * dL_dcov.xy, dL_dcov.yy}};
 }
 
 }  // namespace ar

@@ -31,11 +31,17 @@ void check_vector(Tensor& t, const char* name) {
 }
 
 void check_positive(double value, const char* name) {
-  TORCH_CHECK_VALUE(std::isfinite(value) && value > 0, name, " must be positive and finite, got ", value);
+  // As a float, too: what is zero or infinite there makes the projection so.
+  TORCH_CHECK_VALUE(std::isfinite(float(value)) && float(value) > 0, name, " must be positive and finite, got ", value);
 }
 
 void check_finite(const Tensor& t, const char* name) {
-  TORCH_CHECK_VALUE(at::isfinite(t).all().item<bool>(), name, " must be finite, got ", t);
+  const Tensor finite = at::isfinite(t);
+  if (finite.all().item<bool>()) return;
+  const int64_t first = finite.logical_not().reshape(-1).nonzero()[0].item<int64_t>(), columns = t.size(-1);
+  TORCH_CHECK_VALUE(false, name, " must be finite, got ", t.reshape(-1)[first].item<double>(), " at (",
+                    t.dim() == 1 ? "" : std::to_string(first / columns) + ", ", first % columns,
+                    t.dim() == 1 ? ",)" : ")");
 }
 
 }  // namespace

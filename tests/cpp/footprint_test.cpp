@@ -24,7 +24,7 @@ template <class F, typename T> Adjoint<T> weight_vjp(Cov2d<T> cov, Vec2<T> d, T 
     F::add_alpha_vjp(terms, d, s, alpha, g[s], sums);
     weighted += g[s] * alpha;
   }
-  const SplatGrad<T> grad = F::prepare_vjp(cov, shape, F::collect(terms, sums, weighted), weighted);
+  const SplatGrad<T> grad = F::prepare_vjp(cov, shape, F::collect(terms, sums, weighted), weighted, options_of<F>());
   // mean_map says the same; the two columns of a needle's map cancel, hence the norms.
   const Mat2<T> m = F::mean_map(shape);
   const Vec2<T> by_mean = transform_transposed(m, sums.offset);
@@ -75,9 +75,8 @@ TYPED_TEST(FootprintTest, GradientsMatchDifferences) {
     const double value = weight<F>(cov, d, opacity, g);
     const Adjoint<double> adjoint = weight_vjp<F>(cov, d, opacity, g);
     const Vec2<double> by_mean = transform_transposed(axes, adjoint.splat.dL_dmean);
-    const Sym2<double> by_cov = congruence_transposed(axes, adjoint.splat.dL_dcov);
-    const double actual[5] = {s2 * by_mean.x, s2 * by_mean.y, l1 * by_cov.xx + adjoint.splat.dL_dlog_det,
-                              s1 * s2 * 2 * by_cov.xy, l2 * by_cov.yy + adjoint.splat.dL_dlog_det};
+    const Sym2<double> by_cov = congruence_transposed(axes, cov_grad(cov, adjoint.splat));
+    const double actual[5] = {s2 * by_mean.x, s2 * by_mean.y, l1 * by_cov.xx, s1 * s2 * 2 * by_cov.xy, l2 * by_cov.yy};
     EXPECT_NEAR(adjoint.weighted, value, 1e-14 * value);  // alpha is linear in opacity
     for (int k = 0; k < 5; ++k) {
       ASSERT_NEAR(actual[k], expected[k], 1e-6 * std::abs(expected[k]) + 1e-9 * value)
@@ -341,8 +340,8 @@ TEST(ExactBranches, AgreeWhereTheyMeet) {
 }
 
 template <typename T> bool all_finite(const SplatGrad<T>& g) {
-  return std::isfinite(g.dL_dmean.x) && std::isfinite(g.dL_dmean.y) && std::isfinite(g.dL_dcov.xx) &&
-         std::isfinite(g.dL_dcov.xy) && std::isfinite(g.dL_dcov.yy) && std::isfinite(g.dL_dlog_det);
+  return std::isfinite(g.dL_dmean.x) && std::isfinite(g.dL_dmean.y) && std::isfinite(g.dL_dwhite.xx) &&
+         std::isfinite(g.dL_dwhite.xy) && std::isfinite(g.dL_dwhite.yy) && std::isfinite(g.dL_dlog_amp);
 }
 
 // Discs, needles along the axes and across them, invisible and immense ones, near and far.

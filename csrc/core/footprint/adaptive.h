@@ -50,24 +50,25 @@ template <int S> struct AdaptiveBoxVjp : AdaptiveBox<S> {
 
   template <typename T> struct Terms : Box::Gaussian::template Terms<T> {
     Mat2<T> from_common;  ///< whitening matrix here times the inverse of the common one
+    Sym2<T> log_amp;      ///< gradient of log amp here less that of a single sample, in the common coordinates
   };
 
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& shape, T opacity, Vec2<T> origin = {T(0), T(0)}) {
-    return {Box::terms(shape, opacity, origin), from_common(shape.cov)};
+    const Mat2<T> turn = from_common(shape.cov);
+    return {Box::terms(shape, opacity, origin), turn, log_amp_from_common(shape.cov, turn)};
   }
 
   template <typename T> AR_HD static ShapeGrad<T> collect(const Terms<T>& t, const ShapeGrad<T>& sums, T weighted) {
-    const T square = T(1 / (kBase2 * kBase2));
-    const Sym2<T> s = {square * sums.shape.xx - weighted, square * sums.shape.xy, square * sums.shape.yy - weighted};
-    return {transform_transposed(t.from_common, sums.offset), congruence_transposed(t.from_common, s)};
+    const Sym2<T> amplitude = {weighted * t.log_amp.xx, weighted * t.log_amp.xy, weighted * t.log_amp.yy};
+    return {transform_transposed(t.from_common, sums.offset),
+            congruence_transposed(t.from_common, sums.shape) + amplitude};
   }
 
   /// From sums that collect() has taken to the common coordinates.
   template <typename T>
-  AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T> cov, const Shape<T>&, ShapeGrad<T> sums, T weighted) {
-    const Mat2<T> w = Box::whitening(cov, T(kPixelVariance));
-    const Sym2<T> half = {T(0.5) * sums.shape.xx, T(0.5) * sums.shape.xy, T(0.5) * sums.shape.yy};
-    return {transform_transposed(T(1 / kBase2) * w, sums.offset), congruence_transposed(w, half), T(0.5) * weighted};
+  AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T> cov, const Shape<T>&, ShapeGrad<T> sums, T weighted,
+                                        FootprintOptions) {
+    return gaussian_vjp(Box::whitening(cov, T(kPixelVariance)), sums, weighted, T(kPixelVariance));
   }
 
  private:
@@ -79,6 +80,15 @@ template <int S> struct AdaptiveBoxVjp : AdaptiveBox<S> {
     const T across = sqrt(wide / own.det), common_across = sqrt(common_wide / common.det);
     const T turn = -across * cov.xy * T(kPixelVariance - Box::kVariance) / (wide * sqrt(common_wide));
     return {sqrt(common_wide / wide), T(0), turn, across / common_across};
+  }
+  /// With F = w_S w_1^-1 the difference of the gradients, (C_1 - C_S) / 2 = (v_S - v_1) C_1 C_S / 2, is
+  /// (v_S - v_1) w_1 w_1^T F^T F / 2 in coordinates w_1, and there kBase2^2 times what a sum of z z^T is.
+  template <typename T> AR_HD static Sym2<T> log_amp_from_common(Cov2d<T> cov, const Mat2<T>& turn) {
+    const Mat2<T> w = Box::whitening(cov, T(kPixelVariance));
+    const T scale = T(kBase2 * kBase2 * (Box::kVariance - kPixelVariance));
+    const T axx = w.xx * w.xx + w.xy * w.xy, axy = w.xx * w.yx + w.xy * w.yy, ayy = w.yx * w.yx + w.yy * w.yy;
+    const Sym2<T> b = congruence_transposed(turn, Sym2<T>{T(1), T(0), T(1)});
+    return {scale * (axx * b.xx + axy * b.xy), scale * (axx * b.xy + axy * b.yy), scale * (axy * b.xy + ayy * b.yy)};
   }
 };
 

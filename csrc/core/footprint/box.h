@@ -21,6 +21,12 @@ template <int S> struct Box : GaussianFootprint<S, true> {
   template <typename T> AR_HD static GaussianShape<T> prepare(Cov2d<T> cov, FootprintOptions) {
     return GaussianFootprint<S, true>::prepare_with(cov, T(kBoxVariance<S>));
   }
+
+  template <typename T>
+  AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const GaussianShape<T>& shape, ShapeGrad<T> sums, T weighted,
+                                        FootprintOptions) {
+    return GaussianFootprint<S, true>::prepare_vjp_with(shape, sums, weighted, T(kBoxVariance<S>));
+  }
 };
 
 }  // namespace ar

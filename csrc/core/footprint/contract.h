@@ -19,7 +19,8 @@
 //   mean_map(Shape<T>) -> Mat2<T>        m with dL/dmean = m^T sums.offset [dL/dpx]
 //   collect(Terms<T>, ShapeGrad<T> sums, weighted) -> ShapeGrad<T>    per (tile, splat), linear: what is
 //                                        added up over tiles; PlainSums leaves the sums as they are
-//   prepare_vjp(Cov2d<T>, Shape<T>, ShapeGrad<T> sums, weighted) -> SplatGrad<T>         once per splat
+//   prepare_vjp(Cov2d<T>, Shape<T>, ShapeGrad<T> sums, weighted, FootprintOptions) -> SplatGrad<T>
+//                                        once per splat
 //
 // T is float or double, V a scalar or a pack of lanes (lanes.h). The five numbers of ShapeGrad are
 // summed over pixels and samples in whatever coordinates make them cheap; prepare_vjp gives them
@@ -72,13 +73,32 @@ struct PlainSums {
   }
 };
 
-/// Gradient of one splat. dL = dL_dmean . dmean + tr(dL_dcov dSigma) + dL_dlog_det d(log det Sigma).
-/// The part along log det stays apart: its matrix Sigma^-1 does not exist for needles, but its pull
-/// back to the factors of Sigma does (project.h).
+/// Gradient of one splat. dL = dL_dmean . dmean + tr(dL_dwhite w dSigma w^T) + dL_dlog_amp d(log amp),
+/// amp = sqrt(det Sigma / det(Sigma + variance I)). Both parts stay in factors until they meet those of Sigma
+/// (project.h): the sum w^T dL_dwhite w cancels for needles, and d(log amp), a difference of inverses, for
+/// splats much wider than a pixel, where it vanishes.
 template <typename T> struct SplatGrad {
   Vec2<T> dL_dmean;
-  Sym2<T> dL_dcov;
-  T dL_dlog_det;
+  Mat2<T> w;
+  Sym2<T> dL_dwhite;
+  T dL_dlog_amp, variance;
+  bool triangular;  ///< w is whiten(Sigma + variance I), up to signs; else its rows are the axes of Sigma
 };
+
+/// Gradient of log amp by Sigma: (Sigma^-1 - Sigma'^-1) / 2 = v adj(Sigma) adj(Sigma') / (2 det det'), whose
+/// terms do not cancel.
+template <typename T> AR_HD Sym2<T> log_amp_grad(Cov2d<T> c, T v) {
+  const T scale = T(0.5) * v / blur(c, v).det, square = c.xy * c.xy;
+  return {scale * ((c.yy * (c.yy + v) + square) / c.det), -scale * (c.xy / c.det * (c.xx + c.yy + v)),
+          scale * ((c.xx * (c.xx + v) + square) / c.det)};
+}
+
+/// All of the gradient by Sigma, as one matrix: for a Sigma that is known by its entries only.
+template <typename T> AR_HD Sym2<T> cov_grad(Cov2d<T> c, const SplatGrad<T>& grad) {
+  const Sym2<T> g = congruence_transposed(grad.w, grad.dL_dwhite);
+  if (grad.dL_dlog_amp == T(0)) return g;  // det Sigma may be zero
+  const Sym2<T> a = log_amp_grad(c, grad.variance);
+  return g + Sym2<T>{grad.dL_dlog_amp * a.xx, grad.dL_dlog_amp * a.xy, grad.dL_dlog_amp * a.yy};
+}
 
 }  // namespace ar

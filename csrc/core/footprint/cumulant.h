@@ -115,8 +115,9 @@ struct Cumulant : PlainSums {
   template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return T(1 / kBase2) * shape.w; }
 
   template <typename T>
-  AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& shape, ShapeGrad<T> sums, T weighted) {
-    return gaussian_vjp(shape.w, sums, weighted);
+  AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& shape, ShapeGrad<T> sums, T weighted,
+                                        FootprintOptions) {
+    return gaussian_vjp(shape.w, sums, weighted, T(kPixelVariance));
   }
 
  private:

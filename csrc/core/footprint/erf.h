@@ -74,8 +74,9 @@ struct Erf : PlainSums {
     return {r1 * g.axis.x, r1 * g.axis.y, -r2 * g.axis.y, r2 * g.axis.x};
   }
 
-  template <typename T> AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& g, ShapeGrad<T> sums, T) {
-    return moments_vjp(mean_map(g), sums);
+  template <typename T>
+  AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& g, ShapeGrad<T> sums, T, FootprintOptions) {
+    return moments_vjp(mean_map(g), sums, false);
   }
 
  private:

@@ -76,8 +76,9 @@ struct Exact : PlainSums {
 
   template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& g) { return g.w; }
 
-  template <typename T> AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& g, ShapeGrad<T> sums, T) {
-    return moments_vjp(g.w, sums);
+  template <typename T>
+  AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& g, ShapeGrad<T> sums, T, FootprintOptions) {
+    return moments_vjp(g.w, sums, true);
   }
 
  private:

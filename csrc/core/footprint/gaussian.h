@@ -33,13 +33,13 @@ template <typename T> AR_HD T gaussian_level(T amp, T opacity) {
 }
 
 /// Gradient of a sum of Gaussians from sums in whitened coordinates z = kBase2 w d: `offset` = sum g I z,
-/// `shape` = sum g I z z^T. `weighted` = sum g I, zero where the amplitude does not depend on Sigma.
-template <typename T> AR_HD SplatGrad<T> gaussian_vjp(const Mat2<T>& w, ShapeGrad<T> sums, T weighted) {
-  // With kBase2 = 1: d log I = z.w dmu + tr(w^T z z^T w dSigma)/2 + (d log det Sigma - tr(w^T w dSigma))/2
-  const T square = T(1 / (kBase2 * kBase2));
-  const Sym2<T> half = {T(0.5) * (square * sums.shape.xx - weighted), T(0.5) * square * sums.shape.xy,
-                        T(0.5) * (square * sums.shape.yy - weighted)};
-  return {transform_transposed(T(1 / kBase2) * w, sums.offset), congruence_transposed(w, half), T(0.5) * weighted};
+/// `shape` = sum g I z z^T. `weighted` = sum g I, zero where the amplitude does not depend on Sigma; `variance` was
+/// added to Sigma.
+template <typename T> AR_HD SplatGrad<T> gaussian_vjp(const Mat2<T>& w, ShapeGrad<T> sums, T weighted, T variance) {
+  // With kBase2 = 1: d log I = z.w dmu + tr(z z^T w dSigma w^T)/2 + d log amp
+  const T half = T(0.5 / (kBase2 * kBase2));
+  const Sym2<T> white = {half * sums.shape.xx, half * sums.shape.xy, half * sums.shape.yy};
+  return {transform_transposed(T(1 / kBase2) * w, sums.offset), w, white, weighted, variance, true};
 }
 
 /// Variance of each of the S Gaussians of the box footprint [px^2].
@@ -132,8 +132,8 @@ template <int S, bool kCompensated> struct GaussianFootprint : PlainSums {
   template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return T(1 / kBase2) * shape.w; }
 
   template <typename T>
-  AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& shape, ShapeGrad<T> sums, T weighted) {
-    return gaussian_vjp(shape.w, sums, kCompensated ? weighted : T(0));
+  AR_HD static SplatGrad<T> prepare_vjp_with(const Shape<T>& shape, ShapeGrad<T> sums, T weighted, T variance) {
+    return gaussian_vjp(shape.w, sums, kCompensated ? weighted : T(0), variance);
   }
 };
 

@@ -14,6 +14,12 @@ struct Mip : GaussianFootprint<1, true> {
   template <typename T> AR_HD static Shape<T> prepare(Cov2d<T> cov, FootprintOptions options) {
     return prepare_with(cov, T(options.variance));
   }
+
+  template <typename T>
+  AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& shape, ShapeGrad<T> sums, T weighted,
+                                        FootprintOptions options) {
+    return prepare_vjp_with(shape, sums, weighted, T(options.variance));
+  }
 };
 
 }  // namespace ar

@@ -85,10 +85,10 @@ template <class V> AR_HD NormalMoments<V> short_interval_moments(V z, V width) {
 }
 
 /// Gradient from the sums of g f z and g f z z^T over a pixel, f = exp(-|z|^2 / 2), z = w d: like that
-/// of `point`, f has no amplitude that depends on Sigma, so that df = f (z . w dmean + tr(w^T z z^T w dSigma) / 2).
-template <typename T> AR_HD SplatGrad<T> moments_vjp(const Mat2<T>& w, const ShapeGrad<T>& sums) {
+/// of `point`, f has no amplitude that depends on Sigma, so that df = f (z . w dmean + tr(z z^T w dSigma w^T) / 2).
+template <typename T> AR_HD SplatGrad<T> moments_vjp(const Mat2<T>& w, const ShapeGrad<T>& sums, bool triangular) {
   const Sym2<T> half = {T(0.5) * sums.shape.xx, T(0.5) * sums.shape.xy, T(0.5) * sums.shape.yy};
-  return {transform_transposed(w, sums.offset), congruence_transposed(w, half), T(0)};
+  return {transform_transposed(w, sums.offset), w, half, T(0), T(0), triangular};
 }
 
 /// What integrating over the pixel adds at most, along one axis, to the level of the Gaussian of

@@ -1,0 +1,202 @@
+"""What the textbook formulas and this package do with the hard cases, in float32: the tables of docs/stability.md.
+
+    python benchmarks/stability.py            prints the tables
+    python benchmarks/stability.py --write    puts them into docs/stability.md, between their markers
+
+The textbook: the covariance as a product of matrices, the conic by a c - b^2, eigenvectors as [AS, Eq. 2] has them,
+the logistic distribution and differences of it as they are written, gradients by autograd. In the same float32.
+Errors are against float64, relative to the largest entry of the same Gaussian's gradient (of the image: to the largest
+colour, or 1): the worst of all Gaussians and, of the package, of the footprints but `point` without dilation and
+`analytic` with the paper's gradient.
+"""
+
+import argparse
+import math
+import pathlib
+import sys
+
+import torch
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
+
+import hard_cases  # noqa: E402
+import scenes  # noqa: E402
+import test_stability  # noqa: E402
+from hard_cases import CASES  # noqa: E402
+from scenes import VARIANTS, name_of  # noqa: E402
+
+GRADIENTS = ("means3D", "opacities", "colours", "scales", "rotations", "covariance")
+# Gradients that grow without bound by themselves, or vanish by symmetry: held to their tolerance all the same.
+UNBOUNDED = ({"frame_gradient": "paper"}, {"dilation": 0.0})
+COLUMNS = {"shs": "colours", "colors_precomp": "colours", "cov3D_precomp": "covariance"}
+
+
+def textbook(settings, scene, footprint):
+    """Image (3, H, W) of `mip` with a variance of 1/12 or of `analytic`, as one would write them down."""
+    import reference
+
+    if "scales" in scene:
+        covariance = reference.covariance_3d(scene["scales"], scene["rotations"], settings.scale_modifier)
+    else:
+        covariance = reference.unpack_covariance(scene["cov3D_precomp"])
+    means, dtype = scene["means3D"], scene["means3D"].dtype
+    size = torch.tensor([settings.image_width, settings.image_height], dtype=dtype)
+    homogeneous = torch.cat([means, torch.ones_like(means[:, :1])], -1)
+    view, clip = homogeneous @ settings.viewmatrix, homogeneous @ settings.projmatrix
+    means2d = ((clip[:, :2] / clip[:, 3:] + 1) * size - 1) / 2
+    tangent = torch.tensor([settings.tanfovx, settings.tanfovy], dtype=dtype)
+    focal, z = size / (2 * tangent), view[:, 2]
+    t = torch.minimum(torch.maximum(view[:, :2] / z[:, None], -1.3 * tangent), 1.3 * tangent) * z[:, None]
+    zero = torch.zeros_like(z)
+    rows = [[focal[0] / z, zero, -focal[0] * t[:, 0] / z**2], [zero, focal[1] / z, -focal[1] * t[:, 1] / z**2]]
+    to_image = torch.stack([torch.stack(row, -1) for row in rows], -2) @ settings.viewmatrix[:3, :3].T
+    cov2d = to_image @ covariance @ to_image.transpose(-1, -2)
+    a, b, c = (cov2d[:, i, j][:, None, None] for i, j in ((0, 0), (0, 1), (1, 1)))
+    if "shs" in scene:
+        colors = reference.sh_color(settings.sh_degree, scene["shs"], means, settings.campos)
+    else:
+        colors = scene["colors_precomp"]
+
+    order = torch.argsort(z.detach(), stable=True)
+    order = order[z.detach()[order] > 0.2]
+    ys, xs = torch.meshgrid(*(torch.arange(int(n), dtype=dtype) for n in size.flip(0)), indexing="ij")
+    dx, dy = (grid - means2d[:, i, None, None] for i, grid in enumerate((xs, ys)))
+    if footprint == "mip":
+        v = 1 / 12
+        det, wider = a * c - b * b, (a + v) * (c + v) - b * b
+        power = ((c + v) * dx * dx - 2 * b * dx * dy + (a + v) * dy * dy) / wider
+        weight = torch.sqrt(det / wider) * torch.exp(-power / 2)
+    else:
+        middle, det = (a + c) / 2, a * c - b * b
+        root = torch.sqrt(middle * middle - det)
+        l1, l2 = middle + root, middle - root
+        length = torch.sqrt(b * b + (l1 - a) ** 2)
+        vx, vy = b / length, (l1 - a) / length
+
+        def window(u, s):
+            def logistic(x):
+                return 1 / (1 + torch.exp(-1.6 * x - 0.07 * x**3))
+
+            return logistic((u + 0.5) / s) - logistic((u - 0.5) / s)
+
+        s1, s2 = torch.sqrt(l1), torch.sqrt(l2)
+        weight = 2 * math.pi * s1 * s2 * window(dx * vx + dy * vy, s1) * window(dx * vy - dy * vx, s2)
+    alpha = torch.clamp(scene["opacities"][:, :, None] * weight, max=0.99)[order]
+    alpha = torch.where(alpha < 1 / 255, torch.zeros_like(alpha), alpha)
+    through = torch.cumprod(1 - alpha, 0)
+    alpha = torch.where(through.detach() < 1e-4, torch.zeros_like(alpha), alpha)
+    through = torch.cumprod(1 - alpha, 0)
+    front = torch.cat([torch.ones_like(through[:1]), through[:-1]])
+    image = torch.einsum("phw,pc->chw", front * alpha, colors[order])
+    last = through[-1] if len(order) else torch.ones_like(xs)
+    return image + last * settings.bg[:, None, None]
+
+
+def textbook_errors(case, footprint):
+    """{column: error or the share that is not finite, as text}."""
+    camera, scene = case.build()
+    variant = ("mip", {"variance": 1 / 12}) if footprint == "mip" else ("analytic", {"frame_gradient": "paper"})
+    naive = hard_cases.settings_of(camera, torch.float32, torch.float32, variant)
+    exact = hard_cases.settings_of(camera, torch.float64, torch.float32, variant)
+    ours = {name: value.float() for name, value in scene.items()}
+    theirs = {name: value.double() for name, value in ours.items()}
+    clear = hard_cases.clear_pixels(exact, theirs, case.margin)
+    g = torch.Generator().manual_seed(1)
+    loss = scenes.rand(g, 3, camera.image_height, camera.image_width, low=-1.0) * clear
+    expected, _, wanted = hard_cases.run(exact, theirs, loss)
+    leaves = scenes.leaves(ours)
+    image = textbook(naive, leaves, footprint)
+    (image * loss.float()).sum().backward()
+    found = {}
+    bad = ~torch.isfinite(image.detach()).all(0)
+    size = max(1.0, expected.abs().max().item())
+    error = (image.detach().double() - expected).abs()[:, clear].max().item() / size if clear.any() else 0.0
+    found["image"] = f"NaN in {bad.double().mean():.0%}" if bad.any() else number(error)
+    for name, value in wanted.items():
+        if name == "means2D":
+            continue
+        grad = leaves[name].grad
+        grad = torch.zeros_like(leaves[name]) if grad is None else grad
+        bad = ~torch.isfinite(grad.reshape(len(grad), -1)).all(1)
+        scale = hard_cases.rows(value)
+        seen = (scale > 0) & ~bad
+        relative = (hard_cases.rows(grad.double() - value)[seen] / scale[seen]).max().item() if seen.any() else 0.0
+        text = f"NaN in {int(bad.sum())} of {len(bad)}" if bad.any() else number(relative)
+        found[COLUMNS.get(name, name)] = text
+    return found
+
+
+def number(value):
+    """Two digits at most."""
+    if value == 0:
+        return "0"
+    return f"{value:.1g}" if math.isfinite(value) else str(value)
+
+
+def our_errors(case):
+    """{column: worst of the footprints}, and the largest error of all variants as a share of its tolerance."""
+    worst, share = {}, 0.0
+    for variant in VARIANTS:
+        report = hard_cases.measure(case, variant, "cpu", torch.float32)
+        for name, error in report.error.items():
+            column = COLUMNS.get(name, name)
+            if variant[1] not in UNBOUNDED:
+                worst[column] = max(worst.get(column, 0.0), report.relative(name))
+            positive = report.tolerance[name].expand_as(error) > 0
+            if positive.any():
+                share = max(share, (error / report.tolerance[name].expand_as(error))[positive].max().item())
+    return worst, share
+
+
+def case_table():
+    head = ("case", "", "textbook, conic: image / worst gradient", "textbook, eigenvectors: image / worst gradient",
+            "ours: image", *GRADIENTS, "of tolerance")  # fmt: skip
+    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for case in CASES:
+        cells = [f"`{case.name}`", case.row]
+        for footprint in ("mip", "analytic"):
+            found = textbook_errors(case, footprint)
+            image, rest = found.pop("image"), found
+            nans = [f"{k}: {v}" for k, v in rest.items() if "NaN" in v]
+            worst = max(rest, key=lambda k: float(rest[k]) if "NaN" not in rest[k] else -1)
+            cells.append(f"{image} / " + (nans[0] if nans else f"{worst} {rest[worst]}"))
+        errors, share = our_errors(case)
+        cells += [number(errors.pop("image")), *(number(errors[c]) if c in errors else "" for c in GRADIENTS)]
+        lines.append("| " + " | ".join([*cells, f"{share:.2f}"]) + " |")
+        print(lines[-1], file=sys.stderr, flush=True)
+    return "\n".join(lines)
+
+
+def weight_table():
+    lines = ["| footprint | float32 | of tolerance | float64 | of tolerance |", "|---|---|---|---|---|"]
+    for variant in VARIANTS:
+        cells = [name_of(variant)]
+        for dtype in (torch.float32, torch.float64):
+            report = test_stability.measure_weights(variant, "cpu", dtype)
+            share = (report["error"] / report["tolerance"]).max().item()
+            cells += [number(report["error"].max().item()), f"{share:.2f}"]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--write", action="store_true")
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    path = ROOT / "docs" / "stability.md"
+    text = path.read_text() if arguments.write else ""
+    for name, table in (("cases", case_table()), ("weights", weight_table())):
+        if not arguments.write:
+            print(table, end="\n\n")
+            continue
+        begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
+        before, rest = text.split(begin)
+        text = before + begin + "\n" + table + "\n\n" + end + rest.split(end)[1]
+    if arguments.write:
+        path.write_text(text)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,477 @@
+"""The hard cases (hard_cases.py), the policy for bad numbers, and a few seconds of fuzzing.
+
+docs/stability.md is the table of what is asserted here and how large the errors were.
+"""
+
+import math
+import pathlib
+import re
+
+import fuzz
+import hard_cases
+import mpmath
+import pytest
+import reference
+import scenes
+import torch
+from conftest import each_precision
+from hard_cases import CASES, EPS
+from hypothesis import HealthCheck, given
+from hypothesis import settings as hypothesis_settings
+from hypothesis import strategies as st
+from scenes import KINDS, VARIANTS, Camera, name_of
+
+import analytic_rasterizer as ar
+
+DOCUMENT = pathlib.Path(__file__).resolve().parent.parent / "docs" / "stability.md"
+every_footprint = pytest.mark.parametrize("variant", VARIANTS, ids=name_of)
+each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
+
+
+# --- the battery -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@every_footprint
+@each_precision
+def test_hard_case(case, variant, device, dtype):
+    """Finite, and within the tolerance of its condition of the float64 result for the same numbers."""
+    report = hard_cases.measure(case, variant, device, dtype)
+    assert report.finite, report.describe()
+    assert report.unclear <= 0.25, "too many pixels are at a threshold for the case to say anything"
+    assert all(torch.isfinite(tolerance).all() for tolerance in report.tolerance.values())
+    assert not report.failures(), report.describe()
+
+
+@pytest.mark.parametrize("case", [case for case in CASES if case.reference], ids=lambda case: case.name)
+@each_kind
+def test_hard_case_against_the_reference(case, variant):
+    """Image and gradients in float64 against the renderer of reference.py, which shares no code with ours.
+
+    Its conics and determinants cancel: eps r^2 more for splats of ratio r, here at most 1e3.
+    """
+    camera, scene = case.build()
+    settings = hard_cases.settings_of(camera, torch.float64, torch.float64, variant)
+    footprint, options = variant
+    if footprint == "adaptive":
+        options = {"tile_samples": scenes.tile_samples(settings, scene)}
+    ours, theirs = scenes.leaves(scene), scenes.leaves(scene)
+    color, _ = ar.GaussianRasterizer(settings)(**ours)
+    expected = reference.render(settings, **theirs, footprint=footprint, **options)
+    clear = expected.pixel_margin > 1e-6
+    assert clear.float().mean() > 0.9
+    g = torch.Generator().manual_seed(6)
+    loss = scenes.rand(g, *color.shape, low=-1.0) * clear
+    size = max(1.0, expected.color.abs().max().item())
+    assert (color - expected.color)[:, clear].abs().max() <= 1e-9 * size
+    (color * loss).sum().backward()
+    (expected.color * loss).sum().backward()
+    for name, leaf in ours.items():
+        known = torch.isfinite(theirs[name].grad)  # at the camera it is 0/0 there; here it is culled
+        assert (leaf.grad[~known] == 0).all()
+        there = torch.where(known, theirs[name].grad, 0)
+        actual, wanted = hard_cases.rows(leaf.grad), hard_cases.rows(there)
+        error = hard_cases.rows(leaf.grad - there)
+        # The reference's quaternions: a difference of terms of the size of the scales' gradient.
+        floor = (
+            hard_cases.rows(theirs["scales"].grad.nan_to_num()) * hard_cases.rows(scene["scales"])
+            if name == "rotations"
+            else 0
+        )
+        assert (error <= 1e-8 * (wanted + floor) + 1e-14 * size).all(), (name, error, actual, wanted)
+
+
+@every_footprint
+@pytest.mark.parametrize("name", ["stack_opaque", "stack_faint", "stack_mixed"])
+def test_first_and_last_layer_of_a_stack(name, variant, device):
+    """Of 10,000 layers: the first, and the last that is blended. Gradients one by one, float32 against float64.
+
+    T loses a rounding per blended layer on the way there and on the way back, of which there are at most
+    ln(1e4) / (1/255) = 2350.
+    """
+    case = next(case for case in CASES if case.name == name)
+    report = hard_cases.measure(case, variant, device, torch.float32)
+    seen = torch.nonzero(report.size["shs"]).flatten()
+    first, last = seen[0], seen[-1]
+    assert first == 0
+    assert last <= 2400
+    assert name == "stack_opaque" or last > 100
+    for tensor in set(report.error) - {"image"}:
+        for layer in (first, last):
+            error, tolerance = report.error[tensor][layer], report.tolerance[tensor][layer]
+            assert error <= tolerance, (tensor, layer, error, tolerance)
+
+
+def test_a_colour_of_exactly_zero_has_a_gradient(device, best):
+    """Clamped is what is below zero, as in 3DGS: a black point, of coefficient -1/2 / C0, can still brighten."""
+    camera, scene = hard_cases.axis_aligned()
+    scene = scenes.cast(scene, best, device)
+    scene["shs"][:] = 0
+    zero = torch.tensor(0.28209479177387814, dtype=best)
+    candidates = torch.nextafter(-0.5 / zero, torch.zeros_like(zero)) * torch.tensor([1.0, 1.0], dtype=best)
+    black = next(c for c in (-0.5 / zero, *candidates) if c * zero + 0.5 == 0)
+    scene["shs"][1, 0] = black.to(device)
+    leaves = scenes.leaves(scene)
+    color, _ = ar.GaussianRasterizer(camera.settings(best, device, footprint="mip"))(**leaves)
+    color.sum().backward()
+    assert (leaves["shs"].grad[1, 0] > 0).all()
+
+
+def test_equal_depths_keep_their_order(device):
+    """As given: the image of two splats at one depth changes when they are swapped, and only then."""
+    camera, scene = hard_cases.equal_depths()
+    settings = camera.settings(torch.float32, device, footprint="mip")
+    scene = scenes.cast(scene, torch.float32, device)
+    image = ar.GaussianRasterizer(settings)(**scene)[0]
+    # Behind one another by as little as float32 can tell, in that order.
+    spread = dict(scene, means3D=scene["means3D"].clone())
+    for i in range(4):
+        spread["means3D"][i] *= 1 + i * 2.0**-22
+    assert (ar.GaussianRasterizer(settings)(**spread)[0] - image).abs().max() < 1e-4
+    swapped = {name: value.flip(0) for name, value in scene.items()}
+    assert (ar.GaussianRasterizer(settings)(**swapped)[0] - image).abs().max() > 1e-2
+
+
+def available_memory():
+    """Bytes, or 0 where nobody knows."""
+    try:
+        text = pathlib.Path("/proc/meminfo").read_text()
+    except OSError:
+        return 0
+    return 1024 * int(re.search(r"MemAvailable:\s+(\d+)", text)[1])
+
+
+def test_image_of_16384_x_16384():
+    """3.2 GB: indices of pixels beyond 2^31, and splats at the far corner where they belong. CPU only."""
+    if available_memory() < 8 * 2**30:
+        pytest.skip("needs 8 GiB of free memory")
+    n = 16384
+    camera = hard_cases.replace(hard_cases.CAMERA, image_width=n, image_height=n, tanfovx=0.5, tanfovy=0.5)
+    means = [[0.0, 0.0], [n - 1.0, n - 1.0], [n - 1.0, 0.0], [8191.5, 8192.25]]
+    scene = hard_cases.splats(means, [[1.5, 1.5]] * 4, 0.0, 0.8, 2.0, camera)
+    with torch.no_grad():
+        settings = camera.settings(torch.float32, footprint="mip")
+        image, radii = ar.GaussianRasterizer(settings)(**scenes.cast(scene, torch.float32))
+    assert image.shape == (3, n, n)
+    assert (radii > 0).all()
+    exact = hard_cases.settings_of(camera, torch.float64, torch.float32, ("mip", {}))
+    covariance = reference.covariance_3d(scene["scales"], scene["rotations"], 1.0)
+    means2d, cov2d, _ = reference.project(exact, scene["means3D"], covariance)
+    colors = reference.sh_color(0, scene["shs"], scene["means3D"], exact.campos)
+    for i in range(4):
+        x0, y0 = (min(max(int(v) - 4, 0), n - 9) for v in means[i])
+        ys, xs = torch.meshgrid(torch.arange(y0, y0 + 9.0), torch.arange(x0, x0 + 9.0), indexing="ij")
+        offset = torch.stack([xs, ys], -1) - means2d[i]
+        alpha = 0.8 * reference.weight(offset, cov2d[i], "mip")
+        alpha = torch.where(alpha < 1 / 255, 0, alpha)
+        expected = alpha * colors[i][:, None, None] + (1 - alpha) * exact.bg[:, None, None]
+        # A mean is known to a few eps n = 1e-3 px, alpha changes by less than 0.5 per px, and may flip at 1/255.
+        error = (image[:, y0 : y0 + 9, x0 : x0 + 9] - expected).abs()
+        assert alpha.max() > 0.5
+        assert (error < 4 * n * EPS[torch.float32]).float().mean() > 0.9
+        assert error.max() < 1.1 / 255
+
+
+# --- one weight, 40 digits ---------------------------------------------------------------------
+
+
+def weight_in_40_digits(offset, cov2d, footprint, options):
+    """The formulas of docs/numerics.md as they stand there, with mpmath."""
+    mp = mpmath.mp
+    x, y = offset
+    xx, xy, yy = cov2d
+
+    def gaussian(x, y, v, compensated=True):
+        det = (xx + v) * (yy + v) - xy * xy
+        amplitude = mp.sqrt((xx * yy - xy * xy) / det) if compensated else 1
+        return amplitude * mp.exp(-((yy + v) * x * x - 2 * xy * x * y + (xx + v) * y * y) / det / 2)
+
+    if footprint == "point":
+        return gaussian(x, y, mp.mpf(options.get("dilation", 0.3)), False)
+    if footprint == "mip":
+        return gaussian(x, y, mp.mpf(options.get("variance", 0.1)))
+    if footprint in ("box", "adaptive"):
+        samples = options.get("samples", 16)
+        v = {1: mp.mpf(1) / 12, 2: mp.mpf(1) / 48}.get(samples, mp.mpf(1) / (24 * samples))
+        nodes = reference.box_nodes(samples).tolist()
+        return sum(gaussian(x + mp.mpf(a), y + mp.mpf(b), v) for a, b in nodes) / samples
+    if footprint == "cumulant":
+        v = mp.mpf(1) / 12
+        det = (xx + v) * (yy + v) - xy * xy
+        a, b, c = (yy + v) / det, -xy / det, (xx + v) / det
+
+        def axis(p, t):
+            s = t / 12
+            c4 = 1 + mp.mpf(20) / 7 * s + mp.mpf("0.4366") * s * s
+            k2 = 1 + mp.mpf(10) / 7 * s + mp.mpf("0.6240") * s * s
+            k0 = 1 + mp.mpf(20) / 21 * s + mp.mpf("0.6975") * s * s
+            c6 = max(1 - s, mp.mpf("1e-6")) / 63
+            square = min(p * p, (c4 + mp.sqrt(c4 * c4 - 18 * c6 * t * k2)) / (3 * c6))
+            return square * (square * (c4 - c6 * square) - 6 * t * k2) + 3 * t * t * k0
+
+        h = (axis(a * x + b * y, a) + axis(b * x + c * y, c)) / 2880
+        return gaussian(x, y, v) * mp.exp(-h)
+    # The eigenframe.
+    gap = mp.sqrt((xx - yy) ** 2 + 4 * xy * xy)
+    angle = mp.atan2(2 * xy, xx - yy) / 2
+    l1 = (xx + yy + gap) / 2
+    s1, s2 = mp.sqrt(l1), mp.sqrt((xx * yy - xy * xy) / l1)
+    if footprint == "exact":
+        if yy > xx:
+            x, y, xx, yy = y, x, yy, xx
+        wide, rate = mp.sqrt(xx), xy / xx
+        narrow = mp.sqrt((xx * yy - xy * xy) / xx)
+        root = mp.sqrt(2) * narrow
+
+        def strip(t):
+            low, high = (y - mp.mpf(1) / 2 - rate * t) / root, (y + mp.mpf(1) / 2 - rate * t) / root
+            if low + high < 0:
+                low, high = -high, -low
+            return mp.exp(-t * t / (2 * xx)) * (mp.erfc(low) - mp.erfc(high))
+
+        begin, end = x - mp.mpf(1) / 2, x + mp.mpf(1) / 2
+        # Where the integrand turns: at its peak, and where an edge crosses the ridge.
+        turns = [mp.mpf(0)] + ([(y - 0.5) / rate, (y + 0.5) / rate] if rate else [])
+        width = min(wide, narrow / abs(rate)) if rate else wide
+        turns = [t + k * width for t in turns for k in (-8, -3, -1, 0, 1, 3, 8)]
+        points = sorted({begin, end, *(t for t in turns if begin < t < end)})
+        return mp.quad(strip, points) * mp.sqrt(mp.pi / 2) * narrow
+    u, v = x * mp.cos(angle) + y * mp.sin(angle), y * mp.cos(angle) - x * mp.sin(angle)
+
+    def window(u, s):
+        low, high = (abs(u) - mp.mpf(1) / 2) / s, (abs(u) + mp.mpf(1) / 2) / s
+        if footprint == "erf":
+            return (mp.erfc(low / mp.sqrt(2)) - mp.erfc(high / mp.sqrt(2))) / 2
+
+        def upper(z):  # 1 - S
+            f = mp.mpf("1.6") * z + mp.mpf("0.07") * z**3
+            return 1 / (1 + mp.exp(min(f, mp.mpf(10) ** 6)))
+
+        return upper(low) - upper(high)
+
+    return 2 * mp.pi * s1 * s2 * window(u, s1) * window(v, s2)
+
+
+def hard_weights():
+    """Covariances (n, 3) [px^2] and offsets (n, 2) [px]: every size, ratio and angle of the battery."""
+    shapes = [(s, s, 0.0) for s in (1e-6, 1e-3, 0.05, 0.3, 1.0, 30.0, 1e3, 1e6)]
+    shapes += [(1.0, 1 + 1e-7, 0.7), (0.2, 0.2 * (1 + 1e-7), 1.9), (3, 1, 0), (1, 3, 0), (0.3, 0.05, 0.4)]
+    shapes += [(30, 0.03, angle) for angle in (0, 0.4, math.pi / 2)] + [
+        (300, 1e-3, 1.2),
+        (1e3, 1, 2.5),
+        (30, 3e-5, 0.9),
+    ]
+    long, across, angle = torch.tensor(shapes, dtype=torch.float64).unbind(-1)
+    cov2d = scenes.covariance_2d(long, across, angle)
+    axes = torch.stack([torch.cos(angle), torch.sin(angle)], -1)
+    offsets = torch.tensor([[0.0, 0.0], [0.5, 0.5], [0.31, -0.22], [1.7, 0.6]], dtype=torch.float64).expand(
+        len(shapes), 4, 2
+    )
+    along = torch.stack([2 * axes * long[:, None].clamp(max=1e3), axes * long[:, None].clamp(max=20) + 0.2], 1)
+    offsets = torch.cat([offsets, along], 1)
+    return offsets.reshape(-1, 2), cov2d.repeat_interleave(6, 0)
+
+
+@every_footprint
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_weight_in_40_digits(variant, device, dtype):
+    """footprint_weight of hard covariances: within 40 roundings of its condition (hard_cases.py)."""
+    report = measure_weights(variant, device, dtype)
+    worst = (report["error"] / report["tolerance"]).argmax()
+    assert torch.isfinite(report["weight"]).all()
+    assert (report["error"] <= report["tolerance"]).all(), {k: v[worst].tolist() for k, v in report.items()}
+
+
+def measure_weights(variant, device, dtype, operations=40):
+    """Error of the weight and its tolerance, both relative to the peak of 1."""
+    footprint, options = variant
+    offsets, cov2d = (t.to(dtype) for t in hard_weights())
+    if footprint == "exact":  # 40-digit quadrature takes long
+        offsets, cov2d = offsets[::5], cov2d[::5]
+    weight = ar.footprint_weight(offsets.to(device), cov2d.to(device), footprint, **options).cpu().double()
+    g = torch.Generator().manual_seed(1)
+    errors, tolerances = [], []
+    with mpmath.workdps(40):
+        for i in range(len(weight)):
+            d, c = ([mpmath.mpf(v) for v in row.tolist()] for row in (offsets[i].double(), cov2d[i].double()))
+            exact = weight_in_40_digits(d, c, footprint, options)
+            errors.append(float(abs(mpmath.mpf(weight[i].item()) - exact)))
+            moved = 0.0
+            for _ in range(2):
+                sign = (torch.randint(0, 2, (5,), generator=g) * 2 - 1).tolist()
+                eps = mpmath.mpf(EPS[dtype])
+                size_d, size_c = max(map(abs, d)), [max(map(abs, c)) if c[1] else abs(v) for v in c]
+                near_d = [v + s * eps * size_d for v, s in zip(d, sign)]
+                near_c = [v + s * eps * size for v, s, size in zip(c, sign[2:], size_c)]
+                if near_c[0] * near_c[2] <= near_c[1] ** 2:  # not a covariance any more: anything goes
+                    moved = 1.0
+                    continue
+                moved = max(moved, float(abs(weight_in_40_digits(near_d, near_c, footprint, options) - exact)))
+            tolerances.append(operations * (moved + EPS[dtype]))
+    return {
+        "weight": weight,
+        "error": torch.tensor(errors, dtype=torch.float64),
+        "tolerance": torch.tensor(tolerances, dtype=torch.float64),
+        "offset": offsets.double(),
+        "cov2d": cov2d.double(),
+    }
+
+
+# --- the policy for bad numbers ----------------------------------------------------------------
+
+
+@hypothesis_settings(max_examples=60, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@given(seed=st.integers(0, 2**40))
+def test_fuzz(device, seed):
+    """What is culled leaves no trace, nothing spreads. `make fuzz` does it for as long as you like."""
+    fuzz.check(seed, device, torch.float32)
+    if device == "cpu":
+        fuzz.check(seed, device, torch.float64)
+
+
+def visible(dtype=torch.float32, device="cpu", precomputed=False):
+    """A camera and five large splats that it sees."""
+    camera, scene = hard_cases.axis_aligned()
+    return camera, scenes.cast(hard_cases.flat(scene) if precomputed else scene, dtype, device)
+
+
+@each_kind
+@each_precision
+@pytest.mark.parametrize("column", range(4))
+def test_a_quaternion_of_zeros_and_a_nan_is_culled(variant, device, dtype, column):
+    """Not the identity, which a zero quaternion stands for: max() may drop a NaN."""
+    camera, scene = visible(dtype, device)
+    scene["rotations"][2] = 0.0
+    scene["rotations"][2, column] = math.nan
+    settings = camera.settings(dtype, device, footprint=variant[0], **variant[1])
+    assert ar.GaussianRasterizer(settings)(**scene)[1].tolist()[2] == 0
+
+
+@each_kind
+@each_precision
+@pytest.mark.parametrize("variance", [-1.0, -0.05, -1e-4])
+def test_a_negative_covariance_is_culled(variant, device, dtype, variance):
+    """Its projection is negative definite, so that its determinant is positive, but no Gaussian."""
+    camera, scene = visible(dtype, device, precomputed=True)
+    scene["means3D"][2, :2] = 0.0  # straight ahead, where the variance along the line of sight adds nothing
+    size = (2.0 / hard_cases.FOCAL) ** 2  # 1 px^2
+    scene["cov3D_precomp"][2] = torch.tensor([variance, 0, 0, variance, 0, 9.0]) * size
+    settings = camera.settings(dtype, device, footprint=variant[0], **variant[1])
+    assert ar.GaussianRasterizer(settings)(**scene)[1].tolist()[2] == 0
+
+
+def test_a_needle_given_by_its_covariance_is_kept(device, best):
+    """Of ratio 1e4 and more its entries, in float32, often have a negative determinant: `point` draws it."""
+    angles = torch.linspace(0.1, 3.0, 20, dtype=torch.float64)
+    scene = hard_cases.splats([[20.3, 11.6]], torch.tensor([[30.0, 30.0e-5]]).expand(20, 2), angles, 0.9)
+    camera = hard_cases.CAMERA
+    settings = camera.settings(best, device, footprint="point")
+    for i in range(20):
+        one = {name: value[i : i + 1].float() for name, value in scene.items()}
+        entries = {
+            name: value.float() for name, value in hard_cases.flat({k: v.double() for k, v in one.items()}).items()
+        }
+        one["colors_precomp"] = entries["colors_precomp"]
+        del one["shs"]
+        expected, _ = ar.GaussianRasterizer(settings)(**scenes.cast(one, best, device))
+        image, radii = ar.GaussianRasterizer(settings)(**scenes.cast(entries, best, device))
+        assert radii[0] > 0
+        # Rounding moves Sigma by 2^-24 30^2 = 5e-5 px^2 across, of 0.3: alpha by 2e-4 of itself; 1/255 where it flips.
+        assert (image - expected).abs().max() < 1.1 / 255
+        assert ((image - expected).abs() > 1e-3).float().mean() < 0.02
+
+
+BAD = [
+    ("means3D", (3, 1), math.nan, "be finite"),
+    ("opacities", (1, 0), math.inf, "be finite"),
+    ("opacities", (4, 0), 1.5, r"be in \[0, 1\]"),
+    ("opacities", (4, 0), -0.25, r"be in \[0, 1\]"),
+    ("shs", (2, 0, 1), -math.inf, "be finite"),
+    ("scales", (0, 2), math.nan, "be finite"),
+    ("scales", (0, 2), -0.5, "not be negative"),
+    ("rotations", (4, 3), math.nan, "be finite"),
+    ("colors_precomp", (2, 1), math.nan, "be finite"),
+    ("cov3D_precomp", (1, 4), math.inf, "be finite"),
+    ("cov3D_precomp", (1, 3), -2.0, "not have negative variances"),
+]
+
+
+@pytest.mark.parametrize("name, index, value, expectation", BAD, ids=lambda v: str(v) if isinstance(v, str) else None)
+def test_debug_names_the_bad_number(device, name, index, value, expectation, tmp_path, monkeypatch):
+    """Tensor, first index and value; without debug nothing is raised, and the image is finite."""
+    monkeypatch.chdir(tmp_path)
+    camera, scene = visible(torch.float32, device, name in ("colors_precomp", "cov3D_precomp"))
+    settings = camera.settings(torch.float32, device, footprint="box", samples=2)
+    ar.GaussianRasterizer(settings._replace(debug=True))(**scene)
+    scene[name][index] = value
+    if name != "opacities":
+        scene[name][-1] = scene[name][-1]
+    pattern = rf"{name} must {expectation}, got {value} at \({', '.join(map(str, index))}\)"
+    with pytest.raises(ValueError, match=pattern):
+        ar.GaussianRasterizer(settings._replace(debug=True))(**scene)
+    assert [path.name for path in tmp_path.iterdir()] == ["snapshot_fw.dump"]
+    assert torch.isfinite(ar.GaussianRasterizer(settings)(**scene)[0]).all()
+
+
+CAMERA_TENSORS = {"viewmatrix": (2, 1), "projmatrix": (0, 3), "campos": (1,), "bg": (2,)}
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("name", CAMERA_TENSORS)
+def test_a_camera_that_is_not_finite_raises(device, name, value, tmp_path, monkeypatch):
+    """Always on the CPU; on CUDA, where looking at it would wait for the device, with debug."""
+    monkeypatch.chdir(tmp_path)
+    camera, scene = visible(torch.float32, device)
+    settings = camera.settings(torch.float32, device)._replace(debug=device == "cuda")
+    broken = getattr(settings, name).clone()
+    broken[CAMERA_TENSORS[name]] = value
+    index = re.escape(str(CAMERA_TENSORS[name]))
+    with pytest.raises(ValueError, match=rf"{name} must be finite, got {value} at {index}"):
+        ar.GaussianRasterizer(settings._replace(**{name: broken}))(**scene)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan, math.inf, 1e-60, 1e60])
+@pytest.mark.parametrize("name", ["tanfovx", "tanfovy", "scale_modifier"])
+def test_a_number_that_makes_no_camera_raises(device, name, value):
+    """On every device: they are numbers of Python. 1e-60 is zero, and 1e60 infinite, in float32."""
+    camera, scene = visible(torch.float32, device)
+    with pytest.raises(ValueError, match=f"{name} must be positive and finite"):
+        ar.GaussianRasterizer(camera.settings(torch.float32, device)._replace(**{name: value}))(**scene)
+
+
+@pytest.mark.parametrize("value", [0, -3, 2**21])
+@pytest.mark.parametrize("name", ["image_width", "image_height"])
+def test_a_size_that_makes_no_image_raises(device, name, value):
+    camera, scene = visible(torch.float32, device)
+    with pytest.raises(ValueError, match=rf"{name} must be in \[1, \d+\], got {value}"):
+        ar.GaussianRasterizer(camera.settings(torch.float32, device)._replace(**{name: value}))(**scene)
+
+
+def test_a_camera_that_sees_nothing_is_no_error(device):
+    """A singular projection, every Gaussian behind: the background, and zero gradients."""
+    camera, scene = visible(torch.float32, device)
+    settings = camera.settings(torch.float32, device)
+    behind = Camera(image_width=9, image_height=7, eye=(0.0, 0.0, 50.0), target=(0.0, 0.0, 60.0)).settings(
+        torch.float32, device
+    )
+    for s in (settings._replace(projmatrix=torch.zeros(4, 4, device=device)), behind):
+        leaves = scenes.leaves(scene)
+        color, radii = ar.GaussianRasterizer(s)(**leaves)
+        assert torch.equal(color, s.bg[:, None, None].expand_as(color))
+        assert (radii == 0).all()
+        color.sum().backward()
+        assert all((leaf.grad == 0).all() for leaf in leaves.values())
+
+
+# --- the document ------------------------------------------------------------------------------
+
+
+def test_the_document_has_every_case_and_every_test_it_names():
+    text = DOCUMENT.read_text()
+    for case in CASES:
+        assert f"`{case.name}`" in text, f"docs/stability.md has no row for {case.name}"
+    names = set(re.findall(r"\btest_\w+", text)) - {"test_stability"}
+    sources = "".join(path.read_text() for path in pathlib.Path(__file__).parent.glob("test_*.py"))
+    for name in names:
+        known = f"def {name}(" in sources or (DOCUMENT.parent.parent / "tests" / f"{name}.py").exists()
+        assert known, f"docs/stability.md names {name}, which does not exist"
