@@ -3,23 +3,18 @@
 import gc
 import os
 import pathlib
-import subprocess
-import sys
-import textwrap
 import threading
 
 import pytest
 import scenes
 import torch
-from conftest import ROOT, needs_cuda
+from conftest import DEADLINE, needs_cuda, run_python
 from scenes import KINDS, Camera, name_of
 
 import analytic_rasterizer as ar
 
 CAMERA = Camera(image_width=203, image_height=151, bg=(0.1, 0.5, 0.3), sh_degree=2)
 SMALL = Camera(image_width=20, image_height=17, sh_degree=1)
-DEADLINE = 120
-"""Seconds after which a subprocess counts as hanging; it needs a few, most of them to import torch."""
 
 each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
 
@@ -99,20 +94,6 @@ def test_memory_does_not_grow(device):
 # --- interrupts and exceptions -----------------------------------------------------------------
 
 
-def run_python(code, *arguments, **environment):
-    """Output of a fresh interpreter that runs `code` among the tests; fails where it hangs."""
-    paths = [str(ROOT), str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")]
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code), *arguments],
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))} | environment,
-        capture_output=True,
-        text=True,
-        timeout=DEADLINE,
-    )
-    assert done.returncode == 0, (done.returncode, done.stderr[-4000:])
-    return done.stdout
-
-
 INTERRUPTED = """
 import signal, sys, threading, time
 import torch
@@ -147,7 +128,7 @@ def test_keyboard_interrupts(device):
     assert run_python(INTERRUPTED, device) == "8\n"
 
 
-class Stop(Exception):
+class StopError(Exception):
     """Raised in the middle of a pass."""
 
 
@@ -168,14 +149,14 @@ def test_exceptions_leave_no_trace(device, variant):
     assert_identical(render(rasterizer, scene, device), expected)
 
     def stop(_):
-        raise Stop
+        raise StopError
 
     # Before the rasterizer's backward pass, and after it: what it saved is freed on the way out.
     for place in ("image", "means3D", "opacities"):
         leaves = scenes.leaves(scenes.to(scene, device))
         color, _ = rasterizer(**leaves)
         (color if place == "image" else leaves[place]).register_hook(stop)
-        with pytest.raises(Stop):
+        with pytest.raises(StopError):
             color.sum().backward()
         assert_identical(render(rasterizer, scene, device), expected)
 
