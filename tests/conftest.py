@@ -35,7 +35,7 @@ each_precision = pytest.mark.parametrize(
 
 def run_python(code, *arguments, **environment):
     """Output of a fresh interpreter that runs `code` among the tests; fails where it hangs."""
-    paths = [str(ROOT), str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")]
+    paths = [os.environ.get("PYTHONPATH", ""), str(ROOT), str(ROOT / "tests")]
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(code), *arguments],
         env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))} | environment,
