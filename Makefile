@@ -44,7 +44,7 @@ test-python: $(VENV)/.installed
 # Python tests of the extension built under the sanitizers, beside the usual one (docs/process-safety.md): ten minutes
 # to build, ten to run. libasan must come first in a process; libstdc++ with it, or exceptions find no handler.
 SANITIZED := $(BUILD)/python-sanitized
-SANITIZED_TESTS ?= tests/test_api.py tests/test_binning.py tests/test_determinism.py tests/test_process.py
+SANITIZED_TESTS ?= tests/test_api.py tests/test_determinism.py tests/test_process.py
 SANITIZED_SELECT ?= not exact and not memory and not instruction_sets and not another_process
 PRELOAD = $(foreach name,libasan.so libstdc++.so.6,$(shell $(CXX) -print-file-name=$(name)))
 test-python-sanitized: $(VENV)/.installed

@@ -35,10 +35,12 @@ each_precision = pytest.mark.parametrize(
 
 def run_python(code, *arguments, **environment):
     """Output of a fresh interpreter that runs `code` among the tests; fails where it hangs."""
-    paths = [os.environ.get("PYTHONPATH", ""), str(ROOT), str(ROOT / "tests")]
+    # Not in ROOT, whose package would come before the one that these tests were told to use.
+    given = [os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
     done = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(code), *arguments],
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, paths))} | environment,
+        cwd=ROOT / "tests",
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([*given, str(ROOT)])} | environment,
         capture_output=True,
         text=True,
         timeout=DEADLINE,
