@@ -57,8 +57,8 @@ template <typename T> Scene<T> make_scene(int n, int width, int height) {
 
 template <typename T>
 Rendered<T> run_stages(const cpu::Stages<T>& stages, const Scene<T>& scene, FootprintOptions options, int threads) {
-  return run_stages(stages, scene.camera.look(), scene.gaussians(), scene.background, scene.dL_dimage.data(), options,
-                    threads);
+  return test::run_stages(stages, scene.camera.look(), scene.gaussians(), scene.background, scene.dL_dimage.data(),
+                          options, threads);
 }
 
 /// The same from the definitions: every pixel visits every Gaussian that is not culled, in depth order.
