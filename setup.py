@@ -4,6 +4,8 @@ CUDA is built when torch was built with CUDA and a toolkit is found; no GPU need
 ANALYTIC_RASTERIZER_CUDA=0 leaves it out, ANALYTIC_RASTERIZER_CUDA=1 or FORCE_CUDA=1 insists on it.
 TORCH_CUDA_ARCH_LIST chooses the architectures; without it, those of the visible GPUs or, where there is
 none, a list that covers what the toolkit supports.
+ANALYTIC_RASTERIZER_SANITIZE=1 builds the CPU path under AddressSanitizer and UndefinedBehaviorSanitizer, for
+`make test-python-sanitized`: Python must be started with the sanitizer's library preloaded.
 """
 
 import os
@@ -66,6 +68,12 @@ else:
 # No -std: torch sets the standard that its headers need. No contraction: forward and backward must
 # round alike (csrc/core/lanes.h), and bits must not depend on the compiler's choices.
 COMPILE_ARGS = ["-O3", "-fopenmp", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi"]
+LINK_ARGS = ["-fopenmp"]  # libgomp by name only: the loader takes the copy that torch has already loaded
+if os.environ.get("ANALYTIC_RASTERIZER_SANITIZE") == "1":
+    # Checks as calls: see CMakeLists.txt. No vptr: it wants the type information of torch's hidden classes.
+    SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize=vptr", "-fno-sanitize-recover=all"]
+    COMPILE_ARGS += ["-O1", "-g1", *SANITIZERS, "--param", "asan-instrumentation-with-call-threshold=0"]
+    LINK_ARGS += SANITIZERS
 NVCC_ARGS = ["-O3", "--fmad=false", "--expt-relaxed-constexpr", "-Xcompiler", "-fno-gnu-unique"]
 
 
@@ -91,8 +99,7 @@ setup(
             include_dirs=[str(ROOT / "csrc")],
             define_macros=[("AR_WITH_CUDA", None)] if WITH_CUDA else [],
             extra_compile_args={"cxx": COMPILE_ARGS, "nvcc": NVCC_ARGS},
-            # libgomp by name only: the loader takes the copy that torch has already loaded.
-            extra_link_args=["-fopenmp"],
+            extra_link_args=LINK_ARGS,
         )
     ],
     cmdclass={"build_ext": Build},

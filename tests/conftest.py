@@ -1,7 +1,11 @@
 """Fixtures shared by the suite."""
 
 import importlib.util
+import os
 import pathlib
+import subprocess
+import sys
+import textwrap
 
 import pytest
 import torch
@@ -10,6 +14,8 @@ from analytic_rasterizer import _C
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared"
+DEADLINE = 180
+"""Seconds after which something counts as hanging; a fresh process needs a few, most of them to import torch."""
 
 needs_cuda = pytest.mark.skipif(
     not (_C.has_cuda and torch.cuda.is_available()),
@@ -25,6 +31,22 @@ each_precision = pytest.mark.parametrize(
         pytest.param("cuda", torch.float32, id="cuda-torch.float32", marks=needs_cuda),
     ],
 )
+
+
+def run_python(code, *arguments, **environment):
+    """Output of a fresh interpreter that runs `code` among the tests; fails where it hangs."""
+    # Not in ROOT, whose package would come before the one that these tests were told to use.
+    given = [os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code), *arguments],
+        cwd=ROOT / "tests",
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([*given, str(ROOT)])} | environment,
+        capture_output=True,
+        text=True,
+        timeout=DEADLINE,
+    )
+    assert done.returncode == 0, (done.returncode, done.stderr[-4000:])
+    return done.stdout
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=needs_cuda)])

@@ -1,10 +1,12 @@
-"""The same bits every time, for any number of threads, and for images and scenes of odd shape."""
+"""The same bits every time, for any number of threads, and for images and scenes of odd shape; and which bits
+depend on the instruction set.
+"""
 
 import pytest
 import scenes
 import torch
-from conftest import each_precision
-from scenes import KINDS, Camera, name_of
+from conftest import each_precision, run_python
+from scenes import KINDS, VARIANTS, Camera, name_of
 
 import analytic_rasterizer as ar
 
@@ -88,6 +90,115 @@ def test_other_gaussians_do_not_change_a_gradient_by_a_bit(device, variant):
     for a, b in zip(alone[1:8], together[1:8], strict=True):
         assert torch.equal(a, b[:50])
         assert (b[50:] == 0).all()
+
+
+# --- instruction sets --------------------------------------------------------------------------
+#
+# float64 runs the baseline's code at every level: not a bit differs. In float32 what is done once per Gaussian (radii,
+# means, depths, lists, the choice of `adaptive`) is scalar code without contraction: not a bit differs either. What is
+# done per pixel runs on packs. AVX2 and AVX-512 fuse multiply and add, the baseline does not; so the image has the same
+# bits on both of them and is rounded otherwise on the baseline. Gradients are sums over the lanes of a pack and differ
+# between all three.
+
+LEVELS = ("baseline", "avx2", "avx512")
+
+EVERY_RESULT = """
+import sys
+import torch
+import scenes, test_determinism as determinism
+import analytic_rasterizer as ar
+
+results = {}
+for variant in scenes.VARIANTS:
+    for dtype in (torch.float32, torch.float64):
+        torch.set_num_threads(1)
+        results[scenes.name_of(variant), dtype] = determinism.of_levels(variant, dtype)
+    torch.set_num_threads(3)
+    determinism.assert_identical(
+        results[scenes.name_of(variant), torch.float32], determinism.of_levels(variant, torch.float32)
+    )
+torch.save(results, sys.argv[1])
+print(ar.instruction_set(), end="")
+"""
+
+
+def of_levels(variant, dtype):
+    """What is compared: image, radii, gradients and stages of a scene with needles and splats of all sizes."""
+    scene = scenes.random_scene(1, 300, degree=2, sigma=(0.01, 0.4))
+    scene["means2D"] = torch.zeros(300, 4, dtype=torch.float64)
+    return everything(CAMERA, scene, variant, dtype)
+
+
+@pytest.fixture(scope="module")
+def levels(tmp_path_factory):
+    """Results of a process at each level that this machine has."""
+    folder = tmp_path_factory.mktemp("levels")
+    found = {}
+    for level in LEVELS:
+        if run_python(EVERY_RESULT, str(folder / level), ANALYTIC_RASTERIZER_ISA=level) == level:
+            found[level] = torch.load(folder / level)
+    assert "baseline" in found
+    return found
+
+
+def differences(first, second):
+    """Pixels that differ by more than rounding does, RMS of the image's others, relative L2 of the gradients."""
+    image, gradients = (first[0] - second[0]).abs().amax(0), slice(2, 8)
+    flips = image > ROUNDING
+    pairs = list(zip(first[gradients], second[gradients], strict=True))
+    assert not any(torch.isnan(a).any() or torch.isnan(b).any() for a, b in pairs)
+    worst = max(((a - b).norm() / a.norm()).item() for a, b in pairs)
+    return int(flips.sum()), image.max().item(), image[~flips].square().mean().sqrt().item(), worst
+
+
+# Off by more than this, one of the two sums has a term that the other has not: its alpha is 1/255 give or take
+# rounding. A fused operation leaves out a rounding of 6e-8 of coordinates up to 23 px from the tile's corner; before
+# a splat of 1 px that changes alpha by 1.4e-6 of itself, and the colours of a pixel add up to 2 at most.
+ROUNDING = 1e-5
+# A term that comes or goes weighs 1/255 of a difference of colours, which are below 2.
+FLIP = 2 / 255 + ROUNDING
+# Signs of roundings are random: what is left of them over the image are a few units in the last place of 1.
+TYPICAL = 4 * 2.0**-24
+# n terms that are added up in another order differ by sqrt(n) eps of their size, n = 1000 for a splat that fills four
+# tiles: 2e-6; the terms are some four times as large as their sum. A flip adds 1/255 of one of the terms.
+GRADIENT, GRADIENT_OF_FLIP = 8e-6, 1e-4
+
+
+@pytest.mark.parametrize("variant", VARIANTS, ids=name_of)
+def test_instruction_sets(levels, variant):
+    """Measured: baseline against the others 5e-7 in the image where nothing flips, 4e-8 RMS, 1.4e-6 of the gradients;
+    AVX2 against AVX-512 8e-7 of the gradients."""
+    name = name_of(variant)
+    baseline = levels["baseline"]
+    for level, results in levels.items():
+        assert_identical(results[name, torch.float64], baseline[name, torch.float64])
+        ours, theirs = results[name, torch.float32], baseline[name, torch.float32]
+        assert torch.equal(ours[1], theirs[1]), "radii"
+        assert_identical(ours[9:], theirs[9:])
+        flips, largest, typical, gradients = differences(theirs, ours)
+        print(f"{level}: {flips} flips, image {largest:.1e}, RMS {typical:.1e}, gradients {gradients:.1e}")
+        assert flips <= theirs[0][0].numel() / 1000
+        assert largest < FLIP
+        assert typical < TYPICAL
+        assert gradients < GRADIENT + flips * GRADIENT_OF_FLIP
+    if "avx512" in levels:
+        first, second = levels["avx2"][name, torch.float32], levels["avx512"][name, torch.float32]
+        assert torch.equal(first[0], second[0]), "image"
+        *_, gradients = differences(first, second)
+        assert gradients < GRADIENT
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_another_process_gives_the_same_bits(levels, dtype):
+    for variant in VARIANTS:
+        expected = levels[ar.instruction_set()][name_of(variant), dtype]
+        assert_identical(of_levels(variant, dtype), expected)
+
+
+def test_an_unknown_level_is_the_best(levels):
+    """A variable left over from another machine must not break a program."""
+    code = "import analytic_rasterizer as ar; print(ar.instruction_set(), end='')"
+    assert run_python(code, ANALYTIC_RASTERIZER_ISA="avx1024") == list(levels)[-1]
 
 
 # --- odd shapes --------------------------------------------------------------------------------

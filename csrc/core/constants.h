@@ -35,6 +35,10 @@ inline constexpr double kMaxLevel = 17.3;
 /// A splat is culled where det Sigma [px^4] is not below this, so that nothing derived from it
 /// overflows a float: standard deviations up to 3e7 px pass.
 inline constexpr double kMaxDet = 1e30;
+/// Scales beyond this, in world units, have squares that no float holds: degenerate.
+inline constexpr double kMaxScale = 1e18;
+/// Opacities and colours beyond these have products that no float holds: degenerate.
+inline constexpr double kMaxOpacity = 1e6, kMaxColor = 1e12;
 
 /// A negative det Sigma counts as zero where it is at most so much of Sigma_xx Sigma_yy, what rounding the entries of
 /// a cov3d to float can do (16 2^-24); beyond, the splat is culled.

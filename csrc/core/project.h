@@ -314,7 +314,7 @@ AR_HD bool splat_color(const Camera<T>& camera, const Gaussians<T>& g, int64_t i
     sh_basis(g.sh_degree, view_direction(camera, g.means[i]).unit, basis);
     color = sh_color(g.sh_degree, basis, sh);
   }
-  const bool finite = within(color.x, 1e18) && within(color.y, 1e18) && within(color.z, 1e18);
+  const bool finite = within(color.x, kMaxColor) && within(color.y, kMaxColor) && within(color.z, kMaxColor);
   if (!g.colors) color = {max(color.x, T(0)), max(color.y, T(0)), max(color.z, T(0))};
   return finite;
 }
@@ -364,7 +364,11 @@ AR_HD int project_shape(const Camera<T>& camera, const Gaussians<T>& g, int64_t 
   const ProjectedMean<T> mean = project_mean(camera, g.means[i]);
   splat.level = T(0);
   if (!mean.valid) return 0;
-  const Cov2d<T> cov = project_covariance(camera, g, i, mean.view).cov;
+  const Factors<T> factors = project_covariance(camera, g, i, mean.view);
+  if (g.scales &&
+      !(within(factors.scale.x, kMaxScale) && within(factors.scale.y, kMaxScale) && within(factors.scale.z, kMaxScale)))
+    return 0;
+  const Cov2d<T>& cov = factors.cov;
   if (!(cov.det >= T(0) && cov.det < T(kMaxDet) && cov.xx >= T(0) && cov.yy >= T(0)) || !within(cov.xx, 1e18) ||
       !within(cov.yy, 1e18))
     return 0;
@@ -374,7 +378,8 @@ AR_HD int project_shape(const Camera<T>& camera, const Gaussians<T>& g, int64_t 
       !within(w.yy, kMaxWhitening))
     return 0;
   const T opacity = g.opacities[i], level = F::level(splat.shape, opacity);
-  if (!within(level, 1e6)) return 0;  // zero, negative or non-finite opacity, zero determinant
+  if (!within(level, 1e6) || opacity > T(kMaxOpacity))
+    return 0;  // zero, negative or non-finite opacity, zero determinant
   const int radius = splat_radius(cov, T(F::radius_variance(options)));
   const bool on_image = mean.pixel.x + T(radius) >= T(0) && mean.pixel.x - T(radius) <= camera.size.x - T(1) &&
                         mean.pixel.y + T(radius) >= T(0) && mean.pixel.y - T(radius) <= camera.size.y - T(1);

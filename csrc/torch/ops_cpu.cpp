@@ -1,6 +1,9 @@
 // The ops on CPU tensors: check, sizes, allocate, launch.
 #include <ATen/Parallel.h>
 #include <torch/library.h>
+#if defined(__unix__) || defined(__APPLE__)
+#include <pthread.h>
+#endif
 
 #include <array>
 #include <chrono>
@@ -14,6 +17,15 @@ namespace ar::ops {
 namespace {
 
 using cpu::Stages;
+
+bool is_forked = false;
+#if defined(__unix__) || defined(__APPLE__)
+[[maybe_unused]] const int kWatchesForks = pthread_atfork(nullptr, nullptr, [] { is_forked = true; });
+#endif
+
+/// Threads of a loop: as many as torch's, but one in a forked child. fork() leaves the threads of OpenMP's pool
+/// behind, and libgomp would wait for them forever.
+int thread_count() { return is_forked ? 1 : at::get_num_threads(); }
 
 template <typename T> const Stages<T>& stages_of(const std::string& footprint) {
   return found(cpu::find_stages<T>(footprint), footprint);
@@ -31,7 +43,7 @@ template <typename T> Projected project(const Inputs& in, const Stages<T>& stage
   cpu::ProjectTask<T> task{camera_of<T>(in),
                            gaussians_of<T>(in),
                            footprint_options(in.option),
-                           at::get_num_threads(),
+                           thread_count(),
                            flags.data(),
                            offsets.data(),
                            {},
@@ -67,7 +79,7 @@ template <typename T> Binned bin(const Inputs& in, const Projected& projected, c
   task.depths = projected.depths.template const_data_ptr<T>();
   task.n = n;
   task.grid = grid;
-  task.threads = at::get_num_threads();
+  task.threads = thread_count();
   task.tile_offsets = out.tile_offsets.template data_ptr<int64_t>();
   task.splat_offsets = keep ? out.splat_offsets.template data_ptr<int64_t>() : nullptr;
   stages.count_pairs(task);
@@ -87,7 +99,7 @@ Tensor choose(const Inputs& in, const Projected& projected, const Binned& binned
   const Tensor out = at::empty({stages.choose ? grid.tiles() : 0}, binned.pairs.options());
   if (stages.choose) {
     stages.choose({projected.splats.template const_data_ptr<T>(), binned.pairs.const_data_ptr<int32_t>(),
-                   binned.tile_offsets.const_data_ptr<int64_t>(), grid, at::get_num_threads(),
+                   binned.tile_offsets.const_data_ptr<int64_t>(), grid, thread_count(),
                    in.background.const_data_ptr<T>(), footprint_options(in.option), out.data_ptr<int32_t>()});
   }
   return out;
@@ -113,7 +125,7 @@ BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& b
   BlendedImage out{at::empty({3, in.image_height, in.image_width}, options), make(options),
                    make(options.dtype(at::kInt))};
   stages.blend({projected.splats.template const_data_ptr<T>(), binned.pairs.const_data_ptr<int32_t>(),
-                binned.tile_offsets.const_data_ptr<int64_t>(), grid_of(in), at::get_num_threads(),
+                binned.tile_offsets.const_data_ptr<int64_t>(), grid_of(in), thread_count(),
                 samples_or_null(tile_samples), in.background.const_data_ptr<T>(), out.color.template data_ptr<T>(),
                 keep ? out.transmittance.template data_ptr<T>() : nullptr,
                 keep ? out.last.template data_ptr<int32_t>() : nullptr});
@@ -238,7 +250,7 @@ Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const Op
     auto* sums = reinterpret_cast<PairGrad<T>*>(pair_grads.data_ptr<T>());
     auto* abs2d = absolute ? reinterpret_cast<Vec2<T>*>(pair_abs.data_ptr<T>()) : nullptr;
     const Tensor g = dL_dcolor.contiguous();
-    const int threads = at::get_num_threads();
+    const int threads = thread_count();
     stages.blend_vjp({splats.const_data_ptr<T>(), pairs.const_data_ptr<int32_t>(),
                       tile_offsets.const_data_ptr<int64_t>(), grid_of(in), threads, samples_or_null(tile_samples),
                       in.background.const_data_ptr<T>(), transmittance.const_data_ptr<T>(),
@@ -309,7 +321,7 @@ Tensor footprint_weight_cpu(const Tensor& offset, const Tensor& cov2d, std::stri
   const Tensor out = at::empty(offset.sizes().slice(0, offset.dim() - 1), offset.options());
   AT_DISPATCH_FLOATING_TYPES(offset.scalar_type(), "footprint_weight", [&] {
     auto task = weight_task<cpu::WeightTask<scalar_t>, scalar_t>(d, c, option);
-    task.threads = at::get_num_threads();
+    task.threads = thread_count();
     task.weights = out.data_ptr<scalar_t>();
     stages_of<scalar_t>(footprint).weight(task);
   });
@@ -325,7 +337,7 @@ std::tuple<Tensor, Tensor> footprint_weight_vjp_cpu(const Tensor& dL_dweight, co
                dL_dcov = at::empty(cov2d.sizes(), cov2d.options());
   AT_DISPATCH_FLOATING_TYPES(offset.scalar_type(), "footprint_weight_vjp", [&] {
     auto task = weight_task<cpu::WeightTask<scalar_t>, scalar_t>(d, c, option);
-    task.threads = at::get_num_threads();
+    task.threads = thread_count();
     task.dL_dweights = g.const_data_ptr<scalar_t>();
     task.dL_doffsets = reinterpret_cast<Vec2<scalar_t>*>(dL_doffset.data_ptr<scalar_t>());
     task.dL_dcovs = reinterpret_cast<Sym2<scalar_t>*>(dL_dcov.data_ptr<scalar_t>());

@@ -2,10 +2,10 @@
 #include <algorithm>
 #include <cstring>
 #include <numeric>
-#include <utility>
 
 #include "core/blend.h"
 #include "instruction_sets.h"
+#include "stages.h"
 #include "support.h"
 
 namespace ar::test {
@@ -55,84 +55,10 @@ template <typename T> Scene<T> make_scene(int n, int width, int height) {
   return scene;
 }
 
-/// What the stages write. Gradients lie in one array: means, scales, rotations, opacities, colours, means2d.
-template <typename T> struct Rendered {
-  std::vector<T> image, grads;
-  std::vector<int32_t> radii;
-  int64_t pairs = 0;
-};
-
-template <typename T> struct GradArrays {
-  std::vector<T> all;
-  GaussianGrads<T> views = {};
-  explicit GradArrays(int64_t n) : all(18 * n, T(-7)) {
-    T* p = all.data();
-    views.means = reinterpret_cast<Vec3<T>*>(p);
-    views.scales = reinterpret_cast<Vec3<T>*>(p + 3 * n);
-    views.rotations = reinterpret_cast<Vec4<T>*>(p + 6 * n);
-    views.opacities = p + 10 * n;
-    views.colors = reinterpret_cast<Vec3<T>*>(p + 11 * n);
-    views.means2d = p + 14 * n;
-    views.means2d_stride = 4;
-  }
-};
-
 template <typename T>
 Rendered<T> run_stages(const cpu::Stages<T>& stages, const Scene<T>& scene, FootprintOptions options, int threads) {
-  const Gaussians<T> gaussians = scene.gaussians();
-  const TileGrid grid = {scene.camera.width, scene.camera.height};
-  const int64_t plane = int64_t(grid.width) * grid.height;
-  Rendered<T> out;
-  out.radii.resize(gaussians.n);
-  std::vector<uint8_t> candidates(gaussians.n);
-  std::vector<int64_t> chunk_offsets(cpu::chunks_of(gaussians.n) + 1);
-  cpu::ProjectTask<T> project = {scene.camera.look(),  gaussians, options, threads, candidates.data(),
-                                 chunk_offsets.data(), {},        {},      {},      out.radii.data()};
-  stages.count_candidates(project);
-  int64_t n = 0;
-  for (int64_t& offset : chunk_offsets) n += std::exchange(offset, n);
-  std::vector<T> splats(n * kSplatWidth), depths(n);
-  std::vector<int32_t> ids(n);
-  project.splats = splats.data();
-  project.depths = depths.data();
-  project.ids = ids.data();
-  stages.project(project);
-
-  std::vector<int64_t> tile_offsets(grid.tiles() + 1), splat_offsets(n + 1);
-  cpu::BinTask<T> bin = {};
-  bin.splats = splats.data();
-  bin.depths = depths.data();
-  bin.n = n;
-  bin.grid = grid;
-  bin.threads = threads;
-  bin.tile_offsets = tile_offsets.data();
-  bin.splat_offsets = splat_offsets.data();
-  stages.count_pairs(bin);
-  out.pairs = tile_offsets.back();
-  std::vector<int32_t> pairs(out.pairs);
-  std::vector<int64_t> positions(out.pairs);
-  bin.pairs = pairs.data();
-  bin.positions = positions.data();
-  stages.scatter_pairs(bin);
-
-  out.image.resize(3 * plane);
-  std::vector<T> transmittance(stages.samples * plane);
-  std::vector<int32_t> last(stages.samples * plane);
-  // As many samples as the definition below takes; what `adaptive` chooses is tested from Python.
-  const std::vector<int32_t> samples(grid.tiles(), stages.samples);
-  const int32_t* tile_samples = stages.choose ? samples.data() : nullptr;
-  stages.blend({splats.data(), pairs.data(), tile_offsets.data(), grid, threads, tile_samples, scene.background,
-                out.image.data(), transmittance.data(), last.data()});
-
-  std::vector<PairGrad<T>> pair_grads(out.pairs);
-  std::vector<Vec2<T>> pair_abs(out.pairs);
-  GradArrays<T> grads(gaussians.n);
-  stages.blend_vjp({splats.data(), pairs.data(), tile_offsets.data(), grid, threads, tile_samples, scene.background,
-                    transmittance.data(), last.data(), scene.dL_dimage.data(), pair_grads.data(), pair_abs.data()});
-  stages.project_vjp({scene.camera.look(), gaussians, options, threads, ids.data(), n, splat_offsets.data(),
-                      positions.data(), pair_grads.data(), pair_abs.data(), grads.views});
-  out.grads = std::move(grads.all);
-  return out;
+  return test::run_stages(stages, scene.camera.look(), scene.gaussians(), scene.background, scene.dL_dimage.data(),
+                          options, threads);
 }
 
 /// The same from the definitions: every pixel visits every Gaussian that is not culled, in depth order.
