@@ -43,11 +43,10 @@ test-sanitized: $(VENV)/.tools
 test-python: $(VENV)/.installed
 	$(BIN)/python -m pytest -q
 
-<<<<<<< HEAD
 # Random scenes with bad numbers in them, until one breaks a promise of docs/stability.md.
 fuzz: $(VENV)/.installed
 	$(BIN)/python tests/fuzz.py --seconds $(FUZZ_SECONDS)
-=======
+
 # Python tests of the extension built under the sanitizers, beside the usual one (docs/process-safety.md): ten minutes
 # to build, ten to run. libasan must come first in a process; libstdc++ with it, or exceptions find no handler.
 SANITIZED := $(BUILD)/python-sanitized
@@ -67,7 +66,6 @@ fuzz-core: $(VENV)/.tools
 	$(CMAKE) -S . -B $(BUILD)/sanitized -DAR_SANITIZE=ON
 	$(CMAKE) --build $(BUILD)/sanitized -j $(JOBS) --target fuzz_core
 	$(BUILD)/sanitized/fuzz_core $(SEED) $(SEEDS)
->>>>>>> safe
 
 bench: $(VENV)/.installed
 	[ -e $(SCENE) ] || $(MAKE) demo

@@ -1,9 +1,8 @@
 #include "torch/checks.h"
 
-#include "core/params.h"
-
 #include <sstream>
 
+#include "core/params.h"
 #include "core/sh.h"
 
 namespace ar::ops {

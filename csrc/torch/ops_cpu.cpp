@@ -287,7 +287,7 @@ ChannelsOutput rasterize_channels_cpu(const Tensor& colors, const Tensor& bg, in
     check_fit(splats, ids, tile_offsets, tile_samples, grid, stages.choose != nullptr);
     own.narrow(1, kSplatColor, 3).copy_(colors.index_select(0, ids));
     stages.blend({own.const_data_ptr<scalar_t>(), pairs.const_data_ptr<int32_t>(),
-                  tile_offsets.const_data_ptr<int64_t>(), grid, at::get_num_threads(), samples_or_null(tile_samples),
+                  tile_offsets.const_data_ptr<int64_t>(), grid, thread_count(), samples_or_null(tile_samples),
                   background.const_data_ptr<scalar_t>(), image.data_ptr<scalar_t>(), nullptr, nullptr});
   });
   const auto none = [](const Tensor& like) { return at::empty({0}, like.options()); };
@@ -308,7 +308,7 @@ InspectOutput inspect_cpu(const Tensor& splats, const Tensor& ids, const Tensor&
     const Stages<scalar_t>& stages = stages_of<scalar_t>(footprint);
     check_fit(splats, ids, tile_offsets, tile_samples, grid, stages.choose != nullptr);
     stages.inspect({splats.const_data_ptr<scalar_t>(), ids.const_data_ptr<int32_t>(), pairs.const_data_ptr<int32_t>(),
-                    tile_offsets.const_data_ptr<int64_t>(), grid, at::get_num_threads(), samples_or_null(tile_samples),
+                    tile_offsets.const_data_ptr<int64_t>(), grid, thread_count(), samples_or_null(tile_samples),
                     median.data_ptr<int32_t>(), dominant.data_ptr<int32_t>(), touched.data_ptr<int32_t>(),
                     largest.data_ptr<int32_t>(), total.data_ptr<int64_t>()});
   });
