@@ -166,6 +166,8 @@ def rasterize_gaussians(
     gaussians = (means3D, means2D, opacities, *rest)
     debug, effects = bool(raster_settings.debug), raster_settings.effects
     if not _effects.is_plain(effects, rest[1], raster_settings.bg):
+        if debug:
+            _check_gaussians(*gaussians)  # of all channels; the op sees three
         rasterize = _DebugRasterize.apply if debug else torch.ops.analytic_rasterizer.rasterize
         settings = _settings_arguments(raster_settings, device)
         color, radii, outputs = _effects.render(rasterize, gaussians, settings, effects or Effects(), debug)

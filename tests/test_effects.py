@@ -240,6 +240,14 @@ def test_a_feature_that_is_not_finite_culls_its_gaussian_alone(device, best):
         assert (leaf.grad[4] == 0).all(), name
 
 
+def test_debug_names_the_channel_that_is_not_finite(device):
+    scene = colored(scenes.cast(scenes.random_scene(13, 30), torch.float32), 6)
+    scene["colors_precomp"][4, 5] = torch.nan
+    settings = with_bg(CAMERA.settings(torch.float32, footprint="box")._replace(debug=True), torch.zeros(6))
+    with pytest.raises(ValueError, match=r"colors_precomp must be finite, got nan at \(4, 5\)"):
+        ar.GaussianRasterizer(scenes.settings_to(settings, device))(**scenes.to(scene, device))
+
+
 @pytest.mark.parametrize(
     "colors, bg, message",
     [
