@@ -15,6 +15,7 @@ MAX_CHANNELS = 512
 NEAR = 0.2  # camera-space z up to which everything is culled
 _GROUP = 3  # channels that are blended at once
 _UNIT = 2.0**-32  # of sums of weights
+_COLOR = slice(9, 12)  # of a row of splats: kSplatColor in csrc/core/params.h
 
 
 @dataclass(frozen=True)
@@ -225,13 +226,13 @@ class _Channels(torch.autograd.Function):
     def forward(ctx, colors, bg, means3D, means2D, opacities, scales, rotations, cov3D, settings, debug, *saved):
         view, proj, campos, height, width, *rest = settings
         splats, ids, pairs, offsets, splat_offsets, positions, transmittance, last, _, _, counts, samples = saved
-        image, *own = torch.ops.analytic_rasterizer.rasterize_channels(
+        image, _, *own = torch.ops.analytic_rasterizer.rasterize_channels(
             colors, bg, height, width, *rest[-2:], splats, ids, pairs, offsets, counts, samples,
             any(ctx.needs_input_grad), debug,
         )  # fmt: skip
         ctx.save_for_backward(
             means3D, means2D, opacities, colors, scales, rotations, cov3D, bg, view, proj, campos,
-            *own, ids, pairs, offsets, splat_offsets, positions, transmittance, last, samples,
+            splats, *own, ids, pairs, offsets, splat_offsets, positions, transmittance, last, samples,
         )  # fmt: skip
         ctx.numbers, ctx.debug = (height, width, *rest), debug
         return image
@@ -244,6 +245,8 @@ class _Channels(torch.autograd.Function):
             splats, checkpoints, chunks, counts, ids, pairs, offsets, splat_offsets, positions, transmittance, last,
             samples,
         ) = ctx.saved_tensors  # fmt: skip
+        splats = splats.clone()  # with the colours again, rather than kept for every group
+        splats[:, _COLOR] = colors if splats.is_cuda else colors[ids.long()]
         inputs = (means3D, means2D, opacities, None, colors, scales, rotations, cov3D)
         wanted = ctx.needs_input_grad
         needs = [wanted[2], wanted[3], wanted[4], False, wanted[0], wanted[5], wanted[6], wanted[7]]
