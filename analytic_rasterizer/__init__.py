@@ -17,6 +17,7 @@ from .footprints import (
     set_default_footprint,
 )
 from .ops import TILE
+from .plan import needed_sh_degree
 from .rasterizer import (
     GaussianRasterizationSettings,
     GaussianRasterizer,
@@ -42,6 +43,7 @@ __all__ = [
     "footprint_weight",
     "get_default_footprint",
     "instruction_set",
+    "needed_sh_degree",
     "normalized",
     "rasterize_gaussians",
     "render_stages",

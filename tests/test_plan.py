@@ -1,0 +1,72 @@
+"""What a scene calls for."""
+
+import math
+
+import pytest
+import reference
+import scenes
+import torch
+from scenes import Camera
+
+import analytic_rasterizer as ar
+from analytic_rasterizer.plan import sh_band_bounds
+
+
+def scene_with_bands(seed, scales, count=60):
+    """A scene whose band of degree l has coefficients of the size scales[l]."""
+    scene = scenes.random_scene(seed, count, degree=len(scales) - 1)
+    factors = torch.cat([torch.full((2 * band + 1,), scale) for band, scale in enumerate(scales)])
+    scene["shs"] = scene["shs"] * factors[:, None]
+    return scene
+
+
+def test_bounds_hold_for_every_direction_and_are_reached():
+    """A band whose coefficients are the harmonics of one direction adds the most there."""
+    shs = torch.randn(40, 16, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    directions = torch.nn.functional.normalize(torch.randn(2000, 3, dtype=torch.float64), dim=1)
+    basis = reference.spherical_harmonics(3, directions)
+    bounds = sh_band_bounds(shs)
+    for band, bound in enumerate(bounds):
+        used = slice(band**2, (band + 1) ** 2)
+        added = torch.einsum("dk,pkc->dpc", basis[:, used], shs[:, used])
+        assert added.abs().max() <= bound * (1 + 1e-12)
+        aligned = basis[7, used] / basis[7, used].norm()
+        alone = torch.zeros(1, 16, 3, dtype=torch.float64)
+        alone[0, used, 1] = aligned
+        assert math.isclose(sh_band_bounds(alone)[band], (basis[7, used] @ aligned).item(), rel_tol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "scales", [(1, 1e-4, 1e-5, 1e-5), (1, 0.3, 1e-4, 1e-4), (1, 0.3, 0.3, 1e-4), (1, 0.3, 0.3, 0.3)]
+)
+def test_needed_degree_renders_within_the_tolerance(device, best, scales):
+    scene = scenes.cast(scene_with_bands(3, scales), best)
+    degree = ar.needed_sh_degree(scene["shs"])
+    assert degree == [scale > 1e-4 for scale in scales].count(True) - 1
+    images = {}
+    for used in {degree, 3, max(0, degree - 1)}:
+        camera = Camera(image_height=29, image_width=37, sh_degree=used)
+        images[used] = ar.GaussianRasterizer(camera.settings(best, device, footprint="box"))(
+            **scenes.to(scene, device)
+        )[0]
+    assert (images[degree] - images[3]).abs().max() <= 1 / 255
+    if degree > 0:  # and one degree less shows
+        assert (images[degree - 1] - images[3]).abs().max() > 1 / 255
+
+
+def test_a_scene_of_one_colour_per_gaussian_needs_no_band():
+    scene = scenes.random_scene(1, 20, degree=3)
+    scene["shs"][:, 1:] = 0
+    assert ar.needed_sh_degree(scene["shs"], tolerance=0) == 0
+    assert ar.needed_sh_degree(scene["shs"][:, :1], tolerance=0) == 0
+    assert ar.needed_sh_degree(scene["shs"][:0]) == 0
+
+
+def test_bad_numbers_and_arguments():
+    shs = torch.zeros(5, 16, 3)
+    shs[2, 12, 0] = torch.nan
+    assert ar.needed_sh_degree(shs) == 3
+    with pytest.raises(ValueError, match=r"shs must have shape \(P, M, 3\) with M = 1, 4, 9 or 16, got \(5, 8, 3\)"):
+        ar.needed_sh_degree(shs[:, :8])
+    with pytest.raises(ValueError, match="tolerance must be finite and not negative, got -1"):
+        ar.needed_sh_degree(shs, -1)
