@@ -13,8 +13,9 @@ MAX_SH_DEGREE = 3
 def sh_band_bounds(shs: torch.Tensor) -> list[float]:
     """The most that each band of spherical harmonics adds to a colour of the scene, seen from anywhere.
 
-    A band of degree l with coefficients c_m adds sum_m c_m Y_m, at most |c| sqrt((2l + 1) / (4 pi)): Cauchy and Schwarz,
-    and the addition theorem. Blending weights add up to 1 at most, so that no pixel changes by more than a Gaussian does.
+    A band of degree l with coefficients c_m adds sum_m c_m Y_m, at most |c| sqrt((2l + 1) / (4 pi)): Cauchy and
+    Schwarz, and the addition theorem. Blending weights add up to 1 at most, so that no pixel changes by more than a
+    Gaussian does.
 
     Args:
         shs: (P, M, 3) coefficients, M = 1, 4, 9 or 16.
@@ -37,8 +38,8 @@ def sh_band_bounds(shs: torch.Tensor) -> list[float]:
 def needed_sh_degree(shs: torch.Tensor, tolerance: float = 1 / 255) -> int:
     """The smallest degree that renders within the tolerance of all of them, whatever the view.
 
-    Set as `sh_degree` of the settings it saves reading and computing the bands above. Waits for the device once: find it
-    out once per scene.
+    Set as `sh_degree` of the settings it saves reading and computing the bands above. Waits for the device: to be
+    called once per scene.
 
     Args:
         shs: (P, M, 3) coefficients, M = 1, 4, 9 or 16.
