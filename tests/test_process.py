@@ -99,6 +99,7 @@ import signal, sys, threading, time
 import torch
 import scenes, test_process as process
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background inherits that it is ignored
 device = sys.argv[1]
 torch.set_num_threads(2)
 variant = ("box", {"samples": 16})
