@@ -165,7 +165,7 @@ def _look(effects: Effects, means3D: torch.Tensor, view: torch.Tensor, saved: li
     )
     outputs = {}
     if effects.median_depth:
-        z = _depths(means3D, view)
+        z = depths(means3D, view)
         of_pixel = z[median.clamp_min(0).long()] if len(z) else z.new_zeros(median.shape)
         outputs["median_depth"] = torch.where(median < 0, 0, of_pixel)[None]
     if effects.dominant_index:
@@ -175,7 +175,7 @@ def _look(effects: Effects, means3D: torch.Tensor, view: torch.Tensor, saved: li
     return outputs
 
 
-def _depths(means3D: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
+def depths(means3D: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
     """Camera-space z, (P,)."""
     view = view.detach().reshape(4, 4)
     return means3D @ view[:3, 2] + view[3, 2]
@@ -187,7 +187,7 @@ def _features(effects: Effects, means3D: torch.Tensor, view: torch.Tensor, with_
     if effects.alpha or with_alpha:
         features["alpha"] = torch.ones_like(means3D[:, :1])
     if effects.depth or effects.inverse_depth:
-        z = _depths(means3D, view)[:, None]
+        z = depths(means3D, view)[:, None]
         z = torch.where(z > NEAR, z, 1)  # the others are culled, and 0 times infinity would not be
         features |= {"depth": z} if effects.depth else {}
         features |= {"inverse_depth": 1 / z} if effects.inverse_depth else {}

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import torch
 
-from .effects import NEAR
+from .effects import NEAR, depths
 from .rasterizer import GaussianRasterizationSettings
 
 VARIANCE = 0.2  # of the filter, in squares of the finest sampling interval
@@ -43,9 +43,8 @@ def compute_3d_filter(
         raise ValueError("cameras must hold the settings of at least one view, got none")
     interval = means3D.new_full((len(means3D),), torch.inf)
     for camera in cameras:
-        view = camera.viewmatrix.reshape(4, 4).to(means3D)
         clip = camera.projmatrix.reshape(4, 4).to(means3D)
-        z = means3D @ view[:3, 2] + view[3, 2]
+        z = depths(means3D, camera.viewmatrix.to(means3D))
         projected = means3D @ clip[:3] + clip[3]
         inside = (projected[:, :2].abs() <= (1 + 2 * MARGIN) * projected[:, 3:].abs()).all(1)
         # The finer of the two axes.

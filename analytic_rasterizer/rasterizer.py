@@ -276,7 +276,7 @@ class GaussianRasterizer(torch.nn.Module):
         if positions.dtype != view.dtype:
             raise TypeError(f"positions must have dtype {view.dtype}, got {positions.dtype}")
         with torch.no_grad():
-            return positions @ view[:3, 2] + view[3, 2] > 0.2
+            return _effects.depths(positions, view) > _effects.NEAR
 
     def forward(
         self,

@@ -6,6 +6,7 @@ import pathlib
 import subprocess
 import sys
 import textwrap
+import threading
 
 import pytest
 import torch
@@ -47,6 +48,15 @@ def run_python(code, *arguments, **environment):
     )
     assert done.returncode == 0, (done.returncode, done.stderr[-4000:])
     return done.stdout
+
+
+def in_threads(count, work):
+    """Calls work(0) ... work(count - 1) side by side and waits for all."""
+    threads = [threading.Thread(target=work, args=(i,)) for i in range(count)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=needs_cuda)])

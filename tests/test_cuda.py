@@ -6,14 +6,13 @@ rare pixels. Everything else agrees closely, and CUDA agrees with itself to the 
 """
 
 import math
-import threading
 from dataclasses import replace
 from typing import NamedTuple
 
 import pytest
 import scenes
 import torch
-from conftest import needs_cuda
+from conftest import in_threads, needs_cuda
 from scenes import KINDS, VARIANTS, Camera, name_of
 
 import analytic_rasterizer as ar
@@ -383,11 +382,7 @@ def test_threads(variant):
         with torch.cuda.stream(torch.cuda.Stream()):
             results[i].extend(run(both[names[i]], settings, "cuda") for _ in range(5))
 
-    threads = [threading.Thread(target=work, args=(i,)) for i in range(len(names))]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    in_threads(len(names), work)
     for name, several in zip(names, results, strict=True):
         assert len(several) == 5
         for result in several:

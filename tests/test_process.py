@@ -8,7 +8,7 @@ import threading
 import pytest
 import scenes
 import torch
-from conftest import DEADLINE, needs_cuda, run_python
+from conftest import DEADLINE, in_threads, needs_cuda, run_python
 from scenes import KINDS, Camera, name_of
 
 import analytic_rasterizer as ar
@@ -216,11 +216,7 @@ def test_python_threads(device, openmp_threads):
         for _ in range(2):
             results[i].append(render(rasterizers[i], scene, device))
 
-    threads = [threading.Thread(target=work, args=(i,)) for i in range(len(KINDS))]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    in_threads(len(KINDS), work)
     for several, one in zip(results, expected, strict=True):
         assert len(several) == 2
         for result in several:
@@ -243,11 +239,7 @@ def test_one_scene_shared_by_threads():
     def work(i):
         results[i] = gradients()
 
-    threads = [threading.Thread(target=work, args=(i,)) for i in range(len(results))]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    in_threads(len(results), work)
     for result in results:
         assert_identical(result, expected)
 
@@ -268,11 +260,7 @@ def test_both_devices_at_once(variant):
             for _ in range(4):
                 results[i].append(render(rasterizers[devices[i]], scene, devices[i]))
 
-    threads = [threading.Thread(target=work, args=(i,)) for i in range(len(devices))]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    in_threads(len(devices), work)
     for device, several in zip(devices, results, strict=True):
         assert len(several) == 4
         for result in several:
