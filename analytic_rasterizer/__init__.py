@@ -6,7 +6,7 @@ A drop-in replacement for `diff_gaussian_rasterization`. See the README for how 
 import torch  # noqa: F401  (its libraries must be loaded before the extension's)
 
 from ._C import instruction_set
-from .effects import Effects, GaussianStats, Outputs, normalized
+from .effects import Defocus, Effects, GaussianStats, Motion, Outputs, normalized
 from .filters import apply_3d_filter, compute_3d_filter
 from .footprints import (
     FOOTPRINTS,
@@ -31,11 +31,13 @@ __version__ = "0.1.0"
 __all__ = [
     "FOOTPRINTS",
     "TILE",
+    "Defocus",
     "Effects",
     "Footprint",
     "GaussianRasterizationSettings",
     "GaussianRasterizer",
     "GaussianStats",
+    "Motion",
     "Outputs",
     "Stages",
     "apply_3d_filter",

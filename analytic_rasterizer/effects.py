@@ -6,21 +6,77 @@ colours: a group of three costs a blend, not a projection or a sort, and no othe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import torch
 
 MAX_CHANNELS = 512
+MAX_SH_DEGREE = 4
 NEAR = 0.2  # camera-space z up to which everything is culled
+OUTPUTS = ("alpha", "depth", "inverse_depth", "median_depth", "dominant_index", "gaussian_stats")
 _GROUP = 3  # channels that are blended at once
 _UNIT = 2.0**-32  # of sums of weights
 _COLOR = slice(9, 12)  # of a row of splats: kSplatColor in csrc/core/params.h
 
 
 @dataclass(frozen=True)
+class Defocus:
+    """A thin lens: what is not at its focus becomes a disc, taken as the Gaussian of the same variance.
+
+    A point at depth z makes a disc of diameter f * aperture * |1/focus - 1/z| px, f the focal length in px; of
+    f * aperture * |z - focus| px under an orthographic camera, where aperture is the opening of the cone.
+
+    Attributes:
+        aperture: Diameter of the lens, world units, not negative; a number, or a tensor with one, differentiable.
+        focus: Depth that is sharp, world units, positive; likewise.
+    """
+
+    aperture: float | torch.Tensor
+    focus: float | torch.Tensor
+
+    def __post_init__(self):
+        _check_number("aperture", self.aperture, at_least=0)
+        _check_number("focus", self.focus, above=0)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What moves while the shutter is open becomes a streak, taken as the Gaussian of the same variance.
+
+    The streak of a Gaussian is as long as its centre's velocity in the image times the exposure, and lies around
+    where the pose of the settings, the middle of the exposure, puts it. Velocities that are not given are zero.
+
+    Attributes:
+        exposure: Time that the shutter is open, s, not negative; a number, or a tensor with one, differentiable.
+        velocity: (3,) of the camera along its axes (x right, y down, z forward), world units / s.
+        angular_velocity: (3,) of the camera around them, rad / s.
+        screen_velocity: (2,) of the whole picture, px / s.
+    """
+
+    exposure: float | torch.Tensor
+    velocity: tuple | torch.Tensor | None = None
+    angular_velocity: tuple | torch.Tensor | None = None
+    screen_velocity: tuple | torch.Tensor | None = None
+
+    def __post_init__(self):
+        _check_number("exposure", self.exposure, at_least=0)
+        for name, length in (("velocity", 3), ("angular_velocity", 3), ("screen_velocity", 2)):
+            value = getattr(self, name)
+            if isinstance(value, torch.Tensor):
+                fits = value.shape == (length,)
+            else:
+                fits = value is None or (len(value) == length and all(math.isfinite(v) for v in value))
+            if not fits:
+                raise ValueError(f"{name} must have {length} finite numbers, got {value!r}")
+
+
+@dataclass(frozen=True)
 class Effects:
-    """What to render beside the colours. With any of them the rasterizer returns (color, radii, `Outputs`).
+    """What a rendering has beyond three colours of a fixed camera. What is not asked for costs nothing.
+
+    With one of the first six the rasterizer returns (color, radii, `Outputs`).
 
     Attributes:
         alpha: How much of each pixel is covered, 1 - transmittance.
@@ -29,6 +85,23 @@ class Effects:
         median_depth: z of the Gaussian behind which less than half of a pixel's light is left.
         dominant_index: Which Gaussian a pixel shows most of.
         gaussian_stats: How much of every Gaussian is seen, for pruning.
+        camera_gradients: Gradients by viewmatrix, projmatrix, campos, tanfovx and tanfovy of the settings, which
+            then may be tensors that require one; `camera_settings` derives them from a pose and fx, fy, cx, cy.
+        orthographic: No perspective. tanfovx and tanfovy are half the width and height of the picture in world
+            units, and projmatrix must leave w at 1.
+        off_center: Centre the clamp of x/z and y/z in the projection of covariances on the principal point of
+            projmatrix. Without it the clamp is that of 3DGS, around the optical axis: right unless an edge of the
+            picture is more than 1.3 half pictures away from the axis, as in a crop.
+        near: Camera-space z up to which everything is culled, world units.
+        far: Camera-space z from which on everything is culled.
+        filter_3d: (P,) of `compute_3d_filter`: widens scales and lowers opacities (`apply_3d_filter`).
+        defocus: `Defocus`, or None for a pinhole.
+        motion: `Motion`, or None for an instant.
+        sh_degree: Most degrees of spherical harmonics to use, 0 to 4; None: those of the settings.
+
+    Raises:
+        TypeError: A wrong type.
+        ValueError: A wrong number or shape.
     """
 
     alpha: bool = False
@@ -37,16 +110,58 @@ class Effects:
     median_depth: bool = False
     dominant_index: bool = False
     gaussian_stats: bool = False
+    camera_gradients: bool = False
+    orthographic: bool = False
+    off_center: bool = False
+    near: float = NEAR
+    far: float = math.inf
+    filter_3d: torch.Tensor | None = field(default=None, compare=False)
+    defocus: Defocus | None = None
+    motion: Motion | None = None
+    sh_degree: int | None = None
 
     def __post_init__(self):
-        for name, value in vars(self).items():
-            if not isinstance(value, bool):
-                raise TypeError(f"{name} must be a bool, got {value!r}")
+        for name in (*OUTPUTS, "camera_gradients", "orthographic", "off_center"):
+            if not isinstance(getattr(self, name), bool):
+                raise TypeError(f"{name} must be a bool, got {getattr(self, name)!r}")
+        for name, kind in (("filter_3d", torch.Tensor), ("defocus", Defocus), ("motion", Motion), ("sh_degree", int)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not (value is None or isinstance(value, kind)):
+                raise TypeError(f"{name} must be a {kind.__name__} or None, got {value!r}")
+        if self.sh_degree is not None and not 0 <= self.sh_degree <= MAX_SH_DEGREE:
+            raise ValueError(f"sh_degree must be 0 to {MAX_SH_DEGREE}, got {self.sh_degree}")
+        _check_number("near", self.near, **({} if self.orthographic else {"above": 0}))
+        if not self.far > self.near:
+            raise ValueError(f"far must be above near, {self.near}, got {self.far}")
 
     @property
-    def any(self) -> bool:
-        """Whether something is asked for."""
-        return any(vars(self).values())
+    def has_outputs(self) -> bool:
+        """Whether there is something to return beside the colours."""
+        return any(getattr(self, name) for name in OUTPUTS)
+
+    @property
+    def changes_camera(self) -> bool:
+        """Whether projecting takes more than a pinhole of 3DGS."""
+        return (
+            self.camera_gradients
+            or self.orthographic
+            or self.off_center
+            or (self.near, self.far) != (NEAR, math.inf)
+            or self.defocus is not None
+            or self.motion is not None
+        )
+
+
+def _check_number(name: str, value, at_least: float = -math.inf, above: float = -math.inf) -> None:
+    if isinstance(value, torch.Tensor):
+        if value.numel() != 1:
+            raise ValueError(f"{name} must be one number, got a tensor of shape {tuple(value.shape)}")
+        return  # its value may be on a device, for which nobody should wait
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise TypeError(f"{name} must be a number, got {value!r}")
+    if not (math.isfinite(value) and value >= at_least and value > above):
+        limit = f" and above {above}" if above > -math.inf else f" and at least {at_least}" if at_least == 0 else ""
+        raise ValueError(f"{name} must be finite{limit}, got {value}")
 
 
 class GaussianStats(NamedTuple):
@@ -99,7 +214,7 @@ def is_plain(effects: Effects | None, colors: torch.Tensor | None, bg: torch.Ten
     """Whether three colours on one background is all there is to render."""
     wide = isinstance(colors, torch.Tensor) and colors.dim() == 2 and colors.shape[1] != _GROUP
     image = isinstance(bg, torch.Tensor) and bg.dim() == 3
-    return not (wide or image or (effects is not None and effects.any))
+    return not (wide or image or (effects is not None and effects.has_outputs))
 
 
 def render(rasterize, gaussians: tuple, settings: tuple, effects: Effects, debug: bool):

@@ -171,7 +171,7 @@ def rasterize_gaussians(
         rasterize = _DebugRasterize.apply if debug else torch.ops.analytic_rasterizer.rasterize
         settings = _settings_arguments(raster_settings, device)
         color, radii, outputs = _effects.render(rasterize, gaussians, settings, effects or Effects(), debug)
-        return (color, radii, outputs) if effects is not None and effects.any else (color, radii)
+        return (color, radii, outputs) if effects is not None and effects.has_outputs else (color, radii)
     keep = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in gaussians)
     arguments = (*gaussians, *_settings_arguments(raster_settings, device), keep, debug)
     if debug:

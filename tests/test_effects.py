@@ -199,7 +199,7 @@ def test_asking_for_outputs_changes_no_bit_of_the_colors(device, best, variant):
         leaves = scenes.leaves(scenes.to(scene, device))
         settings = CAMERA.settings(best, device, footprint=footprint, effects=effects, **options)
         color, radii, *outputs = ar.GaussianRasterizer(settings)(**leaves)
-        assert len(outputs) == (effects is not None and effects.any)
+        assert len(outputs) == (effects is not None and effects.has_outputs)
         color.square().sum().backward()
         results.append([color.detach(), radii, *(leaf.grad for leaf in leaves.values())])
     for other in results[1:]:
@@ -271,7 +271,7 @@ def test_effects_and_settings():
     assert settings._replace(sh_degree=0).effects == ALL
     assert pickle.loads(pickle.dumps(settings)).effects == ALL
     assert "inverse_depth=True" in repr(settings)
-    assert not ar.Effects().any and ALL.any
+    assert not ar.Effects().has_outputs and ALL.has_outputs
     with pytest.raises(TypeError, match="depth must be a bool, got 1"):
         ar.Effects(depth=1)
     with pytest.raises(TypeError, match="effects must be an Effects, got 'depth'"):
