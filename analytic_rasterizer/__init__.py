@@ -6,6 +6,7 @@ A drop-in replacement for `diff_gaussian_rasterization`. See the README for how 
 import torch  # noqa: F401  (its libraries must be loaded before the extension's)
 
 from ._C import instruction_set
+from .camera import camera_settings, moved
 from .effects import Defocus, Effects, GaussianStats, Motion, Outputs, normalized
 from .filters import apply_3d_filter, compute_3d_filter
 from .footprints import (
@@ -16,8 +17,8 @@ from .footprints import (
     resolve_footprint,
     set_default_footprint,
 )
+from .harmonics import needed_sh_degree
 from .ops import TILE
-from .plan import needed_sh_degree
 from .rasterizer import (
     GaussianRasterizationSettings,
     GaussianRasterizer,
@@ -41,10 +42,12 @@ __all__ = [
     "Outputs",
     "Stages",
     "apply_3d_filter",
+    "camera_settings",
     "compute_3d_filter",
     "footprint_weight",
     "get_default_footprint",
     "instruction_set",
+    "moved",
     "needed_sh_degree",
     "normalized",
     "rasterize_gaussians",

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import torch
 
-from .effects import NEAR, depths
-from .rasterizer import GaussianRasterizationSettings
+from .effects import Effects, depths
+
+if TYPE_CHECKING:
+    from .rasterizer import GaussianRasterizationSettings
 
 VARIANCE = 0.2  # of the filter, in squares of the finest sampling interval
 MARGIN = 0.15  # of the image around it in which a Gaussian still counts as seen
@@ -23,8 +26,9 @@ def compute_3d_filter(
 ) -> torch.Tensor:
     """Standard deviation of every Gaussian's filter, from the camera that samples it most finely.
 
-    A camera samples a point at depth z once every z / focal length world units. Of the cameras that see a point, with
-    a margin around the image, the smallest such interval counts; where none does, the largest of all others.
+    A camera samples a point at depth z once every z / focal length world units, an orthographic one every
+    1 / focal length. Of the cameras that see a point, with a margin around the image, the smallest such interval
+    counts; where none does, the largest of all others.
 
     Args:
         means3D: (P, 3) centres, world units.
@@ -49,7 +53,10 @@ def compute_3d_filter(
         inside = (projected[:, :2].abs() <= (1 + 2 * MARGIN) * projected[:, 3:].abs()).all(1)
         # The finer of the two axes.
         focal = max(camera.image_width / camera.tanfovx, camera.image_height / camera.tanfovy) / 2
-        interval = torch.where((z > NEAR) & inside, torch.minimum(interval, z / focal), interval)
+        effects = camera.effects if isinstance(camera.effects, Effects) else Effects()
+        sampled = torch.ones_like(z) if effects.orthographic else z
+        inside &= (z > effects.near) & (z < effects.far)
+        interval = torch.where(inside, torch.minimum(interval, sampled / focal), interval)
     seen = interval.isfinite()
     largest = interval[seen].max() if seen.any() else interval.new_zeros(())
     return torch.where(seen, interval, largest) * math.sqrt(variance)

@@ -21,7 +21,7 @@ def _tiles(height: int, width: int) -> int:
 @torch.library.register_fake("analytic_rasterizer::rasterize")
 def _(
     means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
-    viewmatrix, projmatrix, campos, image_height, image_width, tanfovx, tanfovy, scale_modifier,
+    viewmatrix, projmatrix, campos, lens, image_height, image_width, tanfovx, tanfovy, scale_modifier,
     sh_degree, footprint, option, keep, debug,
 ):  # fmt: skip
     context = torch.library.get_ctx()
@@ -69,8 +69,12 @@ def _(
 
 
 @torch.library.register_fake("analytic_rasterizer::rasterize_vjp")
-def _(dL_dcolor, means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, *rest):
+def _(
+    dL_dcolor, means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
+    viewmatrix, projmatrix, campos, lens, *rest,
+):  # fmt: skip
     inputs = (means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
+    inputs += (viewmatrix, projmatrix, campos, lens)
     return tuple(
         means3D.new_empty(tensor.shape) if need and tensor is not None else means3D.new_empty(0)
         for tensor, need in zip(inputs, rest[-2])
@@ -80,7 +84,7 @@ def _(dL_dcolor, means3D, means2D, opacities, shs, colors_precomp, scales, rotat
 @torch.library.register_fake("analytic_rasterizer::rasterize_stages")
 def _(
     means3D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg, viewmatrix,
-    projmatrix, campos, image_height, image_width, *rest,
+    projmatrix, campos, lens, image_height, image_width, *rest,
 ):  # fmt: skip
     context = torch.library.get_ctx()
     splats, pairs = context.new_dynamic_size(), context.new_dynamic_size()

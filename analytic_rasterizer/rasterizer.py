@@ -7,10 +7,14 @@ from typing import Any, NamedTuple
 
 import torch
 
-from . import effects as _effects
-from . import ops  # noqa: F401  (registers the fake kernels)
-from .effects import Effects
+from . import (
+    channels,
+    ops,  # noqa: F401  (registers the fake kernels)
+)
+from .effects import AUTO, MAX_SH_DEGREE, NEAR, Effects, depths
+from .filters import apply_3d_filter
 from .footprints import Footprint, check_device, get_default_footprint, resolve_footprint
+from .lens import make_lens, used_sh_degree
 
 
 class _Fields(NamedTuple):
@@ -39,7 +43,7 @@ class GaussianRasterizationSettings(_Fields):
         viewmatrix: (4, 4) or (1, 4, 4) world to camera, transposed (for row vectors).
         projmatrix: (4, 4) or (1, 4, 4) world to clip space, transposed. The principal point is wherever
             it puts it.
-        sh_degree: Degree of the spherical harmonics in use, 0 to 3.
+        sh_degree: Degree of the spherical harmonics in use, 0 to 4.
         campos: (3,) camera centre, world units.
         prefiltered: Accepted for compatibility; culling does not depend on it.
         debug: Raise for a Gaussian that is not finite, has an opacity outside [0, 1] or a negative scale or
@@ -49,24 +53,26 @@ class GaussianRasterizationSettings(_Fields):
             camera is finite, which otherwise is not looked at there.
         footprint: One of `FOOTPRINTS`, optionally with options (`"box:samples=8"`). None: the default at
             the time of rendering, see `set_default_footprint`.
-        effects: What to render beside the colours, see `Effects`. None: nothing.
+        effects: What the rendering has beyond three colours of a pinhole, see `Effects`; None: nothing. "auto":
+            harmonics only up to the degree that changes a colour by 1/255 (`needed_sh_degree`; found once for
+            coefficients that stay the same tensor, and not at all while they are trained).
         **options: Options of the footprint, see `resolve_footprint`.
 
     Attributes:
         footprint: The settled `Footprint`, or None.
-        effects: The `Effects`, or None.
+        effects: The `Effects`, "auto", or None.
 
     Raises:
         ValueError: Unknown footprint or option.
-        TypeError: effects is no `Effects`.
+        TypeError: effects is neither.
     """
 
     # Also where a tuple method makes an instance without __new__.
     footprint: Footprint | None = None
-    effects: Effects | None = None
+    effects: Effects | str | None = None
 
     def __new__(
-        cls, *args: Any, footprint: str | Footprint | None = None, effects: Effects | None = None, **kwargs: Any
+        cls, *args: Any, footprint: str | Footprint | None = None, effects: Effects | str | None = None, **kwargs: Any
     ):
         fields = {k: kwargs.pop(k) for k in _Fields._fields[len(args) :] if k in kwargs}
         self = super().__new__(cls, *args, **fields)
@@ -76,8 +82,8 @@ class GaussianRasterizationSettings(_Fields):
             known = ", ".join((*cls._fields, "footprint", "effects"))
             raise TypeError(f"settings must be among: {known}; got {', '.join(kwargs)}")
         if effects is not None:
-            if not isinstance(effects, Effects):
-                raise TypeError(f"effects must be an Effects, got {effects!r}")
+            if not isinstance(effects, Effects) and effects != AUTO:
+                raise TypeError(f'effects must be an Effects or "auto", got {effects!r}')
             self.effects = effects
         return self
 
@@ -100,7 +106,7 @@ GaussianRasterizationSettings.__signature__ = inspect.signature(_Fields)
 
 
 def _unpickle_settings(
-    fields: tuple, footprint: str | None, effects: Effects | None = None
+    fields: tuple, footprint: str | None, effects: Effects | str | None = None
 ) -> GaussianRasterizationSettings:
     return GaussianRasterizationSettings(*fields, footprint=footprint, effects=effects)
 
@@ -126,16 +132,41 @@ def _optional(device: torch.device, **tensors: Any) -> list[torch.Tensor | None]
     return present
 
 
-def _settings_arguments(settings: GaussianRasterizationSettings, device: torch.device) -> tuple:
+def _settings_arguments(
+    settings: GaussianRasterizationSettings, means3D: torch.Tensor, shs: torch.Tensor | None
+) -> tuple:
     """What the ops take after the Gaussians."""
-    s = settings
-    _check_tensors(device, bg=s.bg, viewmatrix=s.viewmatrix, projmatrix=s.projmatrix, campos=s.campos)
+    s, effects = settings, settings.effects
+    _check_tensors(means3D.device, bg=s.bg, viewmatrix=s.viewmatrix, projmatrix=s.projmatrix, campos=s.campos)
     footprint = s.footprint or get_default_footprint()
+    camera, tangents, lens, degree = (s.viewmatrix, s.projmatrix, s.campos), (s.tanfovx, s.tanfovy), None, s.sh_degree
+    if effects is not None:
+        degree = used_sh_degree(effects, int(degree), shs)
+    full = effects if isinstance(effects, Effects) else Effects()
+    if full.changes_camera or int(degree) >= MAX_SH_DEGREE:
+        lens = make_lens(full, s, means3D)
+        if full.camera_gradients:
+            tangents = (1.0, 1.0)  # the lens has them
+        else:
+            camera = tuple(t.detach() for t in camera)
     return (
-        s.bg, s.viewmatrix, s.projmatrix, s.campos, int(s.image_height), int(s.image_width),
-        float(s.tanfovx), float(s.tanfovy), float(s.scale_modifier), int(s.sh_degree),
-        footprint.key, footprint.option,
+        s.bg, *camera, lens, int(s.image_height), int(s.image_width), *(float(t) for t in tangents),
+        float(s.scale_modifier), int(degree), footprint.key, footprint.option,
     )  # fmt: skip
+
+
+def _filtered(settings: GaussianRasterizationSettings, opacities, scales, cov3D_precomp) -> tuple:
+    """Opacities and scales with the 3D filter of the effects."""
+    effects = settings.effects
+    if not isinstance(effects, Effects) or effects.filter_3d is None:
+        return opacities, scales
+    if scales is None:
+        raise ValueError(
+            f"filter_3d needs scales and rotations, got {'neither' if cov3D_precomp is None else 'cov3D_precomp'}"
+        )
+    # The scale modifier is not the filter's: pictures are sampled as they are.
+    scales, opacities = apply_3d_filter(scales, opacities, effects.filter_3d / settings.scale_modifier)
+    return opacities, scales
 
 
 def rasterize_gaussians(
@@ -154,7 +185,7 @@ def rasterize_gaussians(
     device = means3D.device
     check_device(device)
     _check_tensors(device, opacities=opacities)
-    means2D, *rest = _optional(
+    means2D, shs, colors_precomp, scales, rotations, cov3D_precomp = _optional(
         device,
         means2D=means2D,
         shs=sh,
@@ -163,17 +194,20 @@ def rasterize_gaussians(
         rotations=rotations,
         cov3D_precomp=cov3Ds_precomp,
     )
-    gaussians = (means3D, means2D, opacities, *rest)
     debug, effects = bool(raster_settings.debug), raster_settings.effects
-    if not _effects.is_plain(effects, rest[1], raster_settings.bg):
+    opacities, scales = _filtered(raster_settings, opacities, scales, cov3D_precomp)
+    gaussians = (means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
+    settings = _settings_arguments(raster_settings, means3D, shs)
+    asked = effects if isinstance(effects, Effects) else Effects()
+    if not channels.is_plain(asked, colors_precomp, raster_settings.bg):
         if debug:
             _check_gaussians(*gaussians)  # of all channels; the op sees three
         rasterize = _DebugRasterize.apply if debug else torch.ops.analytic_rasterizer.rasterize
-        settings = _settings_arguments(raster_settings, device)
-        color, radii, outputs = _effects.render(rasterize, gaussians, settings, effects or Effects(), debug)
-        return (color, radii, outputs) if effects is not None and effects.has_outputs else (color, radii)
-    keep = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in gaussians)
-    arguments = (*gaussians, *_settings_arguments(raster_settings, device), keep, debug)
+        color, radii, outputs = channels.render(rasterize, gaussians, settings, asked, debug)
+        return (color, radii, outputs) if asked.has_outputs else (color, radii)
+    of_camera = settings[1:5] if settings[4] is not None else ()
+    keep = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in (*gaussians, *of_camera))
+    arguments = (*gaussians, *settings, keep, debug)
     if debug:
         return _DebugRasterize.apply(*arguments)[:2]
     return torch.ops.analytic_rasterizer.rasterize(*arguments)[:2]
@@ -223,25 +257,29 @@ class _DebugRasterize(torch.autograd.Function):
             raise
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(*output[1:])
-        tensors, (*ctx.settings, _, ctx.debug) = arguments[:12], arguments[12:]
+        tensors, (*ctx.settings, _, ctx.debug) = arguments[:13], arguments[13:]
         ctx.save_for_backward(*tensors, *output[2:])
         return output
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, dL_dcolor, *_):
-        missing = [None] * (len(ctx.needs_input_grad) - 8)
+        none = [None] * len(ctx.needs_input_grad)
         if dL_dcolor is None:
-            return (*[None] * 8, *missing)
-        tensors, saved = ctx.saved_tensors[:12], ctx.saved_tensors[12:]
-        needs = [need and t is not None for need, t in zip(ctx.needs_input_grad, tensors[:8])]
+            return tuple(none)
+        tensors, saved = ctx.saved_tensors[:13], ctx.saved_tensors[13:]
+        of_camera = tensors[9:] if tensors[12] is not None else (None,) * 4
+        inputs = (*tensors[:8], *of_camera)
+        wanted = (*ctx.needs_input_grad[:8], *ctx.needs_input_grad[9:13])
+        needs = [need and t is not None for need, t in zip(wanted, inputs)]
         arguments = (dL_dcolor, *tensors, *ctx.settings, *saved, needs, ctx.debug)
         try:
             grads = torch.ops.analytic_rasterizer.rasterize_vjp(*arguments)
         except Exception:
             _write_snapshot("snapshot_bw.dump", arguments)
             raise
-        return (*(g if need else None for g, need in zip(grads, needs)), *missing)
+        grads = [g.view_as(t) if need else None for g, t, need in zip(grads, inputs, needs)]
+        return (*grads[:8], None, *grads[8:], *none[13:])
 
 
 def _write_snapshot(path: str, arguments: tuple) -> None:
@@ -257,7 +295,7 @@ class GaussianRasterizer(torch.nn.Module):
         self.raster_settings = raster_settings
 
     def markVisible(self, positions: torch.Tensor) -> torch.Tensor:
-        """Which positions lie in front of the near plane, camera-space z > 0.2.
+        """Which positions lie in front of the near plane, camera-space z > 0.2 or as the effects have it.
 
         Args:
             positions: (P, 3) world units.
@@ -275,8 +313,10 @@ class GaussianRasterizer(torch.nn.Module):
         view = self.raster_settings.viewmatrix.reshape(4, 4)
         if positions.dtype != view.dtype:
             raise TypeError(f"positions must have dtype {view.dtype}, got {positions.dtype}")
+        effects = self.raster_settings.effects
+        near = effects.near if isinstance(effects, Effects) else NEAR
         with torch.no_grad():
-            return _effects.depths(positions, view) > _effects.NEAR
+            return depths(positions, view) > near
 
     def forward(
         self,
@@ -376,10 +416,12 @@ def render_stages(
     device = means3D.device
     check_device(device)
     _check_tensors(device, opacities=opacities)
-    optional = _optional(
+    shs, colors_precomp, scales, rotations, cov3D_precomp = _optional(
         device, shs=shs, colors_precomp=colors_precomp, scales=scales, rotations=rotations, cov3D_precomp=cov3D_precomp
     )
+    opacities, scales = _filtered(settings, opacities, scales, cov3D_precomp)
     *tensors, seconds = torch.ops.analytic_rasterizer.rasterize_stages(
-        means3D, opacities, *optional, *_settings_arguments(settings, device)
-    )
+        means3D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp,
+        *_settings_arguments(settings, means3D, shs),
+    )  # fmt: skip
     return Stages(*tensors, dict(zip(("project", "bin", "blend"), seconds.tolist())))

@@ -11,6 +11,7 @@ covariance is (..., 3) = (xx, xy, yy) [px^2]; a 3x3 covariance is (..., 6) = (xx
 zz); view and projection matrices are transposed, as 3DGS passes them.
 """
 
+import functools
 import math
 from typing import NamedTuple
 
@@ -344,12 +345,24 @@ def spherical_harmonics(degree, direction):
             factor(105 / 16) * z * (x * x - y * y),
             -factor(35 / 32) * x * (x * x - 3 * y * y),
         ]
+    if degree >= 4:
+        basis += [
+            factor(315 / 16) * x * y * (x * x - y * y),
+            -factor(315 / 32) * y * z * (3 * x * x - y * y),
+            factor(45 / 16) * x * y * (7 * z * z - 1),
+            -factor(45 / 32) * y * z * (7 * z * z - 3),
+            factor(9 / 256) * (35 * z**4 - 30 * z**2 + 3),
+            -factor(45 / 32) * x * z * (7 * z * z - 3),
+            factor(45 / 64) * (x * x - y * y) * (7 * z * z - 1),
+            -factor(315 / 32) * x * z * (x * x - 3 * y * y),
+            factor(315 / 256) * (x**4 - 6 * x**2 * y**2 + y**4),
+        ]
     return torch.stack(basis, -1)
 
 
-def sh_color(degree, shs, means, camera_position):
-    """max(0, SH + 1/2) (P, 3) seen from camera_position; shs (P, M, 3), M >= (degree + 1)^2."""
-    direction = torch.nn.functional.normalize(means - camera_position, dim=-1)
+def sh_color(degree, shs, direction):
+    """max(0, SH + 1/2) (P, 3) seen along direction (P, 3), of any length; shs (P, M, 3), M >= (degree + 1)^2."""
+    direction = torch.nn.functional.normalize(direction, dim=-1)
     basis = spherical_harmonics(degree, direction)
     color = (basis[:, :, None] * shs[:, : basis.shape[1]]).sum(1) + 0.5
     return torch.clamp(color, min=0)
@@ -365,6 +378,7 @@ class Projection(NamedTuple):
 
 def project(settings, means, covariance):
     """EWA projection of means (P, 3) and 3D covariances (P, 3, 3)."""
+    effects = effects_of(settings)
     size = means.new_tensor([settings.image_width, settings.image_height])
     viewmatrix, projmatrix = settings.viewmatrix.double(), settings.projmatrix.double()
     homogeneous = torch.cat([means, torch.ones_like(means[:, :1])], -1)
@@ -372,11 +386,16 @@ def project(settings, means, covariance):
     clip = homogeneous @ projmatrix
     means2d = ((clip[:, :2] / clip[:, 3:] + 1) * size - 1) / 2
 
-    tangent = means.new_tensor([float(settings.tanfovx), float(settings.tanfovy)])
+    tangent = torch.stack([torch.as_tensor(t).double() for t in (settings.tanfovx, settings.tanfovy)])
     focal = size / (2 * tangent)
     z = view[:, 2]
-    limit = FRUSTUM_CLAMP * tangent
-    slope = torch.minimum(torch.maximum(view[:, :2] / z[:, None], -limit), limit)
+    limit, center = FRUSTUM_CLAMP * tangent, torch.zeros_like(tangent)
+    if effects.off_center:  # projmatrix is viewmatrix times the transposed projection
+        projection = torch.linalg.solve(viewmatrix, projmatrix)
+        center = -projection[2, :2] / torch.stack([projection[0, 0], projection[1, 1]])
+    slope = torch.minimum(torch.maximum(view[:, :2] / z[:, None], center - limit), center + limit)
+    if effects.orthographic:
+        z, slope = torch.ones_like(z), torch.zeros_like(slope)
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
         [
@@ -388,7 +407,48 @@ def project(settings, means, covariance):
     to_image = jacobian @ viewmatrix[:3, :3].T
     full = to_image @ covariance @ to_image.transpose(-1, -2)
     cov2d = torch.stack([full[:, 0, 0], full[:, 0, 1], full[:, 1, 1]], -1)
-    return Projection(means2d, cov2d, z)
+    return Projection(means2d, cov2d, view[:, 2])
+
+
+class Plain(NamedTuple):
+    """A camera without effects."""
+
+    near: float = NEAR
+    far: float = math.inf
+    orthographic: bool = False
+    off_center: bool = False
+    defocus: None = None
+    motion: None = None
+
+
+def effects_of(settings):
+    return getattr(settings, "effects", None) or Plain()
+
+
+def blur(settings, projection, view):
+    """What the lens and the shutter make of cov2d, and the amplitudes: (P, 3), (P,)."""
+    effects, cov2d = effects_of(settings), projection.cov2d
+    tangent = torch.stack([torch.as_tensor(t).double() for t in (settings.tanfovx, settings.tanfovy)])
+    focal = torch.tensor([settings.image_width, settings.image_height]) / (2 * tangent)
+    z, number = view[:, 2], functools.partial(torch.as_tensor, dtype=torch.float64)
+    blurred_cov = cov2d
+    if effects.defocus is not None:
+        aperture, focus = (number(v) for v in (effects.defocus.aperture, effects.defocus.focus))
+        distance = z - focus if effects.orthographic else 1 / focus - 1 / z
+        diameter = focal.prod().sqrt() * aperture * distance
+        blurred_cov = blurred_cov + (diameter**2 / 16)[:, None] * torch.tensor([1.0, 0.0, 1.0])
+    if effects.motion is not None:
+        m = effects.motion
+        velocity, turn = (number([0.0] * 3 if v is None else v) for v in (m.velocity, m.angular_velocity))
+        screen = number([0.0] * 2 if m.screen_velocity is None else m.screen_velocity)
+        flow = -velocity - torch.linalg.cross(turn.expand_as(view), view)
+        if effects.orthographic:
+            speed = focal * flow[:, :2]
+        else:
+            speed = focal * (flow[:, :2] / z[:, None] - view[:, :2] * flow[:, 2:] / z[:, None] ** 2)
+        u, v = ((speed + screen) * number(m.exposure)).unbind(-1)
+        blurred_cov = blurred_cov + torch.stack([u * u, u * v, v * v], -1) / 12
+    return blurred_cov, (determinant(cov2d) / determinant(blurred_cov)).sqrt()
 
 
 # --- the image ----------------------------------------------------------------------------------
@@ -467,11 +527,19 @@ def render(
     else:
         covariance = unpack_covariance(cov3D_precomp)
     projection = project(settings, means3D, covariance)
+    effects = effects_of(settings)
+    view = (torch.cat([means3D, torch.ones_like(means3D[:, :1])], -1) @ settings.viewmatrix.double())[:, :3]
+    if effects.defocus is not None or effects.motion is not None:
+        cov2d, amplitudes = blur(settings, projection, view)
+        projection, opacities = projection._replace(cov2d=cov2d), opacities.reshape(-1) * amplitudes
     means2d, cov2d, depths = projection
     if means2D is not None:
         means2d = means2d + (means2D[:, :2] - means2D[:, :2].detach()) * half
     if colors_precomp is None:
-        colors = sh_color(settings.sh_degree, shs, means3D, settings.campos.double())
+        seen_from = means3D - settings.campos.double()
+        if effects.orthographic:
+            seen_from = settings.viewmatrix.double()[:3, 2].expand_as(means3D)
+        colors = sh_color(settings.sh_degree, shs, seen_from)
     else:
         colors = colors_precomp
     opacities = opacities.reshape(-1)
@@ -494,7 +562,7 @@ def render(
         torch.minimum(pixel_margin, distance.amin(0), out=pixel_margin)
 
     for i in torch.argsort(depths.detach(), stable=True).tolist():
-        if depths[i] <= NEAR or determinant(cov2d[i]) <= 0:
+        if not effects.near < depths[i] < effects.far or determinant(cov2d[i]) <= 0:
             continue
         offset = pixels - means2d[i]
         if keep_offsets and offset.requires_grad:

@@ -233,11 +233,10 @@ def settings_to(settings, device):
 
 def tile_samples(settings, scene):
     """What `adaptive` chooses (tile rows, tile columns), by the op itself."""
-
     footprint = settings.footprint
     numbers = [settings.image_height, settings.image_width, settings.tanfovx, settings.tanfovy]
     numbers += [settings.scale_modifier, settings.sh_degree, footprint.key, footprint.option]
-    tensors = [settings.bg, settings.viewmatrix, settings.projmatrix, settings.campos]
+    tensors = [settings.bg, settings.viewmatrix, settings.projmatrix, settings.campos, None]
     gaussians = [None if scene.get(name) is None else scene[name].detach() for name in INPUTS]
     chosen = torch.ops.analytic_rasterizer.rasterize(*gaussians, *tensors, *numbers, False, False)[-1]
     return chosen.reshape(-(-settings.image_height // 16), -1).cpu()

@@ -78,7 +78,7 @@ def test_choice_follows_the_estimate(device):
     fields = CAMERA.settings()
     covariance = reference.covariance_3d(scene["scales"], scene["rotations"], 1.0)
     projection = reference.project(fields, scene["means3D"], covariance)
-    colors = reference.sh_color(0, scene["shs"], scene["means3D"], fields.campos)
+    colors = reference.sh_color(0, scene["shs"], scene["means3D"] - fields.campos)
     grid = (-(-CAMERA.image_height // 16), -(-CAMERA.image_width // 16))
     estimates = reference.tile_estimates(projection, scene["opacities"].reshape(-1), colors, fields.bg, grid, lists)
     seen = set()

@@ -19,6 +19,7 @@ from scenes import KINDS, VARIANTS, Camera, name_of
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C
 from analytic_rasterizer.footprints import check_device
+from analytic_rasterizer.lens import make_lens
 
 FIELDS = (
     "image_height",
@@ -697,8 +698,11 @@ def test_debug_changes_no_bit(device):
 # --- torch.library -----------------------------------------------------------------------------
 
 
-def op_arguments(variant, device, keep, gradient):
-    """Arguments of the `rasterize` op, as its schema orders them."""
+FULL = ar.Effects(camera_gradients=True, off_center=True, defocus=ar.Defocus(0.1, 2.0))
+
+
+def op_arguments(variant, device, keep, gradient, effects=None):
+    """Arguments of the `rasterize` op, as its schema orders them; with effects, for a full camera."""
     footprint = ar.resolve_footprint(variant[0], **variant[1])
     fields = CAMERA.fields(torch.float32, device)
     scene = scene32(device)
@@ -708,16 +712,22 @@ def op_arguments(variant, device, keep, gradient):
     tensors = [fields[k] for k in ("bg", "viewmatrix", "projmatrix", "campos")]
     numbers = [fields[k] for k in ("image_height", "image_width", "tanfovx", "tanfovy")]
     numbers += [fields["scale_modifier"], fields["sh_degree"], footprint.key, footprint.option]
-    return [*gaussians, *tensors, *numbers, keep, False]
+    lens = None if effects is None else make_lens(effects, CAMERA.settings(torch.float32, device), tensors[0])
+    camera = [*tensors[1:], lens]
+    if effects is not None and gradient:
+        camera = [t.requires_grad_() for t in camera]
+    return [*gaussians, tensors[0], *camera, *numbers, keep, False]
 
 
 OPS = {
     "rasterize": lambda v, d: op_arguments(v, d, True, True),
     "rasterize (inference)": lambda v, d: op_arguments(v, d, False, False),
+    "rasterize (full camera)": lambda v, d: op_arguments(v, d, True, True, FULL),
     "rasterize_stages": lambda v, d: [  # no means2D, no keep, no debug
-        a for i, a in enumerate(op_arguments(v, d, False, False)) if i not in (1, 20, 21)
+        a for i, a in enumerate(op_arguments(v, d, False, False)) if i not in (1, 21, 22)
     ],
     "rasterize_vjp": lambda v, d: vjp_arguments(v, d),
+    "rasterize_vjp (full camera)": lambda v, d: vjp_arguments(v, d, FULL),
     "rasterize_channels": lambda v, d: channels_arguments(v, d),
     "inspect": lambda v, d: inspect_arguments(v, d),
     "footprint_weight": lambda v, d: weight_arguments(v, d, True),
@@ -725,10 +735,10 @@ OPS = {
 }
 
 
-def vjp_arguments(variant, device):
-    arguments = op_arguments(variant, device, True, False)
+def vjp_arguments(variant, device, effects=None):
+    arguments = op_arguments(variant, device, True, False, effects)
     color, _, *saved = torch.ops.analytic_rasterizer.rasterize(*arguments)
-    needs = [a is not None for a in arguments[:8]]
+    needs = [a is not None for a in arguments[:8]] + [effects is not None] * 4
     return [torch.ones_like(color), *arguments[:-2], *saved, needs, False]
 
 
@@ -742,13 +752,13 @@ def kept_lists(variant, device):
 def channels_arguments(variant, device):
     arguments, lists = kept_lists(variant, device)
     colors = torch.rand(len(arguments[0]), 3, generator=torch.Generator().manual_seed(0)).to(device)
-    height, width, footprint, option = (arguments[i] for i in (12, 13, 18, 19))
+    height, width, footprint, option = (arguments[i] for i in (13, 14, 19, 20))
     return [colors, arguments[8], height, width, footprint, option, *lists, True, False]
 
 
 def inspect_arguments(variant, device):
     arguments, lists = kept_lists(variant, device)
-    return [*lists, len(arguments[0]), arguments[12], arguments[13], arguments[18]]
+    return [*lists, len(arguments[0]), arguments[13], arguments[14], arguments[19]]
 
 
 def weight_arguments(variant, device, gradient):
@@ -780,6 +790,7 @@ def test_opcheck(op, device, variant):
     """
     overload = getattr(torch.ops.analytic_rasterizer, op.split(" ")[0]).default
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")
-    if op != "rasterize_stages" and (device, op) not in (("cuda", "rasterize"), ("cuda", "rasterize_channels")):
+    keeps = op in ("rasterize", "rasterize (full camera)", "rasterize_channels")
+    if op != "rasterize_stages" and not (device == "cuda" and keeps):
         checks = (*checks, "test_aot_dispatch_dynamic")
     torch.library.opcheck(overload, tuple(OPS[op](variant, device)), test_utils=checks)

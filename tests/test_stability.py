@@ -157,7 +157,7 @@ def test_image_of_16384_x_16384():
     exact = hard_cases.settings_of(camera, torch.float64, torch.float32, ("mip", {}))
     covariance = reference.covariance_3d(scene["scales"], scene["rotations"], 1.0)
     means2d, cov2d, _ = reference.project(exact, scene["means3D"], covariance)
-    colors = reference.sh_color(0, scene["shs"], scene["means3D"], exact.campos)
+    colors = reference.sh_color(0, scene["shs"], scene["means3D"] - exact.campos)
     for i in range(4):
         x0, y0 = (min(max(int(v) - 4, 0), n - 9) for v in means[i])
         ys, xs = torch.meshgrid(torch.arange(y0, y0 + 9.0), torch.arange(x0, x0 + 9.0), indexing="ij")

@@ -27,17 +27,9 @@ template <typename T> struct CameraView {
   const T* position;  ///< [3] camera centre, world units
   int width, height;  ///< px
   T tan_half_fov_x, tan_half_fov_y;
-};
-
-/// A camera by value: rows of its matrices, loaded once per thread.
-template <typename T> struct Camera {
-  Vec4<T> view_x, view_y, view_z;  ///< world to camera
-  Vec4<T> clip_x, clip_y, clip_w;  ///< world to clip space
-  Vec3<T> position;
-  Vec2<T> size;   ///< px
-  Vec2<T> focal;  ///< px
-  Vec2<T> limit;  ///< of |x/z| and |y/z| in the Jacobian
-  TileGrid grid;
+  /// [kLensWidth] numbers of a Lens for a full camera (camera.h), or null for a plain one, which knows no more than
+  /// the above.
+  const T* lens = nullptr;
 };
 
 /// Scene parameters. Either scales and rotations or cov3ds, either shs or colors; the others null.

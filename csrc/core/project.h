@@ -1,62 +1,13 @@
 // One Gaussian to one splat: cov3d, EWA projection [EWA, Eq. 29-31], colour; and back.
 #pragma once
 
+#include <type_traits>
+
 #include "core/bin.h"
-#include "core/params.h"
+#include "core/camera.h"
 #include "core/sh.h"
 
 namespace ar {
-
-/// Row r of a matrix stored transposed.
-template <typename T> AR_HD Vec4<T> matrix_row(const T* m, int r) { return {m[r], m[4 + r], m[8 + r], m[12 + r]}; }
-
-template <typename T> AR_HD Camera<T> load_camera(const CameraView<T>& c) {
-  const T two = T(2), clamp = T(kFrustumClamp);
-  return {matrix_row(c.view, 0),
-          matrix_row(c.view, 1),
-          matrix_row(c.view, 2),
-          matrix_row(c.proj, 0),
-          matrix_row(c.proj, 1),
-          matrix_row(c.proj, 3),
-          {c.position[0], c.position[1], c.position[2]},
-          {T(c.width), T(c.height)},
-          {T(c.width) / (two * c.tan_half_fov_x), T(c.height) / (two * c.tan_half_fov_y)},
-          {clamp * c.tan_half_fov_x, clamp * c.tan_half_fov_y},
-          {c.width, c.height}};
-}
-
-template <typename T> AR_HD Vec3<T> xyz(Vec4<T> v) { return {v.x, v.y, v.z}; }
-template <typename T> AR_HD T apply_row(Vec4<T> row, Vec3<T> p) { return dot(xyz(row), p) + row.w; }
-
-/// The mean in the image, and what the chain rule needs of the way there.
-template <typename T> struct ProjectedMean {
-  Vec3<T> view;  ///< camera space; z is the depth
-  Vec2<T> ndc;
-  T clip_w;
-  Vec2<T> pixel;
-  bool valid;  ///< in front of the near plane, and finite
-};
-
-template <typename T> AR_HD ProjectedMean<T> project_mean(const Camera<T>& camera, Vec3<T> mean) {
-  ProjectedMean<T> p;
-  p.view = {apply_row(camera.view_x, mean), apply_row(camera.view_y, mean), apply_row(camera.view_z, mean)};
-  p.clip_w = apply_row(camera.clip_w, mean);
-  const T inv_w = T(1) / p.clip_w;
-  p.ndc = {inv_w * apply_row(camera.clip_x, mean), inv_w * apply_row(camera.clip_y, mean)};
-  p.pixel = {T(0.5) * ((p.ndc.x + T(1)) * camera.size.x - T(1)), T(0.5) * ((p.ndc.y + T(1)) * camera.size.y - T(1))};
-  p.valid = p.view.z > T(kNear) && p.clip_w > T(0) && within(p.view.x, 1e18) && within(p.view.y, 1e18) &&
-            within(p.view.z, 1e18) && within(p.pixel.x, 1e9) && within(p.pixel.y, 1e9);
-  return p;
-}
-
-template <typename T>
-AR_HD Vec3<T> project_mean_vjp(const Camera<T>& camera, const ProjectedMean<T>& p, Vec2<T> dL_dpixel,
-                               Vec3<T> dL_dview) {
-  const Vec3<T> px = xyz(camera.clip_x), py = xyz(camera.clip_y), pw = xyz(camera.clip_w);
-  const T gx = T(0.5) * camera.size.x * dL_dpixel.x / p.clip_w, gy = T(0.5) * camera.size.y * dL_dpixel.y / p.clip_w;
-  return gx * px + gy * py - (gx * p.ndc.x + gy * p.ndc.y) * pw + dL_dview.x * xyz(camera.view_x) +
-         dL_dview.y * xyz(camera.view_y) + dL_dview.z * xyz(camera.view_z);
-}
 
 /// No smaller than the largest standard deviation of Gaussian i.
 template <typename T> AR_HD T max_sigma(const Gaussians<T>& g, int64_t i) {
@@ -67,58 +18,21 @@ template <typename T> AR_HD T max_sigma(const Gaussians<T>& g, int64_t i) {
 
 /// Whether Gaussian i may touch the image, from its mean and its largest standard deviation: cheap,
 /// and never false for one that project() keeps. `blur` is the largest variance a footprint adds.
-template <typename T> AR_HD bool may_be_visible(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, T blur) {
+template <class Cam, typename T>
+AR_HD bool may_be_visible(const Cam& camera, const Gaussians<T>& g, int64_t i, T blur) {
   const T largest = max_sigma(g, i), opacity = g.opacities[i];  // loads first: they wait together
   const ProjectedMean<T> p = project_mean(camera, g.means[i]);
   if (!p.valid) return false;
-  // |J| <= f/z |(1, 0, -x/z; 0, 1, -y/z)| <= f/z sqrt(1 + (x/z)^2 + (y/z)^2), with x/z and y/z clamped
-  const T stretch = max(camera.focal.x, camera.focal.y) / p.view.z *
-                    sqrt(T(1) + camera.limit.x * camera.limit.x + camera.limit.y * camera.limit.y);
+  if constexpr (Cam::kFull) {
+    const Blur<T> more = blur_of(camera, p.view);
+    blur += more.streak.x * more.streak.x + more.streak.y * more.streak.y + more.variance;
+  }
+  const T stretch = largest_stretch(camera, p.view.z);
   const T sigma = sqrt(stretch * stretch * largest * largest + blur);
   const T level = T(kMaxLevel) + (opacity > T(1) ? T(2) * std::log(opacity) : T(0));
   const T reach = T(2) + sigma * sqrt(level);
   return p.pixel.x + reach >= T(0) && p.pixel.x - reach <= camera.size.x - T(1) && p.pixel.y + reach >= T(0) &&
          p.pixel.y - reach <= camera.size.y - T(1);
-}
-
-/// The linear part of the projection at a mean: rows of A = J W, world units to px.
-template <typename T> struct Jacobian {
-  Vec3<T> x, y;
-  T ratio_x, ratio_y;  ///< x/z and y/z, clamped
-  bool clamped_x, clamped_y;
-};
-
-template <typename T> AR_HD Jacobian<T> make_jacobian(const Camera<T>& camera, Vec3<T> view) {
-  Jacobian<T> j;
-  const T rx = view.x / view.z, ry = view.y / view.z;
-  j.ratio_x = min(max(rx, -camera.limit.x), camera.limit.x);
-  j.ratio_y = min(max(ry, -camera.limit.y), camera.limit.y);
-  j.clamped_x = j.ratio_x != rx;
-  j.clamped_y = j.ratio_y != ry;
-  const Vec3<T> depth = xyz(camera.view_z);
-  j.x = (camera.focal.x / view.z) * (xyz(camera.view_x) - j.ratio_x * depth);
-  j.y = (camera.focal.y / view.z) * (xyz(camera.view_y) - j.ratio_y * depth);
-  return j;
-}
-
-/// `dL_dlog_size` = dL_dx . j.x + dL_dy . j.y, the gradient by the logarithm of all of J.
-template <typename T>
-AR_HD Vec3<T> jacobian_vjp(const Camera<T>& camera, const Jacobian<T>& j, Vec3<T> view, Vec3<T> dL_dx, Vec3<T> dL_dy,
-                           T dL_dlog_size) {
-  const Vec3<T> depth = xyz(camera.view_z);
-  const T by_ratio_x = -(camera.focal.x / view.z) * dot(dL_dx, depth),
-          by_ratio_y = -(camera.focal.y / view.z) * dot(dL_dy, depth);
-  Vec3<T> g = {T(0), T(0), -dL_dlog_size / view.z};
-  // Where the ratio is clamped it is constant: its gradient is zero, in z too.
-  if (!j.clamped_x) {
-    g.x += by_ratio_x / view.z;
-    g.z -= by_ratio_x * j.ratio_x / view.z;
-  }
-  if (!j.clamped_y) {
-    g.y += by_ratio_y / view.z;
-    g.z -= by_ratio_y * j.ratio_y / view.z;
-  }
-  return g;
 }
 
 /// A unit quaternion, and what normalising it divided by.
@@ -176,8 +90,8 @@ template <typename T> AR_HD Vec3<T> adjugate_times(const Sym3<T>& m, Vec3<T> v) 
   return adj * v;
 }
 
-template <typename T>
-AR_HD Factors<T> project_covariance(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, Vec3<T> view) {
+template <class Cam, typename T>
+AR_HD Factors<T> project_covariance(const Cam& camera, const Gaussians<T>& g, int64_t i, Vec3<T> view) {
   Factors<T> f;
   f.jacobian = make_jacobian(camera, view);
   const Vec3<T>&ax = f.jacobian.x, &ay = f.jacobian.y;
@@ -201,6 +115,47 @@ AR_HD Factors<T> project_covariance(const Camera<T>& camera, const Gaussians<T>&
   return f;
 }
 
+/// Sigma with blur: after the streak, and after all of it.
+template <typename T> struct BlurredCov {
+  Cov2d<T> streaked, all;
+};
+/// streak^T adj(Sigma) streak is a sum of squares in the factors; in the entries it cancels for a needle along the
+/// streak.
+template <typename T>
+AR_HD BlurredCov<T> blurred(const Factors<T>& f, const Gaussians<T>& g, int64_t i, const Blur<T>& by) {
+  const Vec2<T>& b = by.streak;
+  const Vec3<T> across = g.cov3ds ? b.x * f.jacobian.y - b.y * f.jacobian.x : b.x * f.row_y - b.y * f.row_x;
+  const T gain = dot(across, g.cov3ds ? g.cov3ds[i] * across : across);
+  const Cov2d<T>& c = f.cov;
+  const Cov2d<T> streaked = {c.xx + b.x * b.x, c.xy + b.x * b.y, c.yy + b.y * b.y, c.det + gain};
+  return {streaked, blur(streaked, by.variance)};
+}
+/// The covariance that the footprint sees, and the amplitude that keeps the mass of the splat.
+template <typename T> struct SeenCov {
+  Cov2d<T> cov;
+  T amp;
+};
+template <class Cam, typename T>
+AR_HD SeenCov<T> seen_covariance(const Cam& camera, const Gaussians<T>& g, int64_t i, Vec3<T> view,
+                                 const Factors<T>& f) {
+  if constexpr (Cam::kFull) {
+    const Blur<T> by = blur_of(camera, view);
+    if (by.any()) {
+      const Cov2d<T> all = blurred(f, g, i, by).all;
+      return {all, sqrt(f.cov.det / all.det)};
+    }
+  }
+  return {f.cov, T(1)};
+}
+
+/// What turned_vjp knows of a blur; of NoBlur nothing.
+template <class B, typename T> struct BlurContext {
+  B blur;
+  BlurredCov<T> cov;
+  T weighted;  ///< gradient by the logarithm of its amplitude
+};
+template <typename T> struct BlurContext<NoBlur, T> {};
+
 /// H_kl = t_k . dL/dSigma t_l of the columns t_k of A R, which hold the gradient of all that Sigma = A R S^2 R^T A^T is
 /// made of; and dL/dSigma t_k, as two rows.
 template <typename T> struct TurnedGrad {
@@ -209,64 +164,129 @@ template <typename T> struct TurnedGrad {
   Vec3<T> pull_x, pull_y;  ///< another part of x and y, times s_k
 };
 
+/// A covariance M = Sigma + c c^T + v I in the coordinates t_k.
+template <typename T> struct TurnedCov {
+  Cov2d<T> cov;
+  Vec3<T> x, y;  ///< adj(M) t_k, as two rows
+  Vec3<T> c;     ///< c x t_k; zero without blur
+  T v;
+};
+
+/// Adds the gradient of weight log sqrt(det M / det(M + v I)): v adj(M) (adj(M) + v) / (2 det det').
+template <bool kBlurred, typename T>
+AR_HD void add_log_amp_vjp(const Factors<T>& f, const TurnedCov<T>& m, T weight, T v, TurnedGrad<T>& h) {
+  if (weight == T(0) || v == T(0)) return;
+  const Vec3<T>&tx = f.turned_x, &ty = f.turned_y, square = mul(f.scale, f.scale);
+  const T l = T(0.5) * weight * v / blur(m.cov, v).det, inv = T(1) / sqrt(m.cov.det);
+  const Vec3<T> n = inv * cross(tx, ty), nn = mul(n, n), cx = inv * m.x, cy = inv * m.y;
+  // t_k . adj(M) t_l / det M
+  Vec3<T> own = {square.y * nn.z + square.z * nn.y, square.z * nn.x + square.x * nn.z,
+                 square.x * nn.y + square.y * nn.x};
+  Vec3<T> mixed = T(-1) * mul(square, shifted_products(n, n));
+  if constexpr (kBlurred) {
+    const T spread = inv * sqrt(m.v);
+    const Vec3<T> e = inv * m.c, ex = spread * tx, ey = spread * ty;
+    own += mul(e, e) + mul(ex, ex) + mul(ey, ey);
+    mixed += shifted_products(e, e) + shifted_products(ex, ex) + shifted_products(ey, ey);
+  }
+  h.diagonal += l * (mul(cx, cx) + mul(cy, cy) + v * own);
+  h.off += l * (shifted_products(cx, cx) + shifted_products(cy, cy) + v * mixed);
+  h.x += (l * inv) * ((m.cov.yy + v) * cx - m.cov.xy * cy);
+  h.y += (l * inv) * ((m.cov.xx + v) * cy - m.cov.xy * cx);
+}
+
 /// Every product is taken in coordinates, whitened or of the factors, where its terms do not cancel: errors grow
 /// neither with the length of a needle outside the image nor with the size of a splat.
-template <typename T> AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad) {
+template <class B, typename T>
+AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, const BlurContext<B, T>& context) {
+  constexpr bool kBlurred = !std::is_same_v<B, NoBlur>;
   const Vec3<T>&tx = f.turned_x, &ty = f.turned_y, zero = {T(0), T(0), T(0)};
   const Mat2<T>& w = grad.w;
   const Sym2<T>& g = grad.dL_dwhite;
-  // b_k = adj(Sigma) t_k, a sum of two terms: across a needle's long axis t_k it is as small as the needle is thin.
-  const Vec3<T> square = mul(f.scale, f.scale), m = cross(tx, ty);
-  const Vec3<T> bx = cross(mul(square, ty), m), by = cross(m, mul(square, tx));
+  TurnedGrad<T> h = {zero, zero, zero, zero, zero, zero};
+  // adj(Sigma) t_k is a sum of two terms: across a needle's long axis t_k it is as small as the needle is thin.
+  const Vec3<T> square = mul(f.scale, f.scale), n = cross(tx, ty);
+  TurnedCov<T> m = {f.cov, cross(mul(square, ty), n), cross(n, mul(square, tx)), zero, T(0)};
+  if constexpr (kBlurred) {
+    const Vec2<T>& b = context.blur.streak;
+    const Cov2d<T>& streaked = context.cov.streaked;
+    m.c = b.x * ty - b.y * tx;
+    // log sqrt(det Sigma / det streaked) has the gradient u u^T det Sigma / (2 det streaked), u = Sigma^-1 b
+    const T inv = T(1) / (sqrt(f.cov.det) * sqrt(streaked.det));
+    const Vec3<T> e = b.x * m.x + b.y * m.y;
+    const T by_e = T(0.5) * context.weighted * inv * inv, ax = f.cov.yy * b.x - f.cov.xy * b.y,
+            ay = f.cov.xx * b.y - f.cov.xy * b.x;
+    h.diagonal += by_e * mul(e, e);
+    h.off += by_e * shifted_products(e, e);
+    h.x += (by_e * ax) * e;
+    h.y += (by_e * ay) * e;
+    m = {streaked, m.x - b.y * m.c, m.y + b.x * m.c, m.c, T(0)};
+    const T v = context.blur.variance;
+    add_log_amp_vjp<true>(f, m, context.weighted, v, h);
+    m = {context.cov.all, m.x + v * tx, m.y + v * ty, m.c, v};
+  }
   const T v = grad.variance;
   Vec3<T> qx, qy;  // w t_k
   if (grad.triangular) {
-    // The second row of whiten() takes from one row of V its projection on the other, (b + v t) / wide.
+    // The second row of whiten() takes from one row of V its projection on the other, (adj(M) + v) t / wide.
     const bool wide_x = w.xx != T(0);
     const T along = w.xx + w.xy, across = (wide_x ? w.yy : w.yx) * along * along;
     qx = along * (wide_x ? tx : ty);
-    qy = across * (wide_x ? by + v * ty : bx + v * tx);
+    qy = across * (wide_x ? m.y + v * ty : m.x + v * tx);
   } else {
     qx = w.xx * tx + w.xy * ty;
     qy = w.yx * tx + w.yy * ty;
   }
   const Vec3<T> ex = g.xx * qx + g.xy * qy, ey = g.xy * qx + g.yy * qy;
-  TurnedGrad<T> h = {mul(qx, ex) + mul(qy, ey), zero, zero, zero, zero, zero};
+  h.diagonal += mul(qx, ex) + mul(qy, ey);
   if (!grad.triangular) {
-    // (w t_k).(w t_l) = t_k . Sigma^-1 t_l is known without w. A window that holds all of a thin needle's width
+    // (w t_k).(w t_l) = t_k . M^-1 t_l is known without w. A window that holds all of a thin needle's width
     // gives much of it, g.yy, which no turn changes: products of w would leave eps (s1/s2)^2 of it.
-    const T c = f.cov.det > T(0) ? g.yy / f.cov.det : T(0);
+    const T c = m.cov.det > T(0) ? g.yy / m.cov.det : T(0);
     const Vec3<T> rx = (g.xx - g.yy) * qx + g.xy * qy, ry = g.xy * qx;
-    h.off = shifted_products(qx, rx) + shifted_products(qy, ry) - c * mul(square, shifted_products(m, m));
-    h.x = w.xx * rx + w.yx * ry;
-    h.y = w.xy * rx + w.yy * ry;
+    h.off += shifted_products(qx, rx) + shifted_products(qy, ry) - c * mul(square, shifted_products(n, n));
+    h.x += w.xx * rx + w.yx * ry;
+    h.y += w.xy * rx + w.yy * ry;
     h.pull_x = c * cross(f.row_y, f.normal);
     h.pull_y = c * cross(f.normal, f.row_x);
+    if constexpr (kBlurred) {
+      const Vec2<T>& b = context.blur.streak;
+      h.off += c * (shifted_products(m.c, m.c) + m.v * (shifted_products(tx, tx) + shifted_products(ty, ty)));
+      h.pull_x += c * mul(f.scale, m.v * tx - b.y * m.c);
+      h.pull_y += c * mul(f.scale, m.v * ty + b.x * m.c);
+    }
     return h;
   }
-  h.off = shifted_products(qx, ex) + shifted_products(qy, ey);
-  h.x = w.xx * ex + w.yx * ey;
-  h.y = w.xy * ex + w.yy * ey;
-  if (grad.dL_dlog_amp == T(0) || v == T(0)) return h;
-  // log amp: v adj(Sigma) (adj(Sigma) + v) / (2 det det')
-  const T l = T(0.5) * grad.dL_dlog_amp * v / blur(f.cov, v).det, inv = T(1) / sqrt(f.cov.det);
-  const Vec3<T> n = inv * m, nn = mul(n, n), cx = inv * bx, cy = inv * by;
-  const Vec3<T> own = {square.y * nn.z + square.z * nn.y, square.z * nn.x + square.x * nn.z,
-                       square.x * nn.y + square.y * nn.x};
-  h.diagonal += l * (mul(cx, cx) + mul(cy, cy) + v * own);
-  h.off += l * (shifted_products(cx, cx) + shifted_products(cy, cy) - v * mul(square, shifted_products(n, n)));
-  h.x += (l * inv) * ((f.cov.yy + v) * cx - f.cov.xy * cy);
-  h.y += (l * inv) * ((f.cov.xx + v) * cy - f.cov.xy * cx);
+  h.off += shifted_products(qx, ex) + shifted_products(qy, ey);
+  h.x += w.xx * ex + w.yx * ey;
+  h.y += w.xy * ex + w.yy * ey;
+  add_log_amp_vjp<kBlurred>(f, m, grad.dL_dlog_amp, v, h);
   return h;
 }
 
-/// Writes the gradients of scale and rotation, or of cov3d, and returns that of the camera-space mean.
-template <typename T>
-AR_HD Vec3<T> project_covariance_vjp(const Camera<T>& camera, const Gaussians<T>& g, const GaussianGrads<T>& out,
-                                     int64_t i, Vec3<T> view, const Factors<T>& f, const SplatGrad<T>& grad) {
+/// Gradient by Sigma of the logarithm of a blur's amplitude, as a matrix.
+template <typename T> AR_HD Sym2<T> blur_amp_grad(const Cov2d<T>& c, const Blur<T>& by, const BlurredCov<T>& cov) {
+  const Vec2<T>& b = by.streak;
+  const T ax = c.yy * b.x - c.xy * b.y, ay = c.xx * b.y - c.xy * b.x;  // adj(Sigma) b
+  const T scale = T(0.5) / c.det, by_x = scale * (ax / cov.streaked.det), by_y = scale * (ay / cov.streaked.det);
+  return Sym2<T>{by_x * ax, by_x * ay, by_y * ay} + log_amp_grad(cov.streaked, by.variance);
+}
+
+/// Writes the gradients of scale and rotation, or of cov3d, and returns that of the Jacobian.
+template <class B, typename T>
+AR_HD JacobianGrad<T> project_covariance_vjp(const Gaussians<T>& g, const GaussianGrads<T>& out, int64_t i,
+                                             const Factors<T>& f, const SplatGrad<T>& grad,
+                                             const BlurContext<B, T>& context) {
   const Vec3<T>&ax = f.jacobian.x, &ay = f.jacobian.y;
   if (g.cov3ds) {
-    const Sym2<T> s = cov_grad(f.cov, grad);
+    Sym2<T> s;
+    if constexpr (std::is_same_v<B, NoBlur>) {
+      s = cov_grad(f.cov, grad);
+    } else {
+      const Sym2<T> amp = blur_amp_grad(f.cov, context.blur, context.cov);
+      const T k = context.weighted;
+      s = cov_grad(context.cov.all, grad) + Sym2<T>{k * amp.xx, k * amp.xy, k * amp.yy};
+    }
     const Vec3<T> u = s.xx * ax + s.xy * ay, v = s.xy * ax + s.yy * ay;  // s A
     const Sym3<T>& c = g.cov3ds[i];
     if (out.cov3ds) {
@@ -278,9 +298,9 @@ AR_HD Vec3<T> project_covariance_vjp(const Camera<T>& camera, const Gaussians<T>
                        u.z * ax.z + v.z * ay.z};
     }
     const Vec3<T> dL_dax = T(2) * (c * u), dL_day = T(2) * (c * v);
-    return jacobian_vjp(camera, f.jacobian, view, dL_dax, dL_day, dot(dL_dax, ax) + dot(dL_day, ay));
+    return {dL_dax, dL_day, dot(dL_dax, ax) + dot(dL_day, ay)};
   }
-  const TurnedGrad<T> h = turned_vjp(f, grad);
+  const TurnedGrad<T> h = turned_vjp(f, grad, context);
   const Vec3<T>& s = f.scale;
   const Vec3<T> by_scale = T(2) * mul(s, h.diagonal);
   if (out.scales) out.scales[i] = g.scale_modifier * by_scale;
@@ -290,62 +310,68 @@ AR_HD Vec3<T> project_covariance_vjp(const Camera<T>& camera, const Gaussians<T>
     out.rotations[i] = rotation_vjp(f.quaternion, T(2) * mul(gap, h.off));
   }
   const Vec3<T> by_x = T(2) * mul(s, mul(s, h.x) + h.pull_x), by_y = T(2) * mul(s, mul(s, h.y) + h.pull_y);
-  return jacobian_vjp(camera, f.jacobian, view, f.rotation * by_x, f.rotation * by_y, dot(s, by_scale));
+  return {f.rotation * by_x, f.rotation * by_y, dot(s, by_scale)};
 }
 
-/// Direction from the camera to the mean, and 1 / distance.
-template <typename T> struct Direction {
-  Vec3<T> unit;
-  T inv_length;
-};
-template <typename T> AR_HD Direction<T> view_direction(const Camera<T>& camera, Vec3<T> mean) {
-  const Vec3<T> d = mean - camera.position;
-  const T inv = T(1) / sqrt(dot(d, d));
-  return {inv * d, inv};
+/// Gradient by the blur itself.
+template <typename T>
+AR_HD Blur<T> seen_covariance_vjp(const Factors<T>& f, const SplatGrad<T>& grad,
+                                  const BlurContext<Blur<T>, T>& context) {
+  const Vec2<T>& b = context.blur.streak;
+  const Cov2d<T>&c = f.cov, &all = context.cov.all;
+  const T k = context.weighted;
+  const Sym2<T> by_all = cov_grad(all, grad), amp = log_amp_grad(context.cov.streaked, context.blur.variance);
+  const Sym2<T> by_streaked = by_all + Sym2<T>{k * amp.xx, k * amp.xy, k * amp.yy};
+  // of log sqrt(det Sigma / det streaked): -adj(Sigma) b / det streaked
+  const T inv = k / context.cov.streaked.det;
+  return {{T(2) * (by_streaked.xx * b.x + by_streaked.xy * b.y) - inv * (c.yy * b.x - c.xy * b.y),
+           T(2) * (by_streaked.xy * b.x + by_streaked.yy * b.y) - inv * (c.xx * b.y - c.xy * b.x)},
+          by_all.xx + by_all.yy - T(0.5) * k * (all.xx + all.yy) / all.det};
 }
 
 /// Colour of Gaussian i, whose coefficients are `sh`. False if it is not finite.
-template <typename T>
-AR_HD bool splat_color(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, const Vec3<T>* sh, Vec3<T>& color) {
+template <class Cam, typename T>
+AR_HD bool splat_color(const Cam& camera, const Gaussians<T>& g, int64_t i, const Vec3<T>* sh, Vec3<T>& color) {
   if (g.colors) {
     color = g.colors[i];
   } else {
-    T basis[kMaxShCount] = {};
-    sh_basis(g.sh_degree, view_direction(camera, g.means[i]).unit, basis);
-    color = sh_color(g.sh_degree, basis, sh);
+    T basis[sh_count(Cam::kShDegree)] = {};
+    sh_basis<Cam::kShDegree>(g.sh_degree, view_direction(camera, g.means[i]).unit, basis);
+    color = sh_color<Cam::kShDegree>(g.sh_degree, basis, sh);
   }
   const bool finite = within(color.x, kMaxColor) && within(color.y, kMaxColor) && within(color.z, kMaxColor);
   if (!g.colors) color = {max(color.x, T(0)), max(color.y, T(0)), max(color.z, T(0))};
   return finite;
 }
 
-/// Writes the gradient of the colour's parameters and returns its part in that of the mean. `sh` are
-/// the coefficients, `dL_dsh` takes their gradient, or is null; they may be the same memory.
-template <typename T>
-AR_HD Vec3<T> splat_color_vjp(const Camera<T>& camera, const Gaussians<T>& g, const GaussianGrads<T>& out, int64_t i,
+/// Writes the gradient of the colour's parameters and returns its part in that of the direction, as long as it
+/// is. `sh` are the coefficients, `dL_dsh` takes their gradient, or is null; they may be the same memory.
+template <class Cam, typename T>
+AR_HD Vec3<T> splat_color_vjp(const Cam& camera, const Gaussians<T>& g, const GaussianGrads<T>& out, int64_t i,
                               const Vec3<T>* sh, Vec3<T>* dL_dsh, Vec3<T> dL_dcolor) {
   if (g.colors) {
     if (out.colors) out.colors[i] = dL_dcolor;
     return {T(0), T(0), T(0)};
   }
-  T basis[kMaxShCount] = {}, weight[kMaxShCount];
+  constexpr int kCount = sh_count(Cam::kShDegree);
+  T basis[kCount] = {}, weight[kCount];
   const Direction<T> d = view_direction(camera, g.means[i]);
-  sh_basis(g.sh_degree, d.unit, basis);
-  const Vec3<T> c = sh_color(g.sh_degree, basis, sh);
+  sh_basis<Cam::kShDegree>(g.sh_degree, d.unit, basis);
+  const Vec3<T> c = sh_color<Cam::kShDegree>(g.sh_degree, basis, sh);
   const Vec3<T> free = {c.x >= T(0) ? dL_dcolor.x : T(0), c.y >= T(0) ? dL_dcolor.y : T(0),
                         c.z >= T(0) ? dL_dcolor.z : T(0)};
   const int used = sh_count(g.sh_degree);
   AR_UNROLL
-  for (int k = 0; k < kMaxShCount; ++k) weight[k] = k < used ? dot(free, sh[k]) : T(0);
+  for (int k = 0; k < kCount; ++k) weight[k] = k < used ? dot(free, sh[k]) : T(0);
   if (dL_dsh) {
     AR_UNROLL
-    for (int k = 0; k < kMaxShCount; ++k) {
+    for (int k = 0; k < kCount; ++k) {
       if (k < used) dL_dsh[k] = basis[k] * free;
     }
     for (int k = used; k < g.sh_stride; ++k) dL_dsh[k] = {T(0), T(0), T(0)};
   }
   if (g.sh_degree == 0) return {T(0), T(0), T(0)};
-  const Vec3<T> by_unit = sh_basis_vjp(g.sh_degree, d.unit, weight);
+  const Vec3<T> by_unit = sh_basis_vjp<Cam::kShDegree>(g.sh_degree, d.unit, weight);
   return d.inv_length * (by_unit - dot(by_unit, d.unit) * d.unit);
 }
 
@@ -358,8 +384,8 @@ template <typename T> AR_HD int splat_radius(Cov2d<T> cov, T variance) {
 /// Projects Gaussian i, all but its colour. Returns 3DGS's radius, 0 if it is culled: behind the near
 /// plane, off the image, not finite, or degenerate. A splat that is kept may still touch no tile
 /// (level <= 0) and then needs no colour.
-template <class F, typename T>
-AR_HD int project_shape(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options,
+template <class F, class Cam, typename T>
+AR_HD int project_shape(const Cam& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options,
                         Splat<F, T>& splat, T& depth) {
   const ProjectedMean<T> mean = project_mean(camera, g.means[i]);
   splat.level = T(0);
@@ -368,7 +394,8 @@ AR_HD int project_shape(const Camera<T>& camera, const Gaussians<T>& g, int64_t 
   if (g.scales &&
       !(within(factors.scale.x, kMaxScale) && within(factors.scale.y, kMaxScale) && within(factors.scale.z, kMaxScale)))
     return 0;
-  const Cov2d<T>& cov = factors.cov;
+  const SeenCov<T> seen = seen_covariance(camera, g, i, mean.view, factors);
+  const Cov2d<T>& cov = seen.cov;
   if (!(cov.det >= T(0) && cov.det < T(kMaxDet) && cov.xx >= T(0) && cov.yy >= T(0)) || !within(cov.xx, 1e18) ||
       !within(cov.yy, 1e18))
     return 0;
@@ -377,14 +404,14 @@ AR_HD int project_shape(const Camera<T>& camera, const Gaussians<T>& g, int64_t 
   if (!within(w.xx, kMaxWhitening) || !within(w.xy, kMaxWhitening) || !within(w.yx, kMaxWhitening) ||
       !within(w.yy, kMaxWhitening))
     return 0;
-  const T opacity = g.opacities[i], level = F::level(splat.shape, opacity);
+  const T opacity = g.opacities[i], peak = seen.amp * opacity, level = F::level(splat.shape, peak);
   if (!within(level, 1e6) || opacity > T(kMaxOpacity))
     return 0;  // zero, negative or non-finite opacity, zero determinant
   const int radius = splat_radius(cov, T(F::radius_variance(options)));
   const bool on_image = mean.pixel.x + T(radius) >= T(0) && mean.pixel.x - T(radius) <= camera.size.x - T(1) &&
                         mean.pixel.y + T(radius) >= T(0) && mean.pixel.y - T(radius) <= camera.size.y - T(1);
   splat.mean = mean.pixel;
-  splat.opacity = opacity;
+  splat.opacity = peak;
   depth = mean.view.z;
   splat.level = level;
   const bool touches = level > T(0) && touches_image(support_of(splat), camera.grid);
@@ -393,9 +420,9 @@ AR_HD int project_shape(const Camera<T>& camera, const Gaussians<T>& g, int64_t 
 }
 
 /// Projects Gaussian i. Culls it too where its colour is not finite.
-template <class F, typename T>
-AR_HD int project(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options,
-                  Splat<F, T>& splat, T& depth) {
+template <class F, class Cam, typename T>
+AR_HD int project(const Cam& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options, Splat<F, T>& splat,
+                  T& depth) {
   const int radius = project_shape(camera, g, i, options, splat, depth);
   if (!(splat.level > T(0))) return radius;
   if (splat_color(camera, g, i, g.shs ? g.shs + i * g.sh_stride : nullptr, splat.color)) return radius;
@@ -403,18 +430,47 @@ AR_HD int project(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, Foo
   return 0;
 }
 
-/// Writes every gradient of Gaussian i, from the sums over its pairs. `sh` and `dL_dsh` as for
-/// splat_color_vjp; out.shs is not touched.
-template <class F, typename T>
-AR_HD void project_vjp(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options,
-                       const PairGrad<T>& sums, const Vec3<T>* sh, Vec3<T>* dL_dsh, const GaussianGrads<T>& out) {
+/// Writes every gradient of Gaussian i, from the sums over its pairs, and adds that of a full camera to
+/// `camera_grad`, if not null. `sh` and `dL_dsh` as for splat_color_vjp; out.shs is not touched.
+template <class F, class Cam, typename T>
+AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options,
+                       const PairGrad<T>& sums, const Vec3<T>* sh, Vec3<T>* dL_dsh, const GaussianGrads<T>& out,
+                       CameraGrad<T>* camera_grad = nullptr) {
   const ProjectedMean<T> mean = project_mean(camera, g.means[i]);
   const Factors<T> factors = project_covariance(camera, g, i, mean.view);
-  const SplatGrad<T> grad =
-      F::prepare_vjp(factors.cov, F::prepare(factors.cov, options), sums.shape, sums.weighted, options);
-  const Vec3<T> dL_dview = project_covariance_vjp(camera, g, out, i, mean.view, factors, grad);
+  const Cov2d<T> cov = seen_covariance(camera, g, i, mean.view, factors).cov;
+  const SplatGrad<T> grad = F::prepare_vjp(cov, F::prepare(cov, options), sums.shape, sums.weighted, options);
+  JacobianGrad<T> by_jacobian;
+  Vec3<T> dL_dview = {T(0), T(0), T(0)};
+  bool has_blur = false;
+  if constexpr (Cam::kFull) {
+    const Blur<T> blur = blur_of(camera, mean.view);
+    has_blur = blur.any();
+    // At zero the streak has no gradient, and a defocused variance only by the way it grows, which is zero too.
+    if (has_blur) {
+      const BlurContext<Blur<T>, T> context = {blur, blurred(factors, g, i, blur), sums.weighted};
+      by_jacobian = project_covariance_vjp(g, out, i, factors, grad, context);
+      dL_dview = blur_vjp(camera, mean.view, seen_covariance_vjp(factors, grad, context), camera_grad);
+    }
+  }
+  if (!has_blur) by_jacobian = project_covariance_vjp(g, out, i, factors, grad, BlurContext<NoBlur, T>{});
+  dL_dview += jacobian_vjp(camera, factors.jacobian, mean.view, by_jacobian);
   Vec3<T> dL_dmean = project_mean_vjp(camera, mean, grad.dL_dmean, dL_dview);
-  dL_dmean += splat_color_vjp(camera, g, out, i, sh, dL_dsh, sums.color);
+  const Vec3<T> by_direction = splat_color_vjp(camera, g, out, i, sh, dL_dsh, sums.color);
+  bool sees_along = false;
+  if constexpr (Cam::kFull) {
+    sees_along = camera.lens.orthographic();
+    if (camera_grad) {
+      add_project_mean_vjp(camera, mean, g.means[i], grad.dL_dmean, dL_dview, *camera_grad);
+      add_jacobian_vjp(camera, factors.jacobian, mean.view, by_jacobian, *camera_grad);
+      if (sees_along) {
+        add_xyz(camera_grad->view_z, by_direction);
+      } else {
+        camera_grad->position += T(-1) * by_direction;
+      }
+    }
+  }
+  if (!sees_along) dL_dmean += by_direction;
   if (out.means) out.means[i] = dL_dmean;
   if (out.opacities) out.opacities[i] = sums.weighted / g.opacities[i];
   if (out.means2d) {
@@ -426,11 +482,11 @@ AR_HD void project_vjp(const Camera<T>& camera, const Gaussians<T>& g, int64_t i
 }
 
 /// The same with all coefficients in their place.
-template <class F, typename T>
-AR_HD void project_vjp(const Camera<T>& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options,
-                       const PairGrad<T>& sums, const GaussianGrads<T>& out) {
+template <class F, class Cam, typename T>
+AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, FootprintOptions options,
+                       const PairGrad<T>& sums, const GaussianGrads<T>& out, CameraGrad<T>* camera_grad = nullptr) {
   project_vjp<F>(camera, g, i, options, sums, g.shs ? g.shs + i * g.sh_stride : nullptr,
-                 out.shs ? out.shs + i * g.sh_stride : nullptr, out);
+                 out.shs ? out.shs + i * g.sh_stride : nullptr, out, camera_grad);
 }
 
 /// Zero gradient, for a Gaussian that touched no pixel. Coefficients go to `dL_dsh`, if not null.

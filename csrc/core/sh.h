@@ -1,4 +1,5 @@
-// View-dependent colour from real spherical harmonics, degree 0 to 3.
+// View-dependent colour from real spherical harmonics, degree 0 to 4. kMax is the largest degree that the code can
+// use: what the fourth costs in registers and memory is only paid where it is 4.
 #pragma once
 
 #include "core/vec.h"
@@ -8,11 +9,10 @@ namespace ar {
 /// Coefficients of a colour of this degree.
 AR_HD constexpr int sh_count(int degree) { return (degree + 1) * (degree + 1); }
 
-inline constexpr int kMaxShDegree = 3;
-inline constexpr int kMaxShCount = 16;
+inline constexpr int kMaxShDegree = 4;
 
 /// Basis functions at the unit vector d, in the order and sign of 3DGS (Condon-Shortley).
-template <typename T> AR_HD void sh_basis(int degree, Vec3<T> d, T* basis) {
+template <int kMax, typename T> AR_HD void sh_basis(int degree, Vec3<T> d, T* basis) {
   const T x = d.x, y = d.y, z = d.z;
   basis[0] = T(0.28209479177387814);
   if (degree < 1) return;
@@ -35,10 +35,22 @@ template <typename T> AR_HD void sh_basis(int degree, Vec3<T> d, T* basis) {
   basis[13] = T(-0.4570457994644658) * x * (T(4) * zz - xx - yy);
   basis[14] = T(1.445305721320277) * z * (xx - yy);
   basis[15] = T(-0.5900435899266435) * x * (xx - T(3) * yy);
+  if constexpr (kMax >= 4) {
+    if (degree < 4) return;
+    basis[16] = T(2.5033429417967046) * x * y * (xx - yy);
+    basis[17] = T(-1.7701307697799304) * y * z * (T(3) * xx - yy);
+    basis[18] = T(0.9461746957575601) * x * y * (T(7) * zz - T(1));
+    basis[19] = T(-0.6690465435572892) * y * z * (T(7) * zz - T(3));
+    basis[20] = T(0.10578554691520431) * (zz * (T(35) * zz - T(30)) + T(3));
+    basis[21] = T(-0.6690465435572892) * x * z * (T(7) * zz - T(3));
+    basis[22] = T(0.47308734787878004) * (xx - yy) * (T(7) * zz - T(1));
+    basis[23] = T(-1.7701307697799304) * x * z * (xx - T(3) * yy);
+    basis[24] = T(0.6258357354491761) * (xx * (xx - T(3) * yy) - yy * (T(3) * xx - yy));
+  }
 }
 
 /// Gradient by d of sum_k weight[k] basis[k](d), d taken as three free coordinates.
-template <typename T> AR_HD Vec3<T> sh_basis_vjp(int degree, Vec3<T> d, const T* weight) {
+template <int kMax, typename T> AR_HD Vec3<T> sh_basis_vjp(int degree, Vec3<T> d, const T* weight) {
   Vec3<T> g = {T(0), T(0), T(0)};
   if (degree < 1) return g;
   const T x = d.x, y = d.y, z = d.z;
@@ -61,14 +73,33 @@ template <typename T> AR_HD Vec3<T> sh_basis_vjp(int degree, Vec3<T> d, const T*
                    T(6) * c30 * y * z * weight[12] - T(2) * c3z * y * z * weight[14],
                c32 * x * y * weight[10] - T(8) * c31 * z * (y * weight[11] + x * weight[13]) +
                    T(3) * c30 * (T(2) * zz - xx - yy) * weight[12] + c3z * (xx - yy) * weight[14]};
+  if constexpr (kMax >= 4) {
+    if (degree < 4) return g;
+    const T c44 = T(2.5033429417967046), c43 = T(-1.7701307697799304), c42 = T(0.9461746957575601),
+            c41 = T(-0.6690465435572892), c40 = T(0.10578554691520431), c4z = T(0.47308734787878004),
+            c4x = T(0.6258357354491761), seven = T(7) * zz;
+    g += Vec3<T>{c44 * y * (T(3) * xx - yy) * weight[16] + c43 * T(6) * x * y * z * weight[17] +
+                     c42 * y * (seven - T(1)) * weight[18] + c41 * z * (seven - T(3)) * weight[21] +
+                     c4z * T(2) * x * (seven - T(1)) * weight[22] + c43 * T(3) * z * (xx - yy) * weight[23] +
+                     c4x * T(4) * x * (xx - T(3) * yy) * weight[24],
+                 c44 * x * (xx - T(3) * yy) * weight[16] + c43 * T(3) * z * (xx - yy) * weight[17] +
+                     c42 * x * (seven - T(1)) * weight[18] + c41 * z * (seven - T(3)) * weight[19] -
+                     c4z * T(2) * y * (seven - T(1)) * weight[22] - c43 * T(6) * x * y * z * weight[23] +
+                     c4x * T(4) * y * (yy - T(3) * xx) * weight[24],
+                 c43 * y * (T(3) * xx - yy) * weight[17] + c42 * T(14) * x * y * z * weight[18] +
+                     c41 * (T(21) * zz - T(3)) * (y * weight[19] + x * weight[21]) +
+                     c40 * z * (T(140) * zz - T(60)) * weight[20] + c4z * T(14) * z * (xx - yy) * weight[22] +
+                     c43 * x * (xx - T(3) * yy) * weight[23]};
+  }
   return g;
 }
 
 /// Colour before the clamp at zero: sum of coefficients times basis, plus 1/2.
-template <typename T> AR_HD Vec3<T> sh_color(int degree, const T* basis, const Vec3<T>* coefficients) {
+template <int kMax, typename T> AR_HD Vec3<T> sh_color(int degree, const T* basis, const Vec3<T>* coefficients) {
+  constexpr int kCount = sh_count(kMax);
   Vec3<T> color = {T(0.5), T(0.5), T(0.5)};
   AR_UNROLL
-  for (int k = 0; k < kMaxShCount; ++k) {
+  for (int k = 0; k < kCount; ++k) {
     if (k < sh_count(degree)) color += basis[k] * coefficients[k];
   }
   return color;

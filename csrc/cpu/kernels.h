@@ -18,10 +18,23 @@ template <class F, typename T> constexpr auto choose_stage() -> decltype(cpu::St
   }
 }
 
+template <class F, template <typename> class Cam, typename T>
+inline constexpr cpu::CameraStages<T> kCameraStages = {count_candidates<Cam, T>, project<F, Cam, T>,
+                                                       project_vjp<F, Cam, T>};
+
 template <class F, typename T>
 inline constexpr cpu::Stages<T> kStages = {
-    F::kSamples, count_candidates<T>, project<F, T>,     count_pairs<F, T>, scatter_pairs<F, T>, choose_stage<F, T>(),
-    blend<F, T>, blend_vjp<F, T>,     project_vjp<F, T>, weight<F, T>,      weight_vjp<F, T>,    inspect<F, T>,
+    F::kSamples,
+    kCameraStages<F, Camera, T>,
+    kCameraStages<F, FullCamera, T>,
+    count_pairs<F, T>,
+    scatter_pairs<F, T>,
+    choose_stage<F, T>(),
+    blend<F, T>,
+    blend_vjp<F, T>,
+    weight<F, T>,
+    weight_vjp<F, T>,
+    inspect<F, T>,
 };
 
 template <typename T> const cpu::Stages<T>* stages(std::string_view footprint) {

@@ -6,7 +6,7 @@
 #include <string_view>
 #include <vector>
 
-#include "core/params.h"
+#include "core/camera.h"
 #include "core/weight.h"
 
 namespace ar::cpu {
@@ -110,26 +110,34 @@ template <typename T> struct ProjectVjpTask {
   const PairGrad<T>* pair_grads;
   const Vec2<T>* pair_abs;
   GaussianGrads<T> grads;
+  CameraGrad<T>* camera_grads;  ///< [chunks] to add to, of a full camera, or null
 };
 
 template <typename T> struct WeightTask : ar::WeightTask<T> {
   int threads;
 };
 
+/// What depends on the camera.
+template <typename T> struct CameraStages {
+  void (*count_candidates)(const ProjectTask<T>&);
+  void (*project)(const ProjectTask<T>&);
+  void (*project_vjp)(const ProjectVjpTask<T>&);
+};
+
 /// The stages of one footprint.
 template <typename T> struct Stages {
   int samples;
-  void (*count_candidates)(const ProjectTask<T>&);
-  void (*project)(const ProjectTask<T>&);
+  CameraStages<T> plain, full;
   void (*count_pairs)(BinTask<T>&);
   void (*scatter_pairs)(BinTask<T>&);
   void (*choose)(const ChooseTask<T>&);  ///< null where all tiles have the same samples
   void (*blend)(const BlendTask<T>&);
   void (*blend_vjp)(const BlendVjpTask<T>&);
-  void (*project_vjp)(const ProjectVjpTask<T>&);
   void (*weight)(const WeightTask<T>&);
   void (*weight_vjp)(const WeightTask<T>&);
   void (*inspect)(const InspectTask<T>&);
+
+  const CameraStages<T>& of(const CameraView<T>& camera) const { return camera.lens ? full : plain; }
 };
 
 /// Stages of the footprint whose kName is `footprint`, for the best instruction set that this

@@ -9,10 +9,10 @@ namespace ar::cuda {
 
 inline constexpr int kProjectThreads = 128;
 
-/// Rows of spherical harmonics of a warp's Gaussians. Rows go between here and memory with
-/// neighbouring lanes at neighbouring addresses; 49 floats a row keep the lanes on different banks.
-struct ShRows {
-  static constexpr int kStride = 3 * kMaxShCount + 1;
+/// Rows of spherical harmonics, up to kDegree, of a warp's Gaussians. Rows go between here and memory with
+/// neighbouring lanes at neighbouring addresses; 49 or 76 floats a row keep the lanes on different banks, or nearly.
+template <int kDegree> struct ShRows {
+  static constexpr int kCount = sh_count(kDegree), kStride = 3 * kCount + 1;
   float value[32][kStride];
 
   /// Moves the first 4 kQuads numbers of all 32 rows of 4 `quads` in memory, all at once.
@@ -66,17 +66,18 @@ struct ShRows {
   __device__ Vec3<float>* row() { return reinterpret_cast<Vec3<float>*>(value[lane_id()]); }
 };
 
-template <class F> __global__ void __launch_bounds__(kProjectThreads) project_kernel(const ProjectTask task) {
-  __shared__ ShRows sh_rows[kProjectThreads / 32];
+template <class F, class Cam>
+__global__ void __launch_bounds__(kProjectThreads) project_kernel(const ProjectTask task) {
+  __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
   const Gaussians<float>& g = task.gaussians;
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
-  const Camera<float> camera = load_camera(task.camera);
+  const Cam camera = load_camera_as<Cam>(task.camera);
   Splat<F, float> splat = {};
   float depth = 0;
   int radius = 0;
   const float blur = float(max(task.options.variance, kPixelVariance));
   if (i < g.n && may_be_visible(camera, g, i, blur)) radius = project_shape(camera, g, i, task.options, splat, depth);
-  ShRows& rows = sh_rows[threadIdx.x / 32];
+  ShRows<Cam::kShDegree>& rows = sh_rows[threadIdx.x / 32];
   const uint32_t lit = __ballot_sync(kAllLanes, splat.level > 0);
   if (g.shs && lit) rows.load(g.shs + (i - lane_id()) * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
   int count = 0;
@@ -99,7 +100,8 @@ template <class F> __global__ void __launch_bounds__(kProjectThreads) project_ke
 
 template <class F> void project(const ProjectTask& task, cudaStream_t stream) {
   if (task.gaussians.n == 0) return;
-  project_kernel<F><<<blocks_of(task.gaussians.n, kProjectThreads), kProjectThreads, 0, stream>>>(task);
+  const auto kernel = task.camera.lens ? project_kernel<F, FullCamera<float>> : project_kernel<F, Camera<float>>;
+  kernel<<<blocks_of(task.gaussians.n, kProjectThreads), kProjectThreads, 0, stream>>>(task);
 }
 
 /// Gradients summed for one splat.
@@ -148,8 +150,19 @@ __device__ inline void zero_rows(float* to, int count) {
   for (int e = lane_id(); e < count; e += 32) to[e] = 0;
 }
 
-template <class F> __global__ void __launch_bounds__(kProjectThreads, 5) project_vjp_kernel(const ProjectVjpTask task) {
-  __shared__ ShRows sh_rows[kProjectThreads / 32];
+/// Sums of the lanes' gradients, one lane after the other for each number.
+__device__ inline void store_warp_sums(const CameraGrad<float>& grad, float* to) {
+  const float* values = &grad.view_x.x;
+#pragma unroll
+  for (int k = 0; k < kCameraGradWidth; ++k) {
+    const float total = warp_sum(values[k]);
+    if (lane_id() == 0) to[k] = total;
+  }
+}
+
+template <class F, class Cam>
+__global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : 5) project_vjp_kernel(const ProjectVjpTask task) {
+  __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
   const Gaussians<float>& g = task.gaussians;
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
   const int64_t first = i - lane_id();  // of the warp
@@ -167,9 +180,10 @@ template <class F> __global__ void __launch_bounds__(kProjectThreads, 5) project
     if (out.colors) zero_rows(&out.colors[first].x, 3 * n);
     if (out.means2d) zero_rows(out.means2d + first * out.means2d_stride, out.means2d_stride * n);
     if (out.shs) zero_rows(&out.shs[first * g.sh_stride].x, 3 * g.sh_stride * n);
+    if (Cam::kFull && task.camera_grads) zero_rows(task.camera_grads + first / 32 * kCameraGradWidth, kCameraGradWidth);
     return;
   }
-  ShRows& rows = sh_rows[threadIdx.x / 32];
+  ShRows<Cam::kShDegree>& rows = sh_rows[threadIdx.x / 32];
   if (g.shs) rows.load(g.shs + first * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
   SplatSums sums = {};
   if (task.counts->pairs <= task.capacity) {
@@ -177,12 +191,14 @@ template <class F> __global__ void __launch_bounds__(kProjectThreads, 5) project
   } else if (range.count > 0) {
     sums.add(task.pair_grads + i * kPairGradWidth);
   }
-  const Camera<float> camera = load_camera(task.camera);
+  const Cam camera = load_camera_as<Cam>(task.camera);
   // Longer rows than the largest degree's hold coefficients without influence.
-  const bool staged = out.shs && g.sh_stride <= kMaxShCount;
+  const bool staged = out.shs && g.sh_stride <= rows.kCount;
   Vec3<float>* dL_dsh = staged ? rows.row() : out.shs ? out.shs + i * g.sh_stride : nullptr;
+  CameraGrad<float> camera_grad = {};
   if (range.count > 0) {
-    ar::project_vjp<F>(camera, g, i, task.options, sums.grad(), rows.row(), dL_dsh, out);
+    ar::project_vjp<F>(camera, g, i, task.options, sums.grad(), rows.row(), dL_dsh, out,
+                       Cam::kFull && task.camera_grads ? &camera_grad : nullptr);
     if (out.means2d && out.means2d_stride == 4) {
       out.means2d[i * 4 + 2] = 0.5f * camera.size.x * sums.value[9];
       out.means2d[i * 4 + 3] = 0.5f * camera.size.y * sums.value[10];
@@ -191,11 +207,16 @@ template <class F> __global__ void __launch_bounds__(kProjectThreads, 5) project
     zero_grads(g, i, out, dL_dsh);
   }
   if (staged) rows.store(out.shs + first * g.sh_stride, g.sh_stride, n);
+  if constexpr (Cam::kFull) {
+    if (task.camera_grads) store_warp_sums(camera_grad, task.camera_grads + first / 32 * kCameraGradWidth);
+  }
 }
 
 template <class F> void project_vjp(const ProjectVjpTask& task, cudaStream_t stream) {
   if (task.gaussians.n == 0) return;
-  project_vjp_kernel<F><<<blocks_of(task.gaussians.n, kProjectThreads), kProjectThreads, 0, stream>>>(task);
+  const auto kernel =
+      task.camera.lens ? project_vjp_kernel<F, FullCamera<float>> : project_vjp_kernel<F, Camera<float>>;
+  kernel<<<blocks_of(task.gaussians.n, kProjectThreads), kProjectThreads, 0, stream>>>(task);
 }
 
 }  // namespace ar::cuda

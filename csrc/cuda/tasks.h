@@ -11,7 +11,7 @@
 
 #include <string_view>
 
-#include "core/params.h"
+#include "core/camera.h"
 #include "core/weight.h"
 
 namespace ar::cuda {
@@ -178,11 +178,14 @@ struct ProjectVjpTask {
   int64_t capacity;
   const float* pair_grads;
   GaussianGrads<float> grads;
+  float* camera_grads;  ///< [warps_of(n), kCameraGradWidth] CameraGrad of each 32 Gaussians, or null
 };
+
+AR_HD constexpr int64_t warps_of(int64_t n) { return (n + 31) / 32; }
 
 struct ForwardStages {
   int samples;
-  void (*project)(const ProjectTask&, cudaStream_t);
+  void (*project)(const ProjectTask&, cudaStream_t);  ///< for any camera
   void (*emit_pairs)(const EmitTask&, cudaStream_t);
   void (*choose)(const ChooseTask&, cudaStream_t);  ///< null where all tiles have the same samples
   void (*blend)(const BlendTask&, cudaStream_t);

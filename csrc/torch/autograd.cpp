@@ -45,15 +45,16 @@ struct Settings {
 using RasterizeSignature = RasterizeOutput(const Tensor&, const OptionalTensor&, const Tensor&, const OptionalTensor&,
                                            const OptionalTensor&, const OptionalTensor&, const OptionalTensor&,
                                            const OptionalTensor&, const Tensor&, const Tensor&, const Tensor&,
-                                           const Tensor&, int64_t, int64_t, double, double, double, int64_t,
-                                           std::string, double, bool, bool);
+                                           const Tensor&, const OptionalTensor&, int64_t, int64_t, double, double,
+                                           double, int64_t, std::string, double, bool, bool);
 using RasterizeVjpSignature = Grads(const Tensor&, const Tensor&, const OptionalTensor&, const Tensor&,
                                     const OptionalTensor&, const OptionalTensor&, const OptionalTensor&,
                                     const OptionalTensor&, const OptionalTensor&, const Tensor&, const Tensor&,
-                                    const Tensor&, const Tensor&, int64_t, int64_t, double, double, double, int64_t,
-                                    std::string, double, const Tensor&, const Tensor&, const Tensor&, const Tensor&,
+                                    const Tensor&, const Tensor&, const OptionalTensor&, int64_t, int64_t, double,
+                                    double, double, int64_t, std::string, double, const Tensor&, const Tensor&,
                                     const Tensor&, const Tensor&, const Tensor&, const Tensor&, const Tensor&,
-                                    const Tensor&, const Tensor&, const Tensor&, std::array<bool, 8>, bool);
+                                    const Tensor&, const Tensor&, const Tensor&, const Tensor&, const Tensor&, Needs,
+                                    bool);
 using WeightSignature = Tensor(const Tensor&, const Tensor&, std::string, double);
 using WeightVjpSignature = std::tuple<Tensor, Tensor>(const Tensor&, const Tensor&, const Tensor&, std::string, double);
 
@@ -65,7 +66,8 @@ template <class Tuple> variable_list list_of(const Tuple& tuple) {
   return std::apply([](const auto&... t) { return variable_list{t...}; }, tuple);
 }
 
-constexpr size_t kDifferentiable = 8, kInputs = 12, kOutputs = std::tuple_size_v<RasterizeOutput>;
+constexpr size_t kGaussianInputs = 8, kBackground = 8, kLens = 12, kInputs = 13,
+                 kOutputs = std::tuple_size_v<RasterizeOutput>;
 
 /// The derivative of a derivative must fail, not be zero: rasterize_vjp has none, and says so.
 struct Rasterize : torch::autograd::Function<Rasterize> {
@@ -73,12 +75,13 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
                                const Tensor& opacities, const OptionalTensor& shs, const OptionalTensor& colors_precomp,
                                const OptionalTensor& scales, const OptionalTensor& rotations,
                                const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
-                               const Tensor& projmatrix, const Tensor& campos, const Settings& s, bool keep) {
+                               const Tensor& projmatrix, const Tensor& campos, const OptionalTensor& lens,
+                               const Settings& s, bool keep) {
     static const auto op = find_op<RasterizeSignature>("analytic_rasterizer::rasterize");
     const at::AutoDispatchBelowADInplaceOrView guard;
     const variable_list out =
         list_of(op.call(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
-                        viewmatrix, projmatrix, campos, s.image_height, s.image_width, s.tanfovx, s.tanfovy,
+                        viewmatrix, projmatrix, campos, lens, s.image_height, s.image_width, s.tanfovx, s.tanfovy,
                         s.scale_modifier, s.sh_degree, s.footprint, s.option, keep, s.debug));
     ctx->set_materialize_grads(false);  // no zeros the size of everything saved
     ctx->mark_non_differentiable({out.begin() + 1, out.end()});
@@ -96,7 +99,8 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
                              bg,
                              viewmatrix,
                              projmatrix,
-                             campos};
+                             campos,
+                             given(lens)};
       saved.insert(saved.end(), out.begin() + 2, out.end());
       ctx->save_for_backward(std::move(saved));
       s.save(ctx);
@@ -112,17 +116,23 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
     const variable_list t = ctx->get_saved_variables();
     const Settings s = Settings::load(ctx);
     const auto given = [](const Tensor& t) { return t.defined() ? OptionalTensor(t) : std::nullopt; };
-    std::array<bool, kDifferentiable> needs;
-    size_t edge = 0;  // counts the tensors that were given
-    for (size_t i = 0; i < kDifferentiable; ++i) needs[i] = t[i].defined() && ctx->needs_input_grad(edge++);
+    Needs needs;
+    size_t edge = 0;                   // counts the tensors that were given
+    std::array<size_t, kNeeds> input;  // of every gradient
+    for (size_t i = 0, k = 0; i < kInputs; ++i) {
+      const bool needed = t[i].defined() && ctx->needs_input_grad(edge++);
+      if (i == kBackground) continue;
+      input[k] = i;
+      needs[k++] = needed && (i < kGaussianInputs || t[kLens].defined());
+    }
     const auto saved = t.begin() + kInputs;
     const variable_list out = list_of(
         op.call(dL_doutputs[0], t[0], given(t[1]), t[2], given(t[3]), given(t[4]), given(t[5]), given(t[6]),
-                given(t[7]), t[8], t[9], t[10], t[11], s.image_height, s.image_width, s.tanfovx, s.tanfovy,
-                s.scale_modifier, s.sh_degree, s.footprint, s.option, saved[0], saved[1], saved[2], saved[3], saved[4],
-                saved[5], saved[6], saved[7], saved[8], saved[9], saved[10], saved[11], needs, s.debug));
-    for (size_t i = 0; i < kDifferentiable; ++i) {
-      if (needs[i]) grads[i] = out[i];
+                given(t[7]), t[8], t[9], t[10], t[11], given(t[kLens]), s.image_height, s.image_width, s.tanfovx,
+                s.tanfovy, s.scale_modifier, s.sh_degree, s.footprint, s.option, saved[0], saved[1], saved[2], saved[3],
+                saved[4], saved[5], saved[6], saved[7], saved[8], saved[9], saved[10], saved[11], needs, s.debug));
+    for (size_t k = 0; k < kNeeds; ++k) {
+      if (needs[k]) grads[input[k]] = out[k].view_as(t[input[k]]);
     }
     return grads;
   }
@@ -133,13 +143,14 @@ RasterizeOutput rasterize_autograd(const Tensor& means3D, const OptionalTensor& 
                                    const OptionalTensor& shs, const OptionalTensor& colors_precomp,
                                    const OptionalTensor& scales, const OptionalTensor& rotations,
                                    const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
-                                   const Tensor& projmatrix, const Tensor& campos, int64_t image_height,
-                                   int64_t image_width, double tanfovx, double tanfovy, double scale_modifier,
-                                   int64_t sh_degree, std::string footprint, double option, bool keep, bool debug) {
+                                   const Tensor& projmatrix, const Tensor& campos, const OptionalTensor& lens,
+                                   int64_t image_height, int64_t image_width, double tanfovx, double tanfovy,
+                                   double scale_modifier, int64_t sh_degree, std::string footprint, double option,
+                                   bool keep, bool debug) {
   const Settings settings = {image_height, image_width, tanfovx, tanfovy, scale_modifier,
                              sh_degree,    footprint,   option,  debug};
   const variable_list out = Rasterize::apply(means3D, means2D, opacities, shs, colors_precomp, scales, rotations,
-                                             cov3D_precomp, bg, viewmatrix, projmatrix, campos, settings, keep);
+                                             cov3D_precomp, bg, viewmatrix, projmatrix, campos, lens, settings, keep);
   return {out[0], out[1], out[2], out[3],  out[4],  out[5],  out[6],
           out[7], out[8], out[9], out[10], out[11], out[12], out[13]};
 }

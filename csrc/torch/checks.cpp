@@ -2,7 +2,7 @@
 
 #include <sstream>
 
-#include "core/params.h"
+#include "core/camera.h"
 #include "core/sh.h"
 
 namespace ar::ops {
@@ -130,8 +130,8 @@ void Inputs::check() {
   }
   TORCH_CHECK_VALUE(shs.has_value() != colors_precomp.has_value(),
                     "exactly one of shs and colors_precomp must be given, got ", shs ? "both" : "neither");
-  TORCH_CHECK_VALUE(sh_degree >= 0 && sh_degree <= kMaxShDegree, "sh_degree must be 0 to ", kMaxShDegree, ", got ",
-                    sh_degree);
+  const int degrees = lens ? FullCamera<float>::kShDegree : Camera<float>::kShDegree;
+  TORCH_CHECK_VALUE(sh_degree >= 0 && sh_degree <= degrees, "sh_degree must be 0 to ", degrees, ", got ", sh_degree);
   if (shs) {
     const int64_t needed = sh_count(int(sh_degree));
     TORCH_CHECK_VALUE(shs->dim() == 3 && shs->size(0) == p && shs->size(1) >= needed && shs->size(2) == 3,
@@ -162,6 +162,12 @@ void Inputs::check() {
   check_matrix(viewmatrix, "viewmatrix");
   check_matrix(projmatrix, "projmatrix");
   check_vector(campos, "campos");
+  if (lens) {
+    check_like(*lens, "lens", means3D, "means3D");
+    TORCH_CHECK_VALUE(lens->dim() == 1 && lens->size(0) == kLensWidth, "lens must have shape (", kLensWidth, ",), got ",
+                      shape_of(*lens));
+    lens = lens->contiguous();
+  }
   check_image_size(image_height, image_width);
   check_positive(tanfovx, "tanfovx");
   check_positive(tanfovy, "tanfovy");

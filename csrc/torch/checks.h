@@ -20,6 +20,7 @@ struct Inputs {
   Tensor means3D, opacities;
   OptionalTensor means2D, shs, colors_precomp, scales, rotations, cov3D_precomp;
   Tensor background, viewmatrix, projmatrix, campos;
+  OptionalTensor lens;  ///< of a full camera
   int64_t image_height, image_width;
   double tanfovx, tanfovy, scale_modifier;
   int64_t sh_degree;

@@ -50,7 +50,8 @@ template <typename T> Projected project(const Inputs& in, const Stages<T>& stage
                            {},
                            {},
                            {}};
-  stages.count_candidates(task);
+  const cpu::CameraStages<T>& of_camera = stages.of(task.camera);
+  of_camera.count_candidates(task);
   int64_t candidates = 0;
   for (int64_t& offset : offsets) candidates += std::exchange(offset, candidates);
   Projected out{at::empty({candidates, kSplatWidth}, options), at::empty({candidates}, options.dtype(at::kInt)),
@@ -59,7 +60,7 @@ template <typename T> Projected project(const Inputs& in, const Stages<T>& stage
   task.ids = out.ids.data_ptr<int32_t>();
   task.depths = out.depths.data_ptr<T>();
   task.radii = out.radii.data_ptr<int32_t>();
-  stages.project(task);
+  of_camera.project(task);
   return out;
 }
 
@@ -136,12 +137,13 @@ RasterizeOutput rasterize_cpu(const Tensor& means3D, const OptionalTensor& means
                               const OptionalTensor& shs, const OptionalTensor& colors_precomp,
                               const OptionalTensor& scales, const OptionalTensor& rotations,
                               const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
-                              const Tensor& projmatrix, const Tensor& campos, int64_t image_height, int64_t image_width,
-                              double tanfovx, double tanfovy, double scale_modifier, int64_t sh_degree,
-                              std::string footprint, double option, bool keep, bool) {
-  Inputs in{means3D,       opacities, means2D,        shs,        colors_precomp, scales,       rotations,
-            cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
-            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      option};
+                              const Tensor& projmatrix, const Tensor& campos, const OptionalTensor& lens,
+                              int64_t image_height, int64_t image_width, double tanfovx, double tanfovy,
+                              double scale_modifier, int64_t sh_degree, std::string footprint, double option, bool keep,
+                              bool) {
+  Inputs in{means3D, opacities,      means2D,    shs,       colors_precomp, scales,       rotations,   cov3D_precomp,
+            bg,      viewmatrix,     projmatrix, campos,    lens,           image_height, image_width, tanfovx,
+            tanfovy, scale_modifier, sh_degree,  footprint, option};
   in.check();
   in.check_camera();
   RasterizeOutput out;
@@ -173,12 +175,12 @@ StagesOutput rasterize_stages_cpu(const Tensor& means3D, const Tensor& opacities
                                   const OptionalTensor& colors_precomp, const OptionalTensor& scales,
                                   const OptionalTensor& rotations, const OptionalTensor& cov3D_precomp,
                                   const Tensor& bg, const Tensor& viewmatrix, const Tensor& projmatrix,
-                                  const Tensor& campos, int64_t image_height, int64_t image_width, double tanfovx,
-                                  double tanfovy, double scale_modifier, int64_t sh_degree, std::string footprint,
-                                  double option) {
-  Inputs in{means3D,       opacities, std::nullopt,   shs,        colors_precomp, scales,       rotations,
-            cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
-            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      option};
+                                  const Tensor& campos, const OptionalTensor& lens, int64_t image_height,
+                                  int64_t image_width, double tanfovx, double tanfovy, double scale_modifier,
+                                  int64_t sh_degree, std::string footprint, double option) {
+  Inputs in{means3D, opacities,      std::nullopt, shs,       colors_precomp, scales,       rotations,   cov3D_precomp,
+            bg,      viewmatrix,     projmatrix,   campos,    lens,           image_height, image_width, tanfovx,
+            tanfovy, scale_modifier, sh_degree,    footprint, option};
   in.check();
   in.check_camera();
   StagesOutput out;
@@ -225,18 +227,19 @@ Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const Op
                         const Tensor& opacities, const OptionalTensor& shs, const OptionalTensor& colors_precomp,
                         const OptionalTensor& scales, const OptionalTensor& rotations,
                         const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
-                        const Tensor& projmatrix, const Tensor& campos, int64_t image_height, int64_t image_width,
-                        double tanfovx, double tanfovy, double scale_modifier, int64_t sh_degree, std::string footprint,
-                        double option, const Tensor& splats, const Tensor& ids, const Tensor& pairs,
-                        const Tensor& tile_offsets, const Tensor& splat_offsets, const Tensor& positions,
-                        const Tensor& transmittance, const Tensor& last, const Tensor&, const Tensor&, const Tensor&,
-                        const Tensor& tile_samples, std::array<bool, 8> needs, bool) {
-  Inputs in{means3D,       opacities, means2D,        shs,        colors_precomp, scales,       rotations,
-            cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
-            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      option};
+                        const Tensor& projmatrix, const Tensor& campos, const OptionalTensor& lens,
+                        int64_t image_height, int64_t image_width, double tanfovx, double tanfovy,
+                        double scale_modifier, int64_t sh_degree, std::string footprint, double option,
+                        const Tensor& splats, const Tensor& ids, const Tensor& pairs, const Tensor& tile_offsets,
+                        const Tensor& splat_offsets, const Tensor& positions, const Tensor& transmittance,
+                        const Tensor& last, const Tensor&, const Tensor&, const Tensor&, const Tensor& tile_samples,
+                        Needs needs, bool) {
+  Inputs in{means3D, opacities,      means2D,    shs,       colors_precomp, scales,       rotations,   cov3D_precomp,
+            bg,      viewmatrix,     projmatrix, campos,    lens,           image_height, image_width, tanfovx,
+            tanfovy, scale_modifier, sh_degree,  footprint, option};
   in.check();
   in.check_gradient(dL_dcolor);
-  const Grads out = make_grads(in, needs);
+  Grads out = make_grads(in, needs);
   AT_DISPATCH_FLOATING_TYPES(means3D.scalar_type(), "rasterize_vjp", [&] {
     using T = scalar_t;
     const Stages<T>& stages = stages_of<T>(footprint);
@@ -255,9 +258,13 @@ Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const Op
                       tile_offsets.const_data_ptr<int64_t>(), grid_of(in), threads, samples_or_null(tile_samples),
                       in.background.const_data_ptr<T>(), transmittance.const_data_ptr<T>(),
                       last.const_data_ptr<int32_t>(), g.const_data_ptr<T>(), sums, abs2d});
-    stages.project_vjp({camera_of<T>(in), gaussians_of<T>(in), footprint_options(option), threads,
-                        ids.const_data_ptr<int32_t>(), ids.size(0), splat_offsets.const_data_ptr<int64_t>(),
-                        positions.const_data_ptr<int64_t>(), sums, abs2d, grads});
+    const CameraView<T> camera = camera_of<T>(in);
+    const Tensor camera_grads = make_camera_grads(in, needs, cpu::chunks_of(in.count()));
+    stages.of(camera).project_vjp({camera, gaussians_of<T>(in), footprint_options(option), threads,
+                                   ids.const_data_ptr<int32_t>(), ids.size(0), splat_offsets.const_data_ptr<int64_t>(),
+                                   positions.const_data_ptr<int64_t>(), sums, abs2d, grads,
+                                   reinterpret_cast<CameraGrad<T>*>(data_or_null<T>(camera_grads))});
+    set_camera_grads(in, needs, camera_grads, out);
   });
   return out;
 }

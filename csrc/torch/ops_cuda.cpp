@@ -298,12 +298,13 @@ RasterizeOutput rasterize_cuda(const Tensor& means3D, const OptionalTensor& mean
                                const OptionalTensor& shs, const OptionalTensor& colors_precomp,
                                const OptionalTensor& scales, const OptionalTensor& rotations,
                                const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
-                               const Tensor& projmatrix, const Tensor& campos, int64_t image_height,
-                               int64_t image_width, double tanfovx, double tanfovy, double scale_modifier,
-                               int64_t sh_degree, std::string footprint, double option, bool keep, bool debug) {
-  Inputs in{means3D,       opacities, means2D,        shs,        colors_precomp, scales,       rotations,
-            cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
-            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      option};
+                               const Tensor& projmatrix, const Tensor& campos, const OptionalTensor& lens,
+                               int64_t image_height, int64_t image_width, double tanfovx, double tanfovy,
+                               double scale_modifier, int64_t sh_degree, std::string footprint, double option,
+                               bool keep, bool debug) {
+  Inputs in{means3D, opacities,      means2D,    shs,       colors_precomp, scales,       rotations,   cov3D_precomp,
+            bg,      viewmatrix,     projmatrix, campos,    lens,           image_height, image_width, tanfovx,
+            tanfovy, scale_modifier, sh_degree,  footprint, option};
   check_cuda(in, debug);
   const auto& stages = found(cuda::find_forward(footprint), footprint);
   const c10::cuda::CUDAGuard guard(means3D.device());
@@ -363,12 +364,12 @@ StagesOutput rasterize_stages_cuda(const Tensor& means3D, const Tensor& opacitie
                                    const OptionalTensor& colors_precomp, const OptionalTensor& scales,
                                    const OptionalTensor& rotations, const OptionalTensor& cov3D_precomp,
                                    const Tensor& bg, const Tensor& viewmatrix, const Tensor& projmatrix,
-                                   const Tensor& campos, int64_t image_height, int64_t image_width, double tanfovx,
-                                   double tanfovy, double scale_modifier, int64_t sh_degree, std::string footprint,
-                                   double option) {
-  Inputs in{means3D,       opacities, std::nullopt,   shs,        colors_precomp, scales,       rotations,
-            cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
-            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      option};
+                                   const Tensor& campos, const OptionalTensor& lens, int64_t image_height,
+                                   int64_t image_width, double tanfovx, double tanfovy, double scale_modifier,
+                                   int64_t sh_degree, std::string footprint, double option) {
+  Inputs in{means3D, opacities,      std::nullopt, shs,       colors_precomp, scales,       rotations,   cov3D_precomp,
+            bg,      viewmatrix,     projmatrix,   campos,    lens,           image_height, image_width, tanfovx,
+            tanfovy, scale_modifier, sh_degree,    footprint, option};
   check_cuda(in, false);
   const auto& stages = found(cuda::find_forward(footprint), footprint);
   const c10::cuda::CUDAGuard guard(means3D.device());
@@ -481,16 +482,16 @@ Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const Tensor& means3D, const O
                          const Tensor& opacities, const OptionalTensor& shs, const OptionalTensor& colors_precomp,
                          const OptionalTensor& scales, const OptionalTensor& rotations,
                          const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
-                         const Tensor& projmatrix, const Tensor& campos, int64_t image_height, int64_t image_width,
-                         double tanfovx, double tanfovy, double scale_modifier, int64_t sh_degree,
-                         std::string footprint, double option, const Tensor& splats, const Tensor& order,
-                         const Tensor& pairs, const Tensor& tile_offsets, const Tensor& ranges, const Tensor&,
-                         const Tensor& transmittance, const Tensor& last, const Tensor& checkpoints,
-                         const Tensor& chunks, const Tensor& counts, const Tensor& tile_samples,
-                         std::array<bool, 8> needs, bool debug) {
-  Inputs in{means3D,       opacities, means2D,        shs,        colors_precomp, scales,       rotations,
-            cov3D_precomp, bg,        viewmatrix,     projmatrix, campos,         image_height, image_width,
-            tanfovx,       tanfovy,   scale_modifier, sh_degree,  footprint,      option};
+                         const Tensor& projmatrix, const Tensor& campos, const OptionalTensor& lens,
+                         int64_t image_height, int64_t image_width, double tanfovx, double tanfovy,
+                         double scale_modifier, int64_t sh_degree, std::string footprint, double option,
+                         const Tensor& splats, const Tensor& order, const Tensor& pairs, const Tensor& tile_offsets,
+                         const Tensor& ranges, const Tensor&, const Tensor& transmittance, const Tensor& last,
+                         const Tensor& checkpoints, const Tensor& chunks, const Tensor& counts,
+                         const Tensor& tile_samples, Needs needs, bool debug) {
+  Inputs in{means3D, opacities,      means2D,    shs,       colors_precomp, scales,       rotations,   cov3D_precomp,
+            bg,      viewmatrix,     projmatrix, campos,    lens,           image_height, image_width, tanfovx,
+            tanfovy, scale_modifier, sh_degree,  footprint, option};
   check_cuda(in, debug);
   in.check_gradient(dL_dcolor);
   const auto& forward = found(cuda::find_forward(footprint), footprint);
@@ -499,7 +500,7 @@ Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const Tensor& means3D, const O
               tile_samples, forward);
   const c10::cuda::CUDAGuard guard(means3D.device());
   const CUDAStream stream = c10::cuda::getCurrentCUDAStream();
-  const Grads out = make_grads(in, needs);
+  Grads out = make_grads(in, needs);
   const GaussianGrads<float> grads = grads_of<float>(in, out);
   const TileGrid grid = grid_of(in);
   const cuda::TileLists lists = lists_of(splats, order, pairs, tile_offsets, counts, tile_samples);
@@ -512,11 +513,13 @@ Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const Tensor& means3D, const O
                     pair_grads.data_ptr<float>(), grads.means2d && grads.means2d_stride == 4},
                    stream);
   check_stage("blend_vjp", stream, debug);
+  const Tensor camera_grads = make_camera_grads(in, needs, cuda::warps_of(in.count()));
   stages.project_vjp({camera_of<float>(in), gaussians_of<float>(in), footprint_options(option),
                       reinterpret_cast<const cuda::PairRange*>(ranges.const_data_ptr<int32_t>()), lists.counts,
-                      pairs.size(0), pair_grads.const_data_ptr<float>(), grads},
+                      pairs.size(0), pair_grads.const_data_ptr<float>(), grads, data_or_null<float>(camera_grads)},
                      stream);
   check_stage("project_vjp", stream, debug);
+  set_camera_grads(in, needs, camera_grads, out);
   return out;
 }
 

@@ -4,7 +4,7 @@
 #include <array>
 #include <tuple>
 
-#include "core/params.h"
+#include "core/camera.h"
 #include "torch/checks.h"
 
 namespace ar::ops {
@@ -20,7 +20,8 @@ template <typename T> CameraView<T> camera_of(const Inputs& in) {
           int(in.image_width),
           int(in.image_height),
           T(in.tanfovx),
-          T(in.tanfovy)};
+          T(in.tanfovy),
+          in.lens ? in.lens->const_data_ptr<T>() : nullptr};
 }
 
 template <typename T> Gaussians<T> gaussians_of(const Inputs& in) {
@@ -62,17 +63,51 @@ using ChannelsOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
 /// Gaussian.
 using InspectOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
 using StagesOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
-/// Gradients of means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp.
-using Grads = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+/// Gradients of means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp; of viewmatrix,
+/// projmatrix, campos and lens, where there is a lens.
+using Grads =
+    std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
+inline constexpr size_t kNeeds = std::tuple_size_v<Grads>;
+using Needs = std::array<bool, kNeeds>;
 
 /// Room for the gradients that are wanted; an empty tensor stands for one that is not.
-inline Grads make_grads(const Inputs& in, const std::array<bool, 8>& needs) {
+inline Grads make_grads(const Inputs& in, const Needs& needs) {
   const auto make = [&](const OptionalTensor& like, bool needed) {
     return needed && like ? at::empty_like(*like, at::MemoryFormat::Contiguous) : at::empty({0}, in.means3D.options());
   };
-  return {make(in.means3D, needs[0]),   make(in.means2D, needs[1]),        make(in.opacities, needs[2]),
-          make(in.shs, needs[3]),       make(in.colors_precomp, needs[4]), make(in.scales, needs[5]),
-          make(in.rotations, needs[6]), make(in.cov3D_precomp, needs[7])};
+  return {make(in.means3D, needs[0]),
+          make(in.means2D, needs[1]),
+          make(in.opacities, needs[2]),
+          make(in.shs, needs[3]),
+          make(in.colors_precomp, needs[4]),
+          make(in.scales, needs[5]),
+          make(in.rotations, needs[6]),
+          make(in.cov3D_precomp, needs[7]),
+          make({}, false),
+          make({}, false),
+          make({}, false),
+          make({}, false)};
+}
+
+/// Room for `parts` sums of the camera's gradient, zero; undefined where nobody wants it.
+inline Tensor make_camera_grads(const Inputs& in, const Needs& needs, int64_t parts) {
+  const bool needed = needs[8] || needs[9] || needs[10] || needs[11];
+  return in.lens && needed ? at::zeros({parts, kCameraGradWidth}, in.means3D.options()) : Tensor();
+}
+template <typename T> T* data_or_null(const Tensor& t) { return t.defined() ? t.data_ptr<T>() : nullptr; }
+
+/// Adds up the parts of make_camera_grads, in double and always in the same order, and writes what is wanted to `out`.
+inline void set_camera_grads(const Inputs& in, const Needs& needs, const Tensor& parts, Grads& out) {
+  if (!parts.defined()) return;
+  const Tensor sum = parts.sum(0, false, at::kDouble).to(parts.scalar_type());
+  const auto rows = [&](int64_t first) { return sum.narrow(0, first, 12).view({3, 4}); };
+  if (needs[8]) std::get<8>(out) = at::constant_pad_nd(rows(0), {0, 0, 0, 1}).t().contiguous();
+  if (needs[9]) {
+    const Tensor clip = rows(12), none = at::zeros({1, 4}, sum.options());
+    std::get<9>(out) = at::cat({clip.narrow(0, 0, 2), none, clip.narrow(0, 2, 1)}).t().contiguous();
+  }
+  if (needs[10]) std::get<10>(out) = sum.narrow(0, 24, 3).clone();
+  if (needs[11]) std::get<11>(out) = sum.narrow(0, 27, kLensWidth).clone();
 }
 
 template <typename T> GaussianGrads<T> grads_of(const Inputs& in, const Grads& grads) {

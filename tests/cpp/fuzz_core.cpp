@@ -136,7 +136,7 @@ template <typename T> AnyScene<T> decode(Bytes& in) {
 
   const int n = in.below(13);
   const bool by_cov3d = in.one_in(3), by_sh = in.one_in(2);
-  scene.sh_degree = by_sh ? in.below(kMaxShDegree + 1) : 0;
+  scene.sh_degree = by_sh ? in.below(Camera<T>::kShDegree + 1) : 0;
   scene.sh_stride = by_sh ? sh_count(scene.sh_degree) + in.below(2) : 0;
   scene.scale_modifier = in.one_in(8) ? std::max(std::abs(in.any_finite<T>()), std::numeric_limits<T>::min()) : T(1);
   const bool tame = in.one_in(2);  // most numbers of a scene are such as occur

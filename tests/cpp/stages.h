@@ -45,7 +45,7 @@ Rendered<T> run_stages(const cpu::Stages<T>& stages, CameraView<T> camera, Gauss
   std::vector<int64_t> chunk_offsets(cpu::chunks_of(gaussians.n) + 1);
   cpu::ProjectTask<T> project = {camera, gaussians, options, threads,         candidates.data(), chunk_offsets.data(),
                                  {},     {},        {},      out.radii.data()};
-  stages.count_candidates(project);
+  stages.of(camera).count_candidates(project);
   int64_t n = 0;
   for (int64_t& offset : chunk_offsets) n += std::exchange(offset, n);
   std::vector<T> splats(n * kSplatWidth), depths(n);
@@ -53,7 +53,7 @@ Rendered<T> run_stages(const cpu::Stages<T>& stages, CameraView<T> camera, Gauss
   project.splats = splats.data();
   project.depths = depths.data();
   project.ids = ids.data();
-  stages.project(project);
+  stages.of(camera).project(project);
 
   std::vector<int64_t> tile_offsets(grid.tiles() + 1), splat_offsets(n + 1);
   cpu::BinTask<T> bin = {};
@@ -90,8 +90,8 @@ Rendered<T> run_stages(const cpu::Stages<T>& stages, CameraView<T> camera, Gauss
                       gaussians.shs ? gaussians.n * gaussians.sh_stride : 0);
   stages.blend_vjp({splats.data(), pairs.data(), tile_offsets.data(), grid, threads, tile_samples, background,
                     transmittance.data(), last.data(), dL_dimage, pair_grads.data(), pair_abs.data()});
-  stages.project_vjp({camera, gaussians, options, threads, ids.data(), n, splat_offsets.data(), positions.data(),
-                      pair_grads.data(), pair_abs.data(), grads.views});
+  stages.of(camera).project_vjp({camera, gaussians, options, threads, ids.data(), n, splat_offsets.data(),
+                                 positions.data(), pair_grads.data(), pair_abs.data(), grads.views});
   out.grads = std::move(grads.all);
   return out;
 }

@@ -1,0 +1,80 @@
+"""What effects ask of the projection, as the op takes it."""
+
+from __future__ import annotations
+
+import torch
+from torch.utils.weak import WeakTensorKeyDictionary
+
+from .effects import AUTO, Defocus, Effects, Motion
+from .harmonics import needed_sh_degree
+
+_needed_degrees = WeakTensorKeyDictionary()  # of coefficients: their version, the degree asked for, the one found
+
+
+def used_sh_degree(effects: Effects | str, degree: int, shs: torch.Tensor | None) -> int:
+    """How many degrees of harmonics to use of those that the settings ask for.
+
+    With `AUTO` as many as make a difference (`needed_sh_degree`): found once for a tensor and its version, which
+    waits for the device. Coefficients that are being trained, or made in inference mode, are used as they are.
+    """
+    if effects != AUTO:
+        return degree if effects.sh_degree is None else min(degree, effects.sh_degree)
+    if shs is None or shs.dim() != 3 or (shs.requires_grad and torch.is_grad_enabled()):
+        return degree
+    used = shs[:, : (degree + 1) ** 2]
+    if used.shape[1] < (degree + 1) ** 2 or shs.is_inference():  # the latter has no version to tell it by
+        return degree
+    known = _needed_degrees.get(shs)
+    if known is None or known[:2] != (shs._version, degree):
+        known = _needed_degrees[shs] = (shs._version, degree, needed_sh_degree(used))
+    return known[2]
+
+
+def make_lens(effects: Effects, settings, like: torch.Tensor) -> torch.Tensor:
+    """The op's argument `lens`, of the dtype and device of `like`: the numbers of `Lens` in csrc/core/lens.h."""
+    tangents = (settings.tanfovx, settings.tanfovy)
+    if not effects.camera_gradients:
+        tangents = (float(t) for t in tangents)
+    center = (0.0, 0.0)
+    if effects.off_center:
+        center = (_view_center(settings.viewmatrix, settings.projmatrix, effects.camera_gradients),)
+    defocus, motion = effects.defocus or Defocus(0.0, 1.0), effects.motion or Motion(0.0)
+    moved = [
+        _times(motion.exposure, value, length)
+        for value, length in ((motion.velocity, 3), (motion.angular_velocity, 3), (motion.screen_velocity, 2))
+    ]
+    numbers = (
+        *tangents, *center, defocus.aperture, defocus.focus, *moved, effects.near, effects.far,
+        float(effects.orthographic),
+    )  # fmt: skip
+    # Numbers side by side travel together.
+    parts, floats = [], []
+    for number in numbers:
+        if isinstance(number, torch.Tensor):
+            parts += [torch.tensor(floats, dtype=like.dtype).to(like.device)] if floats else []
+            parts.append(number.to(like).reshape(-1))
+            floats = []
+        else:
+            floats += number if isinstance(number, list) else [float(number)]
+    return torch.cat([*parts, torch.tensor(floats, dtype=like.dtype).to(like.device)])
+
+
+def _times(exposure, velocity, length: int):
+    """Their product: a list of numbers, or a tensor where one of them is."""
+    if velocity is None:
+        return [0.0] * length
+    if isinstance(exposure, torch.Tensor) and not isinstance(velocity, torch.Tensor):
+        velocity = exposure.new_tensor(velocity)
+    if isinstance(velocity, torch.Tensor):
+        exposure = exposure.to(velocity).reshape(()) if isinstance(exposure, torch.Tensor) else exposure
+        return exposure * velocity
+    return [exposure * v for v in velocity]
+
+
+def _view_center(view: torch.Tensor, proj: torch.Tensor, with_gradient: bool) -> torch.Tensor:
+    """(2,) x/z and y/z in the middle of the picture: where clip_x = p_xx x + p_xz z is zero."""
+    view, proj = view.reshape(4, 4)[:3, :3], proj.reshape(4, 4)[:3, :2]  # columns, of the world's coordinates
+    if not with_gradient:
+        view, proj = view.detach(), proj.detach()
+    along = (proj * view[:, :2]).sum(0) / (view[:, :2] ** 2).sum(0)
+    return -(proj * view[:, 2:]).sum(0) / (view[:, 2] ** 2).sum() / along

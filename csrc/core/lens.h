@@ -1,0 +1,40 @@
+// What a camera has beyond a pinhole and an instant, and the blur that comes of it.
+#pragma once
+
+#include "core/footprint/contract.h"
+
+namespace ar {
+
+/// What a full camera has beyond a plain one, in the order of the op's argument `lens`. An aggregate of kLensWidth
+/// scalars.
+template <typename T> struct Lens {
+  Vec2<T> tan_half_fov;  ///< of an orthographic camera half the width and height, world units
+  Vec2<T> center;        ///< x/z and y/z at the middle of the picture, around which they are clamped
+  T aperture, focus;     ///< world units
+  Vec3<T> shift, turn;   ///< of the camera while the shutter is open: world units and radians along its axes
+  Vec2<T> screen;        ///< of the picture meanwhile [px]
+  T near, far;           ///< camera-space z between which Gaussians are drawn; without gradient
+  T parallel;            ///< 1 for an orthographic camera, else 0; without gradient
+
+  AR_HD bool orthographic() const { return parallel != T(0); }
+
+  AR_HD bool moves() const {
+    return shift.x != T(0) || shift.y != T(0) || shift.z != T(0) || turn.x != T(0) || turn.y != T(0) ||
+           turn.z != T(0) || screen.x != T(0) || screen.y != T(0);
+  }
+};
+inline constexpr int kLensWidth = 17;
+static_assert(sizeof(Lens<float>) == kLensWidth * sizeof(float));
+
+/// What is added to a projected covariance: streak streak^T + variance I [px^2]. Gaussians stay Gaussians, with the
+/// amplitude that keeps their mass.
+template <typename T> struct Blur {
+  Vec2<T> streak;  ///< [px]
+  T variance;      ///< [px^2]
+
+  AR_HD bool any() const { return streak.x != T(0) || streak.y != T(0) || variance != T(0); }
+};
+/// Of a plain camera.
+struct NoBlur {};
+
+}  // namespace ar
