@@ -107,7 +107,7 @@ def moved(world_to_camera: torch.Tensor, tangent: torch.Tensor) -> torch.Tensor:
             "world_to_camera must have shape (4, 4) and tangent (6,), got "
             f"{tuple(world_to_camera.shape)} and {tuple(tangent.shape)}"
         )
-    x, y, z, rx, ry, rz = tangent
+    x, y, z, rx, ry, rz = tangent.to(world_to_camera)
     zero = torch.zeros_like(x)
     rows = ((zero, -rz, ry, x), (rz, zero, -rx, y), (-ry, rx, zero, z), (zero,) * 4)
     twist = torch.stack([torch.stack(row) for row in rows])

@@ -123,7 +123,7 @@ class Effects:
                 raise TypeError(f"{name} must be a {kind.__name__} or None, got {value!r}")
         if self.sh_degree is not None and not 0 <= self.sh_degree <= MAX_SH_DEGREE:
             raise ValueError(f"sh_degree must be 0 to {MAX_SH_DEGREE}, got {self.sh_degree}")
-        _check_number("near", self.near, **({} if self.orthographic else {"above": 0}))
+        _check_number("near", self.near, **({"at_least": 0} if self.orthographic else {"above": 0}))
         if not self.far > self.near:
             raise ValueError(f"far must be above near, {self.near}, got {self.far}")
 

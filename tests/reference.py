@@ -386,7 +386,7 @@ def project(settings, means, covariance):
     clip = homogeneous @ projmatrix
     means2d = ((clip[:, :2] / clip[:, 3:] + 1) * size - 1) / 2
 
-    tangent = torch.stack([torch.as_tensor(t).double() for t in (settings.tanfovx, settings.tanfovy)])
+    tangent = torch.stack([torch.as_tensor(t, dtype=torch.float64) for t in (settings.tanfovx, settings.tanfovy)])
     focal = size / (2 * tangent)
     z = view[:, 2]
     limit, center = FRUSTUM_CLAMP * tangent, torch.zeros_like(tangent)
@@ -428,7 +428,7 @@ def effects_of(settings):
 def blur(settings, projection, view):
     """What the lens and the shutter make of cov2d, and the amplitudes: (P, 3), (P,)."""
     effects, cov2d = effects_of(settings), projection.cov2d
-    tangent = torch.stack([torch.as_tensor(t).double() for t in (settings.tanfovx, settings.tanfovy)])
+    tangent = torch.stack([torch.as_tensor(t, dtype=torch.float64) for t in (settings.tanfovx, settings.tanfovy)])
     focal = torch.tensor([settings.image_width, settings.image_height]) / (2 * tangent)
     z, number = view[:, 2], functools.partial(torch.as_tensor, dtype=torch.float64)
     blurred_cov = cov2d

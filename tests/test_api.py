@@ -558,7 +558,7 @@ WRONG_SHAPES = {
         ({"tanfovx": 0.0}, r"tanfovx must .*got 0"),
         ({"tanfovy": math.nan}, r"tanfovy must .*got nan"),
         ({"scale_modifier": math.nan}, r"scale_modifier must .*got nan"),
-        ({"sh_degree": 4}, r"sh_degree must .*got 4"),
+        ({"sh_degree": 5}, r"sh_degree must .*got 5"),
         ({"sh_degree": -1}, r"sh_degree must .*got -1"),
     ],
 }
