@@ -17,7 +17,7 @@ from .footprints import (
     set_default_footprint,
 )
 from .ops import TILE
-from .plan import needed_sh_degree
+from .plan import SceneReport, inspect_scene, needed_sh_degree, plan
 from .rasterizer import (
     GaussianRasterizationSettings,
     GaussianRasterizer,
@@ -39,14 +39,17 @@ __all__ = [
     "GaussianStats",
     "Motion",
     "Outputs",
+    "SceneReport",
     "Stages",
     "apply_3d_filter",
     "compute_3d_filter",
     "footprint_weight",
     "get_default_footprint",
+    "inspect_scene",
     "instruction_set",
     "needed_sh_degree",
     "normalized",
+    "plan",
     "rasterize_gaussians",
     "render_stages",
     "resolve_footprint",
