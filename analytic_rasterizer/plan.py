@@ -37,9 +37,10 @@ FINER = 1.1  # times as finely as in training: a view that shows so more than FI
 FINER_SHARE = 0.01
 CLAMP = 1.3  # half pictures from the optical axis: kFrustumClamp of csrc/core/constants.h
 NARROW = 0.5  # px
-BINS = tuple(2.0 ** (i / 4) for i in range(-24, 41))  # edges of the histogram of standard deviations, px
+BINS = tuple(2.0 ** (i / 4) for i in range(-40, 41))  # edges of the histogram of standard deviations, px
 TILE_SAMPLES = (1, 4, 8, 16)  # what `adaptive` chooses from
 SAME = 1.05  # ratio of times up to which the candidate listed first is taken
+DRAWN = 8  # views in the histogram
 TIMED_VIEWS = 2
 ROUNDS = {"cpu": 3, "cuda": 20}
 WARM_UP = 40  # frames before timing on CUDA: the first 32 of a size wait for the device
@@ -229,29 +230,35 @@ class SceneReport:
 
     def to_text(self) -> str:
         """Tables and sentences. Changes and RMS in units of 1/255."""
-        in_255 = "1/255"
         effects = [
             [f.name, _YES_NO[f.needed], _in_255(f.change), f.kind, _ratio(f.cost), f.recommendation]
             for f in self.findings
         ]
         tried = [[c.footprint, _in_255(c.rms), _YES_NO[c.fits], _ratio(c.cost)] for c in self.candidates]
+        header = [
+            "view",
+            "size",
+            "shown",
+            "< 1/2 px",
+            "RMS [1/255]",
+            *(f"{n} sample{'s'[: n > 1]}" for n in TILE_SAMPLES),
+        ]
         views = [
-            [v.name, f"{v.width}x{v.height}", v.shown, _percent(v.narrow)]
+            [v.name, f"{v.width}x{v.height}", v.shown, _percent(v.narrow), _in_255(v.rms)]
             + [_percent(share) for share in v.tile_shares.values()]
-            + [_in_255(v.rms), _percent(v.finer), None if v.finest is None else f"{v.finest:.2f}"]
             for v in self.views
         ]
-        samples = [f"{count} sample{'s' * (count > 1)}" for count in self.views[0].tile_shares]
+        if self.views[0].finer is not None:
+            header += ["finer than trained", "at most"]
+            views = [[*row, _percent(v.finer), _ratio(v.finest)] for row, v in zip(views, self.views)]
         parts = [
-            f"{self.gaussians} Gaussians of SH degree {self.sh_degree}, {len(self.views)} views, tolerance "
-            f"{_in_255(self.tolerance)} [{in_255}] of RMS over every view; {self.machine}",
-            f"recommended: footprint {self.footprint}; {_describe(self.effects)}",
-            report.format_table(["effect", "needed", f"change [{in_255}]", "", "cost", "recommendation"], effects),
+            f"{self.gaussians} Gaussians of SH degree {self.sh_degree}, {len(self.views)} views; tolerance: RMS of "
+            f"{_in_255(self.tolerance)}/255 in every view\n{self.machine}",
+            f"recommended: footprint {self.footprint}, {_describe(self.effects)}",
+            report.format_table(["effect", "needed", "change [1/255]", "", "cost", "recommendation"], effects),
             "\n".join(f"{f.name}: {f.reason}" for f in self.findings),
-            report.format_table(["footprint", f"RMS [{in_255}]", "fits", "cost"], tried),
-            report.format_table(
-                ["view", "size", "shown", "< 1/2 px", *samples, f"RMS [{in_255}]", "finer", "at most"], views
-            ),
+            report.format_table(["footprint", "RMS [1/255]", "fits", "cost"], tried),
+            report.format_table(header, views),
         ]
         return "\n\n".join(parts)
 
@@ -588,9 +595,9 @@ def _footprint_finding(candidates: tuple[Candidate, ...], footprint: str, views:
     chosen = next(c for c in candidates if c.footprint == footprint)
     narrow = sum(v.narrow * v.shown for v in views) / max(1, sum(v.shown for v in views))
     tiles = torch.cat([v.tile_samples.flatten() for v in views])
-    shares = ", ".join(f"{_percent(_share(tiles == n))} {n}" for n in TILE_SAMPLES)
+    shares = ", ".join(f"{n} for {_percent(_share(tiles == n))}" for n in TILE_SAMPLES)
     reason = (
-        f"{_percent(narrow)} of the splats are narrower than {NARROW:g} px; of the tiles {shares} samples; "
+        f"{_percent(narrow)} of the splats have a deviation below {NARROW:g} px; samples that tiles need: {shares}; "
         f"{footprint} is within {_in_255(chosen.rms)}/255 of everything on"
     )
     return Finding("footprint", footprint != BASE, base.rms, "measured", chosen.cost, footprint, reason)
@@ -636,9 +643,11 @@ def _cull_finding(scene: io.Scene, cameras: dict, shown, on_image, cost: float) 
     counts = [int((~shown).sum()), *(int(part.sum()) for part in (behind, hidden & faint, hidden & ~faint))]
     reason = (
         "{} of {} Gaussians touch no pixel of these views: {} behind the near plane of every view, {} too faint or too "
-        "small, {} beside every picture; `shown` leaves them out".format(counts[0], len(shown), *counts[1:])
+        "small, {} beside every picture; `shown` is the mask of the others, the cost that of keeping all".format(
+            counts[0], len(shown), *counts[1:]
+        )
     )
-    return Finding("culls", bool(counts[0]), 0.0, "bound", cost, f"keep {len(shown) - counts[0]}", reason)
+    return Finding("hidden Gaussians", False, 0.0, "bound", cost, f"drop {counts[0]}", reason)
 
 
 def _camera_findings(survey: _Survey) -> tuple[Finding, Finding]:
@@ -727,7 +736,7 @@ def _in_255(value: float | None) -> str | None:
 
 
 def _percent(share: float | None) -> str | None:
-    return None if share is None else f"{100 * share:.3g}%"
+    return None if share is None else f"{100 * share:.1f}%"
 
 
 def _share(which: torch.Tensor) -> float:
@@ -735,32 +744,37 @@ def _share(which: torch.Tensor) -> float:
 
 
 def _draw(found: SceneReport):
+    """Histogram of deviations, and maps of samples per tile of the first two views."""
     colors = [report.BOX_COLORS[samples] for samples in TILE_SAMPLES]
-    look = io.optional_import("matplotlib.colors", "analysis")
+    matplotlib_colors = io.optional_import("matplotlib.colors", "analysis")
     maps = found.views[:2]
-    figure, axes = report.new_figure(5.5 + 5 * len(maps), 4, 1 + len(maps))
+    figure, axes = report.new_figure(5 + 5 * len(maps), 3.8, 1 + len(maps))
     ax = axes[0, 0]
-    for view in found.views:
+    occupied = [BINS.index(NARROW)]
+    for view in found.views[:DRAWN]:
         ax.stairs([100 * count / max(1, view.shown) for count in view.sigmas], BINS, label=view.name, linewidth=1.4)
+        occupied += [i for i, count in enumerate(view.sigmas) if count > 1e-3 * view.shown]
     ax.axvline(NARROW, color="black", linewidth=0.9, linestyle=":")
     ax.set_xscale("log", base=2)
+    ax.set_xlim(BINS[min(occupied)], BINS[max(occupied) + 1])
     ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}" if value >= 1 else f"1/{1 / value:g}")
     ax.set_xlabel("smaller standard deviation in the image [px]")
     ax.set_ylabel("Gaussians shown [%]")
     ax.legend(frameon=False, fontsize=8)
     for ax, view in zip(axes[0, 1:], maps):
+        rows, columns = view.tile_samples.shape
         ax.imshow(
             torch.bucketize(view.tile_samples, torch.tensor(TILE_SAMPLES)),
-            cmap=look.ListedColormap(colors),
-            norm=look.BoundaryNorm([-0.5, 0.5, 1.5, 2.5, 3.5], 4),
-            extent=(0, TILE * view.tile_samples.shape[1], TILE * view.tile_samples.shape[0], 0),
+            cmap=matplotlib_colors.ListedColormap(colors),
+            norm=matplotlib_colors.BoundaryNorm([-0.5, 0.5, 1.5, 2.5, 3.5], len(colors)),
+            extent=(0, TILE * columns, TILE * rows, 0),
             interpolation="nearest",
         )
         ax.set_xlim(0, view.width)
         ax.set_ylim(view.height, 0)
         ax.grid(False)
-        ax.set_title(f"{view.name}: samples per tile", fontsize=10)
+        ax.set_title(f"{view.name}: samples per tile [px]", fontsize=10)
         for samples, color in zip(TILE_SAMPLES, colors):
             ax.plot([], [], "s", color=color, label=f"{samples}: {_percent(view.tile_shares[samples])}")
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=4, frameon=False, fontsize=8)
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=4, frameon=False, fontsize=8)
     return figure
