@@ -23,6 +23,7 @@ from .rasterizer import render_stages
 from .report import format_table
 
 STAGES = ("project", "bin", "blend")
+PLOTS = (".png", ".svg", ".pdf")
 PROGRAM = "python -m analytic_rasterizer"
 # What a user can cause: bad values and files (ValueError, TypeError, OSError), a missing extra
 # (ImportError), a device out of memory or absent (RuntimeError, MemoryError).
@@ -316,7 +317,9 @@ def add_inspect(subcommands) -> None:
     )
     parser.add_argument("--json", metavar="FILE", help="write the findings as JSON; - prints them instead of the text")
     parser.add_argument(
-        "--picture", metavar="FILE", help="plot what the views show: sizes of splats, and samples per tile"
+        "--picture",
+        metavar="FILE",
+        help="plot what the views show, as .png, .svg or .pdf: sizes of splats, and samples per tile",
     )
     _add_view_options(parser)
     _add_machine_options(parser)
@@ -325,8 +328,10 @@ def add_inspect(subcommands) -> None:
 
 def run_inspect(args) -> None:
     """Inspects the scene and prints the report."""
-    if args.picture:
-        io.optional_import("matplotlib.figure", "analysis")  # now rather than after everything is rendered
+    if args.picture:  # now rather than after everything is rendered
+        io.optional_import("matplotlib.figure", "analysis")
+        if Path(args.picture).suffix not in PLOTS:
+            raise ValueError(f"--picture must end in {', '.join(PLOTS[:-1])} or {PLOTS[-1]}, got {args.picture}")
     _use_machine(args)
     views = io.load_views(args.views, args.size)
     views = views[:: -(-len(views) // args.max_views)]

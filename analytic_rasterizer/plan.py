@@ -28,6 +28,7 @@ from .rasterizer import (
     render_stages,
 )
 
+INPUTS = ("means3D", "means2D", "opacities", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")
 REFERENCE = "box:samples=16"
 BASE = "box:samples=1"
 ADAPTIVE = (8, 4, 2, 1)  # tolerances to try, in those of the plan: the RMS is about a tenth of them
@@ -42,7 +43,7 @@ TILE_SAMPLES = (1, 4, 8, 16)  # what `adaptive` chooses from
 SAME = 1.05  # ratio of times up to which the candidate listed first is taken
 DRAWN = 8  # views in the histogram
 TIMED_VIEWS = 2
-ROUNDS = {"cpu": 3, "cuda": 20}
+ROUNDS = {"cpu": 4, "cuda": 20}
 WARM_UP = 40  # frames before timing on CUDA: the first 32 of a size wait for the device
 
 
@@ -271,6 +272,7 @@ class SceneReport:
         _draw(self).savefig(path, dpi=140)
 
 
+@torch.no_grad()
 def plan(
     scene: io.Scene,
     views: Sequence[io.View | GaussianRasterizationSettings],
@@ -310,7 +312,7 @@ def inspect_scene(
         training_views: What the scene was trained from, at their size; None: the 3D filter is not looked at.
         scale: Resolution of `io.View`s among the views, as a factor.
         background: Colour behind the scene in `io.View`s.
-        rounds: Timed rounds, of which the median counts; None: 3, with CUDA 20.
+        rounds: Timed rounds; None: 4, of which the fastest counts, with CUDA 20, of which the median.
 
     Raises:
         TypeError: scene, a view or the tolerance has a wrong type.
@@ -320,12 +322,13 @@ def inspect_scene(
     if rounds is not None and not (isinstance(rounds, int) and rounds >= 1):
         raise ValueError(f"rounds must be a positive whole number, got {rounds!r}")
     survey = _survey(scene, cameras, tolerance, training)
-    names = [BASE, "box:samples=4", *(f"adaptive:tolerance={k * tolerance:.4g}" for k in ADAPTIVE), "box:samples=8"]
-    rms = {footprint: [] for footprint in (*dict.fromkeys(names), REFERENCE)}
+    names = [getattr(view, "name", f"view_{i:03d}") for i, view in enumerate(views)]
+    ladder = [BASE, "box:samples=4", *(f"adaptive:tolerance={k * tolerance:.4g}" for k in ADAPTIVE), "box:samples=8"]
+    rms = {footprint: [] for footprint in dict.fromkeys([*ladder, REFERENCE])}
     fits = dict.fromkeys(rms, True)
     in_views, on_image = [], torch.zeros(len(scene.means), dtype=torch.bool, device=scene.means.device)
     shown, top_band = on_image.clone(), []
-    for camera in cameras.values():
+    for camera in cameras:
         reference = _stages(scene, camera, REFERENCE, survey.everything)
         in_views.append(_touching(reference))
         shown |= in_views[-1]
@@ -340,7 +343,7 @@ def inspect_scene(
             fewer = replace(survey.everything, sh_degree=scene.sh_degree - 1)
             top_band.append(_rms(_stages(scene, camera, REFERENCE, fewer).color, reference.color))
 
-    timed = list(cameras.values())[:: -(-len(cameras) // TIMED_VIEWS)]
+    timed = cameras[:: -(-len(cameras) // TIMED_VIEWS)]
     fitting = [name for name in rms if fits[name]]
     tried = dict.fromkeys([BASE, *fitting])
     seconds = _seconds({name: _passes(scene, timed, name, survey.effects) for name in tried}, scene, rounds)
@@ -352,7 +355,7 @@ def inspect_scene(
 
     views = tuple(
         _view_report(scene, survey, i, name, camera, in_views[i], rms[footprint][i], tolerance)
-        for i, (name, camera) in enumerate(cameras.items())
+        for i, (name, camera) in enumerate(zip(names, cameras))
     )
     findings = (
         _footprint_finding(candidates, footprint, views),
@@ -388,7 +391,7 @@ class _Survey:
         everything: All that the tolerance counts from.
         bounds: Of `sh_band_bounds`.
         ratios: Per view, training interval over the view's, of the Gaussians that both see; empty without training.
-        filter_change: Largest RMS of the 3D filter over the views that call for it; None where none does.
+        filter_change: Largest RMS of the 3D filter over the views; None where no view calls for it.
         orthographic: Whether the views are.
         off_center: Which views are.
     """
@@ -402,55 +405,47 @@ class _Survey:
     off_center: list[bool]
 
 
-def _check(scene, views, tolerance, training_views, scale=1.0, background=(0.0, 0.0, 0.0)):
-    """(settings of the views by name, those of training or None)."""
+def _check(scene, views, tolerance, training_views, *options):
+    """(settings of the views, those of training or None). `options`: scale and background of `io.View.settings`."""
     if not isinstance(scene, io.Scene):
         raise TypeError(f"scene must be an io.Scene, got {type(scene).__name__}")
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)):
         raise TypeError(f"tolerance must be a number, got {tolerance!r}")
     if not 0 <= tolerance < math.inf:
         raise ValueError(f"tolerance must be finite and not negative, got {tolerance}")
-    cameras = _cameras("views", views, scene, scale, background)
-    training = None if training_views is None else _cameras("training_views", training_views, scene)
-    return cameras, None if training is None else list(training.values())
+    cameras = _cameras("views", views, scene, *options)
+    return cameras, None if training_views is None else _cameras("training_views", training_views, scene)
 
 
-def _cameras(what: str, views, scene: io.Scene, *options) -> dict[str, GaussianRasterizationSettings]:
+def _cameras(what: str, views, scene: io.Scene, *options) -> list[GaussianRasterizationSettings]:
     if not isinstance(views, Sequence):
         raise TypeError(f"{what} must be a list of views, got {type(views).__name__}")
-    cameras = {}
-    for i, view in enumerate(views):
-        if isinstance(view, io.View):
-            cameras[view.name if view.name not in cameras else f"{view.name}_{i}"] = view.settings(
-                *options, device=scene.means.device
-            )
-        elif isinstance(view, GaussianRasterizationSettings):
-            cameras[f"view_{i:03d}"] = view
-        else:
+    for view in views:
+        if not isinstance(view, (io.View, GaussianRasterizationSettings)):
             raise TypeError(f"{what} must hold io.View or GaussianRasterizationSettings, got {type(view).__name__}")
-    if not cameras:
+    if not views:
         raise ValueError(f"{what} must hold at least one view, got none")
-    return cameras
+    device = scene.means.device
+    return [view.settings(*options, device=device) if isinstance(view, io.View) else view for view in views]
 
 
-def _survey(scene: io.Scene, cameras: dict, tolerance: float, training: list | None) -> _Survey:
-    orthographic = [_is_orthographic(camera) for camera in cameras.values()]
+def _survey(scene: io.Scene, cameras: list, tolerance: float, training: list | None) -> _Survey:
+    orthographic = [_is_orthographic(camera) for camera in cameras]
     if any(orthographic) != all(orthographic):
         raise ValueError(
             f"views must be all perspective or all orthographic, got {sum(orthographic)} of {len(cameras)} orthographic"
         )
-    off_center = [not flat and _is_off_center(camera) for flat, camera in zip(orthographic, cameras.values())]
+    off_center = [not flat and _is_off_center(camera) for flat, camera in zip(orthographic, cameras)]
     everything = Effects(orthographic=all(orthographic), off_center=any(off_center))
     ratios, filter_change = [], None
     if training is not None:
         finest = reduce(torch.minimum, (sampling_interval(scene.means, camera) for camera in training))
-        ratios = [_ratios(finest, sampling_interval(scene.means, camera)) for camera in cameras.values()]
-        calling = [camera for camera, ratio in zip(cameras.values(), ratios) if _share(ratio > FINER) > FINER_SHARE]
-        if calling:
+        ratios = [_ratios(finest, sampling_interval(scene.means, camera)) for camera in cameras]
+        if any(_share(ratio > FINER) > FINER_SHARE for ratio in ratios):
             filtered = replace(everything, filter_3d=compute_3d_filter(scene.means, training))
             filter_change = max(
                 _rms(*(_stages(scene, camera, REFERENCE, effects).color for effects in (everything, filtered)))
-                for camera in calling
+                for camera in cameras
             )
             everything = filtered
     shs = scene.shs[:, : (scene.sh_degree + 1) ** 2]
@@ -515,17 +510,14 @@ def _rms(color: torch.Tensor, reference: torch.Tensor) -> float:
 
 
 @torch.no_grad()
-def tile_samples(settings: GaussianRasterizationSettings, means3D: torch.Tensor, **gaussians) -> torch.Tensor:
-    """(rows, columns) int32 on the CPU: the samples that `adaptive` takes in every tile.
+def tile_samples(settings: GaussianRasterizationSettings, gaussians: dict[str, torch.Tensor]) -> torch.Tensor:
+    """(rows, columns) int32 on the CPU: the samples that `adaptive`, the footprint of `settings`, takes in every tile.
 
-    Args:
-        settings: Whose footprint is `adaptive`.
-        means3D, **gaussians: As `GaussianRasterizer.forward` takes them.
+    `gaussians` are the keywords of `GaussianRasterizer.forward`.
     """
-    names = ("means2D", "opacities", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")
-    inputs = (means3D, *(gaussians.get(name) for name in names))
-    options = (*_settings_arguments(settings, means3D.device), False, False)
-    chosen = torch.ops.analytic_rasterizer.rasterize(*inputs, *options)[-1]
+    inputs = [gaussians.get(name) for name in INPUTS]
+    options = _settings_arguments(settings, gaussians["means3D"].device)
+    chosen = torch.ops.analytic_rasterizer.rasterize(*inputs, *options, False, False)[-1]
     return chosen.reshape(-(-settings.image_height // TILE), -1).cpu()
 
 
@@ -542,8 +534,8 @@ def _passes(scene: io.Scene, cameras: list, footprint: str, effects: Effects) ->
 
 
 def _seconds(passes: dict[str, list[Callable]], scene: io.Scene, rounds: int | None) -> dict[str, float]:
-    """Seconds over all cameras, of the median round each. On the CPU in turn; on CUDA, where the room for pairs
-    follows the frames before, each by itself."""
+    """Seconds over all cameras. On the CPU in turn, of the fastest round each: what else the machine does only ever
+    adds. On CUDA, where the room for pairs follows the frames before, each by itself, of the median round."""
     device = scene.means.device.type
     rounds = rounds or ROUNDS[device]
     if device == "cuda":
@@ -559,7 +551,7 @@ def _seconds(passes: dict[str, list[Callable]], scene: io.Scene, rounds: int | N
         return {"seconds": time.perf_counter() - start}
 
     samples = measure.in_turn(passes, clock, range(1, rounds + 1))
-    return {name: sum(measure.median_of(taken)["seconds"] for taken in of) for name, of in samples.items()}
+    return {name: sum(min(s["seconds"] for s in taken) for taken in of) for name, of in samples.items()}
 
 
 def _effect_costs(scene, cameras, footprint, survey: _Survey, shown, rounds) -> dict[str, float]:
@@ -635,9 +627,9 @@ def _filter_finding(survey: _Survey, cost: float | None) -> Finding:
     return Finding(name, needed, change, kind, cost, "filter_3d" if needed else "none", reason)
 
 
-def _cull_finding(scene: io.Scene, cameras: dict, shown, on_image, cost: float) -> Finding:
+def _cull_finding(scene: io.Scene, cameras: list, shown, on_image, cost: float) -> Finding:
     behind = torch.ones_like(shown)
-    for camera in cameras.values():
+    for camera in cameras:
         behind &= ~(depths(scene.means, camera.viewmatrix) > NEAR)
     hidden, faint = ~shown & ~behind, on_image | (scene.opacities.reshape(-1) < 1 / 255)
     counts = [int((~shown).sum()), *(int(part.sum()) for part in (behind, hidden & faint, hidden & ~faint))]
@@ -687,7 +679,7 @@ def _view_report(scene, survey: _Survey, i: int, name: str, camera, shown, rms: 
         finer=None if ratio is None else _share(ratio > FINER),
         finest=None if ratio is None or not len(ratio) else ratio.max().item(),
         rms=rms,
-        tile_samples=tile_samples(settings, **gaussians),
+        tile_samples=tile_samples(settings, gaussians),
     )
 
 
@@ -764,17 +756,18 @@ def _draw(found: SceneReport):
     for ax, view in zip(axes[0, 1:], maps):
         rows, columns = view.tile_samples.shape
         ax.imshow(
-            torch.bucketize(view.tile_samples, torch.tensor(TILE_SAMPLES)),
+            torch.bucketize(view.tile_samples, torch.tensor(TILE_SAMPLES)).numpy(),
             cmap=matplotlib_colors.ListedColormap(colors),
             norm=matplotlib_colors.BoundaryNorm([-0.5, 0.5, 1.5, 2.5, 3.5], len(colors)),
             extent=(0, TILE * columns, TILE * rows, 0),
             interpolation="nearest",
         )
+        ax.set_xlabel("px")
         ax.set_xlim(0, view.width)
         ax.set_ylim(view.height, 0)
         ax.grid(False)
-        ax.set_title(f"{view.name}: samples per tile [px]", fontsize=10)
+        ax.set_title(f"{view.name}: samples per tile", fontsize=10)
         for samples, color in zip(TILE_SAMPLES, colors):
             ax.plot([], [], "s", color=color, label=f"{samples}: {_percent(view.tile_shares[samples])}")
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=4, frameon=False, fontsize=8)
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=4, frameon=False, fontsize=8)
     return figure
