@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from analytic_rasterizer import FOOTPRINTS
-from analytic_rasterizer.plan import tile_samples  # noqa: F401
+from analytic_rasterizer.plan import INPUTS, tile_samples  # noqa: F401
 
 # Option values that change the code path; test_footprints.py checks that no footprint with options is missing.
 OPTIONS = {
@@ -20,16 +20,6 @@ OPTIONS = {
 VARIANTS = [(footprint, options) for footprint in FOOTPRINTS for options in OPTIONS.get(footprint, [{}])]
 # One of each kind, for tests where the options do not matter.
 KINDS = [(footprint, {"samples": 4} if footprint == "box" else {}) for footprint in FOOTPRINTS]
-INPUTS = (
-    "means3D",
-    "means2D",
-    "opacities",
-    "shs",
-    "colors_precomp",
-    "scales",
-    "rotations",
-    "cov3D_precomp",
-)
 
 
 def name_of(variant):
