@@ -334,7 +334,8 @@ def run_inspect(args) -> None:
             raise ValueError(f"--picture must end in {', '.join(PLOTS[:-1])} or {PLOTS[-1]}, got {args.picture}")
     _use_machine(args)
     views = io.load_views(args.views, args.size)
-    views = views[:: -(-len(views) // args.max_views)]
+    count = min(len(views), args.max_views)
+    views = [views[i * len(views) // count] for i in range(count)]
     training = None if args.training_views is None else io.load_views(args.training_views, args.size)
     for path in (args.json, args.picture):
         if path not in (None, "-"):

@@ -622,16 +622,15 @@ def _filter_finding(survey: _Survey, cost: float | None) -> Finding:
 def _cull_finding(scene: io.Scene, cameras: list, shown, on_image, cost: float) -> Finding:
     behind = torch.ones_like(shown)
     for camera in cameras:
-        behind &= ~(depths(scene.means, camera.viewmatrix) > NEAR)
+        behind &= depths(scene.means, camera.viewmatrix) <= NEAR
     hidden, faint = ~shown & ~behind, on_image | (scene.opacities.reshape(-1) < 1 / 255)
-    counts = [int((~shown).sum()), *(int(part.sum()) for part in (behind, hidden & faint, hidden & ~faint))]
+    count, *parts = (int(which.sum()) for which in (~shown, behind, hidden & faint, hidden & ~faint))
     reason = (
-        "{} of {} Gaussians touch no pixel of these views: {} behind the near plane of every view, {} too faint or too "
-        "small, {} beside every picture; `shown` is the mask of the others, the cost that of keeping all".format(
-            counts[0], len(shown), *counts[1:]
-        )
+        f"{count} of {len(shown)} Gaussians touch no pixel of these views: {parts[0]} behind the near plane of every "
+        f"view, {parts[1]} too faint or too small, {parts[2]} beside every picture or not finite; `shown` is the mask "
+        "of the others, the cost that of keeping all"
     )
-    return Finding("hidden Gaussians", False, 0.0, "bound", cost, f"drop {counts[0]}", reason)
+    return Finding("hidden Gaussians", False, 0.0, "bound", cost, f"drop {count}", reason)
 
 
 def _camera_findings(survey: _Survey) -> tuple[Finding, Finding]:

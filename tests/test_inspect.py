@@ -86,6 +86,7 @@ def test_recommendation_is_within_the_tolerance_of_everything_on(device, sizes, 
         check_recommendation(scene, views, found)
         for candidate in found.candidates:
             assert candidate.fits == (candidate.rms <= tolerance)
+            assert candidate.cost > 0 if candidate.fits else candidate.cost in (None, 1)
         assert found.footprint in {candidate.footprint for candidate in found.candidates if candidate.fits}
 
 
@@ -225,6 +226,19 @@ def test_report_in_words_and_json(device):
     assert data["views"][0]["tile_shares"].keys() == {"1", "4", "8", "16"}
     assert find(found, "outputs").cost > 0
     assert ar.plan(scene, views, TOLERANCE, views) == found.effects
+
+
+@pytest.mark.parametrize("tolerance", [0, TOLERANCE])
+def test_bad_numbers(device, tolerance):
+    """Gaussians that are not finite are culled, and do not hide what the others call for."""
+    scene = random_scene(device, count=200, bands="large")
+    scene.means[3], scene.shs[5, 12], scene.opacities[7], scene.scales[9] = math.nan, math.nan, math.inf, math.inf
+    found = ar.inspect_scene(scene, settings(device), tolerance, settings(device), rounds=1)
+    check_recommendation(scene, settings(device), found)
+    assert not found.shown[[3, 5, 7, 9]].any() and found.effects.sh_degree is None
+    json.dumps(found.to_json(), allow_nan=False)
+    if tolerance == 0:
+        assert found.footprint == "box:samples=16"
 
 
 def test_empty_scene(device):
