@@ -19,6 +19,7 @@ from .footprints import (
 )
 from .harmonics import needed_sh_degree
 from .ops import TILE
+from .planner import SceneReport, inspect_scene, plan
 from .rasterizer import (
     GaussianRasterizationSettings,
     GaussianRasterizer,
@@ -40,16 +41,19 @@ __all__ = [
     "GaussianStats",
     "Motion",
     "Outputs",
+    "SceneReport",
     "Stages",
     "apply_3d_filter",
     "camera_settings",
     "compute_3d_filter",
     "footprint_weight",
     "get_default_footprint",
+    "inspect_scene",
     "instruction_set",
     "moved",
     "needed_sh_degree",
     "normalized",
+    "plan",
     "rasterize_gaussians",
     "render_stages",
     "resolve_footprint",

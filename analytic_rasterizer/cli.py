@@ -8,6 +8,7 @@ raising: `main` turns that into one line on stderr and exit code 2.
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import sys
 import tempfile
@@ -17,10 +18,12 @@ import torch
 
 from . import __version__, accuracy, demo, errors, io, pareto
 from .footprints import FOOTPRINTS
+from .planner import inspect_scene
 from .rasterizer import render_stages
 from .report import format_table
 
 STAGES = ("project", "bin", "blend")
+PLOTS = (".png", ".svg", ".pdf")
 PROGRAM = "python -m analytic_rasterizer"
 # What a user can cause: bad values and files (ValueError, TypeError, OSError), a missing extra
 # (ImportError), a device out of memory or absent (RuntimeError, MemoryError).
@@ -286,7 +289,71 @@ def run_errors(args) -> None:
     print(f"see the plots and tables in {out}")
 
 
-COMMANDS = (add_render, add_demo, add_errors, add_pareto)
+def add_inspect(subcommands) -> None:
+    parser = subcommands.add_parser(
+        "inspect",
+        help="say which effects and which footprint a scene calls for, and what they cost",
+        description="Render SCENE from the views of VIEWS with every effect that it may call for and with a few "
+        "footprints, and recommend the cheapest that stays within the tolerance of everything switched on. Prints "
+        "what each effect changes and costs, and what the views show.",
+    )
+    parser.add_argument("scene", metavar="SCENE", help="3DGS .ply, compressed .ply or .spz")
+    parser.add_argument("--views", required=True, help="file of views, as for render")
+    parser.add_argument(
+        "--tolerance",
+        type=_tolerance,
+        default=1 / 255,
+        metavar="T",
+        help="root mean square over a view, in units of colour, 0 to 1 (default: 1/255)",
+    )
+    parser.add_argument("--training-views", metavar="F", help="file of the views that the scene was trained from")
+    parser.add_argument("--scale", type=_positive, default=1.0, help="resolution, as a factor (default: 1)")
+    parser.add_argument(
+        "--max-views",
+        type=_count,
+        default=8,
+        metavar="N",
+        help="look at no more than N views, evenly spread over the file (default: %(default)s)",
+    )
+    parser.add_argument("--json", metavar="FILE", help="write the findings as JSON; - prints them instead of the text")
+    parser.add_argument(
+        "--picture",
+        metavar="FILE",
+        help="plot what the views show, as .png, .svg or .pdf: sizes of splats, and samples per tile",
+    )
+    _add_view_options(parser)
+    _add_machine_options(parser)
+    parser.set_defaults(run=run_inspect)
+
+
+def run_inspect(args) -> None:
+    """Inspects the scene and prints the report."""
+    if args.picture:  # now rather than after everything is rendered
+        io.optional_import("matplotlib.figure", "analysis")
+        if Path(args.picture).suffix not in PLOTS:
+            raise ValueError(f"--picture must end in {', '.join(PLOTS[:-1])} or {PLOTS[-1]}, got {args.picture}")
+    _use_machine(args)
+    views = io.load_views(args.views, args.size)
+    count = min(len(views), args.max_views)
+    views = [views[i * len(views) // count] for i in range(count)]
+    training = None if args.training_views is None else io.load_views(args.training_views, args.size)
+    for path in (args.json, args.picture):
+        if path not in (None, "-"):
+            _writable_folder(Path(path).parent)
+    scene = io.load_scene(args.scene).to(args.device)
+    found = inspect_scene(scene, views, args.tolerance, training, scale=args.scale, background=tuple(args.background))
+    if args.picture:
+        found.save_picture(args.picture)
+    if args.json:
+        text = json.dumps(found.to_json(), indent=1, allow_nan=False) + "\n"
+        if args.json == "-":
+            print(text, end="")
+            return
+        Path(args.json).write_text(text, encoding="utf-8")
+    print(found.to_text())
+
+
+COMMANDS = (add_render, add_demo, add_errors, add_pareto, add_inspect)
 
 
 # ------------------------------------------------------------------ shared by commands
@@ -347,6 +414,7 @@ def _number(kind, accepts, expected: str):
 
 _positive = _number(float, lambda v: math.isfinite(v) and v > 0, "a positive number")
 _intensity = _number(float, lambda v: 0 <= v <= 1, "a number from 0 to 1")
+_tolerance = _number(float, lambda v: math.isfinite(v) and v >= 0, "a number that is not negative")
 _density = _number(int, lambda v: v >= 8, "a whole number from 8")
 _count = _number(int, lambda v: v >= 1, "a positive whole number")
 

@@ -47,19 +47,23 @@ def compute_3d_filter(
         raise ValueError("cameras must hold the settings of at least one view, got none")
     interval = means3D.new_full((len(means3D),), torch.inf)
     for camera in cameras:
-        clip = camera.projmatrix.reshape(4, 4).to(means3D)
-        z = depths(means3D, camera.viewmatrix.to(means3D))
-        projected = means3D @ clip[:3] + clip[3]
-        inside = (projected[:, :2].abs() <= (1 + 2 * MARGIN) * projected[:, 3:].abs()).all(1)
-        # The finer of the two axes.
-        focal = max(camera.image_width / camera.tanfovx, camera.image_height / camera.tanfovy) / 2
-        effects = camera.effects if isinstance(camera.effects, Effects) else Effects()
-        sampled = torch.ones_like(z) if effects.orthographic else z
-        inside &= (z > effects.near) & (z < effects.far)
-        interval = torch.where(inside, torch.minimum(interval, sampled / focal), interval)
+        interval = torch.minimum(interval, sampling_interval(means3D, camera))
     seen = interval.isfinite()
     largest = interval[seen].max() if seen.any() else interval.new_zeros(())
     return torch.where(seen, interval, largest) * math.sqrt(variance)
+
+
+def sampling_interval(means3D: torch.Tensor, camera: GaussianRasterizationSettings) -> torch.Tensor:
+    """World units between samples, (P,): z / focal length; infinite for a point that the camera does not see."""
+    effects = camera.effects if isinstance(camera.effects, Effects) else Effects()
+    clip = camera.projmatrix.reshape(4, 4).to(means3D)
+    z = depths(means3D, camera.viewmatrix.to(means3D))
+    projected = means3D @ clip[:3] + clip[3]
+    inside = (projected[:, :2].abs() <= (1 + 2 * MARGIN) * projected[:, 3:].abs()).all(1)
+    # The finer of the two axes.
+    focal = max(camera.image_width / camera.tanfovx, camera.image_height / camera.tanfovy) / 2
+    inside &= (z > effects.near) & (z < effects.far)
+    return torch.where(inside, (torch.ones_like(z) if effects.orthographic else z) / focal, torch.inf)
 
 
 def apply_3d_filter(

@@ -81,18 +81,17 @@ def one_thread():
     torch.set_num_threads(threads)
 
 
-@pytest.fixture(scope="session")
-def plant():
+def shared_scene(name):
     """A trained scene that does not ship with the project: (inputs float32, list of views)."""
     data, reader = SHARED / "data", SHARED / "tools" / "qsplat.py"
-    if not (reader.exists() and (data / "plant_sh3.npz").exists()):
+    if not (reader.exists() and (data / f"{name}.npz").exists()):
         pytest.skip("needs the optional ../shared scenes next to the project")
     import json
 
     spec = importlib.util.spec_from_file_location("qsplat", reader)
     qsplat = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(qsplat)
-    stored = {k: torch.from_numpy(v) for k, v in qsplat.load(str(data / "plant_sh3.npz")).items()}
+    stored = {k: torch.from_numpy(v) for k, v in qsplat.load(str(data / f"{name}.npz")).items()}
     inputs = {
         "means3D": stored["means"],
         "means2D": torch.zeros_like(stored["means"]),
@@ -101,5 +100,15 @@ def plant():
         "scales": torch.exp(stored["log_scales"]),
         "rotations": stored["quats"],
     }
-    views = json.loads((data / "plant_sh3_lo.json").read_text())
+    views = json.loads((data / f"{name}_lo.json").read_text())
     return {name: value.float().contiguous() for name, value in inputs.items()}, views
+
+
+@pytest.fixture(scope="session")
+def plant():
+    return shared_scene("plant_sh3")
+
+
+@pytest.fixture(scope="session")
+def hqgarden():
+    return shared_scene("hqgarden_lod1_sh0")

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from analytic_rasterizer import FOOTPRINTS
+from analytic_rasterizer.planner import INPUTS, tile_samples  # noqa: F401
 
 # Option values that change the code path; test_footprints.py checks that no footprint with options is missing.
 OPTIONS = {
@@ -19,16 +20,6 @@ OPTIONS = {
 VARIANTS = [(footprint, options) for footprint in FOOTPRINTS for options in OPTIONS.get(footprint, [{}])]
 # One of each kind, for tests where the options do not matter.
 KINDS = [(footprint, {"samples": 4} if footprint == "box" else {}) for footprint in FOOTPRINTS]
-INPUTS = (
-    "means3D",
-    "means2D",
-    "opacities",
-    "shs",
-    "colors_precomp",
-    "scales",
-    "rotations",
-    "cov3D_precomp",
-)
 
 
 def name_of(variant):
@@ -229,17 +220,6 @@ def to(named, device):
 def settings_to(settings, device):
     """ar.GaussianRasterizationSettings with their tensors on another device."""
     return settings._replace(**to(settings._asdict(), device))
-
-
-def tile_samples(settings, scene):
-    """What `adaptive` chooses (tile rows, tile columns), by the op itself."""
-    footprint = settings.footprint
-    numbers = [settings.image_height, settings.image_width, settings.tanfovx, settings.tanfovy]
-    numbers += [settings.scale_modifier, settings.sh_degree, footprint.key, footprint.option]
-    tensors = [settings.bg, settings.viewmatrix, settings.projmatrix, settings.campos, None]
-    gaussians = [None if scene.get(name) is None else scene[name].detach() for name in INPUTS]
-    chosen = torch.ops.analytic_rasterizer.rasterize(*gaussians, *tensors, *numbers, False, False)[-1]
-    return chosen.reshape(-(-settings.image_height // 16), -1).cpu()
 
 
 def leaves(scene):

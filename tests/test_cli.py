@@ -266,10 +266,57 @@ def test_interrupt_of_a_process_is_quiet(tmp_path):
     assert (process.returncode, out, err) == (130, "", "")
 
 
+def inspect_arguments(files, *extra):
+    return ["inspect", str(files / "scene.ply"), "--views", str(files / "views.json"), *map(str, extra)]
+
+
+def test_inspect_prints_the_report_and_writes_its_files(files, capsys):
+    pytest.importorskip("matplotlib", reason="needs the analysis extra")
+    out = files / "out"
+    extra = ["--json", out / "report.json", "--picture", out / "report.png", "--scale", "2", "--tolerance", "0.01"]
+    assert cli.main(inspect_arguments(files, *extra, "--training-views", files / "views.json")) == 0
+    text, report = capsys.readouterr().out, json.loads((out / "report.json").read_text())
+    assert f"recommended: footprint {report['recommendation']['footprint']}" in text
+    assert report["tolerance"] == 0.01
+    assert [(view["name"], view["width"], view["height"]) for view in report["views"]] == [
+        ("front", 128, 96),
+        ("off_centre", 100, 80),
+    ]
+    assert report["views"][0]["finest"] == pytest.approx(2)  # --scale leaves the training views as they are
+    assert image.open(out / "report.png").width > 1000
+
+
+def test_inspect_prints_json_alone(files, capsys):
+    assert cli.main(inspect_arguments(files, "--json", "-", "--max-views", "1")) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert [view["name"] for view in report["views"]] == ["front"]
+    assert report["gaussians"] == 30 and report["sh_degree"] == 2
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        (["--tolerance", "-1"], "argument --tolerance: must be a number that is not negative, got -1"),
+        (["--max-views", "0"], "argument --max-views: must be a positive whole number, got 0"),
+        (["--training-views", "none.json"], "none.json: No such file"),
+        (["--picture", "a.gif"], "--picture must end in .png, .svg or .pdf, got a.gif"),
+        (["--json", "views.json/report.json"], "File exists"),
+    ],
+)
+def test_errors_of_inspect_are_one_line(files, capsys, monkeypatch, extra, message):
+    monkeypatch.chdir(files)
+    check_error(inspect_arguments(files, *extra), capsys, message)
+
+
+def test_inspect_without_matplotlib_names_the_extra(files, capsys, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    check_error(inspect_arguments(files, "--picture", "a.png"), capsys, "pip install analytic_rasterizer[analysis]")
+
+
 def test_version_and_help(capsys):
     assert leave(["--version"]) == 0
     assert capsys.readouterr().out == f"analytic_rasterizer {ar.__version__}\n"
-    for args in ([], ["render"], ["demo"], ["errors"], ["pareto"]):
+    for args in ([], ["render"], ["demo"], ["errors"], ["pareto"], ["inspect"]):
         args = [*args, "--help"]
         assert leave(args) == 0
         text = capsys.readouterr().out

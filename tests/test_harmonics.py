@@ -1,4 +1,4 @@
-"""What a scene calls for."""
+"""How much the bands of harmonics add."""
 
 import math
 
@@ -9,7 +9,7 @@ import torch
 from scenes import Camera
 
 import analytic_rasterizer as ar
-from analytic_rasterizer.plan import sh_band_bounds
+from analytic_rasterizer.harmonics import sh_band_bounds
 
 
 def scene_with_bands(seed, scales, count=60):
@@ -62,11 +62,22 @@ def test_a_scene_of_one_colour_per_gaussian_needs_no_band():
     assert ar.needed_sh_degree(scene["shs"][:0]) == 0
 
 
+def test_fourth_degree():
+    shs = torch.randn(20, 25, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    largest = shs[:, 16:].norm(dim=1).max().item()
+    assert math.isclose(sh_band_bounds(shs)[4], largest * math.sqrt(9 / (4 * math.pi)), rel_tol=1e-12)
+    assert ar.needed_sh_degree(shs) == 4
+    shs[:, 16:] *= 1e-4
+    assert ar.needed_sh_degree(shs) == 3
+
+
 def test_bad_numbers_and_arguments():
     shs = torch.zeros(5, 16, 3)
     shs[2, 12, 0] = torch.nan
     assert ar.needed_sh_degree(shs) == 3
-    with pytest.raises(ValueError, match=r"shs must have shape \(P, M, 3\) with M = 1, 4, 9 or 16, got \(5, 8, 3\)"):
+    with pytest.raises(
+        ValueError, match=r"shs must have shape \(P, M, 3\) with M = 1, 4, 9, 16 or 25, got \(5, 8, 3\)"
+    ):
         ar.needed_sh_degree(shs[:, :8])
     with pytest.raises(ValueError, match="tolerance must be finite and not negative, got -1"):
         ar.needed_sh_degree(shs, -1)
