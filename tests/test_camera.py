@@ -302,7 +302,7 @@ def test_motion_is_the_mean_over_the_exposure(moves, device):
     motion = {
         "sideways": {"velocity": (speed, -0.4 * speed, 0.0)},
         "towards": {"velocity": (0.0, 0.0, speed)},
-        "rolling": {"angular_velocity": (0.1, 0.2, 1.5)},
+        "rolling": {"angular_velocity": (0.1, 0.2, 0.8)},
         "screen": {"screen_velocity": (15.0, 8.0)},
     }[moves]
     blurred, _ = ar.GaussianRasterizer(facing(ar.Effects(motion=ar.Motion(exposure, **motion)), torch.float64, "cpu"))(
@@ -329,7 +329,7 @@ def test_motion_is_the_mean_over_the_exposure(moves, device):
             )
         mean += ar.GaussianRasterizer(settings)(**scene)[0] / steps
     changed = (mean - still).abs().max()
-    assert changed > 3 / 255
+    assert changed > 2 / 255
     # Half a percent, and what is skipped below 1/255.
     assert (blurred - mean).abs().max() < 0.005 * still.max() + 1 / 255
 

@@ -274,7 +274,7 @@ def test_effects_and_settings():
     assert not ar.Effects().has_outputs and ALL.has_outputs
     with pytest.raises(TypeError, match="depth must be a bool, got 1"):
         ar.Effects(depth=1)
-    with pytest.raises(TypeError, match="effects must be an Effects, got 'depth'"):
+    with pytest.raises(TypeError, match="effects must be an Effects or .auto., got 'depth'"):
         CAMERA.settings(effects="depth")
 
 
