@@ -24,6 +24,7 @@ def camera_settings(
     scale_modifier: float = 1.0,
     debug: bool = False,
     dtype: torch.dtype = torch.float32,
+    device: torch.device | str | None = None,
     effects: Effects | str | None = None,
     **options,
 ) -> GaussianRasterizationSettings:
@@ -40,7 +41,7 @@ def camera_settings(
         cx, cy: Principal point, px, the image spanning [0, width] x [0, height]; None: its centre.
         bg: As in the settings; None: black.
         sh_degree, scale_modifier, debug: As in the settings.
-        dtype: Of the tensors of the settings: that of the scene.
+        dtype, device: Of the tensors of the settings: those of the scene. No device: that of world_to_camera.
         effects, **options: As in the settings, the footprint among them.
 
     Raises:
@@ -72,17 +73,18 @@ def camera_settings(
     if not (isinstance(effects, Effects) and effects.camera_gradients):
         tangents = tuple(t.item() for t in tangents)
     position = -torch.linalg.solve(view[:3, :3], view[:3, 3])
+    to = {"dtype": dtype, "device": view.device if device is None else device}
     return GaussianRasterizationSettings(
         image_height=height,
         image_width=width,
         tanfovx=tangents[0],
         tanfovy=tangents[1],
-        bg=torch.zeros(3, dtype=dtype, device=view.device) if bg is None else bg,
+        bg=torch.zeros(3, **to) if bg is None else bg.to(**to),
         scale_modifier=scale_modifier,
-        viewmatrix=view.T.to(dtype).contiguous(),
-        projmatrix=(projection @ view).T.to(dtype).contiguous(),
+        viewmatrix=view.T.to(**to).contiguous(),
+        projmatrix=(projection @ view).T.to(**to).contiguous(),
         sh_degree=sh_degree,
-        campos=position.to(dtype),
+        campos=position.to(**to),
         prefiltered=False,
         debug=debug,
         effects=effects,

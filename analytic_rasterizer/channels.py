@@ -1,7 +1,8 @@
 """Colours of any number of channels, backgrounds and outputs, from the op that renders three colours.
 
-Depth, alpha and further channels are blended like colours, three at a time, by the kernels and over the lists of the
-colours: a group of three costs a blend, not a projection or a sort, and no other kernel had to be made, or pays for it.
+Depth and further channels are blended like colours, three at a time, by the kernels and over the lists of the colours:
+a group of three costs a blend, not a projection or a sort, and no other kernel had to be made, or pays for it. Alpha is
+what the blend of the colours has left over, and costs no more than its plane.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ def render(rasterize, gaussians: tuple, settings: tuple, effects: Effects, debug
     if channels > _GROUP:
         extra.append(colors[:, _GROUP:])
         extra_bg.append(bg[_GROUP:])
-    features = _features(effects, means3D, view, with_alpha=bg_image is not None)
+    features = _features(effects, means3D, view)
     camera = (view, *rest[:3])
     extra += features.values()
     extra_bg.append(bg.new_zeros(len(features)))
@@ -60,7 +61,10 @@ def render(rasterize, gaussians: tuple, settings: tuple, effects: Effects, debug
     looks = effects.median_depth or effects.dominant_index or effects.gaussian_stats
     keep = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in (*inputs, *camera))
     main_bg = _padded(bg[None, :_GROUP])[0].contiguous()
-    color, radii, *saved = rasterize(*inputs, main_bg, view, *rest, keep or bool(extra) or looks, debug)
+    with_alpha = effects.alpha or bg_image is not None
+    color, radii, alpha, *saved = rasterize(
+        *inputs, main_bg, view, *rest, keep or bool(extra) or looks, with_alpha, debug
+    )
     planes = [color[:channels]]
     if extra:
         table, table_bg = _padded(torch.cat(extra, 1)), _padded(torch.cat(extra_bg)[None])[0]
@@ -69,10 +73,11 @@ def render(rasterize, gaussians: tuple, settings: tuple, effects: Effects, debug
             group, group_bg = table[:, i : i + _GROUP].contiguous(), table_bg[i : i + _GROUP].contiguous()
             planes.append(_Channels.apply(group, group_bg, *geometry, *camera, rest[3:], debug, *saved))
     image = torch.cat(planes) if len(planes) > 1 else planes[0]
-    color, values = image[:channels], dict(zip(features, image[channels:].split(1)))
+    color, outputs = image[:channels], dict(zip(features, image[channels:].split(1)))
     if bg_image is not None:
-        color = color + (1 - values["alpha"]) * bg_image
-    outputs = {name: values[name] for name in features if getattr(effects, name)}
+        color = color + (1 - alpha) * bg_image
+    if effects.alpha:
+        outputs["alpha"] = alpha[None]
     if looks:
         outputs |= _look(effects, means3D, view, saved, height, width, footprint=rest[-2])
     return color, radii, Outputs(**outputs)
@@ -97,17 +102,14 @@ def _look(effects: Effects, means3D: torch.Tensor, view: torch.Tensor, saved: li
     return outputs
 
 
-def _features(effects: Effects, means3D: torch.Tensor, view: torch.Tensor, with_alpha: bool) -> dict:
-    """A column (P, 1) for every output, by name."""
-    features = {}
-    if effects.alpha or with_alpha:
-        features["alpha"] = torch.ones_like(means3D[:, :1])
-    if effects.depth or effects.inverse_depth:
-        z = depths(means3D, view)[:, None]
-        z = torch.where(z > effects.near, z, 1)  # the others are culled, and 0 times infinity would not be
-        features |= {"depth": z} if effects.depth else {}
-        features |= {"inverse_depth": 1 / z} if effects.inverse_depth else {}
-    return features
+def _features(effects: Effects, means3D: torch.Tensor, view: torch.Tensor) -> dict:
+    """A column (P, 1) for every output that is blended like a colour, by name."""
+    if not (effects.depth or effects.inverse_depth):
+        return {}
+    z = depths(means3D, view)[:, None]
+    z = torch.where(z > effects.near, z, 1)  # the others are culled, and 0 times infinity would not be
+    features = {"depth": z} if effects.depth else {}
+    return features | ({"inverse_depth": 1 / z} if effects.inverse_depth else {})
 
 
 def _count_channels(colors: torch.Tensor, count: int) -> int:
@@ -136,7 +138,7 @@ def _padded(table: torch.Tensor) -> torch.Tensor:
 
 
 class _Channels(torch.autograd.Function):
-    """Other colours (P, 3) over the lists that `rasterize` has kept: `saved` is what it returned after the radii."""
+    """Other colours (P, 3) over the lists that `rasterize` has kept: `saved` is what it returned after alpha."""
 
     @staticmethod
     def forward(
@@ -145,7 +147,7 @@ class _Channels(torch.autograd.Function):
     ):  # fmt: skip
         height, width, *_, footprint, option = numbers
         splats, ids, pairs, offsets, splat_offsets, positions, transmittance, last, _, _, counts, samples = saved
-        image, _, *own = torch.ops.analytic_rasterizer.rasterize_channels(
+        image, *own = torch.ops.analytic_rasterizer.rasterize_channels(
             colors, bg, height, width, footprint, option, splats, ids, pairs, offsets, counts, samples,
             any(ctx.needs_input_grad), debug,
         )  # fmt: skip
@@ -171,7 +173,7 @@ class _Channels(torch.autograd.Function):
         needs = [wanted[2], wanted[3], wanted[4], False, wanted[0], *wanted[5:8]]
         needs += [lens is not None and want for want in wanted[8:12]]
         grads = torch.ops.analytic_rasterizer.rasterize_vjp(
-            dL_dimage, *inputs, bg, view, proj, campos, lens, *ctx.numbers,
+            dL_dimage, None, *inputs, bg, view, proj, campos, lens, *ctx.numbers,
             splats, ids, pairs, offsets, splat_offsets, positions, transmittance, last, checkpoints, chunks, counts,
             samples, needs, ctx.debug,
         )  # fmt: skip

@@ -18,9 +18,8 @@ from typing import NamedTuple
 
 import torch
 
+from .camera import camera_settings
 from .rasterizer import GaussianRasterizationSettings
-
-ZNEAR, ZFAR = 0.01, 100.0  # of the 3DGS projection; the depth they shape is not used
 
 
 class SceneError(ValueError):
@@ -225,34 +224,19 @@ class View:
         if not (math.isfinite(scale) and scale > 0):
             raise ValueError(f"scale must be positive and finite, got {scale}")
         width, height = self.size(scale)
-        tanfovx = self.width / (2 * self.fx)
-        tanfovy = self.height / (2 * self.fy)
-        cx = self.width / 2 if self.cx is None else self.cx
-        cy = self.height / 2 if self.cy is None else self.cy
-        projection = torch.zeros(4, 4, dtype=torch.float64)
-        projection[0, 0] = 1 / tanfovx
-        projection[1, 1] = 1 / tanfovy
-        projection[0, 2] = 2 * cx / self.width - 1  # ndc of the principal point
-        projection[1, 2] = 2 * cy / self.height - 1
-        projection[2, 2] = ZFAR / (ZFAR - ZNEAR)
-        projection[2, 3] = -ZFAR * ZNEAR / (ZFAR - ZNEAR)
-        projection[3, 2] = 1
-        if footprint is not None:
-            options["footprint"] = footprint
-        to_float = {"dtype": torch.float32, "device": device}
-        return GaussianRasterizationSettings(
-            image_height=height,
-            image_width=width,
-            tanfovx=tanfovx,
-            tanfovy=tanfovy,
-            bg=torch.tensor(background, **to_float),
-            scale_modifier=1.0,
-            viewmatrix=self.w2c.T.to(**to_float).contiguous(),
-            projmatrix=(projection @ self.w2c).T.to(**to_float).contiguous(),
+        x, y = width / self.width, height / self.height
+        return camera_settings(
+            self.w2c,
+            width,
+            height,
+            x * self.fx,
+            y * self.fy,
+            None if self.cx is None else x * self.cx,
+            None if self.cy is None else y * self.cy,
+            bg=torch.tensor(background, dtype=torch.float32),
             sh_degree=sh_degree,
-            campos=torch.linalg.inv(self.w2c)[:3, 3].to(**to_float),
-            prefiltered=False,
-            debug=False,
+            footprint=footprint,
+            device=device,
             **options,
         )
 

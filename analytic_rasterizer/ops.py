@@ -22,9 +22,10 @@ def _tiles(height: int, width: int) -> int:
 def _(
     means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
     viewmatrix, projmatrix, campos, lens, image_height, image_width, tanfovx, tanfovy, scale_modifier,
-    sh_degree, footprint, option, keep, debug,
+    sh_degree, footprint, option, keep, alpha, debug,
 ):  # fmt: skip
     context = torch.library.get_ctx()
+    covered = means3D.new_empty(image_height if alpha else 0, image_width)
     samples = _SAMPLES.get(footprint, 1) if keep else 0
     ints, longs = {"dtype": torch.int32}, {"dtype": torch.int64}
     chosen = _tiles(image_height, image_width) if footprint == "adaptive" else 0
@@ -36,6 +37,7 @@ def _(
         return (
             means3D.new_empty(3, image_height, image_width),
             means3D.new_empty(means3D.shape[0], **ints),
+            covered,
             means3D.new_empty((kept, _SPLAT_WIDTH) if keep else (0,)),
             means3D.new_empty(kept, **ints),
             means3D.new_empty((room, 2) if keep else (0,), **ints),
@@ -53,6 +55,7 @@ def _(
     return (
         means3D.new_empty(3, image_height, image_width),
         means3D.new_empty(means3D.shape[0], **ints),
+        covered,
         means3D.new_empty(splats, _SPLAT_WIDTH),
         means3D.new_empty(splats, **ints),
         means3D.new_empty(pairs, **ints),
@@ -70,7 +73,7 @@ def _(
 
 @torch.library.register_fake("analytic_rasterizer::rasterize_vjp")
 def _(
-    dL_dcolor, means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
+    dL_dcolor, dL_dalpha, means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
     viewmatrix, projmatrix, campos, lens, *rest,
 ):  # fmt: skip
     inputs = (means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
@@ -108,7 +111,6 @@ def _(colors, bg, image_height, image_width, footprint, option, splats, ids, pai
     context = torch.library.get_ctx()
     return (
         colors.new_empty(3, image_height, image_width),
-        splats.new_empty(splats.shape),
         colors.new_empty((context.new_dynamic_size(), TILE * TILE, 4) if on_cuda else (0,)),
         colors.new_empty((context.new_dynamic_size(), 3) if on_cuda else (0,), **ints),
         counts.new_empty(counts.shape),

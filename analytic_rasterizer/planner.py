@@ -458,7 +458,7 @@ def tile_samples(settings: GaussianRasterizationSettings, gaussians: dict[str, t
     """
     inputs = [gaussians.get(name) for name in INPUTS]
     options = _settings_arguments(settings, gaussians["means3D"], gaussians.get("shs"))
-    chosen = torch.ops.analytic_rasterizer.rasterize(*inputs, *options, False, False)[-1]
+    chosen = torch.ops.analytic_rasterizer.rasterize(*inputs, *options, False, False, False)[-1]
     return chosen.reshape(-(-settings.image_height // TILE), -1).cpu()
 
 
@@ -669,7 +669,7 @@ def _percent(share: float | None) -> str | None:
 
 
 def _share(which: torch.Tensor) -> float:
-    return which.double().mean().item() if which.numel() else 0.0
+    return which.sum().item() / max(1, which.numel())
 
 
 def _draw(found: SceneReport):

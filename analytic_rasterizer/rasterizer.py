@@ -207,7 +207,7 @@ def rasterize_gaussians(
         return (color, radii, outputs) if asked.has_outputs else (color, radii)
     of_camera = settings[1:5] if settings[4] is not None else ()
     keep = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in (*gaussians, *of_camera))
-    arguments = (*gaussians, *settings, keep, debug)
+    arguments = (*gaussians, *settings, keep, False, debug)
     if debug:
         return _DebugRasterize.apply(*arguments)[:2]
     return torch.ops.analytic_rasterizer.rasterize(*arguments)[:2]
@@ -256,23 +256,25 @@ class _DebugRasterize(torch.autograd.Function):
             _write_snapshot("snapshot_fw.dump", arguments)
             raise
         ctx.set_materialize_grads(False)
-        ctx.mark_non_differentiable(*output[1:])
-        tensors, (*ctx.settings, _, ctx.debug) = arguments[:13], arguments[13:]
-        ctx.save_for_backward(*tensors, *output[2:])
+        tensors, (*ctx.settings, _, with_alpha, ctx.debug) = arguments[:13], arguments[13:]
+        ctx.mark_non_differentiable(output[1], *output[3:], *([] if with_alpha else output[2:3]))
+        ctx.save_for_backward(*tensors, *output[3:])
         return output
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, dL_dcolor, *_):
+    def backward(ctx, dL_dcolor, _, dL_dalpha, *__):
         none = [None] * len(ctx.needs_input_grad)
-        if dL_dcolor is None:
+        if dL_dcolor is None and dL_dalpha is None:
             return tuple(none)
+        if dL_dcolor is None:
+            dL_dcolor = dL_dalpha.new_zeros(3, *dL_dalpha.shape)
         tensors, saved = ctx.saved_tensors[:13], ctx.saved_tensors[13:]
         of_camera = tensors[9:] if tensors[12] is not None else (None,) * 4
         inputs = (*tensors[:8], *of_camera)
         wanted = (*ctx.needs_input_grad[:8], *ctx.needs_input_grad[9:13])
         needs = [need and t is not None for need, t in zip(wanted, inputs)]
-        arguments = (dL_dcolor, *tensors, *ctx.settings, *saved, needs, ctx.debug)
+        arguments = (dL_dcolor, dL_dalpha, *tensors, *ctx.settings, *saved, needs, ctx.debug)
         try:
             grads = torch.ops.analytic_rasterizer.rasterize_vjp(*arguments)
         except Exception:

@@ -147,7 +147,7 @@ class SpeedCase(Case):
     def __init__(self, scene: io.Scene, view: io.View, footprint: str):
         super().__init__(scene, view, footprint)
         footprint = self.settings.footprint
-        given = {**self.gaussians, **self.settings._asdict(), "footprint": footprint.key, "keep": False}
+        given = {**self.gaussians, **self.settings._asdict(), "footprint": footprint.key, "keep": False, "alpha": False}
         given["option"] = footprint.option
         schema = torch.ops.analytic_rasterizer.rasterize.default._schema
         self.op_arguments = [given.get(argument.name) for argument in schema.arguments]

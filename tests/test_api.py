@@ -676,7 +676,7 @@ def test_debug_writes_a_snapshot_when_the_backward_pass_fails(device, tmp_path, 
         (2 * color).sum().backward()
     saved = torch.load(tmp_path / "snapshot_bw.dump", weights_only=False)
     assert torch.equal(saved[0], torch.full_like(color, 2).cpu())
-    assert torch.equal(saved[1], leaves["means3D"].detach().cpu())
+    assert saved[1] is None and torch.equal(saved[2], leaves["means3D"].detach().cpu())
     assert [path.name for path in tmp_path.iterdir()] == ["snapshot_bw.dump"]
 
 
@@ -701,7 +701,7 @@ def test_debug_changes_no_bit(device):
 FULL = ar.Effects(camera_gradients=True, off_center=True, defocus=ar.Defocus(0.1, 2.0))
 
 
-def op_arguments(variant, device, keep, gradient, effects=None):
+def op_arguments(variant, device, keep, gradient, effects=None, alpha=False):
     """Arguments of the `rasterize` op, as its schema orders them; with effects, for a full camera."""
     footprint = ar.resolve_footprint(variant[0], **variant[1])
     fields = CAMERA.fields(torch.float32, device)
@@ -716,18 +716,18 @@ def op_arguments(variant, device, keep, gradient, effects=None):
     camera = [*tensors[1:], lens]
     if effects is not None and gradient:
         camera = [t.requires_grad_() for t in camera]
-    return [*gaussians, tensors[0], *camera, *numbers, keep, False]
+    return [*gaussians, tensors[0], *camera, *numbers, keep, alpha, False]
 
 
 OPS = {
     "rasterize": lambda v, d: op_arguments(v, d, True, True),
     "rasterize (inference)": lambda v, d: op_arguments(v, d, False, False),
-    "rasterize (full camera)": lambda v, d: op_arguments(v, d, True, True, FULL),
+    "rasterize (full camera, alpha)": lambda v, d: op_arguments(v, d, True, True, FULL, True),
     "rasterize_stages": lambda v, d: [  # no means2D, no keep, no debug
-        a for i, a in enumerate(op_arguments(v, d, False, False)) if i not in (1, 21, 22)
+        a for i, a in enumerate(op_arguments(v, d, False, False)) if i not in (1, 21, 22, 23)
     ],
     "rasterize_vjp": lambda v, d: vjp_arguments(v, d),
-    "rasterize_vjp (full camera)": lambda v, d: vjp_arguments(v, d, FULL),
+    "rasterize_vjp (full camera, alpha)": lambda v, d: vjp_arguments(v, d, FULL),
     "rasterize_channels": lambda v, d: channels_arguments(v, d),
     "inspect": lambda v, d: inspect_arguments(v, d),
     "footprint_weight": lambda v, d: weight_arguments(v, d, True),
@@ -736,16 +736,17 @@ OPS = {
 
 
 def vjp_arguments(variant, device, effects=None):
-    arguments = op_arguments(variant, device, True, False, effects)
-    color, _, *saved = torch.ops.analytic_rasterizer.rasterize(*arguments)
+    arguments = op_arguments(variant, device, True, False, effects, alpha=effects is not None)
+    color, _, alpha, *saved = torch.ops.analytic_rasterizer.rasterize(*arguments)
     needs = [a is not None for a in arguments[:8]] + [effects is not None] * 4
-    return [torch.ones_like(color), *arguments[:-2], *saved, needs, False]
+    g_alpha = torch.ones_like(alpha) if alpha.numel() else None
+    return [torch.ones_like(color), g_alpha, *arguments[:-3], *saved, needs, False]
 
 
 def kept_lists(variant, device):
     """(arguments of rasterize, the lists that it keeps for other colours)."""
     arguments = op_arguments(variant, device, True, False)
-    splats, ids, pairs, offsets, *_, counts, samples = torch.ops.analytic_rasterizer.rasterize(*arguments)[2:]
+    splats, ids, pairs, offsets, *_, counts, samples = torch.ops.analytic_rasterizer.rasterize(*arguments)[3:]
     return arguments, (splats, ids, pairs, offsets, counts, samples)
 
 
@@ -790,7 +791,7 @@ def test_opcheck(op, device, variant):
     """
     overload = getattr(torch.ops.analytic_rasterizer, op.split(" ")[0]).default
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")
-    keeps = op in ("rasterize", "rasterize (full camera)", "rasterize_channels")
+    keeps = op in ("rasterize", "rasterize (full camera, alpha)", "rasterize_channels")
     if op != "rasterize_stages" and not (device == "cuda" and keeps):
         checks = (*checks, "test_aot_dispatch_dynamic")
     torch.library.opcheck(overload, tuple(OPS[op](variant, device)), test_utils=checks)

@@ -153,6 +153,33 @@ def test_gradients_add_up_over_the_groups(device, best, variant):
             assert (leaf.grad - expected).abs().max() <= 8 * torch.finfo(best).eps * expected.abs().max(), name
 
 
+@each_kind
+@pytest.mark.parametrize("count", [60, 3000], ids=["few", "several chunks"])
+def test_gradients_of_alpha(device, best, variant, count):
+    """Those of what a white background shows more than a black one; with lists of more than a chunk of a tile too."""
+    footprint, options = variant
+    scene = scenes.cast(scenes.random_scene(10, count, opacity=(0.02, 0.2), sigma=(0.05, 0.3)), best)
+    camera = Camera(image_height=21, image_width=23)
+    g = torch.rand(1, 21, 23, generator=torch.Generator().manual_seed(4), dtype=best).to(device)
+    leaves = scenes.leaves(scenes.to(scene, device))
+    if footprint == "adaptive":  # would look at the background
+        options = {"tolerance": 1e-9}
+    settings = camera.settings(best, device, footprint=footprint, **options)
+    _, _, outputs = ar.GaussianRasterizer(settings._replace(effects=ar.Effects(alpha=True)))(**leaves)
+    (outputs.alpha * g).sum().backward()
+    others = scenes.leaves(scenes.to(scene, device))
+    for value, sign in ((1.0, -1), (0.0, 1)):
+        bg = torch.full((3,), value, dtype=best, device=device)
+        color, _ = ar.GaussianRasterizer(with_bg(settings, bg))(**others)
+        (sign * color[:1] * g).sum().backward()
+    for name in ("means3D", "opacities", "scales", "rotations"):
+        expected = others[name].grad
+        # Both add and subtract the colours, which alpha has not.
+        bound = {torch.float64: 1e-11, torch.float32: 2e-4}[best]
+        assert (leaves[name].grad - expected).abs().max() <= bound * expected.abs().max(), name
+    assert (leaves["shs"].grad == 0).all()
+
+
 @pytest.mark.parametrize("footprint", ["cumulant", "box:samples=4", "exact"])
 def test_gradcheck(footprint):
     camera = Camera(image_height=9, image_width=11, bg=(0.3, 0.6, 0.1))
@@ -274,7 +301,7 @@ def test_effects_and_settings():
     assert not ar.Effects().has_outputs and ALL.has_outputs
     with pytest.raises(TypeError, match="depth must be a bool, got 1"):
         ar.Effects(depth=1)
-    with pytest.raises(TypeError, match="effects must be an Effects or .auto., got 'depth'"):
+    with pytest.raises(TypeError, match=r"effects must be an Effects or .auto., got 'depth'"):
         CAMERA.settings(effects="depth")
 
 

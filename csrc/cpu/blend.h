@@ -154,6 +154,10 @@ template <class F, typename T> void blend_tile(const cpu::BlendTask<T>& task, in
     for (int i = 0; i < kTilePixels; ++i) color[c][i] = color[c][i] / T(kSamples) + through[i] * task.background[c];
     store_tile(view, task.grid, color[c], task.image + c * plane);
   }
+  if (task.alpha) {
+    for (int i = 0; i < kTilePixels; ++i) through[i] = T(1) - through[i];
+    store_tile(view, task.grid, through, task.alpha);
+  }
 }
 
 /// Calls f(F{}) for what a tile is blended with: F itself, or for `adaptive` the one of Boxes that was chosen.
@@ -201,10 +205,12 @@ template <class F, typename T, bool kAbs> void blend_vjp_tile(const cpu::BlendVj
   alignas(64) int32_t last[kSamples][kTilePixels] = {};
   alignas(64) T g[3][kTilePixels] = {};  // dL/d(one sample's colour)
   int32_t row_last[kTile] = {}, tile_last = 0;
+  alignas(64) T g_alpha[kTilePixels] = {};
   for (int c = 0; c < 3; ++c) {
     load_tile(view, task.grid, task.dL_dimage + c * plane, g[c]);
     for (int i = 0; i < kTilePixels; ++i) g[c][i] /= T(kSamples);
   }
+  if (task.dL_dalpha) load_tile(view, task.grid, task.dL_dalpha, g_alpha);
   for (int s = 0; s < kSamples; ++s) {
     std::fill_n(transmittance[s], kTilePixels, T(1));
     load_tile(view, task.grid, task.transmittance + s * plane, transmittance[s]);
@@ -212,6 +218,10 @@ template <class F, typename T, bool kAbs> void blend_vjp_tile(const cpu::BlendVj
     for (int i = 0; i < kTilePixels; ++i) {
       behind[s][i] = g[0][i] * task.background[0] + g[1][i] * task.background[1] + g[2][i] * task.background[2];
       row_last[i / kTile] = std::max(row_last[i / kTile], last[s][i]);
+    }
+    // What is covered does not let the background through: a background of its own.
+    if (task.dL_dalpha) {
+      for (int i = 0; i < kTilePixels; ++i) behind[s][i] -= g_alpha[i] / T(kSamples);
     }
   }
   for (int row = 0; row < kTile; ++row) tile_last = std::max(tile_last, row_last[row]);

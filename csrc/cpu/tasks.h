@@ -66,6 +66,7 @@ template <typename T> struct BlendTask {
   T* image;                     ///< [3, height, width]
   T* transmittance;             ///< [samples, height, width], or null
   int32_t* last;                ///< [samples, height, width] pairs of the tile up to the last one composited, or null
+  T* alpha;                     ///< [height, width] 1 - mean transmittance, or null
 };
 
 template <typename T> struct InspectTask {
@@ -94,6 +95,7 @@ template <typename T> struct BlendVjpTask {
   const T* transmittance;
   const int32_t* last;
   const T* dL_dimage;       ///< [3, height, width]
+  const T* dL_dalpha;       ///< [height, width], or null
   PairGrad<T>* pair_grads;  ///< [pairs]
   Vec2<T>* pair_abs;        ///< [pairs] sums over pixels of |dL/dmean| per coordinate, or null
 };

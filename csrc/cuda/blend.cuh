@@ -215,6 +215,7 @@ __device__ void store_color(const BlendTask& task, int x, int y, Vec3<float> tot
   task.image[i] = scale * total.x + scale * through * task.background[0];
   task.image[plane + i] = scale * total.y + scale * through * task.background[1];
   task.image[2 * plane + i] = scale * total.z + scale * through * task.background[2];
+  if (task.alpha) task.alpha[i] = 1 - scale * through;
 }
 template <int S> __device__ void store_last(const BlendTask& task, int x, int y, const int (&last)[S]) {
   if (x >= task.grid.width || y >= task.grid.height) return;
@@ -597,6 +598,11 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F>) blend
         const Checkpoint c = checkpoints[(first + s) * kTilePixels + q];
         transmittance = abs(c.transmittance);
         behind = dot(g, c.color) / transmittance;
+      }
+      // What is covered does not let the background through: a background of its own.
+      if (task.dL_dalpha && i >= 0) {
+        const float open = final ? 1 : task.transmittance[(first + s) * image + i] / transmittance;
+        behind -= scale * task.dL_dalpha[i] * open;
       }
       stage.samples[s][q] = {transmittance, behind};
       if (s == 0) stage.g[q] = {g.x, g.y, g.z, __int_as_float(last)};

@@ -143,6 +143,7 @@ struct BlendTask {
   float* image;             ///< [3, height, width]
   float* transmittance;     ///< [samples, height, width], or null without backward pass
   int32_t* last;            ///< [samples, height, width], or null; the splats up to which a sample composited
+  float* alpha;             ///< [height, width] 1 - mean transmittance, or null
 };
 
 struct InspectTask {
@@ -165,8 +166,9 @@ struct BlendVjpTask {
   const float* transmittance;
   const int32_t* last;
   const float* dL_dimage;
-  float* pair_grads;  ///< [max(capacity, n), kPairGradWidth] by slot, or by splat if there are too many pairs
-  bool absolute;      ///< sum |dL/dmean| too
+  const float* dL_dalpha;  ///< [height, width], or null
+  float* pair_grads;       ///< [max(capacity, n), kPairGradWidth] by slot, or by splat if there are too many pairs
+  bool absolute;           ///< sum |dL/dmean| too
 };
 
 struct ProjectVjpTask {

@@ -46,9 +46,9 @@ using RasterizeSignature = RasterizeOutput(const Tensor&, const OptionalTensor&,
                                            const OptionalTensor&, const OptionalTensor&, const OptionalTensor&,
                                            const OptionalTensor&, const Tensor&, const Tensor&, const Tensor&,
                                            const Tensor&, const OptionalTensor&, int64_t, int64_t, double, double,
-                                           double, int64_t, std::string, double, bool, bool);
-using RasterizeVjpSignature = Grads(const Tensor&, const Tensor&, const OptionalTensor&, const Tensor&,
-                                    const OptionalTensor&, const OptionalTensor&, const OptionalTensor&,
+                                           double, int64_t, std::string, double, bool, bool, bool);
+using RasterizeVjpSignature = Grads(const Tensor&, const OptionalTensor&, const Tensor&, const OptionalTensor&,
+                                    const Tensor&, const OptionalTensor&, const OptionalTensor&, const OptionalTensor&,
                                     const OptionalTensor&, const OptionalTensor&, const Tensor&, const Tensor&,
                                     const Tensor&, const Tensor&, const OptionalTensor&, int64_t, int64_t, double,
                                     double, double, int64_t, std::string, double, const Tensor&, const Tensor&,
@@ -66,7 +66,7 @@ template <class Tuple> variable_list list_of(const Tuple& tuple) {
   return std::apply([](const auto&... t) { return variable_list{t...}; }, tuple);
 }
 
-constexpr size_t kGaussianInputs = 8, kBackground = 8, kLens = 12, kInputs = 13,
+constexpr size_t kGaussianInputs = 8, kBackground = 8, kLens = 12, kInputs = 13, kAlpha = 2, kFirstSaved = 3,
                  kOutputs = std::tuple_size_v<RasterizeOutput>;
 
 /// The derivative of a derivative must fail, not be zero: rasterize_vjp has none, and says so.
@@ -76,15 +76,18 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
                                const OptionalTensor& scales, const OptionalTensor& rotations,
                                const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
                                const Tensor& projmatrix, const Tensor& campos, const OptionalTensor& lens,
-                               const Settings& s, bool keep) {
+                               const Settings& s, bool keep, bool alpha) {
     static const auto op = find_op<RasterizeSignature>("analytic_rasterizer::rasterize");
     const at::AutoDispatchBelowADInplaceOrView guard;
     const variable_list out =
         list_of(op.call(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
                         viewmatrix, projmatrix, campos, lens, s.image_height, s.image_width, s.tanfovx, s.tanfovy,
-                        s.scale_modifier, s.sh_degree, s.footprint, s.option, keep, s.debug));
+                        s.scale_modifier, s.sh_degree, s.footprint, s.option, keep, alpha, s.debug));
     ctx->set_materialize_grads(false);  // no zeros the size of everything saved
-    ctx->mark_non_differentiable({out.begin() + 1, out.end()});
+    variable_list others = {out.begin() + kFirstSaved, out.end()};
+    others.push_back(out[1]);
+    if (!alpha) others.push_back(out[kAlpha]);
+    ctx->mark_non_differentiable(others);
     ctx->saved_data["keep"] = keep;
     if (keep) {
       const auto given = [](const OptionalTensor& t) { return t ? *t : Tensor(); };
@@ -101,7 +104,7 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
                              projmatrix,
                              campos,
                              given(lens)};
-      saved.insert(saved.end(), out.begin() + 2, out.end());
+      saved.insert(saved.end(), out.begin() + kFirstSaved, out.end());
       ctx->save_for_backward(std::move(saved));
       s.save(ctx);
     }
@@ -110,11 +113,14 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
 
   static variable_list backward(AutogradContext* ctx, variable_list dL_doutputs) {
     TORCH_CHECK(ctx->saved_data["keep"].toBool(), "rasterize was called with keep=False and cannot be differentiated");
-    variable_list grads(kInputs + 2);  // settings and keep have none
-    if (!dL_doutputs[0].defined()) return grads;
+    variable_list grads(kInputs + 3);  // settings, keep and alpha have none
+    const Tensor dL_dalpha = dL_doutputs[kAlpha];
+    if (!dL_doutputs[0].defined() && !dL_dalpha.defined()) return grads;
     static const auto op = find_op<RasterizeVjpSignature>("analytic_rasterizer::rasterize_vjp");
     const variable_list t = ctx->get_saved_variables();
     const Settings s = Settings::load(ctx);
+    const Tensor dL_dcolor =
+        dL_doutputs[0].defined() ? dL_doutputs[0] : at::zeros({3, s.image_height, s.image_width}, t[0].options());
     const auto given = [](const Tensor& t) { return t.defined() ? OptionalTensor(t) : std::nullopt; };
     Needs needs;
     size_t edge = 0;                   // counts the tensors that were given
@@ -126,18 +132,18 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
       needs[k++] = needed && (i < kGaussianInputs || t[kLens].defined());
     }
     const auto saved = t.begin() + kInputs;
-    const variable_list out = list_of(
-        op.call(dL_doutputs[0], t[0], given(t[1]), t[2], given(t[3]), given(t[4]), given(t[5]), given(t[6]),
-                given(t[7]), t[8], t[9], t[10], t[11], given(t[kLens]), s.image_height, s.image_width, s.tanfovx,
-                s.tanfovy, s.scale_modifier, s.sh_degree, s.footprint, s.option, saved[0], saved[1], saved[2], saved[3],
-                saved[4], saved[5], saved[6], saved[7], saved[8], saved[9], saved[10], saved[11], needs, s.debug));
+    const variable_list out = list_of(op.call(
+        dL_dcolor, given(dL_dalpha), t[0], given(t[1]), t[2], given(t[3]), given(t[4]), given(t[5]), given(t[6]),
+        given(t[7]), t[8], t[9], t[10], t[11], given(t[kLens]), s.image_height, s.image_width, s.tanfovx, s.tanfovy,
+        s.scale_modifier, s.sh_degree, s.footprint, s.option, saved[0], saved[1], saved[2], saved[3], saved[4],
+        saved[5], saved[6], saved[7], saved[8], saved[9], saved[10], saved[11], needs, s.debug));
     for (size_t k = 0; k < kNeeds; ++k) {
       if (needs[k]) grads[input[k]] = out[k].view_as(t[input[k]]);
     }
     return grads;
   }
 };
-static_assert(kOutputs == 14, "backward passes all that forward saves");
+static_assert(kOutputs == 15, "backward passes all that forward saves");
 
 RasterizeOutput rasterize_autograd(const Tensor& means3D, const OptionalTensor& means2D, const Tensor& opacities,
                                    const OptionalTensor& shs, const OptionalTensor& colors_precomp,
@@ -146,13 +152,14 @@ RasterizeOutput rasterize_autograd(const Tensor& means3D, const OptionalTensor& 
                                    const Tensor& projmatrix, const Tensor& campos, const OptionalTensor& lens,
                                    int64_t image_height, int64_t image_width, double tanfovx, double tanfovy,
                                    double scale_modifier, int64_t sh_degree, std::string footprint, double option,
-                                   bool keep, bool debug) {
+                                   bool keep, bool alpha, bool debug) {
   const Settings settings = {image_height, image_width, tanfovx, tanfovy, scale_modifier,
                              sh_degree,    footprint,   option,  debug};
-  const variable_list out = Rasterize::apply(means3D, means2D, opacities, shs, colors_precomp, scales, rotations,
-                                             cov3D_precomp, bg, viewmatrix, projmatrix, campos, lens, settings, keep);
-  return {out[0], out[1], out[2], out[3],  out[4],  out[5],  out[6],
-          out[7], out[8], out[9], out[10], out[11], out[12], out[13]};
+  const variable_list out =
+      Rasterize::apply(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
+                       viewmatrix, projmatrix, campos, lens, settings, keep, alpha);
+  return {out[0], out[1], out[2],  out[3],  out[4],  out[5],  out[6], out[7],
+          out[8], out[9], out[10], out[11], out[12], out[13], out[14]};
 }
 
 struct Weight : torch::autograd::Function<Weight> {

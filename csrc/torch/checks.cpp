@@ -182,10 +182,14 @@ void check_weight_gradient(const Tensor& dL_dweight, const Tensor& offset) {
                     shape_of(dL_dweight));
 }
 
-void Inputs::check_gradient(const Tensor& dL_dcolor) const {
+void Inputs::check_gradient(const Tensor& dL_dcolor, const OptionalTensor& dL_dalpha) const {
   check_like(dL_dcolor, "dL_dcolor", means3D, "means3D");
   TORCH_CHECK_VALUE(dL_dcolor.sizes() == at::IntArrayRef({3, image_height, image_width}),
                     "dL_dcolor must have shape (3, ", image_height, ", ", image_width, "), got ", shape_of(dL_dcolor));
+  if (!dL_dalpha) return;
+  check_like(*dL_dalpha, "dL_dalpha", means3D, "means3D");
+  TORCH_CHECK_VALUE(dL_dalpha->sizes() == at::IntArrayRef({image_height, image_width}), "dL_dalpha must have shape (",
+                    image_height, ", ", image_width, "), got ", shape_of(*dL_dalpha));
 }
 
 void Inputs::check_camera() const {

@@ -33,8 +33,8 @@ struct Inputs {
   /// contiguous, and the matrices are 4x4.
   void check();
 
-  /// dL_dcolor is the gradient of an image of these arguments.
-  void check_gradient(const Tensor& dL_dcolor) const;
+  /// dL_dcolor and dL_dalpha are gradients of images of these arguments.
+  void check_gradient(const Tensor& dL_dcolor, const OptionalTensor& dL_dalpha) const;
 
   /// Background, matrices and camera centre are finite. On a device this waits for it.
   void check_camera() const;

@@ -22,6 +22,7 @@ void force_pair_capacity(int64_t capacity);
 // splats, ids are in the order of depth, pairs (room, 2) are splats and slots, `splat_offsets` (P, 2) the
 // first slot and the number of them, positions is empty, and there are `checkpoints` (n, samples, 256, 4),
 // `chunks` (m, 3) and `counts` (12,), see csrc/cuda/tasks.h. Without `keep` what only the backward pass reads is empty.
+// `alpha` (H, W), 1 - transmittance, is empty unless asked for.
 // `debug` waits for every stage, so that an error is raised by the stage that caused it.
 TORCH_LIBRARY(analytic_rasterizer, m) {
   m.def(
@@ -31,13 +32,15 @@ TORCH_LIBRARY(analytic_rasterizer, m) {
       "Tensor? lens, int image_height, int image_width, float tanfovx, float tanfovy, float scale_modifier, int "
       "sh_degree, str "
       "footprint, "
-      "float option, bool keep, bool debug) -> (Tensor color, Tensor radii, Tensor splats, Tensor ids, Tensor pairs, "
+      "float option, bool keep, bool alpha, bool debug) -> (Tensor color, Tensor radii, Tensor alpha, Tensor splats, "
+      "Tensor ids, Tensor pairs, "
       "Tensor "
       "tile_offsets, "
       "Tensor splat_offsets, Tensor positions, Tensor transmittance, Tensor last, Tensor checkpoints, Tensor "
       "chunks, Tensor counts, Tensor tile_samples)");
   m.def(
-      "rasterize_vjp(Tensor dL_dcolor, Tensor means3D, Tensor? means2D, Tensor opacities, Tensor? shs, Tensor? "
+      "rasterize_vjp(Tensor dL_dcolor, Tensor? dL_dalpha, Tensor means3D, Tensor? means2D, Tensor opacities, Tensor? "
+      "shs, Tensor? "
       "colors_precomp, "
       "Tensor? scales, Tensor? rotations, Tensor? cov3D_precomp, Tensor bg, Tensor viewmatrix, Tensor projmatrix, "
       "Tensor campos, Tensor? lens, int image_height, int image_width, float tanfovx, float tanfovy, float "
@@ -61,12 +64,13 @@ TORCH_LIBRARY(analytic_rasterizer, m) {
       "option) -> "
       "(Tensor color, Tensor radii, Tensor ids, Tensor depths, Tensor means2d, Tensor pairs, Tensor tile_offsets, "
       "Tensor seconds)");
-  // Other colours (P, 3) for the same splats: what rasterize with keep=True returned, blended again. `splats`,
-  // `checkpoints`, `chunks` and `counts` are rasterize_vjp's for an image of these colours.
+  // Other colours (P, 3) for the same splats: what rasterize with keep=True returned, blended again.
+  // `checkpoints`, `chunks` and `counts` are rasterize_vjp's for an image of these colours; its splats are those of
+  // rasterize with these colours.
   m.def(
       "rasterize_channels(Tensor colors, Tensor bg, int image_height, int image_width, str footprint, float option, "
       "Tensor splats, Tensor ids, Tensor pairs, Tensor tile_offsets, Tensor counts, Tensor tile_samples, bool keep, "
-      "bool debug) -> (Tensor color, Tensor splats, Tensor checkpoints, Tensor chunks, Tensor counts)");
+      "bool debug) -> (Tensor color, Tensor checkpoints, Tensor chunks, Tensor counts)");
   // What every pixel shows of rasterize's splats, and every one of the `count` Gaussians of the pixels. `total` is in
   // units of 2^-32.
   m.def(

@@ -110,12 +110,12 @@ const int32_t* samples_or_null(const Tensor& tile_samples) {
 }
 
 struct BlendedImage {
-  Tensor color, transmittance, last;
+  Tensor color, transmittance, last, alpha;
 };
 
 template <typename T>
 BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& binned, const Tensor& tile_samples,
-                   const Stages<T>& stages, bool keep) {
+                   const Stages<T>& stages, bool keep, bool with_alpha) {
   const auto options = in.means3D.options();
   const int64_t samples = keep ? stages.samples : 0;
   const std::vector<int64_t> planes = {samples, in.image_height, in.image_width};
@@ -124,12 +124,14 @@ BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& b
     return stages.choose ? at::zeros(planes, o) : at::empty(planes, o);
   };
   BlendedImage out{at::empty({3, in.image_height, in.image_width}, options), make(options),
-                   make(options.dtype(at::kInt))};
+                   make(options.dtype(at::kInt)),
+                   at::empty({with_alpha ? in.image_height : 0, in.image_width}, options)};
   stages.blend({projected.splats.template const_data_ptr<T>(), binned.pairs.const_data_ptr<int32_t>(),
                 binned.tile_offsets.const_data_ptr<int64_t>(), grid_of(in), thread_count(),
                 samples_or_null(tile_samples), in.background.const_data_ptr<T>(), out.color.template data_ptr<T>(),
                 keep ? out.transmittance.template data_ptr<T>() : nullptr,
-                keep ? out.last.template data_ptr<int32_t>() : nullptr});
+                keep ? out.last.template data_ptr<int32_t>() : nullptr,
+                with_alpha ? out.alpha.template data_ptr<T>() : nullptr});
   return out;
 }
 
@@ -140,7 +142,7 @@ RasterizeOutput rasterize_cpu(const Tensor& means3D, const OptionalTensor& means
                               const Tensor& projmatrix, const Tensor& campos, const OptionalTensor& lens,
                               int64_t image_height, int64_t image_width, double tanfovx, double tanfovy,
                               double scale_modifier, int64_t sh_degree, std::string footprint, double option, bool keep,
-                              bool) {
+                              bool with_alpha, bool) {
   Inputs in{means3D, opacities,      means2D,    shs,       colors_precomp, scales,       rotations,   cov3D_precomp,
             bg,      viewmatrix,     projmatrix, campos,    lens,           image_height, image_width, tanfovx,
             tanfovy, scale_modifier, sh_degree,  footprint, option};
@@ -152,9 +154,10 @@ RasterizeOutput rasterize_cpu(const Tensor& means3D, const OptionalTensor& means
     const Projected projected = project(in, stages);
     const Binned binned = bin(in, projected, stages, keep);
     const Tensor tile_samples = choose(in, projected, binned, stages);
-    const BlendedImage image = blend(in, projected, binned, tile_samples, stages, keep);
+    const BlendedImage image = blend(in, projected, binned, tile_samples, stages, keep, with_alpha);
     out = {image.color,
            projected.radii,
+           image.alpha,
            projected.splats,
            projected.ids,
            binned.pairs,
@@ -192,7 +195,8 @@ StagesOutput rasterize_stages_cpu(const Tensor& means3D, const Tensor& opacities
     const auto t1 = Clock::now();
     const Binned binned = bin(in, projected, stages, false);
     const auto t2 = Clock::now();
-    const BlendedImage image = blend(in, projected, binned, choose(in, projected, binned, stages), stages, false);
+    const BlendedImage image =
+        blend(in, projected, binned, choose(in, projected, binned, stages), stages, false, false);
     const auto t3 = Clock::now();
     const Tensor seconds = at::empty({3}, at::kDouble);
     const auto elapsed = [](auto from, auto to) { return std::chrono::duration<double>(to - from).count(); };
@@ -223,13 +227,13 @@ void check_saved(const Inputs& in, const Tensor& splats, const Tensor& ids, cons
       "splats, transmittance, last and tile_samples must be contiguous, got strided ones");
 }
 
-Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const OptionalTensor& means2D,
-                        const Tensor& opacities, const OptionalTensor& shs, const OptionalTensor& colors_precomp,
-                        const OptionalTensor& scales, const OptionalTensor& rotations,
-                        const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
-                        const Tensor& projmatrix, const Tensor& campos, const OptionalTensor& lens,
-                        int64_t image_height, int64_t image_width, double tanfovx, double tanfovy,
-                        double scale_modifier, int64_t sh_degree, std::string footprint, double option,
+Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const OptionalTensor& dL_dalpha, const Tensor& means3D,
+                        const OptionalTensor& means2D, const Tensor& opacities, const OptionalTensor& shs,
+                        const OptionalTensor& colors_precomp, const OptionalTensor& scales,
+                        const OptionalTensor& rotations, const OptionalTensor& cov3D_precomp, const Tensor& bg,
+                        const Tensor& viewmatrix, const Tensor& projmatrix, const Tensor& campos,
+                        const OptionalTensor& lens, int64_t image_height, int64_t image_width, double tanfovx,
+                        double tanfovy, double scale_modifier, int64_t sh_degree, std::string footprint, double option,
                         const Tensor& splats, const Tensor& ids, const Tensor& pairs, const Tensor& tile_offsets,
                         const Tensor& splat_offsets, const Tensor& positions, const Tensor& transmittance,
                         const Tensor& last, const Tensor&, const Tensor&, const Tensor&, const Tensor& tile_samples,
@@ -238,7 +242,7 @@ Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const Op
             bg,      viewmatrix,     projmatrix, campos,    lens,           image_height, image_width, tanfovx,
             tanfovy, scale_modifier, sh_degree,  footprint, option};
   in.check();
-  in.check_gradient(dL_dcolor);
+  in.check_gradient(dL_dcolor, dL_dalpha);
   Grads out = make_grads(in, needs);
   AT_DISPATCH_FLOATING_TYPES(means3D.scalar_type(), "rasterize_vjp", [&] {
     using T = scalar_t;
@@ -252,12 +256,13 @@ Grads rasterize_vjp_cpu(const Tensor& dL_dcolor, const Tensor& means3D, const Op
     const Tensor pair_abs = at::empty({absolute ? n : 0, 2}, means3D.options());
     auto* sums = reinterpret_cast<PairGrad<T>*>(pair_grads.data_ptr<T>());
     auto* abs2d = absolute ? reinterpret_cast<Vec2<T>*>(pair_abs.data_ptr<T>()) : nullptr;
-    const Tensor g = dL_dcolor.contiguous();
+    const Tensor g = dL_dcolor.contiguous(), g_alpha = dL_dalpha ? dL_dalpha->contiguous() : Tensor();
     const int threads = thread_count();
     stages.blend_vjp({splats.const_data_ptr<T>(), pairs.const_data_ptr<int32_t>(),
                       tile_offsets.const_data_ptr<int64_t>(), grid_of(in), threads, samples_or_null(tile_samples),
                       in.background.const_data_ptr<T>(), transmittance.const_data_ptr<T>(),
-                      last.const_data_ptr<int32_t>(), g.const_data_ptr<T>(), sums, abs2d});
+                      last.const_data_ptr<int32_t>(), g.const_data_ptr<T>(), const_data_or_null<T>(g_alpha), sums,
+                      abs2d});
     const CameraView<T> camera = camera_of<T>(in);
     const Tensor camera_grads = make_camera_grads(in, needs, cpu::chunks_of(in.count()));
     stages.of(camera).project_vjp({camera, gaussians_of<T>(in), footprint_options(option), threads,
@@ -295,10 +300,10 @@ ChannelsOutput rasterize_channels_cpu(const Tensor& colors, const Tensor& bg, in
     own.narrow(1, kSplatColor, 3).copy_(colors.index_select(0, ids));
     stages.blend({own.const_data_ptr<scalar_t>(), pairs.const_data_ptr<int32_t>(),
                   tile_offsets.const_data_ptr<int64_t>(), grid, thread_count(), samples_or_null(tile_samples),
-                  background.const_data_ptr<scalar_t>(), image.data_ptr<scalar_t>(), nullptr, nullptr});
+                  background.const_data_ptr<scalar_t>(), image.data_ptr<scalar_t>(), nullptr, nullptr, nullptr});
   });
   const auto none = [](const Tensor& like) { return at::empty({0}, like.options()); };
-  return {image, own, none(colors), none(pairs), none(tile_offsets)};
+  return {image, none(colors), none(pairs), none(tile_offsets)};
 }
 
 InspectOutput inspect_cpu(const Tensor& splats, const Tensor& ids, const Tensor& pairs, const Tensor& tile_offsets,

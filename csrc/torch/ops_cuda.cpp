@@ -247,7 +247,7 @@ struct Plan {
 };
 
 struct BlendedImage {
-  Tensor color, transmittance, last, checkpoints, chunks;
+  Tensor color, transmittance, last, checkpoints, chunks, alpha;
 };
 
 /// Samples of every tile; empty where all have the same.
@@ -267,7 +267,7 @@ Tensor choose(const Inputs& in, const Projected& projected, const Binned& binned
 /// `lists.counts` has pairs and splats, and zeros. `plan_counters` are zero.
 BlendedImage blend(const cuda::TileLists& lists, TileGrid grid, const Tensor& background,
                    const cuda::ForwardStages& stages, const CUDAStream& stream, std::byte* plan_counters, bool keep,
-                   bool debug) {
+                   bool with_alpha, bool debug) {
   const auto floats = background.options(), ints = floats.dtype(at::kInt);
   const int64_t samples = keep ? stages.samples : 0, height = grid.height, width = grid.width;
   const Plan plan(grid, lists.capacity, stages.samples, lists.tile_samples != nullptr, ints, plan_counters);
@@ -275,23 +275,27 @@ BlendedImage blend(const cuda::TileLists& lists, TileGrid grid, const Tensor& ba
   cuda::plan_chunks(lists, grid, stages.samples, plan.view, feedback, stream);
   check_stage("plan_chunks", stream, debug);
   const Tensor tile_open = at::empty({1 + cuda::kSampleClasses, grid.tiles()}, ints);
-  BlendedImage out{at::empty({3, height, width}, floats), at::empty({samples, height, width}, floats),
-                   at::empty({samples, height, width}, ints), at::empty({plan.max_planes, kTile * kTile, 4}, floats),
-                   plan.chunks};
+  BlendedImage out{at::empty({3, height, width}, floats),
+                   at::empty({samples, height, width}, floats),
+                   at::empty({samples, height, width}, ints),
+                   at::empty({plan.max_planes, kTile * kTile, 4}, floats),
+                   plan.chunks,
+                   at::empty({with_alpha ? height : 0, width}, floats)};
   stages.blend({lists, plan.view, grid, background.const_data_ptr<float>(), tile_open.data_ptr<int32_t>(),
                 tile_open.data_ptr<int32_t>() + grid.tiles(),
                 reinterpret_cast<cuda::Checkpoint*>(out.checkpoints.data_ptr<float>()), out.color.data_ptr<float>(),
-                keep ? out.transmittance.data_ptr<float>() : nullptr, keep ? out.last.data_ptr<int32_t>() : nullptr},
+                keep ? out.transmittance.data_ptr<float>() : nullptr, keep ? out.last.data_ptr<int32_t>() : nullptr,
+                with_alpha ? out.alpha.data_ptr<float>() : nullptr},
                stream);
   check_stage("blend", stream, debug);
   return out;
 }
 BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& binned, const Tensor& tile_samples,
                    const cuda::ForwardStages& stages, const CUDAStream& stream, const Scratch& scratch, bool keep,
-                   bool debug) {
+                   bool with_alpha, bool debug) {
   return blend(
       lists_of(projected.splats, binned.order, binned.pairs, binned.tile_offsets, scratch.counts, tile_samples),
-      grid_of(in), in.background, stages, stream, scratch.plan, keep, debug);
+      grid_of(in), in.background, stages, stream, scratch.plan, keep, with_alpha, debug);
 }
 
 RasterizeOutput rasterize_cuda(const Tensor& means3D, const OptionalTensor& means2D, const Tensor& opacities,
@@ -301,7 +305,7 @@ RasterizeOutput rasterize_cuda(const Tensor& means3D, const OptionalTensor& mean
                                const Tensor& projmatrix, const Tensor& campos, const OptionalTensor& lens,
                                int64_t image_height, int64_t image_width, double tanfovx, double tanfovy,
                                double scale_modifier, int64_t sh_degree, std::string footprint, double option,
-                               bool keep, bool debug) {
+                               bool keep, bool with_alpha, bool debug) {
   Inputs in{means3D, opacities,      means2D,    shs,       colors_precomp, scales,       rotations,   cov3D_precomp,
             bg,      viewmatrix,     projmatrix, campos,    lens,           image_height, image_width, tanfovx,
             tanfovy, scale_modifier, sh_degree,  footprint, option};
@@ -314,10 +318,12 @@ RasterizeOutput rasterize_cuda(const Tensor& means3D, const OptionalTensor& mean
   const Projected projected = project(in, stages, stream, debug);
   const Binned binned = bin(in, projected, stages, stream, scratch, keep, exact, debug);
   const Tensor tile_samples = choose(in, projected, binned, stages, stream, scratch, debug);
-  const BlendedImage image = blend(in, projected, binned, tile_samples, stages, stream, scratch, keep, debug);
+  const BlendedImage image =
+      blend(in, projected, binned, tile_samples, stages, stream, scratch, keep, with_alpha, debug);
   const auto kept = [&](const Tensor& t) { return keep ? t : at::empty({0}, t.options()); };
   return {image.color,
           projected.radii,
+          image.alpha,
           kept(projected.splats),
           kept(binned.order),
           kept(binned.pairs),
@@ -381,7 +387,7 @@ StagesOutput rasterize_stages_cuda(const Tensor& means3D, const Tensor& opacitie
   const Binned binned = bin(in, projected, stages, stream, scratch, false, true, false);
   timer.mark();
   const Tensor tile_samples = choose(in, projected, binned, stages, stream, scratch, false);
-  const BlendedImage image = blend(in, projected, binned, tile_samples, stages, stream, scratch, false, false);
+  const BlendedImage image = blend(in, projected, binned, tile_samples, stages, stream, scratch, false, false, false);
   timer.mark();
   const Tensor seconds = timer.seconds();
   const int64_t pairs = scratch.counts[0].item<int64_t>();
@@ -452,8 +458,8 @@ ChannelsOutput rasterize_channels_cuda(const Tensor& colors, const Tensor& bg, i
   const Tensor plan_counters = at::zeros({cuda::kPlanCounters}, order.options());
   const BlendedImage image =
       blend(lists_of(own, order, pairs, tile_offsets, own_counts, tile_samples), grid, bg.contiguous(), stages, stream,
-            static_cast<std::byte*>(plan_counters.data_ptr()), keep, debug);
-  return {image.color, own, image.checkpoints, image.chunks, own_counts};
+            static_cast<std::byte*>(plan_counters.data_ptr()), keep, false, debug);
+  return {image.color, image.checkpoints, image.chunks, own_counts};
 }
 
 /// The tensors that rasterize hands to its vjp must fit each other. Their contents are rasterize's own.
@@ -478,13 +484,13 @@ void check_saved(const Inputs& in, const Tensor& splats, const Tensor& order, co
                     shape_of(splats), " and transmittance of shape ", shape_of(transmittance));
 }
 
-Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const Tensor& means3D, const OptionalTensor& means2D,
-                         const Tensor& opacities, const OptionalTensor& shs, const OptionalTensor& colors_precomp,
-                         const OptionalTensor& scales, const OptionalTensor& rotations,
-                         const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
-                         const Tensor& projmatrix, const Tensor& campos, const OptionalTensor& lens,
-                         int64_t image_height, int64_t image_width, double tanfovx, double tanfovy,
-                         double scale_modifier, int64_t sh_degree, std::string footprint, double option,
+Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const OptionalTensor& dL_dalpha, const Tensor& means3D,
+                         const OptionalTensor& means2D, const Tensor& opacities, const OptionalTensor& shs,
+                         const OptionalTensor& colors_precomp, const OptionalTensor& scales,
+                         const OptionalTensor& rotations, const OptionalTensor& cov3D_precomp, const Tensor& bg,
+                         const Tensor& viewmatrix, const Tensor& projmatrix, const Tensor& campos,
+                         const OptionalTensor& lens, int64_t image_height, int64_t image_width, double tanfovx,
+                         double tanfovy, double scale_modifier, int64_t sh_degree, std::string footprint, double option,
                          const Tensor& splats, const Tensor& order, const Tensor& pairs, const Tensor& tile_offsets,
                          const Tensor& ranges, const Tensor&, const Tensor& transmittance, const Tensor& last,
                          const Tensor& checkpoints, const Tensor& chunks, const Tensor& counts,
@@ -493,7 +499,7 @@ Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const Tensor& means3D, const O
             bg,      viewmatrix,     projmatrix, campos,    lens,           image_height, image_width, tanfovx,
             tanfovy, scale_modifier, sh_degree,  footprint, option};
   check_cuda(in, debug);
-  in.check_gradient(dL_dcolor);
+  in.check_gradient(dL_dcolor, dL_dalpha);
   const auto& forward = found(cuda::find_forward(footprint), footprint);
   const auto& stages = found(cuda::find_backward(footprint), footprint);
   check_saved(in, splats, order, pairs, tile_offsets, ranges, transmittance, last, checkpoints, chunks, counts,
@@ -505,13 +511,14 @@ Grads rasterize_vjp_cuda(const Tensor& dL_dcolor, const Tensor& means3D, const O
   const TileGrid grid = grid_of(in);
   const cuda::TileLists lists = lists_of(splats, order, pairs, tile_offsets, counts, tile_samples);
   const Tensor pair_grads = at::empty({std::max(pairs.size(0), in.count()), cuda::kPairGradWidth}, means3D.options());
-  const Tensor g = dL_dcolor.contiguous();
-  stages.blend_vjp({lists, reinterpret_cast<const cuda::TileChunk*>(chunks.const_data_ptr<int32_t>()), grid,
-                    chunks.size(0), in.background.const_data_ptr<float>(),
-                    reinterpret_cast<const cuda::Checkpoint*>(checkpoints.const_data_ptr<float>()),
-                    transmittance.const_data_ptr<float>(), last.const_data_ptr<int32_t>(), g.const_data_ptr<float>(),
-                    pair_grads.data_ptr<float>(), grads.means2d && grads.means2d_stride == 4},
-                   stream);
+  const Tensor g = dL_dcolor.contiguous(), g_alpha = dL_dalpha ? dL_dalpha->contiguous() : Tensor();
+  stages.blend_vjp(
+      {lists, reinterpret_cast<const cuda::TileChunk*>(chunks.const_data_ptr<int32_t>()), grid, chunks.size(0),
+       in.background.const_data_ptr<float>(),
+       reinterpret_cast<const cuda::Checkpoint*>(checkpoints.const_data_ptr<float>()),
+       transmittance.const_data_ptr<float>(), last.const_data_ptr<int32_t>(), g.const_data_ptr<float>(),
+       const_data_or_null<float>(g_alpha), pair_grads.data_ptr<float>(), grads.means2d && grads.means2d_stride == 4},
+      stream);
   check_stage("blend_vjp", stream, debug);
   const Tensor camera_grads = make_camera_grads(in, needs, cuda::warps_of(in.count()));
   stages.project_vjp({camera_of<float>(in), gaussians_of<float>(in), footprint_options(option),

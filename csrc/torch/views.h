@@ -53,12 +53,12 @@ template <class Task, typename T> Task weight_task(const Tensor& offset, const T
   return task;
 }
 
-/// What rasterize returns: color, radii, and what its vjp needs (schemas in ops.cpp).
+/// What rasterize returns: color, radii, alpha, and what its vjp needs (schemas in ops.cpp).
 using RasterizeOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
-                                   Tensor, Tensor, Tensor, Tensor>;
-/// An image of other colours, and what takes the place of the same outputs of rasterize in its vjp: splats,
-/// checkpoints, chunks, counts.
-using ChannelsOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
+                                   Tensor, Tensor, Tensor, Tensor, Tensor>;
+/// An image of other colours, and what takes the place of the same outputs of rasterize in its vjp: checkpoints,
+/// chunks, counts.
+using ChannelsOutput = std::tuple<Tensor, Tensor, Tensor, Tensor>;
 /// Of inspect: median and dominant Gaussian of every pixel; pixels, largest weight and sum of weights of every
 /// Gaussian.
 using InspectOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
@@ -93,6 +93,9 @@ inline Grads make_grads(const Inputs& in, const Needs& needs) {
 inline Tensor make_camera_grads(const Inputs& in, const Needs& needs, int64_t parts) {
   const bool needed = needs[8] || needs[9] || needs[10] || needs[11];
   return in.lens && needed ? at::zeros({parts, kCameraGradWidth}, in.means3D.options()) : Tensor();
+}
+template <typename T> const T* const_data_or_null(const Tensor& t) {
+  return t.defined() ? t.const_data_ptr<T>() : nullptr;
 }
 template <typename T> T* data_or_null(const Tensor& t) { return t.defined() ? t.data_ptr<T>() : nullptr; }
 

@@ -82,14 +82,14 @@ Rendered<T> run_stages(const cpu::Stages<T>& stages, CameraView<T> camera, Gauss
   }
   const int32_t* tile_samples = stages.choose ? samples.data() : nullptr;
   stages.blend({splats.data(), pairs.data(), tile_offsets.data(), grid, threads, tile_samples, background,
-                out.image.data(), transmittance.data(), last.data()});
+                out.image.data(), transmittance.data(), last.data(), nullptr});
 
   std::vector<PairGrad<T>> pair_grads(out.pairs);
   std::vector<Vec2<T>> pair_abs(out.pairs);
   GradArrays<T> grads(gaussians.n, gaussians.cov3ds ? gaussians.n : 0,
                       gaussians.shs ? gaussians.n * gaussians.sh_stride : 0);
   stages.blend_vjp({splats.data(), pairs.data(), tile_offsets.data(), grid, threads, tile_samples, background,
-                    transmittance.data(), last.data(), dL_dimage, pair_grads.data(), pair_abs.data()});
+                    transmittance.data(), last.data(), dL_dimage, nullptr, pair_grads.data(), pair_abs.data()});
   stages.of(camera).project_vjp({camera, gaussians, options, threads, ids.data(), n, splat_offsets.data(),
                                  positions.data(), pair_grads.data(), pair_abs.data(), grads.views});
   out.grads = std::move(grads.all);
