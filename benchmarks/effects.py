@@ -5,10 +5,10 @@
 Off is the plain path, three colours of a fixed pinhole: from the scene's harmonics, but for `channels` from random
 colours, and for `sh_degree:4` from as many coefficients (zeros where the scene has none), of which degree 3 uses 16.
 Every effect is timed against a plain rendering of its own, in turn, round after round, so that a machine that slows
-down slows both; `off_twice` has two plain ones, and shows what is noise. Medians over rounds, averaged over views. "forward" is without gradient;
-"forward+backward" differentiates sum(image * w) for fixed random w, over all channels and differentiable outputs, in
-all inputs, those of the effect among them (camera, background). "extra" is the memory that a forward and backward pass
-needs beyond inputs, outputs and gradients.
+down slows both; `off_twice` has two plain ones, and shows what is noise. Medians over rounds, averaged over views.
+"forward" is without gradient; "forward+backward" differentiates sum(image * w) for fixed random w, over all channels
+and differentiable outputs, in all inputs, those of the effect among them (camera, background). "extra" is the memory
+that a forward and backward pass needs beyond inputs, outputs and gradients.
 
 Numbers come from the scene: a lens focused on the median depth whose median disc has 2 px, a camera that moves sideways
 by 4 px at the median depth, an orthographic one that shows as much as the other there, planes that cut nothing,

@@ -82,6 +82,7 @@ def profile(call, device: str) -> list[dict]:
     if device == "cuda":
         activities.append(torch.profiler.ProfilerActivity.CUDA)
         torch.cuda.synchronize()
+        torch.cuda.empty_cache()  # a large block that is found there may be handed out whole
     with torch.profiler.profile(activities=activities, profile_memory=True) as profiler:
         call()
         if device == "cuda":
