@@ -16,9 +16,9 @@ Of every footprint and pass the file has
   "empty:2880". Ours, whatever the version of torch.
 - `everything`: all ops from the call of the rasterizer to its end, in order, and `allocated`, the bytes of all
   allocations by size, "12:3" for three of 12 bytes. Torch's own are among them: of one version of torch.
-- on CUDA `kernels`: launches of our kernels by name; `others`, those of torch; `memsets`, `memcpys`; `bytes` and
-  `allocations`: what the caching allocator was asked for, before it rounds. Room for pairs is fixed (FRAME_PAIRS), or
-  it would follow the frames before.
+- on CUDA, where those bytes are what the caching allocator rounds them to, also `kernels`: launches of ours by name;
+  `others`, those of torch; `memsets`, `memcpys`; `bytes` and `allocations`: what was asked for, before rounding. Room
+  for pairs is fixed (FRAME_PAIRS), or it would follow the frames before.
 """
 
 from __future__ import annotations
