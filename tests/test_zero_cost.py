@@ -191,8 +191,8 @@ def scenes_of(effect):
     else:  # some of them clamped, outside the picture or behind the camera
         scene = scenes.random_scene(31, COUNT, degree=1, sigma=(0.01, 0.9), spread=3.5)
         scene["means3D"][:3] *= 20
-    scene["means2D"] = torch.zeros(COUNT, 4, dtype=torch.float64)
     precomputed = scenes.with_precomputed(scene)
+    scene["means2D"] = torch.zeros(COUNT, 4, dtype=torch.float64)  # gradients of both widths
     return [scene] if effect in ("filter_3d", "sh_degree") else [scene, precomputed]
 
 
