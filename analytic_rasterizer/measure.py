@@ -59,8 +59,8 @@ class Case:
 
 
 @functools.cache
-def fixed_weights(height: int, width: int, device: torch.device) -> torch.Tensor:
-    return torch.rand(3, height, width, generator=torch.Generator().manual_seed(0)).to(device)
+def fixed_weights(height: int, width: int, device: torch.device, channels: int = 3) -> torch.Tensor:
+    return torch.rand(channels, height, width, generator=torch.Generator().manual_seed(0)).to(device)
 
 
 def describe_machine(device: str) -> str:
