@@ -28,7 +28,7 @@ def render(rasterize, gaussians: tuple, settings: tuple, effects: Effects, debug
     """(color, radii, `Outputs`) of colours with any number of channels, on a background of as many, and of effects.
 
     Args:
-        rasterize: The op, or what stands for it: its arguments to its outputs.
+        rasterize: The op, or what stands for it: its arguments to its outputs, all in one row.
         gaussians: means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp.
         settings: The op's arguments after these, up to `keep`; bg first.
         effects: What to add.
@@ -62,9 +62,8 @@ def render(rasterize, gaussians: tuple, settings: tuple, effects: Effects, debug
     keep = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in (*inputs, *camera))
     main_bg = _padded(bg[None, :_GROUP])[0].contiguous()
     with_alpha = effects.alpha or bg_image is not None
-    color, radii, alpha, *saved = rasterize(
-        *inputs, main_bg, view, *rest, keep or bool(extra) or looks, with_alpha, debug
-    )
+    color, radii, *saved = rasterize(*inputs, main_bg, view, *rest, keep or bool(extra) or looks, with_alpha, debug)
+    alpha = saved.pop() if with_alpha else None
     planes = [color[:channels]]
     if extra:
         table, table_bg = _padded(torch.cat(extra, 1)), _padded(torch.cat(extra_bg)[None])[0]
@@ -138,7 +137,8 @@ def _padded(table: torch.Tensor) -> torch.Tensor:
 
 
 class _Channels(torch.autograd.Function):
-    """Other colours (P, 3) over the lists that `rasterize` has kept: `saved` is what it returned after alpha."""
+    """Other colours (P, 3) over the lists that `rasterize` has kept: `saved` is what it returned between the radii and
+    alpha."""
 
     @staticmethod
     def forward(
@@ -172,11 +172,11 @@ class _Channels(torch.autograd.Function):
         wanted = ctx.needs_input_grad
         needs = [wanted[2], wanted[3], wanted[4], False, wanted[0], *wanted[5:8]]
         needs += [lens is not None and want for want in wanted[8:12]]
-        grads = torch.ops.analytic_rasterizer.rasterize_vjp(
+        *grads, of_camera = torch.ops.analytic_rasterizer.rasterize_vjp(
             dL_dimage, None, *inputs, bg, view, proj, campos, lens, *ctx.numbers,
             splats, ids, pairs, offsets, splat_offsets, positions, transmittance, last, checkpoints, chunks, counts,
             samples, needs, ctx.debug,
         )  # fmt: skip
-        grads = [grad if need else None for grad, need in zip(grads, needs)]
+        grads = [grad if need else None for grad, need in zip([*grads, *(of_camera or [None] * 4)], needs)]
         of_camera = [None if g is None else g.view_as(t) for g, t in zip(grads[8:], (view, proj, campos, lens))]
         return (grads[4], None, *grads[:3], *grads[5:8], *of_camera, None, None, *[None] * 12)

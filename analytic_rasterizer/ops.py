@@ -25,7 +25,7 @@ def _(
     sh_degree, footprint, option, keep, alpha, debug,
 ):  # fmt: skip
     context = torch.library.get_ctx()
-    covered = means3D.new_empty(image_height if alpha else 0, image_width)
+    covered = [means3D.new_empty(image_height, image_width)] if alpha else []
     samples = _SAMPLES.get(footprint, 1) if keep else 0
     ints, longs = {"dtype": torch.int32}, {"dtype": torch.int64}
     chosen = _tiles(image_height, image_width) if footprint == "adaptive" else 0
@@ -37,7 +37,6 @@ def _(
         return (
             means3D.new_empty(3, image_height, image_width),
             means3D.new_empty(means3D.shape[0], **ints),
-            covered,
             means3D.new_empty((kept, _SPLAT_WIDTH) if keep else (0,)),
             means3D.new_empty(kept, **ints),
             means3D.new_empty((room, 2) if keep else (0,), **ints),
@@ -50,12 +49,12 @@ def _(
             means3D.new_empty((context.new_dynamic_size(), 3) if keep else (0,), **ints),
             means3D.new_empty(12 if keep else 0, **longs),
             tile_samples,
+            covered,
         )
     splats, pairs = context.new_dynamic_size(), context.new_dynamic_size()
     return (
         means3D.new_empty(3, image_height, image_width),
         means3D.new_empty(means3D.shape[0], **ints),
-        covered,
         means3D.new_empty(splats, _SPLAT_WIDTH),
         means3D.new_empty(splats, **ints),
         means3D.new_empty(pairs, **ints),
@@ -68,6 +67,7 @@ def _(
         means3D.new_empty(0, **ints),
         means3D.new_empty(0, **longs),
         tile_samples,
+        covered,
     )
 
 
@@ -76,12 +76,14 @@ def _(
     dL_dcolor, dL_dalpha, means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
     viewmatrix, projmatrix, campos, lens, *rest,
 ):  # fmt: skip
-    inputs = (means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
-    inputs += (viewmatrix, projmatrix, campos, lens)
-    return tuple(
-        means3D.new_empty(tensor.shape) if need and tensor is not None else means3D.new_empty(0)
-        for tensor, need in zip(inputs, rest[-2])
-    )
+    needs = rest[-2]
+
+    def made(tensors, needs):
+        return [means3D.new_empty(t.shape if need and t is not None else 0) for t, need in zip(tensors, needs)]
+
+    gaussians = (means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
+    of_camera = made((viewmatrix.reshape(4, 4), projmatrix.reshape(4, 4), campos.reshape(3), lens), needs[8:])
+    return (*made(gaussians, needs[:8]), of_camera if lens is not None and any(needs[8:]) else [])
 
 
 @torch.library.register_fake("analytic_rasterizer::rasterize_stages")

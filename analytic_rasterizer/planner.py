@@ -458,7 +458,7 @@ def tile_samples(settings: GaussianRasterizationSettings, gaussians: dict[str, t
     """
     inputs = [gaussians.get(name) for name in INPUTS]
     options = _settings_arguments(settings, gaussians["means3D"], gaussians.get("shs"))
-    chosen = torch.ops.analytic_rasterizer.rasterize(*inputs, *options, False, False, False)[-1]
+    chosen = torch.ops.analytic_rasterizer.rasterize(*inputs, *options, False, False, False)[-2]
     return chosen.reshape(-(-settings.image_height // TILE), -1).cpu()
 
 

@@ -16,6 +16,8 @@ from .filters import apply_3d_filter
 from .footprints import Footprint, check_device, get_default_footprint, resolve_footprint
 from .lens import make_lens, used_sh_degree
 
+_NOTHING = Effects()
+
 
 class _Fields(NamedTuple):
     image_height: int
@@ -142,8 +144,8 @@ def _settings_arguments(
     camera, tangents, lens, degree = (s.viewmatrix, s.projmatrix, s.campos), (s.tanfovx, s.tanfovy), None, s.sh_degree
     if effects is not None:
         degree = used_sh_degree(effects, int(degree), shs)
-    full = effects if isinstance(effects, Effects) else Effects()
-    if full.changes_camera or int(degree) >= MAX_SH_DEGREE:
+    full = effects if isinstance(effects, Effects) else _NOTHING
+    if degree >= MAX_SH_DEGREE or (full is not _NOTHING and full.changes_camera):
         lens = make_lens(full, s, means3D)
         if full.camera_gradients:
             tangents = (1.0, 1.0)  # the lens has them
@@ -198,11 +200,11 @@ def rasterize_gaussians(
     opacities, scales = _filtered(raster_settings, opacities, scales, cov3D_precomp)
     gaussians = (means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
     settings = _settings_arguments(raster_settings, means3D, shs)
-    asked = effects if isinstance(effects, Effects) else Effects()
+    asked = effects if isinstance(effects, Effects) else _NOTHING
     if not channels.is_plain(asked, colors_precomp, raster_settings.bg):
         if debug:
             _check_gaussians(*gaussians)  # of all channels; the op sees three
-        rasterize = _DebugRasterize.apply if debug else torch.ops.analytic_rasterizer.rasterize
+        rasterize = _DebugRasterize.apply if debug else _rasterize
         color, radii, outputs = channels.render(rasterize, gaussians, settings, asked, debug)
         return (color, radii, outputs) if asked.has_outputs else (color, radii)
     of_camera = settings[1:5] if settings[4] is not None else ()
@@ -211,6 +213,12 @@ def rasterize_gaussians(
     if debug:
         return _DebugRasterize.apply(*arguments)[:2]
     return torch.ops.analytic_rasterizer.rasterize(*arguments)[:2]
+
+
+def _rasterize(*arguments) -> tuple[torch.Tensor, ...]:
+    """The op's outputs, alpha among them if it is asked for."""
+    *outputs, alpha = torch.ops.analytic_rasterizer.rasterize(*arguments)
+    return (*outputs, *alpha)
 
 
 def _check_gaussians(
@@ -256,15 +264,17 @@ class _DebugRasterize(torch.autograd.Function):
             _write_snapshot("snapshot_fw.dump", arguments)
             raise
         ctx.set_materialize_grads(False)
-        tensors, (*ctx.settings, _, with_alpha, ctx.debug) = arguments[:13], arguments[13:]
-        ctx.mark_non_differentiable(output[1], *output[3:], *([] if with_alpha else output[2:3]))
-        ctx.save_for_backward(*tensors, *output[3:])
-        return output
+        tensors, (*ctx.settings, _, _, ctx.debug) = arguments[:13], arguments[13:]
+        *output, alpha = output
+        ctx.mark_non_differentiable(*output[1:])
+        ctx.save_for_backward(*tensors, *output[2:])
+        return (*output, *alpha)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, dL_dcolor, _, dL_dalpha, *__):
+    def backward(ctx, dL_dcolor, *others):
         none = [None] * len(ctx.needs_input_grad)
+        dL_dalpha = others[13] if len(others) > 13 else None
         if dL_dcolor is None and dL_dalpha is None:
             return tuple(none)
         if dL_dcolor is None:
@@ -276,10 +286,11 @@ class _DebugRasterize(torch.autograd.Function):
         needs = [need and t is not None for need, t in zip(wanted, inputs)]
         arguments = (dL_dcolor, dL_dalpha, *tensors, *ctx.settings, *saved, needs, ctx.debug)
         try:
-            grads = torch.ops.analytic_rasterizer.rasterize_vjp(*arguments)
+            *grads, of_camera = torch.ops.analytic_rasterizer.rasterize_vjp(*arguments)
         except Exception:
             _write_snapshot("snapshot_bw.dump", arguments)
             raise
+        grads += of_camera or [None] * 4
         grads = [g.view_as(t) if need else None for g, t, need in zip(grads, inputs, needs)]
         return (*grads[:8], None, *grads[8:], *none[13:])
 

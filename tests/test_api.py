@@ -737,16 +737,16 @@ OPS = {
 
 def vjp_arguments(variant, device, effects=None):
     arguments = op_arguments(variant, device, True, False, effects, alpha=effects is not None)
-    color, _, alpha, *saved = torch.ops.analytic_rasterizer.rasterize(*arguments)
+    color, _, *saved, alpha = torch.ops.analytic_rasterizer.rasterize(*arguments)
     needs = [a is not None for a in arguments[:8]] + [effects is not None] * 4
-    g_alpha = torch.ones_like(alpha) if alpha.numel() else None
+    g_alpha = torch.ones_like(alpha[0]) if alpha else None
     return [torch.ones_like(color), g_alpha, *arguments[:-3], *saved, needs, False]
 
 
 def kept_lists(variant, device):
     """(arguments of rasterize, the lists that it keeps for other colours)."""
     arguments = op_arguments(variant, device, True, False)
-    splats, ids, pairs, offsets, *_, counts, samples = torch.ops.analytic_rasterizer.rasterize(*arguments)[3:]
+    splats, ids, pairs, offsets, *_, counts, samples, _ = torch.ops.analytic_rasterizer.rasterize(*arguments)[2:]
     return arguments, (splats, ids, pairs, offsets, counts, samples)
 
 

@@ -61,37 +61,19 @@ def test_plain_path_allocates_the_same(device, footprint, pass_):
 
 
 @each_pass
-def test_plain_path_makes_the_same_calls(request, device, footprint, pass_):
+def test_plain_path_makes_the_same_calls(device, footprint, pass_):
     """Of ours to torch."""
     expected = recorded(footprint, pass_, device)["calls"]
-    request.applymarker(more_calls(pass_))
     assert measured(footprint, pass_, device)["calls"] == expected
 
 
 @each_pass
-def test_plain_path_runs_the_same_ops(request, device, footprint, pass_):
+def test_plain_path_runs_the_same_ops(device, footprint, pass_):
     """Inside of torch too."""
     expected = recorded(footprint, pass_, device, of_torch=True)["everything"]
-    request.applymarker(more_calls(pass_))
     assert measured(footprint, pass_, device)["everything"] == expected
 
 
-def more_calls(pass_):
-    """What is known to be wrong."""
-    return pytest.mark.xfail(
-        pass_ == "forward_backward",
-        reason="rasterize_vjp makes four empty tensors for gradients of a camera that nobody asked for, and its "
-        "autograd node views every gradient in the shape that it has",
-        raises=AssertionError,
-        strict=True,
-    )
-
-
-@pytest.mark.xfail(
-    reason="two are made for every call, which with what is asked of them takes 9 us",
-    raises=AssertionError,
-    strict=True,
-)
 def test_plain_path_makes_no_effects(device, monkeypatch):
     """No profiler shows it, but the host needs 50 us for all of a small picture."""
     call, made = record.prepare("box", "inference", device), []

@@ -62,12 +62,18 @@ template <class Signature> c10::TypedOperatorHandle<Signature> find_op(const cha
   return c10::Dispatcher::singleton().findSchemaOrThrow(name, "").typed<Signature>();
 }
 
+void append(variable_list& list, const Tensor& tensor) { list.push_back(tensor); }
+void append(variable_list& list, const std::vector<Tensor>& tensors) {
+  list.insert(list.end(), tensors.begin(), tensors.end());
+}
 template <class Tuple> variable_list list_of(const Tuple& tuple) {
-  return std::apply([](const auto&... t) { return variable_list{t...}; }, tuple);
+  variable_list list;
+  std::apply([&](const auto&... t) { (append(list, t), ...); }, tuple);
+  return list;
 }
 
-constexpr size_t kGaussianInputs = 8, kBackground = 8, kLens = 12, kInputs = 13, kAlpha = 2, kFirstSaved = 3,
-                 kOutputs = std::tuple_size_v<RasterizeOutput>;
+constexpr size_t kGaussianInputs = 8, kBackground = 8, kLens = 12, kInputs = 13,
+                 kAlpha = std::tuple_size_v<RasterizeOutput> - 1;
 
 /// The derivative of a derivative must fail, not be zero: rasterize_vjp has none, and says so.
 struct Rasterize : torch::autograd::Function<Rasterize> {
@@ -84,10 +90,7 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
                         viewmatrix, projmatrix, campos, lens, s.image_height, s.image_width, s.tanfovx, s.tanfovy,
                         s.scale_modifier, s.sh_degree, s.footprint, s.option, keep, alpha, s.debug));
     ctx->set_materialize_grads(false);  // no zeros the size of everything saved
-    variable_list others = {out.begin() + kFirstSaved, out.end()};
-    others.push_back(out[1]);
-    if (!alpha) others.push_back(out[kAlpha]);
-    ctx->mark_non_differentiable(others);
+    ctx->mark_non_differentiable({out.begin() + 1, out.begin() + kAlpha});
     ctx->saved_data["keep"] = keep;
     if (keep) {
       const auto given = [](const OptionalTensor& t) { return t ? *t : Tensor(); };
@@ -104,7 +107,7 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
                              projmatrix,
                              campos,
                              given(lens)};
-      saved.insert(saved.end(), out.begin() + kFirstSaved, out.end());
+      saved.insert(saved.end(), out.begin() + 2, out.begin() + kAlpha);
       ctx->save_for_backward(std::move(saved));
       s.save(ctx);
     }
@@ -114,7 +117,7 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
   static variable_list backward(AutogradContext* ctx, variable_list dL_doutputs) {
     TORCH_CHECK(ctx->saved_data["keep"].toBool(), "rasterize was called with keep=False and cannot be differentiated");
     variable_list grads(kInputs + 3);  // settings, keep and alpha have none
-    const Tensor dL_dalpha = dL_doutputs[kAlpha];
+    const Tensor dL_dalpha = dL_doutputs.size() > kAlpha ? dL_doutputs[kAlpha] : Tensor();
     if (!dL_doutputs[0].defined() && !dL_dalpha.defined()) return grads;
     static const auto op = find_op<RasterizeVjpSignature>("analytic_rasterizer::rasterize_vjp");
     const variable_list t = ctx->get_saved_variables();
@@ -138,12 +141,14 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
         s.scale_modifier, s.sh_degree, s.footprint, s.option, saved[0], saved[1], saved[2], saved[3], saved[4],
         saved[5], saved[6], saved[7], saved[8], saved[9], saved[10], saved[11], needs, s.debug));
     for (size_t k = 0; k < kNeeds; ++k) {
-      if (needs[k]) grads[input[k]] = out[k].view_as(t[input[k]]);
+      if (!needs[k]) continue;
+      // A matrix may have come as (1, 4, 4).
+      grads[input[k]] = input[k] < kGaussianInputs ? out[k] : out[k].view_as(t[input[k]]);
     }
     return grads;
   }
 };
-static_assert(kOutputs == 15, "backward passes all that forward saves");
+static_assert(kAlpha == 14, "backward passes all that forward saves");
 
 RasterizeOutput rasterize_autograd(const Tensor& means3D, const OptionalTensor& means2D, const Tensor& opacities,
                                    const OptionalTensor& shs, const OptionalTensor& colors_precomp,
@@ -158,8 +163,9 @@ RasterizeOutput rasterize_autograd(const Tensor& means3D, const OptionalTensor& 
   const variable_list out =
       Rasterize::apply(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
                        viewmatrix, projmatrix, campos, lens, settings, keep, alpha);
-  return {out[0], out[1], out[2],  out[3],  out[4],  out[5],  out[6], out[7],
-          out[8], out[9], out[10], out[11], out[12], out[13], out[14]};
+  return {out[0],  out[1],  out[2],  out[3],  out[4],
+          out[5],  out[6],  out[7],  out[8],  out[9],
+          out[10], out[11], out[12], out[13], {out.begin() + kAlpha, out.end()}};
 }
 
 struct Weight : torch::autograd::Function<Weight> {

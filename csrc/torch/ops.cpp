@@ -22,7 +22,8 @@ void force_pair_capacity(int64_t capacity);
 // splats, ids are in the order of depth, pairs (room, 2) are splats and slots, `splat_offsets` (P, 2) the
 // first slot and the number of them, positions is empty, and there are `checkpoints` (n, samples, 256, 4),
 // `chunks` (m, 3) and `counts` (12,), see csrc/cuda/tasks.h. Without `keep` what only the backward pass reads is empty.
-// `alpha` (H, W), 1 - transmittance, is empty unless asked for.
+// `alpha` holds one image (H, W), 1 - transmittance, if asked for; `camera` of the vjp the gradients of viewmatrix,
+// projmatrix, campos and lens, if one is needed. As lists, which are no tensors to make where there is nothing.
 // `debug` waits for every stage, so that an error is raised by the stage that caused it.
 TORCH_LIBRARY(analytic_rasterizer, m) {
   m.def(
@@ -32,12 +33,12 @@ TORCH_LIBRARY(analytic_rasterizer, m) {
       "Tensor? lens, int image_height, int image_width, float tanfovx, float tanfovy, float scale_modifier, int "
       "sh_degree, str "
       "footprint, "
-      "float option, bool keep, bool alpha, bool debug) -> (Tensor color, Tensor radii, Tensor alpha, Tensor splats, "
+      "float option, bool keep, bool alpha, bool debug) -> (Tensor color, Tensor radii, Tensor splats, "
       "Tensor ids, Tensor pairs, "
       "Tensor "
       "tile_offsets, "
       "Tensor splat_offsets, Tensor positions, Tensor transmittance, Tensor last, Tensor checkpoints, Tensor "
-      "chunks, Tensor counts, Tensor tile_samples)");
+      "chunks, Tensor counts, Tensor tile_samples, Tensor[] alpha)");
   m.def(
       "rasterize_vjp(Tensor dL_dcolor, Tensor? dL_dalpha, Tensor means3D, Tensor? means2D, Tensor opacities, Tensor? "
       "shs, Tensor? "
@@ -53,8 +54,7 @@ TORCH_LIBRARY(analytic_rasterizer, m) {
       "needs, bool "
       "debug) -> (Tensor means3D, Tensor means2D, Tensor "
       "opacities, "
-      "Tensor shs, Tensor colors_precomp, Tensor scales, Tensor rotations, Tensor cov3D_precomp, Tensor viewmatrix, "
-      "Tensor projmatrix, Tensor campos, Tensor lens)");
+      "Tensor shs, Tensor colors_precomp, Tensor scales, Tensor rotations, Tensor cov3D_precomp, Tensor[] camera)");
   m.def(
       "rasterize_stages(Tensor means3D, Tensor opacities, Tensor? shs, Tensor? colors_precomp, Tensor? scales, Tensor? "
       "rotations, "

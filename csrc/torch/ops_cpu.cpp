@@ -110,7 +110,8 @@ const int32_t* samples_or_null(const Tensor& tile_samples) {
 }
 
 struct BlendedImage {
-  Tensor color, transmittance, last, alpha;
+  Tensor color, transmittance, last;
+  std::vector<Tensor> alpha;  ///< one, if asked for
 };
 
 template <typename T>
@@ -123,15 +124,15 @@ BlendedImage blend(const Inputs& in, const Projected& projected, const Binned& b
   const auto make = [&](const at::TensorOptions& o) {
     return stages.choose ? at::zeros(planes, o) : at::empty(planes, o);
   };
-  BlendedImage out{at::empty({3, in.image_height, in.image_width}, options), make(options),
-                   make(options.dtype(at::kInt)),
-                   at::empty({with_alpha ? in.image_height : 0, in.image_width}, options)};
+  BlendedImage out{
+      at::empty({3, in.image_height, in.image_width}, options), make(options), make(options.dtype(at::kInt)), {}};
+  if (with_alpha) out.alpha.push_back(at::empty({in.image_height, in.image_width}, options));
   stages.blend({projected.splats.template const_data_ptr<T>(), binned.pairs.const_data_ptr<int32_t>(),
                 binned.tile_offsets.const_data_ptr<int64_t>(), grid_of(in), thread_count(),
                 samples_or_null(tile_samples), in.background.const_data_ptr<T>(), out.color.template data_ptr<T>(),
                 keep ? out.transmittance.template data_ptr<T>() : nullptr,
                 keep ? out.last.template data_ptr<int32_t>() : nullptr,
-                with_alpha ? out.alpha.template data_ptr<T>() : nullptr});
+                with_alpha ? out.alpha[0].template data_ptr<T>() : nullptr});
   return out;
 }
 
@@ -157,7 +158,6 @@ RasterizeOutput rasterize_cpu(const Tensor& means3D, const OptionalTensor& means
     const BlendedImage image = blend(in, projected, binned, tile_samples, stages, keep, with_alpha);
     out = {image.color,
            projected.radii,
-           image.alpha,
            projected.splats,
            projected.ids,
            binned.pairs,
@@ -169,7 +169,8 @@ RasterizeOutput rasterize_cpu(const Tensor& means3D, const OptionalTensor& means
            at::empty({0}, in.means3D.options()),
            at::empty({0}, binned.pairs.options()),
            at::empty({0}, binned.tile_offsets.options()),
-           tile_samples};
+           tile_samples,
+           image.alpha};
   });
   return out;
 }

@@ -247,7 +247,8 @@ struct Plan {
 };
 
 struct BlendedImage {
-  Tensor color, transmittance, last, checkpoints, chunks, alpha;
+  Tensor color, transmittance, last, checkpoints, chunks;
+  std::vector<Tensor> alpha;  ///< one, if asked for
 };
 
 /// Samples of every tile; empty where all have the same.
@@ -280,12 +281,13 @@ BlendedImage blend(const cuda::TileLists& lists, TileGrid grid, const Tensor& ba
                    at::empty({samples, height, width}, ints),
                    at::empty({plan.max_planes, kTile * kTile, 4}, floats),
                    plan.chunks,
-                   at::empty({with_alpha ? height : 0, width}, floats)};
+                   {}};
+  if (with_alpha) out.alpha.push_back(at::empty({height, width}, floats));
   stages.blend({lists, plan.view, grid, background.const_data_ptr<float>(), tile_open.data_ptr<int32_t>(),
                 tile_open.data_ptr<int32_t>() + grid.tiles(),
                 reinterpret_cast<cuda::Checkpoint*>(out.checkpoints.data_ptr<float>()), out.color.data_ptr<float>(),
                 keep ? out.transmittance.data_ptr<float>() : nullptr, keep ? out.last.data_ptr<int32_t>() : nullptr,
-                with_alpha ? out.alpha.data_ptr<float>() : nullptr},
+                with_alpha ? out.alpha[0].data_ptr<float>() : nullptr},
                stream);
   check_stage("blend", stream, debug);
   return out;
@@ -323,7 +325,6 @@ RasterizeOutput rasterize_cuda(const Tensor& means3D, const OptionalTensor& mean
   const auto kept = [&](const Tensor& t) { return keep ? t : at::empty({0}, t.options()); };
   return {image.color,
           projected.radii,
-          image.alpha,
           kept(projected.splats),
           kept(binned.order),
           kept(binned.pairs),
@@ -335,7 +336,8 @@ RasterizeOutput rasterize_cuda(const Tensor& means3D, const OptionalTensor& mean
           kept(image.checkpoints),
           kept(image.chunks),
           kept(scratch.counts),
-          tile_samples};
+          tile_samples,
+          image.alpha};
 }
 
 /// Time between stages, in seconds.

@@ -53,9 +53,9 @@ template <class Task, typename T> Task weight_task(const Tensor& offset, const T
   return task;
 }
 
-/// What rasterize returns: color, radii, alpha, and what its vjp needs (schemas in ops.cpp).
+/// What rasterize returns: color, radii, what its vjp needs, and alpha, if asked for (schemas in ops.cpp).
 using RasterizeOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor,
-                                   Tensor, Tensor, Tensor, Tensor, Tensor>;
+                                   Tensor, Tensor, Tensor, Tensor, std::vector<Tensor>>;
 /// An image of other colours, and what takes the place of the same outputs of rasterize in its vjp: checkpoints,
 /// chunks, counts.
 using ChannelsOutput = std::tuple<Tensor, Tensor, Tensor, Tensor>;
@@ -63,11 +63,10 @@ using ChannelsOutput = std::tuple<Tensor, Tensor, Tensor, Tensor>;
 /// Gaussian.
 using InspectOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor>;
 using StagesOutput = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
-/// Gradients of means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp; of viewmatrix,
-/// projmatrix, campos and lens, where there is a lens.
-using Grads =
-    std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor>;
-inline constexpr size_t kNeeds = std::tuple_size_v<Grads>;
+/// Gradients of means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp; and of viewmatrix,
+/// projmatrix, campos and lens, or of none of these four.
+using Grads = std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, std::vector<Tensor>>;
+inline constexpr size_t kNeeds = 12;
 using Needs = std::array<bool, kNeeds>;
 
 /// Room for the gradients that are wanted; an empty tensor stands for one that is not.
@@ -75,18 +74,9 @@ inline Grads make_grads(const Inputs& in, const Needs& needs) {
   const auto make = [&](const OptionalTensor& like, bool needed) {
     return needed && like ? at::empty_like(*like, at::MemoryFormat::Contiguous) : at::empty({0}, in.means3D.options());
   };
-  return {make(in.means3D, needs[0]),
-          make(in.means2D, needs[1]),
-          make(in.opacities, needs[2]),
-          make(in.shs, needs[3]),
-          make(in.colors_precomp, needs[4]),
-          make(in.scales, needs[5]),
-          make(in.rotations, needs[6]),
-          make(in.cov3D_precomp, needs[7]),
-          make({}, false),
-          make({}, false),
-          make({}, false),
-          make({}, false)};
+  return {make(in.means3D, needs[0]),   make(in.means2D, needs[1]),        make(in.opacities, needs[2]),
+          make(in.shs, needs[3]),       make(in.colors_precomp, needs[4]), make(in.scales, needs[5]),
+          make(in.rotations, needs[6]), make(in.cov3D_precomp, needs[7]),  {}};
 }
 
 /// Room for `parts` sums of the camera's gradient, zero; undefined where nobody wants it.
@@ -103,14 +93,15 @@ template <typename T> T* data_or_null(const Tensor& t) { return t.defined() ? t.
 inline void set_camera_grads(const Inputs& in, const Needs& needs, const Tensor& parts, Grads& out) {
   if (!parts.defined()) return;
   const Tensor sum = parts.sum(0, false, at::kDouble).to(parts.scalar_type());
-  const auto rows = [&](int64_t first) { return sum.narrow(0, first, 12).view({3, 4}); };
-  if (needs[8]) std::get<8>(out) = at::constant_pad_nd(rows(0), {0, 0, 0, 1}).t().contiguous();
-  if (needs[9]) {
-    const Tensor clip = rows(12), none = at::zeros({1, 4}, sum.options());
-    std::get<9>(out) = at::cat({clip.narrow(0, 0, 2), none, clip.narrow(0, 2, 1)}).t().contiguous();
-  }
-  if (needs[10]) std::get<10>(out) = sum.narrow(0, 24, 3).clone();
-  if (needs[11]) std::get<11>(out) = sum.narrow(0, 27, kLensWidth).clone();
+  const Tensor none = at::empty({0}, sum.options());
+  const auto rows = [&](int64_t first, int64_t count) { return sum.narrow(0, first, 4 * count).view({count, 4}); };
+  const auto matrix = [&](Tensor first, Tensor last) {  // with a row of zeros between
+    return at::cat({first, at::zeros({4 - first.size(0) - last.size(0), 4}, sum.options()), last}).t().contiguous();
+  };
+  std::get<8>(out) = {needs[8] ? matrix(rows(0, 3), rows(12, 0)) : none.clone(),
+                      needs[9] ? matrix(rows(12, 2), rows(20, 1)) : none.clone(),
+                      needs[10] ? sum.narrow(0, 24, 3).clone() : none.clone(),
+                      needs[11] ? sum.narrow(0, 27, kLensWidth).clone() : none.clone()};
 }
 
 template <typename T> GaussianGrads<T> grads_of(const Inputs& in, const Grads& grads) {
