@@ -47,16 +47,23 @@ def make_lens(effects: Effects, settings, like: torch.Tensor) -> torch.Tensor:
         *tangents, *center, defocus.aperture, defocus.focus, *moved, effects.near, effects.far,
         float(effects.orthographic),
     )  # fmt: skip
-    # Numbers side by side travel together.
+    # Numbers side by side travel together; the last three are never tensors.
     parts, floats = [], []
     for number in numbers:
         if isinstance(number, torch.Tensor):
-            parts += [torch.tensor(floats, dtype=like.dtype).to(like.device)] if floats else []
+            parts += [_copied(floats, like)] if floats else []
             parts.append(number.to(like).reshape(-1))
             floats = []
         else:
             floats += number if isinstance(number, list) else [float(number)]
-    return torch.cat([*parts, torch.tensor(floats, dtype=like.dtype).to(like.device)])
+    last = _copied(floats, like)
+    return torch.cat([*parts, last]) if parts else last
+
+
+def _copied(numbers: list[float], like: torch.Tensor) -> torch.Tensor:
+    """On the device of `like`. From pinned memory, or the host would wait for all work before."""
+    host = torch.tensor(numbers, dtype=like.dtype, pin_memory=like.is_cuda)
+    return host.to(like.device, non_blocking=True)
 
 
 def _times(exposure, velocity, length: int):
@@ -76,5 +83,5 @@ def _view_center(view: torch.Tensor, proj: torch.Tensor, with_gradient: bool) ->
     view, proj = view.reshape(4, 4)[:3, :3], proj.reshape(4, 4)[:3, :2]  # columns, of the world's coordinates
     if not with_gradient:
         view, proj = view.detach(), proj.detach()
-    along = (proj * view[:, :2]).sum(0) / (view[:, :2] ** 2).sum(0)
-    return -(proj * view[:, 2:]).sum(0) / (view[:, 2] ** 2).sum() / along
+    p = view.T @ proj / (view**2).sum(0)[:, None]
+    return -p[2] / p.diagonal()

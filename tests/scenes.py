@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import torch
 
 from analytic_rasterizer import FOOTPRINTS
-from analytic_rasterizer.planner import INPUTS, tile_samples  # noqa: F401
 
 # Option values that change the code path; test_footprints.py checks that no footprint with options is missing.
 OPTIONS = {
@@ -20,6 +19,16 @@ OPTIONS = {
 VARIANTS = [(footprint, options) for footprint in FOOTPRINTS for options in OPTIONS.get(footprint, [{}])]
 # One of each kind, for tests where the options do not matter.
 KINDS = [(footprint, {"samples": 4} if footprint == "box" else {}) for footprint in FOOTPRINTS]
+INPUTS = (
+    "means3D",
+    "means2D",
+    "opacities",
+    "shs",
+    "colors_precomp",
+    "scales",
+    "rotations",
+    "cov3D_precomp",
+)
 
 
 def name_of(variant):
@@ -220,6 +229,13 @@ def to(named, device):
 def settings_to(settings, device):
     """ar.GaussianRasterizationSettings with their tensors on another device."""
     return settings._replace(**to(settings._asdict(), device))
+
+
+def tile_samples(settings, scene):
+    """What `adaptive` chooses (tile rows, tile columns)."""
+    from analytic_rasterizer.planner import tile_samples
+
+    return tile_samples(settings, scene)
 
 
 def leaves(scene):

@@ -418,15 +418,15 @@ def test_a_device_that_is_not_the_current_one(variant):
 WAITING = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize", "cudaMemcpy")
 
 
-def frames(variant, name="some"):
+def frames(variant, name="some", effects=None):
     """A function that renders one frame and its gradients on CUDA, keeping nothing, warmed up."""
-    scene, settings = scene32(name), settings_for(variant)
+    scene, settings = scene32(name), settings_for(variant)._replace(effects=effects)
     leaves = scenes.leaves(scenes.to(scene, "cuda"))
     rasterizer = ar.GaussianRasterizer(scenes.settings_to(settings, "cuda"))
     weights = torch.ones(3, CAMERA.image_height, CAMERA.image_width, device="cuda")
 
     def frame():
-        color, _ = rasterizer(**leaves)
+        color, *_ = rasterizer(**leaves)
         (color * weights).sum().backward()
         for leaf in leaves.values():
             leaf.grad = None
@@ -450,6 +450,15 @@ def waiting_is_an_error():
 def test_nothing_waits_for_the_device(variant, waiting_is_an_error):
     """After the frames that are counted. torch reports the waiting that it does itself."""
     frame = frames(variant)
+    waiting_is_an_error()
+    for _ in range(3):
+        frame()
+
+
+def test_effects_do_not_wait_for_the_device(waiting_is_an_error):
+    lens, shutter = ar.Defocus(0.1, 3.0), ar.Motion(0.1, velocity=(1.0, 0.0, 0.5))
+    outputs = dict.fromkeys(("alpha", "depth", "median_depth", "dominant_index", "gaussian_stats"), True)
+    frame = frames(("box", {}), effects=ar.Effects(**outputs, off_center=True, defocus=lens, motion=shutter))
     waiting_is_an_error()
     for _ in range(3):
         frame()
