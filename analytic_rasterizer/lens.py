@@ -62,6 +62,9 @@ def make_lens(effects: Effects, settings, like: torch.Tensor) -> torch.Tensor:
 
 def _copied(numbers: list[float], like: torch.Tensor) -> torch.Tensor:
     """On the device of `like`. From pinned memory, or the host would wait for all work before."""
+    if like.is_cuda and torch.cuda.is_current_stream_capturing():
+        # A replay would copy from memory that has long been used for something else.
+        raise RuntimeError("effects of the camera cannot be captured in a CUDA graph")
     host = torch.tensor(numbers, dtype=like.dtype, pin_memory=like.is_cuda)
     return host.to(like.device, non_blocking=True)
 

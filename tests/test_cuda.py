@@ -483,6 +483,13 @@ def test_nothing_waits_for_the_device_behind_the_back_of_torch(variant):
     assert not names & set(WAITING)
 
 
+def test_effects_of_the_camera_are_not_captured():
+    frame = frames(("box", {}), effects=ar.Effects(near=0.3))
+    with pytest.raises(RuntimeError, match="effects of the camera cannot be captured"):
+        with torch.cuda.graph(torch.cuda.CUDAGraph()):
+            frame()
+
+
 @each_kind
 def test_cuda_graph(variant):
     """A captured frame renders what its inputs hold when it is replayed."""
