@@ -19,7 +19,7 @@ import time
 
 import scenes
 import torch
-from scenes import VARIANTS, Camera, name_of, rand
+from scenes import VARIANTS, Camera, ParallelCamera, name_of, rand
 
 import analytic_rasterizer as ar
 
@@ -47,34 +47,54 @@ EXTREME = (
 COLORS = ("shs", "colors_precomp")
 
 
-def random_camera(g):
+def random_camera(g, kind):
     """Any size up to 70 px and a few degrees to more than 90, from outside the scene or within."""
     size = torch.randint(1, 70, (2,), generator=g).tolist()
     tangent = torch.exp(rand(g, 2, low=math.log(0.05), high=math.log(1.5))).tolist()
     distance = rand(g, 1, low=0.1, high=6.0).item()
-    return Camera(
+    return kind(
         image_width=size[0],
         image_height=size[1],
         tanfovx=tangent[0],
         tanfovy=tangent[1],
         bg=tuple(rand(g, 3, low=-1.0, high=2.0).tolist()),
         scale_modifier=rand(g, 1, low=0.5, high=2.0).item(),
-        sh_degree=int(torch.randint(0, 4, (1,), generator=g)),
+        sh_degree=int(torch.randint(0, 5, (1,), generator=g)),
         eye=(0.3 * distance, -0.2 * distance, -distance),
     )
 
 
+def random_effects(g, pick):
+    """A full camera, with any of what it has; None for a plain one."""
+    if pick(range(3)):
+        return None
+
+    def speed(size):
+        return tuple((rand(g, 3, low=-1.0) * pick((1e-6, 1.0, 1e2)) * size).tolist())
+
+    return ar.Effects(
+        camera_gradients=True,
+        off_center=pick((False, True)),
+        orthographic=pick((False, True)),
+        near=pick((0.2, 0.01, 1.0)),
+        far=pick((math.inf, 5.0)),
+        defocus=pick((None, ar.Defocus(pick((1e-6, 0.1, 1e3)), pick((0.2, 1.0, 4.0))))),
+        motion=pick((None, ar.Motion(0.1, speed(1.0), speed(1.0), speed(100.0)[:2]))),
+    )
+
+
 def random_case(seed):
-    """(camera, variant, scene, rows with a number that is not finite, those where only the colour is not)."""
+    """(camera, effects, variant, scene, rows with a number that is not finite, those where only the colour is not)."""
     g = torch.Generator().manual_seed(seed)
 
     def pick(choices):
         return choices[int(torch.randint(0, len(choices), (1,), generator=g))]
 
-    camera, variant = random_camera(g), pick(VARIANTS)
+    effects = random_effects(g, pick)
+    camera, variant = random_camera(g, ParallelCamera if effects and effects.orthographic else Camera), pick(VARIANTS)
     count = int(torch.randint(1, 40, (1,), generator=g))
     scene = scenes.random_scene(
-        seed, count, degree=3, opacity=(0.0, 1.0), sigma=(pick((1e-4, 1e-2)), pick((0.5, 20.0)))
+        seed, count, degree=4, opacity=(0.0, 1.0), sigma=(pick((1e-4, 1e-2)), pick((0.5, 20.0)))
     )
     if pick((False, True)):
         scene = scenes.with_precomputed(scene, seed)
@@ -99,16 +119,22 @@ def random_case(seed):
     finite = {name: torch.isfinite(value.reshape(count, -1)).all(1) for name, value in used.items()}
     broken = [r for r in sorted(broken) if not all(finite[name][r] for name in fields if name not in COLORS)]
     discoloured = [r for r in sorted(discoloured) if not all(finite[name][r] for name in fields if name in COLORS)]
-    return camera, variant, scene, broken, discoloured
+    return camera, effects, variant, scene, broken, discoloured
 
 
 def render(settings, scene, device):
-    """(image, radii, gradients) on the CPU, with pixel gradients between -1 and 1."""
-    leaves = scenes.leaves(scenes.to(scene, device))
-    color, radii = ar.GaussianRasterizer(settings)(**leaves)
+    """(image, radii, gradients, those of the camera) on the CPU, with pixel gradients between -1 and 1."""
+    leaves, camera = scenes.leaves(scenes.to(scene, device)), {}
+    if settings.effects:
+        camera = scenes.leaves({name: getattr(settings, name) for name in ("viewmatrix", "projmatrix", "campos")})
+    color, radii = ar.GaussianRasterizer(settings._replace(**camera))(**leaves)
     g = torch.Generator().manual_seed(5)
     (color * rand(g, *color.shape, low=-1.0).to(color)).sum().backward()
-    return color.detach().cpu(), radii.cpu(), {name: leaf.grad.cpu() for name, leaf in leaves.items()}
+    return (
+        color.detach().cpu(),
+        radii.cpu(),
+        *({name: leaf.grad.cpu() for name, leaf in some.items()} for some in (leaves, camera)),
+    )
 
 
 def check(seed, device="cpu", dtype=torch.float32):
@@ -122,18 +148,20 @@ def check(seed, device="cpu", dtype=torch.float32):
 
 
 def check_properties(seed, device, dtype):
-    camera, variant, scene, broken, discoloured = random_case(seed)
+    camera, effects, variant, scene, broken, discoloured = random_case(seed)
     if device == "cuda" and variant[0] == "adaptive":
         return
     footprint, options = variant
-    where = f"seed {seed}, {name_of(variant)}, {device}, {dtype}"
-    settings = camera.settings(dtype, device, footprint=footprint, **options)
+    where = f"seed {seed}, {name_of(variant)}, {device}, {dtype}, {effects}"
+    settings = camera.settings(dtype, device, footprint=footprint, effects=effects, **options)
     scene = scenes.cast(scene, dtype)
-    color, radii, grads = render(settings, scene, device)
+    color, radii, grads, by_camera = render(settings, scene, device)
     assert torch.isfinite(color).all(), f"{where}: the image is not finite"
     for name, grad in grads.items():
         rows = torch.nonzero(~torch.isfinite(grad.reshape(len(grad), -1)).all(1)).flatten().tolist()
         assert not rows, f"{where}: gradient of {name} is not finite at {rows}"
+    for name, grad in by_camera.items():
+        assert torch.isfinite(grad).all(), f"{where}: gradient of {name} is not finite"
     assert (radii[broken] == 0).all(), f"{where}: not culled: {[r for r in broken if radii[r] != 0]}"
     for name, grad in grads.items():
         for rows in (broken, discoloured, radii == 0):

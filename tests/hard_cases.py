@@ -38,7 +38,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from scenes import AxisCamera, Camera, rand
+from scenes import AxisCamera, Camera, ParallelCamera, rand
+
+from analytic_rasterizer import Defocus, Effects, Motion
 
 OPERATIONS = 100
 PERTURBATIONS = 3
@@ -60,6 +62,7 @@ class Case:
     round: bool = False  # has splats of equal eigenvalues
     margin: float = 1e-3  # relative distance from a threshold within which rounding may decide
     reference: bool = False  # also against tests/reference.py, in float64
+    effects: Effects | None = None  # of a full camera, by all of which there are gradients too
 
 
 def tensor(*values):
@@ -294,6 +297,120 @@ def mixed_opacities(n):
     return o
 
 
+# --- a full camera: blur, other planes, other projections ------------------------------------------
+
+DEPTHS = [2, 2.1, 2.2, 2.3, 2.4]
+DIAGONAL = (math.cos(0.4), math.sin(0.4))
+
+
+def streak(length, direction=DIAGONAL):
+    """Of so many px, of the whole picture."""
+    return Motion(1.0, screen_velocity=tuple(length * v for v in direction))
+
+
+def travel(length):
+    """A streak of so many px at the depth 2, by way of the camera."""
+    return Motion(1.0, velocity=(*(length * 2 / FOCAL * v for v in DIAGONAL), 0.0))
+
+
+def spun_needles(ratio):
+    """Along a streak at 0.4 rad, across it, at 1e-3 rad from it and between; where they are crossed as wide as 0.1 px:
+    else nothing of them would be left."""
+
+    def build():
+        long = tensor(30, 1000, 30, 0.1 * ratio, 300)
+        narrow = torch.where(long < 50, long / ratio, 0.1)
+        return CAMERA, splats(SPOTS, torch.stack([long, narrow], -1), [0.4, 0.4 + math.pi / 2, 0.401, 0.4, 1.2], 0.95,
+                              DEPTHS)  # fmt: skip
+
+    return build
+
+
+def spun_needles_by_covariance(ratio):
+    def build():
+        camera, scene = spun_needles(ratio)()
+        return camera, flat(scene)
+
+    return build
+
+
+def wide(sigma):
+    """Far wider than the image and the streak: what is left of their gradients is of the order of its square."""
+
+    def build():
+        hard = splats([[19.4, 11.7], [22.3, 12.6]], [[sigma, sigma], [2 * sigma, sigma]], [0.0, 0.6], 0.7, [2, 2.2])
+        return CAMERA, joined(hard, splats([[21.0, 11.0]], [[40, 30]], 0.4, 0.6, 3.0))
+
+    return build
+
+
+def in_focus():
+    """At the focus to the bit, beside it by as little as float32 knows, and away from it."""
+    depths = tensor(2, 2 * (1 + 2.0**-22), 2 * (1 - 1e-4), 2.1, 1.5)
+    return CAMERA, splats(SPOTS, [[3, 1], [1, 1], [0.1, 0.3], [3, 3], [5, 0.5]], [0.0, 0.0, 0.4, 0.0, 1.1], 0.7, depths)
+
+
+def depths_of(*depths):
+    def build():
+        return CAMERA, splats(SPOTS[: len(depths)], [[3, 2]] * len(depths), 0.5, 0.8, depths)
+
+    return build
+
+
+def cropped():
+    """The principal point ten half-widths left of the picture, and as far above."""
+    camera = replace(CAMERA, shift=(-10 * 20, -10 * 12))
+    means = torch.tensor([*SPOTS, [-30.0, 5.0], [60.0, 40.0]], dtype=torch.float64) - tensor(*camera.shift)
+    return camera, splats(means, [[3, 2], [1, 1], [0.3, 0.2], [6, 4], [9, 0.5], [25, 9], [30, 20]], 0.5, 0.7,
+                          torch.linspace(2, 3, 7))  # fmt: skip
+
+
+class ParallelAxisCamera(ParallelCamera, AxisCamera):
+    """FOCAL px per world unit at any depth, if its numbers are those of CAMERA."""
+
+
+def parallel():
+    """From just in front of the camera, and at it, to far away."""
+    camera = ParallelAxisCamera(**{name: getattr(CAMERA, name) for name in CAMERA.__dataclass_fields__})
+    scene = splats(SPOTS, [[3, 2], [1, 1], [4, 0.4], [3, 1], [6, 5]], [0.0, 0.4, 1.2, 0.0, 2.0], 0.7, 1.0)
+    scene["means3D"][:, 2] = tensor(1e-30, 0.0, 1e-6, 1.0, 1e4)
+    return camera, scene
+
+
+FULL_CASES = [
+    Case("blur_isotropic", "isotropic covariance, defocus", isotropic, round=True,
+         effects=Effects(defocus=Defocus(0.3, 1.0))),
+    Case("blur_axis_aligned", "isotropic and axis-aligned covariance, streak along an axis",
+         lambda: (CAMERA, joined(axis_aligned()[1], isotropic()[1])), effects=Effects(motion=streak(9, (1, 0)))),
+    *[
+        Case(f"blur_needle_{label}", f"needle of ratio {label} along and across a streak of 6 px",
+             spun_needles(float(label)), margin=1e-2, effects=Effects(motion=travel(6)))
+        for label in ("1e2", "1e4")
+    ],
+    Case("blur_needle_defocus", "needle of ratio 1e4, streak and defocus", spun_needles(1e4), margin=1e-2,
+         effects=Effects(motion=travel(6), defocus=Defocus(0.02, 1.0))),
+    Case("blur_needle_cov3d", "needle of ratio 1e2 given as cov3D_precomp, streak and defocus",
+         spun_needles_by_covariance(1e2), margin=1e-2, effects=Effects(motion=travel(6), defocus=Defocus(0.02, 1.0))),
+    Case("streak_1e-6", "streak of 1e-6 px", axis_aligned, effects=Effects(motion=streak(1e-6))),
+    Case("streak_1e3", "streak of 1e3 px", filling, effects=Effects(motion=streak(1e3))),
+    Case("blur_wide_1e6", "standard deviation 1e6 px, streak of 1e2 px", wide(1e6), round=True, margin=1e-2,
+         effects=Effects(motion=streak(1e2))),
+    Case("blur_tiny", "standard deviation 1e-6 px, streak and defocus", sized(1e-6), round=True,
+         effects=Effects(motion=streak(6), defocus=Defocus(0.1, 1.0))),
+    Case("in_focus", "in focus, to the bit and nearly", in_focus, round=True,
+         effects=Effects(defocus=Defocus(1.0, 2.0))),
+    Case("aperture_huge", "aperture of 1e6, one plane in focus", in_focus, round=True,
+         effects=Effects(defocus=Defocus(1e6, 2.0))),
+    Case("focus_near", "focus at the near plane", depths_of(0.2000001, 0.21, 0.3, 1, 5),
+         effects=Effects(defocus=Defocus(0.02, 0.2))),
+    Case("planes", "just in front of and beyond near and far", depths_of(1, 1 + 2.0**-23, 3 - 2.0**-22, 3, 4),
+         effects=Effects(near=1.0, far=3.0)),
+    Case("orthographic", "orthographic, z from 0 to 1e4", parallel,
+         effects=Effects(orthographic=True, near=0.0, motion=travel(3))),
+    Case("crop", "principal point ten half pictures outside", cropped,
+         effects=Effects(off_center=True, motion=travel(6))),
+]  # fmt: skip
+
 CASES = [
     Case("axis_aligned", "axis-aligned covariance", axis_aligned, reference=True),
     Case("isotropic", "isotropic covariance", isotropic, round=True, reference=True),
@@ -339,6 +456,7 @@ CASES = [
     Case("sh_clamp", "colours that clamp at zero", clamped_colours, reference=True),
     Case("background", "background far from 0 to 1", background, reference=True),
     Case("far_from_origin", "world coordinates of 1e6", far_from_origin),
+    *FULL_CASES,
 ]
 
 
@@ -361,13 +479,24 @@ def perturbed(scene, eps, generator):
 # --- measuring ----------------------------------------------------------------------------------
 
 
-def settings_of(camera, dtype, like, variant, device="cpu"):
+def settings_of(camera, dtype, like, variant, device="cpu", effects=None):
     """Settings in `dtype` whose numbers are rounded to `like`."""
     import analytic_rasterizer as ar
 
     fields = camera.fields(like)
     fields = {k: v.to(device, dtype) if torch.is_tensor(v) else v for k, v in fields.items()}
-    return ar.GaussianRasterizationSettings(**fields, footprint=variant[0], **variant[1])
+    if effects is not None:
+        number = torch.as_tensor  # rounded likewise
+        fields |= {k: number(fields[k], dtype=like).to(device, dtype) for k in ("tanfovx", "tanfovy")}
+        lens, motion = effects.defocus, effects.motion
+        if lens is not None:
+            lens = Defocus(*(number(v, dtype=like).to(device, dtype) for v in (lens.aperture, lens.focus)))
+        if motion is not None:
+            speeds = (motion.velocity, motion.angular_velocity, motion.screen_velocity)
+            speeds = (None if v is None else number(v, dtype=like).to(device, dtype) for v in speeds)
+            motion = Motion(motion.exposure, *speeds)
+        effects = replace(effects, defocus=lens, motion=motion, camera_gradients=True)
+    return ar.GaussianRasterizationSettings(**fields, footprint=variant[0], **variant[1], effects=effects)
 
 
 def rows(tensor):
@@ -382,10 +511,32 @@ def run(settings, scene, loss):
     import analytic_rasterizer as ar
 
     leaves = scenes.leaves(scene)
+    settings, camera = with_camera_leaves(settings)
     color, radii = ar.GaussianRasterizer(settings)(**leaves)
     (color * loss.to(color)).sum().backward()
     grads = {name: leaf.grad.double().cpu() for name, leaf in leaves.items()}
+    grads |= {name: leaf.grad.double().cpu().reshape(1, -1) for name, leaf in camera.items() if leaf.grad is not None}
     return color.detach().double().cpu(), radii.cpu(), grads
+
+
+def with_camera_leaves(settings):
+    """The same settings with leaves in place of all that a full camera has gradients by, and those leaves."""
+    effects = settings.effects
+    if effects is None:
+        return settings, {}
+    fields = {k: getattr(settings, k) for k in ("viewmatrix", "projmatrix", "campos", "tanfovx", "tanfovy")}
+    lens = {k: getattr(effects.defocus, k) for k in ("aperture", "focus")} if effects.defocus else {}
+    moved = {k: getattr(effects.motion, k) for k in ("velocity", "screen_velocity")} if effects.motion else {}
+    made = [
+        {k: v.detach().clone().requires_grad_() for k, v in some.items() if v is not None}
+        for some in (fields, lens, moved)
+    ]
+    effects = replace(
+        effects,
+        defocus=Defocus(**made[1]) if lens else None,
+        motion=Motion(effects.motion.exposure, **made[2]) if moved else None,
+    )
+    return settings._replace(**made[0], effects=effects), made[0] | made[1] | made[2]
 
 
 @dataclass
@@ -433,8 +584,8 @@ def measure(case, variant, device, dtype):
     like = torch.float32
     ours = {name: value.to(like) for name, value in scene.items()}
     exact = {name: value.double() for name, value in ours.items()}
-    a = settings_of(camera, dtype, like, variant, device)
-    b = settings_of(camera, torch.float64, like, variant)
+    a = settings_of(camera, dtype, like, variant, device, case.effects)
+    b = settings_of(camera, torch.float64, like, variant, effects=case.effects)
     g = torch.Generator().manual_seed(1)
     loss = rand(g, 3, camera.image_height, camera.image_width, low=-1.0)
     clear = clear_pixels(b, exact, case.margin)
@@ -468,8 +619,9 @@ def measure(case, variant, device, dtype):
     image_error = (error["image"][clear].max().item() if clear.any() else 0.0) / image_size
     if variant[0] == "analytic":
         spread = sigma_px(exact) / camera.image_width
-        for name in size:
-            tolerance[name] = tolerance[name] + 8 * eps * spread * size[name]
+        for name in size:  # a camera's gradient is a sum over all Gaussians
+            of_each = spread if name in exact else spread.max()
+            tolerance[name] = tolerance[name] + 8 * eps * of_each * size[name]
     if variant[1].get("frame_gradient") == "paper" and case.round:
         for name in ("means3D", "scales", "rotations"):
             del error[name], tolerance[name]

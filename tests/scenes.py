@@ -118,6 +118,15 @@ class AxisCamera(Camera):
         return super().fields(dtype, device) | {"campos": torch.zeros(3, dtype=dtype, device=device)}
 
 
+class ParallelCamera(Camera):
+    """Orthographic: tanfovx and tanfovy are half the width and height of the picture in world units."""
+
+    def perspective(self, near=0.01, far=100.0):
+        matrix = torch.diag(torch.tensor([1 / self.tanfovx, 1 / self.tanfovy, 1 / far, 1], dtype=torch.float64))
+        matrix[0, 3], matrix[1, 3] = 2 * self.shift[0] / self.image_width, 2 * self.shift[1] / self.image_height
+        return matrix
+
+
 def rand(generator, *shape, low=0.0, high=1.0):
     """Uniform float64 numbers."""
     return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)

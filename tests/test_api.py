@@ -39,6 +39,12 @@ CAMERA = Camera(bg=(0.2, 0.5, 0.9), sh_degree=1)
 Settings = ar.GaussianRasterizationSettings
 
 each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
+FULL = ar.Effects(
+    camera_gradients=True,
+    defocus=ar.Defocus(0.1, 3.0),
+    motion=ar.Motion(1.0, velocity=(0.1, -0.2, 0.1), screen_velocity=(3.0, 2.0)),
+)
+each_camera = pytest.mark.parametrize("effects", [None, FULL], ids=["plain", "full"])
 
 
 @pytest.fixture(autouse=True)
@@ -422,10 +428,11 @@ NUMBERS = {"nan": math.nan, "inf": math.inf, "-inf": -math.inf}
 @each_precision
 @pytest.mark.parametrize("number", NUMBERS)
 @pytest.mark.parametrize("precomputed", [False, True], ids=["scales-sh", "precomputed"])
-def test_non_finite_gaussians_are_culled(variant, device, dtype, number, precomputed):
+@each_camera
+def test_non_finite_gaussians_are_culled(variant, device, dtype, number, precomputed, effects):
     """Radius 0, zero gradient, and every other Gaussian as if they were not there, to the bit."""
     footprint, options = variant
-    settings = CAMERA.settings(dtype, device, footprint=footprint, **options)
+    settings = CAMERA.settings(dtype, device, footprint=footprint, effects=effects, **options)
     scene = scenes.random_scene(1, 40, degree=1)
     if precomputed:
         scene = scenes.with_precomputed(scene)
@@ -453,14 +460,15 @@ def test_non_finite_gaussians_are_culled(variant, device, dtype, number, precomp
 
 @each_kind
 @each_precision
-def test_degenerate_gaussians_are_harmless(variant, device, dtype):
+@each_camera
+def test_degenerate_gaussians_are_harmless(variant, device, dtype, effects):
     """Zero, negative and huge scales, indefinite covariances, absurd opacities: finite, always.
 
     Nothing but finiteness (and a sane image) is asked: what such a Gaussian looks like is
     undefined.
     """
     footprint, options = variant
-    settings = CAMERA.settings(dtype, device, footprint=footprint, **options)
+    settings = CAMERA.settings(dtype, device, footprint=footprint, effects=effects, **options)
     scene = scenes.random_scene(1, 30, degree=1)
     values = [0.0, 1e-30, 1e-12, 1e-6, 1e6, 1e12, 1e30, -0.3]
     for i, value in enumerate(values):

@@ -347,17 +347,57 @@ def test_a_quaternion_of_zeros_and_a_nan_is_culled(variant, device, dtype, colum
     assert ar.GaussianRasterizer(settings)(**scene)[1].tolist()[2] == 0
 
 
+BLURS = ar.Effects(defocus=ar.Defocus(0.1, 1.0), motion=ar.Motion(1.0, screen_velocity=(7.0, 5.0)))
+
+
 @each_kind
 @each_precision
+@pytest.mark.parametrize("effects", [None, BLURS], ids=["plain", "blurred"])
 @pytest.mark.parametrize("variance", [-1.0, -0.05, -1e-4])
-def test_a_negative_covariance_is_culled(variant, device, dtype, variance):
-    """Its projection is negative definite, so that its determinant is positive, but no Gaussian."""
+def test_a_negative_covariance_is_culled(variant, device, dtype, variance, effects):
+    """Its projection is negative definite, so that its determinant is positive, but no Gaussian; nor does a blur make
+    it one, whose variance outweighs it."""
     camera, scene = visible(dtype, device, precomputed=True)
     scene["means3D"][2, :2] = 0.0  # straight ahead, where the variance along the line of sight adds nothing
     size = (2.0 / hard_cases.FOCAL) ** 2  # 1 px^2
     scene["cov3D_precomp"][2] = torch.tensor([variance, 0, 0, variance, 0, 9.0]) * size
-    settings = camera.settings(dtype, device, footprint=variant[0], **variant[1])
+    settings = camera.settings(dtype, device, footprint=variant[0], effects=effects, **variant[1])
     assert ar.GaussianRasterizer(settings)(**scene)[1].tolist()[2] == 0
+
+
+@each_kind
+@each_precision
+@pytest.mark.parametrize("precomputed", [False, True], ids=["scales", "cov3d"])
+def test_a_flat_covariance_has_no_mass_under_a_blur(variant, device, dtype, precomputed):
+    """A line and a sheet seen from its edge: det Sigma is zero, so the amplitude is. Culled, with zero gradients, and
+    the rest the same to the bit."""
+    camera, scene = visible(torch.float64, "cpu")
+    for i, scales in ((1, (0.5, 0.0, 0.0)), (2, (0.5, 0.0, 0.25))):
+        scene["means3D"][i, 1] = 0.0  # in the sheet
+        scene["scales"][i] = torch.tensor(scales)
+        scene["rotations"][i] = torch.tensor([1.0, 0, 0, 0])
+    if precomputed:
+        scene = hard_cases.flat(scene)
+        line = torch.tensor([1.0, 2.0, 0.0], dtype=torch.float64)
+        scene["cov3D_precomp"][3] = torch.outer(line, line)[tuple(torch.triu_indices(3, 3))] / 64
+    else:
+        scene["scales"][3] = 0.0
+    scene = scenes.cast(scene, dtype, device)
+    settings = camera.settings(dtype, device, footprint=variant[0], effects=BLURS, **variant[1])
+
+    def gradients(some):
+        leaves = scenes.leaves(some)
+        color, radii = ar.GaussianRasterizer(settings)(**leaves)
+        (color**2).sum().backward()
+        return color.detach(), radii.tolist(), {name: leaf.grad for name, leaf in leaves.items()}
+
+    color, radii, grads = gradients(scene)
+    rest = [0, 4]
+    expected, rest_radii, rest_grads = gradients({name: value[rest] for name, value in scene.items()})
+    assert radii[1:4] == [0, 0, 0] and [radii[i] for i in rest] == rest_radii and min(rest_radii) > 0
+    assert torch.equal(color, expected)
+    for name, grad in grads.items():
+        assert (grad[1:4] == 0).all() and torch.equal(grad[rest], rest_grads[name]), name
 
 
 def test_a_needle_given_by_its_covariance_is_kept(device, best):

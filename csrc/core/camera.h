@@ -261,7 +261,8 @@ AR_HD Vec3<T> blur_vjp(const FullCamera<T>& camera, Vec3<T> view, const Blur<T>&
   Vec3<T> by_view = {T(0), T(0), T(0)};
   Lens<T> by_lens = {};
   Vec2<T> by_focal = {T(0), T(0)};
-  defocus_variance_vjp(camera.lens, camera.focal, view.z, dL_dblur.variance, by_view.z, by_lens, by_focal);
+  if (camera.lens.aperture != T(0))  // a pinhole's focus may be anything
+    defocus_variance_vjp(camera.lens, camera.focal, view.z, dL_dblur.variance, by_view.z, by_lens, by_focal);
   motion_streak_vjp(camera.lens, camera.focal, view, dL_dblur.streak, by_view, by_lens, by_focal);
   if (to) {
     to->lens.aperture += by_lens.aperture;

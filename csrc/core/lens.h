@@ -26,6 +26,10 @@ template <typename T> struct Lens {
 inline constexpr int kLensWidth = 17;
 static_assert(sizeof(Lens<float>) == kLensWidth * sizeof(float));
 
+/// A blurred Gaussian whose det Sigma [px^4] is below this, of standard deviations of 3e-8 px, counts as one without
+/// mass, so that nothing derived from it overflows a float.
+inline constexpr double kMinBlurredDet = 1e-30;
+
 /// What is added to a projected covariance: streak streak^T + variance I [px^2]. Gaussians stay Gaussians, with the
 /// amplitude that keeps their mass.
 template <typename T> struct Blur {

@@ -118,17 +118,18 @@ AR_HD Factors<T> project_covariance(const Cam& camera, const Gaussians<T>& g, in
 /// Sigma with blur: after the streak, and after all of it.
 template <typename T> struct BlurredCov {
   Cov2d<T> streaked, all;
+  Vec2<T> pull;  ///< adj(Sigma) streak
 };
-/// streak^T adj(Sigma) streak is a sum of squares in the factors; in the entries it cancels for a needle along the
-/// streak.
+/// Products of adj(Sigma) with the streak are sums in the factors; in the entries they cancel for a needle along it.
 template <typename T>
 AR_HD BlurredCov<T> blurred(const Factors<T>& f, const Gaussians<T>& g, int64_t i, const Blur<T>& by) {
   const Vec2<T>& b = by.streak;
-  const Vec3<T> across = g.cov3ds ? b.x * f.jacobian.y - b.y * f.jacobian.x : b.x * f.row_y - b.y * f.row_x;
-  const T gain = dot(across, g.cov3ds ? g.cov3ds[i] * across : across);
+  const Vec3<T> x = g.cov3ds ? f.jacobian.x : f.row_x, y = g.cov3ds ? f.jacobian.y : f.row_y;
+  const Vec3<T> across = b.x * y - b.y * x, weighted = g.cov3ds ? g.cov3ds[i] * across : across;
+  const T gain = dot(across, weighted);  // negative by rounding of the entries of a cov3d
   const Cov2d<T>& c = f.cov;
-  const Cov2d<T> streaked = {c.xx + b.x * b.x, c.xy + b.x * b.y, c.yy + b.y * b.y, c.det + gain};
-  return {streaked, blur(streaked, by.variance)};
+  const Cov2d<T> streaked = {c.xx + b.x * b.x, c.xy + b.x * b.y, c.yy + b.y * b.y, c.det + (gain < T(0) ? T(0) : gain)};
+  return {streaked, blur(streaked, by.variance), {dot(y, weighted), -dot(x, weighted)}};
 }
 /// The covariance that the footprint sees, and the amplitude that keeps the mass of the splat.
 template <typename T> struct SeenCov {
@@ -141,12 +142,17 @@ AR_HD SeenCov<T> seen_covariance(const Cam& camera, const Gaussians<T>& g, int64
   if constexpr (Cam::kFull) {
     const Blur<T> by = blur_of(camera, view);
     if (by.any()) {
-      const Cov2d<T> all = blurred(f, g, i, by).all;
-      return {all, sqrt(f.cov.det / all.det)};
+      const Cov2d<T>&c = f.cov, all = blurred(f, g, i, by).all;
+      // What is negative definite has a positive determinant, and what is added may hide it.
+      const bool has_mass = c.det >= T(kMinBlurredDet) && c.xx >= T(0) && c.yy >= T(0);
+      return {all, has_mass ? sqrt(c.det / all.det) : T(0)};
     }
   }
   return {f.cov, T(1)};
 }
+
+/// 1 / sqrt(a b), whose product no float may hold.
+template <typename T> AR_HD T inverse_root(T a, T b) { return T(1) / (sqrt(a) * sqrt(b)); }
 
 /// What turned_vjp knows of a blur; of NoBlur nothing.
 template <class B, typename T> struct BlurContext {
@@ -211,15 +217,13 @@ AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, co
     const Vec2<T>& b = context.blur.streak;
     const Cov2d<T>& streaked = context.cov.streaked;
     m.c = b.x * ty - b.y * tx;
-    // log sqrt(det Sigma / det streaked) has the gradient u u^T det Sigma / (2 det streaked), u = Sigma^-1 b
-    const T inv = T(1) / (sqrt(f.cov.det) * sqrt(streaked.det));
-    const Vec3<T> e = b.x * m.x + b.y * m.y;
-    const T by_e = T(0.5) * context.weighted * inv * inv, ax = f.cov.yy * b.x - f.cov.xy * b.y,
-            ay = f.cov.xx * b.y - f.cov.xy * b.x;
-    h.diagonal += by_e * mul(e, e);
-    h.off += by_e * shifted_products(e, e);
-    h.x += (by_e * ax) * e;
-    h.y += (by_e * ay) * e;
+    // log sqrt(det Sigma / det streaked) has the gradient u u^T / 2, u = adj(Sigma) b / sqrt(det Sigma det streaked).
+    const T half = T(0.5) * context.weighted, inv = inverse_root(f.cov.det, streaked.det);
+    const Vec3<T> e = inv * (b.x * m.x + b.y * m.y);
+    h.diagonal += half * mul(e, e);
+    h.off += half * shifted_products(e, e);
+    h.x += (half * (inv * context.cov.pull.x)) * e;
+    h.y += (half * (inv * context.cov.pull.y)) * e;
     m = {streaked, m.x - b.y * m.c, m.y + b.x * m.c, m.c, T(0)};
     const T v = context.blur.variance;
     add_log_amp_vjp<true>(f, m, context.weighted, v, h);
@@ -265,11 +269,9 @@ AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, co
 }
 
 /// Gradient by Sigma of the logarithm of a blur's amplitude, as a matrix.
-template <typename T> AR_HD Sym2<T> blur_amp_grad(const Cov2d<T>& c, const Blur<T>& by, const BlurredCov<T>& cov) {
-  const Vec2<T>& b = by.streak;
-  const T ax = c.yy * b.x - c.xy * b.y, ay = c.xx * b.y - c.xy * b.x;  // adj(Sigma) b
-  const T scale = T(0.5) / c.det, by_x = scale * (ax / cov.streaked.det), by_y = scale * (ay / cov.streaked.det);
-  return Sym2<T>{by_x * ax, by_x * ay, by_y * ay} + log_amp_grad(cov.streaked, by.variance);
+template <typename T> AR_HD Sym2<T> blur_amp_grad(const Cov2d<T>& c, T variance, const BlurredCov<T>& cov) {
+  const T inv = inverse_root(c.det, cov.streaked.det), x = inv * cov.pull.x, y = inv * cov.pull.y;
+  return Sym2<T>{T(0.5) * x * x, T(0.5) * x * y, T(0.5) * y * y} + log_amp_grad(cov.streaked, variance);
 }
 
 /// Writes the gradients of scale and rotation, or of cov3d, and returns that of the Jacobian.
@@ -283,7 +285,7 @@ AR_HD JacobianGrad<T> project_covariance_vjp(const Gaussians<T>& g, const Gaussi
     if constexpr (std::is_same_v<B, NoBlur>) {
       s = cov_grad(f.cov, grad);
     } else {
-      const Sym2<T> amp = blur_amp_grad(f.cov, context.blur, context.cov);
+      const Sym2<T> amp = blur_amp_grad(f.cov, context.blur.variance, context.cov);
       const T k = context.weighted;
       s = cov_grad(context.cov.all, grad) + Sym2<T>{k * amp.xx, k * amp.xy, k * amp.yy};
     }
@@ -313,20 +315,33 @@ AR_HD JacobianGrad<T> project_covariance_vjp(const Gaussians<T>& g, const Gaussi
   return {f.rotation * by_x, f.rotation * by_y, dot(s, by_scale)};
 }
 
-/// Gradient by the blur itself.
+/// Gradient by the blur itself. Of its amplitude only det Sigma' depends on it: -Sigma'^-1 b and -tr(Sigma'^-1) / 2.
 template <typename T>
-AR_HD Blur<T> seen_covariance_vjp(const Factors<T>& f, const SplatGrad<T>& grad,
-                                  const BlurContext<Blur<T>, T>& context) {
+AR_HD Blur<T> seen_covariance_vjp(const SplatGrad<T>& grad, const BlurContext<Blur<T>, T>& context) {
   const Vec2<T>& b = context.blur.streak;
-  const Cov2d<T>&c = f.cov, &all = context.cov.all;
-  const T k = context.weighted;
-  const Sym2<T> by_all = cov_grad(all, grad), amp = log_amp_grad(context.cov.streaked, context.blur.variance);
-  const Sym2<T> by_streaked = by_all + Sym2<T>{k * amp.xx, k * amp.xy, k * amp.yy};
-  // of log sqrt(det Sigma / det streaked): -adj(Sigma) b / det streaked
-  const T inv = k / context.cov.streaked.det;
-  return {{T(2) * (by_streaked.xx * b.x + by_streaked.xy * b.y) - inv * (c.yy * b.x - c.xy * b.y),
-           T(2) * (by_streaked.xy * b.x + by_streaked.yy * b.y) - inv * (c.xx * b.y - c.xy * b.x)},
-          by_all.xx + by_all.yy - T(0.5) * k * (all.xx + all.yy) / all.det};
+  const Cov2d<T>& all = context.cov.all;
+  const T v = context.blur.variance;
+  const Vec2<T> pull = {context.cov.pull.x + v * b.x, context.cov.pull.y + v * b.y};  // adj(Sigma') b
+  SplatGrad<T> rest = grad;
+  Sym2<T>& g = rest.dL_dwhite;
+  T weight = -context.weighted;
+  if (!grad.triangular) {
+    // Here w^T w = Sigma'^-1. Across a thin needle g.yy and the amplitude cancel, so they meet before it comes in.
+    weight += T(2) * g.yy;
+    g = {g.xx - g.yy, g.xy, T(0)};
+  }
+  const Sym2<T> by_all = cov_grad(all, rest);
+  // by_all b: in whitened coordinates, as its entries cancel for a needle along the streak.
+  const Vec2<T> z = transform(grad.w, b);
+  Vec2<T> by_b = transform_transposed(grad.w, Vec2<T>{g.xx * z.x + g.xy * z.y, g.xy * z.x + g.yy * z.y});
+  if (grad.dL_dlog_amp != T(0)) {
+    const T u = grad.variance, scale = T(0.5) * grad.dL_dlog_amp * u / blur(all, u).det;
+    by_b = by_b + Vec2<T>{scale * (((all.yy + u) * pull.x - all.xy * pull.y) / all.det),
+                          scale * (((all.xx + u) * pull.y - all.xy * pull.x) / all.det)};
+  }
+  const T inv = weight / all.det;
+  return {{T(2) * by_b.x + inv * pull.x, T(2) * by_b.y + inv * pull.y},
+          by_all.xx + by_all.yy + T(0.5) * inv * (all.xx + all.yy)};
 }
 
 /// Colour of Gaussian i, whose coefficients are `sh`. False if it is not finite.
@@ -450,7 +465,7 @@ AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, Foot
     if (has_blur) {
       const BlurContext<Blur<T>, T> context = {blur, blurred(factors, g, i, blur), sums.weighted};
       by_jacobian = project_covariance_vjp(g, out, i, factors, grad, context);
-      dL_dview = blur_vjp(camera, mean.view, seen_covariance_vjp(factors, grad, context), camera_grad);
+      dL_dview = blur_vjp(camera, mean.view, seen_covariance_vjp(grad, context), camera_grad);
     }
   }
   if (!has_blur) by_jacobian = project_covariance_vjp(g, out, i, factors, grad, BlurContext<NoBlur, T>{});

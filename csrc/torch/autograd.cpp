@@ -115,7 +115,9 @@ struct Rasterize : torch::autograd::Function<Rasterize> {
   }
 
   static variable_list backward(AutogradContext* ctx, variable_list dL_doutputs) {
-    TORCH_CHECK(ctx->saved_data["keep"].toBool(), "rasterize was called with keep=False and cannot be differentiated");
+    TORCH_CHECK(ctx->saved_data["keep"].toBool(),
+                "rasterize was called with keep=False and cannot be differentiated; gradients of a camera take "
+                "Effects(camera_gradients=True)");
     variable_list grads(kInputs + 3);  // settings, keep and alpha have none
     const Tensor dL_dalpha = dL_doutputs.size() > kAlpha ? dL_doutputs[kAlpha] : Tensor();
     if (!dL_doutputs[0].defined() && !dL_dalpha.defined()) return grads;

@@ -3,9 +3,9 @@
 // LLVMFuzzerTestOneInput is libFuzzer's entry point (CMake: AR_FUZZ=ON with clang). Without libFuzzer, main() feeds it
 // pseudo-random bytes: fuzz_core [first seed] [number of seeds].
 //
-// Whatever the bytes: no fault, no undefined behaviour, what is not finite is culled, and without the culled the
-// image has the same bits. With a camera that occurs, moreover: image and gradients are finite, and those of the culled
-// are zero.
+// Whatever the bytes: no fault, no undefined behaviour, what is not finite is culled, without the culled the image has
+// the same bits, and it is finite. With a camera that occurs, moreover: gradients are finite, and those of the culled
+// are zero. Half of the cameras are full ones, a few of them with a lens of any numbers.
 #include <algorithm>
 #include <cmath>
 #include <cstdio>
@@ -85,9 +85,11 @@ class Bytes {
   size_t size_, at_ = 0;
 };
 
-/// What the ops let through: the camera and the options are finite, everything else is not looked at.
+/// What the ops let through: the plain camera and the options are finite, everything else is not looked at.
 template <typename T> struct AnyScene {
   TestCamera<T> camera;
+  bool full = false;
+  Lens<T> lens = {};
   bool sane = true;  ///< the camera and the image's gradient are such as occur: gradients must be finite
   std::string footprint;
   int level = 0, threads = 1;
@@ -102,6 +104,8 @@ template <typename T> struct AnyScene {
 
   explicit AnyScene(const TestCamera<T>& c) : camera(c) {}
 
+  CameraView<T> look() const { return full ? camera.look(lens) : camera.look(); }
+
   Gaussians<T> gaussians() const {
     const auto given = [](const auto& v) { return v.empty() ? nullptr : v.data(); };
     return {int64_t(means.size()), means.data(), given(scales), given(rotations), given(cov3ds),
@@ -110,13 +114,32 @@ template <typename T> struct AnyScene {
   }
 };
 
+/// What occurs: effects from far below a pixel to far above an image, some in focus or at a plane to the bit.
+template <typename T> Lens<T> decode_lens(Bytes& in, const TestCamera<T>& camera, bool orthographic) {
+  Lens<T> lens = plain_lens(camera.tan_x, camera.tan_y);
+  lens.parallel = T(orthographic);
+  if (in.one_in(3)) lens.near = orthographic && in.one_in(2) ? T(0) : in.log_between<T>(1e-3, 3);
+  if (in.one_in(3)) lens.far = lens.near + in.log_between<T>(1e-3, 30);
+  if (in.one_in(2)) lens.center = {in.between<T>(-10, 10) * camera.tan_x, in.between<T>(-10, 10) * camera.tan_y};
+  if (in.one_in(2)) {
+    lens.aperture = in.log_between<T>(1e-9, 1e4);
+    lens.focus = in.one_in(3) ? std::max(lens.near, T(1e-3)) : in.one_in(3) ? T(2) : in.log_between<T>(1e-2, 1e3);
+  }
+  const auto speed = [&](double most) { return (in.one_in(2) ? T(1) : T(-1)) * in.log_between<T>(1e-12, most); };
+  if (in.one_in(3)) lens.shift = {speed(1e2), in.one_in(3) ? T(0) : speed(1e2), speed(1e2)};
+  if (in.one_in(3)) lens.turn = {speed(10), speed(10), in.one_in(3) ? T(0) : speed(10)};
+  if (in.one_in(3)) lens.screen = {speed(1e5), in.one_in(3) ? T(0) : speed(1e5)};
+  return lens;
+}
+
 template <typename T> AnyScene<T> decode(Bytes& in) {
   const int most = in.one_in(8) ? 40 : 20;  // px; one tile or several
   const int width = 1 + in.below(most), height = 1 + in.below(most);
   const double tangent = in.log_between<double>(0.05, 3);
+  const bool full = in.one_in(2), orthographic = full && in.one_in(3);
   AnyScene<T> scene(TestCamera<T>(width, height, tangent,
                                   {in.between<double>(-3, 3), in.between<double>(-3, 3), in.between<double>(-2, 2)},
-                                  {in.between<double>(-0.3, 0.3), in.between<double>(-0.3, 0.3)}));
+                                  {in.between<double>(-0.3, 0.3), in.between<double>(-0.3, 0.3)}, orthographic));
   if (in.one_in(16)) {
     scene.sane = false;
     TestCamera<T>& c = scene.camera;
@@ -124,6 +147,16 @@ template <typename T> AnyScene<T> decode(Bytes& in) {
     for (T& x : c.proj) x = in.one_in(4) ? in.any_finite<T>() : x;
     for (T& x : c.position) x = in.one_in(4) ? in.any_finite<T>() : x;
     c.tan_x = std::max(std::abs(in.any_finite<T>()), std::numeric_limits<T>::denorm_min());
+  }
+  scene.full = full;
+  if (full) {
+    scene.lens = decode_lens(in, scene.camera, orthographic);
+    if (in.one_in(8)) {  // a tensor on a device may hold anything
+      scene.sane = false;
+      for (int k = 0; k < kLensWidth; ++k) {
+        if (in.one_in(4)) reinterpret_cast<T*>(&scene.lens)[k] = in.any<T>();
+      }
+    }
   }
   std::vector<std::string> names;
   for_each_footprint(Footprints{}, [&](auto f) { names.emplace_back(decltype(f)::kName); });
@@ -136,7 +169,7 @@ template <typename T> AnyScene<T> decode(Bytes& in) {
 
   const int n = in.below(13);
   const bool by_cov3d = in.one_in(3), by_sh = in.one_in(2);
-  scene.sh_degree = by_sh ? in.below(Camera<T>::kShDegree + 1) : 0;
+  scene.sh_degree = by_sh ? in.below((full ? FullCamera<T>::kShDegree : Camera<T>::kShDegree) + 1) : 0;
   scene.sh_stride = by_sh ? sh_count(scene.sh_degree) + in.below(2) : 0;
   scene.scale_modifier = in.one_in(8) ? std::max(std::abs(in.any_finite<T>()), std::numeric_limits<T>::min()) : T(1);
   const bool tame = in.one_in(2);  // most numbers of a scene are such as occur
@@ -149,7 +182,10 @@ template <typename T> AnyScene<T> decode(Bytes& in) {
       if (wild == 0 || !in.one_in(wild)) return T(usual());
       return holds && !in.one_in(4) ? held : in.any<T>();
     };
-    const double z = in.between<double>(-0.5, 8), reach = z * tangent * 1.3;
+    // Some just behind the near plane, or where many a lens is in focus.
+    const double z =
+        full && in.one_in(8) ? double(in.one_in(2) ? scene.lens.near : T(2)) * (1 + 1e-6) : in.between<double>(-0.5, 8);
+    const double reach = (orthographic ? 1 : z) * tangent * 1.3;
     const Vec3<T> mean = scene.camera.world(in.between<double>(-reach, reach), in.between<double>(-reach, reach), z);
     scene.means.push_back(
         {number([&] { return mean.x; }), number([&] { return mean.y; }), number([&] { return mean.z; })});
@@ -193,6 +229,7 @@ template <typename T>
     for (int k = 0; k < n; ++k) std::fprintf(stderr, " %.9g", double(numbers[k]));
     std::fprintf(stderr, "\n");
   };
+  if (scene.full) print("lens", reinterpret_cast<const T*>(&scene.lens), kLensWidth);
   print("view", scene.camera.view, 16);
   print("proj", scene.camera.proj, 16);
   for (size_t i = 0; i < scene.means.size(); ++i) {
@@ -217,7 +254,7 @@ template <typename T> const cpu::Stages<T>& stages_of(const AnyScene<T>& scene) 
 }
 
 template <typename T> Rendered<T> render(const AnyScene<T>& scene) {
-  return run_stages(stages_of(scene), scene.camera.look(), scene.gaussians(), scene.background, scene.dL_dimage.data(),
+  return run_stages(stages_of(scene), scene.look(), scene.gaussians(), scene.background, scene.dL_dimage.data(),
                     scene.options, scene.threads);
 }
 
@@ -268,9 +305,13 @@ template <typename T> void check(Bytes& in) {
   if (std::memcmp(clean.image.data(), out.image.data(), out.image.size() * sizeof(T)) != 0) {
     fail(scene, "what is culled changes the image", -1, 0);
   }
-  if (!scene.sane) return;
   for (const T value : out.image) {
     if (!std::isfinite(value)) fail(scene, "the image is not finite", -1, value);
+  }
+  if (!scene.sane) return;
+  for (size_t k = 0; k < out.camera_grad.size(); ++k) {
+    const T value = out.camera_grad[k];
+    if (!std::isfinite(value)) fail(scene, "not finite: gradient of the camera", int64_t(k), value);
   }
   // Start, numbers per Gaussian and name of each gradient that is written.
   struct Row {

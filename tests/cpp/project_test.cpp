@@ -7,7 +7,7 @@
 namespace ar::test {
 namespace {
 
-constexpr int kStride = 16;
+constexpr int kStride = sh_count(kMaxShDegree);
 
 /// Which of the alternative inputs describe a Gaussian. A degree of -1: a colour.
 struct Form {
@@ -62,7 +62,7 @@ struct Field {
 };
 constexpr Field kMean = {"mean", 0, 3}, kScale = {"scale", 3, 3}, kRotation = {"rotation", 6, 4},
                 kCov3d = {"cov3d", 10, 6}, kOpacity = {"opacity", 16, 1}, kColor = {"color", 17, 3},
-                kSh = {"sh", 20, 48};
+                kSh = {"sh", 20, 3 * kStride};
 
 std::vector<Field> fields_of(Form form) {
   std::vector<Field> fields = {kMean, kOpacity, form.sh_degree < 0 ? kColor : kSh};
@@ -82,9 +82,63 @@ template <typename T> Sym3<T> cov3d_of(Vec4<T> rotation, Vec3<T> s) {
 
 template <typename T> TestCamera<T> test_camera() { return {64, 48, 0.5, {0.3, -0.4, 0.7}, {0.1, -0.2}}; }
 
+/// What a camera is loaded from.
+template <typename T> struct View {
+  TestCamera<T> test = test_camera<T>();
+  Lens<T> lens = plain_lens<T>(test.tan_x, test.tan_y);
+
+  template <class Cam> Cam load() const { return load_camera_as<Cam>(test.look(lens)); }
+
+  /// What number k of CameraGrad is the derivative by.
+  T& number(int k) {
+    constexpr int kRows[] = {0, 1, 3};  // of a clip matrix
+    if (k < 12) return test.view[4 * (k % 4) + k / 4];
+    if (k < 24) return test.proj[4 * (k % 4) + kRows[k / 4 - 3]];
+    return k < 27 ? test.position[k - 24] : reinterpret_cast<T*>(&lens)[k - 27];
+  }
+};
+constexpr Field kCameraFields[] = {{"view_x", 0, 4},  {"view_y", 4, 4},    {"view_z", 8, 4},    {"clip_x", 12, 4},
+                                   {"clip_y", 16, 4}, {"clip_w", 20, 4},   {"position", 24, 3}, {"tan", 27, 2},
+                                   {"center", 29, 2}, {"aperture", 31, 1}, {"focus", 32, 1},    {"shift", 33, 3},
+                                   {"turn", 36, 3},   {"screen", 39, 2}};
+constexpr int kFirstFixed = 41;  ///< near, far and parallel have no gradient
+
+enum Effect { kOffCenter = 1, kDefocus = 2, kShift = 4, kTurn = 8, kScreen = 16, kAllEffects = 31 };
+
+/// With these effects, as large as a splat or so. An orthographic camera sees 4 world units across.
+template <typename T> View<T> random_view(Random& random, int effects, bool orthographic) {
+  View<T> view;
+  if (orthographic) {
+    view.test = {64, 48, 2, {0.3, -0.4, 0.7}, {0.1, -0.2}, true};
+    view.lens = plain_lens<T>(view.test.tan_x, view.test.tan_y);
+    view.lens.parallel = T(1);
+  }
+  const auto normal = [&](double size) { return T(size * random.normal()); };
+  if (effects & kOffCenter) view.lens.center = {normal(0.5), normal(0.5)};
+  if (effects & kDefocus) {
+    view.lens.aperture = T(random.log_uniform(0.01, 1));
+    view.lens.focus = T(random.uniform(1, 6));
+  }
+  if (effects & kShift) view.lens.shift = {normal(0.2), normal(0.2), normal(0.2)};
+  if (effects & kTurn) view.lens.turn = {normal(0.1), normal(0.1), normal(0.1)};
+  if (effects & kScreen) view.lens.screen = {normal(5), normal(5)};
+  return view;
+}
+
+/// Each effect alone, then none, then together.
+int effects_of(int trial) { return trial % 8 < 5 ? 1 << (trial % 8) : trial % 8 == 5 ? 0 : int(kAllEffects); }
+
+/// Widths of a splat along its axes.
+struct Axes {
+  double gap, wide, narrow;  ///< gap: difference of the eigenvalues of Sigma
+
+  explicit Axes(const Cov2d<double>& c)
+      : gap(eigenvalue_gap(c)), wide(std::sqrt((c.xx + c.yy + gap) / 2)), narrow(std::sqrt(c.det) / wide) {}
+};
+
 /// L = sum_k g_k alpha(at pixel k) + c . color, differentiable wherever the Gaussian is kept.
-template <class F> struct Loss {
-  Camera<double> camera;
+template <class F, class Cam> struct Loss {
+  Cam camera;
   Form form;
   double scale_modifier = 1.3;
   Vec2<double> pixels[3] = {};
@@ -110,8 +164,9 @@ template <class F> struct Loss {
     return loss;
   }
 
-  /// `gap`: difference of the eigenvalues of Sigma.
-  Parameters<double> gradient(const Parameters<double>& p, double gap, double* means2d) const {
+  /// `gap`: of the covariance that the footprint sees.
+  Parameters<double> gradient(const Parameters<double>& p, double gap, double* means2d,
+                              CameraGrad<double>* by_camera) const {
     Splat<F, double> splat = {};
     project_to(p, splat);
     const auto terms = F::terms(splat.shape, splat.opacity);
@@ -140,7 +195,8 @@ template <class F> struct Loss {
       }
     }
     Parameters<double> out = {};
-    project_vjp<F>(camera, p.view(form, scale_modifier), 0, options_of<F>(), sums, out.targets(form, means2d));
+    project_vjp<F>(camera, p.view(form, scale_modifier), 0, options_of<F>(), sums, out.targets(form, means2d),
+                   by_camera);
     return out;
   }
 };
@@ -148,16 +204,33 @@ template <class F> struct Loss {
 template <class F> class ProjectTest : public ::testing::Test {};
 TYPED_TEST_SUITE(ProjectTest, AllFootprints, FootprintName);
 
-// Gaussians in and around the frustum, those beyond the clamp of x/z large enough to reach back.
-TYPED_TEST(ProjectTest, GradientsMatchDifferences) {
-  using F = TypeParam;
-  const TestCamera<double> test = test_camera<double>();
+/// Compares a field of gradients with differences of `loss_at`, the loss with number k of the field t larger.
+template <class Function>
+void expect_derivatives(const Field& field, double h, const double* actual, const Function& loss_at, int trial) {
+  std::vector<double> expected(field.count);
+  double largest = 0;
+  for (int k = 0; k < field.count; ++k) {
+    expected[k] = derivative([&](double t) { return loss_at(k, t); }, h);
+    largest = std::max(largest, std::abs(expected[k]));
+  }
+  for (int k = 0; k < field.count; ++k) {  // rounding: eps L / h, L of order one
+    ASSERT_NEAR(actual[k], expected[k], 1e-6 * largest + 1e-15 / std::abs(h))
+        << field.name << " " << k << " trial " << trial;
+  }
+}
+
+// Gaussians in and around the frustum, those beyond the clamp of x/z large enough to reach back. By everything that
+// describes them and, of a full camera, by all of its numbers.
+template <class F, class Cam> void expect_gradients_match_differences(int count) {
+  constexpr int kDegrees = Cam::kShDegree + 2;  // a colour too
   Random random(1);
-  int clamped = 0, checked = 0;
-  for (int trial = 0; checked < 120; ++trial) {
-    const double z = random.uniform(1, 6), size = z * random.log_uniform(0.01, 0.5);
+  int clamped = 0, blurred = 0, checked = 0;
+  for (int trial = 0; checked < count; ++trial) {
+    const bool orthographic = Cam::kFull && random.below(3) == 0;
+    const View<double> at = Cam::kFull ? random_view<double>(random, effects_of(trial), orthographic) : View<double>();
+    const double z = random.uniform(1, 6), scale = orthographic ? 4 : z, size = scale * random.log_uniform(0.01, 0.5);
     Parameters<double> p;
-    p.mean = test.world(z * random.uniform(-1, 1), z * random.uniform(-0.8, 0.8), z);
+    p.mean = at.test.world(scale * random.uniform(-1, 1), scale * random.uniform(-0.8, 0.8), z);
     p.scale = {size * random.uniform(0.2, 1), size * random.uniform(0.2, 1), size * random.uniform(0.2, 1)};
     p.rotation = {random.normal(), random.normal(), random.normal(), random.normal()};
     p.cov3d = cov3d_of(p.rotation, p.scale);
@@ -165,24 +238,27 @@ TYPED_TEST(ProjectTest, GradientsMatchDifferences) {
     p.color = {random.uniform(0.1, 1), random.uniform(0.1, 1), random.uniform(0.1, 1)};
     for (auto& c : p.sh) c = {0.5 * random.normal(), 0.5 * random.normal(), 0.5 * random.normal()};
 
-    Loss<F> loss = {load_camera(test.look()), {trial % 2 == 1, trial % 5 - 1}};
+    Loss<F, Cam> loss = {at.load<Cam>(), {trial % 2 == 1, trial / 2 % kDegrees - 1}};
     Splat<F, double> splat = {};
     if (loss.project_to(p, splat) == 0 || splat.level <= 0) continue;
     const Vec3<double> view = project_mean(loss.camera, p.mean).view;
-    const auto factors = project_covariance(loss.camera, p.view(loss.form, loss.scale_modifier), 0, view);
-    const Cov2d<double>& cov = factors.cov;
-    const double gap = std::hypot(cov.xx - cov.yy, 2 * cov.xy), wide = std::sqrt((cov.xx + cov.yy + gap) / 2);
-    const double narrow = std::sqrt(cov.det) / wide;
+    const Gaussians<double> g = p.view(loss.form, loss.scale_modifier);
+    const auto factors = project_covariance(loss.camera, g, 0, view);
+    const Axes own(factors.cov), seen(seen_covariance(loss.camera, g, 0, view, factors).cov);
     // Differences may straddle no kink: not where a colour or a ratio is clamped, nor near circles.
     const auto near_zero = [](double color) { return color > 0 && color < 0.02; };
-    const auto near_edge = [](double ratio, double limit) { return std::abs(std::abs(ratio) - limit) < 0.01; };
+    const auto near_edge = [](double ratio, double center, double limit) {
+      return std::abs(std::abs(ratio - center) - limit) < 0.01;
+    };
+    const Vec2<double> center = at.lens.center;
     if (near_zero(splat.color.x) || near_zero(splat.color.y) || near_zero(splat.color.z) ||
-        near_edge(view.x / view.z, loss.camera.limit.x) || near_edge(view.y / view.z, loss.camera.limit.y) ||
-        gap < 0.1 * wide * wide) {
+        near_edge(view.x / view.z, center.x, loss.camera.limit.x) ||
+        near_edge(view.y / view.z, center.y, loss.camera.limit.y) || seen.gap < 0.1 * seen.wide * seen.wide) {
       continue;
     }
     ++checked;
-    clamped += factors.jacobian.clamped_x || factors.jacobian.clamped_y;
+    clamped += !orthographic && (factors.jacobian.clamped_x || factors.jacobian.clamped_y);
+    blurred += seen.wide > 1.1 * own.wide;
     for (int k = 0; k < 3; ++k) {
       const Vec2<double> z = on_circle(random.uniform(0, 2), random.uniform(0, 2 * kPi));
       loss.pixels[k] = splat.mean + unwhiten(F::ellipse(splat.shape), z);
@@ -190,50 +266,127 @@ TYPED_TEST(ProjectTest, GradientsMatchDifferences) {
     }
     loss.c = {random.normal(), random.normal(), random.normal()};
     double means2d[3];
-    Parameters<double> actual = loss.gradient(p, gap, means2d);
+    CameraGrad<double> by_camera = {};
+    Parameters<double> actual = loss.gradient(p, seen.gap, means2d, Cam::kFull ? &by_camera : nullptr);
 
     // A step moves the splat by 1e-3 of its narrow width, so that h^4 f^(5) is below 1e-9.
-    const double turn = 1e-3 * narrow / wide, least = std::min({p.scale.x, p.scale.y, p.scale.z});
+    const double turn = 1e-3 * own.narrow / own.wide, least = std::min({p.scale.x, p.scale.y, p.scale.z});
+    const double move = 1e-3 * own.narrow * (orthographic ? 1 : z) / loss.camera.focal.x;
     const auto step_of = [&](const Field& field) {
-      return field.first == kMean.first       ? 1e-3 * narrow * z / loss.camera.focal.x
+      return field.first == kMean.first       ? move
              : field.first == kScale.first    ? turn * least
              : field.first == kRotation.first ? turn * p.rotation.w
              : field.first == kCov3d.first    ? turn * least * least
                                               : 1e-3 * p.opacity;
     };
     for (const Field& field : fields_of(loss.form)) {
-      const double h = step_of(field);
-      std::vector<double> expected(field.count);
-      double largest = 0;
-      for (int k = 0; k < field.count; ++k) {
-        expected[k] = derivative(
-            [&](double t) {
-              Parameters<double> q = p;
-              q.number(field.first + k) += t;
-              return loss(q);
-            },
-            h);
-        largest = std::max(largest, std::abs(expected[k]));
-      }
-      for (int k = 0; k < field.count; ++k) {  // rounding: eps L / h, L of order one
-        ASSERT_NEAR(actual.number(field.first + k), expected[k], 1e-6 * largest + 1e-15 / std::abs(h))
-            << field.name << " " << k << " trial " << trial;
-      }
+      const auto loss_at = [&](int k, double t) {
+        Parameters<double> q = p;
+        q.number(field.first + k) += t;
+        return loss(q);
+      };
+      expect_derivatives(field, step_of(field), &actual.number(field.first), loss_at, trial);
     }
     // means2d: what moving the pixels the other way does, in units of half the image.
     const auto shifted = [&](double x, double y) {
-      Loss<F> moved = loss;
+      Loss<F, Cam> moved = loss;
       for (auto& pixel : moved.pixels) pixel = {pixel.x - x, pixel.y - y};
       return moved(p);
     };
-    const double h = 1e-3 * narrow;
+    const double h = 1e-3 * own.narrow;
     const double by_x = 32 * derivative([&](double t) { return shifted(t, 0); }, h);
     const double by_y = 24 * derivative([&](double t) { return shifted(0, t); }, h);
     ASSERT_NEAR(means2d[0], by_x, 1e-6 * std::abs(by_x) + 32e-15 / h);
     ASSERT_NEAR(means2d[1], by_y, 1e-6 * std::abs(by_y) + 32e-15 / h);
     ASSERT_EQ(means2d[2], 0);
+    if constexpr (Cam::kFull) {
+      const double* grads = reinterpret_cast<const double*>(&by_camera);
+      const double reach = 1 + std::max({std::abs(p.mean.x), std::abs(p.mean.y), std::abs(p.mean.z)});
+      const double focus = at.lens.focus, disc = loss.camera.focal.x * at.lens.aperture;
+      const double refocus =
+          1e-3 * std::min(1.0, own.narrow / std::max(disc, 1e-9)) * (orthographic ? 1 : focus * focus);
+      const auto camera_step = [&](const Field& field) {
+        return field.first < 24    ? std::min(move, turn) / reach
+               : field.first < 27  ? 1e-3 * z
+               : field.first < 31  ? turn
+               : field.first == 31 ? 1e-3 * std::max(at.lens.aperture, 0.01)
+               : field.first == 32 ? refocus
+               : field.first < 36  ? move
+               : field.first < 39  ? move / (1 + scale)
+                                   : 1e-3 * own.narrow;
+      };
+      for (const Field& field : kCameraFields) {
+        const auto loss_at = [&](int k, double t) {
+          View<double> moved = at;
+          moved.number(field.first + k) += t;
+          Loss<F, Cam> other = loss;
+          other.camera = moved.load<Cam>();
+          return other(p);
+        };
+        expect_derivatives(field, camera_step(field), grads + field.first, loss_at, trial);
+      }
+      for (int k = kFirstFixed; k < kCameraGradWidth; ++k) ASSERT_EQ(grads[k], 0) << k;
+    }
+    if (::testing::Test::HasFatalFailure()) return;
   }
   EXPECT_GE(clamped, 10);
+  if constexpr (Cam::kFull) {
+    EXPECT_GE(blurred, 20);
+  }
+}
+TYPED_TEST(ProjectTest, GradientsMatchDifferences) {
+  expect_gradients_match_differences<TypeParam, Camera<double>>(120);
+}
+TYPED_TEST(ProjectTest, GradientsOfAFullCameraMatchDifferences) {
+  expect_gradients_match_differences<TypeParam, FullCamera<double>>(160);
+}
+
+/// Compares what both cameras make of random Gaussians, there and back.
+template <class F, typename T> void expect_a_plain_lens_changes_no_bit() {
+  const View<T> at;
+  const auto plain = at.template load<Camera<T>>();
+  const auto full = at.template load<FullCamera<T>>();
+  Random random(3);
+  int drawn = 0;
+  for (int trial = 0; trial < 2000; ++trial) {
+    const double z = random.uniform(-0.5, 6), size = std::abs(z) * random.log_uniform(1e-3, 1);
+    Parameters<T> p = {};
+    p.mean = at.test.world(z * random.uniform(-1, 1), z * random.uniform(-1, 1), z);
+    p.scale = {T(size * random.uniform(0.01, 1)), T(size * random.uniform(0.01, 1)), T(size)};
+    p.rotation = {T(random.normal()), T(random.normal()), T(random.normal()), T(random.normal())};
+    p.cov3d = cov3d_of(p.rotation, p.scale);
+    p.opacity = T(random.uniform(0, 1));
+    for (auto& c : p.sh) c = {T(random.normal()), T(random.normal()), T(random.normal())};
+    const auto number = [&] { return T(random.normal()); };
+    const PairGrad<T> sums = {
+        {{number(), number()}, {number(), number(), number()}}, number(), {number(), number(), number()}};
+    const Form form = {trial % 2 == 1, trial / 2 % 5 - 1};
+    struct Result {
+      Splat<F, T> splat;
+      Parameters<T> grads;
+      T means2d[3], depth;
+      int radius, candidate;
+    };
+    const auto run = [&](const auto& camera, CameraGrad<T>* to, Result& out) {
+      std::memset(static_cast<void*>(&out), 0, sizeof out);
+      const Gaussians<T> g = p.view(form);
+      out.candidate = may_be_visible(camera, g, 0, T(0.3));
+      out.radius = project(camera, g, 0, options_of<F>(), out.splat, out.depth);
+      if (out.radius > 0 && out.splat.level > T(0))
+        project_vjp<F>(camera, g, 0, options_of<F>(), sums, out.grads.targets(form, out.means2d), to);
+    };
+    Result a, b;
+    CameraGrad<T> by_camera = {};
+    run(plain, nullptr, a);
+    run(full, &by_camera, b);
+    ASSERT_EQ(std::memcmp(&a, &b, sizeof a), 0) << trial;
+    drawn += a.radius > 0;
+  }
+  EXPECT_GT(drawn, 200);
+}
+TYPED_TEST(ProjectTest, ALensThatAsksForNothingChangesNoBit) {
+  expect_a_plain_lens_changes_no_bit<TypeParam, float>();
+  expect_a_plain_lens_changes_no_bit<TypeParam, double>();
 }
 
 template <typename T> Parameters<T> visible_gaussian() {
@@ -281,12 +434,12 @@ TYPED_TEST(ProjectTest, QuaternionsOfAnyLengthSurvive) {
   for (const float x : {none.x, none.y, none.z, none.w}) EXPECT_EQ(x, 0);
 }
 
-template <class F, typename T> void expect_culled_unless_finite() {
-  const TestCamera<T> test = test_camera<T>();
+template <class F, class Cam, typename T> void expect_culled_unless_finite(const View<T>& at) {
+  const TestCamera<T>& test = at.test;
   const auto radius = [&](const Parameters<T>& p, Form form) {
     Splat<F, T> splat = {};
     T depth;
-    const int r = project(load_camera(test.look()), p.view(form), 0, options_of<F>(), splat, depth);
+    const int r = project(at.template load<Cam>(), p.view(form), 0, options_of<F>(), splat, depth);
     EXPECT_TRUE(r > 0 || splat.level <= 0);
     return r;
   };
@@ -304,29 +457,54 @@ template <class F, typename T> void expect_culled_unless_finite() {
       }
     }
   }
-  for (const double z : {-1.0, 0.0, 0.199}) {  // the near plane is at 0.2
+  for (const double z : {-1.0, 0.0, 0.199 / kNear * at.lens.near, 1.001 * at.lens.far}) {
     Parameters<T> p = visible_gaussian<T>();
     p.mean = test.world(0, 0, z);
     EXPECT_EQ(radius(p, {false, -1}), 0) << z;
   }
 }
 TYPED_TEST(ProjectTest, CullsWhatIsNotFiniteOrBehind) {
-  expect_culled_unless_finite<TypeParam, float>();
-  expect_culled_unless_finite<TypeParam, double>();
+  expect_culled_unless_finite<TypeParam, Camera<float>>(View<float>());
+  expect_culled_unless_finite<TypeParam, Camera<double>>(View<double>());
+  Random random(4);
+  for (const bool orthographic : {false, true}) {
+    View<float> at = random_view<float>(random, kAllEffects, orthographic);
+    at.lens.near = 0.3f;
+    at.lens.far = 5;
+    expect_culled_unless_finite<TypeParam, FullCamera<float>>(at);
+  }
 }
 
-TYPED_TEST(ProjectTest, NeverKeepsWhatMayNotBeVisible) {
+// A covariance that is negative definite has a positive determinant, which a blur must not turn into a splat.
+TYPED_TEST(ProjectTest, ABlurDrawsNoNegativeCovariance) {
   using F = TypeParam;
-  const TestCamera<float> test = test_camera<float>();
-  const Camera<float> camera = load_camera(test.look());
+  View<float> at;
+  at.lens.aperture = 1;
+  at.lens.focus = 1;
+  at.lens.screen = {30, 20};
+  for (const float variance : {-1e-2f, -1e-4f, -1e-6f}) {
+    Parameters<float> p = visible_gaussian<float>();
+    p.cov3d = {variance, 0, 0, variance, 0, variance};
+    Splat<F, float> splat = {};
+    float depth;
+    EXPECT_EQ(project(at.load<FullCamera<float>>(), p.view({true, -1}), 0, options_of<F>(), splat, depth), 0);
+  }
+}
+
+/// `view_of`: the camera of a trial.
+template <class F, class Cam, class Function>
+void expect_nothing_kept_that_may_not_be_visible(const Function& view_of) {
   Random random(2);
   int kept = 0;
   for (int trial = 0; trial < 200000; ++trial) {
-    const double z = random.log_uniform(0.15, 100), size = z * random.log_uniform(1e-4, 3);
-    const auto scale = [&] { return float(size * random.log_uniform(0.01, 1) * (random.below(2) ? 1 : -1)); };
+    const View<float>& at = view_of(trial);
+    const auto camera = at.template load<Cam>();
+    const double z = random.log_uniform(0.15, 100), scale = at.lens.orthographic() ? 4 : z,
+                 size = scale * random.log_uniform(1e-4, 3);
+    const auto length = [&] { return float(size * random.log_uniform(0.01, 1) * (random.below(2) ? 1 : -1)); };
     Parameters<float> p = {};
-    p.mean = test.world(z * random.uniform(-3, 3), z * random.uniform(-3, 3), z);
-    p.scale = {scale(), scale(), scale()};
+    p.mean = at.test.world(scale * random.uniform(-3, 3), scale * random.uniform(-3, 3), z);
+    p.scale = {length(), length(), length()};
     p.rotation = {float(random.normal()), float(random.normal()), float(random.normal()), float(random.normal())};
     p.opacity = float(random.log_uniform(0.003, random.below(10) ? 1 : 50));
     const FootprintOptions options = {random.below(2) ? options_of<F>().variance : random.log_uniform(1e-3, 30)};
@@ -338,6 +516,16 @@ TYPED_TEST(ProjectTest, NeverKeepsWhatMayNotBeVisible) {
     ASSERT_TRUE(may_be_visible(camera, p.view({false, -1}), 0, blur)) << trial;
   }
   EXPECT_GT(kept, 1000);
+}
+TYPED_TEST(ProjectTest, NeverKeepsWhatMayNotBeVisible) {
+  const View<float> plain;
+  expect_nothing_kept_that_may_not_be_visible<TypeParam, Camera<float>>(
+      [&](int) -> const View<float>& { return plain; });
+  std::vector<View<float>> views;
+  Random random(5);
+  for (int k = 0; k < 64; ++k) views.push_back(random_view<float>(random, effects_of(k), random.below(3) == 0));
+  expect_nothing_kept_that_may_not_be_visible<TypeParam, FullCamera<float>>(
+      [&](int trial) -> const View<float>& { return views[trial % views.size()]; });
 }
 
 }  // namespace

@@ -15,6 +15,7 @@ template <typename T> struct Rendered {
   std::vector<T> image, grads;
   std::vector<int32_t> radii;
   int64_t pairs = 0;
+  std::vector<T> camera_grad;  ///< of a full camera: the numbers of CameraGrad
 };
 
 template <typename T> struct GradArrays {
@@ -90,8 +91,14 @@ Rendered<T> run_stages(const cpu::Stages<T>& stages, CameraView<T> camera, Gauss
                       gaussians.shs ? gaussians.n * gaussians.sh_stride : 0);
   stages.blend_vjp({splats.data(), pairs.data(), tile_offsets.data(), grid, threads, tile_samples, background,
                     transmittance.data(), last.data(), dL_dimage, nullptr, pair_grads.data(), pair_abs.data()});
+  std::vector<CameraGrad<T>> camera_grads(camera.lens ? cpu::chunks_of(gaussians.n) : 0, CameraGrad<T>{});
   stages.of(camera).project_vjp({camera, gaussians, options, threads, ids.data(), n, splat_offsets.data(),
-                                 positions.data(), pair_grads.data(), pair_abs.data(), grads.views});
+                                 positions.data(), pair_grads.data(), pair_abs.data(), grads.views,
+                                 camera.lens ? camera_grads.data() : nullptr});
+  out.camera_grad.resize(camera.lens ? kCameraGradWidth : 0);
+  for (const CameraGrad<T>& chunk : camera_grads) {
+    for (int k = 0; k < kCameraGradWidth; ++k) out.camera_grad[k] += reinterpret_cast<const T*>(&chunk)[k];
+  }
   out.grads = std::move(grads.all);
   return out;
 }

@@ -86,13 +86,25 @@ inline Vec2<double> on_circle(double radius, double angle) {
   return {radius * std::cos(angle), radius * std::sin(angle)};
 }
 
-/// Matrices of a camera turned about x and y, moved, and with its principal point off the centre.
+/// A lens that asks for nothing.
+template <typename T> Lens<T> plain_lens(T tan_x, T tan_y) {
+  Lens<T> lens = {};
+  lens.tan_half_fov = {tan_x, tan_y};
+  lens.focus = T(1);
+  lens.near = T(kNear);
+  lens.far = std::numeric_limits<T>::infinity();
+  return lens;
+}
+
+/// Matrices of a camera turned about x and y, moved, and with its principal point off the centre. `fov_tan` of an
+/// orthographic one is half its width in world units.
 template <typename T> struct TestCamera {
   int width, height;
   T tan_x, tan_y;
   T view[16], proj[16], position[3];
 
-  TestCamera(int w, int h, double fov_tan, Vec3<double> turn_and_shift, Vec2<double> principal)
+  TestCamera(int w, int h, double fov_tan, Vec3<double> turn_and_shift, Vec2<double> principal,
+             bool orthographic = false)
       : width(w), height(h), tan_x(T(fov_tan)), tan_y(T(fov_tan * h / w)) {
     const double a = turn_and_shift.x, b = turn_and_shift.y, shift = turn_and_shift.z;
     const double near = 0.01, far = 100;
@@ -100,10 +112,11 @@ template <typename T> struct TestCamera {
                             {std::sin(a) * std::sin(b), std::cos(a), -std::sin(a) * std::cos(b), -shift},
                             {-std::cos(a) * std::sin(b), std::sin(a), std::cos(a) * std::cos(b), 0.5 * shift},
                             {0, 0, 0, 1}};
-    const double p[4][4] = {{1 / double(tan_x), 0, principal.x, 0},
-                            {0, 1 / double(tan_y), principal.y, 0},
+    const double by_z = orthographic ? 0 : 1, by_one = 1 - by_z;  // what takes the principal point away, and w
+    const double p[4][4] = {{1 / double(tan_x), 0, by_z * principal.x, by_one * principal.x},
+                            {0, 1 / double(tan_y), by_z * principal.y, by_one * principal.y},
                             {0, 0, far / (far - near), -far * near / (far - near)},
-                            {0, 0, 1, 0}};
+                            {0, 0, by_z, by_one}};
     for (int r = 0; r < 4; ++r) {
       for (int c = 0; c < 4; ++c) {
         double sum = 0;
@@ -115,7 +128,11 @@ template <typename T> struct TestCamera {
     for (int c = 0; c < 3; ++c) position[c] = T(-(m[0][c] * m[0][3] + m[1][c] * m[1][3] + m[2][c] * m[2][3]));
   }
 
-  CameraView<T> look() const { return {view, proj, position, width, height, tan_x, tan_y}; }
+  CameraView<T> look() const { return {view, proj, position, width, height, tan_x, tan_y, nullptr}; }
+  /// Through a lens, which must outlive what is returned.
+  CameraView<T> look(const Lens<T>& lens) const {
+    return {view, proj, position, width, height, tan_x, tan_y, reinterpret_cast<const T*>(&lens)};
+  }
 
   /// The world point at camera-space x, y, z.
   Vec3<T> world(double x, double y, double z) const {
