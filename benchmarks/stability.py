@@ -31,7 +31,7 @@ GRADIENTS = ("means3D", "opacities", "colours", "scales", "rotations", "covarian
 UNBOUNDED = ({"frame_gradient": "paper"}, {"dilation": 0.0})
 COLUMNS = {"shs": "colours", "colors_precomp": "colours", "cov3D_precomp": "covariance"}
 # What a full camera has gradients by (hard_cases.with_camera_leaves).
-CAMERA = "viewmatrix projmatrix campos tanfovx tanfovy aperture focus velocity screen_velocity"
+CAMERA = "viewmatrix projmatrix campos tanfovx tanfovy aperture focus velocity angular_velocity screen_velocity"
 COLUMNS |= dict.fromkeys(CAMERA.split(), "camera")
 
 

@@ -299,6 +299,7 @@ def mixed_opacities(n):
 
 # --- a full camera: blur, other planes, other projections ------------------------------------------
 
+VELOCITIES = ("velocity", "angular_velocity", "screen_velocity")
 DEPTHS = [2, 2.1, 2.2, 2.3, 2.4]
 DIAGONAL = (math.cos(0.4), math.sin(0.4))
 
@@ -314,8 +315,8 @@ def travel(length):
 
 
 def spun_needles(ratio):
-    """Along a streak at 0.4 rad, across it, at 1e-3 rad from it and between; where they are crossed as wide as 0.1 px:
-    else nothing of them would be left."""
+    """Along a streak at 0.4 rad, across it, at 1e-3 rad from it and between. Those that it crosses are 0.1 px wide:
+    of narrower ones nothing would be left."""
 
     def build():
         long = tensor(30, 1000, 30, 0.1 * ratio, 300)
@@ -486,15 +487,16 @@ def settings_of(camera, dtype, like, variant, device="cpu", effects=None):
     fields = camera.fields(like)
     fields = {k: v.to(device, dtype) if torch.is_tensor(v) else v for k, v in fields.items()}
     if effects is not None:
-        number = torch.as_tensor  # rounded likewise
-        fields |= {k: number(fields[k], dtype=like).to(device, dtype) for k in ("tanfovx", "tanfovy")}
+
+        def number(value):
+            return None if value is None else torch.as_tensor(value, dtype=like).to(device, dtype)
+
+        fields |= {k: number(fields[k]) for k in ("tanfovx", "tanfovy")}
         lens, motion = effects.defocus, effects.motion
         if lens is not None:
-            lens = Defocus(*(number(v, dtype=like).to(device, dtype) for v in (lens.aperture, lens.focus)))
+            lens = Defocus(number(lens.aperture), number(lens.focus))
         if motion is not None:
-            speeds = (motion.velocity, motion.angular_velocity, motion.screen_velocity)
-            speeds = (None if v is None else number(v, dtype=like).to(device, dtype) for v in speeds)
-            motion = Motion(motion.exposure, *speeds)
+            motion = Motion(motion.exposure, *(number(getattr(motion, name)) for name in VELOCITIES))
         effects = replace(effects, defocus=lens, motion=motion, camera_gradients=True)
     return ar.GaussianRasterizationSettings(**fields, footprint=variant[0], **variant[1], effects=effects)
 
@@ -526,7 +528,7 @@ def with_camera_leaves(settings):
         return settings, {}
     fields = {k: getattr(settings, k) for k in ("viewmatrix", "projmatrix", "campos", "tanfovx", "tanfovy")}
     lens = {k: getattr(effects.defocus, k) for k in ("aperture", "focus")} if effects.defocus else {}
-    moved = {k: getattr(effects.motion, k) for k in ("velocity", "screen_velocity")} if effects.motion else {}
+    moved = {k: getattr(effects.motion, k) for k in VELOCITIES} if effects.motion else {}
     made = [
         {k: v.detach().clone().requires_grad_() for k, v in some.items() if v is not None}
         for some in (fields, lens, moved)

@@ -320,28 +320,27 @@ template <typename T>
 AR_HD Blur<T> seen_covariance_vjp(const SplatGrad<T>& grad, const BlurContext<Blur<T>, T>& context) {
   const Vec2<T>& b = context.blur.streak;
   const Cov2d<T>& all = context.cov.all;
-  const T v = context.blur.variance;
+  const T v = context.blur.variance, u = grad.variance;
   const Vec2<T> pull = {context.cov.pull.x + v * b.x, context.cov.pull.y + v * b.y};  // adj(Sigma') b
+  // What the footprint gives across a thin needle, g.yy, may cancel the amplitude. w^T w = (Sigma' + u I)^-1 is known
+  // without w, so that both multiply the same numbers; what remains is taken in whitened coordinates, as its entries
+  // cancel for a needle along the streak.
+  const Cov2d<T> seen = blur(all, u);
+  const T own = grad.dL_dwhite.yy / seen.det, inv = context.weighted / all.det;
   SplatGrad<T> rest = grad;
-  Sym2<T>& g = rest.dL_dwhite;
-  T weight = -context.weighted;
-  if (!grad.triangular) {
-    // Here w^T w = Sigma'^-1. Across a thin needle g.yy and the amplitude cancel, so they meet before it comes in.
-    weight += T(2) * g.yy;
-    g = {g.xx - g.yy, g.xy, T(0)};
-  }
+  rest.dL_dwhite = {grad.dL_dwhite.xx - grad.dL_dwhite.yy, grad.dL_dwhite.xy, T(0)};
+  const Sym2<T>& g = rest.dL_dwhite;
   const Sym2<T> by_all = cov_grad(all, rest);
-  // by_all b: in whitened coordinates, as its entries cancel for a needle along the streak.
   const Vec2<T> z = transform(grad.w, b);
-  Vec2<T> by_b = transform_transposed(grad.w, Vec2<T>{g.xx * z.x + g.xy * z.y, g.xy * z.x + g.yy * z.y});
+  Vec2<T> by_b = transform_transposed(grad.w, Vec2<T>{g.xx * z.x + g.xy * z.y, g.xy * z.x});
   if (grad.dL_dlog_amp != T(0)) {
-    const T u = grad.variance, scale = T(0.5) * grad.dL_dlog_amp * u / blur(all, u).det;
+    const T scale = T(0.5) * grad.dL_dlog_amp * u / seen.det;
     by_b = by_b + Vec2<T>{scale * (((all.yy + u) * pull.x - all.xy * pull.y) / all.det),
                           scale * (((all.xx + u) * pull.y - all.xy * pull.x) / all.det)};
   }
-  const T inv = weight / all.det;
-  return {{T(2) * by_b.x + inv * pull.x, T(2) * by_b.y + inv * pull.y},
-          by_all.xx + by_all.yy + T(0.5) * inv * (all.xx + all.yy)};
+  return {{T(2) * (by_b.x + own * (pull.x + u * b.x)) - inv * pull.x,
+           T(2) * (by_b.y + own * (pull.y + u * b.y)) - inv * pull.y},
+          by_all.xx + by_all.yy + own * (seen.xx + seen.yy) - T(0.5) * inv * (all.xx + all.yy)};
 }
 
 /// Colour of Gaussian i, whose coefficients are `sh`. False if it is not finite.
