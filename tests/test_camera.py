@@ -497,6 +497,14 @@ def test_wrong_arguments(error, message, make):
         make()
 
 
+def test_a_lens_that_is_not_finite_raises():
+    """As a camera does; on CUDA only with debug, because it would have to be waited for."""
+    scene = scenes.random_scene(1, 5, degree=1)
+    effects = ar.Effects(defocus=ar.Defocus(torch.tensor(float("nan")), 3.0))
+    with pytest.raises(ValueError, match=r"lens must be finite, got nan at \(4,\)"):
+        ar.GaussianRasterizer(CAMERA.settings(effects=effects))(**scene)
+
+
 def test_settings_with_effects_copy_and_pickle():
     import copy
     import pickle

@@ -197,6 +197,8 @@ void Inputs::check_camera() const {
   check_finite(viewmatrix, "viewmatrix");
   check_finite(projmatrix, "projmatrix");
   check_finite(campos, "campos");
+  // Up to far, which may be infinite.
+  if (lens) check_finite(lens->narrow(0, 0, offsetof(Lens<float>, far) / sizeof(float)), "lens");
 }
 
 }  // namespace ar::ops
