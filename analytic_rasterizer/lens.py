@@ -37,7 +37,7 @@ def make_lens(effects: Effects, settings, like: torch.Tensor) -> torch.Tensor:
         tangents = (float(t) for t in tangents)
     center = (0.0, 0.0)
     if effects.off_center:
-        center = (_view_center(settings.viewmatrix, settings.projmatrix, effects.camera_gradients),)
+        center = (view_center(settings.viewmatrix, settings.projmatrix, effects.camera_gradients),)
     defocus, motion = effects.defocus or Defocus(0.0, 1.0), effects.motion or Motion(0.0)
     moved = [
         _times(motion.exposure, value, length)
@@ -81,7 +81,7 @@ def _times(exposure, velocity, length: int):
     return [exposure * v for v in velocity]
 
 
-def _view_center(view: torch.Tensor, proj: torch.Tensor, with_gradient: bool) -> torch.Tensor:
+def view_center(view: torch.Tensor, proj: torch.Tensor, with_gradient: bool) -> torch.Tensor:
     """(2,) x/z and y/z in the middle of the picture: where clip_x = p_xx x + p_xz z is zero."""
     view, proj = view.reshape(4, 4)[:3, :3], proj.reshape(4, 4)[:3, :2]  # columns, of the world's coordinates
     if not with_gradient:

@@ -20,6 +20,7 @@ from . import io, measure, report
 from .effects import NEAR, Effects, depths
 from .filters import apply_3d_filter, compute_3d_filter, sampling_interval
 from .harmonics import needed_sh_degree, sh_band_bounds
+from .lens import view_center
 from .ops import TILE
 from .rasterizer import (
     GaussianRasterizationSettings,
@@ -416,9 +417,9 @@ def _is_orthographic(camera: GaussianRasterizationSettings) -> bool:
 
 def _is_off_center(camera: GaussianRasterizationSettings) -> bool:
     """Whether an edge of the picture is more than CLAMP half pictures away from the optical axis."""
-    view, proj = (m.detach().reshape(4, 4).double() for m in (camera.viewmatrix, camera.projmatrix))
-    from_camera = torch.linalg.solve(view, proj)  # transposed, as both are
-    return (1 + (from_camera[2, :2] / from_camera[2, 3]).abs().max() > CLAMP + 1e-6).item()
+    center = view_center(camera.viewmatrix.double(), camera.projmatrix.double(), with_gradient=False)
+    tangents = center.new_tensor([float(camera.tanfovx), float(camera.tanfovy)])
+    return (1 + (center / tangents).abs().max() > CLAMP + 1e-6).item()
 
 
 # ------------------------------------------------------------------------------------- rendering
