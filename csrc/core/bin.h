@@ -1,7 +1,8 @@
 // Which pixels and tiles a splat can touch: exact extents of its support ellipse.
 #pragma once
 
-#include "core/params.h"
+#include "core/footprint/registry.h"
+#include "core/stages.h"
 
 namespace ar {
 
@@ -28,6 +29,29 @@ template <typename T> AR_HD Support<T> make_support(Vec2<T> mean, const Mat2<T>&
 
 template <class F, typename T> AR_HD Support<T> support_of(const Splat<F, T>& splat) {
   return make_support(splat.mean, F::ellipse(splat.shape), splat.level, T(F::kReach));
+}
+
+/// Copies a shape into or out of a row whose footprint is known at run time.
+template <class F, typename T> AR_HD void set_shape(SplatRow<T>& row, const typename F::template Shape<T>& shape) {
+  static_assert(sizeof shape == sizeof row.shape, "a Shape is an aggregate of kShapeWidth numbers");
+  memcpy(row.shape, &shape, sizeof shape);
+}
+template <class F, typename T> AR_HD typename F::template Shape<T> shape_of(const SplatRow<T>& row) {
+  typename F::template Shape<T> shape;
+  memcpy(&shape, row.shape, sizeof shape);
+  return shape;
+}
+
+/// The support of a splat whose footprint is at place `footprint` of the registry.
+template <typename T> AR_HD Support<T> support_of(const SplatRow<T>& row, int footprint) {
+  Mat2<T> w = {};
+  T reach = T(0);
+  visit_footprint(footprint, Footprints{}, [&](auto f) {
+    using F = decltype(f);
+    w = F::ellipse(shape_of<F>(row));
+    reach = T(F::kReach);
+  });
+  return make_support(row.mean, w, row.level, reach);
 }
 
 /// Closed interval of pixel coordinates; empty where hi < lo.

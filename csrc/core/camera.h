@@ -8,7 +8,7 @@
 
 #include "core/defocus.h"
 #include "core/motion.h"
-#include "core/params.h"
+#include "core/stages.h"
 
 namespace ar {
 

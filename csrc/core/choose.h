@@ -9,7 +9,7 @@
 #pragma once
 
 #include "core/footprint/adaptive.h"
-#include "core/params.h"
+#include "core/stages.h"
 
 namespace ar {
 

@@ -28,10 +28,6 @@ inline constexpr double kPixelVariance = 1.0 / 12.0;
 /// the level (7e-3 for a needle 1000 px long, docs/numerics.md), so rounding never drops a pair.
 inline constexpr double kLevelSlack = 1e-2;
 
-/// No support ellipse of opacity 1 has a higher level: 2 ln 255 + 6.1, the most a footprint adds to
-/// it (analytic), + the slack. It exceeds the 9 of 3DGS's radius.
-inline constexpr double kMaxLevel = 17.3;
-
 /// A splat is culled where det Sigma [px^4] is not below this, so that nothing derived from it
 /// overflows a float: standard deviations up to 3e7 px pass.
 inline constexpr double kMaxDet = 1e30;

@@ -11,7 +11,7 @@ inline constexpr double kWeightUnit = 1.0 / (int64_t(1) << 32);
 template <typename T> AR_HD int64_t weight_units(T weight) { return int64_t(double(weight) / kWeightUnit + 0.5); }
 
 /// Composites the splats of a pixel front to back, and remembers two of them.
-template <typename T, int S> struct PixelLook {
+template <typename T, int S> struct PixelSummary {
   T transmittance[S];
   T largest = T(0);
   int32_t dominant = -1;  ///< the splat of the largest weight, of equal ones the nearest

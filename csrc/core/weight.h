@@ -6,7 +6,7 @@
 namespace ar {
 
 /// Arguments of footprint_weight and its adjoint, elementwise.
-template <typename T> struct WeightTask {
+template <typename T> struct WeightParams {
   int64_t n;
   FootprintOptions options;
   const Vec2<T>* offsets;

@@ -18,6 +18,7 @@ template <int S> struct AdaptiveBox : GaussianFootprint<S, true> {
   template <typename T> using Shape = AdaptiveShape<T>;
 
   AR_HD static double radius_variance(FootprintOptions) { return kPixelVariance; }
+  AR_HD static double support_variance(FootprintOptions) { return kPixelVariance; }
 
   template <typename T> AR_HD static Shape<T> prepare(Cov2d<T> cov, FootprintOptions) { return {cov, sqrt(cov.det)}; }
 
@@ -98,6 +99,7 @@ using AdaptiveBoxesVjp = FootprintList<AdaptiveBoxVjp<16>, AdaptiveBoxVjp<8>, Ad
 
 struct Adaptive : AdaptiveBoxVjp<16> {
   static constexpr const char* kName = "adaptive";
+  static constexpr Option kOption = {"tolerance", nullptr, 1.0 / 255};
 
   /// Ellipse and level reach at least as far as those of every S: one sample has the largest variance,
   /// sixteen have the largest amplitude and reach.

@@ -95,10 +95,12 @@ enum class FrameGradient {
 };
 
 /// I = 2 pi s1 s2 F(u / s1) F(v / s2), (u, v) = d in the eigenframe of Sigma. |S - CDF| < 4e-4.
-template <FrameGradient kFrame> struct Analytic : PlainSums {
-  static constexpr const char* kName = kFrame == FrameGradient::kFrozen ? "analytic" : "analytic_paper";
-  static constexpr int kSamples = 1;
-  static constexpr double kReach = 0;
+template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
+  static constexpr const char* kName = "analytic";
+  static constexpr const char* kKey = kFrame == FrameGradient::kFrozen ? "analytic" : "analytic_paper";
+  static constexpr Option kOption = {"frame_gradient", kFrame == FrameGradient::kFrozen ? "frozen" : "paper", 0,
+                                     kFrame == FrameGradient::kFrozen};
+  static constexpr double kExtraLevel = 6.1;  // see level(): both w^2 are at most 12
 
   template <typename T> struct Shape {
     Vec2<T> inv_sigma;  ///< 1 / standard deviations along the major and the minor axis [1/px]
@@ -114,6 +116,7 @@ template <FrameGradient kFrame> struct Analytic : PlainSums {
   };
 
   AR_HD static double radius_variance(FootprintOptions) { return 0; }
+  AR_HD static double support_variance(FootprintOptions) { return kPixelVariance; }
 
   /// Deviates: [AS, Eq. 2] takes eigenvectors that are 0/0 for a diagonal Sigma with S11 > S22, and
   /// the smaller eigenvalue as a difference. Here the half angle and l2 = det / l1.
@@ -194,7 +197,7 @@ template <FrameGradient kFrame> struct Analytic : PlainSums {
     const T gap = eigenvalue_gap(cov);
     const T turn = kFrame == FrameGradient::kFrozen ? T(1) : (gap > T(0) ? T(1) / (gap * r.x * r.y) : T(0));
     const Sym2<T> white = {T(0.5) * sums.shape.xx, T(0.5) * sums.shape.xy * turn, T(0.5) * sums.shape.yy};
-    return {transform_transposed(mean_map(g), sums.offset), scaled_frame(g), white, T(0), T(0), false};
+    return {transform_transposed(mean_map(g), sums.offset), scaled_frame(g), white, T(0), T(0), GradFrame::kAxes};
   }
 
  private:

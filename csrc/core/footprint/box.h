@@ -5,18 +5,19 @@
 
 namespace ar {
 
-template <int S> inline constexpr const char* kBoxName = nullptr;
-template <> inline constexpr const char* kBoxName<1> = "box1";
-template <> inline constexpr const char* kBoxName<2> = "box2";
-template <> inline constexpr const char* kBoxName<4> = "box4";
-template <> inline constexpr const char* kBoxName<8> = "box8";
-template <> inline constexpr const char* kBoxName<16> = "box16";
+/// "box1" ... "box16", behind which stands the number of samples alone.
+template <int S> struct BoxKey {
+  static constexpr char kText[] = {'b', 'o', 'x', S >= 10 ? '1' : char('0' + S), S >= 10 ? char('0' + S % 10) : '\0', '\0'};
+};
 
 /// S equal Gaussians at the nodes of box_node<S>. The pixel's colour is the mean over the samples.
 template <int S> struct Box : GaussianFootprint<S, true> {
-  static constexpr const char* kName = kBoxName<S>;
+  static constexpr const char* kName = "box";
+  static constexpr const char* kKey = BoxKey<S>::kText;
+  static constexpr Option kOption = {"samples", BoxKey<S>::kText + 3, 0, S == 4};
 
   AR_HD static double radius_variance(FootprintOptions) { return kPixelVariance; }
+  AR_HD static double support_variance(FootprintOptions) { return kBoxVariance<S>; }
 
   template <typename T> AR_HD static GaussianShape<T> prepare(Cov2d<T> cov, FootprintOptions) {
     return GaussianFootprint<S, true>::prepare_with(cov, T(kBoxVariance<S>));

@@ -1,31 +1,41 @@
 // What a footprint is: the model that turns a projected Gaussian into its weight I in a pixel.
 //
-// A footprint F is a struct of static functions:
+// A footprint F is a struct of static functions and constants, and a line in registry.h. Nothing else in the project
+// names it. FootprintDefaults has what most share.
 //
-//   kName                                key in the registry: the public name and what its options fix
-//   kSamples                             samples of a pixel, each with its own transmittance
-//   kReach                               largest |coordinate| of a sample's node [px]
-//   Shape<T>                             what a splat carries; an aggregate of five T, which leave a Splat
-//                                        no padding: arrays of splats are matrices that torch sees
-//   prepare(Cov2d<T>, FootprintOptions)  -> Shape<T>            once per splat
+//   kName                                what users call it: "box"
+//   kKey                                 its own key: "box4"; by default the name. Footprints of one name differ in an option
+//   kOption                              the option that users may set, see Option; by default none
+//   kYardstick                           true: meant to compare others with; compiled for one instruction set. Default false
+//   Pixels                               a type with the same Shape, terms, alpha, adjoint, ellipse and samples, for which
+//                                        blending is compiled instead, once for all that name it. Default: F
+//   kSamples                             samples of a pixel, each with its own transmittance. Default 1
+//   kReach                               largest |coordinate| of a sample's node [px]. Default 0
+//   kExtraLevel                          no support ellipse has a level above 2 ln(255 opacity) + kExtraLevel. Default 0
+//   support_variance(FootprintOptions)   no support ellipse is wider than that of Sigma + this times I [px^2]
 //   radius_variance(FootprintOptions)    variance added to Sigma for the radius that 3DGS reports [px^2]
+//   Shape<T>                             what a splat carries: an aggregate of kShapeWidth numbers T
+//   prepare(Cov2d<T>, FootprintOptions)  -> Shape<T>            once per splat
 //   ellipse(Shape<T>) -> Mat2<T>         w, and
-//   level(Shape<T>, opacity) -> T        such that opacity * I(d + node) < 1/255 wherever
-//                                        |w (d + node)|^2 > level; level <= 0 where it holds everywhere
-//   terms(Shape<T>, opacity, Vec2<T> origin) -> Terms<T>    numbers that all pixels share, derived per
+//   level(Shape<T>, opacity) -> T        such that opacity * I(d + node) < 1/255 wherever |w (d + node)|^2 > level;
+//                                        level <= 0 where that holds everywhere
+//   terms(Shape<T>, opacity, Vec2<T> origin) -> Terms<T>    numbers that all pixels share, derived once per
 //                                        (tile, splat); origin = a point of the tile - mean [px], by default 0
 //   alpha(Terms<T>, Vec2<V> p, s) -> V   opacity * I at sample s; p = pixel centre - that point [px]
 //   add_alpha_vjp(Terms<T>, p, s, alpha, dL_dalpha, ShapeGrad<V>& sums)    per pixel: plain products
 //   mean_map(Shape<T>) -> Mat2<T>        m with dL/dmean = m^T sums.offset [dL/dpx]
-//   collect(Terms<T>, ShapeGrad<T> sums, weighted) -> ShapeGrad<T>    per (tile, splat), linear: what is
-//                                        added up over tiles; PlainSums leaves the sums as they are
+//   collect(Terms<T>, ShapeGrad<T> sums, weighted) -> ShapeGrad<T>    per (tile, splat), linear: what is added up over
+//                                        tiles. Default: the sums as they are
 //   prepare_vjp(Cov2d<T>, Shape<T>, ShapeGrad<T> sums, weighted, FootprintOptions) -> SplatGrad<T>
 //                                        once per splat
 //
-// T is float or double, V a scalar or a pack of lanes (lanes.h). The five numbers of ShapeGrad are
-// summed over pixels and samples in whatever coordinates make them cheap; prepare_vjp gives them
-// meaning. `weighted` is the sum of alpha dL_dalpha, which the gradient of the opacity needs anyway.
+// T is float or double, V a scalar or a pack of lanes (lanes.h). The five numbers of ShapeGrad are summed over pixels and
+// samples in whatever coordinates make them cheap; prepare_vjp gives them meaning. `weighted` is the sum of
+// alpha dL_dalpha, which the gradient with respect to the opacity needs anyway.
 #pragma once
+
+#include <cstddef>
+#include <type_traits>
 
 #include "core/constants.h"
 #include "core/vec.h"
@@ -51,10 +61,27 @@ template <typename T> AR_HD T eigenvalue_gap(Cov2d<T> c) {
 
 template <class... F> struct FootprintList {};
 
-/// Run-time options. What changes the code of a pixel is a template parameter instead.
+/// Numbers of a footprint's Shape.
+inline constexpr int kShapeWidth = 5;
+
+/// The number that a footprint takes at run time: `dilation` of point, `variance` of mip [px^2], `tolerance` of adaptive.
+/// What changes the code of a pixel is a template parameter instead.
 struct FootprintOptions {
-  double variance;       ///< `dilation` of point, `variance` of mip [px^2]; others ignore it
-  double tolerance = 0;  ///< of adaptive; others ignore it
+  double number;
+};
+
+/// A footprint of the registry, by its place there, and its options.
+struct FootprintChoice {
+  int index;
+  FootprintOptions options;
+};
+
+/// The option of a footprint: a number that it takes at run time, or a value that tells it from its namesakes.
+struct Option {
+  const char* name = nullptr;   ///< null: there is no option
+  const char* value = nullptr;  ///< what the option must be for this footprint; null: a number, FootprintOptions
+  double number = 0;            ///< its default
+  bool is_default = true;       ///< of the namesakes, the one taken where the option is not given
 };
 
 /// Five sums over pixels; see prepare_vjp of each footprint.
@@ -66,26 +93,44 @@ template <class V> AR_HD ShapeGrad<V> operator+(ShapeGrad<V> a, ShapeGrad<V> b) 
   return {a.offset + b.offset, a.shape + b.shape};
 }
 
-/// Base of the footprints whose sums over a tile can be added up as they are.
-struct PlainSums {
+/// What most footprints have in common.
+struct FootprintDefaults {
+  using Pixels = void;  // the footprint itself
+  static constexpr std::nullptr_t kKey = nullptr;  // the name
+  static constexpr Option kOption = {};
+  static constexpr bool kYardstick = false;
+  static constexpr int kSamples = 1;
+  static constexpr double kReach = 0, kExtraLevel = 0;
+
   template <class Terms, typename T> AR_HD static ShapeGrad<T> collect(const Terms&, const ShapeGrad<T>& sums, T) {
     return sums;
   }
 };
 
+/// What blending is compiled for.
+template <class F>
+using PixelsOf = std::conditional_t<std::is_void_v<typename F::Pixels>, F, typename F::Pixels>;
+
+/// What is known about the w of a SplatGrad.
+enum class GradFrame {
+  kTriangular,  ///< w is whiten(Sigma + variance I), up to signs
+  kAxes,        ///< its rows are the axes of Sigma over their standard deviations
+  kPixels,      ///< it is the identity: dL_dwhite is the gradient with respect to Sigma itself
+};
+
 /// Gradient of one splat. dL = dL_dmean . dmean + tr(dL_dwhite w dSigma w^T) + dL_dlog_amp d(log amp),
 /// amp = sqrt(det Sigma / det(Sigma + variance I)). Both parts stay in factors until they meet those of Sigma
-/// (project.h): the sum w^T dL_dwhite w cancels for needles, and d(log amp), a difference of inverses, for
+/// (covariance.h): the sum w^T dL_dwhite w cancels for needles, and d(log amp), a difference of inverses, for
 /// splats much wider than a pixel, where it vanishes.
 template <typename T> struct SplatGrad {
   Vec2<T> dL_dmean;
   Mat2<T> w;
   Sym2<T> dL_dwhite;
   T dL_dlog_amp, variance;
-  bool triangular;  ///< w is whiten(Sigma + variance I), up to signs; else its rows are the axes of Sigma
+  GradFrame frame;
 };
 
-/// Gradient of log amp by Sigma: (Sigma^-1 - Sigma'^-1) / 2 = v adj(Sigma) adj(Sigma') / (2 det det'), whose
+/// Gradient of log amp with respect to Sigma: (Sigma^-1 - Sigma'^-1) / 2 = v adj(Sigma) adj(Sigma') / (2 det det'), whose
 /// terms do not cancel.
 template <typename T> AR_HD Sym2<T> log_amp_grad(Cov2d<T> c, T v) {
   const T scale = T(0.5) * v / blur(c, v).det, square = c.xy * c.xy;
@@ -93,7 +138,7 @@ template <typename T> AR_HD Sym2<T> log_amp_grad(Cov2d<T> c, T v) {
           scale * ((c.xx * (c.xx + v) + square) / c.det)};
 }
 
-/// All of the gradient by Sigma, as one matrix: for a Sigma that is known by its entries only.
+/// All of the gradient with respect to Sigma, as one matrix: for a Sigma that is known by its entries only.
 template <typename T> AR_HD Sym2<T> cov_grad(Cov2d<T> c, const SplatGrad<T>& grad) {
   const Sym2<T> g = congruence_transposed(grad.w, grad.dL_dwhite);
   if (grad.dL_dlog_amp == T(0)) return g;  // det Sigma may be zero

@@ -51,10 +51,9 @@ template <typename T> struct CumulantAxis {
   template <class V> AR_HD V inner(V P) const { return madd(P, quartic(P), V(-linear)); }
 };
 
-struct Cumulant : PlainSums {
+struct Cumulant : FootprintDefaults {
   static constexpr const char* kName = "cumulant";
-  static constexpr int kSamples = 1;
-  static constexpr double kReach = 0;
+  static constexpr double kExtraLevel = 2.4;  // see level(): both a and c are at most 12
   static constexpr double kOrder4 = 1.0 / 2880;
   template <typename T> using Shape = GaussianShape<T>;
 
@@ -66,6 +65,7 @@ struct Cumulant : PlainSums {
   };
 
   AR_HD static double radius_variance(FootprintOptions) { return kPixelVariance; }
+  AR_HD static double support_variance(FootprintOptions) { return kPixelVariance; }
 
   template <typename T> AR_HD static Shape<T> prepare(Cov2d<T> cov, FootprintOptions) {
     const Cov2d<T> blurred = blur(cov, T(kPixelVariance));

@@ -8,10 +8,10 @@ namespace ar {
 
 /// I = 2 pi s1 s2 [Phi]_u [Phi]_v, [Phi]_u = Phi((u + 1/2) / s1) - Phi((u - 1/2) / s1), (u, v) = d in
 /// the eigenframe of Sigma. The adjoint holds the frame fixed, as that of `analytic` does by default.
-struct Erf : PlainSums {
+struct Erf : FootprintDefaults {
   static constexpr const char* kName = "erf";
-  static constexpr int kSamples = 1;
-  static constexpr double kReach = 0;
+  static constexpr bool kYardstick = true;
+  static constexpr double kExtraLevel = 2 * box_excess(1 / kPixelVariance);
 
   /// Standard deviations below this [px] are raised to it, so that their reciprocals stay finite.
   static constexpr double kMinSigma = 1e-9;
@@ -29,6 +29,7 @@ struct Erf : PlainSums {
   };
 
   AR_HD static double radius_variance(FootprintOptions) { return 0; }
+  AR_HD static double support_variance(FootprintOptions) { return kPixelVariance; }
 
   template <typename T> AR_HD static Shape<T> prepare(Cov2d<T> cov, FootprintOptions) {
     const Eigenframe<T> frame = eigenframe(cov);
@@ -76,7 +77,7 @@ struct Erf : PlainSums {
 
   template <typename T>
   AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& g, ShapeGrad<T> sums, T, FootprintOptions) {
-    return moments_vjp(mean_map(g), sums, false);
+    return moments_vjp(mean_map(g), sums, GradFrame::kAxes);
   }
 
  private:

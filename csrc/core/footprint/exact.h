@@ -13,10 +13,10 @@ namespace ar {
 /// z.x depends on one image axis alone, that of the larger variance; along it z.y falls at the rate
 /// `tilt`. Where the other axis is wide, given this one, a product rule over the pixel; else the
 /// other axis in closed form, and this one cut where the pixel's edges cross the Gaussian's ridge.
-struct Exact : PlainSums {
+struct Exact : FootprintDefaults {
   static constexpr const char* kName = "exact";
-  static constexpr int kSamples = 1;
-  static constexpr double kReach = 0;
+  static constexpr bool kYardstick = true;
+  static constexpr double kExtraLevel = 2 * box_excess(1 / kPixelVariance);
 
   /// w: as of whiten(), the sign of its first row chosen so that tilt >= 0. amp: of the Gaussian of
   /// Sigma + I/12 that bounds the weight.
@@ -33,6 +33,7 @@ struct Exact : PlainSums {
   };
 
   AR_HD static double radius_variance(FootprintOptions) { return kPixelVariance; }
+  AR_HD static double support_variance(FootprintOptions) { return kPixelVariance; }
 
   template <typename T> AR_HD static Shape<T> prepare(Cov2d<T> cov, FootprintOptions) {
     Mat2<T> w = whiten(cov);
@@ -78,7 +79,7 @@ struct Exact : PlainSums {
 
   template <typename T>
   AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& g, ShapeGrad<T> sums, T, FootprintOptions) {
-    return moments_vjp(g.w, sums, true);
+    return moments_vjp(g.w, sums, GradFrame::kTriangular);
   }
 
  private:

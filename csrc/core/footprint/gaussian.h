@@ -39,7 +39,7 @@ template <typename T> AR_HD SplatGrad<T> gaussian_vjp(const Mat2<T>& w, ShapeGra
   // With kBase2 = 1: d log I = z.w dmu + tr(z z^T w dSigma w^T)/2 + d log amp
   const T half = T(0.5 / (kBase2 * kBase2));
   const Sym2<T> white = {half * sums.shape.xx, half * sums.shape.xy, half * sums.shape.yy};
-  return {transform_transposed(T(1 / kBase2) * w, sums.offset), w, white, weighted, variance, true};
+  return {transform_transposed(T(1 / kBase2) * w, sums.offset), w, white, weighted, variance, GradFrame::kTriangular};
 }
 
 /// Variance of each of the S Gaussians of the box footprint [px^2].
@@ -76,8 +76,8 @@ template <int S> constexpr double box_reach() {
   return reach;
 }
 
-/// S Gaussians that stand for one pixel. kCompensated: the amplitude keeps the mass of the splat.
-template <int S, bool kCompensated> struct GaussianFootprint : PlainSums {
+/// S Gaussians that stand for one pixel: all that blending has to know, whatever the covariance was widened by.
+template <int S> struct GaussianPixels : FootprintDefaults {
   static constexpr int kSamples = S;
   static constexpr double kReach = box_reach<S>();
   template <typename T> using Shape = GaussianShape<T>;
@@ -87,11 +87,6 @@ template <int S, bool kCompensated> struct GaussianFootprint : PlainSums {
     T log_peak;       ///< log2(opacity * amp)
     Vec2<T> node[S];  ///< each sample's node in whitened coordinates, seen from the mean
   };
-
-  template <typename T> AR_HD static Shape<T> prepare_with(Cov2d<T> cov, T variance) {
-    const Cov2d<T> blurred = blur(cov, variance);
-    return {whiten(blurred), kCompensated ? sqrt(cov.det / blurred.det) : T(1)};
-  }
 
   template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& shape) { return shape.w; }
 
@@ -130,6 +125,17 @@ template <int S, bool kCompensated> struct GaussianFootprint : PlainSums {
   }
 
   template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return T(1 / kBase2) * shape.w; }
+};
+
+/// Footprints that prepare a GaussianPixels<S>. kCompensated: the amplitude keeps the mass of the splat.
+template <int S, bool kCompensated> struct GaussianFootprint : GaussianPixels<S> {
+  using Pixels = GaussianPixels<S>;
+  template <typename T> using Shape = GaussianShape<T>;
+
+  template <typename T> AR_HD static Shape<T> prepare_with(Cov2d<T> cov, T variance) {
+    const Cov2d<T> blurred = blur(cov, variance);
+    return {whiten(blurred), kCompensated ? sqrt(cov.det / blurred.det) : T(1)};
+  }
 
   template <typename T>
   AR_HD static SplatGrad<T> prepare_vjp_with(const Shape<T>& shape, ShapeGrad<T> sums, T weighted, T variance) {

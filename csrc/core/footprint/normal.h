@@ -86,9 +86,9 @@ template <class V> AR_HD NormalMoments<V> short_interval_moments(V z, V width) {
 
 /// Gradient from the sums of g f z and g f z z^T over a pixel, f = exp(-|z|^2 / 2), z = w d: like that
 /// of `point`, f has no amplitude that depends on Sigma, so that df = f (z . w dmean + tr(z z^T w dSigma w^T) / 2).
-template <typename T> AR_HD SplatGrad<T> moments_vjp(const Mat2<T>& w, const ShapeGrad<T>& sums, bool triangular) {
+template <typename T> AR_HD SplatGrad<T> moments_vjp(const Mat2<T>& w, const ShapeGrad<T>& sums, GradFrame frame) {
   const Sym2<T> half = {T(0.5) * sums.shape.xx, T(0.5) * sums.shape.xy, T(0.5) * sums.shape.yy};
-  return {transform_transposed(w, sums.offset), w, half, T(0), T(0), triangular};
+  return {transform_transposed(w, sums.offset), w, half, T(0), T(0), frame};
 }
 
 /// What integrating over the pixel adds at most, along one axis, to the level of the Gaussian of
@@ -96,7 +96,7 @@ template <typename T> AR_HD SplatGrad<T> moments_vjp(const Mat2<T>& w, const Sha
 /// greatest at the pixel's edge, 2 ln(sqrt(2 pi / 12) exp(3/2)) = 2.353 < 144/61, and convolving both
 /// with the splat cannot raise it: 144/61 is safe for every splat. That it falls as t^2 is checked
 /// numerically in the tests.
-template <typename T> AR_HD T box_excess(T t) { return t * t / T(61); }
+template <typename T> AR_HD constexpr T box_excess(T t) { return t * t / T(61); }
 
 /// Standard deviations along the axes of a covariance, and (cos, sin) of the major one.
 template <typename T> struct Eigenframe {

@@ -9,17 +9,19 @@ namespace ar {
 /// mass as it shrinks.
 struct Point : GaussianFootprint<1, false> {
   static constexpr const char* kName = "point";
+  static constexpr Option kOption = {"dilation", nullptr, 0.3};
 
-  AR_HD static double radius_variance(FootprintOptions options) { return options.variance; }
+  AR_HD static double radius_variance(FootprintOptions options) { return options.number; }
+  AR_HD static double support_variance(FootprintOptions options) { return options.number; }
 
   template <typename T> AR_HD static Shape<T> prepare(Cov2d<T> cov, FootprintOptions options) {
-    return prepare_with(cov, T(options.variance));
+    return prepare_with(cov, T(options.number));
   }
 
   template <typename T>
   AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& shape, ShapeGrad<T> sums, T weighted,
                                         FootprintOptions options) {
-    return prepare_vjp_with(shape, sums, weighted, T(options.variance));
+    return prepare_vjp_with(shape, sums, weighted, T(options.number));
   }
 };
 

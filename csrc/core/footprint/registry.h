@@ -1,7 +1,10 @@
 // Every footprint the library knows. A new one is a header and a line here.
 #pragma once
 
+#include <cstddef>
+#include <cstring>
 #include <string_view>
+#include <type_traits>
 
 #include "core/footprint/adaptive.h"
 #include "core/footprint/analytic.h"
@@ -17,17 +20,39 @@ namespace ar {
 using Footprints = FootprintList<Point, Mip, Analytic<FrameGradient::kFrozen>, Analytic<FrameGradient::kPaper>,
                                  Cumulant, Box<1>, Box<2>, Box<4>, Box<8>, Box<16>, Adaptive, Erf, Exact>;
 
-/// Calls f(F{}) for the footprint whose kName is `name`; false if there is none.
-template <class Function, class... F> bool visit_footprint(std::string_view name, FootprintList<F...>, Function&& f) {
-  return ((name == F::kName ? (f(F{}), true) : false) || ...);
-}
-
-/// Calls f(F{}) for the footprint of the list that has so many samples.
-template <class Function, class... F> void visit_samples(int samples, FootprintList<F...>, Function&& f) {
-  ((samples == F::kSamples ? (f(F{}), true) : false) || ...);
+/// The key of a footprint: its kKey, or without one its name.
+template <class F> constexpr const char* key_of() {
+  if constexpr (std::is_same_v<decltype(F::kKey), const std::nullptr_t>) {
+    return F::kName;
+  } else {
+    return F::kKey;
+  }
 }
 
 /// Calls f(F{}) for every footprint of the list.
-template <class Function, class... F> void for_each_footprint(FootprintList<F...>, Function&& f) { (f(F{}), ...); }
+template <class Function, class... F> AR_HD void for_each_footprint(FootprintList<F...>, Function&& f) {
+  (f(F{}), ...);
+}
+
+/// Calls f(F{}) for the footprint at place `index` of the list.
+template <class Function, class... F> AR_HD void visit_footprint(int index, FootprintList<F...>, Function&& f) {
+  int place = 0;
+  ((index == place++ ? (f(F{}), true) : false) || ...);
+}
+
+/// Calls f(F{}) for the footprint of the list that has so many samples.
+template <class Function, class... F> AR_HD void visit_samples(int samples, FootprintList<F...>, Function&& f) {
+  ((samples == F::kSamples ? (f(F{}), true) : false) || ...);
+}
+
+/// Place in the registry of the footprint whose key is `key`; -1 if there is none.
+inline int find_footprint(std::string_view key) {
+  int found = -1, place = 0;
+  for_each_footprint(Footprints{}, [&](auto f) {
+    if (key == key_of<decltype(f)>()) found = place;
+    ++place;
+  });
+  return found;
+}
 
 }  // namespace ar
