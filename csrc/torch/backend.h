@@ -60,6 +60,7 @@ struct ChannelTensors {
 /// As gradients they may be undefined: zero.
 struct ImageTensors {
   Tensor color;
+  int64_t color_channels = 0;
   std::vector<Tensor> extra;
   Tensor alpha;  ///< (H, W), undefined where nobody wants it
 };

@@ -57,7 +57,7 @@ template <typename T> ChannelRows<T> channel_rows(const ChannelTensors& channels
 template <typename T> Planes<T> planes_of(const ImageTensors& image) {
   Planes<T> planes = {};
   planes.first = const_cast<T*>(const_data_or_null<std::remove_const_t<T>>(image.color));
-  planes.split = image.color.defined() ? int(image.color.size(0)) : 0;
+  planes.split = int(image.color_channels);
   for (size_t k = 0; k < image.extra.size(); ++k)
     planes.extra[k] = const_cast<T*>(const_data_or_null<std::remove_const_t<T>>(image.extra[k]));
   return planes;
