@@ -47,6 +47,12 @@ inline constexpr double kMaxWhitening = 1e7;
 /// The gradient by a quaternion grows as 1/|q|. It is held at this, which fits a float, and 1/|q| is too.
 inline constexpr double kMaxQuaternionGrad = 1e38;
 
+/// Channels that can be blended in one pass.
+inline constexpr int kMaxChannels = 512;
+
+/// Weights are added up as whole numbers of 2^-32, so that the order in which pixels come changes no bit.
+inline constexpr double kWeightUnit = 1.0 / 4294967296.0;
+
 inline constexpr double kPi = 3.14159265358979323846;
 inline constexpr double kLog2e = 1.44269504088896340736;
 

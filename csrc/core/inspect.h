@@ -6,8 +6,7 @@
 
 namespace ar {
 
-/// Weights are added up as whole numbers of 2^-32, so that the order in which pixels come changes no bit.
-inline constexpr double kWeightUnit = 1.0 / (int64_t(1) << 32);
+/// A weight in units of kWeightUnit.
 template <typename T> AR_HD int64_t weight_units(T weight) { return int64_t(double(weight) / kWeightUnit + 0.5); }
 
 /// Composites the splats of a pixel front to back, and remembers two of them.

@@ -1,204 +1,164 @@
-// Gradients of the ops, for every device. In C++: registered from Python they took longer than the
+// One autograd node for all differentiable ops, on every device. In C++: registered from Python it took longer than the
 // launches of a small scene.
+//
+// An op `name` is differentiable if there is an op `name_vjp` whose arguments are VjpArguments of the op's: the gradient
+// with respect to every differentiable output, the op's own arguments, what it saved, and which tensors want a gradient.
+// Differentiable outputs are those in front of the first that holds integers, or that is the last list, `saved`. The
+// adjoints themselves have no derivative and say so.
 #include <torch/csrc/autograd/autograd_not_implemented_fallback.h>
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/library.h>
 
-#include "torch/views.h"
+#include "torch/arguments.h"
 
 namespace ar::ops {
 namespace {
 
 using torch::autograd::AutogradContext;
 using torch::autograd::variable_list;
+using torch::jit::Stack;
 
-/// The arguments of rasterize that are no tensors, on their way to the backward pass.
-struct Settings {
-  int64_t image_height, image_width;
-  double tanfovx, tanfovy, scale_modifier;
-  int64_t sh_degree;
-  std::string footprint;
-  double option;
-  bool debug;
+/// What the schemas of an op and of its adjoint say, found once.
+struct Op {
+  c10::OperatorHandle forward, vjp;
+  std::vector<size_t> tensors;  ///< places of the arguments that are tensors
+  size_t arguments, outputs;
+  std::optional<size_t> keep;  ///< place of the argument that asks for the state that the adjoint needs
 
-  void save(AutogradContext* ctx) const {
-    ctx->saved_data["ints"] = std::vector<int64_t>{image_height, image_width, sh_degree};
-    ctx->saved_data["doubles"] = std::vector<double>{tanfovx, tanfovy, scale_modifier, option};
-    ctx->saved_data["footprint"] = footprint;
-    ctx->saved_data["debug"] = debug;
+  explicit Op(const c10::OperatorHandle& op)
+      : forward(op),
+        vjp(c10::Dispatcher::singleton().findSchemaOrThrow((op.schema().name() + "_vjp").c_str(), "")),
+        arguments(op.schema().arguments().size()),
+        outputs(op.schema().returns().size()) {
+    for (size_t i = 0; i < arguments; ++i) {
+      const c10::Argument& argument = op.schema().arguments()[i];
+      const auto& type = *argument.type();
+      if (type.isSubtypeOf(*c10::TensorType::get()) ||
+          type.isSubtypeOf(*c10::OptionalType::create(c10::TensorType::get())))
+        tensors.push_back(i);
+      if (argument.name() == "keep") keep = i;
+    }
   }
-  static Settings load(AutogradContext* ctx) {
-    const auto ints = ctx->saved_data["ints"].toIntVector();
-    const auto doubles = ctx->saved_data["doubles"].toDoubleVector();
-    return {ints[0],
-            ints[1],
-            doubles[0],
-            doubles[1],
-            doubles[2],
-            ints[2],
-            ctx->saved_data["footprint"].toStringRef(),
-            doubles[3],
-            ctx->saved_data["debug"].toBool()};
-  }
+  bool saves() const { return forward.schema().returns()[outputs - 1].type()->kind() == c10::TypeKind::ListType; }
 };
 
-using RasterizeSignature = RasterizeOutput(const Tensor&, const OptionalTensor&, const Tensor&, const OptionalTensor&,
-                                           const OptionalTensor&, const OptionalTensor&, const OptionalTensor&,
-                                           const OptionalTensor&, const Tensor&, const Tensor&, const Tensor&,
-                                           const Tensor&, const OptionalTensor&, int64_t, int64_t, double, double,
-                                           double, int64_t, std::string, double, bool, bool, bool);
-using RasterizeVjpSignature = Grads(const Tensor&, const OptionalTensor&, const Tensor&, const OptionalTensor&,
-                                    const Tensor&, const OptionalTensor&, const OptionalTensor&, const OptionalTensor&,
-                                    const OptionalTensor&, const OptionalTensor&, const Tensor&, const Tensor&,
-                                    const Tensor&, const Tensor&, const OptionalTensor&, int64_t, int64_t, double,
-                                    double, double, int64_t, std::string, double, const Tensor&, const Tensor&,
-                                    const Tensor&, const Tensor&, const Tensor&, const Tensor&, const Tensor&,
-                                    const Tensor&, const Tensor&, const Tensor&, const Tensor&, const Tensor&, Needs,
-                                    bool);
-using WeightSignature = Tensor(const Tensor&, const Tensor&, std::string, double);
-using WeightVjpSignature = std::tuple<Tensor, Tensor>(const Tensor&, const Tensor&, const Tensor&, std::string, double);
+Tensor tensor_or_none(const IValue& value) { return value.isTensor() ? value.toTensor() : Tensor(); }
+IValue none_or_tensor(const Tensor& tensor) { return tensor.defined() ? IValue(tensor) : IValue(); }
 
-template <class Signature> c10::TypedOperatorHandle<Signature> find_op(const char* name) {
-  return c10::Dispatcher::singleton().findSchemaOrThrow(name, "").typed<Signature>();
-}
-
-void append(variable_list& list, const Tensor& tensor) { list.push_back(tensor); }
-void append(variable_list& list, const std::vector<Tensor>& tensors) {
-  list.insert(list.end(), tensors.begin(), tensors.end());
-}
-template <class Tuple> variable_list list_of(const Tuple& tuple) {
-  variable_list list;
-  std::apply([&](const auto&... t) { (append(list, t), ...); }, tuple);
-  return list;
-}
-
-constexpr size_t kGaussianInputs = 8, kBackground = 8, kLens = 12, kInputs = 13,
-                 kAlpha = std::tuple_size_v<RasterizeOutput> - 1;
-
-/// The derivative of a derivative must fail, not be zero: rasterize_vjp has none, and says so.
-struct Rasterize : torch::autograd::Function<Rasterize> {
-  static variable_list forward(AutogradContext* ctx, const Tensor& means3D, const OptionalTensor& means2D,
-                               const Tensor& opacities, const OptionalTensor& shs, const OptionalTensor& colors_precomp,
-                               const OptionalTensor& scales, const OptionalTensor& rotations,
-                               const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
-                               const Tensor& projmatrix, const Tensor& campos, const OptionalTensor& lens,
-                               const Settings& s, bool keep, bool alpha) {
-    static const auto op = find_op<RasterizeSignature>("analytic_rasterizer::rasterize");
+struct Node : torch::autograd::Function<Node> {
+  /// Runs the op on `stack` and returns all tensors of its outputs in a row; `sizes` says how many each of them has.
+  static variable_list forward(AutogradContext* ctx, at::TensorList tensors, const Op* op, Stack* stack,
+                               std::vector<int64_t>* sizes) {
     const at::AutoDispatchBelowADInplaceOrView guard;
-    const variable_list out =
-        list_of(op.call(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
-                        viewmatrix, projmatrix, campos, lens, s.image_height, s.image_width, s.tanfovx, s.tanfovy,
-                        s.scale_modifier, s.sh_degree, s.footprint, s.option, keep, alpha, s.debug));
-    ctx->set_materialize_grads(false);  // no zeros the size of everything saved
-    ctx->mark_non_differentiable({out.begin() + 1, out.begin() + kAlpha});
-    ctx->saved_data["keep"] = keep;
-    if (keep) {
-      const auto given = [](const OptionalTensor& t) { return t ? *t : Tensor(); };
-      variable_list saved = {means3D,
-                             given(means2D),
-                             opacities,
-                             given(shs),
-                             given(colors_precomp),
-                             given(scales),
-                             given(rotations),
-                             given(cov3D_precomp),
-                             bg,
-                             viewmatrix,
-                             projmatrix,
-                             campos,
-                             given(lens)};
-      saved.insert(saved.end(), out.begin() + 2, out.begin() + kAlpha);
-      ctx->save_for_backward(std::move(saved));
-      s.save(ctx);
+    Stack others = *stack;  // the arguments that are no tensors; tensors are kept as autograd wants them
+    for (const size_t i : op->tensors) others[i] = IValue();
+    op->forward.callBoxed(*stack);
+    variable_list out, integers;
+    size_t differentiable = 0;
+    bool counting = true;
+    for (size_t k = 0; k < op->outputs; ++k) {
+      const IValue& value = (*stack)[k];
+      const bool last = k + 1 == op->outputs && op->saves();
+      const std::vector<Tensor> list = value.isTensor() ? std::vector<Tensor>{value.toTensor()} : value.toTensorVector();
+      counting = counting && !last && (list.empty() || list[0].is_floating_point());
+      if (counting) differentiable += list.size();
+      sizes->push_back(int64_t(list.size()));
+      out.insert(out.end(), list.begin(), list.end());
     }
+    ctx->set_materialize_grads(false);  // no zeros of the size of everything that is saved
+    ctx->mark_non_differentiable({out.begin() + differentiable, out.end()});
+    variable_list saved(tensors.begin(), tensors.end());
+    if (op->saves()) saved.insert(saved.end(), out.end() - sizes->back(), out.end());
+    ctx->save_for_backward(std::move(saved));
+    ctx->saved_data["op"] = int64_t(reinterpret_cast<intptr_t>(op));  // lives for ever
+    ctx->saved_data["arguments"] = c10::ivalue::Tuple::create(std::move(others));
+    ctx->saved_data["differentiable"] = int64_t(differentiable);
     return out;
   }
 
   static variable_list backward(AutogradContext* ctx, variable_list dL_doutputs) {
-    TORCH_CHECK(ctx->saved_data["keep"].toBool(),
-                "rasterize was called with keep=False and cannot be differentiated; gradients of a camera take "
-                "Effects(camera_gradients=True)");
-    variable_list grads(kInputs + 3);  // settings, keep and alpha have none
-    const Tensor dL_dalpha = dL_doutputs.size() > kAlpha ? dL_doutputs[kAlpha] : Tensor();
-    if (!dL_doutputs[0].defined() && !dL_dalpha.defined()) return grads;
-    static const auto op = find_op<RasterizeVjpSignature>("analytic_rasterizer::rasterize_vjp");
-    const variable_list t = ctx->get_saved_variables();
-    const Settings s = Settings::load(ctx);
-    const Tensor dL_dcolor =
-        dL_doutputs[0].defined() ? dL_doutputs[0] : at::zeros({3, s.image_height, s.image_width}, t[0].options());
-    const auto given = [](const Tensor& t) { return t.defined() ? OptionalTensor(t) : std::nullopt; };
-    Needs needs;
-    size_t edge = 0;                   // counts the tensors that were given
-    std::array<size_t, kNeeds> input;  // of every gradient
-    for (size_t i = 0, k = 0; i < kInputs; ++i) {
-      const bool needed = t[i].defined() && ctx->needs_input_grad(edge++);
-      if (i == kBackground) continue;
-      input[k] = i;
-      needs[k++] = needed && (i < kGaussianInputs || t[kLens].defined());
+    const Op* op = reinterpret_cast<const Op*>(intptr_t(ctx->saved_data["op"].toInt()));
+    const size_t count = op->tensors.size(), differentiable = size_t(ctx->saved_data["differentiable"].toInt());
+    variable_list grads(count + 3);  // op, stack and sizes have none
+    bool any = false;
+    c10::List<OptionalTensor> given;
+    for (size_t k = 0; k < differentiable; ++k) {
+      given.push_back(dL_doutputs[k].defined() ? OptionalTensor(dL_doutputs[k]) : std::nullopt);
+      any = any || dL_doutputs[k].defined();
     }
-    const auto saved = t.begin() + kInputs;
-    const variable_list out = list_of(op.call(
-        dL_dcolor, given(dL_dalpha), t[0], given(t[1]), t[2], given(t[3]), given(t[4]), given(t[5]), given(t[6]),
-        given(t[7]), t[8], t[9], t[10], t[11], given(t[kLens]), s.image_height, s.image_width, s.tanfovx, s.tanfovy,
-        s.scale_modifier, s.sh_degree, s.footprint, s.option, saved[0], saved[1], saved[2], saved[3], saved[4],
-        saved[5], saved[6], saved[7], saved[8], saved[9], saved[10], saved[11], needs, s.debug));
-    for (size_t k = 0; k < kNeeds; ++k) {
-      if (!needs[k]) continue;
-      // A matrix may have come as (1, 4, 4).
-      grads[input[k]] = input[k] < kGaussianInputs ? out[k] : out[k].view_as(t[input[k]]);
+    if (!any) return grads;
+    const variable_list saved = ctx->get_saved_variables();
+    Stack stack = {given};
+    const auto arguments = ctx->saved_data["arguments"].toTuple();
+    for (const IValue& value : arguments->elements()) stack.push_back(value);
+    c10::List<bool> needs;
+    for (size_t k = 0; k < count; ++k) {
+      stack[1 + op->tensors[k]] = none_or_tensor(saved[k]);
+      needs.push_back(saved[k].defined() && ctx->needs_input_grad(k));
+    }
+    stack.push_back(c10::List<Tensor>(std::vector<Tensor>(saved.begin() + int64_t(count), saved.end())));
+    stack.push_back(needs);
+    op->vjp.callBoxed(stack);
+    const std::vector<Tensor> out = stack[0].toTensorVector();
+    for (size_t k = 0; k < count; ++k) {
+      // An op takes a matrix as (1, 4, 4) too. Gradients that there are not, as of a plain camera, are empty.
+      if (needs[k] && (out[k].numel() > 0 || saved[k].numel() == 0)) grads[k] = out[k].view_as(saved[k]);
     }
     return grads;
   }
 };
-static_assert(kAlpha == 14, "backward passes all that forward saves");
 
-RasterizeOutput rasterize_autograd(const Tensor& means3D, const OptionalTensor& means2D, const Tensor& opacities,
-                                   const OptionalTensor& shs, const OptionalTensor& colors_precomp,
-                                   const OptionalTensor& scales, const OptionalTensor& rotations,
-                                   const OptionalTensor& cov3D_precomp, const Tensor& bg, const Tensor& viewmatrix,
-                                   const Tensor& projmatrix, const Tensor& campos, const OptionalTensor& lens,
-                                   int64_t image_height, int64_t image_width, double tanfovx, double tanfovy,
-                                   double scale_modifier, int64_t sh_degree, std::string footprint, double option,
-                                   bool keep, bool alpha, bool debug) {
-  const Settings settings = {image_height, image_width, tanfovx, tanfovy, scale_modifier,
-                             sh_degree,    footprint,   option,  debug};
-  const variable_list out =
-      Rasterize::apply(means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
-                       viewmatrix, projmatrix, campos, lens, settings, keep, alpha);
-  return {out[0],  out[1],  out[2],  out[3],  out[4],
-          out[5],  out[6],  out[7],  out[8],  out[9],
-          out[10], out[11], out[12], out[13], {out.begin() + kAlpha, out.end()}};
+/// Whether autograd will ask for the gradient of something.
+bool wants_gradient(const Op& op, const Stack& stack, size_t first) {
+  if (!at::GradMode::is_enabled()) return false;
+  for (const size_t i : op.tensors) {
+    const IValue& value = stack[first + i];
+    if (value.isTensor() && value.toTensor().defined() && value.toTensor().requires_grad()) return true;
+  }
+  return false;
 }
 
-struct Weight : torch::autograd::Function<Weight> {
-  static Tensor forward(AutogradContext* ctx, const Tensor& offset, const Tensor& cov2d, const std::string& footprint,
-                        double option) {
-    static const auto op = find_op<WeightSignature>("analytic_rasterizer::footprint_weight");
+void differentiate(const c10::OperatorHandle& handle, Stack* stack) {
+  // One entry per op for ever: looked up by name of the schema, which the dispatcher keeps at one place.
+  static auto* ops = new std::unordered_map<const c10::FunctionSchema*, std::unique_ptr<Op>>;
+  static auto* mutex = new std::mutex;
+  const Op* op = nullptr;
+  {
+    const std::lock_guard lock(*mutex);
+    std::unique_ptr<Op>& entry = (*ops)[&handle.schema()];
+    if (!entry) entry = std::make_unique<Op>(handle);
+    op = entry.get();
+  }
+  const size_t first = stack->size() - op->arguments;
+  if (!wants_gradient(*op, *stack, first)) {
     const at::AutoDispatchBelowADInplaceOrView guard;
-    ctx->save_for_backward({offset, cov2d});
-    ctx->saved_data["footprint"] = footprint;
-    ctx->saved_data["option"] = option;
-    return op.call(offset, cov2d, footprint, option);
+    op->forward.callBoxed(*stack);
+    return;
   }
-  static variable_list backward(AutogradContext* ctx, variable_list dL_dweight) {
-    static const auto op = find_op<WeightVjpSignature>("analytic_rasterizer::footprint_weight_vjp");
-    const variable_list t = ctx->get_saved_variables();
-    const auto [dL_doffset, dL_dcov] = op.call(dL_dweight[0], t[0], t[1], ctx->saved_data["footprint"].toStringRef(),
-                                               ctx->saved_data["option"].toDouble());
-    return {dL_doffset, dL_dcov, Tensor(), Tensor()};
+  if (op->keep) (*stack)[first + *op->keep] = true;
+  Stack arguments(stack->begin() + int64_t(first), stack->end());
+  torch::jit::drop(*stack, op->arguments);
+  variable_list tensors;
+  for (const size_t i : op->tensors) tensors.push_back(tensor_or_none(arguments[i]));
+  std::vector<int64_t> sizes;
+  const variable_list out = Node::apply(at::TensorList(tensors), op, &arguments, &sizes);
+  auto next = out.begin();
+  for (size_t k = 0; k < op->outputs; ++k) {
+    const bool is_list = handle.schema().returns()[k].type()->kind() == c10::TypeKind::ListType;
+    if (is_list) {
+      stack->push_back(c10::List<Tensor>(std::vector<Tensor>(next, next + sizes[k])));
+    } else {
+      stack->push_back(*next);
+    }
+    next += sizes[k];
   }
-};
-
-Tensor footprint_weight_autograd(const Tensor& offset, const Tensor& cov2d, std::string footprint, double option) {
-  return Weight::apply(offset, cov2d, footprint, option);
 }
 
 TORCH_LIBRARY_IMPL(analytic_rasterizer, Autograd, m) {
-  m.impl("rasterize", rasterize_autograd);
-  m.impl("footprint_weight", footprint_weight_autograd);
-  m.impl("rasterize_vjp", torch::autograd::autogradNotImplementedFallback());
-  m.impl("rasterize_channels", torch::autograd::autogradNotImplementedFallback());
-  m.impl("footprint_weight_vjp", torch::autograd::autogradNotImplementedFallback());
+  for (const char* name : {"rasterize", "project", "blend", "footprint_weight"})
+    m.impl(name, torch::CppFunction::makeFromBoxedFunction<&differentiate>());
+  for (const char* name : {"rasterize_vjp", "project_vjp", "blend_vjp", "footprint_weight_vjp"})
+    m.impl(name, torch::autograd::autogradNotImplementedFallback());
 }
 
 }  // namespace

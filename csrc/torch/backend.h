@@ -31,9 +31,16 @@ struct ListTensors {
   Tensor counts;         ///< CUDA: the numbers of Counts (csrc/cuda/stages.h)
   Tensor tile_samples;   ///< (tiles,) int32, samples of each tile, where they are chosen
 
+  static constexpr size_t kMembers = 8;
   template <class Visit> void each(Visit&& visit) {
-    visit(splats), visit(ids), visit(pairs), visit(tile_offsets), visit(splat_offsets), visit(positions), visit(counts),
-        visit(tile_samples);
+    visit("splats", splats);
+    visit("ids", ids);
+    visit("pairs", pairs);
+    visit("tile_offsets", tile_offsets);
+    visit("splat_offsets", splat_offsets);
+    visit("positions", positions);
+    visit("counts", counts);
+    visit("tile_samples", tile_samples);
   }
 };
 
@@ -44,10 +51,24 @@ struct BlendState {
   Tensor checkpoints;    ///< CUDA: state of every pixel between chunks of long lists
   Tensor chunks;         ///< CUDA: (m, 3) int32
 
+  static constexpr size_t kMembers = 4;
   template <class Visit> void each(Visit&& visit) {
-    visit(transmittance), visit(last), visit(checkpoints), visit(chunks);
+    visit("transmittance", transmittance);
+    visit("last", last);
+    visit("checkpoints", checkpoints);
+    visit("chunks", chunks);
   }
 };
+
+/// The members of a struct above as a list of tensors, for an op to return, and back.
+template <class Members> void append_to(std::vector<Tensor>& list, Members members) {
+  members.each([&](const char*, Tensor& t) { list.push_back(t); });
+}
+template <class Members> Members from_list(const std::vector<Tensor>& list, size_t first) {
+  Members members;
+  members.each([&](const char*, Tensor& t) { t = list[first++]; });
+  return members;
+}
 
 /// What is blended. Without `rows` the three colours in the splats.
 struct ChannelTensors {
@@ -80,6 +101,7 @@ struct PairSums {
 /// The public form of splats (ProjectedRows in core/stages.h), and gradients with respect to it.
 struct RowTensors {
   Tensor means2d, cov2d, dets, opacities, depths, colors;
+  Tensor absolute;  ///< of a gradient (n, 2): sums over pixels of |dL/dmeans2d|, if PairSums has them
 };
 
 /// Whether a pass waits for its stages, and what it keeps.

@@ -1,20 +1,45 @@
 #include "torch/checks.h"
 
+#include <cmath>
 #include <sstream>
 
 #include "core/camera.h"
+#include "core/footprint/registry.h"
 #include "core/sh.h"
 
 namespace ar::ops {
 namespace {
 
-/// -1 stands for P, any number of Gaussians.
-void check_shape(const Tensor& t, const char* name, int64_t count, std::initializer_list<int64_t> rest,
-                 const char* expected) {
+std::string text_of(at::IntArrayRef sizes) {
+  std::ostringstream out;
+  out << "(";
+  for (size_t d = 0; d < sizes.size(); ++d) out << (d ? ", " : "") << sizes[d];
+  out << (sizes.size() == 1 ? ",)" : ")");
+  return out.str();
+}
+std::string shape_of(const Tensor& t) { return text_of(t.sizes()); }
+
+/// dtype float32 or float64.
+void check_floating(const Tensor& t, const char* name) {
+  TORCH_CHECK_TYPE(t.scalar_type() == at::kFloat || t.scalar_type() == at::kDouble, name,
+                   " must have dtype float32 or float64, got ", t.scalar_type());
+}
+
+/// Same dtype and device as `like`, which is called `like_name` in the message.
+void check_like(const Tensor& t, const char* name, const Tensor& like, const char* like_name) {
+  TORCH_CHECK_TYPE(t.scalar_type() == like.scalar_type(), name, " must have the dtype of ", like_name, ", ",
+                   like.scalar_type(), ", got ", t.scalar_type());
+  TORCH_CHECK_VALUE(t.device() == like.device(), name, " must be on the device of ", like_name, ", ", like.device(),
+                    ", got ", t.device());
+}
+
+/// Shape (count, rest...), written as `expected` in the message.
+void check_rows(const Tensor& t, const char* name, int64_t count, std::initializer_list<int64_t> rest,
+                const char* expected) {
   const bool ok = t.dim() == int64_t(1 + rest.size()) && t.size(0) == count &&
                   std::equal(rest.begin(), rest.end(), t.sizes().begin() + 1);
-  TORCH_CHECK_VALUE(ok, name, " must have shape ", expected, count >= 0 ? " with P = " + std::to_string(count) : "",
-                    ", got ", shape_of(t));
+  TORCH_CHECK_VALUE(ok, name, " must have shape ", expected, " with ", expected[1], " = ", count, ", got ",
+                    shape_of(t));
 }
 
 void check_matrix(Tensor& t, const char* name) {
@@ -43,56 +68,53 @@ void check_finite(const Tensor& t, const char* name) {
                     t.dim() == 1 ? ",)" : ")");
 }
 
+/// Device and precision of the tensors that all others must match.
+void check_device(const Tensor& t, const char* name) {
+  check_floating(t, name);
+  if (!t.is_cuda()) return;
+  TORCH_CHECK_TYPE(t.scalar_type() != at::kDouble, name,
+                   " must have dtype float32 on CUDA, got Double; float64 runs on the CPU");
+}
+
+/// What `bin` and `blend` take of the rows of `project`.
+void check_projected(const Tensor& means2d, Tensor& cov2d, Tensor& opacities, Tensor& dets, const Tensor& row_splits) {
+  check_device(means2d, "means2d");
+  TORCH_CHECK_VALUE(means2d.dim() == 2 && means2d.size(1) == 2, "means2d must have shape (N, 2), got ",
+                    shape_of(means2d));
+  const int64_t n = means2d.size(0);
+  const auto check_row = [&](Tensor& t, const char* name, std::initializer_list<int64_t> rest, const char* expected) {
+    check_like(t, name, means2d, "means2d");
+    check_rows(t, name, n, rest, expected);
+    t = t.contiguous();
+  };
+  check_row(cov2d, "cov2d", {3}, "(N, 3)");
+  check_row(opacities, "opacities", {}, "(N,)");
+  check_row(dets, "dets", {}, "(N,)");
+  TORCH_CHECK_TYPE(row_splits.scalar_type() == at::kLong, "row_splits must have dtype int64, got ",
+                   row_splits.scalar_type());
+  TORCH_CHECK_VALUE(row_splits.device().is_cpu() && row_splits.dim() == 1 && row_splits.size(0) >= 1 &&
+                        row_splits.is_contiguous(),
+                    "row_splits must be a vector on the CPU, of one number more than there are cameras, got shape ",
+                    shape_of(row_splits), " on ", row_splits.device());
+  const int64_t* splits = row_splits.const_data_ptr<int64_t>();
+  const int64_t cameras = row_splits.size(0) - 1;
+  bool ok = splits[0] == 0 && splits[cameras] == n;
+  for (int64_t c = 0; c < cameras; ++c) ok = ok && splits[c] <= splits[c + 1];
+  TORCH_CHECK_VALUE(ok, "row_splits must rise from 0 to the number of rows, ", n);
+}
+
 }  // namespace
 
-std::string shape_of(const Tensor& t) {
-  std::ostringstream out;
-  out << "(";
-  for (int64_t d = 0; d < t.dim(); ++d) out << (d ? ", " : "") << t.size(d);
-  out << (t.dim() == 1 ? ",)" : ")");
-  return out.str();
-}
-
-void check_floating(const Tensor& t, const char* name) {
-  TORCH_CHECK_TYPE(t.scalar_type() == at::kFloat || t.scalar_type() == at::kDouble, name,
-                   " must have dtype float32 or float64, got ", t.scalar_type());
-}
-
-void check_like(const Tensor& t, const char* name, const Tensor& like, const char* like_name) {
-  TORCH_CHECK_TYPE(t.scalar_type() == like.scalar_type(), name, " must have the dtype of ", like_name, ", ",
-                   like.scalar_type(), ", got ", t.scalar_type());
-  TORCH_CHECK_VALUE(t.device() == like.device(), name, " must be on the device of ", like_name, ", ", like.device(),
-                    ", got ", t.device());
-}
-
-void check_weight_arguments(const Tensor& offset, const Tensor& cov2d, double option) {
-  check_floating(offset, "offset");
-  TORCH_CHECK_VALUE(offset.dim() >= 1 && offset.size(-1) == 2, "offset must have shape (..., 2), got ",
-                    shape_of(offset));
-  check_like(cov2d, "cov2d", offset, "offset");
-  TORCH_CHECK_VALUE(cov2d.dim() == offset.dim() && cov2d.size(-1) == 3 &&
-                        cov2d.sizes().slice(0, cov2d.dim() - 1) == offset.sizes().slice(0, offset.dim() - 1),
-                    "cov2d must have shape (..., 3) with the leading sizes of offset ", shape_of(offset), ", got ",
-                    shape_of(cov2d));
+FootprintSpec find_footprint(const std::string& key, double option) {
+  const int index = ar::find_footprint(key);
+  TORCH_CHECK_VALUE(index >= 0, "footprint must be one of those in csrc/core/footprint/registry.h, got '", key, "'");
   TORCH_CHECK_VALUE(std::isfinite(option) && option >= 0, "option must be finite and not negative, got ", option);
-}
-
-void check_lists(const Tensor& splats, const std::vector<Tensor>& lists) {
-  check_floating(splats, "splats");
-  TORCH_CHECK_VALUE(splats.dim() == 2 && splats.size(1) == kSplatWidth && splats.is_contiguous(),
-                    "splats must be an output of rasterize with keep=True, got shape ", shape_of(splats));
-  for (const Tensor& t : lists) {
-    TORCH_CHECK_VALUE(t.device() == splats.device() && t.is_contiguous(),
-                      "ids ... tile_samples must be contiguous, on the device of splats, ", splats.device(),
-                      ", got a tensor of shape ", shape_of(t), " on ", t.device());
-  }
-}
-
-void check_channels(const Tensor& colors, const Tensor& bg, const Tensor& splats) {
-  check_like(colors, "colors", splats, "splats");
-  TORCH_CHECK_VALUE(colors.dim() == 2 && colors.size(1) == 3, "colors must have shape (P, 3), got ", shape_of(colors));
-  check_like(bg, "bg", splats, "splats");
-  TORCH_CHECK_VALUE(bg.dim() == 1 && bg.size(0) == 3, "bg must have shape (3,), got ", shape_of(bg));
+  FootprintSpec spec{key, {index, {option}}, 1, false};
+  visit_footprint(index, Footprints{}, [&](auto f) {
+    spec.samples = decltype(f)::kSamples;
+    spec.chosen = std::is_same_v<decltype(f), Adaptive>;
+  });
+  return spec;
 }
 
 void check_image_size(int64_t height, int64_t width) {
@@ -102,103 +124,252 @@ void check_image_size(int64_t height, int64_t width) {
   TORCH_CHECK_VALUE(width >= 1 && width <= kMax, "image_width must be in [1, ", kMax, "], got ", width);
 }
 
-void Inputs::check() {
+void check(Inputs& in, bool finite) {
+  Tensor& means3D = in.means3D;
+  check_floating(means3D, "means3D");
   TORCH_CHECK_VALUE(means3D.dim() == 2 && means3D.size(1) == 3, "means3D must have shape (P, 3), got ",
                     shape_of(means3D));
-  check_floating(means3D, "means3D");
-  const int64_t p = count();
-  TORCH_CHECK_VALUE(p < (int64_t(1) << 31), "means3D must have fewer than 2^31 rows, got ", p);
+  check_device(means3D, "means3D");
+  const int64_t p = in.count(), most = int64_t(1) << (means3D.is_cuda() ? 30 : 31);
+  TORCH_CHECK_VALUE(p < most, "means3D must have fewer than ", most, " rows on ", means3D.device().type(), ", got ", p);
 
   const auto check_per_gaussian = [&](Tensor& t, const char* name, std::initializer_list<int64_t> rest,
                                       const char* expected) {
     check_like(t, name, means3D, "means3D");
-    check_shape(t, name, p, rest, expected);
+    check_rows(t, name, p, rest, expected);
     t = t.contiguous();
   };
   means3D = means3D.contiguous();
-  if (opacities.dim() == 1) {
-    check_per_gaussian(opacities, "opacities", {}, "(P, 1) or (P,)");
+  if (in.opacities.dim() == 1) {
+    check_per_gaussian(in.opacities, "opacities", {}, "(P, 1) or (P,)");
   } else {
-    check_per_gaussian(opacities, "opacities", {1}, "(P, 1) or (P,)");
+    check_per_gaussian(in.opacities, "opacities", {1}, "(P, 1) or (P,)");
   }
-  if (means2D) {
-    if (means2D->dim() == 2 && means2D->size(1) == 4) {
-      check_per_gaussian(*means2D, "means2D", {4}, "(P, 3) or (P, 4)");
-    } else {
-      check_per_gaussian(*means2D, "means2D", {3}, "(P, 3) or (P, 4)");
-    }
+  if (in.means2D) {
+    const int64_t columns = in.means2D->dim() == 2 && in.means2D->size(1) == 4 ? 4 : 3;
+    check_per_gaussian(*in.means2D, "means2D", {columns}, "(P, 3) or (P, 4)");
   }
-  TORCH_CHECK_VALUE(shs.has_value() != colors_precomp.has_value(),
-                    "exactly one of shs and colors_precomp must be given, got ", shs ? "both" : "neither");
-  const int degrees = lens ? FullCamera<float>::kShDegree : Camera<float>::kShDegree;
-  TORCH_CHECK_VALUE(sh_degree >= 0 && sh_degree <= degrees, "sh_degree must be 0 to ", degrees, ", got ", sh_degree);
-  if (shs) {
-    const int64_t needed = sh_count(int(sh_degree));
-    TORCH_CHECK_VALUE(shs->dim() == 3 && shs->size(0) == p && shs->size(1) >= needed && shs->size(2) == 3,
-                      "shs must have shape (P, M, 3) with P = ", p, " and M >= ", needed, " for sh_degree ", sh_degree,
-                      ", got ", shape_of(*shs));
-    check_like(*shs, "shs", means3D, "means3D");
-    shs = shs->contiguous();
-  } else {
-    check_per_gaussian(*colors_precomp, "colors_precomp", {3}, "(P, 3)");
+  const int degrees = in.lens ? FullCamera<float>::kShDegree : Camera<float>::kShDegree;
+  TORCH_CHECK_VALUE(in.sh_degree >= 0 && in.sh_degree <= degrees, "sh_degree must be 0 to ", degrees, ", got ",
+                    in.sh_degree);
+  if (in.shs) {
+    const int64_t needed = sh_count(int(in.sh_degree));
+    TORCH_CHECK_VALUE(in.shs->dim() == 3 && in.shs->size(0) == p && in.shs->size(1) >= needed && in.shs->size(2) == 3,
+                      "shs must have shape (P, M, 3) with P = ", p, " and M >= ", needed, " for sh_degree ",
+                      in.sh_degree, ", got ", shape_of(*in.shs));
+    check_like(*in.shs, "shs", means3D, "means3D");
+    in.shs = in.shs->contiguous();
   }
-  TORCH_CHECK_VALUE(scales.has_value() == rotations.has_value(),
-                    "scales and rotations must be given together, got only ", scales ? "scales" : "rotations");
-  TORCH_CHECK_VALUE(scales.has_value() != cov3D_precomp.has_value(),
+  if (in.colors_precomp) {
+    const Tensor& c = *in.colors_precomp;
+    TORCH_CHECK_VALUE(c.dim() == 2 && c.size(0) == p && c.size(1) >= 1 && c.size(1) <= kMaxChannels,
+                      "colors_precomp must have shape (P, C) with P = ", p, " and C from 1 to ", kMaxChannels, ", got ",
+                      shape_of(c));
+    check_per_gaussian(*in.colors_precomp, "colors_precomp", {c.size(1)}, "(P, C)");
+  }
+  TORCH_CHECK_VALUE(in.scales.has_value() == in.rotations.has_value(),
+                    "scales and rotations must be given together, got only ", in.scales ? "scales" : "rotations");
+  TORCH_CHECK_VALUE(in.scales.has_value() != in.cov3D_precomp.has_value(),
                     "exactly one of scales with rotations and cov3D_precomp must be given, got ",
-                    scales ? "both" : "neither");
-  if (scales) {
-    check_per_gaussian(*scales, "scales", {3}, "(P, 3)");
-    check_per_gaussian(*rotations, "rotations", {4}, "(P, 4)");
+                    in.scales ? "both" : "neither");
+  if (in.scales) {
+    check_per_gaussian(*in.scales, "scales", {3}, "(P, 3)");
+    check_per_gaussian(*in.rotations, "rotations", {4}, "(P, 4)");
   } else {
-    check_per_gaussian(*cov3D_precomp, "cov3D_precomp", {6}, "(P, 6)");
+    check_per_gaussian(*in.cov3D_precomp, "cov3D_precomp", {6}, "(P, 6)");
   }
-
-  check_like(background, "bg", means3D, "means3D");
-  check_like(viewmatrix, "viewmatrix", means3D, "means3D");
-  check_like(projmatrix, "projmatrix", means3D, "means3D");
-  check_like(campos, "campos", means3D, "means3D");
-  check_vector(background, "bg");
-  check_matrix(viewmatrix, "viewmatrix");
-  check_matrix(projmatrix, "projmatrix");
-  check_vector(campos, "campos");
-  if (lens) {
-    check_like(*lens, "lens", means3D, "means3D");
-    TORCH_CHECK_VALUE(lens->dim() == 1 && lens->size(0) == kLensWidth, "lens must have shape (", kLensWidth, ",), got ",
-                      shape_of(*lens));
-    lens = lens->contiguous();
+  check_like(in.viewmatrix, "viewmatrix", means3D, "means3D");
+  check_like(in.projmatrix, "projmatrix", means3D, "means3D");
+  check_like(in.campos, "campos", means3D, "means3D");
+  check_matrix(in.viewmatrix, "viewmatrix");
+  check_matrix(in.projmatrix, "projmatrix");
+  check_vector(in.campos, "campos");
+  if (in.lens) {
+    check_like(*in.lens, "lens", means3D, "means3D");
+    TORCH_CHECK_VALUE(in.lens->dim() == 1 && in.lens->size(0) == kLensWidth, "lens must have shape (", kLensWidth,
+                      ",), got ", shape_of(*in.lens));
+    in.lens = in.lens->contiguous();
   }
-  check_image_size(image_height, image_width);
-  check_positive(tanfovx, "tanfovx");
-  check_positive(tanfovy, "tanfovy");
-  check_positive(scale_modifier, "scale_modifier");
-  TORCH_CHECK_VALUE(std::isfinite(option) && option >= 0, "option must be finite and not negative, got ", option);
-}
-
-void check_weight_gradient(const Tensor& dL_dweight, const Tensor& offset) {
-  check_like(dL_dweight, "dL_dweight", offset, "offset");
-  TORCH_CHECK_VALUE(dL_dweight.sizes() == offset.sizes().slice(0, offset.dim() - 1),
-                    "dL_dweight must have the leading sizes of offset ", shape_of(offset), ", got ",
-                    shape_of(dL_dweight));
-}
-
-void Inputs::check_gradient(const Tensor& dL_dcolor, const OptionalTensor& dL_dalpha) const {
-  check_like(dL_dcolor, "dL_dcolor", means3D, "means3D");
-  TORCH_CHECK_VALUE(dL_dcolor.sizes() == at::IntArrayRef({3, image_height, image_width}),
-                    "dL_dcolor must have shape (3, ", image_height, ", ", image_width, "), got ", shape_of(dL_dcolor));
-  if (!dL_dalpha) return;
-  check_like(*dL_dalpha, "dL_dalpha", means3D, "means3D");
-  TORCH_CHECK_VALUE(dL_dalpha->sizes() == at::IntArrayRef({image_height, image_width}), "dL_dalpha must have shape (",
-                    image_height, ", ", image_width, "), got ", shape_of(*dL_dalpha));
-}
-
-void Inputs::check_camera() const {
-  check_finite(background, "bg");
-  check_finite(viewmatrix, "viewmatrix");
-  check_finite(projmatrix, "projmatrix");
-  check_finite(campos, "campos");
+  check_image_size(in.image_height, in.image_width);
+  check_positive(in.tanfovx, "tanfovx");
+  check_positive(in.tanfovy, "tanfovy");
+  check_positive(in.scale_modifier, "scale_modifier");
+  if (!finite && means3D.is_cuda()) return;
+  check_finite(in.viewmatrix, "viewmatrix");
+  check_finite(in.projmatrix, "projmatrix");
+  check_finite(in.campos, "campos");
   // Up to far, which may be infinite.
-  if (lens) check_finite(lens->narrow(0, 0, offsetof(Lens<float>, far) / sizeof(float)), "lens");
+  if (in.lens) check_finite(in.lens->narrow(0, 0, offsetof(Lens<float>, far) / sizeof(float)), "lens");
+}
+
+void check(RasterizeArguments& a) {
+  check(a, a.debug);
+  TORCH_CHECK_VALUE(a.shs.has_value() != a.colors_precomp.has_value(),
+                    "exactly one of shs and colors_precomp must be given, got ", a.shs ? "both" : "neither");
+  check_like(a.bg, "bg", a.means3D, "means3D");
+  const int64_t channels = a.shs ? 3 : a.colors_precomp->size(1);
+  TORCH_CHECK_VALUE(a.bg.numel() == channels && (a.bg.dim() == 1 || (a.bg.dim() == 2 && a.bg.size(0) == 1)),
+                    "bg must have shape (", channels, ",) or (1, ", channels, "), got ", shape_of(a.bg));
+  a.bg = a.bg.reshape({channels}).contiguous();
+  if (a.debug || !a.means3D.is_cuda()) check_finite(a.bg, "bg");
+}
+
+int64_t check_cameras(const ProjectArguments& a) {
+  TORCH_CHECK_VALUE(a.viewmatrix.dim() == 3 && a.viewmatrix.size(1) == 4 && a.viewmatrix.size(2) == 4,
+                    "viewmatrix must have shape (C, 4, 4), got ", shape_of(a.viewmatrix));
+  const int64_t cameras = a.viewmatrix.size(0);
+  check_rows(a.projmatrix, "projmatrix", cameras, {4, 4}, "(C, 4, 4)");
+  check_rows(a.campos, "campos", cameras, {3}, "(C, 3)");
+  if (a.lens) check_rows(*a.lens, "lens", cameras, {kLensWidth}, "(C, 17)");
+  TORCH_CHECK_VALUE(int64_t(a.tanfovx.size()) == cameras && int64_t(a.tanfovy.size()) == cameras,
+                    "tanfovx and tanfovy must have a number for each of ", cameras, " cameras, got ", a.tanfovx.size(),
+                    " and ", a.tanfovy.size());
+  TORCH_CHECK_VALUE(!(a.shs && a.colors_precomp), "at most one of shs and colors_precomp must be given, got both");
+  TORCH_CHECK_VALUE(!a.colors_precomp || (a.colors_precomp->dim() == 2 && a.colors_precomp->size(1) == 3),
+                    "colors_precomp must have shape (P, 3), got ",
+                    a.colors_precomp ? shape_of(*a.colors_precomp) : "");
+  return cameras;
+}
+
+Inputs inputs_of(const ProjectArguments& a, int64_t c) {
+  Inputs in;
+  in.means3D = a.means3D;
+  in.opacities = a.opacities;
+  in.shs = a.shs;
+  in.colors_precomp = a.colors_precomp;
+  in.scales = a.scales;
+  in.rotations = a.rotations;
+  in.cov3D_precomp = a.cov3D_precomp;
+  in.viewmatrix = a.viewmatrix[c];
+  in.projmatrix = a.projmatrix[c];
+  in.campos = a.campos[c];
+  if (a.lens) in.lens = (*a.lens)[c];
+  in.image_height = a.image_height;
+  in.image_width = a.image_width;
+  in.tanfovx = a.tanfovx[c];
+  in.tanfovy = a.tanfovy[c];
+  in.scale_modifier = a.scale_modifier;
+  in.sh_degree = a.sh_degree;
+  return in;
+}
+
+void check(BinArguments& a) {
+  check_projected(a.means2d, a.cov2d, a.opacities, a.dets, a.row_splits);
+  a.means2d = a.means2d.contiguous();
+  check_like(a.depths, "depths", a.means2d, "means2d");
+  check_rows(a.depths, "depths", a.means2d.size(0), {}, "(N,)");
+  a.depths = a.depths.contiguous();
+  if (a.colors) {
+    check_like(*a.colors, "colors", a.means2d, "means2d");
+    check_rows(*a.colors, "colors", a.means2d.size(0), {3}, "(N, 3)");
+    a.colors = a.colors->contiguous();
+  }
+  check_image_size(a.image_height, a.image_width);
+}
+
+void check(BlendArguments& a, const FootprintSpec& footprint) {
+  check_projected(a.means2d, a.cov2d, a.opacities, a.dets, a.row_splits);
+  a.means2d = a.means2d.contiguous();
+  const int64_t n = a.means2d.size(0), cameras = a.row_splits.size(0) - 1;
+  check_like(a.features, "features", a.means2d, "means2d");
+  TORCH_CHECK_VALUE(a.features.dim() == 2 && a.features.size(0) == n && a.features.size(1) >= 1 &&
+                        a.features.size(1) <= kMaxChannels,
+                    "features must have shape (N, K) with N = ", n, " and K from 1 to ", kMaxChannels, ", got ",
+                    shape_of(a.features));
+  a.features = a.features.contiguous();
+  check_like(a.background, "background", a.means2d, "means2d");
+  TORCH_CHECK_VALUE(a.background.sizes() == at::IntArrayRef({cameras, a.features.size(1)}),
+                    "background must have shape (", cameras, ", ", a.features.size(1), "), got ",
+                    shape_of(a.background));
+  a.background = a.background.contiguous();
+  if (a.means2d_abs) {
+    check_like(*a.means2d_abs, "means2d_abs", a.means2d, "means2d");
+    check_rows(*a.means2d_abs, "means2d_abs", n, {2}, "(N, 2)");
+  }
+  check_image_size(a.image_height, a.image_width);
+  const int64_t members = ListTensors::kMembers;
+  TORCH_CHECK_VALUE(int64_t(a.lists.size()) == members * cameras, "lists must be the output of bin for ", cameras,
+                    " cameras, got ", a.lists.size(), " tensors");
+  const TileGrid grid = {int(a.image_width), int(a.image_height)};
+  for (int64_t c = 0; c < cameras; ++c) {
+    const ListTensors lists = from_list<ListTensors>(a.lists, size_t(members * c));
+    check_lists(lists, a.means2d, footprint, grid);
+    const int64_t rows = a.row_splits.const_data_ptr<int64_t>()[c + 1] - a.row_splits.const_data_ptr<int64_t>()[c];
+    TORCH_CHECK_VALUE(lists.splats.size(0) == rows, "lists must be the output of bin for these splats, got ",
+                      lists.splats.size(0), " splats of camera ", c, " and not ", rows);
+  }
+}
+
+void check(InspectArguments& a, const ListTensors& lists, const FootprintSpec& footprint) {
+  check_device(lists.splats, "splats");
+  check_image_size(a.image_height, a.image_width);
+  check_lists(lists, lists.splats, footprint, {int(a.image_width), int(a.image_height)});
+  // The ids of a CPU's lists index the results; on CUDA the splats themselves do.
+  const int64_t n = lists.splats.size(0);
+  const int64_t needed = lists.splats.is_cuda() || n == 0 ? n : lists.ids.max().item<int64_t>() + 1;
+  TORCH_CHECK_VALUE(a.count >= needed && a.count < (int64_t(1) << 31), "count must be the number of Gaussians, at least ",
+                    needed, ", got ", a.count);
+}
+
+void check(WeightArguments& a) {
+  check_floating(a.offset, "offset");
+  TORCH_CHECK_VALUE(a.offset.dim() >= 1 && a.offset.size(-1) == 2, "offset must have shape (..., 2), got ",
+                    shape_of(a.offset));
+  check_like(a.cov2d, "cov2d", a.offset, "offset");
+  TORCH_CHECK_VALUE(a.cov2d.dim() == a.offset.dim() && a.cov2d.size(-1) == 3 &&
+                        a.cov2d.sizes().slice(0, a.cov2d.dim() - 1) == a.offset.sizes().slice(0, a.offset.dim() - 1),
+                    "cov2d must have shape (..., 3) with the leading sizes of offset ", shape_of(a.offset), ", got ",
+                    shape_of(a.cov2d));
+  a.offset = a.offset.contiguous();
+  a.cov2d = a.cov2d.contiguous();
+}
+
+void check_gradient(Tensor& gradient, const char* name, const Tensor& like, at::IntArrayRef sizes) {
+  check_like(gradient, name, like, "the arguments");
+  TORCH_CHECK_VALUE(gradient.sizes() == sizes, name, " must have shape ", text_of(sizes), ", got ", shape_of(gradient));
+  gradient = gradient.contiguous();
+}
+
+void check_lists(const ListTensors& lists, const Tensor& like, const FootprintSpec& footprint, TileGrid grid) {
+  const Tensor &splats = lists.splats, &pairs = lists.pairs;
+  const int64_t n = splats.dim() == 2 ? splats.size(0) : -1;
+  bool ok = n >= 0 && splats.size(1) == kSplatWidth && splats.scalar_type() == like.scalar_type() &&
+            lists.ids.numel() == n && lists.tile_offsets.numel() == grid.tiles() + 1 &&
+            lists.tile_samples.numel() == (footprint.chosen ? grid.tiles() : 0);
+  if (like.is_cuda()) {
+    ok = ok && pairs.dim() == 2 && pairs.size(0) >= 1 && (pairs.size(1) == 1 || pairs.size(1) == 2);
+  } else {
+    ok = ok && pairs.dim() == 1 && lists.tile_offsets.scalar_type() == at::kLong && lists.tile_offsets.is_contiguous() &&
+         lists.tile_offsets.device().is_cpu() &&
+         lists.tile_offsets.const_data_ptr<int64_t>()[grid.tiles()] == pairs.numel();
+  }
+  const auto fits = [&](const Tensor& t, at::ScalarType dtype) {
+    return t.is_contiguous() && t.device() == like.device() && (t.numel() == 0 || t.scalar_type() == dtype);
+  };
+  ok = ok && fits(splats, like.scalar_type()) && fits(lists.ids, at::kInt) && fits(pairs, at::kInt) &&
+       fits(lists.tile_offsets, at::kLong) && fits(lists.positions, at::kLong) && fits(lists.counts, at::kLong) &&
+       fits(lists.tile_samples, at::kInt) && fits(lists.splat_offsets, like.is_cuda() ? at::kInt : at::kLong);
+  TORCH_CHECK_VALUE(ok,
+                    "splats ... tile_samples must be what the forward pass saved for the same arguments, got splats of "
+                    "shape ",
+                    shape_of(splats), " and tile_offsets of shape ", shape_of(lists.tile_offsets));
+}
+
+void check_saved(const ListTensors& lists, const BlendState& state, const Tensor& like, const FootprintSpec& footprint,
+                 TileGrid grid) {
+  check_lists(lists, like, footprint, grid);
+  const std::vector<int64_t> image = {footprint.samples, grid.height, grid.width};
+  const int64_t n = lists.splats.size(0), pairs = lists.pairs.size(0);
+  const bool slots = like.is_cuda() ? lists.pairs.size(1) == 2 && lists.splat_offsets.numel() == 2 * n
+                                    : lists.splat_offsets.numel() == n + 1 && lists.positions.numel() == pairs;
+  bool ok = slots && state.transmittance.sizes() == image && state.last.sizes() == image &&
+            state.transmittance.scalar_type() == like.scalar_type() && state.last.scalar_type() == at::kInt;
+  for (const Tensor* t : {&state.transmittance, &state.last, &state.checkpoints, &state.chunks})
+    ok = ok && t->is_contiguous() && t->device() == like.device();
+  TORCH_CHECK_VALUE(ok,
+                    "transmittance ... chunks must be what the forward pass saved with keep=True for the same arguments, "
+                    "got transmittance of shape ",
+                    shape_of(state.transmittance));
 }
 
 }  // namespace ar::ops

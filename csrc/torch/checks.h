@@ -1,69 +1,37 @@
-// What the ops accept. Checked once, before anything is touched, for every backend alike. Messages
-// say which argument, what was expected and what came: `means3D must have shape (P, 3), got (5, 2)`.
+// What the ops accept. Checked once, before anything is touched, for every backend alike: TypeError for a wrong dtype,
+// ValueError for anything else. Messages say which argument, what was expected and what came:
+// `means3D must have shape (P, 3), got (5, 2)`.
 #pragma once
 
-#include <ATen/ATen.h>
-#include <torch/library.h>
-
-#include <cmath>
-#include <optional>
-#include <string>
-#include <vector>
+#include "torch/backend.h"
 
 namespace ar::ops {
 
-using at::Tensor;
-using OptionalTensor = std::optional<Tensor>;
+/// Afterwards every tensor is contiguous, and the matrices are 4x4. With `finite` numbers of the camera that are not
+/// finite raise too, for which the host must wait for the device; on the CPU they always do.
+void check(Inputs& in, bool finite);
+void check(RasterizeArguments& a);
+void check(BinArguments& a);
+void check(BlendArguments& a, const FootprintSpec& footprint);
+void check(InspectArguments& a, const ListTensors& lists, const FootprintSpec& footprint);
+void check(WeightArguments& a);
 
-/// Arguments of rasterize, as given; check() brings the tensors into the form the kernels read.
-struct Inputs {
-  Tensor means3D, opacities;
-  OptionalTensor means2D, shs, colors_precomp, scales, rotations, cov3D_precomp;
-  Tensor background, viewmatrix, projmatrix, campos;
-  OptionalTensor lens;  ///< of a full camera
-  int64_t image_height, image_width;
-  double tanfovx, tanfovy, scale_modifier;
-  int64_t sh_degree;
-  std::string footprint;
-  double option;
+/// The inputs of camera `c` of a batch, not yet checked.
+Inputs inputs_of(const ProjectArguments& a, int64_t c);
+/// What inputs_of cannot check: that there are as many of everything as there are cameras. Returns their number.
+int64_t check_cameras(const ProjectArguments& a);
 
-  int64_t count() const { return means3D.size(0); }
+/// The footprint of this key and number. Raises ValueError if there is none.
+FootprintSpec find_footprint(const std::string& key, double option);
 
-  /// Raises TypeError for a wrong dtype and ValueError for anything else. Afterwards every tensor is
-  /// contiguous, and the matrices are 4x4.
-  void check();
+/// A gradient has the dtype and device of `like` and these sizes; afterwards it is contiguous.
+void check_gradient(Tensor& gradient, const char* name, const Tensor& like, at::IntArrayRef sizes);
 
-  /// dL_dcolor and dL_dalpha are gradients of images of these arguments.
-  void check_gradient(const Tensor& dL_dcolor, const OptionalTensor& dL_dalpha) const;
-
-  /// Background, matrices and camera centre are finite. On a device this waits for it.
-  void check_camera() const;
-};
-
-std::string shape_of(const Tensor& t);
-
-/// dtype float32 or float64.
-void check_floating(const Tensor& t, const char* name);
-
-/// Same dtype and device as `like`, which is called `like_name` in the message.
-void check_like(const Tensor& t, const char* name, const Tensor& like, const char* like_name);
-
-/// What `find` gave for a footprint; raises ValueError if that is nothing.
-template <class Stages> const Stages& found(const Stages* stages, const std::string& footprint) {
-  TORCH_CHECK_VALUE(stages != nullptr, "footprint must be one of those in csrc/core/footprint/registry.h, got '",
-                    footprint, "'");
-  return *stages;
-}
-
-/// Arguments of footprint_weight.
-void check_weight_arguments(const Tensor& offset, const Tensor& cov2d, double option);
-void check_weight_gradient(const Tensor& dL_dweight, const Tensor& offset);
-
-/// `splats` and the other `lists` look like outputs of rasterize with keep=True.
-void check_lists(const Tensor& splats, const std::vector<Tensor>& lists);
-
-/// Arguments of rasterize_channels.
-void check_channels(const Tensor& colors, const Tensor& bg, const Tensor& splats);
+/// Lists and state fit each other, the splats, the footprint and the image: the outputs of the forward pass for the same
+/// arguments. What they contain is the forward pass's own and is not looked at.
+void check_saved(const ListTensors& lists, const BlendState& state, const Tensor& like, const FootprintSpec& footprint,
+                 TileGrid grid);
+void check_lists(const ListTensors& lists, const Tensor& like, const FootprintSpec& footprint, TileGrid grid);
 
 /// Sizes that tensors and tiles can be indexed with.
 void check_image_size(int64_t height, int64_t width);

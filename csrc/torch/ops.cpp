@@ -1,4 +1,4 @@
-// Schemas of the ops, and the Python module that loads them.
+// The ops: their schemas, their kernels for both devices, and the Python module that loads them.
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 #include <torch/library.h>
@@ -6,82 +6,120 @@
 #include <string>
 #include <vector>
 
+#include "core/camera.h"
 #include "core/footprint/registry.h"
-#include "cpu/tasks.h"
+#include "core/sh.h"
+#include "cpu/stages.h"
+#include "torch/recipe.h"
 
-#if defined(AR_WITH_CUDA)
 namespace ar::ops {
-void force_pair_capacity(int64_t capacity);
+namespace {
+
+using torch::jit::Stack;
+
+void push(Stack& stack, Tensor value) { stack.emplace_back(std::move(value)); }
+void push(Stack& stack, const std::vector<Tensor>& value) { stack.emplace_back(c10::List<Tensor>(value)); }
+void push(Stack& stack, const Rasterized& out) {
+  push(stack, out.color);
+  push(stack, out.images);
+  push(stack, out.radii);
+  push(stack, out.saved);
 }
+void push(Stack& stack, const Projected& out) {
+  for (const Tensor& t : {out.means2d, out.cov2d, out.opacities, out.depths, out.colors, out.radii, out.gaussian_ids,
+                          out.camera_ids, out.row_splits})
+    push(stack, t);
+  push(stack, out.saved);
+}
+void push(Stack& stack, const Blended& out) {
+  push(stack, out.image);
+  push(stack, out.alpha);
+  push(stack, out.saved);
+}
+
+/// An op: a function of recipe.h between the arguments on the dispatcher's stack and the results there.
+template <class A, auto kRun> struct Op {
+  using Arguments = A;
+  static void kernel(const c10::OperatorHandle&, Stack* stack) {
+    auto arguments = take<Arguments>(*stack);
+    push(*stack, kRun(std::move(arguments)));
+  }
+};
+
+Rasterized rasterize_plainly(RasterizeArguments a) { return rasterize(std::move(a)); }
+
+/// `rasterize`, and the seconds that its stages took: project, bin, blend. Waits for the device.
+struct RasterizeTimed {
+  using Arguments = RasterizeArguments;
+  static void kernel(const c10::OperatorHandle&, Stack* stack) {
+    std::vector<double> seconds;
+    push(*stack, rasterize(take<RasterizeArguments>(*stack), &seconds));
+    push(*stack, at::tensor(seconds, at::kDouble));
+  }
+};
+
+/// Calls visit(op, name, results) for every op.
+template <class Visit> void each_op(const Visit& visit) {
+  const char *rasterized = "Tensor color, Tensor[] images, Tensor radii, Tensor[] saved",
+             *timed = "Tensor color, Tensor[] images, Tensor radii, Tensor[] saved, Tensor seconds",
+             *projected = "Tensor means2d, Tensor cov2d, Tensor opacities, Tensor depths, Tensor colors, Tensor radii, "
+                          "Tensor gaussian_ids, Tensor camera_ids, Tensor row_splits, Tensor[] saved",
+             *blended = "Tensor image, Tensor alpha, Tensor[] saved", *gradients = "Tensor[] gradients";
+  visit(Op<RasterizeArguments, rasterize_plainly>{}, "rasterize", rasterized);
+  visit(RasterizeTimed{}, "rasterize_timed", timed);
+  visit(Op<VjpArguments<RasterizeArguments>, rasterize_vjp>{}, "rasterize_vjp", gradients);
+  visit(Op<ProjectArguments, project>{}, "project", projected);
+  visit(Op<VjpArguments<ProjectArguments>, project_vjp>{}, "project_vjp", gradients);
+  visit(Op<BinArguments, bin>{}, "bin", "Tensor[] lists");
+  visit(Op<BlendArguments, blend>{}, "blend", blended);
+  visit(Op<VjpArguments<BlendArguments>, blend_vjp>{}, "blend_vjp", gradients);
+  visit(Op<InspectArguments, inspect>{}, "inspect", "Tensor[] summary");
+  visit(Op<WeightArguments, footprint_weight>{}, "footprint_weight", "Tensor weight");
+  visit(Op<VjpArguments<WeightArguments>, footprint_weight_vjp>{}, "footprint_weight_vjp", gradients);
+}
+
+void register_kernels(torch::Library& m) {
+  each_op([&](auto op, const char* name, const char*) {
+    m.impl(name, torch::CppFunction::makeFromBoxedFunction<&decltype(op)::kernel>());
+  });
+}
+
+TORCH_LIBRARY(analytic_rasterizer, m) {
+  each_op([&](auto op, const std::string& name, const std::string& results) {
+    m.def((name + "(" + schema_of<typename decltype(op)::Arguments>() + ") -> (" + results + ")").c_str());
+  });
+}
+TORCH_LIBRARY_IMPL(analytic_rasterizer, CPU, m) { register_kernels(m); }
+#if defined(AR_WITH_CUDA)
+TORCH_LIBRARY_IMPL(analytic_rasterizer, CUDA, m) { register_kernels(m); }
 #endif
 
-// What only rasterize and its vjp share travels as tensors of its own. On the CPU: `splats` (V, 12) rows of
-// Splat<F, T>, `ids` (V,) the Gaussian of each, `pairs` (N,) splats by tile and depth, `tile_offsets`
-// (tiles + 1,), and for the backward pass `splat_offsets` (V + 1,) and `positions` (N,), the places in
-// pairs of each splat, `transmittance` and `last` (samples, H, W). On CUDA every Gaussian has a row of
-// splats, ids are in the order of depth, pairs (room, 2) are splats and slots, `splat_offsets` (P, 2) the
-// first slot and the number of them, positions is empty, and there are `checkpoints` (n, samples, 256, 4),
-// `chunks` (m, 3) and `counts` (12,), see csrc/cuda/tasks.h. Without `keep` what only the backward pass reads is empty.
-// `alpha` holds one image (H, W), 1 - transmittance, if asked for; `camera` of the vjp the gradients of viewmatrix,
-// projmatrix, campos and lens, if one is needed. As lists, which are no tensors to make where there is nothing.
-// `debug` waits for every stage, so that an error is raised by the stage that caused it.
-TORCH_LIBRARY(analytic_rasterizer, m) {
-  m.def(
-      "rasterize(Tensor means3D, Tensor? means2D, Tensor opacities, Tensor? shs, Tensor? colors_precomp, Tensor? "
-      "scales, "
-      "Tensor? rotations, Tensor? cov3D_precomp, Tensor bg, Tensor viewmatrix, Tensor projmatrix, Tensor campos, "
-      "Tensor? lens, int image_height, int image_width, float tanfovx, float tanfovy, float scale_modifier, int "
-      "sh_degree, str "
-      "footprint, "
-      "float option, bool keep, bool alpha, bool debug) -> (Tensor color, Tensor radii, Tensor splats, "
-      "Tensor ids, Tensor pairs, "
-      "Tensor "
-      "tile_offsets, "
-      "Tensor splat_offsets, Tensor positions, Tensor transmittance, Tensor last, Tensor checkpoints, Tensor "
-      "chunks, Tensor counts, Tensor tile_samples, Tensor[] alpha)");
-  m.def(
-      "rasterize_vjp(Tensor dL_dcolor, Tensor? dL_dalpha, Tensor means3D, Tensor? means2D, Tensor opacities, Tensor? "
-      "shs, Tensor? "
-      "colors_precomp, "
-      "Tensor? scales, Tensor? rotations, Tensor? cov3D_precomp, Tensor bg, Tensor viewmatrix, Tensor projmatrix, "
-      "Tensor campos, Tensor? lens, int image_height, int image_width, float tanfovx, float tanfovy, float "
-      "scale_modifier, int "
-      "sh_degree, "
-      "str footprint, float option, Tensor splats, Tensor ids, Tensor pairs, Tensor tile_offsets, Tensor "
-      "splat_offsets, "
-      "Tensor positions, Tensor transmittance, Tensor last, Tensor checkpoints, Tensor chunks, Tensor counts, Tensor "
-      "tile_samples, bool[12] "
-      "needs, bool "
-      "debug) -> (Tensor means3D, Tensor means2D, Tensor "
-      "opacities, "
-      "Tensor shs, Tensor colors_precomp, Tensor scales, Tensor rotations, Tensor cov3D_precomp, Tensor[] camera)");
-  m.def(
-      "rasterize_stages(Tensor means3D, Tensor opacities, Tensor? shs, Tensor? colors_precomp, Tensor? scales, Tensor? "
-      "rotations, "
-      "Tensor? cov3D_precomp, Tensor bg, Tensor viewmatrix, Tensor projmatrix, Tensor campos, Tensor? lens, int "
-      "image_height, "
-      "int image_width, float tanfovx, float tanfovy, float scale_modifier, int sh_degree, str footprint, float "
-      "option) -> "
-      "(Tensor color, Tensor radii, Tensor ids, Tensor depths, Tensor means2d, Tensor pairs, Tensor tile_offsets, "
-      "Tensor seconds)");
-  // Other colours (P, 3) for the same splats: what rasterize with keep=True returned, blended again.
-  // `checkpoints`, `chunks` and `counts` are rasterize_vjp's for an image of these colours; its splats are those of
-  // rasterize with these colours.
-  m.def(
-      "rasterize_channels(Tensor colors, Tensor bg, int image_height, int image_width, str footprint, float option, "
-      "Tensor splats, Tensor ids, Tensor pairs, Tensor tile_offsets, Tensor counts, Tensor tile_samples, bool keep, "
-      "bool debug) -> (Tensor color, Tensor checkpoints, Tensor chunks, Tensor counts)");
-  // What every pixel shows of rasterize's splats, and every one of the `count` Gaussians of the pixels. `total` is in
-  // units of 2^-32.
-  m.def(
-      "inspect(Tensor splats, Tensor ids, Tensor pairs, Tensor tile_offsets, Tensor counts, Tensor tile_samples, int "
-      "count, int image_height, int image_width, str footprint) -> (Tensor median, Tensor dominant, Tensor touched, "
-      "Tensor largest, Tensor total)");
-  m.def("footprint_weight(Tensor offset, Tensor cov2d, str footprint, float option) -> Tensor");
-  m.def(
-      "footprint_weight_vjp(Tensor dL_dweight, Tensor offset, Tensor cov2d, str footprint, float option) -> "
-      "(Tensor offset, Tensor cov2d)");
+/// What Python knows of a footprint: all of it from its header.
+pybind11::dict describe(const char* key, const char* name, Option option, int samples, bool yardstick) {
+  pybind11::dict d;
+  d["key"] = key;
+  d["name"] = name;
+  d["option"] = option.name ? pybind11::cast(option.name) : pybind11::none();
+  d["value"] = option.value ? pybind11::cast(option.value) : pybind11::none();
+  d["number"] = option.number;
+  d["is_default"] = option.is_default;
+  d["samples"] = samples;
+  d["yardstick"] = yardstick;
+  return d;
 }
+
+template <class Members> std::vector<std::string> member_names() {
+  std::vector<std::string> names;
+  Members().each([&](const char* name, Tensor&) { names.emplace_back(name); });
+  return names;
+}
+
+}  // namespace
+
+#if defined(AR_WITH_CUDA)
+void force_pair_capacity(int64_t capacity);
+#endif
+}  // namespace ar::ops
 
 PYBIND11_MODULE(_C, m) {
   m.doc() = "Loads the ops of analytic_rasterizer into torch.ops.analytic_rasterizer.";
@@ -95,10 +133,22 @@ PYBIND11_MODULE(_C, m) {
   m.def(
       "footprints",
       [] {
-        std::vector<std::string> names;
-        ar::for_each_footprint(ar::Footprints{}, [&](auto f) { names.emplace_back(decltype(f)::kName); });
-        return names;
+        std::vector<pybind11::dict> all;
+        ar::for_each_footprint(ar::Footprints{}, [&](auto f) {
+          using F = decltype(f);
+          all.push_back(ar::ops::describe(ar::key_of<F>(), F::kName, F::kOption, F::kSamples, F::kYardstick));
+        });
+        return all;
       },
-      "Keys of all footprints, in the order of the registry.");
+      "What the headers say of every footprint, in the order of the registry.");
   m.def("instruction_set", &ar::cpu::instruction_set, "Instruction set that the CPU path runs on.");
+  m.attr("LISTS") = ar::ops::member_names<ar::ops::ListTensors>();
+  m.attr("TILE") = ar::kTile;
+  m.attr("SPLAT_WIDTH") = ar::kSplatWidth;
+  m.attr("NEAR") = ar::kNear;
+  m.attr("FRUSTUM_CLAMP") = ar::kFrustumClamp;
+  m.attr("ALPHA_MIN") = ar::kAlphaMin;
+  m.attr("MAX_SH_DEGREE") = ar::kMaxShDegree;
+  m.attr("MAX_CHANNELS") = ar::kMaxChannels;
+  m.attr("WEIGHT_UNIT") = ar::kWeightUnit;
 }
