@@ -10,23 +10,38 @@ import torch
 
 from . import _C  # loads the ops
 
-BOX_SAMPLES = (1, 2, 4, 8, 16)
-FRAME_GRADIENTS = ("frozen", "paper")
+_VARIANTS: dict[str, list[dict[str, Any]]] = {}  # what the headers say, by public name, in the order of the registry
+for _variant in _C.footprints():
+    _VARIANTS.setdefault(_variant["name"], []).append(_variant)
 
-# Options of the footprints that have any, and their defaults.
-OPTIONS: dict[str, dict[str, Any]] = {
-    "point": {"dilation": 0.3},
-    "mip": {"variance": 0.1},
-    "analytic": {"frame_gradient": "frozen"},
-    "box": {"samples": 4},
-    "adaptive": {"tolerance": 1 / 255},
-}
-
-# Kernels that an option chooses.
-_CHOSEN = {"analytic_paper": "analytic", **{f"box{samples}": "box" for samples in BOX_SAMPLES}}
-
-FOOTPRINTS = tuple(dict.fromkeys(_CHOSEN.get(key, key) for key in _C.footprints()))
+FOOTPRINTS = tuple(_VARIANTS)
 """Public names of the footprints, in the order of the registry: those of csrc/core/footprint/registry.h."""
+
+YARDSTICKS = tuple(name for name, variants in _VARIANTS.items() if variants[0]["yardstick"])
+"""Footprints that are meant to compare others with, and are slow."""
+
+
+def _value_of(text: str) -> int | str:
+    return int(text) if text.isdigit() else text
+
+
+def option_values(name: str) -> tuple:
+    """The values that the option of a footprint may have; empty where it is a number, or where there is no option."""
+    return tuple(_value_of(v["value"]) for v in _VARIANTS[name] if v["value"] is not None)
+
+
+BOX_SAMPLES = option_values("box")
+
+
+def _default_options(name: str) -> dict[str, Any]:
+    default = next(v for v in _VARIANTS[name] if v["is_default"])
+    if default["option"] is None:
+        return {}
+    return {default["option"]: default["number"] if default["value"] is None else _value_of(default["value"])}
+
+
+OPTIONS: dict[str, dict[str, Any]] = {name: _default_options(name) for name in FOOTPRINTS}
+"""Options of every footprint, and their defaults."""
 
 ENVIRONMENT_VARIABLE = "ANALYTIC_RASTERIZER_FOOTPRINT"
 
@@ -40,12 +55,14 @@ class Footprint:
         options: Every option of that footprint, as a tuple of (name, value) pairs.
         key: Name of the kernel that computes it.
         option: The number that the kernel takes: dilation, variance or tolerance; 0 where there is none.
+        samples: The most samples that a pixel has.
     """
 
     name: str
     options: tuple[tuple[str, Any], ...]
     key: str
     option: float
+    samples: int
 
     def __str__(self) -> str:
         options = ",".join(f"{k}={v}" for k, v in self.options)
@@ -84,7 +101,7 @@ def resolve_footprint(name: str, **options: Any) -> Footprint:
     name, _, text = name.partition(":")
     if name not in FOOTPRINTS:
         raise ValueError(f"footprint must be one of {', '.join(FOOTPRINTS)}, got {name!r}")
-    settled = dict(OPTIONS.get(name, {}))
+    settled = dict(OPTIONS[name])
     given = dict(item.partition("=")[::2] for item in text.split(",")) if text else {}
     given.update(options)
     for option, value in given.items():
@@ -92,25 +109,17 @@ def resolve_footprint(name: str, **options: Any) -> Footprint:
             known = ", ".join(settled) or "no options"
             raise ValueError(f"options of footprint {name} must be among: {known}; got {option!r}")
         settled[option] = value
-    key, number = name, 0.0
-    if name == "point":
-        number = settled["dilation"] = _number("dilation", settled["dilation"])
-    elif name == "mip":
-        number = settled["variance"] = _number("variance", settled["variance"])
-    elif name == "analytic":
-        if settled["frame_gradient"] not in FRAME_GRADIENTS:
-            raise ValueError(
-                f"frame_gradient must be one of {', '.join(FRAME_GRADIENTS)}, got {settled['frame_gradient']!r}"
-            )
-        key = "analytic" if settled["frame_gradient"] == "frozen" else "analytic_paper"
-    elif name == "box":
-        if str(settled["samples"]) not in map(str, BOX_SAMPLES):
-            raise ValueError(f"samples must be one of {', '.join(map(str, BOX_SAMPLES))}, got {settled['samples']!r}")
-        settled["samples"] = int(settled["samples"])
-        key = f"box{settled['samples']}"
-    elif name == "adaptive":
-        number = settled["tolerance"] = _number("tolerance", settled["tolerance"])
-    return Footprint(name, tuple(settled.items()), key, number)
+    variant, number = _VARIANTS[name][0], 0.0
+    for option, value in settled.items():  # there is one at most
+        values = option_values(name)
+        if not values:
+            number = settled[option] = _number(option, value)
+        elif str(value) in map(str, values):
+            variant = _VARIANTS[name][[str(v) for v in values].index(str(value))]
+            settled[option] = _value_of(variant["value"])
+        else:
+            raise ValueError(f"{option} must be one of {', '.join(map(str, values))}, got {value!r}")
+    return Footprint(name, tuple(settled.items()), variant["key"], number, variant["samples"])
 
 
 _default: Footprint | None = None

@@ -1,6 +1,6 @@
 #include "torch/recipe.h"
 
-#include <torch/serialize.h>
+#include <torch/csrc/jit/serialization/pickle.h>
 
 #include <fstream>
 
@@ -63,7 +63,7 @@ class Snapshot {
   template <class Value> static IValue copy_of(const Value& value) { return IValue(value); }
 
   void write() const {
-    const std::vector<char> bytes = torch::pickle_save(IValue(*copy_));
+    const std::vector<char> bytes = torch::jit::pickle_save(IValue(*copy_));
     std::ofstream(path_, std::ios::binary).write(bytes.data(), std::streamsize(bytes.size()));
   }
 
