@@ -27,10 +27,6 @@ import time
 from collections.abc import Callable
 
 import torch
-from scene_files import load_scene
-
-import analytic_rasterizer as ar
-from analytic_rasterizer import effects, io
 from analytic_rasterizer.measure import (
     Case,
     describe_machine,
@@ -41,6 +37,10 @@ from analytic_rasterizer.measure import (
     warm_up_cuda,
 )
 from analytic_rasterizer.report import markdown_table
+from scene_files import load_scene
+
+import analytic_rasterizer as ar
+from analytic_rasterizer import effects, io
 
 FOOTPRINTS = ["box:samples=1", "box:samples=4"]
 ROUNDS = {"cpu": 5, "cuda": 30}

@@ -28,10 +28,6 @@ import time
 from collections.abc import Callable
 
 import torch
-from scene_files import load_scene
-
-import analytic_rasterizer as ar
-from analytic_rasterizer import io
 from analytic_rasterizer.measure import (
     Case,
     describe_machine,
@@ -42,6 +38,10 @@ from analytic_rasterizer.measure import (
     warm_up_cuda,
 )
 from analytic_rasterizer.report import format_table
+from scene_files import load_scene
+
+import analytic_rasterizer as ar
+from analytic_rasterizer import io
 
 FOOTPRINTS = [
     "box:samples=1",
