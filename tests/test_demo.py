@@ -132,13 +132,18 @@ def test_render_command_repeats_the_demo(demo_run, tmp_path):
 
 
 def test_table_of_the_command(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(accuracy, "MAX_DENSITY", 8)
+    monkeypatch.setattr(reference, "MAX_DENSITY", 8)
     monkeypatch.setattr(demo, "REPEATS", 1)
     assert demo.main(["--out", str(tmp_path / "new"), "--size", "48", "32"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].split() == [*("scale", "footprint", "PSNR", "[dB]", "RMSE", "max", "time", "[s]")]
     assert len(lines) == 1 + len(demo.COLUMNS) * len(demo.REDUCTIONS) + 2
     assert lines[-1] == f"see {tmp_path / 'new' / 'contact_sheet.png'}"
+
+
+def test_wrong_arguments_are_one_line(tmp_path, capsys):
+    assert demo.main(["--out", str(tmp_path), "--size", "30", "20"]) == 2
+    assert capsys.readouterr() == ("", "error: size must be positive multiples of 8, got 30 x 20\n")
 
 
 @pytest.mark.parametrize("size", [(0, 8), (100, 64), (96, 60), (-8, 8)])

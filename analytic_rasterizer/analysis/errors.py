@@ -55,7 +55,7 @@ def run(out, samples: int = SAMPLES, monte_carlo: int = MONTE_CARLO, rotation_sa
     """
     optional_import("matplotlib.figure", "analysis")  # raises before anything is measured
     out, cases = Path(out), all_cases()
-    with optional_import("tqdm").tqdm(total=2 + len(cases), desc="errors", disable=None) as bar:
+    with optional_import("tqdm", "analysis").tqdm(total=2 + len(cases), desc="errors", disable=None) as bar:
         results = {"window": window_errors()}
         bar.update()
         results["rotation"] = rotation_errors(rotation_samples or ROTATION_SAMPLES, monte_carlo)
