@@ -6,7 +6,8 @@ A drop-in replacement for `diff_gaussian_rasterization`. See the README for how 
 import torch  # noqa: F401  (its libraries must be loaded before the extension's)
 
 from ._C import instruction_set
-from .camera import camera_settings, moved
+from .analysis.planner import SceneReport, inspect_scene, plan
+from .camera import moved
 from .effects import Defocus, Effects, GaussianStats, Motion, Outputs, normalized
 from .filters import apply_3d_filter, compute_3d_filter
 from .footprints import (
@@ -17,9 +18,8 @@ from .footprints import (
     resolve_footprint,
     set_default_footprint,
 )
-from .harmonics import needed_sh_degree
+from .io import camera_settings
 from .ops import TILE
-from .planner import SceneReport, inspect_scene, plan
 from .rasterizer import (
     GaussianRasterizationSettings,
     GaussianRasterizer,
@@ -27,6 +27,7 @@ from .rasterizer import (
     rasterize_gaussians,
     render_stages,
 )
+from .sh import needed_sh_degree
 
 __version__ = "0.1.0"
 

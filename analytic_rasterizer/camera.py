@@ -1,16 +1,17 @@
-"""Cameras from a pose and focal lengths, with gradients to both."""
+"""Cameras: the matrices of a pose and focal lengths, with gradients to both, and the numbers that the ops read."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 
-from .effects import Effects
-from .rasterizer import GaussianRasterizationSettings
+from .effects import Defocus, Effects, Motion
 
 _DEPTH_RANGE = (0.01, 100.0)  # of clip-space z, which nothing reads
 
 
-def camera_settings(
+def camera_fields(
     world_to_camera: torch.Tensor,
     width: int,
     height: int,
@@ -19,33 +20,20 @@ def camera_settings(
     cx: float | torch.Tensor | None = None,
     cy: float | torch.Tensor | None = None,
     *,
-    bg: torch.Tensor | None = None,
-    sh_degree: int = 3,
-    scale_modifier: float = 1.0,
-    debug: bool = False,
     dtype: torch.dtype = torch.float32,
     device: torch.device | str | None = None,
     effects: Effects | str | None = None,
-    **options,
-) -> GaussianRasterizationSettings:
-    """Settings of a pinhole camera, or with `Effects(orthographic=True)` of an orthographic one.
+) -> dict[str, Any]:
+    """The fields of `GaussianRasterizationSettings` that describe a camera; `camera_settings` makes settings of them.
 
-    With `Effects(camera_gradients=True)` gradients flow to every tensor given, on the CPU or a device. The matrices
-    are put together in float64 and rounded once.
+    Arguments and errors are those of `camera_settings`.
 
-    Args:
-        world_to_camera: (4, 4), acts on column vectors; camera axes x right, y down, z forward. Its upper left
-            3x3 may be any matrix that can be inverted, which matters to the derivative, not to a rotation.
-        width, height: Size of the image, px.
-        fx, fy: Focal lengths, px; of an orthographic camera px per world unit. Numbers, or tensors with one.
-        cx, cy: Principal point, px, the image spanning [0, width] x [0, height]; None: its centre.
-        bg: As in the settings; None: black.
-        sh_degree, scale_modifier, debug: As in the settings.
-        dtype, device: Of the tensors of the settings: those of the scene. No device: that of world_to_camera.
-        effects, **options: As in the settings, the footprint among them.
-
-    Raises:
-        ValueError: world_to_camera has a wrong shape, or a focal length that is a number is not positive.
+    Returns:
+        image_height, image_width: As given.
+        tanfovx, tanfovy: Tangents of half the field of view: numbers, or with `Effects(camera_gradients=True)` float64
+            tensors on the device of world_to_camera.
+        viewmatrix, projmatrix: (4, 4), transposed.
+        campos: (3,).
     """
     if world_to_camera.shape != (4, 4):
         raise ValueError(f"world_to_camera must have shape (4, 4), got {tuple(world_to_camera.shape)}")
@@ -61,7 +49,7 @@ def camera_settings(
     tangents = width / (2 * fx), height / (2 * fy)
     zero, one = view.new_zeros(()), view.new_ones(())
     near, far = _DEPTH_RANGE
-    # In clip space the principal point is where it is in the image, whose halves are 1 long.
+    # The principal point in clip space, where the image spans [-1, 1] x [-1, 1].
     x, y = 2 * cx / width - 1, 2 * cy / height - 1
     along = (zero, zero, x, y) if orthographic else (x, y, zero, zero)
     projection = torch.stack([
@@ -74,28 +62,21 @@ def camera_settings(
         tangents = tuple(t.item() for t in tangents)
     position = -torch.linalg.solve(view[:3, :3], view[:3, 3])
     to = {"dtype": dtype, "device": view.device if device is None else device}
-    return GaussianRasterizationSettings(
-        image_height=height,
-        image_width=width,
-        tanfovx=tangents[0],
-        tanfovy=tangents[1],
-        bg=torch.zeros(3, **to) if bg is None else bg.to(**to),
-        scale_modifier=scale_modifier,
-        viewmatrix=view.T.to(**to).contiguous(),
-        projmatrix=(projection @ view).T.to(**to).contiguous(),
-        sh_degree=sh_degree,
-        campos=position.to(**to),
-        prefiltered=False,
-        debug=debug,
-        effects=effects,
-        **options,
-    )
+    return {
+        "image_height": height,
+        "image_width": width,
+        "tanfovx": tangents[0],
+        "tanfovy": tangents[1],
+        "viewmatrix": view.T.to(**to).contiguous(),
+        "projmatrix": (projection @ view).T.to(**to).contiguous(),
+        "campos": position.to(**to),
+    }
 
 
 def moved(world_to_camera: torch.Tensor, tangent: torch.Tensor) -> torch.Tensor:
-    """The camera after a small motion, exp(tangent) @ world_to_camera: the tangent-space form of a pose.
+    """The camera after a small motion, exp(tangent) @ world_to_camera: a pose in the tangent space of SE(3).
 
-    Differentiable, at zero too: optimise `tangent` from zeros, and the pose stays rigid.
+    Differentiable, also at zero: optimise `tangent` from zeros, and the pose stays rigid.
 
     Args:
         world_to_camera: (4, 4).
@@ -114,3 +95,69 @@ def moved(world_to_camera: torch.Tensor, tangent: torch.Tensor) -> torch.Tensor:
     rows = ((zero, -rz, ry, x), (rz, zero, -rx, y), (-ry, rx, zero, z), (zero,) * 4)
     twist = torch.stack([torch.stack(row) for row in rows])
     return torch.linalg.matrix_exp(twist) @ world_to_camera
+
+
+def make_lens(effects: Effects, settings, like: torch.Tensor) -> torch.Tensor:
+    """The op's argument `lens`: the numbers of `Lens` in csrc/core/lens.h, in its order.
+
+    Args:
+        effects: What the projection has beyond a pinhole.
+        settings: A `GaussianRasterizationSettings`.
+        like: A tensor whose dtype and device the result takes.
+    """
+    tangents = (settings.tanfovx, settings.tanfovy)
+    if not effects.camera_gradients:
+        tangents = (float(t) for t in tangents)
+    center = (0.0, 0.0)
+    if effects.off_center:
+        center = (view_center(settings.viewmatrix, settings.projmatrix, effects.camera_gradients),)
+    defocus, motion = effects.defocus or Defocus(0.0, 1.0), effects.motion or Motion(0.0)
+    streaks = [
+        _times(motion.exposure, value, length)
+        for value, length in ((motion.velocity, 3), (motion.angular_velocity, 3), (motion.screen_velocity, 2))
+    ]
+    numbers = (
+        *tangents, *center, defocus.aperture, defocus.focus, *streaks, effects.near, effects.far,
+        float(effects.orthographic),
+    )  # fmt: skip
+    # Neighbouring numbers are copied to the device together; the last three are never tensors.
+    parts, floats = [], []
+    for number in numbers:
+        if isinstance(number, torch.Tensor):
+            parts += [_copied(floats, like)] if floats else []
+            parts.append(number.to(like).reshape(-1))
+            floats = []
+        else:
+            floats += number if isinstance(number, list) else [float(number)]
+    last = _copied(floats, like)
+    return torch.cat([*parts, last]) if parts else last
+
+
+def _copied(numbers: list[float], like: torch.Tensor) -> torch.Tensor:
+    """A tensor like `like`. It is copied from pinned memory: otherwise the host would wait for all earlier work."""
+    if like.is_cuda and torch.cuda.is_current_stream_capturing():
+        # A replay would copy from host memory that has been reused since.
+        raise RuntimeError("effects of the camera cannot be captured in a CUDA graph")
+    host = torch.tensor(numbers, dtype=like.dtype, pin_memory=like.is_cuda)
+    return host.to(like.device, non_blocking=True)
+
+
+def _times(exposure, velocity, length: int):
+    """exposure * velocity, `length` numbers: a tensor if one of the two is a tensor, otherwise a list."""
+    if velocity is None:
+        return [0.0] * length
+    if isinstance(exposure, torch.Tensor) and not isinstance(velocity, torch.Tensor):
+        velocity = exposure.new_tensor(velocity)
+    if isinstance(velocity, torch.Tensor):
+        exposure = exposure.to(velocity).reshape(()) if isinstance(exposure, torch.Tensor) else exposure
+        return exposure * velocity
+    return [exposure * v for v in velocity]
+
+
+def view_center(view: torch.Tensor, proj: torch.Tensor, with_gradient: bool) -> torch.Tensor:
+    """(2,) x/z and y/z at the centre of the picture, where clip_x = p_xx x + p_xz z is zero."""
+    view, proj = view.reshape(4, 4)[:3, :3], proj.reshape(4, 4)[:3, :2]  # transposed: they act on row vectors
+    if not with_gradient:
+        view, proj = view.detach(), proj.detach()
+    p = view.T @ proj / (view**2).sum(0)[:, None]
+    return -p[2] / p.diagonal()

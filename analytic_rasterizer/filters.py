@@ -7,32 +7,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 
 from .effects import Effects, depths
-
-if TYPE_CHECKING:
-    from .rasterizer import GaussianRasterizationSettings
 
 VARIANCE = 0.2  # of the filter, in squares of the finest sampling interval
 MARGIN = 0.15  # of the image around it in which a Gaussian still counts as seen
 
 
 @torch.no_grad()
-def compute_3d_filter(
-    means3D: torch.Tensor, cameras: Sequence[GaussianRasterizationSettings], variance: float = VARIANCE
-) -> torch.Tensor:
+def compute_3d_filter(means3D: torch.Tensor, cameras: Sequence[Any], variance: float = VARIANCE) -> torch.Tensor:
     """Standard deviation of every Gaussian's filter, from the camera that samples it most finely.
 
     A camera samples a point at depth z once every z / focal length world units, an orthographic one every
-    1 / focal length. Of the cameras that see a point, with a margin around the image, the smallest such interval
-    counts; where none does, the largest of all others.
+    1 / focal length. A point takes the smallest interval among the cameras that see it, with a margin around the
+    image. A point that no camera sees takes the largest interval of all other points.
 
     Args:
         means3D: (P, 3) centres, world units.
-        cameras: Settings of the training views, at least one; only size, field of view and matrices are read.
+        cameras: `GaussianRasterizationSettings` of the training views, at least one. Size, field of view, matrices and
+            the near and far planes of the effects are read.
         variance: Of the filter, in squares of the sampling interval.
 
     Returns:
@@ -53,8 +49,11 @@ def compute_3d_filter(
     return torch.where(seen, interval, largest) * math.sqrt(variance)
 
 
-def sampling_interval(means3D: torch.Tensor, camera: GaussianRasterizationSettings) -> torch.Tensor:
-    """World units between samples, (P,): z / focal length; infinite for a point that the camera does not see."""
+def sampling_interval(means3D: torch.Tensor, camera: Any) -> torch.Tensor:
+    """(P,) world units between samples, z / focal length; infinite for a point that the camera does not see.
+
+    `camera` is a `GaussianRasterizationSettings`.
+    """
     effects = camera.effects if isinstance(camera.effects, Effects) else Effects()
     clip = camera.projmatrix.reshape(4, 4).to(means3D)
     z = depths(means3D, camera.viewmatrix.to(means3D))
@@ -91,7 +90,7 @@ def apply_3d_filter(
         )
     if opacities.numel() != len(scales):
         raise ValueError(f"opacities must have shape (P, 1) or (P,), got {tuple(opacities.shape)}")
-    # hypot neither overflows nor loses small scales, and its gradient at 0 is finite but where both are.
+    # hypot neither overflows nor loses small scales, and its gradient is finite unless both arguments are 0.
     width = filter_3d[:, None].expand_as(scales)
     filtered = torch.where(width > 0, torch.hypot(scales, torch.where(width > 0, width, 1)), scales)
     share = torch.where(width > 0, scales / torch.where(width > 0, filtered, 1), 1).prod(1)

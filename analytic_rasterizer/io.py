@@ -18,7 +18,8 @@ from typing import NamedTuple
 
 import torch
 
-from .camera import camera_settings
+from .camera import camera_fields
+from .effects import Effects
 from .rasterizer import GaussianRasterizationSettings
 
 
@@ -188,6 +189,57 @@ def _ply_header(path: Path) -> list[str]:
 # -------------------------------------------------------------------------------------- views
 
 
+def camera_settings(
+    world_to_camera: torch.Tensor,
+    width: int,
+    height: int,
+    fx: float | torch.Tensor,
+    fy: float | torch.Tensor,
+    cx: float | torch.Tensor | None = None,
+    cy: float | torch.Tensor | None = None,
+    *,
+    bg: torch.Tensor | None = None,
+    sh_degree: int = 3,
+    scale_modifier: float = 1.0,
+    debug: bool = False,
+    dtype: torch.dtype = torch.float32,
+    device: torch.device | str | None = None,
+    effects: Effects | str | None = None,
+    **options,
+) -> GaussianRasterizationSettings:
+    """Settings of a pinhole camera, or with `Effects(orthographic=True)` of an orthographic one.
+
+    With `Effects(camera_gradients=True)` gradients flow to every tensor that is given. The matrices are computed in
+    float64 and rounded once.
+
+    Args:
+        world_to_camera: (4, 4), acts on column vectors; camera axes x right, y down, z forward. Its upper left
+            3x3 need not be a rotation, only invertible, so that it can be differentiated entry by entry.
+        width, height: Size of the image, px.
+        fx, fy: Focal lengths, px; of an orthographic camera px per world unit. Numbers, or tensors with one.
+        cx, cy: Principal point, px, the image spanning [0, width] x [0, height]; None: its centre.
+        bg: As in the settings; None: black.
+        sh_degree, scale_modifier, debug: As in the settings.
+        dtype, device: Of the tensors of the settings: those of the scene. No device: that of world_to_camera.
+        effects, **options: As in the settings, the footprint among them.
+
+    Raises:
+        ValueError: world_to_camera has a wrong shape, or a focal length that is a number is not positive.
+    """
+    camera = camera_fields(world_to_camera, width, height, fx, fy, cx, cy, dtype=dtype, device=device, effects=effects)
+    view = camera["viewmatrix"]
+    return GaussianRasterizationSettings(
+        **camera,
+        bg=view.new_zeros(3) if bg is None else bg.to(view),
+        scale_modifier=scale_modifier,
+        sh_degree=sh_degree,
+        prefiltered=False,
+        debug=debug,
+        effects=effects,
+        **options,
+    )
+
+
 @dataclass(frozen=True)
 class View:
     """A pinhole camera. Lengths in pixels; the image spans [0, width] x [0, height]."""
@@ -205,6 +257,18 @@ class View:
         """(width, height) of the picture at `scale`: rounded, at least 1."""
         return max(1, round(self.width * scale)), max(1, round(self.height * scale))
 
+    def scaled(self, scale: float) -> View:
+        """The view with `size(scale)` pixels over the same field of view.
+
+        Raises ValueError for a scale that is not positive and finite.
+        """
+        if not (math.isfinite(scale) and scale > 0):
+            raise ValueError(f"scale must be positive and finite, got {scale}")
+        width, height = self.size(scale)
+        x, y = width / self.width, height / self.height
+        cx, cy = (c if c is None else c * factor for c, factor in ((self.cx, x), (self.cy, y)))
+        return replace(self, width=width, height=height, fx=x * self.fx, fy=y * self.fy, cx=cx, cy=cy)
+
     def settings(
         self,
         scale: float = 1.0,
@@ -221,18 +285,15 @@ class View:
         default footprint. Raises ValueError for a scale that is not positive, and what the
         settings raise.
         """
-        if not (math.isfinite(scale) and scale > 0):
-            raise ValueError(f"scale must be positive and finite, got {scale}")
-        width, height = self.size(scale)
-        x, y = width / self.width, height / self.height
+        view = self.scaled(scale)
         return camera_settings(
-            self.w2c,
-            width,
-            height,
-            x * self.fx,
-            y * self.fy,
-            None if self.cx is None else x * self.cx,
-            None if self.cy is None else y * self.cy,
+            view.w2c,
+            view.width,
+            view.height,
+            view.fx,
+            view.fy,
+            view.cx,
+            view.cy,
             bg=torch.tensor(background, dtype=torch.float32),
             sh_degree=sh_degree,
             footprint=footprint,

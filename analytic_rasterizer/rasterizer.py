@@ -11,10 +11,11 @@ from . import (
     channels,
     ops,  # noqa: F401  (registers the fake kernels)
 )
+from .camera import make_lens
 from .effects import AUTO, MAX_SH_DEGREE, NEAR, Effects, depths
 from .filters import apply_3d_filter
 from .footprints import Footprint, check_device, get_default_footprint, resolve_footprint
-from .lens import make_lens, used_sh_degree
+from .sh import used_sh_degree
 
 _NOTHING = Effects()
 

@@ -6,9 +6,9 @@ Off is the plain path, three colours of a fixed pinhole: from the scene's harmon
 colours, and for `sh_degree:4` from as many coefficients (zeros where the scene has none), of which degree 3 uses 16.
 Every effect is timed against a plain rendering of its own, in turn, round after round, so that a machine that slows
 down slows both; `off_twice` has two plain ones, and shows what is noise. Medians over rounds, averaged over views.
-"forward" is without gradient; "forward+backward" differentiates sum(image * w) for fixed random w, over all channels
-and differentiable outputs, in all inputs, those of the effect among them (camera, background). "extra" is the memory
-that a forward and backward pass needs beyond inputs, outputs and gradients.
+"forward" is without gradient; "forward+backward" computes the gradient of sum(image * w) for fixed random w, over all
+channels and differentiable outputs, with respect to all inputs, those of the effect among them (camera, background).
+"extra" is the memory that a forward and backward pass needs beyond inputs, outputs and gradients.
 
 Numbers come from the scene: a lens focused on the median depth whose median disc has 2 px, a camera that moves sideways
 by 4 px at the median depth, an orthographic one that shows as much as the other there, planes that cut nothing,
@@ -20,87 +20,53 @@ With CUDA times are between two events around a call on an idle device, and memo
 from __future__ import annotations
 
 import argparse
-import dataclasses
-import json
 import statistics
-import time
 from collections.abc import Callable
 
 import torch
+from options import UNITS, WARM_UP, make_parser, parse, print_setup, save_json
 from scene_files import load_scene
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import effects, io
-from analytic_rasterizer.measure import (
+from analytic_rasterizer.analysis.tables import markdown_table
+from analytic_rasterizer.analysis.timing import (
     Case,
-    describe_machine,
     event_seconds,
     fixed_weights,
     in_turn,
     median_of,
+    seconds_of,
     warm_up_cuda,
 )
-from analytic_rasterizer.report import markdown_table
 
 FOOTPRINTS = ["box:samples=1", "box:samples=4"]
-ROUNDS = {"cpu": 5, "cuda": 30}
-UNITS = {"cpu": ("s", 1.0), "cuda": ("ms", 1e3)}
-WARM_UP = 15
 DISC, STREAK = 2.0, 4.0  # px
 CAMERA = ("viewmatrix", "projmatrix", "campos", "tanfovx", "tanfovy")
 
 
 def main() -> None:
     args = parse_arguments()
-    torch.set_num_threads(args.threads)
     scene = load_scene(args.scene).to(args.device)
-    views = [scaled(view, args.scale) for view in io.load_views(args.views)]
-    if args.limit_views:
-        views = views[: args.limit_views]
-    machine = describe_machine(args.device)
-    gaussians = f"{len(scene.means)} Gaussians of SH degree {scene.sh_degree}"
-    print(f"{gaussians}, {len(views)} views of {views[0].width}x{views[0].height}, {machine}")
+    views = [view.scaled(args.scale) for view in io.load_views(args.views)[: args.limit_views]]
+    print_setup(scene, views, args.device)
     results = {}
     for footprint in args.footprints:
         setups = [Setup(scene, views, view, footprint) for view in views]
         rows = {name: ROWS[name] for name in args.effects}
         results[footprint] = {name: measure(setups, *row, args.device, args.rounds) for name, row in rows.items()}
         print(f"\n`{footprint}`\n\n{format_results(results[footprint], args.device)}")
-    if args.json:
-        with open(args.json, "w") as f:
-            json.dump({"machine": machine, "arguments": vars(args), "results": results}, f, indent=2)
+    save_json(args, {"results": results})
 
 
 def parse_arguments() -> argparse.Namespace:
-    has_cuda = torch.cuda.is_available() and ar._C.has_cuda
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("scene", help="trained scene: .ply, compressed .ply, .spz, or .npz (see scene_files.py)")
-    parser.add_argument("--views", required=True, help="file of views")
+    parser = make_parser(__doc__.split("\n")[0], FOOTPRINTS)
     parser.add_argument("--limit-views", type=int, help="use only so many of them")
     parser.add_argument("--scale", type=float, default=1.0, help="of the views' size")
-    parser.add_argument("--footprints", nargs="+", default=FOOTPRINTS, metavar="NAME[:k=v]")
     parser.add_argument(
         "--effects", nargs="+", default=list(ROWS), choices=list(ROWS), metavar="ROW", help=", ".join(ROWS)
     )
-    parser.add_argument(
-        "--device", choices=("cpu", "cuda"), default="cuda" if has_cuda else "cpu", help="(default here: %(default)s)"
-    )
-    parser.add_argument("--rounds", type=int, help="timed rounds after warming up (default: 5, with CUDA 30)")
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads(), help="of the CPU")
-    parser.add_argument("--json", help="also write everything measured to this file")
-    args = parser.parse_args()
-    if args.device == "cuda" and not has_cuda:
-        parser.error("--device cuda: no CUDA device, or analytic_rasterizer was built without CUDA")
-    args.rounds = args.rounds or ROUNDS[args.device]
-    return args
-
-
-def scaled(view: io.View, scale: float) -> io.View:
-    """The view with a picture `scale` times as large."""
-    width, height = view.size(scale)
-    x, y = width / view.width, height / view.height
-    center = {"cx": None if view.cx is None else view.cx * x, "cy": None if view.cy is None else view.cy * y}
-    return dataclasses.replace(view, width=width, height=height, fx=view.fx * x, fy=view.fy * y, **center)
+    return parse(parser)
 
 
 def format_results(results: dict[str, dict], device: str) -> str:
@@ -270,13 +236,14 @@ def measure(setups: list[Setup], off: Callable, on: Callable, device: str, round
     """Seconds and bytes off and on: medians over rounds, means over views."""
     cases = {"off": [off(setup) for setup in setups], "on": [on(setup) for setup in setups]}
     if device == "cuda":
-        warm_up_cuda([case for of_name in cases.values() for case in of_name], WARM_UP)
-    clock = event_seconds if device == "cuda" else wall_seconds
-    samples = in_turn(cases, lambda case: time_round(case, clock), range(rounds + 1))
+        each = [case for of_name in cases.values() for case in of_name]
+        warm_up_cuda([call for case in each for call in (case.forward, case.forward_backward)], WARM_UP)
+    clock = event_seconds if device == "cuda" else seconds_of
+    samples = in_turn(cases, lambda case: time_round(case, clock), rounds + 1)
     results = {}
     for name, of_name in cases.items():
         per_view = [
-            median_of(taken) | {"extra_bytes": case.extra_bytes()} for case, taken in zip(of_name, samples[name])
+            median_of(taken[1:]) | {"extra_bytes": case.extra_bytes()} for case, taken in zip(of_name, samples[name])
         ]
         results[name] = {key: statistics.mean(view[key] for view in per_view) for key in per_view[0]}
     return results
@@ -284,12 +251,6 @@ def measure(setups: list[Setup], off: Callable, on: Callable, device: str, round
 
 def time_round(case: PlainCase, clock: Callable) -> dict:
     return {"forward": clock(case.forward), "forward_backward": clock(case.forward_backward)}
-
-
-def wall_seconds(call: Callable[[], object]) -> float:
-    start = time.perf_counter()
-    call()
-    return time.perf_counter() - start
 
 
 if __name__ == "__main__":

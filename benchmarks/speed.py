@@ -22,26 +22,26 @@ of one size, with reserve.
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import time
 from collections.abc import Callable
 
 import torch
+from options import UNITS, WARM_UP, make_parser, parse, print_setup, save_json
 from scene_files import load_scene
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
-from analytic_rasterizer.measure import (
+from analytic_rasterizer.analysis.tables import format_table
+from analytic_rasterizer.analysis.timing import (
     Case,
-    describe_machine,
     event_seconds,
     in_turn,
     median_of,
     median_seconds,
+    seconds_of,
     warm_up_cuda,
 )
-from analytic_rasterizer.report import format_table
 
 FOOTPRINTS = [
     "box:samples=1",
@@ -54,14 +54,10 @@ FOOTPRINTS = [
 ]
 STAGES = ("project", "bin", "blend")
 HOST = ("host op", "host rasterizer", "host f+b")
-ROUNDS = {"cpu": 5, "cuda": 30}
-UNITS = {"cpu": ("s", 1.0), "cuda": ("ms", 1e3)}
-WARM_UP = 15
 
 
 def main() -> None:
     args = parse_arguments()
-    torch.set_num_threads(args.threads)
     scene = pad_sh(load_scene(args.scene), args.sh_degree)
     if args.shuffle:
         order = torch.randperm(len(scene.means), generator=torch.Generator().manual_seed(0))
@@ -72,39 +68,19 @@ def main() -> None:
 
     measured = (measure_cuda if args.device == "cuda" else measure_cpu)(cases, args.rounds)
     results = {name: summarize(per_view) for name, per_view in measured.items()}
-    size = f"{views[0].width}x{views[0].height}"
-    machine = describe_machine(args.device)
-    gaussians = f"{len(scene.means)} Gaussians of SH degree {scene.sh_degree}"
-    print(f"{gaussians}, {len(views)} views of {size}, {machine}")
+    print_setup(scene, views, args.device)
     print(format_results(results, args.device))
     print("B/budget: extra memory over 120 B per Gaussian + 64 B per pair + 64 B per pixel")
-    if args.json:
-        with open(args.json, "w") as f:
-            report = {"machine": machine, "arguments": vars(args), "results": results, "per_view": measured}
-            json.dump(report, f, indent=2)
+    save_json(args, {"results": results, "per_view": measured})
 
 
 def parse_arguments() -> argparse.Namespace:
-    has_cuda = torch.cuda.is_available() and ar._C.has_cuda
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("scene", help="trained scene: .ply, compressed .ply, .spz, or .npz (see scene_files.py)")
-    parser.add_argument("--views", required=True, help="file of views")
-    parser.add_argument("--footprints", nargs="+", default=FOOTPRINTS, metavar="NAME[:k=v]")
-    parser.add_argument(
-        "--device", choices=("cpu", "cuda"), default="cuda" if has_cuda else "cpu", help="(default here: %(default)s)"
-    )
-    parser.add_argument("--rounds", type=int, help="timed rounds after warming up (default: 5, with CUDA 30)")
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads(), help="of the CPU")
+    parser = make_parser(__doc__.split("\n")[0], FOOTPRINTS)
     parser.add_argument("--shuffle", action="store_true", help="randomise the order of the Gaussians")
     parser.add_argument(
         "--sh-degree", type=int, choices=range(4), help="pad the SH with zeros to this degree, as trainers hold them"
     )
-    parser.add_argument("--json", help="also write everything measured to this file")
-    args = parser.parse_args()
-    if args.device == "cuda" and not has_cuda:
-        parser.error("--device cuda: no CUDA device, or analytic_rasterizer was built without CUDA")
-    args.rounds = args.rounds or ROUNDS[args.device]
-    return args
+    return parse(parser)
 
 
 def pad_sh(scene: io.Scene, degree: int | None) -> io.Scene:
@@ -173,8 +149,8 @@ class SpeedCase(Case):
 
 def measure_cpu(cases: dict[str, list[SpeedCase]], rounds: int) -> dict[str, list[dict]]:
     """Seconds and bytes by footprint and view."""
-    samples = in_turn(cases, time_round, range(rounds + 1))
-    medians = {name: [median_of(taken) for taken in of_name] for name, of_name in samples.items()}
+    samples = in_turn(cases, time_round, rounds + 1)
+    medians = {name: [median_of(taken[1:]) for taken in of_name] for name, of_name in samples.items()}
     for name, of_name in cases.items():
         for case, result in zip(of_name, medians[name]):
             result.update(case.extra_memory(result["pairs"]))
@@ -186,16 +162,9 @@ def time_round(case: SpeedCase) -> dict:
     start = time.perf_counter()
     stages = case.stages()
     forward = time.perf_counter() - start
-    pairs, seconds = len(stages.pairs), stages.seconds
+    pairs, by_stage = len(stages.pairs), stages.seconds
     del stages
-    start = time.perf_counter()
-    case.forward_backward()
-    return {
-        "forward": forward,
-        "forward_backward": time.perf_counter() - start,
-        "pairs": pairs,
-        **seconds,
-    }
+    return {"forward": forward, "forward_backward": seconds_of(case.forward_backward), "pairs": pairs, **by_stage}
 
 
 # -------------------------------------------------------------------------------- times, CUDA
@@ -205,7 +174,7 @@ def measure_cuda(cases: dict[str, list[SpeedCase]], rounds: int) -> dict[str, li
     """Seconds and bytes by footprint and view."""
     results = {}
     for name, of_name in cases.items():
-        warm_up_cuda(of_name, WARM_UP)
+        warm_up_cuda([call for case in of_name for call in (case.forward, case.forward_backward)], WARM_UP)
         results[name] = [time_case(case, rounds) for case in of_name]
     return results
 
@@ -236,9 +205,7 @@ def time_case(case: SpeedCase, rounds: int) -> dict:
 
 def host_seconds(call: Callable[[], object]) -> float:
     """Time until a call returns, of a device that has nothing else to do."""
-    start = time.perf_counter()
-    call()
-    seconds = time.perf_counter() - start
+    seconds = seconds_of(call)
     torch.cuda.synchronize()
     return seconds
 

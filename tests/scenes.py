@@ -242,7 +242,7 @@ def settings_to(settings, device):
 
 def tile_samples(settings, scene):
     """What `adaptive` chooses (tile rows, tile columns)."""
-    from analytic_rasterizer.planner import tile_samples
+    from analytic_rasterizer.analysis.planner import tile_samples
 
     return tile_samples(settings, scene)
 

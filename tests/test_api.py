@@ -18,8 +18,8 @@ from scenes import KINDS, VARIANTS, Camera, name_of
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C
+from analytic_rasterizer.camera import make_lens
 from analytic_rasterizer.footprints import check_device
-from analytic_rasterizer.lens import make_lens
 
 FIELDS = (
     "image_height",

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -192,7 +193,6 @@ def test_errors_are_one_line(files, capsys, prepare, extra, message):
         ([], "the following arguments are required: COMMAND"),
         (["paint"], "invalid choice: 'paint'"),
         (["render"], "the following arguments are required: SCENE, --views, --out"),
-        (["demo", "--out", "{}", "--size", "30", "20"], "size must be positive multiples of 8"),
     ],
 )
 def test_wrong_commands_are_one_line(tmp_path, capsys, args, message):
@@ -247,23 +247,26 @@ def test_interrupt_is_quiet(files, capsys, monkeypatch):
 
 
 @pytest.mark.skipif(os.name != "posix", reason="sends a POSIX signal")
-def test_interrupt_of_a_process_is_quiet(tmp_path):
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+def test_interrupt_of_a_process_is_quiet(files):
+    """A run of `render` over many views, of which the first is written when the signal comes."""
+    view = io.load_views(files / "views.json")[0]
+    io.save_views(files / "views.json", [replace(view, name=f"{i}") for i in range(3000)])
     process = subprocess.Popen(
-        [sys.executable, "-m", "analytic_rasterizer", "demo", "--out", str(tmp_path)],
+        [sys.executable, "-m", "analytic_rasterizer", *arguments(files)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=environment,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
         # A job in the background of a script ignores SIGINT, and its children with it.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 60
-    while not (tmp_path / "views.json").exists() and time.monotonic() < deadline:
+    while not (files / "out" / "0.png").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=60)
     assert (process.returncode, out, err) == (130, "", "")
+    assert not (files / "out" / "2999.png").exists()
 
 
 def inspect_arguments(files, *extra):
@@ -316,7 +319,7 @@ def test_inspect_without_matplotlib_names_the_extra(files, capsys, monkeypatch):
 def test_version_and_help(capsys):
     assert leave(["--version"]) == 0
     assert capsys.readouterr().out == f"analytic_rasterizer {ar.__version__}\n"
-    for args in ([], ["render"], ["demo"], ["errors"], ["pareto"], ["inspect"]):
+    for args in ([], ["render"], ["errors"], ["pareto"], ["inspect"]):
         args = [*args, "--help"]
         assert leave(args) == 0
         text = capsys.readouterr().out

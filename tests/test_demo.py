@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from analytic_rasterizer import accuracy, cli, demo
+import demo
+from analytic_rasterizer import cli
+from analytic_rasterizer.analysis import reference
 from analytic_rasterizer.rasterizer import render_stages
 
 pytest.importorskip("gsply", reason="needs the cli extra")
@@ -62,8 +64,8 @@ def test_stamps_land_where_they_are_drawn():
 def test_reference_of_a_reduction_is_aligned_with_its_render():
     scene, view = small_view()
     half = replace(view, width=SIZE[0] // 2, height=SIZE[1] // 2, fx=view.fx / 2, fy=view.fy / 2)
-    direct = accuracy.supersampled(scene, half, 8, background=demo.PAPER)
-    reduced = demo._reduced(accuracy.supersampled(scene, view, 4, background=demo.PAPER))[2]
+    direct = reference.supersampled(scene, half, 8, background=demo.PAPER)
+    reduced = demo._reduced(reference.supersampled(scene, view, 4, background=demo.PAPER))[2]
     assert (direct - reduced).abs().max() < 2 / 255
     assert (direct - reduced).abs().mean() < 1e-5
 
@@ -72,7 +74,7 @@ def test_reference_is_converged(demo_run):
     _, results = demo_run
     for reduction, residual in results["reference"]["residual_rmse"].items():
         errors = [p["rmse"] for p in results["pictures"] if str(p["reduction"]) == reduction]
-        assert residual <= accuracy.RMSE_SHARE * min(errors)
+        assert residual <= reference.RMSE_SHARE * min(errors)
 
 
 def test_errors_are_those_of_the_written_pictures(demo_run):
@@ -99,7 +101,7 @@ def test_footprints_rank_as_they_should():
     That holds where the pixels resolve the target; far below (1/8) four samples alias.
     """
     scene, view = demo.make_target()
-    truth = demo._reduced(accuracy.supersampled(scene, view, 8, background=demo.PAPER))
+    truth = demo._reduced(reference.supersampled(scene, view, 8, background=demo.PAPER))
     for reduction in (1, 2):
         psnr = {
             name: demo._errors(demo._render(scene, view, 1 / reduction, name)[0], truth[reduction])[0]
@@ -130,13 +132,18 @@ def test_render_command_repeats_the_demo(demo_run, tmp_path):
 
 
 def test_table_of_the_command(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(accuracy, "MAX_DENSITY", 8)
+    monkeypatch.setattr(reference, "MAX_DENSITY", 8)
     monkeypatch.setattr(demo, "REPEATS", 1)
-    assert cli.main(["demo", "--out", str(tmp_path / "new"), "--size", "48", "32"]) == 0
+    assert demo.main(["--out", str(tmp_path / "new"), "--size", "48", "32"]) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].split() == [*("scale", "footprint", "PSNR", "[dB]", "RMSE", "max", "time", "[s]")]
     assert len(lines) == 1 + len(demo.COLUMNS) * len(demo.REDUCTIONS) + 2
     assert lines[-1] == f"see {tmp_path / 'new' / 'contact_sheet.png'}"
+
+
+def test_wrong_arguments_are_one_line(tmp_path, capsys):
+    assert demo.main(["--out", str(tmp_path), "--size", "30", "20"]) == 2
+    assert capsys.readouterr() == ("", "error: size must be positive multiples of 8, got 30 x 20\n")
 
 
 @pytest.mark.parametrize("size", [(0, 8), (100, 64), (96, 60), (-8, 8)])

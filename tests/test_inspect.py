@@ -12,7 +12,8 @@ from conftest import SHARED
 from scenes import Camera
 
 import analytic_rasterizer as ar
-from analytic_rasterizer import io, planner
+from analytic_rasterizer import io
+from analytic_rasterizer.analysis import planner
 
 TOLERANCE = 1 / 255
 CAMERAS = [Camera(image_height=61, image_width=83), Camera(image_height=52, image_width=40, eye=(-3.0, 1.5, -3.0))]

@@ -11,7 +11,9 @@ import torch
 from conftest import SHARED
 
 import analytic_rasterizer as ar
-from analytic_rasterizer import accuracy, cli, demo, io, measure, pareto, report
+import demo
+from analytic_rasterizer import cli, io
+from analytic_rasterizer.analysis import pareto, reference, tables, timing
 
 pytest.importorskip("gsply", reason="needs the analysis extra")
 pytest.importorskip("torchmetrics", reason="needs the analysis extra")
@@ -82,7 +84,7 @@ def test_bad_supersampling(text):
 
 def test_supersampled_case_averages_the_large_picture():
     scene, (view, _) = target()
-    case = measure.Case(scene, view, "mip", 3, PAPER)
+    case = timing.Case(scene, view, "mip", 3, PAPER)
     large = rendered(scene, io.View("x", 3 * 97, 3 * 65, 3 * view.fx, 3 * view.fy, view.w2c), "mip")
     expected = large.reshape(3, 65, 3, 97, 3).mean((2, 4))
     assert (case.forward() - expected).abs().max() < 1e-6
@@ -128,8 +130,8 @@ def test_crop_is_the_middle_of_the_picture(scale):
 def test_remainder_of_a_scale_is_cut_off():
     """A pixel of the smaller picture is the mean of the pixels of the larger that it covers."""
     scene, (view, _) = target()
-    large = accuracy.supersampled(scene, view, 8, background=PAPER)[:, :64, :96]
-    small = accuracy.supersampled(scene, pareto.framed(view, 2), 16, background=PAPER)
+    large = reference.supersampled(scene, view, 8, background=PAPER)[:, :64, :96]
+    small = reference.supersampled(scene, pareto.framed(view, 2), 16, background=PAPER)
     assert (small - large.reshape(3, 32, 2, 48, 2).mean((2, 4))).abs().mean() < 1e-5
 
 
@@ -144,7 +146,7 @@ def test_errors_by_hand(measured):
     at_scale = results["scales"][1]
     assert at_scale["sizes"] == [[48, 32], [44, 30]]
     density = at_scale["reference"]["density"]
-    truth = [accuracy.supersampled(scene, view, density, background=PAPER).numpy() for view in small]
+    truth = [reference.supersampled(scene, view, density, background=PAPER).numpy() for view in small]
     for row in at_scale["methods"]:
         if row["supersampling"] > 1:
             continue
@@ -242,7 +244,7 @@ def test_front_by_hand():
 
 def test_times_are_those_of_the_fastest_round_in_turn(monkeypatch):
     scene, views = target()
-    cases = {name: [measure.Case(scene, view, name) for view in views] for name in ("mip", "analytic")}
+    cases = {name: [timing.Case(scene, view, name) for view in views] for name in ("mip", "analytic")}
     calls = []
 
     def clock(call, timer):
@@ -254,7 +256,7 @@ def test_times_are_those_of_the_fastest_round_in_turn(monkeypatch):
         seconds = slower * {"mip": 1.0, "analytic": 3.0}[name] * (3.0 if second_view else 1.0)
         return seconds * (5.0 if call.__name__ == "forward_backward" else 1.0)
 
-    monkeypatch.setattr(pareto, "_seconds", clock)
+    monkeypatch.setattr(timing, "seconds_of", clock)
     times = pareto._times(cases, 4, "mip")
     assert len(calls) == 5 * 8
     assert [name for name, *_ in calls[:8]] == ["mip"] * 4 + ["analytic"] * 4
@@ -267,20 +269,20 @@ def test_times_are_those_of_the_fastest_round_in_turn(monkeypatch):
 
 def test_cpu_time_leaves_out_what_others_take():
     start = time.perf_counter()
-    assert pareto._seconds(lambda: time.sleep(0.2), time.process_time) < 0.1
-    assert 0.2 <= pareto._seconds(lambda: time.sleep(0.2), time.perf_counter) <= time.perf_counter() - start
+    assert timing.seconds_of(lambda: time.sleep(0.2), time.process_time) < 0.1
+    assert 0.2 <= timing.seconds_of(lambda: time.sleep(0.2), time.perf_counter) <= time.perf_counter() - start
 
 
 def test_slow_methods_are_timed_once(monkeypatch):
     scene, views = target()
-    cases = {name: [measure.Case(scene, views[0], name)] for name in ("mip", "analytic")}
+    cases = {name: [timing.Case(scene, views[0], name)] for name in ("mip", "analytic")}
     calls = []
 
     def clock(call, timer):
         calls.append(name := call.__self__.settings.footprint.name)
         return {"mip": 1.0, "analytic": pareto.SLOW + 1.0}[name]
 
-    monkeypatch.setattr(pareto, "_seconds", clock)
+    monkeypatch.setattr(timing, "seconds_of", clock)
     times = pareto._times(cases, 3, "mip")
     assert (calls.count("mip"), calls.count("analytic")) == (4 * 2, 2)
     assert times["analytic"]["forward_ratio"] == times["analytic"]["forward_usual_ratio"] == pareto.SLOW + 1
@@ -296,7 +298,7 @@ def test_files_of_a_run(measured):
     for at_scale in results["scales"]:
         assert (np.asarray(image.open(out / f"pareto_{at_scale['scale']}.png").convert("L")) < 128).mean() > 0.002
         header, rows = pareto.to_table(results, at_scale)
-        assert report.markdown_table(header, rows) in text
+        assert tables.markdown_table(header, rows) in text
         assert [row[0] for row in rows] == METHODS
         assert all(len(row) == len(header) for row in rows)
         assert any("F" in str(row[-1]) for row in rows)

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from analytic_rasterizer import accuracy, demo, io
+import demo
+from analytic_rasterizer import io
+from analytic_rasterizer.analysis import reference
 
 pytest.importorskip("tqdm", reason="needs the cli extra")
 special = pytest.importorskip("scipy.special")
@@ -35,7 +37,7 @@ def test_reference_of_one_gaussian_is_its_integral(sigma):
     alpha below 1/255, outside of a disc, is not drawn."""
     mean, opacity, color = (11.3, 8.85), 0.9, (0.8, 0.5, 0.25)
     scene, view = one_gaussian(sigma, mean, opacity, color)
-    image = accuracy.supersampled(scene, view, 32)
+    image = reference.supersampled(scene, view, 32)
     assert image.shape == (3, 20, 24)
     assert image.dtype == torch.float64
 
@@ -52,7 +54,7 @@ def test_reference_of_one_gaussian_is_its_integral(sigma):
 
 def test_reference_sees_the_background():
     scene, view = one_gaussian(1.0, (5.0, 5.0), 0.5, (1.0, 0.0, 0.0))
-    image = accuracy.supersampled(scene, view, 2, background=(0.25, 0.5, 1.0))
+    image = reference.supersampled(scene, view, 2, background=(0.25, 0.5, 1.0))
     assert image[:, -1, -1].tolist() == [0.25, 0.5, 1.0]
 
 
@@ -61,16 +63,16 @@ def test_reference_sees_the_background():
 def test_reference_from_shifted_renders_is_that_of_one_large_render(monkeypatch, centre, density, pieces):
     scene, _ = demo.make_target()
     view = io.View("part", 96, 64, 115.0, 115.0, torch.eye(4, dtype=torch.float64), *centre)
-    whole = accuracy.supersampled(scene, view, density)
+    whole = reference.supersampled(scene, view, density)
     sizes = []
-    rasterizer = accuracy.GaussianRasterizer
+    rasterizer = reference.GaussianRasterizer
     monkeypatch.setattr(
-        accuracy,
+        reference,
         "GaussianRasterizer",
         lambda s: sizes.append((s.image_width, s.image_height)) or rasterizer(s),
     )
-    monkeypatch.setattr(accuracy, "MAX_PIXELS", (density**2 // pieces) * 96 * 64)
-    parts = accuracy.supersampled(scene, view, density)
+    monkeypatch.setattr(reference, "MAX_PIXELS", (density**2 // pieces) * 96 * 64)
+    parts = reference.supersampled(scene, view, density)
     fine = density // math.isqrt(pieces)
     assert sizes == [(96 * fine, 64 * fine)] * pieces
     # The same samples; a coordinate that rounds differently can cross the 1/255 cut of a splat.
@@ -81,16 +83,16 @@ def test_reference_from_shifted_renders_is_that_of_one_large_render(monkeypatch,
 def test_filtered_samples_are_rendered_in_one_piece(monkeypatch):
     """A footprint with a filter is as wide as a pixel of the picture it is in: shifted pictures would overlap."""
     scene, view = one_gaussian(0.6, (11.3, 8.85), 0.9, (0.8, 0.5, 0.25))
-    whole = accuracy.supersampled(scene, view, 4, "box:samples=16")
-    monkeypatch.setattr(accuracy, "MAX_PIXELS", view.width * view.height)
-    assert torch.equal(accuracy.supersampled(scene, view, 4, "box:samples=16"), whole)
-    assert (accuracy.supersampled(scene, view, 16) - whole).abs().max() < 2 / 255
+    whole = reference.supersampled(scene, view, 4, "box:samples=16")
+    monkeypatch.setattr(reference, "MAX_PIXELS", view.width * view.height)
+    assert torch.equal(reference.supersampled(scene, view, 4, "box:samples=16"), whole)
+    assert (reference.supersampled(scene, view, 16) - whole).abs().max() < 2 / 255
 
 
 def test_denser_samples_approach_the_integral():
     scene, view = one_gaussian(0.3, (11.3, 8.85), 0.9, (1.0, 1.0, 1.0))
     total = 2 * math.pi * 0.09 * (0.9 - 1 / 255)
-    errors = [abs(accuracy.supersampled(scene, view, n)[0].sum().item() - total) for n in (1, 4, 16)]
+    errors = [abs(reference.supersampled(scene, view, n)[0].sum().item() - total) for n in (1, 4, 16)]
     assert errors[0] > 10 * errors[1]
     assert errors[1] > errors[2]
 
@@ -108,7 +110,7 @@ def halving(error_at_one=1.0):
 
 def test_refinement_stops_when_the_change_is_a_tenth_of_the_smallest_error():
     sample, asked = halving()
-    refined = accuracy.refine(sample, lambda truth: {"a": 0.7}, start=2, limit=1024)
+    refined = reference.refine(sample, lambda truth: {"a": 0.7}, start=2, limit=1024)
     # From n/2 to n the picture changes by 1/n: 1/8 is too much, 1/16 is not.
     assert asked == [2, 4, 8, 16]
     assert refined.residuals[16] == {"a": pytest.approx(1 / 16)}
@@ -120,7 +122,7 @@ def test_refinement_stops_when_the_change_is_a_tenth_of_the_smallest_error():
 
 def test_refinement_that_does_not_settle_stops_at_its_limit():
     sample, asked = halving()
-    refined = accuracy.refine(sample, lambda truth: {"a": 1e-9}, start=2, limit=9)
+    refined = reference.refine(sample, lambda truth: {"a": 1e-9}, start=2, limit=9)
     assert asked == [2, 4, 8]
     assert refined.density == 8
 
@@ -130,7 +132,7 @@ def test_errors_of_a_picture():
     color = torch.full((3, 20, 50), 0.01)
     color[0, 0, 0] = -0.5
     color[1, 3, :2] = 0.2
-    errors = accuracy.image_errors(color, truth)
+    errors = reference.image_errors(color, truth)
     square = (0.25 + 2 * 0.04 + 2997 * 1e-4) / 3000
     assert errors["rmse"] == pytest.approx(math.sqrt(square), rel=1e-6)
     assert errors["psnr"] == pytest.approx(10 * math.log10(1 / square), rel=1e-6)
@@ -138,15 +140,15 @@ def test_errors_of_a_picture():
     assert errors["max"] == 0.5
     assert errors["p999"] == pytest.approx(0.01)  # 3 of 3000 exceed it
     color[2, 5, 0] = 0.3
-    assert accuracy.image_errors(color, truth)["p999"] == pytest.approx(0.2)
-    assert accuracy.image_errors(truth, truth)["psnr"] == 300
+    assert reference.image_errors(color, truth)["p999"] == pytest.approx(0.2)
+    assert reference.image_errors(truth, truth)["psnr"] == 300
 
 
 def test_point_samples_and_a_filtered_footprint_have_one_limit():
     """`box` with 16 samples shrinks to a point as the density grows, by another route."""
     scene, view = demo.make_target()
     view = io.View("part", 48, 32, 57.5, 57.5, view.w2c)
-    point = accuracy.supersampled(scene, view, 32)
-    box = accuracy.supersampled(scene, view, 8, "box:samples=16")
-    coarse = accuracy.supersampled(scene, view, 4)
-    assert accuracy.image_errors(box, point)["rmse"] < 0.1 * accuracy.image_errors(coarse, point)["rmse"]
+    point = reference.supersampled(scene, view, 32)
+    box = reference.supersampled(scene, view, 8, "box:samples=16")
+    coarse = reference.supersampled(scene, view, 4)
+    assert reference.image_errors(box, point)["rmse"] < 0.1 * reference.image_errors(coarse, point)["rmse"]

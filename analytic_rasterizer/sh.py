@@ -1,12 +1,13 @@
-"""How much the bands of spherical harmonics add to the colours of a scene."""
+"""Spherical harmonics: how much each band adds to the colours of a scene, and which degree is needed."""
 
 from __future__ import annotations
 
 import math
 
 import torch
+from torch.utils.weak import WeakTensorKeyDictionary
 
-from .effects import MAX_SH_DEGREE
+from .effects import AUTO, MAX_SH_DEGREE, Effects
 
 
 @torch.no_grad()
@@ -58,3 +59,28 @@ def needed_sh_degree(shs: torch.Tensor, tolerance: float = 1 / 255) -> int:
         left_out += bounds[degree]
         degree -= 1
     return degree
+
+
+# By tensor of coefficients: its version, the degree that was asked for, and the degree that is needed.
+_needed_degrees = WeakTensorKeyDictionary()
+
+
+def used_sh_degree(effects: Effects | str, degree: int, shs: torch.Tensor | None) -> int:
+    """The degree of spherical harmonics to evaluate, at most the one that the settings ask for.
+
+    With `AUTO` it is the smallest degree that makes no visible difference (`needed_sh_degree`). That is computed once
+    per tensor and version of the coefficients, because it waits for the device. Coefficients that are being trained,
+    or that were made in inference mode, are used in full. A change through `shs.data` does not raise the tensor's
+    version, and so goes unnoticed.
+    """
+    if effects != AUTO:
+        return degree if effects.sh_degree is None else min(degree, effects.sh_degree)
+    if shs is None or shs.dim() != 3 or (shs.requires_grad and torch.is_grad_enabled()):
+        return degree
+    used = shs[:, : (degree + 1) ** 2]
+    if used.shape[1] < (degree + 1) ** 2 or shs.is_inference():  # a tensor of inference mode has no version
+        return degree
+    known = _needed_degrees.get(shs)
+    if known is None or known[:2] != (shs._version, degree):
+        known = _needed_degrees[shs] = (shs._version, degree, needed_sh_degree(used))
+    return known[2]

@@ -1,4 +1,4 @@
-"""What an image should be, the integral over every pixel, and how far a picture is from it."""
+"""What a picture should be, the integral over every pixel, and how far another picture is from it."""
 
 from __future__ import annotations
 
@@ -9,30 +9,40 @@ from typing import Any, NamedTuple
 
 import torch
 
-from .footprints import resolve_footprint
-from .io import Scene, View, optional_import
-from .rasterizer import GaussianRasterizer
+from ..footprints import BOX_SAMPLES, FOOTPRINTS, resolve_footprint
+from ..io import Scene, View, optional_import
+from ..rasterizer import GaussianRasterizer
 
 UNFILTERED = "point:dilation=0"  # samples of the scene itself, without any filter
-RMSE_SHARE = 0.1  # a reference is refined until it moves by this share of the smallest error
-MAX_DENSITY = 64  # samples along a pixel's side beyond which a reference is left as it is
-MAX_PIXELS = 2**23  # of one render of unfiltered samples; more become more renders
+EXACT = "exact"  # the footprint whose weight has no error
+RMSE_SHARE = 0.1  # a reference is refined until it changes by at most this share of the smallest error
+MAX_DENSITY = 64  # samples along a pixel's side beyond which a reference is not refined
+MAX_PIXELS = 2**23  # of one render of unfiltered samples; more pixels are split over several renders
+
+
+def footprint_variants() -> list[str]:
+    """Every footprint, and one that takes samples with every number of them: "point", ..., "box:samples=16"."""
+    variants = []
+    for name in FOOTPRINTS:
+        takes_samples = "samples" in dict(resolve_footprint(name).options)
+        variants += [f"{name}:samples={n}" for n in BOX_SAMPLES] if takes_samples else [name]
+    return variants
 
 
 def supersampled(
     scene: Scene, view: View, density: int, footprint: str = UNFILTERED, background=(0.0, 0.0, 0.0)
 ) -> torch.Tensor:
-    """Mean of density x density renders of every pixel of a view, equally spaced inside it.
+    """The mean of density x density samples in every pixel of a view, on a regular grid.
 
-    The samples come from a picture `fine` times larger. Unfiltered samples come from `shifts` x `shifts`
-    such pictures whose principal point is moved by a part of a pixel, so that memory stays bounded; a
-    footprint with a filter is as wide as the pixels it is rendered in, and shifted ones would overlap.
+    The samples are the pixels of a picture `fine` times larger. Unfiltered samples may also come from
+    `shifts` x `shifts` such pictures whose principal point is moved by a fraction of a pixel, which bounds the
+    memory. A footprint with a filter is as wide as the pixels it is rendered in: shifted pictures would overlap.
 
     Args:
         scene: On any device.
         view: Its size is the size of the result.
         density: Samples along a pixel's side, at least 1.
-        footprint: How a sample sees a splat, in pixels of its own: see `resolve_footprint`.
+        footprint: Evaluated in the pixels of the larger picture: see `resolve_footprint`.
         background: RGB.
 
     Returns:
@@ -57,11 +67,11 @@ def supersampled(
 
 
 class Refined(NamedTuple):
-    """Pictures at the last density, at half of it, and the RMSE between every density and its half, by key."""
+    """Pictures of a converged reference, by key."""
 
     pictures: dict[Any, torch.Tensor]
-    half: dict[Any, torch.Tensor]
-    residuals: dict[int, dict[Any, float]]
+    half: dict[Any, torch.Tensor]  # the pictures at half the density
+    residuals: dict[int, dict[Any, float]]  # by density: RMSE against the pictures at half of it
 
     @property
     def density(self) -> int:
@@ -71,17 +81,16 @@ class Refined(NamedTuple):
 def refine(
     sample: Callable[[int], dict], smallest_error: Callable[[dict], dict], start: int = 4, limit: int | None = None
 ) -> Refined:
-    """Doubles a density until the pictures settle: what doubling changes is RMSE_SHARE of the smallest error.
+    """Doubles the density until that changes the pictures by at most RMSE_SHARE of the smallest error.
 
-    A midpoint grid's error falls with the density, so that the change bounds the error that is left.
+    The error of a midpoint grid at least halves with every doubling where it converges, and then the last change
+    bounds the error that is left. The caller reports which errors the last residual does not resolve.
 
     Args:
         sample: The pictures at a density, by any key.
         smallest_error: Given the pictures as truth, the smallest RMSE that will be reported, by key.
         start: The coarsest density.
-        limit: Density beyond which pictures are left as they are; None is MAX_DENSITY.
-
-    The caller says which errors the last residual does not resolve.
+        limit: The largest density; None is MAX_DENSITY.
     """
     limit = MAX_DENSITY if limit is None else limit
     density, coarse, residuals = start, sample(start), {}
@@ -92,17 +101,17 @@ def refine(
             bar.update()
             residuals[density] = {key: image_errors(coarse[key], truth[key])["rmse"] for key in truth}
             smallest = smallest_error(truth)
-            settled = all(residuals[density][key] <= RMSE_SHARE * smallest[key] for key in truth)
-            if settled or 2 * density > limit:
+            if 2 * density > limit or all(residuals[density][key] <= RMSE_SHARE * smallest[key] for key in truth):
                 return Refined(truth, coarse, residuals)
             coarse = truth
 
 
 def image_errors(color: torch.Tensor, truth: torch.Tensor) -> dict[str, float]:
-    """How far a picture is from the truth, over all channels of all pixels, for colours in 0 to 1.
+    """How far a picture is from the truth, over all channels of all pixels, for colours from 0 to 1, not clamped.
 
-    Nothing is clamped. Returns psnr (dB, peak 1; 300 where the mean square is below 1e-30), rmse, bias
-    (mean of color - truth), p999 (the absolute error that 99.9% do not exceed) and max.
+    Returns:
+        psnr (dB, peak 1; 300 where the mean square is below 1e-30), rmse, bias (mean of color - truth), p999 (the
+        absolute error that 99.9% of the values do not exceed) and max.
     """
     error = (color.double() - truth).flatten()
     mse = error.square().mean().item()

@@ -9,7 +9,7 @@ import torch
 from scenes import Camera
 
 import analytic_rasterizer as ar
-from analytic_rasterizer.harmonics import sh_band_bounds
+from analytic_rasterizer.sh import sh_band_bounds
 
 
 def scene_with_bands(seed, scales, count=60):

@@ -1,24 +1,27 @@
 """A resolution target made of Gaussians, rendered with every footprint and compared with the truth.
 
-`make_target()` draws, with 3D Gaussians, what is hard to sample: rings and spokes that grow finer,
-strokes of text, needles, a bush of leaves in many layers, and translucent blobs over a fabric.
-`run()` renders it at four resolutions, measures each footprint against a supersampled reference,
-and draws a sheet that shows all of it.
+    python examples/demo.py --out DIR
+
+`make_target()` draws, with 3D Gaussians, what is hard to sample: rings and spokes that grow finer, strokes of text,
+needles, a bush of leaves in many layers, and translucent blobs over a fabric. `run()` renders it at four resolutions,
+measures each footprint against a supersampled reference, and draws a sheet that shows all of it.
 """
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 
-from .accuracy import UNFILTERED, image_errors, refine, supersampled
-from .io import Scene, View, optional_import, save_scene, save_views, to_image
-from .rasterizer import render_stages
+from analytic_rasterizer import render_stages
+from analytic_rasterizer.analysis.reference import UNFILTERED, image_errors, refine, supersampled
+from analytic_rasterizer.analysis.tables import format_table
+from analytic_rasterizer.cli import arguments
+from analytic_rasterizer.io import Scene, View, optional_import, save_scene, save_views, to_image
 
 CANVAS = (384, 256)  # the target is drawn in these units; also the default size of the picture
 FOCAL = 460.0  # canvas units
@@ -188,7 +191,7 @@ LETTERS = {  # strokes on a grid 4 wide and 6 high, y down
 
 
 def _leaves(brush: Brush, random, centre, radius) -> None:
-    """A bush of small opaque leaves, each at a depth of its own."""
+    """A bush of small opaque leaves, each at its own depth."""
     count = 1300
     r = radius * torch.rand(count, generator=random).sqrt()
     angle = 2 * math.pi * torch.rand(count, generator=random)
@@ -247,7 +250,7 @@ def run(out, size: tuple[int, int] = CANVAS, device="cpu") -> dict:
     scene, view = make_target()
     save_scene(out / "target.ply", scene)
     zoom = size[0] / view.width  # pixels are square whatever the size
-    view = replace(view, width=size[0], height=size[1], fx=FOCAL * zoom, fy=FOCAL * zoom)
+    view = View(view.name, *size, FOCAL * zoom, FOCAL * zoom, view.w2c)
     save_views(out / "views.json", [view])
     scene = scene.to(device)
 
@@ -396,3 +399,48 @@ def _error_colors(error: torch.Tensor, halvings: int) -> torch.Tensor:
     ramp = torch.tensor(ERROR_RAMP)
     share = (place - below)[..., None]
     return (ramp[below] * (1 - share) + ramp[below + 1] * share).permute(2, 0, 1)
+
+
+# -------------------------------------------------------------------------------- the command
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Returns the exit code: 0, 2 after an error, 130 when interrupted."""
+    return arguments.run_command(lambda: parse_arguments(argv))
+
+
+def parse_arguments(argv: list[str] | None):
+    parser = arguments.Parser(
+        description="Render a resolution target made of Gaussians with every footprint at four resolutions, compare "
+        "with a supersampled reference, and write DIR/contact_sheet.png, the pictures, results.json, and the target "
+        "itself as target.ply with views.json."
+    )
+    parser.add_argument("--out", required=True, metavar="DIR", help="folder for the results")
+    size_help = "of the full picture, multiples of 8 (default: {} {})".format(*CANVAS)
+    parser.add_argument("--size", nargs=2, type=arguments.count, default=CANVAS, metavar=("W", "H"), help=size_help)
+    arguments.add_machine_options(parser)
+    parser.set_defaults(run=run_demo)
+    return parser.parse_args(argv)
+
+
+def run_demo(args) -> None:
+    """Runs the demo and prints its table of errors and times."""
+    arguments.use_machine(args)
+    out = arguments.writable_folder(args.out)
+    results = run(out, tuple(args.size), args.device)
+    rows = [
+        [f"1/{p['reduction']}", p["footprint"], f"{p['psnr']:.2f}", p["rmse"], p["max"], p["seconds"]]
+        for p in results["pictures"]
+    ]
+    print(format_table(["scale", "footprint", "PSNR [dB]", "RMSE", "max", "time [s]"], rows))
+    reference = results["reference"]
+    residual = ", ".join(f"{value:.1e} (1/{scale})" for scale, value in reference["residual_rmse"].items())
+    print(
+        f"reference: {reference['footprint']}, {reference['samples_per_pixel']['1']} samples per pixel at full size; "
+        f"RMSE against a quarter of the samples: {residual}"
+    )
+    print(f"see {out / 'contact_sheet.png'}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

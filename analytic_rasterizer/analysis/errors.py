@@ -1,0 +1,366 @@
+"""The error of a pixel's weight: the paper's analysis [AS, Sec. 2.4], and the same for every footprint.
+
+`run()` measures three things, in float64, and writes each as CSV and as plots:
+
+- window: the paper's logistic window along one axis against the Gaussian's integral.
+- rotation: the error of turning the pixel into the splat's eigenframe, against Monte Carlo integration as in the
+  paper and against the exact integral.
+- footprints: the weight of every footprint and its gradients, over rotations, anisotropies and offsets.
+
+[AS] is the paper with its supplement, see docs/numerics.md.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+
+from ..footprints import footprint_weight
+from ..io import optional_import
+from . import tables
+from .reference import EXACT, footprint_variants
+
+PAPER_SIGMAS = (0.3, 6.6)  # px, the range of [AS, Sec. 2.4]
+SIGMAS = (0.02, 20.0)  # px, ours
+PER_DECADE = 10
+REACH = 3.0  # standard deviations: the paper's ||x|| < 3 sigma
+RATIO = 100.0  # the largest anisotropy
+SAMPLES = 4096  # splats of one standard deviation
+MONTE_CARLO = 65536  # samples in a pixel, as in the paper
+ROTATION_SAMPLES = 64  # splats of one standard deviation, each integrated by Monte Carlo
+THRESHOLDS = (1e-2, 1e-3, 1e-4)
+TABLE_SIGMAS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
+PAPER_GRADIENT = "analytic:frame_gradient=paper"
+GRADIENTS = {"offset": "dI/d offset", "cov2d": "dI/d covariance"}
+
+
+def run(out, samples: int = SAMPLES, monte_carlo: int = MONTE_CARLO, rotation_samples: int | None = None) -> dict:
+    """Measures all three and writes CSV, PNG and SVG files and summary.md to `out`, a folder that exists.
+
+    Args:
+        out: Folder.
+        samples: Splats of each standard deviation, for the footprints. Maxima are over these splats, and so they are
+            lower bounds.
+        monte_carlo: Samples in a pixel.
+        rotation_samples: Splats of each standard deviation, for the rotation; None is ROTATION_SAMPLES.
+
+    Returns:
+        {"window": rows, "rotation": rows, "footprints": rows, "summary": Markdown}.
+
+    Raises:
+        ImportError: Without the `analysis` extra.
+        ValueError: This build has no `exact` or `erf` footprint.
+    """
+    optional_import("matplotlib.figure", "analysis")  # raises before anything is measured
+    out, cases = Path(out), all_cases()
+    with optional_import("tqdm", "analysis").tqdm(total=2 + len(cases), desc="errors", disable=None) as bar:
+        results = {"window": window_errors()}
+        bar.update()
+        results["rotation"] = rotation_errors(rotation_samples or ROTATION_SAMPLES, monte_carlo)
+        bar.update()
+        results["footprints"] = footprint_errors(cases, samples, bar.update)
+    figures = {
+        "window": _plot_window(results["window"]),
+        "rotation": _plot_rotation(results["rotation"]),
+        "footprints_weight": _plot_weight(results["footprints"]),
+        "footprints_gradient": _plot_gradients(results["footprints"]),
+    }
+    for name, rows in results.items():
+        tables.save_csv(out / f"{name}.csv", rows)
+    for name, figure in figures.items():
+        tables.save_figure(figure, out, name)
+    summary = summarize(results, samples, monte_carlo)
+    (out / "summary.md").write_text(summary, encoding="utf-8")
+    return {**results, "summary": summary}
+
+
+def all_cases() -> list[str]:
+    """Every footprint that has a weight of its own, with the options that change the weight or its gradient."""
+    # `exact` is the truth, and `adaptive` takes the weights of `box`, for whole tiles.
+    cases = [case for case in footprint_variants() if case not in (EXACT, "adaptive")]
+    return [*cases, "point:dilation=0", PAPER_GRADIENT]
+
+
+# ------------------------------------------------------------------------------- (a) one axis
+
+
+def logistic_cdf(x: torch.Tensor) -> torch.Tensor:
+    """S(x), the paper's approximation of the normal CDF [AS, Eq. 5]."""
+    return torch.sigmoid(1.6 * x + 0.07 * x**3)
+
+
+def window_errors(sigmas: int = 200, offsets: int = 2001) -> list[dict]:
+    """Errors of the window S((x + 1/2)/sigma) - S((x - 1/2)/sigma) [AS, Eq. 7] by standard deviation.
+
+    `sigmas` standard deviations, log-uniform in PAPER_SIGMAS; `offsets` x, uniform in |x| <= 3 sigma. A row holds
+    sigma, the maximum and RMS error of the window (the density integrated over the pixel), and the same times
+    sqrt(2 pi) sigma: for a splat of peak 1, as the window enters its weight [AS, Eq. 8].
+    """
+    rows = []
+    for sigma in _log_uniform(PAPER_SIGMAS, sigmas):
+        x = sigma * torch.linspace(-REACH, REACH, offsets, dtype=torch.float64)
+        high, low = (x + 0.5) / sigma, (x - 0.5) / sigma
+        error = (logistic_cdf(high) - logistic_cdf(low)) - (torch.special.ndtr(high) - torch.special.ndtr(low))
+        peak = math.sqrt(2 * math.pi) * sigma
+        rows.append({"sigma": sigma} | _max_rms("window", error) | _max_rms("weight", peak * error))
+    return rows
+
+
+# ------------------------------------------------------------------------------- (b) rotation
+
+
+def rotation_errors(samples: int, monte_carlo: int, sigmas: int = 40) -> list[dict]:
+    """Errors of integrating over the turned pixel, with the exact CDF (the footprint `erf`), by standard deviation.
+
+    `sigmas` smaller standard deviations, log-uniform in PAPER_SIGMAS; for each `samples` splats: anisotropy
+    log-uniform in 1 to RATIO, any rotation, offsets uniform in the ellipse of 3 sigma. References: the mean of
+    `monte_carlo` uniform samples in the pixel, and `exact`. A row holds sigma, maximum and RMS of erf - exact
+    (`exact_`), of erf - Monte Carlo (`monte_carlo_`) and of Monte Carlo - exact (`references_`), the RMS standard
+    error of Monte Carlo, and z_rms, the RMS of (Monte Carlo - exact) over that standard error: 1 where the references
+    agree. The standard error is not estimated but exact: the integrand's square is a splat with half the covariance.
+    """
+    random = torch.Generator().manual_seed(0)
+    unit = _unit_samples(samples)
+    rows = []
+    for sigma in _log_uniform(PAPER_SIGMAS, sigmas):
+        offset, cov2d = _splats(unit, sigma, blur=0.0)
+        turned, exact = (footprint_weight(offset, cov2d, name) for name in ("erf", EXACT))
+        square = footprint_weight(offset, cov2d / 2, EXACT)
+        standard_error = ((square - exact**2).clamp_min(0) / monte_carlo).sqrt()
+        sampled = torch.stack([_monte_carlo(d, c, monte_carlo, random) for d, c in zip(offset, cov2d)])
+        row = {"sigma": sigma} | _max_rms("exact", turned - exact) | _max_rms("monte_carlo", turned - sampled)
+        row |= _max_rms("references", sampled - exact) | {"standard_error": _rms(standard_error)}
+        rows.append(row | {"z_rms": _rms((sampled - exact) / standard_error)})
+    return rows
+
+
+def _monte_carlo(offset: torch.Tensor, cov2d: torch.Tensor, samples: int, random: torch.Generator) -> torch.Tensor:
+    """Mean of exp(-q/2) over uniform samples in the unit pixel around offset (2,)."""
+    d = offset + torch.rand(samples, 2, generator=random, dtype=torch.float64) - 0.5
+    return torch.exp(-(d @ _matrix(cov2d).inverse() * d).sum(1) / 2).mean()
+
+
+# ----------------------------------------------------------------------------- (c) footprints
+
+
+def footprint_errors(cases: list[str], samples: int, progress=lambda: None) -> list[dict]:
+    """Errors of the weight and its gradients against `exact`, by footprint and standard deviation.
+
+    The smaller standard deviation is log-uniform in SIGMAS, PER_DECADE to a decade; for each `samples` splats, the
+    same for every footprint: anisotropy log-uniform in 1 to RATIO, any rotation, offsets uniform in the 3 sigma
+    ellipse of Sigma + I/12. A row holds maximum and RMS of the error of the weight I, and of the norm of the error of
+    dI/d offset [1/px] and of dI/dSigma, whitened by Sigma: L^T (dI/dSigma) L with Sigma = L L^T, that is per relative
+    change of Sigma. `_true_rms` is the RMS norm of the exact value, to make errors relative. The gradient is what
+    autograd gives, which for `analytic` is not the derivative of the weight unless frame_gradient is "paper".
+    """
+    unit = _unit_samples(samples)
+    sigmas = _log_uniform(SIGMAS, round(PER_DECADE * math.log10(SIGMAS[1] / SIGMAS[0])) + 1)
+    splats = [_splats(unit, sigma, blur=1 / 12) for sigma in sigmas]
+    truth = [_weight_and_gradients(*splat, EXACT) for splat in splats]
+    rows = []
+    for case in cases:
+        for sigma, splat, exact in zip(sigmas, splats, truth):
+            row = {"footprint": case, "sigma": sigma}
+            for name, value, true in zip(("weight", *GRADIENTS), _weight_and_gradients(*splat, case), exact):
+                row |= _max_rms(name, (value - true).flatten(1).norm(dim=1))
+                row[f"{name}_true_rms"] = _rms(true.flatten(1).norm(dim=1))
+            rows.append(row)
+        progress()
+    return rows
+
+
+def _weight_and_gradients(offset: torch.Tensor, cov2d: torch.Tensor, footprint: str) -> list[torch.Tensor]:
+    """Weight (n, 1), gradient with respect to the offset (n, 2), whitened one to the covariance (n, 2, 2)."""
+    inputs = offset.clone().requires_grad_(), cov2d.clone().requires_grad_()
+    weight = footprint_weight(*inputs, footprint)
+    dL_doffset, dL_dcov2d = torch.autograd.grad(weight.sum(), inputs)
+    factor = torch.linalg.cholesky(_matrix(cov2d))
+    halved = dL_dcov2d * dL_dcov2d.new_tensor([1, 0.5, 1])  # xy stands for two entries of the matrix
+    return [weight.detach()[:, None], dL_doffset, factor.mT @ _matrix(halved) @ factor]
+
+
+def _unit_samples(count: int) -> torch.Tensor:
+    """(count, 4) float64 in [0, 1): anisotropy, rotation, and offset in polar coordinates; always the same."""
+    return torch.quasirandom.SobolEngine(4, scramble=True, seed=0).draw(count, dtype=torch.float64)
+
+
+def _splats(unit: torch.Tensor, sigma: float, blur: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """(offset (n, 2) [px], cov2d (n, 3) [px^2]) of splats whose smaller standard deviation is sigma.
+
+    Offsets are uniform in the ellipse of REACH standard deviations of Sigma + blur I.
+    """
+    ratio, turn, radius, angle = unit.unbind(-1)
+    large, small = (sigma * RATIO**ratio) ** 2, torch.full_like(ratio, sigma**2)
+    cos, sin = torch.cos(math.pi * turn), torch.sin(math.pi * turn)
+    xx, yy = large * cos**2 + small * sin**2, large * sin**2 + small * cos**2
+    reach = REACH * radius.sqrt()
+    u = reach * (large + blur).sqrt() * torch.cos(2 * math.pi * angle)
+    v = reach * (small + blur).sqrt() * torch.sin(2 * math.pi * angle)
+    offset = torch.stack([cos * u - sin * v, sin * u + cos * v], -1)
+    return offset, torch.stack([xx, (large - small) * cos * sin, yy], -1)
+
+
+def _matrix(cov2d: torch.Tensor) -> torch.Tensor:
+    """(..., 2, 2) of (..., 3) as (xx, xy, yy)."""
+    return cov2d[..., [0, 1, 1, 2]].unflatten(-1, (2, 2))
+
+
+def _log_uniform(limits: tuple[float, float], count: int) -> list[float]:
+    low, high = map(math.log, limits)
+    return torch.linspace(low, high, count, dtype=torch.float64).exp().tolist()
+
+
+def _max_rms(name: str, error: torch.Tensor) -> dict[str, float]:
+    return {f"{name}_max": error.abs().max().item(), f"{name}_rms": _rms(error)}
+
+
+def _rms(error: torch.Tensor) -> float:
+    return error.square().mean().sqrt().item()
+
+
+# ---------------------------------------------------------------------------------- reporting
+
+
+def summarize(results: dict, samples: int, monte_carlo: int) -> str:
+    """The tables, as Markdown."""
+    window, rotation, footprints = results["window"], results["rotation"], results["footprints"]
+    worst, peak = (max(window, key=lambda row: row[key]) for key in ("window_max", "weight_max"))
+    turned = max(rotation, key=lambda row: row["exact_max"])
+    z = math.sqrt(sum(row["z_rms"] ** 2 for row in rotation) / len(rotation))
+    low, high = PAPER_SIGMAS
+    by_sigma = [
+        [f"{row['sigma']:.2f}", *(_error_text(row, name) for name in ("exact", "monte_carlo", "references"))]
+        + [f"{row['z_rms']:.2f}"]
+        for row in rotation[:: max(1, len(rotation) // 8)]
+    ]
+    references = ["against exact, max / RMS", f"against {monte_carlo} samples", "the two references"]
+    parts = [
+        "# Errors of the pixel's weight",
+        f"## One axis: the logistic window, sigma in [{low}, {high}] px, |x| <= 3 sigma",
+        f"Largest error of the window {worst['window_max']:.2e} (sigma {worst['sigma']:.2f}), of a splat of peak 1 "
+        f"{peak['weight_max']:.2e} (sigma {peak['sigma']:.2f}).",
+        f"## The pixel turned into the splat's frame, sigma in [{low}, {high}] px, anisotropy 1 to {RATIO:.0f}",
+        tables.markdown_table(["sigma [px]", *references, "z"], by_sigma),
+        f"Largest error {turned['exact_max']:.2e} (sigma {turned['sigma']:.2f}). z is the RMS difference of the two "
+        f"references over the standard error of Monte Carlo: {z:.3f} over all splats, 1 where they agree.",
+        f"## Every footprint, {samples} splats of each sigma, anisotropy 1 to {RATIO:.0f}, any rotation, offset to "
+        "3 standard deviations",
+        "Error of the weight, max / RMS, by smaller standard deviation [px]:",
+        _by_sigma(_without_paper_gradient(footprints), lambda row: _error_text(row, "weight")),
+        "RMS error of dI/d offset, relative to the RMS of the exact one:",
+        _by_sigma(footprints, lambda row: f"{row['offset_rms'] / row['offset_true_rms']:.1e}"),
+        "RMS error of dI/dSigma, whitened, relative to the RMS of the exact one:",
+        _by_sigma(footprints, lambda row: f"{row['cov2d_rms'] / row['cov2d_true_rms']:.1e}"),
+        "Smallest standard deviation [px] from which on the worst error of the weight stays below:",
+        _by_threshold(_without_paper_gradient(footprints)),
+        "Maxima are over the splats of the sample, and so they are lower bounds.",
+    ]
+    return "\n\n".join(parts) + "\n"
+
+
+def _error_text(row: dict, name: str) -> str:
+    return f"{row[f'{name}_max']:.1e} / {row[f'{name}_rms']:.1e}"
+
+
+def _without_paper_gradient(rows: list[dict]) -> list[dict]:
+    """Without the case whose weight is that of `analytic`."""
+    return [row for row in rows if row["footprint"] != PAPER_GRADIENT]
+
+
+def _by_footprint(rows: list[dict]) -> dict[str, list[dict]]:
+    names = dict.fromkeys(row["footprint"] for row in rows)
+    return {name: [row for row in rows if row["footprint"] == name] for name in names}
+
+
+def _by_sigma(rows: list[dict], text) -> str:
+    by_footprint = _by_footprint(rows)
+    sigmas = [row["sigma"] for row in next(iter(by_footprint.values()))]
+    columns = [min(range(len(sigmas)), key=lambda i: abs(math.log(sigmas[i] / s))) for s in TABLE_SIGMAS]
+    header = ["footprint", *(f"{sigmas[i]:.2g}" for i in columns)]
+    return tables.markdown_table(header, [[name, *(text(of[i]) for i in columns)] for name, of in by_footprint.items()])
+
+
+def _by_threshold(rows: list[dict]) -> str:
+    def smallest(of_name: list[dict], threshold: float) -> str:
+        above = max((row["sigma"] for row in of_name if row["weight_max"] > threshold), default=0)
+        later = [row["sigma"] for row in of_name if row["sigma"] > above]
+        return f"{'' if above else '<= '}{later[0]:.2g}" if later else f"> {SIGMAS[1]:.2g}"
+
+    cells = [[name, *(smallest(of, threshold) for threshold in THRESHOLDS)] for name, of in _by_footprint(rows).items()]
+    return tables.markdown_table(["footprint", *(f"{t:.0e}" for t in THRESHOLDS)], cells)
+
+
+def _plot(ax, rows: list[dict], key: str, relative_to: str | None = None, **options) -> None:
+    """One column of the rows over sigma, on logarithmic axes, which zeros leave at the bottom."""
+    values = [max(row[key] / (row[relative_to] if relative_to else 1), 1e-16) for row in rows]
+    ax.plot([row["sigma"] for row in rows], values, **options)
+    ax.set_yscale("log")
+
+
+def _plot_window(rows: list[dict]):
+    figure, axes = tables.new_figure(10, 4.2, 2, sharex=True, sharey=True)
+    titles = {
+        "window": "integral of the density",
+        "weight": r"weight of a splat of peak 1 ($\sqrt{2\pi}\,\sigma$ times)",
+    }
+    color = tables.style("analytic")["color"]
+    for ax, (key, title) in zip(axes.flat, titles.items()):
+        _plot(ax, rows, f"{key}_max", color=color, label="maximum")
+        _plot(ax, rows, f"{key}_rms", color=color, ls="--", label="RMS")
+        ax.set(ylim=(5e-5, 5e-3), ylabel="absolute error")
+        ax.set_title(title, fontsize=10)
+    title = "The logistic window against erf, |x| within 3 standard deviations"
+    tables.add_titles(figure, axes, title, "standard deviation [px]")
+    return figure
+
+
+def _plot_rotation(rows: list[dict]):
+    figure, axes = tables.new_figure(11, 4.2, 2, sharex=True)
+    left, right = axes[0]
+    labels = {"exact": "turned pixel - exact", "monte_carlo": "turned pixel - Monte Carlo"}
+    for (name, label), footprint in zip(
+        {**labels, "references": "Monte Carlo - exact"}.items(), ("analytic", "mip", "point")
+    ):
+        color = tables.style(footprint)["color"]
+        _plot(left, rows, f"{name}_max", color=color, label=f"{label}, maximum")
+        _plot(left, rows, f"{name}_rms", color=color, ls="--", label=f"{label}, RMS")
+    _plot(left, rows, "standard_error", color="black", ls=":", label="standard error of Monte Carlo")
+    left.set_ylabel("absolute error of the weight")
+    right.axhline(1, color="black", linewidth=0.9, linestyle=":")
+    _plot(right, rows, "z_rms", color=color, marker="o", markersize=3)
+    right.set(yscale="linear", ylim=(0, 2), ylabel="RMS of (Monte Carlo - exact) / standard error")
+    title = "The pixel turned into the splat's frame, against two references"
+    tables.add_titles(figure, axes, title, "smaller standard deviation [px]", fontsize=8)
+    return figure
+
+
+def _plot_weight(rows: list[dict]):
+    keys = {"weight_max": "maximum error of the weight", "weight_rms": "RMS error of the weight"}
+    title = "Weight of a splat of peak 1 against the exact integral"
+    return _plot_footprints(_without_paper_gradient(rows), keys, title, (1e-10, 1.5), relative=False)
+
+
+def _plot_gradients(rows: list[dict]):
+    kinds = {"max": "maximum", "rms": "RMS"}
+    keys = {
+        f"{name}_{kind}": f"{kinds[kind]} error of {label}, relative"
+        for name, label in GRADIENTS.items()
+        for kind in kinds
+    }
+    title = "Gradients against those of the exact integral, relative to their RMS"
+    return _plot_footprints(rows, keys, title, (1e-9, 1e4), relative=True)
+
+
+def _plot_footprints(rows: list[dict], keys: dict[str, str], title: str, ylim: tuple, relative: bool):
+    """A curve of every footprint in the axes of every key, two beside each other."""
+    figure, axes = tables.new_figure(13, 0.7 + 4.2 * len(keys) / 2, 2, len(keys) // 2, sharex=True, sharey=True)
+    for ax, (key, label) in zip(axes.flat, keys.items()):
+        true = f"{key.rpartition('_')[0]}_true_rms" if relative else None
+        for footprint, of_name in _by_footprint(rows).items():
+            options = tables.style(footprint) | {"marker": None, "linewidth": 1.6, "label": footprint}
+            _plot(ax, of_name, key, true, **options)
+        ax.set(ylim=ylim, ylabel=label)
+    tables.add_titles(figure, axes, f"{title}; anisotropy 1 to {RATIO:.0f}", "smaller standard deviation [px]")
+    return figure

@@ -1,0 +1,200 @@
+"""What the planner reports about a scene and its views, as text, JSON and a picture."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import torch
+
+from ..effects import Effects
+from ..io import optional_import
+from ..ops import TILE
+from . import tables
+
+NARROW = 0.5  # px
+BINS = tuple(2.0 ** (i / 4) for i in range(-40, 41))  # edges of the histogram of standard deviations, px
+TILE_SAMPLES = (1, 4, 8, 16)  # what `adaptive` chooses from
+DRAWN = 8  # views in the histogram
+MAPS = 2  # views whose tiles are drawn
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was found about one effect."""
+
+    name: str
+    needed: bool | None  # whether these views call for it; None: not examined
+    change: float | None  # what leaving it out changes at most, in units of colour; None: nothing to leave out
+    kind: str | None  # of the change: "bound" on every pixel, or "measured", the largest RMS over a view
+    cost: float | None  # time of a forward pass with it over that without it; None: not measured
+    recommendation: str
+    reason: str  # a sentence
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A footprint that was tried with the recommended effects."""
+
+    footprint: str  # its name with options
+    rms: float  # largest RMS over a view, in units of colour; not rendered any further after a view in which it fails
+    fits: bool  # whether that is within the tolerance
+    cost: float | None  # time of a forward pass over that of one sample; None: not measured, since it does not fit
+
+
+@dataclass(frozen=True, eq=False)
+class ViewReport:
+    """What one view shows."""
+
+    name: str
+    width: int  # px
+    height: int
+    shown: int  # Gaussians that touch a tile
+    narrow: float  # share of them whose smaller standard deviation in the image is below NARROW
+    sigmas: tuple[int, ...]  # how many of them lie between BINS, by that deviation; the outer bins hold the rest
+    finer: float | None  # share of those seen in training that are sampled FINER times as finely; None: no training
+    finest: float | None  # largest ratio of sampling intervals, training over this view; None: as above, or no such
+    rms: float  # of the recommendation against everything switched on, in units of colour
+    tile_samples: torch.Tensor  # (rows, columns) int32 on the CPU, samples that `adaptive` takes at the tolerance
+
+    @property
+    def tile_shares(self) -> dict[int, float]:
+        """Share of the tiles by the number of samples that they need."""
+        return {samples: share(self.tile_samples == samples) for samples in TILE_SAMPLES}
+
+
+@dataclass(frozen=True, eq=False)
+class SceneReport:
+    """What `inspect_scene` found.
+
+    Attributes:
+        gaussians, sh_degree: Of the scene.
+        tolerance: As given to `inspect_scene`.
+        machine: On which times were measured.
+        effects: The recommended `Effects`.
+        footprint: The recommended footprint, as `GaussianRasterizationSettings` takes it.
+        findings: One `Finding` per effect.
+        candidates: A `Candidate` for every footprint that was tried.
+        views: One `ViewReport` per view.
+        shown: (P,) bool, on the scene's device: Gaussians that touch a tile of some view. The others change no pixel
+            of these views.
+    """
+
+    gaussians: int
+    sh_degree: int
+    tolerance: float
+    machine: str
+    effects: Effects
+    footprint: str
+    findings: tuple[Finding, ...]
+    candidates: tuple[Candidate, ...]
+    views: tuple[ViewReport, ...]
+    shown: torch.Tensor
+
+    def to_json(self) -> dict:
+        """Everything as numbers, strings, lists and dicts; for the tensors shares and counts."""
+        data = asdict(self)
+        effects, footprint = data.pop("effects"), data.pop("footprint")
+        options = {name: effects[name] for name in ("sh_degree", "orthographic", "off_center")}
+        has_filter = {"filter_3d": effects["filter_3d"] is not None}
+        data["recommendation"] = {"footprint": footprint} | options | has_filter
+        for view, fields in zip(self.views, data["views"]):
+            del fields["tile_samples"]
+            fields["tile_shares"] = {str(samples): value for samples, value in view.tile_shares.items()}
+        return data | {"shown": int(self.shown.sum()), "sigma_edges": list(BINS)}
+
+    def to_text(self) -> str:
+        """Tables and sentences. Changes and RMS in units of 1/255."""
+        found = [
+            [f.name, _YES_NO[f.needed], in_255(f.change), f.kind, _ratio(f.cost), f.recommendation]
+            for f in self.findings
+        ]
+        tried = [[c.footprint, in_255(c.rms), _YES_NO[c.fits], _ratio(c.cost)] for c in self.candidates]
+        header = ["view", "size", "shown", "< 1/2 px", "RMS [1/255]"]
+        header += [f"{n} sample{'s' * (n > 1)}" for n in TILE_SAMPLES] + ["finer than trained", "at most"]
+        views = [
+            [v.name, f"{v.width}x{v.height}", v.shown, percent(v.narrow), in_255(v.rms)]
+            + [percent(value) for value in (*v.tile_shares.values(), v.finer)]
+            + [_ratio(v.finest)]
+            for v in self.views
+        ]
+        if self.views[0].finer is None:
+            header, views = header[:-2], [row[:-2] for row in views]
+        return "\n\n".join([
+            f"{self.gaussians} Gaussians of SH degree {self.sh_degree}; {self.machine}\n"
+            f"tolerance: RMS of {in_255(self.tolerance)}/255 in every view",
+            f"recommended: footprint {self.footprint}, {_describe(self.effects)}",
+            tables.format_table(["effect", "needed", "change [1/255]", "", "cost", "recommendation"], found),
+            "\n".join(f"{f.name}: {f.reason}" for f in self.findings),
+            tables.format_table(["footprint", "RMS [1/255]", "fits", "cost"], tried),
+            tables.format_table(header, views),
+        ])  # fmt: skip
+
+    def save_picture(self, path) -> None:
+        """Writes a histogram of standard deviations in the image, beside maps of samples per tile.
+
+        Raises ImportError without matplotlib, OSError where the file cannot be written, ValueError for a suffix that
+        matplotlib does not know.
+        """
+        figure, axes = tables.new_figure(5 + 5 * len(self.views[:MAPS]), 3.8, 1 + len(self.views[:MAPS]))
+        _draw_histogram(axes[0, 0], self.views[:DRAWN])
+        for ax, view in zip(axes[0, 1:], self.views):
+            _draw_tiles(ax, view)
+        figure.savefig(path, dpi=140)
+
+
+def _draw_histogram(ax, views: tuple[ViewReport, ...]) -> None:
+    """Standard deviations of the Gaussians of every view."""
+    occupied = [BINS.index(NARROW)]
+    for view in views:
+        ax.stairs([100 * count / max(1, view.shown) for count in view.sigmas], BINS, label=view.name, linewidth=1.4)
+        occupied += [i for i, count in enumerate(view.sigmas) if count > 1e-3 * view.shown]
+    ax.axvline(NARROW, color="black", linewidth=0.9, linestyle=":")
+    ax.set_xscale("log", base=2)
+    ax.set_xlim(BINS[min(occupied)], BINS[max(occupied) + 1])
+    ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}" if value >= 1 else f"1/{1 / value:g}")
+    ax.set(xlabel="smaller standard deviation in the image [px]", ylabel="Gaussians shown [%]")
+    ax.legend(frameon=False, fontsize=8)
+
+
+def _draw_tiles(ax, view: ViewReport) -> None:
+    """How many samples every tile needs."""
+    rows, columns = view.tile_samples.shape
+    colors = [tables.style(f"box:samples={samples}")["color"] for samples in TILE_SAMPLES]
+    palette = optional_import("matplotlib.colors", "analysis").ListedColormap(colors)
+    index = torch.bucketize(view.tile_samples, torch.tensor(TILE_SAMPLES)).numpy()
+    ax.imshow(index, palette, vmin=-0.5, vmax=3.5, extent=(0, TILE * columns, TILE * rows, 0), interpolation="nearest")
+    ax.set(xlim=(0, view.width), ylim=(view.height, 0), xlabel="px")
+    ax.grid(False)
+    ax.set_title(f"{view.name}: samples per tile", fontsize=10)
+    for samples, color in zip(TILE_SAMPLES, colors):
+        ax.plot([], [], "s", color=color, label=f"{samples}: {percent(view.tile_shares[samples])}")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=4, frameon=False, fontsize=8)
+
+
+# ----------------------------------------------------------------------------------- in words
+
+_YES_NO = {True: "yes", False: "no", None: None}
+
+
+def _describe(effects: Effects) -> str:
+    options = [f"sh_degree={effects.sh_degree}"] if effects.sh_degree is not None else []
+    options += [f"{name}=True" for name in ("orthographic", "off_center") if getattr(effects, name)]
+    options += ["filter_3d=..."] if effects.filter_3d is not None else []
+    return f"Effects({', '.join(options)})"
+
+
+def _ratio(value: float | None) -> str | None:
+    return None if value is None else f"{value:.2f}"
+
+
+def in_255(value: float | None) -> str | None:
+    return None if value is None else f"{255 * value:.3g}"
+
+
+def percent(value: float | None) -> str | None:
+    return None if value is None else f"{100 * value:.1f}%"
+
+
+def share(which: torch.Tensor) -> float:
+    """Share of a bool tensor that is True; 0 of an empty one."""
+    return which.sum().item() / max(1, which.numel())

@@ -1,0 +1,433 @@
+"""Accuracy against time: every footprint on a trained scene, compared with the integral over the pixel.
+
+`run()` renders a scene at several scales with every method, measures how far each picture is from the box integral of
+the image and what it costs, and writes a table, plots with the Pareto front, and JSON. A *method* is a footprint, or a
+footprint in a picture rendered n times larger and averaged ("@n").
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import statistics
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from ..footprints import resolve_footprint
+from ..io import Scene, View, optional_import
+from . import tables, timing
+from .reference import EXACT, RMSE_SHARE, UNFILTERED, Refined, footprint_variants, image_errors, refine, supersampled
+
+BASE = "box:samples=1"  # times on the CPU are ratios to this
+SECOND_ESTIMATE = "box:samples=16"  # another way to the reference's limit
+MAX_FILTERED_PIXELS = 2**25  # of a picture of SECOND_ESTIMATE, which is rendered in one piece
+SUPERSAMPLING = (2, 3, 4)
+SLOW = 20  # a method that takes so many times as long as the base is timed only once on the CPU
+SSIM_WINDOW = 11  # px; smaller pictures have no SSIM
+PASSES = {"forward": "forward", "forward_backward": "forward + backward"}
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to render: a footprint, in a picture `supersampling` times larger that is averaged."""
+
+    footprint: str
+    supersampling: int = 1
+
+    @property
+    def name(self) -> str:
+        return self.footprint + (f"@{self.supersampling}" if self.supersampling > 1 else "")
+
+    @property
+    def has_single_weight(self) -> bool:
+        """Whether every splat has one weight per pixel, so that the best such method is `exact`."""
+        spec = resolve_footprint(self.footprint)
+        takes_many = spec.name == "adaptive" or dict(spec.options).get("samples", 1) > 1
+        return self.supersampling == 1 and not takes_many
+
+
+def parse_method(text: str) -> Method:
+    """The method of "NAME[:k=v,..][@N]". Raises ValueError for a bad footprint or N."""
+    footprint, at, factor = text.partition("@")
+    resolve_footprint(footprint)
+    if at and not (factor.isdecimal() and int(factor) >= 1):
+        raise ValueError(f"supersampling must be a positive whole number, got {factor!r} in {text!r}")
+    return Method(footprint, int(factor) if at else 1)
+
+
+def default_methods() -> list[Method]:
+    """Every footprint with every number of samples, and supersampled `point`, which is 3DGS-SS."""
+    supersampled_points = [Method(point, n) for point in ("point", UNFILTERED) for n in SUPERSAMPLING]
+    return [Method(name) for name in footprint_variants()] + supersampled_points
+
+
+def framed(view: View, scale: int, crop: tuple[int, int] | None = None) -> View:
+    """The view at 1/`scale` of its size, or the middle `crop` = (width, height) of that.
+
+    Pixels stay `scale` times as large as those of the view: where its size is not a multiple of `scale`, the remainder
+    at the right and at the bottom is cut off. A crop larger than the picture has no effect. A cropped view is a
+    narrower camera, not a part of a picture.
+    """
+    size = [max(1, length // scale) for length in (view.width, view.height)]
+    width, height = size if crop is None else map(min, size, crop)
+    centre = (view.width / 2 if view.cx is None else view.cx, view.height / 2 if view.cy is None else view.cy)
+    cx, cy = (c / scale - (have - want) // 2 for c, have, want in zip(centre, size, (width, height)))
+    return replace(view, width=width, height=height, fx=view.fx / scale, fy=view.fy / scale, cx=cx, cy=cy)
+
+
+def run(
+    out,
+    scene: Scene,
+    views: list[View],
+    scales=(1, 2, 4, 8),
+    methods: list[Method] | None = None,
+    *,
+    crop: tuple[int, int] | None = None,
+    background=(0.0, 0.0, 0.0),
+    rounds: int | None = None,
+    max_density: int | None = None,
+    cpu_time: bool = False,
+    name: str = "scene",
+) -> dict:
+    """Measures every method at every scale and writes `out`/pareto.json, pareto.md and pareto_SCALE.png, .svg.
+
+    Args:
+        out: Folder, which must exist.
+        scene: On the device to measure.
+        views: At least one.
+        scales: Reductions: 8 is 1/8 of the views' size. See `framed`.
+        methods: None is `default_methods()`.
+        crop: (width, height) px, at every scale.
+        background: RGB.
+        rounds: Timed rounds after one that warms up; None is `timing.ROUNDS` of the device.
+        max_density: Of the reference, see `refine`.
+        cpu_time: On the CPU count the seconds of computation of all threads together instead of those that went by:
+            with one thread, on a machine that is used for other work too.
+        name: Of the scene, for the titles.
+
+    Returns:
+        What pareto.json holds. Errors are over all channels of all pixels of all views.
+
+    Raises:
+        ValueError: No views, methods or scales, or one of them twice.
+        ImportError: Without the `analysis` extra.
+    """
+    methods = default_methods() if methods is None else methods
+    names = [method.name for method in methods]
+    for what, given in (("views", [view.name for view in views]), ("methods", names), ("scales", list(scales))):
+        if not given or len(set(given)) < len(given):
+            raise ValueError(f"{what} must be given, and each once, got {', '.join(map(str, given)) or 'none'}")
+    for module in ("matplotlib.figure", "torchmetrics.functional.image"):
+        optional_import(module, "analysis")  # raises before anything is measured
+    out, device = Path(out), scene.means.device.type
+    results = {
+        "scene": name,
+        "gaussians": len(scene.means),
+        "sh_degree": scene.sh_degree,
+        "views": [view.name for view in views],
+        "background": list(background),
+        "crop": None if crop is None else list(crop),
+        "device": device,
+        "machine": timing.describe_machine(device),
+        "rounds": rounds or timing.ROUNDS[device],
+        "clock": "CUDA events" if device == "cuda" else "CPU time" if cpu_time else "wall",
+        "base": BASE if BASE in names else names[0],
+        "scales": [],
+    }
+    timer = time.process_time if cpu_time else time.perf_counter
+    for scale in scales:
+        small = [framed(view, scale, crop) for view in views]
+        sizes = [[view.width, view.height] for view in small]
+        measured = _measure_scale(scene, small, methods, background, max_density, results, timer)
+        results["scales"].append({"scale": scale, "sizes": sizes, **measured})
+        tables.save_figure(_plot(results, results["scales"][-1]), out, f"pareto_{scale}")
+        # After every scale, so that a long run that is stopped leaves what it has.
+        (out / "pareto.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
+        (out / "pareto.md").write_text(to_markdown(results), encoding="utf-8")
+    return results
+
+
+# ---------------------------------------------------------------------------------- measuring
+
+
+def _measure_scale(scene, views, methods, background, max_density, settings: dict, timer) -> dict:
+    """Reference and methods at one scale; `settings` are those of the results."""
+
+    def render(of_name: list[timing.Case]) -> dict[str, torch.Tensor]:
+        return {view.name: case.forward() for view, case in zip(views, of_name)}
+
+    def cases_of(method: Method) -> list[timing.Case]:
+        return [timing.Case(scene, view, method.footprint, method.supersampling, background) for view in views]
+
+    cases = {method.name: cases_of(method) for method in methods}
+    progress = optional_import("tqdm").tqdm
+    pictures = {name: render(of) for name, of in progress(cases.items(), desc="render", unit="method", disable=None)}
+    exact = pictures.get(EXACT)
+    if exact is None and any(method.has_single_weight for method in methods):
+        exact = render(cases_of(Method(EXACT)))
+    refined = refine(
+        lambda density: {v.name: supersampled(scene, v, density, background=background) for v in views},
+        lambda truth: {k: min(image_errors(of[k], truth[k])["rmse"] for of in pictures.values()) for k in truth},
+        limit=max_density,
+    )
+    truth = refined.pictures
+    reference = _describe_reference(scene, views, background, refined)
+    times = _times(cases, settings["rounds"], settings["base"], timer)
+    rows = []
+    for method in methods:
+        of_name = pictures[method.name]
+        memory = [case.extra_bytes() for case in cases[method.name]]
+        ssim = [_ssim(of_name[key], truth[key]) for key in truth]
+        row = {
+            "method": method.name,
+            "footprint": str(resolve_footprint(method.footprint)),
+            "supersampling": method.supersampling,
+            **image_errors(_flat(of_name), _flat(truth)),
+            "ssim": None if None in ssim else statistics.mean(ssim),
+            **times[method.name],
+            "extra_bytes": statistics.mean(memory) if min(memory) > 0 else None,  # not every system tells
+            **_split(method, of_name, exact, truth),
+            "per_view": {key: image_errors(of_name[key], truth[key]) for key in truth},
+        }
+        rows.append(row | {"resolved": reference["residual"]["rmse"] <= RMSE_SHARE * row["rmse"]})
+    for passes in PASSES:
+        front = pareto_front([(row[f"{passes}_ratio"], row["rmse"]) for row in rows])
+        for row, on_front in zip(rows, front):
+            row[f"{passes}_front"] = on_front
+    return {"reference": reference, "methods": rows}
+
+
+def _describe_reference(scene, views, background, refined: Refined) -> dict:
+    """How the reference was made, and three estimates of its own error, over all views.
+
+    residual: change from half the density, which bounds the error where every doubling at least halves it.
+    expected_rmse: the error that follows from the order of convergence over the last two doublings (Richardson), where
+    that is positive. second_estimate: distance from another sampler with the same limit.
+    """
+    density, truth = refined.density, refined.pictures
+    sizes = {v.name: v.width * v.height for v in views}
+
+    def over_views(rmse: dict[str, float]) -> float:
+        return math.sqrt(sum(sizes[key] * value**2 for key, value in rmse.items()) / sum(sizes.values()))
+
+    pooled = {str(n): over_views(by_view) for n, by_view in refined.residuals.items()}
+    before, last = pooled.get(str(density // 2)), pooled[str(density)]
+    order = math.log2(before / last) if before and last else None
+    # A sample of the second estimate is a square of 1/16 of its pixel: a quarter of the density suffices.
+    second = max(1, density // 4)
+    while second > 1 and second**2 * max(sizes.values()) > MAX_FILTERED_PIXELS:
+        second //= 2
+    other = {v.name: supersampled(scene, v, second, SECOND_ESTIMATE, background) for v in views}
+    rmse = image_errors(_flat(other), _flat(truth))["rmse"]
+    return {
+        "footprint": UNFILTERED,
+        "density": density,
+        "samples_per_pixel": density**2,
+        "residual": image_errors(_flat(refined.half), _flat(truth)),
+        "residual_rmse": pooled,
+        "order": order,
+        "expected_rmse": last / (2**order - 1) if order is not None and order > 0 else None,
+        "second_estimate": {"footprint": SECOND_ESTIMATE, "density": second, "rmse": rmse},
+        "resolves_rmse_from": last / RMSE_SHARE,
+    }
+
+
+def _split(method: Method, pictures: dict, exact: dict | None, truth: dict) -> dict:
+    """Splits the error of a footprint with one weight per splat into that of its weight and that of blending:
+    rmse^2 = weight_rmse^2 + blending_rmse^2 + 2 correlation weight_rmse blending_rmse."""
+    if exact is None or not method.has_single_weight:
+        return dict.fromkeys(("weight_rmse", "blending_rmse", "correlation"))
+    weight, blending = _flat(pictures).double() - _flat(exact), _flat(exact).double() - _flat(truth)
+    weight_rmse, blending_rmse = (part.square().mean().sqrt().item() for part in (weight, blending))
+    scale = weight_rmse * blending_rmse
+    correlation = (weight * blending).mean().item() / scale if scale else 0.0
+    return {"weight_rmse": weight_rmse, "blending_rmse": blending_rmse, "correlation": correlation}
+
+
+def _times(cases: dict[str, list[timing.Case]], rounds: int, base: str, timer=time.perf_counter) -> dict[str, dict]:
+    """Seconds per view of both passes, and their ratio to the base, of the round that counts (`timing.best_of`).
+
+    `_usual` is the median round, which tells how much other work adds.
+    """
+    device = next(iter(cases.values()))[0].dL_dcolor.device.type
+    calls = {name: [getattr(case, passes) for case in of for passes in PASSES] for name, of in cases.items()}
+    with optional_import("tqdm").tqdm(desc="time", unit="call", disable=None) as bar:
+        samples = timing.time_calls(calls, device, rounds, timer, lambda seconds: SLOW * seconds[base], bar.update)
+    times = {}
+    for name, taken in samples.items():
+        times[name] = {}
+        for i, passes in enumerate(PASSES):
+            of_views = taken[i :: len(PASSES)]
+            times[name][f"{passes}_seconds"] = statistics.mean(timing.best_of(of, device) for of in of_views)
+            times[name][f"{passes}_usual_seconds"] = statistics.mean(map(statistics.median, of_views))
+    for of_name in times.values():
+        for passes in PASSES:
+            for kind in (passes, f"{passes}_usual"):
+                of_name[f"{kind}_ratio"] = of_name[f"{kind}_seconds"] / times[base][f"{passes}_seconds"]
+    return times
+
+
+def pareto_front(points: list[tuple[float, float]]) -> list[bool]:
+    """Which (cost, error) no other point beats: none is as good in both and better in one."""
+    return [not any(o != p and o[0] <= p[0] and o[1] <= p[1] for o in points) for p in points]
+
+
+def _ssim(color: torch.Tensor, truth: torch.Tensor) -> float | None:
+    """Structural similarity with a Gaussian window of 1.5 px, the border mirrored, for colours in 0 to 1."""
+    if min(color.shape[1:]) < SSIM_WINDOW:
+        return None
+    ssim = optional_import("torchmetrics.functional.image", "analysis").structural_similarity_index_measure
+    return ssim(color[None].double(), truth[None], data_range=1.0).item()
+
+
+def _flat(pictures: dict[str, torch.Tensor]) -> torch.Tensor:
+    """All values of the pictures of all views."""
+    return torch.cat([picture.flatten() for picture in pictures.values()])
+
+
+# ---------------------------------------------------------------------------------- reporting
+
+
+def to_table(results: dict, at_scale: dict) -> tuple[list[str], list[list]]:
+    """(header, rows) of one scale. Times are ratios on the CPU, milliseconds on CUDA."""
+    unit, _, key, factor = _time_unit(results)
+    header = ["method", "PSNR [dB]", "RMSE", "bias", "99.9%", "max", "SSIM"]
+    header += [f"forward [{unit}]", f"with backward [{unit}]", "memory [MiB]", "weight RMSE", "blending RMSE", "front"]
+
+    def text(value: float | None, digits: str) -> str | None:
+        return None if value is None else f"{value:{digits}}"
+
+    rows = []
+    for row in at_scale["methods"]:
+        cells = [row["method"], ("" if row["resolved"] else "~") + f"{row['psnr']:.2f}"]
+        cells += [f"{row[error]:.2e}" for error in ("rmse", "bias", "p999", "max")] + [text(row["ssim"], ".5f")]
+        cells += [f"{row[f'{passes}_{key}'] * factor:.2f}" for passes in PASSES]
+        cells.append(text(row["extra_bytes"] and row["extra_bytes"] / 2**20, ".0f"))
+        cells += [text(row[part], ".2e") for part in ("weight_rmse", "blending_rmse")]
+        rows.append([*cells, "".join(letter for letter, p in zip("FB", PASSES) if row[f"{p}_front"]) or None])
+    return header, rows
+
+
+def _time_unit(results: dict) -> tuple[str, str, str, float]:
+    """How times are shown: unit in the table, unit in the plot, key of a row, factor."""
+    return (
+        ("ms", "ms", "seconds", 1e3)
+        if results["device"] == "cuda"
+        else ("ratio", f"times {results['base']}", "ratio", 1)
+    )
+
+
+def describe(results: dict, at_scale: dict) -> list[str]:
+    """What the numbers of one scale are based on, in lines."""
+    reference, base = at_scale["reference"], results["base"]
+    lines = [f"scale {_scale_and_sizes(at_scale)}"]
+    if results["device"] != "cuda":
+        row = next(row for row in at_scale["methods"] if row["method"] == base)
+        seconds = " / ".join(f"{1e3 * row[f'{passes}_seconds']:.1f}" for passes in PASSES)
+        clock = " of CPU time" if results["clock"] == "CPU time" else ""
+        lines.append(
+            f"times are ratios to {base}, {seconds} ms{clock}; the fastest of {results['rounds']} rounds in turn"
+        )
+    density, second = reference["density"], reference["second_estimate"]
+    order = "" if reference["order"] is None else f" (order {reference['order']:.1f})"
+    change = "RMSE {rmse:.1e}{order}, bias {bias:.0e}, at most {max:.1e}".format(order=order, **reference["residual"])
+    lines.append(
+        f"reference: {density}x{density} unfiltered samples per pixel; from half that density it changes by {change}; "
+        f"from {second['footprint']} at {second['density']}x{second['density']} it differs by RMSE {second['rmse']:.1e}"
+    )
+    unresolved = [row["method"] for row in at_scale["methods"] if not row["resolved"]]
+    if unresolved:
+        lines.append(
+            f"~ not converged: the reference resolves RMSE from {reference['resolves_rmse_from']:.1e}; below it, and "
+            f"uncertain: {', '.join(unresolved)}"
+        )
+    return lines
+
+
+def _scale_and_sizes(at_scale: dict) -> str:
+    count = len(at_scale["sizes"])
+    sizes = ", ".join(sorted({f"{w} x {h}" for w, h in at_scale["sizes"]}))
+    return f"1/{at_scale['scale']}, {count} view{'s' * (count > 1)} of {sizes}"
+
+
+def to_markdown(results: dict) -> str:
+    """All tables."""
+    degree = results["sh_degree"]
+    parts = [f"{results['scene']}: {results['gaussians']} Gaussians of SH degree {degree}. {results['machine']}."]
+    for at_scale in results["scales"]:
+        title, *notes = (line[0].upper() + line[1:] for line in describe(results, at_scale))
+        table = tables.markdown_table(*to_table(results, at_scale))
+        parts += [f"## {title}", *(f"{note}." for note in notes), table]
+    return "\n\n".join(parts) + "\n"
+
+
+def _plot(results: dict, at_scale: dict):
+    """Accuracy over time, for both passes, with the front."""
+    _, unit, key, factor = _time_unit(results)
+    figure, axes = tables.new_figure(13, 5.6, 2, sharey=True)
+    for ax, (passes, title) in zip(axes[0], PASSES.items()):
+        points = {row["method"]: (row[f"{passes}_{key}"] * factor, row["psnr"]) for row in at_scale["methods"]}
+        # The best accuracy for a time: constant until the next method of the front.
+        front = sorted(points[row["method"]] for row in at_scale["methods"] if row[f"{passes}_front"])
+        wide = {"color": "#ffd43b", "linewidth": 5, "alpha": 0.7, "zorder": 1, "drawstyle": "steps-post"}
+        ax.plot(*zip(*front), label="Pareto front", **wide)
+        for label, members in _families(at_scale["methods"]).items():
+            look = tables.style(members[-1]["footprint"]) | {"linestyle": ""}
+            if members[-1]["supersampling"] > 1:
+                look["marker"] = "X"
+            ax.plot(*zip(*(points[row["method"]] for row in members)), color=look["color"], linewidth=1, zorder=2)
+            for row in members:
+                x, y = points[row["method"]]
+                if key == "ratio":
+                    ax.plot([x, row[f"{passes}_usual_ratio"]], [y, y], color=look["color"], linewidth=1, alpha=0.5)
+                face = {} if row["resolved"] else {"markerfacecolor": "white"}
+                (dot,) = ax.plot(x, y, **look, markersize=8, zorder=3, **face)
+                ax.annotate(_samples_text(row), (x, y), (0, 7), textcoords="offset points", fontsize=8, ha="center")
+            dot.set_label(label)
+        ax.margins(0.07)
+        _plot_limits(ax, at_scale)
+        ax.set_xlabel(f"{title} [{unit}]")
+    axes[0, 0].set_ylabel("PSNR against the pixel integral [dB]")
+    right = axes[0, 1].secondary_yaxis("right")
+    right.yaxis.set_major_formatter(lambda psnr, _: f"{10 ** (-psnr / 20):.1e}")
+    right.set_ylabel("RMSE")
+    bars = "" if key == "seconds" else f"; bars: from the fastest to the median of {results['rounds']} rounds"
+    title = f"{results['scene']} at {_scale_and_sizes(at_scale)} px: accuracy against time{bars}"
+    tables.add_titles(figure, axes, title)
+    return figure
+
+
+def _plot_limits(ax, at_scale: dict) -> None:
+    """Where the accuracy of one weight per splat ends, and where that of the reference does."""
+    floor = next((row["blending_rmse"] for row in at_scale["methods"] if row["blending_rmse"]), None)
+    if floor:
+        ax.axhline(_psnr(floor), color="black", linewidth=0.9, linestyle=":", label="floor of one exact weight")
+    limit, top = _psnr(at_scale["reference"]["resolves_rmse_from"]), ax.get_ylim()[1]
+    if limit < top:
+        ax.axhspan(limit, top, color="#f1f3f5", zorder=0, label="not resolved by the reference")
+        ax.set_ylim(top=top)
+
+
+def _psnr(rmse: float) -> float:
+    return -20 * math.log10(max(rmse, 1e-15))
+
+
+def _families(rows: list[dict]) -> dict[str, list[dict]]:
+    """Methods that differ only in the number of samples, in order, by label."""
+    families = {}
+    for row in rows:
+        spec = resolve_footprint(row["footprint"])
+        label = f"{spec.name}, S samples" if "samples" in dict(spec.options) else row["method"].partition("@")[0]
+        label += ", supersampled" * (row["supersampling"] > 1)
+        families.setdefault(label, []).append(row)
+    return families
+
+
+def _samples_text(row: dict) -> str:
+    """The label of a method within its family."""
+    if row["supersampling"] > 1:
+        return "{0}x{0}".format(row["supersampling"])
+    return str(dict(resolve_footprint(row["footprint"]).options).get("samples", ""))

@@ -1,0 +1,425 @@
+"""What a scene calls for, seen from some views: bounds and measurements of what leaving an effect out changes.
+
+`inspect_scene` reports on every effect, `plan` returns only the `Effects`. Their tolerance is the root mean square over
+the pixels and channels of a view, in units of colour (0 to 1), between the recommendation and everything switched on:
+REFERENCE, all bands of the harmonics, and the 3D filter where a view calls for it. How far REFERENCE itself is from the
+true integral is measured in docs/accuracy.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial, reduce
+
+import torch
+
+from ..camera import view_center
+from ..effects import NEAR, Effects, depths
+from ..filters import apply_3d_filter, compute_3d_filter, sampling_interval
+from ..io import Scene, View
+from ..ops import TILE
+from ..rasterizer import (
+    GaussianRasterizationSettings,
+    GaussianRasterizer,
+    Stages,
+    _settings_arguments,
+    render_stages,
+)
+from ..sh import needed_sh_degree, sh_band_bounds
+from . import timing
+from .inspection import (
+    BINS,
+    NARROW,
+    TILE_SAMPLES,
+    Candidate,
+    Finding,
+    SceneReport,
+    ViewReport,
+    in_255,
+    percent,
+    share,
+)
+
+REFERENCE = "box:samples=16"
+BASE = "box:samples=1"
+ADAPTIVE = (8, 4, 2, 1)  # tolerances to try, in that of the plan: on two trained scenes the RMS is at most a quarter
+SH_SHARE = 0.5  # of the tolerance, at most, for the harmonics left out
+FILTER_SHARE = 0.25  # of the tolerance: below it the 3D filter is left out
+FINER = 1.1  # a view calls for the 3D filter if it samples so many times as finely as in training
+FINER_SHARE = 0.01  # more than this share of what it shows
+CLAMP = 1.3  # half pictures from the optical axis: kFrustumClamp of csrc/core/constants.h
+SAME = 1.05  # ratio of times up to which the candidate listed first is taken
+TIMED_VIEWS = 2
+INPUTS = ("means3D", "means2D", "opacities", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")
+
+
+@torch.no_grad()
+def plan(
+    scene: Scene,
+    views: Sequence[View | GaussianRasterizationSettings],
+    tolerance: float = 1 / 255,
+    training_views: Sequence[View | GaussianRasterizationSettings] | None = None,
+) -> Effects:
+    """The `Effects` that these views of a scene call for: those of `inspect_scene`, without measuring footprints.
+
+    Arguments and errors are those of `inspect_scene`.
+    """
+    cameras, training = _check(scene, views, tolerance, training_views)
+    return _survey(scene, cameras, tolerance, training).effects
+
+
+@torch.no_grad()
+def inspect_scene(
+    scene: Scene,
+    views: Sequence[View | GaussianRasterizationSettings],
+    tolerance: float = 1 / 255,
+    training_views: Sequence[View | GaussianRasterizationSettings] | None = None,
+    *,
+    scale: float = 1.0,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    rounds: int | None = None,
+) -> SceneReport:
+    """Which effects and which footprint these views of a scene call for, what each changes, and what it costs.
+
+    The recommendation is the cheapest of a few footprints that, with the recommended effects, stays within the
+    tolerance of everything switched on in every view: REFERENCE, all bands of the harmonics, and the 3D filter where it
+    is called for. That is measured in these views. For the bands of harmonics that are left out it is a bound, which
+    holds for any view. Renders every view several times.
+
+    Args:
+        scene: P Gaussians on the device to measure on.
+        views: What it will be seen from, at least one. Footprint and effects of settings are ignored.
+        tolerance: Root mean square over the pixels and channels of each view, in units of colour, not negative.
+        training_views: What the scene was trained from, at their size; None: the 3D filter is not examined.
+        scale: Resolution of `io.View`s among the views, as a factor.
+        background: Colour behind the scene in `io.View`s.
+        rounds: Timed rounds; None: 5, of which the fastest counts, with CUDA 20, of which the median.
+
+    Raises:
+        TypeError: scene, a view or the tolerance has a wrong type.
+        ValueError: No views, a tolerance that is negative or not finite, or perspective and orthographic views at once.
+    """
+    cameras, training = _check(scene, views, tolerance, training_views, scale, background)
+    if rounds is not None and not (isinstance(rounds, int) and rounds >= 1):
+        raise ValueError(f"rounds must be a positive whole number, got {rounds!r}")
+    survey = _survey(scene, cameras, tolerance, training)
+    ladder = [BASE, "box:samples=4", *(f"adaptive:tolerance={k * tolerance:.4g}" for k in ADAPTIVE), "box:samples=8"]
+    rms = {footprint: [] for footprint in [*ladder, REFERENCE]}
+    fitting, in_views = list(rms), []
+    shown = on_image = torch.zeros(len(scene.means), dtype=torch.bool, device=scene.means.device)
+    top_band = 0.0  # what the last band of the harmonics changes
+    for camera in cameras:
+        reference = _stages(scene, camera, REFERENCE, survey.everything)
+        in_views.append(_touching(reference))
+        shown, on_image = shown | in_views[-1], on_image | (reference.radii > 0)
+        for footprint in list(fitting):
+            stages = _stages(scene, camera, footprint, survey.effects)
+            rms[footprint].append(_rms(stages, reference))
+            shown = shown | _touching(stages)
+            if rms[footprint][-1] > tolerance:
+                fitting.remove(footprint)
+        if survey.effects.sh_degree is None and scene.sh_degree > 0:
+            fewer = replace(survey.everything, sh_degree=scene.sh_degree - 1)
+            top_band = max(top_band, _rms(_stages(scene, camera, REFERENCE, fewer), reference))
+
+    timed = cameras[:: -(-len(cameras) // TIMED_VIEWS)]
+    calls = {name: _passes(scene, timed, name, survey.effects) for name in dict.fromkeys([BASE, *fitting])}
+    seconds = _seconds(calls, scene, rounds)
+    costs = {name: of_name / seconds[BASE] for name, of_name in seconds.items()}
+    cheapest = min(costs[name] for name in fitting)
+    footprint = next(name for name in fitting if costs[name] <= SAME * cheapest)
+    candidates = tuple(Candidate(name, max(rms[name]), name in fitting, costs.get(name)) for name in rms)
+    names = [getattr(view, "name", f"view_{i:03d}") for i, view in enumerate(views)]
+    reports = tuple(
+        _view_report(scene, survey, i, names[i], camera, in_views[i], rms[footprint][i], tolerance)
+        for i, camera in enumerate(cameras)
+    )
+    costs = _effect_costs(scene, timed, footprint, survey, shown, rounds)
+    findings = (
+        _footprint_finding(candidates, footprint, reports),
+        _sh_finding(scene, survey, top_band, costs.get("sh")),
+        _filter_finding(survey, costs.get("filter_3d")),
+        _cull_finding(scene, cameras, shown, on_image, costs["culls"]),
+        *_camera_findings(survey),
+        Finding("outputs", False, None, None, costs["outputs"], "off", OUTPUTS_REASON),
+    )
+    machine = timing.describe_machine(scene.means.device.type)
+    found = (survey.effects, footprint, findings, candidates, reports, shown)
+    return SceneReport(len(scene.means), scene.sh_degree, tolerance, machine, *found)
+
+
+def _check(scene, views, tolerance, training_views, *options) -> tuple[list, list | None]:
+    """Settings of the views and of those of training. `options`: scale and background of `View.settings`."""
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene must be an io.Scene, got {type(scene).__name__}")
+    if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)):
+        raise TypeError(f"tolerance must be a number, got {tolerance!r}")
+    if not 0 <= tolerance < math.inf:
+        raise ValueError(f"tolerance must be finite and not negative, got {tolerance}")
+    cameras = _cameras("views", views, scene, *options)
+    return cameras, None if training_views is None else _cameras("training_views", training_views, scene)
+
+
+def _cameras(what: str, views, scene: Scene, *options) -> list[GaussianRasterizationSettings]:
+    if not isinstance(views, Sequence):
+        raise TypeError(f"{what} must be a list of views, got {type(views).__name__}")
+    for view in views:
+        if not isinstance(view, (View, GaussianRasterizationSettings)):
+            raise TypeError(f"{what} must hold io.View or GaussianRasterizationSettings, got {type(view).__name__}")
+    if not views:
+        raise ValueError(f"{what} must hold at least one view, got none")
+    device = scene.means.device
+    return [view.settings(*options, device=device) if isinstance(view, View) else view for view in views]
+
+
+# ------------------------------------------------------------------------- what is called for
+
+
+@dataclass(frozen=True, eq=False)
+class _Survey:
+    """The choice of effects, and what it is based on."""
+
+    effects: Effects  # recommended
+    everything: Effects  # what the tolerance is measured against
+    bounds: list[float]  # of `sh_band_bounds`
+    ratios: list[torch.Tensor]  # per view, of the Gaussians that training saw too: interval in training over the view's
+    filter_change: float | None  # largest RMS of the 3D filter over the views; None where no view calls for it
+    off_center: list[bool]  # which views are
+
+
+def _survey(scene: Scene, cameras: list, tolerance: float, training: list | None) -> _Survey:
+    orthographic = [_is_orthographic(camera) for camera in cameras]
+    if any(orthographic) != all(orthographic):
+        raise ValueError(
+            f"views must be all perspective or all orthographic, got {sum(orthographic)} of {len(cameras)} orthographic"
+        )
+    off_center = [not orthographic[0] and _is_off_center(camera) for camera in cameras]
+    everything = Effects(orthographic=orthographic[0], off_center=any(off_center))
+    ratios, filter_change = [], None
+    if training is not None:
+        finest = reduce(torch.minimum, (sampling_interval(scene.means, camera) for camera in training))
+        intervals = [sampling_interval(scene.means, camera) for camera in cameras]
+        ratios = [(finest / own)[finest.isfinite() & own.isfinite()] for own in intervals]
+        if any(share(ratio > FINER) > FINER_SHARE for ratio in ratios):
+            filtered = replace(everything, filter_3d=compute_3d_filter(scene.means, training))
+            filter_change = max(
+                _rms(*(_stages(scene, camera, REFERENCE, effects) for effects in (everything, filtered)))
+                for camera in cameras
+            )
+            everything = filtered
+    shs = scene.shs[:, : (scene.sh_degree + 1) ** 2]
+    degree = needed_sh_degree(shs, SH_SHARE * tolerance)
+    effects = replace(
+        everything,
+        sh_degree=degree if degree < scene.sh_degree else None,
+        filter_3d=everything.filter_3d if (filter_change or 0) > FILTER_SHARE * tolerance else None,
+    )
+    return _Survey(effects, everything, sh_band_bounds(shs), ratios, filter_change, off_center)
+
+
+def _is_orthographic(camera: GaussianRasterizationSettings) -> bool:
+    """Whether w of clip space is the same everywhere."""
+    w = camera.projmatrix.detach().reshape(4, 4)[:, 3]
+    return (w[:3].abs().max() <= 1e-6 * w[3].abs()).item()
+
+
+def _is_off_center(camera: GaussianRasterizationSettings) -> bool:
+    """Whether an edge of the picture is more than CLAMP half pictures away from the optical axis."""
+    center = view_center(camera.viewmatrix.double(), camera.projmatrix.double(), with_gradient=False)
+    tangents = center.new_tensor([float(camera.tanfovx), float(camera.tanfovy)])
+    return (1 + (center / tangents).abs().max() > CLAMP + 1e-6).item()
+
+
+# ------------------------------------------------------------------------- rendering and costs
+
+
+def _prepare(scene: Scene, cameras: list, footprint: str, effects: Effects) -> tuple[list, dict]:
+    """Settings for every camera, and Gaussians after the 3D filter, for these effects."""
+    gaussians = scene.arguments()
+    if effects.filter_3d is not None:
+        filtered = apply_3d_filter(scene.scales, scene.opacities, effects.filter_3d)
+        gaussians["scales"], gaussians["opacities"] = filtered
+    options = {"footprint": footprint, "sh_degree": scene.sh_degree, "effects": replace(effects, filter_3d=None)}
+    return [camera._replace(**options) for camera in cameras], gaussians
+
+
+def _stages(scene: Scene, camera, footprint: str, effects: Effects) -> Stages:
+    (settings,), gaussians = _prepare(scene, [camera], footprint, effects)
+    return render_stages(settings, **gaussians)
+
+
+def _touching(stages: Stages) -> torch.Tensor:
+    """(P,) bool: which Gaussians are in the list of a tile."""
+    touching = torch.zeros_like(stages.radii, dtype=torch.bool)
+    touching[stages.ids[stages.pairs.long()].long()] = True
+    return touching
+
+
+def _rms(stages: Stages, reference: Stages) -> float:
+    return (stages.color.double() - reference.color).square().mean().sqrt().item()
+
+
+@torch.no_grad()
+def tile_samples(settings: GaussianRasterizationSettings, gaussians: dict[str, torch.Tensor]) -> torch.Tensor:
+    """(rows, columns) int32 on the CPU: the samples that `adaptive`, the footprint of `settings`, takes in every tile.
+
+    `gaussians` are the keywords of `GaussianRasterizer.forward`.
+    """
+    inputs = [gaussians.get(name) for name in INPUTS]
+    options = _settings_arguments(settings, gaussians["means3D"], gaussians.get("shs"))
+    chosen = torch.ops.analytic_rasterizer.rasterize(*inputs, *options, False, False, False)[-2]
+    return chosen.reshape(-(-settings.image_height // TILE), -1).cpu()
+
+
+def _passes(scene: Scene, cameras: list, footprint: str, effects: Effects) -> list[Callable[[], object]]:
+    """A forward pass for every camera."""
+    each, gaussians = _prepare(scene, cameras, footprint, effects)
+    return [partial(GaussianRasterizer(settings), means2D=None, **gaussians) for settings in each]
+
+
+def _seconds(passes: dict[str, list[Callable]], scene: Scene, rounds: int | None) -> dict[str, float]:
+    """Seconds over all cameras, by key."""
+    device = scene.means.device.type
+    samples = timing.time_calls(passes, device, rounds)
+    return {name: sum(timing.best_of(taken, device) for taken in of) for name, of in samples.items()}
+
+
+def _effect_costs(scene, cameras, footprint, survey: _Survey, shown, rounds) -> dict[str, float]:
+    """Time with an effect over that without, by effect."""
+    effects = survey.effects
+    only_shown = Scene(*(field[shown] for field in scene[:-1]), scene.sh_degree)
+    masked = effects if effects.filter_3d is None else replace(effects, filter_3d=effects.filter_3d[shown])
+    variants = {"outputs": replace(effects, alpha=True, depth=True)}
+    pairs = {"culls": ("plain", "shown"), "outputs": ("outputs", "plain")}
+    if scene.sh_degree > 0:
+        variants |= {"bands": replace(effects, sh_degree=None), "no bands": replace(effects, sh_degree=0)}
+        pairs["sh"] = ("bands", "no bands")
+    if effects.filter_3d is not None:
+        variants["no filter"] = replace(effects, filter_3d=None)
+        pairs["filter_3d"] = ("plain", "no filter")
+    passes = {
+        name: _passes(scene, cameras, footprint, variant) for name, variant in ({"plain": effects} | variants).items()
+    }
+    passes["shown"] = _passes(only_shown, cameras, footprint, masked)
+    seconds = _seconds(passes, scene, rounds)
+    return {name: seconds[a] / seconds[b] for name, (a, b) in pairs.items()}
+
+
+# ------------------------------------------------------------------------------------- findings
+
+OUTPUTS_REASON = (
+    "no scene calls for alpha, depth, other outputs, camera gradients, defocus or motion: off until asked for; the "
+    "cost is that of alpha and depth together"
+)
+
+
+def _footprint_finding(candidates: tuple[Candidate, ...], footprint: str, views: tuple[ViewReport, ...]) -> Finding:
+    tried = {candidate.footprint: candidate for candidate in candidates}
+    narrow = sum(v.narrow * v.shown for v in views) / max(1, sum(v.shown for v in views))
+    tiles = torch.cat([v.tile_samples.flatten() for v in views])
+    shares = ", ".join(f"{n} for {percent(share(tiles == n))}" for n in TILE_SAMPLES)
+    reason = (
+        f"{percent(narrow)} of the splats have a standard deviation below {NARROW:g} px; samples that tiles need: "
+        f"{shares}; {footprint} is within {in_255(tried[footprint].rms)}/255 of everything on"
+    )
+    cost = tried[footprint].cost
+    return Finding("footprint", footprint != BASE, tried[BASE].rms, "measured", cost, footprint, reason)
+
+
+def _sh_finding(scene: Scene, survey: _Survey, top_band: float, cost: float | None) -> Finding:
+    name, degree = "spherical harmonics", survey.effects.sh_degree
+    if scene.sh_degree == 0:
+        return Finding(name, False, 0.0, "bound", None, "degree 0", "the scene has none beyond degree 0")
+    bounds = ", ".join(in_255(bound) for bound in survey.bounds[1:])
+    reason = f"bands 1 to {scene.sh_degree} add at most {bounds} /255 to a colour"
+    if degree is None:
+        reason += ", the last of them more than half the tolerance; the change is that of leaving it out"
+        return Finding(name, True, top_band, "measured", cost, f"degree {scene.sh_degree}", reason)
+    reason += f"; left out: those above {degree}"
+    return Finding(name, degree > 0, sum(survey.bounds[degree + 1 :]), "bound", cost, f"degree {degree}", reason)
+
+
+def _filter_finding(survey: _Survey, cost: float | None) -> Finding:
+    if not survey.ratios:
+        reason = "not examined: no training views were given"
+        return Finding("3D filter", None, None, None, None, "none", reason)
+    needed, change = survey.effects.filter_3d is not None, survey.filter_change
+    most = max(share(ratio > FINER) for ratio in survey.ratios)
+    reason = (
+        f"in the view with most of them, {percent(most)} of the Gaussians are sampled more than {FINER:g} times as "
+        "finely as in any training view"
+    )
+    if change is not None and not needed:
+        reason += "; it changes less than a quarter of the tolerance"
+    kind, recommendation = None if change is None else "measured", "filter_3d" if needed else "none"
+    return Finding("3D filter", needed, change, kind, cost, recommendation, reason)
+
+
+def _cull_finding(scene: Scene, cameras: list, shown, on_image, cost: float) -> Finding:
+    behind = reduce(torch.logical_and, (depths(scene.means, camera.viewmatrix) <= NEAR for camera in cameras))
+    hidden, faint = ~shown & ~behind, on_image | (scene.opacities.reshape(-1) < 1 / 255)
+    count, *parts = (int(which.sum()) for which in (~shown, behind, hidden & faint, hidden & ~faint))
+    reason = (
+        f"{count} of {len(shown)} Gaussians touch no pixel of these views: {parts[0]} behind the near plane of every "
+        f"view, {parts[1]} too faint or too small, {parts[2]} beside every picture or not finite; `shown` is the mask "
+        "of the others, the cost that of keeping all"
+    )
+    return Finding("hidden Gaussians", False, 0.0, "bound", cost, f"drop {count}", reason)
+
+
+def _camera_findings(survey: _Survey) -> tuple[Finding, Finding]:
+    flat, off = survey.effects.orthographic, sum(survey.off_center)
+    reason = f"w of clip space {'does not depend' if flat else 'depends'} on the position"
+    crop = (
+        f"in {off} of {len(survey.off_center)} views an edge of the picture is more than {CLAMP} half pictures away "
+        "from the optical axis"
+    )
+    return (
+        Finding("orthographic", flat, None, None, None, "on" if flat else "off", reason),
+        Finding("off-centre clamp", off > 0, None, None, None, "on" if off else "off", crop),
+    )
+
+
+def _view_report(scene, survey: _Survey, i: int, name: str, camera, shown, rms: float, tolerance: float) -> ViewReport:
+    (settings,), gaussians = _prepare(scene, [camera], f"adaptive:tolerance={tolerance}", survey.effects)
+    sigmas = _projected_sigmas(settings, {key: value[shown] for key, value in gaussians.items()})
+    bins = torch.bucketize(sigmas, sigmas.new_tensor(BINS[1:-1]))
+    ratio = survey.ratios[i] if survey.ratios else None
+    return ViewReport(
+        name=name,
+        width=camera.image_width,
+        height=camera.image_height,
+        shown=len(sigmas),
+        narrow=share(sigmas < NARROW),
+        sigmas=tuple(torch.bincount(bins, minlength=len(BINS) - 1).tolist()),
+        finer=None if ratio is None else share(ratio > FINER),
+        finest=None if ratio is None or not len(ratio) else ratio.max().item(),
+        rms=rms,
+        tile_samples=tile_samples(settings, gaussians),
+    )
+
+
+def _projected_sigmas(camera: GaussianRasterizationSettings, gaussians: dict) -> torch.Tensor:
+    """(P,) smaller standard deviation in the image, px, before the footprint [EWA, Eq. 29-31].
+
+    This repeats the projection of csrc/core/project.h, for lack of an op that returns cov2d.
+    """
+    view = camera.viewmatrix.detach().reshape(4, 4)
+    x, y, z = (gaussians["means3D"] @ view[:3, :3] + view[3, :3]).unbind(1)
+    depth, side = (torch.ones_like(z), 0) if camera.effects.orthographic else (z, CLAMP)
+    # The axes of a Gaussian: row i is s_i times the ith column of the rotation of the quaternion (w, u).
+    w, u = torch.nn.functional.normalize(gaussians["rotations"], dim=1)[:, None].split([1, 3], -1)
+    axes = torch.diag_embed(gaussians["scales"])
+    turn = 2 * torch.linalg.cross(u.expand_as(axes), axes)
+    axes = axes + w * turn + torch.linalg.cross(u.expand_as(axes), turn)
+    turned = camera.scale_modifier * axes @ view[:3, :3]  # (P, 3 axes, 3), camera space
+    rows = []
+    for a, b, tan, size in ((0, x, camera.tanfovx, camera.image_width), (1, y, camera.tanfovy, camera.image_height)):
+        slope = (b / z).clamp(-side * tan, side * tan)[:, None]
+        rows.append(size / (2 * tan) * (turned[:, :, a] - slope * turned[:, :, 2]) / depth[:, None])
+    xx, xy, yy = (rows[0] ** 2).sum(1), (rows[0] * rows[1]).sum(1), (rows[1] ** 2).sum(1)
+    largest = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)
+    area = torch.linalg.cross(rows[0], rows[1]).norm(dim=1)
+    return torch.where(largest > 0, area / largest.sqrt(), 0)

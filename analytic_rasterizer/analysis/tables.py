@@ -1,0 +1,118 @@
+"""How measurements are written: tables, and figures in which a footprint always has the same colour and marker."""
+
+from __future__ import annotations
+
+import csv
+import math
+from pathlib import Path
+
+from ..footprints import FOOTPRINTS, resolve_footprint
+from ..io import optional_import
+
+STYLES = {  # colour and marker
+    "point": ("#7a7f87", "o"),
+    "mip": ("#e08214", "s"),
+    "analytic": ("#c2255c", "D"),
+    "cumulant": ("#2b8a3e", "^"),
+    "box": ("#1c7ed6", "v"),
+    "adaptive": ("#7048e8", "P"),
+    "erf": ("#e599b8", "d"),
+    "exact": ("#000000", "*"),
+}
+OTHER_STYLES = (("#0c8599", "h"), ("#8d6e4b", "p"), ("#a9a000", "<"), ("#5f3dc4", ">"))  # of footprints not listed
+
+
+def style(footprint: str) -> dict:
+    """Keywords of matplotlib for a footprint with its options: color, marker and linestyle.
+
+    More samples are darker; options other than the defaults are darker and dashed.
+    """
+    spec = resolve_footprint(footprint)
+    samples = dict(spec.options).get("samples")
+    others = [name for name in FOOTPRINTS if name not in STYLES]
+    known = STYLES.get(spec.name)
+    color, marker = known or OTHER_STYLES[others.index(spec.name) % len(OTHER_STYLES)]
+    is_default = samples is not None or spec == resolve_footprint(spec.name)
+    color = _shade(color, math.log2(samples) / 4 - 0.5 if samples else 0.0 if is_default else 0.5)
+    return {"color": color, "marker": marker, "linestyle": "-" if is_default else "--"}
+
+
+def _shade(color: str, darker: float) -> str:
+    """The colour "#rrggbb" mixed with black, or with white where `darker` (-1 to 1) is negative."""
+    target = 0 if darker > 0 else 255
+    return "#" + bytes(round(c + abs(darker) * (target - c)) for c in bytes.fromhex(color[1:])).hex()
+
+
+def new_figure(width: float, height: float, columns: int = 1, rows: int = 1, **options):
+    """(figure, axes): a matplotlib figure of this size [in] without global state, and its axes as a 2D array."""
+    figure = optional_import("matplotlib.figure", "analysis").Figure((width, height), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, **options)
+    for ax in axes.flat:
+        ax.grid(True, which="major", color="#e3e6ea", linewidth=0.8)
+        ax.set_axisbelow(True)
+        ax.spines[["top", "right"]].set_visible(False)
+    return figure, axes
+
+
+def add_titles(figure, axes, title: str, xlabel: str = "", fontsize: float = 9) -> None:
+    """Logarithmic x axes with a label below the last row, the title, and the legend of the first axes at the right."""
+    for ax in axes.flat:
+        plain_log_ticks(ax)
+    for ax in axes[-1]:
+        ax.set_xlabel(xlabel or ax.get_xlabel())
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", frameon=False, fontsize=fontsize)
+    figure.suptitle(title, fontsize=11)
+
+
+def plain_log_ticks(ax) -> None:
+    """Makes the x axis logarithmic with plain numbers: 1, 2, 5, 10, ..., and more of them in a narrow range."""
+    ticker = optional_import("matplotlib.ticker", "analysis")
+    ax.set_xscale("log")
+    low, high = ax.get_xlim()
+    subs = (
+        (1, 2, 5)
+        if high / low >= 12
+        else (1, 1.5, 2, 3, 5, 7)
+        if high / low >= 3
+        else (1, 1.2, 1.4, 1.7, 2, 3, 4, 6, 8)
+    )
+    ax.xaxis.set_major_locator(ticker.LogLocator(subs=subs))
+    ax.xaxis.set_major_formatter("{x:g}")
+    ax.xaxis.set_minor_formatter(ticker.NullFormatter())
+
+
+def save_figure(figure, out: Path, name: str) -> None:
+    """Writes DIR/NAME.png and DIR/NAME.svg, the same bytes for the same plot."""
+    with optional_import("matplotlib", "analysis").rc_context({"svg.hashsalt": name}):
+        figure.savefig(out / f"{name}.png", dpi=140)
+        figure.savefig(out / f"{name}.svg", metadata={"Date": None})
+
+
+def save_csv(path: Path, rows: list[dict]) -> None:
+    """Writes rows with the keys of the first as header; None is left empty."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def format_table(header: list[str], rows: list[list]) -> str:
+    """Columns of text: the first aligned left, the others right; floats with 4 digits."""
+    cells = [header] + [[format_cell(cell) for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*cells)]
+    aligned = "  ".join(f"{{:{'>' if i else '<'}{width}}}" for i, width in enumerate(widths))
+    return "\n".join(aligned.format(*row).rstrip() for row in cells)
+
+
+def markdown_table(header: list[str], rows: list[list]) -> str:
+    """The same as Markdown."""
+    lines = [header, ["---"] * len(header)] + [[format_cell(cell) for cell in row] for row in rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def format_cell(cell) -> str:
+    """Text of a cell: floats with 4 digits, "-" for None."""
+    if cell is None:
+        return "-"
+    return f"{cell:.4g}" if isinstance(cell, float) else str(cell)

@@ -1,0 +1,216 @@
+"""What rendering costs in time and memory, on the CPU or with CUDA."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from .. import _C, io
+from ..rasterizer import GaussianRasterizer
+
+ROUNDS = {"cpu": 5, "cuda": 20}
+WARM_UP = 40  # calls before timing on CUDA: the first 32 frames of a size wait for the device
+
+
+class Case:
+    """One view of a scene, ready to render with one footprint.
+
+    With `supersampling` n the whole picture is rendered n times larger and averaged over n x n pixels: the
+    footprint is evaluated in the pixels of the larger picture.
+    """
+
+    def __init__(
+        self, scene: io.Scene, view: io.View, footprint: str, supersampling: int = 1, background=(0.0, 0.0, 0.0)
+    ):
+        device = scene.means.device
+        self.supersampling = supersampling
+        self.settings = view.settings(supersampling, background, scene.sh_degree, footprint, device=device)
+        self.rasterizer = GaussianRasterizer(self.settings)
+        self.gaussians = scene.arguments()
+        self.inputs = {k: v.detach().requires_grad_() for k, v in self.gaussians.items()}
+        self.inputs["means2D"] = torch.zeros_like(scene.means, requires_grad=True)
+        self.dL_dcolor = fixed_weights(view.height, view.width, device)
+
+    @torch.no_grad()
+    def forward(self) -> torch.Tensor:
+        """The image (3, H, W), without gradient."""
+        return self.image(means2D=None, **self.gaussians)
+
+    def forward_backward(self) -> list[torch.Tensor]:
+        """The image, and the gradients of sum(image * dL_dcolor) with respect to all inputs."""
+        color = self.image(**self.inputs)
+        return [color, *torch.autograd.grad(color, list(self.inputs.values()), self.dL_dcolor)]
+
+    def image(self, **gaussians) -> torch.Tensor:
+        color, _ = self.rasterizer(**gaussians)
+        if self.supersampling > 1:
+            color = torch.nn.functional.avg_pool2d(color[None], self.supersampling)[0]
+        return color
+
+    def extra_bytes(self) -> int:
+        """Bytes that forward and backward need in addition to inputs, outputs and gradients."""
+        device = self.dL_dcolor.device
+        before = reset_peak_memory(device)
+        results = self.forward_backward()
+        return peak_memory(device) - before - sum(t.numel() * t.element_size() for t in results)
+
+
+@functools.cache
+def fixed_weights(height: int, width: int, device: torch.device, channels: int = 3) -> torch.Tensor:
+    """(channels, height, width) in [0, 1), always the same: a gradient with respect to a picture."""
+    return torch.rand(channels, height, width, generator=torch.Generator().manual_seed(0)).to(device)
+
+
+def describe_machine(device: str) -> str:
+    """The processor and the version of torch, in words."""
+    if device == "cuda":
+        gpu = torch.cuda.get_device_properties(0)
+        memory = f"{gpu.multi_processor_count} SMs, {gpu.total_memory / 2**30:.0f} GiB"
+        return f"{gpu.name} ({gpu.major}.{gpu.minor}, {memory}), CUDA {torch.version.cuda}, torch {torch.__version__}"
+    cpu = platform.processor() or platform.machine()
+    if sys.platform == "linux":
+        with open("/proc/cpuinfo") as f:
+            cpu = next((line.split(":")[1].strip() for line in f if line.startswith("model name")), cpu)
+    return f"{cpu}, {torch.get_num_threads()} threads, {_C.instruction_set()}, torch {torch.__version__}"
+
+
+# -------------------------------------------------------------------------------------- times
+
+
+def in_turn(cases: dict[Any, list], measure: Callable[[Any], Any], rounds: int) -> dict[Any, list[list]]:
+    """`measure(case)` of every case of every key, round after round: by key, a list of rounds for every case.
+
+    A machine that slows down for a while slows down all of them.
+    """
+    samples = {key: [[] for _ in of_key] for key, of_key in cases.items()}
+    for _ in range(rounds):
+        for key, of_key in cases.items():
+            for case, taken in zip(of_key, samples[key]):
+                taken.append(measure(case))
+    return samples
+
+
+def time_calls(
+    calls: dict[Any, list[Callable[[], object]]],
+    device: str,
+    rounds: int | None = None,
+    timer: Callable[[], float] = time.perf_counter,
+    slow: Callable[[dict[Any, float]], float] | None = None,
+    progress: Callable[[], object] = lambda: None,
+) -> dict[Any, list[list[float]]]:
+    """Seconds of every call, for the keys of `calls`: a list of rounds for every call of a key.
+
+    On the CPU the calls take turns after a round that warms up. On CUDA the calls of a key are warmed up and timed by
+    themselves, because the room for their pairs follows the frames before them.
+
+    Args:
+        calls: What to time.
+        device: "cpu" or "cuda".
+        rounds: Timed rounds; None is ROUNDS of the device.
+        timer: The clock on the CPU, in seconds.
+        slow: Of the seconds that every key took in the round that warms up, the limit beyond which a key is not timed
+            again on the CPU, so that this round counts.
+        progress: Called after every timed call.
+    """
+    rounds = rounds or ROUNDS[device]
+
+    def clock(call):
+        progress()
+        return event_seconds(call) if device == "cuda" else seconds_of(call, timer)
+
+    if device == "cuda":
+        samples = {}
+        for key, of_key in calls.items():
+            warm_up_cuda(of_key, WARM_UP)
+            samples[key] = [[clock(call) for _ in range(rounds)] for call in of_key]
+        return samples
+    first = in_turn(calls, clock, 1)
+    totals = {key: sum(taken[0] for taken in of_key) for key, of_key in first.items()}
+    limit = float("inf") if slow is None else slow(totals)
+    again = {key: of_key for key, of_key in calls.items() if totals[key] <= limit}
+    return first | in_turn(again, clock, rounds)
+
+
+def best_of(samples: list[float], device: str) -> float:
+    """The round that counts: on the CPU the fastest, since other work only ever adds time; on CUDA the median."""
+    return statistics.median(samples) if device == "cuda" else min(samples)
+
+
+def seconds_of(call: Callable[[], object], timer: Callable[[], float] = time.perf_counter) -> float:
+    """Time until a call returns."""
+    start = timer()
+    call()
+    return timer() - start
+
+
+def event_seconds(call: Callable[[], object]) -> float:
+    """Time on the CUDA device from before a call to after it."""
+    start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    start.record()
+    call()
+    end.record()
+    torch.cuda.synchronize()
+    return start.elapsed_time(end) * 1e-3
+
+
+def median_seconds(clock: Callable[[Callable], float], call: Callable[[], object], rounds: int) -> float:
+    """Median of `clock(call)` on an idle CUDA device."""
+    torch.cuda.synchronize()
+    clock(call)
+    return statistics.median(clock(call) for _ in range(rounds))
+
+
+def median_of(samples: list[dict]) -> dict:
+    """The median of every key."""
+    return {key: statistics.median(sample[key] for sample in samples) for key in samples[0]}
+
+
+def warm_up_cuda(calls: list[Callable[[], object]], passes: int) -> None:
+    """Renders with one footprint until the room for its pairs depends on these frames alone."""
+    _C.force_pair_capacity(0)
+    for _ in range(passes):
+        for call in calls:
+            call()
+    torch.cuda.synchronize()
+
+
+# ------------------------------------------------------------------------------------- memory
+
+
+def reset_peak_memory(device: torch.device) -> int:
+    """Makes the peak start again from the memory in use now, which is returned, in bytes; 0 where that is unknown."""
+    if device.type == "cuda":
+        torch.cuda.synchronize()
+        torch.cuda.reset_peak_memory_stats()
+        return torch.cuda.memory_allocated()
+    if sys.platform == "linux":  # glibc hands freed blocks back to the system, so that peaks can be compared
+        libc = ctypes.CDLL(None)
+        libc.mallopt(-3, 1 << 16)  # M_MMAP_THRESHOLD: blocks above 64 KiB go back when freed
+        libc.malloc_trim(0)
+    try:
+        with open("/proc/self/clear_refs", "w") as f:
+            f.write("5")
+    except OSError:
+        return 0
+    return _status("VmRSS")
+
+
+def peak_memory(device: torch.device) -> int:
+    """The most memory in use since the last reset, bytes."""
+    return torch.cuda.max_memory_allocated() if device.type == "cuda" else _status("VmHWM")
+
+
+def _status(key: str) -> int:
+    try:
+        with open("/proc/self/status") as f:
+            return next(1024 * int(line.split()[1]) for line in f if line.startswith(key))
+    except OSError:
+        return 0

@@ -1,0 +1,32 @@
+"""The command line: `python -m analytic_rasterizer COMMAND`.
+
+A command is a module with two functions: `add_parser` adds its parser to the subcommands, and `run` takes the parsed
+arguments. COMMANDS lists them. A command reports what the user can correct by raising: `main` turns that into one line
+on stderr and exit code 2.
+"""
+
+from __future__ import annotations
+
+from .. import __version__
+from . import errors, inspect, pareto, render
+from .arguments import Parser, run_command
+
+__all__ = ["Parser", "build_parser", "main"]
+
+COMMANDS = (render, inspect, errors, pareto)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Runs one command and returns its exit code: 0, 2 after an error, 130 when interrupted."""
+    return run_command(lambda: build_parser().parse_args(argv))
+
+
+def build_parser() -> Parser:
+    """The parser of all commands."""
+    description = "Render 3D Gaussians with pixels that integrate, not sample."
+    parser = Parser(prog="python -m analytic_rasterizer", description=description)
+    parser.add_argument("--version", action="version", version=f"analytic_rasterizer {__version__}")
+    subcommands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for command in COMMANDS:
+        command.add_parser(subcommands)
+    return parser

@@ -1,0 +1,123 @@
+"""What the commands share: their parser, options, types of arguments, and how they end."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+# What a user can cause: bad values and files (ValueError, TypeError, OSError), a missing extra
+# (ImportError), a device out of memory or absent (RuntimeError, MemoryError).
+USER_ERRORS = (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError)
+
+
+class Parser(argparse.ArgumentParser):
+    """An ArgumentParser whose errors are one line."""
+
+    def error(self, message):
+        self.exit(2, f"error: {message} (see {self.prog} --help)\n")
+
+
+def run_command(parse: Callable[[], argparse.Namespace]) -> int:
+    """Parses arguments, runs the command that they name, and returns its exit code.
+
+    Args:
+        parse: Returns the arguments; their `run` is called with them.
+
+    Returns:
+        0, 2 after an error that the user can correct, which is one line on stderr, or 130 when interrupted.
+    """
+    try:
+        args = parse()
+        args.run(args)
+        return 0
+    except KeyboardInterrupt:
+        return 130
+    except USER_ERRORS as error:
+        print(f"error: {_describe(error)}", file=sys.stderr)
+        return 2
+
+
+def _describe(error: BaseException) -> str:
+    """The error in one line."""
+    if isinstance(error, OSError) and error.strerror:
+        return f"{error.filename}: {error.strerror}" if error.filename else error.strerror
+    return str(error).partition("\n")[0] or type(error).__name__
+
+
+def add_scene(parser) -> None:
+    parser.add_argument("scene", metavar="SCENE", help="3DGS .ply, compressed .ply or .spz")
+    parser.add_argument(
+        "--views",
+        required=True,
+        help="3DGS cameras.json, Blender or nerfstudio transforms.json, or a list of {width, height, fx, fy, w2c}",
+    )
+
+
+def add_scale(parser) -> None:
+    parser.add_argument("--scale", type=positive_number, default=1.0, help="resolution, as a factor (default: 1)")
+
+
+def add_view_options(parser) -> None:
+    parser.add_argument(
+        "--background",
+        nargs=3,
+        type=intensity,
+        default=(0.0, 0.0, 0.0),
+        metavar=("R", "G", "B"),
+        help="colour behind the scene, 0 to 1 (default: black)",
+    )
+    parser.add_argument(
+        "--size",
+        nargs=2,
+        type=count,
+        metavar=("W", "H"),
+        help="image size for a views file that does not state one",
+    )
+
+
+def add_machine_options(parser) -> None:
+    parser.add_argument("--threads", type=count, metavar="N", help="CPU threads (default: all)")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+
+
+def use_machine(args) -> None:
+    if args.threads is not None:
+        torch.set_num_threads(args.threads)
+    if args.device == "cuda" and not torch.cuda.is_available():
+        raise ValueError("--device cuda: no CUDA device that this torch can use")
+
+
+def writable_folder(path: str) -> Path:
+    """The folder, made if it is missing; OSError before any work is done when it cannot be used."""
+    folder = Path(path)
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=folder):
+        return folder
+
+
+def _number(kind, accepts, expected: str):
+    """An argparse type: a number of this kind that `accepts` says is good."""
+
+    def parse(text: str):
+        try:
+            value = kind(text)
+        except ValueError:
+            value = None
+        if value is None or not accepts(value):
+            raise argparse.ArgumentTypeError(f"must be {expected}, got {text}")
+        return value
+
+    return parse
+
+
+positive_number = _number(float, lambda v: math.isfinite(v) and v > 0, "a positive number")
+intensity = _number(float, lambda v: 0 <= v <= 1, "a number from 0 to 1")
+tolerance = _number(float, lambda v: math.isfinite(v) and v >= 0, "a number that is not negative")
+density = _number(int, lambda v: v >= 8, "a whole number from 8")
+count = _number(int, lambda v: v >= 1, "a positive whole number")

@@ -1,0 +1,84 @@
+"""`inspect`: which effects and which footprint a scene calls for."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from .. import io
+from ..analysis.planner import inspect_scene
+from .arguments import (
+    add_machine_options,
+    add_scale,
+    add_scene,
+    add_view_options,
+    count,
+    tolerance,
+    use_machine,
+    writable_folder,
+)
+
+PLOTS = (".png", ".svg", ".pdf")
+
+
+def add_parser(subcommands) -> None:
+    parser = subcommands.add_parser(
+        "inspect",
+        help="say which effects and which footprint a scene calls for, and what they cost",
+        description="Render SCENE from the views of VIEWS with every effect that it may call for and with a few "
+        "footprints, and recommend the cheapest that stays within the tolerance of everything switched on. Prints "
+        "what each effect changes and costs, and what the views show.",
+    )
+    add_scene(parser)
+    parser.add_argument(
+        "--tolerance",
+        type=tolerance,
+        default=1 / 255,
+        metavar="T",
+        help="root mean square over a view, in units of colour, 0 to 1 (default: 1/255)",
+    )
+    parser.add_argument("--training-views", metavar="F", help="file of the views that the scene was trained from")
+    add_scale(parser)
+    parser.add_argument(
+        "--max-views",
+        type=count,
+        default=8,
+        metavar="N",
+        help="look at no more than N views, evenly spread over the file (default: %(default)s)",
+    )
+    parser.add_argument("--json", metavar="FILE", help="write the findings as JSON; - prints them instead of the text")
+    parser.add_argument(
+        "--picture",
+        metavar="FILE",
+        help="plot what the views show, as .png, .svg or .pdf: sizes of splats, and samples per tile",
+    )
+    add_view_options(parser)
+    add_machine_options(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args) -> None:
+    """Inspects the scene and prints the report."""
+    if args.picture:  # raises before anything is rendered
+        io.optional_import("matplotlib.figure", "analysis")
+        if Path(args.picture).suffix not in PLOTS:
+            raise ValueError(f"--picture must end in {', '.join(PLOTS[:-1])} or {PLOTS[-1]}, got {args.picture}")
+    use_machine(args)
+    views = io.load_views(args.views, args.size)
+    limit = min(len(views), args.max_views)
+    views = [views[i * len(views) // limit] for i in range(limit)]
+    training = None if args.training_views is None else io.load_views(args.training_views, args.size)
+    for path in (args.json, args.picture):
+        if path not in (None, "-"):
+            writable_folder(Path(path).parent)
+    scene = io.load_scene(args.scene).to(args.device)
+    found = inspect_scene(scene, views, args.tolerance, training, scale=args.scale, background=tuple(args.background))
+    if args.picture:
+        found.save_picture(args.picture)
+    if args.json:
+        text = json.dumps(found.to_json(), indent=1, allow_nan=False) + "\n"
+        if args.json == "-":
+            print(text, end="")
+            return
+        Path(args.json).write_text(text, encoding="utf-8")
+    print(found.to_text())

@@ -1,0 +1,91 @@
+"""`pareto`: accuracy against time of every footprint."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from .. import io
+from ..analysis import pareto, tables
+from ..analysis.reference import MAX_DENSITY
+from .arguments import add_machine_options, add_scene, add_view_options, count, density, use_machine, writable_folder
+
+
+def add_parser(subcommands) -> None:
+    parser = subcommands.add_parser(
+        "pareto",
+        help="measure accuracy against time of every footprint on a trained scene",
+        description="Render SCENE with every footprint and with supersampling at several scales, compare with the "
+        "converged integral of the image over every pixel, time them, and write DIR/pareto_SCALE.png and .svg, "
+        "pareto.md and pareto.json. On the CPU times are ratios, of the fastest of interleaved rounds. Errors are of "
+        "colours in 0 to 1, not clamped. ~ marks a PSNR that the reference does not resolve; F and B under front mark "
+        "methods that no other beats, forward and with backward.",
+    )
+    add_scene(parser)
+    parser.add_argument("--out", default="pareto", metavar="DIR", help="folder for the results (default: %(default)s)")
+    parser.add_argument(
+        "--scales",
+        nargs="+",
+        type=count,
+        default=[1, 2, 4, 8],
+        metavar="N",
+        help="1/N of the views' size; a remainder is cut off (default: 1 2 4 8)",
+    )
+    parser.add_argument(
+        "--footprints",
+        nargs="+",
+        metavar="NAME[:k=v,..][@N]",
+        help="methods; @N renders N x N times the pixels and averages (default: {})".format(
+            " ".join(method.name for method in pareto.default_methods())
+        ),
+    )
+    parser.add_argument("--limit-views", type=count, metavar="N", help="only the first N views")
+    parser.add_argument(
+        "--crop",
+        nargs=2,
+        type=count,
+        metavar=("W", "H"),
+        help="only the middle W x H pixels of the picture, at every scale (default: all of it)",
+    )
+    parser.add_argument("--rounds", type=count, metavar="N", help="timed rounds (default: 5, with CUDA 20)")
+    parser.add_argument(
+        "--cpu-time",
+        action="store_true",
+        help="count CPU seconds instead of the wall clock's: on a shared machine, with --threads 1",
+    )
+    parser.add_argument(
+        "--max-density",
+        type=density,
+        metavar="N",
+        help=f"samples of the reference along a pixel's side, at most (default: {MAX_DENSITY})",
+    )
+    add_view_options(parser)
+    add_machine_options(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args) -> None:
+    """Runs the measurement and prints a table for every scale."""
+    use_machine(args)
+    methods = None if args.footprints is None else [pareto.parse_method(text) for text in args.footprints]
+    views = io.load_views(args.views, args.size)[: args.limit_views]
+    out = writable_folder(args.out)
+    scene = io.load_scene(args.scene).to(args.device)
+    results = pareto.run(
+        out,
+        scene,
+        views,
+        args.scales,
+        methods,
+        crop=args.crop and tuple(args.crop),
+        background=tuple(args.background),
+        rounds=args.rounds,
+        max_density=args.max_density,
+        cpu_time=args.cpu_time,
+        name=Path(args.scene).stem,
+    )
+    print(f"{results['gaussians']} Gaussians of SH degree {results['sh_degree']}, {results['machine']}")
+    for at_scale in results["scales"]:
+        title, *notes = pareto.describe(results, at_scale)
+        print(f"\n{title}\n{tables.format_table(*pareto.to_table(results, at_scale))}")
+        print("\n".join(notes))
+    print(f"\nsee {out / 'pareto.md'} and the plots beside it")

@@ -1,0 +1,66 @@
+"""`render`: a scene from the views of a file, as PNG."""
+
+from __future__ import annotations
+
+from .. import io
+from ..analysis import tables
+from ..footprints import FOOTPRINTS
+from ..rasterizer import render_stages
+from .arguments import add_machine_options, add_scale, add_scene, add_view_options, use_machine, writable_folder
+
+STAGES = ("project", "bin", "blend")
+
+
+def add_parser(subcommands) -> None:
+    parser = subcommands.add_parser(
+        "render",
+        help="render a scene from the views of a file, as PNG",
+        description="Render SCENE from every view of VIEWS into DIR/NAME.png, and say what each "
+        "stage cost. Footprints: "
+        + ", ".join(FOOTPRINTS)
+        + "; options follow a colon: box:samples=4, point:dilation=0.",
+    )
+    add_scene(parser)
+    parser.add_argument("--out", required=True, metavar="DIR", help="folder for the pictures")
+    parser.add_argument(
+        "--footprint",
+        metavar="NAME[:k=v,..]",
+        help="how a pixel sees a splat (default: the library's, analytic)",
+    )
+    parser.add_argument("--samples", type=int, help="samples of the box footprint: 1, 2, 4, 8, 16")
+    add_scale(parser)
+    add_view_options(parser)
+    add_machine_options(parser)
+    parser.set_defaults(run=run)
+
+
+def run(args) -> None:
+    """Renders every view, saves it, and prints what each one cost."""
+    tqdm = io.optional_import("tqdm").tqdm
+    io.optional_import("PIL.Image")  # raises before anything is rendered
+    use_machine(args)
+    views = io.load_views(args.views, args.size)
+    out = writable_folder(args.out)
+    scene = io.load_scene(args.scene).to(args.device)
+    options = {} if args.samples is None else {"samples": args.samples}
+    rows = []
+    with tqdm(views, desc="render", unit="view", disable=None) as progress:
+        for view in progress:
+            settings = view.settings(
+                args.scale,
+                args.background,
+                scene.sh_degree,
+                args.footprint,
+                device=args.device,
+                **options,
+            )
+            stages = render_stages(settings, **scene.arguments())
+            io.to_image(stages.color).save(out / f"{view.name}.png")
+            seconds = [stages.seconds[stage] for stage in STAGES]
+            counts = [len(scene.means), len(stages.ids), len(stages.pairs)]
+            size = f"{settings.image_width}x{settings.image_height}"
+            rows.append([view.name, size, *counts, *seconds, sum(seconds)])
+    mean = [sum(column) / len(rows) for column in list(zip(*rows))[2:]]
+    rows.append(["mean", "", *(round(value) for value in mean[:3]), *mean[3:]])
+    header = ["view", "size", "Gaussians", "visible", "pairs"]
+    print(tables.format_table([*header, *(f"{stage} [s]" for stage in STAGES), "total [s]"], rows))
