@@ -5,10 +5,10 @@ A drop-in replacement for `diff_gaussian_rasterization`. See the README for how 
 
 import torch  # noqa: F401  (its libraries must be loaded before the extension's)
 
-from ._C import instruction_set
+from ._C import TILE, instruction_set
 from .analysis.planner import SceneReport, inspect_scene, plan
-from .camera import moved
-from .effects import Defocus, Effects, GaussianStats, Motion, Outputs, normalized
+from .camera import camera_settings, moved
+from .effects import Defocus, Effects, Motion
 from .filters import apply_3d_filter, compute_3d_filter
 from .footprints import (
     FOOTPRINTS,
@@ -18,16 +18,11 @@ from .footprints import (
     resolve_footprint,
     set_default_footprint,
 )
-from .io import camera_settings
-from .ops import TILE
-from .rasterizer import (
-    GaussianRasterizationSettings,
-    GaussianRasterizer,
-    Stages,
-    rasterize_gaussians,
-    render_stages,
-)
+from .outputs import GaussianStats, Outputs, normalized
+from .rasterizer import GaussianRasterizer, rasterize_gaussians
+from .settings import GaussianRasterizationSettings
 from .sh import needed_sh_degree
+from .stages import Splats, Stages, TileLists, bin, blend, project, render_stages
 
 __version__ = "0.1.0"
 
@@ -43,8 +38,12 @@ __all__ = [
     "Motion",
     "Outputs",
     "SceneReport",
+    "Splats",
     "Stages",
+    "TileLists",
     "apply_3d_filter",
+    "bin",
+    "blend",
     "camera_settings",
     "compute_3d_filter",
     "footprint_weight",
@@ -55,6 +54,7 @@ __all__ = [
     "needed_sh_degree",
     "normalized",
     "plan",
+    "project",
     "rasterize_gaussians",
     "render_stages",
     "resolve_footprint",

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 
 from .effects import Defocus, Effects, Motion
+from .settings import GaussianRasterizationSettings
 
 _DEPTH_RANGE = (0.01, 100.0)  # of clip-space z, which nothing reads
 
 
-def camera_fields(
+def camera_settings(
     world_to_camera: torch.Tensor,
     width: int,
     height: int,
@@ -20,20 +19,33 @@ def camera_fields(
     cx: float | torch.Tensor | None = None,
     cy: float | torch.Tensor | None = None,
     *,
+    bg: torch.Tensor | None = None,
+    sh_degree: int = 3,
+    scale_modifier: float = 1.0,
+    debug: bool = False,
     dtype: torch.dtype = torch.float32,
     device: torch.device | str | None = None,
     effects: Effects | str | None = None,
-) -> dict[str, Any]:
-    """The fields of `GaussianRasterizationSettings` that describe a camera; `camera_settings` makes settings of them.
+    **options,
+) -> GaussianRasterizationSettings:
+    """Settings of a pinhole camera, or with `Effects(orthographic=True)` of an orthographic one.
 
-    Arguments and errors are those of `camera_settings`.
+    With `Effects(camera_gradients=True)` gradients flow to every tensor that is given. The matrices are computed in
+    float64 and rounded once.
 
-    Returns:
-        image_height, image_width: As given.
-        tanfovx, tanfovy: Tangents of half the field of view: numbers, or with `Effects(camera_gradients=True)` float64
-            tensors on the device of world_to_camera.
-        viewmatrix, projmatrix: (4, 4), transposed.
-        campos: (3,).
+    Args:
+        world_to_camera: (4, 4), acts on column vectors; camera axes x right, y down, z forward. Its upper left
+            3x3 need not be a rotation, only invertible, so that it can be differentiated entry by entry.
+        width, height: Size of the image, px.
+        fx, fy: Focal lengths, px; of an orthographic camera px per world unit. Numbers, or tensors with one.
+        cx, cy: Principal point, px, the image spanning [0, width] x [0, height]; None: its centre.
+        bg: As in the settings; None: black.
+        sh_degree, scale_modifier, debug: As in the settings.
+        dtype, device: Of the tensors of the settings: those of the scene. No device: that of world_to_camera.
+        effects, **options: As in the settings, the footprint among them.
+
+    Raises:
+        ValueError: world_to_camera has a wrong shape, or a focal length that is a number is not positive.
     """
     if world_to_camera.shape != (4, 4):
         raise ValueError(f"world_to_camera must have shape (4, 4), got {tuple(world_to_camera.shape)}")
@@ -62,15 +74,22 @@ def camera_fields(
         tangents = tuple(t.item() for t in tangents)
     position = -torch.linalg.solve(view[:3, :3], view[:3, 3])
     to = {"dtype": dtype, "device": view.device if device is None else device}
-    return {
-        "image_height": height,
-        "image_width": width,
-        "tanfovx": tangents[0],
-        "tanfovy": tangents[1],
-        "viewmatrix": view.T.to(**to).contiguous(),
-        "projmatrix": (projection @ view).T.to(**to).contiguous(),
-        "campos": position.to(**to),
-    }
+    return GaussianRasterizationSettings(
+        image_height=height,
+        image_width=width,
+        tanfovx=tangents[0],
+        tanfovy=tangents[1],
+        bg=torch.zeros(3, **to) if bg is None else bg.to(**to),
+        scale_modifier=scale_modifier,
+        viewmatrix=view.T.to(**to).contiguous(),
+        projmatrix=(projection @ view).T.to(**to).contiguous(),
+        sh_degree=sh_degree,
+        campos=position.to(**to),
+        prefiltered=False,
+        debug=debug,
+        effects=effects,
+        **options,
+    )
 
 
 def moved(world_to_camera: torch.Tensor, tangent: torch.Tensor) -> torch.Tensor:

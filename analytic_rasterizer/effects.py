@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
-from typing import NamedTuple
-
+from dataclasses import dataclass, field, replace
 import torch
 
-MAX_SH_DEGREE = 4
-NEAR = 0.2  # camera-space z up to which everything is culled
+from . import _C
+
+MAX_SH_DEGREE = _C.MAX_SH_DEGREE
+NEAR = _C.NEAR  # camera-space z up to which everything is culled
 OUTPUTS = ("alpha", "depth", "inverse_depth", "median_depth", "dominant_index", "gaussian_stats")
 AUTO = "auto"
 
@@ -78,8 +78,8 @@ class Effects:
         median_depth: z of the Gaussian behind which less than half of a pixel's light is left.
         dominant_index: Which Gaussian a pixel shows most of.
         gaussian_stats: How much of every Gaussian is seen, for pruning.
-        camera_gradients: Gradients by viewmatrix, projmatrix, campos, tanfovx and tanfovy of the settings, which
-            then may be tensors that require one; `camera_settings` derives them from a pose and fx, fy, cx, cy.
+        camera_gradients: Gradients with respect to viewmatrix, projmatrix, campos, tanfovx and tanfovy of the settings,
+            where these are tensors that require one. Matrices or a campos that require one switch it on by themselves; `camera_settings` derives them from a pose and fx, fy, cx, cy.
         orthographic: No perspective. tanfovx and tanfovy are half the width and height of the picture in world
             units, and projmatrix must leave w at 1.
         off_center: Centre the clamp of x/z and y/z in the projection of covariances on the principal point of
@@ -132,6 +132,10 @@ class Effects:
         """Whether there is something to return beside the colours."""
         return any(getattr(self, name) for name in OUTPUTS)
 
+    def with_camera_gradients(self) -> Effects:
+        """The same with gradients with respect to the camera."""
+        return self if self.camera_gradients else replace(self, camera_gradients=True)
+
     @property
     def changes_camera(self) -> bool:
         """Whether projecting takes more than a pinhole of 3DGS."""
@@ -155,55 +159,3 @@ def _check_number(name: str, value, at_least: float = -math.inf, above: float = 
     if not (math.isfinite(value) and value >= at_least and value > above):
         limit = f" and above {above}" if above > -math.inf else f" and at least {at_least}" if at_least == 0 else ""
         raise ValueError(f"{name} must be finite{limit}, got {value}")
-
-
-class GaussianStats(NamedTuple):
-    """How much of every Gaussian a picture shows. Its weight in a pixel is what its colour is multiplied with there.
-
-    Attributes:
-        pixels: (P,) int32, pixels in which its weight is not zero.
-        max_weight: (P,) largest weight, 0 to 1, float32.
-        sum_weight: (P,) sum of weights over all pixels, in steps of 2^-32.
-    """
-
-    pixels: torch.Tensor
-    max_weight: torch.Tensor
-    sum_weight: torch.Tensor
-
-
-class Outputs(NamedTuple):
-    """What `Effects` asked for; None for the rest. The first three are differentiable in every input of the rasterizer.
-
-    Attributes:
-        alpha: (1, H, W) in 0 to 1.
-        depth: (1, H, W) sum of weight times z, world units; divided by alpha it is the mean depth of what is seen.
-        inverse_depth: (1, H, W) sum of weight over z, 1 / world units.
-        median_depth: (1, H, W) world units; 0 where half of the light gets through.
-        dominant_index: (1, H, W) int32, the Gaussian of the largest weight, of equal ones the nearest; -1 for none.
-        gaussian_stats: `GaussianStats`.
-    """
-
-    alpha: torch.Tensor | None = None
-    depth: torch.Tensor | None = None
-    inverse_depth: torch.Tensor | None = None
-    median_depth: torch.Tensor | None = None
-    dominant_index: torch.Tensor | None = None
-    gaussian_stats: GaussianStats | None = None
-
-
-def normalized(blended: torch.Tensor, alpha: torch.Tensor, smallest: float = 1e-6) -> torch.Tensor:
-    """Mean over what is seen of a blended output: `blended` / `alpha`, and 0 where alpha is below `smallest`.
-
-    Args:
-        blended: (..., H, W), `Outputs.depth` for one.
-        alpha: (1, H, W) of the same picture.
-        smallest: Alpha below which there is nothing to see.
-    """
-    seen = alpha > smallest
-    return torch.where(seen, blended / torch.where(seen, alpha, 1), 0)
-
-
-def depths(means3D: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
-    """Camera-space z, (P,)."""
-    view = view.reshape(4, 4)
-    return means3D @ view[:3, 2] + view[3, 2]

@@ -11,7 +11,8 @@ from typing import Any
 
 import torch
 
-from .effects import Effects, depths
+from .effects import Effects
+from .outputs import depths
 
 VARIANCE = 0.2  # of the filter, in squares of the finest sampling interval
 MARGIN = 0.15  # of the image around it in which a Gaussian still counts as seen

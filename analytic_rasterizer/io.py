@@ -18,9 +18,9 @@ from typing import NamedTuple
 
 import torch
 
-from .camera import camera_fields
+from .camera import camera_settings
 from .effects import Effects
-from .rasterizer import GaussianRasterizationSettings
+from .settings import GaussianRasterizationSettings
 
 
 class SceneError(ValueError):
@@ -187,57 +187,6 @@ def _ply_header(path: Path) -> list[str]:
 
 
 # -------------------------------------------------------------------------------------- views
-
-
-def camera_settings(
-    world_to_camera: torch.Tensor,
-    width: int,
-    height: int,
-    fx: float | torch.Tensor,
-    fy: float | torch.Tensor,
-    cx: float | torch.Tensor | None = None,
-    cy: float | torch.Tensor | None = None,
-    *,
-    bg: torch.Tensor | None = None,
-    sh_degree: int = 3,
-    scale_modifier: float = 1.0,
-    debug: bool = False,
-    dtype: torch.dtype = torch.float32,
-    device: torch.device | str | None = None,
-    effects: Effects | str | None = None,
-    **options,
-) -> GaussianRasterizationSettings:
-    """Settings of a pinhole camera, or with `Effects(orthographic=True)` of an orthographic one.
-
-    With `Effects(camera_gradients=True)` gradients flow to every tensor that is given. The matrices are computed in
-    float64 and rounded once.
-
-    Args:
-        world_to_camera: (4, 4), acts on column vectors; camera axes x right, y down, z forward. Its upper left
-            3x3 need not be a rotation, only invertible, so that it can be differentiated entry by entry.
-        width, height: Size of the image, px.
-        fx, fy: Focal lengths, px; of an orthographic camera px per world unit. Numbers, or tensors with one.
-        cx, cy: Principal point, px, the image spanning [0, width] x [0, height]; None: its centre.
-        bg: As in the settings; None: black.
-        sh_degree, scale_modifier, debug: As in the settings.
-        dtype, device: Of the tensors of the settings: those of the scene. No device: that of world_to_camera.
-        effects, **options: As in the settings, the footprint among them.
-
-    Raises:
-        ValueError: world_to_camera has a wrong shape, or a focal length that is a number is not positive.
-    """
-    camera = camera_fields(world_to_camera, width, height, fx, fy, cx, cy, dtype=dtype, device=device, effects=effects)
-    view = camera["viewmatrix"]
-    return GaussianRasterizationSettings(
-        **camera,
-        bg=view.new_zeros(3) if bg is None else bg.to(view),
-        scale_modifier=scale_modifier,
-        sh_degree=sh_degree,
-        prefiltered=False,
-        debug=debug,
-        effects=effects,
-        **options,
-    )
 
 
 @dataclass(frozen=True)

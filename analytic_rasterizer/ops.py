@@ -1,140 +1,165 @@
-"""The ops' fake kernels. Their gradients are in csrc/torch/autograd.cpp."""
+"""The ops' fake kernels: what they return, without doing it. Their schemas and gradients are in csrc/torch."""
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import torch
 
-from . import _C  # noqa: F401  (loads the ops)
-from .footprints import BOX_SAMPLES
+from . import _C
 
-TILE = 16
-"""Edge of a square tile, px."""
-
-_SAMPLES = {f"box{s}": s for s in BOX_SAMPLES} | {"adaptive": max(BOX_SAMPLES)}
-_SPLAT_WIDTH = 12
+_SAMPLES = {footprint["key"]: footprint["samples"] for footprint in _C.footprints()}
 
 
-def _tiles(height: int, width: int) -> int:
-    return ((height + TILE - 1) // TILE) * ((width + TILE - 1) // TILE)
+def _register(name: str):
+    """Registers a fake kernel that takes the op's arguments as a namespace."""
+    op = getattr(torch.ops.analytic_rasterizer, name).default
+    names = [argument.name for argument in op._schema.arguments]
+    defaults = {argument.name: argument.default_value for argument in op._schema.arguments}
+
+    def register(kernel):
+        @torch.library.register_fake(f"analytic_rasterizer::{name}")
+        def fake(*args, **kwargs):
+            return kernel(SimpleNamespace(**{**defaults, **dict(zip(names, args)), **kwargs}))
+
+        return kernel
+
+    return register
 
 
-@torch.library.register_fake("analytic_rasterizer::rasterize")
-def _(
-    means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
-    viewmatrix, projmatrix, campos, lens, image_height, image_width, tanfovx, tanfovy, scale_modifier,
-    sh_degree, footprint, option, keep, alpha, debug,
-):  # fmt: skip
+def _lists(like: torch.Tensor, rows: int, a, keep: bool, ids=None) -> list[torch.Tensor]:
+    """What `bin` makes of `rows` splats of one camera: ListTensors of csrc/torch/backend.h."""
     context = torch.library.get_ctx()
-    covered = [means3D.new_empty(image_height, image_width)] if alpha else []
-    samples = _SAMPLES.get(footprint, 1) if keep else 0
+    tiles = -(-a.image_height // _C.TILE) * -(-a.image_width // _C.TILE)
+    pairs = context.new_dynamic_size()
     ints, longs = {"dtype": torch.int32}, {"dtype": torch.int64}
-    chosen = _tiles(image_height, image_width) if footprint == "adaptive" else 0
-    tile_samples = means3D.new_empty(chosen, **ints)
-    if means3D.device.type == "cuda":
-        kept = means3D.shape[0] if keep else 0
-        room = context.new_dynamic_size() if keep else 0
-        checkpoints = (context.new_dynamic_size(), TILE * TILE, 4) if keep else (0,)
-        return (
-            means3D.new_empty(3, image_height, image_width),
-            means3D.new_empty(means3D.shape[0], **ints),
-            means3D.new_empty((kept, _SPLAT_WIDTH) if keep else (0,)),
-            means3D.new_empty(kept, **ints),
-            means3D.new_empty((room, 2) if keep else (0,), **ints),
-            means3D.new_empty(_tiles(image_height, image_width) + 1 if keep else 0, **longs),
-            means3D.new_empty((kept, 2) if keep else (0,), **ints),
-            means3D.new_empty(0, **ints),
-            means3D.new_empty(samples, image_height, image_width),
-            means3D.new_empty(samples, image_height, image_width, **ints),
-            means3D.new_empty(checkpoints),
-            means3D.new_empty((context.new_dynamic_size(), 3) if keep else (0,), **ints),
-            means3D.new_empty(12 if keep else 0, **longs),
-            tile_samples,
-            covered,
-        )
-    splats, pairs = context.new_dynamic_size(), context.new_dynamic_size()
-    return (
-        means3D.new_empty(3, image_height, image_width),
-        means3D.new_empty(means3D.shape[0], **ints),
-        means3D.new_empty(splats, _SPLAT_WIDTH),
-        means3D.new_empty(splats, **ints),
-        means3D.new_empty(pairs, **ints),
-        means3D.new_empty(_tiles(image_height, image_width) + 1, **longs),
-        means3D.new_empty(splats + 1 if keep else 0, **longs),
-        means3D.new_empty(pairs if keep else 0, **longs),
-        means3D.new_empty(samples, image_height, image_width),
-        means3D.new_empty(samples, image_height, image_width, **ints),
-        means3D.new_empty(0),
-        means3D.new_empty(0, **ints),
-        means3D.new_empty(0, **longs),
-        tile_samples,
-        covered,
-    )
+    on_cuda = like.device.type == "cuda"
+    return [
+        like.new_empty(rows, _C.SPLAT_WIDTH),
+        like.new_empty(rows, **ints),
+        like.new_empty((pairs, 2 if keep else 1) if on_cuda else (pairs,), **ints),
+        like.new_empty(tiles + 1, **longs),
+        like.new_empty((rows, 2), **ints) if on_cuda else like.new_empty(rows + 1 if keep else 0, **longs),
+        like.new_empty(pairs if keep and not on_cuda else 0, **longs),
+        like.new_empty(context.new_dynamic_size() if on_cuda else 0, **longs),
+        like.new_empty(tiles if a.footprint == "adaptive" else 0, **ints),
+    ]
 
 
-@torch.library.register_fake("analytic_rasterizer::rasterize_vjp")
-def _(
-    dL_dcolor, dL_dalpha, means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg,
-    viewmatrix, projmatrix, campos, lens, *rest,
-):  # fmt: skip
-    needs = rest[-2]
-
-    def made(tensors, needs):
-        return [means3D.new_empty(t.shape if need and t is not None else 0) for t, need in zip(tensors, needs)]
-
-    gaussians = (means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp)
-    of_camera = made((viewmatrix.reshape(4, 4), projmatrix.reshape(4, 4), campos.reshape(3), lens), needs[8:])
-    return (*made(gaussians, needs[:8]), of_camera if lens is not None and any(needs[8:]) else [])
-
-
-@torch.library.register_fake("analytic_rasterizer::rasterize_stages")
-def _(
-    means3D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, bg, viewmatrix,
-    projmatrix, campos, lens, image_height, image_width, *rest,
-):  # fmt: skip
-    context = torch.library.get_ctx()
-    splats, pairs = context.new_dynamic_size(), context.new_dynamic_size()
-    ints, longs = {"dtype": torch.int32}, {"dtype": torch.int64}
-    return (
-        means3D.new_empty(3, image_height, image_width),
-        means3D.new_empty(means3D.shape[0], **ints),
-        means3D.new_empty(splats, **ints),
-        means3D.new_empty(splats),
-        means3D.new_empty(splats, 2),
-        means3D.new_empty(pairs, **ints),
-        means3D.new_empty(_tiles(image_height, image_width) + 1, **longs),
-        torch.empty(3, dtype=torch.float64),
-    )
-
-
-@torch.library.register_fake("analytic_rasterizer::rasterize_channels")
-def _(colors, bg, image_height, image_width, footprint, option, splats, ids, pairs, tile_offsets, counts, *rest):
-    on_cuda = colors.device.type == "cuda"
+def _state(like: torch.Tensor, a) -> list[torch.Tensor]:
+    """What `blend` leaves for its adjoint: BlendState of csrc/torch/backend.h."""
+    planes = _SAMPLES.get(a.footprint, 1), a.image_height, a.image_width
     ints = {"dtype": torch.int32}
+    if like.device.type != "cuda":
+        return [like.new_empty(planes), like.new_empty(planes, **ints), like.new_empty(0), like.new_empty(0, **ints)]
     context = torch.library.get_ctx()
+    checkpoints, chunks = context.new_dynamic_size(), context.new_dynamic_size()
+    return [
+        like.new_empty(planes),
+        like.new_empty(planes, **ints),
+        like.new_empty(checkpoints),
+        like.new_empty(chunks, 3, **ints),
+    ]
+
+
+def _channels(a) -> int:
+    return a.shs.shape[-1] if a.colors_precomp is None else a.colors_precomp.shape[1]
+
+
+@_register("rasterize")
+def _(a):
+    like, size, channels = a.means3D, (a.image_height, a.image_width), _channels(a)
+    saved = []
+    if a.keep:
+        rows = len(like) if like.device.type == "cuda" else torch.library.get_ctx().new_dynamic_size()
+        extra = a.depth + a.inverse_depth
+        made = like.new_empty(len(like), channels + extra) if extra else like.new_empty(0)
+        saved = [*_lists(like, rows, a, True), *_state(like, a), made]
+    images = [like.new_empty(size) for _ in range(a.alpha + a.depth + a.inverse_depth)]
+    return like.new_empty(channels, *size), images, like.new_empty(len(like), dtype=torch.int32), saved
+
+
+@_register("rasterize_timed")
+def _(a):
+    rasterized = torch.ops.analytic_rasterizer.rasterize(**vars(a))
+    return *rasterized, torch.empty(3, dtype=torch.float64)
+
+
+@_register("project")
+def _(a):
+    like = a.means3D
+    rows, cameras = torch.library.get_ctx().new_dynamic_size(), len(a.viewmatrix)
+    colored = a.shs is not None or a.colors_precomp is not None
+    ints = [like.new_empty(rows, dtype=torch.int32) for _ in range(4)]
+    splits = [torch.empty(cameras + 1, dtype=torch.int64) for _ in range(2)]
+    floats = [like.new_empty(rows, *rest) for rest in ((2,), (3,), (), ())]
+    colors = like.new_empty(rows if colored else 0, 3)
+    return *floats, colors, *ints[:3], splits[0], [like.new_empty(rows), ints[3], splits[1]]
+
+
+@_register("bin")
+def _(a):
+    context = torch.library.get_ctx()
+    cameras = len(a.row_splits) - 1
+    rows = [len(a.means2d)] if cameras == 1 else [context.new_dynamic_size() for _ in range(cameras)]
+    return [tensor for n in rows for tensor in _lists(a.means2d, n, a, a.keep)]
+
+
+@_register("blend")
+def _(a):
+    cameras, size = len(a.row_splits) - 1, (a.image_height, a.image_width)
+    saved = [tensor for _ in range(cameras) for tensor in _state(a.means2d, a)] if a.keep else []
     return (
-        colors.new_empty(3, image_height, image_width),
-        colors.new_empty((context.new_dynamic_size(), TILE * TILE, 4) if on_cuda else (0,)),
-        colors.new_empty((context.new_dynamic_size(), 3) if on_cuda else (0,), **ints),
-        counts.new_empty(counts.shape),
+        a.means2d.new_empty(cameras, a.features.shape[1], *size),
+        a.means2d.new_empty(cameras, *size),
+        saved,
     )
 
 
-@torch.library.register_fake("analytic_rasterizer::inspect")
-def _(splats, ids, pairs, tile_offsets, counts, tile_samples, count, image_height, image_width, footprint):
-    return (
-        ids.new_empty(image_height, image_width),
-        ids.new_empty(image_height, image_width),
-        ids.new_empty(count),
-        splats.new_empty(count, dtype=torch.float32),
-        tile_offsets.new_empty(count),
-    )
+def _gradients(a, tensors) -> list[torch.Tensor]:
+    """One like each of the tensors that want a gradient, and an empty one for the others."""
+    like = tensors[0]
+    return [like.new_empty(t.shape if need and t is not None else 0) for t, need in zip(tensors, a.needs)]
 
 
-@torch.library.register_fake("analytic_rasterizer::footprint_weight")
-def _(offset, cov2d, footprint, option):
-    return offset.new_empty(offset.shape[:-1])
+@_register("rasterize_vjp")
+def _(a):
+    camera = (a.viewmatrix.reshape(4, 4), a.projmatrix.reshape(4, 4), a.campos.reshape(3), a.lens)
+    camera = camera if a.lens is not None else (None,) * 4
+    gaussians = (a.means3D, a.means2D, a.opacities, a.shs, a.colors_precomp, a.scales, a.rotations, a.cov3D_precomp)
+    return _gradients(a, (*gaussians, *camera, a.bg.reshape(-1)))
 
 
-@torch.library.register_fake("analytic_rasterizer::footprint_weight_vjp")
-def _(dL_dweight, offset, cov2d, footprint, option):
-    return offset.new_empty(offset.shape), cov2d.new_empty(cov2d.shape)
+@_register("project_vjp")
+def _(a):
+    camera = (a.viewmatrix, a.projmatrix, a.campos, a.lens) if a.lens is not None else (None,) * 4
+    gaussians = (a.means3D, a.opacities, a.shs, a.colors_precomp, a.scales, a.rotations, a.cov3D_precomp)
+    return _gradients(a, (*gaussians, *camera))
+
+
+@_register("blend_vjp")
+def _(a):
+    tensors = (a.means2d, a.cov2d, a.opacities, a.features, a.background, a.means2d_abs)
+    return _gradients(a, (*tensors, None, None))
+
+
+@_register("inspect")
+def _(a):
+    splats, ids = a.saved[:2]
+    image = [ids.new_empty(a.image_height, a.image_width) for _ in range(2)]
+    return [
+        *image,
+        ids.new_empty(a.count),
+        splats.new_empty(a.count, dtype=torch.float32),
+        ids.new_empty(a.count, dtype=torch.int64),
+    ]
+
+
+@_register("footprint_weight")
+def _(a):
+    return a.offset.new_empty(a.offset.shape[:-1])
+
+
+@_register("footprint_weight_vjp")
+def _(a):
+    return [a.offset.new_empty(a.offset.shape), a.cov2d.new_empty(a.cov2d.shape)]

@@ -16,7 +16,8 @@ from functools import partial, reduce
 import torch
 
 from ..camera import view_center
-from ..effects import NEAR, Effects, depths
+from ..effects import NEAR, Effects
+from ..outputs import depths
 from ..filters import apply_3d_filter, compute_3d_filter, sampling_interval
 from ..io import Scene, View
 from ..ops import TILE

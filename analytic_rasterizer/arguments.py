@@ -1,0 +1,98 @@
+"""The arguments of the ops from what users give: checked, named, and completed by settings and effects."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from .camera import make_lens
+from .effects import MAX_SH_DEGREE, Effects
+from .filters import apply_3d_filter
+from .footprints import check_device, get_default_footprint
+from .settings import GaussianRasterizationSettings
+from .sh import used_sh_degree
+
+_NOTHING = Effects()
+
+
+def check_tensors(device: torch.device | None, **tensors: Any) -> None:
+    """Raises unless all are tensors, and on `device` if it is given."""
+    for name, tensor in tensors.items():
+        if not isinstance(tensor, torch.Tensor):
+            raise TypeError(f"{name} must be a tensor, got {type(tensor).__name__}")
+        if device is not None and tensor.device != device:
+            raise ValueError(f"{name} must be on the device of means3D, {device}, got {tensor.device}")
+
+
+def gaussian_arguments(
+    settings: GaussianRasterizationSettings, means3D: torch.Tensor, opacities: torch.Tensor, **optional: Any
+) -> dict[str, Any]:
+    """The Gaussians by the names of the ops, with the 3D filter of the effects.
+
+    Args:
+        settings: Whose effects may hold a 3D filter.
+        means3D, opacities: Tensors.
+        **optional: Inputs that may be missing: None, or as 3DGS passes them an empty tensor on whatever device.
+
+    Raises:
+        TypeError: Something is no tensor.
+        ValueError: A tensor is on another device than means3D, or the filter has no scales to widen.
+        RuntimeError: CUDA tensors, and an extension without CUDA.
+    """
+    check_tensors(None, means3D=means3D)
+    device = means3D.device
+    check_device(device)
+    check_tensors(device, opacities=opacities)
+    for name, tensor in optional.items():
+        if isinstance(tensor, torch.Tensor) and tensor.dim() == 1 and tensor.numel() == 0:
+            optional[name] = None
+        elif tensor is not None:
+            check_tensors(device, **{name: tensor})
+    effects = settings.effects
+    if isinstance(effects, Effects) and effects.filter_3d is not None:
+        if optional["scales"] is None:
+            given = "neither" if optional["cov3D_precomp"] is None else "cov3D_precomp"
+            raise ValueError(f"filter_3d needs scales and rotations, got {given}")
+        # The scale modifier does not widen the filter: it is a property of the training pictures.
+        filter_3d = effects.filter_3d / settings.scale_modifier
+        optional["scales"], opacities = apply_3d_filter(optional["scales"], opacities, filter_3d)
+    return {"means3D": means3D, "opacities": opacities, **optional}
+
+
+def camera_arguments(
+    settings: GaussianRasterizationSettings, means3D: torch.Tensor, shs: torch.Tensor | None, full: bool = False
+) -> dict[str, Any]:
+    """The camera, the degree of the harmonics and the footprint by the names of the ops.
+
+    A plain camera, which is all that 3DGS has, comes without a `lens`; `full` asks for one all the same. A matrix or a
+    camera centre that requires a gradient makes a full camera too, for only that has one.
+    """
+    s, effects = settings, settings.effects
+    view, proj, campos = s.viewmatrix, s.projmatrix, s.campos
+    check_tensors(means3D.device, viewmatrix=view, projmatrix=proj, campos=campos)
+    footprint = s.footprint or get_default_footprint()
+    degree, lens, tanfovx, tanfovy = int(s.sh_degree), None, s.tanfovx, s.tanfovy
+    if effects is not None:
+        degree = used_sh_degree(effects, degree, shs)
+    effects = effects if isinstance(effects, Effects) else _NOTHING
+    if (view.requires_grad or proj.requires_grad or campos.requires_grad) and torch.is_grad_enabled():
+        effects = effects.with_camera_gradients()
+    if full or degree >= MAX_SH_DEGREE or (effects is not _NOTHING and effects.changes_camera):
+        lens = make_lens(effects, s, means3D)
+        if effects.camera_gradients:
+            tanfovx = tanfovy = 1.0  # the lens has them
+    return {
+        "viewmatrix": view,
+        "projmatrix": proj,
+        "campos": campos,
+        "lens": lens,
+        "image_height": int(s.image_height),
+        "image_width": int(s.image_width),
+        "tanfovx": float(tanfovx),
+        "tanfovy": float(tanfovy),
+        "scale_modifier": float(s.scale_modifier),
+        "sh_degree": degree,
+        "footprint": footprint.key,
+        "option": footprint.option,
+    }

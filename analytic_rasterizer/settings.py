@@ -1,0 +1,105 @@
+"""How to render: the settings of 3DGS 2023, with a footprint and effects."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any, NamedTuple
+
+import torch
+
+from .effects import AUTO, Effects
+from .footprints import Footprint, resolve_footprint
+
+
+class _Fields(NamedTuple):
+    image_height: int
+    image_width: int
+    tanfovx: float
+    tanfovy: float
+    bg: torch.Tensor
+    scale_modifier: float
+    viewmatrix: torch.Tensor
+    projmatrix: torch.Tensor
+    sh_degree: int
+    campos: torch.Tensor
+    prefiltered: bool
+    debug: bool
+
+
+class GaussianRasterizationSettings(_Fields):
+    """How to render: the 12 fields of 3DGS 2023, in its order, as a tuple; and the footprint and the effects.
+
+    Args:
+        image_height, image_width: Size of the image, px.
+        tanfovx, tanfovy: Tangent of half the field of view.
+        bg: (3,) background colour; (C,) of C channels; or (C, H, W), an image, differentiable.
+        scale_modifier: Factor on all scales.
+        viewmatrix: (4, 4) or (1, 4, 4) world to camera, transposed (for row vectors).
+        projmatrix: (4, 4) or (1, 4, 4) world to clip space, transposed. The principal point is wherever
+            it puts it.
+        sh_degree: Degree of the spherical harmonics in use, 0 to 4.
+        campos: (3,) camera centre, world units.
+        prefiltered: Accepted for compatibility; culling does not depend on it.
+        debug: Raise for a Gaussian that is not finite, has an opacity outside [0, 1] or a negative scale or
+            variance, naming tensor, index and value; otherwise such a Gaussian is culled or taken as it is. On
+            failure write the arguments to snapshot_fw.dump or snapshot_bw.dump and re-raise. On CUDA wait
+            for every stage, so that the stage that failed is the one that raises, and check that the
+            camera is finite, which otherwise is not looked at there.
+        footprint: One of `FOOTPRINTS`, optionally with options (`"box:samples=8"`). None: the default at
+            the time of rendering, see `set_default_footprint`.
+        effects: What the rendering has beyond three colours of a pinhole, see `Effects`; None: nothing. "auto":
+            harmonics only up to the degree that changes a colour by 1/255 (`needed_sh_degree`; found once for
+            coefficients that stay the same tensor, and not at all while they are trained).
+        **options: Options of the footprint, see `resolve_footprint`.
+
+    Attributes:
+        footprint: The settled `Footprint`, or None.
+        effects: The `Effects`, "auto", or None.
+
+    Raises:
+        ValueError: Unknown footprint or option.
+        TypeError: effects is neither.
+    """
+
+    # Also where a tuple method makes an instance without __new__.
+    footprint: Footprint | None = None
+    effects: Effects | str | None = None
+
+    def __new__(
+        cls, *args: Any, footprint: str | Footprint | None = None, effects: Effects | str | None = None, **kwargs: Any
+    ):
+        fields = {k: kwargs.pop(k) for k in _Fields._fields[len(args) :] if k in kwargs}
+        self = super().__new__(cls, *args, **fields)
+        if footprint is not None:
+            self.footprint = resolve_footprint(str(footprint), **kwargs)
+        elif kwargs:
+            known = ", ".join((*cls._fields, "footprint", "effects"))
+            raise TypeError(f"settings must be among: {known}; got {', '.join(kwargs)}")
+        if effects is not None:
+            if not isinstance(effects, Effects) and effects != AUTO:
+                raise TypeError(f'effects must be an Effects or "auto", got {effects!r}')
+            self.effects = effects
+        return self
+
+    def _replace(self, **kwargs: Any) -> GaussianRasterizationSettings:
+        merged = {**self._asdict(), "footprint": self.footprint, "effects": self.effects, **kwargs}
+        return type(self)(**merged)
+
+    def __reduce__(self):
+        footprint = None if self.footprint is None else str(self.footprint)
+        return _unpickle_settings, (tuple(self), footprint, self.effects)
+
+    def __repr__(self) -> str:
+        fields = ", ".join(f"{k}={v!r}" for k, v in self._asdict().items())
+        effects = "" if self.effects is None else f", effects={self.effects}"
+        return f"{type(self).__name__}({fields}, footprint={str(self.footprint)!r}{effects})"
+
+
+# Downstream code probes the signature to tell dialects apart: it must be 3DGS 2023's.
+GaussianRasterizationSettings.__signature__ = inspect.signature(_Fields)
+
+
+def _unpickle_settings(
+    fields: tuple, footprint: str | None, effects: Effects | str | None = None
+) -> GaussianRasterizationSettings:
+    return GaussianRasterizationSettings(*fields, footprint=footprint, effects=effects)
