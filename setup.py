@@ -9,6 +9,8 @@ ANALYTIC_RASTERIZER_SANITIZE=1 builds the CPU path under AddressSanitizer and Un
 """
 
 import os
+import re
+import subprocess
 import sys
 import sysconfig
 from pathlib import Path
@@ -47,8 +49,9 @@ def wants_cuda() -> bool:
 
 
 def default_architectures() -> str:
-    """Machine code for what this toolkit's users have, and PTX for what comes after."""
-    version = tuple(int(v) for v in torch.version.cuda.split(".")[:2])
+    """Machine code for what this toolkit's users have, and PTX for what comes after. By nvcc's version, not torch's."""
+    text = subprocess.check_output([str(Path(CUDA_HOME) / "bin" / "nvcc"), "--version"], text=True)
+    version = tuple(int(v) for v in re.search(r"release (\d+)\.(\d+)", text).groups())
     known = ["7.5", "8.0", "8.6"]
     known += ["8.9", "9.0"] if version >= (11, 8) else []
     known += ["10.0", "12.0"] if version >= (12, 8) else []
@@ -63,18 +66,22 @@ SOURCES = sorted(str(p.relative_to(ROOT)) for d in ("cpu", "torch") for p in ROO
 if WITH_CUDA:
     SOURCES += sorted(str(p.relative_to(ROOT)) for p in ROOT.glob("csrc/cuda/*.cu"))
 else:
-    SOURCES.remove(str(Path("csrc/torch/ops_cuda.cpp")))
+    SOURCES.remove(str(Path("csrc/torch/backend_cuda.cpp")))
 
 # No -std: torch sets the standard that its headers need. No contraction: forward and backward must
-# round alike (csrc/core/lanes.h), and bits must not depend on the compiler's choices.
-COMPILE_ARGS = ["-O3", "-fopenmp", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi"]
-LINK_ARGS = ["-fopenmp"]  # libgomp by name only: the loader takes the copy that torch has already loaded
+# round alike (csrc/core/lanes.h), and bits must not depend on the compiler's choices. Nothing but the module's entry
+# is visible from outside, and nothing that only a debugger reads is installed.
+COMPILE_ARGS = ["-O3", "-g0", "-fopenmp", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi"]
+COMPILE_ARGS += ["-fvisibility=hidden", "-fvisibility-inlines-hidden", "-ffunction-sections"]
+# libgomp by name only: the loader takes the copy that torch has already loaded.
+LINK_ARGS = ["-fopenmp", "-Wl,--gc-sections", "-Wl,--strip-all"]
 if os.environ.get("ANALYTIC_RASTERIZER_SANITIZE") == "1":
     # Checks as calls: see CMakeLists.txt. No vptr: it wants the type information of torch's hidden classes.
     SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize=vptr", "-fno-sanitize-recover=all"]
     COMPILE_ARGS += ["-O1", "-g1", *SANITIZERS, "--param", "asan-instrumentation-with-call-threshold=0"]
-    LINK_ARGS += SANITIZERS
-NVCC_ARGS = ["-O3", "--fmad=false", "--expt-relaxed-constexpr", "-Xcompiler", "-fno-gnu-unique"]
+    LINK_ARGS = ["-fopenmp", *SANITIZERS]
+NVCC_ARGS = ["-O3", "--fmad=false", "--expt-relaxed-constexpr", "-Xfatbin", "-compress-all"]
+NVCC_ARGS += ["-Xcompiler", "-fno-gnu-unique,-fvisibility=hidden"]
 
 
 class Build(BuildExtension):

@@ -19,7 +19,6 @@ from typing import NamedTuple
 import torch
 
 from .camera import camera_settings
-from .effects import Effects
 from .settings import GaussianRasterizationSettings
 
 

@@ -45,13 +45,13 @@ from pathlib import Path
 from statistics import mean, stdev
 
 import torch
+from analytic_rasterizer.report import format_table
 from tqdm import tqdm
 
 import analytic_rasterizer as ar
 import dataset
 from analytic_rasterizer.cli import Parser
 from analytic_rasterizer.footprints import resolve_footprint
-from analytic_rasterizer.report import format_table
 from densify import DensityControl, DensityOptions
 from gaussians import Gaussians, gaussians_at, make_optimizer, means_rate, random_points
 from metrics import evaluate, save_pictures, training_loss

@@ -6,9 +6,9 @@ from dataclasses import asdict, dataclass
 
 import torch
 
+from .._C import TILE
 from ..effects import Effects
 from ..io import optional_import
-from ..ops import TILE
 from . import tables
 
 NARROW = 0.5  # px

@@ -15,20 +15,16 @@ from functools import partial, reduce
 
 import torch
 
+from .._C import TILE
 from ..camera import view_center
 from ..effects import NEAR, Effects
-from ..outputs import depths
 from ..filters import apply_3d_filter, compute_3d_filter, sampling_interval
 from ..io import Scene, View
-from ..ops import TILE
-from ..rasterizer import (
-    GaussianRasterizationSettings,
-    GaussianRasterizer,
-    Stages,
-    _settings_arguments,
-    render_stages,
-)
+from ..outputs import depths
+from ..rasterizer import GaussianRasterizer
+from ..settings import GaussianRasterizationSettings
 from ..sh import needed_sh_degree, sh_band_bounds
+from ..stages import Stages, render_stages
 from . import timing
 from .inspection import (
     BINS,
@@ -266,11 +262,9 @@ def _rms(stages: Stages, reference: Stages) -> float:
 def tile_samples(settings: GaussianRasterizationSettings, gaussians: dict[str, torch.Tensor]) -> torch.Tensor:
     """(rows, columns) int32 on the CPU: the samples that `adaptive`, the footprint of `settings`, takes in every tile.
 
-    `gaussians` are the keywords of `GaussianRasterizer.forward`.
+    `gaussians` are the keywords of `render_stages`.
     """
-    inputs = [gaussians.get(name) for name in INPUTS]
-    options = _settings_arguments(settings, gaussians["means3D"], gaussians.get("shs"))
-    chosen = torch.ops.analytic_rasterizer.rasterize(*inputs, *options, False, False, False)[-2]
+    chosen = render_stages(settings, **gaussians).tile_samples
     return chosen.reshape(-(-settings.image_height // TILE), -1).cpu()
 
 

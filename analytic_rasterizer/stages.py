@@ -1,0 +1,317 @@
+"""The pass as its three stages, each on its own: project, bin, blend.
+
+`GaussianRasterizer` is these three in one op. By themselves they serve what is made of parts: features of any number of
+channels, several cameras at once, splats from elsewhere. All run on the CPU (float32, float64) and on CUDA (float32).
+
+    splats = ar.project(settings, means3D, opacities, scales=scales, rotations=rotations)
+    lists = ar.bin(splats)
+    image, alpha = ar.blend(splats, lists, features[splats.gaussian_ids])
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+
+from . import (
+    _C,
+    ops,  # noqa: F401  (registers the fake kernels)
+)
+from .arguments import camera_arguments, check_tensors, gaussian_arguments
+from .outputs import depths
+from .settings import GaussianRasterizationSettings
+
+
+@dataclass(frozen=True)
+class Splats:
+    """Projected Gaussians: a row for every Gaussian that a camera may see, camera after camera, Gaussians ascending.
+
+    The first five are differentiable in what `project` was given.
+
+    Attributes:
+        means2d: (N, 2) px; pixel centres are at integers.
+        cov2d: (N, 3) projected covariances (xx, xy, yy), px^2, before any footprint. A gradient with respect to it
+            holds that of the determinant; xy is the one number that fills both places.
+        opacities: (N,) with the amplitude of defocus and motion blur.
+        depths: (N,) camera-space z, world units.
+        colors: (N, 3) RGB where `project` had shs or colors_precomp, else (0, 3).
+        radii: (N,) int32, px, as `GaussianRasterizer` returns; positive.
+        gaussian_ids: (N,) int32.
+        camera_ids: (N,) int32.
+        row_splits: (C + 1,) int64 on the CPU: the rows of camera c are row_splits[c] to row_splits[c + 1].
+        dets: (N,) determinants of cov2d, px^4, without the cancellation of computing them from its entries.
+        width, height: Size of the images, px.
+        footprint: Key of the footprint, and `option` its number, see `Footprint`.
+    """
+
+    means2d: torch.Tensor
+    cov2d: torch.Tensor
+    opacities: torch.Tensor
+    depths: torch.Tensor
+    colors: torch.Tensor
+    radii: torch.Tensor
+    gaussian_ids: torch.Tensor
+    camera_ids: torch.Tensor
+    row_splits: torch.Tensor
+    dets: torch.Tensor
+    width: int
+    height: int
+    footprint: str
+    option: float
+
+    @property
+    def cameras(self) -> int:
+        """Number of cameras, C."""
+        return len(self.row_splits) - 1
+
+    @property
+    def size(self) -> dict[str, Any]:
+        """Size and footprint by the names of the ops."""
+        return {
+            "image_height": self.height,
+            "image_width": self.width,
+            "footprint": self.footprint,
+            "option": self.option,
+        }
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """Which splats every tile shows, front to back. What `bin` makes for `blend`; its tensors are the backend's own.
+
+    Attributes:
+        tensors: The lists of camera after camera.
+        cameras: How many there are.
+    """
+
+    tensors: tuple[torch.Tensor, ...]
+    cameras: int
+
+    def of_camera(self, camera: int = 0) -> dict[str, torch.Tensor]:
+        """The lists of one camera by name (ListTensors in csrc/torch/backend.h)."""
+        first = camera * len(_C.LISTS)
+        return dict(zip(_C.LISTS, self.tensors[first : first + len(_C.LISTS)]))
+
+
+def project(
+    settings: GaussianRasterizationSettings | Sequence[GaussianRasterizationSettings],
+    means3D: torch.Tensor,
+    opacities: torch.Tensor,
+    *,
+    shs: torch.Tensor | None = None,
+    colors_precomp: torch.Tensor | None = None,
+    scales: torch.Tensor | None = None,
+    rotations: torch.Tensor | None = None,
+    cov3D_precomp: torch.Tensor | None = None,
+) -> Splats:
+    """Projects Gaussians into one or several cameras.
+
+    Differentiable in all tensors, and with `Effects(camera_gradients=True)` in the cameras. The gradient with respect to
+    scales and rotations passes through cov2d, whose entries are known to their rounding only: a needle much longer than it
+    is wide keeps more digits in `GaussianRasterizer`. Waits for the device, which counts the rows.
+
+    Args:
+        settings: Of the camera, or of each of several. They must agree in image size, scale modifier, degree of the
+            harmonics and footprint; background and debug are not read. Outputs of their effects are not made.
+        means3D: (P, 3) centres, world units.
+        opacities: (P, 1) or (P,).
+        shs: (P, M, 3) spherical harmonics, or colors_precomp (P, 3), for `Splats.colors`; or neither.
+        scales: (P, 3) standard deviations, world units, with rotations (P, 4) (w, x, y, z); or cov3D_precomp (P, 6).
+
+    Raises:
+        TypeError: Not a tensor, or a wrong dtype.
+        ValueError: Wrong shape, device or value, or settings that disagree.
+        RuntimeError: CUDA tensors, and an extension without CUDA.
+
+    Source: [EWA, Eq. 29-31]; docs/numerics.md.
+    """
+    cameras = [settings] if isinstance(settings, GaussianRasterizationSettings) else list(settings)
+    if not cameras:
+        raise ValueError("settings must hold at least one camera, got none")
+    gaussians = gaussian_arguments(
+        cameras[0],
+        means3D,
+        opacities,
+        shs=shs,
+        colors_precomp=colors_precomp,
+        scales=scales,
+        rotations=rotations,
+        cov3D_precomp=cov3D_precomp,
+    )
+    arguments = [camera_arguments(camera, means3D, shs) for camera in cameras]
+    if any(a["lens"] is not None for a in arguments):
+        arguments = [camera_arguments(camera, means3D, shs, full=True) for camera in cameras]
+    common = ("image_height", "image_width", "scale_modifier", "sh_degree", "footprint", "option")
+    shared = {name: arguments[0][name] for name in common}
+    for number, a in enumerate(arguments):
+        for name in common:
+            if a[name] != shared[name]:
+                raise ValueError(
+                    f"settings must agree in {name}, got {shared[name]} and, of camera {number}, {a[name]}"
+                )
+    batch = {
+        "viewmatrix": torch.stack([a["viewmatrix"].reshape(4, 4) for a in arguments]),
+        "projmatrix": torch.stack([a["projmatrix"].reshape(4, 4) for a in arguments]),
+        "campos": torch.stack([a["campos"].reshape(3) for a in arguments]),
+        "lens": None if arguments[0]["lens"] is None else torch.stack([a["lens"] for a in arguments]),
+        "tanfovx": [a["tanfovx"] for a in arguments],
+        "tanfovy": [a["tanfovy"] for a in arguments],
+    }
+    *rows, saved = torch.ops.analytic_rasterizer.project(**gaussians, **batch, **shared)
+    width, height = shared["image_width"], shared["image_height"]
+    return Splats(*rows, saved[0], width, height, shared["footprint"], shared["option"])
+
+
+def bin(splats: Splats, *, keep: bool = True) -> TileLists:
+    """Sorts splats by tile and depth. Without gradient. Splats of equal depth keep their order.
+
+    Args:
+        splats: Of `project`.
+        keep: Make what the gradient of `blend` needs too.
+
+    Raises:
+        ValueError: The footprint is `adaptive`, which chooses samples by colours, and the splats have none.
+    """
+    s = splats
+    tensors = torch.ops.analytic_rasterizer.bin(
+        means2d=s.means2d.detach(),
+        cov2d=s.cov2d.detach(),
+        dets=s.dets,
+        opacities=s.opacities.detach(),
+        depths=s.depths.detach(),
+        colors=s.colors.detach() if len(s.colors) == len(s.means2d) else None,
+        row_splits=s.row_splits,
+        keep=keep,
+        **s.size,
+    )
+    return TileLists(tuple(tensors), s.cameras)
+
+
+def blend(
+    splats: Splats,
+    lists: TileLists,
+    features: torch.Tensor | None = None,
+    background: torch.Tensor | None = None,
+    *,
+    means2d_abs: torch.Tensor | None = None,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Blends features of splats, front to back, into an image per camera: all channels in one pass.
+
+    Differentiable in means2d, cov2d and opacities of the splats, in features and in background.
+
+    Args:
+        splats: Those that `lists` were made of.
+        lists: Of `bin`, with keep=True where a gradient is wanted.
+        features: (N, K) a row per splat, K from 1 to 512; None: the splats' colours. Not finite ones spread to the pixels
+            of their splat.
+        background: (K,) or (C, K); None: zero.
+        means2d_abs: (N, 2) that requires a gradient: its values are ignored, and its gradient is the sum over pixels of the
+            absolute values of dL/dmeans2d, which density control looks at.
+
+    Returns:
+        image: (C, K, H, W).
+        alpha: (C, 1, H, W), 1 - transmittance, in 0 to 1.
+
+    Raises:
+        TypeError: Not a tensor, or a wrong dtype.
+        ValueError: Wrong shape or device, or lists of other splats.
+    """
+    s = splats
+    features = s.colors if features is None else features
+    check_tensors(s.means2d.device, features=features)
+    if features.dim() != 2:
+        raise ValueError(f"features must have shape ({len(s.means2d)}, K), got {tuple(features.shape)}")
+    shape = s.cameras, features.shape[1]
+    if background is None:
+        background = features.new_zeros(shape)
+    else:
+        check_tensors(s.means2d.device, background=background)
+        if background.shape not in (shape, shape[1:]):
+            raise ValueError(f"background must have shape {shape[1:]} or {shape}, got {tuple(background.shape)}")
+        background = background.expand(shape)
+    image, alpha, _ = torch.ops.analytic_rasterizer.blend(
+        means2d=s.means2d,
+        cov2d=s.cov2d,
+        opacities=s.opacities,
+        features=features,
+        background=background,
+        means2d_abs=means2d_abs,
+        dets=s.dets,
+        row_splits=s.row_splits,
+        lists=list(lists.tensors),
+        **s.size,
+    )
+    return image, alpha[:, None]
+
+
+class Stages(NamedTuple):
+    """What the stages of one rendering produced.
+
+    Attributes:
+        color: (3, H, W) image.
+        radii: (P,) int32, as `GaussianRasterizer` returns.
+        ids: (V,) int32, the Gaussian of each splat, ascending.
+        depths: (V,) camera-space z, world units.
+        means2d: (V, 2) px.
+        pairs: (N,) int32, the splat of each (tile, splat) pair, by tile, then front to back.
+        tile_offsets: (tiles + 1,) int64, first pair of each 16x16 tile, tiles row by row.
+        tile_samples: (tiles,) int32, samples of each tile where the footprint chooses them (`adaptive`), else empty.
+        seconds: Time per stage: "project", "bin", "blend".
+    """
+
+    color: torch.Tensor
+    radii: torch.Tensor
+    ids: torch.Tensor
+    depths: torch.Tensor
+    means2d: torch.Tensor
+    pairs: torch.Tensor
+    tile_offsets: torch.Tensor
+    tile_samples: torch.Tensor
+    seconds: dict[str, float]
+
+
+@torch.no_grad()
+def render_stages(
+    settings: GaussianRasterizationSettings,
+    means3D: torch.Tensor,
+    opacities: torch.Tensor,
+    shs: torch.Tensor | None = None,
+    colors_precomp: torch.Tensor | None = None,
+    scales: torch.Tensor | None = None,
+    rotations: torch.Tensor | None = None,
+    cov3D_precomp: torch.Tensor | None = None,
+) -> Stages:
+    """Renders without gradient, keeping and timing what each stage makes. For inspection; waits for the device.
+
+    Arguments and errors are those of `GaussianRasterizer.forward`.
+    """
+    gaussians = gaussian_arguments(
+        settings,
+        means3D,
+        opacities,
+        means2D=None,
+        shs=shs,
+        colors_precomp=colors_precomp,
+        scales=scales,
+        rotations=rotations,
+        cov3D_precomp=cov3D_precomp,
+    )
+    camera = camera_arguments(settings, means3D, shs)
+    check_tensors(means3D.device, bg=settings.bg)
+    color, _, radii, saved, seconds = torch.ops.analytic_rasterizer.rasterize_timed(
+        **gaussians, **camera, bg=settings.bg, keep=True
+    )
+    lists = dict(zip(_C.LISTS, saved))
+    ids, splats, pairs = lists["ids"], lists["splats"], lists["pairs"]
+    if means3D.is_cuda:  # every Gaussian has a row; here only those that are kept
+        kept = radii > 0
+        ids = kept.nonzero()[:, 0].int()
+        places = kept.cumsum(0) - 1
+        splats, pairs = splats[kept], places[pairs[: lists["tile_offsets"][-1], 0].long()].int()
+    z = depths(means3D, settings.viewmatrix)[ids.long()]
+    times = dict(zip(("project", "bin", "blend"), seconds.tolist()))
+    means2d = splats[:, :2].clone()
+    return Stages(color, radii, ids, z, means2d, pairs, lists["tile_offsets"], lists["tile_samples"], times)
