@@ -79,8 +79,9 @@ class Effects:
         median_depth: z of the Gaussian behind which less than half of a pixel's light is left.
         dominant_index: Which Gaussian a pixel shows most of.
         gaussian_stats: How much of every Gaussian is seen, for pruning.
-        camera_gradients: Gradients with respect to viewmatrix, projmatrix, campos, tanfovx and tanfovy of the settings,
-            where these are tensors that require one. Matrices or a campos that require one switch it on by themselves; `camera_settings` derives them from a pose and fx, fy, cx, cy.
+        camera_gradients: Gradients with respect to viewmatrix, projmatrix, campos, tanfovx and tanfovy of the settings
+            that are tensors and require one. A matrix or campos that requires one switches it on by itself.
+            `camera_settings` derives them from a pose and fx, fy, cx, cy.
         orthographic: No perspective. tanfovx and tanfovy are half the width and height of the picture in world
             units, and projmatrix must leave w at 1.
         off_center: Centre the clamp of x/z and y/z in the projection of covariances on the principal point of

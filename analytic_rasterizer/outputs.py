@@ -69,7 +69,7 @@ def depths(means3D: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
 def summaries(
     effects: Effects, saved: list[torch.Tensor], z: torch.Tensor, size: tuple[int, int], footprint: str, option: float
 ) -> dict:
-    """The outputs without a gradient that `effects` asks for, by name: which Gaussians pixels show, and pixels Gaussians.
+    """The outputs without a gradient that `effects` asks for, by name.
 
     Args:
         effects: What to make.
