@@ -109,9 +109,9 @@ def project(
 ) -> Splats:
     """Projects Gaussians into one or several cameras.
 
-    Differentiable in all tensors, and with `Effects(camera_gradients=True)` in the cameras. The gradient with respect to
-    scales and rotations passes through cov2d, whose entries are known to their rounding only: a needle much longer than it
-    is wide keeps more digits in `GaussianRasterizer`. Waits for the device, which counts the rows.
+    Differentiable in all tensors, and with `Effects(camera_gradients=True)` in the cameras. The gradient with respect
+    to scales and rotations passes through cov2d, whose entries are known to their rounding only: a needle much longer
+    than it is wide keeps more digits in `GaussianRasterizer`. Waits for the device, which counts the rows.
 
     Args:
         settings: Of the camera, or of each of several. They must agree in image size, scale modifier, degree of the
@@ -149,9 +149,7 @@ def project(
     for number, a in enumerate(arguments):
         for name in common:
             if a[name] != shared[name]:
-                raise ValueError(
-                    f"settings must agree in {name}, got {shared[name]} and, of camera {number}, {a[name]}"
-                )
+                raise ValueError(f"settings must agree in {name}, got {shared[name]} and {a[name]} of camera {number}")
     batch = {
         "viewmatrix": torch.stack([a["viewmatrix"].reshape(4, 4) for a in arguments]),
         "projmatrix": torch.stack([a["projmatrix"].reshape(4, 4) for a in arguments]),
@@ -205,11 +203,11 @@ def blend(
     Args:
         splats: Those that `lists` were made of.
         lists: Of `bin`, with keep=True where a gradient is wanted.
-        features: (N, K) a row per splat, K from 1 to 512; None: the splats' colours. Not finite ones spread to the pixels
-            of their splat.
+        features: (N, K) a row per splat, K from 1 to 512; None: the splats' colours. A feature that is not finite
+            spreads to the pixels of its splat.
         background: (K,) or (C, K); None: zero.
-        means2d_abs: (N, 2) that requires a gradient: its values are ignored, and its gradient is the sum over pixels of the
-            absolute values of dL/dmeans2d, which density control looks at.
+        means2d_abs: (N, 2) that requires a gradient: its values are ignored, and its gradient is the sum over pixels
+            of the absolute values of dL/dmeans2d, which density control looks at.
 
     Returns:
         image: (C, K, H, W).

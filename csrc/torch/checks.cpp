@@ -59,14 +59,18 @@ void check_positive(double value, const char* name) {
   TORCH_CHECK_VALUE(std::isfinite(float(value)) && float(value) > 0, name, " must be positive and finite, got ", value);
 }
 
-void check_finite(const Tensor& t, const char* name) {
-  const Tensor finite = at::isfinite(t);
-  if (finite.all().item<bool>()) return;
-  const int64_t first = finite.logical_not().reshape(-1).nonzero()[0].item<int64_t>(), columns = t.size(-1);
-  TORCH_CHECK_VALUE(false, name, " must be finite, got ", t.reshape(-1)[first].item<double>(), " at (",
-                    t.dim() == 1 ? "" : std::to_string(first / columns) + ", ", first % columns,
-                    t.dim() == 1 ? ",)" : ")");
+/// Raises for the first number of `t` that is not valid; (row, column, ...) says where it is.
+void check_values(const Tensor& t, const char* name, const Tensor& valid, const char* expected) {
+  if (valid.all().item<bool>()) return;
+  int64_t place = valid.logical_not().reshape(-1).nonzero()[0].item<int64_t>();
+  const double value = t.reshape(-1)[place].item<double>();
+  std::string index = t.dim() == 1 ? ",)" : ")";
+  for (int64_t d = t.dim() - 1; d >= 0; place /= t.size(d), --d)
+    index = (d > 0 ? ", " : "(") + std::to_string(place % t.size(d)) + index;
+  TORCH_CHECK_VALUE(false, name, " must ", expected, ", got ", value, " at ", index);
 }
+
+void check_finite(const Tensor& t, const char* name) { check_values(t, name, at::isfinite(t), "be finite"); }
 
 /// Device and precision of the tensors that all others must match.
 void check_device(const Tensor& t, const char* name) {
@@ -202,8 +206,34 @@ void check(Inputs& in, bool finite) {
   if (in.lens) check_finite(in.lens->narrow(0, 0, offsetof(Lens<float>, far) / sizeof(float)), "lens");
 }
 
+namespace {
+
+/// Raises for a number that no Gaussian should have. Without debug such a Gaussian is culled, or taken as it is.
+void check_gaussians(const Inputs& in) {
+  const auto finite = [](const OptionalTensor& t, const char* name) {
+    if (t) check_values(*t, name, at::isfinite(*t), "be finite");
+  };
+  finite(in.means3D, "means3D");
+  finite(in.opacities, "opacities");
+  finite(in.shs, "shs");
+  finite(in.colors_precomp, "colors_precomp");
+  finite(in.scales, "scales");
+  finite(in.rotations, "rotations");
+  finite(in.cov3D_precomp, "cov3D_precomp");
+  check_values(in.opacities, "opacities", in.opacities.ge(0).logical_and(in.opacities.le(1)), "be in [0, 1]");
+  if (in.scales) check_values(*in.scales, "scales", in.scales->ge(0), "not be negative");
+  if (in.cov3D_precomp) {
+    Tensor valid = in.cov3D_precomp->ge(0);
+    for (const int64_t off_diagonal : {1, 2, 4}) valid.select(1, off_diagonal).fill_(true);
+    check_values(*in.cov3D_precomp, "cov3D_precomp", valid, "not have negative variances");
+  }
+}
+
+}  // namespace
+
 void check(RasterizeArguments& a) {
   check(a, a.debug);
+  if (a.debug) check_gaussians(a);
   TORCH_CHECK_VALUE(a.shs.has_value() != a.colors_precomp.has_value(),
                     "exactly one of shs and colors_precomp must be given, got ", a.shs ? "both" : "neither");
   check_like(a.bg, "bg", a.means3D, "means3D");
