@@ -1,0 +1,385 @@
+"""The public stages make what the rasterizer makes, with gradients, for any number of channels and cameras."""
+
+import dataclasses
+
+import pytest
+import scenes
+import torch
+from conftest import each_precision
+from scenes import Camera, name_of
+
+import analytic_rasterizer as ar
+
+CAMERA = Camera(image_width=27, image_height=21, bg=(0.1, 0.3, 0.2))
+RENDERED = [variant for variant in scenes.KINDS if variant[0] != "adaptive"]
+
+
+def scene_of(dtype, device, seed=3, count=30, degree=1):
+    scene = scenes.cast(scenes.random_scene(seed, count, degree), dtype, device)
+    return {name: value for name, value in scene.items() if name != "means2D"}
+
+
+def settings_of(dtype, device, variant=("box", {"samples": 4}), camera=CAMERA, **more):
+    footprint, options = variant
+    settings = dataclasses.replace(camera, sh_degree=1).settings(dtype, device, footprint=footprint, **options)
+    return settings._replace(**more) if more else settings
+
+
+def tolerances(dtype):
+    """Of values and of gradients: rounding, through one more matrix of a covariance than the rasterizer needs."""
+    return (1e-12, 1e-9) if dtype == torch.float64 else (2e-6, 2e-3)
+
+
+def assert_gradients_close(actual, expected, dtype):
+    for name in expected:
+        error = (actual[name] - expected[name]).norm() / expected[name].norm().clamp_min(1e-30)
+        assert error <= tolerances(dtype)[1], (name, error.item())
+
+
+def weights(shape, dtype, device, seed=0):
+    return torch.rand(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(device, dtype)
+
+
+@each_precision
+@pytest.mark.parametrize("variant", [*RENDERED, ("adaptive", {})], ids=name_of)
+def test_stages_make_the_picture_of_the_rasterizer(device, dtype, variant):
+    settings = settings_of(dtype, device, variant)
+    scene, again = (scenes.leaves(scene_of(dtype, device)) for _ in range(2))
+    color, radii = ar.GaussianRasterizer(settings)(means2D=None, **scene)
+    splats = ar.project(settings, **again)
+    image, alpha = ar.blend(splats, ar.bin(splats), background=settings.bg)
+    assert image.shape == (1, 3, 21, 27) and alpha.shape == (1, 1, 21, 27)
+    assert (image[0] - color).abs().max() <= tolerances(dtype)[0]
+    assert torch.equal(radii[splats.gaussian_ids.long()], splats.radii) and len(splats.radii) == (radii > 0).sum()
+
+    g = weights(color.shape, dtype, device)
+    expected = dict(zip(scene, torch.autograd.grad((color * g).sum(), list(scene.values()))))
+    actual = dict(zip(again, torch.autograd.grad((image[0] * g).sum(), list(again.values()))))
+    assert_gradients_close(actual, expected, dtype)
+
+
+@each_precision
+def test_several_cameras_are_each_of_them(device, dtype):
+    cameras = [CAMERA, dataclasses.replace(CAMERA, eye=(1.5, 0.4, -3.2)), dataclasses.replace(CAMERA, tanfovx=0.3)]
+    settings = [settings_of(dtype, device, camera=camera) for camera in cameras]
+    scene = scenes.leaves(scene_of(dtype, device))
+    splats = ar.project(settings, **scene)
+    assert splats.cameras == 3 and splats.row_splits[-1] == len(splats.means2d)
+    image, alpha = ar.blend(splats, ar.bin(splats))
+    g = weights(image.shape, dtype, device)
+    together = dict(zip(scene, torch.autograd.grad((image * g).sum(), list(scene.values()))))
+    total = {name: torch.zeros_like(value) for name, value in scene.items()}
+    for c, of_camera in enumerate(settings):
+        alone = ar.project(of_camera, **scene)
+        rows = slice(int(splats.row_splits[c]), int(splats.row_splits[c + 1]))
+        assert torch.equal(splats.means2d[rows], alone.means2d) and (splats.camera_ids[rows] == c).all()
+        assert torch.equal(splats.gaussian_ids[rows], alone.gaussian_ids)
+        own, own_alpha = ar.blend(alone, ar.bin(alone))
+        assert torch.equal(image[c], own[0]) and torch.equal(alpha[c], own_alpha[0])
+        for name, grad in zip(scene, torch.autograd.grad((own[0] * g[c]).sum(), list(scene.values()))):
+            total[name] += grad
+    assert_gradients_close(together, total, dtype)
+
+
+@each_precision
+def test_cameras_in_a_batch_have_gradients(device, dtype):
+    effects = ar.Effects(camera_gradients=True, defocus=ar.Defocus(0.05, 3.0))
+    scene = scene_of(dtype, device)
+
+    def image_of(views):
+        settings = [settings_of(dtype, device, effects=effects)._replace(viewmatrix=view) for view in views]
+        splats = ar.project(settings, **scene)
+        return ar.blend(splats, ar.bin(splats))[0]
+
+    views = [CAMERA.fields(dtype, device)["viewmatrix"].requires_grad_() for _ in range(2)]
+    image = image_of(views)
+    g = weights(image.shape, dtype, device)
+    together = torch.autograd.grad((image * g).sum(), views)
+    for c, view in enumerate(views):
+        alone = torch.autograd.grad((image_of([view])[0] * g[c]).sum(), view)[0]
+        torch.testing.assert_close(together[c], alone, rtol=tolerances(dtype)[1], atol=0)
+
+
+# --- channels ----------------------------------------------------------------------------------------
+
+
+@each_precision
+@pytest.mark.parametrize("channels", [1, 2, 4, 5, 32, 33, 70])
+def test_channels_are_blended_like_colours(device, dtype, channels):
+    """Any number in one pass: the image and the gradients of three at a time."""
+    settings = settings_of(dtype, device)
+    scene = scene_of(dtype, device)
+    del scene["shs"]
+    features = weights((30, channels), dtype, device)
+    background = weights((channels,), dtype, device, seed=1)
+    g = weights((channels, 21, 27), dtype, device, seed=2)
+
+    leaves = scenes.leaves(scene | {"colors_precomp": features})
+    color, radii = ar.GaussianRasterizer(settings._replace(bg=background))(means2D=None, **leaves)
+    actual = dict(zip(leaves, torch.autograd.grad((color * g).sum(), list(leaves.values()))))
+
+    total = {name: torch.zeros_like(value) for name, value in leaves.items()}
+    for first in range(0, channels, 3):
+        part = slice(first, min(first + 3, channels))
+        width = part.stop - part.start
+        pad = lambda t, dim: torch.cat([t, t.new_zeros(*t.shape[:dim], 3 - t.shape[dim], *t.shape[dim + 1 :])], dim)  # noqa: E731
+        three = scenes.leaves(scene | {"colors_precomp": pad(features[:, part], 1)})
+        of_three = settings._replace(bg=pad(background[part], 0))
+        own, own_radii = ar.GaussianRasterizer(of_three)(means2D=None, **three)
+        assert torch.equal(own_radii, radii)
+        assert (own[:width] - color[part]).abs().max() <= tolerances(dtype)[0]
+        for name, grad in zip(three, torch.autograd.grad((own[:width] * g[part]).sum(), list(three.values()))):
+            if name == "colors_precomp":
+                total[name][:, part] = grad[:, :width]
+            else:
+                total[name] += grad
+    assert_gradients_close(actual, total, dtype)
+
+
+def count_calls(call, name):
+    """How often an op of ours runs."""
+    with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profiler:
+        call()
+    return sum(event.count for event in profiler.key_averages() if event.key == f"analytic_rasterizer::{name}")
+
+
+def test_many_channels_take_one_backward_pass(device):
+    settings = settings_of(torch.float32, device, effects=ar.Effects(alpha=True, depth=True, inverse_depth=True))
+    scene = scene_of(torch.float32, device)
+    del scene["shs"]
+    leaves = scenes.leaves(scene | {"colors_precomp": weights((30, 64), torch.float32, device)})
+    settings = settings._replace(bg=torch.zeros(64, device=device))
+
+    def forward_backward():
+        color, _, outputs = ar.GaussianRasterizer(settings)(means2D=None, **leaves)
+        (color.sum() + outputs.alpha.sum() + outputs.depth.sum() + outputs.inverse_depth.sum()).backward()
+
+    assert count_calls(forward_backward, "rasterize_vjp") == 1
+    assert count_calls(forward_backward, "rasterize") == 1
+
+
+@each_precision
+@pytest.mark.parametrize("channels", [3, 40])
+def test_depth_is_a_channel(device, dtype, channels):
+    """Depth and inverse depth, as extra channels of z, of colours from harmonics and of many features."""
+    effects = ar.Effects(alpha=True, depth=True, inverse_depth=True)
+    settings = settings_of(dtype, device, effects=effects)._replace(bg=torch.full((channels,), 0.2).to(device, dtype))
+    scene = scene_of(dtype, device)
+    if channels != 3:
+        del scene["shs"]
+        scene["colors_precomp"] = weights((30, channels), dtype, device)
+    leaves, again = scenes.leaves(scene), scenes.leaves(scene)
+    color, _, outputs = ar.GaussianRasterizer(settings)(means2D=None, **leaves)
+    planes = torch.cat([color, outputs.depth, outputs.inverse_depth, outputs.alpha])
+    g = weights(planes.shape, dtype, device)
+    actual = dict(zip(leaves, torch.autograd.grad((planes * g).sum(), list(leaves.values()))))
+
+    plain = settings_of(dtype, device)
+    features = again.get("colors_precomp")
+    splats = ar.project(plain, **{k: v for k, v in again.items() if k != "colors_precomp"})
+    features = splats.colors if features is None else features[splats.gaussian_ids.long()]
+    table = torch.cat([features, splats.depths[:, None], 1 / splats.depths[:, None]], 1)
+    background = torch.cat([settings.bg, settings.bg.new_zeros(2)])
+    image, alpha = ar.blend(splats, ar.bin(splats), table, background)
+    expected_planes = torch.cat([image[0], alpha[0]])
+    assert (planes - expected_planes).abs().max() <= 5 * tolerances(dtype)[0]
+    expected = dict(zip(again, torch.autograd.grad((expected_planes * g).sum(), list(again.values()))))
+    assert_gradients_close(actual, expected, dtype)
+
+
+@each_precision
+@pytest.mark.parametrize("channels", [3, 5, 40])
+def test_absolute_gradients_are_of_all_channels(device, dtype, channels):
+    """means2D (P, 4): sums over pixels of |dL/dmean|, where a pixel's gradient is that of all its channels."""
+    camera = Camera(image_width=6, image_height=5)
+    settings = camera.settings(dtype, device, footprint="box", samples=4)._replace(
+        bg=torch.zeros(channels).to(device, dtype)
+    )
+    scene = scenes.cast(scenes.random_scene(4, 8), dtype, device)
+    del scene["shs"], scene["means2D"]
+    scene["colors_precomp"] = weights((8, channels), dtype, device)
+    g = weights((channels, 5, 6), dtype, device, seed=1) - 0.5
+    means2D = torch.zeros(8, 4, dtype=dtype, device=device, requires_grad=True)
+    color, _ = ar.GaussianRasterizer(settings)(means2D=means2D, **scene)
+    (color * g).sum().backward()
+    expected = torch.zeros(8, 2, dtype=dtype, device=device)
+    for y in range(5):
+        for x in range(6):
+            single = torch.zeros(8, 3, dtype=dtype, device=device, requires_grad=True)
+            color, _ = ar.GaussianRasterizer(settings)(means2D=single, **scene)
+            (color[:, y, x] * g[:, y, x]).sum().backward()
+            expected += single.grad[:, :2].abs()
+    torch.testing.assert_close(
+        means2D.grad[:, 2:], expected, rtol=tolerances(dtype)[1], atol=1e-5 * expected.max().item()
+    )
+
+    splats = ar.project(settings, **{k: v for k, v in scene.items() if k != "colors_precomp"})
+    absolute = torch.zeros_like(splats.means2d, requires_grad=True)
+    features = scene["colors_precomp"][splats.gaussian_ids.long()]
+    image, _ = ar.blend(splats, ar.bin(splats), features, means2d_abs=absolute)
+    (image[0] * g).sum().backward()
+    half = torch.tensor([3.0, 2.5], dtype=dtype, device=device)
+    torch.testing.assert_close(
+        absolute.grad * half,
+        expected[splats.gaussian_ids.long()],
+        rtol=tolerances(dtype)[1],
+        atol=1e-5 * expected.max().item(),
+    )
+
+
+def test_a_channel_that_is_not_finite_culls_its_gaussian(device):
+    settings = settings_of(torch.float32, device)._replace(bg=torch.zeros(8, device=device))
+    scene = scene_of(torch.float32, device)
+    del scene["shs"]
+    features = weights((30, 8), torch.float32, device)
+    bad = features.clone()
+    bad[7, 5] = torch.nan
+    color, radii = ar.GaussianRasterizer(settings)(means2D=None, colors_precomp=bad, **scene)
+    kept = torch.arange(30, device=device) != 7
+    others = {name: value[kept] for name, value in scene.items()}
+    expected, others_radii = ar.GaussianRasterizer(settings)(means2D=None, colors_precomp=features[kept], **others)
+    assert radii[7] == 0 and torch.equal(radii[kept], others_radii) and torch.equal(color, expected)
+
+
+# --- gradients ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("precomputed", [False, True])
+def test_gradcheck_of_project(precomputed):
+    settings = [settings_of(torch.float64, "cpu"), settings_of(torch.float64, "cpu", camera=CAMERA.shifted(2, -3))]
+    scene = scenes.smooth_scene(5, degree=1)
+    del scene["means2D"]
+    if precomputed:
+        scene = scenes.with_precomputed(scene)
+    leaves = scenes.leaves(scene)
+
+    def rows(*values):
+        s = ar.project(settings, **dict(zip(leaves, values)))
+        return s.means2d, s.cov2d, s.opacities, s.depths, s.colors
+
+    assert torch.autograd.gradcheck(rows, tuple(leaves.values()))
+
+
+@pytest.mark.parametrize("variant", [v for v in RENDERED if v[0] not in ("analytic", "erf")], ids=name_of)
+def test_gradcheck_of_blend(variant):
+    """`analytic` and `erf` hold the pixel's frame while they differentiate: their gradient is not the formula's."""
+    settings = settings_of(torch.float64, "cpu", variant)
+    scene = scenes.smooth_scene(5, degree=1)
+    del scene["means2D"]
+    with torch.no_grad():
+        splats = ar.project(settings, **scene)
+    leaves = [splats.means2d, splats.cov2d, splats.opacities, weights((len(splats.means2d), 5), torch.float64, "cpu")]
+    leaves = [t.detach().clone().requires_grad_() for t in (*leaves, torch.ones(5, dtype=torch.float64))]
+
+    def images(means2d, cov2d, opacities, features, background):
+        xx, xy, yy = cov2d.detach().unbind(1)
+        rows = dataclasses.replace(splats, means2d=means2d, cov2d=cov2d, opacities=opacities, dets=xx * yy - xy * xy)
+        return ar.blend(rows, ar.bin(rows), features, background)
+
+    assert torch.autograd.gradcheck(images, leaves)
+
+
+def test_backgrounds_and_matrices_that_require_a_gradient_get_one(device):
+    """Without any effect asked for."""
+    dtype = torch.float64 if device == "cpu" else torch.float32
+    scene = scene_of(dtype, device)
+    plain = settings_of(dtype, device)
+    bg, view = plain.bg.clone().requires_grad_(), plain.viewmatrix.clone().requires_grad_()
+    color, _ = ar.GaussianRasterizer(plain._replace(bg=bg, viewmatrix=view))(means2D=None, **scene)
+    g = weights(color.shape, dtype, device)
+    grads = torch.autograd.grad((color * g).sum(), (bg, view))
+    _, _, outputs = ar.GaussianRasterizer(plain._replace(effects=ar.Effects(alpha=True)))(means2D=None, **scene)
+    torch.testing.assert_close(grads[0], ((1 - outputs.alpha) * g).sum((1, 2)), rtol=1e-5, atol=0)
+    asked = plain._replace(effects=ar.Effects(camera_gradients=True), viewmatrix=view)
+    color, _ = ar.GaussianRasterizer(asked)(means2D=None, **scene)
+    torch.testing.assert_close(grads[1], torch.autograd.grad((color * g).sum(), view)[0])
+
+
+# --- errors ------------------------------------------------------------------------------------------
+
+
+def test_settings_of_a_batch_must_agree():
+    scene = scene_of(torch.float32, "cpu")
+    settings = settings_of(torch.float32, "cpu")
+    with pytest.raises(ValueError, match="settings must agree in image_width, got 27 and 28 of camera 1"):
+        ar.project([settings, settings._replace(image_width=28)], **scene)
+    with pytest.raises(ValueError, match="at least one camera"):
+        ar.project([], **scene)
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"features": torch.zeros(3, 4)}, r"features must have shape \(N, K\) with N = \d+"),
+        ({"features": torch.zeros(5)}, r"features must have shape \(\d+, K\), got \(5,\)"),
+        ({"background": torch.zeros(2)}, r"background must have shape \(3,\) or \(1, 3\), got \(2,\)"),
+        ({"means2d_abs": torch.zeros(2, 2)}, r"means2d_abs must have shape \(N, 2\)"),
+    ],
+    ids=["rows", "vector", "background", "absolute"],
+)
+def test_blend_says_what_is_wrong(change, message):
+    splats = ar.project(settings_of(torch.float32, "cpu"), **scene_of(torch.float32, "cpu"))
+    with pytest.raises(ValueError, match=message):
+        ar.blend(splats, ar.bin(splats), **change)
+
+
+def test_lists_of_other_splats_are_refused(device):
+    settings, scene = settings_of(torch.float32, device), scene_of(torch.float32, device)
+    splats = ar.project(settings, **scene)
+    fewer = ar.project(settings, **{name: value[:9] for name, value in scene.items()})
+    with pytest.raises(ValueError, match="lists must be the output of bin for these splats"):
+        ar.blend(splats, ar.bin(fewer))
+    larger = ar.project(settings._replace(image_width=99), **scene)
+    with pytest.raises(ValueError, match="must be what the forward pass saved"):
+        ar.blend(larger, ar.TileLists(ar.bin(splats).tensors, 1))
+
+
+def test_no_gaussians_no_splats(device):
+    settings = settings_of(torch.float32, device)
+    scene = {name: value[:0] for name, value in scene_of(torch.float32, device).items()}
+    splats = ar.project(settings, **scenes.leaves(scene))
+    image, alpha = ar.blend(splats, ar.bin(splats), background=settings.bg)
+    assert len(splats.means2d) == 0 and (alpha == 0).all()
+    assert torch.equal(image[0], settings.bg[:, None, None].expand(3, 21, 27))
+    image.sum().backward()
+
+
+# --- torch.library -----------------------------------------------------------------------------------
+
+
+def captured(call, name):
+    """Arguments of the first call of an op of ours."""
+    from torch.utils._python_dispatch import TorchDispatchMode
+
+    class Capture(TorchDispatchMode):
+        seen = None
+
+        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+            if func is getattr(torch.ops.analytic_rasterizer, name).default and self.seen is None:
+                self.seen = args, kwargs or {}
+            return func(*args, **(kwargs or {}))
+
+    with Capture() as mode, torch.no_grad():
+        call()
+    assert mode.seen is not None
+    return mode.seen
+
+
+@pytest.mark.parametrize("name", ["rasterize", "project", "bin", "blend"])
+def test_opcheck(name, device):
+    dtype = torch.float64 if device == "cpu" else torch.float32
+    settings, scene = settings_of(dtype, device), scene_of(dtype, device)
+
+    def call():
+        outputs = settings._replace(effects=ar.Effects(alpha=True, depth=True))
+        ar.GaussianRasterizer(outputs)(means2D=None, **scene)
+        splats = ar.project([settings, settings], **scene)
+        ar.blend(splats, ar.bin(splats), torch.ones(len(splats.means2d), 5, dtype=dtype, device=device))
+
+    args, kwargs = captured(call, name)
+    require = {"rasterize": "means3D", "project": "means3D", "blend": "means2d"}.get(name)
+    schema = getattr(torch.ops.analytic_rasterizer, name).default._schema
+    named = dict(zip((a.name for a in schema.arguments), args)) | kwargs
+    if require:
+        named[require] = named[require].clone().requires_grad_()
+    torch.library.opcheck(getattr(torch.ops.analytic_rasterizer, name).default, (), named)
