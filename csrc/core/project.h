@@ -33,8 +33,8 @@ template <typename T> AR_HD T max_sigma(const Gaussians<T>& g, int64_t i) {
   return g.scale_modifier * max(abs(s.x), max(abs(s.y), abs(s.z)));
 }
 
-/// Whether Gaussian i may touch the image, from its mean and its largest standard deviation: cheap, and never false for one
-/// that project() keeps.
+/// Whether Gaussian i may touch the image, from its mean and its largest standard deviation: cheap, and never false for
+/// one that project() keeps.
 template <class Cam, typename T>
 AR_HD bool may_be_visible(const Cam& camera, const Gaussians<T>& g, int64_t i, CullBounds<T> bounds) {
   const T largest = max_sigma(g, i), opacity = g.opacities[i];  // loads first: they wait together
@@ -61,6 +61,21 @@ template <typename T> struct ProjectedGaussian {
   T depth;    ///< camera-space z
 };
 
+/// False where there is nothing to draw: the covariance is none, or numbers are beyond what floats hold.
+template <typename T> AR_HD bool is_drawable(const ProjectedGaussian<T>& p) {
+  const Cov2d<T>& cov = p.cov;
+  return cov.det >= T(0) && cov.det < T(kMaxDet) && cov.xx >= T(0) && cov.yy >= T(0) && within(cov.xx, 1e18) &&
+         within(cov.yy, 1e18) && !(p.opacity > T(kMaxOpacity));
+}
+
+/// Row i of rows of the caller's. False if project_gaussian would have culled such a Gaussian, or if its depth has no
+/// place in the order of depths.
+template <typename T> AR_HD bool read_row(const ProjectedRows<T>& rows, int64_t i, ProjectedGaussian<T>& out) {
+  const Sym2<T> c = rows.cov2d[i];
+  out = {rows.means2d[i], {c.xx, c.xy, c.yy, rows.dets[i]}, rows.opacities[i], rows.depths[i]};
+  return within(out.mean.x, 1e9) && within(out.mean.y, 1e9) && out.depth >= T(0) && is_drawable(out);
+}
+
 /// False if Gaussian i is culled: behind the near plane, not finite, or degenerate.
 template <class Cam, typename T>
 AR_HD bool project_gaussian(const Cam& camera, const Gaussians<T>& g, int64_t i, ProjectedGaussian<T>& out) {
@@ -72,9 +87,8 @@ AR_HD bool project_gaussian(const Cam& camera, const Gaussians<T>& g, int64_t i,
     return false;
   const SeenCov<T> seen = seen_covariance(camera, g, i, mean.view, factors);
   out = {mean.pixel, seen.cov, seen.amp * g.opacities[i], mean.view.z};
-  const Cov2d<T>& cov = seen.cov;
-  return cov.det >= T(0) && cov.det < T(kMaxDet) && cov.xx >= T(0) && cov.yy >= T(0) && within(cov.xx, 1e18) &&
-         within(cov.yy, 1e18) && !(g.opacities[i] > T(kMaxOpacity));
+  // The opacity before the blur: a large blur must not bring back what is degenerate.
+  return is_drawable(out) && !(g.opacities[i] > T(kMaxOpacity));
 }
 
 /// ceil(3 sigma) along the major axis: the radius that 3DGS reports [px].
@@ -130,8 +144,8 @@ AR_HD bool splat_color(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
   return finite;
 }
 
-/// Writes the gradient of the colour's parameters and returns the gradient with respect to the vector from the camera to
-/// the mean. `sh` are the coefficients, `dL_dsh` takes their gradient, or is null; they may be the same memory.
+/// Writes the gradient of the colour's parameters and returns the gradient with respect to the vector from the camera
+/// to the mean. `sh` are the coefficients, `dL_dsh` takes their gradient, or is null; they may be the same memory.
 template <class Cam, typename T>
 AR_HD Vec3<T> splat_color_vjp(const Cam& camera, const Gaussians<T>& g, const GaussianGrads<T>& out, int64_t i,
                               const Vec3<T>* sh, Vec3<T>* dL_dsh, Vec3<T> dL_dcolor) {
@@ -182,8 +196,7 @@ AR_HD int project(const Cam& camera, const Gaussians<T>& g, int64_t i, Footprint
 }
 
 /// Writes the channels of Gaussian i that project() makes: its colour, and its depth.
-template <typename T>
-AR_HD void write_channels(const ChannelRows<T>& rows, int64_t i, Vec3<T> color, T depth) {
+template <typename T> AR_HD void write_channels(const ChannelRows<T>& rows, int64_t i, Vec3<T> color, T depth) {
   T* row = rows.data + i * rows.stride;
   if (rows.color >= 0) row[rows.color] = color.x, row[rows.color + 1] = color.y, row[rows.color + 2] = color.z;
   if (rows.depth >= 0) row[rows.depth] = depth;
@@ -218,16 +231,15 @@ AR_HD ProjectedGrad<T> projected_grad(FootprintChoice footprint, const Cov2d<T>&
 }
 
 /// From the gradient of row `row` of ProjectedRows. `opacity` is the row's.
-template <typename T>
-AR_HD ProjectedGrad<T> projected_grad(const ProjectedRowGrads<T>& rows, int64_t row, T opacity) {
+template <typename T> AR_HD ProjectedGrad<T> projected_grad(const ProjectedRowGrads<T>& rows, int64_t row, T opacity) {
   const Sym2<T> g = rows.cov2d[row];
   return {{rows.means2d[row], {T(1), T(0), T(0), T(1)}, {g.xx, T(0.5) * g.xy, g.yy}, T(0), T(0), GradFrame::kPixels},
           opacity * rows.opacities[row]};
 }
 
-/// Writes every gradient of Gaussian i, and adds that of a full camera to `camera_grad`, if not null. `grad_of` turns the
-/// covariance and the opacity in the image into a ProjectedGrad. `sh` and `dL_dsh` as for splat_color_vjp; out.shs is not
-/// touched.
+/// Writes every gradient of Gaussian i, and adds that of a full camera to `camera_grad`, if not null. `grad_of` turns
+/// the covariance and the opacity in the image into a ProjectedGrad. `sh` and `dL_dsh` as for splat_color_vjp; out.shs
+/// is not touched.
 template <class Cam, typename T, class GradOf>
 AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, const GradOf& grad_of, ShownGrad<T> shown,
                        const Vec3<T>* sh, Vec3<T>* dL_dsh, const GaussianGrads<T>& out,

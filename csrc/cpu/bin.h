@@ -7,7 +7,7 @@
 #include "cpu/isa.h"
 #include "cpu/parallel.h"
 #include "cpu/sort.h"
-#include "cpu/tasks.h"
+#include "cpu/stages.h"
 
 namespace ar::AR_ISA {
 
@@ -15,68 +15,68 @@ namespace ar::AR_ISA {
 /// in memory.
 inline constexpr int64_t kAhead = 12;
 
-/// visit(splat index, tile) for the pairs of part p of the splats, in depth order.
-template <class F, typename T, class Visit>
-AR_HD void for_each_pair(const cpu::BinTask<T>& task, int64_t p, const Visit& visit) {
-  const auto* splats = reinterpret_cast<const Splat<F, T>*>(task.splats);
-  const cpu::Part part = cpu::part_of(task.n, task.parts, p);
+/// visit(splat index, tile) for the pairs of one part of the splats, in depth order.
+template <typename T, class Visit>
+AR_HD void for_each_pair(const cpu::BinParams<T>& p, int64_t part_index, const Visit& visit) {
+  const auto* splats = reinterpret_cast<const SplatRow<T>*>(p.splats);
+  const cpu::Part part = cpu::part_of(p.n, p.parts, part_index);
   for (int64_t k = part.begin; k < part.end; ++k) {
-    if (k + kAhead < part.end) __builtin_prefetch(&splats[task.order[k + kAhead]]);
-    const int32_t j = task.order[k];
+    if (k + kAhead < part.end) __builtin_prefetch(&splats[p.order[k + kAhead]]);
+    const int32_t j = p.order[k];
     if (!(splats[j].level > T(0))) continue;
-    for_each_tile(support_of(splats[j]), task.grid, [&](int64_t tile) { visit(j, tile); });
+    for_each_tile(support_of(splats[j], p.footprint), p.grid, [&](int64_t tile) { visit(j, tile); });
   }
 }
 
 /// Sorts by depth, counts the pairs of each tile, and turns the counts into places.
-template <class F, typename T> void count_pairs(cpu::BinTask<T>& task) {
-  cpu::sort_by_depth(task.depths, task.n, task.threads, task.order);
-  const int64_t tiles = task.grid.tiles();
+template <typename T> void count_pairs(cpu::BinParams<T>& p) {
+  cpu::sort_by_depth(p.depths, p.n, p.threads, p.order);
+  const int64_t tiles = p.grid.tiles();
   // Parts only speed things up. Their histograms may not outgrow the splats.
-  task.parts = std::clamp<int64_t>(task.n / std::max<int64_t>(tiles, 1), 1, task.threads);
-  task.cursors.assign(task.parts * tiles, 0);
-  cpu::parallel_for(task.parts, task.threads, [&](int64_t p) {
-    int64_t* count = task.cursors.data() + p * tiles;
-    for_each_pair<F>(task, p, [&](int32_t j, int64_t tile) {
+  p.parts = std::clamp<int64_t>(p.n / std::max<int64_t>(tiles, 1), 1, p.threads);
+  p.cursors.assign(p.parts * tiles, 0);
+  cpu::parallel_for(p.parts, p.threads, [&](int64_t part) {
+    int64_t* count = p.cursors.data() + part * tiles;
+    for_each_pair(p, part, [&](int32_t j, int64_t tile) {
       ++count[tile];
-      if (task.splat_offsets) ++task.splat_offsets[j];
+      if (p.splat_offsets) ++p.splat_offsets[j];
     });
   });
   int64_t total = 0;
   for (int64_t tile = 0; tile < tiles; ++tile) {
-    task.tile_offsets[tile] = total;
-    for (int64_t p = 0; p < task.parts; ++p) {
-      const int64_t count = task.cursors[p * tiles + tile];
-      task.cursors[p * tiles + tile] = total;
+    p.tile_offsets[tile] = total;
+    for (int64_t part = 0; part < p.parts; ++part) {
+      const int64_t count = p.cursors[part * tiles + tile];
+      p.cursors[part * tiles + tile] = total;
       total += count;
     }
   }
-  task.tile_offsets[tiles] = total;
-  if (task.splat_offsets) {
+  p.tile_offsets[tiles] = total;
+  if (p.splat_offsets) {
     int64_t sum = 0;
-    for (int64_t j = 0; j <= task.n; ++j) {
-      const int64_t count = task.splat_offsets[j];
-      task.splat_offsets[j] = sum;
+    for (int64_t j = 0; j <= p.n; ++j) {
+      const int64_t count = p.splat_offsets[j];
+      p.splat_offsets[j] = sum;
       sum += count;
     }
   }
 }
 
-template <class F, typename T> void scatter_pairs(cpu::BinTask<T>& task) {
-  const int64_t tiles = task.grid.tiles();
-  cpu::parallel_for(task.parts, task.threads, [&](int64_t p) {
-    int64_t* cursor = task.cursors.data() + p * tiles;
+template <typename T> void scatter_pairs(cpu::BinParams<T>& p) {
+  const int64_t tiles = p.grid.tiles();
+  cpu::parallel_for(p.parts, p.threads, [&](int64_t part) {
+    int64_t* cursor = p.cursors.data() + part * tiles;
     int32_t current = -1;
     int64_t next = 0;  // place in positions: a splat's pairs come one after the other
-    for_each_pair<F>(task, p, [&](int32_t j, int64_t tile) {
+    for_each_pair(p, part, [&](int32_t j, int64_t tile) {
       const int64_t place = cursor[tile]++;
-      task.pairs[place] = j;
-      if (!task.positions) return;
+      p.pairs[place] = j;
+      if (!p.positions) return;
       if (j != current) {
         current = j;
-        next = task.splat_offsets[j];
+        next = p.splat_offsets[j];
       }
-      task.positions[next++] = place;
+      p.positions[next++] = place;
     });
   });
 }

@@ -1,73 +1,108 @@
 // Which instruction set the CPU path runs on.
 #include <cstdlib>
 #include <cstring>
+#include <vector>
 
-#include "cpu/tasks.h"
+#include "cpu/stages.h"
 
 namespace ar {
 
 namespace baseline {
-template <typename T> const cpu::Stages<T>* stages(std::string_view footprint);
-extern template const cpu::Stages<float>* stages<float>(std::string_view);
+template <typename T> cpu::Stages<T> all_stages(int footprint);
+extern template cpu::Stages<float> all_stages<float>(int);
 }  // namespace baseline
 namespace double_precision {
-template <typename T> const cpu::Stages<T>* stages(std::string_view footprint);
-extern template const cpu::Stages<double>* stages<double>(std::string_view);
+template <typename T> cpu::Stages<T> all_stages(int footprint);
+extern template cpu::Stages<double> all_stages<double>(int);
 }  // namespace double_precision
 #if defined(__x86_64__)
 namespace avx2 {
-template <typename T> const cpu::Stages<T>* stages(std::string_view footprint);
-extern template const cpu::Stages<float>* stages<float>(std::string_view);
+template <typename T, bool kYardsticks> void set_blend_stages(int footprint, cpu::Stages<T>& stages);
+extern template void set_blend_stages<float, false>(int, cpu::Stages<float>&);
+template <typename T> void set_projection_and_bin(cpu::Stages<T>& stages);
+extern template void set_projection_and_bin<float>(cpu::Stages<float>&);
 }  // namespace avx2
 namespace avx512 {
-template <typename T> const cpu::Stages<T>* stages(std::string_view footprint);
-extern template const cpu::Stages<float>* stages<float>(std::string_view);
+template <typename T, bool kYardsticks> void set_blend_stages(int footprint, cpu::Stages<T>& stages);
+extern template void set_blend_stages<float, false>(int, cpu::Stages<float>&);
 }  // namespace avx512
 #endif
 
 namespace cpu {
 namespace {
 
-struct InstructionSet {
-  const char* name;
-  bool supported;
-  const Stages<float>* (*stages)(std::string_view);
-};
+/// One table per footprint of the registry.
+template <class Make> auto make_tables(const Make& make) {
+  std::vector<decltype(make(0))> tables;
+  for_each_footprint(Footprints{}, [&](auto) { tables.push_back(make(int(tables.size()))); });
+  return tables;
+}
+
+const Stages<float>& baseline_stages(int footprint) {
+  static const auto tables = make_tables(baseline::all_stages<float>);
+  return tables[footprint];
+}
+
+#if defined(__x86_64__)
+const Stages<float>& avx2_stages(int footprint) {
+  static const auto tables = make_tables([](int i) {
+    Stages<float> stages = baseline_stages(i);
+    avx2::set_blend_stages<float, false>(i, stages);
+    avx2::set_projection_and_bin(stages);
+    return stages;
+  });
+  return tables[footprint];
+}
+const Stages<float>& avx512_stages(int footprint) {
+  static const auto tables = make_tables([](int i) {
+    Stages<float> stages = avx2_stages(i);
+    avx512::set_blend_stages<float, false>(i, stages);
+    return stages;
+  });
+  return tables[footprint];
+}
+#endif
 
 /// The best supported set, or a worse one that the environment asks for. An unknown or unsupported
 /// request changes nothing: a variable left over from another machine must not break a program.
-InstructionSet choose() {
-  const InstructionSet sets[] = {
-#if defined(__x86_64__)
-      {"avx512",
-       __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") &&
-           __builtin_cpu_supports("avx512bw"),
-       avx512::stages<float>},
-      {"avx2", __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2"),
-       avx2::stages<float>},
-#endif
-      {"baseline", true, baseline::stages<float>},
-  };
+const InstructionSet& choose() {
   const char* wanted = std::getenv("ANALYTIC_RASTERIZER_ISA");
-  for (const InstructionSet& set : sets) {
+  for (const InstructionSet& set : instruction_sets()) {
     if (set.supported && wanted && std::strcmp(set.name, wanted) == 0) return set;
   }
-  for (const InstructionSet& set : sets) {
+  for (const InstructionSet& set : instruction_sets()) {
     if (set.supported) return set;
   }
-  return sets[0];
+  return instruction_sets().back();
 }
 
 const InstructionSet& chosen() {
-  static const InstructionSet set = choose();
+  static const InstructionSet& set = choose();
   return set;
 }
 
 }  // namespace
 
-template <> const Stages<float>* find_stages<float>(std::string_view footprint) { return chosen().stages(footprint); }
-template <> const Stages<double>* find_stages<double>(std::string_view footprint) {
-  return double_precision::stages<double>(footprint);
+const std::vector<InstructionSet>& instruction_sets() {
+  static const std::vector<InstructionSet> sets = {
+#if defined(__x86_64__)
+      {"avx512",
+       __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") &&
+           __builtin_cpu_supports("avx512bw") && __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") &&
+           __builtin_cpu_supports("bmi2"),
+       avx512_stages},
+      {"avx2", __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2"),
+       avx2_stages},
+#endif
+      {"baseline", true, baseline_stages},
+  };
+  return sets;
+}
+
+template <> const Stages<float>& stages_of<float>(int footprint) { return chosen().stages(footprint); }
+template <> const Stages<double>& stages_of<double>(int footprint) {
+  static const auto tables = make_tables(double_precision::all_stages<double>);
+  return tables[footprint];
 }
 const char* instruction_set() { return chosen().name; }
 

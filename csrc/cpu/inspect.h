@@ -5,8 +5,8 @@
 #include <cstring>
 
 #include "core/inspect.h"
-#include "cpu/blend.h"
 #include "cpu/parallel.h"
+#include "cpu/tile.h"
 
 namespace ar::AR_ISA {
 
@@ -18,16 +18,16 @@ inline void atomic_max(int32_t* bits, float value) {
   }
 }
 
-template <class F, typename T> void inspect_tile(const cpu::InspectTask<T>& task, int64_t tile) {
-  const auto* splats = reinterpret_cast<const Splat<F, T>*>(task.splats);
-  const TileView view(task.grid, tile);
-  PixelLook<T, F::kSamples> pixels[kTilePixels];
+template <class P, typename T>
+AR_ONE_COPY void inspect_tile(const cpu::InspectParams<T>& p, int64_t tile, const RowAdapter<P, T>* adapter) {
+  const TileView view(p.grid, tile);
+  PixelSummary<T, P::kSamples> pixels[kTilePixels];
   for (int i = 0; i < kTilePixels; ++i) pixels[i].start(i % kTile < view.columns && i / kTile < view.rows);
-  for (int64_t k = task.tile_offsets[tile]; k < task.tile_offsets[tile + 1]; ++k) {
-    const Splat<F, T>& splat = splats[task.pairs[k]];
-    const int32_t id = task.ids[task.pairs[k]];
+  for (int64_t k = p.lists.tile_offsets[tile]; k < p.lists.tile_offsets[tile + 1]; ++k) {
+    const int32_t j = p.lists.pairs[k], id = p.ids[j];
+    const Splat<P, T> splat = splat_at(p.splats, j, adapter);
     const Support<T> support = support_of(splat);
-    const auto terms = F::terms(splat.shape, splat.opacity, {T(view.x0) - splat.mean.x, T(view.y0) - splat.mean.y});
+    const auto terms = P::terms(splat.shape, splat.opacity, {T(view.x0) - splat.mean.x, T(view.y0) - splat.mean.y});
     int32_t touched = 0;
     int64_t units = 0;
     T largest = T(0);
@@ -37,30 +37,31 @@ template <class F, typename T> void inspect_tile(const cpu::InspectTask<T>& task
         if (!(span.lo <= T(view.x0 + column) && span.hi >= T(view.x0 + column))) continue;
         auto& pixel = pixels[row * kTile + column];
         if (!pixel.open()) continue;
-        const T weight = pixel.template add<F>(terms, {T(column), T(row)}, id);
+        const T weight = pixel.template add<P>(terms, {T(column), T(row)}, id);
         touched += weight > T(0);
         units += weight_units(weight);
         largest = max(largest, weight);
       }
     }
     if (touched == 0) continue;
-    __atomic_fetch_add(&task.touched[id], touched, __ATOMIC_RELAXED);
-    __atomic_fetch_add(&task.units[id], units, __ATOMIC_RELAXED);
-    atomic_max(&task.largest[id], float(largest));
+    __atomic_fetch_add(&p.touched[id], touched, __ATOMIC_RELAXED);
+    __atomic_fetch_add(&p.units[id], units, __ATOMIC_RELAXED);
+    atomic_max(&p.largest[id], float(largest));
   }
   for (int row = 0; row < view.rows; ++row) {
     for (int column = 0; column < view.columns; ++column) {
-      const int64_t i = int64_t(view.y0 + row) * task.grid.width + view.x0 + column;
-      task.median[i] = pixels[row * kTile + column].median;
-      task.dominant[i] = pixels[row * kTile + column].dominant;
+      const int64_t i = view.pixel(p.grid, row) + column;
+      p.median[i] = pixels[row * kTile + column].median;
+      p.dominant[i] = pixels[row * kTile + column].dominant;
     }
   }
 }
 
-template <class F, typename T> void inspect(const cpu::InspectTask<T>& task) {
-  cpu::parallel_for(task.grid.tiles(), task.threads, [&](int64_t tile) {
-    visit_tile_footprint<F, AdaptiveBoxes>(task.tile_samples, tile,
-                                           [&](auto f) { inspect_tile<decltype(f), T>(task, tile); });
+template <class F, typename T> void inspect(const cpu::InspectParams<T>& p) {
+  cpu::parallel_for(p.grid.tiles(), p.threads, [&](int64_t tile) {
+    visit_tile<F, AdaptiveBoxes, T>(p.lists.tile_samples, tile, [&](auto pixels, const auto* adapter) {
+      inspect_tile<decltype(pixels), T>(p, tile, adapter);
+    });
   });
 }
 

@@ -13,6 +13,13 @@
 #include <immintrin.h>
 #endif
 
+// One copy of a large function, whatever its callers pass.
+#if defined(__clang__)
+#define AR_ONE_COPY __attribute__((noinline))
+#else
+#define AR_ONE_COPY __attribute__((noinline, noclone))
+#endif
+
 namespace ar::AR_ISA {
 inline constexpr int kLanes = AR_LANES;
 }

@@ -1,46 +1,42 @@
-// All loops of the CPU path for one instruction set: kernels_*.cpp include this.
+// Fills the table of stages with the functions of one instruction set: kernels_*.cpp include this.
+//
+// What works on packs of pixels is compiled for every instruction set. Projection and bin are scalar and gain from AVX2
+// by its fused multiply-add and its rounding instructions; everything else is compiled for the baseline alone.
 #pragma once
 
 #include "core/footprint/registry.h"
 #include "cpu/bin.h"
 #include "cpu/blend.h"
-#include "cpu/inspect.h"
+#include "cpu/blend_vjp.h"
 #include "cpu/project.h"
-#include "cpu/weight.h"
 
 namespace ar::AR_ISA {
 
-template <class F, typename T> constexpr auto choose_stage() -> decltype(cpu::Stages<T>::choose) {
-  if constexpr (std::is_same_v<F, Adaptive>) {
-    return choose<F, T>;
-  } else {
-    return nullptr;
-  }
+/// What the loops over tiles are compiled for.
+template <class F> using TilesOf = std::conditional_t<std::is_same_v<F, Adaptive>, Adaptive, PixelsOf<F>>;
+
+/// Blending; yardsticks, which nobody waits for, only if `kYardsticks`.
+template <typename T, bool kYardsticks> void set_blend_stages(int footprint, cpu::Stages<T>& stages) {
+  visit_footprint(footprint, Footprints{}, [&](auto f) {
+    using F = decltype(f);
+    if constexpr (kYardsticks || !F::kYardstick) {
+      stages.blend = blend<TilesOf<F>, T>;
+      stages.blend_vjp = blend_vjp<TilesOf<F>, T>;
+    }
+  });
 }
 
-template <class F, template <typename> class Cam, typename T>
-inline constexpr cpu::CameraStages<T> kCameraStages = {count_candidates<Cam, T>, project<F, Cam, T>,
-                                                       project_vjp<F, Cam, T>};
+template <template <typename> class Cam, typename T> void set_camera_stages(cpu::CameraStages<T>& stages) {
+  stages.count_candidates = count_candidates<Cam, T>;
+  stages.project = project<Cam, T>;
+  stages.project_vjp = project_vjp<Cam, T>;
+}
 
-template <class F, typename T>
-inline constexpr cpu::Stages<T> kStages = {
-    F::kSamples,
-    kCameraStages<F, Camera, T>,
-    kCameraStages<F, FullCamera, T>,
-    count_pairs<F, T>,
-    scatter_pairs<F, T>,
-    choose_stage<F, T>(),
-    blend<F, T>,
-    blend_vjp<F, T>,
-    weight<F, T>,
-    weight_vjp<F, T>,
-    inspect<F, T>,
-};
-
-template <typename T> const cpu::Stages<T>* stages(std::string_view footprint) {
-  const cpu::Stages<T>* found = nullptr;
-  visit_footprint(footprint, Footprints{}, [&](auto f) { found = &kStages<decltype(f), T>; });
-  return found;
+template <typename T> void set_projection_and_bin(cpu::Stages<T>& stages) {
+  set_camera_stages<Camera>(stages.plain);
+  set_camera_stages<FullCamera>(stages.full);
+  stages.count_pairs = count_pairs<T>;
+  stages.scatter_pairs = scatter_pairs<T>;
 }
 
 }  // namespace ar::AR_ISA

@@ -1,4 +1,4 @@
-// The CPU path for AVX2.
+// What gains from AVX2.
 #if defined(__x86_64__)
 #include "cpu/kernels_std.h"
 
@@ -14,8 +14,9 @@
 #include "cpu/kernels.h"
 
 namespace ar::avx2 {
-template const cpu::Stages<float>* stages<float>(std::string_view);
-}
+template void set_blend_stages<float, false>(int, cpu::Stages<float>&);
+template void set_projection_and_bin<float>(cpu::Stages<float>&);
+}  // namespace ar::avx2
 
 #if defined(__clang__)
 #pragma clang attribute pop

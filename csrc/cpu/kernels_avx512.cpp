@@ -1,4 +1,4 @@
-// The CPU path for AVX512.
+// What gains from AVX-512.
 #if defined(__x86_64__)
 #include "cpu/kernels_std.h"
 
@@ -15,7 +15,7 @@
 #include "cpu/kernels.h"
 
 namespace ar::avx512 {
-template const cpu::Stages<float>* stages<float>(std::string_view);
+template void set_blend_stages<float, false>(int, cpu::Stages<float>&);
 }
 
 #if defined(__clang__)

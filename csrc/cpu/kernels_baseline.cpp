@@ -3,8 +3,8 @@
 
 #define AR_ISA baseline
 #define AR_LANES 4
-#include "cpu/kernels.h"
+#include "cpu/kernels_all.h"
 
 namespace ar::baseline {
-template const cpu::Stages<float>* stages<float>(std::string_view);
+template cpu::Stages<float> all_stages<float>(int);
 }

@@ -3,8 +3,8 @@
 
 #define AR_ISA double_precision
 #define AR_LANES 4
-#include "cpu/kernels.h"
+#include "cpu/kernels_all.h"
 
 namespace ar::double_precision {
-template const cpu::Stages<double>* stages<double>(std::string_view);
+template cpu::Stages<double> all_stages<double>(int);
 }

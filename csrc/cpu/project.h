@@ -6,76 +6,154 @@
 #include "core/project.h"
 #include "cpu/isa.h"
 #include "cpu/parallel.h"
-#include "cpu/tasks.h"
+#include "cpu/stages.h"
 
 namespace ar::AR_ISA {
 
-/// First pass: which Gaussians may be visible, and how many of each chunk, so that splats can be
-/// written densely and in input order.
-template <template <typename> class Cam, typename T> void count_candidates(const cpu::ProjectTask<T>& task) {
-  const Gaussians<T>& g = task.gaussians;
-  const T blur = T(std::max(task.options.variance, kPixelVariance));
-  cpu::parallel_for(cpu::chunks_of(g.n), task.threads, [&](int64_t chunk) {
-    const auto camera = load_camera_as<Cam<T>>(task.camera);
-    const int64_t begin = chunk * cpu::kChunk, end = std::min(g.n, begin + cpu::kChunk);
+/// body(chunk, begin, end) for all chunks of [0, n).
+template <class Body> void for_each_chunk(int64_t n, int threads, const Body& body) {
+  cpu::parallel_for(cpu::chunks_of(n), threads,
+                    [&](int64_t chunk) { body(chunk, chunk * cpu::kChunk, std::min(n, (chunk + 1) * cpu::kChunk)); });
+}
+
+template <typename T> AR_HD bool all_finite(const T* row, int count) {
+  for (int c = 0; c < count; ++c) {
+    if (!within(row[c], kMaxColor)) return false;
+  }
+  return true;
+}
+
+/// Coefficients of Gaussian i, or null.
+template <class Vec> AR_HD Vec* coefficients_of(Vec* shs, int stride, int64_t i) {
+  return shs ? shs + i * stride : nullptr;
+}
+
+template <template <typename> class Cam, typename T> void count_candidates(const cpu::ProjectParams<T>& p) {
+  const Gaussians<T>& g = p.gaussians;
+  for_each_chunk(g.n, p.threads, [&](int64_t chunk, int64_t begin, int64_t end) {
+    const auto camera = load_camera_as<Cam<T>>(p.camera);
     int64_t count = 0;
     for (int64_t i = begin; i < end; ++i) {
-      const bool candidate = may_be_visible(camera, g, i, blur);
-      task.candidates[i] = candidate;
+      const bool candidate = may_be_visible(camera, g, i, p.bounds);
+      p.candidates[i] = candidate;
       count += candidate;
     }
-    task.chunk_offsets[chunk] = count;
+    p.chunk_offsets[chunk] = count;
   });
 }
 
-template <class F, template <typename> class Cam, typename T> void project(const cpu::ProjectTask<T>& task) {
-  const int64_t n = task.gaussians.n;
-  auto* splats = reinterpret_cast<Splat<F, T>*>(task.splats);
-  cpu::parallel_for(cpu::chunks_of(n), task.threads, [&](int64_t chunk) {
-    const auto camera = load_camera_as<Cam<T>>(task.camera);
-    const int64_t begin = chunk * cpu::kChunk, end = std::min(n, begin + cpu::kChunk);
-    int64_t j = task.chunk_offsets[chunk];
+template <template <typename> class Cam, typename T> void project(const cpu::ProjectParams<T>& p) {
+  auto* splats = reinterpret_cast<SplatRow<T>*>(p.splats);
+  for_each_chunk(p.gaussians.n, p.threads, [&](int64_t chunk, int64_t begin, int64_t end) {
+    const auto camera = load_camera_as<Cam<T>>(p.camera);
+    int64_t j = p.chunk_offsets[chunk];
     for (int64_t i = begin; i < end; ++i) {
-      task.radii[i] = 0;
-      if (!task.candidates[i]) continue;
-      Splat<F, T> splat = {};
+      p.radii[i] = 0;
+      if (!p.candidates[i]) continue;
+      SplatRow<T> splat = {};
       T depth = T(0);
-      task.radii[i] = ar::project<F>(camera, task.gaussians, i, task.options, splat, depth);
+      p.radii[i] = ar::project(camera, p.gaussians, i, p.footprint, splat, depth);
+      if (splat.level > T(0)) {
+        if (p.given.data && !all_finite(p.given.row(int32_t(i)), p.given.count)) {
+          splat.level = T(0);
+          p.radii[i] = 0;
+        } else if (p.channels.data) {
+          write_channels(p.channels, i, splat.color, depth);
+        }
+      }
       splats[j] = splat;
-      task.depths[j] = depth;
-      task.ids[j] = int32_t(i);
+      p.depths[j] = depth;
+      p.ids[j] = int32_t(i);
       ++j;
     }
   });
 }
 
-template <class F, template <typename> class Cam, typename T> void project_vjp(const cpu::ProjectVjpTask<T>& task) {
-  const int64_t n = task.gaussians.n;
-  cpu::parallel_for(cpu::chunks_of(n), task.threads, [&](int64_t chunk) {
-    const auto camera = load_camera_as<Cam<T>>(task.camera);
-    const int64_t begin = chunk * cpu::kChunk, end = std::min(n, begin + cpu::kChunk);
-    int64_t j = std::lower_bound(task.ids, task.ids + task.n_splats, begin) - task.ids;
+/// The radii are those of project().
+template <template <typename> class Cam, typename T> void project_rows(const cpu::ProjectRowsParams<T>& p) {
+  const Gaussians<T>& g = p.gaussians;
+  for_each_chunk(g.n, p.threads, [&](int64_t, int64_t begin, int64_t end) {
+    const auto camera = load_camera_as<Cam<T>>(p.camera);
     for (int64_t i = begin; i < end; ++i) {
-      const bool is_splat = j < task.n_splats && task.ids[j] == i;
-      const int64_t first = is_splat ? task.splat_offsets[j] : 0, last = is_splat ? task.splat_offsets[j + 1] : 0;
+      p.radii[i] = 0;
+      ProjectedGaussian<T> projected;
+      if (!may_be_visible(camera, g, i, p.bounds) || !project_gaussian(camera, g, i, projected)) continue;
+      SplatRow<T> splat = {};
+      const int radius = shape_splat(projected, p.footprint, camera.grid, splat);
+      if (radius == 0) continue;
+      const bool touches = splat.level > T(0);
+      bool finite = true;
+      if (p.rows.colors) {
+        finite = splat_color(camera, g, i, coefficients_of(g.shs, g.sh_stride, i), splat.color);
+        p.rows.colors[i] = finite ? splat.color : Vec3<T>{T(0), T(0), T(0)};
+      }
+      if (touches && p.given.data) finite = finite && all_finite(p.given.row(int32_t(i)), p.given.count);
+      if (touches && !finite) continue;
+      p.radii[i] = radius;
+      p.rows.means2d[i] = projected.mean;
+      p.rows.cov2d[i] = {projected.cov.xx, projected.cov.xy, projected.cov.yy};
+      p.rows.dets[i] = projected.cov.det;
+      p.rows.opacities[i] = projected.opacity;
+      p.rows.depths[i] = projected.depth;
+    }
+  });
+}
+
+template <template <typename> class Cam, typename T> void project_vjp(const cpu::ProjectVjpParams<T>& p) {
+  const Gaussians<T>& g = p.gaussians;
+  for_each_chunk(g.n, p.threads, [&](int64_t chunk, int64_t begin, int64_t end) {
+    const auto camera = load_camera_as<Cam<T>>(p.camera);
+    int64_t j = std::lower_bound(p.pairs.ids, p.pairs.ids + p.pairs.splats, begin) - p.pairs.ids;
+    for (int64_t i = begin; i < end; ++i) {
+      const bool is_splat = j < p.pairs.splats && p.pairs.ids[j] == i;
+      const int64_t first = is_splat ? p.pairs.splat_offsets[j] : 0, last = is_splat ? p.pairs.splat_offsets[j + 1] : 0;
       j += is_splat;
       if (first == last) {
-        zero_grads(task.gaussians, i, task.grads);
+        zero_grads(g, i, p.grads);
         continue;
       }
       PairGrad<T> sums = {};
+      ShownGrad<T> shown = {};
       Vec2<T> abs2d = {};
       for (int64_t k = first; k < last; ++k) {
-        sums = sums + task.pair_grads[task.positions[k]];
-        if (task.pair_abs) abs2d = abs2d + task.pair_abs[task.positions[k]];
+        const int64_t pair = p.pairs.positions[k];
+        const T* row = p.pair_grads + pair * p.pair_stride;
+        sums = sums + *reinterpret_cast<const PairGrad<T>*>(row);
+        if (p.pair_colors) shown.color += *reinterpret_cast<const Vec3<T>*>(row + cpu::kPairNumbers);
+        if (p.pair_abs) abs2d = abs2d + p.pair_abs[pair];
       }
-      ar::project_vjp<F>(camera, task.gaussians, i, task.options, sums, task.grads,
-                         task.camera_grads ? &task.camera_grads[chunk] : nullptr);
-      if (task.grads.means2d && task.grads.means2d_stride == 4) {
-        T* row = task.grads.means2d + i * 4;
+      if (p.dL_dchannels.data) add_channels_vjp(p.dL_dchannels, i, apply_row(camera.view_z, g.means[i]), shown);
+      const auto grad_of = [&](const Cov2d<T>& cov, T) { return projected_grad(p.footprint, cov, sums); };
+      ar::project_vjp(camera, g, i, grad_of, shown, coefficients_of(g.shs, g.sh_stride, i),
+                      coefficients_of(p.grads.shs, g.sh_stride, i), p.grads,
+                      p.camera_grads ? &p.camera_grads[chunk] : nullptr);
+      if (p.grads.means2d && p.grads.means2d_stride == 4) {
+        T* row = p.grads.means2d + i * 4;
         row[2] = T(0.5) * camera.size.x * abs2d.x;
         row[3] = T(0.5) * camera.size.y * abs2d.y;
       }
+    }
+  });
+}
+
+template <template <typename> class Cam, typename T> void project_rows_vjp(const cpu::ProjectRowsVjpParams<T>& p) {
+  const Gaussians<T>& g = p.gaussians;
+  for_each_chunk(g.n, p.threads, [&](int64_t chunk, int64_t begin, int64_t end) {
+    const auto camera = load_camera_as<Cam<T>>(p.camera);
+    for (int64_t i = begin; i < end; ++i) {
+      const int64_t row = p.rows.rows[i];
+      if (row < 0) {
+        zero_grads(g, i, p.grads);
+        continue;
+      }
+      ShownGrad<T> shown = {};
+      if (p.rows.colors) shown.color = p.rows.colors[row];
+      if (p.rows.depths) shown.depth = p.rows.depths[row];
+      const auto grad_of = [&](const Cov2d<T>&, T opacity) { return projected_grad(p.rows, row, opacity); };
+      ar::project_vjp(camera, g, i, grad_of, shown, coefficients_of(g.shs, g.sh_stride, i),
+                      coefficients_of(p.grads.shs, g.sh_stride, i), p.grads,
+                      p.camera_grads ? &p.camera_grads[chunk] : nullptr);
+      if (p.grads.means2d && p.grads.means2d_stride == 4) p.grads.means2d[i * 4 + 3] = T(0);
     }
   });
 }

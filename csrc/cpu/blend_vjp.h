@@ -1,0 +1,173 @@
+// Loop of blend_vjp: as blend, from the last splat to the first.
+#pragma once
+
+#include "core/blend.h"
+#include "cpu/parallel.h"
+#include "cpu/tile.h"
+
+namespace ar::AR_ISA {
+
+/// The gradient of a tile, per sample, with respect to the channels [first, first + count).
+template <typename T>
+void load_gradient(const cpu::BlendVjpParams<T>& p, const TileView& view, int first, int count, T samples, T* to) {
+  constexpr int kCount = LanesOf<T>::kCount;
+  using V = typename LanesOf<T>::Type;
+  const int64_t size = int64_t(p.grid.width) * p.grid.height;
+  for (int c = 0; c < count; ++c) {
+    alignas(64) T plane[kTilePixels] = {};
+    if (const T* image = p.dL_dimage.plane(first + c, size)) load_tile(view, p.grid, image, plane);
+    for (int i = 0; i < kTilePixels; i += kCount)
+      store(channels_at(to, i, count) + c * kCount, load(plane + i, V()) / V(samples));
+  }
+}
+
+/// a . b over `count` channels of one pack of pixels.
+template <class V, typename T> AR_HD V dot_channels(const T* gradient, const T* shown, int count) {
+  constexpr int kCount = LanesOf<T>::kCount;
+  const auto term = [&](int c, V sum) { return madd(load(gradient + c * kCount, V()), V(shown[c]), sum); };
+  if (count == 3) return term(0, term(1, load(gradient + 2 * kCount, V()) * V(shown[2])));
+  const V zero = V(T(0));
+  V sums[4] = {zero, zero, zero, zero};  // as many as hide the latency of a madd
+  int c = 0;
+  for (; c + 4 <= count; c += 4) {
+    AR_UNROLL
+    for (int k = 0; k < 4; ++k) sums[k] = term(c + k, sums[k]);
+  }
+  for (; c < count; ++c) sums[0] = term(c, sums[0]);
+  return (sums[0] + sums[1]) + (sums[2] + sums[3]);
+}
+
+/// `gradient`: room for the channels of a tile. `adapter`: null where rows hold P's shape.
+template <class P, typename T>
+AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T* gradient,
+                                const RowAdapter<P, T>* adapter) {
+  using V = typename LanesOf<T>::Type;
+  constexpr int kCount = LanesOf<T>::kCount, kSamples = P::kSamples;
+  const TileView view(p.grid, tile);
+  const LaneIndex<T> lanes;
+  const int64_t size = int64_t(p.grid.width) * p.grid.height;
+  // What a pair shows enters dL/dalpha with all channels, the sums only with the window's.
+  const bool with_shape = p.pair_grads != nullptr, with_abs = with_shape && p.pair_abs;
+  const int loaded = with_shape ? p.channels.count : p.count, window = with_shape ? p.first : 0;
+  alignas(64) T transmittance[kSamples][kTilePixels];
+  alignas(64) T behind[kSamples][kTilePixels];
+  alignas(64) int32_t last[kSamples][kTilePixels] = {};
+  alignas(64) T behind_all[kTilePixels] = {};
+  int32_t row_last[kTile] = {}, tile_last = 0;
+  load_gradient(p, view, with_shape ? 0 : p.first, loaded, T(kSamples), gradient);
+  if (with_shape) {
+    for (int i = 0; i < kTilePixels; i += kCount) {
+      V sum = V(T(0));
+      for (int c = 0; c < loaded; ++c) {
+        const V g = load(channels_at(gradient, i, loaded) + c * kCount, V());
+        sum = sum + g * V(p.background[c]);
+      }
+      store(behind_all + i, sum);
+    }
+    if (p.dL_dalpha) {
+      // Alpha is what hides the background: a channel with a background of -1 and no splats' colours.
+      alignas(64) T dL_dalpha[kTilePixels] = {};
+      load_tile(view, p.grid, p.dL_dalpha, dL_dalpha);
+      for (int i = 0; i < kTilePixels; ++i) behind_all[i] -= dL_dalpha[i] / T(kSamples);
+    }
+  }
+  for (int s = 0; s < kSamples; ++s) {
+    std::fill_n(transmittance[s], kTilePixels, T(1));
+    load_tile(view, p.grid, p.transmittance + s * size, transmittance[s]);
+    load_tile(view, p.grid, p.last + s * size, last[s]);
+    std::copy_n(behind_all, kTilePixels, behind[s]);
+    for (int i = 0; i < kTilePixels; ++i) row_last[i / kTile] = std::max(row_last[i / kTile], last[s][i]);
+  }
+  for (int row = 0; row < kTile; ++row) tile_last = std::max(tile_last, row_last[row]);
+  const uint32_t rows_in_image = (1u << view.rows) - 1;
+  const int32_t* pairs = p.lists.pairs;
+  const int64_t begin = p.lists.tile_offsets[tile], end = p.lists.tile_offsets[tile + 1];
+  for (int64_t k = begin + tile_last; k < end; ++k) {
+    if (with_shape) std::fill_n(p.pair_grads + k * p.pair_stride, cpu::kPairNumbers, T(0));
+    if (with_abs) p.pair_abs[k] = {T(0), T(0)};
+    std::fill_n(p.channel_sums + k * p.channel_stride, p.count, T(0));
+  }
+  for (int32_t k = tile_last - 1; k >= 0; --k) {
+    if (k >= 4) __builtin_prefetch(p.splats + int64_t(pairs[begin + k - 4]) * kSplatWidth);
+    const int32_t j = pairs[begin + k];
+    const Splat<P, T> splat = splat_at(p.splats, j, adapter);
+    const T* shown = p.channels.row(j);
+    const TileMask<T> reach = reach_of(splat, view, lanes);
+    const Vec2<T> origin = {T(view.x0) - splat.mean.x, T(view.y0) - splat.mean.y};
+    const auto terms = P::terms(splat.shape, splat.opacity, origin);
+    const V zero = V(T(0));
+    const IndexOf<V> index(k);
+    ShapeGrad<V> shape = {{zero, zero}, {zero, zero, zero}};
+    V weighted = zero;
+    Vec3<V> color = {zero, zero, zero};  // of three channels
+    alignas(64) T sums[cpu::kWindow * kCount];
+    if (p.count != 3) std::fill_n(sums, p.count * kCount, T(0));
+    Vec2<V> abs2d = {zero, zero};
+    for (int c = 0; c < TileMask<T>::kPacks; ++c) {
+      const V x = load(lanes.value + c * kCount, V());
+      for (uint32_t rows = reach.rows[c] & rows_in_image; rows != 0; rows &= rows - 1) {
+        const int row = __builtin_ctz(rows), pixel = row * kTile + c * kCount;
+        if (k >= row_last[row]) continue;
+        const Vec2<V> at = {x, V(lanes.value[row])};
+        const T* g = channels_at(gradient, pixel, loaded);
+        const V g_color = with_shape ? dot_channels<V>(g, shown, loaded) : zero;
+        V contribution = zero;
+        ShapeGrad<V> of_pixel = {{zero, zero}, {zero, zero, zero}};
+        AR_UNROLL
+        for (int s = 0; s < kSamples; ++s) {
+          const V alpha = P::alpha(terms, at, s);
+          const MaskOf<V> mask = (alpha >= V(T(kAlphaMin))) & (index < load_index(last[s] + pixel, V()));
+          V t = load(transmittance[s] + pixel, V()), b = load(behind[s] + pixel, V());
+          const BlendGrad<V> grad = blend_sample_vjp(mask, alpha, g_color, t, b);
+          store(transmittance[s] + pixel, t);
+          store(behind[s] + pixel, b);
+          contribution = contribution + grad.contribution;
+          weighted = madd(grad.dL_dalpha, alpha, weighted);
+          P::add_alpha_vjp(terms, at, s, alpha, grad.dL_dalpha, shape);
+          // Again for the pixel alone: to ask for it must not change the other sums by a bit.
+          if (with_abs) P::add_alpha_vjp(terms, at, s, alpha, grad.dL_dalpha, of_pixel);
+        }
+        g += window * kCount;
+        if (p.count == 3) {
+          color = {madd(contribution, load(g, V()), color.x), madd(contribution, load(g + kCount, V()), color.y),
+                   madd(contribution, load(g + 2 * kCount, V()), color.z)};
+        } else {
+          for (int i = 0; i < p.count * kCount; i += kCount)
+            store(sums + i, madd(contribution, load(g + i, V()), load(sums + i, V())));
+        }
+        if (with_abs) {
+          const Vec2<V> by_mean = transform_transposed(P::mean_map(splat.shape), of_pixel.offset);
+          abs2d = abs2d + Vec2<V>{abs(by_mean.x), abs(by_mean.y)};
+        }
+      }
+    }
+    T* channel_sums = p.channel_sums + (begin + k) * p.channel_stride;
+    if (p.count == 3) {
+      channel_sums[0] = sum(color.x);
+      channel_sums[1] = sum(color.y);
+      channel_sums[2] = sum(color.z);
+    } else {
+      for (int c = 0; c < p.count; ++c) channel_sums[c] = sum(load(sums + c * kCount, V()));
+    }
+    if (!with_shape) continue;
+    const ShapeGrad<T> total = {{sum(shape.offset.x), sum(shape.offset.y)},
+                                {sum(shape.shape.xx), sum(shape.shape.xy), sum(shape.shape.yy)}};
+    const T total_weighted = sum(weighted);
+    const auto& row = reinterpret_cast<const SplatRow<T>*>(p.splats)[j];
+    auto* pair = reinterpret_cast<PairGrad<T>*>(p.pair_grads + (begin + k) * p.pair_stride);
+    *pair = {adapter ? adapter->collect(row, total, total_weighted) : P::collect(terms, total, total_weighted),
+             total_weighted};
+    if (with_abs) p.pair_abs[begin + k] = {sum(abs2d.x), sum(abs2d.y)};
+  }
+}
+
+template <class F, typename T> void blend_vjp(const cpu::BlendVjpParams<T>& p) {
+  cpu::parallel_for(p.grid.tiles(), p.threads, [&](int64_t tile) {
+    T* gradient = p.scratch + omp_get_thread_num() * int64_t(p.channels.count) * kTilePixels;
+    visit_tile<F, AdaptiveBoxesVjp, T>(p.lists.tile_samples, tile, [&](auto pixels, const auto* adapter) {
+      blend_vjp_tile<decltype(pixels), T>(p, tile, gradient, adapter);
+    });
+  });
+}
+
+}  // namespace ar::AR_ISA
