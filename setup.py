@@ -62,11 +62,11 @@ WITH_CUDA = wants_cuda()
 if WITH_CUDA and not torch.cuda.is_available():
     os.environ.setdefault("TORCH_CUDA_ARCH_LIST", default_architectures())
 
-SOURCES = sorted(str(p.relative_to(ROOT)) for d in ("cpu", "torch") for p in ROOT.glob(f"csrc/{d}/*.cpp"))
+SOURCES = [str(p.relative_to(ROOT)) for d in ("cpu", "torch") for p in sorted(ROOT.glob(f"csrc/{d}/*.cpp"))]
 if WITH_CUDA:
-    SOURCES += sorted(str(p.relative_to(ROOT)) for p in ROOT.glob("csrc/cuda/*.cu"))
+    SOURCES += [str(p.relative_to(ROOT)) for p in sorted(ROOT.glob("csrc/cuda/*.cu"))]
 else:
-    SOURCES.remove(str(Path("csrc/torch/backend_cuda.cpp")))
+    SOURCES = [source for source in SOURCES if not source.endswith("_cuda.cpp")]
 
 # No -std: torch sets the standard that its headers need. No contraction: forward and backward must
 # round alike (csrc/core/lanes.h), and bits must not depend on the compiler's choices. Nothing but the module's entry

@@ -163,11 +163,12 @@ def project(
     return Splats(*rows, saved[0], width, height, shared["footprint"], shared["option"])
 
 
-def bin(splats: Splats, *, keep: bool = True) -> TileLists:
+def bin(splats: Splats, *, background: torch.Tensor | None = None, keep: bool = True) -> TileLists:
     """Sorts splats by tile and depth. Without gradient. Splats of equal depth keep their order.
 
     Args:
         splats: Of `project`.
+        background: (3,) what `adaptive` takes to lie behind the splats; None: black. Other footprints do not read it.
         keep: Make what the gradient of `blend` needs too.
 
     Raises:
@@ -181,6 +182,7 @@ def bin(splats: Splats, *, keep: bool = True) -> TileLists:
         opacities=s.opacities.detach(),
         depths=s.depths.detach(),
         colors=s.colors.detach() if len(s.colors) == len(s.means2d) else None,
+        background=background,
         row_splits=s.row_splits,
         keep=keep,
         **s.size,

@@ -47,7 +47,7 @@ def test_stages_make_the_picture_of_the_rasterizer(device, dtype, variant):
     scene, again = (scenes.leaves(scene_of(dtype, device)) for _ in range(2))
     color, radii = ar.GaussianRasterizer(settings)(means2D=None, **scene)
     splats = ar.project(settings, **again)
-    image, alpha = ar.blend(splats, ar.bin(splats), background=settings.bg)
+    image, alpha = ar.blend(splats, ar.bin(splats, background=settings.bg), background=settings.bg)
     assert image.shape == (1, 3, 21, 27) and alpha.shape == (1, 1, 21, 27)
     assert (image[0] - color).abs().max() <= tolerances(dtype)[0]
     assert torch.equal(radii[splats.gaussian_ids.long()], splats.radii) and len(splats.radii) == (radii > 0).sum()

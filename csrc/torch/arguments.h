@@ -124,7 +124,7 @@ struct ProjectArguments {
 /// Arguments of `bin`: the rows that `project` made for C cameras, camera after camera.
 struct BinArguments {
   Tensor means2d, cov2d, dets, opacities, depths;
-  OptionalTensor colors;  ///< what `adaptive` chooses samples by
+  OptionalTensor colors, background;  ///< (N, 3), (3,): what `adaptive` chooses samples by
   Tensor row_splits;      ///< (C + 1,) int64 on the CPU, first row of each camera
   int64_t image_height = 0, image_width = 0;
   std::string footprint;
@@ -138,6 +138,7 @@ struct BinArguments {
     visit("Tensor opacities", opacities);
     visit("Tensor depths", depths);
     visit("Tensor? colors", colors);
+    visit("Tensor? background", background);
     visit("Tensor row_splits", row_splits);
     visit("int image_height", image_height);
     visit("int image_width", image_width);

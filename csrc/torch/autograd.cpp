@@ -42,16 +42,20 @@ struct Op {
   bool saves() const { return forward.schema().returns()[outputs - 1].type()->kind() == c10::TypeKind::ListType; }
 };
 
-Tensor tensor_or_none(const IValue& value) { return value.isTensor() ? value.toTensor() : Tensor(); }
-IValue none_or_tensor(const Tensor& tensor) { return tensor.defined() ? IValue(tensor) : IValue(); }
+bool is_given(const IValue& value) { return value.isTensor() && value.toTensor().defined(); }
 
 struct Node : torch::autograd::Function<Node> {
   /// Runs the op on `stack` and returns all tensors of its outputs in a row; `sizes` says how many each of them has.
+  /// `tensors` are the arguments that are tensors, but for those that are missing.
   static variable_list forward(AutogradContext* ctx, at::TensorList tensors, const Op* op, Stack* stack,
                                std::vector<int64_t>* sizes) {
     const at::AutoDispatchBelowADInplaceOrView guard;
     Stack others = *stack;  // the arguments that are no tensors; tensors are kept as autograd wants them
-    for (const size_t i : op->tensors) others[i] = IValue();
+    std::vector<bool> given;
+    for (const size_t i : op->tensors) {
+      given.push_back(is_given(others[i]));
+      others[i] = IValue();
+    }
     op->forward.callBoxed(*stack);
     variable_list out, integers;
     size_t differentiable = 0;
@@ -72,37 +76,43 @@ struct Node : torch::autograd::Function<Node> {
     ctx->save_for_backward(std::move(saved));
     ctx->saved_data["op"] = int64_t(reinterpret_cast<intptr_t>(op));  // lives for ever
     ctx->saved_data["arguments"] = c10::ivalue::Tuple::create(std::move(others));
+    ctx->saved_data["given"] = given;
     ctx->saved_data["differentiable"] = int64_t(differentiable);
     return out;
   }
 
   static variable_list backward(AutogradContext* ctx, variable_list dL_doutputs) {
     const Op* op = reinterpret_cast<const Op*>(intptr_t(ctx->saved_data["op"].toInt()));
-    const size_t count = op->tensors.size(), differentiable = size_t(ctx->saved_data["differentiable"].toInt());
-    variable_list grads(count + 3);  // op, stack and sizes have none
+    const auto given = ctx->saved_data["given"].toBoolList();
+    const size_t differentiable = size_t(ctx->saved_data["differentiable"].toInt());
+    const variable_list saved = ctx->get_saved_variables();
+    std::vector<size_t> places;  // of the given tensors among all
+    for (size_t k = 0; k < given.size(); ++k) {
+      if (given[k]) places.push_back(k);
+    }
+    variable_list grads(places.size() + 3);  // op, stack and sizes have none
     bool any = false;
-    c10::List<OptionalTensor> given;
+    c10::List<OptionalTensor> gradients;
     for (size_t k = 0; k < differentiable; ++k) {
-      given.push_back(dL_doutputs[k].defined() ? OptionalTensor(dL_doutputs[k]) : std::nullopt);
+      gradients.push_back(dL_doutputs[k].defined() ? OptionalTensor(dL_doutputs[k]) : std::nullopt);
       any = any || dL_doutputs[k].defined();
     }
     if (!any) return grads;
-    const variable_list saved = ctx->get_saved_variables();
-    Stack stack = {given};
+    Stack stack = {gradients};
     const auto arguments = ctx->saved_data["arguments"].toTuple();
     for (const IValue& value : arguments->elements()) stack.push_back(value);
-    c10::List<bool> needs;
-    for (size_t k = 0; k < count; ++k) {
-      stack[1 + op->tensors[k]] = none_or_tensor(saved[k]);
-      needs.push_back(saved[k].defined() && ctx->needs_input_grad(k));
+    std::vector<bool> needs(given.size(), false);
+    for (size_t k = 0; k < places.size(); ++k) {
+      stack[1 + op->tensors[places[k]]] = saved[k];
+      needs[places[k]] = ctx->needs_input_grad(k);
     }
-    stack.push_back(c10::List<Tensor>(std::vector<Tensor>(saved.begin() + int64_t(count), saved.end())));
+    stack.push_back(c10::List<Tensor>(std::vector<Tensor>(saved.begin() + int64_t(places.size()), saved.end())));
     stack.push_back(needs);
     op->vjp.callBoxed(stack);
     const std::vector<Tensor> out = stack[0].toTensorVector();
-    for (size_t k = 0; k < count; ++k) {
-      // An op takes a matrix as (1, 4, 4) too. Gradients that there are not, as of a plain camera, are empty.
-      if (needs[k] && (out[k].numel() > 0 || saved[k].numel() == 0)) grads[k] = out[k].view_as(saved[k]);
+    for (size_t k = 0; k < places.size(); ++k) {
+      // An op takes a matrix as (1, 4, 4) too.
+      if (needs[places[k]]) grads[k] = out[places[k]].view_as(saved[k]);
     }
     return grads;
   }
@@ -113,7 +123,7 @@ bool wants_gradient(const Op& op, const Stack& stack, size_t first) {
   if (!at::GradMode::is_enabled()) return false;
   for (const size_t i : op.tensors) {
     const IValue& value = stack[first + i];
-    if (value.isTensor() && value.toTensor().defined() && value.toTensor().requires_grad()) return true;
+    if (is_given(value) && value.toTensor().requires_grad()) return true;
   }
   return false;
 }
@@ -139,7 +149,9 @@ void differentiate(const c10::OperatorHandle& handle, Stack* stack) {
   Stack arguments(stack->begin() + int64_t(first), stack->end());
   torch::jit::drop(*stack, op->arguments);
   variable_list tensors;
-  for (const size_t i : op->tensors) tensors.push_back(tensor_or_none(arguments[i]));
+  for (const size_t i : op->tensors) {
+    if (is_given(arguments[i])) tensors.push_back(arguments[i].toTensor());
+  }
   std::vector<int64_t> sizes;
   const variable_list out = Node::apply(at::TensorList(tensors), op, &arguments, &sizes);
   auto next = out.begin();

@@ -294,6 +294,9 @@ void check(BinArguments& a) {
     check_rows(*a.colors, "colors", a.means2d.size(0), {3}, "(N, 3)");
     a.colors = a.colors->contiguous();
   }
+  if (!a.background) a.background = at::zeros({3}, a.means2d.options());
+  check_like(*a.background, "background", a.means2d, "means2d");
+  check_vector(*a.background, "background");
   check_image_size(a.image_height, a.image_width);
 }
 

@@ -10,6 +10,7 @@
 #include "core/footprint/registry.h"
 #include "core/sh.h"
 #include "cpu/stages.h"
+#include "torch/backend.h"
 #include "torch/recipe.h"
 
 namespace ar::ops {

@@ -124,6 +124,11 @@ bool any_of(const std::vector<bool>& needs, size_t first, size_t count) {
 void check_needs(const std::vector<bool>& needs, size_t count) {
   TORCH_CHECK_VALUE(needs.size() == count, "needs must have ", count, " members, got ", needs.size());
 }
+/// Without a lens there are no gradients with respect to the four tensors of the camera, which begin at `first`.
+void check_camera_needs(const std::vector<bool>& needs, size_t first, const OptionalTensor& lens) {
+  TORCH_CHECK_VALUE(lens || !any_of(needs, first, 4),
+                    "lens must be given where viewmatrix, projmatrix or campos requires a gradient, got None");
+}
 
 /// The tensors of Inputs, in the order of Grads.
 constexpr size_t kGaussianTensors = 8, kCameraTensors = 4, kInputTensors = kGaussianTensors + kCameraTensors;
@@ -214,6 +219,7 @@ std::vector<Tensor> rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
     check(a);
     const std::vector<bool>& needs = arguments.needs;
     check_needs(needs, kInputTensors + 1);
+    check_camera_needs(needs, kGaussianTensors, a.lens);
     const Saved saved(arguments.saved);
     const TileGrid grid = grid_of(a.image_height, a.image_width);
     check_saved(saved.lists, saved.state, a.means3D, footprint, grid);
@@ -310,6 +316,7 @@ std::vector<Tensor> project_vjp(VjpArguments<ProjectArguments> arguments) {
   const int64_t cameras = check_cameras(a);
   const std::vector<bool>& needs = arguments.needs;
   check_needs(needs, 11);
+  check_camera_needs(needs, 7, a.lens);
   TORCH_CHECK_VALUE(arguments.saved.size() == 3, "saved must be what project saved, got ", arguments.saved.size(),
                     " tensors");
   const Tensor ids = arguments.saved[1], splits = arguments.saved[2];
@@ -380,7 +387,6 @@ std::vector<Tensor> bin(BinArguments a) {
   TORCH_CHECK_VALUE(!footprint.chosen || a.colors,
                     "colors must be given for the footprint adaptive, which chooses samples by them, got None");
   const TileGrid grid = grid_of(a.image_height, a.image_width);
-  const Tensor black = at::zeros({3}, a.means2d.options());
   const int64_t* splits = a.row_splits.const_data_ptr<int64_t>();
   std::vector<Tensor> out;
   for (int64_t c = 0; c + 1 < a.row_splits.size(0); ++c) {
@@ -396,7 +402,7 @@ std::vector<Tensor> bin(BinArguments a) {
     PassOptions options = {};
     options.keep = a.keep;
     options.exact = at::globalContext().deterministicAlgorithms();
-    append_to(out, backend->bin(backend->shape_rows(rows, footprint, grid), footprint, grid, black, options));
+    append_to(out, backend->bin(backend->shape_rows(rows, footprint, grid), footprint, grid, *a.background, options));
   }
   return out;
 }
