@@ -46,7 +46,7 @@ template <class F, typename T> AR_HD typename F::template Shape<T> shape_of(cons
 template <typename T> AR_HD Support<T> support_of(const SplatRow<T>& row, int footprint) {
   Mat2<T> w = {};
   T reach = T(0);
-  visit_footprint(footprint, Footprints{}, [&](auto f) {
+  visit_footprint(footprint, Footprints{}, [&](auto f) AR_HD_LAMBDA {
     using F = decltype(f);
     w = F::ellipse(shape_of<F>(row));
     reach = T(F::kReach);
@@ -127,7 +127,7 @@ template <typename T, class Visit> AR_HD void for_each_tile_row(const Support<T>
 
 /// Calls visit(tile index) for every tile the support touches, rows first, columns ascending.
 template <typename T, class Visit> AR_HD void for_each_tile(const Support<T>& s, TileGrid grid, Visit&& visit) {
-  for_each_tile_row(s, grid, [&](int row, Range columns) {
+  for_each_tile_row(s, grid, [&](int row, Range columns) AR_HD_LAMBDA {
     for (int column = columns.first; column <= columns.last; ++column) visit(int64_t(row) * grid.columns() + column);
   });
 }

@@ -3,10 +3,13 @@
 
 #if defined(__CUDACC__)
 #define AR_HD __host__ __device__ __forceinline__
+#define AR_HD_LAMBDA
 #else
 // Always inlined, so that a translation unit compiled for a newer instruction set never leaves a
 // copy of a core function behind for the linker to hand to one compiled for an older set.
 #define AR_HD inline __attribute__((always_inline))
+/// The same for a lambda, between its parameters and its body.
+#define AR_HD_LAMBDA __attribute__((always_inline))
 #endif
 
 /// Before a loop of few, constant iterations, whose body should see the index as a constant.

@@ -18,7 +18,7 @@ template <typename T> struct CullBounds {
 
 template <typename T> CullBounds<T> cull_bounds(FootprintChoice footprint) {
   CullBounds<T> bounds = {};
-  visit_footprint(footprint.index, Footprints{}, [&](auto f) {
+  visit_footprint(footprint.index, Footprints{}, [&](auto f) AR_HD_LAMBDA {
     using F = decltype(f);
     const double support = F::support_variance(footprint.options), radius = F::radius_variance(footprint.options);
     bounds = {T(max(support, radius)), T(2 * std::log(1 / kAlphaMin) + F::kExtraLevel + kLevelSlack)};
@@ -106,7 +106,7 @@ AR_HD int shape_splat(const ProjectedGaussian<T>& p, FootprintChoice footprint, 
   splat.level = T(0);
   Mat2<T> w = {};
   T level = T(0), reach = T(0), radius_variance = T(0);
-  visit_footprint(footprint.index, Footprints{}, [&](auto f) {
+  visit_footprint(footprint.index, Footprints{}, [&](auto f) AR_HD_LAMBDA {
     using F = decltype(f);
     const auto shape = F::prepare(p.cov, footprint.options);
     w = F::ellipse(shape);
@@ -223,7 +223,7 @@ template <typename T>
 AR_HD ProjectedGrad<T> projected_grad(FootprintChoice footprint, const Cov2d<T>& cov, const PairGrad<T>& sums) {
   ProjectedGrad<T> grad = {};
   grad.weighted = sums.weighted;
-  visit_footprint(footprint.index, Footprints{}, [&](auto f) {
+  visit_footprint(footprint.index, Footprints{}, [&](auto f) AR_HD_LAMBDA {
     using F = decltype(f);
     grad.splat = F::prepare_vjp(cov, F::prepare(cov, footprint.options), sums.shape, sums.weighted, footprint.options);
   });

@@ -25,6 +25,8 @@ extern template void set_projection_and_bin<float>(cpu::Stages<float>&);
 namespace avx512 {
 template <typename T, bool kYardsticks> void set_blend_stages(int footprint, cpu::Stages<T>& stages);
 extern template void set_blend_stages<float, false>(int, cpu::Stages<float>&);
+template <typename T> void set_projection_and_bin(cpu::Stages<T>& stages);
+extern template void set_projection_and_bin<float>(cpu::Stages<float>&);
 }  // namespace avx512
 #endif
 
@@ -55,8 +57,9 @@ const Stages<float>& avx2_stages(int footprint) {
 }
 const Stages<float>& avx512_stages(int footprint) {
   static const auto tables = make_tables([](int i) {
-    Stages<float> stages = avx2_stages(i);
+    Stages<float> stages = baseline_stages(i);
     avx512::set_blend_stages<float, false>(i, stages);
+    avx512::set_projection_and_bin(stages);
     return stages;
   });
   return tables[footprint];

@@ -1,7 +1,8 @@
 // Fills the table of stages with the functions of one instruction set: kernels_*.cpp include this.
 //
-// What works on packs of pixels is compiled for every instruction set. Projection and bin are scalar and gain from AVX2
-// by its fused multiply-add and its rounding instructions; everything else is compiled for the baseline alone.
+// Here is what every instruction set has: blending works on packs of pixels, projection and bin are scalar and gain by
+// the fused multiply-add and the rounding instructions. kernels_all.h has the rest, which is compiled for the baseline
+// alone.
 #pragma once
 
 #include "core/footprint/registry.h"

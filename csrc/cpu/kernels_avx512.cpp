@@ -16,7 +16,8 @@
 
 namespace ar::avx512 {
 template void set_blend_stages<float, false>(int, cpu::Stages<float>&);
-}
+template void set_projection_and_bin<float>(cpu::Stages<float>&);
+}  // namespace ar::avx512
 
 #if defined(__clang__)
 #pragma clang attribute pop
