@@ -1,10 +1,9 @@
-// The parts of bin that no footprint changes: sorts, and the plan of the blending work.
+// Launches of bin: sorts, pairs, and the plan of the blending work.
 #include <algorithm>
 #include <cub/block/block_reduce.cuh>
 #include <cub/block/block_scan.cuh>
 
-#include "cuda/sort.cuh"
-#include "cuda/tasks.h"
+#include "cuda/bin.cuh"
 #include "cuda/warp.cuh"
 
 namespace ar::cuda {
@@ -70,10 +69,14 @@ __global__ void __launch_bounds__(kCountThreads)
 
 constexpr int kRangeThreads = 128;
 
-/// Each tile finds its first pair.
+/// Each tile finds its first pair. Tells the host how many pairs there are.
 __global__ void __launch_bounds__(kRangeThreads)
     tile_offsets_kernel(const uint32_t* tiles, const Counts* counts, int64_t capacity, int64_t tile_count,
-                        int64_t* tile_offsets) {
+                        int64_t* tile_offsets, PairFeedback feedback) {
+  if (blockIdx.x == 0 && threadIdx.x == 0 && feedback.word) {
+    const uint64_t pairs = min(uint64_t(counts->pairs), uint64_t(0xffffffff));
+    *feedback.word = uint64_t(feedback.frame) << 32 | pairs;
+  }
   const int64_t tile = int64_t(blockIdx.x) * kRangeThreads + threadIdx.x;
   if (counts->pairs > capacity || tile > tile_count) return;
   int64_t low = 0, high = counts->pairs;
@@ -90,14 +93,12 @@ __global__ void __launch_bounds__(kRangeThreads)
 
 constexpr int kPlanThreads = 256;
 
-/// Work is handed out by samples, and of those longest first, so that no block starts on a long piece
-/// when the others are done. Lengths are classed by powers of two; within a class the order does not matter.
+/// Work is handed out by samples, and of those longest first, so that no block starts on a long piece when the others are
+/// done. Lengths are classed by powers of two; within a class the order does not matter.
 struct WorkClasses {
-  static constexpr int kLengths = 33, kCount = kSampleClasses * kLengths;
-
-  __device__ static int of(int samples, int length) { return sample_class(samples) * kLengths + __clz(length); }
-  /// Adds a piece to its class and returns how many were there. Lanes of one class go together: atomics
-  /// to one place are slow.
+  __device__ static int of(int samples, int length) { return sample_class(samples) * kLengthClasses + __clz(length); }
+  /// Adds a piece to its class and returns how many were there. Lanes of one class go together: atomics to one place are
+  /// slow.
   __device__ static int take(int32_t* classes, int of) {
     const uint32_t peers = __match_any_sync(__activemask(), of);
     const int leader = __ffs(peers) - 1;
@@ -106,13 +107,6 @@ struct WorkClasses {
     return __shfl_sync(peers, first, leader) + __popc(peers & ((1u << lane_id()) - 1));
   }
 };
-
-/// Counters of a plan, zero before use.
-struct PlanCounters {
-  int32_t tile_sizes[WorkClasses::kCount], chunk_sizes[WorkClasses::kCount];  // pieces per class
-  int32_t tile_places[WorkClasses::kCount], chunk_places[WorkClasses::kCount];
-};
-static_assert(sizeof(PlanCounters) == kPlanCounters * sizeof(int32_t));
 
 __device__ int list_length(const TileLists& lists, int64_t tile) {
   if (lists.counts->pairs > lists.capacity) return 1;
@@ -123,11 +117,14 @@ __device__ int samples_of(const TileLists& lists, int64_t tile, int most) {
   return lists.tile_samples ? lists.tile_samples[tile] : most;
 }
 
+/// Pairs of a chunk of a tile with so many samples.
+__device__ int piece_length(int samples, bool whole) { return whole ? kWholeList : chunk_length(samples); }
+
 __global__ void __launch_bounds__(kPlanThreads)
-    count_work_kernel(const TileLists lists, int64_t tiles, int most_samples, PlanCounters* counters) {
+    count_work_kernel(const TileLists lists, int64_t tiles, int most_samples, bool whole, PlanCounters* counters) {
   const int64_t tile = int64_t(blockIdx.x) * kPlanThreads + threadIdx.x;
   if (tile >= tiles) return;
-  const int samples = samples_of(lists, tile, most_samples), length = chunk_length(samples);
+  const int samples = samples_of(lists, tile, most_samples), length = piece_length(samples, whole);
   const int n = list_length(lists, tile);
   WorkClasses::take(counters->tile_sizes, WorkClasses::of(samples, n));
   if (n >= length) atomicAdd(&counters->chunk_sizes[WorkClasses::of(samples, length)], n / length);
@@ -136,55 +133,57 @@ __global__ void __launch_bounds__(kPlanThreads)
 
 /// Places come from atomics: which tile gets which differs from run to run, and changes no result.
 __global__ void __launch_bounds__(kPlanThreads)
-    plan_kernel(const TileLists lists, TileGrid grid, int most_samples, PlanCounters* counters, const ChunkPlan plan,
-                int64_t* feedback) {
+    plan_kernel(const TileLists lists, TileGrid grid, int most_samples, bool whole, CheckpointLayout layout,
+                const ChunkPlan plan) {
   using Scan = cub::BlockScan<int, kPlanThreads>;
-  static_assert(WorkClasses::kCount < kPlanThreads);
+  static_assert(kWorkClasses < kPlanThreads);
   __shared__ typename Scan::TempStorage storage;
-  __shared__ int tile_base[WorkClasses::kCount], chunk_base[WorkClasses::kCount];
+  __shared__ int tile_base[kWorkClasses], chunk_base[kWorkClasses];
+  PlanCounters& counters = plan.state->counters;
+  PlanCounts& counts = plan.state->counts;
   const auto find_bases = [&](const int32_t* sizes, int* base, SampleParts& parts) {
     const int c = threadIdx.x;
-    int first = c < WorkClasses::kCount ? sizes[c] : 0;
+    int first = c < kWorkClasses ? sizes[c] : 0;
     Scan(storage).ExclusiveSum(first, first);
-    if (c < WorkClasses::kCount) base[c] = first;
-    if (blockIdx.x == 0 && c <= WorkClasses::kCount && c % WorkClasses::kLengths == 0)
-      parts.first[c / WorkClasses::kLengths] = first;
+    if (c < kWorkClasses) base[c] = first;
+    if (blockIdx.x == 0 && c <= kWorkClasses && c % kLengthClasses == 0) parts.first[c / kLengthClasses] = first;
     __syncthreads();
   };
-  find_bases(counters->tile_sizes, tile_base, lists.counts->tiles);
-  find_bases(counters->chunk_sizes, chunk_base, lists.counts->chunks);
-  if (blockIdx.x == 0 && threadIdx.x == 0) *feedback = lists.counts->pairs;
+  find_bases(counters.tile_sizes, tile_base, counts.tiles);
+  find_bases(counters.chunk_sizes, chunk_base, counts.chunks);
   const int64_t tile = int64_t(blockIdx.x) * kPlanThreads + threadIdx.x;
   if (tile >= grid.tiles()) return;
-  const int samples = samples_of(lists, tile, most_samples), length = chunk_length(samples);
-  const int n = list_length(lists, tile), whole = n / length, chunks = (n + length - 1) / length;
+  const int samples = samples_of(lists, tile, most_samples), length = piece_length(samples, whole);
+  const int n = list_length(lists, tile), full = n / length, chunks = (n + length - 1) / length;
   const int tile_class = WorkClasses::of(samples, n);
-  plan.tile_order[tile_base[tile_class] + WorkClasses::take(counters->tile_places, tile_class)] = int32_t(tile);
-  const int plane = chunks > 1 ? atomicAdd(&lists.counts->planes, chunks * samples) : 0;
+  plan.tile_order[tile_base[tile_class] + WorkClasses::take(counters.tile_places, tile_class)] = int32_t(tile);
+  const int planes = whole ? 0 : layout.tile_planes(grid, samples, chunks);
+  const int plane = planes > 0 ? atomicAdd(&counts.planes, planes) : 0;
   plan.tile_planes[tile] = plane;
-  const auto part = [&](int chunk) { return TileChunk{int32_t(tile), chunk, plane + chunk * samples}; };
-  if (whole > 0) {
+  const int first = layout.first_chunk(grid, samples), of_chunk = layout.planes(samples);
+  const auto part = [&](int chunk) { return TileChunk{int32_t(tile), chunk, plane + (chunk - first) * of_chunk}; };
+  if (full > 0) {
     const int c = WorkClasses::of(samples, length);
-    TileChunk* order = plan.chunk_order + chunk_base[c] + atomicAdd(&counters->chunk_places[c], whole);
-    for (int chunk = 0; chunk < whole; ++chunk) order[chunk] = part(chunk);
+    TileChunk* order = plan.chunk_order + chunk_base[c] + atomicAdd(&counters.chunk_places[c], full);
+    for (int chunk = 0; chunk < full; ++chunk) order[chunk] = part(chunk);
   }
   if (n % length) {
     const int c = WorkClasses::of(samples, n % length);
-    plan.chunk_order[chunk_base[c] + WorkClasses::take(counters->chunk_places, c)] = part(whole);
+    plan.chunk_order[chunk_base[c] + WorkClasses::take(counters.chunk_places, c)] = part(full);
   }
   const int front = front_chunks(grid, samples);
   if (chunks > front) {
-    TileChunk* rest = plan.rest + atomicAdd(&lists.counts->rest, chunks - front);
-    for (int chunk = front; chunk < chunks; ++chunk) rest[chunk - front] = part(chunk);
+    TileChunk* tail = plan.tail + atomicAdd(&counts.tail, chunks - front);
+    for (int chunk = front; chunk < chunks; ++chunk) tail[chunk - front] = part(chunk);
   }
 }
 
 template <class Value>
-void sort_values(const TileSort<Value>& task, TileGrid grid, uint32_t* memory, cudaStream_t stream) {
+void sort_values(const TileSort<Value>& p, TileGrid grid, uint32_t* memory, cudaStream_t stream) {
   const int passes = tile_passes(grid);
-  const SortScratch scratch(memory, task.capacity, passes);
+  const SortScratch scratch(memory, p.capacity, passes);
   const auto count = [&](auto kernel) {
-    kernel<<<kCountBlocks, kCountThreads, 0, stream>>>(task.tiles[0], task.counts, task.capacity, scratch.histograms);
+    kernel<<<kCountBlocks, kCountThreads, 0, stream>>>(p.tiles[0], p.counts, p.capacity, scratch.histograms);
   };
   switch (passes) {
     case 1:
@@ -203,59 +202,65 @@ void sort_values(const TileSort<Value>& task, TileGrid grid, uint32_t* memory, c
   for (int pass = 0; pass < passes; ++pass) {
     // After an overflow the histograms are empty, and with them the sort.
     sort_pass_kernel<Value, false><<<unsigned(scratch.blocks), kSortThreads, 0, stream>>>(
-        scratch, pass, 0, 0, task.tiles[pass % 2], task.tiles[1 - pass % 2], task.values[pass % 2],
-        task.values[1 - pass % 2]);
+        scratch, pass, 0, 0, p.tiles[pass % 2], p.tiles[1 - pass % 2], p.values[pass % 2],
+        p.values[1 - pass % 2]);
   }
   tile_offsets_kernel<<<blocks_of(grid.tiles() + 1, kRangeThreads), kRangeThreads, 0, stream>>>(
-      task.tiles[passes % 2], task.counts, task.capacity, grid.tiles(), task.tile_offsets);
+      p.tiles[passes % 2], p.counts, p.capacity, grid.tiles(), p.tile_offsets, p.feedback);
 }
 
 }  // namespace
 
-int64_t max_pairs() { return kMaxSortItems; }
+int64_t max_items() { return kMaxSortItems; }
 
-int64_t depth_sort_scratch(int64_t n) { return SortScratch::words(n, kDepthPasses) * sizeof(uint32_t); }
+/// Bytes of so many words, rounded up so that what follows is aligned.
+static int64_t aligned_bytes(int64_t words) { return (words * int64_t(sizeof(uint32_t)) + 15) / 16 * 16; }
+
+int64_t depth_sort_scratch(int64_t n) { return aligned_bytes(SortScratch::words(n, kDepthPasses)); }
 
 int64_t tile_sort_scratch(int64_t capacity, TileGrid grid) {
-  return SortScratch::words(capacity, tile_passes(grid)) * sizeof(uint32_t);
+  return aligned_bytes(SortScratch::words(capacity, tile_passes(grid)));
 }
 
 int tile_sort_result(TileGrid grid) { return tile_passes(grid) % 2; }
 
-void count_depths(const DepthSort& task, void* memory, cudaStream_t stream) {
-  const SortScratch scratch(static_cast<uint32_t*>(memory), task.n, kDepthPasses);
-  if (task.n == 0) return;
-  count_depths_kernel<<<kCountBlocks, kCountThreads, 0, stream>>>(task.keys[0], task.ranges, task.n, scratch.histograms,
-                                                                  task.counts);
+void count_depths(const DepthSort& p, void* memory, cudaStream_t stream) {
+  const SortScratch scratch(static_cast<uint32_t*>(memory), p.n, kDepthPasses);
+  if (p.n == 0) return;
+  count_depths_kernel<<<kCountBlocks, kCountThreads, 0, stream>>>(p.keys[0], p.ranges, p.n, scratch.histograms,
+                                                                  p.counts);
 }
 
-void sort_by_depth(const DepthSort& task, void* memory, cudaStream_t stream) {
-  if (task.n == 0) return;
-  const SortScratch scratch(static_cast<uint32_t*>(memory), task.n, kDepthPasses);
+void sort_by_depth(const DepthSort& p, void* memory, cudaStream_t stream) {
+  if (p.n == 0) return;
+  const SortScratch scratch(static_cast<uint32_t*>(memory), p.n, kDepthPasses);
   const auto blocks = unsigned(scratch.blocks);
-  sort_pass_kernel<int32_t, true><<<blocks, kSortThreads, 0, stream>>>(scratch, 0, task.n, kCulledKey, task.keys[0],
-                                                                       task.keys[1], nullptr, task.order[1]);
+  sort_pass_kernel<int32_t, true><<<blocks, kSortThreads, 0, stream>>>(scratch, 0, p.n, kCulledKey, p.keys[0],
+                                                                       p.keys[1], nullptr, p.order[1]);
   for (int pass = 1; pass < kDepthPasses; ++pass) {
-    sort_pass_kernel<int32_t, false><<<blocks, kSortThreads, 0, stream>>>(scratch, pass, 0, 0, task.keys[pass % 2],
-                                                                          task.keys[1 - pass % 2], task.order[pass % 2],
-                                                                          task.order[1 - pass % 2]);
+    sort_pass_kernel<int32_t, false><<<blocks, kSortThreads, 0, stream>>>(scratch, pass, 0, 0, p.keys[pass % 2],
+                                                                          p.keys[1 - pass % 2], p.order[pass % 2],
+                                                                          p.order[1 - pass % 2]);
   }
 }
 
-void sort_by_tile(const TileSort<int32_t>& task, TileGrid grid, void* scratch, cudaStream_t stream) {
-  sort_values(task, grid, static_cast<uint32_t*>(scratch), stream);
-}
-void sort_by_tile(const TileSort<SlotPair>& task, TileGrid grid, void* scratch, cudaStream_t stream) {
-  sort_values(task, grid, static_cast<uint32_t*>(scratch), stream);
+void emit_pairs(const EmitParams& p, cudaStream_t stream) {
+  if (p.n == 0) return;
+  emit_pairs_kernel<<<blocks_of(p.n, kEmitThreads), kEmitThreads, 0, stream>>>(p);
 }
 
-void plan_chunks(const TileLists& lists, TileGrid grid, int samples, const ChunkPlan& plan, int64_t* feedback,
-                 cudaStream_t stream) {
-  const int64_t tiles = grid.tiles();
-  auto* counters = reinterpret_cast<PlanCounters*>(plan.counters);
-  count_work_kernel<<<blocks_of(tiles, kPlanThreads), kPlanThreads, 0, stream>>>(lists, tiles, samples, counters);
-  plan_kernel<<<blocks_of(tiles, kPlanThreads), kPlanThreads, 0, stream>>>(lists, grid, samples, counters, plan,
-                                                                           feedback);
+void sort_by_tile(const TileSort<int32_t>& p, TileGrid grid, void* scratch, cudaStream_t stream) {
+  sort_values(p, grid, static_cast<uint32_t*>(scratch), stream);
+}
+void sort_by_tile(const TileSort<SlotPair>& p, TileGrid grid, void* scratch, cudaStream_t stream) {
+  sort_values(p, grid, static_cast<uint32_t*>(scratch), stream);
+}
+
+void plan_chunks(const TileLists& lists, TileGrid grid, int samples, bool whole, CheckpointLayout layout,
+                 const ChunkPlan& plan, cudaStream_t stream) {
+  const unsigned blocks = blocks_of(grid.tiles(), kPlanThreads);
+  count_work_kernel<<<blocks, kPlanThreads, 0, stream>>>(lists, grid.tiles(), samples, whole, &plan.state->counters);
+  plan_kernel<<<blocks, kPlanThreads, 0, stream>>>(lists, grid, samples, whole, layout, plan);
 }
 
 }  // namespace ar::cuda

@@ -1,23 +1,23 @@
-// Kernel of bin that depends on the footprint: writes the pairs of every splat.
+// Kernel of bin that writes the pairs of every splat.
 #pragma once
 
 #include <cub/block/block_scan.cuh>
 
 #include "core/bin.h"
 #include "cuda/sort.cuh"
-#include "cuda/tasks.h"
+#include "cuda/stages.h"
 
 namespace ar::cuda {
 
 /// A splat with more pairs than this is written by its whole warp.
 inline constexpr int kManyTiles = 16;
 
-__device__ inline void write_pair(const EmitTask& task, int64_t place, uint32_t tile, int32_t splat) {
-  task.tiles[place] = tile;
-  if (task.slot_pairs) {
-    task.slot_pairs[place] = {splat, int32_t(place)};
+__device__ inline void write_pair(const EmitParams& params, int64_t place, uint32_t tile, int32_t splat) {
+  params.tiles[place] = tile;
+  if (params.slot_pairs) {
+    params.slot_pairs[place] = {splat, int32_t(place)};
   } else {
-    task.splat_pairs[place] = splat;
+    params.splat_pairs[place] = splat;
   }
 }
 
@@ -39,22 +39,22 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
 }
 
 /// Pairs in the order of depth, a splat's by rows of tiles.
-template <class F> __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitTask task) {
+__global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitParams params) {
   using Scan = cub::BlockScan<uint32_t, kEmitThreads>;
   __shared__ typename Scan::TempStorage storage;
   __shared__ uint32_t block_id, before_block;
-  if (task.counts->pairs > task.capacity) return;
-  if (threadIdx.x == 0) block_id = atomicAdd(&task.status[0], 1);
+  if (params.counts->pairs > params.capacity) return;
+  if (threadIdx.x == 0) block_id = atomicAdd(&params.status[0], 1);
   __syncthreads();
-  const int64_t r = int64_t(block_id) * kEmitThreads + threadIdx.x, n = task.counts->splats;
+  const int64_t r = int64_t(block_id) * kEmitThreads + threadIdx.x, n = params.counts->splats;
   if (int64_t(block_id) * kEmitThreads >= n) return;
-  const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.splats);
-  const int32_t i = r < n ? task.order[r] : 0;
-  const int count = r < n ? task.ranges[i].count : 0;
-  const Splat<F, float> splat = splats[i];
+  const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
+  const int32_t i = r < n ? params.order[r] : 0;
+  const int count = r < n ? params.ranges[i].count : 0;
+  const SplatRow<float> splat = splats[i];
   uint32_t before, sum;
   Scan(storage).ExclusiveSum(uint32_t(count), before, sum);
-  uint32_t* status = task.status + 1;
+  uint32_t* status = params.status + 1;
   if (threadIdx.x < 32) {
     if (threadIdx.x == 0) write_status(status + block_id, (block_id == 0 ? kUpToBlock : kOfBlock) | sum);
     const uint32_t earlier = look_back(status, int(block_id));
@@ -65,21 +65,21 @@ template <class F> __global__ void __launch_bounds__(kEmitThreads) emit_pairs_ke
   }
   __syncthreads();
   const int64_t begin = int64_t(before_block) + before;
-  const int columns = task.grid.columns();
-  if (count > 0 && task.slot_pairs) task.ranges[i].first = int32_t(begin);
+  const int columns = params.grid.columns();
+  if (count > 0 && params.slot_pairs) params.ranges[i].first = int32_t(begin);
   if (count > 0 && count <= kManyTiles) {
     int64_t place = begin;
-    for_each_tile(support_of(splat), task.grid, [&](int64_t tile) { write_pair(task, place++, tile, i); });
+    for_each_tile(support_of(splat, params.footprint), params.grid, [&](int64_t tile) { write_pair(params, place++, tile, i); });
   }
   for (uint32_t many = __ballot_sync(kAllLanes, count > kManyTiles); many != 0; many &= many - 1) {
     const int source = __ffs(many) - 1;
     const int32_t id = __shfl_sync(kAllLanes, i, source);
     int64_t place = __shfl_sync(kAllLanes, begin, source);
-    const Support<float> support = support_of(splats[id]);
-    const Range rows = clamp_range(rows_of(support), task.grid.height), tile_rows = tiles_of(rows);
+    const Support<float> support = support_of(splats[id], params.footprint);
+    const Range rows = clamp_range(rows_of(support), params.grid.height), tile_rows = tiles_of(rows);
     for (int first = tile_rows.first; first <= tile_rows.last; first += 32) {
       const int row = first + lane_id();
-      const Range range = row <= tile_rows.last ? tile_columns_of(support, task.grid, rows, row) : Range{0, -1};
+      const Range range = row <= tile_rows.last ? tile_columns_of(support, params.grid, rows, row) : Range{0, -1};
       const int width = range.last - range.first + 1;
       int up_to = width;  // inclusive sum over the lanes
 #pragma unroll
@@ -88,15 +88,10 @@ template <class F> __global__ void __launch_bounds__(kEmitThreads) emit_pairs_ke
         if (lane_id() >= offset) up_to += other;
       }
       int64_t mine = place + up_to - width;
-      for (int c = range.first; c <= range.last; ++c) write_pair(task, mine++, uint32_t(row) * columns + c, id);
+      for (int c = range.first; c <= range.last; ++c) write_pair(params, mine++, uint32_t(row) * columns + c, id);
       place += __shfl_sync(kAllLanes, up_to, 31);
     }
   }
-}
-
-template <class F> void emit_pairs(const EmitTask& task, cudaStream_t stream) {
-  if (task.n == 0) return;
-  emit_pairs_kernel<F><<<blocks_of(task.n, kEmitThreads), kEmitThreads, 0, stream>>>(task);
 }
 
 }  // namespace ar::cuda

@@ -27,12 +27,12 @@ __device__ inline int warp_max(int v) {
 #endif
 }
 
-/// Sums N values over the lanes with N + 4 shuffles instead of 5 N: lanes trade the halves that the
-/// other will sum. Returns the sum of value l / 4 in lanes with l % 4 == 0, for the first 8 values;
-/// of value 8 in lanes with l % 4 == 2.
-__device__ inline float sum_nine(const float (&v)[9]) {
+/// Sums N = 8, 9 or 10 values over the lanes with 9 or 12 shuffles instead of 5 N: lanes trade the halves that the other
+/// will sum. A lane l gets the sum of value summed_value<N>(l).
+template <int N> __device__ float sum_values(const float (&v)[N]) {
+  static_assert(N >= 8 && N <= 10);
   const int lane = lane_id();
-  float a[8], last = v[8];
+  float a[8], last = N > 8 ? v[N > 8 ? 8 : 0] : 0;
 #pragma unroll
   for (int i = 0; i < 8; ++i) a[i] = v[i];
 #pragma unroll
@@ -43,12 +43,25 @@ __device__ inline float sum_nine(const float (&v)[9]) {
       const float keep = upper ? a[i + half] : a[i], give = upper ? a[i] : a[i + half];
       a[i] = keep + __shfl_xor_sync(kAllLanes, give, offset);
     }
-    last += __shfl_xor_sync(kAllLanes, last, offset);
+    if (N == 10 && half == 4) {
+      const float keep = upper ? v[N - 1] : last, give = upper ? last : v[N - 1];
+      last = keep + __shfl_xor_sync(kAllLanes, give, offset);
+    } else if (N > 8) {
+      last += __shfl_xor_sync(kAllLanes, last, offset);
+    }
   }
   const bool upper = lane & 2;
-  const float keep = upper ? last : a[0], give = upper ? a[0] : last;
+  const float keep = N > 8 && upper ? last : a[0], give = N > 8 && !upper ? last : a[0];
   const float sum = keep + __shfl_xor_sync(kAllLanes, give, 2);
   return sum + __shfl_xor_sync(kAllLanes, sum, 1);
+}
+
+/// Which of N values a lane has after sum_values, or -1.
+template <int N> __device__ int summed_value(int lane) {
+  if (lane % 4 == 0) return lane / 4;
+  if (N > 8 && lane == 2) return 8;
+  if (N > 9 && lane == 18) return 9;
+  return -1;
 }
 
 }  // namespace ar::cuda

@@ -1,8 +1,8 @@
-// Kernel of choose: the samples of every tile.
+// Kernel of choose_samples: the samples of every tile.
 #pragma once
 
 #include "core/choose.h"
-#include "cuda/blend.cuh"
+#include "cuda/composite.cuh"
 
 namespace ar::cuda {
 
@@ -60,14 +60,14 @@ inline constexpr int kChooseThreads = 256;
 /// kWarps warps per tile: one, or a whole block. SampleEstimate goes through a list in order; here each
 /// thread adds one splat of a group, with what is in front of it from a scan.
 template <class F, int kWarps>
-__global__ void __launch_bounds__(kChooseThreads) choose_kernel(const ChooseTask task, SampleLimits<float> limits) {
+__global__ void __launch_bounds__(kChooseThreads) choose_samples_kernel(const ChooseParams params, SampleLimits<float> limits) {
   constexpr int kThreads = 32 * kWarps;
-  const auto* splats = reinterpret_cast<const Splat<F, float>*>(task.lists.splats);
+  const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int64_t tile = (int64_t(blockIdx.x) * kChooseThreads + threadIdx.x) / kThreads;
-  if (tile >= task.grid.tiles()) return;
+  if (tile >= params.grid.tiles()) return;
   const int rank = int(threadIdx.x) % kThreads;
-  const TileList list = list_of(task.lists, task.grid, int(tile));
-  const Vec2<float> center = tile_center<float>(task.grid, tile);
+  const TileList list = list_of(params.lists, params.grid, int(tile));
+  const Vec2<float> center = tile_center<float>(params.grid, tile);
   SampleEstimate<float> own = {};
   Passed passed = {1, 0};
   float behind = 1;           // transmittance behind the last splat that counts
@@ -113,20 +113,20 @@ __global__ void __launch_bounds__(kChooseThreads) choose_kernel(const ChooseTask
     }
   }
   if (rank > 0) return;
-  task.lists.tile_samples[tile] =
-      limits.choose(part.value({task.background[0], task.background[1], task.background[2]}));
+  const auto background = [&](int c) { return c < params.background_count ? params.background[c] : 0.0f; };
+  params.tile_samples[tile] = limits.choose(part.value({background(0), background(1), background(2)}));
 }
 
-/// Few tiles have long lists and leave the device empty: a block for each. Many have short ones, of which the
-/// front is enough: a warp.
-template <class F> void choose(const ChooseTask& task, cudaStream_t stream) {
+/// Few tiles have long lists and leave the device empty: a block for each. Many have short ones, of which the front is
+/// enough: a warp.
+template <class F> void launch_choose_samples(const ChooseParams& p, cudaStream_t stream) {
   constexpr int kWarps = kChooseThreads / 32;
-  const SampleLimits<float> limits = sample_limits<float>(task.options.tolerance);
-  const int64_t tiles = task.grid.tiles();
+  const SampleLimits<float> limits = sample_limits<float>(p.options.number);
+  const int64_t tiles = p.grid.tiles();
   if (tiles >= 2048) {
-    choose_kernel<F, 1><<<blocks_of(tiles, kWarps), kChooseThreads, 0, stream>>>(task, limits);
+    choose_samples_kernel<F, 1><<<blocks_of(tiles, kWarps), kChooseThreads, 0, stream>>>(p, limits);
   } else {
-    choose_kernel<F, kWarps><<<unsigned(tiles), kChooseThreads, 0, stream>>>(task, limits);
+    choose_samples_kernel<F, kWarps><<<unsigned(tiles), kChooseThreads, 0, stream>>>(p, limits);
   }
 }
 

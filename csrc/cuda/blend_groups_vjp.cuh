@@ -1,0 +1,215 @@
+// Kernel of blend_vjp for any number of channels, a group of 32 after the other: a block per tile, a warp per subtile, a
+// pixel per lane, back to front through the whole list.
+//
+// dL/dalpha is linear in the gradient of the image: each group adds its share to the six sums of a pair, which a single
+// block owns. Only the absolute values |dL/dmean| need the channels of all groups at once: where they are wanted, the
+// first group makes all sums, and reads the channels of the others where they lie.
+#pragma once
+
+#include "cuda/blend_groups.cuh"
+
+namespace ar::cuda {
+
+inline constexpr int kVjpBatch = 32;
+/// Sums of a pair besides its channels: PairGrad, and |dL/dmean|.
+inline constexpr int kShapeSums = 8;
+
+/// What a block keeps in shared memory.
+template <class F> struct GroupVjpShared {
+  TileSplat<F, 0> splats[kVjpBatch];
+  GroupChannels<kVjpBatch> channels;
+  float4 contributions[kSubtiles][2][8];  ///< of a warp's 32 pixels; two, so that one can be read while the next is written
+  float sums[kSubtiles][kVjpBatch][kChannelGroup + kShapeSums];  ///< of a warp's pixels
+  uint32_t hits[kSubtiles];                                      ///< splats that have sums of a warp
+  int32_t rows[kVjpBatch];
+  Mat2<float> mean_maps[kVjpBatch];
+  int last[kSubtiles];  ///< place behind the last splat that a subtile composited
+  uint8_t reach[kVjpBatch];
+};
+
+__device__ inline float dot(const float (&g)[kChannelGroup], const float4 (&values)[kChannelGroup / 4]) {
+  float sum[4] = {0, 0, 0, 0};
+#pragma unroll
+  for (int q = 0; q < kChannelGroup / 4; ++q) {
+    const float4 v = values[q];
+    sum[0] = madd(g[4 * q], v.x, sum[0]);
+    sum[1] = madd(g[4 * q + 1], v.y, sum[1]);
+    sum[2] = madd(g[4 * q + 2], v.z, sum[2]);
+    sum[3] = madd(g[4 * q + 3], v.w, sum[3]);
+  }
+  return (sum[0] + sum[1]) + (sum[2] + sum[3]);
+}
+
+template <class F> __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
+    blend_groups_vjp_kernel(const BlendVjpParams params, int group) {
+  constexpr int S = F::kSamples;
+  extern __shared__ float4 memory[];
+  auto& shared = *reinterpret_cast<GroupVjpShared<F>*>(memory);
+  const SampleParts& tiles = params.plan->counts.chunks;  // a chunk is a tile's whole list
+  const int place = tiles.first[sample_class(S)] + int(blockIdx.x);
+  if (place >= tiles.first[sample_class(S) + 1]) return;
+  const TileList list = list_of(params.lists, params.grid, params.chunk_order[place].tile);
+  const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
+  const int first = group * kChannelGroup, lane = lane_id(), warp = threadIdx.x / 32, channel_count = params.channels.count;
+  const bool absolute = params.absolute, all_at_once = absolute && channel_count > kChannelGroup;
+  const bool with_shape = !all_at_once || group == 0;
+  const Vec2<float> p = pixel_of(warp, lane);
+  const Pixel pixel(list, params.grid, p);
+  const float scale = pixel.inside ? 1.0f / S : 0;
+
+  float transmittance[S], behind[S];
+  int last[S], own_last = 0;
+#pragma unroll
+  for (int s = 0; s < S; ++s) {
+    last[s] = pixel.inside ? params.last[s * pixel.image + pixel.index] : 0;
+    transmittance[s] = pixel.inside ? params.transmittance[s * pixel.image + pixel.index] : 1;
+    own_last = max(own_last, last[s]);
+  }
+  own_last = warp_max(own_last);
+  if (lane == 0) shared.last[warp] = own_last;
+  __syncthreads();
+  int tile_last = 0;
+#pragma unroll
+  for (int b = 0; b < kSubtiles; ++b) tile_last = max(tile_last, shared.last[b]);
+  if (group == 0 && !list.overflow) {  // pairs that nothing reached
+    for (int k = tile_last + threadIdx.x / 8; k < list.count; k += kBlendThreads / 8) {
+      const int q = threadIdx.x % 8;
+      const int64_t slot = list.slot(k);
+      const float4 zero = {0, 0, 0, 0};
+      if (q < kPairGradWidth / 4) reinterpret_cast<float4*>(params.pair_grads + slot * kPairGradWidth)[q] = zero;
+      if (params.channel_sums) reinterpret_cast<float4*>(params.channel_sums + slot * kChannelGroup)[q] = zero;
+    }
+  }
+  if (tile_last == 0) return;
+
+  const auto gradient = [&](int channel) {  // of this pixel, with respect to one sample
+    const float* plane = channel < channel_count ? params.dL_dimage.plane(channel, pixel.image) : nullptr;
+    return pixel.inside && plane ? scale * plane[pixel.index] : 0.0f;
+  };
+  float g[kChannelGroup];         // this lane's pixel, all channels
+  float g_channel[kChannelGroup];  // this lane's channel, all pixels
+  float through = 0;               // what the background gives
+#pragma unroll
+  for (int c = 0; c < kChannelGroup; ++c) {
+    g[c] = gradient(first + c);
+    if (first + c < channel_count) through += g[c] * params.background[first + c];
+  }
+  if (all_at_once && group == 0) {
+    for (int c = kChannelGroup; c < channel_count; ++c) through += gradient(c) * params.background[c];
+  }
+  // Alpha is 1 - transmittance: its gradient acts like one more channel whose background is -1.
+  if (group == 0 && params.dL_dalpha && pixel.inside) through -= scale * params.dL_dalpha[pixel.index];
+#pragma unroll
+  for (int s = 0; s < S; ++s) behind[s] = through;
+  {
+    constexpr int kStride = kChannelGroup + 1;  // keeps the lanes on different banks
+    static_assert(32 * kStride <= kVjpBatch * (kChannelGroup + kShapeSums));
+    float* transposed = &shared.sums[warp][0][0];
+#pragma unroll
+    for (int c = 0; c < kChannelGroup; ++c) transposed[lane * kStride + c] = g[c];
+    __syncwarp();
+#pragma unroll
+    for (int q = 0; q < 32; ++q) g_channel[q] = transposed[q * kStride + lane];
+  }
+
+  int turn = 0;
+  for (int k1 = tile_last; k1 > 0; k1 -= kVjpBatch) {
+    const int k0 = max(k1 - kVjpBatch, 0), count = k1 - k0;
+    __syncthreads();  // all have read what the last batch left
+    if (threadIdx.x < kVjpBatch) {
+      uint32_t reach = 0;
+      const int k = k0 + lane;
+      if (k < k1) {
+        const int32_t id = list.splat(k);
+        const Splat<F, float> splat = splats[id];
+        reach = subtile_reach(support_of(splat), list.x0, list.y0);
+#pragma unroll
+        for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= shared.last[b]) << b);
+        if (reach) shared.splats[lane] = {tile_terms(splat, list), {}};
+        if (absolute) shared.mean_maps[lane] = F::mean_map(splat.shape);
+        shared.channels.ids[lane] = id;
+        shared.rows[lane] = list.overflow ? id : list.slot(k);
+      }
+      shared.reach[lane] = uint8_t(reach);
+    }
+    __syncthreads();
+    shared.channels.load(params.channels, first, count, shared.reach);
+    __syncthreads();
+    uint32_t hits = 0;
+    for (uint32_t mask = __ballot_sync(kAllLanes, shared.reach[lane] >> warp & 1); mask != 0;) {
+      const int j = 31 - __clz(mask);
+      mask ^= 1u << j;
+      TileSplatRef<F, 0> splat = shared.splats[j];
+      float alpha[S];
+      bool any = false;
+#pragma unroll
+      for (int s = 0; s < S; ++s) {
+        alpha[s] = F::alpha(splat.terms, p, s);
+        any |= alpha[s] >= float(kAlphaMin) && k0 + j < last[s];
+      }
+      if (!__any_sync(kAllLanes, any)) continue;
+      hits |= 1u << j;
+      float g_color = dot(g, shared.channels.values[j]);
+      if (all_at_once && group == 0) {
+        const float* row = params.channels.row(shared.channels.ids[j]);
+        for (int c = kChannelGroup; c < channel_count; ++c) g_color = madd(gradient(c), row[c], g_color);
+      }
+      ShapeGrad<float> shape = {{0, 0}, {0, 0, 0}};
+      float weighted = 0, contribution = 0;
+#pragma unroll
+      for (int s = 0; s < S; ++s) {
+        const bool hit = alpha[s] >= float(kAlphaMin) && k0 + j < last[s];
+        const BlendGrad<float> grad = blend_sample_vjp(hit, alpha[s], g_color, transmittance[s], behind[s]);
+        if (with_shape) F::add_alpha_vjp(splat.terms, p, s, alpha[s], grad.dL_dalpha, shape);
+        contribution += grad.contribution;
+        weighted += grad.dL_dalpha * alpha[s];
+      }
+      turn ^= 1;
+      reinterpret_cast<float*>(shared.contributions[warp][turn])[lane] = contribution;
+      float* sums = shared.sums[warp][j];
+      if (with_shape) {
+        Vec2<float> dL_dmean = {0, 0};
+        if (absolute) dL_dmean = transform_transposed(shared.mean_maps[j], shape.offset);
+        shape = F::collect(splat.terms, shape, weighted);
+        const float values[kShapeSums] = {shape.offset.x, shape.offset.y, shape.shape.xx,  shape.shape.xy,
+                                          shape.shape.yy, weighted,       abs(dL_dmean.x), abs(dL_dmean.y)};
+        const float sum = sum_values(values);
+        if (lane % 4 == 0) sums[kChannelGroup + lane / 4] = sum;
+      }
+      __syncwarp();
+      sums[lane] = dot(g_channel, shared.contributions[warp][turn]);
+    }
+    if (lane == 0) shared.hits[warp] = hits;
+    __syncthreads();
+    for (int j = warp; j < count; j += kSubtiles) {
+      float sum = 0, shape_sum = 0;
+#pragma unroll
+      for (int w = 0; w < kSubtiles; ++w) {
+        if (!(shared.hits[w] >> j & 1)) continue;
+        sum += shared.sums[w][j][lane];
+        if (lane < kShapeSums) shape_sum += shared.sums[w][j][kChannelGroup + lane];
+      }
+      const int32_t row = shared.rows[j];
+      if (params.channel_sums) {
+        put_sum(params.channel_sums, kChannelGroup, list.overflow, row, lane, sum);
+      } else if (lane < kFewChannels) {
+        const int column = lane == 3 ? kPairFourthChannel : kPairChannels + lane;
+        put_sum(params.pair_grads, kPairGradWidth, list.overflow, row, column, sum);
+      }
+      if (with_shape && lane < kShapeSums) {
+        const int column = lane < kPairChannels ? lane : kPairAbsolute + lane - kPairChannels;
+        if (group > 0 && !list.overflow) shape_sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
+        put_sum(params.pair_grads, kPairGradWidth, list.overflow, row, column, shape_sum);
+      }
+    }
+  }
+}
+
+template <class F> void blend_vjp_groups(const BlendVjpParams& p, int group, cudaStream_t stream) {
+  const auto kernel = blend_groups_vjp_kernel<F>;
+  const int bytes = int(sizeof(GroupVjpShared<F>));
+  if (bytes > 48 * 1024) cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, bytes);
+  kernel<<<unsigned(p.grid.tiles()), kBlendThreads, bytes, stream>>>(p, group);
+}
+
+}  // namespace ar::cuda

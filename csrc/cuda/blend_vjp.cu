@@ -1,0 +1,34 @@
+// Launches of blend_vjp.
+#include "cuda/blend_groups_vjp.cuh"
+#include "cuda/blend_vjp.cuh"
+
+namespace ar::cuda {
+namespace {
+
+/// With too many pairs there is a row per splat that all tiles add to. The sums of shapes stay from group to group.
+__global__ void clear_splat_sums_kernel(const BlendVjpParams params, int group) {
+  if (params.lists.counts->pairs <= params.lists.capacity) return;
+  const auto clear = [&](float* to, int width) {
+    const int64_t n = params.lists.n * width;
+    for (int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x; i < n; i += int64_t(gridDim.x) * blockDim.x)
+      to[i] = 0;
+  };
+  if (group == 0) clear(params.pair_grads, kPairGradWidth);
+  if (params.channel_sums) clear(params.channel_sums, kChannelGroup);
+}
+
+}  // namespace
+
+void blend_vjp(int footprint, const BlendVjpParams& p, int group, cudaStream_t stream) {
+  clear_splat_sums_kernel<<<kClearBlocks, kBlendThreads, 0, stream>>>(p, group);
+  visit_tile_footprints<AdaptiveBoxesVjp>(footprint, stream, [&](auto f, cudaStream_t side) {
+    using F = decltype(f);
+    if constexpr (!F::kYardstick) {
+      if (!p.channels.data) return blend_vjp_few<F, 3>(p, side);
+      if (p.channels.count <= kFewChannels) return blend_vjp_few<F, 4>(p, side);
+    }
+    blend_vjp_groups<F>(with_channels(p), group, side);
+  });
+}
+
+}  // namespace ar::cuda

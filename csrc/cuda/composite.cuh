@@ -1,0 +1,201 @@
+// What the kernels of blend and blend_vjp share: pixels, lists of tiles, and splats staged for a tile.
+//
+// A tile's 16x16 pixels are eight subtiles of 8x4, a warp of lanes each: subtile b at column b % 2 and row b / 2, lane l
+// at column l % 8 and row l / 8 of it. A splat is tested against the subtiles once per tile; warps skip those that do not
+// reach them.
+#pragma once
+
+#include <type_traits>
+
+#include "core/bin.h"
+#include "core/blend.h"
+#include "cuda/side_streams.h"
+#include "cuda/stages.h"
+#include "cuda/warp.cuh"
+
+namespace ar::cuda {
+
+inline constexpr int kTilePixels = kTile * kTile;
+inline constexpr int kSubtiles = 8;
+inline constexpr int kBlendThreads = 32 * kSubtiles;
+
+/// A lane's pixel of subtile b, relative to the tile's first.
+__device__ inline Vec2<float> pixel_of(int b, int lane) {
+  return {float((b & 1) * 8 + (lane & 7)), float((b >> 1) * 4 + (lane >> 3))};
+}
+
+/// A tile and its list of splats, front to back.
+struct TileList {
+  int x0, y0;
+  const int32_t* pairs;
+  int stride, count;
+  bool overflow;  ///< the list is all splats
+
+  __device__ int32_t splat(int k) const { return pairs[int64_t(k) * stride]; }
+  __device__ int32_t slot(int k) const { return pairs[int64_t(k) * stride + 1]; }
+};
+
+__device__ inline TileList list_of(const TileLists& lists, TileGrid grid, int tile) {
+  TileList list;
+  list.x0 = tile % grid.columns() * kTile;
+  list.y0 = tile / grid.columns() * kTile;
+  list.overflow = lists.counts->pairs > lists.capacity;
+  list.stride = list.overflow ? 1 : lists.stride;
+  const int64_t first = list.overflow ? 0 : lists.tile_offsets[tile];
+  list.pairs = list.overflow ? lists.order : lists.pairs + first * lists.stride;
+  list.count = int(list.overflow ? lists.counts->splats : lists.tile_offsets[tile + 1] - first);
+  return list;
+}
+
+/// Bit b: the support reaches subtile b.
+__device__ inline uint32_t subtile_reach(const Support<float>& support, int x0, int y0) {
+  uint32_t reach = 0;
+#pragma unroll
+  for (int band = 0; band < 4; ++band) {
+    const Span<float> span = columns_of(support, float(y0 + 4 * band), float(y0 + 4 * band + 3));
+    reach |= uint32_t(span.lo <= float(x0 + 7) && span.hi >= float(x0)) << (2 * band);
+    reach |= uint32_t(span.lo <= float(x0 + 15) && span.hi >= float(x0 + 8)) << (2 * band + 1);
+  }
+  return reach;
+}
+
+/// Values of C channels.
+template <int C> struct Values {
+  float v[C];
+
+  __device__ void add(float weight, const Values& other) {
+#pragma unroll
+    for (int c = 0; c < C; ++c) v[c] = madd(weight, other.v[c], v[c]);
+  }
+  __device__ Values& operator+=(const Values& other) {
+#pragma unroll
+    for (int c = 0; c < C; ++c) v[c] += other.v[c];
+    return *this;
+  }
+};
+template <> struct Values<0> {};
+template <int C> __device__ Values<C> times(float scale, const Values<C>& values) {
+  Values<C> scaled;
+#pragma unroll
+  for (int c = 0; c < C; ++c) scaled.v[c] = scale * values.v[c];
+  return scaled;
+}
+
+/// What the pixels of a tile need of a splat: its terms, and C channels.
+template <class F, int C> struct alignas(16) TileSplat {
+  typename F::template Terms<float> terms;
+  Values<C> channels;
+};
+
+/// A staged splat in use: copied to registers, unless it has too many numbers.
+template <class F, int C>
+using TileSplatRef =
+    std::conditional_t<sizeof(TileSplat<F, C>) <= 112, const TileSplat<F, C>, const TileSplat<F, C>&>;
+
+/// The channels of a splat: three lie in it; of four, those that there are in rows, and zeros.
+template <int C, class F>
+__device__ Values<C> channels_of(const Channels<float>& channels, const Splat<F, float>& splat, int32_t id) {
+  if constexpr (C == 0) {
+    return {};
+  } else if constexpr (C == 3) {
+    return {{splat.color.x, splat.color.y, splat.color.z}};
+  } else {
+    static_assert(C == 4);
+    const float* row = channels.row(id);
+    if (channels.count == 4 && reinterpret_cast<uintptr_t>(channels.data) % 16 == 0) {
+      const float4 v = *reinterpret_cast<const float4*>(row);
+      return {{v.x, v.y, v.z, v.w}};
+    }
+    Values<C> values;
+#pragma unroll
+    for (int c = 0; c < C; ++c) values.v[c] = c < channels.count ? row[c] : 0;
+    return values;
+  }
+}
+
+template <class F> __device__ auto tile_terms(const Splat<F, float>& splat, const TileList& list) {
+  return F::terms(splat.shape, splat.opacity, {float(list.x0) - splat.mean.x, float(list.y0) - splat.mean.y});
+}
+
+/// Up to kBatch splats of a tile that a block works on together, a thread for each.
+template <class F, int C, int kBatch> struct Stage {
+  TileSplat<F, C> splats[kBatch];
+  uint8_t reach[kBatch];
+
+  /// Loads splats [k, k + kBatch) of the list; returns how many there are before `end`.
+  __device__ int load(const Splat<F, float>* splats_in, const Channels<float>& channels, const TileList& list, int k,
+                      int end) {
+    const int t = threadIdx.x;
+    if (kBatch == kBlendThreads || t < kBatch) {
+      uint32_t bits = 0;
+      if (k + t < end) {
+        const int32_t id = list.splat(k + t);
+        const Splat<F, float> splat = splats_in[id];
+        bits = subtile_reach(support_of(splat), list.x0, list.y0);
+        if (bits) splats[t] = {tile_terms(splat, list), channels_of<C>(channels, splat, id)};
+      }
+      reach[t] = uint8_t(bits);
+    }
+    return min(end - k, kBatch);
+  }
+
+  /// Of the splats [k, k + 32), those that reach this warp's subtile. All lanes must call it.
+  __device__ uint32_t reached(int k) const {
+    return __ballot_sync(kAllLanes, reach[k + lane_id()] >> (threadIdx.x / 32) & 1);
+  }
+};
+
+/// A sample at the end of a chunk, kept for a backward pass.
+template <int C> struct alignas(C == 3 ? 16 : 4) Checkpoint {
+  Values<C> channels;
+  float transmittance;  ///< negated where the sample has stopped
+};
+
+/// Whether a tile is blended with S samples.
+template <int S> __device__ bool has_samples(const TileLists& lists, int tile) {
+  return !lists.tile_samples || lists.tile_samples[tile] == S;
+}
+
+/// The numbers of a pixel's samples, and of its image.
+struct Pixel {
+  int64_t index, image;  ///< of the pixel, and how many there are
+  bool inside;
+
+  __device__ Pixel(const TileList& list, TileGrid grid, Vec2<float> p) {
+    const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
+    inside = x < grid.width && y < grid.height;
+    index = int64_t(y) * grid.width + x;
+    image = int64_t(grid.width) * grid.height;
+  }
+};
+
+/// Sums gradients of a splat in row `row` of pairs, or of splats, where all tiles add to it.
+__device__ inline void put_sum(float* rows, int width, bool overflow, int32_t row, int column, float x) {
+  float* place = rows + int64_t(row) * width + column;
+  if (overflow) {
+    atomicAdd(place, x);
+  } else {
+    *place = x;
+  }
+}
+
+/// Calls f(F{}, stream) for the footprint F of every kind of tile: where samples are chosen those of Boxes, side by side,
+/// as a few tiles of many samples would else keep the device waiting.
+template <class F, class Boxes, class Function> void for_each_tile_footprint(cudaStream_t stream, Function&& f) {
+  if constexpr (std::is_same_v<F, Adaptive>) {
+    SideStreams sides(stream);
+    int k = 0;
+    for_each_footprint(Boxes{}, [&](auto tile_footprint) { f(tile_footprint, sides.stream(k++)); });
+    sides.join();
+  } else {
+    f(PixelsOf<F>{}, stream);
+  }
+}
+
+/// Calls f(F{}, stream) for the pixels of the footprint at place `footprint` of the registry.
+template <class Boxes, class Function> void visit_tile_footprints(int footprint, cudaStream_t stream, Function&& f) {
+  visit_footprint(footprint, Footprints{},
+                  [&](auto chosen) { for_each_tile_footprint<decltype(chosen), Boxes>(stream, f); });
+}
+
+}  // namespace ar::cuda

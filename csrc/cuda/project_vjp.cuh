@@ -1,0 +1,253 @@
+// Kernels of project_vjp, project_rows_vjp and row_grads, a thread per Gaussian or row; and of sum_channels.
+#pragma once
+
+#include "cuda/project.cuh"
+
+namespace ar::cuda {
+
+/// A row of pair gradients, summed for one splat.
+struct SplatSums {
+  float value[kPairGradWidth];
+
+  __device__ void add(const float* row) {
+    const float4* quads = reinterpret_cast<const float4*>(row);
+#pragma unroll
+    for (int q = 0; q < kPairGradWidth / 4; ++q) {
+      const float4 v = quads[q];
+      value[4 * q] += v.x, value[4 * q + 1] += v.y, value[4 * q + 2] += v.z, value[4 * q + 3] += v.w;
+    }
+  }
+  __device__ PairGrad<float> grad() const {
+    return {{{value[0], value[1]}, {value[2], value[3], value[4]}}, value[5]};
+  }
+  __device__ Vec3<float> color() const {
+    return {value[kPairChannels], value[kPairChannels + 1], value[kPairChannels + 2]};
+  }
+};
+
+/// A splat with more pairs than this is summed by its whole warp.
+inline constexpr int kManyPairs = 64;
+
+/// Sums the pairs of each lane's splat i, always in the same order. All lanes must call it.
+__device__ inline SplatSums sum_pairs(const PairSumsView& pairs, int64_t i, PairRange range) {
+  SplatSums sums = {};
+  const auto add_row = [&](SplatSums& to, int64_t row) { to.add(pairs.pair_grads + row * kPairGradWidth); };
+  if (pairs.by_splat()) {
+    if (range.count > 0) add_row(sums, i);
+    return sums;
+  }
+  if (range.count <= kManyPairs) {
+    for (int q = range.first; q < range.first + range.count; ++q) add_row(sums, q);
+  }
+  for (uint32_t many = __ballot_sync(kAllLanes, range.count > kManyPairs); many != 0; many &= many - 1) {
+    const int source = __ffs(many) - 1;
+    const int first = __shfl_sync(kAllLanes, range.first, source), count = __shfl_sync(kAllLanes, range.count, source);
+    SplatSums part = {};
+    for (int q = lane_id(); q < count; q += 32) add_row(part, first + q);
+#pragma unroll
+    for (int v = 0; v < kPairGradWidth; ++v) {
+      const float total = warp_sum(part.value[v]);
+      if (lane_id() == source) sums.value[v] = total;
+    }
+  }
+  return sums;
+}
+
+/// Zeros, with neighbouring lanes at neighbouring addresses.
+__device__ inline void zero_rows(float* to, int count) {
+  for (int e = lane_id(); e < count; e += 32) to[e] = 0;
+}
+__device__ inline void zero_grads_of_warp(const Gaussians<float>& g, const GaussianGrads<float>& out, int64_t first,
+                                          int n) {
+  if (out.means) zero_rows(&out.means[first].x, 3 * n);
+  if (out.scales) zero_rows(&out.scales[first].x, 3 * n);
+  if (out.rotations) zero_rows(&out.rotations[first].x, 4 * n);
+  if (out.cov3ds) zero_rows(&out.cov3ds[first].xx, 6 * n);
+  if (out.opacities) zero_rows(out.opacities + first, n);
+  if (out.colors) zero_rows(&out.colors[first].x, 3 * n);
+  if (out.means2d) zero_rows(out.means2d + first * out.means2d_stride, out.means2d_stride * n);
+  if (out.shs) zero_rows(&out.shs[first * g.sh_stride].x, 3 * g.sh_stride * n);
+}
+
+/// Sums of the lanes' gradients, one number after the other.
+__device__ inline void store_warp_sums(const CameraGrad<float>& grad, float* to) {
+  const float* values = &grad.view_x.x;
+#pragma unroll
+  for (int k = 0; k < kCameraGradWidth; ++k) {
+    const float total = warp_sum(values[k]);
+    if (lane_id() == 0) to[k] = total;
+  }
+}
+
+/// What project_vjp starts from: sums over pairs.
+struct FromPairs {
+  const ProjectVjpParams& params;
+
+  /// What is known of Gaussian i before its gradient is asked for. count: 0 if it has none.
+  __device__ PairRange range(int64_t i) const { return params.sums.ranges[i]; }
+  /// Calls use(gradient with respect to the splat as a function of it, what it shows, |dL/dmean|) where range.count > 0.
+  template <class Cam, class Use>
+  __device__ void visit(const Cam& camera, int64_t i, PairRange range, Use&& use) const {
+    const SplatSums sums = sum_pairs(params.sums, i, range);
+    if (range.count == 0) return;
+    ShownGrad<float> shown = {{0, 0, 0}, 0};
+    if (params.dL_dchannels.data) {
+      const float depth = apply_row(camera.view_z, params.gaussians.means[i]);
+      add_channels_vjp(params.dL_dchannels, i, depth, shown);
+    } else {
+      shown.color = sums.color();
+    }
+    use([&](const Cov2d<float>& cov, float) { return projected_grad(params.footprint, cov, sums.grad()); }, shown,
+        Vec2<float>{sums.value[kPairAbsolute], sums.value[kPairAbsolute + 1]});
+  }
+};
+
+/// What project_rows_vjp starts from: gradients with respect to public rows.
+struct FromRows {
+  const ProjectRowsVjpParams& params;
+
+  __device__ PairRange range(int64_t i) const {
+    const int32_t row = params.rows.rows[i];
+    return {row, row >= 0 ? 1 : 0};
+  }
+  template <class Cam, class Use>
+  __device__ void visit(const Cam&, int64_t, PairRange range, Use&& use) const {
+    if (range.count == 0) return;
+    const int64_t row = range.first;
+    ShownGrad<float> shown = {{0, 0, 0}, 0};
+    if (params.rows.colors) shown.color = params.rows.colors[row];
+    if (params.rows.depths) shown.depth = params.rows.depths[row];
+    use([&](const Cov2d<float>&, float opacity) { return projected_grad(params.rows, row, opacity); }, shown,
+        Vec2<float>{0, 0});
+  }
+};
+
+template <class Cam, class From, class Params>
+__device__ void project_vjp_body(const Params& params, const From& from) {
+  __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
+  const Gaussians<float>& g = params.gaussians;
+  const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
+  const int64_t first = i - lane_id();  // of the warp
+  if (first >= g.n) return;
+  const PairRange range = i < g.n ? from.range(i) : PairRange{0, 0};
+  const uint32_t lit = __ballot_sync(kAllLanes, range.count > 0);
+  const int n = int(min(int64_t(32), g.n - first));
+  const GaussianGrads<float>& out = params.grads;
+  float* camera_grads = params.camera_grads ? params.camera_grads + first / 32 * kCameraGradWidth : nullptr;
+  if (lit == 0) {
+    zero_grads_of_warp(g, out, first, n);
+    if (Cam::kFull && camera_grads) zero_rows(camera_grads, kCameraGradWidth);
+    return;
+  }
+  ShRows<Cam::kShDegree>& rows = sh_rows[threadIdx.x / 32];
+  if (g.shs) rows.load(g.shs + first * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
+  const Cam camera = load_camera_as<Cam>(params.camera);
+  // Longer rows than the largest degree's hold coefficients without influence.
+  const bool staged = out.shs && g.sh_stride <= rows.kCount;
+  Vec3<float>* dL_dsh = staged ? rows.row() : out.shs ? out.shs + i * g.sh_stride : nullptr;
+  CameraGrad<float> camera_grad = {};
+  from.visit(camera, i, range, [&](const auto& grad_of, const ShownGrad<float>& shown, Vec2<float> absolute) {
+    ar::project_vjp(camera, g, i, grad_of, shown, rows.row(), dL_dsh, out,
+                    Cam::kFull && camera_grads ? &camera_grad : nullptr);
+    if (out.means2d && out.means2d_stride == 4) {
+      out.means2d[i * 4 + 2] = 0.5f * camera.size.x * absolute.x;
+      out.means2d[i * 4 + 3] = 0.5f * camera.size.y * absolute.y;
+    }
+  });
+  if (range.count == 0 && i < g.n) zero_grads(g, i, out, dL_dsh);
+  if (staged) rows.store(out.shs + first * g.sh_stride, g.sh_stride, n);
+  if constexpr (Cam::kFull) {
+    if (camera_grads) store_warp_sums(camera_grad, camera_grads);
+  }
+}
+
+template <class Cam>
+__global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : 5)
+    project_vjp_kernel(const ProjectVjpParams params) {
+  project_vjp_body<Cam>(params, FromPairs{params});
+}
+template <class Cam>
+__global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : 5)
+    project_rows_vjp_kernel(const ProjectRowsVjpParams params) {
+  project_vjp_body<Cam>(params, FromRows{params});
+}
+
+__global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGradsParams params) {
+  const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
+  const PairRange range = i < params.rows.n ? params.sums.ranges[i] : PairRange{0, 0};
+  const SplatSums sums = sum_pairs(params.sums, i, range);
+  if (i >= params.rows.n) return;
+  Vec2<float> dL_dmean = {0, 0};
+  Sym2<float> dL_dcov = {0, 0, 0};
+  float dL_dopacity = 0;
+  if (range.count > 0) {
+    const Cov2d<float> cov = cov_of(params.rows, i);
+    const ProjectedGrad<float> grad = projected_grad(params.footprint, cov, sums.grad());
+    dL_dmean = grad.splat.dL_dmean;
+    dL_dcov = cov_grad(cov, grad.splat);
+    dL_dopacity = grad.weighted / params.rows.opacities[i];
+  }
+  params.dL_dmeans2d[i] = dL_dmean;
+  params.dL_dcov2d[i] = {dL_dcov.xx, 2 * dL_dcov.xy, dL_dcov.yy};
+  params.dL_dopacities[i] = dL_dopacity;
+  if (params.dL_dcolors) params.dL_dcolors[i] = sums.color();
+}
+
+/// Channels that lie in the rows of pairs: a thread per splat.
+__global__ void __launch_bounds__(kProjectThreads) sum_few_channels_kernel(const SumChannelsParams params) {
+  const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x, n = params.sums.n;
+  const PairRange range = i < n ? params.sums.ranges[i] : PairRange{0, 0};
+  const SplatSums sums = sum_pairs(params.sums, i, range);
+  if (i >= n) return;
+#pragma unroll
+  for (int c = 0; c < kFewChannels; ++c) {
+    const float sum = sums.value[c == 3 ? kPairFourthChannel : kPairChannels + c];
+    if (c < params.count) params.dL_dchannels[i * params.stride + params.first + c] = sum;
+  }
+}
+
+inline constexpr int kSumWarps = 8;
+
+/// A group of channels: a warp per splat, a lane per channel. The warps of a block share the splats with many pairs.
+__global__ void __launch_bounds__(32 * kSumWarps) sum_channels_kernel(const SumChannelsParams params) {
+  __shared__ float parts[kSumWarps][32];
+  __shared__ int64_t first[kSumWarps];
+  __shared__ int counts[kSumWarps];
+  constexpr int kMany = 256, kAhead = 8;
+  const int lane = lane_id(), warp = threadIdx.x / 32;
+  const int64_t i = int64_t(blockIdx.x) * kSumWarps + warp, n = params.sums.n;
+  PairRange range = i < n ? params.sums.ranges[i] : PairRange{0, 0};
+  if (params.sums.by_splat() && range.count > 0) range = {int32_t(i), 1};
+  const auto sum_rows = [&](int64_t row, int count, int step) {
+    float sum = 0;
+    for (int q = 0; q < count; q += kAhead * step) {
+      float x[kAhead];
+#pragma unroll
+      for (int k = 0; k < kAhead; ++k)
+        x[k] = q + k * step < count ? params.channel_sums[(row + q + k * step) * kChannelGroup + lane] : 0;
+#pragma unroll
+      for (int k = 0; k < kAhead; ++k) sum += x[k];
+    }
+    return sum;
+  };
+  const auto store = [&](int64_t splat, float sum) {
+    if (lane < params.count) params.dL_dchannels[splat * params.stride + params.first + lane] = sum;
+  };
+  if (lane == 0) first[warp] = range.first, counts[warp] = range.count;
+  if (i < n && range.count <= kMany) store(i, sum_rows(range.first, range.count, 1));
+  __syncthreads();
+  for (int w = 0; w < kSumWarps; ++w) {
+    if (counts[w] <= kMany) continue;
+    parts[warp][lane] = sum_rows(first[w] + warp, counts[w] - warp, kSumWarps);
+    __syncthreads();
+    if (warp == w) {
+      float sum = 0;
+#pragma unroll
+      for (int k = 0; k < kSumWarps; ++k) sum += parts[k][lane];
+      store(i, sum);
+    }
+    __syncthreads();
+  }
+}
+
+}  // namespace ar::cuda

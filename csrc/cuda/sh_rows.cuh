@@ -1,0 +1,66 @@
+// Rows of spherical harmonics between memory and the threads of a warp.
+#pragma once
+
+#include "core/sh.h"
+#include "cuda/warp.cuh"
+
+namespace ar::cuda {
+
+/// Rows of spherical harmonics, up to kDegree, of a warp's Gaussians. Rows go between here and memory with
+/// neighbouring lanes at neighbouring addresses; 49 or 76 floats a row keep the lanes on different banks, or nearly.
+template <int kDegree> struct ShRows {
+  static constexpr int kCount = sh_count(kDegree), kStride = 3 * kCount + 1;
+  float value[32][kStride];
+
+  /// Moves the first 4 kQuads numbers of all 32 rows of 4 `quads` in memory, all at once.
+  template <int kQuads> __device__ void load_quads(const float4* base, int quads, uint32_t lanes) {
+    const int lane = lane_id();
+#pragma unroll
+    for (int e = 0; e < kQuads; ++e) {
+      const int k = e * 32 + lane, row = k / kQuads, q = k % kQuads;
+      if (!(lanes >> row & 1)) continue;
+      const float4 v = base[row * quads + q];
+      float* to = value[row] + 4 * q;
+      to[0] = v.x, to[1] = v.y, to[2] = v.z, to[3] = v.w;
+    }
+    __syncwarp();
+  }
+
+  /// Loads `count` coefficients of the rows of the lanes in `lanes`; base is lane 0's row.
+  __device__ void load(const Vec3<float>* base, int stride, int count, uint32_t lanes) {
+    if (3 * stride % 4 == 0 && reinterpret_cast<uintptr_t>(base) % 16 == 0) {
+      const auto* quads = reinterpret_cast<const float4*>(base);
+      if (count == 16) return load_quads<12>(quads, 3 * stride / 4, lanes);
+      if (count == 9) return load_quads<7>(quads, 3 * stride / 4, lanes);
+      if (count == 4) return load_quads<3>(quads, 3 * stride / 4, lanes);
+    }
+    for (; lanes != 0; lanes &= lanes - 1) {
+      const int row = __ffs(lanes) - 1;
+      const float* from = &base[int64_t(row) * stride].x;
+      for (int e = lane_id(); e < 3 * count; e += 32) value[row][e] = from[e];
+    }
+    __syncwarp();
+  }
+  /// Stores rows [0, rows) of `stride` coefficients.
+  __device__ void store(Vec3<float>* base, int stride, int rows) const {
+    __syncwarp();
+    if (stride == 16 && reinterpret_cast<uintptr_t>(base) % 16 == 0) {
+      auto* to = reinterpret_cast<float4*>(base);
+#pragma unroll
+      for (int e = 0; e < 12; ++e) {
+        const int k = e * 32 + lane_id(), row = k / 12;
+        const float* from = value[row] + 4 * (k % 12);
+        if (row < rows) to[k] = {from[0], from[1], from[2], from[3]};
+      }
+      return;
+    }
+    const int width = 3 * stride;
+    float* to = &base->x;
+    for (int row = 0; row < rows; ++row) {
+      for (int e = lane_id(); e < width; e += 32) to[row * width + e] = value[row][e];
+    }
+  }
+  __device__ Vec3<float>* row() { return reinterpret_cast<Vec3<float>*>(value[lane_id()]); }
+};
+
+}  // namespace ar::cuda

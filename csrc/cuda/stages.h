@@ -1,0 +1,363 @@
+// What each stage of the CUDA path reads and writes beyond core/stages.h, and the functions that launch the stages. All
+// pointers are views of device memory that the caller owns. Every function enqueues work on a stream and returns; none
+// waits for the device.
+//
+// Sizes that depend on the data stay on the device. The caller guesses how many pairs there will be and gives room for
+// `capacity` of them. If there are more, no pair is written, and blending goes through all splats in depth order for
+// every tile: slow, with the same result, and without a host.
+#pragma once
+
+#include <cuda_runtime_api.h>
+
+#include "core/camera.h"
+#include "core/project.h"
+#include "core/weight.h"
+
+namespace ar::cuda {
+
+/// Floats per row of pair gradients: PairGrad, three channels, sums of |dL/dmean| per coordinate, a fourth channel.
+inline constexpr int kPairGradWidth = 12;
+inline constexpr int kPairChannels = 6, kPairAbsolute = 9, kPairFourthChannel = 11;  ///< columns
+/// Channels that lie in the rows of pairs. More are blended in groups, and summed in memory of their own.
+inline constexpr int kFewChannels = 4;
+inline constexpr int kChannelGroup = 32;
+
+/// Pairs of a tile that blend_vjp takes as one piece of work, and between which blend leaves checkpoints. Checkpoints
+/// hold every sample, so many samples get longer chunks.
+inline constexpr int chunk_length(int samples) { return samples <= 4 ? 256 : 64 * samples; }
+/// Length of a chunk that holds any list.
+inline constexpr int kWholeList = 1 << 30;
+
+/// Chunks of a tile that blend goes through one after the other, which reads no pair behind the point where all pixels
+/// have stopped. The remaining chunks are blended side by side. With many tiles there is enough to do side by side; with
+/// few, a long list must not keep a single block busy.
+AR_HD int front_chunks(TileGrid grid, int samples) {
+  const int pairs = grid.tiles() >= 2048 ? 2048 : 256;
+  return pairs > chunk_length(samples) ? pairs / chunk_length(samples) : 1;
+}
+
+/// Depth keys of splats without pairs: after all others.
+inline constexpr uint32_t kCulledKey = 0x7fffffff;
+
+/// Where the pairs of a splat are, in the order in which they are emitted.
+struct PairRange {
+  int32_t first, count;
+};
+
+/// A pair, and its place in that order: where blend_vjp leaves its gradient.
+struct alignas(8) SlotPair {
+  int32_t splat, slot;
+};
+
+/// 1, 2, 4, 8 or 16 samples.
+inline constexpr int kSampleClasses = 5;
+AR_HD constexpr int sample_class(int samples) {
+  int c = 0;
+  for (; samples > 1; samples /= 2) ++c;
+  return c;
+}
+
+/// What bin counts.
+struct alignas(8) Counts {
+  int64_t pairs;
+  int64_t splats;  ///< with pairs
+};
+
+/// Where the work of a plan is by sample_class: [first[c], first[c + 1]).
+struct SampleParts {
+  int32_t first[kSampleClasses + 1];
+};
+
+/// What plan_chunks and blend count.
+struct PlanCounts {
+  int32_t planes, tail;       ///< planes of checkpoints; chunks behind the front ones
+  SampleParts tiles, chunks;  ///< of the plan's orders
+  /// Tiles that the front chunks left with an open sample and pairs, by sample_class: those of different samples are
+  /// blended side by side.
+  int32_t open_tiles[kSampleClasses];
+};
+
+/// Scratch of plan_chunks.
+inline constexpr int kLengthClasses = 33, kWorkClasses = kSampleClasses * kLengthClasses;
+struct PlanCounters {
+  int32_t tile_sizes[kWorkClasses], chunk_sizes[kWorkClasses];  ///< pieces of work per class
+  int32_t tile_places[kWorkClasses], chunk_places[kWorkClasses];
+};
+/// Zero before use. The counts stay for blend_vjp.
+struct PlanState {
+  PlanCounts counts;
+  PlanCounters counters;
+};
+
+struct ProjectParams : ar::ProjectParams<float> {
+  CullBounds<float> bounds;
+  uint32_t* keys;     ///< [n] in the order of depth
+  PairRange* ranges;  ///< [n] count
+};
+
+struct ProjectRowsParams {
+  CameraView<float> camera;
+  Gaussians<float> gaussians;
+  FootprintChoice footprint;
+  CullBounds<float> bounds;
+  ProjectedRows<float> rows;  ///< [n]; those with radius 0 are not written
+  int32_t* radii;             ///< [n]
+};
+
+/// Rows of ProjectedRows, read only.
+struct RowsView {
+  int64_t n;
+  const Vec2<float>* means2d;
+  const Sym2<float>* cov2d;
+  const float* dets;  ///< or null: worked out from cov2d
+  const float* opacities;
+  const float* depths;
+  const Vec3<float>* colors;  ///< or null
+};
+
+struct ShapeRowsParams {
+  RowsView rows;
+  FootprintChoice footprint;
+  TileGrid grid;
+  float* splats;      ///< [n] SplatRow
+  uint32_t* keys;     ///< [n]
+  PairRange* ranges;  ///< [n] count
+};
+
+struct EmitParams {
+  const float* splats;
+  int64_t n;
+  int footprint;  ///< place in the registry
+  TileGrid grid;
+  int64_t capacity;
+  const Counts* counts;
+  const int32_t* order;  ///< [counts->splats] splats by depth
+  PairRange* ranges;     ///< [n] first
+  uint32_t* status;      ///< emit_scratch(n) bytes, zero
+  uint32_t* tiles;       ///< [capacity] tile of each pair
+  int32_t* splat_pairs;  ///< [capacity] splat of each pair, or null:
+  SlotPair* slot_pairs;  ///< [capacity] the same with its slot, for a backward pass
+};
+
+/// The lists of splats that blend walks.
+struct TileLists {
+  const int32_t* pairs;         ///< [capacity, stride] splats by tile, then depth, and their slots
+  int stride;                   ///< 1, or 2 with slots
+  const int64_t* tile_offsets;  ///< [tiles + 1]
+  const int32_t* order;         ///< [counts->splats] all splats with pairs by depth
+  const Counts* counts;
+  int64_t n, capacity;
+  const int32_t* tile_samples;  ///< [tiles] samples in use, or null: all
+};
+
+struct ChooseParams {
+  const float* splats;
+  TileLists lists;
+  TileGrid grid;
+  const float* background;
+  int background_count;  ///< channels that it has; those missing are black
+  FootprintOptions options;
+  int32_t* tile_samples;  ///< [tiles]
+};
+
+struct TileChunk {
+  int32_t tile, chunk;
+  int32_t plane;  ///< first plane of its checkpoints, if the tile has any
+};
+
+/// How the state of a tile's pixels between chunks lies in memory: planes of kTile^2 floats. For a backward pass a
+/// chunk's planes hold, for each sample and pixel, its channels and its transmittance. Without one they are the
+/// transmittance of each sample and a single set of channels, and only the last front chunk and those behind have any.
+struct CheckpointLayout {
+  int channels;
+  bool keep;
+
+  AR_HD int planes(int samples) const { return keep ? samples * (channels + 1) : samples + channels; }
+  /// The first chunk with planes.
+  AR_HD int first_chunk(TileGrid grid, int samples) const { return keep ? 0 : front_chunks(grid, samples) - 1; }
+  /// Planes of a tile with so many chunks. The last chunk needs none where no sample is left open in front of it.
+  AR_HD int tile_planes(TileGrid grid, int samples, int chunks) const {
+    const int front = front_chunks(grid, samples);
+    const int used = chunks > front ? chunks - first_chunk(grid, samples) : keep ? chunks - 1 : 0;
+    return (used > 0 ? used : 0) * planes(samples);
+  }
+  /// No fewer planes than plan_chunks makes of `pairs` pairs where no tile has more than `samples`. A tile of x chunks
+  /// of pairs, rounded up to less than x + 1, has that many planes where it has tail chunks (x > front), less front - 1
+  /// without a backward pass; and no more than x where it has none.
+  int64_t max_planes(TileGrid grid, int samples, int64_t pairs, bool chosen) const {
+    // Chosen samples: those with the most planes per pair. For a backward pass all from 4 on have the same.
+    const int densest = chosen && !keep ? 4 : samples, front = front_chunks(grid, samples);
+    const int64_t full = pairs / chunk_length(densest) * planes(densest) + planes(densest) + planes(samples);
+    const int64_t with_tail = grid.tiles() * planes(samples);
+    const int64_t rounding = keep ? full / front : front == 1 ? full : 0;
+    return full + (rounding < with_tail ? rounding : with_tail);
+  }
+};
+
+/// How the lists are cut into chunks, and in which order work is begun; made by plan_chunks.
+struct ChunkPlan {
+  PlanState* state;
+  TileChunk* chunk_order;  ///< [chunks] by samples, longest first
+  int32_t* tile_order;     ///< [tiles] by samples, longest first
+  int32_t* tile_planes;    ///< [tiles] first plane of a tile's checkpoints, if it has any
+  TileChunk* tail;         ///< [counts.tail] chunks behind the front ones, or null where lists are not cut
+};
+
+struct BlendParams : ar::BlendParams<float> {
+  TileLists lists;
+  ChunkPlan plan;
+  int32_t* tile_open;   ///< [tiles] whether the tile is one of the open ones
+  int32_t* open_tiles;  ///< [kSampleClasses, tiles]
+  CheckpointLayout layout;
+  float* checkpoints;  ///< [planes, kTile^2]
+};
+
+struct InspectParams {
+  const float* splats;
+  TileLists lists;
+  TileGrid grid;
+  int32_t* median;    ///< [height, width] Gaussians, or -1; see PixelSummary
+  int32_t* dominant;  ///< [height, width]
+  int32_t* touched;   ///< [n] pixels, to add to
+  int32_t* largest;   ///< [n] largest weight, as the bits of a float; to raise
+  int64_t* units;     ///< [n] sum of weights in units of kWeightUnit, to add to
+};
+
+struct BlendVjpParams : ar::BlendVjpParams<float> {
+  TileLists lists;
+  const TileChunk* chunk_order;
+  const PlanState* plan;
+  int64_t max_chunks;
+  const float* checkpoints;
+  float* pair_grads;    ///< [max(capacity, n), kPairGradWidth] by slot, or by splat if there are too many pairs
+  float* channel_sums;  ///< [max(capacity, n), kChannelGroup] likewise, for more than kFewChannels channels; or null
+  bool absolute;        ///< sum |dL/dmean| too
+};
+
+/// Sums over the pairs of every splat.
+struct PairSumsView {
+  int64_t n;
+  const PairRange* ranges;
+  const Counts* counts;
+  int64_t capacity;
+  const float* pair_grads;
+
+  /// Whether there were too many pairs: then pair_grads has a row per splat.
+  AR_HD bool by_splat() const { return counts->pairs > capacity; }
+};
+
+/// From rows of pairs to gradients with respect to channels [first, first + count) of every splat.
+struct SumChannelsParams {
+  PairSumsView sums;
+  const float* channel_sums;  ///< of kChannelGroup channels; null: in the rows of pairs
+  int first, count;
+  float* dL_dchannels;  ///< [n, stride]
+  int64_t stride;
+};
+
+struct ProjectVjpParams : ar::ProjectVjpParams<float> {
+  PairSumsView sums;
+  float* camera_grads;  ///< [warps_of(n), kCameraGradWidth] CameraGrad of each 32 Gaussians, or null
+};
+
+struct ProjectRowsVjpParams {
+  CameraView<float> camera;
+  Gaussians<float> gaussians;
+  GaussianGrads<float> grads;
+  ProjectedRowGrads<float> rows;  ///< depths and colors may be null
+  float* camera_grads;            ///< as in ProjectVjpParams
+};
+
+struct RowGradsParams {
+  RowsView rows;
+  FootprintChoice footprint;
+  PairSumsView sums;
+  Vec2<float>* dL_dmeans2d;
+  Sym2<float>* dL_dcov2d;  ///< xy: with respect to the one number that fills both places
+  float* dL_dopacities;
+  Vec3<float>* dL_dcolors;  ///< or null
+};
+
+AR_HD constexpr int64_t warps_of(int64_t n) { return (n + 31) / 32; }
+
+// Projection: kernels for each camera type, whatever the footprint (project.cu).
+void project(const ProjectParams& p, cudaStream_t stream);
+void project_rows(const ProjectRowsParams& p, cudaStream_t stream);
+void shape_rows(const ShapeRowsParams& p, cudaStream_t stream);
+void project_vjp(const ProjectVjpParams& p, cudaStream_t stream);
+void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream);
+void row_grads(const RowGradsParams& p, cudaStream_t stream);
+void sum_channels(const SumChannelsParams& p, cudaStream_t stream);
+
+// Blending. `footprint` is a place in the registry (blend.cu, blend_vjp.cu).
+
+/// Whether so many channels are blended in groups of kChannelGroup, by kernels that walk the whole list of a tile and
+/// need no checkpoints. The yardsticks have no other.
+bool blends_groups(int footprint, int64_t channels);
+/// Channels that a group-less blending is compiled for: 3 in the splats themselves, or 4 in rows.
+constexpr int compiled_channels(bool in_splats) { return in_splats ? 3 : kFewChannels; }
+/// Only for a footprint that chooses.
+void choose_samples(const ChooseParams& p, cudaStream_t stream);
+/// Without p.channels.data the three colours in the splats.
+void blend(int footprint, const BlendParams& p, cudaStream_t stream);
+/// `group`: which kChannelGroup channels; 0 where they are few.
+void blend_vjp(int footprint, const BlendVjpParams& p, int group, cudaStream_t stream);
+void inspect(int footprint, const InspectParams& p, cudaStream_t stream);
+
+// One weight per element (weight.cu).
+void weight(int footprint, const WeightParams<float>& p, cudaStream_t stream);
+void weight(int footprint, const WeightParams<double>& p, cudaStream_t stream);
+void weight_vjp(int footprint, const WeightParams<float>& p, cudaStream_t stream);
+void weight_vjp(int footprint, const WeightParams<double>& p, cudaStream_t stream);
+
+// Binning (bin.cu).
+
+/// Most splats, and most pairs, that can be sorted: 2^30 - 1.
+int64_t max_items();
+
+/// Bytes of scratch memory, all of which must be zero; multiples of 16.
+int64_t depth_sort_scratch(int64_t n);
+int64_t tile_sort_scratch(int64_t capacity, TileGrid grid);
+inline constexpr int kEmitThreads = 256;
+inline int64_t emit_scratch(int64_t n) {
+  return ((1 + (n + kEmitThreads - 1) / kEmitThreads) * int64_t(sizeof(uint32_t)) + 15) / 16 * 16;
+}
+
+/// Splats by depth, ties in input order. The result is order[0].
+struct DepthSort {
+  int64_t n;
+  uint32_t* keys[2];  ///< [n]; both are overwritten
+  int32_t* order[2];  ///< [n]
+  const PairRange* ranges;
+  Counts* counts;
+};
+/// First adds to the counts, then sorts.
+void count_depths(const DepthSort& p, void* scratch, cudaStream_t stream);
+void sort_by_depth(const DepthSort& p, void* scratch, cudaStream_t stream);
+
+void emit_pairs(const EmitParams& p, cudaStream_t stream);
+
+/// Where the device reports the number of pairs of a frame: memory of the host that it can write (pair_guess.h).
+struct PairFeedback {
+  uint64_t* word;
+  uint32_t frame;
+};
+
+/// Pairs by tile, stably. The result is values[tile_sort_result(grid)].
+template <class Value> struct TileSort {
+  int64_t capacity;
+  const Counts* counts;
+  uint32_t* tiles[2];  ///< [capacity]; both are overwritten
+  Value* values[2];
+  int64_t* tile_offsets;
+  PairFeedback feedback;
+};
+int tile_sort_result(TileGrid grid);
+void sort_by_tile(const TileSort<int32_t>& p, TileGrid grid, void* scratch, cudaStream_t stream);
+void sort_by_tile(const TileSort<SlotPair>& p, TileGrid grid, void* scratch, cudaStream_t stream);
+
+/// `whole`: a chunk per tile, whatever its length, and no checkpoints.
+void plan_chunks(const TileLists& lists, TileGrid grid, int samples, bool whole, CheckpointLayout layout,
+                 const ChunkPlan& plan, cudaStream_t stream);
+
+}  // namespace ar::cuda
