@@ -8,6 +8,7 @@ import torch
 
 from .effects import Defocus, Effects, Motion
 
+FRUSTUM_CLAMP = 1.3  # half pictures from the optical axis: kFrustumClamp of csrc/core/constants.h
 _DEPTH_RANGE = (0.01, 100.0)  # of clip-space z, which nothing reads
 
 
@@ -161,3 +162,45 @@ def view_center(view: torch.Tensor, proj: torch.Tensor, with_gradient: bool) -> 
         view, proj = view.detach(), proj.detach()
     p = view.T @ proj / (view**2).sum(0)[:, None]
     return -p[2] / p.diagonal()
+
+
+def is_orthographic(settings) -> bool:
+    """Whether w of clip space is the same everywhere."""
+    w = settings.projmatrix.detach().reshape(4, 4)[:, 3]
+    return (w[:3].abs().max() <= 1e-6 * w[3].abs()).item()
+
+
+def is_off_center(settings) -> bool:
+    """Whether an edge of the picture is more than FRUSTUM_CLAMP half pictures away from the optical axis."""
+    center = view_center(settings.viewmatrix.double(), settings.projmatrix.double(), with_gradient=False)
+    tangents = center.new_tensor([float(settings.tanfovx), float(settings.tanfovy)])
+    return (1 + (center / tangents).abs().max() > FRUSTUM_CLAMP + 1e-6).item()
+
+
+def projected_sigmas(settings, means3D: torch.Tensor, scales: torch.Tensor, rotations: torch.Tensor) -> torch.Tensor:
+    """(P,) smaller standard deviation of every Gaussian in the image, px, before the footprint [EWA, Eq. 29-31].
+
+    This repeats the projection of csrc/core/project.h, with its clamp around the optical axis, because no op returns
+    the projected covariance. It is the square root of the smaller eigenvalue of that.
+    """
+    view = settings.viewmatrix.detach().reshape(4, 4)
+    x, y, z = (means3D @ view[:3, :3] + view[3, :3]).unbind(1)
+    flat = isinstance(settings.effects, Effects) and settings.effects.orthographic
+    depth, side = (torch.ones_like(z), 0) if flat else (z, FRUSTUM_CLAMP)
+    # Row i of the axes: s_i times column i of the rotation of the quaternion (w, u).
+    w, u = torch.nn.functional.normalize(rotations, dim=1)[:, None].split([1, 3], -1)
+    axes = torch.diag_embed(scales)
+    u = u.expand_as(axes)
+    turn = 2 * torch.linalg.cross(u, axes)
+    axes = settings.scale_modifier * (axes + w * turn + torch.linalg.cross(u, turn)) @ view[:3, :3]
+    rows = []
+    for a, b, tan, size in (
+        (0, x, settings.tanfovx, settings.image_width),
+        (1, y, settings.tanfovy, settings.image_height),
+    ):
+        slope = (b / z).clamp(-side * tan, side * tan)[:, None]
+        rows.append(size / (2 * tan) * (axes[:, :, a] - slope * axes[:, :, 2]) / depth[:, None])
+    xx, xy, yy = (rows[0] ** 2).sum(1), (rows[0] * rows[1]).sum(1), (rows[1] ** 2).sum(1)
+    largest = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)
+    area = torch.linalg.cross(rows[0], rows[1]).norm(dim=1)
+    return torch.where(largest > 0, area / largest.sqrt(), 0)

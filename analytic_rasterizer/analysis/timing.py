@@ -161,18 +161,6 @@ def event_seconds(call: Callable[[], object]) -> float:
     return start.elapsed_time(end) * 1e-3
 
 
-def median_seconds(clock: Callable[[Callable], float], call: Callable[[], object], rounds: int) -> float:
-    """Median of `clock(call)` on an idle CUDA device."""
-    torch.cuda.synchronize()
-    clock(call)
-    return statistics.median(clock(call) for _ in range(rounds))
-
-
-def median_of(samples: list[dict]) -> dict:
-    """The median of every key."""
-    return {key: statistics.median(sample[key] for sample in samples) for key in samples[0]}
-
-
 def warm_up_cuda(calls: list[Callable[[], object]], passes: int) -> None:
     """Renders with one footprint until the room for its pairs depends on these frames alone."""
     _C.force_pair_capacity(0)
