@@ -77,9 +77,6 @@ def all_cases() -> list[str]:
     return [*cases, "point:dilation=0", PAPER_GRADIENT]
 
 
-# ------------------------------------------------------------------------------- (a) one axis
-
-
 def logistic_cdf(x: torch.Tensor) -> torch.Tensor:
     """S(x), the paper's approximation of the normal CDF [AS, Eq. 5]."""
     return torch.sigmoid(1.6 * x + 0.07 * x**3)
@@ -100,9 +97,6 @@ def window_errors(sigmas: int = 200, offsets: int = 2001) -> list[dict]:
         peak = math.sqrt(2 * math.pi) * sigma
         rows.append({"sigma": sigma} | _max_rms("window", error) | _max_rms("weight", peak * error))
     return rows
-
-
-# ------------------------------------------------------------------------------- (b) rotation
 
 
 def rotation_errors(samples: int, monte_carlo: int, sigmas: int = 40) -> list[dict]:
@@ -131,9 +125,6 @@ def rotation_errors(samples: int, monte_carlo: int, sigmas: int = 40) -> list[di
         row |= _max_rms("references", sampled - exact) | {"standard_error_rms": _rms(standard_error)}
         rows.append(row | {"z_rms": _rms((sampled - exact) / standard_error)})
     return rows
-
-
-# ----------------------------------------------------------------------------- (c) footprints
 
 
 def footprint_errors(cases: list[str], samples: int, progress=lambda: None) -> list[dict]:
@@ -209,9 +200,6 @@ def _max_rms(name: str, error: torch.Tensor) -> dict[str, float]:
 
 def _rms(error: torch.Tensor) -> float:
     return error.square().mean().sqrt().item()
-
-
-# ---------------------------------------------------------------------------------- reporting
 
 
 def summarize(results: dict, samples: int, monte_carlo: int) -> str:
@@ -296,6 +284,7 @@ def _figures(results: dict) -> dict:
         return [(label, results[kind], prefix, style) for (label, prefix), style in zip(prefixes.items(), styles)]
 
     footprints = [(name, rows, "", tables.style(name)) for name, rows in _by_footprint(results["footprints"]).items()]
+    own_weights = [line for line in footprints if line[0] != PAPER_GRADIENT]
     weights = {f"weight_{kind}": label for kind, label in columns.items()}
     gradients = {f"{of}_relative_{kind}": f"{columns[kind]} of {GRADIENTS[of]}" for of in GRADIENTS for kind in columns}
     frame = "The pixel turned into the splat's frame, against two references"
@@ -303,7 +292,7 @@ def _figures(results: dict) -> dict:
     return {
         "window": _figure("The logistic window against erf", columns, lines("window", window)),
         "rotation": _figure(frame, columns, lines("rotation", rotation)),
-        "footprints_weight": _figure("Weight of a splat of peak 1 against the exact integral", weights, footprints),
+        "footprints_weight": _figure("Weight of a splat of peak 1 against the exact integral", weights, own_weights),
         "footprints_gradient": _figure(relative, gradients, footprints),
     }
 
@@ -314,8 +303,9 @@ def _figure(title: str, columns: dict[str, str], lines: list[tuple]):
     for ax, (column, label) in zip(axes.flat, columns.items()):
         for name, rows, prefix, style in lines:
             if prefix + column in rows[0]:
-                values = [max(row[prefix + column], 1e-10) for row in rows]  # zeros have no logarithm
+                values = [max(row[prefix + column], 1e-16) for row in rows]  # zeros have no logarithm
                 ax.plot([row["sigma"] for row in rows], values, **style | {"marker": None, "label": name})
         ax.set(yscale="log", ylabel=label)
+    ax.set_ylim(bottom=max(ax.get_ylim()[0], 1e-10))
     tables.add_titles(figure, axes, title, "smaller standard deviation [px]")
     return figure

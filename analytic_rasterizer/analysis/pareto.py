@@ -136,9 +136,6 @@ def run(
     return results
 
 
-# ---------------------------------------------------------------------------------- measuring
-
-
 def _measure_scale(scene, views, methods, background, max_density, settings: dict, timer) -> dict:
     """Reference and methods at one scale; `settings` are those of the results."""
 
@@ -272,9 +269,6 @@ def _ssim(color: torch.Tensor, truth: torch.Tensor) -> float | None:
 def _flat(pictures: dict[str, torch.Tensor]) -> torch.Tensor:
     """All values of the pictures of all views."""
     return torch.cat([picture.flatten() for picture in pictures.values()])
-
-
-# ---------------------------------------------------------------------------------- reporting
 
 
 def to_table(results: dict, at_scale: dict) -> tuple[list[str], list[list]]:

@@ -155,9 +155,6 @@ def _check(scene, views, tolerance, training_views, *options) -> tuple[list, lis
     return cameras[0], cameras[1]
 
 
-# ------------------------------------------------------------------------- what is called for
-
-
 @dataclass(frozen=True, eq=False)
 class _Survey:
     """The choice of effects, and what it is based on."""
@@ -198,9 +195,6 @@ def _survey(scene: Scene, cameras: list, tolerance: float, training: list | None
         filter_3d=everything.filter_3d if (filter_change or 0) > FILTER_SHARE * tolerance else None,
     )
     return _Survey(effects, everything, sh_band_bounds(shs), ratios, filter_change, off_center)
-
-
-# ------------------------------------------------------------------------- rendering and costs
 
 
 def _prepare(scene: Scene, camera, footprint: str, effects: Effects) -> tuple[GaussianRasterizationSettings, dict]:
@@ -269,9 +263,6 @@ def _effect_costs(scene, cameras, footprint, effects: Effects, shown, rounds) ->
     cases["shown"] = (only_shown, footprint, replace(effects, filter_3d=filter_3d))
     seconds = _seconds(cases, cameras, rounds)
     return {name: seconds[a] / seconds[b] for name, (a, b) in pairs.items()}
-
-
-# ------------------------------------------------------------------------------------- findings
 
 
 def _footprint_finding(candidates: tuple[Candidate, ...], footprint: str, views: tuple[ViewReport, ...]) -> Finding:
