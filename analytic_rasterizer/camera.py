@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import torch
 
+from ._C import FRUSTUM_CLAMP
 from .effects import Defocus, Effects, Motion
 from .settings import GaussianRasterizationSettings
 
@@ -180,3 +181,16 @@ def view_center(view: torch.Tensor, proj: torch.Tensor, with_gradient: bool) -> 
         view, proj = view.detach(), proj.detach()
     p = view.T @ proj / (view**2).sum(0)[:, None]
     return -p[2] / p.diagonal()
+
+
+def is_orthographic(settings) -> bool:
+    """Whether w of clip space is the same everywhere."""
+    w = settings.projmatrix.detach().reshape(4, 4)[:, 3]
+    return (w[:3].abs().max() <= 1e-6 * w[3].abs()).item()
+
+
+def is_off_center(settings) -> bool:
+    """Whether an edge of the picture is more than FRUSTUM_CLAMP half pictures away from the optical axis."""
+    center = view_center(settings.viewmatrix.double(), settings.projmatrix.double(), with_gradient=False)
+    tangents = center.new_tensor([float(settings.tanfovx), float(settings.tanfovy)])
+    return (1 + (center / tangents).abs().max() > FRUSTUM_CLAMP + 1e-6).item()

@@ -217,6 +217,19 @@ class View:
         cx, cy = (c if c is None else c * factor for c, factor in ((self.cx, x), (self.cy, y)))
         return replace(self, width=width, height=height, fx=x * self.fx, fy=y * self.fy, cx=cx, cy=cy)
 
+    def framed(self, scale: int, crop: tuple[int, int] | None = None) -> View:
+        """The view at 1/`scale` of its size, or the middle `crop` = (width, height) of that.
+
+        Pixels become `scale` times as large: where the size is not a multiple of `scale`, the remainder at the right
+        and at the bottom is cut off. A crop larger than the picture has no effect. A cropped view is a narrower
+        camera, not a part of a picture.
+        """
+        size = [max(1, length // scale) for length in (self.width, self.height)]
+        width, height = size if crop is None else map(min, size, crop)
+        centre = (self.width / 2 if self.cx is None else self.cx, self.height / 2 if self.cy is None else self.cy)
+        cx, cy = (c / scale - (have - want) // 2 for c, have, want in zip(centre, size, (width, height)))
+        return replace(self, width=width, height=height, fx=self.fx / scale, fy=self.fy / scale, cx=cx, cy=cy)
+
     def settings(
         self,
         scale: float = 1.0,

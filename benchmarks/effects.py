@@ -24,7 +24,7 @@ import statistics
 from collections.abc import Callable
 
 import torch
-from options import UNITS, WARM_UP, make_parser, parse, print_setup, save_json
+from common import UNITS, WARM_UP, make_parser, median_of, parse, print_setup, save_json
 from scene_files import load_scene
 
 import analytic_rasterizer as ar
@@ -35,7 +35,6 @@ from analytic_rasterizer.analysis.timing import (
     event_seconds,
     fixed_weights,
     in_turn,
-    median_of,
     seconds_of,
     warm_up_cuda,
 )

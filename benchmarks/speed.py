@@ -27,7 +27,7 @@ import time
 from collections.abc import Callable
 
 import torch
-from options import UNITS, WARM_UP, make_parser, parse, print_setup, save_json
+from common import UNITS, WARM_UP, make_parser, median_of, median_seconds, parse, print_setup, save_json
 from scene_files import load_scene
 
 import analytic_rasterizer as ar
@@ -37,8 +37,6 @@ from analytic_rasterizer.analysis.timing import (
     Case,
     event_seconds,
     in_turn,
-    median_of,
-    median_seconds,
     seconds_of,
     warm_up_cuda,
 )

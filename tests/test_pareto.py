@@ -105,13 +105,13 @@ def test_supersampled_case_averages_the_large_picture():
 
 def test_framed_view_has_pixels_of_the_scale():
     _, (view, shifted) = target()
-    half = pareto.framed(view, 2)
+    half = view.framed(2)
     assert (half.width, half.height) == (48, 32)  # of 97 x 65
     assert (half.fx, half.cx, half.cy) == (view.fx / 2, 97 / 4, 65 / 4)
-    assert pareto.framed(shifted, 2).cx == 15
-    tiny = pareto.framed(view, 1000)
+    assert shifted.framed(2).cx == 15
+    tiny = view.framed(1000)
     assert (tiny.width, tiny.height) == (1, 1)
-    whole = pareto.framed(view, 1, (500, 10))
+    whole = view.framed(1, (500, 10))
     assert (whole.width, whole.height) == (97, 10)
 
 
@@ -119,8 +119,8 @@ def test_framed_view_has_pixels_of_the_scale():
 def test_crop_is_the_middle_of_the_picture(scale):
     scene, views = target()
     for view in views:
-        whole = rendered(scene, pareto.framed(view, scale), "box")
-        part = rendered(scene, pareto.framed(view, scale, (20, 11)), "box")
+        whole = rendered(scene, view.framed(scale), "box")
+        part = rendered(scene, view.framed(scale, (20, 11)), "box")
         top, left = (whole.shape[1] - 11) // 2, (whole.shape[2] - 20) // 2
         difference = (part - whole[:, top : top + 11, left : left + 20]).abs()
         assert difference.max() < 2 / 255  # a splat at the 1/255 cut
@@ -131,7 +131,7 @@ def test_remainder_of_a_scale_is_cut_off():
     """A pixel of the smaller picture is the mean of the pixels of the larger that it covers."""
     scene, (view, _) = target()
     large = reference.supersampled(scene, view, 8, background=PAPER)[:, :64, :96]
-    small = reference.supersampled(scene, pareto.framed(view, 2), 16, background=PAPER)
+    small = reference.supersampled(scene, view.framed(2), 16, background=PAPER)
     assert (small - large.reshape(3, 32, 2, 48, 2).mean((2, 4))).abs().mean() < 1e-5
 
 
@@ -141,7 +141,7 @@ def test_remainder_of_a_scale_is_cut_off():
 def test_errors_by_hand(measured):
     _, results = measured
     scene, views = target()
-    small = [pareto.framed(view, 2) for view in views]
+    small = [view.framed(2) for view in views]
     assert [at["scale"] for at in results["scales"]] == [1, 2]
     at_scale = results["scales"][1]
     assert at_scale["sizes"] == [[48, 32], [44, 30]]

@@ -61,15 +61,9 @@ def run(out, samples: int = SAMPLES, monte_carlo: int = MONTE_CARLO, rotation_sa
         results["rotation"] = rotation_errors(rotation_samples or ROTATION_SAMPLES, monte_carlo)
         bar.update()
         results["footprints"] = footprint_errors(cases, samples, bar.update)
-    figures = {
-        "window": _plot_window(results["window"]),
-        "rotation": _plot_rotation(results["rotation"]),
-        "footprints_weight": _plot_weight(results["footprints"]),
-        "footprints_gradient": _plot_gradients(results["footprints"]),
-    }
     for name, rows in results.items():
         tables.save_csv(out / f"{name}.csv", rows)
-    for name, figure in figures.items():
+    for name, figure in _figures(results).items():
         tables.save_figure(figure, out, name)
     summary = summarize(results, samples, monte_carlo)
     (out / "summary.md").write_text(summary, encoding="utf-8")
@@ -81,9 +75,6 @@ def all_cases() -> list[str]:
     # `exact` is the truth, and `adaptive` takes the weights of `box`, for whole tiles.
     cases = [case for case in footprint_variants() if case not in (EXACT, "adaptive")]
     return [*cases, "point:dilation=0", PAPER_GRADIENT]
-
-
-# ------------------------------------------------------------------------------- (a) one axis
 
 
 def logistic_cdf(x: torch.Tensor) -> torch.Tensor:
@@ -108,9 +99,6 @@ def window_errors(sigmas: int = 200, offsets: int = 2001) -> list[dict]:
     return rows
 
 
-# ------------------------------------------------------------------------------- (b) rotation
-
-
 def rotation_errors(samples: int, monte_carlo: int, sigmas: int = 40) -> list[dict]:
     """Errors of integrating over the turned pixel, with the exact CDF (the footprint `erf`), by standard deviation.
 
@@ -129,20 +117,14 @@ def rotation_errors(samples: int, monte_carlo: int, sigmas: int = 40) -> list[di
         turned, exact = (footprint_weight(offset, cov2d, name) for name in ("erf", EXACT))
         square = footprint_weight(offset, cov2d / 2, EXACT)
         standard_error = ((square - exact**2).clamp_min(0) / monte_carlo).sqrt()
-        sampled = torch.stack([_monte_carlo(d, c, monte_carlo, random) for d, c in zip(offset, cov2d)])
+        sampled = torch.empty_like(exact)
+        for i, conic in enumerate(_matrix(cov2d).inverse()):
+            d = offset[i] + torch.rand(monte_carlo, 2, generator=random, dtype=torch.float64) - 0.5
+            sampled[i] = torch.exp(-(d @ conic * d).sum(1) / 2).mean()
         row = {"sigma": sigma} | _max_rms("exact", turned - exact) | _max_rms("monte_carlo", turned - sampled)
-        row |= _max_rms("references", sampled - exact) | {"standard_error": _rms(standard_error)}
+        row |= _max_rms("references", sampled - exact) | {"standard_error_rms": _rms(standard_error)}
         rows.append(row | {"z_rms": _rms((sampled - exact) / standard_error)})
     return rows
-
-
-def _monte_carlo(offset: torch.Tensor, cov2d: torch.Tensor, samples: int, random: torch.Generator) -> torch.Tensor:
-    """Mean of exp(-q/2) over uniform samples in the unit pixel around offset (2,)."""
-    d = offset + torch.rand(samples, 2, generator=random, dtype=torch.float64) - 0.5
-    return torch.exp(-(d @ _matrix(cov2d).inverse() * d).sum(1) / 2).mean()
-
-
-# ----------------------------------------------------------------------------- (c) footprints
 
 
 def footprint_errors(cases: list[str], samples: int, progress=lambda: None) -> list[dict]:
@@ -152,8 +134,8 @@ def footprint_errors(cases: list[str], samples: int, progress=lambda: None) -> l
     same for every footprint: anisotropy log-uniform in 1 to RATIO, any rotation, offsets uniform in the 3 sigma
     ellipse of Sigma + I/12. A row holds maximum and RMS of the error of the weight I, and of the norm of the error of
     dI/d offset [1/px] and of dI/dSigma, whitened by Sigma: L^T (dI/dSigma) L with Sigma = L L^T, that is per relative
-    change of Sigma. `_true_rms` is the RMS norm of the exact value, to make errors relative. The gradient is what
-    autograd gives, which for `analytic` is not the derivative of the weight unless frame_gradient is "paper".
+    change of Sigma; `_relative_` over the RMS norm of the exact value. The gradient is what autograd gives, which for
+    `analytic` is not the derivative of the weight unless frame_gradient is "paper".
     """
     unit = _unit_samples(samples)
     sigmas = _log_uniform(SIGMAS, round(PER_DECADE * math.log10(SIGMAS[1] / SIGMAS[0])) + 1)
@@ -164,8 +146,8 @@ def footprint_errors(cases: list[str], samples: int, progress=lambda: None) -> l
         for sigma, splat, exact in zip(sigmas, splats, truth):
             row = {"footprint": case, "sigma": sigma}
             for name, value, true in zip(("weight", *GRADIENTS), _weight_and_gradients(*splat, case), exact):
-                row |= _max_rms(name, (value - true).flatten(1).norm(dim=1))
-                row[f"{name}_true_rms"] = _rms(true.flatten(1).norm(dim=1))
+                error, size = (value - true).flatten(1).norm(dim=1), _rms(true.flatten(1).norm(dim=1))
+                row |= _max_rms(name, error) | _max_rms(f"{name}_relative", error / size)
             rows.append(row)
         progress()
     return rows
@@ -220,22 +202,21 @@ def _rms(error: torch.Tensor) -> float:
     return error.square().mean().sqrt().item()
 
 
-# ---------------------------------------------------------------------------------- reporting
-
-
 def summarize(results: dict, samples: int, monte_carlo: int) -> str:
     """The tables, as Markdown."""
-    window, rotation, footprints = results["window"], results["rotation"], results["footprints"]
+    window, rotation = results["window"], results["rotation"]
     worst, peak = (max(window, key=lambda row: row[key]) for key in ("window_max", "weight_max"))
     turned = max(rotation, key=lambda row: row["exact_max"])
     z = math.sqrt(sum(row["z_rms"] ** 2 for row in rotation) / len(rotation))
     low, high = PAPER_SIGMAS
+    references = ["against exact, max / RMS", f"against {monte_carlo} samples", "the two references"]
     by_sigma = [
-        [f"{row['sigma']:.2f}", *(_error_text(row, name) for name in ("exact", "monte_carlo", "references"))]
+        [f"{row['sigma']:.2f}", *(_max_rms_text(row, name) for name in ("exact", "monte_carlo", "references"))]
         + [f"{row['z_rms']:.2f}"]
         for row in rotation[:: max(1, len(rotation) // 8)]
     ]
-    references = ["against exact, max / RMS", f"against {monte_carlo} samples", "the two references"]
+    footprints = _by_footprint(results["footprints"])
+    weights = {name: rows for name, rows in footprints.items() if name != PAPER_GRADIENT}  # whose weight is not its own
     parts = [
         "# Errors of the pixel's weight",
         f"## One axis: the logistic window, sigma in [{low}, {high}] px, |x| <= 3 sigma",
@@ -248,25 +229,19 @@ def summarize(results: dict, samples: int, monte_carlo: int) -> str:
         f"## Every footprint, {samples} splats of each sigma, anisotropy 1 to {RATIO:.0f}, any rotation, offset to "
         "3 standard deviations",
         "Error of the weight, max / RMS, by smaller standard deviation [px]:",
-        _by_sigma(_without_paper_gradient(footprints), lambda row: _error_text(row, "weight")),
+        _by_sigma(weights, lambda row: _max_rms_text(row, "weight")),
         "RMS error of dI/d offset, relative to the RMS of the exact one:",
-        _by_sigma(footprints, lambda row: f"{row['offset_rms'] / row['offset_true_rms']:.1e}"),
+        _by_sigma(footprints, lambda row: f"{row['offset_relative_rms']:.1e}"),
         "RMS error of dI/dSigma, whitened, relative to the RMS of the exact one:",
-        _by_sigma(footprints, lambda row: f"{row['cov2d_rms'] / row['cov2d_true_rms']:.1e}"),
+        _by_sigma(footprints, lambda row: f"{row['cov2d_relative_rms']:.1e}"),
         "Smallest standard deviation [px] from which on the worst error of the weight stays below:",
-        _by_threshold(_without_paper_gradient(footprints)),
+        tables.markdown_table(
+            ["footprint", *(f"{threshold:.0e}" for threshold in THRESHOLDS)],
+            [[name, *(_smallest_sigma(rows, t) for t in THRESHOLDS)] for name, rows in weights.items()],
+        ),
         "Maxima are over the splats of the sample, and so they are lower bounds.",
     ]
     return "\n\n".join(parts) + "\n"
-
-
-def _error_text(row: dict, name: str) -> str:
-    return f"{row[f'{name}_max']:.1e} / {row[f'{name}_rms']:.1e}"
-
-
-def _without_paper_gradient(rows: list[dict]) -> list[dict]:
-    """Without the case whose weight is that of `analytic`."""
-    return [row for row in rows if row["footprint"] != PAPER_GRADIENT]
 
 
 def _by_footprint(rows: list[dict]) -> dict[str, list[dict]]:
@@ -274,93 +249,63 @@ def _by_footprint(rows: list[dict]) -> dict[str, list[dict]]:
     return {name: [row for row in rows if row["footprint"] == name] for name in names}
 
 
-def _by_sigma(rows: list[dict], text) -> str:
-    by_footprint = _by_footprint(rows)
-    sigmas = [row["sigma"] for row in next(iter(by_footprint.values()))]
-    columns = [min(range(len(sigmas)), key=lambda i: abs(math.log(sigmas[i] / s))) for s in TABLE_SIGMAS]
-    header = ["footprint", *(f"{sigmas[i]:.2g}" for i in columns)]
-    return tables.markdown_table(header, [[name, *(text(of[i]) for i in columns)] for name, of in by_footprint.items()])
+def _max_rms_text(row: dict, name: str) -> str:
+    return f"{row[f'{name}_max']:.1e} / {row[f'{name}_rms']:.1e}"
 
 
-def _by_threshold(rows: list[dict]) -> str:
-    def smallest(of_name: list[dict], threshold: float) -> str:
-        above = max((row["sigma"] for row in of_name if row["weight_max"] > threshold), default=0)
-        later = [row["sigma"] for row in of_name if row["sigma"] > above]
-        return f"{'' if above else '<= '}{later[0]:.2g}" if later else f"> {SIGMAS[1]:.2g}"
-
-    cells = [[name, *(smallest(of, threshold) for threshold in THRESHOLDS)] for name, of in _by_footprint(rows).items()]
-    return tables.markdown_table(["footprint", *(f"{t:.0e}" for t in THRESHOLDS)], cells)
-
-
-def _plot(ax, rows: list[dict], key: str, relative_to: str | None = None, **options) -> None:
-    """One column of the rows over sigma, on logarithmic axes, which zeros leave at the bottom."""
-    values = [max(row[key] / (row[relative_to] if relative_to else 1), 1e-16) for row in rows]
-    ax.plot([row["sigma"] for row in rows], values, **options)
-    ax.set_yscale("log")
+def _by_sigma(by_footprint: dict[str, list[dict]], text) -> str:
+    """A table of `text(row)` at the deviations nearest to TABLE_SIGMAS."""
+    header, *lines = ["footprint"], *([name] for name in by_footprint)
+    for sigma in TABLE_SIGMAS:
+        nearest = [min(rows, key=lambda row: abs(math.log(row["sigma"] / sigma))) for rows in by_footprint.values()]
+        header.append(f"{nearest[0]['sigma']:.2g}")
+        for line, row in zip(lines, nearest):
+            line.append(text(row))
+    return tables.markdown_table(header, lines)
 
 
-def _plot_window(rows: list[dict]):
-    figure, axes = tables.new_figure(10, 4.2, 2, sharex=True, sharey=True)
-    titles = {
-        "window": "integral of the density",
-        "weight": r"weight of a splat of peak 1 ($\sqrt{2\pi}\,\sigma$ times)",
+def _smallest_sigma(rows: list[dict], threshold: float) -> str:
+    """The deviation from which on the weight's error stays below the threshold."""
+    above = max((row["sigma"] for row in rows if row["weight_max"] > threshold), default=0)
+    later = [row["sigma"] for row in rows if row["sigma"] > above]
+    return f"{'' if above else '<= '}{later[0]:.2g}" if later else f"> {SIGMAS[1]:.2g}"
+
+
+def _figures(results: dict) -> dict:
+    """The figures, by name."""
+    columns = {"max": "maximum error", "rms": "RMS error"}
+    window = {"density integrated over the pixel": "window_", "weight of a splat of peak 1": "weight_"}
+    rotation = {"turned pixel - exact": "exact_", "turned pixel - Monte Carlo": "monte_carlo_"}
+    rotation |= {"Monte Carlo - exact": "references_", "standard error of Monte Carlo": "standard_error_"}
+    rotation["(Monte Carlo - exact) / standard error"] = "z_"
+    styles = [tables.style(name) for name in ("analytic", "mip", "point", "exact", "cumulant")]
+
+    def lines(kind: str, prefixes: dict[str, str]) -> list[tuple]:
+        return [(label, results[kind], prefix, style) for (label, prefix), style in zip(prefixes.items(), styles)]
+
+    footprints = [(name, rows, "", tables.style(name)) for name, rows in _by_footprint(results["footprints"]).items()]
+    own_weights = [line for line in footprints if line[0] != PAPER_GRADIENT]
+    weights = {f"weight_{kind}": label for kind, label in columns.items()}
+    gradients = {f"{of}_relative_{kind}": f"{columns[kind]} of {GRADIENTS[of]}" for of in GRADIENTS for kind in columns}
+    frame = "The pixel turned into the splat's frame, against two references"
+    relative = "Gradients against those of the exact integral, relative to their RMS"
+    return {
+        "window": _figure("The logistic window against erf", columns, lines("window", window)),
+        "rotation": _figure(frame, columns, lines("rotation", rotation)),
+        "footprints_weight": _figure("Weight of a splat of peak 1 against the exact integral", weights, own_weights),
+        "footprints_gradient": _figure(relative, gradients, footprints),
     }
-    color = tables.style("analytic")["color"]
-    for ax, (key, title) in zip(axes.flat, titles.items()):
-        _plot(ax, rows, f"{key}_max", color=color, label="maximum")
-        _plot(ax, rows, f"{key}_rms", color=color, ls="--", label="RMS")
-        ax.set(ylim=(5e-5, 5e-3), ylabel="absolute error")
-        ax.set_title(title, fontsize=10)
-    title = "The logistic window against erf, |x| within 3 standard deviations"
-    tables.add_titles(figure, axes, title, "standard deviation [px]")
-    return figure
 
 
-def _plot_rotation(rows: list[dict]):
-    figure, axes = tables.new_figure(11, 4.2, 2, sharex=True)
-    left, right = axes[0]
-    labels = {"exact": "turned pixel - exact", "monte_carlo": "turned pixel - Monte Carlo"}
-    for (name, label), footprint in zip(
-        {**labels, "references": "Monte Carlo - exact"}.items(), ("analytic", "mip", "point")
-    ):
-        color = tables.style(footprint)["color"]
-        _plot(left, rows, f"{name}_max", color=color, label=f"{label}, maximum")
-        _plot(left, rows, f"{name}_rms", color=color, ls="--", label=f"{label}, RMS")
-    _plot(left, rows, "standard_error", color="black", ls=":", label="standard error of Monte Carlo")
-    left.set_ylabel("absolute error of the weight")
-    right.axhline(1, color="black", linewidth=0.9, linestyle=":")
-    _plot(right, rows, "z_rms", color=color, marker="o", markersize=3)
-    right.set(yscale="linear", ylim=(0, 2), ylabel="RMS of (Monte Carlo - exact) / standard error")
-    title = "The pixel turned into the splat's frame, against two references"
-    tables.add_titles(figure, axes, title, "smaller standard deviation [px]", fontsize=8)
-    return figure
-
-
-def _plot_weight(rows: list[dict]):
-    keys = {"weight_max": "maximum error of the weight", "weight_rms": "RMS error of the weight"}
-    title = "Weight of a splat of peak 1 against the exact integral"
-    return _plot_footprints(_without_paper_gradient(rows), keys, title, (1e-10, 1.5), relative=False)
-
-
-def _plot_gradients(rows: list[dict]):
-    kinds = {"max": "maximum", "rms": "RMS"}
-    keys = {
-        f"{name}_{kind}": f"{kinds[kind]} error of {label}, relative"
-        for name, label in GRADIENTS.items()
-        for kind in kinds
-    }
-    title = "Gradients against those of the exact integral, relative to their RMS"
-    return _plot_footprints(rows, keys, title, (1e-9, 1e4), relative=True)
-
-
-def _plot_footprints(rows: list[dict], keys: dict[str, str], title: str, ylim: tuple, relative: bool):
-    """A curve of every footprint in the axes of every key, two beside each other."""
-    figure, axes = tables.new_figure(13, 0.7 + 4.2 * len(keys) / 2, 2, len(keys) // 2, sharex=True, sharey=True)
-    for ax, (key, label) in zip(axes.flat, keys.items()):
-        true = f"{key.rpartition('_')[0]}_true_rms" if relative else None
-        for footprint, of_name in _by_footprint(rows).items():
-            options = tables.style(footprint) | {"marker": None, "linewidth": 1.6, "label": footprint}
-            _plot(ax, of_name, key, true, **options)
-        ax.set(ylim=ylim, ylabel=label)
-    tables.add_titles(figure, axes, f"{title}; anisotropy 1 to {RATIO:.0f}", "smaller standard deviation [px]")
+def _figure(title: str, columns: dict[str, str], lines: list[tuple]):
+    """Axes for every column of the rows and its label; a line is its label, rows, prefix of the column, and style."""
+    figure, axes = tables.new_figure(12, 0.6 + 2.2 * len(columns), 2, len(columns) // 2, sharex=True, sharey=True)
+    for ax, (column, label) in zip(axes.flat, columns.items()):
+        for name, rows, prefix, style in lines:
+            if prefix + column in rows[0]:
+                values = [max(row[prefix + column], 1e-16) for row in rows]  # zeros have no logarithm
+                ax.plot([row["sigma"] for row in rows], values, **style | {"marker": None, "label": name})
+        ax.set(yscale="log", ylabel=label)
+    ax.set_ylim(bottom=max(ax.get_ylim()[0], 1e-10))
+    tables.add_titles(figure, axes, title, "smaller standard deviation [px]")
     return figure

@@ -64,39 +64,25 @@ class ViewReport:
 
 @dataclass(frozen=True, eq=False)
 class SceneReport:
-    """What `inspect_scene` found.
+    """What `inspect_scene` found: the recommended `effects` and `footprint`, and what the choice is based on."""
 
-    Attributes:
-        gaussians, sh_degree: Of the scene.
-        tolerance: As given to `inspect_scene`.
-        machine: On which times were measured.
-        effects: The recommended `Effects`.
-        footprint: The recommended footprint, as `GaussianRasterizationSettings` takes it.
-        findings: One `Finding` per effect.
-        candidates: A `Candidate` for every footprint that was tried.
-        views: One `ViewReport` per view.
-        shown: (P,) bool, on the scene's device: Gaussians that touch a tile of some view. The others change no pixel
-            of these views.
-    """
-
-    gaussians: int
+    gaussians: int  # of the scene
     sh_degree: int
-    tolerance: float
-    machine: str
+    tolerance: float  # RMS in units of colour, as given to `inspect_scene`
+    machine: str  # on which times were measured
     effects: Effects
-    footprint: str
-    findings: tuple[Finding, ...]
-    candidates: tuple[Candidate, ...]
+    footprint: str  # as `GaussianRasterizationSettings` takes it
+    findings: tuple[Finding, ...]  # one per effect
+    candidates: tuple[Candidate, ...]  # the footprints that were tried
     views: tuple[ViewReport, ...]
-    shown: torch.Tensor
+    shown: torch.Tensor  # (P,) bool, on the scene's device: touches a tile of some view; the others change no pixel
 
     def to_json(self) -> dict:
         """Everything as numbers, strings, lists and dicts; for the tensors shares and counts."""
         data = asdict(self)
-        effects, footprint = data.pop("effects"), data.pop("footprint")
-        options = {name: effects[name] for name in ("sh_degree", "orthographic", "off_center")}
-        has_filter = {"filter_3d": effects["filter_3d"] is not None}
-        data["recommendation"] = {"footprint": footprint} | options | has_filter
+        effects = data.pop("effects")
+        data["recommendation"] = {"footprint": data.pop("footprint"), "filter_3d": effects["filter_3d"] is not None}
+        data["recommendation"] |= {name: effects[name] for name in ("sh_degree", "orthographic", "off_center")}
         for view, fields in zip(self.views, data["views"]):
             del fields["tile_samples"]
             fields["tile_shares"] = {str(samples): value for samples, value in view.tile_shares.items()}
@@ -104,11 +90,11 @@ class SceneReport:
 
     def to_text(self) -> str:
         """Tables and sentences. Changes and RMS in units of 1/255."""
-        found = [
-            [f.name, _YES_NO[f.needed], in_255(f.change), f.kind, _ratio(f.cost), f.recommendation]
-            for f in self.findings
+        shown = {None: None, True: "yes", False: "no"}
+        effects = [
+            [f.name, shown[f.needed], in_255(f.change), f.kind, _ratio(f.cost), f.recommendation] for f in self.findings
         ]
-        tried = [[c.footprint, in_255(c.rms), _YES_NO[c.fits], _ratio(c.cost)] for c in self.candidates]
+        tried = [[c.footprint, in_255(c.rms), shown[c.fits], _ratio(c.cost)] for c in self.candidates]
         header = ["view", "size", "shown", "< 1/2 px", "RMS [1/255]"]
         header += [f"{n} sample{'s' * (n > 1)}" for n in TILE_SAMPLES] + ["finer than trained", "at most"]
         views = [
@@ -117,16 +103,18 @@ class SceneReport:
             + [_ratio(v.finest)]
             for v in self.views
         ]
-        if self.views[0].finer is None:
-            header, views = header[:-2], [row[:-2] for row in views]
+        columns = len(header) - 2 * (self.views[0].finer is None)
+        options = [f"sh_degree={self.effects.sh_degree}"] if self.effects.sh_degree is not None else []
+        options += [f"{name}=True" for name in ("orthographic", "off_center") if getattr(self.effects, name)]
+        options += ["filter_3d=..."] if self.effects.filter_3d is not None else []
         return "\n\n".join([
             f"{self.gaussians} Gaussians of SH degree {self.sh_degree}; {self.machine}\n"
             f"tolerance: RMS of {in_255(self.tolerance)}/255 in every view",
-            f"recommended: footprint {self.footprint}, {_describe(self.effects)}",
-            tables.format_table(["effect", "needed", "change [1/255]", "", "cost", "recommendation"], found),
+            f"recommended: footprint {self.footprint}, Effects({', '.join(options)})",
+            tables.format_table(["effect", "needed", "change [1/255]", "", "cost", "recommendation"], effects),
             "\n".join(f"{f.name}: {f.reason}" for f in self.findings),
             tables.format_table(["footprint", "RMS [1/255]", "fits", "cost"], tried),
-            tables.format_table(header, views),
+            tables.format_table(header[:columns], [row[:columns] for row in views]),
         ])  # fmt: skip
 
     def save_picture(self, path) -> None:
@@ -135,52 +123,32 @@ class SceneReport:
         Raises ImportError without matplotlib, OSError where the file cannot be written, ValueError for a suffix that
         matplotlib does not know.
         """
-        figure, axes = tables.new_figure(5 + 5 * len(self.views[:MAPS]), 3.8, 1 + len(self.views[:MAPS]))
-        _draw_histogram(axes[0, 0], self.views[:DRAWN])
-        for ax, view in zip(axes[0, 1:], self.views):
-            _draw_tiles(ax, view)
+        maps = self.views[:MAPS]
+        figure, axes = tables.new_figure(5 + 5 * len(maps), 3.8, 1 + len(maps))
+        ax, occupied = axes[0, 0], [BINS.index(NARROW)]
+        for view in self.views[:DRAWN]:
+            ax.stairs([100 * count / max(1, view.shown) for count in view.sigmas], BINS, label=view.name, linewidth=1.4)
+            occupied += [i for i, count in enumerate(view.sigmas) if count > 1e-3 * view.shown]
+        ax.axvline(NARROW, color="black", linewidth=0.9, linestyle=":")
+        ax.set_xscale("log", base=2)
+        ax.set_xlim(BINS[min(occupied)], BINS[max(occupied) + 1])
+        ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}" if value >= 1 else f"1/{1 / value:g}")
+        ax.set(xlabel="smaller standard deviation in the image [px]", ylabel="Gaussians shown [%]")
+        ax.legend(frameon=False, fontsize=8)
+        colors = [tables.style(f"box:samples={samples}")["color"] for samples in TILE_SAMPLES]
+        palette = optional_import("matplotlib.colors", "analysis").ListedColormap(colors)
+        for ax, view in zip(axes[0, 1:], maps):
+            rows, columns = view.tile_samples.shape
+            index = torch.bucketize(view.tile_samples, torch.tensor(TILE_SAMPLES)).numpy()
+            extent = (0, TILE * columns, TILE * rows, 0)
+            ax.imshow(index, palette, vmin=-0.5, vmax=3.5, extent=extent, interpolation="nearest")
+            ax.set(xlim=(0, view.width), ylim=(view.height, 0), xlabel="px")
+            ax.grid(False)
+            ax.set_title(f"{view.name}: samples per tile", fontsize=10)
+            for color, (samples, value) in zip(colors, view.tile_shares.items()):
+                ax.plot([], [], "s", color=color, label=f"{samples}: {percent(value)}")
+            ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=4, frameon=False, fontsize=8)
         figure.savefig(path, dpi=140)
-
-
-def _draw_histogram(ax, views: tuple[ViewReport, ...]) -> None:
-    """Standard deviations of the Gaussians of every view."""
-    occupied = [BINS.index(NARROW)]
-    for view in views:
-        ax.stairs([100 * count / max(1, view.shown) for count in view.sigmas], BINS, label=view.name, linewidth=1.4)
-        occupied += [i for i, count in enumerate(view.sigmas) if count > 1e-3 * view.shown]
-    ax.axvline(NARROW, color="black", linewidth=0.9, linestyle=":")
-    ax.set_xscale("log", base=2)
-    ax.set_xlim(BINS[min(occupied)], BINS[max(occupied) + 1])
-    ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}" if value >= 1 else f"1/{1 / value:g}")
-    ax.set(xlabel="smaller standard deviation in the image [px]", ylabel="Gaussians shown [%]")
-    ax.legend(frameon=False, fontsize=8)
-
-
-def _draw_tiles(ax, view: ViewReport) -> None:
-    """How many samples every tile needs."""
-    rows, columns = view.tile_samples.shape
-    colors = [tables.style(f"box:samples={samples}")["color"] for samples in TILE_SAMPLES]
-    palette = optional_import("matplotlib.colors", "analysis").ListedColormap(colors)
-    index = torch.bucketize(view.tile_samples, torch.tensor(TILE_SAMPLES)).numpy()
-    ax.imshow(index, palette, vmin=-0.5, vmax=3.5, extent=(0, TILE * columns, TILE * rows, 0), interpolation="nearest")
-    ax.set(xlim=(0, view.width), ylim=(view.height, 0), xlabel="px")
-    ax.grid(False)
-    ax.set_title(f"{view.name}: samples per tile", fontsize=10)
-    for samples, color in zip(TILE_SAMPLES, colors):
-        ax.plot([], [], "s", color=color, label=f"{samples}: {percent(view.tile_shares[samples])}")
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=4, frameon=False, fontsize=8)
-
-
-# ----------------------------------------------------------------------------------- in words
-
-_YES_NO = {True: "yes", False: "no", None: None}
-
-
-def _describe(effects: Effects) -> str:
-    options = [f"sh_degree={effects.sh_degree}"] if effects.sh_degree is not None else []
-    options += [f"{name}=True" for name in ("orthographic", "off_center") if getattr(effects, name)]
-    options += ["filter_3d=..."] if effects.filter_3d is not None else []
-    return f"Effects({', '.join(options)})"
 
 
 def _ratio(value: float | None) -> str | None:

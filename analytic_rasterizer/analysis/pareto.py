@@ -11,7 +11,7 @@ import json
 import math
 import statistics
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -64,20 +64,6 @@ def default_methods() -> list[Method]:
     return [Method(name) for name in footprint_variants()] + supersampled_points
 
 
-def framed(view: View, scale: int, crop: tuple[int, int] | None = None) -> View:
-    """The view at 1/`scale` of its size, or the middle `crop` = (width, height) of that.
-
-    Pixels stay `scale` times as large as those of the view: where its size is not a multiple of `scale`, the remainder
-    at the right and at the bottom is cut off. A crop larger than the picture has no effect. A cropped view is a
-    narrower camera, not a part of a picture.
-    """
-    size = [max(1, length // scale) for length in (view.width, view.height)]
-    width, height = size if crop is None else map(min, size, crop)
-    centre = (view.width / 2 if view.cx is None else view.cx, view.height / 2 if view.cy is None else view.cy)
-    cx, cy = (c / scale - (have - want) // 2 for c, have, want in zip(centre, size, (width, height)))
-    return replace(view, width=width, height=height, fx=view.fx / scale, fy=view.fy / scale, cx=cx, cy=cy)
-
-
 def run(
     out,
     scene: Scene,
@@ -98,7 +84,7 @@ def run(
         out: Folder, which must exist.
         scene: On the device to measure.
         views: At least one.
-        scales: Reductions: 8 is 1/8 of the views' size. See `framed`.
+        scales: Reductions: 8 is 1/8 of the views' size. See `View.framed`.
         methods: None is `default_methods()`.
         crop: (width, height) px, at every scale.
         background: RGB.
@@ -139,7 +125,7 @@ def run(
     }
     timer = time.process_time if cpu_time else time.perf_counter
     for scale in scales:
-        small = [framed(view, scale, crop) for view in views]
+        small = [view.framed(scale, crop) for view in views]
         sizes = [[view.width, view.height] for view in small]
         measured = _measure_scale(scene, small, methods, background, max_density, results, timer)
         results["scales"].append({"scale": scale, "sizes": sizes, **measured})
@@ -148,9 +134,6 @@ def run(
         (out / "pareto.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
         (out / "pareto.md").write_text(to_markdown(results), encoding="utf-8")
     return results
-
-
-# ---------------------------------------------------------------------------------- measuring
 
 
 def _measure_scale(scene, views, methods, background, max_density, settings: dict, timer) -> dict:
@@ -288,36 +271,28 @@ def _flat(pictures: dict[str, torch.Tensor]) -> torch.Tensor:
     return torch.cat([picture.flatten() for picture in pictures.values()])
 
 
-# ---------------------------------------------------------------------------------- reporting
-
-
 def to_table(results: dict, at_scale: dict) -> tuple[list[str], list[list]]:
     """(header, rows) of one scale. Times are ratios on the CPU, milliseconds on CUDA."""
-    unit, _, key, factor = _time_unit(results)
-    header = ["method", "PSNR [dB]", "RMSE", "bias", "99.9%", "max", "SSIM"]
-    header += [f"forward [{unit}]", f"with backward [{unit}]", "memory [MiB]", "weight RMSE", "blending RMSE", "front"]
-
-    def text(value: float | None, digits: str) -> str | None:
-        return None if value is None else f"{value:{digits}}"
-
+    _, key, factor = _time_unit(results)
+    unit = "ms" if key == "seconds" else key
+    header = ["method", "PSNR [dB]", "RMSE", "bias", "99.9%", "max", "SSIM", f"forward [{unit}]"]
+    header += [f"with backward [{unit}]", "memory [MiB]", "weight RMSE", "blending RMSE", "front"]
+    formats = {"rmse": ".2e", "bias": ".2e", "p999": ".2e", "max": ".2e", "ssim": ".5f"}
+    formats |= {f"{passes}_{key}": ".2f" for passes in PASSES}
+    formats |= {"extra_bytes": ".0f", "weight_rmse": ".2e", "blending_rmse": ".2e"}
+    factors = {f"{passes}_{key}": factor for passes in PASSES} | {"extra_bytes": 2**-20}
     rows = []
     for row in at_scale["methods"]:
         cells = [row["method"], ("" if row["resolved"] else "~") + f"{row['psnr']:.2f}"]
-        cells += [f"{row[error]:.2e}" for error in ("rmse", "bias", "p999", "max")] + [text(row["ssim"], ".5f")]
-        cells += [f"{row[f'{passes}_{key}'] * factor:.2f}" for passes in PASSES]
-        cells.append(text(row["extra_bytes"] and row["extra_bytes"] / 2**20, ".0f"))
-        cells += [text(row[part], ".2e") for part in ("weight_rmse", "blending_rmse")]
+        for name, digits in formats.items():
+            cells.append(None if row[name] is None else f"{row[name] * factors.get(name, 1):{digits}}")
         rows.append([*cells, "".join(letter for letter, p in zip("FB", PASSES) if row[f"{p}_front"]) or None])
     return header, rows
 
 
-def _time_unit(results: dict) -> tuple[str, str, str, float]:
-    """How times are shown: unit in the table, unit in the plot, key of a row, factor."""
-    return (
-        ("ms", "ms", "seconds", 1e3)
-        if results["device"] == "cuda"
-        else ("ratio", f"times {results['base']}", "ratio", 1)
-    )
+def _time_unit(results: dict) -> tuple[str, str, float]:
+    """How times are shown: the unit, the key of a row, and a factor."""
+    return ("ms", "seconds", 1e3) if results["device"] == "cuda" else (f"times {results['base']}", "ratio", 1)
 
 
 def describe(results: dict, at_scale: dict) -> list[str]:
@@ -366,53 +341,41 @@ def to_markdown(results: dict) -> str:
 
 def _plot(results: dict, at_scale: dict):
     """Accuracy over time, for both passes, with the front."""
-    _, unit, key, factor = _time_unit(results)
+    unit, key, factor = _time_unit(results)
+    rows = at_scale["methods"]
     figure, axes = tables.new_figure(13, 5.6, 2, sharey=True)
     for ax, (passes, title) in zip(axes[0], PASSES.items()):
-        points = {row["method"]: (row[f"{passes}_{key}"] * factor, row["psnr"]) for row in at_scale["methods"]}
-        # The best accuracy for a time: constant until the next method of the front.
-        front = sorted(points[row["method"]] for row in at_scale["methods"] if row[f"{passes}_front"])
-        wide = {"color": "#ffd43b", "linewidth": 5, "alpha": 0.7, "zorder": 1, "drawstyle": "steps-post"}
-        ax.plot(*zip(*front), label="Pareto front", **wide)
-        for label, members in _families(at_scale["methods"]).items():
-            look = tables.style(members[-1]["footprint"]) | {"linestyle": ""}
-            if members[-1]["supersampling"] > 1:
-                look["marker"] = "X"
-            ax.plot(*zip(*(points[row["method"]] for row in members)), color=look["color"], linewidth=1, zorder=2)
-            for row in members:
-                x, y = points[row["method"]]
-                if key == "ratio":
-                    ax.plot([x, row[f"{passes}_usual_ratio"]], [y, y], color=look["color"], linewidth=1, alpha=0.5)
-                face = {} if row["resolved"] else {"markerfacecolor": "white"}
-                (dot,) = ax.plot(x, y, **look, markersize=8, zorder=3, **face)
-                ax.annotate(_samples_text(row), (x, y), (0, 7), textcoords="offset points", fontsize=8, ha="center")
-            dot.set_label(label)
-        ax.margins(0.07)
-        _plot_limits(ax, at_scale)
+        times = {row["method"]: row[f"{passes}_{key}"] * factor for row in rows}
+        front = sorted((times[row["method"]], row["psnr"]) for row in rows if row[f"{passes}_front"])
+        wide = {"color": "#ffd43b", "linewidth": 5, "alpha": 0.7, "zorder": 1}
+        ax.plot(*zip(*front), drawstyle="steps-post", label="Pareto front", **wide)
+        for label, family in _families(rows).items():
+            style = tables.style(family[-1]["footprint"]) | {"linestyle": "-", "linewidth": 1, "markersize": 8}
+            if family[-1]["supersampling"] > 1:
+                style["marker"] = "X"
+            x, y = [times[row["method"]] for row in family], [row["psnr"] for row in family]
+            added = [row[f"{passes}_usual_{key}"] * factor - time for row, time in zip(family, x)]
+            ax.errorbar(x, y, xerr=[[0] * len(x), added], label=label, **style)
+            for row, *place in zip(family, x, y):
+                if not row["resolved"]:
+                    ax.plot(*place, **style, markerfacecolor="white")
+                samples = dict(resolve_footprint(row["footprint"]).options).get("samples", "")
+                text = samples if row["supersampling"] == 1 else "{0}x{0}".format(row["supersampling"])
+                ax.annotate(text, place, (0, 7), textcoords="offset points", fontsize=8, ha="center")
+        floor = next((row["blending_rmse"] for row in rows if row["blending_rmse"]), None)
+        if floor:
+            ax.axhline(_psnr(floor), color="black", linewidth=0.9, linestyle=":", label="floor of one exact weight")
+        limit, top = _psnr(at_scale["reference"]["resolves_rmse_from"]), ax.get_ylim()[1]
+        if limit < top:
+            ax.axhspan(limit, top, color="#f1f3f5", zorder=0, label="not resolved by the reference")
         ax.set_xlabel(f"{title} [{unit}]")
     axes[0, 0].set_ylabel("PSNR against the pixel integral [dB]")
     right = axes[0, 1].secondary_yaxis("right")
     right.yaxis.set_major_formatter(lambda psnr, _: f"{10 ** (-psnr / 20):.1e}")
     right.set_ylabel("RMSE")
-    bars = "" if key == "seconds" else f"; bars: from the fastest to the median of {results['rounds']} rounds"
-    title = f"{results['scene']} at {_scale_and_sizes(at_scale)} px: accuracy against time{bars}"
-    tables.add_titles(figure, axes, title)
+    bars = f"; bars: from the fastest to the median of {results['rounds']} rounds" if key == "ratio" else ""
+    tables.add_titles(figure, axes, f"{results['scene']} at {_scale_and_sizes(at_scale)} px: accuracy over time{bars}")
     return figure
-
-
-def _plot_limits(ax, at_scale: dict) -> None:
-    """Where the accuracy of one weight per splat ends, and where that of the reference does."""
-    floor = next((row["blending_rmse"] for row in at_scale["methods"] if row["blending_rmse"]), None)
-    if floor:
-        ax.axhline(_psnr(floor), color="black", linewidth=0.9, linestyle=":", label="floor of one exact weight")
-    limit, top = _psnr(at_scale["reference"]["resolves_rmse_from"]), ax.get_ylim()[1]
-    if limit < top:
-        ax.axhspan(limit, top, color="#f1f3f5", zorder=0, label="not resolved by the reference")
-        ax.set_ylim(top=top)
-
-
-def _psnr(rmse: float) -> float:
-    return -20 * math.log10(max(rmse, 1e-15))
 
 
 def _families(rows: list[dict]) -> dict[str, list[dict]]:
@@ -421,13 +384,9 @@ def _families(rows: list[dict]) -> dict[str, list[dict]]:
     for row in rows:
         spec = resolve_footprint(row["footprint"])
         label = f"{spec.name}, S samples" if "samples" in dict(spec.options) else row["method"].partition("@")[0]
-        label += ", supersampled" * (row["supersampling"] > 1)
-        families.setdefault(label, []).append(row)
+        families.setdefault(label + ", supersampled" * (row["supersampling"] > 1), []).append(row)
     return families
 
 
-def _samples_text(row: dict) -> str:
-    """The label of a method within its family."""
-    if row["supersampling"] > 1:
-        return "{0}x{0}".format(row["supersampling"])
-    return str(dict(resolve_footprint(row["footprint"]).options).get("samples", ""))
+def _psnr(rmse: float) -> float:
+    return -20 * math.log10(max(rmse, 1e-15))

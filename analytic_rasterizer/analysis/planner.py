@@ -9,14 +9,14 @@ true integral is measured in docs/accuracy.md.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 
 import torch
 
-from .._C import TILE
-from ..camera import view_center
+from .._C import FRUSTUM_CLAMP, TILE
+from ..camera import is_off_center, is_orthographic
 from ..effects import NEAR, Effects
 from ..filters import apply_3d_filter, compute_3d_filter, sampling_interval
 from ..io import Scene, View
@@ -24,20 +24,9 @@ from ..outputs import depths
 from ..rasterizer import GaussianRasterizer
 from ..settings import GaussianRasterizationSettings
 from ..sh import needed_sh_degree, sh_band_bounds
-from ..stages import Stages, render_stages
+from ..stages import Splats, Stages, project, render_stages
 from . import timing
-from .inspection import (
-    BINS,
-    NARROW,
-    TILE_SAMPLES,
-    Candidate,
-    Finding,
-    SceneReport,
-    ViewReport,
-    in_255,
-    percent,
-    share,
-)
+from .inspection import BINS, NARROW, TILE_SAMPLES, Candidate, Finding, SceneReport, ViewReport, in_255, percent, share
 
 REFERENCE = "box:samples=16"
 BASE = "box:samples=1"
@@ -46,10 +35,8 @@ SH_SHARE = 0.5  # of the tolerance, at most, for the harmonics left out
 FILTER_SHARE = 0.25  # of the tolerance: below it the 3D filter is left out
 FINER = 1.1  # a view calls for the 3D filter if it samples so many times as finely as in training
 FINER_SHARE = 0.01  # more than this share of what it shows
-CLAMP = 1.3  # half pictures from the optical axis: kFrustumClamp of csrc/core/constants.h
 SAME = 1.05  # ratio of times up to which the candidate listed first is taken
 TIMED_VIEWS = 2
-INPUTS = ("means3D", "means2D", "opacities", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")
 
 
 @torch.no_grad()
@@ -122,25 +109,24 @@ def inspect_scene(
             top_band = max(top_band, _rms(_stages(scene, camera, REFERENCE, fewer), reference))
 
     timed = cameras[:: -(-len(cameras) // TIMED_VIEWS)]
-    calls = {name: _passes(scene, timed, name, survey.effects) for name in dict.fromkeys([BASE, *fitting])}
-    seconds = _seconds(calls, scene, rounds)
+    tried = {name: (scene, name, survey.effects) for name in dict.fromkeys([BASE, *fitting])}
+    seconds = _seconds(tried, timed, rounds)
+    cheapest = min(seconds[name] for name in fitting)
+    footprint = next(name for name in fitting if seconds[name] <= SAME * cheapest)
     costs = {name: of_name / seconds[BASE] for name, of_name in seconds.items()}
-    cheapest = min(costs[name] for name in fitting)
-    footprint = next(name for name in fitting if costs[name] <= SAME * cheapest)
     candidates = tuple(Candidate(name, max(rms[name]), name in fitting, costs.get(name)) for name in rms)
     names = [getattr(view, "name", f"view_{i:03d}") for i, view in enumerate(views)]
     reports = tuple(
         _view_report(scene, survey, i, names[i], camera, in_views[i], rms[footprint][i], tolerance)
         for i, camera in enumerate(cameras)
     )
-    costs = _effect_costs(scene, timed, footprint, survey, shown, rounds)
+    costs = _effect_costs(scene, timed, footprint, survey.effects, shown, rounds)
     findings = (
         _footprint_finding(candidates, footprint, reports),
         _sh_finding(scene, survey, top_band, costs.get("sh")),
         _filter_finding(survey, costs.get("filter_3d")),
         _cull_finding(scene, cameras, shown, on_image, costs["culls"]),
-        *_camera_findings(survey),
-        Finding("outputs", False, None, None, costs["outputs"], "off", OUTPUTS_REASON),
+        *_other_findings(survey, costs["outputs"]),
     )
     machine = timing.describe_machine(scene.means.device.type)
     found = (survey.effects, footprint, findings, candidates, reports, shown)
@@ -155,23 +141,20 @@ def _check(scene, views, tolerance, training_views, *options) -> tuple[list, lis
         raise TypeError(f"tolerance must be a number, got {tolerance!r}")
     if not 0 <= tolerance < math.inf:
         raise ValueError(f"tolerance must be finite and not negative, got {tolerance}")
-    cameras = _cameras("views", views, scene, *options)
-    return cameras, None if training_views is None else _cameras("training_views", training_views, scene)
-
-
-def _cameras(what: str, views, scene: Scene, *options) -> list[GaussianRasterizationSettings]:
-    if not isinstance(views, Sequence):
-        raise TypeError(f"{what} must be a list of views, got {type(views).__name__}")
-    for view in views:
-        if not isinstance(view, (View, GaussianRasterizationSettings)):
-            raise TypeError(f"{what} must hold io.View or GaussianRasterizationSettings, got {type(view).__name__}")
-    if not views:
-        raise ValueError(f"{what} must hold at least one view, got none")
-    device = scene.means.device
-    return [view.settings(*options, device=device) if isinstance(view, View) else view for view in views]
-
-
-# ------------------------------------------------------------------------- what is called for
+    cameras = []
+    for what, given, settings in (("views", views, options), ("training_views", training_views, ())):
+        if what == "training_views" and given is None:
+            return cameras[0], None
+        if not isinstance(given, Sequence):
+            raise TypeError(f"{what} must be a list of views, got {type(given).__name__}")
+        for view in given:
+            if not isinstance(view, (View, GaussianRasterizationSettings)):
+                raise TypeError(f"{what} must hold io.View or GaussianRasterizationSettings, got {type(view).__name__}")
+        if not given:
+            raise ValueError(f"{what} must hold at least one view, got none")
+        device = scene.means.device
+        cameras.append([v.settings(*settings, device=device) if isinstance(v, View) else v for v in given])
+    return cameras[0], cameras[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,12 +170,12 @@ class _Survey:
 
 
 def _survey(scene: Scene, cameras: list, tolerance: float, training: list | None) -> _Survey:
-    orthographic = [_is_orthographic(camera) for camera in cameras]
+    orthographic = [is_orthographic(camera) for camera in cameras]
     if any(orthographic) != all(orthographic):
         raise ValueError(
             f"views must be all perspective or all orthographic, got {sum(orthographic)} of {len(cameras)} orthographic"
         )
-    off_center = [not orthographic[0] and _is_off_center(camera) for camera in cameras]
+    off_center = [not orthographic[0] and is_off_center(camera) for camera in cameras]
     everything = Effects(orthographic=orthographic[0], off_center=any(off_center))
     ratios, filter_change = [], None
     if training is not None:
@@ -216,34 +199,18 @@ def _survey(scene: Scene, cameras: list, tolerance: float, training: list | None
     return _Survey(effects, everything, sh_band_bounds(shs), ratios, filter_change, off_center)
 
 
-def _is_orthographic(camera: GaussianRasterizationSettings) -> bool:
-    """Whether w of clip space is the same everywhere."""
-    w = camera.projmatrix.detach().reshape(4, 4)[:, 3]
-    return (w[:3].abs().max() <= 1e-6 * w[3].abs()).item()
-
-
-def _is_off_center(camera: GaussianRasterizationSettings) -> bool:
-    """Whether an edge of the picture is more than CLAMP half pictures away from the optical axis."""
-    center = view_center(camera.viewmatrix.double(), camera.projmatrix.double(), with_gradient=False)
-    tangents = center.new_tensor([float(camera.tanfovx), float(camera.tanfovy)])
-    return (1 + (center / tangents).abs().max() > CLAMP + 1e-6).item()
-
-
-# ------------------------------------------------------------------------- rendering and costs
-
-
-def _prepare(scene: Scene, cameras: list, footprint: str, effects: Effects) -> tuple[list, dict]:
-    """Settings for every camera, and Gaussians after the 3D filter, for these effects."""
+def _prepare(scene: Scene, camera, footprint: str, effects: Effects) -> tuple[GaussianRasterizationSettings, dict]:
+    """Settings, and Gaussians after the 3D filter, for these effects."""
     gaussians = scene.arguments()
     if effects.filter_3d is not None:
         filtered = apply_3d_filter(scene.scales, scene.opacities, effects.filter_3d)
         gaussians["scales"], gaussians["opacities"] = filtered
     options = {"footprint": footprint, "sh_degree": scene.sh_degree, "effects": replace(effects, filter_3d=None)}
-    return [camera._replace(**options) for camera in cameras], gaussians
+    return camera._replace(**options), gaussians
 
 
 def _stages(scene: Scene, camera, footprint: str, effects: Effects) -> Stages:
-    (settings,), gaussians = _prepare(scene, [camera], footprint, effects)
+    settings, gaussians = _prepare(scene, camera, footprint, effects)
     return render_stages(settings, **gaussians)
 
 
@@ -268,46 +235,34 @@ def tile_samples(settings: GaussianRasterizationSettings, gaussians: dict[str, t
     return chosen.reshape(-(-settings.image_height // TILE), -1).cpu()
 
 
-def _passes(scene: Scene, cameras: list, footprint: str, effects: Effects) -> list[Callable[[], object]]:
-    """A forward pass for every camera."""
-    each, gaussians = _prepare(scene, cameras, footprint, effects)
-    return [partial(GaussianRasterizer(settings), means2D=None, **gaussians) for settings in each]
-
-
-def _seconds(passes: dict[str, list[Callable]], scene: Scene, rounds: int | None) -> dict[str, float]:
-    """Seconds over all cameras, by key."""
-    device = scene.means.device.type
+def _seconds(cases: dict[str, tuple], cameras: list, rounds: int | None) -> dict[str, float]:
+    """Seconds of the forward passes of all cameras, by case: (scene, footprint, effects)."""
+    passes, device = {}, cameras[0].viewmatrix.device.type
+    for name, (scene, footprint, effects) in cases.items():
+        prepared = (_prepare(scene, camera, footprint, effects) for camera in cameras)
+        passes[name] = [partial(GaussianRasterizer(s), means2D=None, **gaussians) for s, gaussians in prepared]
     samples = timing.time_calls(passes, device, rounds)
     return {name: sum(timing.best_of(taken, device) for taken in of) for name, of in samples.items()}
 
 
-def _effect_costs(scene, cameras, footprint, survey: _Survey, shown, rounds) -> dict[str, float]:
+def _effect_costs(scene, cameras, footprint, effects: Effects, shown, rounds) -> dict[str, float]:
     """Time with an effect over that without, by effect."""
-    effects = survey.effects
     only_shown = Scene(*(field[shown] for field in scene[:-1]), scene.sh_degree)
-    masked = effects if effects.filter_3d is None else replace(effects, filter_3d=effects.filter_3d[shown])
-    variants = {"outputs": replace(effects, alpha=True, depth=True)}
+    filter_3d = None if effects.filter_3d is None else effects.filter_3d[shown]
     pairs = {"culls": ("plain", "shown"), "outputs": ("outputs", "plain")}
+    variants = {"plain": {}, "outputs": {"alpha": True, "depth": True}}
     if scene.sh_degree > 0:
-        variants |= {"bands": replace(effects, sh_degree=None), "no bands": replace(effects, sh_degree=0)}
-        pairs["sh"] = ("bands", "no bands")
+        pairs["sh"], variants["bands"], variants["no bands"] = (
+            ("bands", "no bands"),
+            {"sh_degree": None},
+            {"sh_degree": 0},
+        )
     if effects.filter_3d is not None:
-        variants["no filter"] = replace(effects, filter_3d=None)
-        pairs["filter_3d"] = ("plain", "no filter")
-    passes = {
-        name: _passes(scene, cameras, footprint, variant) for name, variant in ({"plain": effects} | variants).items()
-    }
-    passes["shown"] = _passes(only_shown, cameras, footprint, masked)
-    seconds = _seconds(passes, scene, rounds)
+        pairs["filter_3d"], variants["no filter"] = ("plain", "no filter"), {"filter_3d": None}
+    cases = {name: (scene, footprint, replace(effects, **changed)) for name, changed in variants.items()}
+    cases["shown"] = (only_shown, footprint, replace(effects, filter_3d=filter_3d))
+    seconds = _seconds(cases, cameras, rounds)
     return {name: seconds[a] / seconds[b] for name, (a, b) in pairs.items()}
-
-
-# ------------------------------------------------------------------------------------- findings
-
-OUTPUTS_REASON = (
-    "no scene calls for alpha, depth, other outputs, camera gradients, defocus or motion: off until asked for; the "
-    "cost is that of alpha and depth together"
-)
 
 
 def _footprint_finding(candidates: tuple[Candidate, ...], footprint: str, views: tuple[ViewReport, ...]) -> Finding:
@@ -338,18 +293,15 @@ def _sh_finding(scene: Scene, survey: _Survey, top_band: float, cost: float | No
 
 def _filter_finding(survey: _Survey, cost: float | None) -> Finding:
     if not survey.ratios:
-        reason = "not examined: no training views were given"
-        return Finding("3D filter", None, None, None, None, "none", reason)
+        return Finding("3D filter", None, None, None, None, "none", "not examined: no training views were given")
     needed, change = survey.effects.filter_3d is not None, survey.filter_change
-    most = max(share(ratio > FINER) for ratio in survey.ratios)
     reason = (
-        f"in the view with most of them, {percent(most)} of the Gaussians are sampled more than {FINER:g} times as "
-        "finely as in any training view"
+        f"in the view with most of them, {percent(max(share(ratio > FINER) for ratio in survey.ratios))} of the "
+        f"Gaussians are sampled more than {FINER:g} times as finely as in any training view"
     )
-    if change is not None and not needed:
-        reason += "; it changes less than a quarter of the tolerance"
-    kind, recommendation = None if change is None else "measured", "filter_3d" if needed else "none"
-    return Finding("3D filter", needed, change, kind, cost, recommendation, reason)
+    reason += "; it changes less than a quarter of the tolerance" * (change is not None and not needed)
+    kind = None if change is None else "measured"
+    return Finding("3D filter", needed, change, kind, cost, "filter_3d" if needed else "none", reason)
 
 
 def _cull_finding(scene: Scene, cameras: list, shown, on_image, cost: float) -> Finding:
@@ -364,22 +316,34 @@ def _cull_finding(scene: Scene, cameras: list, shown, on_image, cost: float) -> 
     return Finding("hidden Gaussians", False, 0.0, "bound", cost, f"drop {count}", reason)
 
 
-def _camera_findings(survey: _Survey) -> tuple[Finding, Finding]:
-    flat, off = survey.effects.orthographic, sum(survey.off_center)
-    reason = f"w of clip space {'does not depend' if flat else 'depends'} on the position"
-    crop = (
-        f"in {off} of {len(survey.off_center)} views an edge of the picture is more than {CLAMP} half pictures away "
-        "from the optical axis"
+def _other_findings(survey: _Survey, cost_of_outputs: float) -> tuple[Finding, ...]:
+    """Orthographic views, views whose axis is off centre, and outputs."""
+    flat, off, count = survey.effects.orthographic, sum(survey.off_center), len(survey.off_center)
+    reasons = (
+        f"w of clip space {'does not depend' if flat else 'depends'} on the position",
+        f"in {off} of {count} views an edge of the picture is more than {FRUSTUM_CLAMP} half pictures away from the "
+        "optical axis",
+        "no scene calls for alpha, depth, other outputs, camera gradients, defocus or motion: off until asked for; the "
+        "cost is that of alpha and depth together",
     )
     return (
-        Finding("orthographic", flat, None, None, None, "on" if flat else "off", reason),
-        Finding("off-centre clamp", off > 0, None, None, None, "on" if off else "off", crop),
+        Finding("orthographic", flat, None, None, None, "on" if flat else "off", reasons[0]),
+        Finding("off-centre clamp", off > 0, None, None, None, "on" if off else "off", reasons[1]),
+        Finding("outputs", False, None, None, cost_of_outputs, "off", reasons[2]),
     )
+
+
+def _smaller_sigmas(splats: Splats) -> torch.Tensor:
+    """(N,) smaller standard deviation of every splat, px, before the footprint."""
+    xx, xy, yy = splats.cov2d.unbind(1)
+    largest = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)  # eigenvalue
+    return torch.where(largest > 0, (splats.dets / largest).sqrt(), 0)
 
 
 def _view_report(scene, survey: _Survey, i: int, name: str, camera, shown, rms: float, tolerance: float) -> ViewReport:
-    (settings,), gaussians = _prepare(scene, [camera], f"adaptive:tolerance={tolerance}", survey.effects)
-    sigmas = _projected_sigmas(settings, {key: value[shown] for key, value in gaussians.items()})
+    settings, gaussians = _prepare(scene, camera, f"adaptive:tolerance={tolerance}", survey.effects)
+    names = ("means3D", "opacities", "scales", "rotations")
+    sigmas = _smaller_sigmas(project(settings, **{name: gaussians[name][shown] for name in names}))
     bins = torch.bucketize(sigmas, sigmas.new_tensor(BINS[1:-1]))
     ratio = survey.ratios[i] if survey.ratios else None
     return ViewReport(
@@ -394,27 +358,3 @@ def _view_report(scene, survey: _Survey, i: int, name: str, camera, shown, rms: 
         rms=rms,
         tile_samples=tile_samples(settings, gaussians),
     )
-
-
-def _projected_sigmas(camera: GaussianRasterizationSettings, gaussians: dict) -> torch.Tensor:
-    """(P,) smaller standard deviation in the image, px, before the footprint [EWA, Eq. 29-31].
-
-    This repeats the projection of csrc/core/project.h, for lack of an op that returns cov2d.
-    """
-    view = camera.viewmatrix.detach().reshape(4, 4)
-    x, y, z = (gaussians["means3D"] @ view[:3, :3] + view[3, :3]).unbind(1)
-    depth, side = (torch.ones_like(z), 0) if camera.effects.orthographic else (z, CLAMP)
-    # The axes of a Gaussian: row i is s_i times the ith column of the rotation of the quaternion (w, u).
-    w, u = torch.nn.functional.normalize(gaussians["rotations"], dim=1)[:, None].split([1, 3], -1)
-    axes = torch.diag_embed(gaussians["scales"])
-    turn = 2 * torch.linalg.cross(u.expand_as(axes), axes)
-    axes = axes + w * turn + torch.linalg.cross(u.expand_as(axes), turn)
-    turned = camera.scale_modifier * axes @ view[:3, :3]  # (P, 3 axes, 3), camera space
-    rows = []
-    for a, b, tan, size in ((0, x, camera.tanfovx, camera.image_width), (1, y, camera.tanfovy, camera.image_height)):
-        slope = (b / z).clamp(-side * tan, side * tan)[:, None]
-        rows.append(size / (2 * tan) * (turned[:, :, a] - slope * turned[:, :, 2]) / depth[:, None])
-    xx, xy, yy = (rows[0] ** 2).sum(1), (rows[0] * rows[1]).sum(1), (rows[1] ** 2).sum(1)
-    largest = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)
-    area = torch.linalg.cross(rows[0], rows[1]).norm(dim=1)
-    return torch.where(largest > 0, area / largest.sqrt(), 0)

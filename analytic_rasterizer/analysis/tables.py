@@ -54,32 +54,27 @@ def new_figure(width: float, height: float, columns: int = 1, rows: int = 1, **o
     return figure, axes
 
 
-def add_titles(figure, axes, title: str, xlabel: str = "", fontsize: float = 9) -> None:
-    """Logarithmic x axes with a label below the last row, the title, and the legend of the first axes at the right."""
+def add_titles(figure, axes, title: str, xlabel: str = "") -> None:
+    """Logarithmic x axes labelled 1, 2, 5, 10, ..., the title, and the legend of the last axes at the right."""
+    ticker = optional_import("matplotlib.ticker", "analysis")
     for ax in axes.flat:
-        plain_log_ticks(ax)
+        ax.set_xscale("log")
+        low, high = ax.get_xlim()
+        subs = (
+            (1, 2, 5)
+            if high / low >= 12
+            else (1, 1.5, 2, 3, 5, 7)
+            if high / low >= 3
+            else (1, 1.2, 1.4, 1.7, 2, 3, 4, 6, 8)
+        )
+        ax.xaxis.set_major_locator(ticker.LogLocator(subs=subs))
+        ax.xaxis.set_major_formatter("{x:g}")
+        ax.xaxis.set_minor_formatter(ticker.NullFormatter())
     for ax in axes[-1]:
         ax.set_xlabel(xlabel or ax.get_xlabel())
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside right center", frameon=False, fontsize=fontsize)
+    handles, labels = axes[-1, -1].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", frameon=False, fontsize=9)
     figure.suptitle(title, fontsize=11)
-
-
-def plain_log_ticks(ax) -> None:
-    """Makes the x axis logarithmic with plain numbers: 1, 2, 5, 10, ..., and more of them in a narrow range."""
-    ticker = optional_import("matplotlib.ticker", "analysis")
-    ax.set_xscale("log")
-    low, high = ax.get_xlim()
-    subs = (
-        (1, 2, 5)
-        if high / low >= 12
-        else (1, 1.5, 2, 3, 5, 7)
-        if high / low >= 3
-        else (1, 1.2, 1.4, 1.7, 2, 3, 4, 6, 8)
-    )
-    ax.xaxis.set_major_locator(ticker.LogLocator(subs=subs))
-    ax.xaxis.set_major_formatter("{x:g}")
-    ax.xaxis.set_minor_formatter(ticker.NullFormatter())
 
 
 def save_figure(figure, out: Path, name: str) -> None:
@@ -98,8 +93,8 @@ def save_csv(path: Path, rows: list[dict]) -> None:
 
 
 def format_table(header: list[str], rows: list[list]) -> str:
-    """Columns of text: the first aligned left, the others right; floats with 4 digits."""
-    cells = [header] + [[format_cell(cell) for cell in row] for row in rows]
+    """Columns of text: the first aligned left, the others right; floats with 4 digits, "-" for None."""
+    cells = [header, *map(_texts, rows)]
     widths = [max(map(len, column)) for column in zip(*cells)]
     aligned = "  ".join(f"{{:{'>' if i else '<'}{width}}}" for i, width in enumerate(widths))
     return "\n".join(aligned.format(*row).rstrip() for row in cells)
@@ -107,12 +102,8 @@ def format_table(header: list[str], rows: list[list]) -> str:
 
 def markdown_table(header: list[str], rows: list[list]) -> str:
     """The same as Markdown."""
-    lines = [header, ["---"] * len(header)] + [[format_cell(cell) for cell in row] for row in rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return "\n".join(f"| {' | '.join(line)} |" for line in (header, ["---"] * len(header), *map(_texts, rows)))
 
 
-def format_cell(cell) -> str:
-    """Text of a cell: floats with 4 digits, "-" for None."""
-    if cell is None:
-        return "-"
-    return f"{cell:.4g}" if isinstance(cell, float) else str(cell)
+def _texts(row: list) -> list[str]:
+    return ["-" if cell is None else f"{cell:.4g}" if isinstance(cell, float) else str(cell) for cell in row]

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import math
 import platform
 import statistics
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -51,9 +53,8 @@ class Case:
 
     def image(self, **gaussians) -> torch.Tensor:
         color, _ = self.rasterizer(**gaussians)
-        if self.supersampling > 1:
-            color = torch.nn.functional.avg_pool2d(color[None], self.supersampling)[0]
-        return color
+        n = self.supersampling
+        return torch.nn.functional.avg_pool2d(color[None], n)[0] if n > 1 else color
 
     def extra_bytes(self) -> int:
         """Bytes that forward and backward need in addition to inputs, outputs and gradients."""
@@ -77,12 +78,9 @@ def describe_machine(device: str) -> str:
         return f"{gpu.name} ({gpu.major}.{gpu.minor}, {memory}), CUDA {torch.version.cuda}, torch {torch.__version__}"
     cpu = platform.processor() or platform.machine()
     if sys.platform == "linux":
-        with open("/proc/cpuinfo") as f:
-            cpu = next((line.split(":")[1].strip() for line in f if line.startswith("model name")), cpu)
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        cpu = next((line.split(":")[1].strip() for line in lines if line.startswith("model name")), cpu)
     return f"{cpu}, {torch.get_num_threads()} threads, {_C.instruction_set()}, torch {torch.__version__}"
-
-
-# -------------------------------------------------------------------------------------- times
 
 
 def in_turn(cases: dict[Any, list], measure: Callable[[Any], Any], rounds: int) -> dict[Any, list[list]]:
@@ -103,10 +101,10 @@ def time_calls(
     device: str,
     rounds: int | None = None,
     timer: Callable[[], float] = time.perf_counter,
-    slow: Callable[[dict[Any, float]], float] | None = None,
+    limit: Callable[[dict[Any, float]], float] = lambda seconds: math.inf,
     progress: Callable[[], object] = lambda: None,
 ) -> dict[Any, list[list[float]]]:
-    """Seconds of every call, for the keys of `calls`: a list of rounds for every call of a key.
+    """Seconds of every call, by key: a list of rounds for every call of a key.
 
     On the CPU the calls take turns after a round that warms up. On CUDA the calls of a key are warmed up and timed by
     themselves, because the room for their pairs follows the frames before them.
@@ -116,9 +114,9 @@ def time_calls(
         device: "cpu" or "cuda".
         rounds: Timed rounds; None is ROUNDS of the device.
         timer: The clock on the CPU, in seconds.
-        slow: Of the seconds that every key took in the round that warms up, the limit beyond which a key is not timed
-            again on the CPU, so that this round counts.
-        progress: Called after every timed call.
+        limit: Given the seconds of every key in the round that warms up, how many a key may take to be timed again on
+            the CPU; for a slower one that round counts.
+        progress: Called before every timed call.
     """
     rounds = rounds or ROUNDS[device]
 
@@ -134,8 +132,7 @@ def time_calls(
         return samples
     first = in_turn(calls, clock, 1)
     totals = {key: sum(taken[0] for taken in of_key) for key, of_key in first.items()}
-    limit = float("inf") if slow is None else slow(totals)
-    again = {key: of_key for key, of_key in calls.items() if totals[key] <= limit}
+    again = {key: of_key for key, of_key in calls.items() if totals[key] <= limit(totals)}
     return first | in_turn(again, clock, rounds)
 
 
@@ -161,18 +158,6 @@ def event_seconds(call: Callable[[], object]) -> float:
     return start.elapsed_time(end) * 1e-3
 
 
-def median_seconds(clock: Callable[[Callable], float], call: Callable[[], object], rounds: int) -> float:
-    """Median of `clock(call)` on an idle CUDA device."""
-    torch.cuda.synchronize()
-    clock(call)
-    return statistics.median(clock(call) for _ in range(rounds))
-
-
-def median_of(samples: list[dict]) -> dict:
-    """The median of every key."""
-    return {key: statistics.median(sample[key] for sample in samples) for key in samples[0]}
-
-
 def warm_up_cuda(calls: list[Callable[[], object]], passes: int) -> None:
     """Renders with one footprint until the room for its pairs depends on these frames alone."""
     _C.force_pair_capacity(0)
@@ -182,35 +167,31 @@ def warm_up_cuda(calls: list[Callable[[], object]], passes: int) -> None:
     torch.cuda.synchronize()
 
 
-# ------------------------------------------------------------------------------------- memory
-
-
 def reset_peak_memory(device: torch.device) -> int:
     """Makes the peak start again from the memory in use now, which is returned, in bytes; 0 where that is unknown."""
     if device.type == "cuda":
         torch.cuda.synchronize()
         torch.cuda.reset_peak_memory_stats()
         return torch.cuda.memory_allocated()
-    if sys.platform == "linux":  # glibc hands freed blocks back to the system, so that peaks can be compared
-        libc = ctypes.CDLL(None)
-        libc.mallopt(-3, 1 << 16)  # M_MMAP_THRESHOLD: blocks above 64 KiB go back when freed
-        libc.malloc_trim(0)
+    if sys.platform != "linux":
+        return 0
+    libc = ctypes.CDLL(None)  # glibc is told to hand freed blocks back to the system, so that peaks can be compared
+    libc.mallopt(-3, 1 << 16)  # M_MMAP_THRESHOLD: blocks above 64 KiB go back when freed
+    libc.malloc_trim(0)
     try:
-        with open("/proc/self/clear_refs", "w") as f:
-            f.write("5")
+        Path("/proc/self/clear_refs").write_text("5")
     except OSError:
         return 0
     return _status("VmRSS")
 
 
 def peak_memory(device: torch.device) -> int:
-    """The most memory in use since the last reset, bytes."""
-    return torch.cuda.max_memory_allocated() if device.type == "cuda" else _status("VmHWM")
+    """The most memory in use since the last reset, bytes; 0 where that is unknown."""
+    if device.type == "cuda":
+        return torch.cuda.max_memory_allocated()
+    return _status("VmHWM") if sys.platform == "linux" else 0
 
 
 def _status(key: str) -> int:
-    try:
-        with open("/proc/self/status") as f:
-            return next(1024 * int(line.split()[1]) for line in f if line.startswith(key))
-    except OSError:
-        return 0
+    lines = Path("/proc/self/status").read_text().splitlines()
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith(key))

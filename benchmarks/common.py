@@ -1,9 +1,11 @@
-"""The command line that the benchmarks share."""
+"""The command line and the medians that the benchmarks share."""
 
 from __future__ import annotations
 
 import argparse
 import json
+import statistics
+from collections.abc import Callable
 
 import torch
 
@@ -55,3 +57,15 @@ def save_json(args: argparse.Namespace, results: dict) -> None:
     if args.json:
         with open(args.json, "w") as f:
             json.dump({"machine": describe_machine(args.device), "arguments": vars(args), **results}, f, indent=2)
+
+
+def median_seconds(clock: Callable[[Callable], float], call: Callable[[], object], rounds: int) -> float:
+    """Median of `clock(call)` on an idle CUDA device."""
+    torch.cuda.synchronize()
+    clock(call)
+    return statistics.median(clock(call) for _ in range(rounds))
+
+
+def median_of(samples: list[dict]) -> dict:
+    """The median of every key."""
+    return {key: statistics.median(sample[key] for sample in samples) for key in samples[0]}
