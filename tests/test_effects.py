@@ -234,23 +234,6 @@ def test_asking_for_outputs_changes_no_bit_of_the_colors(device, best, variant):
         assert all(torch.equal(a, b) for a, b in zip(results[0], other))
 
 
-def test_plain_path_calls_one_op(device, best):
-    """Nothing of the effects runs, or takes memory, where none is asked for."""
-    scene = scenes.to(scenes.cast(scenes.random_scene(12, 20, degree=1), best), device)
-    for effects, extra in ((None, 0), (ar.Effects(), 0), (ar.Effects(depth=True), 1), (ALL, 1)):
-        settings = CAMERA.settings(best, device, effects=effects)
-        with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
-            ar.GaussianRasterizer(settings)(**scene)
-        calls = [event.key for event in profile.key_averages() for _ in range(event.count)]
-        ours = [key for key in calls if key.startswith("analytic_rasterizer::")]
-        assert ours.count("analytic_rasterizer::rasterize") == 1
-        assert ours.count("analytic_rasterizer::rasterize_channels") == extra
-        if not extra:
-            assert not any(
-                key in calls for key in ("aten::cat", "aten::where", "aten::matmul", "aten::constant_pad_nd")
-            )
-
-
 def test_a_feature_that_is_not_finite_culls_its_gaussian_alone(device, best):
     scene = scenes.cast(colored(scenes.random_scene(13, 30), 6), best)
     settings = with_bg(CAMERA.settings(best, footprint="box"), torch.zeros(6, dtype=best))
