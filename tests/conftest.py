@@ -15,6 +15,8 @@ from analytic_rasterizer import _C
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared"
+WORKERS_PER_DEVICE = 4
+"""Processes of a test run that share a CUDA device, at most."""
 DEADLINE = 180
 """Seconds after which something counts as hanging; a fresh process needs a few, most of them to import torch."""
 
@@ -32,6 +34,13 @@ each_precision = pytest.mark.parametrize(
         pytest.param("cuda", torch.float32, id="cuda-torch.float32", marks=needs_cuda),
     ],
 )
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers():
+    """What `-n auto` in pyproject.toml means: every core that this process may use."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return min(cores, WORKERS_PER_DEVICE) if _C.has_cuda and torch.cuda.is_available() else cores
 
 
 def run_python(code, *arguments, **environment):

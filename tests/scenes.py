@@ -17,8 +17,18 @@ OPTIONS = {
 }
 # Every registered footprint with these: a new one is tested without a change here.
 VARIANTS = [(footprint, options) for footprint in FOOTPRINTS for options in OPTIONS.get(footprint, [{}])]
-# One of each kind, for tests where the options do not matter.
-KINDS = [(footprint, {"samples": 4} if footprint == "box" else {}) for footprint in FOOTPRINTS]
+# Footprints that show what others should compute. Their weights are tested as everybody's; they render on one slow
+# path, so that few tests of whole images take them.
+YARDSTICKS = ("erf", "exact")
+# For tests of whole images: every footprint that is meant for rendering, with every option that changes the code path.
+RENDERED = [variant for variant in VARIANTS if variant[0] not in YARDSTICKS]
+# One of each footprint, for tests where the options do not matter.
+KINDS = [
+    (footprint, {"samples": 4} if footprint == "box" else {}) for footprint in FOOTPRINTS if footprint not in YARDSTICKS
+]
+# One of each path through the rasterizer, for tests where the formula of the weight does not matter: one sample per
+# pixel with a conic and with eigenvectors, several samples, a number of samples per tile.
+PATHS = [("cumulant", {}), ("analytic", {}), ("box", {"samples": 4}), ("adaptive", {})]
 INPUTS = (
     "means3D",
     "means2D",

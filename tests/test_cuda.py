@@ -10,11 +10,12 @@ import math
 from dataclasses import replace
 from typing import NamedTuple
 
+import hard_cases
 import pytest
 import scenes
 import torch
 from conftest import in_threads, needs_cuda
-from scenes import KINDS, VARIANTS, Camera, name_of
+from scenes import KINDS, PATHS, RENDERED, Camera, name_of
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C
@@ -31,7 +32,8 @@ SCENES = {
 # After so many frames of one size and scene, room for pairs is guessed (PairGuess::kCountedFrames, one more).
 COUNTED_FRAMES = 33
 
-every_footprint = pytest.mark.parametrize("variant", VARIANTS, ids=name_of)
+every_footprint = pytest.mark.parametrize("variant", RENDERED, ids=name_of)
+each_path = pytest.mark.parametrize("variant", PATHS, ids=name_of)
 each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
 
 
@@ -70,12 +72,14 @@ def run_without_gradient(scene, settings, device):
         return ar.GaussianRasterizer(scenes.settings_to(settings, device))(**scenes.to(scene, device))[0].cpu()
 
 
-def compare(scene, settings, flips=1e-4, scale=1.0):
+def compare(scene, settings, flips=1e-4, scale=1.0, layers=0):
     """Asserts that CUDA agrees with the CPU, and returns its image.
 
-    The image to 1e-4 but for a share `flips` of the samples, where an alpha of 1/255 comes or goes; the
-    radii; gradients to 1e-3 of the largest entry, of a loss that leaves out the pixels with a flip. `scale`
-    is the largest number that colours reach.
+    The image to 1e-4 but for a share `flips` of the samples, where an alpha of 1/255 comes or goes; the radii;
+    gradients Gaussian by Gaussian (`row_tolerances`), of a loss that leaves out the pixels with a flip. A flip so far
+    behind that the image does not show it remains in that loss: a hundredth of the Gaussians may be off by more, if
+    by less than 1e-3 of the largest entry of all. `scale` is the largest number that colours reach, `layers` the
+    largest number of splats that are blended in one pixel, where that is large.
     """
     leaves = [scenes.leaves(scenes.to(scene, device)) for device in ("cuda", "cpu")]
     (color, radii), (expected, expected_radii) = (
@@ -86,16 +90,48 @@ def compare(scene, settings, flips=1e-4, scale=1.0):
     same = error < 1e-5 * scale
     backward(color * same.to(color.device))
     backward(expected * same)
-    grads = {name: relative_error(ours.grad.cpu(), leaves[1][name].grad) for name, ours in leaves[0].items()}
+    grads = [{name: leaf.grad.cpu() for name, leaf in some.items()} for some in leaves]
     over = (error > 1e-4 * scale).sum().item()
-    print(f"image {error.max():.1e}, {over} pixels over", {name: f"{value:.1e}" for name, value in grads.items()})
+    print(f"image {error.max():.1e}, {over} pixels over")
     assert over <= math.ceil(flips * most_samples(settings) * error.numel())
     assert error.max() < 0.02 * scale
     assert same.float().mean() > 0.9
     assert torch.equal(radii.cpu(), expected_radii)
-    for name, value in grads.items():
-        assert value < 1e-3, (name, value)
+    compare_gradients(*grads, row_tolerances(scene, settings, same, grads[1], layers))
     return color.detach().cpu()
+
+
+def row_tolerances(scene, settings, clear, grads, layers=0):
+    """How far the gradients of a loss on the `clear` pixels may be off, by name and Gaussian (P,).
+
+    The law of hard_cases.py, twice, for two float32 results are compared: 2 OPERATIONS (S + eps A), S how far the
+    row moves when every input is moved by eps, A its largest entry, and three roundings more per layer. In float32
+    inputs are moved by 16 eps and S is a sixteenth of what that does, so that it stands out from rounding.
+    """
+    step, g = 16 * hard_cases.EPS[torch.float32], torch.Generator().manual_seed(7)
+    rasterizer = ar.GaussianRasterizer(settings)
+    moved = {name: torch.zeros(len(grad)) for name, grad in grads.items()}
+    for _ in range(hard_cases.PERTURBATIONS):
+        near = scenes.leaves(scenes.cast(hard_cases.perturbed(scene, step, g), torch.float32))
+        backward(rasterizer(**near)[0] * clear)
+        for name, leaf in near.items():
+            moved[name] = torch.maximum(moved[name], hard_cases.rows(leaf.grad - grads[name]))
+    operations = 2 * (hard_cases.OPERATIONS + 3 * layers)
+    eps = hard_cases.EPS[torch.float32]
+    return {name: operations * (moved[name] / 16 + eps * hard_cases.rows(grad)) for name, grad in grads.items()}
+
+
+def compare_gradients(ours, theirs, tolerances):
+    """Gaussian by Gaussian, as `compare` says."""
+    for name, expected in theirs.items():
+        if not len(expected):
+            continue
+        error = hard_cases.rows(ours[name] - expected)
+        over = (error > tolerances[name]).double().mean().item()
+        largest = expected.abs().max()
+        print(f"{name}: {error.max() / largest.clamp_min(1e-30):.1e} of the largest entry, {over:.2%} of the rows over")
+        assert over <= 0.01, name
+        assert (error <= 1e-3 * largest).all(), name
 
 
 def assert_same_without_gradient(scene, settings, color):
@@ -110,10 +146,6 @@ def assert_same_without_gradient(scene, settings, color):
 
 def most_samples(settings):
     return 16 if settings.footprint.name == "adaptive" else dict(settings.footprint.options).get("samples", 1)
-
-
-def relative_error(actual, expected):
-    return ((actual - expected).abs().max() / expected.abs().max().clamp_min(1e-30)).item() if len(expected) else 0.0
 
 
 def assert_identical(first, second):
@@ -191,11 +223,12 @@ def test_long_lists(variant, kind, bg):
         scene["opacities"][::50] = 0.9
     scene = scenes.cast(scene, torch.float32)
     settings = settings_for(variant, camera)
-    color = compare(scene, settings, flips=1e-2, scale=max(1.0, *map(abs, bg)))
+    layers = 0 if kind == "opaque" else 2350  # of alpha 1/255 until 1e-4 of the light is left
+    color = compare(scene, settings, flips=1e-2, scale=max(1.0, *map(abs, bg)), layers=layers)
     assert_same_without_gradient(scene, settings, color)
 
 
-@each_kind
+@each_path
 @pytest.mark.parametrize("size", [(300, 1), (1, 300), (1, 1), (97, 61), (16, 16), (2048, 2048)], ids=str)
 def test_image_sizes(variant, size):
     camera = replace(CAMERA, image_width=size[0], image_height=size[1])
@@ -238,7 +271,7 @@ def test_too_many_pairs(variant, little_room):
         assert_same_without_gradient(scene, settings, color)
 
 
-@each_kind
+@each_path
 def test_many_more_pairs_than_in_the_frame_before(variant):
     """The same Gaussians, eighty times as large: the guess is wrong once."""
     camera = replace(CAMERA, image_width=333, image_height=222)
@@ -257,25 +290,54 @@ def test_many_more_pairs_than_in_the_frame_before(variant):
     compare(scene, small)
 
 
-@each_kind
-def test_other_numbers_of_gaussians_in_between(variant):
-    """None, none visible, few, many, few: each frame is guessed from the one before."""
+@each_path
+def test_other_numbers_of_gaussians_in_between(variant, waiting_is_an_error):
+    """None, none visible, few, many, in turn: room is guessed for each after the frames that are counted, without
+    waiting for the device, and is never mistaken for that of another."""
     camera = replace(CAMERA, image_width=187, image_height=131)
     settings = settings_for(variant, camera)
     many = scene32()
-    none = {name: value[:0] for name, value in many.items()}
-    behind = dict(many, means3D=many["means3D"] + torch.tensor([0.0, 0.0, -50.0]))
-    few = {name: value[:100] for name, value in many.items()}
+    scenes_in_turn = {
+        "none": {name: value[:0] for name, value in many.items()},
+        "behind": dict(many, means3D=many["means3D"] + torch.tensor([0.0, 0.0, -50.0])),
+        "few": {name: value[:100] for name, value in many.items()},
+        "many": many,
+    }
+    expected = {name: run(scene, settings, "cpu").color for name, scene in scenes_in_turn.items()}
+    on_device = {name: scenes.to(scene, "cuda") for name, scene in scenes_in_turn.items()}
+    rasterizer = ar.GaussianRasterizer(scenes.settings_to(settings, "cuda"))
+    images = {}
+    with torch.no_grad():
+        for _ in range(COUNTED_FRAMES):
+            for scene in on_device.values():
+                rasterizer(**scene)
+        torch.cuda.synchronize()
+        waiting_is_an_error()
+        for turn in range(3):
+            for name, scene in on_device.items():
+                images[name, turn] = rasterizer(**scene)[0]
+    torch.cuda.set_sync_debug_mode("default")
     background = torch.tensor(camera.bg)[:, None, None].expand(3, 131, 187)
-    for scene in (none, behind, few, many, few, behind, many, none):
-        if scene is none or scene is behind:
-            actual = run(scene, settings, "cuda")
-            assert torch.equal(actual.color, background)
-            assert (actual.radii == 0).all()
-            assert all((grad == 0).all() for grad in actual.grads.values())
-            assert torch.equal(run_without_gradient(scene, settings, "cuda"), background)
+    for (name, _), image in images.items():
+        if name in ("none", "behind"):
+            assert torch.equal(image.cpu(), background)
         else:
-            compare(scene, settings)
+            assert ((image.cpu() - expected[name]).abs().amax(0) < 1e-5).float().mean() > 0.9, name
+            assert (image.cpu() - expected[name]).abs().max() < 0.02, name
+
+
+@pytest.mark.parametrize("name", ["none", "behind"])
+def test_nothing_to_see_has_no_gradient(name):
+    settings, many = settings_for(("box", {})), scene32()
+    nothing = {
+        "none": {name: value[:0] for name, value in many.items()},
+        "behind": dict(many, means3D=many["means3D"] + torch.tensor([0.0, 0.0, -50.0])),
+    }[name]
+    actual = run(nothing, settings, "cuda")
+    assert (actual.color == torch.tensor(CAMERA.bg)[:, None, None]).all()
+    assert (actual.radii == 0).all()
+    assert all((grad == 0).all() for grad in actual.grads.values())
+    assert torch.equal(run_without_gradient(nothing, settings, "cuda"), actual.color)
 
 
 # --- the same bits every time ------------------------------------------------------------------
@@ -299,7 +361,7 @@ def deterministic():
     torch.use_deterministic_algorithms(before)
 
 
-@each_kind
+@each_path
 def test_deterministic_mode(variant, deterministic):
     """It never guesses, and changes no bit; memory that is not written must not show (torch fills it)."""
     scene, settings = scene32(), settings_for(variant)
@@ -310,7 +372,7 @@ def test_deterministic_mode(variant, deterministic):
     assert_identical(run(scene, settings, "cuda"), first)
 
 
-@each_kind
+@each_path
 def test_debug_changes_no_bit(variant):
     scene, settings = scene32(), settings_for(variant)
     assert_identical(run(scene, settings._replace(debug=True), "cuda"), run(scene, settings, "cuda"))
@@ -319,7 +381,7 @@ def test_debug_changes_no_bit(variant):
 # --- streams, devices and threads --------------------------------------------------------------
 
 
-@each_kind
+@each_path
 def test_current_stream(variant):
     """Inputs are written late on another stream: work on any other than that reads zeros."""
     scene, settings = scene32(), settings_for(variant)
@@ -344,7 +406,7 @@ def test_current_stream(variant):
     assert_identical(actual, expected)
 
 
-@each_kind
+@each_path
 def test_two_streams(variant):
     """Frames in flight at once share nothing."""
     settings = settings_for(variant)
@@ -369,7 +431,7 @@ def test_two_streams(variant):
             assert_identical(Result(color.cpu(), radii.cpu(), grads), expected[i])
 
 
-@each_kind
+@each_path
 def test_threads(variant):
     """Four threads, each on its own stream, give the bits of one after the other."""
     settings = settings_for(variant)
@@ -390,7 +452,7 @@ def test_threads(variant):
             assert_identical(result, expected[name])
 
 
-@each_kind
+@each_path
 def test_a_device_that_is_not_the_current_one(variant):
     if torch.cuda.device_count() < 2:
         pytest.skip("needs two CUDA devices")
@@ -447,7 +509,7 @@ def waiting_is_an_error():
     torch.cuda.set_sync_debug_mode("default")
 
 
-@each_kind
+@each_path
 def test_nothing_waits_for_the_device(variant, waiting_is_an_error):
     """After the frames that are counted. torch reports the waiting that it does itself."""
     frame = frames(variant)
@@ -465,7 +527,7 @@ def test_effects_do_not_wait_for_the_device(waiting_is_an_error):
         frame()
 
 
-@each_kind
+@each_path
 def test_nothing_waits_for_the_device_behind_the_back_of_torch(variant):
     """The same by the calls that the driver's profiler sees."""
     from torch.profiler import ProfilerActivity, profile, record_function
@@ -491,7 +553,7 @@ def test_effects_of_the_camera_are_not_captured():
         frame()
 
 
-@each_kind
+@each_path
 def test_cuda_graph(variant):
     """A captured frame renders what its inputs hold when it is replayed."""
     scene, settings = scene32(), settings_for(variant)
@@ -517,7 +579,7 @@ def test_cuda_graph(variant):
         assert torch.equal(radii.cpu(), run(case, settings, "cuda").radii)
 
 
-@each_kind
+@each_path
 def test_memory_does_not_grow(variant):
     frame = frames(variant)
     gc.collect()  # what other tests have left

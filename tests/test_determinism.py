@@ -6,11 +6,12 @@ import pytest
 import scenes
 import torch
 from conftest import each_precision, run_python
-from scenes import KINDS, VARIANTS, Camera, name_of
+from scenes import KINDS, PATHS, RENDERED, YARDSTICKS, Camera, name_of
 
 import analytic_rasterizer as ar
 
-each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
+each_path = pytest.mark.parametrize("variant", PATHS, ids=name_of)
+each_weight = pytest.mark.parametrize("variant", [*KINDS, *((name, {}) for name in YARDSTICKS)], ids=name_of)
 each_dtype = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 
 # Large enough that several threads get tiles, several tiles share splats, and partial sums matter.
@@ -38,7 +39,7 @@ def assert_identical(first, second):
         assert torch.equal(a, b)
 
 
-@each_kind
+@each_path
 @each_dtype
 def test_thread_count_changes_no_bit(variant, dtype):
     scene = scenes.random_scene(1, 400, degree=2, sigma=(0.01, 0.4))
@@ -51,7 +52,7 @@ def test_thread_count_changes_no_bit(variant, dtype):
     assert_identical(results[0], results[2])
 
 
-@each_kind
+@each_path
 def test_repeated_runs_are_identical(device, variant):
     torch.set_num_threads(7)
     scene = scenes.random_scene(2, 300, degree=2, sigma=(0.01, 0.4))
@@ -60,7 +61,7 @@ def test_repeated_runs_are_identical(device, variant):
         assert_identical(first, everything(CAMERA, scene, variant, torch.float32, device))
 
 
-@each_kind
+@each_weight
 def test_weight_function_is_deterministic(device, variant):
     """20000 weights, more than one thread's worth; each alone gives the same as in the batch."""
     footprint, options = variant
@@ -77,7 +78,7 @@ def test_weight_function_is_deterministic(device, variant):
     assert_identical(results[0], results[2])
 
 
-@each_kind
+@each_path
 def test_other_gaussians_do_not_change_a_gradient_by_a_bit(device, variant):
     """Far-away Gaussians change the partition of the work, not the sums of the others."""
     near = scenes.random_scene(4, 50, degree=2)
@@ -109,7 +110,7 @@ import scenes, test_determinism as determinism
 import analytic_rasterizer as ar
 
 results = {}
-for variant in scenes.VARIANTS:
+for variant in scenes.RENDERED:
     for dtype in (torch.float32, torch.float64):
         torch.set_num_threads(1)
         results[scenes.name_of(variant), dtype] = determinism.of_levels(variant, dtype)
@@ -164,7 +165,8 @@ TYPICAL = 4 * 2.0**-24
 GRADIENT, GRADIENT_OF_FLIP = 8e-6, 1e-4
 
 
-@pytest.mark.parametrize("variant", VARIANTS, ids=name_of)
+@pytest.mark.xdist_group("levels")
+@pytest.mark.parametrize("variant", RENDERED, ids=name_of)
 def test_instruction_sets(levels, variant):
     """Measured: baseline against the others 5e-7 in the image where nothing flips, 4e-8 RMS, 1.4e-6 of the gradients;
     AVX2 against AVX-512 8e-7 of the gradients."""
@@ -188,13 +190,15 @@ def test_instruction_sets(levels, variant):
         assert gradients < GRADIENT
 
 
+@pytest.mark.xdist_group("levels")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_another_process_gives_the_same_bits(levels, dtype):
-    for variant in VARIANTS:
+    for variant in RENDERED:
         expected = levels[ar.instruction_set()][name_of(variant), dtype]
         assert_identical(of_levels(variant, dtype), expected)
 
 
+@pytest.mark.xdist_group("levels")
 def test_an_unknown_level_is_the_best(levels):
     """A variable left over from another machine must not break a program."""
     code = "import analytic_rasterizer as ar; print(ar.instruction_set(), end='')"
@@ -204,7 +208,7 @@ def test_an_unknown_level_is_the_best(levels):
 # --- odd shapes --------------------------------------------------------------------------------
 
 
-@each_kind
+@each_path
 @each_precision
 def test_no_gaussians(variant, device, dtype):
     """P = 0 renders the background; the backward pass runs and gives empty gradients."""
@@ -216,7 +220,7 @@ def test_no_gaussians(variant, device, dtype):
     assert all(gradient.shape[0] == 0 for gradient in rest[: len(scene)])
 
 
-@each_kind
+@each_path
 @pytest.mark.parametrize("size", [(1, 1), (4000, 1), (1, 4000), (31, 17)], ids=str)
 def test_odd_image_shapes(device, variant, size):
     """Few rows and many tiles, or the reverse. (Their values: test_render_reference.py.)"""
@@ -232,7 +236,7 @@ def test_odd_image_shapes(device, variant, size):
     assert_identical(results[0], results[2])
 
 
-@each_kind
+@each_path
 def test_all_culled(device, variant):
     """Behind the camera, or with no opacity: background, radii where due, zero gradients."""
     scene = scenes.random_scene(8, 20, degree=2)
@@ -248,7 +252,7 @@ def test_all_culled(device, variant):
             assert (radii == 0).all()
 
 
-@each_kind
+@each_path
 def test_empty_tiles(device, variant):
     """One small splat in a large image: every other tile is plain background."""
     camera = Camera(image_width=200, image_height=120, bg=(0.2, 0.4, 0.8)).facing_z()

@@ -1,25 +1,29 @@
-"""Optimisation from hard starts: 500 steps of Adam on one target at three sizes, float32 against float64.
+"""Optimisation from hard starts: Adam on one target at three sizes.
 
 The starts are those where a renderer's gradients go wrong: isotropic Gaussians, whose eigenvectors are undefined;
 needles, whose covariance is singular in float32; and Gaussians most of which are finer than a pixel.
 
-Two runs that differ by rounding part: even in float64 the losses at the end differ by up to 20% where the starts
-differ by 1e-7, and by 40% where the start is needles. So the ends are compared with that in mind, and the gradients
-along the way, which do not drift apart, closely.
+A long optimisation is chaotic: two starts that differ by 1e-7 of their size are far apart after 100 steps. So the end
+of a float32 run is not compared with that of a float64 run. Gradients and descent are tested at points along one
+float64 path, by bounds that hold at any point, and a float32 run only has to go down.
 """
 
+import functools
 import math
 
+import hard_cases
 import pytest
 import scenes
 import torch
-from scenes import VARIANTS, Camera, name_of
+from hard_cases import Case
+from scenes import RENDERED, Camera, name_of
 
 import analytic_rasterizer as ar
 
 COUNT = 40
 SIZES = ((32, 24), (16, 12), (8, 6))
-CAMERAS = [Camera(image_width=width, image_height=height, bg=(0.1, 0.2, 0.3)) for width, height in SIZES]
+CAMERAS = [Camera(image_width=width, image_height=height, bg=(0.1, 0.2, 0.3)).facing_z() for width, height in SIZES]
+CENTRE = torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64)  # of the Gaussians, before the cameras
 # Columns of the parameters, and how far a step of Adam moves each: mean, log scales, quaternion, logit of the
 # opacity, colour.
 PARTS = (3, 3, 4, 1, 3)
@@ -27,13 +31,18 @@ RATES = torch.cat([torch.full((n,), rate) for n, rate in zip(PARTS, (0.01, 0.02,
 
 # Longest and shortest scale in world units; a pixel of the three images is 0.15, 0.3 and 0.6 across at the target.
 STARTS = {"isotropic": (0.15, 0.15), "needles": (0.6, 0.003), "sub-pixel": (0.06, 0.015)}
+# Steps of the path at which gradients and descent are tested: the start itself, and on the way.
+POINTS = (0, 5, 20, 40)
+
+each_start = pytest.mark.parametrize("kind", STARTS)
+each_variant = pytest.mark.parametrize("variant", RENDERED, ids=name_of)
 
 
 def start(kind):
     """Parameters (COUNT, 14) float64, rounded to float32 so that both precisions start alike."""
     g = torch.Generator().manual_seed(11)
     longest, shortest = map(math.log, STARTS[kind])
-    means = scenes.rand(g, COUNT, 3, low=-1.2, high=1.2)
+    means = CENTRE + scenes.rand(g, COUNT, 3, low=-1.2, high=1.2)
     scales = torch.full((COUNT, 3), longest, dtype=torch.float64)
     rotations = torch.tensor([[1.0, 0.0, 0.0, 0.0]], dtype=torch.float64).repeat(COUNT, 1)
     if kind == "needles":
@@ -46,10 +55,24 @@ def start(kind):
     return torch.cat([means, scales, rotations, logits, colors], -1).float().double()
 
 
-@pytest.fixture(scope="module")
-def images():
+def inputs_of(parameters):
+    """Keyword inputs of the rasterizer, differentiable in the parameters."""
+    means, log_scales, rotations, logits, colors = parameters.split(PARTS, -1)
+    return {
+        "means3D": means,
+        "means2D": torch.zeros_like(means),
+        "opacities": torch.sigmoid(logits),
+        "colors_precomp": colors,
+        "scales": torch.exp(log_scales),
+        "rotations": rotations,
+    }
+
+
+@functools.cache
+def targets():
     """Large and small Gaussians as sixteen samples per pixel see them at each size."""
     scene = scenes.random_scene(12, 30, opacity=(0.4, 0.95), sigma=(0.03, 0.5), spread=1.2)
+    scene["means3D"] += CENTRE
     with torch.no_grad():
         return [ar.GaussianRasterizer(camera.settings(footprint="box", samples=16))(**scene)[0] for camera in CAMERAS]
 
@@ -57,25 +80,19 @@ def images():
 class Problem:
     """The loss at each size, for one footprint, in one precision."""
 
-    def __init__(self, variant, images, dtype, device):
+    def __init__(self, variant, dtype=torch.float64, device="cpu"):
         footprint, options = variant
         settings = [camera.settings(dtype, device, footprint=footprint, **options) for camera in CAMERAS]
         self.rasterizers = [ar.GaussianRasterizer(s) for s in settings]
-        self.images = [image.to(device, dtype) for image in images]
+        self.images = [image.to(device, dtype) for image in targets()]
 
     def loss(self, parameters, k):
-        means, log_scales, rotations, logits, colors = parameters.split(PARTS, -1)
-        image, _ = self.rasterizers[k](
-            means3D=means,
-            means2D=torch.zeros_like(means),
-            opacities=torch.sigmoid(logits),
-            colors_precomp=colors,
-            scales=torch.exp(log_scales),
-            rotations=rotations,
-        )
-        return ((image - self.images[k]) ** 2).mean()
+        """Mean squared error of the image of size k; added up in float64."""
+        color, _ = self.rasterizers[k](**inputs_of(parameters))
+        return (color - self.images[k]).double().square().mean()
 
     def total(self, parameters):
+        """Mean of the loss over the sizes, a number."""
         with torch.no_grad():
             return sum(self.loss(parameters, k).item() for k in range(len(SIZES))) / len(SIZES)
 
@@ -83,65 +100,113 @@ class Problem:
         leaf = parameters.detach().to(self.images[k]).requires_grad_()
         return torch.autograd.grad(self.loss(leaf, k), leaf)[0]
 
-    def optimise(self, parameters, steps, look):
-        """Parameters after so many steps of Adam over the sizes in turn; look(step, parameters, gradient)."""
+    def optimise(self, parameters, steps):
+        """Parameters before the first and after each of so many steps of Adam, over the sizes in turn."""
         parameters = parameters.to(self.images[0])
         rates = RATES.to(parameters)
         first, second = torch.zeros_like(parameters), torch.zeros_like(parameters)
+        path = [parameters]
         for step in range(1, steps + 1):
             gradient = self.gradient(parameters, step % len(SIZES))
             assert torch.isfinite(gradient).all(), f"step {step}"
-            look(step, parameters, gradient)
             first.lerp_(gradient, 0.1)
             second.mul_(0.99).addcmul_(gradient, gradient, value=0.01)
             unbiased = math.sqrt(1 - 0.99**step) / (1 - 0.9**step)
-            parameters = parameters - unbiased * rates * first / (second.sqrt() + 1e-12)
+            parameters = parameters - unbiased * rates * first / (second.sqrt() + 1e-8)
+            path.append(parameters)
         assert torch.isfinite(parameters).all()
-        return parameters
+        return path
 
 
-def steps_for(variant):
-    """`exact` takes ten times as long in float64 as the others: fewer."""
-    return 150 if variant[0] == "exact" else 500
+@functools.cache
+def path(kind):
+    """Parameters at POINTS of one float64 optimisation, rounded to float32.
 
-
-def distance_for(variant, kind):
-    """Largest ratio of the two losses: twice the largest difference, in logarithms, that was measured.
-
-    Over all footprints, starts moved by 1e-7, in float64 and in float32 against float64: 0.18 and 0.21, from needles
-    0.34 and 0.34. `point` without dilation sees nothing of a needle between the centres: 0.74 and 0.8.
+    One path for all footprints: what is tested are gradients at its points, not where it leads.
     """
-    measured = 0.21 if kind != "needles" else 0.8 if variant == ("point", {"dilation": 0.0}) else 0.34
-    return math.exp(2 * measured)
+    steps = Problem(("box", {"samples": 4})).optimise(start(kind), max(POINTS))
+    return [steps[point].float().double() for point in POINTS]
 
 
-# A needle's gradient is conditioned like its aspect ratio, 200; with some 100 roundings of 6e-8 that makes 1.2e-3.
-# Measured: up to 3e-4 for the scales of needles, 3e-5 for everything else.
-GRADIENT_ERROR = 1e-3
+def allow_for_the_determinant(report, scales):
+    """`analytic` divides by the smaller deviation, which it takes from det Sigma. The entries of Sigma are rounded
+    before that, so the deviation is off by up to 16 eps times the condition number of Sigma (`rounding_bound` in
+    test_footprints.py), which the squared ratio of the scales bounds, and so is the gradient with respect to them."""
+    if "scales" not in report.tolerance:
+        return  # unbounded, and so not compared, where splats are round (hard_cases.py)
+    condition = (scales.amax(-1) / scales.amin(-1)).square()
+    report.tolerance["scales"] = report.tolerance["scales"] + 16 * 2.0**-24 * condition * report.size["scales"]
 
 
-@pytest.mark.parametrize("kind", STARTS)
-@pytest.mark.parametrize("variant", VARIANTS, ids=name_of)
-def test_from_a_hard_start(device, variant, kind, images):
-    """Everything is finite; gradients are float64's along the way; the loss falls as far as in float64."""
-    ours, exact = Problem(variant, images, torch.float32, device), Problem(variant, images, torch.float64, "cpu")
-    steps = steps_for(variant)
-    errors = []
+@each_start
+@each_variant
+def test_gradients_along_a_path(device, variant, kind):
+    """The float32 image and gradients agree with float64's for the same numbers, within the tolerance that the
+    condition of each point allows (hard_cases.py), Gaussian by Gaussian.
 
-    def compare(step, parameters, gradient):
-        if step % 25:
-            return
-        expected = exact.gradient(parameters.cpu(), step % len(SIZES))
-        parts = zip(gradient.cpu().split(PARTS, -1), expected.split(PARTS, -1), strict=True)
-        errors.append([((a - b).norm() / b.norm()).item() for a, b in parts])
+    Measured, over four perturbed paths: at most 0.36 of the tolerance.
+    """
+    for point, parameters in zip(POINTS, path(kind), strict=True):
+        scene = {name: value.detach() for name, value in inputs_of(parameters).items()}
+        for camera in CAMERAS[point % 2 :: 2]:
+            case = Case(
+                f"{kind}, step {point}, {camera.image_width} px",
+                "",
+                lambda camera=camera, scene=scene: (camera, scene),
+                round=kind == "isotropic" and point == 0,
+            )
+            report = hard_cases.measure(case, variant, device, torch.float32)
+            assert report.finite, report.describe()
+            if variant[0] == "analytic":
+                allow_for_the_determinant(report, scene["scales"])
+            assert not report.failures(), report.describe()
 
-    first = start(kind)
-    before = ours.total(first.to(device, torch.float32))
-    after = ours.total(ours.optimise(first, steps, compare))
-    expected = exact.total(exact.optimise(first, steps, lambda *_: None))
-    # The median step: at some an alpha crosses 1/255, which takes a term from one of the two sums.
-    typical = torch.tensor(errors).median(0).values
-    print(f"loss {before:.2e} -> {after:.2e}, float64 {expected:.2e}", [f"{e:.1e}" for e in typical])
-    assert typical.max() < GRADIENT_ERROR
-    assert after < before / 5
-    assert 1 / distance_for(variant, kind) < after / expected < distance_for(variant, kind)
+
+@each_start
+@each_variant
+def test_a_step_against_the_gradient_descends(device, variant, kind):
+    """From every point of the path some step, of the learning rates or of 2^-10 of them or between, lowers the float32
+    loss by at least half of what the float32 gradient promises for it (Armijo's condition).
+
+    Where the loss is smooth, half of the promise is kept by every step that is short enough. It also jumps, either
+    way, where an alpha crosses 1/255, so that not every step is asked to keep it. Measured: the best step keeps 0.87
+    of the promise or more, over four perturbed paths.
+    """
+    problem = Problem(variant, torch.float32, device)
+    for point, parameters in zip(POINTS, path(kind), strict=True):
+        here = parameters.to(device, torch.float32)
+        for k in range(len(SIZES)):
+            gradient = problem.gradient(here, k)
+            direction = -RATES.to(here) * gradient  # a positive diagonal leaves it a direction of descent
+            slope = (gradient.double() * direction.double()).sum().item()
+            assert math.isfinite(slope) and slope < 0
+            longest = 1 / gradient.abs().max().item()
+            before = problem.loss(here, k).item()
+            kept = []
+            for length in (longest / 2**i for i in range(11)):
+                kept.append((problem.loss(here + length * direction, k).item() - before) / (length * slope))
+            assert max(kept) > 0.5, (point, k, kept)
+
+
+STEPS = 150
+
+
+def most_left(variant, kind):
+    """Largest fraction of the loss that may be left after STEPS steps.
+
+    Measured from 16 starts moved by 1e-3 of their size, for every footprint: at most 0.125, with a standard deviation
+    of the logarithm of at most 0.13, so that 0.3 is seven of them away. `point` without dilation sees nothing of a
+    needle that lies between the pixel centres: 0.7 with a deviation of 0.07, so that all that is asked is descent.
+    """
+    return 1.0 if kind == "needles" and variant == ("point", {"dilation": 0.0}) else 0.3
+
+
+@each_start
+@each_variant
+def test_adam_descends(device, variant, kind):
+    """Everything stays finite over a whole float32 optimisation, and most of the loss goes."""
+    problem = Problem(variant, torch.float32, device)
+    steps = problem.optimise(start(kind), STEPS)
+    before, after = problem.total(steps[0]), problem.total(steps[-1])
+    print(f"loss {before:.2e} -> {after:.2e}")
+    assert after < most_left(variant, kind) * before

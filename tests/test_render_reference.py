@@ -14,7 +14,7 @@ import pytest
 import reference
 import scenes
 import torch
-from scenes import KINDS, VARIANTS, Camera, name_of
+from scenes import KINDS, PATHS, RENDERED, VARIANTS, Camera, name_of
 
 import analytic_rasterizer as ar
 
@@ -23,8 +23,9 @@ GRADIENT_TOLERANCE = {torch.float64: 1e-9, torch.float32: 2e-4}  # of the larges
 # Rounding must not decide a comparison with a threshold: distance to it, relative.
 MARGIN = {torch.float64: 1e-10, torch.float32: 1e-3}
 
-every_footprint = pytest.mark.parametrize("variant", VARIANTS, ids=name_of)
+every_footprint = pytest.mark.parametrize("variant", RENDERED, ids=name_of)
 each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
+each_path = pytest.mark.parametrize("variant", PATHS, ids=name_of)
 
 
 def render(camera, scene, variant):
@@ -146,7 +147,7 @@ def hard_scene(seed=11, degree=0):
 CAMERA = Camera(bg=(0.2, 0.5, 0.9), scale_modifier=1.15, shift=(2.3, -4.1))
 
 
-@every_footprint
+@pytest.mark.parametrize("variant", VARIANTS, ids=name_of)
 def test_everything_at_once(device, best, variant):
     """44 Gaussians, 45x37 px, off-centre projection, background, scale modifier, clamp, cap."""
     expected = compare(CAMERA, hard_scene(), variant, device, best)
@@ -158,7 +159,7 @@ def test_everything_at_once(device, best, variant):
     assert clamped.any(), "no visible splat beyond the frustum clamp"
 
 
-@each_kind
+@pytest.mark.parametrize("variant", [("point", {})], ids=name_of)
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_spherical_harmonics(device, best, variant, degree):
     compare(Camera(sh_degree=degree), scenes.random_scene(20 + degree, 20, degree), variant, device, best)
@@ -198,7 +199,7 @@ def test_scale_modifier_acts_on_scales_only(device, best):
     )
 
 
-@each_kind
+@each_path
 @pytest.mark.parametrize("size", [(1, 1), (16, 16), (17, 15), (33, 48), (4000, 1), (1, 4000)], ids=str)
 def test_image_sizes(device, best, variant, size):
     camera = Camera(image_width=size[0], image_height=size[1], bg=(0.1, 0.2, 0.3))
@@ -336,7 +337,7 @@ def test_near_plane(device, best, variant):
 # --- gradcheck ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("variant", [v for v in VARIANTS if v[1].get("frame_gradient") != "frozen"], ids=name_of)
+@pytest.mark.parametrize("variant", [v for v in RENDERED if v[1].get("frame_gradient") != "frozen"], ids=name_of)
 @pytest.mark.parametrize("precomputed", [False, True], ids=["scales-sh", "precomputed"])
 def test_gradcheck(variant, precomputed):
     """Finite differences of the whole rasterizer, in a scene that no threshold touches.

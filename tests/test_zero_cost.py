@@ -1,115 +1,174 @@
 """What an effect costs where it is off, nothing, and what it changes besides itself, nothing.
 
-The plain path calls, launches and allocates what it did before the full camera was compiled in (record_plain_path.py
-says how that is known). An effect that is switched on, and adds an output or by its numbers leaves the picture as it
-is, leaves every bit of all else as it is.
+The plain path, three colours of a fixed pinhole, calls the same ops, launches the same kernels and allocates the same
+bytes whether effects are left out, given without any that is on, or were on in the frame before; and what it allocates
+per pixel and per Gaussian is written down here. An effect that is switched on, and adds an output or by its numbers
+leaves the picture as it is, leaves every bit of all else as it is.
 """
 
+import collections
+import dataclasses
 import functools
 import itertools
 import json
-import pathlib
-import re
+from dataclasses import MISSING
+from typing import NamedTuple
 
 import pytest
-import record_plain_path as record
 import scenes
 import torch
 from conftest import each_precision, needs_cuda
-from scenes import KINDS, Camera, name_of
+from scenes import PATHS, Camera, name_of
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C
 
-each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
-RECORD = json.loads((pathlib.Path(__file__).parent / "data" / "plain_path.json").read_text())
+each_path = pytest.mark.parametrize("variant", PATHS, ids=name_of)
 
 # --- what the plain path calls, launches and allocates -----------------------------------------------
 
-each_pass = pytest.mark.parametrize(
-    "footprint, pass_", list(itertools.product(record.FOOTPRINTS, record.PASSES)), ids=lambda value: value
-)
-measured = functools.cache(record.measure)
+# Tensors are known by their sizes: pixels, Gaussians and what either has are numbers without a common factor.
+SMALL = Camera(image_height=29, image_width=37, sh_degree=1)
+PIXELS, GAUSSIANS = 29 * 37, 61
+FRAME_PAIRS = 1 << 12  # room for pairs on CUDA, which would else follow the frames before
+PASSES = ("inference", "forward", "forward_backward")
+each_pass = pytest.mark.parametrize("pass_", PASSES)
 
 
-def recorded(footprint, pass_, device, of_torch=False):
-    """What was recorded; `of_torch`: of this version of it."""
-    if device not in RECORD:
-        pytest.skip(f"tests/data/plain_path.json has no record of {device}: tests/record_plain_path.py makes one there")
-    version = RECORD[device]["torch"]
-    if of_torch and version != torch.__version__:
-        pytest.skip(f"recorded with torch {version}, whose own ops and allocations may be others")
-    return RECORD[device]["passes"][footprint][pass_]
+class Cost(NamedTuple):
+    """What one call does, for comparison with another."""
+
+    outermost: list  # ops that are not called by another, in order
+    ops: list  # all ops, in order
+    allocated: dict  # how many allocations of so many bytes
+    launched: dict  # on CUDA: how many kernels, memsets and copies, by name
+    requested: tuple  # on CUDA: bytes before rounding, and in how many allocations
 
 
+def frame(variant, pass_, device, effects=None):
+    """A function that renders the fixed scene, all of whose inputs are there."""
+    footprint, options = variant
+    settings = SMALL.settings(torch.float32, device, footprint=footprint, effects=effects, **options)
+    scene = scenes.cast(scenes.random_scene(11, GAUSSIANS, degree=1), torch.float32, device)
+    rasterizer = ar.GaussianRasterizer(settings)
+    if pass_ == "inference":
+        return torch.no_grad()(lambda: rasterizer(**scene))
+    leaves = scenes.leaves(scene)
+    weights = torch.ones(3, SMALL.image_height, SMALL.image_width, device=device)
+
+    def forward_backward():
+        color, *_ = rasterizer(**leaves)
+        return torch.autograd.grad(color, list(leaves.values()), weights)
+
+    return forward_backward if pass_ == "forward_backward" else lambda: rasterizer(**leaves)
+
+
+def cost_of(call, device, tmp_path):
+    """Of the second call: what happens once is no cost of a frame."""
+    call()
+    events = trace(call, device, tmp_path)
+    spans = [e for e in events if e.get("cat") == "cpu_op"]
+    ends, outermost = {}, []  # spans of a thread nest
+    for event in spans:
+        if event["ts"] >= ends.get(event["tid"], -1):
+            outermost.append(event["name"])
+            ends[event["tid"]] = event["ts"] + event["dur"]
+    sizes = [e["args"]["Bytes"] for e in events if e["name"] == "[memory]" and e["args"]["Bytes"] > 0]
+    launched = [e["name"] for e in events if e.get("cat") in ("kernel", "gpu_memset", "gpu_memcpy")]
+    requested = ()
+    if device == "cuda":
+        assert any("ar::" in name for name in launched), "torch's profiler saw no kernel: CUPTI is missing, or refused"
+        names = ("requested_bytes.all.allocated", "allocation.all.allocated")
+        before = torch.cuda.memory_stats()
+        results = call()
+        after = torch.cuda.memory_stats()
+        del results
+        requested = tuple(after[name] - before[name] for name in names)
+    names = [event["name"] for event in spans]
+    return Cost(outermost, names, collections.Counter(sizes), collections.Counter(launched), requested)
+
+
+def trace(call, device, tmp_path):
+    """What torch's profiler saw of a call: events of its trace, by time."""
+    activities = [torch.profiler.ProfilerActivity.CPU]
+    if device == "cuda":
+        activities.append(torch.profiler.ProfilerActivity.CUDA)
+        torch.cuda.synchronize()
+        torch.cuda.empty_cache()  # a large block that is found there may be handed out whole
+    with torch.profiler.profile(activities=activities, profile_memory=True) as profiler:
+        call()
+        if device == "cuda":
+            torch.cuda.synchronize()
+    path = tmp_path / "trace.json"
+    profiler.export_chrome_trace(str(path))
+    events = json.loads(path.read_text())["traceEvents"]
+    return sorted((e for e in events if e.get("ph") in ("X", "i")), key=lambda e: (e["ts"], -e.get("dur", 0)))
+
+
+@pytest.fixture
+def room_for_pairs(same_room):
+    """On CUDA, enough and always the same. After `same_room`, which makes more."""
+    if _C.has_cuda and torch.cuda.is_available():
+        _C.force_pair_capacity(FRAME_PAIRS)
+
+
+@each_path
 @each_pass
-def test_plain_path_makes_the_same_tensors(device, footprint, pass_):
-    """Ours that take memory, in order, with their bytes."""
-
-    def tensors(found):
-        return [call for call in " ".join(found["calls"]).split() if re.search(r":\d+$", call)]
-
-    expected = tensors(recorded(footprint, pass_, device))
-    assert expected and tensors(measured(footprint, pass_, device)) == expected
-
-
-@each_pass
-def test_plain_path_allocates_the_same(device, footprint, pass_):
-    """Inside of torch too."""
-    expected = recorded(footprint, pass_, device, of_torch=True)["allocated"]
-    assert measured(footprint, pass_, device)["allocated"] == expected
+def test_effects_that_are_off_cost_nothing(device, variant, pass_, tmp_path, room_for_pairs):
+    """The same ops, allocations and kernels as without effects; after a frame with effects too."""
+    plain = cost_of(frame(variant, pass_, device), device, tmp_path)
+    defaults = {f.name: f.default for f in dataclasses.fields(ar.Effects) if f.default is not MISSING}
+    assert defaults, "Effects has no fields with defaults"
+    for off in (ar.Effects(), ar.Effects(**defaults)):
+        assert cost_of(frame(variant, pass_, device, off), device, tmp_path) == plain
+    frame(variant, pass_, device, ar.Effects(**ALL_OUTPUTS, near=0.15))()
+    assert cost_of(frame(variant, pass_, device), device, tmp_path) == plain
 
 
-@each_pass
-def test_plain_path_makes_the_same_calls(device, footprint, pass_):
-    """Of ours to torch."""
-    expected = recorded(footprint, pass_, device)["calls"]
-    assert measured(footprint, pass_, device)["calls"] == expected
+@each_path
+@pytest.mark.parametrize("pass_", ["inference", "forward"])
+def test_the_plain_path_is_one_op(device, variant, pass_, tmp_path):
+    """Python calls nothing of torch beside it."""
+    (op,) = cost_of(frame(variant, pass_, device), device, tmp_path).outermost
+    assert op.startswith("analytic_rasterizer::")
 
 
-@each_pass
-def test_plain_path_runs_the_same_ops(device, footprint, pass_):
-    """Inside of torch too."""
-    expected = recorded(footprint, pass_, device, of_torch=True)["everything"]
-    assert measured(footprint, pass_, device)["everything"] == expected
-
-
-def test_plain_path_makes_no_effects(device, monkeypatch):
+def test_the_plain_path_makes_no_effects(device, monkeypatch):
     """No profiler shows it, but the host needs 50 us for all of a small picture."""
-    call, made = record.prepare("box", "inference", device), []
+    call, made = frame(("box", {}), "inference", device), []
     monkeypatch.setattr(ar.Effects, "__post_init__", lambda self: made.append(self))
     call()
     assert not made
 
 
-@needs_cuda
+# Bytes on the CPU. Per pixel: three colours; for a backward pass, of each sample the transmittance that is left and
+# the number of splats that it has seen. Per Gaussian: its splat, and its radius, its id and its number of pairs; from a
+# backward pass the gradients with respect to the inputs, which are as large as those.
+COLOR, SAMPLE = 3 * 4, 4 + 4
+SPLAT, NUMBERS = 48, 3 * 4
+GRADIENTS = 4 * (3 + 3 + 1 + 12 + 3 + 4)
+SAMPLES = {"box": 4, "adaptive": 16}  # per pixel that there is room for
+
+
+@each_path
 @each_pass
-def test_plain_path_launches_the_same_kernels(footprint, pass_):
-    """And asks the device for as many bytes."""
-    found = measured(footprint, pass_, "cuda")
-    assert not any("FullCamera" in name for name in found["kernels"])
-    expected = recorded(footprint, pass_, "cuda")
-    assert found["kernels"] == expected["kernels"]
-    for count in ("memsets", "memcpys", "others", "bytes", "allocations"):
-        assert found[count] == expected[count], count
+def test_memory_of_the_plain_path(variant, pass_, tmp_path):
+    """Nothing per pixel or per Gaussian but what a picture without effects needs."""
+    allocated = cost_of(frame(variant, pass_, "cpu"), "cpu", tmp_path).allocated
+    of_pixels = sum(size * count for size, count in allocated.items() if size % PIXELS == 0)
+    of_gaussians = sum(size * count for size, count in allocated.items() if size % GAUSSIANS == 0 and size % PIXELS)
+    samples = 0 if pass_ == "inference" else SAMPLES.get(variant[0], 1)
+    assert COLOR * PIXELS <= of_pixels <= (COLOR + SAMPLE * samples) * PIXELS
+    gradients = GRADIENTS if pass_ == "forward_backward" else 0
+    assert gradients * GAUSSIANS < of_gaussians <= (SPLAT + NUMBERS + gradients) * GAUSSIANS
 
 
 @needs_cuda
-def test_a_full_camera_shows_in_the_names_of_kernels():
-    settings = CAMERA.settings(torch.float32, "cuda", effects=ar.Effects(near=0.1))
-    scene = scenes.cast(scenes.random_scene(1, degree=1), torch.float32, "cuda")
-    events = record.profile(lambda: ar.GaussianRasterizer(settings)(**scene), "cuda")
-    assert any("project_kernel" in event["name"] and "FullCamera" in event["name"] for event in events)
-
-
-def test_kernels_are_compared_by_the_names_of_before():
-    before = "void ar::cuda::project_kernel<ar::Analytic<(ar::FrameGradient)0> >(ar::cuda::ProjectTask)"
-    plain = (
-        "void ar::cuda::project_kernel<ar::Analytic<(ar::FrameGradient)0>, ar::Camera<float> >(ar::cuda::ProjectTask)"
-    )
-    assert record.kernel_name(plain) == record.kernel_name(before)
-    full = plain.replace("Camera", "FullCamera")
-    assert record.kernel_name(full) != record.kernel_name(before) and "FullCamera" in record.kernel_name(full)
+def test_a_full_camera_shows_in_the_names_of_kernels(tmp_path):
+    """And only where there is one."""
+    for effects, there in ((None, False), (ar.Effects(near=0.1), True)):
+        launched = cost_of(frame(("box", {}), "inference", "cuda", effects), "cuda", tmp_path).launched
+        assert any("FullCamera" in name for name in launched) == there
 
 
 # --- what an effect changes --------------------------------------------------------------------------
@@ -229,11 +288,11 @@ def assert_same_bits(found, expected):
 @functools.cache
 def plain(scene_index, effect_scenes, variant_index, dtype, device, with_loss):
     scene = scenes_of(effect_scenes)[scene_index]
-    return render(scene, KINDS[variant_index], None, dtype, device, ("color",) if with_loss else ())
+    return render(scene, PATHS[variant_index], None, dtype, device, ("color",) if with_loss else ())
 
 
 @each_precision
-@each_kind
+@each_path
 @pytest.mark.parametrize("name", [*OTHER_EFFECTS, *CAMERA_EFFECTS, *OUTPUT_EFFECTS])
 def test_an_effect_changes_nothing_else(variant, device, dtype, name):
     """Colours, radii and gradients of a loss on colours, with a backward pass to come and without."""
@@ -243,12 +302,12 @@ def test_an_effect_changes_nothing_else(variant, device, dtype, name):
         for loss in (("color",), ()):
             if device == "cuda" and not loss and effects.has_outputs:
                 continue  # outputs keep what a backward pass takes, whose sum over samples has another order
-            expected = plain(index, which, KINDS.index(variant), dtype, device, bool(loss))
+            expected = plain(index, which, PATHS.index(variant), dtype, device, bool(loss))
             assert_same_bits(render(scene, variant, effects, dtype, device, loss), expected)
 
 
 @each_precision
-@each_kind
+@each_path
 @each_camera_effect
 def test_a_camera_changes_no_output(variant, device, dtype, name):
     """All outputs, and the gradients of a loss on all of them."""
@@ -260,7 +319,7 @@ def test_a_camera_changes_no_output(variant, device, dtype, name):
 
 
 @each_precision
-@each_kind
+@each_path
 def test_outputs_do_not_see_each_other(variant, device, dtype):
     """Each alone, in pairs, and with all others: values, and gradients of a loss on it alone."""
     scene = scenes_of("")[0]
@@ -275,7 +334,7 @@ def test_outputs_do_not_see_each_other(variant, device, dtype):
 
 
 @each_precision
-@each_kind
+@each_path
 def test_a_band_of_zeros_changes_nothing_else(variant, device, dtype):
     """Harmonics of degree 4 that are zero, used or left out."""
     scene = scenes.random_scene(31, COUNT, degree=4)
