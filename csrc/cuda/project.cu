@@ -33,8 +33,8 @@ void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream) {
   launch(project_rows_vjp_kernel<Plain>, project_rows_vjp_kernel<Full>, p, stream);
 }
 
-void shape_rows(const ShapeRowsParams& p, cudaStream_t stream) { launch(shape_rows_kernel, p, p.rows.n, stream); }
-void row_grads(const RowGradsParams& p, cudaStream_t stream) { launch(row_grads_kernel, p, p.rows.n, stream); }
+void shape_rows(const ShapeRowsParams& p, cudaStream_t stream) { launch(shape_rows_kernel, p, p.n, stream); }
+void row_grads(const RowGradsParams& p, cudaStream_t stream) { launch(row_grads_kernel, p, p.n, stream); }
 
 void sum_channels(const SumChannelsParams& p, cudaStream_t stream) {
   const int64_t n = p.sums.n;

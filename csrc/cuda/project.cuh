@@ -94,32 +94,20 @@ __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const Pro
   if (params.rows.colors) params.rows.colors[i] = splat.color;
 }
 
-__device__ inline Cov2d<float> cov_of(const RowsView& rows, int64_t i) {
-  const Sym2<float> c = rows.cov2d[i];
-  if (!rows.dets) return with_det(c);
-  return {c.xx, c.xy, c.yy, rows.dets[i]};
-}
-
-/// Rows come from anyone: what project() would have culled touches nothing.
 __global__ void __launch_bounds__(kProjectThreads) shape_rows_kernel(const ShapeRowsParams params) {
-  const RowsView& rows = params.rows;
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
-  if (i >= rows.n) return;
-  const ProjectedGaussian<float> projected = {rows.means2d[i], cov_of(rows, i), rows.opacities[i],
-                                              rows.depths[i] + 0.0f};  // -0 to 0: keys are in the order of the bits
-  const Cov2d<float>& cov = projected.cov;
-  const bool valid = within(projected.mean.x, 1e9) && within(projected.mean.y, 1e9) && cov.det >= 0 &&
-                     cov.det < float(kMaxDet) && cov.xx >= 0 && cov.yy >= 0 && within(cov.xx, 1e18) &&
-                     within(cov.yy, 1e18) && !(projected.opacity > float(kMaxOpacity)) && projected.depth >= 0 &&
-                     within(projected.depth, 1e18);
+  if (i >= params.n) return;
+  ProjectedGaussian<float> projected;
   SplatRow<float> splat = {};
-  if (valid && shape_splat(projected, params.footprint, params.grid, splat) == 0) splat.level = 0;
-  if (rows.colors) splat.color = rows.colors[i];
-  if (!(within(splat.color.x, kMaxColor) && within(splat.color.y, kMaxColor) && within(splat.color.z, kMaxColor)))
+  if (read_row(params.rows, i, projected) && shape_splat(projected, params.footprint, params.grid, splat) == 0)
     splat.level = 0;
+  if (params.rows.colors) splat.color = params.rows.colors[i];
+  const Vec3<float>& color = splat.color;
+  if (!(within(color.x, kMaxColor) && within(color.y, kMaxColor) && within(color.z, kMaxColor))) splat.level = 0;
   const int count = splat.level > 0 ? count_tiles(splat, params.footprint.index, params.grid) : 0;
   reinterpret_cast<SplatRow<float>*>(params.splats)[i] = splat;
-  params.keys[i] = count > 0 ? __float_as_uint(projected.depth) : kCulledKey;
+  // Keys are in the order of their bits, where -0 would come last.
+  params.keys[i] = count > 0 ? __float_as_uint(projected.depth + 0.0f) : kCulledKey;
   params.ranges[i] = {0, count};
 }
 

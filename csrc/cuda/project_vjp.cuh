@@ -20,6 +20,7 @@ struct SplatSums {
   __device__ PairGrad<float> grad() const {
     return {{{value[0], value[1]}, {value[2], value[3], value[4]}}, value[5]};
   }
+  __device__ Vec2<float> absolute() const { return {value[kPairAbsolute], value[kPairAbsolute + 1]}; }
   __device__ Vec3<float> color() const {
     return {value[kPairChannels], value[kPairChannels + 1], value[kPairChannels + 2]};
   }
@@ -98,7 +99,7 @@ struct FromPairs {
       shown.color = sums.color();
     }
     use([&](const Cov2d<float>& cov, float) { return projected_grad(params.footprint, cov, sums.grad()); }, shown,
-        Vec2<float>{sums.value[kPairAbsolute], sums.value[kPairAbsolute + 1]});
+        sums.absolute());
   }
 };
 
@@ -174,14 +175,15 @@ __global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : 5)
 
 __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGradsParams params) {
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
-  const PairRange range = i < params.rows.n ? params.sums.ranges[i] : PairRange{0, 0};
+  const PairRange range = i < params.n ? params.sums.ranges[i] : PairRange{0, 0};
   const SplatSums sums = sum_pairs(params.sums, i, range);
-  if (i >= params.rows.n) return;
+  if (i >= params.n) return;
   Vec2<float> dL_dmean = {0, 0};
   Sym2<float> dL_dcov = {0, 0, 0};
   float dL_dopacity = 0;
   if (range.count > 0) {
-    const Cov2d<float> cov = cov_of(params.rows, i);
+    const Sym2<float> c = params.rows.cov2d[i];
+    const Cov2d<float> cov = {c.xx, c.xy, c.yy, params.rows.dets[i]};
     const ProjectedGrad<float> grad = projected_grad(params.footprint, cov, sums.grad());
     dL_dmean = grad.splat.dL_dmean;
     dL_dcov = cov_grad(cov, grad.splat);
@@ -190,7 +192,7 @@ __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGra
   params.dL_dmeans2d[i] = dL_dmean;
   params.dL_dcov2d[i] = {dL_dcov.xx, 2 * dL_dcov.xy, dL_dcov.yy};
   params.dL_dopacities[i] = dL_dopacity;
-  if (params.dL_dcolors) params.dL_dcolors[i] = sums.color();
+  if (params.absolute) params.absolute[i] = sums.absolute();
 }
 
 /// Channels that lie in the rows of pairs: a thread per splat.

@@ -104,19 +104,9 @@ struct ProjectRowsParams {
   int32_t* radii;             ///< [n]
 };
 
-/// Rows of ProjectedRows, read only.
-struct RowsView {
-  int64_t n;
-  const Vec2<float>* means2d;
-  const Sym2<float>* cov2d;
-  const float* dets;  ///< or null: worked out from cov2d
-  const float* opacities;
-  const float* depths;
-  const Vec3<float>* colors;  ///< or null
-};
-
 struct ShapeRowsParams {
-  RowsView rows;
+  int64_t n;
+  ProjectedRows<float> rows;  ///< read only; colors may be null: black
   FootprintChoice footprint;
   TileGrid grid;
   float* splats;      ///< [n] SplatRow
@@ -269,13 +259,14 @@ struct ProjectRowsVjpParams {
 };
 
 struct RowGradsParams {
-  RowsView rows;
+  int64_t n;
+  ProjectedRows<float> rows;  ///< of which cov2d, dets and opacities are read
   FootprintChoice footprint;
   PairSumsView sums;
   Vec2<float>* dL_dmeans2d;
   Sym2<float>* dL_dcov2d;  ///< xy: with respect to the one number that fills both places
   float* dL_dopacities;
-  Vec3<float>* dL_dcolors;  ///< or null
+  Vec2<float>* absolute;  ///< sums of |dL/dmeans2d| over pixels, or null
 };
 
 AR_HD constexpr int64_t warps_of(int64_t n) { return (n + 31) / 32; }
