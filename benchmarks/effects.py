@@ -101,11 +101,15 @@ class Setup:
 
     def depths(self) -> torch.Tensor:
         """z of the Gaussians whose centres are in the picture, world units; 1 where there are none."""
-        z = effects.depths(self.scene.means, self.settings.viewmatrix)
-        clip = self.settings.projmatrix
+        z, clip = self.all_depths(), self.settings.projmatrix
         projected = self.scene.means @ clip[:3] + clip[3]
         seen = z[(z > effects.NEAR) & (projected[:, :2].abs() <= projected[:, 3:]).all(1)]
         return seen if len(seen) else z.new_ones(1)
+
+    def all_depths(self) -> torch.Tensor:
+        """z of all Gaussians, world units."""
+        view = self.settings.viewmatrix
+        return self.scene.means @ view[:3, 2] + view[3, 2]
 
     def channels(self, count: int) -> PlainCase:
         """Random colours in place of the harmonics."""
@@ -137,7 +141,7 @@ class Setup:
         return self.plain().change(settings={name: getattr(camera, name) for name in names})
 
     def near_far(self) -> PlainCase:
-        return self.with_effects(far=2 * effects.depths(self.scene.means, self.settings.viewmatrix).abs().max().item())
+        return self.with_effects(far=2 * self.all_depths().abs().max().item())
 
     def filter_3d(self) -> PlainCase:
         cameras = [view.settings(device=self.device) for view in self.views]
@@ -184,7 +188,7 @@ class PlainCase(Case):
         color, _, *outputs = self.rasterizer(**gaussians)
         found = [color]
         for value in outputs[0] if outputs else ():
-            found += value if isinstance(value, effects.GaussianStats) else [value]
+            found += value if isinstance(value, ar.GaussianStats) else [value]
         return [image for image in found if image is not None]
 
     @torch.no_grad()

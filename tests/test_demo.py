@@ -8,9 +8,8 @@ import pytest
 import torch
 
 import demo
-from analytic_rasterizer import cli
+from analytic_rasterizer import cli, render_stages
 from analytic_rasterizer.analysis import reference
-from analytic_rasterizer.rasterizer import render_stages
 
 pytest.importorskip("gsply", reason="needs the cli extra")
 image = pytest.importorskip("PIL.Image", reason="needs the cli extra")

@@ -10,8 +10,7 @@ import pytest
 import torch
 from conftest import SHARED
 
-from analytic_rasterizer import io
-from analytic_rasterizer.rasterizer import render_stages
+from analytic_rasterizer import io, render_stages
 
 image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
 pytest.importorskip("tqdm", reason="needs the cli extra")

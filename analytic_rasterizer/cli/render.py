@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from .. import io
+from .. import io, render_stages
 from ..analysis import tables
 from ..footprints import FOOTPRINTS
-from ..rasterizer import render_stages
 from .arguments import add_machine_options, add_scale, add_scene, add_view_options, use_machine, writable_folder
 
 STAGES = ("project", "bin", "blend")
