@@ -165,7 +165,6 @@ TYPICAL = 4 * 2.0**-24
 GRADIENT, GRADIENT_OF_FLIP = 8e-6, 1e-4
 
 
-@pytest.mark.xdist_group("levels")
 @pytest.mark.parametrize("variant", RENDERED, ids=name_of)
 def test_instruction_sets(levels, variant):
     """Measured: baseline against the others 5e-7 in the image where nothing flips, 4e-8 RMS, 1.4e-6 of the gradients;
@@ -190,7 +189,6 @@ def test_instruction_sets(levels, variant):
         assert gradients < GRADIENT
 
 
-@pytest.mark.xdist_group("levels")
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_another_process_gives_the_same_bits(levels, dtype):
     for variant in RENDERED:
@@ -198,7 +196,6 @@ def test_another_process_gives_the_same_bits(levels, dtype):
         assert_identical(of_levels(variant, dtype), expected)
 
 
-@pytest.mark.xdist_group("levels")
 def test_an_unknown_level_is_the_best(levels):
     """A variable left over from another machine must not break a program."""
     code = "import analytic_rasterizer as ar; print(ar.instruction_set(), end='')"

@@ -14,9 +14,6 @@ from analytic_rasterizer import io
 gsply = pytest.importorskip("gsply", reason="needs the cli extra")
 image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
 
-# gsply compiles itself when it is first called.
-pytestmark = pytest.mark.xdist_group("gsply")
-
 
 # ------------------------------------------------------------------------------------- scenes
 

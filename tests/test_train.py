@@ -20,8 +20,6 @@ import dataset  # noqa: E402
 import gaussians as g  # noqa: E402
 import train  # noqa: E402
 
-pytestmark = pytest.mark.xdist_group("train")  # for the scenes of its fixtures
-
 # ---------------------------------------------------------------------------------------- data
 
 
