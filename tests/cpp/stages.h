@@ -41,13 +41,19 @@ template <typename T> struct Rendered {
 template <typename T> struct GradArrays {
   std::vector<T> all;
   GaussianGrads<T> views = {};
-  explicit GradArrays(int64_t n, int64_t cov3ds = 0, int64_t shs = 0) : all(18 * n + 6 * cov3ds + 3 * shs, T(-7)) {
+  /// -7 where something is to be written.
+  explicit GradArrays(const Gaussians<T>& g)
+      : GradArrays(g.n, g.cov3ds ? g.n : 0, g.shs ? g.n * g.sh_stride : 0, g.colors != nullptr) {}
+
+ private:
+  GradArrays(int64_t n, int64_t cov3ds, int64_t shs, bool colors) : all(18 * n + 6 * cov3ds + 3 * shs, T(-7)) {
     T* p = all.data();
     views.means = reinterpret_cast<Vec3<T>*>(p);
     views.scales = reinterpret_cast<Vec3<T>*>(p + 3 * n);
     views.rotations = reinterpret_cast<Vec4<T>*>(p + 6 * n);
     views.opacities = p + 10 * n;
-    views.colors = reinterpret_cast<Vec3<T>*>(p + 11 * n);
+    if (colors) views.colors = reinterpret_cast<Vec3<T>*>(p + 11 * n);
+    if (!colors) std::fill_n(p + 11 * n, 3 * n, T(0));
     views.means2d = p + 14 * n;
     views.means2d_stride = 4;
     if (cov3ds) views.cov3ds = reinterpret_cast<Sym3<T>*>(p + 18 * n);
@@ -253,7 +259,7 @@ template <typename T> Rendered<T> run_stages(const cpu::Stages<T>& stages, const
   const Sums<T> sums = blend_vjp(stages, lists, grid, channels, own, g.n, image, pass.background, pass.dL_dimage,
                                  pass.dL_dalpha, pass.absolute, pass.threads);
 
-  GradArrays<T> grads(g.n, g.cov3ds ? g.n : 0, g.shs ? g.n * g.sh_stride : 0);
+  GradArrays<T> grads(g);
   std::vector<CameraGrad<T>> camera_grads(pass.camera.lens ? cpu::chunks_of(g.n) : 0, CameraGrad<T>{});
   cpu::ProjectVjpParams<T> vjp = {};
   vjp.camera = pass.camera;
