@@ -1,6 +1,7 @@
 // Extents of support ellipses and the tiles they touch, against searches over pixels and rectangles.
 #include <algorithm>
 
+#include "core/bin.h"
 #include "support.h"
 
 namespace ar::test {
@@ -139,51 +140,47 @@ TEST(Bin, RangesSurviveAnySpan) {
   EXPECT_TRUE(all.first == 0 && all.last == 99 && one.first == 3 && one.last == 3);
 }
 
-template <class F> class BinTest : public ::testing::Test {};
-TYPED_TEST_SUITE(BinTest, AllFootprints, FootprintName);
+class BinTest : public ::testing::TestWithParam<Footprint> {};
+AR_ALL_FOOTPRINTS(BinTest);
 
 /// Discs and needles of up to 1000 px, as kLevelSlack says.
-template <class F> Splat<F, float> random_splat(Random& random, TileGrid grid) {
+SplatRow<float> random_splat(const Footprint& f, Random& random, TileGrid grid) {
   const double s2 = random.log_uniform(1e-3, 20), ratio = random.log_uniform(1, random.below(2) ? 10 : 1e6);
   const Cov2d<double> cov = covariance(std::min(1000.0, s2 * ratio), s2, random.uniform(0, kPi));
-  Splat<F, float> splat = {};
+  SplatRow<float> splat = f.row(rounded<float>(cov));
   splat.mean = {float(random.uniform(-20, grid.width + 20)), float(random.uniform(-20, grid.height + 20))};
-  splat.shape = F::prepare(rounded<float>(cov), options_of<F>());
   return splat;
 }
 
 /// Whether bin and then blend's own test of a row let a splat reach a pixel.
-template <class F> bool reaches(const Splat<F, float>& splat, TileGrid grid, int x, int y) {
-  const Support<float> support = support_of(splat);
+bool reaches(const Footprint& f, const SplatRow<float>& splat, TileGrid grid, int x, int y) {
+  const Support<float> support = support_of(splat, f.index);
   bool touched = false;
   if (splat.level > 0) {
     const int64_t wanted = int64_t(y / kTile) * grid.columns() + x / kTile;
     for_each_tile(support, grid, [&](int64_t tile) { touched |= tile == wanted; });
   }
-  const Span<float> span = F::kReach == 0 ? chord_of(support, float(y)) : columns_of(support, float(y), float(y));
+  const Span<float> span = f.reach == 0 ? chord_of(support, float(y)) : columns_of(support, float(y), float(y));
   return touched && float(x) >= span.lo && float(x) <= span.hi;
 }
 
 // In float, rounding included.
-TYPED_TEST(BinTest, NoVisiblePixelIsLost) {
-  using F = TypeParam;
+TEST_P(BinTest, NoVisiblePixelIsLost) {
+  const Footprint& f = GetParam();
   const TileGrid grid = {70, 50};
   Random random(3);
   int visible = 0;
   for (int trial = 0; trial < 200; ++trial) {
-    Splat<F, float> splat = random_splat<F>(random, grid);
+    SplatRow<float> splat = random_splat(f, random, grid);
     splat.opacity = float(random.uniform(0.01, 1));
-    splat.level = F::level(splat.shape, splat.opacity);
-    const auto terms = F::terms(splat.shape, splat.opacity);
+    splat.level = f.in_float.level(splat);
     for (int y = 0; y < grid.height; ++y) {
       for (int x = 0; x < grid.width; ++x) {
-        float alpha = 0;
-        for (int s = 0; s < F::kSamples; ++s) {
-          alpha = std::max(alpha, F::alpha(terms, Vec2<float>{x - splat.mean.x, y - splat.mean.y}, s));
-        }
-        if (alpha < float(kAlphaMin)) continue;
+        float alphas[16];
+        f.in_float.alphas(splat, {x - splat.mean.x, y - splat.mean.y}, alphas);
+        if (*std::max_element(alphas, alphas + f.samples) < float(kAlphaMin)) continue;
         ++visible;
-        ASSERT_TRUE(reaches(splat, grid, x, y)) << "trial " << trial << " opacity " << splat.opacity;
+        ASSERT_TRUE(reaches(f, splat, grid, x, y)) << "trial " << trial << " opacity " << splat.opacity;
       }
     }
   }
@@ -192,26 +189,28 @@ TYPED_TEST(BinTest, NoVisiblePixelIsLost) {
 
 // The opacity is such that one sample of one pixel just reaches 1/255: without kLevelSlack a rounding
 // of the level or of the distance could lose it.
-TYPED_TEST(BinTest, NoPixelAtTheThresholdIsLost) {
-  using F = TypeParam;
+TEST_P(BinTest, NoPixelAtTheThresholdIsLost) {
+  const Footprint& f = GetParam();
   const TileGrid grid = {2000, 1500};
   Random random(4);
   int checked = 0;
   for (int trial = 0; trial < 20000; ++trial) {
-    Splat<F, float> splat = random_splat<F>(random, grid);
+    SplatRow<float> splat = random_splat(f, random, grid);
     const Vec2<float> z = {float(random.uniform(-2.3, 2.3)), float(random.uniform(-2.3, 2.3))};
-    const Vec2<float> d = unwhiten(F::ellipse(splat.shape), z);
-    const int x = int(std::lround(splat.mean.x + d.x)), y = int(std::lround(splat.mean.y + d.y)),
-              s = trial % F::kSamples;
+    const Vec2<float> d = unwhiten(f.in_float.ellipse(splat), z);
+    const int x = int(std::lround(splat.mean.x + d.x)), y = int(std::lround(splat.mean.y + d.y)), s = trial % f.samples;
     const auto alpha = [&](float opacity) {
-      return F::alpha(F::terms(splat.shape, opacity), Vec2<float>{x - splat.mean.x, y - splat.mean.y}, s);
+      float alphas[16];
+      splat.opacity = opacity;
+      f.in_float.alphas(splat, {x - splat.mean.x, y - splat.mean.y}, alphas);
+      return alphas[s];
     };
     if (x < 0 || y < 0 || x >= grid.width || y >= grid.height || alpha(1) < float(kAlphaMin)) continue;
     splat.opacity = float(kAlphaMin) / alpha(1);
     while (alpha(splat.opacity) < float(kAlphaMin)) splat.opacity = std::nextafter(splat.opacity, 2.0f);
-    splat.level = F::level(splat.shape, splat.opacity);
+    splat.level = f.in_float.level(splat);
     ++checked;
-    ASSERT_TRUE(reaches(splat, grid, x, y)) << "trial " << trial << " opacity " << splat.opacity;
+    ASSERT_TRUE(reaches(f, splat, grid, x, y)) << "trial " << trial << " opacity " << splat.opacity;
   }
   EXPECT_GT(checked, 1000);
 }

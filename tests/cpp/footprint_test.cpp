@@ -1,32 +1,30 @@
 // Every footprint against differences, integrals and its own stated bounds.
 #include <algorithm>
 
+#include "core/footprint/registry.h"
 #include "support.h"
 
 namespace ar::test {
 namespace {
 
-template <class F> class FootprintTest : public ::testing::Test {};
-TYPED_TEST_SUITE(FootprintTest, AllFootprints, FootprintName);
+class FootprintTest : public ::testing::TestWithParam<Footprint> {};
+AR_ALL_FOOTPRINTS(FootprintTest);
 
 template <typename T> struct Adjoint {
   SplatGrad<T> splat;
   T weighted;
 };
 
-template <class F, typename T> Adjoint<T> weight_vjp(Cov2d<T> cov, Vec2<T> d, T opacity, const T* g) {
-  const auto shape = F::prepare(cov, options_of<F>());
-  const auto terms = F::terms(shape, opacity);
-  ShapeGrad<T> sums = {};
-  T weighted = 0;
-  for (int s = 0; s < F::kSamples; ++s) {
-    const T alpha = F::alpha(terms, d, s);
-    F::add_alpha_vjp(terms, d, s, alpha, g[s], sums);
-    weighted += g[s] * alpha;
-  }
-  const SplatGrad<T> grad = F::prepare_vjp(cov, shape, F::collect(terms, sums, weighted), weighted, options_of<F>());
+template <typename T> Adjoint<T> weight_vjp(const Footprint& f, Cov2d<T> cov, Vec2<T> d, T opacity, const T* g) {
+  const Model<T>& model = f.model<T>();
+  const SplatRow<T> row = f.row(cov, opacity);
+  T alphas[16], weighted = 0;
+  model.alphas(row, d, alphas);
+  for (int s = 0; s < f.samples; ++s) weighted += g[s] * alphas[s];
+  const ShapeGrad<T> sums = model.sums(row, d, g);
+  const SplatGrad<T> grad = model.prepare_vjp(cov, row, model.collect(row, sums, weighted), weighted, f.options);
   // mean_map says the same; the two columns of a needle's map cancel, hence the norms.
-  const Mat2<T> m = F::mean_map(shape);
+  const Mat2<T> m = model.mean_map(row);
   const Vec2<T> by_mean = transform_transposed(m, sums.offset);
   const T size = std::hypot(std::hypot(m.xx, m.xy), std::hypot(m.yx, m.yy)) * std::hypot(sums.offset.x, sums.offset.y);
   EXPECT_NEAR(by_mean.x, grad.dL_dmean.x, 8 * kEps<T> * size + std::numeric_limits<T>::min());
@@ -34,16 +32,10 @@ template <class F, typename T> Adjoint<T> weight_vjp(Cov2d<T> cov, Vec2<T> d, T 
   return {grad, weighted};
 }
 
-// Padding would hold whatever was in memory, and torch would see it.
-TYPED_TEST(FootprintTest, SplatsHaveNoPadding) {
-  EXPECT_EQ(sizeof(Splat<TypeParam, float>), kSplatWidth * sizeof(float));
-  EXPECT_EQ(sizeof(typename TypeParam::template Shape<float>), (kSplatWidth - 7) * sizeof(float));
-}
-
 // In the eigenframe of Sigma, in units of l1, s1 s2 and l2, where every derivative is of the order
 // of the weight. The differences are good to 1e-10 of it.
-TYPED_TEST(FootprintTest, GradientsMatchDifferences) {
-  using F = TypeParam;
+TEST_P(FootprintTest, GradientsMatchDifferences) {
+  const Footprint& f = GetParam();
   Random random(1);
   for (int trial = 0; trial < 500; ++trial) {
     const double s2 = random.log_uniform(0.05, 10), s1 = s2 * random.log_uniform(1.05, 30), l1 = s1 * s1, l2 = s2 * s2;
@@ -51,16 +43,16 @@ TYPED_TEST(FootprintTest, GradientsMatchDifferences) {
     const Mat2<double> axes = {std::cos(angle), -std::sin(angle), std::sin(angle), std::cos(angle)};  // in columns
     const Cov2d<double> cov = covariance(s1, s2, angle);
     // Within 3 standard deviations, where the kinks of cumulant's tail (q' > 23.6) are far.
-    const Mat2<double> w = F::ellipse(F::prepare(cov, options_of<F>()));
+    const Mat2<double> w = f.in_double.ellipse(f.row(cov));
     const Vec2<double> d = unwhiten(w, on_circle(random.uniform(0, 3), random.uniform(0, 2 * kPi)));
     double g[16];
     for (double& x : g) x = random.uniform(0.5, 1);
 
     const auto moved = [&](double u, double v) {
-      return weight<F>(cov, d + transform(axes, Vec2<double>{u, v}), opacity, g);
+      return weight(f, cov, d + transform(axes, Vec2<double>{u, v}), opacity, g);
     };
     const auto changed = [&](double l11, double l12, double l22) {
-      return weight<F>(turned(l1 + l11, l12, l2 + l22, angle), d, opacity, g);
+      return weight(f, turned(l1 + l11, l12, l2 + l22, angle), d, opacity, g);
     };
     // Frozen: the window keeps still, so that d/dSigma12 is d2/du dv as for any convolution.
     const auto mixed = [&](double u) { return derivative([&](double v) { return moved(u, v); }, 2 * h); };
@@ -69,11 +61,11 @@ TYPED_TEST(FootprintTest, GradientsMatchDifferences) {
         s2 * derivative([&](double t) { return -moved(t, 0); }, h),
         s2 * derivative([&](double t) { return -moved(0, t); }, h),
         l1 * derivative([&](double t) { return changed(t, 0, 0); }, h * s1),
-        s1 * s2 * (kIsFrozen<F> ? derivative(mixed, 2e-3 * s1) : derivative(across, h * std::min(s1, (l1 - l2) / s1))),
+        s1 * s2 * (f.is_frozen() ? derivative(mixed, 2e-3 * s1) : derivative(across, h * std::min(s1, (l1 - l2) / s1))),
         l2 * derivative([&](double t) { return changed(0, 0, t); }, h * s2)};
 
-    const double value = weight<F>(cov, d, opacity, g);
-    const Adjoint<double> adjoint = weight_vjp<F>(cov, d, opacity, g);
+    const double value = weight(f, cov, d, opacity, g);
+    const Adjoint<double> adjoint = weight_vjp(f, cov, d, opacity, g);
     const Vec2<double> by_mean = transform_transposed(axes, adjoint.splat.dL_dmean);
     const Sym2<double> by_cov = congruence_transposed(axes, cov_grad(cov, adjoint.splat));
     const double actual[5] = {s2 * by_mean.x, s2 * by_mean.y, l1 * by_cov.xx, s1 * s2 * 2 * by_cov.xy, l2 * by_cov.yy};
@@ -88,8 +80,8 @@ TYPED_TEST(FootprintTest, GradientsMatchDifferences) {
 // The trapezoidal rule with step h errs by exp(-2 pi^2 (sigma/h)^2) for a Gaussian and, for the
 // logistic, whose poles lie 2.7 sigma off the real axis, by exp(-2 pi 2.7 sigma/h): both below 1e-7
 // at h <= sigma. From sigma = 1 on, h = 1: the sum over the pixels themselves.
-TYPED_TEST(FootprintTest, MassIsConserved) {
-  using F = TypeParam;
+TEST_P(FootprintTest, MassIsConserved) {
+  const Footprint& f = GetParam();
   const double sigmas[][2] = {{0.05, 0.05}, {0.2, 0.06}, {0.5, 0.3}, {1, 1}, {3, 1}, {8, 2}};
   for (const auto& [s1, s2] : sigmas) {
     for (const double angle : {0.0, 0.4, kPi / 4, kPi / 2, 2.2}) {
@@ -98,16 +90,16 @@ TYPED_TEST(FootprintTest, MassIsConserved) {
       const int n = int((1.5 + 8 * std::hypot(s1, 0.3)) / step);
       double total = 0;
       for (int y = -n; y <= n; ++y) {
-        for (int x = -n; x <= n; ++x) total += step * step * weight<F>(cov, {x * step, y * step}, 1.0);
+        for (int x = -n; x <= n; ++x) total += step * step * weight(f, cov, {x * step, y * step}, 1.0);
       }
       // Without compensation the dilated Gaussian keeps its peak instead.
-      const Cov2d<double> mass = std::is_same_v<F, Point> ? blur(cov, options_of<F>().variance) : cov;
+      const Cov2d<double> mass = f.is("point") ? blur(cov, f.options.number) : cov;
       const double expected = 2 * kPi * std::sqrt(mass.det);
       // `cumulant` truncates a series: 1/(240000 l^4) of the amplitude (docs/numerics.md) in each of some
       // 2 pi 9 s1' s2' pixels, against a mass of 2 pi s1 s2; 6.6% in the limit sigma = 0 (measured).
       const double l = s2 * s2 + kPixelVariance;
       const double truncation =
-          kIsCumulant<F> ? std::min(0.066, 9 * (s1 * s1 + kPixelVariance) / (s1 * s2) / (240000 * l * l * l * l)) : 0;
+          f.is("cumulant") ? std::min(0.066, 9 * (s1 * s1 + kPixelVariance) / (s1 * s2) / (240000 * l * l * l * l)) : 0;
       EXPECT_NEAR(total / expected, 1, 1e-6 + truncation) << s1 << " " << s2 << " " << angle;
     }
   }
@@ -115,16 +107,16 @@ TYPED_TEST(FootprintTest, MassIsConserved) {
 
 // Widening by a variance v changes the weight by at most v/2 max|Laplacian| = v / l2; dilation,
 // which keeps the peak, by less. The logistic's density is 1.6^2 2 pi / 16 - 1 = 5.3e-3 too high.
-TYPED_TEST(FootprintTest, WideSplatsAreTheGaussianItself) {
-  using F = TypeParam;
+TEST_P(FootprintTest, WideSplatsAreTheGaussianItself) {
+  const Footprint& f = GetParam();
   Random random(2);
   for (int trial = 0; trial < 2000; ++trial) {
     const double s2 = random.log_uniform(20, 1000), s1 = s2 * random.log_uniform(1, 100), u = random.uniform(0, 4),
                  turn = random.uniform(0, 2 * kPi);
     const Cov2d<double> cov = covariance(s1, s2, random.uniform(0, kPi));
     const Vec2<double> d = unwhiten(whiten(cov), on_circle(u, turn));
-    const double v = std::max(options_of<F>().variance, kPixelVariance);
-    ASSERT_NEAR(weight<F>(cov, d, 1.0), std::exp(-u * u / 2), v / (s2 * s2) + (kIsAnalytic<F> ? 5.4e-3 : 0));
+    const double v = std::max(f.options.number, kPixelVariance);
+    ASSERT_NEAR(weight(f, cov, d, 1.0), std::exp(-u * u / 2), v / (s2 * s2) + (f.is_analytic() ? 5.4e-3 : 0));
   }
 }
 
@@ -156,27 +148,52 @@ TEST(BoxNodes, HaveTheMomentsOfThePixel) {
 }
 
 // Random search outside the ellipse.
-TYPED_TEST(FootprintTest, SupportIsConservative) {
-  using F = TypeParam;
+TEST_P(FootprintTest, SupportIsConservative) {
+  const Footprint& f = GetParam();
   Random random(3);
   for (int trial = 0; trial < 30000; ++trial) {
     const double s2 = random.log_uniform(0.01, 100), s1 = std::min(100.0, s2 * random.log_uniform(1, 1000));
     const double opacity = random.log_uniform(0.004, 1);
-    const auto shape = F::prepare(covariance(s1, s2, random.uniform(0, kPi)), options_of<F>());
-    const double level = F::level(shape, opacity);
-    ASSERT_LE(F::level(shape, 1.0) + kLevelSlack, kMaxLevel) << s1 << " " << s2;
-    const auto terms = F::terms(shape, opacity);
+    const SplatRow<double> row = f.row(covariance(s1, s2, random.uniform(0, kPi)), opacity);
+    const double level = f.in_double.level(row);
     for (int k = 0; k < 12; ++k) {
       const double beyond =
           std::max(level, 0.0) * (1 + random.log_uniform(1e-9, 2)) + (level > 0 ? 0 : random.uniform(0, 1));
-      const Vec2<double> z = unwhiten(F::ellipse(shape), on_circle(std::sqrt(beyond), random.uniform(0, 2 * kPi)));
-      for (int s = 0; s < F::kSamples; ++s) {
-        Vec2<double> node = {0, 0};
-        if constexpr (F::kSamples > 1) node = box_node<F::kSamples>(s);
-        ASSERT_LT(F::alpha(terms, Vec2<double>{z.x - node.x, z.y - node.y}, s), kAlphaMin)
-            << "sigma " << s1 << " " << s2 << " opacity " << opacity << " level " << level << " |w d|^2 " << beyond;
+      const Vec2<double> z =
+          unwhiten(f.in_double.ellipse(row), on_circle(std::sqrt(beyond), random.uniform(0, 2 * kPi)));
+      for (int s = 0; s < f.samples; ++s) {
+        const Vec2<double> node = f.node(s);
+        double alphas[16];
+        f.in_double.alphas(row, {z.x - node.x, z.y - node.y}, alphas);
+        ASSERT_LT(alphas[s], kAlphaMin) << "sigma " << s1 << " " << s2 << " opacity " << opacity << " level " << level
+                                        << " |w d|^2 " << beyond;
       }
     }
+  }
+}
+
+// What the contract says of support ellipses, and culling relies on: in no direction wider than that of Sigma +
+// support_variance, and of no higher level.
+TEST_P(FootprintTest, SupportStaysWithinItsBounds) {
+  const Footprint& f = GetParam();
+  Random random(6);
+  for (int trial = 0; trial < 30000; ++trial) {
+    const double s2 = random.log_uniform(1e-4, 100), s1 = std::min(100.0, s2 * random.log_uniform(1, 1e4));
+    const double opacity = random.log_uniform(0.004, 100);
+    const FootprintOptions options = {random.below(2) ? f.options.number : random.log_uniform(1e-3, 30)};
+    const Cov2d<double> cov = covariance(s1, s2, random.uniform(0, kPi)),
+                        bound = blur(cov, f.support_variance(options));
+    SplatRow<double> row = {};
+    f.in_double.prepare(cov, options, row);
+    row.opacity = opacity;
+    ASSERT_LE(f.in_double.level(row), 2 * std::log(opacity / kAlphaMin) + f.extra_level + 1e-9) << s1 << " " << s2;
+    // Half the extent of |w d|^2 <= 1 along u is the length of w^-T u.
+    const Mat2<double> w = f.in_double.ellipse(row);
+    const double det = w.xx * w.yy - w.xy * w.yx;
+    const Vec2<double> u = on_circle(1, random.uniform(0, 2 * kPi));
+    const double extent = std::hypot(w.yy * u.x - w.yx * u.y, w.xx * u.y - w.xy * u.x) / std::abs(det);
+    const double most = u.x * u.x * bound.xx + 2 * u.x * u.y * bound.xy + u.y * u.y * bound.yy;
+    ASSERT_LE(extent * extent, most * (1 + 1e-6)) << s1 << " " << s2 << " " << options.number;
   }
 }
 
@@ -284,6 +301,8 @@ TEST(NormalMomentsTest, MatchTheClosedForm) {
   }
 }
 
+const Footprint& exact() { return footprint_named("exact"); }
+
 // box_excess() along one axis, and that it is not wildly loose: the ratio comes within a third.
 TEST(BoxExcess, HoldsAlongOneAxis) {
   for (double sigma = 1e-3; sigma < 100; sigma *= 1.01) {
@@ -313,7 +332,7 @@ TEST(BoxExcess, HoldsForThePixel) {
       const double radius = random.uniform(0, 4);
       const Vec2<double> d = unwhiten(w, on_circle(radius, random.uniform(0, 2 * kPi)));
       const double bound = std::sqrt(cov.det / wide.det) * std::exp((excess - radius * radius) / 2);
-      ASSERT_LE(weight<Exact>(cov, d, 1.0), bound * (1 + 1e-9)) << s1 << " " << s2 << " d " << d.x << " " << d.y;
+      ASSERT_LE(weight(exact(), cov, d, 1.0), bound * (1 + 1e-9)) << s1 << " " << s2 << " d " << d.x << " " << d.y;
     }
   }
 }
@@ -332,7 +351,7 @@ TEST(ExactBranches, AgreeWhereTheyMeet) {
     for (int side = 0; side < 2; ++side) {
       const double s = s2 * (side ? 1 + 1e-13 : 1 - 1e-13);
       const Cov2d<double> cov = covariance(ratio * s, s, angle);
-      value[side] = weight<Exact>(cov, unwhiten(whiten(blur(cov, kPixelVariance)), at), 1.0);
+      value[side] = weight(exact(), cov, unwhiten(whiten(blur(cov, kPixelVariance)), at), 1.0);
     }
     // 2e-13 of sigma, and of d with it, times a slope of at most 3 ratio per deviation.
     ASSERT_NEAR(value[0], value[1], 1e-12 * (1 + ratio)) << ratio << " " << angle;
@@ -345,8 +364,8 @@ template <typename T> bool all_finite(const SplatGrad<T>& g) {
 }
 
 // Discs, needles along the axes and across them, invisible and immense ones, near and far.
-TYPED_TEST(FootprintTest, HardInputsStayFiniteInFloat) {
-  using F = TypeParam;
+TEST_P(FootprintTest, HardInputsStayFiniteInFloat) {
+  const Footprint& f = GetParam();
   float g[16];
   std::fill(g, g + 16, 1.0f);
   for (double s1 = 1e-6; s1 < 2e6; s1 *= 10) {
@@ -356,11 +375,11 @@ TYPED_TEST(FootprintTest, HardInputsStayFiniteInFloat) {
         for (const double distance : {0.0, 0.5, s2, s1, 30.0, 1e3, 1e5}) {
           for (const double direction : {angle, angle + kPi / 2, 0.0, 1.0}) {
             const Vec2<double> d = on_circle(distance, direction);
-            const Adjoint<float> a = weight_vjp<F>(cov, {float(d.x), float(d.y)}, 1.0f, g);
+            const Adjoint<float> a = weight_vjp(f, cov, {float(d.x), float(d.y)}, 1.0f, g);
             ASSERT_TRUE(std::isfinite(a.weighted) && all_finite(a.splat))
                 << "sigma " << s1 << " " << s2 << " turned " << angle << " d " << d.x << " " << d.y;
             ASSERT_GE(a.weighted, 0);
-            ASSERT_LE(a.weighted, 1.01f * F::kSamples);
+            ASSERT_LE(a.weighted, 1.01f * f.samples);
           }
         }
       }
@@ -372,32 +391,34 @@ TYPED_TEST(FootprintTest, HardInputsStayFiniteInFloat) {
 // few eps times |dI/dd| (|d| + half a pixel) + I. Twelve is the longest chain (eigenframe, window). Those
 // that sum up a logarithm to base 2 round each partial sum, which lies between the peak's and the
 // weight's, by half an eps of it: six sums at most (the peak, two squares, cumulant's constants and axes).
-TYPED_TEST(FootprintTest, FloatAgreesWithDouble) {
-  using F = TypeParam;
+TEST_P(FootprintTest, FloatAgreesWithDouble) {
+  const Footprint& f = GetParam();
   Random random(5);
   for (int trial = 0; trial < 20000; ++trial) {
     const double s2 = random.log_uniform(1e-2, 100), s1 = std::min(1000.0, s2 * random.log_uniform(1, 1e4));
     const Cov2d<float> cov = rounded<float>(covariance(s1, s2, random.uniform(0, kPi)));
     const Cov2d<double> same = {cov.xx, cov.xy, cov.yy, cov.det};
-    const Mat2<double> w = F::ellipse(F::prepare(same, options_of<F>()));
+    const Mat2<double> w = f.in_double.ellipse(f.row(same));
     const Vec2<double> at = unwhiten(w, on_circle(random.uniform(0, 4), random.uniform(0, 2 * kPi)));
     const Vec2<float> d = {float(at.x), float(at.y)};
     const Vec2<double> dd = {d.x, d.y};
     // `exact` cuts the Gaussian off at 7 deviations, exp(-24.5) = 2.3e-11 of its peak.
-    const double floor = std::is_same_v<F, Exact> ? 5e-11 : 1e-37;
-    for (int s = 0; s < F::kSamples; ++s) {
+    const double floor = f.is("exact") ? 5e-11 : 1e-37;
+    for (int s = 0; s < f.samples; ++s) {
       float pick[16] = {};
       double pick_too[16] = {};
       pick[s] = 1;
       pick_too[s] = 1;
-      const Adjoint<double> adjoint = weight_vjp<F>(same, dd, 1.0, pick_too);
+      const Adjoint<double> adjoint = weight_vjp(f, same, dd, 1.0, pick_too);
       const double condition =
           std::hypot(adjoint.splat.dL_dmean.x, adjoint.splat.dL_dmean.y) * (std::hypot(dd.x, dd.y) + 0.5) +
           adjoint.weighted;
-      const double peak = F::alpha(F::terms(F::prepare(same, options_of<F>()), 1.0), Vec2<double>{0, 0}, 0);
-      const bool in_exponent = !kIsAnalytic<F> && !kIsNormal<F>;
+      double peaks[16];
+      f.in_double.alphas(f.row(same), {0, 0}, peaks);
+      const double peak = peaks[0];
+      const bool in_exponent = !f.is_analytic() && !f.is_normal();
       const double exponent = in_exponent ? std::abs(std::log(peak)) + std::abs(std::log(adjoint.weighted)) : 0;
-      ASSERT_NEAR(weight<F>(cov, d, 1.0f, pick), adjoint.weighted,
+      ASSERT_NEAR(weight(f, cov, d, 1.0f, pick), adjoint.weighted,
                   kEps<float> * (12 * condition + 3 * exponent * adjoint.weighted) + floor)
           << s1 << " " << s2;
     }

@@ -17,7 +17,8 @@
 #include <type_traits>
 #include <vector>
 
-#include "core/sh.h"
+#include "core/footprint/registry.h"
+#include "core/project.h"
 #include "instruction_sets.h"
 #include "stages.h"
 #include "support.h"
@@ -91,9 +92,8 @@ template <typename T> struct AnyScene {
   bool full = false;
   Lens<T> lens = {};
   bool sane = true;  ///< the camera and the image's gradient are such as occur: gradients must be finite
-  std::string footprint;
   int level = 0, threads = 1;
-  FootprintOptions options = {};
+  FootprintChoice footprint = {};
   T background[3] = {};
   std::vector<Vec3<T>> means, scales, colors, shs;
   std::vector<Vec4<T>> rotations;
@@ -104,13 +104,23 @@ template <typename T> struct AnyScene {
 
   explicit AnyScene(const TestCamera<T>& c) : camera(c) {}
 
-  CameraView<T> look() const { return full ? camera.look(lens) : camera.look(); }
+  CameraView<T> camera_view() const { return full ? camera.camera_view(lens) : camera.camera_view(); }
 
   Gaussians<T> gaussians() const {
     const auto given = [](const auto& v) { return v.empty() ? nullptr : v.data(); };
-    return {int64_t(means.size()), means.data(), given(scales), given(rotations), given(cov3ds),
-            opacities.data(),      given(shs),   given(colors), sh_stride,        sh_degree,
-            scale_modifier};
+    Gaussians<T> g = {};
+    g.n = int64_t(means.size());
+    g.means = means.data();
+    g.scales = given(scales);
+    g.rotations = given(rotations);
+    g.cov3ds = given(cov3ds);
+    g.opacities = opacities.data();
+    g.shs = given(shs);
+    g.colors = given(colors);
+    g.sh_stride = sh_stride;
+    g.sh_degree = sh_degree;
+    g.scale_modifier = scale_modifier;
+    return g;
   }
 };
 
@@ -158,13 +168,11 @@ template <typename T> AnyScene<T> decode(Bytes& in) {
       }
     }
   }
-  std::vector<std::string> names;
-  for_each_footprint(Footprints{}, [&](auto f) { names.emplace_back(decltype(f)::kName); });
-  scene.footprint = names[in.below(int(names.size()))];
+  scene.footprint.index = in.below(int(footprints().size()));
   scene.level = in.below(8);
   scene.threads = in.one_in(8) ? 2 : 1;
   const double option = in.one_in(8) ? std::abs(double(in.any_finite<float>())) : in.between<double>(0, 1);
-  scene.options = {option, option};
+  scene.footprint.options = {option};
   for (T& x : scene.background) x = in.one_in(16) ? T(in.between<double>(-1e6, 1e6)) : in.between<T>(0, 1);
 
   const int n = in.below(13);
@@ -219,9 +227,9 @@ template <typename T> AnyScene<T> decode(Bytes& in) {
 template <typename T>
 [[noreturn]] void fail(const AnyScene<T>& scene, const char* what, int64_t gaussian, double value) {
   std::fprintf(stderr, "%s: %s, %zu bytes a number, level %d, %dx%d, Gaussian %lld of %zu, value %g\n", what,
-               scene.footprint.c_str(), sizeof(T), scene.level, scene.camera.width, scene.camera.height,
-               static_cast<long long>(gaussian), scene.means.size(), value);
-  std::fprintf(stderr, "option %g, scale modifier %g, background %g %g %g, tan %g %g\n", scene.options.variance,
+               footprints()[scene.footprint.index].name.c_str(), sizeof(T), scene.level, scene.camera.width,
+               scene.camera.height, static_cast<long long>(gaussian), scene.means.size(), value);
+  std::fprintf(stderr, "option %g, scale modifier %g, background %g %g %g, tan %g %g\n", scene.footprint.options.number,
                double(scene.scale_modifier), double(scene.background[0]), double(scene.background[1]),
                double(scene.background[2]), double(scene.camera.tan_x), double(scene.camera.tan_y));
   const auto print = [](const char* name, const auto* numbers, int n) {
@@ -248,14 +256,20 @@ template <typename T> const cpu::Stages<T>& stages_of(const AnyScene<T>& scene) 
   if constexpr (std::is_same_v<T, float>) {
     const std::vector<InstructionSet>& sets = instruction_sets();
     const InstructionSet& set = sets[scene.level % sets.size()];
-    if (set.supported) return *set.stages(scene.footprint);
+    if (set.supported) return set.stages(scene.footprint.index);
   }
-  return *cpu::find_stages<T>(scene.footprint);
+  return cpu::stages_of<T>(scene.footprint.index);
 }
 
 template <typename T> Rendered<T> render(const AnyScene<T>& scene) {
-  return run_stages(stages_of(scene), scene.look(), scene.gaussians(), scene.background, scene.dL_dimage.data(),
-                    scene.options, scene.threads);
+  Pass<T> pass;
+  pass.camera = scene.camera_view();
+  pass.gaussians = scene.gaussians();
+  pass.footprint = scene.footprint;
+  pass.background = scene.background;
+  pass.dL_dimage = scene.dL_dimage.data();
+  pass.threads = scene.threads;
+  return run_stages(stages_of(scene), pass);
 }
 
 /// Whether a number of Gaussian i that decides where it is drawn is not finite.

@@ -1,32 +1,38 @@
 #include "instruction_sets.h"
 
-#define AR_DECLARE(isa)                                                           \
-  namespace ar::isa {                                                             \
-  extern const test::PackOps kPackOps;                                            \
-  template <typename T> const cpu::Stages<T>* stages(std::string_view footprint); \
-  extern template const cpu::Stages<float>* stages<float>(std::string_view);      \
-  }
-AR_DECLARE(baseline)
+#include <cstring>
+
+namespace ar {
+
+namespace baseline {
+extern const test::PackOps kPackOps;
+}
 #if defined(__x86_64__)
-AR_DECLARE(avx2)
-AR_DECLARE(avx512)
+namespace avx2 {
+extern const test::PackOps kPackOps;
+}
+namespace avx512 {
+extern const test::PackOps kPackOps;
+}
 #endif
 
-namespace ar::test {
+namespace test {
 
 const std::vector<InstructionSet>& instruction_sets() {
-  static const std::vector<InstructionSet> sets = {
-      {"baseline", true, baseline::kPackOps, baseline::stages<float>},
+  static const std::vector<InstructionSet> sets = [] {
+    std::vector<InstructionSet> all;
+    for (const cpu::InstructionSet& set : cpu::instruction_sets()) {
+      const PackOps* ops = &baseline::kPackOps;
 #if defined(__x86_64__)
-      {"avx2", __builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma") && __builtin_cpu_supports("bmi2"),
-       avx2::kPackOps, avx2::stages<float>},
-      {"avx512",
-       __builtin_cpu_supports("avx512f") && __builtin_cpu_supports("avx512dq") && __builtin_cpu_supports("avx512vl") &&
-           __builtin_cpu_supports("avx512bw"),
-       avx512::kPackOps, avx512::stages<float>},
+      if (std::strcmp(set.name, "avx2") == 0) ops = &avx2::kPackOps;
+      if (std::strcmp(set.name, "avx512") == 0) ops = &avx512::kPackOps;
 #endif
-  };
+      all.push_back({set.name, set.supported, *ops, set.stages});
+    }
+    return all;
+  }();
   return sets;
 }
 
-}  // namespace ar::test
+}  // namespace test
+}  // namespace ar

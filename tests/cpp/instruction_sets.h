@@ -3,10 +3,9 @@
 
 #include <cstdint>
 #include <ostream>
-#include <string_view>
 #include <vector>
 
-#include "cpu/tasks.h"
+#include "cpu/stages.h"
 
 namespace ar::test {
 
@@ -24,7 +23,7 @@ struct InstructionSet {
   const char* name;
   bool supported;  ///< by this CPU
   PackOps ops;
-  const cpu::Stages<float>* (*stages)(std::string_view footprint);
+  const cpu::Stages<float>& (*stages)(int footprint);
 };
 
 inline void PrintTo(const InstructionSet& set, std::ostream* out) { *out << set.name; }

@@ -2,6 +2,7 @@
 #include <algorithm>
 #include <cstring>
 
+#include "core/project.h"
 #include "support.h"
 
 namespace ar::test {
@@ -26,34 +27,48 @@ template <typename T> struct Parameters {
   T& number(int k) { return reinterpret_cast<T*>(this)[k]; }
 
   Gaussians<T> view(Form form, T scale_modifier = T(1)) const {
-    const bool colored = form.sh_degree < 0;
-    return {1,
-            &mean,
-            form.with_cov3d ? nullptr : &scale,
-            form.with_cov3d ? nullptr : &rotation,
-            form.with_cov3d ? &cov3d : nullptr,
-            &opacity,
-            colored ? nullptr : sh,
-            colored ? &color : nullptr,
-            kStride,
-            std::max(form.sh_degree, 0),
-            scale_modifier};
+    Gaussians<T> g = {};
+    g.n = 1;
+    g.means = &mean;
+    if (form.with_cov3d) {
+      g.cov3ds = &cov3d;
+    } else {
+      g.scales = &scale;
+      g.rotations = &rotation;
+    }
+    g.opacities = &opacity;
+    (form.sh_degree < 0 ? g.colors : g.shs) = form.sh_degree < 0 ? &color : sh;
+    g.sh_stride = kStride;
+    g.sh_degree = std::max(form.sh_degree, 0);
+    g.scale_modifier = scale_modifier;
+    return g;
   }
 
   /// As the destination of gradients.
   GaussianGrads<T> targets(Form form, T* means2d) {
-    const bool colored = form.sh_degree < 0;
-    return {&mean,
-            form.with_cov3d ? nullptr : &scale,
-            form.with_cov3d ? nullptr : &rotation,
-            form.with_cov3d ? &cov3d : nullptr,
-            &opacity,
-            colored ? nullptr : sh,
-            colored ? &color : nullptr,
-            means2d,
-            3};
+    GaussianGrads<T> g = {};
+    g.means = &mean;
+    if (form.with_cov3d) {
+      g.cov3ds = &cov3d;
+    } else {
+      g.scales = &scale;
+      g.rotations = &rotation;
+    }
+    g.opacities = &opacity;
+    (form.sh_degree < 0 ? g.colors : g.shs) = form.sh_degree < 0 ? &color : sh;
+    g.means2d = means2d;
+    g.means2d_stride = 3;
+    return g;
   }
 };
+
+/// core's adjoint of Gaussian 0 from the sums over its pairs.
+template <class Cam, typename T>
+void vjp_from_sums(const Footprint& f, const Cam& camera, const Gaussians<T>& g, const PairGrad<T>& sums,
+                   ShownGrad<T> shown, const GaussianGrads<T>& out, CameraGrad<T>* by_camera = nullptr) {
+  const auto grad_of = [&](const Cov2d<T>& cov, T) { return projected_grad(f.choice(), cov, sums); };
+  project_vjp(camera, g, 0, grad_of, shown, g.shs, out.shs, out, by_camera);
+}
 
 /// A run of numbers in Parameters.
 struct Field {
@@ -87,7 +102,7 @@ template <typename T> struct View {
   TestCamera<T> test = test_camera<T>();
   Lens<T> lens = plain_lens<T>(test.tan_x, test.tan_y);
 
-  template <class Cam> Cam load() const { return load_camera_as<Cam>(test.look(lens)); }
+  template <class Cam> Cam load() const { return load_camera_as<Cam>(test.camera_view(lens)); }
 
   /// What number k of CameraGrad is the derivative by.
   T& number(int k) {
@@ -136,30 +151,35 @@ struct Axes {
       : gap(eigenvalue_gap(c)), wide(std::sqrt((c.xx + c.yy + gap) / 2)), narrow(std::sqrt(c.det) / wide) {}
 };
 
-/// L = sum_k g_k alpha(at pixel k) + c . color, differentiable wherever the Gaussian is kept.
-template <class F, class Cam> struct Loss {
+/// L = sum_k g_k alpha(at pixel k) + c . color + e depth, differentiable wherever the Gaussian is kept.
+template <class Cam> struct Loss {
+  const Footprint& f;
   Cam camera;
   Form form;
   double scale_modifier = 1.3;
   Vec2<double> pixels[3] = {};
   double g[3] = {};
   Vec3<double> c = {};
+  double e = 0;
 
-  int project_to(const Parameters<double>& p, Splat<F, double>& splat) const {
-    double depth;
-    return project(camera, p.view(form, scale_modifier), 0, options_of<F>(), splat, depth);
+  int project_to(const Parameters<double>& p, SplatRow<double>& splat, double& depth) const {
+    return project(camera, p.view(form, scale_modifier), 0, f.choice(), splat, depth);
   }
-  Vec2<double> offset(int k, const Splat<F, double>& splat) const {
+  Vec2<double> offset(int k, const SplatRow<double>& splat) const {
     return {pixels[k].x - splat.mean.x, pixels[k].y - splat.mean.y};
   }
 
   double operator()(const Parameters<double>& p) const {
-    Splat<F, double> splat = {};
-    EXPECT_GT(project_to(p, splat), 0);
-    const auto terms = F::terms(splat.shape, splat.opacity);
-    double loss = dot(c, splat.color);
+    SplatRow<double> splat = {};
+    double depth = 0, alphas[16];
+    EXPECT_GT(project_to(p, splat, depth), 0);
+    // Asked for apart: project() leaves it out where a step has taken the splat off the image.
+    Vec3<double> color;
+    EXPECT_TRUE(splat_color(camera, p.view(form, scale_modifier), 0, p.sh, color));
+    double loss = dot(c, color) + e * depth;
     for (int k = 0; k < 3; ++k) {
-      for (int s = 0; s < F::kSamples; ++s) loss += g[k] * F::alpha(terms, offset(k, splat), s);
+      f.in_double.alphas(splat, offset(k, splat), alphas);
+      for (int s = 0; s < f.samples; ++s) loss += g[k] * alphas[s];
     }
     return loss;
   }
@@ -167,42 +187,37 @@ template <class F, class Cam> struct Loss {
   /// `gap`: of the covariance that the footprint sees.
   Parameters<double> gradient(const Parameters<double>& p, double gap, double* means2d,
                               CameraGrad<double>* by_camera) const {
-    Splat<F, double> splat = {};
-    project_to(p, splat);
-    const auto terms = F::terms(splat.shape, splat.opacity);
-    PairGrad<double> sums = {{}, 0, c};
+    SplatRow<double> splat = {};
+    double depth = 0, alphas[16], gs[16];
+    project_to(p, splat, depth);
+    PairGrad<double> sums = {};
     for (int k = 0; k < 3; ++k) {
       const Vec2<double> d = offset(k, splat);
-      for (int s = 0; s < F::kSamples; ++s) {
-        const double alpha = F::alpha(terms, d, s);
-        ShapeGrad<double> one = {};
-        F::add_alpha_vjp(terms, d, s, alpha, g[k], one);
-        // A frozen adjoint is deliberately not the formula's. Give it the formula's own frame term.
-        if constexpr (std::is_same_v<F, Erf>) {
-          // (dI/du v - dI/dv u) / gap, whitened
-          const Vec2<double> z = transform(terms.w, d), r = splat.shape.inv_sigma;
-          one.shape.xy = (r.y / r.x * one.offset.y * z.x - r.x / r.y * one.offset.x * z.y) / (gap * r.x * r.y);
-        } else if constexpr (kIsFrozen<F>) {
-          using Paper = Analytic<FrameGradient::kPaper>;
-          const auto paper = Paper::terms(
-              Paper::Shape<double>{splat.shape.inv_sigma, splat.shape.axis, splat.shape.mass}, splat.opacity);
-          ShapeGrad<double> turned = {};
-          Paper::add_alpha_vjp(paper, d, s, alpha, g[k], turned);
-          one.shape.xy = turned.shape.xy / (gap * splat.shape.inv_sigma.x * splat.shape.inv_sigma.y);
-        }
-        add(F::collect(terms, one, g[k] * alpha), sums.shape);
-        sums.weighted += g[k] * alpha;
+      f.in_double.alphas(splat, d, alphas);
+      double weighted = 0;
+      for (int s = 0; s < f.samples; ++s) weighted += (gs[s] = g[k]) * alphas[s];
+      ShapeGrad<double> one = f.in_double.sums(splat, d, gs);
+      // A frozen adjoint is deliberately not the formula's. Give it the formula's own frame term.
+      const Vec2<double> r = {splat.shape[0], splat.shape[1]};  // 1 / standard deviations, of erf and of analytic
+      if (f.is("erf")) {
+        // (dI/du v - dI/dv u) / gap, whitened
+        const Vec2<double> z = transform(f.in_double.mean_map(splat), d);
+        one.shape.xy = (r.y / r.x * one.offset.y * z.x - r.x / r.y * one.offset.x * z.y) / (gap * r.x * r.y);
+      } else if (f.is("analytic")) {
+        const Footprint& paper = footprint_named("analytic_paper");
+        one.shape.xy = paper.in_double.sums(splat, d, gs).shape.xy / (gap * r.x * r.y);
       }
+      add(f.in_double.collect(splat, one, weighted), sums.shape);
+      sums.weighted += weighted;
     }
     Parameters<double> out = {};
-    project_vjp<F>(camera, p.view(form, scale_modifier), 0, options_of<F>(), sums, out.targets(form, means2d),
-                   by_camera);
+    vjp_from_sums(f, camera, p.view(form, scale_modifier), sums, {c, e}, out.targets(form, means2d), by_camera);
     return out;
   }
 };
 
-template <class F> class ProjectTest : public ::testing::Test {};
-TYPED_TEST_SUITE(ProjectTest, AllFootprints, FootprintName);
+class ProjectTest : public ::testing::TestWithParam<Footprint> {};
+AR_ALL_FOOTPRINTS(ProjectTest);
 
 /// Compares a field of gradients with differences of `loss_at`, the loss with number k of the field t larger.
 template <class Function>
@@ -221,7 +236,7 @@ void expect_derivatives(const Field& field, double h, const double* actual, cons
 
 // Gaussians in and around the frustum, those beyond the clamp of x/z large enough to reach back. By everything that
 // describes them and, of a full camera, by all of its numbers.
-template <class F, class Cam> void expect_gradients_match_differences(int count) {
+template <class Cam> void expect_gradients_match_differences(const Footprint& f, int count) {
   constexpr int kDegrees = Cam::kShDegree + 2;  // a colour too
   Random random(1);
   int clamped = 0, blurred = 0, checked = 0;
@@ -238,9 +253,10 @@ template <class F, class Cam> void expect_gradients_match_differences(int count)
     p.color = {random.uniform(0.1, 1), random.uniform(0.1, 1), random.uniform(0.1, 1)};
     for (auto& c : p.sh) c = {0.5 * random.normal(), 0.5 * random.normal(), 0.5 * random.normal()};
 
-    Loss<F, Cam> loss = {at.load<Cam>(), {trial % 2 == 1, trial / 2 % kDegrees - 1}};
-    Splat<F, double> splat = {};
-    if (loss.project_to(p, splat) == 0 || splat.level <= 0) continue;
+    Loss<Cam> loss = {f, at.load<Cam>(), {trial % 2 == 1, trial / 2 % kDegrees - 1}};
+    SplatRow<double> splat = {};
+    double depth;
+    if (loss.project_to(p, splat, depth) == 0 || splat.level <= 0) continue;
     const Vec3<double> view = project_mean(loss.camera, p.mean).view;
     const Gaussians<double> g = p.view(loss.form, loss.scale_modifier);
     const auto factors = project_covariance(loss.camera, g, 0, view);
@@ -261,10 +277,11 @@ template <class F, class Cam> void expect_gradients_match_differences(int count)
     blurred += seen.wide > 1.1 * own.wide;
     for (int k = 0; k < 3; ++k) {
       const Vec2<double> z = on_circle(random.uniform(0, 2), random.uniform(0, 2 * kPi));
-      loss.pixels[k] = splat.mean + unwhiten(F::ellipse(splat.shape), z);
+      loss.pixels[k] = splat.mean + unwhiten(f.in_double.ellipse(splat), z);
       loss.g[k] = random.uniform(0.5, 1);
     }
     loss.c = {random.normal(), random.normal(), random.normal()};
+    loss.e = 0.1 * (trial % 5 - 2);
     double means2d[3];
     CameraGrad<double> by_camera = {};
     Parameters<double> actual = loss.gradient(p, seen.gap, means2d, Cam::kFull ? &by_camera : nullptr);
@@ -289,7 +306,7 @@ template <class F, class Cam> void expect_gradients_match_differences(int count)
     }
     // means2d: what moving the pixels the other way does, in units of half the image.
     const auto shifted = [&](double x, double y) {
-      Loss<F, Cam> moved = loss;
+      Loss<Cam> moved = loss;
       for (auto& pixel : moved.pixels) pixel = {pixel.x - x, pixel.y - y};
       return moved(p);
     };
@@ -319,7 +336,7 @@ template <class F, class Cam> void expect_gradients_match_differences(int count)
         const auto loss_at = [&](int k, double t) {
           View<double> moved = at;
           moved.number(field.first + k) += t;
-          Loss<F, Cam> other = loss;
+          Loss<Cam> other = loss;
           other.camera = moved.load<Cam>();
           return other(p);
         };
@@ -334,15 +351,13 @@ template <class F, class Cam> void expect_gradients_match_differences(int count)
     EXPECT_GE(blurred, 20);
   }
 }
-TYPED_TEST(ProjectTest, GradientsMatchDifferences) {
-  expect_gradients_match_differences<TypeParam, Camera<double>>(120);
-}
-TYPED_TEST(ProjectTest, GradientsOfAFullCameraMatchDifferences) {
-  expect_gradients_match_differences<TypeParam, FullCamera<double>>(160);
+TEST_P(ProjectTest, GradientsMatchDifferences) { expect_gradients_match_differences<Camera<double>>(GetParam(), 120); }
+TEST_P(ProjectTest, GradientsOfAFullCameraMatchDifferences) {
+  expect_gradients_match_differences<FullCamera<double>>(GetParam(), 160);
 }
 
 /// Compares what both cameras make of random Gaussians, there and back.
-template <class F, typename T> void expect_a_plain_lens_changes_no_bit() {
+template <typename T> void expect_a_plain_lens_changes_no_bit(const Footprint& f) {
   const View<T> at;
   const auto plain = at.template load<Camera<T>>();
   const auto full = at.template load<FullCamera<T>>();
@@ -358,11 +373,11 @@ template <class F, typename T> void expect_a_plain_lens_changes_no_bit() {
     p.opacity = T(random.uniform(0, 1));
     for (auto& c : p.sh) c = {T(random.normal()), T(random.normal()), T(random.normal())};
     const auto number = [&] { return T(random.normal()); };
-    const PairGrad<T> sums = {
-        {{number(), number()}, {number(), number(), number()}}, number(), {number(), number(), number()}};
+    const PairGrad<T> sums = {{{number(), number()}, {number(), number(), number()}}, number()};
+    const ShownGrad<T> shown = {{number(), number(), number()}, number()};
     const Form form = {trial % 2 == 1, trial / 2 % 5 - 1};
     struct Result {
-      Splat<F, T> splat;
+      SplatRow<T> splat;
       Parameters<T> grads;
       T means2d[3], depth;
       int radius, candidate;
@@ -370,10 +385,10 @@ template <class F, typename T> void expect_a_plain_lens_changes_no_bit() {
     const auto run = [&](const auto& camera, CameraGrad<T>* to, Result& out) {
       std::memset(static_cast<void*>(&out), 0, sizeof out);
       const Gaussians<T> g = p.view(form);
-      out.candidate = may_be_visible(camera, g, 0, T(0.3));
-      out.radius = project(camera, g, 0, options_of<F>(), out.splat, out.depth);
+      out.candidate = may_be_visible(camera, g, 0, cull_bounds<T>(f.choice()));
+      out.radius = project(camera, g, 0, f.choice(), out.splat, out.depth);
       if (out.radius > 0 && out.splat.level > T(0))
-        project_vjp<F>(camera, g, 0, options_of<F>(), sums, out.grads.targets(form, out.means2d), to);
+        vjp_from_sums(f, camera, g, sums, shown, out.grads.targets(form, out.means2d), to);
     };
     Result a, b;
     CameraGrad<T> by_camera = {};
@@ -384,9 +399,9 @@ template <class F, typename T> void expect_a_plain_lens_changes_no_bit() {
   }
   EXPECT_GT(drawn, 200);
 }
-TYPED_TEST(ProjectTest, ALensThatAsksForNothingChangesNoBit) {
-  expect_a_plain_lens_changes_no_bit<TypeParam, float>();
-  expect_a_plain_lens_changes_no_bit<TypeParam, double>();
+TEST_P(ProjectTest, ALensThatAsksForNothingChangesNoBit) {
+  expect_a_plain_lens_changes_no_bit<float>(GetParam());
+  expect_a_plain_lens_changes_no_bit<double>(GetParam());
 }
 
 template <typename T> Parameters<T> visible_gaussian() {
@@ -401,25 +416,25 @@ template <typename T> Parameters<T> visible_gaussian() {
 }
 
 // Powers of two scale a quaternion without rounding, so nothing but its gradient changes.
-TYPED_TEST(ProjectTest, QuaternionsOfAnyLengthSurvive) {
-  using F = TypeParam;
+TEST_P(ProjectTest, QuaternionsOfAnyLengthSurvive) {
+  const Footprint& f = GetParam();
   const TestCamera<float> test = test_camera<float>();
-  const Camera<float> camera = load_camera(test.look());
+  const Camera<float> camera = load_camera(test.camera_view());
   const Form form = {false, -1};
-  const PairGrad<float> sums = {{{0.5f, 0.25f}, {1, 0.5f, 0.75f}}, 1, {1, 1, 1}};
-  const auto run = [&](Vec4<float> rotation, Splat<F, float>& splat) {
+  const PairGrad<float> sums = {{{0.5f, 0.25f}, {1, 0.5f, 0.75f}}, 1};
+  const auto run = [&](Vec4<float> rotation, SplatRow<float>& splat) {
     Parameters<float> p = visible_gaussian<float>();
     p.rotation = rotation;
     float depth;
     Vec4<float> gradient;
     GaussianGrads<float> out = {};
     out.rotations = &gradient;
-    EXPECT_GT(project(camera, p.view(form), 0, options_of<F>(), splat, depth), 0);
-    project_vjp<F>(camera, p.view(form), 0, options_of<F>(), sums, out);
+    EXPECT_GT(project(camera, p.view(form), 0, f.choice(), splat, depth), 0);
+    vjp_from_sums(f, camera, p.view(form), sums, {{1, 1, 1}, 0}, out);
     return gradient;
   };
   const Vec4<float> q = visible_gaussian<float>().rotation;
-  Splat<F, float> expected = {}, splat = {};
+  SplatRow<float> expected = {}, splat = {};
   const Vec4<float> g = run(q, expected);
   for (const float length :
        {std::ldexp(1.0f, -120), std::ldexp(1.0f, -30), std::ldexp(1.0f, 30), std::ldexp(1.0f, 100)}) {
@@ -434,12 +449,12 @@ TYPED_TEST(ProjectTest, QuaternionsOfAnyLengthSurvive) {
   for (const float x : {none.x, none.y, none.z, none.w}) EXPECT_EQ(x, 0);
 }
 
-template <class F, class Cam, typename T> void expect_culled_unless_finite(const View<T>& at) {
+template <class Cam, typename T> void expect_culled_unless_finite(const Footprint& f, const View<T>& at) {
   const TestCamera<T>& test = at.test;
   const auto radius = [&](const Parameters<T>& p, Form form) {
-    Splat<F, T> splat = {};
+    SplatRow<T> splat = {};
     T depth;
-    const int r = project(at.template load<Cam>(), p.view(form), 0, options_of<F>(), splat, depth);
+    const int r = project(at.template load<Cam>(), p.view(form), 0, f.choice(), splat, depth);
     EXPECT_TRUE(r > 0 || splat.level <= 0);
     return r;
   };
@@ -463,21 +478,21 @@ template <class F, class Cam, typename T> void expect_culled_unless_finite(const
     EXPECT_EQ(radius(p, {false, -1}), 0) << z;
   }
 }
-TYPED_TEST(ProjectTest, CullsWhatIsNotFiniteOrBehind) {
-  expect_culled_unless_finite<TypeParam, Camera<float>>(View<float>());
-  expect_culled_unless_finite<TypeParam, Camera<double>>(View<double>());
+TEST_P(ProjectTest, CullsWhatIsNotFiniteOrBehind) {
+  expect_culled_unless_finite<Camera<float>>(GetParam(), View<float>());
+  expect_culled_unless_finite<Camera<double>>(GetParam(), View<double>());
   Random random(4);
   for (const bool orthographic : {false, true}) {
     View<float> at = random_view<float>(random, kAllEffects, orthographic);
     at.lens.near = 0.3f;
     at.lens.far = 5;
-    expect_culled_unless_finite<TypeParam, FullCamera<float>>(at);
+    expect_culled_unless_finite<FullCamera<float>>(GetParam(), at);
   }
 }
 
 // A covariance that is negative definite has a positive determinant, which a blur must not turn into a splat.
-TYPED_TEST(ProjectTest, ABlurDrawsNoNegativeCovariance) {
-  using F = TypeParam;
+TEST_P(ProjectTest, ABlurDrawsNoNegativeCovariance) {
+  const Footprint& f = GetParam();
   View<float> at;
   at.lens.aperture = 1;
   at.lens.focus = 1;
@@ -485,15 +500,15 @@ TYPED_TEST(ProjectTest, ABlurDrawsNoNegativeCovariance) {
   for (const float variance : {-1e-2f, -1e-4f, -1e-6f}) {
     Parameters<float> p = visible_gaussian<float>();
     p.cov3d = {variance, 0, 0, variance, 0, variance};
-    Splat<F, float> splat = {};
+    SplatRow<float> splat = {};
     float depth;
-    EXPECT_EQ(project(at.load<FullCamera<float>>(), p.view({true, -1}), 0, options_of<F>(), splat, depth), 0);
+    EXPECT_EQ(project(at.load<FullCamera<float>>(), p.view({true, -1}), 0, f.choice(), splat, depth), 0);
   }
 }
 
 /// `view_of`: the camera of a trial.
-template <class F, class Cam, class Function>
-void expect_nothing_kept_that_may_not_be_visible(const Function& view_of) {
+template <class Cam, class Function>
+void expect_nothing_kept_that_may_not_be_visible(const Footprint& f, const Function& view_of) {
   Random random(2);
   int kept = 0;
   for (int trial = 0; trial < 200000; ++trial) {
@@ -507,25 +522,49 @@ void expect_nothing_kept_that_may_not_be_visible(const Function& view_of) {
     p.scale = {length(), length(), length()};
     p.rotation = {float(random.normal()), float(random.normal()), float(random.normal()), float(random.normal())};
     p.opacity = float(random.log_uniform(0.003, random.below(10) ? 1 : 50));
-    const FootprintOptions options = {random.below(2) ? options_of<F>().variance : random.log_uniform(1e-3, 30)};
-    Splat<F, float> splat = {};
+    const FootprintOptions options = {random.below(2) ? f.options.number : random.log_uniform(1e-3, 30)};
+    SplatRow<float> splat = {};
     float depth;
-    if (project(camera, p.view({false, -1}), 0, options, splat, depth) == 0) continue;
+    if (project(camera, p.view({false, -1}), 0, {f.index, options}, splat, depth) == 0) continue;
     ++kept;
-    const float blur = float(std::max(options.variance, kPixelVariance));
-    ASSERT_TRUE(may_be_visible(camera, p.view({false, -1}), 0, blur)) << trial;
+    ASSERT_TRUE(may_be_visible(camera, p.view({false, -1}), 0, cull_bounds<float>({f.index, options}))) << trial;
   }
   EXPECT_GT(kept, 1000);
 }
-TYPED_TEST(ProjectTest, NeverKeepsWhatMayNotBeVisible) {
+TEST_P(ProjectTest, NeverKeepsWhatMayNotBeVisible) {
   const View<float> plain;
-  expect_nothing_kept_that_may_not_be_visible<TypeParam, Camera<float>>(
-      [&](int) -> const View<float>& { return plain; });
+  expect_nothing_kept_that_may_not_be_visible<Camera<float>>(GetParam(),
+                                                             [&](int) -> const View<float>& { return plain; });
   std::vector<View<float>> views;
   Random random(5);
   for (int k = 0; k < 64; ++k) views.push_back(random_view<float>(random, effects_of(k), random.below(3) == 0));
-  expect_nothing_kept_that_may_not_be_visible<TypeParam, FullCamera<float>>(
-      [&](int trial) -> const View<float>& { return views[trial % views.size()]; });
+  expect_nothing_kept_that_may_not_be_visible<FullCamera<float>>(
+      GetParam(), [&](int trial) -> const View<float>& { return views[trial % views.size()]; });
+}
+
+// A speck 3 px off the image, far beyond the reach of a pixel's own variance, is drawn by a footprint that widens it to
+// two pixels.
+TEST(Culling, KeepsWhatAWideFootprintDraws) {
+  const Footprint& mip = footprint_named("mip");
+  const View<float> at;
+  const auto camera = at.load<Camera<float>>();
+  Parameters<float> p = visible_gaussian<float>();
+  p.scale = {0.02f, 0.02f, 0.02f};
+  p.opacity = 1;
+  SplatRow<float> splat = {};
+  float depth;
+  // The principal point is off the centre: found along x.
+  for (float x = -2; x < 2; x += 0.005f) {
+    p.mean = at.test.world(x, 0.05, 2);
+    const float left = project_mean(camera, p.mean).pixel.x;
+    if (left > -2.9f) break;
+    if (left < -3.1f) continue;
+    EXPECT_TRUE(may_be_visible(camera, p.view({false, -1}), 0, cull_bounds<float>({mip.index, {4}})));
+    EXPECT_GT(project(camera, p.view({false, -1}), 0, {mip.index, {4}}, splat, depth), 0);
+    EXPECT_GT(splat.level, 0);
+    return;
+  }
+  FAIL() << "no mean is 3 px off the image";
 }
 
 }  // namespace

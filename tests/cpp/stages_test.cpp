@@ -1,11 +1,12 @@
 // The tables of stages end to end, project -> bin -> blend and back.
+#include "stages.h"
+
 #include <algorithm>
 #include <cstring>
 #include <numeric>
 
 #include "core/blend.h"
 #include "instruction_sets.h"
-#include "stages.h"
 #include "support.h"
 
 namespace ar::test {
@@ -13,24 +14,41 @@ namespace {
 
 template <typename T> struct Scene {
   TestCamera<T> camera;
-  T background[3] = {T(0.1), T(0.3), T(0.2)};
+  std::vector<T> background = {T(0.1), T(0.3), T(0.2)};
   std::vector<Vec3<T>> means = {}, scales = {}, colors = {};
   std::vector<Vec4<T>> rotations = {};
-  std::vector<T> opacities = {}, dL_dimage = {};
+  std::vector<T> opacities = {}, dL_dimage = {}, dL_dalpha = {};
+  std::vector<T> channels = {};  ///< [n, count], if not the colours
+  int count = 3;
 
   Gaussians<T> gaussians() const {
-    return {int64_t(means.size()),
-            means.data(),
-            scales.data(),
-            rotations.data(),
-            nullptr,
-            opacities.data(),
-            nullptr,
-            colors.data(),
-            0,
-            0,
-            T(1)};
+    Gaussians<T> g = {};
+    g.n = int64_t(means.size());
+    g.means = means.data();
+    g.scales = scales.data();
+    g.rotations = rotations.data();
+    g.opacities = opacities.data();
+    g.colors = channels.empty() ? colors.data() : nullptr;
+    g.scale_modifier = T(1);
+    return g;
   }
+
+  Pass<T> pass(FootprintChoice footprint, int threads = 2) const {
+    Pass<T> pass;
+    pass.camera = camera.camera_view();
+    pass.gaussians = gaussians();
+    pass.footprint = footprint;
+    pass.background = background.data();
+    pass.dL_dimage = dL_dimage.data();
+    pass.dL_dalpha = dL_dalpha.empty() ? nullptr : dL_dalpha.data();
+    pass.threads = threads;
+    pass.count = count;
+    if (!channels.empty()) pass.given = channels.data(), pass.given_count = count;
+    return pass;
+  }
+
+  /// What splat i shows in channel c.
+  T shown(int64_t i, int c) const { return channels.empty() ? (&colors[i].x)[c] : channels[i * count + c]; }
 };
 
 /// Splats from 0.3 px across, some off screen, behind, equally deep, opaque or invisible. Numbers of
@@ -55,78 +73,105 @@ template <typename T> Scene<T> make_scene(int n, int width, int height) {
   return scene;
 }
 
-template <typename T>
-Rendered<T> run_stages(const cpu::Stages<T>& stages, const Scene<T>& scene, FootprintOptions options, int threads) {
-  return test::run_stages(stages, scene.camera.look(), scene.gaussians(), scene.background, scene.dL_dimage.data(),
-                          options, threads);
+/// The same with `count` channels of its own, and a gradient with respect to alpha.
+template <typename T> Scene<T> make_channel_scene(int n, int width, int height, int count) {
+  Scene<T> scene = make_scene<T>(n, width, height);
+  Random random(count);
+  scene.count = count;
+  const auto fill = [&](std::vector<T>& numbers, size_t size) {
+    numbers.resize(size);
+    for (T& x : numbers) x = T(float(random.normal()));
+  };
+  fill(scene.channels, size_t(n) * count);
+  fill(scene.background, count);
+  fill(scene.dL_dimage, size_t(count) * width * height);
+  fill(scene.dL_dalpha, size_t(width) * height);
+  return scene;
+}
+
+template <typename T> Rendered<T> render(const Footprint& f, const Scene<T>& scene, int threads = 2) {
+  return run_stages(cpu::stages_of<T>(f.index), scene.pass(f.choice(), threads));
 }
 
 /// The same from the definitions: every pixel visits every Gaussian that is not culled, in depth order.
-template <class F> Rendered<double> render_plainly(const Scene<double>& scene) {
-  const Camera<double> camera = load_camera(scene.camera.look());
+Rendered<double> render_plainly(const Footprint& f, const Scene<double>& scene) {
+  const Camera<double> camera = load_camera(scene.camera.camera_view());
   const Gaussians<double> g = scene.gaussians();
-  const FootprintOptions options = options_of<F>();
-  const int width = scene.camera.width, height = scene.camera.height;
+  const Model<double>& model = f.in_double;
+  const int width = scene.camera.width, height = scene.camera.height, count = scene.count, samples = f.samples;
   Rendered<double> out;
-  std::vector<Splat<F, double>> splats(g.n);
-  std::vector<typename F::template Terms<double>> terms(g.n);
+  std::vector<SplatRow<double>> splats(g.n);
   std::vector<double> depths(g.n);
   std::vector<int> order;
   for (int i = 0; i < g.n; ++i) {
-    out.radii.push_back(project(camera, g, i, options, splats[i], depths[i]));
-    if (out.radii[i] == 0) continue;
-    order.push_back(i);
-    splats[i].color = g.colors[i];  // project() leaves it out where nothing shows
-    terms[i] = F::terms(splats[i].shape, splats[i].opacity);
+    out.radii.push_back(project(camera, g, i, f.choice(), splats[i], depths[i]));
+    if (out.radii[i] > 0) order.push_back(i);
   }
   std::stable_sort(order.begin(), order.end(), [&](int a, int b) { return depths[a] < depths[b]; });
   std::vector<PairGrad<double>> sums(g.n, PairGrad<double>{});
   std::vector<Vec2<double>> absolute(g.n, Vec2<double>{});
-  const Vec3<double> background = {scene.background[0], scene.background[1], scene.background[2]};
-  out.image.resize(3 * width * height);
+  out.image.resize(count * width * height);
+  out.alpha.resize(width * height);
+  out.dL_dchannels.resize(g.n * count);
   for (int pixel = 0; pixel < width * height; ++pixel) {
-    const auto plane = [&](auto& image, int c) -> auto& { return image[c * width * height + pixel]; };
-    const double share = 1.0 / F::kSamples;
-    const Vec3<double> gp = {share * plane(scene.dL_dimage, 0), share * plane(scene.dL_dimage, 1),
-                             share * plane(scene.dL_dimage, 2)};
-    std::vector<Vec2<double>> offset(g.n, Vec2<double>{});
-    for (int s = 0; s < F::kSamples; ++s) {
-      std::vector<double> alphas;
+    const double share = 1.0 / samples;
+    std::vector<double> gradient(count);
+    double of_background = 0;
+    for (int c = 0; c < count; ++c) {
+      gradient[c] = share * scene.dL_dimage[c * width * height + pixel];
+      of_background += gradient[c] * scene.background[c];
+    }
+    if (!scene.dL_dalpha.empty()) of_background -= share * scene.dL_dalpha[pixel];
+    const auto offset_of = [&](int i) {
+      return Vec2<double>{pixel % width - splats[i].mean.x, pixel / width - splats[i].mean.y};
+    };
+    std::vector<double> alphas(order.size() * samples), dL_dalphas(order.size() * samples, 0.0);
+    for (size_t k = 0; k < order.size(); ++k) model.alphas(splats[order[k]], offset_of(order[k]), &alphas[k * samples]);
+    for (int s = 0; s < samples; ++s) {
       std::vector<bool> masks;
       double transmittance = 1;
-      for (const int i : order) {
-        alphas.push_back(
-            F::alpha(terms[i], Vec2<double>{pixel % width - splats[i].mean.x, pixel / width - splats[i].mean.y}, s));
-        const Blended<double> b = blend_sample(alphas.back(), transmittance);
+      for (size_t k = 0; k < order.size(); ++k) {
+        const Blended<double> b = blend_sample(alphas[k * samples + s], transmittance);
         masks.push_back(b.mask);
-        for (int c = 0; c < 3; ++c) plane(out.image, c) += share * b.contribution * (&splats[i].color.x)[c];
+        for (int c = 0; c < count; ++c)
+          out.image[c * width * height + pixel] += share * b.contribution * scene.shown(order[k], c);
       }
       transmittance = std::abs(transmittance);
-      for (int c = 0; c < 3; ++c) plane(out.image, c) += share * transmittance * scene.background[c];
-      double behind = dot(gp, background);
+      for (int c = 0; c < count; ++c)
+        out.image[c * width * height + pixel] += share * transmittance * scene.background[c];
+      out.alpha[pixel] += share * (1 - transmittance);
+      double behind = of_background;
       for (size_t k = order.size(); k-- > 0;) {
         const int i = order[k];
-        const BlendGrad<double> b =
-            blend_sample_vjp(masks[k], alphas[k], dot(gp, splats[i].color), transmittance, behind);
-        const Vec2<double> d = {pixel % width - splats[i].mean.x, pixel / width - splats[i].mean.y};
-        ShapeGrad<double> one = {};
-        F::add_alpha_vjp(terms[i], d, s, alphas[k], b.dL_dalpha, one);
-        add(F::collect(terms[i], one, alphas[k] * b.dL_dalpha), sums[i].shape);
-        offset[i] = offset[i] + one.offset;
-        sums[i].weighted += alphas[k] * b.dL_dalpha;
-        sums[i].color += b.contribution * gp;
+        const double alpha = alphas[k * samples + s];
+        double g_color = 0;
+        for (int c = 0; c < count; ++c) g_color += gradient[c] * scene.shown(i, c);
+        const BlendGrad<double> b = blend_sample_vjp(masks[k], alpha, g_color, transmittance, behind);
+        dL_dalphas[k * samples + s] = b.dL_dalpha;
+        sums[i].weighted += alpha * b.dL_dalpha;
+        for (int c = 0; c < count; ++c) out.dL_dchannels[i * count + c] += b.contribution * gradient[c];
       }
     }
-    for (const int i : order) {
-      const Vec2<double> by_mean = transform_transposed(F::mean_map(splats[i].shape), offset[i]);
+    for (size_t k = 0; k < order.size(); ++k) {
+      const int i = order[k];
+      const double* of_pixel = &dL_dalphas[k * samples];
+      double weighted = 0;
+      for (int s = 0; s < samples; ++s) weighted += of_pixel[s] * alphas[k * samples + s];
+      const ShapeGrad<double> one = model.sums(splats[i], offset_of(i), of_pixel);
+      add(model.collect(splats[i], one, weighted), sums[i].shape);
+      const Vec2<double> by_mean = transform_transposed(model.mean_map(splats[i]), one.offset);
       absolute[i] = absolute[i] + Vec2<double>{std::abs(by_mean.x), std::abs(by_mean.y)};
     }
   }
-  GradArrays<double> grads(g.n);
+  GradArrays<double> grads(g);
   for (int i = 0; i < g.n; ++i) {
     zero_grads(g, i, grads.views);
     if (out.radii[i] == 0) continue;
-    project_vjp<F>(camera, g, i, options, sums[i], grads.views);
+    ShownGrad<double> shown = {};
+    if (scene.channels.empty()) shown.color = *reinterpret_cast<const Vec3<double>*>(&out.dL_dchannels[3 * i]);
+    project_vjp(
+        camera, g, i, [&](const Cov2d<double>& cov, double) { return projected_grad(f.choice(), cov, sums[i]); }, shown,
+        static_cast<const Vec3<double>*>(nullptr), static_cast<Vec3<double>*>(nullptr), grads.views);
     grads.views.means2d[4 * i + 2] = absolute[i].x * width / 2;
     grads.views.means2d[4 * i + 3] = absolute[i].y * height / 2;
   }
@@ -134,36 +179,57 @@ template <class F> Rendered<double> render_plainly(const Scene<double>& scene) {
   return out;
 }
 
-template <class F> class StagesTest : public ::testing::Test {
- protected:
-  template <typename T> static Rendered<T> render(const Scene<T>& scene, int threads = 2) {
-    return run_stages(*cpu::find_stages<T>(F::kName), scene, options_of<F>(), threads);
-  }
-};
-TYPED_TEST_SUITE(StagesTest, AllFootprints, FootprintName);
-
-// Both in double, with the same formulas: only the order of sums differs. n terms of size m lose at
-// most n eps m; 1e-9 of the largest gradient covers sums over 3000 pixels with room for the needles'
-// dL/dSigma -> dL/dscale, which cancels by (s1/s2)^2 < 2500.
-TYPED_TEST(StagesTest, DoubleIsThePlainLoop) {
-  const Scene<double> scene = make_scene<double>(120, 53, 37);
-  const Rendered<double> actual = this->render(scene), expected = render_plainly<TypeParam>(scene);
+/// Both in double, with the same formulas: only the order of sums differs. n terms of size m lose at most n eps m; 1e-9
+/// of the largest gradient covers sums over 3000 pixels with room for the needles' dL/dSigma -> dL/dscale, which
+/// cancels by (s1/s2)^2 < 2500.
+void expect_same(const Rendered<double>& actual, const Rendered<double>& expected) {
   EXPECT_EQ(actual.radii, expected.radii);
-  for (size_t i = 0; i < actual.image.size(); ++i) ASSERT_NEAR(actual.image[i], expected.image[i], 1e-13) << i;
-  double largest = 0;
-  for (const double g : expected.grads) largest = std::max(largest, std::abs(g));
-  for (size_t i = 0; i < actual.grads.size(); ++i)
-    ASSERT_NEAR(actual.grads[i], expected.grads[i], 1e-9 * std::abs(expected.grads[i]) + 1e-12 * largest) << i;
+  const auto compare = [](const std::vector<double>& a, const std::vector<double>& b, double relative, double floor,
+                          const char* name) {
+    ASSERT_EQ(a.size(), b.size()) << name;
+    double largest = 0;
+    for (const double x : b) largest = std::max(largest, std::abs(x));
+    for (size_t i = 0; i < a.size(); ++i)
+      ASSERT_NEAR(a[i], b[i], relative * std::abs(b[i]) + floor * largest) << name << " " << i;
+  };
+  compare(actual.image, expected.image, 0, 1e-13, "image");
+  compare(actual.alpha, expected.alpha, 0, 1e-13, "alpha");
+  compare(actual.grads, expected.grads, 1e-9, 1e-12, "gradient");
+  if (!actual.dL_dchannels.empty())
+    compare(actual.dL_dchannels, expected.dL_dchannels, 1e-9, 1e-12, "gradient of channels");
 }
 
-TYPED_TEST(StagesTest, ThreadsChangeNoBit) {
-  const Scene<float> scene = make_scene<float>(5000, 50, 35);  // two chunks
-  const Rendered<float> one = this->render(scene, 1);
-  for (const int threads : {2, 7}) {
-    const Rendered<float> many = this->render(scene, threads);
-    EXPECT_EQ(many.radii, one.radii);
-    EXPECT_EQ(std::memcmp(many.image.data(), one.image.data(), one.image.size() * sizeof(float)), 0);
-    EXPECT_EQ(std::memcmp(many.grads.data(), one.grads.data(), one.grads.size() * sizeof(float)), 0);
+class StagesTest : public ::testing::TestWithParam<Footprint> {};
+AR_ALL_FOOTPRINTS(StagesTest);
+
+TEST_P(StagesTest, DoubleIsThePlainLoop) {
+  const Scene<double> scene = make_scene<double>(120, 53, 37);
+  expect_same(render(GetParam(), scene), render_plainly(GetParam(), scene));
+}
+
+// One window of channels, several, and fewer than three; |dL/dmean| is that of all channels together.
+TEST_P(StagesTest, AnyNumberOfChannels) {
+  for (const int count : {1, 4, 5, 37}) {
+    const Scene<double> scene = make_channel_scene<double>(60, 35, 21, count);
+    expect_same(render(GetParam(), scene), render_plainly(GetParam(), scene));
+    if (HasFatalFailure()) return;
+  }
+}
+
+TEST_P(StagesTest, ThreadsChangeNoBit) {
+  const Scene<float> scenes[] = {make_scene<float>(5000, 50, 35), make_channel_scene<float>(5000, 50, 35, 35)};
+  for (const Scene<float>& scene : scenes) {  // two chunks of Gaussians
+    const Rendered<float> one = render(GetParam(), scene, 1);
+    for (const int threads : {2, 7}) {
+      const Rendered<float> many = render(GetParam(), scene, threads);
+      EXPECT_EQ(many.radii, one.radii);
+      const auto same = [](const std::vector<float>& a, const std::vector<float>& b) {
+        return a.size() == b.size() && std::memcmp(a.data(), b.data(), a.size() * sizeof(float)) == 0;
+      };
+      EXPECT_TRUE(same(many.image, one.image));
+      EXPECT_TRUE(same(many.grads, one.grads));
+      EXPECT_TRUE(same(many.dL_dchannels, one.dL_dchannels));
+    }
   }
 }
 
@@ -174,15 +240,15 @@ TYPED_TEST(StagesTest, ThreadsChangeNoBit) {
 // goes; a share of 2 delta/255 of the (splat, pixel) pairs is that close, less than a pixel in 100.
 // Typical: a mean off by 2 eps W before a splat of 1 px, so 8e-6 for the RMS of the image and of the
 // gradients; a flip adds 1/255 of one of their thousands of terms.
-TYPED_TEST(StagesTest, EveryInstructionSetAgreesWithDouble) {
-  using F = TypeParam;
+TEST_P(StagesTest, EveryInstructionSetAgreesWithDouble) {
+  const Footprint& f = GetParam();
   const double worst = 2 * 4e-4, typical = 8e-6;
   const auto squares = [](double a, double b) { return a + b * b; };
-  const Rendered<double> expected = this->render(make_scene<double>(300, 67, 45));
+  const Rendered<double> expected = render(f, make_scene<double>(300, 67, 45));
   const Scene<float> scene = make_scene<float>(300, 67, 45);
   for (const InstructionSet& set : instruction_sets()) {
     if (!set.supported) continue;
-    const Rendered<float> actual = run_stages(*set.stages(F::kName), scene, options_of<F>(), 2);
+    const Rendered<float> actual = run_stages(set.stages(f.index), scene.pass(f.choice()));
     int flips = 0;
     std::vector<double> small, grads;
     for (size_t i = 0; i < actual.image.size(); ++i) {
@@ -203,30 +269,50 @@ TYPED_TEST(StagesTest, EveryInstructionSetAgreesWithDouble) {
   }
 }
 
-TYPED_TEST(StagesTest, EmptyScenesAndThinImages) {
+// To ask for the sums of absolute values changes no bit of what is not one.
+TEST_P(StagesTest, AbsoluteSumsChangeNoOtherBit) {
+  const Scene<float> scene = make_scene<float>(300, 67, 45);
+  Pass<float> pass = scene.pass(GetParam().choice());
+  const auto& stages = cpu::stages_of<float>(GetParam().index);
+  const Rendered<float> with = run_stages(stages, pass);
+  pass.absolute = false;
+  const Rendered<float> without = run_stages(stages, pass);
+  const size_t means2d = 14 * scene.means.size();
+  EXPECT_EQ(std::memcmp(with.grads.data(), without.grads.data(), means2d * sizeof(float)), 0);
+  for (size_t i = means2d; i < with.grads.size(); ++i) {
+    if ((i - means2d) % 4 < 2) {
+      ASSERT_EQ(with.grads[i], without.grads[i]);
+    } else {
+      ASSERT_EQ(without.grads[i], 0);
+    }
+  }
+}
+
+TEST_P(StagesTest, EmptyScenesAndThinImages) {
+  const Footprint& f = GetParam();
   for (const auto& [width, height] : {std::pair(1, 1), std::pair(1, 4000), std::pair(4000, 1), std::pair(33, 17)}) {
     for (const bool hidden : {false, true}) {
       Scene<float> scene = make_scene<float>(hidden ? 50 : 0, width, height);
       for (auto& mean : scene.means) mean.z = -1;
-      const Rendered<float> out = this->render(scene);
+      const Rendered<float> out = render(f, scene);
       EXPECT_EQ(out.pairs, 0);
       const int plane = width * height;
       for (int i = 0; i < 3 * plane; ++i) ASSERT_EQ(out.image[i], scene.background[i / plane]);
       for (const float g : out.grads) ASSERT_EQ(g, 0);
       for (const int radius : out.radii) ASSERT_EQ(radius, 0);
     }
-    const Rendered<double> actual = this->render(make_scene<double>(10, width, height)),
-                           expected = render_plainly<TypeParam>(make_scene<double>(10, width, height));
+    const Scene<double> scene = make_scene<double>(10, width, height);
+    const Rendered<double> actual = render(f, scene), expected = render_plainly(f, scene);
     EXPECT_GT(actual.pairs, 0);
     for (size_t i = 0; i < actual.image.size(); ++i) ASSERT_NEAR(actual.image[i], expected.image[i], 1e-13);
   }
 }
 
-// footprint_weight is the mean over the samples at opacity 1; its derivatives are by the offset and
-// by (xx, xy, yy). The frozen frame's are checked in footprint_test.
-TYPED_TEST(StagesTest, WeightAndItsAdjoint) {
-  using F = TypeParam;
-  const cpu::Stages<double>& stages = *cpu::find_stages<double>(F::kName);
+// footprint_weight is the mean over the samples at opacity 1; its derivatives are with respect to the offset and
+// to (xx, xy, yy). The frozen frame's are checked in footprint_test.
+TEST_P(StagesTest, WeightAndItsAdjoint) {
+  const Footprint& f = GetParam();
+  const cpu::Stages<double>& stages = cpu::stages_of<double>(f.index);
   Random random(1);
   const int64_t n = cpu::kChunk + 100;
   std::vector<Vec2<double>> offsets(n), dL_doffsets(n);
@@ -238,18 +324,18 @@ TYPED_TEST(StagesTest, WeightAndItsAdjoint) {
     covs[i] = {c.xx, c.xy, c.yy};
     offsets[i] = {random.normal(), random.normal()};
   }
-  cpu::WeightTask<double> task{};
-  task.n = n;
-  task.threads = 2;
-  task.options = options_of<F>();
-  task.offsets = offsets.data();
-  task.covs = covs.data();
-  task.dL_dweights = ones.data();
-  task.weights = weights.data();
-  task.dL_doffsets = dL_doffsets.data();
-  task.dL_dcovs = dL_dcovs.data();
-  stages.weight(task);
-  stages.weight_vjp(task);
+  cpu::WeightParams<double> p = {};
+  p.n = n;
+  p.threads = 2;
+  p.options = f.options;
+  p.offsets = offsets.data();
+  p.covs = covs.data();
+  p.dL_dweights = ones.data();
+  p.weights = weights.data();
+  p.dL_doffsets = dL_doffsets.data();
+  p.dL_dcovs = dL_dcovs.data();
+  stages.weight(p);
+  stages.weight_vjp(p);
   for (int64_t i = 0; i < n; i += 50) {
     const double x[5] = {offsets[i].x, offsets[i].y, covs[i].xx, covs[i].xy, covs[i].yy};
     const double grads[5] = {dL_doffsets[i].x, dL_doffsets[i].y, dL_dcovs[i].xx, dL_dcovs[i].xy, dL_dcovs[i].yy};
@@ -257,18 +343,358 @@ TYPED_TEST(StagesTest, WeightAndItsAdjoint) {
       const auto moved = [&](double t) {
         double y[5];
         for (int j = 0; j < 5; ++j) y[j] = x[j] + (j == k ? t : 0);
-        return weight<F>(Cov2d<double>{y[2], y[3], y[4], y[2] * y[4] - y[3] * y[3]}, Vec2<double>{y[0], y[1]}, 1.0);
+        return weight(f, Cov2d<double>{y[2], y[3], y[4], y[2] * y[4] - y[3] * y[3]}, Vec2<double>{y[0], y[1]});
       };
       ASSERT_NEAR(weights[i], moved(0), 1e-14);
-      if (kIsFrozen<F> && k >= 2) continue;
+      if (f.is_frozen() && k >= 2) continue;
       ASSERT_NEAR(grads[k], derivative(moved, 1e-4), 1e-7) << k;
     }
   }
 }
 
-TEST(FindStages, KnowsNoOtherNames) {
-  EXPECT_EQ(cpu::find_stages<float>("nothing"), nullptr);
-  EXPECT_EQ(cpu::find_stages<double>(""), nullptr);
+/// L = <dL_dimage, image>, in which no small step may carry an alpha across a threshold: smooth where it does not.
+double loss_of(const Rendered<double>& out, const Scene<double>& scene) {
+  double loss = std::inner_product(out.image.begin(), out.image.end(), scene.dL_dimage.begin(), 0.0);
+  if (!scene.dL_dalpha.empty())
+    loss += std::inner_product(out.alpha.begin(), out.alpha.end(), scene.dL_dalpha.begin(), 0.0);
+  return loss;
+}
+
+// The colour, the depth and its inverse as channels that the projection writes, and a given one before them: every
+// gradient by differences. A difference that straddles a threshold of alpha or of transmittance is off by a jump, which
+// grows as the step shrinks: two steps that agree straddle none.
+TEST(ChannelRows, GradientsMatchDifferences) {
+  const Footprint& f = footprint_named("box4");
+  Scene<double> scene = make_channel_scene<double>(25, 35, 21, 6);
+  std::vector<double> given(25);
+  Random random(3);
+  for (double& x : given) x = random.normal();
+  const auto run = [&] {
+    Pass<double> pass = scene.pass(f.choice());
+    pass.gaussians.colors = scene.colors.data();
+    pass.given = given.data();
+    pass.given_count = 1;
+    pass.color = 1;
+    pass.depth = 4;
+    pass.inverse_depth = 5;
+    return run_stages(cpu::stages_of<double>(f.index), pass);
+  };
+  const Rendered<double> actual = run();
+  double largest = 0;
+  for (size_t i = 0; i < 14 * given.size(); ++i) largest = std::max(largest, std::abs(actual.grads[i]));
+  int compared = 0, smooth = 0;
+  const auto compare = [&](double& number, double gradient, const char* name) {
+    if (gradient == 0) return;
+    const double at = number;
+    const auto slope = [&](double h) {
+      return derivative(
+          [&](double t) {
+            number = at + t;
+            const double loss = loss_of(run(), scene);
+            number = at;
+            return loss;
+          },
+          h);
+    };
+    const double wide = slope(2e-6), narrow = slope(1e-6), bound = 1e-6 * std::abs(wide) + 1e-8 * largest;
+    ++compared;
+    if (std::abs(wide - narrow) > bound) return;
+    ++smooth;
+    EXPECT_NEAR(gradient, narrow, 2 * bound) << name;
+  };
+  const int n = int(given.size());
+  for (int i = 0; i < n; ++i) {
+    for (int k = 0; k < 3; ++k) {
+      compare((&scene.means[i].x)[k], actual.grads[3 * i + k], "mean");
+      compare((&scene.colors[i].x)[k], actual.grads[11 * n + 3 * i + k], "colour");
+    }
+    compare(scene.opacities[i], actual.grads[10 * n + i], "opacity");
+    compare(given[i], actual.dL_dchannels[6 * i], "given channel");
+  }
+  EXPECT_GT(compared, 80);
+  EXPECT_GT(smooth, compared * 9 / 10);
+}
+
+// A number that is not finite, in any channel, culls what would show it, and nothing else.
+TEST(ChannelRows, WhatIsNotFiniteIsCulled) {
+  const Footprint& f = footprint_named("box1");
+  const Scene<float> scene = make_channel_scene<float>(40, 35, 21, 5);
+  const Rendered<float> expected = render(f, scene);
+  for (const float bad : {std::numeric_limits<float>::quiet_NaN(), std::numeric_limits<float>::infinity(), -2e12f}) {
+    for (int c = 0; c < 5; ++c) {
+      Scene<float> broken = scene;
+      for (int i = 0; i < 40; i += 2) broken.channels[5 * i + c] = bad;
+      const Rendered<float> actual = render(f, broken);
+      int culled = 0;
+      for (int i = 0; i < 40; ++i) {
+        if (i % 2) {
+          EXPECT_EQ(actual.radii[i], expected.radii[i]);
+        } else if (expected.radii[i] != actual.radii[i]) {
+          EXPECT_EQ(actual.radii[i], 0);
+          ++culled;
+        }
+      }
+      EXPECT_GT(culled, 5);
+      for (const float x : actual.image) ASSERT_TRUE(std::isfinite(x));
+      for (const float x : actual.grads) ASSERT_TRUE(std::isfinite(x));
+    }
+  }
+}
+
+// Without a gradient of the image and of alpha all of it is zero.
+TEST(ChannelRows, MissingGradientsAreZero) {
+  const Footprint& f = footprint_named("analytic");
+  const Scene<double> scene = make_channel_scene<double>(30, 35, 21, 4);
+  Pass<double> pass = scene.pass(f.choice());
+  pass.dL_dimage = nullptr;
+  Scene<double> zero = scene;
+  std::fill(zero.dL_dimage.begin(), zero.dL_dimage.end(), 0.0);
+  const auto& stages = cpu::stages_of<double>(f.index);
+  EXPECT_EQ(run_stages(stages, pass).grads, run_stages(stages, zero.pass(f.choice())).grads);
+  pass.dL_dalpha = nullptr;
+  for (const double g : run_stages(stages, pass).grads) EXPECT_EQ(g, 0);
+}
+
+/// Public rows of a scene, as project_rows leaves them.
+template <typename T> struct Rows {
+  std::vector<Vec2<T>> means2d;
+  std::vector<Sym2<T>> cov2d;
+  std::vector<T> dets, opacities, depths;
+  std::vector<Vec3<T>> colors;
+  std::vector<int32_t> radii;
+
+  explicit Rows(int64_t n) : means2d(n), cov2d(n), dets(n), opacities(n), depths(n), colors(n), radii(n) {}
+  ProjectedRows<T> view() {
+    return {means2d.data(), cov2d.data(), dets.data(), opacities.data(), depths.data(), colors.data()};
+  }
+};
+
+template <typename T> Rows<T> project_rows(const Footprint& f, const Scene<T>& scene) {
+  const Pass<T> pass = scene.pass(f.choice());
+  Rows<T> rows(pass.gaussians.n);
+  cpu::ProjectRowsParams<T> p = {};
+  p.camera = pass.camera;
+  p.gaussians = pass.gaussians;
+  p.footprint = pass.footprint;
+  p.bounds = cull_bounds<T>(pass.footprint);
+  p.threads = 2;
+  p.radii = rows.radii.data();
+  p.rows = rows.view();
+  cpu::stages_of<T>(f.index).of(p.camera).project_rows(p);
+  return rows;
+}
+
+template <typename T> Lists<T> bin_rows(const Footprint& f, Rows<T>& rows, TileGrid grid, const T* background) {
+  const auto& stages = cpu::stages_of<T>(f.index);
+  Lists<T> lists;
+  const int64_t n = int64_t(rows.radii.size());
+  lists.splats.resize(n * kSplatWidth);
+  lists.ids.resize(n);
+  std::iota(lists.ids.begin(), lists.ids.end(), 0);
+  lists.depths = rows.depths;
+  cpu::ShapeRowsParams<T> p = {};
+  p.n = n;
+  p.rows = rows.view();
+  p.footprint = f.choice();
+  p.grid = grid;
+  p.threads = 2;
+  p.splats = lists.splats.data();
+  stages.shape_rows(p);
+  lists.bin(stages, f.choice(), grid, background, 2);
+  return lists;
+}
+
+class RowsTest : public ::testing::TestWithParam<Footprint> {};
+AR_ALL_FOOTPRINTS(RowsTest);
+
+/// The whole pass in stages: project_rows, bin, blend and back are the pass in one. The gradient with respect to
+/// cov2d is one matrix there and factors here, hence the rounding of needles.
+TEST_P(RowsTest, AreThePassInOne) {
+  const Footprint& f = GetParam();
+  const Scene<double> scene = make_scene<double>(120, 53, 37);
+  const TileGrid grid = {53, 37};
+  const Rendered<double> expected = render(f, scene);
+  Rows<double> rows = project_rows(f, scene);
+  EXPECT_EQ(rows.radii, expected.radii);
+  for (size_t i = 0; i < rows.radii.size(); ++i) {
+    if (rows.radii[i] == 0) rows.dets[i] = -1;  // what is left undefined must not matter
+  }
+  const auto& stages = cpu::stages_of<double>(f.index);
+  const Lists<double> lists = bin_rows(f, rows, grid, scene.background.data());
+  const Channels<double> channels = channels_of<double>(lists, &rows.colors[0].x, 3, false);
+  const Image<double> image = blend(stages, lists, grid, channels, scene.background.data(), 2);
+  EXPECT_EQ(image.image, expected.image);
+  const int64_t n = int64_t(scene.means.size());
+  const Sums<double> sums = blend_vjp<double>(stages, lists, grid, channels, false, n, image, scene.background.data(),
+                                              scene.dL_dimage.data(), nullptr, true, 2);
+  std::vector<Vec2<double>> dL_dmeans2d(n), absolute(n);
+  std::vector<Sym2<double>> dL_dcov2d(n);
+  std::vector<double> dL_dopacities(n), dL_ddepths(n);
+  cpu::RowGradsParams<double> p = {};
+  p.pairs = lists.splat_pairs();
+  p.n = n;
+  p.footprint = f.choice();
+  p.threads = 2;
+  p.rows = rows.view();
+  p.pair_grads = sums.pairs.data();
+  p.pair_stride = sums.stride;
+  p.pair_abs = sums.absolute.data();
+  p.dL_dmeans2d = dL_dmeans2d.data();
+  p.dL_dcov2d = dL_dcov2d.data();
+  p.dL_dopacities = dL_dopacities.data();
+  p.absolute = absolute.data();
+  stages.row_grads(p);
+  std::vector<int32_t> row_of(n);
+  for (int64_t i = 0; i < n; ++i) row_of[i] = rows.radii[i] > 0 ? int32_t(i) : -1;
+  GradArrays<double> grads(scene.gaussians());
+  cpu::ProjectRowsVjpParams<double> vjp = {};
+  vjp.camera = scene.camera.camera_view();
+  vjp.gaussians = scene.gaussians();
+  vjp.grads = grads.views;
+  vjp.threads = 2;
+  vjp.rows = {row_of.data(),     dL_dmeans2d.data(),
+              dL_dcov2d.data(),  dL_dopacities.data(),
+              dL_ddepths.data(), reinterpret_cast<const Vec3<double>*>(sums.dL_dchannels.data())};
+  stages.plain.project_rows_vjp(vjp);
+  double largest = 0;
+  for (const double g : expected.grads) largest = std::max(largest, std::abs(g));
+  for (int64_t i = 0; i < 14 * n; ++i)
+    ASSERT_NEAR(grads.all[i], expected.grads[i], 1e-7 * std::abs(expected.grads[i]) + 1e-9 * largest) << i;
+  for (int64_t i = 0; i < n; ++i) {
+    for (int k = 0; k < 2; ++k) {
+      ASSERT_NEAR(grads.views.means2d[4 * i + k], expected.grads[14 * n + 4 * i + k], 1e-12 * largest);
+      ASSERT_NEAR((&absolute[i].x)[k] * (k ? 37 : 53) / 2, expected.grads[14 * n + 4 * i + 2 + k], 1e-12 * largest);
+    }
+  }
+}
+
+/// L = <dL_dimage, image> from rows, with the determinant of cov2d.
+struct RowsLoss {
+  const Footprint& f;
+  const Scene<double>& scene;
+  TileGrid grid;
+
+  double operator()(Rows<double> rows) const {
+    const auto& stages = cpu::stages_of<double>(f.index);
+    const Lists<double> lists = bin_rows(f, rows, grid, scene.background.data());
+    const auto image =
+        blend(stages, lists, grid, channels_of<double>(lists, nullptr, 3, false), scene.background.data(), 1);
+    return std::inner_product(image.image.begin(), image.image.end(), scene.dL_dimage.begin(), 0.0);
+  }
+};
+
+// row_grads by differences: with respect to means2d, cov2d (its determinant with it) and opacities.
+TEST_P(RowsTest, GradientsMatchDifferences) {
+  const Footprint& f = GetParam();
+  const Scene<double> scene = make_scene<double>(16, 19, 18);
+  const RowsLoss loss = {f, scene, {19, 18}};
+  Rows<double> rows = project_rows(f, scene);
+  const int64_t n = int64_t(rows.radii.size());
+  for (int64_t i = 0; i < n; ++i) {
+    if (rows.radii[i] == 0) rows.opacities[i] = 0, rows.depths[i] = 0;
+    const Sym2<double> c = rows.cov2d[i];
+    rows.dets[i] = c.xx * c.yy - c.xy * c.xy;
+  }
+  const auto& stages = cpu::stages_of<double>(f.index);
+  const Lists<double> lists = bin_rows(f, rows, loss.grid, scene.background.data());
+  const auto channels = channels_of<double>(lists, nullptr, 3, false);
+  const auto image = blend(stages, lists, loss.grid, channels, scene.background.data(), 1);
+  const Sums<double> sums = blend_vjp<double>(stages, lists, loss.grid, channels, true, n, image,
+                                              scene.background.data(), scene.dL_dimage.data(), nullptr, false, 1);
+  std::vector<Vec2<double>> dL_dmeans2d(n);
+  std::vector<Sym2<double>> dL_dcov2d(n);
+  std::vector<double> dL_dopacities(n);
+  cpu::RowGradsParams<double> p = {};
+  p.pairs = lists.splat_pairs();
+  p.n = n;
+  p.footprint = f.choice();
+  p.threads = 1;
+  p.rows = rows.view();
+  p.pair_grads = sums.pairs.data();
+  p.pair_stride = sums.stride;
+  p.dL_dmeans2d = dL_dmeans2d.data();
+  p.dL_dcov2d = dL_dcov2d.data();
+  p.dL_dopacities = dL_dopacities.data();
+  stages.row_grads(p);
+  int compared = 0, smooth = 0;
+  const auto compare = [&](int64_t i, double& number, double gradient, const char* name) {
+    if (gradient == 0) return;
+    const double at = number;
+    const auto slope = [&](double h) {
+      return derivative(
+          [&](double t) {
+            number = at + t;
+            const Sym2<double> c = rows.cov2d[i];
+            const double det = std::exchange(rows.dets[i], c.xx * c.yy - c.xy * c.xy), value = loss(rows);
+            number = at;
+            rows.dets[i] = det;
+            return value;
+          },
+          h);
+    };
+    // Two steps that agree straddle no threshold.
+    const double wide = slope(2e-6), narrow = slope(1e-6), bound = 1e-6 * std::abs(wide) + 1e-7;
+    ++compared;
+    if (std::abs(wide - narrow) > bound) return;
+    ++smooth;
+    EXPECT_NEAR(gradient, narrow, 4 * bound) << name << " " << i;
+  };
+  for (int64_t i = 0; i < n; ++i) {
+    compare(i, rows.means2d[i].x, dL_dmeans2d[i].x, "mean2d");
+    compare(i, rows.means2d[i].y, dL_dmeans2d[i].y, "mean2d");
+    compare(i, rows.opacities[i], dL_dopacities[i], "opacity");
+    if (f.is_frozen()) continue;  // not the formula's derivative
+    compare(i, rows.cov2d[i].xx, dL_dcov2d[i].xx, "cov2d xx");
+    compare(i, rows.cov2d[i].xy, dL_dcov2d[i].xy, "cov2d xy");
+    compare(i, rows.cov2d[i].yy, dL_dcov2d[i].yy, "cov2d yy");
+  }
+  EXPECT_GT(compared, 15);
+  EXPECT_GT(smooth, compared * 8 / 10);
+}
+
+// Rows of any numbers make splats that touch no tile or that blend finitely.
+TEST_P(RowsTest, AnyNumbersAreSafe) {
+  const Footprint& f = GetParam();
+  const float inf = std::numeric_limits<float>::infinity(), nan = std::numeric_limits<float>::quiet_NaN();
+  const Scene<float> scene = make_scene<float>(60, 35, 21);
+  const TileGrid grid = {35, 21};
+  const auto& stages = cpu::stages_of<float>(f.index);
+  for (const float bad : {nan, inf, -inf, -1.0f, 1e30f}) {
+    for (int member = 0; member < 7; ++member) {
+      Rows<float> rows = project_rows(f, scene);
+      const auto spoil = [&](int i) -> float& {
+        switch (member) {
+          case 0:
+            return rows.means2d[i].x;
+          case 1:
+            return rows.cov2d[i].xx;
+          case 2:
+            return rows.cov2d[i].yy;
+          case 3:
+            return rows.dets[i];
+          case 4:
+            return rows.opacities[i];
+          case 5:
+            return rows.depths[i];
+          default:
+            return rows.colors[i].y;
+        }
+      };
+      for (int i = 0; i < 60; i += 3) spoil(i) = bad;
+      for (int i = 0; i < 60; ++i) {
+        if (rows.radii[i] == 0) rows.dets[i] = nan;
+      }
+      const Lists<float> lists = bin_rows(f, rows, grid, scene.background.data());
+      const auto image =
+          blend(stages, lists, grid, channels_of<float>(lists, nullptr, 3, false), scene.background.data(), 1);
+      for (const float x : image.image) ASSERT_TRUE(std::isfinite(x)) << member << " " << bad;
+      // A mean of -1, a colour below zero and any depth that has an order are numbers like others.
+      if (!(bad == -1 && (member == 0 || member == 6)) && !(bad > 0 && member == 5)) {
+        for (int i = 0; i < 60; i += 3)
+          ASSERT_EQ(lists.splat_offsets[i], lists.splat_offsets[i + 1]) << member << " " << bad;
+      }
+    }
+  }
 }
 
 }  // namespace

@@ -1,4 +1,4 @@
-// What the tests share: footprints as a typed list, random numbers, differences, a camera.
+// What the tests share: random numbers, differences, covariances, a camera.
 #pragma once
 
 #include <gtest/gtest.h>
@@ -8,31 +8,10 @@
 #include <random>
 #include <vector>
 
-#include "core/footprint/registry.h"
-#include "core/project.h"
+#include "core/camera.h"
+#include "models.h"
 
 namespace ar::test {
-
-template <class List> struct TypesOf;
-template <class... F> struct TypesOf<FootprintList<F...>> {
-  using Type = ::testing::Types<F...>;
-};
-using AllFootprints = TypesOf<Footprints>::Type;
-
-struct FootprintName {
-  template <class F> static std::string GetName(int) { return F::kName; }
-};
-
-template <class F>
-inline constexpr bool kIsAnalytic =
-    std::is_same_v<F, Analytic<FrameGradient::kFrozen>> || std::is_same_v<F, Analytic<FrameGradient::kPaper>>;
-template <class F>
-inline constexpr bool kIsFrozen = std::is_same_v<F, Analytic<FrameGradient::kFrozen>> || std::is_same_v<F, Erf>;
-template <class F> inline constexpr bool kIsNormal = std::is_same_v<F, Erf> || std::is_same_v<F, Exact>;
-template <class F> inline constexpr bool kIsCumulant = std::is_same_v<F, Cumulant>;
-
-/// The public defaults of the options.
-template <class F> FootprintOptions options_of() { return {std::is_same_v<F, Point> ? 0.3 : 0.1}; }
 
 /// Rounding error of one operation, relative.
 template <typename T> inline constexpr T kEps = std::numeric_limits<T>::epsilon() / 2;
@@ -52,10 +31,11 @@ template <class Function> double derivative(const Function& f, double h) {
 }
 
 /// Sum over the samples of g[s] alpha at d; g null: their mean.
-template <class F, typename T> T weight(Cov2d<T> cov, Vec2<T> d, T opacity, const T* g = nullptr) {
-  const auto terms = F::terms(F::prepare(cov, options_of<F>()), opacity);
-  T total = 0;
-  for (int s = 0; s < F::kSamples; ++s) total += (g ? g[s] : T(1) / F::kSamples) * F::alpha(terms, d, s);
+template <typename T>
+T weight(const Footprint& footprint, Cov2d<T> cov, Vec2<T> d, T opacity = T(1), const T* g = nullptr) {
+  T alphas[16], total = 0;
+  footprint.model<T>().alphas(footprint.row(cov, opacity), d, alphas);
+  for (int s = 0; s < footprint.samples; ++s) total += (g ? g[s] : T(1) / footprint.samples) * alphas[s];
   return total;
 }
 
@@ -128,9 +108,9 @@ template <typename T> struct TestCamera {
     for (int c = 0; c < 3; ++c) position[c] = T(-(m[0][c] * m[0][3] + m[1][c] * m[1][3] + m[2][c] * m[2][3]));
   }
 
-  CameraView<T> look() const { return {view, proj, position, width, height, tan_x, tan_y, nullptr}; }
+  CameraView<T> camera_view() const { return {view, proj, position, width, height, tan_x, tan_y, nullptr}; }
   /// Through a lens, which must outlive what is returned.
-  CameraView<T> look(const Lens<T>& lens) const {
+  CameraView<T> camera_view(const Lens<T>& lens) const {
     return {view, proj, position, width, height, tan_x, tan_y, reinterpret_cast<const T*>(&lens)};
   }
 
