@@ -23,8 +23,8 @@ constexpr int kCountThreads = 512, kCountBlocks = 132 * 2;
 /// how many pairs.
 __global__ void __launch_bounds__(kCountThreads) count_depths_kernel(const uint32_t* keys, const PairRange* ranges,
                                                                      int64_t n, uint32_t* histograms, Counts* counts) {
-  __shared__ uint32_t local[kDepthPasses][kBins];
-  for (int b = threadIdx.x; b < kDepthPasses * kBins; b += kCountThreads) local[0][b] = 0;
+  __shared__ uint32_t local[kDepthPasses * kBins];
+  for (int b = threadIdx.x; b < kDepthPasses * kBins; b += kCountThreads) local[b] = 0;
   __syncthreads();
   unsigned long long pairs = 0, splats = 0;
   const int64_t stride = int64_t(gridDim.x) * kCountThreads, rounded = (n + 31) / 32 * 32;
@@ -37,7 +37,7 @@ __global__ void __launch_bounds__(kCountThreads) count_depths_kernel(const uint3
   }
   __syncthreads();
   for (int b = threadIdx.x; b < kDepthPasses * kBins; b += kCountThreads) {
-    if (local[0][b]) atomicAdd(&histograms[b], local[0][b]);
+    if (local[b]) atomicAdd(&histograms[b], local[b]);
   }
   using Reduce = cub::BlockReduce<unsigned long long, kCountThreads>;
   __shared__ typename Reduce::TempStorage storage;
@@ -55,15 +55,15 @@ __global__ void __launch_bounds__(kCountThreads)
     count_tiles_kernel(const uint32_t* tiles, const Counts* counts, int64_t capacity, uint32_t* histograms) {
   const int64_t n = counts->pairs;
   if (n > capacity) return;
-  __shared__ uint32_t local[kPasses][kBins];
-  for (int b = threadIdx.x; b < kPasses * kBins; b += kCountThreads) local[0][b] = 0;
+  __shared__ uint32_t local[kPasses * kBins];
+  for (int b = threadIdx.x; b < kPasses * kBins; b += kCountThreads) local[b] = 0;
   __syncthreads();
   const int64_t stride = int64_t(gridDim.x) * kCountThreads, rounded = (n + 31) / 32 * 32;
   for (int64_t k = int64_t(blockIdx.x) * kCountThreads + threadIdx.x; k < rounded; k += stride)
     count_digits<kPasses>(k < n ? tiles[k] : 0, k < n, local);
   __syncthreads();
   for (int b = threadIdx.x; b < kPasses * kBins; b += kCountThreads) {
-    if (local[0][b]) atomicAdd(&histograms[b], local[0][b]);
+    if (local[b]) atomicAdd(&histograms[b], local[b]);
   }
 }
 

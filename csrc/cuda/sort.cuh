@@ -45,7 +45,7 @@ struct SortScratch {
 };
 
 /// Adds the digits of a warp's keys to histograms in shared memory.
-template <int kPasses> __device__ void count_digits(uint32_t key, bool valid, uint32_t (*histograms)[kBins]) {
+template <int kPasses> __device__ void count_digits(uint32_t key, bool valid, uint32_t* histograms) {
 #pragma unroll
   for (int pass = 0; pass < kPasses; ++pass) {
     const uint32_t digit = key >> (pass * kDigitBits) & (kBins - 1);
@@ -53,9 +53,9 @@ template <int kPasses> __device__ void count_digits(uint32_t key, bool valid, ui
     int agree = 0;
     __match_all_sync(kAllLanes, valid ? digit : kBins, &agree);
     if (agree) {
-      if (valid && lane_id() == 0) atomicAdd(&histograms[pass][digit], 32);
+      if (valid && lane_id() == 0) atomicAdd(&histograms[pass * kBins + digit], 32);
     } else if (valid) {
-      atomicAdd(&histograms[pass][digit], 1);
+      atomicAdd(&histograms[pass * kBins + digit], 1);
     }
   }
 }
