@@ -33,7 +33,7 @@ template <typename T> struct Scene {
     return g;
   }
 
-  Pass<T> pass(FootprintChoice footprint, int threads = 2) const {
+  Pass<T> pass(FootprintChoice footprint, int threads = 1) const {
     Pass<T> pass;
     pass.camera = camera.camera_view();
     pass.gaussians = gaussians();
@@ -89,7 +89,7 @@ template <typename T> Scene<T> make_channel_scene(int n, int width, int height, 
   return scene;
 }
 
-template <typename T> Rendered<T> render(const Footprint& f, const Scene<T>& scene, int threads = 2) {
+template <typename T> Rendered<T> render(const Footprint& f, const Scene<T>& scene, int threads = 1) {
   return run_stages(cpu::stages_of<T>(f.index), scene.pass(f.choice(), threads));
 }
 
@@ -326,7 +326,7 @@ TEST_P(StagesTest, WeightAndItsAdjoint) {
   }
   cpu::WeightParams<double> p = {};
   p.n = n;
-  p.threads = 2;
+  p.threads = 1;
   p.options = f.options;
   p.offsets = offsets.data();
   p.covs = covs.data();
@@ -477,7 +477,7 @@ template <typename T> Rows<T> project_rows(const Footprint& f, const Scene<T>& s
   p.gaussians = pass.gaussians;
   p.footprint = pass.footprint;
   p.bounds = cull_bounds<T>(pass.footprint);
-  p.threads = 2;
+  p.threads = 1;
   p.radii = rows.radii.data();
   p.rows = rows.view();
   cpu::stages_of<T>(f.index).of(p.camera).project_rows(p);
@@ -497,10 +497,10 @@ template <typename T> Lists<T> bin_rows(const Footprint& f, Rows<T>& rows, TileG
   p.rows = rows.view();
   p.footprint = f.choice();
   p.grid = grid;
-  p.threads = 2;
+  p.threads = 1;
   p.splats = lists.splats.data();
   stages.shape_rows(p);
-  lists.bin(stages, f.choice(), grid, background, 2);
+  lists.bin(stages, f.choice(), grid, background, 1);
   return lists;
 }
 
@@ -522,11 +522,11 @@ TEST_P(RowsTest, AreThePassInOne) {
   const auto& stages = cpu::stages_of<double>(f.index);
   const Lists<double> lists = bin_rows(f, rows, grid, scene.background.data());
   const Channels<double> channels = channels_of<double>(lists, &rows.colors[0].x, 3, false);
-  const Image<double> image = blend(stages, lists, grid, channels, scene.background.data(), 2);
+  const Image<double> image = blend(stages, lists, grid, channels, scene.background.data(), 1);
   EXPECT_EQ(image.image, expected.image);
   const int64_t n = int64_t(scene.means.size());
   const Sums<double> sums = blend_vjp<double>(stages, lists, grid, channels, false, n, image, scene.background.data(),
-                                              scene.dL_dimage.data(), nullptr, true, 2);
+                                              scene.dL_dimage.data(), nullptr, true, 1);
   std::vector<Vec2<double>> dL_dmeans2d(n), absolute(n);
   std::vector<Sym2<double>> dL_dcov2d(n);
   std::vector<double> dL_dopacities(n), dL_ddepths(n);
@@ -534,7 +534,7 @@ TEST_P(RowsTest, AreThePassInOne) {
   p.pairs = lists.splat_pairs();
   p.n = n;
   p.footprint = f.choice();
-  p.threads = 2;
+  p.threads = 1;
   p.rows = rows.view();
   p.pair_grads = sums.pairs.data();
   p.pair_stride = sums.stride;
@@ -551,7 +551,7 @@ TEST_P(RowsTest, AreThePassInOne) {
   vjp.camera = scene.camera.camera_view();
   vjp.gaussians = scene.gaussians();
   vjp.grads = grads.views;
-  vjp.threads = 2;
+  vjp.threads = 1;
   vjp.rows = {row_of.data(),     dL_dmeans2d.data(),
               dL_dcov2d.data(),  dL_dopacities.data(),
               dL_ddepths.data(), reinterpret_cast<const Vec3<double>*>(sums.dL_dchannels.data())};
