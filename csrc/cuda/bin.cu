@@ -93,12 +93,12 @@ __global__ void __launch_bounds__(kRangeThreads)
 
 constexpr int kPlanThreads = 256;
 
-/// Work is handed out by samples, and of those longest first, so that no block starts on a long piece when the others are
-/// done. Lengths are classed by powers of two; within a class the order does not matter.
+/// Work is handed out by samples, and of those longest first, so that no block starts on a long piece when the others
+/// are done. Lengths are classed by powers of two; within a class the order does not matter.
 struct WorkClasses {
   __device__ static int of(int samples, int length) { return sample_class(samples) * kLengthClasses + __clz(length); }
-  /// Adds a piece to its class and returns how many were there. Lanes of one class go together: atomics to one place are
-  /// slow.
+  /// Adds a piece to its class and returns how many were there. Lanes of one class go together: atomics to one place
+  /// are slow.
   __device__ static int take(int32_t* classes, int of) {
     const uint32_t peers = __match_any_sync(__activemask(), of);
     const int leader = __ffs(peers) - 1;
@@ -132,9 +132,8 @@ __global__ void __launch_bounds__(kPlanThreads)
 }
 
 /// Places come from atomics: which tile gets which differs from run to run, and changes no result.
-__global__ void __launch_bounds__(kPlanThreads)
-    plan_kernel(const TileLists lists, TileGrid grid, int most_samples, bool whole, CheckpointLayout layout,
-                const ChunkPlan plan) {
+__global__ void __launch_bounds__(kPlanThreads) plan_kernel(const TileLists lists, TileGrid grid, int most_samples,
+                                                            bool whole, CheckpointLayout layout, const ChunkPlan plan) {
   using Scan = cub::BlockScan<int, kPlanThreads>;
   static_assert(kWorkClasses < kPlanThreads);
   __shared__ typename Scan::TempStorage storage;
@@ -202,8 +201,7 @@ void sort_values(const TileSort<Value>& p, TileGrid grid, uint32_t* memory, cuda
   for (int pass = 0; pass < passes; ++pass) {
     // After an overflow the histograms are empty, and with them the sort.
     sort_pass_kernel<Value, false><<<unsigned(scratch.blocks), kSortThreads, 0, stream>>>(
-        scratch, pass, 0, 0, p.tiles[pass % 2], p.tiles[1 - pass % 2], p.values[pass % 2],
-        p.values[1 - pass % 2]);
+        scratch, pass, 0, 0, p.tiles[pass % 2], p.tiles[1 - pass % 2], p.values[pass % 2], p.values[1 - pass % 2]);
   }
   tile_offsets_kernel<<<blocks_of(grid.tiles() + 1, kRangeThreads), kRangeThreads, 0, stream>>>(
       p.tiles[passes % 2], p.counts, p.capacity, grid.tiles(), p.tile_offsets, p.feedback);
@@ -235,12 +233,11 @@ void sort_by_depth(const DepthSort& p, void* memory, cudaStream_t stream) {
   if (p.n == 0) return;
   const SortScratch scratch(static_cast<uint32_t*>(memory), p.n, kDepthPasses);
   const auto blocks = unsigned(scratch.blocks);
-  sort_pass_kernel<int32_t, true><<<blocks, kSortThreads, 0, stream>>>(scratch, 0, p.n, kCulledKey, p.keys[0],
-                                                                       p.keys[1], nullptr, p.order[1]);
+  sort_pass_kernel<int32_t, true>
+      <<<blocks, kSortThreads, 0, stream>>>(scratch, 0, p.n, kCulledKey, p.keys[0], p.keys[1], nullptr, p.order[1]);
   for (int pass = 1; pass < kDepthPasses; ++pass) {
-    sort_pass_kernel<int32_t, false><<<blocks, kSortThreads, 0, stream>>>(scratch, pass, 0, 0, p.keys[pass % 2],
-                                                                          p.keys[1 - pass % 2], p.order[pass % 2],
-                                                                          p.order[1 - pass % 2]);
+    sort_pass_kernel<int32_t, false><<<blocks, kSortThreads, 0, stream>>>(
+        scratch, pass, 0, 0, p.keys[pass % 2], p.keys[1 - pass % 2], p.order[pass % 2], p.order[1 - pass % 2]);
   }
 }
 

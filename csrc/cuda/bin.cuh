@@ -69,7 +69,8 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
   if (count > 0 && params.slot_pairs) params.ranges[i].first = int32_t(begin);
   if (count > 0 && count <= kManyTiles) {
     int64_t place = begin;
-    for_each_tile(support_of(splat, params.footprint), params.grid, [&](int64_t tile) { write_pair(params, place++, tile, i); });
+    for_each_tile(support_of(splat, params.footprint), params.grid,
+                  [&](int64_t tile) { write_pair(params, place++, tile, i); });
   }
   for (uint32_t many = __ballot_sync(kAllLanes, count > kManyTiles); many != 0; many &= many - 1) {
     const int source = __ffs(many) - 1;

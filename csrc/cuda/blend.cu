@@ -26,8 +26,8 @@ void blend(int footprint, const BlendParams& p, cudaStream_t stream) {
 }
 
 void inspect(int footprint, const InspectParams& p, cudaStream_t stream) {
-  visit_tile_footprints<AdaptiveBoxes>(
-      footprint, stream, [&](auto f, cudaStream_t side) { launch_inspect<decltype(f)>(p, side); });
+  visit_tile_footprints<AdaptiveBoxes>(footprint, stream,
+                                       [&](auto f, cudaStream_t side) { launch_inspect<decltype(f)>(p, side); });
 }
 
 }  // namespace ar::cuda

@@ -1,17 +1,18 @@
 // Kernels of blend for up to four channels.
 //
 // Lists are cut into chunks. blend_front goes through a tile's first chunks in order and knows when all pixels have
-// stopped. Where pairs are left, the other chunks, the tail, are done all at once: tail_through finds how much light each
-// lets through, tail_scan from that the transmittance in front of each, with which tail_blend composites each exactly as
-// if the chunks before had just been, and tail_sum adds up. So few tiles with long lists, as in small images of large
-// scenes, still fill the device, and the last bits depend on nothing but the lists.
+// stopped. Where pairs are left, the other chunks, the tail, are done all at once: tail_through finds how much light
+// each lets through, tail_scan from that the transmittance in front of each, with which tail_blend composites each
+// exactly as if the chunks before had just been, and tail_sum adds up. So few tiles with long lists, as in small images
+// of large scenes, still fill the device, and the last bits depend on nothing but the lists.
 #pragma once
 
 #include "cuda/composite.cuh"
 
 namespace ar::cuda {
 
-/// What compositing carries from splat to splat. kSets: sets of channels, 1, or one per sample where checkpoints need it.
+/// What compositing carries from splat to splat. kSets: sets of channels, 1, or one per sample where checkpoints need
+/// it.
 template <int S, int C, int kSets> struct PixelState {
   float transmittance[S];
   Values<C> channels[kSets];
@@ -145,9 +146,12 @@ template <int S> struct TransmittancePlanes {
     first_chunk = layout.first_chunk(params.grid, S);
     chunk_stride = int64_t(layout.planes(S)) * kTilePixels;
     sample_stride = int64_t(of_sample) * kTilePixels;
-    base = params.checkpoints + int64_t(params.plan.tile_planes[tile]) * kTilePixels + pixel * of_sample + of_sample - 1;
+    base =
+        params.checkpoints + int64_t(params.plan.tile_planes[tile]) * kTilePixels + pixel * of_sample + of_sample - 1;
   }
-  __device__ float& at(int chunk, int s) const { return base[(chunk - first_chunk) * chunk_stride + s * sample_stride]; }
+  __device__ float& at(int chunk, int s) const {
+    return base[(chunk - first_chunk) * chunk_stride + s * sample_stride];
+  }
 };
 
 template <int C> __device__ Values<C> background_of(const BlendParams& params) {
@@ -204,7 +208,9 @@ __device__ void accumulate_behind(const PixelCheckpoints<S, C, true>& checkpoint
 
 /// Blocks of blend_front that an SM should hold: bounds the registers.
 template <class F, int C>
-inline constexpr int kFrontBlocks = F::kSamples > 1 ? 1 : sizeof(TileSplat<F, C>) > 96 ? 4 : 5;
+inline constexpr int kFrontBlocks = F::kSamples > 1                ? 1
+                                    : sizeof(TileSplat<F, C>) > 96 ? 4
+                                                                   : 5;
 
 /// A block per tile.
 template <class F, int C, bool kKeep>
@@ -307,8 +313,8 @@ __device__ inline int chunks_of(const BlendParams& params, int tile, int length)
   return int((params.lists.tile_offsets[tile + 1] - params.lists.tile_offsets[tile] + length - 1) / length);
 }
 
-/// Turns the transmittance of each chunk into the one in front of it, negative where a sample has stopped before. Blocks
-/// share the open tiles.
+/// Turns the transmittance of each chunk into the one in front of it, negative where a sample has stopped before.
+/// Blocks share the open tiles.
 template <int S> __global__ void __launch_bounds__(kTilePixels) tail_scan_kernel(const BlendParams params) {
   constexpr int kBatch = 16;
   const int items = params.plan.state->counts.open_tiles[sample_class(S)] * S;
@@ -371,8 +377,7 @@ __global__ void __launch_bounds__(kBlendThreads) tail_blend_kernel(const BlendPa
       const float transmittance = started[s] ? state.transmittance[s] : 0;
       if constexpr (kKeep) {
         checkpoints.kept(tail.chunk, s) = {state.channels[s], transmittance};
-        if (pixel.inside && state.last[s] > 0)
-          atomicMax(&params.last[s * pixel.image + pixel.index], state.last[s]);
+        if (pixel.inside && state.last[s] > 0) atomicMax(&params.last[s * pixel.image + pixel.index], state.last[s]);
       } else {
         checkpoints.transmittance(tail.chunk, s) = transmittance;
       }

@@ -1,6 +1,6 @@
-// Kernel of blend for any number of channels, in groups of 32: a block per tile and group walks the whole list, a pixel per
-// lane. The weights are worked out again for every group, which costs less than to keep them. The yardsticks use it for
-// any number of channels, as their weights are slow anyway.
+// Kernel of blend for any number of channels, in groups of 32: a block per tile and group walks the whole list, a pixel
+// per lane. The weights are worked out again for every group, which costs less than to keep them. The yardsticks use it
+// for any number of channels, as their weights are slow anyway.
 #pragma once
 
 #include "cuda/composite.cuh"
@@ -35,7 +35,8 @@ template <int kBatch> struct GroupChannels {
 
 inline constexpr int kGroupBatch = 128;
 
-template <class F> __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
+template <class F>
+__global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
     blend_groups_kernel(const BlendParams params) {
   constexpr int S = F::kSamples;
   __shared__ Stage<F, 0, kGroupBatch> stage;

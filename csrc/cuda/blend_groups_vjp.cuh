@@ -1,5 +1,5 @@
-// Kernel of blend_vjp for any number of channels, a group of 32 after the other: a block per tile, a warp per subtile, a
-// pixel per lane, back to front through the whole list.
+// Kernel of blend_vjp for any number of channels, a group of 32 after the other: a block per tile, a warp per subtile,
+// a pixel per lane, back to front through the whole list.
 //
 // dL/dalpha is linear in the gradient of the image: each group adds its share to the six sums of a pair, which a single
 // block owns. Only the absolute values |dL/dmean| need the channels of all groups at once: where they are wanted, the
@@ -18,7 +18,8 @@ inline constexpr int kShapeSums = 8;
 template <class F> struct GroupVjpShared {
   TileSplat<F, 0> splats[kVjpBatch];
   GroupChannels<kVjpBatch> channels;
-  float4 contributions[kSubtiles][2][8];  ///< of a warp's 32 pixels; two, so that one can be read while the next is written
+  float4 contributions[kSubtiles][2]
+                      [8];  ///< of a warp's 32 pixels; two, so that one can be read while the next is written
   float sums[kSubtiles][kVjpBatch][kChannelGroup + kShapeSums];  ///< of a warp's pixels
   uint32_t hits[kSubtiles];                                      ///< splats that have sums of a warp
   int32_t rows[kVjpBatch];
@@ -40,7 +41,8 @@ __device__ inline float dot(const float (&g)[kChannelGroup], const float4 (&valu
   return (sum[0] + sum[1]) + (sum[2] + sum[3]);
 }
 
-template <class F> __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
+template <class F>
+__global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
     blend_groups_vjp_kernel(const BlendVjpParams params, int group) {
   constexpr int S = F::kSamples;
   extern __shared__ float4 memory[];
@@ -50,7 +52,8 @@ template <class F> __global__ void __launch_bounds__(kBlendThreads, F::kSamples 
   if (place >= tiles.first[sample_class(S) + 1]) return;
   const TileList list = list_of(params.lists, params.grid, params.chunk_order[place].tile);
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
-  const int first = group * kChannelGroup, lane = lane_id(), warp = threadIdx.x / 32, channel_count = params.channels.count;
+  const int first = group * kChannelGroup, lane = lane_id(), warp = threadIdx.x / 32,
+            channel_count = params.channels.count;
   const bool absolute = params.absolute, all_at_once = absolute && channel_count > kChannelGroup;
   const bool with_shape = !all_at_once || group == 0;
   const Vec2<float> p = pixel_of(warp, lane);
@@ -86,7 +89,7 @@ template <class F> __global__ void __launch_bounds__(kBlendThreads, F::kSamples 
     const float* plane = channel < channel_count ? params.dL_dimage.plane(channel, pixel.image) : nullptr;
     return pixel.inside && plane ? scale * plane[pixel.index] : 0.0f;
   };
-  float g[kChannelGroup];         // this lane's pixel, all channels
+  float g[kChannelGroup];          // this lane's pixel, all channels
   float g_channel[kChannelGroup];  // this lane's channel, all pixels
   float through = 0;               // what the background gives
 #pragma unroll

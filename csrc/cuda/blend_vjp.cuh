@@ -8,8 +8,8 @@ namespace ar::cuda {
 /// What a kernel of blend_vjp sums: gradients, |dL/dmean| of each pixel, or both at once.
 enum class Sums { kGrads, kAbs, kBoth };
 
-/// Samples of a pixel that a warp of blend_vjp takes. More are shared out to the warps of a block: one warp would be busy
-/// for long with their chunk. Only the absolute values need a pixel's sum at once.
+/// Samples of a pixel that a warp of blend_vjp takes. More are shared out to the warps of a block: one warp would be
+/// busy for long with their chunk. Only the absolute values need a pixel's sum at once.
 template <class F, Sums kSums>
 inline constexpr int kVjpSamples = F::kSamples <= 4 || kSums == Sums::kAbs ? F::kSamples : 4;
 
@@ -58,7 +58,10 @@ template <int C> __device__ float dot(const Values<C>& a, const Values<C>& b) {
 
 /// Blocks of blend_vjp that an SM should hold: bounds the registers.
 template <class F, int C>
-inline constexpr int kVjpBlocks = F::kSamples > 1 ? 1 : sizeof(TileSplat<F, C>) > 48 ? 5 : C == 3 ? 7 : 6;
+inline constexpr int kVjpBlocks = F::kSamples > 1                ? 1
+                                  : sizeof(TileSplat<F, C>) > 48 ? 5
+                                  : C == 3                       ? 7
+                                                                 : 6;
 
 /// Warps of a block of blend_vjp: as many as leave room for a few blocks in shared memory.
 template <class F, Sums kSums>
@@ -127,7 +130,7 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const Vec2<float> p0 = pixel_of(0, lane);
   constexpr int kTwo23 = 0x4b000000;
-  const int value = summed_value<kSumCount>(lane);                     // that sum_values leaves here
+  const int value = summed_value<kSumCount>(lane);             // that sum_values leaves here
   const int column = value == 9 ? kPairFourthChannel : value;  // of the pairs' rows
   const float* dL_dplanes[C];
   Values<C> background;

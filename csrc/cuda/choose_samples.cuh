@@ -60,7 +60,8 @@ inline constexpr int kChooseThreads = 256;
 /// kWarps warps per tile: one, or a whole block. SampleEstimate goes through a list in order; here each
 /// thread adds one splat of a group, with what is in front of it from a scan.
 template <class F, int kWarps>
-__global__ void __launch_bounds__(kChooseThreads) choose_samples_kernel(const ChooseParams params, SampleLimits<float> limits) {
+__global__ void __launch_bounds__(kChooseThreads)
+    choose_samples_kernel(const ChooseParams params, SampleLimits<float> limits) {
   constexpr int kThreads = 32 * kWarps;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int64_t tile = (int64_t(blockIdx.x) * kChooseThreads + threadIdx.x) / kThreads;

@@ -1,8 +1,8 @@
 // What the kernels of blend and blend_vjp share: pixels, lists of tiles, and splats staged for a tile.
 //
-// A tile's 16x16 pixels are eight subtiles of 8x4, a warp of lanes each: subtile b at column b % 2 and row b / 2, lane l
-// at column l % 8 and row l / 8 of it. A splat is tested against the subtiles once per tile; warps skip those that do not
-// reach them.
+// A tile's 16x16 pixels are eight subtiles of 8x4, a warp of lanes each: subtile b at column b % 2 and row b / 2, lane
+// l at column l % 8 and row l / 8 of it. A splat is tested against the subtiles once per tile; warps skip those that do
+// not reach them.
 #pragma once
 
 #include <type_traits>
@@ -89,8 +89,7 @@ template <class F, int C> struct alignas(16) TileSplat {
 
 /// A staged splat in use: copied to registers, unless it has too many numbers.
 template <class F, int C>
-using TileSplatRef =
-    std::conditional_t<sizeof(TileSplat<F, C>) <= 112, const TileSplat<F, C>, const TileSplat<F, C>&>;
+using TileSplatRef = std::conditional_t<sizeof(TileSplat<F, C>) <= 112, const TileSplat<F, C>, const TileSplat<F, C>&>;
 
 /// The channels of a splat: three lie in it; of four, those that there are in rows, and zeros.
 template <int C, class F>
@@ -179,8 +178,8 @@ __device__ inline void put_sum(float* rows, int width, bool overflow, int32_t ro
   }
 }
 
-/// Calls f(F{}, stream) for the footprint F of every kind of tile: where samples are chosen those of Boxes, side by side,
-/// as a few tiles of many samples would else keep the device waiting.
+/// Calls f(F{}, stream) for the footprint F of every kind of tile: where samples are chosen those of Boxes, side by
+/// side, as a few tiles of many samples would else keep the device waiting.
 template <class F, class Boxes, class Function> void for_each_tile_footprint(cudaStream_t stream, Function&& f) {
   if constexpr (std::is_same_v<F, Adaptive>) {
     SideStreams sides(stream);

@@ -6,10 +6,10 @@
 
 namespace ar::cuda {
 
-/// Remembers the frames of one image size. A frame that turns out to have more pairs than there is room for is slow, not
-/// wrong, so the first frames are counted, and wait for the device; afterwards the largest frame so far, and a reserve,
-/// are room enough in all but the rarest cases. The number of Gaussians may change from frame to frame: with more of them
-/// than were ever seen the room grows in proportion, with fewer it stays.
+/// Remembers the frames of one image size. A frame that turns out to have more pairs than there is room for is slow,
+/// not wrong, so the first frames are counted, and wait for the device; afterwards the largest frame so far, and a
+/// reserve, are room enough in all but the rarest cases. The number of Gaussians may change from frame to frame: with
+/// more of them than were ever seen the room grows in proportion, with fewer it stays.
 class PairGuess {
  public:
   /// Frames that are counted at the start.
@@ -62,9 +62,9 @@ class PairGuess {
   Frame recent_[kRecent] = {};
 };
 
-/// The guesses of the image sizes used last. The device writes the number of pairs of each frame into a word of host memory
-/// when it gets there; nobody waits for it. A word says which frame it is of, so that a write that comes after its slot
-/// was given to another image size is known as such.
+/// The guesses of the image sizes used last. The device writes the number of pairs of each frame into a word of host
+/// memory when it gets there; nobody waits for it. A word says which frame it is of, so that a write that comes after
+/// its slot was given to another image size is known as such.
 class PairGuesses {
  public:
   static constexpr int kSlots = 64;

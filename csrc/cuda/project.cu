@@ -4,14 +4,12 @@
 namespace ar::cuda {
 namespace {
 
-template <class Params>
-void launch(void (*kernel)(Params), const Params& p, int64_t n, cudaStream_t stream) {
+template <class Params> void launch(void (*kernel)(Params), const Params& p, int64_t n, cudaStream_t stream) {
   if (n > 0) kernel<<<blocks_of(n, kProjectThreads), kProjectThreads, 0, stream>>>(p);
 }
 
 /// The kernel for the camera: `plain` or `full`.
-template <class Params>
-void launch(void (*plain)(Params), void (*full)(Params), const Params& p, cudaStream_t stream) {
+template <class Params> void launch(void (*plain)(Params), void (*full)(Params), const Params& p, cudaStream_t stream) {
   launch(p.camera.lens ? full : plain, p, p.gaussians.n, stream);
 }
 

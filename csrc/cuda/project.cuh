@@ -29,8 +29,7 @@ __device__ inline uint32_t rows_not_finite(const Channels<float>& channels, int6
   return found;
 }
 
-template <class Cam>
-__global__ void __launch_bounds__(kProjectThreads) project_kernel(const ProjectParams params) {
+template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_kernel(const ProjectParams params) {
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
   const Gaussians<float>& g = params.gaussians;
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;

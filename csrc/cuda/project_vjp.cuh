@@ -17,9 +17,7 @@ struct SplatSums {
       value[4 * q] += v.x, value[4 * q + 1] += v.y, value[4 * q + 2] += v.z, value[4 * q + 3] += v.w;
     }
   }
-  __device__ PairGrad<float> grad() const {
-    return {{{value[0], value[1]}, {value[2], value[3], value[4]}}, value[5]};
-  }
+  __device__ PairGrad<float> grad() const { return {{{value[0], value[1]}, {value[2], value[3], value[4]}}, value[5]}; }
   __device__ Vec2<float> absolute() const { return {value[kPairAbsolute], value[kPairAbsolute + 1]}; }
   __device__ Vec3<float> color() const {
     return {value[kPairChannels], value[kPairChannels + 1], value[kPairChannels + 2]};
@@ -86,7 +84,8 @@ struct FromPairs {
 
   /// What is known of Gaussian i before its gradient is asked for. count: 0 if it has none.
   __device__ PairRange range(int64_t i) const { return params.sums.ranges[i]; }
-  /// Calls use(gradient with respect to the splat as a function of it, what it shows, |dL/dmean|) where range.count > 0.
+  /// Calls use(gradient with respect to the splat as a function of it, what it shows, |dL/dmean|) where range.count >
+  /// 0.
   template <class Cam, class Use>
   __device__ void visit(const Cam& camera, int64_t i, PairRange range, Use&& use) const {
     const SplatSums sums = sum_pairs(params.sums, i, range);
@@ -111,8 +110,7 @@ struct FromRows {
     const int32_t row = params.rows.rows[i];
     return {row, row >= 0 ? 1 : 0};
   }
-  template <class Cam, class Use>
-  __device__ void visit(const Cam&, int64_t, PairRange range, Use&& use) const {
+  template <class Cam, class Use> __device__ void visit(const Cam&, int64_t, PairRange range, Use&& use) const {
     if (range.count == 0) return;
     const int64_t row = range.first;
     ShownGrad<float> shown = {{0, 0, 0}, 0};

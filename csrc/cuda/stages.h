@@ -29,8 +29,8 @@ inline constexpr int chunk_length(int samples) { return samples <= 4 ? 256 : 64 
 inline constexpr int kWholeList = 1 << 30;
 
 /// Chunks of a tile that blend goes through one after the other, which reads no pair behind the point where all pixels
-/// have stopped. The remaining chunks are blended side by side. With many tiles there is enough to do side by side; with
-/// few, a long list must not keep a single block busy.
+/// have stopped. The remaining chunks are blended side by side. With many tiles there is enough to do side by side;
+/// with few, a long list must not keep a single block busy.
 AR_HD int front_chunks(TileGrid grid, int samples) {
   const int pairs = grid.tiles() >= 2048 ? 2048 : 256;
   return pairs > chunk_length(samples) ? pairs / chunk_length(samples) : 1;

@@ -27,8 +27,8 @@ __device__ inline int warp_max(int v) {
 #endif
 }
 
-/// Sums N = 8, 9 or 10 values over the lanes with 9 or 12 shuffles instead of 5 N: lanes trade the halves that the other
-/// will sum. A lane l gets the sum of value summed_value<N>(l).
+/// Sums N = 8, 9 or 10 values over the lanes with 9 or 12 shuffles instead of 5 N: lanes trade the halves that the
+/// other will sum. A lane l gets the sum of value summed_value<N>(l).
 template <int N> __device__ float sum_values(const float (&v)[N]) {
   static_assert(N >= 8 && N <= 10);
   const int lane = lane_id();

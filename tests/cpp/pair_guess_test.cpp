@@ -9,7 +9,8 @@ namespace {
 
 constexpr int64_t kMost = (int64_t(1) << 30) - 1;
 
-/// Renders frames of one image size with a device that is `lag` frames behind, as long as the host does not wait for it.
+/// Renders frames of one image size with a device that is `lag` frames behind, as long as the host does not wait for
+/// it.
 class Renderer {
  public:
   explicit Renderer(int width = 640, int lag = 2) : width_(width), lag_(lag) {}
