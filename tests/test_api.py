@@ -1,6 +1,7 @@
 """The contract with code that was written for other rasterizers, and with wrong input."""
 
 import copy
+import functools
 import inspect
 import math
 import os
@@ -13,12 +14,13 @@ import pytest
 import reference
 import scenes
 import torch
+import torch.utils._pytree
 from conftest import each_precision
 from scenes import PATHS, RENDERED, Camera, name_of
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C
-from analytic_rasterizer.camera import make_lens
 from analytic_rasterizer.footprints import check_device
 
 FIELDS = (
@@ -665,7 +667,7 @@ def test_debug_writes_a_snapshot_on_failure(device, tmp_path, monkeypatch):
     with pytest.raises(ValueError, match="scales must"):
         render(dict(scene32(device), scales=t(20, 2, device=device)), settings)
     saved = torch.load(tmp_path / "snapshot_fw.dump", weights_only=False)
-    assert any(torch.is_tensor(a) and a.shape == (20, 2) for a in saved)
+    assert saved["scales"].shape == (20, 2) and saved["footprint"] == "analytic" and saved["shs"] is not None
     with pytest.raises(ValueError, match="scales must"):
         render(dict(scene32(device), scales=t(20, 2, device=device)))  # without debug: no file
     assert [path.name for path in tmp_path.iterdir()] == ["snapshot_fw.dump"]
@@ -674,17 +676,14 @@ def test_debug_writes_a_snapshot_on_failure(device, tmp_path, monkeypatch):
 def test_debug_writes_a_snapshot_when_the_backward_pass_fails(device, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
-    def fail(*arguments):
-        raise RuntimeError("out of something")
-
-    monkeypatch.setattr(torch.ops.analytic_rasterizer, "rasterize_vjp", fail)
-    leaves = scenes.leaves(scene32(device))
-    color, _ = render(leaves, CAMERA.settings(torch.float32, device)._replace(debug=True))
-    with pytest.raises(RuntimeError, match="out of something"):
-        (2 * color).sum().backward()
+    function, arguments = calls(("box", {"samples": 4}), device, False)["rasterize_vjp"]
+    named = dict(zip((argument.name for argument in function._schema.arguments), arguments))
+    named |= {"debug": True, "dL_doutputs": [torch.ones(3, 5, 5, device=device)]}
+    with pytest.raises(ValueError, match=r"dL_dcolor must have shape \(3, 37, 45\), got \(3, 5, 5\)"):
+        function(**named)
     saved = torch.load(tmp_path / "snapshot_bw.dump", weights_only=False)
-    assert torch.equal(saved[0], torch.full_like(color, 2).cpu())
-    assert saved[1] is None and torch.equal(saved[2], leaves["means3D"].detach().cpu())
+    assert torch.equal(saved["dL_doutputs"][0], torch.ones(3, 5, 5))
+    assert torch.equal(saved["means3D"], named["means3D"].cpu()) and saved["shs"].shape == named["shs"].shape
     assert [path.name for path in tmp_path.iterdir()] == ["snapshot_bw.dump"]
 
 
@@ -706,76 +705,50 @@ def test_debug_changes_no_bit(device):
 # --- torch.library -----------------------------------------------------------------------------
 
 
-FULL = ar.Effects(camera_gradients=True, off_center=True, defocus=ar.Defocus(0.1, 2.0))
+class Calls(TorchDispatchMode):
+    """Records the arguments of the first call of every op of ours."""
+
+    def __init__(self):
+        super().__init__()
+        self.first = {}
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        if func.namespace == "analytic_rasterizer":
+            self.first.setdefault(func._schema.name.split("::")[1], (func, args))
+        return func(*args, **(kwargs or {}))
 
 
-def op_arguments(variant, device, keep, gradient, effects=None, alpha=False):
-    """Arguments of the `rasterize` op, as its schema orders them; with effects, for a full camera."""
-    footprint = ar.resolve_footprint(variant[0], **variant[1])
-    fields = CAMERA.fields(torch.float32, device)
+def calls(variant, device, full):
+    """Arguments of every op, of all that the package does with them; `full`: a full camera, and outputs."""
+    return _calls(variant[0], tuple(variant[1].items()), device, full)
+
+
+@functools.cache
+def _calls(footprint, options, device, full):
+    effects = ar.Effects(gaussian_stats=True)
+    if full:
+        effects = ar.Effects(alpha=True, depth=True, median_depth=True, off_center=True, defocus=ar.Defocus(0.1, 2.0))
+    settings = CAMERA.settings(torch.float32, device, footprint=footprint, effects=effects, **dict(options))
     scene = scene32(device)
-    if gradient:
-        scene = scenes.leaves(scene)
-    gaussians = [scene.get(name) for name in scenes.INPUTS]
-    tensors = [fields[k] for k in ("bg", "viewmatrix", "projmatrix", "campos")]
-    numbers = [fields[k] for k in ("image_height", "image_width", "tanfovx", "tanfovy")]
-    numbers += [fields["scale_modifier"], fields["sh_degree"], footprint.key, footprint.option]
-    lens = None if effects is None else make_lens(effects, CAMERA.settings(torch.float32, device), tensors[0])
-    camera = [*tensors[1:], lens]
-    if effects is not None and gradient:
-        camera = [t.requires_grad_() for t in camera]
-    return [*gaussians, tensors[0], *camera, *numbers, keep, alpha, False]
+    leaves = scenes.leaves(scene)
+    if full:
+        settings = settings._replace(viewmatrix=settings.viewmatrix.clone().requires_grad_())
+    with Calls() as mode:
+        ar.GaussianRasterizer(settings)(**leaves)[0].sum().backward()
+        del scene["means2D"], leaves["means2D"]
+        ar.render_stages(settings, **scene)
+        splats = ar.project([settings, settings], **leaves)
+        image, alpha = ar.blend(splats, ar.bin(splats), torch.ones(len(splats.means2d), 5, device=device))
+        (image.sum() + alpha.sum()).backward()
+        offset, cov2d = torch.ones(7, 2, device=device), torch.tensor([2.0, 0.3, 1.0], device=device)
+        ar.footprint_weight(offset.requires_grad_(), cov2d, footprint, **dict(options)).sum().backward()
+    return mode.first
 
 
 OPS = {
-    "rasterize": lambda v, d: op_arguments(v, d, True, True),
-    "rasterize (inference)": lambda v, d: op_arguments(v, d, False, False),
-    "rasterize (full camera, alpha)": lambda v, d: op_arguments(v, d, True, True, FULL, True),
-    "rasterize_stages": lambda v, d: [  # no means2D, no keep, no debug
-        a for i, a in enumerate(op_arguments(v, d, False, False)) if i not in (1, 21, 22, 23)
-    ],
-    "rasterize_vjp": lambda v, d: vjp_arguments(v, d),
-    "rasterize_vjp (full camera, alpha)": lambda v, d: vjp_arguments(v, d, FULL),
-    "rasterize_channels": lambda v, d: channels_arguments(v, d),
-    "inspect": lambda v, d: inspect_arguments(v, d),
-    "footprint_weight": lambda v, d: weight_arguments(v, d, True),
-    "footprint_weight_vjp": lambda v, d: [torch.ones(7, device=d), *weight_arguments(v, d, False)],
+    *("rasterize", "rasterize_timed", "rasterize_vjp", "project", "project_vjp", "bin", "blend", "blend_vjp"),
+    *("inspect", "footprint_weight", "footprint_weight_vjp"),
 }
-
-
-def vjp_arguments(variant, device, effects=None):
-    arguments = op_arguments(variant, device, True, False, effects, alpha=effects is not None)
-    color, _, *saved, alpha = torch.ops.analytic_rasterizer.rasterize(*arguments)
-    needs = [a is not None for a in arguments[:8]] + [effects is not None] * 4
-    g_alpha = torch.ones_like(alpha[0]) if alpha else None
-    return [torch.ones_like(color), g_alpha, *arguments[:-3], *saved, needs, False]
-
-
-def kept_lists(variant, device):
-    """(arguments of rasterize, the lists that it keeps for other colours)."""
-    arguments = op_arguments(variant, device, True, False)
-    splats, ids, pairs, offsets, *_, counts, samples, _ = torch.ops.analytic_rasterizer.rasterize(*arguments)[2:]
-    return arguments, (splats, ids, pairs, offsets, counts, samples)
-
-
-def channels_arguments(variant, device):
-    arguments, lists = kept_lists(variant, device)
-    colors = torch.rand(len(arguments[0]), 3, generator=torch.Generator().manual_seed(0)).to(device)
-    height, width, footprint, option = (arguments[i] for i in (13, 14, 19, 20))
-    return [colors, arguments[8], height, width, footprint, option, *lists, True, False]
-
-
-def inspect_arguments(variant, device):
-    arguments, lists = kept_lists(variant, device)
-    return [*lists, len(arguments[0]), arguments[13], arguments[14], arguments[19]]
-
-
-def weight_arguments(variant, device, gradient):
-    footprint = ar.resolve_footprint(variant[0], **variant[1])
-    g = torch.Generator().manual_seed(0)
-    offset = scenes.rand(g, 7, 2).float().to(device).requires_grad_(gradient)
-    cov2d = scenes.random_cov2d(g, 7, (0.5, 2.0)).float().to(device).requires_grad_(gradient)
-    return [offset, cov2d, footprint.key, footprint.option]
 
 
 def test_every_op_is_checked():
@@ -784,22 +757,29 @@ def test_every_op_is_checked():
         for name in torch._C._dispatch_get_all_op_names()
         if name.startswith("analytic_rasterizer::")
     }
-    assert registered == {name.split(" ")[0] for name in OPS}
+    assert registered == OPS
 
 
+@pytest.mark.parametrize("full", [False, True], ids=["plain", "full"])
 @pytest.mark.parametrize("variant", [v for v in PATHS if v[0] != "cumulant"], ids=name_of)
-@pytest.mark.parametrize("op", OPS)
-def test_opcheck(op, device, variant):
+@pytest.mark.parametrize("op", sorted(OPS))
+def test_opcheck(op, device, variant, full):
     """Schema, fake kernel, autograd registration, and dispatch under tracing.
 
-    rasterize_stages returns how long it took, so two runs of it are never equal, which is what the
-    tracing test asks. Nor are two runs of rasterize or rasterize_channels on CUDA that keep what the
-    backward pass reads: there is room for more pairs than there are, how much depends on earlier
-    frames, and it is not cleared.
+    rasterize_timed returns how long it took, so two runs of it are never equal, which is what the tracing test asks. Nor
+    are two runs on CUDA that keep what the backward pass reads: there is room for more pairs than there are, how much
+    depends on earlier frames, and it is not cleared.
     """
-    overload = getattr(torch.ops.analytic_rasterizer, op.split(" ")[0]).default
+    function, arguments = calls(variant, device, full)[op]
+    differentiable = hasattr(torch.ops.analytic_rasterizer, f"{op}_vjp")
+
+    def copied(value):
+        if not torch.is_tensor(value):
+            return value
+        return value.detach().clone().requires_grad_(differentiable and value.is_floating_point())
+
+    arguments = torch.utils._pytree.tree_map(copied, arguments)
     checks = ("test_schema", "test_autograd_registration", "test_faketensor")
-    keeps = op in ("rasterize", "rasterize (full camera, alpha)", "rasterize_channels")
-    if op != "rasterize_stages" and not (device == "cuda" and keeps):
+    if op != "rasterize_timed" and not (device == "cuda" and op in ("rasterize", "bin", "blend")):
         checks = (*checks, "test_aot_dispatch_dynamic")
-    torch.library.opcheck(overload, tuple(OPS[op](variant, device)), test_utils=checks)
+    torch.library.opcheck(function, arguments, test_utils=checks)

@@ -140,7 +140,7 @@ def test_gradients_add_up_over_the_groups(device, best, variant):
     g = torch.rand(7, 29, 37, generator=torch.Generator().manual_seed(2), dtype=best)
     whole = scenes.leaves(scenes.to(scene, device))
     ar.GaussianRasterizer(scenes.settings_to(settings, device))(**whole)[0].backward(g.to(device))
-    parts = scenes.leaves(scenes.to(scene, device))
+    parts, total, size = scenes.leaves(scenes.to(scene, device)), {}, {}
     for i in range(0, 7, 3):
         colors = torch.nn.functional.pad(parts["colors_precomp"][:, i : i + 3], (0, max(0, i - 4)))
         bg = torch.nn.functional.pad(settings.bg[i : i + 3], (0, max(0, i - 4)))
@@ -148,10 +148,15 @@ def test_gradients_add_up_over_the_groups(device, best, variant):
             **{**parts, "colors_precomp": colors}
         )
         (image[: 7 - i] * g[i : i + 3].to(device)).sum().backward()
-    for name, leaf in whole.items():
-        expected = parts[name].grad
-        if expected is not None:
-            assert (leaf.grad - expected).abs().max() <= 8 * torch.finfo(best).eps * expected.abs().max(), name
+        for name, leaf in parts.items():
+            if leaf.grad is not None:
+                total[name] = total.get(name, 0) + leaf.grad
+                size[name] = size.get(name, 0) + leaf.grad.abs().max()
+                leaf.grad = None
+    for name, expected in total.items():
+        # A gradient of seven channels has a product of seven terms where its parts have three: 10 roundings, of numbers
+        # that may be larger than what they add up to.
+        assert (whole[name].grad - expected).abs().max() <= 16 * torch.finfo(best).eps * size[name], name
 
 
 @each_kind
@@ -262,10 +267,14 @@ def test_debug_names_the_channel_that_is_not_finite(device):
 @pytest.mark.parametrize(
     "colors, bg, message",
     [
-        ((30, 0), (0,), r"colors_precomp must have shape \(30, C\) with C from 1 to 512, got \(30, 0\)"),
-        ((30, 513), (513,), r"colors_precomp must have shape \(30, C\) with C from 1 to 512, got \(30, 513\)"),
-        ((29, 4), (4,), r"colors_precomp must have shape \(30, C\) with C from 1 to 512, got \(29, 4\)"),
-        ((30, 4), (3,), r"bg must have shape \(4,\) or that of the image, got \(3,\)"),
+        ((30, 0), (0,), r"colors_precomp must have shape \(P, C\) with P = 30 and C from 1 to 512, got \(30, 0\)"),
+        (
+            (30, 513),
+            (513,),
+            r"colors_precomp must have shape \(P, C\) with P = 30 and C from 1 to 512, got \(30, 513\)",
+        ),
+        ((29, 4), (4,), r"colors_precomp must have shape \(P, C\) with P = 30 and C from 1 to 512, got \(29, 4\)"),
+        ((30, 4), (3,), r"bg must have shape \(4,\) or \(1, 4\), got \(3,\)"),
         ((30, 3), (3, 29, 36), r"bg must have shape \(3, 29, 37\), got \(3, 29, 36\)"),
     ],
 )

@@ -100,6 +100,13 @@ def test_cameras_in_a_batch_have_gradients(device, dtype):
         torch.testing.assert_close(together[c], alone, rtol=tolerances(dtype)[1], atol=0)
 
 
+def pad(tensor, dim):
+    """With zeros up to three of dimension `dim`."""
+    shape = list(tensor.shape)
+    shape[dim] = 3 - shape[dim]
+    return torch.cat([tensor, tensor.new_zeros(shape)], dim)
+
+
 # --- channels ----------------------------------------------------------------------------------------
 
 
@@ -122,7 +129,6 @@ def test_channels_are_blended_like_colours(device, dtype, channels):
     for first in range(0, channels, 3):
         part = slice(first, min(first + 3, channels))
         width = part.stop - part.start
-        pad = lambda t, dim: torch.cat([t, t.new_zeros(*t.shape[:dim], 3 - t.shape[dim], *t.shape[dim + 1 :])], dim)  # noqa: E731
         three = scenes.leaves(scene | {"colors_precomp": pad(features[:, part], 1)})
         of_three = settings._replace(bg=pad(background[part], 0))
         own, own_radii = ar.GaussianRasterizer(of_three)(means2D=None, **three)
@@ -342,44 +348,3 @@ def test_no_gaussians_no_splats(device):
     assert len(splats.means2d) == 0 and (alpha == 0).all()
     assert torch.equal(image[0], settings.bg[:, None, None].expand(3, 21, 27))
     image.sum().backward()
-
-
-# --- torch.library -----------------------------------------------------------------------------------
-
-
-def captured(call, name):
-    """Arguments of the first call of an op of ours."""
-    from torch.utils._python_dispatch import TorchDispatchMode
-
-    class Capture(TorchDispatchMode):
-        seen = None
-
-        def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-            if func is getattr(torch.ops.analytic_rasterizer, name).default and self.seen is None:
-                self.seen = args, kwargs or {}
-            return func(*args, **(kwargs or {}))
-
-    with Capture() as mode, torch.no_grad():
-        call()
-    assert mode.seen is not None
-    return mode.seen
-
-
-@pytest.mark.parametrize("name", ["rasterize", "project", "bin", "blend"])
-def test_opcheck(name, device):
-    dtype = torch.float64 if device == "cpu" else torch.float32
-    settings, scene = settings_of(dtype, device), scene_of(dtype, device)
-
-    def call():
-        outputs = settings._replace(effects=ar.Effects(alpha=True, depth=True))
-        ar.GaussianRasterizer(outputs)(means2D=None, **scene)
-        splats = ar.project([settings, settings], **scene)
-        ar.blend(splats, ar.bin(splats), torch.ones(len(splats.means2d), 5, dtype=dtype, device=device))
-
-    args, kwargs = captured(call, name)
-    require = {"rasterize": "means3D", "project": "means3D", "blend": "means2d"}.get(name)
-    schema = getattr(torch.ops.analytic_rasterizer, name).default._schema
-    named = dict(zip((a.name for a in schema.arguments), args)) | kwargs
-    if require:
-        named[require] = named[require].clone().requires_grad_()
-    torch.library.opcheck(getattr(torch.ops.analytic_rasterizer, name).default, (), named)

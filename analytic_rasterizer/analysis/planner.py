@@ -229,9 +229,10 @@ def _rms(stages: Stages, reference: Stages) -> float:
 def tile_samples(settings: GaussianRasterizationSettings, gaussians: dict[str, torch.Tensor]) -> torch.Tensor:
     """(rows, columns) int32 on the CPU: the samples that `adaptive`, the footprint of `settings`, takes in every tile.
 
-    `gaussians` are the keywords of `render_stages`.
+    `gaussians` are the keywords of `GaussianRasterizer.forward`.
     """
-    chosen = render_stages(settings, **gaussians).tile_samples
+    stages = render_stages(settings, **{name: value for name, value in gaussians.items() if name != "means2D"})
+    chosen = stages.tile_samples
     return chosen.reshape(-(-settings.image_height // TILE), -1).cpu()
 
 

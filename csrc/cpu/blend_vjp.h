@@ -21,20 +21,22 @@ void load_gradient(const cpu::BlendVjpParams<T>& p, const TileView& view, int fi
   }
 }
 
-/// a . b over `count` channels of one pack of pixels.
+/// a . b over `count` channels of one pack of pixels. Channels behind the third whose gradient is zero change no bit.
 template <class V, typename T> AR_HD V dot_channels(const T* gradient, const T* shown, int count) {
   constexpr int kCount = LanesOf<T>::kCount;
   const auto term = [&](int c, V sum) { return madd(load(gradient + c * kCount, V()), V(shown[c]), sum); };
-  if (count == 3) return term(0, term(1, load(gradient + 2 * kCount, V()) * V(shown[2])));
   const V zero = V(T(0));
+  if (count < 3) return count == 2 ? term(0, term(1, zero)) : term(0, zero);
+  const V colors = term(0, term(1, load(gradient + 2 * kCount, V()) * V(shown[2])));
+  if (count == 3) return colors;
   V sums[4] = {zero, zero, zero, zero};  // as many as hide the latency of a madd
-  int c = 0;
+  int c = 3;
   for (; c + 4 <= count; c += 4) {
     AR_UNROLL
     for (int k = 0; k < 4; ++k) sums[k] = term(c + k, sums[k]);
   }
   for (; c < count; ++c) sums[0] = term(c, sums[0]);
-  return (sums[0] + sums[1]) + (sums[2] + sums[3]);
+  return colors + ((sums[0] + sums[1]) + (sums[2] + sums[3]));
 }
 
 /// `gradient`: room for the channels of a tile. `adapter`: null where rows hold P's shape.
