@@ -36,8 +36,9 @@ template <int kBatch> struct GroupChannels {
 inline constexpr int kGroupBatch = 128;
 
 template <class F>
-__global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
-    blend_groups_kernel(const BlendParams params) {
+__global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4   ? 1
+                                                 : F::kSamples > 1 ? 2
+                                                                   : 3) blend_groups_kernel(const BlendParams params) {
   constexpr int S = F::kSamples;
   __shared__ Stage<F, 0, kGroupBatch> stage;
   __shared__ GroupChannels<kGroupBatch> staged;

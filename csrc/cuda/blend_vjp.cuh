@@ -132,12 +132,12 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
   constexpr int kTwo23 = 0x4b000000;
   const int value = summed_value<kSumCount>(lane);             // that sum_values leaves here
   const int column = value == 9 ? kPairFourthChannel : value;  // of the pairs' rows
-  const float* dL_dplanes[C];
+  const float* dL_dplanes[C];                                  // of three channels all are there
   Values<C> background;
 #pragma unroll
   for (int c = 0; c < C; ++c) {
     const bool used = C == 3 || c < params.channels.count;
-    dL_dplanes[c] = used ? params.dL_dimage.plane(c, image) : nullptr;
+    dL_dplanes[c] = C == 3 ? params.dL_dimage.first + c * image : used ? params.dL_dimage.plane(c, image) : nullptr;
     background.v[c] = used ? params.background[c] : 0;
   }
 #pragma unroll
@@ -147,7 +147,7 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
     const float scale = i < 0 ? 0 : 1.0f / S;
     Values<C> g;
 #pragma unroll
-    for (int c = 0; c < C; ++c) g.v[c] = i >= 0 && dL_dplanes[c] ? scale * dL_dplanes[c][i] : 0;
+    for (int c = 0; c < C; ++c) g.v[c] = i >= 0 && (C == 3 || dL_dplanes[c]) ? scale * dL_dplanes[c][i] : 0;
     stage.set(q, g);
 #pragma unroll
     for (int s = 0; s < kOwn; ++s) {

@@ -213,6 +213,7 @@ struct InspectParams {
   int64_t* units;     ///< [n] sum of weights in units of kWeightUnit, to add to
 };
 
+/// For the three colours in the splats dL_dimage.first is not null.
 struct BlendVjpParams : ar::BlendVjpParams<float> {
   TileLists lists;
   const TileChunk* chunk_order;

@@ -386,7 +386,10 @@ class CudaBackend final : public Backend {
     p.background = background.const_data_ptr<float>();
     p.transmittance = state.transmittance.const_data_ptr<float>();
     p.last = state.last.const_data_ptr<int32_t>();
-    p.dL_dimage = planes_of<const float>(dL_dimage);
+    ImageTensors gradient = dL_dimage;
+    if (!channels.rows.defined() && !gradient.color.defined())  // the kernels for three colours look for no null
+      gradient.color = at::zeros({3, grid.height, grid.width}, floats_);
+    p.dL_dimage = planes_of<const float>(gradient);
     p.dL_dalpha = const_data_or_null<float>(dL_dimage.alpha);
     p.lists = tile_lists_of(lists);
     p.plan = reinterpret_cast<const cuda::PlanState*>(state.chunks.const_data_ptr<int32_t>());

@@ -72,7 +72,9 @@ TEST(PairGuessTest, CountsAgainAfterAnOverflowAndOnlyThen) {
   for (int k = 0; k < 100; ++k) {
     const int64_t next = renderer.frame(1000, 10 * room);
     counted += next == 0;
-    if (counted == PairGuess::kRecountedFrames && next > 0) EXPECT_GE(next, 12 * room);
+    if (counted == PairGuess::kRecountedFrames && next > 0) {
+      EXPECT_GE(next, 12 * room);
+    }
   }
   EXPECT_EQ(counted, PairGuess::kRecountedFrames);
 }
