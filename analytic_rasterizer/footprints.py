@@ -40,8 +40,8 @@ def _default_options(name: str) -> dict[str, Any]:
     return {default["option"]: default["number"] if default["value"] is None else _value_of(default["value"])}
 
 
-OPTIONS: dict[str, dict[str, Any]] = {name: _default_options(name) for name in FOOTPRINTS}
-"""Options of every footprint, and their defaults."""
+OPTIONS = {name: options for name in FOOTPRINTS if (options := _default_options(name))}
+"""Options of the footprints that have any, and their defaults."""
 
 ENVIRONMENT_VARIABLE = "ANALYTIC_RASTERIZER_FOOTPRINT"
 
@@ -101,7 +101,7 @@ def resolve_footprint(name: str, **options: Any) -> Footprint:
     name, _, text = name.partition(":")
     if name not in FOOTPRINTS:
         raise ValueError(f"footprint must be one of {', '.join(FOOTPRINTS)}, got {name!r}")
-    settled = dict(OPTIONS[name])
+    settled = dict(OPTIONS.get(name, {}))
     given = dict(item.partition("=")[::2] for item in text.split(",")) if text else {}
     given.update(options)
     for option, value in given.items():

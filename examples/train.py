@@ -45,7 +45,7 @@ from pathlib import Path
 from statistics import mean, stdev
 
 import torch
-from analytic_rasterizer.report import format_table
+from analytic_rasterizer.analysis.tables import format_table
 from tqdm import tqdm
 
 import analytic_rasterizer as ar

@@ -119,7 +119,7 @@ template <typename T> class CpuBackend final : public Backend {
     out.depths = at::empty({n}, floats_);
     cpu::ProjectRowsParams<T> p = {};
     set_projection(p, in, footprint, radii);
-    if (p.gaussians.shs || p.gaussians.colors) out.colors = at::empty({n, 3}, floats_);
+    if (in.shs || in.colors_precomp) out.colors = at::empty({n, 3}, floats_);
     p.rows = projected_rows_of<T>(out);
     stages_of(footprint).of(p.camera).project_rows(p);
     return out;

@@ -180,7 +180,7 @@ class CudaBackend final : public Backend {
     out.depths = at::empty({n}, floats_);
     cuda::ProjectRowsParams p = {};
     set_projection(p, in, footprint, radii);
-    if (p.gaussians.shs || p.gaussians.colors) out.colors = at::empty({n, 3}, floats_);
+    if (in.shs || in.colors_precomp) out.colors = at::empty({n, 3}, floats_);
     p.rows = projected_rows_of(out);
     cuda::project_rows(p, stream_);
     check_stage("project_rows", false);

@@ -102,6 +102,12 @@ struct ChannelPlan {
   bool makes_rows() const { return columns.color >= 0 || columns.depth >= 0 || columns.inverse_depth >= 0; }
 };
 
+/// What `adaptive` looks at of a background: three channels, those that are missing black.
+Tensor first_three(const Tensor& background) {
+  const int64_t channels = background.size(0);
+  return channels >= 3 ? background.narrow(0, 0, 3) : at::constant_pad_nd(background, {0, 3 - channels});
+}
+
 /// Everything that the adjoint of a rasterization needs.
 struct Saved {
   ListTensors lists;
@@ -170,6 +176,18 @@ std::vector<Tensor> list_of(Grads grads, const Tensor& like) {
   return list;
 }
 
+/// Mean transmittance of every pixel's samples, (H, W). A tile of `adaptive` uses the first of them only.
+Tensor mean_transmittance(const BlendState& state, const ListTensors& lists, TileGrid grid) {
+  if (lists.tile_samples.numel() == 0) return state.transmittance.mean(0);
+  const Tensor samples = lists.tile_samples.view({grid.rows(), grid.columns()})
+                             .repeat_interleave(kTile, 0)
+                             .repeat_interleave(kTile, 1)
+                             .slice(0, 0, grid.height)
+                             .slice(1, 0, grid.width);
+  const Tensor number = at::arange(state.transmittance.size(0), samples.options()).view({-1, 1, 1});
+  return at::where(number.lt(samples), state.transmittance, at::zeros({}, state.transmittance.options())).sum(0) / samples;
+}
+
 /// The gradient with respect to a differentiable output, if there is one.
 Tensor given(const std::vector<OptionalTensor>& gradients, size_t place) {
   return place < gradients.size() && gradients[place] ? *gradients[place] : Tensor();
@@ -193,7 +211,7 @@ Rasterized rasterize(RasterizeArguments a, std::vector<double>* seconds) {
     lap();
     const SplatTensors splats = backend->project(a, footprint, plan.channels, plan.columns, out.radii);
     lap();
-    const ListTensors lists = backend->bin(splats, footprint, grid, plan.background, options);
+    const ListTensors lists = backend->bin(splats, footprint, grid, first_three(plan.background), options);
     lap();
     BlendState state;
     const ImageTensors image = backend->blend(lists, footprint, grid, plan.channels, plan.color_channels,
@@ -257,7 +275,7 @@ std::vector<Tensor> rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
     Tensor dL_dbg = at::empty({0}, a.means3D.options());
     if (needs[kInputTensors]) {
       dL_dbg = dL_dimage.color.defined()
-                   ? (dL_dimage.color * saved.state.transmittance.mean(0)).sum(at::IntArrayRef({1, 2}))
+                   ? (dL_dimage.color * mean_transmittance(saved.state, saved.lists, grid)).sum(at::IntArrayRef({1, 2}))
                    : at::zeros_like(a.bg);
     }
     list.push_back(dL_dbg);
@@ -495,7 +513,7 @@ std::vector<Tensor> blend_vjp(VjpArguments<BlendArguments> arguments) {
     opacities.push_back(rows.opacities);
     if (absolute) sums_abs.push_back(rows.absolute);
     features.push_back(sums.dL_dchannels);
-    backgrounds.push_back(dL_dimage.defined() ? (dL_dimage[c] * state.transmittance.mean(0)).sum(at::IntArrayRef({1, 2}))
+    backgrounds.push_back(dL_dimage.defined() ? (dL_dimage[c] * mean_transmittance(state, part.lists, grid)).sum(at::IntArrayRef({1, 2}))
                                               : at::zeros({channels}, options));
   }
   const auto join = [&](bool wanted, const std::vector<Tensor>& parts, const Tensor& like) {
@@ -510,7 +528,7 @@ std::vector<Tensor> blend_vjp(VjpArguments<BlendArguments> arguments) {
           : cameras == 0 ? at::zeros_like(a.background)
                            : at::stack(backgrounds),
           join(absolute, sums_abs, a.means2d),
-          none.clone(),
+          needs[6] ? at::zeros_like(a.dets) : none.clone(),  // what depends on dets is in cov2d's
           none.clone()};
 }
 
