@@ -161,13 +161,12 @@ TEST_P(FootprintTest, SupportIsConservative) {
           std::max(level, 0.0) * (1 + random.log_uniform(1e-9, 2)) + (level > 0 ? 0 : random.uniform(0, 1));
       const Vec2<double> z =
           unwhiten(f.in_double.ellipse(row), on_circle(std::sqrt(beyond), random.uniform(0, 2 * kPi)));
-      for (int s = 0; s < f.samples; ++s) {
-        const Vec2<double> node = f.node(s);
-        double alphas[16];
-        f.in_double.alphas(row, {z.x - node.x, z.y - node.y}, alphas);
-        ASSERT_LT(alphas[s], kAlphaMin) << "sigma " << s1 << " " << s2 << " opacity " << opacity << " level " << level
-                                        << " |w d|^2 " << beyond;
-      }
+      const int sample = (trial + k) % f.samples;
+      const Vec2<double> node = f.node(sample);
+      double alphas[16];
+      f.in_double.alphas(row, {z.x - node.x, z.y - node.y}, alphas);
+      ASSERT_LT(alphas[sample], kAlphaMin)
+          << "sigma " << s1 << " " << s2 << " opacity " << opacity << " level " << level << " |w d|^2 " << beyond;
     }
   }
 }
