@@ -140,7 +140,7 @@ def _(a):
 @_register("blend_vjp")
 def _(a):
     tensors = (a.means2d, a.cov2d, a.opacities, a.features, a.background, a.means2d_abs)
-    return _gradients(a, (*tensors, None, None))
+    return _gradients(a, (*tensors, a.dets, None))
 
 
 @_register("inspect")

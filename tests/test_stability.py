@@ -467,7 +467,7 @@ def test_debug_names_the_bad_number(device, name, index, value, expectation, tmp
     scene[name][index] = value
     if name != "opacities":
         scene[name][-1] = scene[name][-1]
-    pattern = rf"{name} must {expectation}, got {value} at \({', '.join(map(str, index))}\)"
+    pattern = rf"{name} must {expectation}, got {value:g} at \({', '.join(map(str, index))}\)"
     with pytest.raises(ValueError, match=pattern):
         ar.GaussianRasterizer(settings._replace(debug=True))(**scene)
     assert [path.name for path in tmp_path.iterdir()] == ["snapshot_fw.dump"]
@@ -487,7 +487,7 @@ def test_a_camera_that_is_not_finite_raises(device, name, value, tmp_path, monke
     broken = getattr(settings, name).clone()
     broken[CAMERA_TENSORS[name]] = value
     index = re.escape(str(CAMERA_TENSORS[name]))
-    with pytest.raises(ValueError, match=rf"{name} must be finite, got {value} at {index}"):
+    with pytest.raises(ValueError, match=rf"{name} must be finite, got {value:g} at {index}"):
         ar.GaussianRasterizer(settings._replace(**{name: broken}))(**scene)
 
 

@@ -261,7 +261,7 @@ def render(scene, variant, effects, dtype, device, loss=("color",)):
         color, radii, *rest = ar.GaussianRasterizer(settings)(**inputs)
     results = {"color": color, "radii": radii}
     for name, value in rest[0]._asdict().items() if rest else ():
-        fields = value._asdict() if isinstance(value, ar.effects.GaussianStats) else {name: value}
+        fields = value._asdict() if isinstance(value, ar.GaussianStats) else {name: value}
         results |= {field: image for field, image in fields.items() if image is not None}
     if loss:
         g = torch.Generator().manual_seed(3)

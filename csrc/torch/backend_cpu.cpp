@@ -66,6 +66,9 @@ template <typename T> Channels<T> channels_of(const ChannelTensors& channels, co
 }
 
 /// Members that are undefined become null.
+/// Tiles of an image of 268 million pixels: to write numbers for more of them takes a second or longer.
+constexpr int64_t kManyTiles = int64_t(1) << 20;
+
 template <typename T> ProjectedRows<T> projected_rows_of(RowTensors rows) {
   ProjectedRows<T> out;
   out.means2d = elements_of<Vec2<T>, T>(rows.means2d);
@@ -145,7 +148,7 @@ template <typename T> class CpuBackend final : public Backend {
   ListTensors bin(const SplatTensors& splats, const FootprintSpec& footprint, TileGrid grid, const Tensor& background,
                   PassOptions options) override {
     // An image that cannot be made raises here, before numbers are written for every one of its tiles.
-    at::empty({background.numel(), grid.height, grid.width}, floats_);
+    if (grid.tiles() > kManyTiles) at::empty({background.numel(), grid.height, grid.width}, floats_);
     const int64_t n = splats.ids.size(0);
     const cpu::Stages<T>& stages = stages_of(footprint);
     ListTensors out;
