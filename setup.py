@@ -72,9 +72,9 @@ else:
 # round alike (csrc/core/lanes.h), and bits must not depend on the compiler's choices. Nothing but the module's entry
 # is visible from outside, and nothing that only a debugger reads is installed.
 COMPILE_ARGS = ["-O3", "-g0", "-fopenmp", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi"]
-COMPILE_ARGS += ["-fvisibility=hidden", "-fvisibility-inlines-hidden", "-ffunction-sections"]
+COMPILE_ARGS += ["-fvisibility=hidden", "-fvisibility-inlines-hidden"]
 # libgomp by name only: the loader takes the copy that torch has already loaded.
-LINK_ARGS = ["-fopenmp", "-Wl,--gc-sections", "-Wl,--strip-all"]
+LINK_ARGS = ["-fopenmp", "-Wl,--strip-all"]
 if os.environ.get("ANALYTIC_RASTERIZER_SANITIZE") == "1":
     # Checks as calls: see CMakeLists.txt. No vptr: it wants the type information of torch's hidden classes.
     SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize=vptr", "-fno-sanitize-recover=all"]

@@ -38,10 +38,10 @@ def rasterize_gaussians(
         rotations=rotations,
         cov3D_precomp=cov3Ds_precomp,
     )
+    check_tensors(means3D.device, bg=raster_settings.bg)
     camera = camera_arguments(raster_settings, means3D, gaussians["shs"])
     effects = raster_settings.effects if isinstance(raster_settings.effects, Effects) else _NOTHING
     bg, debug = raster_settings.bg, bool(raster_settings.debug)
-    check_tensors(means3D.device, bg=bg)
     if effects is _NOTHING and bg.dim() < 3:
         return torch.ops.analytic_rasterizer.rasterize(**gaussians, **camera, bg=bg, debug=debug)[::2]
     return _render_with_outputs(gaussians, camera, effects, bg, debug)
