@@ -130,7 +130,7 @@ def compare_gradients(ours, theirs, tolerances):
         over = (error > tolerances[name]).double().mean().item()
         largest = expected.abs().max()
         print(f"{name}: {error.max() / largest.clamp_min(1e-30):.1e} of the largest entry, {over:.2%} of the rows over")
-        assert over <= 0.01, name
+        assert over <= max(0.01, 1 / len(expected)), name  # in a small scene one row
         assert (error <= 1e-3 * largest).all(), name
 
 

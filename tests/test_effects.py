@@ -44,7 +44,8 @@ def depths(scene, camera=CAMERA):
 @each_path
 @pytest.mark.parametrize("channels", [1, 2, 4, 8])
 def test_channels_are_colors_three_at_a_time(device, best, variant, channels):
-    """Bit for bit what rendering those three colours alone gives: the same splats, lists and kernels."""
+    """What rendering those three colours alone gives: bit for bit on the CPU, where any number of channels takes the
+    same steps; on CUDA, whose kernel for many channels adds up samples in another order, to rounding."""
     footprint, options = variant
     scene = scenes.cast(colored(scenes.random_scene(3, 50), channels), best)
     bg = torch.linspace(0.1, 0.9, channels, dtype=best)
@@ -60,7 +61,8 @@ def test_channels_are_colors_three_at_a_time(device, best, variant, channels):
         alone = scenes.settings_to(with_bg(settings, pad(bg[i : i + 3], (0, max(0, i + 3 - channels)))), device)
         single = scenes.leaves(scenes.to({**scene, "colors_precomp": three}, device))
         expected, expected_radii = ar.GaussianRasterizer(alone)(**single)
-        assert torch.equal(color[i : i + 3], expected[: channels - i])
+        # A pixel is a sum of products of at most 1 whose weights add up to 1.
+        assert (color[i : i + 3] - expected[: channels - i]).abs().max() <= (0 if device == "cpu" else 1e-6)
         assert torch.equal(radii, expected_radii)
 
 
@@ -225,18 +227,22 @@ def test_depth_gradient_of_a_culled_gaussian_is_zero(device, best):
 
 @each_path
 def test_asking_for_outputs_changes_no_bit_of_the_colors(device, best, variant):
+    """On CUDA depth takes a kernel of more channels, whose sums round differently."""
     footprint, options = variant
     scene = scenes.cast(scenes.random_scene(11, 60, degree=1), best)
     results = []
-    for effects in (None, ar.Effects(), ar.Effects(alpha=True), ar.Effects(depth=True), ALL):
+    asked = (None, ar.Effects(), ar.Effects(alpha=True), ar.Effects(depth=True), ALL)
+    for effects in asked:
         leaves = scenes.leaves(scenes.to(scene, device))
         settings = CAMERA.settings(best, device, footprint=footprint, effects=effects, **options)
         color, radii, *outputs = ar.GaussianRasterizer(settings)(**leaves)
         assert len(outputs) == (effects is not None and effects.has_outputs)
         color.square().sum().backward()
         results.append([color.detach(), radii, *(leaf.grad for leaf in leaves.values())])
-    for other in results[1:]:
-        assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+    for effects, other in zip(asked[1:], results[1:]):
+        for a, b in zip(results[0], other):
+            bound = 1e-5 * a.abs().max() if device == "cuda" and effects.depth else 0
+            assert (a - b).abs().max() <= bound, effects
 
 
 def test_a_feature_that_is_not_finite_culls_its_gaussian_alone(device, best):

@@ -276,12 +276,19 @@ def bits(tensor):
     return tensor.contiguous().view({2: torch.int16, 4: torch.int32, 8: torch.int64}[tensor.element_size()])
 
 
-def assert_same_bits(found, expected):
-    """Of all that both have."""
+def rounds_differently(device, *effects):
+    """Whether one of them blends depth on CUDA: as further channels, in a kernel whose sums have another order."""
+    return device == "cuda" and any(e is not None and (e.depth or e.inverse_depth) for e in effects)
+
+
+def assert_same_bits(found, expected, rounding=False):
+    """Of all that both have; with `rounding` to 1e-5 of the largest number, 80 roundings."""
     for name in found.keys() & expected.keys():
         a, b = found[name], expected[name]
         assert (a is None) == (b is None), name
-        if a is not None:
+        if a is not None and rounding and a.is_floating_point():
+            assert (a - b).abs().max() <= 1e-5 * b.abs().max(), name
+        elif a is not None:
             assert torch.equal(bits(a), bits(b)), (name, (a.double() - b.double()).abs().max().item())
 
 
@@ -303,7 +310,8 @@ def test_an_effect_changes_nothing_else(variant, device, dtype, name):
             if device == "cuda" and not loss and effects.has_outputs:
                 continue  # outputs keep what a backward pass takes, whose sum over samples has another order
             expected = plain(index, which, PATHS.index(variant), dtype, device, bool(loss))
-            assert_same_bits(render(scene, variant, effects, dtype, device, loss), expected)
+            found = render(scene, variant, effects, dtype, device, loss)
+            assert_same_bits(found, expected, rounds_differently(device, effects))
 
 
 @each_precision
@@ -326,11 +334,13 @@ def test_outputs_do_not_see_each_other(variant, device, dtype):
     together = [*itertools.combinations(OUTPUTS, 2), OUTPUTS]
     for output in OUTPUTS:
         loss = (output if output in ("alpha", "depth", "inverse_depth") else "color",)
-        alone = render(scene, variant, ar.Effects(**{output: True}), dtype, device, loss)
+        own = ar.Effects(**{output: True})
+        alone = render(scene, variant, own, dtype, device, loss)
         for names in together:
             if output in names:
                 effects = ar.Effects(**dict.fromkeys(names, True))
-                assert_same_bits(render(scene, variant, effects, dtype, device, loss), alone)
+                found = render(scene, variant, effects, dtype, device, loss)
+                assert_same_bits(found, alone, rounds_differently(device, own, effects))
 
 
 @each_precision

@@ -2,7 +2,8 @@
 
 #include <torch/csrc/jit/serialization/pickle.h>
 
-#include <fstream>
+#include <algorithm>
+#include <cstdio>
 
 #include "core/camera.h"
 #include "torch/checks.h"
@@ -64,7 +65,10 @@ class Snapshot {
 
   void write() const {
     const std::vector<char> bytes = torch::jit::pickle_save(IValue(*copy_));
-    std::ofstream(path_, std::ios::binary).write(bytes.data(), std::streamsize(bytes.size()));
+    if (std::FILE* file = std::fopen(path_, "wb")) {
+      std::fwrite(bytes.data(), 1, bytes.size(), file);
+      std::fclose(file);
+    }
   }
 
   const char* path_;
