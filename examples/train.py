@@ -45,11 +45,11 @@ from pathlib import Path
 from statistics import mean, stdev
 
 import torch
-from analytic_rasterizer.analysis.tables import format_table
 from tqdm import tqdm
 
 import analytic_rasterizer as ar
 import dataset
+from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.cli import Parser
 from analytic_rasterizer.footprints import resolve_footprint
 from densify import DensityControl, DensityOptions

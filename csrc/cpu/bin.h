@@ -11,21 +11,29 @@
 
 namespace ar::AR_ISA {
 
+/// What the loops over splats and tiles are compiled for.
+template <class F> using TilesOf = std::conditional_t<std::is_same_v<F, Adaptive>, Adaptive, PixelsOf<F>>;
+
 /// How far ahead of its use a splat is fetched: splats are visited in depth order, which is random
 /// in memory.
 inline constexpr int64_t kAhead = 12;
 
-/// visit(splat index, tile) for the pairs of one part of the splats, in depth order.
-template <typename T, class Visit>
-AR_HD void for_each_pair(const cpu::BinParams<T>& p, int64_t part_index, const Visit& visit) {
-  const auto* splats = reinterpret_cast<const SplatRow<T>*>(p.splats);
+template <class F, typename T, class Visit>
+void for_each_pair_of(const cpu::BinParams<T>& p, int64_t part_index, const Visit& visit) {
+  const auto* splats = reinterpret_cast<const Splat<F, T>*>(p.splats);
   const cpu::Part part = cpu::part_of(p.n, p.parts, part_index);
   for (int64_t k = part.begin; k < part.end; ++k) {
     if (k + kAhead < part.end) __builtin_prefetch(&splats[p.order[k + kAhead]]);
     const int32_t j = p.order[k];
     if (!(splats[j].level > T(0))) continue;
-    for_each_tile(support_of(splats[j], p.footprint), p.grid, [&](int64_t tile) { visit(j, tile); });
+    for_each_tile(support_of(splats[j]), p.grid, [&](int64_t tile) { visit(j, tile); });
   }
+}
+/// visit(splat index, tile) for the pairs of one part of the splats, in depth order.
+template <typename T, class Visit>
+void for_each_pair(const cpu::BinParams<T>& p, int64_t part_index, const Visit& visit) {
+  visit_footprint(p.footprint, Footprints{},
+                  [&](auto f) AR_HD_LAMBDA { for_each_pair_of<TilesOf<decltype(f)>>(p, part_index, visit); });
 }
 
 /// Sorts by depth, counts the pairs of each tile, and turns the counts into places.

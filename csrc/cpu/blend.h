@@ -35,6 +35,7 @@ AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* color
   const TileView view(p.grid, tile);
   const LaneIndex<T> lanes;
   const int channels = p.channels.count;
+  const bool three = channels == 3, keeps = p.last != nullptr;
   alignas(64) T transmittance[kSamples][kTilePixels];
   alignas(64) int32_t last[kSamples][kTilePixels] = {};
   std::fill_n(colors, channels * kTilePixels, T(0));
@@ -53,6 +54,7 @@ AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* color
     if (k + 4 < end) __builtin_prefetch(p.splats + int64_t(pairs[k + 4]) * kSplatWidth);
     const Splat<P, T> splat = splat_at(p.splats, pairs[k], adapter);
     const T* shown = p.channels.row(pairs[k]);
+    const Vec3<V> color = three_channels<V>(shown, three);
     const TileMask<T> reach = reach_of(splat, view, lanes);
     const Vec2<T> origin = {T(view.x0) - splat.mean.x, T(view.y0) - splat.mean.y};
     const auto terms = P::terms(splat.shape, splat.opacity, origin);
@@ -69,19 +71,19 @@ AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* color
           const Blended<V> blended = blend_sample(P::alpha(terms, at, s), t);
           store(transmittance[s] + pixel, t);
           contribution = contribution + blended.contribution;
-          if (p.last) {
+          if (keeps) {
             store_index(last[s] + pixel, select(blended.mask, index, load_index(last[s] + pixel, V())));
           }
         }
         T* to = channels_at(colors, pixel, channels);
-        const auto add = [&](int channel) {
+        const auto add = [&](int channel, V value) {
           T* sum = to + channel * kCount;
-          store(sum, madd(contribution, V(shown[channel]), load(sum, V())));
+          store(sum, madd(contribution, value, load(sum, V())));
         };
-        if (channels == 3) {  // unrolled
-          add(0), add(1), add(2);
+        if (three) {
+          add(0, color.x), add(1, color.y), add(2, color.z);
         } else {
-          for (int channel = 0; channel < channels; ++channel) add(channel);
+          for (int channel = 0; channel < channels; ++channel) add(channel, V(shown[channel]));
         }
       }
     }
@@ -96,14 +98,14 @@ AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* color
     if (p.transmittance) store_tile(view, p.grid, transmittance[s], p.transmittance + s * size);
     if (p.last) store_tile(view, p.grid, last[s], p.last + s * size);
   }
-  alignas(64) T color[kTilePixels];
+  alignas(64) T plane[kTilePixels];
   for (int channel = 0; channel < channels; ++channel) {
     const V samples(T{kSamples}), background(p.background[channel]);
     for (int i = 0; i < kTilePixels; i += kCount) {
       const V sum = load(channels_at(colors, i, channels) + channel * kCount, V());
-      store(color + i, sum / samples + load(through + i, V()) * background);
+      store(plane + i, sum / samples + load(through + i, V()) * background);
     }
-    store_tile(view, p.grid, color, p.image.plane(channel, size));
+    store_tile(view, p.grid, plane, p.image.plane(channel, size));
   }
   if (p.alpha) {
     for (int i = 0; i < kTilePixels; ++i) through[i] = T(1) - through[i];

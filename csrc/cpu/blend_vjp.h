@@ -21,7 +21,8 @@ void load_gradient(const cpu::BlendVjpParams<T>& p, const TileView& view, int fi
   }
 }
 
-/// a . b over `count` channels of one pack of pixels. Channels behind the third whose gradient is zero change no bit.
+/// The product of what a pack of pixels has as gradient and what a splat shows, over `count` channels. Channels behind the
+/// third whose gradient is zero change no bit.
 template <class V, typename T> AR_HD V dot_channels(const T* gradient, const T* shown, int count) {
   constexpr int kCount = LanesOf<T>::kCount;
   const auto term = [&](int c, V sum) { return madd(load(gradient + c * kCount, V()), V(shown[c]), sum); };
@@ -50,7 +51,8 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
   const int64_t size = int64_t(p.grid.width) * p.grid.height;
   // What a pair shows enters dL/dalpha with all channels, the sums only with the window's.
   const bool with_shape = p.pair_grads != nullptr, with_abs = with_shape && p.pair_abs;
-  const int loaded = with_shape ? p.channels.count : p.count, window = with_shape ? p.first : 0;
+  const int loaded = with_shape ? p.channels.count : p.count, window = with_shape ? p.first : 0, count = p.count;
+  const bool three = count == 3;
   alignas(64) T transmittance[kSamples][kTilePixels];
   alignas(64) T behind[kSamples][kTilePixels];
   alignas(64) int32_t last[kSamples][kTilePixels] = {};
@@ -101,9 +103,10 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
     const IndexOf<V> index(k);
     ShapeGrad<V> shape = {{zero, zero}, {zero, zero, zero}};
     V weighted = zero;
-    Vec3<V> color = {zero, zero, zero};  // of three channels
+    const Vec3<V> splat_color = three_channels<V>(shown, loaded == 3);
+    Vec3<V> color = {zero, zero, zero};  // sums of three channels
     alignas(64) T sums[cpu::kWindow * kCount];
-    if (p.count != 3) std::fill_n(sums, p.count * kCount, T(0));
+    if (!three) std::fill_n(sums, count * kCount, T(0));
     Vec2<V> abs2d = {zero, zero};
     for (int c = 0; c < TileMask<T>::kPacks; ++c) {
       const V x = load(lanes.value + c * kCount, V());
@@ -112,7 +115,13 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
         if (k >= row_last[row]) continue;
         const Vec2<V> at = {x, V(lanes.value[row])};
         const T* g = channels_at(gradient, pixel, loaded);
-        const V g_color = with_shape ? dot_channels<V>(g, shown, loaded) : zero;
+        V g_color = zero;
+        if (loaded == 3) {
+          g_color = madd(load(g, V()), splat_color.x,
+                         madd(load(g + kCount, V()), splat_color.y, load(g + 2 * kCount, V()) * splat_color.z));
+        } else if (with_shape) {
+          g_color = dot_channels<V>(g, shown, loaded);
+        }
         V contribution = zero;
         ShapeGrad<V> of_pixel = {{zero, zero}, {zero, zero, zero}};
         AR_UNROLL
@@ -130,11 +139,11 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
           if (with_abs) P::add_alpha_vjp(terms, at, s, alpha, grad.dL_dalpha, of_pixel);
         }
         g += window * kCount;
-        if (p.count == 3) {
+        if (three) {
           color = {madd(contribution, load(g, V()), color.x), madd(contribution, load(g + kCount, V()), color.y),
                    madd(contribution, load(g + 2 * kCount, V()), color.z)};
         } else {
-          for (int i = 0; i < p.count * kCount; i += kCount)
+          for (int i = 0; i < count * kCount; i += kCount)
             store(sums + i, madd(contribution, load(g + i, V()), load(sums + i, V())));
         }
         if (with_abs) {
@@ -144,12 +153,12 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
       }
     }
     T* channel_sums = p.channel_sums + (begin + k) * p.channel_stride;
-    if (p.count == 3) {
+    if (three) {
       channel_sums[0] = sum(color.x);
       channel_sums[1] = sum(color.y);
       channel_sums[2] = sum(color.z);
     } else {
-      for (int c = 0; c < p.count; ++c) channel_sums[c] = sum(load(sums + c * kCount, V()));
+      for (int c = 0; c < count; ++c) channel_sums[c] = sum(load(sums + c * kCount, V()));
     }
     if (!with_shape) continue;
     const ShapeGrad<T> total = {{sum(shape.offset.x), sum(shape.offset.y)},

@@ -11,6 +11,7 @@ namespace ar::AR_ISA {
 template <typename T> void choose_samples(const cpu::ChooseSamplesParams<T>& p) {
   const auto* splats = reinterpret_cast<const Splat<Adaptive, T>*>(p.splats);
   const SampleLimits<T> limits = sample_limits<T>(p.tolerance);
+  const auto background = [&](int c) { return c < p.background_count ? p.background[c] : T(0); };
   cpu::parallel_for(p.grid.tiles(), p.threads, [&](int64_t tile) {
     const Vec2<T> center = tile_center<T>(p.grid, tile);
     SampleEstimate<T> estimate;
@@ -19,7 +20,7 @@ template <typename T> void choose_samples(const cpu::ChooseSamplesParams<T>& p) 
       const Vec2<T> d = {center.x - splat.mean.x, center.y - splat.mean.y};
       estimate.add(tile_share(splat.shape, splat.opacity, d), splat.color);
     }
-    p.tile_samples[tile] = limits.choose(estimate.value({p.background[0], p.background[1], p.background[2]}));
+    p.tile_samples[tile] = limits.choose(estimate.value({background(0), background(1), background(2)}));
   });
 }
 

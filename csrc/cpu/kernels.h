@@ -13,9 +13,6 @@
 
 namespace ar::AR_ISA {
 
-/// What the loops over tiles are compiled for.
-template <class F> using TilesOf = std::conditional_t<std::is_same_v<F, Adaptive>, Adaptive, PixelsOf<F>>;
-
 /// Blending; yardsticks, which nobody waits for, only if `kYardsticks`.
 template <typename T, bool kYardsticks> void set_blend_stages(int footprint, cpu::Stages<T>& stages) {
   visit_footprint(footprint, Footprints{}, [&](auto f) {

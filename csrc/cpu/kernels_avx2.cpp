@@ -1,4 +1,4 @@
-// What gains from AVX2.
+// The CPU path for AVX2.
 #if defined(__x86_64__)
 #include "cpu/kernels_std.h"
 

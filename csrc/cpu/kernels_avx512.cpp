@@ -1,4 +1,4 @@
-// What gains from AVX-512.
+// The CPU path for AVX-512.
 #if defined(__x86_64__)
 #include "cpu/kernels_std.h"
 

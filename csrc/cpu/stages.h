@@ -79,7 +79,8 @@ template <typename T> struct ChooseSamplesParams {
   TileLists lists;
   TileGrid grid;
   int threads;
-  const T* background;  ///< [3]
+  const T* background;  ///< [background_count], of which the first three count; those that lack are zero
+  int background_count;
   double tolerance;
   int32_t* tile_samples;  ///< [tiles]
 };

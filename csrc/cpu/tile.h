@@ -48,6 +48,11 @@ template <typename T> struct LaneIndex {
 /// pixel's are together. Channel c of the pack that begins with `pixel` is at pixel * channels + c * lanes.
 template <typename T> AR_HD T* channels_at(T* tile, int pixel, int channels) { return tile + pixel * channels; }
 
+/// Three channels of a splat on every lane, which the loops over pixels keep in registers; zero if there are not three.
+template <class V, typename T> AR_HD Vec3<V> three_channels(const T* shown, bool three) {
+  return three ? Vec3<V>{V(shown[0]), V(shown[1]), V(shown[2])} : Vec3<V>{V(T(0)), V(T(0)), V(T(0))};
+}
+
 /// The packs of a tile that a splat can reach: bit r of rows[c] for pack c of row r.
 template <typename T> struct TileMask {
   static constexpr int kCount = LanesOf<T>::kCount, kPacks = kTile / kCount;

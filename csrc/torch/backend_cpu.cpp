@@ -181,6 +181,7 @@ template <typename T> class CpuBackend final : public Backend {
       choice.grid = grid;
       choice.threads = p.threads;
       choice.background = background.const_data_ptr<T>();
+      choice.background_count = int(background.numel());
       choice.tolerance = footprint.choice.options.number;
       choice.tile_samples = out.tile_samples.template data_ptr<int32_t>();
       stages.choose_samples(choice);

@@ -94,7 +94,10 @@ template <typename T> struct AnyScene {
   bool sane = true;  ///< the camera and the image's gradient are such as occur: gradients must be finite
   int level = 0, threads = 1;
   FootprintChoice footprint = {};
-  T background[3] = {};
+  std::vector<T> background;  ///< [count]
+  std::vector<T> given;       ///< [n, given_count] channels instead of three colours, or empty
+  int given_count = 0, count = 3;
+  bool depth = false, inverse_depth = false;  ///< as channels, behind the others
   std::vector<Vec3<T>> means, scales, colors, shs;
   std::vector<Vec4<T>> rotations;
   std::vector<Sym3<T>> cov3ds;
@@ -173,10 +176,16 @@ template <typename T> AnyScene<T> decode(Bytes& in) {
   scene.threads = in.one_in(8) ? 2 : 1;
   const double option = in.one_in(8) ? std::abs(double(in.any_finite<float>())) : in.between<double>(0, 1);
   scene.footprint.options = {option};
+  // Fewer channels than three, about as many as a window has, and with what the projection writes.
+  if (in.one_in(3)) scene.given_count = in.one_in(2) ? 1 + in.below(5) : 30 + in.below(5);
+  scene.depth = in.one_in(4);
+  scene.inverse_depth = in.one_in(4);
+  scene.count = (scene.given_count ? scene.given_count : 3) + scene.depth + scene.inverse_depth;
+  scene.background.resize(scene.count);
   for (T& x : scene.background) x = in.one_in(16) ? T(in.between<double>(-1e6, 1e6)) : in.between<T>(0, 1);
 
   const int n = in.below(13);
-  const bool by_cov3d = in.one_in(3), by_sh = in.one_in(2);
+  const bool by_cov3d = in.one_in(3), by_sh = in.one_in(2) && scene.given_count == 0;
   scene.sh_degree = by_sh ? in.below((full ? FullCamera<T>::kShDegree : Camera<T>::kShDegree) + 1) : 0;
   scene.sh_stride = by_sh ? sh_count(scene.sh_degree) + in.below(2) : 0;
   scene.scale_modifier = in.one_in(8) ? std::max(std::abs(in.any_finite<T>()), std::numeric_limits<T>::min()) : T(1);
@@ -184,11 +193,11 @@ template <typename T> AnyScene<T> decode(Bytes& in) {
   for (int i = 0; i < n; ++i) {
     // One number in `wild` is any, 0: none. Often the same one again: one bad number may hide another.
     const int wild = in.one_in(tame ? 8 : 2) ? 1 + in.below(8) : 0;
-    const T held = in.any<T>();
-    const bool holds = in.one_in(3);
+    const T repeated = in.any<T>();
+    const bool repeats = in.one_in(3);
     const auto number = [&](auto usual) {
       if (wild == 0 || !in.one_in(wild)) return T(usual());
-      return holds && !in.one_in(4) ? held : in.any<T>();
+      return repeats && !in.one_in(4) ? repeated : in.any<T>();
     };
     // Some just behind the near plane, or where many a lens is in focus.
     const double z =
@@ -211,14 +220,15 @@ template <typename T> AnyScene<T> decode(Bytes& in) {
     }
     if (by_sh) {
       for (int k = 0; k < scene.sh_stride; ++k) scene.shs.push_back({number(color), number(color), number(color)});
-    } else {
+    } else if (scene.given_count == 0) {
       scene.colors.push_back({number(color), number(color), number(color)});
     }
+    for (int c = 0; c < scene.given_count; ++c) scene.given.push_back(number(color));
     scene.opacities.push_back(number([&] { return in.between<double>(0, 1); }));
   }
   const bool any_gradient = in.one_in(16);
   if (any_gradient) scene.sane = false;
-  for (int i = 0; i < 3 * width * height; ++i)
+  for (int i = 0; i < scene.count * width * height; ++i)
     scene.dL_dimage.push_back(any_gradient && in.one_in(8) ? in.any<T>() : T(std::sin(1.7 * i)));
   return scene;
 }
@@ -266,8 +276,18 @@ template <typename T> Rendered<T> render(const AnyScene<T>& scene) {
   pass.camera = scene.camera_view();
   pass.gaussians = scene.gaussians();
   pass.footprint = scene.footprint;
-  pass.background = scene.background;
+  pass.background = scene.background.data();
   pass.dL_dimage = scene.dL_dimage.data();
+  pass.count = scene.count;
+  if (scene.given_count) {
+    pass.given = scene.given.data();
+    pass.given_count = scene.given_count;
+  } else if (scene.count > 3) {
+    pass.color = 0;
+  }
+  const int first = scene.given_count ? scene.given_count : 3;
+  if (scene.depth) pass.depth = first;
+  if (scene.inverse_depth) pass.inverse_depth = scene.count - 1;
   pass.threads = scene.threads;
   return run_stages(stages_of(scene), pass);
 }
@@ -303,6 +323,7 @@ template <typename T> AnyScene<T> without_culled(const AnyScene<T>& scene, const
   keep(kept.colors, 1);
   keep(kept.opacities, 1);
   keep(kept.shs, std::max(scene.sh_stride, 1));
+  keep(kept.given, std::max(scene.given_count, 1));
   return kept;
 }
 
@@ -318,6 +339,9 @@ template <typename T> void check(Bytes& in) {
   const Rendered<T> clean = render(without_culled(scene, out.radii));
   if (std::memcmp(clean.image.data(), out.image.data(), out.image.size() * sizeof(T)) != 0) {
     fail(scene, "what is culled changes the image", -1, 0);
+  }
+  for (const T value : out.dL_dchannels) {
+    if (scene.sane && !std::isfinite(value)) fail(scene, "not finite: gradient of channels", -1, value);
   }
   for (const T value : out.image) {
     if (!std::isfinite(value)) fail(scene, "the image is not finite", -1, value);

@@ -136,8 +136,8 @@ TYPED_TEST(LanesTest, DifferenceOfProductsKeepsItsBound) {
     for (int k = random.below(4); k > 0; --k) d = std::nextafter(d, T(1e9));
     // Exact: the rounding of each product, then their difference, all by fma in twice the precision.
     const long double ab = (long double)a * b, cd = (long double)c * d;
-    const T rest_ab = std::fma(a, b, -T(ab)), rest_cd = std::fma(c, d, -T(cd));
-    const long double exact = ((long double)T(ab) - T(cd)) + ((long double)rest_ab - rest_cd);
+    const T tail_ab = std::fma(a, b, -T(ab)), tail_cd = std::fma(c, d, -T(cd));
+    const long double exact = ((long double)T(ab) - T(cd)) + ((long double)tail_ab - tail_cd);
     ASSERT_NEAR(difference_of_products(a, b, c, d), double(exact), 3 * kEps<T> * std::abs(double(exact)));
   }
 }

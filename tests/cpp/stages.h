@@ -25,7 +25,7 @@ template <typename T> struct Pass {
   int color = -1, depth = -1, inverse_depth = -1;  ///< columns of the channels that the projection writes
   bool absolute = true;
 
-  bool has_channels() const { return given || color >= 0 || depth >= 0 || inverse_depth >= 0; }
+  bool has_channels() const { return given_count > 0 || color >= 0 || depth >= 0 || inverse_depth >= 0; }
 };
 
 /// What the stages write. Gradients lie in one array: means, scales, rotations, opacities, colours, means2d; then
@@ -67,8 +67,9 @@ template <typename T> struct Lists {
   std::vector<int32_t> ids, pairs, samples;
   std::vector<int64_t> tile_offsets, splat_offsets, positions;
 
-  /// Fills the lists from splats, ids and depths. `background` of the first three channels.
-  void bin(const cpu::Stages<T>& stages, FootprintChoice footprint, TileGrid grid, const T* background, int threads) {
+  /// Fills the lists from splats, ids and depths.
+  void bin(const cpu::Stages<T>& stages, FootprintChoice footprint, TileGrid grid, const T* background, int count,
+           int threads) {
     tile_offsets.resize(grid.tiles() + 1);
     splat_offsets.assign(ids.size() + 1, 0);
     cpu::BinParams<T> p = {};
@@ -96,6 +97,7 @@ template <typename T> struct Lists {
     choice.grid = grid;
     choice.threads = threads;
     choice.background = background;
+    choice.background_count = count;
     choice.tolerance = footprint.options.number;
     choice.tile_samples = samples.data();
     stages.choose_samples(choice);
@@ -121,12 +123,13 @@ template <typename T> struct Image {
   std::vector<int32_t> last;
 };
 
-/// What is blended: rows of channels, or with null the colours in the splats.
-template <typename T> Channels<T> channels_of(const Lists<T>& lists, const T* rows, int count, bool by_gaussian) {
+/// What is blended: the splats' own colours, or rows of channels.
+template <typename T>
+Channels<T> channels_of(const Lists<T>& lists, bool own, const T* rows, int count, bool by_gaussian) {
   Channels<T> channels = {};
-  channels.data = rows ? rows : lists.splats.data() + kSplatColor;
-  channels.stride = rows ? count : kSplatWidth;
-  channels.ids = rows && by_gaussian ? lists.ids.data() : nullptr;
+  channels.data = own ? lists.splats.data() + kSplatColor : rows;
+  channels.stride = own ? kSplatWidth : count;
+  channels.ids = !own && by_gaussian ? lists.ids.data() : nullptr;
   channels.count = count;
   return channels;
 }
@@ -251,10 +254,10 @@ template <typename T> Rendered<T> run_stages(const cpu::Stages<T>& stages, const
   project.ids = lists.ids.data();
   of_camera.project(project);
 
-  lists.bin(stages, pass.footprint, grid, pass.background, pass.threads);
+  lists.bin(stages, pass.footprint, grid, pass.background, pass.count, pass.threads);
   out.pairs = int64_t(lists.pairs.size());
   const bool own = !pass.has_channels();
-  const Channels<T> channels = channels_of(lists, own ? nullptr : rows.data(), pass.count, true);
+  const Channels<T> channels = channels_of(lists, own, rows.data(), pass.count, true);
   const Image<T> image = blend(stages, lists, grid, channels, pass.background, pass.threads);
   const Sums<T> sums = blend_vjp(stages, lists, grid, channels, own, g.n, image, pass.background, pass.dL_dimage,
                                  pass.dL_dalpha, pass.absolute, pass.threads);

@@ -501,7 +501,7 @@ template <typename T> Lists<T> bin_rows(const Footprint& f, Rows<T>& rows, TileG
   p.threads = 1;
   p.splats = lists.splats.data();
   stages.shape_rows(p);
-  lists.bin(stages, f.choice(), grid, background, 1);
+  lists.bin(stages, f.choice(), grid, background, 3, 1);
   return lists;
 }
 
@@ -522,7 +522,7 @@ TEST_P(RowsTest, AreThePassInOne) {
   }
   const auto& stages = cpu::stages_of<double>(f.index);
   const Lists<double> lists = bin_rows(f, rows, grid, scene.background.data());
-  const Channels<double> channels = channels_of<double>(lists, &rows.colors[0].x, 3, false);
+  const Channels<double> channels = channels_of<double>(lists, false, &rows.colors[0].x, 3, false);
   const Image<double> image = blend(stages, lists, grid, channels, scene.background.data(), 1);
   EXPECT_EQ(image.image, expected.image);
   const int64_t n = int64_t(scene.means.size());
@@ -579,7 +579,7 @@ struct RowsLoss {
     const auto& stages = cpu::stages_of<double>(f.index);
     const Lists<double> lists = bin_rows(f, rows, grid, scene.background.data());
     const auto image =
-        blend(stages, lists, grid, channels_of<double>(lists, nullptr, 3, false), scene.background.data(), 1);
+        blend(stages, lists, grid, channels_of<double>(lists, true, nullptr, 3, false), scene.background.data(), 1);
     return std::inner_product(image.image.begin(), image.image.end(), scene.dL_dimage.begin(), 0.0);
   }
 };
@@ -598,7 +598,7 @@ TEST_P(RowsTest, GradientsMatchDifferences) {
   }
   const auto& stages = cpu::stages_of<double>(f.index);
   const Lists<double> lists = bin_rows(f, rows, loss.grid, scene.background.data());
-  const auto channels = channels_of<double>(lists, nullptr, 3, false);
+  const auto channels = channels_of<double>(lists, true, nullptr, 3, false);
   const auto image = blend(stages, lists, loss.grid, channels, scene.background.data(), 1);
   const Sums<double> sums = blend_vjp<double>(stages, lists, loss.grid, channels, true, n, image,
                                               scene.background.data(), scene.dL_dimage.data(), nullptr, false, 1);
@@ -687,7 +687,7 @@ TEST_P(RowsTest, AnyNumbersAreSafe) {
       }
       const Lists<float> lists = bin_rows(f, rows, grid, scene.background.data());
       const auto image =
-          blend(stages, lists, grid, channels_of<float>(lists, nullptr, 3, false), scene.background.data(), 1);
+          blend(stages, lists, grid, channels_of<float>(lists, true, nullptr, 3, false), scene.background.data(), 1);
       for (const float x : image.image) ASSERT_TRUE(std::isfinite(x)) << member << " " << bad;
       // A mean of -1, a colour below zero and any depth that has an order are numbers like others.
       if (!(bad == -1 && (member == 0 || member == 6)) && !(bad > 0 && member == 5)) {
