@@ -69,8 +69,8 @@ else:
     SOURCES = [source for source in SOURCES if not source.endswith("_cuda.cpp")]
 
 # No -std: torch sets the standard that its headers need. No contraction: forward and backward must
-# round alike (csrc/core/lanes.h), and bits must not depend on the compiler's choices. Nothing that only a debugger reads
-# is installed; nothing but the module's entry is visible from outside.
+# round alike (csrc/core/lanes.h), and bits must not depend on the compiler's choices. Nothing that only a debugger
+# reads is installed; nothing but the module's entry is visible from outside.
 COMPILE_ARGS = ["-O3", "-g0", "-fopenmp", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi"]
 COMPILE_ARGS += ["-fvisibility=hidden", "-fvisibility-inlines-hidden"]
 # libgomp by name only: the loader takes the copy that torch has already loaded.
