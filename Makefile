@@ -58,7 +58,7 @@ test-python-sanitized: $(VENV)/.installed
 	ANALYTIC_RASTERIZER_CUDA=0 ANALYTIC_RASTERIZER_SANITIZE=1 \
 	  $(BIN)/python setup.py -q build --build-base $(SANITIZED) --build-lib $(SANITIZED)/lib
 	LD_PRELOAD="$(PRELOAD)" ASAN_OPTIONS=detect_leaks=0 PYTHONMALLOC=malloc PYTHONPATH=$(SANITIZED)/lib \
-	  $(BIN)/pytest -q $(SANITIZED_TESTS) -k "$(SANITIZED_SELECT)"
+	  $(BIN)/pytest -q -n0 $(SANITIZED_TESTS) -k "$(SANITIZED_SELECT)"
 
 # The core on arbitrary bytes under the sanitizers, from a seed on; test-sanitized runs the first few.
 SEED ?= 100000

@@ -81,8 +81,11 @@ def _(a):
 
 @_register("rasterize_timed")
 def _(a):
-    rasterized = torch.ops.analytic_rasterizer.rasterize(**vars(a))
-    return *rasterized, torch.empty(3, dtype=torch.float64)
+    *rasterized, saved = torch.ops.analytic_rasterizer.rasterize(**vars(a))
+    if not a.keep:
+        on_cuda = a.means3D.device.type == "cuda"
+        saved = _lists(a.means3D, len(a.means3D) if on_cuda else torch.library.get_ctx().new_dynamic_size(), a, False)
+    return *rasterized, saved, torch.empty(3, dtype=torch.float64)
 
 
 @_register("project")

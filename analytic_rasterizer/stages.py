@@ -302,7 +302,7 @@ def render_stages(
     camera = camera_arguments(settings, means3D, shs)
     check_tensors(means3D.device, bg=settings.bg)
     color, _, radii, saved, seconds = torch.ops.analytic_rasterizer.rasterize_timed(
-        **gaussians, **camera, bg=settings.bg, keep=True
+        **gaussians, **camera, bg=settings.bg
     )
     lists = dict(zip(_C.LISTS, saved))
     ids, splats, pairs = lists["ids"], lists["splats"], lists["pairs"]

@@ -12,8 +12,8 @@ template <typename T> struct BlurredCov {
   Vec2<T> adj_streak;  ///< adj(Sigma) streak
 };
 
-/// Products of adj(Sigma) with the streak are sums of the factors' products. Worked out from the entries of Sigma they would
-/// cancel for a needle along the streak.
+/// Products of adj(Sigma) with the streak are sums of the factors' products. Worked out from the entries of Sigma they
+/// would cancel for a needle along the streak.
 template <typename T>
 AR_HD BlurredCov<T> blurred(const Factors<T>& f, const Gaussians<T>& g, int64_t i, const Blur<T>& by) {
   const Vec2<T>& b = by.streak;

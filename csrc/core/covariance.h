@@ -1,5 +1,5 @@
-// Scale and rotation, or a 3D covariance, to the covariance in the image: EWA projection [EWA, Eq. 29-31]. The way back is
-// in covariance_vjp.h.
+// Scale and rotation, or a 3D covariance, to the covariance in the image: EWA projection [EWA, Eq. 29-31]. The way back
+// is in covariance_vjp.h.
 #pragma once
 
 #include "core/camera.h"

@@ -6,12 +6,13 @@
 
 namespace ar {
 
-/// The gradient with respect to Sigma = A R S^2 R^T A^T, taken to the columns t_k of A R: H_kl = t_k . dL/dSigma t_l and
-/// dL/dSigma t_k. With these every factor's gradient is a product (docs/numerics.md, "Gradient in the turned frame").
+/// The gradient with respect to Sigma = A R S^2 R^T A^T, taken to the columns t_k of A R: H_kl = t_k . dL/dSigma t_l
+/// and dL/dSigma t_k. With these every factor's gradient is a product (docs/numerics.md, "Gradient in the turned
+/// frame").
 template <typename T> struct TurnedGrad {
-  Vec3<T> diagonal, off;         ///< H_kk; H_12, H_20, H_01
-  Vec3<T> x, y;                  ///< dL/dSigma t_k, as two rows
-  Vec3<T> scaled_x, scaled_y;    ///< another part of x and y, already times s_k
+  Vec3<T> diagonal, off;       ///< H_kk; H_12, H_20, H_01
+  Vec3<T> x, y;                ///< dL/dSigma t_k, as two rows
+  Vec3<T> scaled_x, scaled_y;  ///< another part of x and y, already times s_k
 };
 
 /// A covariance M = Sigma + c c^T + v I in the coordinates t_k.

@@ -32,8 +32,8 @@ template <typename T> struct CameraView {
   const T* position;  ///< [3] camera centre, world units
   int width, height;  ///< px
   T tan_half_fov_x, tan_half_fov_y;
-  /// [kLensWidth] numbers of a Lens for a full camera (camera.h), or null for a plain camera, which has only the members
-  /// above.
+  /// [kLensWidth] numbers of a Lens for a full camera (camera.h), or null for a plain camera, which has only the
+  /// members above.
   const T* lens = nullptr;
 };
 
@@ -57,7 +57,8 @@ template <typename T> struct GaussianGrads {
   Vec3<T>* means;
   Vec3<T>* scales;
   Vec4<T>* rotations;
-  Sym3<T>* cov3ds;  ///< an entry off the diagonal is the derivative with respect to the one number that fills both places
+  Sym3<T>*
+      cov3ds;  ///< an entry off the diagonal is the derivative with respect to the one number that fills both places
   T* opacities;
   Vec3<T>* shs;
   Vec3<T>* colors;
@@ -109,7 +110,7 @@ template <typename T> struct ChannelRows {
 
 /// One image (height, width) per channel. The channels from `split` on lie by themselves.
 template <typename T> struct Planes {
-  T* first;     ///< [split, height, width]; null: all of it is missing, or as a gradient zero
+  T* first;  ///< [split, height, width]; null: all of it is missing, or as a gradient zero
   int split;
   T* extra[2];  ///< [height, width] each; null likewise
 
@@ -170,11 +171,11 @@ template <typename T> struct BlendParams {
   TileGrid grid;
   const T* splats;
   Channels<T> channels;
-  const T* background;   ///< [channels.count]
-  Planes<T> image;       ///< one per channel
-  T* alpha;              ///< [height, width] 1 - mean transmittance, or null
-  T* transmittance;      ///< [samples, height, width] of every sample at the end, or null without a backward pass
-  int32_t* last;         ///< [samples, height, width] pairs of the tile up to the last one composited, or null
+  const T* background;  ///< [channels.count]
+  Planes<T> image;      ///< one per channel
+  T* alpha;             ///< [height, width] 1 - mean transmittance, or null
+  T* transmittance;     ///< [samples, height, width] of every sample at the end, or null without a backward pass
+  int32_t* last;        ///< [samples, height, width] pairs of the tile up to the last one composited, or null
 };
 
 /// The gradient of an image to sums per pair.
@@ -195,7 +196,8 @@ template <typename T> struct ProjectVjpParams {
   Gaussians<T> gaussians;
   FootprintChoice footprint;
   GaussianGrads<T> grads;
-  /// Gradient of the rows that ProjectParams::channels wrote; `data` is null where three colours in the pairs' sums are all.
+  /// Gradient of the rows that ProjectParams::channels wrote; `data` is null where three colours in the pairs' sums are
+  /// all.
   ChannelRows<const T> dL_dchannels;
 };
 

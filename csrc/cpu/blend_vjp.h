@@ -21,8 +21,8 @@ void load_gradient(const cpu::BlendVjpParams<T>& p, const TileView& view, int fi
   }
 }
 
-/// The product of what a pack of pixels has as gradient and what a splat shows, over `count` channels. Channels behind the
-/// third whose gradient is zero change no bit.
+/// The product of what a pack of pixels has as gradient and what a splat shows, over `count` channels. Channels behind
+/// the third whose gradient is zero change no bit.
 template <class V, typename T> AR_HD V dot_channels(const T* gradient, const T* shown, int count) {
   constexpr int kCount = LanesOf<T>::kCount;
   const auto term = [&](int c, V sum) { return madd(load(gradient + c * kCount, V()), V(shown[c]), sum); };

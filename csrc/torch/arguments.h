@@ -1,5 +1,5 @@
-// The arguments of the ops, each named and typed once: `each` of a struct lists them for the schema, for reading them off
-// the dispatcher's stack, and for the names in snapshots.
+// The arguments of the ops, each named and typed once: `each` of a struct lists them for the schema, for reading them
+// off the dispatcher's stack, and for the names in snapshots.
 #pragma once
 
 #include <ATen/ATen.h>
@@ -125,7 +125,7 @@ struct ProjectArguments {
 struct BinArguments {
   Tensor means2d, cov2d, dets, opacities, depths;
   OptionalTensor colors, background;  ///< (N, 3), (3,): what `adaptive` chooses samples by
-  Tensor row_splits;      ///< (C + 1,) int64 on the CPU, first row of each camera
+  Tensor row_splits;                  ///< (C + 1,) int64 on the CPU, first row of each camera
   int64_t image_height = 0, image_width = 0;
   std::string footprint;
   double option = 0;
@@ -177,8 +177,8 @@ struct BlendArguments {
   }
 };
 
-/// Arguments of `inspect`: what every pixel shows of the Gaussians that `lists` of rasterize hold, and how much of each of
-/// the `count` Gaussians is seen.
+/// Arguments of `inspect`: what every pixel shows of the Gaussians that `lists` of rasterize hold, and how much of each
+/// of the `count` Gaussians is seen.
 struct InspectArguments {
   std::vector<Tensor> saved;
   int64_t count = 0, image_height = 0, image_width = 0;
@@ -209,8 +209,8 @@ struct WeightArguments {
   }
 };
 
-/// Arguments of the adjoint of an op: the gradient with respect to its differentiable outputs, its own arguments, what it
-/// saved, and which of its tensor arguments want a gradient.
+/// Arguments of the adjoint of an op: the gradient with respect to its differentiable outputs, its own arguments, what
+/// it saved, and which of its tensor arguments want a gradient.
 template <class Arguments> struct VjpArguments {
   std::vector<OptionalTensor> dL_doutputs;
   Arguments of_op;
@@ -233,7 +233,8 @@ template <class Arguments> struct VjpArguments {
 template <class Arguments> std::string schema_of() {
   std::string text;
   Arguments arguments;
-  arguments.each([&](const char* declaration, auto&) { text += (text.empty() ? "" : ", ") + std::string(declaration); });
+  arguments.each(
+      [&](const char* declaration, auto&) { text += (text.empty() ? "" : ", ") + std::string(declaration); });
   return text;
 }
 
@@ -248,8 +249,7 @@ inline void assign(const IValue& from, std::string& to) { to = from.toStringRef(
 inline void assign(const IValue& from, std::vector<Tensor>& to) { to = from.toTensorVector(); }
 inline void assign(const IValue& from, std::vector<OptionalTensor>& to) {
   to.clear();
-  for (const OptionalTensor& t : from.toOptionalTensorVector())
-    to.push_back(t && t->defined() ? t : std::nullopt);
+  for (const OptionalTensor& t : from.toOptionalTensorVector()) to.push_back(t && t->defined() ? t : std::nullopt);
 }
 inline void assign(const IValue& from, std::vector<double>& to) { to = from.toDoubleVector(); }
 inline void assign(const IValue& from, std::vector<bool>& to) {

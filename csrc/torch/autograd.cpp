@@ -1,10 +1,10 @@
 // One autograd node for all differentiable ops, on every device. In C++: registered from Python it took longer than the
 // launches of a small scene.
 //
-// An op `name` is differentiable if there is an op `name_vjp` whose arguments are VjpArguments of the op's: the gradient
-// with respect to every differentiable output, the op's own arguments, what it saved, and which tensors want a gradient.
-// Differentiable outputs are those in front of the first that holds integers, or that is the last list, `saved`. The
-// adjoints themselves have no derivative and say so.
+// An op `name` is differentiable if there is an op `name_vjp` whose arguments are VjpArguments of the op's: the
+// gradient with respect to every differentiable output, the op's own arguments, what it saved, and which tensors want a
+// gradient. Differentiable outputs are those in front of the first that holds integers, or that is the last list,
+// `saved`. The adjoints themselves have no derivative and say so.
 #include <torch/csrc/autograd/autograd_not_implemented_fallback.h>
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/library.h>
@@ -63,7 +63,8 @@ struct Node : torch::autograd::Function<Node> {
     for (size_t k = 0; k < op->outputs; ++k) {
       const IValue& value = (*stack)[k];
       const bool last = k + 1 == op->outputs && op->saves();
-      const std::vector<Tensor> list = value.isTensor() ? std::vector<Tensor>{value.toTensor()} : value.toTensorVector();
+      const std::vector<Tensor> list =
+          value.isTensor() ? std::vector<Tensor>{value.toTensor()} : value.toTensorVector();
       counting = counting && !last && (list.empty() || list[0].is_floating_point());
       if (counting) differentiable += list.size();
       sizes->push_back(int64_t(list.size()));

@@ -1,5 +1,6 @@
-// What a device must be able to do for the pass that recipe.h writes down once: a stage per function. A backend allocates
-// what its stages need, fills their parameters (core/stages.h) by name and launches them. Arguments have been checked.
+// What a device must be able to do for the pass that recipe.h writes down once: a stage per function. A backend
+// allocates what its stages need, fills their parameters (core/stages.h) by name and launches them. Arguments have been
+// checked.
 #pragma once
 
 #include <memory>
@@ -10,8 +11,8 @@
 
 namespace ar::ops {
 
-/// Splats on their way from `project` to `bin`. On the CPU there is a row for every Gaussian that may be seen; on CUDA one
-/// for every Gaussian, so that nothing has to be counted.
+/// Splats on their way from `project` to `bin`. On the CPU there is a row for every Gaussian that may be seen; on CUDA
+/// one for every Gaussian, so that nothing has to be counted.
 struct SplatTensors {
   Tensor splats;  ///< (n, kSplatWidth) SplatRow
   Tensor ids;     ///< (n,) int32, CPU: the Gaussian of each, ascending
@@ -22,9 +23,9 @@ struct SplatTensors {
 
 /// Splats by tile, front to back: what `bin` makes and `blend` reads. Members that a device does not use are empty.
 struct ListTensors {
-  Tensor splats;         ///< (n, kSplatWidth)
-  Tensor ids;            ///< (n,) int32; CPU: the Gaussian of each splat; CUDA: splats in the order of depth
-  Tensor pairs;          ///< CPU: (N,) int32 splats; CUDA: (room, 2) splats and slots, or (room, 1) without a backward pass
+  Tensor splats;  ///< (n, kSplatWidth)
+  Tensor ids;     ///< (n,) int32; CPU: the Gaussian of each splat; CUDA: splats in the order of depth
+  Tensor pairs;   ///< CPU: (N,) int32 splats; CUDA: (room, 2) splats and slots, or (room, 1) without a backward pass
   Tensor tile_offsets;   ///< (tiles + 1,) int64, first pair of each tile
   Tensor splat_offsets;  ///< CPU: (n + 1,) int64 into positions; CUDA: (n, 2) int32 first slot and number of slots
   Tensor positions;      ///< CPU: (N,) int64 places in `pairs` of each splat's pairs

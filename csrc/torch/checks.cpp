@@ -96,10 +96,10 @@ void check_projected(const Tensor& means2d, Tensor& cov2d, Tensor& opacities, Te
   check_row(dets, "dets", {}, "(N,)");
   TORCH_CHECK_TYPE(row_splits.scalar_type() == at::kLong, "row_splits must have dtype int64, got ",
                    row_splits.scalar_type());
-  TORCH_CHECK_VALUE(row_splits.device().is_cpu() && row_splits.dim() == 1 && row_splits.size(0) >= 1 &&
-                        row_splits.is_contiguous(),
-                    "row_splits must be a vector on the CPU, of one number more than there are cameras, got shape ",
-                    shape_of(row_splits), " on ", row_splits.device());
+  TORCH_CHECK_VALUE(
+      row_splits.device().is_cpu() && row_splits.dim() == 1 && row_splits.size(0) >= 1 && row_splits.is_contiguous(),
+      "row_splits must be a vector on the CPU, of one number more than there are cameras, got shape ",
+      shape_of(row_splits), " on ", row_splits.device());
   const int64_t* splits = row_splits.const_data_ptr<int64_t>();
   const int64_t cameras = row_splits.size(0) - 1;
   bool ok = splits[0] == 0 && splits[cameras] == n;
@@ -256,8 +256,7 @@ int64_t check_cameras(const ProjectArguments& a) {
                     " and ", a.tanfovy.size());
   TORCH_CHECK_VALUE(!(a.shs && a.colors_precomp), "at most one of shs and colors_precomp must be given, got both");
   TORCH_CHECK_VALUE(!a.colors_precomp || (a.colors_precomp->dim() == 2 && a.colors_precomp->size(1) == 3),
-                    "colors_precomp must have shape (P, 3), got ",
-                    a.colors_precomp ? shape_of(*a.colors_precomp) : "");
+                    "colors_precomp must have shape (P, 3), got ", a.colors_precomp ? shape_of(*a.colors_precomp) : "");
   return cameras;
 }
 
@@ -305,10 +304,10 @@ void check(BlendArguments& a, const FootprintSpec& footprint) {
   a.means2d = a.means2d.contiguous();
   const int64_t n = a.means2d.size(0), cameras = a.row_splits.size(0) - 1;
   check_like(a.features, "features", a.means2d, "means2d");
-  TORCH_CHECK_VALUE(a.features.dim() == 2 && a.features.size(0) == n && a.features.size(1) >= 1 &&
-                        a.features.size(1) <= kMaxChannels,
-                    "features must have shape (N, K) with N = ", n, " and K from 1 to ", kMaxChannels, ", got ",
-                    shape_of(a.features));
+  TORCH_CHECK_VALUE(
+      a.features.dim() == 2 && a.features.size(0) == n && a.features.size(1) >= 1 && a.features.size(1) <= kMaxChannels,
+      "features must have shape (N, K) with N = ", n, " and K from 1 to ", kMaxChannels, ", got ",
+      shape_of(a.features));
   a.features = a.features.contiguous();
   check_like(a.background, "background", a.means2d, "means2d");
   TORCH_CHECK_VALUE(a.background.sizes() == at::IntArrayRef({cameras, a.features.size(1)}),
@@ -340,8 +339,8 @@ void check(InspectArguments& a, const ListTensors& lists, const FootprintSpec& f
   // The ids of a CPU's lists index the results; on CUDA the splats themselves do.
   const int64_t n = lists.splats.size(0);
   const int64_t needed = lists.splats.is_cuda() || n == 0 ? n : lists.ids.max().item<int64_t>() + 1;
-  TORCH_CHECK_VALUE(a.count >= needed && a.count < (int64_t(1) << 31), "count must be the number of Gaussians, at least ",
-                    needed, ", got ", a.count);
+  TORCH_CHECK_VALUE(a.count >= needed && a.count < (int64_t(1) << 31),
+                    "count must be the number of Gaussians, at least ", needed, ", got ", a.count);
 }
 
 void check(WeightArguments& a) {
@@ -372,8 +371,8 @@ void check_lists(const ListTensors& lists, const Tensor& like, const FootprintSp
   if (like.is_cuda()) {
     ok = ok && pairs.dim() == 2 && pairs.size(0) >= 1 && (pairs.size(1) == 1 || pairs.size(1) == 2);
   } else {
-    ok = ok && pairs.dim() == 1 && lists.tile_offsets.scalar_type() == at::kLong && lists.tile_offsets.is_contiguous() &&
-         lists.tile_offsets.device().is_cpu() &&
+    ok = ok && pairs.dim() == 1 && lists.tile_offsets.scalar_type() == at::kLong &&
+         lists.tile_offsets.is_contiguous() && lists.tile_offsets.device().is_cpu() &&
          lists.tile_offsets.const_data_ptr<int64_t>()[grid.tiles()] == pairs.numel();
   }
   const auto fits = [&](const Tensor& t, at::ScalarType dtype) {
@@ -399,10 +398,11 @@ void check_saved(const ListTensors& lists, const BlendState& state, const Tensor
             state.transmittance.scalar_type() == like.scalar_type() && state.last.scalar_type() == at::kInt;
   for (const Tensor* t : {&state.transmittance, &state.last, &state.checkpoints, &state.chunks})
     ok = ok && t->is_contiguous() && t->device() == like.device();
-  TORCH_CHECK_VALUE(ok,
-                    "transmittance ... chunks must be what the forward pass saved with keep=True for the same arguments, "
-                    "got transmittance of shape ",
-                    shape_of(state.transmittance));
+  TORCH_CHECK_VALUE(
+      ok,
+      "transmittance ... chunks must be what the forward pass saved with keep=True for the same arguments, "
+      "got transmittance of shape ",
+      shape_of(state.transmittance));
 }
 
 }  // namespace ar::ops

@@ -27,8 +27,8 @@ FootprintSpec find_footprint(const std::string& key, double option);
 /// A gradient has the dtype and device of `like` and these sizes; afterwards it is contiguous.
 void check_gradient(Tensor& gradient, const char* name, const Tensor& like, at::IntArrayRef sizes);
 
-/// Lists and state fit each other, the splats, the footprint and the image: the outputs of the forward pass for the same
-/// arguments. What they contain is the forward pass's own and is not looked at.
+/// Lists and state fit each other, the splats, the footprint and the image: the outputs of the forward pass for the
+/// same arguments. What they contain is the forward pass's own and is not looked at.
 void check_saved(const ListTensors& lists, const BlendState& state, const Tensor& like, const FootprintSpec& footprint,
                  TileGrid grid);
 void check_lists(const ListTensors& lists, const Tensor& like, const FootprintSpec& footprint, TileGrid grid);

@@ -63,8 +63,9 @@ struct RasterizeTimed {
 template <class Visit> void each_op(const Visit& visit) {
   const char *rasterized = "Tensor color, Tensor[] images, Tensor radii, Tensor[] saved",
              *timed = "Tensor color, Tensor[] images, Tensor radii, Tensor[] saved, Tensor seconds",
-             *projected = "Tensor means2d, Tensor cov2d, Tensor opacities, Tensor depths, Tensor colors, Tensor radii, "
-                          "Tensor gaussian_ids, Tensor camera_ids, Tensor row_splits, Tensor[] saved",
+             *projected =
+                 "Tensor means2d, Tensor cov2d, Tensor opacities, Tensor depths, Tensor colors, Tensor radii, "
+                 "Tensor gaussian_ids, Tensor camera_ids, Tensor row_splits, Tensor[] saved",
              *blended = "Tensor image, Tensor alpha, Tensor[] saved", *gradients = "Tensor[] gradients";
   visit(Op<RasterizeArguments, rasterize_plainly>{}, "rasterize", rasterized);
   visit(RasterizeTimed{}, "rasterize_timed", timed);

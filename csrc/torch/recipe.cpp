@@ -20,8 +20,8 @@ std::unique_ptr<Backend> make_backend(const Tensor& like) {
 
 TileGrid grid_of(int64_t height, int64_t width) { return {int(width), int(height)}; }
 
-/// Copies the arguments of an op before it runs, if it is being debugged, and writes them to a file if it fails: after an
-/// error the device may give nothing back.
+/// Copies the arguments of an op before it runs, if it is being debugged, and writes them to a file if it fails: after
+/// an error the device may give nothing back.
 class Snapshot {
  public:
   template <class Arguments> Snapshot(Arguments& arguments, bool debug, const char* path) : path_(path) {
@@ -189,7 +189,8 @@ Tensor mean_transmittance(const BlendState& state, const ListTensors& lists, Til
                              .slice(0, 0, grid.height)
                              .slice(1, 0, grid.width);
   const Tensor number = at::arange(state.transmittance.size(0), samples.options()).view({-1, 1, 1});
-  return at::where(number.lt(samples), state.transmittance, at::zeros({}, state.transmittance.options())).sum(0) / samples;
+  return at::where(number.lt(samples), state.transmittance, at::zeros({}, state.transmittance.options())).sum(0) /
+         samples;
 }
 
 /// The gradient with respect to a differentiable output, if there is one.
@@ -218,8 +219,8 @@ Rasterized rasterize(RasterizeArguments a, std::vector<double>* seconds) {
     const ListTensors lists = backend->bin(splats, footprint, grid, first_three(plan.background), options);
     lap();
     BlendState state;
-    const ImageTensors image = backend->blend(lists, footprint, grid, plan.channels, plan.color_channels,
-                                              plan.background, options, state);
+    const ImageTensors image =
+        backend->blend(lists, footprint, grid, plan.channels, plan.color_channels, plan.background, options, state);
     lap();
     out.color = image.color;
     if (a.alpha) out.images.push_back(image.alpha);
@@ -228,6 +229,8 @@ Rasterized rasterize(RasterizeArguments a, std::vector<double>* seconds) {
       append_to(out.saved, lists);
       append_to(out.saved, state);
       out.saved.push_back(plan.makes_rows() ? plan.channels.rows : at::empty({0}, a.means3D.options()));
+    } else if (seconds) {
+      append_to(out.saved, lists);
     }
     return out;
   });
@@ -301,7 +304,9 @@ Projected project(ProjectArguments a) {
     Tensor all_radii;
     const RowTensors rows = backend->project_rows(in, footprint, all_radii);
     const Tensor kept = all_radii.gt(0).nonzero().select(1, 0);
-    const auto pick = [&](std::vector<Tensor>& to, const Tensor& of_all) { to.push_back(of_all.index_select(0, kept)); };
+    const auto pick = [&](std::vector<Tensor>& to, const Tensor& of_all) {
+      to.push_back(of_all.index_select(0, kept));
+    };
     pick(means2d, rows.means2d);
     pick(cov2d, rows.cov2d);
     pick(dets, rows.dets);
@@ -317,7 +322,9 @@ Projected project(ProjectArguments a) {
   const auto join = [&](const std::vector<Tensor>& parts, std::initializer_list<int64_t> rest, at::ScalarType dtype) {
     std::vector<int64_t> sizes = {0};
     sizes.insert(sizes.end(), rest);
-    return parts.empty() ? at::empty(sizes, a.means3D.options().dtype(dtype)) : parts.size() == 1 ? parts[0] : at::cat(parts);
+    return parts.empty()       ? at::empty(sizes, a.means3D.options().dtype(dtype))
+           : parts.size() == 1 ? parts[0]
+                               : at::cat(parts);
   };
   const at::ScalarType floats = a.means3D.scalar_type();
   out.means2d = join(means2d, {2}, floats);
@@ -386,8 +393,8 @@ std::vector<Tensor> project_vjp(VjpArguments<ProjectArguments> arguments) {
     }
   }
   std::vector<Tensor> out;
-  const OptionalTensor inputs[] = {a.means3D, a.opacities, a.shs, a.colors_precomp, a.scales, a.rotations,
-                                   a.cov3D_precomp};
+  const OptionalTensor inputs[] = {a.means3D, a.opacities, a.shs,          a.colors_precomp,
+                                   a.scales,  a.rotations, a.cov3D_precomp};
   const size_t places[] = {0, 2, 3, 4, 5, 6, 7};
   for (size_t k = 0; k < 7; ++k) {
     const bool wanted = needs[k] && inputs[k];
@@ -398,7 +405,9 @@ std::vector<Tensor> project_vjp(VjpArguments<ProjectArguments> arguments) {
   const Tensor matrices[] = {a.viewmatrix, a.projmatrix, a.campos, a.lens ? *a.lens : Tensor()};
   for (size_t k = 0; k < kCameraTensors; ++k) {
     const bool wanted = needs[7 + k] && a.lens;
-    out.push_back(!wanted ? at::empty({0}, options) : cameras == 0 ? at::zeros_like(matrices[k]) : at::stack(of_cameras[k]));
+    out.push_back(!wanted        ? at::empty({0}, options)
+                  : cameras == 0 ? at::zeros_like(matrices[k])
+                                 : at::stack(of_cameras[k]));
   }
   return out;
 }
@@ -517,8 +526,9 @@ std::vector<Tensor> blend_vjp(VjpArguments<BlendArguments> arguments) {
     opacities.push_back(rows.opacities);
     if (absolute) sums_abs.push_back(rows.absolute);
     features.push_back(sums.dL_dchannels);
-    backgrounds.push_back(dL_dimage.defined() ? (dL_dimage[c] * mean_transmittance(state, part.lists, grid)).sum(at::IntArrayRef({1, 2}))
-                                              : at::zeros({channels}, options));
+    backgrounds.push_back(
+        dL_dimage.defined() ? (dL_dimage[c] * mean_transmittance(state, part.lists, grid)).sum(at::IntArrayRef({1, 2}))
+                            : at::zeros({channels}, options));
   }
   const auto join = [&](bool wanted, const std::vector<Tensor>& parts, const Tensor& like) {
     return !wanted ? at::empty({0}, options) : parts.empty() ? at::zeros_like(like) : at::cat(parts);
@@ -528,9 +538,9 @@ std::vector<Tensor> blend_vjp(VjpArguments<BlendArguments> arguments) {
           join(needs[1], cov2d, a.cov2d),
           join(needs[2], opacities, a.opacities),
           join(needs[3], features, a.features),
-          !needs[4]        ? none
+          !needs[4]      ? none
           : cameras == 0 ? at::zeros_like(a.background)
-                           : at::stack(backgrounds),
+                         : at::stack(backgrounds),
           join(absolute, sums_abs, a.means2d),
           needs[6] ? at::zeros_like(a.dets) : none.clone(),  // what depends on dets is in cov2d's
           none.clone()};
@@ -540,8 +550,7 @@ std::vector<Tensor> inspect(InspectArguments a) {
   const FootprintSpec footprint = find_footprint(a.footprint, a.option);
   const ListTensors lists = Saved(a.saved).lists;
   check(a, lists, footprint);
-  return make_backend(lists.splats)
-      ->inspect(lists, footprint, grid_of(a.image_height, a.image_width), a.count);
+  return make_backend(lists.splats)->inspect(lists, footprint, grid_of(a.image_height, a.image_width), a.count);
 }
 
 Tensor footprint_weight(WeightArguments a) {

@@ -1,4 +1,5 @@
-// The pass, written once for every device: check, project, bin, blend, and back. A Backend does what depends on the device.
+// The pass, written once for every device: check, project, bin, blend, and back. A Backend does what depends on the
+// device.
 #pragma once
 
 #include <tuple>
@@ -16,16 +17,17 @@ struct Rasterized {
   std::vector<Tensor> saved;
 };
 struct Projected {
-  Tensor means2d, cov2d, opacities, depths, colors;        ///< (N, ...) rows, camera after camera
-  Tensor radii, gaussian_ids, camera_ids, row_splits;      ///< integers; row_splits on the CPU
-  std::vector<Tensor> saved;                               ///< dets (N,)
+  Tensor means2d, cov2d, opacities, depths, colors;    ///< (N, ...) rows, camera after camera
+  Tensor radii, gaussian_ids, camera_ids, row_splits;  ///< integers; row_splits on the CPU
+  std::vector<Tensor> saved;                           ///< dets (N,)
 };
 struct Blended {
   Tensor image, alpha;  ///< (C, K, H, W) and (C, H, W)
   std::vector<Tensor> saved;
 };
 
-/// With `seconds` the times of project, bin and blend are appended to it.
+/// With `seconds` the times before, of project, bin and blend are appended to it, and without `keep` the lists are
+/// saved.
 Rasterized rasterize(RasterizeArguments a, std::vector<double>* seconds = nullptr);
 std::vector<Tensor> rasterize_vjp(VjpArguments<RasterizeArguments> a);
 

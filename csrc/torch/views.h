@@ -9,9 +9,7 @@ namespace ar::ops {
 template <typename T> const T* const_data_or_null(const Tensor& t) {
   return t.defined() && t.numel() ? t.const_data_ptr<T>() : nullptr;
 }
-template <typename T> T* data_or_null(const Tensor& t) {
-  return t.defined() && t.numel() ? t.data_ptr<T>() : nullptr;
-}
+template <typename T> T* data_or_null(const Tensor& t) { return t.defined() && t.numel() ? t.data_ptr<T>() : nullptr; }
 template <class Element, typename T> const Element* rows_of(const OptionalTensor& t) {
   return t ? reinterpret_cast<const Element*>(t->const_data_ptr<T>()) : nullptr;
 }

@@ -7,7 +7,8 @@ namespace ar {
 
 /// "box1" ... "box16", behind which stands the number of samples alone.
 template <int S> struct BoxKey {
-  static constexpr char kText[] = {'b', 'o', 'x', S >= 10 ? '1' : char('0' + S), S >= 10 ? char('0' + S % 10) : '\0', '\0'};
+  static constexpr char kText[] = {'b', 'o', 'x', S >= 10 ? '1' : char('0' + S), S >= 10 ? char('0' + S % 10) : '\0',
+                                   '\0'};
 };
 
 /// S equal Gaussians at the nodes of box_node<S>. The pixel's colour is the mean over the samples.

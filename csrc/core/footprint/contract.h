@@ -4,15 +4,15 @@
 // names it. FootprintDefaults has what most share.
 //
 //   kName                                what users call it: "box"
-//   kKey                                 its own key: "box4"; by default the name. Footprints of one name differ in an option
-//   kOption                              the option that users may set, see Option; by default none
-//   kYardstick                           true: meant to compare others with; compiled for one instruction set. Default false
-//   Pixels                               a type with the same Shape, terms, alpha, adjoint, ellipse and samples, for which
+//   kKey                                 its own key: "box4"; by default the name. Footprints of one name differ in an
+//   option kOption                              the option that users may set, see Option; by default none kYardstick
+//   true: meant to compare others with; compiled for one instruction set. Default false Pixels a type with the same
+//   Shape, terms, alpha, adjoint, ellipse and samples, for which
 //                                        blending is compiled instead, once for all that name it. Default: F
 //   kSamples                             samples of a pixel, each with its own transmittance. Default 1
 //   kReach                               largest |coordinate| of a sample's node [px]. Default 0
-//   kExtraLevel                          no support ellipse has a level above 2 ln(255 opacity) + kExtraLevel. Default 0
-//   support_variance(FootprintOptions)   no support ellipse is wider than that of Sigma + this times I [px^2]
+//   kExtraLevel                          no support ellipse has a level above 2 ln(255 opacity) + kExtraLevel. Default
+//   0 support_variance(FootprintOptions)   no support ellipse is wider than that of Sigma + this times I [px^2]
 //   radius_variance(FootprintOptions)    variance added to Sigma for the radius that 3DGS reports [px^2]
 //   Shape<T>                             what a splat carries: an aggregate of kShapeWidth numbers T
 //   prepare(Cov2d<T>, FootprintOptions)  -> Shape<T>            once per splat
@@ -29,9 +29,9 @@
 //   prepare_vjp(Cov2d<T>, Shape<T>, ShapeGrad<T> sums, weighted, FootprintOptions) -> SplatGrad<T>
 //                                        once per splat
 //
-// T is float or double, V a scalar or a pack of lanes (lanes.h). The five numbers of ShapeGrad are summed over pixels and
-// samples in whatever coordinates make them cheap; prepare_vjp gives them meaning. `weighted` is the sum of
-// alpha dL_dalpha, which the gradient with respect to the opacity needs anyway.
+// T is float or double, V a scalar or a pack of lanes (lanes.h). The five numbers of ShapeGrad are summed over pixels
+// and samples in whatever coordinates make them cheap; prepare_vjp gives them meaning. `weighted` is the sum of alpha
+// dL_dalpha, which the gradient with respect to the opacity needs anyway.
 #pragma once
 
 #include <cstddef>
@@ -64,8 +64,8 @@ template <class... F> struct FootprintList {};
 /// Numbers of a footprint's Shape.
 inline constexpr int kShapeWidth = 5;
 
-/// The number that a footprint takes at run time: `dilation` of point, `variance` of mip [px^2], `tolerance` of adaptive.
-/// What changes the code of a pixel is a template parameter instead.
+/// The number that a footprint takes at run time: `dilation` of point, `variance` of mip [px^2], `tolerance` of
+/// adaptive. What changes the code of a pixel is a template parameter instead.
 struct FootprintOptions {
   double number;
 };
@@ -95,7 +95,7 @@ template <class V> AR_HD ShapeGrad<V> operator+(ShapeGrad<V> a, ShapeGrad<V> b) 
 
 /// What most footprints have in common.
 struct FootprintDefaults {
-  using Pixels = void;  // the footprint itself
+  using Pixels = void;                             // the footprint itself
   static constexpr std::nullptr_t kKey = nullptr;  // the name
   static constexpr Option kOption = {};
   static constexpr bool kYardstick = false;
@@ -108,8 +108,7 @@ struct FootprintDefaults {
 };
 
 /// What blending is compiled for.
-template <class F>
-using PixelsOf = std::conditional_t<std::is_void_v<typename F::Pixels>, F, typename F::Pixels>;
+template <class F> using PixelsOf = std::conditional_t<std::is_void_v<typename F::Pixels>, F, typename F::Pixels>;
 
 /// What is known about the w of a SplatGrad.
 enum class GradFrame {
@@ -130,8 +129,8 @@ template <typename T> struct SplatGrad {
   GradFrame frame;
 };
 
-/// Gradient of log amp with respect to Sigma: (Sigma^-1 - Sigma'^-1) / 2 = v adj(Sigma) adj(Sigma') / (2 det det'), whose
-/// terms do not cancel.
+/// Gradient of log amp with respect to Sigma: (Sigma^-1 - Sigma'^-1) / 2 = v adj(Sigma) adj(Sigma') / (2 det det'),
+/// whose terms do not cancel.
 template <typename T> AR_HD Sym2<T> log_amp_grad(Cov2d<T> c, T v) {
   const T scale = T(0.5) * v / blur(c, v).det, square = c.xy * c.xy;
   return {scale * ((c.yy * (c.yy + v) + square) / c.det), -scale * (c.xy / c.det * (c.xx + c.yy + v)),
