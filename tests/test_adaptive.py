@@ -141,3 +141,14 @@ def test_empty_tiles_take_one_sample(device):
 def test_bad_tolerance(tolerance):
     with pytest.raises(ValueError, match="tolerance must"):
         ar.resolve_footprint("adaptive", tolerance=tolerance)
+
+
+def test_of_many_channels_the_first_three_choose(device):
+    scene = scenes.cast(scenes.random_scene(3, 200, sigma=(0.02, 0.2)), torch.float32, device)
+    del scene["shs"], scene["means2D"]
+    colors = torch.rand(200, 5, generator=torch.Generator().manual_seed(1)).to(device)
+    settings = scenes.Camera(bg=(0.9, 0.1, 0.5)).settings(torch.float32, device, footprint="adaptive")
+    wide = settings._replace(bg=torch.tensor([0.9, 0.1, 0.5, 0.7, 0.2], device=device))
+    chosen = ar.render_stages(settings, **scene, colors_precomp=colors[:, :3].contiguous()).tile_samples
+    assert len(chosen.unique()) > 1
+    assert torch.equal(ar.render_stages(wide, **scene, colors_precomp=colors).tile_samples, chosen)

@@ -195,6 +195,11 @@ AR_HD int project(const Cam& camera, const Gaussians<T>& g, int64_t i, Footprint
   return 0;
 }
 
+/// The first three of a row of channels, those that are missing black: what `adaptive` takes as a splat's colour.
+template <typename T> AR_HD Vec3<T> first_channels(const T* row, int count) {
+  return {row[0], count > 1 ? row[1] : T(0), count > 2 ? row[2] : T(0)};
+}
+
 /// Writes the channels of Gaussian i that project() makes: its colour, and its depth.
 template <typename T> AR_HD void write_channels(const ChannelRows<T>& rows, int64_t i, Vec3<T> color, T depth) {
   T* row = rows.data + i * rows.stride;

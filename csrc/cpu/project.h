@@ -57,8 +57,9 @@ template <template <typename> class Cam, typename T> void project(const cpu::Pro
         if (p.given.data && !all_finite(p.given.row(int32_t(i)), p.given.count)) {
           splat.level = T(0);
           p.radii[i] = 0;
-        } else if (p.channels.data) {
-          write_channels(p.channels, i, splat.color, depth);
+        } else {
+          if (p.given.data) splat.color = first_channels(p.given.row(int32_t(i)), p.given.count);
+          if (p.channels.data) write_channels(p.channels, i, splat.color, depth);
         }
       }
       splats[j] = splat;

@@ -50,7 +50,7 @@ struct BlendState {
   Tensor transmittance;  ///< (samples, H, W)
   Tensor last;           ///< (samples, H, W) int32
   Tensor checkpoints;    ///< CUDA: state of every pixel between chunks of long lists
-  Tensor chunks;         ///< CUDA: (m, 3) int32
+  Tensor chunks;         ///< CUDA: (m, 3) int32: the plan's counts, then tile, chunk and plane of every chunk
 
   static constexpr size_t kMembers = 4;
   template <class Visit> void each(Visit&& visit) {
@@ -94,9 +94,9 @@ struct ChannelColumns {
 
 /// Sums over the pairs of every splat, as `blend_vjp` leaves them for `project_vjp` or `row_grads`.
 struct PairSums {
-  Tensor pairs;         ///< CPU: (N, 6); CUDA: (room, kPairGradWidth)
+  Tensor pairs;         ///< CPU: (N, 6), or (N, 9) with the three colours; CUDA: (room, kPairGradWidth)
   Tensor absolute;      ///< CPU: (N, 2), if |dL/dmean| is wanted
-  Tensor dL_dchannels;  ///< like ChannelTensors::rows; undefined on CUDA where the pairs hold the three colours
+  Tensor dL_dchannels;  ///< like ChannelTensors::rows; undefined where the pairs hold the three colours
 };
 
 /// The public form of splats (ProjectedRows in core/stages.h), and gradients with respect to it.

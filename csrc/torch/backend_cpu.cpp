@@ -65,10 +65,10 @@ template <typename T> Channels<T> channels_of(const ChannelTensors& channels, co
   return out;
 }
 
-/// Members that are undefined become null.
 /// Tiles of an image of 268 million pixels: to write numbers for more of them takes a second or longer.
 constexpr int64_t kManyTiles = int64_t(1) << 20;
 
+/// Members that are undefined become null.
 template <typename T> ProjectedRows<T> projected_rows_of(RowTensors rows) {
   ProjectedRows<T> out;
   out.means2d = elements_of<Vec2<T>, T>(rows.means2d);

@@ -338,7 +338,9 @@ void check(InspectArguments& a, const ListTensors& lists, const FootprintSpec& f
   check_lists(lists, lists.splats, footprint, {int(a.image_width), int(a.image_height)});
   // The ids of a CPU's lists index the results; on CUDA the splats themselves do.
   const int64_t n = lists.splats.size(0);
-  const int64_t needed = lists.splats.is_cuda() || n == 0 ? n : lists.ids.max().item<int64_t>() + 1;
+  const bool by_id = !lists.splats.is_cuda() && n > 0;
+  TORCH_CHECK_VALUE(!by_id || lists.ids.min().item<int64_t>() >= 0, "ids must not be negative");
+  const int64_t needed = by_id ? lists.ids.max().item<int64_t>() + 1 : n;
   TORCH_CHECK_VALUE(a.count >= needed && a.count < (int64_t(1) << 31),
                     "count must be the number of Gaussians, at least ", needed, ", got ", a.count);
 }
