@@ -17,7 +17,7 @@ template <typename T> AR_HD Vec4<T> matrix_row(const T* m, int r) { return {m[r]
 
 template <typename T> AR_HD Vec3<T> xyz(Vec4<T> v) { return {v.x, v.y, v.z}; }
 template <typename T> AR_HD T apply_row(Vec4<T> row, Vec3<T> p) { return dot(xyz(row), p) + row.w; }
-/// to += the gradient by a row from that by its value at p.
+/// Adds to `to` the gradient with respect to a row, from that with respect to its value at p.
 template <typename T> AR_HD void add_row_vjp(Vec4<T>& to, T dL_dvalue, Vec3<T> p) {
   to = {to.x + dL_dvalue * p.x, to.y + dL_dvalue * p.y, to.z + dL_dvalue * p.z, to.w + dL_dvalue};
 }
@@ -107,7 +107,7 @@ template <class Cam, typename T> AR_HD ProjectedMean<T> project_mean(const Cam& 
   return p;
 }
 
-/// Gradients by the rows of clip space at a mean.
+/// Gradients with respect to clip-space x, y and w of a mean.
 template <typename T> AR_HD Vec3<T> clip_vjp(const Camera<T>& camera, const ProjectedMean<T>& p, Vec2<T> dL_dpixel) {
   const T gx = T(0.5) * camera.size.x * dL_dpixel.x / p.clip_w, gy = T(0.5) * camera.size.y * dL_dpixel.y / p.clip_w;
   return {gx, gy, -(gx * p.ndc.x + gy * p.ndc.y)};
@@ -120,7 +120,7 @@ AR_HD Vec3<T> project_mean_vjp(const Camera<T>& camera, const ProjectedMean<T>& 
   return g.x * xyz(camera.clip_x) + g.y * xyz(camera.clip_y) + g.z * xyz(camera.clip_w) +
          dL_dview.x * xyz(camera.view_x) + dL_dview.y * xyz(camera.view_y) + dL_dview.z * xyz(camera.view_z);
 }
-/// The same by the matrices.
+/// Adds the gradient with respect to the matrices.
 template <typename T>
 AR_HD void add_project_mean_vjp(const Camera<T>& camera, const ProjectedMean<T>& p, Vec3<T> mean, Vec2<T> dL_dpixel,
                                 Vec3<T> dL_dview, CameraGrad<T>& to) {
@@ -139,7 +139,7 @@ template <typename T> struct Jacobian {
   T ratio_x, ratio_y;  ///< x/z and y/z, clamped
   bool clamped_x, clamped_y;
 };
-/// `log_size` = x . j.x + y . j.y, the gradient by the logarithm of all of J.
+/// `log_size` = x . j.x + y . j.y, the gradient with respect to the logarithm of a factor on all of J.
 template <typename T> struct JacobianGrad {
   Vec3<T> x, y;
   T log_size;
@@ -166,13 +166,13 @@ template <typename T> AR_HD Jacobian<T> make_jacobian(const FullCamera<T>& camer
   return {camera.focal.x * xyz(camera.view_x), camera.focal.y * xyz(camera.view_y), T(0), T(0), true, true};
 }
 
-/// Gradients by the clamped ratios.
+/// Gradients with respect to the clamped ratios.
 template <typename T> AR_HD Vec2<T> ratio_vjp(const Camera<T>& camera, Vec3<T> view, const JacobianGrad<T>& grad) {
   const Vec3<T> depth = xyz(camera.view_z);
   return {-(camera.focal.x / view.z) * dot(grad.x, depth), -(camera.focal.y / view.z) * dot(grad.y, depth)};
 }
 
-/// Gradient by the camera-space mean.
+/// Gradient with respect to the camera-space mean.
 template <typename T>
 AR_HD Vec3<T> jacobian_vjp(const Camera<T>& camera, const Jacobian<T>& j, Vec3<T> view, const JacobianGrad<T>& grad) {
   const Vec2<T> by_ratio = ratio_vjp(camera, view, grad);
@@ -194,7 +194,7 @@ AR_HD Vec3<T> jacobian_vjp(const FullCamera<T>& camera, const Jacobian<T>& j, Ve
   if (camera.lens.orthographic()) return {T(0), T(0), T(0)};
   return jacobian_vjp(static_cast<const Camera<T>&>(camera), j, view, grad);
 }
-/// The same by the camera.
+/// Adds the gradient with respect to the camera.
 template <typename T>
 AR_HD void add_jacobian_vjp(const FullCamera<T>& camera, const Jacobian<T>& j, Vec3<T> view,
                             const JacobianGrad<T>& grad, CameraGrad<T>& to) {
@@ -255,7 +255,7 @@ template <typename T> AR_HD Blur<T> blur_of(const FullCamera<T>& camera, Vec3<T>
   return blur;
 }
 
-/// Gradient by `view` of that; adds the one by the camera, if wanted.
+/// Gradient of blur_of with respect to `view`; adds the one with respect to the camera to `to`, if not null.
 template <typename T>
 AR_HD Vec3<T> blur_vjp(const FullCamera<T>& camera, Vec3<T> view, const Blur<T>& dL_dblur, CameraGrad<T>* to) {
   Vec3<T> by_view = {T(0), T(0), T(0)};

@@ -44,7 +44,8 @@ inline constexpr double kSingular = 1e-6;
 /// `point` without dilation can get there: every other footprint's ellipse is wider than 1/56 px.
 inline constexpr double kMaxWhitening = 1e7;
 
-/// The gradient by a quaternion grows as 1/|q|. It is held at this, which fits a float, and 1/|q| is too.
+/// The gradient with respect to a quaternion grows as 1/|q|. It is limited to this, which fits a float, and so is
+/// 1/|q|.
 inline constexpr double kMaxQuaternionGrad = 1e38;
 
 /// Channels that can be blended in one pass.

@@ -20,8 +20,8 @@ template <typename T> struct Mat2 {
   T xx, xy, yx, yy;
 };
 
-/// Symmetric 2x2. As a gradient G it means dL = tr(G dSigma): xy is the matrix entry, so the
-/// derivative by the one number that fills both off-diagonal entries is 2 xy.
+/// Symmetric 2x2. As a gradient G it means dL = tr(G dSigma): xy is the matrix entry, so the derivative with respect to
+/// the one number that fills both off-diagonal entries is 2 xy.
 template <typename T> struct Sym2 {
   T xx, xy, yy;
 };

@@ -14,7 +14,7 @@ template <typename T> struct WeightParams {
   const T* dL_dweights;  ///< vjp only
   T* weights;            ///< forward only
   Vec2<T>* dL_doffsets;  ///< vjp only
-  Sym2<T>* dL_dcovs;     ///< vjp only; xy: derivative by the one number that fills both places
+  Sym2<T>* dL_dcovs;     ///< vjp only; xy: derivative with respect to the one number that fills both places
 };
 
 template <typename T> AR_HD Cov2d<T> with_det(Sym2<T> c) {
@@ -32,7 +32,7 @@ template <class F, typename T> AR_HD T weight(Sym2<T> cov, Vec2<T> d, FootprintO
 
 template <typename T> struct WeightGrad {
   Vec2<T> offset;
-  Sym2<T> cov;  ///< xy: derivative by the one number that fills both places
+  Sym2<T> cov;  ///< xy: derivative with respect to the one number that fills both places
 };
 
 template <class F, typename T>

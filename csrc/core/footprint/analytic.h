@@ -90,7 +90,7 @@ template <class V> struct LogisticValue {
 
 /// Which derivative of the frame the adjoint takes.
 enum class FrameGradient {
-  kFrozen,  ///< the pixel's frame is held fixed: finite everywhere (docs/numerics.md, "Near l1 = l2")
+  kFrozen,  ///< the pixel's frame is held fixed: finite everywhere (docs/numerics.md, "Frame gradient")
   kPaper,   ///< the derivative of the formula [AS, Eq. 10-16]: grows like 1/(l1 - l2)
 };
 
@@ -179,7 +179,7 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
     sums.shape.xx = madd(scaled_g, f.by_sigma, sums.shape.xx);
     sums.shape.yy = madd(scaled_f, g.by_sigma, sums.shape.yy);
     if (kFrame == FrameGradient::kFrozen) {
-      // I_u I_v / I: the pull of the covariance between u and v at a window that stays put.
+      // I_u I_v / I: the derivative with respect to the covariance of u and v while the window stays where it is.
       sums.shape.xy = madd(scale * f.by_t, g.by_t, sums.shape.xy);
     } else {
       const T ratio = t.u.half / t.v.half;  // s2 / s1

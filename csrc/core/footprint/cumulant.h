@@ -1,5 +1,5 @@
 // The axis-aligned unit pixel through its cumulants: one exponential, smooth in Sigma, no
-// eigenvectors. "Q6" of docs/numerics.md.
+// eigenvectors. "Weights" of docs/numerics.md.
 #pragma once
 
 #include "core/footprint/gaussian.h"

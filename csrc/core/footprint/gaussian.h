@@ -2,7 +2,7 @@
 //
 // A Gaussian is kept as a whitening matrix w with w^T w = (Sigma + v I)^-1, so that the exponent is
 // -|w d|^2 / 2. Unlike the conic form a dx^2 + 2 b dx dy + c dy^2 it cannot turn positive, and it
-// does not cancel for long needles (docs/numerics.md, "q', length 1000").
+// does not cancel for long needles (docs/numerics.md, "Whitening").
 #pragma once
 
 #include "core/footprint/contract.h"
