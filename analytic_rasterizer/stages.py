@@ -11,7 +11,7 @@ channels, several cameras at once, splats from elsewhere. All run on the CPU (fl
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
 import torch
@@ -76,6 +76,9 @@ class Splats:
             "footprint": self.footprint,
             "option": self.option,
         }
+
+
+_ROWS = tuple(field.name for field in fields(Splats))[:9]  # in the order in which the op returns them
 
 
 @dataclass(frozen=True)
@@ -159,8 +162,14 @@ def project(
         "tanfovy": [a["tanfovy"] for a in arguments],
     }
     *rows, saved = torch.ops.analytic_rasterizer.project(**gaussians, **batch, **shared)
-    width, height = shared["image_width"], shared["image_height"]
-    return Splats(*rows, saved[0], width, height, shared["footprint"], shared["option"])
+    return Splats(
+        **dict(zip(_ROWS, rows)),
+        dets=saved[0],
+        width=shared["image_width"],
+        height=shared["image_height"],
+        footprint=shared["footprint"],
+        option=shared["option"],
+    )
 
 
 def bin(splats: Splats, *, background: torch.Tensor | None = None, keep: bool = True) -> TileLists:
