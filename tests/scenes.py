@@ -6,8 +6,9 @@ from dataclasses import dataclass, replace
 import torch
 
 from analytic_rasterizer import FOOTPRINTS
+from analytic_rasterizer.footprints import YARDSTICKS
 
-# Option values that change the code path; test_footprints.py checks that no footprint with options is missing.
+# Option values that change the code path. A footprint that is not listed is tested with its default.
 OPTIONS = {
     "point": [{}, {"dilation": 0.0}],
     "mip": [{}, {"variance": 0.25}],
@@ -17,10 +18,8 @@ OPTIONS = {
 }
 # Every registered footprint with these: a new one is tested without a change here.
 VARIANTS = [(footprint, options) for footprint in FOOTPRINTS for options in OPTIONS.get(footprint, [{}])]
-# Footprints that show what others should compute. Their weights are tested as everybody's; they render on one slow
-# path, so that few tests of whole images take them.
-YARDSTICKS = ("erf", "exact")
 # For tests of whole images: every footprint that is meant for rendering, with every option that changes the code path.
+# The weights of yardsticks are tested as everybody's; they render on one slow path.
 RENDERED = [variant for variant in VARIANTS if variant[0] not in YARDSTICKS]
 # One of each footprint, for tests where the options do not matter.
 KINDS = [

@@ -290,6 +290,8 @@ def hard_weights():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 def test_weight_in_40_digits(variant, device, dtype):
     """footprint_weight of hard covariances: within 40 roundings of its condition (hard_cases.py)."""
+    if variant[0] not in reference.DEFAULT_OPTIONS:
+        pytest.skip(f"no independent formula of {variant[0]}")
     report = measure_weights(variant, device, dtype)
     worst = (report["error"] / report["tolerance"]).argmax()
     assert torch.isfinite(report["weight"]).all()
