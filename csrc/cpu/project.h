@@ -58,8 +58,8 @@ template <template <typename> class Cam, typename T> void project(const cpu::Pro
           splat.level = T(0);
           p.radii[i] = 0;
         } else {
-          if (p.given.data) splat.color = first_channels(p.given.row(int32_t(i)), p.given.count);
           if (p.channels.data) write_channels(p.channels, i, splat.color, depth);
+          if (p.given.data) splat.color = first_channels(p.given.row(int32_t(i)), p.given.count);
         }
       }
       splats[j] = splat;
