@@ -133,7 +133,7 @@ class Backend {
   virtual RowTensors project_rows(const Inputs& in, const FootprintSpec& footprint, Tensor& radii) = 0;
   /// Splats from public rows.
   virtual SplatTensors shape_rows(const RowTensors& rows, const FootprintSpec& footprint, TileGrid grid) = 0;
-  /// Lists by tile and depth, and samples per tile, for which `background` (3,) is looked at.
+  /// Lists by tile and depth, and samples per tile, for which the first three channels of `background` are looked at.
   virtual ListTensors bin(const SplatTensors& splats, const FootprintSpec& footprint, TileGrid grid,
                           const Tensor& background, PassOptions options) = 0;
   virtual ImageTensors blend(const ListTensors& lists, const FootprintSpec& footprint, TileGrid grid,

@@ -128,7 +128,7 @@ void check_image_size(int64_t height, int64_t width) {
   TORCH_CHECK_VALUE(width >= 1 && width <= kMax, "image_width must be in [1, ", kMax, "], got ", width);
 }
 
-void check(Inputs& in, bool finite) {
+void check(Inputs& in) {
   Tensor& means3D = in.means3D;
   check_floating(means3D, "means3D");
   TORCH_CHECK_VALUE(means3D.dim() == 2 && means3D.size(1) == 3, "means3D must have shape (P, 3), got ",
@@ -198,7 +198,10 @@ void check(Inputs& in, bool finite) {
   check_positive(in.tanfovx, "tanfovx");
   check_positive(in.tanfovy, "tanfovy");
   check_positive(in.scale_modifier, "scale_modifier");
-  if (!finite && means3D.is_cuda()) return;
+}
+
+void check_values(const Inputs& in, bool debug) {
+  if (!debug && in.means3D.is_cuda()) return;
   check_finite(in.viewmatrix, "viewmatrix");
   check_finite(in.projmatrix, "projmatrix");
   check_finite(in.campos, "campos");
@@ -232,8 +235,7 @@ void check_gaussians(const Inputs& in) {
 }  // namespace
 
 void check(RasterizeArguments& a) {
-  check(a, a.debug);
-  if (a.debug) check_gaussians(a);
+  check(static_cast<Inputs&>(a));
   TORCH_CHECK_VALUE(a.shs.has_value() != a.colors_precomp.has_value(),
                     "exactly one of shs and colors_precomp must be given, got ", a.shs ? "both" : "neither");
   check_like(a.bg, "bg", a.means3D, "means3D");
@@ -241,6 +243,11 @@ void check(RasterizeArguments& a) {
   TORCH_CHECK_VALUE(a.bg.numel() == channels && (a.bg.dim() == 1 || (a.bg.dim() == 2 && a.bg.size(0) == 1)),
                     "bg must have shape (", channels, ",) or (1, ", channels, "), got ", shape_of(a.bg));
   a.bg = a.bg.reshape({channels}).contiguous();
+}
+
+void check_values(const RasterizeArguments& a) {
+  check_values(a, a.debug);
+  if (a.debug) check_gaussians(a);
   if (a.debug || !a.means3D.is_cuda()) check_finite(a.bg, "bg");
 }
 

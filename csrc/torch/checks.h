@@ -7,10 +7,14 @@
 
 namespace ar::ops {
 
-/// Afterwards every tensor is contiguous, and the matrices are 4x4. With `finite` numbers of the camera that are not
-/// finite raise too, for which the host must wait for the device; on the CPU they always do.
-void check(Inputs& in, bool finite);
+/// Afterwards every tensor is contiguous, and the matrices are 4x4.
+void check(Inputs& in);
 void check(RasterizeArguments& a);
+/// Raises for numbers of the camera that are not finite: always on the CPU, and on a device, for which the host must
+/// then wait, with `debug`. Of arguments that have been checked; the forward pass alone asks.
+void check_values(const Inputs& in, bool debug);
+/// The same, and with debug for numbers that no Gaussian should have.
+void check_values(const RasterizeArguments& a);
 void check(BinArguments& a);
 void check(BlendArguments& a, const FootprintSpec& footprint);
 void check(InspectArguments& a, const ListTensors& lists, const FootprintSpec& footprint);

@@ -106,12 +106,6 @@ struct ChannelPlan {
   bool makes_rows() const { return columns.color >= 0 || columns.depth >= 0 || columns.inverse_depth >= 0; }
 };
 
-/// What `adaptive` looks at of a background: three channels, those that are missing black.
-Tensor first_three(const Tensor& background) {
-  const int64_t channels = background.size(0);
-  return channels >= 3 ? background.narrow(0, 0, 3) : at::constant_pad_nd(background, {0, 3 - channels});
-}
-
 /// Everything that the adjoint of a rasterization needs.
 struct Saved {
   ListTensors lists;
@@ -193,6 +187,11 @@ Tensor mean_transmittance(const BlendState& state, const ListTensors& lists, Til
          samples;
 }
 
+/// Gradient with respect to a background: it shows through what no splat covers.
+Tensor background_grad(const Tensor& dL_dcolor, const BlendState& state, const ListTensors& lists, TileGrid grid) {
+  return (dL_dcolor * mean_transmittance(state, lists, grid)).sum(at::IntArrayRef({1, 2}));
+}
+
 /// The gradient with respect to a differentiable output, if there is one.
 Tensor given(const std::vector<OptionalTensor>& gradients, size_t place) {
   return place < gradients.size() && gradients[place] ? *gradients[place] : Tensor();
@@ -205,6 +204,7 @@ Rasterized rasterize(RasterizeArguments a, std::vector<double>* seconds) {
   return snapshot.guard([&] {
     const FootprintSpec footprint = find_footprint(a.footprint, a.option);
     check(a);
+    check_values(a);
     const TileGrid grid = grid_of(a.image_height, a.image_width);
     const PassOptions options = {a.keep, a.alpha, a.debug, at::globalContext().deterministicAlgorithms()};
     const std::unique_ptr<Backend> backend = make_backend(a.means3D);
@@ -216,7 +216,7 @@ Rasterized rasterize(RasterizeArguments a, std::vector<double>* seconds) {
     lap();
     const SplatTensors splats = backend->project(a, footprint, plan.channels, plan.columns, out.radii);
     lap();
-    const ListTensors lists = backend->bin(splats, footprint, grid, first_three(plan.background), options);
+    const ListTensors lists = backend->bin(splats, footprint, grid, plan.background, options);
     lap();
     BlendState state;
     const ImageTensors image =
@@ -278,14 +278,9 @@ std::vector<Tensor> rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
           all.size(1) == plan.color_channels ? all : all.narrow(1, 0, plan.color_channels).contiguous();
     }
     std::vector<Tensor> list = list_of(grads, a.means3D);
-    // What no splat covers lets the background through.
-    Tensor dL_dbg = at::empty({0}, a.means3D.options());
-    if (needs[kInputTensors]) {
-      dL_dbg = dL_dimage.color.defined()
-                   ? (dL_dimage.color * mean_transmittance(saved.state, saved.lists, grid)).sum(at::IntArrayRef({1, 2}))
-                   : at::zeros_like(a.bg);
-    }
-    list.push_back(dL_dbg);
+    list.push_back(!needs[kInputTensors]       ? at::empty({0}, a.means3D.options())
+                   : dL_dimage.color.defined() ? background_grad(dL_dimage.color, saved.state, saved.lists, grid)
+                                               : at::zeros_like(a.bg));
     return list;
   });
 }
@@ -299,7 +294,8 @@ Projected project(ProjectArguments a) {
   const bool with_colors = a.shs || a.colors_precomp;
   for (int64_t c = 0; c < cameras; ++c) {
     Inputs in = inputs_of(a, c);
-    check(in, false);
+    check(in);
+    check_values(in, false);
     const std::unique_ptr<Backend> backend = make_backend(in.means3D);
     Tensor all_radii;
     const RowTensors rows = backend->project_rows(in, footprint, all_radii);
@@ -375,7 +371,7 @@ std::vector<Tensor> project_vjp(VjpArguments<ProjectArguments> arguments) {
   std::vector<std::vector<Tensor>> of_cameras(kCameraTensors);
   for (int64_t c = 0; c < cameras; ++c) {
     Inputs in = inputs_of(a, c);
-    check(in, false);
+    check(in);
     const std::unique_ptr<Backend> backend = make_backend(in.means3D);
     const int64_t first = splits[c].item<int64_t>(), last = splits[c + 1].item<int64_t>();
     const Tensor rows = at::full({count}, -1, ids.options());
@@ -442,7 +438,6 @@ namespace {
 
 /// The part of a blending that one camera has.
 struct CameraPart {
-  int64_t first, last;
   ListTensors lists;
   RowTensors rows;
   ChannelTensors channels;
@@ -450,8 +445,7 @@ struct CameraPart {
 
   CameraPart(const BlendArguments& a, int64_t c) {
     const int64_t* splits = a.row_splits.const_data_ptr<int64_t>();
-    first = splits[c];
-    last = splits[c + 1];
+    const int64_t first = splits[c], last = splits[c + 1];
     lists = from_list<ListTensors>(a.lists, size_t(c) * ListTensors::kMembers);
     rows.means2d = a.means2d.slice(0, first, last);
     rows.cov2d = a.cov2d.slice(0, first, last);
@@ -526,9 +520,10 @@ std::vector<Tensor> blend_vjp(VjpArguments<BlendArguments> arguments) {
     opacities.push_back(rows.opacities);
     if (absolute) sums_abs.push_back(rows.absolute);
     features.push_back(sums.dL_dchannels);
-    backgrounds.push_back(
-        dL_dimage.defined() ? (dL_dimage[c] * mean_transmittance(state, part.lists, grid)).sum(at::IntArrayRef({1, 2}))
-                            : at::zeros({channels}, options));
+    if (needs[4]) {
+      backgrounds.push_back(dL_dimage.defined() ? background_grad(gradient.color, state, part.lists, grid)
+                                                : at::zeros({channels}, options));
+    }
   }
   const auto join = [&](bool wanted, const std::vector<Tensor>& parts, const Tensor& like) {
     return !wanted ? at::empty({0}, options) : parts.empty() ? at::zeros_like(like) : at::cat(parts);
