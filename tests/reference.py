@@ -488,9 +488,9 @@ def radius_covariance(cov2d, footprint, **options):
 
 
 def three_sigma(cov2d, footprint, **options):
-    """3 sqrt(largest eigenvalue) [px], before rounding up."""
+    """3 sqrt(largest eigenvalue) [px], before rounding up; of round splats a little more, as 3DGS has it."""
     xx, xy, yy = radius_covariance(cov2d, footprint, **options).unbind(-1)
-    largest = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy)
+    largest = (xx + yy) / 2 + torch.hypot((xx - yy) / 2, xy).clamp_min(math.sqrt(0.1))
     return 3 * torch.sqrt(largest)
 
 
@@ -653,9 +653,19 @@ def render_adaptive(settings, scene, tile_samples, keep_offsets):
 
 def absolute_gradient(rendered, count, settings):
     """Columns 2:4 of a (P, 4) means2D gradient: sum over pixels of |dL/d(mean)| * (W, H) / 2."""
+    return _sum_over_pixels(rendered, count, settings, torch.abs)
+
+
+def norm_gradient(rendered, count, settings):
+    """The sum over pixels of the length of dL/d(mean) * (W, H) / 2."""
+    return _sum_over_pixels(rendered, count, settings, lambda grad: grad.norm(dim=-1, keepdim=True))[:, 0]
+
+
+def _sum_over_pixels(rendered, count, settings, of_pixel):
     out = torch.zeros(count, 2, dtype=torch.float64)
+    scale = torch.tensor([settings.image_width / 2, settings.image_height / 2])
     for i, of_samples in rendered.offsets.items():
         for offset in of_samples:  # no pixel has a gradient in more than one
             if offset.grad is not None:
-                out[i] += offset.grad.abs().sum((0, 1))
-    return out * torch.tensor([settings.image_width / 2, settings.image_height / 2])
+                out[i] += of_pixel(offset.grad * scale).sum((0, 1))
+    return out

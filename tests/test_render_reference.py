@@ -17,6 +17,7 @@ import torch
 from scenes import KINDS, PATHS, RENDERED, VARIANTS, Camera, name_of
 
 import analytic_rasterizer as ar
+from analytic_rasterizer.arguments import camera_arguments, gaussian_arguments
 
 IMAGE_TOLERANCE = {torch.float64: 1e-10, torch.float32: 4e-5}
 GRADIENT_TOLERANCE = {torch.float64: 1e-9, torch.float32: 2e-4}  # of the largest entry
@@ -33,6 +34,14 @@ def render(camera, scene, variant):
     footprint, options = variant
     settings = camera.settings(scene["means3D"].dtype, scene["means3D"].device, footprint=footprint, **options)
     return ar.GaussianRasterizer(settings)(**scene)
+
+
+def rasterize_op(settings, scene, **chosen):
+    """What the op returns for a scene, with arguments of the op that settings do not have."""
+    optional = dict.fromkeys(("means2D", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp"))
+    gaussians = gaussian_arguments(settings, **(optional | scene))
+    camera = camera_arguments(settings, scene["means3D"], gaussians["shs"])
+    return torch.ops.analytic_rasterizer.rasterize(**gaussians, **camera, bg=settings.bg, **chosen)
 
 
 def exact_settings(camera, dtype, variant):
@@ -267,6 +276,47 @@ def test_absolute_gradients(device, best, variant):
     actual = ours["means2D"].grad.cpu()
     assert relative_error(actual[:, :2], theirs["means2D"].grad[:, :2]) < GRADIENT_TOLERANCE[best]
     assert relative_error(actual[:, 2:], absolute) < GRADIENT_TOLERANCE[best]
+
+
+@pytest.mark.parametrize("means2d_z", ["sum_abs", "sum_norm"])
+@every_footprint
+def test_third_column_of_means2d(device, best, variant, means2d_z):
+    """means2D (P, 3): column 2 the sum over pixels of |gx| + |gy|, or of the length of (gx, gy)."""
+    camera = CAMERA
+    scene = dict(hard_scene(13), means2D=torch.zeros(44, 3).double())
+    ours, theirs = both_leaves(scene, best, device)
+    expected = render_reference(camera, theirs, variant, best, keep_offsets=True)
+    loss = clear_probe(camera, expected, best)
+    footprint, options = variant
+    settings = camera.settings(best, device, footprint=footprint, **options)
+    color = rasterize_op(settings, ours, means2d_z=means2d_z)[0]
+    (color * loss.to(device, best)).sum().backward()
+    (expected.color * loss).sum().backward()
+    actual = ours["means2D"].grad.cpu()
+    assert relative_error(actual[:, :2], theirs["means2D"].grad[:, :2]) < GRADIENT_TOLERANCE[best]
+    if means2d_z == "sum_abs":
+        column = reference.absolute_gradient(expected, 44, camera.settings()).sum(1)
+    else:
+        column = reference.norm_gradient(expected, 44, camera.settings())
+    assert relative_error(actual[:, 2], column) < GRADIENT_TOLERANCE[best]
+
+
+@pytest.mark.parametrize("means2d_z", ["zero", "sum_abs", "sum_norm"])
+def test_four_columns_of_means2d_are_the_same_whatever_the_third_is(device, best, means2d_z):
+    scene = scenes.cast(scenes.random_scene(36, 25), best, device)
+    results = []
+    for choice in ("zero", means2d_z):
+        ours = scenes.leaves(dict(scene, means2D=torch.zeros(25, 4, dtype=best, device=device)))
+        color = rasterize_op(Camera().settings(best, device), ours, means2d_z=choice)[0]
+        (color * probe(Camera()).to(color)).sum().backward()
+        results.append(ours["means2D"].grad)
+    assert torch.equal(*results)
+
+
+def test_unknown_third_column_of_means2d(device, best):
+    scene = scenes.cast(scenes.random_scene(36, 25), best, device)
+    with pytest.raises(ValueError, match="means2d_z must be zero, sum_abs or sum_norm, got norm"):
+        rasterize_op(Camera().settings(best, device), scene, means2d_z="norm")
 
 
 @each_kind

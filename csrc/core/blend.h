@@ -3,6 +3,7 @@
 
 #include "core/constants.h"
 #include "core/lanes.h"
+#include "core/stages.h"
 
 namespace ar {
 
@@ -54,6 +55,13 @@ template <class V> AR_HD BlendGrad<V> blend_sample_vjp(MaskOf<V> mask, V raw, V 
   behind = madd(alpha, difference, behind);
   const MaskOf<V> free = mask & (raw <= cap);
   return {transmittance * alpha, select(free, transmittance * difference, zero)};
+}
+
+/// A pixel's share of `sums`; not for kNone. `size`: of the image [px].
+template <class V, typename T> AR_HD Vec2<V> mean_sums_of(MeanSums sums, Vec2<T> size, Vec2<V> dL_dmean) {
+  if (sums == MeanSums::kAbsolute) return {abs(dL_dmean.x), abs(dL_dmean.y)};
+  const V x = V(T(0.5) * size.x) * dL_dmean.x, y = V(T(0.5) * size.y) * dL_dmean.y;
+  return {sqrt(x * x + y * y), V(T(0))};
 }
 
 }  // namespace ar

@@ -21,6 +21,10 @@ inline constexpr double kAlphaMax = 0.99;
 /// A sample stops before its transmittance would fall below this.
 inline constexpr double kTransmittanceMin = 1e-4;
 
+/// In the radius that 3DGS reports, the largest eigenvalue of a covariance exceeds the mean of the two by no less than
+/// the root of this [px^4].
+inline constexpr double kRadiusMinGap = 0.1;
+
 /// Variance of the unit pixel along each axis [px^2].
 inline constexpr double kPixelVariance = 1.0 / 12.0;
 

@@ -21,7 +21,8 @@ template <typename T> CullBounds<T> cull_bounds(FootprintChoice footprint) {
   visit_footprint(footprint.index, Footprints{}, [&](auto f) AR_HD_LAMBDA {
     using F = decltype(f);
     const double support = F::support_variance(footprint.options), radius = F::radius_variance(footprint.options);
-    bounds = {T(max(support, radius)), T(2 * std::log(1 / kAlphaMin) + F::kExtraLevel + kLevelSlack)};
+    bounds = {T(max(support, radius + std::sqrt(kRadiusMinGap))),
+              T(2 * std::log(1 / kAlphaMin) + F::kExtraLevel + kLevelSlack)};
   });
   return bounds;
 }
@@ -91,9 +92,11 @@ AR_HD bool project_gaussian(const Cam& camera, const Gaussians<T>& g, int64_t i,
   return is_drawable(out) && !(g.opacities[i] > T(kMaxOpacity));
 }
 
-/// ceil(3 sigma) along the major axis: the radius that 3DGS reports [px].
+/// ceil(3 sigma) along the major axis: the radius that 3DGS reports [px], which takes a round splat for a little larger
+/// than it is.
 template <typename T> AR_HD int splat_radius(Cov2d<T> cov, T variance) {
-  const T largest = T(0.5) * (cov.xx + cov.yy + eigenvalue_gap(cov)) + variance;
+  const T half_gap = max(T(0.5) * eigenvalue_gap(cov), sqrt(T(kRadiusMinGap)));
+  const T largest = T(0.5) * (cov.xx + cov.yy) + half_gap + variance;
   return int(min(std::ceil(T(3) * sqrt(largest)), T(1e9)));
 }
 
@@ -292,6 +295,19 @@ AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
     row[0] = T(0.5) * camera.size.x * grad.dL_dmean.x;
     row[1] = T(0.5) * camera.size.y * grad.dL_dmean.y;
     row[2] = T(0);
+  }
+}
+
+/// Writes what density control looks at, `sums` over pixels, into the columns of means2d that are there for it.
+template <typename T> AR_HD void write_mean_sums(const GaussianGrads<T>& out, int64_t i, Vec2<T> size, Vec2<T> sums) {
+  if (!out.means2d || out.mean_sums == MeanSums::kNone) return;
+  T* row = out.means2d + i * out.means2d_stride;
+  const Vec2<T> absolute = {T(0.5) * size.x * sums.x, T(0.5) * size.y * sums.y};
+  if (out.means2d_stride == 4) {
+    row[2] = absolute.x;
+    row[3] = absolute.y;
+  } else {
+    row[2] = out.mean_sums == MeanSums::kNorm ? sums.x : absolute.x + absolute.y;
   }
 }
 

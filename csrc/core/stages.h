@@ -52,6 +52,14 @@ template <typename T> struct Gaussians {
   T scale_modifier;
 };
 
+/// What blend_vjp sums over pixels besides the gradient: functions of a pixel's gradient with respect to the splat's
+/// mean, in which pixels that pull to different sides do not cancel. Density control looks at them.
+enum class MeanSums : int32_t {
+  kNone,
+  kAbsolute,  ///< |dL/dx| and |dL/dy| per px
+  kNorm,      ///< the length of the gradient in the units of GaussianGrads::means2d; and zero
+};
+
 /// Gradients with respect to the same, written, not added to. Null where not wanted.
 template <typename T> struct GaussianGrads {
   Vec3<T>* means;
@@ -63,7 +71,8 @@ template <typename T> struct GaussianGrads {
   Vec3<T>* shs;
   Vec3<T>* colors;
   T* means2d;          ///< [n, means2d_stride], in 3DGS's units: per (0.5 W, 0.5 H) px
-  int means2d_stride;  ///< 3, or 4 with the sums of absolute values in columns 2 and 3
+  int means2d_stride;  ///< 3, or 4
+  MeanSums mean_sums;  ///< in column 2 of three, absolute values added; absolute values in columns 2 and 3 of four
 };
 
 /// Scalars per splat, whatever the footprint.

@@ -49,8 +49,9 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
   const TileView view(p.grid, tile);
   const LaneIndex<T> lanes;
   const int64_t size = int64_t(p.grid.width) * p.grid.height;
+  const Vec2<T> size_px = {T(p.grid.width), T(p.grid.height)};
   // What a pair shows enters dL/dalpha with all channels, the sums only with the window's.
-  const bool with_shape = p.pair_grads != nullptr, with_abs = with_shape && p.pair_abs;
+  const bool with_shape = p.pair_grads != nullptr, with_means = with_shape && p.pair_means;
   const int loaded = with_shape ? p.channels.count : p.count, window = with_shape ? p.first : 0, count = p.count;
   const bool three = count == 3;
   alignas(64) T transmittance[kSamples][kTilePixels];
@@ -88,7 +89,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
   const int64_t begin = p.lists.tile_offsets[tile], end = p.lists.tile_offsets[tile + 1];
   for (int64_t k = begin + tile_last; k < end; ++k) {
     if (with_shape) std::fill_n(p.pair_grads + k * p.pair_stride, cpu::kPairNumbers, T(0));
-    if (with_abs) p.pair_abs[k] = {T(0), T(0)};
+    if (with_means) p.pair_means[k] = {T(0), T(0)};
     std::fill_n(p.channel_sums + k * p.channel_stride, p.count, T(0));
   }
   for (int32_t k = tile_last - 1; k >= 0; --k) {
@@ -107,7 +108,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
     Vec3<V> color = {zero, zero, zero};  // sums of three channels
     alignas(64) T sums[cpu::kWindow * kCount];
     if (!three) std::fill_n(sums, count * kCount, T(0));
-    Vec2<V> abs2d = {zero, zero};
+    Vec2<V> mean_sums = {zero, zero};
     for (int c = 0; c < TileMask<T>::kPacks; ++c) {
       const V x = load(lanes.value + c * kCount, V());
       for (uint32_t rows = reach.rows[c] & rows_in_image; rows != 0; rows &= rows - 1) {
@@ -136,7 +137,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
           weighted = madd(grad.dL_dalpha, alpha, weighted);
           P::add_alpha_vjp(terms, at, s, alpha, grad.dL_dalpha, shape);
           // Again for the pixel alone: to ask for it must not change the other sums by a bit.
-          if (with_abs) P::add_alpha_vjp(terms, at, s, alpha, grad.dL_dalpha, of_pixel);
+          if (with_means) P::add_alpha_vjp(terms, at, s, alpha, grad.dL_dalpha, of_pixel);
         }
         g += window * kCount;
         if (three) {
@@ -146,9 +147,9 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
           for (int i = 0; i < count * kCount; i += kCount)
             store(sums + i, madd(contribution, load(g + i, V()), load(sums + i, V())));
         }
-        if (with_abs) {
+        if (with_means) {
           const Vec2<V> by_mean = transform_transposed(P::mean_map(splat.shape), of_pixel.offset);
-          abs2d = abs2d + Vec2<V>{abs(by_mean.x), abs(by_mean.y)};
+          mean_sums = mean_sums + mean_sums_of(p.mean_sums, size_px, by_mean);
         }
       }
     }
@@ -168,7 +169,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
     auto* pair = reinterpret_cast<PairGrad<T>*>(p.pair_grads + (begin + k) * p.pair_stride);
     *pair = {adapter ? adapter->collect(row, total, total_weighted) : P::collect(terms, total, total_weighted),
              total_weighted};
-    if (with_abs) p.pair_abs[begin + k] = {sum(abs2d.x), sum(abs2d.y)};
+    if (with_means) p.pair_means[begin + k] = {sum(mean_sums.x), sum(mean_sums.y)};
   }
 }
 

@@ -115,24 +115,20 @@ template <template <typename> class Cam, typename T> void project_vjp(const cpu:
       }
       PairGrad<T> sums = {};
       ShownGrad<T> shown = {};
-      Vec2<T> abs2d = {};
+      Vec2<T> mean_sums = {};
       for (int64_t k = first; k < last; ++k) {
         const int64_t pair = p.pairs.positions[k];
         const T* row = p.pair_grads + pair * p.pair_stride;
         sums = sums + *reinterpret_cast<const PairGrad<T>*>(row);
         if (p.pair_colors) shown.color += *reinterpret_cast<const Vec3<T>*>(row + cpu::kPairNumbers);
-        if (p.pair_abs) abs2d = abs2d + p.pair_abs[pair];
+        if (p.pair_means) mean_sums = mean_sums + p.pair_means[pair];
       }
       if (p.dL_dchannels.data) add_channels_vjp(p.dL_dchannels, i, apply_row(camera.view_z, g.means[i]), shown);
       const auto grad_of = [&](const Cov2d<T>& cov, T) { return projected_grad(p.footprint, cov, sums); };
       ar::project_vjp(camera, g, i, grad_of, shown, coefficients_of(g.shs, g.sh_stride, i),
                       coefficients_of(p.grads.shs, g.sh_stride, i), p.grads,
                       p.camera_grads ? &p.camera_grads[chunk] : nullptr);
-      if (p.grads.means2d && p.grads.means2d_stride == 4) {
-        T* row = p.grads.means2d + i * 4;
-        row[2] = T(0.5) * camera.size.x * abs2d.x;
-        row[3] = T(0.5) * camera.size.y * abs2d.y;
-      }
+      write_mean_sums(p.grads, i, camera.size, mean_sums);
     }
   });
 }
@@ -154,7 +150,6 @@ template <template <typename> class Cam, typename T> void project_rows_vjp(const
       ar::project_vjp(camera, g, i, grad_of, shown, coefficients_of(g.shs, g.sh_stride, i),
                       coefficients_of(p.grads.shs, g.sh_stride, i), p.grads,
                       p.camera_grads ? &p.camera_grads[chunk] : nullptr);
-      if (p.grads.means2d && p.grads.means2d_stride == 4) p.grads.means2d[i * 4 + 3] = T(0);
     }
   });
 }

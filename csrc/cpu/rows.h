@@ -37,7 +37,7 @@ template <typename T> void row_grads(const cpu::RowGradsParams<T>& p) {
       for (int64_t k = first; k < last; ++k) {
         const int64_t pair = p.pairs.positions[k];
         sums = sums + *reinterpret_cast<const PairGrad<T>*>(p.pair_grads + pair * p.pair_stride);
-        if (p.absolute) p.absolute[i] = p.absolute[i] + p.pair_abs[pair];
+        if (p.absolute) p.absolute[i] = p.absolute[i] + p.pair_means[pair];
       }
       const Sym2<T> c = p.rows.cov2d[i];
       const Cov2d<T> cov = {c.xx, c.xy, c.yy, p.rows.dets[i]};

@@ -98,8 +98,9 @@ template <typename T> struct BlendVjpParams : ar::BlendVjpParams<T> {
   int first, count;  ///< the window: channels [first, first + count), count <= kWindow
   T* pair_grads;     ///< [pairs] a PairGrad at the start of every row, or null: not wanted again
   int64_t pair_stride;
-  Vec2<T>* pair_abs;  ///< [pairs] sums over pixels of |dL/dmean| per coordinate, with pair_grads; or null
-  T* channel_sums;    ///< [pairs] `count` numbers at the start of every row
+  MeanSums mean_sums;
+  Vec2<T>* pair_means;  ///< [pairs] mean_sums, with pair_grads; or null
+  T* channel_sums;      ///< [pairs] `count` numbers at the start of every row
   int64_t channel_stride;
   T* scratch;  ///< [threads, channels.count, kTile * kTile] the gradient of a tile
 };
@@ -130,7 +131,7 @@ template <typename T> struct ProjectVjpParams : ar::ProjectVjpParams<T> {
   const T* pair_grads;  ///< [pairs] a PairGrad at the start of every row
   int64_t pair_stride;
   bool pair_colors;             ///< behind every PairGrad are the sums of the three colours in the splats
-  const Vec2<T>* pair_abs;      ///< [pairs] or null
+  const Vec2<T>* pair_means;    ///< [pairs] or null
   CameraGrad<T>* camera_grads;  ///< [chunks] to add to, of a full camera, or null
 };
 
@@ -149,11 +150,11 @@ template <typename T> struct RowGradsParams {
   ProjectedRows<T> rows;  ///< read: cov2d, dets, opacities
   const T* pair_grads;
   int64_t pair_stride;
-  const Vec2<T>* pair_abs;  ///< [pairs] or null
+  const Vec2<T>* pair_means;  ///< [pairs] or null
   Vec2<T>* dL_dmeans2d;
   Sym2<T>* dL_dcov2d;  ///< xy: with respect to the one number that fills both places
   T* dL_dopacities;
-  Vec2<T>* absolute;  ///< [n] sums over pixels of |dL/dmeans2d|, with pair_abs
+  Vec2<T>* absolute;  ///< [n] sums over pixels of |dL/dmeans2d|, with pair_means
 };
 
 template <typename T> struct InspectParams {

@@ -2,7 +2,7 @@
 // a pixel per lane, back to front through the whole list.
 //
 // dL/dalpha is linear in the gradient of the image: each group adds its share to the six sums of a pair, which a single
-// block owns. Only the absolute values |dL/dmean| need the channels of all groups at once: where they are wanted, the
+// block owns. Only MeanSums need the channels of all groups at once: where they are wanted, the
 // first group makes all sums, and reads the channels of the others where they lie.
 #pragma once
 
@@ -11,7 +11,7 @@
 namespace ar::cuda {
 
 inline constexpr int kVjpBatch = 32;
-/// Sums of a pair besides its channels: PairGrad, and |dL/dmean|.
+/// Sums of a pair besides its channels: PairGrad, and MeanSums.
 inline constexpr int kShapeSums = 8;
 
 /// What a block keeps in shared memory.
@@ -54,7 +54,8 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int first = group * kChannelGroup, lane = lane_id(), warp = threadIdx.x / 32,
             channel_count = params.channels.count;
-  const bool absolute = params.absolute, all_at_once = absolute && channel_count > kChannelGroup;
+  const bool with_means = params.mean_sums != MeanSums::kNone,
+             all_at_once = with_means && channel_count > kChannelGroup;
   const bool with_shape = !all_at_once || group == 0;
   const Vec2<float> p = pixel_of(warp, lane);
   const Pixel pixel(list, params.grid, p);
@@ -129,7 +130,7 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
 #pragma unroll
         for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= shared.last[b]) << b);
         if (reach) shared.splats[lane] = {tile_terms(splat, list), {}};
-        if (absolute) shared.mean_maps[lane] = F::mean_map(splat.shape);
+        if (with_means) shared.mean_maps[lane] = F::mean_map(splat.shape);
         shared.channels.ids[lane] = id;
         shared.rows[lane] = list.overflow ? id : list.slot(k);
       }
@@ -171,11 +172,14 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
       reinterpret_cast<float*>(shared.contributions[warp][turn])[lane] = contribution;
       float* sums = shared.sums[warp][j];
       if (with_shape) {
-        Vec2<float> dL_dmean = {0, 0};
-        if (absolute) dL_dmean = transform_transposed(shared.mean_maps[j], shape.offset);
+        Vec2<float> means = {0, 0};
+        if (with_means) {
+          const Vec2<float> size = {float(params.grid.width), float(params.grid.height)};
+          means = mean_sums_of(params.mean_sums, size, transform_transposed(shared.mean_maps[j], shape.offset));
+        }
         shape = F::collect(splat.terms, shape, weighted);
-        const float values[kShapeSums] = {shape.offset.x, shape.offset.y, shape.shape.xx,  shape.shape.xy,
-                                          shape.shape.yy, weighted,       abs(dL_dmean.x), abs(dL_dmean.y)};
+        const float values[kShapeSums] = {shape.offset.x, shape.offset.y, shape.shape.xx, shape.shape.xy,
+                                          shape.shape.yy, weighted,       means.x,        means.y};
         const float sum = sum_values(values);
         if (lane % 4 == 0) sums[kChannelGroup + lane / 4] = sum;
       }
@@ -200,7 +204,7 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
         put_sum(params.pair_grads, kPairGradWidth, list.overflow, row, column, sum);
       }
       if (with_shape && lane < kShapeSums) {
-        const int column = lane < kPairChannels ? lane : kPairAbsolute + lane - kPairChannels;
+        const int column = lane < kPairChannels ? lane : kPairMeans + lane - kPairChannels;
         if (group > 0 && !list.overflow) shape_sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
         put_sum(params.pair_grads, kPairGradWidth, list.overflow, row, column, shape_sum);
       }

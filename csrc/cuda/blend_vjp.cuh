@@ -5,13 +5,13 @@
 
 namespace ar::cuda {
 
-/// What a kernel of blend_vjp sums: gradients, |dL/dmean| of each pixel, or both at once.
-enum class Sums { kGrads, kAbs, kBoth };
+/// What a kernel of blend_vjp sums: gradients, MeanSums, or both at once.
+enum class Sums { kGrads, kMeans, kBoth };
 
 /// Samples of a pixel that a warp of blend_vjp takes. More are shared out to the warps of a block: one warp would be
-/// busy for long with their chunk. Only the absolute values need a pixel's sum at once.
+/// busy for long with their chunk. Only MeanSums need a pixel's sum at once.
 template <class F, Sums kSums>
-inline constexpr int kVjpSamples = F::kSamples <= 4 || kSums == Sums::kAbs ? F::kSamples : 4;
+inline constexpr int kVjpSamples = F::kSamples <= 4 || kSums == Sums::kMeans ? F::kSamples : 4;
 
 /// Splats in blend_vjp, and what each of the warps that share them sums.
 template <class F, int C, int kGroup> struct VjpGroup {
@@ -77,7 +77,7 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
     blend_vjp_kernel(const BlendVjpParams params) {
   constexpr int S = F::kSamples, kLength = chunk_length(S), kWarps = kVjpWarps<F, kSums>, kSumCount = 6 + C;
   constexpr int kOwn = kVjpSamples<F, kSums>, kGroup = S / kOwn;  // samples of a warp, warps of a chunk
-  constexpr bool kGrads = kSums != Sums::kAbs, kAbs = kSums != Sums::kGrads;
+  constexpr bool kGrads = kSums != Sums::kMeans, kMeans = kSums != Sums::kGrads;
   // A shared-out sample's number is not known when the code is compiled: keep its node indexable.
   using VjpSplat = std::conditional_t<kGroup == 1, TileSplatRef<F, C>, const TileSplat<F, C>&>;
   using Pixels = VjpPixels<kOwn, C>;
@@ -100,6 +100,7 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
   const TileList list = list_of(params.lists, params.grid, tile);
   const int begin = chunk * kLength, end = list.overflow ? list.count : min(list.count, begin + kLength);
   const int64_t image = int64_t(params.grid.width) * params.grid.height;
+  const Vec2<float> size = {float(params.grid.width), float(params.grid.height)};
   const auto pixel_index = [&](int b) {  // in the image; -1 outside
     const Vec2<float> p = pixel_of(b, lane);
     const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
@@ -189,7 +190,7 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
       for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= subtile_last[b]) << b);
       if (reach && first == 0)
         group.splats[lane] = {tile_terms(splat, list), channels_of<C>(params.channels, splat, id)};
-      if (kAbs) mean_map = F::mean_map(splat.shape);
+      if (kMeans) mean_map = F::mean_map(splat.shape);
       if (kGroup > 1 && first == 0) group.rows[lane] = row_index;
     }
     group_sync();
@@ -197,13 +198,13 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
       const uint32_t reached = __shfl_sync(kAllLanes, reach, j);
       VjpSplat splat = group.splats[j];
       const Mat2<float> m =
-          !kAbs ? mean_map
-                : Mat2<float>{__shfl_sync(kAllLanes, mean_map.xx, j), __shfl_sync(kAllLanes, mean_map.xy, j),
-                              __shfl_sync(kAllLanes, mean_map.yx, j), __shfl_sync(kAllLanes, mean_map.yy, j)};
+          !kMeans ? mean_map
+                  : Mat2<float>{__shfl_sync(kAllLanes, mean_map.xx, j), __shfl_sync(kAllLanes, mean_map.xy, j),
+                                __shfl_sync(kAllLanes, mean_map.yx, j), __shfl_sync(kAllLanes, mean_map.yy, j)};
       ShapeGrad<float> shape = {{0, 0}, {0, 0, 0}};
       float weighted = 0;
       Values<C> channels = {};
-      Vec2<float> abs2d = {0, 0};
+      Vec2<float> mean_sums = {0, 0};
       for (uint32_t hit = reached; hit != 0; hit &= hit - 1) {
         const int b = __ffs(hit) - 1, q = b * 32 + lane;
         // pixel_of(b, lane); an integer below 2^23 set into the mantissa of 2^23 is that float, plus 2^23
@@ -227,15 +228,15 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
           stage.samples[s][q] = sample;
           if (kGrads) F::add_alpha_vjp(splat.terms, p, node, alpha, grad.dL_dalpha, shape);
           // Again for the pixel alone: to ask for it must not change the other sums by a bit.
-          if (kAbs) F::add_alpha_vjp(splat.terms, p, node, alpha, grad.dL_dalpha, of_pixel);
+          if (kMeans) F::add_alpha_vjp(splat.terms, p, node, alpha, grad.dL_dalpha, of_pixel);
           contribution = s == 0 ? grad.contribution : contribution + grad.contribution;
           weighted += grad.dL_dalpha * alpha;
         }
 #pragma unroll
         for (int c = 0; c < C; ++c) channels.v[c] = madd(contribution, of_pixel_g.v[c], channels.v[c]);
-        if (kAbs) {
+        if (kMeans) {
           const Vec2<float> dL_dmean = transform_transposed(m, of_pixel.offset);
-          abs2d = abs2d + Vec2<float>{abs(dL_dmean.x), abs(dL_dmean.y)};
+          mean_sums = mean_sums + mean_sums_of(params.mean_sums, size, dL_dmean);
         }
       }
       const int32_t row = __shfl_sync(kAllLanes, row_index, j);
@@ -254,10 +255,10 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
           }
         }
       }
-      if (kAbs) {
-        const Vec2<float> total = {warp_sum(abs2d.x), warp_sum(abs2d.y)};
-        if (lane == 1) put(row, kPairAbsolute, total.x);
-        if (lane == 3) put(row, kPairAbsolute + 1, total.y);
+      if (kMeans) {
+        const Vec2<float> total = {warp_sum(mean_sums.x), warp_sum(mean_sums.y)};
+        if (lane == 1) put(row, kPairMeans, total.x);
+        if (lane == 3) put(row, kPairMeans + 1, total.y);
       }
     }
     if constexpr (kGroup > 1 && kGrads) {
@@ -285,8 +286,8 @@ template <class F, int C, Sums kSums> void launch_blend_vjp(const BlendVjpParams
 }
 template <class F, int C> void blend_vjp_few(const BlendVjpParams& p, cudaStream_t stream) {
   constexpr bool kAtOnce = kVjpSamples<F, Sums::kGrads> == F::kSamples;
-  if (!kAtOnce || !p.absolute) launch_blend_vjp<F, C, Sums::kGrads>(p, stream);
-  if (p.absolute) launch_blend_vjp<F, C, kAtOnce ? Sums::kBoth : Sums::kAbs>(p, stream);
+  if (!kAtOnce || p.mean_sums == MeanSums::kNone) launch_blend_vjp<F, C, Sums::kGrads>(p, stream);
+  if (p.mean_sums != MeanSums::kNone) launch_blend_vjp<F, C, kAtOnce ? Sums::kBoth : Sums::kMeans>(p, stream);
 }
 
 }  // namespace ar::cuda

@@ -18,7 +18,7 @@ struct SplatSums {
     }
   }
   __device__ PairGrad<float> grad() const { return {{{value[0], value[1]}, {value[2], value[3], value[4]}}, value[5]}; }
-  __device__ Vec2<float> absolute() const { return {value[kPairAbsolute], value[kPairAbsolute + 1]}; }
+  __device__ Vec2<float> mean_sums() const { return {value[kPairMeans], value[kPairMeans + 1]}; }
   __device__ Vec3<float> color() const {
     return {value[kPairChannels], value[kPairChannels + 1], value[kPairChannels + 2]};
   }
@@ -84,8 +84,7 @@ struct FromPairs {
 
   /// What is known of Gaussian i before its gradient is asked for. count: 0 if it has none.
   __device__ PairRange range(int64_t i) const { return params.sums.ranges[i]; }
-  /// Calls use(gradient with respect to the splat as a function of it, what it shows, |dL/dmean|) where range.count >
-  /// 0.
+  /// Calls use(gradient with respect to the splat as a function of it, what it shows, MeanSums) where range.count > 0.
   template <class Cam, class Use>
   __device__ void visit(const Cam& camera, int64_t i, PairRange range, Use&& use) const {
     const SplatSums sums = sum_pairs(params.sums, i, range);
@@ -98,7 +97,7 @@ struct FromPairs {
       shown.color = sums.color();
     }
     use([&](const Cov2d<float>& cov, float) { return projected_grad(params.footprint, cov, sums.grad()); }, shown,
-        sums.absolute());
+        sums.mean_sums());
   }
 };
 
@@ -145,13 +144,10 @@ __device__ void project_vjp_body(const Params& params, const From& from) {
   const bool staged = out.shs && g.sh_stride <= rows.kCount;
   Vec3<float>* dL_dsh = staged ? rows.row() : out.shs ? out.shs + i * g.sh_stride : nullptr;
   CameraGrad<float> camera_grad = {};
-  from.visit(camera, i, range, [&](const auto& grad_of, const ShownGrad<float>& shown, Vec2<float> absolute) {
+  from.visit(camera, i, range, [&](const auto& grad_of, const ShownGrad<float>& shown, Vec2<float> mean_sums) {
     ar::project_vjp(camera, g, i, grad_of, shown, rows.row(), dL_dsh, out,
                     Cam::kFull && camera_grads ? &camera_grad : nullptr);
-    if (out.means2d && out.means2d_stride == 4) {
-      out.means2d[i * 4 + 2] = 0.5f * camera.size.x * absolute.x;
-      out.means2d[i * 4 + 3] = 0.5f * camera.size.y * absolute.y;
-    }
+    write_mean_sums(out, i, camera.size, mean_sums);
   });
   if (range.count == 0 && i < g.n) zero_grads(g, i, out, dL_dsh);
   if (staged) rows.store(out.shs + first * g.sh_stride, g.sh_stride, n);
@@ -190,7 +186,7 @@ __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGra
   params.dL_dmeans2d[i] = dL_dmean;
   params.dL_dcov2d[i] = {dL_dcov.xx, 2 * dL_dcov.xy, dL_dcov.yy};
   params.dL_dopacities[i] = dL_dopacity;
-  if (params.absolute) params.absolute[i] = sums.absolute();
+  if (params.absolute) params.absolute[i] = sums.mean_sums();
 }
 
 /// Channels that lie in the rows of pairs: a thread per splat.

@@ -15,9 +15,9 @@
 
 namespace ar::cuda {
 
-/// Floats per row of pair gradients: PairGrad, three channels, sums of |dL/dmean| per coordinate, a fourth channel.
+/// Floats per row of pair gradients: PairGrad, three channels, MeanSums, a fourth channel.
 inline constexpr int kPairGradWidth = 12;
-inline constexpr int kPairChannels = 6, kPairAbsolute = 9, kPairFourthChannel = 11;  ///< columns
+inline constexpr int kPairChannels = 6, kPairMeans = 9, kPairFourthChannel = 11;  ///< columns
 /// Channels that lie in the rows of pairs. More are blended in groups, and summed in memory of their own.
 inline constexpr int kFewChannels = 4;
 inline constexpr int kChannelGroup = 32;
@@ -222,7 +222,7 @@ struct BlendVjpParams : ar::BlendVjpParams<float> {
   const float* checkpoints;
   float* pair_grads;    ///< [max(capacity, n), kPairGradWidth] by slot, or by splat if there are too many pairs
   float* channel_sums;  ///< [max(capacity, n), kChannelGroup] likewise, for more than kFewChannels channels; or null
-  bool absolute;        ///< sum |dL/dmean| too
+  MeanSums mean_sums;
 };
 
 /// Sums over the pairs of every splat.

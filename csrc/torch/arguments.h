@@ -11,6 +11,8 @@
 #include <string_view>
 #include <vector>
 
+#include "core/stages.h"
+
 namespace ar::ops {
 
 using at::Tensor;
@@ -57,6 +59,7 @@ struct Inputs {
 struct Grads {
   Tensor means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp;
   Tensor viewmatrix, projmatrix, campos, lens;
+  MeanSums mean_sums = MeanSums::kNone;  ///< that means2D holds
 
   template <class Visit> void each(Visit&& visit) {
     for (Tensor* t : {&means3D, &means2D, &opacities, &shs, &colors_precomp, &scales, &rotations, &cov3D_precomp,
@@ -71,6 +74,7 @@ struct RasterizeArguments : Inputs {
   std::string footprint;
   double option = 0;
   bool depth = false, inverse_depth = false, alpha = false, keep = false, debug = false;
+  std::string means2d_z = "zero";  ///< third column of the gradient with respect to means2D: "sum_abs", "sum_norm"
 
   template <class Visit> void each(Visit&& visit) {
     Inputs::each(visit);
@@ -82,6 +86,7 @@ struct RasterizeArguments : Inputs {
     visit("bool inverse_depth=False", inverse_depth);
     visit("bool keep=False", keep);
     visit("bool debug=False", debug);
+    visit("str means2d_z=\"zero\"", means2d_z);
   }
 };
 

@@ -95,7 +95,7 @@ struct ChannelColumns {
 /// Sums over the pairs of every splat, as `blend_vjp` leaves them for `project_vjp` or `row_grads`.
 struct PairSums {
   Tensor pairs;         ///< CPU: (N, 6), or (N, 9) with the three colours; CUDA: (room, kPairGradWidth)
-  Tensor absolute;      ///< CPU: (N, 2), if |dL/dmean| is wanted
+  Tensor means;         ///< CPU: (N, 2) MeanSums, if they are wanted
   Tensor dL_dchannels;  ///< like ChannelTensors::rows; undefined where the pairs hold the three colours
 };
 
@@ -143,10 +143,10 @@ class Backend {
   virtual std::vector<Tensor> inspect(const ListTensors& lists, const FootprintSpec& footprint, TileGrid grid,
                                       int64_t count) = 0;
 
-  // Backward. `absolute`: sums of |dL/dmean| over pixels too.
+  // Backward.
   virtual PairSums blend_vjp(const ListTensors& lists, const BlendState& state, const FootprintSpec& footprint,
                              TileGrid grid, const ChannelTensors& channels, const Tensor& background,
-                             const ImageTensors& dL_dimage, bool absolute, bool debug) = 0;
+                             const ImageTensors& dL_dimage, MeanSums mean_sums, bool debug) = 0;
   /// Writes `grads`; returns sums of the camera's gradient, (parts, kCameraGradWidth), if `with_camera`.
   virtual Tensor project_vjp(const Inputs& in, const ListTensors& lists, const FootprintSpec& footprint,
                              const PairSums& sums, ChannelColumns columns, const Grads& grads, bool with_camera,

@@ -246,12 +246,12 @@ template <typename T> class CpuBackend final : public Backend {
 
   PairSums blend_vjp(const ListTensors& lists, const BlendState& state, const FootprintSpec& footprint, TileGrid grid,
                      const ChannelTensors& channels, const Tensor& background, const ImageTensors& dL_dimage,
-                     bool absolute, bool) override {
+                     MeanSums mean_sums, bool) override {
     const int64_t pairs = lists.pairs.numel(), count = channels.count;
     const bool own = !channels.rows.defined();  // the colours in the splats, whose sums stay with the pairs
     PairSums out;
     out.pairs = at::empty({pairs, cpu::kPairNumbers + (own ? 3 : 0)}, floats_);
-    if (absolute) out.absolute = at::empty({pairs, 2}, floats_);
+    if (mean_sums != MeanSums::kNone) out.means = at::empty({pairs, 2}, floats_);
     cpu::BlendVjpParams<T> p = {};
     p.grid = grid;
     p.splats = const_data_or_null<T>(lists.splats);
@@ -267,7 +267,8 @@ template <typename T> class CpuBackend final : public Backend {
     p.scratch = scratch.data_ptr<T>();
     p.pair_grads = data_or_null<T>(out.pairs);
     p.pair_stride = out.pairs.size(1);
-    p.pair_abs = elements_of<Vec2<T>, T>(out.absolute);
+    p.mean_sums = mean_sums;
+    p.pair_means = elements_of<Vec2<T>, T>(out.means);
     const cpu::Stages<T>& stages = stages_of(footprint);
     if (own) {
       p.count = 3;
@@ -306,7 +307,7 @@ template <typename T> class CpuBackend final : public Backend {
     p.pair_grads = const_data_or_null<T>(sums.pairs);
     p.pair_stride = sums.pairs.size(1);
     p.pair_colors = p.pair_stride > cpu::kPairNumbers;
-    p.pair_abs = elements_of<Vec2<T>, T>(sums.absolute);
+    p.pair_means = elements_of<Vec2<T>, T>(sums.means);
     if (columns.color >= 0 || columns.depth >= 0 || columns.inverse_depth >= 0) {
       p.dL_dchannels.data = const_data_or_null<T>(sums.dL_dchannels);
       p.dL_dchannels.stride = sums.dL_dchannels.size(1);
@@ -340,7 +341,7 @@ template <typename T> class CpuBackend final : public Backend {
     out.means2d = at::empty({n, 2}, floats_);
     out.cov2d = at::empty({n, 3}, floats_);
     out.opacities = at::empty({n}, floats_);
-    if (sums.absolute.defined()) out.absolute = at::empty({n, 2}, floats_);
+    if (sums.means.defined()) out.absolute = at::empty({n, 2}, floats_);
     cpu::RowGradsParams<T> p = {};
     p.pairs = splat_pairs_of(lists);
     p.n = n;
@@ -349,7 +350,7 @@ template <typename T> class CpuBackend final : public Backend {
     p.rows = projected_rows_of<T>(rows);
     p.pair_grads = const_data_or_null<T>(sums.pairs);
     p.pair_stride = sums.pairs.size(1);
-    p.pair_abs = elements_of<Vec2<T>, T>(sums.absolute);
+    p.pair_means = elements_of<Vec2<T>, T>(sums.means);
     p.dL_dmeans2d = elements_of<Vec2<T>, T>(out.means2d);
     p.dL_dcov2d = elements_of<Sym2<T>, T>(out.cov2d);
     p.dL_dopacities = data_or_null<T>(out.opacities);

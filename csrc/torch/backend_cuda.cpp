@@ -371,14 +371,14 @@ class CudaBackend final : public Backend {
 
   PairSums blend_vjp(const ListTensors& lists, const BlendState& state, const FootprintSpec& footprint, TileGrid grid,
                      const ChannelTensors& channels, const Tensor& background, const ImageTensors& dL_dimage,
-                     bool absolute, bool debug) override {
+                     MeanSums mean_sums, bool debug) override {
     check_counts(lists);
     check_plan(state);
     const int64_t n = lists.ids.numel(), rows = std::max(lists.pairs.size(0), n);
     const int count = int(channels.count);
     PairSums out;
     out.pairs = at::empty({rows, cuda::kPairGradWidth}, floats_);
-    if (absolute) out.absolute = out.pairs.narrow(1, cuda::kPairAbsolute, 2);
+    if (mean_sums != MeanSums::kNone) out.means = out.pairs.narrow(1, cuda::kPairMeans, 2);
     cuda::BlendVjpParams p = {};
     p.grid = grid;
     p.splats = const_data_or_null<float>(lists.splats);
@@ -397,7 +397,7 @@ class CudaBackend final : public Backend {
     p.max_chunks = state.chunks.size(0) - kPlanRows;
     p.checkpoints = const_data_or_null<float>(state.checkpoints);
     p.pair_grads = out.pairs.data_ptr<float>();
-    p.absolute = absolute;
+    p.mean_sums = mean_sums;
 
     cuda::SumChannelsParams sum = {};
     sum.sums = pair_sums_of(lists, out.pairs);
@@ -464,7 +464,7 @@ class CudaBackend final : public Backend {
     out.means2d = at::empty({n, 2}, floats_);
     out.cov2d = at::empty({n, 3}, floats_);
     out.opacities = at::empty({n}, floats_);
-    if (sums.absolute.defined()) out.absolute = at::empty({n, 2}, floats_);
+    if (sums.means.defined()) out.absolute = at::empty({n, 2}, floats_);
     cuda::RowGradsParams p = {};
     p.n = n;
     p.rows = projected_rows_of(rows);

@@ -243,6 +243,8 @@ void check(RasterizeArguments& a) {
   TORCH_CHECK_VALUE(a.bg.numel() == channels && (a.bg.dim() == 1 || (a.bg.dim() == 2 && a.bg.size(0) == 1)),
                     "bg must have shape (", channels, ",) or (1, ", channels, "), got ", shape_of(a.bg));
   a.bg = a.bg.reshape({channels}).contiguous();
+  TORCH_CHECK_VALUE(a.means2d_z == "zero" || a.means2d_z == "sum_abs" || a.means2d_z == "sum_norm",
+                    "means2d_z must be zero, sum_abs or sum_norm, got ", a.means2d_z);
 }
 
 void check_values(const RasterizeArguments& a) {

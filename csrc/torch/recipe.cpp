@@ -154,6 +154,12 @@ Grads make_grads(const Inputs& in, const std::vector<bool>& needs) {
   return grads;
 }
 
+/// What the gradient with respect to means2D holds besides itself.
+MeanSums mean_sums_of(const RasterizeArguments& a) {
+  if (a.means2D->size(1) == 4) return MeanSums::kAbsolute;
+  return a.means2d_z == "sum_abs" ? MeanSums::kAbsolute : a.means2d_z == "sum_norm" ? MeanSums::kNorm : MeanSums::kNone;
+}
+
 /// Adds up parts of CameraGrad, in double and always in the same order, and writes what is wanted.
 void set_camera_grads(const Tensor& parts, const std::vector<bool>& needs, Grads& grads) {
   const Tensor sum = parts.sum(0, false, at::kDouble).to(parts.scalar_type());
@@ -265,10 +271,10 @@ std::vector<Tensor> rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
 
     const std::unique_ptr<Backend> backend = make_backend(a.means3D);
     Grads grads = make_grads(a, needs);
-    const bool absolute = grads.means2D.defined() && grads.means2D.size(1) == 4;
+    if (grads.means2D.defined()) grads.mean_sums = mean_sums_of(a);
     const bool with_camera = a.lens && any_of(needs, kGaussianTensors, kCameraTensors);
     const PairSums sums = backend->blend_vjp(saved.lists, saved.state, footprint, grid, plan.channels, plan.background,
-                                             dL_dimage, absolute, a.debug);
+                                             dL_dimage, grads.mean_sums, a.debug);
     const Tensor camera =
         backend->project_vjp(a, saved.lists, footprint, sums, plan.columns, grads, with_camera, a.debug);
     if (with_camera) set_camera_grads(camera, needs, grads);
@@ -513,7 +519,7 @@ std::vector<Tensor> blend_vjp(VjpArguments<BlendArguments> arguments) {
     if (dL_dimage.defined()) gradient.color = dL_dimage[c];
     if (dL_dalpha.defined()) gradient.alpha = dL_dalpha[c];
     const PairSums sums = backend->blend_vjp(part.lists, state, footprint, grid, part.channels, part.background,
-                                             gradient, absolute, false);
+                                             gradient, absolute ? MeanSums::kAbsolute : MeanSums::kNone, false);
     const RowTensors rows = backend->row_grads(part.rows, part.lists, footprint, sums);
     means2d.push_back(rows.means2d);
     cov2d.push_back(rows.cov2d);

@@ -73,6 +73,7 @@ template <typename T> GaussianGrads<T> grads_of(const Inputs& in, const Grads& g
     out.colors = reinterpret_cast<Vec3<T>*>(data_or_null<T>(grads.colors_precomp));
   out.means2d = data_or_null<T>(grads.means2D);
   out.means2d_stride = in.means2D ? int(in.means2D->size(1)) : 0;
+  out.mean_sums = grads.mean_sums;
   return out;
 }
 

@@ -188,7 +188,8 @@ Sums<T> blend_vjp(const cpu::Stages<T>& stages, const Lists<T>& lists, TileGrid 
   p.scratch = scratch.data();
   p.pair_grads = out.pairs.data();
   p.pair_stride = out.stride;
-  p.pair_abs = absolute ? out.absolute.data() : nullptr;
+  p.mean_sums = absolute ? MeanSums::kAbsolute : MeanSums::kNone;
+  p.pair_means = absolute ? out.absolute.data() : nullptr;
   if (own) {
     p.count = 3;
     p.channel_sums = out.pairs.data() + cpu::kPairNumbers;
@@ -276,7 +277,8 @@ template <typename T> Rendered<T> run_stages(const cpu::Stages<T>& stages, const
   vjp.pair_grads = sums.pairs.data();
   vjp.pair_stride = sums.stride;
   vjp.pair_colors = own;
-  vjp.pair_abs = pass.absolute ? sums.absolute.data() : nullptr;
+  vjp.grads.mean_sums = pass.absolute ? MeanSums::kAbsolute : MeanSums::kNone;
+  vjp.pair_means = pass.absolute ? sums.absolute.data() : nullptr;
   vjp.camera_grads = pass.camera.lens ? camera_grads.data() : nullptr;
   of_camera.project_vjp(vjp);
 

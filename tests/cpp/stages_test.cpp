@@ -539,7 +539,7 @@ TEST_P(RowsTest, AreThePassInOne) {
   p.rows = rows.view();
   p.pair_grads = sums.pairs.data();
   p.pair_stride = sums.stride;
-  p.pair_abs = sums.absolute.data();
+  p.pair_means = sums.absolute.data();
   p.dL_dmeans2d = dL_dmeans2d.data();
   p.dL_dcov2d = dL_dcov2d.data();
   p.dL_dopacities = dL_dopacities.data();
