@@ -121,17 +121,18 @@ class SpeedCase(Case):
     def __init__(self, scene: io.Scene, view: io.View, footprint: str):
         super().__init__(scene, view, footprint)
         footprint = self.settings.footprint
-        given = {**self.gaussians, **self.settings._asdict(), "footprint": footprint.key, "keep": False, "alpha": False}
+        given = {**self.gaussians, **self.settings._asdict(), "footprint": footprint.key}
         given["option"] = footprint.option
         schema = torch.ops.analytic_rasterizer.rasterize.default._schema
-        self.op_arguments = [given.get(argument.name) for argument in schema.arguments]
+        required = [a.name for a in schema.arguments if not a.has_default_value()]
+        self.op_arguments = {name: given.get(name) for name in required}
 
     def stages(self) -> ar.Stages:
         return ar.render_stages(self.settings, **self.gaussians)
 
     @torch.no_grad()
     def op(self) -> None:
-        torch.ops.analytic_rasterizer.rasterize(*self.op_arguments)
+        torch.ops.analytic_rasterizer.rasterize(**self.op_arguments)
 
     def extra_memory(self, pairs: int) -> dict:
         """Bytes that forward and backward need beyond what goes in and comes out, and their share of

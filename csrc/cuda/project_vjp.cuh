@@ -90,11 +90,18 @@ struct FromPairs {
     const SplatSums sums = sum_pairs(params.sums, i, range);
     if (range.count == 0) return;
     ShownGrad<float> shown = {{0, 0, 0}, 0};
+    const float depth = apply_row(camera.view_z, params.gaussians.means[i]);
     if (params.dL_dchannels.data) {
-      const float depth = apply_row(camera.view_z, params.gaussians.means[i]);
       add_channels_vjp(params.dL_dchannels, i, depth, shown);
     } else {
       shown.color = sums.color();
+    }
+    if (params.channels_in_pairs) {
+      const ChannelRows<const float>& columns = params.dL_dchannels;
+      const float fourth = sums.value[kPairFourthChannel];
+      const ChannelRows<const float> row = {&fourth, 1, -1, columns.depth >= 0 ? 0 : -1,
+                                            columns.inverse_depth >= 0 ? 0 : -1};
+      add_channels_vjp(row, 0, depth, shown);
     }
     use([&](const Cov2d<float>& cov, float) { return projected_grad(params.footprint, cov, sums.grad()); }, shown,
         sums.mean_sums());

@@ -248,6 +248,8 @@ struct SumChannelsParams {
 
 struct ProjectVjpParams : ar::ProjectVjpParams<float> {
   PairSumsView sums;
+  /// dL_dchannels has no rows: its channels, the colour and a fourth one, are summed in the rows of pairs.
+  bool channels_in_pairs;
   float* camera_grads;  ///< [warps_of(n), kCameraGradWidth] CameraGrad of each 32 Gaussians, or null
 };
 

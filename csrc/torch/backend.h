@@ -73,8 +73,9 @@ template <class Members> Members from_list(const std::vector<Tensor>& list, size
 
 /// What is blended. Without `rows` the three colours in the splats.
 struct ChannelTensors {
-  Tensor rows;       ///< (m, count) contiguous, or undefined
-  bool by_gaussian;  ///< a row per Gaussian; else per splat
+  Tensor rows;            ///< (m, count) contiguous, or undefined
+  bool by_gaussian;       ///< a row per Gaussian; else per splat
+  bool all_made = false;  ///< by `project`: only project_vjp looks at their gradient
   int64_t count;
 };
 
@@ -94,9 +95,10 @@ struct ChannelColumns {
 
 /// Sums over the pairs of every splat, as `blend_vjp` leaves them for `project_vjp` or `row_grads`.
 struct PairSums {
-  Tensor pairs;         ///< CPU: (N, 6), or (N, 9) with the three colours; CUDA: (room, kPairGradWidth)
-  Tensor means;         ///< CPU: (N, 2) MeanSums, if they are wanted
-  Tensor dL_dchannels;  ///< like ChannelTensors::rows; undefined where the pairs hold the three colours
+  Tensor pairs;  ///< CPU: (N, 6), or (N, 9) with the three colours; CUDA: (room, kPairGradWidth)
+  Tensor means;  ///< CPU: (N, 2) MeanSums, if they are wanted
+  /// Like ChannelTensors::rows; undefined where the pairs hold the three colours, or all that `project` made.
+  Tensor dL_dchannels;
 };
 
 /// The public form of splats (ProjectedRows in core/stages.h), and gradients with respect to it.

@@ -401,13 +401,14 @@ class CudaBackend final : public Backend {
 
     cuda::SumChannelsParams sum = {};
     sum.sums = pair_sums_of(lists, out.pairs);
-    if (channels.rows.defined()) {
+    const bool few = count <= cuda::kFewChannels;
+    const bool with_sums = channels.rows.defined() && !(few && channels.all_made);
+    if (with_sums) {
       out.dL_dchannels = at::empty({n, count}, floats_);
       sum.dL_dchannels = data_or_null<float>(out.dL_dchannels);
       sum.stride = count;
     }
     Tensor channel_sums;
-    const bool few = count <= cuda::kFewChannels;
     if (!few) {
       channel_sums = at::empty({rows, cuda::kChannelGroup}, floats_);
       sum.channel_sums = p.channel_sums = channel_sums.data_ptr<float>();
@@ -418,7 +419,7 @@ class CudaBackend final : public Backend {
       check_stage("blend_vjp", debug);
       sum.first = first;
       sum.count = std::min(count - first, width);
-      if (channels.rows.defined()) cuda::sum_channels(sum, stream_);
+      if (with_sums) cuda::sum_channels(sum, stream_);
       check_stage("sum_channels", debug);
     }
     return out;
@@ -431,8 +432,9 @@ class CudaBackend final : public Backend {
     p.footprint = footprint.choice;
     p.sums = pair_sums_of(lists, sums.pairs);
     if (columns.color >= 0 || columns.depth >= 0 || columns.inverse_depth >= 0) {
+      p.channels_in_pairs = !sums.dL_dchannels.defined();
       p.dL_dchannels.data = const_data_or_null<float>(sums.dL_dchannels);
-      p.dL_dchannels.stride = sums.dL_dchannels.size(1);
+      p.dL_dchannels.stride = p.channels_in_pairs ? 0 : sums.dL_dchannels.size(1);
       p.dL_dchannels.color = columns.color;
       p.dL_dchannels.depth = columns.depth;
       p.dL_dchannels.inverse_depth = columns.inverse_depth;

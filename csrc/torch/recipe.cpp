@@ -97,6 +97,7 @@ struct ChannelPlan {
     }
     channels.rows = made;
     if (color_channels == 3) columns.color = 0;
+    channels.all_made = columns.color == 0;
     if (a.depth) columns.depth = int(color_channels);
     if (a.inverse_depth) columns.inverse_depth = int(channels.count) - 1;
     if (made.defined()) return;
