@@ -10,7 +10,8 @@
 
 namespace ar::cuda {
 
-inline constexpr int kVjpBatch = 32;
+/// Splats that a block takes between barriers: many, as its warps do not all meet equally many of them.
+inline constexpr int kVjpBatch = 64;
 /// Sums of a pair besides its channels: PairGrad, and MeanSums.
 inline constexpr int kShapeSums = 8;
 
@@ -21,7 +22,7 @@ template <class F> struct GroupVjpShared {
   float4 contributions[kSubtiles][2]
                       [8];  ///< of a warp's 32 pixels; two, so that one can be read while the next is written
   float sums[kSubtiles][kVjpBatch][kChannelGroup + kShapeSums];  ///< of a warp's pixels
-  uint32_t hits[kSubtiles];                                      ///< splats that have sums of a warp
+  uint32_t hits[kSubtiles][kVjpBatch / 32];                      ///< splats that have sums of a warp
   int32_t rows[kVjpBatch];
   Mat2<float> mean_maps[kVjpBatch];
   int last[kSubtiles];  ///< place behind the last splat that a subtile composited
@@ -116,85 +117,99 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
     for (int q = 0; q < 32; ++q) g_channel[q] = transposed[q * kStride + lane];
   }
 
-  int turn = 0;
+  // The splat of this thread in the batch that ends at k1, for the threads that there are splats for.
+  const auto splat_of_batch = [&](int k1) {
+    const int k = max(k1 - kVjpBatch, 0) + int(threadIdx.x);
+    return threadIdx.x < kVjpBatch && k < k1 ? list.splat(k) : -1;
+  };
+  int turn = 0, id = splat_of_batch(tile_last);
   for (int k1 = tile_last; k1 > 0; k1 -= kVjpBatch) {
     const int k0 = max(k1 - kVjpBatch, 0), count = k1 - k0;
+    const int32_t next_id = splat_of_batch(k0);
     __syncthreads();  // all have read what the last batch left
     if (threadIdx.x < kVjpBatch) {
       uint32_t reach = 0;
-      const int k = k0 + lane;
+      const int t = threadIdx.x, k = k0 + t;
       if (k < k1) {
-        const int32_t id = list.splat(k);
         const Splat<F, float> splat = splats[id];
         reach = subtile_reach(support_of(splat), list.x0, list.y0);
 #pragma unroll
         for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= shared.last[b]) << b);
-        if (reach) shared.splats[lane] = {tile_terms(splat, list), {}};
-        if (with_means) shared.mean_maps[lane] = F::mean_map(splat.shape);
-        shared.channels.ids[lane] = id;
-        shared.rows[lane] = list.overflow ? id : list.slot(k);
+        if (reach) shared.splats[t] = {tile_terms(splat, list), {}};
+        if (with_means) shared.mean_maps[t] = F::mean_map(splat.shape);
+        shared.channels.ids[t] = id;
+        shared.rows[t] = list.overflow ? id : list.slot(k);
       }
-      shared.reach[lane] = uint8_t(reach);
+      shared.reach[t] = uint8_t(reach);
     }
     __syncthreads();
     shared.channels.load(params.channels, first, count, shared.reach);
     __syncthreads();
-    uint32_t hits = 0;
-    for (uint32_t mask = __ballot_sync(kAllLanes, shared.reach[lane] >> warp & 1); mask != 0;) {
-      const int j = 31 - __clz(mask);
-      mask ^= 1u << j;
-      TileSplatRef<F, 0> splat = shared.splats[j];
-      float alpha[S];
-      bool any = false;
-#pragma unroll
-      for (int s = 0; s < S; ++s) {
-        alpha[s] = F::alpha(splat.terms, p, s);
-        any |= alpha[s] >= float(kAlphaMin) && k0 + j < last[s];
-      }
-      if (!__any_sync(kAllLanes, any)) continue;
-      hits |= 1u << j;
-      float g_color = dot(g, shared.channels.values[j]);
-      if (all_at_once && group == 0) {
-        const float* row = params.channels.row(shared.channels.ids[j]);
-        for (int c = kChannelGroup; c < channel_count; ++c) g_color = madd(gradient(c), row[c], g_color);
-      }
-      ShapeGrad<float> shape = {{0, 0}, {0, 0, 0}};
-      float weighted = 0, contribution = 0;
-#pragma unroll
-      for (int s = 0; s < S; ++s) {
-        const bool hit = alpha[s] >= float(kAlphaMin) && k0 + j < last[s];
-        const BlendGrad<float> grad = blend_sample_vjp(hit, alpha[s], g_color, transmittance[s], behind[s]);
-        if (with_shape) F::add_alpha_vjp(splat.terms, p, s, alpha[s], grad.dL_dalpha, shape);
-        contribution += grad.contribution;
-        weighted += grad.dL_dalpha * alpha[s];
-      }
-      turn ^= 1;
-      reinterpret_cast<float*>(shared.contributions[warp][turn])[lane] = contribution;
-      float* sums = shared.sums[warp][j];
-      if (with_shape) {
-        Vec2<float> means = {0, 0};
-        if (with_means) {
-          const Vec2<float> size = {float(params.grid.width), float(params.grid.height)};
-          means = mean_sums_of(params.mean_sums, size, transform_transposed(shared.mean_maps[j], shape.offset));
-        }
-        shape = F::collect(splat.terms, shape, weighted);
-        const float values[kShapeSums] = {shape.offset.x, shape.offset.y, shape.shape.xx, shape.shape.xy,
-                                          shape.shape.yy, weighted,       means.x,        means.y};
-        const float sum = sum_values(values);
-        if (lane % 4 == 0) sums[kChannelGroup + lane / 4] = sum;
-      }
-      __syncwarp();
-      sums[lane] = dot(g_channel, shared.contributions[warp][turn]);
+    if (next_id >= 0) {  // so that the next batch need not wait for memory
+      prefetch(splats + next_id);
+      prefetch(params.channels.row(next_id) + first);
     }
-    if (lane == 0) shared.hits[warp] = hits;
+    id = next_id;
+    for (int part = kVjpBatch / 32 - 1; part >= 0; --part) {
+      uint32_t hits = 0;
+      for (uint32_t mask = __ballot_sync(kAllLanes, shared.reach[32 * part + lane] >> warp & 1); mask != 0;) {
+        const int bit = 31 - __clz(mask), j = 32 * part + bit;
+        mask ^= 1u << bit;
+        TileSplatRef<F, 0> splat = shared.splats[j];
+        float alpha[S];
+        bool any = false;
+#pragma unroll
+        for (int s = 0; s < S; ++s) {
+          alpha[s] = F::alpha(splat.terms, p, s);
+          any |= alpha[s] >= float(kAlphaMin) && k0 + j < last[s];
+        }
+        if (!__any_sync(kAllLanes, any)) continue;
+        hits |= 1u << bit;
+        float g_color = dot(g, shared.channels.values[j]);
+        if (all_at_once && group == 0) {
+          const float* row = params.channels.row(shared.channels.ids[j]);
+          for (int c = kChannelGroup; c < channel_count; ++c) g_color = madd(gradient(c), row[c], g_color);
+        }
+        ShapeGrad<float> shape = {{0, 0}, {0, 0, 0}};
+        float weighted = 0, contribution = 0;
+#pragma unroll
+        for (int s = 0; s < S; ++s) {
+          const bool hit = alpha[s] >= float(kAlphaMin) && k0 + j < last[s];
+          const BlendGrad<float> grad = blend_sample_vjp(hit, alpha[s], g_color, transmittance[s], behind[s]);
+          if (with_shape) F::add_alpha_vjp(splat.terms, p, s, alpha[s], grad.dL_dalpha, shape);
+          contribution += grad.contribution;
+          weighted += grad.dL_dalpha * alpha[s];
+        }
+        turn ^= 1;
+        reinterpret_cast<float*>(shared.contributions[warp][turn])[lane] = contribution;
+        float* sums = shared.sums[warp][j];
+        if (with_shape) {
+          Vec2<float> means = {0, 0};
+          if (with_means) {
+            const Vec2<float> size = {float(params.grid.width), float(params.grid.height)};
+            means = mean_sums_of(params.mean_sums, size, transform_transposed(shared.mean_maps[j], shape.offset));
+          }
+          shape = F::collect(splat.terms, shape, weighted);
+          const float values[kShapeSums] = {shape.offset.x, shape.offset.y, shape.shape.xx, shape.shape.xy,
+                                            shape.shape.yy, weighted,       means.x,        means.y};
+          const float sum = sum_values(values);
+          if (lane % 4 == 0) sums[kChannelGroup + lane / 4] = sum;
+        }
+        __syncwarp();
+        sums[lane] = dot(g_channel, shared.contributions[warp][turn]);
+      }
+      if (lane == 0) shared.hits[warp][part] = hits;
+    }
     __syncthreads();
     for (int j = warp; j < count; j += kSubtiles) {
       float sum = 0, shape_sum = 0;
+      const uint32_t of_warps = __ballot_sync(kAllLanes, shared.hits[lane % kSubtiles][j / 32] >> j % 32 & 1);
 #pragma unroll
       for (int w = 0; w < kSubtiles; ++w) {
-        if (!(shared.hits[w] >> j & 1)) continue;
-        sum += shared.sums[w][j][lane];
-        if (lane < kShapeSums) shape_sum += shared.sums[w][j][kChannelGroup + lane];
+        if (of_warps >> w & 1) {
+          sum += shared.sums[w][j][lane];
+          if (lane < kShapeSums) shape_sum += shared.sums[w][j][kChannelGroup + lane];
+        }
       }
       const int32_t row = shared.rows[j];
       if (params.channel_sums) {

@@ -27,6 +27,9 @@ __device__ inline int warp_max(int v) {
 #endif
 }
 
+/// Asks for the line of memory that holds `*address`.
+__device__ inline void prefetch(const void* address) { asm volatile("prefetch.global.L1 [%0];" ::"l"(address)); }
+
 /// Sums N = 8, 9 or 10 values over the lanes with 9 or 12 shuffles instead of 5 N: lanes trade the halves that the
 /// other will sum. A lane l gets the sum of value summed_value<N>(l).
 template <int N> __device__ float sum_values(const float (&v)[N]) {
