@@ -30,7 +30,33 @@ def distCUDA2(points: torch.Tensor) -> torch.Tensor:
     layout, has too many rows, or is on a device that this package does not serve or was not built for.
     """
     check_points(points)
-    points = points.detach().resolve_neg().contiguous()
+    return mean_squared_distances(points.detach().resolve_neg().contiguous())
+
+
+def check_points(points: torch.Tensor) -> None:
+    """Raises what `distCUDA2` says it does."""
+    if not isinstance(points, torch.Tensor):
+        raise TypeError(f"points must be a torch.Tensor, got {type(points).__name__}")
+    if points.dtype != torch.float32:
+        raise TypeError(f"points must have dtype torch.float32, got {points.dtype}")
+    if points.layout != torch.strided:
+        raise ValueError(f"points must have layout torch.strided, got {points.layout}")
+    if points.dim() != 2 or points.shape[1] != 3:
+        raise ValueError(f"points must have shape (N, 3), got {tuple(points.shape)}")
+    if points.shape[0] > _C.MAX_POINTS:
+        raise ValueError(f"points must have at most {_C.MAX_POINTS} rows, got {points.shape[0]}")
+    if points.device.type not in ("cpu", "cuda"):
+        raise ValueError(f"points must be on the CPU or on a CUDA device, got {points.device}")
+    if points.is_cuda and not has_cuda:
+        raise ValueError(
+            f"points must be on the CPU, because analytic_simple_knn was built without CUDA, got {points.device}"
+        )
+
+
+# An operator, because what has no memory (torch.compile traces with such tensors) must not reach the pointers.
+@torch.library.custom_op("analytic_simple_knn::mean_squared_distances", mutates_args=())
+def mean_squared_distances(points: torch.Tensor) -> torch.Tensor:
+    """`distCUDA2` of points that have been checked and are contiguous."""
     n = len(points)
     out = points.new_empty(n)
     if n == 0:
@@ -47,21 +73,6 @@ def distCUDA2(points: torch.Tensor) -> torch.Tensor:
     return out
 
 
-def check_points(points: torch.Tensor) -> None:
-    """Raises what `distCUDA2` says it does."""
-    if not isinstance(points, torch.Tensor):
-        raise TypeError(f"points must be a torch.Tensor, got {type(points).__name__}")
-    if points.dtype != torch.float32:
-        raise TypeError(f"points must have dtype torch.float32, got {points.dtype}")
-    if points.layout != torch.strided:
-        raise ValueError(f"points must have layout torch.strided, got {points.layout}")
-    if points.dim() != 2 or points.shape[1] != 3:
-        raise ValueError(f"points must have shape (N, 3), got {tuple(points.shape)}")
-    if len(points) > _C.MAX_POINTS:
-        raise ValueError(f"points must have at most {_C.MAX_POINTS} rows, got {len(points)}")
-    if points.device.type not in ("cpu", "cuda"):
-        raise ValueError(f"points must be on the CPU or on a CUDA device, got {points.device}")
-    if points.is_cuda and not has_cuda:
-        raise ValueError(
-            f"points must be on the CPU, because analytic_simple_knn was built without CUDA, got {points.device}"
-        )
+@mean_squared_distances.register_fake
+def _(points: torch.Tensor) -> torch.Tensor:
+    return points.new_empty(points.shape[0])

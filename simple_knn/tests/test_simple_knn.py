@@ -248,6 +248,21 @@ def test_errors(points, error, message):
         distCUDA2(points)
 
 
+def test_torch_compile(device):
+    """Traced as one operator, without a break of the graph."""
+    points = benchmark.cube(1000).to(device)
+    compiled = torch.compile(lambda p: distCUDA2(2 * p) + 1, backend="eager", fullgraph=True)
+    assert torch.equal(compiled(points), distCUDA2(2 * points) + 1)
+    torch.library.opcheck(analytic_simple_knn.mean_squared_distances, (points,))
+
+
+def test_tensors_without_memory():
+    """What traces a program gets the shape of the result, and nothing looks for numbers."""
+    with torch._subclasses.FakeTensorMode():
+        result = distCUDA2(torch.rand(5, 3))
+    assert result.shape == (5,) and result.dtype == torch.float32
+
+
 def test_the_name_that_repositories_import():
     import simple_knn._C
 
