@@ -19,16 +19,16 @@ BUILD ?= build
 BIN := $(VENV)/bin
 JOBS := $(shell nproc 2>/dev/null || echo 2)
 SOURCES := $(shell find csrc -name '*.h' -o -name '*.cpp' -o -name '*.cuh' -o -name '*.cu') setup.py pyproject.toml
-CPP_SOURCES := $(shell git ls-files 'csrc/*' 'tests/cpp/*' 2>/dev/null)
+CPP_SOURCES := $(shell git ls-files 'csrc/*' 'tests/cpp/*' 'simple_knn/csrc/*' 2>/dev/null)
 # The system's cmake, or else one from PyPI.
 CMAKE = $(shell command -v cmake || echo $(BIN)/cmake)
 
-.PHONY: demo test test-cpp test-python test-sanitized test-python-sanitized fuzz fuzz-core bench wheel format lint clean
+.PHONY: demo test test-cpp test-python test-simple-knn test-sanitized test-python-sanitized fuzz fuzz-core bench wheel format lint clean
 
 demo: $(VENV)/.installed
 	$(BIN)/python examples/demo.py --out $(OUT)
 
-test: test-cpp test-python
+test: test-cpp test-python test-simple-knn
 
 test-cpp: $(VENV)/.tools
 	$(CMAKE) -S . -B $(BUILD)/cpp -DCMAKE_BUILD_TYPE=Release
@@ -43,6 +43,12 @@ test-sanitized: $(VENV)/.tools
 
 test-python: $(VENV)/.installed
 	$(BIN)/python -m pytest -q
+
+# Built in place and not installed, so that a simple_knn that VENV may have stays what it is.
+test-simple-knn: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet "setuptools>=77" ninja pybind11
+	cd simple_knn && $(abspath $(BIN))/python setup.py -q build_ext --inplace
+	PYTHONPATH=simple_knn $(BIN)/python -m pytest -q -n 2 simple_knn/tests
 
 # Random scenes with bad numbers in them, until one breaks a promise of docs/stability.md.
 fuzz: $(VENV)/.installed
@@ -118,3 +124,4 @@ $(VENV)/.installed: $(VENV)/.torch $(SOURCES)
 
 clean:
 	rm -rf $(VENV) $(BUILD) $(OUT) analytic_rasterizer/*.so *.egg-info
+	rm -rf simple_knn/build simple_knn/analytic_simple_knn/*.so simple_knn/*.egg-info
