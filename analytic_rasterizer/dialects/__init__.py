@@ -62,7 +62,8 @@ def set_dialect(name: str | None) -> None:
     """
     global _chosen
     _chosen = _FROM_ENVIRONMENT if name is None else _dialect_named(name, "dialect")
-    _base.choose(None if _chosen is None else _MODULES[_chosen].GaussianRasterizationSettings)
+    # Under 3DGS 2023 other dialects are inferred all the same.
+    _base.choose(None if get_dialect() == DEFAULT else _MODULES[_chosen].GaussianRasterizationSettings)
 
 
 def get_dialect() -> str:

@@ -22,6 +22,10 @@ from ._refused import refusal, refuse
 
 FIELDS = LibrarySettings._fields
 """The settings of 3DGS 2023, in its order."""
+ARGUMENTS = (
+    "means3D", "means2D", "opacities", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp",
+)  # fmt: skip
+"""The arguments of forward of 3DGS 2023, in its order."""
 
 _resolved = lru_cache(maxsize=64)(resolve_footprint)
 _inferred_from: dict[str, type] = {}  # keyword of settings: the settings that have it
@@ -72,6 +76,7 @@ class GaussianRasterizationSettings(LibrarySettings):
         "DepthSplat",
         "InstantSplat",
         "GaussianAvatars",
+        "Mini-Splatting",
         "gaussian-splatting-lightning",
     )
     optional: dict[str, Any] = {}  # noqa: RUF012
@@ -146,7 +151,7 @@ class GaussianRasterizationSettings(LibrarySettings):
         """
         arguments = means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp
         if further:
-            return self._inferred(further).render(*arguments, **further)
+            return self._inferred(further).render(**dict(zip(ARGUMENTS, arguments)), **further)
         return self.values(*render(self, self.outputs, *arguments))
 
     def values(self, color: torch.Tensor, radii: torch.Tensor, outputs: Outputs | None = None) -> tuple:

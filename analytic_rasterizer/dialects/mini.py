@@ -22,17 +22,15 @@ class GaussianRasterizationSettings(Settings):
     """Those of 3DGS 2023."""
 
     dialect = "mini"
-    repositories = ("Mini-Splatting",)
+    repositories = ()  # the repository imports it by the name of its own module
     filter = "point"
     outputs = Effects(gaussian_stats=True, dominant_index=True)
 
     def returned(self, color, radii, outputs):
-        dominant = outputs.dominant_index.flatten()
-        dominated = torch.zeros_like(radii).index_add(
-            0, dominant.clamp_min(0).long(), (dominant >= 0).int()
-        ) if len(radii) else radii  # fmt: skip
+        dominant = outputs.dominant_index.flatten()  # -1 for pixels of nobody, counted first
+        counts = radii.new_zeros(len(radii) + 1).index_add(0, dominant + 1, torch.ones_like(dominant))
         stats = outputs.gaussian_stats
-        return color, radii, stats.sum_weight, stats.pixels, dominated
+        return color, radii, stats.sum_weight, stats.pixels, counts[1:]
 
 
 class GaussianRasterizer(Rasterizer):
@@ -105,8 +103,8 @@ def _rays(settings: Settings, like: torch.Tensor) -> torch.Tensor:
     """
     height, width = like.shape[1:]
     proj, view = settings.projmatrix.reshape(4, 4), settings.viewmatrix.reshape(4, 4)
-    x = ((2 * torch.arange(width, device=like.device) + 1) / width - 1).to(like.dtype)
-    y = ((2 * torch.arange(height, device=like.device) + 1) / height - 1).to(like.dtype)
+    x = (2 * torch.arange(width, dtype=like.dtype, device=like.device) + 1) / width - 1
+    y = (2 * torch.arange(height, dtype=like.dtype, device=like.device) + 1) / height - 1
     columns = (proj[:3, 0] - x[:, None] * proj[:3, 3])[None].expand(height, width, 3)
     rows = (proj[:3, 1] - y[:, None] * proj[:3, 3])[:, None].expand(height, width, 3)
     rays = torch.linalg.cross(columns, rows)
