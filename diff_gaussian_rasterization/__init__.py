@@ -6,10 +6,11 @@ environment variable ANALYTIC_RASTERIZER_DIALECT.
 
 import sys as _sys
 
-from analytic_rasterizer.dialects import _native as _C
+from analytic_rasterizer.dialects import _native as _C  # noqa: N812  (its name in the original)
 from analytic_rasterizer.dialects import dialect_module as _dialect_module
 from analytic_rasterizer.dialects import exporters as _exporters
-from analytic_rasterizer.dialects import get_dialect, set_dialect
+from analytic_rasterizer.dialects import get_dialect as get_dialect
+from analytic_rasterizer.dialects import set_dialect as set_dialect
 from analytic_rasterizer.dialects._refused import refusal as _refusal
 
 # Another rasterizer that was installed before may have left its compiled _C in this folder, which would come first.

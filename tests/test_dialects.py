@@ -7,7 +7,6 @@ import math
 import pickle
 import shutil
 
-import diff_gaussian_rasterization as drop_in
 import pytest
 import scenes
 import torch
@@ -15,13 +14,15 @@ from conftest import ROOT, each_precision, in_threads, run_python
 from scenes import Camera
 
 import analytic_rasterizer as ar
+import diff_gaussian_rasterization as drop_in
 from analytic_rasterizer import dialects
 from analytic_rasterizer.dialects import _base
 
-BASE = (
-    "image_height image_width tanfovx tanfovy bg scale_modifier viewmatrix projmatrix sh_degree campos prefiltered debug"
-).split()
-FORWARD = "means3D means2D opacities shs colors_precomp scales rotations cov3D_precomp".split()
+BASE = [
+    "image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier", "viewmatrix", "projmatrix",
+    "sh_degree", "campos", "prefiltered", "debug",
+]  # fmt: skip
+FORWARD = ["means3D", "means2D", "opacities", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp"]
 CAMERA = Camera(bg=(0.2, 0.5, 0.9), sh_degree=1, image_width=40, image_height=30)
 COUNT = 25
 
@@ -346,13 +347,13 @@ def test_ambiguous_and_missing_settings():
         drop_in.GaussianRasterizationSettings(*values[:9], debug=False)
     with pytest.raises(TypeError, match="mip must have debug, which are missing"):
         drop_in.GaussianRasterizationSettings(*values[:4], kernel_size=0.1, **dict(zip(BASE[4:11], values[4:11])))
-    with pytest.raises(TypeError, match="settings must be among.*nonsense"):
+    with pytest.raises(TypeError, match=r"settings must be among.*nonsense"):
         drop_in.GaussianRasterizationSettings(*values, nonsense=1)
 
 
 def test_arguments_of_other_dialects():
     rasterizer = drop_in.GaussianRasterizer(settings_of("gs2023"))
-    with pytest.raises(TypeError, match="gs2023 does not take theta: .*docs/dialects.md"):
+    with pytest.raises(TypeError, match=r"gs2023 does not take theta: .*docs/dialects.md"):
         rasterizer(**scene_of(), theta=torch.zeros(3))
     with pytest.raises(TypeError, match="dc belongs to dialect accel, and the settings are those of gs2023"):
         rasterizer(**scene_of(), dc=torch.zeros(COUNT, 1, 3))
@@ -561,7 +562,9 @@ def test_accel_has_the_gradient_of_dc(device):
         (made * probe(made)).sum().backward()
     assert torch.equal(torch.cat([scene["dc"].grad, scene["shs"].grad], 1), whole["shs"].grad)
     only = scene_of(device) | {"shs": None, "dc": scene["dc"].detach()}
-    expected = plain(device, scene=scene_of(device) | {"shs": only["dc"]}, camera=dataclasses.replace(CAMERA, sh_degree=0))
+    expected = plain(
+        device, scene=scene_of(device) | {"shs": only["dc"]}, camera=dataclasses.replace(CAMERA, sh_degree=0)
+    )
     assert torch.equal(render("accel", device, scene=only, sh_degree=0)[0], expected[0])
 
 
@@ -572,7 +575,9 @@ def test_sparse_adam_against_its_definition(device):
     parameters = [torch.nn.Parameter(draw(6, 2, 3).to(device)), torch.nn.Parameter(draw(6).to(device))]
     groups = [{"params": [parameters[0]], "lr": 0.1, "name": "a"}, {"params": [parameters[1]], "name": "b"}]
     optimizer = drop_in.SparseGaussianAdam(groups, lr=0.02, eps=1e-15)
-    states = [[p.detach().cpu().clone(), torch.zeros(p.shape).double(), torch.zeros(p.shape).double()] for p in parameters]
+    states = [
+        [p.detach().cpu().clone(), torch.zeros(p.shape).double(), torch.zeros(p.shape).double()] for p in parameters
+    ]
     for visible in ([1, 0, 1, 0, 1, 1], [0, 0, 1, 1, 0, 1], [0, 0, 0, 0, 0, 0]):
         for p, lr, (value, m, v) in zip(parameters, (0.1, 0.02), states):
             p.grad = draw(*p.shape).to(device)
@@ -696,7 +701,14 @@ def test_module_of_mini_splatting():
     made = second.GaussianRasterizer(settings)(**scene_of())
     assert all(map(torch.equal, made, render("mini")))
     # The module of 3DGS 2023 stays what it is.
-    assert len(drop_in.GaussianRasterizer(drop_in.GaussianRasterizationSettings(**CAMERA.fields(torch.float32)))(**scene_of())) == 2
+    assert (
+        len(
+            drop_in.GaussianRasterizer(drop_in.GaussianRasterizationSettings(**CAMERA.fields(torch.float32)))(
+                **scene_of()
+            )
+        )
+        == 2
+    )
 
 
 @each_precision
@@ -747,7 +759,9 @@ def test_relocation_against_the_paper(device):
     opacity = torch.tensor([0.0, 1e-6, 0.005, 0.3, 0.7, 0.97, 1 - 2.0**-20, 1.0], dtype=torch.float64)
     for n in (1, 2, 7, 50):
         new, scale = ar.compute_relocation(
-            opacity.to(device), torch.full((8, 3), 2.0, dtype=torch.float64, device=device), torch.full((8,), n, device=device)
+            opacity.to(device),
+            torch.full((8, 3), 2.0, dtype=torch.float64, device=device),
+            torch.full((8,), n, device=device),
         )
         for i, o in enumerate(opacity.clamp(max=1 - 2.0**-24).tolist()):
             o_new = -math.expm1(math.log1p(-o) / n)
@@ -822,7 +836,9 @@ def test_native_functions(device, inputs):
     weights = probe(color)
     (expected * weights).sum().backward()
     ar.set_default_footprint("point")  # the backward pass is of what was rendered
-    bg, means3D, colors, _, scales, rotations, modifier, cov, view, proj, tx, ty, _, _, sh, degree, campos, *_ = arguments
+    bg, means3D, colors, _, scales, rotations, modifier, cov, view, proj, tx, ty, _, _, sh, degree, campos, *_ = (
+        arguments
+    )
     made = _C.rasterize_gaussians_backward(
         bg, means3D, radii, colors, scales, rotations, modifier, cov, view, proj, tx, ty, weights, sh, degree, campos,
         buffers[0], count, buffers[1], buffers[2], False,
@@ -846,7 +862,8 @@ def test_native_functions_without_gaussians(device):
     empty, f = torch.Tensor([]), fields
     made = _C.rasterize_gaussians_backward(
         f["bg"], scene["means3D"], radii, empty, scene["scales"], scene["rotations"], 1.0, empty, f["viewmatrix"],
-        f["projmatrix"], 0.6, 0.5, probe(color), scene["shs"], 1, f["campos"], buffers[0], 0, buffers[1], buffers[2], False,
+        f["projmatrix"], 0.6, 0.5, probe(color), scene["shs"], 1, f["campos"], buffers[0], 0, buffers[1], buffers[2],
+        False,
     )  # fmt: skip
     assert [tuple(g.shape) for g in made] == [(0, 3), (0, 3), (0, 1), (0, 3), (0, 6), (0, 4, 3), (0, 3), (0, 4)]
 

@@ -50,12 +50,13 @@ def set_dialect(name: str | None) -> None:
 
     From then on the names of the module are those of the dialect: what it exports, `_fields` and signatures answer as
     those of the repository. Classes that were imported before follow where they can: the settings of 3DGS 2023 make
-    settings of the chosen dialect, and a rasterizer does what its settings say. Settings that were made before stay what
-    they are, and so do classes that were imported from another dialect than 3DGS 2023.
+    settings of the chosen dialect, and a rasterizer does what its settings say. Settings that were made before stay
+    what they are, and so do classes that were imported from another dialect than 3DGS 2023.
 
     Args:
-        name: One of `DIALECTS`, or the name of a repository that a dialect lists, in any spelling. None: that of the environment variable ANALYTIC_RASTERIZER_DIALECT as it was when this
-            package was imported, or else 3DGS 2023 with every dialect inferred from the settings that can be.
+        name: One of `DIALECTS`, or the name of a repository that a dialect lists, in any spelling. None: that of the
+            environment variable ANALYTIC_RASTERIZER_DIALECT as it was when this package was imported, or else 3DGS
+            2023. Under 3DGS 2023 other dialects are inferred from settings and arguments where that is possible.
 
     Raises:
         ValueError: No such dialect.

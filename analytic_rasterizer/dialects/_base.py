@@ -44,8 +44,8 @@ class GaussianRasterizationSettings(LibrarySettings):
     """How to render, as 3DGS 2023 has it; or, where the keywords are those of another dialect, as that one has it.
 
     The arguments are those of `analytic_rasterizer.GaussianRasterizationSettings`. Further ones that belong to one
-    dialect alone, such as `antialiasing` or `kernel_size`, make settings of that dialect. Where a dialect was chosen for
-    the process with `set_dialect` or ANALYTIC_RASTERIZER_DIALECT, settings of that one are made.
+    dialect alone, such as `antialiasing` or `kernel_size`, make settings of that dialect. Where a dialect was chosen
+    for the process with `set_dialect` or ANALYTIC_RASTERIZER_DIALECT, settings of that one are made.
 
     A dialect is a subclass, in a file of its own, with some of these attributes:
 
@@ -327,7 +327,9 @@ def with_channels(
     if given(colors_precomp):  # otherwise `render` raises
         channels = torch.cat([colors_precomp, features], 1)
         bg = torch.cat([bg, bg.new_zeros(features.shape[1], *bg.shape[1:])])
-    image, radii, *outputs = render(settings, settings.outputs, means3D, means2D, opacities, shs, channels, *geometry, bg)
+    image, radii, *outputs = render(
+        settings, settings.outputs, means3D, means2D, opacities, shs, channels, *geometry, bg
+    )
     return image[:3], image[3:], radii, outputs[0] if outputs else None
 
 

@@ -1,7 +1,7 @@
-"""diff_gaussian_rasterization._C: the three functions of the original's compiled module, with its positional arguments and results (3DGS 2023).
+"""diff_gaussian_rasterization._C: the functions of the original's compiled module (3DGS 2023), by position as there.
 
-The buffers that travel from `rasterize_gaussians` to `rasterize_gaussians_backward` are opaque to callers. Here they hold
-what the backward pass is not given otherwise: the opacities, and the name of the footprint. It renders again.
+The buffers that travel from `rasterize_gaussians` to `rasterize_gaussians_backward` are opaque to callers. Here they
+hold what the backward pass is not given otherwise: the opacities, and the name of the footprint. It renders again.
 """
 
 from __future__ import annotations
@@ -17,7 +17,18 @@ _TILE_OFFSETS = _C.LISTS.index("tile_offsets")  # in what the op saves
 
 
 def _settings(
-    background, scale_modifier, viewmatrix, projmatrix, tan_fovx, tan_fovy, height, width, degree, campos, debug, footprint
+    background,
+    scale_modifier,
+    viewmatrix,
+    projmatrix,
+    tan_fovx,
+    tan_fovy,
+    height,
+    width,
+    degree,
+    campos,
+    debug,
+    footprint,
 ) -> GaussianRasterizationSettings:
     return GaussianRasterizationSettings(
         image_height=height,
@@ -69,8 +80,8 @@ def rasterize_gaussians(
         geomBuffer, binningBuffer, imgBuffer: For `rasterize_gaussians_backward`.
     """
     settings = _settings(
-        background, scale_modifier, viewmatrix, projmatrix, tan_fovx, tan_fovy, image_height, image_width, degree, campos,
-        debug, None,
+        background, scale_modifier, viewmatrix, projmatrix, tan_fovx, tan_fovy, image_height, image_width, degree,
+        campos, debug, None,
     )  # fmt: skip
     gaussians = gaussian_arguments(
         settings,
@@ -119,14 +130,14 @@ def rasterize_gaussians_backward(
     """Gradients of `rasterize_gaussians`; the size of the image is that of dL_dout_color.
 
     Returns:
-        dL_dmeans2D (P, 3), dL_dcolors (P, 3), dL_dopacity (P, 1), dL_dmeans3D (P, 3), dL_dcov3D (P, 6), dL_dsh (P, M, 3),
-        dL_dscales (P, 3), dL_drotations (P, 4): of an input that was not given, zero.
+        dL_dmeans2D (P, 3), dL_dcolors (P, 3), dL_dopacity (P, 1), dL_dmeans3D (P, 3), dL_dcov3D (P, 6), dL_dsh (P, M,
+        3), dL_dscales (P, 3), dL_drotations (P, 4): of an input that was not given, zero.
     """
     footprint = bytes(binningBuffer.tolist()).decode()
     height, width = dL_dout_color.shape[-2:]
     settings = _settings(
-        background.detach(), scale_modifier, viewmatrix.detach(), projmatrix.detach(), tan_fovx, tan_fovy, height, width,
-        degree, campos.detach(), debug, footprint,
+        background.detach(), scale_modifier, viewmatrix.detach(), projmatrix.detach(), tan_fovx, tan_fovy, height,
+        width, degree, campos.detach(), debug, footprint,
     )  # fmt: skip
     count = len(means3D)
     shapes = {

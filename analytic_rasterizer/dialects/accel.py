@@ -1,13 +1,13 @@
-"""3DGS since October 2024 with the accelerated rasterizer: as gs2024, `dc` apart from the other harmonics, an optimiser.
+"""3DGS since October 2024 with the accelerated rasterizer: as gs2024, with `dc` apart, and an optimiser.
 
-Repositories: graphdeco-inria/gaussian-splatting with the rasterizer's branch 3dgs_accel, DashGaussian. They look whether
-the module has a SparseGaussianAdam, and call with `dc` if it has: it is exported under this dialect alone.
+Repositories: graphdeco-inria/gaussian-splatting with the rasterizer's branch 3dgs_accel, DashGaussian. They look
+whether the module has a SparseGaussianAdam, and call with `dc` if it has: it is exported under this dialect alone.
 """
 
 import torch
 
-from ._base import forward_like, given
 from ._base import GaussianRasterizer as Rasterizer
+from ._base import forward_like, given
 from .gs2024 import GaussianRasterizationSettings as Settings
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam", "rasterize_gaussians"]

@@ -1,8 +1,8 @@
 """Depth as a third value: (color, radii, depth).
 
-Repositories: hustvl/4DGaussians, ingra14m/Deformable-3D-Gaussians and others with ingra14m's rasterizer. Depth is blended
-like a colour on zero. Its settings are those of 3DGS 2023: the dialect has to be chosen, but where `means2D_densify` is
-given.
+Repositories: hustvl/4DGaussians, ingra14m/Deformable-3D-Gaussians and others with ingra14m's rasterizer. Depth is
+blended like a colour on zero. Its settings are those of 3DGS 2023: the dialect has to be chosen, but where
+`means2D_densify` is given.
 """
 
 from ..effects import Effects

@@ -1,7 +1,9 @@
 """Mini-Splatting: (color, radii, sum of weights, pixels seen, pixels dominated), and `GaussianRasterizer.render_depth`.
 
 Repositories: fatPeter/mini-splatting, which imports it as diff_gaussian_rasterization_ms beside
-diff_gaussian_rasterization (3DGS 2023). The second module is always this dialect. [MS] Fang & Wang, Mini-Splatting, 2024.
+diff_gaussian_rasterization (3DGS 2023). The second module is always this dialect.
+
+[MS] Fang & Wang, Mini-Splatting: Representing Scenes with a Constrained Number of Gaussians, 2024.
 """
 
 from __future__ import annotations
