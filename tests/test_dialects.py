@@ -148,6 +148,24 @@ def test_module_answers_as_the_original(name):
         assert getattr(drop_in, export) is not None
 
 
+def test_the_table_of_the_documentation():
+    """docs/dialects.md has a row for every dialect, with what recognises it and its filter."""
+    rows = {}
+    for line in (ROOT / "docs" / "dialects.md").read_text().splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if len(cells) == 5 and cells[0].startswith("`"):
+            rows[cells[0].strip("`")] = cells
+    assert set(rows) == set(dialects.DIALECTS)
+    for name, (_, repositories, recognised, _, footprint) in rows.items():
+        settings = dialects.dialect_module(name).GaussianRasterizationSettings
+        expected = THEIR_FILTER[name].replace("0.25", "kernel_size").partition(":dil")[0].partition(":frame")[0]
+        assert footprint == f"`{expected}`"
+        stated = vars(settings)
+        names = [*stated.get("inferred_from", ()), *stated.get("inferred_from_arguments", ())]
+        assert not names or any(f"`{keyword}`" in recognised for keyword in names)
+        assert name == "mini" or any(repository.lower() in repositories.lower() for repository in settings.repositories)
+
+
 def test_names_are_unique():
     """A repository belongs to one dialect, however it is spelled, and no dialect has the name of another's."""
     owner = {}
@@ -671,6 +689,17 @@ def test_features_are_blended_like_colors(device, dtype, name, key, channels, co
 
 def relative_error(actual, expected):
     return ((actual - expected).norm() / expected.norm()).item()
+
+
+def test_features_and_a_background_that_is_an_image():
+    """The image lies behind the colours, nothing behind the features."""
+    behind = torch.rand(3, 30, 40, generator=torch.Generator().manual_seed(3))
+    objects = torch.rand(COUNT, 1, 16, generator=torch.Generator().manual_seed(4))
+    scene = scene_of() | {"sh_objs": objects}
+    over_black = render("grouping", scene=scene, bg=torch.zeros(3), effects=ar.Effects(alpha=True))
+    made = render("grouping", scene=scene, bg=behind)
+    expected = over_black[0] + (1 - over_black[3].alpha) * behind
+    assert (made[0] - expected).abs().max() < 1e-6 and (made[2] - over_black[2]).abs().max() < 1e-6
 
 
 def test_features_of_a_wrong_shape():
