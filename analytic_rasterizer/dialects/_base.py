@@ -326,7 +326,7 @@ def with_channels(
     channels, bg = colors_precomp, settings.bg
     if given(colors_precomp):  # otherwise `render` raises
         channels = torch.cat([colors_precomp, features], 1)
-        bg = torch.cat([bg, bg.new_zeros(features.shape[1], *bg.shape[1:])])
+        bg = torch.nn.functional.pad(bg, (0, 0) * (bg.dim() - 1) + (0, features.shape[1]))
     image, radii, *outputs = render(
         settings, settings.outputs, means3D, means2D, opacities, shs, channels, *geometry, bg
     )

@@ -98,19 +98,18 @@ class GaussianRasterizer(Rasterizer):
 
 
 def _rays(settings: Settings, like: torch.Tensor) -> torch.Tensor:
-    """(H, W, 3) directions into the picture through the centres of the pixels, world units, of any length.
+    """(H, W, 3) directions of the rays through the centres of the pixels, world units, of any length and sign.
 
     The points of a column of pixels lie in one plane, clip_x = x clip_w, those of a row in another: the ray is where
     the two meet.
     """
     height, width = like.shape[1:]
-    proj, view = settings.projmatrix.reshape(4, 4), settings.viewmatrix.reshape(4, 4)
+    proj = settings.projmatrix.reshape(4, 4)
     x = (2 * torch.arange(width, dtype=like.dtype, device=like.device) + 1) / width - 1
     y = (2 * torch.arange(height, dtype=like.dtype, device=like.device) + 1) / height - 1
     columns = (proj[:3, 0] - x[:, None] * proj[:3, 3])[None].expand(height, width, 3)
     rows = (proj[:3, 1] - y[:, None] * proj[:3, 3])[:, None].expand(height, width, 3)
-    rays = torch.linalg.cross(columns, rows)
-    return rays * (rays @ view[:3, 2]).sign()[..., None]
+    return torch.linalg.cross(columns, rows)
 
 
 def _ellipsoids(scales, rotations, cov3D_precomp, gaussian: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
