@@ -453,6 +453,8 @@ def test_classes_that_were_imported_before():
     drop_in.set_dialect("mip")
     with pytest.raises(TypeError, match="dialect mip must have kernel_size, which are missing"):
         settings_class(**CAMERA.fields(torch.float32))
+    with pytest.raises(TypeError, match=r"settings must be among.*kernel_size.*got antialiasing"):
+        settings_class(**fields_of("mip"), antialiasing=True)  # a choice is not overruled
     # The library's own classes belong to no dialect.
     assert len(ar.GaussianRasterizer(CAMERA.settings(torch.float32))(**scene_of())) == 2
 

@@ -192,9 +192,9 @@ class GaussianRasterizationSettings(LibrarySettings):
 
 def _class_of(positional: int, keywords: dict[str, Any]) -> type:
     """The settings that are meant by so many positional fields and these keywords."""
-    found = {_inferred_from[name] for name in keywords if name in _inferred_from}
-    if _chosen is not None and all(name in _chosen._fields for name in keywords if name in _inferred_from):
+    if _chosen is not None:
         return _chosen
+    found = {_inferred_from[name] for name in keywords if name in _inferred_from}
     if len(found) > 1:
         names = sorted(f"{name} ({_inferred_from[name].dialect})" for name in keywords if name in _inferred_from)
         raise TypeError(f"settings must be of one dialect, got {', '.join(names)}")

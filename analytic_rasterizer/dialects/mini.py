@@ -61,7 +61,7 @@ class GaussianRasterizer(Rasterizer):
             gidx: (1, H, W) int32, the Gaussian that the pixel shows most of; -1 for none.
             out_pts: (3, H, W) the point, world units; 0 where there is none.
             depth: (1, H, W) camera-space z of the point.
-            accum_alpha: (1, H, W) how much light is left, 1 - alpha: what the name means in 3DGS.
+            accum_alpha: (1, H, W) how much light is left, 1 - alpha.
         """
         settings = self.raster_settings
         color, radii, outputs = render(
