@@ -18,8 +18,10 @@ from .footprints import (
     resolve_footprint,
     set_default_footprint,
 )
+from .installation import warn_if_replaced
 from .outputs import GaussianStats, Outputs, normalized
 from .rasterizer import GaussianRasterizer, rasterize_gaussians
+from .relocation import compute_relocation
 from .settings import GaussianRasterizationSettings
 from .sh import needed_sh_degree
 from .stages import Splats, Stages, TileLists, bin, blend, project, render_stages
@@ -46,6 +48,7 @@ __all__ = [
     "blend",
     "camera_settings",
     "compute_3d_filter",
+    "compute_relocation",
     "footprint_weight",
     "get_default_footprint",
     "inspect_scene",
@@ -60,3 +63,5 @@ __all__ = [
     "resolve_footprint",
     "set_default_footprint",
 ]
+
+warn_if_replaced()

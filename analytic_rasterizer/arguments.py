@@ -9,7 +9,7 @@ import torch
 from .camera import make_lens
 from .effects import MAX_SH_DEGREE, Effects
 from .filters import apply_3d_filter
-from .footprints import check_device, get_default_footprint
+from .footprints import check_device
 from .settings import GaussianRasterizationSettings
 from .sh import used_sh_degree
 
@@ -71,7 +71,7 @@ def camera_arguments(
     s, effects = settings, settings.effects
     view, proj, campos = s.viewmatrix, s.projmatrix, s.campos
     check_tensors(means3D.device, viewmatrix=view, projmatrix=proj, campos=campos)
-    footprint = s.footprint or get_default_footprint()
+    footprint = s.footprint_in_use()
     degree, lens, tanfovx, tanfovy = int(s.sh_degree), None, s.tanfovx, s.tanfovy
     if effects is not None:
         degree = used_sh_degree(effects, degree, shs)

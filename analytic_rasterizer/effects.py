@@ -134,6 +134,10 @@ class Effects:
         """Whether there is something to return beside the colours."""
         return any(getattr(self, name) for name in OUTPUTS)
 
+    def with_outputs_of(self, other: Effects) -> Effects:
+        """The same with the outputs that `other` asks for, too."""
+        return replace(self, **{name: True for name in OUTPUTS if getattr(other, name)})
+
     def with_camera_gradients(self) -> Effects:
         """The same with gradients with respect to the camera."""
         return self if self.camera_gradients else replace(self, camera_gradients=True)

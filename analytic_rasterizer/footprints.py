@@ -122,13 +122,15 @@ def resolve_footprint(name: str, **options: Any) -> Footprint:
     return Footprint(name, tuple(settled.items()), variant["key"], number, variant["samples"])
 
 
+_ANALYTIC = resolve_footprint("analytic")
 _default: Footprint | None = None
 
 
 def set_default_footprint(name: str | None, **options: Any) -> None:
     """Chooses the footprint of settings that name none, for the whole process.
 
-    `None` returns to the environment variable ANALYTIC_RASTERIZER_FOOTPRINT, or else `analytic`.
+    `None` returns to the environment variable ANALYTIC_RASTERIZER_FOOTPRINT, or else to the filter of the dialect that
+    the settings are of (docs/dialects.md), or else to `analytic`.
 
     Raises:
         ValueError: As `resolve_footprint()`.
@@ -137,19 +139,30 @@ def set_default_footprint(name: str | None, **options: Any) -> None:
     _default = None if name is None else resolve_footprint(name, **options)
 
 
-def get_default_footprint() -> Footprint:
-    """The footprint of settings that name none.
+def chosen_footprint() -> Footprint | None:
+    """What the user chose for the process, by `set_default_footprint` or the environment variable; None: nothing.
 
     Raises:
         ValueError: The environment variable holds no footprint.
     """
     if _default is not None:
         return _default
-    name = os.environ.get(ENVIRONMENT_VARIABLE) or "analytic"
+    name = os.environ.get(ENVIRONMENT_VARIABLE)
+    if not name:
+        return None
     try:
         return resolve_footprint(name)
     except ValueError as error:
         raise ValueError(f"environment variable {ENVIRONMENT_VARIABLE}={name!r}: {error}") from None
+
+
+def get_default_footprint() -> Footprint:
+    """The footprint of settings that name none: the chosen one, or `analytic`. Settings of a dialect may differ.
+
+    Raises:
+        ValueError: The environment variable holds no footprint.
+    """
+    return chosen_footprint() or _ANALYTIC
 
 
 def check_device(device: torch.device) -> None:

@@ -12,7 +12,8 @@ from .effects import NEAR, Effects
 from .outputs import BLENDED, Outputs, depths, summaries
 from .settings import GaussianRasterizationSettings
 
-_NOTHING = Effects()
+NOTHING = Effects()
+"""Asks for no output."""
 
 
 def rasterize_gaussians(
@@ -27,24 +28,60 @@ def rasterize_gaussians(
     raster_settings: GaussianRasterizationSettings,
 ) -> tuple[torch.Tensor, ...]:
     """Renders Gaussians. The functional form of `GaussianRasterizer.forward`, which says more."""
-    gaussians = gaussian_arguments(
+    return render(
         raster_settings,
+        NOTHING,
+        means3D,
+        means2D,
+        opacities,
+        sh,
+        colors_precomp,
+        scales,
+        rotations,
+        cov3Ds_precomp,
+    )
+
+
+def render(
+    settings: GaussianRasterizationSettings,
+    outputs: Effects,
+    means3D: torch.Tensor,
+    means2D: torch.Tensor | None,
+    opacities: torch.Tensor,
+    shs: torch.Tensor | None,
+    colors_precomp: torch.Tensor | None,
+    scales: torch.Tensor | None,
+    rotations: torch.Tensor | None,
+    cov3D_precomp: torch.Tensor | None,
+    bg: torch.Tensor | None = None,
+) -> tuple:
+    """(color, radii), and `Outputs` where `outputs` or the effects of the settings ask for some.
+
+    `outputs` is an `Effects` of which only the outputs are read: what a dialect returns whatever the settings say. `bg`
+    replaces the background of the settings.
+    """
+    gaussians = gaussian_arguments(
+        settings,
         means3D,
         opacities,
         means2D=means2D,
-        shs=sh,
+        shs=shs,
         colors_precomp=colors_precomp,
         scales=scales,
         rotations=rotations,
-        cov3D_precomp=cov3Ds_precomp,
+        cov3D_precomp=cov3D_precomp,
     )
-    check_tensors(means3D.device, bg=raster_settings.bg)
-    camera = camera_arguments(raster_settings, means3D, gaussians["shs"])
-    effects = raster_settings.effects if isinstance(raster_settings.effects, Effects) else _NOTHING
-    bg, debug = raster_settings.bg, bool(raster_settings.debug)
-    if effects is _NOTHING and bg.dim() < 3:
+    bg = settings.bg if bg is None else bg
+    check_tensors(means3D.device, bg=bg)
+    camera = camera_arguments(settings, means3D, gaussians["shs"])
+    if settings.means2d_z != "zero":
+        camera["means2d_z"] = settings.means2d_z
+    if isinstance(settings.effects, Effects) and settings.effects.has_outputs:
+        outputs = settings.effects if outputs is NOTHING else outputs.with_outputs_of(settings.effects)
+    debug = bool(settings.debug)
+    if outputs is NOTHING and bg.dim() < 3:
         return torch.ops.analytic_rasterizer.rasterize(**gaussians, **camera, bg=bg, debug=debug)[::2]
-    return _render_with_outputs(gaussians, camera, effects, bg, debug)
+    return _render_with_outputs(gaussians, camera, outputs, bg, debug)
 
 
 def _render_with_outputs(

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 
 from .effects import AUTO, Effects
-from .footprints import Footprint, resolve_footprint
+from .footprints import Footprint, get_default_footprint, resolve_footprint
 
 
 class _Fields(NamedTuple):
@@ -64,30 +64,51 @@ class GaussianRasterizationSettings(_Fields):
     # Also where a tuple method makes an instance without __new__.
     footprint: Footprint | None = None
     effects: Effects | str | None = None
+    means2d_z = "zero"
+    """What the third column of the gradient of means2D (P, 3) holds: "zero", "sum_abs" or "sum_norm", the sum over
+    pixels of |gx| + |gy| or of the length of (gx, gy). Dialects have it otherwise."""
 
     def __new__(
         cls, *args: Any, footprint: str | Footprint | None = None, effects: Effects | str | None = None, **kwargs: Any
     ):
         fields = {k: kwargs.pop(k) for k in _Fields._fields[len(args) :] if k in kwargs}
         self = super().__new__(cls, *args, **fields)
+        self._set_keywords(footprint, effects, kwargs)
+        return self
+
+    def _set_keywords(
+        self, footprint: str | Footprint | None, effects: Effects | str | None, options: dict[str, Any]
+    ) -> None:
+        """Checks and keeps what is not in the tuple."""
         if footprint is not None:
-            self.footprint = resolve_footprint(str(footprint), **kwargs)
-        elif kwargs:
-            known = ", ".join((*cls._fields, "footprint", "effects"))
-            raise TypeError(f"settings must be among: {known}; got {', '.join(kwargs)}")
+            self.footprint = resolve_footprint(str(footprint), **options)
+        elif options:
+            known = ", ".join((*self._fields, "footprint", "effects"))
+            raise TypeError(f"settings must be among: {known}; got {', '.join(options)}")
         if effects is not None:
             if not isinstance(effects, Effects) and effects != AUTO:
                 raise TypeError(f'effects must be an Effects or "auto", got {effects!r}')
             self.effects = effects
-        return self
+
+    def footprint_in_use(self) -> Footprint:
+        """The footprint to render with: that of the settings, or else the default.
+
+        Raises:
+            ValueError: The environment variable ANALYTIC_RASTERIZER_FOOTPRINT holds no footprint.
+        """
+        return self.footprint or get_default_footprint()
 
     def _replace(self, **kwargs: Any) -> GaussianRasterizationSettings:
-        merged = {**self._asdict(), "footprint": self.footprint, "effects": self.effects, **kwargs}
-        return type(self)(**merged)
+        fields = [kwargs.pop(name, value) for name, value in zip(self._fields, self)]
+        made = tuple.__new__(type(self), fields)
+        made._set_keywords(kwargs.pop("footprint", self.footprint), kwargs.pop("effects", self.effects), kwargs)
+        return made
+
+    __replace__ = _replace  # what copy.replace calls
 
     def __reduce__(self):
         footprint = None if self.footprint is None else str(self.footprint)
-        return _unpickle_settings, (tuple(self), footprint, self.effects)
+        return _unpickle_settings, (type(self), tuple(self), footprint, self.effects)
 
     def __repr__(self) -> str:
         fields = ", ".join(f"{k}={v!r}" for k, v in self._asdict().items())
@@ -100,6 +121,8 @@ GaussianRasterizationSettings.__signature__ = inspect.signature(_Fields)
 
 
 def _unpickle_settings(
-    fields: tuple, footprint: str | None, effects: Effects | str | None = None
+    cls: type, fields: tuple, footprint: str | None, effects: Effects | str | None
 ) -> GaussianRasterizationSettings:
-    return GaussianRasterizationSettings(*fields, footprint=footprint, effects=effects)
+    made = tuple.__new__(cls, fields)
+    made._set_keywords(footprint, effects, {})
+    return made

@@ -1,0 +1,52 @@
+"""Depth as a third value: (color, radii, depth).
+
+Repositories: hustvl/4DGaussians, ingra14m/Deformable-3D-Gaussians and others with ingra14m's rasterizer. Depth is
+blended like a colour on zero. Its settings are those of 3DGS 2023: the dialect has to be chosen, but where
+`means2D_densify` is given.
+"""
+
+from ..effects import Effects
+from ._base import GaussianRasterizationSettings as Settings
+from ._base import GaussianRasterizer as Rasterizer
+from ._base import forward_like, rasterize_gaussians
+
+__all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
+
+
+class GaussianRasterizationSettings(Settings):
+    """Those of 3DGS 2023."""
+
+    dialect = "depth"
+    repositories = ("4DGaussians", "Deformable-3D-Gaussians", "Deformable-3DGS")
+    inferred_from_arguments = ("means2D_densify",)
+    filter = "point"
+    outputs = Effects(depth=True)
+
+    def render(
+        self,
+        means3D,
+        means2D,
+        opacities,
+        shs=None,
+        colors_precomp=None,
+        scales=None,
+        rotations=None,
+        cov3D_precomp=None,
+        means2D_densify=None,
+        **further,
+    ) -> tuple:
+        """As 3DGS 2023; `means2D_densify`, of the shape of means2D, receives the gradient that means2D receives."""
+        if means2D_densify is not None:
+            means2D = means2D_densify if means2D is None else means2D + means2D_densify
+        return super().render(
+            means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, **further
+        )
+
+    def returned(self, color, radii, outputs):
+        return color, radii, outputs.depth
+
+
+class GaussianRasterizer(Rasterizer):
+    """Renders 3D Gaussians; `forward` takes `means2D_densify`."""
+
+    forward = forward_like(GaussianRasterizationSettings.render)

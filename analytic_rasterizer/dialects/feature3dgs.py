@@ -1,0 +1,60 @@
+"""Feature 3DGS: (color, feature map, radii, depth), blended in one pass.
+
+Repositories: ShijieZhou-UCLA/feature-3dgs. `semantic_feature` (P, 1, K) holds a feature of each Gaussian.
+"""
+
+from ..effects import Effects
+from ._base import GaussianRasterizationSettings as Settings
+from ._base import GaussianRasterizer as Rasterizer
+from ._base import forward_like, rasterize_gaussians, with_channels
+
+__all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
+
+
+class GaussianRasterizationSettings(Settings):
+    """Those of 3DGS 2023."""
+
+    dialect = "feature3dgs"
+    repositories = ("Feature 3DGS",)
+    inferred_from_arguments = ("semantic_feature",)
+    filter = "point"
+    outputs = Effects(depth=True)
+
+    def render(
+        self,
+        means3D,
+        means2D,
+        opacities,
+        shs=None,
+        colors_precomp=None,
+        semantic_feature=None,
+        scales=None,
+        rotations=None,
+        cov3D_precomp=None,
+    ) -> tuple:
+        """As 3DGS 2023; `semantic_feature` (P, 1, K), or (P, K), is blended on zero with the colours' weights."""
+        if semantic_feature is None:
+            raise ValueError("semantic_feature must be given in dialect feature3dgs, got None")
+        color, features, radii, outputs = with_channels(
+            self,
+            semantic_feature.flatten(1),
+            means3D,
+            means2D,
+            opacities,
+            shs,
+            colors_precomp,
+            scales,
+            rotations,
+            cov3D_precomp,
+        )
+        color, radii, *rest = self.values(color, radii, outputs)
+        return color, features, radii, *rest
+
+    def returned(self, color, radii, outputs):
+        return color, radii, outputs.depth
+
+
+class GaussianRasterizer(Rasterizer):
+    """Renders 3D Gaussians; `forward` takes `semantic_feature`."""
+
+    forward = forward_like(GaussianRasterizationSettings.render)

@@ -1,0 +1,77 @@
+"""LangSplat: (color, language features, radii), blended in one pass.
+
+Repositories: minghanqin/LangSplat. `include_feature` says whether the features are rendered; where they are not, their
+image is zero.
+"""
+
+from ._base import FIELDS, forward_like, with_channels
+from ._base import GaussianRasterizationSettings as Settings
+from ._base import GaussianRasterizer as Rasterizer
+
+__all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
+
+
+class GaussianRasterizationSettings(Settings):
+    """Those of 3DGS 2023, and `include_feature`."""
+
+    dialect = "langsplat"
+    repositories = ("LangSplat",)
+    fields = (*FIELDS, "include_feature")
+    inferred_from = ("include_feature",)
+    filter = "point"
+
+    def render(
+        self,
+        means3D,
+        means2D,
+        opacities,
+        shs=None,
+        colors_precomp=None,
+        language_feature_precomp=None,
+        scales=None,
+        rotations=None,
+        cov3D_precomp=None,
+    ) -> tuple:
+        """As 3DGS 2023; `language_feature_precomp` (P, 3), or (P, K), is blended on zero with the colours' weights."""
+        arguments = means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp
+        if self.include_feature:
+            if language_feature_precomp is None:
+                raise ValueError("language_feature_precomp must be given where include_feature is set, got None")
+            color, features, radii, outputs = with_channels(self, language_feature_precomp, *arguments)
+            color, radii, *further = self.values(color, radii, outputs)
+        else:
+            color, radii, *further = super().render(*arguments)
+            features = color.new_zeros(color.shape)
+        return color, features, radii, *further
+
+
+class GaussianRasterizer(Rasterizer):
+    """Renders 3D Gaussians; `forward` takes `language_feature_precomp`."""
+
+    forward = forward_like(GaussianRasterizationSettings.render)
+
+
+def rasterize_gaussians(
+    means3D,
+    means2D,
+    sh,
+    colors_precomp,
+    language_feature_precomp,
+    opacities,
+    scales,
+    rotations,
+    cov3Ds_precomp,
+    raster_settings,
+) -> tuple:
+    """The functional form of `GaussianRasterizer.forward`."""
+    return raster_settings.render(
+        means3D,
+        means2D,
+        opacities,
+        sh,
+        colors_precomp,
+        language_feature_precomp,
+        scales,
+        rotations,
+        cov3Ds_precomp,
+    )

@@ -1,0 +1,75 @@
+"""Other repositories' own render functions, unmodified, on our modules: where ../shared has them beside the project.
+
+Each runs in a process of its own and takes up to twenty steps of its optimiser, so that the file takes a few minutes of
+one core. They are told their dialect by the environment, as their users tell it.
+"""
+
+import importlib.util
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+from conftest import DEADLINE, ROOT, SHARED, needs_cuda
+
+RUNNER, CONTRACT = SHARED / "compat" / "run.py", SHARED / "compat" / "contract.py"
+CHECKS = 22  # of contract.py
+
+pytestmark = pytest.mark.skipif(not RUNNER.exists(), reason="needs the optional ../shared/compat next to the project")
+
+# The dialects that settings and arguments cannot tell; all others are inferred.
+CHOSEN = {
+    "3dgs-2024-accel": "accel",
+    "analytic-splatting --dense": "analytic",
+    "dreamgaussian": "depth_alpha",
+    "4dgaussians": "depth",
+    "scaffold-gs": "scaffold",
+    "3dgs-mcmc": "mcmc",
+}
+
+
+def cases():
+    """Names of the runner's cases whose repository is there."""
+    if not RUNNER.exists():
+        return []
+    spec = importlib.util.spec_from_file_location("compat_run", RUNNER)
+    runner = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(runner)
+    return [name for name, case in runner.CASES.items() if (runner.REPOS / case[1]).is_dir()]
+
+
+def run(device, *command, dialect=""):
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("ANALYTIC_RASTERIZER_")}
+    environment |= {"PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1", "ANALYTIC_RASTERIZER_DIALECT": dialect}
+    paths = [os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
+    environment["PYTHONPATH"] = os.pathsep.join([*paths, str(ROOT)])
+    return subprocess.run(
+        [sys.executable, *map(str, command), "--device", device],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=2 * DEADLINE,
+    )
+
+
+each_device = pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=needs_cuda)])
+
+
+@each_device
+@pytest.mark.parametrize("name", cases())
+def test_repository(device, name, tmp_path):
+    results = tmp_path / "results.json"
+    done = run(device, RUNNER, name, "--out", results, dialect=CHOSEN.get(name, ""))
+    assert results.exists(), done.stderr[-2000:]
+    (report,) = json.loads(results.read_text())
+    assert report["result"] == "pass", (report["stages"], report.get("error"), report.get("at"))
+    assert report["module"] is None or report["module"].startswith(str(ROOT)) or "site-packages" in report["module"]
+
+
+@each_device
+def test_contract(device):
+    done = run(device, CONTRACT)
+    lines = done.stdout.splitlines()
+    assert len(lines) == CHECKS, done.stderr[-2000:]
+    assert [line for line in lines if not line.endswith(" ok")] == []
