@@ -137,19 +137,30 @@ def set_default_footprint(name: str | None, **options: Any) -> None:
     _default = None if name is None else resolve_footprint(name, **options)
 
 
-def get_default_footprint() -> Footprint:
-    """The footprint of settings that name none.
+def chosen_footprint() -> Footprint | None:
+    """What was chosen for settings that name no footprint: `set_default_footprint`, or the environment; or None.
 
     Raises:
         ValueError: The environment variable holds no footprint.
     """
     if _default is not None:
         return _default
-    name = os.environ.get(ENVIRONMENT_VARIABLE) or "analytic"
+    name = os.environ.get(ENVIRONMENT_VARIABLE)
+    if not name:
+        return None
     try:
         return resolve_footprint(name)
     except ValueError as error:
         raise ValueError(f"environment variable {ENVIRONMENT_VARIABLE}={name!r}: {error}") from None
+
+
+def get_default_footprint() -> Footprint:
+    """The footprint of settings that name none.
+
+    Raises:
+        ValueError: The environment variable holds no footprint.
+    """
+    return chosen_footprint() or resolve_footprint("analytic")
 
 
 def check_device(device: torch.device) -> None:

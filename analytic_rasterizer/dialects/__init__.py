@@ -1,0 +1,1 @@
+"""The interfaces of other rasterizers, over this package's stages."""
