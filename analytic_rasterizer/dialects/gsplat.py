@@ -128,13 +128,14 @@ def rasterization(
     Returns:
         render_colors: (..., C, height, width, X): D channels, one of depth, or both.
         render_alphas: (..., C, height, width, 1).
-        meta: By name. The rows are (R, ...) of R splats if packed, else (..., C, N, ...) and zero for what is culled:
-            means2d (2,) px with pixel centres at 0.5, through which the image's gradients flow, so that `retain_grad`
-            works; depths, differentiable; radii (2,) int32, px along x and y; conics (3,), the inverse of the
-            covariance with the filter's variance (1/12 px^2 for footprints other than `point` and `mip`); opacities,
-            with the amplitude of `mip`; the last three without gradient. batch_ids, camera_ids, gaussian_ids: (R,)
-            int64 if packed, else None. width, height, tile_size, tile_width, tile_height, n_batches, n_cameras:
-            numbers. gsplat's lists of tiles (tiles_per_gauss, isect_ids, flatten_ids, isect_offsets) are missing.
+        meta: A dictionary. Its rows are (R, ...) of R splats if packed, else (..., C, N, ...), where they mean
+            something if the radii are positive: means2d (2,) px with pixel centres at 0.5, through which gradients of
+            the images flow, so that `retain_grad` works; depths, differentiable; radii (2,) int32, px along x and y;
+            conics (3,), the inverse of the covariance with the filter's variance (1/12 px^2 for footprints other than
+            `point` and `mip`); opacities, with the amplitude of `mip`; the last three without gradient. batch_ids,
+            camera_ids, gaussian_ids: (R,) int64 if packed, else None. width, height, tile_size, tile_width,
+            tile_height, n_batches, n_cameras: numbers. gsplat's lists of tiles (tiles_per_gauss, isect_ids,
+            flatten_ids, isect_offsets) are missing.
 
     Raises:
         NotImplementedError: What this package does not render; the message names it.
@@ -227,8 +228,8 @@ def rasterization(
         "n_batches": math.prod(sizes.batch),
         "n_cameras": sizes.cameras,
     }
-    shape = (*sizes.batch, sizes.cameras, height, width, -1)
-    return images.reshape(shape), alphas.reshape(shape), meta
+    dims = (*sizes.batch, sizes.cameras)
+    return images.unflatten(0, dims), alphas.unflatten(0, dims), meta
 
 
 # --- what is given -----------------------------------------------------------------------------------
@@ -355,14 +356,17 @@ def _project(
 
     One `project` serves the cameras that see the same Gaussians: those of a batch, unless harmonics are per camera.
     """
-    flat = {name: value.reshape(-1, *value.shape[len(sizes.batch) :]) for name, value in gaussians.items()}
+    batches, dims = math.prod(sizes.batch), len(sizes.batch)
+    flat = {name: value.reshape(batches, *value.shape[dims:]) for name, value in gaussians.items()}
+    if shs is not None:
+        shs = shs.reshape(len(settings) if per_camera else batches, *shs.shape[-3:])
     together = 1 if shs is not None and per_camera else sizes.cameras
     parts = []
     for first in range(0, len(settings), together):
         batch = first // sizes.cameras
         of_batch = {name: value[batch] for name, value in flat.items()}
         if shs is not None:
-            of_batch["shs"] = shs.reshape(-1, *shs.shape[-3:])[first if per_camera else batch]
+            of_batch["shs"] = shs[first if per_camera else batch]
         parts.append(project(settings[first : first + together], **of_batch))
     return _join(parts)
 
@@ -428,7 +432,7 @@ def _measure(splats: Splats, footprint: Footprint, radius_clip: float) -> _Measu
     on_image = (x + rx > 0) & (x - rx < splats.width) & (y + ry > 0) & (y - ry < splats.height)
     drawn = on_image & (rx > 0) & (ry > 0) & ((rx > radius_clip) | (ry > radius_clip))
     radii = torch.where(drawn[:, None], torch.stack([rx, ry], 1), 0).int()
-    return _Measures(drawn, radii, conics, torch.where(drawn, opacities, 0))
+    return _Measures(drawn, radii, conics, opacities)
 
 
 def _without_culled(splats: Splats, measures: _Measures) -> tuple[Splats, _Measures]:
@@ -438,11 +442,8 @@ def _without_culled(splats: Splats, measures: _Measures) -> tuple[Splats, _Measu
     row_splits = before[splats.row_splits.to(before.device)].cpu()
     rows = {name: getattr(splats, name) for name in _ROWS}
     rows = {name: values.index_select(0, kept) if len(values) else values for name, values in rows.items()}
-    of_rows = (value.index_select(0, kept) for value in (measures.drawn, measures.radii, measures.conics))
-    return (
-        dataclasses.replace(splats, row_splits=row_splits, **rows),
-        _Measures(*of_rows, measures.opacities.index_select(0, kept)),
-    )
+    measured = (getattr(measures, field.name).index_select(0, kept) for field in dataclasses.fields(measures))
+    return dataclasses.replace(splats, row_splits=row_splits, **rows), _Measures(*measured)
 
 
 @dataclass(frozen=True)
@@ -459,7 +460,7 @@ class _Layout:
 
     @classmethod
     def of(cls, splats: Splats, sizes: _Sizes, packed: bool) -> _Layout:
-        """The layout of these rows."""
+        """For the rows of `splats`."""
         places = None if packed else splats.camera_ids.long() * sizes.gaussians + splats.gaussian_ids.long()
         return cls((*sizes.batch, sizes.cameras, sizes.gaussians), places)
 
@@ -474,7 +475,7 @@ class _Layout:
         """The rows of what `to_meta` made."""
         if self.places is None:
             return held
-        return held.reshape(-1, *held.shape[len(self.shape) :]).index_select(0, self.places)
+        return held.flatten(0, len(self.shape) - 1).index_select(0, self.places)
 
 
 class _KeepAbsolute(torch.autograd.Function):
@@ -502,14 +503,14 @@ def _colors_of_rows(splats: Splats, sizes: _Sizes, colors: torch.Tensor, per_cam
     if not per_camera:
         table = table // sizes.cameras
     rows = table * sizes.gaussians + splats.gaussian_ids.long()
-    return colors.reshape(-1, colors.shape[-1]).index_select(0, rows)
+    return colors.flatten(0, -2).index_select(0, rows)
 
 
 def _backgrounds(backgrounds: torch.Tensor | None, with_colors: bool, with_depth: bool) -> torch.Tensor | None:
     """(B * C, K) of all channels: there is no depth behind the Gaussians."""
     if backgrounds is None or not with_colors:
         return None
-    flat = backgrounds.reshape(-1, backgrounds.shape[-1])
+    flat = backgrounds.flatten(0, -2)
     return torch.nn.functional.pad(flat, (0, 1)) if with_depth else flat
 
 
@@ -575,9 +576,10 @@ def quat_scale_to_covar_preci(
             f"quats must have shape (..., 4) and scales (..., 3), got {tuple(quats.shape)} and {tuple(scales.shape)}"
         )
     w, v = torch.nn.functional.normalize(quats, dim=-1).split((1, 3), -1)
-    # R = I + 2 w [v] + 2 [v]^2 with the matrix [v] of the cross product with v.
-    cross = torch.linalg.cross(v[..., None, :], torch.eye(3, dtype=v.dtype, device=v.device)).mT
-    rotations = torch.eye(3, dtype=v.dtype, device=v.device) + 2 * (w[..., None] * cross + cross @ cross)
+    # R = I + 2 w [v] + 2 [v]^2, where the matrix [v] takes a vector to its cross product with v.
+    identity = torch.eye(3, dtype=v.dtype, device=v.device).expand(*v.shape[:-1], 3, 3)
+    cross = torch.linalg.cross(v[..., None, :].expand_as(identity), identity).mT
+    rotations = identity + 2 * (w[..., None] * cross + cross @ cross)
 
     def squared(factors: torch.Tensor) -> torch.Tensor:
         square = rotations * factors[..., None, :]
