@@ -37,6 +37,7 @@ _EXTENT = 3.33  # standard deviations in gsplat's radii at most: there an opacit
 _PIXEL_VARIANCE = 1 / 12  # px^2, of a square pixel
 _LARGEST_RADIUS = 1e9  # px, fits an int32
 _SMALLEST_ALPHA = 1e-10  # that an accumulated depth is divided by, as in gsplat
+_MAX_CHANNELS = 512  # of `blend`
 
 _REFUSED = {
     "sparse_grad": "gradients are dense tensors",
@@ -159,32 +160,26 @@ def rasterization(
     _check_numbers(width, height, near_plane, far_plane, radius_clip, eps2d)
     width, height = int(width), int(height)
     sizes = _check_scene(means, quats, scales, opacities, covars, viewmats, Ks)
-    per_camera = _check_colors(means, sizes, colors, backgrounds, sh_degree)
+    per_camera = _check_colors(means, sizes, colors, backgrounds, sh_degree, render_mode)
     settled = _settle_footprint(footprint, rasterize_mode, eps2d)
-    effects = Effects(
-        camera_gradients=True,  # keeps the focal lengths on the device
-        off_center=True,  # gsplat's clamp of x/z and y/z
+    settings = _camera_settings(
+        viewmats,
+        Ks,
+        width,
+        height,
         near=near_plane,
         far=far_plane,
         orthographic=camera_model == "ortho",
+        sh_degree=sh_degree or 0,
+        footprint=settled,
     )
-    settings = [
-        camera_settings(
-            *(view, width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2]),
-            sh_degree=sh_degree or 0,
-            dtype=means.dtype,
-            effects=effects,
-            footprint=str(settled),
-        )
-        for view, K in zip(viewmats.reshape(-1, 4, 4), Ks.reshape(-1, 3, 3))
-    ]
     with_colors, with_depth = "RGB" in render_mode, render_mode != "RGB"
     shs = colors if with_colors and sh_degree is not None else None
-    gaussians = {"means3D": means, "opacities": opacities}
     if covars is None:
-        gaussians |= {"scales": scales, "rotations": quats}
+        covariances = {"scales": scales, "rotations": quats}
     else:
-        gaussians["cov3D_precomp"] = _upper_triangle(covars)
+        covariances = {"cov3D_precomp": _upper_triangle(covars)}
+    gaussians = {"means3D": means, "opacities": opacities, **covariances}
     splats = _project(sizes, settings, gaussians, shs, per_camera)
     measures = _measure(splats, settled, radius_clip)
     if packed:
@@ -200,31 +195,30 @@ def rasterization(
         absolute = layout.to_rows(absolute)
     splats = dataclasses.replace(splats, means2d=layout.to_rows(through) - 0.5)
 
-    features = []
+    channels = []
     if with_colors:
-        features.append(_colors_of_rows(splats, sizes, colors, per_camera) if shs is None else splats.colors)
+        channels.append(_colors_of_rows(splats, sizes, colors, per_camera) if shs is None else splats.colors)
     if with_depth:
-        features.append(splats.depths[:, None])
-    features = torch.cat(features, 1) if len(features) > 1 else features[0]
+        channels.append(splats.depths[:, None])
+    features = torch.cat(channels, 1)
     images, alphas = _blend(splats, features, _backgrounds(backgrounds, with_colors, with_depth), absolute)
     if render_mode.endswith("ED"):
         images = torch.cat([images[..., :-1], images[..., -1:] / alphas.clamp(min=_SMALLEST_ALPHA)], -1)
 
-    cameras_of_rows = splats.camera_ids.long()
     meta = {
-        "batch_ids": cameras_of_rows // sizes.cameras if packed else None,
-        "camera_ids": cameras_of_rows % sizes.cameras if packed else None,
+        "batch_ids": splats.camera_ids.long() // sizes.cameras if packed else None,
+        "camera_ids": splats.camera_ids.long() % sizes.cameras if packed else None,
         "gaussian_ids": splats.gaussian_ids.long() if packed else None,
         "radii": layout.to_meta(measures.radii),
         "means2d": means2d,
         "depths": layout.to_meta(splats.depths),
         "conics": layout.to_meta(measures.conics),
         "opacities": layout.to_meta(measures.opacities),
-        "tile_width": math.ceil(width / TILE),
-        "tile_height": math.ceil(height / TILE),
-        "tile_size": TILE,
         "width": width,
         "height": height,
+        "tile_size": TILE,
+        "tile_width": math.ceil(width / TILE),
+        "tile_height": math.ceil(height / TILE),
         "n_batches": math.prod(sizes.batch),
         "n_cameras": sizes.cameras,
     }
@@ -309,7 +303,7 @@ def _check_scene(means, quats, scales, opacities, covars, viewmats, Ks) -> _Size
     return sizes
 
 
-def _check_colors(means, sizes: _Sizes, colors, backgrounds, sh_degree: int | None) -> bool:
+def _check_colors(means, sizes: _Sizes, colors, backgrounds, sh_degree: int | None, render_mode: str) -> bool:
     """Whether every camera has colours of its own."""
     if not isinstance(colors, torch.Tensor):
         raise TypeError(f"colors must be a tensor, got {type(colors).__name__}")
@@ -319,6 +313,9 @@ def _check_colors(means, sizes: _Sizes, colors, backgrounds, sh_degree: int | No
         (*sizes.batch, sizes.cameras, sizes.gaussians, *last),
     )
     _check_tensor("colors", colors, means, shared, own)
+    most = _MAX_CHANNELS if render_mode == "RGB" else _MAX_CHANNELS - 1
+    if sh_degree is None and "RGB" in render_mode and not 1 <= last[0] <= most:
+        raise ValueError(f"colors must have 1 to {most} channels in render_mode {render_mode}, got {last[0]}")
     if sh_degree is not None:
         if not 0 <= sh_degree <= MAX_SH_DEGREE:
             raise ValueError(f"sh_degree must be 0 to {MAX_SH_DEGREE}, got {sh_degree}")
@@ -343,6 +340,38 @@ def _settle_footprint(footprint: str | Footprint | None, rasterize_mode: str, ep
 
 _ROWS = ("means2d", "cov2d", "opacities", "depths", "colors", "radii", "gaussian_ids", "camera_ids", "dets")
 """Fields of `Splats` with a row per splat; colors may have none."""
+
+
+def _camera_settings(
+    viewmats: torch.Tensor,
+    Ks: torch.Tensor,
+    width: int,
+    height: int,
+    *,
+    near: float,
+    far: float,
+    orthographic: bool,
+    sh_degree: int,
+    footprint: Footprint,
+) -> list[GaussianRasterizationSettings]:
+    """Settings of all cameras, in the order of their leading dimensions."""
+    effects = Effects(
+        camera_gradients=True,  # keeps the focal lengths on the device
+        off_center=True,  # the clamp of x/z and y/z is around the centre of the picture, as in gsplat
+        near=near,
+        far=far,
+        orthographic=orthographic,
+    )
+    return [
+        camera_settings(
+            *(view, width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2]),
+            sh_degree=sh_degree,
+            dtype=view.dtype,
+            effects=effects,
+            footprint=str(footprint),
+        )
+        for view, K in zip(viewmats.reshape(-1, 4, 4), Ks.reshape(-1, 3, 3))
+    ]
 
 
 def _project(
