@@ -23,7 +23,7 @@ import torch
 
 from .. import relocation
 from .._C import TILE
-from ..camera import camera_settings
+from ..camera import camera_matrices
 from ..effects import MAX_SH_DEGREE, Effects
 from ..footprints import Footprint, chosen_footprint, resolve_footprint
 from ..settings import GaussianRasterizationSettings
@@ -354,7 +354,7 @@ def _camera_settings(
     sh_degree: int,
     footprint: Footprint,
 ) -> list[GaussianRasterizationSettings]:
-    """Settings of all cameras, in the order of their leading dimensions."""
+    """Settings of all cameras, in the order of their leading dimensions, for `project`."""
     effects = Effects(
         camera_gradients=True,  # keeps the focal lengths on the device
         off_center=True,  # the clamp of x/z and y/z is around the centre of the picture, as in gsplat
@@ -362,15 +362,31 @@ def _camera_settings(
         far=far,
         orthographic=orthographic,
     )
+    background = viewmats.new_zeros(3)  # which `project` does not read
+    views, intrinsics = viewmats.reshape(-1, 4, 4).double(), Ks.reshape(-1, 3, 3).double()
+    fx, fy, cx, cy = (intrinsics[:, row, column] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    scale = torch.stack([2 * fx / width, 2 * fy / height], 1)
+    center = torch.stack([2 * cx / width - 1, 2 * cy / height - 1], 1)
+    projections, positions = camera_matrices(views, scale, center, orthographic)
+    projections, positions, tangents = (t.to(viewmats.dtype) for t in (projections.mT, positions, 1 / scale))
     return [
-        camera_settings(
-            *(view, width, height, K[0, 0], K[1, 1], K[0, 2], K[1, 2]),
+        GaussianRasterizationSettings(
+            image_height=height,
+            image_width=width,
+            tanfovx=tangent[0],
+            tanfovy=tangent[1],
+            bg=background,
+            scale_modifier=1.0,
+            viewmatrix=view.mT,
+            projmatrix=projection,
             sh_degree=sh_degree,
-            dtype=view.dtype,
+            campos=position,
+            prefiltered=False,
+            debug=False,
             effects=effects,
             footprint=str(footprint),
         )
-        for view, K in zip(viewmats.reshape(-1, 4, 4), Ks.reshape(-1, 3, 3))
+        for view, projection, position, tangent in zip(viewmats.reshape(-1, 4, 4), projections, positions, tangents)
     ]
 
 
