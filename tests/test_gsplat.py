@@ -607,6 +607,10 @@ def test_what_is_not_served_is_refused_by_name(asked):
         ({"viewmats": torch.zeros(0, 4, 4)}, ValueError, "viewmats must hold at least one camera"),
         ({"viewmats": torch.eye(4)[None, None]}, ValueError, r"viewmats must have shape \(1, 4, 4\), got \(1, 1, 4, 4"),
         ({"Ks": torch.eye(3)[None]}, ValueError, r"Ks must have shape \(2, 3, 3\), got \(1, 3, 3\)"),
+        (
+            {"Ks": torch.tensor([[-5.0, 0, 4], [0, 5, 4], [0, 0, 1]]).expand(2, 3, 3)},
+            *(ValueError, "Ks must have positive focal lengths, got -5.0"),
+        ),
         ({"colors": torch.ones(5, 3)}, ValueError, r"colors must have shape \(6, 3\) or \(2, 6, 3\), got \(5, 3\)"),
         ({"colors": torch.ones(3, 6, 3)}, ValueError, r"colors must have shape \(6, 3\) or \(2, 6, 3\), got \(3, 6"),
         ({"colors": torch.ones(6, 3).long()}, TypeError, "colors must have the dtype of means, torch.float32, got"),
@@ -619,6 +623,7 @@ def test_what_is_not_served_is_refused_by_name(asked):
         ({"colors": torch.ones(6, 0)}, ValueError, "colors must have 1 to 512 channels in render_mode RGB, got 0"),
         ({"sh_degree": 1}, ValueError, r"colors must have shape \(6, 6, 3\) or \(2, 6, 6, 3\), got \(6, 3\)"),
         ({"sh_degree": 1, "colors": torch.ones(6, 3, 3)}, ValueError, "colors must have 4 harmonics of degree 1, got"),
+        ({"sh_degree": 0.5, "colors": torch.ones(6, 9, 3)}, ValueError, "sh_degree must be 0 to 4, got 0.5"),
         ({"sh_degree": 5, "colors": torch.ones(6, 36, 3)}, ValueError, "sh_degree must be 0 to 4, got 5"),
         ({"backgrounds": torch.ones(3)}, ValueError, r"backgrounds must have shape \(2, 3\), got \(3,\)"),
         ({"width": 0}, ValueError, "width must be a positive integer, got 0"),

@@ -107,7 +107,7 @@ def rasterization(
         Ks: (..., C, 3, 3) focal lengths and principal points, px, the image spanning [0, width] x [0, height]. Of an
             orthographic camera the focal lengths are px per world unit.
         width, height: Size of the images, px.
-        near_plane, far_plane: Camera-space z between which Gaussians are drawn.
+        near_plane, far_plane: Camera-space z between which Gaussians are drawn, world units.
         radius_clip: A splat whose radii are at most this many px is not drawn.
         eps2d: Variance of the filter, px^2: `point:dilation=eps2d` in the mode "classic", `mip:variance=eps2d` in
             the mode "antialiased". Not read where a footprint was chosen.
@@ -141,7 +141,8 @@ def rasterization(
     Raises:
         NotImplementedError: What this package does not render; the message names it.
         TypeError: Not a tensor, or a wrong dtype.
-        ValueError: Wrong shape, device or value.
+        ValueError: Wrong shape, device or value. The numbers of cameras are looked at on the CPU only.
+        RuntimeError: CUDA tensors, and an extension without CUDA; or a pose in viewmats that is singular.
     """
     asked = {
         "sparse_grad": sparse_grad,
@@ -231,7 +232,7 @@ def rasterization(
 
 @dataclass(frozen=True)
 class _Sizes:
-    """Leading dimensions, cameras in each of their places, and Gaussians in each of their places."""
+    """Leading dimensions, and how many cameras and Gaussians there are for each of their indices."""
 
     batch: tuple[int, ...]
     cameras: int
@@ -279,7 +280,8 @@ def _check_tensor(name: str, tensor: Any, like: torch.Tensor, *shapes: tuple[int
         raise TypeError(f"{name} must have the dtype of means, {like.dtype}, got {tensor.dtype}")
 
 
-def _check_scene(means, quats, scales, opacities, covars, viewmats, Ks) -> _Sizes:
+def _check_scene(means: Any, quats: Any, scales: Any, opacities: Any, covars: Any, viewmats: Any, Ks: Any) -> _Sizes:
+    """The sizes that means and viewmats have, after checking all against them."""
     for name, tensor, last in (("means", means, (3,)), ("viewmats", viewmats, (4, 4))):
         if not isinstance(tensor, torch.Tensor):
             raise TypeError(f"{name} must be a tensor, got {type(tensor).__name__}")
@@ -300,11 +302,16 @@ def _check_scene(means, quats, scales, opacities, covars, viewmats, Ks) -> _Size
     _check_tensor("opacities", opacities, means, of_gaussians)
     _check_tensor("viewmats", viewmats, means, (*of_cameras, 4, 4))
     _check_tensor("Ks", Ks, means, (*of_cameras, 3, 3))
+    focal = Ks.detach().diagonal(dim1=-2, dim2=-1)[..., :2]
+    if not Ks.is_cuda and (focal <= 0).any():  # on CUDA it would wait for the device
+        raise ValueError(f"Ks must have positive focal lengths, got {focal[focal <= 0][0].item()}")
     return sizes
 
 
-def _check_colors(means, sizes: _Sizes, colors, backgrounds, sh_degree: int | None, render_mode: str) -> bool:
-    """Whether every camera has colours of its own."""
+def _check_colors(
+    means: torch.Tensor, sizes: _Sizes, colors: Any, backgrounds: Any, sh_degree: int | None, render_mode: str
+) -> bool:
+    """Whether every camera has colours of its own, after checking them."""
     if not isinstance(colors, torch.Tensor):
         raise TypeError(f"colors must be a tensor, got {type(colors).__name__}")
     last = tuple(colors.shape[-1:]) if sh_degree is None else (*colors.shape[-2:-1], 3)
@@ -317,7 +324,7 @@ def _check_colors(means, sizes: _Sizes, colors, backgrounds, sh_degree: int | No
     if sh_degree is None and "RGB" in render_mode and not 1 <= last[0] <= most:
         raise ValueError(f"colors must have 1 to {most} channels in render_mode {render_mode}, got {last[0]}")
     if sh_degree is not None:
-        if not 0 <= sh_degree <= MAX_SH_DEGREE:
+        if sh_degree not in range(MAX_SH_DEGREE + 1):
             raise ValueError(f"sh_degree must be 0 to {MAX_SH_DEGREE}, got {sh_degree}")
         if last[0] < (sh_degree + 1) ** 2:
             raise ValueError(f"colors must have {(sh_degree + 1) ** 2} harmonics of degree {sh_degree}, got {last[0]}")
