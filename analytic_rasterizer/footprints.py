@@ -122,13 +122,15 @@ def resolve_footprint(name: str, **options: Any) -> Footprint:
     return Footprint(name, tuple(settled.items()), variant["key"], number, variant["samples"])
 
 
+_ANALYTIC = resolve_footprint("analytic")
 _default: Footprint | None = None
 
 
 def set_default_footprint(name: str | None, **options: Any) -> None:
     """Chooses the footprint of settings that name none, for the whole process.
 
-    `None` returns to the environment variable ANALYTIC_RASTERIZER_FOOTPRINT, or else `analytic`.
+    `None` returns to the environment variable ANALYTIC_RASTERIZER_FOOTPRINT, or else to the filter of the dialect that
+    the settings are of (docs/dialects.md), or else to `analytic`.
 
     Raises:
         ValueError: As `resolve_footprint()`.
@@ -138,7 +140,7 @@ def set_default_footprint(name: str | None, **options: Any) -> None:
 
 
 def chosen_footprint() -> Footprint | None:
-    """What was chosen for settings that name no footprint: `set_default_footprint`, or the environment; or None.
+    """What the user chose for the process, by `set_default_footprint` or the environment variable; None: nothing.
 
     Raises:
         ValueError: The environment variable holds no footprint.
@@ -155,12 +157,12 @@ def chosen_footprint() -> Footprint | None:
 
 
 def get_default_footprint() -> Footprint:
-    """The footprint of settings that name none.
+    """The footprint of settings that name none: the chosen one, or `analytic`. Settings of a dialect may differ.
 
     Raises:
         ValueError: The environment variable holds no footprint.
     """
-    return chosen_footprint() or resolve_footprint("analytic")
+    return chosen_footprint() or _ANALYTIC
 
 
 def check_device(device: torch.device) -> None:

@@ -1,55 +1,77 @@
-"""Opacities and scales of Gaussians that share the place of one: 3DGS as Markov chain Monte Carlo."""
+"""Splitting a Gaussian into several at one place that look as it did: the relocation of 3DGS-MCMC.
+
+[MCMC] Kheradmand et al., 3D Gaussian Splatting as Markov Chain Monte Carlo, 2024.
+"""
 
 from __future__ import annotations
+
+import functools
+import math
 
 import torch
 
 
+@functools.lru_cache(maxsize=8)
+def _coefficients(n_max: int) -> torch.Tensor:
+    """(n_max + 1, n_max): entry (N, k) is binom(N, k + 1) (-1)^k / sqrt(k + 1), float64.
+
+    [MCMC, Eq. 9] sums binom(i - 1, k) over i = 1 to N, which is binom(N, k + 1).
+    """
+    rows = [[math.comb(n, k + 1) * (-1) ** k / math.sqrt(k + 1) for k in range(n_max)] for n in range(n_max + 1)]
+    return torch.tensor(rows, dtype=torch.float64)
+
+
 @torch.no_grad()
 def compute_relocation(
-    opacity_old: torch.Tensor, scale_old: torch.Tensor, N: torch.Tensor, binoms: torch.Tensor, n_max: int
+    opacity_old: torch.Tensor,
+    scale_old: torch.Tensor,
+    N: torch.Tensor,
+    binoms: torch.Tensor | None = None,
+    n_max: int = 51,
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Opacity and scales with which N copies of a Gaussian at its place look like the Gaussian did alone.
+    """Opacity and scale of N Gaussians in the place of one. Without gradient, on any device.
 
-    The new opacity is o' = 1 - (1 - o)^(1/N), and the scales are multiplied with o over the sum over i = 1 to N and
-    k = 0 to i - 1 of binom(i - 1, k) (-1)^k o'^(k + 1) / sqrt(k + 1). The sum alternates, and is taken in float64.
+    Computed in float64: the sum of the scale's denominator has alternating terms, and cancels.
 
     Args:
-        opacity_old: (P,) or (P, 1), 0 to 1.
-        scale_old: (P, 3) world units.
-        N: (P,) or (P, 1) of integers: how many Gaussians take the place; taken to 1 to n_max.
-        binoms: (n_max, n_max) with n over k in row n, column k.
-        n_max: Size of the table.
+        opacity_old: (P,) or (P, 1), 0 to 1; 1 is taken as the largest float32 below it.
+        scale_old: (P, 3), or of any shape whose leading dimension is P.
+        N: (P,) or (P, 1) integers, how many there will be, the old one counted; taken as 1 to n_max.
+        binoms: Table of binomials of the original interface. Not read: they are computed exactly here.
+        n_max: Largest N.
 
     Returns:
-        New opacities in the shape of opacity_old, and new scales (P, 3).
+        Opacities and scales, of the shapes and dtypes of the old ones.
 
     Raises:
-        TypeError: Not a tensor.
-        ValueError: Wrong shape.
+        TypeError: Not a tensor, or N is not of integers.
+        ValueError: Wrong shape or device, or n_max is below 1.
 
-    Source: [MCMC, Eq. 9]: Kheradmand et al., 3D Gaussian Splatting as Markov Chain Monte Carlo, NeurIPS 2024.
+    Source: [MCMC, Eq. 9].
     """
-    given = {"opacity_old": opacity_old, "scale_old": scale_old, "N": N, "binoms": binoms}
-    for name, tensor in given.items():
+    for name, tensor in (("opacity_old", opacity_old), ("scale_old", scale_old), ("N", N)):
         if not isinstance(tensor, torch.Tensor):
             raise TypeError(f"{name} must be a tensor, got {type(tensor).__name__}")
-    count = len(opacity_old)
-    for name, shapes in (
-        ("opacity_old", ((count,), (count, 1))),
-        ("scale_old", ((count, 3),)),
-        ("N", ((count,), (count, 1))),
-        ("binoms", ((n_max, n_max),)),
-    ):
-        if given[name].shape not in shapes:
-            raise ValueError(f"{name} must have shape {' or '.join(map(str, shapes))}, got {tuple(given[name].shape)}")
-    # At an opacity of exactly 1 the terms of many copies grow beyond what float64 can add up.
-    old, copies = opacity_old.reshape(-1).double().clamp(0, 1 - 2**-24), N.reshape(-1).long().clamp(1, n_max)
-    new = -torch.expm1(torch.log1p(-old) / copies)
-    # The sum over i has the same o'^(k + 1) in all its terms: row N of the table's running sums.
-    of_power = binoms.double().cumsum(0)[copies - 1]
-    k = torch.arange(n_max, dtype=torch.float64, device=old.device)
-    signs = 1 - 2 * (k % 2)
-    total = (of_power * signs / (k + 1).sqrt() * new[:, None] ** (k + 1)).sum(1)
-    scale = scale_old * (old / total).to(scale_old)[:, None]
-    return new.to(opacity_old).reshape(opacity_old.shape), scale
+        if tensor.device != opacity_old.device:
+            raise ValueError(f"{name} must be on the device of opacity_old, {opacity_old.device}, got {tensor.device}")
+    count = opacity_old.numel()
+    for name, tensor in (("opacity_old", opacity_old), ("N", N)):
+        if tensor.shape not in ((count,), (count, 1)):
+            raise ValueError(f"{name} must have shape ({count},) or ({count}, 1), got {tuple(tensor.shape)}")
+    if scale_old.dim() < 1 or len(scale_old) != count:
+        raise ValueError(f"scale_old must have shape ({count}, 3), got {tuple(scale_old.shape)}")
+    if N.is_floating_point():
+        raise TypeError(f"N must be of integers, got {N.dtype}")
+    if n_max < 1:
+        raise ValueError(f"n_max must be at least 1, got {n_max}")
+    times = N.reshape(-1).long().clamp(1, n_max)
+    old = opacity_old.reshape(-1).double().clamp(max=1 - 2.0**-24)
+    new = -torch.expm1(torch.log1p(-old) / times)
+    table = _coefficients(n_max).to(new.device)
+    denominator, power = torch.zeros_like(new), new.clone()
+    for k in range(n_max):
+        denominator += table[times, k] * power
+        power *= new
+    factor = torch.where((times == 1) | (old == 0), 1.0, old / denominator)
+    scale = scale_old * factor.reshape(-1, *[1] * (scale_old.dim() - 1)).to(scale_old.dtype)
+    return new.reshape(opacity_old.shape).to(opacity_old.dtype), scale
