@@ -593,6 +593,11 @@ def test_what_is_not_served_is_refused_by_name(asked):
         render(scene_of(torch.float32, "cpu"), cameras_of(torch.float32, "cpu"), **asked)
 
 
+def test_2dgs_is_refused_by_name():
+    with pytest.raises(NotImplementedError, match=r"^rasterization_2dgs is not supported: "):
+        dialect.rasterization_2dgs(torch.zeros(1, 3), render_mode="RGB")
+
+
 @pytest.mark.parametrize(
     "change, error, message",
     [

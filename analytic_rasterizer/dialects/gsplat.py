@@ -581,6 +581,17 @@ def _blend(
 # --- gsplat's own programs ---------------------------------------------------------------------------
 
 
+def rasterization_2dgs(*args: Any, **kwargs: Any) -> None:
+    """gsplat's rasterizer of 2D Gaussian splatting, which this package does not have.
+
+    Raises:
+        NotImplementedError: Always.
+    """
+    raise NotImplementedError(
+        "rasterization_2dgs is not supported: 2DGS intersects rays with discs, see docs/gsplat.md"
+    )
+
+
 def compute_relocation(
     opacities: torch.Tensor, scales: torch.Tensor, ratios: torch.Tensor, binoms: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
