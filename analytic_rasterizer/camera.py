@@ -60,20 +60,11 @@ def camera_settings(
     )
     orthographic = isinstance(effects, Effects) and effects.orthographic
     tangents = width / (2 * fx), height / (2 * fy)
-    zero, one = view.new_zeros(()), view.new_ones(())
-    near, far = _DEPTH_RANGE
-    # The principal point in clip space, where the image spans [-1, 1] x [-1, 1].
-    x, y = 2 * cx / width - 1, 2 * cy / height - 1
-    along = (zero, zero, x, y) if orthographic else (x, y, zero, zero)
-    projection = torch.stack([
-        torch.stack([1 / tangents[0], zero, along[0], along[2]]),
-        torch.stack([zero, 1 / tangents[1], along[1], along[3]]),
-        view.new_tensor([0, 0, far / (far - near), -far * near / (far - near)]),
-        torch.stack([zero, zero, zero, one] if orthographic else [zero, zero, one, zero]),
-    ])  # fmt: skip
+    scale = torch.stack([1 / tangent for tangent in tangents])
+    center = torch.stack([2 * cx / width - 1, 2 * cy / height - 1])
+    projection, position = camera_matrices(view, scale, center, orthographic)
     if not (isinstance(effects, Effects) and effects.camera_gradients):
         tangents = tuple(t.item() for t in tangents)
-    position = -torch.linalg.solve(view[:3, :3], view[:3, 3])
     to = {"dtype": dtype, "device": view.device if device is None else device}
     return GaussianRasterizationSettings(
         image_height=height,
@@ -83,7 +74,7 @@ def camera_settings(
         bg=torch.zeros(3, **to) if bg is None else bg.to(**to),
         scale_modifier=scale_modifier,
         viewmatrix=view.T.to(**to).contiguous(),
-        projmatrix=(projection @ view).T.to(**to).contiguous(),
+        projmatrix=projection.T.to(**to).contiguous(),
         sh_degree=sh_degree,
         campos=position.to(**to),
         prefiltered=False,
@@ -91,6 +82,29 @@ def camera_settings(
         effects=effects,
         **options,
     )
+
+
+def camera_matrices(
+    view: torch.Tensor, scale: torch.Tensor, center: torch.Tensor, orthographic: bool
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """World to clip space, where the image spans [-1, 1] x [-1, 1], and the camera's centre. Differentiable.
+
+    Args:
+        view: (..., 4, 4) world to camera, for column vectors.
+        scale: (..., 2) clip space per x/z and y/z, twice the focal length over the size of the image; of an
+            orthographic camera per world unit.
+        center: (..., 2) the principal point in clip space.
+        orthographic: Whether w of clip space is 1, and not z.
+
+    Returns:
+        (..., 4, 4) for column vectors, and (..., 3) world units.
+    """
+    near, far = _DEPTH_RANGE
+    w = view[..., 3:, :] if orthographic else view[..., 2:3, :]
+    xy = scale[..., None] * view[..., :2, :] + center[..., None] * w
+    z = far / (far - near) * (view[..., 2:3, :] - near * view[..., 3:, :])
+    position = -torch.linalg.solve(view[..., :3, :3], view[..., :3, 3:])[..., 0]
+    return torch.cat([xy, z, w], -2), position
 
 
 def moved(world_to_camera: torch.Tensor, tangent: torch.Tensor) -> torch.Tensor:

@@ -1,6 +1,7 @@
 """The dialects of diff_gaussian_rasterization: how each repository calls its rasterizer, and what it unpacks.
 
-A dialect is a file of this package, and its name is the file's. Adding one: docs/dialects.md.
+A dialect is a file of this package, and its name is the file's. Adding one: docs/dialects.md. `gsplat` is no dialect
+but another interface, which takes cameras in batches.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ DEFAULT = "gs2023"
 _MODULES = {
     name: importlib.import_module(f"{__name__}.{name}")
     for _, name, _ in pkgutil.iter_modules(__path__)
-    if not name.startswith("_")
+    if not name.startswith("_") and name != "gsplat"
 }
 
 DIALECTS = tuple(_MODULES)

@@ -1,0 +1,680 @@
+"""gsplat's `rasterization` over the stages of this package: its arguments, its returns, its `meta`.
+
+    from analytic_rasterizer.dialects.gsplat import rasterization  # in place of gsplat's
+
+or, in programs that stay as they are, before they import gsplat's:
+
+    from analytic_rasterizer.dialects import gsplat
+    gsplat.patch()
+
+Only `patch` needs gsplat to be installed. What is served, what differs and what is refused: docs/gsplat.md.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+
+from .. import relocation
+from .._C import TILE
+from ..camera import camera_matrices
+from ..effects import MAX_SH_DEGREE, Effects
+from ..footprints import Footprint, chosen_footprint, resolve_footprint
+from ..settings import GaussianRasterizationSettings
+from ..stages import Splats, bin, blend, project
+
+RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
+RASTERIZE_MODES = ("classic", "antialiased")
+
+_ALPHA_MIN = 1 / 255  # alpha below which nothing is drawn, here and in gsplat
+_EXTENT = 3.33  # standard deviations in gsplat's radii at most: there an opacity of 1 has fallen to _ALPHA_MIN
+_PIXEL_VARIANCE = 1 / 12  # px^2, of a square pixel
+_LARGEST_RADIUS = 1e9  # px, fits an int32
+_SMALLEST_ALPHA = 1e-10  # that an accumulated depth is divided by, as in gsplat
+_MAX_CHANNELS = 512  # of `blend`
+
+_REFUSED = {
+    "sparse_grad": "gradients are dense tensors",
+    "distributed": "each process renders its own images",
+    "with_ut": "the unscented transform of 3DGUT is not implemented",
+    "with_eval3d": "Gaussians are evaluated in the image, not along rays",
+    "radial_coeffs": "lenses without distortion only, undistort the images",
+    "tangential_coeffs": "lenses without distortion only, undistort the images",
+    "thin_prism_coeffs": "lenses without distortion only, undistort the images",
+    "ftheta_coeffs": "lenses without distortion only, undistort the images",
+    "viewmats_rs": "the shutter is global",
+}
+"""Arguments of gsplat that are refused, and why."""
+
+
+def rasterization(
+    means: torch.Tensor,
+    quats: torch.Tensor | None,
+    scales: torch.Tensor | None,
+    opacities: torch.Tensor,
+    colors: torch.Tensor,
+    viewmats: torch.Tensor,
+    Ks: torch.Tensor,
+    width: int,
+    height: int,
+    near_plane: float = 0.01,
+    far_plane: float = 1e10,
+    radius_clip: float = 0.0,
+    eps2d: float = 0.3,
+    sh_degree: int | None = None,
+    packed: bool = True,
+    tile_size: int = 16,
+    backgrounds: torch.Tensor | None = None,
+    render_mode: str = "RGB",
+    sparse_grad: bool = False,
+    absgrad: bool = False,
+    rasterize_mode: str = "classic",
+    channel_chunk: int = 32,
+    distributed: bool = False,
+    camera_model: str = "pinhole",
+    segmented: bool = False,
+    covars: torch.Tensor | None = None,
+    with_ut: bool = False,
+    with_eval3d: bool = False,
+    radial_coeffs: torch.Tensor | None = None,
+    tangential_coeffs: torch.Tensor | None = None,
+    thin_prism_coeffs: torch.Tensor | None = None,
+    ftheta_coeffs: Any = None,
+    rolling_shutter: Any = None,
+    viewmats_rs: torch.Tensor | None = None,
+    *,
+    footprint: str | Footprint | None = None,
+) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    """Renders N Gaussians into C cameras, for every index of the leading dimensions `...`, of which there may be none.
+
+    Differentiable in all tensors, also in viewmats and Ks. Floating tensors share one device and dtype (float32;
+    float64 on the CPU).
+
+    Args:
+        means: (..., N, 3) centres, world units.
+        quats: (..., N, 4) quaternions (w, x, y, z) of any length.
+        scales: (..., N, 3) standard deviations, world units.
+        opacities: (..., N) 0 to 1.
+        colors: (..., N, D) or, for every camera, (..., C, N, D): colours or features, at most 512 channels, depth
+            included. With sh_degree: (..., N, K, 3) or (..., C, N, K, 3) spherical harmonics.
+        viewmats: (..., C, 4, 4) world to camera; x right, y down, z forward.
+        Ks: (..., C, 3, 3) focal lengths and principal points, px, the image spanning [0, width] x [0, height]. Of an
+            orthographic camera the focal lengths are px per world unit.
+        width, height: Size of the images, px.
+        near_plane, far_plane: Camera-space z between which Gaussians are drawn, world units.
+        radius_clip: A splat whose radii are at most this many px is not drawn.
+        eps2d: Variance of the filter, px^2: `point:dilation=eps2d` in the mode "classic", `mip:variance=eps2d` in
+            the mode "antialiased". Not read where a footprint was chosen.
+        sh_degree: Degree of the harmonics in use, 0 to 4; None: colors are colours.
+        packed: Whether `meta` has a row per splat, or a place for every Gaussian in every camera.
+        tile_size: Ignored: tiles have 16 px.
+        backgrounds: (..., C, D) colours behind the Gaussians; None: zero. There is no depth behind them.
+        render_mode: "RGB" for colours, "D" for accumulated depth, "ED" for expected depth, "RGB+D", "RGB+ED".
+        absgrad: Let the backward pass set `meta["means2d"].absgrad`: sums over pixels of absolute gradients.
+        rasterize_mode: "classic" or "antialiased".
+        channel_chunk, segmented: Ignored: all channels are blended in one pass, and sorting has one way.
+        camera_model: "pinhole" or "ortho".
+        covars: (..., N, 3, 3) covariances in place of quats and scales, world units^2; the upper triangle is read.
+        sparse_grad, distributed, with_ut, with_eval3d, radial_coeffs, tangential_coeffs, thin_prism_coeffs,
+        ftheta_coeffs, rolling_shutter, viewmats_rs: Refused unless they ask for nothing.
+        footprint: See `resolve_footprint`. None: the one that `set_default_footprint` or the environment variable
+            ANALYTIC_RASTERIZER_FOOTPRINT chose, or else the filter of rasterize_mode and eps2d.
+
+    Returns:
+        render_colors: (..., C, height, width, X): D channels, one of depth, or both.
+        render_alphas: (..., C, height, width, 1).
+        meta: A dictionary. Its rows are (R, ...) of R splats if packed, else (..., C, N, ...), where they mean
+            something if the radii are positive: means2d (2,) px with pixel centres at 0.5, through which gradients of
+            the images flow, so that `retain_grad` works; depths, differentiable; radii (2,) int32, px along x and y;
+            conics (3,), the inverse of the covariance with the filter's variance (1/12 px^2 for footprints other than
+            `point` and `mip`); opacities, with the amplitude of `mip`; the last three without gradient. batch_ids,
+            camera_ids, gaussian_ids: (R,) int64 if packed, else None. width, height, tile_size, tile_width,
+            tile_height, n_batches, n_cameras: numbers. gsplat's lists of tiles (tiles_per_gauss, isect_ids,
+            flatten_ids, isect_offsets) are missing.
+
+    Raises:
+        NotImplementedError: What this package does not render; the message names it.
+        TypeError: Not a tensor, or a wrong dtype.
+        ValueError: Wrong shape, device or value. The numbers of cameras are looked at on the CPU only.
+        RuntimeError: CUDA tensors, and an extension without CUDA; or a pose in viewmats that is singular.
+    """
+    asked = {
+        "sparse_grad": sparse_grad,
+        "distributed": distributed,
+        "with_ut": with_ut,
+        "with_eval3d": with_eval3d,
+        "radial_coeffs": radial_coeffs,
+        "tangential_coeffs": tangential_coeffs,
+        "thin_prism_coeffs": thin_prism_coeffs,
+        "ftheta_coeffs": ftheta_coeffs,
+        "viewmats_rs": viewmats_rs,
+    }
+    _refuse(asked, camera_model, rolling_shutter)
+    _check_choice("render_mode", render_mode, RENDER_MODES)
+    _check_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
+    _check_numbers(width, height, near_plane, far_plane, radius_clip, eps2d)
+    width, height = int(width), int(height)
+    sizes = _check_scene(means, quats, scales, opacities, covars, viewmats, Ks)
+    per_camera = _check_colors(means, sizes, colors, backgrounds, sh_degree, render_mode)
+    settled = _settle_footprint(footprint, rasterize_mode, eps2d)
+    settings = _camera_settings(
+        viewmats,
+        Ks,
+        width,
+        height,
+        near=near_plane,
+        far=far_plane,
+        orthographic=camera_model == "ortho",
+        sh_degree=sh_degree or 0,
+        footprint=settled,
+    )
+    with_colors, with_depth = "RGB" in render_mode, render_mode != "RGB"
+    shs = colors if with_colors and sh_degree is not None else None
+    if covars is None:
+        covariances = {"scales": scales, "rotations": quats}
+    else:
+        covariances = {"cov3D_precomp": _upper_triangle(covars)}
+    gaussians = {"means3D": means, "opacities": opacities, **covariances}
+    splats = _project(sizes, settings, gaussians, shs, per_camera)
+    measures = _measure(splats, settled, radius_clip)
+    if packed:
+        splats, measures = _without_culled(splats, measures)
+    else:
+        splats = dataclasses.replace(splats, opacities=torch.where(measures.drawn, splats.opacities, 0))
+    layout = _Layout.of(splats, sizes, packed)
+
+    means2d = layout.to_meta(splats.means2d + 0.5)
+    through, absolute = means2d, None
+    if absgrad and means2d.requires_grad:
+        through, absolute = _KeepAbsolute.apply(means2d)
+        absolute = layout.to_rows(absolute)
+    splats = dataclasses.replace(splats, means2d=layout.to_rows(through) - 0.5)
+
+    channels = []
+    if with_colors:
+        channels.append(_colors_of_rows(splats, sizes, colors, per_camera) if shs is None else splats.colors)
+    if with_depth:
+        channels.append(splats.depths[:, None])
+    features = torch.cat(channels, 1)
+    images, alphas = _blend(splats, features, _backgrounds(backgrounds, with_colors, with_depth), absolute)
+    if render_mode.endswith("ED"):
+        images = torch.cat([images[..., :-1], images[..., -1:] / alphas.clamp(min=_SMALLEST_ALPHA)], -1)
+
+    meta = {
+        "batch_ids": splats.camera_ids.long() // sizes.cameras if packed else None,
+        "camera_ids": splats.camera_ids.long() % sizes.cameras if packed else None,
+        "gaussian_ids": splats.gaussian_ids.long() if packed else None,
+        "radii": layout.to_meta(measures.radii),
+        "means2d": means2d,
+        "depths": layout.to_meta(splats.depths),
+        "conics": layout.to_meta(measures.conics),
+        "opacities": layout.to_meta(measures.opacities),
+        "width": width,
+        "height": height,
+        "tile_size": TILE,
+        "tile_width": math.ceil(width / TILE),
+        "tile_height": math.ceil(height / TILE),
+        "n_batches": math.prod(sizes.batch),
+        "n_cameras": sizes.cameras,
+    }
+    dims = (*sizes.batch, sizes.cameras)
+    return images.unflatten(0, dims), alphas.unflatten(0, dims), meta
+
+
+# --- what is given -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Sizes:
+    """Leading dimensions, and how many cameras and Gaussians there are for each of their indices."""
+
+    batch: tuple[int, ...]
+    cameras: int
+    gaussians: int
+
+
+def _refuse(asked: dict[str, Any], camera_model: str, rolling_shutter: Any) -> None:
+    for name, value in asked.items():
+        if value is not None and value is not False:
+            raise NotImplementedError(f"{name} is not supported: {_REFUSED[name]}")
+    if rolling_shutter is not None and getattr(rolling_shutter, "name", rolling_shutter) != "GLOBAL":
+        raise NotImplementedError(f"rolling_shutter is not supported: the shutter is global; got {rolling_shutter}")
+    if camera_model in ("fisheye", "ftheta"):
+        raise NotImplementedError(f"camera_model {camera_model!r} is not supported: cameras are pinhole or ortho")
+    _check_choice("camera_model", camera_model, ("pinhole", "ortho"))
+
+
+def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
+    if value not in choices:
+        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
+
+
+def _check_numbers(
+    width: int, height: int, near_plane: float, far_plane: float, radius_clip: float, eps2d: float
+) -> None:
+    for name, value in (("width", width), ("height", height)):
+        if int(value) != value or value < 1:
+            raise ValueError(f"{name} must be a positive integer, got {value}")
+    if not 0 < near_plane < far_plane:
+        raise ValueError(f"near_plane must be above 0 and below far_plane, got {near_plane} and {far_plane}")
+    for name, value in (("radius_clip", radius_clip), ("eps2d", eps2d)):
+        if not 0 <= value < math.inf:
+            raise ValueError(f"{name} must be finite and not negative, got {value}")
+
+
+def _check_tensor(name: str, tensor: Any, like: torch.Tensor, *shapes: tuple[int, ...]) -> None:
+    """Raises unless it is a tensor of one of these shapes, of the dtype and on the device of the means."""
+    if not isinstance(tensor, torch.Tensor):
+        raise TypeError(f"{name} must be a tensor, got {type(tensor).__name__}")
+    if tensor.shape not in shapes:
+        raise ValueError(f"{name} must have shape {' or '.join(map(str, shapes))}, got {tuple(tensor.shape)}")
+    if tensor.device != like.device:
+        raise ValueError(f"{name} must be on the device of means, {like.device}, got {tensor.device}")
+    if tensor.dtype != like.dtype:
+        raise TypeError(f"{name} must have the dtype of means, {like.dtype}, got {tensor.dtype}")
+
+
+def _check_scene(means: Any, quats: Any, scales: Any, opacities: Any, covars: Any, viewmats: Any, Ks: Any) -> _Sizes:
+    """The sizes that means and viewmats have, after checking all against them."""
+    for name, tensor, last in (("means", means, (3,)), ("viewmats", viewmats, (4, 4))):
+        if not isinstance(tensor, torch.Tensor):
+            raise TypeError(f"{name} must be a tensor, got {type(tensor).__name__}")
+        dims = len(last) + 1
+        if tensor.dim() < dims or tensor.shape[1 - dims :] != last:
+            counted = "N" if name == "means" else "C"
+            shape = ", ".join(("...", counted, *map(str, last)))
+            raise ValueError(f"{name} must have shape ({shape}), got {tuple(tensor.shape)}")
+    sizes = _Sizes(tuple(means.shape[:-2]), viewmats.shape[-3], means.shape[-2])
+    of_gaussians, of_cameras = (*sizes.batch, sizes.gaussians), (*sizes.batch, sizes.cameras)
+    if math.prod(of_cameras) == 0:
+        raise ValueError(f"viewmats must hold at least one camera, got shape {tuple(viewmats.shape)}")
+    if covars is None:
+        _check_tensor("quats", quats, means, (*of_gaussians, 4))
+        _check_tensor("scales", scales, means, (*of_gaussians, 3))
+    else:
+        _check_tensor("covars", covars, means, (*of_gaussians, 3, 3))
+    _check_tensor("opacities", opacities, means, of_gaussians)
+    _check_tensor("viewmats", viewmats, means, (*of_cameras, 4, 4))
+    _check_tensor("Ks", Ks, means, (*of_cameras, 3, 3))
+    focal = Ks.detach().diagonal(dim1=-2, dim2=-1)[..., :2]
+    if not Ks.is_cuda and (focal <= 0).any():  # on CUDA it would wait for the device
+        raise ValueError(f"Ks must have positive focal lengths, got {focal[focal <= 0][0].item()}")
+    return sizes
+
+
+def _check_colors(
+    means: torch.Tensor, sizes: _Sizes, colors: Any, backgrounds: Any, sh_degree: int | None, render_mode: str
+) -> bool:
+    """Whether every camera has colours of its own, after checking them."""
+    if not isinstance(colors, torch.Tensor):
+        raise TypeError(f"colors must be a tensor, got {type(colors).__name__}")
+    last = tuple(colors.shape[-1:]) if sh_degree is None else (*colors.shape[-2:-1], 3)
+    shared, own = (
+        (*sizes.batch, sizes.gaussians, *last),
+        (*sizes.batch, sizes.cameras, sizes.gaussians, *last),
+    )
+    _check_tensor("colors", colors, means, shared, own)
+    most = _MAX_CHANNELS if render_mode == "RGB" else _MAX_CHANNELS - 1
+    if sh_degree is None and "RGB" in render_mode and not 1 <= last[0] <= most:
+        raise ValueError(f"colors must have 1 to {most} channels in render_mode {render_mode}, got {last[0]}")
+    if sh_degree is not None:
+        if sh_degree not in range(MAX_SH_DEGREE + 1):
+            raise ValueError(f"sh_degree must be 0 to {MAX_SH_DEGREE}, got {sh_degree}")
+        if last[0] < (sh_degree + 1) ** 2:
+            raise ValueError(f"colors must have {(sh_degree + 1) ** 2} harmonics of degree {sh_degree}, got {last[0]}")
+    if backgrounds is not None:
+        _check_tensor("backgrounds", backgrounds, means, (*sizes.batch, sizes.cameras, last[-1]))
+    return colors.shape == own
+
+
+def _settle_footprint(footprint: str | Footprint | None, rasterize_mode: str, eps2d: float) -> Footprint:
+    if footprint is not None:
+        return resolve_footprint(str(footprint))
+    if (chosen := chosen_footprint()) is not None:
+        return chosen
+    if rasterize_mode == "classic":
+        return resolve_footprint("point", dilation=eps2d)
+    return resolve_footprint("mip", variance=eps2d)
+
+
+# --- projection --------------------------------------------------------------------------------------
+
+_ROWS = ("means2d", "cov2d", "opacities", "depths", "colors", "radii", "gaussian_ids", "camera_ids", "dets")
+"""Fields of `Splats` with a row per splat; colors may have none."""
+
+
+def _camera_settings(
+    viewmats: torch.Tensor,
+    Ks: torch.Tensor,
+    width: int,
+    height: int,
+    *,
+    near: float,
+    far: float,
+    orthographic: bool,
+    sh_degree: int,
+    footprint: Footprint,
+) -> list[GaussianRasterizationSettings]:
+    """Settings of all cameras, in the order of their leading dimensions, for `project`."""
+    effects = Effects(
+        camera_gradients=True,  # keeps the focal lengths on the device
+        off_center=True,  # the clamp of x/z and y/z is around the centre of the picture, as in gsplat
+        near=near,
+        far=far,
+        orthographic=orthographic,
+    )
+    background = viewmats.new_zeros(3)  # which `project` does not read
+    views, intrinsics = viewmats.reshape(-1, 4, 4).double(), Ks.reshape(-1, 3, 3).double()
+    fx, fy, cx, cy = (intrinsics[:, row, column] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    scale = torch.stack([2 * fx / width, 2 * fy / height], 1)
+    center = torch.stack([2 * cx / width - 1, 2 * cy / height - 1], 1)
+    projections, positions = camera_matrices(views, scale, center, orthographic)
+    projections, positions, tangents = (t.to(viewmats.dtype) for t in (projections.mT, positions, 1 / scale))
+    return [
+        GaussianRasterizationSettings(
+            image_height=height,
+            image_width=width,
+            tanfovx=tangent[0],
+            tanfovy=tangent[1],
+            bg=background,
+            scale_modifier=1.0,
+            viewmatrix=view.mT,
+            projmatrix=projection,
+            sh_degree=sh_degree,
+            campos=position,
+            prefiltered=False,
+            debug=False,
+            effects=effects,
+            footprint=str(footprint),
+        )
+        for view, projection, position, tangent in zip(viewmats.reshape(-1, 4, 4), projections, positions, tangents)
+    ]
+
+
+def _project(
+    sizes: _Sizes,
+    settings: list[GaussianRasterizationSettings],
+    gaussians: dict[str, torch.Tensor],
+    shs: torch.Tensor | None,
+    per_camera: bool,
+) -> Splats:
+    """Splats of all Gaussians in all cameras; the cameras of batch b are b * C to b * C + C - 1.
+
+    One `project` serves the cameras that see the same Gaussians: those of a batch, unless harmonics are per camera.
+    """
+    batches, dims = math.prod(sizes.batch), len(sizes.batch)
+    flat = {name: value.reshape(batches, *value.shape[dims:]) for name, value in gaussians.items()}
+    if shs is not None:
+        shs = shs.reshape(len(settings) if per_camera else batches, *shs.shape[-3:])
+    together = 1 if shs is not None and per_camera else sizes.cameras
+    parts = []
+    for first in range(0, len(settings), together):
+        batch = first // sizes.cameras
+        of_batch = {name: value[batch] for name, value in flat.items()}
+        if shs is not None:
+            of_batch["shs"] = shs[first if per_camera else batch]
+        parts.append(project(settings[first : first + together], **of_batch))
+    return _join(parts)
+
+
+def _upper_triangle(matrices: torch.Tensor) -> torch.Tensor:
+    """(..., 6) of (..., 3, 3)."""
+    return torch.stack([matrices[..., row, column] for row in range(3) for column in range(row, 3)], -1)
+
+
+def _join(parts: list[Splats]) -> Splats:
+    """Splats of several projections as of one, camera after camera."""
+    if len(parts) == 1:
+        return parts[0]
+    cameras = [0]
+    splits = [parts[0].row_splits[:1]]
+    for part in parts:
+        cameras.append(cameras[-1] + part.cameras)
+        splits.append(splits[-1][-1] + part.row_splits[1:])
+    rows = {name: torch.cat([getattr(part, name) for part in parts]) for name in _ROWS}
+    rows["camera_ids"] = torch.cat([part.camera_ids + first for part, first in zip(parts, cameras)])
+    return dataclasses.replace(parts[0], row_splits=torch.cat(splits), **rows)
+
+
+# --- what meta says ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Measures:
+    """What `meta` says of splats beside what they are. Without gradient, a row per splat.
+
+    Attributes:
+        drawn: (R,) bool, whether gsplat would draw it.
+        radii: (R, 2) int32, px; 0 where it is not drawn.
+        conics: (R, 3), 1/px^2.
+        opacities: (R,).
+    """
+
+    drawn: torch.Tensor
+    radii: torch.Tensor
+    conics: torch.Tensor
+    opacities: torch.Tensor
+
+
+@torch.no_grad()
+def _measure(splats: Splats, footprint: Footprint, radius_clip: float) -> _Measures:
+    """Radii by gsplat's definition: half the width and height, in whole px, of the ellipse where alpha is 1/255.
+
+    A splat whose rectangle misses the image is not drawn, as in gsplat. This hides nothing: the centre of the nearest
+    pixel is half a pixel further away, so that alpha is below 1/255 there also where the weight is an integral over
+    the pixel.
+    """
+    variance = footprint.option if footprint.name in ("point", "mip") else _PIXEL_VARIANCE
+    xx, xy, yy = splats.cov2d.unbind(1)
+    det = splats.dets + variance * (xx + yy) + variance**2  # without the cancellation of computing it from entries
+    xx, yy = xx + variance, yy + variance
+    conics = torch.stack([yy / det, -xy / det, xx / det], 1)
+    opacities = splats.opacities
+    if footprint.name == "mip":
+        opacities = opacities * (splats.dets / det).sqrt()
+    extent = (2 * (opacities / _ALPHA_MIN).log()).clamp(min=0).sqrt().clamp(max=_EXTENT)
+    rx, ry = ((extent * v.sqrt()).ceil().clamp(max=_LARGEST_RADIUS) for v in (xx, yy))
+    x, y = (splats.means2d + 0.5).unbind(1)
+    on_image = (x + rx > 0) & (x - rx < splats.width) & (y + ry > 0) & (y - ry < splats.height)
+    drawn = on_image & (rx > 0) & (ry > 0) & ((rx > radius_clip) | (ry > radius_clip))
+    radii = torch.where(drawn[:, None], torch.stack([rx, ry], 1), 0).int()
+    return _Measures(drawn, radii, conics, opacities)
+
+
+def _without_culled(splats: Splats, measures: _Measures) -> tuple[Splats, _Measures]:
+    """Only what is drawn. Waits for the device."""
+    kept = measures.drawn.nonzero()[:, 0]
+    before = torch.nn.functional.pad(measures.drawn.cumsum(0), (1, 0))  # rows kept before each row
+    row_splits = before[splats.row_splits.to(before.device)].cpu()
+    rows = {name: getattr(splats, name) for name in _ROWS}
+    rows = {name: values.index_select(0, kept) if len(values) else values for name, values in rows.items()}
+    measured = (getattr(measures, field.name).index_select(0, kept) for field in dataclasses.fields(measures))
+    return dataclasses.replace(splats, row_splits=row_splits, **rows), _Measures(*measured)
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """How `meta` holds rows: as they are, or in a table with a place for every Gaussian in every camera.
+
+    Attributes:
+        shape: (..., C, N) of the table.
+        places: (R,) int64, where in the flattened table each row is; None: packed.
+    """
+
+    shape: tuple[int, ...]
+    places: torch.Tensor | None
+
+    @classmethod
+    def of(cls, splats: Splats, sizes: _Sizes, packed: bool) -> _Layout:
+        """For the rows of `splats`."""
+        places = None if packed else splats.camera_ids.long() * sizes.gaussians + splats.gaussian_ids.long()
+        return cls((*sizes.batch, sizes.cameras, sizes.gaussians), places)
+
+    def to_meta(self, rows: torch.Tensor) -> torch.Tensor:
+        """Rows as `meta` holds them, zero where there is none."""
+        if self.places is None:
+            return rows
+        table = rows.new_zeros(math.prod(self.shape), *rows.shape[1:])
+        return table.index_copy(0, self.places, rows).reshape(*self.shape, *rows.shape[1:])
+
+    def to_rows(self, held: torch.Tensor) -> torch.Tensor:
+        """The rows of what `to_meta` made."""
+        if self.places is None:
+            return held
+        return held.flatten(0, len(self.shape) - 1).index_select(0, self.places)
+
+
+class _KeepAbsolute(torch.autograd.Function):
+    """Passes means2d on, with a second tensor that takes the sums of absolute gradients for `means2d.absgrad`."""
+
+    @staticmethod
+    def forward(ctx, means2d: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """means2d, and zeros."""
+        ctx.means2d = means2d
+        return means2d.view_as(means2d), torch.zeros_like(means2d)
+
+    @staticmethod
+    def backward(ctx, dL_dmeans2d: torch.Tensor, absolute: torch.Tensor) -> torch.Tensor:
+        """The gradient of means2d as it came; the other one becomes the attribute."""
+        ctx.means2d.absgrad = absolute
+        return dL_dmeans2d
+
+
+# --- blending ----------------------------------------------------------------------------------------
+
+
+def _colors_of_rows(splats: Splats, sizes: _Sizes, colors: torch.Tensor, per_camera: bool) -> torch.Tensor:
+    """(R, D) of colours that are given per Gaussian, or per camera and Gaussian."""
+    table = splats.camera_ids.long()
+    if not per_camera:
+        table = table // sizes.cameras
+    rows = table * sizes.gaussians + splats.gaussian_ids.long()
+    return colors.flatten(0, -2).index_select(0, rows)
+
+
+def _backgrounds(backgrounds: torch.Tensor | None, with_colors: bool, with_depth: bool) -> torch.Tensor | None:
+    """(B * C, K) of all channels: there is no depth behind the Gaussians."""
+    if backgrounds is None or not with_colors:
+        return None
+    flat = backgrounds.flatten(0, -2)
+    return torch.nn.functional.pad(flat, (0, 1)) if with_depth else flat
+
+
+def _blend(
+    splats: Splats, features: torch.Tensor, backgrounds: torch.Tensor | None, absolute: torch.Tensor | None
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Images (B * C, H, W, K) and alphas (B * C, H, W, 1)."""
+    if splats.footprint == "adaptive":  # it chooses samples by the first three channels
+        three = features.detach()[:, :3]
+        splats = dataclasses.replace(splats, colors=torch.nn.functional.pad(three, (0, 3 - three.shape[1])))
+    lists = bin(splats, keep=torch.is_grad_enabled())
+    images, alphas = blend(splats, lists, features, backgrounds, means2d_abs=absolute)
+    return images.permute(0, 2, 3, 1).contiguous(), alphas.permute(0, 2, 3, 1).contiguous()
+
+
+# --- gsplat's own programs ---------------------------------------------------------------------------
+
+
+def rasterization_2dgs(*args: Any, **kwargs: Any) -> None:
+    """gsplat's rasterizer of 2D Gaussian splatting, which this package does not have.
+
+    Raises:
+        NotImplementedError: Always.
+    """
+    raise NotImplementedError(
+        "rasterization_2dgs is not supported: 2DGS intersects rays with discs, see docs/gsplat.md"
+    )
+
+
+def compute_relocation(
+    opacities: torch.Tensor, scales: torch.Tensor, ratios: torch.Tensor, binoms: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """gsplat's function of that name, which its MCMCStrategy calls. See `relocation.compute_relocation`.
+
+    Args:
+        opacities: (P,) or (P, 1), 0 to 1.
+        scales: (P, 3) world units.
+        ratios: (P,) integers: how many Gaussians take the place of each.
+        binoms: (n, n) binomial coefficients, with ratios up to n.
+
+    Returns:
+        New opacities and new scales, in the shapes of the old.
+
+    Raises:
+        TypeError: Not a tensor.
+        ValueError: Wrong shape.
+    """
+    return relocation.compute_relocation(opacities, scales, ratios, binoms, len(binoms))
+
+
+def quat_scale_to_covar_preci(
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    compute_covar: bool = True,
+    compute_preci: bool = True,
+    triu: bool = False,
+) -> tuple[torch.Tensor | None, torch.Tensor | None]:
+    """gsplat's function of that name, which its MCMCStrategy calls: covariances and their inverses. Differentiable.
+
+    Args:
+        quats: (..., 4) quaternions (w, x, y, z) of any length; zero is the identity.
+        scales: (..., 3) standard deviations, world units.
+        compute_covar, compute_preci: Which of the two to make.
+        triu: Return (..., 6), the upper triangles row by row, in place of (..., 3, 3).
+
+    Returns:
+        Covariances and their inverses, None for what is not asked for.
+
+    Raises:
+        ValueError: Wrong shape.
+    """
+    if quats.shape[-1:] != (4,) or scales.shape != (*quats.shape[:-1], 3):
+        raise ValueError(
+            f"quats must have shape (..., 4) and scales (..., 3), got {tuple(quats.shape)} and {tuple(scales.shape)}"
+        )
+    w, v = torch.nn.functional.normalize(quats, dim=-1).split((1, 3), -1)
+    # R = I + 2 w [v] + 2 [v]^2, where the matrix [v] takes a vector to its cross product with v.
+    identity = torch.eye(3, dtype=v.dtype, device=v.device).expand(*v.shape[:-1], 3, 3)
+    cross = torch.linalg.cross(v[..., None, :].expand_as(identity), identity).mT
+    rotations = identity + 2 * (w[..., None] * cross + cross @ cross)
+
+    def squared(factors: torch.Tensor) -> torch.Tensor:
+        square = rotations * factors[..., None, :]
+        square = square @ square.mT
+        return _upper_triangle(square) if triu else square
+
+    return squared(scales) if compute_covar else None, squared(1 / scales) if compute_preci else None
+
+
+def patch() -> None:
+    """Puts this module's functions in the place of gsplat's, whose CUDA kernels are then not needed.
+
+    To be called before other modules import names from gsplat: what they have imported already stays gsplat's. The
+    three functions are `rasterization`, `compute_relocation` and `quat_scale_to_covar_preci`, which is what gsplat's
+    DefaultStrategy and MCMCStrategy and nerfstudio's splatfacto call. Before version 1.5 `meta["radii"]` had one
+    number per splat: then it is the larger one of the two.
+
+    Raises:
+        ImportError: gsplat is not installed, or is older than its strategies. Tested with 1.4.0 and 1.5.3.
+    """
+    import gsplat
+    import gsplat.relocation
+    import gsplat.rendering
+    import gsplat.strategy.ops
+
+    version = tuple(int(number) for number in gsplat.__version__.split(".")[:2])
+    gsplat.rasterization = gsplat.rendering.rasterization = rasterization if version >= (1, 5) else _with_one_radius
+    gsplat.relocation.compute_relocation = gsplat.strategy.ops.compute_relocation = compute_relocation
+    gsplat.quat_scale_to_covar_preci = gsplat.strategy.ops.quat_scale_to_covar_preci = quat_scale_to_covar_preci
+
+
+@functools.wraps(rasterization)
+def _with_one_radius(*args: Any, **kwargs: Any) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    images, alphas, meta = rasterization(*args, **kwargs)
+    return images, alphas, meta | {"radii": meta["radii"].amax(-1)}

@@ -1,0 +1,919 @@
+"""gsplat's call: its signature, its semantics by its own torch reference, our rasterizer's pictures and gradients, and
+its strategies on our meta."""
+
+import inspect
+import math
+
+import pytest
+import scenes
+import torch
+from conftest import each_precision, run_python
+from scenes import Camera, name_of
+from test_stages import weights
+
+import analytic_rasterizer as ar
+from analytic_rasterizer.dialects import gsplat as dialect
+from analytic_rasterizer.dialects.gsplat import rasterization
+from analytic_rasterizer.relocation import compute_relocation
+
+WIDTH, HEIGHT = 45, 37
+NEAR, FAR = 0.01, 1e10
+RENDERED = [variant for variant in scenes.KINDS if variant[0] != "adaptive"]
+BOTH_LAYOUTS = pytest.mark.parametrize("packed", [False, True], ids=["dense", "packed"])
+
+
+def tolerance(dtype):
+    """Of an image. In float32 a splat moves by the rounding of adding and removing half a pixel, twice 2^-19 px at
+    45 px, which is 7e-6 of a weight with a standard deviation of 0.55 px; a pixel's weights add up to 1."""
+    return 1e-12 if dtype == torch.float64 else 2e-5
+
+
+def gradient_tolerance(dtype):
+    """Of the norm of a gradient: those of two orders of summation, through a covariance in between."""
+    return 1e-9 if dtype == torch.float64 else 2e-3
+
+
+def scene_of(dtype, device, degree=0, count=40, seed=1):
+    """In float64 any scene; in float32 one without an alpha so near to a threshold that rounding decides."""
+    make = scenes.random_scene if dtype == torch.float64 else scenes.smooth_scene
+    scene = scenes.cast(make(seed, count if dtype == torch.float64 else 6, degree), dtype, device)
+    return {
+        "means": scene["means3D"],
+        "quats": scene["rotations"],
+        "scales": scene["scales"],
+        "opacities": scene["opacities"][:, 0].contiguous(),
+        "colors": scene["shs"] if degree else scene["shs"][:, 0].abs().contiguous(),
+    }
+
+
+def cameras_of(dtype, device, count=2):
+    """viewmats and Ks, with a principal point beside the centre."""
+    eyes = [(0.3, -0.2, -4.0), (1.2, 0.5, -3.4), (-0.8, 0.1, -3.8)][:count]
+    viewmats = torch.stack([Camera(eye=eye).world_to_camera() for eye in eyes])
+    K = torch.tensor([[37.5, 0, 20.0], [0, 36.0, 19.5], [0, 0, 1]], dtype=torch.float64)
+    return {"viewmats": viewmats.to(device, dtype), "Ks": K.expand(count, 3, 3).to(device, dtype).contiguous()}
+
+
+def render(scene, cameras, **options):
+    return rasterization(**{**scene, **cameras, "width": WIDTH, "height": HEIGHT, **options})
+
+
+def drop_in(scene, view, K, degree, footprint, means2D=None, background=None, **effects):
+    """The same Gaussians in one camera by our own rasterizer."""
+    settings = ar.camera_settings(
+        view,
+        WIDTH,
+        HEIGHT,
+        *(K[0, 0], K[1, 1], K[0, 2], K[1, 2]),
+        sh_degree=degree or 0,
+        bg=background,
+        dtype=view.dtype,
+        effects=ar.Effects(camera_gradients=True, off_center=True, near=NEAR, far=FAR, **effects),
+        footprint=footprint,
+    )
+    colors = {"colors_precomp": scene["colors"]} if degree is None else {"shs": scene["colors"]}
+    return ar.GaussianRasterizer(settings)(
+        means3D=scene["means"],
+        means2D=means2D,
+        opacities=scene["opacities"],
+        scales=scene["scales"],
+        rotations=scene["quats"],
+        **colors,
+    )
+
+
+def assert_gradients_close(actual, expected, dtype):
+    for name in expected:
+        error = (actual[name] - expected[name]).norm() / expected[name].norm().clamp_min(1e-30)
+        assert error <= gradient_tolerance(dtype), (name, error.item())
+
+
+def gradients(value, inputs):
+    return dict(zip(inputs, torch.autograd.grad(value, list(inputs.values()))))
+
+
+# --- gsplat's own reference --------------------------------------------------------------------------
+
+
+@pytest.fixture
+def reference():
+    """gsplat's torch implementation."""
+    return pytest.importorskip("gsplat.cuda._torch_impl", reason="needs gsplat, of the extra test")
+
+
+def test_the_signature_is_gsplats():
+    gsplat = pytest.importorskip("gsplat", reason="needs gsplat, of the extra test")
+    expected = list(inspect.signature(gsplat.rendering.rasterization).parameters.values())
+    actual = list(inspect.signature(rasterization).parameters.values())
+    for ours, theirs in zip(actual, expected):
+        assert (ours.name, ours.kind) == (theirs.name, theirs.kind)
+        if ours.name != "rolling_shutter":  # gsplat's default is a value of an enumeration of its own
+            assert ours.default == theirs.default, ours.name
+    assert [p.name for p in actual[len(expected) :]] == ["footprint"]
+    assert actual[-1].kind is inspect.Parameter.KEYWORD_ONLY
+    image, *_ = render(
+        scene_of(torch.float32, "cpu"),
+        cameras_of(torch.float32, "cpu"),
+        rolling_shutter=inspect.signature(gsplat.rendering.rasterization).parameters["rolling_shutter"].default,
+    )
+    assert image.shape == (2, HEIGHT, WIDTH, 3)
+
+
+def projected(reference, scene, cameras, mode, model="pinhole"):
+    """What gsplat's reference says of every Gaussian in every camera; radii by the rule of gsplat's kernels."""
+    covars, _ = reference._quat_scale_to_covar_preci(scene["quats"], scene["scales"], True, False)
+    _, means2d, depths, conics, amplitudes = reference._fully_fused_projection(
+        scene["means"],
+        covars,
+        cameras["viewmats"],
+        cameras["Ks"],
+        WIDTH,
+        HEIGHT,
+        near_plane=NEAR,
+        far_plane=FAR,
+        calc_compensations=mode == "antialiased",
+        camera_model=model,
+    )
+    opacities = scene["opacities"].expand(len(means2d), -1)
+    opacities = opacities if amplitudes is None else opacities * amplitudes
+    a, b, c = conics.unbind(-1)
+    variances = torch.stack([c, a], -1) / (a * c - b * b)[..., None]  # of the inverse of the conic
+    extent = (2 * (255 * opacities).log()).clamp(min=0).sqrt().clamp(max=3.33)
+    radii = (extent[..., None] * variances.sqrt()).ceil()
+    size = means2d.new_tensor([WIDTH, HEIGHT])
+    drawn = ((radii > 0) & (means2d + radii > 0) & (means2d - radii < size)).all(-1)
+    drawn &= (depths > NEAR) & (depths < FAR)
+    radii = torch.where(drawn[..., None], radii, 0).int()
+    names = ("means2d", "depths", "conics", "opacities", "radii")
+    return dict(zip(names, (means2d, depths, conics, opacities, radii)))
+
+
+@each_precision
+@BOTH_LAYOUTS
+@pytest.mark.parametrize("mode", dialect.RASTERIZE_MODES)
+@pytest.mark.parametrize("model", ["pinhole", "ortho"])
+def test_meta_is_that_of_gsplats_reference(device, dtype, packed, mode, model, reference):
+    scene, cameras = scene_of(torch.float64, "cpu", count=200), cameras_of(torch.float64, "cpu")
+    scene["opacities"][::7] = 0.003
+    scene["means"] *= 2  # some lie outside the images
+    expected = projected(reference, scene, cameras, mode, model)
+    kept = (expected["radii"] > 0).all(-1)
+    assert 20 < kept.sum() < 0.9 * kept.numel()
+    scene, cameras = ({k: v.to(device, dtype) for k, v in part.items()} for part in (scene, cameras))
+    _, _, meta = render(scene, cameras, packed=packed, rasterize_mode=mode, camera_model=model)
+    # Our projection looks at the ellipse and not at the rectangle around it: it culls a few at corners, unseen.
+    found = torch.zeros_like(kept)
+    if packed:
+        found[meta["camera_ids"].cpu(), meta["gaussian_ids"].cpu()] = True
+    else:
+        found = (meta["radii"].cpu() > 0).all(-1)
+    missing = (kept & ~found).nonzero()
+    assert len(missing) <= 0.05 * kept.sum()
+    assert all(alphas_of(expected, camera, i).max() < 1 / 255 for camera, i in missing)
+    kept[tuple(missing.T)] = False
+    expected["radii"][tuple(missing.T)] = 0
+    if packed:
+        cameras_of_rows, ids = kept.nonzero().unbind(1)
+        assert torch.equal(meta["camera_ids"].cpu(), cameras_of_rows)
+        assert torch.equal(meta["gaussian_ids"].cpu(), ids)
+        assert (meta["batch_ids"] == 0).all() and meta["batch_ids"].dtype == torch.int64
+        expected = {name: value[kept] for name, value in expected.items()}
+    else:
+        assert meta["camera_ids"] is None and meta["gaussian_ids"] is None and meta["batch_ids"] is None
+    assert meta["radii"].dtype == torch.int32 and torch.equal(meta["radii"].cpu(), expected["radii"])
+    drawn = (expected["radii"] > 0).all(-1)  # where the rest means something
+    rtol = 1e-9 if dtype == torch.float64 else 1e-3  # of conics and amplitudes of splats 50 times longer than wide
+    for name in ("means2d", "depths", "conics", "opacities"):
+        assert meta[name].shape == expected[name].shape and meta[name].dtype == dtype
+        actual = meta[name].cpu().double()[drawn]
+        torch.testing.assert_close(actual, expected[name][drawn], rtol=rtol, atol=1e-5 * (rtol > 1e-5))
+    assert {k: meta[k] for k in ("width", "height", "tile_size", "tile_width", "tile_height")} == {
+        "width": WIDTH,
+        "height": HEIGHT,
+        "tile_size": 16,
+        "tile_width": 3,
+        "tile_height": 3,
+    }
+    assert meta["n_cameras"] == 2 and meta["n_batches"] == 1
+
+
+def pixel_centres():
+    """Rows and columns of all pixels (H, W), px."""
+    return torch.meshgrid(*(torch.arange(n, dtype=torch.float64) + 0.5 for n in (HEIGHT, WIDTH)), indexing="ij")
+
+
+def alphas_of(rows, camera, i):
+    """(H, W) of one splat of what `projected` returns."""
+    y, x = pixel_centres()
+    (mean_x, mean_y), (a, b, c) = rows["means2d"][camera, i], rows["conics"][camera, i]
+    dx, dy = x - mean_x, y - mean_y
+    return rows["opacities"][camera, i] * torch.exp(-0.5 * (a * dx * dx + c * dy * dy) - b * dx * dy)
+
+
+def composited(rows, colors):
+    """Images and alphas of what `projected` returns, by definition: splat after splat over all pixels."""
+    images = torch.zeros(len(colors), HEIGHT, WIDTH, colors.shape[-1], dtype=torch.float64)
+    rest = torch.ones(len(colors), HEIGHT, WIDTH, 1, dtype=torch.float64)
+    for camera in range(len(colors)):
+        open_ = torch.ones(HEIGHT, WIDTH, 1, dtype=torch.bool)
+        for i in rows["depths"][camera].argsort():
+            if rows["radii"][camera, i].min() == 0:
+                continue
+            alpha = alphas_of(rows, camera, i)[..., None]
+            alpha = torch.where(alpha >= 1 / 255, alpha, 0)
+            open_ = open_ & (rest[camera] * (1 - alpha) > 1e-4)
+            alpha = torch.where(open_, alpha, 0)
+            images[camera] += rest[camera] * alpha * colors[camera, i]
+            rest[camera] *= 1 - alpha
+    return images, 1 - rest
+
+
+@each_precision
+@pytest.mark.parametrize("mode", dialect.RASTERIZE_MODES)
+@pytest.mark.parametrize("degree", [None, 0, 3, 4])
+def test_images_are_gsplats_by_definition(device, dtype, mode, degree, reference):
+    """With gsplat's projection and its harmonics; opacities are below our cap of alpha, 0.99."""
+    scene, cameras = scene_of(dtype, device, degree=degree or 0), cameras_of(dtype, device)
+    if degree == 0:
+        scene["colors"] = scene["colors"][:, None] - 0.4  # one harmonic
+    background = weights((2, 3), dtype, device)
+    images, alphas, _ = render(scene, cameras, sh_degree=degree, rasterize_mode=mode, backgrounds=background)
+    double, views = ({k: v.cpu().double() for k, v in part.items()} for part in (scene, cameras))
+    colors = double["colors"].expand(2, *double["colors"].shape)
+    if degree is not None:
+        directions = double["means"] - torch.inverse(views["viewmats"])[:, None, :3, 3]
+        colors = (reference._spherical_harmonics(degree, directions, colors) + 0.5).clamp(min=0)
+    expected, expected_alphas = composited(projected(reference, double, views, mode), colors)
+    expected = expected + (1 - expected_alphas) * background.cpu().double()[:, None, None]
+    assert (images.cpu() - expected).abs().max() <= 2 * tolerance(dtype)
+    assert (alphas.cpu() - expected_alphas).abs().max() <= tolerance(dtype)
+
+
+# --- our rasterizer ----------------------------------------------------------------------------------
+
+
+@each_precision
+@BOTH_LAYOUTS
+@pytest.mark.parametrize("variant", RENDERED, ids=name_of)
+def test_images_and_gradients_are_the_rasterizers(device, dtype, packed, variant):
+    """Of every input and of the cameras, with harmonics, alpha and depth, whatever the footprint."""
+    footprint = str(ar.resolve_footprint(variant[0], **variant[1]))
+    scene = scenes.leaves(scene_of(dtype, device, degree=1))
+    cameras = scenes.leaves(cameras_of(dtype, device))
+    again, views = scenes.leaves(scene), scenes.leaves(cameras)
+    images, alphas, _ = render(
+        scene, cameras, sh_degree=1, packed=packed, footprint=footprint, render_mode="RGB+D", backgrounds=None
+    )
+    g = weights((2, HEIGHT, WIDTH, 5), dtype, device)
+    actual = gradients((torch.cat([images, alphas], -1) * g).sum(), scene | cameras)
+    total = 0
+    for camera, (view, K) in enumerate(zip(views["viewmats"], views["Ks"])):
+        color, _, outputs = drop_in(again, view, K, 1, footprint, alpha=True, depth=True)
+        planes = torch.cat([color, outputs.depth, outputs.alpha]).permute(1, 2, 0)
+        shown = torch.cat([images[camera], alphas[camera]], -1)
+        assert (shown - planes).abs().max() <= 6 * tolerance(dtype)  # depths are up to 6
+        total = total + (planes * g[camera]).sum()
+    assert_gradients_close(actual, gradients(total, again | views), dtype)
+
+
+@each_precision
+@BOTH_LAYOUTS
+def test_means2d_has_the_gradients_that_density_control_reads(device, dtype, packed):
+    """The rasterizer gives them per half an image; absgrad are sums over pixels of absolute values."""
+    scene, cameras = scenes.leaves(scene_of(dtype, device)), cameras_of(dtype, device)
+    images, _, meta = render(scene, cameras, packed=packed, absgrad=True)
+    meta["means2d"].retain_grad()
+    g = weights(images.shape, dtype, device) - 0.5
+    (images * g).sum().backward()
+    half = torch.tensor([WIDTH / 2, HEIGHT / 2], dtype=dtype, device=device)
+    for camera in range(2):
+        means2D = torch.zeros(len(scene["means"]), 4, dtype=dtype, device=device, requires_grad=True)
+        view, K = cameras["viewmats"][camera], cameras["Ks"][camera]
+        color, _, *_ = drop_in(scene, view, K, None, "point:dilation=0.3", means2D)
+        (color.permute(1, 2, 0) * g[camera]).sum().backward()
+        rows = camera if not packed else meta["camera_ids"] == camera
+        ids = slice(None) if not packed else meta["gaussian_ids"][rows]
+        for name, expected in (("grad", means2D.grad[:, :2]), ("absgrad", means2D.grad[:, 2:])):
+            actual = getattr(meta["means2d"], name)[rows] * half
+            torch.testing.assert_close(
+                actual, expected[ids], rtol=gradient_tolerance(dtype), atol=1e-5 * expected.abs().max().item()
+            )
+
+
+def test_absolute_gradients_come_with_gradients_of_anything(device):
+    """Also where torch.autograd.grad asks for the means alone, and none where nothing requires a gradient."""
+    dtype = torch.float32
+    scene, cameras = scenes.leaves(scene_of(dtype, device)), cameras_of(dtype, device)
+    images, _, meta = render(scene, cameras, absgrad=True)
+    torch.autograd.grad(images.sum(), scene["means"])
+    assert meta["means2d"].absgrad.shape == meta["means2d"].shape and (meta["means2d"].absgrad > 0).any()
+    plain, _, meta = render(scene_of(dtype, device), cameras, absgrad=True)
+    assert not plain.requires_grad and not hasattr(meta["means2d"], "absgrad")
+    with torch.no_grad():
+        inferred, *_ = render(scene, cameras, absgrad=True)
+    assert torch.equal(plain, images) and torch.equal(inferred, images)
+
+
+@pytest.mark.parametrize("options", [{}, {"packed": False, "rasterize_mode": "antialiased", "absgrad": True}])
+@pytest.mark.parametrize("model", ["pinhole", "ortho"])
+def test_gradcheck(options, model):
+    scene, cameras = scene_of(torch.float64, "cpu"), cameras_of(torch.float64, "cpu")
+    smooth = scenes.smooth_scene(5)
+    scene = {
+        "means": smooth["means3D"],
+        "quats": smooth["rotations"],
+        "scales": smooth["scales"],
+        "opacities": smooth["opacities"][:, 0],
+        "colors": weights((6, 2), torch.float64, "cpu"),
+    }
+    size = {"width": 9, "height": 7}
+    cameras["Ks"][:, :2] *= 0.2
+    leaves = scenes.leaves({**scene, **cameras, "backgrounds": torch.rand(2, 2, dtype=torch.float64)})
+
+    def images(*values):
+        given = dict(zip(leaves, values)) | size
+        shown, alphas, meta = rasterization(**given, render_mode="RGB+ED", camera_model=model, **options)
+        return shown, alphas, meta["means2d"], meta["depths"]
+
+    with torch.no_grad():
+        assert (images(*leaves.values())[1] > 1 / 255).all()
+    assert torch.autograd.gradcheck(images, tuple(leaves.values()))
+
+
+def test_gradcheck_of_covariances():
+    smooth = scenes.smooth_scene(5)
+    covars, _ = dialect.quat_scale_to_covar_preci(smooth["rotations"], smooth["scales"])
+    cameras = cameras_of(torch.float64, "cpu", 1)
+    cameras["Ks"][:, :2] *= 0.2
+
+    def image(matrices):
+        symmetric = (matrices + matrices.mT) / 2  # what is a covariance stays one
+        return rasterization(
+            smooth["means3D"],
+            None,
+            None,
+            smooth["opacities"][:, 0],
+            weights((6, 1), torch.float64, "cpu"),
+            cameras["viewmats"],
+            cameras["Ks"],
+            9,
+            7,
+            covars=symmetric,
+        )[0]
+
+    assert torch.autograd.gradcheck(image, (covars.detach().requires_grad_(),))
+
+
+# --- arguments ---------------------------------------------------------------------------------------
+
+
+@each_precision
+def test_covariances_in_place_of_scales(device, dtype):
+    scene, cameras = scene_of(dtype, device), cameras_of(dtype, device)
+    covars, _ = dialect.quat_scale_to_covar_preci(scene["quats"], scene["scales"])
+    expected, *_ = render(scene, cameras)
+    lower = torch.ones(3, 3, dtype=dtype, device=device).tril(-1)  # is not read
+    actual, *_ = render(scene | {"quats": None, "scales": None}, cameras, covars=covars + lower)
+    assert (actual - expected).abs().max() <= 10 * tolerance(dtype)
+
+
+@each_precision
+@BOTH_LAYOUTS
+@pytest.mark.parametrize("per_camera", [False, True], ids=["shared", "per-camera"])
+@pytest.mark.parametrize("degree", [None, 1])
+def test_a_batch_is_each_of_its_scenes(device, dtype, packed, per_camera, degree):
+    """Two by one scenes of two cameras: images, gradients and meta; colours of a camera are used in that camera."""
+    single, cameras = [], []
+    for seed in (1, 2):
+        scene = scene_of(dtype, device, degree=degree or 0, seed=seed)
+        if per_camera:
+            scene["colors"] = torch.stack([scene["colors"], scene["colors"].flip(0)])
+        single.append(scene)
+        cameras.append(cameras_of(dtype, device))
+    cameras[1]["viewmats"] = cameras[1]["viewmats"].flip(0)
+    together = scenes.leaves({k: torch.stack([scene[k] for scene in single])[:, None] for k in single[0]})
+    views = {k: torch.stack([c[k] for c in cameras])[:, None] for k in cameras[0]}
+    background = weights((2, 1, 2, 3), dtype, device)
+    options = {"sh_degree": degree, "packed": packed, "render_mode": "RGB+ED"}
+    images, alphas, meta = render(together, views, backgrounds=background, **options)
+    assert images.shape == (2, 1, 2, HEIGHT, WIDTH, 4) and alphas.shape == (2, 1, 2, HEIGHT, WIDTH, 1)
+    assert meta["n_batches"] == 2 and meta["n_cameras"] == 2
+    g = weights(images.shape, dtype, device)
+    actual = gradients((images * g).sum(), together)
+    for b in range(2):
+        leaves = scenes.leaves(single[b])
+        own, own_alphas, own_meta = render(leaves, cameras[b], backgrounds=background[b, 0], **options)
+        assert torch.equal(images[b, 0], own) and torch.equal(alphas[b, 0], own_alphas)
+        expected = gradients((own * g[b, 0]).sum(), leaves)
+        assert_gradients_close({k: v[b, 0] for k, v in actual.items()}, expected, dtype)
+        rows = meta["batch_ids"] == b if packed else (b, 0)
+        for name in ("means2d", "radii", "depths", "conics", "opacities"):
+            assert torch.equal(meta[name][rows], own_meta[name]), name
+        for name in ("camera_ids", "gaussian_ids"):
+            assert own_meta[name] is None if not packed else torch.equal(meta[name][rows], own_meta[name])
+        if per_camera:
+            for c in range(2):
+                of_camera = {k: v[c : c + 1] for k, v in cameras[b].items()}
+                colors = {"colors": single[b]["colors"][c]}
+                alone, *_ = render(single[b] | colors, of_camera, backgrounds=background[b, 0, c : c + 1], **options)
+                assert torch.equal(images[b, 0, c], alone[0])
+
+
+@each_precision
+def test_layouts_agree(device, dtype):
+    """Packed rows are those of the table that are not culled; the images are the same."""
+    scene, cameras = scene_of(torch.float64, "cpu", count=100), cameras_of(torch.float64, "cpu")
+    scene["means"] *= 2
+    scene, cameras = ({k: v.to(device, dtype) for k, v in part.items()} for part in (scene, cameras))
+    dense_images, dense_alphas, dense = render(scene, cameras, packed=False)
+    images, alphas, packed = render(scene, cameras, packed=True)
+    assert torch.equal(images, dense_images) and torch.equal(alphas, dense_alphas)
+    kept = (dense["radii"] > 0).all(-1)
+    assert 0 < kept.sum() < kept.numel()
+    for name in ("means2d", "radii", "depths", "conics", "opacities"):
+        assert torch.equal(dense[name][kept], packed[name]), name
+
+
+@each_precision
+@pytest.mark.parametrize("channels", [1, 2, 40])
+def test_render_modes(device, dtype, channels):
+    """Depth is a channel like a feature of z; expected depth is depth by alpha."""
+    scene, cameras = scene_of(dtype, device), cameras_of(dtype, device)
+    scene["colors"] = weights((len(scene["means"]), channels), dtype, device)
+    background = weights((2, channels), dtype, device, seed=1)
+    images, alphas, meta = render(scene, cameras, backgrounds=background, packed=False)
+    assert images.shape == (2, HEIGHT, WIDTH, channels)
+    z = meta["depths"][..., None]
+    depth, *_ = render(scene | {"colors": z}, cameras)
+    modes = {mode: render(scene, cameras, backgrounds=background, render_mode=mode) for mode in dialect.RENDER_MODES}
+    close = {"rtol": 0, "atol": 10 * tolerance(dtype)}
+    expected = depth / alphas.clamp(min=1e-10)
+    torch.testing.assert_close(modes["RGB"][0], images, **close)
+    torch.testing.assert_close(modes["D"][0], depth, **close)
+    torch.testing.assert_close(modes["ED"][0], expected, rtol=1e-4 if dtype == torch.float32 else 1e-9, atol=1e-9)
+    torch.testing.assert_close(modes["RGB+D"][0], torch.cat([images, depth], -1), **close)
+    torch.testing.assert_close(modes["RGB+ED"][0][..., :-1], images, **close)
+    torch.testing.assert_close(modes["RGB+ED"][0][..., -1:], modes["ED"][0], rtol=1e-4, atol=1e-9)
+    for image, alpha, _ in modes.values():
+        assert torch.equal(alpha, alphas) and image.is_contiguous()
+
+
+@each_precision
+@BOTH_LAYOUTS
+def test_small_splats_are_clipped(device, dtype, packed):
+    """As if they were not there, and with no radius."""
+    scene, cameras = scene_of(torch.float64, "cpu", count=60), cameras_of(torch.float64, "cpu", 1)
+    scene, cameras = ({k: v.to(device, dtype) for k, v in part.items()} for part in (scene, cameras))
+    _, _, meta = render(scene, cameras, packed=False)
+    large = (meta["radii"][0] > 8).any(-1)
+    assert 5 < large.sum() < 55
+    images, _, clipped = render(scene, cameras, packed=packed, radius_clip=8.0)
+    expected, *_ = render({k: v[large] for k, v in scene.items()}, cameras)
+    assert torch.equal(images, expected)
+    if packed:
+        assert torch.equal(clipped["gaussian_ids"], large.nonzero()[:, 0])
+    else:
+        assert torch.equal((clipped["radii"][0] > 0).all(-1), large)
+
+
+def test_planes_cut_depths(device):
+    scene, cameras = scene_of(torch.float32, device), cameras_of(torch.float32, device, 1)
+    z = render(scene, cameras, packed=False)[2]["depths"][0]
+    near, far = z.sort().values[[1, 4]].tolist()
+    _, _, meta = render(scene, cameras, near_plane=near, far_plane=far)
+    assert torch.equal(meta["gaussian_ids"], ((z > near) & (z < far)).nonzero()[:, 0]) and len(meta["depths"]) == 2
+
+
+def test_the_footprint_is_gsplats_filter_unless_one_was_chosen(device, monkeypatch):
+    scene, cameras = scene_of(torch.float32, device), cameras_of(torch.float32, device)
+
+    def image(**options):
+        return render(scene, cameras, **options)[0]
+
+    monkeypatch.delenv("ANALYTIC_RASTERIZER_FOOTPRINT", raising=False)
+    classic, antialiased = image(eps2d=0.2), image(eps2d=0.2, rasterize_mode="antialiased")
+    assert torch.equal(classic, image(footprint="point:dilation=0.2"))
+    assert torch.equal(antialiased, image(footprint="mip:variance=0.2"))
+    box = image(footprint=ar.resolve_footprint("box", samples=8))
+    assert not torch.equal(box, classic) and not torch.equal(antialiased, classic)
+    monkeypatch.setenv("ANALYTIC_RASTERIZER_FOOTPRINT", "box:samples=8")
+    assert torch.equal(image(), box) and torch.equal(image(footprint="point:dilation=0.2"), classic)
+    monkeypatch.delenv("ANALYTIC_RASTERIZER_FOOTPRINT")
+    try:
+        ar.set_default_footprint("box", samples=8)
+        assert torch.equal(image(), box)
+    finally:
+        ar.set_default_footprint(None)
+    assert torch.equal(image(eps2d=0.2), classic)
+
+
+@each_precision
+@pytest.mark.parametrize("channels", [1, 3, 5])
+def test_adaptive_chooses_by_the_first_channels(device, dtype, channels):
+    """As the rasterizer does; with other colours it chooses otherwise."""
+    scene, cameras = scene_of(dtype, device), cameras_of(dtype, device)
+    scene["colors"] = weights((len(scene["means"]), channels), dtype, device)
+    images, *_ = render(scene, cameras, footprint="adaptive")
+    background = torch.zeros(channels, dtype=dtype, device=device)
+    for camera in range(2):
+        view, K = cameras["viewmats"][camera], cameras["Ks"][camera]
+        color, *_ = drop_in(scene, view, K, None, "adaptive", background=background)
+        assert (images[camera] - color.permute(1, 2, 0)).abs().max() <= tolerance(dtype)
+    if dtype == torch.float64:
+        dark, *_ = render(scene | {"colors": scene["colors"] / 100}, cameras, footprint="adaptive")
+        assert (100 * dark - images).abs().max() > 1e-4
+
+
+def test_meta_of_other_footprints_has_the_variance_of_a_pixel(device, best):
+    scene, cameras = scene_of(best, device), cameras_of(best, device)
+    _, _, box = render(scene, cameras, footprint="box:samples=4")
+    _, _, point = render(scene, cameras, footprint="point", eps2d=5.0)
+    _, _, expected = render(scene, cameras, eps2d=1 / 12)
+    assert torch.equal(box["gaussian_ids"], expected["gaussian_ids"])
+    torch.testing.assert_close(box["conics"], expected["conics"])
+    assert torch.equal(box["radii"], expected["radii"]) and torch.equal(box["opacities"], expected["opacities"])
+    assert not torch.allclose(point["conics"][: len(box["conics"])], box["conics"][: len(point["conics"])])
+
+
+def test_the_longest_splat_has_a_radius_that_fits(device):
+    """8e8 px of standard deviation are drawn; the radius is cut to what an int32 holds."""
+    scene = {name: value[:1] for name, value in scene_of(torch.float32, device).items()} | {
+        "means": torch.tensor([[0.0, 0, 4]], device=device),
+        "quats": torch.tensor([[1.0, 0, 0, 0]], device=device),
+        "scales": torch.tensor([[9e7, 1, 1]], device=device),
+    }
+    cameras = cameras_of(torch.float32, device, 1) | {"viewmats": torch.eye(4, device=device)[None]}
+    images, _, meta = render(scene, cameras)
+    assert meta["radii"][0, 0] == 10**9 and 0 < meta["radii"][0, 1] < 40
+    assert images.isfinite().all() and images.max() > 0
+
+
+@BOTH_LAYOUTS
+def test_no_gaussians(device, packed):
+    scene = {k: v[:0] for k, v in scene_of(torch.float32, device).items()}
+    background = weights((2, 3), torch.float32, device)
+    leaves = scenes.leaves(scene)
+    images, alphas, meta = render(
+        leaves, cameras_of(torch.float32, device), packed=packed, backgrounds=background, absgrad=True
+    )
+    assert torch.equal(images, background[:, None, None].expand(2, HEIGHT, WIDTH, 3)) and (alphas == 0).all()
+    assert meta["means2d"].shape == ((0, 2) if packed else (2, 0, 2))
+    images.sum().backward()
+    assert leaves["means"].grad.shape == (0, 3)
+
+
+def test_gaussians_behind_every_camera(device):
+    scene, cameras = scene_of(torch.float32, device), cameras_of(torch.float32, device)
+    scene["means"] = scene["means"] - 50 * cameras["viewmats"][0, 2, :3]
+    leaves = scenes.leaves(scene)
+    images, _, meta = render(leaves, cameras, absgrad=True)
+    images.sum().backward()
+    assert (images == 0).all() and len(meta["means2d"]) == 0 and (leaves["means"].grad == 0).all()
+
+
+REFUSED = [
+    {"sparse_grad": True},
+    {"distributed": True},
+    {"with_ut": True},
+    {"with_eval3d": True},
+    {"radial_coeffs": torch.zeros(2, 6)},
+    {"tangential_coeffs": torch.zeros(2, 2)},
+    {"thin_prism_coeffs": torch.zeros(2, 4)},
+    {"ftheta_coeffs": object()},
+    {"viewmats_rs": torch.eye(4).expand(2, 4, 4)},
+    {"rolling_shutter": "ROLLING_TOP_TO_BOTTOM"},
+    {"camera_model": "fisheye"},
+    {"camera_model": "ftheta"},
+]
+
+
+@pytest.mark.parametrize("asked", REFUSED, ids=lambda asked: next(iter(asked)))
+def test_what_is_not_served_is_refused_by_name(asked):
+    with pytest.raises(NotImplementedError, match=f"^{next(iter(asked))} .*not supported: "):
+        render(scene_of(torch.float32, "cpu"), cameras_of(torch.float32, "cpu"), **asked)
+
+
+def test_2dgs_is_refused_by_name():
+    with pytest.raises(NotImplementedError, match=r"^rasterization_2dgs is not supported: "):
+        dialect.rasterization_2dgs(torch.zeros(1, 3), render_mode="RGB")
+
+
+@pytest.mark.parametrize(
+    "change, error, message",
+    [
+        ({"means": torch.zeros(6, 2)}, ValueError, r"means must have shape \(\.\.\., N, 3\), got \(6, 2\)"),
+        ({"means": None}, TypeError, "means must be a tensor, got NoneType"),
+        ({"quats": None}, TypeError, "quats must be a tensor, got NoneType"),
+        ({"quats": torch.zeros(5, 4)}, ValueError, r"quats must have shape \(6, 4\), got \(5, 4\)"),
+        ({"scales": torch.ones(6, 3).double()}, TypeError, "scales must have the dtype of means, torch.float32"),
+        ({"opacities": torch.ones(6, 1)}, ValueError, r"opacities must have shape \(6,\), got \(6, 1\)"),
+        ({"covars": torch.ones(6, 6)}, ValueError, r"covars must have shape \(6, 3, 3\), got \(6, 6\)"),
+        ({"viewmats": torch.eye(4)}, ValueError, r"viewmats must have shape \(\.\.\., C, 4, 4\), got \(4, 4\)"),
+        ({"viewmats": torch.zeros(0, 4, 4)}, ValueError, "viewmats must hold at least one camera"),
+        ({"viewmats": torch.eye(4)[None, None]}, ValueError, r"viewmats must have shape \(1, 4, 4\), got \(1, 1, 4, 4"),
+        ({"Ks": torch.eye(3)[None]}, ValueError, r"Ks must have shape \(2, 3, 3\), got \(1, 3, 3\)"),
+        (
+            {"Ks": torch.tensor([[-5.0, 0, 4], [0, 5, 4], [0, 0, 1]]).expand(2, 3, 3)},
+            *(ValueError, "Ks must have positive focal lengths, got -5.0"),
+        ),
+        ({"colors": torch.ones(5, 3)}, ValueError, r"colors must have shape \(6, 3\) or \(2, 6, 3\), got \(5, 3\)"),
+        ({"colors": torch.ones(3, 6, 3)}, ValueError, r"colors must have shape \(6, 3\) or \(2, 6, 3\), got \(3, 6"),
+        ({"colors": torch.ones(6, 3).long()}, TypeError, "colors must have the dtype of means, torch.float32, got"),
+        ({"colors": torch.ones(6, 3, device="meta")}, ValueError, "colors must be on the device of means, cpu, got me"),
+        ({"colors": torch.ones(6, 513)}, ValueError, "colors must have 1 to 512 channels in render_mode RGB, got 513"),
+        (
+            {"colors": torch.ones(6, 512), "render_mode": "RGB+D"},
+            *(ValueError, "colors must have 1 to 511 channels in render_mode RGB.D, got 512"),
+        ),
+        ({"colors": torch.ones(6, 0)}, ValueError, "colors must have 1 to 512 channels in render_mode RGB, got 0"),
+        ({"sh_degree": 1}, ValueError, r"colors must have shape \(6, 6, 3\) or \(2, 6, 6, 3\), got \(6, 3\)"),
+        ({"sh_degree": 1, "colors": torch.ones(6, 3, 3)}, ValueError, "colors must have 4 harmonics of degree 1, got"),
+        ({"sh_degree": 0.5, "colors": torch.ones(6, 9, 3)}, ValueError, "sh_degree must be 0 to 4, got 0.5"),
+        ({"sh_degree": 5, "colors": torch.ones(6, 36, 3)}, ValueError, "sh_degree must be 0 to 4, got 5"),
+        ({"backgrounds": torch.ones(3)}, ValueError, r"backgrounds must have shape \(2, 3\), got \(3,\)"),
+        ({"width": 0}, ValueError, "width must be a positive integer, got 0"),
+        ({"near_plane": 0.0}, ValueError, "near_plane must be above 0 and below far_plane, got 0.0"),
+        ({"far_plane": 0.001}, ValueError, "near_plane must be above 0 and below far_plane"),
+        ({"eps2d": -1.0}, ValueError, "eps2d must be finite and not negative, got -1.0"),
+        ({"radius_clip": math.nan}, ValueError, "radius_clip must be finite and not negative, got nan"),
+        ({"render_mode": "rgb"}, ValueError, r"render_mode must be one of RGB, D, ED, RGB\+D, RGB\+ED, got 'rgb'"),
+        ({"rasterize_mode": "mip"}, ValueError, "rasterize_mode must be one of classic, antialiased, got 'mip'"),
+        ({"camera_model": "lens"}, ValueError, "camera_model must be one of pinhole, ortho, got 'lens'"),
+        ({"footprint": "disc"}, ValueError, "footprint must be one of"),
+    ],
+)
+def test_errors_name_what_is_wrong(change, error, message):
+    with pytest.raises(error, match=message):
+        render(scene_of(torch.float32, "cpu"), cameras_of(torch.float32, "cpu"), **change)
+
+
+# --- gsplat's own programs ---------------------------------------------------------------------------
+
+
+@pytest.fixture
+def patched(monkeypatch):
+    """gsplat with our functions in it, for one test."""
+    gsplat = pytest.importorskip("gsplat", reason="needs gsplat, of the extra test")
+    for module, names in (
+        (gsplat, ("rasterization", "quat_scale_to_covar_preci")),
+        (gsplat.rendering, ("rasterization",)),
+        (gsplat.relocation, ("compute_relocation",)),
+        (gsplat.strategy.ops, ("compute_relocation", "quat_scale_to_covar_preci")),
+    ):
+        for name in names:
+            monkeypatch.setattr(module, name, getattr(module, name))  # puts it back in the end
+    dialect.patch()
+    return gsplat
+
+
+def trained(device, count=60, seed=0):
+    """Parameters as gsplat's strategies expect them, and an optimiser for each."""
+    scene = scenes.cast(scenes.random_scene(seed, count, degree=1, sigma=(0.05, 0.5)), torch.float32, device)
+    params = {
+        "means": scene["means3D"],
+        "scales": scene["scales"].log(),
+        "quats": scene["rotations"],
+        "opacities": torch.logit(scene["opacities"][:, 0]),
+        "colors": scene["shs"],
+    }
+    params = torch.nn.ParameterDict({name: torch.nn.Parameter(value) for name, value in params.items()})
+    return params, {name: torch.optim.Adam([value], lr=1e-3) for name, value in params.items()}
+
+
+def step_once(params, optimizers, cameras, before=lambda meta: None, **options):
+    """One step of training towards grey; what `rasterization` returned."""
+    images, alphas, meta = render(
+        {
+            "means": params["means"],
+            "quats": params["quats"],
+            "scales": params["scales"].exp(),
+            "opacities": params["opacities"].sigmoid(),
+            "colors": params["colors"],
+        },
+        cameras,
+        sh_degree=1,
+        **options,
+    )
+    before(meta)
+    (images - 0.5).square().mean().backward()
+    for optimizer in optimizers.values():
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
+    return images, alphas, meta
+
+
+@BOTH_LAYOUTS
+@pytest.mark.parametrize("absgrad", [False, True], ids=["grad", "absgrad"])
+def test_default_strategy_runs_on_our_meta(device, packed, absgrad, patched):
+    """Statistics, growth, pruning and reset: the numbers of Gaussians are those that the rules give."""
+    params, optimizers = trained(device)
+    cameras = cameras_of(torch.float32, device)
+    strategy = patched.DefaultStrategy(
+        refine_start_iter=1, refine_every=4, grow_grad2d=0.0, prune_opa=0.2, absgrad=absgrad, refine_scale2d_stop_iter=3
+    )
+    strategy.check_sanity(params, optimizers)
+    state = strategy.initialize_state()
+    norms, counts = torch.zeros(60, device=device), torch.zeros(60, device=device)
+    for step in range(5):
+
+        def before(meta, step=step):
+            strategy.step_pre_backward(params, optimizers, state, step, meta)
+
+        _, _, meta = step_once(params, optimizers, cameras, before, packed=packed, absgrad=absgrad)
+        scaled = meta["means2d"].absgrad if absgrad else meta["means2d"].grad
+        scaled = scaled * torch.tensor([WIDTH, HEIGHT], device=device)  # half of each, and two cameras
+        if packed:
+            ids = meta["gaussian_ids"]
+        else:
+            drawn = (meta["radii"] > 0).all(-1)
+            ids, scaled = drawn.nonzero()[:, 1], scaled[drawn]
+        norms.index_add_(0, ids, scaled.norm(dim=-1))
+        counts.index_add_(0, ids, torch.ones(len(ids), device=device))
+        if step == 4:
+            grown = (norms > 0).sum().item()
+            faint = params["opacities"].sigmoid() < 0.2
+            expected = 60 + grown - faint.sum() - (faint & (norms > 0)).sum()
+        strategy.step_post_backward(params, optimizers, state, step, meta, packed=packed)
+        if step < 4:
+            torch.testing.assert_close(state["grad2d"], norms)
+            assert torch.equal(state["count"], counts)
+    assert grown > 30 and faint.sum() > 0
+    assert len(params["means"]) == expected and (params["opacities"].sigmoid() >= 0.2).all()
+    assert all(len(optimizers[name].state[value]["exp_avg"]) == expected for name, value in params.items())
+
+    patched.strategy.ops.reset_opa(params, optimizers, state, value=0.4)
+    assert params["opacities"].sigmoid().max() <= 0.4 + 1e-6
+    images, _, _ = step_once(params, optimizers, cameras, packed=packed, absgrad=absgrad)
+    assert images.isfinite().all()
+
+
+@BOTH_LAYOUTS
+@pytest.mark.parametrize("column", [False, True], ids=["vector", "column"])
+def test_mcmc_strategy_runs_on_our_meta(device, packed, column, patched):
+    """With our relocation: dead Gaussians move to living ones, whose places they share, and 5% are added."""
+    params, optimizers = trained(device)
+    if column:  # as nerfstudio has them
+        params["opacities"] = torch.nn.Parameter(params["opacities"].detach()[:, None])
+        optimizers["opacities"] = torch.optim.Adam([params["opacities"]], lr=1e-3)
+    with torch.no_grad():
+        params["opacities"][:10] = -8.0  # sigmoid 3.4e-4
+    cameras = cameras_of(torch.float32, device)
+    strategy = patched.MCMCStrategy(cap_max=65, refine_start_iter=0, refine_every=1, noise_lr=1e3)
+    strategy.check_sanity(params, optimizers)
+    state = strategy.initialize_state()
+    torch.manual_seed(0)
+    for step, expected in enumerate((60, 63, 65, 65)):
+        values = {"opacities": params["opacities"].sigmoid().reshape(-1)} if column else {}
+        images, _, meta = render(
+            {
+                "means": params["means"],
+                "quats": params["quats"],
+                "scales": params["scales"].exp(),
+                "opacities": params["opacities"].sigmoid(),
+                "colors": params["colors"],
+                **values,
+            },
+            cameras,
+            sh_degree=1,
+            packed=packed,
+        )
+        strategy.step_pre_backward(params, optimizers, state, step, meta)
+        (images - 0.5).square().mean().backward()
+        for optimizer in optimizers.values():
+            optimizer.step()
+            optimizer.zero_grad(set_to_none=True)
+        strategy.step_post_backward(params, optimizers, state, step, meta, lr=1e-4)
+        assert len(params["means"]) == expected
+        assert all(value.isfinite().all() for value in params.values())
+    assert (params["opacities"].sigmoid() >= 0.0049).all()
+
+
+def test_splatfactos_call(patched, device):
+    """The keywords that nerfstudio calls with, and what it does with the results."""
+    params, _ = trained(device)
+    cameras = cameras_of(torch.float32, device, 1)
+    render_, alpha, info = patched.rendering.rasterization(
+        means=params["means"],
+        quats=params["quats"],
+        scales=torch.exp(params["scales"]),
+        opacities=torch.sigmoid(params["opacities"][:, None]).squeeze(-1),
+        colors=params["colors"],
+        viewmats=cameras["viewmats"],
+        Ks=cameras["Ks"],
+        width=WIDTH,
+        height=HEIGHT,
+        packed=False,
+        near_plane=0.01,
+        far_plane=1e10,
+        render_mode="RGB+ED",
+        sh_degree=0,
+        sparse_grad=False,
+        absgrad=True,
+        rasterize_mode="classic",
+    )
+    rgb = (render_[:, ..., :3] + (1 - alpha) * torch.ones(3, device=device)).clamp(0, 1)
+    assert rgb.squeeze(0).shape == (HEIGHT, WIDTH, 3) and render_[:, ..., 3:4].squeeze(0).shape == (HEIGHT, WIDTH, 1)
+    info["means2d"].retain_grad()
+    rgb.sum().backward()
+    assert info["means2d"].grad.shape == info["means2d"].absgrad.shape == (1, 60, 2)
+
+
+def test_patching_puts_ours_in_the_place_of_gsplats():
+    """Before 1.5 a splat had one radius, which the strategies of that time read."""
+    pytest.importorskip("gsplat", reason="needs gsplat, of the extra test")
+    code = """
+        import sys, torch
+        import gsplat as theirs
+        from analytic_rasterizer.dialects import gsplat
+        theirs.__version__ = sys.argv[1]
+        gsplat.patch()
+        from gsplat import rasterization
+        from gsplat.rendering import rasterization as again
+        from gsplat.strategy import ops
+        assert rasterization is again and ops.compute_relocation is gsplat.compute_relocation
+        assert theirs.relocation.compute_relocation is gsplat.compute_relocation
+        assert ops.quat_scale_to_covar_preci is gsplat.quat_scale_to_covar_preci
+        K = torch.tensor([[9.0, 0, 4], [0, 9, 4], [0, 0, 1]])[None]
+        scene = torch.tensor([[0, 0, 3.0]]), torch.eye(4)[:1], torch.tensor([[1.0, 0.1, 0.1]])
+        _, _, meta = rasterization(*scene, torch.ones(1), torch.ones(1, 3), torch.eye(4)[None], K, 8, 8, packed=False)
+        print(meta["radii"].tolist())
+    """
+    # 3.33 sqrt(9 + 0.3) and 3.33 sqrt(0.09 + 0.3) px
+    assert run_python(code, "1.5.3").strip() == "[[[11, 3]]]"
+    assert run_python(code, "1.4.0").strip() == "[[11]]"
+
+
+def test_gsplat_need_not_be_installed():
+    code = """
+        import sys
+        sys.modules["gsplat"] = None
+        from analytic_rasterizer.dialects import gsplat
+        try:
+            gsplat.patch()
+        except ImportError:
+            print("missing")
+    """
+    assert run_python(code).strip() == "missing"
+
+
+@each_precision
+def test_covariances_and_their_inverses(device, dtype, reference):
+    scene = scene_of(torch.float64, "cpu")
+    quats, scales = scene["quats"].reshape(2, 20, 4), scene["scales"].reshape(2, 20, 3)
+    for triu in (False, True):
+        expected = reference._quat_scale_to_covar_preci(quats, scales, triu=triu)
+        actual = dialect.quat_scale_to_covar_preci(quats.to(device, dtype), scales.to(device, dtype), triu=triu)
+        for a, e in zip(actual, expected):
+            rounding = 20 * torch.finfo(dtype).eps * e.abs().amax(-1, keepdim=True).amax()
+            assert a.shape == e.shape and (a.cpu() - e).abs().max() <= rounding
+    assert dialect.quat_scale_to_covar_preci(quats, scales, compute_preci=False)[1] is None
+    assert dialect.quat_scale_to_covar_preci(quats, scales, compute_covar=False)[0] is None
+    identity, _ = dialect.quat_scale_to_covar_preci(torch.zeros(4), torch.tensor([1.0, 2.0, 3.0]))
+    assert torch.equal(identity, torch.diag(torch.tensor([1.0, 4.0, 9.0])))
+    with pytest.raises(ValueError, match=r"quats must have shape \(\.\.\., 4\) and scales \(\.\.\., 3\)"):
+        dialect.quat_scale_to_covar_preci(torch.zeros(3), torch.zeros(3))
+
+
+BINOMS = torch.tensor([[math.comb(n, k) for k in range(51)] for n in range(51)], dtype=torch.float64)
+
+
+def relocated(opacity, scale, copies):
+    """The formula of the paper, term by term, in exact integers and float64."""
+    new = 1 - (1 - opacity) ** (1 / copies)
+    terms = (
+        math.comb(i - 1, k) * (-1) ** k * new ** (k + 1) / math.sqrt(k + 1)
+        for i in range(1, copies + 1)
+        for k in range(i)
+    )
+    return new, opacity / math.fsum(terms) * scale
+
+
+@each_precision
+@pytest.mark.parametrize("column", [False, True], ids=["vector", "column"])
+def test_relocation_is_the_papers_formula(device, dtype, column):
+    opacities, copies = torch.meshgrid(
+        *(torch.tensor(v, dtype=torch.float64) for v in ([0.005, 0.1, 0.5, 0.9, 0.999], [1, 2, 5, 51])), indexing="ij"
+    )
+    opacities, copies = opacities.flatten().to(dtype), copies.flatten().long()
+    scales = torch.rand(20, 3, dtype=torch.float64).to(dtype)
+    given = opacities[:, None] if column else opacities
+    new, new_scales = compute_relocation(
+        given.to(device), scales.to(device), copies.to(device), BINOMS.to(device, dtype), 51
+    )
+    assert new.shape == given.shape and new.dtype == dtype
+    for i in range(20):
+        opacity, factor = relocated(opacities[i].item(), 1.0, copies[i].item())
+        assert new.reshape(-1)[i].item() == pytest.approx(opacity, rel=1e-6 if dtype == torch.float32 else 1e-11)
+        expected = factor * scales[i]
+        # For an opacity of 0.999 alternating terms of up to e^7 / sqrt(7) leave a sum of 0.3.
+        torch.testing.assert_close(
+            new_scales[i].cpu(), expected, rtol=1e-6 if dtype == torch.float32 else 1e-11, atol=0
+        )
+
+
+def test_relocation_checks_shapes():
+    copies = torch.ones(4, dtype=torch.int64)
+    with pytest.raises(ValueError, match=r"scale_old must have shape \(4, 3\), got \(3, 3\)"):
+        compute_relocation(torch.ones(4), torch.ones(3, 3), copies, BINOMS, 51)
+    with pytest.raises(TypeError, match="N must be a tensor, got int"):
+        compute_relocation(torch.ones(4), torch.ones(4, 3), 2, BINOMS, 51)
