@@ -279,7 +279,8 @@ __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front
 }
 
 /// Blocks share the chunks. Writes the transmittance of each chunk alone.
-template <class F> __global__ void __launch_bounds__(kBlendThreads) tail_through_kernel(const BlendParams params) {
+template <class F>
+__global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, 0>) tail_through_kernel(const BlendParams params) {
   constexpr int S = F::kSamples, kLength = chunk_length(S);
   __shared__ BlendStage<F, 0> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
