@@ -63,6 +63,7 @@ THEIR_FILTER = {
 def nothing_chosen(monkeypatch):
     monkeypatch.delenv("ANALYTIC_RASTERIZER_FOOTPRINT", raising=False)
     ar.set_default_footprint(None)
+    monkeypatch.setattr(_base, "_companion_filter", None)
     dialects.set_dialect("gs2023")
     yield
     ar.set_default_footprint(None)
@@ -238,7 +239,7 @@ def expected_values(name, device, dtype):
         return color, radii, outputs.depth, outputs.alpha
     if name == "luiten":
         color, radii, outputs = of(median_depth=True)
-        return color, radii, outputs.median_depth
+        return color, radii, torch.where(outputs.median_depth > 0, outputs.median_depth, 15.0)
     if name == "monogs":
         color, radii, outputs = of(depth=True, alpha=True, gaussian_stats=True)
         return color, radii, outputs.depth, outputs.alpha, outputs.gaussian_stats.pixels
@@ -731,6 +732,21 @@ def test_module_of_mini_splatting():
     settings = second.GaussianRasterizationSettings(**CAMERA.fields(torch.float32))
     made = second.GaussianRasterizer(settings)(**scene_of())
     assert all(map(torch.equal, made, render("mini")))
+
+
+def test_minis_two_modules_have_one_filter():
+    """It trains through one and evaluates through the other; a footprint that the user chose is that of both."""
+    program = """
+        import diff_gaussian_rasterization as evaluates
+        made = lambda: evaluates.GaussianRasterizationSettings(*range(12)).footprint_in_use().name
+        print(made())
+        import diff_gaussian_rasterization_ms as trains
+        print(made(), trains.GaussianRasterizationSettings(*range(12)).footprint_in_use().name)
+        import analytic_rasterizer
+        analytic_rasterizer.set_default_footprint("mip")
+        print(made(), trains.GaussianRasterizationSettings(*range(12)).footprint_in_use().name)
+    """
+    assert run_python(program).split() == ["analytic", "point", "point", "mip", "mip"]
     # The module of 3DGS 2023 stays what it is.
     assert (
         len(

@@ -32,12 +32,22 @@ _inferred_from: dict[str, type] = {}  # keyword of settings: the settings that h
 _inferred_from_arguments: dict[str, type] = {}  # keyword of forward: the settings whose rasterizer has it
 _inferred_without: dict[str, type] = {}  # keyword of settings: the settings that lack it
 _chosen: type | None = None  # settings of the dialect that was chosen for the process
+_companion_filter: str | None = None  # of a program that trains through another module of ours
 
 
 def choose(settings_class: type | None) -> None:
     """Makes `GaussianRasterizationSettings` of 3DGS 2023, wherever it was imported, make those of another dialect."""
     global _chosen
     _chosen = settings_class
+
+
+def use_filter_of_companion(name: str) -> None:
+    """Makes settings of 3DGS 2023 render with this footprint where the user chose none.
+
+    For a program that trains through a second module, with that module's filter, and evaluates through this one.
+    """
+    global _companion_filter
+    _companion_filter = name
 
 
 class GaussianRasterizationSettings(LibrarySettings):
@@ -122,7 +132,8 @@ class GaussianRasterizationSettings(LibrarySettings):
 
     def own_footprint(self) -> Footprint:
         """The footprint to render with where the user chose none."""
-        return _resolved(self.filter or "analytic")
+        of_2023 = type(self) is GaussianRasterizationSettings
+        return _resolved(self.filter or (of_2023 and _companion_filter) or "analytic")
 
     def footprint_in_use(self) -> Footprint:
         """The footprint to render with: of the settings, or chosen for the process, or else the dialect's own.

@@ -1,14 +1,18 @@
 """Luiten's: (color, radii, median depth), and settings without `debug`.
 
 Repositories: SplaTAM, Dynamic3DGaussians. The median depth is that of the Gaussian behind which less than half of a
-pixel's light is left; it has no gradient, and is 0 where more gets through.
+pixel's light is left; it has no gradient, and is 15 where more gets through.
 """
+
+import torch
 
 from ..effects import Effects
 from ._base import FIELDS, GaussianRasterizer, rasterize_gaussians
 from ._base import GaussianRasterizationSettings as Settings
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
+
+NO_DEPTH = 15.0  # what the original returns where there is no median
 
 
 class GaussianRasterizationSettings(Settings):
@@ -28,7 +32,8 @@ class GaussianRasterizationSettings(Settings):
         return super().__new__(cls, *args, **kwargs)
 
     def returned(self, color, radii, outputs):
-        return color, radii, outputs.median_depth
+        depth = outputs.median_depth
+        return color, radii, torch.where(depth == 0, NO_DEPTH, depth)
 
 
 class _SettingsWithDebug(GaussianRasterizationSettings):
