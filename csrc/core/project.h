@@ -294,7 +294,7 @@ AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
     T* row = out.means2d + i * out.means2d_stride;
     row[0] = T(0.5) * camera.size.x * grad.dL_dmean.x;
     row[1] = T(0.5) * camera.size.y * grad.dL_dmean.y;
-    row[2] = T(0);
+    for (int k = 2; k < out.means2d_stride; ++k) row[k] = T(0);
   }
 }
 
