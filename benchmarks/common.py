@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import statistics
-from collections.abc import Callable
 
 import torch
 
@@ -59,13 +58,11 @@ def save_json(args: argparse.Namespace, results: dict) -> None:
             json.dump({"machine": describe_machine(args.device), "arguments": vars(args), **results}, f, indent=2)
 
 
-def median_seconds(clock: Callable[[Callable], float], call: Callable[[], object], rounds: int) -> float:
-    """Median of `clock(call)` on an idle CUDA device."""
-    torch.cuda.synchronize()
-    clock(call)
-    return statistics.median(clock(call) for _ in range(rounds))
-
-
 def median_of(samples: list[dict]) -> dict:
     """The median of every key."""
     return {key: statistics.median(sample[key] for sample in samples) for key in samples[0]}
+
+
+def mean_of(samples: list[dict]) -> dict:
+    """The mean of every key."""
+    return {key: statistics.mean(sample[key] for sample in samples) for key in samples[0]}

@@ -26,6 +26,8 @@ import test_stability  # noqa: E402
 from hard_cases import CASES, FULL_CASES  # noqa: E402
 from scenes import VARIANTS, name_of  # noqa: E402
 
+from analytic_rasterizer.analysis.tables import markdown_table  # noqa: E402
+
 GRADIENTS = ("means3D", "opacities", "colours", "scales", "rotations", "covariance")
 # Gradients that grow without bound by themselves, or vanish by symmetry: held to their tolerance all the same.
 UNBOUNDED = ({"frame_gradient": "paper"}, {"dilation": 0.0})
@@ -153,47 +155,46 @@ def our_errors(case):
 
 
 def case_table():
-    head = ("case", "", "textbook, conic: image / worst gradient", "textbook, eigenvectors: image / worst gradient",
-            "ours: image", *GRADIENTS, "of tolerance")  # fmt: skip
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    head = ["case", "", "textbook, conic: image / worst gradient", "textbook, eigenvectors: image / worst gradient"]
+    rows = []
     for case in CASES:
-        if case.effects is not None:
-            continue
-        cells = [f"`{case.name}`", case.row]
-        for footprint in ("mip", "analytic"):
-            found = textbook_errors(case, footprint)
-            image, rest = found.pop("image"), found
-            nans = [f"{k}: {v}" for k, v in rest.items() if "NaN" in v]
-            worst = max(rest, key=lambda k: float(rest[k]) if "NaN" not in rest[k] else -1)
-            cells.append(f"{image} / " + (nans[0] if nans else f"{worst} {rest[worst]}"))
-        errors, share = our_errors(case)
-        cells += [number(errors.pop("image")), *(number(errors[c]) if c in errors else "" for c in GRADIENTS)]
-        lines.append("| " + " | ".join([*cells, f"{share:.2f}"]) + " |")
-        print(lines[-1], file=sys.stderr, flush=True)
-    return "\n".join(lines)
+        if case.effects is None:
+            rows.append([*textbook_cells(case), *our_cells(case, ("image", *GRADIENTS))])
+            print(rows[-1], file=sys.stderr, flush=True)
+    return markdown_table([*head, "ours: image", *GRADIENTS, "of tolerance"], rows)
+
+
+def textbook_cells(case):
+    cells = [f"`{case.name}`", case.row]
+    for footprint in ("mip", "analytic"):
+        found = textbook_errors(case, footprint)
+        image = found.pop("image")
+        nans = [f"{k}: {v}" for k, v in found.items() if "NaN" in v]
+        worst = max(found, key=lambda k: float(found[k]) if "NaN" not in found[k] else -1)
+        cells.append(f"{image} / " + (nans[0] if nans else f"{worst} {found[worst]}"))
+    return cells
+
+
+def our_cells(case, columns):
+    errors, share = our_errors(case)
+    return [*(number(errors[name]) if name in errors else "" for name in columns), f"{share:.2f}"]
 
 
 def full_table():
-    head = ("case", "", "image", *GRADIENTS, "camera", "of tolerance")
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    for case in FULL_CASES:
-        errors, share = our_errors(case)
-        cells = [number(errors[c]) if c in errors else "" for c in ("image", *GRADIENTS, "camera")]
-        lines.append("| " + " | ".join([f"`{case.name}`", case.row, *cells, f"{share:.2f}"]) + " |")
-        print(lines[-1], file=sys.stderr, flush=True)
-    return "\n".join(lines)
+    columns = ("image", *GRADIENTS, "camera")
+    rows = [[f"`{case.name}`", case.row, *our_cells(case, columns)] for case in FULL_CASES]
+    return markdown_table(["case", "", *columns, "of tolerance"], rows)
 
 
 def weight_table():
-    lines = ["| footprint | float32 | of tolerance | float64 | of tolerance |", "|---|---|---|---|---|"]
+    rows = []
     for variant in VARIANTS:
-        cells = [name_of(variant)]
+        rows.append([name_of(variant)])
         for dtype in (torch.float32, torch.float64):
             report = test_stability.measure_weights(variant, "cpu", dtype)
             share = (report["error"] / report["tolerance"]).max().item()
-            cells += [number(report["error"].max().item()), f"{share:.2f}"]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+            rows[-1] += [number(report["error"].max().item()), f"{share:.2f}"]
+    return markdown_table(["footprint", "float32", "of tolerance", "float64", "of tolerance"], rows)
 
 
 def main():
