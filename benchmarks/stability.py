@@ -59,7 +59,7 @@ def textbook(settings, scene, footprint):
     cov2d = to_image @ covariance @ to_image.transpose(-1, -2)
     a, b, c = (cov2d[:, i, j][:, None, None] for i, j in ((0, 0), (0, 1), (1, 1)))
     if "shs" in scene:
-        colors = reference.sh_color(settings.sh_degree, scene["shs"], means, settings.campos)
+        colors = reference.sh_color(settings.sh_degree, scene["shs"], means - settings.campos)
     else:
         colors = scene["colors_precomp"]
 
