@@ -1,19 +1,27 @@
-"""The command line and the medians that the benchmarks share."""
+"""The command line and the measuring that the benchmarks share."""
 
 from __future__ import annotations
 
 import argparse
 import json
 import statistics
+from collections.abc import Callable
 
 import torch
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
-from analytic_rasterizer.analysis.timing import describe_machine
+from analytic_rasterizer.analysis.timing import (
+    Case,
+    describe_machine,
+    event_seconds,
+    in_turn,
+    seconds_of,
+    warm_up_cuda,
+)
 
 ROUNDS = {"cpu": 5, "cuda": 30}
-UNITS = {"cpu": ("s", 1.0), "cuda": ("ms", 1e3)}  # in which times are printed, and how many are in a second
+CLOCKS = {"cpu": seconds_of, "cuda": event_seconds}  # seconds of a call
 WARM_UP = 15  # passes over the views before timing on CUDA
 
 
@@ -58,9 +66,21 @@ def save_json(args: argparse.Namespace, results: dict) -> None:
             json.dump({"machine": describe_machine(args.device), "arguments": vars(args), **results}, f, indent=2)
 
 
-def median_of(samples: list[dict]) -> dict:
-    """The median of every key."""
-    return {key: statistics.median(sample[key] for sample in samples) for key in samples[0]}
+def measure(
+    cases: dict[str, list[Case]], time_round: Callable[[Case], dict], device: str, rounds: int
+) -> dict[str, list[dict]]:
+    """Medians of the numbers of `time_round` over rounds in turn, after one that warms up, and the bytes that a forward
+    and backward pass needs in addition, by key and case."""
+    if device == "cuda":
+        each = [case for of_key in cases.values() for case in of_key]
+        warm_up_cuda([call for case in each for call in (case.forward, case.forward_backward)], WARM_UP)
+    measured = in_turn(cases, time_round, rounds + 1)
+    for key, of_key in cases.items():
+        for i, case in enumerate(of_key):
+            taken = measured[key][i][1:]
+            medians = {name: statistics.median(of_round[name] for of_round in taken) for name in taken[0]}
+            measured[key][i] = medians | {"extra_bytes": case.extra_bytes()}
+    return measured
 
 
 def mean_of(samples: list[dict]) -> dict:

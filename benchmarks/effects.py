@@ -23,13 +23,13 @@ import argparse
 from collections.abc import Callable
 
 import torch
-from common import UNITS, WARM_UP, make_parser, mean_of, median_of, parse, print_setup, save_json
+from common import CLOCKS, make_parser, mean_of, measure, parse, print_setup, save_json
 from scene_files import load_scene, pad_sh
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import effects, io
 from analytic_rasterizer.analysis.tables import markdown_table
-from analytic_rasterizer.analysis.timing import Case, event_seconds, fixed_weights, in_turn, seconds_of, warm_up_cuda
+from analytic_rasterizer.analysis.timing import Case, fixed_weights
 from analytic_rasterizer.outputs import depths
 
 FOOTPRINTS = ["box:samples=1", "box:samples=4"]
@@ -42,7 +42,11 @@ def main() -> None:
     scene = load_scene(args.scene).to(args.device)
     views = [view.scaled(args.scale) for view in io.load_views(args.views)[: args.limit_views]]
     print_setup(scene, views, args.device)
-    results = {}
+    clock, results = CLOCKS[args.device], {}
+
+    def time_round(case: EffectCase) -> dict:
+        return {"forward": clock(case.forward), "forward_backward": clock(case.forward_backward)}
+
     for footprint in args.footprints:
         results[footprint] = {}
         for name in args.effects:
@@ -50,8 +54,9 @@ def main() -> None:
                 side: [change(EffectCase(scene, views, view, footprint)) for view in views]
                 for side, change in zip(("off", "on"), ROWS[name])
             }
-            results[footprint][name] = measure(cases, args.device, args.rounds)
-        print(f"\n`{footprint}`\n\n{format_results(results[footprint], args.device)}")
+            measured = measure(cases, time_round, args.device, args.rounds)
+            results[footprint][name] = {side: mean_of(per_view) for side, per_view in measured.items()}
+        print(f"\n`{footprint}`\n\n{format_results(results[footprint])}")
     save_json(args, {"results": results})
 
 
@@ -65,16 +70,15 @@ def parse_arguments() -> argparse.Namespace:
     return parse(parser)
 
 
-def format_results(results: dict[str, dict], device: str) -> str:
-    unit, per_second = UNITS[device]
-    header = ["effect", f"forward {unit}: off", "on", "ratio", f"forward+backward {unit}: off", "on", "ratio"]
+def format_results(results: dict[str, dict]) -> str:
+    header = ["effect", "forward ms: off", "on", "ratio", "forward+backward ms: off", "on", "ratio"]
     header += ["extra MiB: off", "on"]
     rows = []
     for name, result in results.items():
         row = [name]
         for key in ("forward", "forward_backward"):
             off, on = result["off"][key], result["on"][key]
-            row += [off * per_second, on * per_second, on / off]
+            row += [1e3 * off, 1e3 * on, on / off]
         rows.append([*row, *(side["extra_bytes"] / 2**20 for side in result.values())])
     return markdown_table(header, rows)
 
@@ -207,28 +211,6 @@ ROWS = {
     "sh_degree:0": (EffectCase.plain, effect(sh_degree=0)),
     "sh_degree:4": (lambda case: case.with_degree(3), lambda case: case.with_degree(4)),
 }
-
-# -------------------------------------------------------------------------------------- what is measured
-
-
-def measure(cases: dict[str, list[EffectCase]], device: str, rounds: int) -> dict[str, dict]:
-    """Seconds and bytes off and on: medians over rounds, means over views."""
-    if device == "cuda":
-        each = [case for of_name in cases.values() for case in of_name]
-        warm_up_cuda([call for case in each for call in (case.forward, case.forward_backward)], WARM_UP)
-    clock = event_seconds if device == "cuda" else seconds_of
-
-    def time_round(case: EffectCase) -> dict:
-        return {"forward": clock(case.forward), "forward_backward": clock(case.forward_backward)}
-
-    samples = in_turn(cases, time_round, rounds + 1)
-    results = {}
-    for name, of_name in cases.items():
-        per_view = [
-            median_of(taken[1:]) | {"extra_bytes": case.extra_bytes()} for case, taken in zip(of_name, samples[name])
-        ]
-        results[name] = mean_of(per_view)
-    return results
 
 
 if __name__ == "__main__":

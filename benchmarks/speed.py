@@ -24,16 +24,16 @@ it also holds what forward does only for its sake.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from functools import partial
 
 import torch
-from common import UNITS, WARM_UP, make_parser, mean_of, median_of, parse, print_setup, save_json
+from common import CLOCKS, make_parser, mean_of, measure, parse, print_setup, save_json
 from scene_files import load_scene, pad_sh
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
 from analytic_rasterizer.analysis.tables import format_table
-from analytic_rasterizer.analysis.timing import Case, event_seconds, in_turn, seconds_of, warm_up_cuda
+from analytic_rasterizer.analysis.timing import Case, seconds_of
 
 FOOTPRINTS = ["box:samples=1", "point", "mip", "cumulant", "analytic", "box:samples=2", "box:samples=4"]
 STAGES = ("project", "bin", "blend")
@@ -47,13 +47,16 @@ def main() -> None:
         if args.sh_degree < scene.sh_degree:
             raise SystemExit(f"--sh-degree {args.sh_degree} is below the scene's, {scene.sh_degree}")
         scene = pad_sh(scene, args.sh_degree)
-    if args.shuffle:
-        order = torch.randperm(len(scene.means), generator=torch.Generator().manual_seed(0))
-        scene = io.Scene(*(field[order] for field in scene[:-1]), scene.sh_degree)
     scene = scene.to(args.device)
     views = io.load_views(args.views)
     cases = {name: [SpeedCase(scene, view, name) for view in views] for name in args.footprints}
-    measured = measure(cases, args.device, args.rounds)
+    together = [{name: of_name} for name, of_name in cases.items()] if args.device == "cuda" else [cases]
+    measured = {}
+    for part in together:
+        measured |= measure(part, partial(time_round, device=args.device), args.device, args.rounds)
+    for name, of_name in cases.items():
+        for case, result in zip(of_name, measured[name]):
+            result["extra_share"] = result["extra_bytes"] / case.budget(result["pairs"])
     results = {name: summarize(per_view) for name, per_view in measured.items()}
     print_setup(scene, views, args.device)
     print(format_results(results, args.device))
@@ -63,7 +66,6 @@ def main() -> None:
 
 def parse_arguments() -> argparse.Namespace:
     parser = make_parser(__doc__.split("\n")[0], FOOTPRINTS)
-    parser.add_argument("--shuffle", action="store_true", help="randomise the order of the Gaussians")
     parser.add_argument(
         "--sh-degree", type=int, choices=range(4), help="pad the SH with zeros to this degree, as trainers hold them"
     )
@@ -72,13 +74,12 @@ def parse_arguments() -> argparse.Namespace:
 
 def format_results(results: dict[str, dict], device: str) -> str:
     base = next(iter(results.values()))
-    unit, per_second = UNITS[device]
     parts = [*STAGES, "backward", *HOST] if device == "cuda" else [*STAGES, "backward"]
-    header = ["footprint", f"forward {unit}", f"forward+backward {unit}", "ratio", "ratio f+b"]
+    header = ["footprint", "forward ms", "forward+backward ms", "ratio", "ratio f+b"]
     rows = []
     for name, r in results.items():
         ratios = [r[key] / base[key] for key in ("forward", "forward_backward")]
-        seconds = [r[key] * per_second for key in ("forward", "forward_backward", *parts)]
+        seconds = [1e3 * r[key] for key in ("forward", "forward_backward", *parts)]
         memory = [r["extra_bytes"] / 2**20, r["extra_share"]]
         rows.append([name, *seconds[:2], *ratios, *seconds[2:], round(r["pairs"]), *memory])
     return format_table([*header, *parts, "pairs", "extra MiB", "B/budget"], rows)
@@ -103,46 +104,24 @@ class SpeedCase(Case):
     def op(self) -> None:
         torch.ops.analytic_rasterizer.rasterize(**self.op_arguments)
 
-    def extra_memory(self, pairs: int) -> dict:
-        """Bytes that forward and backward need beyond what goes in and comes out, and their share of
-        120 B per Gaussian + 64 B per pair + 64 B per pixel."""
-        extra = self.extra_bytes()
+    def budget(self, pairs: int) -> int:
+        """Bytes that the extra memory is compared with."""
         pixels = self.settings.image_height * self.settings.image_width
-        budget = 120 * len(self.gaussians["means3D"]) + 64 * pairs + 64 * pixels
-        return {"extra_bytes": extra, "extra_share": extra / budget}
+        return 120 * len(self.gaussians["means3D"]) + 64 * pairs + 64 * pixels
 
 
-def measure(cases: dict[str, list[SpeedCase]], device: str, rounds: int) -> dict[str, list[dict]]:
-    """Medians of seconds and pairs, and bytes, by footprint and view."""
-    if device == "cuda":
-        samples = {}
-        for name, of_name in cases.items():
-            warm_up_cuda([call for case in of_name for call in (case.forward, case.forward_backward)], WARM_UP)
-            samples |= in_turn({name: of_name}, time_round_cuda, rounds + 1)
-    else:
-        samples = in_turn(cases, lambda case: time_round(case, seconds_of), rounds + 1)
-    medians = {name: [median_of(taken[1:]) for taken in of_name] for name, of_name in samples.items()}
-    for name, of_name in cases.items():
-        for case, result in zip(of_name, medians[name]):
-            result |= case.extra_memory(result["pairs"])
-    return medians
-
-
-def time_round(case: SpeedCase, clock: Callable) -> dict:
-    """Seconds of the stages, of a forward pass without gradient, and of one with its backward pass."""
-    stages = case.stages()
+def time_round(case: SpeedCase, device: str) -> dict:
+    """Seconds of the stages, of a forward pass without gradient, and of one with its backward pass; with CUDA also
+    until calls return when the device has nothing else to do."""
+    clock, stages = CLOCKS[device], case.stages()
     result = {**stages.seconds, "pairs": len(stages.pairs)}
     del stages
     result |= {"forward": clock(case.forward), "forward_backward": clock(case.forward_backward)}
-    return result | {"backward": result["forward_backward"] - result["forward"]}
-
-
-def time_round_cuda(case: SpeedCase) -> dict:
-    """The same on the device, and seconds until calls return when the device has nothing else to do."""
-    result = time_round(case, event_seconds)
-    for name, call in zip(HOST, (case.op, case.forward, case.forward_backward)):
-        result[name] = seconds_of(call)
-        torch.cuda.synchronize()
+    result["backward"] = result["forward_backward"] - result["forward"]
+    if device == "cuda":
+        for name, call in zip(HOST, (case.op, case.forward, case.forward_backward)):
+            result[name] = seconds_of(call)
+            torch.cuda.synchronize()
     return result
 
 

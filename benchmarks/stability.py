@@ -99,7 +99,7 @@ def textbook(settings, scene, footprint):
 
 
 def textbook_errors(case, footprint):
-    """{column: error or the share that is not finite, as text}."""
+    """Error of the image and of the worst gradient, or the share of it that is not finite, as text."""
     camera, scene = case.build()
     variant = ("mip", {"variance": 1 / 12}) if footprint == "mip" else ("analytic", {"frame_gradient": "paper"})
     naive = hard_cases.settings_of(camera, torch.float32, torch.float32, variant)
@@ -113,23 +113,26 @@ def textbook_errors(case, footprint):
     leaves = scenes.leaves(ours)
     image = textbook(naive, leaves, footprint)
     (image * loss.float()).sum().backward()
-    found = {}
     bad = ~torch.isfinite(image.detach()).all(0)
     size = max(1.0, expected.abs().max().item())
     error = (image.detach().double() - expected).abs()[:, clear].max().item() / size if clear.any() else 0.0
-    found["image"] = f"NaN in {bad.double().mean():.0%}" if bad.any() else number(error)
+    image_text = f"NaN in {bad.double().mean():.0%}" if bad.any() else number(error)
+    relative = {}
     for name, value in wanted.items():
         if name == "means2D":
             continue
-        grad = leaves[name].grad
-        grad = torch.zeros_like(leaves[name]) if grad is None else grad
+        column = COLUMNS.get(name, name)
+        grad = torch.zeros_like(leaves[name]) if leaves[name].grad is None else leaves[name].grad
         bad = ~torch.isfinite(grad.reshape(len(grad), -1)).all(1)
+        if bad.any():
+            return f"{image_text} / {column}: NaN in {int(bad.sum())} of {len(bad)}"
         scale = hard_cases.rows(value)
-        seen = (scale > 0) & ~bad
-        relative = (hard_cases.rows(grad.double() - value)[seen] / scale[seen]).max().item() if seen.any() else 0.0
-        text = f"NaN in {int(bad.sum())} of {len(bad)}" if bad.any() else number(relative)
-        found[COLUMNS.get(name, name)] = text
-    return found
+        seen = scale > 0
+        relative[column] = (
+            (hard_cases.rows(grad.double() - value)[seen] / scale[seen]).max().item() if seen.any() else 0
+        )
+    worst = max(relative, key=relative.get)
+    return f"{image_text} / {worst} {number(relative[worst])}"
 
 
 def number(value):
@@ -139,8 +142,19 @@ def number(value):
     return f"{value:.1g}" if math.isfinite(value) else str(value)
 
 
-def our_errors(case):
-    """{column: worst of the footprints}, and the largest error of all variants as a share of its tolerance."""
+def case_table():
+    head = ["case", "", "textbook, conic: image / worst gradient", "textbook, eigenvectors: image / worst gradient"]
+    rows = []
+    for case in CASES:
+        if case.effects is None:
+            textbooks = [textbook_errors(case, footprint) for footprint in ("mip", "analytic")]
+            rows.append([f"`{case.name}`", case.row, *textbooks, *our_cells(case, ("image", *GRADIENTS))])
+            print(rows[-1], file=sys.stderr, flush=True)
+    return markdown_table([*head, "ours: image", *GRADIENTS, "of tolerance"], rows)
+
+
+def our_cells(case, columns):
+    """The worst error of the footprints, by column, and the largest share of its tolerance that any variant uses."""
     worst, share = {}, 0.0
     for variant in VARIANTS:
         report = hard_cases.measure(case, variant, "cpu", torch.float32)
@@ -148,36 +162,10 @@ def our_errors(case):
             column = COLUMNS.get(name, name)
             if variant[1] not in UNBOUNDED:
                 worst[column] = max(worst.get(column, 0.0), report.relative(name))
-            positive = report.tolerance[name].expand_as(error) > 0
-            if positive.any():
-                share = max(share, (error / report.tolerance[name].expand_as(error))[positive].max().item())
-    return worst, share
-
-
-def case_table():
-    head = ["case", "", "textbook, conic: image / worst gradient", "textbook, eigenvectors: image / worst gradient"]
-    rows = []
-    for case in CASES:
-        if case.effects is None:
-            rows.append([*textbook_cells(case), *our_cells(case, ("image", *GRADIENTS))])
-            print(rows[-1], file=sys.stderr, flush=True)
-    return markdown_table([*head, "ours: image", *GRADIENTS, "of tolerance"], rows)
-
-
-def textbook_cells(case):
-    cells = [f"`{case.name}`", case.row]
-    for footprint in ("mip", "analytic"):
-        found = textbook_errors(case, footprint)
-        image = found.pop("image")
-        nans = [f"{k}: {v}" for k, v in found.items() if "NaN" in v]
-        worst = max(found, key=lambda k: float(found[k]) if "NaN" not in found[k] else -1)
-        cells.append(f"{image} / " + (nans[0] if nans else f"{worst} {found[worst]}"))
-    return cells
-
-
-def our_cells(case, columns):
-    errors, share = our_errors(case)
-    return [*(number(errors[name]) if name in errors else "" for name in columns), f"{share:.2f}"]
+            tolerance = report.tolerance[name].expand_as(error)
+            if (tolerance > 0).any():
+                share = max(share, (error / tolerance)[tolerance > 0].max().item())
+    return [*(number(worst[name]) if name in worst else "" for name in columns), f"{share:.2f}"]
 
 
 def full_table():
