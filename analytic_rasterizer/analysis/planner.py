@@ -261,7 +261,7 @@ def _footprint_finding(candidates: dict[str, Candidate], footprint: str, views: 
     best = candidates[footprint]
     reason = (
         f"{percent(narrow)} of the splats have a standard deviation below {NARROW:g} px; samples that tiles need: "
-        f"{shares}; {footprint} is within {in_255(best.rms)}/255 of everything on"
+        f"{shares}; every view is within {in_255(best.rms)}/255 of everything on"
     )
     return Finding("footprint", footprint != BASE, candidates[BASE].rms, "measured", best.cost, footprint, reason)
 
@@ -273,7 +273,7 @@ def _sh_finding(scene: Scene, survey: _Survey, top_band: float, cost: float | No
     bounds = ", ".join(in_255(bound) for bound in survey.bounds[1:])
     reason = f"bands 1 to {scene.sh_degree} add at most {bounds} /255 to a colour"
     if degree is None:
-        reason += ", the last of them more than half the tolerance; the change is that of leaving it out"
+        reason += "; the last exceeds half the tolerance, and the change is what the views lose without it"
         return Finding(name, True, top_band, "measured", cost, f"degree {scene.sh_degree}", reason)
     reason += f"; left out: those above {degree}"
     return Finding(name, degree > 0, sum(survey.bounds[degree + 1 :]), "bound", cost, f"degree {degree}", reason)
@@ -298,8 +298,8 @@ def _cull_finding(scene: Scene, cameras: list, shown, on_image, cost: float) -> 
     count, *parts = (int(which.sum()) for which in (~shown, behind, hidden & faint, hidden & ~faint))
     reason = (
         f"{count} of {len(shown)} Gaussians touch no pixel of these views: {parts[0]} behind the near plane of every "
-        f"view, {parts[1]} too faint or too small, {parts[2]} beside every picture or not finite; `shown` is the mask "
-        "of the others, the cost that of keeping all"
+        f"view, {parts[1]} too faint or too small, {parts[2]} beside every picture or not finite; the cost is that of "
+        "rendering them too, and `shown` of the report is the mask of the others"
     )
     return Finding("hidden Gaussians", False, 0.0, "bound", cost, f"drop {count}", reason)
 
@@ -307,7 +307,7 @@ def _cull_finding(scene: Scene, cameras: list, shown, on_image, cost: float) -> 
 def _other_findings(survey: _Survey, cost_of_outputs: float) -> tuple[Finding, ...]:
     """Orthographic views, views whose axis is off centre, and outputs."""
     flat, off = survey.effects.orthographic, sum(survey.off_center)
-    w = f"w of clip space {'does not depend' if flat else 'depends'} on the position"
+    w = f"w of clip space {'is the same for every position' if flat else 'depends on the position'}"
     edge = (
         f"in {off} of {len(survey.off_center)} views an edge of the picture is more than {FRUSTUM_CLAMP} half pictures "
         "away from the optical axis"
