@@ -1,4 +1,4 @@
-"""The command line and the medians that the benchmarks share."""
+"""The command line and the measuring that the benchmarks share."""
 
 from __future__ import annotations
 
@@ -11,10 +11,17 @@ import torch
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
-from analytic_rasterizer.analysis.timing import describe_machine
+from analytic_rasterizer.analysis.timing import (
+    Case,
+    describe_machine,
+    event_seconds,
+    in_turn,
+    seconds_of,
+    warm_up_cuda,
+)
 
 ROUNDS = {"cpu": 5, "cuda": 30}
-UNITS = {"cpu": ("s", 1.0), "cuda": ("ms", 1e3)}  # in which times are printed, and how many are in a second
+CLOCKS = {"cpu": seconds_of, "cuda": event_seconds}  # seconds of a call
 WARM_UP = 15  # passes over the views before timing on CUDA
 
 
@@ -59,13 +66,23 @@ def save_json(args: argparse.Namespace, results: dict) -> None:
             json.dump({"machine": describe_machine(args.device), "arguments": vars(args), **results}, f, indent=2)
 
 
-def median_seconds(clock: Callable[[Callable], float], call: Callable[[], object], rounds: int) -> float:
-    """Median of `clock(call)` on an idle CUDA device."""
-    torch.cuda.synchronize()
-    clock(call)
-    return statistics.median(clock(call) for _ in range(rounds))
+def measure(
+    cases: dict[str, list[Case]], time_round: Callable[[Case], dict], device: str, rounds: int
+) -> dict[str, list[dict]]:
+    """Medians of the numbers of `time_round` over rounds in turn, after one that warms up, and the bytes that a forward
+    and backward pass needs in addition, by key and case."""
+    if device == "cuda":
+        each = [case for of_key in cases.values() for case in of_key]
+        warm_up_cuda([call for case in each for call in (case.forward, case.forward_backward)], WARM_UP)
+    measured = in_turn(cases, time_round, rounds + 1)
+    for key, of_key in cases.items():
+        for i, case in enumerate(of_key):
+            taken = measured[key][i][1:]
+            medians = {name: statistics.median(of_round[name] for of_round in taken) for name in taken[0]}
+            measured[key][i] = medians | {"extra_bytes": case.extra_bytes()}
+    return measured
 
 
-def median_of(samples: list[dict]) -> dict:
-    """The median of every key."""
-    return {key: statistics.median(sample[key] for sample in samples) for key in samples[0]}
+def mean_of(samples: list[dict]) -> dict:
+    """The mean of every key."""
+    return {key: statistics.mean(sample[key] for sample in samples) for key in samples[0]}

@@ -18,36 +18,27 @@ import torch
 
 from analytic_rasterizer import io
 
+NAMES = io.Scene._fields[:-1]
+
 
 def load_scene(path: str) -> io.Scene:
-    """The scene of an .npz as above, or of anything else that `io.load_scene` reads, on the CPU.
-
-    Raises io.SceneError for an .npz without these arrays or with other shapes.
-    """
-    return _load_npz(path) if Path(path).suffix == ".npz" else io.load_scene(path)
+    """The scene of an .npz as above, or of anything else that `io.load_scene` reads, on the CPU."""
+    if Path(path).suffix != ".npz":
+        return io.load_scene(path)
+    with np.load(path) as file:
+        fields = {name: torch.from_numpy(file[name].astype(np.float32)) for name in NAMES}
+    return io.Scene(**fields, sh_degree=math.isqrt(fields["shs"].shape[1]) - 1)
 
 
 def save_npz(path: str, scene: io.Scene) -> None:
     """Writes what `load_scene` reads."""
-    np.savez(path, **{name: field.cpu().numpy() for name, field in zip(scene._fields[:-1], scene[:-1])})
+    np.savez(path, **{name: getattr(scene, name).cpu().numpy() for name in NAMES})
 
 
-def _load_npz(path: str) -> io.Scene:
-    names = io.Scene._fields[:-1]
-    with np.load(path) as file:
-        missing = [name for name in names if name not in file]
-        if missing:
-            raise io.SceneError(f"{path}: expected arrays {', '.join(names)}; missing {', '.join(missing)}")
-        arrays = {name: torch.from_numpy(file[name].astype(np.float32)) for name in names}
-    count, coefficients = arrays["shs"].shape[:2]
-    if coefficients not in (1, 4, 9, 16):
-        raise io.SceneError(f"{path}: shs must have 1, 4, 9 or 16 coefficients, got {coefficients}")
-    widths = {"means": (3,), "scales": (3,), "rotations": (4,), "opacities": (1,), "shs": (coefficients, 3)}
-    for name, width in widths.items():
-        if arrays[name].numel() != count * math.prod(width):
-            raise io.SceneError(f"{path}: {name} must have shape {(count, *width)}, got {tuple(arrays[name].shape)}")
-        arrays[name] = arrays[name].reshape(count, *width).contiguous()
-    return io.Scene(**arrays, sh_degree=math.isqrt(coefficients) - 1)
+def pad_sh(scene: io.Scene, degree: int) -> io.Scene:
+    """The scene with zeros for the coefficients that it lacks up to `degree`, which is at least its own."""
+    missing = (degree + 1) ** 2 - scene.shs.shape[1]
+    return scene._replace(shs=torch.nn.functional.pad(scene.shs, (0, 0, 0, missing)), sh_degree=degree)
 
 
 def main() -> None:

@@ -26,6 +26,8 @@ import test_stability  # noqa: E402
 from hard_cases import CASES, FULL_CASES  # noqa: E402
 from scenes import VARIANTS, name_of  # noqa: E402
 
+from analytic_rasterizer.analysis.tables import markdown_table  # noqa: E402
+
 GRADIENTS = ("means3D", "opacities", "colours", "scales", "rotations", "covariance")
 # Gradients that grow without bound by themselves, or vanish by symmetry: held to their tolerance all the same.
 UNBOUNDED = ({"frame_gradient": "paper"}, {"dilation": 0.0})
@@ -57,7 +59,7 @@ def textbook(settings, scene, footprint):
     cov2d = to_image @ covariance @ to_image.transpose(-1, -2)
     a, b, c = (cov2d[:, i, j][:, None, None] for i, j in ((0, 0), (0, 1), (1, 1)))
     if "shs" in scene:
-        colors = reference.sh_color(settings.sh_degree, scene["shs"], means, settings.campos)
+        colors = reference.sh_color(settings.sh_degree, scene["shs"], means - settings.campos)
     else:
         colors = scene["colors_precomp"]
 
@@ -97,7 +99,7 @@ def textbook(settings, scene, footprint):
 
 
 def textbook_errors(case, footprint):
-    """{column: error or the share that is not finite, as text}."""
+    """Error of the image and of the worst gradient, or the share of it that is not finite, as text."""
     camera, scene = case.build()
     variant = ("mip", {"variance": 1 / 12}) if footprint == "mip" else ("analytic", {"frame_gradient": "paper"})
     naive = hard_cases.settings_of(camera, torch.float32, torch.float32, variant)
@@ -111,23 +113,26 @@ def textbook_errors(case, footprint):
     leaves = scenes.leaves(ours)
     image = textbook(naive, leaves, footprint)
     (image * loss.float()).sum().backward()
-    found = {}
     bad = ~torch.isfinite(image.detach()).all(0)
     size = max(1.0, expected.abs().max().item())
     error = (image.detach().double() - expected).abs()[:, clear].max().item() / size if clear.any() else 0.0
-    found["image"] = f"NaN in {bad.double().mean():.0%}" if bad.any() else number(error)
+    image_text = f"NaN in {bad.double().mean():.0%}" if bad.any() else number(error)
+    relative = {}
     for name, value in wanted.items():
         if name == "means2D":
             continue
-        grad = leaves[name].grad
-        grad = torch.zeros_like(leaves[name]) if grad is None else grad
+        column = COLUMNS.get(name, name)
+        grad = torch.zeros_like(leaves[name]) if leaves[name].grad is None else leaves[name].grad
         bad = ~torch.isfinite(grad.reshape(len(grad), -1)).all(1)
+        if bad.any():
+            return f"{image_text} / {column}: NaN in {int(bad.sum())} of {len(bad)}"
         scale = hard_cases.rows(value)
-        seen = (scale > 0) & ~bad
-        relative = (hard_cases.rows(grad.double() - value)[seen] / scale[seen]).max().item() if seen.any() else 0.0
-        text = f"NaN in {int(bad.sum())} of {len(bad)}" if bad.any() else number(relative)
-        found[COLUMNS.get(name, name)] = text
-    return found
+        seen = scale > 0
+        relative[column] = (
+            (hard_cases.rows(grad.double() - value)[seen] / scale[seen]).max().item() if seen.any() else 0
+        )
+    worst = max(relative, key=relative.get)
+    return f"{image_text} / {worst} {number(relative[worst])}"
 
 
 def number(value):
@@ -137,8 +142,19 @@ def number(value):
     return f"{value:.1g}" if math.isfinite(value) else str(value)
 
 
-def our_errors(case):
-    """{column: worst of the footprints}, and the largest error of all variants as a share of its tolerance."""
+def case_table():
+    head = ["case", "", "textbook, conic: image / worst gradient", "textbook, eigenvectors: image / worst gradient"]
+    rows = []
+    for case in CASES:
+        if case.effects is None:
+            textbooks = [textbook_errors(case, footprint) for footprint in ("mip", "analytic")]
+            rows.append([f"`{case.name}`", case.row, *textbooks, *our_cells(case, ("image", *GRADIENTS))])
+            print(rows[-1], file=sys.stderr, flush=True)
+    return markdown_table([*head, "ours: image", *GRADIENTS, "of tolerance"], rows)
+
+
+def our_cells(case, columns):
+    """The worst error of the footprints, by column, and the largest share of its tolerance that any variant uses."""
     worst, share = {}, 0.0
     for variant in VARIANTS:
         report = hard_cases.measure(case, variant, "cpu", torch.float32)
@@ -146,54 +162,27 @@ def our_errors(case):
             column = COLUMNS.get(name, name)
             if variant[1] not in UNBOUNDED:
                 worst[column] = max(worst.get(column, 0.0), report.relative(name))
-            positive = report.tolerance[name].expand_as(error) > 0
-            if positive.any():
-                share = max(share, (error / report.tolerance[name].expand_as(error))[positive].max().item())
-    return worst, share
-
-
-def case_table():
-    head = ("case", "", "textbook, conic: image / worst gradient", "textbook, eigenvectors: image / worst gradient",
-            "ours: image", *GRADIENTS, "of tolerance")  # fmt: skip
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    for case in CASES:
-        if case.effects is not None:
-            continue
-        cells = [f"`{case.name}`", case.row]
-        for footprint in ("mip", "analytic"):
-            found = textbook_errors(case, footprint)
-            image, rest = found.pop("image"), found
-            nans = [f"{k}: {v}" for k, v in rest.items() if "NaN" in v]
-            worst = max(rest, key=lambda k: float(rest[k]) if "NaN" not in rest[k] else -1)
-            cells.append(f"{image} / " + (nans[0] if nans else f"{worst} {rest[worst]}"))
-        errors, share = our_errors(case)
-        cells += [number(errors.pop("image")), *(number(errors[c]) if c in errors else "" for c in GRADIENTS)]
-        lines.append("| " + " | ".join([*cells, f"{share:.2f}"]) + " |")
-        print(lines[-1], file=sys.stderr, flush=True)
-    return "\n".join(lines)
+            tolerance = report.tolerance[name].expand_as(error)
+            if (tolerance > 0).any():
+                share = max(share, (error / tolerance)[tolerance > 0].max().item())
+    return [*(number(worst[name]) if name in worst else "" for name in columns), f"{share:.2f}"]
 
 
 def full_table():
-    head = ("case", "", "image", *GRADIENTS, "camera", "of tolerance")
-    lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
-    for case in FULL_CASES:
-        errors, share = our_errors(case)
-        cells = [number(errors[c]) if c in errors else "" for c in ("image", *GRADIENTS, "camera")]
-        lines.append("| " + " | ".join([f"`{case.name}`", case.row, *cells, f"{share:.2f}"]) + " |")
-        print(lines[-1], file=sys.stderr, flush=True)
-    return "\n".join(lines)
+    columns = ("image", *GRADIENTS, "camera")
+    rows = [[f"`{case.name}`", case.row, *our_cells(case, columns)] for case in FULL_CASES]
+    return markdown_table(["case", "", *columns, "of tolerance"], rows)
 
 
 def weight_table():
-    lines = ["| footprint | float32 | of tolerance | float64 | of tolerance |", "|---|---|---|---|---|"]
+    rows = []
     for variant in VARIANTS:
-        cells = [name_of(variant)]
+        rows.append([name_of(variant)])
         for dtype in (torch.float32, torch.float64):
             report = test_stability.measure_weights(variant, "cpu", dtype)
             share = (report["error"] / report["tolerance"]).max().item()
-            cells += [number(report["error"].max().item()), f"{share:.2f}"]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+            rows[-1] += [number(report["error"].max().item()), f"{share:.2f}"]
+    return markdown_table(["footprint", "float32", "of tolerance", "float64", "of tolerance"], rows)
 
 
 def main():

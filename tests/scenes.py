@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
+import analytic_rasterizer as ar
 from analytic_rasterizer import FOOTPRINTS
 from analytic_rasterizer.footprints import YARDSTICKS
 
@@ -251,9 +252,8 @@ def settings_to(settings, device):
 
 def tile_samples(settings, scene):
     """What `adaptive` chooses (tile rows, tile columns)."""
-    from analytic_rasterizer.analysis.planner import tile_samples
-
-    return tile_samples(settings, scene)
+    stages = ar.render_stages(settings, **{name: value for name, value in scene.items() if name != "means2D"})
+    return stages.tile_samples.reshape(-(-settings.image_height // ar._C.TILE), -1).cpu()
 
 
 def leaves(scene):

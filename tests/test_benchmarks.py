@@ -47,7 +47,7 @@ def test_speed(device, small_scene, monkeypatch, capsys):
     speed = importlib.import_module("speed")
     footprints = ["box:samples=1", "mip"]
     arguments = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--json", small_scene / "out.json"]
-    options = ["--rounds", "1", "--sh-degree", "2", "--shuffle", "--threads", "1", "--device", device]
+    options = ["--rounds", "1", "--sh-degree", "2", "--threads", "1", "--device", device]
     monkeypatch.setattr(sys, "argv", ["speed.py", *map(str, arguments), *options, "--footprints", *footprints])
     speed.main()
     lines = capsys.readouterr().out.splitlines()

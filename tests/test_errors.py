@@ -173,7 +173,8 @@ def test_the_truth_has_no_error_and_cases_cover_the_footprints():
 def small(monkeypatch, tmp_path):
     """(folder, results) of a run on few splats."""
     monkeypatch.setattr(errors, "all_cases", lambda: ["point", "analytic", errors.PAPER_GRADIENT, "cumulant"])
-    return tmp_path, errors.run(tmp_path, samples=32, monte_carlo=128, rotation_samples=4)
+    monkeypatch.setattr(errors, "ROTATION_SAMPLES", 4)
+    return tmp_path, errors.run(tmp_path, samples=32, monte_carlo=128)
 
 
 def test_files_of_a_run(small):

@@ -36,7 +36,7 @@ PAPER_GRADIENT = "analytic:frame_gradient=paper"
 GRADIENTS = {"offset": "dI/d offset", "cov2d": "dI/d covariance"}
 
 
-def run(out, samples: int = SAMPLES, monte_carlo: int = MONTE_CARLO, rotation_samples: int | None = None) -> dict:
+def run(out, samples: int = SAMPLES, monte_carlo: int = MONTE_CARLO) -> dict:
     """Measures all three and writes CSV, PNG and SVG files and summary.md to `out`, a folder that exists.
 
     Args:
@@ -44,7 +44,6 @@ def run(out, samples: int = SAMPLES, monte_carlo: int = MONTE_CARLO, rotation_sa
         samples: Splats of each standard deviation, for the footprints. Maxima are over these splats, and so they are
             lower bounds.
         monte_carlo: Samples in a pixel.
-        rotation_samples: Splats of each standard deviation, for the rotation; None is ROTATION_SAMPLES.
 
     Returns:
         {"window": rows, "rotation": rows, "footprints": rows, "summary": Markdown}.
@@ -53,19 +52,18 @@ def run(out, samples: int = SAMPLES, monte_carlo: int = MONTE_CARLO, rotation_sa
         ImportError: Without the `analysis` extra.
         ValueError: This build has no `exact` or `erf` footprint.
     """
-    optional_import("matplotlib.figure", "analysis")  # raises before anything is measured
-    out, cases = Path(out), all_cases()
-    with optional_import("tqdm", "analysis").tqdm(total=2 + len(cases), desc="errors", disable=None) as bar:
-        results = {"window": window_errors()}
-        bar.update()
-        results["rotation"] = rotation_errors(rotation_samples or ROTATION_SAMPLES, monte_carlo)
-        bar.update()
-        results["footprints"] = footprint_errors(cases, samples, bar.update)
+    for module in ("matplotlib.figure", "tqdm"):
+        optional_import(module, "analysis")  # raises before anything is measured
+    results = {
+        "window": window_errors(),
+        "rotation": rotation_errors(ROTATION_SAMPLES, monte_carlo),
+        "footprints": footprint_errors(all_cases(), samples),
+    }
+    out, summary = Path(out), summarize(results, samples, monte_carlo)
     for name, rows in results.items():
         tables.save_csv(out / f"{name}.csv", rows)
     for name, figure in _figures(results).items():
         tables.save_figure(figure, out, name)
-    summary = summarize(results, samples, monte_carlo)
     (out / "summary.md").write_text(summary, encoding="utf-8")
     return {**results, "summary": summary}
 
@@ -127,7 +125,7 @@ def rotation_errors(samples: int, monte_carlo: int, sigmas: int = 40) -> list[di
     return rows
 
 
-def footprint_errors(cases: list[str], samples: int, progress=lambda: None) -> list[dict]:
+def footprint_errors(cases: list[str], samples: int) -> list[dict]:
     """Errors of the weight and its gradients against `exact`, by footprint and standard deviation.
 
     The smaller standard deviation is log-uniform in SIGMAS, PER_DECADE to a decade; for each `samples` splats, the
@@ -142,14 +140,13 @@ def footprint_errors(cases: list[str], samples: int, progress=lambda: None) -> l
     splats = [_splats(unit, sigma, blur=1 / 12) for sigma in sigmas]
     truth = [_weight_and_gradients(*splat, EXACT) for splat in splats]
     rows = []
-    for case in cases:
+    for case in optional_import("tqdm", "analysis").tqdm(cases, desc="footprints", disable=None):
         for sigma, splat, exact in zip(sigmas, splats, truth):
             row = {"footprint": case, "sigma": sigma}
             for name, value, true in zip(("weight", *GRADIENTS), _weight_and_gradients(*splat, case), exact):
                 error, size = (value - true).flatten(1).norm(dim=1), _rms(true.flatten(1).norm(dim=1))
                 row |= _max_rms(name, error) | _max_rms(f"{name}_relative", error / size)
             rows.append(row)
-        progress()
     return rows
 
 
@@ -209,21 +206,19 @@ def summarize(results: dict, samples: int, monte_carlo: int) -> str:
     turned = max(rotation, key=lambda row: row["exact_max"])
     z = math.sqrt(sum(row["z_rms"] ** 2 for row in rotation) / len(rotation))
     low, high = PAPER_SIGMAS
-    references = ["against exact, max / RMS", f"against {monte_carlo} samples", "the two references"]
-    by_sigma = [
-        [f"{row['sigma']:.2f}", *(_max_rms_text(row, name) for name in ("exact", "monte_carlo", "references"))]
-        + [f"{row['z_rms']:.2f}"]
-        for row in rotation[:: max(1, len(rotation) // 8)]
-    ]
-    footprints = _by_footprint(results["footprints"])
-    weights = {name: rows for name, rows in footprints.items() if name != PAPER_GRADIENT}  # whose weight is not its own
+    of_rotation = []
+    for row in rotation[:: max(1, len(rotation) // 8)]:
+        errors = [_max_rms_text(row, name) for name in ("exact", "monte_carlo", "references")]
+        of_rotation.append([f"{row['sigma']:.2f}", *errors, f"{row['z_rms']:.2f}"])
+    header = ["sigma [px]", "against exact, max / RMS", f"against {monte_carlo} samples", "the two references", "z"]
+    footprints, weights = _by_footprint(results["footprints"])
     parts = [
         "# Errors of the pixel's weight",
         f"## One axis: the logistic window, sigma in [{low}, {high}] px, |x| <= 3 sigma",
         f"Largest error of the window {worst['window_max']:.2e} (sigma {worst['sigma']:.2f}), of a splat of peak 1 "
         f"{peak['weight_max']:.2e} (sigma {peak['sigma']:.2f}).",
         f"## The pixel turned into the splat's frame, sigma in [{low}, {high}] px, anisotropy 1 to {RATIO:.0f}",
-        tables.markdown_table(["sigma [px]", *references, "z"], by_sigma),
+        tables.markdown_table(header, of_rotation),
         f"Largest error {turned['exact_max']:.2e} (sigma {turned['sigma']:.2f}). z is the RMS difference of the two "
         f"references over the standard error of Monte Carlo: {z:.3f} over all splats, 1 where they agree.",
         f"## Every footprint, {samples} splats of each sigma, anisotropy 1 to {RATIO:.0f}, any rotation, offset to "
@@ -244,9 +239,12 @@ def summarize(results: dict, samples: int, monte_carlo: int) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _by_footprint(rows: list[dict]) -> dict[str, list[dict]]:
-    names = dict.fromkeys(row["footprint"] for row in rows)
-    return {name: [row for row in rows if row["footprint"] == name] for name in names}
+def _by_footprint(rows: list[dict]) -> tuple[dict[str, list[dict]], dict[str, list[dict]]]:
+    """The rows of every footprint, and of those whose weight is their own: PAPER_GRADIENT has that of `analytic`."""
+    by_footprint = {}
+    for row in rows:
+        by_footprint.setdefault(row["footprint"], []).append(row)
+    return by_footprint, {name: of_name for name, of_name in by_footprint.items() if name != PAPER_GRADIENT}
 
 
 def _max_rms_text(row: dict, name: str) -> str:
@@ -255,13 +253,10 @@ def _max_rms_text(row: dict, name: str) -> str:
 
 def _by_sigma(by_footprint: dict[str, list[dict]], text) -> str:
     """A table of `text(row)` at the deviations nearest to TABLE_SIGMAS."""
-    header, *lines = ["footprint"], *([name] for name in by_footprint)
-    for sigma in TABLE_SIGMAS:
-        nearest = [min(rows, key=lambda row: abs(math.log(row["sigma"] / sigma))) for rows in by_footprint.values()]
-        header.append(f"{nearest[0]['sigma']:.2g}")
-        for line, row in zip(lines, nearest):
-            line.append(text(row))
-    return tables.markdown_table(header, lines)
+    sigmas = [row["sigma"] for row in next(iter(by_footprint.values()))]
+    shown = [min(range(len(sigmas)), key=lambda i: abs(math.log(sigmas[i] / sigma))) for sigma in TABLE_SIGMAS]
+    lines = [[name, *(text(rows[i]) for i in shown)] for name, rows in by_footprint.items()]
+    return tables.markdown_table(["footprint", *(f"{sigmas[i]:.2g}" for i in shown)], lines)
 
 
 def _smallest_sigma(rows: list[dict], threshold: float) -> str:
@@ -283,17 +278,17 @@ def _figures(results: dict) -> dict:
     def lines(kind: str, prefixes: dict[str, str]) -> list[tuple]:
         return [(label, results[kind], prefix, style) for (label, prefix), style in zip(prefixes.items(), styles)]
 
-    footprints = [(name, rows, "", tables.style(name)) for name, rows in _by_footprint(results["footprints"]).items()]
-    own_weights = [line for line in footprints if line[0] != PAPER_GRADIENT]
-    weights = {f"weight_{kind}": label for kind, label in columns.items()}
+    footprints, weights = _by_footprint(results["footprints"])
+    of_weight = [(name, rows, "weight_", tables.style(name)) for name, rows in weights.items()]
+    of_gradients = [(name, rows, "", tables.style(name)) for name, rows in footprints.items()]
     gradients = {f"{of}_relative_{kind}": f"{columns[kind]} of {GRADIENTS[of]}" for of in GRADIENTS for kind in columns}
     frame = "The pixel turned into the splat's frame, against two references"
     relative = "Gradients against those of the exact integral, relative to their RMS"
     return {
         "window": _figure("The logistic window against erf", columns, lines("window", window)),
         "rotation": _figure(frame, columns, lines("rotation", rotation)),
-        "footprints_weight": _figure("Weight of a splat of peak 1 against the exact integral", weights, own_weights),
-        "footprints_gradient": _figure(relative, gradients, footprints),
+        "footprints_weight": _figure("Weight of a splat of peak 1 against the exact integral", columns, of_weight),
+        "footprints_gradient": _figure(relative, gradients, of_gradients),
     }
 
 

@@ -103,7 +103,6 @@ class SceneReport:
             + [_ratio(v.finest)]
             for v in self.views
         ]
-        columns = len(header) - 2 * (self.views[0].finer is None)
         options = [f"sh_degree={self.effects.sh_degree}"] if self.effects.sh_degree is not None else []
         options += [f"{name}=True" for name in ("orthographic", "off_center") if getattr(self.effects, name)]
         options += ["filter_3d=..."] if self.effects.filter_3d is not None else []
@@ -114,7 +113,7 @@ class SceneReport:
             tables.format_table(["effect", "needed", "change [1/255]", "", "cost", "recommendation"], effects),
             "\n".join(f"{f.name}: {f.reason}" for f in self.findings),
             tables.format_table(["footprint", "RMS [1/255]", "fits", "cost"], tried),
-            tables.format_table(header[:columns], [row[:columns] for row in views]),
+            tables.format_table(header, views),
         ])  # fmt: skip
 
     def save_picture(self, path) -> None:

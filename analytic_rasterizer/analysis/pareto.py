@@ -11,6 +11,7 @@ import json
 import math
 import statistics
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,7 +26,6 @@ BASE = "box:samples=1"  # times on the CPU are ratios to this
 SECOND_ESTIMATE = "box:samples=16"  # another way to the reference's limit
 MAX_FILTERED_PIXELS = 2**25  # of a picture of SECOND_ESTIMATE, which is rendered in one piece
 SUPERSAMPLING = (2, 3, 4)
-SLOW = 20  # a method that takes so many times as long as the base is timed only once on the CPU
 SSIM_WINDOW = 11  # px; smaller pictures have no SSIM
 PASSES = {"forward": "forward", "forward_backward": "forward + backward"}
 
@@ -102,8 +102,8 @@ def run(
         ImportError: Without the `analysis` extra.
     """
     methods = default_methods() if methods is None else methods
-    names = [method.name for method in methods]
-    for what, given in (("views", [view.name for view in views]), ("methods", names), ("scales", list(scales))):
+    names, view_names = [method.name for method in methods], [view.name for view in views]
+    for what, given in (("views", view_names), ("methods", names), ("scales", list(scales))):
         if not given or len(set(given)) < len(given):
             raise ValueError(f"{what} must be given, and each once, got {', '.join(map(str, given)) or 'none'}")
     for module in ("matplotlib.figure", "torchmetrics.functional.image"):
@@ -113,7 +113,7 @@ def run(
         "scene": name,
         "gaussians": len(scene.means),
         "sh_degree": scene.sh_degree,
-        "views": [view.name for view in views],
+        "views": view_names,
         "background": list(background),
         "crop": None if crop is None else list(crop),
         "device": device,
@@ -123,59 +123,65 @@ def run(
         "base": BASE if BASE in names else names[0],
         "scales": [],
     }
-    timer = time.process_time if cpu_time else time.perf_counter
     for scale in scales:
-        small = [view.framed(scale, crop) for view in views]
-        sizes = [[view.width, view.height] for view in small]
-        measured = _measure_scale(scene, small, methods, background, max_density, results, timer)
-        results["scales"].append({"scale": scale, "sizes": sizes, **measured})
-        tables.save_figure(_plot(results, results["scales"][-1]), out, f"pareto_{scale}")
+        framed = [view.framed(scale, crop) for view in views]
+        sizes = [[view.width, view.height] for view in framed]
+        at_scale = {"scale": scale, "sizes": sizes, **_measure(scene, framed, methods, results, max_density)}
+        results["scales"].append(at_scale)
+        tables.save_figure(_plot(results, at_scale), out, f"pareto_{scale}")
         # After every scale, so that a long run that is stopped leaves what it has.
         (out / "pareto.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
         (out / "pareto.md").write_text(to_markdown(results), encoding="utf-8")
     return results
 
 
-def _measure_scale(scene, views, methods, background, max_density, settings: dict, timer) -> dict:
-    """Reference and methods at one scale; `settings` are those of the results."""
-
-    def render(of_name: list[timing.Case]) -> dict[str, torch.Tensor]:
-        return {view.name: case.forward() for view, case in zip(views, of_name)}
+def _measure(scene: Scene, views: list[View], methods: list[Method], results: dict, max_density: int | None) -> dict:
+    """Reference and methods at one scale; `results` are those of `run`. A picture is known by the name of its view."""
+    background = results["background"]
+    names = [view.name for view in views]
 
     def cases_of(method: Method) -> list[timing.Case]:
         return [timing.Case(scene, view, method.footprint, method.supersampling, background) for view in views]
 
+    def sample(density: int, footprint: str = UNFILTERED) -> dict[str, torch.Tensor]:
+        return {view.name: supersampled(scene, view, density, footprint, background) for view in views}
+
     cases = {method.name: cases_of(method) for method in methods}
-    progress = optional_import("tqdm").tqdm
-    pictures = {name: render(of) for name, of in progress(cases.items(), desc="render", unit="method", disable=None)}
-    exact = pictures.get(EXACT)
-    if exact is None and any(method.has_single_weight for method in methods):
-        exact = render(cases_of(Method(EXACT)))
-    refined = refine(
-        lambda density: {v.name: supersampled(scene, v, density, background=background) for v in views},
-        lambda truth: {k: min(image_errors(of[k], truth[k])["rmse"] for of in pictures.values()) for k in truth},
-        limit=max_density,
-    )
+    rendered = dict(cases)
+    if any(method.has_single_weight for method in methods):
+        rendered.setdefault(EXACT, cases_of(Method(EXACT)))
+    with optional_import("tqdm").tqdm(rendered.items(), desc="render", unit="method", disable=None) as progress:
+        pictures = {name: dict(zip(names, (case.forward() for case in of_name))) for name, of_name in progress}
+
+    def smallest_error(truth: dict[str, torch.Tensor]) -> dict[str, float]:
+        return {key: min(image_errors(pictures[name][key], truth[key])["rmse"] for name in cases) for key in names}
+
+    refined = refine(sample, smallest_error, limit=max_density)
     truth = refined.pictures
-    reference = _describe_reference(scene, views, background, refined)
-    times = _times(cases, settings["rounds"], settings["base"], timer)
-    rows = []
+    reference = _describe_reference(refined, sample)
+    clock = time.process_time if results["clock"] == "CPU time" else time.perf_counter
+    times = _times(cases, results["rounds"], results["base"], clock)
+    all_truth, rows = _flat(truth), []
     for method in methods:
         of_name = pictures[method.name]
+        errors = image_errors(_flat(of_name), all_truth)
         memory = [case.extra_bytes() for case in cases[method.name]]
-        ssim = [_ssim(of_name[key], truth[key]) for key in truth]
+        ssim = [_ssim(of_name[key], truth[key]) for key in names]
         row = {
             "method": method.name,
             "footprint": str(resolve_footprint(method.footprint)),
             "supersampling": method.supersampling,
-            **image_errors(_flat(of_name), _flat(truth)),
+            **errors,
             "ssim": None if None in ssim else statistics.mean(ssim),
             **times[method.name],
             "extra_bytes": statistics.mean(memory) if min(memory) > 0 else None,  # not every system tells
-            **_split(method, of_name, exact, truth),
-            "per_view": {key: image_errors(of_name[key], truth[key]) for key in truth},
+            **dict.fromkeys(("weight_rmse", "blending_rmse", "correlation")),
+            "per_view": {key: image_errors(of_name[key], truth[key]) for key in names},
+            "resolved": reference["residual"]["rmse"] <= RMSE_SHARE * errors["rmse"],
         }
-        rows.append(row | {"resolved": reference["residual"]["rmse"] <= RMSE_SHARE * row["rmse"]})
+        if method.has_single_weight:
+            row |= _split(_flat(of_name), _flat(pictures[EXACT]), all_truth)
+        rows.append(row)
     for passes in PASSES:
         front = pareto_front([(row[f"{passes}_ratio"], row["rmse"]) for row in rows])
         for row, on_front in zip(rows, front):
@@ -183,7 +189,7 @@ def _measure_scale(scene, views, methods, background, max_density, settings: dic
     return {"reference": reference, "methods": rows}
 
 
-def _describe_reference(scene, views, background, refined: Refined) -> dict:
+def _describe_reference(refined: Refined, sample: Callable[..., dict]) -> dict:
     """How the reference was made, and three estimates of its own error, over all views.
 
     residual: change from half the density, which bounds the error where every doubling at least halves it.
@@ -191,63 +197,54 @@ def _describe_reference(scene, views, background, refined: Refined) -> dict:
     that is positive. second_estimate: distance from another sampler with the same limit.
     """
     density, truth = refined.density, refined.pictures
-    sizes = {v.name: v.width * v.height for v in views}
-
-    def over_views(rmse: dict[str, float]) -> float:
-        return math.sqrt(sum(sizes[key] * value**2 for key, value in rmse.items()) / sum(sizes.values()))
-
-    pooled = {str(n): over_views(by_view) for n, by_view in refined.residuals.items()}
+    all_truth = _flat(truth)
+    pixels = {key: picture[0].numel() for key, picture in truth.items()}
+    pooled = {}
+    for n, by_view in refined.residuals.items():
+        pooled[str(n)] = math.sqrt(sum(pixels[key] * by_view[key] ** 2 for key in truth) / sum(pixels.values()))
     before, last = pooled.get(str(density // 2)), pooled[str(density)]
     order = math.log2(before / last) if before and last else None
     # A sample of the second estimate is a square of 1/16 of its pixel: a quarter of the density suffices.
-    second = max(1, density // 4)
-    while second > 1 and second**2 * max(sizes.values()) > MAX_FILTERED_PIXELS:
-        second //= 2
-    other = {v.name: supersampled(scene, v, second, SECOND_ESTIMATE, background) for v in views}
-    rmse = image_errors(_flat(other), _flat(truth))["rmse"]
+    second = max(1, min(density // 4, math.isqrt(MAX_FILTERED_PIXELS // max(pixels.values()))))
+    distance = image_errors(_flat(sample(second, SECOND_ESTIMATE)), all_truth)["rmse"]
     return {
         "footprint": UNFILTERED,
         "density": density,
         "samples_per_pixel": density**2,
-        "residual": image_errors(_flat(refined.half), _flat(truth)),
+        "residual": image_errors(_flat(refined.half), all_truth),
         "residual_rmse": pooled,
         "order": order,
         "expected_rmse": last / (2**order - 1) if order is not None and order > 0 else None,
-        "second_estimate": {"footprint": SECOND_ESTIMATE, "density": second, "rmse": rmse},
+        "second_estimate": {"footprint": SECOND_ESTIMATE, "density": second, "rmse": distance},
         "resolves_rmse_from": last / RMSE_SHARE,
     }
 
 
-def _split(method: Method, pictures: dict, exact: dict | None, truth: dict) -> dict:
+def _split(picture: torch.Tensor, exact: torch.Tensor, truth: torch.Tensor) -> dict[str, float]:
     """Splits the error of a footprint with one weight per splat into that of its weight and that of blending:
     rmse^2 = weight_rmse^2 + blending_rmse^2 + 2 correlation weight_rmse blending_rmse."""
-    if exact is None or not method.has_single_weight:
-        return dict.fromkeys(("weight_rmse", "blending_rmse", "correlation"))
-    weight, blending = _flat(pictures).double() - _flat(exact), _flat(exact).double() - _flat(truth)
+    weight, blending = picture.double() - exact, exact - truth
     weight_rmse, blending_rmse = (part.square().mean().sqrt().item() for part in (weight, blending))
     scale = weight_rmse * blending_rmse
     correlation = (weight * blending).mean().item() / scale if scale else 0.0
     return {"weight_rmse": weight_rmse, "blending_rmse": blending_rmse, "correlation": correlation}
 
 
-def _times(cases: dict[str, list[timing.Case]], rounds: int, base: str, timer=time.perf_counter) -> dict[str, dict]:
+def _times(cases: dict[str, list[timing.Case]], rounds: int, base: str, clock=time.perf_counter) -> dict[str, dict]:
     """Seconds per view of both passes, and their ratio to the base, of the round that counts (`timing.best_of`).
 
     `_usual` is the median round, which tells how much other work adds.
     """
     device = next(iter(cases.values()))[0].dL_dcolor.device.type
-    calls = {name: [getattr(case, passes) for case in of for passes in PASSES] for name, of in cases.items()}
+    calls = {name: [getattr(case, passes) for passes in PASSES for case in of] for name, of in cases.items()}
     with optional_import("tqdm").tqdm(desc="time", unit="call", disable=None) as bar:
-        samples = timing.time_calls(calls, device, rounds, timer, lambda seconds: SLOW * seconds[base], bar.update)
-    times = {}
-    for name, taken in samples.items():
-        times[name] = {}
-        for i, passes in enumerate(PASSES):
-            of_views = taken[i :: len(PASSES)]
-            times[name][f"{passes}_seconds"] = statistics.mean(timing.best_of(of, device) for of in of_views)
-            times[name][f"{passes}_usual_seconds"] = statistics.mean(map(statistics.median, of_views))
-    for of_name in times.values():
-        for passes in PASSES:
+        samples = timing.time_calls(calls, device, rounds, clock, base, bar.update)
+    times = {name: {} for name in [base, *cases]}  # the base first: the others are divided by it
+    for name, of_name in times.items():
+        views = len(cases[name])
+        for passes, taken in zip(PASSES, (samples[name][:views], samples[name][views:])):
+            of_name[f"{passes}_seconds"] = statistics.mean(timing.best_of(of_view, device) for of_view in taken)
+            of_name[f"{passes}_usual_seconds"] = statistics.mean(map(statistics.median, taken))
             for kind in (passes, f"{passes}_usual"):
                 of_name[f"{kind}_ratio"] = of_name[f"{kind}_seconds"] / times[base][f"{passes}_seconds"]
     return times
@@ -273,21 +270,27 @@ def _flat(pictures: dict[str, torch.Tensor]) -> torch.Tensor:
 
 def to_table(results: dict, at_scale: dict) -> tuple[list[str], list[list]]:
     """(header, rows) of one scale. Times are ratios on the CPU, milliseconds on CUDA."""
-    _, key, factor = _time_unit(results)
-    unit = "ms" if key == "seconds" else key
-    header = ["method", "PSNR [dB]", "RMSE", "bias", "99.9%", "max", "SSIM", f"forward [{unit}]"]
-    header += [f"with backward [{unit}]", "memory [MiB]", "weight RMSE", "blending RMSE", "front"]
-    formats = {"rmse": ".2e", "bias": ".2e", "p999": ".2e", "max": ".2e", "ssim": ".5f"}
-    formats |= {f"{passes}_{key}": ".2f" for passes in PASSES}
-    formats |= {"extra_bytes": ".0f", "weight_rmse": ".2e", "blending_rmse": ".2e"}
-    factors = {f"{passes}_{key}": factor for passes in PASSES} | {"extra_bytes": 2**-20}
+    _, time_key, factor = _time_unit(results)
+    unit = "ms" if time_key == "seconds" else time_key
+    columns = [  # header, key of a row, format, factor
+        ("RMSE", "rmse", ".2e", 1),
+        ("bias", "bias", ".2e", 1),
+        ("99.9%", "p999", ".2e", 1),
+        ("max", "max", ".2e", 1),
+        ("SSIM", "ssim", ".5f", 1),
+        (f"forward [{unit}]", f"forward_{time_key}", ".2f", factor),
+        (f"with backward [{unit}]", f"forward_backward_{time_key}", ".2f", factor),
+        ("memory [MiB]", "extra_bytes", ".0f", 2**-20),
+        ("weight RMSE", "weight_rmse", ".2e", 1),
+        ("blending RMSE", "blending_rmse", ".2e", 1),
+    ]
     rows = []
     for row in at_scale["methods"]:
-        cells = [row["method"], ("" if row["resolved"] else "~") + f"{row['psnr']:.2f}"]
-        for name, digits in formats.items():
-            cells.append(None if row[name] is None else f"{row[name] * factors.get(name, 1):{digits}}")
-        rows.append([*cells, "".join(letter for letter, p in zip("FB", PASSES) if row[f"{p}_front"]) or None])
-    return header, rows
+        cells = [None if row[key] is None else f"{row[key] * by:{digits}}" for _, key, digits, by in columns]
+        psnr = ("" if row["resolved"] else "~") + f"{row['psnr']:.2f}"
+        front = "F" * row["forward_front"] + "B" * row["forward_backward_front"]
+        rows.append([row["method"], psnr, *cells, front or None])
+    return ["method", "PSNR [dB]", *(header for header, *_ in columns), "front"], rows
 
 
 def _time_unit(results: dict) -> tuple[str, str, float]:
@@ -303,14 +306,13 @@ def describe(results: dict, at_scale: dict) -> list[str]:
         row = next(row for row in at_scale["methods"] if row["method"] == base)
         seconds = " / ".join(f"{1e3 * row[f'{passes}_seconds']:.1f}" for passes in PASSES)
         clock = " of CPU time" if results["clock"] == "CPU time" else ""
-        lines.append(
-            f"times are ratios to {base}, {seconds} ms{clock}; the fastest of {results['rounds']} rounds in turn"
-        )
-    density, second = reference["density"], reference["second_estimate"]
+        rounds = f"the fastest of {results['rounds']} rounds in turn"
+        lines.append(f"times are ratios to {base}, {seconds} ms{clock}; {rounds}")
+    density, second, change = reference["density"], reference["second_estimate"], reference["residual"]
     order = "" if reference["order"] is None else f" (order {reference['order']:.1f})"
-    change = "RMSE {rmse:.1e}{order}, bias {bias:.0e}, at most {max:.1e}".format(order=order, **reference["residual"])
     lines.append(
-        f"reference: {density}x{density} unfiltered samples per pixel; from half that density it changes by {change}; "
+        f"reference: {density}x{density} unfiltered samples per pixel; from half that density it changes by RMSE "
+        f"{change['rmse']:.1e}{order}, bias {change['bias']:.0e}, at most {change['max']:.1e}; "
         f"from {second['footprint']} at {second['density']}x{second['density']} it differs by RMSE {second['rmse']:.1e}"
     )
     unresolved = [row["method"] for row in at_scale["methods"] if not row["resolved"]]

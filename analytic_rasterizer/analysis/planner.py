@@ -91,13 +91,13 @@ def inspect_scene(
     survey = _survey(scene, cameras, tolerance, training)
     ladder = [BASE, "box:samples=4", *(f"adaptive:tolerance={k * tolerance:.4g}" for k in ADAPTIVE), "box:samples=8"]
     rms = {footprint: [] for footprint in [*ladder, REFERENCE]}
-    fitting, in_views = list(rms), []
+    fitting, seen = list(rms), []  # footprints within the tolerance so far; what each view shows
     shown = on_image = torch.zeros(len(scene.means), dtype=torch.bool, device=scene.means.device)
     top_band = 0.0  # what the last band of the harmonics changes
     for camera in cameras:
         reference = _stages(scene, camera, REFERENCE, survey.everything)
-        in_views.append(_touching(reference))
-        shown, on_image = shown | in_views[-1], on_image | (reference.radii > 0)
+        seen.append(_touching(reference))
+        shown, on_image = shown | seen[-1], on_image | (reference.radii > 0)
         for footprint in list(fitting):
             stages = _stages(scene, camera, footprint, survey.effects)
             rms[footprint].append(_rms(stages, reference))
@@ -114,12 +114,11 @@ def inspect_scene(
     cheapest = min(seconds[name] for name in fitting)
     footprint = next(name for name in fitting if seconds[name] <= SAME * cheapest)
     costs = {name: of_name / seconds[BASE] for name, of_name in seconds.items()}
-    candidates = tuple(Candidate(name, max(rms[name]), name in fitting, costs.get(name)) for name in rms)
-    names = [getattr(view, "name", f"view_{i:03d}") for i, view in enumerate(views)]
-    reports = tuple(
-        _view_report(scene, survey, i, names[i], camera, in_views[i], rms[footprint][i], tolerance)
-        for i, camera in enumerate(cameras)
-    )
+    candidates = {name: Candidate(name, max(rms[name]), name in fitting, costs.get(name)) for name in rms}
+    reports = []
+    for i, camera in enumerate(cameras):
+        name = getattr(views[i], "name", f"view_{i:03d}")
+        reports.append(_view_report(scene, survey, i, name, camera, seen[i], rms[footprint][i], tolerance))
     costs = _effect_costs(scene, timed, footprint, survey.effects, shown, rounds)
     findings = (
         _footprint_finding(candidates, footprint, reports),
@@ -129,7 +128,7 @@ def inspect_scene(
         *_other_findings(survey, costs["outputs"]),
     )
     machine = timing.describe_machine(scene.means.device.type)
-    found = (survey.effects, footprint, findings, candidates, reports, shown)
+    found = (survey.effects, footprint, findings, tuple(candidates.values()), tuple(reports), shown)
     return SceneReport(len(scene.means), scene.sh_degree, tolerance, machine, *found)
 
 
@@ -141,20 +140,20 @@ def _check(scene, views, tolerance, training_views, *options) -> tuple[list, lis
         raise TypeError(f"tolerance must be a number, got {tolerance!r}")
     if not 0 <= tolerance < math.inf:
         raise ValueError(f"tolerance must be finite and not negative, got {tolerance}")
-    cameras = []
-    for what, given, settings in (("views", views, options), ("training_views", training_views, ())):
-        if what == "training_views" and given is None:
-            return cameras[0], None
-        if not isinstance(given, Sequence):
-            raise TypeError(f"{what} must be a list of views, got {type(given).__name__}")
-        for view in given:
-            if not isinstance(view, (View, GaussianRasterizationSettings)):
-                raise TypeError(f"{what} must hold io.View or GaussianRasterizationSettings, got {type(view).__name__}")
-        if not given:
-            raise ValueError(f"{what} must hold at least one view, got none")
-        device = scene.means.device
-        cameras.append([v.settings(*settings, device=device) if isinstance(v, View) else v for v in given])
-    return cameras[0], cameras[1]
+    device = scene.means.device
+    cameras = _cameras("views", views, device, *options)
+    return cameras, None if training_views is None else _cameras("training_views", training_views, device)
+
+
+def _cameras(what: str, views, device, *options) -> list[GaussianRasterizationSettings]:
+    if not isinstance(views, Sequence):
+        raise TypeError(f"{what} must be a list of views, got {type(views).__name__}")
+    for view in views:
+        if not isinstance(view, (View, GaussianRasterizationSettings)):
+            raise TypeError(f"{what} must hold io.View or GaussianRasterizationSettings, got {type(view).__name__}")
+    if not views:
+        raise ValueError(f"{what} must hold at least one view, got none")
+    return [view.settings(*options, device=device) if isinstance(view, View) else view for view in views]
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,17 +224,6 @@ def _rms(stages: Stages, reference: Stages) -> float:
     return (stages.color.double() - reference.color).square().mean().sqrt().item()
 
 
-@torch.no_grad()
-def tile_samples(settings: GaussianRasterizationSettings, gaussians: dict[str, torch.Tensor]) -> torch.Tensor:
-    """(rows, columns) int32 on the CPU: the samples that `adaptive`, the footprint of `settings`, takes in every tile.
-
-    `gaussians` are the keywords of `GaussianRasterizer.forward`.
-    """
-    stages = render_stages(settings, **{name: value for name, value in gaussians.items() if name != "means2D"})
-    chosen = stages.tile_samples
-    return chosen.reshape(-(-settings.image_height // TILE), -1).cpu()
-
-
 def _seconds(cases: dict[str, tuple], cameras: list, rounds: int | None) -> dict[str, float]:
     """Seconds of the forward passes of all cameras, by case: (scene, footprint, effects)."""
     passes, device = {}, cameras[0].viewmatrix.device.type
@@ -246,37 +234,36 @@ def _seconds(cases: dict[str, tuple], cameras: list, rounds: int | None) -> dict
     return {name: sum(timing.best_of(taken, device) for taken in of) for name, of in samples.items()}
 
 
-def _effect_costs(scene, cameras, footprint, effects: Effects, shown, rounds) -> dict[str, float]:
+def _effect_costs(scene: Scene, cameras, footprint, effects: Effects, shown, rounds) -> dict[str, float]:
     """Time with an effect over that without, by effect."""
     only_shown = Scene(*(field[shown] for field in scene[:-1]), scene.sh_degree)
-    filter_3d = None if effects.filter_3d is None else effects.filter_3d[shown]
-    pairs = {"culls": ("plain", "shown"), "outputs": ("outputs", "plain")}
-    variants = {"plain": {}, "outputs": {"alpha": True, "depth": True}}
+    filter_of_shown = None if effects.filter_3d is None else effects.filter_3d[shown]
+    cases = {
+        "plain": (scene, footprint, effects),
+        "shown": (only_shown, footprint, replace(effects, filter_3d=filter_of_shown)),
+        "outputs": (scene, footprint, replace(effects, alpha=True, depth=True)),
+    }
+    with_and_without = {"culls": ("plain", "shown"), "outputs": ("outputs", "plain")}
     if scene.sh_degree > 0:
-        pairs["sh"], variants["bands"], variants["no bands"] = (
-            ("bands", "no bands"),
-            {"sh_degree": None},
-            {"sh_degree": 0},
-        )
+        cases["bands"], cases["no bands"] = ((scene, footprint, replace(effects, sh_degree=n)) for n in (None, 0))
+        with_and_without["sh"] = ("bands", "no bands")
     if effects.filter_3d is not None:
-        pairs["filter_3d"], variants["no filter"] = ("plain", "no filter"), {"filter_3d": None}
-    cases = {name: (scene, footprint, replace(effects, **changed)) for name, changed in variants.items()}
-    cases["shown"] = (only_shown, footprint, replace(effects, filter_3d=filter_3d))
+        cases["no filter"] = (scene, footprint, replace(effects, filter_3d=None))
+        with_and_without["filter_3d"] = ("plain", "no filter")
     seconds = _seconds(cases, cameras, rounds)
-    return {name: seconds[a] / seconds[b] for name, (a, b) in pairs.items()}
+    return {name: seconds[on] / seconds[off] for name, (on, off) in with_and_without.items()}
 
 
-def _footprint_finding(candidates: tuple[Candidate, ...], footprint: str, views: tuple[ViewReport, ...]) -> Finding:
-    tried = {candidate.footprint: candidate for candidate in candidates}
+def _footprint_finding(candidates: dict[str, Candidate], footprint: str, views: list[ViewReport]) -> Finding:
     narrow = sum(v.narrow * v.shown for v in views) / max(1, sum(v.shown for v in views))
     tiles = torch.cat([v.tile_samples.flatten() for v in views])
     shares = ", ".join(f"{n} for {percent(share(tiles == n))}" for n in TILE_SAMPLES)
+    best = candidates[footprint]
     reason = (
         f"{percent(narrow)} of the splats have a standard deviation below {NARROW:g} px; samples that tiles need: "
-        f"{shares}; {footprint} is within {in_255(tried[footprint].rms)}/255 of everything on"
+        f"{shares}; every view is within {in_255(best.rms)}/255 of everything on"
     )
-    cost = tried[footprint].cost
-    return Finding("footprint", footprint != BASE, tried[BASE].rms, "measured", cost, footprint, reason)
+    return Finding("footprint", footprint != BASE, candidates[BASE].rms, "measured", best.cost, footprint, reason)
 
 
 def _sh_finding(scene: Scene, survey: _Survey, top_band: float, cost: float | None) -> Finding:
@@ -286,7 +273,7 @@ def _sh_finding(scene: Scene, survey: _Survey, top_band: float, cost: float | No
     bounds = ", ".join(in_255(bound) for bound in survey.bounds[1:])
     reason = f"bands 1 to {scene.sh_degree} add at most {bounds} /255 to a colour"
     if degree is None:
-        reason += ", the last of them more than half the tolerance; the change is that of leaving it out"
+        reason += "; the last exceeds half the tolerance, and the change is what the views lose without it"
         return Finding(name, True, top_band, "measured", cost, f"degree {scene.sh_degree}", reason)
     reason += f"; left out: those above {degree}"
     return Finding(name, degree > 0, sum(survey.bounds[degree + 1 :]), "bound", cost, f"degree {degree}", reason)
@@ -311,26 +298,28 @@ def _cull_finding(scene: Scene, cameras: list, shown, on_image, cost: float) -> 
     count, *parts = (int(which.sum()) for which in (~shown, behind, hidden & faint, hidden & ~faint))
     reason = (
         f"{count} of {len(shown)} Gaussians touch no pixel of these views: {parts[0]} behind the near plane of every "
-        f"view, {parts[1]} too faint or too small, {parts[2]} beside every picture or not finite; `shown` is the mask "
-        "of the others, the cost that of keeping all"
+        f"view, {parts[1]} too faint or too small, {parts[2]} beside every picture or not finite; the cost is that of "
+        "rendering them too, and `shown` of the report is the mask of the others"
     )
     return Finding("hidden Gaussians", False, 0.0, "bound", cost, f"drop {count}", reason)
 
 
 def _other_findings(survey: _Survey, cost_of_outputs: float) -> tuple[Finding, ...]:
     """Orthographic views, views whose axis is off centre, and outputs."""
-    flat, off, count = survey.effects.orthographic, sum(survey.off_center), len(survey.off_center)
-    reasons = (
-        f"w of clip space {'does not depend' if flat else 'depends'} on the position",
-        f"in {off} of {count} views an edge of the picture is more than {FRUSTUM_CLAMP} half pictures away from the "
-        "optical axis",
+    flat, off = survey.effects.orthographic, sum(survey.off_center)
+    w = f"w of clip space {'is the same for every position' if flat else 'depends on the position'}"
+    edge = (
+        f"in {off} of {len(survey.off_center)} views an edge of the picture is more than {FRUSTUM_CLAMP} half pictures "
+        "away from the optical axis"
+    )
+    outputs = (
         "no scene calls for alpha, depth, other outputs, camera gradients, defocus or motion: off until asked for; the "
-        "cost is that of alpha and depth together",
+        "cost is that of alpha and depth together"
     )
     return (
-        Finding("orthographic", flat, None, None, None, "on" if flat else "off", reasons[0]),
-        Finding("off-centre clamp", off > 0, None, None, None, "on" if off else "off", reasons[1]),
-        Finding("outputs", False, None, None, cost_of_outputs, "off", reasons[2]),
+        Finding("orthographic", flat, None, None, None, "on" if flat else "off", w),
+        Finding("off-centre clamp", off > 0, None, None, None, "on" if off else "off", edge),
+        Finding("outputs", False, None, None, cost_of_outputs, "off", outputs),
     )
 
 
@@ -343,6 +332,7 @@ def _smaller_sigmas(splats: Splats) -> torch.Tensor:
 
 def _view_report(scene, survey: _Survey, i: int, name: str, camera, shown, rms: float, tolerance: float) -> ViewReport:
     settings, gaussians = _prepare(scene, camera, f"adaptive:tolerance={tolerance}", survey.effects)
+    tile_samples = render_stages(settings, **gaussians).tile_samples
     names = ("means3D", "opacities", "scales", "rotations")
     sigmas = _smaller_sigmas(project(settings, **{name: gaussians[name][shown] for name in names}))
     bins = torch.bucketize(sigmas, sigmas.new_tensor(BINS[1:-1]))
@@ -357,5 +347,5 @@ def _view_report(scene, survey: _Survey, i: int, name: str, camera, shown, rms: 
         finer=None if ratio is None else share(ratio > FINER),
         finest=None if ratio is None or not len(ratio) else ratio.max().item(),
         rms=rms,
-        tile_samples=tile_samples(settings, gaussians),
+        tile_samples=tile_samples.reshape(-(-camera.image_height // TILE), -1).cpu(),
     )

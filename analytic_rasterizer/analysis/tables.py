@@ -6,7 +6,7 @@ import csv
 import math
 from pathlib import Path
 
-from ..footprints import FOOTPRINTS, resolve_footprint
+from ..footprints import resolve_footprint
 from ..io import optional_import
 
 STYLES = {  # colour and marker
@@ -19,7 +19,7 @@ STYLES = {  # colour and marker
     "erf": ("#e599b8", "d"),
     "exact": ("#000000", "*"),
 }
-OTHER_STYLES = (("#0c8599", "h"), ("#8d6e4b", "p"), ("#a9a000", "<"), ("#5f3dc4", ">"))  # of footprints not listed
+OTHER_STYLE = ("#0c8599", "h")  # of footprints that are not listed
 
 
 def style(footprint: str) -> dict:
@@ -29,9 +29,7 @@ def style(footprint: str) -> dict:
     """
     spec = resolve_footprint(footprint)
     samples = dict(spec.options).get("samples")
-    others = [name for name in FOOTPRINTS if name not in STYLES]
-    known = STYLES.get(spec.name)
-    color, marker = known or OTHER_STYLES[others.index(spec.name) % len(OTHER_STYLES)]
+    color, marker = STYLES.get(spec.name, OTHER_STYLE)
     is_default = samples is not None or spec == resolve_footprint(spec.name)
     color = _shade(color, math.log2(samples) / 4 - 0.5 if samples else 0.0 if is_default else 0.5)
     return {"color": color, "marker": marker, "linestyle": "-" if is_default else "--"}
@@ -55,18 +53,12 @@ def new_figure(width: float, height: float, columns: int = 1, rows: int = 1, **o
 
 
 def add_titles(figure, axes, title: str, xlabel: str = "") -> None:
-    """Logarithmic x axes labelled 1, 2, 5, 10, ..., the title, and the legend of the last axes at the right."""
+    """Logarithmic x axes with labels, the title, and the legend of the last axes at the right."""
     ticker = optional_import("matplotlib.ticker", "analysis")
     for ax in axes.flat:
         ax.set_xscale("log")
         low, high = ax.get_xlim()
-        subs = (
-            (1, 2, 5)
-            if high / low >= 12
-            else (1, 1.5, 2, 3, 5, 7)
-            if high / low >= 3
-            else (1, 1.2, 1.4, 1.7, 2, 3, 4, 6, 8)
-        )
+        subs = (1, 2, 5) if high / low >= 12 else (1, 1.2, 1.5, 2, 3, 5, 7)
         ax.xaxis.set_major_locator(ticker.LogLocator(subs=subs))
         ax.xaxis.set_major_formatter("{x:g}")
         ax.xaxis.set_minor_formatter(ticker.NullFormatter())

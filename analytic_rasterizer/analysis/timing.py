@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import math
 import platform
 import statistics
 import sys
@@ -19,6 +18,7 @@ from .. import _C, io
 from ..rasterizer import GaussianRasterizer
 
 ROUNDS = {"cpu": 5, "cuda": 20}
+SLOW = 20  # calls that take so many times as long as the base are timed only once on the CPU
 WARM_UP = 40  # calls before timing on CUDA: the first 32 frames of a size wait for the device
 
 
@@ -57,11 +57,9 @@ class Case:
         return torch.nn.functional.avg_pool2d(color[None], n)[0] if n > 1 else color
 
     def extra_bytes(self) -> int:
-        """Bytes that forward and backward need in addition to inputs, outputs and gradients."""
-        device = self.dL_dcolor.device
-        before = reset_peak_memory(device)
-        results = self.forward_backward()
-        return peak_memory(device) - before - sum(t.numel() * t.element_size() for t in results)
+        """Bytes that forward and backward need in addition to inputs, outputs and gradients; below 0 where unknown."""
+        results, added = added_memory(self.forward_backward, self.dL_dcolor.device)
+        return added - sum(t.numel() * t.element_size() for t in results)
 
 
 @functools.cache
@@ -100,8 +98,8 @@ def time_calls(
     calls: dict[Any, list[Callable[[], object]]],
     device: str,
     rounds: int | None = None,
-    timer: Callable[[], float] = time.perf_counter,
-    limit: Callable[[dict[Any, float]], float] = lambda seconds: math.inf,
+    clock: Callable[[], float] = time.perf_counter,
+    base: Any = None,
     progress: Callable[[], object] = lambda: None,
 ) -> dict[Any, list[list[float]]]:
     """Seconds of every call, by key: a list of rounds for every call of a key.
@@ -113,27 +111,27 @@ def time_calls(
         calls: What to time.
         device: "cpu" or "cuda".
         rounds: Timed rounds; None is ROUNDS of the device.
-        timer: The clock on the CPU, in seconds.
-        limit: Given the seconds of every key in the round that warms up, how many a key may take to be timed again on
-            the CPU; for a slower one that round counts.
+        clock: On the CPU, in seconds.
+        base: A key. Where the calls of another take SLOW times as long in the round that warms up, that round counts
+            and they are not timed again. CPU only; None: all are timed again.
         progress: Called before every timed call.
     """
     rounds = rounds or ROUNDS[device]
 
-    def clock(call):
+    def measure(call):
         progress()
-        return event_seconds(call) if device == "cuda" else seconds_of(call, timer)
+        return event_seconds(call) if device == "cuda" else seconds_of(call, clock)
 
     if device == "cuda":
         samples = {}
         for key, of_key in calls.items():
             warm_up_cuda(of_key, WARM_UP)
-            samples[key] = [[clock(call) for _ in range(rounds)] for call in of_key]
+            samples |= in_turn({key: of_key}, measure, rounds)
         return samples
-    first = in_turn(calls, clock, 1)
+    first = in_turn(calls, measure, 1)
     totals = {key: sum(taken[0] for taken in of_key) for key, of_key in first.items()}
-    again = {key: of_key for key, of_key in calls.items() if totals[key] <= limit(totals)}
-    return first | in_turn(again, clock, rounds)
+    again = {key: of for key, of in calls.items() if base is None or totals[key] <= SLOW * totals[base]}
+    return first | in_turn(again, measure, rounds)
 
 
 def best_of(samples: list[float], device: str) -> float:
@@ -141,11 +139,11 @@ def best_of(samples: list[float], device: str) -> float:
     return statistics.median(samples) if device == "cuda" else min(samples)
 
 
-def seconds_of(call: Callable[[], object], timer: Callable[[], float] = time.perf_counter) -> float:
+def seconds_of(call: Callable[[], object], clock: Callable[[], float] = time.perf_counter) -> float:
     """Time until a call returns."""
-    start = timer()
+    start = clock()
     call()
-    return timer() - start
+    return clock() - start
 
 
 def event_seconds(call: Callable[[], object]) -> float:
@@ -167,29 +165,24 @@ def warm_up_cuda(calls: list[Callable[[], object]], passes: int) -> None:
     torch.cuda.synchronize()
 
 
-def reset_peak_memory(device: torch.device) -> int:
-    """Makes the peak start again from the memory in use now, which is returned, in bytes; 0 where that is unknown."""
+def added_memory(call: Callable[[], Any], device: torch.device) -> tuple[Any, int]:
+    """What a call returns, and the most bytes in use during it beyond those before it; 0 where that is unknown."""
     if device.type == "cuda":
         torch.cuda.synchronize()
         torch.cuda.reset_peak_memory_stats()
-        return torch.cuda.memory_allocated()
+        before = torch.cuda.memory_allocated()
+        return call(), torch.cuda.max_memory_allocated() - before
     if sys.platform != "linux":
-        return 0
+        return call(), 0
     libc = ctypes.CDLL(None)  # glibc is told to hand freed blocks back to the system, so that peaks can be compared
     libc.mallopt(-3, 1 << 16)  # M_MMAP_THRESHOLD: blocks above 64 KiB go back when freed
     libc.malloc_trim(0)
     try:
-        Path("/proc/self/clear_refs").write_text("5")
+        Path("/proc/self/clear_refs").write_text("5")  # the peak starts again from what is in use now
     except OSError:
-        return 0
-    return _status("VmRSS")
-
-
-def peak_memory(device: torch.device) -> int:
-    """The most memory in use since the last reset, bytes; 0 where that is unknown."""
-    if device.type == "cuda":
-        return torch.cuda.max_memory_allocated()
-    return _status("VmHWM") if sys.platform == "linux" else 0
+        return call(), 0
+    before = _status("VmRSS")
+    return call(), _status("VmHWM") - before
 
 
 def _status(key: str) -> int:

@@ -51,39 +51,25 @@ def _describe(error: BaseException) -> str:
 
 
 def add_scene(parser) -> None:
-    parser.add_argument("scene", metavar="SCENE", help="3DGS .ply, compressed .ply or .spz")
-    parser.add_argument(
-        "--views",
-        required=True,
-        help="3DGS cameras.json, Blender or nerfstudio transforms.json, or a list of {width, height, fx, fy, w2c}",
-    )
-
-
-def add_scale(parser) -> None:
-    parser.add_argument("--scale", type=positive_number, default=1.0, help="resolution, as a factor (default: 1)")
-
-
-def add_view_options(parser) -> None:
-    parser.add_argument(
-        "--background",
-        nargs=3,
-        type=intensity,
-        default=(0.0, 0.0, 0.0),
-        metavar=("R", "G", "B"),
-        help="colour behind the scene, 0 to 1 (default: black)",
-    )
-    parser.add_argument(
-        "--size",
-        nargs=2,
-        type=count,
-        metavar=("W", "H"),
-        help="image size for a views file that does not state one",
-    )
+    """SCENE, --views, and how to render them."""
+    add = parser.add_argument
+    add("scene", metavar="SCENE", help="3DGS .ply, compressed .ply or .spz")
+    views = "3DGS cameras.json, Blender or nerfstudio transforms.json, or a list of {width, height, fx, fy, w2c}"
+    add("--views", required=True, help=views)
+    size = "image size for a views file that does not state one"
+    add("--size", nargs=2, type=count, metavar=("W", "H"), help=size)
+    background = "colour behind the scene, 0 to 1 (default: black)"
+    add("--background", nargs=3, type=intensity, default=(0.0, 0.0, 0.0), metavar=("R", "G", "B"), help=background)
+    add_machine_options(parser)
 
 
 def add_machine_options(parser) -> None:
     parser.add_argument("--threads", type=count, metavar="N", help="CPU threads (default: all)")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+
+
+def add_scale(parser) -> None:
+    parser.add_argument("--scale", type=positive_number, default=1.0, help="resolution, as a factor (default: 1)")
 
 
 def use_machine(args) -> None:

@@ -14,22 +14,13 @@ def add_parser(subcommands) -> None:
         "and the exact integral, and both errors of every footprint from 0.02 to 20 px. Writes plots (.png, .svg), "
         ".csv files and summary.md to DIR, and prints the summary.",
     )
-    parser.add_argument("--out", required=True, metavar="DIR", help="folder for the results")
-    parser.add_argument(
-        "--samples",
-        type=count,
-        default=errors.SAMPLES,
-        metavar="N",
-        help="splats of each standard deviation (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--monte-carlo",
-        type=count,
-        default=errors.MONTE_CARLO,
-        metavar="N",
-        help="samples in a pixel (default: %(default)s, as in the paper)",
-    )
-    parser.add_argument("--threads", type=count, metavar="N", help="CPU threads (default: all)")
+    add = parser.add_argument
+    add("--out", required=True, metavar="DIR", help="folder for the results")
+    samples = "splats of each standard deviation (default: %(default)s)"
+    add("--samples", type=count, default=errors.SAMPLES, metavar="N", help=samples)
+    monte_carlo = "samples in a pixel (default: %(default)s, as in the paper)"
+    add("--monte-carlo", type=count, default=errors.MONTE_CARLO, metavar="N", help=monte_carlo)
+    add("--threads", type=count, metavar="N", help="CPU threads (default: all)")
     parser.set_defaults(run=run, device="cpu")
 
 

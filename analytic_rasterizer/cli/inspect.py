@@ -7,18 +7,7 @@ from pathlib import Path
 
 from .. import io
 from ..analysis.planner import inspect_scene
-from .arguments import (
-    add_machine_options,
-    add_scale,
-    add_scene,
-    add_view_options,
-    count,
-    tolerance,
-    use_machine,
-    writable_folder,
-)
-
-PLOTS = (".png", ".svg", ".pdf")
+from .arguments import add_scale, add_scene, count, tolerance, use_machine, writable_folder
 
 
 def add_parser(subcommands) -> None:
@@ -30,30 +19,16 @@ def add_parser(subcommands) -> None:
         "what each effect changes and costs, and what the views show.",
     )
     add_scene(parser)
-    parser.add_argument(
-        "--tolerance",
-        type=tolerance,
-        default=1 / 255,
-        metavar="T",
-        help="root mean square over a view, in units of colour, 0 to 1 (default: 1/255)",
-    )
-    parser.add_argument("--training-views", metavar="F", help="file of the views that the scene was trained from")
     add_scale(parser)
-    parser.add_argument(
-        "--max-views",
-        type=count,
-        default=8,
-        metavar="N",
-        help="look at no more than N views, evenly spread over the file (default: %(default)s)",
-    )
-    parser.add_argument("--json", metavar="FILE", help="write the findings as JSON; - prints them instead of the text")
-    parser.add_argument(
-        "--picture",
-        metavar="FILE",
-        help="plot what the views show, as .png, .svg or .pdf: sizes of splats, and samples per tile",
-    )
-    add_view_options(parser)
-    add_machine_options(parser)
+    add = parser.add_argument
+    rms = "root mean square over a view, in units of colour, 0 to 1 (default: 1/255)"
+    add("--tolerance", type=tolerance, default=1 / 255, metavar="T", help=rms)
+    add("--training-views", metavar="F", help="file of the views that the scene was trained from")
+    views = "look at no more than N views, evenly spread over the file (default: %(default)s)"
+    add("--max-views", type=count, default=8, metavar="N", help=views)
+    add("--json", metavar="FILE", help="write the findings as JSON; - prints them instead of the text")
+    picture = "plot what the views show, as .png, .svg or .pdf: sizes of splats, and samples per tile"
+    add("--picture", metavar="FILE", help=picture)
     parser.set_defaults(run=run)
 
 
@@ -61,8 +36,8 @@ def run(args) -> None:
     """Inspects the scene and prints the report."""
     if args.picture:  # raises before anything is rendered
         io.optional_import("matplotlib.figure", "analysis")
-        if Path(args.picture).suffix not in PLOTS:
-            raise ValueError(f"--picture must end in {', '.join(PLOTS[:-1])} or {PLOTS[-1]}, got {args.picture}")
+        if Path(args.picture).suffix not in (".png", ".svg", ".pdf"):
+            raise ValueError(f"--picture must end in .png, .svg or .pdf, got {args.picture}")
     use_machine(args)
     views = io.load_views(args.views, args.size)
     limit = min(len(views), args.max_views)
@@ -72,7 +47,7 @@ def run(args) -> None:
         if path not in (None, "-"):
             writable_folder(Path(path).parent)
     scene = io.load_scene(args.scene).to(args.device)
-    found = inspect_scene(scene, views, args.tolerance, training, scale=args.scale, background=tuple(args.background))
+    found = inspect_scene(scene, views, args.tolerance, training, scale=args.scale, background=args.background)
     if args.picture:
         found.save_picture(args.picture)
     if args.json:

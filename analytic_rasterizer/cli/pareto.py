@@ -7,7 +7,7 @@ from pathlib import Path
 from .. import io
 from ..analysis import pareto, tables
 from ..analysis.reference import MAX_DENSITY
-from .arguments import add_machine_options, add_scene, add_view_options, count, density, use_machine, writable_folder
+from .arguments import add_scene, count, density, use_machine, writable_folder
 
 
 def add_parser(subcommands) -> None:
@@ -21,45 +21,21 @@ def add_parser(subcommands) -> None:
         "methods that no other beats, forward and with backward.",
     )
     add_scene(parser)
-    parser.add_argument("--out", default="pareto", metavar="DIR", help="folder for the results (default: %(default)s)")
-    parser.add_argument(
-        "--scales",
-        nargs="+",
-        type=count,
-        default=[1, 2, 4, 8],
-        metavar="N",
-        help="1/N of the views' size; a remainder is cut off (default: 1 2 4 8)",
-    )
-    parser.add_argument(
-        "--footprints",
-        nargs="+",
-        metavar="NAME[:k=v,..][@N]",
-        help="methods; @N renders N x N times the pixels and averages (default: {})".format(
-            " ".join(method.name for method in pareto.default_methods())
-        ),
-    )
-    parser.add_argument("--limit-views", type=count, metavar="N", help="only the first N views")
-    parser.add_argument(
-        "--crop",
-        nargs=2,
-        type=count,
-        metavar=("W", "H"),
-        help="only the middle W x H pixels of the picture, at every scale (default: all of it)",
-    )
-    parser.add_argument("--rounds", type=count, metavar="N", help="timed rounds (default: 5, with CUDA 20)")
-    parser.add_argument(
-        "--cpu-time",
-        action="store_true",
-        help="count CPU seconds instead of the wall clock's: on a shared machine, with --threads 1",
-    )
-    parser.add_argument(
-        "--max-density",
-        type=density,
-        metavar="N",
-        help=f"samples of the reference along a pixel's side, at most (default: {MAX_DENSITY})",
-    )
-    add_view_options(parser)
-    add_machine_options(parser)
+    add = parser.add_argument
+    add("--out", default="pareto", metavar="DIR", help="folder for the results (default: %(default)s)")
+    scales = "1/N of the views' size; a remainder is cut off (default: 1 2 4 8)"
+    add("--scales", nargs="+", type=count, default=[1, 2, 4, 8], metavar="N", help=scales)
+    names = " ".join(method.name for method in pareto.default_methods())
+    methods = f"methods; @N renders N x N times the pixels and averages (default: {names})"
+    add("--footprints", nargs="+", metavar="NAME[:k=v,..][@N]", help=methods)
+    add("--limit-views", type=count, metavar="N", help="only the first N views")
+    crop = "only the middle W x H pixels of the picture, at every scale (default: all of it)"
+    add("--crop", nargs=2, type=count, metavar=("W", "H"), help=crop)
+    add("--rounds", type=count, metavar="N", help="timed rounds (default: 5, with CUDA 20)")
+    cpu_time = "count CPU seconds instead of the wall clock's: on a shared machine, with --threads 1"
+    add("--cpu-time", action="store_true", help=cpu_time)
+    at_most = f"samples of the reference along a pixel's side, at most (default: {MAX_DENSITY})"
+    add("--max-density", type=density, metavar="N", help=at_most)
     parser.set_defaults(run=run)
 
 
@@ -76,8 +52,8 @@ def run(args) -> None:
         views,
         args.scales,
         methods,
-        crop=args.crop and tuple(args.crop),
-        background=tuple(args.background),
+        crop=args.crop,
+        background=args.background,
         rounds=args.rounds,
         max_density=args.max_density,
         cpu_time=args.cpu_time,

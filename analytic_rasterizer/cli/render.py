@@ -5,7 +5,7 @@ from __future__ import annotations
 from .. import io, render_stages
 from ..analysis import tables
 from ..footprints import FOOTPRINTS
-from .arguments import add_machine_options, add_scale, add_scene, add_view_options, use_machine, writable_folder
+from .arguments import add_scale, add_scene, use_machine, writable_folder
 
 STAGES = ("project", "bin", "blend")
 
@@ -14,22 +14,16 @@ def add_parser(subcommands) -> None:
     parser = subcommands.add_parser(
         "render",
         help="render a scene from the views of a file, as PNG",
-        description="Render SCENE from every view of VIEWS into DIR/NAME.png, and say what each "
-        "stage cost. Footprints: "
-        + ", ".join(FOOTPRINTS)
-        + "; options follow a colon: box:samples=4, point:dilation=0.",
+        description="Render SCENE from every view of VIEWS into DIR/NAME.png, and say what each stage cost. "
+        f"Footprints: {', '.join(FOOTPRINTS)}; options follow a colon: box:samples=4, point:dilation=0.",
     )
     add_scene(parser)
-    parser.add_argument("--out", required=True, metavar="DIR", help="folder for the pictures")
-    parser.add_argument(
-        "--footprint",
-        metavar="NAME[:k=v,..]",
-        help="how a pixel sees a splat (default: the library's, analytic)",
-    )
-    parser.add_argument("--samples", type=int, help="samples of the box footprint: 1, 2, 4, 8, 16")
     add_scale(parser)
-    add_view_options(parser)
-    add_machine_options(parser)
+    add = parser.add_argument
+    add("--out", required=True, metavar="DIR", help="folder for the pictures")
+    footprint = "how a pixel sees a splat (default: the library's, analytic)"
+    add("--footprint", metavar="NAME[:k=v,..]", help=footprint)
+    add("--samples", type=int, help="samples of the box footprint: 1, 2, 4, 8, 16")
     parser.set_defaults(run=run)
 
 
@@ -46,12 +40,7 @@ def run(args) -> None:
     with tqdm(views, desc="render", unit="view", disable=None) as progress:
         for view in progress:
             settings = view.settings(
-                args.scale,
-                args.background,
-                scene.sh_degree,
-                args.footprint,
-                device=args.device,
-                **options,
+                args.scale, args.background, scene.sh_degree, args.footprint, device=args.device, **options
             )
             stages = render_stages(settings, **scene.arguments())
             io.to_image(stages.color).save(out / f"{view.name}.png")
