@@ -42,6 +42,24 @@ void check_rows(const Tensor& t, const char* name, int64_t count, std::initializ
                     shape_of(t));
 }
 
+/// What other tensors must match.
+struct Like {
+  const Tensor& tensor;
+  const char* name;
+
+  /// Checks that `t` has the dtype and device, a row for each of this tensor, and the shape (rows, rest...), written
+  /// as `expected` in the message. Afterwards it is contiguous.
+  void check_rows_of(Tensor& t, const char* t_name, std::initializer_list<int64_t> rest, const char* expected) const {
+    check_like(t, t_name, tensor, name);
+    check_rows(t, t_name, tensor.size(0), rest, expected);
+    t = t.contiguous();
+  }
+  void check_rows_of(OptionalTensor& t, const char* t_name, std::initializer_list<int64_t> rest,
+                     const char* expected) const {
+    if (t) check_rows_of(*t, t_name, rest, expected);
+  }
+};
+
 void check_matrix(Tensor& t, const char* name) {
   const bool ok = (t.dim() == 2 || (t.dim() == 3 && t.size(0) == 1)) && t.size(-1) == 4 && t.size(-2) == 4;
   TORCH_CHECK_VALUE(ok, name, " must have shape (4, 4) or (1, 4, 4), got ", shape_of(t));
@@ -81,19 +99,16 @@ void check_device(const Tensor& t, const char* name) {
 }
 
 /// What `bin` and `blend` take of the rows of `project`.
-void check_projected(const Tensor& means2d, Tensor& cov2d, Tensor& opacities, Tensor& dets, const Tensor& row_splits) {
+void check_projected(Tensor& means2d, Tensor& cov2d, Tensor& opacities, Tensor& dets, const Tensor& row_splits) {
   check_device(means2d, "means2d");
   TORCH_CHECK_VALUE(means2d.dim() == 2 && means2d.size(1) == 2, "means2d must have shape (N, 2), got ",
                     shape_of(means2d));
+  means2d = means2d.contiguous();
   const int64_t n = means2d.size(0);
-  const auto check_row = [&](Tensor& t, const char* name, std::initializer_list<int64_t> rest, const char* expected) {
-    check_like(t, name, means2d, "means2d");
-    check_rows(t, name, n, rest, expected);
-    t = t.contiguous();
-  };
-  check_row(cov2d, "cov2d", {3}, "(N, 3)");
-  check_row(opacities, "opacities", {}, "(N,)");
-  check_row(dets, "dets", {}, "(N,)");
+  const Like like{means2d, "means2d"};
+  like.check_rows_of(cov2d, "cov2d", {3}, "(N, 3)");
+  like.check_rows_of(opacities, "opacities", {}, "(N,)");
+  like.check_rows_of(dets, "dets", {}, "(N,)");
   TORCH_CHECK_TYPE(row_splits.scalar_type() == at::kLong, "row_splits must have dtype int64, got ",
                    row_splits.scalar_type());
   TORCH_CHECK_VALUE(
@@ -113,7 +128,7 @@ FootprintSpec find_footprint(const std::string& key, double option) {
   const int index = ar::find_footprint(key);
   TORCH_CHECK_VALUE(index >= 0, "footprint must be one of those in csrc/core/footprint/registry.h, got '", key, "'");
   TORCH_CHECK_VALUE(std::isfinite(option) && option >= 0, "option must be finite and not negative, got ", option);
-  FootprintSpec spec{key, {index, {option}}, 1, false};
+  FootprintSpec spec{{index, {option}}, 1, false};
   visit_footprint(index, Footprints{}, [&](auto f) {
     spec.samples = decltype(f)::kSamples;
     spec.chosen = std::is_same_v<decltype(f), Adaptive>;
@@ -137,22 +152,15 @@ void check(Inputs& in) {
   const int64_t p = in.count(), most = int64_t(1) << (means3D.is_cuda() ? 30 : 31);
   TORCH_CHECK_VALUE(p < most, "means3D must have fewer than ", most, " rows on ", means3D.device().type(), ", got ", p);
 
-  const auto check_per_gaussian = [&](Tensor& t, const char* name, std::initializer_list<int64_t> rest,
-                                      const char* expected) {
-    check_like(t, name, means3D, "means3D");
-    check_rows(t, name, p, rest, expected);
-    t = t.contiguous();
-  };
   means3D = means3D.contiguous();
+  const Like like{means3D, "means3D"};
   if (in.opacities.dim() == 1) {
-    check_per_gaussian(in.opacities, "opacities", {}, "(P, 1) or (P,)");
+    like.check_rows_of(in.opacities, "opacities", {}, "(P, 1) or (P,)");
   } else {
-    check_per_gaussian(in.opacities, "opacities", {1}, "(P, 1) or (P,)");
+    like.check_rows_of(in.opacities, "opacities", {1}, "(P, 1) or (P,)");
   }
-  if (in.means2D) {
-    const int64_t columns = in.means2D->dim() == 2 && in.means2D->size(1) == 4 ? 4 : 3;
-    check_per_gaussian(*in.means2D, "means2D", {columns}, "(P, 3) or (P, 4)");
-  }
+  const int64_t columns = in.means2D && in.means2D->dim() == 2 && in.means2D->size(1) == 4 ? 4 : 3;
+  like.check_rows_of(in.means2D, "means2D", {columns}, "(P, 3) or (P, 4)");
   const int degrees = in.lens ? FullCamera<float>::kShDegree : Camera<float>::kShDegree;
   TORCH_CHECK_VALUE(in.sh_degree >= 0 && in.sh_degree <= degrees, "sh_degree must be 0 to ", degrees, ", got ",
                     in.sh_degree);
@@ -169,19 +177,16 @@ void check(Inputs& in) {
     TORCH_CHECK_VALUE(c.dim() == 2 && c.size(0) == p && c.size(1) >= 1 && c.size(1) <= kMaxChannels,
                       "colors_precomp must have shape (P, C) with P = ", p, " and C from 1 to ", kMaxChannels, ", got ",
                       shape_of(c));
-    check_per_gaussian(*in.colors_precomp, "colors_precomp", {c.size(1)}, "(P, C)");
+    like.check_rows_of(in.colors_precomp, "colors_precomp", {c.size(1)}, "(P, C)");
   }
   TORCH_CHECK_VALUE(in.scales.has_value() == in.rotations.has_value(),
                     "scales and rotations must be given together, got only ", in.scales ? "scales" : "rotations");
   TORCH_CHECK_VALUE(in.scales.has_value() != in.cov3D_precomp.has_value(),
                     "exactly one of scales with rotations and cov3D_precomp must be given, got ",
                     in.scales ? "both" : "neither");
-  if (in.scales) {
-    check_per_gaussian(*in.scales, "scales", {3}, "(P, 3)");
-    check_per_gaussian(*in.rotations, "rotations", {4}, "(P, 4)");
-  } else {
-    check_per_gaussian(*in.cov3D_precomp, "cov3D_precomp", {6}, "(P, 6)");
-  }
+  like.check_rows_of(in.scales, "scales", {3}, "(P, 3)");
+  like.check_rows_of(in.rotations, "rotations", {4}, "(P, 4)");
+  like.check_rows_of(in.cov3D_precomp, "cov3D_precomp", {6}, "(P, 6)");
   check_like(in.viewmatrix, "viewmatrix", means3D, "means3D");
   check_like(in.projmatrix, "projmatrix", means3D, "means3D");
   check_like(in.campos, "campos", means3D, "means3D");
@@ -214,7 +219,7 @@ namespace {
 /// Raises for a number that no Gaussian should have. Without debug such a Gaussian is culled, or taken as it is.
 void check_gaussians(const Inputs& in) {
   const auto finite = [](const OptionalTensor& t, const char* name) {
-    if (t) check_values(*t, name, at::isfinite(*t), "be finite");
+    if (t) check_finite(*t, name);
   };
   finite(in.means3D, "means3D");
   finite(in.opacities, "opacities");
@@ -259,7 +264,7 @@ int64_t check_cameras(const ProjectArguments& a) {
   const int64_t cameras = a.viewmatrix.size(0);
   check_rows(a.projmatrix, "projmatrix", cameras, {4, 4}, "(C, 4, 4)");
   check_rows(a.campos, "campos", cameras, {3}, "(C, 3)");
-  if (a.lens) check_rows(*a.lens, "lens", cameras, {kLensWidth}, "(C, 17)");
+  if (a.lens) check_rows(*a.lens, "lens", cameras, {kLensWidth}, ("(C, " + std::to_string(kLensWidth) + ")").c_str());
   TORCH_CHECK_VALUE(int64_t(a.tanfovx.size()) == cameras && int64_t(a.tanfovy.size()) == cameras,
                     "tanfovx and tanfovy must have a number for each of ", cameras, " cameras, got ", a.tanfovx.size(),
                     " and ", a.tanfovy.size());
@@ -271,13 +276,7 @@ int64_t check_cameras(const ProjectArguments& a) {
 
 Inputs inputs_of(const ProjectArguments& a, int64_t c) {
   Inputs in;
-  in.means3D = a.means3D;
-  in.opacities = a.opacities;
-  in.shs = a.shs;
-  in.colors_precomp = a.colors_precomp;
-  in.scales = a.scales;
-  in.rotations = a.rotations;
-  in.cov3D_precomp = a.cov3D_precomp;
+  static_cast<SceneTensors<OptionalTensor>&>(in) = a;
   in.viewmatrix = a.viewmatrix[c];
   in.projmatrix = a.projmatrix[c];
   in.campos = a.campos[c];
@@ -293,15 +292,9 @@ Inputs inputs_of(const ProjectArguments& a, int64_t c) {
 
 void check(BinArguments& a) {
   check_projected(a.means2d, a.cov2d, a.opacities, a.dets, a.row_splits);
-  a.means2d = a.means2d.contiguous();
-  check_like(a.depths, "depths", a.means2d, "means2d");
-  check_rows(a.depths, "depths", a.means2d.size(0), {}, "(N,)");
-  a.depths = a.depths.contiguous();
-  if (a.colors) {
-    check_like(*a.colors, "colors", a.means2d, "means2d");
-    check_rows(*a.colors, "colors", a.means2d.size(0), {3}, "(N, 3)");
-    a.colors = a.colors->contiguous();
-  }
+  const Like like{a.means2d, "means2d"};
+  like.check_rows_of(a.depths, "depths", {}, "(N,)");
+  like.check_rows_of(a.colors, "colors", {3}, "(N, 3)");
   if (!a.background) a.background = at::zeros({3}, a.means2d.options());
   check_like(*a.background, "background", a.means2d, "means2d");
   check_vector(*a.background, "background");
@@ -310,7 +303,6 @@ void check(BinArguments& a) {
 
 void check(BlendArguments& a, const FootprintSpec& footprint) {
   check_projected(a.means2d, a.cov2d, a.opacities, a.dets, a.row_splits);
-  a.means2d = a.means2d.contiguous();
   const int64_t n = a.means2d.size(0), cameras = a.row_splits.size(0) - 1;
   check_like(a.features, "features", a.means2d, "means2d");
   TORCH_CHECK_VALUE(
@@ -367,10 +359,17 @@ void check(WeightArguments& a) {
   a.cov2d = a.cov2d.contiguous();
 }
 
-void check_gradient(Tensor& gradient, const char* name, const Tensor& like, at::IntArrayRef sizes) {
+Tensor gradient_of(const std::vector<OptionalTensor>& dL_doutputs, size_t place, const char* name, const Tensor& like,
+                   at::IntArrayRef sizes) {
+  if (place >= dL_doutputs.size() || !dL_doutputs[place]) return Tensor();
+  const Tensor& gradient = *dL_doutputs[place];
   check_like(gradient, name, like, "the arguments");
   TORCH_CHECK_VALUE(gradient.sizes() == sizes, name, " must have shape ", text_of(sizes), ", got ", shape_of(gradient));
-  gradient = gradient.contiguous();
+  return gradient.contiguous();
+}
+
+void check_needs(const std::vector<bool>& needs, size_t count) {
+  TORCH_CHECK_VALUE(needs.size() == count, "needs must have ", count, " members, got ", needs.size());
 }
 
 void check_lists(const ListTensors& lists, const Tensor& like, const FootprintSpec& footprint, TileGrid grid) {

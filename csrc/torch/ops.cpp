@@ -11,7 +11,7 @@
 #include "core/sh.h"
 #include "cpu/stages.h"
 #include "torch/backend.h"
-#include "torch/recipe.h"
+#include "torch/ops.h"
 
 namespace ar::ops {
 namespace {
@@ -38,7 +38,7 @@ void push(Stack& stack, const Blended& out) {
   push(stack, out.saved);
 }
 
-/// An op: a function of recipe.h between the arguments on the dispatcher's stack and the results there.
+/// An op: a function of ops.h between the arguments on the dispatcher's stack and the results there.
 template <class A, auto kRun> struct Op {
   using Arguments = A;
   static void kernel(const c10::OperatorHandle&, Stack* stack) {

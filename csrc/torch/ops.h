@@ -1,8 +1,7 @@
-// The pass, written once for every device: check, project, bin, blend, and back. A Backend does what depends on the
-// device.
+// The ops, each written once for every device: the pass in rasterize.cpp, its stages in stages.cpp. Registered with
+// torch in ops.cpp, made differentiable in autograd.cpp.
 #pragma once
 
-#include <tuple>
 #include <vector>
 
 #include "torch/arguments.h"
