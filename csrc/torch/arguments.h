@@ -71,11 +71,20 @@ struct Grads : SceneTensors<Tensor> {
   bool with_camera = false;              ///< one of the camera's tensors wants a gradient
 };
 
-/// Arguments of `rasterize`.
-struct RasterizeArguments : Inputs {
-  Tensor bg;  ///< (C,) of C colour channels
+/// A footprint by its key, and the number of its option.
+struct FootprintArguments {
   std::string footprint;
   double option = 0;
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("footprint", footprint);
+    visit("option", option);
+  }
+};
+
+/// Arguments of `rasterize`.
+struct RasterizeArguments : Inputs, FootprintArguments {
+  Tensor bg;  ///< (C,) of C colour channels
   ImageSwitches images = {};
   bool keep = false, debug = false;
   std::string means2d_z = "zero";  ///< third column of the gradient with respect to means2D: "sum_abs", "sum_norm"
@@ -83,8 +92,7 @@ struct RasterizeArguments : Inputs {
   template <class Visit> void each(Visit&& visit) {
     Inputs::each(visit);
     visit("bg", bg);
-    visit("footprint", footprint);
-    visit("option", option);
+    FootprintArguments::each(visit);
     for (size_t k = 0; k < kImageCount; ++k) visit(kImageSwitches[k], images[k]);
     visit("keep=False", keep);
     visit("debug=False", debug);
@@ -94,30 +102,23 @@ struct RasterizeArguments : Inputs {
 
 /// Arguments of `project`: of one or several cameras, in C numbers each of the tangents and in tensors of shape
 /// (C, 4, 4), (C, 4, 4), (C, 3), (C, kLensWidth). It has no means2D, which is an output.
-struct ProjectArguments : SceneArguments<std::vector<double>> {
-  std::string footprint;
-  double option = 0;
-
+struct ProjectArguments : SceneArguments<std::vector<double>>, FootprintArguments {
   template <class Visit> void each(Visit&& visit) {
     SceneArguments::each([&](std::string_view name, auto& value) {
       if (name != "means2D") visit(name, value);
     });
-    visit("footprint", footprint);
-    visit("option", option);
+    FootprintArguments::each(visit);
   }
 };
 
 /// What the arguments of `bin`, `blend` and `inspect` have in common.
-struct ImageArguments {
+struct ImageArguments : FootprintArguments {
   int64_t image_height = 0, image_width = 0;
-  std::string footprint;
-  double option = 0;
 
   template <class Visit> void each(Visit&& visit) {
     visit("image_height", image_height);
     visit("image_width", image_width);
-    visit("footprint", footprint);
-    visit("option", option);
+    FootprintArguments::each(visit);
   }
 };
 
@@ -179,16 +180,13 @@ struct InspectArguments : ImageArguments {
 };
 
 /// Arguments of `footprint_weight`.
-struct WeightArguments {
+struct WeightArguments : FootprintArguments {
   Tensor offset, cov2d;
-  std::string footprint;
-  double option = 0;
 
   template <class Visit> void each(Visit&& visit) {
     visit("offset", offset);
     visit("cov2d", cov2d);
-    visit("footprint", footprint);
-    visit("option", option);
+    FootprintArguments::each(visit);
   }
 };
 
@@ -212,44 +210,24 @@ template <class Arguments> struct VjpArguments {
   }
 };
 
-/// The name of a type in a schema.
-inline const char* type_of(const Tensor&) { return "Tensor"; }
-inline const char* type_of(const OptionalTensor&) { return "Tensor?"; }
-inline const char* type_of(const int64_t&) { return "int"; }
-inline const char* type_of(const double&) { return "float"; }
-inline const char* type_of(const bool&) { return "bool"; }
-inline const char* type_of(const std::string&) { return "str"; }
-inline const char* type_of(const std::vector<Tensor>&) { return "Tensor[]"; }
-inline const char* type_of(const std::vector<OptionalTensor>&) { return "Tensor?[]"; }
-inline const char* type_of(const std::vector<double>&) { return "float[]"; }
-inline const char* type_of(const std::vector<bool>&) { return "bool[]"; }
-
 /// "Tensor means3D, Tensor? means2D, ...".
 template <class Arguments> std::string schema_of() {
   std::string text;
   Arguments().each([&](std::string_view declaration, auto& value) {
-    text += (text.empty() ? "" : ", ") + std::string(type_of(value)) + " " + std::string(declaration);
+    const std::string type = c10::getTypePtr<std::decay_t<decltype(value)>>()->str();
+    text += (text.empty() ? "" : ", ") + type + " " + std::string(declaration);
   });
   return text;
 }
 
-inline void assign(const IValue& from, Tensor& to) { to = from.toTensor(); }
+template <class Value> void assign(const IValue& from, Value& to) { to = from.to<Value>(); }
+/// A tensor that autograd left undefined is one that is missing.
 inline void assign(const IValue& from, OptionalTensor& to) {
   to = from.isTensor() && from.toTensor().defined() ? OptionalTensor(from.toTensor()) : std::nullopt;
 }
-inline void assign(const IValue& from, int64_t& to) { to = from.toInt(); }
-inline void assign(const IValue& from, double& to) { to = from.toDouble(); }
-inline void assign(const IValue& from, bool& to) { to = from.toBool(); }
-inline void assign(const IValue& from, std::string& to) { to = from.toStringRef(); }
-inline void assign(const IValue& from, std::vector<Tensor>& to) { to = from.toTensorVector(); }
 inline void assign(const IValue& from, std::vector<OptionalTensor>& to) {
   to.clear();
   for (const OptionalTensor& t : from.toOptionalTensorVector()) to.push_back(t && t->defined() ? t : std::nullopt);
-}
-inline void assign(const IValue& from, std::vector<double>& to) { to = from.toDoubleVector(); }
-inline void assign(const IValue& from, std::vector<bool>& to) {
-  const auto list = from.toBoolList();
-  to.assign(list.begin(), list.end());
 }
 
 /// Takes an op's arguments off the dispatcher's stack.

@@ -3,6 +3,7 @@
 // parameters of its stages (core/stages.h) and launches them.
 #pragma once
 
+#include <array>
 #include <memory>
 #include <vector>
 
@@ -84,6 +85,9 @@ struct PairSums {
 struct RowTensors {
   Tensor means2d, cov2d, dets, opacities, depths, colors;
   Tensor absolute;  ///< of a gradient (n, 2): sums over pixels of |dL/dmeans2d|, if PairSums has them
+
+  /// Those that every splat has.
+  std::array<Tensor*, 5> numbers() { return {&means2d, &cov2d, &dets, &opacities, &depths}; }
 };
 
 /// What `inspect` finds, in the order in which the op returns it.

@@ -8,39 +8,34 @@
 
 namespace ar::ops {
 
-/// What an op returns, in the order of its schema. `saved` is for its adjoint.
-struct Rasterized {
-  Tensor color;                ///< (C, H, W)
-  std::vector<Tensor> images;  ///< of alpha, depth, inverse_depth those that are asked for, (H, W)
-  Tensor radii;
-  std::vector<Tensor> saved;
-};
-struct Projected {
-  Tensor means2d, cov2d, opacities, depths, colors;    ///< (N, ...) rows, camera after camera
-  Tensor radii, gaussian_ids, camera_ids, row_splits;  ///< integers; row_splits on the CPU
-  std::vector<Tensor> saved;                           ///< dets (N,)
-};
-struct Blended {
-  Tensor image, alpha;  ///< (C, K, H, W) and (C, H, W)
-  std::vector<Tensor> saved;
-};
+/// What an op returns, in the order of its schema (ops.cpp). `saved` is for its adjoint.
+using Results = std::vector<IValue>;
 
-/// With `seconds` the times before, of project, bin and blend are appended to it, and without `keep` the lists are
-/// saved.
-Rasterized rasterize(RasterizeArguments a, std::vector<double>* seconds = nullptr);
-std::vector<Tensor> rasterize_vjp(VjpArguments<RasterizeArguments> a);
+/// color (C, H, W); images: those of kImageNames that are asked for, (H, W); radii (P,) int32; saved.
+Results rasterize(RasterizeArguments a);
+/// The same, and the seconds that project, bin and blend took, (3,) float64. Saves the lists without `keep` too. Waits
+/// for the device.
+Results rasterize_timed(RasterizeArguments a);
+/// gradients, as from every adjoint: a tensor for every tensor among the op's arguments, empty where none is wanted.
+Results rasterize_vjp(VjpArguments<RasterizeArguments> a);
 
-Projected project(ProjectArguments a);
-std::vector<Tensor> project_vjp(VjpArguments<ProjectArguments> a);
+/// means2d, cov2d, opacities, depths, colors (N, ...): rows, camera after camera; radii, gaussian_ids, camera_ids (N,)
+/// int32; row_splits (C + 1,) int64 on the CPU; saved: dets (N,), gaussian_ids, row_splits.
+Results project(ProjectArguments a);
+Results project_vjp(VjpArguments<ProjectArguments> a);
 
-std::vector<Tensor> bin(BinArguments a);
+/// lists: ListTensors of camera after camera.
+Results bin(BinArguments a);
 
-Blended blend(BlendArguments a);
-std::vector<Tensor> blend_vjp(VjpArguments<BlendArguments> a);
+/// image (C, K, H, W), alpha (C, H, W), saved: BlendState of camera after camera.
+Results blend(BlendArguments a);
+Results blend_vjp(VjpArguments<BlendArguments> a);
 
-std::vector<Tensor> inspect(InspectArguments a);
+/// summary: SummaryTensors.
+Results inspect(InspectArguments a);
 
-Tensor footprint_weight(WeightArguments a);
-std::vector<Tensor> footprint_weight_vjp(VjpArguments<WeightArguments> a);
+/// weight
+Results footprint_weight(WeightArguments a);
+Results footprint_weight_vjp(VjpArguments<WeightArguments> a);
 
 }  // namespace ar::ops

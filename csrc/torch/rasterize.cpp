@@ -54,9 +54,8 @@ struct Saved {
   }
 };
 
-}  // namespace
-
-Rasterized rasterize(RasterizeArguments a, std::vector<double>* seconds) {
+/// With `seconds` the times before, of project, bin and blend are appended to it.
+Results run(RasterizeArguments a, std::vector<double>* seconds) {
   const Snapshot snapshot(a, a.debug, "snapshot_fw.dump");
   return snapshot.guard([&] {
     Pass pass(a);
@@ -69,10 +68,9 @@ Rasterized rasterize(RasterizeArguments a, std::vector<double>* seconds) {
       if (seconds) seconds->push_back(backend->lap());
     };
     const ChannelTensors channels = channels_of(a, Tensor());
-    Rasterized out;
-    out.radii = at::empty({a.count()}, a.means3D.options().dtype(at::kInt));
+    const Tensor radii = at::empty({a.count()}, a.means3D.options().dtype(at::kInt));
     lap();
-    const SplatTensors splats = backend->project(a, pass, channels, out.radii);
+    const SplatTensors splats = backend->project(a, pass, channels, radii);
     lap();
     const ListTensors lists = backend->bin(splats, pass, channels.background);
     lap();
@@ -80,20 +78,31 @@ Rasterized rasterize(RasterizeArguments a, std::vector<double>* seconds) {
     BlendState state = make_state(pass, a.means3D);
     backend->blend(lists, pass, channels, image, state);
     lap();
-    out.color = image.color;
+    std::vector<Tensor> images, saved;
     for (const Tensor& other : image.others) {
-      if (other.defined()) out.images.push_back(other);
+      if (other.defined()) images.push_back(other);
     }
-    if (a.keep || seconds) append_to(out.saved, lists);
+    if (a.keep || seconds) append_to(saved, lists);
     if (a.keep) {
-      append_to(out.saved, state);
-      out.saved.push_back(or_empty(channels.made_by_projection() ? channels.rows : Tensor(), a.means3D));
+      append_to(saved, state);
+      saved.push_back(or_empty(channels.made_by_projection() ? channels.rows : Tensor(), a.means3D));
     }
-    return out;
+    return Results{image.color, images, radii, saved};
   });
 }
 
-std::vector<Tensor> rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
+}  // namespace
+
+Results rasterize(RasterizeArguments a) { return run(std::move(a), nullptr); }
+
+Results rasterize_timed(RasterizeArguments a) {
+  std::vector<double> seconds;
+  Results results = run(std::move(a), &seconds);
+  results.push_back(at::tensor({seconds[1], seconds[2], seconds[3]}, at::kDouble));  // the first is of what came before
+  return results;
+}
+
+Results rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
   RasterizeArguments& a = arguments.of_op;
   const Snapshot snapshot(arguments, a.debug, "snapshot_bw.dump");
   return snapshot.guard([&] {
@@ -131,11 +140,11 @@ std::vector<Tensor> rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
     list.push_back(!needs[kSceneTensors]       ? at::empty({0}, a.means3D.options())
                    : dL_dimage.color.defined() ? background_grad(dL_dimage.color, saved.state, saved.lists, pass.grid)
                                                : at::zeros_like(a.bg));
-    return list;
+    return Results{list};
   });
 }
 
-std::vector<Tensor> inspect(InspectArguments a) {
+Results inspect(InspectArguments a) {
   const Pass pass(a);
   const ListTensors lists = Saved(a.saved).lists;
   check(a, lists, pass.footprint);
@@ -147,7 +156,7 @@ std::vector<Tensor> inspect(InspectArguments a) {
   summary.largest = at::zeros({a.count}, options.dtype(at::kFloat));
   summary.total = at::zeros({a.count}, options.dtype(at::kLong));
   make_backend(lists.splats)->inspect(lists, pass, summary);
-  return {summary.median, summary.dominant, summary.touched, summary.largest, summary.total};
+  return {std::vector<Tensor>{summary.median, summary.dominant, summary.touched, summary.largest, summary.total}};
 }
 
 }  // namespace ar::ops

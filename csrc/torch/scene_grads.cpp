@@ -5,13 +5,17 @@
 #include "core/camera.h"
 
 namespace ar::ops {
+namespace {
 
-bool any_of(const std::vector<bool>& needs, size_t first, size_t count) {
-  return std::find(needs.begin() + first, needs.begin() + first + count, true) != needs.begin() + first + count;
+bool needs_camera(const std::vector<bool>& needs) {
+  const auto first = needs.begin() + kGaussianTensors, last = first + kCameraTensors;
+  return std::find(first, last, true) != last;
 }
 
+}  // namespace
+
 void check_camera_needs(const std::vector<bool>& needs, const OptionalTensor& lens) {
-  TORCH_CHECK_VALUE(lens || !any_of(needs, kGaussianTensors, kCameraTensors),
+  TORCH_CHECK_VALUE(lens || !needs_camera(needs),
                     "lens must be given where viewmatrix, projmatrix or campos requires a gradient, got None");
 }
 
@@ -29,7 +33,7 @@ Grads make_grads(const Inputs& in, const std::vector<bool>& needs) {
   make(grads.scales, in.scales, needs[5]);
   make(grads.rotations, in.rotations, needs[6]);
   make(grads.cov3D_precomp, in.cov3D_precomp, needs[7]);
-  grads.with_camera = in.lens && any_of(needs, kGaussianTensors, kCameraTensors);
+  grads.with_camera = in.lens && needs_camera(needs);
   return grads;
 }
 

@@ -7,9 +7,6 @@
 
 namespace ar::ops {
 
-/// Whether one of `count` members from `first` on is set.
-bool any_of(const std::vector<bool>& needs, size_t first, size_t count);
-
 /// `needs`: which of the tensors of SceneTensors want a gradient. Without a lens those of the camera have none; raises
 /// ValueError where one of them wants it.
 void check_camera_needs(const std::vector<bool>& needs, const OptionalTensor& lens);

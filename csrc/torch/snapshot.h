@@ -34,24 +34,13 @@ class Snapshot {
   }
 
  private:
-  static IValue copy_of(const Tensor& t) { return t.defined() ? IValue(t.detach().cpu()) : IValue(); }
-  static IValue copy_of(const OptionalTensor& t) { return t ? copy_of(*t) : IValue(); }
-  static IValue copy_of(const std::vector<Tensor>& list) {
-    c10::List<Tensor> copies;
-    for (const Tensor& t : list) copies.push_back(t.detach().cpu());
+  static IValue copy_of(const IValue& value) {
+    if (value.isTensor()) return value.toTensor().defined() ? IValue(value.toTensor().detach().cpu()) : IValue();
+    if (!value.isList()) return value;
+    c10::impl::GenericList copies(value.toList().elementType());
+    for (const IValue& member : value.toListRef()) copies.push_back(copy_of(member));
     return copies;
   }
-  static IValue copy_of(const std::vector<OptionalTensor>& list) {
-    c10::List<OptionalTensor> copies;
-    for (const OptionalTensor& t : list) copies.push_back(t ? OptionalTensor(t->detach().cpu()) : std::nullopt);
-    return copies;
-  }
-  static IValue copy_of(const std::vector<bool>& list) {
-    c10::List<bool> copies;
-    for (const bool b : list) copies.push_back(b);
-    return copies;
-  }
-  template <class Value> static IValue copy_of(const Value& value) { return IValue(value); }
 
   void write() const {
     const std::vector<char> bytes = torch::jit::pickle_save(IValue(*copy_));

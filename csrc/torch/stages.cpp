@@ -51,15 +51,14 @@ struct CameraPart {
 
 }  // namespace
 
-Projected project(ProjectArguments a) {
+Results project(ProjectArguments a) {
   const Pass pass(a);
   const int64_t cameras = check_cameras(a);
   const bool with_colors = a.shs || a.colors_precomp;
   const at::TensorOptions options = a.means3D.options(), ints = options.dtype(at::kInt);
-  Projected out;
-  out.row_splits = at::zeros({cameras + 1}, at::kLong);
-  int64_t* splits = out.row_splits.data_ptr<int64_t>();
-  std::array<std::vector<Tensor>, 9> parts;  // of every camera: the rows of `out`, and dets
+  const Tensor row_splits = at::zeros({cameras + 1}, at::kLong);
+  int64_t* splits = row_splits.data_ptr<int64_t>();
+  std::array<std::vector<Tensor>, 9> parts;  // of every camera: the results that are rows, and dets
   const auto add = [&](const RowTensors& r, const Tensor& radii, const Tensor& ids, const Tensor& camera_ids) {
     const Tensor rows[] = {r.means2d, r.cov2d, r.opacities, r.depths, r.colors, radii, ids, camera_ids, r.dets};
     for (size_t k = 0; k < parts.size(); ++k) parts[k].push_back(rows[k]);
@@ -74,8 +73,7 @@ Projected project(ProjectArguments a) {
     backend->project_rows(in, pass, rows, radii);
     const Tensor kept = radii.gt(0).nonzero().select(1, 0), ids = kept.to(at::kInt);
     splits[c + 1] = splits[c] + kept.size(0);
-    for (Tensor* t : {&rows.means2d, &rows.cov2d, &rows.dets, &rows.opacities, &rows.depths})
-      *t = t->index_select(0, kept);
+    for (Tensor* t : rows.numbers()) *t = t->index_select(0, kept);
     if (with_colors) rows.colors = rows.colors.index_select(0, kept);
     add(rows, radii.index_select(0, kept), ids, at::full_like(ids, c));
   }
@@ -83,20 +81,15 @@ Projected project(ProjectArguments a) {
     const Tensor none = at::empty({0}, ints);
     add(make_rows(0, with_colors, options), none, none, none);
   }
-  out.means2d = join(parts[0]);
-  out.cov2d = join(parts[1]);
-  out.opacities = join(parts[2]);
-  out.depths = join(parts[3]);
-  out.colors = join(parts[4]);
-  out.radii = join(parts[5]);
-  out.gaussian_ids = join(parts[6]);
-  out.camera_ids = join(parts[7]);
+  Results out;
+  for (size_t k = 0; k < 8; ++k) out.push_back(join(parts[k]));
+  out.push_back(row_splits);
   // The ids again for the adjoint, which takes what was saved.
-  out.saved = {join(parts[8]), out.gaussian_ids.clone(), out.row_splits.clone()};
+  out.push_back(std::vector<Tensor>{join(parts[8]), out[6].toTensor().clone(), row_splits.clone()});
   return out;
 }
 
-std::vector<Tensor> project_vjp(VjpArguments<ProjectArguments> arguments) {
+Results project_vjp(VjpArguments<ProjectArguments> arguments) {
   const ProjectArguments& a = arguments.of_op;
   const int64_t cameras = check_cameras(a);
   check_needs(arguments.needs, kSceneTensors - 1);
@@ -148,10 +141,10 @@ std::vector<Tensor> project_vjp(VjpArguments<ProjectArguments> arguments) {
                                          : at::stack(of_cameras[k - kGaussianTensors]));
   });
   out.erase(out.begin() + 1);  // means2D
-  return out;
+  return {out};
 }
 
-std::vector<Tensor> bin(BinArguments a) {
+Results bin(BinArguments a) {
   Pass pass(a);
   pass.keep = a.keep;
   check(a);
@@ -160,26 +153,21 @@ std::vector<Tensor> bin(BinArguments a) {
   const std::unique_ptr<Backend> backend = make_backend(a.means2d);
   std::vector<Tensor> out;
   for (int64_t c = 0; c + 1 < a.row_splits.size(0); ++c) {
-    RowTensors rows;
-    rows.means2d = rows_of(a.means2d, a.row_splits, c);
-    rows.cov2d = rows_of(a.cov2d, a.row_splits, c);
-    rows.dets = rows_of(a.dets, a.row_splits, c);
-    rows.opacities = rows_of(a.opacities, a.row_splits, c);
-    rows.depths = rows_of(a.depths, a.row_splits, c);
-    if (a.colors) rows.colors = rows_of(*a.colors, a.row_splits, c);
+    RowTensors rows = {a.means2d, a.cov2d, a.dets, a.opacities, a.depths, a.colors ? *a.colors : Tensor()};
+    for (Tensor* t : rows.numbers()) *t = rows_of(*t, a.row_splits, c);
+    if (a.colors) rows.colors = rows_of(rows.colors, a.row_splits, c);
     append_to(out, backend->bin(backend->shape_rows(rows, pass), pass, *a.background));
   }
-  return out;
+  return {out};
 }
 
-Blended blend(BlendArguments a) {
+Results blend(BlendArguments a) {
   Pass pass(a);
   pass.keep = a.keep;
   check(a, pass.footprint);
   const std::unique_ptr<Backend> backend = make_backend(a.means2d);
   const int64_t cameras = a.row_splits.size(0) - 1;
-  std::vector<Tensor> images, alphas;
-  Blended out;
+  std::vector<Tensor> images, alphas, saved;
   for (int64_t c = 0; c < cameras; ++c) {
     const CameraPart part(a, c);
     ImageSwitches wanted = {};
@@ -189,15 +177,14 @@ Blended blend(BlendArguments a) {
     backend->blend(part.lists, pass, part.channels, image, state);
     images.push_back(image.color);
     alphas.push_back(image.others[kAlpha]);
-    if (a.keep) append_to(out.saved, state);
+    if (a.keep) append_to(saved, state);
   }
   const auto options = a.means2d.options();
-  out.image = cameras ? at::stack(images) : at::empty({0, a.features.size(1), a.image_height, a.image_width}, options);
-  out.alpha = cameras ? at::stack(alphas) : at::empty({0, a.image_height, a.image_width}, options);
-  return out;
+  return {cameras ? at::stack(images) : at::empty({0, a.features.size(1), a.image_height, a.image_width}, options),
+          cameras ? at::stack(alphas) : at::empty({0, a.image_height, a.image_width}, options), saved};
 }
 
-std::vector<Tensor> blend_vjp(VjpArguments<BlendArguments> arguments) {
+Results blend_vjp(VjpArguments<BlendArguments> arguments) {
   BlendArguments& a = arguments.of_op;
   const Pass pass(a);
   check(a, pass.footprint);
@@ -213,7 +200,10 @@ std::vector<Tensor> blend_vjp(VjpArguments<BlendArguments> arguments) {
   const std::unique_ptr<Backend> backend = make_backend(a.means2d);
   const auto options = a.means2d.options();
   const bool absolute = needs[5] && a.means2d_abs;
-  std::vector<Tensor> means2d, cov2d, opacities, features, backgrounds, sums_abs;
+  // With respect to means2d, cov2d, opacities, features, background and means2d_abs.
+  const Tensor like[] = {a.means2d, a.cov2d, a.opacities, a.features, a.background, a.means2d};
+  const bool wanted[] = {needs[0], needs[1], needs[2], needs[3], needs[4], absolute};
+  std::array<std::vector<Tensor>, 6> parts;
   for (int64_t c = 0; c < cameras; ++c) {
     const CameraPart part(a, c);
     const auto state = from_list<BlendState>(arguments.saved, c * BlendState::kMembers);
@@ -230,39 +220,31 @@ std::vector<Tensor> blend_vjp(VjpArguments<BlendArguments> arguments) {
     rows.opacities = at::empty({n}, options);
     if (absolute) rows.absolute = at::empty({n, 2}, options);
     backend->row_grads(part.rows, part.lists, pass, sums, rows);
-    means2d.push_back(rows.means2d);
-    cov2d.push_back(rows.cov2d);
-    opacities.push_back(rows.opacities);
-    sums_abs.push_back(rows.absolute);
-    features.push_back(sums.dL_dchannels);
-    if (!needs[4]) continue;
-    backgrounds.push_back(dL_dimage.defined()
-                              ? background_grad(gradient.color, state, part.lists, pass.grid).unsqueeze(0)
-                              : at::zeros({1, channels}, options));
+    Tensor background;
+    if (needs[4])
+      background = dL_dimage.defined() ? background_grad(gradient.color, state, part.lists, pass.grid).unsqueeze(0)
+                                       : at::zeros({1, channels}, options);
+    const Tensor grads[] = {rows.means2d, rows.cov2d, rows.opacities, sums.dL_dchannels, background, rows.absolute};
+    for (size_t k = 0; k < parts.size(); ++k) parts[k].push_back(grads[k]);
   }
-  const auto if_wanted = [&](bool wanted, const std::vector<Tensor>& parts, const Tensor& like) {
-    return !wanted ? at::empty({0}, options) : parts.empty() ? at::zeros_like(like) : join(parts);
-  };
-  return {if_wanted(needs[0], means2d, a.means2d),
-          if_wanted(needs[1], cov2d, a.cov2d),
-          if_wanted(needs[2], opacities, a.opacities),
-          if_wanted(needs[3], features, a.features),
-          if_wanted(needs[4], backgrounds, a.background),
-          if_wanted(absolute, sums_abs, a.means2d),
-          needs[6] ? at::zeros_like(a.dets) : at::empty({0}, options),  // what depends on dets is in cov2d's
-          at::empty({0}, options)};
+  std::vector<Tensor> out;
+  for (size_t k = 0; k < parts.size(); ++k)
+    out.push_back(!wanted[k] ? at::empty({0}, options) : parts[k].empty() ? at::zeros_like(like[k]) : join(parts[k]));
+  out.push_back(needs[6] ? at::zeros_like(a.dets) : at::empty({0}, options));  // what depends on dets is in cov2d's
+  out.push_back(at::empty({0}, options));                                      // row_splits
+  return {out};
 }
 
-Tensor footprint_weight(WeightArguments a) {
+Results footprint_weight(WeightArguments a) {
   const FootprintSpec footprint = find_footprint(a.footprint, a.option);
   check(a);
   WeightTensors tensors = {a.offset, a.cov2d};
   tensors.weight = at::empty(a.offset.sizes().slice(0, a.offset.dim() - 1), a.offset.options());
   make_backend(a.offset)->weight(tensors, footprint);
-  return tensors.weight;
+  return {tensors.weight};
 }
 
-std::vector<Tensor> footprint_weight_vjp(VjpArguments<WeightArguments> arguments) {
+Results footprint_weight_vjp(VjpArguments<WeightArguments> arguments) {
   WeightArguments& a = arguments.of_op;
   const FootprintSpec footprint = find_footprint(a.footprint, a.option);
   check(a);
@@ -275,7 +257,7 @@ std::vector<Tensor> footprint_weight_vjp(VjpArguments<WeightArguments> arguments
   tensors.dL_doffset = at::empty(a.offset.sizes(), a.offset.options());
   tensors.dL_dcov2d = at::empty(a.cov2d.sizes(), a.offset.options());
   make_backend(a.offset)->weight_vjp(tensors, footprint);
-  return {tensors.dL_doffset, tensors.dL_dcov2d};
+  return {std::vector<Tensor>{tensors.dL_doffset, tensors.dL_dcov2d}};
 }
 
 }  // namespace ar::ops
