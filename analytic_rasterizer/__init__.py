@@ -8,7 +8,7 @@ import torch  # noqa: F401  (its libraries must be loaded before the extension's
 from ._C import TILE, instruction_set
 from .analysis.planner import SceneReport, inspect_scene, plan
 from .camera import camera_settings, moved
-from .effects import Defocus, Effects, Motion
+from .effects import Defocus, Effects, GaussianStats, Motion, Outputs
 from .filters import apply_3d_filter, compute_3d_filter
 from .footprints import (
     FOOTPRINTS,
@@ -19,7 +19,7 @@ from .footprints import (
     set_default_footprint,
 )
 from .installation import warn_if_replaced
-from .outputs import GaussianStats, Outputs, normalized
+from .outputs import normalized
 from .rasterizer import GaussianRasterizer, rasterize_gaussians
 from .relocation import compute_relocation
 from .settings import GaussianRasterizationSettings

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from ._C import FRUSTUM_CLAMP
-from .effects import Defocus, Effects, Motion
+from . import _C
+from .effects import Effects
 from .settings import GaussianRasterizationSettings
 
 _DEPTH_RANGE = (0.01, 100.0)  # of clip-space z, which nothing reads
@@ -132,37 +132,29 @@ def moved(world_to_camera: torch.Tensor, tangent: torch.Tensor) -> torch.Tensor:
 
 
 def make_lens(effects: Effects, settings, like: torch.Tensor) -> torch.Tensor:
-    """The op's argument `lens`: the numbers of `Lens` in csrc/core/lens.h, in its order.
+    """The op's argument `lens`: the members of `Lens` in csrc/core/lens.h by their names, zero where nothing sets them.
 
     Args:
         effects: What the projection has beyond a pinhole.
         settings: A `GaussianRasterizationSettings`.
         like: A tensor whose dtype and device the result takes.
     """
+    members = effects.lens_members()
     tangents = (settings.tanfovx, settings.tanfovy)
-    if not effects.camera_gradients:
-        tangents = (float(t) for t in tangents)
-    center = (0.0, 0.0)
+    members["tan_half_fov"] = tangents if effects.camera_gradients else [float(t) for t in tangents]
     if effects.off_center:
-        center = (view_center(settings.viewmatrix, settings.projmatrix, effects.camera_gradients),)
-    defocus, motion = effects.defocus or Defocus(0.0, 1.0), effects.motion or Motion(0.0)
-    streaks = [
-        _times(motion.exposure, value, length)
-        for value, length in ((motion.velocity, 3), (motion.angular_velocity, 3), (motion.screen_velocity, 2))
-    ]
-    numbers = (
-        *tangents, *center, defocus.aperture, defocus.focus, *streaks, effects.near, effects.far,
-        float(effects.orthographic),
-    )  # fmt: skip
-    # Neighbouring numbers are copied to the device together; the last three are never tensors.
+        members["center"] = view_center(settings.viewmatrix, settings.projmatrix, effects.camera_gradients)
+    # Neighbouring numbers are copied to the device together; the last member is never a tensor.
     parts, floats = [], []
-    for number in numbers:
-        if isinstance(number, torch.Tensor):
-            parts += [_copied(floats, like)] if floats else []
-            parts.append(number.to(like).reshape(-1))
-            floats = []
-        else:
-            floats += number if isinstance(number, list) else [float(number)]
+    for name, size in _C.LENS:
+        member = members.get(name, [0.0] * size)
+        for number in member if isinstance(member, (list, tuple)) else [member]:
+            if isinstance(number, torch.Tensor):
+                parts += [_copied(floats, like)] if floats else []
+                parts.append(number.to(like).reshape(-1))
+                floats = []
+            else:
+                floats.append(float(number))
     last = _copied(floats, like)
     return torch.cat([*parts, last]) if parts else last
 
@@ -174,18 +166,6 @@ def _copied(numbers: list[float], like: torch.Tensor) -> torch.Tensor:
         raise RuntimeError("effects of the camera cannot be captured in a CUDA graph")
     host = torch.tensor(numbers, dtype=like.dtype, pin_memory=like.is_cuda)
     return host.to(like.device, non_blocking=True)
-
-
-def _times(exposure, velocity, length: int):
-    """exposure * velocity, `length` numbers: a tensor if one of the two is a tensor, otherwise a list."""
-    if velocity is None:
-        return [0.0] * length
-    if isinstance(exposure, torch.Tensor) and not isinstance(velocity, torch.Tensor):
-        velocity = exposure.new_tensor(velocity)
-    if isinstance(velocity, torch.Tensor):
-        exposure = exposure.to(velocity).reshape(()) if isinstance(exposure, torch.Tensor) else exposure
-        return exposure * velocity
-    return [exposure * v for v in velocity]
 
 
 def view_center(view: torch.Tensor, proj: torch.Tensor, with_gradient: bool) -> torch.Tensor:
@@ -207,4 +187,4 @@ def is_off_center(settings) -> bool:
     """Whether an edge of the picture is more than FRUSTUM_CLAMP half pictures away from the optical axis."""
     center = view_center(settings.viewmatrix.double(), settings.projmatrix.double(), with_gradient=False)
     tangents = center.new_tensor([float(settings.tanfovx), float(settings.tanfovy)])
-    return (1 + (center / tangents).abs().max() > FRUSTUM_CLAMP + 1e-6).item()
+    return (1 + (center / tangents).abs().max() > _C.FRUSTUM_CLAMP + 1e-6).item()

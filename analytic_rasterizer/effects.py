@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import torch
 
@@ -11,8 +12,44 @@ from . import _C
 
 MAX_SH_DEGREE = _C.MAX_SH_DEGREE
 NEAR = _C.NEAR  # camera-space z up to which everything is culled
-OUTPUTS = ("alpha", "depth", "inverse_depth", "median_depth", "dominant_index", "gaussian_stats")
 AUTO = "auto"
+
+
+class GaussianStats(NamedTuple):
+    """How much of every Gaussian a picture shows. Its weight in a pixel is what its colour is multiplied with there.
+
+    Attributes:
+        pixels: (P,) int32, pixels in which its weight is not zero.
+        max_weight: (P,) largest weight, 0 to 1, float32.
+        sum_weight: (P,) sum of weights over all pixels, in steps of 2^-32.
+    """
+
+    pixels: torch.Tensor
+    max_weight: torch.Tensor
+    sum_weight: torch.Tensor
+
+
+class Outputs(NamedTuple):
+    """What `Effects` asked for; None for the rest. The first three are differentiable in every input of the rasterizer.
+
+    Attributes:
+        alpha: (1, H, W) in 0 to 1.
+        depth: (1, H, W) sum of weight times z, world units; divided by alpha it is the mean depth of what is seen.
+        inverse_depth: (1, H, W) sum of weight over z, 1 / world units.
+        median_depth: (1, H, W) world units; 0 where half of the light gets through.
+        dominant_index: (1, H, W) int32, the Gaussian of the largest weight, of equal ones the nearest; -1 for none.
+        gaussian_stats: `GaussianStats`.
+    """
+
+    alpha: torch.Tensor | None = None
+    depth: torch.Tensor | None = None
+    inverse_depth: torch.Tensor | None = None
+    median_depth: torch.Tensor | None = None
+    dominant_index: torch.Tensor | None = None
+    gaussian_stats: GaussianStats | None = None
+
+
+OUTPUTS = Outputs._fields
 
 
 @dataclass(frozen=True)
@@ -154,6 +191,20 @@ class Effects:
             or self.motion is not None
         )
 
+    def lens_members(self) -> dict:
+        """What the effects set of the op's argument `lens`: numbers, lists or tensors by the names of `_C.LENS`."""
+        members = {"focus": 1.0, "near": self.near, "far": self.far, "parallel": float(self.orthographic)}
+        if self.defocus:
+            members |= {"aperture": self.defocus.aperture, "focus": self.defocus.focus}
+        if self.motion:
+            velocities = {
+                "shift": self.motion.velocity,
+                "turn": self.motion.angular_velocity,
+                "screen": self.motion.screen_velocity,
+            }
+            members |= {k: _times(self.motion.exposure, v) for k, v in velocities.items() if v is not None}
+        return members
+
 
 def _check_number(name: str, value, at_least: float = -math.inf, above: float = -math.inf) -> None:
     if isinstance(value, torch.Tensor):
@@ -165,3 +216,13 @@ def _check_number(name: str, value, at_least: float = -math.inf, above: float = 
     if not (math.isfinite(value) and value >= at_least and value > above):
         limit = f" and above {above}" if above > -math.inf else f" and at least {at_least}" if at_least == 0 else ""
         raise ValueError(f"{name} must be finite{limit}, got {value}")
+
+
+def _times(exposure, velocity):
+    """exposure * velocity: a tensor if one of the two is a tensor, otherwise a list."""
+    if isinstance(exposure, torch.Tensor) and not isinstance(velocity, torch.Tensor):
+        velocity = exposure.new_tensor(velocity)
+    if isinstance(velocity, torch.Tensor):
+        exposure = exposure.to(velocity).reshape(()) if isinstance(exposure, torch.Tensor) else exposure
+        return exposure * velocity
+    return [exposure * v for v in velocity]

@@ -75,7 +75,7 @@ def _(a):
         extra = a.depth + a.inverse_depth
         made = like.new_empty(len(like), channels + extra) if extra else like.new_empty(0)
         saved = [*_lists(like, rows, a, True), *_state(like, a), made]
-    images = [like.new_empty(size) for _ in range(a.alpha + a.depth + a.inverse_depth)]
+    images = [like.new_empty(size) for name in _C.IMAGES if getattr(a, name)]
     return like.new_empty(channels, *size), images, like.new_empty(len(like), dtype=torch.int32), saved
 
 

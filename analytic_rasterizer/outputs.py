@@ -1,50 +1,11 @@
-"""What a rendering returns besides its colours."""
+"""How the outputs of a rendering are made that are no images of the op, and what is made of outputs."""
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import torch
 
 from . import _C
-from .effects import Effects
-
-BLENDED = ("alpha", "depth", "inverse_depth")
-"""Outputs that the op returns as images, in its order."""
-
-
-class GaussianStats(NamedTuple):
-    """How much of every Gaussian a picture shows. Its weight in a pixel is what its colour is multiplied with there.
-
-    Attributes:
-        pixels: (P,) int32, pixels in which its weight is not zero.
-        max_weight: (P,) largest weight, 0 to 1, float32.
-        sum_weight: (P,) sum of weights over all pixels, in steps of 2^-32.
-    """
-
-    pixels: torch.Tensor
-    max_weight: torch.Tensor
-    sum_weight: torch.Tensor
-
-
-class Outputs(NamedTuple):
-    """What `Effects` asked for; None for the rest. The first three are differentiable in every input of the rasterizer.
-
-    Attributes:
-        alpha: (1, H, W) in 0 to 1.
-        depth: (1, H, W) sum of weight times z, world units; divided by alpha it is the mean depth of what is seen.
-        inverse_depth: (1, H, W) sum of weight over z, 1 / world units.
-        median_depth: (1, H, W) world units; 0 where half of the light gets through.
-        dominant_index: (1, H, W) int32, the Gaussian of the largest weight, of equal ones the nearest; -1 for none.
-        gaussian_stats: `GaussianStats`.
-    """
-
-    alpha: torch.Tensor | None = None
-    depth: torch.Tensor | None = None
-    inverse_depth: torch.Tensor | None = None
-    median_depth: torch.Tensor | None = None
-    dominant_index: torch.Tensor | None = None
-    gaussian_stats: GaussianStats | None = None
+from .effects import Effects, GaussianStats
 
 
 def normalized(blended: torch.Tensor, alpha: torch.Tensor, smallest: float = 1e-6) -> torch.Tensor:

@@ -6,10 +6,13 @@ from typing import Any
 
 import torch
 
-from . import ops  # noqa: F401  (registers the fake kernels)
+from . import (
+    _C,
+    ops,  # noqa: F401  (registers the fake kernels)
+)
 from .arguments import camera_arguments, check_tensors, gaussian_arguments
-from .effects import NEAR, Effects
-from .outputs import BLENDED, Outputs, depths, summaries
+from .effects import NEAR, Effects, Outputs
+from .outputs import depths, summaries
 from .settings import GaussianRasterizationSettings
 
 NOTHING = Effects()
@@ -96,12 +99,12 @@ def _render_with_outputs(
             raise ValueError(f"bg must have shape {(channels, *size)}, got {tuple(bg.shape)}")
         bg, bg_image = bg.new_zeros(channels), bg
     with_summaries = effects.median_depth or effects.dominant_index or effects.gaussian_stats
-    blended = {name: getattr(effects, name) for name in BLENDED}
+    blended = {name: getattr(effects, name) for name in _C.IMAGES}
     blended["alpha"] |= bg_image is not None
     color, images, radii, saved = torch.ops.analytic_rasterizer.rasterize(
         **gaussians, **camera, bg=bg, **blended, keep=with_summaries, debug=debug
     )
-    outputs = dict(zip((name for name in BLENDED if blended[name]), (image[None] for image in images)))
+    outputs = dict(zip((name for name in _C.IMAGES if blended[name]), (image[None] for image in images)))
     if bg_image is not None:
         color = color + (1 - outputs["alpha"]) * bg_image
         if not effects.alpha:

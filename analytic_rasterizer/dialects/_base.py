@@ -10,9 +10,8 @@ from typing import Any
 import torch
 
 from ..arguments import check_tensors
-from ..effects import Effects
+from ..effects import Effects, Outputs
 from ..footprints import Footprint, chosen_footprint, resolve_footprint
-from ..outputs import Outputs
 from ..rasterizer import NOTHING, render
 from ..rasterizer import GaussianRasterizer as LibraryRasterizer
 from ..rasterizer import rasterize_gaussians as library_rasterize_gaussians

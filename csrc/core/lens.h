@@ -5,8 +5,8 @@
 
 namespace ar {
 
-/// What a full camera has beyond a plain one, in the order of the op's argument `lens`. An aggregate of kLensWidth
-/// scalars.
+/// What a full camera has beyond a plain one: an aggregate of kLensWidth scalars. What Python knows of it is
+/// kLensMembers.
 template <typename T> struct Lens {
   Vec2<T> tan_half_fov;  ///< of an orthographic camera half the width and height, world units
   Vec2<T> center;        ///< x/z and y/z at the middle of the picture, around which they are clamped
@@ -23,7 +23,20 @@ template <typename T> struct Lens {
            turn.z != T(0) || screen.x != T(0) || screen.y != T(0);
   }
 };
-inline constexpr int kLensWidth = 17;
+/// The members of Lens, in order: Python fills the op's argument `lens` by these names, with zeros where it has none.
+struct LensMember {
+  const char* name;
+  int size;
+};
+inline constexpr LensMember kLensMembers[] = {
+    {"tan_half_fov", 2}, {"center", 2}, {"aperture", 1}, {"focus", 1}, {"shift", 3},
+    {"turn", 3},         {"screen", 2}, {"near", 1},     {"far", 1},   {"parallel", 1},
+};
+inline constexpr int kLensWidth = [] {
+  int width = 0;
+  for (const LensMember& member : kLensMembers) width += member.size;
+  return width;
+}();
 static_assert(sizeof(Lens<float>) == kLensWidth * sizeof(float));
 
 /// A blurred Gaussian whose det Sigma [px^4] is below this, of standard deviations of 3e-8 px, counts as one without

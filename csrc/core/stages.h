@@ -175,6 +175,26 @@ template <typename T> struct ProjectedRowGrads {
   const Vec3<T>* colors;
 };
 
+/// Public rows to splats. Nothing is known about their numbers: a row that makes no splat touches no tile.
+template <typename T> struct ShapeRowsParams {
+  int64_t n;
+  ProjectedRows<T> rows;  ///< read; without colours the splats are black
+  FootprintChoice footprint;
+  TileGrid grid;
+  T* splats;  ///< [n] SplatRow
+};
+
+/// Sums of pairs to the gradient with respect to public rows, written for every row: zero where it has no pairs.
+template <typename T> struct RowGradsParams {
+  int64_t n;
+  ProjectedRows<T> rows;  ///< read: cov2d, dets, opacities
+  FootprintChoice footprint;
+  Vec2<T>* dL_dmeans2d;
+  Sym2<T>* dL_dcov2d;  ///< xy: with respect to the one number that fills both places
+  T* dL_dopacities;
+  Vec2<T>* absolute;  ///< [n] sums over pixels of |dL/dmeans2d|, or null
+};
+
 /// Splats, by tile and depth, to an image.
 template <typename T> struct BlendParams {
   TileGrid grid;
@@ -185,6 +205,17 @@ template <typename T> struct BlendParams {
   T* alpha;             ///< [height, width] 1 - mean transmittance, or null
   T* transmittance;     ///< [samples, height, width] of every sample at the end, or null without a backward pass
   int32_t* last;        ///< [samples, height, width] pairs of the tile up to the last one composited, or null
+};
+
+/// Splats, by tile and depth, to what every pixel shows of the `n` Gaussians.
+template <typename T> struct InspectParams {
+  const T* splats;
+  TileGrid grid;
+  int32_t* median;    ///< [height, width] Gaussians, or -1; see PixelSummary
+  int32_t* dominant;  ///< [height, width]
+  int32_t* touched;   ///< [n] pixels, to add to
+  int32_t* largest;   ///< [n] largest weight, as the bits of a float; to raise
+  int64_t* units;     ///< [n] sum of weights in units of kWeightUnit, to add to
 };
 
 /// The gradient of an image to sums per pair.

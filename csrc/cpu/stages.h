@@ -39,14 +39,8 @@ template <typename T> struct ProjectRowsParams : ar::ProjectParams<T> {
   ProjectedRows<T> rows;  ///< [gaussians] each; what belongs to a radius of 0 is not written
 };
 
-/// Public rows to splats. Nothing is known about their numbers: a row that makes no splat touches no tile.
-template <typename T> struct ShapeRowsParams {
-  int64_t n;
-  ProjectedRows<T> rows;  ///< read; without colours the splats are black
-  FootprintChoice footprint;
-  TileGrid grid;
+template <typename T> struct ShapeRowsParams : ar::ShapeRowsParams<T> {
   int threads;
-  T* splats;  ///< [n] SplatRow
 };
 
 /// count_pairs fills the offsets and scatter_pairs, once the caller has made room, `pairs` and `positions`.
@@ -141,33 +135,18 @@ template <typename T> struct ProjectRowsVjpParams : ar::ProjectVjpParams<T> {
   CameraGrad<T>* camera_grads;
 };
 
-/// Sums of pairs to the gradient with respect to public rows, written for every row: zero where it has no pairs.
-template <typename T> struct RowGradsParams {
+template <typename T> struct RowGradsParams : ar::RowGradsParams<T> {
   SplatPairs pairs;
-  int64_t n;
-  FootprintChoice footprint;
   int threads;
-  ProjectedRows<T> rows;  ///< read: cov2d, dets, opacities
   const T* pair_grads;
   int64_t pair_stride;
-  const Vec2<T>* pair_means;  ///< [pairs] or null
-  Vec2<T>* dL_dmeans2d;
-  Sym2<T>* dL_dcov2d;  ///< xy: with respect to the one number that fills both places
-  T* dL_dopacities;
-  Vec2<T>* absolute;  ///< [n] sums over pixels of |dL/dmeans2d|, with pair_means
+  const Vec2<T>* pair_means;  ///< [pairs] or null, as `absolute`
 };
 
-template <typename T> struct InspectParams {
-  const T* splats;
+template <typename T> struct InspectParams : ar::InspectParams<T> {
   const int32_t* ids;  ///< Gaussian of each splat, in [0, n)
   TileLists lists;
-  TileGrid grid;
   int threads;
-  int32_t* median;    ///< [height, width] Gaussians, or -1; see PixelSummary
-  int32_t* dominant;  ///< [height, width]
-  int32_t* touched;   ///< [n] pixels, to add to
-  int32_t* largest;   ///< [n] largest weight, as the bits of a float; to raise
-  int64_t* units;     ///< [n] sum of weights in units of kWeightUnit, to add to
 };
 
 template <typename T> struct WeightParams : ar::WeightParams<T> {

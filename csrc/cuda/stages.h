@@ -104,12 +104,7 @@ struct ProjectRowsParams {
   int32_t* radii;             ///< [n]
 };
 
-struct ShapeRowsParams {
-  int64_t n;
-  ProjectedRows<float> rows;  ///< read only; colors may be null: black
-  FootprintChoice footprint;
-  TileGrid grid;
-  float* splats;      ///< [n] SplatRow
+struct ShapeRowsParams : ar::ShapeRowsParams<float> {
   uint32_t* keys;     ///< [n]
   PairRange* ranges;  ///< [n] count
 };
@@ -202,15 +197,8 @@ struct BlendParams : ar::BlendParams<float> {
   float* checkpoints;  ///< [planes, kTile^2]
 };
 
-struct InspectParams {
-  const float* splats;
+struct InspectParams : ar::InspectParams<float> {
   TileLists lists;
-  TileGrid grid;
-  int32_t* median;    ///< [height, width] Gaussians, or -1; see PixelSummary
-  int32_t* dominant;  ///< [height, width]
-  int32_t* touched;   ///< [n] pixels, to add to
-  int32_t* largest;   ///< [n] largest weight, as the bits of a float; to raise
-  int64_t* units;     ///< [n] sum of weights in units of kWeightUnit, to add to
 };
 
 /// For the three colours in the splats dL_dimage.first is not null.
@@ -261,15 +249,8 @@ struct ProjectRowsVjpParams {
   float* camera_grads;            ///< as in ProjectVjpParams
 };
 
-struct RowGradsParams {
-  int64_t n;
-  ProjectedRows<float> rows;  ///< of which cov2d, dets and opacities are read
-  FootprintChoice footprint;
+struct RowGradsParams : ar::RowGradsParams<float> {
   PairSumsView sums;
-  Vec2<float>* dL_dmeans2d;
-  Sym2<float>* dL_dcov2d;  ///< xy: with respect to the one number that fills both places
-  float* dL_dopacities;
-  Vec2<float>* absolute;  ///< sums of |dL/dmeans2d| over pixels, or null
 };
 
 AR_HD constexpr int64_t warps_of(int64_t n) { return (n + 31) / 32; }

@@ -1,218 +1,197 @@
-// The arguments of the ops, each named and typed once: `each` of a struct lists them for the schema, for reading them
-// off the dispatcher's stack, and for the names in snapshots.
+// The arguments of the ops, each named once, in the order of its schema: `each` of a struct lists them for the schema,
+// for reading them off the dispatcher's stack, and for the names in snapshots.
 #pragma once
 
 #include <ATen/ATen.h>
 #include <ATen/core/ivalue.h>
 #include <ATen/core/stack.h>
 
-#include <optional>
 #include <string>
 #include <string_view>
 #include <vector>
 
-#include "core/stages.h"
+#include "torch/images.h"
 
 namespace ar::ops {
 
-using at::Tensor;
-using OptionalTensor = std::optional<Tensor>;
 using c10::IValue;
 
-/// A scene and a camera as 3DGS names them. check() (checks.h) brings the tensors into the form the kernels read.
-struct Inputs {
+/// A tensor, or what takes its place, for every tensor of a scene and a camera as 3DGS names them.
+template <class Optional> struct SceneTensors {
   Tensor means3D;
-  OptionalTensor means2D;
+  Optional means2D;
   Tensor opacities;
-  OptionalTensor shs, colors_precomp, scales, rotations, cov3D_precomp;
+  Optional shs, colors_precomp, scales, rotations, cov3D_precomp;
   Tensor viewmatrix, projmatrix, campos;
-  OptionalTensor lens;  ///< of a full camera
+  Optional lens;  ///< of a full camera
+
+  template <class Visit> void each_tensor(Visit&& visit) {
+    visit("means3D", means3D);
+    visit("means2D", means2D);
+    visit("opacities", opacities);
+    visit("shs", shs);
+    visit("colors_precomp", colors_precomp);
+    visit("scales", scales);
+    visit("rotations", rotations);
+    visit("cov3D_precomp", cov3D_precomp);
+    visit("viewmatrix", viewmatrix);
+    visit("projmatrix", projmatrix);
+    visit("campos", campos);
+    visit("lens", lens);
+  }
+};
+/// The first of them are of the Gaussians, the others of the camera.
+inline constexpr size_t kGaussianTensors = 8, kCameraTensors = 4, kSceneTensors = kGaussianTensors + kCameraTensors;
+
+/// A scene and a camera, whose tangents are a double each; or several cameras, with a std::vector<double> and tensors
+/// that have a dimension more. check() (checks.h) brings the tensors into the form the kernels read.
+template <class Tangent> struct SceneArguments : SceneTensors<OptionalTensor> {
   int64_t image_height = 0, image_width = 0;
-  double tanfovx = 0, tanfovy = 0, scale_modifier = 1;
+  Tangent tanfovx = {}, tanfovy = {};
+  double scale_modifier = 1;
   int64_t sh_degree = 0;
 
   int64_t count() const { return means3D.size(0); }
 
   template <class Visit> void each(Visit&& visit) {
-    visit("Tensor means3D", means3D);
-    visit("Tensor? means2D", means2D);
-    visit("Tensor opacities", opacities);
-    visit("Tensor? shs", shs);
-    visit("Tensor? colors_precomp", colors_precomp);
-    visit("Tensor? scales", scales);
-    visit("Tensor? rotations", rotations);
-    visit("Tensor? cov3D_precomp", cov3D_precomp);
-    visit("Tensor viewmatrix", viewmatrix);
-    visit("Tensor projmatrix", projmatrix);
-    visit("Tensor campos", campos);
-    visit("Tensor? lens", lens);
-    visit("int image_height", image_height);
-    visit("int image_width", image_width);
-    visit("float tanfovx", tanfovx);
-    visit("float tanfovy", tanfovy);
-    visit("float scale_modifier", scale_modifier);
-    visit("int sh_degree", sh_degree);
+    each_tensor(visit);
+    visit("image_height", image_height);
+    visit("image_width", image_width);
+    visit("tanfovx", tanfovx);
+    visit("tanfovy", tanfovy);
+    visit("scale_modifier", scale_modifier);
+    visit("sh_degree", sh_degree);
   }
 };
+using Inputs = SceneArguments<double>;
 
-/// Gradients with respect to the tensors of Inputs, in their order; undefined where nobody wants one.
-struct Grads {
-  Tensor means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp;
-  Tensor viewmatrix, projmatrix, campos, lens;
+/// Gradients with respect to the tensors of Inputs; undefined where nobody wants one.
+struct Grads : SceneTensors<Tensor> {
   MeanSums mean_sums = MeanSums::kNone;  ///< that means2D holds
+  bool with_camera = false;              ///< one of the camera's tensors wants a gradient
+};
+
+/// A footprint by its key, and the number of its option.
+struct FootprintArguments {
+  std::string footprint;
+  double option = 0;
 
   template <class Visit> void each(Visit&& visit) {
-    for (Tensor* t : {&means3D, &means2D, &opacities, &shs, &colors_precomp, &scales, &rotations, &cov3D_precomp,
-                      &viewmatrix, &projmatrix, &campos, &lens})
-      visit(*t);
+    visit("footprint", footprint);
+    visit("option", option);
   }
 };
 
 /// Arguments of `rasterize`.
-struct RasterizeArguments : Inputs {
+struct RasterizeArguments : Inputs, FootprintArguments {
   Tensor bg;  ///< (C,) of C colour channels
-  std::string footprint;
-  double option = 0;
-  bool depth = false, inverse_depth = false, alpha = false, keep = false, debug = false;
+  ImageSwitches images = {};
+  bool keep = false, debug = false;
   std::string means2d_z = "zero";  ///< third column of the gradient with respect to means2D: "sum_abs", "sum_norm"
 
   template <class Visit> void each(Visit&& visit) {
     Inputs::each(visit);
-    visit("Tensor bg", bg);
-    visit("str footprint", footprint);
-    visit("float option", option);
-    visit("bool alpha=False", alpha);
-    visit("bool depth=False", depth);
-    visit("bool inverse_depth=False", inverse_depth);
-    visit("bool keep=False", keep);
-    visit("bool debug=False", debug);
-    visit("str means2d_z=\"zero\"", means2d_z);
+    visit("bg", bg);
+    FootprintArguments::each(visit);
+    for (size_t k = 0; k < kImageCount; ++k) visit(kImageSwitches[k], images[k]);
+    visit("keep=False", keep);
+    visit("debug=False", debug);
+    visit("means2d_z=\"zero\"", means2d_z);
   }
 };
 
-/// Arguments of `project`: Inputs for several cameras at once.
-struct ProjectArguments {
-  Tensor means3D, opacities;
-  OptionalTensor shs, colors_precomp, scales, rotations, cov3D_precomp;
-  Tensor viewmatrix, projmatrix, campos;  ///< (C, 4, 4), (C, 4, 4), (C, 3)
-  OptionalTensor lens;                    ///< (C, kLensWidth)
+/// Arguments of `project`: of one or several cameras, in C numbers each of the tangents and in tensors of shape
+/// (C, 4, 4), (C, 4, 4), (C, 3), (C, kLensWidth). It has no means2D, which is an output.
+struct ProjectArguments : SceneArguments<std::vector<double>>, FootprintArguments {
+  template <class Visit> void each(Visit&& visit) {
+    SceneArguments::each([&](std::string_view name, auto& value) {
+      if (name != "means2D") visit(name, value);
+    });
+    FootprintArguments::each(visit);
+  }
+};
+
+/// What the arguments of `bin`, `blend` and `inspect` have in common.
+struct ImageArguments : FootprintArguments {
   int64_t image_height = 0, image_width = 0;
-  std::vector<double> tanfovx, tanfovy;  ///< C numbers each
-  double scale_modifier = 1;
-  int64_t sh_degree = 0;
-  std::string footprint;
-  double option = 0;
 
   template <class Visit> void each(Visit&& visit) {
-    visit("Tensor means3D", means3D);
-    visit("Tensor opacities", opacities);
-    visit("Tensor? shs", shs);
-    visit("Tensor? colors_precomp", colors_precomp);
-    visit("Tensor? scales", scales);
-    visit("Tensor? rotations", rotations);
-    visit("Tensor? cov3D_precomp", cov3D_precomp);
-    visit("Tensor viewmatrix", viewmatrix);
-    visit("Tensor projmatrix", projmatrix);
-    visit("Tensor campos", campos);
-    visit("Tensor? lens", lens);
-    visit("int image_height", image_height);
-    visit("int image_width", image_width);
-    visit("float[] tanfovx", tanfovx);
-    visit("float[] tanfovy", tanfovy);
-    visit("float scale_modifier", scale_modifier);
-    visit("int sh_degree", sh_degree);
-    visit("str footprint", footprint);
-    visit("float option", option);
+    visit("image_height", image_height);
+    visit("image_width", image_width);
+    FootprintArguments::each(visit);
   }
 };
 
 /// Arguments of `bin`: the rows that `project` made for C cameras, camera after camera.
-struct BinArguments {
+struct BinArguments : ImageArguments {
   Tensor means2d, cov2d, dets, opacities, depths;
   OptionalTensor colors, background;  ///< (N, 3), (3,): what `adaptive` chooses samples by
   Tensor row_splits;                  ///< (C + 1,) int64 on the CPU, first row of each camera
-  int64_t image_height = 0, image_width = 0;
-  std::string footprint;
-  double option = 0;
   bool keep = true;
 
   template <class Visit> void each(Visit&& visit) {
-    visit("Tensor means2d", means2d);
-    visit("Tensor cov2d", cov2d);
-    visit("Tensor dets", dets);
-    visit("Tensor opacities", opacities);
-    visit("Tensor depths", depths);
-    visit("Tensor? colors", colors);
-    visit("Tensor? background", background);
-    visit("Tensor row_splits", row_splits);
-    visit("int image_height", image_height);
-    visit("int image_width", image_width);
-    visit("str footprint", footprint);
-    visit("float option", option);
-    visit("bool keep=True", keep);
+    visit("means2d", means2d);
+    visit("cov2d", cov2d);
+    visit("dets", dets);
+    visit("opacities", opacities);
+    visit("depths", depths);
+    visit("colors", colors);
+    visit("background", background);
+    visit("row_splits", row_splits);
+    ImageArguments::each(visit);
+    visit("keep=True", keep);
   }
 };
 
 /// Arguments of `blend`.
-struct BlendArguments {
+struct BlendArguments : ImageArguments {
   Tensor means2d, cov2d, opacities, features, background;
   OptionalTensor means2d_abs;  ///< its values are ignored; its gradient is the sum over pixels of |dL/dmeans2d|
   Tensor dets, row_splits;
   std::vector<Tensor> lists;  ///< of `bin`
-  int64_t image_height = 0, image_width = 0;
-  std::string footprint;
-  double option = 0;
   bool keep = false;
 
   template <class Visit> void each(Visit&& visit) {
-    visit("Tensor means2d", means2d);
-    visit("Tensor cov2d", cov2d);
-    visit("Tensor opacities", opacities);
-    visit("Tensor features", features);
-    visit("Tensor background", background);
-    visit("Tensor? means2d_abs", means2d_abs);
-    visit("Tensor dets", dets);
-    visit("Tensor row_splits", row_splits);
-    visit("Tensor[] lists", lists);
-    visit("int image_height", image_height);
-    visit("int image_width", image_width);
-    visit("str footprint", footprint);
-    visit("float option", option);
-    visit("bool keep=False", keep);
+    visit("means2d", means2d);
+    visit("cov2d", cov2d);
+    visit("opacities", opacities);
+    visit("features", features);
+    visit("background", background);
+    visit("means2d_abs", means2d_abs);
+    visit("dets", dets);
+    visit("row_splits", row_splits);
+    visit("lists", lists);
+    ImageArguments::each(visit);
+    visit("keep=False", keep);
   }
 };
 
 /// Arguments of `inspect`: what every pixel shows of the Gaussians that `lists` of rasterize hold, and how much of each
 /// of the `count` Gaussians is seen.
-struct InspectArguments {
+struct InspectArguments : ImageArguments {
   std::vector<Tensor> saved;
-  int64_t count = 0, image_height = 0, image_width = 0;
-  std::string footprint;
-  double option = 0;
+  int64_t count = 0;
 
   template <class Visit> void each(Visit&& visit) {
-    visit("Tensor[] saved", saved);
-    visit("int count", count);
-    visit("int image_height", image_height);
-    visit("int image_width", image_width);
-    visit("str footprint", footprint);
-    visit("float option", option);
+    visit("saved", saved);
+    visit("count", count);
+    ImageArguments::each(visit);
   }
 };
 
 /// Arguments of `footprint_weight`.
-struct WeightArguments {
+struct WeightArguments : FootprintArguments {
   Tensor offset, cov2d;
-  std::string footprint;
-  double option = 0;
 
   template <class Visit> void each(Visit&& visit) {
-    visit("Tensor offset", offset);
-    visit("Tensor cov2d", cov2d);
-    visit("str footprint", footprint);
-    visit("float option", option);
+    visit("offset", offset);
+    visit("cov2d", cov2d);
+    FootprintArguments::each(visit);
   }
 };
+
+/// The name in a declaration `name` or `name=default`.
+inline std::string_view name_of(std::string_view declaration) { return declaration.substr(0, declaration.find('=')); }
 
 /// Arguments of the adjoint of an op: the gradient with respect to its differentiable outputs, its own arguments, what
 /// it saved, and which of its tensor arguments want a gradient.
@@ -223,52 +202,41 @@ template <class Arguments> struct VjpArguments {
   std::vector<bool> needs;
 
   template <class Visit> void each(Visit&& visit) {
-    visit("Tensor?[] dL_doutputs", dL_doutputs);
-    of_op.each([&](const char* declaration, auto& value) {
-      // Nothing may follow a default that has none itself.
-      const std::string_view text = declaration;
-      visit(std::string(text.substr(0, text.find('='))).c_str(), value);
-    });
-    visit("Tensor[] saved", saved);
-    visit("bool[] needs", needs);
+    visit("dL_doutputs", dL_doutputs);
+    // Nothing without a default may follow something that has one.
+    of_op.each([&](std::string_view declaration, auto& value) { visit(name_of(declaration), value); });
+    visit("saved", saved);
+    visit("needs", needs);
   }
 };
 
 /// "Tensor means3D, Tensor? means2D, ...".
 template <class Arguments> std::string schema_of() {
   std::string text;
-  Arguments arguments;
-  arguments.each(
-      [&](const char* declaration, auto&) { text += (text.empty() ? "" : ", ") + std::string(declaration); });
+  Arguments().each([&](std::string_view declaration, auto& value) {
+    const std::string type = c10::getTypePtr<std::decay_t<decltype(value)>>()->str();
+    text += (text.empty() ? "" : ", ") + type + " " + std::string(declaration);
+  });
   return text;
 }
 
-inline void assign(const IValue& from, Tensor& to) { to = from.toTensor(); }
+template <class Value> void assign(const IValue& from, Value& to) { to = from.to<Value>(); }
+/// A tensor that autograd left undefined is one that is missing.
 inline void assign(const IValue& from, OptionalTensor& to) {
   to = from.isTensor() && from.toTensor().defined() ? OptionalTensor(from.toTensor()) : std::nullopt;
 }
-inline void assign(const IValue& from, int64_t& to) { to = from.toInt(); }
-inline void assign(const IValue& from, double& to) { to = from.toDouble(); }
-inline void assign(const IValue& from, bool& to) { to = from.toBool(); }
-inline void assign(const IValue& from, std::string& to) { to = from.toStringRef(); }
-inline void assign(const IValue& from, std::vector<Tensor>& to) { to = from.toTensorVector(); }
 inline void assign(const IValue& from, std::vector<OptionalTensor>& to) {
   to.clear();
   for (const OptionalTensor& t : from.toOptionalTensorVector()) to.push_back(t && t->defined() ? t : std::nullopt);
-}
-inline void assign(const IValue& from, std::vector<double>& to) { to = from.toDoubleVector(); }
-inline void assign(const IValue& from, std::vector<bool>& to) {
-  const auto list = from.toBoolList();
-  to.assign(list.begin(), list.end());
 }
 
 /// Takes an op's arguments off the dispatcher's stack.
 template <class Arguments> Arguments take(torch::jit::Stack& stack) {
   Arguments arguments;
   size_t count = 0;
-  arguments.each([&](const char*, auto&) { ++count; });
+  arguments.each([&](std::string_view, auto&) { ++count; });
   const IValue* next = stack.data() + (stack.size() - count);
-  arguments.each([&](const char*, auto& value) { assign(*next++, value); });
+  arguments.each([&](std::string_view, auto& value) { assign(*next++, value); });
   torch::jit::drop(stack, count);
   return arguments;
 }

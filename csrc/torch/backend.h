@@ -1,13 +1,15 @@
-// What a device must be able to do for the pass that recipe.h writes down once: a stage per function. A backend
-// allocates what its stages need, fills their parameters (core/stages.h) by name and launches them. Arguments have been
-// checked.
+// What a device must be able to do: a stage per function. The ops (rasterize.cpp, stages.cpp) are written once for all
+// devices. They check the arguments and allocate what is the same everywhere; a backend allocates the rest, sets the
+// parameters of its stages (core/stages.h) and launches them.
 #pragma once
 
+#include <array>
 #include <memory>
 #include <vector>
 
 #include "core/stages.h"
 #include "torch/arguments.h"
+#include "torch/images.h"
 
 namespace ar::ops {
 
@@ -71,99 +73,110 @@ template <class Members> Members from_list(const std::vector<Tensor>& list, size
   return members;
 }
 
-/// What is blended. Without `rows` the three colours in the splats.
-struct ChannelTensors {
-  Tensor rows;            ///< (m, count) contiguous, or undefined
-  bool by_gaussian;       ///< a row per Gaussian; else per splat
-  bool all_made = false;  ///< by `project`: only project_vjp looks at their gradient
-  int64_t count;
-};
-
-/// An image as separate tensors: `color` holds the first channels (C, H, W), every one of `extra` another (H, W).
-/// As gradients they may be undefined: zero.
-struct ImageTensors {
-  Tensor color;
-  int64_t color_channels = 0;
-  std::vector<Tensor> extra;
-  Tensor alpha;  ///< (H, W), undefined where nobody wants it
-};
-
-/// Columns of `rows` in ChannelTensors that `project` fills, -1 where it does not (ChannelRows in core/stages.h).
-struct ChannelColumns {
-  int color = -1, depth = -1, inverse_depth = -1;
-};
-
 /// Sums over the pairs of every splat, as `blend_vjp` leaves them for `project_vjp` or `row_grads`.
 struct PairSums {
   Tensor pairs;  ///< CPU: (N, 6), or (N, 9) with the three colours; CUDA: (room, kPairGradWidth)
-  Tensor means;  ///< CPU: (N, 2) MeanSums, if they are wanted
+  Tensor means;  ///< (N, 2) MeanSums, if they are wanted
   /// Like ChannelTensors::rows; undefined where the pairs hold the three colours, or all that `project` made.
   Tensor dL_dchannels;
 };
 
-/// The public form of splats (ProjectedRows in core/stages.h), and gradients with respect to it.
+/// The public form of splats (ProjectedRows in core/stages.h), or gradients with respect to it.
 struct RowTensors {
   Tensor means2d, cov2d, dets, opacities, depths, colors;
   Tensor absolute;  ///< of a gradient (n, 2): sums over pixels of |dL/dmeans2d|, if PairSums has them
+
+  /// Those that every splat has.
+  std::array<Tensor*, 5> numbers() { return {&means2d, &cov2d, &dets, &opacities, &depths}; }
 };
 
-/// Whether a pass waits for its stages, and what it keeps.
-struct PassOptions {
-  bool keep;           ///< for a backward pass
-  bool alpha;          ///< make the image of alpha
-  bool debug;          ///< wait for every stage, so that the stage that failed is the one that raises
-  bool exact = false;  ///< count pairs before room is made for them, whatever earlier frames had
+/// What `inspect` finds, in the order in which the op returns it.
+struct SummaryTensors {
+  Tensor median, dominant;         ///< (H, W) int32
+  Tensor touched, largest, total;  ///< (count,) int32, float32 whose bits are raised as int32, int64
+};
+
+/// One weight per element: what `weight` and `weight_vjp` read and write.
+struct WeightTensors {
+  Tensor offset, cov2d;
+  Tensor weight;                             ///< written by `weight`
+  Tensor dL_dweight, dL_doffset, dL_dcov2d;  ///< of `weight_vjp`, which reads the first
 };
 
 /// The chosen footprint.
 struct FootprintSpec {
-  std::string key;
   FootprintChoice choice;
   int samples;  ///< the most that a pixel has
   bool chosen;  ///< per tile
 };
+
+/// The footprint of this key and number. Raises ValueError if there is none.
+FootprintSpec find_footprint(const std::string& key, double option);
+
+/// What all stages of a pass share.
+struct Pass {
+  FootprintSpec footprint;
+  TileGrid grid;
+  bool keep = false;   ///< what a backward pass needs
+  bool debug = false;  ///< wait for every stage, so that the stage that failed is the one that raises
+  bool exact;          ///< count pairs before room is made for them, whatever earlier frames had
+
+  template <class Arguments>
+  explicit Pass(const Arguments& a)
+      : footprint(find_footprint(a.footprint, a.option)),
+        grid{int(a.image_width), int(a.image_height)},
+        exact(at::globalContext().deterministicAlgorithms()) {}
+};
+
+/// Room for the members of BlendState that are the same on every device.
+inline BlendState make_state(const Pass& pass, const Tensor& like) {
+  const FootprintSpec& footprint = pass.footprint;
+  const std::vector<int64_t> planes = {pass.keep ? footprint.samples : 0, pass.grid.height, pass.grid.width};
+  // Where samples are chosen not every tile writes all planes.
+  const auto make = [&](const at::TensorOptions& o) {
+    return footprint.chosen ? at::zeros(planes, o) : at::empty(planes, o);
+  };
+  BlendState state;
+  state.transmittance = make(like.options());
+  state.last = make(like.options().dtype(at::kInt));
+  return state;
+}
 
 class Backend {
  public:
   virtual ~Backend() = default;
 
   // Forward.
-  /// Splats of every Gaussian that may be seen, and `radii` (P,) int32. `channels` has room for the columns.
-  virtual SplatTensors project(const Inputs& in, const FootprintSpec& footprint, const ChannelTensors& channels,
-                               ChannelColumns columns, Tensor& radii) = 0;
-  /// The public rows of all Gaussians (P, ...) and radii; rows of those with radius 0 are undefined.
-  virtual RowTensors project_rows(const Inputs& in, const FootprintSpec& footprint, Tensor& radii) = 0;
+  /// Splats of every Gaussian that may be seen. Writes `radii` (P,) int32, and into `channels` the columns it makes.
+  virtual SplatTensors project(const Inputs& in, const Pass& pass, const ChannelTensors& channels,
+                               const Tensor& radii) = 0;
+  /// Writes the public rows of all Gaussians (P, ...) and radii; rows of those with radius 0 are undefined.
+  virtual void project_rows(const Inputs& in, const Pass& pass, const RowTensors& rows, const Tensor& radii) = 0;
   /// Splats from public rows.
-  virtual SplatTensors shape_rows(const RowTensors& rows, const FootprintSpec& footprint, TileGrid grid) = 0;
+  virtual SplatTensors shape_rows(const RowTensors& rows, const Pass& pass) = 0;
   /// Lists by tile and depth, and samples per tile, for which the first three channels of `background` are looked at.
-  virtual ListTensors bin(const SplatTensors& splats, const FootprintSpec& footprint, TileGrid grid,
-                          const Tensor& background, PassOptions options) = 0;
-  virtual ImageTensors blend(const ListTensors& lists, const FootprintSpec& footprint, TileGrid grid,
-                             const ChannelTensors& channels, int64_t color_channels, const Tensor& background,
-                             PassOptions options, BlendState& state) = 0;
-  /// median, dominant, touched, largest, total (schema of `inspect`).
-  virtual std::vector<Tensor> inspect(const ListTensors& lists, const FootprintSpec& footprint, TileGrid grid,
-                                      int64_t count) = 0;
+  virtual ListTensors bin(const SplatTensors& splats, const Pass& pass, const Tensor& background) = 0;
+  /// Writes `image` and, with pass.keep, the tensors of make_state; makes the others of `state`.
+  virtual void blend(const ListTensors& lists, const Pass& pass, const ChannelTensors& channels,
+                     const ImageTensors& image, BlendState& state) = 0;
+  virtual void inspect(const ListTensors& lists, const Pass& pass, const SummaryTensors& summary) = 0;
 
   // Backward.
-  virtual PairSums blend_vjp(const ListTensors& lists, const BlendState& state, const FootprintSpec& footprint,
-                             TileGrid grid, const ChannelTensors& channels, const Tensor& background,
-                             const ImageTensors& dL_dimage, MeanSums mean_sums, bool debug) = 0;
-  /// Writes `grads`; returns sums of the camera's gradient, (parts, kCameraGradWidth), if `with_camera`.
-  virtual Tensor project_vjp(const Inputs& in, const ListTensors& lists, const FootprintSpec& footprint,
-                             const PairSums& sums, ChannelColumns columns, const Grads& grads, bool with_camera,
-                             bool debug) = 0;
+  virtual PairSums blend_vjp(const ListTensors& lists, const BlendState& state, const Pass& pass,
+                             const ChannelTensors& channels, const ImageTensors& dL_dimage, MeanSums mean_sums) = 0;
+  /// Writes `grads`; returns sums of the camera's gradient, (parts, kCameraGradWidth), if it is wanted.
+  virtual Tensor project_vjp(const Inputs& in, const ListTensors& lists, const Pass& pass, const PairSums& sums,
+                             const ChannelTensors& channels, const Grads& grads) = 0;
   /// The same from the gradient of public rows; `rows` (P,) int32 has the row of each Gaussian, or -1.
-  virtual Tensor project_rows_vjp(const Inputs& in, const Tensor& rows, const RowTensors& dL_drows, const Grads& grads,
-                                  bool with_camera) = 0;
-  /// Gradient with respect to means2d, cov2d and opacities of public rows.
-  virtual RowTensors row_grads(const RowTensors& rows, const ListTensors& lists, const FootprintSpec& footprint,
-                               const PairSums& sums) = 0;
+  virtual Tensor project_rows_vjp(const Inputs& in, const Tensor& rows, const RowTensors& dL_drows,
+                                  const Grads& grads) = 0;
+  /// Writes the gradient with respect to means2d, cov2d and opacities of public rows, and `absolute`.
+  virtual void row_grads(const RowTensors& rows, const ListTensors& lists, const Pass& pass, const PairSums& sums,
+                         const RowTensors& dL_drows) = 0;
 
   // One weight per element.
-  virtual Tensor weight(const Tensor& offset, const Tensor& cov2d, const FootprintSpec& footprint) = 0;
-  virtual std::tuple<Tensor, Tensor> weight_vjp(const Tensor& dL_dweight, const Tensor& offset, const Tensor& cov2d,
-                                                const FootprintSpec& footprint) = 0;
+  virtual void weight(const WeightTensors& tensors, const FootprintSpec& footprint) = 0;
+  virtual void weight_vjp(const WeightTensors& tensors, const FootprintSpec& footprint) = 0;
 
   /// Time since the last call on the device's clock [s]; waits for the device.
   virtual double lap() = 0;
@@ -172,5 +185,11 @@ class Backend {
 /// For tensors like `like`; makes its device the current one while it lives.
 std::unique_ptr<Backend> make_cpu_backend(const Tensor& like);
 std::unique_ptr<Backend> make_cuda_backend(const Tensor& like);
+inline std::unique_ptr<Backend> make_backend(const Tensor& like) {
+#if defined(AR_WITH_CUDA)
+  if (like.is_cuda()) return make_cuda_backend(like);
+#endif
+  return make_cpu_backend(like);
+}
 
 }  // namespace ar::ops

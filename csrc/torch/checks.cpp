@@ -25,12 +25,9 @@ void check_floating(const Tensor& t, const char* name) {
                    " must have dtype float32 or float64, got ", t.scalar_type());
 }
 
-/// Same dtype and device as `like`, which is called `like_name` in the message.
-void check_like(const Tensor& t, const char* name, const Tensor& like, const char* like_name) {
-  TORCH_CHECK_TYPE(t.scalar_type() == like.scalar_type(), name, " must have the dtype of ", like_name, ", ",
-                   like.scalar_type(), ", got ", t.scalar_type());
-  TORCH_CHECK_VALUE(t.device() == like.device(), name, " must be on the device of ", like_name, ", ", like.device(),
-                    ", got ", t.device());
+/// `expected`: what makes the text of the shape in the message.
+template <class... Text> void check_shape(bool ok, const Tensor& t, const char* name, const Text&... expected) {
+  TORCH_CHECK_VALUE(ok, name, " must have shape ", expected..., ", got ", shape_of(t));
 }
 
 /// Shape (count, rest...), written as `expected` in the message.
@@ -38,21 +35,45 @@ void check_rows(const Tensor& t, const char* name, int64_t count, std::initializ
                 const char* expected) {
   const bool ok = t.dim() == int64_t(1 + rest.size()) && t.size(0) == count &&
                   std::equal(rest.begin(), rest.end(), t.sizes().begin() + 1);
-  TORCH_CHECK_VALUE(ok, name, " must have shape ", expected, " with ", expected[1], " = ", count, ", got ",
-                    shape_of(t));
+  check_shape(ok, t, name, expected, " with ", expected[1], " = ", count);
 }
 
-void check_matrix(Tensor& t, const char* name) {
-  const bool ok = (t.dim() == 2 || (t.dim() == 3 && t.size(0) == 1)) && t.size(-1) == 4 && t.size(-2) == 4;
-  TORCH_CHECK_VALUE(ok, name, " must have shape (4, 4) or (1, 4, 4), got ", shape_of(t));
-  t = t.reshape({4, 4}).contiguous();
-}
+/// What other tensors must match. Afterwards they are contiguous.
+struct Like {
+  const Tensor& tensor;
+  const char* name;
 
-void check_vector(Tensor& t, const char* name) {
-  TORCH_CHECK_VALUE(t.numel() == 3 && (t.dim() == 1 || (t.dim() == 2 && t.size(0) == 1)), name,
-                    " must have shape (3,) or (1, 3), got ", shape_of(t));
-  t = t.reshape({3}).contiguous();
-}
+  void check_type(const Tensor& t, const char* t_name) const {
+    TORCH_CHECK_TYPE(t.scalar_type() == tensor.scalar_type(), t_name, " must have the dtype of ", name, ", ",
+                     tensor.scalar_type(), ", got ", t.scalar_type());
+    TORCH_CHECK_VALUE(t.device() == tensor.device(), t_name, " must be on the device of ", name, ", ", tensor.device(),
+                      ", got ", t.device());
+  }
+  /// Type, and a row for each of this tensor: check_rows.
+  void check_rows_of(Tensor& t, const char* t_name, std::initializer_list<int64_t> rest, const char* expected) const {
+    check_type(t, t_name);
+    check_rows(t, t_name, tensor.size(0), rest, expected);
+    t = t.contiguous();
+  }
+  void check_rows_of(OptionalTensor& t, const char* t_name, std::initializer_list<int64_t> rest,
+                     const char* expected) const {
+    if (t) check_rows_of(*t, t_name, rest, expected);
+  }
+  /// Type, and the shape (4, 4).
+  void check_matrix(Tensor& t, const char* t_name) const {
+    check_type(t, t_name);
+    const bool ok = (t.dim() == 2 || (t.dim() == 3 && t.size(0) == 1)) && t.size(-1) == 4 && t.size(-2) == 4;
+    check_shape(ok, t, t_name, "(4, 4) or (1, 4, 4)");
+    t = t.reshape({4, 4}).contiguous();
+  }
+  /// Type, and the shape (size,).
+  void check_vector(Tensor& t, const char* t_name, int64_t size) const {
+    check_type(t, t_name);
+    const bool ok = t.numel() == size && (t.dim() == 1 || (t.dim() == 2 && t.size(0) == 1));
+    check_shape(ok, t, t_name, "(", size, ",) or (1, ", size, ")");
+    t = t.reshape({size}).contiguous();
+  }
+};
 
 void check_positive(double value, const char* name) {
   // As a float, too: what is zero or infinite there makes the projection so.
@@ -81,19 +102,15 @@ void check_device(const Tensor& t, const char* name) {
 }
 
 /// What `bin` and `blend` take of the rows of `project`.
-void check_projected(const Tensor& means2d, Tensor& cov2d, Tensor& opacities, Tensor& dets, const Tensor& row_splits) {
+void check_projected(Tensor& means2d, Tensor& cov2d, Tensor& opacities, Tensor& dets, const Tensor& row_splits) {
   check_device(means2d, "means2d");
-  TORCH_CHECK_VALUE(means2d.dim() == 2 && means2d.size(1) == 2, "means2d must have shape (N, 2), got ",
-                    shape_of(means2d));
+  check_shape(means2d.dim() == 2 && means2d.size(1) == 2, means2d, "means2d", "(N, 2)");
+  means2d = means2d.contiguous();
   const int64_t n = means2d.size(0);
-  const auto check_row = [&](Tensor& t, const char* name, std::initializer_list<int64_t> rest, const char* expected) {
-    check_like(t, name, means2d, "means2d");
-    check_rows(t, name, n, rest, expected);
-    t = t.contiguous();
-  };
-  check_row(cov2d, "cov2d", {3}, "(N, 3)");
-  check_row(opacities, "opacities", {}, "(N,)");
-  check_row(dets, "dets", {}, "(N,)");
+  const Like like{means2d, "means2d"};
+  like.check_rows_of(cov2d, "cov2d", {3}, "(N, 3)");
+  like.check_rows_of(opacities, "opacities", {}, "(N,)");
+  like.check_rows_of(dets, "dets", {}, "(N,)");
   TORCH_CHECK_TYPE(row_splits.scalar_type() == at::kLong, "row_splits must have dtype int64, got ",
                    row_splits.scalar_type());
   TORCH_CHECK_VALUE(
@@ -113,7 +130,7 @@ FootprintSpec find_footprint(const std::string& key, double option) {
   const int index = ar::find_footprint(key);
   TORCH_CHECK_VALUE(index >= 0, "footprint must be one of those in csrc/core/footprint/registry.h, got '", key, "'");
   TORCH_CHECK_VALUE(std::isfinite(option) && option >= 0, "option must be finite and not negative, got ", option);
-  FootprintSpec spec{key, {index, {option}}, 1, false};
+  FootprintSpec spec{{index, {option}}, 1, false};
   visit_footprint(index, Footprints{}, [&](auto f) {
     spec.samples = decltype(f)::kSamples;
     spec.chosen = std::is_same_v<decltype(f), Adaptive>;
@@ -131,67 +148,50 @@ void check_image_size(int64_t height, int64_t width) {
 void check(Inputs& in) {
   Tensor& means3D = in.means3D;
   check_floating(means3D, "means3D");
-  TORCH_CHECK_VALUE(means3D.dim() == 2 && means3D.size(1) == 3, "means3D must have shape (P, 3), got ",
-                    shape_of(means3D));
+  check_shape(means3D.dim() == 2 && means3D.size(1) == 3, means3D, "means3D", "(P, 3)");
   check_device(means3D, "means3D");
   const int64_t p = in.count(), most = int64_t(1) << (means3D.is_cuda() ? 30 : 31);
   TORCH_CHECK_VALUE(p < most, "means3D must have fewer than ", most, " rows on ", means3D.device().type(), ", got ", p);
 
-  const auto check_per_gaussian = [&](Tensor& t, const char* name, std::initializer_list<int64_t> rest,
-                                      const char* expected) {
-    check_like(t, name, means3D, "means3D");
-    check_rows(t, name, p, rest, expected);
-    t = t.contiguous();
-  };
   means3D = means3D.contiguous();
+  const Like like{means3D, "means3D"};
   if (in.opacities.dim() == 1) {
-    check_per_gaussian(in.opacities, "opacities", {}, "(P, 1) or (P,)");
+    like.check_rows_of(in.opacities, "opacities", {}, "(P, 1) or (P,)");
   } else {
-    check_per_gaussian(in.opacities, "opacities", {1}, "(P, 1) or (P,)");
+    like.check_rows_of(in.opacities, "opacities", {1}, "(P, 1) or (P,)");
   }
-  if (in.means2D) {
-    const int64_t columns = in.means2D->dim() == 2 && in.means2D->size(1) == 4 ? 4 : 3;
-    check_per_gaussian(*in.means2D, "means2D", {columns}, "(P, 3) or (P, 4)");
-  }
+  const int64_t columns = in.means2D && in.means2D->dim() == 2 && in.means2D->size(1) == 4 ? 4 : 3;
+  like.check_rows_of(in.means2D, "means2D", {columns}, "(P, 3) or (P, 4)");
   const int degrees = in.lens ? FullCamera<float>::kShDegree : Camera<float>::kShDegree;
   TORCH_CHECK_VALUE(in.sh_degree >= 0 && in.sh_degree <= degrees, "sh_degree must be 0 to ", degrees, ", got ",
                     in.sh_degree);
   if (in.shs) {
     const int64_t needed = sh_count(int(in.sh_degree));
-    TORCH_CHECK_VALUE(in.shs->dim() == 3 && in.shs->size(0) == p && in.shs->size(1) >= needed && in.shs->size(2) == 3,
-                      "shs must have shape (P, M, 3) with P = ", p, " and M >= ", needed, " for sh_degree ",
-                      in.sh_degree, ", got ", shape_of(*in.shs));
-    check_like(*in.shs, "shs", means3D, "means3D");
+    const bool ok = in.shs->dim() == 3 && in.shs->size(0) == p && in.shs->size(1) >= needed && in.shs->size(2) == 3;
+    check_shape(ok, *in.shs, "shs", "(P, M, 3) with P = ", p, " and M >= ", needed, " for sh_degree ", in.sh_degree);
+    like.check_type(*in.shs, "shs");
     in.shs = in.shs->contiguous();
   }
   if (in.colors_precomp) {
     const Tensor& c = *in.colors_precomp;
-    TORCH_CHECK_VALUE(c.dim() == 2 && c.size(0) == p && c.size(1) >= 1 && c.size(1) <= kMaxChannels,
-                      "colors_precomp must have shape (P, C) with P = ", p, " and C from 1 to ", kMaxChannels, ", got ",
-                      shape_of(c));
-    check_per_gaussian(*in.colors_precomp, "colors_precomp", {c.size(1)}, "(P, C)");
+    const bool ok = c.dim() == 2 && c.size(0) == p && c.size(1) >= 1 && c.size(1) <= kMaxChannels;
+    check_shape(ok, c, "colors_precomp", "(P, C) with P = ", p, " and C from 1 to ", kMaxChannels);
+    like.check_rows_of(in.colors_precomp, "colors_precomp", {c.size(1)}, "(P, C)");
   }
   TORCH_CHECK_VALUE(in.scales.has_value() == in.rotations.has_value(),
                     "scales and rotations must be given together, got only ", in.scales ? "scales" : "rotations");
   TORCH_CHECK_VALUE(in.scales.has_value() != in.cov3D_precomp.has_value(),
                     "exactly one of scales with rotations and cov3D_precomp must be given, got ",
                     in.scales ? "both" : "neither");
-  if (in.scales) {
-    check_per_gaussian(*in.scales, "scales", {3}, "(P, 3)");
-    check_per_gaussian(*in.rotations, "rotations", {4}, "(P, 4)");
-  } else {
-    check_per_gaussian(*in.cov3D_precomp, "cov3D_precomp", {6}, "(P, 6)");
-  }
-  check_like(in.viewmatrix, "viewmatrix", means3D, "means3D");
-  check_like(in.projmatrix, "projmatrix", means3D, "means3D");
-  check_like(in.campos, "campos", means3D, "means3D");
-  check_matrix(in.viewmatrix, "viewmatrix");
-  check_matrix(in.projmatrix, "projmatrix");
-  check_vector(in.campos, "campos");
+  like.check_rows_of(in.scales, "scales", {3}, "(P, 3)");
+  like.check_rows_of(in.rotations, "rotations", {4}, "(P, 4)");
+  like.check_rows_of(in.cov3D_precomp, "cov3D_precomp", {6}, "(P, 6)");
+  like.check_matrix(in.viewmatrix, "viewmatrix");
+  like.check_matrix(in.projmatrix, "projmatrix");
+  like.check_vector(in.campos, "campos", 3);
   if (in.lens) {
-    check_like(*in.lens, "lens", means3D, "means3D");
-    TORCH_CHECK_VALUE(in.lens->dim() == 1 && in.lens->size(0) == kLensWidth, "lens must have shape (", kLensWidth,
-                      ",), got ", shape_of(*in.lens));
+    like.check_type(*in.lens, "lens");
+    check_shape(in.lens->dim() == 1 && in.lens->size(0) == kLensWidth, *in.lens, "lens", "(", kLensWidth, ",)");
     in.lens = in.lens->contiguous();
   }
   check_image_size(in.image_height, in.image_width);
@@ -212,17 +212,13 @@ void check_values(const Inputs& in, bool debug) {
 namespace {
 
 /// Raises for a number that no Gaussian should have. Without debug such a Gaussian is culled, or taken as it is.
-void check_gaussians(const Inputs& in) {
-  const auto finite = [](const OptionalTensor& t, const char* name) {
-    if (t) check_values(*t, name, at::isfinite(*t), "be finite");
-  };
-  finite(in.means3D, "means3D");
-  finite(in.opacities, "opacities");
-  finite(in.shs, "shs");
-  finite(in.colors_precomp, "colors_precomp");
-  finite(in.scales, "scales");
-  finite(in.rotations, "rotations");
-  finite(in.cov3D_precomp, "cov3D_precomp");
+void check_gaussians(Inputs in) {
+  size_t place = 0;
+  in.each_tensor([&](const char* name, const OptionalTensor& t) {
+    const bool is_read = place != 1 && place < kGaussianTensors;  // nobody reads means2D
+    if (t && is_read) check_finite(*t, name);
+    ++place;
+  });
   check_values(in.opacities, "opacities", in.opacities.ge(0).logical_and(in.opacities.le(1)), "be in [0, 1]");
   if (in.scales) check_values(*in.scales, "scales", in.scales->ge(0), "not be negative");
   if (in.cov3D_precomp) {
@@ -238,11 +234,7 @@ void check(RasterizeArguments& a) {
   check(static_cast<Inputs&>(a));
   TORCH_CHECK_VALUE(a.shs.has_value() != a.colors_precomp.has_value(),
                     "exactly one of shs and colors_precomp must be given, got ", a.shs ? "both" : "neither");
-  check_like(a.bg, "bg", a.means3D, "means3D");
-  const int64_t channels = a.shs ? 3 : a.colors_precomp->size(1);
-  TORCH_CHECK_VALUE(a.bg.numel() == channels && (a.bg.dim() == 1 || (a.bg.dim() == 2 && a.bg.size(0) == 1)),
-                    "bg must have shape (", channels, ",) or (1, ", channels, "), got ", shape_of(a.bg));
-  a.bg = a.bg.reshape({channels}).contiguous();
+  Like{a.means3D, "means3D"}.check_vector(a.bg, "bg", a.shs ? 3 : a.colors_precomp->size(1));
   TORCH_CHECK_VALUE(a.means2d_z == "zero" || a.means2d_z == "sum_abs" || a.means2d_z == "sum_norm",
                     "means2d_z must be zero, sum_abs or sum_norm, got ", a.means2d_z);
 }
@@ -254,12 +246,12 @@ void check_values(const RasterizeArguments& a) {
 }
 
 int64_t check_cameras(const ProjectArguments& a) {
-  TORCH_CHECK_VALUE(a.viewmatrix.dim() == 3 && a.viewmatrix.size(1) == 4 && a.viewmatrix.size(2) == 4,
-                    "viewmatrix must have shape (C, 4, 4), got ", shape_of(a.viewmatrix));
+  const bool ok = a.viewmatrix.dim() == 3 && a.viewmatrix.size(1) == 4 && a.viewmatrix.size(2) == 4;
+  check_shape(ok, a.viewmatrix, "viewmatrix", "(C, 4, 4)");
   const int64_t cameras = a.viewmatrix.size(0);
   check_rows(a.projmatrix, "projmatrix", cameras, {4, 4}, "(C, 4, 4)");
   check_rows(a.campos, "campos", cameras, {3}, "(C, 3)");
-  if (a.lens) check_rows(*a.lens, "lens", cameras, {kLensWidth}, "(C, 17)");
+  if (a.lens) check_rows(*a.lens, "lens", cameras, {kLensWidth}, ("(C, " + std::to_string(kLensWidth) + ")").c_str());
   TORCH_CHECK_VALUE(int64_t(a.tanfovx.size()) == cameras && int64_t(a.tanfovy.size()) == cameras,
                     "tanfovx and tanfovy must have a number for each of ", cameras, " cameras, got ", a.tanfovx.size(),
                     " and ", a.tanfovy.size());
@@ -271,13 +263,7 @@ int64_t check_cameras(const ProjectArguments& a) {
 
 Inputs inputs_of(const ProjectArguments& a, int64_t c) {
   Inputs in;
-  in.means3D = a.means3D;
-  in.opacities = a.opacities;
-  in.shs = a.shs;
-  in.colors_precomp = a.colors_precomp;
-  in.scales = a.scales;
-  in.rotations = a.rotations;
-  in.cov3D_precomp = a.cov3D_precomp;
+  static_cast<SceneTensors<OptionalTensor>&>(in) = a;
   in.viewmatrix = a.viewmatrix[c];
   in.projmatrix = a.projmatrix[c];
   in.campos = a.campos[c];
@@ -293,40 +279,29 @@ Inputs inputs_of(const ProjectArguments& a, int64_t c) {
 
 void check(BinArguments& a) {
   check_projected(a.means2d, a.cov2d, a.opacities, a.dets, a.row_splits);
-  a.means2d = a.means2d.contiguous();
-  check_like(a.depths, "depths", a.means2d, "means2d");
-  check_rows(a.depths, "depths", a.means2d.size(0), {}, "(N,)");
-  a.depths = a.depths.contiguous();
-  if (a.colors) {
-    check_like(*a.colors, "colors", a.means2d, "means2d");
-    check_rows(*a.colors, "colors", a.means2d.size(0), {3}, "(N, 3)");
-    a.colors = a.colors->contiguous();
-  }
+  const Like like{a.means2d, "means2d"};
+  like.check_rows_of(a.depths, "depths", {}, "(N,)");
+  like.check_rows_of(a.colors, "colors", {3}, "(N, 3)");
   if (!a.background) a.background = at::zeros({3}, a.means2d.options());
-  check_like(*a.background, "background", a.means2d, "means2d");
-  check_vector(*a.background, "background");
+  like.check_vector(*a.background, "background", 3);
   check_image_size(a.image_height, a.image_width);
 }
 
 void check(BlendArguments& a, const FootprintSpec& footprint) {
   check_projected(a.means2d, a.cov2d, a.opacities, a.dets, a.row_splits);
-  a.means2d = a.means2d.contiguous();
+  const Like like{a.means2d, "means2d"};
   const int64_t n = a.means2d.size(0), cameras = a.row_splits.size(0) - 1;
-  check_like(a.features, "features", a.means2d, "means2d");
-  TORCH_CHECK_VALUE(
-      a.features.dim() == 2 && a.features.size(0) == n && a.features.size(1) >= 1 && a.features.size(1) <= kMaxChannels,
-      "features must have shape (N, K) with N = ", n, " and K from 1 to ", kMaxChannels, ", got ",
-      shape_of(a.features));
+  like.check_type(a.features, "features");
+  const bool ok =
+      a.features.dim() == 2 && a.features.size(0) == n && a.features.size(1) >= 1 && a.features.size(1) <= kMaxChannels;
+  check_shape(ok, a.features, "features", "(N, K) with N = ", n, " and K from 1 to ", kMaxChannels);
   a.features = a.features.contiguous();
-  check_like(a.background, "background", a.means2d, "means2d");
-  TORCH_CHECK_VALUE(a.background.sizes() == at::IntArrayRef({cameras, a.features.size(1)}),
-                    "background must have shape (", cameras, ", ", a.features.size(1), "), got ",
-                    shape_of(a.background));
+  const int64_t channels = a.features.size(1);
+  like.check_type(a.background, "background");
+  check_shape(a.background.sizes() == at::IntArrayRef({cameras, channels}), a.background, "background", "(", cameras,
+              ", ", channels, ")");
   a.background = a.background.contiguous();
-  if (a.means2d_abs) {
-    check_like(*a.means2d_abs, "means2d_abs", a.means2d, "means2d");
-    check_rows(*a.means2d_abs, "means2d_abs", n, {2}, "(N, 2)");
-  }
+  like.check_rows_of(a.means2d_abs, "means2d_abs", {2}, "(N, 2)");
   check_image_size(a.image_height, a.image_width);
   const int64_t members = ListTensors::kMembers;
   TORCH_CHECK_VALUE(int64_t(a.lists.size()) == members * cameras, "lists must be the output of bin for ", cameras,
@@ -356,21 +331,27 @@ void check(InspectArguments& a, const ListTensors& lists, const FootprintSpec& f
 
 void check(WeightArguments& a) {
   check_floating(a.offset, "offset");
-  TORCH_CHECK_VALUE(a.offset.dim() >= 1 && a.offset.size(-1) == 2, "offset must have shape (..., 2), got ",
-                    shape_of(a.offset));
-  check_like(a.cov2d, "cov2d", a.offset, "offset");
-  TORCH_CHECK_VALUE(a.cov2d.dim() == a.offset.dim() && a.cov2d.size(-1) == 3 &&
-                        a.cov2d.sizes().slice(0, a.cov2d.dim() - 1) == a.offset.sizes().slice(0, a.offset.dim() - 1),
-                    "cov2d must have shape (..., 3) with the leading sizes of offset ", shape_of(a.offset), ", got ",
-                    shape_of(a.cov2d));
+  check_shape(a.offset.dim() >= 1 && a.offset.size(-1) == 2, a.offset, "offset", "(..., 2)");
+  Like{a.offset, "offset"}.check_type(a.cov2d, "cov2d");
+  const bool ok = a.cov2d.dim() == a.offset.dim() && a.cov2d.size(-1) == 3 &&
+                  a.cov2d.sizes().slice(0, a.cov2d.dim() - 1) == a.offset.sizes().slice(0, a.offset.dim() - 1);
+  TORCH_CHECK_VALUE(ok, "cov2d must have shape (..., 3) with the leading sizes of offset ", shape_of(a.offset),
+                    ", got ", shape_of(a.cov2d));
   a.offset = a.offset.contiguous();
   a.cov2d = a.cov2d.contiguous();
 }
 
-void check_gradient(Tensor& gradient, const char* name, const Tensor& like, at::IntArrayRef sizes) {
-  check_like(gradient, name, like, "the arguments");
+Tensor gradient_of(const std::vector<OptionalTensor>& dL_doutputs, size_t place, const char* name, const Tensor& like,
+                   at::IntArrayRef sizes) {
+  if (place >= dL_doutputs.size() || !dL_doutputs[place]) return Tensor();
+  const Tensor& gradient = *dL_doutputs[place];
+  Like{like, "the arguments"}.check_type(gradient, name);
   TORCH_CHECK_VALUE(gradient.sizes() == sizes, name, " must have shape ", text_of(sizes), ", got ", shape_of(gradient));
-  gradient = gradient.contiguous();
+  return gradient.contiguous();
+}
+
+void check_needs(const std::vector<bool>& needs, size_t count) {
+  TORCH_CHECK_VALUE(needs.size() == count, "needs must have ", count, " members, got ", needs.size());
 }
 
 void check_lists(const ListTensors& lists, const Tensor& like, const FootprintSpec& footprint, TileGrid grid) {

@@ -25,11 +25,12 @@ Inputs inputs_of(const ProjectArguments& a, int64_t c);
 /// What inputs_of cannot check: that there are as many of everything as there are cameras. Returns their number.
 int64_t check_cameras(const ProjectArguments& a);
 
-/// The footprint of this key and number. Raises ValueError if there is none.
-FootprintSpec find_footprint(const std::string& key, double option);
-
-/// A gradient has the dtype and device of `like` and these sizes; afterwards it is contiguous.
-void check_gradient(Tensor& gradient, const char* name, const Tensor& like, at::IntArrayRef sizes);
+/// The gradient with respect to the differentiable output at `place`, contiguous; undefined if there is none. It must
+/// have the dtype and device of `like` and these sizes.
+Tensor gradient_of(const std::vector<OptionalTensor>& dL_doutputs, size_t place, const char* name, const Tensor& like,
+                   at::IntArrayRef sizes);
+/// Says of so many tensor arguments whether they want a gradient.
+void check_needs(const std::vector<bool>& needs, size_t count);
 
 /// Lists and state fit each other, the splats, the footprint and the image: the outputs of the forward pass for the
 /// same arguments. What they contain is the forward pass's own and is not looked at.

@@ -4,6 +4,7 @@
 #include <torch/library.h>
 
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "core/camera.h"
@@ -11,51 +12,18 @@
 #include "core/sh.h"
 #include "cpu/stages.h"
 #include "torch/backend.h"
-#include "torch/recipe.h"
+#include "torch/ops.h"
 
 namespace ar::ops {
 namespace {
 
 using torch::jit::Stack;
 
-void push(Stack& stack, Tensor value) { stack.emplace_back(std::move(value)); }
-void push(Stack& stack, const std::vector<Tensor>& value) { stack.emplace_back(c10::List<Tensor>(value)); }
-void push(Stack& stack, const Rasterized& out) {
-  push(stack, out.color);
-  push(stack, out.images);
-  push(stack, out.radii);
-  push(stack, out.saved);
-}
-void push(Stack& stack, const Projected& out) {
-  for (const Tensor& t : {out.means2d, out.cov2d, out.opacities, out.depths, out.colors, out.radii, out.gaussian_ids,
-                          out.camera_ids, out.row_splits})
-    push(stack, t);
-  push(stack, out.saved);
-}
-void push(Stack& stack, const Blended& out) {
-  push(stack, out.image);
-  push(stack, out.alpha);
-  push(stack, out.saved);
-}
-
-/// An op: a function of recipe.h between the arguments on the dispatcher's stack and the results there.
-template <class A, auto kRun> struct Op {
+/// An op: a function of ops.h between the arguments on the dispatcher's stack and the results there.
+template <class A, Results (*kRun)(A)> struct Op {
   using Arguments = A;
   static void kernel(const c10::OperatorHandle&, Stack* stack) {
-    auto arguments = take<Arguments>(*stack);
-    push(*stack, kRun(std::move(arguments)));
-  }
-};
-
-Rasterized rasterize_plainly(RasterizeArguments a) { return rasterize(std::move(a)); }
-
-/// `rasterize`, and the seconds that its stages took: project, bin, blend. Waits for the device.
-struct RasterizeTimed {
-  using Arguments = RasterizeArguments;
-  static void kernel(const c10::OperatorHandle&, Stack* stack) {
-    std::vector<double> seconds;
-    push(*stack, rasterize(take<RasterizeArguments>(*stack), &seconds));
-    push(*stack, at::tensor({seconds[1], seconds[2], seconds[3]}, at::kDouble));  // the first is of what came before
+    for (IValue& result : kRun(take<A>(*stack))) stack->push_back(std::move(result));
   }
 };
 
@@ -67,8 +35,8 @@ template <class Visit> void each_op(const Visit& visit) {
                  "Tensor means2d, Tensor cov2d, Tensor opacities, Tensor depths, Tensor colors, Tensor radii, "
                  "Tensor gaussian_ids, Tensor camera_ids, Tensor row_splits, Tensor[] saved",
              *blended = "Tensor image, Tensor alpha, Tensor[] saved", *gradients = "Tensor[] gradients";
-  visit(Op<RasterizeArguments, rasterize_plainly>{}, "rasterize", rasterized);
-  visit(RasterizeTimed{}, "rasterize_timed", timed);
+  visit(Op<RasterizeArguments, rasterize>{}, "rasterize", rasterized);
+  visit(Op<RasterizeArguments, rasterize_timed>{}, "rasterize_timed", timed);
   visit(Op<VjpArguments<RasterizeArguments>, rasterize_vjp>{}, "rasterize_vjp", gradients);
   visit(Op<ProjectArguments, project>{}, "project", projected);
   visit(Op<VjpArguments<ProjectArguments>, project_vjp>{}, "project_vjp", gradients);
@@ -116,6 +84,19 @@ template <class Members> std::vector<std::string> member_names() {
   return names;
 }
 
+std::vector<std::string> image_names() {
+  std::vector<std::string> names;
+  for (const char* declaration : kImageSwitches) names.emplace_back(name_of(declaration));
+  return names;
+}
+
+/// Name and size of the members of Lens, in order.
+std::vector<std::pair<std::string, int>> lens_members() {
+  std::vector<std::pair<std::string, int>> members;
+  for (const LensMember& member : kLensMembers) members.emplace_back(member.name, member.size);
+  return members;
+}
+
 }  // namespace
 
 #if defined(AR_WITH_CUDA)
@@ -144,6 +125,8 @@ PYBIND11_MODULE(_C, m) {
       },
       "What the headers say of every footprint, in the order of the registry.");
   m.def("instruction_set", &ar::cpu::instruction_set, "Instruction set that the CPU path runs on.");
+  m.attr("IMAGES") = ar::ops::image_names();
+  m.attr("LENS") = ar::ops::lens_members();
   m.attr("LISTS") = ar::ops::member_names<ar::ops::ListTensors>();
   m.attr("TILE") = ar::kTile;
   m.attr("SPLAT_WIDTH") = ar::kSplatWidth;

@@ -1,91 +1,169 @@
-// Tensors as the views that the stages take. The same on every device.
+// Tensors as the parameters of stages, for what these have in common on every device. Images are in images.h.
 #pragma once
 
 #include "core/camera.h"
+#include "core/project.h"
 #include "torch/backend.h"
 
 namespace ar::ops {
 
-template <typename T> const T* const_data_or_null(const Tensor& t) {
-  return t.defined() && t.numel() ? t.const_data_ptr<T>() : nullptr;
-}
-template <typename T> T* data_or_null(const Tensor& t) { return t.defined() && t.numel() ? t.data_ptr<T>() : nullptr; }
-template <class Element, typename T> const Element* rows_of(const OptionalTensor& t) {
-  return t ? reinterpret_cast<const Element*>(t->const_data_ptr<T>()) : nullptr;
-}
-
 template <typename T> CameraView<T> camera_of(const Inputs& in) {
   CameraView<T> c;
-  c.view = in.viewmatrix.const_data_ptr<T>();
-  c.proj = in.projmatrix.const_data_ptr<T>();
-  c.position = in.campos.const_data_ptr<T>();
+  c.view = const_pointer<T>(in.viewmatrix);
+  c.proj = const_pointer<T>(in.projmatrix);
+  c.position = const_pointer<T>(in.campos);
   c.width = int(in.image_width);
   c.height = int(in.image_height);
   c.tan_half_fov_x = T(in.tanfovx);
   c.tan_half_fov_y = T(in.tanfovy);
-  c.lens = in.lens ? in.lens->const_data_ptr<T>() : nullptr;
+  c.lens = const_pointer<T>(in.lens);
   return c;
 }
+
+/// Whether colors_precomp are the three colours of the splats; else they are channels of the caller's.
+inline bool has_colors(const Inputs& in) { return in.colors_precomp && in.colors_precomp->size(1) == 3; }
 
 template <typename T> Gaussians<T> gaussians_of(const Inputs& in) {
   Gaussians<T> g = {};
   g.n = in.count();
-  g.means = reinterpret_cast<const Vec3<T>*>(in.means3D.const_data_ptr<T>());
-  g.scales = rows_of<Vec3<T>, T>(in.scales);
-  g.rotations = rows_of<Vec4<T>, T>(in.rotations);
-  g.cov3ds = rows_of<Sym3<T>, T>(in.cov3D_precomp);
-  g.opacities = in.opacities.const_data_ptr<T>();
-  g.shs = rows_of<Vec3<T>, T>(in.shs);
-  if (in.colors_precomp && in.colors_precomp->size(1) == 3) g.colors = rows_of<Vec3<T>, T>(in.colors_precomp);
+  g.means = const_pointer<Vec3<T>>(in.means3D);
+  g.scales = const_pointer<Vec3<T>>(in.scales);
+  g.rotations = const_pointer<Vec4<T>>(in.rotations);
+  g.cov3ds = const_pointer<Sym3<T>>(in.cov3D_precomp);
+  g.opacities = const_pointer<T>(in.opacities);
+  g.shs = const_pointer<Vec3<T>>(in.shs);
+  if (has_colors(in)) g.colors = const_pointer<Vec3<T>>(in.colors_precomp);
   g.sh_stride = in.shs ? int(in.shs->size(1)) : 0;
   g.sh_degree = int(in.sh_degree);
   g.scale_modifier = T(in.scale_modifier);
   return g;
 }
 
-inline TileGrid grid_of(const Inputs& in) { return {int(in.image_width), int(in.image_height)}; }
-
-/// The rows that `project` fills.
-template <typename T> ChannelRows<T> channel_rows(const ChannelTensors& channels, ChannelColumns columns) {
-  const bool fills = columns.color >= 0 || columns.depth >= 0 || columns.inverse_depth >= 0;
-  return {fills ? channels.rows.data_ptr<T>() : nullptr, channels.count, columns.color, columns.depth,
-          columns.inverse_depth};
-}
-
-template <typename T> Planes<T> planes_of(const ImageTensors& image) {
-  Planes<T> planes = {};
-  planes.first = const_cast<T*>(const_data_or_null<std::remove_const_t<T>>(image.color));
-  planes.split = int(image.color_channels);
-  for (size_t k = 0; k < image.extra.size(); ++k)
-    planes.extra[k] = const_cast<T*>(const_data_or_null<std::remove_const_t<T>>(image.extra[k]));
-  return planes;
-}
-
 template <typename T> GaussianGrads<T> grads_of(const Inputs& in, const Grads& grads) {
   GaussianGrads<T> out = {};
-  out.means = reinterpret_cast<Vec3<T>*>(data_or_null<T>(grads.means3D));
-  out.scales = reinterpret_cast<Vec3<T>*>(data_or_null<T>(grads.scales));
-  out.rotations = reinterpret_cast<Vec4<T>*>(data_or_null<T>(grads.rotations));
-  out.cov3ds = reinterpret_cast<Sym3<T>*>(data_or_null<T>(grads.cov3D_precomp));
-  out.opacities = data_or_null<T>(grads.opacities);
-  out.shs = reinterpret_cast<Vec3<T>*>(data_or_null<T>(grads.shs));
-  if (in.colors_precomp && in.colors_precomp->size(1) == 3)
-    out.colors = reinterpret_cast<Vec3<T>*>(data_or_null<T>(grads.colors_precomp));
-  out.means2d = data_or_null<T>(grads.means2D);
+  out.means = pointer<Vec3<T>>(grads.means3D);
+  out.scales = pointer<Vec3<T>>(grads.scales);
+  out.rotations = pointer<Vec4<T>>(grads.rotations);
+  out.cov3ds = pointer<Sym3<T>>(grads.cov3D_precomp);
+  out.opacities = pointer<T>(grads.opacities);
+  out.shs = pointer<Vec3<T>>(grads.shs);
+  out.colors = pointer<Vec3<T>>(grads.colors_precomp);
+  out.means2d = pointer<T>(grads.means2D);
   out.means2d_stride = in.means2D ? int(in.means2D->size(1)) : 0;
   out.mean_sums = grads.mean_sums;
   return out;
 }
 
-/// Arguments of footprint_weight, contiguous, without results.
-template <class Params, typename T>
-Params weight_params(const Tensor& offset, const Tensor& cov2d, const FootprintSpec& footprint) {
-  Params p = {};
-  p.n = offset.numel() / 2;
+/// For reading or for writing. Members that are undefined become null.
+template <typename T> ProjectedRows<T> projected_rows_of(const RowTensors& rows) {
+  ProjectedRows<T> out;
+  out.means2d = const_cast<Vec2<T>*>(const_pointer<Vec2<T>>(rows.means2d));
+  out.cov2d = const_cast<Sym2<T>*>(const_pointer<Sym2<T>>(rows.cov2d));
+  out.dets = const_cast<T*>(const_pointer<T>(rows.dets));
+  out.opacities = const_cast<T*>(const_pointer<T>(rows.opacities));
+  out.depths = const_cast<T*>(const_pointer<T>(rows.depths));
+  out.colors = const_cast<Vec3<T>*>(const_pointer<Vec3<T>>(rows.colors));
+  return out;
+}
+
+template <typename T> ProjectedRowGrads<T> projected_row_grads_of(const Tensor& rows, const RowTensors& dL_drows) {
+  ProjectedRowGrads<T> out;
+  out.rows = const_pointer<int32_t>(rows);
+  out.means2d = const_pointer<Vec2<T>>(dL_drows.means2d);
+  out.cov2d = const_pointer<Sym2<T>>(dL_drows.cov2d);
+  out.opacities = const_pointer<T>(dL_drows.opacities);
+  out.depths = const_pointer<T>(dL_drows.depths);
+  out.colors = const_pointer<Vec3<T>>(dL_drows.colors);
+  return out;
+}
+
+/// What `project` and `project_rows` have in common.
+template <typename T, class Params>
+void set_projection(Params& p, const Inputs& in, const Pass& pass, const Tensor& radii) {
+  p.camera = camera_of<T>(in);
+  p.gaussians = gaussians_of<T>(in);
+  p.footprint = pass.footprint.choice;
+  p.bounds = cull_bounds<T>(pass.footprint.choice);
+  p.radii = pointer<int32_t>(radii);
+}
+/// What `project` has besides.
+template <typename T> void set_channels(ProjectParams<T>& p, const Inputs& in, const ChannelTensors& channels) {
+  p.channels = channel_rows<T>(channels.rows, channels);
+  if (!in.colors_precomp || has_colors(in)) return;
+  p.given.data = const_pointer<T>(in.colors_precomp);
+  p.given.stride = in.colors_precomp->size(1);
+  p.given.count = int(p.given.stride);
+}
+
+/// What `project_vjp` and `project_rows_vjp` have in common.
+template <typename T, class Params> void set_projection_vjp(Params& p, const Inputs& in, const Grads& grads) {
+  p.camera = camera_of<T>(in);
+  p.gaussians = gaussians_of<T>(in);
+  p.grads = grads_of<T>(in, grads);
+}
+
+template <typename T>
+void set_shape_rows(ShapeRowsParams<T>& p, const RowTensors& rows, const Pass& pass, const Tensor& splats) {
+  p.n = rows.means2d.size(0);
+  p.rows = projected_rows_of<T>(rows);
+  p.footprint = pass.footprint.choice;
+  p.grid = pass.grid;
+  p.splats = pointer<T>(splats);
+}
+
+template <typename T>
+void set_row_grads(RowGradsParams<T>& p, const RowTensors& rows, const Pass& pass, const RowTensors& dL_drows) {
+  p.n = rows.means2d.size(0);
+  p.rows = projected_rows_of<T>(rows);
+  p.footprint = pass.footprint.choice;
+  p.dL_dmeans2d = pointer<Vec2<T>>(dL_drows.means2d);
+  p.dL_dcov2d = pointer<Sym2<T>>(dL_drows.cov2d);
+  p.dL_dopacities = pointer<T>(dL_drows.opacities);
+  p.absolute = pointer<Vec2<T>>(dL_drows.absolute);
+}
+
+template <typename T>
+void set_blend(BlendParams<T>& p, const ListTensors& lists, const Pass& pass, const ChannelTensors& channels,
+               const ImageTensors& image, const BlendState& state) {
+  p.grid = pass.grid;
+  p.splats = const_pointer<T>(lists.splats);
+  p.background = const_pointer<T>(channels.background);
+  p.transmittance = pointer<T>(state.transmittance);
+  p.last = pointer<int32_t>(state.last);
+  set_images(p, image, channels);
+}
+
+template <typename T>
+void set_blend_vjp(BlendVjpParams<T>& p, const ListTensors& lists, const Pass& pass, const ChannelTensors& channels,
+                   const ImageTensors& dL_dimage, const BlendState& state) {
+  p.grid = pass.grid;
+  p.splats = const_pointer<T>(lists.splats);
+  p.background = const_pointer<T>(channels.background);
+  p.transmittance = const_pointer<T>(state.transmittance);
+  p.last = const_pointer<int32_t>(state.last);
+  set_images(p, dL_dimage, channels);
+}
+
+template <typename T>
+void set_inspect(InspectParams<T>& p, const ListTensors& lists, const Pass& pass, const SummaryTensors& summary) {
+  p.splats = const_pointer<T>(lists.splats);
+  p.grid = pass.grid;
+  p.median = pointer<int32_t>(summary.median);
+  p.dominant = pointer<int32_t>(summary.dominant);
+  p.touched = pointer<int32_t>(summary.touched);
+  p.largest = reinterpret_cast<int32_t*>(pointer<float>(summary.largest));
+  p.units = pointer<int64_t>(summary.total);
+}
+
+template <typename T> void set_weight(WeightParams<T>& p, const WeightTensors& t, const FootprintSpec& footprint) {
+  p.n = t.offset.numel() / 2;
   p.options = footprint.choice.options;
-  p.offsets = reinterpret_cast<const Vec2<T>*>(offset.const_data_ptr<T>());
-  p.covs = reinterpret_cast<const Sym2<T>*>(cov2d.const_data_ptr<T>());
-  return p;
+  p.offsets = const_pointer<Vec2<T>>(t.offset);
+  p.covs = const_pointer<Sym2<T>>(t.cov2d);
+  p.weights = pointer<T>(t.weight);
+  p.dL_dweights = const_pointer<T>(t.dL_dweight);
+  p.dL_doffsets = pointer<Vec2<T>>(t.dL_doffset);
+  p.dL_dcovs = pointer<Sym2<T>>(t.dL_dcov2d);
 }
 
 }  // namespace ar::ops

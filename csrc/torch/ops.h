@@ -1,0 +1,41 @@
+// The ops, each written once for every device: the pass in rasterize.cpp, its stages in stages.cpp. Registered with
+// torch in ops.cpp, made differentiable in autograd.cpp.
+#pragma once
+
+#include <vector>
+
+#include "torch/arguments.h"
+
+namespace ar::ops {
+
+/// What an op returns, in the order of its schema (ops.cpp). `saved` is for its adjoint.
+using Results = std::vector<IValue>;
+
+/// color (C, H, W); images: those of kImageNames that are asked for, (H, W); radii (P,) int32; saved.
+Results rasterize(RasterizeArguments a);
+/// The same, and the seconds that project, bin and blend took, (3,) float64. Saves the lists without `keep` too. Waits
+/// for the device.
+Results rasterize_timed(RasterizeArguments a);
+/// gradients, as from every adjoint: a tensor for every tensor among the op's arguments, empty where none is wanted.
+Results rasterize_vjp(VjpArguments<RasterizeArguments> a);
+
+/// means2d, cov2d, opacities, depths, colors (N, ...): rows, camera after camera; radii, gaussian_ids, camera_ids (N,)
+/// int32; row_splits (C + 1,) int64 on the CPU; saved: dets (N,), gaussian_ids, row_splits.
+Results project(ProjectArguments a);
+Results project_vjp(VjpArguments<ProjectArguments> a);
+
+/// lists: ListTensors of camera after camera.
+Results bin(BinArguments a);
+
+/// image (C, K, H, W), alpha (C, H, W), saved: BlendState of camera after camera.
+Results blend(BlendArguments a);
+Results blend_vjp(VjpArguments<BlendArguments> a);
+
+/// summary: SummaryTensors.
+Results inspect(InspectArguments a);
+
+/// weight
+Results footprint_weight(WeightArguments a);
+Results footprint_weight_vjp(VjpArguments<WeightArguments> a);
+
+}  // namespace ar::ops

@@ -1,0 +1,33 @@
+// Pointers into tensors, typed as what the kernels read there. Null where a tensor is missing or empty.
+#pragma once
+
+#include <ATen/ATen.h>
+
+#include <optional>
+
+namespace ar::ops {
+
+using at::Tensor;
+using OptionalTensor = std::optional<Tensor>;
+
+/// The scalars that an Element consists of: T of a Vec2<T>, and any other type itself.
+template <class Element> struct ScalarIn {
+  using Type = Element;
+};
+template <template <class> class Vector, class T> struct ScalarIn<Vector<T>> {
+  using Type = T;
+};
+
+template <class Element> const Element* const_pointer(const Tensor& t) {
+  if (!t.defined() || t.numel() == 0) return nullptr;
+  return reinterpret_cast<const Element*>(t.const_data_ptr<typename ScalarIn<Element>::Type>());
+}
+template <class Element> const Element* const_pointer(const OptionalTensor& t) {
+  return t ? const_pointer<Element>(*t) : nullptr;
+}
+template <class Element> Element* pointer(const Tensor& t) {
+  if (!t.defined() || t.numel() == 0) return nullptr;
+  return reinterpret_cast<Element*>(t.data_ptr<typename ScalarIn<Element>::Type>());
+}
+
+}  // namespace ar::ops

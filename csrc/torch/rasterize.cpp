@@ -1,0 +1,162 @@
+// The pass, written once for every device: check, project, bin, blend, and back.
+#include <vector>
+
+#include "torch/checks.h"
+#include "torch/ops.h"
+#include "torch/scene_grads.h"
+#include "torch/snapshot.h"
+
+namespace ar::ops {
+namespace {
+
+/// Which channels are blended: the colours, then depth and inverse depth, if they are asked for. `made`: the rows as
+/// the forward pass saved them, or undefined: make room for them.
+ChannelTensors channels_of(const RasterizeArguments& a, const Tensor& made) {
+  const int64_t extra = int64_t(a.images[kDepth]) + int64_t(a.images[kInverseDepth]);
+  ChannelTensors out;
+  out.by_gaussian = true;
+  out.color_channels = a.bg.size(0);
+  out.count = out.color_channels + extra;
+  out.background = extra > 0 ? at::constant_pad_nd(a.bg, {0, extra}) : a.bg;
+  const bool three = out.color_channels == 3;
+  if (extra == 0) {
+    if (!three) out.rows = *a.colors_precomp;
+    return out;
+  }
+  if (three) out.color = 0;
+  if (a.images[kDepth]) out.depth = int(out.color_channels);
+  if (a.images[kInverseDepth]) out.inverse_depth = int(out.count) - 1;
+  out.rows = made;
+  if (made.defined()) return out;
+  out.rows = at::empty({a.count(), out.count}, a.means3D.options());
+  if (!three) out.rows.narrow(1, 0, out.color_channels).copy_(*a.colors_precomp);
+  return out;
+}
+
+/// What the gradient with respect to means2D holds besides itself.
+MeanSums mean_sums_of(const RasterizeArguments& a) {
+  if (a.means2D->size(1) == 4) return MeanSums::kAbsolute;
+  return a.means2d_z == "sum_abs" ? MeanSums::kAbsolute : a.means2d_z == "sum_norm" ? MeanSums::kNorm : MeanSums::kNone;
+}
+
+/// Everything that the adjoint of a rasterization needs.
+struct Saved {
+  ListTensors lists;
+  BlendState state;
+  Tensor channels;  ///< the rows that the projection made, or empty
+
+  explicit Saved(const std::vector<Tensor>& list) {
+    TORCH_CHECK_VALUE(list.size() == ListTensors::kMembers + BlendState::kMembers + 1,
+                      "saved must be what the forward pass saved with keep=True, got ", list.size(), " tensors");
+    lists = from_list<ListTensors>(list, 0);
+    state = from_list<BlendState>(list, ListTensors::kMembers);
+    channels = list.back();
+  }
+};
+
+/// With `seconds` the times before, of project, bin and blend are appended to it.
+Results run(RasterizeArguments a, std::vector<double>* seconds) {
+  const Snapshot snapshot(a, a.debug, "snapshot_fw.dump");
+  return snapshot.guard([&] {
+    Pass pass(a);
+    pass.keep = a.keep;
+    pass.debug = a.debug;
+    check(a);
+    check_values(a);
+    const std::unique_ptr<Backend> backend = make_backend(a.means3D);
+    const auto lap = [&] {
+      if (seconds) seconds->push_back(backend->lap());
+    };
+    const ChannelTensors channels = channels_of(a, Tensor());
+    const Tensor radii = at::empty({a.count()}, a.means3D.options().dtype(at::kInt));
+    lap();
+    const SplatTensors splats = backend->project(a, pass, channels, radii);
+    lap();
+    const ListTensors lists = backend->bin(splats, pass, channels.background);
+    lap();
+    const ImageTensors image = make_images(channels, a.images, pass.grid);
+    BlendState state = make_state(pass, a.means3D);
+    backend->blend(lists, pass, channels, image, state);
+    lap();
+    std::vector<Tensor> images, saved;
+    for (const Tensor& other : image.others) {
+      if (other.defined()) images.push_back(other);
+    }
+    if (a.keep || seconds) append_to(saved, lists);
+    if (a.keep) {
+      append_to(saved, state);
+      saved.push_back(or_empty(channels.made_by_projection() ? channels.rows : Tensor(), a.means3D));
+    }
+    return Results{image.color, images, radii, saved};
+  });
+}
+
+}  // namespace
+
+Results rasterize(RasterizeArguments a) { return run(std::move(a), nullptr); }
+
+Results rasterize_timed(RasterizeArguments a) {
+  std::vector<double> seconds;
+  Results results = run(std::move(a), &seconds);
+  results.push_back(at::tensor({seconds[1], seconds[2], seconds[3]}, at::kDouble));  // the first is of what came before
+  return results;
+}
+
+Results rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
+  RasterizeArguments& a = arguments.of_op;
+  const Snapshot snapshot(arguments, a.debug, "snapshot_bw.dump");
+  return snapshot.guard([&] {
+    Pass pass(a);
+    pass.debug = a.debug;
+    check(a);
+    const std::vector<bool>& needs = arguments.needs;
+    check_needs(needs, kSceneTensors + 1);
+    check_camera_needs(needs, a.lens);
+    const Saved saved(arguments.saved);
+    check_saved(saved.lists, saved.state, a.means3D, pass.footprint, pass.grid);
+    const ChannelTensors channels = channels_of(a, saved.channels);
+    const int64_t height = a.image_height, width = a.image_width;
+    ImageTensors dL_dimage;
+    dL_dimage.color = gradient_of(arguments.dL_doutputs, 0, "dL_dcolor", a.means3D, {a.bg.size(0), height, width});
+    size_t place = 1;
+    for (size_t k = 0; k < kImageCount; ++k) {
+      const std::string name = "dL_d" + std::string(name_of(kImageSwitches[k]));
+      if (a.images[k])
+        dL_dimage.others[k] = gradient_of(arguments.dL_doutputs, place++, name.c_str(), a.means3D, {height, width});
+    }
+
+    const std::unique_ptr<Backend> backend = make_backend(a.means3D);
+    Grads grads = make_grads(a, needs);
+    if (grads.means2D.defined()) grads.mean_sums = mean_sums_of(a);
+    const PairSums sums = backend->blend_vjp(saved.lists, saved.state, pass, channels, dL_dimage, grads.mean_sums);
+    const Tensor camera = backend->project_vjp(a, saved.lists, pass, sums, channels, grads);
+    if (grads.with_camera) set_camera_grads(camera, needs, grads);
+    if (needs[4] && channels.color_channels != 3) {
+      const Tensor& all = sums.dL_dchannels;
+      grads.colors_precomp =
+          all.size(1) == channels.color_channels ? all : all.narrow(1, 0, channels.color_channels).contiguous();
+    }
+    std::vector<Tensor> list = list_of(grads, a.means3D);
+    list.push_back(!needs[kSceneTensors]       ? at::empty({0}, a.means3D.options())
+                   : dL_dimage.color.defined() ? background_grad(dL_dimage.color, saved.state, saved.lists, pass.grid)
+                                               : at::zeros_like(a.bg));
+    return Results{list};
+  });
+}
+
+Results inspect(InspectArguments a) {
+  const Pass pass(a);
+  const ListTensors lists = Saved(a.saved).lists;
+  check(a, lists, pass.footprint);
+  const at::TensorOptions options = lists.splats.options(), ints = options.dtype(at::kInt);
+  SummaryTensors summary;
+  summary.median = at::empty({a.image_height, a.image_width}, ints);
+  summary.dominant = at::empty_like(summary.median);
+  summary.touched = at::zeros({a.count}, ints);
+  summary.largest = at::zeros({a.count}, options.dtype(at::kFloat));
+  summary.total = at::zeros({a.count}, options.dtype(at::kLong));
+  make_backend(lists.splats)->inspect(lists, pass, summary);
+  return {std::vector<Tensor>{summary.median, summary.dominant, summary.touched, summary.largest, summary.total}};
+}
+
+}  // namespace ar::ops

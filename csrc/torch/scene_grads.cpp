@@ -1,0 +1,81 @@
+#include "torch/scene_grads.h"
+
+#include <algorithm>
+
+#include "core/camera.h"
+
+namespace ar::ops {
+namespace {
+
+bool needs_camera(const std::vector<bool>& needs) {
+  const auto first = needs.begin() + kGaussianTensors, last = first + kCameraTensors;
+  return std::find(first, last, true) != last;
+}
+
+}  // namespace
+
+void check_camera_needs(const std::vector<bool>& needs, const OptionalTensor& lens) {
+  TORCH_CHECK_VALUE(lens || !needs_camera(needs),
+                    "lens must be given where viewmatrix, projmatrix or campos requires a gradient, got None");
+}
+
+Grads make_grads(const Inputs& in, const std::vector<bool>& needs) {
+  Grads grads;
+  const auto make = [&](Tensor& grad, const OptionalTensor& like, bool needed) {
+    if (needed && like) grad = at::empty_like(*like, at::MemoryFormat::Contiguous);
+  };
+  make(grads.means3D, in.means3D, needs[0]);
+  make(grads.means2D, in.means2D, needs[1]);
+  make(grads.opacities, in.opacities, needs[2]);
+  make(grads.shs, in.shs, needs[3]);
+  // Channels of the caller's own have theirs from blend_vjp.
+  if (in.colors_precomp && in.colors_precomp->size(1) == 3) make(grads.colors_precomp, in.colors_precomp, needs[4]);
+  make(grads.scales, in.scales, needs[5]);
+  make(grads.rotations, in.rotations, needs[6]);
+  make(grads.cov3D_precomp, in.cov3D_precomp, needs[7]);
+  grads.with_camera = in.lens && needs_camera(needs);
+  return grads;
+}
+
+void set_camera_grads(const Tensor& parts, const std::vector<bool>& needs, Grads& grads) {
+  // In double and always in the same order.
+  const Tensor sum = parts.sum(0, false, at::kDouble).to(parts.scalar_type());
+  // Rows of CameraGrad.
+  const auto rows = [&](int64_t first, int64_t count) { return sum.narrow(0, first, 4 * count).view({count, 4}); };
+  const auto matrix = [&](Tensor first, Tensor last) {  // with rows of zeros between
+    return at::cat({first, at::zeros({4 - first.size(0) - last.size(0), 4}, sum.options()), last}).t().contiguous();
+  };
+  if (needs[8]) grads.viewmatrix = matrix(rows(0, 3), rows(12, 0));
+  if (needs[9]) grads.projmatrix = matrix(rows(12, 2), rows(20, 1));
+  if (needs[10]) grads.campos = sum.narrow(0, 24, 3).clone();
+  if (needs[11]) grads.lens = sum.narrow(0, 27, kLensWidth).clone();
+}
+
+std::vector<Tensor> list_of(Grads grads, const Tensor& like) {
+  std::vector<Tensor> list;
+  grads.each_tensor([&](const char*, Tensor& t) { list.push_back(or_empty(t, like)); });
+  return list;
+}
+
+namespace {
+
+/// Mean transmittance of every pixel's samples, (H, W). A tile of `adaptive` uses the first of them only.
+Tensor mean_transmittance(const BlendState& state, const ListTensors& lists, TileGrid grid) {
+  if (lists.tile_samples.numel() == 0) return state.transmittance.mean(0);
+  const Tensor samples = lists.tile_samples.view({grid.rows(), grid.columns()})
+                             .repeat_interleave(kTile, 0)
+                             .repeat_interleave(kTile, 1)
+                             .slice(0, 0, grid.height)
+                             .slice(1, 0, grid.width);
+  const Tensor number = at::arange(state.transmittance.size(0), samples.options()).view({-1, 1, 1});
+  return at::where(number.lt(samples), state.transmittance, at::zeros({}, state.transmittance.options())).sum(0) /
+         samples;
+}
+
+}  // namespace
+
+Tensor background_grad(const Tensor& dL_dcolor, const BlendState& state, const ListTensors& lists, TileGrid grid) {
+  return (dL_dcolor * mean_transmittance(state, lists, grid)).sum(at::IntArrayRef({1, 2}));
+}
+
+}  // namespace ar::ops

@@ -1,0 +1,27 @@
+// Gradients with respect to a scene and its camera, for the adjoints that end there.
+#pragma once
+
+#include <vector>
+
+#include "torch/backend.h"
+
+namespace ar::ops {
+
+/// `needs`: which of the tensors of SceneTensors want a gradient. Without a lens those of the camera have none; raises
+/// ValueError where one of them wants it.
+void check_camera_needs(const std::vector<bool>& needs, const OptionalTensor& lens);
+
+/// Room for the gradients with respect to the Gaussians, and whether those of the camera are wanted.
+Grads make_grads(const Inputs& in, const std::vector<bool>& needs);
+
+/// Sets the gradients with respect to the camera that are wanted, from the parts that project_vjp returned.
+void set_camera_grads(const Tensor& parts, const std::vector<bool>& needs, Grads& grads);
+
+/// For an op to return: an empty tensor like `like` stands for one that is not wanted.
+inline Tensor or_empty(const Tensor& t, const Tensor& like) { return t.defined() ? t : at::empty({0}, like.options()); }
+std::vector<Tensor> list_of(Grads grads, const Tensor& like);
+
+/// Gradient with respect to a background: it shows through what no splat covers.
+Tensor background_grad(const Tensor& dL_dcolor, const BlendState& state, const ListTensors& lists, TileGrid grid);
+
+}  // namespace ar::ops
