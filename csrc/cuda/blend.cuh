@@ -219,11 +219,8 @@ __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front
   __shared__ BlendStage<F, C> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   PlanCounts& counts = params.plan.state->counts;
-  int place = int(blockIdx.x);
-  if (params.lists.tile_samples) {
-    place += counts.tiles.first[sample_class(S)];
-    if (place >= counts.tiles.first[sample_class(S) + 1]) return;
-  }
+  const int place = tile_place<S>(params, int(blockIdx.x));
+  if (place < 0) return;
   const int tile = params.plan.tile_order[place], warp = threadIdx.x / 32, front_length = front_chunks(params.grid, S);
   const TileList list = list_of(params.lists, params.grid, tile);
   const Vec2<float> p = pixel_of(warp, lane_id());

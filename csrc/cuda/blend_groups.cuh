@@ -33,6 +33,19 @@ template <int kBatch> struct GroupChannels {
   }
 };
 
+/// `sums` += contribution times values.
+__device__ inline void add_channels(float contribution, const float4 (&values)[kChannelGroup / 4],
+                                    float (&sums)[kChannelGroup]) {
+#pragma unroll
+  for (int q = 0; q < kChannelGroup / 4; ++q) {
+    const float4 v = values[q];
+    sums[4 * q] = madd(contribution, v.x, sums[4 * q]);
+    sums[4 * q + 1] = madd(contribution, v.y, sums[4 * q + 1]);
+    sums[4 * q + 2] = madd(contribution, v.z, sums[4 * q + 2]);
+    sums[4 * q + 3] = madd(contribution, v.w, sums[4 * q + 3]);
+  }
+}
+
 inline constexpr int kGroupBatch = 128;
 
 template <class F>
@@ -43,12 +56,8 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4   ? 1
   __shared__ Stage<F, 0, kGroupBatch> stage;
   __shared__ GroupChannels<kGroupBatch> staged;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
-  int place = int(blockIdx.x);
-  if (params.lists.tile_samples) {
-    const SampleParts& tiles = params.plan.state->counts.tiles;
-    place += tiles.first[sample_class(S)];
-    if (place >= tiles.first[sample_class(S) + 1]) return;
-  }
+  const int place = tile_place<S>(params, int(blockIdx.x));
+  if (place < 0) return;
   const int first = int(blockIdx.y) * kChannelGroup, lane = lane_id();
   const TileList list = list_of(params.lists, params.grid, params.plan.tile_order[place]);
   const Vec2<float> p = pixel_of(threadIdx.x / 32, lane);
@@ -84,14 +93,7 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4   ? 1
           last[s] = b.mask ? k + j + 1 : last[s];
         }
         if (!__any_sync(kAllLanes, contribution > 0)) continue;
-#pragma unroll
-        for (int q = 0; q < kChannelGroup / 4; ++q) {
-          const float4 v = staged.values[j][q];
-          sums[4 * q] = madd(contribution, v.x, sums[4 * q]);
-          sums[4 * q + 1] = madd(contribution, v.y, sums[4 * q + 1]);
-          sums[4 * q + 2] = madd(contribution, v.z, sums[4 * q + 2]);
-          sums[4 * q + 3] = madd(contribution, v.w, sums[4 * q + 3]);
-        }
+        add_channels(contribution, staged.values[j], sums);
       }
     }
   }

@@ -1,12 +1,12 @@
-// Kernel of blend_vjp for any number of channels, a group of 32 after the other: a block per tile, a warp per subtile,
-// a pixel per lane, back to front through the whole list.
+// Kernel of blend_vjp for any number of channels, a group of 32 after the other: a block per tile and segment of its
+// list, a warp per subtile, a pixel per lane, back to front.
 //
 // dL/dalpha is linear in the gradient of the image: each group adds its share to the six sums of a pair, which a single
 // block owns. Only MeanSums need the channels of all groups at once: where they are wanted, the
 // first group makes all sums, and reads the channels of the others where they lie.
 #pragma once
 
-#include "cuda/blend_groups.cuh"
+#include "cuda/blend_segments.cuh"
 
 namespace ar::cuda {
 
@@ -42,42 +42,54 @@ __device__ inline float dot(const float (&g)[kChannelGroup], const float4 (&valu
   return (sum[0] + sum[1]) + (sum[2] + sum[3]);
 }
 
+/// The tile of block `block` of a kernel for tiles with S samples; -1 if there is none.
+template <int S> __device__ int listed_tile(const BlendVjpParams& params, int block) {
+  const SampleParts& tiles = params.plan->counts.chunks;  // a chunk is a tile's whole list
+  const int place = tiles.first[sample_class(S)] + block;
+  return place < tiles.first[sample_class(S) + 1] ? params.chunk_order[place].tile : -1;
+}
+
+/// The gradient of a pixel with respect to a channel of one of its S samples.
+struct SampleGradient {
+  const BlendVjpParams& params;
+  const Pixel& pixel;
+  int samples;
+
+  __device__ float operator()(int channel) const {
+    const float* plane = channel < params.channels.count ? params.dL_dimage.plane(channel, pixel.image) : nullptr;
+    return pixel.inside && plane ? 1.0f / samples * plane[pixel.index] : 0.0f;
+  }
+};
+
 template <class F>
 __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
     blend_groups_vjp_kernel(const BlendVjpParams params, int group) {
   constexpr int S = F::kSamples;
   extern __shared__ float4 memory[];
   auto& shared = *reinterpret_cast<GroupVjpShared<F>*>(memory);
-  const SampleParts& tiles = params.plan->counts.chunks;  // a chunk is a tile's whole list
-  const int place = tiles.first[sample_class(S)] + int(blockIdx.x);
-  if (place >= tiles.first[sample_class(S) + 1]) return;
-  const TileList list = list_of(params.lists, params.grid, params.chunk_order[place].tile);
+  const Segments& segments = params.segments;
+  const int tile = listed_tile<S>(params, int(blockIdx.x) / segments.count);
+  if (tile < 0) return;
+  const Segment<S> segment(params.lists, params.grid, tile, int(blockIdx.x) % segments.count, segments.count,
+                           params.last);
+  const TileList& list = segment.list;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int first = group * kChannelGroup, lane = lane_id(), warp = threadIdx.x / 32,
             channel_count = params.channels.count;
   const bool with_means = params.mean_sums != MeanSums::kNone,
              all_at_once = with_means && channel_count > kChannelGroup;
   const bool with_shape = !all_at_once || group == 0;
-  const Vec2<float> p = pixel_of(warp, lane);
-  const Pixel pixel(list, params.grid, p);
-  const float scale = pixel.inside ? 1.0f / S : 0;
-
-  float transmittance[S], behind[S];
-  int last[S], own_last = 0;
+  const Vec2<float> p = segment.p;
+  const Pixel& pixel = segment.pixel;
+  const int (&last)[S] = segment.last;
+  int own_last = 0;
 #pragma unroll
-  for (int s = 0; s < S; ++s) {
-    last[s] = pixel.inside ? params.last[s * pixel.image + pixel.index] : 0;
-    transmittance[s] = pixel.inside ? params.transmittance[s * pixel.image + pixel.index] : 1;
-    own_last = max(own_last, last[s]);
-  }
+  for (int s = 0; s < S; ++s) own_last = max(own_last, last[s]);
   own_last = warp_max(own_last);
   if (lane == 0) shared.last[warp] = own_last;
   __syncthreads();
-  int tile_last = 0;
-#pragma unroll
-  for (int b = 0; b < kSubtiles; ++b) tile_last = max(tile_last, shared.last[b]);
-  if (group == 0 && !list.overflow) {  // pairs that nothing reached
-    for (int k = tile_last + threadIdx.x / 8; k < list.count; k += kBlendThreads / 8) {
+  if (group == 0 && !list.overflow && segment.number + 1 == segments.count) {  // pairs that nothing reached
+    for (int k = segment.end + threadIdx.x / 8; k < list.count; k += kBlendThreads / 8) {
       const int q = threadIdx.x % 8;
       const int64_t slot = list.slot(k);
       const float4 zero = {0, 0, 0, 0};
@@ -85,12 +97,9 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
       if (params.channel_sums) reinterpret_cast<float4*>(params.channel_sums + slot * kChannelGroup)[q] = zero;
     }
   }
-  if (tile_last == 0) return;
+  if (segment.begin == segment.end) return;
 
-  const auto gradient = [&](int channel) {  // of this pixel, with respect to one sample
-    const float* plane = channel < channel_count ? params.dL_dimage.plane(channel, pixel.image) : nullptr;
-    return pixel.inside && plane ? scale * plane[pixel.index] : 0.0f;
-  };
+  const SampleGradient gradient = {params, pixel, S};
   float g[kChannelGroup];          // this lane's pixel, all channels
   float g_channel[kChannelGroup];  // this lane's channel, all pixels
   float through = 0;               // what the background gives
@@ -103,9 +112,18 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
     for (int c = kChannelGroup; c < channel_count; ++c) through += gradient(c) * params.background[c];
   }
   // Alpha is 1 - transmittance: its gradient acts like one more channel whose background is -1.
-  if (group == 0 && params.dL_dalpha && pixel.inside) through -= scale * params.dL_dalpha[pixel.index];
+  if (group == 0 && params.dL_dalpha && pixel.inside) through -= 1.0f / S * params.dL_dalpha[pixel.index];
+  float transmittance[S], behind[S];  // at the end of the segment
 #pragma unroll
-  for (int s = 0; s < S; ++s) behind[s] = through;
+  for (int s = 0; s < S; ++s) {
+    transmittance[s] = pixel.inside ? params.transmittance[s * pixel.image + pixel.index] : 1;
+    behind[s] = through;
+    if (last[s] <= segment.end) continue;
+    float rest = transmittance[s] * through;
+    for (int k = segment.number + 1; k < segments.count; ++k) rest += segments.shown_at(tile, k, s)[threadIdx.x];
+    transmittance[s] = segments.transmittance_at(tile, segment.number + 1, s)[threadIdx.x];
+    behind[s] = rest / transmittance[s];
+  }
   {
     constexpr int kStride = kChannelGroup + 1;  // keeps the lanes on different banks
     static_assert(32 * kStride <= kVjpBatch * (kChannelGroup + kShapeSums));
@@ -119,12 +137,12 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
 
   // The splat of this thread in the batch that ends at k1, for the threads that there are splats for.
   const auto splat_of_batch = [&](int k1) {
-    const int k = max(k1 - kVjpBatch, 0) + int(threadIdx.x);
+    const int k = max(k1 - kVjpBatch, segment.begin) + int(threadIdx.x);
     return threadIdx.x < kVjpBatch && k < k1 ? list.splat(k) : -1;
   };
-  int turn = 0, id = splat_of_batch(tile_last);
-  for (int k1 = tile_last; k1 > 0; k1 -= kVjpBatch) {
-    const int k0 = max(k1 - kVjpBatch, 0), count = k1 - k0;
+  int turn = 0, id = splat_of_batch(segment.end);
+  for (int k1 = segment.end; k1 > segment.begin; k1 -= kVjpBatch) {
+    const int k0 = max(k1 - kVjpBatch, segment.begin), count = k1 - k0;
     const int32_t next_id = splat_of_batch(k0);
     __syncthreads();  // all have read what the last batch left
     if (threadIdx.x < kVjpBatch) {
@@ -227,11 +245,46 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
   }
 }
 
+/// What the segments behind the first add to each pixel, as its gradient weighs it: what those before them see.
+template <class F>
+__global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
+    segment_shown_kernel(const BlendVjpParams params, int group) {
+  constexpr int S = F::kSamples;
+  const Segments& segments = params.segments;
+  const int tile = listed_tile<S>(params, int(blockIdx.x) / segments.count), number = int(blockIdx.x) % segments.count;
+  if (tile < 0 || number == 0) return;
+  const Segment<S> segment(params.lists, params.grid, tile, number, segments.count, params.last);
+  const SampleGradient gradient = {params, segment.pixel, S};
+  const int first = group * kChannelGroup, channel_count = params.channels.count;
+  const bool all_at_once = params.mean_sums != MeanSums::kNone && group == 0;
+  float g[kChannelGroup], transmittance[S], shown[S];
+#pragma unroll
+  for (int c = 0; c < kChannelGroup; ++c) g[c] = gradient(first + c);
+#pragma unroll
+  for (int s = 0; s < S; ++s) {
+    transmittance[s] = segments.transmittance_at(tile, number, s)[threadIdx.x];
+    shown[s] = 0;
+  }
+  const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
+  walk_segment<F>(splats, params.channels, first, segment, transmittance,
+                  [&](int32_t id, const float4(&values)[kChannelGroup / 4], const float (&contributions)[S]) {
+                    float g_color = dot(g, values);
+                    for (int c = kChannelGroup; all_at_once && c < channel_count; ++c)
+                      g_color = madd(gradient(c), params.channels.row(id)[c], g_color);
+#pragma unroll
+                    for (int s = 0; s < S; ++s) shown[s] = madd(contributions[s], g_color, shown[s]);
+                  });
+#pragma unroll
+  for (int s = 0; s < S; ++s) segments.shown_at(tile, number, s)[threadIdx.x] = shown[s];
+}
+
 template <class F> void blend_vjp_groups(const BlendVjpParams& p, int group, cudaStream_t stream) {
+  const unsigned blocks = unsigned(p.grid.tiles() * p.segments.count);
+  if (p.segments.count > 1) segment_shown_kernel<F><<<blocks, kBlendThreads, 0, stream>>>(p, group);
   const auto kernel = blend_groups_vjp_kernel<F>;
   const int bytes = int(sizeof(GroupVjpShared<F>));
   if (bytes > 48 * 1024) cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, bytes);
-  kernel<<<unsigned(p.grid.tiles()), kBlendThreads, bytes, stream>>>(p, group);
+  kernel<<<blocks, kBlendThreads, bytes, stream>>>(p, group);
 }
 
 }  // namespace ar::cuda

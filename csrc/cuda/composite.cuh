@@ -155,6 +155,14 @@ template <int S> __device__ bool has_samples(const TileLists& lists, int tile) {
   return !lists.tile_samples || lists.tile_samples[tile] == S;
 }
 
+/// Place in the plan's order of tiles of block `block` of a kernel for tiles with S samples; -1 if there is none.
+template <int S, class Params> __device__ int tile_place(const Params& params, int block) {
+  if (!params.lists.tile_samples) return block;
+  const SampleParts& tiles = params.plan.state->counts.tiles;
+  const int place = tiles.first[sample_class(S)] + block;
+  return place < tiles.first[sample_class(S) + 1] ? place : -1;
+}
+
 /// The numbers of a pixel's samples, and of its image.
 struct Pixel {
   int64_t index, image;  ///< of the pixel, and how many there are

@@ -188,6 +188,29 @@ struct ChunkPlan {
   TileChunk* tail;         ///< [counts.tail] chunks behind the front ones, or null where lists are not cut
 };
 
+/// The parts of a tile's list that are blended side by side where many channels meet few tiles.
+struct Segments {
+  int count;             ///< of each tile; 1: the list is walked as one, and there is nothing else here
+  int samples;           ///< the most that a tile has
+  float* transmittance;  ///< [tiles, count, samples, kTile^2] in front of a segment, where the sample is still open
+  float* sums;           ///< [tiles, count, kChannelGroup, kTile^2] what a segment adds to the channels of a group
+  float* shown;  ///< [tiles, count, samples, kTile^2] the product of that, per sample, with the pixel's gradient
+
+  AR_HD float* transmittance_at(int tile, int segment, int sample) const {
+    return transmittance + plane(tile, segment, samples, sample);
+  }
+  AR_HD float* sum_at(int tile, int segment, int channel) const {
+    return sums + plane(tile, segment, kChannelGroup, channel);
+  }
+  AR_HD float* shown_at(int tile, int segment, int sample) const {
+    return shown + plane(tile, segment, samples, sample);
+  }
+
+  AR_HD int64_t plane(int tile, int segment, int width, int k) const {
+    return ((int64_t(tile) * count + segment) * width + k) * (kTile * kTile);
+  }
+};
+
 struct BlendParams : ar::BlendParams<float> {
   TileLists lists;
   ChunkPlan plan;
@@ -195,6 +218,7 @@ struct BlendParams : ar::BlendParams<float> {
   int32_t* open_tiles;  ///< [kSampleClasses, tiles]
   CheckpointLayout layout;
   float* checkpoints;  ///< [planes, kTile^2]
+  Segments segments;   ///< for more than kFewChannels channels
 };
 
 struct InspectParams : ar::InspectParams<float> {
@@ -211,6 +235,7 @@ struct BlendVjpParams : ar::BlendVjpParams<float> {
   float* pair_grads;    ///< [max(capacity, n), kPairGradWidth] by slot, or by splat if there are too many pairs
   float* channel_sums;  ///< [max(capacity, n), kChannelGroup] likewise, for more than kFewChannels channels; or null
   MeanSums mean_sums;
+  Segments segments;  ///< as in BlendParams
 };
 
 /// Sums over the pairs of every splat.
@@ -270,11 +295,15 @@ void sum_channels(const SumChannelsParams& p, cudaStream_t stream);
 /// need no checkpoints. The yardsticks have no other.
 bool blends_groups(int footprint, int64_t channels);
 /// Channels that a group-less blending is compiled for: 3 in the splats themselves, or 4 in rows.
+/// Segments of each tile's list that they are blended in.
+int list_segments(int footprint, int64_t channels, TileGrid grid);
 constexpr int compiled_channels(bool in_splats) { return in_splats ? 3 : kFewChannels; }
 /// Only for a footprint that chooses.
 void choose_samples(const ChooseParams& p, cudaStream_t stream);
-/// Without p.channels.data the three colours in the splats.
-void blend(int footprint, const BlendParams& p, cudaStream_t stream);
+/// Without p.channels.data the three colours in the splats. `cut`: only where lists have several segments, parameters
+/// to blend the splats' three colours with as for a backward pass; their transmittance, last and alpha are those of
+/// `p`.
+void blend(int footprint, const BlendParams& p, const BlendParams* cut, cudaStream_t stream);
 /// `group`: which kChannelGroup channels; 0 where they are few.
 void blend_vjp(int footprint, const BlendVjpParams& p, int group, cudaStream_t stream);
 void inspect(int footprint, const InspectParams& p, cudaStream_t stream);
