@@ -270,29 +270,32 @@ class CudaBackend final : public Backend {
     p.channels = channels_of(channels);
     p.lists = tile_lists_of(lists);
 
-    const bool whole = cuda::blends_groups(footprint.choice.index, channels.count);
-    const int64_t tiles = grid.tiles(), capacity = p.lists.capacity;
-    const int64_t chunks = whole ? 0 : capacity / cuda::chunk_length(footprint.chosen ? 1 : footprint.samples);
     p.layout = {cuda::compiled_channels(!channels.rows.defined()), pass.keep};
-    const int64_t max_planes = whole ? 0 : p.layout.max_planes(grid, footprint.samples, capacity, footprint.chosen);
-    state.checkpoints = at::empty({max_planes * kTile * kTile}, floats_);
-    state.chunks = at::empty({kPlanRows + chunks + tiles, kChunkWidth}, ints_);
-    C10_CUDA_CHECK(cudaMemsetAsync(state.chunks.data_ptr(), 0, sizeof(cuda::PlanState), stream_));
-    const Tensor tail = at::empty({chunks + 1, kChunkWidth}, ints_);
-    // Tiles in order, their planes, whether they are open, and the open ones by samples.
-    const Tensor of_tiles = at::empty({3 + cuda::kSampleClasses, tiles}, ints_);
-    auto* of_tile = pointer<int32_t>(of_tiles);
-    p.plan.state = structs_of<cuda::PlanState>(state.chunks);
-    p.plan.chunk_order = structs_of<cuda::TileChunk>(state.chunks) + kPlanRows;
-    p.plan.tile_order = of_tile;
-    p.plan.tile_planes = of_tile + tiles;
-    p.plan.tail = structs_of<cuda::TileChunk>(tail);
-    p.tile_open = of_tile + 2 * tiles;
-    p.open_tiles = of_tile + 3 * tiles;
-    p.checkpoints = pointer<float>(state.checkpoints);
-    cuda::plan_chunks(p.lists, grid, footprint.samples, whole, p.layout, p.plan, stream_);
-    check_stage("plan_chunks", pass.debug);
-    cuda::blend(footprint.choice.index, p, stream_);
+    const Plan plan = make_plan(p, pass, cuda::blends_groups(footprint.choice.index, channels.count), state);
+    p.segments.count = cuda::list_segments(footprint.choice.index, channels.count, grid);
+    if (p.segments.count == 1) {
+      cuda::blend(footprint.choice.index, p, nullptr, stream_);
+      check_stage("blend", pass.debug);
+      return;
+    }
+    // The colours in the splats go first, into images that nobody looks at.
+    Pass first_pass = pass;
+    first_pass.keep = true;
+    BlendState first_state = pass.keep ? state : make_state(first_pass, lists.splats);
+    p.transmittance = pointer<float>(first_state.transmittance);
+    p.last = pointer<int32_t>(first_state.last);
+    const Tensor first_image = at::empty({3, grid.height, grid.width}, floats_);
+    cuda::BlendParams cut = p;
+    cut.channels = {nullptr, 0, nullptr, 3};
+    cut.image = {pointer<float>(first_image), 3, {}};
+    cut.layout = {3, true};
+    const Plan first_plan = make_plan(cut, first_pass, false, first_state);
+    const Tensor sums = segment_planes(p.segments, grid, cuda::kChannelGroup);
+    state.checkpoints = segment_planes(p.segments, grid, footprint.samples);
+    p.segments.samples = footprint.samples;
+    p.segments.sums = pointer<float>(sums);
+    p.segments.transmittance = pointer<float>(state.checkpoints);
+    cuda::blend(footprint.choice.index, p, &cut, stream_);
     check_stage("blend", pass.debug);
   }
 
@@ -325,6 +328,15 @@ class CudaBackend final : public Backend {
     p.chunk_order = const_structs_of<cuda::TileChunk>(state.chunks) + kPlanRows;
     p.max_chunks = state.chunks.size(0) - kPlanRows;
     p.checkpoints = const_pointer<float>(state.checkpoints);
+    p.segments.count = cuda::list_segments(pass.footprint.choice.index, count, pass.grid);
+    p.segments.samples = pass.footprint.samples;
+    p.segments.transmittance = const_cast<float*>(p.checkpoints);
+    Tensor shown;
+    if (p.segments.count > 1) {
+      check_segments(p.segments, pass.grid, state);
+      shown = segment_planes(p.segments, pass.grid, p.segments.samples);
+      p.segments.shown = pointer<float>(shown);
+    }
     p.pair_grads = pointer<float>(out.pairs);
     p.mean_sums = mean_sums;
 
@@ -428,6 +440,48 @@ class CudaBackend final : public Backend {
     TORCH_CHECK_VALUE(chunks.dim() == 2 && chunks.size(0) >= kPlanRows && chunks.size(1) == kChunkWidth &&
                           chunks.scalar_type() == at::kInt && state.checkpoints.scalar_type() == at::kFloat,
                       "chunks and checkpoints must be what blend saved, got shape ", chunks.sizes());
+  }
+
+  static void check_segments(const cuda::Segments& segments, TileGrid grid, const BlendState& state) {
+    const int64_t numbers = grid.tiles() * segments.count * segments.samples * kTile * kTile;
+    TORCH_CHECK_VALUE(state.checkpoints.numel() == numbers, "checkpoints must be what blend saved, got shape ",
+                      state.checkpoints.sizes());
+  }
+  /// Planes of every segment of every tile.
+  Tensor segment_planes(const cuda::Segments& segments, TileGrid grid, int64_t planes) const {
+    return at::empty({grid.tiles() * segments.count * planes, kTile * kTile}, floats_);
+  }
+
+  /// Memory of a plan that its kernels need while they run.
+  struct Plan {
+    Tensor tail;
+    Tensor of_tiles;  ///< tiles in order, their planes, whether they are open, and the open ones by samples
+  };
+  /// Plans the blending of lists in chunks, or each as a `whole`: sets the members of `p` and `state` that belong to
+  /// it.
+  Plan make_plan(cuda::BlendParams& p, const Pass& pass, bool whole, BlendState& state) const {
+    const FootprintSpec& footprint = pass.footprint;
+    const int64_t tiles = pass.grid.tiles(), capacity = p.lists.capacity;
+    const int64_t chunks = whole ? 0 : capacity / cuda::chunk_length(footprint.chosen ? 1 : footprint.samples);
+    const int64_t max_planes =
+        whole ? 0 : p.layout.max_planes(pass.grid, footprint.samples, capacity, footprint.chosen);
+    state.checkpoints = at::empty({max_planes * kTile * kTile}, floats_);
+    state.chunks = at::empty({kPlanRows + chunks + tiles, kChunkWidth}, ints_);
+    C10_CUDA_CHECK(cudaMemsetAsync(state.chunks.data_ptr(), 0, sizeof(cuda::PlanState), stream_));
+    const Plan plan = {at::empty({chunks + 1, kChunkWidth}, ints_),
+                       at::empty({3 + cuda::kSampleClasses, tiles}, ints_)};
+    auto* of_tile = pointer<int32_t>(plan.of_tiles);
+    p.plan.state = structs_of<cuda::PlanState>(state.chunks);
+    p.plan.chunk_order = structs_of<cuda::TileChunk>(state.chunks) + kPlanRows;
+    p.plan.tile_order = of_tile;
+    p.plan.tile_planes = of_tile + tiles;
+    p.plan.tail = structs_of<cuda::TileChunk>(plan.tail);
+    p.tile_open = of_tile + 2 * tiles;
+    p.open_tiles = of_tile + 3 * tiles;
+    p.checkpoints = pointer<float>(state.checkpoints);
+    cuda::plan_chunks(p.lists, pass.grid, footprint.samples, whole, p.layout, p.plan, stream_);
+    check_stage("plan_chunks", pass.debug);
+    return plan;
   }
 
   SplatTensors make_splats(int64_t n) const {
