@@ -449,7 +449,7 @@ class CudaBackend final : public Backend {
   }
   /// Planes of every segment of every tile.
   Tensor segment_planes(const cuda::Segments& segments, TileGrid grid, int64_t planes) const {
-    return at::empty({grid.tiles() * segments.count * planes, kTile * kTile}, floats_);
+    return at::empty({grid.tiles() * segments.count * planes * kTile * kTile}, floats_);
   }
 
   /// Memory of a plan that its kernels need while they run.
