@@ -262,7 +262,8 @@ def test_a_feature_that_is_not_finite_culls_its_gaussian_alone(device, best):
         assert (leaf.grad[4] == 0).all(), name
 
 
-def test_debug_names_the_channel_that_is_not_finite(device):
+def test_debug_names_the_channel_that_is_not_finite(device, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where the snapshot goes
     scene = colored(scenes.cast(scenes.random_scene(13, 30), torch.float32), 6)
     scene["colors_precomp"][4, 5] = torch.nan
     settings = with_bg(CAMERA.settings(torch.float32, footprint="box")._replace(debug=True), torch.zeros(6))
