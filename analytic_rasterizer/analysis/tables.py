@@ -15,11 +15,12 @@ STYLES = {  # colour and marker
     "analytic": ("#c2255c", "D"),
     "cumulant": ("#2b8a3e", "^"),
     "box": ("#1c7ed6", "v"),
+    "moment": ("#0c8599", "X"),
     "adaptive": ("#7048e8", "P"),
     "erf": ("#e599b8", "d"),
     "exact": ("#000000", "*"),
 }
-OTHER_STYLES = (("#0c8599", "h"), ("#8d6e4b", "p"), ("#a9a000", "<"), ("#5f3dc4", ">"))  # of footprints not listed
+OTHER_STYLES = (("#495057", "h"), ("#8d6e4b", "p"), ("#a9a000", "<"), ("#5f3dc4", ">"))  # of footprints not listed
 
 
 def style(footprint: str) -> dict:

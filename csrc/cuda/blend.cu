@@ -7,9 +7,18 @@
 namespace ar::cuda {
 
 bool blends_groups(int footprint, int64_t channels) {
-  bool yardstick = false;
-  visit_footprint(footprint, Footprints{}, [&](auto f) { yardstick = decltype(f)::kYardstick; });
-  return yardstick || channels > kFewChannels;
+  bool always = false;
+  visit_footprint(footprint, Footprints{}, [&](auto f) { always = kOnlyGroups<decltype(f)>; });
+  return always || channels > kFewChannels;
+}
+
+int64_t max_state_planes(int footprint, int64_t capacity) {
+  int planes = 0;
+  visit_footprint(footprint, Footprints{}, [&](auto f) {
+    using F = decltype(f);
+    if (F::kMoves) planes = state_planes(F::kSamples);
+  });
+  return capacity / kStateChunk * planes;
 }
 
 void choose_samples(const ChooseParams& p, cudaStream_t stream) { launch_choose_samples<Adaptive>(p, stream); }
@@ -17,7 +26,7 @@ void choose_samples(const ChooseParams& p, cudaStream_t stream) { launch_choose_
 void blend(int footprint, const BlendParams& p, cudaStream_t stream) {
   visit_tile_footprints<AdaptiveBoxes>(footprint, stream, [&](auto f, cudaStream_t side) {
     using F = decltype(f);
-    if constexpr (!F::kYardstick) {
+    if constexpr (!kOnlyGroups<F>) {
       if (!p.channels.data) return blend_few<F, 3>(p, side);
       if (p.channels.count <= kFewChannels) return blend_few<F, 4>(p, side);
     }

@@ -326,7 +326,9 @@ class CudaBackend final : public Backend {
     const int64_t tiles = grid.tiles(), capacity = p.lists.capacity;
     const int64_t chunks = whole ? 0 : capacity / cuda::chunk_length(footprint.chosen ? 1 : footprint.samples);
     p.layout = {cuda::compiled_channels(!channels.rows.defined()), options.keep};
-    const int64_t max_planes = whole ? 0 : p.layout.max_planes(grid, footprint.samples, capacity, footprint.chosen);
+    const int64_t max_planes = !whole         ? p.layout.max_planes(grid, footprint.samples, capacity, footprint.chosen)
+                               : options.keep ? cuda::max_state_planes(footprint.choice.index, capacity)
+                                              : 0;
     state.checkpoints = at::empty({max_planes * kTile * kTile}, floats_);
     state.chunks = at::empty({kPlanRows + chunks + tiles, kChunkWidth}, ints_);
     C10_CUDA_CHECK(cudaMemsetAsync(state.chunks.data_ptr(), 0, sizeof(cuda::PlanState), stream_));
