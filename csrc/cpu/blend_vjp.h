@@ -116,7 +116,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
     Vec2<V> mean_sums = {zero, zero};
     for (int c = 0; c < TileMask<T>::kPacks; ++c) {
       const V x = load(lanes.value + c * kCount, V());
-      for (uint32_t rows = reach.rows[c] & rows_in_image; rows != 0; rows &= rows - 1) {
+      for (uint32_t rows = reach.rows[c] & rows_in_image & replay.rows(c); rows != 0; rows &= rows - 1) {
         const int row = __builtin_ctz(rows), pixel = row * kTile + c * kCount;
         if (k >= row_last[row]) continue;
         const Vec2<V> at = {x, V(lanes.value[row])};

@@ -42,6 +42,7 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
  public:
   explicit Replay(const ReplayTile<P, T>&) {}
   void enter(int32_t) {}
+  AR_HD uint32_t rows(int) const { return ~0u; }
 };
 
 /// Transmittance and displacements in front of every pair of a tile's list, from the last to the first.
@@ -68,9 +69,11 @@ template <class P, typename T> class Replay<P, T, true> {
       std::memcpy(&states_, kept_state(kept), sizeof states_);
       composite(kept * spacing_, k + 1, false);
     }
+    std::fill(std::begin(rows_), std::end(rows_), 0);
     for (; changes_ > 0; --changes_) {
       const Change& change = log()[changes_ - 1];
       if (change.pair != k) return;
+      rows_[change.pixel % kTile / kCount] |= 1u << change.pixel / kTile;
       for (int s = 0; s < kSamples; ++s) {
         std::memcpy(states_.transmittance[s] + change.pixel, change.transmittance[s], sizeof change.transmittance[s]);
         std::memcpy(states_.moved.x[s] + change.pixel, change.x[s], sizeof change.x[s]);
@@ -78,6 +81,8 @@ template <class P, typename T> class Replay<P, T, true> {
       }
     }
   }
+  /// Bit r: pack c of row r holds a sample that the pair was composited into.
+  AR_HD uint32_t rows(int c) const { return rows_[c]; }
   AR_HD V transmittance(int s, int pixel) const { return load(states_.transmittance[s] + pixel, V()); }
   AR_HD SampleState<V, true> state(int s, int pixel) const { return states_.moved.at(s, pixel); }
 
@@ -148,6 +153,7 @@ template <class P, typename T> class Replay<P, T, true> {
   int32_t spacing_;
   int32_t first_;  ///< pair that the log begins with
   int64_t changes_ = 0;
+  uint32_t rows_[TileMask<T>::kPacks] = {};
 };
 
 }  // namespace ar::AR_ISA
