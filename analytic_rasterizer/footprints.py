@@ -30,9 +30,6 @@ def option_values(name: str) -> tuple:
     return tuple(_value_of(v["value"]) for v in _VARIANTS[name] if v["value"] is not None)
 
 
-BOX_SAMPLES = option_values("box")
-
-
 def _default_options(name: str) -> dict[str, Any]:
     default = next(v for v in _VARIANTS[name] if v["is_default"])
     if default["option"] is None:
@@ -90,6 +87,7 @@ def resolve_footprint(name: str, **options: Any) -> Footprint:
             mip: `variance` (px^2, default 0.1).
             analytic: `frame_gradient`, `"frozen"` (default) or `"paper"`.
             box: `samples`, 1, 2, 4 (default), 8 or 16.
+            moment: `samples`, 1, 4 (default), 9 or 16.
             adaptive: `tolerance`, of the image, in units of colour (default 1/255): `box` with 1, 4, 8 or 16
                 samples, chosen for every tile of 16x16 pixels.
 
@@ -185,8 +183,9 @@ def footprint_weight(
     window of `analytic` with the exact CDF; its gradient holds the frame, as that of `analytic` does by
     default.
 
-    For `box` the weight is the mean over its samples; in an image each sample is composited on its
-    own, which the mean of the weights does not show.
+    For `box` and `moment` the weight is the mean over the samples; in an image each sample is composited
+    on its own, which the mean of the weights does not show. Those of `moment` are at rest here: in an image
+    the splats in front move them.
 
     Args:
         offset: (..., 2) pixel centre minus projected mean, px; float32 or float64.

@@ -30,6 +30,7 @@ DEFAULT_OPTIONS = {
     "analytic": {"frame_gradient": "frozen"},
     "cumulant": {},
     "box": {"samples": 4},
+    "moment": {"samples": 4},
     "adaptive": {"tolerance": 1 / 255},
     "erf": {},
     "exact": {},
@@ -202,8 +203,32 @@ def box_variance(samples):
     return {1: 1 / 12, 2: 1 / 48}.get(samples, 1 / (24 * samples))
 
 
-def sample_weights(offset, cov2d, footprint, **options):
-    """Weights (S, ...) of the samples that are composited on their own; S = 1 for all but `box`.
+def cell_nodes(samples):
+    """Centres (S, 2) [px] of the equal square cells of the pixel, row by row."""
+    side = math.isqrt(samples)
+    axis = (torch.arange(side, dtype=torch.float64) + 0.5) / side - 0.5
+    y, x = torch.meshgrid(axis, axis, indexing="ij")
+    return torch.stack([x, y], -1).reshape(-1, 2)
+
+
+def moved_nodes(moved, offset, cov2d, samples, alpha):
+    """Displacements (S, ..., 2) of the nodes of `moment` behind a splat, from those in front of it.
+
+    The light of a cell is a round Gaussian of the cell's variance about its node, of which the splat
+    passes 1 - alpha: the centroid of what is left, by the formula for the product of two Gaussians.
+    offset (..., 2), alpha (S, ...) as composited.
+    """
+    xx, xy, yy = add_variance(cov2d, 1 / (12 * samples)).unbind(-1)
+    x, y = (offset + cell_nodes(samples).reshape(samples, *[1] * (offset.dim() - 1), 2) + moved).unbind(-1)
+    pull = torch.stack([yy * x - xy * y, xx * y - xy * x], -1) / (xx * yy - xy * xy)[..., None]
+    taken = (alpha / (1 - alpha) / (12 * samples))[..., None]
+    return moved + taken * pull
+
+
+def sample_weights(offset, cov2d, footprint, moved=None, **options):
+    """Weights (S, ...) of the samples that are composited on their own; S = 1 for all but `box` and `moment`.
+
+    `moved` (S, ..., 2) is what moved_nodes() says, by default nothing.
 
     `adaptive` by itself, without a tile, is `box` with 16 samples.
     """
@@ -232,6 +257,11 @@ def sample_weights(offset, cov2d, footprint, **options):
             d, c = (t.expand(*near.shape, -1)[near] for t in (offset, cov2d))
             value = value.masked_scatter(near, exact_weight(d, c, panels=min(64, math.ceil(0.64 / smallest))))
         return value[None]
+    if footprint == "moment":
+        samples = options["samples"]
+        moved = torch.zeros(samples, 2, dtype=torch.float64) if moved is None else moved
+        nodes = cell_nodes(samples)
+        return torch.stack([blurred(offset + n + m, cov2d, 1 / (12 * samples)) for n, m in zip(nodes, moved, strict=True)])
     if footprint == "box":
         variance = box_variance(options["samples"])
         nodes = box_nodes(options["samples"])
@@ -480,6 +510,7 @@ def radius_covariance(cov2d, footprint, **options):
         "analytic": 0.0,
         "cumulant": 1 / 12,
         "box": 1 / 12,
+        "moment": 1 / 12,
         "adaptive": 1 / 12,
         "erf": 0.0,
         "exact": 1 / 12,
@@ -555,6 +586,7 @@ def render(
     stopped = torch.zeros(samples, height, width, dtype=torch.bool)
     color = torch.zeros(3, height, width, dtype=torch.float64)
     pixel_margin = torch.full((height, width), math.inf, dtype=torch.float64)
+    moved = torch.zeros(samples, height, width, 2, dtype=torch.float64) if footprint == "moment" else None
     offsets, touched = {}, torch.zeros(len(means3D), dtype=torch.bool)
 
     def keep_away(value, threshold, where):
@@ -568,7 +600,7 @@ def render(
         if keep_offsets and offset.requires_grad:
             offset.retain_grad()
             offsets[i] = [offset]
-        response = opacities[i] * sample_weights(offset, cov2d[i], footprint, **options)
+        response = opacities[i] * sample_weights(offset, cov2d[i], footprint, moved=moved, **options)
         keep_away(response, ALPHA_MIN, ~stopped)
         keep_away(response, ALPHA_MAX, ~stopped)
         alpha = torch.where(response < ALPHA_MAX, response, ALPHA_MAX)
@@ -581,6 +613,12 @@ def render(
         alpha = torch.where(stopped, 0.0, alpha)
         color = color + (transmittance * alpha).mean(0) * colors[i][:, None, None]
         transmittance = transmittance * (1 - alpha)
+        if moved is not None:
+            half = 0.5 / math.isqrt(samples)  # nodes stay in their cells
+            moved = moved_nodes(moved, offset, cov2d[i], samples, alpha)
+            keep_away(moved.abs().amax(-1), half, blended & ~stopped)
+            keep_away(moved.abs().amin(-1), half, blended & ~stopped)
+            moved = moved.clamp(-half, half)
     color = color + transmittance.mean(0) * settings.bg.double()[:, None, None]
     radii = torch.ceil(three_sigma(cov2d.detach(), footprint, **options)) * touched
     return Rendered(color, radii.int(), projection, pixel_margin.min().item(), pixel_margin, offsets)

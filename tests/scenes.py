@@ -15,6 +15,7 @@ OPTIONS = {
     "mip": [{}, {"variance": 0.25}],
     "analytic": [{"frame_gradient": "frozen"}, {"frame_gradient": "paper"}],
     "box": [{"samples": samples} for samples in (1, 2, 4, 8, 16)],
+    "moment": [{"samples": samples} for samples in (1, 4, 9, 16)],
     "adaptive": [{"tolerance": 1 / 255}],
 }
 # Every registered footprint with these: a new one is tested without a change here.
@@ -24,11 +25,11 @@ VARIANTS = [(footprint, options) for footprint in FOOTPRINTS for options in OPTI
 RENDERED = [variant for variant in VARIANTS if variant[0] not in YARDSTICKS]
 # One of each footprint, for tests where the options do not matter.
 KINDS = [
-    (footprint, {"samples": 4} if footprint == "box" else {}) for footprint in FOOTPRINTS if footprint not in YARDSTICKS
+    (footprint, {"samples": 4} if footprint in ("box", "moment") else {}) for footprint in FOOTPRINTS if footprint not in YARDSTICKS
 ]
 # One of each path through the rasterizer, for tests where the formula of the weight does not matter: one sample per
-# pixel with a conic and with eigenvectors, several samples, a number of samples per tile.
-PATHS = [("cumulant", {}), ("analytic", {}), ("box", {"samples": 4}), ("adaptive", {})]
+# pixel with a conic and with eigenvectors, several samples, samples that move, a number of samples per tile.
+PATHS = [("cumulant", {}), ("analytic", {}), ("box", {"samples": 4}), ("moment", {"samples": 4}), ("adaptive", {})]
 INPUTS = (
     "means3D",
     "means2D",

@@ -209,6 +209,10 @@ def weight_in_40_digits(offset, cov2d, footprint, options):
         v = {1: mp.mpf(1) / 12, 2: mp.mpf(1) / 48}.get(samples, mp.mpf(1) / (24 * samples))
         nodes = reference.box_nodes(samples).tolist()
         return sum(gaussian(x + mp.mpf(a), y + mp.mpf(b), v) for a, b in nodes) / samples
+    if footprint == "moment":
+        nodes, samples = reference.cell_nodes(options["samples"]).tolist(), options["samples"]
+        v = mp.mpf(1) / (12 * samples)
+        return sum(gaussian(x + mp.mpf(a), y + mp.mpf(b), v) for a, b in nodes) / samples
     if footprint == "cumulant":
         v = mp.mpf(1) / 12
         det = (xx + v) * (yy + v) - xy * xy

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from ..footprints import BOX_SAMPLES, FOOTPRINTS, resolve_footprint
+from ..footprints import FOOTPRINTS, option_values, resolve_footprint
 from ..io import Scene, View, optional_import
 from ..rasterizer import GaussianRasterizer
 
@@ -25,7 +25,7 @@ def footprint_variants() -> list[str]:
     variants = []
     for name in FOOTPRINTS:
         takes_samples = "samples" in dict(resolve_footprint(name).options)
-        variants += [f"{name}:samples={n}" for n in BOX_SAMPLES] if takes_samples else [name]
+        variants += [f"{name}:samples={n}" for n in option_values(name)] if takes_samples else [name]
     return variants
 
 

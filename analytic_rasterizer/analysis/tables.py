@@ -15,11 +15,12 @@ STYLES = {  # colour and marker
     "analytic": ("#c2255c", "D"),
     "cumulant": ("#2b8a3e", "^"),
     "box": ("#1c7ed6", "v"),
+    "moment": ("#0c8599", "X"),
     "adaptive": ("#7048e8", "P"),
     "erf": ("#e599b8", "d"),
     "exact": ("#000000", "*"),
 }
-OTHER_STYLE = ("#0c8599", "h")  # of footprints that are not listed
+OTHER_STYLE = ("#495057", "h")  # of footprints that are not listed
 
 
 def style(footprint: str) -> dict:

@@ -35,6 +35,44 @@ template <class V> AR_HD Blended<V> blend_sample(V raw, V& transmittance) {
   return {MaskOf<V>(hit & open), select(open, contribution, zero)};
 }
 
+/// What a sample of footprint P carries from splat to splat besides its transmittance: nothing, unless it moves.
+template <class V, bool kMoves> struct SampleState {};
+template <class V> struct SampleState<V, true> {
+  Vec2<V> moved = {V(ScalarOf<V>(0)), V(ScalarOf<V>(0))};
+};
+
+/// Composites one splat into sample s of the pixel at p.
+template <class P, class Terms, class V>
+AR_HD Blended<V> blend_sample(const Terms& terms, Vec2<V> p, int s, V& transmittance,
+                              SampleState<V, P::kMoves>& state) {
+  if constexpr (P::kMoves) {
+    using T = ScalarOf<V>;
+    const Vec2<V> at = p + state.moved;
+    const V raw = P::alpha(terms, at, s);
+    const Blended<V> blended = blend_sample(raw, transmittance);
+    const V alpha = select(blended.mask, min(raw, V(T(kAlphaMax))), V(T(0)));
+    state.moved = P::move(terms, at, s, alpha, state.moved);
+    return blended;
+  } else {
+    return blend_sample(P::alpha(terms, p, s), transmittance);
+  }
+}
+
+/// The same once more, for the samples of a P that moves which the forward pass composited the splat into. `before`:
+/// the splat is not behind the last one of the sample. Returns whether it was composited.
+template <class P, class Terms, class V>
+AR_HD MaskOf<V> replay_sample(const Terms& terms, Vec2<V> p, int s, MaskOf<V> before, V& transmittance,
+                              SampleState<V, true>& state) {
+  using T = ScalarOf<V>;
+  const Vec2<V> at = p + state.moved;
+  const V raw = P::alpha(terms, at, s);
+  const MaskOf<V> mask = (raw >= V(T(kAlphaMin))) & before;
+  const V alpha = select(mask, min(raw, V(T(kAlphaMax))), V(T(0)));
+  transmittance = transmittance - transmittance * alpha;
+  state.moved = P::move(terms, at, s, alpha, state.moved);
+  return mask;
+}
+
 /// Adjoint of one step, walked from the last splat to the first.
 template <class V> struct BlendGrad {
   V contribution;  ///< T alpha, zero outside the mask: dL/dcolor is this times the pixel's gradient
@@ -55,6 +93,29 @@ template <class V> AR_HD BlendGrad<V> blend_sample_vjp(MaskOf<V> mask, V raw, V 
   behind = madd(alpha, difference, behind);
   const MaskOf<V> free = mask & (raw <= cap);
   return {transmittance * alpha, select(free, transmittance * difference, zero)};
+}
+
+/// Adjoint of one step of a sample that moves.
+template <class V> struct MovingBlendGrad {
+  V contribution;  ///< as in BlendGrad
+  MoveGrad<V> of_splat;
+};
+
+/// As blend_sample_vjp, but `transmittance` and `state` are those in front of the splat: since alpha depends on the
+/// displacement, they cannot be had from those behind it. `dL_dmoved` goes from behind the splat to in front of it.
+template <class P, class Terms, class V>
+AR_HD MovingBlendGrad<V> blend_moving_sample_vjp(const Terms& terms, Vec2<V> p, int s, MaskOf<V> before, V g_color,
+                                                 V transmittance, const SampleState<V, true>& state, V& behind,
+                                                 Vec2<V>& dL_dmoved) {
+  using T = ScalarOf<V>;
+  const Vec2<V> at = p + state.moved;
+  const V raw = P::alpha(terms, at, s), cap = V(T(kAlphaMax));
+  const MaskOf<V> mask = (raw >= V(T(kAlphaMin))) & before, free = mask & (raw <= cap);
+  const V alpha = select(mask, min(raw, cap), V(T(0)));
+  const V difference = g_color - behind;
+  behind = madd(alpha, difference, behind);
+  return {transmittance * alpha,
+          P::alpha_and_move_vjp(terms, at, s, raw, alpha, free, transmittance * difference, state.moved, dL_dmoved)};
 }
 
 /// A pixel's share of `sums`; not for kNone. `size`: of the image [px].

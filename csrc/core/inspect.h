@@ -10,8 +10,10 @@ namespace ar {
 template <typename T> AR_HD int64_t weight_units(T weight) { return int64_t(double(weight) / kWeightUnit + 0.5); }
 
 /// Composites the splats of a pixel front to back, and remembers two of them.
-template <typename T, int S> struct PixelSummary {
+template <typename T, class P> struct PixelSummary {
+  static constexpr int S = P::kSamples;
   T transmittance[S];
+  SampleState<T, P::kMoves> states[S];
   T largest = T(0);
   int32_t dominant = -1;  ///< the splat of the largest weight, of equal ones the nearest
   int32_t median = -1;    ///< the first behind which less than half of the light is left
@@ -26,11 +28,11 @@ template <typename T, int S> struct PixelSummary {
   }
 
   /// The weight of splat `id` in the pixel: the mean over the samples of transmittance times alpha.
-  template <class F> AR_HD T add(const typename F::template Terms<T>& terms, Vec2<T> p, int32_t id) {
+  AR_HD T add(const typename P::template Terms<T>& terms, Vec2<T> p, int32_t id) {
     T weight = T(0), through = T(0);
     AR_UNROLL
     for (int s = 0; s < S; ++s) {
-      weight += blend_sample(F::alpha(terms, p, s), transmittance[s]).contribution;
+      weight += blend_sample<P>(terms, p, s, transmittance[s], states[s]).contribution;
       through += abs(transmittance[s]);
     }
     weight *= T(1.0 / S);

@@ -5,6 +5,7 @@
 
 #include "core/blend.h"
 #include "cpu/parallel.h"
+#include "cpu/replay.h"
 #include "cpu/tile.h"
 
 namespace ar::AR_ISA {
@@ -38,6 +39,7 @@ AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* color
   const bool three = channels == 3, keeps = p.last != nullptr;
   alignas(64) T transmittance[kSamples][kTilePixels];
   alignas(64) int32_t last[kSamples][kTilePixels] = {};
+  TileStates<P, T> states;
   std::fill_n(colors, channels * kTilePixels, T(0));
   for (int s = 0; s < kSamples; ++s) {
     for (int i = 0; i < kTilePixels; ++i) transmittance[s][i] = i % kTile < view.columns ? T(1) : T(-1);
@@ -68,8 +70,10 @@ AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* color
         AR_UNROLL
         for (int s = 0; s < kSamples; ++s) {
           V t = load(transmittance[s] + pixel, V());
-          const Blended<V> blended = blend_sample(P::alpha(terms, at, s), t);
+          auto state = states.at(s, pixel);
+          const Blended<V> blended = blend_sample<P>(terms, at, s, t, state);
           store(transmittance[s] + pixel, t);
+          states.set(s, pixel, state);
           contribution = contribution + blended.contribution;
           if (keeps) {
             store_index(last[s] + pixel, select(blended.mask, index, load_index(last[s] + pixel, V())));

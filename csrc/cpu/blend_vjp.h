@@ -3,6 +3,7 @@
 
 #include "core/blend.h"
 #include "cpu/parallel.h"
+#include "cpu/replay.h"
 #include "cpu/tile.h"
 
 namespace ar::AR_ISA {
@@ -40,9 +41,10 @@ template <class V, typename T> AR_HD V dot_channels(const T* gradient, const T* 
   return colors + ((sums[0] + sums[1]) + (sums[2] + sums[3]));
 }
 
-/// `gradient`: room for the channels of a tile. `adapter`: null where rows hold P's shape.
+/// `gradient`: room for the channels of a tile. `replay_memory`: null unless samples move. `adapter`: null where rows
+/// hold P's shape.
 template <class P, typename T>
-AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T* gradient,
+AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T* gradient, T* replay_memory,
                                 const RowAdapter<P, T>* adapter) {
   using V = typename LanesOf<T>::Type;
   constexpr int kCount = LanesOf<T>::kCount, kSamples = P::kSamples;
@@ -92,7 +94,10 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
     if (with_means) p.pair_means[k] = {T(0), T(0)};
     std::fill_n(p.channel_sums + k * p.channel_stride, p.count, T(0));
   }
+  TileStates<P, T> dL_dmoved;
+  Replay<P, T> replay({p, view, last, row_last, begin, tile_last, replay_memory});
   for (int32_t k = tile_last - 1; k >= 0; --k) {
+    replay.enter(k);
     if (k >= 4) __builtin_prefetch(p.splats + int64_t(pairs[begin + k - 4]) * kSplatWidth);
     const int32_t j = pairs[begin + k];
     const Splat<P, T> splat = splat_at(p.splats, j, adapter);
@@ -111,7 +116,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
     Vec2<V> mean_sums = {zero, zero};
     for (int c = 0; c < TileMask<T>::kPacks; ++c) {
       const V x = load(lanes.value + c * kCount, V());
-      for (uint32_t rows = reach.rows[c] & rows_in_image; rows != 0; rows &= rows - 1) {
+      for (uint32_t rows = reach.rows[c] & rows_in_image & replay.rows(c); rows != 0; rows &= rows - 1) {
         const int row = __builtin_ctz(rows), pixel = row * kTile + c * kCount;
         if (k >= row_last[row]) continue;
         const Vec2<V> at = {x, V(lanes.value[row])};
@@ -127,17 +132,31 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
         ShapeGrad<V> of_pixel = {{zero, zero}, {zero, zero, zero}};
         AR_UNROLL
         for (int s = 0; s < kSamples; ++s) {
-          const V alpha = P::alpha(terms, at, s);
-          const MaskOf<V> mask = (alpha >= V(T(kAlphaMin))) & (index < load_index(last[s] + pixel, V()));
-          V t = load(transmittance[s] + pixel, V()), b = load(behind[s] + pixel, V());
-          const BlendGrad<V> grad = blend_sample_vjp(mask, alpha, g_color, t, b);
-          store(transmittance[s] + pixel, t);
-          store(behind[s] + pixel, b);
-          contribution = contribution + grad.contribution;
-          weighted = madd(grad.dL_dalpha, alpha, weighted);
-          P::add_alpha_vjp(terms, at, s, alpha, grad.dL_dalpha, shape);
-          // Again for the pixel alone: to ask for it must not change the other sums by a bit.
-          if (with_means) P::add_alpha_vjp(terms, at, s, alpha, grad.dL_dalpha, of_pixel);
+          if constexpr (P::kMoves) {
+            V b = load(behind[s] + pixel, V());
+            auto state = dL_dmoved.at(s, pixel);
+            const MovingBlendGrad<V> grad =
+                blend_moving_sample_vjp<P>(terms, at, s, index < load_index(last[s] + pixel, V()), g_color,
+                                           replay.transmittance(s, pixel), replay.state(s, pixel), b, state.moved);
+            store(behind[s] + pixel, b);
+            dL_dmoved.set(s, pixel, state);
+            contribution = contribution + grad.contribution;
+            weighted = weighted + grad.of_splat.weighted;
+            shape = shape + grad.of_splat.sums;
+            of_pixel = of_pixel + grad.of_splat.sums;
+          } else {
+            const V alpha = P::alpha(terms, at, s);
+            const MaskOf<V> mask = (alpha >= V(T(kAlphaMin))) & (index < load_index(last[s] + pixel, V()));
+            V t = load(transmittance[s] + pixel, V()), b = load(behind[s] + pixel, V());
+            const BlendGrad<V> grad = blend_sample_vjp(mask, alpha, g_color, t, b);
+            store(transmittance[s] + pixel, t);
+            store(behind[s] + pixel, b);
+            contribution = contribution + grad.contribution;
+            weighted = madd(grad.dL_dalpha, alpha, weighted);
+            P::add_alpha_vjp(terms, at, s, alpha, grad.dL_dalpha, shape);
+            // Again for the pixel alone: to ask for it must not change the other sums by a bit.
+            if (with_means) P::add_alpha_vjp(terms, at, s, alpha, grad.dL_dalpha, of_pixel);
+          }
         }
         g += window * kCount;
         if (three) {
@@ -175,9 +194,11 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
 
 template <class F, typename T> void blend_vjp(const cpu::BlendVjpParams<T>& p) {
   cpu::parallel_for(p.grid.tiles(), p.threads, [&](int64_t tile) {
-    T* gradient = p.scratch + omp_get_thread_num() * int64_t(p.channels.count) * kTilePixels;
+    const int64_t thread = omp_get_thread_num();
+    T* gradient = p.scratch + thread * p.channels.count * kTilePixels;
+    T* replay_memory = p.replay ? p.replay + thread * cpu::kReplayNumbers : nullptr;
     visit_tile<F, AdaptiveBoxesVjp, T>(p.lists.tile_samples, tile, [&](auto pixels, const auto* adapter) {
-      blend_vjp_tile<decltype(pixels), T>(p, tile, gradient, adapter);
+      blend_vjp_tile<decltype(pixels), T>(p, tile, gradient, replay_memory, adapter);
     });
   });
 }

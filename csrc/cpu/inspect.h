@@ -21,7 +21,7 @@ inline void atomic_max(int32_t* bits, float value) {
 template <class P, typename T>
 AR_ONE_COPY void inspect_tile(const cpu::InspectParams<T>& p, int64_t tile, const RowAdapter<P, T>* adapter) {
   const TileView view(p.grid, tile);
-  PixelSummary<T, P::kSamples> pixels[kTilePixels];
+  PixelSummary<T, P> pixels[kTilePixels];
   for (int i = 0; i < kTilePixels; ++i) pixels[i].start(i % kTile < view.columns && i / kTile < view.rows);
   for (int64_t k = p.lists.tile_offsets[tile]; k < p.lists.tile_offsets[tile + 1]; ++k) {
     const int32_t j = p.lists.pairs[k], id = p.ids[j];
@@ -37,7 +37,7 @@ AR_ONE_COPY void inspect_tile(const cpu::InspectParams<T>& p, int64_t tile, cons
         if (!(span.lo <= T(view.x0 + column) && span.hi >= T(view.x0 + column))) continue;
         auto& pixel = pixels[row * kTile + column];
         if (!pixel.open()) continue;
-        const T weight = pixel.template add<P>(terms, {T(column), T(row)}, id);
+        const T weight = pixel.add(terms, {T(column), T(row)}, id);
         touched += weight > T(0);
         units += weight_units(weight);
         largest = max(largest, weight);

@@ -27,6 +27,7 @@ template <typename T> cpu::Stages<T> all_stages(int footprint) {
   visit_footprint(footprint, Footprints{}, [&](auto f) {
     using F = decltype(f);
     stages.samples = F::kSamples;
+    stages.moves = F::kMoves;
     if constexpr (std::is_same_v<F, Adaptive>) stages.choose_samples = choose_samples<T>;
     stages.inspect = inspect<TilesOf<F>, T>;
     stages.weight = weight<F, T>;

@@ -21,6 +21,9 @@ inline constexpr int kPairNumbers = sizeof(PairGrad<float>) / sizeof(float);
 /// Channels that one call of blend_vjp sums at most: what bounds the memory of the sums.
 inline constexpr int kWindow = 32;
 
+/// Numbers of memory that blend_vjp takes per thread for a footprint whose samples move (cpu/replay.h).
+inline constexpr int64_t kReplayNumbers = int64_t(1) << 20;
+
 /// count_candidates marks the Gaussians that may be visible, so that project can write their splats densely and in the
 /// order of the Gaussians.
 template <typename T> struct ProjectParams : ar::ProjectParams<T> {
@@ -97,6 +100,7 @@ template <typename T> struct BlendVjpParams : ar::BlendVjpParams<T> {
   T* channel_sums;      ///< [pairs] `count` numbers at the start of every row
   int64_t channel_stride;
   T* scratch;  ///< [threads, channels.count, kTile * kTile] the gradient of a tile
+  T* replay;   ///< [threads, kReplayNumbers] where Stages::moves, or null
 };
 
 /// Where the pairs of every splat are.
@@ -165,6 +169,7 @@ template <typename T> struct CameraStages {
 /// The stages of a footprint. Only the last five depend on it; choose_samples is null where all tiles have the same.
 template <typename T> struct Stages {
   int samples;
+  bool moves;  ///< samples carry a state besides their transmittance
   CameraStages<T> plain, full;
   void (*shape_rows)(const ShapeRowsParams<T>&);
   void (*row_grads)(const RowGradsParams<T>&);

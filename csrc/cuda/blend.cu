@@ -10,16 +10,25 @@
 namespace ar::cuda {
 
 bool blends_groups(int footprint, int64_t channels) {
-  bool yardstick = false;
-  visit_footprint(footprint, Footprints{}, [&](auto f) { yardstick = decltype(f)::kYardstick; });
-  return yardstick || channels > kFewChannels;
+  bool always = false;
+  visit_footprint(footprint, Footprints{}, [&](auto f) { always = kOnlyGroups<decltype(f)>; });
+  return always || channels > kFewChannels;
+}
+
+int64_t max_state_planes(int footprint, int64_t capacity) {
+  int planes = 0;
+  visit_footprint(footprint, Footprints{}, [&](auto f) {
+    using F = decltype(f);
+    if (F::kMoves) planes = state_planes(F::kSamples);
+  });
+  return capacity / kStateChunk * planes;
 }
 
 int list_segments(int footprint, int64_t channels, TileGrid grid) {
   constexpr int64_t kBlocks = 1056, kMost = 16;  // eight for each SM of a large device
-  bool yardstick = false;
-  visit_footprint(footprint, Footprints{}, [&](auto f) { yardstick = decltype(f)::kYardstick; });
-  if (yardstick || channels <= kFewChannels || 2 * grid.tiles() > kBlocks) return 1;
+  bool only_groups = false;
+  visit_footprint(footprint, Footprints{}, [&](auto f) { only_groups = kOnlyGroups<decltype(f)>; });
+  if (only_groups || channels <= kFewChannels || 2 * grid.tiles() > kBlocks) return 1;
   return int(std::min(kMost, kBlocks / grid.tiles()));
 }
 
@@ -28,7 +37,7 @@ void choose_samples(const ChooseParams& p, cudaStream_t stream) { launch_choose_
 void blend(int footprint, const BlendParams& p, const BlendParams* cut, cudaStream_t stream) {
   visit_tile_footprints<AdaptiveBoxes>(footprint, stream, [&](auto f, cudaStream_t side) {
     using F = decltype(f);
-    if constexpr (!F::kYardstick) {
+    if constexpr (!kOnlyGroups<F>) {
       if (!p.channels.data) return blend_few<F, 3>(p, side);
       if (p.channels.count <= kFewChannels) return blend_few<F, 4>(p, side);
       if (p.segments.count > 1) return blend_segments<F>(p, *cut, side);

@@ -23,7 +23,7 @@ void blend_vjp(int footprint, const BlendVjpParams& p, int group, cudaStream_t s
   clear_splat_sums_kernel<<<kClearBlocks, kBlendThreads, 0, stream>>>(p, group);
   visit_tile_footprints<AdaptiveBoxesVjp>(footprint, stream, [&](auto f, cudaStream_t side) {
     using F = decltype(f);
-    if constexpr (!F::kYardstick) {
+    if constexpr (!kOnlyGroups<F>) {
       if (!p.channels.data) return blend_vjp_few<F, 3>(p, side);
       if (p.channels.count <= kFewChannels) return blend_vjp_few<F, 4>(p, side);
     }

@@ -17,7 +17,7 @@ template <class F> __global__ void __launch_bounds__(kBlendThreads) inspect_kern
   const Vec2<float> p = pixel_of(warp, lane);
   const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
   const bool inside = x < params.grid.width && y < params.grid.height;
-  PixelSummary<float, F::kSamples> pixel;
+  PixelSummary<float, F> pixel;
   pixel.start(inside);
   for (int k = 0; k < list.count && __syncthreads_or(pixel.open()); k += kBlendThreads) {
     const int count = stage.load(splats, {}, list, k, list.count);
@@ -26,7 +26,7 @@ template <class F> __global__ void __launch_bounds__(kBlendThreads) inspect_kern
     for (int first = 0; first < count; first += 32) {
       for (uint32_t mask = stage.reached(first); mask != 0; mask &= mask - 1) {
         const int j = first + __ffs(mask) - 1, id = ids[j];
-        const float weight = pixel.template add<F>(stage.splats[j].terms, p, id);
+        const float weight = pixel.add(stage.splats[j].terms, p, id);
         const int touched = __popc(__ballot_sync(kAllLanes, weight > 0));
         if (touched == 0) continue;
         const int64_t units = warp_sum(weight_units(weight));

@@ -49,7 +49,12 @@ struct alignas(8) SlotPair {
   int32_t splat, slot;
 };
 
-/// 1, 2, 4, 8 or 16 samples.
+/// Pairs between the checkpoints of a footprint whose samples move, and the planes of one of them: transmittance and
+/// displacement of each sample.
+inline constexpr int kStateChunk = 128;
+AR_HD constexpr int state_planes(int samples) { return 3 * samples; }
+
+/// 1, 2 and 3, 4 to 7, 8 to 15, or 16 samples.
 inline constexpr int kSampleClasses = 5;
 AR_HD constexpr int sample_class(int samples) {
   int c = 0;
@@ -292,8 +297,11 @@ void sum_channels(const SumChannelsParams& p, cudaStream_t stream);
 // Blending. `footprint` is a place in the registry (blend.cu, blend_vjp.cu).
 
 /// Whether so many channels are blended in groups of kChannelGroup, by kernels that walk the whole list of a tile and
-/// need no checkpoints. The yardsticks have no other.
+/// need no checkpoints of channels. The yardsticks, and footprints whose samples move, have no other.
 bool blends_groups(int footprint, int64_t channels);
+/// Planes of kTile^2 floats in BlendParams::checkpoints of a footprint whose samples move, for a backward pass. None
+/// for the others.
+int64_t max_state_planes(int footprint, int64_t capacity);
 /// Channels that a group-less blending is compiled for: 3 in the splats themselves, or 4 in rows.
 /// Segments of each tile's list that they are blended in.
 int list_segments(int footprint, int64_t channels, TileGrid grid);

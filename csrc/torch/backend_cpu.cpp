@@ -199,6 +199,8 @@ template <typename T> class CpuBackend final : public Backend {
     p.mean_sums = mean_sums;
     p.pair_means = pointer<Vec2<T>>(out.means);
     const cpu::Stages<T>& stages = stages_of(pass.footprint);
+    const Tensor replay = at::empty({stages.moves ? p.threads : 0, cpu::kReplayNumbers}, floats_);
+    p.replay = pointer<T>(replay);
     if (own) {
       p.count = 3;
       p.channel_sums = pairs ? p.pair_grads + cpu::kPairNumbers : nullptr;

@@ -463,8 +463,9 @@ class CudaBackend final : public Backend {
     const FootprintSpec& footprint = pass.footprint;
     const int64_t tiles = pass.grid.tiles(), capacity = p.lists.capacity;
     const int64_t chunks = whole ? 0 : capacity / cuda::chunk_length(footprint.chosen ? 1 : footprint.samples);
-    const int64_t max_planes =
-        whole ? 0 : p.layout.max_planes(pass.grid, footprint.samples, capacity, footprint.chosen);
+    const int64_t max_planes = !whole ? p.layout.max_planes(pass.grid, footprint.samples, capacity, footprint.chosen)
+                               : pass.keep ? cuda::max_state_planes(footprint.choice.index, capacity)
+                                           : 0;
     state.checkpoints = at::empty({max_planes * kTile * kTile}, floats_);
     state.chunks = at::empty({kPlanRows + chunks + tiles, kChunkWidth}, ints_);
     C10_CUDA_CHECK(cudaMemsetAsync(state.chunks.data_ptr(), 0, sizeof(cuda::PlanState), stream_));

@@ -147,6 +147,90 @@ TEST(BoxNodes, HaveTheMomentsOfThePixel) {
   expect_moments_of_the_pixel<16>();
 }
 
+// What a sample that moves does behind a splat, by the displacement in front of it, the mean, Sigma and the opacity;
+// also where alpha is capped and where a coordinate is held at its bound. The differences are good to 1e-9 of the
+// largest.
+TEST_P(FootprintTest, MovesMatchDifferences) {
+  const Footprint& f = GetParam();
+  if (f.move_reach == 0) return;
+  Random random(31);
+  int held = 0, capped = 0;
+  for (int trial = 0; trial < 2000; ++trial) {
+    const double s2 = random.log_uniform(0.05, 3), s1 = s2 * random.log_uniform(1.05, 10),
+                 angle = random.uniform(0, kPi);
+    const double opacity = trial % 4 ? random.uniform(0.1, 0.98) : random.uniform(1.0, 3.0), h = 1e-4;
+    const int s = trial % f.samples;
+    const Cov2d<double> cov = covariance(s1, s2, angle);
+    const Vec2<double> at =
+        unwhiten(f.in_double.ellipse(f.row(cov)), on_circle(random.uniform(0, 2), random.uniform(0, 7)));
+    const Vec2<double> node = f.node(s), d = {at.x - node.x, at.y - node.y};
+    const double reach = f.move_reach;
+    const Vec2<double> moved = {random.uniform(-reach, reach), random.uniform(-reach, reach)};
+    const double by_alpha = random.normal();
+    const Vec2<double> by_moved = {random.normal(), random.normal()};
+    // Of what is behind the splat: the derivative with respect to alpha as composited, and to where the node is then.
+    const auto loss = [&](Vec2<double> step, Vec2<double> front, Cov2d<double> c, double o) {
+      const SplatRow<double> row = f.row(c, o);
+      const Vec2<double> p = {d.x + step.x + front.x, d.y + step.y + front.y};
+      const double alpha = std::min(f.in_double.alpha(row, p, s), kAlphaMax);
+      const Vec2<double> next = f.in_double.move(row, p, s, alpha, front);
+      return by_alpha * alpha + by_moved.x * next.x + by_moved.y * next.y;
+    };
+    const SplatRow<double> row = f.row(cov, opacity);
+    const Vec2<double> p = d + moved;
+    const double raw = f.in_double.alpha(row, p, s), alpha = std::min(raw, kAlphaMax);
+    const Vec2<double> next = f.in_double.move(row, p, s, alpha, moved);
+    ASSERT_LE(std::max(std::abs(next.x), std::abs(next.y)), reach);
+    const auto is_held = [&](Vec2<double> front, bool y) {
+      const Vec2<double> at_front = d + front;
+      const double a = std::min(f.in_double.alpha(row, at_front, s), kAlphaMax);
+      const Vec2<double> after = f.in_double.move(row, at_front, s, a, front);
+      return std::abs(y ? after.y : after.x) >= reach;
+    };
+    bool kink = std::abs(raw - kAlphaMax) < 0.02;  // within the steps of the differences
+    for (const double t : {-0.02, 0.02}) {
+      for (const bool y : {false, true}) {
+        for (const Vec2<double> front : {Vec2<double>{moved.x + t, moved.y}, Vec2<double>{moved.x, moved.y + t}})
+          kink |= is_held(front, y) != is_held(moved, y);
+      }
+    }
+    if (kink) continue;
+    held += is_held(moved, false) || is_held(moved, true);
+    capped += raw > kAlphaMax;
+    Vec2<double> dL_dmoved = by_moved;
+    const MoveGrad<double> grad =
+        f.in_double.alpha_and_move_vjp(row, p, s, raw, alpha, raw <= kAlphaMax, by_alpha, moved, dL_dmoved);
+    const SplatGrad<double> of_splat = f.in_double.prepare_vjp(cov, row, grad.sums, grad.weighted, f.options);
+    const Sym2<double> by_cov = cov_grad(cov, of_splat);
+    const Vec2<double> still = {0, 0};
+    const auto changed = [&](double xx, double xy, double yy) {
+      Cov2d<double> c = {cov.xx + xx, cov.xy + xy, cov.yy + yy, 0};
+      c.det = c.xx * c.yy - c.xy * c.xy;
+      return loss(still, moved, c, opacity);
+    };
+    const double step = h * s2, area = h * s2 * s2;
+    const double actual[8] = {dL_dmoved.x,   dL_dmoved.y, -of_splat.dL_dmean.x,   -of_splat.dL_dmean.y, by_cov.xx,
+                              2 * by_cov.xy, by_cov.yy,   grad.weighted / opacity};
+    const double expected[8] = {
+        derivative([&](double t) { return loss(still, {moved.x + t, moved.y}, cov, opacity); }, step),
+        derivative([&](double t) { return loss(still, {moved.x, moved.y + t}, cov, opacity); }, step),
+        derivative([&](double t) { return loss({t, 0}, moved, cov, opacity); }, step),
+        derivative([&](double t) { return loss({0, t}, moved, cov, opacity); }, step),
+        derivative([&](double t) { return changed(t, 0, 0); }, area),
+        derivative([&](double t) { return changed(0, t, 0); }, area),
+        derivative([&](double t) { return changed(0, 0, t); }, area),
+        derivative([&](double t) { return loss(still, moved, cov, opacity * (1 + t)) / opacity; }, h)};
+    // Rounding of the loss, of order 1, over the step.
+    for (int k = 0; k < 8; ++k) {
+      const double noise = 1e-14 / (k < 4 ? step : k < 7 ? area : h);
+      ASSERT_NEAR(actual[k], expected[k], 1e-6 * std::abs(expected[k]) + 100 * noise)
+          << k << ": sigma " << s1 << " " << s2 << " alpha " << raw;
+    }
+  }
+  EXPECT_GT(held, 20);
+  EXPECT_GT(capped, 20);
+}
+
 // Random search outside the ellipse.
 TEST_P(FootprintTest, SupportIsConservative) {
   const Footprint& f = GetParam();

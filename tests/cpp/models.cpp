@@ -35,6 +35,24 @@ template <class F, class P, typename T> Model<T> make_model() {
     for (int s = 0; s < P::kSamples; ++s) P::add_alpha_vjp(terms, d, s, P::alpha(terms, d, s), dL_dalphas[s], sums);
     return sums;
   };
+  m.alpha = [](const SplatRow<T>& row, Vec2<T> d, int s) { return P::alpha(terms_of<P>(row), d, s); };
+  m.move = [](const SplatRow<T>& row, Vec2<T> d, int s, T alpha, Vec2<T> moved) {
+    if constexpr (P::kMoves) return P::move(terms_of<P>(row), d, s, alpha, moved);
+    return moved;
+  };
+  m.alpha_and_move_vjp = [](const SplatRow<T>& row, Vec2<T> d, int s, T raw, T alpha, bool free, T dL_dalpha,
+                            Vec2<T> moved, Vec2<T>& dL_dmoved) {
+    const auto terms = terms_of<P>(row);
+    if constexpr (P::kMoves) {
+      return P::alpha_and_move_vjp(terms, d, s, raw, alpha, free, dL_dalpha, moved, dL_dmoved);
+    } else {
+      MoveGrad<T> grad = {};
+      if (!free) return grad;
+      P::add_alpha_vjp(terms, d, s, raw, dL_dalpha, grad.sums);
+      grad.weighted = raw * dL_dalpha;
+      return grad;
+    }
+  };
   m.collect = [](const SplatRow<T>& row, ShapeGrad<T> sums, T weighted) {
     return P::collect(terms_of<P>(row), sums, weighted);
   };
@@ -58,12 +76,19 @@ const std::vector<Footprint>& footprints() {
       one.index = int(list.size());
       one.samples = F::kSamples;
       one.reach = F::kReach;
+      one.move_reach = 0;
+      if constexpr (F::kMoves) one.move_reach = F::kMoveReach;
       one.extra_level = F::kExtraLevel;
       one.options = {std::is_same_v<F, Adaptive> ? 0 : F::kOption.number};
       one.support_variance = [](FootprintOptions options) { return F::support_variance(options); };
       one.node = [](int sample) {
-        if constexpr (F::kSamples > 1) return box_node<F::kSamples>(sample);
-        return Vec2<double>{0, 0};
+        if constexpr (F::kMoves) {
+          return F::node(sample);
+        } else if constexpr (F::kSamples > 1) {
+          return box_node<F::kSamples>(sample);
+        } else {
+          return Vec2<double>{0, 0};
+        }
       };
       one.in_float = make_model<F, P, float>();
       one.in_double = make_model<F, P, double>();

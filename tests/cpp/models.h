@@ -21,6 +21,12 @@ template <typename T> struct Model {
   void (*alphas)(const SplatRow<T>& row, Vec2<T> d, T* alphas);
   /// The sums of one pixel, as add_alpha_vjp leaves them.
   ShapeGrad<T> (*sums)(const SplatRow<T>& row, Vec2<T> d, const T* dL_dalphas);
+  /// Of sample s with the pixel centre at offset d, displacement included; see contract.h. Samples of most footprints
+  /// do not move.
+  T (*alpha)(const SplatRow<T>& row, Vec2<T> d, int s);
+  Vec2<T> (*move)(const SplatRow<T>& row, Vec2<T> d, int s, T alpha, Vec2<T> moved);
+  MoveGrad<T> (*alpha_and_move_vjp)(const SplatRow<T>& row, Vec2<T> d, int s, T raw, T alpha, bool free, T dL_dalpha,
+                                    Vec2<T> moved, Vec2<T>& dL_dmoved);
   ShapeGrad<T> (*collect)(const SplatRow<T>& row, ShapeGrad<T> sums, T weighted);
   SplatGrad<T> (*prepare_vjp)(Cov2d<T> cov, const SplatRow<T>& row, ShapeGrad<T> sums, T weighted,
                               FootprintOptions options);
@@ -29,7 +35,7 @@ template <typename T> struct Model {
 struct Footprint {
   std::string name;  ///< key, with letters and digits only
   int index, samples;
-  double reach, extra_level;
+  double reach, move_reach, extra_level;
   FootprintOptions options;  ///< the public default; of `adaptive` no tolerance: as many samples as there may be
   double (*support_variance)(FootprintOptions options);
   Vec2<double> (*node)(int sample);  ///< of the footprints that take alpha at nodes; else the pixel's centre

@@ -186,6 +186,8 @@ Sums<T> blend_vjp(const cpu::Stages<T>& stages, const Lists<T>& lists, TileGrid 
   p.lists = lists.view();
   p.threads = threads;
   p.scratch = scratch.data();
+  std::vector<T> replay(stages.moves ? threads * cpu::kReplayNumbers : 0);
+  p.replay = replay.empty() ? nullptr : replay.data();
   p.pair_grads = out.pairs.data();
   p.pair_stride = out.stride;
   p.mean_sums = absolute ? MeanSums::kAbsolute : MeanSums::kNone;

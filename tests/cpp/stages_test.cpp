@@ -125,41 +125,53 @@ Rendered<double> render_plainly(const Footprint& f, const Scene<double>& scene) 
     const auto offset_of = [&](int i) {
       return Vec2<double>{pixel % width - splats[i].mean.x, pixel / width - splats[i].mean.y};
     };
-    std::vector<double> alphas(order.size() * samples), dL_dalphas(order.size() * samples, 0.0);
-    for (size_t k = 0; k < order.size(); ++k) model.alphas(splats[order[k]], offset_of(order[k]), &alphas[k * samples]);
+    struct Step {  // in front of a splat
+      double transmittance;
+      Vec2<double> moved;
+      bool composited;
+    };
+    std::vector<PairGrad<double>> of_pixel(order.size(), PairGrad<double>{});
     for (int s = 0; s < samples; ++s) {
-      std::vector<bool> masks;
+      std::vector<Step> steps;
       double transmittance = 1;
-      for (size_t k = 0; k < order.size(); ++k) {
-        const Blended<double> b = blend_sample(alphas[k * samples + s], transmittance);
-        masks.push_back(b.mask);
+      Vec2<double> moved = {0, 0};
+      for (const int i : order) {
+        const Vec2<double> d = offset_of(i) + moved;
+        const double raw = model.alpha(splats[i], d, s), in_front = transmittance;
+        const Blended<double> b = blend_sample(raw, transmittance);
+        steps.push_back({in_front, moved, b.mask});
+        if (b.mask) moved = model.move(splats[i], d, s, std::min(raw, kAlphaMax), moved);
         for (int c = 0; c < count; ++c)
-          out.image[c * width * height + pixel] += share * b.contribution * scene.shown(order[k], c);
+          out.image[c * width * height + pixel] += share * b.contribution * scene.shown(i, c);
       }
       transmittance = std::abs(transmittance);
       for (int c = 0; c < count; ++c)
         out.image[c * width * height + pixel] += share * transmittance * scene.background[c];
       out.alpha[pixel] += share * (1 - transmittance);
       double behind = of_background;
+      Vec2<double> dL_dmoved = {0, 0};
       for (size_t k = order.size(); k-- > 0;) {
+        if (!steps[k].composited) continue;
         const int i = order[k];
-        const double alpha = alphas[k * samples + s];
+        const Vec2<double> d = offset_of(i) + steps[k].moved;
+        const double raw = model.alpha(splats[i], d, s), alpha = std::min(raw, kAlphaMax);
         double g_color = 0;
         for (int c = 0; c < count; ++c) g_color += gradient[c] * scene.shown(i, c);
-        const BlendGrad<double> b = blend_sample_vjp(masks[k], alpha, g_color, transmittance, behind);
-        dL_dalphas[k * samples + s] = b.dL_dalpha;
-        sums[i].weighted += alpha * b.dL_dalpha;
-        for (int c = 0; c < count; ++c) out.dL_dchannels[i * count + c] += b.contribution * gradient[c];
+        const double difference = g_color - behind;
+        const MoveGrad<double> grad =
+            model.alpha_and_move_vjp(splats[i], d, s, raw, alpha, raw <= kAlphaMax, steps[k].transmittance * difference,
+                                     steps[k].moved, dL_dmoved);
+        behind += alpha * difference;
+        add(grad.sums, of_pixel[k].shape);
+        of_pixel[k].weighted += grad.weighted;
+        for (int c = 0; c < count; ++c) out.dL_dchannels[i * count + c] += steps[k].transmittance * alpha * gradient[c];
       }
     }
     for (size_t k = 0; k < order.size(); ++k) {
       const int i = order[k];
-      const double* of_pixel = &dL_dalphas[k * samples];
-      double weighted = 0;
-      for (int s = 0; s < samples; ++s) weighted += of_pixel[s] * alphas[k * samples + s];
-      const ShapeGrad<double> one = model.sums(splats[i], offset_of(i), of_pixel);
-      add(model.collect(splats[i], one, weighted), sums[i].shape);
-      const Vec2<double> by_mean = transform_transposed(model.mean_map(splats[i]), one.offset);
+      sums[i].weighted += of_pixel[k].weighted;
+      add(model.collect(splats[i], of_pixel[k].shape, of_pixel[k].weighted), sums[i].shape);
+      const Vec2<double> by_mean = transform_transposed(model.mean_map(splats[i]), of_pixel[k].shape.offset);
       absolute[i] = absolute[i] + Vec2<double>{std::abs(by_mean.x), std::abs(by_mean.y)};
     }
   }
@@ -240,7 +252,8 @@ TEST_P(StagesTest, ThreadsChangeNoBit) {
 // an alpha across 1/255 or a transmittance across 1e-4, a whole contribution, at most 0.01, comes or
 // goes; a share of 2 delta/255 of the (splat, pixel) pairs is that close, less than a pixel in 100.
 // Typical: a mean off by 2 eps W before a splat of 1 px, so 8e-6 for the RMS of the image and of the
-// gradients; a flip adds 1/255 of one of their thousands of terms.
+// gradients; a flip adds 1/255 of one of their thousands of terms. One of S samples changes the pixel by a share of 1/S
+// of that, which is why the gradients' flips are counted from 1/S of the bound on.
 TEST_P(StagesTest, EveryInstructionSetAgreesWithDouble) {
   const Footprint& f = GetParam();
   const double worst = 2 * 4e-4, typical = 8e-6;
@@ -250,11 +263,12 @@ TEST_P(StagesTest, EveryInstructionSetAgreesWithDouble) {
   for (const InstructionSet& set : instruction_sets()) {
     if (!set.supported) continue;
     const Rendered<float> actual = run_stages(set.stages(f.index), scene.pass(f.choice()));
-    int flips = 0;
+    int flips = 0, sample_flips = 0;
     std::vector<double> small, grads;
     for (size_t i = 0; i < actual.image.size(); ++i) {
       const double error = std::abs(actual.image[i] - expected.image[i]);
       ASSERT_LT(error, 0.01 + worst) << set.name << " " << i;
+      sample_flips += error > worst / f.samples;
       if (error > worst) {
         ++flips;
       } else {
@@ -265,7 +279,8 @@ TEST_P(StagesTest, EveryInstructionSetAgreesWithDouble) {
     EXPECT_LT(std::accumulate(small.begin(), small.end(), 0.0, squares), typical * typical * small.size()) << set.name;
     for (size_t i = 0; i < actual.grads.size(); ++i) grads.push_back(actual.grads[i] - expected.grads[i]);
     const double size = std::accumulate(expected.grads.begin(), expected.grads.end(), 0.0, squares);
-    const double bound = typical + flips * 1e-4;
+    EXPECT_LE(sample_flips, 67 * 45 / 100) << set.name;
+    const double bound = typical + sample_flips * 1e-4;
     EXPECT_LT(std::accumulate(grads.begin(), grads.end(), 0.0, squares), bound * bound * size) << set.name;
   }
 }

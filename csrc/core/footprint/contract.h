@@ -29,6 +29,23 @@
 //   prepare_vjp(Cov2d<T>, Shape<T>, ShapeGrad<T> sums, weighted, FootprintOptions) -> SplatGrad<T>
 //                                        once per splat
 //
+// Samples may carry a state besides their transmittance: with
+//
+//   kMoves                               true; default false
+//
+// a sample has a displacement `moved` from its node [px], zero in front of the first splat, which every splat that is
+// composited changes. Then alpha gets pixel centre - that point + moved for p, and there are
+//
+//   kMoveReach                           largest |coordinate| of a displacement [px], which kReach includes
+//   node(s) -> Vec2<double>              of sample s [px from the pixel's centre]
+//   move(Terms<T>, Vec2<V> p, s, alpha, Vec2<V> moved) -> Vec2<V>
+//                                        the displacement behind a splat; alpha as composited, 0: not at all, and
+//                                        nothing moves
+//   alpha_and_move_vjp(Terms<T>, p, s, raw, alpha, free, dL_dalpha, moved, Vec2<V>& dL_dmoved) -> MoveGrad<V>
+//                                        the adjoint of both: raw = opacity * I; dL_dalpha through what is composited,
+//                                        `free` where alpha depends on raw; `moved` in front of the splat; dL_dmoved on
+//                                        entry behind the splat, on exit in front of it
+//
 // T is float or double, V a scalar or a pack of lanes (lanes.h). The five numbers of ShapeGrad are summed over pixels
 // and samples in whatever coordinates make them cheap; prepare_vjp gives them meaning. `weighted` is the sum of alpha
 // dL_dalpha, which the gradient with respect to the opacity needs anyway.
@@ -93,6 +110,12 @@ template <class V> AR_HD ShapeGrad<V> operator+(ShapeGrad<V> a, ShapeGrad<V> b) 
   return {a.offset + b.offset, a.shape + b.shape};
 }
 
+/// What one splat gets from one sample that moves.
+template <class V> struct MoveGrad {
+  V weighted;         ///< raw dL_draw: of `weighted`
+  ShapeGrad<V> sums;  ///< as add_alpha_vjp adds them up
+};
+
 /// What most footprints have in common.
 struct FootprintDefaults {
   using Pixels = void;                             // the footprint itself
@@ -101,6 +124,7 @@ struct FootprintDefaults {
   static constexpr bool kYardstick = false;
   static constexpr int kSamples = 1;
   static constexpr double kReach = 0, kExtraLevel = 0;
+  static constexpr bool kMoves = false;
 
   template <class Terms, typename T> AR_HD static ShapeGrad<T> collect(const Terms&, const ShapeGrad<T>& sums, T) {
     return sums;

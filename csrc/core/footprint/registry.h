@@ -13,12 +13,14 @@
 #include "core/footprint/erf.h"
 #include "core/footprint/exact.h"
 #include "core/footprint/mip.h"
+#include "core/footprint/moment.h"
 #include "core/footprint/point.h"
 
 namespace ar {
 
-using Footprints = FootprintList<Point, Mip, Analytic<FrameGradient::kFrozen>, Analytic<FrameGradient::kPaper>,
-                                 Cumulant, Box<1>, Box<2>, Box<4>, Box<8>, Box<16>, Adaptive, Erf, Exact>;
+using Footprints =
+    FootprintList<Point, Mip, Analytic<FrameGradient::kFrozen>, Analytic<FrameGradient::kPaper>, Cumulant, Box<1>,
+                  Box<2>, Box<4>, Box<8>, Box<16>, Moment<1>, Moment<4>, Moment<9>, Moment<16>, Adaptive, Erf, Exact>;
 
 /// The key of a footprint: its kKey, or without one its name.
 template <class F> constexpr const char* key_of() {
