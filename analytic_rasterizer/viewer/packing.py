@@ -147,7 +147,7 @@ def pack_scene(
     harmonics[:, :used] = scene.shs.reshape(count, -1)[:, :used].clamp(-LARGEST_HALF, LARGEST_HALF)
 
     center, radius = _extent(scene)
-    views = [_overview(center, radius)] if not views else views
+    views = views or [_overview(center, radius)]
     meta = {
         "name": name,
         "count": count,

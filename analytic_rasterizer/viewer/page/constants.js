@@ -8,7 +8,7 @@ export const CONSTANTS = {
   kPixelVariance: 1 / 12,
   kLevelSlack: 0.01,
   kMaxDet: 1e30,
-  kBase2: 0.849321800288019,
+  kBase2: 0.8493218002880191,
   kLog2e: 1.4426950408889634,
   kPi: 3.141592653589793,
   kLogistic1: 1.6,
