@@ -282,6 +282,7 @@ class Viewer {
       else {
         this.journey = null;
         arrived();
+        this.restLater();
       }
     }
     const flight = this.controls.flight();
