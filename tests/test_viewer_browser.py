@@ -522,9 +522,12 @@ def test_dragging_turns_the_scene_the_way_of_the_mouse(controls):
 
 
 def test_keys_fly_and_reset(controls):
-    controls.keyboard.down("w")
-    ahead = changed_pose(controls, lambda: controls.wait_for_timeout(300))
-    controls.keyboard.up("w")
+    def fly():
+        controls.keyboard.down("w")
+        controls.wait_for_timeout(300)
+        controls.keyboard.up("w")
+
+    ahead = changed_pose(controls, fly)
     assert ahead[2] > 0 and np.abs(ahead[:2]).max() < 1e-6
     controls.keyboard.press("r")
     wait_for(controls, "() => !location.hash.includes('camera=')")

@@ -51,10 +51,10 @@ export const DEFAULT_VARIANCE = { point: 0.3, mip: 0.1 };
 
 // What the page offers, with the name that people read.
 export const FOOTPRINTS = [
-  ['point', 'point: sampled at the centre'],
-  ['mip', 'mip: blurred by a fixed filter'],
-  ['analytic', 'analytic: integrated, turned pixel'],
-  ['cumulant', 'cumulant: integrated, square pixel'],
+  ['point', 'point (sampled)'],
+  ['mip', 'mip (blurred)'],
+  ['analytic', 'analytic'],
+  ['cumulant', 'cumulant'],
   ['box:samples=1', 'box, 1 sample'],
   ['box:samples=2', 'box, 2 samples'],
   ['box:samples=4', 'box, 4 samples'],

@@ -30,6 +30,7 @@ export class Renderer {
     // Every browser has four targets; numbers between four and eight would not divide the samples evenly.
     const targets = Math.min(gl.getParameter(gl.MAX_DRAW_BUFFERS), gl.getParameter(gl.MAX_COLOR_ATTACHMENTS));
     this.samplesPerPass = targets >= 8 ? 8 : 4;
+    this.timing = gl.getExtension('EXT_disjoint_timer_query_webgl2');
     this.programs = new Map();
     this.targets = new Map();
     this.pictures = new Map();
@@ -147,6 +148,28 @@ export class Renderer {
     gl.uniform1f(uniforms.uFull, FULL_DIFFERENCE);
     gl.bindVertexArray(this.fullScreen);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  /// Starts to measure the time on the device; null where it cannot be measured.
+  startTimer() {
+    if (!this.timing) return null;
+    const query = this.gl.createQuery();
+    this.gl.beginQuery(this.timing.TIME_ELAPSED_EXT, query);
+    return query;
+  }
+
+  stopTimer(query) {
+    if (query) this.gl.endQuery(this.timing.TIME_ELAPSED_EXT);
+  }
+
+  /// Milliseconds between start and stop, or null where they are not known.
+  readTimer(query) {
+    const gl = this.gl;
+    if (!query) return null;
+    const known = gl.getQueryParameter(query, gl.QUERY_RESULT_AVAILABLE) && !gl.getParameter(this.timing.GPU_DISJOINT_EXT);
+    const milliseconds = known ? gl.getQueryParameter(query, gl.QUERY_RESULT) / 1e6 : null;
+    gl.deleteQuery(query);
+    return milliseconds;
   }
 
   /// Waits until everything has been drawn.

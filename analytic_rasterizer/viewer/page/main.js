@@ -49,6 +49,8 @@ class Viewer {
     this.sorted = { row: null, exact: false };
     this.atView = true;  // nothing has moved the camera away from the view
     this.frameRequested = false;
+    this.drawing = false;  // the device is at work on a frame
+    this.again = false;    // and then there is another one to draw
     this.movedAt = -Infinity;
     this.rate = null;
     this.lost = false;
@@ -211,7 +213,8 @@ class Viewer {
 
   /// Has a frame drawn soon.
   wake() {
-    if (this.frameRequested || this.lost) return;
+    this.again = this.drawing;
+    if (this.frameRequested || this.drawing || this.lost) return;
     this.frameRequested = true;
     requestAnimationFrame(() => this.frame());
   }
@@ -231,7 +234,7 @@ class Viewer {
       this.rate = null;
       this.writeAddress();
       this.wake();
-    }, REST_AFTER);
+    }, REST_AFTER + 20);  // timers may be early
   }
 
   get moving() {
@@ -262,6 +265,7 @@ class Viewer {
     this.fitCanvas();
     this.order();
     if (this.sorted.row === null) return;  // the first order will wake the loop
+    const timer = this.renderer.startTimer();
     try {
       this.drawFrame(this.moving);
     } catch (error) {
@@ -269,8 +273,9 @@ class Viewer {
       showFailure(error.message);
       return;
     }
+    this.renderer.stopTimer(timer);
     this.lastFrame = now;
-    this.whenDrawn(now);
+    this.whenDrawn(now, timer);
   }
 
   /// Moves along a journey, or with the keys that are held.
@@ -324,27 +329,27 @@ class Viewer {
 
   /// Calls for the next frame, if there is to be one, only when the device has finished this one: otherwise a slow
   /// device would lag behind the mouse.
-  whenDrawn(start) {
+  whenDrawn(start, timer) {
     const { gl } = this.renderer, fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
-    this.frameRequested = true;
+    this.drawing = true;
     const poll = () => {
       if (!gl.isContextLost() && gl.getSyncParameter(fence, gl.SYNC_STATUS) === gl.UNSIGNALED) {
         setTimeout(poll, 1);
         return;
       }
       gl.deleteSync(fence);
-      this.frameRequested = false;
-      const now = performance.now();
-      const seconds = (now - start) / 1000, { width, height } = this.pinhole(this.state.divisor);
+      const again = this.again, { width, height } = this.pinhole(this.state.divisor);
+      this.drawing = this.again = false;
+      const now = performance.now(), milliseconds = this.renderer.readTimer(timer) ?? now - start;
       const active = this.moving || this.journey || this.controls.flight();
       if (this.moving && this.lastDrawn) {
         const rate = 1000 / Math.max(now - this.lastDrawn, 1);
         this.rate = this.rate === null ? rate : 0.8 * this.rate + 0.2 * rate;
       }
       this.lastDrawn = active ? now : null;
-      this.controls.showFigures(width, height, 1000 * seconds, this.rate);
-      if (active || this.wanted()) this.wake();
+      this.controls.showFigures(width, height, milliseconds, this.rate);
+      if (active || again || this.wanted()) this.wake();
     };
     poll();
   }
