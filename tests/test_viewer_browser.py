@@ -312,6 +312,8 @@ def test_an_exported_file_looks_the_same_without_network(browser, tmp_path):
     with open_page(browser, path.as_uri(), offline=True) as page:
         wait_for_frame(page)
         assert page.inner_text("#scene-name") == "scene"
+        page.keyboard.press("1")
+        wait_for(page, "() => location.hash.includes('footprint=point')")
 
 
 # ------------------------------------------------------------------------------- misfortunes
@@ -546,6 +548,41 @@ def test_a_double_click_focuses_what_is_there(controls):
     ray = np.array([(250 - 160) / 300, (60 - 120) / 300, 1])
     np.testing.assert_allclose(looks, ray / np.linalg.norm(ray), atol=1e-4)
     assert 2 < after[7] < 12
+
+
+def test_the_camera_travels_between_views(browser):
+    views = [facing(), turned_view()]
+    with serve(random_scene(100), views) as server, open_page(browser, server.url) as page:
+        wait_for_frame(page)
+        page.keyboard.press(".")
+        # At the end it is at the view exactly: the address needs no pose.
+        wait_for(page, "() => location.hash.includes('view=1') && !location.hash.includes('camera=')")
+
+
+def test_two_fingers_zoom(browser):
+    with (
+        serve(random_scene(100), [facing()]) as server,
+        open_page(browser, server.url, has_touch=True) as page,
+    ):
+        wait_for_frame(page)
+        touch = page.context.new_cdp_session(page)
+
+        def fingers(kind, *places):
+            points = [{"x": x, "y": 40, "id": i} for i, x in enumerate(places)]
+            touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+        def pinch():
+            fingers("touchStart", 140)
+            fingers("touchStart", 140, 180)
+            for spread in (30, 40):
+                fingers("touchMove", 160 - spread, 160 + spread)
+            fingers("touchEnd")
+
+        near = changed_pose(page, pinch)
+        # The fingers end twice as far apart as they began, about the same middle.
+        assert near[2] > 0
+        np.testing.assert_allclose(near[3:7], [1, 0, 0, 0], atol=1e-6)
+        np.testing.assert_allclose(near[7] + near[2], 2 * near[7], rtol=1e-5)
 
 
 def test_the_address_brings_back_pose_and_state(browser):
