@@ -10,6 +10,7 @@ const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], Arrow
 const ARROW_STEP = 0.06;      // radians; with Shift, parts of the distance
 const WHEEL_STEP = 0.0015;    // logarithm of the distance, per px of scrolling
 const RADIANS_PER_PX = 0.006;
+export const READING_TIME = 4;  // seconds that a message stays
 
 /// Shows one sentence in place of the picture.
 export function showFailure(sentence) {
@@ -24,9 +25,13 @@ export function hideFailure() {
   element('message').hidden = true;
 }
 
-/// Shows what is going on, and has it read out.
-export function announce(text) {
+let announcementEnds;
+
+/// Shows what is going on, and has it read out. `seconds` later it is gone.
+export function announce(text, seconds = Infinity) {
+  clearTimeout(announcementEnds);
   if (element('status').textContent !== text) element('status').textContent = text;
+  if (seconds < Infinity) announcementEnds = setTimeout(() => announce(''), 1000 * seconds);
 }
 
 export class Interface {
@@ -199,7 +204,7 @@ export class Interface {
 
   toggleFullScreen() {
     const request = document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen();
-    request.catch(() => announce('This browser allows no full screen here.'));
+    request.catch(() => announce('This browser allows no full screen here.', READING_TIME));
   }
 
   toggleFolded() {

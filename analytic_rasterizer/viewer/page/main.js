@@ -3,7 +3,7 @@
 import { Camera, add, between, depthAt, times } from './camera.js';
 import { CONSTANTS, FOOTPRINTS, parseFootprint } from './constants.js';
 import { Renderer } from './draw.js';
-import { Interface, announce, hideFailure, showFailure } from './interface.js';
+import { Interface, READING_TIME, announce, hideFailure, showFailure } from './interface.js';
 import { loadScene, startSorter } from './load.js';
 
 // Above so many Gaussians the order is rough while the camera moves.
@@ -132,7 +132,7 @@ class Viewer {
     const pinhole = this.pinhole(), ratio = this.canvas.width / this.canvas.clientWidth;
     const depth = depthAt(this.scene.geometry, pinhole, x * ratio, y * ratio);
     if (depth === null) {
-      announce('There is nothing here to focus on.');
+      announce('There is nothing here to focus on.', READING_TIME);
       return;
     }
     const point = add(this.camera.position, times(this.camera.ray(pinhole, x * ratio, y * ratio), depth));
@@ -148,7 +148,7 @@ class Viewer {
     this.camera.view = k;
     this.camera.lens = this.scene.meta.views[k];
     this.controls.update();
-    announce(`View ${this.scene.meta.views[k].name}`);
+    announce(`View ${this.scene.meta.views[k].name}`, READING_TIME);
     this.travel(this.camera.poseOfView(k), () => { this.atView = true; });
   }
 
@@ -168,7 +168,7 @@ class Viewer {
       link.download = name;
       link.click();
       setTimeout(() => URL.revokeObjectURL(link.href), 10000);
-      announce(`Saved ${name}`);
+      announce(`Saved ${name}`, READING_TIME);
     });
   }
 
