@@ -13,8 +13,9 @@ export const FULL_DIFFERENCE = 0.25;
 export class Renderer {
   /// Throws an Error with a sentence where the browser or the device cannot do it. `bits` per channel: 16, or 8.
   constructor(canvas, scene, bits = 16) {
-    const options = { antialias: false, alpha: false, depth: false, stencil: false, powerPreference: 'high-performance' };
-    const gl = canvas.getContext('webgl2', options);
+    const gl = canvas.getContext('webgl2', {
+      antialias: false, alpha: false, depth: false, stencil: false, powerPreference: 'high-performance',
+    });
     if (!gl) throw new Error('This viewer needs WebGL2, which this browser or this machine does not offer.');
     if (gl.getParameter(gl.MAX_TEXTURE_SIZE) < 4096) throw new Error('This viewer needs textures of 4096 pixels.');
     const halves = gl.getExtension('EXT_color_buffer_float') ?? gl.getExtension('EXT_color_buffer_half_float');
@@ -166,7 +167,8 @@ export class Renderer {
   readTimer(query) {
     const gl = this.gl;
     if (!query) return null;
-    const known = gl.getQueryParameter(query, gl.QUERY_RESULT_AVAILABLE) && !gl.getParameter(this.timing.GPU_DISJOINT_EXT);
+    const available = gl.getQueryParameter(query, gl.QUERY_RESULT_AVAILABLE);
+    const known = available && !gl.getParameter(this.timing.GPU_DISJOINT_EXT);
     const milliseconds = known ? gl.getQueryParameter(query, gl.QUERY_RESULT) / 1e6 : null;
     gl.deleteQuery(query);
     return milliseconds;

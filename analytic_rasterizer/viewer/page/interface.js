@@ -203,7 +203,8 @@ export class Interface {
   }
 
   toggleFullScreen() {
-    const request = document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen();
+    const page = document.documentElement;
+    const request = document.fullscreenElement ? document.exitFullscreen() : page.requestFullscreen();
     request.catch(() => announce('This browser allows no full screen here.', READING_TIME));
   }
 

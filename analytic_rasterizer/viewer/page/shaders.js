@@ -300,7 +300,8 @@ vec3 heat(float t) {
   const vec3 k0 = vec3(0.03, 0.03, 0.06), k1 = vec3(0.32, 0.10, 0.45), k2 = vec3(0.80, 0.26, 0.30),
              k3 = vec3(0.98, 0.65, 0.18), k4 = vec3(1.00, 0.98, 0.85);
   t *= 4.0;
-  return t < 1.0 ? mix(k0, k1, t) : t < 2.0 ? mix(k1, k2, t - 1.0) : t < 3.0 ? mix(k2, k3, t - 2.0) : mix(k3, k4, t - 3.0);
+  if (t < 2.0) return t < 1.0 ? mix(k0, k1, t) : mix(k1, k2, t - 1.0);
+  return t < 3.0 ? mix(k2, k3, t - 2.0) : mix(k3, k4, t - 3.0);
 }
 void main() {
   vec2 at = vec2(gl_FragCoord.x, uCanvas.y - gl_FragCoord.y);

@@ -1,5 +1,5 @@
-// A worker that orders Gaussians by depth. First message: {means, count}, with the numbers of one Gaussian `stride` apart.
-// Then {row, near, exact, id}: the row of the world-to-camera matrix that gives the depth. Answer: {order, exact, id},
+// A worker that orders Gaussians by depth. First message: {means, stride, count}, with the numbers of one Gaussian
+// `stride` apart. Then {row, near, exact, id}: the row of the world-to-camera matrix that gives the depth. Answer: {order, exact, id},
 // indices of what lies beyond `near`, the farthest first. Equal depths keep the rasterizer's order, in which the first
 // Gaussian of the input is in front.
 'use strict';
