@@ -23,7 +23,7 @@ CPP_SOURCES := $(shell git ls-files 'csrc/*' 'tests/cpp/*' 'simple_knn/csrc/*' 2
 # The system's cmake, or else one from PyPI.
 CMAKE = $(shell command -v cmake || echo $(BIN)/cmake)
 
-.PHONY: demo test test-cpp test-python test-simple-knn test-sanitized test-python-sanitized fuzz fuzz-core bench wheel format lint clean
+.PHONY: demo test test-cpp test-python test-simple-knn test-browser test-sanitized test-python-sanitized fuzz fuzz-core bench wheel format lint clean
 
 demo: $(VENV)/.installed
 	$(BIN)/python examples/demo.py --out $(OUT)
@@ -49,6 +49,14 @@ test-simple-knn: $(VENV)/.installed
 	$(BIN)/python -m pip install --quiet "setuptools>=77" ninja pybind11
 	cd simple_knn && $(abspath $(BIN))/python setup.py -q build_ext --inplace
 	PYTHONPATH=simple_knn $(BIN)/python -m pytest -q -n 2 simple_knn/tests
+
+# The viewer in chromium, which draws in software. Elsewhere than on Debian as root, CHROMIUM names the browser.
+test-browser: $(VENV)/.installed
+	$(BIN)/python -m pip install --quiet --editable ".[test,test-browser]"
+	@if command -v apt-get > /dev/null && [ "$$(id -u)" = 0 ] && ! command -v chromium > /dev/null; then \
+	  apt-get update -qq && \
+	  apt-get install -y -qq --no-install-recommends chromium libgl1-mesa-dri libegl1 libgl1 > /dev/null; fi
+	$(BIN)/python -m pytest -q -n0 -rs tests/test_viewer.py tests/test_viewer_browser.py
 
 # Random scenes with bad numbers in them, until one breaks a promise of docs/stability.md.
 fuzz: $(VENV)/.installed

@@ -1,0 +1,21 @@
+"""A viewer in the browser that draws scenes with the footprints of the rasterizer.
+
+`pack_scene` brings a scene into the form that the page reads, `start_server` serves page and scene on this machine,
+and `export_page` writes both into one HTML file. The page itself is in the folder `page`: HTML, CSS and JavaScript
+modules that are served as they are. From the command line: `python -m analytic_rasterizer view`.
+"""
+
+from .export import export_page
+from .packing import PAGE_FOOTPRINTS, PackedScene, footprint_of_file, pack_scene, page_footprint
+from .server import ViewerServer, start_server
+
+__all__ = [
+    "PAGE_FOOTPRINTS",
+    "PackedScene",
+    "ViewerServer",
+    "export_page",
+    "footprint_of_file",
+    "pack_scene",
+    "page_footprint",
+    "start_server",
+]

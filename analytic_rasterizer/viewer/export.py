@@ -1,0 +1,88 @@
+"""The page and a scene in one HTML file, which opens without a server and without a network."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+import hashlib
+import re
+from pathlib import Path
+
+from .packing import PackedScene
+from .pages import MODULES, WORKER, content_security_policy, page_file
+
+MAX_EMBEDDED = 500_000_000
+"""Characters of an array in an exported file: browsers hold no longer string."""
+
+
+def export_page(path, scene: PackedScene) -> int:
+    """Writes the page and the scene into one file, and returns its size in bytes.
+
+    The file loads nothing: its Content-Security-Policy allows the hashes of its own script and style and no connection.
+
+    Raises:
+        ValueError: A scene too large for one file.
+        OSError: The file cannot be written.
+    """
+    style, script = page_file("style.css"), bundle(MODULES)
+    policy = content_security_policy(
+        script=_source_hash(script), style=_source_hash(style), connect="'none'", worker="blob:"
+    )
+    data = [
+        _element("scene", "application/json", scene.meta_json().decode().replace("<", "\\u003c")),
+        _element("geometry", "application/octet-stream", _compressed(scene.geometry)),
+        _element("harmonics", "application/octet-stream", _compressed(scene.harmonics)),
+        _element("sorter", "text/plain", page_file(WORKER)),
+    ]
+    html = page_file("index.html")
+    html = _replace_once(
+        html,
+        '<meta charset="utf-8">',
+        f'<meta charset="utf-8">\n<meta http-equiv="Content-Security-Policy" content="{policy}">',
+    )
+    html = _replace_once(html, '<link rel="stylesheet" href="style.css">', f"<style>{style}</style>")
+    html = _replace_once(
+        html,
+        '<script type="module" src="main.js"></script>',
+        "\n".join([*data, f'<script type="module">{script}</script>']),
+    )
+    content = html.encode()
+    Path(path).write_bytes(content)
+    return len(content)
+
+
+def bundle(names) -> str:
+    """The modules as one: their text in this order, without imports and exports.
+
+    They then share one scope, so that no two of them may declare the same name.
+    """
+    parts = []
+    for name in names:
+        text = re.sub(r"^import\s[^;]*;\n", "", page_file(name), flags=re.MULTILINE)
+        parts.append(re.sub(r"^export\s+", "", text, flags=re.MULTILINE))
+    return "\n".join(parts)
+
+
+def _compressed(data: bytes) -> str:
+    text = base64.b64encode(gzip.compress(data, 6, mtime=0)).decode()
+    if len(text) > MAX_EMBEDDED:
+        raise ValueError(
+            f"the scene is too large for one file: an array takes {len(text) / 1e6:.0f} MB, and browsers hold "
+            f"{MAX_EMBEDDED / 1e6:.0f} MB; serve it instead"
+        )
+    return text
+
+
+def _element(name: str, kind: str, text: str) -> str:
+    return f'<script type="{kind}" id="data-{name}">{text}</script>'
+
+
+def _source_hash(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+def _replace_once(text: str, old: str, new: str) -> str:
+    before, found, after = text.partition(old)
+    if not found:
+        raise ValueError(f"index.html of the viewer must contain {old}")
+    return before + new + after

@@ -1,0 +1,205 @@
+"""A scene in the form that the page reads: one JSON object and two arrays of numbers."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import struct
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from .. import io
+from ..footprints import Footprint, get_default_footprint, resolve_footprint
+
+PAGE_FOOTPRINTS = (
+    "point",
+    "mip",
+    "analytic",
+    "cumulant",
+    "box:samples=1",
+    "box:samples=2",
+    "box:samples=4",
+    "box:samples=8",
+    "box:samples=16",
+)
+"""What the page can draw. The options of `point` and `mip` may have any value."""
+
+MAX_SH_DEGREE = 3
+GEOMETRY_WIDTH = 12
+"""Numbers of a Gaussian in `PackedScene.geometry`."""
+LARGEST_HALF = 65504.0
+DEFAULT_SIZE = (1280, 720)
+DEFAULT_FOCAL = 1100.0  # px: a vertical field of view of 36 degrees in a picture of the default size
+
+
+@dataclass(frozen=True)
+class PackedScene:
+    """What the page needs of a scene.
+
+    Attributes:
+        meta: JSON: name, count, sh_degree, footprint, background, views (each with name, width, height, fx, fy, cx,
+            cy in pixels and the 16 numbers of w2c by rows), center and radius (of most of the Gaussians, world units),
+            and up (a unit vector).
+        geometry: float32, little endian, 12 numbers per Gaussian: mean, opacity, scales, 0, unit quaternion (w, x, y,
+            z).
+        harmonics: float16, little endian. Per Gaussian the coefficients of spherical harmonics, each as (r, g, b),
+            filled up with zeros to a multiple of four numbers.
+    """
+
+    meta: dict
+    geometry: bytes
+    harmonics: bytes
+
+    def meta_json(self) -> bytes:
+        """`meta` as UTF-8."""
+        return json.dumps(self.meta, allow_nan=False).encode()
+
+
+def page_footprint(footprint: Footprint) -> str:
+    """The footprint as the page writes it, such as `box:samples=8`.
+
+    Raises ValueError for a footprint that the page cannot draw.
+    """
+    if footprint.name == "analytic":  # its option concerns gradients only
+        return "analytic"
+    name = str(footprint)
+    if footprint.name in ("point", "mip"):
+        default = resolve_footprint(footprint.name)
+        return footprint.name if footprint == default else name
+    if name not in PAGE_FOOTPRINTS:
+        raise ValueError(f"footprint must be one that the viewer can draw ({', '.join(PAGE_FOOTPRINTS)}), got {name}")
+    return name
+
+
+def footprint_of_file(path) -> str | None:
+    """The footprint that a scene file asks for, or None where it says nothing.
+
+    Files of scenes that were trained with an antialiasing filter say so: a .ply in a comment, `SplatRenderMode: mip` or
+    `antialiased 1`, and an .spz in a flag of its header. Such scenes are drawn with `mip`.
+    """
+    path = Path(path)
+    if path.suffix == ".spz":
+        antialiased = _spz_flags(path) & 1
+    else:
+        comments = [line.split()[1:] for line in io._ply_header(path) if line.startswith("comment ")]
+        antialiased = ["SplatRenderMode:", "mip"] in comments or ["antialiased", "1"] in comments
+    return "mip" if antialiased else None
+
+
+def _spz_flags(path: Path) -> int:
+    """The byte of flags in the header of an .spz, which is compressed up to version 3; 0 if there is no header."""
+    with path.open("rb") as file:
+        start = file.read(2)
+    try:
+        with gzip.open(path) if start == b"\x1f\x8b" else path.open("rb") as file:
+            header = file.read(16)
+    except OSError:
+        return 0
+    if len(header) < 16 or header[:4] != b"NGSP":
+        return 0
+    (flags,) = struct.unpack_from("<14xB", header)
+    return flags
+
+
+def pack_scene(
+    scene: io.Scene,
+    views: list[io.View] | None = None,
+    *,
+    name: str = "scene",
+    footprint: str | None = None,
+    background=(0.0, 0.0, 0.0),
+) -> PackedScene:
+    """Brings a scene into the form that the page reads.
+
+    Args:
+        scene: Gaussians, on any device.
+        views: Cameras to jump to. Without any there is one, which sees most of the scene.
+        name: What the page calls the scene.
+        footprint: One of `PAGE_FOOTPRINTS`; None takes the library's default.
+        background: (r, g, b) in [0, 1].
+
+    Raises:
+        ValueError: A scene without Gaussians or with numbers that are not finite, harmonics beyond degree 3, or a
+            footprint that the page cannot draw.
+    """
+    count = len(scene.means)
+    if count == 0:
+        raise ValueError(f"{name}: the scene has no Gaussians")
+    if scene.sh_degree > MAX_SH_DEGREE:
+        raise ValueError(f"{name}: the viewer draws spherical harmonics up to degree 3, got {scene.sh_degree}")
+    chosen = get_default_footprint() if footprint is None else resolve_footprint(footprint)
+    chosen_name = page_footprint(chosen)
+    for field in ("means", "scales", "rotations", "opacities", "shs"):
+        if not bool(getattr(scene, field).isfinite().all()):
+            raise ValueError(f"{name}: {field} must be finite")
+
+    scene = scene.to("cpu")
+    geometry = torch.zeros(count, GEOMETRY_WIDTH)
+    geometry[:, 0:3] = scene.means
+    geometry[:, 3:4] = scene.opacities
+    geometry[:, 4:7] = scene.scales
+    geometry[:, 8:12] = _unit_quaternions(scene.rotations)
+
+    used = 3 * (scene.sh_degree + 1) ** 2
+    harmonics = torch.zeros(count, -(-used // 4) * 4, dtype=torch.float16)
+    harmonics[:, :used] = scene.shs.reshape(count, -1)[:, :used].clamp(-LARGEST_HALF, LARGEST_HALF)
+
+    center, radius = _extent(scene)
+    views = views or [_overview(center, radius)]
+    meta = {
+        "name": name,
+        "count": count,
+        "sh_degree": scene.sh_degree,
+        "footprint": chosen_name,
+        "background": [float(value) for value in background],
+        "views": [_view_entry(view) for view in views],
+        "center": center.tolist(),
+        "radius": radius,
+        "up": _up(views),
+    }
+    return PackedScene(meta, geometry.numpy().astype("<f4").tobytes(), harmonics.numpy().astype("<f2").tobytes())
+
+
+def _unit_quaternions(rotations: torch.Tensor) -> torch.Tensor:
+    """Quaternions of any length, normalised; zero becomes the identity, as in the rasterizer."""
+    wide = rotations.double()
+    length = wide.norm(dim=1, keepdim=True)
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    return torch.where(length > 0, wide / length.clamp_min(torch.finfo(torch.float64).tiny), identity).float()
+
+
+def _extent(scene: io.Scene) -> tuple[torch.Tensor, float]:
+    """Centre and radius of most of the Gaussians that can be seen; far outliers are left out."""
+    visible = scene.means[scene.opacities[:, 0] > 0.05]
+    means = (visible if len(visible) else scene.means).double()
+    means = means[:: max(1, len(means) // 100_000)]
+    center = means.median(dim=0).values
+    distance = (means - center).norm(dim=1)
+    largest = scene.scales.max().item() if len(scene.means) == 1 else 0.0
+    return center, max(distance.quantile(0.8).item(), 2 * largest, 1e-3)
+
+
+def _overview(center: torch.Tensor, radius: float) -> io.View:
+    """A camera that looks along +z at the centre, with most of the scene in the picture."""
+    width, height = DEFAULT_SIZE
+    w2c = torch.eye(4, dtype=torch.float64)
+    w2c[:3, 3] = -center
+    w2c[2, 3] += 2 * radius * DEFAULT_FOCAL / height + 0.2
+    return io.View("overview", width, height, DEFAULT_FOCAL, DEFAULT_FOCAL, w2c)
+
+
+def _view_entry(view: io.View) -> dict:
+    entry = {key: getattr(view, key) for key in ("name", "width", "height", "fx", "fy")}
+    entry["cx"] = view.width / 2 if view.cx is None else view.cx
+    entry["cy"] = view.height / 2 if view.cy is None else view.cy
+    return entry | {"w2c": view.w2c.flatten().tolist()}
+
+
+def _up(views: list[io.View]) -> list[float]:
+    """The mean direction that is up in the pictures; that of the first where they cancel."""
+    ups = torch.stack([-view.w2c[1, :3] for view in views])
+    mean = ups.mean(dim=0)
+    up = mean if mean.norm() > 0.1 else ups[0]
+    return (up / up.norm()).tolist()

@@ -1,0 +1,202 @@
+// The camera: a pose, the point that it turns about, and a lens. Axes are OpenCV's: x right, y down, z forward.
+// Vectors are arrays of three numbers, quaternions are (w, x, y, z).
+
+export const add = (a, b) => a.map((value, i) => value + b[i]);
+export const times = (a, factor) => a.map(value => value * factor);
+export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+export const cross = (a, b) => [
+  a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0],
+];
+export const unit = a => times(a, 1 / Math.hypot(...a));
+const minus = (a, b) => a.map((value, i) => value - b[i]);
+
+// The angle between looking direction and up stays this far from 0 and pi when turning about a point.
+const STEEPEST = 0.05;
+
+/// Turns v about a unit axis by an angle.
+function turned(v, axis, angle) {
+  const c = Math.cos(angle), s = Math.sin(angle);
+  return add(add(times(v, c), times(cross(axis, v), s)), times(axis, dot(axis, v) * (1 - c)));
+}
+
+/// The quaternion of a rotation matrix, given by its rows.
+export function quaternionOf([x, y, z]) {
+  const trace = x[0] + y[1] + z[2];
+  const q = trace > 0
+    ? [1 + trace, z[1] - y[2], x[2] - z[0], y[0] - x[1]]
+    : x[0] >= y[1] && x[0] >= z[2]
+      ? [z[1] - y[2], 1 + x[0] - y[1] - z[2], x[1] + y[0], x[2] + z[0]]
+      : y[1] >= z[2]
+        ? [x[2] - z[0], x[1] + y[0], 1 + y[1] - x[0] - z[2], y[2] + z[1]]
+        : [y[0] - x[1], x[2] + z[0], y[2] + z[1], 1 + z[2] - x[0] - y[1]];
+  return unit(q);
+}
+
+/// Rows of the rotation matrix of a quaternion.
+export function rotationOf(quaternion) {
+  const [w, x, y, z] = unit(quaternion);
+  return [
+    [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+    [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+    [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+  ];
+}
+
+/// The pose a part of the way from one to another.
+export function between(from, to, part) {
+  const a = quaternionOf(from.axes);
+  let b = quaternionOf(to.axes);
+  let cosine = a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3];
+  if (cosine < 0) [b, cosine] = [times(b, -1), -cosine];
+  const angle = Math.acos(Math.min(cosine, 1));
+  const weights = angle < 1e-4 ? [1 - part, part]
+    : [Math.sin((1 - part) * angle) / Math.sin(angle), Math.sin(part * angle) / Math.sin(angle)];
+  const mix = (u, v) => u + (v - u) * part;
+  return {
+    position: from.position.map((value, i) => mix(value, to.position[i])),
+    axes: rotationOf(add(times(a, weights[0]), times(b, weights[1]))),
+    distance: mix(from.distance, to.distance),
+  };
+}
+
+export class Camera {
+  /// `meta` is that of the scene. Starts at its first view.
+  constructor(meta) {
+    this.meta = meta;
+    this.up = meta.up;
+    this.setView(0);
+  }
+
+  /// The pose: position, axes (rows right, down, forward) and distance of the point that the camera turns about.
+  get pose() {
+    return { position: this.position, axes: this.axes, distance: this.distance };
+  }
+
+  set pose({ position, axes, distance }) {
+    this.position = position;
+    this.axes = axes;
+    this.distance = distance;
+  }
+
+  /// Pose of view k. The camera turns about the point in front of it that is nearest to the middle of the scene.
+  poseOfView(k) {
+    const m = this.meta.views[k].w2c;
+    const axes = [0, 1, 2].map(r => unit(m.slice(4 * r, 4 * r + 3)));
+    const position = [0, 1, 2].map(c => -(axes[0][c] * m[3] + axes[1][c] * m[7] + axes[2][c] * m[11]));
+    const ahead = dot(minus(this.meta.center, position), axes[2]);
+    return { position, axes, distance: Math.max(ahead, 0.1 * this.meta.radius) };
+  }
+
+  setView(k) {
+    this.view = k;
+    this.lens = this.meta.views[k];
+    this.pose = this.poseOfView(k);
+  }
+
+  get target() {
+    return add(this.position, times(this.axes[2], this.distance));
+  }
+
+  /// The matrix from world to camera, 16 numbers by rows. `exactly` at view k, it is that of the file.
+  matrix(exactly) {
+    if (exactly) return this.meta.views[this.view].w2c;
+    const rows = this.axes.map(axis => [...axis, -dot(axis, this.position)]);
+    return [...rows.flat(), 0, 0, 0, 1];
+  }
+
+  /// What the renderer needs for a picture of this size. `stretch` fills it with exactly the view, as the rasterizer
+  /// does; otherwise pixels are square and all of the view is in the picture.
+  pinhole(width, height, stretch, exactly = false) {
+    const { lens } = this, x = width / lens.width, y = height / lens.height, least = Math.min(x, y);
+    const [sx, sy] = stretch ? [x, y] : [least, least];
+    return {
+      width, height, w2c: this.matrix(exactly), fx: lens.fx * sx, fy: lens.fy * sy,
+      cx: width / 2 + (lens.cx - lens.width / 2) * sx, cy: height / 2 + (lens.cy - lens.height / 2) * sy,
+    };
+  }
+
+  /// Turns about the target, by angles, so that the scene turns to the right and down.
+  orbit(right, down) {
+    const { target } = this;
+    const angle = Math.acos(Math.min(Math.max(dot(this.axes[2], this.up), -1), 1));
+    // A view of a file may look more steeply than the limit: then turning is free until it is within.
+    const free = angle < STEEPEST || angle > Math.PI - STEEPEST;
+    const wanted = free ? angle + down : Math.min(Math.max(angle + down, STEEPEST), Math.PI - STEEPEST);
+    this.turn(-right, angle - wanted);
+    this.position = add(target, times(this.axes[2], -this.distance));
+  }
+
+  /// Turns on the spot: to the left about up, then upwards about the camera's own x axis.
+  turn(yaw, pitch) {
+    const turnedAxes = this.axes.map(axis => turned(axis, this.up, yaw));
+    const axes = turnedAxes.map(axis => turned(axis, turnedAxes[0], pitch));
+    const right = unit(axes[0]), forward = unit(minus(axes[2], times(right, dot(axes[2], right))));
+    this.axes = [right, cross(forward, right), forward];
+  }
+
+  /// Moves along the axes of the camera, world units.
+  move(right, down, forward) {
+    [right, down, forward].forEach((step, i) => {
+      this.position = add(this.position, times(this.axes[i], step));
+    });
+  }
+
+  /// Moves towards the target so that its distance is multiplied by a factor.
+  dolly(factor) {
+    const { target } = this;
+    this.distance = Math.min(Math.max(this.distance * factor, 1e-4 * this.meta.radius), 1e4 * this.meta.radius);
+    this.position = add(target, times(this.axes[2], -this.distance));
+  }
+
+  /// Direction of a pixel of a picture, of length 1 along the optical axis.
+  ray(pinhole, x, y) {
+    const a = (x - pinhole.cx) / pinhole.fx, b = (y - pinhole.cy) / pinhole.fy;
+    return add(add(times(this.axes[0], a), times(this.axes[1], b)), this.axes[2]);
+  }
+
+  /// The pose that looks at a point from where the camera is.
+  poseTowards(point) {
+    const way = minus(point, this.position), forward = unit(way);
+    const side = cross(forward, this.up);
+    const right = Math.hypot(...side) > 1e-3 ? unit(side) : this.axes[0];
+    return { position: this.position, axes: [right, cross(forward, right), forward], distance: Math.hypot(...way) };
+  }
+
+  /// The pose as text for the address, and back; null where the text is none.
+  poseText() {
+    const numbers = [...this.position, ...quaternionOf(this.axes), this.distance];
+    return numbers.map(value => Number(value.toPrecision(7))).join(',');
+  }
+
+  static poseFromText(text) {
+    const numbers = text.split(',').map(Number);
+    const quaternion = numbers.slice(3, 7);
+    if (numbers.length !== 8 || !numbers.every(Number.isFinite) || Math.hypot(...quaternion) === 0) return null;
+    if (!(numbers[7] > 0)) return null;
+    return { position: numbers.slice(0, 3), axes: rotationOf(quaternion), distance: numbers[7] };
+  }
+}
+
+/// Depth at which half of the light of a pixel is gone, or null where it meets nothing. Splats count as round, which is
+/// enough to choose a point to turn about.
+export function depthAt(geometry, pinhole, x, y) {
+  const m = pinhole.w2c, hits = [];
+  for (let at = 0; at < geometry.length; at += 12) {
+    const [px, py, pz] = [geometry[at], geometry[at + 1], geometry[at + 2]];
+    const z = m[8] * px + m[9] * py + m[10] * pz + m[11];
+    if (!(z > 0.2)) continue;
+    const dx = (pinhole.fx * (m[0] * px + m[1] * py + m[2] * pz + m[3])) / z + pinhole.cx - x;
+    const dy = (pinhole.fy * (m[4] * px + m[5] * py + m[6] * pz + m[7])) / z + pinhole.cy - y;
+    const size = Math.cbrt(geometry[at + 4] * geometry[at + 5] * geometry[at + 6]);
+    const sigma = 1 + (pinhole.fx * size) / z, squared = (dx * dx + dy * dy) / (sigma * sigma);
+    if (squared > 9) continue;
+    hits.push([z, geometry[at + 3] * Math.exp(-0.5 * squared)]);
+  }
+  hits.sort((a, b) => a[0] - b[0]);
+  let transmittance = 1;
+  for (const [z, alpha] of hits) {
+    transmittance *= 1 - alpha;
+    if (transmittance < 0.5) return z;
+  }
+  return hits.length > 0 ? hits[0][0] : null;
+}

@@ -1,0 +1,72 @@
+// What every pass needs of WebGL2: programs, textures and framebuffers.
+
+/// A linked program and the places of its uniforms.
+export function createProgram(gl, vertex, fragment) {
+  const program = gl.createProgram();
+  const shaders = [[gl.VERTEX_SHADER, vertex], [gl.FRAGMENT_SHADER, fragment]].map(([type, source]) => {
+    const shader = gl.createShader(type);
+    gl.shaderSource(shader, source);
+    gl.compileShader(shader);
+    gl.attachShader(program, shader);
+    return shader;
+  });
+  gl.linkProgram(program);
+  if (!gl.getProgramParameter(program, gl.LINK_STATUS) && !gl.isContextLost()) {
+    const reason = shaders.map(shader => gl.getShaderInfoLog(shader)).join(' ') + gl.getProgramInfoLog(program);
+    throw new Error(`This browser's graphics driver rejects a shader: ${reason.trim()}`);
+  }
+  const uniforms = {};
+  const count = gl.getProgramParameter(program, gl.ACTIVE_UNIFORMS) ?? 0;
+  for (let i = 0; i < count; ++i) {
+    const name = gl.getActiveUniform(program, i).name.replace('[0]', '');
+    uniforms[name] = gl.getUniformLocation(program, name);
+  }
+  return { program, uniforms };
+}
+
+/// A texture without filtering. `format` is [internal format, format, type].
+export function createTexture(gl, width, height, format) {
+  const texture = gl.createTexture();
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  gl.texStorage2D(gl.TEXTURE_2D, 1, format[0], width, height);
+  for (const key of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, key, gl.NEAREST);
+  for (const key of [gl.TEXTURE_WRAP_S, gl.TEXTURE_WRAP_T]) gl.texParameteri(gl.TEXTURE_2D, key, gl.CLAMP_TO_EDGE);
+  return texture;
+}
+
+/// Fills the texture, `width` texels wide, from a flat array: whole rows at once, then the rest of the last one.
+export function fillTexture(gl, texture, width, format, numbersPerTexel, data) {
+  gl.bindTexture(gl.TEXTURE_2D, texture);
+  gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+  const texels = data.length / numbersPerTexel;
+  const rows = Math.floor(texels / width), rest = texels - rows * width;
+  const [, layout, type] = format;
+  if (rows > 0) gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, rows, layout, type, data, 0);
+  if (rest > 0) {
+    const start = rows * width * numbersPerTexel;
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, rows, rest, 1, layout, type, data.subarray(start));
+  }
+}
+
+/// A framebuffer that draws into these textures, which have one size.
+export function createFramebuffer(gl, textures) {
+  const framebuffer = gl.createFramebuffer();
+  gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+  textures.forEach((texture, i) =>
+    gl.framebufferTexture2D(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + i, gl.TEXTURE_2D, texture, 0));
+  gl.drawBuffers(textures.map((_, i) => gl.COLOR_ATTACHMENT0 + i));
+  const status = gl.checkFramebufferStatus(gl.FRAMEBUFFER);
+  if (status !== gl.FRAMEBUFFER_COMPLETE && !gl.isContextLost()) {
+    throw new Error(`This browser cannot draw into the textures that the viewer needs (status ${status}).`);
+  }
+  return framebuffer;
+}
+
+/// Binds textures to the uniforms of these names, in order.
+export function bindTextures(gl, uniforms, textures) {
+  Object.entries(textures).forEach(([name, texture], unit) => {
+    gl.activeTexture(gl.TEXTURE0 + unit);
+    gl.bindTexture(gl.TEXTURE_2D, texture);
+    gl.uniform1i(uniforms[name], unit);
+  });
+}

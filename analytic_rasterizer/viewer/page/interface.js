@@ -1,0 +1,251 @@
+// The controls: what the user does becomes calls of the viewer, and what the viewer shows becomes text.
+
+import { FOOTPRINTS } from './constants.js';
+
+const element = id => document.getElementById(id);
+const DIVISORS = [1, 2, 4, 8];
+const COMPARISONS = ['off', 'split', 'difference'];
+const FLY_KEYS = { w: [0, 0, 1], s: [0, 0, -1], a: [-1, 0, 0], d: [1, 0, 0], q: [0, 1, 0], e: [0, -1, 0] };
+const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+const ARROW_STEP = 0.06;      // radians; with Shift, parts of the distance
+const WHEEL_STEP = 0.0015;    // logarithm of the distance, per px of scrolling
+const RADIANS_PER_PX = 0.006;
+export const READING_TIME = 4;  // seconds that a message stays
+
+/// Shows one sentence in place of the picture.
+export function showFailure(sentence) {
+  const paragraph = document.createElement('p');
+  paragraph.textContent = sentence;
+  element('message').replaceChildren(paragraph);
+  element('message').hidden = false;
+  announce('');
+}
+
+export function hideFailure() {
+  element('message').hidden = true;
+}
+
+let announcementEnds;
+
+/// Shows what is going on, and has it read out. `seconds` later it is gone.
+export function announce(text, seconds = Infinity) {
+  clearTimeout(announcementEnds);
+  if (element('status').textContent !== text) element('status').textContent = text;
+  if (seconds < Infinity) announcementEnds = setTimeout(() => announce(''), 1000 * seconds);
+}
+
+export class Interface {
+  constructor(viewer) {
+    this.viewer = viewer;
+    this.keys = new Set();
+    this.pointers = new Map();
+    this.canvas = element('canvas');
+    this.fillIn(viewer.scene.meta);
+    this.connectControls();
+    this.connectPointers();
+    this.connectKeys();
+    this.connectDivider();
+    this.update();
+  }
+
+  fillIn(meta) {
+    element('scene-name').textContent = meta.name;
+    document.title = `${meta.name} - Gaussian splats, integrated over the pixel`;
+    const count = meta.count.toLocaleString('en');
+    element('scene-facts').textContent = `${count} Gaussians, spherical harmonics of degree ${meta.sh_degree}`;
+    const known = FOOTPRINTS.map(([name]) => name);
+    const all = known.includes(meta.footprint) ? FOOTPRINTS : [[meta.footprint, meta.footprint], ...FOOTPRINTS];
+    const options = () => all.map(([name, text]) => new Option(text, name));
+    element('footprint').replaceChildren(...options());
+    element('compare').replaceChildren(new Option('nothing', ''), ...options());
+    element('view').replaceChildren(...meta.views.map((view, k) => new Option(view.name, k)));
+    for (const id of ['previous', 'next']) element(id).disabled = meta.views.length < 2;
+  }
+
+  connectControls() {
+    const { viewer } = this;
+    element('controls').addEventListener('submit', event => event.preventDefault());
+    element('footprint').addEventListener('change', event => viewer.change({ footprint: event.target.value }));
+    element('compare').addEventListener('change', event => viewer.change({ compare: event.target.value || null }));
+    for (const input of document.querySelectorAll('input[name="mode"]')) {
+      input.addEventListener('change', () => viewer.change({ mode: input.value }));
+    }
+    element('resolution').addEventListener('input', event => viewer.change({ divisor: DIVISORS[event.target.value] }));
+    element('view').addEventListener('change', event => viewer.goToView(Number(event.target.value)));
+    element('previous').addEventListener('click', () => viewer.stepView(-1));
+    element('next').addEventListener('click', () => viewer.stepView(1));
+    element('reset').addEventListener('click', () => viewer.goToView(viewer.camera.view));
+    element('screenshot').addEventListener('click', () => viewer.saveScreenshot());
+    element('full').addEventListener('click', () => this.toggleFullScreen());
+    element('help-open').addEventListener('click', () => element('help').showModal());
+    element('fold').addEventListener('click', () => this.toggleFolded());
+  }
+
+  connectPointers() {
+    const { canvas, viewer, pointers } = this;
+    const place = event => ({ x: event.clientX, y: event.clientY });
+    canvas.addEventListener('pointerdown', event => {
+      canvas.setPointerCapture(event.pointerId);
+      pointers.set(event.pointerId, place(event));
+      canvas.classList.add('dragged');
+    });
+    const release = event => {
+      pointers.delete(event.pointerId);
+      if (pointers.size === 0) canvas.classList.remove('dragged');
+    };
+    canvas.addEventListener('pointerup', release);
+    canvas.addEventListener('pointercancel', release);
+    canvas.addEventListener('pointermove', event => {
+      const old = pointers.get(event.pointerId);
+      if (!old) return;
+      const now = place(event), others = [...pointers].filter(([id]) => id !== event.pointerId).map(([, at]) => at);
+      pointers.set(event.pointerId, now);
+      const x = now.x - old.x, y = now.y - old.y;
+      if (others.length > 0) {
+        const before = Math.hypot(old.x - others[0].x, old.y - others[0].y);
+        const after = Math.hypot(now.x - others[0].x, now.y - others[0].y);
+        viewer.dolly(Math.max(before, 1) / Math.max(after, 1));
+        viewer.pan(x / 2, y / 2);
+      } else if (event.shiftKey || (event.buttons & 6) !== 0) {
+        viewer.pan(x, y);
+      } else {
+        viewer.orbit(x * RADIANS_PER_PX, y * RADIANS_PER_PX);
+      }
+    });
+    canvas.addEventListener('contextmenu', event => event.preventDefault());
+    canvas.addEventListener('dblclick', event => viewer.focusOn(event.offsetX, event.offsetY));
+    canvas.addEventListener('wheel', event => {
+      event.preventDefault();
+      const pixels = event.deltaY * (event.deltaMode === WheelEvent.DOM_DELTA_LINE ? 18 : 1);
+      viewer.dolly(Math.exp(Math.min(Math.max(pixels * WHEEL_STEP, -1), 1)));
+    }, { passive: false });
+  }
+
+  connectKeys() {
+    window.addEventListener('keydown', event => {
+      // Fields and the dialog keep their keys; so do the browser's shortcuts.
+      const inField = event.target instanceof Element && event.target.closest('select, input, dialog');
+      if (inField || event.ctrlKey || event.metaKey || event.altKey) return;
+      if (this.press(event)) event.preventDefault();
+    });
+    window.addEventListener('keyup', event => this.keys.delete(event.key.toLowerCase()));
+    window.addEventListener('blur', () => this.keys.clear());
+  }
+
+  /// Does what a key stands for. Whether it stands for anything.
+  press(event) {
+    const { viewer } = this, key = event.key.length === 1 ? event.key.toLowerCase() : event.key;
+    this.faster = event.shiftKey;
+    const state = viewer.state;
+    if (key in FLY_KEYS) {
+      this.keys.add(key);
+      viewer.wake();
+      return true;
+    }
+    if (key in ARROWS) {
+      if (event.target === element('divider')) return false;
+      const [x, y] = ARROWS[key].map(value => value * ARROW_STEP);
+      if (event.shiftKey) viewer.panBy(x, y);
+      else viewer.orbit(-x, -y);
+      return true;
+    }
+    if (/^[1-9]$/.test(key) && key <= FOOTPRINTS.length) {
+      viewer.change({ footprint: FOOTPRINTS[key - 1][0] });
+      return true;
+    }
+    const actions = {
+      '+': () => viewer.dolly(0.9),
+      '=': () => viewer.dolly(0.9),
+      '-': () => viewer.dolly(1 / 0.9),
+      ',': () => viewer.stepView(-1),
+      '.': () => viewer.stepView(1),
+      c: () => {
+        const now = state.compare === null ? 'off' : state.mode;
+        const next = COMPARISONS[(COMPARISONS.indexOf(now) + 1) % COMPARISONS.length];
+        const other = state.footprint === 'point' ? 'analytic' : 'point';
+        viewer.change(next === 'off' ? { compare: null } : { compare: state.compare ?? other, mode: next });
+      },
+      z: () => viewer.change({ divisor: DIVISORS[(DIVISORS.indexOf(state.divisor) + 1) % DIVISORS.length] }),
+      r: () => viewer.goToView(viewer.camera.view),
+      p: () => viewer.saveScreenshot(),
+      f: () => this.toggleFullScreen(),
+      h: () => this.toggleFolded(),
+      '?': () => element('help').showModal(),
+    };
+    actions[key]?.();
+    return key in actions;
+  }
+
+  /// Direction of the fly keys that are held, or null.
+  flight() {
+    if (this.keys.size === 0) return null;
+    const sum = [0, 0, 0];
+    for (const key of this.keys) FLY_KEYS[key].forEach((value, i) => { sum[i] += value; });
+    return sum.map(value => value * (this.faster ? 4 : 1));
+  }
+
+  connectDivider() {
+    const divider = element('divider'), { viewer } = this;
+    const moveTo = part => viewer.change({ divider: Math.min(Math.max(part, 0), 1) });
+    divider.addEventListener('pointerdown', event => divider.setPointerCapture(event.pointerId));
+    divider.addEventListener('pointermove', event => {
+      if (divider.hasPointerCapture(event.pointerId)) moveTo(event.clientX / this.canvas.clientWidth);
+    });
+    divider.addEventListener('keydown', event => {
+      const step = event.shiftKey ? 0.1 : 0.02, { divider: now } = viewer.state;
+      const places = { ArrowLeft: now - step, ArrowRight: now + step, ArrowDown: now - step, ArrowUp: now + step,
+        Home: 0, End: 1 };
+      if (!(event.key in places)) return;
+      event.preventDefault();
+      event.stopPropagation();
+      moveTo(places[event.key]);
+    });
+  }
+
+  toggleFullScreen() {
+    const page = document.documentElement;
+    const request = document.fullscreenElement ? document.exitFullscreen() : page.requestFullscreen();
+    request.catch(() => announce('This browser allows no full screen here.', READING_TIME));
+  }
+
+  toggleFolded() {
+    const folded = document.body.classList.toggle('folded');
+    element('fold').setAttribute('aria-expanded', String(!folded));
+    element('fold').textContent = folded ? 'Show' : 'Hide';
+  }
+
+  /// Brings all controls in line with the state of the viewer.
+  update() {
+    const { footprint, compare, mode, divisor, divider } = this.viewer.state;
+    const comparing = compare !== null, split = comparing && mode === 'split';
+    element('footprint').value = footprint;
+    element('compare').value = compare ?? '';
+    element('compare-options').hidden = !comparing;
+    element('legend').hidden = !(comparing && mode === 'difference');
+    for (const input of document.querySelectorAll('input[name="mode"]')) input.checked = input.value === mode;
+    element('resolution').value = DIVISORS.indexOf(divisor);
+    const resolution = divisor === 1 ? '1' : `1/${divisor}`;
+    element('resolution-text').textContent = resolution;
+    element('resolution').setAttribute('aria-valuetext', resolution);
+    element('view').value = this.viewer.camera.view;
+    const place = `${100 * divider}%`;
+    for (const id of ['divider', 'label-left', 'label-right']) {
+      element(id).hidden = !split;
+      element(id).style.left = place;
+    }
+    element('divider').setAttribute('aria-valuenow', String(Math.round(100 * divider)));
+    element('label-left').textContent = footprint;
+    element('label-right').textContent = compare ?? '';
+  }
+
+  /// Shows how fast frames are, and how large. `rate` is null where the camera rests.
+  showFigures(width, height, milliseconds, rate) {
+    const speed = rate === null ? '' : `${rate.toFixed(rate < 10 ? 1 : 0)} FPS, `;
+    element('figures').textContent = `${width} x ${height}, ${speed}${milliseconds.toFixed(1)} ms per frame`;
+  }
+
+  showNote(text) {
+    element('note').textContent = text;
+    element('note').hidden = text === '';
+  }
+}

@@ -1,0 +1,318 @@
+// GLSL of the passes: project, draw, add, present. The formulas are those of csrc/core, in the same form.
+//
+// Everything is highp: with 16 bits the offset of a pixel from a mean, the exponents and the cubes of 1/sigma are all
+// wrong. Offsets are floor(gl_FragCoord) - mean, not interpolated, which is exact. There are no `precise` qualifiers in
+// GLSL ES 3.00; the forms stay positive however a compiler rounds them. docs/viewer.md says how close the result is.
+
+import { CONSTANTS, MINIMAX, boxNodes } from './constants.js';
+
+// Splats of one instance of the draw call. One instance per splat is eight times slower without a GPU.
+export const SPLATS_PER_INSTANCE = 4096;
+// Splats in a row of the textures that have one texel, or three, per splat.
+export const SPLATS_PER_ROW = 1024;
+// Quads are this much larger on all sides [px], because vertices may snap to 1/16 px.
+const QUAD_MARGIN = 0.25;
+
+const glslNumber = value => (Number.isInteger(value) ? value.toFixed(1) : value.toPrecision(17));
+
+const HEAD = `#version 300 es
+precision highp float;
+precision highp int;
+precision highp sampler2D;
+precision highp usampler2D;
+${Object.entries(CONSTANTS).map(([name, value]) => `const float ${name} = ${glslNumber(value)};`).join('\n')}
+`;
+
+const LOGISTIC = `
+float oneMinusExp(float x, float e) {  // 1 - exp(-x), of which e = exp(-x)
+  float series = ${MINIMAX.map(glslNumber).reduceRight((sum, c) => `${c} + x * (${sum})`)};
+  return x < 0.5 ? x * series : 1.0 - e;
+}
+float logistic(float z) { return z * (kLogistic3 * kLog2e * z * z + kLogistic1 * kLog2e); }  // f(z) log2(e)
+// Of one axis: half a pixel in standard deviations, and f(b) - f(a) = y + z t^2.
+vec3 axisOf(float r) { return vec3(0.5 * r, r * (kLogistic1 + 0.25 * kLogistic3 * r * r), 3.0 * kLogistic3 * r); }
+// Numerator and denominator of S(t + half) - S(t - half).
+vec2 window(float t, vec3 axis) {
+  float away = abs(t);
+  float lower = exp2(min(logistic(away - axis.x), 40.0 * kLog2e));
+  float upper = exp2(-logistic(away + axis.x));
+  return vec2(oneMinusExp(axis.y + axis.z * t * t, lower * upper), (1.0 + lower) * (1.0 + upper));
+}
+`;
+
+/// GLSL of the colour from spherical harmonics. Coefficients are packed four numbers to a texel.
+function harmonics(degree) {
+  const basis = [
+    '0.28209479177387814',
+    '-0.4886025119029199 * y', '0.4886025119029199 * z', '-0.4886025119029199 * x',
+    '1.0925484305920792 * x * y', '-1.0925484305920792 * y * z', '0.31539156525252005 * (2.0 * zz - xx - yy)',
+    '-1.0925484305920792 * x * z', '0.5462742152960396 * (xx - yy)',
+    '-0.5900435899266435 * y * (3.0 * xx - yy)', '2.890611442640554 * x * y * z',
+    '-0.4570457994644658 * y * (4.0 * zz - xx - yy)', '0.3731763325901154 * z * (2.0 * zz - 3.0 * xx - 3.0 * yy)',
+    '-0.4570457994644658 * x * (4.0 * zz - xx - yy)', '1.445305721320277 * z * (xx - yy)',
+    '-0.5900435899266435 * x * (xx - 3.0 * yy)',
+  ].slice(0, (degree + 1) ** 2);
+  const texels = texelsOfHarmonics(degree);
+  const number = k => `t${k >> 2}.${'xyzw'[k & 3]}`;
+  const lines = [
+    ...Array.from({ length: texels }, (_, k) => `vec4 t${k} = texelFetch(uHarmonics, at + ivec2(${k}, 0), 0);`),
+    'float x = direction.x, y = direction.y, z = direction.z, xx = x * x, yy = y * y, zz = z * z;',
+    ...basis.map((b, k) => `color += (${b}) * vec3(${number(3 * k)}, ${number(3 * k + 1)}, ${number(3 * k + 2)});`),
+  ];
+  return `
+vec3 colorSeenFrom(vec3 direction, ivec2 at) {
+  vec3 color = vec3(0.5);
+  ${lines.join('\n  ')}
+  return max(color, 0.0);
+}
+`;
+}
+
+/// Texels that the harmonics of a splat take.
+export function texelsOfHarmonics(degree) {
+  return Math.ceil((3 * (degree + 1) ** 2) / 4);
+}
+
+export const FULL_SCREEN = `${HEAD}
+void main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0); }
+`;
+
+/// Projects one Gaussian per fragment. Written for each: mean, root of the level and peak; whitening matrix; colour.
+/// A root of zero marks what is not drawn.
+export function projectShader(kind, degree) {
+  const gaussian = `
+  float wideX = xx + uVariance, wideY = yy + uVariance;
+  float wideDet = det + uVariance * (xx + yy) + uVariance * uVariance;
+  bool alongX = xx >= yy;
+  float wide = alongX ? wideX : wideY;
+  float along = inversesqrt(wide), across = sqrt(wide / wideDet), slope = -across * (xy / wide);
+  whitening = alongX ? vec4(along, 0.0, slope, across) : vec4(0.0, along, across, slope);
+  float amplitude = ${kind === 'point' ? '1.0' : 'sqrt(det / wideDet)'};
+  peak = log2(opacity * amplitude);
+  level = 2.0 * log(opacity * amplitude / kAlphaMin);`;
+  const cumulant = `${gaussian}
+  vec2 conic = vec2(dot(whitening.xz, whitening.xz), dot(whitening.yw, whitening.yw));
+  level += dot(conic, conic) / 124.0;`;
+  const analytic = `
+  float dx = xx - yy, dy = 2.0 * xy, gap = length(vec2(dx, dy)), major = 0.5 * (xx + yy + gap);
+  float s1 = max(sqrt(major), kMinSigma), s2 = max(sqrt(det / max(major, 1e-30)), kMinSigma);
+  vec2 axis = vec2(1.0, 0.0);
+  if (dx > 0.0) {
+    axis.x = sqrt(0.5 * (1.0 + dx / gap));
+    axis.y = dy / (2.0 * gap * axis.x);
+  } else if (gap > 0.0) {
+    float sine = sqrt(0.5 * (1.0 - dx / gap));
+    axis = vec2(abs(dy) / (2.0 * gap * sine), dy < 0.0 ? -sine : sine);
+  }
+  vec2 inverse = 1.0 / vec2(s1, s2);
+  whitening = vec4(axis * inverse.x, vec2(-axis.y, axis.x) * inverse.y);
+  peak = 2.0 * kPi * s1 * s2 * opacity;
+  vec2 f = window(0.0, axisOf(inverse.x)), g = window(0.0, axisOf(inverse.y));
+  vec2 widened = inverse * inverse / (1.0 + kPixelVariance * inverse * inverse);
+  level = 2.0 * log(peak * (f.x * g.x) / (f.y * g.y) / kAlphaMin) + dot(widened, widened) / 48.0 + 0.1;`;
+  return `${HEAD}
+uniform sampler2D uGeometry, uHarmonics;
+uniform int uCount, uHarmonicsPerRow;
+uniform vec4 uView[3];  // rows of world to camera
+uniform vec3 uEye;
+uniform vec4 uPinhole;  // focal lengths and principal point [px]
+uniform vec2 uLimit;    // of |x/z| and |y/z| in the Jacobian
+uniform float uVariance;
+layout(location = 0) out uvec4 outMean;
+layout(location = 1) out uvec4 outWhitening;
+layout(location = 2) out uvec4 outColor;
+${kind === 'analytic' ? LOGISTIC : ''}${harmonics(degree)}
+void main() {
+  ivec2 pixel = ivec2(gl_FragCoord.xy);
+  int i = pixel.x + pixel.y * ${SPLATS_PER_ROW};
+  outMean = outWhitening = outColor = uvec4(0);
+  if (i >= uCount) return;
+  ivec2 texel = ivec2(3 * pixel.x, pixel.y);
+  vec4 g0 = texelFetch(uGeometry, texel, 0), g1 = texelFetch(uGeometry, texel + ivec2(1, 0), 0);
+  vec4 q = texelFetch(uGeometry, texel + ivec2(2, 0), 0);
+  vec3 position = g0.xyz, scale = g1.xyz;
+  float opacity = g0.w;
+
+  vec3 v = vec3(dot(uView[0].xyz, position) + uView[0].w, dot(uView[1].xyz, position) + uView[1].w,
+                dot(uView[2].xyz, position) + uView[2].w);
+  if (!(v.z > kNear)) return;
+  float inverseZ = 1.0 / v.z;
+  vec2 mean = uPinhole.xy * v.xy * inverseZ + uPinhole.zw - 0.5;
+  if (!(abs(mean.x) < 1e9 && abs(mean.y) < 1e9)) return;
+  vec2 ratio = clamp(v.xy * inverseZ, -uLimit, uLimit);
+  vec3 ax = uPinhole.x * inverseZ * (uView[0].xyz - ratio.x * uView[2].xyz);
+  vec3 ay = uPinhole.y * inverseZ * (uView[1].xyz - ratio.y * uView[2].xyz);
+  float w = q.x, a = q.y, b = q.z, c = q.w;
+  mat3 turn = mat3(1.0 - 2.0 * (b * b + c * c), 2.0 * (a * b - w * c), 2.0 * (a * c + w * b),
+                   2.0 * (a * b + w * c), 1.0 - 2.0 * (a * a + c * c), 2.0 * (b * c - w * a),
+                   2.0 * (a * c - w * b), 2.0 * (b * c + w * a), 1.0 - 2.0 * (a * a + b * b));
+  vec3 rowX = (turn * ax) * scale, rowY = (turn * ay) * scale, normal = cross(rowX, rowY);
+  // The determinant is never xx yy - xy xy, which is negative for half of all long needles.
+  float xx = dot(rowX, rowX), xy = dot(rowX, rowY), yy = dot(rowY, rowY), det = dot(normal, normal);
+  if (!(det < kMaxDet && xx < 1e18 && yy < 1e18)) return;
+  vec4 whitening;
+  float peak, level;
+${{ analytic, cumulant }[kind] ?? gaussian}
+  if (!(level > 0.0 && level < 1e6)) return;
+
+  ivec2 at = ivec2((i % uHarmonicsPerRow) * ${texelsOfHarmonics(degree)}, i / uHarmonicsPerRow);
+  outMean = floatBitsToUint(vec4(mean, sqrt(level + kLevelSlack), peak));
+  outWhitening = floatBitsToUint(whitening);
+  outColor = floatBitsToUint(vec4(colorSeenFrom(normalize(position - uEye), at), 0.0));
+}
+`;
+}
+
+// What differs between kinds of footprints: `varyings` go from vertex to fragment shader, `set` computes them from
+// whitening matrix W and peak, `alpha` is the body of a function of d = pixel - mean [px].
+const GAUSSIAN = {
+  varyings: ['vec4 fW', 'float fPeak'],
+  set: 'fW = kBase2 * W; fPeak = peak;',
+  alpha: 'vec2 z = vec2(dot(fW.xy, d), dot(fW.zw, d)); return exp2(fPeak - dot(z, z));',
+};
+const KINDS = {
+  point: GAUSSIAN,
+  mip: GAUSSIAN,
+  box: GAUSSIAN,
+  cumulant: {
+    varyings: ['vec4 fW', 'vec4 fX', 'vec4 fY', 'float fPeak'],  // fX, fY: c4, c6, linear, cap
+    functions: {
+      vertex: `
+vec4 cumulantAxis(float t, float unit, float scale) {
+  float x = t * scale * kPixelVariance;
+  float u2 = unit * scale * scale, u3 = u2 * scale, u4 = u3 * scale, u6 = u4 * scale * scale;
+  float c4 = u4 * (1.0 + x * (20.0 / 7.0 + x * 0.4366)), c6 = u6 * max(1.0 - x, 1e-6) / 63.0;
+  float linear = u3 * 6.0 * t * (1.0 + x * (10.0 / 7.0 + x * 0.6240));
+  return vec4(c4, c6, linear, (c4 + sqrt(c4 * c4 - 3.0 * c6 * linear)) / (3.0 * c6));
+}
+float cumulantConstant(float t, float unit, float scale) {
+  float x = t * scale * kPixelVariance;
+  return unit * scale * scale * 3.0 * t * t * (1.0 + x * (20.0 / 21.0 + x * 0.6975));
+}`,
+    },
+    set: `fW = kBase2 * W;
+  float unit = kOrder4 * kLog2e, scale = 1.0 / (kBase2 * kBase2);
+  float a = dot(fW.xz, fW.xz), c = dot(fW.yw, fW.yw);
+  fX = cumulantAxis(a, unit, scale);
+  fY = cumulantAxis(c, unit, scale);
+  fPeak = peak - cumulantConstant(a, unit, scale) - cumulantConstant(c, unit, scale);`,
+    alpha: `vec2 z = vec2(dot(fW.xy, d), dot(fW.zw, d)), p = vec2(dot(fW.xz, z), dot(fW.yw, z));
+  vec2 P = min(p * p, vec2(fX.w, fY.w));
+  vec2 h = vec2(P.x * (P.x * (fX.x - fX.y * P.x) - fX.z), P.y * (P.y * (fY.x - fY.y * P.y) - fY.z));
+  return exp2(fPeak - dot(z, z) - h.y - h.x);`,
+  },
+  analytic: {
+    varyings: ['vec4 fW', 'vec3 fU', 'vec3 fV', 'float fPeak'],
+    functions: { vertex: LOGISTIC, fragment: LOGISTIC },
+    set: 'fW = W; fPeak = peak; fU = axisOf(length(W.xy)); fV = axisOf(length(W.zw));',
+    alpha: `vec2 e = vec2(dot(fW.xy, d), dot(fW.zw, d)), f = window(e.x, fU), g = window(e.y, fV);
+  return fPeak * (f.x * g.x) / (f.y * g.y);`,
+  },
+};
+
+const declare = (kind, direction) =>
+  KINDS[kind].varyings.map(varying => `flat ${direction} highp ${varying};`).join('\n');
+
+/// Draws splats as the parallelograms W^-1 [-s, s]^2 around their ellipses.
+export function drawVertexShader(kind, samples) {
+  const reach = Math.max(...boxNodes(samples).flat().map(Math.abs));
+  const ellipse = kind === 'analytic'
+    ? 'vec2 r = vec2(length(W.xy), length(W.zw)), shrink = inversesqrt(1.0 + kPixelVariance * r * r);\n' +
+      '  vec4 E = vec4(W.xy * shrink.x, W.zw * shrink.y);'
+    : 'vec4 E = W;';
+  return `${HEAD}
+uniform usampler2D uMean, uWhitening, uColor, uOrder;
+uniform int uVisible;
+uniform vec2 uSize;
+flat out highp vec2 fMean;
+flat out highp vec3 fColor;
+${declare(kind, 'out')}
+${KINDS[kind].functions?.vertex ?? ''}
+ivec2 texelOf(int k) { return ivec2(k % ${SPLATS_PER_ROW}, k / ${SPLATS_PER_ROW}); }
+void main() {
+  gl_Position = vec4(0.0, 0.0, 2.0, 1.0);  // outside: not drawn
+  int k = gl_InstanceID * ${SPLATS_PER_INSTANCE} + gl_VertexID / 4;
+  if (k >= uVisible) return;
+  ivec2 texel = texelOf(int(texelFetch(uOrder, texelOf(k), 0).x));
+  vec4 m = uintBitsToFloat(texelFetch(uMean, texel, 0));
+  if (!(m.z > 0.0)) return;
+  vec4 W = uintBitsToFloat(texelFetch(uWhitening, texel, 0));
+  float peak = m.w;
+  fMean = m.xy;
+  fColor = uintBitsToFloat(texelFetch(uColor, texel, 0)).xyz;
+  ${KINDS[kind].set}
+  ${ellipse}
+  vec2 corner = vec2(gl_VertexID & 1, (gl_VertexID >> 1) & 1) * 2.0 - 1.0;
+  float margin = ${glslNumber(reach + QUAD_MARGIN)};
+  vec2 s = corner * (m.z + margin * vec2(abs(E.x) + abs(E.y), abs(E.z) + abs(E.w)));
+  vec2 offset = vec2(E.w * s.x - E.y * s.y, E.x * s.y - E.z * s.x) / (E.x * E.w - E.y * E.z);
+  gl_Position = vec4((m.xy + offset + 0.5) / uSize * 2.0 - 1.0, 0.0, 1.0);
+}
+`;
+}
+
+/// Writes premultiplied colour and alpha, for every one of `nodes` into a target of its own.
+export function drawFragmentShader(kind, nodes) {
+  const write = nodes.map(([x, y], k) => `o${k} = shade(d + vec2(${glslNumber(x)}, ${glslNumber(y)}));`);
+  return `${HEAD}
+flat in highp vec2 fMean;
+flat in highp vec3 fColor;
+${declare(kind, 'in')}
+${nodes.map((_, k) => `layout(location = ${k}) out vec4 o${k};`).join('\n')}
+${KINDS[kind].functions?.fragment ?? ''}
+float alphaAt(vec2 d) {
+  ${KINDS[kind].alpha}
+}
+vec4 shade(vec2 d) {
+  float raw = alphaAt(d), alpha = raw >= kAlphaMin ? min(raw, kAlphaMax) : 0.0;
+  return vec4(fColor * alpha, alpha);
+}
+void main() {
+  vec2 d = floor(gl_FragCoord.xy) - fMean;
+  ${write.join('\n  ')}
+  ${nodes.length === 1 ? 'if (o0.a == 0.0) discard;' : ''}
+}
+`;
+}
+
+/// Multiplies a picture by a number; blending adds the results up.
+export const ADD = `${HEAD}
+uniform sampler2D uPicture;
+uniform float uFactor;
+out vec4 color;
+void main() { color = uFactor * texelFetch(uPicture, ivec2(gl_FragCoord.xy), 0); }
+`;
+
+/// Shows one picture, two beside each other, or their difference. Row 0 of a picture is its top.
+export const PRESENT = `${HEAD}
+uniform sampler2D uLeft, uRight;
+uniform vec2 uCanvas, uSize;
+uniform vec3 uBackground;
+uniform float uDivider;  // canvas px; right of it is uRight
+uniform bool uDifference;
+uniform float uFull;     // difference of the last colour
+out vec4 color;
+vec3 over(sampler2D picture, ivec2 at) {
+  vec4 c = texelFetch(picture, at, 0);
+  return clamp(c.rgb + (1.0 - c.a) * uBackground, 0.0, 1.0);
+}
+vec3 heat(float t) {
+  const vec3 k0 = vec3(0.03, 0.03, 0.06), k1 = vec3(0.32, 0.10, 0.45), k2 = vec3(0.80, 0.26, 0.30),
+             k3 = vec3(0.98, 0.65, 0.18), k4 = vec3(1.00, 0.98, 0.85);
+  t *= 4.0;
+  if (t < 2.0) return t < 1.0 ? mix(k0, k1, t) : mix(k1, k2, t - 1.0);
+  return t < 3.0 ? mix(k2, k3, t - 2.0) : mix(k3, k4, t - 3.0);
+}
+void main() {
+  vec2 at = vec2(gl_FragCoord.x, uCanvas.y - gl_FragCoord.y);
+  ivec2 texel = min(ivec2(at / uCanvas * uSize), ivec2(uSize) - 1);
+  if (uDifference) {
+    vec3 d = abs(over(uLeft, texel) - over(uRight, texel));
+    color = vec4(heat(min(max(d.r, max(d.g, d.b)) / uFull, 1.0)), 1.0);
+  } else if (at.x < uDivider) {
+    color = vec4(over(uLeft, texel), 1.0);
+  } else {
+    color = vec4(over(uRight, texel), 1.0);
+  }
+}
+`;

@@ -1,0 +1,71 @@
+// A worker that orders Gaussians by depth. First message: {means, stride, count}, with the numbers of one Gaussian
+// `stride` apart. Then {row, near, exact, id}: the row of the world-to-camera matrix that gives the depth. Answer: {order, exact, id},
+// indices of what lies beyond `near`, the farthest first. Equal depths keep the rasterizer's order, in which the first
+// Gaussian of the input is in front.
+'use strict';
+
+let means, stride, count;
+let keys, keysB, indices, indicesB;
+
+onmessage = ({ data }) => {
+  if (data.means) {
+    ({ means, stride, count } = data);
+    keys = new Uint32Array(count);
+    keysB = new Uint32Array(count);
+    indices = new Uint32Array(count);
+    indicesB = new Uint32Array(count);
+    return;
+  }
+  const visible = depths(data.row, data.near);
+  const sorted = data.exact ? sortExactly(visible) : sortRoughly(visible);
+  const order = sorted.slice(0, visible).reverse();
+  postMessage({ order, exact: data.exact, id: data.id }, [order.buffer]);
+};
+
+/// Writes the keys and indices of the Gaussians beyond `near`, and returns how many. Positive floats are ordered as
+/// their bits are. The sum is rounded at every step as the rasterizer rounds it, so that the order is the same.
+function depths(row, near) {
+  const fround = Math.fround, values = new Float32Array(keys.buffer);
+  const [x, y, z, w] = row, limit = fround(near);
+  let visible = 0;
+  for (let i = 0, at = 0; i < count; ++i, at += stride) {
+    const xy = fround(fround(x * means[at]) + fround(y * means[at + 1]));
+    const depth = fround(fround(xy + fround(z * means[at + 2])) + w);
+    if (depth > limit) {
+      values[visible] = depth;
+      indices[visible++] = i;
+    }
+  }
+  return visible;
+}
+
+/// Two stable counting passes over 16 bits each.
+function sortExactly(visible) {
+  let from = keys, to = keysB, a = indices, b = indicesB;
+  for (const shift of [0, 16]) {
+    const starts = new Uint32Array(65537);
+    for (let i = 0; i < visible; ++i) ++starts[((from[i] >>> shift) & 65535) + 1];
+    for (let k = 0; k < 65536; ++k) starts[k + 1] += starts[k];
+    for (let i = 0; i < visible; ++i) {
+      const place = starts[(from[i] >>> shift) & 65535]++;
+      b[place] = a[i];
+      to[place] = from[i];
+    }
+    [from, to, a, b] = [to, from, b, a];
+  }
+  return a;
+}
+
+/// One counting pass over 65536 steps of the bits between the nearest and the farthest.
+function sortRoughly(visible) {
+  let least = 0xffffffff, most = 0;
+  for (let i = 0; i < visible; ++i) {
+    least = Math.min(least, keys[i]);
+    most = Math.max(most, keys[i]);
+  }
+  const factor = 65535 / Math.max(most - least, 1), starts = new Uint32Array(65537);
+  for (let i = 0; i < visible; ++i) ++starts[(((keys[i] - least) * factor) | 0) + 1];
+  for (let k = 0; k < 65536; ++k) starts[k + 1] += starts[k];
+  for (let i = 0; i < visible; ++i) indicesB[starts[((keys[i] - least) * factor) | 0]++] = indices[i];
+  return indicesB;
+}

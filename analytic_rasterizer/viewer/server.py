@@ -1,0 +1,110 @@
+"""Serves the page and one scene to browsers on this machine."""
+
+from __future__ import annotations
+
+import http.server
+import secrets
+
+from .packing import PackedScene
+from .pages import content_security_policy, served_files
+
+ADDRESS = "127.0.0.1"
+CHUNK = 1 << 20
+
+
+class ViewerServer(http.server.ThreadingHTTPServer):
+    """Serves a fixed set of files from memory, under a random path, on 127.0.0.1 only.
+
+    Attributes:
+        url: Where the page is.
+        token: First part of every path that is answered. Who does not know it, such as another user of the machine or a
+            page from elsewhere in the browser, is refused.
+    """
+
+    daemon_threads = True
+
+    def __init__(self, scene: PackedScene, port: int = 0):
+        """Binds to `port`, or to any free one for 0. Raises OSError where the port cannot be had."""
+        super().__init__((ADDRESS, port), _Handler)
+        self.token = secrets.token_urlsafe(24)
+        self.files = served_files() | {
+            "scene.json": (scene.meta_json(), "application/json"),
+            "geometry.bin": (scene.geometry, "application/octet-stream"),
+            "harmonics.bin": (scene.harmonics, "application/octet-stream"),
+        }
+        self.files[""] = self.files["index.html"]
+        self.url = f"http://{ADDRESS}:{self.server_port}/{self.token}/"
+
+
+def start_server(scene: PackedScene, port: int = 0) -> ViewerServer:
+    """A server that is bound, and answers as soon as its `serve_forever` runs.
+
+    Args:
+        scene: What `pack_scene` returned.
+        port: 0 takes any free port.
+
+    Raises:
+        ValueError: The port cannot be used.
+    """
+    try:
+        return ViewerServer(scene, port)
+    except (OSError, OverflowError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise ValueError(f"port {port} cannot be used: {reason}") from None
+
+
+class _Handler(http.server.BaseHTTPRequestHandler):
+    """Answers GET and HEAD for the files of its server."""
+
+    server_version = "analytic_rasterizer"
+    sys_version = ""
+    timeout = 60  # seconds, so that connections that say nothing end
+
+    def do_GET(self):
+        self._answer(with_body=True)
+
+    def do_HEAD(self):
+        self._answer(with_body=False)
+
+    def _answer(self, with_body: bool) -> None:
+        # A page from elsewhere whose name was made to point to this machine still sends its own name.
+        hosts = {f"{name}:{self.server.server_port}" for name in (ADDRESS, "localhost")}
+        if self.headers.get("Host") not in hosts:
+            self._refuse(403, "This viewer answers to 127.0.0.1 only.")
+            return
+        token, slash, name = self.path.partition("?")[0].lstrip("/").partition("/")
+        if not secrets.compare_digest(token.encode(), self.server.token.encode()):
+            self._refuse(403, "Open the address that the command printed: it holds a key.")
+            return
+        # A fixed table of names: no path ever reaches the file system.
+        if not slash or name not in self.server.files:
+            self._refuse(404, "There is no such file.")
+            return
+        content, kind = self.server.files[name]
+        self._send(200, content, kind, with_body)
+
+    def _refuse(self, status: int, reason: str) -> None:
+        self._send(status, f"{reason}\n".encode(), "text/plain; charset=utf-8", self.command != "HEAD")
+
+    def _send(self, status: int, content: bytes, kind: str, with_body: bool) -> None:
+        policy = content_security_policy(script="'self'", style="'self'", connect="'self'", worker="'self'")
+        self.send_response(status)
+        self.send_header("Content-Type", kind)
+        self.send_header("Content-Length", str(len(content)))
+        self.send_header("Content-Security-Policy", f"{policy}; frame-ancestors 'none'")
+        self.send_header("Cross-Origin-Resource-Policy", "same-origin")
+        self.send_header("Referrer-Policy", "no-referrer")
+        self.send_header("X-Content-Type-Options", "nosniff")
+        self.send_header("Cache-Control", "no-store")
+        self.end_headers()
+        if not with_body:
+            return
+        body = memoryview(content)
+        try:
+            for start in range(0, len(body), CHUNK):
+                self.wfile.write(body[start : start + CHUNK])
+        except ConnectionError:
+            pass  # the browser closed the page
+
+    def log_message(self, format, *args):
+        """Says nothing: the terminal is the user's."""

@@ -1,0 +1,481 @@
+"""The viewer without a browser: packing, server, exported file, command, and what the page says of the footprints."""
+
+import base64
+import gzip
+import hashlib
+import http.client
+import json
+import re
+import struct
+import threading
+
+import numpy as np
+import pytest
+import torch
+from conftest import ROOT
+
+import analytic_rasterizer as ar
+from analytic_rasterizer import _C, cli, io, viewer
+from analytic_rasterizer.viewer import pages
+
+CORE = ROOT / "csrc" / "core"
+JAVASCRIPT = (*pages.MODULES, pages.WORKER)
+
+
+def make_scene(count=30, degree=2):
+    g = torch.Generator().manual_seed(0)
+    return io.Scene(
+        2 * torch.rand(count, 3, generator=g) + torch.tensor([-1.0, -1.0, 3.0]),
+        0.3 * torch.rand(count, 3, generator=g) + 0.01,
+        torch.randn(count, 4, generator=g),
+        torch.rand(count, 1, generator=g),
+        0.5 * torch.randn(count, (degree + 1) ** 2, 3, generator=g),
+        degree,
+    )
+
+
+def make_view(name="front", **options):
+    return io.View(name, 64, 48, 70.0, 71.0, torch.eye(4, dtype=torch.float64), **options)
+
+
+@pytest.fixture
+def server():
+    with viewer.start_server(viewer.pack_scene(make_scene(), [make_view()])) as running:
+        thread = threading.Thread(target=running.serve_forever, daemon=True)
+        thread.start()
+        yield running
+        running.shutdown()
+        thread.join()
+
+
+def ask(server, path, method="GET", host=None):
+    """(status, headers, body) of a request to the server, sent as it is."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
+    connection.putrequest(method, path, skip_host=True)
+    connection.putheader("Host", host or f"127.0.0.1:{server.server_port}")
+    connection.endheaders()
+    response = connection.getresponse()
+    answer = response.status, dict(response.getheaders()), response.read()
+    connection.close()
+    return answer
+
+
+# ------------------------------------------------------------------------------------ packing
+
+
+@pytest.mark.parametrize("degree, numbers", [(0, 4), (1, 12), (2, 28), (3, 48)])
+def test_packed_numbers(degree, numbers):
+    scene = make_scene(7, degree)
+    packed = viewer.pack_scene(scene, [make_view()], name="a scene", footprint="box:samples=8", background=(1, 0.5, 0))
+    geometry = np.frombuffer(packed.geometry, "<f4").reshape(7, 12)
+    np.testing.assert_array_equal(geometry[:, :3], scene.means)
+    np.testing.assert_array_equal(geometry[:, 3:4], scene.opacities)
+    np.testing.assert_array_equal(geometry[:, 4:7], scene.scales)
+    np.testing.assert_allclose(
+        geometry[:, 8:], torch.nn.functional.normalize(scene.rotations.double(), dim=1), rtol=0, atol=2**-24
+    )
+    harmonics = np.frombuffer(packed.harmonics, "<f2").reshape(7, numbers)
+    used = 3 * (degree + 1) ** 2
+    np.testing.assert_array_equal(harmonics[:, :used], scene.shs.reshape(7, -1).half())
+    assert not harmonics[:, used:].any()
+    meta = json.loads(packed.meta_json())
+    assert (meta["name"], meta["count"], meta["sh_degree"]) == ("a scene", 7, degree)
+    assert (meta["footprint"], meta["background"]) == ("box:samples=8", [1.0, 0.5, 0.0])
+
+
+def test_packed_views():
+    views = [make_view("centre"), make_view("off centre", cx=20.0, cy=25.0)]
+    meta = viewer.pack_scene(make_scene(), views).meta
+    assert [(v["name"], v["cx"], v["cy"]) for v in meta["views"]] == [("centre", 32, 24), ("off centre", 20.0, 25.0)]
+    assert meta["views"][0]["w2c"] == torch.eye(4).flatten().tolist()
+    assert meta["up"] == [0.0, -1.0, 0.0]
+
+
+def test_without_views_there_is_one_that_sees_the_scene():
+    scene = make_scene(400)
+    (entry,) = viewer.pack_scene(scene).meta["views"]
+    w2c = torch.tensor(entry["w2c"]).reshape(4, 4)
+    seen = scene.means @ w2c[:3, :3].T + w2c[:3, 3]
+    x = entry["fx"] * seen[:, 0] / seen[:, 2] + entry["cx"]
+    y = entry["fy"] * seen[:, 1] / seen[:, 2] + entry["cy"]
+    inside = (seen[:, 2] > 0.2) & (x > 0) & (x < entry["width"]) & (y > 0) & (y < entry["height"])
+    assert inside.float().mean() > 0.8
+
+
+def test_one_gaussian_has_a_view():
+    (entry,) = viewer.pack_scene(make_scene(1)).meta["views"]
+    assert np.isfinite(entry["w2c"]).all()
+
+
+def test_a_zero_quaternion_is_the_identity_and_tiny_ones_survive():
+    scene = make_scene(2)
+    scene.rotations[0] = 0
+    scene.rotations[1] = torch.tensor([0, 1e-30, 0, 0])
+    geometry = np.frombuffer(viewer.pack_scene(scene).geometry, "<f4").reshape(2, 12)
+    np.testing.assert_array_equal(geometry[:, 8:], [[1, 0, 0, 0], [0, 1, 0, 0]])
+
+
+@pytest.mark.parametrize("field", ["means", "scales", "rotations", "opacities", "shs"])
+def test_numbers_that_are_not_finite_are_refused(field):
+    scene = make_scene()
+    getattr(scene, field).view(-1)[4] = float("nan")
+    with pytest.raises(ValueError, match=f"{field} must be finite"):
+        viewer.pack_scene(scene)
+
+
+def test_an_empty_scene_is_refused():
+    with pytest.raises(ValueError, match=r"garden\.ply: the scene has no Gaussians"):
+        viewer.pack_scene(make_scene(0), name="garden.ply")
+
+
+@pytest.mark.parametrize(
+    "given, name",
+    [
+        ("analytic", "analytic"),
+        ("analytic:frame_gradient=paper", "analytic"),
+        ("box", "box:samples=4"),
+        ("point", "point"),
+        ("point:dilation=0", "point:dilation=0.0"),
+        ("mip:variance=0.3", "mip:variance=0.3"),
+        ("cumulant", "cumulant"),
+    ],
+)
+def test_names_of_footprints(given, name):
+    assert viewer.page_footprint(ar.resolve_footprint(given)) == name
+
+
+@pytest.mark.parametrize("name", ["adaptive", "erf", "exact"])
+def test_footprints_that_the_page_cannot_draw_are_refused(name):
+    with pytest.raises(ValueError, match="viewer can draw"):
+        viewer.pack_scene(make_scene(), footprint=name)
+
+
+# ------------------------------------------------------------------------- tags of the files
+
+
+@pytest.fixture
+def files(tmp_path):
+    pytest.importorskip("gsply", reason="needs the cli extra")
+    io.save_scene(tmp_path / "scene.ply", make_scene())
+    io.save_scene(tmp_path / "scene.spz", make_scene())
+    io.save_views(tmp_path / "views.json", [make_view(), make_view("other")])
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    "comment, footprint",
+    [
+        ("comment SplatRenderMode: mip", "mip"),
+        ("comment antialiased 1", "mip"),
+        ("comment antialiased 0", None),
+        ("comment SplatRenderMode: default", None),
+        ("comment made for antialiased 1 screens", None),
+    ],
+)
+def test_comments_of_a_ply_choose_the_footprint(files, comment, footprint):
+    path = files / "scene.ply"
+    assert viewer.footprint_of_file(path) is None
+    path.write_bytes(path.read_bytes().replace(b"\nelement vertex", f"\n{comment}\nelement vertex".encode(), 1))
+    assert viewer.footprint_of_file(path) == footprint
+    assert len(io.load_scene(path).means) == 30
+
+
+@pytest.mark.parametrize("compressed", [True, False])
+def test_the_flag_of_an_spz_chooses_the_footprint(tmp_path, compressed):
+    path = tmp_path / "scene.spz"
+    for flags, footprint in ((0, None), (1, "mip"), (3, "mip"), (2, None)):
+        header = struct.pack("<4sIIBBBB", b"NGSP", 3, 0, 0, 12, flags, 0)
+        path.write_bytes(gzip.compress(header) if compressed else header)
+        assert viewer.footprint_of_file(path) == footprint
+
+
+def test_an_spz_of_our_own_has_no_flag(files):
+    assert viewer.footprint_of_file(files / "scene.spz") is None
+
+
+# ------------------------------------------------------------------------------------- server
+
+
+def test_the_server_listens_on_this_machine_only(server):
+    assert server.server_address[0] == "127.0.0.1"
+    assert server.url == f"http://127.0.0.1:{server.server_port}/{server.token}/"
+    assert len(server.token) >= 32
+
+
+def test_the_server_serves_page_and_scene(server):
+    for name in ("", "index.html", "style.css", "scene.json", "geometry.bin", "harmonics.bin", *JAVASCRIPT):
+        status, headers, body = ask(server, f"/{server.token}/{name}")
+        assert status == 200, name
+        assert body == server.files[name][0]
+        assert headers["Content-Length"] == str(len(body))
+        assert headers["X-Content-Type-Options"] == "nosniff"
+        assert "default-src 'none'" in headers["Content-Security-Policy"]
+        assert "unsafe" not in headers["Content-Security-Policy"]
+    status, headers, body = ask(server, f"/{server.token}/?view=0&footprint=point")
+    assert (status, body) == (200, server.files[""][0])
+
+
+def test_head_has_no_body(server):
+    status, headers, body = ask(server, f"/{server.token}/geometry.bin", method="HEAD")
+    assert (status, body) == (200, b"")
+    assert int(headers["Content-Length"]) == 30 * 12 * 4
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:{port}", "127.0.0.1", "127.0.0.1:1", "[::1]:{port}"])
+def test_a_foreign_host_is_refused(server, host):
+    status, _, body = ask(server, f"/{server.token}/", host=host.format(port=server.server_port))
+    assert status == 403
+    assert b"<html" not in body
+
+
+def test_localhost_is_not_foreign(server):
+    assert ask(server, f"/{server.token}/", host=f"localhost:{server.server_port}")[0] == 200
+
+
+@pytest.mark.parametrize("path", ["/", "/index.html", "//", "/x{token}/", "/{token}x/", "/{upper}/", "/%00/", "/é/"])
+def test_without_the_token_nothing_is_served(server, path):
+    path = path.format(token=server.token, upper=server.token.swapcase())
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
+    connection._encode_request = lambda request: request.encode("latin-1")  # paths no browser would send
+    connection.putrequest("GET", path.replace("é", "\xe9"), skip_host=True)
+    connection.putheader("Host", f"127.0.0.1:{server.server_port}")
+    connection.endheaders()
+    assert connection.getresponse().status == 403
+    connection.close()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "missing.js",
+        "../server.py",
+        "../../../../../../etc/passwd",
+        "%2e%2e/server.py",
+        "page/index.html",
+        "//etc/passwd",
+        "/index.html",
+        "index.html/",
+        "INDEX.HTML",
+    ],
+)
+def test_nothing_but_the_listed_files_is_served(server, name):
+    assert ask(server, f"/{server.token}/{name}")[0] == 404
+    assert ask(server, f"/{server.token}")[0] == 404
+
+
+def test_other_methods_are_refused(server):
+    for method in ("POST", "PUT", "DELETE", "OPTIONS"):
+        assert ask(server, f"/{server.token}/", method=method)[0] == 501
+
+
+def test_a_port_in_use_is_one_sentence(server):
+    with pytest.raises(ValueError, match=rf"port {server.server_port} cannot be used: "):
+        viewer.start_server(viewer.pack_scene(make_scene()), server.server_port)
+
+
+# ------------------------------------------------------------------------------ exported file
+
+
+@pytest.fixture
+def exported(tmp_path):
+    packed = viewer.pack_scene(make_scene(), [make_view("</script><b>")], name="<script>alert(1)</script>")
+    size = viewer.export_page(tmp_path / "scene.html", packed)
+    text = (tmp_path / "scene.html").read_text(encoding="utf-8")
+    assert size == len(text.encode())
+    return packed, text
+
+
+def test_the_exported_file_holds_the_scene(exported):
+    packed, text = exported
+
+    def data(name):
+        return re.search(rf'<script type="[^"]*" id="data-{name}">(.*?)</script>', text, re.DOTALL)[1]
+
+    assert json.loads(data("scene")) == packed.meta
+    assert gzip.decompress(base64.b64decode(data("geometry"))) == packed.geometry
+    assert gzip.decompress(base64.b64decode(data("harmonics"))) == packed.harmonics
+    assert data("sorter") == pages.page_file("sort.js")
+
+
+def test_the_exported_file_allows_its_own_script_and_style_only(exported):
+    _, text = exported
+    policy = re.search(r'http-equiv="Content-Security-Policy" content="([^"]*)"', text)[1]
+    assert text.index("Content-Security-Policy") < text.index("<style>")
+    allowed = dict(part.split(maxsplit=1) for part in policy.split("; "))
+    assert allowed["default-src"] == allowed["connect-src"] == "'none'"
+    for directive, tag in (("script-src", '<script type="module">'), ("style-src", "<style>")):
+        content = text.split(tag)[1].split(f"</{tag[1:].split()[0].rstrip('>')}>")[0]
+        digest = base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
+        assert allowed[directive] == f"'sha256-{digest}'"
+
+
+def test_the_exported_file_refers_to_nothing_outside(exported):
+    _, text = exported
+    assert not re.search(r'(src|href)="(?!data:)', text)
+    assert "http://" not in text and "https://" not in text
+    assert not re.search(r"^\s*(import|export)\s", text, re.MULTILINE)
+    assert "<script>alert" not in text
+
+
+def test_a_scene_too_large_for_one_file_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr("analytic_rasterizer.viewer.export.MAX_EMBEDDED", 100)
+    with pytest.raises(ValueError, match="too large for one file"):
+        viewer.export_page(tmp_path / "scene.html", viewer.pack_scene(make_scene()))
+    assert not (tmp_path / "scene.html").exists()
+
+
+# ------------------------------------------------------------------------------------ command
+
+
+def run_view(*arguments):
+    return cli.main(["view", *map(str, arguments)])
+
+
+def test_export_by_the_command(files, capsys):
+    out = files / "out.html"
+    code = run_view(files / "scene.ply", "--views", files / "views.json", "--export", out, "--footprint", "box")
+    assert code == 0
+    text = out.read_text(encoding="utf-8")
+    assert '"footprint": "box:samples=4"' in text and '"name": "other"' in text
+    assert "30 Gaussians" in capsys.readouterr().out
+
+
+def test_the_command_takes_the_footprint_of_the_file(files):
+    path, out = files / "scene.ply", files / "out.html"
+    path.write_bytes(path.read_bytes().replace(b"\nelement", b"\ncomment antialiased 1\nelement", 1))
+    assert run_view(path, "--export", out) == 0
+    assert '"footprint": "mip"' in out.read_text(encoding="utf-8")
+    assert run_view(path, "--export", out, "--footprint", "cumulant") == 0
+    assert '"footprint": "cumulant"' in out.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    "arguments, sentence",
+    [
+        (["missing.ply"], "no such file"),
+        (["scene.ply", "--footprint", "exact"], "viewer can draw"),
+        (["scene.ply", "--footprint", "box:samples=3"], "samples must be one of"),
+        (["scene.ply", "--views", "missing.json"], "missing.json"),
+        (["scene.ply", "--export", "out.txt"], "--export must end in .html"),
+        (["scene.ply", "--export", "missing/out.html"], "No such file or directory"),
+        (["broken.ply"], "broken.ply"),
+        (["empty.ply"], "no Gaussians"),
+        (["broken.spz"], "broken.spz"),
+    ],
+)
+def test_mistakes_are_one_sentence(files, monkeypatch, capsys, arguments, sentence):
+    monkeypatch.chdir(files)
+    ply = (files / "scene.ply").read_bytes()
+    (files / "broken.ply").write_bytes(ply[: len(ply) // 2])
+    (files / "broken.spz").write_bytes(b"not an spz")
+    header, _ = ply.split(b"end_header\n")
+    (files / "empty.ply").write_bytes(header.replace(b"element vertex 30", b"element vertex 0") + b"end_header\n")
+    assert run_view(*arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and error.count("\n") == 1
+    assert sentence in error
+
+
+@pytest.mark.parametrize("port", ["-1", "65536", "http"])
+def test_a_port_is_a_number(files, capsys, port):
+    with pytest.raises(SystemExit) as stop:
+        run_view(files / "scene.ply", "--port", port)
+    assert stop.value.code == 2
+    assert "a port from 0 to 65535" in capsys.readouterr().err
+
+
+def test_the_command_serves_and_ends(files, monkeypatch, capsys):
+    opened = []
+    monkeypatch.setattr("webbrowser.open", opened.append)
+
+    def interrupted(server):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(viewer.ViewerServer, "serve_forever", interrupted)
+    assert run_view(files / "scene.ply") == 0
+    assert run_view(files / "scene.ply", "--no-browser") == 0
+    assert len(opened) == 1
+    assert opened[0] in capsys.readouterr().out
+
+
+# --------------------------------------------------------------------- sources of the page
+
+
+def number(text):
+    return eval(text, {"__builtins__": {}})  # of our own sources: digits and arithmetic
+
+
+def header(name):
+    return (CORE / name).read_text(encoding="utf-8")
+
+
+def test_constants_are_those_of_the_headers():
+    text = pages.page_file("constants.js")
+    block = re.search(r"CONSTANTS = \{(.*?)\};", text, re.DOTALL)[1]
+    constants = {name: number(value) for name, value in re.findall(r"(\w+): ([^,]+),", block)}
+    names = ("constants.h", "footprint/gaussian.h", "footprint/analytic.h", "footprint/cumulant.h")
+    headers = "".join(header(name) for name in names)
+    for name, value in constants.items():
+        found = re.search(rf"constexpr double {name} = ([^;,]+)[;,]", headers)
+        assert found, name
+        assert value == number(found[1]), name
+    assert (constants["kNear"], constants["kFrustumClamp"]) == (_C.NEAR, _C.FRUSTUM_CLAMP)
+
+
+def test_nodes_are_those_of_the_headers():
+    text = pages.page_file("constants.js")
+    block = re.search(r"HALF_NODES = (\{.*?\});", text, re.DOTALL)[1]
+    ours = json.loads(re.sub(r",(\s*[\]}])", r"\1", re.sub(r"(\d+):", r'"\1":', block)))
+    source = header("footprint/gaussian.h")
+    assert set(ours) == {"2", "4", "8", "16"}
+    for samples, nodes in ours.items():
+        listed = re.search(rf"kNodes{samples}\[\] = \{{(.*?)\}};", source, re.DOTALL)[1]
+        theirs = [[float(x), float(y)] for x, y in re.findall(r"\{(-?[\d.]+), (-?[\d.]+)\}", listed)]
+        assert nodes == theirs
+        assert len(nodes) == int(samples) // 2
+
+
+def test_polynomials_are_those_of_the_headers():
+    minimax = re.search(r"kMinimax\[\] = \{(.*?)\}", header("lanes.h"), re.DOTALL)[1]
+    ours = re.search(r"MINIMAX = \[(.*?)\]", pages.page_file("constants.js"), re.DOTALL)[1]
+    assert [float(x) for x in ours.split(",") if x.strip()] == [float(x) for x in minimax.split(",")]
+    shaders, harmonics = pages.page_file("shaders.js"), header("sh.h")
+    for value in re.findall(r"\d\.\d{6,}", shaders):
+        assert value in harmonics, value
+    cumulant = header("footprint/cumulant.h")
+    for value in re.findall(r"x \* (\d\.\d+)\)", shaders):
+        assert float(value) in {float(v) for v in re.findall(r"x \* T\((?:\d \* )?(\d\.\d+)\)", cumulant)}, value
+
+
+def test_default_options_are_those_of_the_library():
+    text = pages.page_file("constants.js")
+    point, mip = re.search(r"DEFAULT_VARIANCE = \{ point: ([\d.]+), mip: ([\d.]+) \}", text).groups()
+    assert ar.resolve_footprint("point").option == float(point)
+    assert ar.resolve_footprint("mip").option == float(mip)
+    block = re.search(r"FOOTPRINTS = \[(.*?)\n\];", text, re.DOTALL)[1]
+    assert tuple(re.findall(r"\['([^']+)',", block)) == viewer.PAGE_FOOTPRINTS
+
+
+@pytest.mark.parametrize("name", JAVASCRIPT)
+def test_numbers_have_full_precision_in_the_shaders(name):
+    assert not re.search(r"\b(mediump|lowp)\b", pages.page_file(name))
+
+
+def test_the_page_fetches_nothing_from_elsewhere():
+    for name in ("index.html", "style.css", *JAVASCRIPT):
+        assert not re.search(r"https?://|@import|url\(", pages.page_file(name)), name
+
+
+def test_modules_share_no_names_and_come_after_what_they_import():
+    names = []
+    for place, module in enumerate(pages.MODULES):
+        text = pages.page_file(module)
+        names += re.findall(r"^(?:export )?(?:async )?(?:const|let|class|function) (\w+)", text, re.MULTILINE)
+        for imported in re.findall(r"from '\./([\w.]+)';", text):
+            assert imported in pages.MODULES[:place], (module, imported)
+    assert len(names) == len(set(names)), sorted(name for name in names if names.count(name) > 1)
+
+
+def test_every_file_of_the_page_is_served():
+    folder = ROOT / "analytic_rasterizer" / "viewer" / "page"
+    assert {path.name for path in folder.iterdir()} == set(pages.served_files())
