@@ -261,7 +261,9 @@ def sample_weights(offset, cov2d, footprint, moved=None, **options):
         samples = options["samples"]
         moved = torch.zeros(samples, 2, dtype=torch.float64) if moved is None else moved
         nodes = cell_nodes(samples)
-        return torch.stack([blurred(offset + n + m, cov2d, 1 / (12 * samples)) for n, m in zip(nodes, moved, strict=True)])
+        return torch.stack(
+            [blurred(offset + n + m, cov2d, 1 / (12 * samples)) for n, m in zip(nodes, moved, strict=True)]
+        )
     if footprint == "box":
         variance = box_variance(options["samples"])
         nodes = box_nodes(options["samples"])

@@ -24,7 +24,9 @@ VARIANTS = [(footprint, options) for footprint in FOOTPRINTS for options in OPTI
 RENDERED = [variant for variant in VARIANTS if variant[0] not in YARDSTICKS]
 # One of each footprint, for tests where the options do not matter.
 KINDS = [
-    (footprint, {"samples": 4} if footprint in ("box", "moment") else {}) for footprint in FOOTPRINTS if footprint not in YARDSTICKS
+    (footprint, {"samples": 4} if footprint in ("box", "moment") else {})
+    for footprint in FOOTPRINTS
+    if footprint not in YARDSTICKS
 ]
 # One of each path through the rasterizer, for tests where the formula of the weight does not matter: one sample per
 # pixel with a conic and with eigenvectors, several samples, samples that move, a number of samples per tile.

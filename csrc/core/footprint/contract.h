@@ -112,8 +112,8 @@ template <class V> AR_HD ShapeGrad<V> operator+(ShapeGrad<V> a, ShapeGrad<V> b) 
 
 /// What one splat gets from one sample that moves.
 template <class V> struct MoveGrad {
-  V weighted;          ///< raw dL_draw: of `weighted`
-  ShapeGrad<V> sums;   ///< as add_alpha_vjp adds them up
+  V weighted;         ///< raw dL_draw: of `weighted`
+  ShapeGrad<V> sums;  ///< as add_alpha_vjp adds them up
 };
 
 /// What most footprints have in common.
