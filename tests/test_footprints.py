@@ -18,9 +18,8 @@ every_footprint = pytest.mark.parametrize("variant", VARIANTS, ids=name_of)
 # "paper" is the derivative of the formula; "frozen", and with it erf, on purpose is not.
 FROZEN = [("analytic", {"frame_gradient": "frozen"}), ("erf", {})]
 every_true_derivative = pytest.mark.parametrize("variant", [v for v in VARIANTS if v not in FROZEN], ids=name_of)
-closed_form = pytest.mark.parametrize(
-    "variant", [v for v in VARIANTS if v[0] in ("point", "mip", "box", "moment")], ids=name_of
-)
+GAUSSIANS = ("point", "mip", "box", "moment")
+closed_form = pytest.mark.parametrize("variant", [v for v in VARIANTS if v[0] in GAUSSIANS], ids=name_of)
 
 
 def weight(device, offset, cov2d, **options):

@@ -35,10 +35,11 @@ template <class V> AR_HD Blended<V> blend_sample(V raw, V& transmittance) {
   return {MaskOf<V>(hit & open), select(open, contribution, zero)};
 }
 
-/// What a sample of footprint P carries from splat to splat besides its transmittance: nothing, unless it moves.
+/// What a sample carries from splat to splat besides its transmittance: nothing, unless it moves. Zero in front of the
+/// first one. (Without an initialiser, which a pack of lanes could not have: its constructor is the compiler's own.)
 template <class V, bool kMoves> struct SampleState {};
 template <class V> struct SampleState<V, true> {
-  Vec2<V> moved = {V(ScalarOf<V>(0)), V(ScalarOf<V>(0))};
+  Vec2<V> moved;
 };
 
 /// Composites one splat into sample s of the pixel at p.

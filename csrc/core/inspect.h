@@ -13,7 +13,7 @@ template <typename T> AR_HD int64_t weight_units(T weight) { return int64_t(doub
 template <typename T, class P> struct PixelSummary {
   static constexpr int S = P::kSamples;
   T transmittance[S];
-  SampleState<T, P::kMoves> states[S];
+  SampleState<T, P::kMoves> states[S] = {};
   T largest = T(0);
   int32_t dominant = -1;  ///< the splat of the largest weight, of equal ones the nearest
   int32_t median = -1;    ///< the first behind which less than half of the light is left

@@ -126,20 +126,25 @@ template <class P, typename T> class Replay<P, T, true> {
           const int row = __builtin_ctz(rows), pixel = row * kTile + c * kCount;
           if (k >= tile_.row_last[row]) continue;
           const Vec2<V> at = {x, V(lanes.value[row])};
-          Change& change = log()[changes_];  // one that is not counted is written over
-          bool changed = false;
+          V t[kSamples];
+          SampleState<V, true> states[kSamples];
+          uint32_t composited = 0;
+          AR_UNROLL
           for (int s = 0; s < kSamples; ++s) {
-            V t = transmittance(s, pixel);
-            SampleState<V, true> state = this->state(s, pixel);
-            store(change.transmittance[s], t);
-            store(change.x[s], state.moved.x);
-            store(change.y[s], state.moved.y);
+            t[s] = transmittance(s, pixel);
+            states[s] = state(s, pixel);
             const MaskOf<V> before = index < load_index(tile_.last[s] + pixel, V());
-            changed |= bits(replay_sample<P>(terms, at, s, before, t, state)) != 0;
-            store(states_.transmittance[s] + pixel, t);
-            states_.moved.set(s, pixel, state);
+            composited |= bits(replay_sample<P>(terms, at, s, before, t[s], states[s]));
           }
-          if (!changed) continue;
+          if (composited == 0) continue;
+          Change& change = log()[changes_];
+          for (int s = 0; s < kSamples; ++s) {
+            std::memcpy(change.transmittance[s], states_.transmittance[s] + pixel, sizeof change.transmittance[s]);
+            std::memcpy(change.x[s], states_.moved.x[s] + pixel, sizeof change.x[s]);
+            std::memcpy(change.y[s], states_.moved.y[s] + pixel, sizeof change.y[s]);
+            store(states_.transmittance[s] + pixel, t[s]);
+            states_.moved.set(s, pixel, states[s]);
+          }
           change.pair = k;
           change.pixel = pixel;
           ++changes_;

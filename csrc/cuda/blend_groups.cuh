@@ -128,7 +128,7 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4   ? 1
   float sums[kChannelGroup];
   int last[S];
 #pragma unroll
-  for (int s = 0; s < S; ++s) transmittance[s] = pixel.inside ? 1.0f : -1.0f, last[s] = 0;
+  for (int s = 0; s < S; ++s) transmittance[s] = pixel.inside ? 1.0f : -1.0f, samples.states[s] = {}, last[s] = 0;
 #pragma unroll
   for (int c = 0; c < kChannelGroup; ++c) sums[c] = 0;
   const auto open = [&] {
