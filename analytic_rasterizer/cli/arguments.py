@@ -56,11 +56,17 @@ def add_scene(parser) -> None:
     add("scene", metavar="SCENE", help="3DGS .ply, compressed .ply or .spz")
     views = "3DGS cameras.json, Blender or nerfstudio transforms.json, or a list of {width, height, fx, fy, w2c}"
     add("--views", required=True, help=views)
+    add_view_options(parser)
+    add_machine_options(parser)
+
+
+def add_view_options(parser) -> None:
+    """What views do not say."""
+    add = parser.add_argument
     size = "image size for a views file that does not state one"
     add("--size", nargs=2, type=count, metavar=("W", "H"), help=size)
     background = "colour behind the scene, 0 to 1 (default: black)"
     add("--background", nargs=3, type=intensity, default=(0.0, 0.0, 0.0), metavar=("R", "G", "B"), help=background)
-    add_machine_options(parser)
 
 
 def add_machine_options(parser) -> None:
