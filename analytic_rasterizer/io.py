@@ -146,7 +146,7 @@ PLY_COLUMNS = (
 def _check_ply_header(path: Path) -> None:
     """Says what is wrong with a .ply that gsply would refuse without a reason, or misread: it
     takes every vertex property for a float, whatever the header says."""
-    lines = _ply_header(path)
+    lines = ply_header(path)
     if any(line.startswith("element chunk") for line in lines):
         return  # compressed: gsply checks the layout
     layout = next((line.split()[1:2] for line in lines if line.startswith("format")), [])
@@ -172,7 +172,8 @@ def _check_ply_header(path: Path) -> None:
         raise SceneError(f"expected 0, 9, 24 or 45 f_rest properties (SH degree 0 to 3), got {rest}")
 
 
-def _ply_header(path: Path) -> list[str]:
+def ply_header(path: Path) -> list[str]:
+    """The lines of a .ply's header, comments among them. Raises SceneError where it has none."""
     lines = []
     with path.open("rb") as file:
         if file.readline(8).strip() != b"ply":

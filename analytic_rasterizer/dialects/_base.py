@@ -316,7 +316,7 @@ def with_channels(
         means3D to cov3D_precomp: As in `render`.
 
     Returns:
-        color (3, H, W), image of the features (K, H, W), radii, and `Outputs` or None.
+        Image of the features (K, H, W), and what the dialect returns besides: `values` of the settings.
 
     Raises:
         TypeError, ValueError: As `render`, or features have another shape.
@@ -340,7 +340,7 @@ def with_channels(
     image, radii, *outputs = render(
         settings, settings.outputs, means3D, means2D, opacities, shs, channels, *geometry, bg
     )
-    return image[:3], image[3:], radii, outputs[0] if outputs else None
+    return image[3:], settings.values(image[:3], radii, *outputs)
 
 
 def given(tensor: torch.Tensor | None) -> bool:

@@ -162,7 +162,7 @@ def rasterize_gaussians_backward(
     }
     leaves = {name: t.detach().requires_grad_() for name, t in inputs.items() if t is not None and len(t) == count}
     with torch.enable_grad():
-        color, _ = GaussianRasterizer(settings)(**{"means2D": None} | leaves)
+        color, _ = GaussianRasterizer(settings)(**leaves)
         found = torch.autograd.grad(color, list(leaves.values()), dL_dout_color, allow_unused=True)
     gradients = dict(zip(leaves, found))
     return tuple(

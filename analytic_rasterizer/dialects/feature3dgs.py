@@ -35,20 +35,9 @@ class GaussianRasterizationSettings(Settings):
         """As 3DGS 2023; `semantic_feature` (P, 1, K), or (P, K), is blended on zero with the colours' weights."""
         if semantic_feature is None:
             raise ValueError("semantic_feature must be given in dialect feature3dgs, got None")
-        color, features, radii, outputs = with_channels(
-            self,
-            semantic_feature.flatten(1),
-            means3D,
-            means2D,
-            opacities,
-            shs,
-            colors_precomp,
-            scales,
-            rotations,
-            cov3D_precomp,
-        )
-        color, radii, *rest = self.values(color, radii, outputs)
-        return color, features, radii, *rest
+        arguments = means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp
+        features, (color, radii, *further) = with_channels(self, semantic_feature.flatten(1), *arguments)
+        return color, features, radii, *further
 
     def returned(self, color, radii, outputs):
         return color, radii, outputs.depth

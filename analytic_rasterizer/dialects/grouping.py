@@ -38,8 +38,7 @@ class GaussianRasterizationSettings(Settings):
         """
         arguments = means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp
         if given(sh_objs):
-            color, objects, radii, outputs = with_channels(self, sh_objs.flatten(1), *arguments)
-            color, radii, *further = self.values(color, radii, outputs)
+            objects, (color, radii, *further) = with_channels(self, sh_objs.flatten(1), *arguments)
         else:
             color, radii, *further = super().render(*arguments)
             objects = color.new_zeros(CHANNELS, *color.shape[1:])

@@ -26,6 +26,7 @@ from .._C import TILE
 from ..camera import camera_matrices
 from ..effects import MAX_SH_DEGREE, Effects
 from ..footprints import Footprint, chosen_footprint, resolve_footprint
+from ..rotations import rotation_matrices
 from ..settings import GaussianRasterizationSettings
 from ..stages import Splats, bin, blend, project
 
@@ -638,11 +639,7 @@ def quat_scale_to_covar_preci(
         raise ValueError(
             f"quats must have shape (..., 4) and scales (..., 3), got {tuple(quats.shape)} and {tuple(scales.shape)}"
         )
-    w, v = torch.nn.functional.normalize(quats, dim=-1).split((1, 3), -1)
-    # R = I + 2 w [v] + 2 [v]^2, where the matrix [v] takes a vector to its cross product with v.
-    identity = torch.eye(3, dtype=v.dtype, device=v.device).expand(*v.shape[:-1], 3, 3)
-    cross = torch.linalg.cross(v[..., None, :].expand_as(identity), identity).mT
-    rotations = identity + 2 * (w[..., None] * cross + cross @ cross)
+    rotations = rotation_matrices(quats)
 
     def squared(factors: torch.Tensor) -> torch.Tensor:
         square = rotations * factors[..., None, :]

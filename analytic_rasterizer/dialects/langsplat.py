@@ -37,8 +37,7 @@ class GaussianRasterizationSettings(Settings):
         if self.include_feature:
             if language_feature_precomp is None:
                 raise ValueError("language_feature_precomp must be given where include_feature is set, got None")
-            color, features, radii, outputs = with_channels(self, language_feature_precomp, *arguments)
-            color, radii, *further = self.values(color, radii, outputs)
+            features, (color, radii, *further) = with_channels(self, language_feature_precomp, *arguments)
         else:
             color, radii, *further = super().render(*arguments)
             features = color.new_zeros(color.shape)

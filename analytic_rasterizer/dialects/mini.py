@@ -13,6 +13,7 @@ import torch
 from ..effects import Effects
 from ..outputs import depths
 from ..rasterizer import render
+from ..rotations import rotation_matrices
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
 from ._base import given, rasterize_gaussians
@@ -120,12 +121,7 @@ def _ellipsoids(scales, rotations, cov3D_precomp, gaussian: torch.Tensor) -> tup
         variances, axes = torch.linalg.eigh(matrices)
         lengths = variances.clamp_min(0).sqrt()
     else:
-        w, x, y, z = torch.nn.functional.normalize(rotations[gaussian]).unbind(1)
-        axes = torch.stack([
-            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-        ], 1).reshape(-1, 3, 3)  # fmt: skip
+        axes = rotation_matrices(rotations[gaussian])
         lengths = scales[gaussian]
     # A flat one is a little thick, so that a ray that lies in it has a middle.
     return axes, lengths.clamp_min(1e-6 * lengths.amax(1, keepdim=True).clamp_min(1e-30))

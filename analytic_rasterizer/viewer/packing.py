@@ -83,7 +83,7 @@ def footprint_of_file(path) -> str | None:
     if path.suffix == ".spz":
         antialiased = _spz_flags(path) & 1
     else:
-        comments = [line.split()[1:] for line in io._ply_header(path) if line.startswith("comment ")]
+        comments = [line.split()[1:] for line in io.ply_header(path) if line.startswith("comment ")]
         antialiased = ["SplatRenderMode:", "mip"] in comments or ["antialiased", "1"] in comments
     return "mip" if antialiased else None
 

@@ -65,8 +65,8 @@ template <typename T> struct GaussianGrads {
   Vec3<T>* means;
   Vec3<T>* scales;
   Vec4<T>* rotations;
-  Sym3<T>*
-      cov3ds;  ///< an entry off the diagonal is the derivative with respect to the one number that fills both places
+  /// An entry off the diagonal is the derivative with respect to the one number that fills both places.
+  Sym3<T>* cov3ds;
   T* opacities;
   Vec3<T>* shs;
   Vec3<T>* colors;

@@ -1,5 +1,5 @@
 // A worker that orders Gaussians by depth. First message: {means, stride, count}, with the numbers of one Gaussian
-// `stride` apart. Then {row, near, exact, id}: the row of the world-to-camera matrix that gives the depth. Answer: {order, exact, id},
+// `stride` apart. Then {row, near, exact}: the row of the world-to-camera matrix that gives the depth. Answer: {order},
 // indices of what lies beyond `near`, the farthest first. Equal depths keep the rasterizer's order, in which the first
 // Gaussian of the input is in front.
 'use strict';
@@ -19,7 +19,7 @@ onmessage = ({ data }) => {
   const visible = depths(data.row, data.near);
   const sorted = data.exact ? sortExactly(visible) : sortRoughly(visible);
   const order = sorted.slice(0, visible).reverse();
-  postMessage({ order, exact: data.exact, id: data.id }, [order.buffer]);
+  postMessage({ order }, [order.buffer]);
 };
 
 /// Writes the keys and indices of the Gaussians beyond `near`, and returns how many. Positive floats are ordered as

@@ -1,0 +1,16 @@
+"""Rotations of Gaussians."""
+
+from __future__ import annotations
+
+import torch
+
+
+def rotation_matrices(quaternions: torch.Tensor) -> torch.Tensor:
+    """(..., 3, 3) of quaternions (..., 4) (w, x, y, z) of any length; zero is the identity. Differentiable."""
+    w, x, y, z = torch.nn.functional.normalize(quaternions, dim=-1).unbind(-1)
+    entries = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(entries, -1).unflatten(-1, (3, 3))
