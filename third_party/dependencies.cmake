@@ -15,4 +15,5 @@ if(BUILD_TESTING)
   if(NOT AR_NVCC)
     message(STATUS "nvcc was not found: the test cuda_kernels, which compiles them, is left out.")
   endif()
+  find_package(CUDAToolkit QUIET)  # its headers
 endif()

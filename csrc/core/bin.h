@@ -109,19 +109,21 @@ template <typename T> AR_HD bool touches_image(const Support<T>& s, TileGrid gri
 }
 
 /// Tiles that hold a range of pixels.
-AR_HD Range tiles_of(Range pixels) {
-  return pixels.first <= pixels.last ? Range{pixels.first / kTile, pixels.last / kTile} : Range{0, -1};
+AR_HD Range tiles_of(Range pixels, TileGrid grid) {
+  return pixels.first <= pixels.last ? Range{pixels.first >> grid.tile_bits, pixels.last >> grid.tile_bits}
+                                     : Range{0, -1};
 }
 
 /// Columns of the tiles that the support touches in a row of tiles; `rows` are its rows of pixels.
 template <typename T> AR_HD Range tile_columns_of(const Support<T>& s, TileGrid grid, Range rows, int tile_row) {
-  const T y0 = T(max(tile_row * kTile, rows.first)), y1 = T(min(tile_row * kTile + kTile - 1, rows.last));
-  return tiles_of(clamp_range(columns_of(s, y0, y1), grid.width));
+  const int top = tile_row << grid.tile_bits, bottom = top + grid.side() - 1;
+  const T y0 = T(max(top, rows.first)), y1 = T(min(bottom, rows.last));
+  return tiles_of(clamp_range(columns_of(s, y0, y1), grid.width), grid);
 }
 
 /// Calls visit(tile row, range of tile columns) for every row of tiles that the support may touch.
 template <typename T, class Visit> AR_HD void for_each_tile_row(const Support<T>& s, TileGrid grid, Visit&& visit) {
-  const Range rows = clamp_range(rows_of(s), grid.height), tile_rows = tiles_of(rows);
+  const Range rows = clamp_range(rows_of(s), grid.height), tile_rows = tiles_of(rows, grid);
   for (int row = tile_rows.first; row <= tile_rows.last; ++row) visit(row, tile_columns_of(s, grid, rows, row));
 }
 

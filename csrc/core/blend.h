@@ -59,18 +59,28 @@ AR_HD Blended<V> blend_sample(const Terms& terms, Vec2<V> p, int s, V& transmitt
   }
 }
 
-/// The same once more, for the samples of a P that moves which the forward pass composited the splat into. `before`:
-/// the splat is not behind the last one of the sample. Returns whether it was composited.
+/// Composites one splat into a sample of a P that moves: `place` is its node's, which stays within `bounds`, z its
+/// whitened coordinates, and `raw` opacity * I there.
 template <class P, class Terms, class V>
-AR_HD MaskOf<V> replay_sample(const Terms& terms, Vec2<V> p, int s, MaskOf<V> before, V& transmittance,
-                              SampleState<V, true>& state) {
+AR_HD Blended<V> blend_placed_sample(const Terms& terms, Vec2<V> z, V raw, const Bounds<V>& bounds, V& transmittance,
+                                     Vec2<V>& place) {
   using T = ScalarOf<V>;
-  const Vec2<V> at = p + state.moved;
-  const V raw = P::alpha(terms, at, s);
+  const Blended<V> blended = blend_sample(raw, transmittance);
+  const V alpha = select(blended.mask, min(raw, V(T(kAlphaMax))), V(T(0)));
+  place = P::move_in(terms, z, alpha, place, bounds);
+  return blended;
+}
+
+/// The same once more, where it is known whether the forward pass composited the splat if the sample's node was near
+/// enough: `before`, it is not behind the last one of the sample. Returns whether it was.
+template <class P, class Terms, class V>
+AR_HD MaskOf<V> replay_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> before, const Bounds<V>& bounds,
+                                     V& transmittance, Vec2<V>& place) {
+  using T = ScalarOf<V>;
   const MaskOf<V> mask = (raw >= V(T(kAlphaMin))) & before;
   const V alpha = select(mask, min(raw, V(T(kAlphaMax))), V(T(0)));
   transmittance = transmittance - transmittance * alpha;
-  state.moved = P::move(terms, at, s, alpha, state.moved);
+  place = P::move_in(terms, z, alpha, place, bounds);
   return mask;
 }
 
@@ -102,21 +112,20 @@ template <class V> struct MovingBlendGrad {
   MoveGrad<V> of_splat;
 };
 
-/// As blend_sample_vjp, but `transmittance` and `state` are those in front of the splat: since alpha depends on the
-/// displacement, they cannot be had from those behind it. `dL_dmoved` goes from behind the splat to in front of it.
+/// Adjoint of blend_placed_sample. `raw` is zero where the splat was not composited, `place` that in front of the
+/// splat. `transmittance`, `behind` and `dL_dplace` go from behind the splat to in front of it.
 template <class P, class Terms, class V>
-AR_HD MovingBlendGrad<V> blend_moving_sample_vjp(const Terms& terms, Vec2<V> p, int s, MaskOf<V> before, V g_color,
-                                                 V transmittance, const SampleState<V, true>& state, V& behind,
-                                                 Vec2<V>& dL_dmoved) {
+AR_HD MovingBlendGrad<V> blend_placed_sample_vjp(const Terms& terms, Vec2<V> z, V raw, const Bounds<V>& bounds,
+                                                 V g_color, Vec2<V> place, V& transmittance, V& behind,
+                                                 Vec2<V>& dL_dplace) {
   using T = ScalarOf<V>;
-  const Vec2<V> at = p + state.moved;
-  const V raw = P::alpha(terms, at, s), cap = V(T(kAlphaMax));
-  const MaskOf<V> mask = (raw >= V(T(kAlphaMin))) & before, free = mask & (raw <= cap);
-  const V alpha = select(mask, min(raw, cap), V(T(0)));
+  const V cap = V(T(kAlphaMax)), alpha = min(raw, cap);
+  const MaskOf<V> free = (raw > V(T(0))) & (raw <= cap);
+  transmittance = madd(transmittance, odds(alpha), transmittance);  // 1 / (1 - alpha) = 1 + odds
   const V difference = g_color - behind;
   behind = madd(alpha, difference, behind);
   return {transmittance * alpha,
-          P::alpha_and_move_vjp(terms, at, s, raw, alpha, free, transmittance * difference, state.moved, dL_dmoved)};
+          P::alpha_and_move_in_vjp(terms, z, raw, alpha, free, transmittance * difference, place, bounds, dL_dplace)};
 }
 
 /// A pixel's share of `sums`; not for kNone. `size`: of the image [px].

@@ -3,8 +3,10 @@
 
 namespace ar {
 
-/// Edge of a square tile [px].
-inline constexpr int kTile = 16;
+/// Edge of a square tile [px], and its logarithm to base 2.
+inline constexpr int kTileBits = 4, kTile = 1 << kTileBits;
+/// The same on CUDA where samples move (csrc/cuda/blend_moving.cuh).
+inline constexpr int kMovingTileBits = 3, kMovingTile = 1 << kMovingTileBits;
 
 /// A Gaussian is culled unless the camera-space z of its mean exceeds this [world units].
 inline constexpr double kNear = 0.2;
@@ -14,6 +16,10 @@ inline constexpr double kFrustumClamp = 1.3;
 
 /// A splat is skipped where its alpha is below this.
 inline constexpr double kAlphaMin = 1.0 / 255.0;
+
+/// Below log2(kAlphaMin) by 1e-4, hundreds of times what rounding and exp2 of any device are wrong by: no splat whose
+/// exponent is below this reaches kAlphaMin.
+inline constexpr double kLogAlphaMin = -7.99445;
 
 /// Alpha never exceeds this.
 inline constexpr double kAlphaMax = 0.99;

@@ -9,6 +9,12 @@ namespace ar {
 /// A weight in units of kWeightUnit.
 template <typename T> AR_HD int64_t weight_units(T weight) { return int64_t(double(weight) / kWeightUnit + 0.5); }
 
+/// What a pixel shows of a splat.
+template <typename T> struct Shown {
+  T weight;       ///< the mean over the samples of transmittance times alpha
+  bool in_front;  ///< it shows something of the splat, and more than half of the light is left behind it
+};
+
 /// Composites the splats of a pixel front to back, and remembers two of them.
 template <typename T, class P> struct PixelSummary {
   static constexpr int S = P::kSamples;
@@ -27,8 +33,8 @@ template <typename T, class P> struct PixelSummary {
     return any;
   }
 
-  /// The weight of splat `id` in the pixel: the mean over the samples of transmittance times alpha.
-  AR_HD T add(const typename P::template Terms<T>& terms, Vec2<T> p, int32_t id) {
+  /// Composites splat `id`.
+  AR_HD Shown<T> add(const typename P::template Terms<T>& terms, Vec2<T> p, int32_t id) {
     T weight = T(0), through = T(0);
     AR_UNROLL
     for (int s = 0; s < S; ++s) {
@@ -41,7 +47,7 @@ template <typename T, class P> struct PixelSummary {
       dominant = id;
     }
     if (median < 0 && weight > T(0) && through < T(0.5 * S)) median = id;
-    return weight;
+    return {weight, weight > T(0) && through > T(0.5 * S)};
   }
 };
 

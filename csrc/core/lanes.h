@@ -47,6 +47,15 @@ AR_HD float min(float a, float b) {
   return b < a ? b : a;
 #endif
 }
+AR_HD float max(float a, float b) {
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
+  float y;
+  asm("max.NaN.f32 %0, %1, %2;" : "=f"(y) : "f"(a), "f"(b));
+  return y;
+#else
+  return a < b ? b : a;
+#endif
+}
 
 /// a * b + c. Written out where the hot loops need one rounding less and one instruction less: the
 /// build turns contraction off, so that forward and backward round alike.
@@ -116,6 +125,9 @@ template <typename T> AR_HD T difference_of_products(T a, T b, T c, T d) {
   const T cd = c * d;
   return std::fma(a, b, -cd) + std::fma(-c, d, cd);
 }
+
+/// alpha / (1 - alpha).
+template <class V> AR_HD V odds(V alpha) { return divide(alpha, V(ScalarOf<V>(1)) - alpha); }
 
 /// False for NaN.
 template <typename T> AR_HD bool within(T x, double bound) { return abs(x) <= T(bound); }

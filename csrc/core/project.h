@@ -198,6 +198,11 @@ AR_HD int project(const Cam& camera, const Gaussians<T>& g, int64_t i, Footprint
   return 0;
 }
 
+/// Whether the channels of the caller's take the place of colours; else they are features beside them.
+template <typename T> AR_HD bool given_colors(const ProjectParams<T>& p) {
+  return p.given.data && !(p.channels.data && p.channels.color >= 0);
+}
+
 /// The first three of a row of channels, those that are missing black: what `adaptive` takes as a splat's colour.
 template <typename T> AR_HD Vec3<T> first_channels(const T* row, int count) {
   return {row[0], count > 1 ? row[1] : T(0), count > 2 ? row[2] : T(0)};

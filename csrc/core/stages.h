@@ -18,12 +18,17 @@
 
 namespace ar {
 
-/// The grid of tiles over an image.
+/// The grid of square tiles over an image.
 struct TileGrid {
-  int width, height;  ///< px
-  AR_HD int columns() const { return (width + kTile - 1) / kTile; }
-  AR_HD int rows() const { return (height + kTile - 1) / kTile; }
+  int width, height;          ///< px
+  int tile_bits = kTileBits;  ///< log2 of a tile's side [px]
+  AR_HD int side() const { return 1 << tile_bits; }
+  AR_HD int columns() const { return (width + side() - 1) >> tile_bits; }
+  AR_HD int rows() const { return (height + side() - 1) >> tile_bits; }
   AR_HD int64_t tiles() const { return int64_t(columns()) * rows(); }
+  AR_HD bool operator==(const TileGrid& other) const {
+    return width == other.width && height == other.height && tile_bits == other.tile_bits;
+  }
 };
 
 template <typename T> struct CameraView {
@@ -213,9 +218,12 @@ template <typename T> struct InspectParams {
   TileGrid grid;
   int32_t* median;    ///< [height, width] Gaussians, or -1; see PixelSummary
   int32_t* dominant;  ///< [height, width]
-  int32_t* touched;   ///< [n] pixels, to add to
-  int32_t* largest;   ///< [n] largest weight, as the bits of a float; to raise
-  int64_t* units;     ///< [n] sum of weights in units of kWeightUnit, to add to
+  // What is known of each of the n Gaussians: numbers of pixels and the sum to add to, the largest weight to raise.
+  int32_t* touched;    ///< [n] pixels that show it
+  int32_t* largest;    ///< [n] largest weight, as the bits of a float
+  int64_t* units;      ///< [n] sum of weights in units of kWeightUnit
+  int32_t* in_front;   ///< [n] pixels of Shown::in_front
+  int32_t* dominated;  ///< [n] pixels whose `dominant` it is
 };
 
 /// The gradient of an image to sums per pair.

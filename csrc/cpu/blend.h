@@ -25,9 +25,6 @@ template <int kSamples, typename T> uint32_t find_open_rows(const T (&transmitta
   return open;
 }
 
-/// So many splats pass before the open rows are found anew.
-inline constexpr int64_t kSplatsPerCheck = 16;
-
 /// `colors`: room for the channels of a tile. `adapter`: null where rows hold P's shape.
 template <class P, typename T>
 AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* colors, const RowAdapter<P, T>* adapter) {
@@ -39,7 +36,8 @@ AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* color
   const bool three = channels == 3, keeps = p.last != nullptr;
   alignas(64) T transmittance[kSamples][kTilePixels];
   alignas(64) int32_t last[kSamples][kTilePixels] = {};
-  TileStates<P, T> states;
+  using Places = TilePlaces<P, T>;
+  Places moving;
   std::fill_n(colors, channels * kTilePixels, T(0));
   for (int s = 0; s < kSamples; ++s) {
     for (int i = 0; i < kTilePixels; ++i) transmittance[s][i] = i % kTile < view.columns ? T(1) : T(-1);
@@ -48,46 +46,75 @@ AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* color
   uint32_t open_rows = rows_in_image;
   const int32_t* pairs = p.lists.pairs;
   const int64_t begin = p.lists.tile_offsets[tile], end = p.lists.tile_offsets[tile + 1];
-  for (int64_t k = begin; k < end; ++k) {
-    if ((k - begin) % kSplatsPerCheck == kSplatsPerCheck - 1) {
+  TileSplat<P, T> batch[kBatch];
+  for (int64_t first = begin; first < end; first += kBatch) {
+    if (first > begin) {
       open_rows = rows_in_image & find_open_rows<kSamples, T>(transmittance);
       if (open_rows == 0) break;
     }
-    if (k + 4 < end) __builtin_prefetch(p.splats + int64_t(pairs[k + 4]) * kSplatWidth);
-    const Splat<P, T> splat = splat_at(p.splats, pairs[k], adapter);
-    const T* shown = p.channels.row(pairs[k]);
-    const Vec3<V> color = three_channels<V>(shown, three);
-    const TileMask<T> reach = reach_of(splat, view, lanes);
-    const Vec2<T> origin = {T(view.x0) - splat.mean.x, T(view.y0) - splat.mean.y};
-    const auto terms = P::terms(splat.shape, splat.opacity, origin);
-    const IndexOf<V> index(int32_t(k - begin + 1));
-    for (int c = 0; c < TileMask<T>::kPacks; ++c) {
-      const V x = load(lanes.value + c * kCount, V());
-      for (uint32_t rows = reach.rows[c] & open_rows; rows != 0; rows &= rows - 1) {
-        const int row = __builtin_ctz(rows), pixel = row * kTile + c * kCount;
-        const Vec2<V> at = {x, V(lanes.value[row])};
-        V contribution(T(0));
-        AR_UNROLL
-        for (int s = 0; s < kSamples; ++s) {
-          V t = load(transmittance[s] + pixel, V());
-          auto state = states.at(s, pixel);
-          const Blended<V> blended = blend_sample<P>(terms, at, s, t, state);
-          store(transmittance[s] + pixel, t);
-          states.set(s, pixel, state);
-          contribution = contribution + blended.contribution;
-          if (keeps) {
-            store_index(last[s] + pixel, select(blended.mask, index, load_index(last[s] + pixel, V())));
+    const int count = int(std::min<int64_t>(kBatch, end - first));
+    for (int i = 0; i < count; ++i) {
+      const int64_t ahead = first + i + kPrefetch;
+      if (ahead < end) prefetch_splat(p.splats, pairs[ahead]);
+      batch[i] = tile_splat(p.splats, pairs[first + i], adapter, view, lanes);
+    }
+    for (int i = 0; i < count; ++i) {
+      const auto& terms = batch[i].terms;
+      const TileMask<T>& reach = batch[i].reach;
+      const T* shown = p.channels.row(pairs[first + i]);
+      const Vec3<V> color = three_channels<V>(shown, three);
+      const IndexOf<V> index(int32_t(first + i - begin + 1));
+      for (int c = 0; c < TileMask<T>::kPacks; ++c) {
+        const V x = load(lanes.value + c * kCount, V());
+        for (uint32_t rows = reach.rows[c] & open_rows; rows != 0; rows &= rows - 1) {
+          const int row = __builtin_ctz(rows), pixel = row * kTile + c * kCount;
+          const Vec2<V> at = {x, V(lanes.value[row])};
+          V contribution(T(0));
+          if constexpr (P::kMoves) {
+            const Vec2<V> z = P::whitened(terms, at, 0);
+            bool hit = false;
+            for (int group_first = 0; group_first < kSamples; group_first += Places::kGroup) {
+              typename Places::Group group;
+              if (!moving.look(terms, z, group_first, pixel, group)) continue;
+              hit = true;
+              AR_UNROLL
+              for (int j = 0; j < Places::kGroup; ++j) {
+                const int s = group_first + j;
+                V t = load(transmittance[s] + pixel, V());
+                Vec2<V> place = moving.places.at(s, pixel);
+                const Blended<V> blended =
+                    blend_placed_sample<P>(terms, group.z[j], exp2(group.log_alpha[j]), moving.bounds(s), t, place);
+                store(transmittance[s] + pixel, t);
+                moving.places.set(s, pixel, place);
+                contribution = contribution + blended.contribution;
+                if (keeps) {
+                  store_index(last[s] + pixel, select(blended.mask, index, load_index(last[s] + pixel, V())));
+                }
+              }
+            }
+            if (!hit) continue;
+          } else {
+            AR_UNROLL
+            for (int s = 0; s < kSamples; ++s) {
+              V t = load(transmittance[s] + pixel, V());
+              const Blended<V> blended = blend_sample(P::alpha(terms, at, s), t);
+              store(transmittance[s] + pixel, t);
+              contribution = contribution + blended.contribution;
+              if (keeps) {
+                store_index(last[s] + pixel, select(blended.mask, index, load_index(last[s] + pixel, V())));
+              }
+            }
           }
-        }
-        T* to = channels_at(colors, pixel, channels);
-        const auto add = [&](int channel, V value) {
-          T* sum = to + channel * kCount;
-          store(sum, madd(contribution, value, load(sum, V())));
-        };
-        if (three) {
-          add(0, color.x), add(1, color.y), add(2, color.z);
-        } else {
-          for (int channel = 0; channel < channels; ++channel) add(channel, V(shown[channel]));
+          T* to = channels_at(colors, pixel, channels);
+          const auto add = [&](int channel, V value) {
+            T* sum = to + channel * kCount;
+            store(sum, madd(contribution, value, load(sum, V())));
+          };
+          if (three) {
+            add(0, color.x), add(1, color.y), add(2, color.z);
+          } else {
+            for (int channel = 0; channel < channels; ++channel) add(channel, V(shown[channel]));
+          }
         }
       }
     }

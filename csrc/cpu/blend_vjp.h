@@ -89,20 +89,26 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
   const uint32_t rows_in_image = (1u << view.rows) - 1;
   const int32_t* pairs = p.lists.pairs;
   const int64_t begin = p.lists.tile_offsets[tile], end = p.lists.tile_offsets[tile + 1];
-  for (int64_t k = begin + tile_last; k < end; ++k) {
+  const auto write_zeros = [&](int64_t k) {
     if (with_shape) std::fill_n(p.pair_grads + k * p.pair_stride, cpu::kPairNumbers, T(0));
     if (with_means) p.pair_means[k] = {T(0), T(0)};
     std::fill_n(p.channel_sums + k * p.channel_stride, p.count, T(0));
-  }
-  TileStates<P, T> dL_dmoved;
+  };
+  for (int64_t k = begin + tile_last; k < end; ++k) write_zeros(k);
+  TilePairs<P, T> dL_dplaces = {};
   Replay<P, T> replay({p, view, last, row_last, begin, tile_last, replay_memory});
   for (int32_t k = tile_last - 1; k >= 0; --k) {
-    replay.enter(k);
-    if (k >= 4) __builtin_prefetch(p.splats + int64_t(pairs[begin + k - 4]) * kSplatWidth);
+    if constexpr (P::kMoves) {
+      replay.enter(k);
+      if (!replay.has(k)) {
+        write_zeros(begin + k);
+        continue;
+      }
+    }
+    if (k >= kPrefetch) prefetch_splat(p.splats, pairs[begin + k - kPrefetch]);
     const int32_t j = pairs[begin + k];
     const Splat<P, T> splat = splat_at(p.splats, j, adapter);
     const T* shown = p.channels.row(j);
-    const TileMask<T> reach = reach_of(splat, view, lanes);
     const Vec2<T> origin = {T(view.x0) - splat.mean.x, T(view.y0) - splat.mean.y};
     const auto terms = P::terms(splat.shape, splat.opacity, origin);
     const V zero = V(T(0));
@@ -114,61 +120,79 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
     alignas(64) T sums[cpu::kWindow * kCount];
     if (!three) std::fill_n(sums, count * kCount, T(0));
     Vec2<V> mean_sums = {zero, zero};
-    for (int c = 0; c < TileMask<T>::kPacks; ++c) {
-      const V x = load(lanes.value + c * kCount, V());
-      for (uint32_t rows = reach.rows[c] & rows_in_image & replay.rows(c); rows != 0; rows &= rows - 1) {
-        const int row = __builtin_ctz(rows), pixel = row * kTile + c * kCount;
-        if (k >= row_last[row]) continue;
-        const Vec2<V> at = {x, V(lanes.value[row])};
-        const T* g = channels_at(gradient, pixel, loaded);
-        V g_color = zero;
-        if (loaded == 3) {
-          g_color = madd(load(g, V()), splat_color.x,
-                         madd(load(g + kCount, V()), splat_color.y, load(g + 2 * kCount, V()) * splat_color.z));
-        } else if (with_shape) {
-          g_color = dot_channels<V>(g, shown, loaded);
-        }
-        V contribution = zero;
-        ShapeGrad<V> of_pixel = {{zero, zero}, {zero, zero, zero}};
-        AR_UNROLL
-        for (int s = 0; s < kSamples; ++s) {
-          if constexpr (P::kMoves) {
-            V b = load(behind[s] + pixel, V());
-            auto state = dL_dmoved.at(s, pixel);
-            const MovingBlendGrad<V> grad =
-                blend_moving_sample_vjp<P>(terms, at, s, index < load_index(last[s] + pixel, V()), g_color,
-                                           replay.transmittance(s, pixel), replay.state(s, pixel), b, state.moved);
+    const auto visit = [&](int pixel) AR_HD_LAMBDA {
+      const Vec2<V> at = {load(lanes.value + pixel % kTile, V()), V(lanes.value[pixel / kTile])};
+      const T* g = channels_at(gradient, pixel, loaded);
+      V g_color = zero;
+      if (loaded == 3) {
+        g_color = madd(load(g, V()), splat_color.x,
+                       madd(load(g + kCount, V()), splat_color.y, load(g + 2 * kCount, V()) * splat_color.z));
+      } else if (with_shape) {
+        g_color = dot_channels<V>(g, shown, loaded);
+      }
+      V contribution = zero;
+      ShapeGrad<V> of_pixel = {{zero, zero}, {zero, zero, zero}};
+      if constexpr (P::kMoves) {
+        const Vec2<V> z = P::whitened(terms, at, 0);
+        do {
+          auto found = replay.take();
+          AR_UNROLL
+          for (int j = 0; j < Replay<P, T>::kGroup; ++j) {
+            const int s = found.first + j;
+            if (found.lanes[j] == 0) continue;
+            V raw;
+            Vec2<V> place;
+            found.read(j, replay.bounds(s).lo, raw, place);
+            V t = load(transmittance[s] + pixel, V()), b = load(behind[s] + pixel, V());
+            Vec2<V> dL_dplace = dL_dplaces.at(s, pixel);
+            const MovingBlendGrad<V> grad = blend_placed_sample_vjp<P>(
+                terms, P::whitened_node(terms, z, place), raw, replay.bounds(s), g_color, place, t, b, dL_dplace);
+            store(transmittance[s] + pixel, t);
             store(behind[s] + pixel, b);
-            dL_dmoved.set(s, pixel, state);
+            dL_dplaces.set(s, pixel, dL_dplace);
             contribution = contribution + grad.contribution;
             weighted = weighted + grad.of_splat.weighted;
             shape = shape + grad.of_splat.sums;
-            of_pixel = of_pixel + grad.of_splat.sums;
-          } else {
-            const V alpha = P::alpha(terms, at, s);
-            const MaskOf<V> mask = (alpha >= V(T(kAlphaMin))) & (index < load_index(last[s] + pixel, V()));
-            V t = load(transmittance[s] + pixel, V()), b = load(behind[s] + pixel, V());
-            const BlendGrad<V> grad = blend_sample_vjp(mask, alpha, g_color, t, b);
-            store(transmittance[s] + pixel, t);
-            store(behind[s] + pixel, b);
-            contribution = contribution + grad.contribution;
-            weighted = madd(grad.dL_dalpha, alpha, weighted);
-            P::add_alpha_vjp(terms, at, s, alpha, grad.dL_dalpha, shape);
-            // Again for the pixel alone: to ask for it must not change the other sums by a bit.
-            if (with_means) P::add_alpha_vjp(terms, at, s, alpha, grad.dL_dalpha, of_pixel);
+            if (with_means) of_pixel = of_pixel + grad.of_splat.sums;
           }
+        } while (replay.has(k) && replay.pixel() == pixel);
+      } else {
+        AR_UNROLL
+        for (int s = 0; s < kSamples; ++s) {
+          const V alpha = P::alpha(terms, at, s);
+          const MaskOf<V> mask = (alpha >= V(T(kAlphaMin))) & (index < load_index(last[s] + pixel, V()));
+          V t = load(transmittance[s] + pixel, V()), b = load(behind[s] + pixel, V());
+          const BlendGrad<V> grad = blend_sample_vjp(mask, alpha, g_color, t, b);
+          store(transmittance[s] + pixel, t);
+          store(behind[s] + pixel, b);
+          contribution = contribution + grad.contribution;
+          weighted = madd(grad.dL_dalpha, alpha, weighted);
+          P::add_alpha_vjp(terms, at, s, alpha, grad.dL_dalpha, shape);
+          // Again for the pixel alone: to ask for it must not change the other sums by a bit.
+          if (with_means) P::add_alpha_vjp(terms, at, s, alpha, grad.dL_dalpha, of_pixel);
         }
-        g += window * kCount;
-        if (three) {
-          color = {madd(contribution, load(g, V()), color.x), madd(contribution, load(g + kCount, V()), color.y),
-                   madd(contribution, load(g + 2 * kCount, V()), color.z)};
-        } else {
-          for (int i = 0; i < count * kCount; i += kCount)
-            store(sums + i, madd(contribution, load(g + i, V()), load(sums + i, V())));
-        }
-        if (with_means) {
-          const Vec2<V> by_mean = transform_transposed(P::mean_map(splat.shape), of_pixel.offset);
-          mean_sums = mean_sums + mean_sums_of(p.mean_sums, size_px, by_mean);
+      }
+      g += window * kCount;
+      if (three) {
+        color = {madd(contribution, load(g, V()), color.x), madd(contribution, load(g + kCount, V()), color.y),
+                 madd(contribution, load(g + 2 * kCount, V()), color.z)};
+      } else {
+        for (int i = 0; i < count * kCount; i += kCount)
+          store(sums + i, madd(contribution, load(g + i, V()), load(sums + i, V())));
+      }
+      if (with_means) {
+        const Vec2<V> by_mean = transform_transposed(P::mean_map(splat.shape), of_pixel.offset);
+        mean_sums = mean_sums + mean_sums_of(p.mean_sums, size_px, by_mean);
+      }
+    };
+    if constexpr (P::kMoves) {
+      while (replay.has(k)) visit(replay.pixel());
+    } else {
+      const TileMask<T> reach = reach_of(splat, view, lanes);
+      for (int c = 0; c < TileMask<T>::kPacks; ++c) {
+        for (uint32_t rows = reach.rows[c] & rows_in_image; rows != 0; rows &= rows - 1) {
+          const int row = __builtin_ctz(rows);
+          if (k < row_last[row]) visit(row * kTile + c * kCount);
         }
       }
     }

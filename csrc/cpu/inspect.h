@@ -28,7 +28,7 @@ AR_ONE_COPY void inspect_tile(const cpu::InspectParams<T>& p, int64_t tile, cons
     const Splat<P, T> splat = splat_at(p.splats, j, adapter);
     const Support<T> support = support_of(splat);
     const auto terms = P::terms(splat.shape, splat.opacity, {T(view.x0) - splat.mean.x, T(view.y0) - splat.mean.y});
-    int32_t touched = 0;
+    int32_t touched = 0, in_front = 0;
     int64_t units = 0;
     T largest = T(0);
     for (int row = 0; row < view.rows; ++row) {
@@ -37,22 +37,26 @@ AR_ONE_COPY void inspect_tile(const cpu::InspectParams<T>& p, int64_t tile, cons
         if (!(span.lo <= T(view.x0 + column) && span.hi >= T(view.x0 + column))) continue;
         auto& pixel = pixels[row * kTile + column];
         if (!pixel.open()) continue;
-        const T weight = pixel.add(terms, {T(column), T(row)}, id);
-        touched += weight > T(0);
-        units += weight_units(weight);
-        largest = max(largest, weight);
+        const Shown<T> shown = pixel.add(terms, {T(column), T(row)}, id);
+        touched += shown.weight > T(0);
+        in_front += shown.in_front;
+        units += weight_units(shown.weight);
+        largest = max(largest, shown.weight);
       }
     }
     if (touched == 0) continue;
     __atomic_fetch_add(&p.touched[id], touched, __ATOMIC_RELAXED);
+    __atomic_fetch_add(&p.in_front[id], in_front, __ATOMIC_RELAXED);
     __atomic_fetch_add(&p.units[id], units, __ATOMIC_RELAXED);
     atomic_max(&p.largest[id], float(largest));
   }
   for (int row = 0; row < view.rows; ++row) {
     for (int column = 0; column < view.columns; ++column) {
       const int64_t i = view.pixel(p.grid, row) + column;
+      const int32_t dominant = pixels[row * kTile + column].dominant;
       p.median[i] = pixels[row * kTile + column].median;
-      p.dominant[i] = pixels[row * kTile + column].dominant;
+      p.dominant[i] = dominant;
+      if (dominant >= 0) __atomic_fetch_add(&p.dominated[dominant], 1, __ATOMIC_RELAXED);
     }
   }
 }

@@ -183,6 +183,35 @@ AR_HD Pack load(const float* p, Pack) { return Pack::load(p); }
 AR_HD double load(const double* p, double) { return *p; }
 AR_HD void store(float* p, Pack v) { v.store(p); }
 AR_HD void store(double* p, double v) { *p = v; }
+/// How many numbers store_lanes takes for the lanes whose bit is set: none for none; else as many, where there is an
+/// instruction that puts them one behind the other, or all.
+AR_HD int lanes_stored(uint32_t lanes, Pack) {
+#if AR_LANES == 16
+  return __builtin_popcount(lanes);
+#else
+  return lanes != 0 ? kLanes : 0;
+#endif
+}
+/// Stores the lanes whose bit is set; writes kLanes numbers, whatever it takes.
+AR_HD void store_lanes(float* p, [[maybe_unused]] uint32_t lanes, Pack v) {
+#if AR_LANES == 16
+  store(p, Pack((Pack::Raw)_mm512_maskz_compress_ps(__mmask16(lanes), v.v)));
+#else
+  store(p, v);
+#endif
+}
+/// The same lanes, of which there is one or more, and those that were left out as in `otherwise`; reads kLanes numbers.
+AR_HD Pack load_lanes(const float* p, [[maybe_unused]] uint32_t lanes, [[maybe_unused]] Pack otherwise) {
+#if AR_LANES == 16
+  return Pack((Pack::Raw)_mm512_mask_expand_ps(otherwise.v, __mmask16(lanes), load(p, Pack()).v));
+#else
+  return load(p, Pack());
+#endif
+}
+AR_HD int lanes_stored(uint32_t lanes, double) { return int(lanes); }
+AR_HD void store_lanes(double* p, uint32_t, double v) { *p = v; }
+AR_HD double load_lanes(const double* p, uint32_t, double) { return *p; }
+
 AR_HD PackIndex load_index(const int32_t* p, Pack) { return PackIndex::load(p); }
 AR_HD int32_t load_index(const int32_t* p, double) { return *p; }
 AR_HD void store_index(int32_t* p, PackIndex v) { v.store(p); }

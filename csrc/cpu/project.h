@@ -59,7 +59,7 @@ template <template <typename> class Cam, typename T> void project(const cpu::Pro
           p.radii[i] = 0;
         } else {
           if (p.channels.data) write_channels(p.channels, i, splat.color, depth);
-          if (p.given.data) splat.color = first_channels(p.given.row(int32_t(i)), p.given.count);
+          if (given_colors(p)) splat.color = first_channels(p.given.row(int32_t(i)), p.given.count);
         }
       }
       splats[j] = splat;
@@ -88,7 +88,6 @@ template <template <typename> class Cam, typename T> void project_rows(const cpu
         finite = splat_color(camera, g, i, coefficients_of(g.shs, g.sh_stride, i), splat.color);
         p.rows.colors[i] = finite ? splat.color : Vec3<T>{T(0), T(0), T(0)};
       }
-      if (touches && p.given.data) finite = finite && all_finite(p.given.row(int32_t(i)), p.given.count);
       if (touches && !finite) continue;
       p.radii[i] = radius;
       p.rows.means2d[i] = projected.mean;

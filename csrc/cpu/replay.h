@@ -1,4 +1,4 @@
-// The samples of a tile that move, on the way forwards and, for the backward pass, back again.
+// The samples of a tile that move, on the way forwards and, for the backward pass, once more.
 #pragma once
 
 #include <algorithm>
@@ -9,20 +9,60 @@
 
 namespace ar::AR_ISA {
 
-/// The state of a tile's samples besides their transmittance: nothing, unless P moves.
-template <class P, typename T, bool kMoves = P::kMoves> struct TileStates {
+/// Two numbers for every sample of a tile. Nothing, unless P moves.
+template <class P, typename T, bool kMoves = P::kMoves> struct TilePairs {};
+template <class P, typename T> struct TilePairs<P, T, true> {
   using V = typename LanesOf<T>::Type;
-  SampleState<V, false> at(int, int) const { return {}; }
-  void set(int, int, SampleState<V, false>) {}
-};
-template <class P, typename T> struct TileStates<P, T, true> {
-  using V = typename LanesOf<T>::Type;
-  alignas(64) T x[P::kSamples][kTilePixels] = {}, y[P::kSamples][kTilePixels] = {};
+  alignas(64) T x[P::kSamples][kTilePixels], y[P::kSamples][kTilePixels];
 
-  AR_HD SampleState<V, true> at(int s, int pixel) const { return {{load(x[s] + pixel, V()), load(y[s] + pixel, V())}}; }
-  AR_HD void set(int s, int pixel, const SampleState<V, true>& state) {
-    store(x[s] + pixel, state.moved.x);
-    store(y[s] + pixel, state.moved.y);
+  AR_HD Vec2<V> at(int s, int pixel) const { return {load(x[s] + pixel, V()), load(y[s] + pixel, V())}; }
+  AR_HD void set(int s, int pixel, Vec2<V> pair) {
+    store(x[s] + pixel, pair.x);
+    store(y[s] + pixel, pair.y);
+  }
+};
+
+/// Where the samples of a tile are, from the centres of their pixels [px], and where they may be. Nothing, unless P
+/// moves.
+template <class P, typename T, bool kMoves = P::kMoves> struct TilePlaces {};
+template <class P, typename T> struct TilePlaces<P, T, true> {
+  using V = typename LanesOf<T>::Type;
+  static constexpr int kCount = LanesOf<T>::kCount, kSamples = P::kSamples;
+  TilePairs<P, T> places;
+  Bounds<T> cells[kSamples];
+
+  TilePlaces() {
+    for (int s = 0; s < kSamples; ++s) {
+      std::fill_n(places.x[s], kTilePixels, T(P::node(s).x));
+      std::fill_n(places.y[s], kTilePixels, T(P::node(s).y));
+      cells[s] = P::template cell<T>(s);
+    }
+  }
+
+  AR_HD Bounds<V> bounds(int s) const {
+    return {{V(cells[s].lo.x), V(cells[s].lo.y)}, {V(cells[s].hi.x), V(cells[s].hi.y)}};
+  }
+
+  /// Samples that are composited together, one behind the other: as many as have their numbers in registers.
+  static constexpr int kGroup = kSamples % 4 == 0 ? 4 : kSamples % 3 == 0 ? 3 : 1;
+
+  /// The samples of a group in a pack of pixels.
+  struct Group {
+    Vec2<V> z[kGroup];    ///< whitened coordinates
+    V log_alpha[kGroup];  ///< to base 2
+  };
+
+  /// Looks at the samples from `first` on of the pixels with the whitened coordinates z. Whether alpha may reach its
+  /// minimum anywhere: no exponential is needed where it does not.
+  template <class Terms> AR_HD bool look(const Terms& terms, Vec2<V> z, int first, int pixel, Group& group) const {
+    V most = V(T(kLogAlphaMin - 1));
+    AR_UNROLL
+    for (int j = 0; j < kGroup; ++j) {
+      group.z[j] = P::whitened_node(terms, z, places.at(first + j, pixel));
+      group.log_alpha[j] = P::log_alpha(terms, group.z[j]);
+      most = max(most, group.log_alpha[j]);
+    }
+    return bits(most >= V(T(kLogAlphaMin))) != 0;
   }
 };
 
@@ -37,128 +77,174 @@ template <class P, typename T> struct ReplayTile {
   T* memory;  ///< cpu::kReplayNumbers numbers
 };
 
-/// What blend_vjp composites once more where samples move. Nothing, where they do not.
-template <class P, typename T, bool kMoves = P::kMoves> class Replay {
- public:
-  explicit Replay(const ReplayTile<P, T>&) {}
-  void enter(int32_t) {}
-  AR_HD uint32_t rows(int) const { return ~0u; }
-};
-
-/// Transmittance and displacements in front of every pair of a tile's list, from the last to the first.
+/// The alphas of every pair of a tile's list and the places of the samples in front of it, from the last pair to the
+/// first. Nothing, unless P moves.
 ///
-/// They cannot be had from those behind the pair, so the list is composited once more, and what every pair changes is
-/// logged: to go back is to take the changes back. Where the log is full it begins anew; the pairs before are
-/// composited again, from the nearest of a few states kept on the way, when the walk gets there. So memory does not
-/// depend on the list, and a list whose changes fit the log is composited once.
-template <class P, typename T> class Replay<P, T, true> {
+/// The places cannot be computed from those behind the pair, so the list is composited once more, and alphas and places
+/// are logged where a pair was composited: the walk back looks at nothing else, and needs no exponentials. Where the
+/// log is full it begins anew; the pairs before are composited again, from the nearest of a few states kept on the way,
+/// when the walk gets there. So memory does not depend on the list, and a list that fits the log is composited once.
+template <class P, typename T, bool kMoves = P::kMoves> class Replay {
   using V = typename LanesOf<T>::Type;
+  using Places = TilePlaces<P, T>;
   static constexpr int kCount = LanesOf<T>::kCount, kSamples = P::kSamples;
 
  public:
+  static constexpr int kGroup = Places::kGroup;
+
+  /// What the log has of a pair in a group of samples of a pack of pixels.
+  struct Found {
+    int first;              ///< sample of the group
+    const uint32_t* lanes;  ///< [kGroup] where the pair was composited
+    const T* numbers;       ///< of the next sample
+
+    /// opacity * I of the next sample of the group, zero where the pair was not composited, and its place in front of
+    /// the pair, where it was; elsewhere `rest`.
+    AR_HD void read(int j, Vec2<V> rest, V& raw, Vec2<V>& place) {
+      const int stored = lanes_stored(lanes[j], V());
+      raw = load_lanes(numbers, lanes[j], V(T(0)));
+      place = {load_lanes(numbers + stored, lanes[j], rest.x), load_lanes(numbers + 2 * stored, lanes[j], rest.y)};
+      numbers += 3 * stored;
+    }
+  };
+
   explicit Replay(const ReplayTile<P, T>& tile)
-      : tile_(tile), spacing_((tile.count + kStates - 1) / kStates), first_(tile.count) {
-    for (auto& plane : states_.transmittance) std::fill_n(plane, kTilePixels, T(1));
+      : tile_(tile), spacing_(std::max(kMinSpacing, (tile.count + kStates - 1) / kStates)), first_(tile.count) {
     if (tile.count > 0) composite(0, tile.count, true);
   }
 
-  /// Makes transmittance() and state() those in front of pair k: for every k from the last to the first.
+  /// Makes take() give what pair k found: for every k from the last to the first.
   void enter(int32_t k) {
-    if (k < first_) {
-      const int32_t kept = k / spacing_;
-      std::memcpy(&states_, kept_state(kept), sizeof states_);
-      composite(kept * spacing_, k + 1, false);
-    }
-    std::fill(std::begin(rows_), std::end(rows_), 0);
-    for (; changes_ > 0; --changes_) {
-      const Change& change = log()[changes_ - 1];
-      if (change.pair != k) return;
-      rows_[change.pixel % kTile / kCount] |= 1u << change.pixel / kTile;
-      for (int s = 0; s < kSamples; ++s) {
-        std::memcpy(states_.transmittance[s] + change.pixel, change.transmittance[s], sizeof change.transmittance[s]);
-        std::memcpy(states_.moved.x[s] + change.pixel, change.x[s], sizeof change.x[s]);
-        std::memcpy(states_.moved.y[s] + change.pixel, change.y[s], sizeof change.y[s]);
-      }
-    }
+    if (k >= first_) return;
+    const int32_t kept = k / spacing_;
+    samples_.places = kept_states()[kept];
+    composite(kept * spacing_, k + 1, false);
   }
-  /// Bit r: pack c of row r holds a sample that the pair was composited into.
-  AR_HD uint32_t rows(int c) const { return rows_[c]; }
-  AR_HD V transmittance(int s, int pixel) const { return load(states_.transmittance[s] + pixel, V()); }
-  AR_HD SampleState<V, true> state(int s, int pixel) const { return states_.moved.at(s, pixel); }
+
+  AR_HD Bounds<V> bounds(int s) const { return samples_.bounds(s); }
+
+  /// Whether there is anything to take of pair k, for which enter() was called.
+  AR_HD bool has(int32_t k) const { return entries_ != 0 && end_[-entries_].pair == k; }
+
+  /// The first pixel of the pack that take() is about, where has(k).
+  AR_HD int pixel() const { return end_[-entries_].pixel; }
+
+  /// A group of samples of this pack that the pair was composited into. The groups of a pack come one after the other.
+  AR_HD Found take() {
+    const Entry& entry = end_[-entries_--];
+    for (const uint32_t lanes : entry.lanes) top_ -= 3 * lanes_stored(lanes, V());
+    return {entry.first, entry.lanes, top_};
+  }
 
  private:
-  struct States {
-    alignas(64) T transmittance[kSamples][kTilePixels];
-    TileStates<P, T> moved;
+  struct Entry {
+    int32_t pair;
+    uint16_t pixel, first;
+    uint32_t lanes[kGroup];
   };
-  /// What a pair found in a pack of pixels.
-  struct Change {
-    int32_t pair, pixel;
-    T transmittance[kSamples][kCount], x[kSamples][kCount], y[kSamples][kCount];
-  };
-  static constexpr int32_t kStates = 16;  ///< kept on the way
+  using States = TilePairs<P, T>;
+  static constexpr int32_t kStates = 16;      ///< kept on the way
+  static constexpr int32_t kMinSpacing = 64;  ///< pairs between them
   static constexpr int64_t kBytes = cpu::kReplayNumbers * int64_t(sizeof(T));
-  static constexpr int64_t kMaxChanges = (kBytes - kStates * int64_t(sizeof(States))) / int64_t(sizeof(Change));
-  static constexpr int64_t kMaxOfPair = kTilePixels / kCount;
-  static_assert(kMaxChanges >= kMaxOfPair, "the log must hold what one pair changes");
+  static constexpr int64_t kPacksOfPair = kTilePixels / kCount;
+  static constexpr int64_t kBytesOfPair =
+      kPacksOfPair * int64_t(kSamples * (sizeof(Entry) + 3 * kCount * sizeof(T))) + kCount * int64_t(sizeof(T));
+  static_assert(kStates * int64_t(sizeof(States)) + kBytesOfPair <= kBytes, "the log must hold what one pair finds");
 
-  std::byte* kept_state(int32_t i) const { return reinterpret_cast<std::byte*>(tile_.memory) + i * sizeof(States); }
-  Change* log() const { return reinterpret_cast<Change*>(kept_state(kStates)); }
+  std::byte* memory() const { return reinterpret_cast<std::byte*>(tile_.memory); }
+  States* kept_states() const { return reinterpret_cast<States*>(memory()); }
+
+  /// The log. From its start, for every sample: the lanes of opacity * I and of the coordinates of its place. From its
+  /// end the entries.
+  void clear_log() {
+    top_ = reinterpret_cast<T*>(kept_states() + kStates);
+    end_ = reinterpret_cast<Entry*>(memory() + kBytes);
+    entries_ = 0;
+  }
+  bool log_is_full() const {
+    return reinterpret_cast<std::byte*>(end_ - entries_) - reinterpret_cast<std::byte*>(top_) < kBytesOfPair;
+  }
 
   /// From the states in front of pair `from` to those behind pair `to` - 1.
   void composite(int32_t from, int32_t to, bool keep) {
     const cpu::BlendVjpParams<T>& p = tile_.params;
     const TileView& view = tile_.view;
-    const LaneIndex<T> lanes;
-    const uint32_t rows_in_image = (1u << view.rows) - 1;
+    const int32_t* pairs = p.lists.pairs + tile_.begin;
     first_ = from;
-    changes_ = 0;
-    for (int32_t k = from; k < to; ++k) {
-      if (keep && k % spacing_ == 0) std::memcpy(kept_state(k / spacing_), &states_, sizeof states_);
-      if (changes_ + kMaxOfPair > kMaxChanges) first_ = k, changes_ = 0;
-      const auto splat = reinterpret_cast<const Splat<P, T>*>(p.splats)[p.lists.pairs[tile_.begin + k]];
-      const TileMask<T> reach = reach_of(splat, view, lanes);
-      const auto terms = P::terms(splat.shape, splat.opacity, {T(view.x0) - splat.mean.x, T(view.y0) - splat.mean.y});
-      const IndexOf<V> index(k);
-      for (int c = 0; c < TileMask<T>::kPacks; ++c) {
-        const V x = load(lanes.value + c * kCount, V());
-        for (uint32_t rows = reach.rows[c] & rows_in_image; rows != 0; rows &= rows - 1) {
-          const int row = __builtin_ctz(rows), pixel = row * kTile + c * kCount;
-          if (k >= tile_.row_last[row]) continue;
-          const Vec2<V> at = {x, V(lanes.value[row])};
-          V t[kSamples];
-          SampleState<V, true> states[kSamples];
-          uint32_t composited = 0;
-          AR_UNROLL
-          for (int s = 0; s < kSamples; ++s) {
-            t[s] = transmittance(s, pixel);
-            states[s] = state(s, pixel);
-            const MaskOf<V> before = index < load_index(tile_.last[s] + pixel, V());
-            composited |= bits(replay_sample<P>(terms, at, s, before, t[s], states[s]));
-          }
-          if (composited == 0) continue;
-          Change& change = log()[changes_];
-          for (int s = 0; s < kSamples; ++s) {
-            std::memcpy(change.transmittance[s], states_.transmittance[s] + pixel, sizeof change.transmittance[s]);
-            std::memcpy(change.x[s], states_.moved.x[s] + pixel, sizeof change.x[s]);
-            std::memcpy(change.y[s], states_.moved.y[s] + pixel, sizeof change.y[s]);
-            store(states_.transmittance[s] + pixel, t[s]);
-            states_.moved.set(s, pixel, states[s]);
-          }
-          change.pair = k;
-          change.pixel = pixel;
-          ++changes_;
-        }
+    clear_log();
+    TileSplat<P, T> batch[kBatch];
+    for (int32_t first = from; first < to; first += kBatch) {
+      const int count = std::min(kBatch, to - first);
+      uint32_t open_rows = 0;  // a sample was composited into later, which rows outside the image never are
+      for (int row = 0; row < kTile; ++row) open_rows |= uint32_t(first < tile_.row_last[row]) << row;
+      for (int i = 0; i < count; ++i) {
+        if (first + i + kPrefetch < to) prefetch_splat(p.splats, pairs[first + i + kPrefetch]);
+        batch[i] = tile_splat<P, T>(p.splats, pairs[first + i], nullptr, view, lanes_);
+      }
+      for (int32_t k = first; k < first + count; ++k) {
+        if (keep && k % spacing_ == 0) kept_states()[k / spacing_] = samples_.places;
+        if (log_is_full()) first_ = k, clear_log();
+        find(batch[k - first], k, open_rows);
       }
     }
   }
 
+  /// Composites pair k, and logs what it finds.
+  AR_HD void find(const TileSplat<P, T>& splat, int32_t k, uint32_t open_rows) {
+    const auto& terms = splat.terms;
+    T* top = top_;
+    const IndexOf<V> index(k);
+    for (int c = 0; c < TileMask<T>::kPacks; ++c) {
+      const V x = load(lanes_.value + c * kCount, V());
+      for (uint32_t rows = splat.reach.rows[c] & open_rows; rows != 0; rows &= rows - 1) {
+        const int row = __builtin_ctz(rows), pixel = row * kTile + c * kCount;
+        const Vec2<V> z = P::whitened(terms, Vec2<V>{x, V(lanes_.value[row])}, 0);
+        for (int group_first = 0; group_first < kSamples; group_first += kGroup) {
+          typename Places::Group group;
+          if (!samples_.look(terms, z, group_first, pixel, group)) continue;
+          Entry& entry = end_[-entries_ - 1];
+          uint32_t composited = 0;
+          AR_UNROLL
+          for (int j = 0; j < kGroup; ++j) {
+            const int s = group_first + j;
+            const V raw = exp2(group.log_alpha[j]);
+            const MaskOf<V> mask = (raw >= V(T(kAlphaMin))) & (index < load_index(tile_.last[s] + pixel, V()));
+            const uint32_t lanes = bits(mask);
+            entry.lanes[j] = lanes;
+            if (lanes == 0) continue;
+            const V found = select(mask, raw, V(T(0)));
+            const Vec2<V> place = samples_.places.at(s, pixel);
+            const int stored = lanes_stored(lanes, V());
+            store_lanes(top, lanes, found);
+            store_lanes(top + stored, lanes, place.x);
+            store_lanes(top + 2 * stored, lanes, place.y);
+            top += 3 * stored;
+            composited |= lanes;
+            samples_.places.set(s, pixel,
+                                P::move_in(terms, group.z[j], min(found, V(T(kAlphaMax))), place, samples_.bounds(s)));
+          }
+          entry.pair = k;
+          entry.pixel = pixel;
+          entry.first = group_first;
+          entries_ += composited != 0;
+        }
+      }
+    }
+    top_ = top;
+  }
+
   ReplayTile<P, T> tile_;
-  States states_;
+  LaneIndex<T> lanes_;
+  TilePlaces<P, T> samples_;
   int32_t spacing_;
   int32_t first_;  ///< pair that the log begins with
-  int64_t changes_ = 0;
-  uint32_t rows_[TileMask<T>::kPacks] = {};
+  T* top_;
+  Entry* end_;
+  int64_t entries_ = 0;
+};
+template <class P, typename T> class Replay<P, T, false> {
+ public:
+  explicit Replay(const ReplayTile<P, T>&) {}
 };
 
 }  // namespace ar::AR_ISA

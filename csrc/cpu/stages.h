@@ -35,7 +35,7 @@ template <typename T> struct ProjectParams : ar::ProjectParams<T> {
   T* depths;               ///< [candidates] camera-space z
 };
 
-/// Uses of ar::ProjectParams the camera, the Gaussians, the footprint, `radii` and `given`.
+/// Uses of ar::ProjectParams the camera, the Gaussians, the footprint and `radii`.
 template <typename T> struct ProjectRowsParams : ar::ProjectParams<T> {
   CullBounds<T> bounds;
   int threads;

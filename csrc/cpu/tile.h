@@ -102,6 +102,33 @@ template <class P, typename T> AR_HD Splat<P, T> splat_at(const T* splats, int32
   return splat;
 }
 
+/// So many pairs before a splat is read, its row is asked for.
+inline constexpr int kPrefetch = 16;
+
+/// Asks for row j of `splats`, which may lie in two lines of the cache.
+template <typename T> AR_HD void prefetch_splat(const T* splats, int32_t j) {
+  const T* row = splats + int64_t(j) * kSplatWidth;
+  __builtin_prefetch(row);
+  __builtin_prefetch(row + kSplatWidth - 1);
+}
+
+/// So many pairs of a list are prepared, then composited: where the loops over pixels branch is known before they come.
+inline constexpr int kBatch = 16;
+
+/// A splat in a tile.
+template <class P, typename T> struct TileSplat {
+  Splat<P, T> splat;
+  decltype(P::terms(splat.shape, T(1), Vec2<T>{})) terms;
+  TileMask<T> reach;
+};
+template <class P, typename T>
+AR_HD TileSplat<P, T> tile_splat(const T* splats, int32_t j, const RowAdapter<P, T>* adapter, const TileView& view,
+                                 const LaneIndex<T>& lanes) {
+  const Splat<P, T> splat = splat_at(splats, j, adapter);
+  const Vec2<T> origin = {T(view.x0) - splat.mean.x, T(view.y0) - splat.mean.y};
+  return {splat, P::terms(splat.shape, splat.opacity, origin), reach_of(splat, view, lanes)};
+}
+
 /// visit(P{}, adapter) for what footprint F blends a tile with: its own pixels, or for `adaptive` those of the samples
 /// that were chosen. Boxes are the lists of adaptive.h.
 template <class F, class Boxes, typename T, class Visit>

@@ -77,7 +77,7 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
     const int32_t id = __shfl_sync(kAllLanes, i, source);
     int64_t place = __shfl_sync(kAllLanes, begin, source);
     const Support<float> support = support_of(splats[id], params.footprint);
-    const Range rows = clamp_range(rows_of(support), params.grid.height), tile_rows = tiles_of(rows);
+    const Range rows = clamp_range(rows_of(support), params.grid.height), tile_rows = tiles_of(rows, params.grid);
     for (int first = tile_rows.first; first <= tile_rows.last; first += 32) {
       const int row = first + lane_id();
       const Range range = row <= tile_rows.last ? tile_columns_of(support, params.grid, rows, row) : Range{0, -1};

@@ -3,16 +3,41 @@
 
 #include "cuda/blend.cuh"
 #include "cuda/blend_groups.cuh"
+#include "cuda/blend_moving.cuh"
 #include "cuda/blend_segments.cuh"
 #include "cuda/choose_samples.cuh"
 #include "cuda/inspect.cuh"
 
 namespace ar::cuda {
 
-bool blends_groups(int footprint, int64_t channels) {
+namespace {
+
+template <class F, int C> void launch_moving_blend(const BlendParams& p, int first, cudaStream_t stream) {
+  choose_layout<F, C, false>(p.grid, [&](auto layout) {
+    using Layout = decltype(layout);
+    moving_blend_kernel<F, C, Layout><<<unsigned(p.grid.tiles()), Layout::kThreads, 0, stream>>>(p, first);
+  });
+}
+template <class F> void blend_moving(const BlendParams& p, cudaStream_t stream) {
+  if (!p.channels.data) return launch_moving_blend<F, 3>(p, 0, stream);
+  if (p.channels.count <= kFewChannels) return launch_moving_blend<F, 4>(p, 0, stream);
+  for (int first = 0; first < p.channels.count; first += kMovingChannels)
+    launch_moving_blend<F, kMovingChannels>(p, first, stream);
+}
+
+bool always_whole_lists(int footprint) {
   bool always = false;
-  visit_footprint(footprint, Footprints{}, [&](auto f) { always = kOnlyGroups<decltype(f)>; });
-  return always || channels > kFewChannels;
+  visit_footprint(footprint, Footprints{}, [&](auto f) {
+    using F = decltype(f);
+    always = F::kYardstick || F::kMoves;
+  });
+  return always;
+}
+
+}  // namespace
+
+bool blends_whole_lists(int footprint, int64_t channels) {
+  return always_whole_lists(footprint) || channels > kFewChannels;
 }
 
 int64_t max_state_planes(int footprint, int64_t capacity) {
@@ -26,9 +51,7 @@ int64_t max_state_planes(int footprint, int64_t capacity) {
 
 int list_segments(int footprint, int64_t channels, TileGrid grid) {
   constexpr int64_t kBlocks = 1056, kMost = 16;  // eight for each SM of a large device
-  bool only_groups = false;
-  visit_footprint(footprint, Footprints{}, [&](auto f) { only_groups = kOnlyGroups<decltype(f)>; });
-  if (only_groups || channels <= kFewChannels || 2 * grid.tiles() > kBlocks) return 1;
+  if (always_whole_lists(footprint) || channels <= kFewChannels || 2 * grid.tiles() > kBlocks) return 1;
   return int(std::min(kMost, kBlocks / grid.tiles()));
 }
 
@@ -37,12 +60,16 @@ void choose_samples(const ChooseParams& p, cudaStream_t stream) { launch_choose_
 void blend(int footprint, const BlendParams& p, const BlendParams* cut, cudaStream_t stream) {
   visit_tile_footprints<AdaptiveBoxes>(footprint, stream, [&](auto f, cudaStream_t side) {
     using F = decltype(f);
-    if constexpr (!kOnlyGroups<F>) {
-      if (!p.channels.data) return blend_few<F, 3>(p, side);
-      if (p.channels.count <= kFewChannels) return blend_few<F, 4>(p, side);
-      if (p.segments.count > 1) return blend_segments<F>(p, *cut, side);
+    if constexpr (F::kMoves) {
+      blend_moving<F>(p, side);
+    } else {
+      if constexpr (!F::kYardstick) {
+        if (!p.channels.data) return blend_few<F, 3>(p, side);
+        if (p.channels.count <= kFewChannels) return blend_few<F, 4>(p, side);
+        if (p.segments.count > 1) return blend_segments<F>(p, *cut, side);
+      }
+      blend_groups<F>(with_channels(p), side);
     }
-    blend_groups<F>(with_channels(p), side);
   });
 }
 

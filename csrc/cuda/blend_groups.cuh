@@ -1,8 +1,6 @@
 // Kernel of blend for any number of channels, in groups of 32: a block per tile and group walks the whole list, a pixel
 // per lane. The weights are worked out again for every group, which costs less than to keep them. The yardsticks use it
-// for any number of channels, as their weights are slow anyway, and so do footprints whose samples move: what a chunk
-// of the list does to a sample depends on the displacement that enters it, so that chunks cannot be blended side by
-// side.
+// for any number of channels, as their weights are slow anyway.
 #pragma once
 
 #include "cuda/composite.cuh"
@@ -50,64 +48,6 @@ __device__ inline void add_channels(float contribution, const float4 (&values)[k
 
 inline constexpr int kGroupBatch = 128;
 
-/// Whether F is blended by these kernels whatever the number of channels.
-template <class F> inline constexpr bool kOnlyGroups = F::kYardstick || F::kMoves;
-
-/// Where the checkpoints of a tile's samples that move are: the one in front of pair i spacing, i > 0, is number first
-/// + i - 1. With too many pairs the tiles share equally what room there is.
-struct StatePlaces {
-  int64_t first;
-  int spacing;  ///< a multiple of kStateChunk
-
-  __device__ StatePlaces(const TileLists& lists, const TileList& list, TileGrid grid, int tile)
-      : first(list.overflow ? 0 : lists.tile_offsets[tile] / kStateChunk), spacing(kStateChunk) {
-    if (!list.overflow) return;
-    const int64_t room = lists.capacity / kStateChunk / grid.tiles();
-    first = tile * room;
-    spacing = int(((list.count - 1) / (room + 1) / kStateChunk + 1) * kStateChunk);
-  }
-};
-
-/// The samples of a lane's pixel, for the backward pass of a footprint whose samples move.
-template <class F> struct MovingSamples {
-  static constexpr int S = F::kSamples;
-  float transmittance[S];
-  SampleState<float, F::kMoves> states[S];
-
-  /// Checkpoint `number` of a thread.
-  __device__ static int64_t place(int64_t number, int s) {
-    return (number * state_planes(S) + 3 * s) * kTilePixels + threadIdx.x;
-  }
-  __device__ void store(float* checkpoints, int64_t number) const {
-#pragma unroll
-    for (int s = 0; s < S; ++s) {
-      float* to = checkpoints + place(number, s);
-      to[0] = abs(transmittance[s]);
-      to[kTilePixels] = states[s].moved.x;
-      to[2 * kTilePixels] = states[s].moved.y;
-    }
-  }
-  /// In front of pair k, a multiple of the spacing.
-  __device__ void load(const float* checkpoints, const StatePlaces& places, int k) {
-#pragma unroll
-    for (int s = 0; s < S; ++s) {
-      if (k == 0) {
-        transmittance[s] = 1;
-        states[s] = {};
-      } else {
-        const float* from = checkpoints + place(places.first + k / places.spacing - 1, s);
-        transmittance[s] = from[0];
-        states[s].moved = {from[kTilePixels], from[2 * kTilePixels]};
-      }
-    }
-  }
-  /// To behind pair k. `last`: pairs up to the last one that each sample composited.
-  __device__ void pass(const typename F::template Terms<float>& terms, Vec2<float> p, int k, const int (&last)[S]) {
-#pragma unroll
-    for (int s = 0; s < S; ++s) replay_sample<F>(terms, p, s, k < last[s], transmittance[s], states[s]);
-  }
-};
-
 template <class F>
 __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4   ? 1
                                                  : F::kSamples > 1 ? 2
@@ -123,12 +63,10 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4   ? 1
   const TileList list = list_of(params.lists, params.grid, tile);
   const Vec2<float> p = pixel_of(threadIdx.x / 32, lane);
   const Pixel pixel(list, params.grid, p);
-  MovingSamples<F> samples;
-  auto& transmittance = samples.transmittance;
-  float sums[kChannelGroup];
+  float transmittance[S], sums[kChannelGroup];
   int last[S];
 #pragma unroll
-  for (int s = 0; s < S; ++s) transmittance[s] = pixel.inside ? 1.0f : -1.0f, samples.states[s] = {}, last[s] = 0;
+  for (int s = 0; s < S; ++s) transmittance[s] = pixel.inside ? 1.0f : -1.0f, last[s] = 0;
 #pragma unroll
   for (int c = 0; c < kChannelGroup; ++c) sums[c] = 0;
   const auto open = [&] {
@@ -138,11 +76,6 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4   ? 1
     return any;
   };
   for (int k = 0; k < list.count && __syncthreads_or(open()); k += kGroupBatch) {
-    if constexpr (F::kMoves) {
-      const StatePlaces places(params.lists, list, params.grid, tile);
-      if (first == 0 && params.transmittance && k > 0 && k % places.spacing == 0)
-        samples.store(params.checkpoints, places.first + k / places.spacing - 1);
-    }
     const int count = stage.load(splats, params.channels, list, k, list.count);
     if (int(threadIdx.x) < count) staged.ids[threadIdx.x] = list.splat(k + threadIdx.x);
     __syncthreads();
@@ -156,7 +89,7 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4   ? 1
         float contribution = 0;
 #pragma unroll
         for (int s = 0; s < S; ++s) {
-          const Blended<float> b = blend_sample<F>(splat.terms, p, s, transmittance[s], samples.states[s]);
+          const Blended<float> b = blend_sample(F::alpha(splat.terms, p, s), transmittance[s]);
           contribution += b.contribution;
           last[s] = b.mask ? k + j + 1 : last[s];
         }

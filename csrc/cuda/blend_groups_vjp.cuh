@@ -4,9 +4,6 @@
 // dL/dalpha is linear in the gradient of the image: each group adds its share to the six sums of a pair, which a single
 // block owns. Only MeanSums need the channels of all groups at once: where they are wanted, the
 // first group makes all sums, and reads the channels of the others where they lie.
-//
-// Samples that move are composited again from the nearest checkpoint in front of each batch, since their state in front
-// of a splat cannot be had from that behind it.
 #pragma once
 
 #include "cuda/blend_segments.cuh"
@@ -15,8 +12,6 @@ namespace ar::cuda {
 
 /// Splats that a block takes between barriers: many, as its warps do not all meet equally many of them.
 inline constexpr int kVjpBatch = 64;
-/// Splats between which the states of samples that move are kept at once, per thread.
-inline constexpr int kReplayPart = 16;
 /// Sums of a pair besides its channels: PairGrad, and MeanSums.
 inline constexpr int kShapeSums = 8;
 
@@ -47,13 +42,6 @@ __device__ inline float dot(const float (&g)[kChannelGroup], const float4 (&valu
   return (sum[0] + sum[1]) + (sum[2] + sum[3]);
 }
 
-/// The tile of block `block` of a kernel for tiles with S samples; -1 if there is none.
-template <int S> __device__ int listed_tile(const BlendVjpParams& params, int block) {
-  const SampleParts& tiles = params.plan->counts.chunks;  // a chunk is a tile's whole list
-  const int place = tiles.first[sample_class(S)] + block;
-  return place < tiles.first[sample_class(S) + 1] ? params.chunk_order[place].tile : -1;
-}
-
 /// The gradient of a pixel with respect to a channel of one of its S samples.
 struct SampleGradient {
   const BlendVjpParams& params;
@@ -65,13 +53,6 @@ struct SampleGradient {
     return pixel.inside && plane ? 1.0f / samples * plane[pixel.index] : 0.0f;
   }
 };
-
-/// Where the batch that ends at k1 begins, in a segment that begins at `begin`. That of samples that move begins where
-/// a checkpoint may be.
-template <class F> __device__ int batch_begin(int k1, int begin) {
-  static_assert(kStateChunk % kVjpBatch == 0);
-  return F::kMoves ? (max(k1, 1) - 1) / kVjpBatch * kVjpBatch : max(k1 - kVjpBatch, begin);
-}
 
 template <class F>
 __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
@@ -149,41 +130,15 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
 
   // The splat of this thread in the batch that ends at k1, for the threads that there are splats for.
   const auto splat_of_batch = [&](int k1) {
-    const int k = batch_begin<F>(k1, segment.begin) + int(threadIdx.x);
+    const int k = max(k1 - kVjpBatch, segment.begin) + int(threadIdx.x);
     return threadIdx.x < kVjpBatch && k < k1 ? list.splat(k) : -1;
   };
-  // What samples that move need besides: nothing is stored of the others.
-  constexpr int kParts = F::kMoves ? 32 / kReplayPart : 1;  // of 32 splats
-  MovingSamples<F> samples, at_part[F::kMoves ? kVjpBatch / kReplayPart : 1], in_front[F::kMoves ? kReplayPart : 1];
-  Vec2<float> dL_dmoved[S] = {};
   // Those of the staged splats [from, from + 32) that reach this warp's subtile.
   const auto reached = [&](int from) { return __ballot_sync(kAllLanes, shared.reach[from + lane] >> warp & 1); };
   int turn = 0, id = splat_of_batch(segment.end);
-  for (int k1 = segment.end; k1 > segment.begin; k1 = batch_begin<F>(k1, segment.begin)) {
-    const int k0 = batch_begin<F>(k1, segment.begin), count = k1 - k0;
+  for (int k1 = segment.end; k1 > segment.begin; k1 = max(k1 - kVjpBatch, segment.begin)) {
+    const int k0 = max(k1 - kVjpBatch, segment.begin), count = k1 - k0;
     const int32_t next_id = splat_of_batch(k0);
-    if constexpr (F::kMoves) {  // from the checkpoint to the batch
-      const StatePlaces places(params.lists, list, params.grid, tile);
-      int k = k0 / places.spacing * places.spacing;
-      samples.load(params.checkpoints, places, k);
-      for (; k < k0; k += kVjpBatch) {
-        __syncthreads();
-        if (threadIdx.x < kVjpBatch) {
-          const int t = threadIdx.x;
-          const Splat<F, float> splat = splats[list.splat(k + t)];
-          const uint32_t reach = subtile_reach(support_of(splat), list.x0, list.y0);
-          if (reach) shared.splats[t] = {tile_terms(splat, list), {}};
-          shared.reach[t] = uint8_t(reach);
-        }
-        __syncthreads();
-        for (int from = 0; from < kVjpBatch; from += 32) {
-          for (uint32_t mask = reached(from); mask != 0; mask &= mask - 1) {
-            const int j = from + __ffs(mask) - 1;
-            samples.pass(shared.splats[j].terms, p, k + j, last);
-          }
-        }
-      }
-    }
     __syncthreads();  // all have read what the last batch left
     if (threadIdx.x < kVjpBatch) {
       uint32_t reach = 0;
@@ -208,90 +163,53 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
       prefetch(params.channels.row(next_id) + first);
     }
     id = next_id;
-    if constexpr (F::kMoves) {  // to the parts of the batch
-      for (int q = 0; q < kVjpBatch / kReplayPart; ++q) {
-        at_part[q] = samples;
-        const int from = q * kReplayPart / 32 * 32, low = q % kParts * kReplayPart;
-        for (uint32_t mask = reached(from) >> low & ((1u << kReplayPart) - 1); mask != 0; mask &= mask - 1) {
-          const int j = from + low + __ffs(mask) - 1;
-          samples.pass(shared.splats[j].terms, p, k0 + j, last);
-        }
-      }
-    }
     for (int part = kVjpBatch / 32 - 1; part >= 0; --part) {
-      uint32_t hits = 0;
-      const uint32_t all = reached(32 * part);
-      for (int sub = kParts - 1; sub >= 0; --sub) {
-        uint32_t mask = all;
-        if constexpr (F::kMoves) {  // the states in front of each splat
-          mask &= ((1u << kReplayPart) - 1) << (kReplayPart * sub);
-          samples = at_part[part * kParts + sub];
-          for (uint32_t ahead = mask; ahead != 0; ahead &= ahead - 1) {
-            const int bit = __ffs(ahead) - 1;
-            in_front[bit % kReplayPart] = samples;
-            samples.pass(shared.splats[32 * part + bit].terms, p, k0 + 32 * part + bit, last);
-          }
-        }
-        while (mask != 0) {
-          const int bit = 31 - __clz(mask), j = 32 * part + bit;
-          mask ^= 1u << bit;
-          TileSplatRef<F, 0> splat = shared.splats[j];
-          float alpha[S];
-          bool any = false;
+      uint32_t hits = 0, mask = reached(32 * part);
+      while (mask != 0) {
+        const int bit = 31 - __clz(mask), j = 32 * part + bit;
+        mask ^= 1u << bit;
+        TileSplatRef<F, 0> splat = shared.splats[j];
+        float alpha[S];
+        bool any = false;
 #pragma unroll
-          for (int s = 0; s < S; ++s) {
-            if constexpr (F::kMoves) {
-              alpha[s] = F::alpha(splat.terms, p + in_front[bit % kReplayPart].states[s].moved, s);
-            } else {
-              alpha[s] = F::alpha(splat.terms, p, s);
-            }
-            any |= alpha[s] >= float(kAlphaMin) && k0 + j < last[s];
-          }
-          if (!__any_sync(kAllLanes, any)) continue;
-          hits |= 1u << bit;
-          float g_color = dot(g, shared.channels.values[j]);
-          if (all_at_once && group == 0) {
-            const float* row = params.channels.row(shared.channels.ids[j]);
-            for (int c = kChannelGroup; c < channel_count; ++c) g_color = madd(gradient(c), row[c], g_color);
-          }
-          ShapeGrad<float> shape = {{0, 0}, {0, 0, 0}};
-          float weighted = 0, contribution = 0;
-#pragma unroll
-          for (int s = 0; s < S; ++s) {
-            if constexpr (F::kMoves) {
-              const MovingSamples<F>& front = in_front[bit % kReplayPart];
-              const MovingBlendGrad<float> grad =
-                  blend_moving_sample_vjp<F>(splat.terms, p, s, k0 + j < last[s], g_color, front.transmittance[s],
-                                             front.states[s], behind[s], dL_dmoved[s]);
-              shape = shape + grad.of_splat.sums;
-              contribution += grad.contribution;
-              weighted += grad.of_splat.weighted;
-            } else {
-              const bool hit = alpha[s] >= float(kAlphaMin) && k0 + j < last[s];
-              const BlendGrad<float> grad = blend_sample_vjp(hit, alpha[s], g_color, transmittance[s], behind[s]);
-              if (with_shape) F::add_alpha_vjp(splat.terms, p, s, alpha[s], grad.dL_dalpha, shape);
-              contribution += grad.contribution;
-              weighted += grad.dL_dalpha * alpha[s];
-            }
-          }
-          turn ^= 1;
-          reinterpret_cast<float*>(shared.contributions[warp][turn])[lane] = contribution;
-          float* sums = shared.sums[warp][j];
-          if (with_shape) {
-            Vec2<float> means = {0, 0};
-            if (with_means) {
-              const Vec2<float> size = {float(params.grid.width), float(params.grid.height)};
-              means = mean_sums_of(params.mean_sums, size, transform_transposed(shared.mean_maps[j], shape.offset));
-            }
-            shape = F::collect(splat.terms, shape, weighted);
-            const float values[kShapeSums] = {shape.offset.x, shape.offset.y, shape.shape.xx, shape.shape.xy,
-                                              shape.shape.yy, weighted,       means.x,        means.y};
-            const float sum = sum_values(values);
-            if (lane % 4 == 0) sums[kChannelGroup + lane / 4] = sum;
-          }
-          __syncwarp();
-          sums[lane] = dot(g_channel, shared.contributions[warp][turn]);
+        for (int s = 0; s < S; ++s) {
+          alpha[s] = F::alpha(splat.terms, p, s);
+          any |= alpha[s] >= float(kAlphaMin) && k0 + j < last[s];
         }
+        if (!__any_sync(kAllLanes, any)) continue;
+        hits |= 1u << bit;
+        float g_color = dot(g, shared.channels.values[j]);
+        if (all_at_once && group == 0) {
+          const float* row = params.channels.row(shared.channels.ids[j]);
+          for (int c = kChannelGroup; c < channel_count; ++c) g_color = madd(gradient(c), row[c], g_color);
+        }
+        ShapeGrad<float> shape = {{0, 0}, {0, 0, 0}};
+        float weighted = 0, contribution = 0;
+#pragma unroll
+        for (int s = 0; s < S; ++s) {
+          const bool hit = alpha[s] >= float(kAlphaMin) && k0 + j < last[s];
+          const BlendGrad<float> grad = blend_sample_vjp(hit, alpha[s], g_color, transmittance[s], behind[s]);
+          if (with_shape) F::add_alpha_vjp(splat.terms, p, s, alpha[s], grad.dL_dalpha, shape);
+          contribution += grad.contribution;
+          weighted += grad.dL_dalpha * alpha[s];
+        }
+        turn ^= 1;
+        reinterpret_cast<float*>(shared.contributions[warp][turn])[lane] = contribution;
+        float* sums = shared.sums[warp][j];
+        if (with_shape) {
+          Vec2<float> means = {0, 0};
+          if (with_means) {
+            const Vec2<float> size = {float(params.grid.width), float(params.grid.height)};
+            means = mean_sums_of(params.mean_sums, size, transform_transposed(shared.mean_maps[j], shape.offset));
+          }
+          shape = F::collect(splat.terms, shape, weighted);
+          const float values[kShapeSums] = {shape.offset.x, shape.offset.y, shape.shape.xx, shape.shape.xy,
+                                            shape.shape.yy, weighted,       means.x,        means.y};
+          const float sum = sum_values(values);
+          if (lane % 4 == 0) sums[kChannelGroup + lane / 4] = sum;
+        }
+        __syncwarp();
+        sums[lane] = dot(g_channel, shared.contributions[warp][turn]);
       }
       if (lane == 0) shared.hits[warp][part] = hits;
     }
@@ -357,8 +275,10 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
 
 template <class F> void blend_vjp_groups(const BlendVjpParams& p, int group, cudaStream_t stream) {
   const unsigned blocks = unsigned(p.grid.tiles() * p.segments.count);
-  if constexpr (!kOnlyGroups<F>) {
-    if (p.segments.count > 1) segment_shown_kernel<F><<<blocks, kBlendThreads, 0, stream>>>(p, group);
+  if constexpr (!F::kYardstick) {
+    // Only the sums of shapes read what it writes. With MeanSums the first group makes them for all channels.
+    const bool with_shape = group == 0 || p.mean_sums == MeanSums::kNone;
+    if (p.segments.count > 1 && with_shape) segment_shown_kernel<F><<<blocks, kBlendThreads, 0, stream>>>(p, group);
   }
   const auto kernel = blend_groups_vjp_kernel<F>;
   const int bytes = int(sizeof(GroupVjpShared<F>));

@@ -1,5 +1,6 @@
 // Launches of blend_vjp.
 #include "cuda/blend_groups_vjp.cuh"
+#include "cuda/blend_moving_vjp.cuh"
 #include "cuda/blend_vjp.cuh"
 
 namespace ar::cuda {
@@ -17,17 +18,39 @@ __global__ void clear_splat_sums_kernel(const BlendVjpParams params, int group) 
   if (params.channel_sums) clear(params.channel_sums, kChannelGroup);
 }
 
+template <class F, int C> void launch_moving_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
+  choose_layout<F, C, true>(p.grid, [&](auto layout) {
+    using Layout = decltype(layout);
+    const auto kernel = moving_vjp_kernel<F, C, Layout>;
+    constexpr int kBytes = int(sizeof(MovingVjpShared<F, C, Layout>));
+    if (kBytes > 48 * 1024) cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, kBytes);
+    kernel<<<unsigned(p.grid.tiles()), Layout::kThreads, kBytes, stream>>>(p, first);
+  });
+}
+/// `group`: which kChannelGroup channels; 0 where they are few.
+template <class F> void blend_vjp_moving(const BlendVjpParams& p, int group, cudaStream_t stream) {
+  if (!p.channels.data) return launch_moving_vjp<F, 3>(p, 0, stream);
+  if (p.channels.count <= kFewChannels) return launch_moving_vjp<F, 4>(p, 0, stream);
+  const int end = std::min((group + 1) * kChannelGroup, p.channels.count);
+  for (int first = group * kChannelGroup; first < end; first += kMovingChannels)
+    launch_moving_vjp<F, kMovingChannels>(p, first, stream);
+}
+
 }  // namespace
 
 void blend_vjp(int footprint, const BlendVjpParams& p, int group, cudaStream_t stream) {
   clear_splat_sums_kernel<<<kClearBlocks, kBlendThreads, 0, stream>>>(p, group);
   visit_tile_footprints<AdaptiveBoxesVjp>(footprint, stream, [&](auto f, cudaStream_t side) {
     using F = decltype(f);
-    if constexpr (!kOnlyGroups<F>) {
-      if (!p.channels.data) return blend_vjp_few<F, 3>(p, side);
-      if (p.channels.count <= kFewChannels) return blend_vjp_few<F, 4>(p, side);
+    if constexpr (F::kMoves) {
+      blend_vjp_moving<F>(p, group, side);
+    } else {
+      if constexpr (!F::kYardstick) {
+        if (!p.channels.data) return blend_vjp_few<F, 3>(p, side);
+        if (p.channels.count <= kFewChannels) return blend_vjp_few<F, 4>(p, side);
+      }
+      blend_vjp_groups<F>(with_channels(p), group, side);
     }
-    blend_vjp_groups<F>(with_channels(p), group, side);
   });
 }
 

@@ -37,8 +37,8 @@ struct TileList {
 
 __device__ inline TileList list_of(const TileLists& lists, TileGrid grid, int tile) {
   TileList list;
-  list.x0 = tile % grid.columns() * kTile;
-  list.y0 = tile / grid.columns() * kTile;
+  list.x0 = tile % grid.columns() << grid.tile_bits;
+  list.y0 = tile / grid.columns() << grid.tile_bits;
   list.overflow = lists.counts->pairs > lists.capacity;
   list.stride = list.overflow ? 1 : lists.stride;
   const int64_t first = list.overflow ? 0 : lists.tile_offsets[tile];
@@ -91,23 +91,23 @@ template <class F, int C> struct alignas(16) TileSplat {
 template <class F, int C>
 using TileSplatRef = std::conditional_t<sizeof(TileSplat<F, C>) <= 112, const TileSplat<F, C>, const TileSplat<F, C>&>;
 
-/// The channels of a splat: three lie in it; of four, those that there are in rows, and zeros.
+/// The channels of a splat: three lie in it; of more, those that there are in rows from `first` on, and zeros.
 template <int C, class F>
-__device__ Values<C> channels_of(const Channels<float>& channels, const Splat<F, float>& splat, int32_t id) {
+__device__ Values<C> channels_of(const Channels<float>& channels, const Splat<F, float>& splat, int32_t id,
+                                 int first = 0) {
   if constexpr (C == 0) {
     return {};
   } else if constexpr (C == 3) {
     return {{splat.color.x, splat.color.y, splat.color.z}};
   } else {
-    static_assert(C == 4);
-    const float* row = channels.row(id);
-    if (channels.count == 4 && reinterpret_cast<uintptr_t>(channels.data) % 16 == 0) {
+    const float* row = channels.row(id) + first;
+    if (C == 4 && channels.count == 4 && reinterpret_cast<uintptr_t>(channels.data) % 16 == 0) {
       const float4 v = *reinterpret_cast<const float4*>(row);
       return {{v.x, v.y, v.z, v.w}};
     }
     Values<C> values;
 #pragma unroll
-    for (int c = 0; c < C; ++c) values.v[c] = c < channels.count ? row[c] : 0;
+    for (int c = 0; c < C; ++c) values.v[c] = first + c < channels.count ? row[c] : 0;
     return values;
   }
 }
@@ -138,10 +138,12 @@ template <class F, int C, int kBatch> struct Stage {
     return min(end - k, kBatch);
   }
 
-  /// Of the splats [k, k + 32), those that reach this warp's subtile. All lanes must call it.
-  __device__ uint32_t reached(int k) const {
-    return __ballot_sync(kAllLanes, reach[k + lane_id()] >> (threadIdx.x / 32) & 1);
+  /// Of the splats [k, k + 32), those that reach a subtile. All lanes must call it.
+  __device__ uint32_t reached(int k, int subtile) const {
+    return __ballot_sync(kAllLanes, reach[k + lane_id()] >> subtile & 1);
   }
+  /// The same for this warp's subtile.
+  __device__ uint32_t reached(int k) const { return reached(k, threadIdx.x / 32); }
 };
 
 /// A sample at the end of a chunk, kept for a backward pass.
@@ -161,6 +163,14 @@ template <int S, class Params> __device__ int tile_place(const Params& params, i
   const SampleParts& tiles = params.plan.state->counts.tiles;
   const int place = tiles.first[sample_class(S)] + block;
   return place < tiles.first[sample_class(S) + 1] ? place : -1;
+}
+
+/// The tile of block `block` of a kernel of blend_vjp for tiles with S samples whose lists are walked as a whole; -1 if
+/// there is none.
+template <int S> __device__ int listed_tile(const BlendVjpParams& params, int block) {
+  const SampleParts& tiles = params.plan->counts.chunks;  // a chunk is a tile's whole list
+  const int place = tiles.first[sample_class(S)] + block;
+  return place < tiles.first[sample_class(S) + 1] ? params.chunk_order[place].tile : -1;
 }
 
 /// The numbers of a pixel's samples, and of its image.

@@ -6,33 +6,40 @@
 
 namespace ar::cuda {
 
+/// Warps of a block: of smaller tiles only the subtiles in the first column of the upper half are there.
+template <class F> inline constexpr int kInspectWarps = F::kMoves ? 2 : kSubtiles;
+
 /// A block per tile, a warp per subtile.
-template <class F> __global__ void __launch_bounds__(kBlendThreads) inspect_kernel(const InspectParams params) {
-  __shared__ Stage<F, 0, kBlendThreads> stage;
-  __shared__ int32_t ids[kBlendThreads];
+template <class F> __global__ void __launch_bounds__(32 * kInspectWarps<F>) inspect_kernel(const InspectParams params) {
+  constexpr int kThreads = 32 * kInspectWarps<F>;
+  __shared__ Stage<F, 0, kThreads> stage;
+  __shared__ int32_t ids[kThreads];
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
-  const int tile = int(blockIdx.x), warp = threadIdx.x / 32, lane = lane_id();
+  const int tile = int(blockIdx.x), subtile = int(threadIdx.x) / 32 * (F::kMoves ? 2 : 1);
+  const int lane = lane_id();
   if (!has_samples<F::kSamples>(params.lists, tile)) return;
   const TileList list = list_of(params.lists, params.grid, tile);
-  const Vec2<float> p = pixel_of(warp, lane);
+  const Vec2<float> p = pixel_of(subtile, lane);
   const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
   const bool inside = x < params.grid.width && y < params.grid.height;
   PixelSummary<float, F> pixel;
   pixel.start(inside);
-  for (int k = 0; k < list.count && __syncthreads_or(pixel.open()); k += kBlendThreads) {
+  for (int k = 0; k < list.count && __syncthreads_or(pixel.open()); k += kThreads) {
     const int count = stage.load(splats, {}, list, k, list.count);
     if (int(threadIdx.x) < count) ids[threadIdx.x] = list.splat(k + threadIdx.x);
     __syncthreads();
     for (int first = 0; first < count; first += 32) {
-      for (uint32_t mask = stage.reached(first); mask != 0; mask &= mask - 1) {
+      for (uint32_t mask = stage.reached(first, subtile); mask != 0; mask &= mask - 1) {
         const int j = first + __ffs(mask) - 1, id = ids[j];
-        const float weight = pixel.add(stage.splats[j].terms, p, id);
-        const int touched = __popc(__ballot_sync(kAllLanes, weight > 0));
+        const Shown<float> shown = pixel.add(stage.splats[j].terms, p, id);
+        const int touched = __popc(__ballot_sync(kAllLanes, shown.weight > 0));
         if (touched == 0) continue;
-        const int64_t units = warp_sum(weight_units(weight));
-        const int largest = warp_max(__float_as_int(weight));  // not negative: the bits have its order
+        const int in_front = __popc(__ballot_sync(kAllLanes, shown.in_front));
+        const int64_t units = warp_sum(weight_units(shown.weight));
+        const int largest = warp_max(__float_as_int(shown.weight));  // not negative: the bits have its order
         if (lane == 0) {
           atomicAdd(&params.touched[id], touched);
+          if (in_front) atomicAdd(&params.in_front[id], in_front);
           atomicAdd(reinterpret_cast<unsigned long long*>(&params.units[id]), static_cast<unsigned long long>(units));
           atomicMax(&params.largest[id], largest);
         }
@@ -43,10 +50,11 @@ template <class F> __global__ void __launch_bounds__(kBlendThreads) inspect_kern
   const int64_t i = int64_t(y) * params.grid.width + x;
   params.median[i] = pixel.median;
   params.dominant[i] = pixel.dominant;
+  if (pixel.dominant >= 0) atomicAdd(&params.dominated[pixel.dominant], 1);
 }
 
 template <class F> void launch_inspect(const InspectParams& p, cudaStream_t stream) {
-  inspect_kernel<F><<<unsigned(p.grid.tiles()), kBlendThreads, 0, stream>>>(p);
+  inspect_kernel<F><<<unsigned(p.grid.tiles()), 32 * kInspectWarps<F>, 0, stream>>>(p);
 }
 
 }  // namespace ar::cuda

@@ -4,9 +4,11 @@
 #include <algorithm>
 #include <cstdint>
 
+#include "core/stages.h"
+
 namespace ar::cuda {
 
-/// Remembers the frames of one image size. A frame that turns out to have more pairs than there is room for is slow,
+/// Remembers the frames of one grid of tiles. A frame that turns out to have more pairs than there is room for is slow,
 /// not wrong, so the first frames are counted, and wait for the device; afterwards the largest frame so far, and a
 /// reserve, are room enough in all but the rarest cases. The number of Gaussians may change from frame to frame: with
 /// more of them than were ever seen the room grows in proportion, with fewer it stays.
@@ -62,9 +64,9 @@ class PairGuess {
   Frame recent_[kRecent] = {};
 };
 
-/// The guesses of the image sizes used last. The device writes the number of pairs of each frame into a word of host
+/// The guesses of the grids used last. The device writes the number of pairs of each frame into a word of host
 /// memory when it gets there; nobody waits for it. A word says which frame it is of, so that a write that comes after
-/// its slot was given to another image size is known as such.
+/// its slot was given to another grid is known as such.
 class PairGuesses {
  public:
   static constexpr int kSlots = 64;
@@ -81,8 +83,8 @@ class PairGuesses {
   };
 
   /// `most`: pairs that the frame can have.
-  Frame begin(int device, int width, int height, int64_t gaussians, int64_t most, bool may_wait) {
-    const int slot = slot_of(device, width, height);
+  Frame begin(int device, TileGrid grid, int64_t gaussians, int64_t most, bool may_wait) {
+    const int slot = slot_of(device, grid);
     Slot& s = slots_[slot];
     s.used = ++uses_;
     if (++frame_ == 0) ++frame_;  // 0: nothing was written yet
@@ -109,21 +111,22 @@ class PairGuesses {
 
  private:
   struct Slot {
-    int device = -1, width = 0, height = 0;
+    int device = -1;
+    TileGrid grid = {};
     uint64_t used = 0;
     uint32_t first_frame = 0;
     PairGuess guess;
   };
 
-  /// The slot of an image size, or else the one least recently used, begun anew.
-  int slot_of(int device, int width, int height) {
+  /// The slot of a grid, or else the one least recently used, begun anew.
+  int slot_of(int device, TileGrid grid) {
     int oldest = 0;
     for (int k = 0; k < kSlots; ++k) {
       const Slot& s = slots_[k];
-      if (s.device == device && s.width == width && s.height == height) return k;
+      if (s.device == device && s.grid == grid) return k;
       if (s.used < slots_[oldest].used) oldest = k;
     }
-    slots_[oldest] = Slot{device, width, height, 0, frame_ + 1, {}};
+    slots_[oldest] = Slot{device, grid, 0, frame_ + 1, {}};
     return oldest;
   }
 

@@ -47,9 +47,9 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
   int count = 0;
   if (splat.level > 0) {
     if (splat_color(camera, g, i, rows.row(), splat.color) && !(not_finite >> lane_id() & 1)) {
-      count = count_tiles(splat, params.footprint.index, camera.grid);
+      count = count_tiles(splat, params.footprint.index, params.grid);
       if (params.channels.data) write_channels(params.channels, i, splat.color, depth);
-      if (params.given.data) splat.color = first_channels(params.given.row(int32_t(i)), params.given.count);
+      if (given_colors(params)) splat.color = first_channels(params.given.row(int32_t(i)), params.given.count);
     } else {
       radius = 0;
       splat.level = 0;

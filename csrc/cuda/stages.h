@@ -49,9 +49,9 @@ struct alignas(8) SlotPair {
   int32_t splat, slot;
 };
 
-/// Pairs between the checkpoints of a footprint whose samples move, and the planes of one of them: transmittance and
-/// displacement of each sample.
-inline constexpr int kStateChunk = 128;
+/// Pairs between the checkpoints of a footprint whose samples move, and the planes of kMovingTile^2 floats of one of
+/// them: transmittance and displacement of each sample.
+inline constexpr int kStateChunk = 32;
 AR_HD constexpr int state_planes(int samples) { return 3 * samples; }
 
 /// 1, 2 and 3, 4 to 7, 8 to 15, or 16 samples.
@@ -96,6 +96,7 @@ struct PlanState {
 
 struct ProjectParams : ar::ProjectParams<float> {
   CullBounds<float> bounds;
+  TileGrid grid;
   uint32_t* keys;     ///< [n] in the order of depth
   PairRange* ranges;  ///< [n] count
 };
@@ -296,15 +297,15 @@ void sum_channels(const SumChannelsParams& p, cudaStream_t stream);
 
 // Blending. `footprint` is a place in the registry (blend.cu, blend_vjp.cu).
 
-/// Whether so many channels are blended in groups of kChannelGroup, by kernels that walk the whole list of a tile and
-/// need no checkpoints of channels. The yardsticks, and footprints whose samples move, have no other.
-bool blends_groups(int footprint, int64_t channels);
-/// Planes of kTile^2 floats in BlendParams::checkpoints of a footprint whose samples move, for a backward pass. None
-/// for the others.
+/// Whether kernels blend so many channels that walk the whole list of a tile and need no checkpoints of channels: of
+/// the yardsticks and of footprints whose samples move all do, of others those for more than kFewChannels.
+bool blends_whole_lists(int footprint, int64_t channels);
+/// Planes of kMovingTile^2 floats in BlendParams::checkpoints of a footprint whose samples move, for a backward pass.
+/// None for the others.
 int64_t max_state_planes(int footprint, int64_t capacity);
-/// Channels that a group-less blending is compiled for: 3 in the splats themselves, or 4 in rows.
-/// Segments of each tile's list that they are blended in.
+/// Segments of each tile's list that many channels are blended in.
 int list_segments(int footprint, int64_t channels, TileGrid grid);
+/// Channels that a group-less blending is compiled for: 3 in the splats themselves, or 4 in rows.
 constexpr int compiled_channels(bool in_splats) { return in_splats ? 3 : kFewChannels; }
 /// Only for a footprint that chooses.
 void choose_samples(const ChooseParams& p, cudaStream_t stream);

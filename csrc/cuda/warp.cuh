@@ -27,8 +27,32 @@ __device__ inline int warp_max(int v) {
 #endif
 }
 
+/// The bits that any lane has.
+__device__ inline uint32_t warp_or(uint32_t bits) {
+#if __CUDA_ARCH__ >= 800
+  return __reduce_or_sync(kAllLanes, bits);
+#else
+  for (int offset = 16; offset > 0; offset /= 2) bits |= __shfl_xor_sync(kAllLanes, bits, offset);
+  return bits;
+#endif
+}
+
+/// The shared memory of a block whose size its launch gives.
+#if defined(__CUDACC__)
+__device__ inline float4* dynamic_shared() {
+  extern __shared__ float4 memory[];
+  return memory;
+}
+#else
+float4* dynamic_shared();  // of a test that runs kernels on the host
+#endif
+
 /// Asks for the line of memory that holds `*address`.
-__device__ inline void prefetch(const void* address) { asm volatile("prefetch.global.L1 [%0];" ::"l"(address)); }
+__device__ inline void prefetch([[maybe_unused]] const void* address) {
+#if defined(__CUDA_ARCH__)
+  asm volatile("prefetch.global.L1 [%0];" ::"l"(address));
+#endif
+}
 
 /// Sums N = 8, 9 or 10 values over the lanes with 9 or 12 shuffles instead of 5 N: lanes trade the halves that the
 /// other will sum. A lane l gets the sum of value summed_value<N>(l).

@@ -88,6 +88,7 @@ struct RasterizeArguments : Inputs, FootprintArguments {
   ImageSwitches images = {};
   bool keep = false, debug = false;
   std::string means2d_z = "zero";  ///< third column of the gradient with respect to means2D: "sum_abs", "sum_norm"
+  OptionalTensor features;         ///< (P, K) further channels beside three colours, blended on zero
 
   template <class Visit> void each(Visit&& visit) {
     Inputs::each(visit);
@@ -97,6 +98,7 @@ struct RasterizeArguments : Inputs, FootprintArguments {
     visit("keep=False", keep);
     visit("debug=False", debug);
     visit("means2d_z=\"zero\"", means2d_z);
+    visit("features=None", features);
   }
 };
 
@@ -190,6 +192,74 @@ struct WeightArguments : FootprintArguments {
   }
 };
 
+/// Arguments of `ssim_map`: the similarity of every pixel of `image` and `target` (core/ssim.h).
+struct SsimArguments {
+  Tensor image;   ///< (..., H, W)
+  Tensor target;  ///< the same, of the image's dtype or uint8; has no gradient
+  bool keep = false;
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("image", image);
+    visit("target", target);
+    visit("keep=False", keep);
+  }
+};
+
+/// Arguments of `l1_ssim`: l1_weight * (mean of |image - target|) + ssim_weight * (mean similarity) + constant.
+struct L1SsimArguments : SsimArguments {
+  double l1_weight = 0, ssim_weight = 0, constant = 0;
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("image", image);
+    visit("target", target);
+    visit("l1_weight", l1_weight);
+    visit("ssim_weight", ssim_weight);
+    visit("constant", constant);
+    visit("keep=False", keep);
+  }
+};
+
+/// Arguments of `activate`: parameters of Gaussians as a training optimises them (core/activations.h).
+struct ActivateArguments {
+  Tensor log_scales, quats, logit_opacities;
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("log_scales", log_scales);
+    visit("quats", quats);
+    visit("logit_opacities", logit_opacities);
+  }
+};
+
+/// Tensors that an op writes to, marked in its schema by a letter that no other argument has.
+template <char kLetter> struct WrittenTensors : std::vector<Tensor> {};
+
+/// Arguments of `adam_`: a step on several tensors (core/adam.h). The lists have a member for each of them.
+struct AdamArguments {
+  WrittenTensors<'a'> params;  ///< contiguous
+  std::vector<Tensor> grads;
+  WrittenTensors<'b'> exp_avgs;
+  WrittenTensors<'c'> exp_avg_sqs;
+  std::vector<double> rates;
+  std::vector<int64_t> steps;  ///< 1 for the first
+  double beta1 = 0, beta2 = 0, eps = 0;
+  OptionalTensor rows;  ///< (P,) bool or uint8
+  bool bias_correction = true;
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("params", params);
+    visit("grads", grads);
+    visit("exp_avgs", exp_avgs);
+    visit("exp_avg_sqs", exp_avg_sqs);
+    visit("rates", rates);
+    visit("steps", steps);
+    visit("beta1", beta1);
+    visit("beta2", beta2);
+    visit("eps", eps);
+    visit("rows=None", rows);
+    visit("bias_correction=True", bias_correction);
+  }
+};
+
 /// The name in a declaration `name` or `name=default`.
 inline std::string_view name_of(std::string_view declaration) { return declaration.substr(0, declaration.find('=')); }
 
@@ -210,12 +280,17 @@ template <class Arguments> struct VjpArguments {
   }
 };
 
+/// The type of an argument in a schema.
+template <class Value> std::string type_in_schema(const Value&) { return c10::getTypePtr<Value>()->str(); }
+template <char kLetter> std::string type_in_schema(const WrittenTensors<kLetter>&) {
+  return std::string("Tensor(") + kLetter + "!)[]";
+}
+
 /// "Tensor means3D, Tensor? means2D, ...".
 template <class Arguments> std::string schema_of() {
   std::string text;
   Arguments().each([&](std::string_view declaration, auto& value) {
-    const std::string type = c10::getTypePtr<std::decay_t<decltype(value)>>()->str();
-    text += (text.empty() ? "" : ", ") + type + " " + std::string(declaration);
+    text += (text.empty() ? "" : ", ") + type_in_schema(value) + " " + std::string(declaration);
   });
   return text;
 }
@@ -228,6 +303,9 @@ inline void assign(const IValue& from, OptionalTensor& to) {
 inline void assign(const IValue& from, std::vector<OptionalTensor>& to) {
   to.clear();
   for (const OptionalTensor& t : from.toOptionalTensorVector()) to.push_back(t && t->defined() ? t : std::nullopt);
+}
+template <char kLetter> void assign(const IValue& from, WrittenTensors<kLetter>& to) {
+  static_cast<std::vector<Tensor>&>(to) = from.toTensorVector();
 }
 
 /// Takes an op's arguments off the dispatcher's stack.

@@ -94,13 +94,14 @@ struct RowTensors {
 struct SummaryTensors {
   Tensor median, dominant;         ///< (H, W) int32
   Tensor touched, largest, total;  ///< (count,) int32, float32 whose bits are raised as int32, int64
+  Tensor in_front, dominated;      ///< (count,) int32
 };
 
-/// One weight per element: what `weight` and `weight_vjp` read and write.
+/// One weight per element, or its adjoint.
 struct WeightTensors {
   Tensor offset, cov2d;
-  Tensor weight;                             ///< written by `weight`
-  Tensor dL_dweight, dL_doffset, dL_dcov2d;  ///< of `weight_vjp`, which reads the first
+  Tensor weight;                             ///< written
+  Tensor dL_dweight, dL_doffset, dL_dcov2d;  ///< of the adjoint, which reads the first
 };
 
 /// The chosen footprint.
@@ -108,10 +109,14 @@ struct FootprintSpec {
   FootprintChoice choice;
   int samples;  ///< the most that a pixel has
   bool chosen;  ///< per tile
+  bool moves;   ///< samples carry a state besides their transmittance
 };
 
 /// The footprint of this key and number. Raises ValueError if there is none.
 FootprintSpec find_footprint(const std::string& key, double option);
+
+/// The tiles of an image: on CUDA those of samples that move are smaller.
+TileGrid grid_of(const FootprintSpec& footprint, int64_t width, int64_t height, bool cuda);
 
 /// What all stages of a pass share.
 struct Pass {
@@ -121,10 +126,11 @@ struct Pass {
   bool debug = false;  ///< wait for every stage, so that the stage that failed is the one that raises
   bool exact;          ///< count pairs before room is made for them, whatever earlier frames had
 
+  /// For tensors like `like`.
   template <class Arguments>
-  explicit Pass(const Arguments& a)
+  Pass(const Arguments& a, const Tensor& like)
       : footprint(find_footprint(a.footprint, a.option)),
-        grid{int(a.image_width), int(a.image_height)},
+        grid(grid_of(footprint, a.image_width, a.image_height, like.is_cuda())),
         exact(at::globalContext().deterministicAlgorithms()) {}
 };
 
@@ -174,13 +180,16 @@ class Backend {
   virtual void row_grads(const RowTensors& rows, const ListTensors& lists, const Pass& pass, const PairSums& sums,
                          const RowTensors& dL_drows) = 0;
 
-  // One weight per element.
+  /// One weight per element; where dL_dweight is given the adjoint instead.
   virtual void weight(const WeightTensors& tensors, const FootprintSpec& footprint) = 0;
-  virtual void weight_vjp(const WeightTensors& tensors, const FootprintSpec& footprint) = 0;
 
   /// Time since the last call on the device's clock [s]; waits for the device.
   virtual double lap() = 0;
 };
+
+/// Threads of a loop on the CPU: as many as torch's, but one in a forked child. fork() leaves the threads of OpenMP's
+/// pool behind, and libgomp would wait for them forever.
+int thread_count();
 
 /// For tensors like `like`; makes its device the current one while it lives.
 std::unique_ptr<Backend> make_cpu_backend(const Tensor& like);

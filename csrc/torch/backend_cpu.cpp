@@ -23,10 +23,6 @@ bool is_forked = false;
 [[maybe_unused]] const int kWatchesForks = pthread_atfork(nullptr, nullptr, [] { is_forked = true; });
 #endif
 
-/// Threads of a loop: as many as torch's, but one in a forked child. fork() leaves the threads of OpenMP's pool
-/// behind, and libgomp would wait for them forever.
-int thread_count() { return is_forked ? 1 : at::get_num_threads(); }
-
 cpu::TileLists tile_lists_of(const ListTensors& lists) {
   cpu::TileLists out;
   out.pairs = const_pointer<int32_t>(lists.pairs);
@@ -72,7 +68,7 @@ template <typename T> class CpuBackend final : public Backend {
     std::vector<uint8_t> candidates(in.count());
     cpu::ProjectParams<T> p = {};
     set_projection<T>(p, in, pass, radii);
-    set_channels<T>(p, in, channels);
+    set_channels<T>(p, channels);
     p.threads = thread_count();
     p.candidates = candidates.data();
     p.chunk_offsets = offsets.data();
@@ -188,7 +184,7 @@ template <typename T> class CpuBackend final : public Backend {
     out.pairs = at::empty({pairs, cpu::kPairNumbers + (own ? 3 : 0)}, floats_);
     if (mean_sums != MeanSums::kNone) out.means = at::empty({pairs, 2}, floats_);
     cpu::BlendVjpParams<T> p = {};
-    set_blend_vjp<T>(p, lists, pass, channels, dL_dimage, state);
+    set_blend<T>(p, lists, pass, channels, dL_dimage, state);
     p.channels = channels_of<T>(channels, lists);
     p.lists = tile_lists_of(lists);
     p.threads = thread_count();
@@ -263,10 +259,11 @@ template <typename T> class CpuBackend final : public Backend {
   }
 
   void weight(const WeightTensors& tensors, const FootprintSpec& footprint) override {
-    stages_of(footprint).weight(weight_params(tensors, footprint));
-  }
-  void weight_vjp(const WeightTensors& tensors, const FootprintSpec& footprint) override {
-    stages_of(footprint).weight_vjp(weight_params(tensors, footprint));
+    cpu::WeightParams<T> p = {};
+    set_weight<T>(p, tensors, footprint);
+    p.threads = thread_count();
+    const cpu::Stages<T>& stages = stages_of(footprint);
+    (tensors.dL_dweight.defined() ? stages.weight_vjp : stages.weight)(p);
   }
 
   double lap() override {
@@ -279,13 +276,6 @@ template <typename T> class CpuBackend final : public Backend {
 
   static const cpu::Stages<T>& stages_of(const FootprintSpec& footprint) {
     return cpu::stages_of<T>(footprint.choice.index);
-  }
-
-  static cpu::WeightParams<T> weight_params(const WeightTensors& tensors, const FootprintSpec& footprint) {
-    cpu::WeightParams<T> p = {};
-    set_weight<T>(p, tensors, footprint);
-    p.threads = thread_count();
-    return p;
   }
 
   /// What project_vjp and row_grads read of the sums.
@@ -314,6 +304,8 @@ template <typename T> class CpuBackend final : public Backend {
 };
 
 }  // namespace
+
+int thread_count() { return is_forked ? 1 : at::get_num_threads(); }
 
 std::unique_ptr<Backend> make_cpu_backend(const Tensor& like) {
   const at::TensorOptions options = like.options().requires_grad(std::nullopt);

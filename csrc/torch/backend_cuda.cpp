@@ -141,7 +141,8 @@ class CudaBackend final : public Backend {
     SplatTensors out = make_splats(in.count());
     cuda::ProjectParams p = {};
     set_projection<float>(p, in, pass, radii);
-    set_channels<float>(p, in, channels);
+    set_channels<float>(p, channels);
+    p.grid = pass.grid;
     p.splats = pointer<float>(out.splats);
     p.keys = structs_of<uint32_t>(out.keys);
     p.ranges = structs_of<cuda::PairRange>(out.ranges);
@@ -181,8 +182,7 @@ class CudaBackend final : public Backend {
     const int64_t most = std::clamp<int64_t>(n, 1, cuda::max_items() / grid.tiles() + 1) * grid.tiles();
     auto& guesses = SharedGuesses::instance();
     const auto frame = guesses.use([&](cuda::PairGuesses& g) {
-      return g.begin(floats_.device().index(), grid.width, grid.height, n, std::min(most, cuda::max_items()),
-                     !capturing);
+      return g.begin(floats_.device().index(), grid, n, std::min(most, cuda::max_items()), !capturing);
     });
     int64_t capacity = pass.exact ? 0 : frame.capacity;
     TORCH_CHECK(capacity > 0 || !capturing,
@@ -271,7 +271,7 @@ class CudaBackend final : public Backend {
     p.lists = tile_lists_of(lists);
 
     p.layout = {cuda::compiled_channels(!channels.rows.defined()), pass.keep};
-    const Plan plan = make_plan(p, pass, cuda::blends_groups(footprint.choice.index, channels.count), state);
+    const Plan plan = make_plan(p, pass, cuda::blends_whole_lists(footprint.choice.index, channels.count), state);
     p.segments.count = cuda::list_segments(footprint.choice.index, channels.count, grid);
     if (p.segments.count == 1) {
       cuda::blend(footprint.choice.index, p, nullptr, stream_);
@@ -321,7 +321,7 @@ class CudaBackend final : public Backend {
     if (!channels.rows.defined() && !gradient.color.defined())  // the kernels for three colours look for no null
       gradient.color = at::zeros({3, pass.grid.height, pass.grid.width}, floats_);
     cuda::BlendVjpParams p = {};
-    set_blend_vjp<float>(p, lists, pass, channels, gradient, state);
+    set_blend<float>(p, lists, pass, channels, gradient, state);
     p.channels = channels_of(channels);
     p.lists = tile_lists_of(lists);
     p.plan = const_structs_of<cuda::PlanState>(state.chunks);
@@ -374,8 +374,7 @@ class CudaBackend final : public Backend {
     p.dL_dchannels = channel_rows<const float>(sums.dL_dchannels, channels);
     p.channels_in_pairs = channels.made_by_projection() && !sums.dL_dchannels.defined();
     p.sums = pair_sums_of(lists, sums.pairs);
-    const Tensor camera_grads = make_camera_grads(grads, in.count());
-    p.camera_grads = pointer<float>(camera_grads);
+    const Tensor camera_grads = make_camera_grads(p, grads);
     cuda::project_vjp(p, stream_);
     check_stage("project_vjp", pass.debug);
     return camera_grads;
@@ -386,8 +385,7 @@ class CudaBackend final : public Backend {
     cuda::ProjectRowsVjpParams p = {};
     set_projection_vjp<float>(p, in, grads);
     p.rows = projected_row_grads_of<float>(rows, dL_drows);
-    const Tensor camera_grads = make_camera_grads(grads, in.count());
-    p.camera_grads = pointer<float>(camera_grads);
+    const Tensor camera_grads = make_camera_grads(p, grads);
     cuda::project_rows_vjp(p, stream_);
     check_stage("project_rows_vjp", false);
     return camera_grads;
@@ -406,18 +404,13 @@ class CudaBackend final : public Backend {
     AT_DISPATCH_FLOATING_TYPES(tensors.offset.scalar_type(), "footprint_weight", [&] {
       WeightParams<scalar_t> p = {};
       set_weight(p, tensors, footprint);
-      cuda::weight(footprint.choice.index, p, stream_);
+      if (tensors.dL_dweight.defined()) {
+        cuda::weight_vjp(footprint.choice.index, p, stream_);
+      } else {
+        cuda::weight(footprint.choice.index, p, stream_);
+      }
     });
     check_stage("footprint_weight", false);
-  }
-
-  void weight_vjp(const WeightTensors& tensors, const FootprintSpec& footprint) override {
-    AT_DISPATCH_FLOATING_TYPES(tensors.offset.scalar_type(), "footprint_weight_vjp", [&] {
-      WeightParams<scalar_t> p = {};
-      set_weight(p, tensors, footprint);
-      cuda::weight_vjp(footprint.choice.index, p, stream_);
-    });
-    check_stage("footprint_weight_vjp", false);
   }
 
   double lap() override { return laps_.next(stream_); }
@@ -466,7 +459,7 @@ class CudaBackend final : public Backend {
     const int64_t max_planes = !whole ? p.layout.max_planes(pass.grid, footprint.samples, capacity, footprint.chosen)
                                : pass.keep ? cuda::max_state_planes(footprint.choice.index, capacity)
                                            : 0;
-    state.checkpoints = at::empty({max_planes * kTile * kTile}, floats_);
+    state.checkpoints = at::empty({max_planes * pass.grid.side() * pass.grid.side()}, floats_);
     state.chunks = at::empty({kPlanRows + chunks + tiles, kChunkWidth}, ints_);
     C10_CUDA_CHECK(cudaMemsetAsync(state.chunks.data_ptr(), 0, sizeof(cuda::PlanState), stream_));
     const Plan plan = {at::empty({chunks + 1, kChunkWidth}, ints_),
@@ -501,9 +494,11 @@ class CudaBackend final : public Backend {
   }
 
   /// Room for the camera's gradient, if it is wanted.
-  Tensor make_camera_grads(const Grads& grads, int64_t n) const {
+  template <class Params> Tensor make_camera_grads(Params& p, const Grads& grads) const {
     if (!grads.with_camera) return Tensor();
-    return at::empty({cuda::warps_of(n), kCameraGradWidth}, floats_);
+    const Tensor camera_grads = at::empty({cuda::warps_of(p.gaussians.n), kCameraGradWidth}, floats_);
+    p.camera_grads = pointer<float>(camera_grads);
+    return camera_grads;
   }
 
   /// Emits pairs of a splat, or of a splat and its slot, into the member `to`, and sorts them by tile.

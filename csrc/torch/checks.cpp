@@ -1,5 +1,6 @@
 #include "torch/checks.h"
 
+#include <algorithm>
 #include <cmath>
 #include <sstream>
 
@@ -101,6 +102,34 @@ void check_device(const Tensor& t, const char* name) {
                    " must have dtype float32 on CUDA, got Double; float64 runs on the CPU");
 }
 
+/// Raises where memory that is written is also that of another tensor: what comes out would depend on the order.
+void check_overlaps(const AdamArguments& a) {
+  struct Range {
+    const char *begin, *end;
+    bool written;
+  };
+  std::vector<Range> ranges;
+  ranges.reserve(4 * a.params.size());
+  const auto add = [&](const std::vector<Tensor>& tensors, bool written) {
+    for (const Tensor& t : tensors) {
+      const char* begin = static_cast<const char*>(t.const_data_ptr());
+      if (t.numel() > 0) ranges.push_back({begin, begin + t.nbytes(), written});
+    }
+  };
+  add(a.params, true);
+  add(a.exp_avgs, true);
+  add(a.exp_avg_sqs, true);
+  add(a.grads, false);
+  std::sort(ranges.begin(), ranges.end(), [](const Range& x, const Range& y) { return x.begin < y.begin; });
+  const char *end = nullptr, *written_end = nullptr;  // of those that begin earlier
+  for (const Range& range : ranges) {
+    TORCH_CHECK_VALUE(range.begin >= (range.written ? end : written_end),
+                      "params, exp_avgs and exp_avg_sqs must not share memory with each other or with grads");
+    end = std::max(end, range.end);
+    if (range.written) written_end = std::max(written_end, range.end);
+  }
+}
+
 /// What `bin` and `blend` take of the rows of `project`.
 void check_projected(Tensor& means2d, Tensor& cov2d, Tensor& opacities, Tensor& dets, const Tensor& row_splits) {
   check_device(means2d, "means2d");
@@ -124,18 +153,41 @@ void check_projected(Tensor& means2d, Tensor& cov2d, Tensor& opacities, Tensor& 
   TORCH_CHECK_VALUE(ok, "row_splits must rise from 0 to the number of rows, ", n);
 }
 
+/// Raises for a number that no Gaussian should have. Without debug such a Gaussian is culled, or taken as it is.
+void check_gaussians(Inputs in) {
+  size_t place = 0;
+  in.each_tensor([&](const char* name, const OptionalTensor& t) {
+    const bool is_read = place != 1 && place < kGaussianTensors;  // nobody reads means2D
+    if (t && is_read) check_finite(*t, name);
+    ++place;
+  });
+  check_values(in.opacities, "opacities", in.opacities.ge(0).logical_and(in.opacities.le(1)), "be in [0, 1]");
+  if (in.scales) check_values(*in.scales, "scales", in.scales->ge(0), "not be negative");
+  if (in.cov3D_precomp) {
+    Tensor valid = in.cov3D_precomp->ge(0);
+    for (const int64_t off_diagonal : {1, 2, 4}) valid.select(1, off_diagonal).fill_(true);
+    check_values(*in.cov3D_precomp, "cov3D_precomp", valid, "not have negative variances");
+  }
+}
+
 }  // namespace
 
 FootprintSpec find_footprint(const std::string& key, double option) {
   const int index = ar::find_footprint(key);
   TORCH_CHECK_VALUE(index >= 0, "footprint must be one of those in csrc/core/footprint/registry.h, got '", key, "'");
   TORCH_CHECK_VALUE(std::isfinite(option) && option >= 0, "option must be finite and not negative, got ", option);
-  FootprintSpec spec{{index, {option}}, 1, false};
+  FootprintSpec spec = {};
+  spec.choice = {index, {option}};
   visit_footprint(index, Footprints{}, [&](auto f) {
     spec.samples = decltype(f)::kSamples;
     spec.chosen = std::is_same_v<decltype(f), Adaptive>;
+    spec.moves = decltype(f)::kMoves;
   });
   return spec;
+}
+
+TileGrid grid_of(const FootprintSpec& footprint, int64_t width, int64_t height, bool cuda) {
+  return {int(width), int(height), cuda && footprint.moves ? kMovingTileBits : kTileBits};
 }
 
 void check_image_size(int64_t height, int64_t width) {
@@ -147,9 +199,8 @@ void check_image_size(int64_t height, int64_t width) {
 
 void check(Inputs& in) {
   Tensor& means3D = in.means3D;
-  check_floating(means3D, "means3D");
-  check_shape(means3D.dim() == 2 && means3D.size(1) == 3, means3D, "means3D", "(P, 3)");
   check_device(means3D, "means3D");
+  check_shape(means3D.dim() == 2 && means3D.size(1) == 3, means3D, "means3D", "(P, 3)");
   const int64_t p = in.count(), most = int64_t(1) << (means3D.is_cuda() ? 30 : 31);
   TORCH_CHECK_VALUE(p < most, "means3D must have fewer than ", most, " rows on ", means3D.device().type(), ", got ", p);
 
@@ -209,32 +260,20 @@ void check_values(const Inputs& in, bool debug) {
   if (in.lens) check_finite(in.lens->narrow(0, 0, offsetof(Lens<float>, far) / sizeof(float)), "lens");
 }
 
-namespace {
-
-/// Raises for a number that no Gaussian should have. Without debug such a Gaussian is culled, or taken as it is.
-void check_gaussians(Inputs in) {
-  size_t place = 0;
-  in.each_tensor([&](const char* name, const OptionalTensor& t) {
-    const bool is_read = place != 1 && place < kGaussianTensors;  // nobody reads means2D
-    if (t && is_read) check_finite(*t, name);
-    ++place;
-  });
-  check_values(in.opacities, "opacities", in.opacities.ge(0).logical_and(in.opacities.le(1)), "be in [0, 1]");
-  if (in.scales) check_values(*in.scales, "scales", in.scales->ge(0), "not be negative");
-  if (in.cov3D_precomp) {
-    Tensor valid = in.cov3D_precomp->ge(0);
-    for (const int64_t off_diagonal : {1, 2, 4}) valid.select(1, off_diagonal).fill_(true);
-    check_values(*in.cov3D_precomp, "cov3D_precomp", valid, "not have negative variances");
-  }
-}
-
-}  // namespace
-
 void check(RasterizeArguments& a) {
   check(static_cast<Inputs&>(a));
   TORCH_CHECK_VALUE(a.shs.has_value() != a.colors_precomp.has_value(),
                     "exactly one of shs and colors_precomp must be given, got ", a.shs ? "both" : "neither");
-  Like{a.means3D, "means3D"}.check_vector(a.bg, "bg", a.shs ? 3 : a.colors_precomp->size(1));
+  const Like like{a.means3D, "means3D"};
+  like.check_vector(a.bg, "bg", a.shs ? 3 : a.colors_precomp->size(1));
+  if (a.features) {
+    const int64_t colors = a.bg.size(0), most = kMaxChannels - 3;
+    TORCH_CHECK_VALUE(colors == 3, "features must come with shs or colors_precomp (P, 3), got (P, ", colors, ")");
+    const Tensor& f = *a.features;
+    const bool ok = f.dim() == 2 && f.size(0) == a.count() && f.size(1) >= 1 && f.size(1) <= most;
+    check_shape(ok, f, "features", "(P, K) with P = ", a.count(), " and K from 1 to ", most);
+    like.check_rows_of(a.features, "features", {f.size(1)}, "(P, K)");
+  }
   TORCH_CHECK_VALUE(a.means2d_z == "zero" || a.means2d_z == "sum_abs" || a.means2d_z == "sum_norm",
                     "means2d_z must be zero, sum_abs or sum_norm, got ", a.means2d_z);
 }
@@ -242,6 +281,7 @@ void check(RasterizeArguments& a) {
 void check_values(const RasterizeArguments& a) {
   check_values(a, a.debug);
   if (a.debug) check_gaussians(a);
+  if (a.debug && a.features) check_finite(*a.features, "features");
   if (a.debug || !a.means3D.is_cuda()) check_finite(a.bg, "bg");
 }
 
@@ -287,7 +327,7 @@ void check(BinArguments& a) {
   check_image_size(a.image_height, a.image_width);
 }
 
-void check(BlendArguments& a, const FootprintSpec& footprint) {
+void check(BlendArguments& a, const Pass& pass) {
   check_projected(a.means2d, a.cov2d, a.opacities, a.dets, a.row_splits);
   const Like like{a.means2d, "means2d"};
   const int64_t n = a.means2d.size(0), cameras = a.row_splits.size(0) - 1;
@@ -306,20 +346,19 @@ void check(BlendArguments& a, const FootprintSpec& footprint) {
   const int64_t members = ListTensors::kMembers;
   TORCH_CHECK_VALUE(int64_t(a.lists.size()) == members * cameras, "lists must be the output of bin for ", cameras,
                     " cameras, got ", a.lists.size(), " tensors");
-  const TileGrid grid = {int(a.image_width), int(a.image_height)};
   for (int64_t c = 0; c < cameras; ++c) {
     const ListTensors lists = from_list<ListTensors>(a.lists, size_t(members * c));
-    check_lists(lists, a.means2d, footprint, grid);
+    check_lists(lists, a.means2d, pass);
     const int64_t rows = a.row_splits.const_data_ptr<int64_t>()[c + 1] - a.row_splits.const_data_ptr<int64_t>()[c];
     TORCH_CHECK_VALUE(lists.splats.size(0) == rows, "lists must be the output of bin for these splats, got ",
                       lists.splats.size(0), " splats of camera ", c, " and not ", rows);
   }
 }
 
-void check(InspectArguments& a, const ListTensors& lists, const FootprintSpec& footprint) {
+void check(InspectArguments& a, const ListTensors& lists, const Pass& pass) {
   check_device(lists.splats, "splats");
   check_image_size(a.image_height, a.image_width);
-  check_lists(lists, lists.splats, footprint, {int(a.image_width), int(a.image_height)});
+  check_lists(lists, lists.splats, pass);
   // The ids of a CPU's lists index the results; on CUDA the splats themselves do.
   const int64_t n = lists.splats.size(0);
   const bool by_id = !lists.splats.is_cuda() && n > 0;
@@ -341,6 +380,86 @@ void check(WeightArguments& a) {
   a.cov2d = a.cov2d.contiguous();
 }
 
+void check(SsimArguments& a) {
+  const Tensor &image = a.image, &target = a.target;
+  check_floating(image, "image");
+  TORCH_CHECK_TYPE(target.scalar_type() == image.scalar_type() || target.scalar_type() == at::kByte,
+                   "target must have the dtype of image, ", image.scalar_type(), ", or uint8, got ",
+                   target.scalar_type());
+  TORCH_CHECK_VALUE(target.device() == image.device(), "target must be on the device of image, ", image.device(),
+                    ", got ", target.device());
+  check_shape(image.dim() == 3 || image.dim() == 4, image, "image", "(C, H, W) or (B, C, H, W)");
+  check_shape(target.sizes() == image.sizes(), target, "target", "that of image, ", shape_of(image));
+  // The mean over nothing is not a number.
+  TORCH_CHECK_VALUE(image.numel() > 0, "image must have at least one pixel, got shape ", shape_of(image));
+  constexpr int64_t kMax = int64_t(1) << 30;
+  TORCH_CHECK_VALUE(image.size(-1) <= kMax && image.size(-2) <= kMax, "image must have at most ", kMax,
+                    " rows and columns, got shape ", shape_of(image));
+  a.image = a.image.contiguous();
+  a.target = a.target.contiguous();
+}
+
+void check(ActivateArguments& a) {
+  check_floating(a.log_scales, "log_scales");
+  check_shape(a.log_scales.dim() == 2 && a.log_scales.size(1) == 3, a.log_scales, "log_scales", "(N, 3)");
+  a.log_scales = a.log_scales.contiguous();
+  const Like like{a.log_scales, "log_scales"};
+  like.check_rows_of(a.quats, "quats", {4}, "(N, 4)");
+  like.check_rows_of(a.logit_opacities, "logit_opacities", {1}, "(N, 1)");
+}
+
+void check(AdamArguments& a) {
+  const size_t count = a.params.size();
+  const auto check_count = [&](size_t members, const char* name) {
+    TORCH_CHECK_VALUE(members == count, name, " must have as many members as params, ", count, ", got ", members);
+  };
+  check_count(a.grads.size(), "grads");
+  check_count(a.exp_avgs.size(), "exp_avgs");
+  check_count(a.exp_avg_sqs.size(), "exp_avg_sqs");
+  check_count(a.rates.size(), "rates");
+  check_count(a.steps.size(), "steps");
+  TORCH_CHECK_VALUE(a.beta1 >= 0 && a.beta1 < 1, "beta1 must be in [0, 1), got ", a.beta1);
+  TORCH_CHECK_VALUE(a.beta2 >= 0 && a.beta2 < 1, "beta2 must be in [0, 1), got ", a.beta2);
+  TORCH_CHECK_VALUE(std::isfinite(a.eps) && a.eps >= 0, "eps must be finite and not negative, got ", a.eps);
+
+  const auto check_tensor = [&](const Tensor& t, const char* list, size_t i) {
+    const Tensor &first = a.params[0], &param = a.params[i];
+    TORCH_CHECK_TYPE(t.scalar_type() == first.scalar_type(), list, "[", i, "] must have the dtype of params[0], ",
+                     first.scalar_type(), ", got ", t.scalar_type());
+    TORCH_CHECK_VALUE(t.device() == first.device(), list, "[", i, "] must be on the device of params[0], ",
+                      first.device(), ", got ", t.device());
+    TORCH_CHECK_VALUE(t.sizes() == param.sizes(), list, "[", i, "] must have the shape of params[", i, "], ",
+                      shape_of(param), ", got ", shape_of(t));
+  };
+  const auto check_written = [&](const Tensor& t, const char* list, size_t i) {
+    check_tensor(t, list, i);
+    TORCH_CHECK_VALUE(t.is_contiguous(), list, "[", i, "] must be contiguous, got strides ", t.strides());
+  };
+  for (size_t i = 0; i < count; ++i) {
+    TORCH_CHECK_VALUE(std::isfinite(float(a.rates[i])) && a.rates[i] >= 0, "rates[", i,
+                      "] must be finite and not negative, got ", a.rates[i]);
+    TORCH_CHECK_VALUE(a.steps[i] >= 1, "steps[", i, "] must be at least 1, got ", a.steps[i]);
+    check_floating(a.params[i], "params");
+    check_written(a.params[i], "params", i);
+    check_tensor(a.grads[i], "grads", i);
+    check_written(a.exp_avgs[i], "exp_avgs", i);
+    check_written(a.exp_avg_sqs[i], "exp_avg_sqs", i);
+    if (!a.rows) continue;
+    TORCH_CHECK_VALUE(a.params[i].dim() >= 1 && a.params[i].size(0) == a.rows->numel(), "params[", i,
+                      "] must have a row for each of rows, ", a.rows->numel(), ", got shape ", shape_of(a.params[i]));
+  }
+  if (a.rows) {
+    TORCH_CHECK_TYPE(a.rows->scalar_type() == at::kBool || a.rows->scalar_type() == at::kByte,
+                     "rows must have dtype bool or uint8, got ", a.rows->scalar_type());
+    check_shape(a.rows->dim() == 1, *a.rows, "rows", "(P,)");
+    TORCH_CHECK_VALUE(count == 0 || a.rows->device() == a.params[0].device(),
+                      "rows must be on the device of params, got ", a.rows->device());
+    a.rows = a.rows->contiguous();
+  }
+  for (Tensor& grad : a.grads) grad = grad.contiguous();
+  check_overlaps(a);
+}
+
 Tensor gradient_of(const std::vector<OptionalTensor>& dL_doutputs, size_t place, const char* name, const Tensor& like,
                    at::IntArrayRef sizes) {
   if (place >= dL_doutputs.size() || !dL_doutputs[place]) return Tensor();
@@ -354,12 +473,13 @@ void check_needs(const std::vector<bool>& needs, size_t count) {
   TORCH_CHECK_VALUE(needs.size() == count, "needs must have ", count, " members, got ", needs.size());
 }
 
-void check_lists(const ListTensors& lists, const Tensor& like, const FootprintSpec& footprint, TileGrid grid) {
+void check_lists(const ListTensors& lists, const Tensor& like, const Pass& pass) {
+  const TileGrid grid = pass.grid;
   const Tensor &splats = lists.splats, &pairs = lists.pairs;
   const int64_t n = splats.dim() == 2 ? splats.size(0) : -1;
   bool ok = n >= 0 && splats.size(1) == kSplatWidth && splats.scalar_type() == like.scalar_type() &&
             lists.ids.numel() == n && lists.tile_offsets.numel() == grid.tiles() + 1 &&
-            lists.tile_samples.numel() == (footprint.chosen ? grid.tiles() : 0);
+            lists.tile_samples.numel() == (pass.footprint.chosen ? grid.tiles() : 0);
   if (like.is_cuda()) {
     ok = ok && pairs.dim() == 2 && pairs.size(0) >= 1 && (pairs.size(1) == 1 || pairs.size(1) == 2);
   } else {
@@ -379,10 +499,9 @@ void check_lists(const ListTensors& lists, const Tensor& like, const FootprintSp
                     shape_of(splats), " and tile_offsets of shape ", shape_of(lists.tile_offsets));
 }
 
-void check_saved(const ListTensors& lists, const BlendState& state, const Tensor& like, const FootprintSpec& footprint,
-                 TileGrid grid) {
-  check_lists(lists, like, footprint, grid);
-  const std::vector<int64_t> image = {footprint.samples, grid.height, grid.width};
+void check_saved(const ListTensors& lists, const BlendState& state, const Tensor& like, const Pass& pass) {
+  check_lists(lists, like, pass);
+  const std::vector<int64_t> image = {pass.footprint.samples, pass.grid.height, pass.grid.width};
   const int64_t n = lists.splats.size(0), pairs = lists.pairs.size(0);
   const bool slots = like.is_cuda() ? lists.pairs.size(1) == 2 && lists.splat_offsets.numel() == 2 * n
                                     : lists.splat_offsets.numel() == n + 1 && lists.positions.numel() == pairs;

@@ -16,9 +16,12 @@ void check_values(const Inputs& in, bool debug);
 /// The same, and with debug for numbers that no Gaussian should have.
 void check_values(const RasterizeArguments& a);
 void check(BinArguments& a);
-void check(BlendArguments& a, const FootprintSpec& footprint);
-void check(InspectArguments& a, const ListTensors& lists, const FootprintSpec& footprint);
+void check(BlendArguments& a, const Pass& pass);
+void check(InspectArguments& a, const ListTensors& lists, const Pass& pass);
 void check(WeightArguments& a);
+void check(SsimArguments& a);
+void check(ActivateArguments& a);
+void check(AdamArguments& a);
 
 /// The inputs of camera `c` of a batch, not yet checked.
 Inputs inputs_of(const ProjectArguments& a, int64_t c);
@@ -34,9 +37,8 @@ void check_needs(const std::vector<bool>& needs, size_t count);
 
 /// Lists and state fit each other, the splats, the footprint and the image: the outputs of the forward pass for the
 /// same arguments. What they contain is the forward pass's own and is not looked at.
-void check_saved(const ListTensors& lists, const BlendState& state, const Tensor& like, const FootprintSpec& footprint,
-                 TileGrid grid);
-void check_lists(const ListTensors& lists, const Tensor& like, const FootprintSpec& footprint, TileGrid grid);
+void check_saved(const ListTensors& lists, const BlendState& state, const Tensor& like, const Pass& pass);
+void check_lists(const ListTensors& lists, const Tensor& like, const Pass& pass);
 
 /// Sizes that tensors and tiles can be indexed with.
 void check_image_size(int64_t height, int64_t width);

@@ -18,7 +18,7 @@ using ImageSwitches = std::array<bool, kImageCount>;
 
 /// Images, or gradients with respect to them; those are undefined where they are zero.
 struct ImageTensors {
-  Tensor color;                            ///< (C, H, W) of C colour channels
+  Tensor color;                            ///< (C, H, W) of C colour channels, which features are too
   std::array<Tensor, kImageCount> others;  ///< (H, W); undefined where nobody wants them
 };
 
@@ -29,12 +29,14 @@ struct ChannelTensors {
   int64_t count;           ///< of channels
   int64_t color_channels;  ///< the first ones; each of the others makes an image of its own
   Tensor background;       ///< (count,)
+  Tensor given;            ///< (m, k) those of `rows` that the caller gave; undefined: none
+  int first_given = 0;     ///< their first column
   /// Columns of `rows` that `project` fills, -1 where it does not (ChannelRows in core/stages.h).
   int color = -1, depth = -1, inverse_depth = -1;
 
   bool made_by_projection() const { return color >= 0 || depth >= 0 || inverse_depth >= 0; }
   /// The projection makes all of them, and nobody else looks at their gradient.
-  bool only_made_by_projection() const { return color == 0; }
+  bool only_made_by_projection() const { return made_by_projection() && !given.defined(); }
 };
 
 inline ImageTensors make_images(const ChannelTensors& channels, const ImageSwitches& wanted, TileGrid grid) {

@@ -46,6 +46,13 @@ template <class Visit> void each_op(const Visit& visit) {
   visit(Op<InspectArguments, inspect>{}, "inspect", "Tensor[] summary");
   visit(Op<WeightArguments, footprint_weight>{}, "footprint_weight", "Tensor weight");
   visit(Op<VjpArguments<WeightArguments>, footprint_weight_vjp>{}, "footprint_weight_vjp", gradients);
+  visit(Op<SsimArguments, ssim_map>{}, "ssim_map", "Tensor map, Tensor[] saved");
+  visit(Op<VjpArguments<SsimArguments>, ssim_map_vjp>{}, "ssim_map_vjp", gradients);
+  visit(Op<L1SsimArguments, l1_ssim>{}, "l1_ssim", "Tensor loss, Tensor[] saved");
+  visit(Op<VjpArguments<L1SsimArguments>, l1_ssim_vjp>{}, "l1_ssim_vjp", gradients);
+  visit(Op<ActivateArguments, activate>{}, "activate", "Tensor scales, Tensor rotations, Tensor opacities");
+  visit(Op<VjpArguments<ActivateArguments>, activate_vjp>{}, "activate_vjp", gradients);
+  visit(Op<AdamArguments, adam>{}, "adam_", "");
 }
 
 void register_kernels(torch::Library& m) {
@@ -129,6 +136,12 @@ PYBIND11_MODULE(_C, m) {
   m.attr("LENS") = ar::ops::lens_members();
   m.attr("LISTS") = ar::ops::member_names<ar::ops::ListTensors>();
   m.attr("TILE") = ar::kTile;
+  m.def(
+      "tile_size",
+      [](const std::string& footprint, double option, bool cuda) {
+        return ar::ops::grid_of(ar::ops::find_footprint(footprint, option), 1, 1, cuda).side();
+      },
+      "Edge of the tiles that a footprint is binned for [px].");
   m.attr("SPLAT_WIDTH") = ar::kSplatWidth;
   m.attr("NEAR") = ar::kNear;
   m.attr("FRUSTUM_CLAMP") = ar::kFrustumClamp;

@@ -1,5 +1,5 @@
-// The ops, each written once for every device: the pass in rasterize.cpp, its stages in stages.cpp. Registered with
-// torch in ops.cpp, made differentiable in autograd.cpp.
+// The ops, each written once for every device: the pass in rasterize.cpp, its stages in stages.cpp, what a training
+// step has besides in training.cpp. Registered with torch in ops.cpp, made differentiable in autograd.cpp.
 #pragma once
 
 #include <vector>
@@ -11,7 +11,8 @@ namespace ar::ops {
 /// What an op returns, in the order of its schema (ops.cpp). `saved` is for its adjoint.
 using Results = std::vector<IValue>;
 
-/// color (C, H, W); images: those of kImageNames that are asked for, (H, W); radii (P,) int32; saved.
+/// color (C + K, H, W) of C colours and K features; images: those of kImageSwitches that are asked for, (H, W); radii
+/// (P,) int32; saved.
 Results rasterize(RasterizeArguments a);
 /// The same, and the seconds that project, bin and blend took, (3,) float64. Saves the lists without `keep` too. Waits
 /// for the device.
@@ -37,5 +38,19 @@ Results inspect(InspectArguments a);
 /// weight
 Results footprint_weight(WeightArguments a);
 Results footprint_weight_vjp(VjpArguments<WeightArguments> a);
+
+/// map (..., H, W), saved: with `keep` the derivatives of the similarity, (kSsimPartials, ..., H, W).
+Results ssim_map(SsimArguments a);
+Results ssim_map_vjp(VjpArguments<SsimArguments> a);
+/// loss (), saved: as from ssim_map.
+Results l1_ssim(L1SsimArguments a);
+Results l1_ssim_vjp(VjpArguments<L1SsimArguments> a);
+
+/// scales (N, 3), rotations (N, 4), opacities (N, 1)
+Results activate(ActivateArguments a);
+Results activate_vjp(VjpArguments<ActivateArguments> a);
+
+/// Nothing: writes to params, exp_avgs and exp_avg_sqs.
+Results adam(AdamArguments a);
 
 }  // namespace ar::ops

@@ -9,18 +9,22 @@
 namespace ar::ops {
 namespace {
 
-/// Which channels are blended: the colours, then depth and inverse depth, if they are asked for. `made`: the rows as
-/// the forward pass saved them, or undefined: make room for them.
+/// Which channels are blended: the colours, the features, then depth and inverse depth, if they are asked for. `made`:
+/// the rows as the forward pass saved them, or undefined: make room for them.
 ChannelTensors channels_of(const RasterizeArguments& a, const Tensor& made) {
-  const int64_t extra = int64_t(a.images[kDepth]) + int64_t(a.images[kInverseDepth]);
+  const int64_t colors = a.bg.size(0), depths = int64_t(a.images[kDepth]) + int64_t(a.images[kInverseDepth]);
+  const bool three = colors == 3;
   ChannelTensors out;
   out.by_gaussian = true;
-  out.color_channels = a.bg.size(0);
-  out.count = out.color_channels + extra;
+  if (!three) out.given = *a.colors_precomp;
+  if (a.features) out.given = *a.features;
+  out.first_given = three ? 3 : 0;
+  out.color_channels = colors + (a.features ? a.features->size(1) : 0);
+  out.count = out.color_channels + depths;
+  const int64_t extra = out.count - colors;
   out.background = extra > 0 ? at::constant_pad_nd(a.bg, {0, extra}) : a.bg;
-  const bool three = out.color_channels == 3;
   if (extra == 0) {
-    if (!three) out.rows = *a.colors_precomp;
+    out.rows = out.given;
     return out;
   }
   if (three) out.color = 0;
@@ -29,7 +33,7 @@ ChannelTensors channels_of(const RasterizeArguments& a, const Tensor& made) {
   out.rows = made;
   if (made.defined()) return out;
   out.rows = at::empty({a.count(), out.count}, a.means3D.options());
-  if (!three) out.rows.narrow(1, 0, out.color_channels).copy_(*a.colors_precomp);
+  if (out.given.defined()) out.rows.narrow(1, out.first_given, out.given.size(1)).copy_(out.given);
   return out;
 }
 
@@ -58,7 +62,7 @@ struct Saved {
 Results run(RasterizeArguments a, std::vector<double>* seconds) {
   const Snapshot snapshot(a, a.debug, "snapshot_fw.dump");
   return snapshot.guard([&] {
-    Pass pass(a);
+    Pass pass(a, a.means3D);
     pass.keep = a.keep;
     pass.debug = a.debug;
     check(a);
@@ -106,18 +110,19 @@ Results rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
   RasterizeArguments& a = arguments.of_op;
   const Snapshot snapshot(arguments, a.debug, "snapshot_bw.dump");
   return snapshot.guard([&] {
-    Pass pass(a);
+    Pass pass(a, a.means3D);
     pass.debug = a.debug;
     check(a);
     const std::vector<bool>& needs = arguments.needs;
-    check_needs(needs, kSceneTensors + 1);
+    check_needs(needs, kSceneTensors + 2);
     check_camera_needs(needs, a.lens);
     const Saved saved(arguments.saved);
-    check_saved(saved.lists, saved.state, a.means3D, pass.footprint, pass.grid);
+    check_saved(saved.lists, saved.state, a.means3D, pass);
     const ChannelTensors channels = channels_of(a, saved.channels);
     const int64_t height = a.image_height, width = a.image_width;
     ImageTensors dL_dimage;
-    dL_dimage.color = gradient_of(arguments.dL_doutputs, 0, "dL_dcolor", a.means3D, {a.bg.size(0), height, width});
+    dL_dimage.color =
+        gradient_of(arguments.dL_doutputs, 0, "dL_dcolor", a.means3D, {channels.color_channels, height, width});
     size_t place = 1;
     for (size_t k = 0; k < kImageCount; ++k) {
       const std::string name = "dL_d" + std::string(name_of(kImageSwitches[k]));
@@ -131,23 +136,28 @@ Results rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
     const PairSums sums = backend->blend_vjp(saved.lists, saved.state, pass, channels, dL_dimage, grads.mean_sums);
     const Tensor camera = backend->project_vjp(a, saved.lists, pass, sums, channels, grads);
     if (grads.with_camera) set_camera_grads(camera, needs, grads);
-    if (needs[4] && channels.color_channels != 3) {
-      const Tensor& all = sums.dL_dchannels;
-      grads.colors_precomp =
-          all.size(1) == channels.color_channels ? all : all.narrow(1, 0, channels.color_channels).contiguous();
+    Tensor background, features;
+    if (channels.given.defined() && needs[a.features ? kSceneTensors + 1 : 4]) {
+      Tensor& grad = a.features ? features : grads.colors_precomp;
+      grad = sums.dL_dchannels.narrow(1, channels.first_given, channels.given.size(1)).contiguous();
+    }
+    if (needs[kSceneTensors]) {
+      const Tensor& color = dL_dimage.color;
+      background = color.defined()
+                       ? background_grad(color.narrow(0, 0, a.bg.size(0)), saved.state, saved.lists, pass.grid)
+                       : at::zeros_like(a.bg);
     }
     std::vector<Tensor> list = list_of(grads, a.means3D);
-    list.push_back(!needs[kSceneTensors]       ? at::empty({0}, a.means3D.options())
-                   : dL_dimage.color.defined() ? background_grad(dL_dimage.color, saved.state, saved.lists, pass.grid)
-                                               : at::zeros_like(a.bg));
+    list.push_back(or_empty(background, a.means3D));
+    list.push_back(or_empty(features, a.means3D));
     return Results{list};
   });
 }
 
 Results inspect(InspectArguments a) {
-  const Pass pass(a);
   const ListTensors lists = Saved(a.saved).lists;
-  check(a, lists, pass.footprint);
+  const Pass pass(a, lists.splats);
+  check(a, lists, pass);
   const at::TensorOptions options = lists.splats.options(), ints = options.dtype(at::kInt);
   SummaryTensors summary;
   summary.median = at::empty({a.image_height, a.image_width}, ints);
@@ -155,8 +165,11 @@ Results inspect(InspectArguments a) {
   summary.touched = at::zeros({a.count}, ints);
   summary.largest = at::zeros({a.count}, options.dtype(at::kFloat));
   summary.total = at::zeros({a.count}, options.dtype(at::kLong));
+  summary.in_front = at::zeros({a.count}, ints);
+  summary.dominated = at::zeros({a.count}, ints);
   make_backend(lists.splats)->inspect(lists, pass, summary);
-  return {std::vector<Tensor>{summary.median, summary.dominant, summary.touched, summary.largest, summary.total}};
+  return {std::vector<Tensor>{summary.median, summary.dominant, summary.touched, summary.largest, summary.total,
+                              summary.in_front, summary.dominated}};
 }
 
 }  // namespace ar::ops

@@ -12,6 +12,19 @@ bool needs_camera(const std::vector<bool>& needs) {
   return std::find(first, last, true) != last;
 }
 
+/// Mean transmittance of every pixel's samples, (H, W). A tile of `adaptive` uses the first of them only.
+Tensor mean_transmittance(const BlendState& state, const ListTensors& lists, TileGrid grid) {
+  if (lists.tile_samples.numel() == 0) return state.transmittance.mean(0);
+  const Tensor samples = lists.tile_samples.view({grid.rows(), grid.columns()})
+                             .repeat_interleave(kTile, 0)
+                             .repeat_interleave(kTile, 1)
+                             .slice(0, 0, grid.height)
+                             .slice(1, 0, grid.width);
+  const Tensor number = at::arange(state.transmittance.size(0), samples.options()).view({-1, 1, 1});
+  return at::where(number.lt(samples), state.transmittance, at::zeros({}, state.transmittance.options())).sum(0) /
+         samples;
+}
+
 }  // namespace
 
 void check_camera_needs(const std::vector<bool>& needs, const OptionalTensor& lens) {
@@ -56,23 +69,6 @@ std::vector<Tensor> list_of(Grads grads, const Tensor& like) {
   grads.each_tensor([&](const char*, Tensor& t) { list.push_back(or_empty(t, like)); });
   return list;
 }
-
-namespace {
-
-/// Mean transmittance of every pixel's samples, (H, W). A tile of `adaptive` uses the first of them only.
-Tensor mean_transmittance(const BlendState& state, const ListTensors& lists, TileGrid grid) {
-  if (lists.tile_samples.numel() == 0) return state.transmittance.mean(0);
-  const Tensor samples = lists.tile_samples.view({grid.rows(), grid.columns()})
-                             .repeat_interleave(kTile, 0)
-                             .repeat_interleave(kTile, 1)
-                             .slice(0, 0, grid.height)
-                             .slice(1, 0, grid.width);
-  const Tensor number = at::arange(state.transmittance.size(0), samples.options()).view({-1, 1, 1});
-  return at::where(number.lt(samples), state.transmittance, at::zeros({}, state.transmittance.options())).sum(0) /
-         samples;
-}
-
-}  // namespace
 
 Tensor background_grad(const Tensor& dL_dcolor, const BlendState& state, const ListTensors& lists, TileGrid grid) {
   return (dL_dcolor * mean_transmittance(state, lists, grid)).sum(at::IntArrayRef({1, 2}));

@@ -52,7 +52,7 @@ struct CameraPart {
 }  // namespace
 
 Results project(ProjectArguments a) {
-  const Pass pass(a);
+  const Pass pass(a, a.means3D);
   const int64_t cameras = check_cameras(a);
   const bool with_colors = a.shs || a.colors_precomp;
   const at::TensorOptions options = a.means3D.options(), ints = options.dtype(at::kInt);
@@ -145,7 +145,7 @@ Results project_vjp(VjpArguments<ProjectArguments> arguments) {
 }
 
 Results bin(BinArguments a) {
-  Pass pass(a);
+  Pass pass(a, a.means2d);
   pass.keep = a.keep;
   check(a);
   TORCH_CHECK_VALUE(!pass.footprint.chosen || a.colors,
@@ -162,9 +162,9 @@ Results bin(BinArguments a) {
 }
 
 Results blend(BlendArguments a) {
-  Pass pass(a);
+  Pass pass(a, a.means2d);
   pass.keep = a.keep;
-  check(a, pass.footprint);
+  check(a, pass);
   const std::unique_ptr<Backend> backend = make_backend(a.means2d);
   const int64_t cameras = a.row_splits.size(0) - 1;
   std::vector<Tensor> images, alphas, saved;
@@ -186,8 +186,8 @@ Results blend(BlendArguments a) {
 
 Results blend_vjp(VjpArguments<BlendArguments> arguments) {
   BlendArguments& a = arguments.of_op;
-  const Pass pass(a);
-  check(a, pass.footprint);
+  const Pass pass(a, a.means2d);
+  check(a, pass);
   const std::vector<bool>& needs = arguments.needs;
   check_needs(needs, 8);
   const int64_t cameras = a.row_splits.size(0) - 1, channels = a.features.size(1);
@@ -207,7 +207,7 @@ Results blend_vjp(VjpArguments<BlendArguments> arguments) {
   for (int64_t c = 0; c < cameras; ++c) {
     const CameraPart part(a, c);
     const auto state = from_list<BlendState>(arguments.saved, c * BlendState::kMembers);
-    check_saved(part.lists, state, a.means2d, pass.footprint, pass.grid);
+    check_saved(part.lists, state, a.means2d, pass);
     ImageTensors gradient;
     if (dL_dimage.defined()) gradient.color = dL_dimage[c];
     if (dL_dalpha.defined()) gradient.others[kAlpha] = dL_dalpha[c];
@@ -256,7 +256,7 @@ Results footprint_weight_vjp(VjpArguments<WeightArguments> arguments) {
                     "dL_doutputs must hold the gradient with respect to the weight, got none");
   tensors.dL_doffset = at::empty(a.offset.sizes(), a.offset.options());
   tensors.dL_dcov2d = at::empty(a.cov2d.sizes(), a.offset.options());
-  make_backend(a.offset)->weight_vjp(tensors, footprint);
+  make_backend(a.offset)->weight(tensors, footprint);
   return {std::vector<Tensor>{tensors.dL_doffset, tensors.dL_dcov2d}};
 }
 

@@ -87,11 +87,11 @@ void set_projection(Params& p, const Inputs& in, const Pass& pass, const Tensor&
   p.radii = pointer<int32_t>(radii);
 }
 /// What `project` has besides.
-template <typename T> void set_channels(ProjectParams<T>& p, const Inputs& in, const ChannelTensors& channels) {
+template <typename T> void set_channels(ProjectParams<T>& p, const ChannelTensors& channels) {
   p.channels = channel_rows<T>(channels.rows, channels);
-  if (!in.colors_precomp || has_colors(in)) return;
-  p.given.data = const_pointer<T>(in.colors_precomp);
-  p.given.stride = in.colors_precomp->size(1);
+  if (!channels.given.defined()) return;
+  p.given.data = const_pointer<T>(channels.given);
+  p.given.stride = channels.given.size(1);
   p.given.count = int(p.given.stride);
 }
 
@@ -122,8 +122,9 @@ void set_row_grads(RowGradsParams<T>& p, const RowTensors& rows, const Pass& pas
   p.absolute = pointer<Vec2<T>>(dL_drows.absolute);
 }
 
-template <typename T>
-void set_blend(BlendParams<T>& p, const ListTensors& lists, const Pass& pass, const ChannelTensors& channels,
+/// Of `blend`, which writes `image` and `state`, or of its adjoint, which reads them: there `image` is a gradient.
+template <typename T, class Params>
+void set_blend(Params& p, const ListTensors& lists, const Pass& pass, const ChannelTensors& channels,
                const ImageTensors& image, const BlendState& state) {
   p.grid = pass.grid;
   p.splats = const_pointer<T>(lists.splats);
@@ -131,17 +132,6 @@ void set_blend(BlendParams<T>& p, const ListTensors& lists, const Pass& pass, co
   p.transmittance = pointer<T>(state.transmittance);
   p.last = pointer<int32_t>(state.last);
   set_images(p, image, channels);
-}
-
-template <typename T>
-void set_blend_vjp(BlendVjpParams<T>& p, const ListTensors& lists, const Pass& pass, const ChannelTensors& channels,
-                   const ImageTensors& dL_dimage, const BlendState& state) {
-  p.grid = pass.grid;
-  p.splats = const_pointer<T>(lists.splats);
-  p.background = const_pointer<T>(channels.background);
-  p.transmittance = const_pointer<T>(state.transmittance);
-  p.last = const_pointer<int32_t>(state.last);
-  set_images(p, dL_dimage, channels);
 }
 
 template <typename T>
@@ -153,6 +143,8 @@ void set_inspect(InspectParams<T>& p, const ListTensors& lists, const Pass& pass
   p.touched = pointer<int32_t>(summary.touched);
   p.largest = reinterpret_cast<int32_t*>(pointer<float>(summary.largest));
   p.units = pointer<int64_t>(summary.total);
+  p.in_front = pointer<int32_t>(summary.in_front);
+  p.dominated = pointer<int32_t>(summary.dominated);
 }
 
 template <typename T> void set_weight(WeightParams<T>& p, const WeightTensors& t, const FootprintSpec& footprint) {

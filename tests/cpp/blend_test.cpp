@@ -3,6 +3,7 @@
 
 #include <algorithm>
 
+#include "core/footprint/moment.h"
 #include "support.h"
 
 namespace ar::test {
@@ -158,6 +159,110 @@ TEST(BlendVjp, KeepsDeepStacksAccurate) {
       ASSERT_NEAR(grads.colors[k], double(front[k] * alphas[k]), bound);
     }
   }
+}
+
+TEST(BlendSample, NoExponentBelowTheBoundReachesTheMinimum) {
+  EXPECT_LT(kLogAlphaMin, std::log2(kAlphaMin) - 5e-5);
+  EXPECT_GT(kLogAlphaMin, std::log2(kAlphaMin) - 5e-4);
+}
+
+/// Adjoint of blend_sample of a P that moves. `transmittance` and `state` are those in front of the splat; `dL_dmoved`
+/// goes from behind the splat to in front of it.
+template <class P, class Terms>
+MovingBlendGrad<double> blend_moving_sample_vjp(const Terms& terms, Vec2<double> p, int s, bool before, double g_color,
+                                                double transmittance, const SampleState<double, true>& state,
+                                                double& behind, Vec2<double>& dL_dmoved) {
+  const Vec2<double> at = p + state.moved;
+  const double raw = P::alpha(terms, at, s), alpha = before && raw >= kAlphaMin ? std::min(raw, kAlphaMax) : 0;
+  const bool free = alpha > 0 && raw <= kAlphaMax;
+  const double difference = g_color - behind;
+  behind = madd(alpha, difference, behind);
+  return {transmittance * alpha,
+          P::alpha_and_move_vjp(terms, at, s, raw, alpha, free, transmittance * difference, state.moved, dL_dmoved)};
+}
+
+// A sample that moves, by its displacement and by its place: two forms of the same, for a stack of splats and back.
+template <int S> void expect_places_and_displacements_to_agree() {
+  using P = Moment<S>;
+  using V = Vec2<double>;
+  Random random(40 + S);
+  int composited = 0, held = 0;
+  for (int trial = 0; trial < 300; ++trial) {
+    const int s = trial % S, count = 30;
+    const V p = {random.uniform(0, 16), random.uniform(0, 16)};
+    const Vec2<double> node = P::node(s);
+    const Bounds<double> cell = P::template cell<double>(s);
+    std::vector<decltype(P::terms(GaussianShape<double>(), 1.0))> terms;
+    std::vector<V> fronts, places;
+    std::vector<double> front_transmittance, raws, colors = randoms<double>(random, count, 0, 1);
+    SampleState<double, true> state = {};
+    double by_moved = 1, by_place = 1;
+    V place = node;
+    for (int k = 0; k < count; ++k) {
+      const double xx = random.log_uniform(0.05, 3), yy = random.log_uniform(0.05, 3);
+      const double xy = random.uniform(-0.9, 0.9) * std::sqrt(xx * yy);
+      const auto shape = P::prepare(Cov2d<double>{xx, xy, yy, xx * yy - xy * xy}, FootprintOptions{});
+      const V mean = {p.x + random.uniform(-2, 2), p.y + random.uniform(-2, 2)};
+      terms.push_back(P::terms(shape, random.uniform(0.1, 1.2), V{-mean.x, -mean.y}));
+      const V z = P::whitened_node(terms[k], P::whitened(terms[k], p, 0), place);
+      const double raw = exp2(P::log_alpha(terms[k], z));
+      const V at = p + state.moved;
+      ASSERT_NEAR(raw, P::alpha(terms[k], at, s), 1e-11);
+      fronts.push_back(state.moved), places.push_back(place), front_transmittance.push_back(by_moved);
+      const Blended<double> a = blend_sample<P>(terms[k], p, s, by_moved, state);
+      const Blended<double> b = blend_placed_sample<P>(terms[k], z, raw, cell, by_place, place);
+      ASSERT_EQ(a.mask, b.mask);
+      ASSERT_NEAR(a.contribution, b.contribution, 1e-10);
+      ASSERT_NEAR(node.x + state.moved.x, place.x, 1e-10);
+      ASSERT_NEAR(node.y + state.moved.y, place.y, 1e-10);
+      raws.push_back(b.mask ? raw : 0);
+      composited += b.mask;
+      held += place.x == cell.lo.x || place.x == cell.hi.x || place.y == cell.lo.y || place.y == cell.hi.y;
+    }
+    double behind_moved = 0.7, behind_place = 0.7, transmittance = std::abs(by_place);
+    V dL_dmoved = {0, 0}, dL_dplace = {0, 0};
+    for (int k = count - 1; k >= 0; --k) {
+      const MovingBlendGrad<double> a =
+          blend_moving_sample_vjp<P>(terms[k], p, s, raws[k] > 0, colors[k], front_transmittance[k],
+                                     SampleState<double, true>{fronts[k]}, behind_moved, dL_dmoved);
+      const V z = P::whitened_node(terms[k], P::whitened(terms[k], p, 0), places[k]);
+      const MovingBlendGrad<double> b = blend_placed_sample_vjp<P>(terms[k], z, raws[k], cell, colors[k], places[k],
+                                                                   transmittance, behind_place, dL_dplace);
+      const double actual[] = {b.contribution,
+                               b.of_splat.weighted,
+                               b.of_splat.sums.offset.x,
+                               b.of_splat.sums.offset.y,
+                               b.of_splat.sums.shape.xx,
+                               b.of_splat.sums.shape.xy,
+                               b.of_splat.sums.shape.yy,
+                               behind_place,
+                               dL_dplace.x,
+                               dL_dplace.y,
+                               transmittance};
+      const double expected[] = {a.contribution,
+                                 a.of_splat.weighted,
+                                 a.of_splat.sums.offset.x,
+                                 a.of_splat.sums.offset.y,
+                                 a.of_splat.sums.shape.xx,
+                                 a.of_splat.sums.shape.xy,
+                                 a.of_splat.sums.shape.yy,
+                                 behind_moved,
+                                 dL_dmoved.x,
+                                 dL_dmoved.y,
+                                 std::abs(front_transmittance[k])};
+      // Rounding, which 1 / (1 - alpha)^2 enlarges by up to 1e4, and steps of up to 30 splats in a row.
+      for (int i = 0; i < 11; ++i)
+        ASSERT_NEAR(actual[i], expected[i], 1e-8 * (1 + std::abs(expected[i]))) << k << " " << i;
+    }
+  }
+  EXPECT_GT(composited, 1000);
+  EXPECT_GT(held, 20);
+}
+TEST(BlendSample, PlacesAndDisplacementsAgree) {
+  expect_places_and_displacements_to_agree<1>();
+  expect_places_and_displacements_to_agree<4>();
+  expect_places_and_displacements_to_agree<9>();
+  expect_places_and_displacements_to_agree<16>();
 }
 
 }  // namespace

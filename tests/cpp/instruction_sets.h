@@ -17,6 +17,8 @@ struct PackOps {
   Map select;  ///< a < b ? b : c
   float (*sum)(const float* a);
   uint32_t (*bits)(const float* a, const float* b);  ///< of a < b
+  /// Some lanes of a, stored and loaded again; returns how many numbers that took.
+  int (*keep_lanes)(uint32_t lanes, const float* a, const float* otherwise, float* out);
 };
 
 struct InstructionSet {

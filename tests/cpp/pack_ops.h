@@ -23,6 +23,12 @@ const test::PackOps kPackOps = {
     },
     [](const float* a) { return sum(Pack::load(a)); },
     [](const float* a, const float* b) { return bits(Pack::load(a) < Pack::load(b)); },
+    [](uint32_t lanes, const float* a, const float* otherwise, float* out) {
+      float stored[kLanes];
+      store_lanes(stored, lanes, Pack::load(a));
+      load_lanes(stored, lanes, Pack::load(otherwise)).store(out);
+      return lanes_stored(lanes, Pack());
+    },
 };
 
 }  // namespace ar::AR_ISA

@@ -122,6 +122,25 @@ TEST_P(PackTest, SumAndBits) {
   }
 }
 
+TEST_P(PackTest, LanesComeBack) {
+  const int lanes = GetParam().ops.lanes;
+  std::vector<float> a(lanes), otherwise(lanes), out(lanes);
+  for (int i = 0; i < lanes; ++i) a[i] = float(i + 1), otherwise[i] = float(-i - 1);
+  ASSERT_EQ(GetParam().ops.keep_lanes(0, a.data(), otherwise.data(), out.data()), 0);
+  for (uint32_t kept = 1; kept < 1u << lanes; ++kept) {
+    const int numbers = GetParam().ops.keep_lanes(kept, a.data(), otherwise.data(), out.data());
+    const int count = __builtin_popcount(kept);
+    ASSERT_TRUE(numbers == count || numbers == lanes) << kept;
+    for (int i = 0; i < lanes; ++i) {
+      const bool is_kept = kept >> i & 1;
+      ASSERT_TRUE(out[i] == a[i] || (!is_kept && out[i] == otherwise[i])) << kept << " " << i;
+      if (!is_kept && numbers == count) {
+        ASSERT_EQ(out[i], otherwise[i]) << kept << " " << i;
+      }
+    }
+  }
+}
+
 template <typename T> class LanesTest : public ::testing::Test {};
 using Scalars = ::testing::Types<float, double>;
 TYPED_TEST_SUITE(LanesTest, Scalars);

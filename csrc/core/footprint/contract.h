@@ -46,6 +46,15 @@
 //                                        `free` where alpha depends on raw; `moved` in front of the splat; dL_dmoved on
 //                                        entry behind the splat, on exit in front of it
 //
+// and the same in the form that the CPU composites with, where a sample has its place from the pixel's centre, node +
+// displacement, and its whitened coordinates z, of which the pixel's part is shared by its samples:
+//
+//   cell(s) -> Bounds<T>                 where the place of sample s may be [px]
+//   whitened(Terms<T>, p, 0) -> Vec2<V>  of the pixel's centre
+//   whitened_node(Terms<T>, Vec2<V> of_pixel, Vec2<V> place) -> Vec2<V>    z
+//   log_alpha(Terms<T>, Vec2<V> z) -> V  log2(opacity * I)
+//   move_in, alpha_and_move_in_vjp       as move and alpha_and_move_vjp, from z, a place or displacement, its bounds
+//
 // T is float or double, V a scalar or a pack of lanes (lanes.h). The five numbers of ShapeGrad are summed over pixels
 // and samples in whatever coordinates make them cheap; prepare_vjp gives them meaning. `weighted` is the sum of alpha
 // dL_dalpha, which the gradient with respect to the opacity needs anyway.
@@ -109,6 +118,11 @@ template <class V> struct ShapeGrad {
 template <class V> AR_HD ShapeGrad<V> operator+(ShapeGrad<V> a, ShapeGrad<V> b) {
   return {a.offset + b.offset, a.shape + b.shape};
 }
+
+/// Where a node may be [px].
+template <class V> struct Bounds {
+  Vec2<V> lo, hi;
+};
 
 /// What one splat gets from one sample that moves.
 template <class V> struct MoveGrad {

@@ -111,9 +111,13 @@ template <int S> struct GaussianPixels : FootprintDefaults {
     return {z.x + V(t.node[s].x), z.y + V(t.node[s].y)};
   }
 
+  /// log2 of alpha at the whitened coordinates z.
+  template <typename T, class V> AR_HD static V log_alpha(const Terms<T>& t, Vec2<V> z) {
+    return madd(-z.x, z.x, madd(-z.y, z.y, V(t.log_peak)));
+  }
+
   template <typename T, class V> AR_HD static V alpha(const Terms<T>& t, Vec2<V> p, int s) {
-    const Vec2<V> z = whitened(t, p, s);
-    return exp2(madd(-z.x, z.x, madd(-z.y, z.y, V(t.log_peak))));
+    return exp2(log_alpha(t, whitened(t, p, s)));
   }
 
   template <typename T, class V>

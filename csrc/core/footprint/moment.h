@@ -58,35 +58,58 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
 
   template <typename T, class V>
   AR_HD static Vec2<V> move(const Terms<T>& t, Vec2<V> p, int s, V alpha, Vec2<V> moved) {
-    const Vec2<V> next = moved + step(t, Gaussian::whitened(t, p + place<T, V>(s), 0), ratio(alpha));
     const V reach = V(T(kMoveReach));
-    return {min(max(next.x, -reach), reach), min(max(next.y, -reach), reach)};
+    return move_in(t, Gaussian::whitened(t, p + place<T, V>(s), 0), alpha, moved, {{-reach, -reach}, {reach, reach}});
   }
 
-  /// With z = w d, y = w dL_dmoved and r = alpha / (1 - alpha), both times kBase2 as the sums are. A coordinate that
-  /// move() has held at its bound does not depend on anything.
   template <typename T, class V>
   AR_HD static MoveGrad<V> alpha_and_move_vjp(const Terms<T>& t, Vec2<V> p, int s, V raw, V alpha, MaskOf<V> free,
                                               V dL_dalpha, Vec2<V> moved, Vec2<V>& dL_dmoved) {
-    const V zero = V(T(0)), reach = V(T(kMoveReach)), two = V(T(2)), scale = V(T(kStep));
-    const V r = ratio(alpha);
-    const Vec2<V> z = Gaussian::whitened(t, p + place<T, V>(s), 0);
-    const Vec2<V> next = moved + step(t, z, r);
-    const Vec2<V> behind = {select(abs(next.x) > reach, zero, dL_dmoved.x),
-                            select(abs(next.y) > reach, zero, dL_dmoved.y)};
+    const V reach = V(T(kMoveReach));
+    return alpha_and_move_in_vjp(t, Gaussian::whitened(t, p + place<T, V>(s), 0), raw, alpha, free, dL_dalpha, moved,
+                                 {{-reach, -reach}, {reach, reach}}, dL_dmoved);
+  }
+
+  /// Where the node of sample s may be [px from the pixel's centre]: its cell.
+  template <typename T> AR_HD static Bounds<T> cell(int s) {
+    const Vec2<double> n = node(s);
+    return {{T(n.x - kMoveReach), T(n.y - kMoveReach)}, {T(n.x + kMoveReach), T(n.y + kMoveReach)}};
+  }
+
+  /// The whitened coordinates of nodes that are at `place` from the centres of pixels with the coordinates `of_pixel`.
+  template <typename T, class V>
+  AR_HD static Vec2<V> whitened_node(const Terms<T>& t, Vec2<V> of_pixel, Vec2<V> place) {
+    return {madd(V(t.w.xx), place.x, madd(V(t.w.xy), place.y, of_pixel.x)),
+            madd(V(t.w.yx), place.x, madd(V(t.w.yy), place.y, of_pixel.y))};
+  }
+
+  /// move() from the node's whitened coordinates z: `at` is its place or its displacement, and stays within `bounds`.
+  template <typename T, class V>
+  AR_HD static Vec2<V> move_in(const Terms<T>& t, Vec2<V> z, V alpha, Vec2<V> at, const Bounds<V>& bounds) {
+    const Vec2<V> next = step(t, z, odds(alpha), at);
+    return {min(max(next.x, bounds.lo.x), bounds.hi.x), min(max(next.y, bounds.lo.y), bounds.hi.y)};
+  }
+
+  /// alpha_and_move_vjp() likewise. With z = w d, y = w dL_dat and r = alpha / (1 - alpha), both times kBase2 as the
+  /// sums are. A coordinate that move_in() has held at a bound does not depend on anything.
+  template <typename T, class V>
+  AR_HD static MoveGrad<V> alpha_and_move_in_vjp(const Terms<T>& t, Vec2<V> z, V raw, V alpha, MaskOf<V> free,
+                                                 V dL_dalpha, Vec2<V> at, const Bounds<V>& bounds, Vec2<V>& dL_dat) {
+    const V zero = V(T(0)), scale = V(T(kStep)), unit = V(T(1 / (kBase2 * kBase2)));
+    const V r = odds(alpha), slope = V(T(1)) + r;  // 1 / (1 - alpha), whose square is dr / dalpha
+    const Vec2<V> next = step(t, z, r, at);
+    const MaskOf<V> free_x = (next.x >= bounds.lo.x) & (next.x <= bounds.hi.x);
+    const MaskOf<V> free_y = (next.y >= bounds.lo.y) & (next.y <= bounds.hi.y);
+    const Vec2<V> behind = {select(free_x, dL_dat.x, zero), select(free_y, dL_dat.y, zero)};
     const Vec2<V> y = transform(t.w, behind);
-    const V slope = V(T(1)) + r;  // 1 / (1 - alpha), whose square is dr / dalpha
     const V by_move = scale * madd(z.x, y.x, z.y * y.y) * slope * slope;
     const V g = select(free, raw * (dL_dalpha + by_move), zero), vr = V(T(kVariance)) * r;
-    MoveGrad<V> grad;
-    grad.weighted = g;
-    grad.sums.offset = {madd(g, z.x, -vr * y.x), madd(g, z.y, -vr * y.y)};
-    grad.sums.shape = {z.x * madd(g, z.x, -two * vr * y.x), madd(g * z.x, z.y, -vr * madd(z.x, y.y, z.y * y.x)),
-                       z.y * madd(g, z.y, -two * vr * y.y)};
-    const Vec2<V> by_place = transform_transposed(t.w, grad.sums.offset);
-    const V unit = V(T(1 / (kBase2 * kBase2)));
-    dL_dmoved = {behind.x - unit * by_place.x, behind.y - unit * by_place.y};
-    return grad;
+    const Vec2<V> q = {vr * y.x, vr * y.y};
+    const Vec2<V> offset = {madd(g, z.x, -q.x), madd(g, z.y, -q.y)};
+    const Sym2<V> shape = {z.x * (offset.x - q.x), madd(z.x, offset.y, -q.x * z.y), z.y * (offset.y - q.y)};
+    const Vec2<V> by_place = transform_transposed(t.w, offset);
+    dL_dat = {madd(-unit, by_place.x, behind.x), madd(-unit, by_place.y, behind.y)};
+    return {g, {offset, shape}};
   }
 
  private:
@@ -95,13 +118,11 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
 
   template <typename T, class V> AR_HD static Vec2<V> place(int s) { return {V(T(node(s).x)), V(T(node(s).y))}; }
 
-  template <class V> AR_HD static V ratio(V alpha) { return divide(alpha, V(ScalarOf<V>(1)) - alpha); }
-
-  /// v r (Sigma + v I)^-1 d, before the bound.
-  template <typename T, class V> AR_HD static Vec2<V> step(const Terms<T>& t, Vec2<V> z, V r) {
+  /// at + v r (Sigma + v I)^-1 d, before the bound.
+  template <typename T, class V> AR_HD static Vec2<V> step(const Terms<T>& t, Vec2<V> z, V r, Vec2<V> at) {
     const Vec2<V> along = transform_transposed(t.w, z);
     const V length = V(T(kStep)) * r;
-    return {length * along.x, length * along.y};
+    return {madd(length, along.x, at.x), madd(length, along.y, at.y)};
   }
 };
 

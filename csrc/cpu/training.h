@@ -1,0 +1,20 @@
+// The loops of a training step besides rendering, in float and double: loss, activations and optimiser. They are
+// compiled once, for the baseline instruction set. Bits do not depend on `threads`.
+#pragma once
+
+#include "core/activations.h"
+#include "core/adam.h"
+#include "core/ssim.h"
+
+namespace ar::cpu {
+
+template <typename T, typename Target> void ssim(const SsimParams<T, Target>& p, int threads);
+template <typename T, typename Target> void ssim_vjp(const SsimVjpParams<T, Target>& p, int threads);
+
+template <typename T> void activate(const ActivateParams<T>& p, int threads);
+template <typename T> void activate_vjp(const ActivateVjpParams<T>& p, int threads);
+
+/// p.first_item need not be set.
+template <typename T> void adam(AdamParams<T> p, int threads);
+
+}  // namespace ar::cpu

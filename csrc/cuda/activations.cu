@@ -1,0 +1,36 @@
+// Activations and their adjoint: a thread per Gaussian.
+#include "core/activations.h"
+
+#include "cuda/training.h"
+#include "cuda/warp.cuh"
+
+namespace ar::cuda {
+namespace {
+
+constexpr int kThreads = 256;
+
+template <typename T> __global__ void activate_kernel(const ActivateParams<T> p) {
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i < p.n) ar::activate(p, i);
+}
+
+template <typename T> __global__ void activate_vjp_kernel(const ActivateVjpParams<T> p) {
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i < p.n) ar::activate_vjp(p, i);
+}
+
+}  // namespace
+
+template <typename T> void activate(const ActivateParams<T>& p, cudaStream_t stream) {
+  if (p.n > 0) activate_kernel<T><<<blocks_of(p.n, kThreads), kThreads, 0, stream>>>(p);
+}
+template <typename T> void activate_vjp(const ActivateVjpParams<T>& p, cudaStream_t stream) {
+  if (p.n > 0) activate_vjp_kernel<T><<<blocks_of(p.n, kThreads), kThreads, 0, stream>>>(p);
+}
+
+template void activate(const ActivateParams<float>&, cudaStream_t);
+template void activate(const ActivateParams<double>&, cudaStream_t);
+template void activate_vjp(const ActivateVjpParams<float>&, cudaStream_t);
+template void activate_vjp(const ActivateVjpParams<double>&, cudaStream_t);
+
+}  // namespace ar::cuda

@@ -1,0 +1,260 @@
+// Kernel of blend for footprints whose samples move: a block per tile of 8x8 pixels, a lane per few samples of a pixel.
+//
+// What a splat does to a sample depends on where the sample is when they meet, so that the chunks of a list cannot be
+// blended side by side as in blend.cuh: a block walks its whole list. What fills the device instead is that samples are
+// spread over lanes and that tiles are small. It also wastes less: the fewer pixels a warp has, the fewer splats pass
+// through it that touch only some of them.
+#pragma once
+
+#include "cuda/composite.cuh"
+
+namespace ar::cuda {
+
+inline constexpr int kMovingPixels = kMovingTile * kMovingTile;
+/// Of more channels than lie in the rows of pairs, those that are blended at once.
+inline constexpr int kMovingChannels = 8;
+
+/// How the samples of 8x8 pixels are shared out: kCells to a lane, those of a pixel to kLanes neighbours, a power of
+/// two, of which the last may have fewer, or none. A warp's pixels are a rectangle.
+template <int kCellsOfLane, int kLanesOfPixel> struct CellLayout {
+  static constexpr int kCells = kCellsOfLane, kLanes = kLanesOfPixel;
+  static constexpr int kThreads = kLanes * kMovingPixels, kWarps = kThreads / 32;
+  static_assert((kLanes & (kLanes - 1)) == 0 && kWarps <= 32);
+  static constexpr int kPixels = 32 / kLanes;  ///< of a warp
+  static constexpr int kWide = kPixels == 32 ? 8 : kPixels >= 8 ? 4 : 2, kHigh = kPixels / kWide;
+  static constexpr int kColumns = kMovingTile / kWide;  ///< warps side by side
+
+  /// This thread's pixel, relative to the tile's first.
+  __device__ static Vec2<float> pixel() {
+    const int warp = threadIdx.x / 32, i = lane_id() / kLanes;
+    return {float(warp % kColumns * kWide + i % kWide), float(warp / kColumns * kHigh + i / kWide)};
+  }
+  /// Its place among the tile's pixels, row by row, whatever the layout.
+  __device__ static int pixel_number() {
+    const Vec2<float> p = pixel();
+    return int(p.y) * kMovingTile + int(p.x);
+  }
+  /// The first of this thread's samples of its pixel.
+  __device__ static int first_sample() { return lane_id() % kLanes * kCells; }
+
+  /// Bit w: the support reaches the pixels of warp w of the tile that begins at (x0, y0).
+  __device__ static uint32_t reach(const Support<float>& support, int x0, int y0) {
+    uint32_t reach = 0;
+#pragma unroll
+    for (int w = 0; w < kWarps; w += kColumns) {
+      const float y = float(y0 + w / kColumns * kHigh);
+      const Span<float> span = columns_of(support, y, y + float(kHigh - 1));
+#pragma unroll
+      for (int c = 0; c < kColumns; ++c) {
+        const float x = float(x0 + c * kWide);
+        reach |= uint32_t(span.lo <= x + float(kWide - 1) && span.hi >= x) << (w + c);
+      }
+    }
+    return reach;
+  }
+
+  /// The sum over the lanes of a pixel, in each of them.
+  __device__ static float sum_lanes(float x) {
+#pragma unroll
+    for (int offset = 1; offset < kLanes; offset *= 2) x += __shfl_xor_sync(kAllLanes, x, offset);
+    return x;
+  }
+};
+
+/// Where the checkpoints of a tile's samples are: the one in front of pair i spacing, i > 0, is number first + i - 1.
+/// With too many pairs the tiles share equally what room there is.
+struct StatePlaces {
+  int64_t first;
+  int spacing;  ///< a multiple of kStateChunk
+
+  __device__ StatePlaces(const TileLists& lists, const TileList& list, TileGrid grid, int tile)
+      : first(list.overflow ? 0 : lists.tile_offsets[tile] / kStateChunk), spacing(kStateChunk) {
+    if (!list.overflow) return;
+    const int64_t room = lists.capacity / kStateChunk / grid.tiles();
+    first = tile * room;
+    spacing = int(((list.count - 1) / (room + 1) / kStateChunk + 1) * kStateChunk);
+  }
+};
+
+/// A lane's samples on their way through a list.
+template <class F, class Layout> struct MovingSamples {
+  static constexpr int kCells = Layout::kCells;
+  float transmittance[kCells];
+  Vec2<float> place[kCells];     ///< of the node [px from the pixel's centre]
+  Bounds<float> bounds[kCells];  ///< of the place
+
+  /// In front of all splats.
+  __device__ explicit MovingSamples(bool inside) {
+#pragma unroll
+    for (int i = 0; i < kCells; ++i) {
+      transmittance[i] = inside && exists(i) ? 1.0f : -1.0f;
+      place[i] = node(i);
+      bounds[i] = F::template cell<float>(Layout::first_sample() + i);
+    }
+  }
+  __device__ static bool exists(int i) { return Layout::first_sample() + i < F::kSamples; }
+  __device__ static Vec2<float> node(int i) {
+    const Vec2<double> n = F::node(Layout::first_sample() + i);
+    return {float(n.x), float(n.y)};
+  }
+  __device__ bool open() const {
+    bool any = false;
+#pragma unroll
+    for (int i = 0; i < kCells; ++i) any |= transmittance[i] > 0;
+    return any;
+  }
+
+  /// Where checkpoint `number` has sample i of this pixel: its transmittance, and its place in the two planes behind.
+  __device__ static int64_t in_checkpoint(int64_t number, int i) {
+    const int64_t plane = number * state_planes(F::kSamples) + 3 * (Layout::first_sample() + i);
+    return plane * kMovingPixels + Layout::pixel_number();
+  }
+  __device__ void store(float* checkpoints, int64_t number) const {
+#pragma unroll
+    for (int i = 0; i < kCells; ++i) {
+      if (!exists(i)) continue;
+      float* to = checkpoints + in_checkpoint(number, i);
+      to[0] = abs(transmittance[i]);
+      to[kMovingPixels] = place[i].x;
+      to[2 * kMovingPixels] = place[i].y;
+    }
+  }
+  /// In front of pair k, a multiple of the spacing.
+  __device__ void load(const float* checkpoints, const StatePlaces& places, int k) {
+#pragma unroll
+    for (int i = 0; i < kCells; ++i) {
+      transmittance[i] = 1;
+      place[i] = node(i);
+      if (k == 0 || !exists(i)) continue;
+      const float* from = checkpoints + in_checkpoint(places.first + k / places.spacing - 1, i);
+      transmittance[i] = from[0];
+      place[i] = {from[kMovingPixels], from[2 * kMovingPixels]};
+    }
+  }
+};
+
+/// Up to kBatch splats of a tile that a block works on together.
+template <class F, int C, class Layout, int kBatch> struct MovingStage {
+  static_assert(kBatch <= Layout::kThreads);
+  TileSplat<F, C> splats[kBatch];
+  uint32_t reach[kBatch];
+
+  /// This thread's splat of those in [k, k + kBatch) and before `end` of the list, or -1.
+  __device__ static int32_t splat_of(const TileList& list, int k, int end) {
+    const int t = threadIdx.x;
+    return t < kBatch && k + t < end ? list.splat(k + t) : -1;
+  }
+  /// Loads the splats, `id` = splat_of(), with channels from `first` on.
+  __device__ void load(const Splat<F, float>* splats_in, const Channels<float>& channels, int first,
+                       const TileList& list, int32_t id) {
+    uint32_t bits = 0;
+    if (id >= 0) {
+      const Splat<F, float> splat = splats_in[id];
+      bits = Layout::reach(support_of(splat), list.x0, list.y0);
+      if (bits) splats[threadIdx.x] = {tile_terms(splat, list), channels_of<C>(channels, splat, id, first)};
+    }
+    if (threadIdx.x < kBatch) reach[threadIdx.x] = bits;
+  }
+
+  /// Of the splats [k, k + 32), those that reach this warp's pixels. All lanes must call it.
+  __device__ uint32_t reached(int k) const {
+    return __ballot_sync(kAllLanes, reach[k + lane_id()] >> (threadIdx.x / 32) & 1);
+  }
+};
+
+/// A block per tile; C channels from `first` on.
+template <class F, int C, class Layout>
+__global__ void __launch_bounds__(Layout::kThreads) moving_blend_kernel(const BlendParams params, int first) {
+  constexpr int kCells = Layout::kCells, kBatch = Layout::kThreads < 256 ? Layout::kThreads : 256;
+  __shared__ MovingStage<F, C, Layout, kBatch> stage;
+  const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
+  const int tile = params.plan.tile_order[blockIdx.x];
+  const TileList list = list_of(params.lists, params.grid, tile);
+  const StatePlaces places(params.lists, list, params.grid, tile);
+  const bool keep = params.transmittance && first == 0;
+  const Vec2<float> p = Layout::pixel();
+  const Pixel pixel(list, params.grid, p);
+  MovingSamples<F, Layout> samples(pixel.inside);
+  Values<C> sums = {};
+  int last[kCells] = {};
+  int32_t id = stage.splat_of(list, 0, list.count);
+  for (int k = 0; k < list.count && __syncthreads_or(samples.open()); k += kBatch) {
+    const int count = min(list.count - k, kBatch);
+    const int32_t next_id = stage.splat_of(list, k + kBatch, list.count);
+    stage.load(splats, params.channels, first, list, id);
+    __syncthreads();
+    if (next_id >= 0) prefetch(splats + next_id);  // so that the next batch need not wait for memory
+    id = next_id;
+    for (int from = 0; from < count; from += 32) {
+      if (!__any_sync(kAllLanes, samples.open())) break;
+      if (keep && k + from > 0 && (k + from) % places.spacing == 0)
+        samples.store(params.checkpoints, places.first + (k + from) / places.spacing - 1);
+      for (uint32_t mask = stage.reached(from); mask != 0; mask &= mask - 1) {
+        const int j = from + __ffs(mask) - 1;
+        TileSplatRef<F, C> splat = stage.splats[j];
+        const Vec2<float> of_pixel = transform(splat.terms.w, p, splat.terms.node[0]);
+        float contribution = 0;
+#pragma unroll
+        for (int i = 0; i < kCells; ++i) {
+          const Vec2<float> z = F::whitened_node(splat.terms, of_pixel, samples.place[i]);
+          const Blended<float> b =
+              blend_placed_sample<F>(splat.terms, z, exp2(F::log_alpha(splat.terms, z)), samples.bounds[i],
+                                     samples.transmittance[i], samples.place[i]);
+          contribution = i == 0 ? b.contribution : contribution + b.contribution;
+          last[i] = b.mask ? k + j + 1 : last[i];
+        }
+        sums.add(contribution, splat.channels);
+      }
+    }
+  }
+  float through = 0;
+#pragma unroll
+  for (int i = 0; i < kCells; ++i) {
+    if (!samples.exists(i)) continue;
+    through += abs(samples.transmittance[i]);
+    if (!keep || !pixel.inside) continue;
+    const int64_t place = (Layout::first_sample() + i) * pixel.image + pixel.index;
+    params.transmittance[place] = abs(samples.transmittance[i]);
+    params.last[place] = last[i];
+  }
+  through = Layout::sum_lanes(through);
+#pragma unroll
+  for (int c = 0; c < C; ++c) sums.v[c] = Layout::sum_lanes(sums.v[c]);
+  if (!pixel.inside || Layout::first_sample() > 0) return;
+  const float scale = 1.0f / F::kSamples;
+#pragma unroll
+  for (int c = 0; c < C; ++c) {
+    if (first + c >= params.channels.count) break;
+    params.image.plane(first + c, pixel.image)[pixel.index] =
+        scale * sums.v[c] + scale * through * params.background[first + c];
+  }
+  if (first == 0 && params.alpha) params.alpha[pixel.index] = 1 - scale * through;
+}
+
+/// Samples shared out so that there is least to do, forwards and backwards.
+template <class F, bool kBackward>
+using EvenLayout =
+    std::conditional_t<F::kSamples == 1, CellLayout<1, 1>,
+                       std::conditional_t<F::kSamples == 4, CellLayout<2, 2>,
+                                          std::conditional_t<F::kSamples == 9 && !kBackward, CellLayout<5, 2>,
+                                                             CellLayout<(F::kSamples + 3) / 4, 4>>>>;
+/// Samples shared out so that each warp has few pixels, even if lanes have nothing to do. A warp meets fewer splats
+/// then, one after the other, which is what takes the time where few tiles have long lists.
+/// Many channels need the room of half of the warps.
+template <class F, int C>
+using FineLayout = std::conditional_t<
+    F::kSamples <= 4, CellLayout<1, 8>,
+    std::conditional_t<F::kSamples == 9 || C == kMovingChannels, CellLayout<2, 8>, CellLayout<1, 16>>>;
+/// Tiles from which on there are enough to keep a device busy.
+inline constexpr int64_t kManyTiles = 4096;
+
+/// Calls launch(Layout{}) for the layout that suits the grid.
+template <class F, int C, bool kBackward, class Launch> void choose_layout(TileGrid grid, Launch&& launch) {
+  if (grid.tiles() < kManyTiles) {
+    launch(FineLayout<F, C>{});
+  } else {
+    launch(EvenLayout<F, kBackward>{});
+  }
+}
+
+}  // namespace ar::cuda

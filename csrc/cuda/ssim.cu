@@ -1,0 +1,262 @@
+// The similarity of two images, the loss made of it, and their adjoint: one kernel each, and one that sums the sums of
+// the blocks in their order.
+//
+// A block has the pixels of a tile. It copies the tile with what the windows reach into shared memory, makes the window
+// sums along the rows, and from those the sums along the columns. In both steps a thread makes kRun neighbouring sums
+// from values that it reads once into registers: the kernels would otherwise wait for shared memory.
+#include "core/ssim.h"
+
+#include "cuda/training.h"
+#include "cuda/warp.cuh"
+
+namespace ar::cuda {
+namespace {
+
+constexpr int kThreads = 256;
+constexpr int kReach = 2 * kSsimRadius;
+
+/// The tile of a block, and where its numbers are in shared memory.
+template <typename T> struct Tile {
+  static constexpr int kColumns = 32;
+  static constexpr int kRun = sizeof(T) == 4 ? 4 : 1;  ///< pixels of a thread, one below the other
+  static constexpr int kRows = kThreads / kColumns * kRun;
+  static constexpr int kReadColumns = kColumns + kReach, kReadRows = kRows + kReach;
+  // Odd, and with a remainder by four of three: threads that read runs of four in neighbouring rows hit different
+  // banks.
+  static constexpr int kReadPitch = kReadColumns + 1;
+  static constexpr int kSumPitch = kColumns + 1;
+};
+
+/// What the windows of a tile read, of kImages images, and its window sums along the rows.
+template <typename T, int kImages, int kSums> struct Shared {
+  T read[kImages][Tile<T>::kReadRows * Tile<T>::kReadPitch];
+  T sums[kSums][Tile<T>::kReadRows * Tile<T>::kSumPitch];
+};
+
+/// A block's tile: plane, and first row and column.
+struct Place {
+  int64_t plane;
+  int top, left;
+};
+
+__host__ __device__ inline int tiles_along(int size, int tile) { return (size - 1) / tile + 1; }
+
+template <typename T> __device__ Place place_of(int block, int height, int width) {
+  using Tile = Tile<T>;
+  const int across = tiles_along(width, Tile::kColumns), down = tiles_along(height, Tile::kRows);
+  return {block / across / down, block / across % down * Tile::kRows, block % across * Tile::kColumns};
+}
+
+/// copy(place in shared memory, pixel of the plane) for all that the windows of the tile read, which is outside the
+/// image where the pixel is -1.
+template <typename T, class Copy> __device__ void for_each_read(Place place, int height, int width, const Copy& copy) {
+  using Tile = Tile<T>;
+  for (int i = threadIdx.x; i < Tile::kReadRows * Tile::kReadColumns; i += kThreads) {
+    const int row = i / Tile::kReadColumns, column = i % Tile::kReadColumns;
+    const int y = place.top + row - kSsimRadius, x = place.left + column - kSsimRadius;
+    const bool inside = y >= 0 && y < height && x >= 0 && x < width;
+    copy(row * Tile::kReadPitch + column, inside ? int64_t(y) * width + x : -1);
+  }
+}
+
+/// body(place of the first value read, place of the first sum) for every run of sums along the rows of a tile.
+template <typename T, class Body> __device__ void for_each_run(const Body& body) {
+  using Tile = Tile<T>;
+  constexpr int kRuns = Tile::kColumns / Tile::kRun;  // of a row
+  for (int i = threadIdx.x; i < Tile::kReadRows * kRuns; i += kThreads) {
+    const int row = i / kRuns, column = i % kRuns * Tile::kRun;
+    body(row * Tile::kReadPitch + column, row * Tile::kSumPitch + column);
+  }
+}
+
+/// The window sums of a run of values: out[j] of the eleven from v[j] on.
+template <typename T, int kRun> __device__ void sum_run(const T (&v)[kRun + kReach], T (&out)[kRun]) {
+#pragma unroll
+  for (int j = 0; j < kRun; ++j) out[j] = window_sum<T>([&](int k) { return v[j + kSsimRadius + k]; });
+}
+
+/// The window sums of the pixels of this thread, from those along the rows.
+template <typename T> __device__ void sum_columns(const T* along_rows, T (&out)[Tile<T>::kRun]) {
+  using Tile = Tile<T>;
+  const int column = threadIdx.x % Tile::kColumns, row = threadIdx.x / Tile::kColumns * Tile::kRun;
+  T v[Tile::kRun + kReach];
+#pragma unroll
+  for (int k = 0; k < Tile::kRun + kReach; ++k) v[k] = along_rows[(row + k) * Tile::kSumPitch + column];
+  sum_run<T, Tile::kRun>(v, out);
+}
+
+/// body(j, pixel of the plane) for the pixels of this thread that are in the image.
+template <typename T, class Body> __device__ void for_each_pixel(Place place, int height, int width, const Body& body) {
+  using Tile = Tile<T>;
+  const int x = place.left + threadIdx.x % Tile::kColumns;
+  const int top = place.top + threadIdx.x / Tile::kColumns * Tile::kRun;
+#pragma unroll
+  for (int j = 0; j < Tile::kRun; ++j) {
+    if (x < width && top + j < height) body(j, int64_t(top + j) * width + x);
+  }
+}
+
+/// The sums of both values over the block, in its first thread.
+template <typename T> __device__ void sum_block(T& a, T& b) {
+  constexpr int kWarps = kThreads / 32;
+  __shared__ T of_warps[kWarps][2];
+  a = warp_sum(a);
+  b = warp_sum(b);
+  if (lane_id() == 0) {
+    of_warps[threadIdx.x / 32][0] = a;
+    of_warps[threadIdx.x / 32][1] = b;
+  }
+  __syncthreads();
+  if (threadIdx.x > 0) return;
+  for (int w = 1; w < kWarps; ++w) {
+    a += of_warps[w][0];
+    b += of_warps[w][1];
+  }
+}
+
+/// block_sums: sums of |x - y| and of the similarity, of each block; or null.
+template <typename T, typename Target>
+__global__ void __launch_bounds__(kThreads) ssim_kernel(const SsimParams<T, Target> p, T* block_sums) {
+  constexpr int kRun = Tile<T>::kRun;
+  __shared__ Shared<T, 2, kSsimMoments> shared;
+  const Place place = place_of<T>(int(blockIdx.x), p.height, p.width);
+  const int64_t plane = place.plane * p.height * p.width;
+  const T* image = p.image + plane;
+  const Target* target = p.target + plane;
+
+  for_each_read<T>(place, p.height, p.width, [&](int to, int64_t pixel) {
+    shared.read[0][to] = pixel < 0 ? T(0) : image[pixel];
+    shared.read[1][to] = pixel < 0 ? T(0) : pixel_value<T>(target[pixel]);
+  });
+  __syncthreads();
+  for_each_run<T>([&](int from, int to) {
+    constexpr int kValues = kRun + kReach;
+    T x[kValues], y[kValues], product[kValues], out[kRun];
+    const auto sum = [&](const T(&values)[kValues], int moment) {
+      sum_run<T, kRun>(values, out);
+#pragma unroll
+      for (int j = 0; j < kRun; ++j) shared.sums[moment][to + j] = out[j];
+    };
+    const auto sum_products = [&](const T(&a)[kValues], const T(&b)[kValues], int moment) {
+#pragma unroll
+      for (int k = 0; k < kValues; ++k) product[k] = a[k] * b[k];
+      sum(product, moment);
+    };
+#pragma unroll
+    for (int k = 0; k < kValues; ++k) {
+      x[k] = shared.read[0][from + k];
+      y[k] = shared.read[1][from + k];
+    }
+    sum(x, kMomentX);
+    sum(y, kMomentY);
+    sum_products(x, x, kMomentXX);
+    sum_products(y, y, kMomentYY);
+    sum_products(x, y, kMomentXY);
+  });
+  __syncthreads();
+  T sums[kSsimMoments][kRun];
+#pragma unroll
+  for (int m = 0; m < kSsimMoments; ++m) sum_columns<T>(shared.sums[m], sums[m]);
+
+  T l1_sum = T(0), ssim_sum = T(0);
+  for_each_pixel<T>(place, p.height, p.width, [&](int j, int64_t pixel) {
+    T moments[kSsimMoments];
+#pragma unroll
+    for (int m = 0; m < kSsimMoments; ++m) moments[m] = sums[m][j];
+    const Ssim<T> s = ar::ssim(moments);
+    if (p.map) p.map[plane + pixel] = s.value;
+    if (p.partials) {
+#pragma unroll
+      for (int k = 0; k < kSsimPartials; ++k) p.partials[k * p.pixels() + plane + pixel] = s.partials[k];
+    }
+    l1_sum += abs(image[pixel] - pixel_value<T>(target[pixel]));
+    ssim_sum += s.value;
+  });
+  if (!block_sums) return;
+  sum_block(l1_sum, ssim_sum);
+  if (threadIdx.x == 0) {
+    block_sums[2 * int64_t(blockIdx.x)] = l1_sum;
+    block_sums[2 * int64_t(blockIdx.x) + 1] = ssim_sum;
+  }
+}
+
+/// One block: the loss from the sums of all blocks.
+template <typename T, typename Target>
+__global__ void loss_kernel(const SsimParams<T, Target> p, const T* block_sums, int64_t blocks) {
+  double l1_sum = 0, ssim_sum = 0;
+  for (int64_t i = threadIdx.x; i < blocks; i += kThreads) {
+    l1_sum += double(block_sums[2 * i]);
+    ssim_sum += double(block_sums[2 * i + 1]);
+  }
+  sum_block(l1_sum, ssim_sum);
+  if (threadIdx.x == 0) *p.loss = combined_loss(p, l1_sum, ssim_sum);
+}
+
+template <typename T, typename Target>
+__global__ void __launch_bounds__(kThreads) ssim_vjp_kernel(const SsimVjpParams<T, Target> p) {
+  constexpr int kRun = Tile<T>::kRun;
+  __shared__ Shared<T, kSsimPartials, kSsimPartials> shared;
+  const Place place = place_of<T>(int(blockIdx.x), p.height, p.width);
+  const int64_t plane = place.plane * p.height * p.width;
+
+  for_each_read<T>(place, p.height, p.width, [&](int to, int64_t pixel) {
+    const T scale = p.dL_dmap && pixel >= 0 ? p.dL_dmap[plane + pixel] : T(1);
+#pragma unroll
+    for (int k = 0; k < kSsimPartials; ++k)
+      shared.read[k][to] = pixel < 0 ? T(0) : p.partials[k * p.pixels() + plane + pixel] * scale;
+  });
+  __syncthreads();
+  for_each_run<T>([&](int from, int to) {
+#pragma unroll
+    for (int m = 0; m < kSsimPartials; ++m) {
+      T values[kRun + kReach], out[kRun];
+#pragma unroll
+      for (int k = 0; k < kRun + kReach; ++k) values[k] = shared.read[m][from + k];
+      sum_run<T, kRun>(values, out);
+#pragma unroll
+      for (int j = 0; j < kRun; ++j) shared.sums[m][to + j] = out[j];
+    }
+  });
+  __syncthreads();
+  T sums[kSsimPartials][kRun];
+#pragma unroll
+  for (int m = 0; m < kSsimPartials; ++m) sum_columns<T>(shared.sums[m], sums[m]);
+
+  const LossWeights<T> weights = pixel_weights(p);
+  for_each_pixel<T>(place, p.height, p.width, [&](int j, int64_t pixel) {
+    T partials[kSsimPartials];
+#pragma unroll
+    for (int k = 0; k < kSsimPartials; ++k) partials[k] = sums[k][j];
+    p.dL_dimage[plane + pixel] =
+        ar::ssim_vjp(p.image[plane + pixel], pixel_value<T>(p.target[plane + pixel]), partials, weights);
+  });
+}
+
+}  // namespace
+
+template <typename T> int64_t ssim_blocks(int64_t planes, int height, int width) {
+  return planes * tiles_along(height, Tile<T>::kRows) * tiles_along(width, Tile<T>::kColumns);
+}
+
+template <typename T, typename Target> void ssim(const SsimParams<T, Target>& p, T* block_sums, cudaStream_t stream) {
+  const int64_t blocks = ssim_blocks<T>(p.planes, p.height, p.width);
+  ssim_kernel<T, Target><<<unsigned(blocks), kThreads, 0, stream>>>(p, p.loss ? block_sums : nullptr);
+  if (p.loss) loss_kernel<T, Target><<<1, kThreads, 0, stream>>>(p, block_sums, blocks);
+}
+template <typename T, typename Target> void ssim_vjp(const SsimVjpParams<T, Target>& p, cudaStream_t stream) {
+  const int64_t blocks = ssim_blocks<T>(p.planes, p.height, p.width);
+  ssim_vjp_kernel<T, Target><<<unsigned(blocks), kThreads, 0, stream>>>(p);
+}
+
+template int64_t ssim_blocks<float>(int64_t, int, int);
+template int64_t ssim_blocks<double>(int64_t, int, int);
+template void ssim(const SsimParams<float, float>&, float*, cudaStream_t);
+template void ssim(const SsimParams<float, uint8_t>&, float*, cudaStream_t);
+template void ssim(const SsimParams<double, double>&, double*, cudaStream_t);
+template void ssim(const SsimParams<double, uint8_t>&, double*, cudaStream_t);
+template void ssim_vjp(const SsimVjpParams<float, float>&, cudaStream_t);
+template void ssim_vjp(const SsimVjpParams<float, uint8_t>&, cudaStream_t);
+template void ssim_vjp(const SsimVjpParams<double, double>&, cudaStream_t);
+template void ssim_vjp(const SsimVjpParams<double, uint8_t>&, cudaStream_t);
+
+}  // namespace ar::cuda

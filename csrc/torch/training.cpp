@@ -1,0 +1,127 @@
+// What a training step has besides rendering, as ops: the loss, the activations and the optimiser.
+#include "torch/training.h"
+
+#include "torch/checks.h"
+#include "torch/ops.h"
+
+namespace ar::ops {
+namespace {
+
+/// The images, checked, and room for `partials` if they are wanted.
+SsimTensors make_ssim(SsimArguments& a, bool keep) {
+  check(a);
+  SsimTensors t;
+  t.image = a.image;
+  t.target = a.target;
+  if (keep) {
+    std::vector<int64_t> sizes = {kSsimPartials};
+    sizes.insert(sizes.end(), a.image.sizes().begin(), a.image.sizes().end());
+    t.partials = at::empty(sizes, a.image.options());
+  }
+  return t;
+}
+
+std::vector<Tensor> saved_of(const SsimTensors& t) {
+  return t.partials.defined() ? std::vector<Tensor>{t.partials} : std::vector<Tensor>{};
+}
+
+/// The images, checked, what was saved for them, and room for the gradient.
+SsimTensors make_ssim_vjp(SsimArguments& a, const std::vector<Tensor>& saved, const std::vector<bool>& needs) {
+  SsimTensors t = make_ssim(a, false);
+  check_needs(needs, 2);
+  TORCH_CHECK_VALUE(!needs[1], "target has no gradient, but one is wanted");
+  const bool fits = saved.size() == 1 && saved[0].numel() == kSsimPartials * a.image.numel() &&
+                    saved[0].scalar_type() == a.image.scalar_type() && saved[0].device() == a.image.device();
+  TORCH_CHECK_VALUE(fits, "saved must be what the op saved for the same images");
+  t.partials = saved[0].contiguous();
+  t.dL_dimage = at::empty(a.image.sizes(), a.image.options());
+  return t;
+}
+
+/// What the adjoint returns: the gradient with respect to image, and none with respect to target.
+Results gradients_of(const SsimTensors& t) {
+  training_kernels(t.image).ssim_vjp(t);
+  return {std::vector<Tensor>{t.dL_dimage, at::empty({0}, t.image.options())}};
+}
+
+}  // namespace
+
+Results ssim_map(SsimArguments a) {
+  SsimTensors t = make_ssim(a, a.keep);
+  t.map = at::empty(a.image.sizes(), a.image.options());
+  training_kernels(t.image).ssim(t);
+  return {t.map, saved_of(t)};
+}
+
+Results ssim_map_vjp(VjpArguments<SsimArguments> arguments) {
+  SsimTensors t = make_ssim_vjp(arguments.of_op, arguments.saved, arguments.needs);
+  t.dL_dmap = gradient_of(arguments.dL_doutputs, 0, "dL_dmap", t.image, t.image.sizes());
+  TORCH_CHECK_VALUE(t.dL_dmap.defined(), "dL_doutputs must hold the gradient with respect to the map, got none");
+  return gradients_of(t);
+}
+
+Results l1_ssim(L1SsimArguments a) {
+  SsimTensors t = make_ssim(a, a.keep);
+  t.weights = {a.l1_weight, a.ssim_weight, a.constant};
+  t.loss = at::empty({}, a.image.options());
+  training_kernels(t.image).ssim(t);
+  return {t.loss, saved_of(t)};
+}
+
+Results l1_ssim_vjp(VjpArguments<L1SsimArguments> arguments) {
+  const L1SsimArguments& a = arguments.of_op;
+  SsimTensors t = make_ssim_vjp(arguments.of_op, arguments.saved, arguments.needs);
+  t.weights = {a.l1_weight, a.ssim_weight, a.constant};
+  t.dL_dloss = gradient_of(arguments.dL_doutputs, 0, "dL_dloss", t.image, {});
+  TORCH_CHECK_VALUE(t.dL_dloss.defined(), "dL_doutputs must hold the gradient with respect to the loss, got none");
+  return gradients_of(t);
+}
+
+Results activate(ActivateArguments a) {
+  check(a);
+  ActivateTensors t = {a.log_scales, a.quats, a.logit_opacities};
+  t.scales = at::empty(a.log_scales.sizes(), a.log_scales.options());
+  t.rotations = at::empty(a.quats.sizes(), a.quats.options());
+  t.opacities = at::empty(a.logit_opacities.sizes(), a.logit_opacities.options());
+  training_kernels(a.log_scales).activate(t);
+  return {t.scales, t.rotations, t.opacities};
+}
+
+Results activate_vjp(VjpArguments<ActivateArguments> arguments) {
+  ActivateArguments& a = arguments.of_op;
+  check(a);
+  check_needs(arguments.needs, 3);
+  const auto options = a.log_scales.options();
+  const auto gradient = [&](size_t place, const char* name, const Tensor& of) {
+    return gradient_of(arguments.dL_doutputs, place, name, a.log_scales, of.sizes());
+  };
+  const auto room = [&](size_t place, const Tensor& like) {
+    return arguments.needs[place] ? at::empty(like.sizes(), options) : at::empty({0}, options);
+  };
+  ActivateTensors t = {a.log_scales, a.quats, a.logit_opacities};
+  t.dL_dscales = gradient(0, "dL_dscales", a.log_scales);
+  t.dL_drotations = gradient(1, "dL_drotations", a.quats);
+  t.dL_dopacities = gradient(2, "dL_dopacities", a.logit_opacities);
+  t.dL_dlog_scales = room(0, a.log_scales);
+  t.dL_dquats = room(1, a.quats);
+  t.dL_dlogit_opacities = room(2, a.logit_opacities);
+  training_kernels(a.log_scales).activate_vjp(t);
+  return {std::vector<Tensor>{t.dL_dlog_scales, t.dL_dquats, t.dL_dlogit_opacities}};
+}
+
+Results adam(AdamArguments a) {
+  check(a);
+  if (a.params.empty()) return {};
+  training_kernels(a.params[0]).adam(a);
+  // So that autograd notices where a backward pass still needs the values of before. Inference tensors have no version.
+  for (const std::vector<Tensor>* written :
+       {static_cast<const std::vector<Tensor>*>(&a.params), static_cast<const std::vector<Tensor>*>(&a.exp_avgs),
+        static_cast<const std::vector<Tensor>*>(&a.exp_avg_sqs)}) {
+    for (const Tensor& t : *written) {
+      if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();
+    }
+  }
+  return {};
+}
+
+}  // namespace ar::ops

@@ -1,0 +1,173 @@
+// What the ops of a training step besides rendering (training.cpp) ask of a device, and their tensors as the parameters
+// of its kernels. Tensors have been checked and are contiguous; members that are undefined are not there or not wanted.
+#pragma once
+
+#include <cmath>
+
+#include "core/activations.h"
+#include "core/adam.h"
+#include "core/ssim.h"
+#include "torch/arguments.h"
+
+namespace ar::ops {
+
+/// Of the similarity of images: the map or the loss, and their adjoint, which reads `partials` and one of the
+/// gradients.
+struct SsimTensors {
+  Tensor image;   ///< (..., H, W)
+  Tensor target;  ///< (..., H, W), of the image's dtype or uint8
+  LossWeights<double> weights = {};
+  Tensor map;                ///< (..., H, W)
+  Tensor loss;               ///< ()
+  Tensor partials;           ///< (kSsimPartials, ..., H, W)
+  Tensor dL_dmap, dL_dloss;  ///< like map and loss
+  Tensor dL_dimage;          ///< (..., H, W)
+};
+
+/// Of the activations and their adjoint.
+struct ActivateTensors {
+  Tensor log_scales, quats, logit_opacities;
+  Tensor scales, rotations, opacities;
+  Tensor dL_dscales, dL_drotations, dL_dopacities;
+  Tensor dL_dlog_scales, dL_dquats, dL_dlogit_opacities;
+};
+
+/// The kernels of a device. They run on its current stream.
+class TrainingKernels {
+ public:
+  virtual ~TrainingKernels() = default;
+  virtual void ssim(const SsimTensors& t) const = 0;
+  virtual void ssim_vjp(const SsimTensors& t) const = 0;
+  virtual void activate(const ActivateTensors& t) const = 0;
+  virtual void activate_vjp(const ActivateTensors& t) const = 0;
+  virtual void adam(const AdamArguments& a) const = 0;
+};
+const TrainingKernels& cpu_training_kernels();
+const TrainingKernels& cuda_training_kernels();
+inline const TrainingKernels& training_kernels([[maybe_unused]] const Tensor& like) {
+#if defined(AR_WITH_CUDA)
+  if (like.is_cuda()) return cuda_training_kernels();
+#endif
+  return cpu_training_kernels();
+}
+
+/// visit(T(), Target()) for the scalars of image and target.
+template <class Visit> void visit_scalars(const SsimTensors& t, const Visit& visit) {
+  const bool is_double = t.image.scalar_type() == at::kDouble, is_uint8 = t.target.scalar_type() == at::kByte;
+  if (is_double && is_uint8) visit(double(), uint8_t());
+  if (is_double && !is_uint8) visit(double(), double());
+  if (!is_double && is_uint8) visit(float(), uint8_t());
+  if (!is_double && !is_uint8) visit(float(), float());
+}
+
+/// What the parameters of ssim and of its adjoint have in common.
+template <typename T, typename Target, class Params> void set_images(Params& p, const SsimTensors& t) {
+  p.height = int(t.image.size(-2));
+  p.width = int(t.image.size(-1));
+  p.planes = t.image.numel() / t.image.size(-2) / t.image.size(-1);
+  p.image = const_pointer<T>(t.image);
+  p.target = const_pointer<Target>(t.target);
+  p.weights = {T(t.weights.l1), T(t.weights.ssim), T(t.weights.constant)};
+}
+
+template <typename T, typename Target> SsimParams<T, Target> ssim_params(const SsimTensors& t) {
+  SsimParams<T, Target> p = {};
+  set_images<T, Target>(p, t);
+  p.map = pointer<T>(t.map);
+  p.loss = pointer<T>(t.loss);
+  p.partials = pointer<T>(t.partials);
+  return p;
+}
+
+template <typename T, typename Target> SsimVjpParams<T, Target> ssim_vjp_params(const SsimTensors& t) {
+  SsimVjpParams<T, Target> p = {};
+  set_images<T, Target>(p, t);
+  p.partials = const_pointer<T>(t.partials);
+  p.dL_dmap = const_pointer<T>(t.dL_dmap);
+  p.dL_dloss = const_pointer<T>(t.dL_dloss);
+  p.dL_dimage = pointer<T>(t.dL_dimage);
+  return p;
+}
+
+/// visit(T()) for the scalar of the parameters.
+template <class Visit> void visit_scalar(const Tensor& parameters, const Visit& visit) {
+  if (parameters.scalar_type() == at::kDouble) return visit(double());
+  visit(float());
+}
+
+/// What the parameters of activate and of its adjoint have in common.
+template <typename T, class Params> void set_parameters(Params& p, const ActivateTensors& t) {
+  p.n = t.log_scales.size(0);
+  p.log_scales = const_pointer<Vec3<T>>(t.log_scales);
+  p.quats = const_pointer<Vec4<T>>(t.quats);
+  p.logit_opacities = const_pointer<T>(t.logit_opacities);
+}
+
+template <typename T> ActivateParams<T> activate_params(const ActivateTensors& t) {
+  ActivateParams<T> p = {};
+  set_parameters<T>(p, t);
+  p.scales = pointer<Vec3<T>>(t.scales);
+  p.rotations = pointer<Vec4<T>>(t.rotations);
+  p.opacities = pointer<T>(t.opacities);
+  return p;
+}
+
+template <typename T> ActivateVjpParams<T> activate_vjp_params(const ActivateTensors& t) {
+  ActivateVjpParams<T> p = {};
+  set_parameters<T>(p, t);
+  p.dL_dscales = const_pointer<Vec3<T>>(t.dL_dscales);
+  p.dL_drotations = const_pointer<Vec4<T>>(t.dL_drotations);
+  p.dL_dopacities = const_pointer<T>(t.dL_dopacities);
+  p.dL_dlog_scales = pointer<Vec3<T>>(t.dL_dlog_scales);
+  p.dL_dquats = pointer<Vec4<T>>(t.dL_dquats);
+  p.dL_dlogit_opacities = pointer<T>(t.dL_dlogit_opacities);
+  return p;
+}
+
+/// For the tensor at place i. Powers in double precision, since 1 - beta2^step is small at first.
+template <typename T> AdamRule<T> adam_rule(const AdamArguments& a, size_t i) {
+  AdamRule<T> rule = {};
+  rule.beta1 = T(a.beta1);
+  rule.one_minus_beta1 = T(1 - a.beta1);
+  rule.beta2 = T(a.beta2);
+  rule.one_minus_beta2 = T(1 - a.beta2);
+  rule.eps = T(a.eps);
+  const double step = double(a.steps[i]);
+  rule.rate = T(a.bias_correction ? a.rates[i] / (1 - std::pow(a.beta1, step)) : a.rates[i]);
+  rule.root_scale = T(a.bias_correction ? 1 / std::sqrt(1 - std::pow(a.beta2, step)) : 1);
+  return rule;
+}
+
+/// The tensor at place i.
+template <typename T> AdamTensor<T> adam_tensor(const AdamArguments& a, size_t i) {
+  AdamTensor<T> t = {};
+  t.n = a.params[i].numel();
+  t.row_size = a.rows ? t.n / a.rows->numel() : t.n;
+  t.rule = adam_rule<T>(a, i);
+  t.grad = const_pointer<T>(a.grads[i]);
+  t.param = pointer<T>(a.params[i]);
+  t.exp_avg = pointer<T>(a.exp_avgs[i]);
+  t.exp_avg_sq = pointer<T>(a.exp_avg_sqs[i]);
+  t.aligned = true;
+  for (const T* first :
+       {t.grad, static_cast<const T*>(t.param), static_cast<const T*>(t.exp_avg), static_cast<const T*>(t.exp_avg_sq)})
+    t.aligned = t.aligned && reinterpret_cast<uintptr_t>(first) % 16 == 0;
+  return t;
+}
+
+/// run(AdamParams<T>) for as many tensors at once as there is room for; those without numbers are left out.
+template <typename T, class Run> void for_adam_tensors(const AdamArguments& a, const Run& run) {
+  AdamParams<T> p = {};
+  // Of dtype bool or uint8, both of one byte.
+  p.rows = a.rows ? static_cast<const uint8_t*>(a.rows->const_data_ptr()) : nullptr;
+  for (size_t i = 0; i < a.params.size(); ++i) {
+    if (a.params[i].numel() == 0) continue;
+    p.tensors[p.count++] = adam_tensor<T>(a, i);
+    if (p.count < kAdamTensors) continue;
+    run(p);
+    p.count = 0;
+  }
+  if (p.count > 0) run(p);
+}
+
+}  // namespace ar::ops

@@ -1,0 +1,43 @@
+// The loss, the activations and the optimiser on CPU tensors.
+#include "cpu/training.h"
+#include "torch/backend.h"
+#include "torch/training.h"
+
+namespace ar::ops {
+namespace {
+
+class CpuTrainingKernels final : public TrainingKernels {
+ public:
+  void ssim(const SsimTensors& t) const override {
+    visit_scalars(t, [&](auto scalar, auto target) {
+      cpu::ssim(ssim_params<decltype(scalar), decltype(target)>(t), thread_count());
+    });
+  }
+  void ssim_vjp(const SsimTensors& t) const override {
+    visit_scalars(t, [&](auto scalar, auto target) {
+      cpu::ssim_vjp(ssim_vjp_params<decltype(scalar), decltype(target)>(t), thread_count());
+    });
+  }
+  void activate(const ActivateTensors& t) const override {
+    visit_scalar(t.log_scales,
+                 [&](auto scalar) { cpu::activate(activate_params<decltype(scalar)>(t), thread_count()); });
+  }
+  void activate_vjp(const ActivateTensors& t) const override {
+    visit_scalar(t.log_scales,
+                 [&](auto scalar) { cpu::activate_vjp(activate_vjp_params<decltype(scalar)>(t), thread_count()); });
+  }
+  void adam(const AdamArguments& a) const override {
+    visit_scalar(a.params[0], [&](auto scalar) {
+      for_adam_tensors<decltype(scalar)>(a, [](const auto& p) { cpu::adam(p, thread_count()); });
+    });
+  }
+};
+
+}  // namespace
+
+const TrainingKernels& cpu_training_kernels() {
+  static const CpuTrainingKernels kernels;
+  return kernels;
+}
+
+}  // namespace ar::ops

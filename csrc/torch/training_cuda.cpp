@@ -1,0 +1,71 @@
+// The loss, the activations and the optimiser on CUDA tensors. Nothing here waits for the device.
+#include <c10/cuda/CUDAException.h>
+#include <c10/cuda/CUDAGuard.h>
+#include <c10/cuda/CUDAStream.h>
+
+#include "cuda/training.h"
+#include "torch/training.h"
+
+namespace ar::ops {
+namespace {
+
+/// launch(stream) on the device of `like`; raises what the launch left behind.
+template <class Launch> void on_stream(const Tensor& like, const Launch& launch) {
+  const c10::cuda::CUDAGuard guard(like.device());
+  launch(cudaStream_t(c10::cuda::getCurrentCUDAStream()));
+  C10_CUDA_KERNEL_LAUNCH_CHECK();
+}
+
+/// Blocks that the kernels for an image run in.
+template <typename T, class Params> int64_t count_blocks(const Params& p) {
+  const int64_t blocks = cuda::ssim_blocks<T>(p.planes, p.height, p.width), most = (int64_t(1) << 31) - 1;
+  TORCH_CHECK_VALUE(blocks <= most, "image must have at most ", most, " blocks of pixels, got ", blocks);
+  return blocks;
+}
+
+class CudaTrainingKernels final : public TrainingKernels {
+ public:
+  void ssim(const SsimTensors& t) const override {
+    visit_scalars(t, [&](auto scalar, auto target) {
+      using T = decltype(scalar);
+      const auto p = ssim_params<T, decltype(target)>(t);
+      const Tensor block_sums = at::empty({count_blocks<T>(p), p.loss ? 2 : 0}, t.image.options());
+      on_stream(t.image, [&](cudaStream_t stream) { cuda::ssim(p, pointer<T>(block_sums), stream); });
+    });
+  }
+  void ssim_vjp(const SsimTensors& t) const override {
+    visit_scalars(t, [&](auto scalar, auto target) {
+      using T = decltype(scalar);
+      const auto p = ssim_vjp_params<T, decltype(target)>(t);
+      count_blocks<T>(p);
+      on_stream(t.image, [&](cudaStream_t stream) { cuda::ssim_vjp(p, stream); });
+    });
+  }
+  void activate(const ActivateTensors& t) const override {
+    visit_scalar(t.log_scales, [&](auto scalar) {
+      const auto p = activate_params<decltype(scalar)>(t);
+      on_stream(t.log_scales, [&](cudaStream_t stream) { cuda::activate(p, stream); });
+    });
+  }
+  void activate_vjp(const ActivateTensors& t) const override {
+    visit_scalar(t.log_scales, [&](auto scalar) {
+      const auto p = activate_vjp_params<decltype(scalar)>(t);
+      on_stream(t.log_scales, [&](cudaStream_t stream) { cuda::activate_vjp(p, stream); });
+    });
+  }
+  void adam(const AdamArguments& a) const override {
+    visit_scalar(a.params[0], [&](auto scalar) {
+      for_adam_tensors<decltype(scalar)>(
+          a, [&](const auto& p) { on_stream(a.params[0], [&](cudaStream_t stream) { cuda::adam(p, stream); }); });
+    });
+  }
+};
+
+}  // namespace
+
+const TrainingKernels& cuda_training_kernels() {
+  static const CudaTrainingKernels kernels;
+  return kernels;
+}
+
+}  // namespace ar::ops

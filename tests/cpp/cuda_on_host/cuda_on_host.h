@@ -1,0 +1,173 @@
+// Runs kernels of csrc/cuda on the host: a block after the other, its threads as contexts that take turns wherever they
+// wait for each other. Slow, and without anything of the memory model, but in every CI. Include before any kernel.
+//
+// Known: threadIdx, blockIdx, __syncthreads, __syncthreads_or, __syncwarp, and the votes, shuffles and bit functions
+// below, of which all lanes of a warp must take part.
+#pragma once
+
+#include <cuda_runtime_api.h>
+#include <ucontext.h>
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <functional>
+#include <vector>
+
+#undef __global__
+#undef __device__
+#undef __shared__
+#undef __launch_bounds__
+#define __global__
+#define __device__
+#define __shared__ thread_local  // of the one thread that all contexts run on
+#define __launch_bounds__(...)
+
+// Functions that a device has in the global namespace.
+using std::max;
+using std::min;
+
+namespace cuda_on_host {
+
+inline constexpr int kMaxThreads = 1024;
+
+struct Context {
+  ucontext_t registers;
+  std::vector<char> stack;
+  bool done = false;
+};
+
+inline ucontext_t scheduler;
+inline std::vector<Context> contexts;
+
+/// Where threads exchange a value each: all must have come before any goes on. What the last exchange gave stays until
+/// the one after the next, which no thread can complete before all have read it.
+struct Meeting {
+  uint64_t given[kMaxThreads], taken[2][kMaxThreads];
+  int arrived = 0, number = 0;
+
+  const uint64_t* exchange(int place, int size, uint64_t value);
+};
+inline Meeting of_warps[kMaxThreads / 32], of_block;
+
+}  // namespace cuda_on_host
+
+struct HostDim {
+  unsigned x, y, z;
+};
+inline HostDim threadIdx, blockIdx;
+
+namespace cuda_on_host {
+
+inline void let_others_run() {
+  const unsigned me = threadIdx.x;
+  swapcontext(&contexts[me].registers, &scheduler);
+  threadIdx.x = me;
+}
+
+inline const uint64_t* Meeting::exchange(int place, int size, uint64_t value) {
+  given[place] = value;
+  const int mine = number;
+  if (++arrived == size) {
+    std::memcpy(taken[mine & 1], given, size * sizeof(uint64_t));
+    arrived = 0;
+    ++number;
+  }
+  while (number == mine) let_others_run();
+  return taken[mine & 1];
+}
+
+inline const uint64_t* exchange_in_warp(uint64_t value) {
+  return of_warps[threadIdx.x / 32].exchange(int(threadIdx.x % 32), 32, value);
+}
+inline const uint64_t* exchange_in_block(uint64_t value) {
+  return of_block.exchange(int(threadIdx.x), int(contexts.size()), value);
+}
+template <class T> T from_lane(T value, int lane) {
+  static_assert(sizeof(T) <= sizeof(uint64_t));
+  uint64_t bits = 0;
+  std::memcpy(&bits, &value, sizeof value);
+  std::memcpy(&value, exchange_in_warp(bits) + lane, sizeof value);
+  return value;
+}
+
+inline std::function<void()> kernel;
+inline void run_thread() {
+  const unsigned me = threadIdx.x;
+  kernel();
+  contexts[me].done = true;
+  swapcontext(&contexts[me].registers, &scheduler);
+}
+
+/// Calls body() for every thread of every block.
+inline void launch(int blocks, int threads, std::function<void()> body) {
+  constexpr size_t kStack = 1 << 17;
+  kernel = std::move(body);
+  for (int block = 0; block < blocks; ++block) {
+    blockIdx.x = unsigned(block);
+    contexts = std::vector<Context>(threads);
+    for (Meeting& meeting : of_warps) meeting.arrived = meeting.number = 0;
+    of_block.arrived = of_block.number = 0;
+    for (Context& context : contexts) {
+      context.stack.resize(kStack);
+      getcontext(&context.registers);
+      context.registers.uc_stack.ss_sp = context.stack.data();
+      context.registers.uc_stack.ss_size = kStack;
+      context.registers.uc_link = &scheduler;
+      makecontext(&context.registers, run_thread, 0);
+    }
+    for (int left = threads; left > 0;) {
+      for (int t = 0; t < threads; ++t) {
+        if (contexts[t].done) continue;
+        threadIdx.x = unsigned(t);
+        swapcontext(&scheduler, &contexts[t].registers);
+        left -= contexts[t].done;
+      }
+    }
+  }
+}
+
+}  // namespace cuda_on_host
+
+inline void __syncthreads() { cuda_on_host::exchange_in_block(0); }
+inline int __syncthreads_or(int x) {
+  const uint64_t* all = cuda_on_host::exchange_in_block(x != 0);
+  return std::any_of(all, all + cuda_on_host::contexts.size(), [](uint64_t one) { return one != 0; });
+}
+inline void __syncwarp() { cuda_on_host::exchange_in_warp(0); }
+inline uint32_t __ballot_sync(uint32_t, bool x) {
+  const uint64_t* all = cuda_on_host::exchange_in_warp(x);
+  uint32_t bits = 0;
+  for (int lane = 0; lane < 32; ++lane) bits |= uint32_t(all[lane]) << lane;
+  return bits;
+}
+inline bool __any_sync(uint32_t lanes, bool x) { return __ballot_sync(lanes, x) != 0; }
+template <class T> T __shfl_sync(uint32_t, T x, int lane) { return cuda_on_host::from_lane(x, lane); }
+template <class T> T __shfl_xor_sync(uint32_t, T x, int lanes) {
+  return cuda_on_host::from_lane(x, int(threadIdx.x % 32) ^ lanes);
+}
+
+inline int __ffs(uint32_t x) { return __builtin_ffs(int(x)); }
+inline int __popc(uint32_t x) { return __builtin_popcount(x); }
+inline int __clz(uint32_t x) { return x ? __builtin_clz(x) : 32; }
+inline float __int_as_float(int x) {
+  float y;
+  std::memcpy(&y, &x, sizeof y);
+  return y;
+}
+inline int __float_as_int(float x) {
+  int y;
+  std::memcpy(&y, &x, sizeof y);
+  return y;
+}
+template <class T> T atomicAdd(T* place, T x) {
+  const T before = *place;
+  *place += x;
+  return before;
+}
+template <class T> T atomicMax(T* place, T x) {
+  const T before = *place;
+  *place = std::max(before, x);
+  return before;
+}

@@ -1,0 +1,170 @@
+// The kernels for samples that move, run on the host: every way of sharing samples out among lanes gives the same, in
+// either direction, and it is what compositing pixel by pixel gives.
+#include <random>
+
+#include "cuda_on_host.h"
+// After it: kernels.
+#include <gtest/gtest.h>
+
+#include "core/inspect.h"
+#include "cuda/blend_moving_vjp.cuh"
+
+namespace ar::cuda {
+
+alignas(16) static float4 memory[1 << 13];
+float4* dynamic_shared() { return memory; }
+
+namespace {
+
+constexpr int kWidth = 21, kHeight = 18, kPixels = kWidth * kHeight, kSplats = 150, kColors = 3;
+constexpr TileGrid kGrid = {kWidth, kHeight, kMovingTileBits};
+
+/// A random scene, of which every tile lists all splats.
+template <class F> struct Scene {
+  std::vector<Splat<F, float>> splats = std::vector<Splat<F, float>>(kSplats);
+  std::vector<SlotPair> pairs;
+  std::vector<int64_t> offsets = {0};
+  std::vector<float> background = {0.2f, 0.5f, 0.9f}, dL_dimage = std::vector<float>(kColors * kPixels);
+  Counts counts = {};
+  TileLists lists = {};
+
+  Scene() {
+    std::mt19937 bits(7);
+    const auto uniform = [&](float low, float high) { return std::uniform_real_distribution<float>(low, high)(bits); };
+    for (Splat<F, float>& splat : splats) {
+      const float a = std::exp(uniform(-2, 2)), b = std::exp(uniform(-2, 2)), angle = uniform(0, 3.14f);
+      const float c = std::cos(angle), s = std::sin(angle);
+      const Cov2d<float> cov = {a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c, a * b};
+      splat.mean = {uniform(0, kWidth), uniform(0, kHeight)};
+      splat.shape = F::prepare(cov, FootprintOptions{0});
+      splat.opacity = uniform(0.05f, 0.95f);
+      splat.level = F::level(splat.shape, splat.opacity);
+      splat.color = {uniform(0, 1), uniform(0, 1), uniform(0, 1)};
+    }
+    for (float& x : dL_dimage) x = uniform(-0.5f, 0.5f);
+    for (int tile = 0; tile < kGrid.tiles(); ++tile) {
+      for (int k = 0; k < kSplats; ++k) pairs.push_back({k, int32_t(pairs.size())});
+      offsets.push_back(int64_t(pairs.size()));
+    }
+    counts = {int64_t(pairs.size()), kSplats};
+    lists.pairs = &pairs[0].splat;
+    lists.stride = 2;
+    lists.tile_offsets = offsets.data();
+    lists.counts = &counts;
+    lists.n = kSplats;
+    lists.capacity = int64_t(pairs.size());
+  }
+};
+
+struct Results {
+  std::vector<float> image, alpha, transmittance, pair_grads;
+  std::vector<int32_t> last;
+};
+
+/// Forwards with one layout, back with another.
+template <class F, class Forward, class Backward> Results run(Scene<F>& scene) {
+  constexpr int S = F::kSamples;
+  const int tiles = int(kGrid.tiles());
+  Results out;
+  out.image.resize(kColors * kPixels);
+  out.alpha.resize(kPixels);
+  out.transmittance.resize(S * kPixels);
+  out.last.resize(S * kPixels);
+  out.pair_grads.resize(scene.pairs.size() * kPairGradWidth);
+  std::vector<float> checkpoints(scene.pairs.size() / kStateChunk * state_planes(S) * kMovingPixels);
+  PlanState state = {};
+  std::vector<int32_t> order;
+  std::vector<TileChunk> chunks;
+  for (int tile = 0; tile < tiles; ++tile) order.push_back(tile), chunks.push_back({tile, 0, 0});
+  for (int c = 0; c <= kSampleClasses; ++c) state.counts.chunks.first[c] = c > sample_class(S) ? tiles : 0;
+
+  BlendParams blend = {};
+  blend.grid = kGrid;
+  blend.splats = &scene.splats[0].mean.x;
+  blend.channels.count = kColors;
+  blend.background = scene.background.data();
+  blend.image = {out.image.data(), kColors, {}};
+  blend.alpha = out.alpha.data();
+  blend.transmittance = out.transmittance.data();
+  blend.last = out.last.data();
+  blend.lists = scene.lists;
+  blend.plan.tile_order = order.data();
+  blend.checkpoints = checkpoints.data();
+  cuda_on_host::launch(tiles, Forward::kThreads, [&] { moving_blend_kernel<F, kColors, Forward>(blend, 0); });
+
+  BlendVjpParams vjp = {};
+  vjp.grid = kGrid;
+  vjp.splats = blend.splats;
+  vjp.channels = blend.channels;
+  vjp.background = blend.background;
+  vjp.transmittance = blend.transmittance;
+  vjp.last = blend.last;
+  vjp.dL_dimage = {scene.dL_dimage.data(), kColors, {}};
+  vjp.lists = scene.lists;
+  vjp.plan = &state;
+  vjp.chunk_order = chunks.data();
+  vjp.max_chunks = tiles;
+  vjp.checkpoints = checkpoints.data();
+  vjp.pair_grads = out.pair_grads.data();
+  vjp.mean_sums = MeanSums::kNorm;
+  static_assert(sizeof(MovingVjpShared<F, kColors, Backward>) <= sizeof memory);
+  cuda_on_host::launch(tiles, Backward::kThreads, [&] { moving_vjp_kernel<F, kColors, Backward>(vjp, 0); });
+  return out;
+}
+
+/// Sums of a hundred terms of order 1, in different orders.
+constexpr float kRounding = 100 * 1.2e-7f;
+
+/// The same samples, and the same sums to rounding.
+void expect_same(const Results& a, const Results& b) {
+  EXPECT_EQ(a.last, b.last);
+  EXPECT_EQ(a.transmittance, b.transmittance);
+  for (size_t i = 0; i < a.image.size(); ++i) ASSERT_NEAR(a.image[i], b.image[i], kRounding) << i;
+  for (size_t i = 0; i < a.pair_grads.size(); ++i) {
+    if (i % kPairGradWidth == kPairFourthChannel) continue;  // nothing writes it
+    ASSERT_NEAR(a.pair_grads[i], b.pair_grads[i], kRounding * (1 + std::abs(b.pair_grads[i]))) << i;
+  }
+}
+
+/// Pixel by pixel, in float64.
+template <class F> void expect_composited(const Scene<F>& scene, const Results& results) {
+  for (int i = 0; i < kPixels; ++i) {
+    PixelSummary<double, F> pixel;
+    pixel.start(true);
+    double color[kColors] = {};
+    for (int k = 0; k < kSplats; ++k) {
+      const Splat<F, float>& splat = scene.splats[k];
+      GaussianShape<double> shape = {{splat.shape.w.xx, splat.shape.w.xy, splat.shape.w.yx, splat.shape.w.yy},
+                                     splat.shape.amp};
+      const auto terms = F::terms(shape, double(splat.opacity));
+      const Vec2<double> d = {i % kWidth - double(splat.mean.x), i / kWidth - double(splat.mean.y)};
+      const double weight = pixel.add(terms, d, k).weight;
+      const float colors[] = {splat.color.x, splat.color.y, splat.color.z};
+      for (int c = 0; c < kColors; ++c) color[c] += weight * colors[c];
+    }
+    double through = 0;
+    for (int s = 0; s < F::kSamples; ++s) through += std::abs(pixel.transmittance[s]) / F::kSamples;
+    // A splat that rounding takes over the threshold of 1/255 shows as much.
+    EXPECT_NEAR(results.alpha[i], 1 - through, 1.0 / 255);
+    for (int c = 0; c < kColors; ++c)
+      EXPECT_NEAR(results.image[c * kPixels + i], color[c] + through * scene.background[c], 1.0 / 255);
+  }
+}
+
+template <class F> class MovingKernels : public testing::Test {};
+using Moments = testing::Types<Moment<1>, Moment<4>, Moment<9>, Moment<16>>;
+TYPED_TEST_SUITE(MovingKernels, Moments);
+
+TYPED_TEST(MovingKernels, AgreeWhateverTheLayouts) {
+  using F = TypeParam;
+  using Forward = EvenLayout<F, false>;
+  using Backward = EvenLayout<F, true>;
+  Scene<F> scene;
+  const Results fine = run<F, FineLayout<F, kColors>, FineLayout<F, kColors>>(scene);
+  expect_composited(scene, fine);
+  expect_same(run<F, Forward, Backward>(scene), fine);
+  expect_same(run<F, FineLayout<F, kColors>, Backward>(scene), fine);
+}
+
+}  // namespace
+}  // namespace ar::cuda
