@@ -1,26 +1,36 @@
-"""The example that trains: its data, and what it reports."""
+"""Training: what it reads, what it writes, that it learns, and that nothing is lost where it ends early."""
 
 import json
 import math
+import re
+import shutil
+import signal
 import struct
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from conftest import SHARED
+from conftest import DEADLINE, ROOT, SHARED, needs_cuda
 
-from analytic_rasterizer import io, render_stages
+from analytic_rasterizer import cli, io, render_stages
+from analytic_rasterizer.filters import bake_pixel
+from analytic_rasterizer.viewer import footprint_of_file
 
-image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
-pytest.importorskip("tqdm", reason="needs the cli extra")
+image = pytest.importorskip("PIL.Image", reason="needs the train extra")
+pytest.importorskip("tqdm", reason="needs the train extra")
+pytest.importorskip("scipy", reason="needs the train extra")
+pytest.importorskip("gsply", reason="needs the train extra")
 
-import colmap  # noqa: E402
-import dataset  # noqa: E402
-import gaussians as g  # noqa: E402
-import train  # noqa: E402
+from analytic_rasterizer import training  # noqa: E402
+from analytic_rasterizer.losses import l1_ssim, ssim  # noqa: E402
+from analytic_rasterizer.training import TrainingOptions, captures, colmap, files, pictures, schedule  # noqa: E402
+from analytic_rasterizer.training import model as g  # noqa: E402
+from analytic_rasterizer.training.evaluation import evaluate, psnr  # noqa: E402
 
-# ---------------------------------------------------------------------------------------- data
+# ------------------------------------------------------------------------------------ captures
 
 
 def write_colmap(folder, views, points, colors, model=1) -> None:
@@ -28,8 +38,7 @@ def write_colmap(folder, views, points, colors, model=1) -> None:
     folder.mkdir(parents=True)
     cameras, images = [struct.pack("<Q", len(views))], [struct.pack("<Q", len(views))]
     for i, view in enumerate(views):
-        parameters = {0: [view.fx], 1: [view.fx, view.fy]}.get(model, [view.fx] * 2)
-        parameters += [view.width / 2 if view.cx is None else view.cx, view.height / 2 if view.cy is None else view.cy]
+        parameters = camera_parameters(view, model)
         cameras.append(struct.pack(f"<iiQQ{len(parameters)}d", i + 1, model, view.width, view.height, *parameters))
         turn = quaternion(view.w2c[:3, :3])
         images.append(struct.pack("<i7di", i + 7, *turn, *view.w2c[:3, 3].tolist(), i + 1))
@@ -41,6 +50,28 @@ def write_colmap(folder, views, points, colors, model=1) -> None:
         track = [1, 2] * (i % 3)
         records.append(struct.pack(f"<Q3d3BdQ{len(track)}i", i, *point, *color, 0.5, len(track) // 2, *track))
     (folder / "points3D.bin").write_bytes(b"".join(records))
+
+
+def write_colmap_text(folder, views, points, colors, model=1) -> None:
+    """The same as text."""
+    folder.mkdir(parents=True)
+    name = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 4: "OPENCV"}[model]
+    cameras, images, rows = ["# comment"], ["# comment"], ["# comment"]
+    for i, view in enumerate(views):
+        cameras.append(" ".join(map(str, [i + 1, name, view.width, view.height, *camera_parameters(view, model)])))
+        pose = [*quaternion(view.w2c[:3, :3]), *view.w2c[:3, 3].tolist()]
+        images.append(" ".join(map(str, [i + 7, *pose, i + 1, f"{view.name}.png"])))
+        images.append("1.0 2.0 -1" if i % 2 else "")  # a picture may have no observations
+    for i, (point, color) in enumerate(zip(points.tolist(), colors.tolist())):
+        rows.append(" ".join(map(str, [i, *point, *color, 0.5, 1, 2])))
+    for file, lines in (("cameras", cameras), ("images", images), ("points3D", rows)):
+        (folder / f"{file}.txt").write_text("\n".join(lines) + "\n")
+
+
+def camera_parameters(view, model) -> list[float]:
+    parameters = {0: [view.fx], 1: [view.fx, view.fy]}.get(model, [view.fx] * 2)
+    center = [view.width / 2 if view.cx is None else view.cx, view.height / 2 if view.cy is None else view.cy]
+    return [*parameters, *center, *[0.0] * (4 if model == 4 else 0)]
 
 
 def quaternion(rotation) -> list[float]:
@@ -59,17 +90,22 @@ def looking_at_origin(angle: float, distance: float = 4.0) -> torch.Tensor:
     return w2c
 
 
+WRITERS = pytest.mark.parametrize("write", [write_colmap, write_colmap_text])
+
+
+@WRITERS
 @pytest.mark.parametrize("model", [0, 1])
-def test_colmap_files(tmp_path, model):
+def test_colmap_files(tmp_path, write, model):
     views = [
         io.View(name, 40 + i, 30, 50.0, 50.0 + model, looking_at_origin(0.7 * i), 20.5, 14.0)
-        for i, name in enumerate("cab")
+        for i, name in enumerate(["c", "a", "b c"])
     ]
-    points = torch.randn(5, 3)
+    points = torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
     colors = torch.arange(15).reshape(5, 3)
-    write_colmap(tmp_path / "0", views, points, colors, model)
+    write(tmp_path / "0", views, points, colors, model)
+    assert colmap.is_reconstruction(tmp_path / "0")
     read = colmap.load_views(tmp_path / "0")
-    assert [name for name, _ in read] == ["a.png", "b.png", "c.png"]
+    assert [name for name, _ in read] == ["a.png", "b c.png", "c.png"]
     for expected, (_, view) in zip(sorted(views, key=lambda v: v.name), read):
         assert replace(view, w2c=None) == replace(expected, w2c=None)
         torch.testing.assert_close(view.w2c, expected.w2c)
@@ -90,23 +126,47 @@ def test_colmap_files_cut_short(tmp_path, name):
             colmap.load_points(tmp_path / "0") if name == "points3D" else colmap.load_views(tmp_path / "0")
 
 
-def test_colmap_cameras_with_distortion(tmp_path):
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_colmap_text_cut_short(tmp_path, name):
+    """A last line with words missing, as many as make it useless."""
     view = io.View("a", 40, 30, 50.0, 50.0, looking_at_origin(0.1))
-    write_colmap(tmp_path / "0", [view], torch.zeros(2, 3), torch.zeros(2, 3, dtype=torch.int32), model=4)
-    with pytest.raises(io.SceneError, match=r"cameras.bin: cameras must be pinholes"):
+    write_colmap_text(tmp_path / "0", [view], torch.zeros(1, 3), torch.zeros(1, 3, dtype=torch.int32))
+    path = tmp_path / "0" / f"{name}.txt"
+    words = path.read_text().splitlines()[1].split()
+    for count in range(1, min(len(words), 7)):
+        path.write_text(" ".join(words[:count]) + "\n")
+        with pytest.raises(io.SceneError, match=r"cut short|cameras must be pinholes"):
+            colmap.load_points(tmp_path / "0") if name == "points3D" else colmap.load_views(tmp_path / "0")
+
+
+@WRITERS
+def test_colmap_cameras_with_distortion(tmp_path, write):
+    view = io.View("a", 40, 30, 50.0, 50.0, looking_at_origin(0.1))
+    write(tmp_path / "0", [view], torch.zeros(2, 3), torch.zeros(2, 3, dtype=torch.int32), model=4)
+    with pytest.raises(io.SceneError, match=r"cameras must be pinholes"):
         colmap.load_views(tmp_path / "0")
 
 
-@pytest.mark.parametrize("name, pictures, points", [("bonsai", 292, 82_641), ("fox", 50, None)])
-def test_capture_is_read_as_it_was_taken(name, pictures, points):
+@WRITERS
+def test_colmap_poses_that_are_not_finite(tmp_path, write):
+    view = io.View("a", 40, 30, 50.0, 50.0, looking_at_origin(0.1))
+    view.w2c[0, 3] = math.nan
+    write(tmp_path / "0", [view], torch.zeros(2, 3), torch.zeros(2, 3, dtype=torch.int32))
+    with pytest.raises(io.SceneError, match=r"the pose of a.png must be finite"):
+        colmap.load_views(tmp_path / "0")
+
+
+@pytest.mark.parametrize("name, count, points", [("bonsai", 292, 82_641), ("fox", 50, None)])
+def test_capture_is_read_as_it_was_taken(name, count, points):
     """Points have the colours of the pixels that they project to: cameras, cut and pictures belong together."""
     folder = SHARED / "data" / name
     if not folder.exists():
         pytest.skip("needs the optional ../shared scenes next to the project")
-    views = colmap.load_views(folder / "sparse" / "0")
-    means, colors = colmap.load_points(folder / "sparse" / "0")
-    assert len(views) == pictures and len(means) == (points or len(means))
-    view, rgba = dataset.load_picture(folder / "images" / views[9][0], views[9][1], 16)
+    capture = training.load_capture(folder)
+    means, colors = capture.points
+    assert len(capture.train) + len(capture.test) == count and len(means) == (points or len(means))
+    item = capture.train[8]
+    view, rgba = pictures.cut(item.files[1], item.view, 16)
     assert rgba.shape == (view.height, view.width, 4) and view.height % 16 == view.width % 16 == 0
     stages = render_stages(view.settings(), **point_inputs(means))
     colors = colors[stages.ids.long()]
@@ -133,73 +193,40 @@ def point_inputs(means) -> dict:
     }
 
 
-def test_cut_pictures_see_the_same(tmp_path):
-    """What is left of a picture shows a point where it did, in px of the cut; at half the intrinsics' size too."""
-    pixels = torch.randint(256, (29, 45, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)).numpy()
-    image.fromarray(pixels).save(tmp_path / "a.png")
-    view = io.View("a", 45, 29, 50.0, 51.0, looking_at_origin(0.3), cx=20.0)
-    cut, rgba = dataset.load_picture(tmp_path / "a.png", view, 8)
-    assert np.array_equal(rgba[..., :3].numpy(), pixels[2:26, 2:42])
-    point = torch.tensor([[0.2, -0.3, 0.4]])
-    whole, part = (render_stages(v.settings(), **point_inputs(point)).means2d for v in (view, cut))
-    torch.testing.assert_close(part, whole - 2, rtol=0, atol=1e-4)
-    double = replace(view, width=90, height=58, fx=100.0, fy=102.0, cx=40.0)
-    again, _ = dataset.load_picture(tmp_path / "a.png", double, 8)
-    assert again == replace(cut, w2c=again.w2c)
-    with pytest.raises(io.SceneError, match="45 x 29 px are too few"):
-        dataset.load_picture(tmp_path / "a.png", view, 32)
-
-
-def test_reduced_pictures_average_straight_colors():
-    rgba = torch.tensor([[[255, 0, 0, 255], [0, 255, 0, 0]]], dtype=torch.uint8).repeat(2, 1, 1)
-    levels = dataset.reduce(rgba, (1.0, 1.0, 1.0), [1, 2])
-    assert levels[1][:, 0].T.tolist() == [[255, 0, 0], [255, 255, 255]]
-    assert levels[2][:, 0, 0].tolist() == [191, 191, 128]  # 255 (0.5 * 0.5 + 0.5), 128 where there is no blue
-
-
-# ------------------------------------------------------------------------------------ training
-
-
-def test_schedule_shows_every_pair_in_turn():
-    schedule = train.endless_schedule(3, [1, 4], seed=1)
-    rounds = [[next(schedule) for _ in range(6)] for _ in range(3)]
-    assert all(sorted(pairs) == [(v, s) for v in range(3) for s in (1, 4)] for pairs in rounds)
-    assert rounds[0] != rounds[1]
-
-
-def test_progress_by_seconds_grows_at_the_last_pace():
-    progress = train.Progress(None, seconds=10.0)
-    for elapsed in (1.0, 3.0):
-        for _ in range(100):
-            progress.advance()
-        progress.measure(elapsed)
-        assert progress.share == elapsed / 10
-    progress.advance()
-    assert progress.share == pytest.approx(0.302)
-    steps = train.Progress(3, None)
-    for share in (1 / 3, 2 / 3, 1.0):
-        steps.advance()
-        steps.measure(99.0)
-        assert steps.share == share
-
-
-def write_pictures(folder, view, opaque: bool) -> None:
-    """A few coloured Gaussians, rendered on transparent or on black."""
-    points, colors = g.random_points(12, seed=5)
-    truth = g.gaussians_at(points, colors, 0)._replace(log_scales=torch.full((12, 3), 0.25).log())
-    truth = truth._replace(logit_opacities=torch.full((12, 1), 3.0))
-    color, _ = truth.render(view.settings(1, sh_degree=0, footprint="exact"))
-    alpha, _ = truth._replace(sh_dc=torch.full((12, 1, 3), 0.5 / g.SH_C0)).render(
-        view.settings(1, sh_degree=0, footprint="exact")
-    )
-    pixels = torch.cat([color if opaque else color / alpha.clamp_min(1e-3), alpha[:1]])[: 3 if opaque else 4]
-    pixels = (255 * pixels.clamp(0, 1)).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
-    folder.mkdir(parents=True, exist_ok=True)
-    image.fromarray(pixels).save(folder / f"{view.name}.png")
-
-
 def circle(count: int, size=(32, 32)) -> list[io.View]:
     return [io.View(f"r_{i}", *size, 36.0, 36.0, looking_at_origin(0.3 * (i - count / 2))) for i in range(count)]
+
+
+def truth_gaussians() -> g.Gaussians:
+    """A few coloured Gaussians."""
+    generator = torch.Generator().manual_seed(5)
+    points, _ = g.random_points(12, seed=5)
+    gaussians = g.gaussians_at(points, torch.rand(12, 3, generator=generator), 0)
+    gaussians = gaussians._replace(log_scales=torch.full((12, 3), 0.25).log())
+    return gaussians._replace(logit_opacities=torch.full((12, 1), 3.0))
+
+
+def draw_picture(view, opaque: bool) -> np.ndarray:
+    """The Gaussians on transparent, (H, W, 4) uint8 of straight alpha, or on black, (H, W, 3)."""
+    truth = truth_gaussians()
+    settings = view.settings(1, sh_degree=0, footprint="exact")
+    color, _ = truth.render(settings)
+    if not opaque:
+        alpha, _ = truth._replace(sh_dc=torch.full((12, 1, 3), 0.5 / g.SH_C0)).render(settings)
+        color = torch.cat([color / alpha[:1].clamp_min(1e-3), alpha[:1]])
+    return (255 * color.clamp(0, 1)).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
+
+
+def write_pictures(folder, views, opaque: bool) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    for view in views:
+        image.fromarray(draw_picture(view, opaque)).save(folder / f"{view.name}.png")
+
+
+def opengl_pose(view) -> list:
+    c2w = torch.linalg.inv(view.w2c)
+    c2w[:3, 1:3] *= -1
+    return c2w.tolist()
 
 
 @pytest.fixture(scope="module")
@@ -207,12 +234,8 @@ def synthetic(tmp_path_factory):
     """A scene in the files of NeRF-synthetic."""
     folder = tmp_path_factory.mktemp("synthetic")
     for split, views in (("train", circle(10)), ("test", circle(3))):
-        frames = []
-        for view in views:
-            write_pictures(folder / split, view, opaque=False)
-            c2w = torch.linalg.inv(view.w2c)
-            c2w[:3, 1:3] *= -1
-            frames.append({"file_path": f"./{split}/{view.name}", "transform_matrix": c2w.tolist()})
+        write_pictures(folder / split, views, opaque=False)
+        frames = [{"file_path": f"./{split}/{v.name}", "transform_matrix": opengl_pose(v)} for v in views]
         content = {"camera_angle_x": 2 * math.atan(32 / 72), "frames": frames}
         (folder / f"transforms_{split}.json").write_text(json.dumps(content))
     return folder
@@ -224,91 +247,648 @@ def capture(tmp_path_factory):
     folder = tmp_path_factory.mktemp("capture")
     views = circle(9, (35, 33))
     points, colors = g.random_points(60, seed=5)
-    for view in views:
-        write_pictures(folder / "photographs", view, opaque=True)
+    write_pictures(folder / "photographs", views, opaque=True)
     write_colmap(folder / "sparse" / "0", views, points, (255 * colors).to(torch.uint8))
     return folder
 
 
-COMMON = ["--device", "cpu", "--sh-degree", "1", "--scales", "1", "2", "--pictures", "1"]
-GROWTH = ["--densify-from", "20", "--densify-every", "20", "--reset-every", "500", "--max-gaussians", "400"]
+def test_nerf_synthetic_folder(synthetic):
+    found = training.load_capture(synthetic)
+    assert (len(found.train), len(found.test), found.background, found.points) == (10, 3, captures.WHITE, None)
+    for item, expected in zip(found.train, circle(10)):
+        assert item.files == {1: synthetic / "train" / f"{expected.name}.png"}
+        torch.testing.assert_close(item.view.w2c, expected.w2c)
+        assert item.view.fx == pytest.approx(36.0)
 
 
-def test_training_lowers_the_loss_and_reports_it(synthetic, tmp_path, capsys):
-    args = [str(synthetic), "--out", str(tmp_path), "--steps", "120", "--gaussians", "150", "--seeds", "0", "1"]
-    args += ["--footprints", "mip", "box:samples=2", "--evaluate-every", "50", *COMMON, *GROWTH]
-    assert train.main(args) == 0
-    report = json.loads((tmp_path / "results.json").read_text())
-    assert report.keys() == {"device", "torch", "arguments", "runs"}
-    runs = report["runs"]
-    names = ["mip", "box:samples=2"]
-    assert [(run["footprint"], run["seed"]) for run in runs] == [(name, seed) for seed in (0, 1) for name in names]
-    for run in runs:
-        assert [point["steps"] for point in run["checkpoints"]] == [50, 100, 120]
-        assert run["steps"] == 120 and len(run["loss"]) == 12
-        assert run["loss"][-1] < 0.5 * run["loss"][0]
-        assert run["checkpoints"][-1].items() <= run.items()
-        assert run["psnr"].keys() == run["ssim"].keys() == {"1", "2"}
-        assert run["psnr"]["1"] > run["checkpoints"][0]["psnr"]["1"] > 10
-        assert 0 < run["ssim"]["1"] < 1
-        assert 150 < run["gaussians"] <= 400
-        assert run["seconds"] == pytest.approx(0.120 * run["ms_per_step"])
-        seconds = [point["seconds"] for point in run["checkpoints"]]
-        assert seconds == sorted(seconds)
-    assert runs[0]["loss"] != runs[2]["loss"]
-    assert len(list((tmp_path / "pictures").iterdir())) == 4
-    assert image.open(tmp_path / "pictures" / "mip_2_r_0.png").size == (32, 16)
-    table = capsys.readouterr().out.splitlines()
-    assert table[1].split()[:5] == ["footprint", "PSNR", "1/1", "PSNR", "1/2"]
-    assert [line.split()[0] for line in table[2:]] == names and all("±" in line for line in table[2:])
+def test_colmap_folder(capture):
+    found = training.load_capture(capture, "photographs")
+    assert [item.view.name for item in found.test] == ["r_0", "r_8"]
+    assert len(found.train) == 7 and found.background == captures.BLACK and found.points[0].shape == (60, 3)
+    assert len(training.load_capture(capture, "photographs", test_every=0).train) == 9
 
 
-def test_training_repeats_to_the_bit(synthetic, tmp_path):
-    args = [str(synthetic), "--steps", "60", "--gaussians", "50", "--footprints", "analytic", *COMMON, *GROWTH]
-    losses = []
-    for name in "ab":
-        assert train.main([*args, "--out", str(tmp_path / name)]) == 0
-        losses.append(json.loads((tmp_path / name / "results.json").read_text())["runs"][0]["loss"])
-    assert losses[0] == losses[1]
+def test_nerfstudio_folder(tmp_path):
+    views = circle(9, (35, 33))
+    write_pictures(tmp_path / "images", views, opaque=True)
+    frames = [{"file_path": f"images/{v.name}.png", "transform_matrix": opengl_pose(v)} for v in views]
+    content = {"w": 35, "h": 33, "fl_x": 36.0, "fl_y": 36.0, "cx": 17.0, "cy": 16.0, "frames": frames}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
+    header += "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+    (tmp_path / "sparse_pc.ply").write_text(header + "0 1 2 255 0 51\n3 4 5 0 255 0\n")
+    found = training.load_capture(tmp_path)
+    assert [item.view.name for item in found.test] == ["r_0", "r_8"] and len(found.train) == 7
+    assert found.train[0].view.cx == 17.0
+    points, colors = found.points
+    assert points.tolist() == [[0, 1, 2], [3, 4, 5]]
+    torch.testing.assert_close(colors, torch.tensor([[1.0, 0.0, 0.2], [0.0, 1.0, 0.0]]))
 
 
-def test_training_on_a_capture_for_some_time(capture, tmp_path):
-    args = [str(capture), "--images", "photographs", "--out", str(tmp_path), "--seconds", "0.6", *COMMON]
-    assert train.main([*args, "--footprints", "cumulant", "--no-densify"]) == 0
-    run = json.loads((tmp_path / "results.json").read_text())["runs"][0]
-    assert 0.6 <= run["seconds"] < 6 and run["steps"] >= 10
-    assert run["gaussians"] == 60
-    assert run["loss"][-1] < run["loss"][0]
-    assert image.open(tmp_path / "pictures" / "cumulant_1_r_0.png").size == (2 * 34, 32)
+def test_multi_scale_blender_folder(tmp_path):
+    """Pictures of coarse scales are those that are stored, not those that the finest would give."""
+    metadata = {}
+    for split, views in (("train", circle(3)), ("test", circle(2))):
+        keys = ("file_path", "cam2world", "width", "height", "focal")
+        rows = {key: [] for key in keys}
+        (tmp_path / split).mkdir()
+        for view in views:
+            for level in range(3):
+                size, name = 32 >> level, f"{split}/{view.name}_d{level}.png"
+                values = name, opengl_pose(view), float(size), float(size), view.fx / 2**level
+                for key, value in zip(keys, values):
+                    rows[key].append(value)
+                image.new("RGBA", (size, size), (10 + level, 20, 30, 255)).save(tmp_path / name)
+        metadata[split] = rows
+    (tmp_path / "metadata.json").write_text(json.dumps(metadata))
+    found = training.load_capture(tmp_path)
+    assert (len(found.train), len(found.test)) == (3, 2)
+    assert [sorted(item.files) for item in found.train] == [[1, 2, 4]] * 3
+    loaded = training.load_pictures(found.train, (1, 2, 4), captures.WHITE, "cpu")
+    assert [loaded.colors[scale][1][0, 0, 0].item() for scale in (1, 2, 4)] == [10, 11, 12]
+    assert [loaded.settings[scale][1].image_width for scale in (1, 2, 4)] == [32, 16, 8]
+
+
+@pytest.mark.parametrize("layout", ["binary_little_endian", "ascii"])
+def test_points_of_a_ply(tmp_path, layout):
+    rows = np.array(
+        [(1, 2, 3, 0, 255), (4, 5, 6, 7, 51)], [("x", "<f8"), ("y", "<f4"), ("z", "<f4"), ("n", "u1"), ("red", "u1")]
+    )
+    kinds = ["double x", "float y", "float z", "uchar n", "uchar red"]
+    header = [f"ply\nformat {layout} 1.0\nelement vertex 2", *(f"property {kind}" for kind in kinds), "end_header\n"]
+    body = rows.tobytes() if layout != "ascii" else "\n".join(" ".join(map(str, row)) for row in rows.tolist()).encode()
+    (tmp_path / "p.ply").write_bytes("\n".join(header).encode() + body)
+    points, colors = training.load_points(tmp_path / "p.ply")
+    assert points.tolist() == [[1, 2, 3], [4, 5, 6]] and (colors == 0.5).all()  # no green: no colours
+    (tmp_path / "p.ply").write_bytes("\n".join(header).encode() + body[: len(body) // 2])
+    with pytest.raises(io.SceneError, match=r"cut short|expected 2 finite points"):
+        training.load_points(tmp_path / "p.ply")
+
+
+def test_a_ply_that_is_none_is_named(synthetic, tmp_path, capsys):
+    (tmp_path / "p.ply").write_text("nothing")
+    arguments = ["train", str(synthetic), "--out", str(tmp_path / "out"), "--device", "cpu"]
+    assert cli.main([*arguments, "--points", str(tmp_path / "p.ply")]) == 2
+    assert capsys.readouterr().err.startswith(f"error: {tmp_path / 'p.ply'}: not a PLY file")
+
+
+def test_cut_pictures_see_the_same(tmp_path):
+    """What is left of a picture shows a point where it did, in px of the cut; at half the intrinsics' size too."""
+    pixels = torch.randint(256, (29, 45, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)).numpy()
+    image.fromarray(pixels).save(tmp_path / "a.png")
+    view = io.View("a", 45, 29, 50.0, 51.0, looking_at_origin(0.3), cx=20.0)
+    cut, rgba = pictures.cut(tmp_path / "a.png", view, 8)
+    assert np.array_equal(rgba[..., :3].numpy(), pixels[2:26, 2:42])
+    point = torch.tensor([[0.2, -0.3, 0.4]])
+    whole, part = (render_stages(v.settings(), **point_inputs(point)).means2d for v in (view, cut))
+    torch.testing.assert_close(part, whole - 2, rtol=0, atol=1e-4)
+    double = replace(view, width=90, height=58, fx=100.0, fy=102.0, cx=40.0)
+    again, _ = pictures.cut(tmp_path / "a.png", double, 8)
+    assert again == replace(cut, w2c=again.w2c)
+    with pytest.raises(io.SceneError, match="45 x 29 px are too few"):
+        pictures.cut(tmp_path / "a.png", view, 32)
+
+
+def test_reduced_pictures_average_straight_colors():
+    rgba = torch.tensor([[[255, 0, 0, 255], [0, 255, 0, 0]]], dtype=torch.uint8).repeat(2, 1, 1)
+    assert pictures.reduce(rgba, 1, captures.WHITE)[:, 0].T.tolist() == [[255, 0, 0], [255, 255, 255]]
+    assert pictures.reduce(rgba, 2, captures.WHITE)[:, 0, 0].tolist() == [191, 191, 128]  # 255 (0.5 * 0.5 + 0.5), 128
+    assert pictures.reduce(rgba, 2, None)[:, 0, 0].tolist() == [64, 64, 0, 128]  # premultiplied
+
+
+@pytest.mark.parametrize("scale", [2, 4])
+def test_bicubic_reduction_is_that_of_pillow(scale):
+    """Within the level of 255 by which Pillow's own rounding between rows and columns may differ."""
+    pixels = torch.randint(256, (16, 24, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
+    rgba = torch.cat([pixels, torch.full((16, 24, 1), 255, dtype=torch.uint8)], dim=2)
+    expected = image.fromarray(pixels.numpy()).resize((24 // scale, 16 // scale), image.Resampling.BICUBIC)
+    got = pictures.reduce(rgba, scale, captures.BLACK, "bicubic").permute(1, 2, 0)
+    assert (got.int() - torch.from_numpy(np.array(expected)).int()).abs().max() <= 1
+
+
+def test_sixteen_bits_are_rounded_to_eight(tmp_path):
+    image.fromarray(np.array([[0, 257 * 100, 65535]], np.uint16)).save(tmp_path / "a.png")
+    assert pictures.read_picture(tmp_path / "a.png")[0, :, 0].tolist() == [0, 100, 255]
+
+
+# -------------------------------------------------------------------------------------- errors
+
+
+def change_transforms(folder, change) -> None:
+    path = folder / "transforms_train.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def nan_picture(folder) -> None:
+    """A floating-point picture where the PNG was: Pillow tells formats by their content."""
+    pixels = np.zeros((32, 32), np.float32)
+    pixels[3, 7] = np.nan
+    image.fromarray(pixels).save(folder / "train" / "r_4.png", format="TIFF")
+
+
+BROKEN = {
+    "no folder": (lambda f: f.rename(f.with_name("elsewhere")), "no such folder"),
+    "nothing in it": (
+        lambda f: (f / "transforms_train.json").unlink(),
+        "expected transforms_train.json, metadata.json",
+    ),
+    "missing pictures": (
+        lambda f: [(f / "train" / f"r_{i}.png").unlink() for i in (2, 5)],
+        r"2 of 13 pictures are missing, the first is .*r_2",
+    ),
+    "nan": (nan_picture, r"r_4.png: pixels must be finite, got nan at x 7, y 3"),
+    "cut short": (
+        lambda f: (f / "train" / "r_1.png").write_bytes((f / "train" / "r_1.png").read_bytes()[:200]),
+        "r_1.png: unreadable or cut short",
+    ),
+    "one camera": (
+        lambda f: change_transforms(f, lambda c: c.update(frames=c["frames"][:1])),
+        "training needs at least 2 pictures, got 1",
+    ),
+    "one place": (
+        lambda f: change_transforms(f, lambda c: c.update(frames=[c["frames"][0]] * 3)),
+        "cameras at different places, got all 3 at one",
+    ),
+    "bad pose": (
+        lambda f: change_transforms(f, lambda c: c["frames"][1].update(transform_matrix=[[math.nan] * 4] * 4)),
+        "frame 1: transform_matrix must hold 4 x 4 finite numbers",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN)
+def test_broken_captures_are_one_line_and_leave_no_results(synthetic, tmp_path, capsys, case):
+    folder = tmp_path / "scene"
+    shutil.copytree(synthetic, folder)
+    breaks, message = BROKEN[case]
+    breaks(folder)
+    assert cli.main(["train", str(folder), "--out", str(tmp_path / "out"), "--device", "cpu"]) == 2
+    error = capsys.readouterr().err
+    assert re.search(message, error) and error.startswith("error: ") and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(
     "extra, message",
     [
-        (["--footprints", "bx"], "footprint must be one of"),
-        (["--footprints", "box:samples=3"], "samples must be one of"),
-        (["--steps", "0"], "argument --steps: must be at least 1, got 0"),
-        (["--seconds", "nan"], "argument --seconds: must be positive and finite, got nan"),
-        (["--steps", "9", "--seconds", "9"], "not allowed with argument"),
-        (["--gaussians", "3"], "--gaussians must be at least 4, got 3"),
-        (["--scales", "1", "0"], "argument --scales: must be at least 1, got 0"),
+        (["--footprint", "bx"], "footprint must be one of"),
+        (["--footprint", "box:samples=3"], "samples must be one of"),
+        (["--iterations", "0"], "iterations must be at least 1, got 0"),
+        (["--seconds", "nan"], "seconds must be finite and not negative, got nan"),
+        (["--scales", "1,0"], "scales must be whole numbers of at least 1, got (1, 0)"),
+        (["--scales", "1,1"], "scales must be different from each other"),
+        (["--scales", "1,2", "--scale-repeats", "1"], "scale_repeats must be 2 numbers"),
+        (["--scales", "one"], "must be whole numbers with commas between them, got one"),
         (["--scales", "64"], "32 x 32 px are too few for these scales"),
+        (["--density", "more"], "density must be one of 3dgs, absgrad, mcmc, none, got more"),
+        (["--densify-until", "1.5"], "densify_until must be 0 to 1, got 1.5"),
+        (["--sh-degree", "4"], "sh_degree must be 0 to 3, got 4"),
+        (["--background", "green"], "background must be one of black, white, random, got green"),
+        (["--preset", "quick", "--opacity-rate", "0"], "opacity_rate must be positive and finite, got 0.0"),
+        (["--preset", "slow"], "argument --preset: invalid choice: 'slow'"),
+        (["--port", "8000"], "--port is for --watch"),
+        (["--watch", "--port", "65536"], "must be a port from 0 to 65535, got 65536"),
+        (["--export", "mip", "--footprint", "point"], "--export mip is for footprints that integrate over pixels"),
+        (["--test-every", "1"], "test_every must be 0 or at least 2, got 1"),
+        (["--resume"], "checkpoint.pt: no such file; there is no training to resume"),
+        (["--points", "none.ply"], "none.ply"),
     ],
 )
 def test_bad_arguments_are_one_line(synthetic, tmp_path, capsys, extra, message):
-    assert leave([str(synthetic), "--out", str(tmp_path), "--device", "cpu", *extra]) == 2
-    error = capsys.readouterr().err
-    assert message in error and error.startswith("error: ") and error.count("\n") == 1
-
-
-def test_a_folder_without_a_scene_is_one_line(tmp_path, capsys):
-    assert leave([str(tmp_path), "--out", str(tmp_path / "out"), "--device", "cpu"]) == 2
-    assert capsys.readouterr().err == f"error: {tmp_path}: holds neither transforms_train.json nor sparse/0\n"
-
-
-def leave(args) -> int:
-    """The exit code of a command line."""
     try:
-        return train.main(args)
+        code = cli.main(["train", str(synthetic), "--out", str(tmp_path / "out"), "--device", "cpu", *extra])
     except SystemExit as stop:
-        return stop.code
+        code = stop.code
+    error = capsys.readouterr().err
+    assert code == 2 and message in error
+    assert error.startswith("error: ") and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+# ------------------------------------------------------------------------------------ training
+
+TINY = {"sh_degree": 1, "random_points": 150, "densify_from": 20, "densify_every": 20, "max_gaussians": 400}
+
+
+def make_run(folder, out, device="cpu", resume=False, **options) -> training.Run:
+    chosen = TrainingOptions(**{"iterations": 120, "scales": (1, 2), **TINY, **options})
+    return training.Run(folder, out, chosen, device=device, images="photographs", save_every=0, resume=resume)
+
+
+@pytest.mark.parametrize("options", [{}, {"density": "absgrad"}, {"density": "mcmc"}, {"density": "none"}], ids=str)
+def test_psnr_rises_and_the_results_say_so(device, synthetic, tmp_path, options):
+    run = make_run(synthetic, tmp_path, device, **options)
+    assert run.train()
+    metrics = run.evaluate()
+    log = [json.loads(line) for line in (tmp_path / files.LOG).read_text().splitlines()]
+    assert [entry["step"] for entry in log] == [10, 100, 120]
+    assert log[-1]["loss"] < 0.5 * log[0]["loss"]
+    start = evaluate(g.gaussians_at(*g.random_points(150, 0), 1).to_scene(), cpu_test_pictures(synthetic), "box")
+    assert metrics["test"]["mean"]["psnr"] > start["mean"]["psnr"] + 3
+    assert metrics["steps"] == 120 and metrics == json.loads((tmp_path / files.METRICS).read_text())
+    assert {"1", "2", "mean"} == metrics["test"].keys() and len(metrics["test"]["1"]["views"]) == 3
+    if options.get("density") != "none":
+        assert 150 < metrics["gaussians"] <= 400
+
+
+def cpu_test_pictures(folder):
+    return training.load_pictures(training.load_capture(folder).test, (1, 2), captures.WHITE, "cpu")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"density": "absgrad", "gradient_scales": "finest", "filter_3d": True, "scale_repeats": (2, 1)},
+        {"density": "mcmc", "background": "random", "pictures_per_step": 2},
+        {"sh_degree": 0},
+        {"sh_degree": 0, "density": "mcmc"},
+    ],
+    ids=["3dgs", "absgrad", "mcmc", "3dgs-constant-colors", "mcmc-constant-colors"],
+)
+def test_resumed_training_gives_the_same_bits(device, synthetic, tmp_path, options):
+    """Through a file, at a step between two changes of density, and against a run without a break."""
+    common = {"iterations": 75, "densify_until": 0.9, **options}  # changes after steps 40 and 60
+    whole = make_run(synthetic, tmp_path / "whole", device, **common)
+    whole.train()
+    part = make_run(synthetic, tmp_path / "part", device, **common)
+    for _ in range(47):
+        part.trainer.step()
+    part.save()
+    again = make_run(synthetic, tmp_path / "part", device, resume=True)
+    assert again.options == whole.options and again.progress.step == 47
+    again.train()
+    assert len(part.trainer.gaussians.means) != 150 and len(again.trainer.gaussians.means) != 150
+    for name, expected, got in zip(g.Gaussians._fields, whole.trainer.gaussians, again.trainer.gaussians):
+        assert torch.equal(expected, got), name
+    assert (tmp_path / "whole" / files.SCENE).read_bytes() == (tmp_path / "part" / files.SCENE).read_bytes()
+
+
+def test_ctrl_c_saves_and_resumes(synthetic, tmp_path, capsys, monkeypatch):
+    """The step that runs is completed; the end is the same as without the interruption."""
+    arguments = ["train", str(synthetic), "--device", "cpu", "--iterations", "60", "--random-points", "50"]
+    arguments += ["--sh-degree", "0", "--scales", "1"]
+    assert cli.main([*arguments, "--out", str(tmp_path / "whole")]) == 0
+    step = training.Trainer.step
+
+    def interrupted(trainer):
+        if trainer.progress.step == 33:
+            signal.raise_signal(signal.SIGINT)
+        step(trainer)
+
+    monkeypatch.setattr(training.Trainer, "step", interrupted)
+    before = signal.getsignal(signal.SIGINT)
+    assert cli.main([*arguments, "--out", str(tmp_path / "part")]) == 130
+    assert signal.getsignal(signal.SIGINT) is before
+    assert "stopped after 34 steps and saved; go on with --resume" in capsys.readouterr().out
+    assert (tmp_path / "part" / files.SCENE).exists()
+    monkeypatch.undo()
+    assert cli.main([*arguments, "--out", str(tmp_path / "part")]) == 2
+    assert "go on with --resume" in capsys.readouterr().err
+    assert cli.main([*arguments, "--seed", "3", "--resume", "--out", str(tmp_path / "part")]) == 2
+    assert "--seed: a resumed training keeps the options of its checkpoint" in capsys.readouterr().err
+    assert cli.main([*arguments, "--resume", "--out", str(tmp_path / "part")]) == 0
+    assert (tmp_path / "whole" / files.SCENE).read_bytes() == (tmp_path / "part" / files.SCENE).read_bytes()
+
+
+def test_a_second_ctrl_c_ends_at_once(synthetic, tmp_path, monkeypatch):
+    run = make_run(synthetic, tmp_path)
+
+    def interrupted():
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(run.trainer, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run.train()
+
+
+def full_disk(state, path) -> None:
+    path.write_bytes(b"half of it")
+    raise OSError(28, "No space left on device")
+
+
+def test_full_disk_on_the_way_is_reported_and_at_the_end_keeps_what_was_there(synthetic, tmp_path, capsys, monkeypatch):
+    run = make_run(synthetic, tmp_path, iterations=30)
+    run.save_every = 10
+    save, calls = torch.save, []
+
+    def fails_after_the_first(state, path):
+        calls.append(state["progress"]["step"])
+        (save if len(calls) == 1 else full_disk)(state, path)
+
+    monkeypatch.setattr(torch, "save", fails_after_the_first)
+    with pytest.raises(OSError, match=r"checkpoint.pt: cannot be written \(No space left on device\)"):
+        run.train()
+    assert calls == [10, 20, 30]
+    assert "No space left on device" in capsys.readouterr().err
+    assert files.read_checkpoint(tmp_path / files.CHECKPOINT)["progress"]["step"] == 10
+    assert not [path for path in tmp_path.iterdir() if "partial" in path.name]
+
+
+def test_a_loss_that_is_not_finite_ends_with_an_error(synthetic, tmp_path, capsys, monkeypatch):
+    run = make_run(synthetic, tmp_path)
+    for _ in range(3):
+        run.trainer.step()
+    run.save()
+    monkeypatch.setattr("analytic_rasterizer.training.trainer.l1_ssim", lambda image, *_: math.nan * image.mean())
+    with pytest.raises(FloatingPointError, match=r"the loss of step 4 is nan"):
+        run.train()
+    assert cli.main(["train", str(synthetic), "--out", str(tmp_path), "--device", "cpu", "--resume"]) == 2
+    assert capsys.readouterr().err.endswith("error: the loss of step 4 is nan; lower learning rates may help\n")
+    assert files.read_checkpoint(tmp_path / files.CHECKPOINT)["progress"]["step"] == 3
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 nonsense", b"\x80\x04K\x01."])
+def test_a_broken_checkpoint_is_one_line(synthetic, tmp_path, capsys, content):
+    (tmp_path / files.CHECKPOINT).write_bytes(content)
+    assert cli.main(["train", str(synthetic), "--out", str(tmp_path), "--device", "cpu", "--resume"]) == 2
+    error = capsys.readouterr().err
+    assert "checkpoint.pt: " in error and error.startswith("error: ") and error.count("\n") == 1
+
+
+def test_training_by_time_on_a_capture(capture, tmp_path):
+    run = make_run(capture, tmp_path, seconds=0.6, density="none", footprint="cumulant")
+    assert run.train()
+    assert run.clock.total >= 0.6 and run.progress.share >= 1 and run.progress.step >= 10
+    assert len(run.trainer.gaussians.means) == 60
+    assert run.trainer.pictures.settings[2][0].image_width == 17
+
+
+@pytest.mark.parametrize("kind", [pytest.param(k, id=f"cuda-{k}", marks=needs_cuda) for k in ("3dgs", "mcmc")])
+def test_steps_do_not_wait_for_the_device(synthetic, tmp_path, kind):
+    """Outside of the steps that change the number of Gaussians, once the frames of every size are known."""
+    run = make_run(synthetic, tmp_path, "cuda", iterations=1000, density=kind, densify_from=900)
+    for _ in range(100):
+        run.trainer.step()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(20):
+            run.trainer.step()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+
+
+# ------------------------------------------------------------------------------------- watching
+
+
+def watched(arguments, monkeypatch) -> list[tuple]:
+    """Runs the command with a viewer that wants every scene; returns what it was shown: (scene, step, text, force)."""
+    pytest.importorskip("viser", reason="needs the view extra")
+    from analytic_rasterizer.viewer import LiveViewer
+
+    shown, update = [], LiveViewer.update
+
+    def note(viewer, scene, *, step, text="", force=False):
+        shown.append((scene(), step, text, force))
+        return update(viewer, scene, step=step, text=text, force=force)
+
+    monkeypatch.setattr(LiveViewer, "update", note)
+    assert cli.main([*arguments, "--watch"]) == 0
+    return shown
+
+
+def test_watching_shows_the_scene_and_changes_no_bit(synthetic, tmp_path, monkeypatch, capsys, device):
+    common = ["--device", device, "--iterations", "12", "--random-points", "60", "--sh-degree", "0", "--no-evaluate"]
+    assert cli.main(["train", str(synthetic), "--out", str(tmp_path / "alone"), *common]) == 0
+    capsys.readouterr()
+    shown = watched(["train", str(synthetic), "--out", str(tmp_path / "watched"), *common], monkeypatch)
+    assert re.search(r"^watch at http://127\.0\.0\.1:\d+$", capsys.readouterr().out, re.M)
+    assert [step for _, step, *_ in shown] == list(range(13))
+    assert [force for *_, force in shown] == [False] * 12 + [True]
+    assert shown[9][2] == "" and re.fullmatch(r"loss [\d.]+, PSNR [\d.]+, Gaussians 60", shown[10][2])
+    written = io.load_scene(tmp_path / "watched" / files.SCENE)
+    torch.testing.assert_close(shown[-1][0].scales.cpu(), written.scales, rtol=1e-5, atol=1e-6)
+    alone, together = ((tmp_path / name / files.SCENE).read_bytes() for name in ("alone", "watched"))
+    assert alone == together
+
+
+def test_a_viewer_starts_with_what_is_trained(synthetic, tmp_path):
+    pytest.importorskip("viser", reason="needs the view extra")
+    with make_run(synthetic, tmp_path, footprint="moment:samples=4", background="random").start_viewer() as viewer:
+        assert [view.name for view in viewer.views] == [view.name for view in circle(10)]
+        assert (viewer.footprint, viewer.background) == ("moment:samples=4", captures.WHITE)
+        assert viewer.name == synthetic.name
+
+
+def test_watching_without_viser_names_the_extra(synthetic, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert cli.main(["train", str(synthetic), "--out", str(tmp_path / "out"), "--watch"]) == 2
+    assert "needs viser: pip install analytic_rasterizer[view]" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+# ------------------------------------------------------------------------------------- results
+
+
+@pytest.fixture(scope="module")
+def trained(synthetic, tmp_path_factory):
+    """A folder of results."""
+    out = tmp_path_factory.mktemp("trained")
+    arguments = ["train", str(synthetic), "--out", str(out), "--device", "cpu", "--iterations", "40"]
+    assert cli.main([*arguments, "--random-points", "80", "--sh-degree", "1", "--scales", "1,2"]) == 0
+    return out
+
+
+def test_the_ply_holds_what_was_trained(trained):
+    state = files.read_checkpoint(trained / files.CHECKPOINT)
+    expected = g.Gaussians(**state["gaussians"]).to_scene()
+    read = io.load_scene(trained / files.SCENE)
+    assert read.sh_degree == 1
+    for name in ("means", "scales", "opacities", "shs"):
+        torch.testing.assert_close(getattr(read, name), getattr(expected, name), rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(read.rotations, torch.nn.functional.normalize(expected.rotations, dim=1))
+
+
+@pytest.mark.parametrize("footprint, tag", [("point", None), ("box:samples=4", "mip"), ("mip", "mip")])
+def test_the_ply_says_that_pixels_were_integrated(tmp_path, footprint, tag):
+    scene = truth_gaussians().to_scene()
+    files.write_scene(tmp_path / "s.ply", scene, footprint)
+    assert footprint_of_file(tmp_path / "s.ply") == tag
+    assert torch.equal(io.load_scene(tmp_path / "s.ply").means, scene.means)
+
+
+@pytest.mark.parametrize("filter_3d", [False, True])
+def test_the_exported_scene_has_the_pixel_in_it(synthetic, tmp_path, capsys, device, filter_3d):
+    arguments = ["--iterations", "3", "--random-points", "60", "--sh-degree", "1", "--no-evaluate", "--scales", "2,1"]
+    arguments += ["--device", device, "--export", "mip"] + ["--filter-3d"] * filter_3d
+    assert cli.main(["train", str(synthetic), "--out", str(tmp_path), *arguments]) == 0
+    assert f"{tmp_path / files.MIP_SCENE}: for viewers" in capsys.readouterr().out
+    assert footprint_of_file(tmp_path / files.SCENE) == "mip" and footprint_of_file(tmp_path / files.MIP_SCENE) is None
+    scene, baked = (io.load_scene(tmp_path / name) for name in (files.SCENE, files.MIP_SCENE))
+    cameras = [view.settings() for view in circle(10)]  # of the finest scale
+    scales, opacities = bake_pixel(scene.means, scene.scales, scene.rotations, scene.opacities, cameras)
+    assert torch.equal(baked.means, scene.means) and torch.equal(baked.shs, scene.shs)
+    torch.testing.assert_close(baked.scales, scales, rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(baked.opacities, opacities, rtol=1e-4, atol=1e-6)
+    assert (baked.scales > scene.scales).all() and (baked.opacities < scene.opacities).all()
+
+
+def test_comments_that_cannot_be_written_are_refused(tmp_path):
+    scene = truth_gaussians().to_scene()
+    for name, comment in (("s.spz", "a"), ("s.ply", "a\nb"), ("s.ply", "ä")):
+        with pytest.raises(io.SceneError, match="comments"):
+            io.save_scene(tmp_path / name, scene, [comment])
+
+
+def test_cameras_json_gives_the_training_views(trained):
+    views = io.load_views(trained / files.CAMERAS)
+    assert [view.name for view in views] == [view.name for view in circle(10)]
+    for view, expected in zip(views, circle(10)):
+        # `looking_at_origin` rounds its rotation to float32, and a file that holds rotations is read as if exact.
+        torch.testing.assert_close(view.w2c, expected.w2c, rtol=0, atol=4 * 2**-22)
+        assert (view.width, view.height) == (32, 32) and view.fx == pytest.approx(36.0)
+
+
+def test_training_starts_from_a_scene(synthetic, trained, tmp_path):
+    options = TrainingOptions(iterations=1, sh_degree=2, density="none")
+    run = training.Run(synthetic, tmp_path / "out", options, points=trained / files.SCENE)
+    expected = io.load_scene(trained / files.SCENE)
+    torch.testing.assert_close(run.trainer.gaussians.means.detach(), expected.means)
+    torch.testing.assert_close(run.trainer.gaussians.to_scene().shs[:, :4], expected.shs)
+    assert run.trainer.gaussians.sh_rest.shape[1] == 8 and (run.trainer.gaussians.sh_rest[:, 3:] == 0).all()
+
+
+def test_evaluate_compares_footprints(trained, capsys):
+    arguments = ["evaluate", str(trained), "--footprint", "box:samples=4", "point", "--scales", "1,2,4"]
+    assert cli.main([*arguments, "--lpips", "none", "--pictures", "1"]) == 0
+    table = capsys.readouterr().out.splitlines()
+    assert table[0].split() == ["footprint", "1/1", "1/2", "1/4", "mean"]
+    names = [line.split()[:2] for line in table[1:] if line.split()[0] in ("box:samples=4", "point:dilation=0.3")]
+    assert names == [[name, m] for name in ("box:samples=4", "point:dilation=0.3") for m in ("PSNR", "SSIM")]
+    results = json.loads((trained / "evaluation.json").read_text())["results"]
+    metrics = json.loads((trained / files.METRICS).read_text())["test"]
+    for scale in ("1", "2"):  # the .ply rounds a little
+        assert results["box:samples=4"][scale]["psnr"] == pytest.approx(metrics[scale]["psnr"], abs=1e-2)
+    drawn = image.open(trained / "evaluation" / "box_samples_4_2_r_0.png")
+    assert drawn.size == (3 * 16, 16)
+    truth = np.array(drawn)[:, :16]
+    assert np.array_equal(truth, cpu_test_pictures_at(trained).colors[2][0].permute(1, 2, 0).numpy())
+
+
+def cpu_test_pictures_at(trained):
+    return cpu_test_pictures(json.loads((trained / files.OPTIONS).read_text())["source"]["scene"])
+
+
+def test_evaluate_says_how_to_get_the_weights_of_lpips(trained, capsys, monkeypatch, tmp_path):
+    monkeypatch.setattr(torch.hub, "get_dir", lambda: str(tmp_path))
+    assert cli.main(["evaluate", str(trained), "--pictures", "0"]) == 0
+    captured = capsys.readouterr()
+    assert "LPIPS is left out" in captured.err and "vgg16-397923af.pth" in captured.err
+    assert "LPIPS" not in captured.out
+
+
+def test_evaluate_of_another_folder_is_one_line(tmp_path, capsys):
+    assert cli.main(["evaluate", str(tmp_path)]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("error: ") and "options.json" in error and error.count("\n") == 1
+
+
+def test_example_trains(synthetic, tmp_path):
+    source = (ROOT / "examples" / "train.py").read_text()
+    assert "iterations=7000" in source and "(1, 2, 4, 8)" in source
+    source = source.replace("iterations=7000", "iterations=3, random_points=50").replace("(1, 2, 4, 8)", "(1, 2)")
+    (tmp_path / "train.py").write_text(source)
+    done = subprocess.run(
+        [sys.executable, "train.py", str(synthetic), "out", "mip"],
+        cwd=tmp_path, capture_output=True, text=True, timeout=DEADLINE,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.startswith("mip: PSNR ") and (tmp_path / "out" / "mip" / files.SCENE).exists()
+
+
+# -------------------------------------------------------------------------- schedules, measures
+
+
+def test_order_shows_every_pair_in_turn():
+    options = TrainingOptions(scales=(1, 4), scale_repeats=(2, 1), seed=1)
+    order = schedule.PictureOrder(3, options)
+    rounds = [[order(9 * k + i) for i in range(9)] for k in range(3)]
+    pairs = sorted([(v, 1) for v in range(3)] * 2 + [(v, 4) for v in range(3)])
+    assert all(sorted(shown) == pairs for shown in rounds)
+    assert rounds[0] != rounds[1]
+    assert schedule.PictureOrder(3, options)(13) == rounds[1][4]  # without what came before
+    assert [schedule.PictureOrder(3, replace(options, seed=2))(i) for i in range(9)] != rounds[0]
+
+
+def test_progress_by_seconds_grows_at_the_last_pace():
+    progress = schedule.Progress(None, seconds=10.0)
+    for elapsed in (1.0, 3.0):
+        for _ in range(100):
+            progress.advance()
+        progress.measure(elapsed)
+        assert progress.share == elapsed / 10
+    progress.advance()
+    assert progress.share == pytest.approx(0.302)
+    steps = schedule.Progress(3, None)
+    for share in (1 / 3, 2 / 3, 1.0):
+        steps.advance()
+        steps.measure(99.0)
+        assert steps.share == share
+
+
+def test_rate_of_the_means_falls_over_the_training_or_over_steps():
+    whole, fixed = TrainingOptions(), TrainingOptions(means_rate_steps=30_000)
+    assert schedule.means_rate_at(3500, 0.5, whole) == pytest.approx(1.6e-5)  # the geometric mean of the ends
+    assert schedule.means_rate_at(15_000, 0.9, fixed) == pytest.approx(1.6e-5)
+    assert schedule.means_rate_at(60_000, 0.9, fixed) == pytest.approx(1.6e-6)
+
+
+def test_degrees_of_the_harmonics_come_after_steps_or_shares():
+    options = TrainingOptions()
+    assert [schedule.sh_degree_at(step, 0.0, options) for step in (999, 1000, 5000)] == [0, 1, 3]
+    assert [schedule.sh_degree_at(9, share, options) for share in (0.09, 0.11, 0.9)] == [0, 1, 3]
+
+
+def test_options_survive_a_file():
+    options = TrainingOptions(scales=[1, 2], density="mcmc", footprint="box")
+    assert options.footprint == "box:samples=4" and options.scale_repeats == (1, 1)
+    assert TrainingOptions.from_dict(json.loads(json.dumps(options.to_dict()))) == options
+    with pytest.raises(ValueError, match="among those of TrainingOptions, got speed"):
+        TrainingOptions.from_dict({"speed": 1})
+
+
+def test_presets_give_way_to_what_is_given():
+    assert TrainingOptions.preset("3dgs") == TrainingOptions()
+    quick = TrainingOptions.preset("quick")
+    assert (quick.iterations, quick.density, quick.opacity_rate, quick.scale_repeats) == (7000, "absgrad", 0.1, (1,))
+    assert TrainingOptions.preset("quick", scales=(4, 1, 2)).scale_repeats == (1, 2, 1)  # the finest twice
+    given = {"scales": (1, 2), "scale_repeats": (1, 3), "iterations": 9, "scale_rate": 5e-3}
+    chosen = TrainingOptions.preset("quick", **given)
+    assert {name: getattr(chosen, name) for name in given} == given
+    assert replace(chosen, iterations=7000, scale_rate=1e-2, scales=(1,), scale_repeats=()) == quick
+    with pytest.raises(ValueError, match="preset must be one of 3dgs, quick, got slow"):
+        TrainingOptions.preset("slow")
+
+
+def test_the_command_takes_a_preset_and_resumes_with_it(synthetic, tmp_path, capsys):
+    small = ["--iterations", "3", "--random-points", "50", "--sh-degree", "0", "--no-evaluate", "--device", "cpu"]
+    arguments = ["train", str(synthetic), "--out", str(tmp_path), *small]
+    assert cli.main([*arguments, "--preset", "quick", "--scales", "1,2", "--color-rate", "0.001"]) == 0
+    stored = TrainingOptions.from_dict(json.loads((tmp_path / files.OPTIONS).read_text())["options"])
+    given = {"scales": (1, 2), "color_rate": 1e-3, "iterations": 3, "random_points": 50, "sh_degree": 0}
+    assert stored == TrainingOptions.preset("quick", **given) and stored.scale_repeats == (2, 1)
+    # The same options once more are no contradiction, with or without the scales; others are.
+    assert cli.main([*arguments, "--preset", "quick", "--color-rate", "0.001", "--resume"]) == 0
+    capsys.readouterr()
+    assert cli.main([*arguments, "--preset", "quick", "--resume"]) == 2
+    assert capsys.readouterr().err == "error: --color-rate: a resumed training keeps the options of its checkpoint\n"
+
+
+def test_ssim_is_that_of_torchmetrics():
+    """Inside, where windows are whole: torchmetrics reflects at the edges, 3DGS's loss has zeros there."""
+    functional = pytest.importorskip("torchmetrics.functional", reason="needs the train extra")
+    generator = torch.Generator().manual_seed(0)
+    truth = torch.rand(3, 40, 48, generator=generator)
+    picture = (truth + 0.1 * torch.randn(3, 40, 48, generator=generator)).clamp(0, 1)
+    assert ssim(truth, truth).item() == pytest.approx(1, abs=1e-6)
+    assert l1_ssim(picture, truth, 0.0).item() == pytest.approx((picture - truth).abs().mean().item())
+    assert psnr(truth + 0.1, truth + 0.0) < psnr(picture * 0.5 + truth * 0.5, truth)
+    # Zeros around: the same as torchmetrics on pictures with a black frame, but for the frame's own windows.
+    pad = torch.nn.functional.pad
+    framed = functional.structural_similarity_index_measure(
+        pad(picture, [11] * 4)[None], pad(truth, [11] * 4)[None], data_range=1.0, return_full_image=True
+    )[1][0, :, 11:-11, 11:-11]
+    assert ssim(picture, truth).item() == pytest.approx(framed.mean().item(), abs=1e-5)

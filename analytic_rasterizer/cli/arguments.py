@@ -11,9 +11,12 @@ from pathlib import Path
 
 import torch
 
+from .. import _C
+
 # What a user can cause: bad values and files (ValueError, TypeError, OSError), a missing extra
-# (ImportError), a device out of memory or absent (RuntimeError, MemoryError).
-USER_ERRORS = (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError)
+# (ImportError), a device out of memory or absent (RuntimeError, MemoryError), a training that
+# diverges (FloatingPointError).
+USER_ERRORS = (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError, FloatingPointError)
 
 
 class Parser(argparse.ArgumentParser):
@@ -69,9 +72,11 @@ def add_view_options(parser) -> None:
     add("--background", nargs=3, type=intensity, default=(0.0, 0.0, 0.0), metavar=("R", "G", "B"), help=background)
 
 
-def add_machine_options(parser) -> None:
+def add_machine_options(parser, device: str | None = "cpu") -> None:
+    """Threads and the device, by default this one; None: CUDA where there is one, see `use_machine`."""
     parser.add_argument("--threads", type=count, metavar="N", help="CPU threads (default: all)")
-    parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
+    chosen = "(default: cuda where there is one)" if device is None else None
+    parser.add_argument("--device", choices=("cpu", "cuda"), default=device, help=chosen)
 
 
 def add_scale(parser) -> None:
@@ -79,8 +84,11 @@ def add_scale(parser) -> None:
 
 
 def use_machine(args) -> None:
+    """Sets the number of threads, and a device that was left open: CUDA where there is one."""
     if args.threads is not None:
         torch.set_num_threads(args.threads)
+    if args.device is None:
+        args.device = "cuda" if torch.cuda.is_available() and _C.has_cuda else "cpu"
     if args.device == "cuda" and not torch.cuda.is_available():
         raise ValueError("--device cuda: no CUDA device that this torch can use")
 
@@ -106,6 +114,14 @@ def _number(kind, accepts, expected: str):
         return value
 
     return parse
+
+
+def whole_numbers(text: str) -> tuple[int, ...]:
+    """An argparse type: whole numbers, with commas between them."""
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be whole numbers with commas between them, got {text}") from None
 
 
 positive_number = _number(float, lambda v: math.isfinite(v) and v > 0, "a positive number")

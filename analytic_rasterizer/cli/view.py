@@ -7,7 +7,7 @@ from pathlib import Path
 
 from .. import io, viewer
 from ..footprints import resolve_footprint
-from .arguments import add_view_options, port
+from .arguments import add_machine_options, add_view_options, port, use_machine
 
 
 def add_parser(subcommands) -> None:
@@ -16,7 +16,8 @@ def add_parser(subcommands) -> None:
         help="look at a scene in the browser, with any footprint",
         description="Serve SCENE to a browser on this machine, which draws it with any of the footprints "
         + ", ".join(viewer.PAGE_FOOTPRINTS)
-        + ". Nothing is sent elsewhere. Ctrl-C ends.",
+        + ". With --server this machine renders every frame, with any footprint that the library has. Nothing is sent "
+        "elsewhere. Ctrl-C ends.",
     )
     parser.add_argument("scene", metavar="SCENE", help="3DGS .ply, compressed .ply or .spz")
     parser.add_argument(
@@ -36,19 +37,29 @@ def add_parser(subcommands) -> None:
     parser.add_argument(
         "--export", metavar="FILE.html", help="write page and scene into one file that opens anywhere, and end"
     )
+    parser.add_argument(
+        "--server",
+        action="store_true",
+        help="render every frame here, by the library's own kernels, and not in the browser; needs the extra 'view'",
+    )
     add_view_options(parser)
+    add_machine_options(parser)
     parser.set_defaults(run=run)
 
 
 def run(args) -> None:
     """Serves or exports the scene."""
+    if args.server:
+        run_live(args)
+        return
+    if args.threads is not None or args.device != "cpu":
+        raise ValueError("--device and --threads are for --server: otherwise the browser draws")
     if args.export and Path(args.export).suffix != ".html":
         raise ValueError(f"--export must end in .html, got {args.export}")
     footprint = args.footprint
     if footprint is not None:  # raises before the scene is read
         footprint = viewer.page_footprint(resolve_footprint(footprint))
-    views = None if args.views is None else io.load_views(args.views, args.size)
-    scene = io.load_scene(args.scene)
+    scene, views = read(args)
     if footprint is None:
         footprint = viewer.footprint_of_file(args.scene)
     name = Path(args.scene).name
@@ -59,11 +70,42 @@ def run(args) -> None:
         return
     del scene  # the packed scene is all that is served
     with viewer.start_server(packed, args.port) as server:
-        print(f"{name}: {packed.meta['count']} Gaussians, footprint {packed.meta['footprint']}")
-        print(f"{server.url}  (Ctrl-C ends)", flush=True)
-        if not args.no_browser:
-            webbrowser.open(server.url)
+        announce(args, packed.meta["count"], packed.meta["footprint"], server.url)
         try:
             server.serve_forever()
         except KeyboardInterrupt:
             print()
+
+
+def run_live(args) -> None:
+    """Renders for browsers until interrupted."""
+    if args.export:
+        raise ValueError("--export writes the page that needs no server: leave out --server")
+    footprint = None if args.footprint is None else resolve_footprint(args.footprint)
+    use_machine(args)
+    io.optional_import("viser", "view")  # raises before the scene is read
+    scene, views = read(args)
+    footprint = footprint or viewer.footprint_of_file(args.scene)
+    name = Path(args.scene).name
+    options = {"views": views, "footprint": footprint, "background": args.background, "name": name}
+    with viewer.LiveViewer(args.port, **options) as live:
+        live.update(scene.to(args.device), copy=False)
+        announce(args, len(scene.means), live.footprint, live.url)
+        try:
+            live.wait()
+        except KeyboardInterrupt:
+            print()
+
+
+def read(args) -> tuple[io.Scene, list[io.View] | None]:
+    """The scene and the views that the arguments name."""
+    views = None if args.views is None else io.load_views(args.views, args.size)
+    return io.load_scene(args.scene), views
+
+
+def announce(args, count: int, footprint: str, url: str) -> None:
+    """Says what is served where, and opens it."""
+    print(f"{Path(args.scene).name}: {count} Gaussians, footprint {footprint}")
+    print(f"{url}  (Ctrl-C ends)", flush=True)
+    if not args.no_browser:
+        webbrowser.open(url)

@@ -1,0 +1,135 @@
+"""`train`: a scene from photographs."""
+
+from __future__ import annotations
+
+import argparse
+import typing
+from contextlib import nullcontext
+from dataclasses import fields
+from pathlib import Path
+
+from .. import io
+from ..footprints import resolve_footprint
+from ..training import Run, TrainingOptions
+from ..training.files import CHECKPOINT, SCENE, read_checkpoint
+from ..training.options import BACKGROUNDS, DENSITIES, DOWNSAMPLINGS, PRESETS, RANDOM_BACKGROUND, preset_values
+from .arguments import add_machine_options, port, use_machine, whole_numbers
+
+MAIN = {
+    "footprint": "how a pixel sees a splat",
+    "scales": "reductions to train at: 1,2,4,8",
+    "scale_repeats": "how often pictures of each scale occur in a pass: 3,1,1,1",
+    "downsampling": f"how coarse pictures are made: {', '.join(DOWNSAMPLINGS)}",
+    "iterations": "steps",
+    "seconds": "train for this long instead, by the clock",
+    "pictures_per_step": "pictures whose mean loss makes a step",
+    "sh_degree": "of the spherical harmonics, 0 to 3",
+    "background": f"{', '.join(BACKGROUNDS)} or {RANDOM_BACKGROUND} (default: white for NeRF-synthetic scenes, else "
+    "black)",
+    "filter_3d": "widen Gaussians by the 3D filter of Mip-Splatting",
+    "seed": "of everything that is drawn",
+    "density": f"density control: {', '.join(DENSITIES)}",
+    "max_gaussians": "grow no further than this",
+}
+
+
+def add_parser(subcommands) -> None:
+    parser = subcommands.add_parser(
+        "train",
+        help="train a scene from photographs",
+        description="Train Gaussians on the pictures of SCENE, a folder of a NeRF-synthetic scene, of the multi-scale "
+        "Blender set, of a COLMAP reconstruction or of a nerfstudio capture. Writes scene.ply, cameras.json, "
+        "metrics.json, log.jsonl, options.json and checkpoint.pt to DIR. Ctrl-C saves and ends; --resume goes on.",
+    )
+    add = parser.add_argument
+    add("scene", metavar="SCENE", help="folder of pictures with cameras")
+    add("--out", required=True, metavar="DIR", help="folder for the results")
+    add("--images", default="images", metavar="NAME", help="folder in SCENE of a reconstruction's photographs")
+    add("--test-every", type=int, default=8, metavar="N", help="keep every N-th photograph for the test; 0: none")
+    add("--points", metavar="FILE.ply", help="start from this: a 3DGS scene, or points with colours")
+    presets = "options that belong together: quick for trainings of about 7,000 steps, 3dgs for the recipe of 3DGS, "
+    presets += "which the defaults are; options that are given win"
+    add("--preset", choices=tuple(PRESETS), help=presets)
+    add("--resume", action="store_true", help="go on from the checkpoint in DIR, with its options")
+    add("--save-every", type=int, default=5000, metavar="STEPS", help="between checkpoints (default: 5000; 0: none)")
+    add("--no-evaluate", action="store_true", help="leave out the test at the end")
+    export = "write point_cloud_mip.ply too, for viewers that do not integrate over pixels"
+    add("--export", choices=("mip",), help=export)
+    add(
+        "--watch", action="store_true", help="show the scene in the browser while it is trained; needs the extra 'view'"
+    )
+    add("--port", type=port, metavar="N", help="of --watch: port to serve on (default: any free one)")
+    add_machine_options(parser, device=None)
+    rest = parser.add_argument_group("fine tuning", "see docs/training.md")
+    types = typing.get_type_hints(TrainingOptions)
+    for field in fields(TrainingOptions):
+        group = parser if field.name in MAIN else rest
+        flag = "--" + field.name.replace("_", "-")
+        default = ",".join(map(str, field.default)) if isinstance(field.default, tuple) else field.default
+        text = MAIN.get(field.name, "")
+        text += f" (default: {default})" if "default" not in text and default not in ("", False) else ""
+        # What is not given is absent, so that a checkpoint's options are only compared with what is.
+        if types[field.name] is bool:
+            group.add_argument(flag, action="store_true", default=argparse.SUPPRESS, help=text)
+        else:
+            kind = whole_numbers if isinstance(field.default, tuple) else types[field.name]
+            group.add_argument(flag, type=kind, default=argparse.SUPPRESS, metavar="X", help=text)
+    parser.set_defaults(run=run)
+
+
+def run(args) -> None:
+    """Trains, writes the results, and prints what the test views say."""
+    given = {field.name: getattr(args, field.name) for field in fields(TrainingOptions) if hasattr(args, field.name)}
+    if args.port is not None and not args.watch:
+        raise ValueError("--port is for --watch")
+    use_machine(args)
+    io.optional_import("gsply")  # writes the scene in the end
+    if args.watch:
+        io.optional_import("viser", "view")  # raises before the pictures are read
+    checkpoint = Path(args.out) / CHECKPOINT
+    stored = TrainingOptions.from_dict(read_checkpoint(checkpoint)["options"]) if args.resume else None
+    if args.preset is not None:
+        # Without --scales, a preset is for those of the checkpoint.
+        given.setdefault("scales", (stored or TrainingOptions).scales)
+        given = preset_values(args.preset, given["scales"]) | given
+    options = TrainingOptions(**given)
+    if stored is not None:
+        differing = [name for name in given if getattr(options, name) != getattr(stored, name)]
+        if differing:
+            named = ", ".join(f"--{name.replace('_', '-')}" for name in differing)
+            raise ValueError(f"{named}: a resumed training keeps the options of its checkpoint")
+    elif checkpoint.exists():
+        raise ValueError(f"{checkpoint} exists: go on with --resume, or choose another --out")
+    if args.export and resolve_footprint((stored or options).footprint).name == "point":
+        raise ValueError("--export mip is for footprints that integrate over pixels, got point")
+    training = Run(
+        args.scene,
+        args.out,
+        options,
+        device=args.device,
+        images=args.images,
+        test_every=args.test_every,
+        points=args.points,
+        save_every=args.save_every,
+        resume=args.resume,
+    )
+    with training.start_viewer(args.port or 0) if args.watch else nullcontext() as viewer:
+        if viewer is not None:
+            print(f"watch at {viewer.url}", flush=True)
+        finish(training, training.train(viewer), args)
+
+
+def finish(training: Run, complete: bool, args) -> None:
+    """Says what was written, and tests it. Raises KeyboardInterrupt for a training that was interrupted."""
+    if not complete:
+        print(f"stopped after {training.progress.step} steps and saved; go on with --resume")
+        raise KeyboardInterrupt
+    print(f"{Path(args.out) / SCENE}: {len(training.trainer.gaussians.means)} Gaussians")
+    if args.export:
+        print(f"{training.export_mip()}: for viewers that do not integrate over pixels")
+    if not args.no_evaluate:
+        metrics = training.evaluate()
+        print(f"{metrics['steps']} steps in {metrics['seconds']:.1f} s, {metrics['ms_per_step']:.2f} ms each")
+        for scale, values in metrics.get("test", {}).items():
+            name = scale if scale == "mean" else f"1/{scale}"
+            print(f"test, {name}: PSNR {values['psnr']:.2f} dB, SSIM {values['ssim']:.4f}")

@@ -1,0 +1,183 @@
+"""Optimisers for Gaussians, beside those of torch: a step on all parameters at once, in one kernel on CUDA."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from . import ops  # noqa: F401  (registers the fake kernels)
+from .footprints import check_device
+
+_adam = torch.ops.analytic_rasterizer.adam_.default
+
+
+class FusedAdam(torch.optim.Optimizer):
+    """torch.optim.Adam, with one kernel for the parameters of all groups on CUDA, and little work of the host.
+
+    Of a parameter p with gradient g, after t steps on it:
+
+        m = b1 m + (1 - b1) g;  v = b2 v + (1 - b2) g^2
+        p = p - lr / (1 - b1^t) * m / (sqrt(v) / sqrt(1 - b2^t) + eps)
+
+    [Kingma and Ba, "Adam", 2015, with eps outside of the root as in torch.] Parameters without a gradient are left as
+    they are. There is no weight decay, no AMSGrad and no `maximize`. The state of a parameter is that of torch, `step`,
+    `exp_avg` and `exp_avg_sq`, but that `step` is an int. What `state_dict` of torch.optim.Adam gives can be loaded,
+    and the other way round after `step` has been made a tensor. A CUDA graph of a step repeats the `step` and the
+    learning rates that it was captured with.
+
+    Args:
+        params: Tensors or groups, as every optimiser of torch takes them: float32 or float64, contiguous, all of one
+            dtype and on one device, the CPU or a CUDA device. Tensors may be empty.
+        lr: Learning rate of groups that name none; each group may have its own.
+        betas: Decay rates of the first and the second moment, each in [0, 1), the same in all groups.
+        eps: Added to the root of the second moment, at least 0, the same in all groups.
+
+    Raises:
+        ValueError: A number is out of its range.
+    """
+
+    def __init__(self, params, lr: float = 1e-3, betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-8):
+        if not (math.isfinite(lr) and lr >= 0):
+            raise ValueError(f"lr must be finite and not negative, got {lr}")
+        if len(betas) != 2 or not all(0 <= beta < 1 for beta in betas):
+            raise ValueError(f"betas must be two numbers in [0, 1), got {betas}")
+        if not (math.isfinite(eps) and eps >= 0):
+            raise ValueError(f"eps must be finite and not negative, got {eps}")
+        super().__init__(params, {"lr": lr, "betas": betas, "eps": eps})
+
+    @torch.no_grad()
+    def step(self, closure=None, *, rows: Tensor | None = None):
+        """Takes one step. Nothing waits for the device.
+
+        Args:
+            closure: Computes the loss and its gradients anew, as for every optimiser of torch.
+            rows: (P,) bool or uint8, on the device of the parameters. Only rows of the parameters, along their first
+                dimension of size P, whose number is not 0 are updated; the others keep their values and moments. The
+                bias is corrected for the steps of the optimiser, not for those of a row.
+
+        Returns:
+            What `closure` returned, or None.
+
+        Raises:
+            TypeError: A parameter is neither float32 nor float64, or not of the dtype of the others; a gradient is of
+                another dtype; rows is not a tensor of bool or uint8.
+            ValueError: Parameters are not on one device, not contiguous, share memory, or do not have P rows; a
+                gradient is sparse; groups differ in betas or eps; a learning rate is not finite or negative.
+            RuntimeError: CUDA tensors, and an extension without CUDA.
+        """
+        loss = None
+        if closure is not None:
+            with torch.enable_grad():
+                loss = closure()
+        _update(self, rows, betas=_common(self, "betas"))
+        return loss
+
+    def zero_grad(self, set_to_none: bool = True) -> None:
+        """Forgets the gradients, or sets them to zero."""
+        if not set_to_none:
+            super().zero_grad(set_to_none=False)
+            return
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = None
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Takes over what `state_dict` gave, of this class or of torch.optim.Adam.
+
+        Raises:
+            ValueError: Groups or parameters do not fit, or a group has weight decay, AMSGrad or `maximize`.
+        """
+        for group in state_dict["param_groups"]:
+            for name in ("weight_decay", "amsgrad", "maximize"):
+                if group.get(name):
+                    raise ValueError(f"FusedAdam has no {name}, but the state has {name} = {group[name]}")
+        super().load_state_dict(state_dict)
+
+
+class SparseGaussianAdam(torch.optim.Adam):
+    """Adam that moves the Gaussians in the picture only, with decays 0.9 and 0.999 and without correction of bias.
+
+    Args:
+        params: Groups of one tensor each, whose leading dimension is that of the Gaussians. What `FusedAdam` asks of
+            parameters is asked here too.
+        lr: Learning rate of groups that name none.
+        eps: Added to the root of the second moment, the same in all groups.
+    """
+
+    def __init__(self, params, lr: float, eps: float):
+        super().__init__(params=params, lr=lr, eps=eps)
+
+    @torch.no_grad()
+    def step(self, visibility: Tensor, N: int) -> None:
+        """Moves the rows of visible Gaussians; all others keep their values and their moments.
+
+        Args:
+            visibility: (N,) bool.
+            N: Number of Gaussians.
+
+        Raises:
+            TypeError, ValueError, RuntimeError: As from `FusedAdam.step`; visibility has another shape, a group has
+                several tensors, or a tensor is not made of N rows.
+        """
+        if visibility.shape != (N,):
+            raise ValueError(f"visibility must have shape ({N},), got {tuple(visibility.shape)}")
+        for group in self.param_groups:
+            if len(group["params"]) != 1:
+                raise ValueError(f"a group must have one tensor, got {len(group['params'])}")
+            (parameter,) = group["params"]
+            if parameter.grad is not None and len(parameter) != N:
+                raise ValueError(f"parameters must have {N} rows, got shape {tuple(parameter.shape)}")
+        _update(self, visibility.bool(), betas=(0.9, 0.999), bias_correction=False)
+
+
+def _common(optimizer: torch.optim.Optimizer, name: str) -> Any:
+    """The option that all groups have.
+
+    Raises:
+        ValueError: They differ.
+    """
+    first, *others = (group[name] for group in optimizer.param_groups)
+    for other in others:
+        if other != first:
+            raise ValueError(f"{name} must be the same in all groups, got {first} and {other}")
+    return first
+
+
+def _update(
+    optimizer: torch.optim.Optimizer, rows: Tensor | None, betas: tuple[float, float], bias_correction: bool = True
+) -> None:
+    """A step on all parameters that have a gradient."""
+    eps = _common(optimizer, "eps")
+    if rows is not None and not isinstance(rows, Tensor):
+        raise TypeError(f"rows must be a tensor, got {type(rows).__name__}")
+    # Made anew in every step, which takes a few microseconds: density control may replace parameters and state.
+    parameters, gradients, means, squares, rates, steps, states = [], [], [], [], [], [], []
+    for group in optimizer.param_groups:
+        rate = group["lr"]
+        for parameter in group["params"]:
+            gradient = parameter.grad
+            if gradient is None:
+                continue
+            if gradient.layout is not torch.strided:
+                raise ValueError(f"gradients must be dense, got layout {gradient.layout}")
+            state = optimizer.state[parameter]
+            if not state:
+                state["step"] = 0
+                state["exp_avg"] = torch.zeros_like(parameter)
+                state["exp_avg_sq"] = torch.zeros_like(parameter)
+            parameters.append(parameter)
+            gradients.append(gradient)
+            means.append(state["exp_avg"])
+            squares.append(state["exp_avg_sq"])
+            rates.append(rate)
+            steps.append(int(state["step"]) + 1)  # a tensor in states of torch.optim.Adam
+            states.append(state)
+    if not parameters:
+        return
+    check_device(parameters[0].device)
+    _adam(parameters, gradients, means, squares, rates, steps, *betas, eps, rows, bias_correction)
+    for state, step in zip(states, steps):
+        state["step"] = step

@@ -1,0 +1,36 @@
+"""Training scenes from photographs, and measuring how good they are.
+
+    options = TrainingOptions(footprint="box:samples=4", scales=(1, 2, 4, 8), iterations=7000)
+    run = Run("lego", "out", options, device="cuda")
+    run.train()
+    print(run.evaluate()["test"]["mean"])
+
+Needs the libraries of `pip install analytic_rasterizer[train]`; they are imported on first use.
+"""
+
+from .captures import Capture, Photograph, extent_of, load_capture, load_points
+from .evaluation import evaluate, load_lpips, save_pictures
+from .model import Gaussians
+from .options import PRESETS, TrainingOptions
+from .pictures import Pictures, load_pictures
+from .run import Run
+from .trainer import Trainer, starting_gaussians
+
+__all__ = [
+    "PRESETS",
+    "Capture",
+    "Gaussians",
+    "Photograph",
+    "Pictures",
+    "Run",
+    "Trainer",
+    "TrainingOptions",
+    "evaluate",
+    "extent_of",
+    "load_capture",
+    "load_lpips",
+    "load_pictures",
+    "load_points",
+    "save_pictures",
+    "starting_gaussians",
+]

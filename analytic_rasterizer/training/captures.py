@@ -1,0 +1,211 @@
+"""Captures: photographs with cameras, and where they come from.
+
+Read are NeRF-synthetic scenes (transforms_train.json), the multi-scale Blender set (metadata.json), COLMAP
+reconstructions (sparse/0, sparse or colmap/sparse/0; binary or text) and nerfstudio captures (transforms.json).
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .. import io
+from . import colmap
+
+BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+TEST_PERIOD = 8
+RECONSTRUCTIONS = ("sparse/0", "sparse", "colmap/sparse/0")
+
+
+class Photograph(NamedTuple):
+    """A camera, and the files of its picture by scale: 1 is always there, and makes the scales that are not."""
+
+    view: io.View
+    files: dict[int, Path]
+
+
+class Capture(NamedTuple):
+    """What a folder holds."""
+
+    train: list[Photograph]
+    test: list[Photograph]
+    background: tuple[float, float, float]  # by convention, behind pictures with alpha
+    points: tuple[Tensor, Tensor] | None  # positions and colours in [0, 1], (P, 3) float32 each, on the CPU
+
+
+def load_capture(folder, images: str = "images", test_every: int = TEST_PERIOD) -> Capture:
+    """Reads the cameras of a folder, and looks whether all of its pictures are there.
+
+    Args:
+        folder: With one of the layouts of this module.
+        images: Folder in it of the photographs of a COLMAP reconstruction.
+        test_every: Where the capture does not say what is for the test: one in so many pictures, the first by name
+            among them; 0 for none.
+
+    Raises:
+        io.SceneError: No such layout; missing pictures; no pictures to train with; all cameras at one place.
+        OSError: A file that cannot be read.
+        ValueError: test_every is negative or 1.
+    """
+    if test_every < 0 or test_every == 1:
+        raise ValueError(f"test_every must be 0 or at least 2, got {test_every}")
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise io.SceneError(f"{folder}: no such folder")
+    sparse = next((folder / name for name in RECONSTRUCTIONS if colmap.is_reconstruction(folder / name)), None)
+    if (folder / "metadata.json").exists():
+        train, test = (multi_scale_blender(folder, split) for split in ("train", "test"))
+        capture = Capture(train, test, WHITE, None)
+    elif (folder / "transforms_train.json").exists():
+        test_file = folder / "transforms_test.json"
+        test = transforms(test_file) if test_file.exists() else []
+        capture = Capture(transforms(folder / "transforms_train.json"), test, WHITE, initial_points(folder))
+    elif sparse is not None:
+        named = [Photograph(view, {1: folder / images / name}) for name, view in colmap.load_views(sparse)]
+        capture = Capture(*_split(named, test_every), BLACK, colmap.load_points(sparse))
+    elif (folder / "transforms.json").exists():
+        named = sorted(transforms(folder / "transforms.json"), key=lambda item: str(item.files[1]))
+        capture = Capture(*_split(named, test_every), BLACK, initial_points(folder))
+    else:
+        raise io.SceneError(
+            f"{folder}: expected transforms_train.json, metadata.json, transforms.json, or COLMAP's cameras, images "
+            "and points3D (.bin or .txt) in sparse/0"
+        )
+    check_capture(folder, capture)
+    return capture
+
+
+def check_capture(folder: Path, capture: Capture) -> None:
+    """Raises io.SceneError for pictures that are missing, and where there is too little to train with."""
+    files = [path for item in (*capture.train, *capture.test) for path in item.files.values()]
+    missing = [path for path in files if not path.is_file()]
+    if missing:
+        raise io.SceneError(f"{folder}: {len(missing)} of {len(files)} pictures are missing, the first is {missing[0]}")
+    if len(capture.train) < 2:
+        raise io.SceneError(f"{folder}: training needs at least 2 pictures, got {len(capture.train)}")
+    if not extent_of([item.view for item in capture.train]) > 0:
+        raise io.SceneError(
+            f"{folder}: training needs cameras at different places, got all {len(capture.train)} at one"
+        )
+
+
+def extent_of(views: list[io.View]) -> float:
+    """The radius around the cameras that 3DGS scales the learning rate of the means by, world units."""
+    centers = torch.stack([torch.linalg.inv(view.w2c)[:3, 3] for view in views])
+    return 1.1 * (centers - centers.mean(0)).norm(dim=1).max().item()
+
+
+def transforms(path: Path) -> list[Photograph]:
+    """The views of a transforms file and where their pictures are, in the order of the file."""
+    views = io.load_views(path)
+    found = []
+    for view, frame in zip(views, json.loads(path.read_text(encoding="utf-8"))["frames"]):
+        file = path.parent / str(frame.get("file_path", ""))
+        # NeRF-synthetic leaves out the suffix, and its names may hold points.
+        found.append(Photograph(view, {1: file if file.is_file() else file.with_name(file.name + ".png")}))
+    return found
+
+
+def multi_scale_blender(folder: Path, split: str) -> list[Photograph]:
+    """A split of the multi-scale Blender set: pictures of one camera at several sizes follow each other.
+
+    metadata.json has for each split lists with an entry per picture: file_path, cam2world (OpenGL axes), width,
+    height, and focal in px.
+    """
+    path = folder / "metadata.json"
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))[split]
+        rows = list(zip(*(data[key] for key in ("file_path", "cam2world", "width", "height", "focal"))))
+    except (ValueError, KeyError, TypeError) as error:
+        raise io.SceneError(f"{path}: not the metadata of the multi-scale Blender set ({error!r})") from None
+    found: list[Photograph] = []
+    for name, pose, width, height, focal in rows:
+        c2w = torch.tensor(pose, dtype=torch.float64)
+        if c2w.shape != (4, 4) or not c2w.isfinite().all():
+            raise io.SceneError(f"{path}: cam2world of {name} must hold 4 x 4 finite numbers")
+        c2w[:3, 1:3] *= -1
+        w2c = torch.linalg.inv(c2w)
+        largest = found[-1].view if found else None
+        if largest is not None and largest.width > width and torch.equal(largest.w2c, w2c):
+            found[-1].files[round(largest.width / width)] = folder / name
+        else:
+            view = io.View(Path(name).stem, round(width), round(height), float(focal), float(focal), w2c)
+            found.append(Photograph(view, {1: folder / name}))
+    return found
+
+
+def initial_points(folder: Path) -> tuple[Tensor, Tensor] | None:
+    """The points that 3DGS's and nerfstudio's folders may hold beside the cameras."""
+    for name in ("points3d.ply", "points3D.ply", "sparse_pc.ply"):
+        if (folder / name).is_file():
+            return load_points(folder / name)
+    return None
+
+
+PLY_TYPES = {
+    **dict.fromkeys(("float", "float32"), "<f4"), **dict.fromkeys(("double", "float64"), "<f8"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"), **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("ushort", "uint16"), "<u2"), **dict.fromkeys(("short", "int16"), "<i2"),
+    **dict.fromkeys(("uint", "uint32"), "<u4"), **dict.fromkeys(("int", "int32"), "<i4"),
+}  # fmt: skip
+
+
+def header_of(path: Path) -> list[str]:
+    """The lines of a .ply's header. Raises io.SceneError, naming the file."""
+    try:
+        return io.ply_header(path)
+    except io.SceneError as error:
+        raise io.SceneError(f"{path}: {error}") from None
+
+
+def is_scene(path: Path) -> bool:
+    """Whether a .ply holds Gaussians rather than points. Raises io.SceneError for what is no .ply."""
+    names = {line.split()[-1] for line in header_of(path) if line.startswith("property ")}
+    return set(io.PLY_COLUMNS) <= names
+
+
+def load_points(path: Path) -> tuple[Tensor, Tensor]:
+    """Positions (P, 3) float32, and colours (P, 3) float32 in [0, 1], grey where there are none, of a .ply of points.
+
+    Raises io.SceneError for anything but a complete binary little-endian or ASCII file with finite x, y, z.
+    """
+    path = Path(path)
+    lines = header_of(path)
+    layout = next((line.split()[1] for line in lines if line.startswith("format ")), "none")
+    elements = [i for i, line in enumerate(lines) if line.startswith("element")]
+    if not elements or not lines[elements[0]].startswith("element vertex "):
+        raise io.SceneError(f"{path}: expected the vertices as the first element of the .ply")
+    count = int(lines[elements[0]].split()[2])
+    end = elements[1] if len(elements) > 1 else len(lines)
+    properties = [line.split()[1:] for line in lines[elements[0] + 1 : end] if line.startswith("property ")]
+    known = all(len(words) == 2 and words[0] in PLY_TYPES for words in properties)
+    names = [words[-1] for words in properties]
+    if not known or not {"x", "y", "z"} <= set(names):
+        raise io.SceneError(f"{path}: expected vertices of numbers with x, y and z, got {', '.join(names)}")
+    dtype = np.dtype([(name, PLY_TYPES[kind]) for kind, name in properties])
+    body = path.read_bytes().split(b"end_header\n", 1)[-1]
+    if layout == "binary_little_endian" and len(body) >= count * dtype.itemsize:
+        rows = np.frombuffer(body, dtype, count)
+    elif layout == "ascii":
+        rows = np.array([tuple(line.split()[: len(names)]) for line in body.decode().splitlines()[:count]], dtype)
+    else:
+        raise io.SceneError(f"{path}: cut short, or neither ascii nor binary_little_endian but {layout}")
+    points = torch.from_numpy(np.stack([rows[axis].astype(np.float32) for axis in "xyz"], 1))
+    if len(rows) != count or not points.isfinite().all():
+        raise io.SceneError(f"{path}: expected {count} finite points, got {int(points.isfinite().all(1).sum())}")
+    if {"red", "green", "blue"} <= set(names):
+        colors = np.stack([rows[name].astype(np.float32) / 255 for name in ("red", "green", "blue")], 1)
+        return points, torch.from_numpy(colors)
+    return points, torch.full_like(points, 0.5)
+
+
+def _split(items: list[Photograph], test_every: int) -> tuple[list[Photograph], list[Photograph]]:
+    """Pictures to train with and to test with."""
+    if test_every == 0:
+        return items, []
+    return [item for i, item in enumerate(items) if i % test_every], items[::test_every]

@@ -1,0 +1,118 @@
+"""The Gaussians that are trained: how they start, and how they become a scene."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from .. import io
+from ..activations import activate
+from ..rasterizer import GaussianRasterizer
+from ..settings import GaussianRasterizationSettings
+
+HALF_EDGE = 1.3  # of the cube of random points; NeRF-synthetic objects fit in it
+SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic
+NEIGHBOURS = 3  # whose distances make the first scale
+
+
+class Gaussians(NamedTuple):
+    """What is trained: unconstrained float32 parameters, one row each."""
+
+    means: Tensor  # (P, 3) world units
+    log_scales: Tensor  # (P, 3) logarithms of standard deviations in world units
+    rotations: Tensor  # (P, 4) quaternions (w, x, y, z) of any length
+    logit_opacities: Tensor  # (P, 1)
+    sh_dc: Tensor  # (P, 1, 3) spherical harmonics, the constant
+    sh_rest: Tensor  # (P, K - 1, 3) and the others
+
+    def render(self, settings: GaussianRasterizationSettings, means2D: Tensor | None = None) -> tuple[Tensor, ...]:
+        """What the rasterizer returns: picture (3, H, W), radii (P,) in px with 0 for what is not seen."""
+        return self.activated().render(settings, means2D)
+
+    def activated(self) -> Activated:
+        """What the rasterizer takes. Differentiable."""
+        scales, rotations, opacities = activate(self.log_scales, self.rotations, self.logit_opacities)
+        # At degree 0 as well, where sh_rest is empty: every parameter needs a gradient, so that the optimizer has a
+        # state for it that density control can change.
+        shs = torch.cat([self.sh_dc, self.sh_rest], dim=1)
+        return Activated(self.means, scales, rotations, opacities, shs)
+
+    @torch.no_grad()
+    def to_scene(self) -> io.Scene:
+        """The scene on the same device, without gradients."""
+        means, scales, rotations, opacities, shs = (t.detach() for t in self.activated())
+        return io.Scene(means, scales, rotations, opacities, shs, round(shs.shape[1] ** 0.5) - 1)
+
+    @staticmethod
+    @torch.no_grad()
+    def from_scene(scene: io.Scene, sh_degree: int) -> Gaussians:
+        """Parameters that give this scene; harmonics are cut or filled with zeros to the degree."""
+        shs = scene.shs[:, : (sh_degree + 1) ** 2]
+        missing = (sh_degree + 1) ** 2 - shs.shape[1]
+        rest = torch.cat([shs[:, 1:], shs.new_zeros(len(shs), missing, 3)], dim=1)
+        # Scales of 0 and opacities of 0 or 1 have no finite parameter.
+        return Gaussians(
+            scene.means,
+            scene.scales.clamp_min(1e-12).log(),
+            scene.rotations,
+            scene.opacities.logit(eps=1e-6),
+            shs[:, :1].contiguous(),
+            rest,
+        )
+
+
+class Activated(NamedTuple):
+    """Gaussians as the rasterizer takes them, one row each, with a graph back to the parameters."""
+
+    means: Tensor  # (P, 3) world units
+    scales: Tensor  # (P, 3) standard deviations, world units
+    rotations: Tensor  # (P, 4) quaternions (w, x, y, z)
+    opacities: Tensor  # (P, 1) in (0, 1)
+    shs: Tensor  # (P, K, 3)
+
+    def render(self, settings: GaussianRasterizationSettings, means2D: Tensor | None = None) -> tuple[Tensor, ...]:
+        """As `Gaussians.render`."""
+        return GaussianRasterizer(settings)(
+            means3D=self.means,
+            means2D=means2D,
+            opacities=self.opacities,
+            shs=self.shs,
+            scales=self.scales,
+            rotations=self.rotations,
+        )
+
+
+def random_points(count: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Positions (count, 3) in the cube of NeRF-synthetic scenes, and grey, (count, 3) of colours in [0, 1].
+
+    Random colours, of which nothing is known, would only have to be unlearned.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    return HALF_EDGE * (2 * torch.rand(count, 3, generator=generator) - 1), torch.full((count, 3), 0.5)
+
+
+def gaussians_at(points: Tensor, colors: Tensor, sh_degree: int, opacity: float = 0.1, scale: float = 1.0) -> Gaussians:
+    """Round Gaussians at (P, 3) points on the CPU, `scale` times as large as the gaps between them.
+
+    Raises ImportError without SciPy.
+    """
+    count = len(points)
+    return Gaussians(
+        points,
+        (scale * neighbour_distance(points)).log()[:, None].repeat(1, 3),
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        torch.full((count, 1), opacity).logit(),
+        (colors[:, None] - 0.5) / SH_C0,
+        torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3),
+    )
+
+
+def neighbour_distance(points: Tensor) -> Tensor:
+    """Root mean square distance of each of the (P, 3) points to its nearest neighbours, (P,), at least 1e-7."""
+    tree = io.optional_import("scipy.spatial", "train").cKDTree(points.double().numpy())
+    neighbours = min(NEIGHBOURS, len(points) - 1)
+    distances, _ = tree.query(points.double().numpy(), k=neighbours + 1)
+    nearest = torch.from_numpy(distances).reshape(len(points), -1)[:, 1:]  # the first is the point itself
+    return nearest.square().mean(1).sqrt().nan_to_num(0).float().clamp_min(1e-7)

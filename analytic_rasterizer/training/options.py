@@ -1,0 +1,233 @@
+"""What a training is told: one dataclass, the same for the command line, for programs and for checkpoints."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, fields
+from typing import Any, NamedTuple
+
+from ..footprints import resolve_footprint
+
+DOWNSAMPLINGS = ("box", "bicubic")
+DENSITIES = ("3dgs", "absgrad", "mcmc", "none")
+BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+RANDOM_BACKGROUND = "random"
+
+
+class Preset(NamedTuple):
+    """Values of `TrainingOptions` that belong together; the other options keep their defaults."""
+
+    values: dict[str, Any]
+    finest_repeats: int = 1  # scale_repeats of the finest of several scales; the others have 1
+
+
+PRESETS = {
+    "3dgs": Preset({}),
+    "quick": Preset(
+        {
+            "iterations": 7000,
+            "density": "absgrad",
+            "gradient": 3e-4,
+            "gradient_scales": "finest",
+            "densify_until": 0.75,
+            "means_rate": 3.2e-4,
+            "color_rate": 5e-3,
+            "opacity_rate": 0.1,
+            "scale_rate": 1e-2,
+            "rotation_rate": 2e-3,
+        },
+        finest_repeats=2,
+    ),
+}
+"""By name: "3dgs", the recipe of 3DGS, which is that of the defaults, and "quick", for trainings of a few thousand
+steps. docs/training.md has the measurements."""
+
+
+def preset_values(name: str, scales: tuple[int, ...]) -> dict[str, Any]:
+    """What a preset sets among `TrainingOptions`, `scale_repeats` included where several scales are trained.
+
+    Raises:
+        ValueError: No preset of this name.
+    """
+    _check("preset", name in PRESETS, f"one of {', '.join(PRESETS)}", name)
+    preset = PRESETS[name]
+    values = dict(preset.values)
+    if preset.finest_repeats > 1 and len(scales) > 1:
+        finest = min(scales)
+        values["scale_repeats"] = tuple(preset.finest_repeats if scale == finest else 1 for scale in scales)
+    return values
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """How to train. Positions in time that are called steps are steps; shares are of the whole training, 0 to 1.
+
+    Learning rates and the density control are those of 3DGS [Kerbl et al. 2023] where nothing else is said;
+    `TrainingOptions.preset` has others, for short trainings.
+
+    Attributes:
+        footprint: One of `FOOTPRINTS`, with options: "box:samples=4".
+        scales: Reductions to train at: 1 is the full size, 2 half of it.
+        scale_repeats: How often every picture of a scale occurs in one pass over the pictures; one number per scale.
+        downsampling: How coarse pictures are made: "box", means over squares of pixels, or "bicubic", with the kernel
+            widened to the scale.
+        iterations: Steps of the optimizer.
+        seconds: Time to train, s, by the clock, instead of a number of steps; 0: go by `iterations`.
+        pictures_per_step: Pictures whose mean loss makes one step.
+        sh_degree: Highest degree of the spherical harmonics, 0 to 3.
+        sh_every: Steps between two degrees, at most; never more than a tenth of the training.
+        background: "black", "white", "random" (drawn anew for every step; needs pictures with alpha), or "" for white
+            where the pictures have alpha by convention (NeRF-synthetic), and black for photographs.
+        filter_3d: Whether Gaussians are widened by the 3D filter of Mip-Splatting.
+        seed: Of the starting points, the order of the pictures, and everything else that is drawn.
+        random_points: Gaussians at the start where the capture has no points.
+        ssim_weight: Share of 1 - SSIM in the loss, next to the mean absolute error.
+        initial_opacity: Of the first Gaussians.
+        initial_scale: Of the first Gaussians, in distances to their neighbours.
+        means_rate: Learning rate of the means at the start, per unit of the scene's extent.
+        means_rate_end: The same at the end; in between it falls exponentially.
+        means_rate_steps: Steps after which the rate of the means has reached its end, whatever the length of the
+            training (3DGS: 30,000); 0: when the training ends.
+        color_rate: Learning rate of the constant of the harmonics; the others learn at 1/20 of it.
+        opacity_rate, scale_rate, rotation_rate: Learning rates of logit opacities, log scales and quaternions.
+        rates_end: Factor that the learning rates other than that of the means fall to, exponentially; 1: constant.
+        density: "3dgs": clone and split by the gradient of the projected means; "absgrad": the same by the sum of its
+            absolute values over pixels [AbsGS]; "mcmc": relocate and add by opacity [3DGS-MCMC]; "none".
+        densify_from: Steps before the first change.
+        densify_until: Share of the training after which the number of Gaussians stays.
+        densify_every: Steps between changes.
+        gradient: Mean norm above which a Gaussian is cloned or split, by normalized device coordinates; 0: 2e-4 for
+            "3dgs", 4e-4 for "absgrad".
+        gradient_scales: Which scales the mean is over: "all", or "finest", the largest pictures alone.
+        reset_every: Steps between resets of the opacities ("3dgs" and "absgrad"); 0: never.
+        prune_opacity: Least opacity that is kept.
+        split_above: Scale above which a Gaussian is split rather than cloned, in extents of the scene.
+        prune_above: Scale above which a Gaussian is pruned after the first reset, in extents of the scene.
+        max_gaussians: Most Gaussians; 0: no limit, and 500,000 for "mcmc", which grows up to its limit.
+        grow_share: Of "mcmc": Gaussians that are added at a time, as a share of those that are there.
+        noise: Of "mcmc": strength of the noise on the means, in learning rates of the means.
+        opacity_weight: Weight of the mean opacity in the loss; -1: 0.01 for "mcmc", otherwise 0.
+        scale_weight: Weight of the mean scale in the loss, likewise.
+
+    Raises:
+        ValueError: A value outside its range, naming the option.
+    """
+
+    footprint: str = "box:samples=4"
+    scales: tuple[int, ...] = (1,)
+    scale_repeats: tuple[int, ...] = ()
+    downsampling: str = "box"
+    iterations: int = 30_000
+    seconds: float = 0.0
+    pictures_per_step: int = 1
+    sh_degree: int = 3
+    sh_every: int = 1000
+    background: str = ""
+    filter_3d: bool = False
+    seed: int = 0
+    random_points: int = 100_000
+    ssim_weight: float = 0.2
+    initial_opacity: float = 0.1
+    initial_scale: float = 1.0
+    means_rate: float = 1.6e-4
+    means_rate_end: float = 1.6e-6
+    means_rate_steps: int = 0
+    color_rate: float = 2.5e-3
+    opacity_rate: float = 0.05
+    scale_rate: float = 5e-3
+    rotation_rate: float = 1e-3
+    rates_end: float = 1.0
+    density: str = "3dgs"
+    densify_from: int = 500
+    densify_until: float = 0.5
+    densify_every: int = 100
+    gradient: float = 0.0
+    gradient_scales: str = "all"
+    reset_every: int = 3000
+    prune_opacity: float = 0.005
+    split_above: float = 0.01
+    prune_above: float = 0.1
+    max_gaussians: int = 0
+    grow_share: float = 0.05
+    noise: float = 5e5
+    opacity_weight: float = -1.0
+    scale_weight: float = -1.0
+
+    def __post_init__(self):
+        # Lists, as JSON and the command line have them, become tuples.
+        object.__setattr__(self, "scales", tuple(self.scales))
+        object.__setattr__(self, "scale_repeats", tuple(self.scale_repeats) or (1,) * len(self.scales))
+        object.__setattr__(self, "footprint", str(resolve_footprint(self.footprint)))
+        for name in ("iterations", "pictures_per_step", "sh_every", "random_points", "densify_every"):
+            _check(name, getattr(self, name) >= 1, "at least 1", getattr(self, name))
+        for name in ("densify_from", "reset_every", "max_gaussians", "means_rate_steps"):
+            _check(name, getattr(self, name) >= 0, "at least 0", getattr(self, name))
+        for name in ("scales", "scale_repeats"):
+            value = getattr(self, name)
+            _check(name, len(value) > 0 and all(v >= 1 for v in value), "whole numbers of at least 1", value)
+        _check("scales", len(set(self.scales)) == len(self.scales), "different from each other", self.scales)
+        fits = len(self.scale_repeats) == len(self.scales)
+        _check("scale_repeats", fits, f"{len(self.scales)} numbers, one per scale", self.scale_repeats)
+        _check("sh_degree", 0 <= self.sh_degree <= 3, "0 to 3", self.sh_degree)
+        known = ("", *BACKGROUNDS, RANDOM_BACKGROUND)
+        _check("background", self.background in known, f"one of {', '.join(known[1:])}", self.background)
+        expected = f"one of {', '.join(DOWNSAMPLINGS)}"
+        _check("downsampling", self.downsampling in DOWNSAMPLINGS, expected, self.downsampling)
+        _check("density", self.density in DENSITIES, f"one of {', '.join(DENSITIES)}", self.density)
+        _check("gradient_scales", self.gradient_scales in ("all", "finest"), "all or finest", self.gradient_scales)
+        for name in ("ssim_weight", "densify_until", "grow_share"):
+            _check(name, 0 <= getattr(self, name) <= 1, "0 to 1", getattr(self, name))
+        _check("initial_opacity", 0 < self.initial_opacity < 1, "above 0 and below 1", self.initial_opacity)
+        positive = ("initial_scale", "means_rate", "means_rate_end", "color_rate", "opacity_rate", "scale_rate")
+        for name in (*positive, "rotation_rate", "rates_end", "split_above", "prune_above"):
+            value = getattr(self, name)
+            _check(name, 0 < value < math.inf, "positive and finite", value)
+        for name in ("seconds", "gradient", "prune_opacity", "noise"):
+            value = getattr(self, name)
+            _check(name, 0 <= value < math.inf, "finite and not negative", value)
+        for name in ("opacity_weight", "scale_weight"):
+            value = getattr(self, name)
+            _check(name, value == -1 or 0 <= value < math.inf, "finite and not negative, or -1", value)
+
+    @property
+    def growth_gradient(self) -> float:
+        """The threshold of `gradient`, settled."""
+        return self.gradient or (4e-4 if self.density == "absgrad" else 2e-4)
+
+    @property
+    def gaussian_limit(self) -> float:
+        """The limit of `max_gaussians`, settled."""
+        return self.max_gaussians or (500_000 if self.density == "mcmc" else math.inf)
+
+    @property
+    def regularizers(self) -> tuple[float, float]:
+        """Weights of mean opacity and mean scale, settled."""
+        usual = 0.01 if self.density == "mcmc" else 0.0
+        return tuple(usual if weight == -1 else weight for weight in (self.opacity_weight, self.scale_weight))
+
+    @classmethod
+    def preset(cls, name: str, **given: Any) -> TrainingOptions:
+        """The options of a preset of `PRESETS`: what is `given` wins over the preset, which wins over the defaults.
+
+        Raises:
+            TypeError: A name in `given` that is no option.
+            ValueError: No preset of this name, or a value outside its range.
+        """
+        return cls(**(preset_values(name, given.get("scales", cls.scales)) | given))
+
+    def to_dict(self) -> dict[str, Any]:
+        """Names and values that JSON can hold."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> TrainingOptions:
+        """The options that `to_dict` gave. Raises ValueError for a name that there is not."""
+        unknown = set(values) - {field.name for field in fields(cls)}
+        if unknown:
+            raise ValueError(f"options must be among those of TrainingOptions, got {', '.join(sorted(unknown))}")
+        return cls(**values)
+
+
+def _check(name: str, fits: bool, expected: str, got: Any) -> None:
+    if not fits:
+        raise ValueError(f"{name} must be {expected}, got {got}")

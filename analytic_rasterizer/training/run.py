@@ -1,0 +1,273 @@
+"""A training from a folder of pictures to a folder of results."""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from statistics import mean
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from .. import io
+from ..filters import bake_pixel
+from .captures import Capture, is_scene, load_capture, load_points
+from .evaluation import evaluate, psnr
+from .files import (
+    CAMERAS,
+    CHECKPOINT,
+    LOG,
+    METRICS,
+    MIP_SCENE,
+    OPTIONS,
+    SCENE,
+    read_checkpoint,
+    write_cameras,
+    write_checkpoint,
+    write_json,
+    write_log,
+    write_safely,
+    write_scene,
+)
+from .model import Gaussians
+from .options import TrainingOptions
+from .pictures import load_pictures
+from .schedule import Clock
+from .trainer import Trainer, background_of, starting_gaussians
+
+if TYPE_CHECKING:
+    from ..viewer import LiveViewer
+
+LOOK_PERIOD = 100  # steps between looks at the loss and the clock, each of which waits for the device
+FIRST_LOOK = 10  # steps, for the pace of a training by seconds
+
+
+class Run:
+    """A training with its files.
+
+    Args:
+        scene: Folder of a capture, see `load_capture`.
+        out: Folder for the results, made if it is missing.
+        options: None: the defaults, or with `resume` those of the checkpoint.
+        device: "cpu" or "cuda".
+        images, test_every: As `load_capture`.
+        points: A .ply to start from: a 3DGS scene, or points with colours. None: what the capture has.
+        save_every: Steps between checkpoints, besides the last; 0: none.
+        resume: Go on from the checkpoint in `out`.
+
+    Raises:
+        io.SceneError, OSError, ImportError, ValueError: Before anything is written.
+    """
+
+    def __init__(
+        self,
+        scene,
+        out,
+        options: TrainingOptions | None = None,
+        *,
+        device: str = "cpu",
+        images: str = "images",
+        test_every: int = 8,
+        points=None,
+        save_every: int = 5000,
+        resume: bool = False,
+    ):
+        torch.backends.cudnn.allow_tf32 = False  # the variances of SSIM are small differences
+        self.out, self.device, self.save_every = Path(out), torch.device(device), save_every
+        state = read_checkpoint(self.out / CHECKPOINT) if resume else None
+        if state is not None:
+            options = TrainingOptions.from_dict(state["options"])
+        self.options = options or TrainingOptions()
+        self.source = {"scene": str(scene), "images": images, "test_every": test_every}
+        self.capture = load_capture(scene, images, test_every)
+        background = background_of(self.options, self.capture.background)
+        pictures = load_pictures(
+            self.capture.train, self.options.scales, background, self.device, self.options.downsampling
+        )
+        if state is None:
+            start = first_gaussians(self.options, self.capture, points)
+        else:
+            start = Gaussians(**state["gaussians"])
+        self.trainer = Trainer(self.options, start, pictures, background, self.device)
+        self.clock, self.history = Clock(self.device), []
+        if state is not None:
+            if state["pictures"] != len(pictures.views):
+                raise io.SceneError(
+                    f"{scene}: the checkpoint was trained with {state['pictures']} pictures, got {len(pictures.views)}"
+                )
+            self.trainer.load_state_dict(state)
+            self.clock.total, self.history = state["seconds"], state["history"]
+        self.out.mkdir(parents=True, exist_ok=True)
+
+    @property
+    def progress(self):
+        return self.trainer.progress
+
+    def train(self, viewer: LiveViewer | None = None) -> bool:
+        """Trains to the end, or until Ctrl-C, and writes everything. Returns whether it came to the end.
+
+        Args:
+            viewer: Is shown the scene, between steps; no step waits for its frames. It is left running.
+
+        Raises:
+            FloatingPointError: The loss is not finite; files are then those of the last checkpoint.
+            OSError: Results cannot be written. A periodic checkpoint that cannot be is only reported.
+        """
+        tqdm = io.optional_import("tqdm", "train").tqdm
+        write_json(self.out / OPTIONS, self.describe())
+        write_cameras(self.out / CAMERAS, self.trainer.pictures.views)
+        trainer, progress = self.trainer, self.trainer.progress
+        if self.clock.total == 0:
+            trainer.warm_up()
+        figures = ""
+        if viewer is not None:
+            viewer.update(trainer.scene, step=progress.step)
+        self.clock.start()
+        total = self.options.iterations if self.options.seconds == 0 else None
+        with interruption() as stopped, tqdm(total=total, initial=progress.step, unit="step", disable=None) as bar:
+            while progress.share < 1 and not stopped.is_set():
+                trainer.step()
+                last = progress.share >= 1 or stopped.is_set()
+                if progress.step % LOOK_PERIOD == 0 or progress.step == FIRST_LOOK or last:
+                    bar.update(progress.step - bar.n)
+                    look = self._look()
+                    bar.set_postfix(look)
+                    figures = ", ".join(f"{name} {value}" for name, value in look.items())
+                if viewer is not None:
+                    viewer.update(trainer.scene, step=progress.step, text=figures, force=last)
+                if self.save_every and progress.step % self.save_every == 0 and not last:
+                    self._save_or_say(bar)
+        self.clock.stop()
+        self.save()
+        write_scene(self.out / SCENE, trainer.scene(), self.options.footprint)
+        return progress.share >= 1
+
+    def export_mip(self) -> Path:
+        """Writes and returns point_cloud_mip.ply: the scene for viewers that do not integrate, see `bake_pixel`.
+
+        The pixels are those of the training pictures at the finest scale. Raises OSError.
+        """
+        scene = self.trainer.scene()
+        cameras = self.trainer.pictures.settings[min(self.options.scales)]
+        scales, opacities = bake_pixel(scene.means, scene.scales, scene.rotations, scene.opacities, cameras)
+        baked = scene._replace(scales=scales, opacities=opacities)
+        write_safely(self.out / MIP_SCENE, lambda temporary: io.save_scene(temporary, baked))
+        return self.out / MIP_SCENE
+
+    def start_viewer(self, port: int = 0) -> LiveViewer:
+        """A viewer for `train`, with the training views, footprint and background. The caller stops it.
+
+        Args:
+            port: To listen on; 0 takes any free one.
+
+        Raises:
+            ImportError: viser is missing; names the extra that installs it.
+            ValueError: A port that cannot be used.
+        """
+        from ..viewer import LiveViewer
+
+        return LiveViewer(
+            port,
+            views=self.trainer.pictures.views,
+            footprint=self.options.footprint,
+            background=background_of(self.options, self.capture.background) or self.capture.background,
+            name=Path(self.source["scene"]).name,
+        )
+
+    def describe(self) -> dict[str, Any]:
+        """What options.json holds."""
+        name = torch.cuda.get_device_name(self.device) if self.device.type == "cuda" else "CPU"
+        return {"source": self.source, "device": name, "torch": torch.__version__, "options": self.options.to_dict()}
+
+    def save(self) -> None:
+        """Writes the checkpoint and the log."""
+        state = self.trainer.state_dict() | {
+            "options": self.options.to_dict(),
+            "source": self.source,
+            "pictures": len(self.trainer.pictures.views),
+            "seconds": self.clock.read(),
+            "history": self.history,
+        }
+        write_checkpoint(self.out / CHECKPOINT, state)
+        write_log(self.out / LOG, self.history)
+
+    def evaluate(self) -> dict[str, Any]:
+        """Writes and returns metrics.json: steps, seconds, Gaussians, and `evaluate` on the test views, if any."""
+        progress = self.trainer.progress
+        metrics = {
+            "steps": progress.step,
+            "seconds": self.clock.read(),
+            "ms_per_step": 1e3 * self.clock.read() / max(progress.step, 1),
+            "gaussians": len(self.trainer.gaussians.means),
+        }
+        if self.capture.test:
+            # A random background has no truth of its own to test against: the convention's has.
+            background = background_of(self.options, self.capture.background) or self.capture.background
+            pictures = load_pictures(
+                self.capture.test, self.options.scales, background, self.device, self.options.downsampling
+            )
+            metrics["test"] = evaluate(self.trainer.scene(), pictures, self.options.footprint)
+        write_json(self.out / METRICS, metrics)
+        return metrics
+
+    def _look(self) -> dict[str, str]:
+        """Reads the losses and the clock, notes them in the history, and says what the bar shows."""
+        losses = self.trainer.take_losses()
+        seconds = self.clock.read()
+        self.progress.measure(seconds)
+        entry = {
+            "step": self.progress.step,
+            "seconds": round(seconds, 3),
+            "loss": mean(losses),
+            "psnr": psnr(*self.trainer.last).item(),
+            "gaussians": len(self.trainer.gaussians.means),
+        }
+        self.history.append(entry)
+        return {
+            "loss": f"{entry['loss']:.4f}",
+            "PSNR": f"{entry['psnr']:.1f}",
+            "Gaussians": f"{entry['gaussians']:,}",
+        }
+
+    def _save_or_say(self, bar) -> None:
+        """A checkpoint on the way. That the disk is full now need not end the training."""
+        self.clock.stop()
+        try:
+            self.save()
+        except OSError as error:
+            bar.write(f"warning: {error}; training goes on", file=sys.stderr)
+        self.clock.start()
+
+
+def first_gaussians(options: TrainingOptions, capture: Capture, points) -> Gaussians:
+    """From a .ply if one is given, a scene or points; otherwise from the capture's points, or at random places."""
+    if points is None:
+        return starting_gaussians(options, capture.points)
+    points = Path(points)
+    if is_scene(points):
+        return Gaussians.from_scene(io.load_scene(points), options.sh_degree)
+    return starting_gaussians(options, load_points(points))
+
+
+@contextmanager
+def interruption() -> Iterator[threading.Event]:
+    """Ctrl-C sets the event, so that the step that runs is completed; a second Ctrl-C raises KeyboardInterrupt."""
+    stopped = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stopped  # only the main thread may look at signals
+        return
+    before = signal.getsignal(signal.SIGINT)
+
+    def stop(*_) -> None:
+        stopped.set()
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    signal.signal(signal.SIGINT, stop)
+    try:
+        yield stopped
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -1,0 +1,96 @@
+"""What happens when: the share of a training that is over, the order of the pictures, and the learning rates."""
+
+from __future__ import annotations
+
+import time
+
+import torch
+
+from .options import TrainingOptions
+
+SH_SHARE = 0.1  # of the training, after which another degree is due at the latest
+
+
+class Progress:
+    """The share of the training that is over, by steps or else by seconds.
+
+    By seconds, the share grows in steps at the last measured pace; `measure` corrects it.
+    """
+
+    def __init__(self, steps: int | None, seconds: float | None):
+        self.steps, self.seconds = steps, seconds
+        self.step, self.share = 0, 0.0
+        self.measured = (0, 0.0)  # step and share where the clock was last read
+        self.pace = 0.0  # share per step, by the clock
+
+    def advance(self) -> None:
+        self.step += 1
+        self.share = self.step / self.steps if self.steps else self.share + self.pace
+
+    def measure(self, elapsed: float) -> None:
+        """Corrects the share by the seconds of training so far."""
+        if self.seconds and self.step > self.measured[0]:
+            step, share = self.measured
+            self.share = elapsed / self.seconds
+            self.pace = (self.share - share) / (self.step - step)
+            self.measured = (self.step, self.share)
+
+    def state_dict(self) -> dict:
+        return {"step": self.step, "share": self.share, "measured": self.measured, "pace": self.pace}
+
+    def load_state_dict(self, state: dict) -> None:
+        self.step, self.share, self.pace = state["step"], state["share"], state["pace"]
+        self.measured = tuple(state["measured"])
+
+
+class Clock:
+    """Wall time of training in seconds, work on the device included. Runs from `start`."""
+
+    def __init__(self, device: torch.device, total: float = 0.0):
+        self.device, self.total, self.since = device, total, None
+
+    def start(self) -> None:
+        self.since = self._now()
+
+    def stop(self) -> None:
+        self.total, self.since = self.read(), None
+
+    def read(self) -> float:
+        """Seconds so far. Waits for the device."""
+        return self.total + (0.0 if self.since is None else self._now() - self.since)
+
+    def _now(self) -> float:
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+        return time.perf_counter()
+
+
+class PictureOrder:
+    """View and scale of the n-th picture of a training: all pairs in random order, again and again.
+
+    A pass is drawn from the seed and its number, so that a training can go on from any place.
+    """
+
+    def __init__(self, views: int, options: TrainingOptions):
+        self.seed = options.seed
+        repeats = zip(options.scales, options.scale_repeats)
+        self.pairs = [(view, scale) for scale, times in repeats for _ in range(times) for view in range(views)]
+        self.drawn = (-1, [])  # number of the pass, and its order
+
+    def __call__(self, n: int) -> tuple[int, int]:
+        number, place = divmod(n, len(self.pairs))
+        if self.drawn[0] != number:
+            generator = torch.Generator().manual_seed((self.seed << 24) + number)
+            self.drawn = number, torch.randperm(len(self.pairs), generator=generator).tolist()
+        return self.pairs[self.drawn[1][place]]
+
+
+def sh_degree_at(step: int, share: float, options: TrainingOptions) -> int:
+    """Degree of the harmonics in use after so many steps."""
+    return min(options.sh_degree, max(step // options.sh_every, int(share / SH_SHARE)))
+
+
+def means_rate_at(step: int, share: float, options: TrainingOptions) -> float:
+    """Learning rate of the means, per unit of the scene's extent."""
+    over = min(step / options.means_rate_steps, 1) if options.means_rate_steps else share
+    return options.means_rate * (options.means_rate_end / options.means_rate) ** over

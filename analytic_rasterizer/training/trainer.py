@@ -1,0 +1,220 @@
+"""One training: the Gaussians, their optimizer, and what a step does."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .. import io
+from ..effects import Effects
+from ..filters import apply_3d_filter, compute_3d_filter
+from ..losses import l1_ssim
+from ..optim import FusedAdam
+from .captures import WHITE, extent_of
+from .density import make_density
+from .model import Gaussians, gaussians_at, random_points
+from .options import BACKGROUNDS, RANDOM_BACKGROUND, TrainingOptions
+from .pictures import Pictures
+from .schedule import PictureOrder, Progress, means_rate_at, sh_degree_at
+
+SH_REST_SHARE = 1 / 20  # of the learning rate of the constant
+FILTER_PERIOD = 100  # steps between two 3D filters, while Gaussians move
+ADAM_EPS = 1e-15
+
+
+class Trainer:
+    """Trains Gaussians on pictures, step by step.
+
+    On CUDA nothing in a step waits for the device, but the steps that change the number of Gaussians. The same seed
+    gives the same bits; so does a training that goes on from `state_dict`, in another process as well.
+
+    Args:
+        start: Parameters, on any device; they are copied.
+        pictures: To train with; with alpha where the background is random.
+        background: Behind the pictures, 0 to 1; None: random.
+        device: To train on, that of the pictures.
+
+    Attributes:
+        gaussians: The parameters at present.
+        progress: Steps taken, and the share of the training that is over.
+        losses: Of the steps since they were last taken away, one-element tensors.
+        last: Picture and truth of the last step, for looking at.
+    """
+
+    def __init__(
+        self,
+        options: TrainingOptions,
+        start: Gaussians,
+        pictures: Pictures,
+        background: tuple[float, float, float] | None,
+        device: str | torch.device,
+    ):
+        self.options, self.pictures, self.device = options, pictures, torch.device(device)
+        self.random_background = background is None
+        self.extent = extent_of(pictures.views)
+        fields = (field.detach().to(self.device, torch.float32, copy=True).contiguous() for field in start)
+        gaussians = Gaussians(*(field.requires_grad_() for field in fields))
+        self.rates = {
+            "means": options.means_rate * self.extent,
+            "log_scales": options.scale_rate,
+            "rotations": options.rotation_rate,
+            "logit_opacities": options.opacity_rate,
+            "sh_dc": options.color_rate,
+            "sh_rest": options.color_rate * SH_REST_SHARE,
+        }
+        groups = [{"params": [getattr(gaussians, name)], "lr": self.rates[name]} for name in Gaussians._fields]
+        self.optimizer = FusedAdam(groups, eps=ADAM_EPS)
+        self.density = make_density(options, gaussians, self.optimizer, self.extent, background == WHITE)
+        self.generator = torch.Generator(self.device).manual_seed(options.seed + 1)
+        self.progress = Progress(options.iterations if options.seconds == 0 else None, options.seconds)
+        self.order = PictureOrder(len(pictures.views), options)
+        self.filter_3d: Tensor | None = None
+        self.losses: list[Tensor] = []
+        self.last: tuple[Tensor, Tensor] | None = None
+        self._resolved: tuple[int, dict] | None = None  # degree of the harmonics, and the settings of it
+        if options.filter_3d:
+            self._compute_filter()
+
+    @property
+    def gaussians(self) -> Gaussians:
+        return self.density.gaussians
+
+    def step(self) -> None:
+        """Takes one step of the optimizer."""
+        options, progress = self.options, self.progress
+        over, optimizer = progress.share, self.optimizer
+        means_rate = self.extent * means_rate_at(progress.step, over, options)
+        for group, rate in zip(optimizer.param_groups, self.rates.values()):
+            group["lr"] = rate * options.rates_end**over
+        optimizer.param_groups[0]["lr"] = means_rate
+
+        loss, seen = self._loss()
+        loss.backward()
+        for leaf, radii in seen:
+            self.density.observe(leaf, radii)
+        optimizer.step()
+        optimizer.zero_grad(set_to_none=True)
+        self.losses.append(loss.detach())
+        progress.advance()
+        changed = self.density.after_step(progress.step, progress.share)
+        if options.filter_3d and (changed or progress.step % FILTER_PERIOD == 0):
+            self._compute_filter()
+
+    def _loss(self) -> tuple[Tensor, list[tuple[Tensor | None, Tensor]]]:
+        """The loss of the next step, and of every picture what `density.observe` takes."""
+        options, first = self.options, self.progress.step * self.options.pictures_per_step
+        settings = self._settings()
+        gaussians = self.gaussians.activated()
+        losses, seen = [], []
+        for n in range(first, first + options.pictures_per_step):
+            view, scale = self.order(n)
+            chosen, background = settings[scale][view], None
+            if self.random_background:
+                background = torch.rand(3, generator=self.generator, device=self.device)
+                chosen = chosen._replace(bg=background)
+            if self.filter_3d is not None:
+                chosen = chosen._replace(effects=Effects(filter_3d=self.filter_3d))
+            leaf = self.density.leaf(scale)
+            image, radii = gaussians.render(chosen, leaf)
+            truth = self.pictures.truth(scale, view, background)
+            losses.append(l1_ssim(image, truth, options.ssim_weight))
+            seen.append((leaf, radii))
+            self.last = image.detach(), truth
+        loss = losses[0] if len(losses) == 1 else torch.stack(losses).mean()
+        opacity_weight, scale_weight = options.regularizers
+        if opacity_weight:
+            loss = loss + opacity_weight * gaussians.opacities.mean()
+        if scale_weight:
+            loss = loss + scale_weight * gaussians.scales.mean()
+        return loss, seen
+
+    def _settings(self) -> dict:
+        """Settings of all pictures, with the degree of the harmonics that is due."""
+        degree = sh_degree_at(self.progress.step, self.progress.share, self.options)
+        if self._resolved is None or self._resolved[0] != degree:
+            self._resolved = degree, self.pictures.resolve(footprint=self.options.footprint, sh_degree=degree)
+        return self._resolved[1]
+
+    def _compute_filter(self) -> None:
+        self.filter_3d = compute_3d_filter(self.gaussians.means.detach(), self._settings()[min(self.options.scales)])
+
+    def warm_up(self) -> None:
+        """Renders and differentiates one picture of each scale without a step, so that no step loads kernels."""
+        for scale, settings in self._settings().items():
+            image, _ = self.gaussians.render(settings[0])
+            truth = self.pictures.truth(scale, 0, settings[0].bg if self.random_background else None)
+            l1_ssim(image, truth, self.options.ssim_weight).backward()
+        self.optimizer.zero_grad(set_to_none=True)
+
+    def take_losses(self) -> list[float]:
+        """The losses of the steps since the last call. Waits for the device.
+
+        Raises:
+            FloatingPointError: One is not finite.
+        """
+        if not self.losses:
+            return []
+        values = torch.stack(self.losses).tolist()
+        self.losses = []
+        for i, value in enumerate(values):
+            if not math.isfinite(value):
+                step = self.progress.step - len(values) + i + 1
+                raise FloatingPointError(f"the loss of step {step} is {value}; lower learning rates may help")
+        return values
+
+    @torch.no_grad()
+    def scene(self) -> io.Scene:
+        """The Gaussians as a scene, with the 3D filter applied where there is one."""
+        scene = self.gaussians.to_scene()
+        if self.filter_3d is None:
+            return scene
+        scales, opacities = apply_3d_filter(scene.scales, scene.opacities, self.filter_3d)
+        return scene._replace(scales=scales, opacities=opacities)
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that decides how the training goes on. Tensors are those of the training, not copies."""
+        return {
+            "gaussians": {name: field.detach() for name, field in self.gaussians._asdict().items()},
+            "optimizer": self.optimizer.state_dict(),
+            "density": self.density.state_dict(),
+            "progress": self.progress.state_dict(),
+            "generator": self.generator.get_state(),
+            "filter_3d": self.filter_3d,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state_dict` gave."""
+        fields = (state["gaussians"][name].to(self.device, copy=True) for name in Gaussians._fields)
+        gaussians = Gaussians(*(field.requires_grad_() for field in fields))
+        for group, field in zip(self.optimizer.param_groups, gaussians):
+            group["params"] = [field]
+        self.optimizer.state.clear()
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.density.gaussians = gaussians
+        self.density.load_state_dict(state["density"])
+        self.progress.load_state_dict(state["progress"])
+        self.generator.set_state(state["generator"].cpu())
+        self.filter_3d = None if state["filter_3d"] is None else state["filter_3d"].to(self.device)
+        self.losses, self.last = [], None
+
+
+def starting_gaussians(options: TrainingOptions, points: tuple[Tensor, Tensor] | None) -> Gaussians:
+    """Gaussians at points (positions and colours (P, 3)), or at random places where there are none. On the CPU.
+
+    Raises:
+        io.SceneError: Fewer than two points.
+    """
+    means, colors = random_points(options.random_points, options.seed) if points is None else points
+    if len(means) < 2:
+        raise io.SceneError(f"training needs at least 2 points to start from, got {len(means)}")
+    return gaussians_at(means, colors, options.sh_degree, options.initial_opacity, options.initial_scale)
+
+
+def background_of(options: TrainingOptions, convention: tuple[float, float, float]) -> tuple | None:
+    """The colour of the options, or that of the capture's convention; None for random ones."""
+    if options.background == RANDOM_BACKGROUND:
+        return None
+    return BACKGROUNDS.get(options.background, convention)

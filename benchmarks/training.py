@@ -1,0 +1,194 @@
+"""Trains one capture with several variants of the options, from several seeds, and compares what they reach.
+
+    python benchmarks/training.py lego --iterations 7000 --scales 1,2,4,8 --seeds 0 1 2 --json results.json
+    python benchmarks/training.py lego --variants plain absgrad --footprint moment:samples=4 --seconds 12
+    python benchmarks/training.py lego --more variants.json
+
+VARIANTS below names them; `--more` adds others from a JSON file, {name: {option: value}}, with the options of
+`analytic_rasterizer.training.TrainingOptions`. Options that are given on the command line are common to all variants.
+All variants of a seed see the same pictures in the same order, unless they change what an order is made of.
+
+A row of the table is a variant: PSNR [dB] of the test pictures per scale and their mean, ± the standard deviation over
+seeds of that mean; SSIM; Gaussians in the end; seconds of training alone, without reading pictures and testing, and the
+median time of a step, from looks at the clock every 100 steps. The JSON file holds every run with its options and its
+history, and is rewritten after each of them. Variants follow each other within a seed, so that a machine that slows
+down slows all of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import sys
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import torch
+from common import has_cuda
+from tqdm import tqdm
+
+from analytic_rasterizer.analysis.tables import format_table
+from analytic_rasterizer.analysis.timing import describe_machine
+from analytic_rasterizer.training import Trainer, TrainingOptions, evaluate, load_capture, load_pictures
+from analytic_rasterizer.training.options import preset_values
+from analytic_rasterizer.training.schedule import Clock
+from analytic_rasterizer.training.trainer import background_of, starting_gaussians
+
+LOOK_PERIOD = 100  # steps between looks at loss and clock
+# Of a training of fewer than 30,000 steps, the first part of 3DGS's: its schedules do not shrink.
+CUT_OFF = {"means_rate_steps": 30_000, "densify_until": 1.0}
+# The preset "quick" for four scales, all of it and its density control alone; all variants take the same steps.
+QUICK = {name: value for name, value in preset_values("quick", (1, 2, 4, 8)).items() if name != "iterations"}
+QUICK_DENSITY = {name: value for name, value in QUICK.items() if not name.endswith("_rate")}
+VARIANTS: dict[str, dict[str, Any]] = {
+    "plain": {},
+    "quick": QUICK,
+    "quick, rates of 3DGS": QUICK_DENSITY,
+    "quick, means rate alone": QUICK_DENSITY | {"means_rate": QUICK["means_rate"]},
+    "quick, 3dgs 1e-4": QUICK_DENSITY | {"density": "3dgs", "gradient": 1e-4, "means_rate": QUICK["means_rate"]},
+    "3DGS, cut off": CUT_OFF,
+    "grow until 0.75": {"densify_until": 0.75},
+    "gradient 1e-4": {"gradient": 1e-4},
+    "finest gradients": {"gradient_scales": "finest"},
+    "finest, until 0.75": {"gradient_scales": "finest", "densify_until": 0.75},
+    "absgrad 8e-4": {"density": "absgrad", "gradient": 8e-4},
+    "absgrad 4e-4": {"density": "absgrad", "gradient": 4e-4},
+    "absgrad 4e-4, finest": {"density": "absgrad", "gradient": 4e-4, "gradient_scales": "finest"},
+    "absgrad 2e-4": {"density": "absgrad", "gradient": 2e-4},
+    "mcmc 100k": {"density": "mcmc", "max_gaussians": 100_000, "densify_until": 0.8},
+    "mcmc 200k": {"density": "mcmc", "max_gaussians": 200_000, "densify_until": 0.8},
+    "mcmc 400k": {"density": "mcmc", "max_gaussians": 400_000, "densify_until": 0.8},
+    "mcmc 400k, finest twice": {
+        "density": "mcmc", "max_gaussians": 400_000, "densify_until": 0.8, "means_rate": QUICK["means_rate"],
+        "scale_repeats": (2, 1, 1, 1),
+    },
+    "mcmc 200k, start as there": {
+        "density": "mcmc", "max_gaussians": 200_000, "densify_until": 0.8, "initial_opacity": 0.5,
+        "initial_scale": 0.1,
+    },
+    "opacity rate 0.025": {"opacity_rate": 0.025},
+    "rates fall to 0.1": {"rates_end": 0.1},
+    "means rate x 2": {"means_rate": 3.2e-4},
+    "no resets": {"reset_every": 0},
+    "SSIM 0.1": {"ssim_weight": 0.1},
+    "finest twice": {"scale_repeats": (2, 1, 1, 1)},
+    "finest four times": {"scale_repeats": (4, 1, 1, 1)},
+    "4 pictures a step": {"pictures_per_step": 4},
+    "together": {
+        "density": "absgrad", "gradient_scales": "finest", "densify_until": 0.75, "rates_end": 0.1,
+        "scale_repeats": (2, 1, 1, 1),
+    },
+}  # fmt: skip
+
+
+def main() -> int:
+    args = parse_arguments()
+    torch.backends.cudnn.allow_tf32 = False  # as in Run
+    variants = VARIANTS | (json.loads(args.more.read_text()) if args.more else {})
+    chosen = args.variants or list(variants)
+    unknown = [name for name in chosen if name not in variants]
+    if unknown:
+        print(f"error: variants must be among {', '.join(variants)}; got {', '.join(unknown)}", file=sys.stderr)
+        return 2
+    options = {name: TrainingOptions(**(args.common | fitting(variants[name], args.common))) for name in chosen}
+    capture = load_capture(args.scene, args.images)
+    scales = args.common["scales"]
+    background = background_of(TrainingOptions(**args.common), capture.background)
+    train, test = (load_pictures(items, scales, background, args.device) for items in (capture.train, capture.test))
+    print(f"{args.scene}, {len(train.views)} pictures, {len(test.views)} for the test, {describe_machine(args.device)}")
+    report = {"machine": describe_machine(args.device), "torch": torch.__version__, "scene": str(args.scene)}
+    report["runs"] = runs = []
+    for seed in args.seeds:
+        for name in chosen:
+            runs.append({"variant": name, "seed": seed, **train_once(options[name], seed, capture, train, test, args)})
+            if args.json:
+                args.json.write_text(json.dumps(report, indent=1) + "\n")
+    print(format_runs(runs, scales))
+    return 0
+
+
+def parse_arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    add = parser.add_argument
+    add("scene", type=Path, help="folder of a capture")
+    add("--images", default="images", help="folder in it of a reconstruction's photographs")
+    add("--variants", nargs="+", metavar="NAME", help="(default: all)")
+    add("--more", type=Path, metavar="FILE.json", help="further variants")
+    add("--seeds", type=int, nargs="+", default=[0])
+    add("--scales", default="1,2,4,8", help="(default: %(default)s)")
+    add("--footprint", default="box:samples=4")
+    add("--iterations", type=int, default=7000)
+    add("--seconds", type=float, default=0.0, help="instead of iterations")
+    add("--random-points", type=int, default=100_000)
+    add("--device", choices=("cpu", "cuda"), default="cuda" if has_cuda() else "cpu")
+    add("--json", type=Path, metavar="FILE", help="every run")
+    args = parser.parse_args()
+    args.common = {name: getattr(args, name) for name in ("footprint", "iterations", "seconds", "random_points")}
+    args.common["scales"] = tuple(int(scale) for scale in args.scales.split(","))
+    return args
+
+
+def fitting(variant: dict[str, Any], common: dict[str, Any]) -> dict[str, Any]:
+    """The variant with as many `scale_repeats` as there are scales."""
+    if "scale_repeats" not in variant:
+        return variant
+    return variant | {"scale_repeats": tuple(variant["scale_repeats"])[: len(common["scales"])]}
+
+
+def train_once(options: TrainingOptions, seed: int, capture, train, test, args) -> dict[str, Any]:
+    """One training and its test."""
+    options = TrainingOptions.from_dict(options.to_dict() | {"seed": seed})
+    background = background_of(options, capture.background)
+    trainer = Trainer(options, starting_gaussians(options, capture.points), train, background, args.device)
+    trainer.warm_up()
+    clock, history = Clock(trainer.device), []
+    clock.start()
+    with tqdm(total=options.iterations if options.seconds == 0 else None, unit="step", disable=None) as bar:
+        while trainer.progress.share < 1:
+            trainer.step()
+            if trainer.progress.step % LOOK_PERIOD == 0 or trainer.progress.step == 10 or trainer.progress.share >= 1:
+                losses, seconds, count = trainer.take_losses(), clock.read(), len(trainer.gaussians.means)
+                history.append([trainer.progress.step, seconds, statistics.mean(losses), count])
+                trainer.progress.measure(seconds)
+                bar.update(trainer.progress.step - bar.n)
+    clock.stop()
+    paces = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(history)] or [history[0][1] / history[0][0]]
+    results = evaluate(trainer.scene(), test, options.footprint)
+    for values in results.values():
+        values.pop("views", None)
+    return {
+        "options": options.to_dict(),
+        "steps": trainer.progress.step,
+        "seconds": clock.read(),
+        "ms_per_step": 1e3 * statistics.median(paces),
+        "gaussians": len(trainer.gaussians.means),
+        "test": results,
+        "history": history,
+    }
+
+
+def format_runs(runs: list[dict], scales: tuple[int, ...]) -> str:
+    rows = []
+    for name in dict.fromkeys(run["variant"] for run in runs):
+        of_variant = [run for run in runs if run["variant"] == name]
+        means = [run["test"]["mean"]["psnr"] for run in of_variant]
+        spread = f" ± {statistics.stdev(means):.2f}" if len(means) > 1 else ""
+        rows.append(
+            [
+                name,
+                *(f"{statistics.mean(run['test'][str(scale)]['psnr'] for run in of_variant):.2f}" for scale in scales),
+                f"{statistics.mean(means):.2f}{spread}",
+                f"{statistics.mean(run['test']['mean']['ssim'] for run in of_variant):.4f}",
+                round(statistics.mean(run["gaussians"] for run in of_variant)),
+                f"{statistics.mean(run['seconds'] for run in of_variant):.1f}",
+                f"{statistics.mean(run['ms_per_step'] for run in of_variant):.2f}",
+            ]
+        )
+    header = ["variant", *(f"1/{scale}" for scale in scales), "mean", "SSIM", "Gaussians", "seconds", "ms/step"]
+    return format_table(header, rows)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
