@@ -146,8 +146,8 @@ def pack_scene(
     harmonics = torch.zeros(count, -(-used // 4) * 4, dtype=torch.float16)
     harmonics[:, :used] = scene.shs.reshape(count, -1)[:, :used].clamp(-LARGEST_HALF, LARGEST_HALF)
 
-    center, radius = _extent(scene)
-    views = views or [_overview(center, radius)]
+    center, radius = extent(scene)
+    views = views or [overview(center, radius)]
     meta = {
         "name": name,
         "count": count,
@@ -157,7 +157,7 @@ def pack_scene(
         "views": [_view_entry(view) for view in views],
         "center": center.tolist(),
         "radius": radius,
-        "up": _up(views),
+        "up": mean_up(views),
     }
     return PackedScene(meta, geometry.numpy().astype("<f4").tobytes(), harmonics.numpy().astype("<f2").tobytes())
 
@@ -170,7 +170,7 @@ def _unit_quaternions(rotations: torch.Tensor) -> torch.Tensor:
     return torch.where(length > 0, wide / length.clamp_min(torch.finfo(torch.float64).tiny), identity).float()
 
 
-def _extent(scene: io.Scene) -> tuple[torch.Tensor, float]:
+def extent(scene: io.Scene) -> tuple[torch.Tensor, float]:
     """Centre and radius of most of the Gaussians that can be seen; far outliers are left out."""
     visible = scene.means[scene.opacities[:, 0] > 0.05]
     means = (visible if len(visible) else scene.means).double()
@@ -181,7 +181,7 @@ def _extent(scene: io.Scene) -> tuple[torch.Tensor, float]:
     return center, max(distance.quantile(0.8).item(), 2 * largest, 1e-3)
 
 
-def _overview(center: torch.Tensor, radius: float) -> io.View:
+def overview(center: torch.Tensor, radius: float) -> io.View:
     """A camera that looks along +z at the centre, with most of the scene in the picture."""
     width, height = DEFAULT_SIZE
     w2c = torch.eye(4, dtype=torch.float64)
@@ -197,7 +197,7 @@ def _view_entry(view: io.View) -> dict:
     return entry | {"w2c": view.w2c.flatten().tolist()}
 
 
-def _up(views: list[io.View]) -> list[float]:
+def mean_up(views: list[io.View]) -> list[float]:
     """The mean direction that is up in the pictures; that of the first where they cancel."""
     ups = torch.stack([-view.w2c[1, :3] for view in views])
     mean = ups.mean(dim=0)

@@ -11,8 +11,9 @@ import {
 export const FULL_DIFFERENCE = 0.25;
 
 export class Renderer {
-  /// Throws an Error with a sentence where the browser or the device cannot do it. `bits` per channel: 16, or 8.
-  constructor(canvas, scene, bits = 16) {
+  /// Throws an Error with a sentence where the browser or the device cannot do it. `bits` per channel that are blended,
+  /// at most: 8, 16, or 32 where the picture is settled.
+  constructor(canvas, scene, bits = 32) {
     const gl = canvas.getContext('webgl2', {
       antialias: false, alpha: false, depth: false, stencil: false, powerPreference: 'high-performance',
     });
@@ -26,7 +27,9 @@ export class Renderer {
     this.bits = halves ? bits : 8;
     const full = [gl.RGBA32F, gl.RGBA, gl.FLOAT], half = [gl.RGBA16F, gl.RGBA, gl.HALF_FLOAT];
     const bytes = [gl.RGBA8, gl.RGBA, gl.UNSIGNED_BYTE];
-    this.sampleFormat = this.bits === 8 ? bytes : half;
+    // Half floats are quick, but some devices cut them off at every blend where others round.
+    this.quickFormat = this.bits === 8 ? bytes : half;
+    this.settledFormat = this.bits === 8 ? bytes : floats && bits !== 16 ? full : half;
     this.sumFormat = this.bits === 8 ? bytes : floats ? full : half;
     // Every browser has four targets; numbers between four and eight would not divide the samples evenly.
     const targets = Math.min(gl.getParameter(gl.MAX_DRAW_BUFFERS), gl.getParameter(gl.MAX_COLOR_ATTACHMENTS));
@@ -72,23 +75,26 @@ export class Renderer {
     return target;
   }
 
-  /// Renders the picture called `name`. `span` = [first column, last column) limits what is drawn [px].
-  render(name, camera, footprint, span = [0, camera.width]) {
+  /// Renders the picture called `name`, a `settled` one as exactly as the device can. `span` = [first column, last
+  /// column) limits what is drawn [px].
+  render(name, camera, footprint, settled, span = [0, camera.width]) {
     const gl = this.gl, { width, height } = camera;
     const nodes = footprint.kind === 'box' ? boxNodes(footprint.samples) : [[0, 0]];
     this.projection.project(camera, footprint);
     gl.viewport(0, 0, width, height);
     gl.enable(gl.SCISSOR_TEST);
     gl.scissor(span[0], 0, Math.max(span[1] - span[0], 0), height);
+    const format = settled ? this.settledFormat : this.quickFormat;
     let picture;
     if (nodes.length === 1) {
-      picture = this.target(`picture ${name}`, width, height, this.sampleFormat);
+      picture = this.target(`picture ${name} ${format[2]}`, width, height, format);
       this.drawSamples(picture, camera, footprint, nodes);
     } else {
       // Every sample keeps its own transmittance, in a picture of its own; the result is their mean.
       picture = this.target(`sum ${name}`, width, height, this.sumFormat);
-      const group = Math.min(this.samplesPerPass, nodes.length);
-      const samples = this.target('samples', width, height, this.sampleFormat, group);
+      // Four pictures of floats take the memory of eight of half floats.
+      const group = Math.min(format[2] === gl.FLOAT ? 4 : this.samplesPerPass, nodes.length);
+      const samples = this.target('samples', width, height, format, group);
       for (let start = 0; start < nodes.length; start += group) {
         this.drawSamples(samples, camera, footprint, nodes.slice(start, start + group));
         samples.textures.forEach((texture, k) => this.add(picture, texture, 1 / nodes.length, start + k === 0));

@@ -10,6 +10,8 @@ const ARROWS = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], Arrow
 const ARROW_STEP = 0.06;      // radians; with Shift, parts of the distance
 const WHEEL_STEP = 0.0015;    // logarithm of the distance, per px of scrolling
 const RADIANS_PER_PX = 0.006;
+// Where the controls would cover most of the scene, they are out of the way at first.
+const SMALL_TOUCH_SCREEN = '(pointer: coarse) and (max-width: 640px), (pointer: coarse) and (max-height: 480px)';
 export const READING_TIME = 4;  // seconds that a message stays
 
 /// Shows one sentence in place of the picture.
@@ -45,6 +47,7 @@ export class Interface {
     this.connectPointers();
     this.connectKeys();
     this.connectDivider();
+    if (matchMedia(SMALL_TOUCH_SCREEN).matches) this.toggleFolded();
     this.update();
   }
 
@@ -123,8 +126,9 @@ export class Interface {
 
   connectKeys() {
     window.addEventListener('keydown', event => {
-      // Fields and the dialog keep their keys; so do the browser's shortcuts.
-      const inField = event.target instanceof Element && event.target.closest('select, input, dialog');
+      // Fields and the open dialog keep their keys; so do the browser's shortcuts. A dialog that has just been closed
+      // still has the focus until the next frame.
+      const inField = event.target instanceof Element && event.target.closest('select, input, dialog[open]');
       if (inField || event.ctrlKey || event.metaKey || event.altKey) return;
       if (this.press(event)) event.preventDefault();
     });

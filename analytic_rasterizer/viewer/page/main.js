@@ -55,7 +55,8 @@ class Viewer {
     this.rate = null;
     this.lost = false;
     this.controls = null;
-    const bits = new URLSearchParams(location.search).get('bits') === '8' ? 8 : 16;
+    const asked = new URLSearchParams(location.search).get('bits');
+    const bits = ['8', '16'].includes(asked) ? Number(asked) : 32;
     this.createRenderer = () => new Renderer(this.canvas, scene, bits);
     this.renderer = this.createRenderer();
     this.canvas.addEventListener('webglcontextlost', event => {
@@ -319,9 +320,9 @@ class Viewer {
       return coarse && wanted.kind === 'box' ? parseFootprint('box:samples=1') : wanted;
     };
     const split = compare !== null && mode === 'split', column = Math.ceil(divider * pinhole.width);
-    renderer.render('left', pinhole, chosen(footprint), split ? [0, column] : undefined);
+    renderer.render('left', pinhole, chosen(footprint), !coarse, split ? [0, column] : undefined);
     if (compare !== null) {
-      renderer.render('right', pinhole, chosen(compare), split ? [Math.max(column - 1, 0), pinhole.width] : undefined);
+      renderer.render('right', pinhole, chosen(compare), !coarse, split ? [Math.max(column - 1, 0), pinhole.width] : undefined);
     }
     renderer.present('left', compare === null ? null : 'right', divider * this.canvas.width,
       compare !== null && mode === 'difference');
@@ -376,7 +377,7 @@ class Viewer {
     this.canvas.style.width = `${pinhole.width}px`;
     this.canvas.style.height = `${pinhole.height}px`;
     this.renderer.projection.setOrder(await this.sorter.sort(pinhole.w2c, true));
-    this.renderer.render('left', pinhole, parsed);
+    this.renderer.render('left', pinhole, parsed, true);
     this.renderer.present('left', null, 0, false);
     this.renderer.finish('left');
     return pinhole;
@@ -389,7 +390,7 @@ class Viewer {
     for (let round = -1; round < rounds; ++round) {  // the first compiles shaders and is not counted
       for (const [name] of FOOTPRINTS) {
         const start = performance.now();
-        this.renderer.render('left', pinhole, parseFootprint(name));
+        this.renderer.render('left', pinhole, parseFootprint(name), false);
         this.renderer.finish('left');
         if (round >= 0) times[name].push(performance.now() - start);
       }
