@@ -5,11 +5,12 @@ A drop-in replacement for `diff_gaussian_rasterization`. See the README for how 
 
 import torch  # noqa: F401  (its libraries must be loaded before the extension's)
 
+from . import activations, losses, optim
 from ._C import TILE, instruction_set
 from .analysis.planner import SceneReport, inspect_scene, plan
 from .camera import camera_settings, moved
 from .effects import Defocus, Effects, GaussianStats, Motion, Outputs
-from .filters import apply_3d_filter, compute_3d_filter
+from .filters import apply_3d_filter, bake_pixel, compute_3d_filter
 from .footprints import (
     FOOTPRINTS,
     Footprint,
@@ -43,7 +44,9 @@ __all__ = [
     "Splats",
     "Stages",
     "TileLists",
+    "activations",
     "apply_3d_filter",
+    "bake_pixel",
     "bin",
     "blend",
     "camera_settings",
@@ -53,9 +56,11 @@ __all__ = [
     "get_default_footprint",
     "inspect_scene",
     "instruction_set",
+    "losses",
     "moved",
     "needed_sh_degree",
     "normalized",
+    "optim",
     "plan",
     "project",
     "rasterize_gaussians",

@@ -22,11 +22,15 @@ class GaussianStats(NamedTuple):
         pixels: (P,) int32, pixels in which its weight is not zero.
         max_weight: (P,) largest weight, 0 to 1, float32.
         sum_weight: (P,) sum of weights over all pixels, in steps of 2^-32.
+        pixels_in_front: (P,) int32, those of `pixels` in which more than half of the light is left behind it.
+        pixels_dominated: (P,) int32, pixels that show most of it, as `Outputs.dominant_index` has it.
     """
 
     pixels: torch.Tensor
     max_weight: torch.Tensor
     sum_weight: torch.Tensor
+    pixels_in_front: torch.Tensor
+    pixels_dominated: torch.Tensor
 
 
 class Outputs(NamedTuple):

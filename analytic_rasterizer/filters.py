@@ -1,5 +1,7 @@
 """The 3D smoothing filter of Mip-Splatting: no Gaussian finer than the pictures it was trained on could show.
 
+`bake_pixel` widens Gaussians likewise, by the pixel itself, for viewers that do not integrate over it.
+
 Source: Yu et al., Mip-Splatting: Alias-free 3D Gaussian Splatting, CVPR 2024, Eq. 6-9.
 """
 
@@ -13,8 +15,10 @@ import torch
 
 from .effects import Effects
 from .outputs import depths
+from .rotations import rotation_matrices
 
 VARIANCE = 0.2  # of the filter, in squares of the finest sampling interval
+PIXEL_VARIANCE = 1 / 12  # of the square pixel along an axis, in squares of its width
 MARGIN = 0.15  # of the image around it in which a Gaussian still counts as seen
 
 
@@ -96,3 +100,70 @@ def apply_3d_filter(
     filtered = torch.where(width > 0, torch.hypot(scales, torch.where(width > 0, width, 1)), scales)
     share = torch.where(width > 0, scales / torch.where(width > 0, filtered, 1), 1).prod(1)
     return filtered, opacities * share.reshape(opacities.shape)
+
+
+@torch.no_grad()
+def bake_pixel(
+    means3D: torch.Tensor,
+    scales: torch.Tensor,
+    rotations: torch.Tensor,
+    opacities: torch.Tensor,
+    cameras: Sequence[Any],
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Scales and opacities of Gaussians that contain the integration over a pixel, for viewers that sample.
+
+    The covariance of a Gaussian gains, along every axis, the variance of a pixel of the camera that samples it most
+    finely: `PIXEL_VARIANCE` squares of the sampling interval of `compute_3d_filter`. A projection then has the variance
+    that integrating over such a pixel gives it. Its mass is kept by a lower opacity: by the factor between the areas
+    sqrt(det) of the projections along the line of sight before and after, which is averaged over the cameras that see
+    the Gaussian. (The opacity of `apply_3d_filter` keeps the mass in space instead, which lowers it too far: the
+    third axis, along the line of sight, does not count in a picture, and for flat Gaussians it has the smallest factor
+    of all.) A Gaussian that no camera sees stays as it is.
+
+    This is no substitute for integration. At other distances a pixel has another size than the one that is baked: from
+    further away pictures alias, less than without it, and from nearby they are blurred.
+
+    Args:
+        means3D: (P, 3) centres, world units.
+        scales: (P, 3) standard deviations, world units.
+        rotations: (P, 4) quaternions (w, x, y, z).
+        opacities: (P, 1) or (P,).
+        cameras: As in `compute_3d_filter`.
+
+    Returns:
+        (scales, opacities) of the same shapes.
+
+    Raises:
+        ValueError: No cameras, or the shapes do not fit.
+    """
+    width = compute_3d_filter(means3D, cameras, PIXEL_VARIANCE)
+    widened, _ = apply_3d_filter(scales, opacities, width)  # checks the shapes
+    if rotations.shape != (len(scales), 4):
+        raise ValueError(f"rotations must have shape ({len(scales)}, 4), got {tuple(rotations.shape)}")
+    axes = rotation_matrices(rotations)  # their columns
+    total, count = torch.zeros_like(width), torch.zeros_like(width)
+    for camera in cameras:
+        seen = sampling_interval(means3D, camera).isfinite()
+        if isinstance(camera.effects, Effects) and camera.effects.orthographic:
+            sight = camera.viewmatrix[:3, 2].to(means3D).expand_as(means3D)
+        else:
+            sight = torch.nn.functional.normalize(means3D - camera.campos.to(means3D).reshape(1, 3), dim=1)
+        sight = torch.einsum("pik,pi->pk", axes, sight)  # in the frames of the Gaussians
+        total += torch.where(seen, projected_area(scales, sight) / projected_area(widened, sight), 0)
+        count += seen
+    known = count > 0
+    share = torch.where(known, total / count.clamp_min(1), 1)
+    return torch.where(known[:, None], widened, scales), opacities * share.reshape(opacities.shape)
+
+
+def projected_area(scales: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
+    """sqrt(det) of the covariance of a Gaussian that is projected in parallel along a direction, (P,).
+
+    It is det(S) |S^-1 d| for covariance S^2, without the division by a scale that may vanish.
+
+    Args:
+        scales: (P, 3) standard deviations.
+        direction: (P, 3) unit vectors d in the frames of the Gaussians.
+    """
+    x, y, z = scales.unbind(1)
+    return torch.linalg.vector_norm(direction * torch.stack([y * z, x * z, x * y], dim=1), dim=1)

@@ -12,6 +12,7 @@ import importlib
 import json
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -113,15 +114,20 @@ def load_scene(path) -> Scene:
     return scene
 
 
-def save_scene(path, scene: Scene) -> None:
+def save_scene(path, scene: Scene, comments: Sequence[str] = ()) -> None:
     """Writes a scene as `.ply`, `.compressed.ply` or `.spz`, by its name.
 
     The two small formats round: see their own documentation. Opacities are kept off 0 and 1 by
-    1e-6, where their logit is infinite. Raises SceneError for another suffix.
+    1e-6, where their logit is infinite. `comments` are lines for the header of a `.ply`. Raises
+    SceneError for another suffix, and for comments that cannot be written.
     """
     path = Path(path)
     if path.suffix not in (".ply", ".spz"):
         raise SceneError(f"{path}: expected a .ply or .spz name, got {path.suffix!r}")
+    if comments and path.suffix != ".ply":
+        raise SceneError(f"{path}: only a .ply holds comments")
+    if any("\n" in comment or not comment.isascii() for comment in comments):
+        raise SceneError(f"{path}: comments must be single lines of ASCII, got {list(comments)}")
     gsply = optional_import("gsply")
     cpu = scene.to("cpu")
     data = gsply.GSData.from_arrays(
@@ -134,6 +140,11 @@ def save_scene(path, scene: Scene) -> None:
         format="ply",
     )
     (gsply.write_spz if path.suffix == ".spz" else gsply.plywrite)(path, data)
+    if comments:
+        content = path.read_bytes()
+        start = content.index(b"\n", content.index(b"\n") + 1) + 1  # "ply", then "format ..."
+        added = "".join(f"comment {comment}\n" for comment in comments).encode()
+        path.write_bytes(content[:start] + added + content[start:])
 
 
 PLY_COLUMNS = (

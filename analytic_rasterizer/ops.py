@@ -30,10 +30,11 @@ def _register(name: str):
 def _lists(like: torch.Tensor, rows: int, a, keep: bool, ids=None) -> list[torch.Tensor]:
     """What `bin` makes of `rows` splats of one camera: ListTensors of csrc/torch/backend.h."""
     context = torch.library.get_ctx()
-    tiles = -(-a.image_height // _C.TILE) * -(-a.image_width // _C.TILE)
+    on_cuda = like.device.type == "cuda"
+    side = _C.tile_size(a.footprint, a.option, on_cuda)
+    tiles = -(-a.image_height // side) * -(-a.image_width // side)
     pairs = context.new_dynamic_size()
     ints, longs = {"dtype": torch.int32}, {"dtype": torch.int64}
-    on_cuda = like.device.type == "cuda"
     return [
         like.new_empty(rows, _C.SPLAT_WIDTH),
         like.new_empty(rows, **ints),
@@ -63,7 +64,8 @@ def _state(like: torch.Tensor, a) -> list[torch.Tensor]:
 
 
 def _channels(a) -> int:
-    return a.shs.shape[-1] if a.colors_precomp is None else a.colors_precomp.shape[1]
+    features = 0 if a.features is None else a.features.shape[1]
+    return features + (a.shs.shape[-1] if a.colors_precomp is None else a.colors_precomp.shape[1])
 
 
 @_register("rasterize")
@@ -73,7 +75,7 @@ def _(a):
     if a.keep:
         rows = len(like) if like.device.type == "cuda" else torch.library.get_ctx().new_dynamic_size()
         extra = a.depth + a.inverse_depth
-        made = like.new_empty(len(like), channels + extra) if extra else like.new_empty(0)
+        made = like.new_empty(len(like), channels + extra) if extra or a.features is not None else like.new_empty(0)
         saved = [*_lists(like, rows, a, True), *_state(like, a), made]
     images = [like.new_empty(size) for name in _C.IMAGES if getattr(a, name)]
     return like.new_empty(channels, *size), images, like.new_empty(len(like), dtype=torch.int32), saved
@@ -130,7 +132,7 @@ def _(a):
     camera = (a.viewmatrix.reshape(4, 4), a.projmatrix.reshape(4, 4), a.campos.reshape(3), a.lens)
     camera = camera if a.lens is not None else (None,) * 4
     gaussians = (a.means3D, a.means2D, a.opacities, a.shs, a.colors_precomp, a.scales, a.rotations, a.cov3D_precomp)
-    return _gradients(a, (*gaussians, *camera, a.bg.reshape(-1)))
+    return _gradients(a, (*gaussians, *camera, a.bg.reshape(-1), a.features))
 
 
 @_register("project_vjp")
@@ -155,6 +157,7 @@ def _(a):
         ids.new_empty(a.count),
         splats.new_empty(a.count, dtype=torch.float32),
         ids.new_empty(a.count, dtype=torch.int64),
+        *(ids.new_empty(a.count) for _ in range(2)),
     ]
 
 
@@ -166,3 +169,43 @@ def _(a):
 @_register("footprint_weight_vjp")
 def _(a):
     return [a.offset.new_empty(a.offset.shape), a.cov2d.new_empty(a.cov2d.shape)]
+
+
+def _partials(a) -> list[torch.Tensor]:
+    """What ssim_map and l1_ssim leave for their adjoints: kSsimPartials planes of csrc/core/ssim.h."""
+    return [a.image.new_empty(3, *a.image.shape)] if a.keep else []
+
+
+@_register("ssim_map")
+def _(a):
+    return a.image.new_empty(a.image.shape), _partials(a)
+
+
+@_register("l1_ssim")
+def _(a):
+    return a.image.new_empty(()), _partials(a)
+
+
+@_register("ssim_map_vjp")
+def _(a):
+    return _gradients(a, (a.image, a.target))
+
+
+@_register("l1_ssim_vjp")
+def _(a):
+    return _gradients(a, (a.image, a.target))
+
+
+@_register("activate")
+def _(a):
+    return tuple(t.new_empty(t.shape) for t in (a.log_scales, a.quats, a.logit_opacities))
+
+
+@_register("activate_vjp")
+def _(a):
+    return _gradients(a, (a.log_scales, a.quats, a.logit_opacities))
+
+
+@_register("adam_")
+def _(a):
+    return None

@@ -39,16 +39,16 @@ def summaries(
         size: Height and width of the image, px.
         footprint, option: Key and number of the footprint that it was rendered with.
     """
-    median, dominant, pixels, largest, total = torch.ops.analytic_rasterizer.inspect(
+    median, dominant, pixels, largest, total, in_front, dominated = torch.ops.analytic_rasterizer.inspect(
         saved, len(z), *size, footprint, option
     )
     outputs = {}
     if effects.median_depth:
         of_pixel = z[median.clamp_min(0).long()] if len(z) else z.new_zeros(median.shape)
-        outputs["median_depth"] = torch.where(median < 0, 0, of_pixel)[None]
+        outputs["median_depth"] = of_pixel.masked_fill(median < 0, 0)[None]
     if effects.dominant_index:
         outputs["dominant_index"] = dominant[None]
     if effects.gaussian_stats:
         sums = (total.double() * _C.WEIGHT_UNIT).to(z.dtype)
-        outputs["gaussian_stats"] = GaussianStats(pixels, largest, sums)
+        outputs["gaussian_stats"] = GaussianStats(pixels, largest, sums, in_front, dominated)
     return outputs

@@ -56,12 +56,12 @@ def render(
     scales: torch.Tensor | None,
     rotations: torch.Tensor | None,
     cov3D_precomp: torch.Tensor | None,
-    bg: torch.Tensor | None = None,
+    features: torch.Tensor | None = None,
 ) -> tuple:
     """(color, radii), and `Outputs` where `outputs` or the effects of the settings ask for some.
 
-    `outputs` is an `Effects` of which only the outputs are read: what a dialect returns whatever the settings say. `bg`
-    replaces the background of the settings.
+    `outputs` is an `Effects` of which only the outputs are read: what a dialect returns whatever the settings say.
+    `features` (P, K), K up to 509, are blended on zero beside three colours, and follow them in `color` (3 + K, H, W).
     """
     gaussians = gaussian_arguments(
         settings,
@@ -74,8 +74,11 @@ def render(
         rotations=rotations,
         cov3D_precomp=cov3D_precomp,
     )
-    bg = settings.bg if bg is None else bg
+    bg = settings.bg
     check_tensors(means3D.device, bg=bg)
+    if features is not None:
+        check_tensors(means3D.device, features=features)
+        gaussians["features"] = features
     camera = camera_arguments(settings, means3D, gaussians["shs"])
     if settings.means2d_z != "zero":
         camera["means2d_z"] = settings.means2d_z
@@ -106,7 +109,8 @@ def _render_with_outputs(
     )
     outputs = dict(zip((name for name in _C.IMAGES if blended[name]), (image[None] for image in images)))
     if bg_image is not None:
-        color = color + (1 - outputs["alpha"]) * bg_image
+        behind = (1 - outputs["alpha"]) * bg_image
+        color = torch.cat([color[: len(bg_image)] + behind, color[len(bg_image) :]])  # there is nothing behind features
         if not effects.alpha:
             del outputs["alpha"]
     if not effects.has_outputs:

@@ -266,7 +266,8 @@ class Stages(NamedTuple):
         depths: (V,) camera-space z, world units.
         means2d: (V, 2) px.
         pairs: (N,) int32, the splat of each (tile, splat) pair, by tile, then front to back.
-        tile_offsets: (tiles + 1,) int64, first pair of each 16x16 tile, tiles row by row.
+        tile_offsets: (tiles + 1,) int64, first pair of each tile, tiles row by row. Tiles have 16x16 px; those of
+            `moment` on CUDA have 8x8.
         tile_samples: (tiles,) int32, samples of each tile where the footprint chooses them (`adaptive`), else empty.
         seconds: Time per stage: "project", "bin", "blend".
     """

@@ -32,12 +32,18 @@ def make_parser(description: str, footprints: list[str]) -> argparse.ArgumentPar
     add("scene", help="trained scene: .ply, compressed .ply, .spz, or .npz (see scene_files.py)")
     add("--views", required=True, help="file of views")
     add("--footprints", nargs="+", default=footprints, metavar="NAME[:k=v]")
+    add_measuring(parser)
+    return parser
+
+
+def add_measuring(parser: argparse.ArgumentParser) -> None:
+    """Adds how to measure, which `parse` reads."""
+    add = parser.add_argument
     device = "cuda" if has_cuda() else "cpu"
     add("--device", choices=("cpu", "cuda"), default=device, help="(default here: %(default)s)")
     add("--rounds", type=int, help="timed rounds after warming up (default: 5, with CUDA 30)")
     add("--threads", type=int, default=torch.get_num_threads(), help="of the CPU")
     add("--json", help="also write everything measured to this file")
-    return parser
 
 
 def parse(parser: argparse.ArgumentParser) -> argparse.Namespace:

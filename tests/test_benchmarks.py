@@ -11,6 +11,7 @@ import torch
 from conftest import ROOT
 
 from analytic_rasterizer import io
+from analytic_rasterizer.dialects import DIALECTS
 
 
 @pytest.fixture
@@ -42,6 +43,25 @@ def test_effects(device, small_scene, monkeypatch, capsys):
             assert min(result[side]["forward"], result[side]["forward_backward"]) > 0
 
 
+def test_dialects(monkeypatch, capsys):
+    """A row for every dialect, and both calls of each make the same images."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    benchmark = importlib.import_module("dialects")
+    monkeypatch.setattr(sys, "argv", ["dialects.py", "--rounds", "2"])
+    benchmark.main()
+    rows = capsys.readouterr().out.splitlines()[4:]
+    assert [row.split()[1] for row in rows] == list(DIALECTS)
+    assert all(float(cell) < math.inf for row in rows for cell in row.strip("|").split("|")[1:])
+    for name in DIALECTS:
+        calls = benchmark.calls_of(name)
+        own, library = calls["dialect"](), calls["library"]()
+        color = own[2] if name == "lightgaussian" else own[0]
+        assert torch.equal(color, library[0][:3]) and (color > 0).any()
+        if len(library) == 3 and library[2].gaussian_stats is None:  # the others are arranged in many ways
+            made = [image for image in library[2] if image is not None]
+            assert name == "luiten" or all(any(torch.equal(image, value) for value in own) for image in made)
+
+
 def test_speed(device, small_scene, monkeypatch, capsys):
     """A row for every footprint, with numbers in all of its columns."""
     speed = importlib.import_module("speed")
@@ -59,3 +79,52 @@ def test_speed(device, small_scene, monkeypatch, capsys):
         assert all(math.isfinite(value) for value in result.values())
         assert min(result["forward"], result["forward_backward"], result["pairs"]) > 0
         assert len(written["per_view"][name]) == 2
+
+
+def test_losses(device, tmp_path, monkeypatch, capsys):
+    """Every row, with a time in all of its columns."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    losses = importlib.import_module("losses")
+    options = ["--sizes", "20x10", "--gaussians", "30", "--rounds", "1", "--threads", "1", "--device", device]
+    monkeypatch.setattr(sys, "argv", ["losses.py", *options, "--json", str(tmp_path / "out.json")])
+    losses.main()
+    table = capsys.readouterr().out
+    results = json.loads((tmp_path / "out.json").read_text())["results"]
+    assert len(results) == 11
+    for name, result in results.items():
+        assert f"| {name} |" in table
+        times = [result["call"]] + ([result["device"]] if device == "cuda" else [])
+        assert all(0 < value < math.inf for value in times)
+
+
+def test_training(device, tmp_path, monkeypatch, capsys):
+    """A row for every variant, and a run for every variant and seed, on pictures of noise."""
+    image = pytest.importorskip("PIL.Image", reason="needs the train extra")
+    pytest.importorskip("scipy", reason="needs the train extra")
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    training = importlib.import_module("training")
+    pixels = torch.randint(256, (16, 16, 4), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)).numpy()
+    image.fromarray(pixels).save(tmp_path / "a.png")
+    frames = []
+    for x in (0.0, 1.0):
+        pose = torch.eye(4)
+        pose[0, 3], pose[2, 3] = x, 4.0
+        frames.append({"file_path": "a", "transform_matrix": pose.tolist()})
+    for split in ("train", "test"):
+        content = {"camera_angle_x": 0.7, "frames": frames}
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(content))
+    (tmp_path / "more.json").write_text(json.dumps({"mine": {"scale_repeats": [3, 1, 1, 1], "density": "mcmc"}}))
+    arguments = [tmp_path, "--more", tmp_path / "more.json", "--json", tmp_path / "out.json", "--device", device]
+    names = ["plain", "mine", "quick"]
+    options = ["--variants", *names, "--seeds", "0", "1", "--scales", "1,2", "--iterations", "12"]
+    monkeypatch.setattr(sys, "argv", ["training.py", *map(str, arguments), *options, "--random-points", "20"])
+    assert training.main() == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[2:]] == names and all("±" in line for line in lines[2:])
+    runs = json.loads((tmp_path / "out.json").read_text())["runs"]
+    assert [(run["variant"], run["seed"]) for run in runs] == [(v, s) for s in (0, 1) for v in names]
+    assert all(run["steps"] == 12 and math.isfinite(run["test"]["mean"]["psnr"]) for run in runs)
+    assert runs[1]["options"]["scale_repeats"] == [3, 1]
+    assert (runs[2]["options"]["scale_repeats"], runs[2]["options"]["density"]) == ([2, 1], "absgrad")
+    monkeypatch.setattr(sys, "argv", ["training.py", str(tmp_path), "--variants", "none"])
+    assert training.main() == 2

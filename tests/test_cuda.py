@@ -237,6 +237,14 @@ def test_image_sizes(variant, size):
     compare(scene, settings)
 
 
+@pytest.mark.parametrize("samples", [1, 4, 9, 16])
+def test_moving_samples_in_large_images(samples):
+    """From 4096 tiles of 8x8 pixels on, samples are shared out among lanes in another way, and backwards perhaps in
+    another one than forwards."""
+    camera = replace(CAMERA, image_height=520, image_width=528)
+    compare(scene32(), settings_for(("moment", {"samples": samples}), camera))
+
+
 @every_footprint
 def test_a_splat_that_fills_the_screen(variant):
     """One Gaussian with a pair in every tile among thousands with one or two."""

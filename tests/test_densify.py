@@ -1,13 +1,15 @@
-"""The density control of the example that trains: what grows, what goes, and that the optimizer follows."""
+"""Density control: what grows, what moves, what goes, and that the optimizer follows."""
 
 import math
 
 import pytest
 import torch
 
-import densify
-import gaussians as g
 from analytic_rasterizer import io
+from analytic_rasterizer.optim import FusedAdam
+from analytic_rasterizer.rotations import rotation_matrices
+from analytic_rasterizer.training import TrainingOptions, density
+from analytic_rasterizer.training import model as g
 
 EXTENT = 10.0
 SMALL, LARGE, HUGE = 0.05, 0.5, 2.0  # scales that are cloned, split, and pruned once opacities were reset
@@ -29,20 +31,25 @@ def make_gaussians(scales, opacities) -> g.Gaussians:
     return g.Gaussians(*(field.requires_grad_() for field in fields))
 
 
-def make_control(scales, opacities, white_background=False, **options) -> densify.DensityControl:
+def make_control(sizes, opacities, white_background=False, device="cpu", **options) -> density.FixedDensity:
     """A control whose optimizer has taken a step."""
-    gaussians = make_gaussians(scales, opacities)
-    optimizer = g.make_optimizer(gaussians, EXTENT)
+    gaussians = g.Gaussians(*(f.detach().to(device).requires_grad_() for f in make_gaussians(sizes, opacities)))
+    optimizer = FusedAdam([{"params": [field]} for field in gaussians], lr=1e-3, eps=1e-15)
     for field in gaussians:
-        field.grad = torch.randn(field.shape, generator=torch.Generator().manual_seed(4))
+        field.grad = torch.randn(field.shape, generator=torch.Generator().manual_seed(4)).to(device)
     optimizer.step()
-    return densify.DensityControl(gaussians, optimizer, EXTENT, densify.DensityOptions(**options), white_background)
+    return density.make_density(TrainingOptions(**options), gaussians, optimizer, EXTENT, white_background)
 
 
 def after_step(control, norms, step=STEP, progress=0.1, radii=None) -> None:
     """As if a step's gradients by the projected means had these norms."""
-    control.means2D.grad = torch.tensor(norms)[:, None] * torch.tensor([0.6, -0.8, 0.0])
-    control.after_step(step, progress, torch.ones(len(norms), dtype=torch.int32) if radii is None else radii)
+    leaf = control.leaf(1)
+    if leaf is not None:
+        leaf.grad = torch.zeros_like(leaf)
+        columns = slice(2, 4) if leaf.shape[1] == 4 else slice(0, 2)
+        leaf.grad[:, columns] = torch.tensor(norms)[:, None] * torch.tensor([0.6, -0.8])
+    control.observe(leaf, torch.ones(len(norms), dtype=torch.int32) if radii is None else radii)
+    control.after_step(step, progress)
 
 
 def moments(control) -> dict[str, g.Gaussians]:
@@ -62,8 +69,8 @@ def test_growth_and_pruning_of_a_few():
     assert all(len(field) == 5 and field.requires_grad and field.is_leaf for field in after)
     for old, new in zip(before, after):
         assert torch.equal(new[:3], old[[0, 1, 1]])  # the clone equals its original
-    left, right = densify.select(after, slice(3, 4)), densify.select(after, slice(4, 5))
-    parent = densify.select(before, slice(2, 3))
+    left, right = density.select(after, slice(3, 4)), density.select(after, slice(4, 5))
+    parent = density.select(before, slice(2, 3))
     for half in (left, right):
         torch.testing.assert_close(half.log_scales.exp(), parent.log_scales.exp() / 1.6)
         assert 0 < (half.means - parent.means).norm() < 5 * LARGE
@@ -78,14 +85,14 @@ def test_growth_and_pruning_of_a_few():
     parameters = [group["params"] for group in control.optimizer.param_groups]
     assert all(len(held) == 1 and held[0] is field for held, field in zip(parameters, after))
     assert len(control.optimizer.state) == len(after)
-    assert control.means2D.shape == (5, 3)
+    assert control.leaf(1).shape == (5, 3)
     assert (control.gradient_sums == 0).all() and (control.views == 0).all()
 
 
 def test_optimizer_goes_on_with_the_new_rows():
     control = make_control([SMALL, LARGE], [0.5, 0.5])
     after_step(control, [1.0, 1.0])
-    before = densify.Gaussians(*(field.detach().clone() for field in control.gaussians))
+    before = g.Gaussians(*(field.detach().clone() for field in control.gaussians))
     sum(field.sum() for field in control.gaussians).backward()
     control.optimizer.step()
     assert all((new != old).all() for old, new in zip(before, control.gaussians))
@@ -94,7 +101,7 @@ def test_optimizer_goes_on_with_the_new_rows():
 def test_gradients_are_averaged_over_the_views_that_saw_them():
     control = make_control([SMALL, SMALL], [0.5, 0.5])
     seen = torch.tensor([1, 0], dtype=torch.int32)
-    after_step(control, [3e-4, 3e-4], step=STEP - 2, radii=seen)
+    after_step(control, [3e-4, 0.0], step=STEP - 2, radii=seen)  # what is not seen has no gradient
     after_step(control, [0.5e-4, 0.0], step=STEP - 1, radii=seen)
     torch.testing.assert_close(control.gradient_sums, torch.tensor([3.5e-4, 0.0]))
     assert control.views.tolist() == [2, 0]
@@ -108,11 +115,11 @@ def test_growth_keeps_to_its_times(step, progress, count):
     control = make_control([SMALL], [0.5])
     after_step(control, [1.0], step, progress)
     assert len(control.gaussians.means) == count
-    assert (control.means2D is None) == (progress >= 0.5)
+    assert (control.leaf(1) is None) == (progress >= 0.5)
 
 
 def test_cap_lets_the_largest_gradients_grow():
-    control = make_control([SMALL] * 4, [0.5] * 4, most=6)
+    control = make_control([SMALL] * 4, [0.5] * 4, max_gaussians=6)
     before = control.gaussians.means
     after_step(control, [3e-4, 5e-4, 4e-4, 1e-4])
     assert torch.equal(control.gaussians.means, before[[0, 1, 2, 3, 1, 2]])
@@ -145,10 +152,10 @@ def test_halves_are_drawn_from_their_parent():
     count = 20_000
     turn = torch.tensor([math.cos(0.4), 0.0, 0.0, math.sin(0.4)])  # 0.8 rad about z
     scales = torch.tensor([1.0, 0.2, 0.1])
-    parent = densify.select(make_gaussians([1.0], [0.5]), slice(0, 1))
+    parent = density.select(make_gaussians([1.0], [0.5]), slice(0, 1))
     parent = parent._replace(rotations=3 * turn[None], log_scales=scales.log()[None])
     parents = g.Gaussians(*(field.detach().repeat(count, *[1] * (field.dim() - 1)) for field in parent))
-    halves = densify.split(parents, torch.Generator().manual_seed(0))
+    halves = density.split(parents, torch.Generator().manual_seed(0))
     offsets = halves.means - parent.means
     c, s = math.cos(0.8), math.sin(0.8)
     axes = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]])
@@ -162,14 +169,110 @@ def test_halves_are_drawn_from_their_parent():
     assert mass.sum() / count == pytest.approx(2 / 1.6**2 * 0.5 * 0.2, rel=1e-5)
 
 
+def test_absolute_gradients_are_read_from_their_own_columns():
+    control = make_control([SMALL, SMALL], [0.5, 0.5], density="absgrad")
+    assert control.leaf(1).shape == (2, 4)
+    after_step(control, [3e-4, 5e-4])  # one below the threshold of 4e-4
+    assert len(control.gaussians.means) == 3
+    assert torch.equal(control.gaussians.means[2], control.gaussians.means[1])
+
+
+def test_gradients_of_coarse_pictures_can_be_left_out():
+    control = make_control([SMALL], [0.5], scales=(2, 4), gradient_scales="finest")
+    assert control.leaf(4) is None and control.leaf(2).shape == (1, 3)
+    control.observe(None, torch.ones(1, dtype=torch.int32))
+    assert control.views.tolist() == [0]
+
+
+def picture_of(gaussians) -> torch.Tensor:
+    """Of means at the origin, with constant colours; exact where splats lie at the same place and depth."""
+    view = io.View("", 48, 48, 60.0, 60.0, torch.eye(4, dtype=torch.float64))
+    view.w2c[2, 3] = 3.0
+    count = len(gaussians.means)
+    constant = gaussians._replace(sh_dc=torch.ones(count, 1, 3), sh_rest=torch.zeros(count, 0, 3))
+    with torch.no_grad():
+        return constant.render(view.settings(sh_degree=0, footprint="point:dilation=0"))[0]
+
+
+def test_relocation_leaves_the_middle_of_a_splat_as_it_was():
+    """What dies goes to what lives. In the middle of a splat k of opacity o' make the o of one [MCMC, Eq. 8]."""
+    control = make_control([0.3, 0.3, 0.3], [0.6, 0.001, 0.002], density="mcmc", noise=0.0, max_gaussians=3)
+    with torch.no_grad():
+        control.gaussians.means.zero_()
+        control.gaussians.rotations.copy_(torch.tensor([[1.0, 0, 0, 0]]).expand(3, 4))
+    alone = picture_of(density.select(control.gaussians, slice(0, 1)))
+    assert control.after_step(STEP, 0.1)
+    after = control.gaussians
+    opacities = after.logit_opacities.sigmoid()[:, 0]
+    torch.testing.assert_close(opacities, torch.full((3,), 1 - (1 - 0.6) ** (1 / 3)), atol=2e-3, rtol=0)
+    assert all(torch.equal(field, field[:1].expand_as(field)) for field in after)
+    # The step that the optimizer took before moves the opacity by 1e-3 and colours are shared: 3 levels of 255.
+    assert (picture_of(after) - alone)[:, 23:25, 23:25].abs().max() < 3 / 255
+    assert all((fields.means == 0).all() for fields in moments(control).values())
+
+
+def test_addition_stops_at_the_limit():
+    control = make_control([SMALL] * 40, [0.5] * 40, density="mcmc", max_gaussians=43, noise=0.0)
+    assert control.after_step(STEP, 0.1) and len(control.gaussians.means) == 42  # 5% more
+    sum(field.sum() for field in control.gaussians).backward()
+    control.optimizer.step()
+    assert control.after_step(STEP + 100, 0.1) and len(control.gaussians.means) == 43
+    assert control.after_step(STEP + 200, 0.1) and len(control.gaussians.means) == 43
+    assert not control.after_step(STEP + 300, 0.6)  # growth is over
+
+
+def test_noise_follows_the_covariance_and_spares_the_opaque():
+    """Along every axis of a Gaussian the standard deviation of its noise is the axis's variance times a constant."""
+    count, rate = 20_000, 1e-3
+    control = make_control([1.0] * count, [0.001] * count, density="mcmc", noise=5.0)
+    control.optimizer.param_groups[0]["lr"] = rate
+    scales, turn = torch.tensor([1.0, 0.5, 0.2]), torch.tensor([0.3, -0.5, 0.7, 0.2])
+    with torch.no_grad():
+        control.gaussians.log_scales.copy_(scales.log().expand(count, 3))
+        control.gaussians.rotations.copy_(turn.expand(count, 4))
+        control.gaussians.logit_opacities[count // 2 :] = 5.0  # opaque
+    before = control.gaussians.means.detach().clone()
+    control.after_step(1, 0.0)
+    moved = (control.gaussians.means.detach() - before) @ rotation_matrices(turn)  # in the Gaussian's frame
+    transparent, opaque = moved.split(count // 2)
+    strength = 5.0 * rate * torch.sigmoid(torch.tensor(100 * (0.005 - 0.001)))
+    # 2.5% is five standard deviations of the estimate from 10,000; the step before moved opacities by 0.1%.
+    torch.testing.assert_close(transparent.std(0), strength * scales**2, rtol=0.03, atol=0)
+    assert opaque.abs().max() < 1e-6
+
+
+def test_draws_follow_the_weights(device):
+    """Frequencies of rows, against five standard deviations; rows of weight 0 are never drawn."""
+    weights = torch.tensor([0.5, 0.0, 0.25, 1.0, 0.0], device=device)
+    rows = density.draw(weights, 70_000, torch.Generator(device).manual_seed(1))
+    counts = rows.bincount(minlength=5).cpu()
+    expected = 70_000 * weights.cpu() / weights.sum().cpu()
+    assert ((counts - expected).abs() <= 5 * expected.sqrt()).all()
+    again = density.draw(weights, 70_000, torch.Generator(device).manual_seed(1))
+    assert torch.equal(rows, again)
+
+
+@pytest.mark.parametrize("kind", ["3dgs", "absgrad", "mcmc"])
+def test_all_kinds_grow_on_the_device(device, kind):
+    control = make_control([SMALL, LARGE, SMALL], [0.5, 0.5, 0.001], device=device, density=kind, max_gaussians=5)
+    for step in range(590, 601):
+        leaf = control.leaf(1)
+        if leaf is not None:
+            leaf.grad = torch.ones_like(leaf)
+        control.observe(leaf, torch.ones(len(control.gaussians.means), dtype=torch.int32, device=device))
+        control.after_step(step, 0.1)
+    assert len(control.gaussians.means) == (3 if kind == "mcmc" else 4)  # 5% of three is none
+    assert all(field.device.type == device and field.isfinite().all() for field in control.gaussians)
+
+
 @pytest.mark.parametrize("footprint", ["point:dilation=0", "analytic", "box:samples=4"])
 def test_gradient_that_grows_does_not_depend_on_the_scale(footprint):
     """A splat of many pixels: dL/d(means2D) of a mean over the picture, at full and half size."""
     view = io.View("", 64, 48, 60.0, 60.0, torch.eye(4, dtype=torch.float64))
     gradients = []
     for scale in (1, 2):
-        gaussian = g.gaussians_at(torch.tensor([[0.1, 0.2, 3.0]] * 4), torch.rand(4, 3), 0)
-        gaussian = gaussian._replace(log_scales=torch.full((4, 3), 0.3).log())
+        gaussian = make_gaussians([0.3] * 4, [0.1] * 4)._replace(means=torch.tensor([[0.1, 0.2, 3.0]] * 4))
+        gaussian = gaussian._replace(sh_rest=torch.zeros(4, 0, 3))
         means2D = torch.zeros(4, 3, requires_grad=True)
         settings = view.settings(1 / scale, sh_degree=0, footprint=footprint)
         picture, _ = gaussian._replace(sh_dc=torch.ones(4, 1, 3)).render(settings, means2D)

@@ -16,7 +16,7 @@ from scenes import Camera
 import analytic_rasterizer as ar
 import diff_gaussian_rasterization as drop_in
 from analytic_rasterizer import dialects
-from analytic_rasterizer.dialects import _base
+from analytic_rasterizer.dialects import _base, mip
 
 BASE = [
     "image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier", "viewmatrix", "projmatrix",
@@ -64,6 +64,7 @@ def nothing_chosen(monkeypatch):
     monkeypatch.delenv("ANALYTIC_RASTERIZER_FOOTPRINT", raising=False)
     ar.set_default_footprint(None)
     monkeypatch.setattr(_base, "_companion_filter", None)
+    monkeypatch.setattr(mip, "_looks_left", mip._LOOKS)
     dialects.set_dialect("gs2023")
     yield
     ar.set_default_footprint(None)
@@ -242,7 +243,7 @@ def expected_values(name, device, dtype):
         return color, radii, torch.where(outputs.median_depth > 0, outputs.median_depth, 15.0)
     if name == "monogs":
         color, radii, outputs = of(depth=True, alpha=True, gaussian_stats=True)
-        return color, radii, outputs.depth, outputs.alpha, outputs.gaussian_stats.pixels
+        return color, radii, outputs.depth, outputs.alpha, outputs.gaussian_stats.pixels_in_front
     if name == "langsplat":
         color, radii, _ = of()
         return color, torch.zeros_like(color), radii
@@ -567,12 +568,73 @@ def test_densify_receives_what_means2d_receives(device):
 # --- dialect by dialect -------------------------------------------------------------------------
 
 
-def test_mip_has_no_jitter(device):
-    offset = torch.zeros(30, 40, 2, device=device)
+def test_mip_takes_no_offset_for_zero(device):
     assert torch.equal(render("mip", device, subpixel_offset=None)[0], render("mip", device)[0])
+
+
+@pytest.mark.parametrize("x, y", [(0.3, -0.2), (-0.5, 0.0), (0.0, 1.25)])
+def test_mip_offset_of_all_pixels_against_its_definition(device, x, y):
+    """A Gaussian's weight in a pixel whose centre is moved, and the same gradient as where the mean is moved."""
+    one = {name: tensor[:1] for name, tensor in scene_of(device).items() if name != "means2D"}
+    del one["shs"]
+    one["colors_precomp"] = torch.ones(1, 3, device=device)
+    settings = settings_of("mip", device, bg=torch.zeros(3, device=device))
+    splat = ar.project(CAMERA.settings(torch.float32, device), **one)
+    rows, columns = torch.meshgrid(torch.arange(30.0), torch.arange(40.0), indexing="ij")
+    offset = torch.tensor([x, y], device=device)
+    centers = torch.stack([columns, rows], -1).to(device) + offset
+    weight = ar.footprint_weight(centers - splat.means2d[0], splat.cov2d[0], "mip", variance=0.25)
+    alpha = (one["opacities"] * weight).clamp(max=0.99)
+    moved = settings._replace(subpixel_offset=offset.expand(30, 40, 2))
+    color = moved.render(**one, means2D=None)[0][0]
+    # 40 px of a mean in float32, seen through a slope of at most 1 / px: 40 roundings of 2^-23, several times.
+    decided = (alpha - 1 / 255).abs() > 1e-4
+    assert decided.float().mean() > 0.9 and (alpha > 0.1).any()
+    expected = torch.where(alpha >= 1 / 255, alpha, 0)
+    assert (color - expected)[decided].abs().max() <= 5e-5
+    if (x, y) != (0.0, 0.0):
+        assert (color - settings.render(**one, means2D=None)[0][0]).abs().max() > 1e-2
+
+
+def test_mip_refuses_jitter(device):
+    """Also in a tensor that was zero, and after many that were."""
+    offset = torch.zeros(30, 40, 2, device=device)
+    render("mip", device, subpixel_offset=offset)
     offset[3, 4, 1] = 0.5
-    with pytest.raises(ValueError, match="subpixel_offset must be zero"):
+    with pytest.raises(ValueError, match=r"the same for all pixels, .* y from 0.0 to 0.5"):
         render("mip", device, subpixel_offset=offset, debug=True)
+    with pytest.raises(ValueError, match=r"the same for all pixels"):
+        render("mip", device, subpixel_offset=torch.full((30, 40, 2), math.nan, device=device), debug=True)
+    with pytest.raises(ValueError, match=r"subpixel_offset must have shape \(30, 40, 2\), got \(40, 30, 2\)"):
+        render("mip", device, subpixel_offset=torch.zeros(40, 30, 2, device=device))
+
+
+@pytest.mark.parametrize("inference", [False, True])
+def test_mip_looks_at_a_tensor_once(device, monkeypatch, inference):
+    """And on CUDA no longer at new ones, once 8 were zero."""
+    looks = []
+    monkeypatch.setattr(torch, "stack", lambda *args, of=torch.stack: looks.append(1) or of(*args))
+    shape = 30, 40, 2
+    with torch.inference_mode(inference):
+        offset = torch.zeros(shape, device=device)
+    for _ in range(3):
+        assert mip._offset_of(offset, shape, debug=False) == (0, 0)
+    assert len(looks) == (3 if inference else 1)
+    offset = torch.zeros(shape, device=device)
+    for step in range(3):
+        offset += 0.25
+        assert mip._offset_of(offset, shape, debug=False) == (0.25 * (step + 1),) * 2
+    looks.clear()
+    for _ in range(20):  # one was not zero: all are looked at
+        mip._offset_of(torch.zeros(shape, device=device), shape, debug=False)
+    assert len(looks) == 20
+    mip._looks_left = mip._LOOKS
+    looks.clear()
+    for _ in range(20):
+        mip._offset_of(torch.zeros(shape, device=device), shape, debug=False)
+    assert len(looks) == (mip._LOOKS if device == "cuda" else 20)
+    mip._offset_of(torch.zeros(shape, device=device), shape, debug=True)
+    assert len(looks) == (mip._LOOKS + 1 if device == "cuda" else 21)
 
 
 def test_accel_has_the_gradient_of_dc(device):
@@ -595,6 +657,7 @@ def test_sparse_adam_against_its_definition(device):
     draw = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
     parameters = [torch.nn.Parameter(draw(6, 2, 3).to(device)), torch.nn.Parameter(draw(6).to(device))]
     groups = [{"params": [parameters[0]], "lr": 0.1, "name": "a"}, {"params": [parameters[1]], "name": "b"}]
+    assert drop_in.SparseGaussianAdam is ar.optim.SparseGaussianAdam
     optimizer = drop_in.SparseGaussianAdam(groups, lr=0.02, eps=1e-15)
     states = [
         [p.detach().cpu().clone(), torch.zeros(p.shape).double(), torch.zeros(p.shape).double()] for p in parameters
@@ -705,9 +768,44 @@ def test_features_and_a_background_that_is_an_image():
     assert (made[0] - expected).abs().max() < 1e-6 and (made[2] - over_black[2]).abs().max() < 1e-6
 
 
-def test_features_of_a_wrong_shape():
-    with pytest.raises(ValueError, match=r"features must have shape \(25, K\), got \(24, 3\)"):
+def test_gaussians_whose_features_are_not_finite_are_culled(device):
+    """As with colours that are not; the others are drawn as without them."""
+    scene = scene_of(device)
+    objects = torch.rand(COUNT, 1, 16, device=device)
+    scene["sh_objs"] = objects.clone()
+    scene["sh_objs"][[3, 11], 0, 15] = math.nan
+    left = torch.ones(COUNT, dtype=torch.bool)
+    left[[3, 11]] = False
+    made = render("grouping", device, scene=scene)
+    expected = render("grouping", device, scene={k: v[left] for k, v in scene.items()})
+    assert (made[1][~left] == 0).all() and (render("grouping", device, scene=scene | {"sh_objs": objects})[1] > 0).all()
+    assert all(map(torch.equal, (made[0], made[1][left], made[2]), expected))
+
+
+def test_the_background_has_its_gradient_beside_features(device):
+    bg = torch.rand(3, device=device, requires_grad=True)
+    scene = arguments_of("grouping", device, sh_objs=torch.rand(COUNT, 1, 5, device=device))
+    color, _, image = render("grouping", device, scene=scene, bg=bg)
+    ((color * probe(color)).sum() + image.sum()).backward()
+    expected = bg.detach().clone().requires_grad_()
+    settings = CAMERA.settings(torch.float32, device, footprint="point")._replace(bg=expected)
+    color = ar.GaussianRasterizer(settings)(**scene_of(device))[0]
+    (color * probe(color)).sum().backward()
+    assert torch.allclose(bg.grad, expected.grad, rtol=1e-5)
+
+
+def test_wrong_features(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where debug writes its dump
+    with pytest.raises(ValueError, match=r"features must have shape \(P, K\) with P = 25 .*, got \(24, 3\)"):
         render("langsplat", scene=scene_of() | {"language_feature_precomp": torch.zeros(24, 3)}, include_feature=True)
+    with pytest.raises(TypeError, match="features must be a tensor, got list"):
+        render("langsplat", scene=scene_of() | {"language_feature_precomp": []}, include_feature=True)
+    with pytest.raises(ValueError, match=r"features must come with shs or colors_precomp \(P, 3\), got \(P, 4\)"):
+        given = {"shs": None, "colors_precomp": torch.zeros(COUNT, 4), "sh_objs": torch.zeros(COUNT, 1, 16)}
+        render("grouping", scene=scene_of() | given, bg=torch.zeros(4))
+    with pytest.raises(ValueError, match=r"features must be finite, got nan at \(2, 1\)"):
+        nan = torch.zeros(COUNT, 3).index_put((torch.tensor(2), torch.tensor(1)), torch.tensor(math.nan))
+        render("langsplat", scene=scene_of() | {"language_feature_precomp": nan}, include_feature=True, debug=True)
     with pytest.raises(ValueError, match="language_feature_precomp must be given"):
         render("langsplat", include_feature=True)
     with pytest.raises(ValueError, match=r"exactly one|shs"):

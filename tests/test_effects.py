@@ -334,6 +334,7 @@ def test_looks_match_the_weights(device, best, variant):
 
     stats = outputs.gaussian_stats
     assert torch.equal(stats.pixels.cpu().long(), (weights > 0).sum((1, 2)))
+    assert torch.equal(stats.pixels_dominated.cpu().long(), dominant[seen].long().bincount(minlength=count))
     assert (stats.max_weight.cpu() - weights.amax((1, 2))).abs().max() <= max(eps, 1e-7)
     total = weights.double().sum((1, 2))
     assert (stats.sum_weight.cpu().double() - total).abs().max() <= 29 * 37 * (eps + 2**-33)
@@ -348,6 +349,13 @@ def test_looks_match_the_weights(device, best, variant):
     clear = ((through - 0.5).abs() > 1e-5).all(0)  # rounding may decide the others
     assert clear.double().mean() > 0.98 and below.any(0).double().mean() > 0.2
     assert (median - expected)[clear].abs().max() < 1e-5
+
+    seen_here = weights[order] > 0
+    in_front = (seen_here & (through > 0.5)).sum((1, 2))
+    undecided = (seen_here & ((through - 0.5).abs() <= 1e-5)).sum((1, 2))
+    found = stats.pixels_in_front.cpu().long()[order]
+    assert ((found - in_front).abs() <= undecided).all()
+    assert (in_front > 0).any() and (in_front < stats.pixels.cpu()[order]).any()
 
 
 def test_looks_do_not_depend_on_threads_or_runs():

@@ -8,6 +8,8 @@ import torch
 from scenes import Camera
 
 import analytic_rasterizer as ar
+from analytic_rasterizer import filters
+from analytic_rasterizer.rotations import rotation_matrices
 
 F64 = torch.float64
 
@@ -84,3 +86,60 @@ def test_errors():
         ar.apply_3d_filter(torch.ones(2, 3), torch.ones(2, 1), torch.ones(3))
     with pytest.raises(ValueError, match=r"opacities must have shape \(P, 1\) or \(P,\), got \(3, 1\)"):
         ar.apply_3d_filter(torch.ones(2, 3), torch.ones(3, 1), torch.ones(2))
+
+
+def test_a_baked_pixel_widens_by_its_variance_and_keeps_what_the_camera_sees():
+    """Against projections made with explicit bases of the plane across the line of sight."""
+    scene, view = scenes.random_scene(3, 40), camera(8)
+    rotations = torch.nn.functional.normalize(scene["rotations"], dim=1)
+    scene["scales"][0] = torch.tensor([0.0, 0.1, 0.2])  # flat
+    scales, opacities = ar.bake_pixel(scene["means3D"], scene["scales"], rotations, scene["opacities"], [view])
+    width = ar.compute_3d_filter(scene["means3D"], [view], 1 / 12)
+    seen = filters.sampling_interval(scene["means3D"], view).isfinite()
+    assert seen.sum() > 20
+    assert torch.allclose(scales[seen] ** 2, (scene["scales"] ** 2 + width[:, None] ** 2)[seen])
+    sight = scene["means3D"] - view.campos
+    masses = []
+    for sizes, opacity in ((scene["scales"], scene["opacities"]), (scales, opacities)):
+        shaped = rotation_matrices(rotations) * sizes[:, None]
+        across = torch.linalg.svd(sight[:, None])[2][:, 1:]  # (P, 2, 3) orthonormal, across the line of sight
+        flat = across @ shaped @ shaped.mT @ across.mT
+        masses.append(opacity[:, 0] * torch.linalg.det(flat).clamp_min(0).sqrt())
+    assert torch.allclose(masses[0][seen], masses[1][seen], rtol=1e-6, atol=1e-12)
+
+
+def test_a_baked_pixel_averages_over_the_cameras_that_see_a_gaussian():
+    means, rotations = torch.tensor([[0.0, 0, 0], [1e4, 0, 0]], dtype=F64), torch.tensor([[1.0, 0, 0, 0]] * 2).to(F64)
+    scales, opacities = torch.full((2, 3), 0.05, dtype=F64), torch.tensor([0.8, 0.7], dtype=F64)
+    near, far = camera(8), camera(16)
+    baked, faded = ar.bake_pixel(means, scales, rotations, opacities, [near, far])
+    variance = (8 / 64) ** 2 / 12  # of the nearer one, for a ball the same from all sides
+    assert torch.allclose(baked[0] ** 2, torch.tensor(0.05**2 + variance, dtype=F64))
+    assert faded[0].item() == pytest.approx(0.8 * 0.05**2 / (0.05**2 + variance))
+    assert torch.equal(baked[1], scales[1]) and faded[1] == opacities[1]  # seen by none
+    # A stick, seen by one camera along its axis and by one of the same distance across it.
+    stick = torch.tensor([[0.02, 0.02, 0.5]] * 2, dtype=F64)
+    size = {"image_width": 64, "image_height": 48, "tanfovx": 0.5, "tanfovy": 0.375}
+    along, across = (Camera(**size, eye=eye).settings(F64) for eye in ((0, 0, -8), (8, 0, 0)))
+    kept = [ar.bake_pixel(means, stick, rotations, opacities, views)[1][0] for views in ([along], [across])]
+    short, long = (length**2 / (length**2 + variance) for length in (0.02, 0.5))
+    assert kept[0].item() == pytest.approx(0.8 * short)
+    assert kept[1].item() == pytest.approx(0.8 * math.sqrt(short * long))
+    both = ar.bake_pixel(means, stick, rotations, opacities, [along, across])[1][0]
+    assert both.item() == pytest.approx(sum(kept).item() / 2)
+    none = ar.bake_pixel(*(t[:0] for t in (means, scales, rotations, opacities)), [near])
+    assert [tuple(t.shape) for t in none] == [(0, 3), (0,)]
+
+
+def test_bad_shapes_are_refused_before_baking():
+    means, scales, rotations, opacities = torch.zeros(2, 3), torch.ones(2, 3), torch.ones(2, 4), torch.ones(2, 1)
+    with pytest.raises(ValueError, match="cameras must hold"):
+        ar.bake_pixel(means, scales, rotations, opacities, [])
+    for bad, message in (
+        ((means[:, :2], scales, rotations, opacities), "means3D must have shape"),
+        ((means, scales[:1], rotations, opacities), "scales must have shape"),
+        ((means, scales, rotations[:, :3], opacities), "rotations must have shape"),
+        ((means, scales, rotations, opacities[:1]), "opacities must have shape"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ar.bake_pixel(*bad, [camera(8)])

@@ -94,7 +94,7 @@ def test_long_lists(device, dtype, samples):
         rows = {name: value.detach().clone().requires_grad_() for name, value in rows.items()}
         part = dataclasses.replace(part, **rows)
         lists = ar.bin(part)
-        assert len(lists.of_camera()["tile_offsets"]) == 2
+        assert lists.of_camera()["tile_offsets"].diff().max() > 1024
         image, alpha = ar.blend(part, lists, background=torch.tensor(camera.bg, dtype=dtype, device=device))
         weights = torch.arange(1.0, 28.0, dtype=dtype, device=device).reshape(3, 3, 3).sin()
         loss = (image[0, :, :3, :3] * weights).sum()

@@ -308,7 +308,7 @@ def with_channels(
     rotations: torch.Tensor | None,
     cov3D_precomp: torch.Tensor | None,
 ) -> tuple:
-    """Renders colours and features in one blend of more channels; the features lie on zero, not on the background.
+    """Renders colours and features in one pass; the features lie on zero, not on the background.
 
     Args:
         settings: Whose outputs are made too.
@@ -321,26 +321,21 @@ def with_channels(
     Raises:
         TypeError, ValueError: As `render`, or features have another shape.
     """
-    check_tensors(None, means3D=means3D)
-    check_tensors(means3D.device, features=features, bg=settings.bg)
-    if features.dim() != 2 or len(features) != len(means3D):
-        raise ValueError(f"features must have shape ({len(means3D)}, K), got {tuple(features.shape)}")
-    geometry = scales, rotations, cov3D_precomp
-    if given(shs) and not given(colors_precomp):
-        # The channels are blended as colours that are known; those of the harmonics come from the projection.
-        splats = project(
-            settings, means3D, opacities, shs=shs, scales=scales, rotations=rotations, cov3D_precomp=cov3D_precomp
-        )
-        colors = means3D.new_zeros(len(means3D), 3)
-        shs, colors_precomp = None, colors.index_copy(0, splats.gaussian_ids.long(), splats.colors)
-    channels, bg = colors_precomp, settings.bg
-    if given(colors_precomp):  # otherwise `render` raises
-        channels = torch.cat([colors_precomp, features], 1)
-        bg = torch.nn.functional.pad(bg, (0, 0) * (bg.dim() - 1) + (0, features.shape[1]))
     image, radii, *outputs = render(
-        settings, settings.outputs, means3D, means2D, opacities, shs, channels, *geometry, bg
+        settings,
+        settings.outputs,
+        means3D,
+        means2D,
+        opacities,
+        shs,
+        colors_precomp,
+        scales,
+        rotations,
+        cov3D_precomp,
+        features,
     )
-    return image[3:], settings.values(image[:3], radii, *outputs)
+    color, of_features = image.tensor_split((3,))
+    return of_features, settings.values(color, radii, *outputs)
 
 
 def given(tensor: torch.Tensor | None) -> bool:

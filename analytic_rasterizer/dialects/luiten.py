@@ -32,8 +32,7 @@ class GaussianRasterizationSettings(Settings):
         return super().__new__(cls, *args, **kwargs)
 
     def returned(self, color, radii, outputs):
-        depth = outputs.median_depth
-        return color, radii, torch.where(depth == 0, NO_DEPTH, depth)
+        return color, radii, torch.threshold(outputs.median_depth, 0.0, NO_DEPTH)
 
 
 class _SettingsWithDebug(GaussianRasterizationSettings):

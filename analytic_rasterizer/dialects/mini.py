@@ -27,13 +27,11 @@ class GaussianRasterizationSettings(Settings):
     dialect = "mini"
     repositories = ()  # the repository imports it by the name of its own module
     filter = "point"
-    outputs = Effects(gaussian_stats=True, dominant_index=True)
+    outputs = Effects(gaussian_stats=True)
 
     def returned(self, color, radii, outputs):
-        dominant = outputs.dominant_index.flatten()  # -1 for pixels of nobody, counted first
-        counts = radii.new_zeros(len(radii) + 1).index_add(0, dominant + 1, torch.ones_like(dominant))
         stats = outputs.gaussian_stats
-        return color, radii, stats.sum_weight, stats.pixels, counts[1:]
+        return color, radii, stats.sum_weight, stats.pixels, stats.pixels_dominated
 
 
 class GaussianRasterizer(Rasterizer):

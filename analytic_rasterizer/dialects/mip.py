@@ -1,12 +1,13 @@
 """Mip-Splatting: (color, radii), and the third column of means2D's gradient is the sum over pixels of |gx| + |gy|.
 
 Repositories: autonomousvision/mip-splatting, TRELLIS. `kernel_size` is the variance of the filter, px^2.
-Deviates: `subpixel_offset` must be zero, so pixels cannot be jittered one by one.
+Deviates: `subpixel_offset` must be the same for all pixels, so pixels cannot be jittered one by one.
 """
 
 from __future__ import annotations
 
 import torch
+from torch.utils.weak import WeakTensorKeyDictionary
 
 from ..footprints import Footprint
 from ._base import FIELDS, GaussianRasterizer, _resolved, rasterize_gaussians
@@ -14,7 +15,11 @@ from ._base import GaussianRasterizationSettings as Settings
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
 
-_seen: set = set()  # sizes and devices of offsets that were looked at
+_LOOKS = 8
+"""On CUDA, where looking at an offset waits for the device, one is taken for zero after so many that were."""
+_looks_left = _LOOKS  # infinite once one was not zero
+
+_known = WeakTensorKeyDictionary()  # by tensor of offsets: its version, and the offset that all pixels have
 
 
 class GaussianRasterizationSettings(Settings):
@@ -32,20 +37,56 @@ class GaussianRasterizationSettings(Settings):
         return _resolved("mip", variance=float(self.kernel_size))
 
     def render(self, *arguments, **further) -> tuple:
-        self._check_offset()
-        return super().render(*arguments, **further)
+        """As 3DGS 2023. `subpixel_offset` moves the centres of the pixels, all of them alike.
 
-    def _check_offset(self) -> None:
-        """Raises ValueError unless subpixel_offset is zero.
-
-        Looking at it on CUDA waits for the device: there it is looked at once per size, and always with debug=True.
+        Raises:
+            ValueError: subpixel_offset has another shape, or differs from pixel to pixel. See `_offset_of` for when it
+                is looked at.
         """
-        offset = self.subpixel_offset
-        if not isinstance(offset, torch.Tensor):
-            return
-        key = offset.shape, offset.device
-        if offset.is_cuda and key in _seen and not self.debug:
-            return
-        if offset.any():
-            raise ValueError("subpixel_offset must be zero: dialect mip does not move pixels one by one")
-        _seen.add(key)
+        settings = self
+        if isinstance(self.subpixel_offset, torch.Tensor):
+            offset = _offset_of(self.subpixel_offset, (self.image_height, self.image_width, 2), self.debug)
+            if offset != (0.0, 0.0):
+                settings = self._moved(*offset)
+        return super(GaussianRasterizationSettings, settings).render(*arguments, **further)
+
+    def _moved(self, x: float, y: float) -> GaussianRasterizationSettings:
+        """These settings with a principal point that is moved by (-x, -y) px, which moves pixels by (x, y)."""
+        column = self.projmatrix.reshape(4, 4).unbind(1)
+        moved = (
+            column[0] - 2 * x / self.image_width * column[3],
+            column[1] - 2 * y / self.image_height * column[3],
+        )
+        return self._replace(projmatrix=torch.stack([*moved, *column[2:]], 1))
+
+
+def _offset_of(offset: torch.Tensor, shape: tuple[int, int, int], debug: bool) -> tuple[float, float]:
+    """The offset that all pixels have, px.
+
+    A tensor is looked at once, and again after it was changed. On CUDA looking waits for the device, and programs make
+    a new tensor of zeros in every frame: once `_LOOKS` tensors were zero and none was not, further ones there are taken
+    for zero, but for debug.
+
+    Raises:
+        ValueError: It has another shape, or not all pixels have the same.
+    """
+    global _looks_left
+    version = None if offset.is_inference() else offset._version  # a tensor of inference mode has no version
+    known = _known.get(offset)
+    if version is not None and known is not None and known[0] == version:
+        return known[1]
+    if tuple(offset.shape) != shape:
+        raise ValueError(f"subpixel_offset must have shape {shape}, got {tuple(offset.shape)}")
+    if offset.is_cuda and _looks_left <= 0 and not debug:
+        return 0.0, 0.0
+    low, high = torch.stack(offset.detach().reshape(-1, 2).aminmax(dim=0)).tolist()
+    if low != high:
+        _looks_left = float("inf")
+        raise ValueError(
+            "subpixel_offset must be the same for all pixels, for dialect mip does not move pixels one by one "
+            f"(ray_jitter), got x from {low[0]} to {high[0]} and y from {low[1]} to {high[1]}"
+        )
+    x, y = low
+    _looks_left = float("inf") if (x, y) != (0.0, 0.0) else _looks_left - 1
+    _known[offset] = version, (x, y)
+    return x, y

@@ -1,7 +1,7 @@
 """MonoGS: (color, radii, depth, opacity, n_touched), with gradients to a small motion of the camera.
 
 Repositories: muskie82/MonoGS, NoPoSplat. Depth is blended like a colour on zero, opacity is alpha.
-Deviates: `n_touched` counts the pixels in which a Gaussian is seen at all, also behind half of the light.
+`n_touched` counts the pixels in which a Gaussian is seen and more than half of the light is left behind it.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ class GaussianRasterizationSettings(Settings):
         return self._replace(viewmatrix=view, projmatrix=proj, campos=campos)
 
     def returned(self, color, radii, outputs):
-        return color, radii, outputs.depth, outputs.alpha, outputs.gaussian_stats.pixels
+        return color, radii, outputs.depth, outputs.alpha, outputs.gaussian_stats.pixels_in_front
 
 
 class GaussianRasterizer(Rasterizer):

@@ -1,19 +1,8 @@
-"""gsplat's `rasterization` over the stages of this package: its arguments, its returns, its `meta`.
-
-    from analytic_rasterizer.dialects.gsplat import rasterization  # in place of gsplat's
-
-or, in programs that stay as they are, before they import gsplat's:
-
-    from analytic_rasterizer.dialects import gsplat
-    gsplat.patch()
-
-Only `patch` needs gsplat to be installed. What is served, what differs and what is refused: docs/gsplat.md.
-"""
+"""gsplat's `rasterization`: its arguments, its returns, its `meta`."""
 
 from __future__ import annotations
 
 import dataclasses
-import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,14 +10,12 @@ from typing import Any
 
 import torch
 
-from .. import relocation
-from .._C import TILE
-from ..camera import camera_matrices
-from ..effects import MAX_SH_DEGREE, Effects
-from ..footprints import Footprint, chosen_footprint, resolve_footprint
-from ..rotations import rotation_matrices
-from ..settings import GaussianRasterizationSettings
-from ..stages import Splats, bin, blend, project
+from ..._C import TILE
+from ...camera import camera_matrices
+from ...effects import MAX_SH_DEGREE, Effects
+from ...footprints import Footprint, chosen_footprint, resolve_footprint
+from ...settings import GaussianRasterizationSettings
+from ...stages import Splats, bin, blend, project
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
@@ -180,7 +167,7 @@ def rasterization(
     if covars is None:
         covariances = {"scales": scales, "rotations": quats}
     else:
-        covariances = {"cov3D_precomp": _upper_triangle(covars)}
+        covariances = {"cov3D_precomp": upper_triangle(covars)}
     gaussians = {"means3D": means, "opacities": opacities, **covariances}
     splats = _project(sizes, settings, gaussians, shs, per_camera)
     measures = _measure(splats, settled, radius_clip)
@@ -424,7 +411,7 @@ def _project(
     return _join(parts)
 
 
-def _upper_triangle(matrices: torch.Tensor) -> torch.Tensor:
+def upper_triangle(matrices: torch.Tensor) -> torch.Tensor:
     """(..., 6) of (..., 3, 3)."""
     return torch.stack([matrices[..., row, column] for row in range(3) for column in range(row, 3)], -1)
 
@@ -577,101 +564,3 @@ def _blend(
     lists = bin(splats, keep=torch.is_grad_enabled())
     images, alphas = blend(splats, lists, features, backgrounds, means2d_abs=absolute)
     return images.permute(0, 2, 3, 1).contiguous(), alphas.permute(0, 2, 3, 1).contiguous()
-
-
-# --- gsplat's own programs ---------------------------------------------------------------------------
-
-
-def rasterization_2dgs(*args: Any, **kwargs: Any) -> None:
-    """gsplat's rasterizer of 2D Gaussian splatting, which this package does not have.
-
-    Raises:
-        NotImplementedError: Always.
-    """
-    raise NotImplementedError(
-        "rasterization_2dgs is not supported: 2DGS intersects rays with discs, see docs/gsplat.md"
-    )
-
-
-def compute_relocation(
-    opacities: torch.Tensor, scales: torch.Tensor, ratios: torch.Tensor, binoms: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """gsplat's function of that name, which its MCMCStrategy calls. See `relocation.compute_relocation`.
-
-    Args:
-        opacities: (P,) or (P, 1), 0 to 1.
-        scales: (P, 3) world units.
-        ratios: (P,) integers: how many Gaussians take the place of each.
-        binoms: (n, n) binomial coefficients, with ratios up to n.
-
-    Returns:
-        New opacities and new scales, in the shapes of the old.
-
-    Raises:
-        TypeError: Not a tensor.
-        ValueError: Wrong shape.
-    """
-    return relocation.compute_relocation(opacities, scales, ratios, binoms, len(binoms))
-
-
-def quat_scale_to_covar_preci(
-    quats: torch.Tensor,
-    scales: torch.Tensor,
-    compute_covar: bool = True,
-    compute_preci: bool = True,
-    triu: bool = False,
-) -> tuple[torch.Tensor | None, torch.Tensor | None]:
-    """gsplat's function of that name, which its MCMCStrategy calls: covariances and their inverses. Differentiable.
-
-    Args:
-        quats: (..., 4) quaternions (w, x, y, z) of any length; zero is the identity.
-        scales: (..., 3) standard deviations, world units.
-        compute_covar, compute_preci: Which of the two to make.
-        triu: Return (..., 6), the upper triangles row by row, in place of (..., 3, 3).
-
-    Returns:
-        Covariances and their inverses, None for what is not asked for.
-
-    Raises:
-        ValueError: Wrong shape.
-    """
-    if quats.shape[-1:] != (4,) or scales.shape != (*quats.shape[:-1], 3):
-        raise ValueError(
-            f"quats must have shape (..., 4) and scales (..., 3), got {tuple(quats.shape)} and {tuple(scales.shape)}"
-        )
-    rotations = rotation_matrices(quats)
-
-    def squared(factors: torch.Tensor) -> torch.Tensor:
-        square = rotations * factors[..., None, :]
-        square = square @ square.mT
-        return _upper_triangle(square) if triu else square
-
-    return squared(scales) if compute_covar else None, squared(1 / scales) if compute_preci else None
-
-
-def patch() -> None:
-    """Puts this module's functions in the place of gsplat's, whose CUDA kernels are then not needed.
-
-    To be called before other modules import names from gsplat: what they have imported already stays gsplat's. The
-    three functions are `rasterization`, `compute_relocation` and `quat_scale_to_covar_preci`, which is what gsplat's
-    DefaultStrategy and MCMCStrategy and nerfstudio's splatfacto call. Before version 1.5 `meta["radii"]` had one
-    number per splat: then it is the larger one of the two.
-
-    Raises:
-        ImportError: gsplat is not installed, or is older than its strategies. Tested with 1.4.0 and 1.5.3.
-    """
-    import gsplat
-    import gsplat.relocation
-    import gsplat.rendering
-    import gsplat.strategy.ops
-
-    version = tuple(int(number) for number in gsplat.__version__.split(".")[:2])
-    gsplat.rasterization = gsplat.rendering.rasterization = rasterization if version >= (1, 5) else _with_one_radius
-    gsplat.relocation.compute_relocation = gsplat.strategy.ops.compute_relocation = compute_relocation
-    gsplat.quat_scale_to_covar_preci = gsplat.strategy.ops.quat_scale_to_covar_preci = quat_scale_to_covar_preci
-
-
-@functools.wraps(rasterization)
-def _with_one_radius(*args: Any, **kwargs: Any) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
-    images, alphas, meta = rasterization(*args, **kwargs)
-    return images, alphas, meta | {"radii": meta["radii"].amax(-1)}

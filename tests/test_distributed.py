@@ -1,0 +1,519 @@
+"""Gaussians that are sharded over ranks make the pictures of one rank bit for bit, and its gradients to rounding.
+
+One set of processes runs every scenario, of as many ranks as it says, and leaves its results in files, for starting a
+process takes seconds. On the CPU they talk through gloo, on CUDA through NCCL, with a device for each.
+"""
+
+import dataclasses
+import datetime
+import time
+from unittest import mock
+
+import pytest
+import scenes
+import torch
+import torch.distributed as dist
+from conftest import DEADLINE, needs_cuda
+from scenes import Camera
+
+import analytic_rasterizer as ar
+from analytic_rasterizer import distributed
+
+WORLD = 3
+COUNT, HIDDEN = 60, slice(37, 46)
+CAMERAS = (
+    (Camera(image_width=27, image_height=21, bg=(0.1, 0.3, 0.2)), "box:samples=4"),
+    (Camera(image_width=40, image_height=17, eye=(1.5, 0.4, -3.2)), "analytic"),
+    (Camera(image_width=18, image_height=33, tanfovx=0.3, bg=(0.5, 0.0, 1.0)), "adaptive"),
+    (Camera(image_width=27, image_height=21, eye=(-1.1, 0.2, -4.5)), "cumulant"),
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Scenario:
+    """How a scene of `COUNT` Gaussians is spread over ranks; cameras by their place in `CAMERAS`."""
+
+    shards: tuple
+    cameras: tuple = (0, 1, 2, 3)
+    owners: tuple | None = None
+    dtype: torch.dtype = torch.float32
+    frozen: tuple = ()  # ranks whose Gaussians require no gradient; with one of them cameras require none either
+    means2d_abs: bool = True
+
+    @property
+    def ranks(self):
+        return len(self.shards)
+
+
+SCENARIOS = {
+    "one-rank": Scenario((60,)),
+    "two-ranks": Scenario((41, 19)),
+    "two-ranks-float64": Scenario((19, 41), dtype=torch.float64),
+    "two-ranks-one-without-gradient": Scenario((30, 30), frozen=(0,), means2d_abs=False),
+    "two-ranks-one-without-camera": Scenario((30, 30), cameras=(1,)),
+    "three-ranks-one-unseen": Scenario((37, 9, 14)),
+    "three-ranks-one-empty": Scenario((0, 45, 15), owners=(2, 0, 0, 2)),
+}
+
+
+def scene_of(dtype, device):
+    """Gaussians of which every one has a twin of equal depth far away in the input, and some that no camera sees."""
+    scene = scenes.random_scene(7, COUNT, degree=1, opacity=(0.2, 0.95))
+    del scene["means2D"]
+    scene["means3D"][COUNT // 2 :] = scene["means3D"][: COUNT // 2].flip(0)
+    scene["means3D"][HIDDEN, 2] = -50
+    return scenes.cast(scene, dtype, device)
+
+
+def settings_of(scenario, device):
+    cameras = [CAMERAS[k] for k in scenario.cameras]
+    return [
+        dataclasses.replace(camera, sh_degree=1).settings(scenario.dtype, device, footprint=footprint)
+        for camera, footprint in cameras
+    ]
+
+
+def with_camera_gradients(settings, requires_grad=True):
+    """The same with leaves for backgrounds, and for view matrices that may require gradients; and these."""
+    views = [s.viewmatrix.clone().requires_grad_(requires_grad) for s in settings]
+    bgs = [s.bg.clone().requires_grad_() for s in settings]
+    return [s._replace(viewmatrix=v, bg=b) for s, v, b in zip(settings, views, bgs)], views, bgs
+
+
+def weighted(image, alpha):
+    """A loss in which every pixel counts differently."""
+    generator = torch.Generator().manual_seed(5)
+    return sum((t * torch.rand(t.shape, generator=generator).to(t)).sum() for t in (image, alpha))
+
+
+def or_zero(gradient, like):
+    return torch.zeros_like(like) if gradient is None else gradient
+
+
+def make(scenario, scene, settings, group=None, requires_grad=True):
+    """What a rank makes of its shard, by name."""
+    settings, views, bgs = with_camera_gradients(settings, not scenario.frozen)
+    leaves = {name: value.detach().clone().requires_grad_(requires_grad) for name, value in scene.items()}
+    batch = distributed.rasterize(
+        settings, **leaves, owners=scenario.owners, means2d_abs=scenario.means2d_abs, group=group
+    )
+    (batch.anchor + sum(weighted(view.image, view.alpha) for view in batch.views)).backward()
+    return {
+        "cameras": [view.camera for view in batch.views],
+        "images": [view.image.detach() for view in batch.views],
+        "alphas": [view.alpha.detach() for view in batch.views],
+        "gaussian_ids": [view.splats.gaussian_ids for view in batch.views],
+        "bg": [bgs[view.camera].grad for view in batch.views],
+        "views": [or_zero(v.grad, v) for v in views],
+        "gradients": {name: or_zero(leaf.grad, leaf) for name, leaf in leaves.items()},
+        "ids": [s.gaussian_ids + batch.first_id for s in batch.shard],
+        "radii": [s.radii for s in batch.shard],
+        "means2d": [or_zero(s.means2d.grad, s.means2d) for s in batch.shard],
+        "absolute": [t.grad for t in batch.means2d_abs],
+        "count": batch.count,
+    }
+
+
+def plain(scenario, scene, settings):
+    """The same of all Gaussians by `project`, `bin` and `blend`; and the gradients of each camera alone."""
+    settings, views, bgs = with_camera_gradients(settings, not scenario.frozen)
+    leaves = scenes.leaves(scene)
+    made = {name: [] for name in ("images", "alphas", "losses", "absolute", "ids", "radii")}
+    shard = [ar.project(s, **leaves) for s in settings]
+    for s, splats in zip(settings, shard):
+        splats.means2d.retain_grad()
+        absolute = torch.zeros_like(splats.means2d, requires_grad=True)
+        lists = ar.bin(splats, background=s.bg.detach())
+        image, alpha = ar.blend(splats, lists, background=s.bg, means2d_abs=absolute)
+        row = image[0].detach(), alpha[0].detach(), weighted(image[0], alpha[0]), absolute
+        for name, value in zip(made, (*row, splats.gaussian_ids, splats.radii)):
+            made[name].append(value)
+    losses = made.pop("losses")
+    of_cameras = [torch.autograd.grad(loss, list(leaves.values()), retain_graph=True) for loss in losses]
+    for leaf in (*leaves.values(), *made["absolute"], *(s.means2d for s in shard), *views, *bgs):
+        leaf.grad = None
+    sum(losses).backward()
+    return made | {
+        "gradients": {name: leaf.grad for name, leaf in leaves.items()},
+        "magnitudes": {name: sum(g[k].abs() for g in of_cameras) for k, name in enumerate(leaves)},
+        "means2d": [s.means2d.grad for s in shard],
+        "absolute": [t.grad for t in made["absolute"]],
+        "views": [v.grad for v in views],
+        "bg": [b.grad for b in bgs],
+    }
+
+
+# --- the processes ----------------------------------------------------------------------------------
+
+
+def error_of(call):
+    try:
+        call()
+    except Exception as error:
+        return type(error).__name__, str(error)
+    return None
+
+
+def mistakes(rank, device):
+    """What a rank of two raises where rank 1, or each, is given something wrong."""
+    scenario = SCENARIOS["two-ranks"]
+    scene = {name: value[rank::2] for name, value in scene_of(scenario.dtype, device).items()}
+    settings = settings_of(scenario, device)
+
+    def call(change=None, cameras=settings, **more):
+        arguments = scene | more
+        if rank == 1:
+            arguments |= change or {}
+        cameras = arguments.pop("settings", cameras)
+        return lambda: distributed.rasterize(cameras, **arguments, group=GROUPS[2])
+
+    moving = settings[3]._replace(viewmatrix=settings[3].viewmatrix.clone().requires_grad_())
+    other_view = settings[3]._replace(viewmatrix=settings[3].viewmatrix + 1e-6)
+    found = {
+        "shape": error_of(call({"means3D": torch.zeros(5, 2, device=device)})),
+        "tensor": error_of(call({"opacities": None})),
+        "no cameras": error_of(call({"settings": []})),
+        "cameras": error_of(call({"settings": settings[:3]})),
+        "matrix": error_of(call({"settings": [*settings[:3], other_view]})),
+        "camera gradients": error_of(call({"settings": [*settings[:3], moving]})),
+        "owners": error_of(call(owners=(0, 1, 2, 0))),
+        "other owners": error_of(call({"owners": (0, 0, 0, 0)})),
+        "colors": error_of(call({"shs": None})),
+        "bg": error_of(call({"settings": [s._replace(bg=torch.zeros(4, device=device)) for s in settings]})),
+        "auto": error_of(call(cameras=[s._replace(effects="auto") for s in settings])),
+    }
+    if device == "cpu":
+        double = dataclasses.replace(scenario, dtype=torch.float64)
+        found["dtype"] = error_of(
+            call({"settings": settings_of(double, device)} | {name: value.double() for name, value in scene.items()})
+        )
+    with torch.set_grad_enabled(rank == 0):
+        found["grad"] = error_of(call())
+    return found
+
+
+GROUPS = {}  # of this process, by number of ranks
+
+
+def work(rank, world, folder, kind):
+    """What a process does: every scenario in which it takes part."""
+    torch.set_num_threads(1)
+    device = kind
+    if kind == "cuda":
+        device = f"cuda:{rank}"
+        torch.cuda.set_device(device)
+    dist.init_process_group(
+        "gloo" if kind == "cpu" else "nccl",
+        init_method=f"file://{folder}/rendezvous",
+        rank=rank,
+        world_size=world,
+        timeout=datetime.timedelta(seconds=DEADLINE / 3),
+    )
+    # The last processes, so that a rank in the group is not that in the world.
+    GROUPS.update({ranks: dist.new_group(list(range(world - ranks, world))) for ranks in range(1, world)})
+    GROUPS[world] = None
+    for name, scenario in scenarios_of(kind, world).items():
+        place = rank - (world - scenario.ranks)
+        if place < 0:
+            continue
+        first = sum(scenario.shards[:place])
+        rows = slice(first, first + scenario.shards[place])
+        scene = {name: value[rows] for name, value in scene_of(scenario.dtype, device).items()}
+        arguments = scenario, scene, settings_of(scenario, device), GROUPS[scenario.ranks], place not in scenario.frozen
+        with mock.patch.object(dist, "all_to_all_single", wraps=dist.all_to_all_single) as calls:
+            made = make(*arguments)
+        made["sent"] = [call.args[1].nbytes for call in calls.call_args_list]
+        torch.save((made, make(*arguments)), f"{folder}/{name}-{place}.pt")
+    if rank >= world - 2:
+        torch.save(mistakes(rank - (world - 2), device), f"{folder}/mistakes-{rank - (world - 2)}.pt")
+    if rank == world - 1:
+        torch.save(without_sending(device), f"{folder}/silent.pt")
+    else:
+        torch.save(error_of(lambda: distributed.rasterize([], None, None, group=GROUPS[1])), f"{folder}/outside.pt")
+    dist.barrier()
+    dist.destroy_process_group()
+
+
+def without_sending(device):
+    """Whether a group of one rank sends something."""
+    scenario = SCENARIOS["one-rank"]
+    calls = ("all_gather", "all_gather_object", "all_to_all_single")
+    with mock.patch.multiple(dist, **{name: mock.Mock(side_effect=AssertionError(name)) for name in calls}):
+        arguments = scenario, scene_of(scenario.dtype, device), settings_of(scenario, device), GROUPS[1]
+        return error_of(lambda: make(*arguments))
+
+
+def scenarios_of(kind, world):
+    """Those that a kind of device can run with so many processes."""
+    return {
+        name: s for name, s in SCENARIOS.items() if s.ranks <= world and (kind == "cpu" or s.dtype == torch.float32)
+    }
+
+
+@dataclasses.dataclass
+class Runs:
+    kind: str
+    world: int
+    folder: object
+
+    def load(self, name):
+        return torch.load(self.folder / f"{name}.pt", map_location=self.kind)
+
+
+@pytest.fixture(scope="module", params=["cpu", pytest.param("cuda", marks=needs_cuda)])
+def runs(request, tmp_path_factory):
+    """The folder into which the processes have written."""
+    kind = request.param
+    world = WORLD if kind == "cpu" else min(WORLD, torch.cuda.device_count())
+    if world < 2:
+        pytest.skip("needs two CUDA devices: NCCL does not put two ranks on one")
+    folder = tmp_path_factory.mktemp("ranks")
+    context = torch.multiprocessing.start_processes(
+        work, (world, str(folder), kind), nprocs=world, join=False, start_method="spawn"
+    )
+    end = time.monotonic() + DEADLINE
+    try:
+        while not context.join(timeout=max(end - time.monotonic(), 0.0)):
+            assert time.monotonic() < end, "the processes hang"
+    finally:
+        for process in context.processes:
+            if process.is_alive():
+                process.kill()
+    return Runs(kind, world, folder)
+
+
+@pytest.fixture(params=SCENARIOS)
+def ran(request, runs):
+    """A scenario, what its ranks made, what they made again, and what one process makes without them."""
+    scenario = scenarios_of(runs.kind, runs.world).get(request.param)
+    if scenario is None:
+        pytest.skip(f"not of {runs.kind} with {runs.world} devices")
+    made, again = zip(*(runs.load(f"{request.param}-{rank}") for rank in range(scenario.ranks)))
+    arguments = scenario, scene_of(scenario.dtype, runs.kind), settings_of(scenario, runs.kind)
+    return scenario, made, again, plain(*arguments)
+
+
+# --- images and gradients ---------------------------------------------------------------------------
+
+
+def test_images_are_those_of_one_rank(ran):
+    """Bit for bit: Gaussians of equal depth keep the order of their global ids wherever they live."""
+    scenario, made, _, expected = ran
+    owners = scenario.owners or [c % scenario.ranks for c in range(len(scenario.cameras))]
+    assert [rank["cameras"] for rank in made] == [
+        [c for c, owner in enumerate(owners) if owner == rank] for rank in range(scenario.ranks)
+    ]
+    for rank in made:
+        assert rank["count"] == COUNT
+        for k, camera in enumerate(rank["cameras"]):
+            assert torch.equal(rank["images"][k], expected["images"][camera])
+            assert torch.equal(rank["alphas"][k], expected["alphas"][camera])
+            assert torch.equal(rank["gaussian_ids"][k], expected["ids"][camera])
+            assert torch.equal(rank["bg"][k], expected["bg"][camera])
+
+
+def trained(scenario, ids):
+    """Whether the ranks of Gaussians let them require a gradient."""
+    ends = torch.tensor(scenario.shards).cumsum(0).to(ids.device)
+    rank = torch.searchsorted(ends, ids.long(), right=True)
+    return ~torch.isin(rank, torch.tensor(scenario.frozen, dtype=rank.dtype, device=ids.device))
+
+
+def test_gradients_are_those_of_one_rank(ran):
+    """A gradient of each camera is the same; their sum over C cameras has C - 1 roundings, in either order."""
+    scenario, made, _, expected = ran
+    eps = torch.finfo(scenario.dtype).eps
+    for name, whole in expected["gradients"].items():
+        parts = [rank["gradients"][name] for rank in made]
+        given = trained(scenario, torch.arange(COUNT, device=whole.device))
+        assert all((parts[rank] == 0).all() for rank in scenario.frozen)
+        error = (torch.cat(parts) - whole).abs()[given]
+        bound = (len(scenario.cameras) - 1) * eps * expected["magnitudes"][name][given]
+        assert whole[given].abs().max() > 0 and (error <= bound).all(), (name, (error - bound).max())
+        if scenario.ranks == 1:
+            assert torch.equal(parts[0], whole)
+
+
+def camera_terms(settings, scene):
+    """(P, 4, 4) the part of each Gaussian in the gradient of `weighted` with respect to viewmatrix."""
+    (settings,), (view,), _ = with_camera_gradients([settings])
+    splats = ar.project(settings, **scene)
+    image, alpha = ar.blend(splats, ar.bin(splats, background=settings.bg.detach()), background=settings.bg)
+    rows = [splats.means2d, splats.cov2d, splats.opacities, splats.depths, splats.colors]
+    loss = weighted(image[0], alpha[0])
+    grads = torch.autograd.grad(loss, rows, retain_graph=True, materialize_grads=True)
+    terms = []
+    for k in range(len(splats.means2d)):
+        of_row = [torch.zeros_like(grad) for grad in grads]
+        for part, grad in zip(of_row, grads):
+            part[k] = grad[k]
+        terms.append(torch.autograd.grad(rows, view, of_row, retain_graph=True)[0])
+    return torch.stack(terms)
+
+
+def test_gradients_of_cameras_are_the_sum_over_ranks(ran, runs):
+    """Each rank has the sum over its Gaussians: of n terms either sum has n - 1 roundings, in another order."""
+    scenario, made, _, expected = ran
+    if scenario.frozen:
+        pytest.skip("its cameras require no gradient")
+    scene, settings = scene_of(scenario.dtype, runs.kind), settings_of(scenario, runs.kind)
+    for camera, whole in enumerate(expected["views"]):
+        terms = camera_terms(settings[camera], scene)
+        error = (sum(rank["views"][camera] for rank in made) - whole).abs()
+        bound = 2 * (len(terms) - 1) * torch.finfo(scenario.dtype).eps / 2 * terms.abs().sum(0)
+        assert whole.abs().max() > 0 and (error <= bound).all(), (camera, error, bound)
+
+
+def test_radii_and_gradients_of_means2d_are_where_the_gaussians_are(ran):
+    """What density control reads, of every camera, on the rank of the Gaussian."""
+    scenario, made, _, expected = ran
+    for camera in range(len(scenario.cameras)):
+        given = trained(scenario, expected["ids"][camera])[:, None]
+        wanted = {
+            "ids": expected["ids"][camera],
+            "radii": expected["radii"][camera],
+            "means2d": expected["means2d"][camera] * given,
+        }
+        if scenario.means2d_abs:
+            wanted["absolute"] = expected["absolute"][camera]
+        for name, value in wanted.items():
+            assert torch.equal(torch.cat([rank[name][camera] for rank in made]), value), name
+        assert expected["means2d"][camera].abs().max() > 0
+    if HIDDEN.start in (sum(scenario.shards[:k]) for k in range(scenario.ranks)):
+        assert [len(rank["ids"][0]) for rank in made][1] == 0  # the scenario holds a rank that sends nothing
+
+
+def test_a_second_run_makes_the_same_bits(ran):
+    _, made, again, _ = ran
+    for first, second in zip(made, again):
+        for name, value in second.items():
+            torch.testing.assert_close(first[name], value, rtol=0, atol=0)
+
+
+def test_as_many_bytes_are_sent_as_the_documentation_says(ran):
+    """docs/distributed.md, "What is sent": per splat 12 numbers forth, 10 back, and 2 for absolute gradients."""
+    scenario, made, _, _ = ran
+    for rank in made:
+        forth, back = 12 * sum(len(ids) for ids in rank["ids"]), 10 * sum(len(ids) for ids in rank["gaussian_ids"])
+        if scenario.means2d_abs:
+            back = back // 10 * 12
+        size = 8 if scenario.dtype == torch.float64 else 4
+        assert rank["sent"] == ([] if scenario.ranks == 1 else [forth * size, back * size])
+
+
+def test_depths_are_equal_in_pairs():
+    """The scene does ask for an order among equal depths: another order makes another picture."""
+    scenario = SCENARIOS["two-ranks"]
+    scene, settings = scene_of(torch.float32, "cpu"), settings_of(scenario, "cpu")[0]
+    splats = ar.project(settings, **scene)
+    assert len(splats.depths.unique()) < len(splats.depths)
+    swapped = {name: value.roll(COUNT // 2, 0) for name, value in scene.items()}
+    images = [ar.blend(s, ar.bin(s))[0] for s in (splats, ar.project(settings, **swapped))]
+    assert (images[0] - images[1]).abs().max() > 1e-3
+
+
+# --- one rank ---------------------------------------------------------------------------------------
+
+
+def test_one_rank_sends_nothing(runs):
+    assert runs.load("silent") is None
+
+
+def test_without_torch_distributed_it_is_the_plain_path(device):
+    """Where no process group was made: the same bits, forward and backward."""
+    scenario = SCENARIOS["one-rank"]
+    scene, settings = scene_of(scenario.dtype, device), settings_of(scenario, device)
+    made, expected = make(scenario, scene, settings), plain(scenario, scene, settings)
+    for name in ("images", "alphas", "ids", "radii", "means2d", "absolute", "gradients", "views", "bg"):
+        torch.testing.assert_close(made[name], expected[name], rtol=0, atol=0)
+
+
+def test_without_gradient(device):
+    scenario = SCENARIOS["one-rank"]
+    scene, settings = scene_of(scenario.dtype, device), settings_of(scenario, device)
+    with torch.no_grad():
+        batch = distributed.rasterize(settings, **scene)
+    assert [view.image.requires_grad for view in batch.views] == [False] * 4 and batch.means2d_abs == ()
+    assert torch.equal(batch.views[1].image, plain(scenario, scene, settings)["images"][1])
+
+
+@pytest.mark.parametrize(
+    "change, error, message",
+    [
+        ({"settings": None}, TypeError, "settings must be a sequence with the settings of each camera"),
+        ({"settings": []}, ValueError, "settings must hold at least one camera, got none"),
+        ({"settings": [3]}, TypeError, "settings must hold GaussianRasterizationSettings, got int at 0"),
+        ({"means3D": torch.zeros(5, 2)}, ValueError, r"means3D must have shape \(P, 3\), got \(5, 2\)"),
+        ({"owners": [0, 0, 0, 1]}, ValueError, "owners must be ranks from 0 to 0, got 1 for camera 3"),
+        ({"owners": [0]}, ValueError, "owners must hold a rank for each of 4 cameras, got 1"),
+        ({"shs": None}, ValueError, "shs or colors_precomp must be given, got neither"),
+        ({"shs": torch.empty(0)}, ValueError, "shs or colors_precomp must be given, got neither"),
+        ({"bg": torch.zeros(3).double()}, TypeError, "bg must have dtype torch.float32, got torch.float64 of camera 0"),
+        ({"bg": (0, 0, 0)}, TypeError, "bg must be a tensor, got tuple"),
+        ({"viewmatrix": None}, TypeError, "viewmatrix must be a tensor, got NoneType"),
+    ],
+    ids=["one-camera", "none", "number", "shape", "owner", "owners", "colours", "empty", "bg", "no-bg", "no-matrix"],
+)
+def test_one_rank_says_what_is_wrong(change, error, message):
+    scenario = SCENARIOS["one-rank"]
+    settings = settings_of(scenario, "cpu")
+    of_camera = {name: value for name, value in change.items() if name in settings[0]._fields}
+    of_call = {name: value for name, value in change.items() if name not in of_camera}
+    settings = [s._replace(**of_camera) for s in settings]
+    arguments = {"settings": settings} | scene_of(scenario.dtype, "cpu") | of_call
+    if arguments["settings"] is None:
+        arguments["settings"] = settings[0]
+    with pytest.raises(error, match=message):
+        distributed.rasterize(**arguments)
+
+
+# --- errors -----------------------------------------------------------------------------------------
+
+MISTAKES = {
+    "shape": ("ValueError", "on rank 1: means3D must have shape (P, 3), got (5, 2)"),
+    "tensor": ("TypeError", "on rank 1: opacities must be a tensor, got NoneType"),
+    "no cameras": ("ValueError", "on rank 1: settings must hold at least one camera, got none"),
+    "cameras": (
+        "ValueError",
+        "settings must hold as many cameras on every rank, got a difference between ranks 0 and 1: 4 and 3",
+    ),
+    "matrix": (
+        "ValueError",
+        "settings, owners and means2d_abs must be the same on every rank, got a difference between ranks 0 and 1",
+    ),
+    "camera gradients": (
+        "ValueError",
+        "settings, owners and means2d_abs must be the same on every rank, got a difference between ranks 0 and 1",
+    ),
+    "owners": ("ValueError", "on rank 0: owners must be ranks from 0 to 1, got 2 for camera 2"),
+    "other owners": (
+        "ValueError",
+        "settings, owners and means2d_abs must be the same on every rank, got a difference between ranks 0 and 1",
+    ),
+    "colors": ("ValueError", "on rank 1: shs or colors_precomp must be given, got neither"),
+    "bg": ("ValueError", "on rank 1: bg must have shape (3,), got (4,) of camera 0"),
+    "auto": ("ValueError", 'on rank 0: effects must not be "auto", which looks at all Gaussians, got it of camera 0'),
+    "dtype": (
+        "ValueError",
+        "means3D must have one dtype and one kind of device on every rank, got a difference between ranks 0 and 1: "
+        "torch.float32 on cpu and torch.float64 on cpu",
+    ),
+    "grad": (
+        "ValueError",
+        "gradients must be enabled on every rank or on none, got a difference between ranks 0 and 1: 1 and 0",
+    ),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_of_one_rank_raises_on_all(runs, mistake):
+    """The same error, and nothing hangs."""
+    if mistake == "dtype" and runs.kind == "cuda":
+        pytest.skip("there is one dtype on CUDA")
+    for rank in range(2):
+        assert runs.load(f"mistakes-{rank}")[mistake] == MISTAKES[mistake]
+
+
+def test_a_rank_outside_the_group_raises(runs):
+    kind, message = runs.load("outside")
+    assert kind == "ValueError" and message.startswith("group must hold this process, got one without rank ")
