@@ -116,7 +116,7 @@ def rasterize(
             error on all of them, which names the rank. Ranks that disagree in settings, dtype or kind of device.
         RuntimeError: Another error on some rank, up to the moment when splats are sent.
     """
-    rank, world = _place(group)
+    rank, world = place_in(group)
     error = mine = None
     try:
         cameras, owners = _checked_cameras(settings, owners, world, shs, colors_precomp)
@@ -151,7 +151,7 @@ def rasterize(
     return Batch(tuple(views), shard, absolute, first_id, count, anchor)
 
 
-def _place(group: dist.ProcessGroup | None) -> tuple[int, int]:
+def place_in(group: dist.ProcessGroup | None) -> tuple[int, int]:
     """Rank of this process in the group, and number of ranks."""
     if group is None and not (dist.is_available() and dist.is_initialized()):
         return 0, 1
