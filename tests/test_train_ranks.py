@@ -281,7 +281,7 @@ def test_gradients_are_those_of_one_process(made):
     assert loss.item() == pytest.approx(got["loss"], rel=4 * torch.finfo(torch.float32).eps)
     for name, field in one.gaussians._asdict().items():
         assert torch.equal(field.grad, got[name]), name
-        assert field.grad.abs().max() > 0 or name == "sh_rest"  # the degree in use is 0
+        assert field.grad.abs().max() > 0 or name in ("rotations", "sh_rest")  # of balls, and above the degree in use
     one._observe(seen)
     # The mean over two pictures has half the gradient of each.
     torch.testing.assert_close(2 * one.density.gradient_sums, got["sums"])
@@ -408,5 +408,5 @@ def test_a_rank_that_dies_ends_all_with_one_message(made, tmp_path, end):
         assert all("on rank 0: another rank is gone" in line for line in messages) and len(messages) <= 1
     else:
         assert messages == ["error: on rank 1: CUDA is out of memory"]
-    assert "Traceback" not in done.stderr.partition("torch.distributed.elastic")[0]
+    assert "analytic_rasterizer/training" not in done.stderr  # no traceback but torchrun's own
     assert not (tmp_path / "out" / files.CHECKPOINT).exists()

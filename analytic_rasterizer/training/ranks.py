@@ -13,7 +13,7 @@ from typing import Any
 import torch.distributed as dist
 from torch import Tensor
 
-from ..distributed import place_in
+from ..distributed.agreement import place_in
 
 
 @dataclass(frozen=True)

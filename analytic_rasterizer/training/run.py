@@ -229,11 +229,11 @@ class Run:
 
     def evaluate(self) -> dict[str, Any]:
         """Writes and returns metrics.json: steps, seconds, Gaussians, and `evaluate` on the test views, if any."""
-        progress = self.trainer.progress
+        steps, seconds = self.progress.step, self.ranks.from_first(self.clock.read())
         metrics = {
-            "steps": progress.step,
-            "seconds": self.clock.read(),
-            "ms_per_step": 1e3 * self.clock.read() / max(progress.step, 1),
+            "steps": steps,
+            "seconds": seconds,
+            "ms_per_step": 1e3 * seconds / max(steps, 1),
             "gaussians": self.count(),
         }
         if self.capture.test:
