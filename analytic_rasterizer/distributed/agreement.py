@@ -75,18 +75,23 @@ def agree(
                 raise ValueError(f"{requirement}, got a difference between ranks 0 and {other}{values}")
     count = sum(of_rank["gaussians"] for of_rank in of_ranks)
     if count > _MAX_GAUSSIANS:
-        raise ValueError(f"means3D must have at most {_MAX_GAUSSIANS} rows on all ranks together, got {count}")
+        raise ValueError(f"all ranks together must have at most {_MAX_GAUSSIANS} Gaussians, got {count}")
     return made, of_ranks
 
 
-def facts_of(means3D: torch.Tensor, differentiable: Sequence[torch.Tensor], group: dist.ProcessGroup | None) -> Facts:
-    """What REQUIREMENTS names. Raises ValueError for a device that the group does not serve."""
+def facts_of(
+    means3D: torch.Tensor,
+    differentiable: Sequence[torch.Tensor],
+    group: dist.ProcessGroup | None,
+    name: str = "means3D",
+) -> Facts:
+    """What REQUIREMENTS names. Raises ValueError for a device that the group does not serve; `name` is of the means."""
     devices = _devices_of(group)
     if means3D.device.type not in devices:
-        raise ValueError(f"means3D must be on a device of the group, {' or '.join(devices)}, got {means3D.device}")
+        raise ValueError(f"{name} must be on a device of the group, {' or '.join(devices)}, got {means3D.device}")
     if means3D.is_cuda and means3D.device.index != torch.cuda.current_device():
         current = f"cuda:{torch.cuda.current_device()}"  # what NCCL goes by
-        raise ValueError(f"means3D must be on the current device, {current}, got {means3D.device}")
+        raise ValueError(f"{name} must be on the current device, {current}, got {means3D.device}")
     requires_grad = any(t.requires_grad for t in differentiable)
     return {
         "kind": _KINDS.index((means3D.device.type, means3D.dtype)),

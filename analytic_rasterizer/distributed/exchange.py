@@ -157,5 +157,5 @@ def _columns(*tensors: torch.Tensor) -> torch.Tensor:
 
 def _named(rows: torch.Tensor, widths: dict[str, int | None]) -> dict[str, torch.Tensor]:
     """The opposite, by name."""
-    columns = rows.split([width or 1 for width in widths.values()], 1)
+    columns = rows.split([1 if width is None else width for width in widths.values()], 1)
     return {name: (t[:, 0] if width is None else t).contiguous() for (name, width), t in zip(widths.items(), columns)}
