@@ -8,6 +8,7 @@ import json
 import math
 import os
 import re
+import shutil
 import subprocess
 import sys
 import textwrap
@@ -35,11 +36,12 @@ from analytic_rasterizer.training.ranks import ALONE, Ranks, even_counts  # noqa
 from analytic_rasterizer.training.sharded import UNEVEN, ShardedTrainer  # noqa: E402
 
 WORLD = 3
-STEPS, BREAKS = 76, (26, 51)  # where the chain changes from 2 ranks to 1, and from 1 to 3
-COMMON = TINY | {"scales": (1, 2), "densify_until": 0.9, "iterations": STEPS, "random_points": 120}
+STEPS, BREAKS = 43, (14, 27)  # where the chain changes from 2 ranks to 1, and from 1 to 3
+HALF = 24  # where the others have a break
+COMMON = TINY | {"iterations": STEPS, "scales": (1, 2), "random_points": 120, "densify_until": 0.9}
+COMMON |= {"densify_from": 10, "densify_every": 10}
 VARIANTS = {
-    "3dgs": {"max_gaussians": 150, "reset_every": 30},
-    "absgrad": {"density": "absgrad", "gradient_scales": "finest", "filter_3d": True},
+    "absgrad": {"density": "absgrad", "gradient_scales": "finest", "filter_3d": True, "reset_every": 35},
     "mcmc": {"density": "mcmc", "max_gaussians": 150, "background": "random", "pictures_per_step": 2},
 }
 CAMERAS = 2  # of the step whose gradients are compared
@@ -74,7 +76,7 @@ def train_until(run, step):
 def work(rank, world, folder):
     torch.set_num_threads(1)
     init = f"file://{folder}/rendezvous"
-    timeout = datetime.timedelta(seconds=DEADLINE / 3)
+    timeout = datetime.timedelta(seconds=DEADLINE)
     dist.init_process_group("gloo", init_method=init, rank=rank, world_size=world, timeout=timeout)
     pair, late = dist.new_group([1, 2]), dist.new_group([1, 2], timeout=datetime.timedelta(seconds=1))
     all_ranks, scene = Ranks.of_group(), folder / "scene"
@@ -85,16 +87,19 @@ def work(rank, world, folder):
             repeat(scene, folder / name, two, more)
         gradients(scene, folder, two)
         train_until(make_run(scene, folder / "chain", two), BREAKS[0])
+        if two.is_first:
+            shutil.copytree(folder / "chain", folder / "chain-by-2")
         if rank == 1:
             wait_in_vain(late, folder)
     dist.barrier()
     if rank == 0:
         run = make_run(scene, folder / "chain", ALONE, resume=True)
-        save_again(run, folder / "chain-1")
+        save_again(run, folder / "chain-read-by-1")
         train_until(run, BREAKS[1])
+        shutil.copytree(folder / "chain", folder / "chain-by-1")
     dist.barrier()
     run = make_run(scene, folder / "chain", all_ranks, resume=True)
-    save_again(run, folder / "chain-3")
+    save_again(run, folder / "chain-read-by-3")
     run.train()
     metrics = run.evaluate()
     if rank == 2:
@@ -109,9 +114,9 @@ def repeat(scene, out, ranks, more):
     """A training to its end, and once more with a break after about half of it."""
     whole = make_run(scene, out / "whole", ranks, **more)
     whole.train()
-    train_until(make_run(scene, out / "part", ranks, **more), 44)
+    train_until(make_run(scene, out / "part", ranks, **more), HALF)
     part = make_run(scene, out / "part", ranks, resume=True)
-    assert part.progress.step == 44
+    assert part.progress.step == HALF
     part.train()
 
 
@@ -187,7 +192,7 @@ def made(tmp_path_factory):
     folder = tmp_path_factory.mktemp("ranks")
     write_scene(folder / "scene")
     context = torch.multiprocessing.start_processes(work, (WORLD, folder), WORLD, join=False, start_method="spawn")
-    end = time.monotonic() + DEADLINE
+    end = time.monotonic() + 2 * DEADLINE
     try:
         while not context.join(timeout=max(end - time.monotonic(), 0.0)):
             assert time.monotonic() < end, "the processes hang"
@@ -240,33 +245,15 @@ def test_gaussians_are_spread_evenly_and_stay_within_the_limit(made, name):
 
 
 def test_two_ranks_then_one_then_three(made):
-    """Each goes on from what the one before wrote, all of it, and in the end the pictures are learnt."""
-    for name in ("chain-1", "chain-3"):
-        state = checkpoint_in(made / name)
-        assert state["progress"]["step"] == BREAKS[name == "chain-3"]
-        assert {s["step"] for s in state["optimizer"]["state"].values()} <= steps_near(state["progress"]["step"])
+    """Each goes on from what the one before wrote, all of it."""
+    for written, read, step in (("2", "1", BREAKS[0]), ("1", "3", BREAKS[1])):
+        before, after = (checkpoint_in(made / f"chain-{name}") for name in (f"by-{written}", f"read-by-{read}"))
+        assert before["progress"]["step"] == step and before["density"]["gradient_sums"].sum() > 0
+        assert {of_field["step"] for of_field in before["optimizer"]["state"].values()} == {step}
+        assert [len(state.get("shards", "1")) for state in (before, after)] == [int(written), int(read)]
+        assert_same(before, after, but=("shards",))
     final = checkpoint_in(made / "chain")
     assert final["progress"]["step"] == STEPS and final["progress"]["share"] == 1 and len(final["shards"]) == 3
-    metrics = json.loads((made / "metrics.json").read_text())
-    options = options_of()
-    start = model.gaussians_at(*model.random_points(120, 0), 1).to_scene()
-    test = training.load_pictures(training.load_capture(made / "scene").test, (1, 2), (1.0, 1.0, 1.0), "cpu")
-    before = training.evaluate(start, test, options.footprint)
-    assert metrics["test"]["mean"]["psnr"] > before["mean"]["psnr"] + 3
-
-
-def steps_near(step):
-    """What the optimizer may count: as many as there were, rounded to whole steps of three ranks."""
-    return {step} | {WORLD * round(step / WORLD)}
-
-
-def test_a_checkpoint_is_read_whole_on_any_number_of_ranks(made):
-    """What was read is written again with the same bits; the generators of density control are those of a rank."""
-    first = checkpoint_in(made / "chain-1")
-    assert first["progress"]["step"] == BREAKS[0]
-    second = checkpoint_in(made / "chain-3")
-    assert len(second["shards"]) == 3 and "shards" not in first
-    assert sum(second["shards"]) == len(second["gaussians"]["means"])
 
 
 def test_gradients_are_those_of_one_process(made):
@@ -278,6 +265,7 @@ def test_gradients_are_those_of_one_process(made):
     one._set_rates()
     loss, seen = one._loss()
     loss.backward()
+    # A rounding for each part of the sum, and one for each part's division.
     assert loss.item() == pytest.approx(got["loss"], rel=4 * torch.finfo(torch.float32).eps)
     for name, field in one.gaussians._asdict().items():
         assert torch.equal(field.grad, got[name]), name
@@ -368,7 +356,8 @@ def torchrun(scene, out, *options, program=None):
 
 
 def test_torchrun_trains_and_writes_once(made, tmp_path):
-    done = torchrun(made / "scene", tmp_path / "out", "--iterations", "21", "--sh-degree", "0", "--export", "mip")
+    """And what it trains is nearer to the pictures than what it starts from."""
+    done = torchrun(made / "scene", tmp_path / "out", "--iterations", "121", "--sh-degree", "0", "--export", "mip")
     assert done.returncode == 0, done.stderr[-4000:]
     lines = done.stdout.splitlines()
     assert lines[0] == f"{tmp_path / 'out' / files.SCENE}: 60 Gaussians"
@@ -376,7 +365,12 @@ def test_torchrun_trains_and_writes_once(made, tmp_path):
     written = {path.name for path in (tmp_path / "out").iterdir()}
     assert {files.SCENE, files.MIP_SCENE, files.CAMERAS, files.METRICS, files.LOG, files.OPTIONS} < written
     state = checkpoint_in(tmp_path / "out")
-    assert state["progress"]["step"] == 21 and state["shards"] == [30, 30]
+    assert state["progress"]["step"] == 121 and state["shards"] == [30, 30]
+    test = training.load_pictures(training.load_capture(made / "scene").test, (1,), (1.0, 1.0, 1.0), "cpu")
+    start = model.gaussians_at(*model.random_points(60, 0), 0).to_scene()
+    before = training.evaluate(start, test, TrainingOptions().footprint)["mean"]["psnr"]
+    after = json.loads((tmp_path / "out" / files.METRICS).read_text())["test"]["mean"]["psnr"]
+    assert after > before + 2
 
 
 @pytest.mark.parametrize("end", ["raise RuntimeError('CUDA is out of memory')", "os.kill(os.getpid(), signal.SIGKILL)"])
