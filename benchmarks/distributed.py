@@ -201,13 +201,18 @@ def format_results(results: dict[int, dict[str, Any]], expected: dict[int, dict[
     base, rows = results[min(results)]["images_per_second"], []
     for ranks, model in expected.items():
         model_rate = f"{model['images_per_second']:.2f}" if "images_per_second" in model else "-"
-        row = [ranks, *["-"] * 6, f"{model['sent'] / 1e6:.2f}", model_rate]
+        cells = [None] * 6
         if ranks in results:
             r = results[ranks]
-            rate = r["images_per_second"]
-            row[1:7] = [f"{rate:.2f}", f"{rate / base:.2f}", *(f"{r[k] / 2**20:.1f}" for k in COLUMNS[3:])]
-            row[5:7] = [f"{r['sent'] / 1e6:.2f}", f"{1e3 * r['exchange']:.2f}"]
-        rows.append(row)
+            rate, memory = r["images_per_second"], [f"{r[key] / 2**20:.1f}" for key in ("own_bytes", "extra_bytes")]
+            cells = [
+                f"{rate:.2f}",
+                f"{rate / base:.2f}",
+                *memory,
+                f"{r['sent'] / 1e6:.2f}",
+                f"{1e3 * r['exchange']:.2f}",
+            ]
+        rows.append([ranks, *cells, f"{model['sent'] / 1e6:.2f}", model_rate])
     header = ["ranks", "images/s", "ratio", "Gaussians MiB", "step MiB", "MB sent", "exchange ms"]
     return format_table([*header, "model MB", "model images/s"], rows)
 

@@ -142,7 +142,9 @@ def test_distributed(small_scene):
         env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]
-    assert [line.split()[0] for line in done.stdout.splitlines()[3:]] == ["1", "2", "4", "8", "64"]
+    rows = [line.split() for line in done.stdout.splitlines()[3:]]
+    assert [row[0] for row in rows] == ["1", "2", "4", "8", "64"] and {len(row) for row in rows} == {9}
+    assert all(cell != "-" for row in rows[:2] for cell in row) and rows[2][1:7] == ["-"] * 6
     written = json.loads((small_scene / "out.json").read_text())
     assert all(math.isfinite(value) for of_ranks in written["results"].values() for value in of_ranks.values())
     one, two = (written["results"][ranks] for ranks in ("1", "2"))
