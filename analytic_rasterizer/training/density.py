@@ -84,8 +84,12 @@ class FixedDensity:
         return None
 
     def observe_rows(self, rows: Tensor, gradients: Tensor) -> None:
-        """The same as `observe` from the gradients (n, 2) of the Gaussians `rows` (n,) int64 that a picture shows, by
-        normalized device coordinates: dL/d(mean), or the sums of its absolute values where the options ask for them.
+        """As `observe`, for a picture whose gradients are known by row.
+
+        Args:
+            rows: (n,) int64, the Gaussians that the picture shows, each once.
+            gradients: (n, 2) with respect to their means in normalized device coordinates; with the density control
+                "absgrad" the sums of absolute values.
         """
 
     def forget(self) -> None:

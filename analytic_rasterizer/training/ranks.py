@@ -1,6 +1,7 @@
 """The processes that train one scene together, and what they tell each other besides splats.
 
-Everything here goes through the CPU side of the process group, but for `move_rows`, which takes the way of its tensor.
+On CUDA the process group needs a backend for the CPU too, as in init_process_group("cpu:gloo,cuda:nccl"): what is no
+tensor of the device goes that way.
 """
 
 from __future__ import annotations
