@@ -143,9 +143,8 @@ def measure_row(args: argparse.Namespace, count: int, size: tuple[int, int]) -> 
     row = {"gaussians": count, "width": size[0], "height": size[1]}
     try:
         case = make_case(args, count, size)
-        [[result]] = measure(
-            {"row": [case]}, partial(time_round, device=args.device), args.device, args.rounds
-        ).values()
+        time_this = partial(time_round, device=args.device)
+        [[result]] = measure({"row": [case]}, time_this, args.device, args.rounds).values()
         memory = result["extra_bytes"] if args.device == "cuda" else state_bytes(case)
     except (RuntimeError, MemoryError) as error:
         if not is_out_of_memory(error):

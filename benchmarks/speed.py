@@ -72,10 +72,8 @@ def parse_arguments() -> argparse.Namespace:
 
 def add_against(parser: argparse.ArgumentParser) -> None:
     """Adds --against, a list of names; empty without it."""
-    names = lambda text: text.split(",")  # noqa: E731
-    parser.add_argument(
-        "--against", type=names, default=[], metavar="PEER[,PEER...]", help="other rasterizers: peers.py"
-    )
+    add, split = parser.add_argument, lambda text: text.split(",")
+    add("--against", type=split, default=[], metavar="PEER[,PEER...]", help="other rasterizers: peers.py")
 
 
 def measure_scene(args: argparse.Namespace, scene: io.Scene, views: list[io.View]) -> tuple[dict, dict]:

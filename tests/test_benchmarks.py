@@ -264,7 +264,7 @@ def test_scaling_says_what_does_not_fit_into_memory(device, tmp_path, monkeypatc
         if count == 400:
             raise torch.cuda.OutOfMemoryError("no room\nfor a long trace")
         if count == 307:
-            return torch.empty(2**60)  # as torch says it on this device
+            return torch.empty(2**60)  # what torch raises on the CPU
         return original(args, count, size)
 
     monkeypatch.setattr(scaling, "make_case", make_case)

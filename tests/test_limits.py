@@ -19,6 +19,11 @@ import analytic_rasterizer as ar
 OPS = torch.ops.analytic_rasterizer
 ROWS = {"cpu": 2**31, "cuda": 2**30}  # the first number of Gaussians that cannot be numbered
 
+limits_memory = pytest.mark.skipif(
+    sys.platform != "linux" or "libasan" in os.environ.get("LD_PRELOAD", ""),
+    reason="limits the address space as Linux does, where no sanitizer ends the process for it",
+)
+
 
 def repeated(rows, *shape, device="cpu"):
     """A tensor (rows, *shape) that takes the memory of one number."""
@@ -98,15 +103,15 @@ RENDER_WITH_LITTLE_MEMORY = """
     libc = ctypes.CDLL(None)
     libc.mallopt(-3, 1 << 16)  # M_MMAP_THRESHOLD: every larger block is asked of the system, and given back
     torch.set_num_threads(1)
-    scene = scenes.cast(scenes.random_scene(1, 100_000, sigma=(0.01, 0.02)), torch.float32)
+    scene = scenes.cast(scenes.random_scene(1, 30_000, sigma=(0.01, 0.02)), torch.float32)
     rasterizer = ar.GaussianRasterizer(scenes.Camera(64, 48).settings(torch.float32, "cpu"))
     expected, _ = rasterizer(**scene)
     libc.malloc_trim(0)
     outcomes = []
-    for step in range(1, 60):
+    for step in range(1, 40):
         used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
         limits = resource.getrlimit(resource.RLIMIT_AS)
-        resource.setrlimit(resource.RLIMIT_AS, (used + step * 2**19, limits[1]))
+        resource.setrlimit(resource.RLIMIT_AS, (used + step * 2**18, limits[1]))
         try:
             color, _ = rasterizer(**scene)
             outcome = "the same" if torch.equal(color, expected) else "another picture"
@@ -118,8 +123,7 @@ RENDER_WITH_LITTLE_MEMORY = """
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="limits the address space as Linux does")
-@pytest.mark.skipif("libasan" in os.environ.get("LD_PRELOAD", ""), reason="the sanitizer ends where memory does")
+@limits_memory
 def test_without_memory_the_error_is_that_of_torch():
     """On the CPU, wherever memory ends: in one of torch's tensors or in a vector of ours."""
     outcomes = json.loads(run_python(RENDER_WITH_LITTLE_MEMORY).splitlines()[-1])
@@ -130,7 +134,7 @@ def test_without_memory_the_error_is_that_of_torch():
     assert outcomes[-1] == "the same"
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="limits the address space as Linux does")
+@limits_memory
 def test_a_hundred_million_gaussians_are_not_refused_but_need_memory():
     """The copies of 1e8 rows do not fit into 1 GiB; the checks let them pass."""
     code = """

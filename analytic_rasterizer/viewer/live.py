@@ -116,8 +116,6 @@ class LiveViewer:
             raise ValueError(f"interval must be finite and not negative, got {interval}")
         if not 0 <= port <= 65535:
             raise ValueError(f"port must be from 0 to 65535, got {port}")
-        self._server, self.url = start_viser(port)
-        self.port = self._server.get_port()
 
         self.name = name
         self.interval = interval
@@ -134,6 +132,8 @@ class LiveViewer:
         self._settled: Cost | None = None  # these two belong to the rendering thread
         self._moving: Cost | None = None
 
+        self._server, self.url = start_viser(port)
+        self.port = self._server.get_port()
         self._server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._server.gui.set_panel_label("Gaussian splats")
         self._server.scene.set_up_direction(tuple(mean_up(self.views)))
