@@ -127,7 +127,8 @@ RENDER_WITH_LITTLE_MEMORY = """
 def test_without_memory_the_error_is_that_of_torch():
     """On the CPU, wherever memory ends: in one of torch's tensors or in a vector of ours."""
     outcomes = json.loads(run_python(RENDER_WITH_LITTLE_MEMORY).splitlines()[-1])
-    failed = [outcome for outcome in outcomes if outcome != "the same"]
+    # Python's own objects need memory as well.
+    failed = [outcome for outcome in outcomes if outcome != "the same" and not outcome.startswith("MemoryError")]
     assert all(outcome.startswith("OutOfMemoryError: ") for outcome in failed), failed
     assert any("Not enough memory on the CPU" in outcome for outcome in failed), failed
     assert any("DefaultCPUAllocator" in outcome for outcome in failed), failed
