@@ -185,7 +185,7 @@ def photographs(tmp_path_factory):
 
 
 def run(name, data, out, **options) -> Results:
-    return run_table(TABLES[name], data, out, say=lambda line: None, **{**TINY, **options})
+    return run_table(TABLES[name], data, out, **{"say": lambda line: None, **TINY, **options})
 
 
 def test_a_table_is_trained_tested_and_written(blender, tmp_path):
@@ -273,8 +273,10 @@ def test_an_interrupted_table_goes_on_with_the_same_bits(blender, tmp_path, monk
         step(trainer)
 
     monkeypatch.setattr(training.Trainer, "step", interrupted)
+    said = []
     with pytest.raises(KeyboardInterrupt):
-        run("blender-stst", blender, tmp_path / "part", rows=["box"], iterations=6)
+        run("blender-stst", blender, tmp_path / "part", rows=["box"], iterations=6, say=said.append)
+    assert said[-1] == "stopped and saved: the same call goes on with box, lego"
     assert "chair" in (tmp_path / "part" / "blender-stst.md").read_text()
     assert steps[6:] == [0, 1, 2]
     run("blender-stst", blender, tmp_path / "part", rows=["box"], iterations=6)
@@ -375,11 +377,15 @@ def replace_scenes(table, scenes):
 # -------------------------------------------------------------------------------------------- errors
 
 
-def test_results_of_other_options_are_left_alone(blender, tmp_path):
+def test_results_of_other_options_or_pictures_are_left_alone(blender, tmp_path, tmp_path_factory):
     run("blender-stst", blender, tmp_path, rows=["box"], scenes=["lego"])
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     with pytest.raises(ValueError, match=r"box/lego was trained with other iterations, seed; choose another --out"):
         run("blender-stst", blender, tmp_path, rows=["box"], iterations=4, seed=1)
+    elsewhere = tmp_path_factory.mktemp("elsewhere")
+    shutil.copytree(blender / "lego", elsewhere / "lego")
+    with pytest.raises(ValueError, match=r"box/lego was trained on .*blender.*/lego; choose another --out"):
+        run("blender-stst", elsewhere, tmp_path, rows=["box"])
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
@@ -430,7 +436,7 @@ def test_the_command_lists_the_tables(capsys):
     printed = capsys.readouterr().out
     assert all(f"{name} (" in printed for name in TABLES)
     assert "360-super-resolution (paper, Tab. 6)" in printed and "tests at 2 times it" in printed
-    assert "images_2: room, counter, kitchen, bonsai" in printed and "blender-stmt (ours only)" in printed
+    assert "full size 1/2: room, counter, kitchen, bonsai" in printed and "blender-stmt (ours only)" in printed
 
 
 def test_the_command_prints_the_table(blender, tmp_path, capsys, monkeypatch):

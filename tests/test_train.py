@@ -427,6 +427,17 @@ def test_supersampled_pictures_are_means_of_larger_ones(device):
     torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-3, atol=1e-3 * gradients[0].abs().max().item())
 
 
+def test_a_step_renders_supersampled_pictures(device, synthetic, tmp_path):
+    run = make_run(synthetic, tmp_path, device, supersampling=4, footprint="point")
+    view, scale = run.trainer.order(0)
+    settings = run.trainer.pictures.settings[scale][view]._replace(sh_degree=0, footprint="point")
+    with torch.no_grad():
+        expected, plain = (run.trainer.gaussians.render(settings, supersampling=n)[0] for n in (4, 1))
+    run.trainer.step()
+    torch.testing.assert_close(run.trainer.last[0], expected, rtol=0, atol=1e-6)
+    assert (plain - expected).abs().max() > 1e-3
+
+
 def test_evaluate_supersamples_as_the_training_did(synthetic, tmp_path, capsys):
     arguments = ["--iterations", "3", "--random-points", "60", "--sh-degree", "0", "--device", "cpu"]
     arguments += ["--footprint", "point", "--supersampling", "4", "--scales", "4"]  # coarse pixels: it matters

@@ -67,20 +67,16 @@ def run(args) -> None:
 
 def describe(table: Table) -> str:
     """A table and its protocol, for the list."""
-    published, names = PUBLISHED.get(table.name), table.data.scenes
-    pictures = {table.images(table.rows[0], scene): [] for scene in names}
-    for scene in names:
-        pictures[table.images(table.rows[0], scene)].append(scene)
-    blender = table.data.test_views is not None
-    where = ["scenes: " + ", ".join(names)] if blender else [f"{k}: {', '.join(v)}" for k, v in pictures.items()]
-    tests = f"tests at {_fractions(table.scales)} of it"
-    if table.enlarged > 1:
-        tests = f"tests at {table.enlarged} times it"
+    published, views = PUBLISHED.get(table.name), table.data.test_views
+    scenes: dict[int, list[str]] = {}
+    for scene, reduction in table.data.scenes.items():
+        scenes.setdefault(reduction, []).append(scene)
+    size = f"{table.enlarged} times" if table.enlarged > 1 else f"{_fractions(table.scales)} of"
     lines = [
         f"{table.name} ({'paper, ' + published.source if published else 'ours only'}): {table.title}",
-        *where,
-        f"trains at {_fractions(table.options['scales'])} of the full size, {tests}, on "
-        + ("transforms_test.json" if blender else "every eighth photograph"),
+        *(f"full size {_fractions((reduction,))}: {', '.join(names)}" for reduction, names in scenes.items()),
+        f"trains at {_fractions(table.options['scales'])} of the full size, tests at {size} it, on "
+        + (f"{views} views" if views else "every eighth photograph"),
         f"rows: {', '.join(row.name for row in table.rows)}",
     ]
     return "\n    ".join(lines)

@@ -75,8 +75,8 @@ def run_table(
         What was measured; also in TABLE.json and TABLE.md.
 
     Raises:
-        ValueError: An unknown scene or row, a bad option, or results in `out` that were trained with other options;
-            before anything is written.
+        ValueError: An unknown scene or row, a bad option, or results in `out` that were trained with other options or
+            on other pictures; before anything is written.
         io.SceneError, OSError: None of the scenes is there, or one is broken; likewise.
         KeyboardInterrupt: The training was interrupted, and saved.
     """
@@ -89,7 +89,7 @@ def run_table(
     jobs, skipped = [], []
     for row in chosen:
         for scene in (scene for scene in table.data.scenes if scene in (scenes or [scene])):
-            place = table.data.find(Path(data), scene)
+            place = table.data.find(Path(data).resolve(), scene)
             missing = _missing(table, row, scene, place)
             if missing:
                 skipped.append(missing)
@@ -108,7 +108,9 @@ def run_table(
         measured = _stored_test(job, table, lpips)
         if measured is None:
             say(f"[{number}/{len(jobs)}] {job}")
-            _train(job, table, device)
+            if not _train(job, table, device):
+                say(f"stopped and saved: the same call goes on with {job}")
+                raise KeyboardInterrupt
             measured = _test(job, table, device, lpips)
         results.tests.setdefault(job.row.name, {})[job.scene] = measured
         _write(results, Path(out))
@@ -134,7 +136,7 @@ def _missing(table: Table, row: Row, scene: str, place: Path | None) -> str | No
 
 
 def _check(jobs: list[Job], table: Table) -> None:
-    """Raises for captures that cannot be used, and for results of other options."""
+    """Raises for captures that cannot be used, and for results of other options or pictures."""
     used = {(job.place, images(job.row, job.scene)) for job in jobs for images in (table.images, table.test_images)}
     for place, images in sorted(used):
         if not load_capture(place, images).test:
@@ -142,16 +144,20 @@ def _check(jobs: list[Job], table: Table) -> None:
     for job in jobs:
         if not (job.folder / OPTIONS).exists():
             continue
-        stored = TrainingOptions.from_dict(_read(job.folder / OPTIONS)["options"])
+        described = _read(job.folder / OPTIONS)
+        source = described["source"]
+        if (source["scene"], source["images"]) != (str(job.place), table.images(job.row, job.scene)):
+            raise ValueError(f"{job.folder} was trained on {source['scene']}; choose another --out")
+        stored = TrainingOptions.from_dict(described["options"])
         differing = [f.name for f in fields(stored) if getattr(stored, f.name) != getattr(job.options, f.name)]
         if differing:
             raise ValueError(f"{job.folder} was trained with other {', '.join(differing)}; choose another --out")
 
 
-def _train(job: Job, table: Table, device: str) -> None:
-    """Trains to the end, unless that was done before. Raises KeyboardInterrupt where it was interrupted."""
+def _train(job: Job, table: Table, device: str) -> bool:
+    """Trains, unless that was done before. Returns whether it came to the end; otherwise it was interrupted."""
     if (job.folder / METRICS).exists():
-        return
+        return True
     run = Run(
         job.place,
         job.folder,
@@ -161,9 +167,10 @@ def _train(job: Job, table: Table, device: str) -> None:
         resume=(job.folder / CHECKPOINT).exists(),
     )
     if not run.train():
-        raise KeyboardInterrupt
+        return False
     write_json(job.folder / METRICS, run.summary())
     (job.folder / CHECKPOINT).unlink()
+    return True
 
 
 def _test(job: Job, table: Table, device: str, lpips: Perceptual | None) -> dict[str, Any]:
