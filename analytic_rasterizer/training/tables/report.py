@@ -66,7 +66,7 @@ def markdown(results: Results) -> str:
 
 
 def as_dict(results: Results) -> dict[str, Any]:
-    """What JSON can hold: all that was measured, and the paper's numbers for the same scenes."""
+    """What JSON can hold: all that was measured, and all that the paper prints."""
     published = PUBLISHED.get(results.table.name)
     return {
         "table": results.table.name,
@@ -97,8 +97,10 @@ def _blocks(results: Results) -> list[tuple[str, list[str], list[list[str]]]]:
     blocks = []
     for measure in results.measures:
         for scale in results.scales:
-            where = "" if len(results.scales) == 1 else ", mean over scales" if scale == MEAN else f", scale 1/{scale}"
-            blocks.append((f"{UNITS[measure]}{where}", header, _rows(results, measure, scale)))
+            heading = UNITS[measure]
+            if len(results.scales) > 1:
+                heading += ", mean over scales" if scale == MEAN else f", scale 1/{scale}"
+            blocks.append((heading, header, _rows(results, measure, scale)))
     return blocks
 
 
