@@ -67,7 +67,7 @@ def run(args) -> None:
 
 def describe(table: Table) -> str:
     """A table and its protocol, for the list."""
-    published, views = PUBLISHED.get(table.name), table.data.test_views
+    published = PUBLISHED.get(table.name)
     scenes: dict[int, list[str]] = {}
     for scene, reduction in table.data.scenes.items():
         scenes.setdefault(reduction, []).append(scene)
@@ -76,7 +76,7 @@ def describe(table: Table) -> str:
         f"{table.name} ({'paper, ' + published.source if published else 'ours only'}): {table.title}",
         *(f"full size {_fractions((reduction,))}: {', '.join(names)}" for reduction, names in scenes.items()),
         f"trains at {_fractions(table.options['scales'])} of the full size, tests at {size} it, on "
-        + (f"{views} views" if views else "every eighth photograph"),
+        + (f"the test views ({table.data.views})" if table.data.views else "every eighth photograph"),
         f"rows: {', '.join(row.name for row in table.rows)}",
     ]
     return "\n    ".join(lines)

@@ -58,12 +58,12 @@ class Data(NamedTuple):
         scenes: Name, and how many times smaller than the photographs the pictures are that come with the data and that
             the paper calls the full size: 4 are in the folder images_4, 1 in the folder images.
         folders: Where a scene may be in the folder of the data: as the sets unpack, or beside each other.
-        test_views: How many test views the paper's numbers are means over, where it is the same for all scenes.
+        views: How many views of which size a scene is tested on, where it is the same for all scenes.
     """
 
     scenes: dict[str, int]
     folders: tuple[str, ...]
-    test_views: int | None = None
+    views: str = ""
 
     def find(self, data: Path, scene: str) -> Path | None:
         """The folder of a scene, or None where there is none."""
@@ -76,7 +76,7 @@ BLENDER_SCENES = ("chair", "drums", "ficus", "hotdog", "lego", "materials", "mic
 OUTDOOR = ("bicycle", "flowers", "garden", "stump", "treehill")
 INDOOR = ("room", "counter", "kitchen", "bonsai")
 
-BLENDER = Data(dict.fromkeys(BLENDER_SCENES, 1), (".", "multiscale", "nerf_synthetic"), 200)
+BLENDER = Data(dict.fromkeys(BLENDER_SCENES, 1), (".", "multiscale", "nerf_synthetic"), "200 of 800x800 px")
 MIPNERF360 = Data(dict.fromkeys(OUTDOOR, 4) | dict.fromkeys(INDOOR, 2), (".", "360_v2", "360_extra_scenes"))
 TANKS = Data(dict.fromkeys(("truck", "train", "drjohnson", "playroom"), 1), (".", "tandt", "db"))
 

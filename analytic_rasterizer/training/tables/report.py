@@ -161,6 +161,12 @@ def _cell(measure: str, number: Number) -> str:
     return f"{number.value:.{DECIMALS[measure]}f}{'?' if number.doubtful else ''}"
 
 
+def _views(results: Results, scene: str) -> str:
+    """How many were tested, and their size."""
+    test = next(row[scene] for row in results.tests.values() if scene in row)
+    return f"{test['views']} of {test['size'][0]}x{test['size'][1]} px"
+
+
 def _remarks(results: Results) -> list[str]:
     """Whatever makes these numbers differ from those of the protocol, or the paper's doubtful."""
     table, remarks = results.table, [f"Measured on {results.machine}."]
@@ -175,11 +181,10 @@ def _remarks(results: Results) -> list[str]:
         remarks.append(f"Departs from the protocol: {', '.join(changes)}.")
     if len(results.scenes) < len(table.data.scenes):
         remarks.append(f"Means, the paper's too, are over {len(results.scenes)} of {len(table.data.scenes)} scenes.")
-    expected = table.data.test_views
-    for scene in results.scenes if expected else []:
-        views = next(row[scene]["views"] for row in results.tests.values() if scene in row)
-        if views != expected:
-            remarks.append(f"{scene}: tested on {views} views, the paper on {expected}.")
+    views = {scene: _views(results, scene) for scene in results.scenes}
+    remarks.append(f"Views that were tested: {', '.join(f'{scene} {tested}' for scene, tested in views.items())}.")
+    if table.data.views and set(views.values()) != {table.data.views}:
+        remarks.append(f"The paper tests {table.data.views} of every scene.")
     if "lpips" not in results.measures:
         remarks.append("LPIPS is left out.")
     remarks += [f"Skipped: {line}." for line in results.skipped]
