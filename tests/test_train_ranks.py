@@ -42,7 +42,13 @@ COMMON = TINY | {"iterations": STEPS, "scales": (1, 2), "random_points": 120, "d
 COMMON |= {"densify_from": 10, "densify_every": 10}
 VARIANTS = {
     "absgrad": {"density": "absgrad", "gradient_scales": "finest", "filter_3d": True, "reset_every": 35},
-    "mcmc": {"density": "mcmc", "max_gaussians": 150, "background": "random", "pictures_per_step": 2},
+    "mcmc": {
+        "density": "mcmc",
+        "max_gaussians": 150,
+        "background": "random",
+        "pictures_per_step": 2,
+        "supersampling": 2,
+    },
 }
 CAMERAS = 2  # of the step whose gradients are compared
 

@@ -14,7 +14,7 @@ from ..training.evaluation import LPIPS_WEIGHTS, MEASURES
 from ..training.files import OPTIONS, SCENE, write_json
 from ..training.ranks import Ranks, even_counts
 from ..training.trainer import background_of
-from .arguments import add_machine_options, use_machine, whole_numbers, writable_folder
+from .arguments import add_machine_options, count, use_machine, whole_numbers, writable_folder
 from .launch import add_rank_options, ranks_of
 
 HEADINGS = {"psnr": ("PSNR", "{:.2f}"), "ssim": ("SSIM", "{:.4f}"), "lpips": ("LPIPS", "{:.4f}")}
@@ -33,6 +33,8 @@ def add_parser(subcommands) -> None:
     add("--data", metavar="SCENE", help="folder of the capture (default: the one that was trained with)")
     add("--footprint", nargs="+", dest="footprints", metavar="NAME[:k=v]", help="(default: that of the training)")
     add("--scales", type=whole_numbers, metavar="1,2,..", help="reductions to test at (default: those trained at)")
+    supersampling = "render pictures so many times larger and average them (default: as in the training)"
+    add("--supersampling", type=count, metavar="N", help=supersampling)
     add("--lpips", choices=(*LPIPS_WEIGHTS, "none"), default="vgg", help="network of LPIPS (default: vgg)")
     add("--pictures", type=int, default=2, metavar="N", help="views to draw per footprint and scale (default: 2)")
     add_machine_options(parser, device=None)
@@ -72,12 +74,15 @@ def run_on(ranks: Ranks, args) -> None:
                 print(f"LPIPS is left out: {error}", file=sys.stderr)
     out = writable_folder(folder / "evaluation")
     results = {}
+    common = {"supersampling": args.supersampling or options.supersampling, "ranks": ranks}
     for footprint in footprints:
-        results[footprint] = evaluate(scene, pictures, footprint, lpips, ranks=ranks)
+        results[footprint] = evaluate(scene, pictures, footprint, lpips, **common)
         if args.pictures > 0:
-            save_pictures(out, scene, pictures, footprint, args.pictures, ranks=ranks)
+            save_pictures(out, scene, pictures, footprint, args.pictures, **common)
     if ranks.is_first:
-        write_json(folder / "evaluation.json", {"views": [view.name for view in pictures.views], "results": results})
+        views = [view.name for view in pictures.views]
+        written = {"views": views, "supersampling": common["supersampling"], "results": results}
+        write_json(folder / "evaluation.json", written)
         print(format_results(results, scales))
 
 

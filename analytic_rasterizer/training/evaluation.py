@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .. import distributed, io
+from .. import io
 from ..losses import ssim
 from ..settings import GaussianRasterizationSettings
 from .model import Activated
@@ -30,8 +30,13 @@ def psnr(image: Tensor, target: Tensor) -> Tensor:
     return -10 * (image.clamp(0, 1) - target).square().mean().log10()
 
 
-def load_lpips(network: str, device: str | torch.device) -> Perceptual:
+def load_lpips(network: str, device: str | torch.device, like_3dgs: bool = False) -> Perceptual:
     """LPIPS of two (3, H, W) images in [0, 1], by torchmetrics, whose weights of the network must be there already.
+
+    Args:
+        network: One of LPIPS_WEIGHTS.
+        like_3dgs: Hand the network values in [0, 1], as 3DGS's program does, whose numbers papers compare with. The
+            network was made for [-1, 1], to which values are scaled otherwise.
 
     Raises:
         ImportError: No torchmetrics or torchvision.
@@ -45,10 +50,10 @@ def load_lpips(network: str, device: str | torch.device) -> Perceptual:
         )
     try:
         import torchvision  # noqa: F401  (of torchmetrics; no extra names it, as its version must fit torch's)
-    except ImportError as error:
+    except (ImportError, RuntimeError) as error:  # a version for another torch raises RuntimeError
         raise ImportError(f"LPIPS needs torchvision, in the version that fits torch {torch.__version__}") from error
     module = io.optional_import("torchmetrics.image.lpip", "train")
-    metric = module.LearnedPerceptualImagePatchSimilarity(network, normalize=True).to(device).eval()
+    metric = module.LearnedPerceptualImagePatchSimilarity(network, normalize=not like_3dgs).to(device).eval()
     return lambda image, truth: metric(image[None].clamp(0, 1), truth[None])
 
 
@@ -59,6 +64,7 @@ def evaluate(
     footprint: str,
     lpips: Perceptual | None = None,
     *,
+    supersampling: int = 1,
     ranks: Ranks = ALONE,
     **options: Any,
 ) -> dict[str, dict]:
@@ -67,6 +73,7 @@ def evaluate(
     Args:
         scene: On the device of the pictures; of several ranks each has its part.
         lpips: From `load_lpips`; None: left out.
+        supersampling: As in `TrainingOptions`.
         ranks: Those that share the scene and the views. All of them get all results.
         **options: Further settings.
 
@@ -78,7 +85,7 @@ def evaluate(
     results: dict[str, dict] = {}
     for scale, settings in pictures.resolve(footprint=footprint, sh_degree=scene.sh_degree, **options).items():
         measured = {}
-        for view, image in rendered(gaussians, settings, ranks):
+        for view, image in rendered(gaussians, settings, supersampling, ranks):
             image, truth = image.clamp(0, 1), pictures.truth(scale, view)
             values = [psnr(image, truth), ssim(image, truth)]
             if lpips is not None:
@@ -97,7 +104,7 @@ def _means(rows: list[dict[str, float]]) -> dict[str, float]:
 
 
 def rendered(
-    gaussians: Activated, settings: list[GaussianRasterizationSettings], ranks: Ranks
+    gaussians: Activated, settings: list[GaussianRasterizationSettings], supersampling: int, ranks: Ranks
 ) -> Iterator[tuple[int, Tensor]]:
     """Places in `settings` and pictures (3, H, W) of them; of several ranks they take turns.
 
@@ -106,18 +113,10 @@ def rendered(
     """
     if ranks.world == 1:
         for place, chosen in enumerate(settings):
-            yield place, gaussians.render(chosen)[0]
+            yield place, gaussians.render(chosen, supersampling=supersampling)[0]
         return
     for first in range(0, len(settings), ranks.world):
-        batch = distributed.rasterize(
-            settings[first : first + ranks.world],
-            gaussians.means,
-            gaussians.opacities,
-            shs=gaussians.shs,
-            scales=gaussians.scales,
-            rotations=gaussians.rotations,
-            group=ranks.group,
-        )
+        batch = gaussians.render_together(settings[first : first + ranks.world], supersampling, group=ranks.group)
         for view in batch.views:
             yield first + view.camera, view.image
 
@@ -130,6 +129,7 @@ def save_pictures(
     footprint: str,
     count: int,
     *,
+    supersampling: int = 1,
     ranks: Ranks = ALONE,
     **options: Any,
 ) -> list[Path]:
@@ -145,7 +145,7 @@ def save_pictures(
     chosen = [i * len(pictures.views) // count for i in range(count)]
     for scale, settings in pictures.resolve(footprint=footprint, sh_degree=scene.sh_degree, **options).items():
         of_scale = [folder / f"{name}_{scale}_{pictures.views[view].name}.png" for view in chosen]
-        for place, image in rendered(gaussians, [settings[view] for view in chosen], ranks):
+        for place, image in rendered(gaussians, [settings[view] for view in chosen], supersampling, ranks):
             image, truth = image.clamp(0, 1), pictures.truth(scale, chosen[place])
             row = torch.cat([truth, image, ERROR_GAIN * (image - truth).abs()], dim=2)
             io.to_image(row).save(of_scale[place])

@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
-from .. import io
+from .. import distributed, io
 from ..activations import activate
 from ..rasterizer import GaussianRasterizer
 from ..settings import GaussianRasterizationSettings
+
+if TYPE_CHECKING:
+    from torch.distributed import ProcessGroup
 
 HALF_EDGE = 1.3  # of the cube of random points; NeRF-synthetic objects fit in it
 SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic
@@ -27,9 +32,11 @@ class Gaussians(NamedTuple):
     sh_dc: Tensor  # (P, 1, 3) spherical harmonics, the constant
     sh_rest: Tensor  # (P, K - 1, 3) and the others
 
-    def render(self, settings: GaussianRasterizationSettings, means2D: Tensor | None = None) -> tuple[Tensor, ...]:
-        """What the rasterizer returns: picture (3, H, W), radii (P,) in px with 0 for what is not seen."""
-        return self.activated().render(settings, means2D)
+    def render(
+        self, settings: GaussianRasterizationSettings, means2D: Tensor | None = None, supersampling: int = 1
+    ) -> tuple[Tensor, Tensor]:
+        """As `Activated.render`."""
+        return self.activated().render(settings, means2D, supersampling)
 
     def activated(self) -> Activated:
         """What the rasterizer takes. Differentiable."""
@@ -72,9 +79,17 @@ class Activated(NamedTuple):
     opacities: Tensor  # (P, 1) in (0, 1)
     shs: Tensor  # (P, K, 3)
 
-    def render(self, settings: GaussianRasterizationSettings, means2D: Tensor | None = None) -> tuple[Tensor, ...]:
-        """As `Gaussians.render`."""
-        return GaussianRasterizer(settings)(
+    def render(
+        self, settings: GaussianRasterizationSettings, means2D: Tensor | None = None, supersampling: int = 1
+    ) -> tuple[Tensor, Tensor]:
+        """The picture (3, H, W), and the radii (P,) int32 in px, 0 for what is not seen.
+
+        Args:
+            means2D: Receives the gradient with respect to the projected means.
+            supersampling: Render so many times larger, and average over squares of pixels. Radii, and the pixels of
+                the footprint, are those of the larger picture.
+        """
+        picture, radii = GaussianRasterizer(enlarged(settings, supersampling))(
             means3D=self.means,
             means2D=means2D,
             opacities=self.opacities,
@@ -82,6 +97,42 @@ class Activated(NamedTuple):
             scales=self.scales,
             rotations=self.rotations,
         )
+        return averaged(picture, supersampling), radii
+
+    def render_together(
+        self,
+        settings: list[GaussianRasterizationSettings],
+        supersampling: int = 1,
+        means2d_abs: bool = False,
+        group: ProcessGroup | None = None,
+    ) -> distributed.Batch:
+        """The pictures of several ranks, each of which has a part of the Gaussians: see `distributed.rasterize`.
+
+        Args:
+            supersampling: As in `render`. The splats are those of the larger pictures, and alpha is.
+        """
+        batch = distributed.rasterize(
+            [enlarged(of_camera, supersampling) for of_camera in settings],
+            self.means,
+            self.opacities,
+            shs=self.shs,
+            scales=self.scales,
+            rotations=self.rotations,
+            means2d_abs=means2d_abs,
+            group=group,
+        )
+        views = (view._replace(image=averaged(view.image, supersampling)) for view in batch.views)
+        return replace(batch, views=tuple(views))
+
+
+def enlarged(settings: GaussianRasterizationSettings, times: int) -> GaussianRasterizationSettings:
+    """Those of a picture so many times as large."""
+    return settings._replace(image_height=times * settings.image_height, image_width=times * settings.image_width)
+
+
+def averaged(picture: Tensor, times: int) -> Tensor:
+    """Means over squares of so many pixels, (3, H / times, W / times)."""
+    return avg_pool2d(picture, times) if times > 1 else picture
 
 
 def random_points(count: int, seed: int) -> tuple[Tensor, Tensor]:

@@ -227,22 +227,27 @@ class Run:
         if reason is not None:
             raise error or OSError(reason)
 
-    def evaluate(self) -> dict[str, Any]:
-        """Writes and returns metrics.json: steps, seconds, Gaussians, and `evaluate` on the test views, if any."""
+    def summary(self) -> dict[str, Any]:
+        """Steps, seconds, milliseconds per step and Gaussians so far."""
         steps, seconds = self.progress.step, self.ranks.from_first(self.clock.read())
-        metrics = {
+        return {
             "steps": steps,
             "seconds": seconds,
             "ms_per_step": 1e3 * seconds / max(steps, 1),
             "gaussians": self.count(),
         }
+
+    def evaluate(self) -> dict[str, Any]:
+        """Writes and returns metrics.json: `summary`, and `evaluate` on the test views, if any."""
+        metrics = self.summary()
         if self.capture.test:
             # A random background has no truth of its own to test against: the convention's has.
             background = background_of(self.options, self.capture.background) or self.capture.background
             pictures = load_pictures(
                 self.capture.test, self.options.scales, background, self.device, self.options.downsampling
             )
-            metrics["test"] = evaluate(self.trainer.scene(), pictures, self.options.footprint, ranks=self.ranks)
+            common = {"supersampling": self.options.supersampling, "ranks": self.ranks}
+            metrics["test"] = evaluate(self.trainer.scene(), pictures, self.options.footprint, **common)
         if self.ranks.is_first:
             write_json(self.out / METRICS, metrics)
         return metrics

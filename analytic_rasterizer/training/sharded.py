@@ -73,13 +73,9 @@ class ShardedTrainer(Trainer):
         """This rank's part of the loss, whose sum over the ranks is the loss of the step."""
         options, shown = self.options, self._next()
         gaussians = self.gaussians.activated()
-        batch = distributed.rasterize(
+        batch = gaussians.render_together(
             [picture.settings for picture in shown],
-            gaussians.means,
-            gaussians.opacities,
-            shs=gaussians.shs,
-            scales=gaussians.scales,
-            rotations=gaussians.rotations,
+            options.supersampling,
             means2d_abs=options.density == "absgrad",
             group=self.ranks.group,
         )

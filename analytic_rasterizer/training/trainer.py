@@ -148,7 +148,7 @@ class Trainer:
         losses, seen = [], []
         for scale, view, settings, background in self._next():
             leaf = self.density.leaf(scale)
-            image, radii = gaussians.render(settings, leaf)
+            image, radii = gaussians.render(settings, leaf, options.supersampling)
             truth = self.pictures.truth(scale, view, background)
             losses.append(l1_ssim(image, truth, options.ssim_weight))
             seen.append((leaf, radii))
@@ -182,7 +182,7 @@ class Trainer:
     def warm_up(self) -> None:
         """Renders and differentiates one picture of each scale without a step, so that no step loads kernels."""
         for scale, settings in self._settings().items():
-            image, _ = self.gaussians.render(settings[0])
+            image, _ = self.gaussians.render(settings[0], supersampling=self.options.supersampling)
             truth = self.pictures.truth(scale, 0, settings[0].bg if self.random_background else None)
             l1_ssim(image, truth, self.options.ssim_weight).backward()
         self.optimizer.zero_grad(set_to_none=True)

@@ -40,6 +40,7 @@ void check_device(const Tensor& t, const char* name) {
 void check_projected(Tensor& means2d, Tensor& cov2d, Tensor& opacities, Tensor& dets, const Tensor& row_splits) {
   check_device(means2d, "means2d");
   check_shape(means2d.dim() == 2 && means2d.size(1) == 2, means2d, "means2d", "(N, 2)");
+  check_row_count(means2d.size(0), "means2d");
   means2d = means2d.contiguous();
   const int64_t n = means2d.size(0);
   const Like like{means2d, "means2d"};
@@ -96,6 +97,11 @@ TileGrid grid_of(const FootprintSpec& footprint, int64_t width, int64_t height, 
   return {int(width), int(height), cuda && footprint.moves ? kMovingTileBits : kTileBits};
 }
 
+void check_row_count(int64_t rows, const char* name) {
+  constexpr int64_t kMost = int64_t(1) << 31;
+  TORCH_CHECK_VALUE(rows < kMost, name, " must have fewer than ", kMost, " rows, got ", rows);
+}
+
 void check_image_size(int64_t height, int64_t width) {
   // float32 counts pixels exactly up to 2^24; 2^20 leaves four bits for where in the pixel.
   constexpr int64_t kMax = int64_t(1) << 20;
@@ -126,6 +132,10 @@ void check(Inputs& in) {
     const int64_t needed = sh_count(int(in.sh_degree));
     const bool ok = in.shs->dim() == 3 && in.shs->size(0) == p && in.shs->size(1) >= needed && in.shs->size(2) == 3;
     check_shape(ok, *in.shs, "shs", "(P, M, 3) with P = ", p, " and M >= ", needed, " for sh_degree ", in.sh_degree);
+    // The kernels address the rows of the 32 Gaussians of a warp in 32 bits.
+    constexpr int64_t kMostCoefficients = int64_t(1) << 20;
+    TORCH_CHECK_VALUE(in.shs->size(1) <= kMostCoefficients, "shs must have at most ", kMostCoefficients,
+                      " coefficients per Gaussian, got shape ", shape_of(*in.shs));
     like.check_type(*in.shs, "shs");
     in.shs = in.shs->contiguous();
   }
@@ -264,6 +274,10 @@ void check(BlendArguments& a, const Pass& pass) {
 void check(InspectArguments& a, const ListTensors& lists, const Pass& pass) {
   check_device(lists.splats, "splats");
   check_image_size(a.image_height, a.image_width);
+  constexpr int64_t kMostPixels = int64_t(1) << 31;  // a Gaussian's pixels are counted in 32 bits with a sign
+  TORCH_CHECK_VALUE(a.image_height * a.image_width < kMostPixels,
+                    "gaussian_stats and dominant Gaussians need an image of fewer than ", kMostPixels, " pixels, got ",
+                    a.image_height, " x ", a.image_width);
   check_lists(lists, lists.splats, pass);
   // The ids of a CPU's lists index the results; on CUDA the splats themselves do.
   const int64_t n = lists.splats.size(0);

@@ -51,8 +51,9 @@ void check(SsimArguments& a) {
   // The mean over nothing is not a number.
   TORCH_CHECK_VALUE(image.numel() > 0, "image must have at least one pixel, got shape ", shape_of(image));
   constexpr int64_t kMax = int64_t(1) << 30;
-  TORCH_CHECK_VALUE(image.size(-1) <= kMax && image.size(-2) <= kMax, "image must have at most ", kMax,
-                    " rows and columns, got shape ", shape_of(image));
+  const int64_t planes = image.numel() / (image.size(-1) * image.size(-2));
+  TORCH_CHECK_VALUE(image.size(-1) <= kMax && image.size(-2) <= kMax && planes <= kMax, "image must have at most ",
+                    kMax, " rows, columns and channels of the whole batch, got shape ", shape_of(image));
   a.image = a.image.contiguous();
   a.target = a.target.contiguous();
 }
