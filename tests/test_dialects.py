@@ -6,6 +6,7 @@ import inspect
 import math
 import pickle
 import shutil
+import sys
 
 import pytest
 import scenes
@@ -29,7 +30,7 @@ from originals import (
 
 import analytic_rasterizer as ar
 import diff_gaussian_rasterization as drop_in
-from analytic_rasterizer import dialects
+from analytic_rasterizer import dialects, installation
 from analytic_rasterizer.dialects import _base
 
 pytestmark = pytest.mark.usefixtures("nothing_chosen")
@@ -865,7 +866,7 @@ FAKE = "GaussianRasterizer = None\n"
 @pytest.mark.parametrize(
     "files, message",
     [
-        ({"diff_gaussian_rasterization/__init__.py": FAKE}, "is not that of analytic_rasterizer but"),
+        ({"diff_gaussian_rasterization/__init__.py": FAKE}, "is not that of analytic_rasterizer but another at"),
         ({"diff_gaussian_rasterization/leftover.txt": ""}, "diff_gaussian_rasterization is missing"),
         ({"diff_gaussian_rasterization_ms.py": FAKE}, "diff_gaussian_rasterization_ms is not that of"),
         ({}, None),
@@ -898,6 +899,19 @@ def test_another_distribution_of_the_same_name(tmp_path, files, message):
         assert printed == ""
     else:
         assert printed.count("\n") == 0 and message in printed and "--force-reinstall --no-deps" in printed
+
+
+def test_the_distribution_to_uninstall_is_named(tmp_path, monkeypatch):
+    """As pip knows it, which need not be the name of the module."""
+    info = tmp_path / "their_rasterizer-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: their-rasterizer\nVersion: 1.0\n")
+    (info / "top_level.txt").write_text("diff_gaussian_rasterization\n")
+    (tmp_path / "diff_gaussian_rasterization.py").write_text(FAKE)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "diff_gaussian_rasterization")
+    problem = installation.problem_of("diff_gaussian_rasterization")
+    assert "`pip uninstall -y their-rasterizer` and then `pip install --force-reinstall --no-deps" in problem
 
 
 def installed(folder):
