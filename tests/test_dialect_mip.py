@@ -159,6 +159,15 @@ def test_a_tensor_that_was_looked_at_is_not_asked_for_again(slow_device, monkeyp
     render("mip", subpixel_offset=offset)
 
 
+def test_what_is_known_of_a_tensor_goes_with_it():
+    before = len(mip._known)
+    offset = zeros()
+    render("mip", subpixel_offset=offset)
+    assert len(mip._known) == before + 1
+    del offset
+    assert len(mip._known) == before
+
+
 def test_debug_looks_at_every_offset(slow_device):
     exhaust_looks()
     with pytest.raises(ValueError, match="the same for all pixels"):

@@ -342,9 +342,9 @@ def with_channels(
     """
     gaussians = means3D, means2D, opacities
     shape = scales, rotations, cov3D_precomp
-    further = ()
-    if isinstance(features, torch.Tensor) and features.dim() == 2:
-        features, *further = features.split(_C.MAX_CHANNELS - 3, dim=1)
+    most, further = _C.MAX_CHANNELS - 3, ()
+    if isinstance(features, torch.Tensor) and features.dim() == 2 and features.shape[1] > most:
+        features, *further = features.split(most, dim=1)
     image, radii, *outputs = render(settings, settings.outputs, *gaussians, shs, colors_precomp, *shape, features)
     color, *images = image.tensor_split((3,))
     for channels in further:

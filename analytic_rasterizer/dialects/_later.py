@@ -29,6 +29,8 @@ class LaterFlags:
 
     def any_set(self) -> bool:
         """Whether a flag was set among those that have arrived since the last call."""
+        if not self._places:  # as a rule, and taking a lock costs time
+            return False
         found = False
         with self._lock:
             while self._places:
