@@ -80,6 +80,15 @@ def test_the_table_of_the_documentation():
         assert name == "mini" or any(repository.lower() in repositories.lower() for repository in settings.repositories)
 
 
+def test_every_repository_has_its_row_in_the_guide():
+    """docs/migrating.md says what to set for each that a dialect names, but for second names of the same."""
+    plain_name = lambda text: "".join(filter(str.isalnum, text.lower()))  # noqa: E731
+    guide = plain_name((ROOT / "docs" / "migrating.md").read_text())
+    for name in dialects.DIALECTS:
+        for repository in dialects.dialect_module(name).GaussianRasterizationSettings.repositories:
+            assert repository in ("3DGS accel", "Deformable-3D-Gaussians") or plain_name(repository) in guide
+
+
 def test_names_are_unique():
     """A repository belongs to one dialect, however it is spelled, and no dialect has the name of another's."""
     owner = {}
