@@ -104,7 +104,7 @@ def _offset_of(offset: torch.Tensor, shape: tuple[int, int, int], debug: bool) -
         )
     x, y = low
     _looks_left = float("inf") if (x, y) != (0.0, 0.0) else _looks_left - 1
-    _known[key] = weakref.ref(offset, lambda _: _known.pop(key, None)), version, (x, y)
+    _known[key] = weakref.ref(offset, lambda _, forget=_known.pop: forget(key, None)), version, (x, y)
     return x, y
 
 
