@@ -41,7 +41,7 @@ ALPHA_MAX, TRANSMITTANCE_MIN = 0.99, 1e-4
 FAINTEST = 1e-5  # alphas below this are left out everywhere
 REACH = 1.5  # splats are looked for so many times as far away, since their outlines are not those of [EWA]
 BLOCK = 16  # px; the splats of a block are looked for once
-ELEMENTS = 2**21  # of a tensor: samples times splats
+ELEMENTS = 2**18  # of a tensor: samples times splats
 
 
 @dataclass(frozen=True)
@@ -102,20 +102,22 @@ class Splats:
         return ((self.mean + reach > low) & (self.mean - reach < high)).all(1).nonzero()[:, 0]
 
 
-def alphas_and_depths(s: Splats, ids, rays: torch.Tensor, pixels: torch.Tensor, projection: str):
-    """(M, N) alpha, not bounded by 0.99, and the depth at which each ray meets each splat.
+def affine_alphas(s: Splats, ids: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
+    """(M, N) alpha of the projected splats at `pixels` (M, 2), not bounded by 0.99."""
+    x, y = (pixels[:, k, None] - s.mean[ids, k] for k in range(2))
+    xx, xy, yy = s.conic[ids].unbind(1)
+    return s.opacity[ids] * torch.exp(-(xx * x * x + 2 * xy * x * y + yy * y * y) / 2)
 
-    `rays` (M, 3) are directions in camera space with z = 1, `pixels` (M, 2) the same in px.
+
+def alphas_and_depths(s: Splats, ids: torch.Tensor, rays: torch.Tensor, projection: str):
+    """(M, N) alpha in space, not bounded by 0.99, and the depth at which each ray meets each splat.
+
+    `rays` (M, 3) are directions in camera space with z = 1.
     """
     ray = [sum(s.whiten[ids, i, k] * rays[:, k, None] for k in range(3)) for i in range(3)]
     centre = (s.whiten[ids] @ s.centre[ids, :, None])[..., 0].unbind(1)
     square = sum(r * r for r in ray)
     depth = sum(r * c for r, c in zip(ray, centre)) / square
-    if projection == "affine":
-        d = pixels[:, None] - s.mean[ids]
-        xx, xy, yy = s.conic[ids].unbind(1)
-        q = xx * d[..., 0] ** 2 + 2 * xy * d[..., 0] * d[..., 1] + yy * d[..., 1] ** 2
-        return s.opacity[ids] * torch.exp(-q / 2), depth
     # |centre x ray|^2 / |ray|^2, which does not cancel: squared distance of the ray from the Gaussian in its own units.
     pairs = ((0, 1), (1, 2), (2, 0))
     q = sum((centre[i] * ray[j] - centre[j] * ray[i]) ** 2 for i, j in pairs) / square
@@ -127,22 +129,33 @@ def alphas_and_depths(s: Splats, ids, rays: torch.Tensor, pixels: torch.Tensor, 
     return torch.where(depth > 0, alpha, 0), depth
 
 
-def composite(alpha: torch.Tensor, color: torch.Tensor, variant: Variant) -> torch.Tensor:
-    """(M, 3) of alphas (M, N) front to back and colours (M, N, 3) or (N, 3), over black."""
+def weights(alpha: torch.Tensor, variant: Variant) -> torch.Tensor:
+    """(M, N) what each splat adds to each sample, of alphas (M, N) front to back."""
     alpha = torch.where(alpha < variant.alpha_min, 0, alpha.clamp(max=ALPHA_MAX))
     behind = torch.cumprod(1 - alpha, 1)
     front = torch.cat([torch.ones_like(behind[:, :1]), behind[:, :-1]], 1)
-    weight = torch.where(behind < variant.transmittance_min, 0, front * alpha)
-    return weight @ color if color.dim() == 2 else (weight[..., None] * color).sum(1)
+    return torch.where(behind < variant.transmittance_min, 0, front * alpha)
+
+
+def sample(s: Splats, ids: torch.Tensor, rays: torch.Tensor, pixels: torch.Tensor, variant: Variant) -> torch.Tensor:
+    """(M, 3) colours of samples, over black."""
+    if variant.projection == "affine":
+        alpha = affine_alphas(s, ids, pixels)
+    if variant.projection != "affine" or not variant.central_order:
+        in_space, depth = alphas_and_depths(s, ids, rays, variant.projection)
+        alpha = alpha if variant.projection == "affine" else in_space
+    if variant.central_order:
+        return weights(alpha, variant) @ s.color[ids]
+    order = depth.sort(dim=1, stable=True).indices
+    sorted_weights = weights(alpha.gather(1, order), variant)
+    return torch.empty_like(alpha).scatter_(1, order, sorted_weights) @ s.color[ids]
 
 
 def render(s: Splats, view: io.View, corner: tuple[int, int], size: tuple[int, int], samples: int, variant: Variant):
     """(3, height, width) of the rectangle of `size` (width, height) whose first pixel is `corner`."""
     width, height = size
-    focal = torch.tensor([view.fx, view.fy], dtype=torch.float64)
-    principal = torch.tensor(
-        [c if c is not None else n / 2 for c, n in ((view.cx, view.width), (view.cy, view.height))]
-    )
+    centre = [n / 2 if c is None else c for c, n in ((view.cx, view.width), (view.cy, view.height))]
+    focal, principal = torch.tensor([[view.fx, view.fy], centre], dtype=torch.float64)
     grid = (torch.arange(samples, dtype=torch.float64) + 0.5) / samples - 0.5
     image = torch.zeros(height, width, 3, dtype=torch.float64)
     for y in range(0, height, BLOCK):
@@ -153,14 +166,8 @@ def render(s: Splats, view: io.View, corner: tuple[int, int], size: tuple[int, i
             columns, rows = ((torch.arange(n)[:, None] + grid).flatten() for n in (w, h))
             pixels = low + torch.cartesian_prod(rows, columns).flip(1)
             rays = torch.cat([(pixels + 0.5 - principal) / focal, torch.ones(len(pixels), 1, dtype=torch.float64)], 1)
-            colors = []
-            for part in torch.arange(len(pixels)).split(max(1, ELEMENTS // max(1, len(ids)))):
-                alpha, depth = alphas_and_depths(s, ids, rays[part], pixels[part], variant.projection)
-                color = s.color[ids]
-                if not variant.central_order:
-                    order = depth.sort(dim=1, stable=True).indices
-                    alpha, color = alpha.gather(1, order), color[order]
-                colors.append(composite(alpha, color, variant))
+            parts = zip(*(part.split(max(1, ELEMENTS // max(1, len(ids)))) for part in (rays, pixels)))
+            colors = [sample(s, ids, *part, variant) for part in parts]
             block = torch.cat(colors).view(h, samples, w, samples, 3)
             image[y : y + h, x : x + w] = block.mean((1, 3))
     return image.permute(2, 0, 1)
@@ -182,13 +189,13 @@ def main() -> None:
     args = parse_arguments()
     torch.set_num_threads(args.threads)
     scene, results = load_scene(args.scene), []
+    print(markdown_table(["view", "scale", "library", *VARIANTS], []), flush=True)
     for view in io.load_views(args.views)[: args.limit_views]:
         for scale in args.scales:
             measured = measure(scene, view.framed(scale), tuple(args.crop), args.samples)
             results.append({"view": view.name, "scale": scale, **measured})
-    header = ["view", "scale", "library", *VARIANTS]
-    rows = [[r["view"], f"1/{r['scale']}", *(f"{r[name]:.1f}" for name in header[2:])] for r in results]
-    print(markdown_table(header, rows))
+            numbers = " | ".join(f"{value:.1f}" for value in measured.values())
+            print(f"| {view.name} | 1/{scale} | {numbers} |", flush=True)
     save_json(args, {"results": results})
 
 

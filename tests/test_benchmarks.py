@@ -168,7 +168,7 @@ def test_perspective_is_that_of_sampling_along_rays(small_scene):
     through_centres = torch.trapezoid(*along(straight), dim=-1).diagonal()
     expected = {"maximum": density.amax(-1), "integral": torch.trapezoid(density, distance, dim=-1) / through_centres}
     for projection, sampled in expected.items():
-        alpha, depth = benchmark.alphas_and_depths(splats, ids, rays, rays[:, :2], projection)
+        alpha, depth = benchmark.alphas_and_depths(splats, ids, rays, projection)
         front = depth > 0
         assert front.any() and (alpha[~front] == 0).all()
         torch.testing.assert_close(alpha[front], (splats.opacity[ids] * sampled)[front], rtol=1e-9, atol=1e-15)
