@@ -30,12 +30,7 @@ from .inspection import BINS, NARROW, TILE_SAMPLES, Candidate, Finding, SceneRep
 
 REFERENCE = "moment:samples=16"
 BASE = "box:samples=1"
-ADAPTIVE = (
-    8,
-    4,
-    2,
-    1,
-)  # in tolerances of the plan: on two trained scenes its RMS is at most a quarter of what is asked
+ADAPTIVE = (8, 4, 2, 1)  # in tolerances of the plan: on two trained scenes its RMS is at most a quarter of its own
 LADDER = (BASE, "moment:samples=1", "box:samples=4", "moment:samples=4", "box:samples=8", "box:samples=16")
 SH_SHARE = 0.5  # of the tolerance, at most, for the harmonics left out
 FILTER_SHARE = 0.25  # of the tolerance: below it the 3D filter is left out
