@@ -34,7 +34,7 @@ COLUMNS = {  # footprint: its title on the sheet
     "cumulant": "cumulant",
     "box:samples=1": "box, 1 sample",
     "box:samples=4": "box, 4 samples",
-    "box:samples=8": "box, 8 samples",
+    "moment:samples=4": "moment, 4 cells",
 }
 
 INK = (0.09, 0.11, 0.17)

@@ -11,7 +11,7 @@ scene = {
     "scales": torch.full((3, 3), 0.3),
     "rotations": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(3, 1),
 }
-settings = ar.camera_settings(torch.eye(4), width=64, height=48, fx=60.0, fy=60.0, footprint="box", samples=4)
+settings = ar.camera_settings(torch.eye(4), width=64, height=48, fx=60.0, fy=60.0, footprint="moment", samples=4)
 color, radii = ar.GaussianRasterizer(settings)(means3D=means, means2D=None, **scene)
 color.sum().backward()
 

@@ -15,7 +15,7 @@ import torch
 from analytic_rasterizer.training import Run, TrainingOptions
 
 folder, out, *footprints = sys.argv[1:]
-for footprint in footprints or ["analytic", "box:samples=4"]:
+for footprint in footprints or ["analytic", "box:samples=4", "moment:samples=4"]:
     options = TrainingOptions(footprint=footprint, scales=(1, 2, 4, 8), iterations=7000)
     name = footprint.replace(":", "_").replace("=", "_")
     run = Run(folder, Path(out) / name, options, device="cuda" if torch.cuda.is_available() else "cpu")

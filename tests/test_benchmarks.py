@@ -385,3 +385,70 @@ def test_distributed(small_scene):
     # Exact where each rank has half of the splats of each camera; here each has at most all of them.
     assert 0 < two["sent"] <= 2 * written["model"]["2"]["sent"]
     assert written["model"]["64"]["images_per_second"] > written["model"]["4"]["images_per_second"] > 0
+
+
+def test_approximations(small_scene, monkeypatch, capsys):
+    """The program's first picture is the library's, and what is approximated changes it (no ray of it is dark)."""
+    benchmark = importlib.import_module("approximations")
+    arguments = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--json", small_scene / "out.json"]
+    options = ["--scales", "1", "--crop", "24", "20", "--samples", "2", "--limit-views", "1", "--threads", "1"]
+    monkeypatch.setattr(sys, "argv", ["approximations.py", *map(str, arguments), *options])
+    benchmark.main()
+    assert "| a | 1/1 |" in capsys.readouterr().out
+    [result] = json.loads((small_scene / "out.json").read_text())["results"]
+    # One of the 1920 samples on the other side of a threshold by rounding: 1/255/4 in one of 480 pixels.
+    assert result["library"] > -20 * math.log10(1 / 255 / 4 / math.sqrt(480))
+    changed = [name for name in benchmark.VARIANTS if name != "0.9999"]
+    assert all(0 < result[name] < 0.9 * result["library"] for name in changed)
+
+
+def test_perspective_is_that_of_sampling_along_rays(small_scene):
+    """Maximum and integral of a Gaussian along a ray, by their closed forms and at 1,001 points of the ray."""
+    benchmark = importlib.import_module("approximations")
+    scene = importlib.import_module("scene_files").load_scene(small_scene / "scene.npz")
+    splats = benchmark.Splats(scene, io.load_views(small_scene / "views.json")[0])
+    ids = torch.arange(8)
+    rays = torch.tensor([[0.0, 0.0, 1.0], [0.2, -0.3, 1.0], [-0.5, 0.4, 1.0]], dtype=torch.float64)
+    straight = splats.centre[ids] / splats.centre[ids, 2:]  # through the centre of each
+
+    def along(rays):
+        """(M, N, 1001) density relative to the peak, and distances of the points from the camera."""
+        at = torch.linspace(-1, 1, 1001, dtype=torch.float64)
+        whitened = (splats.whiten[ids] @ rays.T).permute(2, 0, 1)
+        centre = (splats.whiten[ids] @ splats.centre[ids, :, None])[..., 0]
+        square = whitened.square().sum(-1)
+        t = (whitened * centre).sum(-1)[..., None] / square[..., None] + 8 * at / square[..., None].sqrt()
+        d = t[..., None] * whitened[:, :, None] - centre[None, :, None]
+        return torch.exp(-d.square().sum(-1) / 2), t * rays.norm(dim=1)[:, None, None]
+
+    density, distance = along(rays)
+    through_centres = torch.trapezoid(*along(straight), dim=-1).diagonal()
+    expected = {"maximum": density.amax(-1), "integral": torch.trapezoid(density, distance, dim=-1) / through_centres}
+    for projection, sampled in expected.items():
+        alpha, depth = benchmark.alphas_and_depths(splats, ids, rays, projection)
+        front = depth > 0
+        assert front.any() and (alpha[~front] == 0).all()
+        torch.testing.assert_close(alpha[front], (splats.opacity[ids] * sampled)[front], rtol=1e-9, atol=1e-15)
+
+
+def test_order_of_each_ray(small_scene):
+    """Two plates that cross: on each side another one is in front, whichever has the nearer centre."""
+    benchmark = importlib.import_module("approximations")
+    turn = math.pi / 8  # half of the angle between plate and picture
+    scene = io.Scene(
+        means=torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 4.01]]),
+        scales=torch.tensor([[1.0, 1.0, 0.01]]).repeat(2, 1),
+        rotations=torch.tensor([[math.cos(turn), 0, math.sin(turn), 0], [math.cos(turn), 0, -math.sin(turn), 0]]),
+        opacities=torch.full((2, 1), 0.99),
+        shs=torch.tensor([[[1.5, -1.5, -1.5]], [[-1.5, 1.5, -1.5]]]),
+        sh_degree=0,
+    )
+    view = io.View("a", 32, 16, 30.0, 30.0, torch.eye(4, dtype=torch.float64))
+    splats = benchmark.Splats(scene, view)
+    by_center, by_ray = (
+        benchmark.render(splats, view, (0, 0), (32, 16), 2, benchmark.Variant(central_order=central))
+        for central in (True, False)
+    )
+    left, right = (slice(None), 8, 11), (slice(None), 8, 20)
+    assert by_center[left][0] > by_center[left][1] and by_center[right][0] > by_center[right][1]
+    assert (by_ray[left][0] > by_ray[left][1]) != (by_ray[right][0] > by_ray[right][1])

@@ -60,7 +60,7 @@ def check_recommendation(scene, views, found, filter_3d=None):
     effects = found.effects
     for view, reported in zip(views, found.views):
         recommended = picture(scene, view, found.footprint, effects.sh_degree, effects.filter_3d)
-        everything = picture(scene, view, "box:samples=16", filter_3d=filter_3d)
+        everything = picture(scene, view, planner.REFERENCE, filter_3d=filter_3d)
         rms = (recommended.double() - everything).square().mean().sqrt().item()
         assert rms <= found.tolerance
         assert rms == pytest.approx(reported.rms, rel=1e-3, abs=1e-7)
@@ -94,7 +94,18 @@ def test_splats_larger_than_a_pixel_need_one_sample(device, clock):
     found = ar.inspect_scene(random_scene(device, sizes="large"), settings(device))
     assert found.footprint == "box:samples=1" and not find(found, "footprint").needed
     assert all(view.narrow == 0 and view.tile_shares[1] == 1 for view in found.views)
-    assert {candidate.footprint: candidate.cost for candidate in found.candidates}["box:samples=4"] == 2
+    costs = {candidate.footprint: candidate.cost for candidate in found.candidates}
+    assert (costs["box:samples=1"], costs["moment:samples=1"]) == (1, 2)
+
+
+def test_moment_is_tried_and_measured_against(device):
+    """The reference is the footprint that is nearest to the integral over the pixel, and every other way of being
+    nearer than one sample is a candidate, so that what is recommended is what measures best."""
+    assert planner.REFERENCE == "moment:samples=16"
+    found = ar.inspect_scene(random_scene(device, sizes="fine", count=4000), settings(device), TOLERANCE, rounds=1)
+    rms = {candidate.footprint: candidate.rms for candidate in found.candidates}
+    assert {f"moment:samples={n}" for n in (1, 4, 9, 16)} <= set(rms)
+    assert rms["moment:samples=4"] < min(rms["box:samples=4"], rms["box:samples=1"])
 
 
 def test_splats_finer_than_a_pixel_need_more(device, clock):
@@ -170,7 +181,7 @@ def test_hidden_gaussians_change_nothing(device):
     assert "40 behind the near plane" in hidden.reason and "60 beside every picture" in hidden.reason
     assert f"{count - 100} too faint" in hidden.reason
     left = io.Scene(*(field[found.shown] for field in scene[:-1]), scene.sh_degree)
-    for footprint in ("box:samples=16", found.footprint):
+    for footprint in (planner.REFERENCE, found.footprint):
         assert torch.equal(picture(scene, view[0], footprint), picture(left, view[0], footprint))
 
 
@@ -238,7 +249,7 @@ def test_bad_numbers(device, tolerance):
     assert not found.shown[[3, 5, 7, 9]].any() and found.effects.sh_degree is None
     json.dumps(found.to_json(), allow_nan=False)
     if tolerance == 0:
-        assert found.footprint == "box:samples=16"
+        assert found.footprint == planner.REFERENCE
 
 
 def test_empty_scene(device):

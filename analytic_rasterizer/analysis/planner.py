@@ -28,9 +28,10 @@ from ..stages import Splats, Stages, project, render_stages
 from . import timing
 from .inspection import BINS, NARROW, TILE_SAMPLES, Candidate, Finding, SceneReport, ViewReport, in_255, percent, share
 
-REFERENCE = "box:samples=16"
+REFERENCE = "moment:samples=16"
 BASE = "box:samples=1"
-ADAPTIVE = (8, 4, 2, 1)  # tolerances to try, in that of the plan: on two trained scenes the RMS is at most a quarter
+ADAPTIVE = (8, 4, 2, 1)  # in tolerances of the plan: on two trained scenes its RMS is at most a quarter of its own
+LADDER = (BASE, "moment:samples=1", "box:samples=4", "moment:samples=4", "box:samples=8", "box:samples=16")
 SH_SHARE = 0.5  # of the tolerance, at most, for the harmonics left out
 FILTER_SHARE = 0.25  # of the tolerance: below it the 3D filter is left out
 FINER = 1.1  # a view calls for the 3D filter if it samples so many times as finely as in training
@@ -89,8 +90,8 @@ def inspect_scene(
     if rounds is not None and not (isinstance(rounds, int) and rounds >= 1):
         raise ValueError(f"rounds must be a positive whole number, got {rounds!r}")
     survey = _survey(scene, cameras, tolerance, training)
-    ladder = [BASE, "box:samples=4", *(f"adaptive:tolerance={k * tolerance:.4g}" for k in ADAPTIVE), "box:samples=8"]
-    rms = {footprint: [] for footprint in [*ladder, REFERENCE]}
+    adaptive = (f"adaptive:tolerance={k * tolerance:.4g}" for k in ADAPTIVE)
+    rms = {footprint: [] for footprint in [*LADDER, *adaptive, "moment:samples=9", REFERENCE]}
     fitting, seen = list(rms), []  # footprints within the tolerance so far; what each view shows
     shown = on_image = torch.zeros(len(scene.means), dtype=torch.bool, device=scene.means.device)
     top_band = 0.0  # what the last band of the harmonics changes

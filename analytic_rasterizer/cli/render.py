@@ -23,7 +23,7 @@ def add_parser(subcommands) -> None:
     add("--out", required=True, metavar="DIR", help="folder for the pictures")
     footprint = "how a pixel sees a splat (default: the library's, analytic)"
     add("--footprint", metavar="NAME[:k=v,..]", help=footprint)
-    add("--samples", type=int, help="samples of the box footprint: 1, 2, 4, 8, 16")
+    add("--samples", type=int, help="samples of a pixel: 1, 2, 4, 8 or 16 of box, 1, 4, 9 or 16 of moment")
     parser.set_defaults(run=run)
 
 
