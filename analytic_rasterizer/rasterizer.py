@@ -192,7 +192,7 @@ class GaussianRasterizer(torch.nn.Module):
             ValueError: Wrong shape, device or value. The message names the argument, what was expected
                 and what came.
             RuntimeError: CUDA tensors, and an extension without CUDA; or an error of CUDA.
-            torch.OutOfMemoryError: No room for splats, pairs or gradients on the device.
+            torch.OutOfMemoryError: No room for splats, pairs or gradients, on the CPU as on CUDA.
         """
         return rasterize_gaussians(
             means3D,

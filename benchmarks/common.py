@@ -47,13 +47,24 @@ def add_measuring(parser: argparse.ArgumentParser) -> None:
 
 
 def parse(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """The arguments, on a device that is there; sets the number of threads."""
+    """The arguments, settled; sets the number of threads."""
     args = parser.parse_args()
+    settle(parser, args)
+    torch.set_num_threads(args.threads)
+    return args
+
+
+def settle(parser: argparse.ArgumentParser, args: argparse.Namespace) -> None:
+    """Sets the number of rounds if it was not given. Ends the program where the device is not there."""
     if args.device == "cuda" and not has_cuda():
         parser.error("--device cuda: no CUDA device, or analytic_rasterizer was built without CUDA")
     args.rounds = args.rounds or ROUNDS[args.device]
-    torch.set_num_threads(args.threads)
-    return args
+
+
+def parse_size(text: str) -> tuple[int, int]:
+    """(width, height) of "WxH"."""
+    width, height = map(int, text.split("x"))
+    return width, height
 
 
 def has_cuda() -> bool:

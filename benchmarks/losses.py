@@ -21,7 +21,7 @@ from collections.abc import Callable
 from functools import partial
 
 import torch
-from common import CLOCKS, add_measuring, parse, save_json
+from common import CLOCKS, add_measuring, parse, parse_size, save_json
 from torch import Tensor
 from torch.nn import functional
 
@@ -51,12 +51,6 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument("--gaussians", type=int, default=200_000)
     add_measuring(parser)
     return parse(parser)
-
-
-def parse_size(text: str) -> tuple[int, int]:
-    """(width, height) of "WxH"."""
-    width, height = map(int, text.split("x"))
-    return width, height
 
 
 # ----------------------------------------------------------------------------------------- what is timed

@@ -1,6 +1,7 @@
 """What each footprint costs: time per stage and memory, on any scene and views, on the CPU or with CUDA.
 
     python benchmarks/speed.py SCENE --views VIEWS [--footprints box:samples=1 analytic ...] [--device cuda]
+                               [--against gsplat,module:NAME ...]
 
 The table gives medians over rounds, averaged over views, and the ratio to the first footprint.
 "forward" is without gradient; "forward+backward" differentiates sum(image * w) for fixed random w in
@@ -17,6 +18,10 @@ and `GaussianRasterizer`, both without gradient, and forward and backward of the
 torch's allocator handed out; room for pairs follows the largest of the footprint's views of one size,
 with reserve.
 
+With --against, other rasterizers that are installed are timed beside ours (peers.py says which and how): all of them
+in turn with the footprints, also with CUDA, where the room for pairs then is that of the footprint that has most. Of a
+peer only the whole pass is timed. "differs" is the mean absolute difference of its pictures from ours.
+
 Stages are those of `render_stages`, without gradient; "backward" is forward+backward less forward, so
 it also holds what forward does only for its sake.
 """
@@ -28,6 +33,7 @@ from functools import partial
 
 import torch
 from common import CLOCKS, make_parser, mean_of, measure, parse, print_setup, save_json
+from peers import find_peers, mean_difference
 from scene_files import load_scene, pad_sh
 
 import analytic_rasterizer as ar
@@ -47,21 +53,12 @@ def main() -> None:
         if args.sh_degree < scene.sh_degree:
             raise SystemExit(f"--sh-degree {args.sh_degree} is below the scene's, {scene.sh_degree}")
         scene = pad_sh(scene, args.sh_degree)
-    scene = scene.to(args.device)
-    views = io.load_views(args.views)
-    cases = {name: [SpeedCase(scene, view, name) for view in views] for name in args.footprints}
-    together = [{name: of_name} for name, of_name in cases.items()] if args.device == "cuda" else [cases]
-    measured = {}
-    for part in together:
-        measured |= measure(part, partial(time_round, device=args.device), args.device, args.rounds)
-    for name, of_name in cases.items():
-        for case, result in zip(of_name, measured[name]):
-            result["extra_share"] = result["extra_bytes"] / case.budget(result["pairs"])
-    results = {name: summarize(per_view) for name, per_view in measured.items()}
+    scene, views = scene.to(args.device), io.load_views(args.views)
+    results, per_view = measure_scene(args, scene, views)
     print_setup(scene, views, args.device)
     print(format_results(results, args.device))
     print("B/budget: extra memory over 120 B per Gaussian + 64 B per pair + 64 B per pixel")
-    save_json(args, {"results": results, "per_view": measured})
+    save_json(args, {"results": results, "per_view": per_view})
 
 
 def parse_arguments() -> argparse.Namespace:
@@ -69,20 +66,49 @@ def parse_arguments() -> argparse.Namespace:
     parser.add_argument(
         "--sh-degree", type=int, choices=range(4), help="pad the SH with zeros to this degree, as trainers hold them"
     )
+    add_against(parser)
     return parse(parser)
+
+
+def add_against(parser: argparse.ArgumentParser) -> None:
+    """Adds --against, a list of names; empty without it."""
+    add, split = parser.add_argument, lambda text: text.split(",")
+    add("--against", type=split, default=[], metavar="PEER[,PEER...]", help="other rasterizers: peers.py")
+
+
+def measure_scene(args: argparse.Namespace, scene: io.Scene, views: list[io.View]) -> tuple[dict, dict]:
+    """(means over the views, numbers of every view), each by footprint and peer; seconds and bytes."""
+    peers = find_peers(args.against, args.device)
+    cases = {name: [SpeedCase(scene, view, name) for view in views] for name in args.footprints}
+    cases |= {name: [make(scene, view) for view in views] for name, make in peers.items()}
+    by_themselves = args.device == "cuda" and not peers
+    together = [{name: of_name} for name, of_name in cases.items()] if by_themselves else [cases]
+    measured = {}
+    for part in together:
+        measured |= measure(part, partial(time_round, device=args.device), args.device, args.rounds)
+    for name, of_name in cases.items():
+        for case, view, result in zip(of_name, views, measured[name]):
+            if name in peers:
+                result["difference"] = mean_difference(case, scene, view)
+            else:
+                result["extra_share"] = result["extra_bytes"] / case.budget(result["pairs"])
+    return {name: summarize(per_view) for name, per_view in measured.items()}, measured
 
 
 def format_results(results: dict[str, dict], device: str) -> str:
     base = next(iter(results.values()))
     parts = [*STAGES, "backward", *HOST] if device == "cuda" else [*STAGES, "backward"]
     header = ["footprint", "forward ms", "forward+backward ms", "ratio", "ratio f+b"]
+    further = ["pairs", "extra MiB", "B/budget"]
+    with_peers = any("difference" in r for r in results.values())
     rows = []
     for name, r in results.items():
         ratios = [r[key] / base[key] for key in ("forward", "forward_backward")]
-        seconds = [1e3 * r[key] for key in ("forward", "forward_backward", *parts)]
-        memory = [r["extra_bytes"] / 2**20, r["extra_share"]]
-        rows.append([name, *seconds[:2], *ratios, *seconds[2:], round(r["pairs"]), *memory])
-    return format_table([*header, *parts, "pairs", "extra MiB", "B/budget"], rows)
+        seconds = [1e3 * r[key] if key in r else None for key in ("forward", "forward_backward", *parts)]
+        pairs = round(r["pairs"]) if "pairs" in r else None
+        rows.append([name, *seconds[:2], *ratios, *seconds[2:], pairs, r["extra_bytes"] / 2**20, r.get("extra_share")])
+        rows[-1] += [r.get("difference")] if with_peers else []
+    return format_table([*header, *parts, *further, *(["differs"] if with_peers else [])], rows)
 
 
 class SpeedCase(Case):
@@ -110,24 +136,32 @@ class SpeedCase(Case):
         return 120 * len(self.gaussians["means3D"]) + 64 * pairs + 64 * pixels
 
 
-def time_round(case: SpeedCase, device: str) -> dict:
+def time_round(case: Case, device: str) -> dict:
     """Seconds of the stages, of a forward pass without gradient, and of one with its backward pass; with CUDA also
-    until calls return when the device has nothing else to do."""
-    clock, stages = CLOCKS[device], case.stages()
-    result = {**stages.seconds, "pairs": len(stages.pairs)}
-    del stages
+    until calls return when the device has nothing else to do. Of a peer's case only those of whole passes."""
+    clock, result = CLOCKS[device], {}
+    own = isinstance(case, SpeedCase)
+    if own:
+        stages = case.stages()
+        result = {**stages.seconds, "pairs": len(stages.pairs)}
+        del stages
     result |= {"forward": clock(case.forward), "forward_backward": clock(case.forward_backward)}
     result["backward"] = result["forward_backward"] - result["forward"]
     if device == "cuda":
-        for name, call in zip(HOST, (case.op, case.forward, case.forward_backward)):
-            result[name] = seconds_of(call)
-            torch.cuda.synchronize()
+        calls = [case.op if own else None, case.forward, case.forward_backward]
+        for name, call in zip(HOST, calls):
+            if call is not None:
+                result[name] = seconds_of(call)
+                torch.cuda.synchronize()
     return result
 
 
 def summarize(per_view: list[dict]) -> dict:
     """Means over views; of the share of the memory budget the worst."""
-    return {**mean_of(per_view), "extra_share": max(view["extra_share"] for view in per_view)}
+    summary = mean_of(per_view)
+    if "extra_share" in summary:
+        summary["extra_share"] = max(view["extra_share"] for view in per_view)
+    return summary
 
 
 if __name__ == "__main__":

@@ -155,7 +155,7 @@ def train_once(options: TrainingOptions, seed: int, capture, train, test, args) 
                 bar.update(trainer.progress.step - bar.n)
     clock.stop()
     paces = [(b[1] - a[1]) / (b[0] - a[0]) for a, b in pairwise(history)] or [history[0][1] / history[0][0]]
-    results = evaluate(trainer.scene(), test, options.footprint)
+    results = evaluate(trainer.scene(), test, options.footprint, supersampling=options.supersampling)
     for values in results.values():
         values.pop("views", None)
     return {

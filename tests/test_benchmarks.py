@@ -1,17 +1,22 @@
 """The programs in benchmarks/ run, on a scene so small that their numbers mean nothing."""
 
 import importlib
+import inspect
 import json
 import math
 import sys
+import types
+from typing import Any, NamedTuple
 
 import pytest
 import scenes
 import torch
 from conftest import ROOT
 
+import analytic_rasterizer as ar
 from analytic_rasterizer import io
 from analytic_rasterizer.dialects import DIALECTS
+from analytic_rasterizer.dialects.gsplat import rasterization
 
 
 @pytest.fixture
@@ -79,6 +84,234 @@ def test_speed(device, small_scene, monkeypatch, capsys):
         assert all(math.isfinite(value) for value in result.values())
         assert min(result["forward"], result["forward_backward"], result["pairs"]) > 0
         assert len(written["per_view"][name]) == 2
+
+
+class OfficialSettings(NamedTuple):
+    """Those of a fork of 3DGS: two more than ours."""
+
+    image_height: int
+    image_width: int
+    tanfovx: float
+    tanfovy: float
+    bg: torch.Tensor
+    scale_modifier: float
+    viewmatrix: torch.Tensor
+    projmatrix: torch.Tensor
+    sh_degree: int
+    campos: torch.Tensor
+    prefiltered: bool
+    debug: bool
+    antialiasing: bool
+    kernel_size: float
+
+
+class OfficialRasterizer:
+    """Renders as 3DGS does, and returns a depth map besides."""
+
+    def __init__(self, settings: OfficialSettings):
+        assert (settings.antialiasing, settings.kernel_size) == (False, 0.1)
+        self.rasterizer = ar.GaussianRasterizer(ar.GaussianRasterizationSettings(*settings[:12], footprint="point"))
+
+    def __call__(self, means3D, means2D, opacities, shs, scales, rotations) -> tuple[Any, ...]:
+        color, radii = self.rasterizer(means3D, means2D, opacities, shs=shs, scales=scales, rotations=rotations)
+        return color, radii, color[:1]
+
+
+def add_peers(monkeypatch):
+    """Modules that look like other rasterizers, and the calls of gsplat's that are made."""
+    calls = []
+
+    def recorded(*args, **kwargs):
+        calls.append((args, kwargs))
+        return rasterization(*args, **kwargs)
+
+    modules = {
+        "gsplat": {"rasterization": recorded},
+        "official": {"GaussianRasterizer": OfficialRasterizer, "GaussianRasterizationSettings": OfficialSettings},
+        "strange": {},
+    }
+    for name, content in modules.items():
+        module = types.ModuleType(name)
+        vars(module).update(content)
+        monkeypatch.setitem(sys.modules, name, module)
+    peers = importlib.import_module("peers")
+    for case in (peers.GsplatCase, peers.ModuleCase):
+        monkeypatch.setattr(case, "needs_cuda", False)
+    return calls
+
+
+def test_speed_against(device, small_scene, monkeypatch, capsys):
+    """A row for every peer that is there, whose picture is ours of the same footprint; the others are named."""
+    speed = importlib.import_module("speed")
+    calls = add_peers(monkeypatch)
+    arguments = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--json", small_scene / "out.json"]
+    names = ["gsplat", "gsplat_antialiased", "official", "module:official=mip", "not_there"]
+    options = ["--rounds", "1", "--threads", "1", "--device", device, "--footprints", "box:samples=1"]
+    monkeypatch.setattr(sys, "argv", ["speed.py", *map(str, arguments), *options, "--against", ",".join(names)])
+    speed.main()
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0].startswith("not_there: left out, for it is not installed")
+    assert [line.split()[0] for line in lines[3:8]] == ["box:samples=1", *names[:-1]]
+    results = json.loads((small_scene / "out.json").read_text())["results"]
+    assert list(results) == ["box:samples=1", *names[:-1]]
+    assert "difference" not in results["box:samples=1"] and results["box:samples=1"]["pairs"] > 0
+    for name in names[:-1]:
+        assert all(math.isfinite(value) for value in results[name].values())
+        assert min(results[name]["forward"], results[name]["forward_backward"]) > 0
+    # One rounding for each of 50 splats that a pixel may show, of colours up to 1.
+    assert results["gsplat"]["difference"] < 50 * 2**-23 and results["gsplat_antialiased"]["difference"] < 50 * 2**-23
+    assert results["official"]["difference"] == 0.0 < 1e-3 < results["module:official=mip"]["difference"]
+    assert {kwargs["rasterize_mode"] for _, kwargs in calls} == {"classic", "antialiased"}
+
+
+def test_gsplat_is_called_as_it_can_be(small_scene, monkeypatch):
+    """With arguments that gsplat's own function has."""
+    real = pytest.importorskip("gsplat", reason="needs gsplat").rasterization
+    calls = add_peers(monkeypatch)
+    scene = importlib.import_module("scene_files").load_scene(str(small_scene / "scene.npz"))
+    [view, _] = io.load_views(small_scene / "views.json")
+    importlib.import_module("peers").GsplatCase(scene, view).forward()
+    [(args, kwargs)] = calls
+    inspect.signature(real).bind(*args, **kwargs)
+
+
+@pytest.mark.parametrize(
+    "name, sentence",
+    [
+        ("diff_gaussian_rasterization", "this is this package"),
+        ("module:diff_gaussian_rasterization", "this is this package"),
+        ("strange", "strange has no GaussianRasterizer"),
+    ],
+)
+def test_what_is_no_peer_is_refused(small_scene, monkeypatch, name, sentence):
+    add_peers(monkeypatch)
+    with pytest.raises(SystemExit, match=f"--against {name}: {sentence}"):
+        importlib.import_module("peers").find_peers([name], "cuda")
+
+
+def test_peers_that_need_cuda_are_left_out_without(small_scene, monkeypatch, capsys):
+    add_peers(monkeypatch)
+    peers = importlib.import_module("peers")
+    monkeypatch.setattr(peers.GsplatCase, "needs_cuda", True)
+    assert list(peers.find_peers(["gsplat", "official"], "cpu")) == ["official"]
+    assert capsys.readouterr().out == "gsplat: left out, for it needs CUDA\n"
+    assert list(peers.find_peers(["gsplat", "official"], "cuda")) == ["gsplat", "official"]
+
+
+def test_table(device, small_scene, monkeypatch, capsys):
+    """A column for every scene, a row for every footprint and peer."""
+    table = importlib.import_module("table")
+    add_peers(monkeypatch)
+    columns = [f"{label}={small_scene}/scene.npz,{small_scene}/views.json" for label in ("first", "second one")]
+    options = ["--rounds", "1", "--threads", "1", "--device", device, "--against", "official"]
+    arguments = [*columns, *options, "--footprints", "mip", "analytic", "--json", str(small_scene / "out.json")]
+    monkeypatch.setattr(sys, "argv", ["table.py", *arguments])
+    table.main()
+    lines = capsys.readouterr().out.splitlines()
+    results = json.loads((small_scene / "out.json").read_text())["results"]
+    assert lines[2] == "| forward / forward + backward, ms | first | second one |"
+    for line, name in zip(lines[4:7], ("mip", "analytic", "official"), strict=True):
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        expected = [
+            " / ".join(f"{1e3 * results[label][name][key]:.3g}" for key in ("forward", "forward_backward"))
+            for label in ("first", "second one")
+        ]
+        assert cells == [name, *expected]
+    assert lines[7] == "first, official: mean absolute difference from our picture 0"
+    monkeypatch.setattr(sys, "argv", ["table.py", "scene.npz"])
+    with pytest.raises(SystemExit):
+        table.main()
+    assert "must be LABEL=SCENE,VIEWS, got scene.npz" in capsys.readouterr().err
+
+
+def run_scaling(monkeypatch, device, folder, *options):
+    """What scaling.py writes for 100 and 400 Gaussians and for three sizes."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    scaling = importlib.import_module("scaling")
+    given = ["--gaussians", "1e2,4e2", "--size", "96x64", "--sizes", "48x32,96x64,192x128", "--rounds", "1"]
+    given += ["--density", "0.05", "--count", "200", "--device", device, "--json", str(folder / "out.json"), *options]
+    monkeypatch.setattr(sys, "argv", ["scaling.py", *given])
+    scaling.main()
+    return json.loads((folder / "out.json").read_text())
+
+
+def test_scaling(device, tmp_path, monkeypatch, capsys):
+    """Two series whose pairs grow as the Gaussians do, and the figure of them."""
+    pytest.importorskip("matplotlib", reason="needs the analysis extra")
+    written = run_scaling(monkeypatch, device, tmp_path, "--threads", "1", "--out", str(tmp_path / "figures"))
+    rows = written["rows"]
+    assert [row["gaussians"] for row in rows] == [100, 400, 77, 307, 1229]
+    assert [row["series"] for row in rows] == ["gaussians"] * 2 + ["pixels"] * 3
+    for row in rows:
+        # A splat reaches 3.6 px, or 4.1 with a pixel: from its pairs in a large image, or with those cut off at edges.
+        assert 1.0 <= row["pairs"] / row["gaussians"] <= 4.0
+        assert all(math.isfinite(value) for value in row.values() if not isinstance(value, str))
+        assert min(row["project"], row["bin"], row["blend"], row["memory_bytes"]) > 0
+    assert rows[1]["pairs"] / rows[0]["pairs"] == pytest.approx(4, rel=0.1)
+    assert written["threads"] == {}
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[2] for line in lines[3:8]] == ["96x64", "96x64", "48x32", "96x64", "192x128"]
+    assert sorted(path.name for path in (tmp_path / "figures").iterdir()) == ["scaling.png", "scaling.svg"]
+
+
+def test_scaling_says_what_does_not_fit_into_memory(device, tmp_path, monkeypatch, capsys):
+    """A row, not the end of the program; any other error ends it."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    scaling = importlib.import_module("scaling")
+    original = scaling.make_case
+
+    def make_case(args, count, size):
+        if count == 400:
+            raise torch.cuda.OutOfMemoryError("no room\nfor a long trace")
+        if count == 307:
+            return torch.empty(2**60)  # what torch raises on the CPU
+        return original(args, count, size)
+
+    monkeypatch.setattr(scaling, "make_case", make_case)
+    rows = run_scaling(monkeypatch, device, tmp_path, "--threads", "1")["rows"]
+    assert ["error" in row for row in rows] == [False, True, False, True, False]
+    assert rows[1]["error"] == "out of memory: no room"
+    assert sum("out of memory" in line for line in capsys.readouterr().out.splitlines()) == 2
+
+    def fail(*_):
+        raise RuntimeError("something else")
+
+    monkeypatch.setattr(scaling, "make_case", fail)
+    with pytest.raises(RuntimeError, match="something else"):
+        run_scaling(monkeypatch, device, tmp_path, "--threads", "1")
+
+
+def test_scaling_with_threads(tmp_path, monkeypatch, capsys):
+    """A row for every number of threads, timed with that many in turn; the other rows with the largest."""
+    pytest.importorskip("matplotlib", reason="needs the analysis extra")
+    asked = []  # and not set: threads that wait for each other take long on a busy machine
+    monkeypatch.setattr(torch, "set_num_threads", asked.append)
+    options = ["--threads", "1,2", "--gaussians", "50", "--sizes", "48x32", "--out", str(tmp_path / "figures")]
+    written = run_scaling(monkeypatch, "cpu", tmp_path, *options)
+    assert asked == [2, 1, 2, 1, 2, 2]  # at first, in a round that warms up, in the timed one, and at the end
+    assert list(written["threads"]) == ["1", "2"]
+    assert all(0 < value["forward"] < math.inf for value in written["threads"].values())
+    assert "200 Gaussians, 96x64" in capsys.readouterr().out
+    assert {path.name for path in (tmp_path / "figures").iterdir()} >= {"scaling.png", "threads.png", "threads.svg"}
+
+
+def test_synthetic_splats_keep_their_size(monkeypatch):
+    """In px, whatever the image; so every Gaussian has as many pairs, and none is culled."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    scaling = importlib.import_module("scaling")
+    for width, height in ((240, 135), (960, 540)):
+        view = io.View("", width, height, 4.0 * width, 4.0 * width, torch.eye(4, dtype=torch.float64))
+        scene = scaling.make_scene(500, view, 1, "cpu")
+        splats = ar.project(view.settings(sh_degree=1), **scene.arguments())
+        assert len(splats.means2d) == 500
+        cov_xx, _, cov_yy = splats.cov2d.unbind(1)
+        # Off the axis by x / z, at most half a width over four widths, a splat is sqrt(1 + (x / z)^2) times as wide.
+        widest = 1 + 0.125**2
+        for variance in (cov_xx, cov_yy):
+            assert (variance / scaling.SIGMA**2 >= 1 - 1e-4).all() and (
+                variance / scaling.SIGMA**2 < widest + 1e-4
+            ).all()
+        assert (splats.means2d.amax(0) > 0.95 * torch.tensor([width, height])).all()
 
 
 def test_losses(device, tmp_path, monkeypatch, capsys):

@@ -5,7 +5,6 @@ import math
 import re
 import shutil
 import signal
-import struct
 import subprocess
 import sys
 from dataclasses import replace
@@ -24,6 +23,17 @@ pytest.importorskip("tqdm", reason="needs the train extra")
 pytest.importorskip("scipy", reason="needs the train extra")
 pytest.importorskip("gsply", reason="needs the train extra")
 
+from capture_files import (  # noqa: E402
+    circle,
+    looking_at_origin,
+    opengl_pose,
+    truth_gaussians,
+    write_colmap,
+    write_colmap_text,
+    write_nerf_synthetic,
+    write_pictures,
+)
+
 from analytic_rasterizer import training  # noqa: E402
 from analytic_rasterizer.losses import l1_ssim, ssim  # noqa: E402
 from analytic_rasterizer.training import TrainingOptions, captures, colmap, files, pictures, schedule  # noqa: E402
@@ -31,63 +41,6 @@ from analytic_rasterizer.training import model as g  # noqa: E402
 from analytic_rasterizer.training.evaluation import evaluate, psnr  # noqa: E402
 
 # ------------------------------------------------------------------------------------ captures
-
-
-def write_colmap(folder, views, points, colors, model=1) -> None:
-    """A reconstruction with one camera per view, observations and tracks included."""
-    folder.mkdir(parents=True)
-    cameras, images = [struct.pack("<Q", len(views))], [struct.pack("<Q", len(views))]
-    for i, view in enumerate(views):
-        parameters = camera_parameters(view, model)
-        cameras.append(struct.pack(f"<iiQQ{len(parameters)}d", i + 1, model, view.width, view.height, *parameters))
-        turn = quaternion(view.w2c[:3, :3])
-        images.append(struct.pack("<i7di", i + 7, *turn, *view.w2c[:3, 3].tolist(), i + 1))
-        images.append(f"{view.name}.png".encode() + b"\0" + struct.pack("<Qddqddq", 2, 1, 2, -1, 3, 4, 5))
-    (folder / "cameras.bin").write_bytes(b"".join(cameras))
-    (folder / "images.bin").write_bytes(b"".join(images))
-    records = [struct.pack("<Q", len(points))]
-    for i, (point, color) in enumerate(zip(points.tolist(), colors.tolist())):
-        track = [1, 2] * (i % 3)
-        records.append(struct.pack(f"<Q3d3BdQ{len(track)}i", i, *point, *color, 0.5, len(track) // 2, *track))
-    (folder / "points3D.bin").write_bytes(b"".join(records))
-
-
-def write_colmap_text(folder, views, points, colors, model=1) -> None:
-    """The same as text."""
-    folder.mkdir(parents=True)
-    name = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 4: "OPENCV"}[model]
-    cameras, images, rows = ["# comment"], ["# comment"], ["# comment"]
-    for i, view in enumerate(views):
-        cameras.append(" ".join(map(str, [i + 1, name, view.width, view.height, *camera_parameters(view, model)])))
-        pose = [*quaternion(view.w2c[:3, :3]), *view.w2c[:3, 3].tolist()]
-        images.append(" ".join(map(str, [i + 7, *pose, i + 1, f"{view.name}.png"])))
-        images.append("1.0 2.0 -1" if i % 2 else "")  # a picture may have no observations
-    for i, (point, color) in enumerate(zip(points.tolist(), colors.tolist())):
-        rows.append(" ".join(map(str, [i, *point, *color, 0.5, 1, 2])))
-    for file, lines in (("cameras", cameras), ("images", images), ("points3D", rows)):
-        (folder / f"{file}.txt").write_text("\n".join(lines) + "\n")
-
-
-def camera_parameters(view, model) -> list[float]:
-    parameters = {0: [view.fx], 1: [view.fx, view.fy]}.get(model, [view.fx] * 2)
-    center = [view.width / 2 if view.cx is None else view.cx, view.height / 2 if view.cy is None else view.cy]
-    return [*parameters, *center, *[0.0] * (4 if model == 4 else 0)]
-
-
-def quaternion(rotation) -> list[float]:
-    """(w, x, y, z) of a rotation of less than half a turn."""
-    w = 0.5 * math.sqrt(1 + rotation.trace())
-    skew = rotation - rotation.T
-    return [w, *(skew[i, j].item() / (4 * w) for i, j in ((2, 1), (0, 2), (1, 0)))]
-
-
-def looking_at_origin(angle: float, distance: float = 4.0) -> torch.Tensor:
-    """World to camera from a place on a circle around y."""
-    c, s = math.cos(angle), math.sin(angle)
-    w2c = torch.eye(4, dtype=torch.float64)
-    w2c[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-    w2c[2, 3] = distance
-    return w2c
 
 
 WRITERS = pytest.mark.parametrize("write", [write_colmap, write_colmap_text])
@@ -193,51 +146,11 @@ def point_inputs(means) -> dict:
     }
 
 
-def circle(count: int, size=(32, 32)) -> list[io.View]:
-    return [io.View(f"r_{i}", *size, 36.0, 36.0, looking_at_origin(0.3 * (i - count / 2))) for i in range(count)]
-
-
-def truth_gaussians() -> g.Gaussians:
-    """A few coloured Gaussians."""
-    generator = torch.Generator().manual_seed(5)
-    points, _ = g.random_points(12, seed=5)
-    gaussians = g.gaussians_at(points, torch.rand(12, 3, generator=generator), 0)
-    gaussians = gaussians._replace(log_scales=torch.full((12, 3), 0.25).log())
-    return gaussians._replace(logit_opacities=torch.full((12, 1), 3.0))
-
-
-def draw_picture(view, opaque: bool) -> np.ndarray:
-    """The Gaussians on transparent, (H, W, 4) uint8 of straight alpha, or on black, (H, W, 3)."""
-    truth = truth_gaussians()
-    settings = view.settings(1, sh_degree=0, footprint="exact")
-    color, _ = truth.render(settings)
-    if not opaque:
-        alpha, _ = truth._replace(sh_dc=torch.full((12, 1, 3), 0.5 / g.SH_C0)).render(settings)
-        color = torch.cat([color / alpha[:1].clamp_min(1e-3), alpha[:1]])
-    return (255 * color.clamp(0, 1)).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
-
-
-def write_pictures(folder, views, opaque: bool) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    for view in views:
-        image.fromarray(draw_picture(view, opaque)).save(folder / f"{view.name}.png")
-
-
-def opengl_pose(view) -> list:
-    c2w = torch.linalg.inv(view.w2c)
-    c2w[:3, 1:3] *= -1
-    return c2w.tolist()
-
-
 @pytest.fixture(scope="module")
 def synthetic(tmp_path_factory):
     """A scene in the files of NeRF-synthetic."""
     folder = tmp_path_factory.mktemp("synthetic")
-    for split, views in (("train", circle(10)), ("test", circle(3))):
-        write_pictures(folder / split, views, opaque=False)
-        frames = [{"file_path": f"./{split}/{v.name}", "transform_matrix": opengl_pose(v)} for v in views]
-        content = {"camera_angle_x": 2 * math.atan(32 / 72), "frames": frames}
-        (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+    write_nerf_synthetic(folder, circle(10), circle(3))
     return folder
 
 
@@ -477,7 +390,11 @@ def make_run(folder, out, device="cpu", resume=False, **options) -> training.Run
     return training.Run(folder, out, chosen, device=device, images="photographs", save_every=0, resume=resume)
 
 
-@pytest.mark.parametrize("options", [{}, {"density": "absgrad"}, {"density": "mcmc"}, {"density": "none"}], ids=str)
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"density": "absgrad"}, {"density": "mcmc"}, {"density": "none"}, {"supersampling": 2, "footprint": "point"}],
+    ids=str,
+)
 def test_psnr_rises_and_the_results_say_so(device, synthetic, tmp_path, options):
     run = make_run(synthetic, tmp_path, device, **options)
     assert run.train()
@@ -491,6 +408,50 @@ def test_psnr_rises_and_the_results_say_so(device, synthetic, tmp_path, options)
     assert {"1", "2", "mean"} == metrics["test"].keys() and len(metrics["test"]["1"]["views"]) == 3
     if options.get("density") != "none":
         assert 150 < metrics["gaussians"] <= 400
+
+
+def test_supersampled_pictures_are_means_of_larger_ones(device):
+    """With the gradient of the mean; within what the two cameras' roundings to float32 differ by."""
+    view = circle(3)[0]
+    pictures, gradients = [], []
+    for scale, supersampling in ((3, 1), (1, 3)):
+        gaussians = g.Gaussians(*(field.to(device).requires_grad_() for field in truth_gaussians()))
+        settings = view.settings(scale, sh_degree=0, footprint="point", device=device)
+        picture, radii = gaussians.render(settings, supersampling=supersampling)
+        pictures.append(torch.nn.functional.avg_pool2d(picture, 3 // supersampling))
+        pictures[-1].square().sum().backward()
+        gradients.append(gaussians.means.grad)
+        assert radii.max() > 20  # px of the large picture
+    assert pictures[1].shape == (3, 32, 32)
+    torch.testing.assert_close(pictures[1], pictures[0], rtol=0, atol=1e-4)
+    torch.testing.assert_close(gradients[1], gradients[0], rtol=1e-3, atol=1e-3 * gradients[0].abs().max().item())
+
+
+def test_a_step_renders_supersampled_pictures(device, synthetic, tmp_path):
+    run = make_run(synthetic, tmp_path, device, supersampling=4, footprint="point")
+    view, scale = run.trainer.order(0)
+    settings = run.trainer.pictures.settings[scale][view]._replace(sh_degree=0, footprint="point")
+    with torch.no_grad():
+        expected, plain = (run.trainer.gaussians.render(settings, supersampling=n)[0] for n in (4, 1))
+    run.trainer.step()
+    torch.testing.assert_close(run.trainer.last[0], expected, rtol=0, atol=1e-6)
+    assert (plain - expected).abs().max() > 1e-3
+
+
+def test_evaluate_supersamples_as_the_training_did(synthetic, tmp_path, capsys):
+    arguments = ["--iterations", "3", "--random-points", "60", "--sh-degree", "0", "--device", "cpu"]
+    arguments += ["--footprint", "point", "--supersampling", "4", "--scales", "4"]  # coarse pixels: it matters
+    assert cli.main(["train", str(synthetic), "--out", str(tmp_path), *arguments]) == 0
+    expected = json.loads((tmp_path / files.METRICS).read_text())["test"]["mean"]["psnr"]
+    measured = []
+    for extra in ([], ["--supersampling", "4"], ["--supersampling", "1"]):
+        assert cli.main(["evaluate", str(tmp_path), "--lpips", "none", "--pictures", "0", *extra]) == 0
+        results = json.loads((tmp_path / "evaluation.json").read_text())
+        measured.append(results["results"]["point:dilation=0.3"]["mean"]["psnr"])
+    assert measured[0] == measured[1] == pytest.approx(expected, abs=1e-2)  # the .ply rounds a little
+    assert abs(measured[2] - expected) > 0.05
+    assert cli.main(["train", str(synthetic), "--out", str(tmp_path / "no"), "--supersampling", "0"]) == 2
+    assert "supersampling must be at least 1, got 0" in capsys.readouterr().err
 
 
 def cpu_test_pictures(folder):

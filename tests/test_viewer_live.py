@@ -1,9 +1,13 @@
 """The live viewer: its frames are the rasterizer's, and it serves browsers, whose part a websocket plays here."""
 
+import http.client
+import socket
 import struct
 import sys
 import threading
 import time
+import urllib.error
+import urllib.request
 from contextlib import contextmanager
 
 import numpy as np
@@ -14,7 +18,7 @@ from test_viewer import make_scene, make_view
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io, render_stages, viewer
-from analytic_rasterizer.viewer import live
+from analytic_rasterizer.viewer import frames, live
 
 pytestmark = pytest.mark.gate
 
@@ -32,10 +36,10 @@ def expected_frame(scene, view, footprint, background=(0.0, 0.0, 0.0)):
 # -------------------------------------------------------------------------- without a server
 
 
-@pytest.mark.parametrize("footprint", live.LIVE_FOOTPRINTS)
+@pytest.mark.parametrize("footprint", viewer.LIVE_FOOTPRINTS)
 def test_frames_are_those_of_the_library(device, footprint):
     scene, background = make_scene().to(device), (0.2, 0.4, 0.6)
-    view = live.camera_view((0.1, -0.2, 0.3), (0.9, 0.1, -0.2, 0.05), FOV, 80, 60)
+    view = frames.camera_view((0.1, -0.2, 0.3), (0.9, 0.1, -0.2, 0.05), FOV, 80, 60)
     frame = live.render_frame(scene, view, footprint, background)
     assert (frame.shape, frame.dtype) == ((60, 80, 3), np.uint8)
     assert np.ptp(frame) > 50  # there is something to see
@@ -45,20 +49,20 @@ def test_frames_are_those_of_the_library(device, footprint):
 @pytest.mark.parametrize("device", [pytest.param("cuda", marks=needs_cuda)])
 def test_a_snapshot_waits_for_the_stream_that_fills_it(device):
     scene = make_scene().to(device)
-    view = live.camera_view((0.0, 0.0, 0.0), REST, FOV, 64, 48)
+    view = frames.camera_view((0.0, 0.0, 0.0), REST, FOV, 64, 48)
     expected = expected_frame(scene, view, "analytic")
     means, late = scene.means, torch.zeros_like(scene.means)
     torch.cuda.synchronize()
     with torch.cuda.stream(torch.cuda.Stream()):
         torch.cuda._sleep(200_000_000)  # about 0.1 s
         late.copy_(means)
-        snapshot = live._take(scene._replace(means=late), copy=True)
+        snapshot = frames.take_snapshot(scene._replace(means=late), copy=True)
     snapshot.wait()
     np.testing.assert_array_equal(live.render_frame(snapshot.scene, view, "analytic"), expected)
 
 
 def test_every_footprint_can_be_chosen():
-    chosen = [ar.resolve_footprint(name) for name in live.LIVE_FOOTPRINTS]
+    chosen = [ar.resolve_footprint(name) for name in viewer.LIVE_FOOTPRINTS]
     assert {footprint.name for footprint in chosen} == set(ar.FOOTPRINTS)
     assert {f.samples for f in chosen if f.name == "box"} == {1, 2, 4, 8, 16}
     assert {f.samples for f in chosen if f.name == "moment"} == {1, 4, 9, 16}
@@ -68,7 +72,7 @@ def test_every_footprint_can_be_chosen():
 def test_a_camera_is_a_pinhole():
     quaternion = torch.tensor([0.8, 0.3, -0.4, 0.2], dtype=torch.float64)
     position = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    view = live.camera_view(position.numpy(), (2 * quaternion).numpy(), 1.0, 200, 100)
+    view = frames.camera_view(position.numpy(), (2 * quaternion).numpy(), 1.0, 200, 100)
     assert (view.fx, view.fy) == pytest.approx((50 / np.tan(0.5), 50 / np.tan(0.5)))
     rotation = view.w2c[:3, :3].T  # camera to world
     torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=torch.float64))
@@ -92,12 +96,12 @@ def test_a_camera_is_a_pinhole():
         {"fov": np.nan},
         {"width": 0},
         {"height": -1},
-        {"width": live.LARGEST_SIDE + 1},
+        {"width": frames.LARGEST_SIDE + 1},
     ],
 )
 def test_a_bad_camera_is_refused(changed):
     with pytest.raises(ValueError, match=next(iter(changed))):
-        live.camera_view(**{"position": (0, 0, 0), "wxyz": REST, "fov": FOV, "width": 8, "height": 8} | changed)
+        frames.camera_view(**{"position": (0, 0, 0), "wxyz": REST, "fov": FOV, "width": 8, "height": 8} | changed)
 
 
 def test_without_viser_the_extra_is_named(monkeypatch):
@@ -116,22 +120,22 @@ def test_the_command_names_the_extra(monkeypatch, tmp_path, capsys):
 
 def test_the_size_of_moving_frames_follows_from_what_frames_take():
     def seconds(pixels, fixed, per_pixel):
-        return live.Cost(pixels, fixed + per_pixel * pixels)
+        return frames.Cost(pixels, fixed + per_pixel * pixels)
 
     def chosen(fixed, per_pixel):
-        return live.moving_pixels(seconds(10**6, fixed, per_pixel), seconds(10**5, fixed, per_pixel))
+        return frames.moving_pixels(seconds(10**6, fixed, per_pixel), seconds(10**5, fixed, per_pixel))
 
-    target = live.MOVING_SECONDS
-    assert live.moving_pixels(None, live.Cost(1, 1.0)) == live.moving_pixels(live.Cost(1, 1.0), None)
+    target = frames.MOVING_SECONDS
+    assert frames.moving_pixels(None, frames.Cost(1, 1.0)) == frames.moving_pixels(frames.Cost(1, 1.0), None)
     for fixed in (0.0, target / 2):  # within the target, it is met
         assert chosen(fixed, 1e-6) == pytest.approx((target - fixed) / 1e-6)
     for fixed in (2 * target, 10 * target):  # where it cannot be met, pixels may take a quarter more
         assert chosen(fixed, 1e-6) == pytest.approx(fixed / 4 / 1e-6)
     # A frame that took longer than a larger one, by chance, says that pixels cost nothing.
-    assert live.moving_pixels(live.Cost(10**6, 0.01), live.Cost(10**5, 0.02)) > 10**9
-    full = live.Cost(10**6, 0.01)
-    assert live.moving_pixels(full, full) == np.inf
-    assert live.moving_pixels(full, live.Cost(10**6, 1.0)) == 10**6 / 2
+    assert frames.moving_pixels(frames.Cost(10**6, 0.01), frames.Cost(10**5, 0.02)) > 10**9
+    full = frames.Cost(10**6, 0.01)
+    assert frames.moving_pixels(full, full) == np.inf
+    assert frames.moving_pixels(full, frames.Cost(10**6, 1.0)) == 10**6 / 2
 
 
 @pytest.mark.parametrize(
@@ -157,12 +161,14 @@ def test_bad_arguments_are_refused_before_anything_starts(arguments, sentence):
 class Browser:
     """What a browser does, without one: sends a camera and values of controls, and receives messages of viser."""
 
-    def __init__(self, port):
+    def __init__(self, url, **options):
         self.msgpack = pytest.importorskip("msgspec").msgpack
         self.zstd = pytest.importorskip("zstandard").ZstdDecompressor()
         client = pytest.importorskip("websockets.sync.client")
         protocol = f"viser-v{pytest.importorskip('viser').__version__}"
-        self.socket = client.connect(f"ws://127.0.0.1:{port}", subprotocols=[protocol], compression=None, max_size=None)
+        address = url.replace("http:", "ws:").rstrip("/")  # as the page does
+        options |= {"subprotocols": [protocol], "compression": None, "max_size": None}
+        self.socket = client.connect(address, **options)
         self.controls = {}  # label: uuid
         self.texts = {}  # uuid: HTML
         self.camera = {}  # what the server has set
@@ -235,8 +241,8 @@ class Browser:
 
 
 @contextmanager
-def connected(port, **camera):
-    browser = Browser(port)
+def connected(url, **camera):
+    browser = Browser(url)
     try:
         browser.move(**camera)
         yield browser
@@ -252,7 +258,7 @@ def live_viewer():
 
 
 def seen(position=(0.0, 0.0, 0.0), width=64, height=48, fov=FOV):
-    return live.camera_view(position, REST, fov, width, height)
+    return frames.camera_view(position, REST, fov, width, height)
 
 
 def front(browser_width=64, browser_height=48):
@@ -264,7 +270,7 @@ def front(browser_width=64, browser_height=48):
 def test_a_browser_sees_the_first_view_and_moves(live_viewer, device):
     scene = make_scene().to(device)
     live_viewer.update(scene)
-    with connected(live_viewer.port) as browser:
+    with connected(live_viewer.url) as browser:
         browser.wait_for_picture(expected_frame(scene, front(), "analytic"))
         assert browser.frames[-1][0] == "png"
         assert browser.camera["fov"] == pytest.approx(2 * np.arctan(24 / 70))
@@ -277,7 +283,7 @@ def test_a_browser_sees_the_first_view_and_moves(live_viewer, device):
 def test_controls_change_the_picture(live_viewer):
     scene = make_scene()
     live_viewer.update(scene)
-    with connected(live_viewer.port) as browser:
+    with connected(live_viewer.url) as browser:
         browser.wait_for(lambda: browser.frames)
         browser.move()
         for footprint in ("adaptive", "moment:samples=4", "exact"):
@@ -293,7 +299,7 @@ def test_controls_change_the_picture(live_viewer):
 def test_browsers_have_cameras_and_controls_of_their_own(live_viewer):
     scene = make_scene()
     live_viewer.update(scene)
-    with connected(live_viewer.port) as one, connected(live_viewer.port) as two:
+    with connected(live_viewer.url) as one, connected(live_viewer.url) as two:
         for browser in (one, two):
             browser.wait_for(lambda browser=browser: browser.frames)
         one.choose("Footprint", "point")
@@ -306,7 +312,7 @@ def test_browsers_have_cameras_and_controls_of_their_own(live_viewer):
 def test_an_update_is_shown_with_its_text(live_viewer):
     live_viewer.interval = 0.0
     first, second = make_scene(), make_scene(50)
-    with connected(live_viewer.port) as browser:
+    with connected(live_viewer.url) as browser:
         browser.wait_for(lambda: "waiting for the first scene" in browser.text)
         assert live_viewer.update(first, step=1, text="loss <0.5>")
         browser.wait_for_picture(expected_frame(first, front(), "analytic"))
@@ -322,13 +328,13 @@ def test_what_is_shown_is_a_copy(live_viewer, device):
     kept = io.Scene(*(tensor.clone() for tensor in scene[:-1]), scene.sh_degree)
     live_viewer.update(scene)
     scene.means.zero_()  # as an optimiser changes its parameters
-    with connected(live_viewer.port) as browser:
+    with connected(live_viewer.url) as browser:
         browser.wait_for_picture(expected_frame(kept, front(), "analytic"))
 
 
 def test_views_can_be_stepped_through(live_viewer):
     live_viewer.update(make_scene())
-    with connected(live_viewer.port, position=(1.0, 0.0, 0.0)) as browser:
+    with connected(live_viewer.url, position=(1.0, 0.0, 0.0)) as browser:
         browser.wait_for(lambda: browser.camera.get("position") == [0.0, 0.0, 0.0] and "Jump to" in browser.controls)
         for button, name in (("Next", "other"), ("Next", "front"), ("Previous", "other")):
             browser.choose("Jump to", button)
@@ -356,7 +362,7 @@ def test_without_a_browser_nothing_is_rendered_or_copied(live_viewer, monkeypatc
     assert not any(live_viewer.update(gaussians, step=step) for step in range(100))
     assert live_viewer.update(gaussians, force=True)
     assert len(asked) == 2
-    with connected(live_viewer.port) as browser:
+    with connected(live_viewer.url) as browser:
         browser.wait_for_picture(expected_frame(scene, front(), "analytic"))
     end = time.monotonic() + DEADLINE
     while live_viewer._clients and time.monotonic() < end:
@@ -373,7 +379,7 @@ def test_copies_keep_their_distance(live_viewer):
     live_viewer.interval = 1e6
     scene = make_scene()
     live_viewer.update(scene)
-    with connected(live_viewer.port) as browser:
+    with connected(live_viewer.url) as browser:
         browser.wait_for_picture(expected_frame(scene, front(), "analytic"))
         assert not live_viewer.update(scene)
         assert live_viewer.update(scene, force=True)
@@ -390,7 +396,7 @@ def test_an_update_does_not_wait_for_a_frame(live_viewer, monkeypatch):
     monkeypatch.setattr(live, "render_frame", slow_frame)
     live_viewer.interval = 0.0
     live_viewer.update(make_scene())
-    with connected(live_viewer.port) as browser:
+    with connected(live_viewer.url) as browser:
         assert rendering.wait(DEADLINE)
         # These come back although the frame does not end before they do.
         assert live_viewer.update(make_scene(40), step=1)
@@ -407,7 +413,7 @@ def test_a_frame_that_fails_is_said_and_the_next_one_comes(live_viewer, monkeypa
 
     monkeypatch.setattr(live, "render_frame", fail)
     scene = make_scene()
-    with connected(live_viewer.port) as browser:
+    with connected(live_viewer.url) as browser:
         browser.wait_for(lambda: "waiting for the first scene" in browser.text)
         live_viewer.update(scene)
         browser.wait_for(lambda: "Rendering failed: out of &lt;memory&gt;<" in browser.text)
@@ -419,7 +425,7 @@ def test_a_frame_that_fails_is_said_and_the_next_one_comes(live_viewer, monkeypa
 def test_a_browser_that_sends_nonsense_changes_nothing(live_viewer):
     scene = make_scene()
     live_viewer.update(scene)
-    with connected(live_viewer.port) as browser:
+    with connected(live_viewer.url) as browser:
         browser.wait_for(lambda: browser.frames)
         browser.move(fov=float("nan"))
         browser.move(width=10**9)
@@ -431,7 +437,7 @@ def test_a_browser_that_sends_nonsense_changes_nothing(live_viewer):
 def test_while_the_camera_moves_frames_are_small(live_viewer):
     scene = make_scene()
     live_viewer.update(scene)
-    with connected(live_viewer.port, width=640, height=480) as browser:
+    with connected(live_viewer.url, width=640, height=480) as browser:
         expected = expected_frame(scene, front(640, 480), "analytic")
         # The jump to the first view is a motion. Its end is the whole picture.
         browser.wait_for_picture(expected)
@@ -462,7 +468,7 @@ def test_bad_scenes_are_refused(live_viewer, scene, error):
 
 def test_stopping_ends_thread_and_server(live_viewer):
     live_viewer.update(make_scene())
-    with connected(live_viewer.port) as browser:
+    with connected(live_viewer.url) as browser:
         browser.wait_for(lambda: browser.frames)
         waiting = threading.Thread(target=live_viewer.wait)
         waiting.start()
@@ -471,15 +477,67 @@ def test_stopping_ends_thread_and_server(live_viewer):
         assert not waiting.is_alive()
     assert not live_viewer._thread.is_alive()
     with pytest.raises(OSError):
-        Browser(live_viewer.port)
+        Browser(live_viewer.url)
     live_viewer.stop()
     assert not live_viewer.update(make_scene())
 
 
 def test_the_server_is_on_this_machine_only_and_shares_nothing(live_viewer):
     assert live_viewer._server.get_host() == "127.0.0.1"
-    assert live_viewer.url == f"http://127.0.0.1:{live_viewer.port}"
     assert live_viewer._server.request_share_url() is None
+
+
+def key_of(url):
+    return url.rstrip("/").rpartition("/")[2]
+
+
+def test_only_who_knows_the_key_is_answered(live_viewer):
+    """Websockets and pages, with the address of the server, a wrong key, or the right key under another host name."""
+    live_viewer.update(make_scene())
+    root, key = f"http://127.0.0.1:{live_viewer.port}", key_of(live_viewer.url)
+    assert live_viewer.url == f"{root}/{key}/" and len(key) >= 32
+    rejected = pytest.importorskip("websockets.exceptions").InvalidStatus
+    for address in (root, f"{root}/{key[:-1]}", f"{root}/x/{key}", f"{root}/?{key}"):
+        with pytest.raises(rejected, match="403"):
+            Browser(address)
+        with pytest.raises(urllib.error.HTTPError, match="403") as refused:
+            urllib.request.urlopen(f"{address}/", timeout=DEADLINE)
+        refused.value.close()
+    for host, allowed in (("127.0.0.1", True), ("localhost:99", True), ("example.org", False), ("", False)):
+        connection = http.client.HTTPConnection("127.0.0.1", live_viewer.port, timeout=DEADLINE)
+        connection.request("GET", f"/{key}/", headers={"Host": host})
+        answer = connection.getresponse()
+        assert (answer.status == 200) == allowed and (b"<title>Viser</title>" in answer.read()) == allowed
+        connection.close()
+    # A page from elsewhere sends its own name, where it was made to point to this machine.
+    there = socket.create_connection(("127.0.0.1", live_viewer.port), DEADLINE)
+    with pytest.raises(rejected, match="403"):
+        Browser(live_viewer.url.replace("127.0.0.1", "example.org"), sock=there)
+    with pytest.raises(rejected, match="403"):  # two names
+        Browser(live_viewer.url, additional_headers={"Host": "example.org"})
+    with connected(live_viewer.url) as browser:
+        browser.wait_for(lambda: browser.frames)
+
+
+def test_every_viewer_has_its_own_key_and_viser_prints_no_address_without(live_viewer, capsys):
+    with viewer.LiveViewer() as other:
+        assert key_of(other.url) != key_of(live_viewer.url)
+    assert "http" not in "".join(capsys.readouterr())
+
+
+def test_a_viser_without_the_check_is_not_used(monkeypatch):
+    """Where viser does not serve through the function that the check is added to, nothing is left running."""
+    viser = pytest.importorskip("viser", reason="needs the view extra")
+    stopped = []
+
+    class Server:
+        def __init__(self, **_):
+            self.stop = lambda: stopped.append(True)
+
+    monkeypatch.setattr(viser, "ViserServer", Server)
+    with pytest.raises(RuntimeError, match="cannot be given an access check"):
+        viewer.LiveViewer()
+    assert stopped == [True]
 
 
 def test_a_port_in_use_is_one_sentence(live_viewer):
@@ -500,7 +558,7 @@ def test_the_command_serves_and_ends(monkeypatch, tmp_path, capsys):
 
     def interrupted(running):
         started.append((running.footprint, running.background, [view.name for view in running.views]))
-        with connected(running.port) as browser:
+        with connected(running.url) as browser:
             browser.wait_for(lambda: browser.frames)
         raise KeyboardInterrupt
 

@@ -13,7 +13,7 @@ from ..training import TrainingOptions, evaluate, load_capture, load_lpips, load
 from ..training.evaluation import LPIPS_WEIGHTS, MEASURES
 from ..training.files import OPTIONS, SCENE, write_json
 from ..training.trainer import background_of
-from .arguments import add_machine_options, use_machine, whole_numbers, writable_folder
+from .arguments import add_machine_options, count, use_machine, whole_numbers, writable_folder
 
 HEADINGS = {"psnr": ("PSNR", "{:.2f}"), "ssim": ("SSIM", "{:.4f}"), "lpips": ("LPIPS", "{:.4f}")}
 
@@ -31,6 +31,8 @@ def add_parser(subcommands) -> None:
     add("--data", metavar="SCENE", help="folder of the capture (default: the one that was trained with)")
     add("--footprint", nargs="+", dest="footprints", metavar="NAME[:k=v]", help="(default: that of the training)")
     add("--scales", type=whole_numbers, metavar="1,2,..", help="reductions to test at (default: those trained at)")
+    supersampling = "render pictures so many times larger and average them (default: as in the training)"
+    add("--supersampling", type=count, metavar="N", help=supersampling)
     add("--lpips", choices=(*LPIPS_WEIGHTS, "none"), default="vgg", help="network of LPIPS (default: vgg)")
     add("--pictures", type=int, default=2, metavar="N", help="views to draw per footprint and scale (default: 2)")
     add_machine_options(parser, device=None)
@@ -60,13 +62,16 @@ def run(args) -> None:
             lpips = load_lpips(args.lpips, args.device)
         except (ImportError, io.SceneError) as error:
             print(f"LPIPS is left out: {error}", file=sys.stderr)
+    supersampling = args.supersampling or options.supersampling
     out = writable_folder(folder / "evaluation")
     results = {}
     for footprint in footprints:
-        results[footprint] = evaluate(scene, pictures, footprint, lpips)
+        results[footprint] = evaluate(scene, pictures, footprint, lpips, supersampling=supersampling)
         if args.pictures > 0:
-            save_pictures(out, scene, pictures, footprint, args.pictures)
-    write_json(folder / "evaluation.json", {"views": [view.name for view in pictures.views], "results": results})
+            save_pictures(out, scene, pictures, footprint, args.pictures, supersampling=supersampling)
+    views = [view.name for view in pictures.views]
+    written = {"views": views, "supersampling": supersampling, "results": results}
+    write_json(folder / "evaluation.json", written)
     print(format_results(results, scales))
 
 

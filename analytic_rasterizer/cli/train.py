@@ -23,6 +23,7 @@ MAIN = {
     "iterations": "steps",
     "seconds": "train for this long instead, by the clock",
     "pictures_per_step": "pictures whose mean loss makes a step",
+    "supersampling": "render pictures so many times larger and average them",
     "sh_degree": "of the spherical harmonics, 0 to 3",
     "background": f"{', '.join(BACKGROUNDS)} or {RANDOM_BACKGROUND} (default: white for NeRF-synthetic scenes, else "
     "black)",

@@ -28,8 +28,13 @@ def psnr(image: Tensor, target: Tensor) -> Tensor:
     return -10 * (image.clamp(0, 1) - target).square().mean().log10()
 
 
-def load_lpips(network: str, device: str | torch.device) -> Perceptual:
+def load_lpips(network: str, device: str | torch.device, like_3dgs: bool = False) -> Perceptual:
     """LPIPS of two (3, H, W) images in [0, 1], by torchmetrics, whose weights of the network must be there already.
+
+    Args:
+        network: One of LPIPS_WEIGHTS.
+        like_3dgs: Hand the network values in [0, 1], as 3DGS's program does, whose numbers papers compare with. The
+            network was made for [-1, 1], to which values are scaled otherwise.
 
     Raises:
         ImportError: No torchmetrics or torchvision.
@@ -43,22 +48,29 @@ def load_lpips(network: str, device: str | torch.device) -> Perceptual:
         )
     try:
         import torchvision  # noqa: F401  (of torchmetrics; no extra names it, as its version must fit torch's)
-    except ImportError as error:
+    except (ImportError, RuntimeError) as error:  # a version for another torch raises RuntimeError
         raise ImportError(f"LPIPS needs torchvision, in the version that fits torch {torch.__version__}") from error
     module = io.optional_import("torchmetrics.image.lpip", "train")
-    metric = module.LearnedPerceptualImagePatchSimilarity(network, normalize=True).to(device).eval()
+    metric = module.LearnedPerceptualImagePatchSimilarity(network, normalize=not like_3dgs).to(device).eval()
     return lambda image, truth: metric(image[None].clamp(0, 1), truth[None])
 
 
 @torch.no_grad()
 def evaluate(
-    scene: io.Scene, pictures: Pictures, footprint: str, lpips: Perceptual | None = None, **options: Any
+    scene: io.Scene,
+    pictures: Pictures,
+    footprint: str,
+    lpips: Perceptual | None = None,
+    *,
+    supersampling: int = 1,
+    **options: Any,
 ) -> dict[str, dict]:
     """PSNR [dB], SSIM and LPIPS of a scene against pictures, means over views.
 
     Args:
         scene: On the device of the pictures.
         lpips: From `load_lpips`; None: left out.
+        supersampling: As in `TrainingOptions`.
         **options: Further settings.
 
     Returns:
@@ -70,7 +82,8 @@ def evaluate(
     for scale, settings in pictures.resolve(footprint=footprint, sh_degree=scene.sh_degree, **options).items():
         measured = []
         for view, chosen in enumerate(settings):
-            image, truth = gaussians.render(chosen)[0].clamp(0, 1), pictures.truth(scale, view)
+            image = gaussians.render(chosen, supersampling=supersampling)[0].clamp(0, 1)
+            truth = pictures.truth(scale, view)
             values = [psnr(image, truth), ssim(image, truth)]
             if lpips is not None:
                 values.append(lpips(image, truth).reshape(()))
@@ -87,7 +100,14 @@ def _means(rows: list[dict[str, float]]) -> dict[str, float]:
 
 @torch.no_grad()
 def save_pictures(
-    folder: Path, scene: io.Scene, pictures: Pictures, footprint: str, count: int, **options: Any
+    folder: Path,
+    scene: io.Scene,
+    pictures: Pictures,
+    footprint: str,
+    count: int,
+    *,
+    supersampling: int = 1,
+    **options: Any,
 ) -> list[Path]:
     """Truth, rendering, and their difference times ERROR_GAIN side by side, for `count` views spread over all.
 
@@ -98,7 +118,8 @@ def save_pictures(
     count, files = min(count, len(pictures.views)), []
     for scale, settings in pictures.resolve(footprint=footprint, sh_degree=scene.sh_degree, **options).items():
         for view in (i * len(pictures.views) // count for i in range(count)):
-            image, truth = gaussians.render(settings[view])[0].clamp(0, 1), pictures.truth(scale, view)
+            image = gaussians.render(settings[view], supersampling=supersampling)[0].clamp(0, 1)
+            truth = pictures.truth(scale, view)
             row = torch.cat([truth, image, ERROR_GAIN * (image - truth).abs()], dim=2)
             files.append(folder / f"{name}_{scale}_{pictures.views[view].name}.png")
             io.to_image(row).save(files[-1])

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from .. import io
 from ..activations import activate
@@ -27,9 +28,11 @@ class Gaussians(NamedTuple):
     sh_dc: Tensor  # (P, 1, 3) spherical harmonics, the constant
     sh_rest: Tensor  # (P, K - 1, 3) and the others
 
-    def render(self, settings: GaussianRasterizationSettings, means2D: Tensor | None = None) -> tuple[Tensor, ...]:
-        """What the rasterizer returns: picture (3, H, W), radii (P,) in px with 0 for what is not seen."""
-        return self.activated().render(settings, means2D)
+    def render(
+        self, settings: GaussianRasterizationSettings, means2D: Tensor | None = None, supersampling: int = 1
+    ) -> tuple[Tensor, Tensor]:
+        """As `Activated.render`."""
+        return self.activated().render(settings, means2D, supersampling)
 
     def activated(self) -> Activated:
         """What the rasterizer takes. Differentiable."""
@@ -72,9 +75,20 @@ class Activated(NamedTuple):
     opacities: Tensor  # (P, 1) in (0, 1)
     shs: Tensor  # (P, K, 3)
 
-    def render(self, settings: GaussianRasterizationSettings, means2D: Tensor | None = None) -> tuple[Tensor, ...]:
-        """As `Gaussians.render`."""
-        return GaussianRasterizer(settings)(
+    def render(
+        self, settings: GaussianRasterizationSettings, means2D: Tensor | None = None, supersampling: int = 1
+    ) -> tuple[Tensor, Tensor]:
+        """The picture (3, H, W), and the radii (P,) int32 in px, 0 for what is not seen.
+
+        Args:
+            means2D: Receives the gradient with respect to the projected means.
+            supersampling: Render so many times larger, and average over squares of pixels. Radii, and the pixels of
+                the footprint, are those of the larger picture.
+        """
+        if supersampling > 1:
+            height, width = supersampling * settings.image_height, supersampling * settings.image_width
+            settings = settings._replace(image_height=height, image_width=width)
+        picture, radii = GaussianRasterizer(settings)(
             means3D=self.means,
             means2D=means2D,
             opacities=self.opacities,
@@ -82,6 +96,7 @@ class Activated(NamedTuple):
             scales=self.scales,
             rotations=self.rotations,
         )
+        return (avg_pool2d(picture, supersampling) if supersampling > 1 else picture), radii
 
 
 def random_points(count: int, seed: int) -> tuple[Tensor, Tensor]:

@@ -74,6 +74,8 @@ class TrainingOptions:
         iterations: Steps of the optimizer.
         seconds: Time to train, s, by the clock, instead of a number of steps; 0: go by `iterations`.
         pictures_per_step: Pictures whose mean loss makes one step.
+        supersampling: How many times larger pictures are rendered before squares of pixels are averaged; the footprint
+            is evaluated in the small pixels. 1: not at all.
         sh_degree: Highest degree of the spherical harmonics, 0 to 3.
         sh_every: Steps between two degrees, at most; never more than a tenth of the training.
         background: "black", "white", "random" (drawn anew for every step; needs pictures with alpha), or "" for white
@@ -120,6 +122,7 @@ class TrainingOptions:
     iterations: int = 30_000
     seconds: float = 0.0
     pictures_per_step: int = 1
+    supersampling: int = 1
     sh_degree: int = 3
     sh_every: int = 1000
     background: str = ""
@@ -158,7 +161,7 @@ class TrainingOptions:
         object.__setattr__(self, "scales", tuple(self.scales))
         object.__setattr__(self, "scale_repeats", tuple(self.scale_repeats) or (1,) * len(self.scales))
         object.__setattr__(self, "footprint", str(resolve_footprint(self.footprint)))
-        for name in ("iterations", "pictures_per_step", "sh_every", "random_points", "densify_every"):
+        for name in ("iterations", "pictures_per_step", "supersampling", "sh_every", "random_points", "densify_every"):
             _check(name, getattr(self, name) >= 1, "at least 1", getattr(self, name))
         for name in ("densify_from", "reset_every", "max_gaussians", "means_rate_steps"):
             _check(name, getattr(self, name) >= 0, "at least 0", getattr(self, name))

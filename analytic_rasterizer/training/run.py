@@ -195,22 +195,28 @@ class Run:
         write_checkpoint(self.out / CHECKPOINT, state)
         write_log(self.out / LOG, self.history)
 
-    def evaluate(self) -> dict[str, Any]:
-        """Writes and returns metrics.json: steps, seconds, Gaussians, and `evaluate` on the test views, if any."""
-        progress = self.trainer.progress
-        metrics = {
-            "steps": progress.step,
-            "seconds": self.clock.read(),
-            "ms_per_step": 1e3 * self.clock.read() / max(progress.step, 1),
+    def summary(self) -> dict[str, Any]:
+        """Steps, seconds, milliseconds per step and Gaussians so far."""
+        steps, seconds = self.trainer.progress.step, self.clock.read()
+        return {
+            "steps": steps,
+            "seconds": seconds,
+            "ms_per_step": 1e3 * seconds / max(steps, 1),
             "gaussians": len(self.trainer.gaussians.means),
         }
+
+    def evaluate(self) -> dict[str, Any]:
+        """Writes and returns metrics.json: `summary`, and `evaluate` on the test views, if any."""
+        metrics = self.summary()
         if self.capture.test:
             # A random background has no truth of its own to test against: the convention's has.
             background = background_of(self.options, self.capture.background) or self.capture.background
             pictures = load_pictures(
                 self.capture.test, self.options.scales, background, self.device, self.options.downsampling
             )
-            metrics["test"] = evaluate(self.trainer.scene(), pictures, self.options.footprint)
+            metrics["test"] = evaluate(
+                self.trainer.scene(), pictures, self.options.footprint, supersampling=self.options.supersampling
+            )
         write_json(self.out / METRICS, metrics)
         return metrics
 

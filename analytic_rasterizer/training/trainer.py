@@ -118,7 +118,7 @@ class Trainer:
             if self.filter_3d is not None:
                 chosen = chosen._replace(effects=Effects(filter_3d=self.filter_3d))
             leaf = self.density.leaf(scale)
-            image, radii = gaussians.render(chosen, leaf)
+            image, radii = gaussians.render(chosen, leaf, options.supersampling)
             truth = self.pictures.truth(scale, view, background)
             losses.append(l1_ssim(image, truth, options.ssim_weight))
             seen.append((leaf, radii))
@@ -144,7 +144,7 @@ class Trainer:
     def warm_up(self) -> None:
         """Renders and differentiates one picture of each scale without a step, so that no step loads kernels."""
         for scale, settings in self._settings().items():
-            image, _ = self.gaussians.render(settings[0])
+            image, _ = self.gaussians.render(settings[0], supersampling=self.options.supersampling)
             truth = self.pictures.truth(scale, 0, settings[0].bg if self.random_background else None)
             l1_ssim(image, truth, self.options.ssim_weight).backward()
         self.optimizer.zero_grad(set_to_none=True)

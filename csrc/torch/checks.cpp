@@ -1,80 +1,14 @@
 #include "torch/checks.h"
 
-#include <algorithm>
 #include <cmath>
-#include <sstream>
 
 #include "core/camera.h"
 #include "core/footprint/registry.h"
 #include "core/sh.h"
+#include "torch/check_tensors.h"
 
 namespace ar::ops {
 namespace {
-
-std::string text_of(at::IntArrayRef sizes) {
-  std::ostringstream out;
-  out << "(";
-  for (size_t d = 0; d < sizes.size(); ++d) out << (d ? ", " : "") << sizes[d];
-  out << (sizes.size() == 1 ? ",)" : ")");
-  return out.str();
-}
-std::string shape_of(const Tensor& t) { return text_of(t.sizes()); }
-
-/// dtype float32 or float64.
-void check_floating(const Tensor& t, const char* name) {
-  TORCH_CHECK_TYPE(t.scalar_type() == at::kFloat || t.scalar_type() == at::kDouble, name,
-                   " must have dtype float32 or float64, got ", t.scalar_type());
-}
-
-/// `expected`: what makes the text of the shape in the message.
-template <class... Text> void check_shape(bool ok, const Tensor& t, const char* name, const Text&... expected) {
-  TORCH_CHECK_VALUE(ok, name, " must have shape ", expected..., ", got ", shape_of(t));
-}
-
-/// Shape (count, rest...), written as `expected` in the message.
-void check_rows(const Tensor& t, const char* name, int64_t count, std::initializer_list<int64_t> rest,
-                const char* expected) {
-  const bool ok = t.dim() == int64_t(1 + rest.size()) && t.size(0) == count &&
-                  std::equal(rest.begin(), rest.end(), t.sizes().begin() + 1);
-  check_shape(ok, t, name, expected, " with ", expected[1], " = ", count);
-}
-
-/// What other tensors must match. Afterwards they are contiguous.
-struct Like {
-  const Tensor& tensor;
-  const char* name;
-
-  void check_type(const Tensor& t, const char* t_name) const {
-    TORCH_CHECK_TYPE(t.scalar_type() == tensor.scalar_type(), t_name, " must have the dtype of ", name, ", ",
-                     tensor.scalar_type(), ", got ", t.scalar_type());
-    TORCH_CHECK_VALUE(t.device() == tensor.device(), t_name, " must be on the device of ", name, ", ", tensor.device(),
-                      ", got ", t.device());
-  }
-  /// Type, and a row for each of this tensor: check_rows.
-  void check_rows_of(Tensor& t, const char* t_name, std::initializer_list<int64_t> rest, const char* expected) const {
-    check_type(t, t_name);
-    check_rows(t, t_name, tensor.size(0), rest, expected);
-    t = t.contiguous();
-  }
-  void check_rows_of(OptionalTensor& t, const char* t_name, std::initializer_list<int64_t> rest,
-                     const char* expected) const {
-    if (t) check_rows_of(*t, t_name, rest, expected);
-  }
-  /// Type, and the shape (4, 4).
-  void check_matrix(Tensor& t, const char* t_name) const {
-    check_type(t, t_name);
-    const bool ok = (t.dim() == 2 || (t.dim() == 3 && t.size(0) == 1)) && t.size(-1) == 4 && t.size(-2) == 4;
-    check_shape(ok, t, t_name, "(4, 4) or (1, 4, 4)");
-    t = t.reshape({4, 4}).contiguous();
-  }
-  /// Type, and the shape (size,).
-  void check_vector(Tensor& t, const char* t_name, int64_t size) const {
-    check_type(t, t_name);
-    const bool ok = t.numel() == size && (t.dim() == 1 || (t.dim() == 2 && t.size(0) == 1));
-    check_shape(ok, t, t_name, "(", size, ",) or (1, ", size, ")");
-    t = t.reshape({size}).contiguous();
-  }
-};
 
 void check_positive(double value, const char* name) {
   // As a float, too: what is zero or infinite there makes the projection so.
@@ -102,38 +36,11 @@ void check_device(const Tensor& t, const char* name) {
                    " must have dtype float32 on CUDA, got Double; float64 runs on the CPU");
 }
 
-/// Raises where memory that is written is also that of another tensor: what comes out would depend on the order.
-void check_overlaps(const AdamArguments& a) {
-  struct Range {
-    const char *begin, *end;
-    bool written;
-  };
-  std::vector<Range> ranges;
-  ranges.reserve(4 * a.params.size());
-  const auto add = [&](const std::vector<Tensor>& tensors, bool written) {
-    for (const Tensor& t : tensors) {
-      const char* begin = static_cast<const char*>(t.const_data_ptr());
-      if (t.numel() > 0) ranges.push_back({begin, begin + t.nbytes(), written});
-    }
-  };
-  add(a.params, true);
-  add(a.exp_avgs, true);
-  add(a.exp_avg_sqs, true);
-  add(a.grads, false);
-  std::sort(ranges.begin(), ranges.end(), [](const Range& x, const Range& y) { return x.begin < y.begin; });
-  const char *end = nullptr, *written_end = nullptr;  // of those that begin earlier
-  for (const Range& range : ranges) {
-    TORCH_CHECK_VALUE(range.begin >= (range.written ? end : written_end),
-                      "params, exp_avgs and exp_avg_sqs must not share memory with each other or with grads");
-    end = std::max(end, range.end);
-    if (range.written) written_end = std::max(written_end, range.end);
-  }
-}
-
 /// What `bin` and `blend` take of the rows of `project`.
 void check_projected(Tensor& means2d, Tensor& cov2d, Tensor& opacities, Tensor& dets, const Tensor& row_splits) {
   check_device(means2d, "means2d");
   check_shape(means2d.dim() == 2 && means2d.size(1) == 2, means2d, "means2d", "(N, 2)");
+  check_row_count(means2d.size(0), "means2d");
   means2d = means2d.contiguous();
   const int64_t n = means2d.size(0);
   const Like like{means2d, "means2d"};
@@ -190,6 +97,11 @@ TileGrid grid_of(const FootprintSpec& footprint, int64_t width, int64_t height, 
   return {int(width), int(height), cuda && footprint.moves ? kMovingTileBits : kTileBits};
 }
 
+void check_row_count(int64_t rows, const char* name) {
+  constexpr int64_t kMost = int64_t(1) << 31;
+  TORCH_CHECK_VALUE(rows < kMost, name, " must have fewer than ", kMost, " rows, got ", rows);
+}
+
 void check_image_size(int64_t height, int64_t width) {
   // float32 counts pixels exactly up to 2^24; 2^20 leaves four bits for where in the pixel.
   constexpr int64_t kMax = int64_t(1) << 20;
@@ -220,6 +132,10 @@ void check(Inputs& in) {
     const int64_t needed = sh_count(int(in.sh_degree));
     const bool ok = in.shs->dim() == 3 && in.shs->size(0) == p && in.shs->size(1) >= needed && in.shs->size(2) == 3;
     check_shape(ok, *in.shs, "shs", "(P, M, 3) with P = ", p, " and M >= ", needed, " for sh_degree ", in.sh_degree);
+    // The kernels address the rows of the 32 Gaussians of a warp in 32 bits.
+    constexpr int64_t kMostCoefficients = int64_t(1) << 20;
+    TORCH_CHECK_VALUE(in.shs->size(1) <= kMostCoefficients, "shs must have at most ", kMostCoefficients,
+                      " coefficients per Gaussian, got shape ", shape_of(*in.shs));
     like.check_type(*in.shs, "shs");
     in.shs = in.shs->contiguous();
   }
@@ -358,6 +274,10 @@ void check(BlendArguments& a, const Pass& pass) {
 void check(InspectArguments& a, const ListTensors& lists, const Pass& pass) {
   check_device(lists.splats, "splats");
   check_image_size(a.image_height, a.image_width);
+  constexpr int64_t kMostPixels = int64_t(1) << 31;  // a Gaussian's pixels are counted in 32 bits with a sign
+  TORCH_CHECK_VALUE(a.image_height * a.image_width < kMostPixels,
+                    "gaussian_stats and dominant Gaussians need an image of fewer than ", kMostPixels, " pixels, got ",
+                    a.image_height, " x ", a.image_width);
   check_lists(lists, lists.splats, pass);
   // The ids of a CPU's lists index the results; on CUDA the splats themselves do.
   const int64_t n = lists.splats.size(0);
@@ -378,86 +298,6 @@ void check(WeightArguments& a) {
                     ", got ", shape_of(a.cov2d));
   a.offset = a.offset.contiguous();
   a.cov2d = a.cov2d.contiguous();
-}
-
-void check(SsimArguments& a) {
-  const Tensor &image = a.image, &target = a.target;
-  check_floating(image, "image");
-  TORCH_CHECK_TYPE(target.scalar_type() == image.scalar_type() || target.scalar_type() == at::kByte,
-                   "target must have the dtype of image, ", image.scalar_type(), ", or uint8, got ",
-                   target.scalar_type());
-  TORCH_CHECK_VALUE(target.device() == image.device(), "target must be on the device of image, ", image.device(),
-                    ", got ", target.device());
-  check_shape(image.dim() == 3 || image.dim() == 4, image, "image", "(C, H, W) or (B, C, H, W)");
-  check_shape(target.sizes() == image.sizes(), target, "target", "that of image, ", shape_of(image));
-  // The mean over nothing is not a number.
-  TORCH_CHECK_VALUE(image.numel() > 0, "image must have at least one pixel, got shape ", shape_of(image));
-  constexpr int64_t kMax = int64_t(1) << 30;
-  TORCH_CHECK_VALUE(image.size(-1) <= kMax && image.size(-2) <= kMax, "image must have at most ", kMax,
-                    " rows and columns, got shape ", shape_of(image));
-  a.image = a.image.contiguous();
-  a.target = a.target.contiguous();
-}
-
-void check(ActivateArguments& a) {
-  check_floating(a.log_scales, "log_scales");
-  check_shape(a.log_scales.dim() == 2 && a.log_scales.size(1) == 3, a.log_scales, "log_scales", "(N, 3)");
-  a.log_scales = a.log_scales.contiguous();
-  const Like like{a.log_scales, "log_scales"};
-  like.check_rows_of(a.quats, "quats", {4}, "(N, 4)");
-  like.check_rows_of(a.logit_opacities, "logit_opacities", {1}, "(N, 1)");
-}
-
-void check(AdamArguments& a) {
-  const size_t count = a.params.size();
-  const auto check_count = [&](size_t members, const char* name) {
-    TORCH_CHECK_VALUE(members == count, name, " must have as many members as params, ", count, ", got ", members);
-  };
-  check_count(a.grads.size(), "grads");
-  check_count(a.exp_avgs.size(), "exp_avgs");
-  check_count(a.exp_avg_sqs.size(), "exp_avg_sqs");
-  check_count(a.rates.size(), "rates");
-  check_count(a.steps.size(), "steps");
-  TORCH_CHECK_VALUE(a.beta1 >= 0 && a.beta1 < 1, "beta1 must be in [0, 1), got ", a.beta1);
-  TORCH_CHECK_VALUE(a.beta2 >= 0 && a.beta2 < 1, "beta2 must be in [0, 1), got ", a.beta2);
-  TORCH_CHECK_VALUE(std::isfinite(a.eps) && a.eps >= 0, "eps must be finite and not negative, got ", a.eps);
-
-  const auto check_tensor = [&](const Tensor& t, const char* list, size_t i) {
-    const Tensor &first = a.params[0], &param = a.params[i];
-    TORCH_CHECK_TYPE(t.scalar_type() == first.scalar_type(), list, "[", i, "] must have the dtype of params[0], ",
-                     first.scalar_type(), ", got ", t.scalar_type());
-    TORCH_CHECK_VALUE(t.device() == first.device(), list, "[", i, "] must be on the device of params[0], ",
-                      first.device(), ", got ", t.device());
-    TORCH_CHECK_VALUE(t.sizes() == param.sizes(), list, "[", i, "] must have the shape of params[", i, "], ",
-                      shape_of(param), ", got ", shape_of(t));
-  };
-  const auto check_written = [&](const Tensor& t, const char* list, size_t i) {
-    check_tensor(t, list, i);
-    TORCH_CHECK_VALUE(t.is_contiguous(), list, "[", i, "] must be contiguous, got strides ", t.strides());
-  };
-  for (size_t i = 0; i < count; ++i) {
-    TORCH_CHECK_VALUE(std::isfinite(float(a.rates[i])) && a.rates[i] >= 0, "rates[", i,
-                      "] must be finite and not negative, got ", a.rates[i]);
-    TORCH_CHECK_VALUE(a.steps[i] >= 1, "steps[", i, "] must be at least 1, got ", a.steps[i]);
-    check_floating(a.params[i], "params");
-    check_written(a.params[i], "params", i);
-    check_tensor(a.grads[i], "grads", i);
-    check_written(a.exp_avgs[i], "exp_avgs", i);
-    check_written(a.exp_avg_sqs[i], "exp_avg_sqs", i);
-    if (!a.rows) continue;
-    TORCH_CHECK_VALUE(a.params[i].dim() >= 1 && a.params[i].size(0) == a.rows->numel(), "params[", i,
-                      "] must have a row for each of rows, ", a.rows->numel(), ", got shape ", shape_of(a.params[i]));
-  }
-  if (a.rows) {
-    TORCH_CHECK_TYPE(a.rows->scalar_type() == at::kBool || a.rows->scalar_type() == at::kByte,
-                     "rows must have dtype bool or uint8, got ", a.rows->scalar_type());
-    check_shape(a.rows->dim() == 1, *a.rows, "rows", "(P,)");
-    TORCH_CHECK_VALUE(count == 0 || a.rows->device() == a.params[0].device(),
-                      "rows must be on the device of params, got ", a.rows->device());
-    a.rows = a.rows->contiguous();
-  }
-  for (Tensor& grad : a.grads) grad = grad.contiguous();
-  check_overlaps(a);
 }
 
 Tensor gradient_of(const std::vector<OptionalTensor>& dL_doutputs, size_t place, const char* name, const Tensor& like,

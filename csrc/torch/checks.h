@@ -40,6 +40,8 @@ void check_needs(const std::vector<bool>& needs, size_t count);
 void check_saved(const ListTensors& lists, const BlendState& state, const Tensor& like, const Pass& pass);
 void check_lists(const ListTensors& lists, const Tensor& like, const Pass& pass);
 
+/// Rows that int32 can number: those of the splats of all cameras.
+void check_row_count(int64_t rows, const char* name);
 /// Sizes that tensors and tiles can be indexed with.
 void check_image_size(int64_t height, int64_t width);
 

@@ -3,6 +3,7 @@
 #include <pybind11/stl.h>
 #include <torch/library.h>
 
+#include <new>
 #include <string>
 #include <utility>
 #include <vector>
@@ -19,11 +20,27 @@ namespace {
 
 using torch::jit::Stack;
 
+/// Calls `work`. What it fails to allocate on the CPU raises torch.OutOfMemoryError, as it does on CUDA: vectors throw
+/// std::bad_alloc, and torch's allocator an error that only its message tells from others.
+template <class Work> auto with_memory_errors(const Work& work) {
+  try {
+    return work();
+  } catch (const std::bad_alloc&) {
+    TORCH_CHECK_WITH(OutOfMemoryError, false, "Not enough memory on the CPU");
+  } catch (const c10::Error& error) {
+    const std::string message = error.what_without_backtrace();
+    const bool is_of_memory = message.find("DefaultCPUAllocator: can't allocate memory") != std::string::npos;
+    if (!is_of_memory) throw;
+    TORCH_CHECK_WITH(OutOfMemoryError, false, message);
+  }
+}
+
 /// An op: a function of ops.h between the arguments on the dispatcher's stack and the results there.
 template <class A, Results (*kRun)(A)> struct Op {
   using Arguments = A;
   static void kernel(const c10::OperatorHandle&, Stack* stack) {
-    for (IValue& result : kRun(take<A>(*stack))) stack->push_back(std::move(result));
+    Results results = with_memory_errors([&] { return kRun(take<A>(*stack)); });
+    for (IValue& result : results) stack->push_back(std::move(result));
   }
 };
 

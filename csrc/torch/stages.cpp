@@ -73,6 +73,7 @@ Results project(ProjectArguments a) {
     backend->project_rows(in, pass, rows, radii);
     const Tensor kept = radii.gt(0).nonzero().select(1, 0), ids = kept.to(at::kInt);
     splits[c + 1] = splits[c] + kept.size(0);
+    check_row_count(splits[c + 1], "means2d");
     for (Tensor* t : rows.numbers()) *t = t->index_select(0, kept);
     if (with_colors) rows.colors = rows.colors.index_select(0, kept);
     add(rows, radii.index_select(0, kept), ids, at::full_like(ids, c));

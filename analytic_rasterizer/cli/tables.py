@@ -1,0 +1,86 @@
+"""`tables`: the tables of the paper, trained and tested here."""
+
+from __future__ import annotations
+
+import sys
+
+from .. import io
+from ..training import load_lpips
+from ..training.options import PRESETS
+from ..training.tables import PUBLISHED, TABLES, Table, run_table, text
+from .arguments import add_machine_options, count, use_machine
+
+
+def add_parser(subcommands) -> None:
+    parser = subcommands.add_parser(
+        "tables",
+        help="repeat the tables of the paper",
+        description="Train and test all that a table of the paper shows, and print our rows beside the paper's. "
+        "Nothing is downloaded; scenes that are not in FOLDER are skipped. What is complete is not done again: the "
+        "same command goes on after an interruption. Writes NAME.md, NAME.json and the trainings to DIR. Without "
+        "NAME, lists the tables.",
+    )
+    add = parser.add_argument
+    add("name", nargs="?", choices=tuple(TABLES), metavar="NAME", help="of a table; without one, they are listed")
+    add("--data", metavar="FOLDER", help="folder with the scenes")
+    add("--out", metavar="DIR", help="folder for the results")
+    add("--scenes", nargs="+", default=(), metavar="NAME", help="(default: all that are there)")
+    add("--rows", nargs="+", default=(), metavar="NAME", help="(default: all)")
+    add("--iterations", type=count, metavar="N", help="steps of every training (default: 30000)")
+    add("--preset", choices=tuple(PRESETS), default="3dgs", help="as of `train`; the paper's is 3dgs, the default")
+    add("--seed", type=int, metavar="N", help="of everything that is drawn (default: 0)")
+    add("--no-lpips", action="store_true", help="leave out LPIPS")
+    add_machine_options(parser, device=None)
+    parser.set_defaults(run=run)
+
+
+def run(args) -> None:
+    """Lists the tables, or trains, tests and prints one."""
+    if args.name is None:
+        print("\n\n".join(describe(table) for table in TABLES.values()))
+        return
+    if args.data is None or args.out is None:
+        raise ValueError(f"{args.name} needs --data FOLDER and --out DIR")
+    use_machine(args)
+    io.optional_import("gsply")  # writes the scenes in the end
+    lpips = None
+    if not args.no_lpips:
+        try:
+            lpips = load_lpips("vgg", args.device, like_3dgs=True)
+        except (ImportError, io.SceneError) as error:
+            print(f"LPIPS is left out: {error}", file=sys.stderr)
+    given = {name: getattr(args, name) for name in ("iterations", "seed") if getattr(args, name) is not None}
+    results = run_table(
+        TABLES[args.name],
+        args.data,
+        args.out,
+        scenes=args.scenes,
+        rows=args.rows,
+        device=args.device,
+        preset=args.preset,
+        lpips=lpips,
+        say=lambda line: print(line, file=sys.stderr, flush=True),
+        **given,
+    )
+    print(text(results))
+
+
+def describe(table: Table) -> str:
+    """A table and its protocol, for the list."""
+    published = PUBLISHED.get(table.name)
+    scenes: dict[int, list[str]] = {}
+    for scene, reduction in table.data.scenes.items():
+        scenes.setdefault(reduction, []).append(scene)
+    size = f"{table.enlarged} times" if table.enlarged > 1 else f"{_fractions(table.scales)} of"
+    lines = [
+        f"{table.name} ({'paper, ' + published.source if published else 'ours only'}): {table.title}",
+        *(f"full size {_fractions((reduction,))}: {', '.join(names)}" for reduction, names in scenes.items()),
+        f"trains at {_fractions(table.options['scales'])} of the full size, tests at {size} it, on "
+        + (f"the test views ({table.data.views})" if table.data.views else "every eighth photograph"),
+        f"rows: {', '.join(row.name for row in table.rows)}",
+    ]
+    return "\n    ".join(lines)
+
+
+def _fractions(scales: tuple[int, ...]) -> str:
+    return ", ".join("1" if scale == 1 else f"1/{scale}" for scale in scales)

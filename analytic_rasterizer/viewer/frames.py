@@ -1,0 +1,142 @@
+"""Frames of scenes that may change, rendered by the library's own kernels for any footprint.
+
+Used by `LiveViewer`. Needs nothing but the library itself.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from .. import io
+from ..footprints import FOOTPRINTS, OPTIONS, option_values
+from ..rasterizer import rasterize_gaussians
+
+MOVING_SECONDS = 0.06
+"""What a frame should take while its camera moves; the resolution adapts to it."""
+FIRST_MOVING_PIXELS = 40_000
+"""Pixels of such a frame as long as nothing is known."""
+SMALLEST_MOVING_SCALE = 1 / 8
+LARGEST_SIDE = 8192
+"""Pixels of a frame along one side, at most."""
+
+
+def _footprint_choices() -> tuple[str, ...]:
+    choices = []
+    for name in FOOTPRINTS:
+        by_samples = "samples" in OPTIONS.get(name, {})
+        choices += [f"{name}:samples={n}" for n in option_values(name)] if by_samples else [name]
+    return tuple(choices)
+
+
+LIVE_FOOTPRINTS = _footprint_choices()
+"""The footprints that can be chosen in a live viewer: all of them, with every number of samples."""
+
+
+def camera_view(position, wxyz, fov: float, width: int, height: int) -> io.View:
+    """The pinhole of a camera of viser, whose axes are x right, y down, z forward, as those of `View`.
+
+    Args:
+        position: (3,) world units.
+        wxyz: (4,) quaternion of the rotation from camera to world, of any length but zero.
+        fov: Vertical field of view, radians, between 0 and pi.
+        width, height: Size of the picture, px, 1 to `LARGEST_SIDE`.
+
+    Raises:
+        ValueError: Numbers that are not finite or out of their range.
+    """
+    pose = torch.as_tensor(np.concatenate([position, wxyz]), dtype=torch.float64)
+    if not (pose.shape == (7,) and pose.isfinite().all() and pose[3:].norm() > 0):
+        raise ValueError(f"position and wxyz must be 3 and 4 finite numbers, wxyz not zero, got {pose.tolist()}")
+    if not 0 < fov < math.pi:
+        raise ValueError(f"fov must be between 0 and pi, got {fov}")
+    if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
+        raise ValueError(f"width and height must be from 1 to {LARGEST_SIDE}, got {width} and {height}")
+    w, x, y, z = pose[3:] / pose[3:].norm()
+    w2c = torch.eye(4, dtype=torch.float64)
+    w2c[:3, :3] = torch.stack(  # the rows are the axes of the camera
+        [
+            torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]),
+            torch.stack([2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]),
+            torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)]),
+        ]
+    )
+    w2c[:3, 3] = -w2c[:3, :3] @ pose[:3]
+    focal = height / (2 * math.tan(fov / 2))
+    return io.View("live", width, height, focal, focal, w2c)
+
+
+@torch.no_grad()
+def render_frame(scene: io.Scene, view: io.View, footprint: str, background=(0.0, 0.0, 0.0)) -> np.ndarray:
+    """Renders a view on the device of the scene.
+
+    Returns:
+        (H, W, 3) uint8: the rasterizer's picture, clamped to [0, 1] and rounded to 8 bits.
+
+    Raises:
+        ValueError: As `resolve_footprint` and `GaussianRasterizer`.
+    """
+    settings = view.settings(1.0, background, scene.sh_degree, footprint, device=scene.means.device)
+    color, *_ = rasterize_gaussians(
+        scene.means, None, scene.shs, None, scene.opacities, scene.scales, scene.rotations, None, settings
+    )
+    return color.clamp(0, 1).mul(255).round().to("cpu", torch.uint8).permute(1, 2, 0).contiguous().numpy()
+
+
+class Cost(NamedTuple):
+    """What a frame has taken."""
+
+    pixels: int
+    seconds: float
+
+
+def moving_pixels(settled: Cost | None, moving: Cost | None) -> float:
+    """Pixels that a frame may have while its camera moves, given the last frames at rest and in motion.
+
+    Two frames tell what a frame takes whatever its size, to project and sort, and what each pixel adds. Pixels get what
+    is left of `MOVING_SECONDS`, or a quarter of the rest, below which a smaller frame is hardly a faster one.
+    """
+    if settled is None or moving is None:
+        return FIRST_MOVING_PIXELS
+    if moving.pixels >= settled.pixels:
+        return math.inf if moving.seconds <= 2 * MOVING_SECONDS else moving.pixels / 2
+    per_pixel = max((settled.seconds - moving.seconds) / (settled.pixels - moving.pixels), 1e-12)
+    fixed = max(moving.seconds - per_pixel * moving.pixels, 0.0)
+    return max(MOVING_SECONDS - fixed, fixed / 4) / per_pixel
+
+
+class Snapshot(NamedTuple):
+    """A scene that nobody changes, and when it is complete."""
+
+    scene: io.Scene
+    ready: torch.cuda.Event | None
+    """Recorded on the stream of whoever made the tensors; None on the CPU."""
+
+    def wait(self) -> None:
+        """Makes the current stream wait until the tensors are filled, and keeps their memory for it."""
+        if self.ready is None:
+            return
+        stream = torch.cuda.current_stream(self.scene.means.device)
+        stream.wait_event(self.ready)
+        for tensor in self.scene[:-1]:
+            tensor.record_stream(stream)
+
+
+@torch.no_grad()
+def take_snapshot(scene: io.Scene | Callable[[], io.Scene], copy: bool) -> Snapshot:
+    """What `LiveViewer.update` is given, checked, and where asked for copied."""
+    given = scene() if callable(scene) else scene
+    if not isinstance(given, io.Scene):
+        raise TypeError(f"scene must be an io.Scene or a function that returns one, got {type(given).__name__}")
+    if len(given.means) == 0:
+        raise ValueError("scene must have Gaussians, got none")
+    tensors = [tensor.detach().to(torch.float32, copy=copy).contiguous() for tensor in given[:-1]]
+    ready = None
+    if given.means.is_cuda:
+        ready = torch.cuda.Event()
+        ready.record(torch.cuda.current_stream(given.means.device))
+    return Snapshot(io.Scene(*tensors, given.sh_degree), ready)

@@ -1,0 +1,78 @@
+// The shapes, dtypes and devices of tensors, with one wording of the messages for the checks of all ops.
+#pragma once
+
+#include <algorithm>
+#include <initializer_list>
+#include <sstream>
+#include <string>
+
+#include "torch/arguments.h"
+
+namespace ar::ops {
+
+inline std::string text_of(at::IntArrayRef sizes) {
+  std::ostringstream out;
+  out << "(";
+  for (size_t d = 0; d < sizes.size(); ++d) out << (d ? ", " : "") << sizes[d];
+  out << (sizes.size() == 1 ? ",)" : ")");
+  return out.str();
+}
+inline std::string shape_of(const Tensor& t) { return text_of(t.sizes()); }
+
+/// dtype float32 or float64.
+inline void check_floating(const Tensor& t, const char* name) {
+  TORCH_CHECK_TYPE(t.scalar_type() == at::kFloat || t.scalar_type() == at::kDouble, name,
+                   " must have dtype float32 or float64, got ", t.scalar_type());
+}
+
+/// `expected`: what makes the text of the shape in the message.
+template <class... Text> void check_shape(bool ok, const Tensor& t, const char* name, const Text&... expected) {
+  TORCH_CHECK_VALUE(ok, name, " must have shape ", expected..., ", got ", shape_of(t));
+}
+
+/// Shape (count, rest...), written as `expected` in the message.
+inline void check_rows(const Tensor& t, const char* name, int64_t count, std::initializer_list<int64_t> rest,
+                       const char* expected) {
+  const bool ok = t.dim() == int64_t(1 + rest.size()) && t.size(0) == count &&
+                  std::equal(rest.begin(), rest.end(), t.sizes().begin() + 1);
+  check_shape(ok, t, name, expected, " with ", expected[1], " = ", count);
+}
+
+/// What other tensors must match. Afterwards they are contiguous.
+struct Like {
+  const Tensor& tensor;
+  const char* name;
+
+  void check_type(const Tensor& t, const char* t_name) const {
+    TORCH_CHECK_TYPE(t.scalar_type() == tensor.scalar_type(), t_name, " must have the dtype of ", name, ", ",
+                     tensor.scalar_type(), ", got ", t.scalar_type());
+    TORCH_CHECK_VALUE(t.device() == tensor.device(), t_name, " must be on the device of ", name, ", ", tensor.device(),
+                      ", got ", t.device());
+  }
+  /// Type, and a row for each of this tensor: check_rows.
+  void check_rows_of(Tensor& t, const char* t_name, std::initializer_list<int64_t> rest, const char* expected) const {
+    check_type(t, t_name);
+    check_rows(t, t_name, tensor.size(0), rest, expected);
+    t = t.contiguous();
+  }
+  void check_rows_of(OptionalTensor& t, const char* t_name, std::initializer_list<int64_t> rest,
+                     const char* expected) const {
+    if (t) check_rows_of(*t, t_name, rest, expected);
+  }
+  /// Type, and the shape (4, 4).
+  void check_matrix(Tensor& t, const char* t_name) const {
+    check_type(t, t_name);
+    const bool ok = (t.dim() == 2 || (t.dim() == 3 && t.size(0) == 1)) && t.size(-1) == 4 && t.size(-2) == 4;
+    check_shape(ok, t, t_name, "(4, 4) or (1, 4, 4)");
+    t = t.reshape({4, 4}).contiguous();
+  }
+  /// Type, and the shape (size,).
+  void check_vector(Tensor& t, const char* t_name, int64_t size) const {
+    check_type(t, t_name);
+    const bool ok = t.numel() == size && (t.dim() == 1 || (t.dim() == 2 && t.size(0) == 1));
+    check_shape(ok, t, t_name, "(", size, ",) or (1, ", size, ")");
+    t = t.reshape({size}).contiguous();
+  }
+};
+
+}  // namespace ar::ops

@@ -1,0 +1,122 @@
+// What the ops of a training step accept.
+#include <cmath>
+#include <vector>
+
+#include "torch/check_tensors.h"
+#include "torch/checks.h"
+
+namespace ar::ops {
+namespace {
+
+/// Raises where memory that is written is also that of another tensor: what comes out would depend on the order.
+void check_overlaps(const AdamArguments& a) {
+  struct Range {
+    const char *begin, *end;
+    bool written;
+  };
+  std::vector<Range> ranges;
+  ranges.reserve(4 * a.params.size());
+  const auto add = [&](const std::vector<Tensor>& tensors, bool written) {
+    for (const Tensor& t : tensors) {
+      const char* begin = static_cast<const char*>(t.const_data_ptr());
+      if (t.numel() > 0) ranges.push_back({begin, begin + t.nbytes(), written});
+    }
+  };
+  add(a.params, true);
+  add(a.exp_avgs, true);
+  add(a.exp_avg_sqs, true);
+  add(a.grads, false);
+  std::sort(ranges.begin(), ranges.end(), [](const Range& x, const Range& y) { return x.begin < y.begin; });
+  const char *end = nullptr, *written_end = nullptr;  // of those that begin earlier
+  for (const Range& range : ranges) {
+    TORCH_CHECK_VALUE(range.begin >= (range.written ? end : written_end),
+                      "params, exp_avgs and exp_avg_sqs must not share memory with each other or with grads");
+    end = std::max(end, range.end);
+    if (range.written) written_end = std::max(written_end, range.end);
+  }
+}
+
+}  // namespace
+
+void check(SsimArguments& a) {
+  const Tensor &image = a.image, &target = a.target;
+  check_floating(image, "image");
+  TORCH_CHECK_TYPE(target.scalar_type() == image.scalar_type() || target.scalar_type() == at::kByte,
+                   "target must have the dtype of image, ", image.scalar_type(), ", or uint8, got ",
+                   target.scalar_type());
+  TORCH_CHECK_VALUE(target.device() == image.device(), "target must be on the device of image, ", image.device(),
+                    ", got ", target.device());
+  check_shape(image.dim() == 3 || image.dim() == 4, image, "image", "(C, H, W) or (B, C, H, W)");
+  check_shape(target.sizes() == image.sizes(), target, "target", "that of image, ", shape_of(image));
+  // The mean over nothing is not a number.
+  TORCH_CHECK_VALUE(image.numel() > 0, "image must have at least one pixel, got shape ", shape_of(image));
+  constexpr int64_t kMax = int64_t(1) << 30;
+  const int64_t planes = image.numel() / (image.size(-1) * image.size(-2));
+  TORCH_CHECK_VALUE(image.size(-1) <= kMax && image.size(-2) <= kMax && planes <= kMax, "image must have at most ",
+                    kMax, " rows, columns and channels of the whole batch, got shape ", shape_of(image));
+  a.image = a.image.contiguous();
+  a.target = a.target.contiguous();
+}
+
+void check(ActivateArguments& a) {
+  check_floating(a.log_scales, "log_scales");
+  check_shape(a.log_scales.dim() == 2 && a.log_scales.size(1) == 3, a.log_scales, "log_scales", "(N, 3)");
+  a.log_scales = a.log_scales.contiguous();
+  const Like like{a.log_scales, "log_scales"};
+  like.check_rows_of(a.quats, "quats", {4}, "(N, 4)");
+  like.check_rows_of(a.logit_opacities, "logit_opacities", {1}, "(N, 1)");
+}
+
+void check(AdamArguments& a) {
+  const size_t count = a.params.size();
+  const auto check_count = [&](size_t members, const char* name) {
+    TORCH_CHECK_VALUE(members == count, name, " must have as many members as params, ", count, ", got ", members);
+  };
+  check_count(a.grads.size(), "grads");
+  check_count(a.exp_avgs.size(), "exp_avgs");
+  check_count(a.exp_avg_sqs.size(), "exp_avg_sqs");
+  check_count(a.rates.size(), "rates");
+  check_count(a.steps.size(), "steps");
+  TORCH_CHECK_VALUE(a.beta1 >= 0 && a.beta1 < 1, "beta1 must be in [0, 1), got ", a.beta1);
+  TORCH_CHECK_VALUE(a.beta2 >= 0 && a.beta2 < 1, "beta2 must be in [0, 1), got ", a.beta2);
+  TORCH_CHECK_VALUE(std::isfinite(a.eps) && a.eps >= 0, "eps must be finite and not negative, got ", a.eps);
+
+  const auto check_tensor = [&](const Tensor& t, const char* list, size_t i) {
+    const Tensor &first = a.params[0], &param = a.params[i];
+    TORCH_CHECK_TYPE(t.scalar_type() == first.scalar_type(), list, "[", i, "] must have the dtype of params[0], ",
+                     first.scalar_type(), ", got ", t.scalar_type());
+    TORCH_CHECK_VALUE(t.device() == first.device(), list, "[", i, "] must be on the device of params[0], ",
+                      first.device(), ", got ", t.device());
+    TORCH_CHECK_VALUE(t.sizes() == param.sizes(), list, "[", i, "] must have the shape of params[", i, "], ",
+                      shape_of(param), ", got ", shape_of(t));
+  };
+  const auto check_written = [&](const Tensor& t, const char* list, size_t i) {
+    check_tensor(t, list, i);
+    TORCH_CHECK_VALUE(t.is_contiguous(), list, "[", i, "] must be contiguous, got strides ", t.strides());
+  };
+  for (size_t i = 0; i < count; ++i) {
+    TORCH_CHECK_VALUE(std::isfinite(float(a.rates[i])) && a.rates[i] >= 0, "rates[", i,
+                      "] must be finite and not negative, got ", a.rates[i]);
+    TORCH_CHECK_VALUE(a.steps[i] >= 1, "steps[", i, "] must be at least 1, got ", a.steps[i]);
+    check_floating(a.params[i], "params");
+    check_written(a.params[i], "params", i);
+    check_tensor(a.grads[i], "grads", i);
+    check_written(a.exp_avgs[i], "exp_avgs", i);
+    check_written(a.exp_avg_sqs[i], "exp_avg_sqs", i);
+    if (!a.rows) continue;
+    TORCH_CHECK_VALUE(a.params[i].dim() >= 1 && a.params[i].size(0) == a.rows->numel(), "params[", i,
+                      "] must have a row for each of rows, ", a.rows->numel(), ", got shape ", shape_of(a.params[i]));
+  }
+  if (a.rows) {
+    TORCH_CHECK_TYPE(a.rows->scalar_type() == at::kBool || a.rows->scalar_type() == at::kByte,
+                     "rows must have dtype bool or uint8, got ", a.rows->scalar_type());
+    check_shape(a.rows->dim() == 1, *a.rows, "rows", "(P,)");
+    TORCH_CHECK_VALUE(count == 0 || a.rows->device() == a.params[0].device(),
+                      "rows must be on the device of params, got ", a.rows->device());
+    a.rows = a.rows->contiguous();
+  }
+  for (Tensor& grad : a.grads) grad = grad.contiguous();
+  check_overlaps(a);
+}
+
+}  // namespace ar::ops
