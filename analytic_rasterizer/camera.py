@@ -6,6 +6,7 @@ import torch
 
 from . import _C
 from .effects import Effects
+from .rotations import product
 from .settings import GaussianRasterizationSettings
 
 _DEPTH_RANGE = (0.01, 100.0)  # of clip-space z, which nothing reads
@@ -128,7 +129,9 @@ def moved(world_to_camera: torch.Tensor, tangent: torch.Tensor) -> torch.Tensor:
     zero = torch.zeros_like(x)
     rows = ((zero, -rz, ry, x), (rz, zero, -rx, y), (-ry, rx, zero, z), (zero,) * 4)
     twist = torch.stack([torch.stack(row) for row in rows])
-    return torch.linalg.matrix_exp(twist) @ world_to_camera
+    # Its matrix products are rounded like others, except in float64.
+    motion = torch.linalg.matrix_exp(twist.double()).to(twist)
+    return product(motion, world_to_camera)
 
 
 def make_lens(effects: Effects, settings, like: torch.Tensor) -> torch.Tensor:
@@ -164,7 +167,7 @@ def _copied(numbers: list[float], like: torch.Tensor) -> torch.Tensor:
     if like.is_cuda and torch.cuda.is_current_stream_capturing():
         # A replay would copy from host memory that has been reused since.
         raise RuntimeError("effects of the camera cannot be captured in a CUDA graph")
-    host = torch.tensor(numbers, dtype=like.dtype, pin_memory=like.is_cuda)
+    host = torch.tensor(numbers, dtype=like.dtype, device="cpu", pin_memory=like.is_cuda)
     return host.to(like.device, non_blocking=True)
 
 
@@ -173,7 +176,7 @@ def view_center(view: torch.Tensor, proj: torch.Tensor, with_gradient: bool) -> 
     view, proj = view.reshape(4, 4)[:3, :3], proj.reshape(4, 4)[:3, :2]  # transposed: they act on row vectors
     if not with_gradient:
         view, proj = view.detach(), proj.detach()
-    p = view.T @ proj / (view**2).sum(0)[:, None]
+    p = product(view.T, proj) / (view**2).sum(0)[:, None]
     return -p[2] / p.diagonal()
 
 

@@ -23,7 +23,8 @@ def normalized(blended: torch.Tensor, alpha: torch.Tensor, smallest: float = 1e-
 def depths(means3D: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
     """Camera-space z, (P,)."""
     view = view.reshape(4, 4)
-    return means3D @ view[:3, 2] + view[3, 2]
+    x, y, z = means3D.unbind(1)  # not `@`, which autocast and TF32 round
+    return x * view[0, 2] + y * view[1, 2] + z * view[2, 2] + view[3, 2]
 
 
 @torch.no_grad()

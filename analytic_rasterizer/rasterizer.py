@@ -147,7 +147,7 @@ class GaussianRasterizer(torch.nn.Module):
         view = self.raster_settings.viewmatrix.reshape(4, 4)
         if positions.dtype != view.dtype:
             raise TypeError(f"positions must have dtype {view.dtype}, got {positions.dtype}")
-        effects = self.raster_settings.effects
+        effects = getattr(self.raster_settings, "effects", None)  # settings of a class of the program have none
         near = effects.near if isinstance(effects, Effects) else NEAR
         with torch.no_grad():
             return depths(positions, view) > near

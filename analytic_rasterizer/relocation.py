@@ -18,7 +18,7 @@ def _coefficients(n_max: int) -> torch.Tensor:
     [MCMC, Eq. 9] sums binom(i - 1, k) over i = 1 to N, which is binom(N, k + 1).
     """
     rows = [[math.comb(n, k + 1) * (-1) ** k / math.sqrt(k + 1) for k in range(n_max)] for n in range(n_max + 1)]
-    return torch.tensor(rows, dtype=torch.float64)
+    return torch.tensor(rows, dtype=torch.float64, device="cpu")
 
 
 @torch.no_grad()

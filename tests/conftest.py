@@ -68,6 +68,25 @@ def in_threads(count, work):
         thread.join()
 
 
+@pytest.fixture
+def nothing_chosen(monkeypatch):
+    """No footprint and no dialect, and nothing learnt about offsets of pixels."""
+    import analytic_rasterizer as ar
+    from analytic_rasterizer import dialects
+    from analytic_rasterizer.dialects import _base, mip
+    from analytic_rasterizer.dialects._later import LaterFlags
+
+    monkeypatch.delenv("ANALYTIC_RASTERIZER_FOOTPRINT", raising=False)
+    ar.set_default_footprint(None)
+    monkeypatch.setattr(_base, "_companion_filter", None)
+    monkeypatch.setattr(mip, "_looks_left", mip._LOOKS)
+    monkeypatch.setattr(mip, "_not_zero", LaterFlags())
+    dialects.set_dialect("gs2023")
+    yield
+    ar.set_default_footprint(None)
+    dialects.set_dialect(None)
+
+
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=needs_cuda)])
 def device(request):
     """A test that takes it runs once per device."""

@@ -6,129 +6,41 @@ import inspect
 import math
 import pickle
 import shutil
+import sys
 
 import pytest
 import scenes
 import torch
 from conftest import ROOT, each_precision, in_threads, run_python
-from scenes import Camera
+from originals import (
+    BASE,
+    CAMERA,
+    COUNT,
+    ORIGINALS,
+    THEIR_FILTER,
+    arguments_of,
+    fields_of,
+    plain,
+    probe,
+    relative_error,
+    render,
+    scene_of,
+    settings_of,
+)
 
 import analytic_rasterizer as ar
 import diff_gaussian_rasterization as drop_in
-from analytic_rasterizer import dialects
-from analytic_rasterizer.dialects import _base, mip
+from analytic_rasterizer import dialects, installation
+from analytic_rasterizer.dialects import _base
 
-BASE = [
-    "image_height", "image_width", "tanfovx", "tanfovy", "bg", "scale_modifier", "viewmatrix", "projmatrix",
-    "sh_degree", "campos", "prefiltered", "debug",
-]  # fmt: skip
-FORWARD = ["means3D", "means2D", "opacities", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp"]
-CAMERA = Camera(bg=(0.2, 0.5, 0.9), sh_degree=1, image_width=40, image_height=30)
-COUNT = 25
-
-
-def after(names, where, *new):
-    """A list of names with others after one of them."""
-    at = names.index(where) + 1
-    return [*names[:at], *new, *names[at:]]
-
-
-# What the repositories' own modules have: settings, arguments of forward, and further exports.
-ORIGINALS = {
-    "gs2023": (BASE, FORWARD, set()),
-    "gs2024": ([*BASE, "antialiasing"], FORWARD, set()),
-    "accel": ([*BASE, "antialiasing"], after(FORWARD, "opacities", "dc"), {"SparseGaussianAdam"}),
-    "mip": (after(BASE, "tanfovy", "kernel_size", "subpixel_offset"), FORWARD, set()),
-    "analytic": (BASE, FORWARD, set()),
-    "depth": (BASE, [*FORWARD, "means2D_densify"], set()),
-    "depth_alpha": (BASE, [*FORWARD], set()),
-    "luiten": (BASE[:-1], FORWARD, set()),
-    "monogs": (after(BASE, "projmatrix", "projmatrix_raw"), [*FORWARD, "theta", "rho"], set()),
-    "scaffold": (BASE, FORWARD, set()),
-    "langsplat": ([*BASE, "include_feature"], after(FORWARD, "colors_precomp", "language_feature_precomp"), set()),
-    "grouping": (BASE, after(FORWARD, "shs", "sh_objs"), set()),
-    "feature3dgs": (BASE, after(FORWARD, "colors_precomp", "semantic_feature"), set()),
-    "mcmc": (BASE, FORWARD, {"compute_relocation"}),
-    "lightgaussian": ([*BASE, "f_count"], FORWARD, set()),
-    "mini": (BASE, FORWARD, set()),
-}
-THEIR_FILTER = {
-    **dict.fromkeys(ORIGINALS, "point:dilation=0.3"),
-    **dict.fromkeys(("gs2023", "gs2024", "accel", "analytic"), "analytic:frame_gradient=frozen"),
-    "mip": "mip:variance=0.25",
-}
-
-
-@pytest.fixture(autouse=True)
-def nothing_chosen(monkeypatch):
-    monkeypatch.delenv("ANALYTIC_RASTERIZER_FOOTPRINT", raising=False)
-    ar.set_default_footprint(None)
-    monkeypatch.setattr(_base, "_companion_filter", None)
-    monkeypatch.setattr(mip, "_looks_left", mip._LOOKS)
-    dialects.set_dialect("gs2023")
-    yield
-    ar.set_default_footprint(None)
-    dialects.set_dialect(None)
-
-
-def scene_of(device="cpu", dtype=torch.float32, seed=1, count=COUNT):
-    return scenes.cast(scenes.random_scene(seed, count, 1), dtype, device)
-
-
-def fields_of(name, device="cpu", dtype=torch.float32, camera=CAMERA, **changed):
-    """Settings of a dialect by name."""
-    fields = camera.fields(dtype, device)
-    further = {
-        "antialiasing": False,
-        "kernel_size": 0.25,
-        "subpixel_offset": torch.zeros(camera.image_height, camera.image_width, 2, device=device),
-        "projmatrix_raw": camera.perspective().T.contiguous().to(device, dtype),
-        "include_feature": False,
-        "f_count": False,
-    }
-    return {key: {**fields, **further, **changed}[key] for key in ORIGINALS[name][0]}
-
-
-def settings_of(name, device="cpu", dtype=torch.float32, **changed):
-    keywords = {key: changed.pop(key) for key in ("footprint", "effects") if key in changed}
-    settings = dialects.dialect_module(name).GaussianRasterizationSettings
-    return settings(**fields_of(name, device, dtype, **changed), **keywords)
-
-
-def arguments_of(name, device="cpu", dtype=torch.float32, **scene):
-    """A scene as the rasterizer of a dialect takes it."""
-    scene = {**scene_of(device, dtype), **scene}
-    if name == "accel":
-        scene["dc"], scene["shs"] = scene["shs"][:, :1], scene["shs"][:, 1:]
-    if name == "feature3dgs":
-        scene["semantic_feature"] = torch.rand(COUNT, 1, 5, device=device, dtype=dtype)
-    return scene
-
-
-def render(name, device="cpu", dtype=torch.float32, scene=None, **changed):
-    module = dialects.dialect_module(name)
-    rasterizer = module.GaussianRasterizer(settings_of(name, device, dtype, **changed))
-    return rasterizer(**(arguments_of(name, device, dtype) if scene is None else scene))
-
-
-def plain(device="cpu", dtype=torch.float32, footprint=None, scene=None, camera=CAMERA, **effects):
-    """(color, radii, Outputs) by the library."""
-    effects = ar.Effects(**effects) if effects else None
-    settings = camera.settings(dtype, device, footprint=footprint, effects=effects)
-    made = ar.GaussianRasterizer(settings)(**(scene_of(device, dtype) if scene is None else scene))
-    return (*made, None)[:3]
-
-
-def probe(image):
-    generator = torch.Generator().manual_seed(4)
-    return torch.rand(image.shape, generator=generator, dtype=torch.float64).to(image) - 0.3
+pytestmark = pytest.mark.usefixtures("nothing_chosen")
 
 
 # --- the module ---------------------------------------------------------------------------------
 
 
-def test_every_dialect_is_listed_here():
-    assert set(dialects.DIALECTS) == set(ORIGINALS)
+def test_every_dialect_is_listed():
+    assert set(dialects.DIALECTS) == set(ORIGINALS), "ORIGINALS of tests/originals.py must have a row for every dialect"
 
 
 @pytest.mark.parametrize("name", ORIGINALS)
@@ -157,7 +69,7 @@ def test_the_table_of_the_documentation():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         if len(cells) == 5 and cells[0].startswith("`"):
             rows[cells[0].strip("`")] = cells
-    assert set(rows) == set(dialects.DIALECTS)
+    assert set(rows) == set(dialects.DIALECTS), "the table of docs/dialects.md must have a row for every dialect"
     for name, (_, repositories, recognised, _, footprint) in rows.items():
         settings = dialects.dialect_module(name).GaussianRasterizationSettings
         expected = THEIR_FILTER[name].replace("0.25", "kernel_size").partition(":dil")[0].partition(":frame")[0]
@@ -166,6 +78,15 @@ def test_the_table_of_the_documentation():
         names = [*stated.get("inferred_from", ()), *stated.get("inferred_from_arguments", ())]
         assert not names or any(f"`{keyword}`" in recognised for keyword in names)
         assert name == "mini" or any(repository.lower() in repositories.lower() for repository in settings.repositories)
+
+
+def test_every_repository_has_its_row_in_the_guide():
+    """docs/migrating.md says what to set for each that a dialect names, but for second names of the same."""
+    plain_name = lambda text: "".join(filter(str.isalnum, text.lower()))  # noqa: E731
+    guide = plain_name((ROOT / "docs" / "migrating.md").read_text())
+    for name in dialects.DIALECTS:
+        for repository in dialects.dialect_module(name).GaussianRasterizationSettings.repositories:
+            assert repository in ("3DGS accel", "Deformable-3D-Gaussians") or plain_name(repository) in guide
 
 
 def test_names_are_unique():
@@ -250,21 +171,31 @@ def expected_values(name, device, dtype):
     if name == "grouping":
         color, radii, _ = of()
         return color, radii, color.new_zeros(16, *color.shape[1:])
+    if name == "feature3dgs":
+        color, radii, outputs = of(depth=True)
+        features = arguments_of(name, device, dtype)["semantic_feature"].flatten(1)
+        settings = CAMERA.settings(dtype, device, footprint="point")._replace(bg=features.new_zeros(5))
+        scene = scene_of(device, dtype) | {"shs": None, "colors_precomp": features}
+        return color, ar.GaussianRasterizer(settings)(**scene)[0], radii, outputs.depth
     if name == "mcmc":
         color, radii, _ = of()
         return color, radii, (radii > 0).int()
-    assert name == "mini"
+    if name != "mini":
+        pytest.fail(f"expected_values must say what dialect {name} returns")
     color, radii, outputs = of(gaussian_stats=True, dominant_index=True)
     dominated = torch.tensor([(outputs.dominant_index == i).sum() for i in range(COUNT)], device=device).int()
     return color, radii, outputs.gaussian_stats.sum_weight, outputs.gaussian_stats.pixels, dominated
 
 
-@pytest.mark.parametrize("name", [name for name in ORIGINALS if name != "feature3dgs"])
+@pytest.mark.parametrize("name", ORIGINALS)
 def test_returned_values(device, name):
     made, expected = render(name, device), expected_values(name, device, torch.float32)
     assert len(made) == len(expected)
+    # Features are blended with the colours here, and by themselves there: a few roundings of numbers up to 1.
+    tolerance = 2e-6 if name == "feature3dgs" else 0
     for ours, theirs in zip(made, expected):
-        assert ours.dtype == theirs.dtype and torch.equal(ours, theirs)
+        assert ours.dtype == theirs.dtype and ours.shape == theirs.shape
+        assert torch.allclose(ours, theirs, rtol=0, atol=tolerance)
 
 
 @pytest.mark.parametrize("name", ORIGINALS)
@@ -275,8 +206,6 @@ def test_functional_form(name):
     at = order.index("scales")
     order = [*order[:at], "opacities", *order[at:]]
     module, settings = dialects.dialect_module(name), settings_of(name)
-    if name == "feature3dgs":
-        return  # its positions are not known: only forward
     made = module.rasterize_gaussians(*[arguments.get(key) for key in order], settings)
     assert all(map(torch.equal, made, module.GaussianRasterizer(settings)(**arguments)))
 
@@ -288,8 +217,7 @@ def test_outputs_of_the_effects_come_last(name):
     *values, outputs = render(name, scene=arguments_of(name), effects=effects)
     assert isinstance(outputs, ar.Outputs) and outputs.alpha is not None and outputs.median_depth is not None
     assert len(values) == len(made)
-    if name != "feature3dgs":  # whose features are random
-        assert all(map(torch.equal, values, made))
+    assert all(map(torch.equal, values, made))
 
 
 @pytest.mark.parametrize("name", ORIGINALS)
@@ -333,7 +261,15 @@ def test_antialiasing_changes_what_samples_points(name):
 
 # --- what is inferred ---------------------------------------------------------------------------
 
-INFERRED = ["gs2024", "mip", "luiten", "monogs", "langsplat", "lightgaussian"]
+INFERRED = [
+    name
+    for name in ORIGINALS
+    if {"inferred_from", "inferred_without"} & vars(dialects.dialect_module(name).GaussianRasterizationSettings).keys()
+]
+
+
+def test_some_dialects_are_inferred():
+    assert {"gs2024", "mip", "luiten", "monogs", "langsplat", "lightgaussian"} <= set(INFERRED)
 
 
 @pytest.mark.parametrize("name", INFERRED)
@@ -568,75 +504,6 @@ def test_densify_receives_what_means2d_receives(device):
 # --- dialect by dialect -------------------------------------------------------------------------
 
 
-def test_mip_takes_no_offset_for_zero(device):
-    assert torch.equal(render("mip", device, subpixel_offset=None)[0], render("mip", device)[0])
-
-
-@pytest.mark.parametrize("x, y", [(0.3, -0.2), (-0.5, 0.0), (0.0, 1.25)])
-def test_mip_offset_of_all_pixels_against_its_definition(device, x, y):
-    """A Gaussian's weight in a pixel whose centre is moved, and the same gradient as where the mean is moved."""
-    one = {name: tensor[:1] for name, tensor in scene_of(device).items() if name != "means2D"}
-    del one["shs"]
-    one["colors_precomp"] = torch.ones(1, 3, device=device)
-    settings = settings_of("mip", device, bg=torch.zeros(3, device=device))
-    splat = ar.project(CAMERA.settings(torch.float32, device), **one)
-    rows, columns = torch.meshgrid(torch.arange(30.0), torch.arange(40.0), indexing="ij")
-    offset = torch.tensor([x, y], device=device)
-    centers = torch.stack([columns, rows], -1).to(device) + offset
-    weight = ar.footprint_weight(centers - splat.means2d[0], splat.cov2d[0], "mip", variance=0.25)
-    alpha = (one["opacities"] * weight).clamp(max=0.99)
-    moved = settings._replace(subpixel_offset=offset.expand(30, 40, 2))
-    color = moved.render(**one, means2D=None)[0][0]
-    # 40 px of a mean in float32, seen through a slope of at most 1 / px: 40 roundings of 2^-23, several times.
-    decided = (alpha - 1 / 255).abs() > 1e-4
-    assert decided.float().mean() > 0.9 and (alpha > 0.1).any()
-    expected = torch.where(alpha >= 1 / 255, alpha, 0)
-    assert (color - expected)[decided].abs().max() <= 5e-5
-    if (x, y) != (0.0, 0.0):
-        assert (color - settings.render(**one, means2D=None)[0][0]).abs().max() > 1e-2
-
-
-def test_mip_refuses_jitter(device):
-    """Also in a tensor that was zero, and after many that were."""
-    offset = torch.zeros(30, 40, 2, device=device)
-    render("mip", device, subpixel_offset=offset)
-    offset[3, 4, 1] = 0.5
-    with pytest.raises(ValueError, match=r"the same for all pixels, .* y from 0.0 to 0.5"):
-        render("mip", device, subpixel_offset=offset, debug=True)
-    with pytest.raises(ValueError, match=r"the same for all pixels"):
-        render("mip", device, subpixel_offset=torch.full((30, 40, 2), math.nan, device=device), debug=True)
-    with pytest.raises(ValueError, match=r"subpixel_offset must have shape \(30, 40, 2\), got \(40, 30, 2\)"):
-        render("mip", device, subpixel_offset=torch.zeros(40, 30, 2, device=device))
-
-
-@pytest.mark.parametrize("inference", [False, True])
-def test_mip_looks_at_a_tensor_once(device, monkeypatch, inference):
-    """And on CUDA no longer at new ones, once 8 were zero."""
-    looks = []
-    monkeypatch.setattr(torch, "stack", lambda *args, of=torch.stack: looks.append(1) or of(*args))
-    shape = 30, 40, 2
-    with torch.inference_mode(inference):
-        offset = torch.zeros(shape, device=device)
-    for _ in range(3):
-        assert mip._offset_of(offset, shape, debug=False) == (0, 0)
-    assert len(looks) == (3 if inference else 1)
-    offset = torch.zeros(shape, device=device)
-    for step in range(3):
-        offset += 0.25
-        assert mip._offset_of(offset, shape, debug=False) == (0.25 * (step + 1),) * 2
-    looks.clear()
-    for _ in range(20):  # one was not zero: all are looked at
-        mip._offset_of(torch.zeros(shape, device=device), shape, debug=False)
-    assert len(looks) == 20
-    mip._looks_left = mip._LOOKS
-    looks.clear()
-    for _ in range(20):
-        mip._offset_of(torch.zeros(shape, device=device), shape, debug=False)
-    assert len(looks) == (mip._LOOKS if device == "cuda" else 20)
-    mip._offset_of(torch.zeros(shape, device=device), shape, debug=True)
-    assert len(looks) == (mip._LOOKS + 1 if device == "cuda" else 21)
-
-
 def test_accel_has_the_gradient_of_dc(device):
     """The same rows of harmonics, in one tensor or in two."""
     scene = scenes.leaves(arguments_of("accel", device))
@@ -751,10 +618,6 @@ def test_features_are_blended_like_colors(device, dtype, name, key, channels, co
         if leaf is not None:
             # Two passes add up rounded gradients, and the colour's direction passes through one more projection.
             assert relative_error(leaf.grad, theirs[name_of_input].grad) < 1000 * tolerance, name_of_input
-
-
-def relative_error(actual, expected):
-    return ((actual - expected).norm() / expected.norm()).item()
 
 
 def test_features_and_a_background_that_is_an_image():
@@ -1021,7 +884,7 @@ FAKE = "GaussianRasterizer = None\n"
 @pytest.mark.parametrize(
     "files, message",
     [
-        ({"diff_gaussian_rasterization/__init__.py": FAKE}, "is not that of analytic_rasterizer but"),
+        ({"diff_gaussian_rasterization/__init__.py": FAKE}, "is not that of analytic_rasterizer but another at"),
         ({"diff_gaussian_rasterization/leftover.txt": ""}, "diff_gaussian_rasterization is missing"),
         ({"diff_gaussian_rasterization_ms.py": FAKE}, "diff_gaussian_rasterization_ms is not that of"),
         ({}, None),
@@ -1054,6 +917,19 @@ def test_another_distribution_of_the_same_name(tmp_path, files, message):
         assert printed == ""
     else:
         assert printed.count("\n") == 0 and message in printed and "--force-reinstall --no-deps" in printed
+
+
+def test_the_distribution_to_uninstall_is_named(tmp_path, monkeypatch):
+    """As pip knows it, which need not be the name of the module."""
+    info = tmp_path / "their_rasterizer-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: their-rasterizer\nVersion: 1.0\n")
+    (info / "top_level.txt").write_text("diff_gaussian_rasterization\n")
+    (tmp_path / "diff_gaussian_rasterization.py").write_text(FAKE)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "diff_gaussian_rasterization")
+    problem = installation.problem_of("diff_gaussian_rasterization")
+    assert "`pip uninstall -y their-rasterizer` and then `pip install --force-reinstall --no-deps" in problem
 
 
 def installed(folder):

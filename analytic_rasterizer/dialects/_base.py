@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 
+from .. import _C
 from ..arguments import check_tensors
 from ..effects import Effects, Outputs
 from ..footprints import Footprint, chosen_footprint, resolve_footprint
@@ -30,6 +31,7 @@ _resolved = lru_cache(maxsize=64)(resolve_footprint)
 _inferred_from: dict[str, type] = {}  # keyword of settings: the settings that have it
 _inferred_from_arguments: dict[str, type] = {}  # keyword of forward: the settings whose rasterizer has it
 _inferred_without: dict[str, type] = {}  # keyword of settings: the settings that lack it
+_known_fields = dict.fromkeys(FIELDS)  # of all dialects, in order
 _chosen: type | None = None  # settings of the dialect that was chosen for the process
 _companion_filter: str | None = None  # of a program that trains through another module of ours
 
@@ -100,6 +102,7 @@ class GaussianRasterizationSettings(LibrarySettings):
             for name in ("_fields", "_make", "__match_args__", *made._fields):
                 setattr(cls, name, vars(made)[name])
             cls.__signature__ = inspect.signature(made)
+            _known_fields.update(dict.fromkeys(made._fields))
         _inferred_from.update(dict.fromkeys(stated.get("inferred_from", ()), cls))
         _inferred_from_arguments.update(dict.fromkeys(stated.get("inferred_from_arguments", ()), cls))
         _inferred_without.update(dict.fromkeys(stated.get("inferred_without", ()), cls))
@@ -216,11 +219,24 @@ def _class_of(positional: int, keywords: dict[str, Any]) -> type:
     return GaussianRasterizationSettings
 
 
+def as_settings(settings: Any) -> LibrarySettings:
+    """Settings themselves, or those that an object with attributes of their names stands for.
+
+    The originals read attributes and nothing else, so that programs get by with a class of their own.
+
+    Raises:
+        TypeError: A field is missing, see `GaussianRasterizationSettings`.
+    """
+    if isinstance(settings, LibrarySettings):
+        return settings
+    return GaussianRasterizationSettings(**{n: getattr(settings, n) for n in _known_fields if hasattr(settings, n)})
+
+
 def forward_like(render_method):
     """`forward` of a rasterizer, with the signature of its settings' `render`; it follows the settings it is given."""
 
     def forward(self, *args, **kwargs):
-        settings = self.raster_settings
+        settings = as_settings(self.raster_settings)
         if isinstance(settings, GaussianRasterizationSettings):
             return settings.render(*args, **kwargs)
         return LibraryRasterizer.forward(self, *args, **kwargs)  # settings of the library itself
@@ -258,7 +274,7 @@ class GaussianRasterizer(LibraryRasterizer):
         """
         check_tensors(None, means3D=means3D)
         splats = project(
-            self.raster_settings,
+            as_settings(self.raster_settings),
             means3D,
             means3D.new_ones(len(means3D)),
             scales=scales,
@@ -289,6 +305,7 @@ def rasterize_gaussians(
 ) -> tuple:
     """The functional form of `GaussianRasterizer.forward`; it returns what the dialect of the settings returns."""
     arguments = means3D, means2D, opacities, sh, colors_precomp, scales, rotations, cov3Ds_precomp
+    raster_settings = as_settings(raster_settings)
     if isinstance(raster_settings, GaussianRasterizationSettings):
         return raster_settings.render(*arguments)
     return library_rasterize_gaussians(
@@ -308,11 +325,13 @@ def with_channels(
     rotations: torch.Tensor | None,
     cov3D_precomp: torch.Tensor | None,
 ) -> tuple:
-    """Renders colours and features in one pass; the features lie on zero, not on the background.
+    """Renders colours and features; the features lie on zero, not on the background.
+
+    One pass takes up to 509 channels beside the colours. More than that, such as the 512 of CLIP, take further passes.
 
     Args:
         settings: Whose outputs are made too.
-        features: (P, K) of 1 to 509 channels.
+        features: (P, K) of at least 1 channel.
         means3D to cov3D_precomp: As in `render`.
 
     Returns:
@@ -321,20 +340,17 @@ def with_channels(
     Raises:
         TypeError, ValueError: As `render`, or features have another shape.
     """
-    image, radii, *outputs = render(
-        settings,
-        settings.outputs,
-        means3D,
-        means2D,
-        opacities,
-        shs,
-        colors_precomp,
-        scales,
-        rotations,
-        cov3D_precomp,
-        features,
-    )
-    color, of_features = image.tensor_split((3,))
+    gaussians = means3D, means2D, opacities
+    shape = scales, rotations, cov3D_precomp
+    most, further = _C.MAX_CHANNELS - 3, ()
+    if isinstance(features, torch.Tensor) and features.dim() == 2 and features.shape[1] > most:
+        features, *further = features.split(most, dim=1)
+    image, radii, *outputs = render(settings, settings.outputs, *gaussians, shs, colors_precomp, *shape, features)
+    color, *images = image.tensor_split((3,))
+    for channels in further:
+        on_zero = settings._replace(bg=color.new_zeros(channels.shape[1]))
+        images.append(render(on_zero, NOTHING, *gaussians, None, channels, *shape)[0])
+    of_features = torch.cat(images) if further else images[0]
     return of_features, settings.values(color, radii, *outputs)
 
 

@@ -1,4 +1,6 @@
-"""diff_gaussian_rasterization._C: the functions of the original's compiled module (3DGS 2023), by position as there.
+"""diff_gaussian_rasterization._C: the functions of the original's compiled module, by position as there.
+
+Those of 3DGS 2023, and the structural similarity that the accelerated rasterizer of 3DGS 2024 has besides.
 
 The buffers that travel from `rasterize_gaussians` to `rasterize_gaussians_backward` are opaque to callers. Here they
 hold what the backward pass is not given otherwise: the opacities, and the name of the footprint. It renders again.
@@ -6,10 +8,13 @@ hold what the backward pass is not given otherwise: the opacities, and the name 
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 from .. import _C
 from ..arguments import camera_arguments, check_tensors, gaussian_arguments
+from ..losses import ssim
 from ..rasterizer import GaussianRasterizer
 from ..settings import GaussianRasterizationSettings
 
@@ -176,3 +181,22 @@ def mark_visible(means3D, viewmatrix, projmatrix):
     zero = means3D.new_zeros(3)
     settings = _settings(zero, 1.0, viewmatrix, projmatrix, 1.0, 1.0, 1, 1, 0, zero, False, None)
     return GaussianRasterizer(settings).markVisible(means3D)
+
+
+def fusedssim(C1, C2, img1, img2):
+    """Structural similarity of two images (C, H, W) pixel by pixel, without a graph: `ar.losses.ssim`.
+
+    Raises:
+        ValueError: C1 and C2 are not 0.01^2 and 0.03^2. What `ssim` raises.
+    """
+    if not (math.isclose(C1, 0.01**2) and math.isclose(C2, 0.03**2)):
+        raise ValueError(f"C1 and C2 must be 0.01^2 and 0.03^2, got {C1} and {C2}")
+    with torch.no_grad():
+        return ssim(img1, img2, "none")
+
+
+def fusedssim_backward(C1, C2, img1, img2, opt_grad):
+    """Gradient of `fusedssim` with respect to img1; opt_grad is that with respect to what it returned."""
+    img1 = img1.detach().requires_grad_()
+    with torch.enable_grad():
+        return torch.autograd.grad(ssim(img1, img2, "none"), img1, opt_grad)[0]

@@ -24,6 +24,8 @@ _ALGORITHMS = {
     "inv_viewprojmatrix": _STOP,
     "settings": _STOP,
     "ExtendedSettings": _STOP,
+    "SortMode": _STOP,
+    "GlobalSortOrder": _STOP,
     "pixel_weights": _TAMING,
     "scores": _SPEEDY,
     "timestamp": _ROTOR,

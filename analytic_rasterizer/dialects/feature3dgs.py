@@ -1,4 +1,4 @@
-"""Feature 3DGS: (color, feature map, radii, depth), blended in one pass.
+"""Feature 3DGS: (color, feature map, radii, depth).
 
 Repositories: ShijieZhou-UCLA/feature-3dgs. `semantic_feature` (P, 1, K) holds a feature of each Gaussian.
 """
@@ -6,7 +6,7 @@ Repositories: ShijieZhou-UCLA/feature-3dgs. `semantic_feature` (P, 1, K) holds a
 from ..effects import Effects
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
-from ._base import forward_like, rasterize_gaussians, with_channels
+from ._base import forward_like, with_channels
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
 
@@ -47,3 +47,21 @@ class GaussianRasterizer(Rasterizer):
     """Renders 3D Gaussians; `forward` takes `semantic_feature`."""
 
     forward = forward_like(GaussianRasterizationSettings.render)
+
+
+def rasterize_gaussians(
+    means3D,
+    means2D,
+    sh,
+    colors_precomp,
+    semantic_feature,
+    opacities,
+    scales,
+    rotations,
+    cov3Ds_precomp,
+    raster_settings,
+) -> tuple:
+    """The functional form of `GaussianRasterizer.forward`."""
+    return raster_settings.render(
+        means3D, means2D, opacities, sh, colors_precomp, semantic_feature, scales, rotations, cov3Ds_precomp
+    )

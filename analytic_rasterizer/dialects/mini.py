@@ -16,7 +16,7 @@ from ..rasterizer import render
 from ..rotations import rotation_matrices
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
-from ._base import given, rasterize_gaussians
+from ._base import as_settings, given, rasterize_gaussians
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
 
@@ -62,7 +62,7 @@ class GaussianRasterizer(Rasterizer):
             depth: (1, H, W) camera-space z of the point.
             accum_alpha: (1, H, W) how much light is left, 1 - alpha.
         """
-        settings = self.raster_settings
+        settings = as_settings(self.raster_settings)
         color, radii, outputs = render(
             settings,
             Effects(alpha=True, dominant_index=True),
@@ -81,8 +81,8 @@ class GaussianRasterizer(Rasterizer):
         axes, lengths = _ellipsoids(scales, rotations, cov3D_precomp, gaussian)
         origin = settings.campos.reshape(3)
         rays = _rays(settings, color)[seen]
-        to_frame = lambda vectors: torch.einsum("nij,ni->nj", axes, vectors) / lengths  # noqa: E731
-        center, direction = to_frame(means3D[gaussian] - origin), to_frame(rays)
+        center = _in_frame(means3D[gaussian] - origin, axes) / lengths
+        direction = _in_frame(rays, axes) / lengths
         along = (center * direction).sum(1) / direction.square().sum(1)
         points[seen] = origin + along[:, None] * rays
         depth = torch.where(seen, depths(points.reshape(-1, 3), settings.viewmatrix).reshape(seen.shape), 0)
@@ -109,6 +109,12 @@ def _rays(settings: Settings, like: torch.Tensor) -> torch.Tensor:
     columns = (proj[:3, 0] - x[:, None] * proj[:3, 3])[None].expand(height, width, 3)
     rows = (proj[:3, 1] - y[:, None] * proj[:3, 3])[:, None].expand(height, width, 3)
     return torch.linalg.cross(columns, rows)
+
+
+def _in_frame(vectors: torch.Tensor, axes: torch.Tensor) -> torch.Tensor:
+    """(N, 3) coordinates of vectors (N, 3) along the columns of axes (N, 3, 3); not by `@`, which autocast rounds."""
+    x, y, z = vectors[:, :, None].unbind(1)
+    return x * axes[:, 0] + y * axes[:, 1] + z * axes[:, 2]
 
 
 def _ellipsoids(scales, rotations, cov3D_precomp, gaussian: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

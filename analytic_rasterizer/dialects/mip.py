@@ -6,20 +6,26 @@ Deviates: `subpixel_offset` must be the same for all pixels, so pixels cannot be
 
 from __future__ import annotations
 
+import weakref
+
 import torch
-from torch.utils.weak import WeakTensorKeyDictionary
 
 from ..footprints import Footprint
 from ._base import FIELDS, GaussianRasterizer, _resolved, rasterize_gaussians
 from ._base import GaussianRasterizationSettings as Settings
+from ._later import LaterFlags
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
 
 _LOOKS = 8
-"""On CUDA, where looking at an offset waits for the device, one is taken for zero after so many that were."""
+"""On CUDA, where looking at an offset waits for the device, one is taken for zero after so many that were. A later call
+raises if it was not."""
 _looks_left = _LOOKS  # infinite once one was not zero
+_not_zero = LaterFlags()  # of offsets that were taken for zero: whether they were not
 
-_known = WeakTensorKeyDictionary()  # by tensor of offsets: its version, and the offset that all pixels have
+# By id of a tensor of offsets: a reference to it, its version, and the offset that all pixels have. Looking a tensor up
+# in torch's WeakTensorKeyDictionary takes ten times as long, a fifth of what a call of the dialect may take.
+_known: dict[int, tuple[weakref.ref, int | None, tuple[float, float]]] = {}
 
 
 class GaussianRasterizationSettings(Settings):
@@ -40,9 +46,10 @@ class GaussianRasterizationSettings(Settings):
         """As 3DGS 2023. `subpixel_offset` moves the centres of the pixels, all of them alike.
 
         Raises:
-            ValueError: subpixel_offset has another shape, or differs from pixel to pixel. See `_offset_of` for when it
-                is looked at.
+            ValueError: subpixel_offset has another shape, or differs from pixel to pixel; or that of an earlier call
+                was not zero, see `_offset_of`.
         """
+        _raise_for_an_earlier_call()
         settings = self
         if isinstance(self.subpixel_offset, torch.Tensor):
             offset = _offset_of(self.subpixel_offset, (self.image_height, self.image_width, 2), self.debug)
@@ -65,20 +72,29 @@ def _offset_of(offset: torch.Tensor, shape: tuple[int, int, int], debug: bool) -
 
     A tensor is looked at once, and again after it was changed. On CUDA looking waits for the device, and programs make
     a new tensor of zeros in every frame: once `_LOOKS` tensors were zero and none was not, further ones there are taken
-    for zero, but for debug.
+    for zero, but for debug. The device is asked whether they are, and `_raise_for_an_earlier_call` looks at its answer.
 
     Raises:
-        ValueError: It has another shape, or not all pixels have the same.
+        ValueError: It has another shape, not all pixels have the same, or it would have to be looked at while a CUDA
+            graph is captured.
     """
     global _looks_left
     version = None if offset.is_inference() else offset._version  # a tensor of inference mode has no version
-    known = _known.get(offset)
-    if version is not None and known is not None and known[0] == version:
-        return known[1]
+    key = id(offset)
+    known = _known.get(key)
+    if version is not None and known is not None and known[0]() is offset and known[1] == version:
+        return known[2]
     if tuple(offset.shape) != shape:
         raise ValueError(f"subpixel_offset must have shape {shape}, got {tuple(offset.shape)}")
-    if offset.is_cuda and _looks_left <= 0 and not debug:
-        return 0.0, 0.0
+    if _looking_waits(offset):
+        if torch.cuda.is_current_stream_capturing():
+            raise ValueError(
+                "subpixel_offset must be None while a CUDA graph is captured, for it cannot be looked at then, got a "
+                "tensor that is new or was changed"
+            )
+        if _looks_left <= 0 and not debug:
+            _not_zero.send(offset.detach().any())  # of NaN, too
+            return 0.0, 0.0
     low, high = torch.stack(offset.detach().reshape(-1, 2).aminmax(dim=0)).tolist()
     if low != high:
         _looks_left = float("inf")
@@ -88,5 +104,21 @@ def _offset_of(offset: torch.Tensor, shape: tuple[int, int, int], debug: bool) -
         )
     x, y = low
     _looks_left = float("inf") if (x, y) != (0.0, 0.0) else _looks_left - 1
-    _known[offset] = version, (x, y)
+    _known[key] = weakref.ref(offset, lambda _, forget=_known.pop: forget(key, None)), version, (x, y)
     return x, y
+
+
+def _looking_waits(offset: torch.Tensor) -> bool:
+    """Whether the host has to wait for the device before it can read the tensor."""
+    return offset.is_cuda
+
+
+def _raise_for_an_earlier_call() -> None:
+    """Raises ValueError if an offset that was taken for zero was not. Waits for nothing."""
+    global _looks_left
+    if _not_zero.any_set():
+        _looks_left = float("inf")
+        raise ValueError(
+            f"subpixel_offset of an earlier call was not zero, which was not waited for after {_LOOKS} that were: that "
+            "call was rendered without it. Further offsets are looked at at once; with debug=True all are"
+        )

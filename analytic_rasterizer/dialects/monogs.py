@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 
 from ..effects import Effects
+from ..rotations import product
 from ._base import FIELDS, forward_like
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
@@ -33,9 +34,9 @@ class _Moved(torch.autograd.Function):
     @staticmethod
     def backward(ctx, dL_dview, dL_dproj, dL_dcampos):
         view, proj_raw = (matrix.reshape(4, 4) for matrix in ctx.saved_tensors)
-        through_view = dL_dview.reshape(4, 4) + dL_dproj.reshape(4, 4) @ proj_raw.T
-        m = through_view.T @ view  # dL_dV V^T
-        dL_drho = m[:3, 3] - dL_dcampos.reshape(3) @ view[:3, :3]
+        through_view = dL_dview.reshape(4, 4) + product(dL_dproj.reshape(4, 4), proj_raw.T)
+        m = product(through_view.T, view)  # dL_dV V^T
+        dL_drho = m[:3, 3] - product(dL_dcampos.reshape(1, 3), view[:3, :3])[0]
         dL_dtheta = torch.stack([m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]])
         theta_shape, rho_shape = ctx.shapes
         return dL_dtheta.reshape(theta_shape), dL_drho.reshape(rho_shape), dL_dview, dL_dproj, dL_dcampos, None

@@ -47,7 +47,7 @@ constexpr double kReaches[] = {0, 0.25, 15 / 32.0};
 TEST(Bin, TilesAreThoseThatTheSupportTouches) {
   const TileGrid grids[] = {{100, 70}, {1, 1}, {1, 400}, {400, 1}, {16, 32}, {17, 33}};
   Random random(1);
-  for (int trial = 0; trial < 3000; ++trial) {
+  for (int trial = 0; trial < search_trials(3000); ++trial) {
     const TileGrid grid = grids[trial % 6];
     const double r = kReaches[trial % 3];
     const auto [w, s] = random_ellipse(random, r);
@@ -84,7 +84,7 @@ Span<double> chord(const Mat2<double>& w, double level, double y) {
 
 TEST(Bin, ExtentsAreExact) {
   Random random(2);
-  for (int trial = 0; trial < 3000; ++trial) {
+  for (int trial = 0; trial < search_trials(3000); ++trial) {
     const double r = kReaches[trial % 3];
     auto [w, s] = random_ellipse(random, r);
     s.mean = {random.uniform(-100, 100), random.uniform(-100, 100)};
@@ -170,7 +170,7 @@ TEST_P(BinTest, NoVisiblePixelIsLost) {
   const TileGrid grid = {70, 50};
   Random random(3);
   int visible = 0;
-  for (int trial = 0; trial < 200; ++trial) {
+  for (int trial = 0; trial < search_trials(200); ++trial) {
     SplatRow<float> splat = random_splat(f, random, grid);
     splat.opacity = float(random.uniform(0.01, 1));
     splat.level = f.in_float.level(splat);
@@ -184,7 +184,7 @@ TEST_P(BinTest, NoVisiblePixelIsLost) {
       }
     }
   }
-  EXPECT_GT(visible, 5000);
+  EXPECT_GT(visible, search_trials(5000));
 }
 
 // The opacity is such that one sample of one pixel just reaches 1/255: without kLevelSlack a rounding
@@ -194,7 +194,7 @@ TEST_P(BinTest, NoPixelAtTheThresholdIsLost) {
   const TileGrid grid = {2000, 1500};
   Random random(4);
   int checked = 0;
-  for (int trial = 0; trial < 20000; ++trial) {
+  for (int trial = 0; trial < search_trials(20000); ++trial) {
     SplatRow<float> splat = random_splat(f, random, grid);
     const Vec2<float> z = {float(random.uniform(-2.3, 2.3)), float(random.uniform(-2.3, 2.3))};
     const Vec2<float> d = unwhiten(f.in_float.ellipse(splat), z);
@@ -212,7 +212,7 @@ TEST_P(BinTest, NoPixelAtTheThresholdIsLost) {
     ++checked;
     ASSERT_TRUE(reaches(f, splat, grid, x, y)) << "trial " << trial << " opacity " << splat.opacity;
   }
-  EXPECT_GT(checked, 1000);
+  EXPECT_GT(checked, search_trials(1000));
 }
 
 }  // namespace

@@ -160,7 +160,7 @@ TYPED_TEST_SUITE(LanesTest, Scalars);
 TYPED_TEST(LanesTest, DifferenceOfProductsKeepsItsBound) {
   using T = TypeParam;
   Random random(5);
-  for (int trial = 0; trial < 100000; ++trial) {
+  for (int trial = 0; trial < search_trials(100000); ++trial) {
     const T a = T(random.normal()), b = T(random.normal()), c = T(random.normal());
     T d = a * b / c;
     for (int k = random.below(4); k > 0; --k) d = std::nextafter(d, T(1e9));

@@ -511,7 +511,7 @@ template <class Cam, class Function>
 void expect_nothing_kept_that_may_not_be_visible(const Footprint& f, const Function& view_of) {
   Random random(2);
   int kept = 0;
-  for (int trial = 0; trial < 200000; ++trial) {
+  for (int trial = 0; trial < search_trials(200000); ++trial) {
     const View<float>& at = view_of(trial);
     const auto camera = at.template load<Cam>();
     const double z = random.log_uniform(0.15, 100), scale = at.lens.orthographic() ? 4 : z,
@@ -529,7 +529,7 @@ void expect_nothing_kept_that_may_not_be_visible(const Footprint& f, const Funct
     ++kept;
     ASSERT_TRUE(may_be_visible(camera, p.view({false, -1}), 0, cull_bounds<float>({f.index, options}))) << trial;
   }
-  EXPECT_GT(kept, 1000);
+  EXPECT_GT(kept, search_trials(1000));
 }
 TEST_P(ProjectTest, NeverKeepsWhatMayNotBeVisible) {
   const View<float> plain;

@@ -16,6 +16,16 @@ namespace ar::test {
 /// Rounding error of one operation, relative.
 template <typename T> inline constexpr T kEps = std::numeric_limits<T>::epsilon() / 2;
 
+#if defined(AR_SANITIZED)
+inline constexpr bool kSanitized = true;
+#else
+inline constexpr bool kSanitized = false;
+#endif
+
+/// How many trials a long search for a wrong number has. Under sanitizers, which are ten times as slow and look at
+/// memory rather than at numbers, a tenth.
+constexpr int search_trials(int trials) { return kSanitized ? trials / 10 : trials; }
+
 struct Random {
   std::mt19937_64 engine;
   explicit Random(uint64_t seed) : engine(seed) {}
