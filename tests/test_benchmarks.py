@@ -4,6 +4,8 @@ import importlib
 import inspect
 import json
 import math
+import os
+import subprocess
 import sys
 import types
 from typing import Any, NamedTuple
@@ -11,7 +13,7 @@ from typing import Any, NamedTuple
 import pytest
 import scenes
 import torch
-from conftest import ROOT
+from conftest import DEADLINE, ROOT
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
@@ -361,3 +363,25 @@ def test_training(device, tmp_path, monkeypatch, capsys):
     assert (runs[2]["options"]["scale_repeats"], runs[2]["options"]["density"]) == ([2, 1], "absgrad")
     monkeypatch.setattr(sys, "argv", ["training.py", str(tmp_path), "--variants", "none"])
     assert training.main() == 2
+
+
+def test_distributed(small_scene):
+    """Measured numbers for every number of ranks, and the model's for more; as many bytes as the formula says."""
+    arguments = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--json", small_scene / "out.json"]
+    options = ["--ranks", "1", "2", "--rounds", "2", "--threads", "1", "--device", "cpu"]
+    done = subprocess.run(
+        [sys.executable, ROOT / "benchmarks" / "distributed.py", *map(str, arguments), *options],
+        cwd=small_scene, capture_output=True, text=True, timeout=DEADLINE,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-2000:]
+    rows = [line.split() for line in done.stdout.splitlines()[3:]]
+    assert [row[0] for row in rows] == ["1", "2", "4", "8", "64"] and {len(row) for row in rows} == {9}
+    assert all(cell != "-" for row in rows[:2] for cell in row) and rows[2][1:7] == ["-"] * 6
+    written = json.loads((small_scene / "out.json").read_text())
+    assert all(math.isfinite(value) for of_ranks in written["results"].values() for value in of_ranks.values())
+    one, two = (written["results"][ranks] for ranks in ("1", "2"))
+    assert one["sent"] == one["exchange"] == 0 < two["exchange"] and one["own_bytes"] == 2 * two["own_bytes"]
+    # Exact where each rank has half of the splats of each camera; here each has at most all of them.
+    assert 0 < two["sent"] <= 2 * written["model"]["2"]["sent"]
+    assert written["model"]["64"]["images_per_second"] > written["model"]["4"]["images_per_second"] > 0

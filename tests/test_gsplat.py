@@ -573,7 +573,6 @@ def test_gaussians_behind_every_camera(device):
 
 REFUSED = [
     {"sparse_grad": True},
-    {"distributed": True},
     {"with_ut": True},
     {"with_eval3d": True},
     {"radial_coeffs": torch.zeros(2, 6)},

@@ -616,7 +616,7 @@ def test_watching_shows_the_scene_and_changes_no_bit(synthetic, tmp_path, monkey
     assert cli.main(["train", str(synthetic), "--out", str(tmp_path / "alone"), *common]) == 0
     capsys.readouterr()
     shown = watched(["train", str(synthetic), "--out", str(tmp_path / "watched"), *common], monkeypatch)
-    assert re.search(r"^watch at http://127\.0\.0\.1:\d+$", capsys.readouterr().out, re.M)
+    assert re.search(r"^watch at http://127\.0\.0\.1:\d+/[\w-]+/$", capsys.readouterr().out, re.M)
     assert [step for _, step, *_ in shown] == list(range(13))
     assert [force for *_, force in shown] == [False] * 12 + [True]
     assert shown[9][2] == "" and re.fullmatch(r"loss [\d.]+, PSNR [\d.]+, Gaussians 60", shown[10][2])

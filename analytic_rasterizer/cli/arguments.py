@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 import torch
 
 from .. import _C
+from .launch import report
 
 # What a user can cause: bad values and files (ValueError, TypeError, OSError), a missing extra
 # (ImportError), a device out of memory or absent (RuntimeError, MemoryError), a training that
@@ -23,7 +23,8 @@ class Parser(argparse.ArgumentParser):
     """An ArgumentParser whose errors are one line."""
 
     def error(self, message):
-        self.exit(2, f"error: {message} (see {self.prog} --help)\n")
+        report(f"{message} (see {self.prog} --help)")
+        self.exit(2)
 
 
 def run_command(parse: Callable[[], argparse.Namespace]) -> int:
@@ -42,7 +43,7 @@ def run_command(parse: Callable[[], argparse.Namespace]) -> int:
     except KeyboardInterrupt:
         return 130
     except USER_ERRORS as error:
-        print(f"error: {_describe(error)}", file=sys.stderr)
+        report(_describe(error))
         return 2
 
 

@@ -12,8 +12,10 @@ from ..footprints import resolve_footprint
 from ..training import TrainingOptions, evaluate, load_capture, load_lpips, load_pictures, save_pictures
 from ..training.evaluation import LPIPS_WEIGHTS, MEASURES
 from ..training.files import OPTIONS, SCENE, write_json
+from ..training.ranks import Ranks, even_counts
 from ..training.trainer import background_of
 from .arguments import add_machine_options, count, use_machine, whole_numbers, writable_folder
+from .launch import add_rank_options, ranks_of
 
 HEADINGS = {"psnr": ("PSNR", "{:.2f}"), "ssim": ("SSIM", "{:.4f}"), "lpips": ("LPIPS", "{:.4f}")}
 
@@ -36,12 +38,19 @@ def add_parser(subcommands) -> None:
     add("--lpips", choices=(*LPIPS_WEIGHTS, "none"), default="vgg", help="network of LPIPS (default: vgg)")
     add("--pictures", type=int, default=2, metavar="N", help="views to draw per footprint and scale (default: 2)")
     add_machine_options(parser, device=None)
+    add_rank_options(parser)
     parser.set_defaults(run=run)
 
 
 def run(args) -> None:
     """Measures, writes the results, and prints the table."""
     use_machine(args)
+    with ranks_of(args) as ranks:
+        run_on(ranks, args)
+
+
+def run_on(ranks: Ranks, args) -> None:
+    """`run`, on every rank."""
     folder = Path(args.out)
     try:
         described = json.loads((folder / OPTIONS).read_text(encoding="utf-8"))
@@ -53,7 +62,7 @@ def run(args) -> None:
     capture = load_capture(args.data or source["scene"], source["images"], source["test_every"])
     if not capture.test:
         raise io.SceneError(f"{source['scene']}: there are no test pictures")
-    scene = io.load_scene(folder / SCENE).to(args.device)
+    scene = part_of(io.load_scene(folder / SCENE), ranks).to(args.device)
     background = background_of(options, capture.background) or capture.background
     pictures = load_pictures(capture.test, scales, background, args.device, options.downsampling)
     lpips = None
@@ -61,18 +70,26 @@ def run(args) -> None:
         try:
             lpips = load_lpips(args.lpips, args.device)
         except (ImportError, io.SceneError) as error:
-            print(f"LPIPS is left out: {error}", file=sys.stderr)
-    supersampling = args.supersampling or options.supersampling
+            if ranks.is_first:
+                print(f"LPIPS is left out: {error}", file=sys.stderr)
     out = writable_folder(folder / "evaluation")
     results = {}
+    common = {"supersampling": args.supersampling or options.supersampling, "ranks": ranks}
     for footprint in footprints:
-        results[footprint] = evaluate(scene, pictures, footprint, lpips, supersampling=supersampling)
+        results[footprint] = evaluate(scene, pictures, footprint, lpips, **common)
         if args.pictures > 0:
-            save_pictures(out, scene, pictures, footprint, args.pictures, supersampling=supersampling)
-    views = [view.name for view in pictures.views]
-    written = {"views": views, "supersampling": supersampling, "results": results}
-    write_json(folder / "evaluation.json", written)
-    print(format_results(results, scales))
+            save_pictures(out, scene, pictures, footprint, args.pictures, **common)
+    if ranks.is_first:
+        views = [view.name for view in pictures.views]
+        written = {"views": views, "supersampling": common["supersampling"], "results": results}
+        write_json(folder / "evaluation.json", written)
+        print(format_results(results, scales))
+
+
+def part_of(scene: io.Scene, ranks: Ranks) -> io.Scene:
+    """The Gaussians of this rank."""
+    rows = ranks.part_of(even_counts(len(scene.means), ranks.world))
+    return scene._replace(**{name: getattr(scene, name)[rows] for name in scene._fields[:5]})
 
 
 def format_results(results: dict[str, dict], scales: tuple[int, ...]) -> str:

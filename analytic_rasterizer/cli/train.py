@@ -13,7 +13,9 @@ from ..footprints import resolve_footprint
 from ..training import Run, TrainingOptions
 from ..training.files import CHECKPOINT, SCENE, read_checkpoint
 from ..training.options import BACKGROUNDS, DENSITIES, DOWNSAMPLINGS, PRESETS, RANDOM_BACKGROUND, preset_values
+from ..training.ranks import Ranks
 from .arguments import add_machine_options, port, use_machine, whole_numbers
+from .launch import add_rank_options, is_launched, ranks_of
 
 MAIN = {
     "footprint": "how a pixel sees a splat",
@@ -40,7 +42,8 @@ def add_parser(subcommands) -> None:
         help="train a scene from photographs",
         description="Train Gaussians on the pictures of SCENE, a folder of a NeRF-synthetic scene, of the multi-scale "
         "Blender set, of a COLMAP reconstruction or of a nerfstudio capture. Writes scene.ply, cameras.json, "
-        "metrics.json, log.jsonl, options.json and checkpoint.pt to DIR. Ctrl-C saves and ends; --resume goes on.",
+        "metrics.json, log.jsonl, options.json and checkpoint.pt to DIR. Ctrl-C saves and ends; --resume goes on. "
+        "Under torchrun, several processes train one scene together.",
     )
     add = parser.add_argument
     add("scene", metavar="SCENE", help="folder of pictures with cameras")
@@ -61,6 +64,7 @@ def add_parser(subcommands) -> None:
     )
     add("--port", type=port, metavar="N", help="of --watch: port to serve on (default: any free one)")
     add_machine_options(parser, device=None)
+    add_rank_options(parser)
     rest = parser.add_argument_group("fine tuning", "see docs/training.md")
     types = typing.get_type_hints(TrainingOptions)
     for field in fields(TrainingOptions):
@@ -80,15 +84,24 @@ def add_parser(subcommands) -> None:
 
 def run(args) -> None:
     """Trains, writes the results, and prints what the test views say."""
+    use_machine(args)
+    with ranks_of(args) as ranks:
+        run_on(ranks, args)
+
+
+def run_on(ranks: Ranks, args) -> None:
+    """`run`, on every rank."""
     given = {field.name: getattr(args, field.name) for field in fields(TrainingOptions) if hasattr(args, field.name)}
     if args.port is not None and not args.watch:
         raise ValueError("--port is for --watch")
-    use_machine(args)
+    if args.watch and is_launched():
+        raise ValueError("--watch is for one process, got torchrun")
     io.optional_import("gsply")  # writes the scene in the end
     if args.watch:
         io.optional_import("viser", "view")  # raises before the pictures are read
     checkpoint = Path(args.out) / CHECKPOINT
-    stored = TrainingOptions.from_dict(read_checkpoint(checkpoint)["options"]) if args.resume else None
+    mapped = ranks.world > 1
+    stored = TrainingOptions.from_dict(read_checkpoint(checkpoint, mapped=mapped)["options"]) if args.resume else None
     if args.preset is not None:
         # Without --scales, a preset is for those of the checkpoint.
         given.setdefault("scales", (stored or TrainingOptions).scales)
@@ -113,6 +126,7 @@ def run(args) -> None:
         points=args.points,
         save_every=args.save_every,
         resume=args.resume,
+        ranks=ranks,
     )
     with training.start_viewer(args.port or 0) if args.watch else nullcontext() as viewer:
         if viewer is not None:
@@ -122,15 +136,16 @@ def run(args) -> None:
 
 def finish(training: Run, complete: bool, args) -> None:
     """Says what was written, and tests it. Raises KeyboardInterrupt for a training that was interrupted."""
+    say = print if training.ranks.is_first else lambda line: None
     if not complete:
-        print(f"stopped after {training.progress.step} steps and saved; go on with --resume")
+        say(f"stopped after {training.progress.step} steps and saved; go on with --resume")
         raise KeyboardInterrupt
-    print(f"{Path(args.out) / SCENE}: {len(training.trainer.gaussians.means)} Gaussians")
+    say(f"{Path(args.out) / SCENE}: {training.count()} Gaussians")
     if args.export:
-        print(f"{training.export_mip()}: for viewers that do not integrate over pixels")
+        say(f"{training.export_mip()}: for viewers that do not integrate over pixels")
     if not args.no_evaluate:
         metrics = training.evaluate()
-        print(f"{metrics['steps']} steps in {metrics['seconds']:.1f} s, {metrics['ms_per_step']:.2f} ms each")
+        say(f"{metrics['steps']} steps in {metrics['seconds']:.1f} s, {metrics['ms_per_step']:.2f} ms each")
         for scale, values in metrics.get("test", {}).items():
             name = scale if scale == "mean" else f"1/{scale}"
-            print(f"test, {name}: PSNR {values['psnr']:.2f} dB, SSIM {values['ssim']:.4f}")
+            say(f"test, {name}: PSNR {values['psnr']:.2f} dB, SSIM {values['ssim']:.4f}")

@@ -36,6 +36,8 @@ from ..relocation import compute_relocation
 from ..rotations import rotation_matrices
 from .model import Gaussians
 from .options import TrainingOptions
+from .ranks import ALONE, Ranks
+from .schedule import passes
 
 SHRINKAGE = 1.6  # of the two halves of a Gaussian
 RESET_OPACITY = 0.01
@@ -51,10 +53,14 @@ class FixedDensity:
         gaussians: The parameters, in the order of the optimizer's groups, the first of which has the means.
         extent: Radius of the scene, world units.
         white_background: Whether opacities are also lowered when growth begins.
+        ranks: Those that have the other Gaussians. Every rank decides about its own; the limit is that of all.
 
     Attributes:
         gaussians: May be other tensors after `after_step`.
+        row_state: Names of the attributes that have a row per Gaussian.
     """
+
+    row_state: tuple[str, ...] = ()
 
     def __init__(
         self,
@@ -63,24 +69,42 @@ class FixedDensity:
         extent: float,
         options: TrainingOptions,
         white_background: bool = False,
+        ranks: Ranks = ALONE,
     ):
-        self.gaussians, self.optimizer = gaussians, optimizer
+        self.gaussians, self.optimizer, self.ranks = gaussians, optimizer, ranks
         self.extent, self.options, self.white_background = extent, options, white_background
         self.generator = torch.Generator(gaussians.means.device).manual_seed(options.seed)
+
+    def watches(self, scale: int) -> bool:
+        """Whether gradients of pictures of this scale are looked at."""
+        return False
 
     def leaf(self, scale: int) -> Tensor | None:
         """What to render a picture of this scale with as means2D, so that `observe` can read its gradient."""
         return None
 
+    def observe_rows(self, rows: Tensor, gradients: Tensor) -> None:
+        """As `observe`, for a picture whose gradients are known by row.
+
+        Args:
+            rows: (n,) int64, the Gaussians that the picture shows, each once.
+            gradients: (n, 2) with respect to their means in normalized device coordinates; with the density control
+                "absgrad" the sums of absolute values.
+        """
+
+    def forget(self) -> None:
+        """Begins new averages, of as many Gaussians as there are now."""
+
     def observe(self, leaf: Tensor | None, radii: Tensor) -> None:
         """Looks at the gradient of the leaf, and at the radii of its picture. Nothing here waits for the device."""
 
-    def after_step(self, step: int, share: float) -> bool:
+    def after_step(self, step: int, share: float, stride: int = 1) -> bool:
         """Acts where it is time; to be called after every step of the optimizer.
 
         Args:
             step: Steps taken, this one included.
             share: Of the training that is over, 0 to 1.
+            stride: Steps that the last step of the optimizer stood for.
 
         Returns:
             Whether there are other Gaussians now.
@@ -99,17 +123,21 @@ class FixedDensity:
 class GradientDensity(FixedDensity):
     """[3DGS] with signed gradients, or [AbsGS] with sums of absolute values."""
 
+    row_state = ("gradient_sums", "views")
+
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
         self.growing = self.options.densify_until > 0
-        self._forget()
+        self.forget()
+
+    def watches(self, scale: int) -> bool:
+        return self.growing and (self.options.gradient_scales != "finest" or scale == min(self.options.scales))
 
     def leaf(self, scale: int) -> Tensor | None:
-        options = self.options
-        if not self.growing or (options.gradient_scales == "finest" and scale != min(options.scales)):
+        if not self.watches(scale):
             return None
         # Columns 2 and 3 of four receive the absolute values. The values are not read, and need not be written.
-        columns = 4 if options.density == "absgrad" else 3
+        columns = 4 if self.options.density == "absgrad" else 3
         return self.gradient_sums.new_empty(len(self.gradient_sums), columns).requires_grad_()
 
     @torch.no_grad()
@@ -121,19 +149,23 @@ class GradientDensity(FixedDensity):
         self.views += radii > 0
 
     @torch.no_grad()
-    def after_step(self, step: int, share: float) -> bool:
+    def observe_rows(self, rows: Tensor, gradients: Tensor) -> None:
+        self.gradient_sums[rows] += torch.linalg.vector_norm(gradients, dim=1)
+        self.views[rows] += 1
+
+    @torch.no_grad()
+    def after_step(self, step: int, share: float, stride: int = 1) -> bool:
         options = self.options
         if not self.growing or share >= options.densify_until:
             self.growing = False
             return False
-        changes = step > options.densify_from and step % options.densify_every == 0
+        changes = step > options.densify_from and passes(step, options.densify_every, stride)
         if changes:
             self._grow(self.gradient_sums / self.views.clamp_min(1))
             self._prune(too_large=step > options.reset_every > 0)
-            self._forget()
-        if options.reset_every and (
-            step % options.reset_every == 0 or (self.white_background and step == options.densify_from)
-        ):
+            self.forget()
+        begins = step - stride < options.densify_from <= step
+        if options.reset_every and (passes(step, options.reset_every, stride) or (self.white_background and begins)):
             self._lower_opacities()
         return changes
 
@@ -147,8 +179,7 @@ class GradientDensity(FixedDensity):
         self.gradient_sums = state["gradient_sums"].to(self.gradient_sums.device)
         self.views = state["views"].to(self.views.device)
 
-    def _forget(self) -> None:
-        """Begins new averages."""
+    def forget(self) -> None:
         means = self.gaussians.means
         self.gradient_sums = torch.zeros(len(means), device=means.device)
         self.views = torch.zeros(len(means), dtype=torch.int32, device=means.device)
@@ -158,7 +189,7 @@ class GradientDensity(FixedDensity):
         old = self.gaussians
         grown = gradients >= self.options.growth_gradient
         if self.options.gaussian_limit < math.inf:
-            room = min(int(grown.sum()), max(int(self.options.gaussian_limit) - len(grown), 0))
+            room = self.ranks.allowed(int(self.options.gaussian_limit), len(grown), int(grown.sum()))
             chosen = torch.where(grown, gradients, -1).topk(room).indices
             grown = torch.zeros_like(grown).index_fill_(0, chosen, True)
         large = old.log_scales.amax(1).exp() > self.options.split_above * self.extent
@@ -185,9 +216,10 @@ class MonteCarloDensity(FixedDensity):
     """[MCMC]"""
 
     @torch.no_grad()
-    def after_step(self, step: int, share: float) -> bool:
+    def after_step(self, step: int, share: float, stride: int = 1) -> bool:
         options = self.options
-        changes = step > options.densify_from and step % options.densify_every == 0 and share < options.densify_until
+        changes = step > options.densify_from and passes(step, options.densify_every, stride)
+        changes = changes and share < options.densify_until
         if changes:
             self._relocate()
             self._add()
@@ -213,8 +245,9 @@ class MonteCarloDensity(FixedDensity):
         """Adds Gaussians where others are."""
         old = self.gaussians
         count = len(old.means)
-        more = min(int(self.options.gaussian_limit), int((1 + self.options.grow_share) * count)) - count
-        if more <= 0:
+        wanted = int((1 + self.options.grow_share) * count) - count
+        more = self.ranks.allowed(int(self.options.gaussian_limit), count, wanted)
+        if more == 0:
             return
         sources = draw(old.logit_opacities[:, 0].sigmoid(), more, self.generator)
         self._share(sources)

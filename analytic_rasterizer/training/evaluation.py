@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from statistics import mean
 from typing import Any
@@ -13,8 +13,10 @@ from torch import Tensor
 
 from .. import io
 from ..losses import ssim
+from ..settings import GaussianRasterizationSettings
 from .model import Activated
 from .pictures import Pictures
+from .ranks import ALONE, Ranks
 
 LPIPS_WEIGHTS = {"vgg": "vgg16-397923af.pth", "alex": "alexnet-owt-7be5be79.pth"}  # of torchvision
 ERROR_GAIN = 4  # of the pictures of errors
@@ -63,14 +65,16 @@ def evaluate(
     lpips: Perceptual | None = None,
     *,
     supersampling: int = 1,
+    ranks: Ranks = ALONE,
     **options: Any,
 ) -> dict[str, dict]:
     """PSNR [dB], SSIM and LPIPS of a scene against pictures, means over views.
 
     Args:
-        scene: On the device of the pictures.
+        scene: On the device of the pictures; of several ranks each has its part.
         lpips: From `load_lpips`; None: left out.
         supersampling: As in `TrainingOptions`.
+        ranks: Those that share the scene and the views. All of them get all results.
         **options: Further settings.
 
     Returns:
@@ -80,15 +84,16 @@ def evaluate(
     gaussians = Activated(*scene[:5])
     results: dict[str, dict] = {}
     for scale, settings in pictures.resolve(footprint=footprint, sh_degree=scene.sh_degree, **options).items():
-        measured = []
-        for view, chosen in enumerate(settings):
-            image = gaussians.render(chosen, supersampling=supersampling)[0].clamp(0, 1)
-            truth = pictures.truth(scale, view)
+        measured = {}
+        for view, image in rendered(gaussians, settings, supersampling, ranks):
+            image, truth = image.clamp(0, 1), pictures.truth(scale, view)
             values = [psnr(image, truth), ssim(image, truth)]
             if lpips is not None:
                 values.append(lpips(image, truth).reshape(()))
-            measured.append(torch.stack(values))
-        views = [dict(zip(MEASURES, values)) for values in torch.stack(measured).tolist()]
+            measured[view] = torch.stack(values)
+        own = dict(zip(measured, torch.stack(list(measured.values())).tolist() if measured else []))
+        of_views = {view: values for of_rank in ranks.exchange(own) for view, values in of_rank.items()}
+        views = [dict(zip(MEASURES, of_views[view])) for view in range(len(settings))]
         results[str(scale)] = _means(views) | {"views": views}
     results["mean"] = _means([{k: v for k, v in of_scale.items() if k != "views"} for of_scale in results.values()])
     return results
@@ -96,6 +101,24 @@ def evaluate(
 
 def _means(rows: list[dict[str, float]]) -> dict[str, float]:
     return {key: mean(row[key] for row in rows) for key in rows[0]}
+
+
+def rendered(
+    gaussians: Activated, settings: list[GaussianRasterizationSettings], supersampling: int, ranks: Ranks
+) -> Iterator[tuple[int, Tensor]]:
+    """Places in `settings` and pictures (3, H, W) of them; of several ranks they take turns.
+
+    Args:
+        gaussians: Of this rank.
+    """
+    if ranks.world == 1:
+        for place, chosen in enumerate(settings):
+            yield place, gaussians.render(chosen, supersampling=supersampling)[0]
+        return
+    for first in range(0, len(settings), ranks.world):
+        batch = gaussians.render_together(settings[first : first + ranks.world], supersampling, group=ranks.group)
+        for view in batch.views:
+            yield first + view.camera, view.image
 
 
 @torch.no_grad()
@@ -107,20 +130,24 @@ def save_pictures(
     count: int,
     *,
     supersampling: int = 1,
+    ranks: Ranks = ALONE,
     **options: Any,
 ) -> list[Path]:
     """Truth, rendering, and their difference times ERROR_GAIN side by side, for `count` views spread over all.
+
+    Scene and ranks are as in `evaluate`; each rank writes pictures of its own.
 
     Returns:
         The files, FOOTPRINT_SCALE_VIEW.png.
     """
     gaussians, name = Activated(*scene[:5]), re.sub(r"\W+", "_", footprint)
     count, files = min(count, len(pictures.views)), []
+    chosen = [i * len(pictures.views) // count for i in range(count)]
     for scale, settings in pictures.resolve(footprint=footprint, sh_degree=scene.sh_degree, **options).items():
-        for view in (i * len(pictures.views) // count for i in range(count)):
-            image = gaussians.render(settings[view], supersampling=supersampling)[0].clamp(0, 1)
-            truth = pictures.truth(scale, view)
+        of_scale = [folder / f"{name}_{scale}_{pictures.views[view].name}.png" for view in chosen]
+        for place, image in rendered(gaussians, [settings[view] for view in chosen], supersampling, ranks):
+            image, truth = image.clamp(0, 1), pictures.truth(scale, chosen[place])
             row = torch.cat([truth, image, ERROR_GAIN * (image - truth).abs()], dim=2)
-            files.append(folder / f"{name}_{scale}_{pictures.views[view].name}.png")
-            io.to_image(row).save(files[-1])
+            io.to_image(row).save(of_scale[place])
+        files += of_scale
     return files

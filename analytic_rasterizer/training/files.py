@@ -72,12 +72,16 @@ def write_checkpoint(path: Path, state: dict[str, Any]) -> None:
     write_safely(path, lambda temporary: torch.save({"format": CHECKPOINT_FORMAT, **state}, temporary))
 
 
-def read_checkpoint(path: Path, device: str | torch.device = "cpu") -> dict[str, Any]:
-    """What `write_checkpoint` wrote. Raises io.SceneError for a file that is missing or something else."""
+def read_checkpoint(path: Path, device: str | torch.device = "cpu", mapped: bool = False) -> dict[str, Any]:
+    """What `write_checkpoint` wrote. Raises io.SceneError for a file that is missing or something else.
+
+    Args:
+        mapped: Leave tensors in the file until they are read, for who needs a part of them; on the CPU.
+    """
     if not path.is_file():
         raise io.SceneError(f"{path}: no such file; there is no training to resume")
     try:
-        state = torch.load(path, map_location=device, weights_only=True)
+        state = torch.load(path, map_location=device, weights_only=True, mmap=mapped)
     except Exception as error:  # torch.load raises a different type for every way in which a file can be broken
         raise io.SceneError(f"{path}: not a checkpoint, or cut short ({type(error).__name__})") from None
     if not isinstance(state, dict) or state.get("format") != CHECKPOINT_FORMAT:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import replace
+from typing import TYPE_CHECKING, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from .. import io
+from .. import distributed, io
 from ..activations import activate
 from ..rasterizer import GaussianRasterizer
 from ..settings import GaussianRasterizationSettings
+
+if TYPE_CHECKING:
+    from torch.distributed import ProcessGroup
 
 HALF_EDGE = 1.3  # of the cube of random points; NeRF-synthetic objects fit in it
 SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic
@@ -85,10 +89,7 @@ class Activated(NamedTuple):
             supersampling: Render so many times larger, and average over squares of pixels. Radii, and the pixels of
                 the footprint, are those of the larger picture.
         """
-        if supersampling > 1:
-            height, width = supersampling * settings.image_height, supersampling * settings.image_width
-            settings = settings._replace(image_height=height, image_width=width)
-        picture, radii = GaussianRasterizer(settings)(
+        picture, radii = GaussianRasterizer(enlarged(settings, supersampling))(
             means3D=self.means,
             means2D=means2D,
             opacities=self.opacities,
@@ -96,7 +97,42 @@ class Activated(NamedTuple):
             scales=self.scales,
             rotations=self.rotations,
         )
-        return (avg_pool2d(picture, supersampling) if supersampling > 1 else picture), radii
+        return averaged(picture, supersampling), radii
+
+    def render_together(
+        self,
+        settings: list[GaussianRasterizationSettings],
+        supersampling: int = 1,
+        means2d_abs: bool = False,
+        group: ProcessGroup | None = None,
+    ) -> distributed.Batch:
+        """The pictures of several ranks, each of which has a part of the Gaussians: see `distributed.rasterize`.
+
+        Args:
+            supersampling: As in `render`. The splats are those of the larger pictures, and alpha is.
+        """
+        batch = distributed.rasterize(
+            [enlarged(of_camera, supersampling) for of_camera in settings],
+            self.means,
+            self.opacities,
+            shs=self.shs,
+            scales=self.scales,
+            rotations=self.rotations,
+            means2d_abs=means2d_abs,
+            group=group,
+        )
+        views = (view._replace(image=averaged(view.image, supersampling)) for view in batch.views)
+        return replace(batch, views=tuple(views))
+
+
+def enlarged(settings: GaussianRasterizationSettings, times: int) -> GaussianRasterizationSettings:
+    """Those of a picture so many times as large."""
+    return settings._replace(image_height=times * settings.image_height, image_width=times * settings.image_width)
+
+
+def averaged(picture: Tensor, times: int) -> Tensor:
+    """Means over squares of so many pixels, (3, H / times, W / times)."""
+    return avg_pool2d(picture, times) if times > 1 else picture
 
 
 def random_points(count: int, seed: int) -> tuple[Tensor, Tensor]:

@@ -36,7 +36,9 @@ from .files import (
 from .model import Gaussians
 from .options import TrainingOptions
 from .pictures import load_pictures
+from .ranks import ALONE, Ranks
 from .schedule import Clock
+from .sharded import ShardedTrainer, shards_of
 from .trainer import Trainer, background_of, starting_gaussians
 
 if TYPE_CHECKING:
@@ -49,15 +51,19 @@ FIRST_LOOK = 10  # steps, for the pace of a training by seconds
 class Run:
     """A training with its files.
 
+    On several ranks every rank makes one, with the same arguments but for the device, and calls its methods; all of
+    them read the pictures and the checkpoint, and rank 0 alone writes and shows progress.
+
     Args:
         scene: Folder of a capture, see `load_capture`.
         out: Folder for the results, made if it is missing.
         options: None: the defaults, or with `resume` those of the checkpoint.
-        device: "cpu" or "cuda".
+        device: "cpu", "cuda" or "cuda:N".
         images, test_every: As `load_capture`.
         points: A .ply to start from: a 3DGS scene, or points with colours. None: what the capture has.
         save_every: Steps between checkpoints, besides the last; 0: none.
-        resume: Go on from the checkpoint in `out`.
+        resume: Go on from the checkpoint in `out`, which may be that of another number of ranks.
+        ranks: The processes that train together, each with a part of the Gaussians.
 
     Raises:
         io.SceneError, OSError, ImportError, ValueError: Before anything is written.
@@ -75,10 +81,11 @@ class Run:
         points=None,
         save_every: int = 5000,
         resume: bool = False,
+        ranks: Ranks = ALONE,
     ):
         torch.backends.cudnn.allow_tf32 = False  # the variances of SSIM are small differences
-        self.out, self.device, self.save_every = Path(out), torch.device(device), save_every
-        state = read_checkpoint(self.out / CHECKPOINT) if resume else None
+        self.out, self.device, self.save_every, self.ranks = Path(out), torch.device(device), save_every, ranks
+        state = read_checkpoint(self.out / CHECKPOINT, mapped=ranks.world > 1) if resume else None
         if state is not None:
             options = TrainingOptions.from_dict(state["options"])
         self.options = options or TrainingOptions()
@@ -92,7 +99,11 @@ class Run:
             start = first_gaussians(self.options, self.capture, points)
         else:
             start = Gaussians(**state["gaussians"])
-        self.trainer = Trainer(self.options, start, pictures, background, self.device)
+        if ranks.world == 1:
+            self.trainer = Trainer(self.options, start, pictures, background, self.device)
+        else:
+            counts = None if state is None else shards_of(state, ranks)
+            self.trainer = ShardedTrainer(self.options, start, pictures, background, self.device, ranks, counts)
         self.clock, self.history = Clock(self.device), []
         if state is not None:
             if state["pictures"] != len(pictures.views):
@@ -118,8 +129,10 @@ class Run:
             OSError: Results cannot be written. A periodic checkpoint that cannot be is only reported.
         """
         tqdm = io.optional_import("tqdm", "train").tqdm
-        write_json(self.out / OPTIONS, self.describe())
-        write_cameras(self.out / CAMERAS, self.trainer.pictures.views)
+        self.ranks.exchange(None)  # no rank writes before all are here
+        if self.ranks.is_first:
+            write_json(self.out / OPTIONS, self.describe())
+            write_cameras(self.out / CAMERAS, self.trainer.pictures.views)
         trainer, progress = self.trainer, self.trainer.progress
         if self.clock.total == 0:
             trainer.warm_up()
@@ -128,23 +141,33 @@ class Run:
             viewer.update(trainer.scene, step=progress.step)
         self.clock.start()
         total = self.options.iterations if self.options.seconds == 0 else None
-        with interruption() as stopped, tqdm(total=total, initial=progress.step, unit="step", disable=None) as bar:
-            while progress.share < 1 and not stopped.is_set():
+        hidden = None if self.ranks.is_first else True  # None: where stderr is no terminal
+        with interruption() as stopped, tqdm(total=total, initial=progress.step, unit="step", disable=hidden) as bar:
+            ended = False
+            while progress.share < 1 and not ended:
                 trainer.step()
-                last = progress.share >= 1 or stopped.is_set()
-                if progress.step % LOOK_PERIOD == 0 or progress.step == FIRST_LOOK or last:
+                ended = any(self.ranks.exchange(stopped.is_set()))  # on which all ranks have to agree
+                last = progress.share >= 1 or ended
+                first_look = progress.step - progress.stride < FIRST_LOOK <= progress.step
+                if progress.passed(LOOK_PERIOD) or first_look or last:
                     bar.update(progress.step - bar.n)
                     look = self._look()
                     bar.set_postfix(look)
                     figures = ", ".join(f"{name} {value}" for name, value in look.items())
                 if viewer is not None:
                     viewer.update(trainer.scene, step=progress.step, text=figures, force=last)
-                if self.save_every and progress.step % self.save_every == 0 and not last:
+                if self.save_every and progress.passed(self.save_every) and not last:
                     self._save_or_say(bar)
         self.clock.stop()
         self.save()
-        write_scene(self.out / SCENE, trainer.scene(), self.options.footprint)
+        scene = self._whole(trainer.scene())
+        if self.ranks.is_first:
+            write_scene(self.out / SCENE, scene, self.options.footprint)
         return progress.share >= 1
+
+    def _whole(self, scene: io.Scene) -> io.Scene:
+        """The scene of all ranks, of which `scene` is this one's: on rank 0, on the CPU, without rows on the others."""
+        return scene._replace(**{name: self.ranks.gather_rows(getattr(scene, name)) for name in scene._fields[:5]})
 
     def export_mip(self) -> Path:
         """Writes and returns point_cloud_mip.ply: the scene for viewers that do not integrate, see `bake_pixel`.
@@ -154,8 +177,9 @@ class Run:
         scene = self.trainer.scene()
         cameras = self.trainer.pictures.settings[min(self.options.scales)]
         scales, opacities = bake_pixel(scene.means, scene.scales, scene.rotations, scene.opacities, cameras)
-        baked = scene._replace(scales=scales, opacities=opacities)
-        write_safely(self.out / MIP_SCENE, lambda temporary: io.save_scene(temporary, baked))
+        baked = self._whole(scene._replace(scales=scales, opacities=opacities))
+        if self.ranks.is_first:
+            write_safely(self.out / MIP_SCENE, lambda temporary: io.save_scene(temporary, baked))
         return self.out / MIP_SCENE
 
     def start_viewer(self, port: int = 0) -> LiveViewer:
@@ -184,7 +208,7 @@ class Run:
         return {"source": self.source, "device": name, "torch": torch.__version__, "options": self.options.to_dict()}
 
     def save(self) -> None:
-        """Writes the checkpoint and the log."""
+        """Writes the checkpoint and the log. Raises OSError, on all ranks, if that cannot be done."""
         state = self.trainer.state_dict() | {
             "options": self.options.to_dict(),
             "source": self.source,
@@ -192,17 +216,25 @@ class Run:
             "seconds": self.clock.read(),
             "history": self.history,
         }
-        write_checkpoint(self.out / CHECKPOINT, state)
-        write_log(self.out / LOG, self.history)
+        error = None
+        if self.ranks.is_first:
+            try:
+                write_checkpoint(self.out / CHECKPOINT, state)
+                write_log(self.out / LOG, self.history)
+            except OSError as raised:
+                error = raised
+        reason = self.ranks.from_first(None if error is None else str(error))
+        if reason is not None:
+            raise error or OSError(reason)
 
     def summary(self) -> dict[str, Any]:
         """Steps, seconds, milliseconds per step and Gaussians so far."""
-        steps, seconds = self.trainer.progress.step, self.clock.read()
+        steps, seconds = self.progress.step, self.ranks.from_first(self.clock.read())
         return {
             "steps": steps,
             "seconds": seconds,
             "ms_per_step": 1e3 * seconds / max(steps, 1),
-            "gaussians": len(self.trainer.gaussians.means),
+            "gaussians": self.count(),
         }
 
     def evaluate(self) -> dict[str, Any]:
@@ -214,23 +246,29 @@ class Run:
             pictures = load_pictures(
                 self.capture.test, self.options.scales, background, self.device, self.options.downsampling
             )
-            metrics["test"] = evaluate(
-                self.trainer.scene(), pictures, self.options.footprint, supersampling=self.options.supersampling
-            )
-        write_json(self.out / METRICS, metrics)
+            common = {"supersampling": self.options.supersampling, "ranks": self.ranks}
+            metrics["test"] = evaluate(self.trainer.scene(), pictures, self.options.footprint, **common)
+        if self.ranks.is_first:
+            write_json(self.out / METRICS, metrics)
         return metrics
+
+    def count(self) -> int:
+        """Gaussians of all ranks."""
+        return sum(self.ranks.exchange(len(self.trainer.gaussians.means)))
 
     def _look(self) -> dict[str, str]:
         """Reads the losses and the clock, notes them in the history, and says what the bar shows."""
         losses = self.trainer.take_losses()
-        seconds = self.clock.read()
+        shown = self.trainer.last  # which other ranks than the first may lack
+        quality = psnr(*shown).item() if shown else None
+        seconds, quality = self.ranks.from_first((self.clock.read(), quality))
         self.progress.measure(seconds)
         entry = {
             "step": self.progress.step,
             "seconds": round(seconds, 3),
             "loss": mean(losses),
-            "psnr": psnr(*self.trainer.last).item(),
-            "gaussians": len(self.trainer.gaussians.means),
+            "psnr": quality,
+            "gaussians": self.count(),
         }
         self.history.append(entry)
         return {
@@ -245,7 +283,8 @@ class Run:
         try:
             self.save()
         except OSError as error:
-            bar.write(f"warning: {error}; training goes on", file=sys.stderr)
+            if self.ranks.is_first:
+                bar.write(f"warning: {error}; training goes on", file=sys.stderr)
         self.clock.start()
 
 

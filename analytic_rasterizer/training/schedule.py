@@ -14,18 +14,24 @@ SH_SHARE = 0.1  # of the training, after which another degree is due at the late
 class Progress:
     """The share of the training that is over, by steps or else by seconds.
 
-    By seconds, the share grows in steps at the last measured pace; `measure` corrects it.
+    By seconds, the share grows in steps at the last measured pace; `measure` corrects it. A step of the optimizer on
+    several ranks stands for several steps here, its `stride`: one for each rank's pictures.
     """
 
     def __init__(self, steps: int | None, seconds: float | None):
         self.steps, self.seconds = steps, seconds
-        self.step, self.share = 0, 0.0
+        self.step, self.share, self.stride = 0, 0.0, 1
         self.measured = (0, 0.0)  # step and share where the clock was last read
         self.pace = 0.0  # share per step, by the clock
 
-    def advance(self) -> None:
-        self.step += 1
-        self.share = self.step / self.steps if self.steps else self.share + self.pace
+    def advance(self, stride: int = 1) -> None:
+        self.step += stride
+        self.stride = stride
+        self.share = self.step / self.steps if self.steps else self.share + stride * self.pace
+
+    def passed(self, period: int) -> bool:
+        """Whether there was a multiple of `period` among the steps of the last advance."""
+        return passes(self.step, period, self.stride)
 
     def measure(self, elapsed: float) -> None:
         """Corrects the share by the seconds of training so far."""
@@ -83,6 +89,11 @@ class PictureOrder:
             generator = torch.Generator().manual_seed((self.seed << 24) + number)
             self.drawn = number, torch.randperm(len(self.pairs), generator=generator).tolist()
         return self.pairs[self.drawn[1][place]]
+
+
+def passes(step: int, period: int, stride: int = 1) -> bool:
+    """Whether there is a multiple of `period` among the `stride` steps that end with `step`."""
+    return step // period > (step - stride) // period
 
 
 def sh_degree_at(step: int, share: float, options: TrainingOptions) -> int:

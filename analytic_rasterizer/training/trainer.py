@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -13,16 +13,27 @@ from ..effects import Effects
 from ..filters import apply_3d_filter, compute_3d_filter
 from ..losses import l1_ssim
 from ..optim import FusedAdam
+from ..settings import GaussianRasterizationSettings
 from .captures import WHITE, extent_of
 from .density import make_density
 from .model import Gaussians, gaussians_at, random_points
 from .options import BACKGROUNDS, RANDOM_BACKGROUND, TrainingOptions
 from .pictures import Pictures
+from .ranks import ALONE, Ranks
 from .schedule import PictureOrder, Progress, means_rate_at, sh_degree_at
 
 SH_REST_SHARE = 1 / 20  # of the learning rate of the constant
 FILTER_PERIOD = 100  # steps between two 3D filters, while Gaussians move
 ADAM_EPS = 1e-15
+
+
+class Shown(NamedTuple):
+    """A picture that a step renders."""
+
+    scale: int
+    view: int
+    settings: GaussianRasterizationSettings
+    background: Tensor | None  # (3,) that was drawn for it
 
 
 class Trainer:
@@ -36,6 +47,7 @@ class Trainer:
         pictures: To train with; with alpha where the background is random.
         background: Behind the pictures, 0 to 1; None: random.
         device: To train on, that of the pictures.
+        ranks: See `ShardedTrainer`; this class trains in one process.
 
     Attributes:
         gaussians: The parameters at present.
@@ -51,8 +63,9 @@ class Trainer:
         pictures: Pictures,
         background: tuple[float, float, float] | None,
         device: str | torch.device,
+        ranks: Ranks = ALONE,
     ):
-        self.options, self.pictures, self.device = options, pictures, torch.device(device)
+        self.options, self.pictures, self.device, self.ranks = options, pictures, torch.device(device), ranks
         self.random_background = background is None
         self.extent = extent_of(pictures.views)
         fields = (field.detach().to(self.device, torch.float32, copy=True).contiguous() for field in start)
@@ -67,7 +80,7 @@ class Trainer:
         }
         groups = [{"params": [getattr(gaussians, name)], "lr": self.rates[name]} for name in Gaussians._fields]
         self.optimizer = FusedAdam(groups, eps=ADAM_EPS)
-        self.density = make_density(options, gaussians, self.optimizer, self.extent, background == WHITE)
+        self.density = make_density(options, gaussians, self.optimizer, self.extent, background == WHITE, ranks=ranks)
         self.generator = torch.Generator(self.device).manual_seed(options.seed + 1)
         self.progress = Progress(options.iterations if options.seconds == 0 else None, options.seconds)
         self.order = PictureOrder(len(pictures.views), options)
@@ -84,32 +97,40 @@ class Trainer:
 
     def step(self) -> None:
         """Takes one step of the optimizer."""
-        options, progress = self.options, self.progress
-        over, optimizer = progress.share, self.optimizer
-        means_rate = self.extent * means_rate_at(progress.step, over, options)
-        for group, rate in zip(optimizer.param_groups, self.rates.values()):
-            group["lr"] = rate * options.rates_end**over
-        optimizer.param_groups[0]["lr"] = means_rate
-
+        progress, optimizer = self.progress, self.optimizer
+        stride = self.stride
+        self._set_rates()
         loss, seen = self._loss()
         loss.backward()
-        for leaf, radii in seen:
-            self.density.observe(leaf, radii)
+        self._observe(seen)
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
         self.losses.append(loss.detach())
-        progress.advance()
-        changed = self.density.after_step(progress.step, progress.share)
-        if options.filter_3d and (changed or progress.step % FILTER_PERIOD == 0):
+        progress.advance(stride)
+        changed = self.density.after_step(progress.step, progress.share, stride)
+        if changed:
+            self._rebalance()
+        if self.options.filter_3d and (changed or progress.passed(FILTER_PERIOD)):
             self._compute_filter()
 
-    def _loss(self) -> tuple[Tensor, list[tuple[Tensor | None, Tensor]]]:
-        """The loss of the next step, and of every picture what `density.observe` takes."""
-        options, first = self.options, self.progress.step * self.options.pictures_per_step
-        settings = self._settings()
-        gaussians = self.gaussians.activated()
-        losses, seen = [], []
-        for n in range(first, first + options.pictures_per_step):
+    @property
+    def stride(self) -> int:
+        """Steps of one process that the next step stands for."""
+        return 1
+
+    def _set_rates(self) -> None:
+        """Gives the optimizer the learning rates of the next step."""
+        options, over = self.options, self.progress.share
+        for group, rate in zip(self.optimizer.param_groups, self.rates.values()):
+            group["lr"] = rate * options.rates_end**over
+        self.optimizer.param_groups[0]["lr"] = self.extent * means_rate_at(self.progress.step, over, options)
+
+    def _next(self) -> list[Shown]:
+        """The pictures of the next step."""
+        count, settings = self.options.pictures_per_step, self._settings()
+        first = self.progress.step * count
+        shown = []
+        for n in range(first, first + self.stride * count):
             view, scale = self.order(n)
             chosen, background = settings[scale][view], None
             if self.random_background:
@@ -117,8 +138,17 @@ class Trainer:
                 chosen = chosen._replace(bg=background)
             if self.filter_3d is not None:
                 chosen = chosen._replace(effects=Effects(filter_3d=self.filter_3d))
+            shown.append(Shown(scale, view, chosen, background))
+        return shown
+
+    def _loss(self) -> tuple[Tensor, Any]:
+        """The loss of the next step, and what `_observe` takes."""
+        options = self.options
+        gaussians = self.gaussians.activated()
+        losses, seen = [], []
+        for scale, view, settings, background in self._next():
             leaf = self.density.leaf(scale)
-            image, radii = gaussians.render(chosen, leaf, options.supersampling)
+            image, radii = gaussians.render(settings, leaf, options.supersampling)
             truth = self.pictures.truth(scale, view, background)
             losses.append(l1_ssim(image, truth, options.ssim_weight))
             seen.append((leaf, radii))
@@ -130,6 +160,14 @@ class Trainer:
         if scale_weight:
             loss = loss + scale_weight * gaussians.scales.mean()
         return loss, seen
+
+    def _observe(self, seen: list[tuple[Tensor | None, Tensor]]) -> None:
+        """Lets density control look at the gradients of a step."""
+        for leaf, radii in seen:
+            self.density.observe(leaf, radii)
+
+    def _rebalance(self) -> None:
+        """Called when the number of Gaussians has changed; there is nothing to do in one process."""
 
     def _settings(self) -> dict:
         """Settings of all pictures, with the degree of the harmonics that is due."""
@@ -161,7 +199,7 @@ class Trainer:
         self.losses = []
         for i, value in enumerate(values):
             if not math.isfinite(value):
-                step = self.progress.step - len(values) + i + 1
+                step = self.progress.step - (len(values) - i - 1) * self.progress.stride
                 raise FloatingPointError(f"the loss of step {step} is {value}; lower learning rates may help")
         return values
 

@@ -16,6 +16,7 @@ from ...effects import MAX_SH_DEGREE, Effects
 from ...footprints import Footprint, chosen_footprint, resolve_footprint
 from ...settings import GaussianRasterizationSettings
 from ...stages import Splats, bin, blend, project
+from .ranks import Sharing
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
@@ -29,7 +30,6 @@ _MAX_CHANNELS = 512  # of `blend`
 
 _REFUSED = {
     "sparse_grad": "gradients are dense tensors",
-    "distributed": "each process renders its own images",
     "with_ut": "the unscented transform of 3DGUT is not implemented",
     "with_eval3d": "Gaussians are evaluated in the image, not along rays",
     "radial_coeffs": "lenses without distortion only, undistort the images",
@@ -109,8 +109,12 @@ def rasterization(
         channel_chunk, segmented: Ignored: all channels are blended in one pass, and sorting has one way.
         camera_model: "pinhole" or "ortho".
         covars: (..., N, 3, 3) covariances in place of quats and scales, world units^2; the upper triangle is read.
-        sparse_grad, distributed, with_ut, with_eval3d, radial_coeffs, tangential_coeffs, thin_prism_coeffs,
-        ftheta_coeffs, rolling_shutter, viewmats_rs: Refused unless they ask for nothing.
+        distributed: Whether the ranks of torch.distributed's default group render together: each gives Gaussians and
+            cameras of its own, as many cameras as every other, and gets the images of its cameras from the Gaussians of
+            all. There are no leading dimensions then, and colors are shared by the cameras. Every rank has to run the
+            backward pass. Without a process group, or with one rank, it changes nothing.
+        sparse_grad, with_ut, with_eval3d, radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs,
+        rolling_shutter, viewmats_rs: Refused unless they ask for nothing.
         footprint: See `resolve_footprint`. None: the one that `set_default_footprint` or the environment variable
             ANALYTIC_RASTERIZER_FOOTPRINT chose, or else the filter of rasterize_mode and eps2d.
 
@@ -123,7 +127,9 @@ def rasterization(
             conics (3,), the inverse of the covariance with the filter's variance (1/12 px^2 for footprints other than
             `point` and `mip`); opacities, with the amplitude of `mip`; the last three without gradient. batch_ids,
             camera_ids, gaussian_ids: (R,) int64 if packed, else None. width, height, tile_size, tile_width,
-            tile_height, n_batches, n_cameras: numbers. gsplat's lists of tiles (tiles_per_gauss, isect_ids,
+            tile_height, n_batches, n_cameras: numbers. With `distributed` the rows, and C of a table, are those of the
+            rank's own Gaussians in the cameras of all ranks: gaussian_ids count within the rank, camera_ids over all
+            ranks; n_cameras is that of the rank. gsplat's lists of tiles (tiles_per_gauss, isect_ids,
             flatten_ids, isect_offsets) are missing.
 
     Raises:
@@ -134,7 +140,6 @@ def rasterization(
     """
     asked = {
         "sparse_grad": sparse_grad,
-        "distributed": distributed,
         "with_ut": with_ut,
         "with_eval3d": with_eval3d,
         "radial_coeffs": radial_coeffs,
@@ -143,14 +148,33 @@ def rasterization(
         "ftheta_coeffs": ftheta_coeffs,
         "viewmats_rs": viewmats_rs,
     }
-    _refuse(asked, camera_model, rolling_shutter)
-    _check_choice("render_mode", render_mode, RENDER_MODES)
-    _check_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
-    _check_numbers(width, height, near_plane, far_plane, radius_clip, eps2d)
+
+    def check() -> tuple[_Sizes, bool, Footprint]:
+        _refuse(asked, camera_model, rolling_shutter)
+        _check_choice("render_mode", render_mode, RENDER_MODES)
+        _check_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
+        _check_numbers(width, height, near_plane, far_plane, radius_clip, eps2d)
+        sizes = _check_scene(means, quats, scales, opacities, covars, viewmats, Ks)
+        per_camera = _check_colors(means, sizes, colors, backgrounds, sh_degree, render_mode)
+        if distributed:
+            _check_distributed(sizes, per_camera)
+        return sizes, per_camera, _settle_footprint(footprint, rasterize_mode, eps2d)
+
+    sharing = None
+    if distributed:
+        tensors = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
+        tensors |= {"viewmats": viewmats, "Ks": Ks, "covars": covars}
+        numbers = (width, height, near_plane, far_plane, radius_clip, eps2d, sh_degree, packed, render_mode, absgrad)
+        with_channels = colors.shape[-1] if isinstance(colors, torch.Tensor) and colors.dim() else None
+        chosen = rasterize_mode, camera_model, with_channels
+        (own_sizes, per_camera, settled), sharing = Sharing.agreed(check, tensors, (*numbers, *chosen))
+    else:
+        own_sizes, per_camera, settled = check()
+    sizes = own_sizes
+    if sharing is not None:
+        viewmats, Ks = sharing.all_cameras(viewmats, Ks)
+        sizes = dataclasses.replace(own_sizes, cameras=len(viewmats))
     width, height = int(width), int(height)
-    sizes = _check_scene(means, quats, scales, opacities, covars, viewmats, Ks)
-    per_camera = _check_colors(means, sizes, colors, backgrounds, sh_degree, render_mode)
-    settled = _settle_footprint(footprint, rasterize_mode, eps2d)
     settings = _camera_settings(
         viewmats,
         Ks,
@@ -184,13 +208,18 @@ def rasterization(
         absolute = layout.to_rows(absolute)
     splats = dataclasses.replace(splats, means2d=layout.to_rows(through) - 0.5)
 
-    channels = []
+    features = splats.means2d.new_empty(len(splats.means2d), 0)
     if with_colors:
-        channels.append(_colors_of_rows(splats, sizes, colors, per_camera) if shs is None else splats.colors)
+        features = _colors_of_rows(splats, sizes, colors, per_camera) if shs is None else splats.colors
+    blended = splats
+    if sharing is not None:
+        own, absolute = sharing.send(splats, features, absolute)
+        blended = _join(own)
+        features = blended.colors  # of any number of channels, which `bin` does not take
+        blended = dataclasses.replace(blended, colors=features.new_empty(0, 3))
     if with_depth:
-        channels.append(splats.depths[:, None])
-    features = torch.cat(channels, 1)
-    images, alphas = _blend(splats, features, _backgrounds(backgrounds, with_colors, with_depth), absolute)
+        features = torch.cat([features, blended.depths[:, None]], 1)
+    images, alphas = _blend(blended, features, _backgrounds(backgrounds, with_colors, with_depth), absolute)
     if render_mode.endswith("ED"):
         images = torch.cat([images[..., :-1], images[..., -1:] / alphas.clamp(min=_SMALLEST_ALPHA)], -1)
 
@@ -209,9 +238,9 @@ def rasterization(
         "tile_width": math.ceil(width / TILE),
         "tile_height": math.ceil(height / TILE),
         "n_batches": math.prod(sizes.batch),
-        "n_cameras": sizes.cameras,
+        "n_cameras": own_sizes.cameras,
     }
-    dims = (*sizes.batch, sizes.cameras)
+    dims = (*sizes.batch, own_sizes.cameras)
     return images.unflatten(0, dims), alphas.unflatten(0, dims), meta
 
 
@@ -236,6 +265,14 @@ def _refuse(asked: dict[str, Any], camera_model: str, rolling_shutter: Any) -> N
     if camera_model in ("fisheye", "ftheta"):
         raise NotImplementedError(f"camera_model {camera_model!r} is not supported: cameras are pinhole or ortho")
     _check_choice("camera_model", camera_model, ("pinhole", "ortho"))
+
+
+def _check_distributed(sizes: _Sizes, per_camera: bool) -> None:
+    """Raises ValueError for what ranks cannot share."""
+    if sizes.batch:
+        raise ValueError(f"means must have no leading dimensions where distributed is True, got {sizes.batch}")
+    if per_camera:
+        raise ValueError("colors must be shared by the cameras where distributed is True, got colors per camera")
 
 
 def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:

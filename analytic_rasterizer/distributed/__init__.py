@@ -1,0 +1,10 @@
+"""Gaussians sharded over the ranks of torch.distributed: no rank holds all of them.
+
+`rasterize` renders the cameras of a step, each on the rank that owns it; `rasterize_bands` one camera, each rank a band
+of its rows. docs/distributed.md has the method and how much is sent.
+"""
+
+from .bands import Band, rasterize_bands
+from .cameras import Batch, View, rasterize
+
+__all__ = ["Band", "Batch", "View", "rasterize", "rasterize_bands"]

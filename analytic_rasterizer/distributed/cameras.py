@@ -1,0 +1,201 @@
+"""Gaussians sharded over the ranks of torch.distributed: what is projected travels to the rank that owns the camera.
+
+Every rank holds a part of the Gaussians, its shard, projects it into all cameras of a step, sends the splats to the
+ranks that own the cameras, and blends the cameras of its own. Gradients travel back the same way. The shards are
+consecutive: global ids count the Gaussians of rank 0 first, then those of rank 1, and so on.
+
+    batch = distributed.rasterize(settings, means3D, opacities, shs=shs, scales=scales, rotations=rotations)
+    loss = batch.anchor + sum(loss_of(view.image, photographs[view.camera]) for view in batch.views)
+    loss.backward()  # on every rank
+
+docs/distributed.md has the method and how much is sent.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+import torch.distributed as dist
+
+from ..arguments import check_tensors
+from ..effects import AUTO
+from ..settings import GaussianRasterizationSettings
+from ..stages import Splats, bin, blend, project
+from .agreement import REQUIREMENTS, Facts, agree, digest_of, facts_of, gather, place_in, rows_of
+from .exchange import Route, exchange
+
+_REQUIREMENTS = {
+    "cameras": "settings must hold as many cameras on every rank",
+    **REQUIREMENTS,
+    "settings": "settings, owners and means2d_abs must be the same on every rank",
+}
+
+
+class View(NamedTuple):
+    """A camera of this rank.
+
+    Attributes:
+        camera: Its place in the settings.
+        image: (3, H, W).
+        alpha: (1, H, W), 1 - transmittance, in 0 to 1.
+        splats: What all ranks sent: a batch of this one camera, with global gaussian_ids. With more than one rank its
+            radii are empty, (0,): they are in `Batch.shard`, where the Gaussians are.
+    """
+
+    camera: int
+    image: torch.Tensor
+    alpha: torch.Tensor
+    splats: Splats
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What `rasterize` made of a step.
+
+    Attributes:
+        views: The cameras of this rank, ascending; empty where it has none.
+        shard: For every camera of the step the splats of the Gaussians of this rank, with ids that count within the
+            shard. `radii` are those of density control; after the backward pass `means2d.grad` (n, 2) is dL/d(projected
+            mean), per px.
+        means2d_abs: For every camera (n, 2), a row per row of `shard`, whose `grad` is the sum over pixels of the
+            absolute values of dL/dmeans2d; empty unless asked for.
+        first_id: Global id of the first Gaussian of this rank.
+        count: Number of Gaussians of all ranks.
+        anchor: () zero. Gradients return by a collective operation, so every rank has to run the backward pass, also
+            one without cameras: add this to its loss.
+    """
+
+    views: tuple[View, ...]
+    shard: tuple[Splats, ...]
+    means2d_abs: tuple[torch.Tensor, ...]
+    first_id: int
+    count: int
+    anchor: torch.Tensor
+
+
+def rasterize(
+    settings: Sequence[GaussianRasterizationSettings],
+    means3D: torch.Tensor,
+    opacities: torch.Tensor,
+    *,
+    shs: torch.Tensor | None = None,
+    colors_precomp: torch.Tensor | None = None,
+    scales: torch.Tensor | None = None,
+    rotations: torch.Tensor | None = None,
+    cov3D_precomp: torch.Tensor | None = None,
+    owners: Sequence[int] | None = None,
+    means2d_abs: bool = False,
+    group: dist.ProcessGroup | None = None,
+) -> Batch:
+    """Renders the cameras of a step from Gaussians that are sharded over ranks. Every rank of the group calls it.
+
+    The images are those of one rank with all Gaussians, bit for bit; the gradients are, to rounding. One rank, or
+    torch.distributed without a process group, makes what `project`, `bin` and `blend` make of camera after camera, bit
+    for bit, and sends nothing. Differentiable in what `project` is differentiable in, and in the backgrounds. The
+    gradient with respect to a camera is, on each rank, the part of the rank's own Gaussians: the sum over the ranks is
+    the whole. Waits for the device.
+
+    Args:
+        settings: Of all cameras, the same on every rank, bit for bit. Image sizes and footprints may differ. bg is
+            (3,), and only that on the camera's owner is read; a 3D filter is that of the rank's own Gaussians. Outputs
+            of effects are not made, except for alpha.
+        means3D: (P, 3) centres of the Gaussians of this rank, world units; P may be 0.
+        opacities: (P, 1) or (P,).
+        shs: (P, M, 3) spherical harmonics; or colors_precomp (P, 3).
+        scales: (P, 3) standard deviations, world units, with rotations (P, 4) (w, x, y, z); or cov3D_precomp (P, 6).
+        owners: The rank within the group that blends each camera; None: camera c belongs to rank c modulo the number
+            of ranks.
+        means2d_abs: Whether to make `Batch.means2d_abs`.
+        group: Of torch.distributed; None: the default group, and this process alone where there is none.
+
+    Raises:
+        TypeError, ValueError: Wrong arguments, also those of another rank: what is wrong on one rank raises the same
+            error on all of them, which names the rank. Ranks that disagree in settings, dtype or kind of device.
+        RuntimeError: Another error on some rank, up to the moment when splats are sent.
+    """
+    rank, world = place_in(group)
+
+    def make() -> tuple[tuple, Facts | None]:
+        cameras, settled = _checked_cameras(settings, owners, world, shs, colors_precomp)
+        gaussians = {"shs": shs, "colors_precomp": colors_precomp, "scales": scales, "rotations": rotations}
+        shard = tuple(project(s, means3D, opacities, cov3D_precomp=cov3D_precomp, **gaussians) for s in cameras)
+        absolute = tuple(torch.zeros_like(s.means2d, requires_grad=True) for s in shard) if means2d_abs else ()
+        facts = None
+        if world > 1:
+            digest = digest_of(cameras, [settled, means2d_abs], means3D, shs)
+            own = facts_of(means3D, [*rows_of(shard), *absolute], group)
+            facts = {"cameras": len(cameras), "settings": digest, **own}
+        return (cameras, settled, shard, absolute), facts
+
+    if world == 1:
+        (cameras, owners, shard, absolute), _ = make()
+        first_id, count = 0, len(means3D)
+        own, own_absolute, anchor = shard, absolute, means3D.new_zeros(())
+    else:
+        (cameras, owners, shard, absolute), facts = agree(make, _REQUIREMENTS, group)
+        first_id, count, join = summary_of(facts, rank)
+        counts = gather([len(s.means2d) for s in shard], world, group)
+        route = Route(counts, [[c for c, owner in enumerate(owners) if owner == r] for r in range(world)], rank, group)
+        own, own_absolute, anchor = exchange(route, shard, absolute, first_id, join)
+    for splats in shard:
+        if splats.means2d.requires_grad:
+            splats.means2d.retain_grad()
+    views = []
+    for k, camera in enumerate(c for c in range(len(cameras)) if owners[c] == rank):
+        bg = cameras[camera].bg
+        lists = bin(own[k], background=bg.detach(), keep=torch.is_grad_enabled())
+        of_means = own_absolute[k] if means2d_abs else None
+        image, alpha = blend(own[k], lists, background=bg, means2d_abs=of_means)
+        views.append(View(camera, image[0], alpha[0], own[k]))
+    return Batch(tuple(views), shard, absolute, first_id, count, anchor)
+
+
+def summary_of(facts: list[Facts], rank: int) -> tuple[int, int, bool]:
+    """Global id of the rank's first Gaussian, the number of Gaussians of all ranks, and whether one needs gradients."""
+    counts = [of_rank["gaussians"] for of_rank in facts]
+    return sum(counts[:rank]), sum(counts), any(of_rank["requires_grad"] for of_rank in facts)
+
+
+def _checked_cameras(
+    settings: Any, owners: Any, world: int, shs: Any, colors_precomp: Any
+) -> tuple[list[GaussianRasterizationSettings], list[int]]:
+    """Cameras and owners as lists; raises for what `project` does not look at."""
+    if isinstance(settings, GaussianRasterizationSettings):
+        raise TypeError("settings must be a sequence with the settings of each camera, got those of one camera")
+    cameras = list(settings)
+    if not cameras:
+        raise ValueError("settings must hold at least one camera, got none")
+    for camera, s in enumerate(cameras):
+        if not isinstance(s, GaussianRasterizationSettings):
+            raise TypeError(f"settings must hold GaussianRasterizationSettings, got {type(s).__name__} at {camera}")
+        check_camera(s, f" of camera {camera}")
+    check_colors(shs, colors_precomp)
+    owners = [camera % world for camera in range(len(cameras))] if owners is None else list(owners)
+    if len(owners) != len(cameras):
+        raise ValueError(f"owners must hold a rank for each of {len(cameras)} cameras, got {len(owners)}")
+    for camera, owner in enumerate(owners):
+        if isinstance(owner, bool) or not isinstance(owner, int) or not 0 <= owner < world:
+            raise ValueError(f"owners must be ranks from 0 to {world - 1}, got {owner!r} for camera {camera}")
+    return cameras, owners
+
+
+def check_camera(settings: GaussianRasterizationSettings, name: str = "") -> None:
+    """Raises for settings that several ranks cannot render; `name` ends the message."""
+    bg = settings.bg
+    check_tensors(None, viewmatrix=settings.viewmatrix, bg=bg)
+    check_tensors(settings.viewmatrix.device, bg=bg)
+    if bg.dtype != settings.viewmatrix.dtype:
+        raise TypeError(f"bg must have dtype {settings.viewmatrix.dtype}, got {bg.dtype}{name}")
+    if bg.shape != (3,):
+        raise ValueError(f"bg must have shape (3,), got {tuple(bg.shape)}{name}")
+    if isinstance(settings.effects, str) and settings.effects == AUTO:
+        raise ValueError(f'effects must not be "auto", which looks at all Gaussians, got it{name}')
+
+
+def check_colors(shs: Any, colors_precomp: Any) -> None:
+    """Raises ValueError where there are no colours."""
+    if all(c is None or (torch.is_tensor(c) and c.shape == (0,)) for c in (shs, colors_precomp)):
+        raise ValueError("shs or colors_precomp must be given, got neither")

@@ -1,0 +1,192 @@
+"""Training on several ranks: every rank holds a shard of the Gaussians with its part of the optimizer's state.
+
+A step on N ranks renders the pictures of N steps of one process, each rank those of one of them, from the Gaussians of
+all ranks (`analytic_rasterizer.distributed`). It counts as N steps: schedules, the order of the pictures and periods
+are where they would be in one process, and a checkpoint means the same on any number of ranks.
+
+The optimizer is scaled for the larger batch as in [Grendel] Zhao et al., "On Scaling Up 3D Gaussian Splatting
+Training", 2024: learning rates times sqrt(N), and decay rates to the power of N.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .. import distributed
+from ..losses import l1_ssim
+from .density import MOMENTS
+from .model import Gaussians
+from .ranks import Ranks, even_counts
+from .trainer import Shown, Trainer
+
+BETAS = (0.9, 0.999)  # of one process, the defaults of FusedAdam
+UNEVEN = 1.1  # the largest shard, in means of all, above which Gaussians move to other ranks
+
+
+class ShardedTrainer(Trainer):
+    """A `Trainer` whose Gaussians are spread over ranks. Every method is collective, except where it says otherwise.
+
+    Gaussians have the order of one process: those of rank 0 first, then those of rank 1, and so on. Density control is
+    that of each rank, and draws from a generator of its own. When the shards have become uneven, the first and last
+    Gaussians of ranks move to their neighbours, which leaves the order as it is.
+
+    Args:
+        start: All Gaussians, on the CPU; the rank takes its own.
+        ranks: More than one.
+        counts: Gaussians of each rank; None: as many for each.
+        others: As of `Trainer`.
+
+    Attributes:
+        gaussians: Those of this rank.
+    """
+
+    def __init__(self, options, start: Gaussians, pictures, background, device, ranks: Ranks, counts=None):
+        self.counts = even_counts(len(start.means), ranks.world) if counts is None else list(counts)
+        rows = ranks.part_of(self.counts)
+        super().__init__(options, Gaussians(*(field[rows] for field in start)), pictures, background, device, ranks)
+
+    @property
+    def stride(self) -> int:
+        """Of every rank a step; fewer in the end, where fewer are left."""
+        steps = self.progress.steps
+        return self.ranks.world if steps is None else min(self.ranks.world, steps - self.progress.step)
+
+    def step(self) -> None:
+        """Takes one step of the optimizer on all ranks."""
+        # What is drawn depends on seed, step and rank alone: there is no state of several ranks to be saved.
+        drawn = np.random.SeedSequence([self.options.seed % 2**64, self.ranks.rank, self.progress.step])
+        self.density.generator.manual_seed(int(drawn.generate_state(1)[0]))
+        super().step()
+
+    def _set_rates(self) -> None:
+        super()._set_rates()
+        for group in self.optimizer.param_groups:
+            group["lr"] *= math.sqrt(self.stride)
+            group["betas"] = tuple(beta**self.stride for beta in BETAS)
+
+    def _loss(self) -> tuple[Tensor, tuple[list[Shown], distributed.Batch]]:
+        """This rank's part of the loss, whose sum over the ranks is the loss of the step."""
+        options, shown = self.options, self._next()
+        gaussians = self.gaussians.activated()
+        batch = gaussians.render_together(
+            [picture.settings for picture in shown],
+            options.supersampling,
+            means2d_abs=options.density == "absgrad",
+            group=self.ranks.group,
+        )
+        loss = batch.anchor
+        for view in batch.views:
+            picture = shown[view.camera]
+            truth = self.pictures.truth(picture.scale, picture.view, picture.background)
+            loss = loss + l1_ssim(view.image, truth, options.ssim_weight) / len(shown)
+            self.last = view.image.detach(), truth
+        opacity_weight, scale_weight = options.regularizers
+        if opacity_weight:
+            loss = loss + opacity_weight * gaussians.opacities.sum() / batch.count
+        if scale_weight:
+            loss = loss + scale_weight * gaussians.scales.sum() / (3 * batch.count)
+        return loss, (shown, batch)
+
+    def _observe(self, seen: tuple[list[Shown], distributed.Batch]) -> None:
+        """Density control sees the gradients that each picture would have in one process."""
+        shown, batch = seen
+        for camera, (picture, splats) in enumerate(zip(shown, batch.shard)):
+            if not self.density.watches(picture.scale) or len(splats.gaussian_ids) == 0:
+                continue
+            gradient = (batch.means2d_abs[camera] if batch.means2d_abs else splats.means2d).grad
+            # From px to normalized device coordinates, and from the mean over all ranks' pictures to that over one's.
+            unit = gradient.new_tensor([splats.width / 2, splats.height / 2]) * self.stride
+            self.density.observe_rows(splats.gaussian_ids.long(), gradient * unit)
+
+    def _rebalance(self) -> None:
+        """Moves Gaussians, with their moments, to neighbouring ranks if the largest shard is much above the mean."""
+        before = self.ranks.exchange(len(self.gaussians.means))
+        total, world = sum(before), self.ranks.world
+        if max(before) * world > UNEVEN * total:
+            self.counts = even_counts(total, world)
+            self._redistribute(before, self.counts)
+        else:
+            self.counts = before
+
+    @torch.no_grad()
+    def _redistribute(self, before: list[int], after: list[int]) -> None:
+        """To be called when density control has just begun new averages, which do not move."""
+
+        def moved(rows: Tensor) -> Tensor:
+            return self.ranks.move_rows(rows.detach().contiguous(), before, after)
+
+        old, optimizer = self.gaussians, self.optimizer
+        new = Gaussians(*(moved(field).requires_grad_() for field in old))
+        for group, of_old, of_new in zip(optimizer.param_groups, old, new):
+            state = optimizer.state.pop(of_old)
+            optimizer.state[of_new] = state | {moment: moved(state[moment]) for moment in MOMENTS}
+            group["params"] = [of_new]
+        self.density.gaussians = new
+        self.density.forget()
+
+    def warm_up(self) -> None:
+        """Renders and differentiates the pictures of the first step without taking it."""
+        state = self.generator.get_state()
+        self._loss()[0].backward()
+        self.generator.set_state(state)
+        self.optimizer.zero_grad(set_to_none=True)
+
+    def take_losses(self) -> list[float]:
+        """As of `Trainer`: the losses of all ranks together."""
+        parts = self.ranks.exchange(torch.stack(self.losses).tolist() if self.losses else [])
+        self.losses = [torch.tensor(math.fsum(of_step), dtype=torch.float64) for of_step in zip(*parts)]
+        return super().take_losses()
+
+    def state_dict(self) -> dict[str, Any]:
+        """On rank 0 that of one process with all Gaussians, on the CPU, and `shards`, how many each rank has.
+
+        On the other ranks it has no rows. The optimizer's steps and decay rates are those of one process.
+        """
+        state, whole = super().state_dict(), self.ranks.gather_rows
+        state["gaussians"] = {name: whole(rows) for name, rows in state["gaussians"].items()}
+        state["optimizer"]["state"] = {
+            key: {moment: whole(of_field[moment]) for moment in MOMENTS} | {"step": self.progress.step}
+            for key, of_field in state["optimizer"]["state"].items()
+        }
+        for group in state["optimizer"]["param_groups"]:
+            group["betas"] = BETAS
+        state["density"] |= {name: whole(state["density"][name]) for name in self.density.row_state}
+        if self.filter_3d is not None:
+            state["filter_3d"] = whole(self.filter_3d)
+        return state | {"shards": self.ranks.exchange(len(self.gaussians.means))}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on from what `state_dict` of any number of ranks gave. Not collective.
+
+        Args:
+            state: With all Gaussians, as many as the trainer was made for; the rank takes its own.
+        """
+        rows = self.ranks.part_of(self.counts)
+
+        def part(tensor: Tensor) -> Tensor:
+            return tensor[rows].clone()  # else the memory of all rows would be kept
+
+        optimizer, density = state["optimizer"], state["density"]
+        steps = round(state["progress"]["step"] / self.ranks.world)
+        of_fields = {
+            key: of_field | {moment: part(of_field[moment]) for moment in MOMENTS} | {"step": steps}
+            for key, of_field in optimizer["state"].items()
+        }
+        own = {
+            "gaussians": {name: part(field) for name, field in state["gaussians"].items()},
+            "optimizer": optimizer | {"state": of_fields},
+            "density": density | {name: part(density[name]) for name in self.density.row_state},
+            "filter_3d": None if state["filter_3d"] is None else part(state["filter_3d"]),
+        }
+        super().load_state_dict(state | own)
+
+
+def shards_of(state: dict[str, Any], ranks: Ranks) -> list[int] | None:
+    """How many Gaussians of a checkpoint each rank has, where it is of as many ranks; None: it is not."""
+    counts = state.get("shards", [])
+    return counts if len(counts) == ranks.world else None

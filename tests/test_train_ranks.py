@@ -1,0 +1,412 @@
+"""Training on several ranks: it goes on on any number of them, and is what one process makes of the same pictures.
+
+One set of processes makes everything that is looked at here, through gloo, and leaves it in files.
+"""
+
+import datetime
+import json
+import math
+import os
+import re
+import shutil
+import subprocess
+import sys
+import textwrap
+import time
+from unittest import mock
+
+import pytest
+import torch
+import torch.distributed as dist
+from conftest import DEADLINE, ROOT
+
+image = pytest.importorskip("PIL.Image", reason="needs the train extra")
+pytest.importorskip("tqdm", reason="needs the train extra")
+pytest.importorskip("scipy", reason="needs the train extra")
+pytest.importorskip("gsply", reason="needs the train extra")
+
+from test_train import TINY, circle, opengl_pose, write_pictures  # noqa: E402
+
+from analytic_rasterizer import training  # noqa: E402
+from analytic_rasterizer.cli import launch  # noqa: E402
+from analytic_rasterizer.optim import FusedAdam  # noqa: E402
+from analytic_rasterizer.training import TrainingOptions, files, model, schedule  # noqa: E402
+from analytic_rasterizer.training.density import MOMENTS  # noqa: E402
+from analytic_rasterizer.training.ranks import ALONE, Ranks, even_counts  # noqa: E402
+from analytic_rasterizer.training.sharded import UNEVEN, ShardedTrainer  # noqa: E402
+
+WORLD = 3
+STEPS, BREAKS = 43, (14, 27)  # where the chain changes from 2 ranks to 1, and from 1 to 3
+HALF = 24  # where the others have a break
+COMMON = TINY | {"iterations": STEPS, "scales": (1, 2), "random_points": 120, "densify_until": 0.9}
+COMMON |= {"densify_from": 10, "densify_every": 10}
+VARIANTS = {
+    "absgrad": {"density": "absgrad", "gradient_scales": "finest", "filter_3d": True, "reset_every": 35},
+    "mcmc": {
+        "density": "mcmc",
+        "max_gaussians": 150,
+        "background": "random",
+        "pictures_per_step": 2,
+        "supersampling": 2,
+    },
+}
+CAMERAS = 2  # of the step whose gradients are compared
+
+
+def options_of(**more):
+    return TrainingOptions(**COMMON | more)
+
+
+def write_scene(folder):
+    """A scene in the files of NeRF-synthetic."""
+    for split, views in (("train", circle(7)), ("test", circle(4))):
+        write_pictures(folder / split, views, opaque=False)
+        frames = [{"file_path": f"./{split}/{v.name}", "transform_matrix": opengl_pose(v)} for v in views]
+        content = {"camera_angle_x": 2 * math.atan(32 / 72), "frames": frames}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+
+
+def make_run(scene, out, ranks, resume=False, **more):
+    return training.Run(scene, out, options_of(**more), save_every=0, resume=resume, ranks=ranks)
+
+
+def train_until(run, step):
+    while run.progress.step < step:
+        run.trainer.step()
+    run.save()
+
+
+# --- the processes ----------------------------------------------------------------------------------
+
+
+def work(rank, world, folder):
+    torch.set_num_threads(1)
+    init = f"file://{folder}/rendezvous"
+    timeout = datetime.timedelta(seconds=DEADLINE)
+    dist.init_process_group("gloo", init_method=init, rank=rank, world_size=world, timeout=timeout)
+    pair, late = dist.new_group([1, 2]), dist.new_group([1, 2], timeout=datetime.timedelta(seconds=1))
+    all_ranks, scene = Ranks.of_group(), folder / "scene"
+    if rank > 0:
+        two = Ranks.of_group(pair)
+        assert (two.rank, two.world) == (rank - 1, 2)  # the rank in the group is not that in the world
+        for name, more in VARIANTS.items():
+            repeat(scene, folder / name, two, more)
+        gradients(scene, folder, two)
+        train_until(make_run(scene, folder / "chain", two), BREAKS[0])
+        if two.is_first:
+            shutil.copytree(folder / "chain", folder / "chain-by-2")
+        if rank == 1:
+            wait_in_vain(late, folder)
+    dist.barrier()
+    if rank == 0:
+        run = make_run(scene, folder / "chain", ALONE, resume=True)
+        save_again(run, folder / "chain-read-by-1")
+        train_until(run, BREAKS[1])
+        shutil.copytree(folder / "chain", folder / "chain-by-1")
+    dist.barrier()
+    run = make_run(scene, folder / "chain", all_ranks, resume=True)
+    save_again(run, folder / "chain-read-by-3")
+    run.train()
+    metrics = run.evaluate()
+    if rank == 2:
+        (folder / "metrics.json").write_text(json.dumps(metrics))
+    redistribute(run.trainer, folder)
+    not_finite(run, folder)
+    dist.barrier()
+    dist.destroy_process_group()
+
+
+def repeat(scene, out, ranks, more):
+    """A training to its end, and once more with a break after about half of it."""
+    whole = make_run(scene, out / "whole", ranks, **more)
+    whole.train()
+    train_until(make_run(scene, out / "part", ranks, **more), HALF)
+    part = make_run(scene, out / "part", ranks, resume=True)
+    assert part.progress.step == HALF
+    part.train()
+
+
+def gradients(scene, folder, ranks):
+    """The gradients of the first step, and the Gaussians after it."""
+    run = make_run(scene, folder / "gradients", ranks)
+    trainer = run.trainer
+    trainer._set_rates()
+    loss, seen = trainer._loss()
+    loss.backward()
+    made = {name: ranks.gather_rows(field.grad) for name, field in trainer.gaussians._asdict().items()}
+    trainer._observe(seen)
+    made["sums"] = ranks.gather_rows(trainer.density.gradient_sums)
+    made["loss"] = math.fsum(ranks.exchange(loss.item()))
+    trainer.optimizer.step()
+    made["after"] = [ranks.gather_rows(field) for field in trainer.gaussians]
+    if ranks.is_first:
+        torch.save(made, folder / "gradients.pt")
+
+
+def save_again(run, out):
+    """What a training that has just been resumed would write."""
+    run.out, before = out, run.out
+    out.mkdir(exist_ok=True)
+    run.save()
+    run.out = before
+
+
+def redistribute(trainer, folder):
+    """All rows to one rank, some to each, none to the first, and back."""
+    ranks = trainer.ranks
+    counts = ranks.exchange(len(trainer.gaussians.means))
+    total = sum(counts)
+    before, seen = state_rows(trainer), []
+    for after in ([0, total, 0], [total - 2, 1, 1], [0, 5, total - 5], counts):
+        trainer._redistribute(ranks.exchange(len(trainer.gaussians.means)), after)
+        seen.append((len(trainer.gaussians.means), after[ranks.rank], len(trainer.density.gradient_sums)))
+    torch.save((before, state_rows(trainer), seen), folder / f"redistributed-{ranks.rank}.pt")
+
+
+def state_rows(trainer):
+    """Parameters and moments of this rank."""
+    rows = [field.detach().clone() for field in trainer.gaussians]
+    return rows + [trainer.optimizer.state[f][m].clone() for f in trainer.gaussians for m in MOMENTS]
+
+
+def not_finite(run, folder):
+    """A loss that is NaN on one rank: what each of them raises."""
+    trainer, broken = run.trainer, run.ranks.rank == 1
+    trainer.progress.steps = None
+    with mock.patch(
+        "analytic_rasterizer.training.sharded.l1_ssim", lambda i, *_: (math.nan if broken else 1) * i.mean()
+    ):
+        trainer.step()
+    found = "nothing"
+    try:
+        trainer.take_losses()
+    except FloatingPointError as error:
+        found = str(error)
+    (folder / f"not-finite-{run.ranks.rank}.txt").write_text(found)
+
+
+def wait_in_vain(group, folder):
+    try:
+        Ranks.of_group(group).exchange(None)
+    except RuntimeError as error:
+        (folder / "late.txt").write_text(str(error))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """The folder into which the processes have written."""
+    folder = tmp_path_factory.mktemp("ranks")
+    write_scene(folder / "scene")
+    context = torch.multiprocessing.start_processes(work, (WORLD, folder), WORLD, join=False, start_method="spawn")
+    end = time.monotonic() + 2 * DEADLINE
+    try:
+        while not context.join(timeout=max(end - time.monotonic(), 0.0)):
+            assert time.monotonic() < end, "the processes hang"
+    finally:
+        for process in context.processes:
+            if process.is_alive():
+                process.kill()
+    return folder
+
+
+def checkpoint_in(folder):
+    return files.read_checkpoint(folder / files.CHECKPOINT)
+
+
+def assert_same(one, other, but=()):
+    """Nested dictionaries and lists with the same bits in them."""
+    assert type(one) is type(other)
+    if isinstance(one, dict):
+        assert one.keys() - set(but) == other.keys() - set(but)
+        for key in one.keys() - set(but):
+            assert_same(one[key], other[key], but)
+    elif isinstance(one, (list, tuple)):
+        assert len(one) == len(other)
+        for a, b in zip(one, other):
+            assert_same(a, b, but)
+    elif isinstance(one, torch.Tensor):
+        assert torch.equal(one, other)
+    else:
+        assert one == other
+
+
+# --- training ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_resumed_on_as_many_ranks_gives_the_same_bits(made, name):
+    whole, part = (checkpoint_in(made / name / kind) for kind in ("whole", "part"))
+    assert whole["progress"]["step"] == STEPS and len(whole["gaussians"]["means"]) != COMMON["random_points"]
+    assert_same(whole, part, but=("seconds", "history", "measured"))
+    assert (made / name / "whole" / files.SCENE).read_bytes() == (made / name / "part" / files.SCENE).read_bytes()
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_gaussians_are_spread_evenly_and_stay_within_the_limit(made, name):
+    state = checkpoint_in(made / name / "whole")
+    total = len(state["gaussians"]["means"])
+    assert sum(state["shards"]) == total and max(state["shards"]) * len(state["shards"]) <= UNEVEN * total
+    if "max_gaussians" in VARIANTS[name]:
+        assert total <= VARIANTS[name]["max_gaussians"]
+
+
+def test_two_ranks_then_one_then_three(made):
+    """Each goes on from what the one before wrote, all of it."""
+    for written, read, step in (("2", "1", BREAKS[0]), ("1", "3", BREAKS[1])):
+        before, after = (checkpoint_in(made / f"chain-{name}") for name in (f"by-{written}", f"read-by-{read}"))
+        assert before["progress"]["step"] == step and before["density"]["gradient_sums"].sum() > 0
+        assert {of_field["step"] for of_field in before["optimizer"]["state"].values()} == {step}
+        assert [len(state.get("shards", "1")) for state in (before, after)] == [int(written), int(read)]
+        assert_same(before, after, but=("shards",))
+    final = checkpoint_in(made / "chain")
+    assert final["progress"]["step"] == STEPS and final["progress"]["share"] == 1 and len(final["shards"]) == 3
+
+
+def test_gradients_are_those_of_one_process(made):
+    """A sum over two cameras has one rounding, whatever its order; the rest is the same arithmetic."""
+    got = torch.load(made / "gradients.pt")
+    run = make_run(made / "scene", made / "one", ALONE, pictures_per_step=CAMERAS)
+    start = model.Gaussians(*(field.detach() for field in run.trainer.gaussians))
+    one = ShardedTrainer(run.options, start, run.trainer.pictures, (1.0, 1.0, 1.0), "cpu", ALONE)
+    one._set_rates()
+    loss, seen = one._loss()
+    loss.backward()
+    # A rounding for each part of the sum, and one for each part's division.
+    assert loss.item() == pytest.approx(got["loss"], rel=4 * torch.finfo(torch.float32).eps)
+    for name, field in one.gaussians._asdict().items():
+        assert torch.equal(field.grad, got[name]), name
+        assert field.grad.abs().max() > 0 or name in ("rotations", "sh_rest")  # of balls, and above the degree in use
+    one._observe(seen)
+    # The mean over two pictures has half the gradient of each.
+    torch.testing.assert_close(2 * one.density.gradient_sums, got["sums"])
+    rates = [2**0.5 * group["lr"] for group in one.optimizer.param_groups]
+    groups = [{"params": [field], "lr": rate} for field, rate in zip(one.gaussians, rates)]
+    FusedAdam(groups, betas=(0.9**2, 0.999**2), eps=1e-15).step()
+    for name, field, after in zip(model.Gaussians._fields, one.gaussians, got["after"]):
+        assert torch.equal(field, after), name
+
+
+def test_evaluation_is_that_of_one_process(made):
+    """Images of several ranks have the bits of one, and so have the measures of each view."""
+    metrics = json.loads((made / "metrics.json").read_text())
+    assert metrics == json.loads((made / "chain" / files.METRICS).read_text())  # of rank 2, and what rank 0 wrote
+    alone = make_run(made / "scene", made / "chain", ALONE, resume=True)
+    pictures = training.load_pictures(alone.capture.test, (1, 2), (1.0, 1.0, 1.0), "cpu")
+    expected = training.evaluate(alone.trainer.scene(), pictures, alone.options.footprint)
+    assert metrics["test"] == expected and len(expected["1"]["views"]) == 4
+
+
+def test_moved_rows_keep_their_order(made):
+    parts = [torch.load(made / f"redistributed-{rank}.pt") for rank in range(WORLD)]
+    for before, after, seen in parts:
+        assert all(torch.equal(a, b) for a, b in zip(before, after))
+        assert all(count == expected == sums for count, expected, sums in seen)
+
+
+def test_a_loss_that_is_not_finite_on_one_rank_ends_all(made):
+    found = {(made / f"not-finite-{rank}.txt").read_text() for rank in range(WORLD)}
+    assert found == {f"the loss of step {STEPS + WORLD} is nan; lower learning rates may help"}
+
+
+def test_a_rank_that_does_not_answer_is_named_as_a_time_out(made):
+    said = (made / "late.txt").read_text()
+    assert launch._reason(said, 1) == "time-out: another rank did not answer for 1 s (--rank-timeout)"
+
+
+# --- parts ------------------------------------------------------------------------------------------
+
+
+def test_what_is_allowed_is_divided_by_what_is_wanted():
+    def shares(limit, rows):
+        ranks = [Ranks(rank, len(rows)) for rank in range(len(rows))]
+        with mock.patch.object(Ranks, "exchange", lambda self, value: rows):
+            return [r.allowed(limit, *row) for r, row in zip(ranks, rows)]
+
+    assert shares(100, [(10, 5), (20, 0), (30, 7)]) == [5, 0, 7]  # there is room for all
+    assert sum(shares(66, [(10, 5), (20, 0), (30, 7)])) == 6
+    assert shares(60, [(10, 5), (20, 3), (30, 7)]) == [0, 0, 0]
+    assert shares(10, [(10, 5), (20, 3), (30, 7)]) == [0, 0, 0]
+    assert shares(100, [(0, 0), (1, 0)]) == [0, 0]
+    for limit in range(60, 80):
+        got = shares(limit, [(10, 5), (20, 3), (30, 7)])
+        assert sum(got) == min(limit - 60, 15) and all(0 <= g <= w for g, w in zip(got, (5, 3, 7)))
+    assert [ALONE.allowed(limit, 10, 5) for limit in (8, 12, 20)] == [0, 2, 5]
+
+
+def test_even_counts():
+    assert even_counts(10, 3) == [3, 3, 4] and even_counts(2, 3) == [0, 1, 1] and even_counts(0, 2) == [0, 0]
+
+
+@pytest.mark.parametrize("stride", [1, 2, 3, 7])
+def test_periods_are_passed_once_for_each_multiple(stride):
+    ends = range(stride, 100 * stride, stride)
+    assert [step for step in ends if schedule.passes(step, 5, stride)] == sorted(
+        {math.ceil(k / stride) * stride for k in range(5, 99 * stride + 1, 5)} & set(ends)
+    )
+    progress = schedule.Progress(10, None)
+    progress.advance(stride)
+    assert (progress.step, progress.passed(5)) == (stride, stride >= 5)
+
+
+# --- the command ------------------------------------------------------------------------------------
+
+
+def torchrun(scene, out, *options, program=None):
+    """`train` on two processes; `program` replaces `-m analytic_rasterizer`."""
+    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    command += [str(program)] if program else ["-m", "analytic_rasterizer"]
+    command += ["train", str(scene), "--out", str(out), "--device", "cpu", "--random-points", "60", *options]
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": path}
+    return subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE, env=environment, cwd=out.parent)
+
+
+def test_torchrun_trains_and_writes_once(made, tmp_path):
+    """And what it trains is nearer to the pictures than what it starts from."""
+    done = torchrun(made / "scene", tmp_path / "out", "--iterations", "121", "--sh-degree", "0", "--export", "mip")
+    assert done.returncode == 0, done.stderr[-4000:]
+    lines = done.stdout.splitlines()
+    assert lines[0] == f"{tmp_path / 'out' / files.SCENE}: 60 Gaussians"
+    assert [line.split(",")[0].split(":")[0] for line in lines[1:]][-2:] == ["test", "test"] and len(lines) == 5
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {files.SCENE, files.MIP_SCENE, files.CAMERAS, files.METRICS, files.LOG, files.OPTIONS} < written
+    state = checkpoint_in(tmp_path / "out")
+    assert state["progress"]["step"] == 121 and state["shards"] == [30, 30]
+    test = training.load_pictures(training.load_capture(made / "scene").test, (1,), (1.0, 1.0, 1.0), "cpu")
+    start = model.gaussians_at(*model.random_points(60, 0), 0).to_scene()
+    before = training.evaluate(start, test, TrainingOptions().footprint)["mean"]["psnr"]
+    after = json.loads((tmp_path / "out" / files.METRICS).read_text())["test"]["mean"]["psnr"]
+    assert after > before + 2
+
+
+@pytest.mark.parametrize("end", ["raise RuntimeError('CUDA is out of memory')", "os.kill(os.getpid(), signal.SIGKILL)"])
+def test_a_rank_that_dies_ends_all_with_one_message(made, tmp_path, end):
+    program = tmp_path / "program.py"
+    program.write_text(
+        textwrap.dedent(
+            f"""
+            import os, signal, sys
+            from analytic_rasterizer import cli
+            from analytic_rasterizer.training import sharded
+
+            step = sharded.ShardedTrainer.step
+
+            def broken(trainer):
+                if trainer.progress.step >= 6 and trainer.ranks.rank == 1:
+                    {end}
+                step(trainer)
+
+            sharded.ShardedTrainer.step = broken
+            sys.exit(cli.main(sys.argv[1:]))
+            """
+        )
+    )
+    done = torchrun(made / "scene", tmp_path / "out", "--iterations", "30", program=program)
+    assert done.returncode != 0
+    messages = [line for line in done.stderr.splitlines() if re.match(r"error: ", line)]
+    if "KILL" in end:  # torchrun may end the other rank before it has noticed
+        assert all("on rank 0: another rank is gone" in line for line in messages) and len(messages) <= 1
+    else:
+        assert messages == ["error: on rank 1: CUDA is out of memory"]
+    assert "analytic_rasterizer/training" not in done.stderr  # no traceback but torchrun's own
+    assert not (tmp_path / "out" / files.CHECKPOINT).exists()
