@@ -6,6 +6,7 @@
 #include "core/bin.h"
 #include "cpu/isa.h"
 #include "cpu/parallel.h"
+#include "cpu/prefetch.h"
 #include "cpu/sort.h"
 #include "cpu/stages.h"
 
@@ -14,16 +15,27 @@ namespace ar::AR_ISA {
 /// What the loops over splats and tiles are compiled for.
 template <class F> using TilesOf = std::conditional_t<std::is_same_v<F, Adaptive>, Adaptive, PixelsOf<F>>;
 
-/// How far ahead of its use a splat is fetched: splats are visited in depth order, which is random
-/// in memory.
+/// How far ahead of its use what belongs to a splat is fetched: splats are visited in depth order, which is random in
+/// memory.
 inline constexpr int64_t kAhead = 12;
+
+/// Asks for what the splats soon to come need: their rows and counts first, and where their pairs are written once
+/// those have arrived.
+template <typename T> AR_HD void prefetch_pairs_of(const cpu::BinParams<T>& p, int64_t k, int64_t end) {
+  if (k + 2 * kAhead < end) {
+    const int32_t j = p.order[k + 2 * kAhead];
+    prefetch_splat(p.splats, j);
+    if (p.splat_offsets) __builtin_prefetch(p.splat_offsets + j, 1);
+  }
+  if (p.positions && k + kAhead < end) __builtin_prefetch(p.positions + p.splat_offsets[p.order[k + kAhead]], 1);
+}
 
 template <class F, typename T, class Visit>
 void for_each_pair_of(const cpu::BinParams<T>& p, int64_t part_index, const Visit& visit) {
   const auto* splats = reinterpret_cast<const Splat<F, T>*>(p.splats);
   const cpu::Part part = cpu::part_of(p.n, p.parts, part_index);
   for (int64_t k = part.begin; k < part.end; ++k) {
-    if (k + kAhead < part.end) __builtin_prefetch(&splats[p.order[k + kAhead]]);
+    prefetch_pairs_of(p, k, part.end);
     const int32_t j = p.order[k];
     if (!(splats[j].level > T(0))) continue;
     for_each_tile(support_of(splats[j]), p.grid, [&](int64_t tile) { visit(j, tile); });

@@ -41,6 +41,14 @@ template <class V, typename T> AR_HD V dot_channels(const T* gradient, const T* 
   return colors + ((sums[0] + sums[1]) + (sums[2] + sums[3]));
 }
 
+/// Rows of a tile with a sample that composited a pair behind `index`, or `index` itself.
+template <class V> AR_HD uint32_t rows_behind(const int32_t (&row_last)[kTile], IndexOf<V> index) {
+  uint32_t rows = 0;
+  for (int row = 0; row < kTile; row += LanesOf<ScalarOf<V>>::kCount)
+    rows |= bits(index < load_index(row_last + row, V())) << row;
+  return rows;
+}
+
 /// `gradient`: room for the channels of a tile. `replay_memory`: null unless samples move. `adapter`: null where rows
 /// hold P's shape.
 template <class P, typename T>
@@ -86,7 +94,6 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
     for (int i = 0; i < kTilePixels; ++i) row_last[i / kTile] = std::max(row_last[i / kTile], last[s][i]);
   }
   for (int row = 0; row < kTile; ++row) tile_last = std::max(tile_last, row_last[row]);
-  const uint32_t rows_in_image = (1u << view.rows) - 1;
   const int32_t* pairs = p.lists.pairs;
   const int64_t begin = p.lists.tile_offsets[tile], end = p.lists.tile_offsets[tile + 1];
   const auto write_zeros = [&](int64_t k) {
@@ -97,20 +104,31 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
   for (int64_t k = begin + tile_last; k < end; ++k) write_zeros(k);
   TilePairs<P, T> dL_dplaces = {};
   Replay<P, T> replay({p, view, last, row_last, begin, tile_last, replay_memory});
+  // Of the pairs with the same k / kBatch. Where samples move the replay knows the pixels: no batch is needed.
+  TileSplat<P, T> batch[P::kMoves ? 1 : kBatch];
+  const auto prefetch_before = [&](int32_t k) {
+    if (k >= kPrefetch) prefetch_splat(p.splats, pairs[begin + k - kPrefetch]);
+  };
   for (int32_t k = tile_last - 1; k >= 0; --k) {
+    const int32_t j = pairs[begin + k], place = P::kMoves ? 0 : k % kBatch;
     if constexpr (P::kMoves) {
       replay.enter(k);
       if (!replay.has(k)) {
         write_zeros(begin + k);
         continue;
       }
+      prefetch_before(k);
+      batch[0].splat = splat_at(p.splats, j, adapter);
+      batch[0].terms = terms_in_tile<P>(batch[0].splat, view);
+    } else if (place == kBatch - 1 || k == tile_last - 1) {
+      for (int32_t i = place; i >= 0; --i) {
+        prefetch_before(k - place + i);
+        batch[i] = tile_splat(p.splats, pairs[begin + k - place + i], adapter, view, lanes);
+      }
     }
-    if (k >= kPrefetch) prefetch_splat(p.splats, pairs[begin + k - kPrefetch]);
-    const int32_t j = pairs[begin + k];
-    const Splat<P, T> splat = splat_at(p.splats, j, adapter);
+    const TileSplat<P, T>& prepared = batch[place];
+    const auto& terms = prepared.terms;
     const T* shown = p.channels.row(j);
-    const Vec2<T> origin = {T(view.x0) - splat.mean.x, T(view.y0) - splat.mean.y};
-    const auto terms = P::terms(splat.shape, splat.opacity, origin);
     const V zero = V(T(0));
     const IndexOf<V> index(k);
     ShapeGrad<V> shape = {{zero, zero}, {zero, zero, zero}};
@@ -181,33 +199,35 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
           store(sums + i, madd(contribution, load(g + i, V()), load(sums + i, V())));
       }
       if (with_means) {
-        const Vec2<V> by_mean = transform_transposed(P::mean_map(splat.shape), of_pixel.offset);
+        const Vec2<V> by_mean = transform_transposed(P::mean_map(prepared.splat.shape), of_pixel.offset);
         mean_sums = mean_sums + mean_sums_of(p.mean_sums, size_px, by_mean);
       }
     };
     if constexpr (P::kMoves) {
       while (replay.has(k)) visit(replay.pixel());
     } else {
-      const TileMask<T> reach = reach_of(splat, view, lanes);
+      const TileMask<T>& reach = prepared.reach;
+      const uint32_t open_rows = rows_behind<V>(row_last, index);
       for (int c = 0; c < TileMask<T>::kPacks; ++c) {
-        for (uint32_t rows = reach.rows[c] & rows_in_image; rows != 0; rows &= rows - 1) {
-          const int row = __builtin_ctz(rows);
-          if (k < row_last[row]) visit(row * kTile + c * kCount);
-        }
+        for (uint32_t rows = reach.rows[c] & open_rows; rows != 0; rows &= rows - 1)
+          visit(__builtin_ctz(rows) * kTile + c * kCount);
       }
     }
+    const V parts[] = {shape.offset.x, shape.offset.y, shape.shape.xx, shape.shape.xy,
+                       shape.shape.yy, weighted,       color.x,        color.y};
+    T totals[8];
+    sum_lanes(parts, totals);
+    const auto [offset_x, offset_y, xx, xy, yy, total_weighted, red, green] = totals;
     T* channel_sums = p.channel_sums + (begin + k) * p.channel_stride;
     if (three) {
-      channel_sums[0] = sum(color.x);
-      channel_sums[1] = sum(color.y);
+      channel_sums[0] = red;
+      channel_sums[1] = green;
       channel_sums[2] = sum(color.z);
     } else {
       for (int c = 0; c < count; ++c) channel_sums[c] = sum(load(sums + c * kCount, V()));
     }
     if (!with_shape) continue;
-    const ShapeGrad<T> total = {{sum(shape.offset.x), sum(shape.offset.y)},
-                                {sum(shape.shape.xx), sum(shape.shape.xy), sum(shape.shape.yy)}};
-    const T total_weighted = sum(weighted);
+    const ShapeGrad<T> total = {{offset_x, offset_y}, {xx, xy, yy}};
     const auto& row = reinterpret_cast<const SplatRow<T>*>(p.splats)[j];
     auto* pair = reinterpret_cast<PairGrad<T>*>(p.pair_grads + (begin + k) * p.pair_stride);
     *pair = {adapter ? adapter->collect(row, total, total_weighted) : P::collect(terms, total, total_weighted),

@@ -149,14 +149,17 @@ AR_HD Pack erfc(Pack x) {
   return select(x < Pack(0.0f), Pack(2.0f) - tail, tail);
 }
 
+#if AR_LANES == 16
+/// The upper lanes added to the lower.
+AR_HD __m256 eight_lanes(Pack a) { return _mm256_add_ps(_mm512_castps512_ps256(a.v), _mm512_extractf32x8_ps(a.v, 1)); }
+#elif AR_LANES == 8
+AR_HD __m256 eight_lanes(Pack a) { return a.v; }
+#endif
+
 /// Sum of the lanes, in a fixed order.
 AR_HD float sum(Pack a) {
-#if AR_LANES == 16
-  const __m256 half = _mm256_add_ps(_mm512_castps512_ps256(a.v), _mm512_extractf32x8_ps(a.v, 1));
-#elif AR_LANES == 8
-  const __m256 half = a.v;
-#endif
 #if AR_LANES >= 8
+  const __m256 half = eight_lanes(a);
   __m128 q = _mm_add_ps(_mm256_castps256_ps128(half), _mm256_extractf128_ps(half, 1));
   q = _mm_add_ps(q, _mm_movehl_ps(q, q));
   return _mm_cvtss_f32(_mm_add_ss(q, _mm_movehdup_ps(q)));
@@ -166,6 +169,30 @@ AR_HD float sum(Pack a) {
 }
 AR_HD float sum(float a) { return a; }
 AR_HD double sum(double a) { return a; }
+
+/// sum() of eight, with the same bits: where packs are wide the sums share their instructions.
+AR_HD void sum_lanes(const Pack (&packs)[8], float (&sums)[8]) {
+#if AR_LANES >= 8
+  // As in sum(): first the halves of a pack, then what is two lanes away, then neighbours. Every step halves the
+  // number of registers.
+  __m256 halves[4], pairs[2];
+  for (int i = 0; i < 4; ++i) {
+    const __m256 a = eight_lanes(packs[i]), b = eight_lanes(packs[i + 4]);
+    halves[i] = _mm256_add_ps(_mm256_permute2f128_ps(a, b, 0x20), _mm256_permute2f128_ps(a, b, 0x31));
+  }
+  for (int i = 0; i < 2; ++i) {
+    const __m256 a = halves[2 * i], b = halves[2 * i + 1];
+    pairs[i] = _mm256_add_ps(_mm256_shuffle_ps(a, b, 0x44), _mm256_shuffle_ps(a, b, 0xee));
+  }
+  const __m256 even = _mm256_shuffle_ps(pairs[0], pairs[1], 0x88), odd = _mm256_shuffle_ps(pairs[0], pairs[1], 0xdd);
+  _mm256_storeu_ps(sums, _mm256_add_ps(even, odd));
+#else
+  for (int i = 0; i < 8; ++i) sums[i] = sum(packs[i]);
+#endif
+}
+AR_HD void sum_lanes(const double (&packs)[8], double (&sums)[8]) {
+  for (int i = 0; i < 8; ++i) sums[i] = packs[i];
+}
 
 /// The lanes a scalar type is processed in: packs of floats, doubles one by one (they serve tests
 /// and gradcheck, where speed does not matter).

@@ -6,6 +6,7 @@
 #include "core/project.h"
 #include "cpu/isa.h"
 #include "cpu/parallel.h"
+#include "cpu/prefetch.h"
 #include "cpu/stages.h"
 
 namespace ar::AR_ISA {
@@ -99,10 +100,14 @@ template <template <typename> class Cam, typename T> void project_rows(const cpu
   });
 }
 
+/// So many positions before the sums of a pair are read, they are asked for. The pairs of a splat lie in as many tiles.
+inline constexpr int64_t kPairsAhead = 16;
+
 template <template <typename> class Cam, typename T> void project_vjp(const cpu::ProjectVjpParams<T>& p) {
   const Gaussians<T>& g = p.gaussians;
   for_each_chunk(g.n, p.threads, [&](int64_t chunk, int64_t begin, int64_t end) {
     const auto camera = load_camera_as<Cam<T>>(p.camera);
+    const int64_t pairs = p.pairs.splat_offsets[p.pairs.splats];
     int64_t j = std::lower_bound(p.pairs.ids, p.pairs.ids + p.pairs.splats, begin) - p.pairs.ids;
     for (int64_t i = begin; i < end; ++i) {
       const bool is_splat = j < p.pairs.splats && p.pairs.ids[j] == i;
@@ -116,6 +121,8 @@ template <template <typename> class Cam, typename T> void project_vjp(const cpu:
       ShownGrad<T> shown = {};
       Vec2<T> mean_sums = {};
       for (int64_t k = first; k < last; ++k) {
+        if (k + kPairsAhead < pairs)
+          prefetch_row(p.pair_grads + p.pairs.positions[k + kPairsAhead] * p.pair_stride, p.pair_stride);
         const int64_t pair = p.pairs.positions[k];
         const T* row = p.pair_grads + pair * p.pair_stride;
         sums = sums + *reinterpret_cast<const PairGrad<T>*>(row);

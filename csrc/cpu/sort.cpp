@@ -2,6 +2,8 @@
 
 #include <algorithm>
 #include <cstring>
+#include <memory>
+#include <utility>
 
 #include "cpu/parallel.h"
 
@@ -31,14 +33,26 @@ template <typename T> void sort_by_depth(const T* depths, int64_t n, int threads
     int32_t index;
   };
   const int64_t parts = threads;
-  std::vector<Entry> from(n), to(n);
+  const std::unique_ptr<Entry[]> memory(new Entry[2 * n]);  // not a vector, which one thread would fill with zeros
+  Entry *from = memory.get(), *to = from + n;
   std::vector<int64_t> cursors(parts * kBuckets);
+  std::vector<Key> set_in_all(parts), set_in_any(parts);
+  parallel_for(parts, threads, [&](int64_t p) {
+    Key common = ~Key(0), any = 0;
+    const Part part = part_of(n, parts, p);
+    for (int64_t i = part.begin; i < part.end; ++i) {
+      const Key key = depth_key(depths[i]);
+      common &= key;
+      any |= key;
+      from[i] = {key, int32_t(i)};
+    }
+    set_in_all[p] = common;
+    set_in_any[p] = any;
+  });
   Key common = ~Key(0), any = 0;  // bits set in every key, in any key
-  for (int64_t i = 0; i < n; ++i) {
-    const Key key = depth_key(depths[i]);
-    common &= key;
-    any |= key;
-    from[i] = {key, int32_t(i)};
+  for (int64_t p = 0; p < parts; ++p) {
+    common &= set_in_all[p];
+    any |= set_in_any[p];
   }
   for (int shift = 0; shift < int(8 * sizeof(Key)); shift += kBits) {
     if ((((any ^ common) >> shift) & (kBuckets - 1)) == 0) continue;  // all keys agree on this digit
@@ -61,10 +75,13 @@ template <typename T> void sort_by_depth(const T* depths, int64_t n, int threads
       const Part part = part_of(n, parts, p);
       for (int64_t i = part.begin; i < part.end; ++i) to[cursor[(from[i].key >> shift) & (kBuckets - 1)]++] = from[i];
     });
-    from.swap(to);
+    std::swap(from, to);
   }
   order.resize(n);
-  for (int64_t i = 0; i < n; ++i) order[i] = from[i].index;
+  parallel_for(parts, threads, [&](int64_t p) {
+    const Part part = part_of(n, parts, p);
+    for (int64_t i = part.begin; i < part.end; ++i) order[i] = from[i].index;
+  });
 }
 
 template void sort_by_depth<float>(const float*, int64_t, int, std::vector<int32_t>&);

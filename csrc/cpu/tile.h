@@ -7,6 +7,7 @@
 
 #include "core/bin.h"
 #include "cpu/pack.h"
+#include "cpu/prefetch.h"
 #include "cpu/stages.h"
 
 namespace ar::AR_ISA {
@@ -105,15 +106,14 @@ template <class P, typename T> AR_HD Splat<P, T> splat_at(const T* splats, int32
 /// So many pairs before a splat is read, its row is asked for.
 inline constexpr int kPrefetch = 16;
 
-/// Asks for row j of `splats`, which may lie in two lines of the cache.
-template <typename T> AR_HD void prefetch_splat(const T* splats, int32_t j) {
-  const T* row = splats + int64_t(j) * kSplatWidth;
-  __builtin_prefetch(row);
-  __builtin_prefetch(row + kSplatWidth - 1);
-}
-
 /// So many pairs of a list are prepared, then composited: where the loops over pixels branch is known before they come.
 inline constexpr int kBatch = 16;
+
+/// What P needs of a splat to blend it into the pixels of a tile, counted from the tile's first.
+template <class P, typename T> AR_HD auto terms_in_tile(const Splat<P, T>& splat, const TileView& view) {
+  const Vec2<T> origin = {T(view.x0) - splat.mean.x, T(view.y0) - splat.mean.y};
+  return P::terms(splat.shape, splat.opacity, origin);
+}
 
 /// A splat in a tile.
 template <class P, typename T> struct TileSplat {
@@ -125,8 +125,7 @@ template <class P, typename T>
 AR_HD TileSplat<P, T> tile_splat(const T* splats, int32_t j, const RowAdapter<P, T>* adapter, const TileView& view,
                                  const LaneIndex<T>& lanes) {
   const Splat<P, T> splat = splat_at(splats, j, adapter);
-  const Vec2<T> origin = {T(view.x0) - splat.mean.x, T(view.y0) - splat.mean.y};
-  return {splat, P::terms(splat.shape, splat.opacity, origin), reach_of(splat, view, lanes)};
+  return {splat, terms_in_tile<P>(splat, view), reach_of(splat, view, lanes)};
 }
 
 /// visit(P{}, adapter) for what footprint F blends a tile with: its own pixels, or for `adaptive` those of the samples

@@ -16,6 +16,7 @@ struct PackOps {
   Map exp2, erfc, sqrt, abs, min, max, madd;
   Map select;  ///< a < b ? b : c
   float (*sum)(const float* a);
+  void (*sum_lanes)(const float* a, float* sums);    ///< of eight packs, one behind the other
   uint32_t (*bits)(const float* a, const float* b);  ///< of a < b
   /// Some lanes of a, stored and loaded again; returns how many numbers that took.
   int (*keep_lanes)(uint32_t lanes, const float* a, const float* otherwise, float* out);

@@ -22,6 +22,13 @@ const test::PackOps kPackOps = {
       select(Pack::load(a) < Pack::load(b), Pack::load(b), Pack::load(c)).store(out);
     },
     [](const float* a) { return sum(Pack::load(a)); },
+    [](const float* a, float* sums) {
+      Pack packs[8];
+      for (int i = 0; i < 8; ++i) packs[i] = Pack::load(a + i * kLanes);
+      float eight[8];
+      sum_lanes(packs, eight);
+      std::copy_n(eight, 8, sums);
+    },
     [](const float* a, const float* b) { return bits(Pack::load(a) < Pack::load(b)); },
     [](uint32_t lanes, const float* a, const float* otherwise, float* out) {
       float stored[kLanes];

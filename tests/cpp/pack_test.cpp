@@ -122,6 +122,17 @@ TEST_P(PackTest, SumAndBits) {
   }
 }
 
+TEST_P(PackTest, EightSumsHaveTheBitsOfEach) {
+  const int lanes = GetParam().ops.lanes;
+  Random random(5);
+  for (int trial = 0; trial < 200; ++trial) {
+    std::vector<float> a(8 * lanes), sums(8);
+    for (float& x : a) x = float(random.normal());
+    GetParam().ops.sum_lanes(a.data(), sums.data());
+    for (int i = 0; i < 8; ++i) ASSERT_EQ(sums[i], GetParam().ops.sum(a.data() + i * lanes)) << i;
+  }
+}
+
 TEST_P(PackTest, LanesComeBack) {
   const int lanes = GetParam().ops.lanes;
   std::vector<float> a(lanes), otherwise(lanes), out(lanes);
