@@ -353,7 +353,7 @@ def draw_sheet(pictures: list[Picture], truth: dict, results: dict):
     right = sheet.width - gap
     title = "One scene at four resolutions, as each footprint renders it"
     write(gap, 4 * unit, title, 3.2, anchor="ls", bold=True)
-    threads = "" if results["device"] != "cpu" else f" on {results['threads']} CPU threads"
+    threads = "" if results["device"] != "cpu" else f" on the CPU (threads: {results['threads']})"
     notes_on = f"below each picture: its error map, its PSNR against the reference, its time{threads}"
     write(right - width - 9 * unit, 4 * unit, notes_on, 1.8, MUTED, "rs")
     ramp = ERROR_SPAN * torch.linspace(0, 1, 256).expand(3, 1, 256)

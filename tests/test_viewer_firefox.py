@@ -73,10 +73,13 @@ class Firefox:
             digits += byte
         return json.loads(self.stream.read(int(digits)))
 
-    def ask(self, command, **arguments):
+    def send(self, command, **arguments):
         self.count += 1
         message = json.dumps([0, self.count, command, arguments]).encode()
         self.socket.sendall(b"%d:" % len(message) + message)
+
+    def ask(self, command, **arguments):
+        self.send(command, **arguments)
         _, _, error, result = self.receive()
         assert error is None, error["message"]
         return result
@@ -105,8 +108,12 @@ class Firefox:
         self.ask("WebDriver:PerformActions", actions=[{"type": "key", "id": "keys", "actions": actions}])
 
     def end(self):
-        self.ask("Marionette:Quit", flags=["eForceQuit"])
-        self.process.wait(PATIENCE)
+        self.send("Marionette:Quit", flags=["eForceQuit"])  # it may end before it answers
+        self.socket.close()
+        try:
+            self.process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:  # what was to be tested has been
+            self.process.kill()
 
 
 def wait_for(find):

@@ -30,6 +30,10 @@ class Pictures(NamedTuple):
         color = self.colors[scale][view] / 255
         return color if background is None else color[:3] + (1 - color[3:]) * background[:, None, None]
 
+    def target(self, scale: int, view: int, background: Tensor | None = None) -> Tensor:
+        """`truth` as `l1_ssim` takes it: where there is no `background`, (3, H, W) uint8 as stored."""
+        return self.colors[scale][view] if background is None else self.truth(scale, view, background)
+
     def resolve(self, **options) -> dict[int, list[GaussianRasterizationSettings]]:
         """The settings with other options, such as `footprint` and `sh_degree`."""
         return {scale: [s._replace(**options) for s in of_scale] for scale, of_scale in self.settings.items()}

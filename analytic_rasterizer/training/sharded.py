@@ -82,7 +82,7 @@ class ShardedTrainer(Trainer):
         loss = batch.anchor
         for view in batch.views:
             picture = shown[view.camera]
-            truth = self.pictures.truth(picture.scale, picture.view, picture.background)
+            truth = self.pictures.target(picture.scale, picture.view, picture.background)
             loss = loss + l1_ssim(view.image, truth, options.ssim_weight) / len(shown)
             self.last = view.image.detach(), truth
         opacity_weight, scale_weight = options.regularizers

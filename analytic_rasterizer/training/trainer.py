@@ -53,7 +53,7 @@ class Trainer:
         gaussians: The parameters at present.
         progress: Steps taken, and the share of the training that is over.
         losses: Of the steps since they were last taken away, one-element tensors.
-        last: Picture and truth of the last step, for looking at.
+        last: Picture and target (`Pictures.target`) of the last step, for looking at.
     """
 
     def __init__(
@@ -149,7 +149,7 @@ class Trainer:
         for scale, view, settings, background in self._next():
             leaf = self.density.leaf(scale)
             image, radii = gaussians.render(settings, leaf, options.supersampling)
-            truth = self.pictures.truth(scale, view, background)
+            truth = self.pictures.target(scale, view, background)
             losses.append(l1_ssim(image, truth, options.ssim_weight))
             seen.append((leaf, radii))
             self.last = image.detach(), truth
@@ -183,7 +183,7 @@ class Trainer:
         """Renders and differentiates one picture of each scale without a step, so that no step loads kernels."""
         for scale, settings in self._settings().items():
             image, _ = self.gaussians.render(settings[0], supersampling=self.options.supersampling)
-            truth = self.pictures.truth(scale, 0, settings[0].bg if self.random_background else None)
+            truth = self.pictures.target(scale, 0, settings[0].bg if self.random_background else None)
             l1_ssim(image, truth, self.options.ssim_weight).backward()
         self.optimizer.zero_grad(set_to_none=True)
 
