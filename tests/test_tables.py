@@ -436,7 +436,7 @@ def test_the_command_lists_the_tables(capsys):
     assert cli.main(["tables"]) == 0
     printed = capsys.readouterr().out
     assert all(f"{name} (" in printed for name in TABLES)
-    assert "360-super-resolution (paper, Tab. 6)" in printed and "tests at 2 times it" in printed
+    assert "360-super-resolution (paper, Tab. 6)" in printed and "tests at 2 times the full size" in printed
     assert "full size 1/2: room, counter, kitchen, bonsai" in printed and "blender-stmt (ours only)" in printed
 
 

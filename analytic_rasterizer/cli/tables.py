@@ -71,16 +71,20 @@ def describe(table: Table) -> str:
     scenes: dict[int, list[str]] = {}
     for scene, reduction in table.data.scenes.items():
         scenes.setdefault(reduction, []).append(scene)
-    size = f"{table.enlarged} times" if table.enlarged > 1 else f"{_fractions(table.scales)} of"
+    tested = f"{table.enlarged} times the full size" if table.enlarged > 1 else _sizes(table.scales)
     lines = [
         f"{table.name} ({'paper, ' + published.source if published else 'ours only'}): {table.title}",
-        *(f"full size {_fractions((reduction,))}: {', '.join(names)}" for reduction, names in scenes.items()),
-        f"trains at {_fractions(table.options['scales'])} of the full size, tests at {size} it, on "
+        *(f"full size {_fraction(reduction)}: {', '.join(names)}" for reduction, names in scenes.items()),
+        f"trains at {_sizes(table.options['scales'])}, tests at {tested}, on "
         + (f"the test views ({table.data.views})" if table.data.views else "every eighth photograph"),
         f"rows: {', '.join(row.name for row in table.rows)}",
     ]
     return "\n    ".join(lines)
 
 
-def _fractions(scales: tuple[int, ...]) -> str:
-    return ", ".join("1" if scale == 1 else f"1/{scale}" for scale in scales)
+def _sizes(scales: tuple[int, ...]) -> str:
+    return "the full size" if scales == (1,) else f"{', '.join(map(_fraction, scales))} of the full size"
+
+
+def _fraction(scale: int) -> str:
+    return "1" if scale == 1 else f"1/{scale}"
