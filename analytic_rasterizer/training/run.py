@@ -93,7 +93,12 @@ class Run:
         self.capture = load_capture(scene, images, test_every)
         background = background_of(self.options, self.capture.background)
         pictures = load_pictures(
-            self.capture.train, self.options.scales, background, self.device, self.options.downsampling
+            self.capture.train,
+            self.options.scales,
+            background,
+            self.device,
+            self.options.downsampling,
+            on_host=ranks.world > 1,  # a rank shows one in N of them: memory of the device is for Gaussians
         )
         if state is None:
             start = first_gaussians(self.options, self.capture, points)
