@@ -11,7 +11,7 @@ from torch.nn.functional import avg_pool2d
 
 from .. import distributed, io
 from ..activations import activate
-from ..rasterizer import GaussianRasterizer
+from ..rasterizer import rasterize_gaussians
 from ..settings import GaussianRasterizationSettings
 
 if TYPE_CHECKING:
@@ -89,13 +89,16 @@ class Activated(NamedTuple):
             supersampling: Render so many times larger, and average over squares of pixels. Radii, and the pixels of
                 the footprint, are those of the larger picture.
         """
-        picture, radii = GaussianRasterizer(enlarged(settings, supersampling))(
-            means3D=self.means,
-            means2D=means2D,
-            opacities=self.opacities,
-            shs=self.shs,
-            scales=self.scales,
-            rotations=self.rotations,
+        picture, radii = rasterize_gaussians(
+            self.means,
+            means2D,
+            self.shs,
+            None,
+            self.opacities,
+            self.scales,
+            self.rotations,
+            None,
+            enlarged(settings, supersampling),
         )
         return averaged(picture, supersampling), radii
 
@@ -127,6 +130,8 @@ class Activated(NamedTuple):
 
 def enlarged(settings: GaussianRasterizationSettings, times: int) -> GaussianRasterizationSettings:
     """Those of a picture so many times as large."""
+    if times == 1:
+        return settings  # as they are: making others takes longer than all checks of a step
     return settings._replace(image_height=times * settings.image_height, image_width=times * settings.image_width)
 
 

@@ -85,6 +85,7 @@ class Trainer:
         self.progress = Progress(options.iterations if options.seconds == 0 else None, options.seconds)
         self.order = PictureOrder(len(pictures.views), options)
         self.filter_3d: Tensor | None = None
+        self.one = torch.ones((), device=self.device)  # the gradient of the loss with respect to itself
         self.losses: list[Tensor] = []
         self.last: tuple[Tensor, Tensor] | None = None
         self._resolved: tuple[int, dict] | None = None  # degree of the harmonics, and the settings of it
@@ -101,7 +102,10 @@ class Trainer:
         stride = self.stride
         self._set_rates()
         loss, seen = self._loss()
-        loss.backward()
+        # In this thread: otherwise one of the device's does it, and handing over and back takes longer than the kernels
+        # of a small picture.
+        with torch.autograd.set_multithreading_enabled(False):
+            loss.backward(self.one)
         self._observe(seen)
         optimizer.step()
         optimizer.zero_grad(set_to_none=True)
