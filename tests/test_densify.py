@@ -25,8 +25,7 @@ def make_gaussians(scales, opacities) -> g.Gaussians:
         torch.tensor(scales).log()[:, None].repeat(1, 3),
         torch.randn(count, 4, generator=generator),
         torch.tensor(opacities).logit()[:, None],
-        torch.randn(count, 1, 3, generator=generator),
-        torch.randn(count, 8, 3, generator=generator),
+        torch.randn(count, 9, 3, generator=generator),
     )
     return g.Gaussians(*(field.requires_grad_() for field in fields))
 
@@ -74,7 +73,7 @@ def test_growth_and_pruning_of_a_few():
     for half in (left, right):
         torch.testing.assert_close(half.log_scales.exp(), parent.log_scales.exp() / 1.6)
         assert 0 < (half.means - parent.means).norm() < 5 * LARGE
-        for name in ("rotations", "logit_opacities", "sh_dc", "sh_rest"):
+        for name in ("rotations", "logit_opacities", "shs"):
             assert torch.equal(getattr(half, name), getattr(parent, name))
     assert not torch.equal(left.means, right.means)
 
@@ -189,7 +188,7 @@ def picture_of(gaussians) -> torch.Tensor:
     view = io.View("", 48, 48, 60.0, 60.0, torch.eye(4, dtype=torch.float64))
     view.w2c[2, 3] = 3.0
     count = len(gaussians.means)
-    constant = gaussians._replace(sh_dc=torch.ones(count, 1, 3), sh_rest=torch.zeros(count, 0, 3))
+    constant = gaussians._replace(shs=torch.ones(count, 1, 3))
     with torch.no_grad():
         return constant.render(view.settings(sh_degree=0, footprint="point:dilation=0"))[0]
 
@@ -272,10 +271,9 @@ def test_gradient_that_grows_does_not_depend_on_the_scale(footprint):
     gradients = []
     for scale in (1, 2):
         gaussian = make_gaussians([0.3] * 4, [0.1] * 4)._replace(means=torch.tensor([[0.1, 0.2, 3.0]] * 4))
-        gaussian = gaussian._replace(sh_rest=torch.zeros(4, 0, 3))
         means2D = torch.zeros(4, 3, requires_grad=True)
         settings = view.settings(1 / scale, sh_degree=0, footprint=footprint)
-        picture, _ = gaussian._replace(sh_dc=torch.ones(4, 1, 3)).render(settings, means2D)
+        picture, _ = gaussian._replace(shs=torch.ones(4, 1, 3)).render(settings, means2D)
         (picture * torch.linspace(0, 1, picture.shape[2])).mean().backward()
         gradients.append(means2D.grad[0, 0].item())
     assert gradients[1] == pytest.approx(gradients[0], rel=0.05)

@@ -709,7 +709,7 @@ def test_training_starts_from_a_scene(synthetic, trained, tmp_path):
     expected = io.load_scene(trained / files.SCENE)
     torch.testing.assert_close(run.trainer.gaussians.means.detach(), expected.means)
     torch.testing.assert_close(run.trainer.gaussians.to_scene().shs[:, :4], expected.shs)
-    assert run.trainer.gaussians.sh_rest.shape[1] == 8 and (run.trainer.gaussians.sh_rest[:, 3:] == 0).all()
+    assert run.trainer.gaussians.shs.shape[1] == 9 and (run.trainer.gaussians.shs[:, 4:] == 0).all()
 
 
 def test_evaluate_compares_footprints(trained, capsys):

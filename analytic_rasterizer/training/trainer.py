@@ -75,10 +75,10 @@ class Trainer:
             "log_scales": options.scale_rate,
             "rotations": options.rotation_rate,
             "logit_opacities": options.opacity_rate,
-            "sh_dc": options.color_rate,
-            "sh_rest": options.color_rate * SH_REST_SHARE,
+            "shs": options.color_rate * SH_REST_SHARE,
         }
         groups = [{"params": [getattr(gaussians, name)], "lr": self.rates[name]} for name in Gaussians._fields]
+        groups[-1] |= {"head": 1, "head_lr": options.color_rate}  # the constant
         self.optimizer = FusedAdam(groups, eps=ADAM_EPS)
         self.density = make_density(options, gaussians, self.optimizer, self.extent, background == WHITE, ranks=ranks)
         self.generator = torch.Generator(self.device).manual_seed(options.seed + 1)
@@ -125,8 +125,10 @@ class Trainer:
     def _set_rates(self) -> None:
         """Gives the optimizer the learning rates of the next step."""
         options, over = self.options, self.progress.share
+        factor = options.rates_end**over
         for group, rate in zip(self.optimizer.param_groups, self.rates.values()):
-            group["lr"] = rate * options.rates_end**over
+            group["lr"] = rate * factor
+        self.optimizer.param_groups[-1]["head_lr"] = options.color_rate * factor
         self.optimizer.param_groups[0]["lr"] = self.extent * means_rate_at(self.progress.step, over, options)
 
     def _next(self) -> list[Shown]:

@@ -244,6 +244,10 @@ struct AdamArguments {
   double beta1 = 0, beta2 = 0, eps = 0;
   OptionalTensor rows;  ///< (P,) bool or uint8
   bool bias_correction = true;
+  /// The first numbers of every row, along the first dimension, that have a learning rate of their own, and that rate;
+  /// 0: none. Empty lists: none at all.
+  std::vector<int64_t> heads;
+  std::vector<double> head_rates;
 
   template <class Visit> void each(Visit&& visit) {
     visit("params", params);
@@ -257,6 +261,8 @@ struct AdamArguments {
     visit("eps", eps);
     visit("rows=None", rows);
     visit("bias_correction=True", bias_correction);
+    visit("heads=[]", heads);
+    visit("head_rates=[]", head_rates);
   }
 };
 

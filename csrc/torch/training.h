@@ -133,7 +133,9 @@ template <typename T> AdamRule<T> adam_rule(const AdamArguments& a, size_t i) {
   rule.one_minus_beta2 = T(1 - a.beta2);
   rule.eps = T(a.eps);
   const double step = double(a.steps[i]);
-  rule.rate = T(a.bias_correction ? a.rates[i] / (1 - std::pow(a.beta1, step)) : a.rates[i]);
+  const double bias = a.bias_correction ? 1 - std::pow(a.beta1, step) : 1;
+  rule.rate = T(a.rates[i] / bias);
+  if (!a.heads.empty()) rule.head_rate = T(a.head_rates[i] / bias);
   rule.root_scale = T(a.bias_correction ? 1 / std::sqrt(1 - std::pow(a.beta2, step)) : 1);
   return rule;
 }
@@ -142,7 +144,8 @@ template <typename T> AdamRule<T> adam_rule(const AdamArguments& a, size_t i) {
 template <typename T> AdamTensor<T> adam_tensor(const AdamArguments& a, size_t i) {
   AdamTensor<T> t = {};
   t.n = a.params[i].numel();
-  t.row_size = a.rows ? t.n / a.rows->numel() : t.n;
+  t.head = a.heads.empty() ? 0 : a.heads[i];
+  t.row_size = a.rows || t.head > 0 ? t.n / a.params[i].size(0) : t.n;
   t.rule = adam_rule<T>(a, i);
   t.grad = const_pointer<T>(a.grads[i]);
   t.param = pointer<T>(a.params[i]);

@@ -77,6 +77,11 @@ void check(AdamArguments& a) {
   check_count(a.exp_avg_sqs.size(), "exp_avg_sqs");
   check_count(a.rates.size(), "rates");
   check_count(a.steps.size(), "steps");
+  const bool with_heads = !a.heads.empty() || !a.head_rates.empty();
+  if (with_heads) {
+    check_count(a.heads.size(), "heads");
+    check_count(a.head_rates.size(), "head_rates");
+  }
   TORCH_CHECK_VALUE(a.beta1 >= 0 && a.beta1 < 1, "beta1 must be in [0, 1), got ", a.beta1);
   TORCH_CHECK_VALUE(a.beta2 >= 0 && a.beta2 < 1, "beta2 must be in [0, 1), got ", a.beta2);
   TORCH_CHECK_VALUE(std::isfinite(a.eps) && a.eps >= 0, "eps must be finite and not negative, got ", a.eps);
@@ -94,15 +99,26 @@ void check(AdamArguments& a) {
     check_tensor(t, list, i);
     TORCH_CHECK_VALUE(t.is_contiguous(), list, "[", i, "] must be contiguous, got strides ", t.strides());
   };
+  const auto check_rate = [&](double rate, const char* list, size_t i) {
+    TORCH_CHECK_VALUE(std::isfinite(float(rate)) && rate >= 0, list, "[", i, "] must be finite and not negative, got ",
+                      rate);
+  };
   for (size_t i = 0; i < count; ++i) {
-    TORCH_CHECK_VALUE(std::isfinite(float(a.rates[i])) && a.rates[i] >= 0, "rates[", i,
-                      "] must be finite and not negative, got ", a.rates[i]);
+    check_rate(a.rates[i], "rates", i);
     TORCH_CHECK_VALUE(a.steps[i] >= 1, "steps[", i, "] must be at least 1, got ", a.steps[i]);
     check_floating(a.params[i], "params");
     check_written(a.params[i], "params", i);
     check_tensor(a.grads[i], "grads", i);
     check_written(a.exp_avgs[i], "exp_avgs", i);
     check_written(a.exp_avg_sqs[i], "exp_avg_sqs", i);
+    if (with_heads && a.heads[i] != 0) {
+      check_rate(a.head_rates[i], "head_rates", i);
+      const Tensor& param = a.params[i];
+      const int64_t most = param.dim() >= 1 && param.size(0) > 0 ? param.numel() / param.size(0) : a.heads[i];
+      TORCH_CHECK_VALUE(a.heads[i] > 0 && a.heads[i] <= most && param.dim() >= 1, "heads[", i,
+                        "] must be 0 to the size of a row of params[", i, "], got ", a.heads[i], " and shape ",
+                        shape_of(param));
+    }
     if (!a.rows) continue;
     TORCH_CHECK_VALUE(a.params[i].dim() >= 1 && a.params[i].size(0) == a.rows->numel(), "params[", i,
                       "] must have a row for each of rows, ", a.rows->numel(), ", got shape ", shape_of(a.params[i]));
