@@ -77,8 +77,17 @@ class FusedAdam(torch.optim.Optimizer):
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        _update(self, rows, betas=_common(self, "betas"))
+        self.update(rows)
         return loss
+
+    @torch.no_grad()
+    def update(self, rows: Tensor | None = None) -> None:
+        """`step` without what torch puts around it, hooks and a range for its profiler, which cost the host as much.
+
+        Raises:
+            TypeError, ValueError, RuntimeError: As `step`.
+        """
+        _update(self, rows, betas=_common(self, "betas"))
 
     def zero_grad(self, set_to_none: bool = True) -> None:
         """Forgets the gradients, or sets them to zero."""
