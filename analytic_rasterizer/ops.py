@@ -206,6 +206,11 @@ def _(a):
     return _gradients(a, (a.log_scales, a.quats, a.logit_opacities))
 
 
+@_register("observe_")
+def _(a):
+    return None
+
+
 @_register("adam_")
 def _(a):
     return None

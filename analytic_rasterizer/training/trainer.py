@@ -170,7 +170,8 @@ class Trainer:
     def _observe(self, seen: list[tuple[Tensor | None, Tensor]]) -> None:
         """Lets density control look at the gradients of a step."""
         for leaf, radii in seen:
-            self.density.observe(leaf, radii)
+            if leaf is not None:
+                self.density.observe(leaf.grad, radii)
 
     def _rebalance(self) -> None:
         """Called when the number of Gaussians has changed; there is nothing to do in one process."""

@@ -233,6 +233,26 @@ struct ActivateArguments {
 /// Tensors that an op writes to, marked in its schema by a letter that no other argument has.
 template <char kLetter> struct WrittenTensors : std::vector<Tensor> {};
 
+/// A tensor that an op writes to, likewise.
+template <char kLetter> struct WrittenTensor : Tensor {};
+
+/// Arguments of `observe_`: a picture's gradients and radii, and the sums that they are added to (core/density.h).
+struct ObserveArguments {
+  WrittenTensor<'a'> gradient_sums;  ///< (P,)
+  WrittenTensor<'b'> views;          ///< (P,) int32
+  Tensor gradients;                  ///< (P, 3) or (P, 4), with respect to means2D
+  Tensor radii;                      ///< (P,) int32
+  int64_t first_column = 0;          ///< of the two columns of `gradients` that are looked at
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("gradient_sums", gradient_sums);
+    visit("views", views);
+    visit("gradients", gradients);
+    visit("radii", radii);
+    visit("first_column", first_column);
+  }
+};
+
 /// Arguments of `adam_`: a step on several tensors (core/adam.h). The lists have a member for each of them.
 struct AdamArguments {
   WrittenTensors<'a'> params;  ///< contiguous
@@ -292,6 +312,10 @@ template <char kLetter> std::string type_in_schema(const WrittenTensors<kLetter>
   return std::string("Tensor(") + kLetter + "!)[]";
 }
 
+template <char kLetter> std::string type_in_schema(const WrittenTensor<kLetter>&) {
+  return std::string("Tensor(") + kLetter + "!)";
+}
+
 /// "Tensor means3D, Tensor? means2D, ...".
 template <class Arguments> std::string schema_of() {
   std::string text;
@@ -312,6 +336,9 @@ inline void assign(const IValue& from, std::vector<OptionalTensor>& to) {
 }
 template <char kLetter> void assign(const IValue& from, WrittenTensors<kLetter>& to) {
   static_cast<std::vector<Tensor>&>(to) = from.toTensorVector();
+}
+template <char kLetter> void assign(const IValue& from, WrittenTensor<kLetter>& to) {
+  static_cast<Tensor&>(to) = from.toTensor();
 }
 
 /// Takes an op's arguments off the dispatcher's stack.

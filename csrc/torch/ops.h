@@ -50,6 +50,9 @@ Results l1_ssim_vjp(VjpArguments<L1SsimArguments> a);
 Results activate(ActivateArguments a);
 Results activate_vjp(VjpArguments<ActivateArguments> a);
 
+/// Nothing: writes to gradient_sums and views.
+Results observe(ObserveArguments a);
+
 /// Nothing: writes to params, exp_avgs and exp_avg_sqs.
 Results adam(AdamArguments a);
 

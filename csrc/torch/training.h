@@ -6,6 +6,7 @@
 
 #include "core/activations.h"
 #include "core/adam.h"
+#include "core/density.h"
 #include "core/ssim.h"
 #include "torch/arguments.h"
 
@@ -40,6 +41,7 @@ class TrainingKernels {
   virtual void ssim_vjp(const SsimTensors& t) const = 0;
   virtual void activate(const ActivateTensors& t) const = 0;
   virtual void activate_vjp(const ActivateTensors& t) const = 0;
+  virtual void observe(const ObserveArguments& a) const = 0;
   virtual void adam(const AdamArguments& a) const = 0;
 };
 const TrainingKernels& cpu_training_kernels();
@@ -121,6 +123,18 @@ template <typename T> ActivateVjpParams<T> activate_vjp_params(const ActivateTen
   p.dL_dlog_scales = pointer<Vec3<T>>(t.dL_dlog_scales);
   p.dL_dquats = pointer<Vec4<T>>(t.dL_dquats);
   p.dL_dlogit_opacities = pointer<T>(t.dL_dlogit_opacities);
+  return p;
+}
+
+template <typename T> ObserveParams<T> observe_params(const ObserveArguments& a) {
+  ObserveParams<T> p = {};
+  p.n = a.gradient_sums.numel();
+  p.gradients = const_pointer<T>(a.gradients);
+  p.stride = int(a.gradients.size(1));
+  p.first = int(a.first_column);
+  p.radii = const_pointer<int32_t>(a.radii);
+  p.gradient_sums = pointer<T>(a.gradient_sums);
+  p.views = pointer<int32_t>(a.views);
   return p;
 }
 

@@ -67,6 +67,27 @@ void check(ActivateArguments& a) {
   like.check_rows_of(a.logit_opacities, "logit_opacities", {1}, "(N, 1)");
 }
 
+void check(ObserveArguments& a) {
+  const Tensor& sums = a.gradient_sums;
+  check_floating(sums, "gradient_sums");
+  check_shape(sums.dim() == 1 && sums.is_contiguous(), sums, "gradient_sums", "(P,), contiguous");
+  const Like like{sums, "gradient_sums"};
+  const auto check_counts = [&](const Tensor& t, const char* name) {
+    TORCH_CHECK_TYPE(t.scalar_type() == at::kInt, name, " must have dtype int32, got ", t.scalar_type());
+    TORCH_CHECK_VALUE(t.device() == sums.device(), name, " must be on the device of gradient_sums, ", sums.device(),
+                      ", got ", t.device());
+    check_shape(t.sizes() == sums.sizes(), t, name, "(P,) with P = ", sums.numel());
+  };
+  check_counts(a.views, "views");
+  TORCH_CHECK_VALUE(a.views.is_contiguous(), "views must be contiguous, got strides ", a.views.strides());
+  check_counts(a.radii, "radii");
+  a.radii = a.radii.contiguous();
+  const int64_t columns = a.gradients.dim() == 2 && a.gradients.size(1) == 4 ? 4 : 3;
+  like.check_rows_of(a.gradients, "gradients", {columns}, "(P, 3) or (P, 4)");
+  TORCH_CHECK_VALUE(a.first_column >= 0 && a.first_column + 2 <= columns, "first_column must be 0 to ", columns - 2,
+                    ", got ", a.first_column);
+}
+
 void check(AdamArguments& a) {
   const size_t count = a.params.size();
   const auto check_count = [&](size_t members, const char* name) {
