@@ -757,7 +757,7 @@ OPS = {
 }
 OPS_WITH_TESTS_OF_THEIR_OWN = {  # test_losses.py, test_activations.py, test_optim.py, test_densify.py, test_train.py
     *(f"{name}{suffix}" for name in ("ssim_map", "l1_ssim", "activate") for suffix in ("", "_vjp")),
-    *("adam_", "observe_"),
+    *("adam_", "observe_", "picture_gradients"),
 }
 
 

@@ -230,6 +230,44 @@ struct ActivateArguments {
   }
 };
 
+/// Arguments of `picture_gradients`: a scene by the parameters that a training optimises, a plain or a full camera, and
+/// what the picture should be.
+struct PictureArguments : FootprintArguments {
+  Tensor means, log_scales, quats, logit_opacities, shs;
+  int64_t mean_columns = 0;  ///< of the gradient with respect to means2D, 3 or 4; 0: none is wanted
+  Tensor target, dL_dloss;   ///< as of `l1_ssim`; ()
+  double ssim_weight = 0;
+  Tensor bg, viewmatrix, projmatrix, campos;
+  OptionalTensor lens;
+  int64_t image_height = 0, image_width = 0;
+  double tanfovx = 0, tanfovy = 0, scale_modifier = 1;
+  int64_t sh_degree = 0;
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("means", means);
+    visit("log_scales", log_scales);
+    visit("quats", quats);
+    visit("logit_opacities", logit_opacities);
+    visit("shs", shs);
+    visit("mean_columns", mean_columns);
+    visit("target", target);
+    visit("dL_dloss", dL_dloss);
+    visit("ssim_weight", ssim_weight);
+    visit("bg", bg);
+    visit("viewmatrix", viewmatrix);
+    visit("projmatrix", projmatrix);
+    visit("campos", campos);
+    visit("lens", lens);
+    visit("image_height", image_height);
+    visit("image_width", image_width);
+    visit("tanfovx", tanfovx);
+    visit("tanfovy", tanfovy);
+    visit("scale_modifier", scale_modifier);
+    visit("sh_degree", sh_degree);
+    FootprintArguments::each(visit);
+  }
+};
+
 /// Tensors that an op writes to, marked in its schema by a letter that no other argument has.
 template <char kLetter> struct WrittenTensors : std::vector<Tensor> {};
 
