@@ -146,7 +146,7 @@ class Run:
             ended = False
             while progress.share < 1 and not ended:
                 trainer.step()
-                ended = any(self.ranks.exchange(stopped.is_set()))  # on which all ranks have to agree
+                ended = self.ranks.any_of(stopped.is_set())  # on which all ranks have to agree
                 last = progress.share >= 1 or ended
                 first_look = progress.step - progress.stride < FIRST_LOOK <= progress.step
                 if progress.passed(LOOK_PERIOD) or first_look or last:

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .. import distributed
 from ..losses import l1_ssim
+from ..stages import Splats
 from .density import MOMENTS
 from .model import Gaussians
 from .ranks import Ranks, even_counts
@@ -70,7 +70,7 @@ class ShardedTrainer(Trainer):
             group["betas"] = tuple(beta**self.stride for beta in BETAS)
         self.optimizer.param_groups[-1]["head_lr"] *= math.sqrt(self.stride)
 
-    def _loss(self) -> tuple[Tensor, tuple[list[Shown], distributed.Batch]]:
+    def _loss(self) -> tuple[Tensor, tuple[list[Shown], tuple[Splats, ...], tuple[Tensor, ...]]]:
         """This rank's part of the loss, whose sum over the ranks is the loss of the step."""
         options, shown = self.options, self._next()
         gaussians = self.gaussians.activated()
@@ -91,18 +91,20 @@ class ShardedTrainer(Trainer):
             loss = loss + opacity_weight * gaussians.opacities.sum() / batch.count
         if scale_weight:
             loss = loss + scale_weight * gaussians.scales.sum() / (3 * batch.count)
-        return loss, (shown, batch)
+        return loss, (shown, batch.shard, batch.means2d_abs)  # without the views, whose splats the graph alone needs
 
-    def _observe(self, seen: tuple[list[Shown], distributed.Batch]) -> None:
+    def _observe(self, seen: tuple[list[Shown], tuple[Splats, ...], tuple[Tensor, ...]]) -> None:
         """Density control sees the gradients that each picture would have in one process."""
-        shown, batch = seen
-        for camera, (picture, splats) in enumerate(zip(shown, batch.shard)):
+        shown, shard, means2d_abs = seen
+        for camera, (picture, splats) in enumerate(zip(shown, shard)):
             if not self.density.watches(picture.scale) or len(splats.gaussian_ids) == 0:
                 continue
-            gradient = (batch.means2d_abs[camera] if batch.means2d_abs else splats.means2d).grad
+            gradient = (means2d_abs[camera] if means2d_abs else splats.means2d).grad
             # From px to normalized device coordinates, and from the mean over all ranks' pictures to that over one's.
-            unit = gradient.new_tensor([splats.width / 2, splats.height / 2]) * self.stride
-            self.density.observe_rows(splats.gaussian_ids.long(), gradient * unit)
+            # Column by column: a tensor of two numbers from the host would wait for the device.
+            unit = self.stride * splats.width / 2, self.stride * splats.height / 2
+            gradient = torch.stack([gradient[:, k] * unit[k] for k in range(2)], 1)
+            self.density.observe_rows(splats.gaussian_ids.long(), gradient)
 
     def _rebalance(self) -> None:
         """Moves Gaussians, with their moments, to neighbouring ranks if the largest shard is much above the mean."""
