@@ -76,6 +76,7 @@ class ShardedTrainer(Trainer):
         for group in self.optimizer.param_groups:
             group["lr"] *= math.sqrt(self.stride)
             group["betas"] = tuple(beta**self.stride for beta in BETAS)
+        self.optimizer.param_groups[-1]["head_lr"] *= math.sqrt(self.stride)
 
     def _loss(self) -> tuple[Tensor, list[Seen]]:
         """This rank's part of the loss, whose sum over the ranks is the loss of the step; and what `_observe` takes."""
