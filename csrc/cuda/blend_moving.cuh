@@ -272,6 +272,6 @@ using EvenLayout =
 
 /// Grids of fewer tiles are blended by blend_listed.cuh and differentiated in segments (blend_moving_vjp.cuh): there
 /// few tiles have long lists, and the time is that of the longest.
-inline constexpr int64_t kManyTiles = 4096;
+inline constexpr int64_t kLargeImageTiles = 4096;
 
 }  // namespace ar::cuda
