@@ -206,6 +206,20 @@ def _(a):
     return _gradients(a, (a.log_scales, a.quats, a.logit_opacities))
 
 
+@_register("picture_gradients")
+def _(a):
+    gradients = [t.new_empty(t.shape) for t in (a.means, a.log_scales, a.quats, a.logit_opacities, a.shs)]
+    gradients += [a.means.new_empty(len(a.means), a.mean_columns)] if a.mean_columns else []
+    image = a.means.new_empty(3, a.image_height, a.image_width)
+    radii = a.means.new_empty(len(a.means), dtype=torch.int32)
+    return a.means.new_empty(()), image, radii, gradients
+
+
+@_register("observe_")
+def _(a):
+    return None
+
+
 @_register("adam_")
 def _(a):
     return None

@@ -28,6 +28,10 @@ class FusedAdam(torch.optim.Optimizer):
     and the other way round after `step` has been made a tensor. A CUDA graph of a step repeats the `step` and the
     learning rates that it was captured with.
 
+    A group may have two learning rates: with "head" and "head_lr" the first `head` entries along the second dimension
+    of its parameters learn at `head_lr`, and the others at `lr`. So the harmonics of Gaussians (P, K, 3), of which the
+    constant learns faster, are one parameter, that need not be put together for the rasterizer.
+
     Args:
         params: Tensors or groups, as every optimiser of torch takes them: float32 or float64, contiguous, all of one
             dtype and on one device, the CPU or a CUDA device. Tensors may be empty.
@@ -65,15 +69,25 @@ class FusedAdam(torch.optim.Optimizer):
             TypeError: A parameter is neither float32 nor float64, or not of the dtype of the others; a gradient is of
                 another dtype; rows is not a tensor of bool or uint8.
             ValueError: Parameters are not on one device, not contiguous, share memory, or do not have P rows; a
-                gradient is sparse; groups differ in betas or eps; a learning rate is not finite or negative.
+                gradient is sparse; groups differ in betas or eps; a learning rate is not finite or negative; a
+                parameter has fewer than `head` entries along its second dimension, or none.
             RuntimeError: CUDA tensors, and an extension without CUDA.
         """
         loss = None
         if closure is not None:
             with torch.enable_grad():
                 loss = closure()
-        _update(self, rows, betas=_common(self, "betas"))
+        self.update(rows)
         return loss
+
+    @torch.no_grad()
+    def update(self, rows: Tensor | None = None) -> None:
+        """`step` without what torch puts around it, hooks and a range for its profiler, which cost the host as much.
+
+        Raises:
+            TypeError, ValueError, RuntimeError: As `step`.
+        """
+        _update(self, rows, betas=_common(self, "betas"))
 
     def zero_grad(self, set_to_none: bool = True) -> None:
         """Forgets the gradients, or sets them to zero."""
@@ -146,6 +160,17 @@ def _common(optimizer: torch.optim.Optimizer, name: str) -> Any:
     return first
 
 
+def _head_size(parameter: Tensor, head: int) -> int:
+    """How many numbers of a row the first `head` entries along the second dimension are.
+
+    Raises:
+        ValueError: There are not so many.
+    """
+    if parameter.dim() < 2 or not 0 <= head <= parameter.shape[1]:
+        raise ValueError(f"head is {head}, but a parameter has shape {tuple(parameter.shape)}")
+    return head * math.prod(parameter.shape[2:])
+
+
 def _update(
     optimizer: torch.optim.Optimizer, rows: Tensor | None, betas: tuple[float, float], bias_correction: bool = True
 ) -> None:
@@ -155,8 +180,9 @@ def _update(
         raise TypeError(f"rows must be a tensor, got {type(rows).__name__}")
     # Made anew in every step, which takes a few microseconds: density control may replace parameters and state.
     parameters, gradients, means, squares, rates, steps, states = [], [], [], [], [], [], []
+    heads, head_rates = [], []
     for group in optimizer.param_groups:
-        rate = group["lr"]
+        rate, head, head_rate = group["lr"], group.get("head", 0), group.get("head_lr", 0.0)
         for parameter in group["params"]:
             gradient = parameter.grad
             if gradient is None:
@@ -173,11 +199,13 @@ def _update(
             means.append(state["exp_avg"])
             squares.append(state["exp_avg_sq"])
             rates.append(rate)
+            heads.append(_head_size(parameter, head) if head else 0)
+            head_rates.append(head_rate)
             steps.append(int(state["step"]) + 1)  # a tensor in states of torch.optim.Adam
             states.append(state)
     if not parameters:
         return
     check_device(parameters[0].device)
-    _adam(parameters, gradients, means, squares, rates, steps, *betas, eps, rows, bias_correction)
+    _adam(parameters, gradients, means, squares, rates, steps, *betas, eps, rows, bias_correction, heads, head_rates)
     for state, step in zip(states, steps):
         state["step"] = step

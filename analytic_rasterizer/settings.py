@@ -81,7 +81,8 @@ class GaussianRasterizationSettings(_Fields):
     ) -> None:
         """Checks and keeps what is not in the tuple."""
         if footprint is not None:
-            self.footprint = resolve_footprint(str(footprint), **options)
+            settled = isinstance(footprint, Footprint) and not options
+            self.footprint = footprint if settled else resolve_footprint(str(footprint), **options)
         elif options:
             known = ", ".join((*self._fields, "footprint", "effects"))
             raise TypeError(f"settings must be among: {known}; got {', '.join(options)}")

@@ -11,7 +11,7 @@ channels, several cameras at once, splats from elsewhere. All run on the CPU (fl
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -76,6 +76,21 @@ class Splats:
             "footprint": self.footprint,
             "option": self.option,
         }
+
+    def split(self) -> list[Splats]:
+        """Those of every camera by themselves, each as a batch of one camera. Differentiable."""
+        if self.cameras == 1:
+            return [self]
+        sizes = self.row_splits.diff().tolist()
+        rows = {
+            name: getattr(self, name).split(sizes) for name in (*_ROWS, "dets") if name not in ("colors", "row_splits")
+        }
+        rows["colors"] = (
+            self.colors.split(sizes) if len(self.colors) == len(self.means2d) else [self.colors] * len(sizes)
+        )
+        rows["camera_ids"] = [torch.zeros_like(ids) for ids in rows["camera_ids"]]
+        rows["row_splits"] = [torch.tensor([0, size]) for size in sizes]
+        return [replace(self, **dict(zip(rows, of_camera))) for of_camera in zip(*rows.values())]
 
 
 _ROWS = tuple(field.name for field in fields(Splats))[:9]  # in the order in which the op returns them

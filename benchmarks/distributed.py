@@ -1,21 +1,23 @@
-"""What several ranks render and differentiate per second, against one, and what a model expects of more of them.
+"""How many images per second several ranks train with, against one, and what a model expects of more of them.
 
-    python benchmarks/distributed.py SCENE --views VIEWS --ranks 1 2 [--footprint box:samples=4] [--device cuda]
+    python benchmarks/distributed.py SCENE --views VIEWS --ranks 1 2 [--times 8] [--device cuda]
 
-One process per rank is started on this machine, with NCCL and a device each, or with gloo on the CPU. A step on N ranks
-renders N cameras, one per rank, with `analytic_rasterizer.distributed.rasterize` from Gaussians that are spread evenly
-over the ranks, and differentiates sum(image * w) for fixed random w in all of them. All N take turns, round after
-round; the first round warms up, and columns are medians of the slowest rank:
+One process per rank is started on this machine, with NCCL and a device each, or with gloo on the CPU. What is measured
+are training steps as `train` takes them, on pictures of noise and without density control: by `Trainer` on one rank,
+which is the plain path, and by `ShardedTrainer` on more. A step on N ranks shows N pictures, one per rank. All N take
+turns, round after round; the first round warms up, and columns are medians of the slowest rank:
 
 - images/s, and how often as many that is as on the first N of the list;
-- memory: of this rank's Gaussians, and what a step needs beyond them at most, gradients included;
+- state: memory of this rank's Gaussians and their moments; peak: the most that is in use during a step, state included,
+  and what share that is of the first N's;
 - MB sent by a rank to others in a step, forth and back, and what the documentation's formula gives for it;
 - exchange: time of these two exchanges alone, started together, with the step's own sizes, in ms;
 - model: images/s by t(N) = t(1) + sent / bandwidth, the bandwidth being that of the largest N's exchange.
 
 The model is for ranks that have a device each and projections that are spread evenly; it leaves out what waiting for
 the slowest rank and small messages cost. It is printed for 4, 8 and 64 ranks as well. Where processes share the cores
-of one CPU, as with gloo here, its premise does not hold: compare only bytes and exchange then.
+of one CPU, as with gloo here, its premise does not hold: compare only bytes and exchange then. `--times K` makes a
+larger scene of a small one: K Gaussians in the place of each, drawn from it, with its covariance divided by K.
 """
 
 from __future__ import annotations
@@ -32,14 +34,21 @@ import torch.distributed as dist
 from common import add_measuring, parse, print_setup, save_json
 from scene_files import load_scene
 
-from analytic_rasterizer import distributed, io
+from analytic_rasterizer import io
 from analytic_rasterizer.analysis.tables import format_table
-from analytic_rasterizer.analysis.timing import added_memory, fixed_weights
+from analytic_rasterizer.analysis.timing import added_memory
+from analytic_rasterizer.rotations import rotation_matrices
+from analytic_rasterizer.training import TrainingOptions
+from analytic_rasterizer.training.model import Gaussians
+from analytic_rasterizer.training.pictures import Pictures
 from analytic_rasterizer.training.ranks import Ranks, even_counts
+from analytic_rasterizer.training.sharded import ShardedTrainer
+from analytic_rasterizer.training.trainer import Trainer
 
 PREDICTED = (4, 8, 64)
 BYTES_OF_A_SPLAT = 88  # forth and back, docs/distributed.md
-COLUMNS = ("seconds", "exchange", "sent", "own_bytes", "extra_bytes")
+BLACK = (0.0, 0.0, 0.0)
+COLUMNS = ("seconds", "exchange", "sent", "state_bytes", "peak_bytes")
 
 
 def main() -> None:
@@ -52,6 +61,8 @@ def main() -> None:
         torch.multiprocessing.start_processes(work, (folder, args), world, start_method="spawn")
         results = torch.load(f"{folder}/results.pt")
     print_setup(scene, views, args.device)
+    if args.times > 1:
+        print(f"each Gaussian as {args.times}, {args.times * len(scene.means)} in all")
     if args.device == "cpu":
         print(f"the processes share this machine's cores, with {args.threads} threads each")
     expected = model_of(results)
@@ -67,6 +78,8 @@ def parse_arguments() -> argparse.Namespace:
     add("--ranks", type=int, nargs="+", default=[1, 2], metavar="N", help="(default: 1 2)")
     add("--footprint", default="box:samples=4", metavar="NAME[:k=v]")
     add("--scale", type=float, default=1.0, help="resolution, as a factor")
+    add("--times", type=int, default=1, metavar="K", help="replace each Gaussian by K smaller ones (default: 1)")
+    add("--steps", type=int, default=5, metavar="N", help="that are timed together in a round (default: 5)")
     add_measuring(parser)
     return parse(parser)
 
@@ -85,7 +98,7 @@ def work(rank: int, folder: str, args: argparse.Namespace) -> None:
     world = max(args.ranks)
     dist.init_process_group(backend, init_method=f"file://{folder}/rendezvous", rank=rank, world_size=world)
     groups = {count: dist.new_group(list(range(count))) for count in args.ranks}
-    cases = {n: Step(args, Ranks.of_group(group), device) for n, group in groups.items() if rank < n}
+    cases = {n: Case(args, Ranks.of_group(group), device) for n, group in groups.items() if rank < n}
     measured: dict[int, list[dict[str, float]]] = {count: [] for count in args.ranks}
     for _ in range(args.rounds + 1):
         for count, case in cases.items():
@@ -96,71 +109,80 @@ def work(rank: int, folder: str, args: argparse.Namespace) -> None:
         own = {key: statistics.median(of_round[key] for of_round in rounds[1:]) for key in COLUMNS} if rounds else None
         of_ranks = [r for r in Ranks.of_group().exchange(own) if r is not None]
         results[count] = {key: max(r[key] for r in of_ranks) for key in COLUMNS}
-        splats = Ranks.of_group().from_first(cases[count].splats if count in cases else None)
+        of_cases = Ranks.of_group().exchange(cases[count].splats if count in cases else 0.0)
+        splats = max(of_cases)
         results[count] |= {"splats": splats, "images_per_second": count / results[count]["seconds"]}
     if rank == 0:
         torch.save(results, f"{folder}/results.pt")
     dist.destroy_process_group()
 
 
-class Step:
-    """A step on the ranks of a group.
+class Shard(ShardedTrainer):
+    """A `ShardedTrainer` that is given the Gaussians of its rank alone, so that nobody has to hold all of them."""
+
+    def __init__(self, options, start: Gaussians, pictures, background, device, ranks: Ranks):
+        Trainer.__init__(self, options, start, pictures, background, device, ranks)
+
+
+class Case:
+    """A training on the ranks of a group.
 
     Attributes:
-        splats: Mean number of splats of a camera, over all ranks, in the last step.
+        splats: Mean number of splats of a camera, over all ranks, in the last step that was looked at.
     """
 
     def __init__(self, args: argparse.Namespace, ranks: Ranks, device: torch.device):
-        self.ranks, self.device, self.footprint, self.scale = ranks, device, args.footprint, args.scale
+        self.ranks, self.device, self.steps, self.splats = ranks, device, args.steps, 0.0
         scene = load_scene(args.scene)
         rows = ranks.part_of(even_counts(len(scene.means), ranks.world))
         own = io.Scene(*(field[rows] for field in scene[:-1]), scene.sh_degree).to(device)
-        self.leaves = {name: value.clone().requires_grad_() for name, value in own.arguments().items()}
-        self.sh_degree, self.views, self.number, self.splats = scene.sh_degree, io.load_views(args.views), 0, 0.0
-
-    def run(self) -> distributed.Batch:
-        """The next cameras, forward and backward."""
-        world, options = self.ranks.world, {"footprint": self.footprint, "sh_degree": self.sh_degree}
-        views = [self.views[(self.number + k) % len(self.views)] for k in range(world)]
-        self.number += world
-        settings = [view.settings(self.scale, device=self.device, **options) for view in views]
-        batch = distributed.rasterize(settings, **self.leaves, group=self.ranks.group)
-        loss = batch.anchor
-        for view in batch.views:
-            loss = loss + (view.image * fixed_weights(*view.image.shape[1:], self.device)).sum()
-        loss.backward()
-        return batch
+        start = Gaussians.from_scene(densified(own, args.times), scene.sh_degree)
+        # All degrees of the harmonics from the first step on, and no last step.
+        options = {"sh_degree": scene.sh_degree, "sh_every": 1, "iterations": 2**30, "density": "none"}
+        options = TrainingOptions(footprint=args.footprint, **options)
+        pictures = pictures_of_noise(io.load_views(args.views), args.scale, device)
+        if ranks.world == 1:
+            self.trainer = Trainer(options, start, pictures, BLACK, device)
+        else:
+            self.trainer = Shard(options, start, pictures, BLACK, device, ranks)
+        self.trainer.progress.step = scene.sh_degree
 
     def measure(self) -> dict[str, float]:
-        """Seconds of a step, and of its exchanges; bytes sent, of this rank's Gaussians, and needed beyond them."""
+        """Seconds of a step, and of its exchanges; bytes sent, of the state of this rank, and in use at most."""
         self._together()
         start = time.perf_counter()
-        batch = self.run()
+        for _ in range(self.steps):
+            self.trainer.step()
         self._wait()
-        seconds = time.perf_counter() - start
-        in_all = sum(self.ranks.exchange(sum(len(splats.gaussian_ids) for splats in batch.shard)))
-        self.splats = in_all / self.ranks.world
-        del batch
-        self._forget()
-        with mock.patch.object(dist, "all_to_all_single", wraps=dist.all_to_all_single) as calls:
-            _, extra = added_memory(self.run, self.device)
-        self._forget()
-        sizes = [call.args[1:4] for call in calls.call_args_list]  # what is sent, rows received and sent by rank
-        own = sum(leaf.nbytes for leaf in self.leaves.values())
-        return {"seconds": seconds, "own_bytes": own, "extra_bytes": extra} | self._exchange(sizes)
+        seconds = (time.perf_counter() - start) / self.steps
+        calls, send = [], dist.all_to_all_single
 
-    def _exchange(self, calls: list[tuple[torch.Tensor, list[int], list[int]]]) -> dict[str, float]:
-        """The exchanges of a step by themselves."""
-        seconds, sent = 0.0, 0
-        for rows, received, given in calls:
-            sent += (len(rows) - given[self.ranks.rank]) * rows[:1].nbytes
-            out = rows.new_empty(sum(received), rows.shape[1])
+        def noted(out, rows, received, sent, group=None):
+            calls.append((rows.shape[1], received, sent))  # not the rows, whose memory is counted
+            return send(out, rows, received, sent, group=group)
+
+        with mock.patch.object(dist, "all_to_all_single", noted):
+            _, extra = added_memory(self.trainer.step, self.device)
+        self.trainer.losses.clear()
+        if calls:
+            self.splats = sum(self.ranks.exchange(sum(calls[0][2]))) / self.ranks.world
+        gaussians = self.trainer.gaussians
+        moments = (t for field in gaussians for t in self.trainer.optimizer.state[field].values() if torch.is_tensor(t))
+        state = sum(t.nbytes for t in (*gaussians, *moments))
+        return {"seconds": seconds, "state_bytes": state, "peak_bytes": state + extra} | self._exchange(calls)
+
+    def _exchange(self, calls: list[tuple[int, list[int], list[int]]]) -> dict[str, float]:
+        """The exchanges of a step by themselves. Calls: columns, rows received and rows sent by rank."""
+        seconds, bytes_sent = 0.0, 0
+        for columns, received, sent in calls:
+            rows, out = (torch.zeros(sum(counts), columns, device=self.device) for counts in (sent, received))
+            bytes_sent += (len(rows) - sent[self.ranks.rank]) * columns * rows.element_size()
             self._together()
             start = time.perf_counter()
-            dist.all_to_all_single(out, rows.detach().contiguous(), received, given, group=self.ranks.group)
+            dist.all_to_all_single(out, rows, received, sent, group=self.ranks.group)
             self._wait()
             seconds += time.perf_counter() - start
-        return {"exchange": seconds, "sent": sent}
+        return {"exchange": seconds, "sent": bytes_sent}
 
     def _together(self) -> None:
         self._wait()
@@ -170,9 +192,27 @@ class Step:
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
 
-    def _forget(self) -> None:
-        for leaf in self.leaves.values():
-            leaf.grad = None
+
+def densified(scene: io.Scene, times: int) -> io.Scene:
+    """So many Gaussians in the place of each, drawn from it, whose covariances with that of their means make its own.
+
+    Each rank draws anew.
+    """
+    if times == 1:
+        return scene
+    means, scales, rotations, opacities, shs = (field.repeat_interleave(times, 0) for field in scene[:5])
+    generator = torch.Generator(means.device).manual_seed(0)
+    along = (1 - 1 / times) ** 0.5 * scales * torch.randn(means.shape, generator=generator, device=means.device)
+    means = means + (rotation_matrices(rotations) * along[:, None, :]).sum(2)
+    return io.Scene(means, scales / times**0.5, rotations, opacities, shs, scene.sh_degree)
+
+
+def pictures_of_noise(views: list[io.View], scale: float, device: torch.device) -> Pictures:
+    settings = [view.settings(scale, BLACK, device=device) for view in views]
+    generator = torch.Generator().manual_seed(0)
+    sizes = [(3, s.image_height, s.image_width) for s in settings]
+    colors = [torch.randint(256, size, dtype=torch.uint8, generator=generator).to(device) for size in sizes]
+    return Pictures(views, {1: settings}, {1: colors})
 
 
 # --- the model --------------------------------------------------------------------------------------
@@ -198,22 +238,23 @@ def model_of(results: dict[int, dict[str, Any]]) -> dict[int, dict[str, float]]:
 
 
 def format_results(results: dict[int, dict[str, Any]], expected: dict[int, dict[str, float]]) -> str:
-    base, rows = results[min(results)]["images_per_second"], []
+    base, rows = results[min(results)], []
     for ranks, model in expected.items():
         model_rate = f"{model['images_per_second']:.2f}" if "images_per_second" in model else "-"
-        cells = [None] * 6
+        cells = [None] * 7
         if ranks in results:
             r = results[ranks]
-            rate, memory = r["images_per_second"], [f"{r[key] / 2**20:.1f}" for key in ("own_bytes", "extra_bytes")]
             cells = [
-                f"{rate:.2f}",
-                f"{rate / base:.2f}",
-                *memory,
+                f"{r['images_per_second']:.2f}",
+                f"{r['images_per_second'] / base['images_per_second']:.2f}",
+                f"{r['state_bytes'] / 2**20:.1f}",
+                f"{r['peak_bytes'] / 2**20:.1f}",
+                f"{r['peak_bytes'] / base['peak_bytes']:.2f}",
                 f"{r['sent'] / 1e6:.2f}",
                 f"{1e3 * r['exchange']:.2f}",
             ]
         rows.append([ranks, *cells, f"{model['sent'] / 1e6:.2f}", model_rate])
-    header = ["ranks", "images/s", "ratio", "Gaussians MiB", "step MiB", "MB sent", "exchange ms"]
+    header = ["ranks", "images/s", "ratio", "state MiB", "peak MiB", "ratio", "MB sent", "exchange ms"]
     return format_table([*header, "model MB", "model images/s"], rows)
 
 

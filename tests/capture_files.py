@@ -91,7 +91,7 @@ def draw_picture(view, opaque: bool) -> np.ndarray:
     settings = view.settings(1, sh_degree=0, footprint="exact")
     color, _ = truth.render(settings)
     if not opaque:
-        alpha, _ = truth._replace(sh_dc=torch.full((12, 1, 3), 0.5 / g.SH_C0)).render(settings)
+        alpha, _ = truth._replace(shs=torch.full((12, 1, 3), 0.5 / g.SH_C0)).render(settings)
         color = torch.cat([color / alpha[:1].clamp_min(1e-3), alpha[:1]])
     return (255 * color.clamp(0, 1)).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
 

@@ -49,6 +49,11 @@ def scene32(name="some"):
     return scenes.cast(scenes.random_scene(degree=2, **SCENES[name]), torch.float32)
 
 
+def without_means2d(scene):
+    """What `render_stages` takes."""
+    return {name: value for name, value in scene.items() if name != "means2D"}
+
+
 def settings_for(variant, camera=CAMERA, device="cpu"):
     footprint, options = variant
     return camera.settings(torch.float32, device, footprint=footprint, **options)
@@ -228,6 +233,39 @@ def test_long_lists(variant, kind, bg):
     assert_same_without_gradient(scene, settings, color)
 
 
+def splats_smaller_than_a_pixel():
+    """30000 of them, half of them in some 6x6 pixels."""
+    scene = scenes.cast(scenes.random_scene(6, 30000, opacity=(0.02, 0.9), sigma=(0.002, 0.02)), torch.float32)
+    scene["means3D"][::2] *= 0.2
+    return scene
+
+
+@pytest.mark.parametrize("samples", [1, 4, 9, 16])
+def test_moving_samples_with_a_list_for_each_pixel(samples):
+    """A tile's list of thousands, of which a pixel meets few: blended pixel by pixel, differentiated in segments."""
+    scene = splats_smaller_than_a_pixel()
+    settings = settings_for(("moment", {"samples": samples}), Camera(image_height=24, image_width=40))
+    stages = ar.render_stages(scenes.settings_to(settings, "cuda"), **scenes.to(without_means2d(scene), "cuda"))
+    assert stages.tile_offsets.diff().max() > 4 * 1024, "too few segments"
+    color = compare(scene, settings, flips=1e-2, layers=2350)  # as in test_long_lists
+    assert_same_without_gradient(scene, settings, color)
+    first, second = run(scene, settings, "cuda"), run(scene, settings, "cuda")
+    assert torch.equal(first.color, second.color)
+    assert all(torch.equal(grad, second.grads[name]) for name, grad in first.grads.items())
+
+
+def test_a_list_for_each_pixel_changes_no_bit():
+    """With more pairs than room every tile goes through all splats. One sample adds up the same terms in one order."""
+    scene = splats_smaller_than_a_pixel()
+    settings = settings_for(("moment", {"samples": 1}), Camera(image_height=24, image_width=40))
+    color = run_without_gradient(scene, settings, "cuda")
+    _C.force_pair_capacity(64)
+    try:
+        assert torch.equal(run_without_gradient(scene, settings, "cuda"), color)
+    finally:
+        _C.force_pair_capacity(0)
+
+
 @each_path
 @pytest.mark.parametrize("size", [(300, 1), (1, 300), (1, 1), (97, 61), (16, 16), (2048, 2048)], ids=str)
 def test_image_sizes(variant, size):
@@ -286,8 +324,7 @@ def test_many_more_pairs_than_in_the_frame_before(variant):
     scene = scenes.cast(scenes.random_scene(6, 20000, degree=2, sigma=(0.002, 0.02)), torch.float32)
     small = settings_for(variant, replace(camera, scale_modifier=0.5))
     large = settings_for(variant, replace(camera, scale_modifier=40.0))
-    gaussians = {name: value for name, value in scene.items() if name != "means2D"}
-    counts = [len(ar.render_stages(settings, **gaussians).pairs) for settings in (small, large)]
+    counts = [len(ar.render_stages(settings, **without_means2d(scene)).pairs) for settings in (small, large)]
     assert counts[1] > 40 * counts[0]
     assert counts[1] > 4 * (1.25 * counts[0] + 2**16), "the reserve would do"
     compare(scene, small)

@@ -4,12 +4,15 @@ import math
 
 import pytest
 import torch
+from conftest import needs_cuda
 
 from analytic_rasterizer import io
 from analytic_rasterizer.optim import FusedAdam
 from analytic_rasterizer.rotations import rotation_matrices
 from analytic_rasterizer.training import TrainingOptions, density
 from analytic_rasterizer.training import model as g
+
+observe = torch.ops.analytic_rasterizer.observe_.default
 
 EXTENT = 10.0
 SMALL, LARGE, HUGE = 0.05, 0.5, 2.0  # scales that are cloned, split, and pruned once opacities were reset
@@ -25,8 +28,7 @@ def make_gaussians(scales, opacities) -> g.Gaussians:
         torch.tensor(scales).log()[:, None].repeat(1, 3),
         torch.randn(count, 4, generator=generator),
         torch.tensor(opacities).logit()[:, None],
-        torch.randn(count, 1, 3, generator=generator),
-        torch.randn(count, 8, 3, generator=generator),
+        torch.randn(count, 9, 3, generator=generator),
     )
     return g.Gaussians(*(field.requires_grad_() for field in fields))
 
@@ -43,12 +45,11 @@ def make_control(sizes, opacities, white_background=False, device="cpu", **optio
 
 def after_step(control, norms, step=STEP, progress=0.1, radii=None) -> None:
     """As if a step's gradients by the projected means had these norms."""
-    leaf = control.leaf(1)
-    if leaf is not None:
-        leaf.grad = torch.zeros_like(leaf)
-        columns = slice(2, 4) if leaf.shape[1] == 4 else slice(0, 2)
-        leaf.grad[:, columns] = torch.tensor(norms)[:, None] * torch.tensor([0.6, -0.8])
-    control.observe(leaf, torch.ones(len(norms), dtype=torch.int32) if radii is None else radii)
+    if control.watches(1):
+        gradients = torch.zeros(len(norms), control.columns)
+        columns = slice(2, 4) if control.columns == 4 else slice(0, 2)
+        gradients[:, columns] = torch.tensor(norms)[:, None] * torch.tensor([0.6, -0.8])
+        control.observe(gradients, torch.ones(len(norms), dtype=torch.int32) if radii is None else radii)
     control.after_step(step, progress)
 
 
@@ -74,7 +75,7 @@ def test_growth_and_pruning_of_a_few():
     for half in (left, right):
         torch.testing.assert_close(half.log_scales.exp(), parent.log_scales.exp() / 1.6)
         assert 0 < (half.means - parent.means).norm() < 5 * LARGE
-        for name in ("rotations", "logit_opacities", "sh_dc", "sh_rest"):
+        for name in ("rotations", "logit_opacities", "shs"):
             assert torch.equal(getattr(half, name), getattr(parent, name))
     assert not torch.equal(left.means, right.means)
 
@@ -180,8 +181,64 @@ def test_absolute_gradients_are_read_from_their_own_columns():
 def test_gradients_of_coarse_pictures_can_be_left_out():
     control = make_control([SMALL], [0.5], scales=(2, 4), gradient_scales="finest")
     assert control.leaf(4) is None and control.leaf(2).shape == (1, 3)
-    control.observe(None, torch.ones(1, dtype=torch.int32))
-    assert control.views.tolist() == [0]
+    assert control.watches(2) and not control.watches(4)
+
+
+def observed(count=300, columns=4, dtype=torch.float32, device="cpu"):
+    """Arguments of the op: sums and views as they were, gradients and radii of a picture."""
+    generator = torch.Generator().manual_seed(1)
+    sums = torch.rand(count, generator=generator, dtype=torch.float64)
+    gradients = torch.randn(count, columns, generator=generator, dtype=torch.float64)
+    views, radii = (torch.randint(0, 3, (count,), generator=generator, dtype=torch.int32) for _ in range(2))
+    return [sums.to(device, dtype), views.to(device), gradients.to(device, dtype), radii.to(device)]
+
+
+@pytest.mark.parametrize("columns, first", [(3, 0), (4, 0), (4, 2)])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_what_is_observed_of_a_picture(device, dtype, columns, first):
+    sums, views, gradients, radii = observed(5000, columns, dtype, device)  # several work items
+    lengths = gradients[:, first : first + 2].double().norm(dim=1)
+    expected, seen = sums.double() + lengths, views + (radii > 0)
+    observe(sums, views, gradients, radii, first)
+    # Two squares, their sum and its root, 5 roundings at most, and the sum.
+    u = torch.finfo(dtype).eps / 2
+    assert ((sums.double() - expected).abs() <= 1.01 * u * (5 * lengths + expected)).all()
+    assert torch.equal(views, seen) and views.dtype == torch.int32
+
+
+@needs_cuda
+def test_cuda_observes_the_bits_of_the_cpu():
+    on_cpu, on_device = observed(), observed(device="cuda")
+    for arguments in (on_cpu, on_device):
+        observe(*arguments, 2)
+    assert torch.equal(on_device[0].cpu(), on_cpu[0]) and torch.equal(on_device[1].cpu(), on_cpu[1])
+
+
+def test_opcheck_of_observe(device):
+    torch.library.opcheck(observe, (*observed(7, device=device), 2))
+
+
+@pytest.mark.parametrize(
+    "place, wrong, error, message",
+    [
+        (0, torch.zeros(7, 1), ValueError, r"gradient_sums must have shape \(P,\), contiguous, got \(7, 1\)"),
+        (0, torch.zeros(7).half(), TypeError, "gradient_sums must have dtype float32 or float64"),
+        (1, torch.zeros(7), TypeError, "views must have dtype int32, got Float"),
+        (1, torch.zeros(6, dtype=torch.int32), ValueError, r"views must have shape \(P,\) with P = 7, got \(6,\)"),
+        (2, torch.zeros(7, 2), ValueError, r"gradients must have shape \(P, 3\) or \(P, 4\) with P = 7, got \(7, 2\)"),
+        (2, torch.zeros(7, 4).double(), TypeError, "gradients must have the dtype of gradient_sums"),
+        (3, torch.zeros(8, dtype=torch.int32), ValueError, "radii must have shape"),
+        (4, 3, ValueError, "first_column must be 0 to 2, got 3"),
+        (4, -1, ValueError, "first_column must be 0 to 2, got -1"),
+    ],
+)
+def test_errors_of_observe(place, wrong, error, message):
+    arguments = [*observed(7), 2]
+    arguments[place] = wrong
+    before = [arguments[0].clone(), arguments[1].clone()]
+    with pytest.raises(error, match=message):
+        observe(*arguments)
+    assert torch.equal(arguments[0], before[0]) and torch.equal(arguments[1], before[1])
 
 
 def picture_of(gaussians) -> torch.Tensor:
@@ -189,7 +246,7 @@ def picture_of(gaussians) -> torch.Tensor:
     view = io.View("", 48, 48, 60.0, 60.0, torch.eye(4, dtype=torch.float64))
     view.w2c[2, 3] = 3.0
     count = len(gaussians.means)
-    constant = gaussians._replace(sh_dc=torch.ones(count, 1, 3), sh_rest=torch.zeros(count, 0, 3))
+    constant = gaussians._replace(shs=torch.ones(count, 1, 3))
     with torch.no_grad():
         return constant.render(view.settings(sh_degree=0, footprint="point:dilation=0"))[0]
 
@@ -256,10 +313,11 @@ def test_draws_follow_the_weights(device):
 def test_all_kinds_grow_on_the_device(device, kind):
     control = make_control([SMALL, LARGE, SMALL], [0.5, 0.5, 0.001], device=device, density=kind, max_gaussians=5)
     for step in range(590, 601):
-        leaf = control.leaf(1)
-        if leaf is not None:
-            leaf.grad = torch.ones_like(leaf)
-        control.observe(leaf, torch.ones(len(control.gaussians.means), dtype=torch.int32, device=device))
+        if control.watches(1):
+            count = len(control.gaussians.means)
+            control.observe(
+                torch.ones(count, control.columns, device=device), torch.ones(count, dtype=torch.int32, device=device)
+            )
         control.after_step(step, 0.1)
     assert len(control.gaussians.means) == (3 if kind == "mcmc" else 4)  # 5% of three is none
     assert all(field.device.type == device and field.isfinite().all() for field in control.gaussians)
@@ -272,10 +330,9 @@ def test_gradient_that_grows_does_not_depend_on_the_scale(footprint):
     gradients = []
     for scale in (1, 2):
         gaussian = make_gaussians([0.3] * 4, [0.1] * 4)._replace(means=torch.tensor([[0.1, 0.2, 3.0]] * 4))
-        gaussian = gaussian._replace(sh_rest=torch.zeros(4, 0, 3))
         means2D = torch.zeros(4, 3, requires_grad=True)
         settings = view.settings(1 / scale, sh_degree=0, footprint=footprint)
-        picture, _ = gaussian._replace(sh_dc=torch.ones(4, 1, 3)).render(settings, means2D)
+        picture, _ = gaussian._replace(shs=torch.ones(4, 1, 3)).render(settings, means2D)
         (picture * torch.linspace(0, 1, picture.shape[2])).mean().backward()
         gradients.append(means2D.grad[0, 0].item())
     assert gradients[1] == pytest.approx(gradients[0], rel=0.05)

@@ -120,6 +120,71 @@ def test_rows(device, dtype, mask, bias_correction):
     assert_bits(op_step(state, rows=torch.zeros_like(rows), bias_correction=bias_correction), before)
 
 
+HEADS = [1, 0, 6, 1, 2]  # of rows of 3, 1, 15, 1 and 4 numbers
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_heads_of_rows_have_learning_rates_of_their_own(device, dtype, masked):
+    """Each part of a row has the bits of a step with its rate."""
+    count = 7001  # several work items, which end within rows
+    state = make_state([(count, 3), (count,), (count, 5, 3), (count, 1), (count, 4)], dtype, device)
+    rows = torch.arange(count, device=device) % 3 > 0 if masked else None
+    rates, head_rates = ([scale * (i + 1) for i in range(5)] for scale in (1e-2, 0.3))
+
+    def step(rates, *heads):
+        params, grads, means, squares = ([t.clone() for t in tensors] for tensors in state)
+        adam_(params, grads, means, squares, rates, [5] * 5, 0.9, 0.999, 1e-8, rows, True, *heads)
+        return params, means, squares
+
+    both, tails, heads = step(rates, HEADS, head_rates), step(rates), step(head_rates)
+    for result, of_tail, of_head in zip(both, tails, heads):
+        for k, head in enumerate(HEADS):
+            row, tail_row, head_row = (tensors[k].reshape(count, -1) for tensors in (result, of_tail, of_head))
+            assert torch.equal(row[:, :head], head_row[:, :head])
+            assert torch.equal(row[:, head:], tail_row[:, head:])
+    assert not torch.equal(both[0][0], tails[0][0]) and not torch.equal(both[0][0], heads[0][0])
+    assert_bits(step(rates, [0] * 5, [0.0] * 5), tails)
+
+
+@needs_cuda
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_cuda_has_the_bits_of_the_cpu_with_heads(dtype):
+    results = []
+    for device in ("cpu", "cuda"):
+        state = make_state([(7001, 16, 3), (7001, 3)], dtype, device)
+        adam_(*state, [1e-2, 1e-2], [5, 5], 0.9, 0.999, 1e-8, None, True, [3, 0], [0.2, 0.0])
+        results.append([[t.cpu() for t in tensors] for tensors in (state[0], state[2], state[3])])
+    assert_bits(*results)
+
+
+def test_head_of_a_group_is_like_a_parameter_of_its_own(device):
+    """And survives a state_dict."""
+    (value,) = draw([(40, 16, 3)], 0, torch.float32, device)
+    joined = FusedAdam([{"params": [value.clone().requires_grad_()], "lr": 0.01, "head": 1, "head_lr": 0.2}])
+    again = FusedAdam([value.clone().requires_grad_()])
+    again.load_state_dict(joined.state_dict())
+    first, rest = value[:, :1].clone().requires_grad_(), value[:, 1:].clone().requires_grad_()
+    apart = FusedAdam([{"params": [first], "lr": 0.2}, {"params": [rest], "lr": 0.01}])
+    for step in range(3):
+        for optimizer in (joined, again):
+            take_step(optimizer, step)
+        gradient = parameters_of(joined)[0].grad
+        first.grad, rest.grad = gradient[:, :1], gradient[:, 1:]
+        apart.step()
+    for optimizer in (joined, again):
+        assert torch.equal(parameters_of(optimizer)[0], torch.cat([first, rest], dim=1))
+
+
+@pytest.mark.parametrize("head, shape", [(3, (4, 2)), (1, (4,)), (-1, (4, 2))])
+def test_head_that_is_larger_than_a_row(head, shape):
+    value = torch.ones(shape, requires_grad=True)
+    value.grad = torch.ones_like(value)
+    with pytest.raises(ValueError, match=f"head is {head}, but a parameter has shape"):
+        FusedAdam([{"params": [value], "head": head, "head_lr": 0.1}]).step()
+    assert torch.equal(value, torch.ones(shape))
+
+
 def test_no_rows_at_all(device):
     state = make_state([(0, 3), (0,)], device=device)
     op_step(state, rows=torch.zeros(0, dtype=torch.bool, device=device))
@@ -299,6 +364,13 @@ def replaced(name, k, tensor):
         (lambda a: a.update(beta1=1.0), ValueError, r"beta1 must be in \[0, 1\), got 1"),
         (lambda a: a.update(beta2=-0.1), ValueError, r"beta2 must be in \[0, 1\), got -0.1"),
         (lambda a: a.update(eps=float("inf")), ValueError, "eps must be finite and not negative, got inf"),
+        (lambda a: a.update(heads=[1, 1]), ValueError, "head_rates must have as many members as params, 2, got 0"),
+        (
+            lambda a: a.update(heads=[1, 4], head_rates=[0.1, 0.1]),
+            ValueError,
+            r"heads\[1\] must be 0 to the size of a row",
+        ),
+        (lambda a: a.update(heads=[0, 1], head_rates=[0.1, -1.0]), ValueError, r"head_rates\[1\] must be finite"),
         (replaced("params", 0, torch.ones(4, 1).half()), TypeError, "params must have dtype float32 or float64"),
         (
             replaced("params", 1, torch.ones(4, 3).double()),

@@ -1,6 +1,7 @@
 """The public stages make what the rasterizer makes, with gradients, for any number of channels and cameras."""
 
 import dataclasses
+import weakref
 
 import pytest
 import scenes
@@ -302,6 +303,65 @@ def test_backgrounds_and_matrices_that_require_a_gradient_get_one(device):
 
 
 # --- errors ------------------------------------------------------------------------------------------
+
+
+def test_a_batch_is_split_into_its_cameras(device):
+    """The rows of each, as if it had been projected alone, and gradients through them."""
+    settings = [settings_of(torch.float32, device, camera=dataclasses.replace(CAMERA, eye=(x, 0, -4))) for x in (0, 1)]
+    leaves = scenes.leaves(scene_of(torch.float32, device))
+    batch = ar.project(settings, **leaves)
+    for camera, splats in zip(settings, batch.split()):
+        alone = ar.project(camera, **leaves)
+        for name, value in vars(alone).items():
+            assert (
+                torch.equal(getattr(splats, name), value) if torch.is_tensor(value) else getattr(splats, name) == value
+            )
+        got, expected = (
+            torch.autograd.grad(s.means2d.sum(), leaves["means3D"], retain_graph=True) for s in (splats, alone)
+        )
+        assert torch.equal(*got, *expected) and expected[0].abs().max() > 0
+    assert alone.split() == [alone]
+    bare = {name: value for name, value in leaves.items() if name != "shs"}
+    assert [s.colors.shape for s in ar.project(settings, **bare).split()] == [(0, 3)] * 2
+
+
+def test_gradients_of_cameras_are_added_up_in_blocks(device):
+    """More Gaussians than a block has (kGradientBlock): the sum of two cameras' gradients has one rounding."""
+    count = 2**18 + 5
+    generator = torch.Generator().manual_seed(0)
+    scene = {
+        "means3D": torch.rand(count, 3, generator=generator) - 0.5,
+        "scales": 0.01 + 0.01 * torch.rand(count, 3, generator=generator),
+        "rotations": torch.randn(count, 4, generator=generator),
+        "opacities": torch.rand(count, generator=generator),
+        "colors_precomp": torch.rand(count, 3, generator=generator),
+    }
+    leaves = scenes.leaves({name: value.to(device) for name, value in scene.items()})
+    settings = [settings_of(torch.float32, device, camera=dataclasses.replace(CAMERA, eye=(x, 0, -4))) for x in (0, 1)]
+
+    def gradients(cameras):
+        splats = ar.project(cameras, **leaves)
+        rows = [splats.means2d, splats.cov2d, splats.opacities, splats.colors]
+        ids = splats.gaussian_ids.float() / count  # rows of a Gaussian count differently from those of another
+        return torch.autograd.grad(
+            sum((t.flatten(1) if t.dim() > 1 else t[:, None]).sum(1) @ ids for t in rows), list(leaves.values())
+        )
+
+    parts = [gradients([camera]) for camera in settings]
+    for both, first, second in zip(gradients(settings), *parts):
+        assert torch.equal(both, first + second) and first.abs().max() > 0
+
+
+def test_lists_are_freed_as_soon_as_their_gradient_is_made(device):
+    """Also while the loss is kept, as a training does until its optimizer has taken a step."""
+    splats = ar.project(settings_of(torch.float32, device), **scenes.leaves(scene_of(torch.float32, device)))
+    lists = ar.bin(splats)
+    held = weakref.ref(lists.tensors[0])
+    loss = ar.blend(splats, lists)[0].sum()
+    del lists
+    assert held() is not None
+    loss.backward()
+    assert held() is None and loss.grad_fn is not None
 
 
 def test_settings_of_a_batch_must_agree():

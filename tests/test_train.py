@@ -35,6 +35,7 @@ from capture_files import (  # noqa: E402
 )
 
 from analytic_rasterizer import training  # noqa: E402
+from analytic_rasterizer.arguments import camera_arguments  # noqa: E402
 from analytic_rasterizer.losses import l1_ssim, ssim  # noqa: E402
 from analytic_rasterizer.training import TrainingOptions, captures, colmap, files, pictures, schedule  # noqa: E402
 from analytic_rasterizer.training import model as g  # noqa: E402
@@ -487,6 +488,82 @@ def test_resumed_training_gives_the_same_bits(device, synthetic, tmp_path, optio
     assert (tmp_path / "whole" / files.SCENE).read_bytes() == (tmp_path / "part" / files.SCENE).read_bytes()
 
 
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"density": "absgrad", "gradient_scales": "finest"},
+        {"density": "none", "sh_degree": 0},
+        {"background": "random"},
+    ],
+    ids=str,
+)
+def test_one_op_has_the_bits_of_autograd(device, synthetic, tmp_path, options):
+    """Also over a change of density, and where the pictures have alpha."""
+    runs = [make_run(synthetic, tmp_path / name, device, iterations=75, **options) for name in ("op", "autograd")]
+    assert all(run.trainer.in_one_op for run in runs)
+    runs[1].trainer.in_one_op = False
+    for run in runs:
+        run.train()
+    for name, one, other in zip(g.Gaussians._fields, *(run.trainer.gaussians for run in runs)):
+        assert torch.equal(one, other), name
+    assert (tmp_path / "op" / files.SCENE).read_bytes() == (tmp_path / "autograd" / files.SCENE).read_bytes()
+    for one, other in zip(*(run.trainer.last for run in runs)):
+        assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"density": "mcmc"}, {"pictures_per_step": 2}, {"supersampling": 2}, {"filter_3d": True}, {"opacity_weight": 0.1}],
+    ids=str,
+)
+def test_other_losses_go_through_autograd(synthetic, tmp_path, options):
+    assert not make_run(synthetic, tmp_path, **options).trainer.in_one_op
+
+
+def picture_arguments(device, **changed):
+    """Of the op `picture_gradients`."""
+    view = circle(1)[0]
+    gaussians = g.Gaussians(*(field.detach().to(device) for field in truth_gaussians()))
+    camera = camera_arguments(
+        view.settings(sh_degree=0, footprint="box:samples=2", device=device), gaussians.means, None
+    )
+    names = ("means", "log_scales", "quats", "logit_opacities", "shs")
+    target = torch.full((3, view.height, view.width), 100, dtype=torch.uint8, device=device)
+    one = torch.ones((), device=device)
+    others = {
+        "mean_columns": 4,
+        "target": target,
+        "dL_dloss": one,
+        "ssim_weight": 0.2,
+        "bg": torch.zeros(3, device=device),
+    }
+    return dict(zip(names, gaussians)) | others | camera | changed
+
+
+def test_opcheck_of_picture_gradients(device):
+    """Not under tracing on CUDA, where the room for pairs depends on earlier frames."""
+    op = torch.ops.analytic_rasterizer.picture_gradients.default
+    for columns in (0, 3, 4):
+        torch.library.opcheck(op, (), picture_arguments(device, mean_columns=columns))
+
+
+@pytest.mark.parametrize(
+    "changed, error, message",
+    [
+        ({"mean_columns": 2}, ValueError, "mean_columns must be 0, 3 or 4, got 2"),
+        ({"quats": torch.zeros(12, 3)}, ValueError, r"quats must have shape \(N, 4\) with N = 12, got \(12, 3\)"),
+        ({"means": torch.zeros(11, 3)}, ValueError, "opacities must have shape"),
+        ({"target": torch.zeros(3, 5, 5)}, ValueError, "target must have shape"),
+        ({"ssim_weight": 1.5}, ValueError, r"ssim_weight must be in \[0, 1\], got 1.5"),
+        ({"dL_dloss": torch.zeros(2)}, ValueError, "dL_dloss must have shape"),
+    ],
+)
+def test_errors_of_picture_gradients(changed, error, message):
+    with pytest.raises(error, match=message):
+        torch.ops.analytic_rasterizer.picture_gradients(**picture_arguments("cpu", **changed))
+
+
 def test_ctrl_c_saves_and_resumes(synthetic, tmp_path, capsys, monkeypatch):
     """The step that runs is completed; the end is the same as without the interruption."""
     arguments = ["train", str(synthetic), "--device", "cpu", "--iterations", "60", "--random-points", "50"]
@@ -554,7 +631,12 @@ def test_a_loss_that_is_not_finite_ends_with_an_error(synthetic, tmp_path, capsy
     for _ in range(3):
         run.trainer.step()
     run.save()
-    monkeypatch.setattr("analytic_rasterizer.training.trainer.l1_ssim", lambda image, *_: math.nan * image.mean())
+
+    def without_loss(*fields, op=training.trainer._picture_gradients, **others):
+        loss, *results = op(*fields, **others)
+        return math.nan * loss, *results
+
+    monkeypatch.setattr(training.trainer, "_picture_gradients", without_loss)
     with pytest.raises(FloatingPointError, match=r"the loss of step 4 is nan"):
         run.train()
     assert cli.main(["train", str(synthetic), "--out", str(tmp_path), "--device", "cpu", "--resume"]) == 2
@@ -709,7 +791,7 @@ def test_training_starts_from_a_scene(synthetic, trained, tmp_path):
     expected = io.load_scene(trained / files.SCENE)
     torch.testing.assert_close(run.trainer.gaussians.means.detach(), expected.means)
     torch.testing.assert_close(run.trainer.gaussians.to_scene().shs[:, :4], expected.shs)
-    assert run.trainer.gaussians.sh_rest.shape[1] == 8 and (run.trainer.gaussians.sh_rest[:, 3:] == 0).all()
+    assert run.trainer.gaussians.shs.shape[1] == 9 and (run.trainer.gaussians.shs[:, 4:] == 0).all()
 
 
 def test_evaluate_compares_footprints(trained, capsys):

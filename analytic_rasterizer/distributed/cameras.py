@@ -121,7 +121,7 @@ def rasterize(
     def make() -> tuple[tuple, Facts | None]:
         cameras, settled = _checked_cameras(settings, owners, world, shs, colors_precomp)
         gaussians = {"shs": shs, "colors_precomp": colors_precomp, "scales": scales, "rotations": rotations}
-        shard = tuple(project(s, means3D, opacities, cov3D_precomp=cov3D_precomp, **gaussians) for s in cameras)
+        shard = _projected(cameras, means3D, opacities, cov3D_precomp=cov3D_precomp, **gaussians)
         absolute = tuple(torch.zeros_like(s.means2d, requires_grad=True) for s in shard) if means2d_abs else ()
         facts = None
         if world > 1:
@@ -151,6 +151,23 @@ def rasterize(
         image, alpha = blend(own[k], lists, background=bg, means2d_abs=of_means)
         views.append(View(camera, image[0], alpha[0], own[k]))
     return Batch(tuple(views), shard, absolute, first_id, count, anchor)
+
+
+def _projected(
+    cameras: list[GaussianRasterizationSettings], means3D: torch.Tensor, opacities: torch.Tensor, **gaussians: Any
+) -> tuple[Splats, ...]:
+    """The splats of each camera. Cameras that may share a call of `project` do: it adds up their gradients in place."""
+    groups: dict[tuple, list[int]] = {}
+    for camera, s in enumerate(cameras):
+        moves = any(getattr(t, "requires_grad", False) for t in (s.viewmatrix, s.projmatrix, s.campos))
+        size = s.image_height, s.image_width
+        key = (*size, s.scale_modifier, s.sh_degree, str(s.footprint), id(s.effects), moves)
+        groups.setdefault(key, []).append(camera)
+    shard: dict[int, Splats] = {}
+    for group in groups.values():
+        splats = project([cameras[camera] for camera in group], means3D, opacities, **gaussians)
+        shard |= zip(group, splats.split())
+    return tuple(shard[camera] for camera in range(len(cameras)))
 
 
 def summary_of(facts: list[Facts], rank: int) -> tuple[int, int, bool]:

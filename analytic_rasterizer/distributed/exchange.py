@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,7 @@ from ..stages import Splats
 
 DIFFERENTIABLE = ("means2d", "cov2d", "opacities", "depths", "colors")  # what a row that is sent holds
 _FIXED = ("dets", "gaussian_ids")  # and what follows it
+_PARTS = len(DIFFERENTIABLE) + len(_FIXED)
 _ID_OF = {torch.float32: torch.int32, torch.float64: torch.int64}  # integers as wide as the numbers they travel among
 
 
@@ -44,6 +46,11 @@ class Route:
         """Rows from each rank."""
         return [sum(of_rank[c] for c in self.cameras[self.rank]) for of_rank in self.counts]
 
+    @property
+    def sizes(self) -> list[int]:
+        """Rows of each camera of this rank, from all ranks."""
+        return [sum(of_rank[c] for of_rank in self.counts) for c in self.cameras[self.rank]]
+
     def forth(self, rows: torch.Tensor) -> torch.Tensor:
         """From the Gaussians to the cameras."""
         own = self.cameras[self.rank]
@@ -74,32 +81,47 @@ def _transposed(rows: torch.Tensor, sizes: list[list[int]]) -> torch.Tensor:
 class _Exchange(torch.autograd.Function):
     """Sends rows to the owners of the cameras, and their gradients back.
 
-    `absolute`, (n, 2) or None, is not sent: zeros stand for it at the owners, and their gradient comes back. `join` is
-    a tensor that requires a gradient where any rank needs one, so that all take part in the way back.
+    Args:
+        route: Whose cameras come in the order in which their rows are sent.
+        absolute: Whether there are tensors for absolute gradients.
+        join: A tensor that requires a gradient where any rank needs one, so that all take part in the way back.
+        tensors: For each camera of the step those that DIFFERENTIABLE and _FIXED name; then of each camera one (n, 2)
+            that takes absolute gradients. The latter are not sent: zeros stand for them at the owners, and their
+            gradient comes back.
+
+    Returns:
+        The anchor, and the same tensors for each camera of this rank.
     """
 
     @staticmethod
     def forward(
-        ctx: Any,
-        route: Route,
-        rows: torch.Tensor,
-        fixed: torch.Tensor,
-        absolute: torch.Tensor | None,
-        join: torch.Tensor | None,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
-        ctx.route, ctx.absolute, ctx.columns = route, absolute is not None, rows.shape[1]
-        received = route.forth(torch.cat([rows, fixed], 1))
-        own, own_fixed = (t.contiguous() for t in received.split([rows.shape[1], fixed.shape[1]], 1))
-        ctx.mark_non_differentiable(own_fixed)
-        return own, own_fixed, rows.new_zeros(len(own), 2) if ctx.absolute else None
+        ctx: Any, route: Route, absolute: bool, join: torch.Tensor | None, *tensors: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        ctx.set_materialize_grads(False)
+        cameras = sum(map(len, route.cameras))
+        blocks = [tensors[k * _PARTS : (k + 1) * _PARTS] for k in range(cameras)]
+        shapes = [t.shape[1:] for t in blocks[0]]
+        rows = route.forth(_packed(blocks, [len(block[0]) for block in blocks], shapes, tensors[0]))
+        sizes = route.sizes
+        own = [t.contiguous() for block in _unpacked(rows, sizes, shapes) for t in block]
+        ctx.mark_non_differentiable(*(own[k] for k in range(len(own)) if k % _PARTS >= len(DIFFERENTIABLE)))
+        ctx.route, ctx.like = route, rows.new_empty(0)
+        ctx.shapes = [*shapes[: len(DIFFERENTIABLE)], *([torch.Size([2])] if absolute else [])]
+        ctx.sent = [len(block[0]) for block in blocks]
+        return rows.new_zeros(()), *own, *(rows.new_zeros(size, 2) for size in sizes if absolute)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, dL_drows: torch.Tensor, _: torch.Tensor, dL_dabsolute: torch.Tensor | None):
-        gradients = torch.cat([dL_drows, dL_dabsolute], 1) if ctx.absolute else dL_drows
-        returned = ctx.route.back(gradients)
-        dL_drows, dL_dabsolute = returned[:, : ctx.columns], returned[:, ctx.columns :] if ctx.absolute else None
-        return None, dL_drows, None, dL_dabsolute, None
+    def backward(ctx: Any, _: torch.Tensor | None, *gradients: torch.Tensor | None):
+        own, count = len(ctx.route.sizes), len(DIFFERENTIABLE)
+        blocks = [
+            [*gradients[k * _PARTS : k * _PARTS + count], *gradients[own * _PARTS :][k : k + 1]] for k in range(own)
+        ]
+        rows = ctx.route.back(_packed(blocks, ctx.route.sizes, ctx.shapes, ctx.like))
+        returned = _unpacked(rows, ctx.sent, ctx.shapes)
+        given = [grad for block in returned for grad in (*block[:count], *[None] * len(_FIXED))]
+        absolute = [grad for block in returned for grad in block[count:]]
+        return None, None, None, *given, *absolute
 
 
 def exchange(
@@ -115,47 +137,45 @@ def exchange(
         join: Whether any rank needs a gradient.
     """
     order = [c for cameras in route.cameras for c in cameras]
-    dtype = shard[0].means2d.dtype
-    differentiable = _widths(shard[0], DIFFERENTIABLE)
-    rows = torch.cat([_columns(*(getattr(shard[c], name) for name in DIFFERENTIABLE)) for c in order])
-    ids = [(shard[c].gaussian_ids.to(_ID_OF[dtype]) + first_id).view(dtype) for c in order]  # bits, never numbers
-    fixed = torch.cat([_columns(shard[c].dets.detach(), i) for c, i in zip(order, ids)])
-    own, own_fixed, own_absolute = _Exchange.apply(
-        route,
-        rows,
-        fixed,
-        torch.cat([absolute[c] for c in order]) if absolute else None,
-        rows.new_zeros((), requires_grad=True) if join else None,
-    )
-    cameras = route.cameras[route.rank]
-    sizes = [sum(of_rank[c] for of_rank in route.counts) for c in cameras]
-    splats = []
-    for camera, of_rows, of_fixed in zip(cameras, own.split(sizes), own_fixed.split(sizes)):
-        columns = _named(of_rows, differentiable) | _named(of_fixed, _widths(shard[0], _FIXED))
-        ids = columns["gaussian_ids"].view(_ID_OF[dtype]).int()
-        of_camera = shard[camera]
+    like = shard[0].means2d
+    tensors = []
+    for of_camera in (shard[c] for c in order):
+        ids = of_camera.gaussian_ids.to(_ID_OF[like.dtype]) + first_id
+        tensors += [getattr(of_camera, name) for name in DIFFERENTIABLE]
+        tensors += [of_camera.dets.detach(), ids.view(like.dtype)]  # the bits of ids, never numbers
+    joined = like.new_zeros((), requires_grad=True) if join else None
+    anchor, *made = _Exchange.apply(route, bool(absolute), joined, *tensors, *(absolute[c] for c in order if absolute))
+    splats, cameras = [], route.cameras[route.rank]
+    for k, camera in enumerate(cameras):
+        columns = dict(zip((*DIFFERENTIABLE, *_FIXED), made[k * _PARTS : (k + 1) * _PARTS]))
+        ids = columns["gaussian_ids"].view(_ID_OF[like.dtype]).int()
         given = columns | {
             "gaussian_ids": ids,
             "camera_ids": torch.zeros_like(ids),
             "radii": ids.new_empty(0),
             "row_splits": torch.tensor([0, len(ids)]),
-            **{name: getattr(of_camera, name) for name in ("width", "height", "footprint", "option")},
+            **{name: getattr(shard[camera], name) for name in ("width", "height", "footprint", "option")},
         }
         splats.append(Splats(**given))
-    return splats, None if own_absolute is None else own_absolute.split(sizes), own[:0].sum()
+    return splats, made[len(cameras) * _PARTS :] if absolute else None, anchor
 
 
-def _widths(splats: Splats, names: tuple[str, ...]) -> dict[str, int | None]:
-    """Columns of each; None: a vector."""
-    return {name: (t.shape[1] if t.dim() == 2 else None) for name in names for t in [getattr(splats, name)]}
+def _packed(
+    blocks: list[Sequence[torch.Tensor | None]], sizes: list[int], shapes: list[torch.Size], like: torch.Tensor
+) -> torch.Tensor:
+    """Blocks of `sizes` rows one after the other, in each its tensors side by side; None: zeros."""
+    widths = [shape.numel() for shape in shapes]
+    rows = like.new_empty(sum(sizes), sum(widths))
+    for block, of_block in zip(blocks, rows.split(sizes)):
+        for tensor, column in zip(block, of_block.split(widths, 1)):
+            column.zero_() if tensor is None else column.copy_(tensor.reshape(column.shape))
+    return rows
 
 
-def _columns(*tensors: torch.Tensor) -> torch.Tensor:
-    """(n, K) from columns (n,) and (n, k)."""
-    return torch.cat([t[:, None] if t.dim() == 1 else t for t in tensors], 1)
-
-
-def _named(rows: torch.Tensor, widths: dict[str, int | None]) -> dict[str, torch.Tensor]:
-    """The opposite, by name."""
-    columns = rows.split([1 if width is None else width for width in widths.values()], 1)
-    return {name: (t[:, 0] if width is None else t).contiguous() for (name, width), t in zip(widths.items(), columns)}
+def _unpacked(rows: torch.Tensor, sizes: list[int], shapes: list[torch.Size]) -> list[list[torch.Tensor]]:
+    """The opposite: views of the rows."""
+    widths = [shape.numel() for shape in shapes]
+    return [
+        [column if shape else column[:, 0] for column, shape in zip(of_block.split(widths, 1), shapes)]
+        for of_block in rows.split(sizes)
+    ]

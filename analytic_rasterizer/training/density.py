@@ -32,12 +32,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .. import ops  # noqa: F401  (registers the fake kernels)
 from ..relocation import compute_relocation
 from ..rotations import rotation_matrices
 from .model import Gaussians
 from .options import TrainingOptions
 from .ranks import ALONE, Ranks
 from .schedule import passes
+
+_observe = torch.ops.analytic_rasterizer.observe_.default
 
 SHRINKAGE = 1.6  # of the two halves of a Gaussian
 RESET_OPACITY = 0.01
@@ -79,9 +82,20 @@ class FixedDensity:
         """Whether gradients of pictures of this scale are looked at."""
         return False
 
+    @property
+    def columns(self) -> int:
+        """Of the gradients with respect to means2D that are looked at, 3 or 4."""
+        return 3
+
     def leaf(self, scale: int) -> Tensor | None:
-        """What to render a picture of this scale with as means2D, so that `observe` can read its gradient."""
-        return None
+        """What to render a picture of this scale with as means2D, so that it gets the gradients that `observe` takes.
+
+        None where nobody looks at them."""
+        if not self.watches(scale):
+            return None
+        means = self.gaussians.means
+        # The values are not read, and need not be written.
+        return means.new_empty(len(means), self.columns, requires_grad=True)
 
     def observe_rows(self, rows: Tensor, gradients: Tensor) -> None:
         """As `observe`, for a picture whose gradients are known by row.
@@ -95,8 +109,8 @@ class FixedDensity:
     def forget(self) -> None:
         """Begins new averages, of as many Gaussians as there are now."""
 
-    def observe(self, leaf: Tensor | None, radii: Tensor) -> None:
-        """Looks at the gradient of the leaf, and at the radii of its picture. Nothing here waits for the device."""
+    def observe(self, gradients: Tensor, radii: Tensor) -> None:
+        """Looks at the gradients of a picture, (P, columns), and at its radii. Nothing here waits for the device."""
 
     def after_step(self, step: int, share: float, stride: int = 1) -> bool:
         """Acts where it is time; to be called after every step of the optimizer.
@@ -127,26 +141,20 @@ class GradientDensity(FixedDensity):
 
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
+        self.absolute = self.options.density == "absgrad"
         self.growing = self.options.densify_until > 0
         self.forget()
 
     def watches(self, scale: int) -> bool:
         return self.growing and (self.options.gradient_scales != "finest" or scale == min(self.options.scales))
 
-    def leaf(self, scale: int) -> Tensor | None:
-        if not self.watches(scale):
-            return None
-        # Columns 2 and 3 of four receive the absolute values. The values are not read, and need not be written.
-        columns = 4 if self.options.density == "absgrad" else 3
-        return self.gradient_sums.new_empty(len(self.gradient_sums), columns).requires_grad_()
+    @property
+    def columns(self) -> int:
+        return 4 if self.absolute else 3
 
-    @torch.no_grad()
-    def observe(self, leaf: Tensor | None, radii: Tensor) -> None:
-        if leaf is None:
-            return
-        columns = leaf.grad[:, 2:4] if self.options.density == "absgrad" else leaf.grad[:, :2]
-        self.gradient_sums += torch.linalg.vector_norm(columns, dim=1)  # zero for what is not seen
-        self.views += radii > 0
+    def observe(self, gradients: Tensor, radii: Tensor) -> None:
+        # Columns 2 and 3 of four are the sums of absolute values.
+        _observe(self.gradient_sums, self.views, gradients, radii, 2 if self.absolute else 0)
 
     @torch.no_grad()
     def observe_rows(self, rows: Tensor, gradients: Tensor) -> None:

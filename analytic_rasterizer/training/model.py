@@ -11,7 +11,7 @@ from torch.nn.functional import avg_pool2d
 
 from .. import distributed, io
 from ..activations import activate
-from ..rasterizer import GaussianRasterizer
+from ..rasterizer import rasterize_gaussians
 from ..settings import GaussianRasterizationSettings
 
 if TYPE_CHECKING:
@@ -29,8 +29,7 @@ class Gaussians(NamedTuple):
     log_scales: Tensor  # (P, 3) logarithms of standard deviations in world units
     rotations: Tensor  # (P, 4) quaternions (w, x, y, z) of any length
     logit_opacities: Tensor  # (P, 1)
-    sh_dc: Tensor  # (P, 1, 3) spherical harmonics, the constant
-    sh_rest: Tensor  # (P, K - 1, 3) and the others
+    shs: Tensor  # (P, K, 3) spherical harmonics
 
     def render(
         self, settings: GaussianRasterizationSettings, means2D: Tensor | None = None, supersampling: int = 1
@@ -41,10 +40,7 @@ class Gaussians(NamedTuple):
     def activated(self) -> Activated:
         """What the rasterizer takes. Differentiable."""
         scales, rotations, opacities = activate(self.log_scales, self.rotations, self.logit_opacities)
-        # At degree 0 as well, where sh_rest is empty: every parameter needs a gradient, so that the optimizer has a
-        # state for it that density control can change.
-        shs = torch.cat([self.sh_dc, self.sh_rest], dim=1)
-        return Activated(self.means, scales, rotations, opacities, shs)
+        return Activated(self.means, scales, rotations, opacities, self.shs)
 
     @torch.no_grad()
     def to_scene(self) -> io.Scene:
@@ -58,15 +54,13 @@ class Gaussians(NamedTuple):
         """Parameters that give this scene; harmonics are cut or filled with zeros to the degree."""
         shs = scene.shs[:, : (sh_degree + 1) ** 2]
         missing = (sh_degree + 1) ** 2 - shs.shape[1]
-        rest = torch.cat([shs[:, 1:], shs.new_zeros(len(shs), missing, 3)], dim=1)
         # Scales of 0 and opacities of 0 or 1 have no finite parameter.
         return Gaussians(
             scene.means,
             scene.scales.clamp_min(1e-12).log(),
             scene.rotations,
             scene.opacities.logit(eps=1e-6),
-            shs[:, :1].contiguous(),
-            rest,
+            torch.cat([shs, shs.new_zeros(len(shs), missing, 3)], dim=1),
         )
 
 
@@ -89,13 +83,16 @@ class Activated(NamedTuple):
             supersampling: Render so many times larger, and average over squares of pixels. Radii, and the pixels of
                 the footprint, are those of the larger picture.
         """
-        picture, radii = GaussianRasterizer(enlarged(settings, supersampling))(
-            means3D=self.means,
-            means2D=means2D,
-            opacities=self.opacities,
-            shs=self.shs,
-            scales=self.scales,
-            rotations=self.rotations,
+        picture, radii = rasterize_gaussians(
+            self.means,
+            means2D,
+            self.shs,
+            None,
+            self.opacities,
+            self.scales,
+            self.rotations,
+            None,
+            enlarged(settings, supersampling),
         )
         return averaged(picture, supersampling), radii
 
@@ -127,6 +124,8 @@ class Activated(NamedTuple):
 
 def enlarged(settings: GaussianRasterizationSettings, times: int) -> GaussianRasterizationSettings:
     """Those of a picture so many times as large."""
+    if times == 1:
+        return settings  # as they are: making others takes longer than all checks of a step
     return settings._replace(image_height=times * settings.image_height, image_width=times * settings.image_width)
 
 
@@ -155,8 +154,7 @@ def gaussians_at(points: Tensor, colors: Tensor, sh_degree: int, opacity: float 
         (scale * neighbour_distance(points)).log()[:, None].repeat(1, 3),
         torch.tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
         torch.full((count, 1), opacity).logit(),
-        (colors[:, None] - 0.5) / SH_C0,
-        torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3),
+        torch.cat([(colors[:, None] - 0.5) / SH_C0, torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3)], dim=1),
     )
 
 

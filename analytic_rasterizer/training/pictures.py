@@ -1,4 +1,4 @@
-"""The pictures of a capture at several scales, on the device."""
+"""The pictures of a capture at several scales, on the device or waiting for it."""
 
 from __future__ import annotations
 
@@ -19,20 +19,23 @@ from .captures import Photograph
 
 
 class Pictures(NamedTuple):
-    """Views and their pictures, all of them on the device. By scale: 2 is half the size."""
+    """Views and their pictures. By scale: 2 is half the size. Settings are on the device, colours there or on the host."""
 
     views: list[io.View]  # at scale 1
     settings: dict[int, list[GaussianRasterizationSettings]]  # made once: they hold tensors
     colors: dict[int, list[Tensor]]  # (3, H, W) uint8, on the background; or (4, H, W) premultiplied, with alpha
 
     def truth(self, scale: int, view: int, background: Tensor | None = None) -> Tensor:
-        """(3, H, W) float32 in [0, 1]; `background` (3,) is for pictures with alpha."""
-        color = self.colors[scale][view] / 255
+        """(3, H, W) float32 in [0, 1] on the device; `background` (3,) is for pictures with alpha."""
+        color = self._color(scale, view) / 255
         return color if background is None else color[:3] + (1 - color[3:]) * background[:, None, None]
 
     def target(self, scale: int, view: int, background: Tensor | None = None) -> Tensor:
         """`truth` as `l1_ssim` takes it: where there is no `background`, (3, H, W) uint8 as stored."""
-        return self.colors[scale][view] if background is None else self.truth(scale, view, background)
+        return self._color(scale, view) if background is None else self.truth(scale, view, background)
+
+    def _color(self, scale: int, view: int) -> Tensor:
+        return self.colors[scale][view].to(self.settings[scale][view].viewmatrix.device, non_blocking=True)
 
     def resolve(self, **options) -> dict[int, list[GaussianRasterizationSettings]]:
         """The settings with other options, such as `footprint` and `sh_degree`."""
@@ -45,6 +48,7 @@ def load_pictures(
     background: tuple[float, float, float] | None,
     device: str | torch.device,
     downsampling: str = "box",
+    on_host: bool = False,
 ) -> Pictures:
     """Reads photographs and reduces them.
 
@@ -54,6 +58,7 @@ def load_pictures(
     Args:
         background: Behind pictures with alpha, 0 to 1; None: keep alpha.
         downsampling: As in `TrainingOptions`.
+        on_host: Keep colours in pinned memory of the host, from where each comes when it is asked for.
 
     Raises:
         io.SceneError: A picture that cannot be read, holds numbers that are not finite, or is too small for the scales.
@@ -65,7 +70,7 @@ def load_pictures(
             for scale in scales:
                 stored = scale if scale in item.files else 1
                 color = reduce(files[stored].to(device), scale // stored, background, downsampling)
-                pictures.colors[scale].append(color)
+                pictures.colors[scale].append(color.cpu().pin_memory() if on_host and color.is_cuda else color)
                 # In fractions: the cut makes both sizes multiples of the scale.
                 behind = (0.0, 0.0, 0.0) if background is None else background
                 pictures.settings[scale].append(view.settings(1 / scale, behind, device=device))

@@ -14,7 +14,7 @@ from typing import Any
 import torch.distributed as dist
 from torch import Tensor
 
-from ..distributed.agreement import place_in
+from ..distributed.agreement import gather, place_in
 
 
 @dataclass(frozen=True)
@@ -50,6 +50,10 @@ class Ranks:
         values: list[Any] = [None] * self.world
         dist.all_gather_object(values, value, group=self.group)
         return values
+
+    def any_of(self, flag: bool) -> bool:
+        """Whether the flag is set on any rank. Quicker than `exchange`."""
+        return flag if self.world == 1 else any(row[0] for row in gather([int(flag)], self.world, self.group))
 
     def from_first(self, value: Any) -> Any:
         """The value of rank 0, on all ranks."""

@@ -93,7 +93,12 @@ class Run:
         self.capture = load_capture(scene, images, test_every)
         background = background_of(self.options, self.capture.background)
         pictures = load_pictures(
-            self.capture.train, self.options.scales, background, self.device, self.options.downsampling
+            self.capture.train,
+            self.options.scales,
+            background,
+            self.device,
+            self.options.downsampling,
+            on_host=ranks.world > 1,  # a rank shows one in N of them: memory of the device is for Gaussians
         )
         if state is None:
             start = first_gaussians(self.options, self.capture, points)
@@ -146,7 +151,7 @@ class Run:
             ended = False
             while progress.share < 1 and not ended:
                 trainer.step()
-                ended = any(self.ranks.exchange(stopped.is_set()))  # on which all ranks have to agree
+                ended = self.ranks.any_of(stopped.is_set())  # on which all ranks have to agree
                 last = progress.share >= 1 or ended
                 first_look = progress.step - progress.stride < FIRST_LOOK <= progress.step
                 if progress.passed(LOOK_PERIOD) or first_look or last:

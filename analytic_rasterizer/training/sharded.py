@@ -11,13 +11,12 @@ Training", 2024: learning rates times sqrt(N), and decay rates to the power of N
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from .. import distributed
 from ..losses import l1_ssim
 from .density import MOMENTS
 from .model import Gaussians
@@ -26,6 +25,15 @@ from .trainer import Shown, Trainer
 
 BETAS = (0.9, 0.999)  # of one process, the defaults of FusedAdam
 UNEVEN = 1.1  # the largest shard, in means of all, above which Gaussians move to other ranks
+
+
+class Seen(NamedTuple):
+    """A picture of a step, and where the gradients are that density control looks at."""
+
+    picture: Shown
+    ids: Tensor  # (n,) int32, the Gaussians of this rank that it shows
+    means2d: Tensor  # (n, 2) whose grad is with respect to their projected means, px, or sums of absolute values
+    size: tuple[int, int]  # width and height of the rendering, px
 
 
 class ShardedTrainer(Trainer):
@@ -68,9 +76,10 @@ class ShardedTrainer(Trainer):
         for group in self.optimizer.param_groups:
             group["lr"] *= math.sqrt(self.stride)
             group["betas"] = tuple(beta**self.stride for beta in BETAS)
+        self.optimizer.param_groups[-1]["head_lr"] *= math.sqrt(self.stride)
 
-    def _loss(self) -> tuple[Tensor, tuple[list[Shown], distributed.Batch]]:
-        """This rank's part of the loss, whose sum over the ranks is the loss of the step."""
+    def _loss(self) -> tuple[Tensor, list[Seen]]:
+        """This rank's part of the loss, whose sum over the ranks is the loss of the step; and what `_observe` takes."""
         options, shown = self.options, self._next()
         gaussians = self.gaussians.activated()
         batch = gaussians.render_together(
@@ -90,18 +99,21 @@ class ShardedTrainer(Trainer):
             loss = loss + opacity_weight * gaussians.opacities.sum() / batch.count
         if scale_weight:
             loss = loss + scale_weight * gaussians.scales.sum() / (3 * batch.count)
-        return loss, (shown, batch)
+        # What else there is of the batch is let go of: the graph frees it on the way back.
+        leaves = batch.means2d_abs or [splats.means2d for splats in batch.shard]
+        sizes = [(splats.width, splats.height) for splats in batch.shard]
+        ids = [splats.gaussian_ids for splats in batch.shard]
+        return loss, [Seen(*of_picture) for of_picture in zip(shown, ids, leaves, sizes)]
 
-    def _observe(self, seen: tuple[list[Shown], distributed.Batch]) -> None:
+    def _observe(self, seen: list[Seen]) -> None:
         """Density control sees the gradients that each picture would have in one process."""
-        shown, batch = seen
-        for camera, (picture, splats) in enumerate(zip(shown, batch.shard)):
-            if not self.density.watches(picture.scale) or len(splats.gaussian_ids) == 0:
+        for picture, ids, leaf, size in seen:
+            if not self.density.watches(picture.scale) or len(ids) == 0:
                 continue
-            gradient = (batch.means2d_abs[camera] if batch.means2d_abs else splats.means2d).grad
             # From px to normalized device coordinates, and from the mean over all ranks' pictures to that over one's.
-            unit = gradient.new_tensor([splats.width / 2, splats.height / 2]) * self.stride
-            self.density.observe_rows(splats.gaussian_ids.long(), gradient * unit)
+            # Column by column: a tensor of two numbers from the host would wait for the device.
+            columns = [leaf.grad[:, k] * (size[k] / 2 * self.stride) for k in range(2)]
+            self.density.observe_rows(ids.long(), torch.stack(columns, 1))
 
     def _rebalance(self) -> None:
         """Moves Gaussians, with their moments, to neighbouring ranks if the largest shard is much above the mean."""

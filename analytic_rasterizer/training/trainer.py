@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .. import io
+from .. import io, ops  # noqa: F401  (registers the fake kernels)
+from ..arguments import camera_arguments
 from ..effects import Effects
 from ..filters import apply_3d_filter, compute_3d_filter
 from ..losses import l1_ssim
@@ -21,6 +22,8 @@ from .options import BACKGROUNDS, RANDOM_BACKGROUND, TrainingOptions
 from .pictures import Pictures
 from .ranks import ALONE, Ranks
 from .schedule import PictureOrder, Progress, means_rate_at, sh_degree_at
+
+_picture_gradients = torch.ops.analytic_rasterizer.picture_gradients.default
 
 SH_REST_SHARE = 1 / 20  # of the learning rate of the constant
 FILTER_PERIOD = 100  # steps between two 3D filters, while Gaussians move
@@ -75,19 +78,22 @@ class Trainer:
             "log_scales": options.scale_rate,
             "rotations": options.rotation_rate,
             "logit_opacities": options.opacity_rate,
-            "sh_dc": options.color_rate,
-            "sh_rest": options.color_rate * SH_REST_SHARE,
+            "shs": options.color_rate * SH_REST_SHARE,
         }
         groups = [{"params": [getattr(gaussians, name)], "lr": self.rates[name]} for name in Gaussians._fields]
+        groups[-1] |= {"head": 1, "head_lr": options.color_rate}  # the constant
         self.optimizer = FusedAdam(groups, eps=ADAM_EPS)
         self.density = make_density(options, gaussians, self.optimizer, self.extent, background == WHITE, ranks=ranks)
         self.generator = torch.Generator(self.device).manual_seed(options.seed + 1)
         self.progress = Progress(options.iterations if options.seconds == 0 else None, options.seconds)
         self.order = PictureOrder(len(pictures.views), options)
         self.filter_3d: Tensor | None = None
+        self.one = torch.ones((), device=self.device)  # the gradient of the loss with respect to itself
         self.losses: list[Tensor] = []
         self.last: tuple[Tensor, Tensor] | None = None
         self._resolved: tuple[int, dict] | None = None  # degree of the harmonics, and the settings of it
+        self._cameras: dict[tuple[int, int], dict[str, Any]] = {}  # by scale and view, of the same degree
+        self.in_one_op = self._fits_one_op()
         if options.filter_3d:
             self._compute_filter()
 
@@ -100,12 +106,9 @@ class Trainer:
         progress, optimizer = self.progress, self.optimizer
         stride = self.stride
         self._set_rates()
-        loss, seen = self._loss()
-        loss.backward()
-        self._observe(seen)
-        optimizer.step()
+        self.losses.append(self._differentiate_in_one_op() if self.in_one_op else self._differentiate())
+        optimizer.update()
         optimizer.zero_grad(set_to_none=True)
-        self.losses.append(loss.detach())
         progress.advance(stride)
         changed = self.density.after_step(progress.step, progress.share, stride)
         if changed:
@@ -118,17 +121,26 @@ class Trainer:
         """Steps of one process that the next step stands for."""
         return 1
 
+    def _fits_one_op(self) -> bool:
+        """Whether the loss of a step is that of one picture of all Gaussians, and nothing else."""
+        options = self.options
+        one = self.ranks.world == 1 and options.pictures_per_step == 1
+        return one and options.supersampling == 1 and not options.filter_3d and not any(options.regularizers)
+
     def _set_rates(self) -> None:
         """Gives the optimizer the learning rates of the next step."""
         options, over = self.options, self.progress.share
+        factor = options.rates_end**over
         for group, rate in zip(self.optimizer.param_groups, self.rates.values()):
-            group["lr"] = rate * options.rates_end**over
+            group["lr"] = rate * factor
+        self.optimizer.param_groups[-1]["head_lr"] = options.color_rate * factor
         self.optimizer.param_groups[0]["lr"] = self.extent * means_rate_at(self.progress.step, over, options)
 
     def _next(self) -> list[Shown]:
         """The pictures of the next step."""
         count, settings = self.options.pictures_per_step, self._settings()
         first = self.progress.step * count
+        effects = None if self.filter_3d is None else Effects(filter_3d=self.filter_3d)
         shown = []
         for n in range(first, first + self.stride * count):
             view, scale = self.order(n)
@@ -136,10 +148,51 @@ class Trainer:
             if self.random_background:
                 background = torch.rand(3, generator=self.generator, device=self.device)
                 chosen = chosen._replace(bg=background)
-            if self.filter_3d is not None:
-                chosen = chosen._replace(effects=Effects(filter_3d=self.filter_3d))
+            if effects is not None:
+                chosen = chosen._replace(effects=effects)
             shown.append(Shown(scale, view, chosen, background))
         return shown
+
+    def _differentiate(self) -> Tensor:
+        """The loss of the next step. Its gradients are those of the parameters, and density control has seen them."""
+        loss, seen = self._loss()
+        # In this thread: otherwise one of the device's does it, and handing over and back takes longer than the kernels
+        # of a small picture.
+        with torch.autograd.set_multithreading_enabled(False):
+            loss.backward(self.one)
+        self._observe(seen)
+        return loss.detach()
+
+    @torch.no_grad()
+    def _differentiate_in_one_op(self) -> Tensor:
+        """The same, bit for bit, without what autograd costs the host."""
+        (shown,) = self._next()
+        gaussians, density = self.gaussians, self.density
+        columns = density.columns if density.watches(shown.scale) else 0
+        truth = self.pictures.target(shown.scale, shown.view, shown.background)
+        loss, image, radii, gradients = _picture_gradients(
+            *gaussians,
+            mean_columns=columns,
+            target=truth,
+            dL_dloss=self.one,
+            ssim_weight=self.options.ssim_weight,
+            bg=shown.settings.bg,
+            **self._camera(shown),
+        )
+        for field, gradient in zip(gaussians, gradients):
+            field.grad = gradient
+        if columns:
+            density.observe(gradients[-1], radii)
+        self.last = image, truth
+        return loss
+
+    def _camera(self, shown: Shown) -> dict[str, Any]:
+        """Camera and footprint of a picture by the names of the ops; made once for every picture and degree."""
+        camera = self._cameras.get((shown.scale, shown.view))
+        if camera is None:
+            camera = camera_arguments(shown.settings, self.gaussians.means, None)
+            self._cameras[shown.scale, shown.view] = camera
+        return camera
 
     def _loss(self) -> tuple[Tensor, Any]:
         """The loss of the next step, and what `_observe` takes."""
@@ -164,7 +217,8 @@ class Trainer:
     def _observe(self, seen: list[tuple[Tensor | None, Tensor]]) -> None:
         """Lets density control look at the gradients of a step."""
         for leaf, radii in seen:
-            self.density.observe(leaf, radii)
+            if leaf is not None:
+                self.density.observe(leaf.grad, radii)
 
     def _rebalance(self) -> None:
         """Called when the number of Gaussians has changed; there is nothing to do in one process."""
@@ -174,6 +228,7 @@ class Trainer:
         degree = sh_degree_at(self.progress.step, self.progress.share, self.options)
         if self._resolved is None or self._resolved[0] != degree:
             self._resolved = degree, self.pictures.resolve(footprint=self.options.footprint, sh_degree=degree)
+            self._cameras = {}
         return self._resolved[1]
 
     def _compute_filter(self) -> None:

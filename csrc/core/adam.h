@@ -16,6 +16,7 @@ inline constexpr int kAdamTensors = 16;
 template <typename T> struct AdamRule {
   T beta1, one_minus_beta1, beta2, one_minus_beta2, eps;
   T rate;        ///< learning rate / (1 - beta1^step)
+  T head_rate;   ///< the same of the first numbers of every row
   T root_scale;  ///< 1 / sqrt(1 - beta2^step)
 };
 
@@ -23,6 +24,7 @@ template <typename T> struct AdamRule {
 template <typename T> struct AdamTensor {
   int64_t n;         ///< numbers in it, at least 1
   int64_t row_size;  ///< numbers in one of its rows
+  int64_t head;      ///< the first numbers of a row, which have a learning rate of their own; 0: none
   bool aligned;      ///< whether all its pointers are multiples of 16 bytes
   AdamRule<T> rule;
   const T* grad;  ///< [n]
@@ -59,11 +61,11 @@ template <typename T> AR_HD AdamPart part_of_item(const AdamParams<T>& p, int64_
   return {k, begin, end < n ? end : n};
 }
 
-/// Updates one number.
-template <typename T> AR_HD void adam(const AdamRule<T>& rule, T grad, T& param, T& exp_avg, T& exp_avg_sq) {
+/// Updates one number with one of the rates of `rule`.
+template <typename T> AR_HD void adam(const AdamRule<T>& rule, T rate, T grad, T& param, T& exp_avg, T& exp_avg_sq) {
   exp_avg = rule.beta1 * exp_avg + rule.one_minus_beta1 * grad;
   exp_avg_sq = rule.beta2 * exp_avg_sq + rule.one_minus_beta2 * grad * grad;
-  param = param - rule.rate * (exp_avg / (std::sqrt(exp_avg_sq) * rule.root_scale + rule.eps));
+  param = param - rate * (exp_avg / (std::sqrt(exp_avg_sq) * rule.root_scale + rule.eps));
 }
 
 }  // namespace ar

@@ -1,7 +1,9 @@
+// What is done for every Gaussian by itself: activations, their adjoint, and what density control observes.
 #include "core/activations.h"
 
 #include <algorithm>
 
+#include "core/density.h"
 #include "cpu/parallel.h"
 #include "cpu/training.h"
 
@@ -25,10 +27,15 @@ template <typename T> void activate(const ActivateParams<T>& p, int threads) {
 template <typename T> void activate_vjp(const ActivateVjpParams<T>& p, int threads) {
   for_each_gaussian(p.n, threads, [&](int64_t i) { ar::activate_vjp(p, i); });
 }
+template <typename T> void observe(const ObserveParams<T>& p, int threads) {
+  for_each_gaussian(p.n, threads, [&](int64_t i) { ar::observe(p, i); });
+}
 
 template void activate(const ActivateParams<float>&, int);
 template void activate(const ActivateParams<double>&, int);
 template void activate_vjp(const ActivateVjpParams<float>&, int);
 template void activate_vjp(const ActivateVjpParams<double>&, int);
+template void observe(const ObserveParams<float>&, int);
+template void observe(const ObserveParams<double>&, int);
 
 }  // namespace ar::cpu

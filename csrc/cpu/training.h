@@ -1,9 +1,10 @@
-// The loops of a training step besides rendering, in float and double: loss, activations and optimiser. They are
-// compiled once, for the baseline instruction set. Bits do not depend on `threads`.
+// The loops of a training step besides rendering, in float and double: loss, activations, optimiser and what density
+// control observes. They are compiled once, for the baseline instruction set. Bits do not depend on `threads`.
 #pragma once
 
 #include "core/activations.h"
 #include "core/adam.h"
+#include "core/density.h"
 #include "core/ssim.h"
 
 namespace ar::cpu {
@@ -13,6 +14,8 @@ template <typename T, typename Target> void ssim_vjp(const SsimVjpParams<T, Targ
 
 template <typename T> void activate(const ActivateParams<T>& p, int threads);
 template <typename T> void activate_vjp(const ActivateVjpParams<T>& p, int threads);
+
+template <typename T> void observe(const ObserveParams<T>& p, int threads);
 
 /// p.first_item need not be set.
 template <typename T> void adam(AdamParams<T> p, int threads);

@@ -1,5 +1,6 @@
-// Activations and their adjoint: a thread per Gaussian.
+// Activations, their adjoint, and what density control observes: a thread per Gaussian.
 #include "core/activations.h"
+#include "core/density.h"
 
 #include "cuda/training.h"
 #include "cuda/warp.cuh"
@@ -19,6 +20,11 @@ template <typename T> __global__ void activate_vjp_kernel(const ActivateVjpParam
   if (i < p.n) ar::activate_vjp(p, i);
 }
 
+template <typename T> __global__ void observe_kernel(const ObserveParams<T> p) {
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i < p.n) ar::observe(p, i);
+}
+
 }  // namespace
 
 template <typename T> void activate(const ActivateParams<T>& p, cudaStream_t stream) {
@@ -27,10 +33,15 @@ template <typename T> void activate(const ActivateParams<T>& p, cudaStream_t str
 template <typename T> void activate_vjp(const ActivateVjpParams<T>& p, cudaStream_t stream) {
   if (p.n > 0) activate_vjp_kernel<T><<<blocks_of(p.n, kThreads), kThreads, 0, stream>>>(p);
 }
+template <typename T> void observe(const ObserveParams<T>& p, cudaStream_t stream) {
+  if (p.n > 0) observe_kernel<T><<<blocks_of(p.n, kThreads), kThreads, 0, stream>>>(p);
+}
 
 template void activate(const ActivateParams<float>&, cudaStream_t);
 template void activate(const ActivateParams<double>&, cudaStream_t);
 template void activate_vjp(const ActivateVjpParams<float>&, cudaStream_t);
 template void activate_vjp(const ActivateVjpParams<double>&, cudaStream_t);
+template void observe(const ObserveParams<float>&, cudaStream_t);
+template void observe(const ObserveParams<double>&, cudaStream_t);
 
 }  // namespace ar::cuda

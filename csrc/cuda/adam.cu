@@ -22,18 +22,23 @@ template <typename T> __device__ const Packed<T>& packed(const T* first) {
 }
 
 template <typename T> __device__ void update_one(const AdamParams<T>& p, const AdamTensor<T>& t, int64_t i) {
-  if (!p.rows || p.rows[i / t.row_size]) ar::adam(t.rule, t.grad[i], t.param[i], t.exp_avg[i], t.exp_avg_sq[i]);
+  const int64_t row = p.rows || t.head > 0 ? i / t.row_size : 0;
+  if (p.rows && !p.rows[row]) return;
+  const T rate = i - row * t.row_size < t.head ? t.rule.head_rate : t.rule.rate;
+  ar::adam(t.rule, rate, t.grad[i], t.param[i], t.exp_avg[i], t.exp_avg_sq[i]);
 }
 
 /// Numbers [i, i + kWidth), for which there is memory.
 template <typename T> __device__ void update_packed(const AdamParams<T>& p, const AdamTensor<T>& t, int64_t i) {
   constexpr int kWidth = Packed<T>::kWidth;
   bool chosen[kWidth], any = false;
-  int64_t row = p.rows ? i / t.row_size : 0, column = i - row * t.row_size;
+  T rates[kWidth];
+  int64_t row = p.rows || t.head > 0 ? i / t.row_size : 0, column = i - row * t.row_size;
 #pragma unroll
   for (int k = 0; k < kWidth; ++k) {
     chosen[k] = !p.rows || p.rows[row];
     any |= chosen[k];
+    rates[k] = column < t.head ? t.rule.head_rate : t.rule.rate;
     if (++column == t.row_size) {
       column = 0;
       ++row;
@@ -44,7 +49,7 @@ template <typename T> __device__ void update_packed(const AdamParams<T>& p, cons
   Packed<T> param = packed(t.param + i), exp_avg = packed(t.exp_avg + i), exp_avg_sq = packed(t.exp_avg_sq + i);
 #pragma unroll
   for (int k = 0; k < kWidth; ++k) {
-    if (chosen[k]) ar::adam(t.rule, grad.values[k], param.values[k], exp_avg.values[k], exp_avg_sq.values[k]);
+    if (chosen[k]) ar::adam(t.rule, rates[k], grad.values[k], param.values[k], exp_avg.values[k], exp_avg_sq.values[k]);
   }
   packed(t.param + i) = param;
   packed(t.exp_avg + i) = exp_avg;

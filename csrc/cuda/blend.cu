@@ -3,6 +3,7 @@
 
 #include "cuda/blend.cuh"
 #include "cuda/blend_groups.cuh"
+#include "cuda/blend_listed.cuh"
 #include "cuda/blend_moving.cuh"
 #include "cuda/blend_segments.cuh"
 #include "cuda/choose_samples.cuh"
@@ -13,12 +14,20 @@ namespace ar::cuda {
 namespace {
 
 template <class F, int C> void launch_moving_blend(const BlendParams& p, int first, cudaStream_t stream) {
-  choose_layout<F, C, false>(p.grid, [&](auto layout) {
-    using Layout = decltype(layout);
-    moving_blend_kernel<F, C, Layout><<<unsigned(p.grid.tiles()), Layout::kThreads, 0, stream>>>(p, first);
-  });
+  const bool listed = p.grid.tiles() < kManyTiles;
+  if (listed) {
+    using Layout = ListedLayout<F>;
+    const auto blocks = unsigned(p.grid.tiles() * Layout::kBlocks);
+    listed_blend_kernel<F, C, Layout><<<blocks, Layout::kThreads, 0, stream>>>(p, first);
+  }
+  using Layout = EvenLayout<F, false>;
+  moving_blend_kernel<F, C, Layout><<<unsigned(p.grid.tiles()), Layout::kThreads, 0, stream>>>(p, first, listed);
 }
 template <class F> void blend_moving(const BlendParams& p, cudaStream_t stream) {
+  if (p.grid.tiles() < kManyTiles) {
+    const auto pieces = unsigned(max_pieces(p.lists.capacity, kFilterPiece, p.grid));
+    filter_kernel<F, ListedLayout<F>><<<pieces, kFilterPiece, 0, stream>>>(p);
+  }
   if (!p.channels.data) return launch_moving_blend<F, 3>(p, 0, stream);
   if (p.channels.count <= kFewChannels) return launch_moving_blend<F, 4>(p, 0, stream);
   for (int first = 0; first < p.channels.count; first += kMovingChannels)
@@ -47,6 +56,17 @@ int64_t max_state_planes(int footprint, int64_t capacity) {
     if (F::kMoves) planes = state_planes(F::kSamples);
   });
   return capacity / kStateChunk * planes;
+}
+
+int64_t max_reach_words(int footprint, int64_t capacity, TileGrid grid) {
+  int64_t words = 0;
+  visit_footprint(footprint, Footprints{}, [&](auto f) {
+    using F = decltype(f);
+    if constexpr (F::kMoves) {
+      if (grid.tiles() < kManyTiles) words = filter_words<ListedLayout<F>>(capacity, grid);
+    }
+  });
+  return words;
 }
 
 int list_segments(int footprint, int64_t channels, TileGrid grid) {

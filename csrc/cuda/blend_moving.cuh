@@ -3,7 +3,7 @@
 // What a splat does to a sample depends on where the sample is when they meet, so that the chunks of a list cannot be
 // blended side by side as in blend.cuh: a block walks its whole list. What fills the device instead is that samples are
 // spread over lanes and that tiles are small. It also wastes less: the fewer pixels a warp has, the fewer splats pass
-// through it that touch only some of them.
+// through it that touch only some of them. Small images take the kernel of blend_listed.cuh in its place.
 #pragma once
 
 #include "cuda/composite.cuh"
@@ -15,19 +15,25 @@ inline constexpr int kMovingPixels = kMovingTile * kMovingTile;
 inline constexpr int kMovingChannels = 8;
 
 /// How the samples of 8x8 pixels are shared out: kCells to a lane, those of a pixel to kLanes neighbours, a power of
-/// two, of which the last may have fewer, or none. A warp's pixels are a rectangle.
-template <int kCellsOfLane, int kLanesOfPixel> struct CellLayout {
+/// two, of which the last may have fewer, or none. The pixels of a warp, a group, are a rectangle. A tile's groups are
+/// spread over kBlocks blocks of kWarps warps.
+template <int kCellsOfLane, int kLanesOfPixel, int kWarpsOfBlock = kLanesOfPixel * kMovingPixels / 32>
+struct CellLayout {
   static constexpr int kCells = kCellsOfLane, kLanes = kLanesOfPixel;
-  static constexpr int kThreads = kLanes * kMovingPixels, kWarps = kThreads / 32;
-  static_assert((kLanes & (kLanes - 1)) == 0 && kWarps <= 32);
-  static constexpr int kPixels = 32 / kLanes;  ///< of a warp
-  static constexpr int kWide = kPixels == 32 ? 8 : kPixels >= 8 ? 4 : 2, kHigh = kPixels / kWide;
-  static constexpr int kColumns = kMovingTile / kWide;  ///< warps side by side
+  static constexpr int kGroups = kLanes * kMovingPixels / 32;
+  static constexpr int kWarps = kWarpsOfBlock, kThreads = 32 * kWarps, kBlocks = kGroups / kWarps;
+  static_assert((kLanes & (kLanes - 1)) == 0 && kLanes <= 32 && kGroups % kWarps == 0 && kWarps <= 32);
+  static constexpr int kPixels = 32 / kLanes;  ///< of a group
+  static constexpr int kWide = kPixels == 32 ? 8 : kPixels >= 8 ? 4 : kPixels >= 2 ? 2 : 1, kHigh = kPixels / kWide;
+  static constexpr int kColumns = kMovingTile / kWide;                   ///< groups side by side
+  using Reach = std::conditional_t<(kGroups > 32), uint64_t, uint32_t>;  ///< a bit for each group
 
+  /// This warp's group.
+  __device__ static int group() { return int(blockIdx.x) % kBlocks * kWarps + int(threadIdx.x) / 32; }
   /// This thread's pixel, relative to the tile's first.
   __device__ static Vec2<float> pixel() {
-    const int warp = threadIdx.x / 32, i = lane_id() / kLanes;
-    return {float(warp % kColumns * kWide + i % kWide), float(warp / kColumns * kHigh + i / kWide)};
+    const int g = group(), i = lane_id() / kLanes;
+    return {float(g % kColumns * kWide + i % kWide), float(g / kColumns * kHigh + i / kWide)};
   }
   /// Its place among the tile's pixels, row by row, whatever the layout.
   __device__ static int pixel_number() {
@@ -37,17 +43,17 @@ template <int kCellsOfLane, int kLanesOfPixel> struct CellLayout {
   /// The first of this thread's samples of its pixel.
   __device__ static int first_sample() { return lane_id() % kLanes * kCells; }
 
-  /// Bit w: the support reaches the pixels of warp w of the tile that begins at (x0, y0).
-  __device__ static uint32_t reach(const Support<float>& support, int x0, int y0) {
-    uint32_t reach = 0;
+  /// Bit g: the support reaches the pixels of group g of the tile that begins at (x0, y0).
+  __device__ static Reach reach(const Support<float>& support, int x0, int y0) {
+    Reach reach = 0;
 #pragma unroll
-    for (int w = 0; w < kWarps; w += kColumns) {
-      const float y = float(y0 + w / kColumns * kHigh);
+    for (int g = 0; g < kGroups; g += kColumns) {
+      const float y = float(y0 + g / kColumns * kHigh);
       const Span<float> span = columns_of(support, y, y + float(kHigh - 1));
 #pragma unroll
       for (int c = 0; c < kColumns; ++c) {
         const float x = float(x0 + c * kWide);
-        reach |= uint32_t(span.lo <= x + float(kWide - 1) && span.hi >= x) << (w + c);
+        reach |= Reach(span.lo <= x + float(kWide - 1) && span.hi >= x) << (g + c);
       }
     }
     return reach;
@@ -76,8 +82,9 @@ struct StatePlaces {
   }
 };
 
-/// A lane's samples on their way through a list.
-template <class F, class Layout> struct MovingSamples {
+/// A lane's samples on their way through a list. `kTogether`: the samples of a pixel are neighbours in a checkpoint, as
+/// they are among the lanes of warps with few pixels; else the pixels of a sample are.
+template <class F, class Layout, bool kTogether = false> struct MovingSamples {
   static constexpr int kCells = Layout::kCells;
   float transmittance[kCells];
   Vec2<float> place[kCells];     ///< of the node [px from the pixel's centre]
@@ -106,36 +113,39 @@ template <class F, class Layout> struct MovingSamples {
 
   /// Where checkpoint `number` has sample i of this pixel: its transmittance, and its place in the two planes behind.
   __device__ static int64_t in_checkpoint(int64_t number, int i) {
-    const int64_t plane = number * state_planes(F::kSamples) + 3 * (Layout::first_sample() + i);
-    return plane * kMovingPixels + Layout::pixel_number();
+    const int sample = Layout::first_sample() + i, pixel = Layout::pixel_number();
+    const int64_t in_plane = kTogether ? pixel * F::kSamples + sample : 3 * sample * kMovingPixels + pixel;
+    return number * state_planes(F::kSamples) * kMovingPixels + in_plane;
   }
+  static constexpr int kPlane = kTogether ? F::kSamples * kMovingPixels : kMovingPixels;  ///< from one to the next
   __device__ void store(float* checkpoints, int64_t number) const {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
       if (!exists(i)) continue;
       float* to = checkpoints + in_checkpoint(number, i);
       to[0] = abs(transmittance[i]);
-      to[kMovingPixels] = place[i].x;
-      to[2 * kMovingPixels] = place[i].y;
+      to[kPlane] = place[i].x;
+      to[2 * kPlane] = place[i].y;
     }
   }
-  /// In front of pair k, a multiple of the spacing.
-  __device__ void load(const float* checkpoints, const StatePlaces& places, int k) {
+  /// In front of pair k, a multiple of the spacing. Samples that have composited their last splat, `last` pairs from
+  /// the first, may have no checkpoint there, and need none.
+  __device__ void load(const float* checkpoints, const StatePlaces& places, int k, const int (&last)[kCells]) {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
       transmittance[i] = 1;
       place[i] = node(i);
-      if (k == 0 || !exists(i)) continue;
+      if (k == 0 || k >= last[i]) continue;
       const float* from = checkpoints + in_checkpoint(places.first + k / places.spacing - 1, i);
       transmittance[i] = from[0];
-      place[i] = {from[kMovingPixels], from[2 * kMovingPixels]};
+      place[i] = {from[kPlane], from[2 * kPlane]};
     }
   }
 };
 
 /// Up to kBatch splats of a tile that a block works on together.
 template <class F, int C, class Layout, int kBatch> struct MovingStage {
-  static_assert(kBatch <= Layout::kThreads);
+  static_assert(kBatch <= Layout::kThreads && Layout::kBlocks == 1);
   TileSplat<F, C> splats[kBatch];
   uint32_t reach[kBatch];
 
@@ -150,7 +160,7 @@ template <class F, int C, class Layout, int kBatch> struct MovingStage {
     uint32_t bits = 0;
     if (id >= 0) {
       const Splat<F, float> splat = splats_in[id];
-      bits = Layout::reach(support_of(splat), list.x0, list.y0);
+      bits = Layout::reach(support_of(splat), list.x0, list.y0);  // a block has all groups of its tile
       if (bits) splats[threadIdx.x] = {tile_terms(splat, list), channels_of<C>(channels, splat, id, first)};
     }
     if (threadIdx.x < kBatch) reach[threadIdx.x] = bits;
@@ -162,23 +172,77 @@ template <class F, int C, class Layout, int kBatch> struct MovingStage {
   }
 };
 
-/// A block per tile; C channels from `first` on.
+/// A lane's share of blending a pixel.
+template <class F, int C, class Layout, bool kTogether = false> struct MovingBlend {
+  static constexpr int kCells = Layout::kCells;
+  MovingSamples<F, Layout, kTogether> samples;
+  Values<C> sums = {};
+  int last[kCells] = {};
+
+  __device__ explicit MovingBlend(bool inside) : samples(inside) {}
+
+  /// Composites pair k, whose splat is staged, into the samples of the pixel at p.
+  __device__ void add(const TileSplat<F, C>& staged, Vec2<float> p, int k) {
+    TileSplatRef<F, C> splat = staged;
+    const Vec2<float> of_pixel = transform(splat.terms.w, p, splat.terms.node[0]);
+    float contribution = 0;
+#pragma unroll
+    for (int i = 0; i < kCells; ++i) {
+      const Vec2<float> z = F::whitened_node(splat.terms, of_pixel, samples.place[i]);
+      const Blended<float> b = blend_placed_sample<F>(splat.terms, z, exp2(F::log_alpha(splat.terms, z)),
+                                                      samples.bounds[i], samples.transmittance[i], samples.place[i]);
+      contribution = i == 0 ? b.contribution : contribution + b.contribution;
+      last[i] = b.mask ? k + 1 : last[i];
+    }
+    sums.add(contribution, splat.channels);
+  }
+
+  /// Adds the lanes of each pixel up and writes its images. All lanes must call it.
+  __device__ void write(const BlendParams& params, int first, const Pixel& pixel) {
+    const bool keep = params.transmittance && first == 0;
+    float through = 0;
+#pragma unroll
+    for (int i = 0; i < kCells; ++i) {
+      if (!samples.exists(i)) continue;
+      through += abs(samples.transmittance[i]);
+      if (!keep || !pixel.inside) continue;
+      const int64_t place = (Layout::first_sample() + i) * pixel.image + pixel.index;
+      params.transmittance[place] = abs(samples.transmittance[i]);
+      params.last[place] = last[i];
+    }
+    through = Layout::sum_lanes(through);
+#pragma unroll
+    for (int c = 0; c < C; ++c) sums.v[c] = Layout::sum_lanes(sums.v[c]);
+    if (!pixel.inside || Layout::first_sample() > 0) return;
+    const float scale = 1.0f / F::kSamples;
+#pragma unroll
+    for (int c = 0; c < C; ++c) {
+      if (first + c >= params.channels.count) break;
+      params.image.plane(first + c, pixel.image)[pixel.index] =
+          scale * sums.v[c] + scale * through * params.background[first + c];
+    }
+    if (first == 0 && params.alpha) params.alpha[pixel.index] = 1 - scale * through;
+  }
+};
+
+/// A block per tile; C channels from `first` on. `overflow_only`: another kernel blends the tiles, unless there were
+/// too many pairs.
 template <class F, int C, class Layout>
-__global__ void __launch_bounds__(Layout::kThreads) moving_blend_kernel(const BlendParams params, int first) {
-  constexpr int kCells = Layout::kCells, kBatch = Layout::kThreads < 256 ? Layout::kThreads : 256;
+__global__ void __launch_bounds__(Layout::kThreads)
+    moving_blend_kernel(const BlendParams params, int first, bool overflow_only) {
+  constexpr int kBatch = Layout::kThreads < 256 ? Layout::kThreads : 256;
   __shared__ MovingStage<F, C, Layout, kBatch> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int tile = params.plan.tile_order[blockIdx.x];
   const TileList list = list_of(params.lists, params.grid, tile);
+  if (overflow_only && !list.overflow) return;
   const StatePlaces places(params.lists, list, params.grid, tile);
   const bool keep = params.transmittance && first == 0;
   const Vec2<float> p = Layout::pixel();
   const Pixel pixel(list, params.grid, p);
-  MovingSamples<F, Layout> samples(pixel.inside);
-  Values<C> sums = {};
-  int last[kCells] = {};
+  MovingBlend<F, C, Layout> blend(pixel.inside);
   int32_t id = stage.splat_of(list, 0, list.count);
-  for (int k = 0; k < list.count && __syncthreads_or(samples.open()); k += kBatch) {
+  for (int k = 0; k < list.count && __syncthreads_or(blend.samples.open()); k += kBatch) {
     const int count = min(list.count - k, kBatch);
     const int32_t next_id = stage.splat_of(list, k + kBatch, list.count);
     stage.load(splats, params.channels, first, list, id);
@@ -186,49 +250,16 @@ __global__ void __launch_bounds__(Layout::kThreads) moving_blend_kernel(const Bl
     if (next_id >= 0) prefetch(splats + next_id);  // so that the next batch need not wait for memory
     id = next_id;
     for (int from = 0; from < count; from += 32) {
-      if (!__any_sync(kAllLanes, samples.open())) break;
+      if (!__any_sync(kAllLanes, blend.samples.open())) break;
       if (keep && k + from > 0 && (k + from) % places.spacing == 0)
-        samples.store(params.checkpoints, places.first + (k + from) / places.spacing - 1);
+        blend.samples.store(params.checkpoints, places.first + (k + from) / places.spacing - 1);
       for (uint32_t mask = stage.reached(from); mask != 0; mask &= mask - 1) {
         const int j = from + __ffs(mask) - 1;
-        TileSplatRef<F, C> splat = stage.splats[j];
-        const Vec2<float> of_pixel = transform(splat.terms.w, p, splat.terms.node[0]);
-        float contribution = 0;
-#pragma unroll
-        for (int i = 0; i < kCells; ++i) {
-          const Vec2<float> z = F::whitened_node(splat.terms, of_pixel, samples.place[i]);
-          const Blended<float> b =
-              blend_placed_sample<F>(splat.terms, z, exp2(F::log_alpha(splat.terms, z)), samples.bounds[i],
-                                     samples.transmittance[i], samples.place[i]);
-          contribution = i == 0 ? b.contribution : contribution + b.contribution;
-          last[i] = b.mask ? k + j + 1 : last[i];
-        }
-        sums.add(contribution, splat.channels);
+        blend.add(stage.splats[j], p, k + j);
       }
     }
   }
-  float through = 0;
-#pragma unroll
-  for (int i = 0; i < kCells; ++i) {
-    if (!samples.exists(i)) continue;
-    through += abs(samples.transmittance[i]);
-    if (!keep || !pixel.inside) continue;
-    const int64_t place = (Layout::first_sample() + i) * pixel.image + pixel.index;
-    params.transmittance[place] = abs(samples.transmittance[i]);
-    params.last[place] = last[i];
-  }
-  through = Layout::sum_lanes(through);
-#pragma unroll
-  for (int c = 0; c < C; ++c) sums.v[c] = Layout::sum_lanes(sums.v[c]);
-  if (!pixel.inside || Layout::first_sample() > 0) return;
-  const float scale = 1.0f / F::kSamples;
-#pragma unroll
-  for (int c = 0; c < C; ++c) {
-    if (first + c >= params.channels.count) break;
-    params.image.plane(first + c, pixel.image)[pixel.index] =
-        scale * sums.v[c] + scale * through * params.background[first + c];
-  }
-  if (first == 0 && params.alpha) params.alpha[pixel.index] = 1 - scale * through;
+  blend.write(params, first, pixel);
 }
 
 /// Samples shared out so that there is least to do, forwards and backwards.
@@ -238,23 +269,9 @@ using EvenLayout =
                        std::conditional_t<F::kSamples == 4, CellLayout<2, 2>,
                                           std::conditional_t<F::kSamples == 9 && !kBackward, CellLayout<5, 2>,
                                                              CellLayout<(F::kSamples + 3) / 4, 4>>>>;
-/// Samples shared out so that each warp has few pixels, even if lanes have nothing to do. A warp meets fewer splats
-/// then, one after the other, which is what takes the time where few tiles have long lists.
-/// Many channels need the room of half of the warps.
-template <class F, int C>
-using FineLayout = std::conditional_t<
-    F::kSamples <= 4, CellLayout<1, 8>,
-    std::conditional_t<F::kSamples == 9 || C == kMovingChannels, CellLayout<2, 8>, CellLayout<1, 16>>>;
-/// Tiles from which on there are enough to keep a device busy.
-inline constexpr int64_t kManyTiles = 4096;
 
-/// Calls launch(Layout{}) for the layout that suits the grid.
-template <class F, int C, bool kBackward, class Launch> void choose_layout(TileGrid grid, Launch&& launch) {
-  if (grid.tiles() < kManyTiles) {
-    launch(FineLayout<F, C>{});
-  } else {
-    launch(EvenLayout<F, kBackward>{});
-  }
-}
+/// Grids of fewer tiles are blended by blend_listed.cuh and differentiated in segments (blend_moving_vjp.cuh): there
+/// few tiles have long lists, and the time is that of the longest.
+inline constexpr int64_t kManyTiles = 4096;
 
 }  // namespace ar::cuda

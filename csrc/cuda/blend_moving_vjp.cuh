@@ -6,6 +6,11 @@
 // in front of it, keeps where the samples were in front of each splat, and then walks back over those that its pixels
 // show.
 //
+// In small images a block has a segment of a tile's list, so that long lists are differentiated side by side. What the
+// samples carry from splat to splat on the way back goes through a segment as an affine map. So one kernel finds the
+// map of every segment, another chains them from the last segment to the first, and a third has the sums, each segment
+// from what it gets from behind.
+//
 // dL/dalpha is linear in the gradient of the image: of many channels each kernel adds the share of its own to the six
 // sums of a pair, which a single block owns. Only MeanSums need all channels at once: where they are wanted, the first
 // kernel makes all sums, and reads the channels of the others where they lie.
@@ -14,6 +19,7 @@
 #include <algorithm>
 
 #include "cuda/blend_moving.cuh"
+#include "cuda/tile_pieces.cuh"
 
 namespace ar::cuda {
 
@@ -60,16 +66,113 @@ template <int C> __device__ void put_warp_sums(const PairGrad<float>& grad, cons
 /// numbers in memory.
 template <int C> inline constexpr int kMovingVjpThreads = C == 3 ? 1024 : 512;
 
-template <class F, int C, class Layout>
+/// What a sample carries from a splat to the one in front of it: the gradient-weighted colour behind, and the gradient
+/// with respect to its place.
+struct Adjoint {
+  float behind;
+  Vec2<float> dL_dplace;
+};
+
+/// How that goes through a segment: the image of zero, and what a change of each of the three numbers adds. A change of
+/// the place does not reach `behind`.
+struct AdjointMap {
+  static constexpr int kNumbers = 10;
+  Adjoint of_zero, by_behind;
+  Vec2<float> by_x, by_y;
+
+  __device__ Adjoint operator()(const Adjoint& a) const {
+    const auto place = [&](float zero, float behind, float x, float y) {
+      return madd(y, a.dL_dplace.y, madd(x, a.dL_dplace.x, madd(behind, a.behind, zero)));
+    };
+    return {madd(by_behind.behind, a.behind, of_zero.behind),
+            {place(of_zero.dL_dplace.x, by_behind.dL_dplace.x, by_x.x, by_y.x),
+             place(of_zero.dL_dplace.y, by_behind.dL_dplace.y, by_x.y, by_y.y)}};
+  }
+};
+
+/// Where the maps of a pixel's sample are. In place of `of_zero` of a segment is, in the end, what its front gives to
+/// the segment before.
+template <class F> struct MapMemory {
+  static constexpr int kPlane = F::kSamples * kMovingPixels;
+  float* first;  ///< of the sample
+
+  __device__ MapMemory(float* maps, int sample, int pixel_number) : first(maps + pixel_number * F::kSamples + sample) {}
+  __device__ float& at(int64_t piece, int number) const {
+    return first[(piece * AdjointMap::kNumbers + number) * kPlane];
+  }
+  __device__ Adjoint adjoint(int64_t piece, int number = 0) const {
+    return {at(piece, number), {at(piece, number + 1), at(piece, number + 2)}};
+  }
+  __device__ AdjointMap map(int64_t piece) const {
+    return {adjoint(piece), adjoint(piece, 3), {at(piece, 6), at(piece, 7)}, {at(piece, 8), at(piece, 9)}};
+  }
+  __device__ void put(int64_t piece, const Adjoint& a, int number = 0) const {
+    at(piece, number) = a.behind;
+    at(piece, number + 1) = a.dL_dplace.x;
+    at(piece, number + 2) = a.dL_dplace.y;
+  }
+  __device__ void put(int64_t piece, const AdjointMap& m) const {
+    put(piece, m.of_zero);
+    put(piece, m.by_behind, 3);
+    at(piece, 6) = m.by_x.x, at(piece, 7) = m.by_x.y;
+    at(piece, 8) = m.by_y.x, at(piece, 9) = m.by_y.y;
+  }
+};
+
+/// Pairs of a segment. Longer ones need fewer maps, shorter ones fill a device with smaller scenes.
+inline constexpr int kMovingSegment = 1024;
+/// Samples shared out for segments, of which there are many, with small splats: few pixels per warp, and blocks small
+/// enough for two on an SM.
+template <class F> using SegmentLayout = CellLayout<F::kSamples <= 4 ? 1 : 2, F::kSamples <= 4 ? 4 : 8>;
+
+/// A thread per sample of a tile: from the maps of its segments to what each gets from behind.
+template <class F, int kSegment>
+__global__ void __launch_bounds__(kMovingPixels) chain_maps_kernel(const BlendVjpParams params) {
+  constexpr int S = F::kSamples;
+  const int tile = int(blockIdx.x) / S, t = int(blockIdx.x) % S * kMovingPixels + int(threadIdx.x);
+  const int number = t / S, sample = t % S;
+  const TileList list = list_of(params.lists, params.grid, tile);
+  const Pixel pixel(list, params.grid, {float(number % kMovingTile), float(number / kMovingTile)});
+  if (list.overflow || !pixel.inside) return;
+  // The map of the segment with the last splat of the sample already is what its front gives.
+  int segment = (params.last[sample * pixel.image + pixel.index] - 1) / kSegment;
+  if (segment <= 1) return;
+  const int64_t first = first_piece(params.lists, kSegment, tile);
+  const MapMemory<F> memory(params.adjoint_maps, sample, number);
+  Adjoint adjoint = memory.adjoint(first + segment);
+  AdjointMap map = memory.map(first + --segment);
+  for (; segment > 0; --segment) {
+    AdjointMap next = {};
+    if (segment > 1) next = memory.map(first + segment - 1);  // while the one at hand is applied
+    adjoint = map(adjoint);
+    memory.put(first + segment, adjoint);
+    map = next;
+  }
+}
+
+/// A block per tile, or with kSegment > 0 per segment of so many pairs of a tile's list, from what the segment gets
+/// from behind. kMaps: finds the maps of the segments instead of the sums, but of the first ones, which nobody needs.
+/// `overflow_only`: other kernels do the work, unless there were too many pairs.
+template <class F, int C, class Layout, int kSegment = 0, bool kMaps = false>
 __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThreads<C> / Layout::kThreads))
-    moving_vjp_kernel(const BlendVjpParams params, int first) {
+    moving_vjp_kernel(const BlendVjpParams params, int first, bool overflow_only) {
   using Shared = MovingVjpShared<F, C, Layout>;
-  using Samples = MovingSamples<F, Layout>;
-  constexpr int S = F::kSamples, kCells = Layout::kCells, kBatch = Shared::kBatch;
+  using Samples = MovingSamples<F, Layout, (kSegment > 0)>;
+  constexpr int S = F::kSamples, kCells = Layout::kCells, kBatch = Shared::kBatch, kColumns = kMaps ? 4 : 1;
+  static_assert(kSegment % kBatch == 0 && Layout::kBlocks == 1);
   Shared& shared = *reinterpret_cast<Shared*>(dynamic_shared());
-  const int tile = listed_tile<S>(params, int(blockIdx.x));
+  TilePiece piece = {0, 0};
+  if constexpr (kSegment > 0) {
+    piece = find_piece(params.lists, params.grid, kSegment, blockIdx.x);
+    if (kMaps && piece.index == 0) return;
+  } else {
+    piece.tile = listed_tile<S>(params, int(blockIdx.x));
+  }
+  const int tile = piece.tile;
   if (tile < 0) return;
   const TileList list = list_of(params.lists, params.grid, tile);
+  if (overflow_only && !list.overflow) return;
+  const int begin = piece.index * kSegment, end = kSegment > 0 ? begin + kSegment : kWholeList;
   const StatePlaces places(params.lists, list, params.grid, tile);
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int lane = lane_id(), warp = threadIdx.x / 32, channel_count = params.channels.count;
@@ -92,9 +195,10 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
   int tile_last = 0;
 #pragma unroll
   for (int w = 0; w < Layout::kWarps; ++w) tile_last = max(tile_last, shared.last[w]);
-  if (first % kChannelGroup == 0 && !list.overflow) {  // pairs that nothing reached
+  if (!kMaps && first % kChannelGroup == 0 && !list.overflow) {  // pairs that nothing reached
     constexpr int kQuads = kChannelGroup / 4;
-    for (int k = tile_last + threadIdx.x / kQuads; k < list.count; k += Layout::kThreads / kQuads) {
+    const int rest = min(list.count, end);
+    for (int k = max(tile_last, begin) + threadIdx.x / kQuads; k < rest; k += Layout::kThreads / kQuads) {
       const int q = threadIdx.x % kQuads;
       const int64_t slot = list.slot(k);
       const float4 zero = {0, 0, 0, 0};
@@ -104,6 +208,10 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
     }
   }
 
+  const int64_t number = kSegment > 0 ? int64_t(blockIdx.x) : 0;  // of the piece
+  const auto maps_of = [&](int i) {
+    return MapMemory<F>(params.adjoint_maps, Layout::first_sample() + i, Layout::pixel_number());
+  };
   const auto gradient = [&](int channel) {  // with respect to a channel of one sample
     const float* plane = channel < channel_count ? params.dL_dimage.plane(channel, pixel.image) : nullptr;
     return pixel.inside && plane ? 1.0f / S * plane[pixel.index] : 0.0f;
@@ -120,10 +228,17 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
   }
   // Alpha is 1 - transmittance: its gradient acts like one more channel whose background is -1.
   if (first == 0 && params.dL_dalpha && pixel.inside) through -= 1.0f / S * params.dL_dalpha[pixel.index];
-  float behind[kCells];
-  Vec2<float> dL_dplace[kCells];
+  Adjoint adjoint[kCells][kColumns];
 #pragma unroll
-  for (int i = 0; i < kCells; ++i) behind[i] = through, dL_dplace[i] = {0, 0};
+  for (int i = 0; i < kCells; ++i) {
+    adjoint[i][0] = {through, {0, 0}};
+    if (kSegment > 0 && last[i] > end) adjoint[i][0] = kMaps ? Adjoint{0, {0, 0}} : maps_of(i).adjoint(number + 1);
+    if constexpr (kMaps) {
+      adjoint[i][1] = {1, {0, 0}};
+      adjoint[i][2] = {0, {1, 0}};
+      adjoint[i][3] = {0, {0, 1}};
+    }
+  }
 
   Vec2<float> places_in_front[kStateChunk][kCells];
   // Composites those of the staged splats [from, from + 32) that reach the warp; the first of them is pair k. Returns
@@ -148,13 +263,14 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
     return warp_or(shown);
   };
 
-  int k0 = (tile_last - 1) / kBatch * kBatch;
-  int32_t id = shared.stage.splat_of(list, k0, tile_last);
-  for (int k1 = tile_last; k1 > 0; k1 = k0, k0 -= kBatch) {
+  const int stop = min(tile_last, end);
+  int k0 = (stop - 1) / kBatch * kBatch;
+  int32_t id = shared.stage.splat_of(list, k0, stop);
+  for (int k1 = stop; k1 > begin; k1 = k0, k0 -= kBatch) {
     const int count = k1 - k0;
-    if (places.spacing > kStateChunk) {  // with too many pairs: from the checkpoint to the batch
+    if (kSegment == 0 && places.spacing > kStateChunk) {  // with too many pairs: from the checkpoint to the batch
       int k = k0 / places.spacing * places.spacing;
-      samples.load(params.checkpoints, places, k);
+      samples.load(params.checkpoints, places, k, last);
       for (; k < k0; k += kBatch) {
         __syncthreads();
         shared.stage.load(splats, params.channels, first, list, shared.stage.splat_of(list, k, k0));
@@ -162,7 +278,7 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
         for (int from = 0; from < kBatch; from += kStateChunk) replay(from, k + from);
       }
     }
-    const int32_t next_id = k0 > 0 ? shared.stage.splat_of(list, k0 - kBatch, k0) : -1;
+    const int32_t next_id = k0 > begin ? shared.stage.splat_of(list, k0 - kBatch, k0) : -1;
     __syncthreads();  // all have read what the last batch left
     shared.stage.load(splats, params.channels, first, list, id);
     if (id >= 0) {
@@ -177,11 +293,11 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
     for (int from = kBatch - kStateChunk; from >= 0; from -= kStateChunk) {
       uint32_t shown = 0;
       if (k0 + from < warp_last) {
-        if (places.spacing > kStateChunk) {
+        if (kSegment == 0 && places.spacing > kStateChunk) {
           samples = at_batch;
           for (int ahead = 0; ahead < from; ahead += kStateChunk) replay(ahead, k0 + ahead);
         } else {
-          samples.load(params.checkpoints, places, k0 + from);
+          samples.load(params.checkpoints, places, k0 + from, last);
         }
         shown = replay(from, k0 + from);
       }
@@ -207,13 +323,21 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
           const Vec2<float> z = F::whitened_node(splat.terms, of_pixel, place);
           const float raw = exp2(F::log_alpha(splat.terms, z));
           const bool mask = raw >= float(kAlphaMin) && k0 + j < last[i];
-          const MovingBlendGrad<float> grad =
-              blend_placed_sample_vjp<F>(splat.terms, z, mask ? raw : 0.0f, samples.bounds[i], g_color, place,
-                                         samples.transmittance[i], behind[i], dL_dplace[i]);
+          MovingBlendGrad<float> grad;
+          float in_front = 1;
+#pragma unroll
+          for (int c = kColumns - 1; c >= 0; --c) {  // the sums are those of the first
+            Adjoint& a = adjoint[i][c];
+            in_front = samples.transmittance[i];
+            grad = blend_placed_sample_vjp<F>(splat.terms, z, mask ? raw : 0.0f, samples.bounds[i],
+                                              c == 0 ? g_color : 0.0f, place, in_front, a.behind, a.dL_dplace);
+          }
+          samples.transmittance[i] = in_front;
           const PairGrad<float> of_sample = {grad.of_splat.sums, grad.of_splat.weighted};
           sum = i == 0 ? of_sample : sum + of_sample;
           contribution = i == 0 ? grad.contribution : contribution + grad.contribution;
         }
+        if (kMaps) continue;
         float* sums = shared.sums[warp][j];
         if (with_means && with_shape) {
           const Vec2<float> offset = {Layout::sum_lanes(sum.shape.offset.x), Layout::sum_lanes(sum.shape.offset.y)};
@@ -228,6 +352,7 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
       }
       if (lane == 0) shared.hits[warp][from / kStateChunk] = shown;
     }
+    if (kMaps) continue;
     __syncthreads();
     const int used = with_means ? Shared::kSums : Shared::kMeans;
     for (int t = threadIdx.x; t < count * used; t += Layout::kThreads) {
@@ -251,6 +376,13 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
       } else if (with_shape) {
         put(v < 6 ? v : kPairMeans + v - Shared::kMeans);
       }
+    }
+  }
+  if constexpr (kMaps) {
+#pragma unroll
+    for (int i = 0; i < kCells; ++i) {
+      const Adjoint(&a)[kColumns] = adjoint[i];
+      if (last[i] > begin) maps_of(i).put(number, AdjointMap{a[0], a[1], a[2].dL_dplace, a[3].dL_dplace});
     }
   }
 }

@@ -54,6 +54,9 @@ struct alignas(8) SlotPair {
 inline constexpr int kStateChunk = 32;
 AR_HD constexpr int state_planes(int samples) { return 3 * samples; }
 
+/// No fewer pieces of up to `length` pairs than `pairs` pairs in the lists of a grid's tiles make.
+inline int64_t max_pieces(int64_t pairs, int length, TileGrid grid) { return pairs / length + grid.tiles(); }
+
 /// 1, 2 and 3, 4 to 7, 8 to 15, or 16 samples.
 inline constexpr int kSampleClasses = 5;
 AR_HD constexpr int sample_class(int samples) {
@@ -223,8 +226,9 @@ struct BlendParams : ar::BlendParams<float> {
   int32_t* tile_open;   ///< [tiles] whether the tile is one of the open ones
   int32_t* open_tiles;  ///< [kSampleClasses, tiles]
   CheckpointLayout layout;
-  float* checkpoints;  ///< [planes, kTile^2]
-  Segments segments;   ///< for more than kFewChannels channels
+  float* checkpoints;     ///< [planes, kTile^2]
+  uint32_t* reach_words;  ///< [max_reach_words]
+  Segments segments;      ///< for more than kFewChannels channels
 };
 
 struct InspectParams : ar::InspectParams<float> {
@@ -241,7 +245,8 @@ struct BlendVjpParams : ar::BlendVjpParams<float> {
   float* pair_grads;    ///< [max(capacity, n), kPairGradWidth] by slot, or by splat if there are too many pairs
   float* channel_sums;  ///< [max(capacity, n), kChannelGroup] likewise, for more than kFewChannels channels; or null
   MeanSums mean_sums;
-  Segments segments;  ///< as in BlendParams
+  Segments segments;    ///< as in BlendParams
+  float* adjoint_maps;  ///< [max_adjoint_maps]
 };
 
 /// Sums over the pairs of every splat.
@@ -303,6 +308,10 @@ bool blends_whole_lists(int footprint, int64_t channels);
 /// Planes of kMovingTile^2 floats in BlendParams::checkpoints of a footprint whose samples move, for a backward pass.
 /// None for the others.
 int64_t max_state_planes(int footprint, int64_t capacity);
+/// Numbers in BlendParams::reach_words and BlendVjpParams::adjoint_maps, which only footprints whose samples move need,
+/// and only in small images.
+int64_t max_reach_words(int footprint, int64_t capacity, TileGrid grid);
+int64_t max_adjoint_maps(int footprint, int64_t capacity, TileGrid grid);
 /// Segments of each tile's list that many channels are blended in.
 int list_segments(int footprint, int64_t channels, TileGrid grid);
 /// Channels that a group-less blending is compiled for: 3 in the splats themselves, or 4 in rows.

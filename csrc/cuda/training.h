@@ -1,12 +1,13 @@
-// The launches of a training step besides rendering, in float and double: loss, activations and optimiser. All pointers
-// are views of device memory. Every function enqueues work on a stream and returns; none waits for the device, and bits
-// do not depend on the order in which blocks run.
+// The launches of a training step besides rendering, in float and double: loss, activations,
+// optimiser and what density control observes. All pointers are views of device memory. Every function enqueues work on
+// a stream and returns; none waits for the device, and bits do not depend on the order in which blocks run.
 #pragma once
 
 #include <cuda_runtime_api.h>
 
 #include "core/activations.h"
 #include "core/adam.h"
+#include "core/density.h"
 #include "core/ssim.h"
 
 namespace ar::cuda {
@@ -19,6 +20,8 @@ template <typename T, typename Target> void ssim_vjp(const SsimVjpParams<T, Targ
 
 template <typename T> void activate(const ActivateParams<T>& p, cudaStream_t stream);
 template <typename T> void activate_vjp(const ActivateVjpParams<T>& p, cudaStream_t stream);
+
+template <typename T> void observe(const ObserveParams<T>& p, cudaStream_t stream);
 
 /// p.first_item need not be set; at least one tensor, and fewer than 2^40 numbers.
 template <typename T> void adam(AdamParams<T> p, cudaStream_t stream);

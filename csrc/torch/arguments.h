@@ -230,8 +230,66 @@ struct ActivateArguments {
   }
 };
 
+/// Arguments of `picture_gradients`: a scene by the parameters that a training optimises, a plain or a full camera, and
+/// what the picture should be.
+struct PictureArguments : FootprintArguments {
+  Tensor means, log_scales, quats, logit_opacities, shs;
+  int64_t mean_columns = 0;  ///< of the gradient with respect to means2D, 3 or 4; 0: none is wanted
+  Tensor target, dL_dloss;   ///< as of `l1_ssim`; ()
+  double ssim_weight = 0;
+  Tensor bg, viewmatrix, projmatrix, campos;
+  OptionalTensor lens;
+  int64_t image_height = 0, image_width = 0;
+  double tanfovx = 0, tanfovy = 0, scale_modifier = 1;
+  int64_t sh_degree = 0;
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("means", means);
+    visit("log_scales", log_scales);
+    visit("quats", quats);
+    visit("logit_opacities", logit_opacities);
+    visit("shs", shs);
+    visit("mean_columns", mean_columns);
+    visit("target", target);
+    visit("dL_dloss", dL_dloss);
+    visit("ssim_weight", ssim_weight);
+    visit("bg", bg);
+    visit("viewmatrix", viewmatrix);
+    visit("projmatrix", projmatrix);
+    visit("campos", campos);
+    visit("lens", lens);
+    visit("image_height", image_height);
+    visit("image_width", image_width);
+    visit("tanfovx", tanfovx);
+    visit("tanfovy", tanfovy);
+    visit("scale_modifier", scale_modifier);
+    visit("sh_degree", sh_degree);
+    FootprintArguments::each(visit);
+  }
+};
+
 /// Tensors that an op writes to, marked in its schema by a letter that no other argument has.
 template <char kLetter> struct WrittenTensors : std::vector<Tensor> {};
+
+/// A tensor that an op writes to, likewise.
+template <char kLetter> struct WrittenTensor : Tensor {};
+
+/// Arguments of `observe_`: a picture's gradients and radii, and the sums that they are added to (core/density.h).
+struct ObserveArguments {
+  WrittenTensor<'a'> gradient_sums;  ///< (P,)
+  WrittenTensor<'b'> views;          ///< (P,) int32
+  Tensor gradients;                  ///< (P, 3) or (P, 4), with respect to means2D
+  Tensor radii;                      ///< (P,) int32
+  int64_t first_column = 0;          ///< of the two columns of `gradients` that are looked at
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("gradient_sums", gradient_sums);
+    visit("views", views);
+    visit("gradients", gradients);
+    visit("radii", radii);
+    visit("first_column", first_column);
+  }
+};
 
 /// Arguments of `adam_`: a step on several tensors (core/adam.h). The lists have a member for each of them.
 struct AdamArguments {
@@ -244,6 +302,10 @@ struct AdamArguments {
   double beta1 = 0, beta2 = 0, eps = 0;
   OptionalTensor rows;  ///< (P,) bool or uint8
   bool bias_correction = true;
+  /// The first numbers of every row, along the first dimension, that have a learning rate of their own, and that rate;
+  /// 0: none. Empty lists: none at all.
+  std::vector<int64_t> heads;
+  std::vector<double> head_rates;
 
   template <class Visit> void each(Visit&& visit) {
     visit("params", params);
@@ -257,6 +319,8 @@ struct AdamArguments {
     visit("eps", eps);
     visit("rows=None", rows);
     visit("bias_correction=True", bias_correction);
+    visit("heads=[]", heads);
+    visit("head_rates=[]", head_rates);
   }
 };
 
@@ -286,6 +350,10 @@ template <char kLetter> std::string type_in_schema(const WrittenTensors<kLetter>
   return std::string("Tensor(") + kLetter + "!)[]";
 }
 
+template <char kLetter> std::string type_in_schema(const WrittenTensor<kLetter>&) {
+  return std::string("Tensor(") + kLetter + "!)";
+}
+
 /// "Tensor means3D, Tensor? means2D, ...".
 template <class Arguments> std::string schema_of() {
   std::string text;
@@ -306,6 +374,9 @@ inline void assign(const IValue& from, std::vector<OptionalTensor>& to) {
 }
 template <char kLetter> void assign(const IValue& from, WrittenTensors<kLetter>& to) {
   static_cast<std::vector<Tensor>&>(to) = from.toTensorVector();
+}
+template <char kLetter> void assign(const IValue& from, WrittenTensor<kLetter>& to) {
+  static_cast<Tensor&>(to) = from.toTensor();
 }
 
 /// Takes an op's arguments off the dispatcher's stack.

@@ -22,6 +22,7 @@ using torch::jit::Stack;
 struct Op {
   c10::OperatorHandle forward, vjp;
   std::vector<size_t> tensors;  ///< places of the arguments that are tensors
+  std::vector<size_t> lists;    ///< and of those that are lists of them, which have no gradient
   size_t arguments, outputs;
   std::optional<size_t> keep;  ///< place of the argument that asks for the state that the adjoint needs
 
@@ -36,6 +37,7 @@ struct Op {
       if (type.isSubtypeOf(*c10::TensorType::get()) ||
           type.isSubtypeOf(*c10::OptionalType::create(c10::TensorType::get())))
         tensors.push_back(i);
+      if (type.isSubtypeOf(*c10::ListType::ofTensors())) lists.push_back(i);
       if (argument.name() == "keep") keep = i;
     }
   }
@@ -56,6 +58,12 @@ struct Node : torch::autograd::Function<Node> {
       given.push_back(is_given(others[i]));
       others[i] = IValue();
     }
+    variable_list listed;  // kept with the tensors, so that they are freed as soon as the adjoint has run
+    for (const size_t i : op->lists) {
+      const std::vector<Tensor> list = others[i].toTensorVector();
+      listed.insert(listed.end(), list.begin(), list.end());
+      others[i] = int64_t(list.size());
+    }
     op->forward.callBoxed(*stack);
     variable_list out, integers;
     size_t differentiable = 0;
@@ -74,7 +82,10 @@ struct Node : torch::autograd::Function<Node> {
     ctx->mark_non_differentiable({out.begin() + differentiable, out.end()});
     variable_list saved(tensors.begin(), tensors.end());
     if (op->saves()) saved.insert(saved.end(), out.end() - sizes->back(), out.end());
+    const int64_t own = int64_t(saved.size());
+    saved.insert(saved.end(), listed.begin(), listed.end());
     ctx->save_for_backward(std::move(saved));
+    ctx->saved_data["own"] = own;
     ctx->saved_data["op"] = int64_t(reinterpret_cast<intptr_t>(op));  // lives for ever
     ctx->saved_data["arguments"] = c10::ivalue::Tuple::create(std::move(others));
     ctx->saved_data["given"] = given;
@@ -107,7 +118,13 @@ struct Node : torch::autograd::Function<Node> {
       stack[1 + op->tensors[places[k]]] = saved[k];
       needs[places[k]] = ctx->needs_input_grad(k);
     }
-    stack.push_back(c10::List<Tensor>(std::vector<Tensor>(saved.begin() + int64_t(places.size()), saved.end())));
+    auto end = saved.begin() + ctx->saved_data["own"].toInt();
+    stack.push_back(c10::List<Tensor>(std::vector<Tensor>(saved.begin() + int64_t(places.size()), end)));
+    for (const size_t i : op->lists) {
+      const auto first = end;
+      end += stack[1 + i].toInt();
+      stack[1 + i] = c10::List<Tensor>(std::vector<Tensor>(first, end));
+    }
     stack.push_back(needs);
     op->vjp.callBoxed(stack);
     const std::vector<Tensor> out = stack[0].toTensorVector();
@@ -171,7 +188,7 @@ TORCH_LIBRARY_IMPL(analytic_rasterizer, Autograd, m) {
   for (const char* name : {"rasterize", "project", "blend", "footprint_weight", "ssim_map", "l1_ssim", "activate"})
     m.impl(name, torch::CppFunction::makeFromBoxedFunction<&differentiate>());
   for (const char* name : {"rasterize_vjp", "project_vjp", "blend_vjp", "footprint_weight_vjp", "ssim_map_vjp",
-                           "l1_ssim_vjp", "activate_vjp", "adam_"})
+                           "l1_ssim_vjp", "activate_vjp", "picture_gradients", "observe_", "adam_"})
     m.impl(name, torch::autograd::autogradNotImplementedFallback());
 }
 

@@ -272,6 +272,8 @@ class CudaBackend final : public Backend {
 
     p.layout = {cuda::compiled_channels(!channels.rows.defined()), pass.keep};
     const Plan plan = make_plan(p, pass, cuda::blends_whole_lists(footprint.choice.index, channels.count), state);
+    const Tensor reach = at::empty({cuda::max_reach_words(footprint.choice.index, p.lists.capacity, grid)}, ints_);
+    p.reach_words = structs_of<uint32_t>(reach);
     p.segments.count = cuda::list_segments(footprint.choice.index, channels.count, grid);
     if (p.segments.count == 1) {
       cuda::blend(footprint.choice.index, p, nullptr, stream_);
@@ -339,6 +341,9 @@ class CudaBackend final : public Backend {
     }
     p.pair_grads = pointer<float>(out.pairs);
     p.mean_sums = mean_sums;
+    const Tensor maps =
+        at::empty({cuda::max_adjoint_maps(pass.footprint.choice.index, p.lists.capacity, pass.grid)}, floats_);
+    p.adjoint_maps = pointer<float>(maps);
 
     cuda::SumChannelsParams sum = {};
     sum.sums = pair_sums_of(lists, out.pairs);

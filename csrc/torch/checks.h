@@ -21,6 +21,7 @@ void check(InspectArguments& a, const ListTensors& lists, const Pass& pass);
 void check(WeightArguments& a);
 void check(SsimArguments& a);
 void check(ActivateArguments& a);
+void check(ObserveArguments& a);
 void check(AdamArguments& a);
 
 /// The inputs of camera `c` of a batch, not yet checked.

@@ -69,6 +69,9 @@ template <class Visit> void each_op(const Visit& visit) {
   visit(Op<VjpArguments<L1SsimArguments>, l1_ssim_vjp>{}, "l1_ssim_vjp", gradients);
   visit(Op<ActivateArguments, activate>{}, "activate", "Tensor scales, Tensor rotations, Tensor opacities");
   visit(Op<VjpArguments<ActivateArguments>, activate_vjp>{}, "activate_vjp", gradients);
+  visit(Op<PictureArguments, picture_gradients>{}, "picture_gradients",
+        "Tensor loss, Tensor image, Tensor radii, Tensor[] gradients");
+  visit(Op<ObserveArguments, observe>{}, "observe_", "");
   visit(Op<AdamArguments, adam>{}, "adam_", "");
 }
 

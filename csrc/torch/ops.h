@@ -1,5 +1,6 @@
 // The ops, each written once for every device: the pass in rasterize.cpp, its stages in stages.cpp, what a training
-// step has besides in training.cpp. Registered with torch in ops.cpp, made differentiable in autograd.cpp.
+// step has besides in training.cpp, a picture of a training from end to end in picture.cpp. Registered with torch in
+// ops.cpp, made differentiable in autograd.cpp.
 #pragma once
 
 #include <vector>
@@ -49,6 +50,13 @@ Results l1_ssim_vjp(VjpArguments<L1SsimArguments> a);
 /// scales (N, 3), rotations (N, 4), opacities (N, 1)
 Results activate(ActivateArguments a);
 Results activate_vjp(VjpArguments<ActivateArguments> a);
+
+/// loss (), image (3, H, W), radii (P,) int32, gradients: with respect to means, log_scales, quats, logit_opacities,
+/// shs and, with mean_columns, means2D.
+Results picture_gradients(PictureArguments a);
+
+/// Nothing: writes to gradient_sums and views.
+Results observe(ObserveArguments a);
 
 /// Nothing: writes to params, exp_avgs and exp_avg_sqs.
 Results adam(AdamArguments a);

@@ -1,6 +1,8 @@
 // The stages of the pass as ops of their own, for one or several cameras: project, bin, blend. And the weight of a
 // footprint by itself.
+#include <algorithm>
 #include <array>
+#include <type_traits>
 #include <vector>
 
 #include "torch/checks.h"
@@ -9,6 +11,9 @@
 
 namespace ar::ops {
 namespace {
+
+/// Gaussians whose gradients from a camera after the first are made at a time.
+constexpr int64_t kGradientBlock = 1 << 18;
 
 /// The rows of camera `c` in a tensor that holds those of camera after camera.
 Tensor rows_of(const Tensor& t, const Tensor& row_splits, int64_t c) {
@@ -29,6 +34,29 @@ RowTensors make_rows(int64_t n, bool with_colors, const at::TensorOptions& optio
   rows.depths = at::empty({n}, options);
   rows.colors = at::empty({with_colors ? n : 0, 3}, options);
   return rows;
+}
+
+/// The Gaussians from `begin` to `end` alone, as the kernels read them.
+Inputs part_of(Inputs in, int64_t begin, int64_t end) {
+  size_t place = 0;
+  const auto cut = [&](Tensor& t) { t = t.slice(0, begin, end); };
+  in.each_tensor([&](const char*, auto& t) {
+    if (place++ >= kGaussianTensors) return;
+    if constexpr (std::is_same_v<decltype(t), Tensor&>) {
+      cut(t);
+    } else if (t) {
+      cut(*t);
+    }
+  });
+  return in;
+}
+
+/// Whether int32 `ids` number rows of `count`. Waits for the device once.
+bool are_rows_of(const Tensor& ids, int64_t count) {
+  if (ids.numel() == 0) return true;
+  const auto [least, most] = at::aminmax(ids);
+  const Tensor ends = at::stack({least, most}).cpu();
+  return ends[0].item<int64_t>() >= 0 && ends[1].item<int64_t>() < count;
 }
 
 /// What one camera has of a blending.
@@ -102,8 +130,7 @@ Results project_vjp(VjpArguments<ProjectArguments> arguments) {
   const Tensor ids = arguments.saved[1], splits = arguments.saved[2];
   const int64_t n = ids.numel(), count = a.count();
   TORCH_CHECK_VALUE(splits.numel() == cameras + 1 && splits.device().is_cpu() && splits.scalar_type() == at::kLong &&
-                        ids.scalar_type() == at::kInt && splits[-1].item<int64_t>() == n &&
-                        (n == 0 || (ids.min().item<int64_t>() >= 0 && ids.max().item<int64_t>() < count)),
+                        ids.scalar_type() == at::kInt && splits[-1].item<int64_t>() == n && are_rows_of(ids, count),
                     "saved must be what project saved for the same arguments");
   const auto options = a.means3D.options();
   const auto gradient = [&](size_t place, const char* name, std::vector<int64_t> sizes) {
@@ -126,12 +153,25 @@ Results project_vjp(VjpArguments<ProjectArguments> arguments) {
     const int64_t first = splits[c].item<int64_t>(), last = splits[c + 1].item<int64_t>();
     const Tensor rows = at::full({count}, -1, ids.options());
     rows.index_put_({ids.slice(0, first, last).to(at::kLong)}, at::arange(first, last, ids.options()));
-    Grads grads = make_grads(in, needs);
-    const Tensor camera = backend->project_rows_vjp(in, rows, dL_drows, grads);
-    if (grads.with_camera) set_camera_grads(camera, needs, grads);
-    const std::vector<Tensor> list = list_of(grads, in.means3D);
-    for (size_t k = 0; k < kGaussianTensors; ++k) sums[k] = c == 0 ? list[k] : sums[k].add_(list[k]);
-    for (size_t k = 0; k < kCameraTensors; ++k) of_cameras[k].push_back(list[kGaussianTensors + k]);
+    // Block by block, so that no camera but the first needs memory for the gradients of all Gaussians. Those of the
+    // camera are sums over all of them.
+    const int64_t block = c == 0 || in.lens ? std::max<int64_t>(count, 1) : kGradientBlock;
+    for (int64_t begin = 0; begin == 0 || begin < count; begin += block) {
+      const int64_t end = std::min(begin + block, count);
+      const Inputs part = part_of(in, begin, end);
+      Grads grads = make_grads(part, needs);
+      const Tensor camera = backend->project_rows_vjp(part, rows.slice(0, begin, end), dL_drows, grads);
+      if (grads.with_camera) set_camera_grads(camera, needs, grads);
+      const std::vector<Tensor> list = list_of(grads, in.means3D);
+      for (size_t k = 0; k < kGaussianTensors; ++k) {
+        if (c == 0) {
+          sums[k] = list[k];
+        } else {
+          sums[k].slice(0, begin, end).add_(list[k]);
+        }
+      }
+      for (size_t k = 0; begin == 0 && k < kCameraTensors; ++k) of_cameras[k].push_back(list[kGaussianTensors + k]);
+    }
   }
   std::vector<Tensor> out;
   arguments.of_op.each_tensor([&](std::string_view name, const OptionalTensor& tensor) {

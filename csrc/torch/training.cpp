@@ -1,4 +1,5 @@
-// What a training step has besides rendering, as ops: the loss, the activations and the optimiser.
+// What a training step has besides rendering, as ops: the loss, the activations, what density control observes, and the
+// optimiser.
 #include "torch/training.h"
 
 #include "torch/checks.h"
@@ -36,6 +37,11 @@ SsimTensors make_ssim_vjp(SsimArguments& a, const std::vector<Tensor>& saved, co
   t.partials = saved[0].contiguous();
   t.dL_dimage = at::empty(a.image.sizes(), a.image.options());
   return t;
+}
+
+/// So that autograd notices where a backward pass still needs the values of before. Inference tensors have no version.
+void note_written(const Tensor& t) {
+  if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();
 }
 
 /// What the adjoint returns: the gradient with respect to image, and none with respect to target.
@@ -109,17 +115,22 @@ Results activate_vjp(VjpArguments<ActivateArguments> arguments) {
   return {std::vector<Tensor>{t.dL_dlog_scales, t.dL_dquats, t.dL_dlogit_opacities}};
 }
 
+Results observe(ObserveArguments a) {
+  check(a);
+  training_kernels(a.gradient_sums).observe(a);
+  note_written(a.gradient_sums);
+  note_written(a.views);
+  return {};
+}
+
 Results adam(AdamArguments a) {
   check(a);
   if (a.params.empty()) return {};
   training_kernels(a.params[0]).adam(a);
-  // So that autograd notices where a backward pass still needs the values of before. Inference tensors have no version.
   for (const std::vector<Tensor>* written :
        {static_cast<const std::vector<Tensor>*>(&a.params), static_cast<const std::vector<Tensor>*>(&a.exp_avgs),
         static_cast<const std::vector<Tensor>*>(&a.exp_avg_sqs)}) {
-    for (const Tensor& t : *written) {
-      if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();
-    }
+    for (const Tensor& t : *written) note_written(t);
   }
   return {};
 }

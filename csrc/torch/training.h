@@ -6,6 +6,7 @@
 
 #include "core/activations.h"
 #include "core/adam.h"
+#include "core/density.h"
 #include "core/ssim.h"
 #include "torch/arguments.h"
 
@@ -40,6 +41,7 @@ class TrainingKernels {
   virtual void ssim_vjp(const SsimTensors& t) const = 0;
   virtual void activate(const ActivateTensors& t) const = 0;
   virtual void activate_vjp(const ActivateTensors& t) const = 0;
+  virtual void observe(const ObserveArguments& a) const = 0;
   virtual void adam(const AdamArguments& a) const = 0;
 };
 const TrainingKernels& cpu_training_kernels();
@@ -124,6 +126,18 @@ template <typename T> ActivateVjpParams<T> activate_vjp_params(const ActivateTen
   return p;
 }
 
+template <typename T> ObserveParams<T> observe_params(const ObserveArguments& a) {
+  ObserveParams<T> p = {};
+  p.n = a.gradient_sums.numel();
+  p.gradients = const_pointer<T>(a.gradients);
+  p.stride = int(a.gradients.size(1));
+  p.first = int(a.first_column);
+  p.radii = const_pointer<int32_t>(a.radii);
+  p.gradient_sums = pointer<T>(a.gradient_sums);
+  p.views = pointer<int32_t>(a.views);
+  return p;
+}
+
 /// For the tensor at place i. Powers in double precision, since 1 - beta2^step is small at first.
 template <typename T> AdamRule<T> adam_rule(const AdamArguments& a, size_t i) {
   AdamRule<T> rule = {};
@@ -133,7 +147,9 @@ template <typename T> AdamRule<T> adam_rule(const AdamArguments& a, size_t i) {
   rule.one_minus_beta2 = T(1 - a.beta2);
   rule.eps = T(a.eps);
   const double step = double(a.steps[i]);
-  rule.rate = T(a.bias_correction ? a.rates[i] / (1 - std::pow(a.beta1, step)) : a.rates[i]);
+  const double bias = a.bias_correction ? 1 - std::pow(a.beta1, step) : 1;
+  rule.rate = T(a.rates[i] / bias);
+  if (!a.heads.empty()) rule.head_rate = T(a.head_rates[i] / bias);
   rule.root_scale = T(a.bias_correction ? 1 / std::sqrt(1 - std::pow(a.beta2, step)) : 1);
   return rule;
 }
@@ -142,7 +158,8 @@ template <typename T> AdamRule<T> adam_rule(const AdamArguments& a, size_t i) {
 template <typename T> AdamTensor<T> adam_tensor(const AdamArguments& a, size_t i) {
   AdamTensor<T> t = {};
   t.n = a.params[i].numel();
-  t.row_size = a.rows ? t.n / a.rows->numel() : t.n;
+  t.head = a.heads.empty() ? 0 : a.heads[i];
+  t.row_size = a.rows || t.head > 0 ? t.n / a.params[i].size(0) : t.n;
   t.rule = adam_rule<T>(a, i);
   t.grad = const_pointer<T>(a.grads[i]);
   t.param = pointer<T>(a.params[i]);

@@ -67,6 +67,27 @@ void check(ActivateArguments& a) {
   like.check_rows_of(a.logit_opacities, "logit_opacities", {1}, "(N, 1)");
 }
 
+void check(ObserveArguments& a) {
+  const Tensor& sums = a.gradient_sums;
+  check_floating(sums, "gradient_sums");
+  check_shape(sums.dim() == 1 && sums.is_contiguous(), sums, "gradient_sums", "(P,), contiguous");
+  const Like like{sums, "gradient_sums"};
+  const auto check_counts = [&](const Tensor& t, const char* name) {
+    TORCH_CHECK_TYPE(t.scalar_type() == at::kInt, name, " must have dtype int32, got ", t.scalar_type());
+    TORCH_CHECK_VALUE(t.device() == sums.device(), name, " must be on the device of gradient_sums, ", sums.device(),
+                      ", got ", t.device());
+    check_shape(t.sizes() == sums.sizes(), t, name, "(P,) with P = ", sums.numel());
+  };
+  check_counts(a.views, "views");
+  TORCH_CHECK_VALUE(a.views.is_contiguous(), "views must be contiguous, got strides ", a.views.strides());
+  check_counts(a.radii, "radii");
+  a.radii = a.radii.contiguous();
+  const int64_t columns = a.gradients.dim() == 2 && a.gradients.size(1) == 4 ? 4 : 3;
+  like.check_rows_of(a.gradients, "gradients", {columns}, "(P, 3) or (P, 4)");
+  TORCH_CHECK_VALUE(a.first_column >= 0 && a.first_column + 2 <= columns, "first_column must be 0 to ", columns - 2,
+                    ", got ", a.first_column);
+}
+
 void check(AdamArguments& a) {
   const size_t count = a.params.size();
   const auto check_count = [&](size_t members, const char* name) {
@@ -77,6 +98,11 @@ void check(AdamArguments& a) {
   check_count(a.exp_avg_sqs.size(), "exp_avg_sqs");
   check_count(a.rates.size(), "rates");
   check_count(a.steps.size(), "steps");
+  const bool with_heads = !a.heads.empty() || !a.head_rates.empty();
+  if (with_heads) {
+    check_count(a.heads.size(), "heads");
+    check_count(a.head_rates.size(), "head_rates");
+  }
   TORCH_CHECK_VALUE(a.beta1 >= 0 && a.beta1 < 1, "beta1 must be in [0, 1), got ", a.beta1);
   TORCH_CHECK_VALUE(a.beta2 >= 0 && a.beta2 < 1, "beta2 must be in [0, 1), got ", a.beta2);
   TORCH_CHECK_VALUE(std::isfinite(a.eps) && a.eps >= 0, "eps must be finite and not negative, got ", a.eps);
@@ -94,15 +120,26 @@ void check(AdamArguments& a) {
     check_tensor(t, list, i);
     TORCH_CHECK_VALUE(t.is_contiguous(), list, "[", i, "] must be contiguous, got strides ", t.strides());
   };
+  const auto check_rate = [&](double rate, const char* list, size_t i) {
+    TORCH_CHECK_VALUE(std::isfinite(float(rate)) && rate >= 0, list, "[", i, "] must be finite and not negative, got ",
+                      rate);
+  };
   for (size_t i = 0; i < count; ++i) {
-    TORCH_CHECK_VALUE(std::isfinite(float(a.rates[i])) && a.rates[i] >= 0, "rates[", i,
-                      "] must be finite and not negative, got ", a.rates[i]);
+    check_rate(a.rates[i], "rates", i);
     TORCH_CHECK_VALUE(a.steps[i] >= 1, "steps[", i, "] must be at least 1, got ", a.steps[i]);
     check_floating(a.params[i], "params");
     check_written(a.params[i], "params", i);
     check_tensor(a.grads[i], "grads", i);
     check_written(a.exp_avgs[i], "exp_avgs", i);
     check_written(a.exp_avg_sqs[i], "exp_avg_sqs", i);
+    if (with_heads && a.heads[i] != 0) {
+      check_rate(a.head_rates[i], "head_rates", i);
+      const Tensor& param = a.params[i];
+      const int64_t most = param.dim() >= 1 && param.size(0) > 0 ? param.numel() / param.size(0) : a.heads[i];
+      TORCH_CHECK_VALUE(a.heads[i] > 0 && a.heads[i] <= most && param.dim() >= 1, "heads[", i,
+                        "] must be 0 to the size of a row of params[", i, "], got ", a.heads[i], " and shape ",
+                        shape_of(param));
+    }
     if (!a.rows) continue;
     TORCH_CHECK_VALUE(a.params[i].dim() >= 1 && a.params[i].size(0) == a.rows->numel(), "params[", i,
                       "] must have a row for each of rows, ", a.rows->numel(), ", got shape ", shape_of(a.params[i]));

@@ -1,4 +1,4 @@
-// The loss, the activations and the optimiser on CPU tensors.
+// The loss, the activations, the optimiser and what density control observes, on CPU tensors.
 #include "cpu/training.h"
 #include "torch/backend.h"
 #include "torch/training.h"
@@ -25,6 +25,10 @@ class CpuTrainingKernels final : public TrainingKernels {
   void activate_vjp(const ActivateTensors& t) const override {
     visit_scalar(t.log_scales,
                  [&](auto scalar) { cpu::activate_vjp(activate_vjp_params<decltype(scalar)>(t), thread_count()); });
+  }
+  void observe(const ObserveArguments& a) const override {
+    visit_scalar(a.gradient_sums,
+                 [&](auto scalar) { cpu::observe(observe_params<decltype(scalar)>(a), thread_count()); });
   }
   void adam(const AdamArguments& a) const override {
     visit_scalar(a.params[0], [&](auto scalar) {

@@ -1,4 +1,5 @@
-// The loss, the activations and the optimiser on CUDA tensors. Nothing here waits for the device.
+// The loss, the activations, the optimiser and what density control observes, on CUDA tensors. Nothing here waits for
+// the device.
 #include <c10/cuda/CUDAException.h>
 #include <c10/cuda/CUDAGuard.h>
 #include <c10/cuda/CUDAStream.h>
@@ -51,6 +52,12 @@ class CudaTrainingKernels final : public TrainingKernels {
     visit_scalar(t.log_scales, [&](auto scalar) {
       const auto p = activate_vjp_params<decltype(scalar)>(t);
       on_stream(t.log_scales, [&](cudaStream_t stream) { cuda::activate_vjp(p, stream); });
+    });
+  }
+  void observe(const ObserveArguments& a) const override {
+    visit_scalar(a.gradient_sums, [&](auto scalar) {
+      const auto p = observe_params<decltype(scalar)>(a);
+      on_stream(a.gradient_sums, [&](cudaStream_t stream) { cuda::observe(p, stream); });
     });
   }
   void adam(const AdamArguments& a) const override {

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any, TypeVar
 
 import torch
@@ -98,19 +97,13 @@ class Sharing:
         Returns:
             The splats, and what takes the absolute gradients of all of them, one camera after the other.
         """
-        spans = list(pairwise(splats.row_splits.tolist()))
-        shard, of_cameras = [], []
-        for first, end in spans:
-            names = ("means2d", "cov2d", "opacities", "depths", "radii", "gaussian_ids", "camera_ids", "dets")
-            rows = {name: getattr(splats, name)[first:end] for name in names}
-            shard.append(replace(splats, **rows, colors=features[first:end], row_splits=torch.tensor([0, end - first])))
-            of_cameras.append(None if absolute is None else absolute[first:end])
-        counts = gather([end - first for first, end in spans], self.world, None)
+        shard = replace(splats, colors=features).split()
+        sizes = [len(of_camera.means2d) for of_camera in shard]
+        of_cameras = () if absolute is None else absolute.split(sizes)
+        counts = gather(sizes, self.world, None)
         owned = [list(range(r * self.cameras, (r + 1) * self.cameras)) for r in range(self.world)]
         route = Route(counts, owned, self.rank, None)
-        own, own_absolute, _ = exchange(
-            route, tuple(shard), () if absolute is None else tuple(of_cameras), self.first_id, self.join
-        )
+        own, own_absolute, _ = exchange(route, tuple(shard), of_cameras, self.first_id, self.join)
         return own, None if own_absolute is None else torch.cat(own_absolute)
 
 

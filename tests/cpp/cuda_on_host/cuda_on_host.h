@@ -144,6 +144,10 @@ inline uint32_t __ballot_sync(uint32_t, bool x) {
 }
 inline bool __any_sync(uint32_t lanes, bool x) { return __ballot_sync(lanes, x) != 0; }
 template <class T> T __shfl_sync(uint32_t, T x, int lane) { return cuda_on_host::from_lane(x, lane); }
+template <class T> T __shfl_up_sync(uint32_t, T x, int lanes) {
+  const int lane = int(threadIdx.x % 32);
+  return cuda_on_host::from_lane(x, lane < lanes ? lane : lane - lanes);
+}
 template <class T> T __shfl_xor_sync(uint32_t, T x, int lanes) {
   return cuda_on_host::from_lane(x, int(threadIdx.x % 32) ^ lanes);
 }

@@ -7,6 +7,7 @@
 #include <gtest/gtest.h>
 
 #include "core/inspect.h"
+#include "cuda/blend_listed.cuh"
 #include "cuda/blend_moving_vjp.cuh"
 
 namespace ar::cuda {
@@ -16,19 +17,19 @@ float4* dynamic_shared() { return memory; }
 
 namespace {
 
-constexpr int kWidth = 21, kHeight = 18, kPixels = kWidth * kHeight, kSplats = 150, kColors = 3;
+constexpr int kWidth = 21, kHeight = 18, kPixels = kWidth * kHeight, kColors = 3;
 constexpr TileGrid kGrid = {kWidth, kHeight, kMovingTileBits};
 
-/// A random scene, of which every tile lists all splats.
+/// A random scene, of which every tile lists all splats, or all but one the first `others`.
 template <class F> struct Scene {
-  std::vector<Splat<F, float>> splats = std::vector<Splat<F, float>>(kSplats);
+  std::vector<Splat<F, float>> splats;
   std::vector<SlotPair> pairs;
   std::vector<int64_t> offsets = {0};
   std::vector<float> background = {0.2f, 0.5f, 0.9f}, dL_dimage = std::vector<float>(kColors * kPixels);
   Counts counts = {};
   TileLists lists = {};
 
-  Scene() {
+  explicit Scene(int count, int others, float most_opaque) : splats(count) {
     std::mt19937 bits(7);
     const auto uniform = [&](float low, float high) { return std::uniform_real_distribution<float>(low, high)(bits); };
     for (Splat<F, float>& splat : splats) {
@@ -37,21 +38,21 @@ template <class F> struct Scene {
       const Cov2d<float> cov = {a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c, a * b};
       splat.mean = {uniform(0, kWidth), uniform(0, kHeight)};
       splat.shape = F::prepare(cov, FootprintOptions{0});
-      splat.opacity = uniform(0.05f, 0.95f);
+      splat.opacity = uniform(0.02f, most_opaque);
       splat.level = F::level(splat.shape, splat.opacity);
       splat.color = {uniform(0, 1), uniform(0, 1), uniform(0, 1)};
     }
     for (float& x : dL_dimage) x = uniform(-0.5f, 0.5f);
     for (int tile = 0; tile < kGrid.tiles(); ++tile) {
-      for (int k = 0; k < kSplats; ++k) pairs.push_back({k, int32_t(pairs.size())});
+      for (int k = 0; k < (tile == 4 ? count : others); ++k) pairs.push_back({k, int32_t(pairs.size())});
       offsets.push_back(int64_t(pairs.size()));
     }
-    counts = {int64_t(pairs.size()), kSplats};
+    counts = {int64_t(pairs.size()), count};
     lists.pairs = &pairs[0].splat;
     lists.stride = 2;
     lists.tile_offsets = offsets.data();
     lists.counts = &counts;
-    lists.n = kSplats;
+    lists.n = count;
     lists.capacity = int64_t(pairs.size());
   }
 };
@@ -61,8 +62,9 @@ struct Results {
   std::vector<int32_t> last;
 };
 
-/// Forwards with one layout, back with another.
-template <class F, class Forward, class Backward> Results run(Scene<F>& scene) {
+/// Forwards with one layout, back with another: whole lists, or with kSegment > 0 lists of groups of pixels and
+/// segments of so many pairs.
+template <class F, class Forward, class Backward, int kSegment = 0> Results run(Scene<F>& scene) {
   constexpr int S = F::kSamples;
   const int tiles = int(kGrid.tiles());
   Results out;
@@ -71,7 +73,7 @@ template <class F, class Forward, class Backward> Results run(Scene<F>& scene) {
   out.transmittance.resize(S * kPixels);
   out.last.resize(S * kPixels);
   out.pair_grads.resize(scene.pairs.size() * kPairGradWidth);
-  std::vector<float> checkpoints(scene.pairs.size() / kStateChunk * state_planes(S) * kMovingPixels);
+  std::vector<float> checkpoints(scene.pairs.size() / kStateChunk * state_planes(S) * kMovingPixels, NAN);
   PlanState state = {};
   std::vector<int32_t> order;
   std::vector<TileChunk> chunks;
@@ -90,7 +92,16 @@ template <class F, class Forward, class Backward> Results run(Scene<F>& scene) {
   blend.lists = scene.lists;
   blend.plan.tile_order = order.data();
   blend.checkpoints = checkpoints.data();
-  cuda_on_host::launch(tiles, Forward::kThreads, [&] { moving_blend_kernel<F, kColors, Forward>(blend, 0); });
+  std::vector<uint32_t> reach_words(filter_words<Forward>(scene.lists.capacity, kGrid));
+  blend.reach_words = reach_words.data();
+  if constexpr (kSegment > 0) {
+    cuda_on_host::launch(int(max_pieces(scene.lists.capacity, kFilterPiece, kGrid)), kFilterPiece,
+                         [&] { filter_kernel<F, Forward>(blend); });
+    cuda_on_host::launch(tiles * Forward::kBlocks, Forward::kThreads,
+                         [&] { listed_blend_kernel<F, kColors, Forward>(blend, 0); });
+  } else {
+    cuda_on_host::launch(tiles, Forward::kThreads, [&] { moving_blend_kernel<F, kColors, Forward>(blend, 0, false); });
+  }
 
   BlendVjpParams vjp = {};
   vjp.grid = kGrid;
@@ -108,7 +119,18 @@ template <class F, class Forward, class Backward> Results run(Scene<F>& scene) {
   vjp.pair_grads = out.pair_grads.data();
   vjp.mean_sums = MeanSums::kNorm;
   static_assert(sizeof(MovingVjpShared<F, kColors, Backward>) <= sizeof memory);
-  cuda_on_host::launch(tiles, Backward::kThreads, [&] { moving_vjp_kernel<F, kColors, Backward>(vjp, 0); });
+  if constexpr (kSegment > 0) {
+    const int pieces = int(max_pieces(scene.lists.capacity, kSegment, kGrid));
+    std::vector<float> maps(size_t(pieces) * AdjointMap::kNumbers * S * kMovingPixels, NAN);
+    vjp.adjoint_maps = maps.data();
+    cuda_on_host::launch(pieces, Backward::kThreads,
+                         [&] { moving_vjp_kernel<F, kColors, Backward, kSegment, true>(vjp, 0, false); });
+    cuda_on_host::launch(tiles * S, kMovingPixels, [&] { chain_maps_kernel<F, kSegment>(vjp); });
+    cuda_on_host::launch(pieces, Backward::kThreads,
+                         [&] { moving_vjp_kernel<F, kColors, Backward, kSegment>(vjp, 0, false); });
+  } else {
+    cuda_on_host::launch(tiles, Backward::kThreads, [&] { moving_vjp_kernel<F, kColors, Backward>(vjp, 0, false); });
+  }
   return out;
 }
 
@@ -132,7 +154,7 @@ template <class F> void expect_composited(const Scene<F>& scene, const Results& 
     PixelSummary<double, F> pixel;
     pixel.start(true);
     double color[kColors] = {};
-    for (int k = 0; k < kSplats; ++k) {
+    for (int k = 0; k < int(scene.splats.size()); ++k) {
       const Splat<F, float>& splat = scene.splats[k];
       GaussianShape<double> shape = {{splat.shape.w.xx, splat.shape.w.xy, splat.shape.w.yx, splat.shape.w.yy},
                                      splat.shape.amp};
@@ -157,13 +179,23 @@ TYPED_TEST_SUITE(MovingKernels, Moments);
 
 TYPED_TEST(MovingKernels, AgreeWhateverTheLayouts) {
   using F = TypeParam;
+  using Fine = CellLayout<F::kSamples <= 4 ? 1 : 2, 8>;
   using Forward = EvenLayout<F, false>;
   using Backward = EvenLayout<F, true>;
-  Scene<F> scene;
-  const Results fine = run<F, FineLayout<F, kColors>, FineLayout<F, kColors>>(scene);
+  Scene<F> scene(150, 150, 0.95f);
+  const Results fine = run<F, Fine, Fine>(scene);
   expect_composited(scene, fine);
   expect_same(run<F, Forward, Backward>(scene), fine);
-  expect_same(run<F, FineLayout<F, kColors>, Backward>(scene), fine);
+  expect_same(run<F, Fine, Backward>(scene), fine);
+}
+
+/// A list of several batches of pairs and segments, in which some samples stay open, and some stop in the midst.
+TYPED_TEST(MovingKernels, AgreeInListsOfPixelsAndSegments) {
+  using F = TypeParam;
+  Scene<F> scene(1100, 70, 0.1f);
+  const Results whole = run<F, EvenLayout<F, false>, EvenLayout<F, true>>(scene);
+  EXPECT_GT(*std::max_element(whole.last.begin(), whole.last.end()), kListedBatch);
+  expect_same(run<F, ListedLayout<F>, SegmentLayout<F>, 64>(scene), whole);
 }
 
 }  // namespace

@@ -1,0 +1,66 @@
+// A picture of a training from end to end: activations, rendering and loss, and back to the parameters. The same
+// kernels in the same order as the ops that autograd joins, and so the same bits, without what autograd costs the host.
+#include "torch/ops.h"
+
+namespace ar::ops {
+namespace {
+
+/// The scene as it is rendered, with activated parameters.
+RasterizeArguments scene_of(const PictureArguments& a, const Results& activated) {
+  RasterizeArguments scene;
+  scene.means3D = a.means;
+  if (a.mean_columns > 0) scene.means2D = at::empty({a.means.size(0), a.mean_columns}, a.means.options());
+  scene.scales = activated[0].toTensor();
+  scene.rotations = activated[1].toTensor();
+  scene.opacities = activated[2].toTensor();
+  scene.shs = a.shs;
+  scene.viewmatrix = a.viewmatrix;
+  scene.projmatrix = a.projmatrix;
+  scene.campos = a.campos;
+  scene.lens = a.lens;
+  scene.image_height = a.image_height;
+  scene.image_width = a.image_width;
+  scene.tanfovx = a.tanfovx;
+  scene.tanfovy = a.tanfovy;
+  scene.scale_modifier = a.scale_modifier;
+  scene.sh_degree = a.sh_degree;
+  scene.bg = a.bg;
+  scene.footprint = a.footprint;
+  scene.option = a.option;
+  scene.keep = true;
+  return scene;
+}
+
+}  // namespace
+
+Results picture_gradients(PictureArguments a) {
+  TORCH_CHECK_VALUE(a.mean_columns == 0 || a.mean_columns == 3 || a.mean_columns == 4,
+                    "mean_columns must be 0, 3 or 4, got ", a.mean_columns);
+  TORCH_CHECK_VALUE(a.ssim_weight >= 0 && a.ssim_weight <= 1, "ssim_weight must be in [0, 1], got ", a.ssim_weight);
+  const ActivateArguments parameters = {a.log_scales, a.quats, a.logit_opacities};
+  const RasterizeArguments scene = scene_of(a, activate(parameters));
+  const Results rendered = rasterize(scene);
+  L1SsimArguments comparison;
+  comparison.image = rendered[0].toTensor();
+  comparison.target = a.target;
+  comparison.keep = true;
+  comparison.l1_weight = 1 - a.ssim_weight;
+  comparison.ssim_weight = -a.ssim_weight;
+  comparison.constant = a.ssim_weight;
+  const Results compared = l1_ssim(comparison);
+
+  const Results dL_dimage = l1_ssim_vjp({{a.dL_dloss}, comparison, compared[1].toTensorVector(), {true, false}});
+  std::vector<bool> needs(kSceneTensors + 2, false);  // of the tensors among the op's arguments, bg and features too
+  for (const size_t place : {0, 2, 3, 5, 6}) needs[place] = true;  // means3D, opacities, shs, scales, rotations
+  needs[1] = a.mean_columns > 0;
+  const std::vector<Tensor> of_scene =
+      rasterize_vjp({{dL_dimage[0].toTensorVector()[0]}, scene, rendered[3].toTensorVector(), needs})[0]
+          .toTensorVector();
+  const std::vector<Tensor> of_parameters =
+      activate_vjp({{of_scene[5], of_scene[6], of_scene[2]}, parameters, {}, {true, true, true}})[0].toTensorVector();
+  std::vector<Tensor> gradients = {of_scene[0], of_parameters[0], of_parameters[1], of_parameters[2], of_scene[3]};
+  if (needs[1]) gradients.push_back(of_scene[1]);
+  return {compared[0], comparison.image, rendered[2], gradients};
+}
+
+}  // namespace ar::ops
