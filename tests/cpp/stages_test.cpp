@@ -237,7 +237,8 @@ TEST_P(StagesTest, AnyNumberOfChannels) {
 
 TEST_P(StagesTest, ThreadsChangeNoBit) {
   // Two chunks of Gaussians, of which one in eight is in front of the camera; two windows of channels.
-  Scene<float> scenes[] = {make_scene<float>(5000, 50, 35), make_channel_scene<float>(200, 50, 35, 35)};
+  Scene<float> scenes[] = {make_scene<float>(5000, 50, 35),
+                           make_channel_scene<float>(kSanitized ? 60 : 200, 50, 35, 35)};
   for (size_t i = 0; i < scenes[0].means.size(); ++i) {
     if (i % 8) scenes[0].means[i].z = -1;
   }
