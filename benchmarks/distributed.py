@@ -46,7 +46,7 @@ from analytic_rasterizer.training.sharded import ShardedTrainer
 from analytic_rasterizer.training.trainer import Trainer
 
 PREDICTED = (4, 8, 64)
-BYTES_OF_A_SPLAT = 88  # forth and back, docs/distributed.md
+NUMBERS_OF_A_SPLAT, BYTES_OF_A_SPLAT = 12, 88  # forth; forth and back, docs/distributed.md
 BLACK = (0.0, 0.0, 0.0)
 COLUMNS = ("seconds", "exchange", "sent", "state_bytes", "peak_bytes")
 
@@ -157,29 +157,29 @@ class Case:
         seconds = (time.perf_counter() - start) / self.steps
         calls, send = [], dist.all_to_all_single
 
-        def noted(out, rows, received, sent, group=None):
-            calls.append((rows.shape[1], received, sent))  # not the rows, whose memory is counted
-            return send(out, rows, received, sent, group=group)
+        def noted(out, flat, received, sent, group=None):
+            calls.append((received, sent))  # not the tensors, whose memory is counted
+            return send(out, flat, received, sent, group=group)
 
         with mock.patch.object(dist, "all_to_all_single", noted):
             _, extra = added_memory(self.trainer.step, self.device)
         self.trainer.losses.clear()
         if calls:
-            self.splats = sum(self.ranks.exchange(sum(calls[0][2]))) / self.ranks.world
+            self.splats = sum(self.ranks.exchange(sum(calls[0][1]))) / NUMBERS_OF_A_SPLAT / self.ranks.world
         gaussians = self.trainer.gaussians
         moments = (t for field in gaussians for t in self.trainer.optimizer.state[field].values() if torch.is_tensor(t))
         state = sum(t.nbytes for t in (*gaussians, *moments))
         return {"seconds": seconds, "state_bytes": state, "peak_bytes": state + extra} | self._exchange(calls)
 
-    def _exchange(self, calls: list[tuple[int, list[int], list[int]]]) -> dict[str, float]:
-        """The exchanges of a step by themselves. Calls: columns, rows received and rows sent by rank."""
+    def _exchange(self, calls: list[tuple[list[int], list[int]]]) -> dict[str, float]:
+        """The exchanges of a step by themselves. Calls: numbers received and sent by rank."""
         seconds, bytes_sent = 0.0, 0
-        for columns, received, sent in calls:
-            rows, out = (torch.zeros(sum(counts), columns, device=self.device) for counts in (sent, received))
-            bytes_sent += (len(rows) - sent[self.ranks.rank]) * columns * rows.element_size()
+        for received, sent in calls:
+            flat, out = (torch.zeros(sum(counts), device=self.device) for counts in (sent, received))
+            bytes_sent += (len(flat) - sent[self.ranks.rank]) * flat.element_size()
             self._together()
             start = time.perf_counter()
-            dist.all_to_all_single(out, rows, received, sent, group=self.ranks.group)
+            dist.all_to_all_single(out, flat, received, sent, group=self.ranks.group)
             self._wait()
             seconds += time.perf_counter() - start
         return {"exchange": seconds, "sent": bytes_sent}

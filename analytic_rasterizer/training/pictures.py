@@ -19,7 +19,7 @@ from .captures import Photograph
 
 
 class Pictures(NamedTuple):
-    """Views and their pictures. By scale: 2 is half the size. Settings are on the device, colours there or on the host."""
+    """Views and their pictures, on the device or colours on its host. By scale: 2 is half the size."""
 
     views: list[io.View]  # at scale 1
     settings: dict[int, list[GaussianRasterizationSettings]]  # made once: they hold tensors
