@@ -28,10 +28,15 @@ CMAKE = $(shell command -v cmake || echo $(BIN)/cmake)
 demo: $(VENV)/.installed
 	$(BIN)/python examples/demo.py --out $(OUT)
 
-test: test-cpp test-python test-simple-knn
+# The C++ tests take the objects of the CPU path that the extension was linked from, where these are still there.
+EXTENSION_OBJECTS = $(shell $(BIN)/python -c \
+  'import pathlib, sys; print(*pathlib.Path.cwd().glob(f"build/temp-{sys.implementation.cache_tag}/csrc/cpu"))')
+test: $(VENV)/.installed
+	$(MAKE) test-cpp CORE_OBJECTS="$(EXTENSION_OBJECTS)"
+	$(MAKE) test-python test-simple-knn
 
 test-cpp: $(VENV)/.tools
-	$(CMAKE) -S . -B $(BUILD)/cpp -DCMAKE_BUILD_TYPE=Release
+	$(CMAKE) -S . -B $(BUILD)/cpp -DCMAKE_BUILD_TYPE=Release -DAR_CORE_OBJECTS="$(CORE_OBJECTS)"
 	$(CMAKE) --build $(BUILD)/cpp -j $(JOBS)
 	cd $(BUILD)/cpp && $(dir $(CMAKE))ctest --output-on-failure -j $(JOBS)
 

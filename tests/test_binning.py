@@ -107,7 +107,7 @@ SIZES = {"tiny": (0.01, 0.3), "small": (0.1, 2.0), "medium": (1.0, 10.0), "large
 @pytest.mark.parametrize("variant", BINNED, ids=name_of)
 def test_no_visible_pixel_is_missed(variant, size):
     """Float64; 1e-9 absorbs rounding at the threshold itself."""
-    scene = splats(list(SIZES).index(size), 100, SIZES[size])
+    scene = splats(list(SIZES).index(size), 50, SIZES[size])
     result, settings = stages(scene, variant)
     alpha = largest_alpha_per_tile(settings, scene, variant)
     missed = (alpha >= (1 + 1e-9) / 255) & ~in_tile(result, len(alpha))

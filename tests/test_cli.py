@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, SHARED
+from conftest import DEADLINE, ROOT, SHARED
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io
@@ -63,7 +63,7 @@ def run(*args, **options):
         [sys.executable, "-m", "analytic_rasterizer", *map(str, args)],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=DEADLINE,
         env=environment,
         **options,
     )
@@ -260,11 +260,11 @@ def test_interrupt_of_a_process_is_quiet(files):
         # A job in the background of a script ignores SIGINT, and its children with it.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + DEADLINE
     while not (files / "out" / "0.png").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
+    out, err = process.communicate(timeout=DEADLINE)
     assert (process.returncode, out, err) == (130, "", "")
     assert not (files / "out" / "2999.png").exists()
 

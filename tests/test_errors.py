@@ -169,12 +169,14 @@ def test_the_truth_has_no_error_and_cases_cover_the_footprints():
 # ---------------------------------------------------------------------------------- reporting
 
 
-@pytest.fixture
-def small(monkeypatch, tmp_path):
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
     """(folder, results) of a run on few splats."""
-    monkeypatch.setattr(errors, "all_cases", lambda: ["point", "analytic", errors.PAPER_GRADIENT, "cumulant"])
-    monkeypatch.setattr(errors, "ROTATION_SAMPLES", 4)
-    return tmp_path, errors.run(tmp_path, samples=32, monte_carlo=128)
+    out = tmp_path_factory.mktemp("errors")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(errors, "all_cases", lambda: ["point", "analytic", errors.PAPER_GRADIENT, "cumulant"])
+        patch.setattr(errors, "ROTATION_SAMPLES", 4)
+        return out, errors.run(out, samples=32, monte_carlo=128)
 
 
 def test_files_of_a_run(small):

@@ -112,8 +112,8 @@ interrupts = 0
 for turn in range(8):
     # At another point of the work each time: in the forward or the backward pass or in between.
     timer = threading.Timer(seconds * (turn + 0.5) / 8, signal.raise_signal, (signal.SIGINT,))
-    timer.start()
     try:
+        timer.start()  # in here: the signal may come before this thread has its turn again
         for _ in range(1000):
             process.render(rasterizer, scene, device)
     except KeyboardInterrupt:
@@ -291,7 +291,7 @@ expected = everything()
 child = os.fork()
 if child == 0:
     os._exit(0 if everything() == expected else 2)
-deadline = time.monotonic() + 20
+deadline = time.monotonic() + process.DEADLINE / 2
 while True:
     done, status = os.waitpid(child, os.WNOHANG)
     if done:

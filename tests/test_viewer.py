@@ -12,7 +12,7 @@ import threading
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT
+from conftest import DEADLINE, ROOT
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C, cli, io, viewer
@@ -50,7 +50,7 @@ def server():
 
 def ask(server, path, method="GET", host=None):
     """(status, headers, body) of a request to the server, sent as it is."""
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=DEADLINE)
     connection.putrequest(method, path, skip_host=True)
     connection.putheader("Host", host or f"127.0.0.1:{server.server_port}")
     connection.endheaders()
@@ -235,7 +235,7 @@ def test_localhost_is_not_foreign(server):
 @pytest.mark.parametrize("path", ["/", "/index.html", "//", "/x{token}/", "/{token}x/", "/{upper}/", "/%00/", "/é/"])
 def test_without_the_token_nothing_is_served(server, path):
     path = path.format(token=server.token, upper=server.token.swapcase())
-    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=20)
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=DEADLINE)
     connection._encode_request = lambda request: request.encode("latin-1")  # paths no browser would send
     connection.putrequest("GET", path.replace("é", "\xe9"), skip_host=True)
     connection.putheader("Host", f"127.0.0.1:{server.server_port}")

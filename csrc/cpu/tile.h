@@ -66,8 +66,7 @@ AR_HD TileMask<T> reach_of(const Splat<P, T>& splat, const TileView& view, const
   constexpr int kCount = TileMask<T>::kCount, kPacks = TileMask<T>::kPacks;
   const Support<T> support = support_of(splat);
   TileMask<T> mask = {};
-  AR_UNROLL
-  for (int row = 0; row < kTile; row += kCount) {
+  const auto look = [&](int row) AR_HD_LAMBDA {
     const V y = V(T(view.y0)) + load(lanes.value + row, V());
     const Span<V> span = P::kReach == 0 ? chord_of(support, y) : columns_of(support, y, y);
     AR_UNROLL
@@ -75,6 +74,12 @@ AR_HD TileMask<T> reach_of(const Splat<P, T>& splat, const TileView& view, const
       const V first = V(T(view.x0 + c * kCount)), last = V(T(view.x0 + c * kCount + kCount - 1));
       mask.rows[c] |= bits((span.lo <= last) & (span.hi >= first)) << row;
     }
+  };
+  if constexpr (kCount == 1) {  // every pixel is a pack of its own: unrolled, the loop takes half of the build
+    for (int row = 0; row < kTile; ++row) look(row);
+  } else {
+    AR_UNROLL
+    for (int row = 0; row < kTile; row += kCount) look(row);
   }
   return mask;
 }
