@@ -691,6 +691,23 @@ def test_debug_writes_a_snapshot_when_the_backward_pass_fails(device, tmp_path, 
     assert [path.name for path in tmp_path.iterdir()] == ["snapshot_bw.dump"]
 
 
+def test_saved_ids_that_are_no_gaussians(device):
+    """The CPU refuses them; CUDA, which would have to wait for the answer, leaves their rows out."""
+    function, arguments = calls(("box", {"samples": 1}), device, False)["project_vjp"]
+    named = dict(zip((argument.name for argument in function._schema.arguments), arguments))
+    expected = function(**named)[0]
+    dets, ids, splits = named["saved"]
+    wrong = ids.clone()
+    wrong[:2] = torch.tensor([-3, 2**30], dtype=torch.int32)
+    named["saved"] = [dets, wrong, splits]
+    if device == "cpu":
+        with pytest.raises(ValueError, match="saved must be what project saved"):
+            function(**named)
+        return
+    # Of the second camera, whose rows are right, the gradients remain.
+    assert torch.allclose(2 * function(**named)[0][ids[:2].long()], expected[ids[:2].long()])
+
+
 @pytest.mark.skipif(_C.has_cuda, reason="needs an extension that was built without CUDA")
 def test_cuda_tensors_without_cuda_say_what_to_do():
     with pytest.raises(RuntimeError, match="built without CUDA"):

@@ -51,12 +51,20 @@ Inputs part_of(Inputs in, int64_t begin, int64_t end) {
   return in;
 }
 
-/// Whether int32 `ids` number rows of `count`. Waits for the device once.
-bool are_rows_of(const Tensor& ids, int64_t count) {
-  if (ids.numel() == 0) return true;
+/// Whether int32 `ids` number rows of `count`; on a device, where the answer would have to be waited for, it is not
+/// asked for.
+bool may_be_rows_of(const Tensor& ids, int64_t count) {
+  if (ids.numel() == 0 || !ids.is_cpu()) return true;
   const auto [least, most] = at::aminmax(ids);
-  const Tensor ends = at::stack({least, most}).cpu();
-  return ends[0].item<int64_t>() >= 0 && ends[1].item<int64_t>() < count;
+  return least.item<int64_t>() >= 0 && most.item<int64_t>() < count;
+}
+
+/// (count,) int32: at the place of each id its number, counted from `first`, and -1 at all others. Ids that are no
+/// places, which nobody has checked on a device, are left out.
+Tensor places_of(const Tensor& ids, int64_t count, int64_t first) {
+  const Tensor places = at::full({count + 1}, -1, ids.options());  // the last one takes what has no place
+  places.index_put_({ids.to(at::kLong).clamp(-1, count)}, at::arange(first, first + ids.numel(), ids.options()));
+  return places.slice(0, 0, count);
 }
 
 /// What one camera has of a blending.
@@ -130,7 +138,7 @@ Results project_vjp(VjpArguments<ProjectArguments> arguments) {
   const Tensor ids = arguments.saved[1], splits = arguments.saved[2];
   const int64_t n = ids.numel(), count = a.count();
   TORCH_CHECK_VALUE(splits.numel() == cameras + 1 && splits.device().is_cpu() && splits.scalar_type() == at::kLong &&
-                        ids.scalar_type() == at::kInt && splits[-1].item<int64_t>() == n && are_rows_of(ids, count),
+                        ids.scalar_type() == at::kInt && splits[-1].item<int64_t>() == n && may_be_rows_of(ids, count),
                     "saved must be what project saved for the same arguments");
   const auto options = a.means3D.options();
   const auto gradient = [&](size_t place, const char* name, std::vector<int64_t> sizes) {
@@ -151,8 +159,7 @@ Results project_vjp(VjpArguments<ProjectArguments> arguments) {
     check(in);
     const std::unique_ptr<Backend> backend = make_backend(in.means3D);
     const int64_t first = splits[c].item<int64_t>(), last = splits[c + 1].item<int64_t>();
-    const Tensor rows = at::full({count}, -1, ids.options());
-    rows.index_put_({ids.slice(0, first, last).to(at::kLong)}, at::arange(first, last, ids.options()));
+    const Tensor rows = places_of(ids.slice(0, first, last), count, first);
     // Block by block, so that no camera but the first needs memory for the gradients of all Gaussians. Those of the
     // camera are sums over all of them.
     const int64_t block = c == 0 || in.lens ? std::max<int64_t>(count, 1) : kGradientBlock;
