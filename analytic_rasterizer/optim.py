@@ -82,7 +82,7 @@ class FusedAdam(torch.optim.Optimizer):
 
     @torch.no_grad()
     def update(self, rows: Tensor | None = None) -> None:
-        """`step` without what torch puts around it, hooks and a range for its profiler, which cost the host as much.
+        """`step` without what torch puts around it for hooks and its profiler, which takes the host as long again.
 
         Raises:
             TypeError, ValueError, RuntimeError: As `step`.
@@ -182,7 +182,10 @@ def _update(
     parameters, gradients, means, squares, rates, steps, states = [], [], [], [], [], [], []
     heads, head_rates = [], []
     for group in optimizer.param_groups:
-        rate, head, head_rate = group["lr"], group.get("head", 0), group.get("head_lr", 0.0)
+        rate, head = group["lr"], group.get("head", 0)
+        if head and "head_lr" not in group:
+            raise ValueError(f"a group with head needs head_lr, the learning rate of the head, got head {head} alone")
+        head_rate = group.get("head_lr", 0.0)
         for parameter in group["params"]:
             gradient = parameter.grad
             if gradient is None:

@@ -207,7 +207,7 @@ def work(rank, world, folder, kind):
         init_method=f"file://{folder}/rendezvous",
         rank=rank,
         world_size=world,
-        timeout=datetime.timedelta(seconds=DEADLINE),
+        timeout=datetime.timedelta(seconds=DEADLINE / 2),
     )
     # The last processes, so that a rank in the group is not that in the world.
     GROUPS.update({ranks: dist.new_group(list(range(world - ranks, world))) for ranks in range(1, world)})

@@ -175,7 +175,7 @@ def work(rank, folder):
     for world in WORLDS:
         if rank >= world:
             continue
-        init, timeout = f"file://{folder}/rendezvous-{world}", datetime.timedelta(seconds=DEADLINE)
+        init, timeout = f"file://{folder}/rendezvous-{world}", datetime.timedelta(seconds=DEADLINE / 2)
         dist.init_process_group("gloo", init_method=init, rank=rank, world_size=world, timeout=timeout)
         made = {f: band_of(f, torch.float32, SHARDS[world], rank) for f in FOOTPRINTS}
         made["float64"] = band_of(FOOTPRINTS[0], torch.float64, SHARDS[world], rank)

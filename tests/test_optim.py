@@ -324,6 +324,21 @@ def test_closure_scheduler_and_zero_grad(device):
     assert value.grad is None
 
 
+@pytest.mark.parametrize(
+    "group, message",
+    [
+        ({"head": 1}, "a group with head needs head_lr, the learning rate of the head, got head 1 alone"),
+        ({"head": 6, "head_lr": 0.1}, r"head is 6, but a parameter has shape \(4, 5, 3\)"),
+    ],
+)
+def test_heads_that_cannot_be(group, message):
+    value = torch.ones(4, 5, 3, requires_grad=True)
+    value.grad = torch.ones_like(value)
+    with pytest.raises(ValueError, match=message):
+        FusedAdam([{"params": [value], **group}]).step()
+    assert torch.equal(value, torch.ones_like(value))
+
+
 def test_autograd_notices_that_parameters_have_changed(device):
     value = torch.ones(3, device=device, requires_grad=True)
     loss = value.square().sum()

@@ -499,12 +499,18 @@ def test_resumed_training_gives_the_same_bits(device, synthetic, tmp_path, optio
     ids=str,
 )
 def test_one_op_has_the_bits_of_autograd(device, synthetic, tmp_path, options):
-    """Also over a change of density, and where the pictures have alpha."""
-    runs = [make_run(synthetic, tmp_path / name, device, iterations=75, **options) for name in ("op", "autograd")]
+    """Also over changes of density, after steps 40 and 60, and where the pictures have alpha."""
+    common = {"iterations": 75, "densify_until": 0.9, **options}
+    runs = [make_run(synthetic, tmp_path / name, device, **common) for name in ("op", "autograd")]
     assert all(run.trainer.in_one_op for run in runs)
     runs[1].trainer.in_one_op = False
     for run in runs:
         run.train()
+    one, other = (run.trainer.density for run in runs)
+    if options.get("density") != "none":
+        assert len(one.gaussians.means) != 150
+        assert torch.equal(one.gradient_sums, other.gradient_sums) and torch.equal(one.views, other.views)
+        assert one.gradient_sums.any()
     for name, one, other in zip(g.Gaussians._fields, *(run.trainer.gaussians for run in runs)):
         assert torch.equal(one, other), name
     assert (tmp_path / "op" / files.SCENE).read_bytes() == (tmp_path / "autograd" / files.SCENE).read_bytes()
@@ -542,7 +548,6 @@ def picture_arguments(device, **changed):
 
 
 def test_opcheck_of_picture_gradients(device):
-    """Not under tracing on CUDA, where the room for pairs depends on earlier frames."""
     op = torch.ops.analytic_rasterizer.picture_gradients.default
     for columns in (0, 3, 4):
         torch.library.opcheck(op, (), picture_arguments(device, mean_columns=columns))
@@ -553,8 +558,10 @@ def test_opcheck_of_picture_gradients(device):
     [
         ({"mean_columns": 2}, ValueError, "mean_columns must be 0, 3 or 4, got 2"),
         ({"quats": torch.zeros(12, 3)}, ValueError, r"quats must have shape \(N, 4\) with N = 12, got \(12, 3\)"),
-        ({"means": torch.zeros(11, 3)}, ValueError, "opacities must have shape"),
-        ({"target": torch.zeros(3, 5, 5)}, ValueError, "target must have shape"),
+        ({"means": torch.zeros(11, 3)}, ValueError, r"log_scales must have shape \(N, 3\) with N = 11, got \(12, 3\)"),
+        ({"means": torch.zeros(12, 2)}, ValueError, r"means must have shape \(N, 3\), got \(12, 2\)"),
+        ({"target": torch.zeros(3, 5, 5)}, ValueError, r"target must have shape \(3, .*\), got \(3, 5, 5\)"),
+        ({"target": torch.zeros(3, 5, 5, dtype=torch.int32)}, TypeError, "target must have the dtype of means"),
         ({"ssim_weight": 1.5}, ValueError, r"ssim_weight must be in \[0, 1\], got 1.5"),
         ({"dL_dloss": torch.zeros(2)}, ValueError, "dL_dloss must have shape"),
     ],
@@ -650,6 +657,12 @@ def test_a_broken_checkpoint_is_one_line(synthetic, tmp_path, capsys, content):
     assert cli.main(["train", str(synthetic), "--out", str(tmp_path), "--device", "cpu", "--resume"]) == 2
     error = capsys.readouterr().err
     assert "checkpoint.pt: " in error and error.startswith("error: ") and error.count("\n") == 1
+
+
+def test_a_checkpoint_of_an_earlier_format(tmp_path):
+    torch.save({"format": 1}, tmp_path / files.CHECKPOINT)
+    with pytest.raises(io.SceneError, match="expected a checkpoint of format 2, got 1"):
+        files.read_checkpoint(tmp_path / files.CHECKPOINT)
 
 
 def test_training_by_time_on_a_capture(capture, tmp_path, monkeypatch):

@@ -64,7 +64,9 @@ def run_on(ranks: Ranks, args) -> None:
         raise io.SceneError(f"{source['scene']}: there are no test pictures")
     scene = part_of(io.load_scene(folder / SCENE), ranks).to(args.device)
     background = background_of(options, capture.background) or capture.background
-    pictures = load_pictures(capture.test, scales, background, args.device, options.downsampling)
+    pictures = load_pictures(
+        capture.test, scales, background, args.device, options.downsampling, on_host=ranks.world > 1
+    )
     lpips = None
     if args.lpips != "none":
         try:

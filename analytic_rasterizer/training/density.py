@@ -84,7 +84,7 @@ class FixedDensity:
 
     @property
     def columns(self) -> int:
-        """Of the gradients with respect to means2D that are looked at, 3 or 4."""
+        """Columns of the gradients that `observe` takes: 3, or 4 with sums of absolute values."""
         return 3
 
     def leaf(self, scale: int) -> Tensor | None:

@@ -85,5 +85,6 @@ def read_checkpoint(path: Path, device: str | torch.device = "cpu", mapped: bool
     except Exception as error:  # torch.load raises a different type for every way in which a file can be broken
         raise io.SceneError(f"{path}: not a checkpoint, or cut short ({type(error).__name__})") from None
     if not isinstance(state, dict) or state.get("format") != CHECKPOINT_FORMAT:
-        raise io.SceneError(f"{path}: expected a checkpoint of format {CHECKPOINT_FORMAT}")
+        found = state.get("format") if isinstance(state, dict) else type(state).__name__
+        raise io.SceneError(f"{path}: expected a checkpoint of format {CHECKPOINT_FORMAT}, got {found}")
     return state

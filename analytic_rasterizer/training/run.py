@@ -248,8 +248,14 @@ class Run:
         if self.capture.test:
             # A random background has no truth of its own to test against: the convention's has.
             background = background_of(self.options, self.capture.background) or self.capture.background
+            # With several ranks the memory of the device is for Gaussians, as in training.
             pictures = load_pictures(
-                self.capture.test, self.options.scales, background, self.device, self.options.downsampling
+                self.capture.test,
+                self.options.scales,
+                background,
+                self.device,
+                self.options.downsampling,
+                on_host=self.ranks.world > 1,
             )
             common = {"supersampling": self.options.supersampling, "ranks": self.ranks}
             metrics["test"] = evaluate(self.trainer.scene(), pictures, self.options.footprint, **common)

@@ -1,6 +1,6 @@
-// The launches of a training step besides rendering, in float and double: loss, activations,
-// optimiser and what density control observes. All pointers are views of device memory. Every function enqueues work on
-// a stream and returns; none waits for the device, and bits do not depend on the order in which blocks run.
+// The launches of a training step besides rendering, in float and double: loss, activations, optimiser and what density
+// control observes. All pointers are views of device memory. Every function enqueues work on a stream and returns; none
+// waits for the device, and bits do not depend on the order in which blocks run.
 #pragma once
 
 #include <cuda_runtime_api.h>

@@ -22,6 +22,8 @@ void check(WeightArguments& a);
 void check(SsimArguments& a);
 void check(ActivateArguments& a);
 void check(ObserveArguments& a);
+/// What the ops that it is made of would find only after a part of the work, or call by another name.
+void check(PictureArguments& a);
 void check(AdamArguments& a);
 
 /// The inputs of camera `c` of a batch, not yet checked.

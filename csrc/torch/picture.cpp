@@ -1,5 +1,6 @@
 // A picture of a training from end to end: activations, rendering and loss, and back to the parameters. The same
 // kernels in the same order as the ops that autograd joins, and so the same bits, without what autograd costs the host.
+#include "torch/checks.h"
 #include "torch/ops.h"
 
 namespace ar::ops {
@@ -34,9 +35,7 @@ RasterizeArguments scene_of(const PictureArguments& a, const Results& activated)
 }  // namespace
 
 Results picture_gradients(PictureArguments a) {
-  TORCH_CHECK_VALUE(a.mean_columns == 0 || a.mean_columns == 3 || a.mean_columns == 4,
-                    "mean_columns must be 0, 3 or 4, got ", a.mean_columns);
-  TORCH_CHECK_VALUE(a.ssim_weight >= 0 && a.ssim_weight <= 1, "ssim_weight must be in [0, 1], got ", a.ssim_weight);
+  check(a);
   const ActivateArguments parameters = {a.log_scales, a.quats, a.logit_opacities};
   const RasterizeArguments scene = scene_of(a, activate(parameters));
   const Results rendered = rasterize(scene);

@@ -7,11 +7,6 @@
 namespace ar::ops {
 namespace {
 
-bool needs_camera(const std::vector<bool>& needs) {
-  const auto first = needs.begin() + kGaussianTensors, last = first + kCameraTensors;
-  return std::find(first, last, true) != last;
-}
-
 /// Mean transmittance of every pixel's samples, (H, W). A tile of `adaptive` uses the first of them only.
 Tensor mean_transmittance(const BlendState& state, const ListTensors& lists, TileGrid grid) {
   if (lists.tile_samples.numel() == 0) return state.transmittance.mean(0);
@@ -26,6 +21,11 @@ Tensor mean_transmittance(const BlendState& state, const ListTensors& lists, Til
 }
 
 }  // namespace
+
+bool needs_camera(const std::vector<bool>& needs) {
+  const auto first = needs.begin() + kGaussianTensors, last = first + kCameraTensors;
+  return std::find(first, last, true) != last;
+}
 
 void check_camera_needs(const std::vector<bool>& needs, const OptionalTensor& lens) {
   TORCH_CHECK_VALUE(lens || !needs_camera(needs),

@@ -162,7 +162,8 @@ Results project_vjp(VjpArguments<ProjectArguments> arguments) {
     const Tensor rows = places_of(ids.slice(0, first, last), count, first);
     // Block by block, so that no camera but the first needs memory for the gradients of all Gaussians. Those of the
     // camera are sums over all of them.
-    const int64_t block = c == 0 || in.lens ? std::max<int64_t>(count, 1) : kGradientBlock;
+    const bool whole = c == 0 || (in.lens && needs_camera(needs));
+    const int64_t block = whole ? std::max<int64_t>(count, 1) : kGradientBlock;
     for (int64_t begin = 0; begin == 0 || begin < count; begin += block) {
       const int64_t end = std::min(begin + block, count);
       const Inputs part = part_of(in, begin, end);

@@ -88,6 +88,27 @@ void check(ObserveArguments& a) {
                     ", got ", a.first_column);
 }
 
+void check(PictureArguments& a) {
+  TORCH_CHECK_VALUE(a.mean_columns == 0 || a.mean_columns == 3 || a.mean_columns == 4,
+                    "mean_columns must be 0, 3 or 4, got ", a.mean_columns);
+  TORCH_CHECK_VALUE(a.ssim_weight >= 0 && a.ssim_weight <= 1, "ssim_weight must be in [0, 1], got ", a.ssim_weight);
+  check_floating(a.means, "means");
+  check_shape(a.means.dim() == 2 && a.means.size(1) == 3, a.means, "means", "(N, 3)");
+  a.means = a.means.contiguous();
+  const Like like{a.means, "means"};
+  like.check_rows_of(a.log_scales, "log_scales", {3}, "(N, 3)");
+  like.check_type(a.dL_dloss, "dL_dloss");
+  check_shape(a.dL_dloss.dim() == 0, a.dL_dloss, "dL_dloss", "()");
+  const Tensor& target = a.target;
+  TORCH_CHECK_TYPE(target.scalar_type() == a.means.scalar_type() || target.scalar_type() == at::kByte,
+                   "target must have the dtype of means, ", a.means.scalar_type(), ", or uint8, got ",
+                   target.scalar_type());
+  TORCH_CHECK_VALUE(target.device() == a.means.device(), "target must be on the device of means, ", a.means.device(),
+                    ", got ", target.device());
+  const std::vector<int64_t> image = {3, a.image_height, a.image_width};
+  check_shape(target.sizes() == at::IntArrayRef(image), target, "target", text_of(image));
+}
+
 void check(AdamArguments& a) {
   const size_t count = a.params.size();
   const auto check_count = [&](size_t members, const char* name) {
