@@ -15,7 +15,7 @@ import torch
 
 from .. import io
 from ..filters import bake_pixel
-from .captures import Capture, is_scene, load_capture, load_points
+from .captures import Capture, Photograph, is_scene, load_capture, load_points
 from .evaluation import evaluate, psnr
 from .files import (
     CAMERAS,
@@ -35,7 +35,7 @@ from .files import (
 )
 from .model import Gaussians
 from .options import TrainingOptions
-from .pictures import load_pictures
+from .pictures import Pictures, load_pictures
 from .ranks import ALONE, Ranks
 from .schedule import Clock
 from .sharded import ShardedTrainer, shards_of
@@ -92,14 +92,7 @@ class Run:
         self.source = {"scene": str(scene), "images": images, "test_every": test_every}
         self.capture = load_capture(scene, images, test_every)
         background = background_of(self.options, self.capture.background)
-        pictures = load_pictures(
-            self.capture.train,
-            self.options.scales,
-            background,
-            self.device,
-            self.options.downsampling,
-            on_host=ranks.world > 1,  # a rank shows one in N of them: memory of the device is for Gaussians
-        )
+        pictures = self._load(self.capture.train, background)
         if state is None:
             start = first_gaussians(self.options, self.capture, points)
         else:
@@ -248,20 +241,19 @@ class Run:
         if self.capture.test:
             # A random background has no truth of its own to test against: the convention's has.
             background = background_of(self.options, self.capture.background) or self.capture.background
-            # With several ranks the memory of the device is for Gaussians, as in training.
-            pictures = load_pictures(
-                self.capture.test,
-                self.options.scales,
-                background,
-                self.device,
-                self.options.downsampling,
-                on_host=self.ranks.world > 1,
-            )
+            pictures = self._load(self.capture.test, background)
             common = {"supersampling": self.options.supersampling, "ranks": self.ranks}
             metrics["test"] = evaluate(self.trainer.scene(), pictures, self.options.footprint, **common)
         if self.ranks.is_first:
             write_json(self.out / METRICS, metrics)
         return metrics
+
+    def _load(self, photographs: list[Photograph], background: tuple[float, float, float] | None) -> Pictures:
+        """Their pictures at the scales of the training."""
+        options = self.options
+        # Of several ranks each shows one in N of them: memory of the device is for Gaussians.
+        on_host = self.ranks.world > 1
+        return load_pictures(photographs, options.scales, background, self.device, options.downsampling, on_host)
 
     def count(self) -> int:
         """Gaussians of all ranks."""

@@ -43,24 +43,31 @@ template <class Optional> struct SceneTensors {
 /// The first of them are of the Gaussians, the others of the camera.
 inline constexpr size_t kGaussianTensors = 8, kCameraTensors = 4, kSceneTensors = kGaussianTensors + kCameraTensors;
 
-/// A scene and a camera, whose tangents are a double each; or several cameras, with a std::vector<double> and tensors
-/// that have a dimension more. check() (checks.h) brings the tensors into the form the kernels read.
-template <class Tangent> struct SceneArguments : SceneTensors<OptionalTensor> {
+/// How a camera renders, besides its tensors.
+template <class Tangent> struct CameraNumbers {
   int64_t image_height = 0, image_width = 0;
   Tangent tanfovx = {}, tanfovy = {};
   double scale_modifier = 1;
   int64_t sh_degree = 0;
 
-  int64_t count() const { return means3D.size(0); }
-
-  template <class Visit> void each(Visit&& visit) {
-    each_tensor(visit);
+  template <class Visit> void each_number(Visit&& visit) {
     visit("image_height", image_height);
     visit("image_width", image_width);
     visit("tanfovx", tanfovx);
     visit("tanfovy", tanfovy);
     visit("scale_modifier", scale_modifier);
     visit("sh_degree", sh_degree);
+  }
+};
+
+/// A scene and a camera, whose tangents are a double each; or several cameras, with a std::vector<double> and tensors
+/// that have a dimension more. check() (checks.h) brings the tensors into the form the kernels read.
+template <class Tangent> struct SceneArguments : SceneTensors<OptionalTensor>, CameraNumbers<Tangent> {
+  int64_t count() const { return means3D.size(0); }
+
+  template <class Visit> void each(Visit&& visit) {
+    each_tensor(visit);
+    this->each_number(visit);
   }
 };
 using Inputs = SceneArguments<double>;
@@ -232,16 +239,13 @@ struct ActivateArguments {
 
 /// Arguments of `picture_gradients`: a scene by the parameters that a training optimises, a plain or a full camera, and
 /// what the picture should be.
-struct PictureArguments : FootprintArguments {
+struct PictureArguments : CameraNumbers<double>, FootprintArguments {
   Tensor means, log_scales, quats, logit_opacities, shs;
   int64_t mean_columns = 0;  ///< of the gradient with respect to means2D, 3 or 4; 0: none is wanted
   Tensor target, dL_dloss;   ///< as of `l1_ssim`; ()
   double ssim_weight = 0;
   Tensor bg, viewmatrix, projmatrix, campos;
   OptionalTensor lens;
-  int64_t image_height = 0, image_width = 0;
-  double tanfovx = 0, tanfovy = 0, scale_modifier = 1;
-  int64_t sh_degree = 0;
 
   template <class Visit> void each(Visit&& visit) {
     visit("means", means);
@@ -258,12 +262,7 @@ struct PictureArguments : FootprintArguments {
     visit("projmatrix", projmatrix);
     visit("campos", campos);
     visit("lens", lens);
-    visit("image_height", image_height);
-    visit("image_width", image_width);
-    visit("tanfovx", tanfovx);
-    visit("tanfovy", tanfovy);
-    visit("scale_modifier", scale_modifier);
-    visit("sh_degree", sh_degree);
+    each_number(visit);
     FootprintArguments::each(visit);
   }
 };

@@ -19,15 +19,9 @@ RasterizeArguments scene_of(const PictureArguments& a, const Results& activated)
   scene.projmatrix = a.projmatrix;
   scene.campos = a.campos;
   scene.lens = a.lens;
-  scene.image_height = a.image_height;
-  scene.image_width = a.image_width;
-  scene.tanfovx = a.tanfovx;
-  scene.tanfovy = a.tanfovy;
-  scene.scale_modifier = a.scale_modifier;
-  scene.sh_degree = a.sh_degree;
+  static_cast<CameraNumbers<double>&>(scene) = a;
+  static_cast<FootprintArguments&>(scene) = a;
   scene.bg = a.bg;
-  scene.footprint = a.footprint;
-  scene.option = a.option;
   scene.keep = true;
   return scene;
 }

@@ -36,16 +36,22 @@ void check_overlaps(const AdamArguments& a) {
   }
 }
 
+/// Numbers as those of what a target is compared with, or bytes.
+void check_target_type(const Tensor& target, const Like& like) {
+  const Tensor& other = like.tensor;
+  TORCH_CHECK_TYPE(target.scalar_type() == other.scalar_type() || target.scalar_type() == at::kByte,
+                   "target must have the dtype of ", like.name, ", ", other.scalar_type(), ", or uint8, got ",
+                   target.scalar_type());
+  TORCH_CHECK_VALUE(target.device() == other.device(), "target must be on the device of ", like.name, ", ",
+                    other.device(), ", got ", target.device());
+}
+
 }  // namespace
 
 void check(SsimArguments& a) {
   const Tensor &image = a.image, &target = a.target;
   check_floating(image, "image");
-  TORCH_CHECK_TYPE(target.scalar_type() == image.scalar_type() || target.scalar_type() == at::kByte,
-                   "target must have the dtype of image, ", image.scalar_type(), ", or uint8, got ",
-                   target.scalar_type());
-  TORCH_CHECK_VALUE(target.device() == image.device(), "target must be on the device of image, ", image.device(),
-                    ", got ", target.device());
+  check_target_type(target, {image, "image"});
   check_shape(image.dim() == 3 || image.dim() == 4, image, "image", "(C, H, W) or (B, C, H, W)");
   check_shape(target.sizes() == image.sizes(), target, "target", "that of image, ", shape_of(image));
   // The mean over nothing is not a number.
@@ -99,14 +105,9 @@ void check(PictureArguments& a) {
   like.check_rows_of(a.log_scales, "log_scales", {3}, "(N, 3)");
   like.check_type(a.dL_dloss, "dL_dloss");
   check_shape(a.dL_dloss.dim() == 0, a.dL_dloss, "dL_dloss", "()");
-  const Tensor& target = a.target;
-  TORCH_CHECK_TYPE(target.scalar_type() == a.means.scalar_type() || target.scalar_type() == at::kByte,
-                   "target must have the dtype of means, ", a.means.scalar_type(), ", or uint8, got ",
-                   target.scalar_type());
-  TORCH_CHECK_VALUE(target.device() == a.means.device(), "target must be on the device of means, ", a.means.device(),
-                    ", got ", target.device());
+  check_target_type(a.target, like);
   const std::vector<int64_t> image = {3, a.image_height, a.image_width};
-  check_shape(target.sizes() == at::IntArrayRef(image), target, "target", text_of(image));
+  check_shape(a.target.sizes() == at::IntArrayRef(image), a.target, "target", text_of(image));
 }
 
 void check(AdamArguments& a) {
