@@ -3,6 +3,8 @@
 // Arguments have been checked (checks.h). What is relied on here: tensors are contiguous, on the CPU and of one
 // floating type; lists and state fit each other, the splats and the image; `count` of inspect exceeds every id. What
 // lists contain is an earlier stage's own and is not looked at.
+#include <ATen/ops/arange.h>
+#include <ATen/ops/zeros_like.h>
 #include <ATen/Parallel.h>
 #if defined(__unix__) || defined(__APPLE__)
 #include <pthread.h>

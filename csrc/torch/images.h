@@ -1,6 +1,8 @@
 // What is blended, and the images that come of it: their names, their memory, and how the kernels see both.
 #pragma once
 
+#include <ATen/ops/empty.h>
+
 #include <array>
 
 #include "core/stages.h"

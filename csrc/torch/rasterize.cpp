@@ -1,4 +1,9 @@
 // The pass, written once for every device: check, project, bin, blend, and back.
+#include <ATen/ops/constant_pad_nd.h>
+#include <ATen/ops/empty_like.h>
+#include <ATen/ops/tensor.h>
+#include <ATen/ops/zeros_like.h>
+
 #include <vector>
 
 #include "torch/checks.h"
