@@ -82,12 +82,7 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
       const int row = first + lane_id();
       const Range range = row <= tile_rows.last ? tile_columns_of(support, params.grid, rows, row) : Range{0, -1};
       const int width = range.last - range.first + 1;
-      int up_to = width;  // inclusive sum over the lanes
-#pragma unroll
-      for (int offset = 1; offset < 32; offset *= 2) {
-        const int other = __shfl_up_sync(kAllLanes, up_to, offset);
-        if (lane_id() >= offset) up_to += other;
-      }
+      const int up_to = warp_inclusive_sum(width);
       int64_t mine = place + up_to - width;
       for (int c = range.first; c <= range.last; ++c) write_pair(params, mine++, uint32_t(row) * columns + c, id);
       place += __shfl_sync(kAllLanes, up_to, 31);

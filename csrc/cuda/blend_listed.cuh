@@ -72,12 +72,7 @@ template <class F, int C> struct ListedStage {
   /// there are. All lanes must call it.
   __device__ int take(const Splat<F, float>* splats_in, const TileList& list, int k, uint32_t word) {
     const int lane = lane_id(), count = __popc(word);
-    int behind = count;  // of the words up to this lane's
-#pragma unroll
-    for (int offset = 1; offset < 32; offset *= 2) {
-      const int other = __shfl_up_sync(kAllLanes, behind, offset);
-      if (lane >= offset) behind += other;
-    }
+    const int behind = warp_inclusive_sum(count);  // of the words up to this lane's
     int to = behind - count;
     for (; word != 0; word &= word - 1) places[to++] = uint16_t(32 * lane + __ffs(word) - 1);
     const int all = __shfl_sync(kAllLanes, behind, 31);

@@ -37,7 +37,7 @@ template <class F, int C> void launch_segments_vjp(const BlendVjpParams& p, int 
   sums<<<pieces, Layout::kThreads, kBytes, stream>>>(p, first, false);
 }
 template <class F, int C> void launch_moving_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
-  const bool in_segments = p.grid.tiles() < kLargeImageTiles;
+  const bool in_segments = is_small_image(p.grid);
   if (in_segments) launch_segments_vjp<F, C>(p, first, stream);
   using Layout = EvenLayout<F, true>;
   constexpr int kBytes = int(sizeof(MovingVjpShared<F, C, Layout>));
@@ -62,7 +62,7 @@ int64_t max_adjoint_maps(int footprint, int64_t capacity, TileGrid grid) {
     using F = decltype(f);
     if (F::kMoves) samples = F::kSamples;
   });
-  if (grid.tiles() >= kLargeImageTiles) return 0;
+  if (!is_small_image(grid)) return 0;
   return max_pieces(capacity, kMovingSegment, grid) * AdjointMap::kNumbers * kMovingPixels * samples;
 }
 

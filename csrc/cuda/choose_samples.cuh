@@ -14,17 +14,12 @@ __device__ inline Passed operator+(Passed front, Passed behind) {
   return {front.product * behind.product, front.sum + behind.sum};
 }
 __device__ inline Passed shuffle_up(Passed p, int offset) {
-  return {__shfl_up_sync(kAllLanes, p.product, offset), __shfl_up_sync(kAllLanes, p.sum, offset)};
+  return {shuffle_up(p.product, offset), shuffle_up(p.sum, offset)};
 }
 
 /// What is in front of each of the threads of kWarps warps; `all`: of all of them. Several are a whole block.
 template <int kWarps> __device__ Passed passed_before(Passed own, Passed& all) {
-  Passed scan = own;
-#pragma unroll
-  for (int offset = 1; offset < 32; offset *= 2) {
-    const Passed front = shuffle_up(scan, offset);
-    if (lane_id() >= offset) scan = front + scan;
-  }
+  const Passed scan = warp_inclusive_sum(own);
   Passed before = shuffle_up(scan, 1);
   if (lane_id() == 0) before = {1, 0};
   if constexpr (kWarps == 1) {

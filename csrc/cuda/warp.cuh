@@ -18,6 +18,18 @@ template <typename T> __device__ T warp_sum(T v) {
   return v;
 }
 
+template <typename T> __device__ T shuffle_up(T v, int offset) { return __shfl_up_sync(kAllLanes, v, offset); }
+
+/// Sum of the lanes up to and with this one. `T` has a + that need not commute, and a shuffle_up.
+template <typename T> __device__ T warp_inclusive_sum(T v) {
+#pragma unroll
+  for (int offset = 1; offset < 32; offset *= 2) {
+    const T before = shuffle_up(v, offset);
+    if (lane_id() >= offset) v = before + v;
+  }
+  return v;
+}
+
 __device__ inline int warp_max(int v) {
 #if __CUDA_ARCH__ >= 800
   return __reduce_max_sync(kAllLanes, v);
