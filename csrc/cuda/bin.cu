@@ -4,7 +4,7 @@
 #include <cub/block/block_scan.cuh>
 
 #include "cuda/bin.cuh"
-#include "cuda/warp.cuh"
+#include "cuda/launch.cuh"
 
 namespace ar::cuda {
 namespace {
@@ -182,7 +182,7 @@ void sort_values(const TileSort<Value>& p, TileGrid grid, uint32_t* memory, cuda
   const int passes = tile_passes(grid);
   const SortScratch scratch(memory, p.capacity, passes);
   const auto count = [&](auto kernel) {
-    kernel<<<kCountBlocks, kCountThreads, 0, stream>>>(p.tiles[0], p.counts, p.capacity, scratch.histograms);
+    launch(kernel, {kCountBlocks, kCountThreads}, stream, p.tiles[0], p.counts, p.capacity, scratch.histograms);
   };
   switch (passes) {
     case 1:
@@ -200,11 +200,11 @@ void sort_values(const TileSort<Value>& p, TileGrid grid, uint32_t* memory, cuda
   }
   for (int pass = 0; pass < passes; ++pass) {
     // After an overflow the histograms are empty, and with them the sort.
-    sort_pass_kernel<Value, false><<<unsigned(scratch.blocks), kSortThreads, 0, stream>>>(
-        scratch, pass, 0, 0, p.tiles[pass % 2], p.tiles[1 - pass % 2], p.values[pass % 2], p.values[1 - pass % 2]);
+    launch(sort_pass_kernel<Value, false>, {unsigned(scratch.blocks), kSortThreads}, stream, scratch, pass, 0, 0,
+           p.tiles[pass % 2], p.tiles[1 - pass % 2], p.values[pass % 2], p.values[1 - pass % 2]);
   }
-  tile_offsets_kernel<<<blocks_of(grid.tiles() + 1, kRangeThreads), kRangeThreads, 0, stream>>>(
-      p.tiles[passes % 2], p.counts, p.capacity, grid.tiles(), p.tile_offsets, p.feedback);
+  launch(tile_offsets_kernel, {blocks_of(grid.tiles() + 1, kRangeThreads), kRangeThreads}, stream, p.tiles[passes % 2],
+         p.counts, p.capacity, grid.tiles(), p.tile_offsets, p.feedback);
 }
 
 }  // namespace
@@ -225,25 +225,25 @@ int tile_sort_result(TileGrid grid) { return tile_passes(grid) % 2; }
 void count_depths(const DepthSort& p, void* memory, cudaStream_t stream) {
   const SortScratch scratch(static_cast<uint32_t*>(memory), p.n, kDepthPasses);
   if (p.n == 0) return;
-  count_depths_kernel<<<kCountBlocks, kCountThreads, 0, stream>>>(p.keys[0], p.ranges, p.n, scratch.histograms,
-                                                                  p.counts);
+  launch(count_depths_kernel, {kCountBlocks, kCountThreads}, stream, p.keys[0], p.ranges, p.n, scratch.histograms,
+         p.counts);
 }
 
 void sort_by_depth(const DepthSort& p, void* memory, cudaStream_t stream) {
   if (p.n == 0) return;
   const SortScratch scratch(static_cast<uint32_t*>(memory), p.n, kDepthPasses);
-  const auto blocks = unsigned(scratch.blocks);
-  sort_pass_kernel<int32_t, true>
-      <<<blocks, kSortThreads, 0, stream>>>(scratch, 0, p.n, kCulledKey, p.keys[0], p.keys[1], nullptr, p.order[1]);
+  const LaunchShape shape = {unsigned(scratch.blocks), kSortThreads};
+  launch(sort_pass_kernel<int32_t, true>, shape, stream, scratch, 0, p.n, kCulledKey, p.keys[0], p.keys[1], nullptr,
+         p.order[1]);
   for (int pass = 1; pass < kDepthPasses; ++pass) {
-    sort_pass_kernel<int32_t, false><<<blocks, kSortThreads, 0, stream>>>(
-        scratch, pass, 0, 0, p.keys[pass % 2], p.keys[1 - pass % 2], p.order[pass % 2], p.order[1 - pass % 2]);
+    launch(sort_pass_kernel<int32_t, false>, shape, stream, scratch, pass, 0, 0, p.keys[pass % 2], p.keys[1 - pass % 2],
+           p.order[pass % 2], p.order[1 - pass % 2]);
   }
 }
 
 void emit_pairs(const EmitParams& p, cudaStream_t stream) {
   if (p.n == 0) return;
-  emit_pairs_kernel<<<blocks_of(p.n, kEmitThreads), kEmitThreads, 0, stream>>>(p);
+  launch(emit_pairs_kernel, {blocks_of(p.n, kEmitThreads), kEmitThreads}, stream, p);
 }
 
 void sort_by_tile(const TileSort<int32_t>& p, TileGrid grid, void* scratch, cudaStream_t stream) {
@@ -255,9 +255,9 @@ void sort_by_tile(const TileSort<SlotPair>& p, TileGrid grid, void* scratch, cud
 
 void plan_chunks(const TileLists& lists, TileGrid grid, int samples, bool whole, CheckpointLayout layout,
                  const ChunkPlan& plan, cudaStream_t stream) {
-  const unsigned blocks = blocks_of(grid.tiles(), kPlanThreads);
-  count_work_kernel<<<blocks, kPlanThreads, 0, stream>>>(lists, grid.tiles(), samples, whole, &plan.state->counters);
-  plan_kernel<<<blocks, kPlanThreads, 0, stream>>>(lists, grid, samples, whole, layout, plan);
+  const LaunchShape shape = {blocks_of(grid.tiles(), kPlanThreads), kPlanThreads};
+  launch(count_work_kernel, shape, stream, lists, grid.tiles(), samples, whole, &plan.state->counters);
+  launch(plan_kernel, shape, stream, lists, grid, samples, whole, layout, plan);
 }
 
 }  // namespace ar::cuda

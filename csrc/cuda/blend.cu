@@ -18,15 +18,15 @@ template <class F, int C> void launch_moving_blend(const BlendParams& p, int fir
   if (listed) {
     using Layout = ListedLayout<F>;
     const auto blocks = unsigned(p.grid.tiles() * Layout::kBlocks);
-    listed_blend_kernel<F, C, Layout><<<blocks, Layout::kThreads, 0, stream>>>(p, first);
+    launch(listed_blend_kernel<F, C, Layout>, {blocks, Layout::kThreads}, stream, p, first);
   }
   using Layout = EvenLayout<F, false>;
-  moving_blend_kernel<F, C, Layout><<<unsigned(p.grid.tiles()), Layout::kThreads, 0, stream>>>(p, first, listed);
+  launch(moving_blend_kernel<F, C, Layout>, {unsigned(p.grid.tiles()), Layout::kThreads}, stream, p, first, listed);
 }
 template <class F> void blend_moving(const BlendParams& p, cudaStream_t stream) {
   if (is_small_image(p.grid)) {
     const auto pieces = unsigned(max_pieces(p.lists.capacity, kFilterPiece, p.grid));
-    filter_kernel<F, ListedLayout<F>><<<pieces, kFilterPiece, 0, stream>>>(p);
+    launch(filter_kernel<F, ListedLayout<F>>, {pieces, kFilterPiece}, stream, p);
   }
   if (!p.channels.data) return launch_moving_blend<F, 3>(p, 0, stream);
   if (p.channels.count <= kFewChannels) return launch_moving_blend<F, 4>(p, 0, stream);

@@ -8,6 +8,7 @@
 #pragma once
 
 #include "cuda/composite.cuh"
+#include "cuda/launch.cuh"
 
 namespace ar::cuda {
 
@@ -418,11 +419,11 @@ inline constexpr int kTailBlocks = 132 * 8;
 
 template <class F, int C, bool kKeep> void launch_blend(const BlendParams& p, cudaStream_t stream) {
   constexpr int S = F::kSamples;
-  blend_front_kernel<F, C, kKeep><<<unsigned(p.grid.tiles()), kBlendThreads, 0, stream>>>(p);
-  tail_through_kernel<F><<<kTailBlocks, kBlendThreads, 0, stream>>>(p);
-  tail_scan_kernel<S><<<kTailBlocks, kTilePixels, 0, stream>>>(p);
-  tail_blend_kernel<F, C, kKeep><<<kTailBlocks, kBlendThreads, 0, stream>>>(p);
-  tail_sum_kernel<S, C, kKeep><<<kTailBlocks, kTilePixels, 0, stream>>>(p);
+  launch(blend_front_kernel<F, C, kKeep>, {unsigned(p.grid.tiles()), kBlendThreads}, stream, p);
+  launch(tail_through_kernel<F>, {kTailBlocks, kBlendThreads}, stream, p);
+  launch(tail_scan_kernel<S>, {kTailBlocks, kTilePixels}, stream, p);
+  launch(tail_blend_kernel<F, C, kKeep>, {kTailBlocks, kBlendThreads}, stream, p);
+  launch(tail_sum_kernel<S, C, kKeep>, {kTailBlocks, kTilePixels}, stream, p);
 }
 template <class F, int C> void blend_few(const BlendParams& p, cudaStream_t stream) {
   if (p.transmittance) {

@@ -4,6 +4,7 @@
 #pragma once
 
 #include "cuda/composite.cuh"
+#include "cuda/launch.cuh"
 
 namespace ar::cuda {
 
@@ -126,7 +127,7 @@ template <class Params> Params with_channels(Params p) {
 
 template <class F> void blend_groups(const BlendParams& p, cudaStream_t stream) {
   const dim3 blocks(unsigned(p.grid.tiles()), blocks_of(p.channels.count, kChannelGroup));
-  blend_groups_kernel<F><<<blocks, kBlendThreads, 0, stream>>>(p);
+  launch(blend_groups_kernel<F>, {blocks, kBlendThreads}, stream, p);
 }
 
 }  // namespace ar::cuda

@@ -140,8 +140,8 @@ template <class F> void blend_segments(const BlendParams& p, const BlendParams& 
   blend_few<F, 3>(cut, stream);
   const unsigned tiles = unsigned(p.grid.tiles());
   for (int first = 0; first < p.channels.count; first += kChannelGroup) {
-    segment_blend_kernel<F><<<tiles * p.segments.count, kBlendThreads, 0, stream>>>(p, cut, first);
-    segment_sum_kernel<F::kSamples><<<tiles, kTilePixels, 0, stream>>>(p, first);
+    launch(segment_blend_kernel<F>, {tiles * p.segments.count, kBlendThreads}, stream, p, cut, first);
+    launch(segment_sum_kernel<F::kSamples>, {tiles, kTilePixels}, stream, p, first);
   }
 }
 

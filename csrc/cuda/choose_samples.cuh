@@ -3,6 +3,7 @@
 
 #include "core/choose.h"
 #include "cuda/composite.cuh"
+#include "cuda/launch.cuh"
 
 namespace ar::cuda {
 
@@ -120,9 +121,9 @@ template <class F> void launch_choose_samples(const ChooseParams& p, cudaStream_
   const SampleLimits<float> limits = sample_limits<float>(p.options.number);
   const int64_t tiles = p.grid.tiles();
   if (tiles >= 2048) {
-    choose_samples_kernel<F, 1><<<blocks_of(tiles, kWarps), kChooseThreads, 0, stream>>>(p, limits);
+    launch(choose_samples_kernel<F, 1>, {blocks_of(tiles, kWarps), kChooseThreads}, stream, p, limits);
   } else {
-    choose_samples_kernel<F, kWarps><<<unsigned(tiles), kChooseThreads, 0, stream>>>(p, limits);
+    launch(choose_samples_kernel<F, kWarps>, {unsigned(tiles), kChooseThreads}, stream, p, limits);
   }
 }
 

@@ -9,8 +9,6 @@ inline constexpr uint32_t kAllLanes = 0xffffffff;
 
 __device__ inline int lane_id() { return threadIdx.x % 32; }
 
-inline unsigned blocks_of(int64_t n, int threads) { return unsigned((n + threads - 1) / threads); }
-
 /// Sum over the lanes, in every lane, in a fixed order.
 template <typename T> __device__ T warp_sum(T v) {
 #pragma unroll
