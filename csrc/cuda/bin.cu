@@ -23,6 +23,7 @@ constexpr int kCountThreads = 512, kCountBlocks = 132 * 2;
 /// how many pairs.
 __global__ void __launch_bounds__(kCountThreads) count_depths_kernel(const uint32_t* keys, const PairRange* ranges,
                                                                      int64_t n, uint32_t* histograms, Counts* counts) {
+  begin_kernel();
   __shared__ uint32_t local[kDepthPasses * kBins];
   for (int b = threadIdx.x; b < kDepthPasses * kBins; b += kCountThreads) local[b] = 0;
   __syncthreads();
@@ -53,6 +54,7 @@ __global__ void __launch_bounds__(kCountThreads) count_depths_kernel(const uint3
 template <int kPasses>
 __global__ void __launch_bounds__(kCountThreads)
     count_tiles_kernel(const uint32_t* tiles, const Counts* counts, int64_t capacity, uint32_t* histograms) {
+  begin_kernel();
   const int64_t n = counts->pairs;
   if (n > capacity) return;
   __shared__ uint32_t local[kPasses * kBins];
@@ -73,6 +75,7 @@ constexpr int kRangeThreads = 128;
 __global__ void __launch_bounds__(kRangeThreads)
     tile_offsets_kernel(const uint32_t* tiles, const Counts* counts, int64_t capacity, int64_t tile_count,
                         int64_t* tile_offsets, PairFeedback feedback) {
+  begin_kernel();
   if (blockIdx.x == 0 && threadIdx.x == 0 && feedback.word) {
     const uint64_t pairs = min(uint64_t(counts->pairs), uint64_t(0xffffffff));
     *feedback.word = uint64_t(feedback.frame) << 32 | pairs;
@@ -122,6 +125,7 @@ __device__ int piece_length(int samples, bool whole) { return whole ? kWholeList
 
 __global__ void __launch_bounds__(kPlanThreads)
     count_work_kernel(const TileLists lists, int64_t tiles, int most_samples, bool whole, PlanCounters* counters) {
+  begin_kernel();
   const int64_t tile = int64_t(blockIdx.x) * kPlanThreads + threadIdx.x;
   if (tile >= tiles) return;
   const int samples = samples_of(lists, tile, most_samples), length = piece_length(samples, whole);
@@ -134,6 +138,7 @@ __global__ void __launch_bounds__(kPlanThreads)
 /// Places come from atomics: which tile gets which differs from run to run, and changes no result.
 __global__ void __launch_bounds__(kPlanThreads) plan_kernel(const TileLists lists, TileGrid grid, int most_samples,
                                                             bool whole, CheckpointLayout layout, const ChunkPlan plan) {
+  begin_kernel();
   using Scan = cub::BlockScan<int, kPlanThreads>;
   static_assert(kWorkClasses < kPlanThreads);
   __shared__ typename Scan::TempStorage storage;

@@ -40,6 +40,7 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
 
 /// Pairs in the order of depth, a splat's by rows of tiles.
 __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitParams params) {
+  begin_kernel();
   using Scan = cub::BlockScan<uint32_t, kEmitThreads>;
   __shared__ typename Scan::TempStorage storage;
   __shared__ uint32_t block_id, before_block;

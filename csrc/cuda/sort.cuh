@@ -66,6 +66,7 @@ template <class Value, bool kFirst>
 __global__ void __launch_bounds__(kSortThreads)
     sort_pass_kernel(const SortScratch scratch, int pass, int64_t first_count, uint32_t skip, const uint32_t* keys_in,
                      uint32_t* keys_out, const Value* values_in, Value* values_out) {
+  begin_kernel();
   using Scan = cub::BlockScan<uint32_t, kSortThreads>;
   __shared__ typename Scan::TempStorage scan_storage;
   __shared__ uint32_t counts[kSortWarps][kBins];  // of a warp's digits, then their first places in the block
