@@ -1,7 +1,6 @@
 // Launches of bin: sorts, pairs, and the plan of the blending work.
 #include <algorithm>
 #include <cub/block/block_reduce.cuh>
-#include <cub/block/block_scan.cuh>
 
 #include "cuda/bin.cuh"
 #include "cuda/launch.cuh"
@@ -139,16 +138,14 @@ __global__ void __launch_bounds__(kPlanThreads)
 __global__ void __launch_bounds__(kPlanThreads) plan_kernel(const TileLists lists, TileGrid grid, int most_samples,
                                                             bool whole, CheckpointLayout layout, const ChunkPlan plan) {
   begin_kernel();
-  using Scan = cub::BlockScan<int, kPlanThreads>;
   static_assert(kWorkClasses < kPlanThreads);
-  __shared__ typename Scan::TempStorage storage;
   __shared__ int tile_base[kWorkClasses], chunk_base[kWorkClasses];
   PlanCounters& counters = plan.state->counters;
   PlanCounts& counts = plan.state->counts;
   const auto find_bases = [&](const int32_t* sizes, int* base, SampleParts& parts) {
     const int c = threadIdx.x;
-    int first = c < kWorkClasses ? sizes[c] : 0;
-    Scan(storage).ExclusiveSum(first, first);
+    int all;
+    const int first = sum_before<kPlanThreads / 32>(c < kWorkClasses ? sizes[c] : 0, 0, all);
     if (c < kWorkClasses) base[c] = first;
     if (blockIdx.x == 0 && c <= kWorkClasses && c % kLengthClasses == 0) parts.first[c / kLengthClasses] = first;
     __syncthreads();

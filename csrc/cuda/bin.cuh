@@ -1,8 +1,6 @@
 // Kernel of bin that writes the pairs of every splat.
 #pragma once
 
-#include <cub/block/block_scan.cuh>
-
 #include "core/bin.h"
 #include "cuda/sort.cuh"
 #include "cuda/stages.h"
@@ -41,8 +39,6 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
 /// Pairs in the order of depth, a splat's by rows of tiles.
 __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitParams params) {
   begin_kernel();
-  using Scan = cub::BlockScan<uint32_t, kEmitThreads>;
-  __shared__ typename Scan::TempStorage storage;
   __shared__ uint32_t block_id, before_block;
   if (params.counts->pairs > params.capacity) return;
   if (threadIdx.x == 0) block_id = atomicAdd(&params.status[0], 1);
@@ -53,8 +49,8 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
   const int32_t i = r < n ? params.order[r] : 0;
   const int count = r < n ? params.ranges[i].count : 0;
   const SplatRow<float> splat = splats[i];
-  uint32_t before, sum;
-  Scan(storage).ExclusiveSum(uint32_t(count), before, sum);
+  uint32_t sum;
+  const uint32_t before = sum_before<kEmitThreads / 32>(uint32_t(count), 0u, sum);
   uint32_t* status = params.status + 1;
   if (threadIdx.x < 32) {
     if (threadIdx.x == 0) write_status(status + block_id, (block_id == 0 ? kUpToBlock : kOfBlock) | sum);

@@ -14,33 +14,9 @@ struct Passed {
 __device__ inline Passed operator+(Passed front, Passed behind) {
   return {front.product * behind.product, front.sum + behind.sum};
 }
+__device__ inline Passed shuffle(Passed p, int lane) { return {shuffle(p.product, lane), shuffle(p.sum, lane)}; }
 __device__ inline Passed shuffle_up(Passed p, int offset) {
   return {shuffle_up(p.product, offset), shuffle_up(p.sum, offset)};
-}
-
-/// What is in front of each of the threads of kWarps warps; `all`: of all of them. Several are a whole block.
-template <int kWarps> __device__ Passed passed_before(Passed own, Passed& all) {
-  const Passed scan = warp_inclusive_sum(own);
-  Passed before = shuffle_up(scan, 1);
-  if (lane_id() == 0) before = {1, 0};
-  if constexpr (kWarps == 1) {
-    all = {__shfl_sync(kAllLanes, scan.product, 31), __shfl_sync(kAllLanes, scan.sum, 31)};
-    return before;
-  } else {
-    __shared__ Passed warps[kWarps];
-    const int warp = threadIdx.x / 32;
-    __syncthreads();  // the last call's reading
-    if (lane_id() == 31) warps[warp] = scan;
-    __syncthreads();
-    Passed front = {1, 0};
-    all = {1, 0};
-#pragma unroll
-    for (int w = 0; w < kWarps; ++w) {
-      if (w == warp) front = all;
-      all = all + warps[w];
-    }
-    return front + before;
-  }
 }
 
 /// The emit kernel's test, for lists that hold all splats.
@@ -81,7 +57,7 @@ __global__ void __launch_bounds__(kChooseThreads)
     SampleEstimate<float> alone = {};
     alone.add(share, color);
     Passed all;
-    const Passed front = passed + passed_before<kWarps>({alone.transmittance, alone.front}, all);
+    const Passed front = passed + sum_before<kWarps>(Passed{alone.transmittance, alone.front}, {1, 0}, all);
     own.transmittance = front.product;
     own.front = front.sum;
     if (!own.dark()) {
