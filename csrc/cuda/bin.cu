@@ -1,6 +1,5 @@
 // Launches of bin: sorts, pairs, and the plan of the blending work.
 #include <algorithm>
-#include <cub/block/block_reduce.cuh>
 
 #include "cuda/bin.cuh"
 #include "cuda/launch.cuh"
@@ -8,46 +7,10 @@
 namespace ar::cuda {
 namespace {
 
-constexpr int kDepthPasses = 4;
-
 int tile_passes(TileGrid grid) {
   int passes = 1;
   while (grid.tiles() > int64_t(1) << (passes * kDigitBits)) ++passes;
   return passes;
-}
-
-constexpr int kCountThreads = 512, kCountBlocks = 132 * 2;
-
-/// Histograms of all digits of the depth keys of splats with pairs; how many of these there are, and
-/// how many pairs.
-__global__ void __launch_bounds__(kCountThreads) count_depths_kernel(const uint32_t* keys, const PairRange* ranges,
-                                                                     int64_t n, uint32_t* histograms, Counts* counts) {
-  begin_kernel();
-  __shared__ uint32_t local[kDepthPasses * kBins];
-  for (int b = threadIdx.x; b < kDepthPasses * kBins; b += kCountThreads) local[b] = 0;
-  __syncthreads();
-  unsigned long long pairs = 0, splats = 0;
-  const int64_t stride = int64_t(gridDim.x) * kCountThreads, rounded = (n + 31) / 32 * 32;
-  for (int64_t i = int64_t(blockIdx.x) * kCountThreads + threadIdx.x; i < rounded; i += stride) {
-    const uint32_t key = i < n ? keys[i] : kCulledKey;
-    const bool valid = key != kCulledKey;
-    count_digits<kDepthPasses>(key, valid, local);
-    if (valid) pairs += ranges[i].count;
-    splats += valid;
-  }
-  __syncthreads();
-  for (int b = threadIdx.x; b < kDepthPasses * kBins; b += kCountThreads) {
-    if (local[b]) atomicAdd(&histograms[b], local[b]);
-  }
-  using Reduce = cub::BlockReduce<unsigned long long, kCountThreads>;
-  __shared__ typename Reduce::TempStorage storage;
-  pairs = Reduce(storage).Sum(pairs);
-  __syncthreads();
-  splats = Reduce(storage).Sum(splats);
-  if (threadIdx.x == 0) {
-    atomicAdd(reinterpret_cast<unsigned long long*>(&counts->pairs), pairs);
-    atomicAdd(reinterpret_cast<unsigned long long*>(&counts->splats), splats);
-  }
 }
 
 template <int kPasses>
@@ -235,12 +198,7 @@ void sort_by_depth(const DepthSort& p, void* memory, cudaStream_t stream) {
   if (p.n == 0) return;
   const SortScratch scratch(static_cast<uint32_t*>(memory), p.n, kDepthPasses);
   const LaunchShape shape = {unsigned(scratch.blocks), kSortThreads};
-  launch(sort_pass_kernel<int32_t, true>, shape, stream, scratch, 0, p.n, kCulledKey, p.keys[0], p.keys[1], nullptr,
-         p.order[1]);
-  for (int pass = 1; pass < kDepthPasses; ++pass) {
-    launch(sort_pass_kernel<int32_t, false>, shape, stream, scratch, pass, 0, 0, p.keys[pass % 2], p.keys[1 - pass % 2],
-           p.order[pass % 2], p.order[1 - pass % 2]);
-  }
+  for_each_depth_pass(p, scratch, [&](auto kernel, auto... arguments) { launch(kernel, shape, stream, arguments...); });
 }
 
 void emit_pairs(const EmitParams& p, cudaStream_t stream) {
