@@ -120,7 +120,7 @@ template <class F> struct MapMemory {
 };
 
 /// Pairs of a segment. Longer ones need fewer maps, shorter ones fill a device with smaller scenes.
-inline constexpr int kMovingSegment = 1024;
+inline constexpr int kMovingSegment = 512;
 /// Samples shared out for segments, of which there are many, with small splats: few pixels per warp, and blocks small
 /// enough for two on an SM.
 template <class F> using SegmentLayout = CellLayout<F::kSamples <= 4 ? 1 : 2, F::kSamples <= 4 ? 4 : 8>;
