@@ -66,9 +66,9 @@ class GaussianRasterizationSettings(_Fields):
     footprint: Footprint | None = None
     effects: Effects | str | None = None
     means2d_z = "zero"
-    """What the third column of the gradient of means2D (P, 3) holds, where (gx, gy) is what a pixel adds to the first two:
-    "zero"; "sum_abs", the sum over pixels of |gx| + |gy|; or "sum_norm", that of the length of (gx, gy). Some dialects
-    have another value than "zero"."""
+    """What the third column of the gradient of means2D (P, 3) holds: "zero"; "sum_abs", the sum over pixels of
+    |gx| + |gy|; or "sum_norm", that of the length of (gx, gy), where (gx, gy) is what a pixel adds to the first two
+    columns. Some dialects have another value than "zero"."""
 
     def __new__(
         cls, *args: Any, footprint: str | Footprint | None = None, effects: Effects | str | None = None, **kwargs: Any
