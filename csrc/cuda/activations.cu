@@ -2,8 +2,8 @@
 #include "core/activations.h"
 #include "core/density.h"
 
+#include "cuda/launch.cuh"
 #include "cuda/training.h"
-#include "cuda/warp.cuh"
 
 namespace ar::cuda {
 namespace {
@@ -11,16 +11,19 @@ namespace {
 constexpr int kThreads = 256;
 
 template <typename T> __global__ void activate_kernel(const ActivateParams<T> p) {
+  begin_kernel();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i < p.n) ar::activate(p, i);
 }
 
 template <typename T> __global__ void activate_vjp_kernel(const ActivateVjpParams<T> p) {
+  begin_kernel();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i < p.n) ar::activate_vjp(p, i);
 }
 
 template <typename T> __global__ void observe_kernel(const ObserveParams<T> p) {
+  begin_kernel();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i < p.n) ar::observe(p, i);
 }
@@ -28,13 +31,13 @@ template <typename T> __global__ void observe_kernel(const ObserveParams<T> p) {
 }  // namespace
 
 template <typename T> void activate(const ActivateParams<T>& p, cudaStream_t stream) {
-  if (p.n > 0) activate_kernel<T><<<blocks_of(p.n, kThreads), kThreads, 0, stream>>>(p);
+  if (p.n > 0) launch(activate_kernel<T>, {blocks_of(p.n, kThreads), kThreads}, stream, p);
 }
 template <typename T> void activate_vjp(const ActivateVjpParams<T>& p, cudaStream_t stream) {
-  if (p.n > 0) activate_vjp_kernel<T><<<blocks_of(p.n, kThreads), kThreads, 0, stream>>>(p);
+  if (p.n > 0) launch(activate_vjp_kernel<T>, {blocks_of(p.n, kThreads), kThreads}, stream, p);
 }
 template <typename T> void observe(const ObserveParams<T>& p, cudaStream_t stream) {
-  if (p.n > 0) observe_kernel<T><<<blocks_of(p.n, kThreads), kThreads, 0, stream>>>(p);
+  if (p.n > 0) launch(observe_kernel<T>, {blocks_of(p.n, kThreads), kThreads}, stream, p);
 }
 
 template void activate(const ActivateParams<float>&, cudaStream_t);

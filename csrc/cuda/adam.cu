@@ -1,6 +1,7 @@
 // A step of Adam on several tensors: a block updates a part of one of them, a thread 16 bytes of each of its arrays.
 #include "core/adam.h"
 
+#include "cuda/launch.cuh"
 #include "cuda/training.h"
 
 namespace ar::cuda {
@@ -57,6 +58,7 @@ template <typename T> __device__ void update_packed(const AdamParams<T>& p, cons
 }
 
 template <typename T> __global__ void __launch_bounds__(kThreads) adam_kernel(const __grid_constant__ AdamParams<T> p) {
+  begin_kernel();
   const AdamPart part = part_of_item(p, blockIdx.x, kBlockNumbers<T>);
   const AdamTensor<T>& t = p.tensors[part.tensor];
   if (!t.aligned) {
@@ -75,7 +77,7 @@ template <typename T> __global__ void __launch_bounds__(kThreads) adam_kernel(co
 
 template <typename T> void adam(AdamParams<T> p, cudaStream_t stream) {
   const int64_t blocks = divide_work(p, kBlockNumbers<T>);
-  adam_kernel<T><<<unsigned(blocks), kThreads, 0, stream>>>(p);
+  launch(adam_kernel<T>, {unsigned(blocks), kThreads}, stream, p);
 }
 
 template void adam(AdamParams<float>, cudaStream_t);

@@ -4,6 +4,7 @@
 #pragma once
 
 #include "cuda/composite.cuh"
+#include "cuda/launch.cuh"
 
 namespace ar::cuda {
 
@@ -52,6 +53,7 @@ template <class F>
 __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4   ? 1
                                                  : F::kSamples > 1 ? 2
                                                                    : 3) blend_groups_kernel(const BlendParams params) {
+  begin_kernel();
   constexpr int S = F::kSamples;
   __shared__ Stage<F, 0, kGroupBatch> stage;
   __shared__ GroupChannels<kGroupBatch> staged;
@@ -126,7 +128,7 @@ template <class Params> Params with_channels(Params p) {
 
 template <class F> void blend_groups(const BlendParams& p, cudaStream_t stream) {
   const dim3 blocks(unsigned(p.grid.tiles()), blocks_of(p.channels.count, kChannelGroup));
-  blend_groups_kernel<F><<<blocks, kBlendThreads, 0, stream>>>(p);
+  launch(blend_groups_kernel<F>, {blocks, kBlendThreads}, stream, p);
 }
 
 }  // namespace ar::cuda

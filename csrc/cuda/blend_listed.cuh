@@ -34,6 +34,7 @@ __device__ int64_t group_words(const TileLists& lists, const TileList& list, int
 /// A thread per pair: which groups of pixels its splat reaches.
 template <class F, class Layout>
 __global__ void __launch_bounds__(kFilterPiece) filter_kernel(const BlendParams params) {
+  begin_kernel();
   __shared__ uint32_t words[Layout::kGroups][kFilterWords];
   const TilePiece piece = find_piece(params.lists, params.grid, kFilterPiece, blockIdx.x);
   if (piece.tile < 0) return;
@@ -72,12 +73,7 @@ template <class F, int C> struct ListedStage {
   /// there are. All lanes must call it.
   __device__ int take(const Splat<F, float>* splats_in, const TileList& list, int k, uint32_t word) {
     const int lane = lane_id(), count = __popc(word);
-    int behind = count;  // of the words up to this lane's
-#pragma unroll
-    for (int offset = 1; offset < 32; offset *= 2) {
-      const int other = __shfl_up_sync(kAllLanes, behind, offset);
-      if (lane >= offset) behind += other;
-    }
+    const int behind = warp_inclusive_sum(count);  // of the words up to this lane's
     int to = behind - count;
     for (; word != 0; word &= word - 1) places[to++] = uint16_t(32 * lane + __ffs(word) - 1);
     const int all = __shfl_sync(kAllLanes, behind, 31);
@@ -95,6 +91,7 @@ template <class F, int C> struct ListedStage {
 /// A warp per group of a tile's pixels; C channels from `first` on.
 template <class F, int C, class Layout>
 __global__ void __launch_bounds__(Layout::kThreads) listed_blend_kernel(const BlendParams params, int first) {
+  begin_kernel();
   __shared__ ListedStage<F, C> stages[Layout::kWarps];
   ListedStage<F, C>& stage = stages[threadIdx.x / 32];
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);

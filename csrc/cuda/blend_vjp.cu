@@ -8,6 +8,7 @@ namespace {
 
 /// With too many pairs there is a row per splat that all tiles add to. The sums of shapes stay from group to group.
 __global__ void clear_splat_sums_kernel(const BlendVjpParams params, int group) {
+  begin_kernel();
   if (params.lists.counts->pairs <= params.lists.capacity) return;
   const auto clear = [&](float* to, int width) {
     const int64_t n = params.lists.n * width;
@@ -18,32 +19,22 @@ __global__ void clear_splat_sums_kernel(const BlendVjpParams params, int group) 
   if (params.channel_sums) clear(params.channel_sums, kChannelGroup);
 }
 
-/// Lets a kernel have more of a block's memory than kernels have unasked.
-template <class Kernel> void allow_shared(Kernel kernel, int bytes) {
-  if (bytes > 48 * 1024) cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, bytes);
-}
 /// Lists in segments, side by side.
 template <class F, int C> void launch_segments_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
   using Layout = SegmentLayout<F>;
-  constexpr int kBytes = int(sizeof(MovingVjpShared<F, C, Layout>));
   const auto pieces = unsigned(max_pieces(p.lists.capacity, kMovingSegment, p.grid));
-  const auto maps = moving_vjp_kernel<F, C, Layout, kMovingSegment, true>;
-  const auto sums = moving_vjp_kernel<F, C, Layout, kMovingSegment, false>;
-  allow_shared(maps, kBytes);
-  allow_shared(sums, kBytes);
-  maps<<<pieces, Layout::kThreads, kBytes, stream>>>(p, first, false);
+  const LaunchShape shape = {pieces, Layout::kThreads, sizeof(MovingVjpShared<F, C, Layout>)};
+  launch(moving_vjp_kernel<F, C, Layout, kMovingSegment, true>, shape, stream, p, first, false);
   const auto blocks = unsigned(p.grid.tiles() * F::kSamples);
-  chain_maps_kernel<F, kMovingSegment><<<blocks, kMovingPixels, 0, stream>>>(p);
-  sums<<<pieces, Layout::kThreads, kBytes, stream>>>(p, first, false);
+  launch(chain_maps_kernel<F, kMovingSegment>, {blocks, kMovingPixels}, stream, p);
+  launch(moving_vjp_kernel<F, C, Layout, kMovingSegment, false>, shape, stream, p, first, false);
 }
 template <class F, int C> void launch_moving_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
-  const bool in_segments = p.grid.tiles() < kLargeImageTiles;
+  const bool in_segments = is_small_image(p.grid);
   if (in_segments) launch_segments_vjp<F, C>(p, first, stream);
   using Layout = EvenLayout<F, true>;
-  constexpr int kBytes = int(sizeof(MovingVjpShared<F, C, Layout>));
-  const auto kernel = moving_vjp_kernel<F, C, Layout>;
-  allow_shared(kernel, kBytes);
-  kernel<<<unsigned(p.grid.tiles()), Layout::kThreads, kBytes, stream>>>(p, first, in_segments);
+  const LaunchShape shape = {unsigned(p.grid.tiles()), Layout::kThreads, sizeof(MovingVjpShared<F, C, Layout>)};
+  launch(moving_vjp_kernel<F, C, Layout>, shape, stream, p, first, in_segments);
 }
 /// `group`: which kChannelGroup channels; 0 where they are few.
 template <class F> void blend_vjp_moving(const BlendVjpParams& p, int group, cudaStream_t stream) {
@@ -62,12 +53,12 @@ int64_t max_adjoint_maps(int footprint, int64_t capacity, TileGrid grid) {
     using F = decltype(f);
     if (F::kMoves) samples = F::kSamples;
   });
-  if (grid.tiles() >= kLargeImageTiles) return 0;
+  if (!is_small_image(grid)) return 0;
   return max_pieces(capacity, kMovingSegment, grid) * AdjointMap::kNumbers * kMovingPixels * samples;
 }
 
 void blend_vjp(int footprint, const BlendVjpParams& p, int group, cudaStream_t stream) {
-  clear_splat_sums_kernel<<<kClearBlocks, kBlendThreads, 0, stream>>>(p, group);
+  launch(clear_splat_sums_kernel, {kClearBlocks, kBlendThreads}, stream, p, group);
   visit_tile_footprints<AdaptiveBoxesVjp>(footprint, stream, [&](auto f, cudaStream_t side) {
     using F = decltype(f);
     if constexpr (F::kMoves) {

@@ -3,6 +3,7 @@
 
 #include "core/inspect.h"
 #include "cuda/composite.cuh"
+#include "cuda/launch.cuh"
 
 namespace ar::cuda {
 
@@ -11,6 +12,7 @@ template <class F> inline constexpr int kInspectWarps = F::kMoves ? 2 : kSubtile
 
 /// A block per tile, a warp per subtile.
 template <class F> __global__ void __launch_bounds__(32 * kInspectWarps<F>) inspect_kernel(const InspectParams params) {
+  begin_kernel();
   constexpr int kThreads = 32 * kInspectWarps<F>;
   __shared__ Stage<F, 0, kThreads> stage;
   __shared__ int32_t ids[kThreads];
@@ -54,7 +56,7 @@ template <class F> __global__ void __launch_bounds__(32 * kInspectWarps<F>) insp
 }
 
 template <class F> void launch_inspect(const InspectParams& p, cudaStream_t stream) {
-  inspect_kernel<F><<<unsigned(p.grid.tiles()), 32 * kInspectWarps<F>, 0, stream>>>(p);
+  launch(inspect_kernel<F>, {unsigned(p.grid.tiles()), 32 * kInspectWarps<F>}, stream, p);
 }
 
 }  // namespace ar::cuda

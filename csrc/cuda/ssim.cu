@@ -6,6 +6,7 @@
 // from values that it reads once into registers: the kernels would otherwise wait for shared memory.
 #include "core/ssim.h"
 
+#include "cuda/launch.cuh"
 #include "cuda/training.h"
 #include "cuda/warp.cuh"
 
@@ -117,6 +118,7 @@ template <typename T> __device__ void sum_block(T& a, T& b) {
 /// block_sums: sums of |x - y| and of the similarity, of each block; or null.
 template <typename T, typename Target>
 __global__ void __launch_bounds__(kThreads) ssim_kernel(const SsimParams<T, Target> p, T* block_sums) {
+  begin_kernel();
   constexpr int kRun = Tile<T>::kRun;
   __shared__ Shared<T, 2, kSsimMoments> shared;
   const Place place = place_of<T>(int(blockIdx.x), p.height, p.width);
@@ -183,6 +185,7 @@ __global__ void __launch_bounds__(kThreads) ssim_kernel(const SsimParams<T, Targ
 /// One block: the loss from the sums of all blocks.
 template <typename T, typename Target>
 __global__ void loss_kernel(const SsimParams<T, Target> p, const T* block_sums, int64_t blocks) {
+  begin_kernel();
   double l1_sum = 0, ssim_sum = 0;
   for (int64_t i = threadIdx.x; i < blocks; i += kThreads) {
     l1_sum += double(block_sums[2 * i]);
@@ -194,6 +197,7 @@ __global__ void loss_kernel(const SsimParams<T, Target> p, const T* block_sums, 
 
 template <typename T, typename Target>
 __global__ void __launch_bounds__(kThreads) ssim_vjp_kernel(const SsimVjpParams<T, Target> p) {
+  begin_kernel();
   constexpr int kRun = Tile<T>::kRun;
   __shared__ Shared<T, kSsimPartials, kSsimPartials> shared;
   const Place place = place_of<T>(int(blockIdx.x), p.height, p.width);
@@ -240,12 +244,12 @@ template <typename T> int64_t ssim_blocks(int64_t planes, int height, int width)
 
 template <typename T, typename Target> void ssim(const SsimParams<T, Target>& p, T* block_sums, cudaStream_t stream) {
   const int64_t blocks = ssim_blocks<T>(p.planes, p.height, p.width);
-  ssim_kernel<T, Target><<<unsigned(blocks), kThreads, 0, stream>>>(p, p.loss ? block_sums : nullptr);
-  if (p.loss) loss_kernel<T, Target><<<1, kThreads, 0, stream>>>(p, block_sums, blocks);
+  launch(ssim_kernel<T, Target>, {unsigned(blocks), kThreads}, stream, p, p.loss ? block_sums : nullptr);
+  if (p.loss) launch(loss_kernel<T, Target>, {1, kThreads}, stream, p, block_sums, blocks);
 }
 template <typename T, typename Target> void ssim_vjp(const SsimVjpParams<T, Target>& p, cudaStream_t stream) {
   const int64_t blocks = ssim_blocks<T>(p.planes, p.height, p.width);
-  ssim_vjp_kernel<T, Target><<<unsigned(blocks), kThreads, 0, stream>>>(p);
+  launch(ssim_vjp_kernel<T, Target>, {unsigned(blocks), kThreads}, stream, p);
 }
 
 template int64_t ssim_blocks<float>(int64_t, int, int);
