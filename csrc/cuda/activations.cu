@@ -11,19 +11,16 @@ namespace {
 constexpr int kThreads = 256;
 
 template <typename T> __global__ void activate_kernel(const ActivateParams<T> p) {
-  begin_kernel();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i < p.n) ar::activate(p, i);
 }
 
 template <typename T> __global__ void activate_vjp_kernel(const ActivateVjpParams<T> p) {
-  begin_kernel();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i < p.n) ar::activate_vjp(p, i);
 }
 
 template <typename T> __global__ void observe_kernel(const ObserveParams<T> p) {
-  begin_kernel();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i < p.n) ar::observe(p, i);
 }

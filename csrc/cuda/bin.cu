@@ -16,7 +16,6 @@ int tile_passes(TileGrid grid) {
 template <int kPasses>
 __global__ void __launch_bounds__(kCountThreads)
     count_tiles_kernel(const uint32_t* tiles, const Counts* counts, int64_t capacity, uint32_t* histograms) {
-  begin_kernel();
   const int64_t n = counts->pairs;
   if (n > capacity) return;
   __shared__ uint32_t local[kPasses * kBins];
@@ -37,7 +36,6 @@ constexpr int kRangeThreads = 128;
 __global__ void __launch_bounds__(kRangeThreads)
     tile_offsets_kernel(const uint32_t* tiles, const Counts* counts, int64_t capacity, int64_t tile_count,
                         int64_t* tile_offsets, PairFeedback feedback) {
-  begin_kernel();
   if (blockIdx.x == 0 && threadIdx.x == 0 && feedback.word) {
     const uint64_t pairs = min(uint64_t(counts->pairs), uint64_t(0xffffffff));
     *feedback.word = uint64_t(feedback.frame) << 32 | pairs;
@@ -87,7 +85,6 @@ __device__ int piece_length(int samples, bool whole) { return whole ? kWholeList
 
 __global__ void __launch_bounds__(kPlanThreads)
     count_work_kernel(const TileLists lists, int64_t tiles, int most_samples, bool whole, PlanCounters* counters) {
-  begin_kernel();
   const int64_t tile = int64_t(blockIdx.x) * kPlanThreads + threadIdx.x;
   if (tile >= tiles) return;
   const int samples = samples_of(lists, tile, most_samples), length = piece_length(samples, whole);
@@ -100,7 +97,6 @@ __global__ void __launch_bounds__(kPlanThreads)
 /// Places come from atomics: which tile gets which differs from run to run, and changes no result.
 __global__ void __launch_bounds__(kPlanThreads) plan_kernel(const TileLists lists, TileGrid grid, int most_samples,
                                                             bool whole, CheckpointLayout layout, const ChunkPlan plan) {
-  begin_kernel();
   static_assert(kWorkClasses < kPlanThreads);
   __shared__ int tile_base[kWorkClasses], chunk_base[kWorkClasses];
   PlanCounters& counters = plan.state->counters;

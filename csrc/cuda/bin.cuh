@@ -14,7 +14,6 @@ inline constexpr int kCountThreads = 512, kCountBlocks = 132 * 2;
 /// how many pairs.
 __global__ void __launch_bounds__(kCountThreads) count_depths_kernel(const uint32_t* keys, const PairRange* ranges,
                                                                      int64_t n, uint32_t* histograms, Counts* counts) {
-  begin_kernel();
   __shared__ uint32_t local[kDepthPasses * kBins];
   for (int b = threadIdx.x; b < kDepthPasses * kBins; b += kCountThreads) local[b] = 0;
   __syncthreads();
@@ -80,7 +79,6 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
 
 /// Pairs in the order of depth, a splat's by rows of tiles.
 __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitParams params) {
-  begin_kernel();
   __shared__ uint32_t block_id, before_block;
   if (params.counts->pairs > params.capacity) return;
   if (threadIdx.x == 0) block_id = atomicAdd(&params.status[0], 1);

@@ -229,7 +229,6 @@ inline constexpr int kFrontBlocks = F::kSamples > 1                ? 1
 /// A block per tile.
 template <class F, int C, bool kKeep>
 __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front_kernel(const BlendParams params) {
-  begin_kernel();
   constexpr int S = F::kSamples, kLength = chunk_length(S), kSets = kKeep ? S : 1;
   __shared__ BlendStage<F, C> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
@@ -293,7 +292,6 @@ __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front
 /// Blocks share the chunks. Writes the transmittance of each chunk alone.
 template <class F>
 __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, 0>) tail_through_kernel(const BlendParams params) {
-  begin_kernel();
   constexpr int S = F::kSamples, kLength = chunk_length(S);
   __shared__ BlendStage<F, 0> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
@@ -331,7 +329,6 @@ __device__ inline int chunks_of(const BlendParams& params, int tile, int length)
 /// Turns the transmittance of each chunk into that in front of the chunk, negative where a sample has stopped before.
 /// Blocks share the open tiles.
 template <int S> __global__ void __launch_bounds__(kTilePixels) tail_scan_kernel(const BlendParams params) {
-  begin_kernel();
   constexpr int kBatch = 16;
   const int items = params.plan.state->counts.open_tiles[sample_class(S)] * S;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
@@ -360,7 +357,6 @@ template <int S> __global__ void __launch_bounds__(kTilePixels) tail_scan_kernel
 /// sample had stopped before the chunk.
 template <class F, int C, bool kKeep>
 __global__ void __launch_bounds__(kBlendThreads) tail_blend_kernel(const BlendParams params) {
-  begin_kernel();
   constexpr int S = F::kSamples, kLength = chunk_length(S), kSets = kKeep ? S : 1;
   __shared__ BlendStage<F, C> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
@@ -407,7 +403,6 @@ __global__ void __launch_bounds__(kBlendThreads) tail_blend_kernel(const BlendPa
 /// Adds the chunks of the open tiles. Blocks share the tiles.
 template <int S, int C, bool kKeep>
 __global__ void __launch_bounds__(kTilePixels) tail_sum_kernel(const BlendParams params) {
-  begin_kernel();
   const Values<C> background = background_of<C>(params);
   const Vec2<float> p = pixel_of(threadIdx.x / 32, lane_id());
   const int items = params.plan.state->counts.open_tiles[sample_class(S)];

@@ -53,7 +53,6 @@ template <class F>
 __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4   ? 1
                                                  : F::kSamples > 1 ? 2
                                                                    : 3) blend_groups_kernel(const BlendParams params) {
-  begin_kernel();
   constexpr int S = F::kSamples;
   __shared__ Stage<F, 0, kGroupBatch> stage;
   __shared__ GroupChannels<kGroupBatch> staged;

@@ -57,7 +57,6 @@ struct SampleGradient {
 template <class F>
 __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
     blend_groups_vjp_kernel(const BlendVjpParams params, int group) {
-  begin_kernel();
   constexpr int S = F::kSamples;
   auto& shared = *reinterpret_cast<GroupVjpShared<F>*>(dynamic_shared());
   const Segments& segments = params.segments;
@@ -244,7 +243,6 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
 template <class F>
 __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
     segment_shown_kernel(const BlendVjpParams params, int group) {
-  begin_kernel();
   constexpr int S = F::kSamples;
   const Segments& segments = params.segments;
   const int tile = listed_tile<S>(params, int(blockIdx.x) / segments.count), number = int(blockIdx.x) % segments.count;

@@ -34,7 +34,6 @@ __device__ int64_t group_words(const TileLists& lists, const TileList& list, int
 /// A thread per pair: which groups of pixels its splat reaches.
 template <class F, class Layout>
 __global__ void __launch_bounds__(kFilterPiece) filter_kernel(const BlendParams params) {
-  begin_kernel();
   __shared__ uint32_t words[Layout::kGroups][kFilterWords];
   const TilePiece piece = find_piece(params.lists, params.grid, kFilterPiece, blockIdx.x);
   if (piece.tile < 0) return;
@@ -91,7 +90,6 @@ template <class F, int C> struct ListedStage {
 /// A warp per group of a tile's pixels; C channels from `first` on.
 template <class F, int C, class Layout>
 __global__ void __launch_bounds__(Layout::kThreads) listed_blend_kernel(const BlendParams params, int first) {
-  begin_kernel();
   __shared__ ListedStage<F, C> stages[Layout::kWarps];
   ListedStage<F, C>& stage = stages[threadIdx.x / 32];
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);

@@ -230,7 +230,6 @@ template <class F, int C, class Layout, bool kTogether = false> struct MovingBle
 template <class F, int C, class Layout>
 __global__ void __launch_bounds__(Layout::kThreads)
     moving_blend_kernel(const BlendParams params, int first, bool overflow_only) {
-  begin_kernel();
   constexpr int kBatch = Layout::kThreads < 256 ? Layout::kThreads : 256;
   __shared__ MovingStage<F, C, Layout, kBatch> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);

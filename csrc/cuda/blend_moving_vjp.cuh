@@ -128,7 +128,6 @@ template <class F> using SegmentLayout = CellLayout<F::kSamples <= 4 ? 1 : 2, F:
 /// A thread per sample of a tile: from the maps of its segments to what each gets from behind.
 template <class F, int kSegment>
 __global__ void __launch_bounds__(kMovingPixels) chain_maps_kernel(const BlendVjpParams params) {
-  begin_kernel();
   constexpr int S = F::kSamples;
   const int tile = int(blockIdx.x) / S, t = int(blockIdx.x) % S * kMovingPixels + int(threadIdx.x);
   const int number = t / S, sample = t % S;
@@ -157,7 +156,6 @@ __global__ void __launch_bounds__(kMovingPixels) chain_maps_kernel(const BlendVj
 template <class F, int C, class Layout, int kSegment = 0, bool kMaps = false>
 __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThreads<C> / Layout::kThreads))
     moving_vjp_kernel(const BlendVjpParams params, int first, bool overflow_only) {
-  begin_kernel();
   using Shared = MovingVjpShared<F, C, Layout>;
   using Samples = MovingSamples<F, Layout, (kSegment > 0)>;
   constexpr int S = F::kSamples, kCells = Layout::kCells, kBatch = Shared::kBatch, kColumns = kMaps ? 4 : 1;

@@ -85,7 +85,6 @@ __device__ void walk_segment(const Splat<F, float>* splats, const Channels<float
 template <class F>
 __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
     segment_blend_kernel(const BlendParams params, const BlendParams cut, int first) {
-  begin_kernel();
   constexpr int S = F::kSamples;
   const Segments& segments = params.segments;
   const int place = tile_place<S>(params, int(blockIdx.x) / segments.count);
@@ -119,7 +118,6 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
 /// Adds the segments up, of tiles with S samples. A block per tile.
 template <int S>
 __global__ void __launch_bounds__(kTilePixels) segment_sum_kernel(const BlendParams params, int first) {
-  begin_kernel();
   const int tile = int(blockIdx.x);
   if (!has_samples<S>(params.lists, tile)) return;
   const TileList list = list_of(params.lists, params.grid, tile);

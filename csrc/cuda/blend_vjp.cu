@@ -8,7 +8,6 @@ namespace {
 
 /// With too many pairs there is a row per splat that all tiles add to. The sums of shapes stay from group to group.
 __global__ void clear_splat_sums_kernel(const BlendVjpParams params, int group) {
-  begin_kernel();
   if (params.lists.counts->pairs <= params.lists.capacity) return;
   const auto clear = [&](float* to, int width) {
     const int64_t n = params.lists.n * width;

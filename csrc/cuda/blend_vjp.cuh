@@ -76,7 +76,6 @@ inline constexpr int kVjpWarps = F::kSamples > kVjpSamples<F, kSums> ? F::kSampl
 template <class F, int C, Sums kSums>
 __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
     blend_vjp_kernel(const BlendVjpParams params) {
-  begin_kernel();
   constexpr int S = F::kSamples, kLength = chunk_length(S), kWarps = kVjpWarps<F, kSums>, kSumCount = 6 + C;
   constexpr int kOwn = kVjpSamples<F, kSums>, kGroup = S / kOwn;  // samples of a warp, warps of a chunk
   constexpr bool kGrads = kSums != Sums::kMeans, kMeans = kSums != Sums::kGrads;

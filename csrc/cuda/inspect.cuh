@@ -12,7 +12,6 @@ template <class F> inline constexpr int kInspectWarps = F::kMoves ? 2 : kSubtile
 
 /// A block per tile, a warp per subtile.
 template <class F> __global__ void __launch_bounds__(32 * kInspectWarps<F>) inspect_kernel(const InspectParams params) {
-  begin_kernel();
   constexpr int kThreads = 32 * kInspectWarps<F>;
   __shared__ Stage<F, 0, kThreads> stage;
   __shared__ int32_t ids[kThreads];

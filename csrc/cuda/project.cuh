@@ -30,7 +30,6 @@ __device__ inline uint32_t rows_not_finite(const Channels<float>& channels, int6
 }
 
 template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_kernel(const ProjectParams params) {
-  begin_kernel();
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
   const Gaussians<float>& g = params.gaussians;
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
@@ -65,7 +64,6 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
 
 template <class Cam>
 __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const ProjectRowsParams params) {
-  begin_kernel();
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
   const Gaussians<float>& g = params.gaussians;
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
@@ -97,7 +95,6 @@ __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const Pro
 }
 
 __global__ void __launch_bounds__(kProjectThreads) shape_rows_kernel(const ShapeRowsParams params) {
-  begin_kernel();
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
   if (i >= params.n) return;
   ProjectedGaussian<float> projected;

@@ -166,18 +166,15 @@ __device__ void project_vjp_body(const Params& params, const From& from) {
 template <class Cam>
 __global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : 5)
     project_vjp_kernel(const ProjectVjpParams params) {
-  begin_kernel();
   project_vjp_body<Cam>(params, FromPairs{params});
 }
 template <class Cam>
 __global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : 5)
     project_rows_vjp_kernel(const ProjectRowsVjpParams params) {
-  begin_kernel();
   project_vjp_body<Cam>(params, FromRows{params});
 }
 
 __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGradsParams params) {
-  begin_kernel();
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
   const PairRange range = i < params.n ? params.sums.ranges[i] : PairRange{0, 0};
   const SplatSums sums = sum_pairs(params.sums, i, range);
@@ -201,7 +198,6 @@ __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGra
 
 /// Channels that lie in the rows of pairs: a thread per splat.
 __global__ void __launch_bounds__(kProjectThreads) sum_few_channels_kernel(const SumChannelsParams params) {
-  begin_kernel();
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x, n = params.sums.n;
   const PairRange range = i < n ? params.sums.ranges[i] : PairRange{0, 0};
   const SplatSums sums = sum_pairs(params.sums, i, range);
@@ -217,7 +213,6 @@ inline constexpr int kSumWarps = 8;
 
 /// A group of channels: a warp per splat, a lane per channel. The warps of a block share the splats with many pairs.
 __global__ void __launch_bounds__(32 * kSumWarps) sum_channels_kernel(const SumChannelsParams params) {
-  begin_kernel();
   __shared__ float parts[kSumWarps][32];
   __shared__ int64_t first[kSumWarps];
   __shared__ int counts[kSumWarps];

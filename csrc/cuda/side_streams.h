@@ -16,15 +16,11 @@ class SideStreams {
   explicit SideStreams(cudaStream_t caller) : own_(of_this_thread()), caller_(caller) {
     cudaEventRecord(own_.fork, caller);
     for (cudaStream_t side : own_.streams) cudaStreamWaitEvent(side, own_.fork, 0);
-    in_use_ = true;
   }
-  /// Whether this thread is between construction and join().
-  static bool in_use() { return in_use_; }
   /// The caller's for k = 0, then the others in turn.
   cudaStream_t stream(int k) const { return k == 0 ? caller_ : own_.streams[(k - 1) % kCount]; }
 
   void join() {
-    in_use_ = false;
     for (int k = 0; k < kCount; ++k) {
       cudaEventRecord(own_.joins[k], own_.streams[k]);
       cudaStreamWaitEvent(caller_, own_.joins[k], 0);
@@ -58,8 +54,6 @@ class SideStreams {
     cudaGetDevice(&device);
     return of_device[device];
   }
-
-  static inline thread_local bool in_use_ = false;
 
   Own& own_;
   cudaStream_t caller_;

@@ -64,7 +64,6 @@ template <class Value, bool kFirst>
 __global__ void __launch_bounds__(kSortThreads)
     sort_pass_kernel(const SortScratch scratch, int pass, int64_t first_count, uint32_t skip, const uint32_t* keys_in,
                      uint32_t* keys_out, const Value* values_in, Value* values_out) {
-  begin_kernel();
   __shared__ uint32_t counts[kSortWarps][kBins];  // of a warp's digits, then their first places in the block
   __shared__ uint32_t to_global[kBins];           // place in the output - place in the block
   __shared__ Value staged[kSortTile];

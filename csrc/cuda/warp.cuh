@@ -1,4 +1,4 @@
-// What all kernels use: how they begin, and what they do in a warp.
+// What all kernels use of a warp.
 #pragma once
 
 #include <cstdint>
@@ -8,16 +8,6 @@ namespace ar::cuda {
 inline constexpr uint32_t kAllLanes = 0xffffffff;
 
 __device__ inline int lane_id() { return threadIdx.x % 32; }
-
-/// The first statement of every kernel. Lets the next kernel of the stream be put on the device where there is room,
-/// and waits until the one before has ended and all that it wrote can be seen. Each kernel waits for the one before it,
-/// so that it waits for all of them, and nothing is read or written earlier than without launch()'s overlap.
-__device__ inline void begin_kernel() {
-#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900  // as launches_overlap() expects
-  cudaTriggerProgrammaticLaunchCompletion();
-  cudaGridDependencySynchronize();
-#endif
-}
 
 /// Sum over the lanes, in every lane, in a fixed order.
 template <typename T> __device__ T warp_sum(T v) {
