@@ -1,4 +1,5 @@
-// GLSL of the passes: project, draw, add, present. The formulas are those of csrc/core, in the same form.
+// GLSL of the passes: project, draw, add, present. The formulas are those of csrc/core, in the same form; only the window
+// of `analytic` is drawn by polynomials that are fitted to its formula (logistic.js).
 //
 // Everything is highp: with 16 bits the offset of a pixel from a mean, the exponents and the cubes of 1/sigma are all
 // wrong. Offsets are floor(gl_FragCoord) - mean, not interpolated, which is exact. There are no `precise` qualifiers in
