@@ -1,7 +1,7 @@
 """Trains one capture with several variants of the options, from several seeds, and compares what they reach.
 
     python benchmarks/training.py lego --iterations 7000 --scales 1,2,4,8 --seeds 0 1 2 --json results.json
-    python benchmarks/training.py lego --variants plain absgrad --footprint moment:samples=4 --seconds 12
+    python benchmarks/training.py lego --variants default 3dgs --footprint box:samples=4 --seconds 12
     python benchmarks/training.py lego --more variants.json
 
 VARIANTS below names them; `--more` adds others from a JSON file, {name: {option: value}}, with the options of
@@ -37,50 +37,34 @@ from analytic_rasterizer.training.schedule import Clock
 from analytic_rasterizer.training.trainer import background_of, starting_gaussians
 
 LOOK_PERIOD = 100  # steps between looks at loss and clock
-# Of a training of fewer than 30,000 steps, the first part of 3DGS's: its schedules do not shrink.
-CUT_OFF = {"means_rate_steps": 30_000, "densify_until": 1.0}
-# The preset "quick" for four scales, all of it and its density control alone; all variants take the same steps.
-QUICK = {name: value for name, value in preset_values("quick", (1, 2, 4, 8)).items() if name != "iterations"}
-QUICK_DENSITY = {name: value for name, value in QUICK.items() if not name.endswith("_rate")}
+RATES_OF_3DGS = {"means_rate": 1.6e-4, "color_rate": 2.5e-3, "scale_rate": 5e-3, "rotation_rate": 1e-3}
 VARIANTS: dict[str, dict[str, Any]] = {
-    "plain": {},
-    "quick": QUICK,
-    "quick, rates of 3DGS": QUICK_DENSITY,
-    "quick, means rate alone": QUICK_DENSITY | {"means_rate": QUICK["means_rate"]},
-    "quick, 3dgs 1e-4": QUICK_DENSITY | {"density": "3dgs", "gradient": 1e-4, "means_rate": QUICK["means_rate"]},
-    "3DGS, cut off": CUT_OFF,
-    "grow until 0.75": {"densify_until": 0.75},
-    "gradient 1e-4": {"gradient": 1e-4},
-    "finest gradients": {"gradient_scales": "finest"},
-    "finest, until 0.75": {"gradient_scales": "finest", "densify_until": 0.75},
-    "absgrad 8e-4": {"density": "absgrad", "gradient": 8e-4},
-    "absgrad 4e-4": {"density": "absgrad", "gradient": 4e-4},
-    "absgrad 4e-4, finest": {"density": "absgrad", "gradient": 4e-4, "gradient_scales": "finest"},
-    "absgrad 2e-4": {"density": "absgrad", "gradient": 2e-4},
-    "mcmc 100k": {"density": "mcmc", "max_gaussians": 100_000, "densify_until": 0.8},
-    "mcmc 200k": {"density": "mcmc", "max_gaussians": 200_000, "densify_until": 0.8},
-    "mcmc 400k": {"density": "mcmc", "max_gaussians": 400_000, "densify_until": 0.8},
-    "mcmc 400k, finest twice": {
-        "density": "mcmc", "max_gaussians": 400_000, "densify_until": 0.8, "means_rate": QUICK["means_rate"],
-        "scale_repeats": (2, 1, 1, 1),
-    },
-    "mcmc 200k, start as there": {
-        "density": "mcmc", "max_gaussians": 200_000, "densify_until": 0.8, "initial_opacity": 0.5,
-        "initial_scale": 0.1,
-    },
-    "opacity rate 0.025": {"opacity_rate": 0.025},
-    "rates fall to 0.1": {"rates_end": 0.1},
-    "means rate x 2": {"means_rate": 3.2e-4},
+    "default": {},
+    "3dgs": preset_values("3dgs", (1, 2, 4, 8)),
+    "gradient 2e-4": {"gradient": 2e-4},
+    "gradient 4e-4": {"gradient": 4e-4},
+    "gradient 6e-4": {"gradient": 6e-4},
+    "limit 300k": {"max_gaussians": 300_000},
+    "limit 600k": {"max_gaussians": 600_000},
+    "signed gradients": {"density": "3dgs", "gradient": 1e-4},
+    "gradients of all scales": {"gradient_scales": "all"},
+    "split above 0.01": {"split_above": 0.01},
+    "split above 0.001": {"split_above": 0.001},
+    "grow until 0.5": {"densify_until": 0.5},
     "no resets": {"reset_every": 0},
+    "rates of 3DGS": RATES_OF_3DGS,
+    "opacity rate 0.1": {"opacity_rate": 0.1},
+    "opacity rate 0.025": {"opacity_rate": 0.025},
+    "color rate 0.01": {"color_rate": 1e-2},
+    "means rate x 2": {"means_rate": 6.4e-4},
+    "rates stay": {"rates_half_life": 0},
+    "finest once": {"scale_repeats": (1, 1, 1, 1)},
+    "finest three times": {"scale_repeats": (3, 1, 1, 1)},
     "SSIM 0.1": {"ssim_weight": 0.1},
-    "finest twice": {"scale_repeats": (2, 1, 1, 1)},
-    "finest four times": {"scale_repeats": (4, 1, 1, 1)},
     "4 pictures a step": {"pictures_per_step": 4},
-    "together": {
-        "density": "absgrad", "gradient_scales": "finest", "densify_until": 0.75, "rates_end": 0.1,
-        "scale_repeats": (2, 1, 1, 1),
-    },
-}  # fmt: skip
+    "mcmc 300k": {"density": "mcmc", "max_gaussians": 300_000},
+    "mcmc 600k": {"density": "mcmc", "max_gaussians": 600_000},
+}
 
 
 def main() -> int:
@@ -118,7 +102,7 @@ def parse_arguments() -> argparse.Namespace:
     add("--more", type=Path, metavar="FILE.json", help="further variants")
     add("--seeds", type=int, nargs="+", default=[0])
     add("--scales", default="1,2,4,8", help="(default: %(default)s)")
-    add("--footprint", default="box:samples=4")
+    add("--footprint", default=TrainingOptions.footprint)
     add("--iterations", type=int, default=7000)
     add("--seconds", type=float, default=0.0, help="instead of iterations")
     add("--random-points", type=int, default=100_000)

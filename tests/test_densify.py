@@ -40,7 +40,8 @@ def make_control(sizes, opacities, white_background=False, device="cpu", **optio
     for field in gaussians:
         field.grad = torch.randn(field.shape, generator=torch.Generator().manual_seed(4)).to(device)
     optimizer.step()
-    return density.make_density(TrainingOptions(**options), gaussians, optimizer, EXTENT, white_background)
+    options = TrainingOptions.preset("3dgs", **options)
+    return density.make_density(options, gaussians, optimizer, EXTENT, white_background)
 
 
 def after_step(control, norms, step=STEP, progress=0.1, radii=None) -> None:
@@ -119,13 +120,16 @@ def test_growth_keeps_to_its_times(step, progress, count):
     assert (control.leaf(1) is None) == (progress >= 0.5)
 
 
-def test_cap_lets_the_largest_gradients_grow():
-    control = make_control([SMALL] * 4, [0.5] * 4, max_gaussians=6)
+def test_limit_rises_evenly_and_lets_the_largest_gradients_grow():
+    """From 4 to 8 in the first half of the training: to 6 after a quarter."""
+    control = make_control([SMALL] * 4, [0.5] * 4, max_gaussians=8)
     before = control.gaussians.means
-    after_step(control, [3e-4, 5e-4, 4e-4, 1e-4])
+    after_step(control, [3e-4, 5e-4, 4e-4, 1e-4], progress=0.25)
     assert torch.equal(control.gaussians.means, before[[0, 1, 2, 3, 1, 2]])
-    after_step(control, [1.0] * 6, step=STEP + 100)
+    after_step(control, [1.0] * 6, step=STEP + 100, progress=0.25)
     assert len(control.gaussians.means) == 6
+    after_step(control, [1.0] * 6, step=STEP + 200, progress=0.49)
+    assert len(control.gaussians.means) == 7
 
 
 @pytest.mark.parametrize("step, kept", [(3000, [SMALL, HUGE]), (3100, [SMALL])])
@@ -173,7 +177,7 @@ def test_halves_are_drawn_from_their_parent():
 def test_absolute_gradients_are_read_from_their_own_columns():
     control = make_control([SMALL, SMALL], [0.5, 0.5], density="absgrad")
     assert control.leaf(1).shape == (2, 4)
-    after_step(control, [3e-4, 5e-4])  # one below the threshold of 4e-4
+    after_step(control, [2e-4, 4e-4])  # one below the threshold of 3e-4
     assert len(control.gaussians.means) == 3
     assert torch.equal(control.gaussians.means[2], control.gaussians.means[1])
 
@@ -311,7 +315,7 @@ def test_draws_follow_the_weights(device):
 
 @pytest.mark.parametrize("kind", ["3dgs", "absgrad", "mcmc"])
 def test_all_kinds_grow_on_the_device(device, kind):
-    control = make_control([SMALL, LARGE, SMALL], [0.5, 0.5, 0.001], device=device, density=kind, max_gaussians=5)
+    control = make_control([SMALL, LARGE, SMALL], [0.5, 0.5, 0.001], device=device, density=kind, max_gaussians=20)
     for step in range(590, 601):
         if control.watches(1):
             count = len(control.gaussians.means)

@@ -661,7 +661,7 @@ def test_a_broken_checkpoint_is_one_line(synthetic, tmp_path, capsys, content):
 
 def test_a_checkpoint_of_an_earlier_format(tmp_path):
     torch.save({"format": 1}, tmp_path / files.CHECKPOINT)
-    with pytest.raises(io.SceneError, match="expected a checkpoint of format 2, got 1"):
+    with pytest.raises(io.SceneError, match="expected a checkpoint of format 3, got 1"):
         files.read_checkpoint(tmp_path / files.CHECKPOINT)
 
 
@@ -888,10 +888,16 @@ def test_progress_by_seconds_grows_at_the_last_pace():
 
 
 def test_rate_of_the_means_falls_over_the_training_or_over_steps():
-    whole, fixed = TrainingOptions(), TrainingOptions(means_rate_steps=30_000)
+    whole, fixed = (TrainingOptions(means_rate=1.6e-4, means_rate_steps=steps) for steps in (0, 30_000))
     assert schedule.means_rate_at(3500, 0.5, whole) == pytest.approx(1.6e-5)  # the geometric mean of the ends
     assert schedule.means_rate_at(15_000, 0.9, fixed) == pytest.approx(1.6e-5)
     assert schedule.means_rate_at(60_000, 0.9, fixed) == pytest.approx(1.6e-6)
+
+
+def test_other_rates_fall_after_a_while():
+    options = TrainingOptions(rates_from=100, rates_half_life=10)
+    assert [schedule.rates_factor_at(step, options) for step in (0, 100, 110, 130)] == [1, 1, 0.5, 0.125]
+    assert schedule.rates_factor_at(10**6, TrainingOptions(rates_half_life=0)) == 1
 
 
 def test_degrees_of_the_harmonics_come_after_steps_or_shares():
@@ -902,36 +908,37 @@ def test_degrees_of_the_harmonics_come_after_steps_or_shares():
 
 def test_options_survive_a_file():
     options = TrainingOptions(scales=[1, 2], density="mcmc", footprint="box")
-    assert options.footprint == "box:samples=4" and options.scale_repeats == (1, 1)
+    assert options.footprint == "box:samples=4" and options.scale_repeats == (2, 1)
     assert TrainingOptions.from_dict(json.loads(json.dumps(options.to_dict()))) == options
     with pytest.raises(ValueError, match="among those of TrainingOptions, got speed"):
         TrainingOptions.from_dict({"speed": 1})
 
 
 def test_presets_give_way_to_what_is_given():
-    assert TrainingOptions.preset("3dgs") == TrainingOptions()
-    quick = TrainingOptions.preset("quick")
-    assert (quick.iterations, quick.density, quick.opacity_rate, quick.scale_repeats) == (7000, "absgrad", 0.1, (1,))
-    assert TrainingOptions.preset("quick", scales=(4, 1, 2)).scale_repeats == (1, 2, 1)  # the finest twice
-    given = {"scales": (1, 2), "scale_repeats": (1, 3), "iterations": 9, "scale_rate": 5e-3}
-    chosen = TrainingOptions.preset("quick", **given)
+    assert TrainingOptions.preset("quick") == TrainingOptions(iterations=7000)
+    assert TrainingOptions(scales=(4, 1, 2)).scale_repeats == (1, 2, 1)  # the finest twice
+    as_there = TrainingOptions.preset("3dgs")
+    assert (as_there.density, as_there.growth_gradient, as_there.gaussian_limit) == ("3dgs", 2e-4, math.inf)
+    assert TrainingOptions.preset("3dgs", scales=(4, 1, 2)).scale_repeats == (1, 1, 1)
+    given = {"scales": (1, 2), "scale_repeats": (1, 3), "iterations": 9, "scale_rate": 1e-2}
+    chosen = TrainingOptions.preset("3dgs", **given)
     assert {name: getattr(chosen, name) for name in given} == given
-    assert replace(chosen, iterations=7000, scale_rate=1e-2, scales=(1,), scale_repeats=()) == quick
-    with pytest.raises(ValueError, match="preset must be one of 3dgs, quick, got slow"):
+    assert replace(chosen, iterations=30_000, scale_rate=5e-3, scales=(1,), scale_repeats=()) == as_there
+    with pytest.raises(ValueError, match="preset must be one of quick, 3dgs, got slow"):
         TrainingOptions.preset("slow")
 
 
 def test_the_command_takes_a_preset_and_resumes_with_it(synthetic, tmp_path, capsys):
     small = ["--iterations", "3", "--random-points", "50", "--sh-degree", "0", "--no-evaluate", "--device", "cpu"]
     arguments = ["train", str(synthetic), "--out", str(tmp_path), *small]
-    assert cli.main([*arguments, "--preset", "quick", "--scales", "1,2", "--color-rate", "0.001"]) == 0
+    assert cli.main([*arguments, "--preset", "3dgs", "--scales", "1,2", "--color-rate", "0.001"]) == 0
     stored = TrainingOptions.from_dict(json.loads((tmp_path / files.OPTIONS).read_text())["options"])
     given = {"scales": (1, 2), "color_rate": 1e-3, "iterations": 3, "random_points": 50, "sh_degree": 0}
-    assert stored == TrainingOptions.preset("quick", **given) and stored.scale_repeats == (2, 1)
+    assert stored == TrainingOptions.preset("3dgs", **given) and stored.scale_repeats == (1, 1)
     # The same options once more are no contradiction, with or without the scales; others are.
-    assert cli.main([*arguments, "--preset", "quick", "--color-rate", "0.001", "--resume"]) == 0
+    assert cli.main([*arguments, "--preset", "3dgs", "--color-rate", "0.001", "--resume"]) == 0
     capsys.readouterr()
-    assert cli.main([*arguments, "--preset", "quick", "--resume"]) == 2
+    assert cli.main([*arguments, "--preset", "3dgs", "--resume"]) == 2
     assert capsys.readouterr().err == "error: --color-rate: a resumed training keeps the options of its checkpoint\n"
 
 

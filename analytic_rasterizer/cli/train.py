@@ -20,7 +20,7 @@ from .launch import add_rank_options, is_launched, ranks_of
 MAIN = {
     "footprint": "how a pixel sees a splat",
     "scales": "reductions to train at: 1,2,4,8",
-    "scale_repeats": "how often pictures of each scale occur in a pass: 3,1,1,1",
+    "scale_repeats": "how often pictures of each scale occur in a pass: 3,1,1,1 (default: the finest twice)",
     "downsampling": f"how coarse pictures are made: {', '.join(DOWNSAMPLINGS)}",
     "iterations": "steps",
     "seconds": "train for this long instead, by the clock",
@@ -32,7 +32,7 @@ MAIN = {
     "filter_3d": "widen Gaussians by the 3D filter of Mip-Splatting",
     "seed": "of everything that is drawn",
     "density": f"density control: {', '.join(DENSITIES)}",
-    "max_gaussians": "grow no further than this",
+    "max_gaussians": "grow no further than this, and evenly towards it; 0: no limit",
 }
 
 
@@ -51,8 +51,9 @@ def add_parser(subcommands) -> None:
     add("--images", default="images", metavar="NAME", help="folder in SCENE of a reconstruction's photographs")
     add("--test-every", type=int, default=8, metavar="N", help="keep every N-th photograph for the test; 0: none")
     add("--points", metavar="FILE.ply", help="start from this: a 3DGS scene, or points with colours")
-    presets = "options that belong together: quick for trainings of about 7,000 steps, 3dgs for the recipe of 3DGS, "
-    presets += "which the defaults are; options that are given win"
+    presets = (
+        "options that belong together: quick for 7,000 steps, 3dgs for the recipe of 3DGS; options that are given win"
+    )
     add("--preset", choices=tuple(PRESETS), help=presets)
     add("--resume", action="store_true", help="go on from the checkpoint in DIR, with its options")
     add("--save-every", type=int, default=5000, metavar="STEPS", help="between checkpoints (default: 5000; 0: none)")

@@ -1,6 +1,6 @@
 """Training scenes from photographs, and measuring how good they are.
 
-    options = TrainingOptions(footprint="box:samples=4", scales=(1, 2, 4, 8), iterations=7000)
+    options = TrainingOptions(scales=(1, 2, 4, 8), iterations=7000)
     run = Run("lego", "out", options, device="cuda")
     run.train()
     print(run.evaluate()["test"]["mean"])

@@ -143,6 +143,7 @@ class GradientDensity(FixedDensity):
         super().__init__(*args, **kwargs)
         self.absolute = self.options.density == "absgrad"
         self.growing = self.options.densify_until > 0
+        self.first_count = sum(self.ranks.exchange(len(self.gaussians.means)))
         self.forget()
 
     def watches(self, scale: int) -> bool:
@@ -169,7 +170,7 @@ class GradientDensity(FixedDensity):
             return False
         changes = step > options.densify_from and passes(step, options.densify_every, stride)
         if changes:
-            self._grow(self.gradient_sums / self.views.clamp_min(1))
+            self._grow(self.gradient_sums / self.views.clamp_min(1), share / options.densify_until)
             self._prune(too_large=step > options.reset_every > 0)
             self.forget()
         begins = step - stride < options.densify_from <= step
@@ -179,11 +180,12 @@ class GradientDensity(FixedDensity):
 
     def state_dict(self) -> dict[str, Any]:
         own = {"growing": self.growing, "gradient_sums": self.gradient_sums, "views": self.views}
+        own["first_count"] = self.first_count
         return super().state_dict() | own
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         super().load_state_dict(state)
-        self.growing = state["growing"]
+        self.growing, self.first_count = state["growing"], state["first_count"]
         self.gradient_sums = state["gradient_sums"].to(self.gradient_sums.device)
         self.views = state["views"].to(self.views.device)
 
@@ -192,12 +194,20 @@ class GradientDensity(FixedDensity):
         self.gradient_sums = torch.zeros(len(means), device=means.device)
         self.views = torch.zeros(len(means), dtype=torch.int32, device=means.device)
 
-    def _grow(self, gradients: Tensor) -> None:
-        """Clones and splits by the average norms (P,); each of them adds one Gaussian."""
+    def _grow(self, gradients: Tensor, over: float) -> None:
+        """Clones and splits by the average norms (P,); each of them adds one Gaussian.
+
+        Args:
+            over: Share of the time of growth that is over, 0 to 1.
+        """
         old = self.gaussians
         grown = gradients >= self.options.growth_gradient
         if self.options.gaussian_limit < math.inf:
-            room = self.ranks.allowed(int(self.options.gaussian_limit), len(grown), int(grown.sum()))
+            # If all room were taken at once, Gaussians would go where the first, blurred pictures ask for them.
+            limit = int(self.options.gaussian_limit)
+            if limit > self.first_count:
+                limit = self.first_count + int(over * (limit - self.first_count))
+            room = self.ranks.allowed(limit, len(grown), int(grown.sum()))
             chosen = torch.where(grown, gradients, -1).topk(room).indices
             grown = torch.zeros_like(grown).index_fill_(0, chosen, True)
         large = old.log_scales.amax(1).exp() > self.options.split_above * self.extent

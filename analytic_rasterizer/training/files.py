@@ -16,7 +16,7 @@ from ..footprints import resolve_footprint
 CHECKPOINT, SCENE, CAMERAS = "checkpoint.pt", "scene.ply", "cameras.json"
 MIP_SCENE = "point_cloud_mip.ply"
 OPTIONS, METRICS, LOG = "options.json", "metrics.json", "log.jsonl"
-CHECKPOINT_FORMAT = 2
+CHECKPOINT_FORMAT = 3
 
 
 def write_safely(path: Path, write: Callable[[Path], None]) -> None:

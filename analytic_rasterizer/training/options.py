@@ -18,57 +18,63 @@ class Preset(NamedTuple):
     """Values of `TrainingOptions` that belong together; the other options keep their defaults."""
 
     values: dict[str, Any]
-    finest_repeats: int = 1  # scale_repeats of the finest of several scales; the others have 1
+    finest_repeats: int | None = None  # scale_repeats of the finest of several scales; None: as by default
 
 
+FINEST_REPEATS = 2  # by default
 PRESETS = {
-    "3dgs": Preset({}),
-    "quick": Preset(
+    "quick": Preset({"iterations": 7000}),
+    "3dgs": Preset(
         {
-            "iterations": 7000,
-            "density": "absgrad",
-            "gradient": 3e-4,
-            "gradient_scales": "finest",
-            "densify_until": 0.75,
-            "means_rate": 3.2e-4,
-            "color_rate": 5e-3,
-            "opacity_rate": 0.1,
-            "scale_rate": 1e-2,
-            "rotation_rate": 2e-3,
+            "density": "3dgs",
+            "gradient_scales": "all",
+            "densify_until": 0.5,
+            "split_above": 0.01,
+            "max_gaussians": 0,
+            "means_rate": 1.6e-4,
+            "color_rate": 2.5e-3,
+            "scale_rate": 5e-3,
+            "rotation_rate": 1e-3,
+            "rates_half_life": 0,
         },
-        finest_repeats=2,
+        finest_repeats=1,
     ),
 }
-"""By name: "3dgs", the recipe of 3DGS, which is that of the defaults, and "quick", for trainings of a few thousand
-steps. docs/training.md has the measurements."""
+"""By name: "quick", the defaults with 7,000 steps, and "3dgs", the recipe of 3DGS. docs/training.md has what each of
+them reaches."""
 
 
 def preset_values(name: str, scales: tuple[int, ...]) -> dict[str, Any]:
-    """What a preset sets among `TrainingOptions`, `scale_repeats` included where several scales are trained.
+    """What a preset sets among `TrainingOptions`, `scale_repeats` for these scales included where it differs.
 
     Raises:
         ValueError: No preset of this name.
     """
     _check("preset", name in PRESETS, f"one of {', '.join(PRESETS)}", name)
     preset = PRESETS[name]
-    values = dict(preset.values)
-    if preset.finest_repeats > 1 and len(scales) > 1:
-        finest = min(scales)
-        values["scale_repeats"] = tuple(preset.finest_repeats if scale == finest else 1 for scale in scales)
-    return values
+    if preset.finest_repeats is None:
+        return dict(preset.values)
+    return preset.values | {"scale_repeats": repeats_of(scales, preset.finest_repeats)}
+
+
+def repeats_of(scales: tuple[int, ...], finest_repeats: int) -> tuple[int, ...]:
+    """`scale_repeats` with which the finest of several scales occurs so often, and the others once."""
+    several = len(scales) > 1
+    return tuple(finest_repeats if several and scale == min(scales) else 1 for scale in scales)
 
 
 @dataclass(frozen=True)
 class TrainingOptions:
     """How to train. Positions in time that are called steps are steps; shares are of the whole training, 0 to 1.
 
-    Learning rates and the density control are those of 3DGS [Kerbl et al. 2023] where nothing else is said;
-    `TrainingOptions.preset` has others, for short trainings.
+    The defaults are what measured best on several scenes (docs/training.md); `TrainingOptions.preset` has the recipe of
+    3DGS [Kerbl et al. 2023].
 
     Attributes:
         footprint: One of `FOOTPRINTS`, with options: "box:samples=4".
         scales: Reductions to train at: 1 is the full size, 2 half of it.
         scale_repeats: How often every picture of a scale occurs in one pass over the pictures; one number per scale.
+            None: twice for the finest of several scales, once for the others.
         downsampling: How coarse pictures are made: "box", means over squares of pixels, or "bicubic", with the kernel
             widened to the scale.
         iterations: Steps of the optimizer.
@@ -92,20 +98,22 @@ class TrainingOptions:
             training (3DGS: 30,000); 0: when the training ends.
         color_rate: Learning rate of the constant of the harmonics; the others learn at 1/20 of it.
         opacity_rate, scale_rate, rotation_rate: Learning rates of logit opacities, log scales and quaternions.
-        rates_end: Factor that the learning rates other than that of the means fall to, exponentially; 1: constant.
+        rates_from: Steps after which the learning rates other than that of the means begin to fall.
+        rates_half_life: Steps in which they then fall to a half, exponentially; 0: they stay.
         density: "3dgs": clone and split by the gradient of the projected means; "absgrad": the same by the sum of its
             absolute values over pixels [AbsGS]; "mcmc": relocate and add by opacity [3DGS-MCMC]; "none".
         densify_from: Steps before the first change.
         densify_until: Share of the training after which the number of Gaussians stays.
         densify_every: Steps between changes.
         gradient: Mean norm above which a Gaussian is cloned or split, by normalized device coordinates; 0: 2e-4 for
-            "3dgs", 4e-4 for "absgrad".
+            "3dgs", 3e-4 for "absgrad".
         gradient_scales: Which scales the mean is over: "all", or "finest", the largest pictures alone.
         reset_every: Steps between resets of the opacities ("3dgs" and "absgrad"); 0: never.
         prune_opacity: Least opacity that is kept.
         split_above: Scale above which a Gaussian is split rather than cloned, in extents of the scene.
         prune_above: Scale above which a Gaussian is pruned after the first reset, in extents of the scene.
-        max_gaussians: Most Gaussians; 0: no limit, and 500,000 for "mcmc", which grows up to its limit.
+        max_gaussians: Most Gaussians; 0: no limit. With "3dgs" and "absgrad" the limit rises evenly from the number at
+            the start to this, until `densify_until`: those with the largest gradients grow first.
         grow_share: Of "mcmc": Gaussians that are added at a time, as a share of those that are there.
         noise: Of "mcmc": strength of the noise on the means, in learning rates of the means.
         opacity_weight: Weight of the mean opacity in the loss; -1: 0.01 for "mcmc", otherwise 0.
@@ -115,7 +123,7 @@ class TrainingOptions:
         ValueError: A value outside its range, naming the option.
     """
 
-    footprint: str = "box:samples=4"
+    footprint: str = "moment:samples=4"
     scales: tuple[int, ...] = (1,)
     scale_repeats: tuple[int, ...] = ()
     downsampling: str = "box"
@@ -132,25 +140,26 @@ class TrainingOptions:
     ssim_weight: float = 0.2
     initial_opacity: float = 0.1
     initial_scale: float = 1.0
-    means_rate: float = 1.6e-4
+    means_rate: float = 3.2e-4
     means_rate_end: float = 1.6e-6
     means_rate_steps: int = 0
-    color_rate: float = 2.5e-3
+    color_rate: float = 5e-3
     opacity_rate: float = 0.05
-    scale_rate: float = 5e-3
-    rotation_rate: float = 1e-3
-    rates_end: float = 1.0
-    density: str = "3dgs"
+    scale_rate: float = 1e-2
+    rotation_rate: float = 2e-3
+    rates_from: int = 7000
+    rates_half_life: int = 7000
+    density: str = "absgrad"
     densify_from: int = 500
-    densify_until: float = 0.5
+    densify_until: float = 0.75
     densify_every: int = 100
     gradient: float = 0.0
-    gradient_scales: str = "all"
+    gradient_scales: str = "finest"
     reset_every: int = 3000
     prune_opacity: float = 0.005
-    split_above: float = 0.01
+    split_above: float = 0.0025
     prune_above: float = 0.1
-    max_gaussians: int = 0
+    max_gaussians: int = 1_000_000
     grow_share: float = 0.05
     noise: float = 5e5
     opacity_weight: float = -1.0
@@ -159,11 +168,19 @@ class TrainingOptions:
     def __post_init__(self):
         # Lists, as JSON and the command line have them, become tuples.
         object.__setattr__(self, "scales", tuple(self.scales))
-        object.__setattr__(self, "scale_repeats", tuple(self.scale_repeats) or (1,) * len(self.scales))
+        repeats = tuple(self.scale_repeats) or repeats_of(self.scales, FINEST_REPEATS)
+        object.__setattr__(self, "scale_repeats", repeats)
         object.__setattr__(self, "footprint", str(resolve_footprint(self.footprint)))
         for name in ("iterations", "pictures_per_step", "supersampling", "sh_every", "random_points", "densify_every"):
             _check(name, getattr(self, name) >= 1, "at least 1", getattr(self, name))
-        for name in ("densify_from", "reset_every", "max_gaussians", "means_rate_steps"):
+        for name in (
+            "densify_from",
+            "reset_every",
+            "max_gaussians",
+            "means_rate_steps",
+            "rates_from",
+            "rates_half_life",
+        ):
             _check(name, getattr(self, name) >= 0, "at least 0", getattr(self, name))
         for name in ("scales", "scale_repeats"):
             value = getattr(self, name)
@@ -182,7 +199,7 @@ class TrainingOptions:
             _check(name, 0 <= getattr(self, name) <= 1, "0 to 1", getattr(self, name))
         _check("initial_opacity", 0 < self.initial_opacity < 1, "above 0 and below 1", self.initial_opacity)
         positive = ("initial_scale", "means_rate", "means_rate_end", "color_rate", "opacity_rate", "scale_rate")
-        for name in (*positive, "rotation_rate", "rates_end", "split_above", "prune_above"):
+        for name in (*positive, "rotation_rate", "split_above", "prune_above"):
             value = getattr(self, name)
             _check(name, 0 < value < math.inf, "positive and finite", value)
         for name in ("seconds", "gradient", "prune_opacity", "noise"):
@@ -195,12 +212,12 @@ class TrainingOptions:
     @property
     def growth_gradient(self) -> float:
         """The threshold of `gradient`, settled."""
-        return self.gradient or (4e-4 if self.density == "absgrad" else 2e-4)
+        return self.gradient or (3e-4 if self.density == "absgrad" else 2e-4)
 
     @property
     def gaussian_limit(self) -> float:
         """The limit of `max_gaussians`, settled."""
-        return self.max_gaussians or (500_000 if self.density == "mcmc" else math.inf)
+        return self.max_gaussians or math.inf
 
     @property
     def regularizers(self) -> tuple[float, float]:

@@ -105,3 +105,9 @@ def means_rate_at(step: int, share: float, options: TrainingOptions) -> float:
     """Learning rate of the means, per unit of the scene's extent."""
     over = min(step / options.means_rate_steps, 1) if options.means_rate_steps else share
     return options.means_rate * (options.means_rate_end / options.means_rate) ** over
+
+
+def rates_factor_at(step: int, options: TrainingOptions) -> float:
+    """Factor of the learning rates other than that of the means."""
+    over = max(step - options.rates_from, 0)
+    return 0.5 ** (over / options.rates_half_life) if options.rates_half_life else 1.0

@@ -21,7 +21,7 @@ from .model import Gaussians, gaussians_at, random_points
 from .options import BACKGROUNDS, RANDOM_BACKGROUND, TrainingOptions
 from .pictures import Pictures
 from .ranks import ALONE, Ranks
-from .schedule import PictureOrder, Progress, means_rate_at, sh_degree_at
+from .schedule import PictureOrder, Progress, means_rate_at, rates_factor_at, sh_degree_at
 
 _picture_gradients = torch.ops.analytic_rasterizer.picture_gradients.default
 
@@ -130,7 +130,7 @@ class Trainer:
     def _set_rates(self) -> None:
         """Gives the optimizer the learning rates of the next step."""
         options, over = self.options, self.progress.share
-        factor = options.rates_end**over
+        factor = rates_factor_at(self.progress.step, options)
         for group, rate in zip(self.optimizer.param_groups, self.rates.values()):
             group["lr"] = rate * factor
         self.optimizer.param_groups[-1]["head_lr"] = options.color_rate * factor

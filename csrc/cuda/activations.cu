@@ -2,8 +2,8 @@
 #include "core/activations.h"
 #include "core/density.h"
 
+#include "cuda/launch.cuh"
 #include "cuda/training.h"
-#include "cuda/warp.cuh"
 
 namespace ar::cuda {
 namespace {
@@ -28,13 +28,13 @@ template <typename T> __global__ void observe_kernel(const ObserveParams<T> p) {
 }  // namespace
 
 template <typename T> void activate(const ActivateParams<T>& p, cudaStream_t stream) {
-  if (p.n > 0) activate_kernel<T><<<blocks_of(p.n, kThreads), kThreads, 0, stream>>>(p);
+  if (p.n > 0) launch(activate_kernel<T>, {blocks_of(p.n, kThreads), kThreads}, stream, p);
 }
 template <typename T> void activate_vjp(const ActivateVjpParams<T>& p, cudaStream_t stream) {
-  if (p.n > 0) activate_vjp_kernel<T><<<blocks_of(p.n, kThreads), kThreads, 0, stream>>>(p);
+  if (p.n > 0) launch(activate_vjp_kernel<T>, {blocks_of(p.n, kThreads), kThreads}, stream, p);
 }
 template <typename T> void observe(const ObserveParams<T>& p, cudaStream_t stream) {
-  if (p.n > 0) observe_kernel<T><<<blocks_of(p.n, kThreads), kThreads, 0, stream>>>(p);
+  if (p.n > 0) launch(observe_kernel<T>, {blocks_of(p.n, kThreads), kThreads}, stream, p);
 }
 
 template void activate(const ActivateParams<float>&, cudaStream_t);

@@ -1,6 +1,7 @@
 // A step of Adam on several tensors: a block updates a part of one of them, a thread 16 bytes of each of its arrays.
 #include "core/adam.h"
 
+#include "cuda/launch.cuh"
 #include "cuda/training.h"
 
 namespace ar::cuda {
@@ -75,7 +76,7 @@ template <typename T> __global__ void __launch_bounds__(kThreads) adam_kernel(co
 
 template <typename T> void adam(AdamParams<T> p, cudaStream_t stream) {
   const int64_t blocks = divide_work(p, kBlockNumbers<T>);
-  adam_kernel<T><<<unsigned(blocks), kThreads, 0, stream>>>(p);
+  launch(adam_kernel<T>, {unsigned(blocks), kThreads}, stream, p);
 }
 
 template void adam(AdamParams<float>, cudaStream_t);

@@ -1,53 +1,16 @@
 // Launches of bin: sorts, pairs, and the plan of the blending work.
 #include <algorithm>
-#include <cub/block/block_reduce.cuh>
-#include <cub/block/block_scan.cuh>
 
 #include "cuda/bin.cuh"
-#include "cuda/warp.cuh"
+#include "cuda/launch.cuh"
 
 namespace ar::cuda {
 namespace {
-
-constexpr int kDepthPasses = 4;
 
 int tile_passes(TileGrid grid) {
   int passes = 1;
   while (grid.tiles() > int64_t(1) << (passes * kDigitBits)) ++passes;
   return passes;
-}
-
-constexpr int kCountThreads = 512, kCountBlocks = 132 * 2;
-
-/// Histograms of all digits of the depth keys of splats with pairs; how many of these there are, and
-/// how many pairs.
-__global__ void __launch_bounds__(kCountThreads) count_depths_kernel(const uint32_t* keys, const PairRange* ranges,
-                                                                     int64_t n, uint32_t* histograms, Counts* counts) {
-  __shared__ uint32_t local[kDepthPasses * kBins];
-  for (int b = threadIdx.x; b < kDepthPasses * kBins; b += kCountThreads) local[b] = 0;
-  __syncthreads();
-  unsigned long long pairs = 0, splats = 0;
-  const int64_t stride = int64_t(gridDim.x) * kCountThreads, rounded = (n + 31) / 32 * 32;
-  for (int64_t i = int64_t(blockIdx.x) * kCountThreads + threadIdx.x; i < rounded; i += stride) {
-    const uint32_t key = i < n ? keys[i] : kCulledKey;
-    const bool valid = key != kCulledKey;
-    count_digits<kDepthPasses>(key, valid, local);
-    if (valid) pairs += ranges[i].count;
-    splats += valid;
-  }
-  __syncthreads();
-  for (int b = threadIdx.x; b < kDepthPasses * kBins; b += kCountThreads) {
-    if (local[b]) atomicAdd(&histograms[b], local[b]);
-  }
-  using Reduce = cub::BlockReduce<unsigned long long, kCountThreads>;
-  __shared__ typename Reduce::TempStorage storage;
-  pairs = Reduce(storage).Sum(pairs);
-  __syncthreads();
-  splats = Reduce(storage).Sum(splats);
-  if (threadIdx.x == 0) {
-    atomicAdd(reinterpret_cast<unsigned long long*>(&counts->pairs), pairs);
-    atomicAdd(reinterpret_cast<unsigned long long*>(&counts->splats), splats);
-  }
 }
 
 template <int kPasses>
@@ -134,16 +97,14 @@ __global__ void __launch_bounds__(kPlanThreads)
 /// Places come from atomics: which tile gets which differs from run to run, and changes no result.
 __global__ void __launch_bounds__(kPlanThreads) plan_kernel(const TileLists lists, TileGrid grid, int most_samples,
                                                             bool whole, CheckpointLayout layout, const ChunkPlan plan) {
-  using Scan = cub::BlockScan<int, kPlanThreads>;
   static_assert(kWorkClasses < kPlanThreads);
-  __shared__ typename Scan::TempStorage storage;
   __shared__ int tile_base[kWorkClasses], chunk_base[kWorkClasses];
   PlanCounters& counters = plan.state->counters;
   PlanCounts& counts = plan.state->counts;
   const auto find_bases = [&](const int32_t* sizes, int* base, SampleParts& parts) {
     const int c = threadIdx.x;
-    int first = c < kWorkClasses ? sizes[c] : 0;
-    Scan(storage).ExclusiveSum(first, first);
+    int all;
+    const int first = sum_before<kPlanThreads / 32>(c < kWorkClasses ? sizes[c] : 0, 0, all);
     if (c < kWorkClasses) base[c] = first;
     if (blockIdx.x == 0 && c <= kWorkClasses && c % kLengthClasses == 0) parts.first[c / kLengthClasses] = first;
     __syncthreads();
@@ -182,7 +143,7 @@ void sort_values(const TileSort<Value>& p, TileGrid grid, uint32_t* memory, cuda
   const int passes = tile_passes(grid);
   const SortScratch scratch(memory, p.capacity, passes);
   const auto count = [&](auto kernel) {
-    kernel<<<kCountBlocks, kCountThreads, 0, stream>>>(p.tiles[0], p.counts, p.capacity, scratch.histograms);
+    launch(kernel, {kCountBlocks, kCountThreads}, stream, p.tiles[0], p.counts, p.capacity, scratch.histograms);
   };
   switch (passes) {
     case 1:
@@ -200,11 +161,11 @@ void sort_values(const TileSort<Value>& p, TileGrid grid, uint32_t* memory, cuda
   }
   for (int pass = 0; pass < passes; ++pass) {
     // After an overflow the histograms are empty, and with them the sort.
-    sort_pass_kernel<Value, false><<<unsigned(scratch.blocks), kSortThreads, 0, stream>>>(
-        scratch, pass, 0, 0, p.tiles[pass % 2], p.tiles[1 - pass % 2], p.values[pass % 2], p.values[1 - pass % 2]);
+    launch(sort_pass_kernel<Value, false>, {unsigned(scratch.blocks), kSortThreads}, stream, scratch, pass, 0, 0,
+           p.tiles[pass % 2], p.tiles[1 - pass % 2], p.values[pass % 2], p.values[1 - pass % 2]);
   }
-  tile_offsets_kernel<<<blocks_of(grid.tiles() + 1, kRangeThreads), kRangeThreads, 0, stream>>>(
-      p.tiles[passes % 2], p.counts, p.capacity, grid.tiles(), p.tile_offsets, p.feedback);
+  launch(tile_offsets_kernel, {blocks_of(grid.tiles() + 1, kRangeThreads), kRangeThreads}, stream, p.tiles[passes % 2],
+         p.counts, p.capacity, grid.tiles(), p.tile_offsets, p.feedback);
 }
 
 }  // namespace
@@ -225,25 +186,20 @@ int tile_sort_result(TileGrid grid) { return tile_passes(grid) % 2; }
 void count_depths(const DepthSort& p, void* memory, cudaStream_t stream) {
   const SortScratch scratch(static_cast<uint32_t*>(memory), p.n, kDepthPasses);
   if (p.n == 0) return;
-  count_depths_kernel<<<kCountBlocks, kCountThreads, 0, stream>>>(p.keys[0], p.ranges, p.n, scratch.histograms,
-                                                                  p.counts);
+  launch(count_depths_kernel, {kCountBlocks, kCountThreads}, stream, p.keys[0], p.ranges, p.n, scratch.histograms,
+         p.counts);
 }
 
 void sort_by_depth(const DepthSort& p, void* memory, cudaStream_t stream) {
   if (p.n == 0) return;
   const SortScratch scratch(static_cast<uint32_t*>(memory), p.n, kDepthPasses);
-  const auto blocks = unsigned(scratch.blocks);
-  sort_pass_kernel<int32_t, true>
-      <<<blocks, kSortThreads, 0, stream>>>(scratch, 0, p.n, kCulledKey, p.keys[0], p.keys[1], nullptr, p.order[1]);
-  for (int pass = 1; pass < kDepthPasses; ++pass) {
-    sort_pass_kernel<int32_t, false><<<blocks, kSortThreads, 0, stream>>>(
-        scratch, pass, 0, 0, p.keys[pass % 2], p.keys[1 - pass % 2], p.order[pass % 2], p.order[1 - pass % 2]);
-  }
+  const LaunchShape shape = {unsigned(scratch.blocks), kSortThreads};
+  for_each_depth_pass(p, scratch, [&](auto kernel, auto... arguments) { launch(kernel, shape, stream, arguments...); });
 }
 
 void emit_pairs(const EmitParams& p, cudaStream_t stream) {
   if (p.n == 0) return;
-  emit_pairs_kernel<<<blocks_of(p.n, kEmitThreads), kEmitThreads, 0, stream>>>(p);
+  launch(emit_pairs_kernel, {blocks_of(p.n, kEmitThreads), kEmitThreads}, stream, p);
 }
 
 void sort_by_tile(const TileSort<int32_t>& p, TileGrid grid, void* scratch, cudaStream_t stream) {
@@ -255,9 +211,9 @@ void sort_by_tile(const TileSort<SlotPair>& p, TileGrid grid, void* scratch, cud
 
 void plan_chunks(const TileLists& lists, TileGrid grid, int samples, bool whole, CheckpointLayout layout,
                  const ChunkPlan& plan, cudaStream_t stream) {
-  const unsigned blocks = blocks_of(grid.tiles(), kPlanThreads);
-  count_work_kernel<<<blocks, kPlanThreads, 0, stream>>>(lists, grid.tiles(), samples, whole, &plan.state->counters);
-  plan_kernel<<<blocks, kPlanThreads, 0, stream>>>(lists, grid, samples, whole, layout, plan);
+  const LaunchShape shape = {blocks_of(grid.tiles(), kPlanThreads), kPlanThreads};
+  launch(count_work_kernel, shape, stream, lists, grid.tiles(), samples, whole, &plan.state->counters);
+  launch(plan_kernel, shape, stream, lists, grid, samples, whole, layout, plan);
 }
 
 }  // namespace ar::cuda

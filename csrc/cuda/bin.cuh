@@ -1,13 +1,52 @@
-// Kernel of bin that writes the pairs of every splat.
+// Kernels of bin that sort splats by depth and write the pairs of each.
 #pragma once
-
-#include <cub/block/block_scan.cuh>
 
 #include "core/bin.h"
 #include "cuda/sort.cuh"
 #include "cuda/stages.h"
 
 namespace ar::cuda {
+
+inline constexpr int kDepthPasses = 4;
+inline constexpr int kCountThreads = 512, kCountBlocks = 132 * 2;
+
+/// Histograms of all digits of the depth keys of splats with pairs; how many of these there are, and
+/// how many pairs.
+__global__ void __launch_bounds__(kCountThreads) count_depths_kernel(const uint32_t* keys, const PairRange* ranges,
+                                                                     int64_t n, uint32_t* histograms, Counts* counts) {
+  __shared__ uint32_t local[kDepthPasses * kBins];
+  for (int b = threadIdx.x; b < kDepthPasses * kBins; b += kCountThreads) local[b] = 0;
+  __syncthreads();
+  unsigned long long pairs = 0, splats = 0;
+  const int64_t stride = int64_t(gridDim.x) * kCountThreads, rounded = (n + 31) / 32 * 32;
+  for (int64_t i = int64_t(blockIdx.x) * kCountThreads + threadIdx.x; i < rounded; i += stride) {
+    const uint32_t key = i < n ? keys[i] : kCulledKey;
+    const bool valid = key != kCulledKey;
+    count_digits<kDepthPasses>(key, valid, local);
+    if (valid) pairs += ranges[i].count;
+    splats += valid;
+  }
+  __syncthreads();
+  for (int b = threadIdx.x; b < kDepthPasses * kBins; b += kCountThreads) {
+    if (local[b]) atomicAdd(&histograms[b], local[b]);
+  }
+  unsigned long long all_pairs, all_splats;
+  sum_before<kCountThreads / 32>(pairs, 0ull, all_pairs);
+  sum_before<kCountThreads / 32>(splats, 0ull, all_splats);
+  if (threadIdx.x == 0) {
+    atomicAdd(reinterpret_cast<unsigned long long*>(&counts->pairs), all_pairs);
+    atomicAdd(reinterpret_cast<unsigned long long*>(&counts->splats), all_splats);
+  }
+}
+
+/// Calls run(kernel, arguments...) for the passes of a sort by depth, in order.
+template <class Run> void for_each_depth_pass(const DepthSort& p, const SortScratch& scratch, Run&& run) {
+  run(sort_pass_kernel<int32_t, true>, scratch, 0, p.n, kCulledKey, p.keys[0], p.keys[1], nullptr, p.order[1]);
+  for (int pass = 1; pass < kDepthPasses; ++pass) {
+    run(sort_pass_kernel<int32_t, false>, scratch, pass, 0, 0, p.keys[pass % 2], p.keys[1 - pass % 2],
+        p.order[pass % 2], p.order[1 - pass % 2]);
+  }
+}
 
 /// A splat with more pairs than this is written by its whole warp.
 inline constexpr int kManyTiles = 16;
@@ -40,8 +79,6 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
 
 /// Pairs in the order of depth, a splat's by rows of tiles.
 __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitParams params) {
-  using Scan = cub::BlockScan<uint32_t, kEmitThreads>;
-  __shared__ typename Scan::TempStorage storage;
   __shared__ uint32_t block_id, before_block;
   if (params.counts->pairs > params.capacity) return;
   if (threadIdx.x == 0) block_id = atomicAdd(&params.status[0], 1);
@@ -52,8 +89,8 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
   const int32_t i = r < n ? params.order[r] : 0;
   const int count = r < n ? params.ranges[i].count : 0;
   const SplatRow<float> splat = splats[i];
-  uint32_t before, sum;
-  Scan(storage).ExclusiveSum(uint32_t(count), before, sum);
+  uint32_t sum;
+  const uint32_t before = sum_before<kEmitThreads / 32>(uint32_t(count), 0u, sum);
   uint32_t* status = params.status + 1;
   if (threadIdx.x < 32) {
     if (threadIdx.x == 0) write_status(status + block_id, (block_id == 0 ? kUpToBlock : kOfBlock) | sum);
@@ -82,12 +119,7 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
       const int row = first + lane_id();
       const Range range = row <= tile_rows.last ? tile_columns_of(support, params.grid, rows, row) : Range{0, -1};
       const int width = range.last - range.first + 1;
-      int up_to = width;  // inclusive sum over the lanes
-#pragma unroll
-      for (int offset = 1; offset < 32; offset *= 2) {
-        const int other = __shfl_up_sync(kAllLanes, up_to, offset);
-        if (lane_id() >= offset) up_to += other;
-      }
+      const int up_to = warp_inclusive_sum(width);
       int64_t mine = place + up_to - width;
       for (int c = range.first; c <= range.last; ++c) write_pair(params, mine++, uint32_t(row) * columns + c, id);
       place += __shfl_sync(kAllLanes, up_to, 31);

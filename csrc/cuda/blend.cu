@@ -14,19 +14,19 @@ namespace ar::cuda {
 namespace {
 
 template <class F, int C> void launch_moving_blend(const BlendParams& p, int first, cudaStream_t stream) {
-  const bool listed = p.grid.tiles() < kLargeImageTiles;
+  const bool listed = is_small_image(p.grid);
   if (listed) {
     using Layout = ListedLayout<F>;
     const auto blocks = unsigned(p.grid.tiles() * Layout::kBlocks);
-    listed_blend_kernel<F, C, Layout><<<blocks, Layout::kThreads, 0, stream>>>(p, first);
+    launch(listed_blend_kernel<F, C, Layout>, {blocks, Layout::kThreads}, stream, p, first);
   }
   using Layout = EvenLayout<F, false>;
-  moving_blend_kernel<F, C, Layout><<<unsigned(p.grid.tiles()), Layout::kThreads, 0, stream>>>(p, first, listed);
+  launch(moving_blend_kernel<F, C, Layout>, {unsigned(p.grid.tiles()), Layout::kThreads}, stream, p, first, listed);
 }
 template <class F> void blend_moving(const BlendParams& p, cudaStream_t stream) {
-  if (p.grid.tiles() < kLargeImageTiles) {
+  if (is_small_image(p.grid)) {
     const auto pieces = unsigned(max_pieces(p.lists.capacity, kFilterPiece, p.grid));
-    filter_kernel<F, ListedLayout<F>><<<pieces, kFilterPiece, 0, stream>>>(p);
+    launch(filter_kernel<F, ListedLayout<F>>, {pieces, kFilterPiece}, stream, p);
   }
   if (!p.channels.data) return launch_moving_blend<F, 3>(p, 0, stream);
   if (p.channels.count <= kFewChannels) return launch_moving_blend<F, 4>(p, 0, stream);
@@ -63,7 +63,7 @@ int64_t max_reach_words(int footprint, int64_t capacity, TileGrid grid) {
   visit_footprint(footprint, Footprints{}, [&](auto f) {
     using F = decltype(f);
     if constexpr (F::kMoves) {
-      if (grid.tiles() < kLargeImageTiles) words = filter_words<ListedLayout<F>>(capacity, grid);
+      if (is_small_image(grid)) words = filter_words<ListedLayout<F>>(capacity, grid);
     }
   });
   return words;

@@ -1,9 +1,10 @@
 // Kernel of blend for any number of channels, in groups of 32: a block per tile and group walks the whole list, a pixel
-// per lane. The weights are worked out again for every group, which costs less than to keep them. The yardsticks use it
-// for any number of channels, as their weights are slow anyway.
+// per lane. The weights are computed again for every group, which costs less than keeping them. Yardstick footprints
+// (`erf`, `exact`) use this kernel for few channels too, because their weights are slow anyway.
 #pragma once
 
 #include "cuda/composite.cuh"
+#include "cuda/launch.cuh"
 
 namespace ar::cuda {
 
@@ -126,7 +127,7 @@ template <class Params> Params with_channels(Params p) {
 
 template <class F> void blend_groups(const BlendParams& p, cudaStream_t stream) {
   const dim3 blocks(unsigned(p.grid.tiles()), blocks_of(p.channels.count, kChannelGroup));
-  blend_groups_kernel<F><<<blocks, kBlendThreads, 0, stream>>>(p);
+  launch(blend_groups_kernel<F>, {blocks, kBlendThreads}, stream, p);
 }
 
 }  // namespace ar::cuda

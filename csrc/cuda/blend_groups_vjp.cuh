@@ -58,8 +58,7 @@ template <class F>
 __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
     blend_groups_vjp_kernel(const BlendVjpParams params, int group) {
   constexpr int S = F::kSamples;
-  extern __shared__ float4 memory[];
-  auto& shared = *reinterpret_cast<GroupVjpShared<F>*>(memory);
+  auto& shared = *reinterpret_cast<GroupVjpShared<F>*>(dynamic_shared());
   const Segments& segments = params.segments;
   const int tile = listed_tile<S>(params, int(blockIdx.x) / segments.count);
   if (tile < 0) return;
@@ -278,12 +277,9 @@ template <class F> void blend_vjp_groups(const BlendVjpParams& p, int group, cud
   if constexpr (!F::kYardstick) {
     // Only the sums of shapes read what it writes. With MeanSums the first group makes them for all channels.
     const bool with_shape = group == 0 || p.mean_sums == MeanSums::kNone;
-    if (p.segments.count > 1 && with_shape) segment_shown_kernel<F><<<blocks, kBlendThreads, 0, stream>>>(p, group);
+    if (p.segments.count > 1 && with_shape) launch(segment_shown_kernel<F>, {blocks, kBlendThreads}, stream, p, group);
   }
-  const auto kernel = blend_groups_vjp_kernel<F>;
-  const int bytes = int(sizeof(GroupVjpShared<F>));
-  if (bytes > 48 * 1024) cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, bytes);
-  kernel<<<blocks, kBlendThreads, bytes, stream>>>(p, group);
+  launch(blend_groups_vjp_kernel<F>, {blocks, kBlendThreads, sizeof(GroupVjpShared<F>)}, stream, p, group);
 }
 
 }  // namespace ar::cuda

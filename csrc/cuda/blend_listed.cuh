@@ -1,9 +1,9 @@
 // Kernels of blend for footprints whose samples move, in small images: a warp per pixel, each with a list of its own.
 //
-// There a tile of 8x8 pixels may have hundreds of thousands of splats, most of them smaller than a pixel. What takes
-// the time is the longest row of splats that some sample meets one after the other. So the list of every tile is first
-// filtered, all parts of it side by side, into a bit for each splat and group of pixels: whether it reaches them. Then
-// each warp walks the splats of its own group alone, and waits for no other.
+// In a small image of a large scene a tile of 8x8 pixels may have hundreds of thousands of splats, most of them smaller
+// than a pixel. What takes the time is the longest sequence of splats that some sample meets one after the other. So
+// the list of every tile is first filtered, all parts of it side by side, into a bit for each splat and group of
+// pixels: whether it reaches them. Then each warp walks the splats of its own group alone, and waits for no other.
 #pragma once
 
 #include "cuda/blend_moving.cuh"
@@ -72,12 +72,7 @@ template <class F, int C> struct ListedStage {
   /// there are. All lanes must call it.
   __device__ int take(const Splat<F, float>* splats_in, const TileList& list, int k, uint32_t word) {
     const int lane = lane_id(), count = __popc(word);
-    int behind = count;  // of the words up to this lane's
-#pragma unroll
-    for (int offset = 1; offset < 32; offset *= 2) {
-      const int other = __shfl_up_sync(kAllLanes, behind, offset);
-      if (lane >= offset) behind += other;
-    }
+    const int behind = warp_inclusive_sum(count);  // of the words up to this lane's
     int to = behind - count;
     for (; word != 0; word &= word - 1) places[to++] = uint16_t(32 * lane + __ffs(word) - 1);
     const int all = __shfl_sync(kAllLanes, behind, 31);

@@ -270,8 +270,8 @@ using EvenLayout =
                                           std::conditional_t<F::kSamples == 9 && !kBackward, CellLayout<5, 2>,
                                                              CellLayout<(F::kSamples + 3) / 4, 4>>>>;
 
-/// Grids of fewer tiles are blended by blend_listed.cuh and differentiated in segments (blend_moving_vjp.cuh): there
-/// few tiles have long lists, and the time is that of the longest.
-inline constexpr int64_t kLargeImageTiles = 4096;
+/// Small images are blended by blend_listed.cuh and differentiated in segments (blend_moving_vjp.cuh): their few tiles
+/// have long lists, and the time is that of the longest.
+inline bool is_small_image(TileGrid grid) { return grid.tiles() < 4096; }
 
 }  // namespace ar::cuda

@@ -1,7 +1,7 @@
 // Many channels in a small image, where few tiles have long lists: a block per tile would leave most of the device
-// idle. A tile's list is cut into segments, which are blended side by side. The kernels of blend.cuh go first, for
-// three channels that nobody looks at: they find the last splat of every sample and the transmittance between chunks,
-// where segments begin.
+// idle. A tile's list is cut into segments, which are blended side by side. The kernels of blend.cuh go first,
+// for three channels whose values are discarded: they find the last splat of every sample and the transmittance between
+// chunks, where segments begin.
 #pragma once
 
 #include "cuda/blend.cuh"
@@ -140,8 +140,8 @@ template <class F> void blend_segments(const BlendParams& p, const BlendParams& 
   blend_few<F, 3>(cut, stream);
   const unsigned tiles = unsigned(p.grid.tiles());
   for (int first = 0; first < p.channels.count; first += kChannelGroup) {
-    segment_blend_kernel<F><<<tiles * p.segments.count, kBlendThreads, 0, stream>>>(p, cut, first);
-    segment_sum_kernel<F::kSamples><<<tiles, kTilePixels, 0, stream>>>(p, first);
+    launch(segment_blend_kernel<F>, {tiles * p.segments.count, kBlendThreads}, stream, p, cut, first);
+    launch(segment_sum_kernel<F::kSamples>, {tiles, kTilePixels}, stream, p, first);
   }
 }
 

@@ -18,32 +18,23 @@ __global__ void clear_splat_sums_kernel(const BlendVjpParams params, int group) 
   if (params.channel_sums) clear(params.channel_sums, kChannelGroup);
 }
 
-/// Lets a kernel have more of a block's memory than kernels have unasked.
-template <class Kernel> void allow_shared(Kernel kernel, int bytes) {
-  if (bytes > 48 * 1024) cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, bytes);
-}
 /// Lists in segments, side by side.
 template <class F, int C> void launch_segments_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
   using Layout = SegmentLayout<F>;
-  constexpr int kBytes = int(sizeof(MovingVjpShared<F, C, Layout>));
-  const auto pieces = unsigned(max_pieces(p.lists.capacity, kMovingSegment, p.grid));
-  const auto maps = moving_vjp_kernel<F, C, Layout, kMovingSegment, true>;
-  const auto sums = moving_vjp_kernel<F, C, Layout, kMovingSegment, false>;
-  allow_shared(maps, kBytes);
-  allow_shared(sums, kBytes);
-  maps<<<pieces, Layout::kThreads, kBytes, stream>>>(p, first, false);
+  constexpr int kSegment = kMovingSegment<F>;
+  const auto pieces = unsigned(max_pieces(p.lists.capacity, kSegment, p.grid));
+  const LaunchShape shape = {pieces, Layout::kThreads, sizeof(MovingVjpShared<F, C, Layout>)};
+  launch(moving_vjp_kernel<F, C, Layout, kSegment, true>, shape, stream, p, first, false);
   const auto blocks = unsigned(p.grid.tiles() * F::kSamples);
-  chain_maps_kernel<F, kMovingSegment><<<blocks, kMovingPixels, 0, stream>>>(p);
-  sums<<<pieces, Layout::kThreads, kBytes, stream>>>(p, first, false);
+  launch(chain_maps_kernel<F, kSegment>, {blocks, kMovingPixels}, stream, p);
+  launch(moving_vjp_kernel<F, C, Layout, kSegment, false>, shape, stream, p, first, false);
 }
 template <class F, int C> void launch_moving_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
-  const bool in_segments = p.grid.tiles() < kLargeImageTiles;
+  const bool in_segments = is_small_image(p.grid);
   if (in_segments) launch_segments_vjp<F, C>(p, first, stream);
   using Layout = EvenLayout<F, true>;
-  constexpr int kBytes = int(sizeof(MovingVjpShared<F, C, Layout>));
-  const auto kernel = moving_vjp_kernel<F, C, Layout>;
-  allow_shared(kernel, kBytes);
-  kernel<<<unsigned(p.grid.tiles()), Layout::kThreads, kBytes, stream>>>(p, first, in_segments);
+  const LaunchShape shape = {unsigned(p.grid.tiles()), Layout::kThreads, sizeof(MovingVjpShared<F, C, Layout>)};
+  launch(moving_vjp_kernel<F, C, Layout>, shape, stream, p, first, in_segments);
 }
 /// `group`: which kChannelGroup channels; 0 where they are few.
 template <class F> void blend_vjp_moving(const BlendVjpParams& p, int group, cudaStream_t stream) {
@@ -57,17 +48,16 @@ template <class F> void blend_vjp_moving(const BlendVjpParams& p, int group, cud
 }  // namespace
 
 int64_t max_adjoint_maps(int footprint, int64_t capacity, TileGrid grid) {
-  int samples = 0;
+  int64_t maps = 0;
   visit_footprint(footprint, Footprints{}, [&](auto f) {
     using F = decltype(f);
-    if (F::kMoves) samples = F::kSamples;
+    if (F::kMoves && is_small_image(grid)) maps = max_pieces(capacity, kMovingSegment<F>, grid) * F::kSamples;
   });
-  if (grid.tiles() >= kLargeImageTiles) return 0;
-  return max_pieces(capacity, kMovingSegment, grid) * AdjointMap::kNumbers * kMovingPixels * samples;
+  return maps * AdjointMap::kNumbers * kMovingPixels;
 }
 
 void blend_vjp(int footprint, const BlendVjpParams& p, int group, cudaStream_t stream) {
-  clear_splat_sums_kernel<<<kClearBlocks, kBlendThreads, 0, stream>>>(p, group);
+  launch(clear_splat_sums_kernel, {kClearBlocks, kBlendThreads}, stream, p, group);
   visit_tile_footprints<AdaptiveBoxesVjp>(footprint, stream, [&](auto f, cudaStream_t side) {
     using F = decltype(f);
     if constexpr (F::kMoves) {

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "cuda/composite.cuh"
+#include "cuda/launch.cuh"
 
 namespace ar::cuda {
 
@@ -82,10 +83,10 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
   using VjpSplat = std::conditional_t<kGroup == 1, TileSplatRef<F, C>, const TileSplat<F, C>&>;
   using Pixels = VjpPixels<kOwn, C>;
   using Group = VjpGroup<F, C, kGroup>;
-  extern __shared__ float4 shared[];
   const int lane = lane_id(), warp = threadIdx.x / 32, first = warp % kGroup * kOwn;
-  Pixels& stage = reinterpret_cast<Pixels*>(shared)[warp];
-  Group& group = reinterpret_cast<Group*>(reinterpret_cast<Pixels*>(shared) + kWarps)[warp / kGroup];
+  auto* pixels = reinterpret_cast<Pixels*>(dynamic_shared());
+  Pixels& stage = pixels[warp];
+  Group& group = reinterpret_cast<Group*>(pixels + kWarps)[warp / kGroup];
   const auto group_sync = [] {
     if constexpr (kGroup > 1) {
       __syncthreads();
@@ -280,9 +281,7 @@ inline constexpr int kClearBlocks = 132 * 8;
 template <class F, int C, Sums kSums> void launch_blend_vjp(const BlendVjpParams& p, cudaStream_t stream) {
   constexpr int kOwn = kVjpSamples<F, kSums>, kWarps = kVjpWarps<F, kSums>, kGroup = F::kSamples / kOwn;
   const size_t bytes = kWarps * sizeof(VjpPixels<kOwn, C>) + kWarps / kGroup * sizeof(VjpGroup<F, C, kGroup>);
-  const auto kernel = blend_vjp_kernel<F, C, kSums>;
-  if (bytes > 48 * 1024) cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, int(bytes));
-  kernel<<<blocks_of(p.max_chunks, kWarps / kGroup), 32 * kWarps, bytes, stream>>>(p);
+  launch(blend_vjp_kernel<F, C, kSums>, {blocks_of(p.max_chunks, kWarps / kGroup), 32 * kWarps, bytes}, stream, p);
 }
 template <class F, int C> void blend_vjp_few(const BlendVjpParams& p, cudaStream_t stream) {
   constexpr bool kAtOnce = kVjpSamples<F, Sums::kGrads> == F::kSamples;

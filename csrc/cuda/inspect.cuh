@@ -1,8 +1,9 @@
-// Kernel of inspect: which Gaussians pixels show, and pixels Gaussians.
+// Kernel of inspect: statistics of every pixel (core/inspect.h), and of every Gaussian over all pixels.
 #pragma once
 
 #include "core/inspect.h"
 #include "cuda/composite.cuh"
+#include "cuda/launch.cuh"
 
 namespace ar::cuda {
 
@@ -54,7 +55,7 @@ template <class F> __global__ void __launch_bounds__(32 * kInspectWarps<F>) insp
 }
 
 template <class F> void launch_inspect(const InspectParams& p, cudaStream_t stream) {
-  inspect_kernel<F><<<unsigned(p.grid.tiles()), 32 * kInspectWarps<F>, 0, stream>>>(p);
+  launch(inspect_kernel<F>, {unsigned(p.grid.tiles()), 32 * kInspectWarps<F>}, stream, p);
 }
 
 }  // namespace ar::cuda

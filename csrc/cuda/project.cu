@@ -1,16 +1,18 @@
 // Launches of the projection, for every camera type and whatever the footprint.
+#include "cuda/launch.cuh"
 #include "cuda/project_vjp.cuh"
 
 namespace ar::cuda {
 namespace {
 
-template <class Params> void launch(void (*kernel)(Params), const Params& p, int64_t n, cudaStream_t stream) {
-  if (n > 0) kernel<<<blocks_of(n, kProjectThreads), kProjectThreads, 0, stream>>>(p);
+template <class Params> void launch_rows(void (*kernel)(Params), const Params& p, int64_t n, cudaStream_t stream) {
+  if (n > 0) launch(kernel, {blocks_of(n, kProjectThreads), kProjectThreads}, stream, p);
 }
 
 /// The kernel for the camera: `plain` or `full`.
-template <class Params> void launch(void (*plain)(Params), void (*full)(Params), const Params& p, cudaStream_t stream) {
-  launch(p.camera.lens ? full : plain, p, p.gaussians.n, stream);
+template <class Params>
+void launch_rows(void (*plain)(Params), void (*full)(Params), const Params& p, cudaStream_t stream) {
+  launch_rows(p.camera.lens ? full : plain, p, p.gaussians.n, stream);
 }
 
 using Plain = Camera<float>;
@@ -19,25 +21,25 @@ using Full = FullCamera<float>;
 }  // namespace
 
 void project(const ProjectParams& p, cudaStream_t stream) {
-  launch(project_kernel<Plain>, project_kernel<Full>, p, stream);
+  launch_rows(project_kernel<Plain>, project_kernel<Full>, p, stream);
 }
 void project_rows(const ProjectRowsParams& p, cudaStream_t stream) {
-  launch(project_rows_kernel<Plain>, project_rows_kernel<Full>, p, stream);
+  launch_rows(project_rows_kernel<Plain>, project_rows_kernel<Full>, p, stream);
 }
 void project_vjp(const ProjectVjpParams& p, cudaStream_t stream) {
-  launch(project_vjp_kernel<Plain>, project_vjp_kernel<Full>, p, stream);
+  launch_rows(project_vjp_kernel<Plain>, project_vjp_kernel<Full>, p, stream);
 }
 void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream) {
-  launch(project_rows_vjp_kernel<Plain>, project_rows_vjp_kernel<Full>, p, stream);
+  launch_rows(project_rows_vjp_kernel<Plain>, project_rows_vjp_kernel<Full>, p, stream);
 }
 
-void shape_rows(const ShapeRowsParams& p, cudaStream_t stream) { launch(shape_rows_kernel, p, p.n, stream); }
-void row_grads(const RowGradsParams& p, cudaStream_t stream) { launch(row_grads_kernel, p, p.n, stream); }
+void shape_rows(const ShapeRowsParams& p, cudaStream_t stream) { launch_rows(shape_rows_kernel, p, p.n, stream); }
+void row_grads(const RowGradsParams& p, cudaStream_t stream) { launch_rows(row_grads_kernel, p, p.n, stream); }
 
 void sum_channels(const SumChannelsParams& p, cudaStream_t stream) {
   const int64_t n = p.sums.n;
-  if (!p.channel_sums) return launch(sum_few_channels_kernel, p, n, stream);
-  if (n > 0) sum_channels_kernel<<<blocks_of(n, kSumWarps), 32 * kSumWarps, 0, stream>>>(p);
+  if (!p.channel_sums) return launch_rows(sum_few_channels_kernel, p, n, stream);
+  if (n > 0) launch(sum_channels_kernel, {blocks_of(n, kSumWarps), 32 * kSumWarps}, stream, p);
 }
 
 }  // namespace ar::cuda

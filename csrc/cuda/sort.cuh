@@ -1,12 +1,10 @@
 // A stable radix sort whose number of items is known to the device alone.
 //
-// Sorts of libraries take the number of items from the host. Ours would have to wait for it, or sort
-// all there is room for: twice as much, on frames with half the pairs of an earlier one. The method is
-// Adinets and Merrill, "Onesweep" (2022): one histogram for all digits, then a pass per digit in which
-// blocks find their place by looking back at the blocks before them.
+// The sorts of libraries take the number of items from the host. With them the host would have to wait for that number,
+// or sort all items that there is room for: twice as many, on frames with half the pairs of an earlier one. The method
+// is Adinets and Merrill, "Onesweep" (2022): one histogram for all digits, then a pass per digit in which blocks find
+// their place by looking back at the blocks before them.
 #pragma once
-
-#include <cub/block/block_scan.cuh>
 
 #include "cuda/warp.cuh"
 
@@ -66,22 +64,18 @@ template <class Value, bool kFirst>
 __global__ void __launch_bounds__(kSortThreads)
     sort_pass_kernel(const SortScratch scratch, int pass, int64_t first_count, uint32_t skip, const uint32_t* keys_in,
                      uint32_t* keys_out, const Value* values_in, Value* values_out) {
-  using Scan = cub::BlockScan<uint32_t, kSortThreads>;
-  __shared__ typename Scan::TempStorage scan_storage;
   __shared__ uint32_t counts[kSortWarps][kBins];  // of a warp's digits, then their first places in the block
   __shared__ uint32_t to_global[kBins];           // place in the output - place in the block
   __shared__ Value staged[kSortTile];
-  __shared__ uint32_t block_id, total;
+  __shared__ uint32_t block_id;
   const int t = threadIdx.x, warp = t / 32, lane = lane_id(), shift = pass * kDigitBits;
   if (t == 0) block_id = atomicAdd(&scratch.tickets[pass], 1);
-  uint32_t base;
-  const uint32_t all = scratch.histograms[pass * kBins + t];
-  Scan(scan_storage).ExclusiveSum(all, base);
-  if (t == kSortThreads - 1) total = base + all;
+  uint32_t items;
+  const uint32_t base = sum_before<kSortWarps>(scratch.histograms[pass * kBins + t], 0u, items);
 #pragma unroll
   for (int w = 0; w < kSortWarps; ++w) counts[w][t] = 0;
   __syncthreads();
-  const int64_t n = kFirst ? first_count : total, begin = int64_t(block_id) * kSortTile;
+  const int64_t n = kFirst ? first_count : items, begin = int64_t(block_id) * kSortTile;
   if (begin >= n) return;
 
   // A warp's items are consecutive, row after row of 32: the order of ranks is the order of items.
@@ -125,8 +119,8 @@ __global__ void __launch_bounds__(kSortThreads)
   }
   uint32_t* status = scratch.status + (int64_t(pass) * scratch.blocks + block_id) * kBins + t;
   write_status(status, (block_id == 0 ? kUpToBlock : kOfBlock) | mine);
-  uint32_t local;
-  Scan(scan_storage).ExclusiveSum(mine, local);
+  uint32_t total;  // items of this block
+  const uint32_t local = sum_before<kSortWarps>(mine, 0u, total);
   uint32_t earlier = 0;  // of digit t, in the blocks before
   if (block_id > 0) {
     for (const uint32_t* other = status - kBins;; other -= kBins) {
@@ -140,7 +134,6 @@ __global__ void __launch_bounds__(kSortThreads)
   to_global[t] = base + earlier - local;
 #pragma unroll
   for (int w = 0; w < kSortWarps; ++w) counts[w][t] += local;
-  if (t == kSortThreads - 1) total = local + mine;  // items of this block
   __syncthreads();
 
   // Through shared memory, so that neighbouring threads write to neighbouring places.

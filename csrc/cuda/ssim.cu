@@ -6,6 +6,7 @@
 // from values that it reads once into registers: the kernels would otherwise wait for shared memory.
 #include "core/ssim.h"
 
+#include "cuda/launch.cuh"
 #include "cuda/training.h"
 #include "cuda/warp.cuh"
 
@@ -240,12 +241,12 @@ template <typename T> int64_t ssim_blocks(int64_t planes, int height, int width)
 
 template <typename T, typename Target> void ssim(const SsimParams<T, Target>& p, T* block_sums, cudaStream_t stream) {
   const int64_t blocks = ssim_blocks<T>(p.planes, p.height, p.width);
-  ssim_kernel<T, Target><<<unsigned(blocks), kThreads, 0, stream>>>(p, p.loss ? block_sums : nullptr);
-  if (p.loss) loss_kernel<T, Target><<<1, kThreads, 0, stream>>>(p, block_sums, blocks);
+  launch(ssim_kernel<T, Target>, {unsigned(blocks), kThreads}, stream, p, p.loss ? block_sums : nullptr);
+  if (p.loss) launch(loss_kernel<T, Target>, {1, kThreads}, stream, p, block_sums, blocks);
 }
 template <typename T, typename Target> void ssim_vjp(const SsimVjpParams<T, Target>& p, cudaStream_t stream) {
   const int64_t blocks = ssim_blocks<T>(p.planes, p.height, p.width);
-  ssim_vjp_kernel<T, Target><<<unsigned(blocks), kThreads, 0, stream>>>(p);
+  launch(ssim_vjp_kernel<T, Target>, {unsigned(blocks), kThreads}, stream, p);
 }
 
 template int64_t ssim_blocks<float>(int64_t, int, int);

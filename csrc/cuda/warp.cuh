@@ -9,13 +9,50 @@ inline constexpr uint32_t kAllLanes = 0xffffffff;
 
 __device__ inline int lane_id() { return threadIdx.x % 32; }
 
-inline unsigned blocks_of(int64_t n, int threads) { return unsigned((n + threads - 1) / threads); }
-
 /// Sum over the lanes, in every lane, in a fixed order.
 template <typename T> __device__ T warp_sum(T v) {
 #pragma unroll
   for (int offset = 16; offset > 0; offset /= 2) v += __shfl_xor_sync(kAllLanes, v, offset);
   return v;
+}
+
+template <typename T> __device__ T shuffle(T v, int lane) { return __shfl_sync(kAllLanes, v, lane); }
+template <typename T> __device__ T shuffle_up(T v, int offset) { return __shfl_up_sync(kAllLanes, v, offset); }
+
+/// Sum of the lanes up to and with this one. `T` has a + that need not commute, and the two functions above.
+template <typename T> __device__ T warp_inclusive_sum(T v) {
+#pragma unroll
+  for (int offset = 1; offset < 32; offset *= 2) {
+    const T before = shuffle_up(v, offset);
+    if (lane_id() >= offset) v = before + v;
+  }
+  return v;
+}
+
+/// Sum over the threads before this one, of kWarps warps; `all`: of all of them. Several are a whole block, all of
+/// whose threads must call it. `zero` + v is v.
+template <int kWarps, typename T> __device__ T sum_before(T own, T zero, T& all) {
+  const T up_to = warp_inclusive_sum(own);
+  T before = shuffle_up(up_to, 1);
+  if (lane_id() == 0) before = zero;
+  if constexpr (kWarps == 1) {
+    all = shuffle(up_to, 31);
+    return before;
+  } else {
+    __shared__ T warps[kWarps];
+    const int warp = threadIdx.x / 32;
+    __syncthreads();  // the last call's reading
+    if (lane_id() == 31) warps[warp] = up_to;
+    __syncthreads();
+    T front = zero;
+    all = zero;
+#pragma unroll
+    for (int w = 0; w < kWarps; ++w) {
+      if (w == warp) front = all;
+      all = all + warps[w];
+    }
+    return front + before;
+  }
 }
 
 __device__ inline int warp_max(int v) {

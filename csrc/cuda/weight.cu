@@ -1,5 +1,6 @@
 // Launches of footprint_weight and its adjoint.
 #include "core/footprint/registry.h"
+#include "cuda/launch.cuh"
 #include "cuda/weight.cuh"
 
 namespace ar::cuda {
@@ -8,13 +9,13 @@ namespace {
 template <typename T> void launch_weight(int footprint, const WeightParams<T>& p, cudaStream_t stream) {
   if (p.n == 0) return;
   visit_footprint(footprint, Footprints{}, [&](auto f) {
-    weight_kernel<decltype(f), T><<<blocks_of(p.n, kWeightThreads), kWeightThreads, 0, stream>>>(p);
+    launch(weight_kernel<decltype(f), T>, {blocks_of(p.n, kWeightThreads), kWeightThreads}, stream, p);
   });
 }
 template <typename T> void launch_weight_vjp(int footprint, const WeightParams<T>& p, cudaStream_t stream) {
   if (p.n == 0) return;
   visit_footprint(footprint, Footprints{}, [&](auto f) {
-    weight_vjp_kernel<decltype(f), T><<<blocks_of(p.n, kWeightThreads), kWeightThreads, 0, stream>>>(p);
+    launch(weight_vjp_kernel<decltype(f), T>, {blocks_of(p.n, kWeightThreads), kWeightThreads}, stream, p);
   });
 }
 

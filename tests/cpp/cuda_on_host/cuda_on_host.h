@@ -1,8 +1,8 @@
 // Runs kernels of csrc/cuda on the host: a block after the other, its threads as contexts that take turns wherever they
 // wait for each other. Slow, and without anything of the memory model, but in every CI. Include before any kernel.
 //
-// Known: threadIdx, blockIdx, __syncthreads, __syncthreads_or, __syncwarp, and the votes, shuffles and bit functions
-// below, of which all lanes of a warp must take part.
+// Known: threadIdx, blockIdx, gridDim, __syncthreads, __syncthreads_or, __syncwarp, and the votes, shuffles and bit
+// functions below, of which all lanes of a warp must take part.
 #pragma once
 
 #include <cuda_runtime_api.h>
@@ -56,7 +56,7 @@ inline Meeting of_warps[kMaxThreads / 32], of_block;
 struct HostDim {
   unsigned x, y, z;
 };
-inline HostDim threadIdx, blockIdx;
+inline HostDim threadIdx, blockIdx, gridDim;
 
 namespace cuda_on_host {
 
@@ -104,6 +104,7 @@ inline void run_thread() {
 inline void launch(int blocks, int threads, std::function<void()> body) {
   constexpr size_t kStack = 1 << 17;
   kernel = std::move(body);
+  gridDim.x = unsigned(blocks);
   for (int block = 0; block < blocks; ++block) {
     blockIdx.x = unsigned(block);
     contexts = std::vector<Context>(threads);
@@ -142,6 +143,11 @@ inline uint32_t __ballot_sync(uint32_t, bool x) {
   for (int lane = 0; lane < 32; ++lane) bits |= uint32_t(all[lane]) << lane;
   return bits;
 }
+inline uint32_t __match_all_sync(uint32_t, uint32_t x, int* agree) {
+  const uint64_t* all = cuda_on_host::exchange_in_warp(x);
+  *agree = std::all_of(all, all + 32, [&](uint64_t one) { return one == x; });
+  return *agree ? 0xffffffff : 0;
+}
 inline bool __any_sync(uint32_t lanes, bool x) { return __ballot_sync(lanes, x) != 0; }
 template <class T> T __shfl_sync(uint32_t, T x, int lane) { return cuda_on_host::from_lane(x, lane); }
 template <class T> T __shfl_up_sync(uint32_t, T x, int lanes) {
@@ -165,7 +171,7 @@ inline int __float_as_int(float x) {
   std::memcpy(&y, &x, sizeof y);
   return y;
 }
-template <class T> T atomicAdd(T* place, T x) {
+template <class T, class X> T atomicAdd(T* place, X x) {
   const T before = *place;
   *place += x;
   return before;

@@ -1,0 +1,82 @@
+// The kernels that sort splats by depth, run on the host, against std::stable_sort.
+#include <cstring>
+#include <numeric>
+#include <random>
+
+#include "cuda_on_host.h"
+// After it: kernels.
+#include <gtest/gtest.h>
+
+#include "cuda/bin.cuh"
+
+namespace ar::cuda {
+namespace {
+
+constexpr float kCulled = -1;
+
+uint32_t key_of(float depth) {
+  if (depth == kCulled) return kCulledKey;
+  uint32_t key;
+  std::memcpy(&key, &depth, sizeof key);
+  return key;
+}
+
+/// Sorts as count_depths and sort_by_depth do.
+void expect_sorted(const std::vector<float>& depths) {
+  const auto n = int64_t(depths.size());
+  std::vector<uint32_t> keys[2] = {{}, std::vector<uint32_t>(n)};
+  for (float depth : depths) keys[0].push_back(key_of(depth));
+  std::vector<int32_t> order[2] = {std::vector<int32_t>(n, -1), std::vector<int32_t>(n, -1)};
+  std::vector<PairRange> ranges;
+  std::vector<int32_t> expected;
+  int64_t pairs = 0;
+  for (int32_t i = 0; i < n; ++i) {
+    const int count = depths[i] == kCulled ? 0 : i % 3 + 1;
+    ranges.push_back({0, count});
+    pairs += count;
+    if (count > 0) expected.push_back(i);
+  }
+  std::stable_sort(expected.begin(), expected.end(), [&](int32_t a, int32_t b) { return depths[a] < depths[b]; });
+
+  std::vector<uint32_t> memory(SortScratch::words(n, kDepthPasses));
+  const SortScratch scratch(memory.data(), n, kDepthPasses);
+  Counts counts = {};
+  const DepthSort sort = {
+      n, {keys[0].data(), keys[1].data()}, {order[0].data(), order[1].data()}, ranges.data(), &counts};
+  cuda_on_host::launch(2, kCountThreads,
+                       [&] { count_depths_kernel(sort.keys[0], sort.ranges, n, scratch.histograms, sort.counts); });
+  ASSERT_EQ(counts.splats, int64_t(expected.size()));
+  ASSERT_EQ(counts.pairs, pairs);
+  for_each_depth_pass(sort, scratch, [&](auto kernel, auto... arguments) {
+    cuda_on_host::launch(int(scratch.blocks), kSortThreads, [&] { kernel(arguments...); });
+  });
+  order[0].resize(expected.size());
+  ASSERT_EQ(order[0], expected);
+}
+
+std::vector<float> random_depths(int n, float nearest, float farthest, int one_culled_in = 3) {
+  std::mt19937 bits(7);
+  std::uniform_real_distribution<float> uniform(std::log(nearest), std::log(farthest));
+  std::vector<float> depths;
+  for (int i = 0; i < n; ++i) depths.push_back(bits() % one_culled_in == 0 ? kCulled : std::exp(uniform(bits)));
+  return depths;
+}
+
+TEST(SortKernels, Depths) { expect_sorted(random_depths(2 * kSortTile + 100, 0.2f, 100)); }
+
+TEST(SortKernels, DepthsOfEveryMagnitude) { expect_sorted(random_depths(kSortTile + 1, 1e-37f, 1e37f)); }
+
+TEST(SortKernels, FewAndNoDepths) {
+  expect_sorted({2});
+  expect_sorted({kCulled, kCulled});
+  expect_sorted({3, kCulled, 0, 1, 3, 0});
+}
+
+TEST(SortKernels, TiesKeepInputOrder) {
+  std::vector<float> depths = random_depths(kSortTile, 0.2f, 4);
+  for (float& depth : depths) depth = depth == kCulled ? kCulled : std::ceil(depth);
+  expect_sorted(depths);
+}
+
+}  // namespace
+}  // namespace ar::cuda
