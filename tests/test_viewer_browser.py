@@ -218,8 +218,9 @@ def lone_splats(smallest, size=64, columns=16, rows=8):
 
 
 # Alpha is the product of sqrt(2 pi) sigma F of both axes, each at most 1.003. Evaluated on fine grids of h and t, the
-# polynomials of logistic.js change it by up to 1.94e-4, at a sigma of 0.14 px, where it is 0.35 at most; from a sigma of
-# half a pixel on by up to 2.3e-5. So both together change alpha by up to 2.1e-4, or 4.6e-5, and of itself by up to 2.5e-3.
+# polynomials of logistic.js change it by up to 1.94e-4, at a sigma of 0.14 px, where it is 0.35 at most, and by up to
+# 2.3e-5 from a sigma of half a pixel on. So both together change alpha by up to 2.1e-4, or 4.6e-5 where both are half a
+# pixel or more, and by up to 0.25% of itself.
 @pytest.mark.gate
 @pytest.mark.parametrize("smallest, largest_error", [(0.04, 2.5e-4), (0.5, 6e-5)])
 def test_the_window_of_analytic_keeps_its_bounds(browser, smallest, largest_error):
