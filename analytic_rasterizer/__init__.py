@@ -1,6 +1,15 @@
 """Gaussian splatting with every Gaussian integrated over the pixel, not sampled at its centre.
 
-A drop-in replacement for `diff_gaussian_rasterization`. See the README for how to choose a footprint.
+A drop-in replacement for `diff_gaussian_rasterization`. Where to look:
+
+- `GaussianRasterizationSettings`, `GaussianRasterizer`: rendering, with the interface of 3DGS 2023.
+- `FOOTPRINTS`, `set_default_footprint`, `footprint_weight`: the weight of a Gaussian in a pixel (docs/footprints.md).
+- `Effects`, `Outputs`, `Defocus`, `Motion`, `camera_settings`: depth, alpha, statistics, cameras (docs/effects.md).
+- `project`, `bin`, `blend`: the three stages of a rendering, each on its own (docs/library.md).
+- `losses`, `activations`, `optim`: the other parts of a training step (docs/losses.md).
+- `inspect_scene`, `plan`: what a scene calls for (docs/command-line.md).
+
+In modules of their own: `training`, `distributed`, `viewer`, `analysis`, `dialects` and `io` (docs/).
 """
 
 import torch  # noqa: F401  (its libraries must be loaded before the extension's)

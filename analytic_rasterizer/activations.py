@@ -13,7 +13,7 @@ def activate(
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """exp(log_scales), quats / |quats| and sigmoid(logit_opacities): one kernel on CUDA, and one for the gradients.
 
-    What torch's functions give, within a few roundings, with their gradients: quaternions shorter than 1e-12 are
+    Values and gradients are those of torch's functions, within a few roundings. Quaternions shorter than 1e-12 are
     divided by 1e-12 (torch.nn.functional.normalize), so that zero stays zero, which the rasterizer takes as the
     identity. In float32 quaternions longer than 1e19 become zero. NaN stays NaN. The backward pass computes the values
     again from the parameters; nothing is kept for it.

@@ -1,4 +1,4 @@
-"""The arguments of the ops from what users give: checked, named, and completed by settings and effects."""
+"""From what users give to the arguments of the operators: checked, named, and completed by settings and effects."""
 
 from __future__ import annotations
 

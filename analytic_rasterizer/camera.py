@@ -1,4 +1,4 @@
-"""Cameras: the matrices of a pose and focal lengths, with gradients to both, and the numbers that the ops read."""
+"""Cameras: settings from a pose and focal lengths, differentiable in both, and the operators' argument `lens`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a rendering can have beyond three colours of a fixed pinhole: each effect costs nothing unless asked for."""
+"""What a rendering can have beyond three colours of a fixed pinhole camera. What is not asked for costs nothing."""
 
 from __future__ import annotations
 
@@ -16,14 +16,16 @@ AUTO = "auto"
 
 
 class GaussianStats(NamedTuple):
-    """How much of every Gaussian a picture shows. Its weight in a pixel is what its colour is multiplied with there.
+    """How much of each of the P Gaussians a picture shows.
+
+    The weight of a Gaussian in a pixel is here the factor of its colour in the pixel: transmittance times alpha.
 
     Attributes:
-        pixels: (P,) int32, pixels in which its weight is not zero.
-        max_weight: (P,) largest weight, 0 to 1, float32.
+        pixels: (P,) int32, number of pixels in which its weight is not zero.
+        max_weight: (P,) float32, largest weight, 0 to 1.
         sum_weight: (P,) sum of weights over all pixels, in steps of 2^-32.
-        pixels_in_front: (P,) int32, those of `pixels` in which more than half of the light is left behind it.
-        pixels_dominated: (P,) int32, pixels that show most of it, as `Outputs.dominant_index` has it.
+        pixels_in_front: (P,) int32, number of those pixels in which more than half of the light is left behind it.
+        pixels_dominated: (P,) int32, number of pixels whose `Outputs.dominant_index` it is.
     """
 
     pixels: torch.Tensor
@@ -37,10 +39,12 @@ class Outputs(NamedTuple):
     """What `Effects` asked for; None for the rest. The first three are differentiable in every input of the rasterizer.
 
     Attributes:
-        alpha: (1, H, W) in 0 to 1.
-        depth: (1, H, W) sum of weight times z, world units; divided by alpha it is the mean depth of what is seen.
-        inverse_depth: (1, H, W) sum of weight over z, 1 / world units.
-        median_depth: (1, H, W) world units; 0 where half of the light gets through.
+        alpha: (1, H, W) in 0 to 1: the share of the pixel that is covered.
+        depth: (1, H, W) sum over Gaussians of weight times z, world units; divided by alpha (`normalized`) it is the
+            mean depth of what is seen.
+        inverse_depth: (1, H, W) sum over Gaussians of weight divided by z, 1 / world units.
+        median_depth: (1, H, W) z of the Gaussian behind which less than half of the light is left, world units; 0 where
+            half of the light or more gets through.
         dominant_index: (1, H, W) int32, the Gaussian of the largest weight, of equal ones the nearest; -1 for none.
         gaussian_stats: `GaussianStats`.
     """
@@ -65,7 +69,11 @@ class Defocus:
 
     Attributes:
         aperture: Diameter of the lens, world units, not negative; a number, or a tensor with one, differentiable.
-        focus: Depth that is sharp, world units, positive; likewise.
+        focus: Depth that is sharp, world units, positive; a number, or a tensor with one, differentiable.
+
+    Raises:
+        TypeError: Not a number or a tensor.
+        ValueError: A number outside of its domain, or a tensor with more than one.
     """
 
     aperture: float | torch.Tensor
@@ -88,6 +96,12 @@ class Motion:
         velocity: (3,) of the camera along its axes (x right, y down, z forward), world units / s.
         angular_velocity: (3,) of the camera around them, rad / s.
         screen_velocity: (2,) of the whole picture, px / s.
+
+    Velocities may be tuples or tensors, which are differentiable.
+
+    Raises:
+        TypeError: `exposure` is not a number or a tensor.
+        ValueError: A number outside of its domain, or a wrong shape.
     """
 
     exposure: float | torch.Tensor
@@ -111,14 +125,15 @@ class Motion:
 class Effects:
     """What a rendering has beyond three colours of a fixed camera. What is not asked for costs nothing.
 
-    With one of the first six the rasterizer returns (color, radii, `Outputs`).
+    The first six ask for an output of the same name: with any of them the rasterizer returns (color, radii, `Outputs`),
+    and `Outputs` says what they are.
 
     Attributes:
         alpha: How much of each pixel is covered, 1 - transmittance.
-        depth: Expected depth: camera-space z of the Gaussians' centres, blended like a colour on zero.
-        inverse_depth: The same of 1/z.
+        depth: Expected depth: camera-space z of the Gaussians' centres, blended like a colour on a background of zero.
+        inverse_depth: Likewise of 1/z.
         median_depth: z of the Gaussian behind which less than half of a pixel's light is left.
-        dominant_index: Which Gaussian a pixel shows most of.
+        dominant_index: The Gaussian that has the largest weight in a pixel.
         gaussian_stats: How much of every Gaussian is seen, for pruning.
         camera_gradients: Gradients with respect to viewmatrix, projmatrix, campos, tanfovx and tanfovy of the settings
             that are tensors and require one. A matrix or campos that requires one switches it on by itself.
@@ -133,7 +148,7 @@ class Effects:
         filter_3d: (P,) of `compute_3d_filter`: widens scales and lowers opacities (`apply_3d_filter`).
         defocus: `Defocus`, or None for a pinhole.
         motion: `Motion`, or None for an instant.
-        sh_degree: Most degrees of spherical harmonics to use, 0 to 4; None: those of the settings.
+        sh_degree: Highest degree of spherical harmonics to use, 0 to 4; None: that of the settings.
 
     Raises:
         TypeError: A wrong type.
@@ -185,7 +200,7 @@ class Effects:
 
     @property
     def changes_camera(self) -> bool:
-        """Whether projecting takes more than a pinhole of 3DGS."""
+        """Whether the projection needs the full camera (csrc/core/camera.h), not only the pinhole of 3DGS."""
         return (
             self.camera_gradients
             or self.orthographic
@@ -196,7 +211,10 @@ class Effects:
         )
 
     def lens_members(self) -> dict:
-        """What the effects set of the op's argument `lens`: numbers, lists or tensors by the names of `_C.LENS`."""
+        """The entries of the operator's argument `lens` that the effects set, by the names of `_C.LENS`.
+
+        Numbers, lists of numbers, or tensors.
+        """
         members = {"focus": 1.0, "near": self.near, "far": self.far, "parallel": float(self.orthographic)}
         if self.defocus:
             members |= {"aperture": self.defocus.aperture, "focus": self.defocus.focus}
@@ -214,7 +232,7 @@ def _check_number(name: str, value, at_least: float = -math.inf, above: float = 
     if isinstance(value, torch.Tensor):
         if value.numel() != 1:
             raise ValueError(f"{name} must be one number, got a tensor of shape {tuple(value.shape)}")
-        return  # its value may be on a device, for which nobody should wait
+        return  # the value is not examined: on a device that would have to be waited for
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise TypeError(f"{name} must be a number, got {value!r}")
     if not (math.isfinite(value) and value >= at_least and value > above):

@@ -1,4 +1,4 @@
-"""The 3D smoothing filter of Mip-Splatting: no Gaussian finer than the pictures it was trained on could show.
+"""The 3D smoothing filter of Mip-Splatting: no Gaussian is finer than its training pictures could have shown.
 
 `bake_pixel` widens Gaussians likewise, by the pixel itself, for viewers that do not integrate over it.
 
@@ -26,15 +26,15 @@ MARGIN = 0.15  # of the image around it in which a Gaussian still counts as seen
 def compute_3d_filter(means3D: torch.Tensor, cameras: Sequence[Any], variance: float = VARIANCE) -> torch.Tensor:
     """Standard deviation of every Gaussian's filter, from the camera that samples it most finely.
 
-    A camera samples a point at depth z once every z / focal length world units, an orthographic one every
-    1 / focal length. A point takes the smallest interval among the cameras that see it, with a margin around the
-    image. A point that no camera sees takes the largest interval of all other points.
+    A camera samples a point at depth z at intervals of z / focal length, in world units; an orthographic camera at
+    intervals of 1 / focal length. A point takes the smallest interval among the cameras that see it, with a
+    margin around the image. A point that no camera sees takes the largest interval of all other points.
 
     Args:
         means3D: (P, 3) centres, world units.
         cameras: `GaussianRasterizationSettings` of the training views, at least one. Size, field of view, matrices and
             the near and far planes of the effects are read.
-        variance: Of the filter, in squares of the sampling interval.
+        variance: Variance of the filter, in squares of the sampling interval.
 
     Returns:
         (P,) world units, of the dtype and device of means3D.

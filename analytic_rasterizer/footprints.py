@@ -1,4 +1,7 @@
-"""The footprint models: their names, options and defaults, and the weight of one splat in one pixel."""
+"""The footprints: their names, options and defaults, and the weight of one splat in one pixel.
+
+A footprint is the rule that turns a projected Gaussian into its weight in a pixel (docs/footprints.md).
+"""
 
 from __future__ import annotations
 
@@ -45,13 +48,13 @@ ENVIRONMENT_VARIABLE = "ANALYTIC_RASTERIZER_FOOTPRINT"
 
 @dataclass(frozen=True)
 class Footprint:
-    """A footprint with all its options settled.
+    """A footprint with all its options filled in, as `resolve_footprint` returns it.
 
     Attributes:
         name: One of `FOOTPRINTS`.
         options: Every option of that footprint, as a tuple of (name, value) pairs.
-        key: Name of the kernel that computes it.
-        option: The number that the kernel takes: dilation, variance or tolerance; 0 where there is none.
+        key: Name under which it is registered (csrc/core/footprint/registry.h): "box4".
+        option: The number that it takes at run time: dilation, variance or tolerance; 0 where there is none.
         samples: The most samples that a pixel has.
     """
 

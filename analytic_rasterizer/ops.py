@@ -1,4 +1,7 @@
-"""The ops' fake kernels: what they return, without doing it. Their schemas and gradients are in csrc/torch."""
+"""Fake kernels of the operators: shapes and dtypes of what they return, for tracing (torch.compile, torch.export).
+
+The operators' schemas, kernels and gradients are in csrc/torch.
+"""
 
 from __future__ import annotations
 

@@ -24,13 +24,13 @@ class FusedAdam(torch.optim.Optimizer):
 
     [Kingma and Ba, "Adam", 2015, with eps outside of the root as in torch.] Parameters without a gradient are left as
     they are. There is no weight decay, no AMSGrad and no `maximize`. The state of a parameter is that of torch, `step`,
-    `exp_avg` and `exp_avg_sq`, but that `step` is an int. What `state_dict` of torch.optim.Adam gives can be loaded,
-    and the other way round after `step` has been made a tensor. A CUDA graph of a step repeats the `step` and the
+    `exp_avg` and `exp_avg_sq`, except that `step` is an int. A `state_dict` of torch.optim.Adam can be loaded; for the
+    other way round `step` has to be made a tensor. A CUDA graph of a step repeats the `step` and the
     learning rates that it was captured with.
 
     A group may have two learning rates: with "head" and "head_lr" the first `head` entries along the second dimension
     of its parameters learn at `head_lr`, and the others at `lr`. So the harmonics of Gaussians (P, K, 3), of which the
-    constant learns faster, are one parameter, that need not be put together for the rasterizer.
+    constant learns faster, can be one parameter, which need not be concatenated for the rasterizer.
 
     Args:
         params: Tensors or groups, as every optimiser of torch takes them: float32 or float64, contiguous, all of one

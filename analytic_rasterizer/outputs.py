@@ -1,4 +1,4 @@
-"""How the outputs of a rendering are made that are no images of the op, and what is made of outputs."""
+"""Outputs of a rendering that the operator does not return as images: median depth and statistics; and mean depths."""
 
 from __future__ import annotations
 
@@ -9,19 +9,22 @@ from .effects import Effects, GaussianStats
 
 
 def normalized(blended: torch.Tensor, alpha: torch.Tensor, smallest: float = 1e-6) -> torch.Tensor:
-    """Mean over what is seen of a blended output: `blended` / `alpha`, and 0 where alpha is below `smallest`.
+    """Mean of a blended output over what a pixel shows: `blended` / `alpha`, and 0 where alpha is at most `smallest`.
 
     Args:
-        blended: (..., H, W), `Outputs.depth` for one.
+        blended: (..., H, W), for example `Outputs.depth`.
         alpha: (1, H, W) of the same picture.
-        smallest: Alpha below which there is nothing to see.
+        smallest: Alpha up to which a pixel counts as showing nothing.
+
+    Returns:
+        (..., H, W), in the unit of `blended`. Differentiable in both.
     """
     seen = alpha > smallest
     return torch.where(seen, blended / torch.where(seen, alpha, 1), 0)
 
 
 def depths(means3D: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
-    """Camera-space z, (P,)."""
+    """Camera-space z (P,), world units, of means3D (P, 3) under `view`, the (4, 4) viewmatrix of 3DGS (transposed)."""
     view = view.reshape(4, 4)
     x, y, z = means3D.unbind(1)  # not `@`, which autocast and TF32 round
     return x * view[0, 2] + y * view[1, 2] + z * view[2, 2] + view[3, 2]
@@ -34,8 +37,8 @@ def summaries(
     """The outputs without a gradient that `effects` asks for, by name.
 
     Args:
-        effects: What to make.
-        saved: What `rasterize` saved.
+        effects: Which outputs to make.
+        saved: The tensors that the operator `rasterize` saved with keep=True.
         z: (P,) camera-space z of the Gaussians, world units.
         size: Height and width of the image, px.
         footprint, option: Key and number of the footprint that it was rendered with.

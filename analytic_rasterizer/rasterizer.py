@@ -1,4 +1,8 @@
-"""The drop-in API of diff_gaussian_rasterization: the rasterizer, and its function."""
+"""The drop-in interface of diff_gaussian_rasterization: `GaussianRasterizer`, and the function `rasterize_gaussians`.
+
+Both end in `render`, which checks the arguments, completes them by those of the camera, and calls one operator
+(csrc/torch/rasterize.cpp). The dialects call `render` too.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +34,11 @@ def rasterize_gaussians(
     cov3Ds_precomp: torch.Tensor | None,
     raster_settings: GaussianRasterizationSettings,
 ) -> tuple[torch.Tensor, ...]:
-    """Renders Gaussians. The functional form of `GaussianRasterizer.forward`, which says more."""
+    """Renders Gaussians with `raster_settings`, as a function, in the order of arguments of 3DGS.
+
+    `sh` is `shs` and `cov3Ds_precomp` is `cov3D_precomp` of `GaussianRasterizer.forward`. Shapes, what is returned, and
+    errors are described there.
+    """
     return render(
         raster_settings,
         NOTHING,
@@ -58,10 +66,14 @@ def render(
     cov3D_precomp: torch.Tensor | None,
     features: torch.Tensor | None = None,
 ) -> tuple:
-    """(color, radii), and `Outputs` where `outputs` or the effects of the settings ask for some.
+    """Renders: (color, radii), and `Outputs` where `outputs` or the effects of the settings ask for some.
 
-    `outputs` is an `Effects` of which only the outputs are read: what a dialect returns whatever the settings say.
-    `features` (P, K), K up to 509, are blended on zero beside three colours, and follow them in `color` (3 + K, H, W).
+    Args:
+        outputs: An `Effects` of which only the outputs are read: what a dialect returns whatever the settings say.
+        features: (P, K), K up to 509, blended with a background of zero beside three colours, which they follow in
+            `color` (3 + K, H, W).
+
+    The other arguments, what is returned, and errors are those of `GaussianRasterizer.forward`.
     """
     gaussians = gaussian_arguments(
         settings,
@@ -129,7 +141,7 @@ class GaussianRasterizer(torch.nn.Module):
         self.raster_settings = raster_settings
 
     def markVisible(self, positions: torch.Tensor) -> torch.Tensor:
-        """Which positions lie in front of the near plane, camera-space z > 0.2 or as the effects have it.
+        """Which positions lie beyond the near plane: camera-space z above 0.2, or above `Effects.near` if that is set.
 
         Args:
             positions: (P, 3) world units.
@@ -171,9 +183,10 @@ class GaussianRasterizer(torch.nn.Module):
 
         Args:
             means3D: (P, 3) centres, world units.
-            means2D: (P, 3) or (P, 4) whose values are ignored, or None. Its gradient's first two columns
-                are dL/d(projected mean) per (0.5 W, 0.5 H) px, the third is zero, and columns 2 and 3 of
-                a (P, 4) input are sums over pixels of the absolute values instead.
+            means2D: (P, 3) or (P, 4), or None. Its values are ignored; it is there for its gradient, which density
+                control reads. The first two columns of the gradient are dL/d(projected mean) per (0.5 W, 0.5 H) px.
+                The third column of a (P, 3) tensor is zero. Columns 2 and 3 of a (P, 4) tensor are the sums over
+                pixels of the absolute values of what each pixel adds to columns 0 and 1.
             opacities: (P, 1) or (P,).
             shs: (P, M, 3) spherical harmonics, M >= (sh_degree + 1)^2; or colors_precomp.
             colors_precomp: (P, 3) RGB, or (P, C) features of 1 to 512 channels, blended in one pass.

@@ -27,12 +27,12 @@ class _Fields(NamedTuple):
 
 
 class GaussianRasterizationSettings(_Fields):
-    """How to render: the 12 fields of 3DGS 2023, in its order, as a tuple; and the footprint and the effects.
+    """How to render: a tuple of the 12 fields of 3DGS 2023 in its order. Footprint and effects are further attributes.
 
     Args:
         image_height, image_width: Size of the image, px.
         tanfovx, tanfovy: Tangent of half the field of view.
-        bg: (3,) background colour; (C,) of C channels; or (C, H, W), an image, differentiable.
+        bg: Background: (3,) a colour, (C,) of C channels, or (C, H, W) an image. Differentiable.
         scale_modifier: Factor on all scales.
         viewmatrix: (4, 4) or (1, 4, 4) world to camera, transposed (for row vectors).
         projmatrix: (4, 4) or (1, 4, 4) world to clip space, transposed. The principal point is wherever
@@ -40,33 +40,35 @@ class GaussianRasterizationSettings(_Fields):
         sh_degree: Degree of the spherical harmonics in use, 0 to 4.
         campos: (3,) camera centre, world units.
         prefiltered: Accepted for compatibility; culling does not depend on it.
-        debug: Raise for a Gaussian that is not finite, has an opacity outside [0, 1] or a negative scale or
-            variance, naming tensor, index and value; otherwise such a Gaussian is culled or taken as it is. On
-            failure write the arguments to snapshot_fw.dump or snapshot_bw.dump and re-raise. On CUDA wait
-            for every stage, so that the stage that failed is the one that raises, and check that the
-            camera is finite, which otherwise is not looked at there.
+        debug: Raise a ValueError, naming tensor, index and value, for a Gaussian that is not finite, has an opacity
+            outside [0, 1] or a negative scale or variance; without `debug` such a Gaussian is culled or taken as it is.
+            On failure write the arguments to snapshot_fw.dump or snapshot_bw.dump and re-raise. On CUDA wait for every
+            stage, so that the stage that failed is the one that raises, and check that the camera is finite, which is
+            not checked there otherwise.
         footprint: One of `FOOTPRINTS`, optionally with options (`"box:samples=8"`). None: the default at
             the time of rendering, see `set_default_footprint`.
-        effects: What the rendering has beyond three colours of a pinhole, see `Effects`; None: nothing. "auto":
-            harmonics only up to the degree that changes a colour by 1/255 (`needed_sh_degree`; found once for
-            coefficients that stay the same tensor, and not at all while they are trained).
+        effects: What the rendering has beyond three colours of a pinhole camera, see `Effects`; None: nothing. "auto":
+            spherical harmonics only up to the degree above which they change no colour by more than 1/255. That degree
+            is found once for every tensor of coefficients (`needed_sh_degree`); coefficients that require a gradient
+            are used in full.
         **options: Options of the footprint, see `resolve_footprint`.
 
     Attributes:
-        footprint: The settled `Footprint`, or None.
+        footprint: The `Footprint` with its options filled in, or None.
         effects: The `Effects`, "auto", or None.
 
     Raises:
         ValueError: Unknown footprint or option.
-        TypeError: effects is neither.
+        TypeError: `effects` is none of these, or a keyword is unknown.
     """
 
-    # Also where a tuple method makes an instance without __new__.
+    # Class attributes, because methods of tuple make instances without calling __new__.
     footprint: Footprint | None = None
     effects: Effects | str | None = None
     means2d_z = "zero"
-    """What the third column of the gradient of means2D (P, 3) holds: "zero", "sum_abs" or "sum_norm", the sum over
-    pixels of |gx| + |gy| or of the length of (gx, gy). Dialects have it otherwise."""
+    """What the third column of the gradient of means2D (P, 3) holds: "zero"; "sum_abs", the sum over pixels of
+    |gx| + |gy|; or "sum_norm", that of the length of (gx, gy), where (gx, gy) is what a pixel adds to the first two
+    columns. Some dialects have another value than "zero"."""
 
     def __new__(
         cls, *args: Any, footprint: str | Footprint | None = None, effects: Effects | str | None = None, **kwargs: Any

@@ -37,14 +37,17 @@ def sh_band_bounds(shs: torch.Tensor) -> list[float]:
 
 
 def needed_sh_degree(shs: torch.Tensor, tolerance: float = 1 / 255) -> int:
-    """The smallest degree that renders within the tolerance of all of them, whatever the view.
+    """The smallest degree whose colours are within the tolerance of those of all coefficients, for any view.
 
-    Set as `sh_degree` of the settings it saves reading and computing the bands above. Waits for the device: to be
-    called once per scene.
+    Set it as `sh_degree` of the settings to save reading and computing the bands above it. Call it once per scene,
+    because it waits for the device.
 
     Args:
         shs: (P, M, 3) coefficients, M = 1, 4, 9, 16 or 25.
-        tolerance: In units of colour.
+        tolerance: Largest change of a colour, 0 to 1.
+
+    Returns:
+        The degree, 0 to 4.
 
     Raises:
         ValueError: Wrong shape, or a tolerance that is negative or not finite.

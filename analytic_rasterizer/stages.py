@@ -1,7 +1,8 @@
-"""The pass as its three stages, each on its own: project, bin, blend.
+"""The three stages of a rendering, each on its own: `project`, `bin`, `blend`.
 
-`GaussianRasterizer` is these three in one op. By themselves they serve what is made of parts: features of any number of
-channels, several cameras at once, splats from elsewhere. All run on the CPU (float32, float64) and on CUDA (float32).
+`GaussianRasterizer` runs the three in one operator. Call them one by one to render several pictures from one
+projection, several cameras at once, or splats that come from elsewhere. All run on the CPU (float32, float64) and on
+CUDA (float32).
 
     splats = ar.project(settings, means3D, opacities, scales=scales, rotations=rotations)
     lists = ar.bin(splats)
@@ -29,22 +30,23 @@ from .settings import GaussianRasterizationSettings
 class Splats:
     """Projected Gaussians: a row for every Gaussian that a camera may see, camera after camera, Gaussians ascending.
 
-    The first five are differentiable in what `project` was given.
+    N is the number of rows, C that of cameras. The first five members are differentiable in what `project` was given.
 
     Attributes:
         means2d: (N, 2) px; pixel centres are at integers.
-        cov2d: (N, 3) projected covariances (xx, xy, yy), px^2, before any footprint. A gradient with respect to it
-            holds that of the determinant; xy is the one number that fills both places.
-        opacities: (N,) with the amplitude of defocus and motion blur.
+        cov2d: (N, 3) projected covariances (xx, xy, yy), px^2, to which the footprint has added nothing yet. Gradients
+            with respect to it include those through the determinant; that of xy is with respect to the one number that
+            fills both off-diagonal places.
+        opacities: (N,) multiplied by the amplitude of defocus and motion blur.
         depths: (N,) camera-space z, world units.
         colors: (N, 3) RGB where `project` had shs or colors_precomp, else (0, 3).
         radii: (N,) int32, px, as `GaussianRasterizer` returns; positive.
-        gaussian_ids: (N,) int32.
-        camera_ids: (N,) int32.
+        gaussian_ids: (N,) int32, the row of each splat's Gaussian in what `project` was given.
+        camera_ids: (N,) int32, 0 to C - 1.
         row_splits: (C + 1,) int64 on the CPU: the rows of camera c are row_splits[c] to row_splits[c + 1].
-        dets: (N,) determinants of cov2d, px^4, without the cancellation of computing them from its entries.
+        dets: (N,) determinants of cov2d, px^4, which would cancel if they were computed from its entries.
         width, height: Size of the images, px.
-        footprint: Key of the footprint, and `option` its number, see `Footprint`.
+        footprint, option: Key and number of the footprint, see `Footprint`.
     """
 
     means2d: torch.Tensor
@@ -69,7 +71,7 @@ class Splats:
 
     @property
     def size(self) -> dict[str, Any]:
-        """Size and footprint by the names of the ops."""
+        """Image size and footprint, by the names of the operators' arguments."""
         return {
             "image_height": self.height,
             "image_width": self.width,
@@ -78,7 +80,7 @@ class Splats:
         }
 
     def split(self) -> list[Splats]:
-        """Those of every camera by themselves, each as a batch of one camera. Differentiable."""
+        """The splats of every camera by themselves, each as a batch of one camera. Differentiable."""
         if self.cameras == 1:
             return [self]
         sizes = self.row_splits.diff().tolist()
@@ -98,18 +100,18 @@ _ROWS = tuple(field.name for field in fields(Splats))[:9]  # in the order in whi
 
 @dataclass(frozen=True)
 class TileLists:
-    """Which splats every tile shows, front to back. What `bin` makes for `blend`; its tensors are the backend's own.
+    """Which splats may show in every tile, front to back. `bin` makes it for `blend`.
 
     Attributes:
-        tensors: The lists of camera after camera.
-        cameras: How many there are.
+        tensors: The lists, camera after camera, in a form of the device's own (ListTensors in csrc/torch/backend.h).
+        cameras: Number of cameras.
     """
 
     tensors: tuple[torch.Tensor, ...]
     cameras: int
 
     def of_camera(self, camera: int = 0) -> dict[str, torch.Tensor]:
-        """The lists of one camera by name (ListTensors in csrc/torch/backend.h)."""
+        """The lists of one camera, by the names of ListTensors."""
         first = camera * len(_C.LISTS)
         return dict(zip(_C.LISTS, self.tensors[first : first + len(_C.LISTS)]))
 
@@ -128,8 +130,8 @@ def project(
     """Projects Gaussians into one or several cameras.
 
     Differentiable in all tensors, and with `Effects(camera_gradients=True)` in the cameras. The gradient with respect
-    to scales and rotations passes through cov2d, whose entries are known to their rounding only: a needle much longer
-    than it is wide keeps more digits in `GaussianRasterizer`. Waits for the device, which counts the rows.
+    to scales and rotations passes through cov2d, whose entries are rounded. For a needle, much longer than it is wide,
+    that loses digits which `GaussianRasterizer` keeps. The host waits for the device, which counts the rows.
 
     Args:
         settings: Of the camera, or of each of several. They must agree in image size, scale modifier, degree of the
@@ -138,6 +140,9 @@ def project(
         opacities: (P, 1) or (P,).
         shs: (P, M, 3) spherical harmonics, or colors_precomp (P, 3), for `Splats.colors`; or neither.
         scales: (P, 3) standard deviations, world units, with rotations (P, 4) (w, x, y, z); or cov3D_precomp (P, 6).
+
+    Returns:
+        `Splats` of all cameras.
 
     Raises:
         TypeError: Not a tensor, or a wrong dtype.
@@ -188,12 +193,16 @@ def project(
 
 
 def bin(splats: Splats, *, background: torch.Tensor | None = None, keep: bool = True) -> TileLists:
-    """Sorts splats by tile and depth. Without gradient. Splats of equal depth keep their order.
+    """Lists the splats of every tile, in the order of depth. Without gradient. Splats of equal depth keep their order.
 
     Args:
-        splats: Of `project`.
-        background: (3,) what `adaptive` takes to lie behind the splats; None: black. Other footprints do not read it.
-        keep: Make what the gradient of `blend` needs too.
+        splats: What `project` returned.
+        background: (3,) colour that `adaptive` takes to lie behind the splats; None: black. Other footprints do not
+            read it.
+        keep: Whether to make what the backward pass of `blend` needs, too.
+
+    Returns:
+        `TileLists` of all cameras.
 
     Raises:
         ValueError: The footprint is `adaptive`, which chooses samples by colours, and the splats have none.
@@ -227,13 +236,13 @@ def blend(
     Differentiable in means2d, cov2d and opacities of the splats, in features and in background.
 
     Args:
-        splats: Those that `lists` were made of.
-        lists: Of `bin`, with keep=True where a gradient is wanted.
+        splats: The splats from which `lists` were made.
+        lists: What `bin` returned, with keep=True where a gradient is wanted.
         features: (N, K) a row per splat, K from 1 to 512; None: the splats' colours. A feature that is not finite
             spreads to the pixels of its splat.
-        background: (K,) or (C, K); None: zero.
-        means2d_abs: (N, 2) that requires a gradient: its values are ignored, and its gradient is the sum over pixels
-            of the absolute values of dL/dmeans2d, which density control looks at.
+        background: (K,) for all cameras or (C, K); None: zero.
+        means2d_abs: (N, 2), a tensor that requires a gradient. Its values are ignored, and its gradient is the sum over
+            pixels of the absolute values of dL/dmeans2d, which density control reads.
 
     Returns:
         image: (C, K, H, W).
@@ -277,14 +286,14 @@ class Stages(NamedTuple):
     Attributes:
         color: (3, H, W) image.
         radii: (P,) int32, as `GaussianRasterizer` returns.
-        ids: (V,) int32, the Gaussian of each splat, ascending.
+        ids: (V,) int32, the Gaussian of each of the V splats, ascending.
         depths: (V,) camera-space z, world units.
         means2d: (V, 2) px.
-        pairs: (N,) int32, the splat of each (tile, splat) pair, by tile, then front to back.
+        pairs: (N,) int32, the splat of each of the N (tile, splat) pairs, by tile, then front to back.
         tile_offsets: (tiles + 1,) int64, first pair of each tile, tiles row by row. Tiles have 16x16 px; those of
             `moment` on CUDA have 8x8.
         tile_samples: (tiles,) int32, samples of each tile where the footprint chooses them (`adaptive`), else empty.
-        seconds: Time per stage: "project", "bin", "blend".
+        seconds: Time of each stage, s: "project", "bin", "blend".
     """
 
     color: torch.Tensor

@@ -350,7 +350,7 @@ def test_training(device, tmp_path, monkeypatch, capsys):
         (tmp_path / f"transforms_{split}.json").write_text(json.dumps(content))
     (tmp_path / "more.json").write_text(json.dumps({"mine": {"scale_repeats": [3, 1, 1, 1], "density": "mcmc"}}))
     arguments = [tmp_path, "--more", tmp_path / "more.json", "--json", tmp_path / "out.json", "--device", device]
-    names = ["plain", "mine", "quick"]
+    names = ["default", "mine", "3dgs"]
     options = ["--variants", *names, "--seeds", "0", "1", "--scales", "1,2", "--iterations", "12"]
     monkeypatch.setattr(sys, "argv", ["training.py", *map(str, arguments), *options, "--random-points", "20"])
     assert training.main() == 0
@@ -360,7 +360,7 @@ def test_training(device, tmp_path, monkeypatch, capsys):
     assert [(run["variant"], run["seed"]) for run in runs] == [(v, s) for s in (0, 1) for v in names]
     assert all(run["steps"] == 12 and math.isfinite(run["test"]["mean"]["psnr"]) for run in runs)
     assert runs[1]["options"]["scale_repeats"] == [3, 1]
-    assert (runs[2]["options"]["scale_repeats"], runs[2]["options"]["density"]) == ([2, 1], "absgrad")
+    assert (runs[2]["options"]["scale_repeats"], runs[2]["options"]["density"]) == ([1, 1], "3dgs")
     monkeypatch.setattr(sys, "argv", ["training.py", str(tmp_path), "--variants", "none"])
     assert training.main() == 2
 

@@ -1,4 +1,4 @@
-"""Questions to the device that nobody waits for: the answers are looked at in a later call."""
+"""Values on the device that are needed but not waited for: they are copied to the host, and read in a later call."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 // From what a training optimises to what the rasterizer takes: exp of the logarithms of the scales, the quaternion
-// divided by its length, the logistic function of the logit of the opacity. And the way back, which computes the values
+// divided by its length, the logistic function of the logit of the opacity; and the adjoint, which computes the values
 // again from the parameters, so that nothing has to be kept.
 #pragma once
 

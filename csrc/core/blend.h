@@ -1,4 +1,8 @@
-// Front-to-back compositing of one splat into one sample, and back.
+// Front-to-back compositing of one splat into one sample, and its adjoint (docs/numerics.md, "Blending and its
+// adjoint"). The loops over pixels and splats are in cpu/blend.h and cuda/blend*.cuh.
+//
+// T is the transmittance of a sample: the share of light that the splats so far let through. `raw` is opacity * weight
+// of a splat at the sample, before it is capped and thresholded to alpha. V is a scalar or a pack of lanes.
 #pragma once
 
 #include "core/constants.h"
@@ -7,10 +11,10 @@
 
 namespace ar {
 
-// A sample's transmittance is positive while the sample is open. A sample that has stopped keeps the
-// value it stopped at, negated: it then fails every test for being open, and loses nothing.
+// The sign of a sample's transmittance says whether the sample is open, that is, still takes splats. A sample that has
+// stopped keeps the value that it stopped at, negated: further splats leave it as it is.
 
-/// Alpha of a splat in a sample: none below the minimum, no more than the cap. `raw` = opacity * weight.
+/// Alpha of a splat in a sample: zero below kAlphaMin, and no more than kAlphaMax.
 template <class V> AR_HD V effective_alpha(V raw) {
   using T = ScalarOf<V>;
   return select(raw >= V(T(kAlphaMin)), min(raw, V(T(kAlphaMax))), V(T(0)));
@@ -18,12 +22,12 @@ template <class V> AR_HD V effective_alpha(V raw) {
 
 /// Result of compositing one splat into one sample.
 template <class V> struct Blended {
-  MaskOf<V> mask;  ///< the splat was composited
-  V contribution;  ///< T alpha, zero outside mask
+  MaskOf<V> mask;  ///< whether the splat was composited
+  V contribution;  ///< T alpha; zero where it was not
 };
 
-/// T <- T (1 - alpha); `raw` is alpha before the cap. A splat that would take T below the minimum is
-/// not composited and stops the sample, as in 3DGS.
+/// T <- T (1 - alpha). A splat that would take T below kTransmittanceMin is not composited and stops the sample, as in
+/// 3DGS.
 template <class V> AR_HD Blended<V> blend_sample(V raw, V& transmittance) {
   using T = ScalarOf<V>;
   const V zero = V(T(0));
@@ -35,14 +39,15 @@ template <class V> AR_HD Blended<V> blend_sample(V raw, V& transmittance) {
   return {MaskOf<V>(hit & open), select(open, contribution, zero)};
 }
 
-/// What a sample carries from splat to splat besides its transmittance: nothing, unless it moves. Zero in front of the
-/// first one. (Without an initialiser, which a pack of lanes could not have: its constructor is the compiler's own.)
+/// What a sample carries from splat to splat besides its transmittance: nothing, unless the footprint's samples move
+/// (kMoves of contract.h). Callers set it to zero in front of the first splat; a member initialiser is not possible for
+/// packs of lanes.
 template <class V, bool kMoves> struct SampleState {};
 template <class V> struct SampleState<V, true> {
-  Vec2<V> moved;
+  Vec2<V> moved;  ///< displacement from the sample's node [px]
 };
 
-/// Composites one splat into sample s of the pixel at p.
+/// Composites one splat into sample s of the pixel at p, for any footprint; P is what it is blended as (PixelsOf).
 template <class P, class Terms, class V>
 AR_HD Blended<V> blend_sample(const Terms& terms, Vec2<V> p, int s, V& transmittance,
                               SampleState<V, P::kMoves>& state) {
@@ -59,8 +64,8 @@ AR_HD Blended<V> blend_sample(const Terms& terms, Vec2<V> p, int s, V& transmitt
   }
 }
 
-/// Composites one splat into a sample of a P that moves: `place` is its node's, which stays within `bounds`, z its
-/// whitened coordinates, and `raw` opacity * I there.
+/// The same for a P whose samples move, in the form in which both devices blend: `place` is where the sample's node is,
+/// which stays within `bounds`; z are its whitened coordinates; `raw` is opacity * weight there.
 template <class P, class Terms, class V>
 AR_HD Blended<V> blend_placed_sample(const Terms& terms, Vec2<V> z, V raw, const Bounds<V>& bounds, V& transmittance,
                                      Vec2<V>& place) {
@@ -71,8 +76,9 @@ AR_HD Blended<V> blend_placed_sample(const Terms& terms, Vec2<V> z, V raw, const
   return blended;
 }
 
-/// The same once more, where it is known whether the forward pass composited the splat if the sample's node was near
-/// enough: `before`, it is not behind the last one of the sample. Returns whether it was.
+/// Repeats blend_placed_sample in the backward pass, which needs the state in front of every splat. `before`: the splat
+/// is not behind the last one that the forward pass composited into the sample, so that nothing has to be compared with
+/// kTransmittanceMin again. Returns whether the splat was composited.
 template <class P, class Terms, class V>
 AR_HD MaskOf<V> replay_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> before, const Bounds<V>& bounds,
                                      V& transmittance, Vec2<V>& place) {
@@ -84,17 +90,19 @@ AR_HD MaskOf<V> replay_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskO
   return mask;
 }
 
-/// Adjoint of one step, walked from the last splat to the first.
+/// Adjoint of compositing one splat into one sample.
 template <class V> struct BlendGrad {
   V contribution;  ///< T alpha, zero outside the mask: dL/dcolor is this times the pixel's gradient
   V dL_dalpha;     ///< zero outside the mask and where alpha is capped
 };
 
-/// `mask` says which samples the forward pass composited this splat into. On entry `transmittance`
-/// is the value behind the splat, on exit the value in front of it. `behind` is the gradient-weighted
-/// colour of everything behind the splat as seen through it alone, dL_dpixel . (colour of the rest,
-/// background included); `g_color` = dL_dpixel . colour of the splat. This recursion from the back
-/// never forms the difference of total and prefix, which cancels in deep stacks.
+/// Adjoint of blend_sample, called from the last splat to the first.
+///
+/// `mask` says which samples the forward pass composited this splat into. `g_color` is the scalar product of the
+/// pixel's gradient and the colour of the splat, and `behind` (B of docs/numerics.md) that of the pixel's gradient and
+/// the colour of everything behind the splat, background included, as seen through this splat alone. `transmittance`
+/// and `behind` are read as they are behind the splat and left as they are in front of it. This recursion from the back
+/// never forms the difference of the total and a prefix, which cancels in deep stacks.
 template <class V> AR_HD BlendGrad<V> blend_sample_vjp(MaskOf<V> mask, V raw, V g_color, V& transmittance, V& behind) {
   using T = ScalarOf<V>;
   const V zero = V(T(0)), cap = V(T(kAlphaMax));
@@ -106,14 +114,15 @@ template <class V> AR_HD BlendGrad<V> blend_sample_vjp(MaskOf<V> mask, V raw, V 
   return {transmittance * alpha, select(free, transmittance * difference, zero)};
 }
 
-/// Adjoint of one step of a sample that moves.
+/// Adjoint of compositing one splat into one sample that moves.
 template <class V> struct MovingBlendGrad {
-  V contribution;  ///< as in BlendGrad
-  MoveGrad<V> of_splat;
+  V contribution;        ///< as in BlendGrad
+  MoveGrad<V> of_splat;  ///< what is added to the splat's sums
 };
 
-/// Adjoint of blend_placed_sample. `raw` is zero where the splat was not composited, `place` that in front of the
-/// splat. `transmittance`, `behind` and `dL_dplace` go from behind the splat to in front of it.
+/// Adjoint of blend_placed_sample. `raw` is zero where the splat was not composited; `place` is that in front of the
+/// splat. `transmittance`, `behind` and `dL_dplace` are read as they are behind the splat and left as they are in front
+/// of it.
 template <class P, class Terms, class V>
 AR_HD MovingBlendGrad<V> blend_placed_sample_vjp(const Terms& terms, Vec2<V> z, V raw, const Bounds<V>& bounds,
                                                  V g_color, Vec2<V> place, V& transmittance, V& behind,
@@ -128,7 +137,8 @@ AR_HD MovingBlendGrad<V> blend_placed_sample_vjp(const Terms& terms, Vec2<V> z, 
           P::alpha_and_move_in_vjp(terms, z, raw, alpha, free, transmittance * difference, place, bounds, dL_dplace)};
 }
 
-/// A pixel's share of `sums`; not for kNone. `size`: of the image [px].
+/// What a pixel adds to the sums that density control asks for with `sums`, which is not kNone. `size`: of the image
+/// [px]; dL_dmean: the pixel's part of the gradient with respect to the splat's mean [1/px].
 template <class V, typename T> AR_HD Vec2<V> mean_sums_of(MeanSums sums, Vec2<T> size, Vec2<V> dL_dmean) {
   if (sums == MeanSums::kAbsolute) return {abs(dL_dmean.x), abs(dL_dmean.y)};
   const V x = V(T(0.5) * size.x) * dL_dmean.x, y = V(T(0.5) * size.y) * dL_dmean.y;

@@ -1,9 +1,10 @@
-// World to camera space to pixels, the linear part of that at a mean, and back.
+// The projection of a mean, from the world to camera space to pixels; its Jacobian at the mean; and the adjoints of
+// both.
 //
-// Camera is that of 3DGS and no more. What an effect may ask for besides is FullCamera's: the same functions,
-// compiled once more, so that a plain rendering neither reads nor computes anything for it. There is one full
-// camera, not one for every combination of effects: they take a small part of a frame, in branches that all
-// threads take alike.
+// Camera is the pinhole camera of 3DGS and no more. FullCamera has everything that effects may ask for besides. The
+// same functions are compiled for both, so that a plain rendering neither reads nor computes anything for effects.
+// There is one full camera, not one for every combination of effects: projecting takes a small part of a frame, and all
+// threads take the same branches.
 #pragma once
 
 #include "core/defocus.h"

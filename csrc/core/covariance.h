@@ -1,4 +1,4 @@
-// Scale and rotation, or a 3D covariance, to the covariance in the image: EWA projection [EWA, Eq. 29-31]. The way back
+// Scale and rotation, or a 3D covariance, to the covariance in the image: EWA projection [EWA, Eq. 29-31]. The adjoint
 // is in covariance_vjp.h.
 #pragma once
 

@@ -1,5 +1,6 @@
-// The disc of a thin lens: a point at depth z appears as one of diameter f a |1/focus - 1/z| [px], f a |z - focus|
-// under an orthographic camera. A disc of diameter D has the variance D^2 / 16 along every axis.
+// Defocus. Through a thin lens of aperture a, a point at depth z appears as a disc of diameter f a |1/focus - 1/z|
+// [px]; under an orthographic camera of diameter f a |z - focus|. A disc of diameter D has the variance D^2 / 16 along
+// every axis (docs/numerics.md, "Lens and shutter").
 #pragma once
 
 #include "core/lens.h"

@@ -1,4 +1,4 @@
-// What a pixel shows besides its colour: which splats, and how much of each.
+// Statistics of a pixel: how much it shows of every splat, which splat it shows most of, and its median splat.
 #pragma once
 
 #include "core/blend.h"

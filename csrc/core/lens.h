@@ -1,4 +1,5 @@
-// What a camera has beyond a pinhole and an instant, and the blur that comes of it.
+// The parameters of a camera that is more than a pinhole open for an instant, and the blur that its lens and shutter
+// make.
 #pragma once
 
 #include "core/footprint/contract.h"

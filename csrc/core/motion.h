@@ -1,5 +1,6 @@
-// The streak of what moves by u px while the shutter is open: a segment of length |u| has the variance |u|^2 / 12
-// along u. In camera space everything moves by w = -shift - turn x p.
+// Motion blur. What moves by u px in the image while the shutter is open becomes a streak: a segment of length |u|,
+// which has the variance |u|^2 / 12 along u. In camera space a point p moves by w = -shift - turn x p, shift and turn
+// being those of the camera (docs/numerics.md, "Lens and shutter").
 #pragma once
 
 #include "core/lens.h"

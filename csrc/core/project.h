@@ -1,4 +1,4 @@
-// One Gaussian to one splat, and back. The camera gives its mean, covariance, opacity and depth in the image
+// One Gaussian to one splat, and the adjoint. The camera gives its mean, covariance, opacity and depth in the image
 // (project_gaussian), the footprint its shape and support (shape_splat), the harmonics its colour (splat_color).
 #pragma once
 
@@ -10,7 +10,7 @@
 
 namespace ar {
 
-/// What a footprint adds to a Gaussian's reach at most.
+/// The most that a footprint adds to how far a Gaussian reaches in the image (docs/numerics.md, "Culling bound").
 template <typename T> struct CullBounds {
   T variance;  ///< to its covariance [px^2]
   T level;     ///< level of the support ellipse of an opacity of 1

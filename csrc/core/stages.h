@@ -1,5 +1,6 @@
 // What the stages of the pass read and write: one commented struct per stage, shared by the CPU's loops and the GPU's
-// kernels. Members are views of host or device memory, never owners, and are filled by name.
+// kernels. Members are views of host or device memory, never owners, and are filled by name. "[n]" is the shape of an
+// array; "or null" marks what may be missing.
 //
 //     project -> bin -> blend          forward
 //     blend_vjp -> project_vjp         backward
@@ -42,7 +43,8 @@ template <typename T> struct CameraView {
   const T* lens = nullptr;
 };
 
-/// Scene parameters. Either scales and rotations or cov3ds, either shs or colors or neither; the others are null.
+/// Scene parameters. A Gaussian has either scales and rotations or cov3ds, and shs or colors or neither of them; what
+/// it does not have is null.
 template <typename T> struct Gaussians {
   int64_t n;
   const Vec3<T>* means;      ///< [n] world units
@@ -57,15 +59,16 @@ template <typename T> struct Gaussians {
   T scale_modifier;
 };
 
-/// What blend_vjp sums over pixels besides the gradient: functions of a pixel's gradient with respect to the splat's
-/// mean, in which pixels that pull to different sides do not cancel. Density control looks at them.
+/// What blend_vjp sums over pixels besides the gradient: positive functions of a pixel's gradient with respect to the
+/// splat's mean, so that pixels with gradients of opposite signs do not cancel. Density control reads them. There are
+/// two sums per splat.
 enum class MeanSums : int32_t {
   kNone,
-  kAbsolute,  ///< |dL/dx| and |dL/dy| per px
-  kNorm,      ///< the length of the gradient in the units of GaussianGrads::means2d; and zero
+  kAbsolute,  ///< |dL/dx| and |dL/dy|, per px
+  kNorm,      ///< the length of the gradient, in the units of GaussianGrads::means2d; the second sum is zero
 };
 
-/// Gradients with respect to the same, written, not added to. Null where not wanted.
+/// Gradients with respect to the members of Gaussians. They are overwritten, not added to. Null where not wanted.
 template <typename T> struct GaussianGrads {
   Vec3<T>* means;
   Vec3<T>* scales;
@@ -77,12 +80,12 @@ template <typename T> struct GaussianGrads {
   Vec3<T>* colors;
   T* means2d;          ///< [n, means2d_stride], in 3DGS's units: per (0.5 W, 0.5 H) px
   int means2d_stride;  ///< 3, or 4
-  MeanSums mean_sums;  ///< in column 2 of three, absolute values added; absolute values in columns 2 and 3 of four
+  MeanSums mean_sums;  ///< with stride 3 the two sums are added up in column 2; with 4 they are columns 2 and 3
 };
 
-/// Scalars per splat, whatever the footprint.
+/// Scalars per splat, for every footprint.
 inline constexpr int kSplatWidth = 12;
-/// Where its colour begins.
+/// Index of the first scalar of a splat's colour.
 inline constexpr int kSplatColor = 9;
 
 /// A projected Gaussian. Scalars only, so that an array of them is a matrix of T.
@@ -94,7 +97,7 @@ template <class F, typename T> struct alignas(16) Splat {
   Vec3<T> color;
 };
 
-/// The same row where the footprint is known only at run time: its shape is five numbers.
+/// A Splat whose footprint is known only at run time: its shape is kShapeWidth numbers.
 template <typename T> struct alignas(16) SplatRow {
   Vec2<T> mean;
   T shape[kShapeWidth];
@@ -105,11 +108,12 @@ template <typename T> struct alignas(16) SplatRow {
 static_assert(sizeof(SplatRow<float>) == kSplatWidth * sizeof(float));
 static_assert(offsetof(SplatRow<float>, color) == kSplatColor * sizeof(float));
 
-/// What is blended: a row of numbers per splat. Three colours lie in the splats themselves; other channels do not.
+/// What is blended: a row of `count` channels per splat. Where these are three colours, the rows lie in the splats
+/// themselves; otherwise they are a table of their own.
 template <typename T> struct Channels {
   const T* data;
   int64_t stride;      ///< numbers from one row to the next
-  const int32_t* ids;  ///< [splats] row of each splat, or null: a splat's own number
+  const int32_t* ids;  ///< [splats] row of each splat, or null: splat i has row i
   int count;
 
   AR_HD const T* row(int32_t splat) const { return data + (ids ? ids[splat] : splat) * stride; }
@@ -122,9 +126,10 @@ template <typename T> struct ChannelRows {
   int color, depth, inverse_depth;  ///< first column of each, -1 where it is not wanted
 };
 
-/// One image (height, width) per channel. The channels from `split` on lie by themselves.
+/// One image (height, width) per channel. The channels below `split` lie one after the other; there are at most two
+/// more, each in memory of its own.
 template <typename T> struct Planes {
-  T* first;  ///< [split, height, width]; null: all of it is missing, or as a gradient zero
+  T* first;  ///< [split, height, width]; null: these channels are not wanted or, of a gradient, zero
   int split;
   T* extra[2];  ///< [height, width] each; null likewise
 
@@ -143,13 +148,13 @@ template <typename T> AR_HD PairGrad<T> operator+(const PairGrad<T>& a, const Pa
   return {a.shape + b.shape, a.weighted + b.weighted};
 }
 
-/// Gradient with respect to what a splat shows besides its shape.
+/// Gradient with respect to what a splat contributes to pixels besides its shape and opacity.
 template <typename T> struct ShownGrad {
   Vec3<T> color;
   T depth;  ///< with respect to camera-space z
 };
 
-/// Gaussians to splats, or to the rows of ProjectedRows.
+/// Parameters of `project`: Gaussians to splats, or to the rows of ProjectedRows.
 template <typename T> struct ProjectParams {
   CameraView<T> camera;
   Gaussians<T> gaussians;
@@ -157,20 +162,20 @@ template <typename T> struct ProjectParams {
   T* splats;       ///< SplatRow for every Gaussian that may be seen
   int32_t* radii;  ///< [n] 3DGS's radius, px; 0: culled
   ChannelRows<T> channels;
-  Channels<T> given;  ///< channels of the caller's, looked at for numbers that are not finite; data may be null
+  Channels<T> given;  ///< channels that the caller gave, examined for numbers that are not finite; data may be null
 };
 
-/// The public form of splats, whatever the footprint. Row i of each belongs together.
+/// Splats as the public stages hand them out: independent of the footprint. Row i of every array is splat i.
 template <typename T> struct ProjectedRows {
   Vec2<T>* means2d;  ///< px
   Sym2<T>* cov2d;    ///< px^2
-  T* dets;           ///< determinant of cov2d, px^4, without the cancellation of working it out from the entries
+  T* dets;           ///< determinant of cov2d, px^4, which would cancel if it were computed from the entries
   T* opacities;      ///< with the amplitude of a camera's blur
   T* depths;         ///< camera-space z, world units
   Vec3<T>* colors;   ///< or null
 };
 
-/// Gradient with respect to the same, by Gaussian.
+/// Gradient with respect to ProjectedRows, for the adjoint of `project`.
 template <typename T> struct ProjectedRowGrads {
   const int32_t* rows;  ///< [n] row of each Gaussian, or -1
   const Vec2<T>* means2d;
@@ -180,7 +185,7 @@ template <typename T> struct ProjectedRowGrads {
   const Vec3<T>* colors;
 };
 
-/// Public rows to splats. Nothing is known about their numbers: a row that makes no splat touches no tile.
+/// Public rows to splats. The caller may have put any numbers into the rows: a row that makes no splat touches no tile.
 template <typename T> struct ShapeRowsParams {
   int64_t n;
   ProjectedRows<T> rows;  ///< read; without colours the splats are black
@@ -189,7 +194,8 @@ template <typename T> struct ShapeRowsParams {
   T* splats;  ///< [n] SplatRow
 };
 
-/// Sums of pairs to the gradient with respect to public rows, written for every row: zero where it has no pairs.
+/// Sums of pairs to the gradient with respect to the public rows. It is written for every row, zero for one without
+/// pairs.
 template <typename T> struct RowGradsParams {
   int64_t n;
   ProjectedRows<T> rows;  ///< read: cov2d, dets, opacities
@@ -200,7 +206,7 @@ template <typename T> struct RowGradsParams {
   Vec2<T>* absolute;  ///< [n] sums over pixels of |dL/dmeans2d|, or null
 };
 
-/// Splats, by tile and depth, to an image.
+/// Parameters of `blend`: the splats of every tile, in order of depth, to an image.
 template <typename T> struct BlendParams {
   TileGrid grid;
   const T* splats;
@@ -208,17 +214,18 @@ template <typename T> struct BlendParams {
   const T* background;  ///< [channels.count]
   Planes<T> image;      ///< one per channel
   T* alpha;             ///< [height, width] 1 - mean transmittance, or null
-  T* transmittance;     ///< [samples, height, width] of every sample at the end, or null without a backward pass
-  int32_t* last;        ///< [samples, height, width] pairs of the tile up to the last one composited, or null
+  // What the backward pass needs; null where there will be none.
+  T* transmittance;  ///< [samples, height, width] of every sample behind its last splat
+  int32_t* last;     ///< [samples, height, width] number of pairs of the tile up to the last one composited
 };
 
-/// Splats, by tile and depth, to what every pixel shows of the `n` Gaussians.
+/// Parameters of `inspect`: the splats of every tile to how much every pixel shows of the `n` Gaussians.
 template <typename T> struct InspectParams {
   const T* splats;
   TileGrid grid;
   int32_t* median;    ///< [height, width] Gaussians, or -1; see PixelSummary
   int32_t* dominant;  ///< [height, width]
-  // What is known of each of the n Gaussians: numbers of pixels and the sum to add to, the largest weight to raise.
+  // Statistics of each of the n Gaussians, added to or, the largest weight, raised.
   int32_t* touched;    ///< [n] pixels that show it
   int32_t* largest;    ///< [n] largest weight, as the bits of a float
   int64_t* units;      ///< [n] sum of weights in units of kWeightUnit
@@ -226,7 +233,7 @@ template <typename T> struct InspectParams {
   int32_t* dominated;  ///< [n] pixels whose `dominant` it is
 };
 
-/// The gradient of an image to sums per pair.
+/// Parameters of `blend_vjp`: the gradient with respect to an image to sums per pair (PairGrad).
 template <typename T> struct BlendVjpParams {
   TileGrid grid;
   const T* splats;
@@ -238,14 +245,14 @@ template <typename T> struct BlendVjpParams {
   const T* dL_dalpha;  ///< [height, width], or null
 };
 
-/// Sums per pair to the gradient of the Gaussians.
+/// Parameters of `project_vjp`: sums per pair to the gradient with respect to the Gaussians.
 template <typename T> struct ProjectVjpParams {
   CameraView<T> camera;
   Gaussians<T> gaussians;
   FootprintChoice footprint;
   GaussianGrads<T> grads;
-  /// Gradient of the rows that ProjectParams::channels wrote; `data` is null where three colours in the pairs' sums are
-  /// all.
+  /// Gradient with respect to the rows that ProjectParams::channels wrote. `data` is null where only three colours were
+  /// blended, whose gradients are in the sums of the pairs.
   ChannelRows<const T> dL_dchannels;
 };
 

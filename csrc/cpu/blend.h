@@ -1,4 +1,5 @@
-// Loop of blend: a work item is a tile, a step a splat, a vector part of a row of the tile.
+// Loop of blend. Threads share the tiles; within a tile a step of the loop is a splat, and a pack of lanes is a part of
+// a row of the tile's pixels.
 #pragma once
 
 #include <cmath>

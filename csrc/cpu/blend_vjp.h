@@ -1,4 +1,4 @@
-// Loop of blend_vjp: as blend, from the last splat to the first.
+// Loop of blend_vjp: like that of blend, from the last splat to the first.
 #pragma once
 
 #include "core/blend.h"

@@ -1,4 +1,4 @@
-// Loop of inspect: which Gaussians pixels show, and pixels Gaussians.
+// Loop of inspect: statistics of every pixel (core/inspect.h), and of every Gaussian over all pixels.
 #pragma once
 
 #include <cmath>

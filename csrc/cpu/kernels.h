@@ -1,8 +1,8 @@
 // Fills the table of stages with the functions of one instruction set: kernels_*.cpp include this.
 //
-// Here is what every instruction set has: blending works on packs of pixels, projection and bin are scalar and gain by
-// the fused multiply-add and the rounding instructions. kernels_all.h has the rest, which is compiled for the baseline
-// alone.
+// These are the stages that are compiled for every instruction set. Blending works on packs of pixels; projection and
+// bin are scalar code, which gains from fused multiply-add and rounding instructions. kernels_all.h has the other
+// stages, which are compiled for the baseline only.
 #pragma once
 
 #include "core/footprint/registry.h"

@@ -1,4 +1,5 @@
-// All stages, for the instruction sets that have all: kernels_baseline.cpp and kernels_double.cpp include this.
+// All stages, also those that are not worth compiling for several instruction sets: kernels_baseline.cpp and
+// kernels_double.cpp include this.
 #pragma once
 
 #include "cpu/choose_samples.h"

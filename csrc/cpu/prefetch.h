@@ -1,4 +1,4 @@
-// Rows that are visited in an order that is random in memory are asked for before they are read.
+// Prefetching of rows that are read in an order that is random in memory.
 #pragma once
 
 #include "core/stages.h"

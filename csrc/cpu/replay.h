@@ -1,4 +1,5 @@
-// The samples of a tile that move, on the way forwards and, for the backward pass, once more.
+// The samples of a tile that move: their state while the tile is composited, in the forward pass, and composited once
+// more for the backward pass, which logs the state in front of every splat.
 #pragma once
 
 #include <algorithm>

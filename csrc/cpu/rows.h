@@ -1,4 +1,5 @@
-// Loops over public rows: to splats, and from the sums of their pairs back.
+// Loops over the rows of the public stages (ProjectedRows): from rows to splats, and from the sums of a splat's pairs
+// to the gradient with respect to its row.
 #pragma once
 
 #include "cpu/project.h"

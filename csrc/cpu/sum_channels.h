@@ -1,4 +1,4 @@
-// Loop of sum_channels: what blend_vjp summed per pair, per splat.
+// Loop of sum_channels: adds the gradients of channels, which blend_vjp made per pair, up per splat.
 #pragma once
 
 #include "cpu/project.h"

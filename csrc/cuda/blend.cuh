@@ -1,10 +1,20 @@
 // Kernels of blend for up to four channels.
 //
-// Lists are cut into chunks. blend_front goes through a tile's first chunks in order and knows when all pixels have
-// stopped. Where pairs are left, the other chunks, the tail, are done all at once: tail_through finds how much light
-// each lets through, tail_scan from that the transmittance in front of each, with which tail_blend composites each
-// exactly as if the chunks before had just been, and tail_sum adds up. So few tiles with long lists, as in small images
-// of large scenes, still fill the device, and the last bits depend on nothing but the lists.
+// The list of a tile is cut into chunks. The first few chunks are the front, and the others the tail. They are blended
+// by five kernels, one after the other:
+//
+//   blend_front    a block per tile composites the chunks of the front in order, until all pixels have stopped.
+//                  If some are open behind the front and there are pairs left, the next kernels finish the tile
+//   tail_through   a block per chunk of the tail finds how much light the chunk lets through by itself
+//   tail_scan      multiplies these up to the transmittance in front of every chunk
+//   tail_blend     a block per chunk composites it, exactly as if the chunks before it had just been composited
+//   tail_sum       adds up the chunks
+//
+// Since chunks of the tail are handled side by side, few tiles with long lists, as in small images of large scenes,
+// still fill the device. The last bits of the result depend on nothing but the lists.
+//
+// kKeep says whether what the backward pass needs is kept: at the end of every chunk a checkpoint with the
+// transmittance and the channels of every sample.
 #pragma once
 
 #include "cuda/composite.cuh"
@@ -12,8 +22,8 @@
 
 namespace ar::cuda {
 
-/// What compositing carries from splat to splat. kSets: sets of channels, 1, or one per sample where checkpoints need
-/// it.
+/// What compositing carries from splat to splat, for one pixel with S samples and C channels. kSets is the number of
+/// sets of channels: one for all samples, or one per sample where checkpoints need it.
 template <int S, int C, int kSets> struct PixelState {
   float transmittance[S];
   Values<C> channels[kSets];
@@ -44,8 +54,8 @@ template <int S, int C, int kSets> struct PixelState {
 
 template <class F, int C> using BlendStage = Stage<F, C, kBlendThreads>;
 
-/// Composites the staged splats [k, k + 32) that reach the warp's subtile; `index` = place of the first staged one in
-/// the tile's list.
+/// Composites those of the splats [k, k + 32) in shared memory that reach the warp's subtile; `index` is the place of
+/// the first splat in shared memory in the tile's list.
 template <class F, int C, int kSets>
 __device__ __forceinline__ void composite(const BlendStage<F, C>& stage, int k, int index, Vec2<float> p,
                                           PixelState<F::kSamples, C, kSets>& state) {
@@ -66,7 +76,7 @@ __device__ __forceinline__ void composite(const BlendStage<F, C>& stage, int k, 
   });
 }
 
-/// Multiplies the transmittance by what the staged splats let through.
+/// Multiplies the transmittance by what the splats in shared memory let through, without a threshold at which to stop.
 template <class F, int C>
 __device__ void pass_all(const BlendStage<F, C>& stage, int count, Vec2<float> p, float (&transmittance)[F::kSamples]) {
   for (int k = 0; k < count; k += 32) {
@@ -88,7 +98,7 @@ __device__ void composite_all(const BlendStage<F, C>& stage, int count, int inde
   }
 }
 
-/// Those of S samples that the front chunks left open.
+/// List of the tiles with S samples that blend_front left open.
 template <int S> __device__ int32_t* open_tiles(const BlendParams& params) {
   return params.open_tiles + sample_class(S) * params.grid.tiles();
 }
@@ -135,7 +145,8 @@ template <int S, int C, bool kKeep> struct PixelCheckpoints {
   }
 };
 
-/// A lane's transmittance, whatever the layout: for the kernels that need no channels.
+/// A lane's transmittance in the checkpoints, with or without a backward pass: for kernels that are compiled once for
+/// any number of channels.
 template <int S> struct TransmittancePlanes {
   float* base;
   int first_chunk;
@@ -162,7 +173,7 @@ template <int C> __device__ Values<C> background_of(const BlendParams& params) {
   return background;
 }
 
-/// Writes a pixel whose samples are done. `total` is the sum of their channels.
+/// Writes a pixel whose samples are complete. `total` is the sum of their channels.
 template <int S, int C>
 __device__ void store_pixel(const BlendParams& params, Pixel pixel, const Values<C>& total,
                             const float (&transmittance)[S]) {
@@ -187,11 +198,12 @@ template <int S> __device__ void store_last(const BlendParams& params, Pixel pix
   for (int s = 0; s < S; ++s) params.last[s * pixel.image + pixel.index] = last[s];
 }
 
-/// Turns the channels of a sample's first `n` chunks into those of everything behind each: what blend_vjp starts from.
-/// `behind`: of what is behind them all. Sums of positive terms do not cancel.
+/// Turns the checkpoints of a sample's first `n` chunks, which hold the channels of the chunk itself, into the channels
+/// of everything behind the chunk, from which blend_vjp starts. `behind`: the channels of what is behind all of them.
+/// These are sums of positive terms, which do not cancel.
 template <int S, int C>
 __device__ void accumulate_behind(const PixelCheckpoints<S, C, true>& checkpoints, int n, int s, Values<C> behind) {
-  constexpr int kBatch = 8;  // loads before stores, so that they wait together
+  constexpr int kBatch = 8;  // all loads before the first store, so that the loads wait for memory together
   for (int last = n - 1; last >= 0; last -= kBatch) {
     Values<C> own[kBatch];
 #pragma unroll
@@ -207,7 +219,7 @@ __device__ void accumulate_behind(const PixelCheckpoints<S, C, true>& checkpoint
   }
 }
 
-/// Blocks of blend_front that an SM should hold: bounds the registers.
+/// Blocks of blend_front that a streaming multiprocessor should hold at once. It limits the registers of a thread.
 template <class F, int C>
 inline constexpr int kFrontBlocks = F::kSamples > 1                ? 1
                                     : sizeof(TileSplat<F, C>) > 96 ? 4
@@ -304,15 +316,16 @@ __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, 0>) tail_throug
   }
 }
 
-/// A sample with less transmittance than this would be stopped by any splat it meets: it may count as stopped before.
-/// The reserve over the minimum absorbs that products of chunks round differently.
+/// A sample with less transmittance than this would be stopped by the next splat that it meets, since alpha is at least
+/// kAlphaMin, and so it may count as stopped already. The margin above kTransmittanceMin is for the rounding of
+/// products of chunks, which differs from that of single splats.
 inline constexpr float kNearlyStopped = float(kTransmittanceMin * (1 + kAlphaMin / 2));
 
 __device__ inline int chunks_of(const BlendParams& params, int tile, int length) {
   return int((params.lists.tile_offsets[tile + 1] - params.lists.tile_offsets[tile] + length - 1) / length);
 }
 
-/// Turns the transmittance of each chunk into the one in front of it, negative where a sample has stopped before.
+/// Turns the transmittance of each chunk into that in front of the chunk, negative where a sample has stopped before.
 /// Blocks share the open tiles.
 template <int S> __global__ void __launch_bounds__(kTilePixels) tail_scan_kernel(const BlendParams params) {
   constexpr int kBatch = 16;
@@ -339,8 +352,8 @@ template <int S> __global__ void __launch_bounds__(kTilePixels) tail_scan_kernel
   }
 }
 
-/// Blocks share the chunks. Writes the channels of each, and the transmittance at its end; zero where the sample had
-/// stopped before.
+/// Blocks share the chunks. Writes the channels of each chunk and the transmittance at its end, which is zero where the
+/// sample had stopped before the chunk.
 template <class F, int C, bool kKeep>
 __global__ void __launch_bounds__(kBlendThreads) tail_blend_kernel(const BlendParams params) {
   constexpr int S = F::kSamples, kLength = chunk_length(S), kSets = kKeep ? S : 1;
@@ -414,7 +427,7 @@ __global__ void __launch_bounds__(kTilePixels) tail_sum_kernel(const BlendParams
   }
 }
 
-/// Blocks that fill any device.
+/// Blocks of the kernels of the tail, which share the work: eight for each of the 132 multiprocessors of an H200.
 inline constexpr int kTailBlocks = 132 * 8;
 
 template <class F, int C, bool kKeep> void launch_blend(const BlendParams& p, cudaStream_t stream) {

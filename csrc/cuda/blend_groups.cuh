@@ -1,6 +1,6 @@
 // Kernel of blend for any number of channels, in groups of 32: a block per tile and group walks the whole list, a pixel
-// per lane. The weights are worked out again for every group, which costs less than to keep them. The yardsticks use it
-// for any number of channels, as their weights are slow anyway.
+// per lane. The weights are computed again for every group, which costs less than keeping them. Yardstick footprints
+// (`erf`, `exact`) use this kernel for few channels too, because their weights are slow anyway.
 #pragma once
 
 #include "cuda/composite.cuh"

@@ -1,9 +1,9 @@
 // Kernels of blend for footprints whose samples move, in small images: a warp per pixel, each with a list of its own.
 //
-// There a tile of 8x8 pixels may have hundreds of thousands of splats, most of them smaller than a pixel. What takes
-// the time is the longest row of splats that some sample meets one after the other. So the list of every tile is first
-// filtered, all parts of it side by side, into a bit for each splat and group of pixels: whether it reaches them. Then
-// each warp walks the splats of its own group alone, and waits for no other.
+// In a small image of a large scene a tile of 8x8 pixels may have hundreds of thousands of splats, most of them smaller
+// than a pixel. What takes the time is the longest sequence of splats that some sample meets one after the other. So
+// the list of every tile is first filtered, all parts of it side by side, into a bit for each splat and group of
+// pixels: whether it reaches them. Then each warp walks the splats of its own group alone, and waits for no other.
 #pragma once
 
 #include "cuda/blend_moving.cuh"

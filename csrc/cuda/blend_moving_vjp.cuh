@@ -118,8 +118,9 @@ template <class F> struct MapMemory {
   }
 };
 
-/// Pairs of a segment. Longer ones need fewer maps, shorter ones fill a device with smaller scenes.
-inline constexpr int kMovingSegment = 512;
+/// Pairs of a segment. Longer ones need fewer maps, which count where there are many samples; shorter ones fill a
+/// device with smaller scenes.
+template <class F> inline constexpr int kMovingSegment = F::kSamples <= 4 ? 512 : 1024;
 /// Samples shared out for segments, of which there are many, with small splats: few pixels per warp, and blocks small
 /// enough for two on an SM.
 template <class F> using SegmentLayout = CellLayout<F::kSamples <= 4 ? 1 : 2, F::kSamples <= 4 ? 4 : 8>;

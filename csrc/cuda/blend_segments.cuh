@@ -1,7 +1,7 @@
 // Many channels in a small image, where few tiles have long lists: a block per tile would leave most of the device
-// idle. A tile's list is cut into segments, which are blended side by side. The kernels of blend.cuh go first, for
-// three channels that nobody looks at: they find the last splat of every sample and the transmittance between chunks,
-// where segments begin.
+// idle. A tile's list is cut into segments, which are blended side by side. The kernels of blend.cuh go first,
+// for three channels whose values are discarded: they find the last splat of every sample and the transmittance between
+// chunks, where segments begin.
 #pragma once
 
 #include "cuda/blend.cuh"

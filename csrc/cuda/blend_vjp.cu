@@ -21,12 +21,13 @@ __global__ void clear_splat_sums_kernel(const BlendVjpParams params, int group) 
 /// Lists in segments, side by side.
 template <class F, int C> void launch_segments_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
   using Layout = SegmentLayout<F>;
-  const auto pieces = unsigned(max_pieces(p.lists.capacity, kMovingSegment, p.grid));
+  constexpr int kSegment = kMovingSegment<F>;
+  const auto pieces = unsigned(max_pieces(p.lists.capacity, kSegment, p.grid));
   const LaunchShape shape = {pieces, Layout::kThreads, sizeof(MovingVjpShared<F, C, Layout>)};
-  launch(moving_vjp_kernel<F, C, Layout, kMovingSegment, true>, shape, stream, p, first, false);
+  launch(moving_vjp_kernel<F, C, Layout, kSegment, true>, shape, stream, p, first, false);
   const auto blocks = unsigned(p.grid.tiles() * F::kSamples);
-  launch(chain_maps_kernel<F, kMovingSegment>, {blocks, kMovingPixels}, stream, p);
-  launch(moving_vjp_kernel<F, C, Layout, kMovingSegment, false>, shape, stream, p, first, false);
+  launch(chain_maps_kernel<F, kSegment>, {blocks, kMovingPixels}, stream, p);
+  launch(moving_vjp_kernel<F, C, Layout, kSegment, false>, shape, stream, p, first, false);
 }
 template <class F, int C> void launch_moving_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
   const bool in_segments = is_small_image(p.grid);
@@ -47,13 +48,12 @@ template <class F> void blend_vjp_moving(const BlendVjpParams& p, int group, cud
 }  // namespace
 
 int64_t max_adjoint_maps(int footprint, int64_t capacity, TileGrid grid) {
-  int samples = 0;
+  int64_t maps = 0;
   visit_footprint(footprint, Footprints{}, [&](auto f) {
     using F = decltype(f);
-    if (F::kMoves) samples = F::kSamples;
+    if (F::kMoves && is_small_image(grid)) maps = max_pieces(capacity, kMovingSegment<F>, grid) * F::kSamples;
   });
-  if (!is_small_image(grid)) return 0;
-  return max_pieces(capacity, kMovingSegment, grid) * AdjointMap::kNumbers * kMovingPixels * samples;
+  return maps * AdjointMap::kNumbers * kMovingPixels;
 }
 
 void blend_vjp(int footprint, const BlendVjpParams& p, int group, cudaStream_t stream) {

@@ -1,4 +1,4 @@
-// Kernel of inspect: which Gaussians pixels show, and pixels Gaussians.
+// Kernel of inspect: statistics of every pixel (core/inspect.h), and of every Gaussian over all pixels.
 #pragma once
 
 #include "core/inspect.h"

@@ -1,9 +1,9 @@
 // A stable radix sort whose number of items is known to the device alone.
 //
-// Sorts of libraries take the number of items from the host. Ours would have to wait for it, or sort
-// all there is room for: twice as much, on frames with half the pairs of an earlier one. The method is
-// Adinets and Merrill, "Onesweep" (2022): one histogram for all digits, then a pass per digit in which
-// blocks find their place by looking back at the blocks before them.
+// The sorts of libraries take the number of items from the host. With them the host would have to wait for that number,
+// or sort all items that there is room for: twice as many, on frames with half the pairs of an earlier one. The method
+// is Adinets and Merrill, "Onesweep" (2022): one histogram for all digits, then a pass per digit in which blocks find
+// their place by looking back at the blocks before them.
 #pragma once
 
 #include "cuda/warp.cuh"

@@ -4,7 +4,7 @@
 //
 // Sizes that depend on the data stay on the device. The caller guesses how many pairs there will be and gives room for
 // `capacity` of them. If there are more, no pair is written, and blending goes through all splats in depth order for
-// every tile: slow, with the same result, and without a host.
+// every tile: slow, but with the same result and without waiting for the host.
 #pragma once
 
 #include <cuda_runtime_api.h>

@@ -1,4 +1,5 @@
-// What is blended, and the images that come of it: their names, their memory, and how the kernels see both.
+// What is blended and the images that are made of it: their names, their memory, and the views that kernels get of
+// both.
 #pragma once
 
 #include <array>

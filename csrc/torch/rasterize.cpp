@@ -1,4 +1,6 @@
-// The pass, written once for every device: check, project, bin, blend, and back.
+// The pass, written once for both devices: check, project, bin, blend; and its adjoint: blend_vjp, project_vjp. What
+// the devices do differently is behind Backend (backend.h). The structs of tensors (ChannelTensors, ListTensors, ...)
+// are in backend.h and images.h.
 #include <vector>
 
 #include "torch/checks.h"
@@ -9,8 +11,9 @@
 namespace ar::ops {
 namespace {
 
-/// Which channels are blended: the colours, the features, then depth and inverse depth, if they are asked for. `made`:
-/// the rows as the forward pass saved them, or undefined: make room for them.
+/// Which channels are blended, in this order: the colours, the features, depth and inverse depth, as far as they are
+/// asked for. Three colours alone lie in the splats; everything else needs a row of channels per Gaussian. `made`:
+/// these rows as the forward pass saved them; if it is undefined, memory for them is allocated.
 ChannelTensors channels_of(const RasterizeArguments& a, const Tensor& made) {
   const int64_t colors = a.bg.size(0), depths = int64_t(a.images[kDepth]) + int64_t(a.images[kInverseDepth]);
   const bool three = colors == 3;
@@ -37,7 +40,7 @@ ChannelTensors channels_of(const RasterizeArguments& a, const Tensor& made) {
   return out;
 }
 
-/// What the gradient with respect to means2D holds besides itself.
+/// Which sums over pixels the further columns of the gradient with respect to means2D hold.
 MeanSums mean_sums_of(const RasterizeArguments& a) {
   if (a.means2D->size(1) == 4) return MeanSums::kAbsolute;
   return a.means2d_z == "sum_abs" ? MeanSums::kAbsolute : a.means2d_z == "sum_norm" ? MeanSums::kNorm : MeanSums::kNone;
@@ -58,7 +61,8 @@ struct Saved {
   }
 };
 
-/// With `seconds` the times before, of project, bin and blend are appended to it.
+/// The forward pass. With `seconds`, four times [s] are appended to it: of what comes before, of project, bin and
+/// blend.
 Results run(RasterizeArguments a, std::vector<double>* seconds) {
   const Snapshot snapshot(a, a.debug, "snapshot_fw.dump");
   return snapshot.guard([&] {

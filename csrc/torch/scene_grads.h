@@ -1,4 +1,4 @@
-// Gradients with respect to a scene and its camera, for the adjoints that end there.
+// Tensors of the gradients with respect to a scene and its camera, for the ops whose adjoint ends there.
 #pragma once
 
 #include <vector>

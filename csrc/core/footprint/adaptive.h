@@ -11,7 +11,8 @@ template <typename T> struct AdaptiveShape {
   T deviations;  ///< sqrt(det): product of the standard deviations [px^2]
 };
 
-/// A tile of S samples: Box<S> of splats that keep their covariance.
+/// How a tile of S samples is blended: as Box<S>, but from splats that carry their covariance, because tiles with other
+/// numbers of samples need it too.
 template <int S> struct AdaptiveBox : GaussianFootprint<S, true> {
   using Gaussian = GaussianFootprint<S, true>;
   static constexpr double kVariance = kBoxVariance<S>;
@@ -37,14 +38,14 @@ template <int S> struct AdaptiveBox : GaussianFootprint<S, true> {
   }
 
  protected:
-  /// The axis that comes first is that of Sigma, whatever rounding makes of the sum.
+  /// The wide axis is decided by Sigma alone, so that it is the same for every variance in spite of rounding.
   template <typename T> AR_HD static Mat2<T> whitening(Cov2d<T> cov, T variance) {
     return whiten(blur(cov, variance), cov.xx >= cov.yy);
   }
 };
 
-/// The same with gradients. Tiles of different S sum into the same splat, so collect() takes their sums to
-/// common coordinates, those of a single sample.
+/// The same with gradients. Tiles with different S add to the sums of the same splat, so collect() takes their sums to
+/// common coordinates, those of a single sample (docs/numerics.md, "Common coordinates of adaptive").
 template <int S> struct AdaptiveBoxVjp : AdaptiveBox<S> {
   using Box = AdaptiveBox<S>;
   template <typename T> using Shape = AdaptiveShape<T>;

@@ -14,7 +14,7 @@ inline constexpr double kLogistic3 = 0.07;
 /// of so thin a splat is below 2.6e-6, far under the threshold of 1/255.
 inline constexpr double kMinSigma = 1e-6;
 
-/// What the pixels of a splat share of one axis of its frame. Coordinates are t = u/sigma.
+/// Numbers of one axis of a splat's frame that all pixels share. Coordinates along the axis are t = u/sigma.
 template <typename T> struct LogisticAxis {
   T half;              // half a pixel, 1/(2 sigma)
   T constant, square;  // f(b) - f(a) = constant + square t^2, see LogisticWindow
@@ -25,8 +25,10 @@ template <typename T> struct LogisticAxis {
   }
 };
 
-/// What their derivatives need besides: with x and y of LogisticValue and t without its sign, dx/dt = linear +
-/// cubic t^2, dy/dt = square t; t dx/dt + half dx/dhalf = t (dx/dt + spread), of y it is y + cube + square t^2.
+/// What the derivatives need besides LogisticAxis. With x and y as in LogisticValue, t >= 0 and h = half:
+///   dx/dt = linear + 3 kLogistic3 t^2,              dy/dt = square t,
+///   t dx/dt + h dx/dh = t (dx/dt + spread),         t dy/dt + h dy/dh = y + cube + square t^2
+/// (docs/numerics.md, "Logistic window").
 template <typename T> struct LogisticSlopes {
   T linear, spread, cube;
 

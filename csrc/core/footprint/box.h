@@ -5,7 +5,7 @@
 
 namespace ar {
 
-/// "box1" ... "box16", behind which stands the number of samples alone.
+/// The key of a footprint, "box1" ... "box16". From its fourth character on it is the number of samples alone.
 template <int S> struct BoxKey {
   static constexpr char kText[] = {'b', 'o', 'x', S >= 10 ? '1' : char('0' + S), S >= 10 ? char('0' + S % 10) : '\0',
                                    '\0'};

@@ -1,63 +1,80 @@
 // What a footprint is: the model that turns a projected Gaussian into its weight I in a pixel.
 //
 // A footprint F is a struct of static functions and constants, and a line in registry.h. Nothing else in the project
-// names it. FootprintDefaults has what most share.
+// names it. FootprintDefaults has the defaults. docs/adding-a-footprint.md explains how to write one.
 //
-//   kName                                what users call it: "box"
-//   kKey                                 its own key: "box4"; by default the name. Footprints of one name differ in an
-//   option kOption                              the option that users may set, see Option; by default none kYardstick
-//   true: meant to compare others with; compiled for one instruction set. Default false Pixels a type with the same
-//   Shape, terms, alpha, adjoint, ellipse and samples, for which
-//                                        blending is compiled instead, once for all that name it. Default: F
-//   kSamples                             samples of a pixel, each with its own transmittance. Default 1
-//   kReach                               largest |coordinate| of a sample's node [px]. Default 0
-//   kExtraLevel                          no support ellipse has a level above 2 ln(255 opacity) + kExtraLevel. Default
-//   0 support_variance(FootprintOptions)   no support ellipse is wider than that of Sigma + this times I [px^2]
+// In what follows T is float or double, and V is T or a pack of lanes of T (lanes.h). Sigma is the projected covariance
+// [px^2], d = pixel centre - projected mean [px], and a node is where a sample lies, seen from the pixel's centre [px].
+//
+// Constants:
+//
+//   kName                what users call it: "box"
+//   kKey                 its own key: "box4". Footprints of one name differ in an option. Default: the name
+//   kOption              the option that users may set, see Option. Default: none
+//   kYardstick           true: meant to compare others with; compiled for one instruction set. Default: false
+//   Pixels               a type with the same Shape, terms, alpha, adjoint, ellipse and samples, for which blending is
+//                        compiled instead, once for all footprints that name it. Default: F
+//   kSamples             samples of a pixel, each with its own transmittance. Default: 1
+//   kReach               largest |coordinate| of a sample's node [px]. Default: 0
+//   kExtraLevel          no level (below) exceeds 2 ln(255 opacity) + kExtraLevel. Default: 0
+//
+// Once per splat:
+//
+//   support_variance(FootprintOptions)   no ellipse (below) is wider than Sigma widened by this variance [px^2]
 //   radius_variance(FootprintOptions)    variance added to Sigma for the radius that 3DGS reports [px^2]
 //   Shape<T>                             what a splat carries: an aggregate of kShapeWidth numbers T
-//   prepare(Cov2d<T>, FootprintOptions)  -> Shape<T>            once per splat
-//   ellipse(Shape<T>) -> Mat2<T>         w, and
-//   level(Shape<T>, opacity) -> T        such that opacity * I(d + node) < 1/255 wherever |w (d + node)|^2 > level;
-//                                        level <= 0 where that holds everywhere
-//   terms(Shape<T>, opacity, Vec2<T> origin) -> Terms<T>    numbers that all pixels share, derived once per
-//                                        (tile, splat); origin = a point of the tile - mean [px], by default 0
-//   alpha(Terms<T>, Vec2<V> p, s) -> V   opacity * I at sample s; p = pixel centre - that point [px]
-//   add_alpha_vjp(Terms<T>, p, s, alpha, dL_dalpha, ShapeGrad<V>& sums)    per pixel: plain products
-//   mean_map(Shape<T>) -> Mat2<T>        m with dL/dmean = m^T sums.offset [dL/dpx]
-//   collect(Terms<T>, ShapeGrad<T> sums, weighted) -> ShapeGrad<T>    per (tile, splat), linear: what is added up over
-//                                        tiles. Default: the sums as they are
+//   prepare(Cov2d<T>, FootprintOptions) -> Shape<T>
+//   ellipse(Shape<T>) -> Mat2<T>         the matrix w, and
+//   level(Shape<T>, opacity) -> T        the level, such that opacity * I(d + node) < 1/255 wherever
+//                                        |w (d + node)|^2 > level; level <= 0 where that holds everywhere
+//   mean_map(Shape<T>) -> Mat2<T>        the matrix m for which dL/dmean = m^T sums.offset [dL/dpx]
 //   prepare_vjp(Cov2d<T>, Shape<T>, ShapeGrad<T> sums, weighted, FootprintOptions) -> SplatGrad<T>
-//                                        once per splat
+//                                        from the sums over all pixels to the gradient of the splat
 //
-// Samples may carry a state besides their transmittance: with
+// Once per tile and splat:
 //
-//   kMoves                               true; default false
+//   terms(Shape<T>, opacity, Vec2<T> origin) -> Terms<T>
+//                                        numbers that all pixels share. origin = a point of the tile - mean [px]; it is
+//                                        zero unless given
+//   collect(Terms<T>, ShapeGrad<T> sums, weighted) -> ShapeGrad<T>
+//                                        what is added up over tiles, linear in the sums. Default: the sums themselves
 //
-// a sample has a displacement `moved` from its node [px], zero in front of the first splat, which every splat that is
-// composited changes. Then alpha gets pixel centre - that point + moved for p, and there are
+// Once per pixel and sample, with p = pixel centre - that point of the tile [px] and s the number of the sample:
 //
-//   kMoveReach                           largest |coordinate| of a displacement [px], which kReach includes
-//   node(s) -> Vec2<double>              of sample s [px from the pixel's centre]
+//   alpha(Terms<T>, Vec2<V> p, s) -> V   opacity * I
+//   add_alpha_vjp(Terms<T>, Vec2<V> p, s, alpha, dL_dalpha, ShapeGrad<V>& sums)
+//                                        adds this sample's part to the five sums
+//
+// The five numbers of ShapeGrad are summed over pixels and samples in whatever coordinates make them cheap; prepare_vjp
+// gives them meaning. `weighted` is the sum of alpha dL_dalpha, which the gradient with respect to the opacity needs
+// anyway.
+//
+// Samples may carry a state besides their transmittance, as those of moment.h do. With
+//
+//   kMoves                               true. Default: false
+//
+// a sample has a displacement `moved` from its node [px]. It is zero in front of the first splat, and every splat that
+// is composited changes it. Then p of alpha is pixel centre - that point of the tile + moved, and these are needed too:
+//
+//   kMoveReach                           largest |coordinate| of a displacement [px], which kReach has to include
+//   node(s) -> Vec2<double>              the node of sample s
 //   move(Terms<T>, Vec2<V> p, s, alpha, Vec2<V> moved) -> Vec2<V>
-//                                        the displacement behind a splat; alpha as composited, 0: not at all, and
-//                                        nothing moves
-//   alpha_and_move_vjp(Terms<T>, p, s, raw, alpha, free, dL_dalpha, moved, Vec2<V>& dL_dmoved) -> MoveGrad<V>
-//                                        the adjoint of both: raw = opacity * I; dL_dalpha through what is composited,
-//                                        `free` where alpha depends on raw; `moved` in front of the splat; dL_dmoved on
-//                                        entry behind the splat, on exit in front of it
+//                                        the displacement behind a splat. alpha is that which was composited; where it
+//                                        is 0 the splat was not, and nothing moves
+//   alpha_and_move_vjp(Terms<T>, Vec2<V> p, s, raw, alpha, free, dL_dalpha, moved, Vec2<V>& dL_dmoved) -> MoveGrad<V>
+//                                        the adjoint of alpha and move. raw = opacity * I; alpha is what was
+//                                        composited, and `free` says where it depends on raw; `moved` is that in front
+//                                        of the splat; dL_dmoved is read behind the splat and left in front of it
 //
-// and the same in the form that the CPU composites with, where a sample has its place from the pixel's centre, node +
-// displacement, and its whitened coordinates z, of which the pixel's part is shared by its samples:
+// Blending, on both devices, uses the same functions in another form, which computes once what the samples of a pixel
+// share: the whitened coordinates z of the pixel's centre. A sample has a place, node + displacement, seen from there:
 //
 //   cell(s) -> Bounds<T>                 where the place of sample s may be [px]
-//   whitened(Terms<T>, p, 0) -> Vec2<V>  of the pixel's centre
-//   whitened_node(Terms<T>, Vec2<V> of_pixel, Vec2<V> place) -> Vec2<V>    z
+//   whitened(Terms<T>, Vec2<V> p, 0) -> Vec2<V>                            z of the pixel's centre
+//   whitened_node(Terms<T>, Vec2<V> of_pixel, Vec2<V> place) -> Vec2<V>    z of a sample
 //   log_alpha(Terms<T>, Vec2<V> z) -> V  log2(opacity * I)
-//   move_in, alpha_and_move_in_vjp       as move and alpha_and_move_vjp, from z, a place or displacement, its bounds
-//
-// T is float or double, V a scalar or a pack of lanes (lanes.h). The five numbers of ShapeGrad are summed over pixels
-// and samples in whatever coordinates make them cheap; prepare_vjp gives them meaning. `weighted` is the sum of alpha
-// dL_dalpha, which the gradient with respect to the opacity needs anyway.
+//   move_in, alpha_and_move_in_vjp       move and alpha_and_move_vjp, from z, and a place or a displacement with its
+//                                        bounds
 #pragma once
 
 #include <cstddef>
@@ -102,15 +119,16 @@ struct FootprintChoice {
   FootprintOptions options;
 };
 
-/// The option of a footprint: a number that it takes at run time, or a value that tells it from its namesakes.
+/// The option of a footprint: a number that it takes at run time, or a value that distinguishes it from other
+/// footprints of the same name.
 struct Option {
   const char* name = nullptr;   ///< null: there is no option
-  const char* value = nullptr;  ///< what the option must be for this footprint; null: a number, FootprintOptions
+  const char* value = nullptr;  ///< value of the option that selects this footprint; null: it is a number at run time
   double number = 0;            ///< its default
-  bool is_default = true;       ///< of the namesakes, the one taken where the option is not given
+  bool is_default = true;       ///< of footprints of the same name: this one is taken if the option is not given
 };
 
-/// Five sums over pixels; see prepare_vjp of each footprint.
+/// Five sums over pixels. What they mean is up to the footprint: see its add_alpha_vjp and prepare_vjp.
 template <class V> struct ShapeGrad {
   Vec2<V> offset;
   Sym2<V> shape;
@@ -124,10 +142,10 @@ template <class V> struct Bounds {
   Vec2<V> lo, hi;
 };
 
-/// What one splat gets from one sample that moves.
+/// What one sample that moves adds to the sums of one splat.
 template <class V> struct MoveGrad {
-  V weighted;         ///< raw dL_draw: of `weighted`
-  ShapeGrad<V> sums;  ///< as add_alpha_vjp adds them up
+  V weighted;         ///< what is added to the sum `weighted`: raw dL_draw
+  ShapeGrad<V> sums;  ///< what is added to the five sums
 };
 
 /// What most footprints have in common.

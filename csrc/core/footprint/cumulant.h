@@ -12,9 +12,10 @@ namespace ar {
 /// truncated series would fall and the weight diverge. Weights there are below 2e-6.
 template <typename T> struct CumulantAxis {
   T c4, c6, linear, cap;
-  T dc4, dc6, dlinear, dconstant;  // derivatives by t
+  T dc4, dc6, dlinear, dconstant;  // derivatives with respect to t
 
-  /// `unit` times h, of p and t in coordinates where the conic's entries are 1 / `scale` of what they are in pixels.
+  /// The coefficients of `unit` times h, for p and t in coordinates where the entries of the conic are 1 / `scale` of
+  /// what they are in pixels (docs/numerics.md, "Units of the exponent").
   AR_HD static CumulantAxis at(T t, T unit = T(1), T scale = T(1)) {
     const T dx = scale * T(kPixelVariance), x = t * dx;
     const bool floored = T(1) - x < T(1e-6);
@@ -38,9 +39,9 @@ template <typename T> struct CumulantAxis {
   }
 
   template <class V> AR_HD V capped(V p) const { return min(p * p, V(cap)); }
-  /// v - (h - constant), where P = capped(p).
+  /// v less the part of h that depends on p, where P = capped(p).
   template <class V> AR_HD V subtract_from(V v, V P) const { return madd(-P, inner(P), v); }
-  /// dh/dp / 2.
+  /// Half of dh/dp.
   template <class V> AR_HD V half_by_p(V p, V P) const { return p * madd(P, madd(V(-c6), P, quartic(P)), inner(P)); }
   template <class V> AR_HD V by_t(V P) const {
     return madd(P, madd(P, madd(V(-dc6), P, V(dc4)), V(-dlinear)), V(dconstant));

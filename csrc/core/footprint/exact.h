@@ -6,20 +6,21 @@
 
 namespace ar {
 
-/// I = integral of exp(-|w d|^2 / 2) over the pixel. Both the integral and its adjoint are moments
-/// of z = w d, the average over the pixel of what `point` without dilation sums, by quadrature with
-/// positive weights (docs/numerics.md, "The exact integral").
+/// I = integral of exp(-|w d|^2 / 2) over the pixel. The integral and its adjoint are moments of z = w d: averages over
+/// the pixel of what `point` without dilation sums. They are computed by quadrature with positive weights
+/// (docs/numerics.md, "The exact integral").
 ///
-/// z.x depends on one image axis alone, that of the larger variance; along it z.y falls at the rate
-/// `tilt`. Where the other axis is wide, given this one, a product rule over the pixel; else the
-/// other axis in closed form, and this one cut where the pixel's edges cross the Gaussian's ridge.
+/// The wide axis is the image axis of the larger variance, the narrow axis the other one. z.x depends on the wide axis
+/// alone; along it z.y falls at the rate `tilt`, and the line z.y = 0 is the ridge of the Gaussian. If the Gaussian is
+/// wide along the narrow axis too, a product rule over the pixel integrates both. Otherwise the narrow axis is
+/// integrated in closed form, and the wide axis in strips around the places where the pixel's edges cross the ridge.
 struct Exact : FootprintDefaults {
   static constexpr const char* kName = "exact";
   static constexpr bool kYardstick = true;
   static constexpr double kExtraLevel = 2 * box_excess(1 / kPixelVariance);
 
-  /// w: as of whiten(), the sign of its first row chosen so that tilt >= 0. amp: of the Gaussian of
-  /// Sigma + I/12 that bounds the weight.
+  /// w: that of whiten(), with the sign of its first row chosen such that tilt >= 0. amp: amplitude of the Gaussian of
+  /// covariance Sigma + I/12, which bounds the weight.
   template <typename T> using Shape = GaussianShape<T>;
 
   template <typename T> struct Terms {
@@ -90,9 +91,10 @@ struct Exact : FootprintDefaults {
     Sym2<V> second;
   };
 
-  /// Deviations from the ridge beyond which the Gaussian counts as zero: exp(-z^2 / 2) is 2e-11, 5e-32.
+  /// Standard deviations from the ridge beyond which the Gaussian counts as zero: exp(-z^2 / 2) is 2e-11 and 5e-32
+  /// there.
   template <typename T> static constexpr double kTail = sizeof(T) == 4 ? 7 : 12;
-  /// Longest panel, in deviations of the integrand along it, for kManyNodes.
+  /// Longest panel for kManyNodes, in standard deviations of the integrand along it.
   static constexpr double kPanel = 3.3;
   /// 1 + 2 kTail sqrt(2) / kPanel.
   static constexpr int kMaxPanels = 11;
@@ -117,15 +119,14 @@ struct Exact : FootprintDefaults {
     return blur(cov, T(kPixelVariance));
   }
 
-  /// Where the pixel begins and ends along an axis, seen from its point next to the mean: [-1, 0], [0, 1] or
-  /// in between [px]. From there rounding leaves the edges that matter where they are, however small or
-  /// far the Gaussian.
+  /// Where the pixel begins and ends along an axis, seen from its point next to the mean: [-1, 0], [0, 1] or in between
+  /// [px]. Seen from there, rounding does not move the edges that matter, however small or far away the Gaussian is.
   template <class V> struct Edges {
     V begin, end;
     AR_HD V middle() const { return V(ScalarOf<V>(0.5)) * (begin + end); }
   };
   template <class V> struct Pixel {
-    Vec2<V> z;  ///< that point, whitened
+    Vec2<V> z;  ///< whitened coordinates of the point next to the mean
     Edges<V> wide, narrow;
   };
 

@@ -48,8 +48,8 @@ inline constexpr double kBoxVariance = S == 1   ? kPixelVariance
                                        : S == 2 ? kPixelVariance / 4
                                                 : 1.0 / (24 * S);
 
-/// Node s of the box footprint with S samples [px]. With the variance of its Gaussians the mixture has the
-/// mean and, but for two samples, the covariance of the pixel. From 4 on found by search on trained and
+/// Node s of the box footprint with S samples [px]. The mixture of the Gaussians at the nodes has the mean of the pixel
+/// and, except for two samples, its covariance. From 4 samples on the nodes were found by a search on trained and
 /// random scenes (docs/numerics.md, "Nodes").
 template <int S> AR_HD constexpr Vec2<double> box_node(int s) {
   constexpr Vec2<double> kNodes2[] = {{0.25, 0.25}};
@@ -60,7 +60,7 @@ template <int S> AR_HD constexpr Vec2<double> box_node(int s) {
                                        {0.10473, 0.35640},  {0.39573, 0.39912}};
   static_assert(S == 1 || S == 2 || S == 4 || S == 8 || S == 16, "box has 1, 2, 4, 8 or 16 samples");
   if (S == 1) return {0, 0};
-  // The other half is opposite.
+  // Node s + S / 2 is the negative of node s, so only the first half is listed.
   const int k = s % (S / 2 > 0 ? S / 2 : 1);
   const Vec2<double> n = S == 2 ? kNodes2[k % 1] : S == 4 ? kNodes4[k % 2] : S == 8 ? kNodes8[k % 4] : kNodes16[k % 8];
   return s < S / 2 ? n : Vec2<double>{-n.x, -n.y};
@@ -76,7 +76,8 @@ template <int S> constexpr double box_reach() {
   return reach;
 }
 
-/// S Gaussians that stand for one pixel: all that blending has to know, whatever the covariance was widened by.
+/// S Gaussians in place of one pixel: all that blending has to know. It is the same code for all footprints that are
+/// Gaussians, whatever variance they have added to the covariance.
 template <int S> struct GaussianPixels : FootprintDefaults {
   static constexpr int kSamples = S;
   static constexpr double kReach = box_reach<S>();

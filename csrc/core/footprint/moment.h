@@ -1,19 +1,19 @@
-// The pixel as S equal cells, each composited with a transmittance of its own, looked at from the centroid of the light
-// that the splats in front have left in it (docs/numerics.md, "Moving nodes").
+// The pixel as S equal square cells, each composited with a transmittance of its own. A splat is evaluated at the
+// centroid of the light that the splats in front have left in the cell (docs/numerics.md, "Moving nodes").
 #pragma once
 
 #include "core/footprint/gaussian.h"
 
 namespace ar {
 
-/// "moment1" ... "moment16", behind which stands the number of cells alone.
+/// The key of a footprint, "moment1" ... "moment16". From its seventh character on it is the number of cells alone.
 template <int S> struct MomentKey {
   static constexpr char kText[] = {
       'm', 'o', 'm', 'e', 'n', 't', S >= 10 ? '1' : char('0' + S), S >= 10 ? char('0' + S % 10) : '\0', '\0'};
 };
 
-/// n x n cells, S = n^2. At rest each is the Gaussian of the cell's variance at its centre, as `box` has them. Blended
-/// as itself: `Pixels` of the base would stand still.
+/// n x n cells, S = n^2. In front of the first splat each is a Gaussian of the cell's variance at the cell's centre,
+/// like a sample of `box`. `Pixels` is reset, because that of the base class has nodes that do not move.
 template <int S> struct Moment : GaussianFootprint<1, true> {
   using Pixels = void;
   using Gaussian = GaussianFootprint<1, true>;
@@ -76,22 +76,25 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     return {{T(n.x - kMoveReach), T(n.y - kMoveReach)}, {T(n.x + kMoveReach), T(n.y + kMoveReach)}};
   }
 
-  /// The whitened coordinates of nodes that are at `place` from the centres of pixels with the coordinates `of_pixel`.
+  /// Whitened coordinates of a node. `place`: of the node, relative to the pixel's centre; `of_pixel`: the whitened
+  /// coordinates of that centre.
   template <typename T, class V>
   AR_HD static Vec2<V> whitened_node(const Terms<T>& t, Vec2<V> of_pixel, Vec2<V> place) {
     return {madd(V(t.w.xx), place.x, madd(V(t.w.xy), place.y, of_pixel.x)),
             madd(V(t.w.yx), place.x, madd(V(t.w.yy), place.y, of_pixel.y))};
   }
 
-  /// move() from the node's whitened coordinates z: `at` is its place or its displacement, and stays within `bounds`.
+  /// move() from the node's whitened coordinates z. `at` is the node's place or its displacement; what is returned is
+  /// the same behind the splat, within `bounds`.
   template <typename T, class V>
   AR_HD static Vec2<V> move_in(const Terms<T>& t, Vec2<V> z, V alpha, Vec2<V> at, const Bounds<V>& bounds) {
     const Vec2<V> next = step(t, z, odds(alpha), at);
     return {min(max(next.x, bounds.lo.x), bounds.hi.x), min(max(next.y, bounds.lo.y), bounds.hi.y)};
   }
 
-  /// alpha_and_move_vjp() likewise. With z = w d, y = w dL_dat and r = alpha / (1 - alpha), both times kBase2 as the
-  /// sums are. A coordinate that move_in() has held at a bound does not depend on anything.
+  /// alpha_and_move_vjp() likewise (docs/numerics.md, "Adjoint of moving nodes"): z = w d, y = w dL_dat, both times
+  /// kBase2 as the sums are, and r = alpha / (1 - alpha). A coordinate that move_in() has held at a bound does not
+  /// depend on anything.
   template <typename T, class V>
   AR_HD static MoveGrad<V> alpha_and_move_in_vjp(const Terms<T>& t, Vec2<V> z, V raw, V alpha, MaskOf<V> free,
                                                  V dL_dalpha, Vec2<V> at, const Bounds<V>& bounds, Vec2<V>& dL_dat) {
@@ -113,7 +116,7 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   }
 
  private:
-  /// (Sigma + v I)^-1 d is w^T z over kBase2^2.
+  /// v / kBase2^2, since (Sigma + v I)^-1 d = w^T z / kBase2^2.
   static constexpr double kStep = kVariance / (kBase2 * kBase2);
 
   template <typename T, class V> AR_HD static Vec2<V> place(int s) { return {V(T(node(s).x)), V(T(node(s).y))}; }

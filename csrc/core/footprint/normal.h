@@ -43,7 +43,7 @@ template <int N, typename T> struct GaussLegendre {
   }
 };
 
-/// Nodes on an interval of at most half a standard deviation, and of at most two.
+/// Numbers of nodes for an interval of at most half a standard deviation (few), and of at most two (many).
 template <typename T> inline constexpr int kFewNodes = sizeof(T) == 4 ? 4 : 6;
 template <typename T> inline constexpr int kManyNodes = sizeof(T) == 4 ? 8 : 12;
 
@@ -62,7 +62,7 @@ template <class V> struct NormalMoments {
 template <class V> AR_HD NormalMoments<V> interval_moments(V a, V b) {
   using T = ScalarOf<V>;
   const V zero = V(T(0)), root_half = V(T(0.70710678118654752440)), root_half_pi = V(T(1.2533141373155002512));
-  // On the side where both values of erfc are small.
+  // Mirrored, if necessary, to the side where both values of erfc are small.
   const MaskOf<V> mirrored = a + b < zero;
   const V lo = select(mirrored, -b, a), hi = select(mirrored, -a, b);
   const V at_lo = normal(lo), at_hi = normal(hi), first = at_lo - at_hi;

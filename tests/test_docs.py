@@ -1,0 +1,50 @@
+"""The documents point at what exists: files, headings, and the sections of docs/numerics.md that the code cites."""
+
+import pathlib
+import re
+
+import pytest
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+DOCUMENTS = sorted(
+    [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("simple_knn/*.md"), *ROOT.glob("third_party/*.md")]
+)
+SOURCES = sorted(
+    path
+    for folder in ("csrc", "analytic_rasterizer", "tests", "benchmarks")
+    for path in (ROOT / folder).rglob("*")
+    if path.suffix in (".h", ".cpp", ".cu", ".cuh", ".py") and path != pathlib.Path(__file__).resolve()
+)
+
+
+def anchor(heading):
+    """The name that GitHub gives to a heading."""
+    return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
+
+
+def anchors(document):
+    text = re.sub(r"^```.*?^```$", "", document.read_text(), flags=re.M | re.S)
+    return {anchor(heading) for heading in re.findall(r"^#+ (.*)$", text, flags=re.M)}
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_links(document):
+    text = " ".join(document.read_text().split())
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"https?:", target):
+            continue
+        path, _, heading = target.partition("#")
+        file = (document.parent / path).resolve() if path else document
+        assert file.exists(), f"{target} does not exist"
+        assert not heading or heading in anchors(file), f"{target}: there is no such heading"
+
+
+def test_sections_of_numerics_that_the_code_cites():
+    known = anchors(ROOT / "docs" / "numerics.md")
+    cited = 0
+    for path in SOURCES:
+        text = re.sub(r"\n\s*(///?|#)?\s*", " ", path.read_text())  # a citation may be broken over lines of a comment
+        for section in re.findall(r'docs/numerics\.md, "([^"]+)"', text):
+            assert anchor(section) in known, f'{path.relative_to(ROOT)} cites "{section}" of docs/numerics.md'
+            cited += 1
+    assert cited > 10, "the citations are written in another way: this test reads none of them"
