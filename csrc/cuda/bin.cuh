@@ -98,6 +98,22 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
   return sum;
 }
 
+/// Calls write(place, tile, id) for all pairs of a splat, a lane for a row of tiles. All lanes must call it.
+template <class Write>
+__device__ void write_wide(const EmitParams& params, int32_t id, int64_t place, const Write& write) {
+  const Support<float> support =
+      support_of(reinterpret_cast<const SplatRow<float>*>(params.splats)[id], params.footprint);
+  const Range rows = clamp_range(rows_of(support), params.grid.height), tile_rows = tiles_of(rows, params.grid);
+  for (int first = tile_rows.first; first <= tile_rows.last; first += 32) {
+    const int row = first + lane_id();
+    const Range range = row <= tile_rows.last ? tile_columns_of(support, params.grid, rows, row) : Range{0, -1};
+    const int width = range.last - range.first + 1, up_to = warp_inclusive_sum(width);
+    int64_t mine = place + up_to - width;
+    for (int c = range.first; c <= range.last; ++c) write(mine++, uint32_t(row) * params.grid.columns() + c, id);
+    place += shuffle(up_to, 31);
+  }
+}
+
 /// Pairs in the order of depth, a splat's by rows of tiles; and the histograms of the digits of their tiles.
 __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitParams params, int tile_digits) {
   constexpr int kBins = TileDigits::kBins;
@@ -140,7 +156,6 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
   }
   __syncthreads();
   const int64_t begin = int64_t(before_block) + before;
-  const int columns = params.grid.columns();
   const auto write = [&](int64_t place, uint32_t tile, int32_t id) {
     write_pair(params, place, tile, id);
     for (int d = 0; d < tile_digits; ++d) atomicAdd(&histograms[d * kBins + TileDigits::of(tile, d)], 1);
@@ -155,19 +170,7 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
   }
   for (uint32_t many = __ballot_sync(kAllLanes, count > kManyTiles); many != 0; many &= many - 1) {
     const int source = __ffs(many) - 1;
-    const int32_t id = __shfl_sync(kAllLanes, i, source);
-    int64_t place = __shfl_sync(kAllLanes, begin, source);
-    const Support<float> support = support_of(splats[id], params.footprint);
-    const Range rows = clamp_range(rows_of(support), params.grid.height), tile_rows = tiles_of(rows, params.grid);
-    for (int first = tile_rows.first; first <= tile_rows.last; first += 32) {
-      const int row = first + lane_id();
-      const Range range = row <= tile_rows.last ? tile_columns_of(support, params.grid, rows, row) : Range{0, -1};
-      const int width = range.last - range.first + 1;
-      const int widths = warp_inclusive_sum(width);
-      int64_t mine = place + widths - width;
-      for (int c = range.first; c <= range.last; ++c) write(mine++, uint32_t(row) * columns + c, id);
-      place += __shfl_sync(kAllLanes, widths, 31);
-    }
+    write_wide(params, shuffle(i, source), shuffle(begin, source), write);
   }
   __syncthreads();
   for (int b = threadIdx.x; b < tile_digits * kBins; b += kEmitThreads) {
