@@ -67,7 +67,8 @@ function fitPolynomial(places, values, weights) {
 /// unit, c1, ..., c4 for h = `half`.
 function windowRow(half) {
   const flat = Math.max(half - FLAT_FROM, 0), length = endOfWindow(half) - flat;
-  const places = Array.from({ length: POINTS }, (_, k) => (0.5 - 0.5 * Math.cos((Math.PI * (k + 0.5)) / POINTS)) ** 1.5);
+  const places = Array.from(
+    { length: POINTS }, (_, k) => (0.5 - 0.5 * Math.cos((Math.PI * (k + 0.5)) / POINTS)) ** 1.5);
   const values = places.map(
     s => (logisticWindow(0, half) / logisticWindow(flat + length * Math.sqrt(s), half)) ** 0.25);
   // Relative errors of F weigh as sqrt(F): between small errors at the top and at the threshold.

@@ -1,5 +1,5 @@
-// GLSL of the passes: project, draw, add, present. The formulas are those of csrc/core, in the same form; only the window
-// of `analytic` is drawn by polynomials that are fitted to its formula (logistic.js).
+// GLSL of the passes: project, draw, add, present. The formulas are those of csrc/core, in the same form; only the
+// window of `analytic` is drawn by polynomials that are fitted to its formula (logistic.js).
 //
 // Everything is highp: with 16 bits the offset of a pixel from a mean, the exponents and the cubes of 1/sigma are all
 // wrong. Offsets are floor(gl_FragCoord) - mean, not interpolated, which is exact. There are no `precise` qualifiers in
@@ -37,8 +37,8 @@ float windowTop(float r) {
 }
 `;
 
-// The rest of F by the polynomial of logistic.js: coefficients for each vertex, V for each pixel. `axis` is a row of the
-// whitening matrix [1/px], which is turned into units of w.
+// The rest of F by the polynomial of logistic.js: coefficients for each vertex, V for each pixel. `axis` is a row of
+// the whitening matrix [1/px], which is turned into units of w.
 const WINDOW_COEFFICIENTS = `
 uniform sampler2D uWindow;
 void readWindow(inout vec2 axis, out float flatTop, out vec4 c) {
