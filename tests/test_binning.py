@@ -16,7 +16,8 @@ from scenes import KINDS, PATHS, RENDERED, Camera, name_of
 
 import analytic_rasterizer as ar
 
-CAMERA = Camera(image_width=118, image_height=86, tanfovx=0.7, tanfovy=0.51).facing_z()
+# The brute force takes as long as there are pixels. Six by four tiles, the last of them cut off at both edges.
+CAMERA = Camera(image_width=86, image_height=54, tanfovx=0.7, tanfovy=0.44).facing_z()
 
 # "paper" bins exactly as "frozen" does.
 BINNED = [v for v in RENDERED if v[1].get("frame_gradient") != "paper"]
@@ -182,13 +183,13 @@ def test_lists_are_consistent(variant, device, dtype):
     key = tile_of_pair(result) * len(result.ids) + result.pairs
     assert len(key.unique()) == len(key), "a splat appears twice in a tile"
 
-    # Values against the reference, to the rounding of the dtype at 118 px and depth 9.
+    # Values against the reference, to the rounding of the dtype within 1.2 * 86 px and at depth 9.
     covariance = reference.unpack_covariance(scene["cov3D_precomp"])
     means, _, depths = reference.project(settings, scene["means3D"], covariance)
     ids = result.ids.long()
     eps = torch.finfo(dtype).eps
     assert (result.depths.double() - depths[ids]).abs().max() < 9 * 4 * eps
-    assert (result.means2d.double() - means[ids]).abs().max() < 142 * 16 * eps
+    assert (result.means2d.double() - means[ids]).abs().max() < 1.2 * CAMERA.image_width * 16 * eps
 
     # The same image and radii as the rasterizer proper, to the last bit.
     rasterizer = ar.GaussianRasterizer(scenes.settings_to(settings, device))

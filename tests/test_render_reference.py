@@ -187,7 +187,7 @@ def test_spherical_harmonics_below_the_stored_degree(device, best):
     assert torch.equal(render(camera, scene, ("point", {}))[0], render(camera, truncated, ("point", {}))[0])
 
 
-@every_footprint
+@each_path
 def test_precomputed(device, best, variant):
     """colors_precomp (negative and above one too: they are not clamped) and cov3D_precomp."""
     scene = scenes.with_precomputed(hard_scene(12))
@@ -216,7 +216,7 @@ def test_image_sizes(device, best, variant, size):
     compare(camera, scene, variant, device, best)
 
 
-@every_footprint
+@each_kind
 def test_deep_stack(device, best, variant):
     """Opaque layers: samples stop; the splat that would pass 1e-4 is not blended, T stays."""
     camera = Camera(bg=(1.0, 0.0, 0.5))
@@ -262,7 +262,7 @@ def test_extreme_quaternions_float32(device, length):
     assert torch.isfinite(ours["scales"].grad).all()
 
 
-@every_footprint
+@each_kind
 def test_absolute_gradients(device, best, variant):
     """means2D (P, 4): columns 0:2 as ever, 2:4 the sum over pixels of |gx|, |gy|."""
     camera = CAMERA
@@ -279,7 +279,7 @@ def test_absolute_gradients(device, best, variant):
 
 
 @pytest.mark.parametrize("means2d_z", ["sum_abs", "sum_norm"])
-@every_footprint
+@each_kind
 def test_third_column_of_means2d(device, best, variant, means2d_z):
     """means2D (P, 3): column 2 the sum over pixels of |gx| + |gy|, or of the length of (gx, gy)."""
     camera = CAMERA

@@ -1,10 +1,6 @@
-// The arguments of the ops, each named once, in the order of its schema: `each` of a struct lists them for the schema,
-// for reading them off the dispatcher's stack, and for the names in snapshots.
+// The arguments of the ops, each named once, in the order of its schema: `each` of a struct lists them for the schema
+// and for reading them off the dispatcher's stack (boxing.h), and for the names in snapshots.
 #pragma once
-
-#include <ATen/ATen.h>
-#include <ATen/core/ivalue.h>
-#include <ATen/core/stack.h>
 
 #include <string>
 #include <string_view>
@@ -13,8 +9,6 @@
 #include "torch/images.h"
 
 namespace ar::ops {
-
-using c10::IValue;
 
 /// A tensor, or what takes its place, for every tensor of a scene and a camera as 3DGS names them.
 template <class Optional> struct SceneTensors {
@@ -342,51 +336,5 @@ template <class Arguments> struct VjpArguments {
     visit("needs", needs);
   }
 };
-
-/// The type of an argument in a schema.
-template <class Value> std::string type_in_schema(const Value&) { return c10::getTypePtr<Value>()->str(); }
-template <char kLetter> std::string type_in_schema(const WrittenTensors<kLetter>&) {
-  return std::string("Tensor(") + kLetter + "!)[]";
-}
-
-template <char kLetter> std::string type_in_schema(const WrittenTensor<kLetter>&) {
-  return std::string("Tensor(") + kLetter + "!)";
-}
-
-/// "Tensor means3D, Tensor? means2D, ...".
-template <class Arguments> std::string schema_of() {
-  std::string text;
-  Arguments().each([&](std::string_view declaration, auto& value) {
-    text += (text.empty() ? "" : ", ") + type_in_schema(value) + " " + std::string(declaration);
-  });
-  return text;
-}
-
-template <class Value> void assign(const IValue& from, Value& to) { to = from.to<Value>(); }
-/// A tensor that autograd left undefined is one that is missing.
-inline void assign(const IValue& from, OptionalTensor& to) {
-  to = from.isTensor() && from.toTensor().defined() ? OptionalTensor(from.toTensor()) : std::nullopt;
-}
-inline void assign(const IValue& from, std::vector<OptionalTensor>& to) {
-  to.clear();
-  for (const OptionalTensor& t : from.toOptionalTensorVector()) to.push_back(t && t->defined() ? t : std::nullopt);
-}
-template <char kLetter> void assign(const IValue& from, WrittenTensors<kLetter>& to) {
-  static_cast<std::vector<Tensor>&>(to) = from.toTensorVector();
-}
-template <char kLetter> void assign(const IValue& from, WrittenTensor<kLetter>& to) {
-  static_cast<Tensor&>(to) = from.toTensor();
-}
-
-/// Takes an op's arguments off the dispatcher's stack.
-template <class Arguments> Arguments take(torch::jit::Stack& stack) {
-  Arguments arguments;
-  size_t count = 0;
-  arguments.each([&](std::string_view, auto&) { ++count; });
-  const IValue* next = stack.data() + (stack.size() - count);
-  arguments.each([&](std::string_view, auto& value) { assign(*next++, value); });
-  torch::jit::drop(stack, count);
-  return arguments;
-}
 
 }  // namespace ar::ops

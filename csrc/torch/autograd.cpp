@@ -9,7 +9,7 @@
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/library.h>
 
-#include "torch/arguments.h"
+#include "torch/boxing.h"
 
 namespace ar::ops {
 namespace {

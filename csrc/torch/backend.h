@@ -3,6 +3,10 @@
 // parameters of its stages (core/stages.h) and launches them.
 #pragma once
 
+#include <ATen/Context.h>
+#include <ATen/ops/empty.h>
+#include <ATen/ops/zeros.h>
+
 #include <array>
 #include <memory>
 #include <vector>

@@ -3,6 +3,8 @@
 // Arguments have been checked (checks.h). What is relied on here: tensors are contiguous, on the CPU and of one
 // floating type; lists and state fit each other, the splats and the image; `count` of inspect exceeds every id. The
 // contents of lists were made by an earlier stage and are not checked.
+#include <ATen/ops/arange.h>
+#include <ATen/ops/zeros_like.h>
 #include <ATen/Parallel.h>
 #if defined(__unix__) || defined(__APPLE__)
 #include <pthread.h>

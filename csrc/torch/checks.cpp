@@ -1,5 +1,7 @@
 #include "torch/checks.h"
 
+#include <ATen/ops/isfinite.h>
+
 #include <cmath>
 
 #include "core/camera.h"

@@ -2,6 +2,8 @@
 // both.
 #pragma once
 
+#include <ATen/ops/empty.h>
+
 #include <array>
 
 #include "core/stages.h"

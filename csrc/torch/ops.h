@@ -5,7 +5,7 @@
 
 #include <vector>
 
-#include "torch/arguments.h"
+#include "torch/boxing.h"
 
 namespace ar::ops {
 

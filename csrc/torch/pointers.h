@@ -1,7 +1,7 @@
 // Pointers into tensors, typed as what the kernels read there. Null where a tensor is missing or empty.
 #pragma once
 
-#include <ATen/ATen.h>
+#include <ATen/core/Tensor.h>
 
 #include <optional>
 

@@ -1,6 +1,11 @@
 // The pass, written once for both devices: check, project, bin, blend; and its adjoint: blend_vjp, project_vjp. What
 // the devices do differently is behind Backend (backend.h). The structs of tensors (ChannelTensors, ListTensors, ...)
 // are in backend.h and images.h.
+#include <ATen/ops/constant_pad_nd.h>
+#include <ATen/ops/empty_like.h>
+#include <ATen/ops/tensor.h>
+#include <ATen/ops/zeros_like.h>
+
 #include <vector>
 
 #include "torch/checks.h"

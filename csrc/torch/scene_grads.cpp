@@ -1,5 +1,10 @@
 #include "torch/scene_grads.h"
 
+#include <ATen/ops/arange.h>
+#include <ATen/ops/cat.h>
+#include <ATen/ops/empty_like.h>
+#include <ATen/ops/where.h>
+
 #include <algorithm>
 
 #include "core/camera.h"
@@ -16,8 +21,9 @@ Tensor mean_transmittance(const BlendState& state, const ListTensors& lists, Til
                              .slice(0, 0, grid.height)
                              .slice(1, 0, grid.width);
   const Tensor number = at::arange(state.transmittance.size(0), samples.options()).view({-1, 1, 1});
-  return at::where(number.lt(samples), state.transmittance, at::zeros({}, state.transmittance.options())).sum(0) /
-         samples;
+  return at::where(number.lt(samples), state.transmittance, at::zeros({}, state.transmittance.options()))
+      .sum(0)
+      .div(samples);
 }
 
 }  // namespace
@@ -71,7 +77,7 @@ std::vector<Tensor> list_of(Grads grads, const Tensor& like) {
 }
 
 Tensor background_grad(const Tensor& dL_dcolor, const BlendState& state, const ListTensors& lists, TileGrid grid) {
-  return (dL_dcolor * mean_transmittance(state, lists, grid)).sum(at::IntArrayRef({1, 2}));
+  return dL_dcolor.mul(mean_transmittance(state, lists, grid)).sum(at::IntArrayRef({1, 2}));
 }
 
 }  // namespace ar::ops

@@ -8,7 +8,7 @@
 #include <string>
 #include <vector>
 
-#include "torch/arguments.h"
+#include "torch/boxing.h"
 
 namespace ar::ops {
 

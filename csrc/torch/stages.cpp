@@ -1,5 +1,13 @@
 // The stages of the pass as ops of their own, for one or several cameras: project, bin, blend. And the weight of a
 // footprint by itself.
+#include <ATen/ops/aminmax.h>
+#include <ATen/ops/arange.h>
+#include <ATen/ops/cat.h>
+#include <ATen/ops/full.h>
+#include <ATen/ops/full_like.h>
+#include <ATen/ops/stack.h>
+#include <ATen/ops/zeros_like.h>
+
 #include <algorithm>
 #include <array>
 #include <type_traits>

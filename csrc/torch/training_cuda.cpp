@@ -1,5 +1,6 @@
 // The loss, the activations, the optimiser and what density control observes, on CUDA tensors. Nothing here waits for
 // the device.
+#include <ATen/ops/empty.h>
 #include <c10/cuda/CUDAException.h>
 #include <c10/cuda/CUDAGuard.h>
 #include <c10/cuda/CUDAStream.h>
