@@ -285,7 +285,7 @@ def test_addition_stops_at_the_limit():
 def test_noise_follows_the_covariance_and_spares_the_opaque():
     """Along every axis of a Gaussian the standard deviation of its noise is the axis's variance times a constant."""
     count, rate = 20_000, 1e-3
-    control = make_control([1.0] * count, [0.001] * count, density="mcmc", noise=5.0)
+    control = make_control([1.0] * count, [0.001] * count, density="mcmc", noise=5.0, max_gaussians=count)
     control.optimizer.param_groups[0]["lr"] = rate
     scales, turn = torch.tensor([1.0, 0.5, 0.2]), torch.tensor([0.3, -0.5, 0.7, 0.2])
     with torch.no_grad():

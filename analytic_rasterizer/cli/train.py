@@ -51,10 +51,8 @@ def add_parser(subcommands) -> None:
     add("--images", default="images", metavar="NAME", help="folder in SCENE of a reconstruction's photographs")
     add("--test-every", type=int, default=8, metavar="N", help="keep every N-th photograph for the test; 0: none")
     add("--points", metavar="FILE.ply", help="start from this: a 3DGS scene, or points with colours")
-    presets = (
-        "options that belong together: quick for 7,000 steps, 3dgs for the recipe of 3DGS; options that are given win"
-    )
-    add("--preset", choices=tuple(PRESETS), help=presets)
+    preset = "options that belong together: quick, 7,000 steps; 3dgs, the recipe of 3DGS; what is given wins"
+    add("--preset", choices=tuple(PRESETS), help=preset)
     add("--resume", action="store_true", help="go on from the checkpoint in DIR, with its options")
     add("--save-every", type=int, default=5000, metavar="STEPS", help="between checkpoints (default: 5000; 0: none)")
     add("--no-evaluate", action="store_true", help="leave out the test at the end")

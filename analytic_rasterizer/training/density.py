@@ -204,7 +204,7 @@ class GradientDensity(FixedDensity):
         grown = gradients >= self.options.growth_gradient
         if self.options.gaussian_limit < math.inf:
             # If all room were taken at once, Gaussians would go where the first, blurred pictures ask for them.
-            limit = int(self.options.gaussian_limit)
+            limit = self.options.gaussian_limit
             if limit > self.first_count:
                 limit = self.first_count + int(over * (limit - self.first_count))
             room = self.ranks.allowed(limit, len(grown), int(grown.sum()))
@@ -264,7 +264,7 @@ class MonteCarloDensity(FixedDensity):
         old = self.gaussians
         count = len(old.means)
         wanted = int((1 + self.options.grow_share) * count) - count
-        more = self.ranks.allowed(int(self.options.gaussian_limit), count, wanted)
+        more = self.ranks.allowed(self.options.gaussian_limit, count, wanted)
         if more == 0:
             return
         sources = draw(old.logit_opacities[:, 0].sigmoid(), more, self.generator)

@@ -112,8 +112,9 @@ class TrainingOptions:
         prune_opacity: Least opacity that is kept.
         split_above: Scale above which a Gaussian is split rather than cloned, in extents of the scene.
         prune_above: Scale above which a Gaussian is pruned after the first reset, in extents of the scene.
-        max_gaussians: Most Gaussians; 0: no limit. With "3dgs" and "absgrad" the limit rises evenly from the number at
-            the start to this, until `densify_until`: those with the largest gradients grow first.
+        max_gaussians: Most Gaussians; 0: no limit, which "mcmc" does not take. With "3dgs" and "absgrad" the limit
+            rises evenly from the number at the start to this, until `densify_until`, and those with the largest
+            gradients grow first; with "mcmc" the number rises by `grow_share` until it is reached.
         grow_share: Of "mcmc": Gaussians that are added at a time, as a share of those that are there.
         noise: Of "mcmc": strength of the noise on the means, in learning rates of the means.
         opacity_weight: Weight of the mean opacity in the loss; -1: 0.01 for "mcmc", otherwise 0.
@@ -173,14 +174,8 @@ class TrainingOptions:
         object.__setattr__(self, "footprint", str(resolve_footprint(self.footprint)))
         for name in ("iterations", "pictures_per_step", "supersampling", "sh_every", "random_points", "densify_every"):
             _check(name, getattr(self, name) >= 1, "at least 1", getattr(self, name))
-        for name in (
-            "densify_from",
-            "reset_every",
-            "max_gaussians",
-            "means_rate_steps",
-            "rates_from",
-            "rates_half_life",
-        ):
+        steps = ("densify_from", "reset_every", "means_rate_steps", "rates_from", "rates_half_life")
+        for name in (*steps, "max_gaussians"):
             _check(name, getattr(self, name) >= 0, "at least 0", getattr(self, name))
         for name in ("scales", "scale_repeats"):
             value = getattr(self, name)
@@ -194,6 +189,8 @@ class TrainingOptions:
         expected = f"one of {', '.join(DOWNSAMPLINGS)}"
         _check("downsampling", self.downsampling in DOWNSAMPLINGS, expected, self.downsampling)
         _check("density", self.density in DENSITIES, f"one of {', '.join(DENSITIES)}", self.density)
+        limited = self.density != "mcmc" or self.max_gaussians > 0
+        _check("max_gaussians", limited, 'at least 1 with the density control "mcmc", which grows up to it', 0)
         _check("gradient_scales", self.gradient_scales in ("all", "finest"), "all or finest", self.gradient_scales)
         for name in ("ssim_weight", "densify_until", "grow_share"):
             _check(name, 0 <= getattr(self, name) <= 1, "0 to 1", getattr(self, name))

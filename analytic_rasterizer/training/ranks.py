@@ -59,7 +59,7 @@ class Ranks:
         """The value of rank 0, on all ranks."""
         return self.exchange(value)[0]
 
-    def allowed(self, limit: int, count: int, wanted: int) -> int:
+    def allowed(self, limit: float, count: int, wanted: int) -> int:
         """How many of the `wanted` Gaussians this rank may add to its `count`, so that all ranks stay within `limit`.
 
         What is allowed to all ranks together is divided in proportion to what they want.

@@ -6,6 +6,7 @@ from importlib import resources
 
 MODULES = (
     "constants.js",
+    "logistic.js",
     "shaders.js",
     "gl.js",
     "project.js",

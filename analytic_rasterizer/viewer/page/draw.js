@@ -1,7 +1,8 @@
 // Draws the projected splats into pictures of half floats, and shows pictures on the canvas.
 
 import { boxNodes } from './constants.js';
-import { bindTextures, createFramebuffer, createProgram, createTexture } from './gl.js';
+import { bindTextures, createFramebuffer, createProgram, createTexture, fillTexture } from './gl.js';
+import { LAST_HALF, ROWS_PER_UNIT, windowTable } from './logistic.js';
 import { Projection } from './project.js';
 import {
   ADD, FULL_SCREEN, PRESENT, SPLATS_PER_INSTANCE, drawFragmentShader, drawVertexShader,
@@ -39,6 +40,8 @@ export class Renderer {
     this.targets = new Map();
     this.pictures = new Map();
     this.projection = new Projection(gl, scene);
+    this.window = createTexture(gl, 2, LAST_HALF * ROWS_PER_UNIT + 1, full);
+    fillTexture(gl, this.window, 2, full, 4, windowTable());
     this.fullScreen = gl.createVertexArray();
     this.quads = this.createQuads();
   }
@@ -115,7 +118,7 @@ export class Renderer {
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     const [uMean, uWhitening, uColor] = projection.splats;
-    bindTextures(gl, uniforms, { uMean, uWhitening, uColor, uOrder: projection.order });
+    bindTextures(gl, uniforms, { uMean, uWhitening, uColor, uOrder: projection.order, uWindow: this.window });
     gl.uniform1i(uniforms.uVisible, projection.visible);
     gl.uniform2f(uniforms.uSize, camera.width, camera.height);
     gl.bindVertexArray(this.quads);

@@ -2,7 +2,7 @@
 // logistic approximation of the Gaussian's CDF [AS, Eq. 2-9].
 #pragma once
 
-#include "core/footprint/contract.h"
+#include "core/footprint/eigenframe.h"
 
 namespace ar {
 
@@ -123,39 +123,28 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
   /// Deviates: [AS, Eq. 2] takes eigenvectors that are 0/0 for a diagonal Sigma with S11 > S22, and
   /// the smaller eigenvalue as a difference. Here the half angle and l2 = det / l1.
   template <typename T> AR_HD static Shape<T> prepare(Cov2d<T> cov, FootprintOptions) {
-    const T dx = cov.xx - cov.yy, dy = T(2) * cov.xy;
-    const T gap = eigenvalue_gap(cov);
-    const T major = T(0.5) * (cov.xx + cov.yy + gap);
-    const T s1 = max(sqrt(major), T(kMinSigma)), s2 = max(sqrt(max(cov.det / major, T(0))), T(kMinSigma));
-    Vec2<T> axis = {T(1), T(0)};
-    if (dx > T(0)) {
-      axis.x = sqrt(T(0.5) * (T(1) + dx / gap));
-      axis.y = dy / (T(2) * gap * axis.x);
-    } else if (gap > T(0)) {
-      const T sine = sqrt(T(0.5) * (T(1) - dx / gap));
-      axis = {abs(dy) / (T(2) * gap * sine), dy < T(0) ? -sine : sine};
-    }
-    return {{T(1) / s1, T(1) / s2}, axis, T(2 * kPi) * s1 * s2};
+    const Eigenframe<T> frame = eigenframe(cov);
+    const T s1 = max(frame.sigma.x, T(kMinSigma)), s2 = max(frame.sigma.y, T(kMinSigma));
+    return {{T(1) / s1, T(1) / s2}, frame.axis, T(2 * kPi) * s1 * s2};
   }
 
   /// Ellipse of Sigma + I/12.
   template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& g) {
-    const T w1 = widened(g.inv_sigma.x), w2 = widened(g.inv_sigma.y);
-    return {w1 * g.axis.x, w1 * g.axis.y, -w2 * g.axis.y, w2 * g.axis.x};
+    return scaled_axes(widened_by_pixel(g.inv_sigma), g.axis);
   }
 
   /// Along one axis -2 ln(F(u)/F(0)) >= u^2/(sigma^2 + 1/12) - w^4/48 - 0.05, w^2 = 1/(sigma^2 + 1/12),
   /// wherever F(u)/F(0) > 1/255 (checked numerically in the tests). The first term is the flat top
   /// of a narrow Gaussian's window, the second the logistic's tail.
   template <typename T> AR_HD static T level(const Shape<T>& g, T opacity) {
-    const T w1 = widened(g.inv_sigma.x), w2 = widened(g.inv_sigma.y);
-    const T slack = (w1 * w1 * w1 * w1 + w2 * w2 * w2 * w2) / T(48) + T(0.1);
+    const Vec2<T> w = widened_by_pixel(g.inv_sigma);
+    const T slack = (w.x * w.x * w.x * w.x + w.y * w.y * w.y * w.y) / T(48) + T(0.1);
     const T peak = alpha(terms(g, opacity), Vec2<T>{T(0), T(0)}, 0);
     return T(2) * std::log(T(1 / kAlphaMin) * peak) + slack;
   }
 
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& g, T opacity, Vec2<T> origin = {T(0), T(0)}) {
-    const Mat2<T> frame = scaled_frame(g);
+    const Mat2<T> frame = scaled_axes(g.inv_sigma, g.axis);
     const auto u = LogisticAxis<T>::at(g.inv_sigma.x), v = LogisticAxis<T>::at(g.inv_sigma.y);
     return {
         LogisticSlopes<T>::at(u), LogisticSlopes<T>::at(v), frame, transform(frame, origin), opacity * g.mass, u, v};
@@ -189,7 +178,9 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
     }
   }
 
-  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& g) { return T(-1) * scaled_frame(g); }
+  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& g) {
+    return T(-1) * scaled_axes(g.inv_sigma, g.axis);
+  }
 
   template <typename T>
   AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T> cov, const Shape<T>& g, ShapeGrad<T> sums, T, FootprintOptions) {
@@ -199,16 +190,12 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
     const T gap = eigenvalue_gap(cov);
     const T turn = kFrame == FrameGradient::kFrozen ? T(1) : (gap > T(0) ? T(1) / (gap * r.x * r.y) : T(0));
     const Sym2<T> white = {T(0.5) * sums.shape.xx, T(0.5) * sums.shape.xy * turn, T(0.5) * sums.shape.yy};
-    return {transform_transposed(mean_map(g), sums.offset), scaled_frame(g), white, T(0), T(0), GradFrame::kAxes};
-  }
-
- private:
-  template <typename T> AR_HD static Mat2<T> scaled_frame(const Shape<T>& g) {
-    return {g.inv_sigma.x * g.axis.x, g.inv_sigma.x * g.axis.y, -g.inv_sigma.y * g.axis.y, g.inv_sigma.y * g.axis.x};
-  }
-  /// 1 / sqrt(sigma^2 + 1/12).
-  template <typename T> AR_HD static T widened(T inv_sigma) {
-    return inv_sigma / sqrt(T(1) + T(kPixelVariance) * inv_sigma * inv_sigma);
+    return {transform_transposed(mean_map(g), sums.offset),
+            scaled_axes(g.inv_sigma, g.axis),
+            white,
+            T(0),
+            T(0),
+            GradFrame::kAxes};
   }
 };
 

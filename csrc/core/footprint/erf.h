@@ -1,6 +1,7 @@
 // The window of `analytic` with the exact normal distribution in place of the logistic.
 #pragma once
 
+#include "core/footprint/eigenframe.h"
 #include "core/footprint/gaussian.h"
 #include "core/footprint/normal.h"
 
@@ -39,14 +40,13 @@ struct Erf : FootprintDefaults {
 
   /// Ellipse of Sigma + I/12.
   template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& g) {
-    const T w1 = widened(g.inv_sigma.x), w2 = widened(g.inv_sigma.y);
-    return {w1 * g.axis.x, w1 * g.axis.y, -w2 * g.axis.y, w2 * g.axis.x};
+    return scaled_axes(widened_by_pixel(g.inv_sigma), g.axis);
   }
 
   /// See box_excess(), which holds along either axis.
   template <typename T> AR_HD static T level(const Shape<T>& g, T opacity) {
-    const T w1 = widened(g.inv_sigma.x), w2 = widened(g.inv_sigma.y);
-    return gaussian_level(w1 * w2 * g.area, opacity) + box_excess(w1 * w1) + box_excess(w2 * w2);
+    const Vec2<T> w = widened_by_pixel(g.inv_sigma);
+    return gaussian_level(w.x * w.y * g.area, opacity) + box_excess(w.x * w.x) + box_excess(w.y * w.y);
   }
 
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& g, T opacity, Vec2<T> origin = {T(0), T(0)}) {
@@ -70,10 +70,7 @@ struct Erf : FootprintDefaults {
                   madd(of_g, g.second, sums.shape.yy)};
   }
 
-  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& g) {
-    const T r1 = g.inv_sigma.x, r2 = g.inv_sigma.y;
-    return {r1 * g.axis.x, r1 * g.axis.y, -r2 * g.axis.y, r2 * g.axis.x};
-  }
+  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& g) { return scaled_axes(g.inv_sigma, g.axis); }
 
   template <typename T>
   AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& g, ShapeGrad<T> sums, T, FootprintOptions) {
@@ -84,10 +81,6 @@ struct Erf : FootprintDefaults {
   template <typename T, class V> AR_HD static NormalMoments<V> along(V z, T width) {
     if (width <= T(0.5)) return short_interval_moments(z, V(width));
     return interval_moments(z - V(T(0.5) * width), z + V(T(0.5) * width));
-  }
-  /// 1 / sqrt(sigma^2 + 1/12).
-  template <typename T> AR_HD static T widened(T inv_sigma) {
-    return inv_sigma / sqrt(T(1) + T(kPixelVariance) * inv_sigma * inv_sigma);
   }
 };
 

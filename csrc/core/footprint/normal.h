@@ -1,5 +1,5 @@
 // What the footprints with the exact normal distribution share: Gauss-Legendre rules, moments of the
-// normal density over an interval, the eigenframe.
+// normal density over an interval.
 #pragma once
 
 #include "core/footprint/contract.h"
@@ -97,28 +97,5 @@ template <typename T> AR_HD SplatGrad<T> moments_vjp(const Mat2<T>& w, const Sha
 /// with the splat cannot raise it: 144/61 is safe for every splat. That it falls as t^2 is checked
 /// numerically in the tests.
 template <typename T> AR_HD constexpr T box_excess(T t) { return t * t / T(61); }
-
-/// Standard deviations along the axes of a covariance, and (cos, sin) of the major one.
-template <typename T> struct Eigenframe {
-  Vec2<T> sigma;
-  Vec2<T> axis;
-};
-
-/// By the half angle, from whichever of its sine and cosine is larger, and det / l1: neither 0/0 for
-/// diagonal covariances nor a difference of eigenvalues (docs/numerics.md, "Eigenframe").
-template <typename T> AR_HD Eigenframe<T> eigenframe(Cov2d<T> cov) {
-  const T dx = cov.xx - cov.yy, dy = T(2) * cov.xy;
-  const T gap = eigenvalue_gap(cov);
-  const T major = T(0.5) * (cov.xx + cov.yy + gap);
-  Vec2<T> axis = {T(1), T(0)};
-  if (dx > T(0)) {
-    axis.x = sqrt(T(0.5) * (T(1) + dx / gap));
-    axis.y = dy / (T(2) * gap * axis.x);
-  } else if (gap > T(0)) {
-    const T sine = sqrt(T(0.5) * (T(1) - dx / gap));
-    axis = {abs(dy) / (T(2) * gap * sine), dy < T(0) ? -sine : sine};
-  }
-  return {{sqrt(major), sqrt(max(cov.det / major, T(0)))}, axis};
-}
 
 }  // namespace ar

@@ -1,0 +1,42 @@
+// What the footprints with a window along the axes of a splat share: the eigenframe of its covariance.
+#pragma once
+
+#include "core/footprint/contract.h"
+
+namespace ar {
+
+/// Standard deviations along the axes of a covariance, and (cos, sin) of the major one.
+template <typename T> struct Eigenframe {
+  Vec2<T> sigma;
+  Vec2<T> axis;
+};
+
+/// By the half angle, from whichever of its sine and cosine is larger, and det / l1: neither 0/0 for
+/// diagonal covariances nor a difference of eigenvalues (docs/numerics.md, "Eigenframe").
+template <typename T> AR_HD Eigenframe<T> eigenframe(Cov2d<T> cov) {
+  const T dx = cov.xx - cov.yy, dy = T(2) * cov.xy;
+  const T gap = eigenvalue_gap(cov);
+  const T major = T(0.5) * (cov.xx + cov.yy + gap);
+  Vec2<T> axis = {T(1), T(0)};
+  if (dx > T(0)) {
+    axis.x = sqrt(T(0.5) * (T(1) + dx / gap));
+    axis.y = dy / (T(2) * gap * axis.x);
+  } else if (gap > T(0)) {
+    const T sine = sqrt(T(0.5) * (T(1) - dx / gap));
+    axis = {abs(dy) / (T(2) * gap * sine), dy < T(0) ? -sine : sine};
+  }
+  return {{sqrt(major), sqrt(max(cov.det / major, T(0)))}, axis};
+}
+
+/// The matrix whose rows are the axes, the major one first, times `scale`.
+template <typename T> AR_HD Mat2<T> scaled_axes(Vec2<T> scale, Vec2<T> axis) {
+  return {scale.x * axis.x, scale.x * axis.y, -scale.y * axis.y, scale.y * axis.x};
+}
+
+/// 1 / sqrt(sigma^2 + 1/12) along both axes, from 1 / sigma: reciprocal deviations of the splat convolved with a pixel.
+template <typename T> AR_HD Vec2<T> widened_by_pixel(Vec2<T> inv_sigma) {
+  const auto widened = [](T r) { return r / sqrt(T(1) + T(kPixelVariance) * r * r); };
+  return {widened(inv_sigma.x), widened(inv_sigma.y)};
+}
+
+}  // namespace ar
