@@ -35,6 +35,8 @@ COUNTED_FRAMES = 33
 every_footprint = pytest.mark.parametrize("variant", RENDERED, ids=name_of)
 each_path = pytest.mark.parametrize("variant", PATHS, ids=name_of)
 each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
+# On CUDA, sums of absolute values over many samples have kernels of their own.
+each_sum_of_absolute_values = pytest.mark.parametrize("variant", [*KINDS, ("box", {"samples": 16})], ids=name_of)
 
 
 class Result(NamedTuple):
@@ -171,7 +173,7 @@ def test_random_scenes(name, variant):
     assert_same_without_gradient(scene, settings, color)
 
 
-@each_kind
+@each_sum_of_absolute_values
 def test_absolute_gradients(variant):
     """means2D (P, 4): sums of absolute values go another way through the backward pass."""
     scene = dict(scene32(), means2D=torch.zeros(3000, 4))

@@ -13,7 +13,7 @@ SOURCES = sorted(
     path
     for folder in ("csrc", "analytic_rasterizer", "tests", "benchmarks")
     for path in (ROOT / folder).rglob("*")
-    if path.suffix in (".h", ".cpp", ".cu", ".cuh", ".py") and path != pathlib.Path(__file__).resolve()
+    if path.suffix in (".h", ".cpp", ".cu", ".cuh", ".py", ".js") and path != pathlib.Path(__file__).resolve()
 )
 
 

@@ -26,6 +26,8 @@ MARGIN = {torch.float64: 1e-10, torch.float32: 1e-3}
 
 every_footprint = pytest.mark.parametrize("variant", RENDERED, ids=name_of)
 each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
+# On CUDA, sums of absolute values over many samples have kernels of their own.
+each_sum_of_absolute_values = pytest.mark.parametrize("variant", [*KINDS, ("box", {"samples": 16})], ids=name_of)
 each_path = pytest.mark.parametrize("variant", PATHS, ids=name_of)
 
 
@@ -262,7 +264,7 @@ def test_extreme_quaternions_float32(device, length):
     assert torch.isfinite(ours["scales"].grad).all()
 
 
-@each_kind
+@each_sum_of_absolute_values
 def test_absolute_gradients(device, best, variant):
     """means2D (P, 4): columns 0:2 as ever, 2:4 the sum over pixels of |gx|, |gy|."""
     camera = CAMERA
@@ -279,7 +281,7 @@ def test_absolute_gradients(device, best, variant):
 
 
 @pytest.mark.parametrize("means2d_z", ["sum_abs", "sum_norm"])
-@each_kind
+@each_sum_of_absolute_values
 def test_third_column_of_means2d(device, best, variant, means2d_z):
     """means2D (P, 3): column 2 the sum over pixels of |gx| + |gy|, or of the length of (gx, gy)."""
     camera = CAMERA

@@ -361,7 +361,7 @@ def test_broken_captures_are_one_line_and_leave_no_results(synthetic, tmp_path, 
         (["--sh-degree", "4"], "sh_degree must be 0 to 3, got 4"),
         (["--background", "green"], "background must be one of black, white, random, got green"),
         (["--preset", "quick", "--opacity-rate", "0"], "opacity_rate must be positive and finite, got 0.0"),
-        (["--density", "mcmc", "--max-gaussians", "0"], "max_gaussians must be at least 1 with the density control"),
+        (["--density", "mcmc", "--max-gaussians", "0"], 'max_gaussians must be at least 1 with density "mcmc"'),
         (["--preset", "slow"], "argument --preset: invalid choice: 'slow'"),
         (["--port", "8000"], "--port is for --watch"),
         (["--watch", "--port", "65536"], "must be a port from 0 to 65535, got 65536"),
@@ -394,7 +394,13 @@ def make_run(folder, out, device="cpu", resume=False, **options) -> training.Run
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"density": "absgrad"}, {"density": "mcmc"}, {"density": "none"}, {"supersampling": 2, "footprint": "point"}],
+    [
+        {},
+        {"density": "3dgs", "gradient_scales": "all"},
+        {"density": "mcmc"},
+        {"density": "none"},
+        {"supersampling": 2, "footprint": "point"},
+    ],
     ids=str,
 )
 def test_psnr_rises_and_the_results_say_so(device, synthetic, tmp_path, options):
@@ -463,10 +469,10 @@ def cpu_test_pictures(folder):
 @pytest.mark.parametrize(
     "options",
     [
-        {},
+        {"density": "3dgs", "gradient_scales": "all"},
         {"density": "absgrad", "gradient_scales": "finest", "filter_3d": True, "scale_repeats": (2, 1)},
         {"density": "mcmc", "background": "random", "pictures_per_step": 2},
-        {"sh_degree": 0},
+        {"density": "3dgs", "sh_degree": 0},
         {"sh_degree": 0, "density": "mcmc"},
     ],
     ids=["3dgs", "absgrad", "mcmc", "3dgs-constant-colors", "mcmc-constant-colors"],
@@ -493,7 +499,7 @@ def test_resumed_training_gives_the_same_bits(device, synthetic, tmp_path, optio
     "options",
     [
         {},
-        {"density": "absgrad", "gradient_scales": "finest"},
+        {"density": "3dgs", "gradient_scales": "all"},
         {"density": "none", "sh_degree": 0},
         {"background": "random"},
     ],
@@ -676,7 +682,9 @@ def test_training_by_time_on_a_capture(capture, tmp_path, monkeypatch):
     assert run.trainer.pictures.settings[2][0].image_width == 17
 
 
-@pytest.mark.parametrize("kind", [pytest.param(k, id=f"cuda-{k}", marks=needs_cuda) for k in ("3dgs", "mcmc")])
+@pytest.mark.parametrize(
+    "kind", [pytest.param(k, id=f"cuda-{k}", marks=needs_cuda) for k in ("3dgs", "absgrad", "mcmc")]
+)
 def test_steps_do_not_wait_for_the_device(synthetic, tmp_path, kind):
     """Outside of the steps that change the number of Gaussians, once the frames of every size are known."""
     run = make_run(synthetic, tmp_path, "cuda", iterations=1000, density=kind, densify_from=900)

@@ -40,7 +40,7 @@ WORLD = 3
 STEPS, BREAKS = 43, (14, 27)  # where the chain changes from 2 ranks to 1, and from 1 to 3
 HALF = 24  # where the others have a break
 COMMON = TINY | {"iterations": STEPS, "scales": (1, 2), "random_points": 120, "densify_until": 0.9}
-COMMON |= {"densify_from": 10, "densify_every": 10}
+COMMON |= {"densify_from": 10, "densify_every": 10, "density": "3dgs", "gradient_scales": "all"}
 VARIANTS = {
     "absgrad": {"density": "absgrad", "gradient_scales": "finest", "filter_3d": True, "reset_every": 35},
     "mcmc": {
@@ -249,8 +249,7 @@ def test_gaussians_are_spread_evenly_and_stay_within_the_limit(made, name):
     state = checkpoint_in(made / name / "whole")
     total = len(state["gaussians"]["means"])
     assert sum(state["shards"]) == total and max(state["shards"]) * len(state["shards"]) <= UNEVEN * total
-    if "max_gaussians" in VARIANTS[name]:
-        assert total <= VARIANTS[name]["max_gaussians"]
+    assert total <= (COMMON | VARIANTS[name])["max_gaussians"]
 
 
 def test_two_ranks_then_one_then_three(made):
@@ -258,6 +257,7 @@ def test_two_ranks_then_one_then_three(made):
     for written, read, step in (("2", "1", BREAKS[0]), ("1", "3", BREAKS[1])):
         before, after = (checkpoint_in(made / f"chain-{name}") for name in (f"by-{written}", f"read-by-{read}"))
         assert before["progress"]["step"] == step and before["density"]["gradient_sums"].sum() > 0
+        assert before["density"]["first_count"] == COMMON["random_points"]  # of all ranks
         assert {of_field["step"] for of_field in before["optimizer"]["state"].values()} == {step}
         assert [len(state.get("shards", "1")) for state in (before, after)] == [int(written), int(read)]
         assert_same(before, after, but=("shards",))

@@ -67,14 +67,14 @@ def repeats_of(scales: tuple[int, ...], finest_repeats: int) -> tuple[int, ...]:
 class TrainingOptions:
     """How to train. Positions in time that are called steps are steps; shares are of the whole training, 0 to 1.
 
-    The defaults are what measured best on several scenes (docs/training.md); `TrainingOptions.preset` has the recipe of
-    3DGS [Kerbl et al. 2023].
+    The defaults are what measured best in trainings of 7,000 steps on two scenes (docs/training.md);
+    `TrainingOptions.preset` has the recipe of 3DGS [Kerbl et al. 2023].
 
     Attributes:
         footprint: One of `FOOTPRINTS`, with options: "box:samples=4".
         scales: Reductions to train at: 1 is the full size, 2 half of it.
         scale_repeats: How often every picture of a scale occurs in one pass over the pictures; one number per scale.
-            None: twice for the finest of several scales, once for the others.
+            Empty: twice for the finest of several scales, once for the others.
         downsampling: How coarse pictures are made: "box", means over squares of pixels, or "bicubic", with the kernel
             widened to the scale.
         iterations: Steps of the optimizer.
@@ -190,7 +190,9 @@ class TrainingOptions:
         _check("downsampling", self.downsampling in DOWNSAMPLINGS, expected, self.downsampling)
         _check("density", self.density in DENSITIES, f"one of {', '.join(DENSITIES)}", self.density)
         limited = self.density != "mcmc" or self.max_gaussians > 0
-        _check("max_gaussians", limited, 'at least 1 with the density control "mcmc", which grows up to it', 0)
+        _check(
+            "max_gaussians", limited, 'at least 1 with density "mcmc", which grows up to it (the preset 3dgs has 0)', 0
+        )
         _check("gradient_scales", self.gradient_scales in ("all", "finest"), "all or finest", self.gradient_scales)
         for name in ("ssim_weight", "densify_until", "grow_share"):
             _check(name, 0 <= getattr(self, name) <= 1, "0 to 1", getattr(self, name))
@@ -214,7 +216,7 @@ class TrainingOptions:
     @property
     def gaussian_limit(self) -> float:
         """The limit of `max_gaussians`, settled."""
-        return self.max_gaussians or math.inf
+        return int(self.max_gaussians) or math.inf
 
     @property
     def regularizers(self) -> tuple[float, float]:
