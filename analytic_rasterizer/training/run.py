@@ -51,8 +51,8 @@ FIRST_LOOK = 10  # steps, for the pace of a training by seconds
 class Run:
     """A training with its files.
 
-    On several ranks every rank makes one, with the same arguments but for the device, and calls its methods; all of
-    them read the pictures and the checkpoint, and rank 0 alone writes and shows progress.
+    On several ranks every rank makes one, with the same arguments but for the device, and calls its methods; both wait
+    for the others. All of them read the pictures and the checkpoint, and rank 0 alone writes and shows progress.
 
     Args:
         scene: Folder of a capture, see `load_capture`.
