@@ -90,7 +90,7 @@ def test_evaluate_prints_lpips(network, tmp_path, capsys):
     assert cli.main(["evaluate", out, "--pictures", "0", "--scales", "1,2", "--device", "cpu"]) == 0
     rows = [line.split() for line in capsys.readouterr().out.splitlines()]
     names, values = rows[3][:2], [float(value) for value in rows[3][2:]]
-    assert names == ["box:samples=4", "LPIPS"] and len(values) == 3
+    assert names == ["moment:samples=4", "LPIPS"] and len(values) == 3
     assert min(values) > 0 and values[2] == pytest.approx(sum(values[:2]) / 2, abs=1.01e-4)  # of printed numbers
 
 
