@@ -32,12 +32,12 @@ from tqdm import tqdm
 from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import describe_machine
 from analytic_rasterizer.training import Trainer, TrainingOptions, evaluate, load_capture, load_pictures
-from analytic_rasterizer.training.options import preset_values
+from analytic_rasterizer.training.options import PRESETS, preset_values
 from analytic_rasterizer.training.schedule import Clock
 from analytic_rasterizer.training.trainer import background_of, starting_gaussians
 
 LOOK_PERIOD = 100  # steps between looks at loss and clock
-RATES_OF_3DGS = {"means_rate": 1.6e-4, "color_rate": 2.5e-3, "scale_rate": 5e-3, "rotation_rate": 1e-3}
+RATES_OF_3DGS = {name: value for name, value in PRESETS["3dgs"].values.items() if name.endswith("_rate")}
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     "3dgs": preset_values("3dgs", (1, 2, 4, 8)),

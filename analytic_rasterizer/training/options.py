@@ -14,14 +14,16 @@ BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 RANDOM_BACKGROUND = "random"
 
 
+FINEST_REPEATS = 2  # how often the finest of several scales occurs by default, where the others occur once
+
+
 class Preset(NamedTuple):
     """Values of `TrainingOptions` that belong together; the other options keep their defaults."""
 
     values: dict[str, Any]
-    finest_repeats: int | None = None  # scale_repeats of the finest of several scales; None: as by default
+    finest_repeats: int = FINEST_REPEATS  # scale_repeats of the finest of several scales; the others have 1
 
 
-FINEST_REPEATS = 2  # by default
 PRESETS = {
     "quick": Preset({"iterations": 7000}),
     "3dgs": Preset(
@@ -45,15 +47,13 @@ them reaches."""
 
 
 def preset_values(name: str, scales: tuple[int, ...]) -> dict[str, Any]:
-    """What a preset sets among `TrainingOptions`, `scale_repeats` for these scales included where it differs.
+    """What a preset sets among `TrainingOptions`, `scale_repeats` for these scales included.
 
     Raises:
         ValueError: No preset of this name.
     """
     _check("preset", name in PRESETS, f"one of {', '.join(PRESETS)}", name)
     preset = PRESETS[name]
-    if preset.finest_repeats is None:
-        return dict(preset.values)
     return preset.values | {"scale_repeats": repeats_of(scales, preset.finest_repeats)}
 
 
