@@ -46,7 +46,7 @@ from analytic_rasterizer.training.sharded import ShardedTrainer
 from analytic_rasterizer.training.trainer import Trainer
 
 PREDICTED = (4, 8, 64)
-NUMBERS_OF_A_SPLAT, BYTES_OF_A_SPLAT = 12, 88  # forth; forth and back, docs/distributed.md
+NUMBERS_OF_A_SPLAT, BYTES_OF_A_SPLAT = 12, 84  # forth; forth and back, docs/distributed.md
 BLACK = (0.0, 0.0, 0.0)
 COLUMNS = ("seconds", "exchange", "sent", "state_bytes", "peak_bytes")
 

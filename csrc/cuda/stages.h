@@ -109,8 +109,9 @@ struct ProjectRowsParams {
   Gaussians<float> gaussians;
   FootprintChoice footprint;
   CullBounds<float> bounds;
-  ProjectedRows<float> rows;  ///< [n]; those with radius 0 are not written
+  ProjectedRows<float> rows;  ///< [n]; those with radius 0 are not written; or all null
   int32_t* radii;             ///< [n]
+  PackedRows<float> packed;   ///< instead of rows and radii
 };
 
 struct ShapeRowsParams : ar::ShapeRowsParams<float> {
@@ -281,8 +282,9 @@ struct ProjectRowsVjpParams {
   CameraView<float> camera;
   Gaussians<float> gaussians;
   GaussianGrads<float> grads;
-  ProjectedRowGrads<float> rows;  ///< depths and colors may be null
-  float* camera_grads;            ///< as in ProjectVjpParams
+  ProjectedRowGrads<float> rows;
+  bool add;             ///< to the gradients that are there
+  float* camera_grads;  ///< as in ProjectVjpParams
 };
 
 struct RowGradsParams : ar::RowGradsParams<float> {

@@ -160,8 +160,17 @@ class CudaBackend final : public Backend {
     check_stage("project_rows", false);
   }
 
+  void pack_rows(const Inputs& in, const Pass& pass, const PackedTensors& packed) override {
+    cuda::ProjectRowsParams p = {};
+    set_projection<float>(p, in, pass, Tensor());
+    p.packed = packed_rows_of<float>(packed);
+    if (!p.packed.rows) return;
+    cuda::project_rows(p, stream_);
+    check_stage("pack_rows", false);
+  }
+
   SplatTensors shape_rows(const RowTensors& rows, const Pass& pass) override {
-    SplatTensors out = make_splats(rows.means2d.size(0));
+    SplatTensors out = make_splats(row_count(rows));
     cuda::ShapeRowsParams p = {};
     set_shape_rows<float>(p, rows, pass, out.splats);
     p.keys = structs_of<uint32_t>(out.keys);
@@ -391,6 +400,7 @@ class CudaBackend final : public Backend {
     cuda::ProjectRowsVjpParams p = {};
     set_projection_vjp<float>(p, in, grads);
     p.rows = projected_row_grads_of<float>(rows, dL_drows);
+    p.add = grads.add;
     const Tensor camera_grads = make_camera_grads(p, grads);
     cuda::project_rows_vjp(p, stream_);
     check_stage("project_rows_vjp", false);

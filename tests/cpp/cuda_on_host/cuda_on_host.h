@@ -166,6 +166,11 @@ inline float __int_as_float(int x) {
   std::memcpy(&y, &x, sizeof y);
   return y;
 }
+inline uint32_t __float_as_uint(float x) {
+  uint32_t bits;
+  std::memcpy(&bits, &x, sizeof bits);
+  return bits;
+}
 inline int __float_as_int(float x) {
   int y;
   std::memcpy(&y, &x, sizeof y);
