@@ -31,7 +31,8 @@ class Band:
         rank: Of this process, in `rows`.
         image: (3, rows of this band, W).
         alpha: (1, rows of this band, W), 1 - transmittance, in 0 to 1.
-        shard: The splats of the Gaussians of this rank in the whole image, as in `Batch.shard`.
+        shard: The splats of the Gaussians of this rank in the whole image. After the backward pass `means2d.grad`
+            (n, 2) is the gradient with respect to the projected means, per px.
         means2d_abs: (n, 2), as in `Batch.means2d_abs`; None unless asked for.
         first_id: Global id of the first Gaussian of this rank.
         count: Number of Gaussians of all ranks.

@@ -26,7 +26,7 @@ from ..settings import GaussianRasterizationSettings
 from ..stages import Splats, bin, blend, project
 from .agreement import REQUIREMENTS, Agreed, Facts, agree, digest_of, facts_of, place_in
 from .exchange import Route
-from .rows import Step, Together, agreeing, counted, rendered
+from .rows import OwnSplats, Step, Together, agreeing, counted, rendered
 
 _REQUIREMENTS = {
     "cameras": "settings must hold as many cameras on every rank",
@@ -60,8 +60,7 @@ class Batch:
         views: The cameras of this rank, ascending; empty where it has none.
         shard: For every camera of the step the splats of the Gaussians of this rank, with ids that count within the
             shard. `radii` are those of density control; after the backward pass `means2d.grad` (n, 2) is dL/d(projected
-            mean), per px. With more than one rank nothing else of them has a gradient, and a Gaussian whose colour is
-            not finite is among them, with radius 0.
+            mean), per px.
         means2d_abs: For every camera (n, 2), a row per row of `shard`, whose `grad` is the sum over pixels of the
             absolute values of dL/dmeans2d; empty unless asked for.
         first_id: Global id of the first Gaussian of this rank.
@@ -71,7 +70,7 @@ class Batch:
     """
 
     views: tuple[View, ...]
-    shard: tuple[Splats, ...]
+    shard: tuple[OwnSplats, ...]
     means2d_abs: tuple[torch.Tensor, ...]
     first_id: int
     count: int
@@ -180,7 +179,8 @@ def _of_one_rank(
         lists = bin(splats, background=bg.detach(), keep=torch.is_grad_enabled())
         image, alpha = blend(splats, lists, background=bg, means2d_abs=absolute[camera] if means2d_abs else None)
         views.append(View(camera, image[0], alpha[0], splats))
-    return Batch(tuple(views), shard, absolute, 0, len(means3D), means3D.new_zeros(()))
+    own = tuple(OwnSplats(s.means2d, s.radii, s.gaussian_ids, s.width, s.height) for s in shard)
+    return Batch(tuple(views), own, absolute, 0, len(means3D), means3D.new_zeros(()))
 
 
 def _projected(

@@ -10,7 +10,7 @@ import weakref
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import accumulate
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch.autograd.function import once_differentiable
@@ -24,6 +24,23 @@ _OPS = torch.ops.analytic_rasterizer
 _TENSORS = ("means3D", "opacities", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")
 _CAMERA_TENSORS = ("viewmatrix", "projmatrix", "campos", "lens")
 _ID_OF = {torch.float32: torch.int32, torch.float64: torch.int64}  # integers as wide as the numbers they travel among
+
+
+class OwnSplats(NamedTuple):
+    """The splats of this rank's Gaussians in one camera, as far as density control needs them.
+
+    Attributes:
+        means2d: (n, 2) px. After the backward pass `grad` is the gradient with respect to it, per px.
+        radii: (n,) int32, px. On several ranks 0 of a Gaussian whose colour is not finite.
+        gaussian_ids: (n,) int32, the row of each splat's Gaussian on this rank, ascending.
+        width, height: Of the image, px.
+    """
+
+    means2d: torch.Tensor
+    radii: torch.Tensor
+    gaussian_ids: torch.Tensor
+    width: int
+    height: int
 
 
 @dataclass(frozen=True)
@@ -104,7 +121,7 @@ class Step:
     keep: bool
     absolute: bool
     backgrounds: list[torch.Tensor]
-    own: tuple[Splats, ...] = ()
+    own: tuple[OwnSplats, ...] = ()
     received: tuple[Splats, ...] = ()
     means2d_abs: tuple[torch.Tensor, ...] = ()
 
@@ -117,7 +134,7 @@ class Step:
         self._blended: list[list[torch.Tensor]] | None = []  # what is saved of each camera; None: it has been used
         self._means2d: dict[int, weakref.ref] = {}
 
-    def take(self) -> tuple[tuple[Splats, ...], tuple[Splats, ...]]:
+    def take(self) -> tuple[tuple[OwnSplats, ...], tuple[Splats, ...]]:
         """What the forward pass made of splats, own and received, which the step then lets go of."""
         made = self.own, self.received
         self.own = self.received = ()
@@ -132,7 +149,7 @@ class Step:
         """Images (3, H, W) of this rank's cameras, and then their alphas (1, H, W)."""
         sent = self._rows_of_shard()
         rows = self._of_cameras(self.route.send(sent.view(-1), _C.ROW_WIDTH, True).view(-1, _C.ROW_WIDTH))
-        del sent
+        del sent  # before the memory is needed
         sizes = {c: group.batch for group in self.groups for c in group.cameras}
         images, alphas, received = [], [], []
         for camera, of_camera, background in zip(self.route.own, rows, self.backgrounds):
@@ -150,15 +167,16 @@ class Step:
         like = self.groups[0].gaussians["means3D"]
         rows = like.new_empty(self._total, _C.ROW_WIDTH)
         radii, ids = (like.new_empty(self._total, dtype=torch.int32) for _ in range(2))
-        own: dict[int, Splats] = {}
+        own: dict[int, OwnSplats] = {}
         for k, group in enumerate(self.groups):
             places, arguments = self.places(group), group.arguments(group.tensors)
             _OPS.pack_rows_(rows, radii, ids, **arguments, ends=group.ends, **places, first_id=self.first_id)
             self.groups[k] = replace(group, ends=None)
-            image = _image_arguments(group.batch)
+            size = group.batch["image_width"], group.batch["image_height"]
             for camera, first, count in zip(group.cameras, *places.values()):
                 part = slice(first, first + count)
-                own[camera] = _splats_of(rows[part], image, ids[part], radii[part], self._trains(group))
+                means2d = rows[part, :2].contiguous()  # a copy: the rows go when they have been sent
+                own[camera] = OwnSplats(means2d, radii[part], ids[part], *size)
         self.own = tuple(own[c] for c in range(len(own)))
         self._ids = ids
         if self.absolute:
@@ -286,29 +304,20 @@ def _image_arguments(batch: dict[str, Any]) -> dict[str, Any]:
     return {name: batch[name] for name in ("image_height", "image_width", "footprint", "option")}
 
 
-def _splats_of(
-    rows: torch.Tensor,
-    image: dict[str, Any],
-    ids: torch.Tensor | None = None,
-    radii: torch.Tensor | None = None,
-    trains: bool = False,
-) -> Splats:
-    """Rows of one camera by the names of their columns, without copying them; but for the means of splats that are
-    trained, which are kept when the rows are not. Without `ids` those that the rows hold."""
-    columns = rows.detach()
-    if ids is None:
-        ids = columns.view(_ID_OF[rows.dtype])[:, 11].int()
+def _splats_of(rows: torch.Tensor, image: dict[str, Any]) -> Splats:
+    """Rows of one camera by the names of their columns, without copying them."""
+    ids = rows.view(_ID_OF[rows.dtype])[:, 11].int()
     return Splats(
-        means2d=columns[:, :2].contiguous() if trains else columns[:, :2],
-        cov2d=columns[:, 2:5],
-        opacities=columns[:, 5],
-        depths=columns[:, 6],
-        colors=columns[:, 7:10],
-        radii=ids.new_empty(0) if radii is None else radii,
+        means2d=rows[:, :2],
+        cov2d=rows[:, 2:5],
+        opacities=rows[:, 5],
+        depths=rows[:, 6],
+        colors=rows[:, 7:10],
+        radii=ids.new_empty(0),
         gaussian_ids=ids,
         camera_ids=ids.new_zeros(1).expand(len(rows)),
         row_splits=torch.tensor([0, len(rows)]),
-        dets=columns[:, 10],
+        dets=rows[:, 10],
         width=image["image_width"],
         height=image["image_height"],
         footprint=image["footprint"],
