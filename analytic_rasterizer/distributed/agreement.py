@@ -196,9 +196,9 @@ def _channel(group: dist.ProcessGroup | None) -> torch.device:
 
 def _gathered(message: torch.Tensor, world: int, group: dist.ProcessGroup | None) -> list[list[int]]:
     """The integers of every rank, as many from each."""
-    received = message.new_empty(world * len(message))
-    dist.all_gather_into_tensor(received, message, group=group)
-    return received.view(world, -1).tolist()  # waits for the device
+    received = message.new_empty(world, len(message))
+    dist.all_gather(list(received.unbind()), message, group=group)
+    return received.tolist()  # waits for the device
 
 
 def gather(numbers: list[int], world: int, group: dist.ProcessGroup | None) -> list[list[int]]:
