@@ -78,14 +78,28 @@ class Route:
         numbers = [size * widths[k % len(widths)] for k, size in enumerate(sizes)]
         return _shaped(self.send(flat, sum(widths), False).split(numbers), sizes, shapes)
 
+    def rows(self, forth: bool) -> tuple[list[int], list[int]]:
+        """How many this rank receives from each rank and sends to each, on the way to the cameras or back."""
+        sent = [sum(self.counts[self.rank][c] for c in cameras) for cameras in self.cameras]
+        received = [sum(of_rank[c] for c in self.own) for of_rank in self.counts]
+        return (received, sent) if forth else (sent, received)
+
     def send(self, flat: torch.Tensor, width: int, forth: bool) -> torch.Tensor:
         """Sends rows of `width` numbers to the cameras or back, in whatever order within those for a rank."""
-        sent = [width * sum(self.counts[self.rank][c] for c in cameras) for cameras in self.cameras]
-        received = [width * sum(of_rank[c] for c in self.own) for of_rank in self.counts]
-        if not forth:
-            sent, received = received, sent
+        received, sent = ([width * n for n in numbers] for numbers in self.rows(forth))
         out = flat.new_empty(sum(received))
-        dist.all_to_all_single(out, flat, received, sent, group=self.group)
+        kept, last = sent[self.rank], len(sent) - 1
+        if self.rank not in (0, last):
+            dist.all_to_all_single(out, flat, received, sent, group=self.group)
+            return out
+        # What stays, which lies at an end, is copied meanwhile: NCCL is slower at it.
+        received[self.rank] = sent[self.rank] = 0
+        at_start = self.rank == 0
+        parts = [(t[:kept], t[kept:]) if at_start else (t[len(t) - kept :], t[: len(t) - kept]) for t in (out, flat)]
+        (stays_to, comes), (stays, goes) = parts
+        work = dist.all_to_all_single(comes, goes, received, sent, group=self.group, async_op=True)
+        stays_to.copy_(stays)
+        work.wait()
         return out
 
 
