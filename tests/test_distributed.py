@@ -472,9 +472,10 @@ def calls(device):
     n = int(ends[0, -1])
     rows = torch.zeros(2 * n, _C.ROW_WIDTH, device=device)
     radii, ids = (torch.zeros(2 * n, dtype=torch.int32, device=device) for _ in range(2))
-    places = {"firsts": [n, 0], "counts": [n, n]}
-    packed = arguments | {"rows": rows, "radii": radii, "ids": ids, "ends": ends, "first_id": 7} | places
+    packed = arguments | {"rows": rows, "radii": radii, "ids": ids, "ends": ends, "first_id": 7}
+    packed["firsts"] = torch.tensor([n, 0], device=device)
     ops.pack_rows_(**packed)
+    places = {"firsts": [n, 0], "counts": [n, n]}
     image = {name: batch[name] for name in ("image_height", "image_width", "footprint", "option")}
     background = settings[0].bg
     blended = {"rows": rows[:n], "background": background, **image, "keep": True}
@@ -506,7 +507,8 @@ def test_opcheck(op, calls):
     "op, change, message",
     [
         ("pack_rows_", {"rows": torch.zeros(3, 5)}, "rows must be a contiguous matrix of 12 columns"),
-        ("pack_rows_", {"firsts": [0, 10**6]}, "firsts and counts must be places of 2 cameras among"),
+        ("pack_rows_", {"firsts": torch.zeros(2)}, "firsts must hold 2 contiguous int64"),
+        ("pack_rows_vjp", {"firsts": [0, 10**6]}, "firsts and counts must be places of 2 cameras among"),
         ("pack_rows_", {"radii": torch.zeros(1, dtype=torch.int32)}, "radii must hold"),
         ("pack_rows_", {"shs": None}, "shs or colors_precomp must be given, got neither"),
         ("pack_rows_vjp", {"dL_drows": torch.zeros(4, 10)}, "dL_drows must be a contiguous matrix of 9 columns"),

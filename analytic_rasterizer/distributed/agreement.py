@@ -60,6 +60,7 @@ def agree(
     make: Callable[[], tuple[Made, Facts, torch.Tensor | None]],
     requirements: dict[str, str | None],
     group: dist.ProcessGroup | None,
+    meanwhile: Callable[[Made], None] = lambda _: None,
 ) -> tuple[Made, Agreed]:
     """What `make` returns on this rank, and what all ranks told each other. For several ranks. The host waits once.
 
@@ -67,6 +68,8 @@ def agree(
         make: Returns what it made, the facts that `requirements` names, and None or counts, a vector of int64 whose
             length is the fact "cameras".
         requirements: By fact what to say of ranks that differ in it; None: they may.
+        meanwhile: Called with what was made while the message is on its way, to give the device something to do. What
+            it raises the other ranks do not hear of.
 
     Raises:
         TypeError, ValueError, RuntimeError: On every rank the same, if `make` raised on one of them, which the message
@@ -81,7 +84,12 @@ def agree(
     numbers = [facts[name] for name in requirements]
     room = _ROOM - 1 - len(numbers)
     message = _message([int(error is not None), *numbers], counts if counts is None else counts[:room], group)
-    rows = _gathered(message, world, group)
+    wait = _begin_gathering(message, world, group)
+    try:
+        if error is None:
+            meanwhile(made)
+    finally:
+        rows = wait().tolist()
     if any(row[0] for row in rows):
         reports: list[Any] = [None] * world
         kind = next((k for k in (TypeError, ValueError) if isinstance(error, k)), RuntimeError)
@@ -194,11 +202,38 @@ def _channel(group: dist.ProcessGroup | None) -> torch.device:
     return torch.device("cpu")
 
 
+def _begin_gathering(message: torch.Tensor, world: int, group: dist.ProcessGroup | None) -> Callable[[], torch.Tensor]:
+    """A function, to be called once, that waits for the messages of all ranks and returns them, (world, integers) on
+    the CPU. On CUDA it does not wait for what the device is given between this call and that one."""
+    received = message.new_empty(world, len(message))
+    work = dist.all_gather(list(received.unbind()), message, group=group, async_op=True)
+    if not received.is_cuda:
+        work.wait()
+        return lambda: received
+    on_host = torch.empty(received.shape, dtype=received.dtype, pin_memory=True)
+    arrived = torch.cuda.Event()
+    with torch.cuda.stream(_side_stream(received.device)):
+        work.wait()  # lets the stream wait, not the host
+        on_host.copy_(received, non_blocking=True)
+        arrived.record()
+    in_use = [message, received, work]  # until then
+
+    def wait() -> torch.Tensor:
+        arrived.synchronize()
+        in_use.clear()
+        return on_host
+
+    return wait
+
+
+@lru_cache(maxsize=16)
+def _side_stream(device: torch.device) -> torch.cuda.Stream:
+    return torch.cuda.Stream(device)
+
+
 def _gathered(message: torch.Tensor, world: int, group: dist.ProcessGroup | None) -> list[list[int]]:
     """The integers of every rank, as many from each."""
-    received = message.new_empty(world, len(message))
-    dist.all_gather(list(received.unbind()), message, group=group)
-    return received.tolist()  # waits for the device
+    return _begin_gathering(message, world, group)().tolist()
 
 
 def gather(numbers: list[int], world: int, group: dist.ProcessGroup | None) -> list[list[int]]:

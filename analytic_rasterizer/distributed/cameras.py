@@ -24,9 +24,9 @@ from ..arguments import check_tensors
 from ..effects import AUTO
 from ..settings import GaussianRasterizationSettings
 from ..stages import Splats, bin, blend, project
-from .agreement import REQUIREMENTS, Agreed, Facts, agree, digest_of, facts_of, place_in
+from .agreement import REQUIREMENTS, Facts, agree, digest_of, facts_of, place_in
 from .exchange import Route
-from .rows import OwnSplats, Step, Together, agreeing, counted, rendered
+from .rows import OwnSplats, Shard, Step, agreeing, counted, rendered
 
 _REQUIREMENTS = {
     "cameras": "settings must hold as many cameras on every rank",
@@ -138,28 +138,21 @@ def rasterize(
         facts = {"cameras": len(cameras), "settings": digest, **facts_of(means3D, tensors, group)}
         if means2d_abs:
             facts["requires_grad"] = facts["grad_enabled"]
-        return (cameras, settled, groups), facts, torch.cat([g.counts() for g in groups])
+        cameras_of = [[c for c, owner in enumerate(settled) if owner == r] for r in range(world)]
+        own = Shard(groups, [c for of_rank in cameras_of for c in of_rank])
+        return (cameras, cameras_of, own), facts, own.counts
 
-    (cameras, owners, groups), agreed = agree(make, _REQUIREMENTS, group)
+    (cameras, cameras_of, own), agreed = agree(make, _REQUIREMENTS, group, meanwhile=lambda made: made[-1].begin())
     first_id, count, join = summary_of(agreed.facts, rank)
-    route = _route_of(agreed, groups, owners, rank, group)
+    counts = [[n for _, n in sorted(zip(own.order, of_rank))] for of_rank in agreed.counts]
+    route = Route(counts, cameras_of, rank, group)
     backgrounds = [cameras[c].bg for c in route.own]
     keep = torch.is_grad_enabled() and (join or any(bg.requires_grad for bg in backgrounds))
-    step = Step(groups, route, first_id, join, keep, means2d_abs, backgrounds)
+    step = Step(own, route, first_id, join, keep, means2d_abs, backgrounds)
     anchor, images, alphas = rendered(step)
     shard, received = step.take()
     views = tuple(View(*of_camera) for of_camera in zip(route.own, images, alphas, received))
     return Batch(views, shard, step.means2d_abs, first_id, count, anchor)
-
-
-def _route_of(
-    agreed: Agreed, groups: list[Together], owners: list[int], rank: int, group: dist.ProcessGroup | None
-) -> Route:
-    """Which rows go where, from counts that are in the order of the cameras of the groups."""
-    counted_cameras = [c for of_group in groups for c in of_group.cameras]
-    counts = [[n for _, n in sorted(zip(counted_cameras, of_rank))] for of_rank in agreed.counts]
-    cameras = [[c for c, owner in enumerate(owners) if owner == r] for r in range(len(counts))]
-    return Route(counts, cameras, rank, group)
 
 
 def _of_one_rank(

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import accumulate
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch.autograd.function import once_differentiable
@@ -97,12 +99,80 @@ def agreeing(cameras: list[GaussianRasterizationSettings]) -> dict[tuple, list[i
     return groups
 
 
+@lru_cache(maxsize=64)
+def _index(places: tuple[int, ...], device: torch.device) -> torch.Tensor:
+    return torch.tensor(places, device=device)
+
+
+def _at(values: torch.Tensor, places: Sequence[int]) -> torch.Tensor:
+    """The values at these places of a vector. Once an index is on its device nobody waits for it."""
+    if list(places) == list(range(len(values))):
+        return values
+    return values[_index(tuple(places), values.device)]
+
+
+class Shard:
+    """The rows of this rank's Gaussians in all cameras, in the order in which they are sent.
+
+    They can be written before the host knows how many they are: where each camera's begin is known on the device, and
+    how much room they need is guessed from the steps before. What has been guessed wrong is written again.
+
+    Attributes:
+        groups: All cameras.
+        order: The cameras in the order in which their rows are sent.
+        counts: (C,) int64, rows of each camera in this order, on the device.
+    """
+
+    _guesses: ClassVar[dict[tuple, tuple[int, int]]] = {}  # room and id of the first Gaussian, by what is rendered
+
+    def __init__(self, groups: list[Together], order: list[int]):
+        self.groups, self.order = groups, order
+        grouped = [c for group in groups for c in group.cameras]
+        self.counts = _at(torch.cat([group.counts() for group in groups]), [grouped.index(c) for c in order])
+        firsts = _at(self.counts.cumsum(0) - self.counts, [order.index(c) for c in grouped])
+        self._firsts = firsts.split([len(group.cameras) for group in groups])
+        self._key = len(order), self.counts.device
+        self._made: tuple[torch.Tensor, ...] | None = None
+        self._first_id = 0
+
+    def begin(self) -> None:
+        """Writes rows as far as they can be guessed."""
+        guess = self._guesses.get(self._key)
+        if guess is None:
+            return
+        room, first_id = guess
+        most = len(self.order) * len(self.groups[0].gaussians["means3D"])
+        with suppress(torch.OutOfMemoryError):  # there may be enough for as many as there are
+            self._write(min(room, most), first_id)
+
+    def finish(self, total: int, first_id: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """All rows (total, ROW_WIDTH), their radii and ids (total,), the ids in the rows counting from `first_id`."""
+        if self._made is None or len(self._made[0]) < total or self._first_id != first_id:
+            self._made = None
+            self._write(total, first_id)
+        room = max(total + total // 16, self._guesses.get(self._key, (0, 0))[0] * 15 // 16)
+        self._guesses[self._key] = room, first_id
+        rows, radii, ids = (t[:total] for t in self._made)
+        self._made, self.groups[:] = None, [replace(group, ends=None) for group in self.groups]
+        return rows, radii, ids
+
+    @torch.no_grad()
+    def _write(self, room: int, first_id: int) -> None:
+        like = self.groups[0].gaussians["means3D"]
+        rows = like.new_empty(room, _C.ROW_WIDTH)
+        radii, ids = (like.new_empty(room, dtype=torch.int32) for _ in range(2))
+        for group, firsts in zip(self.groups, self._firsts):
+            arguments = group.gaussians | group.batch
+            _OPS.pack_rows_(rows, radii, ids, **arguments, ends=group.ends, firsts=firsts, first_id=first_id)
+        self._made, self._first_id = (rows, radii, ids), first_id
+
+
 @dataclass
 class Step:
     """A step between its agreement and its backward pass.
 
     Attributes:
-        groups: All cameras.
+        shard: The rows of this rank's Gaussians.
         route: Which rows go where.
         first_id: Global id of the first Gaussian of this rank.
         join: Whether any rank needs a gradient with respect to Gaussians or cameras.
@@ -114,7 +184,7 @@ class Step:
         means2d_abs: (n, 2) for each camera, which the backward pass gives gradients; empty unless wanted.
     """
 
-    groups: list[Together]
+    shard: Shard
     route: Route
     first_id: int
     join: bool
@@ -126,6 +196,7 @@ class Step:
     means2d_abs: tuple[torch.Tensor, ...] = ()
 
     def __post_init__(self):
+        self.groups = self.shard.groups
         counts = self.route.counts[self.route.rank]
         ends = list(accumulate(counts[c] for c in self.route.order))
         self._first = {c: end - counts[c] for c, end in zip(self.route.order, ends)}  # of the rows that are sent
@@ -164,16 +235,12 @@ class Step:
 
     def _rows_of_shard(self) -> torch.Tensor:
         """The rows of this rank's Gaussians in all cameras, in the order in which they are sent."""
-        like = self.groups[0].gaussians["means3D"]
-        rows = like.new_empty(self._total, _C.ROW_WIDTH)
-        radii, ids = (like.new_empty(self._total, dtype=torch.int32) for _ in range(2))
+        rows, radii, ids = self.shard.finish(self._total, self.first_id)
+        like = rows
         own: dict[int, OwnSplats] = {}
-        for k, group in enumerate(self.groups):
-            places, arguments = self.places(group), group.arguments(group.tensors)
-            _OPS.pack_rows_(rows, radii, ids, **arguments, ends=group.ends, **places, first_id=self.first_id)
-            self.groups[k] = replace(group, ends=None)
+        for group in self.groups:
             size = group.batch["image_width"], group.batch["image_height"]
-            for camera, first, count in zip(group.cameras, *places.values()):
+            for camera, first, count in zip(group.cameras, *self.places(group).values()):
                 part = slice(first, first + count)
                 means2d = rows[part, :2].contiguous()  # a copy: the rows go when they have been sent
                 own[camera] = OwnSplats(means2d, radii[part], ids[part], *size)

@@ -227,9 +227,11 @@ template <typename T> struct ProjectedRowGrads {
 /// Where `project_rows` writes PackedRow instead of ProjectedRows: those of the Gaussians that may be seen, as `ends`
 /// counts them.
 template <typename T> struct PackedRows {
-  PackedRow<T>* rows;    ///< null: they are not wanted
+  PackedRow<T>* rows;    ///< [room] of several cameras; null: they are not wanted
+  int64_t room;          ///< what would lie behind it is not written
+  const int64_t* first;  ///< [1] place of this camera's rows
   const int32_t* ends;   ///< [gaussians] how many up to this one, itself included, have a radius without their colours
-  int32_t *radii, *ids;  ///< [rows] radius, 0 if the colour is not finite; Gaussian
+  int32_t *radii, *ids;  ///< [room] radius, 0 if the colour is not finite; Gaussian
   int64_t first_id;      ///< PackedRow::id of Gaussian 0
 };
 

@@ -328,12 +328,14 @@ struct AdamArguments {
   }
 };
 
-/// Arguments of `pack_rows_`: what `project` takes, and which Gaussians have rows.
-struct PackArguments : ProjectArguments, PackedPlaces {
-  WrittenTensor<'a'> rows;   ///< (n, kPackedWidth)
-  WrittenTensor<'b'> radii;  ///< (n,) int32
-  WrittenTensor<'c'> ids;    ///< (n,) int32
+/// Arguments of `pack_rows_`: what `project` takes, which Gaussians have rows, and where. What does not fit the room is
+/// left out.
+struct PackArguments : ProjectArguments {
+  WrittenTensor<'a'> rows;   ///< (room, kPackedWidth)
+  WrittenTensor<'b'> radii;  ///< (room,) int32
+  WrittenTensor<'c'> ids;    ///< (room,) int32
   Tensor ends;               ///< (C, P) int32, of `count_rows`
+  Tensor firsts;             ///< (C,) int64 on the device, place of each camera's first row
   int64_t first_id = 0;      ///< what ids in `rows` begin with
 
   template <class Visit> void each(Visit&& visit) {
@@ -342,7 +344,7 @@ struct PackArguments : ProjectArguments, PackedPlaces {
     visit("ids", ids);
     ProjectArguments::each(visit);
     visit("ends", ends);
-    PackedPlaces::each(visit);
+    visit("firsts", firsts);
     visit("first_id", first_id);
   }
 };

@@ -99,9 +99,10 @@ struct RowTensors {
 
 /// Where `project_rows` leaves packed rows (PackedRows in core/stages.h).
 struct PackedTensors {
-  Tensor rows;        ///< (n, kPackedWidth)
-  Tensor radii, ids;  ///< (n,) int32
+  Tensor rows;        ///< (room, kPackedWidth)
+  Tensor radii, ids;  ///< (room,) int32
   Tensor ends;        ///< (P,) int32
+  Tensor first;       ///< () int64
   int64_t first_id;
 };
 

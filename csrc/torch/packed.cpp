@@ -97,16 +97,16 @@ Results pack_rows(PackArguments a) {
   const int64_t cameras = check_cameras(a), rows = a.rows.size(0);
   TORCH_CHECK_VALUE(a.shs || a.colors_precomp, "shs or colors_precomp must be given, got neither");
   check_matrix_of(a.rows, "rows", a.means3D, kPackedWidth);
-  check_places(a, cameras, rows);
   check_ints(a.radii, "radii", rows, a.means3D);
   check_ints(a.ids, "ids", rows, a.means3D);
   check_ints(a.ends, "ends", cameras * a.count(), a.means3D);
+  TORCH_CHECK_VALUE(a.firsts.numel() == cameras && a.firsts.is_contiguous() && a.firsts.scalar_type() == at::kLong &&
+                        a.firsts.device() == a.means3D.device(),
+                    "firsts must hold ", cameras, " contiguous int64 on the device of the others");
   for (int64_t c = 0; c < cameras; ++c) {
     Inputs in = inputs_of(a, c);
     check(in);
-    const int64_t first = a.firsts[c], last = first + a.counts[c];
-    const auto part = [&](const Tensor& t) { return t.slice(0, first, last); };
-    make_backend(in.means3D)->pack_rows(in, pass, {part(a.rows), part(a.radii), part(a.ids), a.ends[c], a.first_id});
+    make_backend(in.means3D)->pack_rows(in, pass, {a.rows, a.radii, a.ids, a.ends[c], a.firsts[c], a.first_id});
   }
   return {};
 }

@@ -88,6 +88,8 @@ template <typename T> ProjectedRowGrads<T> projected_row_grads_of(const Tensor& 
 template <typename T> PackedRows<T> packed_rows_of(const PackedTensors& packed) {
   PackedRows<T> out;
   out.rows = reinterpret_cast<PackedRow<T>*>(pointer<T>(packed.rows));
+  out.room = packed.rows.size(0);
+  out.first = const_pointer<int64_t>(packed.first);
   out.ends = const_pointer<int32_t>(packed.ends);
   out.radii = pointer<int32_t>(packed.radii);
   out.ids = pointer<int32_t>(packed.ids);

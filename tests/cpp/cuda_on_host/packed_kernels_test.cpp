@@ -75,7 +75,7 @@ void project(const ProjectRowsParams& p) {
   cuda_on_host::launch(kBlocks, kProjectThreads, [&] { project_rows_kernel<Cam>(p); });
 }
 
-/// Packed rows, as they are counted and written.
+/// Packed rows, as they are counted and written, behind a place that is left for others.
 struct Packed {
   std::vector<int32_t> ends, radii, ids;
   std::vector<float> rows;
@@ -87,12 +87,20 @@ struct Packed {
     p.radii = seen.data();
     project(p);
     for (int i = 0; i < kCount; ++i) ends[i] = count += seen[i] > 0;
-    rows.resize(kPackedWidth * count);
-    radii.resize(count);
-    ids.resize(count);
+    const int64_t first = 1;
+    rows.assign(kPackedWidth * (count + 1), -7);
+    radii.assign(count + 1, -7);
+    ids.assign(count + 1, -7);
     p.radii = nullptr;
-    p.packed = {as<PackedRow<float>>(rows), ends.data(), radii.data(), ids.data(), 1000};
+    p.packed = {as<PackedRow<float>>(rows), count, &first, ends.data(), radii.data(), ids.data(), 1000};
+    project(p);  // without room for the last one
+    EXPECT_EQ(ids.back(), -7);
+    p.packed.room = count + 1;
     project(p);
+    EXPECT_EQ(ids[0], -7);
+    rows.erase(rows.begin(), rows.begin() + kPackedWidth);
+    radii.erase(radii.begin());
+    ids.erase(ids.begin());
   }
 };
 
