@@ -7,13 +7,17 @@
 
 namespace ar::cuda {
 
-inline constexpr int kDepthPasses = 4;
+/// With keys as depth_key makes them the last of the passes has nothing to do for depths of 1/8 to 8192.
+inline constexpr int kDepthBits = 9, kDepthPasses = 4;
+using DepthDigits = Digits<kDepthBits>;
+using DepthScratch = SortScratch<kDepthBits>;
 inline constexpr int kCountThreads = 512, kCountBlocks = 132 * 2;
 
 /// Histograms of all digits of the depth keys of splats with pairs; how many of these there are, and
 /// how many pairs.
 __global__ void __launch_bounds__(kCountThreads) count_depths_kernel(const uint32_t* keys, const PairRange* ranges,
                                                                      int64_t n, uint32_t* histograms, Counts* counts) {
+  constexpr int kBins = DepthDigits::kBins;
   __shared__ uint32_t local[kDepthPasses * kBins];
   for (int b = threadIdx.x; b < kDepthPasses * kBins; b += kCountThreads) local[b] = 0;
   __syncthreads();
@@ -22,7 +26,7 @@ __global__ void __launch_bounds__(kCountThreads) count_depths_kernel(const uint3
   for (int64_t i = int64_t(blockIdx.x) * kCountThreads + threadIdx.x; i < rounded; i += stride) {
     const uint32_t key = i < n ? keys[i] : kCulledKey;
     const bool valid = key != kCulledKey;
-    count_digits<kDepthPasses>(key, valid, local);
+    count_digits<kDepthBits, kDepthPasses>(key, valid, local);
     if (valid) pairs += ranges[i].count;
     splats += valid;
   }
@@ -40,10 +44,11 @@ __global__ void __launch_bounds__(kCountThreads) count_depths_kernel(const uint3
 }
 
 /// Calls run(kernel, arguments...) for the passes of a sort by depth, in order.
-template <class Run> void for_each_depth_pass(const DepthSort& p, const SortScratch& scratch, Run&& run) {
-  run(sort_pass_kernel<int32_t, true>, scratch, 0, p.n, kCulledKey, p.keys[0], p.keys[1], nullptr, p.order[1]);
+template <class Run> void for_each_depth_pass(const DepthSort& p, const DepthScratch& scratch, Run&& run) {
+  run(sort_pass_kernel<kDepthBits, int32_t, true>, scratch, 0, true, p.n, kCulledKey, p.keys[0], p.keys[1], p.order[0],
+      p.order[1]);
   for (int pass = 1; pass < kDepthPasses; ++pass) {
-    run(sort_pass_kernel<int32_t, false>, scratch, pass, 0, 0, p.keys[pass % 2], p.keys[1 - pass % 2],
+    run(sort_pass_kernel<kDepthBits, int32_t, false>, scratch, pass, true, 0, 0, p.keys[pass % 2], p.keys[1 - pass % 2],
         p.order[pass % 2], p.order[1 - pass % 2]);
   }
 }

@@ -37,7 +37,10 @@ AR_HD int front_chunks(TileGrid grid, int samples) {
 }
 
 /// Depth keys of splats without pairs: after all others.
-inline constexpr uint32_t kCulledKey = 0x7fffffff;
+inline constexpr uint32_t kCulledKey = 0xffffffff;
+/// The depth key of a splat is that of its depth's bits, which have the order of depths >= +0, plus this: so that the
+/// bits from the 27th on are the same for all depths from 1/8 to less than 8192, and need not be sorted.
+inline constexpr uint32_t kDepthKeyOffset = 0x02000000;
 
 /// Where the pairs of a splat are, in the order in which they are emitted.
 struct PairRange {

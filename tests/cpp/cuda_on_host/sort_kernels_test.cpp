@@ -18,11 +18,12 @@ uint32_t key_of(float depth) {
   if (depth == kCulled) return kCulledKey;
   uint32_t key;
   std::memcpy(&key, &depth, sizeof key);
-  return key;
+  return key + kDepthKeyOffset;
 }
 
-/// Sorts as count_depths and sort_by_depth do.
-void expect_sorted(const std::vector<float>& depths) {
+/// Sorts as count_depths and sort_by_depth do, but for passes behind the first `passes`: what these leave must be the
+/// result.
+void expect_sorted(const std::vector<float>& depths, int passes = kDepthPasses) {
   const auto n = int64_t(depths.size());
   std::vector<uint32_t> keys[2] = {{}, std::vector<uint32_t>(n)};
   for (float depth : depths) keys[0].push_back(key_of(depth));
@@ -38,8 +39,8 @@ void expect_sorted(const std::vector<float>& depths) {
   }
   std::stable_sort(expected.begin(), expected.end(), [&](int32_t a, int32_t b) { return depths[a] < depths[b]; });
 
-  std::vector<uint32_t> memory(SortScratch::words(n, kDepthPasses));
-  const SortScratch scratch(memory.data(), n, kDepthPasses);
+  std::vector<uint32_t> memory(DepthScratch::words(n, kDepthPasses));
+  const DepthScratch scratch(memory.data(), n, kDepthPasses);
   Counts counts = {};
   const DepthSort sort = {
       n, {keys[0].data(), keys[1].data()}, {order[0].data(), order[1].data()}, ranges.data(), &counts};
@@ -48,7 +49,7 @@ void expect_sorted(const std::vector<float>& depths) {
   ASSERT_EQ(counts.splats, int64_t(expected.size()));
   ASSERT_EQ(counts.pairs, pairs);
   for_each_depth_pass(sort, scratch, [&](auto kernel, auto... arguments) {
-    cuda_on_host::launch(int(scratch.blocks), kSortThreads, [&] { kernel(arguments...); });
+    if (passes-- > 0) cuda_on_host::launch(int(scratch.blocks), DepthDigits::kThreads, [&] { kernel(arguments...); });
   });
   order[0].resize(expected.size());
   ASSERT_EQ(order[0], expected);
@@ -63,6 +64,20 @@ std::vector<float> random_depths(int n, float nearest, float farthest, int one_c
 }
 
 TEST(SortKernels, Depths) { expect_sorted(random_depths(2 * kSortTile + 100, 0.2f, 100)); }
+
+/// Where all depths lie between 1/8 and 8192 the last pass has nothing to do, and may be left out.
+TEST(SortKernels, TheLastPassIsForDepthsThatAreVeryDifferent) {
+  std::vector<float> depths = random_depths(kSortTile + 700, 0.125f, 8191);
+  depths[5] = 0.125f, depths[6] = std::nextafter(8192.0f, 0.0f);
+  expect_sorted(depths, 3);
+  expect_sorted(depths);
+  for (const float other : {std::nextafter(0.125f, 0.0f), 8192.0f}) {
+    depths[700] = other;
+    expect_sorted(depths);
+  }
+  for (float& depth : depths) depth = depth == kCulled ? kCulled : 65536 * depth;  // all of them far away
+  expect_sorted(depths);
+}
 
 TEST(SortKernels, DepthsOfEveryMagnitude) { expect_sorted(random_depths(kSortTile + 1, 1e-37f, 1e37f)); }
 
