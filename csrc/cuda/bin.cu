@@ -35,30 +35,6 @@ __global__ void __launch_bounds__(kCountThreads)
   }
 }
 
-constexpr int kRangeThreads = 128;
-
-/// Each tile finds its first pair. Tells the host how many pairs there are.
-__global__ void __launch_bounds__(kRangeThreads)
-    tile_offsets_kernel(const uint32_t* tiles, const Counts* counts, int64_t capacity, int64_t tile_count,
-                        int64_t* tile_offsets, PairFeedback feedback) {
-  if (blockIdx.x == 0 && threadIdx.x == 0 && feedback.word) {
-    const uint64_t pairs = min(uint64_t(counts->pairs), uint64_t(0xffffffff));
-    *feedback.word = uint64_t(feedback.frame) << 32 | pairs;
-  }
-  const int64_t tile = int64_t(blockIdx.x) * kRangeThreads + threadIdx.x;
-  if (counts->pairs > capacity || tile > tile_count) return;
-  int64_t low = 0, high = counts->pairs;
-  while (low < high) {
-    const int64_t middle = (low + high) / 2;
-    if (tiles[middle] < tile) {
-      low = middle + 1;
-    } else {
-      high = middle;
-    }
-  }
-  tile_offsets[tile] = low;
-}
-
 constexpr int kPlanThreads = 256;
 
 /// Work is handed out by samples, and of those longest first, so that no block starts on a long piece when the others
@@ -169,8 +145,8 @@ void sort_values(const TileSort<Value>& p, TileGrid grid, uint32_t* memory, cuda
     launch(sort_pass_kernel<kTileBits, Value, false>, {unsigned(scratch.blocks), TileDigits::kThreads}, stream, scratch,
            pass, false, 0, 0, p.tiles[pass % 2], p.tiles[1 - pass % 2], p.values[pass % 2], p.values[1 - pass % 2]);
   }
-  launch(tile_offsets_kernel, {blocks_of(grid.tiles() + 1, kRangeThreads), kRangeThreads}, stream, p.tiles[passes % 2],
-         p.counts, p.capacity, grid.tiles(), p.tile_offsets, p.feedback);
+  launch(tile_offsets_kernel, {blocks_of(grid.tiles() + 1, kRangeTiles), kRangeTiles * kRangeLanes}, stream,
+         p.tiles[passes % 2], p.counts, p.capacity, grid.tiles(), p.tile_offsets, p.feedback);
 }
 
 }  // namespace

@@ -1,4 +1,4 @@
-// Kernels of bin that sort splats by depth and write the pairs of each.
+// Kernels of bin that sort splats by depth, write the pairs of each, and find those of each tile.
 #pragma once
 
 #include "core/bin.h"
@@ -130,6 +130,22 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
       place += __shfl_sync(kAllLanes, up_to, 31);
     }
   }
+}
+
+/// Tiles of a block, and the lanes that look for the first pair of each.
+inline constexpr int kRangeTiles = 16, kRangeLanes = 8;
+
+/// Each tile finds its first pair. Tells the host how many pairs there are.
+__global__ void __launch_bounds__(kRangeTiles* kRangeLanes)
+    tile_offsets_kernel(const uint32_t* tiles, const Counts* counts, int64_t capacity, int64_t tile_count,
+                        int64_t* tile_offsets, PairFeedback feedback) {
+  const int64_t pairs = counts->pairs;
+  if (blockIdx.x == 0 && threadIdx.x == 0 && feedback.word)
+    *feedback.word = uint64_t(feedback.frame) << 32 | min(uint64_t(pairs), uint64_t(0xffffffff));
+  if (pairs > capacity) return;
+  const int64_t tile = int64_t(blockIdx.x) * kRangeTiles + threadIdx.x / kRangeLanes;
+  const int first = partition_point<kRangeLanes>(int(pairs), [&](int k) { return tiles[k] < tile; });
+  if (tile <= tile_count && threadIdx.x % kRangeLanes == 0) tile_offsets[tile] = first;
 }
 
 }  // namespace ar::cuda

@@ -1,4 +1,5 @@
-// The kernels that sort splats by depth, run on the host, against std::stable_sort.
+// The kernels that sort splats by depth, and that find the pairs of each tile, run on the host, against the algorithms
+// of the standard library.
 #include <cstring>
 #include <numeric>
 #include <random>
@@ -91,6 +92,27 @@ TEST(SortKernels, TiesKeepInputOrder) {
   std::vector<float> depths = random_depths(kSortTile, 0.2f, 4);
   for (float& depth : depths) depth = depth == kCulled ? kCulled : std::ceil(depth);
   expect_sorted(depths);
+}
+
+TEST(SortKernels, FirstPairsOfTiles) {
+  std::mt19937 bits(7);
+  for (const int tile_count : {1, 15, 100}) {
+    for (const int pairs : {0, 1, 8, 9, 10, 81, 5000}) {
+      std::vector<uint32_t> tiles(pairs);
+      for (uint32_t& tile : tiles) tile = uint32_t(bits() % tile_count) * 2 % tile_count;  // some tiles have none
+      std::sort(tiles.begin(), tiles.end());
+      std::vector<int64_t> offsets(tile_count + 1, -1), expected;
+      for (int tile = 0; tile <= tile_count; ++tile)
+        expected.push_back(std::lower_bound(tiles.begin(), tiles.end(), uint32_t(tile)) - tiles.begin());
+      const Counts counts = {pairs, pairs};
+      uint64_t word = 0;
+      cuda_on_host::launch(tile_count / kRangeTiles + 1, kRangeTiles * kRangeLanes, [&] {
+        tile_offsets_kernel(tiles.data(), &counts, pairs, tile_count, offsets.data(), {&word, 3});
+      });
+      EXPECT_EQ(offsets, expected) << tile_count << " tiles, " << pairs << " pairs";
+      EXPECT_EQ(word, uint64_t(3) << 32 | uint64_t(pairs));
+    }
+  }
 }
 
 }  // namespace
