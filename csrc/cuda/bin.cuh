@@ -65,6 +65,12 @@ __device__ inline void write_pair(const EmitParams& params, int64_t place, uint3
   }
 }
 
+/// The pairs of those of a warp's splats that have few each, one splat after the other.
+struct FewPairs {
+  uint32_t tiles[32 * kManyTiles];
+  uint8_t lanes[32 * kManyTiles];  ///< whose splat it is
+};
+
 /// Sum of what the blocks before this one published, for all lanes of a warp.
 __device__ inline uint32_t look_back(const uint32_t* status, int block) {
   uint32_t sum = 0;
@@ -85,6 +91,7 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
 /// Pairs in the order of depth, a splat's by rows of tiles.
 __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitParams params) {
   __shared__ uint32_t block_id, before_block;
+  __shared__ FewPairs stages[kEmitThreads / 32];
   if (params.counts->pairs > params.capacity) return;
   if (threadIdx.x == 0) block_id = atomicAdd(&params.status[0], 1);
   __syncthreads();
@@ -97,8 +104,21 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
   uint32_t sum;
   const uint32_t before = sum_before<kEmitThreads / 32>(uint32_t(count), 0u, sum);
   uint32_t* status = params.status + 1;
+  if (threadIdx.x == 0) write_status(status + block_id, (block_id == 0 ? kUpToBlock : kOfBlock) | sum);
+
+  // Tiles are found before their places are known, while the blocks before get to publish theirs; and written by
+  // neighbouring lanes to neighbouring places.
+  FewPairs& stage = stages[threadIdx.x / 32];
+  const int own = count <= kManyTiles ? count : 0, up_to = warp_inclusive_sum(own), first = up_to - own;
+  if (own > 0) {
+    int k = first;
+    for_each_tile(support_of(splat, params.footprint), params.grid, [&](int64_t tile) {
+      stage.tiles[k] = uint32_t(tile);
+      stage.lanes[k++] = uint8_t(lane_id());
+    });
+  }
+
   if (threadIdx.x < 32) {
-    if (threadIdx.x == 0) write_status(status + block_id, (block_id == 0 ? kUpToBlock : kOfBlock) | sum);
     const uint32_t earlier = look_back(status, int(block_id));
     if (threadIdx.x == 0) {
       if (block_id > 0) write_status(status + block_id, kUpToBlock | (earlier + sum));
@@ -109,10 +129,12 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
   const int64_t begin = int64_t(before_block) + before;
   const int columns = params.grid.columns();
   if (count > 0 && params.slot_pairs) params.ranges[i].first = int32_t(begin);
-  if (count > 0 && count <= kManyTiles) {
-    int64_t place = begin;
-    for_each_tile(support_of(splat, params.footprint), params.grid,
-                  [&](int64_t tile) { write_pair(params, place++, tile, i); });
+  const int all = shuffle(up_to, 31);
+  for (int from = 0; from < all; from += 32) {
+    const int k = from + lane_id(), source = k < all ? stage.lanes[k] : 0;
+    const int64_t place = shuffle(begin - first, source) + k;
+    const int32_t id = shuffle(i, source);
+    if (k < all) write_pair(params, place, stage.tiles[k], id);
   }
   for (uint32_t many = __ballot_sync(kAllLanes, count > kManyTiles); many != 0; many &= many - 1) {
     const int source = __ffs(many) - 1;
@@ -124,10 +146,10 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
       const int row = first + lane_id();
       const Range range = row <= tile_rows.last ? tile_columns_of(support, params.grid, rows, row) : Range{0, -1};
       const int width = range.last - range.first + 1;
-      const int up_to = warp_inclusive_sum(width);
-      int64_t mine = place + up_to - width;
+      const int widths = warp_inclusive_sum(width);
+      int64_t mine = place + widths - width;
       for (int c = range.first; c <= range.last; ++c) write_pair(params, mine++, uint32_t(row) * columns + c, id);
-      place += __shfl_sync(kAllLanes, up_to, 31);
+      place += __shfl_sync(kAllLanes, widths, 31);
     }
   }
 }

@@ -64,10 +64,10 @@ std::vector<float> random_depths(int n, float nearest, float farthest, int one_c
   return depths;
 }
 
-TEST(SortKernels, Depths) { expect_sorted(random_depths(2 * kSortTile + 100, 0.2f, 100)); }
+TEST(BinKernels, Depths) { expect_sorted(random_depths(2 * kSortTile + 100, 0.2f, 100)); }
 
 /// Where all depths lie between 1/8 and 8192 the last pass has nothing to do, and may be left out.
-TEST(SortKernels, TheLastPassIsForDepthsThatAreVeryDifferent) {
+TEST(BinKernels, TheLastPassIsForDepthsThatAreVeryDifferent) {
   std::vector<float> depths = random_depths(kSortTile + 700, 0.125f, 8191);
   depths[5] = 0.125f, depths[6] = std::nextafter(8192.0f, 0.0f);
   expect_sorted(depths, 3);
@@ -80,21 +80,91 @@ TEST(SortKernels, TheLastPassIsForDepthsThatAreVeryDifferent) {
   expect_sorted(depths);
 }
 
-TEST(SortKernels, DepthsOfEveryMagnitude) { expect_sorted(random_depths(kSortTile + 1, 1e-37f, 1e37f)); }
+TEST(BinKernels, DepthsOfEveryMagnitude) { expect_sorted(random_depths(kSortTile + 1, 1e-37f, 1e37f)); }
 
-TEST(SortKernels, FewAndNoDepths) {
+TEST(BinKernels, FewAndNoDepths) {
   expect_sorted({2});
   expect_sorted({kCulled, kCulled});
   expect_sorted({3, kCulled, 0, 1, 3, 0});
 }
 
-TEST(SortKernels, TiesKeepInputOrder) {
+TEST(BinKernels, TiesKeepInputOrder) {
   std::vector<float> depths = random_depths(kSortTile, 0.2f, 4);
   for (float& depth : depths) depth = depth == kCulled ? kCulled : std::ceil(depth);
   expect_sorted(depths);
 }
 
-TEST(SortKernels, FirstPairsOfTiles) {
+/// Splats from a fraction of a pixel to the whole image, in an image with more rows of tiles than a warp has lanes.
+std::vector<SplatRow<float>> random_splats(int n, TileGrid grid) {
+  using F = Mip;
+  std::mt19937 bits(7);
+  const auto uniform = [&](float low, float high) { return std::uniform_real_distribution<float>(low, high)(bits); };
+  std::vector<SplatRow<float>> splats(n);
+  for (SplatRow<float>& splat : splats) {
+    const float a = std::exp(uniform(-2, 11)), b = std::exp(uniform(-2, 6));
+    const F::Shape<float> shape = F::prepare(Cov2d<float>{b, 0, a, a * b}, FootprintOptions{0});
+    splat.mean = {uniform(0, float(grid.width)), uniform(0, float(grid.height))};
+    set_shape<F>(splat, shape);
+    splat.opacity = uniform(0.1f, 1);
+    splat.level = F::level(shape, splat.opacity);
+  }
+  return splats;
+}
+
+TEST(BinKernels, PairsOfSplats) {
+  constexpr TileGrid grid = {170, 700};
+  constexpr int n = 2 * kEmitThreads + 30;
+  const int footprint = find_footprint("mip");
+  const std::vector<SplatRow<float>> splats = random_splats(n, grid);
+  std::vector<int32_t> order(n);
+  std::iota(order.begin(), order.end(), 0);
+  std::shuffle(order.begin(), order.end(), std::mt19937(7));
+  std::vector<PairRange> ranges(n), expected_ranges(n);
+  std::vector<uint32_t> expected_tiles;
+  std::vector<int32_t> expected_splats;
+  int many = 0;
+  for (const int32_t i : order) {
+    expected_ranges[i].first = int32_t(expected_tiles.size());
+    for_each_tile(support_of(splats[i], footprint), grid, [&](int64_t tile) {
+      expected_tiles.push_back(uint32_t(tile));
+      expected_splats.push_back(i);
+    });
+    ranges[i].count = expected_ranges[i].count = int32_t(expected_tiles.size()) - expected_ranges[i].first;
+    many += ranges[i].count > kManyTiles;
+  }
+  ASSERT_GT(many, n / 10);
+  ASSERT_LT(many, n / 2);
+
+  const auto pairs = int64_t(expected_tiles.size());
+  const Counts counts = {pairs, n};
+  for (const bool with_slots : {false, true}) {
+    std::vector<uint32_t> status(emit_scratch(n) / sizeof(uint32_t)), tiles(pairs);
+    std::vector<int32_t> splat_pairs(pairs);
+    std::vector<SlotPair> slot_pairs(pairs);
+    EmitParams emit = {};
+    emit.splats = &splats[0].mean.x;
+    emit.n = n;
+    emit.footprint = footprint;
+    emit.grid = grid;
+    emit.capacity = pairs;
+    emit.counts = &counts;
+    emit.order = order.data();
+    emit.ranges = ranges.data();
+    emit.status = status.data();
+    emit.tiles = tiles.data();
+    emit.splat_pairs = with_slots ? nullptr : splat_pairs.data();
+    emit.slot_pairs = with_slots ? slot_pairs.data() : nullptr;
+    cuda_on_host::launch((n + kEmitThreads - 1) / kEmitThreads, kEmitThreads, [&] { emit_pairs_kernel(emit); });
+    EXPECT_EQ(tiles, expected_tiles);
+    for (int64_t k = 0; k < pairs; ++k) {
+      ASSERT_EQ(with_slots ? slot_pairs[k].splat : splat_pairs[k], expected_splats[k]) << k;
+      ASSERT_EQ(with_slots ? slot_pairs[k].slot : k, k);
+    }
+    for (int i = 0; i < n && with_slots; ++i) ASSERT_EQ(ranges[i].first, expected_ranges[i].first) << i;
+  }
+}
+
+TEST(BinKernels, FirstPairsOfTiles) {
   std::mt19937 bits(7);
   for (const int tile_count : {1, 15, 100}) {
     for (const int pairs : {0, 1, 8, 9, 10, 81, 5000}) {
