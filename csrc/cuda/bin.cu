@@ -7,34 +7,6 @@
 namespace ar::cuda {
 namespace {
 
-constexpr int kTileBits = 8;
-using TileDigits = Digits<kTileBits>;
-using TileScratch = SortScratch<kTileBits>;
-
-int tile_passes(TileGrid grid) {
-  int passes = 1;
-  while (grid.tiles() > int64_t(1) << (passes * kTileBits)) ++passes;
-  return passes;
-}
-
-template <int kPasses>
-__global__ void __launch_bounds__(kCountThreads)
-    count_tiles_kernel(const uint32_t* tiles, const Counts* counts, int64_t capacity, uint32_t* histograms) {
-  const int64_t n = counts->pairs;
-  if (n > capacity) return;
-  constexpr int kBins = TileDigits::kBins;
-  __shared__ uint32_t local[kPasses * kBins];
-  for (int b = threadIdx.x; b < kPasses * kBins; b += kCountThreads) local[b] = 0;
-  __syncthreads();
-  const int64_t stride = int64_t(gridDim.x) * kCountThreads, rounded = (n + 31) / 32 * 32;
-  for (int64_t k = int64_t(blockIdx.x) * kCountThreads + threadIdx.x; k < rounded; k += stride)
-    count_digits<kTileBits, kPasses>(k < n ? tiles[k] : 0, k < n, local);
-  __syncthreads();
-  for (int b = threadIdx.x; b < kPasses * kBins; b += kCountThreads) {
-    if (local[b]) atomicAdd(&histograms[b], local[b]);
-  }
-}
-
 constexpr int kPlanThreads = 256;
 
 /// Work is handed out by samples, and of those longest first, so that no block starts on a long piece when the others
@@ -123,23 +95,6 @@ template <class Value>
 void sort_values(const TileSort<Value>& p, TileGrid grid, uint32_t* memory, cudaStream_t stream) {
   const int passes = tile_passes(grid);
   const TileScratch scratch(memory, p.capacity, passes);
-  const auto count = [&](auto kernel) {
-    launch(kernel, {kCountBlocks, kCountThreads}, stream, p.tiles[0], p.counts, p.capacity, scratch.histograms);
-  };
-  switch (passes) {
-    case 1:
-      count(count_tiles_kernel<1>);
-      break;
-    case 2:
-      count(count_tiles_kernel<2>);
-      break;
-    case 3:
-      count(count_tiles_kernel<3>);
-      break;
-    default:
-      count(count_tiles_kernel<4>);
-      break;
-  }
   for (int pass = 0; pass < passes; ++pass) {
     // After an overflow the histograms are empty, and with them the sort.
     launch(sort_pass_kernel<kTileBits, Value, false>, {unsigned(scratch.blocks), TileDigits::kThreads}, stream, scratch,
@@ -180,7 +135,7 @@ void sort_by_depth(const DepthSort& p, void* memory, cudaStream_t stream) {
 
 void emit_pairs(const EmitParams& p, cudaStream_t stream) {
   if (p.n == 0) return;
-  launch(emit_pairs_kernel, {blocks_of(p.n, kEmitThreads), kEmitThreads}, stream, p);
+  launch(emit_pairs_kernel, {blocks_of(p.n, kEmitThreads), kEmitThreads}, stream, p, tile_passes(p.grid));
 }
 
 void sort_by_tile(const TileSort<int32_t>& p, TileGrid grid, void* scratch, cudaStream_t stream) {

@@ -53,6 +53,16 @@ template <class Run> void for_each_depth_pass(const DepthSort& p, const DepthScr
   }
 }
 
+/// Tiles are sorted by as many digits as the number of the last one has.
+inline constexpr int kTileBits = 8, kMostTilePasses = 4;
+using TileDigits = Digits<kTileBits>;
+using TileScratch = SortScratch<kTileBits>;
+inline int tile_passes(TileGrid grid) {
+  int passes = 1;
+  while (grid.tiles() > int64_t(1) << (passes * kTileBits)) ++passes;
+  return passes;
+}
+
 /// A splat with more pairs than this is written by its whole warp.
 inline constexpr int kManyTiles = 16;
 
@@ -88,12 +98,15 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
   return sum;
 }
 
-/// Pairs in the order of depth, a splat's by rows of tiles.
-__global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitParams params) {
+/// Pairs in the order of depth, a splat's by rows of tiles; and the histograms of the digits of their tiles.
+__global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitParams params, int tile_digits) {
+  constexpr int kBins = TileDigits::kBins;
+  __shared__ uint32_t histograms[kMostTilePasses * kBins];
   __shared__ uint32_t block_id, before_block;
   __shared__ FewPairs stages[kEmitThreads / 32];
   if (params.counts->pairs > params.capacity) return;
   if (threadIdx.x == 0) block_id = atomicAdd(&params.status[0], 1);
+  for (int b = threadIdx.x; b < tile_digits * kBins; b += kEmitThreads) histograms[b] = 0;
   __syncthreads();
   const int64_t r = int64_t(block_id) * kEmitThreads + threadIdx.x, n = params.counts->splats;
   if (int64_t(block_id) * kEmitThreads >= n) return;
@@ -128,13 +141,17 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
   __syncthreads();
   const int64_t begin = int64_t(before_block) + before;
   const int columns = params.grid.columns();
+  const auto write = [&](int64_t place, uint32_t tile, int32_t id) {
+    write_pair(params, place, tile, id);
+    for (int d = 0; d < tile_digits; ++d) atomicAdd(&histograms[d * kBins + TileDigits::of(tile, d)], 1);
+  };
   if (count > 0 && params.slot_pairs) params.ranges[i].first = int32_t(begin);
   const int all = shuffle(up_to, 31);
   for (int from = 0; from < all; from += 32) {
     const int k = from + lane_id(), source = k < all ? stage.lanes[k] : 0;
     const int64_t place = shuffle(begin - first, source) + k;
     const int32_t id = shuffle(i, source);
-    if (k < all) write_pair(params, place, stage.tiles[k], id);
+    if (k < all) write(place, stage.tiles[k], id);
   }
   for (uint32_t many = __ballot_sync(kAllLanes, count > kManyTiles); many != 0; many &= many - 1) {
     const int source = __ffs(many) - 1;
@@ -148,9 +165,13 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
       const int width = range.last - range.first + 1;
       const int widths = warp_inclusive_sum(width);
       int64_t mine = place + widths - width;
-      for (int c = range.first; c <= range.last; ++c) write_pair(params, mine++, uint32_t(row) * columns + c, id);
+      for (int c = range.first; c <= range.last; ++c) write(mine++, uint32_t(row) * columns + c, id);
       place += __shfl_sync(kAllLanes, widths, 31);
     }
+  }
+  __syncthreads();
+  for (int b = threadIdx.x; b < tile_digits * kBins; b += kEmitThreads) {
+    if (histograms[b]) atomicAdd(&params.tile_counts[b], histograms[b]);
   }
 }
 

@@ -128,12 +128,13 @@ struct EmitParams {
   TileGrid grid;
   int64_t capacity;
   const Counts* counts;
-  const int32_t* order;  ///< [counts->splats] splats by depth
-  PairRange* ranges;     ///< [n] first
-  uint32_t* status;      ///< emit_scratch(n) bytes, zero
-  uint32_t* tiles;       ///< [capacity] tile of each pair
-  int32_t* splat_pairs;  ///< [capacity] splat of each pair, or null:
-  SlotPair* slot_pairs;  ///< [capacity] the same with its slot, for a backward pass
+  const int32_t* order;   ///< [counts->splats] splats by depth
+  PairRange* ranges;      ///< [n] first
+  uint32_t* status;       ///< emit_scratch(n) bytes, zero
+  uint32_t* tile_counts;  ///< tile_sort_scratch(capacity, grid) bytes, zero; sort_by_tile finds its counts there
+  uint32_t* tiles;        ///< [capacity] tile of each pair
+  int32_t* splat_pairs;   ///< [capacity] splat of each pair, or null:
+  SlotPair* slot_pairs;   ///< [capacity] the same with its slot, for a backward pass
 };
 
 /// The lists of splats that blend walks.
@@ -368,7 +369,7 @@ struct PairFeedback {
   uint32_t frame;
 };
 
-/// Pairs by tile, stably. The result is values[tile_sort_result(grid)].
+/// Pairs by tile, stably; those of emit_pairs. The result is values[tile_sort_result(grid)].
 template <class Value> struct TileSort {
   int64_t capacity;
   const Counts* counts;
@@ -378,6 +379,7 @@ template <class Value> struct TileSort {
   PairFeedback feedback;
 };
 int tile_sort_result(TileGrid grid);
+/// `scratch`: EmitParams::tile_counts.
 void sort_by_tile(const TileSort<int32_t>& p, TileGrid grid, void* scratch, cudaStream_t stream);
 void sort_by_tile(const TileSort<SlotPair>& p, TileGrid grid, void* scratch, cudaStream_t stream);
 

@@ -523,6 +523,7 @@ class CudaBackend final : public Backend {
       sort.tiles[k] = structs_of<uint32_t>(tiles) + k * emit.capacity;
       sort.values[k] = structs_of<Value>(values[k]);
     }
+    emit.tile_counts = static_cast<uint32_t*>(scratch);
     emit.tiles = sort.tiles[0];
     emit.*to = sort.values[0];
     cuda::emit_pairs(emit, stream_);

@@ -141,6 +141,10 @@ TEST(BinKernels, PairsOfSplats) {
     std::vector<uint32_t> status(emit_scratch(n) / sizeof(uint32_t)), tiles(pairs);
     std::vector<int32_t> splat_pairs(pairs);
     std::vector<SlotPair> slot_pairs(pairs);
+    std::vector<uint32_t> scratch(TileScratch::words(pairs, tile_passes(grid))), expected_scratch(scratch.size());
+    for (const uint32_t tile : expected_tiles) {
+      for (int d = 0; d < tile_passes(grid); ++d) ++expected_scratch[d * TileDigits::kBins + TileDigits::of(tile, d)];
+    }
     EmitParams emit = {};
     emit.splats = &splats[0].mean.x;
     emit.n = n;
@@ -151,11 +155,14 @@ TEST(BinKernels, PairsOfSplats) {
     emit.order = order.data();
     emit.ranges = ranges.data();
     emit.status = status.data();
+    emit.tile_counts = scratch.data();
     emit.tiles = tiles.data();
     emit.splat_pairs = with_slots ? nullptr : splat_pairs.data();
     emit.slot_pairs = with_slots ? slot_pairs.data() : nullptr;
-    cuda_on_host::launch((n + kEmitThreads - 1) / kEmitThreads, kEmitThreads, [&] { emit_pairs_kernel(emit); });
+    cuda_on_host::launch((n + kEmitThreads - 1) / kEmitThreads, kEmitThreads,
+                         [&] { emit_pairs_kernel(emit, tile_passes(grid)); });
     EXPECT_EQ(tiles, expected_tiles);
+    EXPECT_EQ(scratch, expected_scratch);
     for (int64_t k = 0; k < pairs; ++k) {
       ASSERT_EQ(with_slots ? slot_pairs[k].splat : splat_pairs[k], expected_splats[k]) << k;
       ASSERT_EQ(with_slots ? slot_pairs[k].slot : k, k);
