@@ -78,6 +78,8 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
     blend_vjp_kernel(const BlendVjpParams params) {
   constexpr int S = F::kSamples, kLength = chunk_length(S), kWarps = kVjpWarps<F, kSums>, kSumCount = 6 + C;
   constexpr int kOwn = kVjpSamples<F, kSums>, kGroup = S / kOwn;  // samples of a warp, warps of a chunk
+  // Where the code for a subtile is short, each has its own: of 58 instructions 11 would work out where its pixels are.
+  constexpr bool kUnroll = S == 1 && sizeof(TileSplat<F, C>) <= 48;
   constexpr bool kGrads = kSums != Sums::kMeans, kMeans = kSums != Sums::kGrads;
   // A shared-out sample's number is not known when the code is compiled: keep its node indexable.
   using VjpSplat = std::conditional_t<kGroup == 1, TileSplatRef<F, C>, const TileSplat<F, C>&>;
@@ -132,9 +134,9 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const Vec2<float> p0 = pixel_of(0, lane);
   constexpr int kTwo23 = 0x4b000000;
-  const int value = summed_value<kSumCount>(lane);             // that sum_values leaves here
-  const int column = value == 9 ? kPairFourthChannel : value;  // of the pairs' rows
-  const float* dL_dplanes[C];                                  // of three channels all are there
+  const int value = summed_value<kSumCount>(lane);  // that sum_values leaves here
+  float* const sums = params.pair_grads + (value == 9 ? kPairFourthChannel : value);
+  const float* dL_dplanes[C];  // of three channels all are there
   Values<C> background;
 #pragma unroll
   for (int c = 0; c < C; ++c) {
@@ -176,8 +178,9 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
   const auto put = [&](int32_t row, int column, float x) {
     put_sum(params.pair_grads, kPairGradWidth, list.overflow, row, column, x);
   };
-  for (int k1 = min(end, tile_last); k1 > begin; k1 -= 32) {
-    const int k0 = max(k1 - 32, begin), k = k0 + lane;
+  static_assert(kLength % 32 == 0);  // no batch begins before `begin`
+  for (int k1 = min(end, tile_last); k1 > begin; k1 = (k1 - 1) / 32 * 32) {
+    const int k0 = (k1 - 1) / 32 * 32, k = k0 + lane;
     uint32_t reach = 0;
     int32_t row_index = 0;
     Mat2<float> mean_map = {0, 0, 0, 0};
@@ -194,9 +197,17 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
       if (kMeans) mean_map = F::mean_map(splat.shape);
       if (kGroup > 1 && first == 0) group.rows[lane] = row_index;
     }
+    uint32_t reaching = 0;  // of lane b the splats that reach subtile b
+#pragma unroll
+    for (int b = 0; b < kSubtiles; ++b) {
+      const uint32_t splats_of_b = __ballot_sync(kAllLanes, reach >> b & 1);
+      if (lane == b) reaching = splats_of_b;
+    }
     group_sync();
-    for (int j = k1 - k0 - 1; j >= 0; --j) {
-      const uint32_t reached = __shfl_sync(kAllLanes, reach, j);
+    for (int at = k1 - 1; at >= k0; --at) {
+      const int j = at & 31;
+      // The same in all lanes, and by a ballot, so that the compiler knows that they branch alike.
+      const uint32_t reached = __ballot_sync(kAllLanes, reaching >> j & 1);
       VjpSplat splat = group.splats[j];
       const Mat2<float> m =
           !kMeans ? mean_map
@@ -206,12 +217,8 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
       float weighted = 0;
       Values<C> channels = {};
       Vec2<float> mean_sums = {0, 0};
-      for (uint32_t hit = reached; hit != 0; hit &= hit - 1) {
-        const int b = __ffs(hit) - 1, q = b * 32 + lane;
-        // pixel_of(b, lane); an integer below 2^23 set into the mantissa of 2^23 is that float, plus 2^23
-        const float column = __int_as_float(kTwo23 | (b & 1)) - 8388608.0f;
-        const float band = __int_as_float(kTwo23 | (b >> 1)) - 8388608.0f;
-        const Vec2<float> p = {madd(8.0f, column, p0.x), madd(4.0f, band, p0.y)};
+      const auto visit = [&](int b, Vec2<float> p) {
+        const int q = b * 32 + lane;
         const float4 g = stage.g[q];
         const Values<4> of_pixel_g = {{g.x, g.y, g.z, g.w}};
         float g_color = madd(g.x, splat.channels.v[0], madd(g.y, splat.channels.v[1], g.z * splat.channels.v[2]));
@@ -222,7 +229,7 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
         for (int s = 0; s < kOwn; ++s) {
           const int node = kGroup == 1 ? s : first + s;
           const float alpha = F::alpha(splat.terms, p, node);
-          const bool mask = alpha >= float(kAlphaMin) && k0 + j < stage.last_of(s, q, g);
+          const bool mask = alpha >= float(kAlphaMin) && at < stage.last_of(s, q, g);
           if (s == 0 && S == 1 && !__any_sync(kAllLanes, mask)) break;
           auto sample = stage.samples[s][q];
           const BlendGrad<float> grad = blend_sample_vjp(mask, alpha, g_color, sample.transmittance, sample.behind);
@@ -239,6 +246,20 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
           const Vec2<float> dL_dmean = transform_transposed(m, of_pixel.offset);
           mean_sums = mean_sums + mean_sums_of(params.mean_sums, size, dL_dmean);
         }
+      };
+      if constexpr (kUnroll) {
+#pragma unroll
+        for (int b = 0; b < kSubtiles; ++b) {
+          if (reached >> b & 1) visit(b, {p0.x + float(8 * (b & 1)), p0.y + float(4 * (b >> 1))});
+        }
+      } else {
+        for (uint32_t hit = reached; hit != 0; hit &= hit - 1) {
+          const int b = __ffs(hit) - 1;
+          // pixel_of(b, lane); an integer below 2^23 set into the mantissa of 2^23 is that float, plus 2^23
+          const float column = __int_as_float(kTwo23 | (b & 1)) - 8388608.0f;
+          const float band = __int_as_float(kTwo23 | (b >> 1)) - 8388608.0f;
+          visit(b, {madd(8.0f, column, p0.x), madd(4.0f, band, p0.y)});
+        }
       }
       const int32_t row = __shfl_sync(kAllLanes, row_index, j);
       if (kGrads) {
@@ -248,12 +269,12 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
 #pragma unroll
         for (int c = 0; c < C; ++c) values[6 + c] = channels.v[c];
         const float sum = sum_values(values);
-        if (value >= 0) {
-          if constexpr (kGroup == 1) {
-            put(row, column, sum);
-          } else {
-            group.sums[warp][j][value] = sum;
-          }
+        if constexpr (kGroup > 1) {
+          if (has_value_first<kSumCount>(lane)) group.sums[warp][j][value] = sum;
+        } else if (!list.overflow) {
+          sums[int64_t(row) * kPairGradWidth] = sum;  // of all lanes: to find the first ones takes longer
+        } else if (has_value_first<kSumCount>(lane)) {
+          atomicAdd(&sums[int64_t(row) * kPairGradWidth], sum);
         }
       }
       if (kMeans) {

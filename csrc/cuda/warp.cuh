@@ -135,12 +135,13 @@ template <int N> __device__ float sum_values(const float (&v)[N]) {
   return sum + __shfl_xor_sync(kAllLanes, sum, 1);
 }
 
-/// Which of N values a lane has after sum_values, or -1.
+/// Which of N values a lane has after sum_values. Lanes that have the same one have the same bits.
 template <int N> __device__ int summed_value(int lane) {
-  if (lane % 4 == 0) return lane / 4;
-  if (N > 8 && lane == 2) return 8;
-  if (N > 9 && lane == 18) return 9;
-  return -1;
+  return N > 8 && lane & 2 ? (N > 9 && lane & 16 ? 9 : 8) : lane / 4;
+}
+/// Whether it is the first lane that has the value.
+template <int N> __device__ bool has_value_first(int lane) {
+  return lane % 4 == 0 || (N > 8 && lane == 2) || (N > 9 && lane == 18);
 }
 
 }  // namespace ar::cuda
