@@ -245,6 +245,7 @@ struct BlendVjpParams : ar::BlendVjpParams<float> {
   const TileChunk* chunk_order;
   const PlanState* plan;
   int64_t max_chunks;
+  int32_t* chunks_taken;  ///< [kSampleClasses] set to zero by blend_vjp; chunks of a class that warps have begun with
   const float* checkpoints;
   float* pair_grads;    ///< [max(capacity, n), kPairGradWidth] by slot, or by splat if there are too many pairs
   float* channel_sums;  ///< [max(capacity, n), kChannelGroup] likewise, for more than kFewChannels channels; or null
