@@ -52,14 +52,15 @@ template <int S, int C, int kSets> struct PixelState {
   }
 };
 
-/// Composites those of a group of 32 splats whose bits are set in `mask`; `index` is the place of the group's first
-/// splat in the tile's list.
+template <class F, int C> using BlendStage = Stage<F, C, kBlendThreads>;
+
+/// Composites those of a group of 32 staged splats, [k, k + 32), that reach the warp's subtile; `index` is the place of the
+/// first staged splat in the tile's list.
 template <class F, int C, int kSets>
-__device__ __forceinline__ void composite(const TileSplat<F, C>* splats, uint32_t mask, int index, Vec2<float> p,
+__device__ __forceinline__ void composite(const BlendStage<F, C>& stage, int k, int index, Vec2<float> p,
                                           PixelState<F::kSamples, C, kSets>& state) {
-  for (; mask != 0; mask &= mask - 1) {
-    const int j = __ffs(mask) - 1;
-    TileSplatRef<F, C> splat = splats[j];
+  stage.for_each_reached(k, [&](int j) {
+    TileSplatRef<F, C> splat = stage.splats[j];
     float contribution = 0;
 #pragma unroll
     for (int s = 0; s < F::kSamples; ++s) {
@@ -72,21 +73,19 @@ __device__ __forceinline__ void composite(const TileSplat<F, C>* splats, uint32_
       state.last[s] = b.mask ? index + j + 1 : state.last[s];
     }
     if (kSets == 1) state.channels[0].add(contribution, splat.channels);
-  }
+  });
 }
-
-template <class F, int C> using BlendStage = Stage<F, C, kBlendThreads>;
 
 /// Multiplies the transmittance by what the splats in shared memory let through, without a threshold at which to stop.
 template <class F, int C>
 __device__ void pass_all(const BlendStage<F, C>& stage, int count, Vec2<float> p, float (&transmittance)[F::kSamples]) {
   for (int k = 0; k < count; k += 32) {
-    for (uint32_t mask = stage.reached(k); mask != 0; mask &= mask - 1) {
-      TileSplatRef<F, C> splat = stage.splats[k + __ffs(mask) - 1];
+    stage.for_each_reached(k, [&](int j) {
+      TileSplatRef<F, C> splat = stage.splats[j];
 #pragma unroll
       for (int s = 0; s < F::kSamples; ++s)
         transmittance[s] -= transmittance[s] * effective_alpha(F::alpha(splat.terms, p, s));
-    }
+    });
   }
 }
 
@@ -95,7 +94,7 @@ __device__ void composite_all(const BlendStage<F, C>& stage, int count, int inde
                               PixelState<F::kSamples, C, kSets>& state) {
   for (int k = 0; k < count; k += 32) {
     if (!__any_sync(kAllLanes, state.open())) return;
-    composite<F>(stage.splats + k, stage.reached(k), index + k, p, state);
+    composite<F>(stage, k, index, p, state);
   }
 }
 

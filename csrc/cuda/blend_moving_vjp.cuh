@@ -51,8 +51,7 @@ template <int C> __device__ void put_warp_sums(const PairGrad<float>& grad, cons
 #pragma unroll
     for (int c = 0; c < C; ++c) values[6 + c] = channels.v[c];
     const float sum = sum_values(values);
-    const int value = summed_value<6 + C>(lane);
-    if (value >= 0) sums[value] = sum;
+    if (has_value_first<6 + C>(lane)) sums[summed_value<6 + C>(lane)] = sum;
   } else {
     static_assert(C == 8);
     const float sum = sum_values(values), of_channels = sum_values(channels.v);

@@ -8,6 +8,10 @@ namespace ar::cuda {
 
 inline constexpr int kProjectThreads = 128;
 
+__device__ inline uint32_t depth_key(float depth) {
+  return __float_as_uint(depth + 0.0f) + kDepthKeyOffset;  // of -0 too
+}
+
 /// Tiles that a splat touches.
 __device__ inline int count_tiles(const SplatRow<float>& splat, int footprint, TileGrid grid) {
   int count = 0;
@@ -57,7 +61,7 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
   }
   if (i >= g.n) return;
   if (radius > 0) reinterpret_cast<SplatRow<float>*>(params.splats)[i] = splat;
-  params.keys[i] = count > 0 ? __float_as_uint(depth) : kCulledKey;
+  params.keys[i] = count > 0 ? depth_key(depth) : kCulledKey;
   params.ranges[i] = {0, count};
   params.radii[i] = radius;
 }
@@ -123,8 +127,7 @@ __global__ void __launch_bounds__(kProjectThreads) shape_rows_kernel(const Shape
   if (!(within(color.x, kMaxColor) && within(color.y, kMaxColor) && within(color.z, kMaxColor))) splat.level = 0;
   const int count = splat.level > 0 ? count_tiles(splat, params.footprint.index, params.grid) : 0;
   reinterpret_cast<SplatRow<float>*>(params.splats)[i] = splat;
-  // Keys are in the order of their bits, where -0 would come last.
-  params.keys[i] = count > 0 ? __float_as_uint(projected.depth + 0.0f) : kCulledKey;
+  params.keys[i] = count > 0 ? depth_key(projected.depth) : kCulledKey;
   params.ranges[i] = {0, count};
 }
 

@@ -339,6 +339,8 @@ class CudaBackend final : public Backend {
     p.plan = const_structs_of<cuda::PlanState>(state.chunks);
     p.chunk_order = const_structs_of<cuda::TileChunk>(state.chunks) + kPlanRows;
     p.max_chunks = state.chunks.size(0) - kPlanRows;
+    const Tensor chunks_taken = at::empty({cuda::kSampleClasses}, ints_);
+    p.chunks_taken = pointer<int32_t>(chunks_taken);
     p.checkpoints = const_pointer<float>(state.checkpoints);
     p.segments.count = cuda::list_segments(pass.footprint.choice.index, count, pass.grid);
     p.segments.samples = pass.footprint.samples;
@@ -533,6 +535,7 @@ class CudaBackend final : public Backend {
       sort.tiles[k] = structs_of<uint32_t>(tiles) + k * emit.capacity;
       sort.values[k] = structs_of<Value>(values[k]);
     }
+    emit.tile_counts = static_cast<uint32_t*>(scratch);
     emit.tiles = sort.tiles[0];
     emit.*to = sort.values[0];
     cuda::emit_pairs(emit, stream_);
