@@ -211,30 +211,36 @@ __global__ void __launch_bounds__(kProjectThreads) sum_few_channels_kernel(const
 
 inline constexpr int kSumWarps = 8;
 
-/// A group of channels: a warp per splat, a lane per channel. The warps of a block share the splats with many pairs.
-__global__ void __launch_bounds__(32 * kSumWarps) sum_channels_kernel(const SumChannelsParams params) {
+/// A group of C channels: a warp per splat, whose lanes are shared out to the channels of 32 / C rows. The warps of a
+/// block share the splats with many pairs.
+template <int C> __global__ void __launch_bounds__(32 * kSumWarps) sum_channels_kernel(const SumChannelsParams params) {
   __shared__ float parts[kSumWarps][32];
   __shared__ int64_t first[kSumWarps];
   __shared__ int counts[kSumWarps];
-  constexpr int kMany = 256, kAhead = 8;
-  const int lane = lane_id(), warp = threadIdx.x / 32;
+  constexpr int kMany = 256, kAhead = 8, kRows = 32 / C;
+  const int lane = lane_id(), warp = threadIdx.x / 32, channel = lane % C;
   const int64_t i = int64_t(blockIdx.x) * kSumWarps + warp, n = params.sums.n;
   PairRange range = i < n ? params.sums.ranges[i] : PairRange{0, 0};
   if (params.sums.by_splat() && range.count > 0) range = {int32_t(i), 1};
+  // What this lane's rows have: every kRows-th of the `step`-th rows.
   const auto sum_rows = [&](int64_t row, int count, int step) {
     float sum = 0;
-    for (int q = 0; q < count; q += kAhead * step) {
+    for (int q = lane / C * step; q < count; q += kAhead * kRows * step) {
       float x[kAhead];
 #pragma unroll
-      for (int k = 0; k < kAhead; ++k)
-        x[k] = q + k * step < count ? params.channel_sums[(row + q + k * step) * kChannelGroup + lane] : 0;
+      for (int k = 0; k < kAhead; ++k) {
+        const int at = q + k * kRows * step;
+        x[k] = at < count ? params.channel_sums[(row + at) * C + channel] : 0;
+      }
 #pragma unroll
       for (int k = 0; k < kAhead; ++k) sum += x[k];
     }
     return sum;
   };
   const auto store = [&](int64_t splat, float sum) {
-    if (lane < params.count) params.dL_dchannels[splat * params.stride + params.first + lane] = sum;
+#pragma unroll
+    for (int offset = 16; offset >= C; offset /= 2) sum += __shfl_xor_sync(kAllLanes, sum, offset);
+    if (lane < C && lane < params.count) params.dL_dchannels[splat * params.stride + params.first + lane] = sum;
   };
   if (lane == 0) first[warp] = range.first, counts[warp] = range.count;
   if (i < n && range.count <= kMany) store(i, sum_rows(range.first, range.count, 1));
