@@ -10,21 +10,24 @@
 
 namespace ar::cuda {
 
-/// Splats that a block takes between barriers: many, as its warps do not all meet equally many of them.
-inline constexpr int kVjpBatch = 64;
+/// Splats that a block takes between barriers: many, as its warps do not all meet equally many of them, but no more
+/// than leave room for a few blocks in shared memory.
+template <int C> inline constexpr int kVjpBatch = C == kSmallGroup ? 64 : 32;
 /// Sums of a pair besides its channels: PairGrad, and MeanSums.
 inline constexpr int kShapeSums = 8;
 
 /// What a block keeps in shared memory.
 template <class F, int C> struct GroupVjpShared {
-  TileSplat<F, 0> splats[kVjpBatch];
-  GroupChannels<kVjpBatch, C> channels;
-  float sums[kSubtiles][kVjpBatch][C + kShapeSums];  ///< of a warp's pixels
-  uint32_t hits[kSubtiles][kVjpBatch / 32];          ///< splats that have sums of a warp
-  int32_t rows[kVjpBatch];
-  Mat2<float> mean_maps[kVjpBatch];
+  static constexpr int kBatch = kVjpBatch<C>;
+
+  TileSplat<F, 0> splats[kBatch];
+  GroupChannels<kBatch, C> channels;
+  float sums[kSubtiles][kBatch][C + kShapeSums];  ///< of a warp's pixels
+  uint32_t hits[kSubtiles][kBatch / 32];          ///< splats that have sums of a warp
+  int32_t rows[kBatch];
+  Mat2<float> mean_maps[kBatch];
   int last[kSubtiles];  ///< place behind the last splat that a subtile composited
-  uint8_t reach[kVjpBatch];
+  uint8_t reach[kBatch];
 };
 
 /// The gradient of a pixel with respect to a channel of one of its S samples.
@@ -56,15 +59,16 @@ __device__ ChannelShare<C> share_of_gradient(const BlendVjpParams& params, const
 
 /// Blocks of the kernels below that a multiprocessor should hold at once. It limits the registers of a thread.
 template <class F, int C>
-inline constexpr int kGroupVjpBlocks = F::kSamples > 4                         ? 1
-                                       : F::kSamples > 1 || C == kChannelGroup ? 2
-                                                                               : 4;
+inline constexpr int kGroupVjpBlocks = F::kSamples > 4   ? 1
+                                       : F::kSamples > 1 ? 2
+                                       : C > kSmallGroup ? 3
+                                                         : 4;
 
 /// Channels [first, first + C).
 template <class F, int C>
 __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C>)
     blend_groups_vjp_kernel(const BlendVjpParams params, int first) {
-  constexpr int S = F::kSamples;
+  constexpr int S = F::kSamples, kBatch = kVjpBatch<C>;
   using Share = ChannelShare<C>;
   auto& shared = *reinterpret_cast<GroupVjpShared<F, C>*>(dynamic_shared());
   const Segments& segments = params.segments;
@@ -126,17 +130,17 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C>)
   }
   // The splat of this thread in the batch that ends at k1, for the threads that there are splats for.
   const auto splat_of_batch = [&](int k1) {
-    const int k = max(k1 - kVjpBatch, segment.begin) + int(threadIdx.x);
-    return threadIdx.x < kVjpBatch && k < k1 ? list.splat(k) : -1;
+    const int k = max(k1 - kBatch, segment.begin) + int(threadIdx.x);
+    return threadIdx.x < kBatch && k < k1 ? list.splat(k) : -1;
   };
   // Those of the staged splats [from, from + 32) that reach this warp's subtile.
   const auto reached = [&](int from) { return __ballot_sync(kAllLanes, shared.reach[from + lane] >> warp & 1); };
   int id = splat_of_batch(segment.end);
-  for (int k1 = segment.end; k1 > segment.begin; k1 = max(k1 - kVjpBatch, segment.begin)) {
-    const int k0 = max(k1 - kVjpBatch, segment.begin), count = k1 - k0;
+  for (int k1 = segment.end; k1 > segment.begin; k1 = max(k1 - kBatch, segment.begin)) {
+    const int k0 = max(k1 - kBatch, segment.begin), count = k1 - k0;
     const int32_t next_id = splat_of_batch(k0);
     __syncthreads();  // all have read what the last batch left
-    if (threadIdx.x < kVjpBatch) {
+    if (threadIdx.x < kBatch) {
       uint32_t reach = 0;
       const int t = threadIdx.x, k = k0 + t;
       if (k < k1) {
@@ -159,7 +163,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C>)
       prefetch(params.channels.row(next_id) + first);
     }
     id = next_id;
-    for (int part = kVjpBatch / 32 - 1; part >= 0; --part) {
+    for (int part = kBatch / 32 - 1; part >= 0; --part) {
       uint32_t hits = 0, mask = reached(32 * part);
       while (mask != 0) {
         const int bit = 31 - __clz(mask), j = 32 * part + bit;
