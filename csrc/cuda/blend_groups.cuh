@@ -150,7 +150,7 @@ template <class F, int C>
 inline constexpr int kGroupBlocks = F::kSamples > 4    ? 1
                                     : F::kSamples > 1  ? 2
                                     : C == kSmallGroup ? 5
-                                                       : 3;
+                                                       : 4;
 
 template <class F, int C>
 __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)

@@ -1,27 +1,32 @@
 // Kernel of blend_vjp for any number of channels, a group after the other: a block per tile and segment of its list, a
 // warp per subtile, a pixel per lane, back to front. Lanes share the channels as in blend_groups.cuh.
 //
-// dL/dalpha is linear in the gradient of the image: each group adds its share to the six sums of a pair, which a single
-// block owns. Only MeanSums need the channels of all groups at once: where they are wanted, the
-// first group makes all sums, and reads the channels of the others where they lie.
+// The sums of shapes come from dL/dalpha, which is linear in the gradient of the image: each group could add its share
+// to the sums of a pair, which a single block owns. As every share costs as much as the whole, the kernel of a group
+// does it for two groups of 32 channels at once, and that of the second one only sums channels. MeanSums, which are not
+// linear, need the channels of all groups: where they are wanted, the first group makes all sums of shapes, and reads
+// the channels of the others where they lie.
 #pragma once
+
+#include <algorithm>
 
 #include "cuda/blend_segments.cuh"
 
 namespace ar::cuda {
 
-/// Splats that a block takes between barriers: many, as its warps do not all meet equally many of them, but no more
-/// than leave room for a few blocks in shared memory.
-template <int C> inline constexpr int kVjpBatch = C == kSmallGroup ? 64 : 32;
+/// The kernel of a group of C channels makes the sums of shapes for kShapeGroups groups: 2, 1 or, if another one does,
+/// none. This is how many splats a block takes between barriers: many, as its warps do not all meet equally many of
+/// them, but no more than leave room for a few blocks in shared memory.
+template <int C, int kShapeGroups> inline constexpr int kVjpBatch = C == kSmallGroup || kShapeGroups == 2 ? 64 : 32;
 /// Sums of a pair besides its channels: PairGrad, and MeanSums.
 inline constexpr int kShapeSums = 8;
 
 /// What a block keeps in shared memory.
-template <class F, int C> struct GroupVjpShared {
-  static constexpr int kBatch = kVjpBatch<C>;
+template <class F, int C, int kShapeGroups> struct GroupVjpShared {
+  static constexpr int kBatch = kVjpBatch<C, kShapeGroups>;
 
   TileSplat<F, 0> splats[kBatch];
-  GroupChannels<kBatch, C> channels;
+  GroupChannels<kBatch, C> channels[std::max(kShapeGroups, 1)];
   float sums[kSubtiles][kBatch][C + kShapeSums];  ///< of a warp's pixels
   uint32_t hits[kSubtiles][kBatch / 32];          ///< splats that have sums of a warp
   int32_t rows[kBatch];
@@ -58,19 +63,20 @@ __device__ ChannelShare<C> share_of_gradient(const BlendVjpParams& params, const
 }
 
 /// Blocks of the kernels below that a multiprocessor should hold at once. It limits the registers of a thread.
-template <class F, int C>
-inline constexpr int kGroupVjpBlocks = F::kSamples > 4   ? 1
-                                       : F::kSamples > 1 ? 2
-                                       : C > kSmallGroup ? 3
-                                                         : 4;
+template <class F, int C, int kShapeGroups>
+inline constexpr int kGroupVjpBlocks = F::kSamples > 4                        ? 1
+                                       : F::kSamples > 1 || kShapeGroups == 2 ? 2
+                                       : C > kSmallGroup                      ? 4
+                                                                              : 5;
 
-/// Channels [first, first + C).
-template <class F, int C>
-__global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C>)
+/// Channels [first, first + C), and the sums of shapes for kShapeGroups groups, from this one on.
+template <class F, int C, int kShapeGroups>
+__global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, kShapeGroups>)
     blend_groups_vjp_kernel(const BlendVjpParams params, int first) {
-  constexpr int S = F::kSamples, kBatch = kVjpBatch<C>;
+  constexpr int S = F::kSamples, kBatch = kVjpBatch<C, kShapeGroups>;
+  constexpr bool kWithShape = kShapeGroups > 0;
   using Share = ChannelShare<C>;
-  auto& shared = *reinterpret_cast<GroupVjpShared<F, C>*>(dynamic_shared());
+  auto& shared = *reinterpret_cast<GroupVjpShared<F, C, kShapeGroups>*>(dynamic_shared());
   const Segments& segments = params.segments;
   const int tile = listed_tile<S>(params, int(blockIdx.x) / segments.count);
   if (tile < 0) return;
@@ -79,9 +85,8 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C>)
   const TileList& list = segment.list;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int lane = lane_id(), warp = threadIdx.x / 32, channel_count = params.channels.count;
-  const bool with_means = params.mean_sums != MeanSums::kNone;
-  const bool all_at_once = with_means && first == 0 && channel_count > C;
-  const bool with_shape = !with_means || first == 0;
+  const bool with_means = kWithShape && params.mean_sums != MeanSums::kNone;
+  const bool all_at_once = with_means && channel_count > C;
   const Vec2<float> p = segment.p;
   const Pixel& pixel = segment.pixel;
   const int (&last)[S] = segment.last;
@@ -104,14 +109,20 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C>)
   if (segment.begin == segment.end) return;
 
   const SampleGradient gradient = {params, pixel, S};
-  const Share g = share_of_gradient<S, C>(params, list, first);
-  float background[Share::kOwn];
+  Share g[std::max(kShapeGroups, 1)];
+  g[0] = share_of_gradient<S, C>(params, list, first);
+  if constexpr (kShapeGroups == 2) g[1] = share_of_gradient<S, C>(params, list, first + C);
+  float through = 0;  // what the background gives
 #pragma unroll
-  for (int k = 0; k < Share::kOwn; ++k) {
-    const int c = first + Share::channel(k);
-    background[k] = c < channel_count ? params.background[c] : 0;
+  for (int i = 0; i < kShapeGroups; ++i) {
+    float background[Share::kOwn];
+#pragma unroll
+    for (int k = 0; k < Share::kOwn; ++k) {
+      const int c = first + i * C + Share::channel(k);
+      background[k] = c < channel_count ? params.background[c] : 0;
+    }
+    through += g[i].dot(background);
   }
-  float through = g.dot(background);  // what the background gives
   if (all_at_once) {
     for (int c = C; c < channel_count; ++c) through += gradient(c) * params.background[c];
   }
@@ -124,7 +135,8 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C>)
     behind[s] = through;
     if (last[s] <= segment.end) continue;
     float rest = transmittance[s] * through;
-    for (int k = segment.number + 1; k < segments.count; ++k) rest += segments.shown_at(tile, k, s)[threadIdx.x];
+    for (int k = segment.number + 1; kWithShape && k < segments.count; ++k)
+      rest += segments.shown_at(tile, k, s)[threadIdx.x];
     transmittance[s] = segments.transmittance_at(tile, segment.number + 1, s)[threadIdx.x];
     behind[s] = rest / transmittance[s];
   }
@@ -150,17 +162,20 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C>)
         for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= shared.last[b]) << b);
         if (reach) shared.splats[t] = {tile_terms(splat, list), {}};
         if (with_means) shared.mean_maps[t] = F::mean_map(splat.shape);
-        shared.channels.ids[t] = id;
+#pragma unroll
+        for (int i = 0; i < kShapeGroups; ++i) shared.channels[i].ids[t] = id;
         shared.rows[t] = list.overflow ? id : list.slot(k);
       }
       shared.reach[t] = uint8_t(reach);
     }
     __syncthreads();
-    shared.channels.load(params.channels, first, count, shared.reach);
-    __syncthreads();
+#pragma unroll
+    for (int i = 0; i < kShapeGroups; ++i) shared.channels[i].load(params.channels, first + i * C, count, shared.reach);
+    if (kWithShape) __syncthreads();
     if (next_id >= 0) {  // so that the next batch need not wait for memory
       prefetch(splats + next_id);
-      prefetch(params.channels.row(next_id) + first);
+#pragma unroll
+      for (int i = 0; i < kShapeGroups; ++i) prefetch(params.channels.row(next_id) + first + i * C);
     }
     id = next_id;
     for (int part = kBatch / 32 - 1; part >= 0; --part) {
@@ -178,9 +193,11 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C>)
         }
         if (!__any_sync(kAllLanes, any)) continue;
         hits |= 1u << bit;
-        float g_color = g.dot(shared.channels.values[j]);
+        float g_color = 0;
+#pragma unroll
+        for (int i = 0; i < kShapeGroups; ++i) g_color += g[i].dot(shared.channels[i].values[j]);
         if (all_at_once) {
-          const float* row = params.channels.row(shared.channels.ids[j]);
+          const float* row = params.channels.row(shared.channels[0].ids[j]);
           for (int c = C; c < channel_count; ++c) g_color = madd(gradient(c), row[c], g_color);
         }
         ShapeGrad<float> shape = {{0, 0}, {0, 0, 0}};
@@ -189,12 +206,12 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C>)
         for (int s = 0; s < S; ++s) {
           const bool hit = alpha[s] >= float(kAlphaMin) && k0 + j < last[s];
           const BlendGrad<float> grad = blend_sample_vjp(hit, alpha[s], g_color, transmittance[s], behind[s]);
-          if (with_shape) F::add_alpha_vjp(splat.terms, p, s, alpha[s], grad.dL_dalpha, shape);
+          if (kWithShape) F::add_alpha_vjp(splat.terms, p, s, alpha[s], grad.dL_dalpha, shape);
           contribution += grad.contribution;
           weighted += grad.dL_dalpha * alpha[s];
         }
         float* sums = shared.sums[warp][j];
-        if (with_shape) {
+        if constexpr (kWithShape) {
           Vec2<float> means = {0, 0};
           if (with_means) {
             const Vec2<float> size = {float(params.grid.width), float(params.grid.height)};
@@ -206,7 +223,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C>)
           const float sum = sum_values(values);
           if (lane % 4 == 0) sums[C + lane / 4] = sum;
         }
-        const float channel_sum = g.weighted_sum(contribution);
+        const float channel_sum = g[0].weighted_sum(contribution);
         if (Share::has_sum()) sums[Share::summed_channel()] = channel_sum;
       }
       if (lane == 0) shared.hits[warp][part] = hits;
@@ -216,14 +233,13 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C>)
       const uint32_t of_warps = __ballot_sync(kAllLanes, shared.hits[lane % kSubtiles][j / 32] >> j % 32 & 1);
       const int32_t row = shared.rows[j];
 #pragma unroll
-      for (int v = lane; v < C + kShapeSums; v += 32) {
+      for (int v = lane; v < C + (kWithShape ? kShapeSums : 0); v += 32) {
         float sum = 0;
 #pragma unroll
         for (int w = 0; w < kSubtiles; ++w) {
           if (of_warps >> w & 1) sum += shared.sums[w][j][v];
         }
         if (v >= C) {
-          if (!with_shape) continue;
           const int column = v - C < kPairChannels ? v - C : kPairMeans + v - C - kPairChannels;
           if (first > 0 && !list.overflow) sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
           put_sum(params.pair_grads, kPairGradWidth, list.overflow, row, column, sum);
@@ -239,9 +255,10 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C>)
 }
 
 /// What the segments behind the first add to each pixel, as its gradient weighs it: what those before them see.
+/// `add`: to what another group of channels left.
 template <class F, int C>
-__global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C>)
-    segment_shown_kernel(const BlendVjpParams params, int first) {
+__global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, 1>)
+    segment_shown_kernel(const BlendVjpParams params, int first, bool add) {
   constexpr int S = F::kSamples;
   const Segments& segments = params.segments;
   const int tile = listed_tile<S>(params, int(blockIdx.x) / segments.count), number = int(blockIdx.x) % segments.count;
@@ -255,7 +272,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C>)
 #pragma unroll
   for (int s = 0; s < S; ++s) {
     transmittance[s] = segments.transmittance_at(tile, number, s)[threadIdx.x];
-    shown[s] = 0;
+    shown[s] = add ? segments.shown_at(tile, number, s)[threadIdx.x] : 0;
   }
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   walk_segment<F, C>(splats, params.channels, first, segment, transmittance,
@@ -270,26 +287,39 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C>)
   for (int s = 0; s < S; ++s) segments.shown_at(tile, number, s)[threadIdx.x] = shown[s];
 }
 
-/// Channels [first, first + C).
-template <class F, int C> void launch_groups_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
+/// Channels [first, first + C), and the sums of shapes for kShapeGroups groups, from this one on.
+template <class F, int C, int kShapeGroups>
+void launch_groups_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
   const unsigned blocks = unsigned(p.grid.tiles() * p.segments.count);
   if constexpr (!F::kYardstick) {
-    // Only the sums of shapes read what it writes. With MeanSums the first group makes them for all channels.
-    const bool with_shape = first == 0 || p.mean_sums == MeanSums::kNone;
-    if (p.segments.count > 1 && with_shape)
-      launch(segment_shown_kernel<F, C>, {blocks, kBlendThreads}, stream, p, first);
+    for (int i = 0; p.segments.count > 1 && i < kShapeGroups; ++i)
+      launch(segment_shown_kernel<F, C>, {blocks, kBlendThreads}, stream, p, first + i * C, i > 0);
   }
-  const LaunchShape shape = {blocks, kBlendThreads, sizeof(GroupVjpShared<F, C>)};
-  launch(blend_groups_vjp_kernel<F, C>, shape, stream, p, first);
+  const LaunchShape shape = {blocks, kBlendThreads, sizeof(GroupVjpShared<F, C, kShapeGroups>)};
+  launch(blend_groups_vjp_kernel<F, C, kShapeGroups>, shape, stream, p, first);
+}
+
+/// For how many groups the kernel of the one that begins with channel `first` makes the sums of shapes.
+template <class F> int shape_groups(const BlendVjpParams& p, int first) {
+  if (p.mean_sums != MeanSums::kNone) return first == 0;
+  const auto is_wide = [&](int begin) { return group_width<F>(p.channels.count - begin) == kChannelGroup; };
+  if (F::kYardstick || !is_wide(first)) return 1;
+  if (first / kChannelGroup % 2 == 1) return 0;
+  return is_wide(first + kChannelGroup) ? 2 : 1;
 }
 
 /// The group that begins with channel `first`.
 template <class F> void blend_vjp_group(const BlendVjpParams& p, int first, cudaStream_t stream) {
+  const int shapes = shape_groups<F>(p, first);
   if constexpr (!F::kYardstick) {
-    if (group_width<F>(p.channels.count - first) == kSmallGroup)
-      return launch_groups_vjp<F, kSmallGroup>(p, first, stream);
+    if (group_width<F>(p.channels.count - first) == kSmallGroup) {
+      if (shapes == 0) return launch_groups_vjp<F, kSmallGroup, 0>(p, first, stream);
+      return launch_groups_vjp<F, kSmallGroup, 1>(p, first, stream);
+    }
+    if (shapes == 2) return launch_groups_vjp<F, kChannelGroup, 2>(p, first, stream);
   }
-  launch_groups_vjp<F, kChannelGroup>(p, first, stream);
+  if (shapes == 0) return launch_groups_vjp<F, kChannelGroup, 0>(p, first, stream);
+  launch_groups_vjp<F, kChannelGroup, 1>(p, first, stream);
 }
 
 }  // namespace ar::cuda
