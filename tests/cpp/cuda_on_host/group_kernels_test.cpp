@@ -357,7 +357,7 @@ TYPED_TEST(GroupKernels, GiveTheSameBitsOfImagesInGroupsOf8AndOf32) {
 
 TYPED_TEST(GroupKernels, GiveTheSameInSegments) {
   using F = TypeParam;
-  const Scene<F> scene(270, F::kSamples > 1 ? 40 : 72, 0.05f, -0.5f);
+  const Scene<F> scene(262, F::kSamples > 1 ? 40 : 72, 0.05f, -0.8f);
   Way whole, segments;
   if (F::kSamples > 1) whole.mean_sums = segments.mean_sums = MeanSums::kNorm;
   segments.segments = 2;
@@ -368,7 +368,7 @@ TYPED_TEST(GroupKernels, GiveTheSameInSegments) {
 
 TYPED_TEST(GroupKernels, GiveTheSameWithARowForEverySplat) {
   using F = TypeParam;
-  const Scene<F> scene(20, 72, 0.3f);
+  const Scene<F> scene(12, 72, 0.3f);
   Way overflow;
   overflow.overflow = true;
   expect_near(Run<F>(scene, overflow).out, Run<F>(scene, {}).out);
