@@ -320,6 +320,19 @@ def test_too_many_pairs(variant, little_room):
 
 
 @each_path
+@pytest.mark.parametrize("channels", [5, 40, 72])
+def test_many_channels_with_too_many_pairs(variant, channels, little_room):
+    """All tiles add to a row per splat, which every group of channels must find cleared."""
+    g = torch.Generator().manual_seed(5)
+    scene = {name: value for name, value in scene32("few").items() if name != "shs"}
+    scene["colors_precomp"] = scenes.rand(g, len(scene["means3D"]), channels).float()
+    settings = settings_for(variant, replace(CAMERA, image_width=50, image_height=40))
+    settings = settings._replace(bg=scenes.rand(g, channels).float())
+    color = compare(scene, settings)
+    assert_same_without_gradient(scene, settings, color)
+
+
+@each_path
 def test_many_more_pairs_than_in_the_frame_before(variant):
     """The same Gaussians, eighty times as large: the guess is wrong once."""
     camera = replace(CAMERA, image_width=333, image_height=222)

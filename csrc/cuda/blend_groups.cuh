@@ -1,6 +1,7 @@
-// Kernel of blend for any number of channels, in groups of 32: a block per tile and group walks the whole list, a pixel
-// per lane. The weights are computed again for every group, which costs less than keeping them. Yardstick footprints
-// (`erf`, `exact`) use this kernel for few channels too, because their weights are slow anyway.
+// Kernel of blend for any number of channels, in groups of 32 or, for a last one of up to 8, of 8: a block per tile and
+// group walks the whole list, a pixel per lane. The weights are computed again for every group, which costs less than
+// keeping them. Yardstick footprints (`erf`, `exact`) use this kernel for few channels too, because their weights are
+// slow anyway, and have groups of 32 only.
 #pragma once
 
 #include "cuda/composite.cuh"
@@ -8,68 +9,169 @@
 
 namespace ar::cuda {
 
-/// Channels [first, first + kChannelGroup) of kBatch splats; zeros where there are no so many.
-template <int kBatch> struct GroupChannels {
-  int32_t ids[kBatch];
-  float4 values[kBatch][kChannelGroup / 4];
+/// Channels that the group is compiled for in which the first of `left` channels are blended.
+template <class F> constexpr int group_width(int left) {
+  return F::kYardstick || F::kMoves || left > kSmallGroup ? kChannelGroup : kSmallGroup;
+}
 
-  /// A warp per row. `reach` and `ids` of the first `count` rows must be known to all threads.
+/// An eighth of the channels of a splat in a group of C.
+template <int C> struct alignas(C / 2) Eighth {
+  float v[C / 8];
+};
+
+/// How the lanes of a warp share the channels of its pixels. Weights belong to a pixel, and a lane has one. But what is
+/// summed over channels or pixels is shared out differently, so that a channel read from shared memory serves four
+/// pixels: a lane has a quarter of the channels of the four pixels in its column. At place i of its pixels is the pixel
+/// of lane l ^ 8 i, which is its own for i = 0, and of its two eighths of the channels the first is number l / 4.
+template <int C> struct ChannelShare {
+  static constexpr int kPixels = 4, kOwn = C / 4, kHalf = C / 8;
+
+  float v[kPixels][kOwn];
+
+  /// The lane whose own pixel is at place i here.
+  __device__ static int lane_of(int i) { return lane_id() ^ 8 * i; }
+  /// Place in the group of this lane's channel k.
+  __device__ static int channel(int k) { return (lane_id() / 4 ^ k / kHalf) * kHalf + k % kHalf; }
+
+  /// A number of every lane's own pixel, for the pixels of this lane.
+  __device__ static void spread(float own, float (&of_pixels)[kPixels]) {
+    of_pixels[0] = own;
+#pragma unroll
+    for (int i = 1; i < kPixels; ++i) of_pixels[i] = __shfl_xor_sync(kAllLanes, own, 8 * i);
+  }
+  /// Sums what four lanes have of each pixel, for this lane's own.
+  __device__ static float gather(const float (&parts)[kPixels]) {
+    float sum = parts[0];
+#pragma unroll
+    for (int i = 1; i < kPixels; ++i) sum += __shfl_xor_sync(kAllLanes, parts[i], 8 * i);
+    return sum;
+  }
+  /// This lane's channels of a splat.
+  __device__ static void read(const Eighth<C> (&splat)[8], float (&own)[kOwn]) {
+    const Eighth<C> first = splat[lane_id() / 4], second = splat[lane_id() / 4 ^ 1];
+#pragma unroll
+    for (int k = 0; k < kHalf; ++k) own[k] = first.v[k], own[k + kHalf] = second.v[k];
+  }
+
+  /// Adds a splat, of which `contribution` reaches this lane's own pixel.
+  __device__ void add(float contribution, const Eighth<C> (&splat)[8]) {
+    float contributions[kPixels], own[kOwn];
+    spread(contribution, contributions);
+    read(splat, own);
+#pragma unroll
+    for (int i = 0; i < kPixels; ++i) {
+#pragma unroll
+      for (int k = 0; k < kOwn; ++k) v[i][k] = madd(contributions[i], own[k], v[i][k]);
+    }
+  }
+  /// The scalar product with one number per channel, for this lane's own pixel.
+  __device__ float dot(const float (&own)[kOwn]) const {
+    float parts[kPixels];
+#pragma unroll
+    for (int i = 0; i < kPixels; ++i) {
+      parts[i] = v[i][0] * own[0];
+#pragma unroll
+      for (int k = 1; k < kOwn; ++k) parts[i] = madd(v[i][k], own[k], parts[i]);
+    }
+    return gather(parts);
+  }
+  __device__ float dot(const Eighth<C> (&splat)[8]) const {
+    float own[kOwn];
+    read(splat, own);
+    return dot(own);
+  }
+  /// The sum over all pixels times their weights, `weight` being that of this lane's own: a lane gets that of channel
+  /// summed_channel(). Lanes trade the halves that the other will sum; the first one they have sorted out already.
+  __device__ float weighted_sum(float weight) const {
+    static_assert(kOwn == 2 || kOwn == 8);
+    float weights[kPixels], sums[kOwn];
+    spread(weight, weights);
+#pragma unroll
+    for (int k = 0; k < kOwn; ++k) {
+      sums[k] = weights[0] * v[0][k];
+#pragma unroll
+      for (int i = 1; i < kPixels; ++i) sums[k] = madd(weights[i], v[i][k], sums[k]);
+    }
+#pragma unroll
+    for (int k = 0; k < kHalf; ++k) sums[k] += __shfl_xor_sync(kAllLanes, sums[k + kHalf], 4);
+    int count = kHalf;
+#pragma unroll
+    for (int offset = 2; offset > 0; offset /= 2) {
+      const bool upper = lane_id() & offset;
+      if (count == 1) {
+        sums[0] += __shfl_xor_sync(kAllLanes, sums[0], offset);
+        continue;
+      }
+      count /= 2;
+#pragma unroll
+      for (int k = 0; k < count; ++k) {
+        const float keep = upper ? sums[k + count] : sums[k], give = upper ? sums[k] : sums[k + count];
+        sums[k] = keep + __shfl_xor_sync(kAllLanes, give, offset);
+      }
+    }
+    return sums[0];
+  }
+  /// The channel of whose sum this lane gets a copy, and whether it is the only or first one that does.
+  __device__ static int summed_channel() { return lane_id() / (32 / C); }
+  __device__ static bool has_sum() { return lane_id() % (32 / C) == 0; }
+};
+
+/// Channels [first, first + C) of kBatch splats; zeros where there are no so many.
+template <int kBatch, int C> struct GroupChannels {
+  int32_t ids[kBatch];
+  Eighth<C> values[kBatch][8];
+
+  /// A lane per channel. `reach` and `ids` of the first `count` rows must be known to all threads.
   __device__ void load(const Channels<float>& channels, int first, int count, const uint8_t* reach) {
     constexpr int kAhead = 4;  // loads before stores, so that they wait together
-    const int lane = lane_id(), warp = threadIdx.x / 32;
-    const bool used = first + lane < channels.count;
-    for (int j0 = warp; j0 < count; j0 += kSubtiles * kAhead) {
+    constexpr int kRows = kBlendThreads / C;
+    const int c = threadIdx.x % C;
+    const bool used = first + c < channels.count;
+    for (int j0 = threadIdx.x / C; j0 < count; j0 += kRows * kAhead) {
       float x[kAhead];
 #pragma unroll
       for (int i = 0; i < kAhead; ++i) {
-        const int j = j0 + kSubtiles * i;
-        x[i] = used && j < count && reach[j] ? channels.row(ids[j])[first + lane] : 0;
+        const int j = j0 + kRows * i;
+        x[i] = used && j < count && reach[j] ? channels.row(ids[j])[first + c] : 0;
       }
 #pragma unroll
       for (int i = 0; i < kAhead; ++i) {
-        const int j = j0 + kSubtiles * i;
-        if (j < count) reinterpret_cast<float*>(values[j])[lane] = x[i];
+        const int j = j0 + kRows * i;
+        if (j < count) reinterpret_cast<float*>(values[j])[c] = x[i];
       }
     }
   }
 };
 
-/// `sums` += contribution times values.
-__device__ inline void add_channels(float contribution, const float4 (&values)[kChannelGroup / 4],
-                                    float (&sums)[kChannelGroup]) {
-#pragma unroll
-  for (int q = 0; q < kChannelGroup / 4; ++q) {
-    const float4 v = values[q];
-    sums[4 * q] = madd(contribution, v.x, sums[4 * q]);
-    sums[4 * q + 1] = madd(contribution, v.y, sums[4 * q + 1]);
-    sums[4 * q + 2] = madd(contribution, v.z, sums[4 * q + 2]);
-    sums[4 * q + 3] = madd(contribution, v.w, sums[4 * q + 3]);
-  }
-}
-
 inline constexpr int kGroupBatch = 128;
 
-template <class F>
-__global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4   ? 1
-                                                 : F::kSamples > 1 ? 2
-                                                                   : 3) blend_groups_kernel(const BlendParams params) {
+/// Blocks that a multiprocessor should hold at once. It limits the registers of a thread.
+template <class F, int C>
+inline constexpr int kGroupBlocks = F::kSamples > 4    ? 1
+                                    : F::kSamples > 1  ? 2
+                                    : C == kSmallGroup ? 5
+                                                       : 4;
+
+template <class F, int C>
+__global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
+    blend_groups_kernel(const BlendParams params, int first_group) {
   constexpr int S = F::kSamples;
+  using Share = ChannelShare<C>;
   __shared__ Stage<F, 0, kGroupBatch> stage;
-  __shared__ GroupChannels<kGroupBatch> staged;
+  __shared__ GroupChannels<kGroupBatch, C> staged;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int place = tile_place<S>(params, int(blockIdx.x));
   if (place < 0) return;
-  const int first = int(blockIdx.y) * kChannelGroup, lane = lane_id();
+  const int first = first_group + int(blockIdx.y) * C, lane = lane_id();
   const int tile = params.plan.tile_order[place];
   const TileList list = list_of(params.lists, params.grid, tile);
   const Vec2<float> p = pixel_of(threadIdx.x / 32, lane);
   const Pixel pixel(list, params.grid, p);
-  float transmittance[S], sums[kChannelGroup];
+  float transmittance[S];
+  Share sums = {};
   int last[S];
 #pragma unroll
   for (int s = 0; s < S; ++s) transmittance[s] = pixel.inside ? 1.0f : -1.0f, last[s] = 0;
-#pragma unroll
-  for (int c = 0; c < kChannelGroup; ++c) sums[c] = 0;
   const auto open = [&] {
     bool any = false;
 #pragma unroll
@@ -95,28 +197,35 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4   ? 1
           last[s] = b.mask ? k + j + 1 : last[s];
         }
         if (!__any_sync(kAllLanes, contribution > 0)) continue;
-        add_channels(contribution, staged.values[j], sums);
+        sums.add(contribution, staged.values[j]);
       }
     }
   }
-  if (!pixel.inside) return;
   float through = 0;
 #pragma unroll
   for (int s = 0; s < S; ++s) {
     through += abs(transmittance[s]);
-    if (first == 0 && params.transmittance) {
+    if (first == 0 && params.transmittance && pixel.inside) {
       params.transmittance[s * pixel.image + pixel.index] = abs(transmittance[s]);
       params.last[s * pixel.image + pixel.index] = last[s];
     }
   }
   const float scale = 1.0f / S;
+  if (first == 0 && params.alpha && pixel.inside) params.alpha[pixel.index] = 1 - scale * through;
+  float throughs[Share::kPixels];
+  Share::spread(through, throughs);
 #pragma unroll
-  for (int c = 0; c < kChannelGroup; ++c) {
-    if (first + c >= params.channels.count) break;
-    params.image.plane(first + c, pixel.image)[pixel.index] =
-        scale * sums[c] + scale * through * params.background[first + c];
+  for (int i = 0; i < Share::kPixels; ++i) {
+    const Pixel of_place(list, params.grid, pixel_of(threadIdx.x / 32, Share::lane_of(i)));
+    if (!of_place.inside) continue;
+#pragma unroll
+    for (int k = 0; k < Share::kOwn; ++k) {
+      const int c = first + Share::channel(k);
+      if (c >= params.channels.count) continue;
+      params.image.plane(c, of_place.image)[of_place.index] =
+          scale * sums.v[i][k] + scale * throughs[i] * params.background[c];
+    }
   }
-  if (first == 0 && params.alpha) params.alpha[pixel.index] = 1 - scale * through;
 }
 
 /// The three colours in the splats are channels like others here.
@@ -126,8 +235,16 @@ template <class Params> Params with_channels(Params p) {
 }
 
 template <class F> void blend_groups(const BlendParams& p, cudaStream_t stream) {
-  const dim3 blocks(unsigned(p.grid.tiles()), blocks_of(p.channels.count, kChannelGroup));
-  launch(blend_groups_kernel<F>, {blocks, kBlendThreads}, stream, p);
+  const unsigned tiles = unsigned(p.grid.tiles());
+  int first = 0;
+  while (first < p.channels.count && group_width<F>(p.channels.count - first) == kChannelGroup) first += kChannelGroup;
+  if (first > 0) {
+    const dim3 blocks(tiles, unsigned(first / kChannelGroup));
+    launch(blend_groups_kernel<F, kChannelGroup>, {blocks, kBlendThreads}, stream, p, 0);
+  }
+  if constexpr (!F::kYardstick) {
+    if (first < p.channels.count) launch(blend_groups_kernel<F, kSmallGroup>, {tiles, kBlendThreads}, stream, p, first);
+  }
 }
 
 }  // namespace ar::cuda

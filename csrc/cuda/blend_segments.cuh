@@ -47,12 +47,12 @@ template <int S> struct Segment {
 
 /// Calls visit(values of the channels, contribution of each sample) for every splat of the segment that a sample of the
 /// warp composited. `transmittance`: of this lane's samples in front of the segment.
-template <class F, class Visit>
+template <class F, int C, class Visit>
 __device__ void walk_segment(const Splat<F, float>* splats, const Channels<float>& channels, int first_channel,
                              const Segment<F::kSamples>& segment, float (&transmittance)[F::kSamples], Visit&& visit) {
   constexpr int S = F::kSamples;
   __shared__ Stage<F, 0, kGroupBatch> stage;
-  __shared__ GroupChannels<kGroupBatch> staged;
+  __shared__ GroupChannels<kGroupBatch, C> staged;
   for (int k = segment.begin; k < segment.end; k += kGroupBatch) {
     __syncthreads();
     const int count = stage.load(splats, channels, segment.list, k, segment.end);
@@ -80,9 +80,9 @@ __device__ void walk_segment(const Splat<F, float>* splats, const Channels<float
   }
 }
 
-/// A block per tile and segment. Writes what the segment adds to the channels [first, first + kChannelGroup) of each
-/// pixel, times the samples. `cut`: of the kernels that went first.
-template <class F>
+/// A block per tile and segment. Writes what the segment adds to the channels [first, first + C) of each pixel, times
+/// the samples. `cut`: of the kernels that went first.
+template <class F, int C>
 __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
     segment_blend_kernel(const BlendParams params, const BlendParams cut, int first) {
   constexpr int S = F::kSamples;
@@ -92,7 +92,9 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
   const Segment<S> segment(params.lists, params.grid, params.plan.tile_order[place], int(blockIdx.x) % segments.count,
                            segments.count, params.last);
   const PixelCheckpoints<S, 3, true> checkpoints(cut, segment.tile);
-  float transmittance[S], sums[kChannelGroup];
+  using Share = ChannelShare<C>;
+  float transmittance[S];
+  Share sums = {};
 #pragma unroll
   for (int s = 0; s < S; ++s) {
     const bool open = segment.last[s] > segment.begin;
@@ -101,23 +103,25 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
       transmittance[s] = abs(checkpoints.transmittance(segment.begin / chunk_length(S) - 1, s));
     if (first == 0) segments.transmittance_at(segment.tile, segment.number, s)[threadIdx.x] = transmittance[s];
   }
-#pragma unroll
-  for (int c = 0; c < kChannelGroup; ++c) sums[c] = 0;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
-  walk_segment<F>(splats, params.channels, first, segment, transmittance,
-                  [&](int32_t, const float4(&values)[kChannelGroup / 4], const float (&contributions)[S]) {
-                    float contribution = contributions[0];
+  walk_segment<F, C>(splats, params.channels, first, segment, transmittance,
+                     [&](int32_t, const Eighth<C>(&values)[8], const float (&contributions)[S]) {
+                       float contribution = contributions[0];
 #pragma unroll
-                    for (int s = 1; s < S; ++s) contribution += contributions[s];
-                    add_channels(contribution, values, sums);
-                  });
+                       for (int s = 1; s < S; ++s) contribution += contributions[s];
+                       sums.add(contribution, values);
+                     });
 #pragma unroll
-  for (int c = 0; c < kChannelGroup; ++c) segments.sum_at(segment.tile, segment.number, c)[threadIdx.x] = sums[c];
+  for (int k = 0; k < Share::kOwn; ++k) {
+    float* plane = segments.sum_at(segment.tile, segment.number, Share::channel(k)) + threadIdx.x / 32 * 32;
+#pragma unroll
+    for (int i = 0; i < Share::kPixels; ++i) plane[Share::lane_of(i)] = sums.v[i][k];
+  }
 }
 
-/// Adds the segments up, of tiles with S samples. A block per tile.
+/// Adds the segments of a group of `width` channels up, of tiles with S samples. A block per tile.
 template <int S>
-__global__ void __launch_bounds__(kTilePixels) segment_sum_kernel(const BlendParams params, int first) {
+__global__ void __launch_bounds__(kTilePixels) segment_sum_kernel(const BlendParams params, int first, int width) {
   const int tile = int(blockIdx.x);
   if (!has_samples<S>(params.lists, tile)) return;
   const TileList list = list_of(params.lists, params.grid, tile);
@@ -127,7 +131,7 @@ __global__ void __launch_bounds__(kTilePixels) segment_sum_kernel(const BlendPar
   const float scale = 1.0f / S;
   float through = 0;
   for (int s = 0; s < S; ++s) through += params.transmittance[s * pixel.image + pixel.index];
-  for (int c = 0; c < kChannelGroup && first + c < params.channels.count; ++c) {
+  for (int c = 0; c < width && first + c < params.channels.count; ++c) {
     float sum = 0;
     for (int k = 0; k < segments.count; ++k) sum += segments.sum_at(tile, k, c)[threadIdx.x];
     params.image.plane(first + c, pixel.image)[pixel.index] =
@@ -139,9 +143,12 @@ __global__ void __launch_bounds__(kTilePixels) segment_sum_kernel(const BlendPar
 template <class F> void blend_segments(const BlendParams& p, const BlendParams& cut, cudaStream_t stream) {
   blend_few<F, 3>(cut, stream);
   const unsigned tiles = unsigned(p.grid.tiles());
-  for (int first = 0; first < p.channels.count; first += kChannelGroup) {
-    launch(segment_blend_kernel<F>, {tiles * p.segments.count, kBlendThreads}, stream, p, cut, first);
-    launch(segment_sum_kernel<F::kSamples>, {tiles, kTilePixels}, stream, p, first);
+  for (int first = 0, width; first < p.channels.count; first += width) {
+    width = group_width<F>(p.channels.count - first);
+    const auto kernel =
+        width == kSmallGroup ? segment_blend_kernel<F, kSmallGroup> : segment_blend_kernel<F, kChannelGroup>;
+    launch(kernel, {tiles * p.segments.count, kBlendThreads}, stream, p, cut, first);
+    launch(segment_sum_kernel<F::kSamples>, {tiles, kTilePixels}, stream, p, first, width);
   }
 }
 

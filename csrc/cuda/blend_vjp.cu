@@ -7,8 +7,8 @@ namespace ar::cuda {
 namespace {
 
 /// No chunk has been begun. With too many pairs there is a row per splat that all tiles add to, and which must be zero;
-/// the sums of shapes stay from group to group.
-__global__ void clear_sums_kernel(const BlendVjpParams params, int group) {
+/// the sums of shapes stay from group to group. The group begins with channel `first` and has `width` of them.
+__global__ void clear_sums_kernel(const BlendVjpParams params, int first, int width) {
   if (blockIdx.x == 0 && threadIdx.x < kSampleClasses) params.chunks_taken[threadIdx.x] = 0;
   if (params.lists.counts->pairs <= params.lists.capacity) return;
   const auto clear = [&](float* to, int width) {
@@ -16,8 +16,8 @@ __global__ void clear_sums_kernel(const BlendVjpParams params, int group) {
     for (int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x; i < n; i += int64_t(gridDim.x) * blockDim.x)
       to[i] = 0;
   };
-  if (group == 0) clear(params.pair_grads, kPairGradWidth);
-  if (params.channel_sums) clear(params.channel_sums, kChannelGroup);
+  if (first == 0) clear(params.pair_grads, kPairGradWidth);
+  if (params.channel_sums) clear(params.channel_sums, width);
 }
 
 /// Lists in segments, side by side.
@@ -38,12 +38,12 @@ template <class F, int C> void launch_moving_vjp(const BlendVjpParams& p, int fi
   const LaunchShape shape = {unsigned(p.grid.tiles()), Layout::kThreads, sizeof(MovingVjpShared<F, C, Layout>)};
   launch(moving_vjp_kernel<F, C, Layout>, shape, stream, p, first, in_segments);
 }
-/// `group`: which kChannelGroup channels; 0 where they are few.
-template <class F> void blend_vjp_moving(const BlendVjpParams& p, int group, cudaStream_t stream) {
+/// The group that begins with channel `first_of_group`; 0 where they are few.
+template <class F> void blend_vjp_moving(const BlendVjpParams& p, int first_of_group, cudaStream_t stream) {
   if (!p.channels.data) return launch_moving_vjp<F, 3>(p, 0, stream);
   if (p.channels.count <= kFewChannels) return launch_moving_vjp<F, 4>(p, 0, stream);
-  const int end = std::min((group + 1) * kChannelGroup, p.channels.count);
-  for (int first = group * kChannelGroup; first < end; first += kMovingChannels)
+  const int end = std::min(first_of_group + kChannelGroup, p.channels.count);
+  for (int first = first_of_group; first < end; first += kMovingChannels)
     launch_moving_vjp<F, kMovingChannels>(p, first, stream);
 }
 
@@ -58,18 +58,25 @@ int64_t max_adjoint_maps(int footprint, int64_t capacity, TileGrid grid) {
   return maps * AdjointMap::kNumbers * kMovingPixels;
 }
 
-void blend_vjp(int footprint, const BlendVjpParams& p, int group, cudaStream_t stream) {
-  launch(clear_sums_kernel, {kClearBlocks, kBlendThreads}, stream, p, group);
+int channel_group(int footprint, int left) {
+  int width = 0;
+  visit_footprint(footprint, Footprints{}, [&](auto f) { width = group_width<decltype(f)>(left); });
+  return width;
+}
+
+void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream) {
+  const int width = channel_group(footprint, p.channels.count - first);
+  launch(clear_sums_kernel, {kClearBlocks, kBlendThreads}, stream, p, first, width);
   visit_tile_footprints<AdaptiveBoxesVjp>(footprint, stream, [&](auto f, cudaStream_t side) {
     using F = decltype(f);
     if constexpr (F::kMoves) {
-      blend_vjp_moving<F>(p, group, side);
+      blend_vjp_moving<F>(p, first, side);
     } else {
       if constexpr (!F::kYardstick) {
         if (!p.channels.data) return blend_vjp_few<F, 3>(p, side);
         if (p.channels.count <= kFewChannels) return blend_vjp_few<F, 4>(p, side);
       }
-      blend_vjp_groups<F>(with_channels(p), group, side);
+      blend_vjp_group<F>(with_channels(p), first, side);
     }
   });
 }

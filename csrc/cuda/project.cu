@@ -40,7 +40,8 @@ void row_grads(const RowGradsParams& p, cudaStream_t stream) { launch_rows(row_g
 void sum_channels(const SumChannelsParams& p, cudaStream_t stream) {
   const int64_t n = p.sums.n;
   if (!p.channel_sums) return launch_rows(sum_few_channels_kernel, p, n, stream);
-  if (n > 0) launch(sum_channels_kernel, {blocks_of(n, kSumWarps), 32 * kSumWarps}, stream, p);
+  const auto kernel = p.width == kSmallGroup ? sum_channels_kernel<kSmallGroup> : sum_channels_kernel<kChannelGroup>;
+  if (n > 0) launch(kernel, {blocks_of(n, kSumThreads / kSumLanes), kSumThreads}, stream, p);
 }
 
 }  // namespace ar::cuda

@@ -223,45 +223,74 @@ __global__ void __launch_bounds__(kProjectThreads) sum_few_channels_kernel(const
   }
 }
 
-inline constexpr int kSumWarps = 8;
+/// Threads of a block of sum_channels, and lanes that a splat has there.
+inline constexpr int kSumThreads = 256, kSumLanes = 8;
 
-/// A group of channels: a warp per splat, a lane per channel. The warps of a block share the splats with many pairs.
-__global__ void __launch_bounds__(32 * kSumWarps) sum_channels_kernel(const SumChannelsParams params) {
-  __shared__ float parts[kSumWarps][32];
-  __shared__ int64_t first[kSumWarps];
-  __shared__ int counts[kSumWarps];
-  constexpr int kMany = 256, kAhead = 8;
-  const int lane = lane_id(), warp = threadIdx.x / 32;
-  const int64_t i = int64_t(blockIdx.x) * kSumWarps + warp, n = params.sums.n;
+/// A group of C channels. A lane reads four channels of a row at once, so that the lanes of a splat read 32 / C rows
+/// together; many splats side by side, because a splat has few pairs and would wait for memory most of the time. The
+/// threads of a block share the splats with many pairs.
+template <int C> __global__ void __launch_bounds__(kSumThreads) sum_channels_kernel(const SumChannelsParams params) {
+  constexpr int kQuads = C / 4, kRows = kSumLanes / kQuads, kSplats = kSumThreads / kSumLanes;
+  constexpr int kAhead = 4, kMany = 16 * kAhead * kRows;
+  static_assert(kRows > 0);
+  __shared__ PairRange ranges[kSplats];
+  __shared__ float4 parts[kSumThreads / 32][kQuads];
+  const int t = int(threadIdx.x), quad = t % kQuads, lane = t % kSumLanes;
+  const int64_t first_splat = int64_t(blockIdx.x) * kSplats, i = first_splat + t / kSumLanes, n = params.sums.n;
   PairRange range = i < n ? params.sums.ranges[i] : PairRange{0, 0};
   if (params.sums.by_splat() && range.count > 0) range = {int32_t(i), 1};
-  const auto sum_rows = [&](int64_t row, int count, int step) {
-    float sum = 0;
-    for (int q = 0; q < count; q += kAhead * step) {
-      float x[kAhead];
+  const auto add = [](float4& to, const float4& v) { to.x += v.x, to.y += v.y, to.z += v.z, to.w += v.w; };
+  // This lane's channels of the rows `row`, `row` + step, ... of a splat.
+  const auto sum_rows = [&](const PairRange& of_splat, int row, int step) {
+    const auto* quads = reinterpret_cast<const float4*>(params.channel_sums) + int64_t(of_splat.first) * kQuads + quad;
+    float4 sum = {0, 0, 0, 0};
+    for (int q = row; q < of_splat.count; q += kAhead * step) {
+      float4 x[kAhead];
 #pragma unroll
-      for (int k = 0; k < kAhead; ++k)
-        x[k] = q + k * step < count ? params.channel_sums[(row + q + k * step) * kChannelGroup + lane] : 0;
+      for (int k = 0; k < kAhead; ++k) {
+        const int at = q + k * step;
+        x[k] = at < of_splat.count ? quads[int64_t(at) * kQuads] : float4{0, 0, 0, 0};
+      }
 #pragma unroll
-      for (int k = 0; k < kAhead; ++k) sum += x[k];
+      for (int k = 0; k < kAhead; ++k) add(sum, x[k]);
     }
     return sum;
   };
-  const auto store = [&](int64_t splat, float sum) {
-    if (lane < params.count) params.dL_dchannels[splat * params.stride + params.first + lane] = sum;
+  // Adds up what `lanes` lanes beside each other have of the same channels.
+  const auto sum_lanes = [&](float4& sum, int lanes) {
+    for (int offset = kQuads; offset < lanes; offset *= 2) {
+      add(sum, {__shfl_xor_sync(kAllLanes, sum.x, offset), __shfl_xor_sync(kAllLanes, sum.y, offset),
+                __shfl_xor_sync(kAllLanes, sum.z, offset), __shfl_xor_sync(kAllLanes, sum.w, offset)});
+    }
   };
-  if (lane == 0) first[warp] = range.first, counts[warp] = range.count;
-  if (i < n && range.count <= kMany) store(i, sum_rows(range.first, range.count, 1));
-  __syncthreads();
-  for (int w = 0; w < kSumWarps; ++w) {
-    if (counts[w] <= kMany) continue;
-    parts[warp][lane] = sum_rows(first[w] + warp, counts[w] - warp, kSumWarps);
-    __syncthreads();
-    if (warp == w) {
-      float sum = 0;
+  const auto store = [&](int64_t splat, const float4& sum) {
+    float* to = params.dL_dchannels + splat * params.stride + params.first + 4 * quad;
+    const int left = params.count - 4 * quad;
+    if (left >= 4 && params.stride % 4 == 0) {
+      *reinterpret_cast<float4*>(to) = sum;
+    } else {
+      const float values[4] = {sum.x, sum.y, sum.z, sum.w};
 #pragma unroll
-      for (int k = 0; k < kSumWarps; ++k) sum += parts[k][lane];
-      store(i, sum);
+      for (int c = 0; c < 4; ++c) {
+        if (c < left) to[c] = values[c];
+      }
+    }
+  };
+  const bool many = range.count > kMany;
+  float4 own = sum_rows(many ? PairRange{0, 0} : range, lane / kQuads, kRows);
+  sum_lanes(own, kSumLanes);
+  if (i < n && !many && lane < kQuads) store(i, own);
+  if (lane == 0) ranges[t / kSumLanes] = range;
+  if (!__syncthreads_or(many)) return;
+  for (int k = 0; k < kSplats; ++k) {
+    if (ranges[k].count <= kMany) continue;
+    float4 sum = sum_rows(ranges[k], t / kQuads, kSumThreads / kQuads);
+    sum_lanes(sum, 32);
+    if (t % 32 < kQuads) parts[t / 32][quad] = sum;
+    __syncthreads();
+    if (t < kQuads) {
+      for (int w = 1; w < kSumThreads / 32; ++w) add(sum, parts[w][quad]);
+      store(first_splat + k, sum);
     }
     __syncthreads();
   }

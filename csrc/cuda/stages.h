@@ -20,7 +20,8 @@ inline constexpr int kPairGradWidth = 12;
 inline constexpr int kPairChannels = 6, kPairMeans = 9, kPairFourthChannel = 11;  ///< columns
 /// Channels that lie in the rows of pairs. More are blended in groups, and summed in memory of their own.
 inline constexpr int kFewChannels = 4;
-inline constexpr int kChannelGroup = 32;
+/// Channels of a group, and of a last one where no more are left.
+inline constexpr int kChannelGroup = 32, kSmallGroup = 8;
 
 /// Pairs of a tile that blend_vjp takes as one piece of work, and between which blend leaves checkpoints. Checkpoints
 /// hold every sample, so many samples get longer chunks.
@@ -249,7 +250,7 @@ struct BlendVjpParams : ar::BlendVjpParams<float> {
   int32_t* chunks_taken;  ///< [kSampleClasses] set to zero by blend_vjp; chunks of a class that warps have begun with
   const float* checkpoints;
   float* pair_grads;    ///< [max(capacity, n), kPairGradWidth] by slot, or by splat if there are too many pairs
-  float* channel_sums;  ///< [max(capacity, n), kChannelGroup] likewise, for more than kFewChannels channels; or null
+  float* channel_sums;  ///< [max(capacity, n), channel_group] likewise, for more than kFewChannels channels; or null
   MeanSums mean_sums;
   Segments segments;    ///< as in BlendParams
   float* adjoint_maps;  ///< [max_adjoint_maps]
@@ -270,7 +271,8 @@ struct PairSumsView {
 /// From rows of pairs to gradients with respect to channels [first, first + count) of every splat.
 struct SumChannelsParams {
   PairSumsView sums;
-  const float* channel_sums;  ///< of kChannelGroup channels; null: in the rows of pairs
+  const float* channel_sums;  ///< of `width` channels; null: in the rows of pairs
+  int width;                  ///< kChannelGroup or kSmallGroup
   int first, count;
   float* dL_dchannels;  ///< [n, stride]
   int64_t stride;
@@ -329,8 +331,10 @@ void choose_samples(const ChooseParams& p, cudaStream_t stream);
 /// to blend the splats' three colours with as for a backward pass; their transmittance, last and alpha are those of
 /// `p`.
 void blend(int footprint, const BlendParams& p, const BlendParams* cut, cudaStream_t stream);
-/// `group`: which kChannelGroup channels; 0 where they are few.
-void blend_vjp(int footprint, const BlendVjpParams& p, int group, cudaStream_t stream);
+/// Width of the group that the first of `left` channels are in, where there are more than kFewChannels in all.
+int channel_group(int footprint, int left);
+/// The group of channels that begins with `first`; 0 where they are few.
+void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream);
 void inspect(int footprint, const InspectParams& p, cudaStream_t stream);
 
 // One weight per element (weight.cu).

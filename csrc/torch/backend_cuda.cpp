@@ -366,17 +366,19 @@ class CudaBackend final : public Backend {
       sum.dL_dchannels = pointer<float>(out.dL_dchannels);
       sum.stride = count;
     }
+    const auto width_of = [&](int first) {
+      return few ? cuda::kFewChannels : cuda::channel_group(pass.footprint.choice.index, count - first);
+    };
     Tensor channel_sums;
     if (!few) {
-      channel_sums = at::empty({rows, cuda::kChannelGroup}, floats_);
+      channel_sums = at::empty({rows, width_of(0)}, floats_);  // no later group is wider
       sum.channel_sums = p.channel_sums = pointer<float>(channel_sums);
     }
-    const int width = few ? cuda::kFewChannels : cuda::kChannelGroup;
-    for (int first = 0; first < count; first += width) {
-      cuda::blend_vjp(pass.footprint.choice.index, p, first / width, stream_);
+    for (; sum.first < count; sum.first += sum.width) {
+      sum.width = width_of(sum.first);
+      sum.count = std::min(count - sum.first, sum.width);
+      cuda::blend_vjp(pass.footprint.choice.index, p, sum.first, stream_);
       check_stage("blend_vjp", pass.debug);
-      sum.first = first;
-      sum.count = std::min(count - first, width);
       if (with_sums) cuda::sum_channels(sum, stream_);
       check_stage("sum_channels", pass.debug);
     }

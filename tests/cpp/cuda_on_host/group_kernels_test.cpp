@@ -1,0 +1,429 @@
+// The kernels for groups of channels, run on the host: they give what compositing pixel by pixel in float64 gives, in
+// either direction, and the same in groups of 8 and of 32, for lists as a whole, in segments, and of all splats. Sums
+// over the pairs of a splat.
+#include <random>
+
+#include "cuda_on_host.h"
+// After it: kernels.
+#include <gtest/gtest.h>
+
+#include "cuda/blend_groups_vjp.cuh"
+#include "cuda/project_vjp.cuh"
+
+namespace ar::cuda {
+
+alignas(16) static float4 memory[1 << 13];
+float4* dynamic_shared() { return memory; }
+
+namespace {
+
+constexpr int kWidth = 20, kHeight = 10, kPixels = kWidth * kHeight;
+constexpr TileGrid kGrid = {kWidth, kHeight};
+
+/// A random scene, all of whose splats every tile lists.
+template <class F> struct Scene {
+  int channels;
+  std::vector<Splat<F, float>> splats;
+  std::vector<SlotPair> pairs;
+  std::vector<int64_t> offsets = {0};
+  std::vector<int32_t> order;
+  std::vector<float> rows, background, dL_dimage, dL_dalpha;
+  Counts counts = {};
+
+  /// `largest`: logarithm of the largest variance.
+  Scene(int count, int channels, float most_opaque, float largest = 2) : channels(channels), splats(count) {
+    std::mt19937 bits(7);
+    const auto uniform = [&](float low, float high) { return std::uniform_real_distribution<float>(low, high)(bits); };
+    const auto fill = [&](std::vector<float>& to, int size, float low, float high) {
+      to.resize(size);
+      for (float& x : to) x = uniform(low, high);
+    };
+    for (Splat<F, float>& splat : splats) {
+      const float a = std::exp(uniform(-1, largest)), b = std::exp(uniform(-1, largest)), angle = uniform(0, 3.14f);
+      const float c = std::cos(angle), s = std::sin(angle);
+      const Cov2d<float> cov = {a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c, a * b};
+      splat.mean = {uniform(0, kWidth), uniform(0, kHeight)};
+      splat.shape = GaussianFootprint<F::kSamples, true>::prepare_with(cov, 1 / 12.0f);
+      splat.opacity = uniform(0.02f, most_opaque);
+      splat.level = F::level(splat.shape, splat.opacity);
+    }
+    fill(rows, count * channels, 0, 1);
+    fill(background, channels, 0, 1);
+    fill(dL_dimage, channels * kPixels, -0.5f, 0.5f);
+    fill(dL_dalpha, kPixels, -0.5f, 0.5f);
+    for (int tile = 0; tile < kGrid.tiles(); ++tile) {
+      for (int k = 0; k < count; ++k) pairs.push_back({k, int32_t(pairs.size())});
+      offsets.push_back(int64_t(pairs.size()));
+    }
+    for (int k = 0; k < count; ++k) order.push_back(k);
+    counts = {int64_t(pairs.size()), count};
+  }
+
+  /// `overflow`: there are more pairs than room, so that no list was made.
+  TileLists lists(bool overflow) const {
+    TileLists out = {};
+    out.pairs = &pairs[0].splat;
+    out.stride = 2;
+    out.tile_offsets = offsets.data();
+    out.order = order.data();
+    out.counts = &counts;
+    out.n = int64_t(splats.size());
+    out.capacity = int64_t(pairs.size()) - overflow;
+    return out;
+  }
+};
+
+/// What a pass gives. Sums are those of splats: over their pairs.
+struct Results {
+  std::vector<float> image, alpha, transmittance;
+  std::vector<int32_t> last;
+  std::vector<std::vector<float>> shapes, channels;  ///< PairGrad and MeanSums, and channels, of every splat
+};
+
+struct Way {
+  int width = kSmallGroup;  ///< of a group of no more than kSmallGroup channels
+  MeanSums mean_sums = MeanSums::kNone;
+  int segments = 1;
+  bool overflow = false;
+};
+
+template <class F> struct Run {
+  static constexpr int S = F::kSamples;
+
+  const Scene<F>& scene;
+  const Way way;
+  const int tiles = int(kGrid.tiles()), count = int(scene.splats.size());
+  Results out;
+  BlendParams blend = {};
+  BlendVjpParams vjp = {};
+  PlanState state = {};
+  std::vector<int32_t> order;
+  std::vector<TileChunk> chunks;
+  std::vector<float> checkpoints, transmittances, sums, shown, pair_grads, channel_sums;
+  std::vector<int32_t> planes;
+
+  Run(const Scene<F>& scene, Way way) : scene(scene), way(way) {
+    out.image.resize(scene.channels * kPixels);
+    out.alpha.resize(kPixels);
+    out.transmittance.resize(S * kPixels);
+    out.last.resize(S * kPixels);
+    out.shapes.assign(count, std::vector<float>(kShapeSums));
+    out.channels.assign(count, std::vector<float>(scene.channels));
+    for (int tile = 0; tile < tiles; ++tile) order.push_back(tile), chunks.push_back({tile, 0, 0});
+    for (int c = 0; c <= kSampleClasses; ++c) state.counts.chunks.first[c] = c > sample_class(S) ? tiles : 0;
+    blend.grid = vjp.grid = kGrid;
+    blend.splats = vjp.splats = &scene.splats[0].mean.x;
+    blend.channels = vjp.channels = {scene.rows.data(), scene.channels, nullptr, scene.channels};
+    blend.background = vjp.background = scene.background.data();
+    blend.image = {out.image.data(), scene.channels, {}};
+    blend.alpha = out.alpha.data();
+    blend.transmittance = out.transmittance.data();
+    blend.last = out.last.data();
+    blend.lists = vjp.lists = scene.lists(way.overflow);
+    blend.plan.tile_order = order.data();
+    vjp.transmittance = blend.transmittance;
+    vjp.last = blend.last;
+    vjp.dL_dimage = {scene.dL_dimage.data(), scene.channels, {}};
+    vjp.dL_dalpha = scene.dL_dalpha.data();
+    vjp.plan = &state;
+    vjp.chunk_order = chunks.data();
+    vjp.mean_sums = way.mean_sums;
+    forward();
+    if (way.segments > 1) in_segments();
+    backward();
+  }
+
+  int width_of(int first) const {
+    const int left = scene.channels - first;
+    return left <= kSmallGroup && first == 0 ? way.width : group_width<F>(left);
+  }
+  /// Calls f(std::integral_constant<int, width>, first channel) for every group.
+  template <class Function> void for_each_group(Function&& f) {
+    for (int first = 0; first < scene.channels; first += width_of(first)) {
+      if (width_of(first) == kSmallGroup) {
+        f(std::integral_constant<int, kSmallGroup>(), first);
+      } else {
+        f(std::integral_constant<int, kChannelGroup>(), first);
+      }
+    }
+  }
+
+  void forward() {
+    for_each_group([&](auto width, int first) {
+      cuda_on_host::launch(tiles, kBlendThreads, [&] { blend_groups_kernel<F, width()>(blend, first); });
+    });
+  }
+
+  /// Blends again, in segments: `last` is known, and so is the transmittance between chunks.
+  void in_segments() {
+    const int length = chunk_length(S), of_tile = (count + length - 1) / length;
+    checkpoints.assign(size_t(tiles) * of_tile * S * 4 * kTilePixels, NAN);
+    BlendParams cut = blend;
+    cut.layout = {3, true};
+    cut.checkpoints = checkpoints.data();
+    for (int tile = 0; tile < tiles; ++tile) planes.push_back(tile * of_tile * S * 4);
+    cut.plan.tile_planes = planes.data();
+    for (int tile = 0; tile < tiles; ++tile) {
+      for (int t = 0; t < kTilePixels; ++t) {
+        const TileList list = list_of(blend.lists, kGrid, tile);
+        const Vec2<float> p = pixel_of(t / 32, t % 32);
+        for (int s = 0; s < S; ++s) {
+          float transmittance = 1;
+          for (int k = 0; k < count; ++k) {
+            const Splat<F, float>& splat = scene.splats[k];
+            const float raw = subtile_reach(support_of(splat), list.x0, list.y0) >> t / 32 & 1
+                                  ? F::alpha(tile_terms(splat, list), p, s)
+                                  : 0;
+            blend_sample(raw, transmittance);
+            if ((k + 1) % length > 0) continue;
+            auto* kept = reinterpret_cast<Checkpoint<3>*>(&checkpoints[size_t(planes[tile]) * kTilePixels]);
+            kept[(k / length * S + s) * kTilePixels + t].transmittance = transmittance;
+          }
+        }
+      }
+    }
+    const size_t all = size_t(tiles) * way.segments * kTilePixels;
+    transmittances.assign(all * S, NAN);
+    shown.assign(all * S, NAN);
+    sums.assign(all * kChannelGroup, NAN);
+    blend.segments = {way.segments, S, transmittances.data(), sums.data(), shown.data()};
+    vjp.segments = blend.segments;
+    out.image.assign(out.image.size(), NAN);
+    for_each_group([&](auto width, int first) {
+      cuda_on_host::launch(tiles * way.segments, kBlendThreads,
+                           [&] { segment_blend_kernel<F, width()>(blend, cut, first); });
+      cuda_on_host::launch(tiles, kTilePixels, [&] { segment_sum_kernel<S>(blend, first, width()); });
+    });
+  }
+
+  template <int C, int kShapeGroups> void backward(int first) {
+    const int blocks = tiles * way.segments;
+    for (int i = 0; way.segments > 1 && i < kShapeGroups; ++i)
+      cuda_on_host::launch(blocks, kBlendThreads, [&] { segment_shown_kernel<F, C>(vjp, first + i * C, i > 0); });
+    static_assert(sizeof(GroupVjpShared<F, C, kShapeGroups>) <= sizeof memory);
+    cuda_on_host::launch(blocks, kBlendThreads, [&] { blend_groups_vjp_kernel<F, C, kShapeGroups>(vjp, first); });
+  }
+
+  void backward() {
+    vjp.segments.count = way.segments;
+    const size_t rows = way.overflow ? count : scene.pairs.size();
+    // With a row for each splat all tiles add to it; otherwise every row must be written.
+    const float start = way.overflow ? 0 : NAN;
+    pair_grads.assign(rows * kPairGradWidth, start);
+    channel_sums.assign(rows * width_of(0), start);  // for the widest group, and for all of them
+    vjp.channel_sums = channel_sums.data();
+    vjp.pair_grads = pair_grads.data();
+    for_each_group([&](auto width, int first) {
+      if (way.overflow) channel_sums.assign(rows * width(), 0);
+      switch (shape_groups<F>(vjp, first)) {
+        case 0:
+          backward<width(), 0>(first);
+          break;
+        case 1:
+          backward<width(), 1>(first);
+          break;
+        default:
+          if constexpr (width() == kChannelGroup) backward<width(), 2>(first);
+      }
+      for (size_t row = 0; row < rows; ++row) {
+        const int c_end = std::min(scene.channels - first, int(width()));
+        for (int c = 0; c < c_end; ++c) out.channels[row % count][first + c] += channel_sums[row * width() + c];
+      }
+    });
+    const int widths = way.mean_sums == MeanSums::kNone ? kPairChannels : kShapeSums;
+    for (size_t row = 0; row < rows; ++row) {
+      for (int v = 0; v < widths; ++v) {
+        const int column = v < kPairChannels ? v : kPairMeans + v - kPairChannels;
+        out.shapes[row % count][v] += pair_grads[row * kPairGradWidth + column];
+      }
+    }
+  }
+};
+
+/// Pixel by pixel, in float64, from the same lists of splats that reach a subtile.
+template <class F> Results reference(const Scene<F>& scene, MeanSums mean_sums) {
+  constexpr int S = F::kSamples;
+  const int count = int(scene.splats.size());
+  Results out;
+  out.image.resize(scene.channels * kPixels);
+  out.alpha.resize(kPixels);
+  std::vector<std::vector<double>> shapes(count, std::vector<double>(kShapeSums));
+  std::vector<std::vector<double>> channels(count, std::vector<double>(scene.channels));
+  for (int i = 0; i < kPixels; ++i) {
+    const Vec2<double> p = {double(i % kWidth), double(i / kWidth)};
+    const auto shape_of = [&](int k) {
+      const auto& w = scene.splats[k].shape.w;
+      return GaussianShape<double>{{w.xx, w.xy, w.yx, w.yy}, scene.splats[k].shape.amp};
+    };
+    const auto terms_of = [&](int k) {
+      const Splat<F, float>& splat = scene.splats[k];
+      return F::terms(shape_of(k), double(splat.opacity), {-double(splat.mean.x), -double(splat.mean.y)});
+    };
+    double transmittance[S], through = 0, g_background = -scene.dL_dalpha[i] / double(S);
+    std::vector<double> image(scene.channels);
+    std::vector<std::array<bool, S>> hits(count);
+    for (int s = 0; s < S; ++s) transmittance[s] = 1;
+    for (int k = 0; k < count; ++k) {
+      const auto terms = terms_of(k);
+      for (int s = 0; s < S; ++s) {
+        const Blended<double> b = blend_sample(F::alpha(terms, p, s), transmittance[s]);
+        hits[k][s] = b.mask;
+        for (int c = 0; c < scene.channels; ++c) image[c] += b.contribution * scene.rows[k * scene.channels + c] / S;
+      }
+    }
+    for (int s = 0; s < S; ++s) through += std::abs(transmittance[s]) / S;
+    for (int c = 0; c < scene.channels; ++c) {
+      out.image[c * kPixels + i] = float(image[c] + through * scene.background[c]);
+      g_background += scene.dL_dimage[c * kPixels + i] / double(S) * scene.background[c];
+    }
+    out.alpha[i] = float(1 - through);
+    double behind[S];
+    for (int s = 0; s < S; ++s) transmittance[s] = std::abs(transmittance[s]), behind[s] = g_background;
+    for (int k = count - 1; k >= 0; --k) {
+      const auto terms = terms_of(k);
+      double g_color = 0, contribution = 0, weighted = 0;
+      for (int c = 0; c < scene.channels; ++c)
+        g_color += scene.dL_dimage[c * kPixels + i] / double(S) * scene.rows[k * scene.channels + c];
+      ShapeGrad<double> sums = {{0, 0}, {0, 0, 0}};
+      for (int s = 0; s < S; ++s) {
+        const double alpha = F::alpha(terms, p, s);
+        const BlendGrad<double> grad = blend_sample_vjp(bool(hits[k][s]), alpha, g_color, transmittance[s], behind[s]);
+        F::add_alpha_vjp(terms, p, s, alpha, grad.dL_dalpha, sums);
+        contribution += grad.contribution;
+        weighted += grad.dL_dalpha * alpha;
+      }
+      for (int c = 0; c < scene.channels; ++c) channels[k][c] += contribution * scene.dL_dimage[c * kPixels + i] / S;
+      Vec2<double> means = {0, 0};
+      if (mean_sums != MeanSums::kNone) {
+        const Vec2<double> size = {kWidth, kHeight};
+        means = mean_sums_of(mean_sums, size, transform_transposed(F::mean_map(shape_of(k)), sums.offset));
+      }
+      sums = F::collect(terms, sums, weighted);
+      const double values[] = {sums.offset.x, sums.offset.y, sums.shape.xx, sums.shape.xy,
+                               sums.shape.yy, weighted,      means.x,       means.y};
+      for (int v = 0; v < kShapeSums; ++v) shapes[k][v] += values[v];
+    }
+  }
+  for (int k = 0; k < count; ++k) {
+    out.shapes.emplace_back(shapes[k].begin(), shapes[k].end());
+    out.channels.emplace_back(channels[k].begin(), channels[k].end());
+  }
+  return out;
+}
+
+/// Sums of hundreds of terms of order 1, in other orders.
+constexpr float kRounding = 500 * 1.2e-7f;
+
+void expect_near(const std::vector<float>& a, const std::vector<float>& b, const char* what) {
+  ASSERT_EQ(a.size(), b.size());
+  for (size_t i = 0; i < a.size(); ++i) ASSERT_NEAR(a[i], b[i], kRounding * (1 + std::abs(b[i]))) << what << " " << i;
+}
+void expect_near(const Results& a, const Results& b) {
+  expect_near(a.image, b.image, "image");
+  expect_near(a.alpha, b.alpha, "alpha");
+  for (size_t k = 0; k < a.shapes.size(); ++k) {
+    expect_near(a.shapes[k], b.shapes[k], "shape");
+    expect_near(a.channels[k], b.channels[k], "channels");
+  }
+}
+
+template <class F> class GroupKernels : public testing::Test {};
+using Gaussians = testing::Types<GaussianPixels<1>, GaussianPixels<4>>;
+TYPED_TEST_SUITE(GroupKernels, Gaussians);
+
+TYPED_TEST(GroupKernels, GiveWhatCompositingPixelByPixelGives) {
+  using F = TypeParam;
+  const std::pair<int, MeanSums> cases[] = {{5, MeanSums::kAbsolute}, {72, MeanSums::kNorm}, {100, MeanSums::kNone}};
+  for (const auto& [channels, mean_sums] : cases) {
+    SCOPED_TRACE(testing::Message() << channels << " channels, MeanSums " << int(mean_sums));
+    const Scene<F> scene(25, channels, 0.95f);
+    Way way;
+    way.mean_sums = mean_sums;
+    expect_near(Run<F>(scene, way).out, reference(scene, mean_sums));
+  }
+}
+
+TYPED_TEST(GroupKernels, GiveTheSameBitsOfImagesInGroupsOf8AndOf32) {
+  using F = TypeParam;
+  const Scene<F> scene(20, 8, 0.95f);
+  Way wide;
+  wide.width = kChannelGroup;
+  const Results of_8 = Run<F>(scene, {}).out, of_32 = Run<F>(scene, wide).out;
+  EXPECT_EQ(of_8.image, of_32.image);
+  EXPECT_EQ(of_8.alpha, of_32.alpha);
+  EXPECT_EQ(of_8.last, of_32.last);
+  expect_near(of_8, of_32);
+}
+
+TYPED_TEST(GroupKernels, GiveTheSameInSegments) {
+  using F = TypeParam;
+  const Scene<F> scene(262, F::kSamples > 1 ? 40 : 72, 0.05f, -0.8f);
+  Way whole, segments;
+  if (F::kSamples > 1) whole.mean_sums = segments.mean_sums = MeanSums::kNorm;
+  segments.segments = 2;
+  const Results results = Run<F>(scene, whole).out;
+  EXPECT_GT(*std::max_element(results.last.begin(), results.last.end()), chunk_length(F::kSamples));
+  expect_near(Run<F>(scene, segments).out, results);
+}
+
+TYPED_TEST(GroupKernels, GiveTheSameWithARowForEverySplat) {
+  using F = TypeParam;
+  const Scene<F> scene(12, 72, 0.3f);
+  Way overflow;
+  overflow.overflow = true;
+  expect_near(Run<F>(scene, overflow).out, Run<F>(scene, {}).out);
+}
+
+/// Whole numbers, whose sums are exact in any order. `stride`: channels of the tensor, of which the group has up to C.
+template <int C> void sum_channels_of(const std::vector<int>& pairs_of_splats, int first, int stride, bool by_splat) {
+  SCOPED_TRACE(testing::Message() << C << " channels from " << first << " of " << stride << ", by splat " << by_splat);
+  const int64_t n = int64_t(pairs_of_splats.size());
+  const int count = std::min(C, stride - first);
+  std::vector<PairRange> ranges;
+  int32_t pairs = 0;
+  for (const int of_splat : pairs_of_splats) ranges.push_back({pairs, of_splat}), pairs += of_splat;
+  const Counts counts = {pairs, 0};
+  std::vector<float> rows(std::max<int64_t>(pairs, n) * C), out(n * stride, NAN), expected = out;
+  for (size_t i = 0; i < rows.size(); ++i) rows[i] = float(int(i * 7919 % 101) - 50);
+  for (int64_t i = 0; i < n; ++i) {
+    const bool none = pairs_of_splats[i] == 0;
+    const int64_t begin = by_splat ? i : ranges[i].first, end = none       ? begin
+                                                                : by_splat ? i + 1
+                                                                           : begin + ranges[i].count;
+    for (int c = 0; c < count; ++c) {
+      float& sum = expected[i * stride + first + c] = 0;
+      for (int64_t row = begin; row < end; ++row) sum += rows[row * C + c];
+    }
+  }
+  SumChannelsParams params = {};
+  params.sums = {n, ranges.data(), &counts, pairs - by_splat, nullptr};
+  params.channel_sums = rows.data();
+  params.width = C, params.first = first, params.count = count;
+  params.dL_dchannels = out.data();
+  params.stride = stride;
+  const int of_block = kSumThreads / kSumLanes;
+  cuda_on_host::launch((int(n) + of_block - 1) / of_block, kSumThreads, [&] { sum_channels_kernel<C>(params); });
+  for (size_t i = 0; i < out.size(); ++i) {
+    if (std::isnan(expected[i])) {
+      EXPECT_TRUE(std::isnan(out[i])) << i;
+    } else {
+      EXPECT_EQ(out[i], expected[i]) << i;
+    }
+  }
+}
+
+TEST(SumChannels, AddsThePairsOfEverySplat) {
+  std::vector<int> pairs;
+  for (int i = 0; i < 40; ++i) pairs.push_back(i * i % 23);
+  pairs.insert(pairs.begin() + 3, {64, 65, 256, 257, 3000});
+  pairs.push_back(1000);
+  for (const bool by_splat : {false, true}) {
+    sum_channels_of<8>(pairs, 0, 8, by_splat);
+    sum_channels_of<8>(pairs, 32, 37, by_splat);
+    sum_channels_of<32>(pairs, 0, 40, by_splat);
+    sum_channels_of<32>(pairs, 32, 46, by_splat);
+  }
+}
+
+}  // namespace
+}  // namespace ar::cuda
