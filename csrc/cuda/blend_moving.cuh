@@ -100,10 +100,7 @@ template <class F, class Layout, bool kTogether = false> struct MovingSamples {
     }
   }
   __device__ static bool exists(int i) { return Layout::first_sample() + i < F::kSamples; }
-  __device__ static Vec2<float> node(int i) {
-    const Vec2<double> n = F::node(Layout::first_sample() + i);
-    return {float(n.x), float(n.y)};
-  }
+  __device__ static Vec2<float> node(int i) { return F::template node<float>(Layout::first_sample() + i); }
   __device__ bool open() const {
     bool any = false;
 #pragma unroll
