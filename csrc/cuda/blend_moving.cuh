@@ -163,11 +163,19 @@ template <class F, int C, class Layout, int kBatch> struct MovingStage {
     if (threadIdx.x < kBatch) reach[threadIdx.x] = bits;
   }
 
-  /// Of the splats [k, k + 32), those that reach this warp's pixels. All lanes must call it.
+  /// Of the splats [k, k + 32), those that reach this warp's pixels: that of k + j is bit 31 - j. All must call it.
   __device__ uint32_t reached(int k) const {
-    return __ballot_sync(kAllLanes, reach[k + lane_id()] >> (threadIdx.x / 32) & 1);
+    return __ballot_sync(kAllLanes, reach[k + 31 - lane_id()] >> (threadIdx.x / 32) & 1);
   }
 };
+
+/// Takes the first splat out of `reached`, as MovingStage has them, and returns its number: the highest bit is found
+/// with one slow instruction, the lowest with two.
+__device__ inline int take_first(uint32_t& reached) {
+  const int first = __clz(int(reached));
+  reached ^= 1u << (31 - first);
+  return first;
+}
 
 /// A lane's share of blending a pixel.
 template <class F, int C, class Layout, bool kTogether = false> struct MovingBlend {
@@ -250,8 +258,8 @@ __global__ void __launch_bounds__(Layout::kThreads)
       if (!__any_sync(kAllLanes, blend.samples.open())) break;
       if (keep && k + from > 0 && (k + from) % places.spacing == 0)
         blend.samples.store(params.checkpoints, places.first + (k + from) / places.spacing - 1);
-      for (uint32_t mask = stage.reached(from); mask != 0; mask &= mask - 1) {
-        const int j = from + __ffs(mask) - 1;
+      for (uint32_t left = stage.reached(from); left != 0;) {
+        const int j = from + take_first(left);
         blend.add(stage.splats[j], p, k + j);
       }
     }

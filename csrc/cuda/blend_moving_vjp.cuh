@@ -247,8 +247,8 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
   const auto replay = [&](int from, int k) {
     uint32_t shown = 0;
     int kept = 0;
-    for (uint32_t mask = shared.stage.reached(from); mask != 0; mask &= mask - 1, ++kept) {
-      const int bit = __ffs(mask) - 1;
+    for (uint32_t left = shared.stage.reached(from); left != 0; ++kept) {
+      const int bit = take_first(left);
       const auto& terms = shared.stage.splats[from + bit].terms;
       const Vec2<float> of_pixel = transform(terms.w, p, terms.node[0]);
       bool any = false;
@@ -306,7 +306,7 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
       for (uint32_t mask = shown; mask != 0;) {
         const int bit = 31 - __clz(mask), j = from + bit;
         mask ^= 1u << bit;
-        const int kept = __popc(reached & ((1u << bit) - 1));
+        const int kept = __popc(reached >> (31 - bit)) - 1;
         TileSplatRef<F, C> splat = shared.stage.splats[j];
         const Vec2<float> of_pixel = transform(splat.terms.w, p, splat.terms.node[0]);
         float g_color = g.v[0] * splat.channels.v[0];
