@@ -38,10 +38,18 @@ template <class F, int C, class Layout> struct MovingVjpShared {
   int last[Layout::kWarps];  ///< place behind the last splat that a warp composited
 };
 
-/// Sums PairGrad and `channels` over a warp, in `sums` as MovingVjpShared has them. All lanes must call it.
+/// Which of the sums of a pair a lane has after put_warp_sums. Of few channels every lane has one; lanes that have the
+/// same one have the same bits.
+template <int C> __device__ int sum_of_lane() {
+  const int lane = lane_id();
+  if (C > kFewChannels) return lane / 4;
+  return (lane & 2) == 0 ? lane / 4 : C == 4 && lane >= 16 ? 9 : 8;
+}
+
+/// Sums PairGrad and `channels` over a warp. `sums` is where MovingVjpShared has sum sum_of_lane() of the pair. All
+/// lanes must call it.
 template <int C> __device__ void put_warp_sums(const PairGrad<float>& grad, const Values<C>& channels, float* sums) {
   const ShapeGrad<float>& shape = grad.shape;
-  const int lane = lane_id();
   const float of_shape[6] = {shape.offset.x, shape.offset.y, shape.shape.xx,
                              shape.shape.xy, shape.shape.yy, grad.weighted};
   float values[C <= kFewChannels ? 6 + C : 8] = {};
@@ -50,15 +58,15 @@ template <int C> __device__ void put_warp_sums(const PairGrad<float>& grad, cons
   if constexpr (C <= kFewChannels) {
 #pragma unroll
     for (int c = 0; c < C; ++c) values[6 + c] = channels.v[c];
-    const float sum = sum_values(values);
-    const int value = summed_value<6 + C>(lane);
-    if (value >= 0) sums[value] = sum;
+    static_assert(C == 3 || C == 4);
+    *sums = sum_values(values);  // by all lanes, which costs less than to find the first of each sum
   } else {
     static_assert(C == 8);
     const float sum = sum_values(values), of_channels = sum_values(channels.v);
+    const int lane = lane_id();
     if (lane % 4 != 0) return;
-    if (lane < 24) sums[lane / 4] = sum;
-    sums[6 + lane / 4] = of_channels;
+    if (lane < 24) *sums = sum;
+    sums[6] = of_channels;
   }
 }
 
@@ -241,6 +249,7 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
     }
   }
 
+  float* const lane_sums = &shared.sums[warp][0][sum_of_lane<C>()];
   Vec2<float> places_in_front[kStateChunk][kCells];
   // Composites those of the staged splats [from, from + 32) that reach the warp; the first of them is pair k. Returns
   // those that a sample of the warp shows, and keeps the places of the samples in front of all.
@@ -339,17 +348,16 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
           contribution = i == 0 ? grad.contribution : contribution + grad.contribution;
         }
         if (kMaps) continue;
-        float* sums = shared.sums[warp][j];
         if (with_means && with_shape) {
           const Vec2<float> offset = {Layout::sum_lanes(sum.shape.offset.x), Layout::sum_lanes(sum.shape.offset.y)};
           const Vec2<float> size = {float(params.grid.width), float(params.grid.height)};
           Vec2<float> means = mean_sums_of(params.mean_sums, size, transform_transposed(shared.mean_maps[j], offset));
           if (Layout::first_sample() > 0) means = {0, 0};  // once for a pixel
           means = {warp_sum(means.x), warp_sum(means.y)};
-          if (lane < 2) sums[Shared::kMeans + lane] = lane == 0 ? means.x : means.y;
+          if (lane < 2) shared.sums[warp][j][Shared::kMeans + lane] = lane == 0 ? means.x : means.y;
         }
         sum.shape = F::collect(splat.terms, sum.shape, sum.weighted);
-        put_warp_sums(sum, times(contribution, g), sums);
+        put_warp_sums(sum, times(contribution, g), lane_sums + j * Shared::kSums);
       }
       if (lane == 0) shared.hits[warp][from / kStateChunk] = shown;
     }
