@@ -125,15 +125,15 @@ template <class F, class Layout, bool kTogether = false> struct MovingSamples {
       to[2 * kPlane] = place[i].y;
     }
   }
-  /// In front of pair k, a multiple of the spacing. Samples that have composited their last splat, `last` pairs from
-  /// the first, may have no checkpoint there, and need none.
-  __device__ void load(const float* checkpoints, const StatePlaces& places, int k, const int (&last)[kCells]) {
+  /// In front of pair k, where checkpoint `number` is, unless k is 0. Samples that have composited their last splat,
+  /// `last` pairs from the first, may have no checkpoint there, and need none.
+  __device__ void load(const float* checkpoints, int64_t number, int k, const int (&last)[kCells]) {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
       transmittance[i] = 1;
       place[i] = node(i);
       if (k == 0 || k >= last[i]) continue;
-      const float* from = checkpoints + in_checkpoint(places.first + k / places.spacing - 1, i);
+      const float* from = checkpoints + in_checkpoint(number, i);
       transmittance[i] = from[0];
       place[i] = {from[kPlane], from[2 * kPlane]};
     }

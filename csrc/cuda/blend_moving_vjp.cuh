@@ -279,8 +279,9 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
   for (int k1 = stop; k1 > begin; k1 = k0, k0 -= kBatch) {
     const int count = k1 - k0;
     if (kSegment == 0 && places.spacing > kStateChunk) {  // with too many pairs: from the checkpoint to the batch
-      int k = k0 / places.spacing * places.spacing;
-      samples.load(params.checkpoints, places, k, last);
+      const int checkpoint = k0 / places.spacing;
+      int k = checkpoint * places.spacing;
+      samples.load(params.checkpoints, places.first + checkpoint - 1, k, last);
       for (; k < k0; k += kBatch) {
         __syncthreads();
         shared.stage.load(splats, params.channels, first, list, shared.stage.splat_of(list, k, k0));
@@ -307,7 +308,7 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
           samples = at_batch;
           for (int ahead = 0; ahead < from; ahead += kStateChunk) replay(ahead, k0 + ahead);
         } else {
-          samples.load(params.checkpoints, places, k0 + from, last);
+          samples.load(params.checkpoints, places.first + (k0 + from) / kStateChunk - 1, k0 + from, last);
         }
         shown = replay(from, k0 + from);
       }
