@@ -168,6 +168,7 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
   using Shared = MovingVjpShared<F, C, Layout>;
   using Samples = MovingSamples<F, Layout, (kSegment > 0)>;
   constexpr int S = F::kSamples, kCells = Layout::kCells, kBatch = Shared::kBatch, kColumns = kMaps ? 4 : 1;
+  constexpr bool kMany = C > kFewChannels;  // `first` may be above 0, and there may be more channels than C
   static_assert(kSegment % kBatch == 0 && Layout::kBlocks == 1);
   Shared& shared = *reinterpret_cast<Shared*>(dynamic_shared());
   TilePiece piece = {0, 0};
@@ -185,7 +186,8 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
   const StatePlaces places(params.lists, list, params.grid, tile);
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int lane = lane_id(), warp = threadIdx.x / 32, channel_count = params.channels.count;
-  const bool with_means = params.mean_sums != MeanSums::kNone, all_at_once = with_means && channel_count > C;
+  const bool with_means = params.mean_sums != MeanSums::kNone;
+  const bool all_at_once = kMany && with_means && channel_count > C;
   const bool with_shape = !all_at_once || first == 0;
   const Vec2<float> p = Layout::pixel();
   const Pixel pixel(list, params.grid, p);
@@ -374,11 +376,11 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
       }
       const int32_t row = shared.rows[j];
       const auto put = [&](int column) {
-        if (first > 0 && !list.overflow) sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
+        if (kMany && first > 0 && !list.overflow) sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
         put_sum(params.pair_grads, kPairGradWidth, list.overflow, row, column, sum);
       };
       if (v >= 6 && v < Shared::kMeans) {
-        if (C > kFewChannels) {
+        if (kMany) {
           put_sum(params.channel_sums, kChannelGroup, list.overflow, row, first % kChannelGroup + v - 6, sum);
         } else {
           put(v == 9 ? kPairFourthChannel : v);
