@@ -366,28 +366,34 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
     }
     if (kMaps) continue;
     __syncthreads();
-    const int used = with_means ? Shared::kSums : Shared::kMeans;
-    for (int t = threadIdx.x; t < count * used; t += Layout::kThreads) {
-      const int j = t / used, v = t % used;
-      float sum = 0;
+    const auto write_sums = [&](auto used) {  // a constant, so that to divide by it costs little
+      for (int t = threadIdx.x; t < count * used; t += Layout::kThreads) {
+        const int j = t / used, v = t % used;
+        float sum = 0;
 #pragma unroll
-      for (int w = 0; w < Layout::kWarps; ++w) {
-        if (shared.hits[w][j / kStateChunk] >> (j % kStateChunk) & 1) sum += shared.sums[w][j][v];
-      }
-      const int32_t row = shared.rows[j];
-      const auto put = [&](int column) {
-        if (kMany && first > 0 && !list.overflow) sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
-        put_sum(params.pair_grads, kPairGradWidth, list.overflow, row, column, sum);
-      };
-      if (v >= 6 && v < Shared::kMeans) {
-        if (kMany) {
-          put_sum(params.channel_sums, kChannelGroup, list.overflow, row, first % kChannelGroup + v - 6, sum);
-        } else {
-          put(v == 9 ? kPairFourthChannel : v);
+        for (int w = 0; w < Layout::kWarps; ++w) {
+          if (shared.hits[w][j / kStateChunk] >> (j % kStateChunk) & 1) sum += shared.sums[w][j][v];
         }
-      } else if (with_shape) {
-        put(v < 6 ? v : kPairMeans + v - Shared::kMeans);
+        const int32_t row = shared.rows[j];
+        const auto put = [&](int column) {
+          if (kMany && first > 0 && !list.overflow) sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
+          put_sum(params.pair_grads, kPairGradWidth, list.overflow, row, column, sum);
+        };
+        if (v >= 6 && v < Shared::kMeans) {
+          if (kMany) {
+            put_sum(params.channel_sums, kChannelGroup, list.overflow, row, first % kChannelGroup + v - 6, sum);
+          } else {
+            put(v == 9 ? kPairFourthChannel : v);
+          }
+        } else if (with_shape) {
+          put(v < 6 ? v : kPairMeans + v - Shared::kMeans);
+        }
       }
+    };
+    if (with_means) {
+      write_sums(std::integral_constant<int, Shared::kSums>());
+    } else {
+      write_sums(std::integral_constant<int, Shared::kMeans>());
     }
   }
   if constexpr (kMaps) {
