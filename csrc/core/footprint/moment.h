@@ -59,7 +59,8 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   template <typename T, class V>
   AR_HD static Vec2<V> move(const Terms<T>& t, Vec2<V> p, int s, V alpha, Vec2<V> moved) {
     const V reach = V(T(kMoveReach));
-    return move_in(t, Gaussian::whitened(t, p + place<T, V>(s), 0), alpha, moved, {{-reach, -reach}, {reach, reach}});
+    return move_in(t, Gaussian::whitened(t, p + place<T, V>(s), 0), odds(alpha), moved,
+                   {{-reach, -reach}, {reach, reach}});
   }
 
   template <typename T, class V>
@@ -84,11 +85,11 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
             madd(V(t.w.yx), place.x, madd(V(t.w.yy), place.y, of_pixel.y))};
   }
 
-  /// move() from the node's whitened coordinates z. `at` is the node's place or its displacement; what is returned is
-  /// the same behind the splat, within `bounds`.
+  /// move() from the node's whitened coordinates z and r = alpha / (1 - alpha). `at` is the node's place or its
+  /// displacement; what is returned is the same behind the splat, within `bounds`.
   template <typename T, class V>
-  AR_HD static Vec2<V> move_in(const Terms<T>& t, Vec2<V> z, V alpha, Vec2<V> at, const Bounds<V>& bounds) {
-    const Vec2<V> next = step(t, z, odds(alpha), at);
+  AR_HD static Vec2<V> move_in(const Terms<T>& t, Vec2<V> z, V r, Vec2<V> at, const Bounds<V>& bounds) {
+    const Vec2<V> next = step(t, z, r, at);
     return {min(max(next.x, bounds.lo.x), bounds.hi.x), min(max(next.y, bounds.lo.y), bounds.hi.y)};
   }
 
