@@ -121,11 +121,22 @@ __global__ void __launch_bounds__(Layout::kThreads) listed_blend_kernel(const Bl
         stage.splats[lane] = {tile_terms(splat, list), channels_of<C>(params.channels, splat, id, first)};
       }
       __syncwarp();
-      for (int j = 0; j < min(count - from, 32); ++j) {
-        const int k = k0 + stage.places[from + j];
+      // Each step waits for the one before. What need not, the next splat and how it is seen, is made ready meanwhile.
+      const int loaded = min(count - from, 32);
+      TileSplat<F, C> splat = stage.splats[0];
+      Vec2<float> of_pixel = transform(splat.terms.w, p, splat.terms.node[0]);
+      int k = k0 + stage.places[from];
+#pragma unroll 2
+      for (int j = 1; j <= loaded; ++j) {
+        const TileSplat<F, C> next = stage.splats[j % 32];
+        const int next_place = stage.places[from + j % 32];
+#pragma unroll 1
         for (; keep && checkpoint <= k; checkpoint += kStateChunk)
           blend.samples.store(params.checkpoints, places.first + checkpoint / kStateChunk - 1);
-        blend.add(stage.splats[j], p, k);
+        blend.add(splat, of_pixel, k);
+        splat = next;
+        of_pixel = transform(splat.terms.w, p, splat.terms.node[0]);
+        k = k0 + next_place;
       }
       open = __any_sync(kAllLanes, blend.samples.open());
     }

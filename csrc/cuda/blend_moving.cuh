@@ -186,10 +186,8 @@ template <class F, int C, class Layout, bool kTogether = false> struct MovingBle
 
   __device__ explicit MovingBlend(bool inside) : samples(inside) {}
 
-  /// Composites pair k, whose splat is staged, into the samples of the pixel at p.
-  __device__ void add(const TileSplat<F, C>& staged, Vec2<float> p, int k) {
-    TileSplatRef<F, C> splat = staged;
-    const Vec2<float> of_pixel = transform(splat.terms.w, p, splat.terms.node[0]);
+  /// Composites pair k into the samples of a pixel, whose whitened coordinates for the splat are of_pixel.
+  __device__ void add(TileSplatRef<F, C>& splat, Vec2<float> of_pixel, int k) {
     float contribution = 0;
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
@@ -260,7 +258,8 @@ __global__ void __launch_bounds__(Layout::kThreads)
         blend.samples.store(params.checkpoints, places.first + (k + from) / places.spacing - 1);
       for (uint32_t left = stage.reached(from); left != 0;) {
         const int j = from + take_first(left);
-        blend.add(stage.splats[j], p, k + j);
+        TileSplatRef<F, C> splat = stage.splats[j];
+        blend.add(splat, transform(splat.terms.w, p, splat.terms.node[0]), k + j);
       }
     }
   }
