@@ -149,13 +149,17 @@ __global__ void __launch_bounds__(kMovingPixels) chain_maps_kernel(const BlendVj
   const int64_t first = first_piece(params.lists, kSegment, tile);
   const MapMemory<F> memory(params.adjoint_maps, sample, number);
   Adjoint adjoint = memory.adjoint(first + segment);
-  AdjointMap map = memory.map(first + --segment);
-  for (; segment > 0; --segment) {
-    AdjointMap next = {};
-    if (segment > 1) next = memory.map(first + segment - 1);  // while the one at hand is applied
-    adjoint = map(adjoint);
-    memory.put(first + segment, adjoint);
-    map = next;
+  constexpr int kAhead = 8;  // segments whose maps are read at once, since each of them waits for memory
+  for (; segment > 1; segment -= kAhead) {
+    AdjointMap maps[kAhead];
+#pragma unroll
+    for (int i = 0; i < kAhead; ++i) maps[i] = memory.map(first + max(segment - 1 - i, 1));
+#pragma unroll
+    for (int i = 0; i < kAhead; ++i) {
+      if (segment - 1 - i < 1) return;
+      adjoint = maps[i](adjoint);
+      memory.put(first + segment - 1 - i, adjoint);
+    }
   }
 }
 
