@@ -131,8 +131,11 @@ template <class F> struct MapMemory {
 /// device with smaller scenes.
 template <class F> inline constexpr int kMovingSegment = F::kSamples <= 4 ? 512 : 1024;
 /// Samples shared out for segments, of which there are many, with small splats: few pixels per warp, and blocks small
-/// enough for two on an SM.
-template <class F> using SegmentLayout = CellLayout<F::kSamples <= 4 ? 1 : 2, F::kSamples <= 4 ? 4 : 8>;
+/// enough for two on an SM. A single sample has a lane, so that none is idle.
+template <class F>
+using SegmentLayout = CellLayout<F::kSamples <= 4 ? 1 : 2, F::kSamples == 1   ? 1
+                                                           : F::kSamples == 4 ? 4
+                                                                              : 8>;
 
 /// A thread per sample of a tile: from the maps of its segments to what each gets from behind.
 template <class F, int kSegment>
