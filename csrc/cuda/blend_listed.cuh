@@ -107,6 +107,7 @@ __global__ void __launch_bounds__(Layout::kThreads) listed_blend_kernel(const Bl
     return mine < list.count ? words[mine / 32] : 0u;
   };
   int checkpoint = kStateChunk;  // the next one is in front of this pair
+  float* to = params.checkpoints + places.first * blend.samples.kCheckpoint;
   uint32_t word = word_of(0);
   bool open = __any_sync(kAllLanes, blend.samples.open());
   for (int k0 = 0; k0 < list.count && open; k0 += kListedBatch) {
@@ -131,8 +132,8 @@ __global__ void __launch_bounds__(Layout::kThreads) listed_blend_kernel(const Bl
         const TileSplat<F, C> next = stage.splats[j % 32];
         const int next_place = stage.places[from + j % 32];
 #pragma unroll 1
-        for (; keep && checkpoint <= k; checkpoint += kStateChunk)
-          blend.samples.store(params.checkpoints, places.first + checkpoint / kStateChunk - 1);
+        for (; keep && checkpoint <= k; checkpoint += kStateChunk, to += blend.samples.kCheckpoint)
+          blend.samples.store(to);
         blend.add(splat, of_pixel, k);
         splat = next;
         of_pixel = transform(splat.terms.w, p, splat.terms.node[0]);

@@ -108,32 +108,32 @@ template <class F, class Layout, bool kTogether = false> struct MovingSamples {
     return any;
   }
 
-  /// Where checkpoint `number` has sample i of this pixel: its transmittance, and its place in the two planes behind.
-  __device__ static int64_t in_checkpoint(int64_t number, int i) {
+  static constexpr int kCheckpoint = state_planes(F::kSamples) * kMovingPixels;           ///< numbers of a checkpoint
+  static constexpr int kPlane = kTogether ? F::kSamples * kMovingPixels : kMovingPixels;  ///< from a plane to the next
+  /// Where a checkpoint has sample i of this pixel: its transmittance, and its place in the two planes behind.
+  __device__ static int in_checkpoint(int i) {
     const int sample = Layout::first_sample() + i, pixel = Layout::pixel_number();
-    const int64_t in_plane = kTogether ? pixel * F::kSamples + sample : 3 * sample * kMovingPixels + pixel;
-    return number * state_planes(F::kSamples) * kMovingPixels + in_plane;
+    return kTogether ? pixel * F::kSamples + sample : 3 * sample * kMovingPixels + pixel;
   }
-  static constexpr int kPlane = kTogether ? F::kSamples * kMovingPixels : kMovingPixels;  ///< from one to the next
-  __device__ void store(float* checkpoints, int64_t number) const {
+  __device__ void store(float* checkpoint) const {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
       if (!exists(i)) continue;
-      float* to = checkpoints + in_checkpoint(number, i);
+      float* to = checkpoint + in_checkpoint(i);
       to[0] = abs(transmittance[i]);
       to[kPlane] = place[i].x;
       to[2 * kPlane] = place[i].y;
     }
   }
-  /// In front of pair k, where checkpoint `number` is, unless k is 0. Samples that have composited their last splat,
-  /// `last` pairs from the first, may have no checkpoint there, and need none.
-  __device__ void load(const float* checkpoints, int64_t number, int k, const int (&last)[kCells]) {
+  /// In front of pair k, where `checkpoint` is, unless k is 0. Samples that have composited their last splat, `last`
+  /// pairs from the first, may have no checkpoint there, and need none.
+  __device__ void load(const float* checkpoint, int k, const int (&last)[kCells]) {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
       transmittance[i] = 1;
       place[i] = node(i);
       if (k == 0 || k >= last[i]) continue;
-      const float* from = checkpoints + in_checkpoint(number, i);
+      const float* from = checkpoint + in_checkpoint(i);
       transmittance[i] = from[0];
       place[i] = {from[kPlane], from[2 * kPlane]};
     }
@@ -255,7 +255,8 @@ __global__ void __launch_bounds__(Layout::kThreads)
     for (int from = 0; from < count; from += 32) {
       if (!__any_sync(kAllLanes, blend.samples.open())) break;
       if (keep && k + from > 0 && (k + from) % places.spacing == 0)
-        blend.samples.store(params.checkpoints, places.first + (k + from) / places.spacing - 1);
+        blend.samples.store(params.checkpoints +
+                            (places.first + (k + from) / places.spacing - 1) * blend.samples.kCheckpoint);
       for (uint32_t left = stage.reached(from); left != 0;) {
         const int j = from + take_first(left);
         TileSplatRef<F, C> splat = stage.splats[j];

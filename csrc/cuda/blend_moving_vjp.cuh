@@ -290,7 +290,7 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
     if (kSegment == 0 && places.spacing > kStateChunk) {  // with too many pairs: from the checkpoint to the batch
       const int checkpoint = k0 / places.spacing;
       int k = checkpoint * places.spacing;
-      samples.load(params.checkpoints, places.first + checkpoint - 1, k, last);
+      samples.load(params.checkpoints + (places.first + checkpoint - 1) * Samples::kCheckpoint, k, last);
       for (; k < k0; k += kBatch) {
         __syncthreads();
         shared.stage.load(splats, params.channels, first, list, shared.stage.splat_of(list, k, k0));
@@ -317,7 +317,8 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
           samples = at_batch;
           for (int ahead = 0; ahead < from; ahead += kStateChunk) replay(ahead, k0 + ahead);
         } else {
-          samples.load(params.checkpoints, places.first + (k0 + from) / kStateChunk - 1, k0 + from, last);
+          const int64_t number = places.first + (k0 + from) / kStateChunk - 1;
+          samples.load(params.checkpoints + number * Samples::kCheckpoint, k0 + from, last);
         }
         shown = replay(from, k0 + from);
       }
