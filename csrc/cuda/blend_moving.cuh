@@ -228,10 +228,10 @@ template <class F, int C, class Layout, bool kTogether = false> struct MovingBle
   }
 };
 
-/// A block per tile; C channels from `first` on. `overflow_only`: another kernel blends the tiles, unless there were
-/// too many pairs.
+/// A block per tile; C channels from `first` on, of three in so few registers that an SM holds 1024 threads.
+/// `overflow_only`: another kernel blends the tiles, unless there were too many pairs.
 template <class F, int C, class Layout>
-__global__ void __launch_bounds__(Layout::kThreads)
+__global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThreads : 1)
     moving_blend_kernel(const BlendParams params, int first, bool overflow_only) {
   constexpr int kBatch = Layout::kThreads < 256 ? Layout::kThreads : 256;
   __shared__ MovingStage<F, C, Layout, kBatch> stage;
