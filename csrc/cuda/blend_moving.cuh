@@ -30,15 +30,16 @@ struct CellLayout {
 
   /// This warp's group.
   __device__ static int group() { return int(blockIdx.x) % kBlocks * kWarps + int(threadIdx.x) / 32; }
+  /// The place of the group's pixel i among the tile's, row by row, whatever the layout.
+  __device__ static int pixel_number(int i) {
+    const int g = group();
+    return (g / kColumns * kHigh + i / kWide) * kMovingTile + g % kColumns * kWide + i % kWide;
+  }
+  __device__ static int pixel_number() { return pixel_number(lane_id() / kLanes); }  ///< of this thread's pixel
   /// This thread's pixel, relative to the tile's first.
   __device__ static Vec2<float> pixel() {
     const int g = group(), i = lane_id() / kLanes;
     return {float(g % kColumns * kWide + i % kWide), float(g / kColumns * kHigh + i / kWide)};
-  }
-  /// Its place among the tile's pixels, row by row, whatever the layout.
-  __device__ static int pixel_number() {
-    const Vec2<float> p = pixel();
-    return int(p.y) * kMovingTile + int(p.x);
   }
   /// The first of this thread's samples of its pixel.
   __device__ static int first_sample() { return lane_id() % kLanes * kCells; }
