@@ -7,53 +7,6 @@
 namespace ar::cuda {
 namespace {
 
-int tile_passes(TileGrid grid) {
-  int passes = 1;
-  while (grid.tiles() > int64_t(1) << (passes * kDigitBits)) ++passes;
-  return passes;
-}
-
-template <int kPasses>
-__global__ void __launch_bounds__(kCountThreads)
-    count_tiles_kernel(const uint32_t* tiles, const Counts* counts, int64_t capacity, uint32_t* histograms) {
-  const int64_t n = counts->pairs;
-  if (n > capacity) return;
-  __shared__ uint32_t local[kPasses * kBins];
-  for (int b = threadIdx.x; b < kPasses * kBins; b += kCountThreads) local[b] = 0;
-  __syncthreads();
-  const int64_t stride = int64_t(gridDim.x) * kCountThreads, rounded = (n + 31) / 32 * 32;
-  for (int64_t k = int64_t(blockIdx.x) * kCountThreads + threadIdx.x; k < rounded; k += stride)
-    count_digits<kPasses>(k < n ? tiles[k] : 0, k < n, local);
-  __syncthreads();
-  for (int b = threadIdx.x; b < kPasses * kBins; b += kCountThreads) {
-    if (local[b]) atomicAdd(&histograms[b], local[b]);
-  }
-}
-
-constexpr int kRangeThreads = 128;
-
-/// Each tile finds its first pair. Tells the host how many pairs there are.
-__global__ void __launch_bounds__(kRangeThreads)
-    tile_offsets_kernel(const uint32_t* tiles, const Counts* counts, int64_t capacity, int64_t tile_count,
-                        int64_t* tile_offsets, PairFeedback feedback) {
-  if (blockIdx.x == 0 && threadIdx.x == 0 && feedback.word) {
-    const uint64_t pairs = min(uint64_t(counts->pairs), uint64_t(0xffffffff));
-    *feedback.word = uint64_t(feedback.frame) << 32 | pairs;
-  }
-  const int64_t tile = int64_t(blockIdx.x) * kRangeThreads + threadIdx.x;
-  if (counts->pairs > capacity || tile > tile_count) return;
-  int64_t low = 0, high = counts->pairs;
-  while (low < high) {
-    const int64_t middle = (low + high) / 2;
-    if (tiles[middle] < tile) {
-      low = middle + 1;
-    } else {
-      high = middle;
-    }
-  }
-  tile_offsets[tile] = low;
-}
-
 constexpr int kPlanThreads = 256;
 
 /// Work is handed out by samples, and of those longest first, so that no block starts on a long piece when the others
@@ -141,31 +94,14 @@ __global__ void __launch_bounds__(kPlanThreads) plan_kernel(const TileLists list
 template <class Value>
 void sort_values(const TileSort<Value>& p, TileGrid grid, uint32_t* memory, cudaStream_t stream) {
   const int passes = tile_passes(grid);
-  const SortScratch scratch(memory, p.capacity, passes);
-  const auto count = [&](auto kernel) {
-    launch(kernel, {kCountBlocks, kCountThreads}, stream, p.tiles[0], p.counts, p.capacity, scratch.histograms);
-  };
-  switch (passes) {
-    case 1:
-      count(count_tiles_kernel<1>);
-      break;
-    case 2:
-      count(count_tiles_kernel<2>);
-      break;
-    case 3:
-      count(count_tiles_kernel<3>);
-      break;
-    default:
-      count(count_tiles_kernel<4>);
-      break;
-  }
+  const TileScratch scratch(memory, p.capacity, passes);
   for (int pass = 0; pass < passes; ++pass) {
     // After an overflow the histograms are empty, and with them the sort.
-    launch(sort_pass_kernel<Value, false>, {unsigned(scratch.blocks), kSortThreads}, stream, scratch, pass, 0, 0,
-           p.tiles[pass % 2], p.tiles[1 - pass % 2], p.values[pass % 2], p.values[1 - pass % 2]);
+    launch(sort_pass_kernel<kTileBits, Value, false>, {unsigned(scratch.blocks), TileDigits::kThreads}, stream, scratch,
+           pass, false, 0, 0, p.tiles[pass % 2], p.tiles[1 - pass % 2], p.values[pass % 2], p.values[1 - pass % 2]);
   }
-  launch(tile_offsets_kernel, {blocks_of(grid.tiles() + 1, kRangeThreads), kRangeThreads}, stream, p.tiles[passes % 2],
-         p.counts, p.capacity, grid.tiles(), p.tile_offsets, p.feedback);
+  launch(tile_offsets_kernel, {blocks_of(grid.tiles() + 1, kRangeTiles), kRangeTiles * kRangeLanes}, stream,
+         p.tiles[passes % 2], p.counts, p.capacity, grid.tiles(), p.tile_offsets, p.feedback);
 }
 
 }  // namespace
@@ -175,16 +111,16 @@ int64_t max_items() { return kMaxSortItems; }
 /// Bytes of so many words, rounded up so that what follows is aligned.
 static int64_t aligned_bytes(int64_t words) { return (words * int64_t(sizeof(uint32_t)) + 15) / 16 * 16; }
 
-int64_t depth_sort_scratch(int64_t n) { return aligned_bytes(SortScratch::words(n, kDepthPasses)); }
+int64_t depth_sort_scratch(int64_t n) { return aligned_bytes(DepthScratch::words(n, kDepthPasses)); }
 
 int64_t tile_sort_scratch(int64_t capacity, TileGrid grid) {
-  return aligned_bytes(SortScratch::words(capacity, tile_passes(grid)));
+  return aligned_bytes(TileScratch::words(capacity, tile_passes(grid)));
 }
 
 int tile_sort_result(TileGrid grid) { return tile_passes(grid) % 2; }
 
 void count_depths(const DepthSort& p, void* memory, cudaStream_t stream) {
-  const SortScratch scratch(static_cast<uint32_t*>(memory), p.n, kDepthPasses);
+  const DepthScratch scratch(static_cast<uint32_t*>(memory), p.n, kDepthPasses);
   if (p.n == 0) return;
   launch(count_depths_kernel, {kCountBlocks, kCountThreads}, stream, p.keys[0], p.ranges, p.n, scratch.histograms,
          p.counts);
@@ -192,14 +128,14 @@ void count_depths(const DepthSort& p, void* memory, cudaStream_t stream) {
 
 void sort_by_depth(const DepthSort& p, void* memory, cudaStream_t stream) {
   if (p.n == 0) return;
-  const SortScratch scratch(static_cast<uint32_t*>(memory), p.n, kDepthPasses);
-  const LaunchShape shape = {unsigned(scratch.blocks), kSortThreads};
+  const DepthScratch scratch(static_cast<uint32_t*>(memory), p.n, kDepthPasses);
+  const LaunchShape shape = {unsigned(scratch.blocks), DepthDigits::kThreads};
   for_each_depth_pass(p, scratch, [&](auto kernel, auto... arguments) { launch(kernel, shape, stream, arguments...); });
 }
 
 void emit_pairs(const EmitParams& p, cudaStream_t stream) {
   if (p.n == 0) return;
-  launch(emit_pairs_kernel, {blocks_of(p.n, kEmitThreads), kEmitThreads}, stream, p);
+  launch(emit_pairs_kernel, {blocks_of(p.n, kEmitThreads), kEmitThreads}, stream, p, tile_passes(p.grid));
 }
 
 void sort_by_tile(const TileSort<int32_t>& p, TileGrid grid, void* scratch, cudaStream_t stream) {

@@ -1,4 +1,4 @@
-// Kernels of bin that sort splats by depth and write the pairs of each.
+// Kernels of bin that sort splats by depth, write the pairs of each, and find those of each tile.
 #pragma once
 
 #include "core/bin.h"
@@ -7,13 +7,17 @@
 
 namespace ar::cuda {
 
-inline constexpr int kDepthPasses = 4;
+/// With keys as depth_key makes them the last of the passes has nothing to do for depths of 1/8 to 8192.
+inline constexpr int kDepthBits = 9, kDepthPasses = 4;
+using DepthDigits = Digits<kDepthBits>;
+using DepthScratch = SortScratch<kDepthBits>;
 inline constexpr int kCountThreads = 512, kCountBlocks = 132 * 2;
 
 /// Histograms of all digits of the depth keys of splats with pairs; how many of these there are, and
 /// how many pairs.
 __global__ void __launch_bounds__(kCountThreads) count_depths_kernel(const uint32_t* keys, const PairRange* ranges,
                                                                      int64_t n, uint32_t* histograms, Counts* counts) {
+  constexpr int kBins = DepthDigits::kBins;
   __shared__ uint32_t local[kDepthPasses * kBins];
   for (int b = threadIdx.x; b < kDepthPasses * kBins; b += kCountThreads) local[b] = 0;
   __syncthreads();
@@ -22,7 +26,7 @@ __global__ void __launch_bounds__(kCountThreads) count_depths_kernel(const uint3
   for (int64_t i = int64_t(blockIdx.x) * kCountThreads + threadIdx.x; i < rounded; i += stride) {
     const uint32_t key = i < n ? keys[i] : kCulledKey;
     const bool valid = key != kCulledKey;
-    count_digits<kDepthPasses>(key, valid, local);
+    count_digits<kDepthBits, kDepthPasses>(key, valid, local);
     if (valid) pairs += ranges[i].count;
     splats += valid;
   }
@@ -40,12 +44,23 @@ __global__ void __launch_bounds__(kCountThreads) count_depths_kernel(const uint3
 }
 
 /// Calls run(kernel, arguments...) for the passes of a sort by depth, in order.
-template <class Run> void for_each_depth_pass(const DepthSort& p, const SortScratch& scratch, Run&& run) {
-  run(sort_pass_kernel<int32_t, true>, scratch, 0, p.n, kCulledKey, p.keys[0], p.keys[1], nullptr, p.order[1]);
+template <class Run> void for_each_depth_pass(const DepthSort& p, const DepthScratch& scratch, Run&& run) {
+  run(sort_pass_kernel<kDepthBits, int32_t, true>, scratch, 0, true, p.n, kCulledKey, p.keys[0], p.keys[1], p.order[0],
+      p.order[1]);
   for (int pass = 1; pass < kDepthPasses; ++pass) {
-    run(sort_pass_kernel<int32_t, false>, scratch, pass, 0, 0, p.keys[pass % 2], p.keys[1 - pass % 2],
+    run(sort_pass_kernel<kDepthBits, int32_t, false>, scratch, pass, true, 0, 0, p.keys[pass % 2], p.keys[1 - pass % 2],
         p.order[pass % 2], p.order[1 - pass % 2]);
   }
+}
+
+/// Tiles are sorted by as many digits as the number of the last one has.
+inline constexpr int kTileBits = 8, kMostTilePasses = 4;
+using TileDigits = Digits<kTileBits>;
+using TileScratch = SortScratch<kTileBits>;
+inline int tile_passes(TileGrid grid) {
+  int passes = 1;
+  while (grid.tiles() > int64_t(1) << (passes * kTileBits)) ++passes;
+  return passes;
 }
 
 /// A splat with more pairs than this is written by its whole warp.
@@ -59,6 +74,12 @@ __device__ inline void write_pair(const EmitParams& params, int64_t place, uint3
     params.splat_pairs[place] = splat;
   }
 }
+
+/// The pairs of those of a warp's splats that have few each, one splat after the other.
+struct FewPairs {
+  uint32_t tiles[32 * kManyTiles];
+  uint8_t lanes[32 * kManyTiles];  ///< whose splat it is
+};
 
 /// Sum of what the blocks before this one published, for all lanes of a warp.
 __device__ inline uint32_t look_back(const uint32_t* status, int block) {
@@ -77,11 +98,15 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
   return sum;
 }
 
-/// Pairs in the order of depth, a splat's by rows of tiles.
-__global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitParams params) {
+/// Pairs in the order of depth, a splat's by rows of tiles; and the histograms of the digits of their tiles.
+__global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitParams params, int tile_digits) {
+  constexpr int kBins = TileDigits::kBins;
+  __shared__ uint32_t histograms[kMostTilePasses * kBins];
   __shared__ uint32_t block_id, before_block;
+  __shared__ FewPairs stages[kEmitThreads / 32];
   if (params.counts->pairs > params.capacity) return;
   if (threadIdx.x == 0) block_id = atomicAdd(&params.status[0], 1);
+  for (int b = threadIdx.x; b < tile_digits * kBins; b += kEmitThreads) histograms[b] = 0;
   __syncthreads();
   const int64_t r = int64_t(block_id) * kEmitThreads + threadIdx.x, n = params.counts->splats;
   if (int64_t(block_id) * kEmitThreads >= n) return;
@@ -92,8 +117,21 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
   uint32_t sum;
   const uint32_t before = sum_before<kEmitThreads / 32>(uint32_t(count), 0u, sum);
   uint32_t* status = params.status + 1;
+  if (threadIdx.x == 0) write_status(status + block_id, (block_id == 0 ? kUpToBlock : kOfBlock) | sum);
+
+  // Tiles are found before their places are known, while the blocks before get to publish theirs; and written by
+  // neighbouring lanes to neighbouring places.
+  FewPairs& stage = stages[threadIdx.x / 32];
+  const int own = count <= kManyTiles ? count : 0, up_to = warp_inclusive_sum(own), first = up_to - own;
+  if (own > 0) {
+    int k = first;
+    for_each_tile(support_of(splat, params.footprint), params.grid, [&](int64_t tile) {
+      stage.tiles[k] = uint32_t(tile);
+      stage.lanes[k++] = uint8_t(lane_id());
+    });
+  }
+
   if (threadIdx.x < 32) {
-    if (threadIdx.x == 0) write_status(status + block_id, (block_id == 0 ? kUpToBlock : kOfBlock) | sum);
     const uint32_t earlier = look_back(status, int(block_id));
     if (threadIdx.x == 0) {
       if (block_id > 0) write_status(status + block_id, kUpToBlock | (earlier + sum));
@@ -103,11 +141,17 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
   __syncthreads();
   const int64_t begin = int64_t(before_block) + before;
   const int columns = params.grid.columns();
+  const auto write = [&](int64_t place, uint32_t tile, int32_t id) {
+    write_pair(params, place, tile, id);
+    for (int d = 0; d < tile_digits; ++d) atomicAdd(&histograms[d * kBins + TileDigits::of(tile, d)], 1);
+  };
   if (count > 0 && params.slot_pairs) params.ranges[i].first = int32_t(begin);
-  if (count > 0 && count <= kManyTiles) {
-    int64_t place = begin;
-    for_each_tile(support_of(splat, params.footprint), params.grid,
-                  [&](int64_t tile) { write_pair(params, place++, tile, i); });
+  const int all = shuffle(up_to, 31);
+  for (int from = 0; from < all; from += 32) {
+    const int k = from + lane_id(), source = k < all ? stage.lanes[k] : 0;
+    const int64_t place = shuffle(begin - first, source) + k;
+    const int32_t id = shuffle(i, source);
+    if (k < all) write(place, stage.tiles[k], id);
   }
   for (uint32_t many = __ballot_sync(kAllLanes, count > kManyTiles); many != 0; many &= many - 1) {
     const int source = __ffs(many) - 1;
@@ -119,12 +163,32 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
       const int row = first + lane_id();
       const Range range = row <= tile_rows.last ? tile_columns_of(support, params.grid, rows, row) : Range{0, -1};
       const int width = range.last - range.first + 1;
-      const int up_to = warp_inclusive_sum(width);
-      int64_t mine = place + up_to - width;
-      for (int c = range.first; c <= range.last; ++c) write_pair(params, mine++, uint32_t(row) * columns + c, id);
-      place += __shfl_sync(kAllLanes, up_to, 31);
+      const int widths = warp_inclusive_sum(width);
+      int64_t mine = place + widths - width;
+      for (int c = range.first; c <= range.last; ++c) write(mine++, uint32_t(row) * columns + c, id);
+      place += __shfl_sync(kAllLanes, widths, 31);
     }
   }
+  __syncthreads();
+  for (int b = threadIdx.x; b < tile_digits * kBins; b += kEmitThreads) {
+    if (histograms[b]) atomicAdd(&params.tile_counts[b], histograms[b]);
+  }
+}
+
+/// Tiles of a block, and the lanes that look for the first pair of each.
+inline constexpr int kRangeTiles = 16, kRangeLanes = 8;
+
+/// Each tile finds its first pair. Tells the host how many pairs there are.
+__global__ void __launch_bounds__(kRangeTiles* kRangeLanes)
+    tile_offsets_kernel(const uint32_t* tiles, const Counts* counts, int64_t capacity, int64_t tile_count,
+                        int64_t* tile_offsets, PairFeedback feedback) {
+  const int64_t pairs = counts->pairs;
+  if (blockIdx.x == 0 && threadIdx.x == 0 && feedback.word)
+    *feedback.word = uint64_t(feedback.frame) << 32 | min(uint64_t(pairs), uint64_t(0xffffffff));
+  if (pairs > capacity) return;
+  const int64_t tile = int64_t(blockIdx.x) * kRangeTiles + threadIdx.x / kRangeLanes;
+  const int first = partition_point<kRangeLanes>(int(pairs), [&](int k) { return tiles[k] < tile; });
+  if (tile <= tile_count && threadIdx.x % kRangeLanes == 0) tile_offsets[tile] = first;
 }
 
 }  // namespace ar::cuda

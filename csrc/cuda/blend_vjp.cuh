@@ -1,6 +1,8 @@
 // Kernels of blend_vjp for up to four channels.
 #pragma once
 
+#include <algorithm>
+
 #include "cuda/composite.cuh"
 #include "cuda/launch.cuh"
 
@@ -71,22 +73,20 @@ inline constexpr int kVjpWarps = F::kSamples > kVjpSamples<F, kSums> ? F::kSampl
                                  : F::kSamples <= 8                  ? 2
                                                                      : 1;
 
-/// A warp per chunk, for many samples a block, back to front, over all pixels of the tile: every pair is summed in one
-/// place, so the sums need no atomics, whose order would change from run to run.
+/// A warp's share of a chunk, back to front over all pixels of the tile: every pair is summed in one place, so the sums
+/// need no atomics, whose order would change from run to run. `first`: the first of the samples that the warp takes.
 template <class F, int C, Sums kSums>
-__global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
-    blend_vjp_kernel(const BlendVjpParams params) {
-  constexpr int S = F::kSamples, kLength = chunk_length(S), kWarps = kVjpWarps<F, kSums>, kSumCount = 6 + C;
+__device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, int64_t item, int first,
+                                                VjpPixels<kVjpSamples<F, kSums>, C>& stage,
+                                                VjpGroup<F, C, F::kSamples / kVjpSamples<F, kSums>>& group) {
+  constexpr int S = F::kSamples, kLength = chunk_length(S), kSumCount = 6 + C;
   constexpr int kOwn = kVjpSamples<F, kSums>, kGroup = S / kOwn;  // samples of a warp, warps of a chunk
+  // Where the code for a subtile is short, each has its own: of 58 instructions 11 would work out where its pixels are.
+  constexpr bool kUnroll = S == 1 && sizeof(TileSplat<F, C>) <= 48;
   constexpr bool kGrads = kSums != Sums::kMeans, kMeans = kSums != Sums::kGrads;
   // A shared-out sample's number is not known when the code is compiled: keep its node indexable.
   using VjpSplat = std::conditional_t<kGroup == 1, TileSplatRef<F, C>, const TileSplat<F, C>&>;
-  using Pixels = VjpPixels<kOwn, C>;
-  using Group = VjpGroup<F, C, kGroup>;
-  const int lane = lane_id(), warp = threadIdx.x / 32, first = warp % kGroup * kOwn;
-  auto* pixels = reinterpret_cast<Pixels*>(dynamic_shared());
-  Pixels& stage = pixels[warp];
-  Group& group = reinterpret_cast<Group*>(pixels + kWarps)[warp / kGroup];
+  const int lane = lane_id(), warp = threadIdx.x / 32;
   const auto group_sync = [] {
     if constexpr (kGroup > 1) {
       __syncthreads();
@@ -94,9 +94,6 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
       __syncwarp();
     }
   };
-  const SampleParts& chunks = params.plan->counts.chunks;
-  const int64_t item = chunks.first[sample_class(S)] + (int64_t(blockIdx.x) * kWarps + warp) / kGroup;
-  if (item >= chunks.first[sample_class(S) + 1]) return;
   const auto [tile, chunk, plane] = params.chunk_order[item];
   const TileList list = list_of(params.lists, params.grid, tile);
   const int begin = chunk * kLength, end = list.overflow ? list.count : min(list.count, begin + kLength);
@@ -132,9 +129,9 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const Vec2<float> p0 = pixel_of(0, lane);
   constexpr int kTwo23 = 0x4b000000;
-  const int value = summed_value<kSumCount>(lane);             // that sum_values leaves here
-  const int column = value == 9 ? kPairFourthChannel : value;  // of the pairs' rows
-  const float* dL_dplanes[C];                                  // of three channels all are there
+  const int value = summed_value<kSumCount>(lane);  // that sum_values leaves here
+  float* const sums = params.pair_grads + (value == 9 ? kPairFourthChannel : value);
+  const float* dL_dplanes[C];  // of three channels all are there
   Values<C> background;
 #pragma unroll
   for (int c = 0; c < C; ++c) {
@@ -176,8 +173,9 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
   const auto put = [&](int32_t row, int column, float x) {
     put_sum(params.pair_grads, kPairGradWidth, list.overflow, row, column, x);
   };
-  for (int k1 = min(end, tile_last); k1 > begin; k1 -= 32) {
-    const int k0 = max(k1 - 32, begin), k = k0 + lane;
+  static_assert(kLength % 32 == 0);  // no batch begins before `begin`
+  for (int k1 = min(end, tile_last); k1 > begin; k1 = (k1 - 1) / 32 * 32) {
+    const int k0 = (k1 - 1) / 32 * 32, k = k0 + lane;
     uint32_t reach = 0;
     int32_t row_index = 0;
     Mat2<float> mean_map = {0, 0, 0, 0};
@@ -194,9 +192,17 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
       if (kMeans) mean_map = F::mean_map(splat.shape);
       if (kGroup > 1 && first == 0) group.rows[lane] = row_index;
     }
+    uint32_t reaching = 0;  // of lane b the splats that reach subtile b
+#pragma unroll
+    for (int b = 0; b < kSubtiles; ++b) {
+      const uint32_t splats_of_b = __ballot_sync(kAllLanes, reach >> b & 1);
+      if (lane == b) reaching = splats_of_b;
+    }
     group_sync();
-    for (int j = k1 - k0 - 1; j >= 0; --j) {
-      const uint32_t reached = __shfl_sync(kAllLanes, reach, j);
+    for (int at = k1 - 1; at >= k0; --at) {
+      const int j = at & 31;
+      // The same in all lanes, and by a ballot, so that the compiler knows that they branch alike.
+      const uint32_t reached = __ballot_sync(kAllLanes, reaching >> j & 1);
       VjpSplat splat = group.splats[j];
       const Mat2<float> m =
           !kMeans ? mean_map
@@ -206,12 +212,8 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
       float weighted = 0;
       Values<C> channels = {};
       Vec2<float> mean_sums = {0, 0};
-      for (uint32_t hit = reached; hit != 0; hit &= hit - 1) {
-        const int b = __ffs(hit) - 1, q = b * 32 + lane;
-        // pixel_of(b, lane); an integer below 2^23 set into the mantissa of 2^23 is that float, plus 2^23
-        const float column = __int_as_float(kTwo23 | (b & 1)) - 8388608.0f;
-        const float band = __int_as_float(kTwo23 | (b >> 1)) - 8388608.0f;
-        const Vec2<float> p = {madd(8.0f, column, p0.x), madd(4.0f, band, p0.y)};
+      const auto visit = [&](int b, Vec2<float> p) {
+        const int q = b * 32 + lane;
         const float4 g = stage.g[q];
         const Values<4> of_pixel_g = {{g.x, g.y, g.z, g.w}};
         float g_color = madd(g.x, splat.channels.v[0], madd(g.y, splat.channels.v[1], g.z * splat.channels.v[2]));
@@ -222,7 +224,7 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
         for (int s = 0; s < kOwn; ++s) {
           const int node = kGroup == 1 ? s : first + s;
           const float alpha = F::alpha(splat.terms, p, node);
-          const bool mask = alpha >= float(kAlphaMin) && k0 + j < stage.last_of(s, q, g);
+          const bool mask = alpha >= float(kAlphaMin) && at < stage.last_of(s, q, g);
           if (s == 0 && S == 1 && !__any_sync(kAllLanes, mask)) break;
           auto sample = stage.samples[s][q];
           const BlendGrad<float> grad = blend_sample_vjp(mask, alpha, g_color, sample.transmittance, sample.behind);
@@ -239,6 +241,20 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
           const Vec2<float> dL_dmean = transform_transposed(m, of_pixel.offset);
           mean_sums = mean_sums + mean_sums_of(params.mean_sums, size, dL_dmean);
         }
+      };
+      if constexpr (kUnroll) {
+#pragma unroll
+        for (int b = 0; b < kSubtiles; ++b) {
+          if (reached >> b & 1) visit(b, {p0.x + float(8 * (b & 1)), p0.y + float(4 * (b >> 1))});
+        }
+      } else {
+        for (uint32_t hit = reached; hit != 0; hit &= hit - 1) {
+          const int b = __ffs(hit) - 1;
+          // pixel_of(b, lane); an integer below 2^23 set into the mantissa of 2^23 is that float, plus 2^23
+          const float column = __int_as_float(kTwo23 | (b & 1)) - 8388608.0f;
+          const float band = __int_as_float(kTwo23 | (b >> 1)) - 8388608.0f;
+          visit(b, {madd(8.0f, column, p0.x), madd(4.0f, band, p0.y)});
+        }
       }
       const int32_t row = __shfl_sync(kAllLanes, row_index, j);
       if (kGrads) {
@@ -248,12 +264,12 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
 #pragma unroll
         for (int c = 0; c < C; ++c) values[6 + c] = channels.v[c];
         const float sum = sum_values(values);
-        if (value >= 0) {
-          if constexpr (kGroup == 1) {
-            put(row, column, sum);
-          } else {
-            group.sums[warp][j][value] = sum;
-          }
+        if constexpr (kGroup > 1) {
+          if (has_value_first<kSumCount>(lane)) group.sums[warp][j][value] = sum;
+        } else if (!list.overflow) {
+          sums[int64_t(row) * kPairGradWidth] = sum;  // of all lanes: to find the first ones takes longer
+        } else if (has_value_first<kSumCount>(lane)) {
+          atomicAdd(&sums[int64_t(row) * kPairGradWidth], sum);
         }
       }
       if (kMeans) {
@@ -275,13 +291,43 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
   }
 }
 
+/// Whether a warp has a chunk for itself. Then it takes the next one when it is done, and need not wait for the others
+/// of its block, which have other chunks. Warps that share a chunk end with their block.
+template <class F, Sums kSums> inline constexpr bool kTakesChunks = kVjpSamples<F, kSums> == F::kSamples;
+
+template <class F, int C, Sums kSums>
+__global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
+    blend_vjp_kernel(const BlendVjpParams params) {
+  constexpr int kWarps = kVjpWarps<F, kSums>, kOwn = kVjpSamples<F, kSums>, kGroup = F::kSamples / kOwn;
+  auto* pixels = reinterpret_cast<VjpPixels<kOwn, C>*>(dynamic_shared());
+  auto* groups = reinterpret_cast<VjpGroup<F, C, kGroup>*>(pixels + kWarps);
+  const int warp = threadIdx.x / 32, first = warp % kGroup * kOwn;
+  const int32_t* firsts = params.plan->counts.chunks.first + sample_class(F::kSamples);
+  const int begin = firsts[0], end = firsts[1];
+  if constexpr (kTakesChunks<F, kSums>) {
+    for (;;) {
+      int taken = 0;
+      if (lane_id() == 0) taken = atomicAdd(&params.chunks_taken[sample_class(F::kSamples)], 1);
+      const int item = begin + shuffle(taken, 0);
+      if (item >= end) return;
+      blend_chunk_vjp<F, C, kSums>(params, item, first, pixels[warp], groups[warp]);
+    }
+  } else {
+    const int64_t item = begin + (int64_t(blockIdx.x) * kWarps + warp) / kGroup;
+    if (item < end) blend_chunk_vjp<F, C, kSums>(params, item, first, pixels[warp], groups[warp / kGroup]);
+  }
+}
+
 /// Blocks that fill any device.
 inline constexpr int kClearBlocks = 132 * 8;
+inline constexpr unsigned kTakingBlocks = 256 * 8;
 
 template <class F, int C, Sums kSums> void launch_blend_vjp(const BlendVjpParams& p, cudaStream_t stream) {
   constexpr int kOwn = kVjpSamples<F, kSums>, kWarps = kVjpWarps<F, kSums>, kGroup = F::kSamples / kOwn;
   const size_t bytes = kWarps * sizeof(VjpPixels<kOwn, C>) + kWarps / kGroup * sizeof(VjpGroup<F, C, kGroup>);
-  launch(blend_vjp_kernel<F, C, kSums>, {blocks_of(p.max_chunks, kWarps / kGroup), 32 * kWarps, bytes}, stream, p);
+  unsigned blocks = blocks_of(p.max_chunks, kWarps / kGroup);
+  if (kTakesChunks<F, kSums>) blocks = std::min(blocks, kTakingBlocks);
+  launch(blend_vjp_kernel<F, C, kSums>, {blocks, 32 * kWarps, bytes}, stream, p);
 }
 template <class F, int C> void blend_vjp_few(const BlendVjpParams& p, cudaStream_t stream) {
   constexpr bool kAtOnce = kVjpSamples<F, Sums::kGrads> == F::kSamples;

@@ -144,6 +144,16 @@ template <class F, int C, int kBatch> struct Stage {
   }
   /// The same for this warp's subtile.
   __device__ uint32_t reached(int k) const { return reached(k, threadIdx.x / 32); }
+  /// Calls visit(j) for those splats j of them, in order. All lanes must call it.
+  template <class Visit> __device__ void for_each_reached(int k, Visit&& visit) const {
+    // The first splat is the highest bit: to find that takes one slow instruction, to find the lowest two.
+    uint32_t left = __ballot_sync(kAllLanes, reach[k + 31 - lane_id()] >> (threadIdx.x / 32) & 1);
+    while (left != 0) {
+      const int bit = 31 - __clz(int(left));
+      left ^= 1u << bit;
+      visit(k + 31 - bit);
+    }
+  }
 };
 
 /// A sample at the end of a chunk, kept for a backward pass.

@@ -8,6 +8,10 @@ namespace ar::cuda {
 
 inline constexpr int kProjectThreads = 128;
 
+__device__ inline uint32_t depth_key(float depth) {
+  return __float_as_uint(depth + 0.0f) + kDepthKeyOffset;  // of -0 too
+}
+
 /// Tiles that a splat touches.
 __device__ inline int count_tiles(const SplatRow<float>& splat, int footprint, TileGrid grid) {
   int count = 0;
@@ -57,7 +61,7 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
   }
   if (i >= g.n) return;
   if (radius > 0) reinterpret_cast<SplatRow<float>*>(params.splats)[i] = splat;
-  params.keys[i] = count > 0 ? __float_as_uint(depth) : kCulledKey;
+  params.keys[i] = count > 0 ? depth_key(depth) : kCulledKey;
   params.ranges[i] = {0, count};
   params.radii[i] = radius;
 }
@@ -73,9 +77,10 @@ __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const Pro
   int radius = 0;
   if (i < g.n && may_be_visible(camera, g, i, params.bounds) && project_gaussian(camera, g, i, projected))
     radius = shape_splat(projected, params.footprint, camera.grid, splat);
-  if (params.rows.colors) {
+  const bool has_row = radius > 0;
+  if (params.rows.colors || params.packed.rows) {
     ShRows<Cam::kShDegree>& rows = sh_rows[threadIdx.x / 32];
-    const uint32_t seen = __ballot_sync(kAllLanes, radius > 0);
+    const uint32_t seen = __ballot_sync(kAllLanes, has_row);
     if (g.shs && seen) rows.load(g.shs + (i - lane_id()) * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), seen);
     if (radius > 0 && !splat_color(camera, g, i, rows.row(), splat.color)) {
       if (splat.level > 0) radius = 0;
@@ -83,8 +88,12 @@ __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const Pro
     }
   }
   if (i >= g.n) return;
+  if (params.packed.rows) {
+    if (has_row) write_packed(params.packed, i, projected, splat.color, radius);
+    return;
+  }
   params.radii[i] = radius;
-  if (radius == 0) return;
+  if (radius == 0 || !params.rows.means2d) return;
   const Cov2d<float>& cov = projected.cov;
   params.rows.means2d[i] = projected.mean;
   params.rows.cov2d[i] = {cov.xx, cov.xy, cov.yy};
@@ -99,15 +108,26 @@ __global__ void __launch_bounds__(kProjectThreads) shape_rows_kernel(const Shape
   if (i >= params.n) return;
   ProjectedGaussian<float> projected;
   SplatRow<float> splat = {};
-  if (read_row(params.rows, i, projected) && shape_splat(projected, params.footprint, params.grid, splat) == 0)
-    splat.level = 0;
-  if (params.rows.colors) splat.color = params.rows.colors[i];
+  bool valid;
+  if (params.packed) {
+    const PackedRow<float> row = params.packed[i];
+    valid = read_row(row, projected);
+    splat.color = row.color;
+  } else {
+    valid = read_row(params.rows, i, projected);
+    if (params.rows.colors) splat.color = params.rows.colors[i];
+  }
+  if (params.kept_covs) {
+    const Cov2d<float>& cov = projected.cov;
+    reinterpret_cast<float4*>(params.kept_covs)[i] = {cov.xx, cov.xy, cov.yy, cov.det};
+    params.kept_opacities[i] = projected.opacity;
+  }
+  if (valid && shape_splat(projected, params.footprint, params.grid, splat) == 0) splat.level = 0;
   const Vec3<float>& color = splat.color;
   if (!(within(color.x, kMaxColor) && within(color.y, kMaxColor) && within(color.z, kMaxColor))) splat.level = 0;
   const int count = splat.level > 0 ? count_tiles(splat, params.footprint.index, params.grid) : 0;
   reinterpret_cast<SplatRow<float>*>(params.splats)[i] = splat;
-  // Keys are in the order of their bits, where -0 would come last.
-  params.keys[i] = count > 0 ? __float_as_uint(projected.depth + 0.0f) : kCulledKey;
+  params.keys[i] = count > 0 ? depth_key(projected.depth) : kCulledKey;
   params.ranges[i] = {0, count};
 }
 

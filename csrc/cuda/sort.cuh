@@ -10,9 +10,15 @@
 
 namespace ar::cuda {
 
-inline constexpr int kDigitBits = 8, kBins = 1 << kDigitBits;
-inline constexpr int kSortThreads = kBins, kSortWarps = kSortThreads / 32;
-inline constexpr int kSortItems = 12, kSortTile = kSortThreads * kSortItems;  // per thread, per block
+inline constexpr int kSortTile = 3072;  // items of a block
+
+/// A sort by digits of kBits bits. A block has a thread for each value of a digit.
+template <int kBits> struct Digits {
+  static constexpr int kBins = 1 << kBits, kThreads = kBins, kWarps = kThreads / 32;
+  static constexpr int kItems = kSortTile / kThreads;  ///< of a thread
+
+  __device__ static uint32_t of(uint32_t key, int pass) { return key >> (pass * kBits) & (kBins - 1); }
+};
 
 // What a block publishes: a count, and what it counts. One word, so that both arrive together.
 inline constexpr uint32_t kOfBlock = 1u << 30, kUpToBlock = 2u << 30, kCountMask = kOfBlock - 1;
@@ -28,7 +34,9 @@ __device__ inline void write_status(uint32_t* status, uint32_t value) {
 inline int64_t sort_blocks(int64_t capacity) { return (capacity + kSortTile - 1) / kSortTile; }
 
 /// Scratch of a sort of `capacity` items by `passes` digits. Zero before use.
-struct SortScratch {
+template <int kBits> struct SortScratch {
+  static constexpr int kBins = Digits<kBits>::kBins;
+  int passes;
   uint32_t* histograms;  ///< [passes, kBins]
   uint32_t* tickets;     ///< [passes]
   uint32_t* status;      ///< [passes, blocks, kBins]
@@ -36,17 +44,19 @@ struct SortScratch {
 
   static int64_t words(int64_t capacity, int passes) { return passes * (kBins * (1 + sort_blocks(capacity)) + 1); }
   SortScratch(uint32_t* memory, int64_t capacity, int passes)
-      : histograms(memory),
+      : passes(passes),
+        histograms(memory),
         tickets(memory + passes * kBins),
         status(memory + passes * (kBins + 1)),
         blocks(sort_blocks(capacity)) {}
 };
 
 /// Adds the digits of a warp's keys to histograms in shared memory.
-template <int kPasses> __device__ void count_digits(uint32_t key, bool valid, uint32_t* histograms) {
+template <int kBits, int kPasses> __device__ void count_digits(uint32_t key, bool valid, uint32_t* histograms) {
+  constexpr int kBins = Digits<kBits>::kBins;
 #pragma unroll
   for (int pass = 0; pass < kPasses; ++pass) {
-    const uint32_t digit = key >> (pass * kDigitBits) & (kBins - 1);
+    const uint32_t digit = Digits<kBits>::of(key, pass);
     // Neighbours often agree, above all in the high digits of depths. Atomics to one place are slow.
     int agree = 0;
     __match_all_sync(kAllLanes, valid ? digit : kBins, &agree);
@@ -60,21 +70,36 @@ template <int kPasses> __device__ void count_digits(uint32_t key, bool valid, ui
 
 /// One pass. `kFirst`: there are first_count keys, those equal to `skip` are left out, and the values are
 /// the places of the others. The number of items of later passes is the histogram's.
-template <class Value, bool kFirst>
-__global__ void __launch_bounds__(kSortThreads)
-    sort_pass_kernel(const SortScratch scratch, int pass, int64_t first_count, uint32_t skip, const uint32_t* keys_in,
-                     uint32_t* keys_out, const Value* values_in, Value* values_out) {
-  __shared__ uint32_t counts[kSortWarps][kBins];  // of a warp's digits, then their first places in the block
+///
+/// `may_skip`: where all items have the same last digit, the last pass ends at once, and those before it have their two
+/// arrays of values in turn the other way round, so that the result is where the last pass would leave it. Keys, which
+/// nobody reads afterwards, are where they would be.
+template <int kBits, class Value, bool kFirst>
+__global__ void __launch_bounds__(Digits<kBits>::kThreads)
+    sort_pass_kernel(const SortScratch<kBits> scratch, int pass, bool may_skip, int64_t first_count, uint32_t skip,
+                     const uint32_t* keys_in, uint32_t* keys_out, Value* values_in, Value* values_out) {
+  using D = Digits<kBits>;
+  constexpr int kBins = D::kBins, kSortThreads = D::kThreads, kSortWarps = D::kWarps, kSortItems = D::kItems;
+  __shared__ uint16_t counts[kSortWarps][kBins];  // of a warp's digits, then their first places in the block
   __shared__ uint32_t to_global[kBins];           // place in the output - place in the block
   __shared__ Value staged[kSortTile];
   __shared__ uint32_t block_id;
-  const int t = threadIdx.x, warp = t / 32, lane = lane_id(), shift = pass * kDigitBits;
+  const int t = threadIdx.x, warp = t / 32, lane = lane_id();
   if (t == 0) block_id = atomicAdd(&scratch.tickets[pass], 1);
   uint32_t items;
   const uint32_t base = sum_before<kSortWarps>(scratch.histograms[pass * kBins + t], 0u, items);
 #pragma unroll
   for (int w = 0; w < kSortWarps; ++w) counts[w][t] = 0;
-  __syncthreads();
+  if (may_skip) {
+    if (__syncthreads_or(scratch.histograms[(scratch.passes - 1) * kBins + t] == items)) {
+      if (pass == scratch.passes - 1) return;
+      Value* other = values_in;
+      values_in = values_out;
+      values_out = other;
+    }
+  } else {
+    __syncthreads();
+  }
   const int64_t n = kFirst ? first_count : items, begin = int64_t(block_id) * kSortTile;
   if (begin >= n) return;
 
@@ -91,10 +116,10 @@ __global__ void __launch_bounds__(kSortThreads)
   const uint32_t before = (1u << lane) - 1;
 #pragma unroll
   for (int i = 0; i < kSortItems; ++i) {
-    const uint32_t digit = keys[i] >> shift & (kBins - 1);
+    const uint32_t digit = D::of(keys[i], pass);
     uint32_t peers = __ballot_sync(kAllLanes, valid[i]);
 #pragma unroll
-    for (int b = 0; b < kDigitBits; ++b) {
+    for (int b = 0; b < kBits; ++b) {
       const bool bit = digit >> b & 1;
       const uint32_t with = __ballot_sync(kAllLanes, bit);
       peers &= bit ? with : ~with;
@@ -103,7 +128,7 @@ __global__ void __launch_bounds__(kSortThreads)
     uint32_t start = 0;
     if (valid[i] && lane == leader) {
       start = counts[warp][digit];
-      counts[warp][digit] = start + __popc(peers);
+      counts[warp][digit] = uint16_t(start + __popc(peers));
     }
     ranks[i] = __shfl_sync(kAllLanes, start, leader) + __popc(peers & before);
     __syncwarp();
@@ -114,7 +139,7 @@ __global__ void __launch_bounds__(kSortThreads)
 #pragma unroll
   for (int w = 0; w < kSortWarps; ++w) {
     const uint32_t c = counts[w][t];
-    counts[w][t] = mine;
+    counts[w][t] = uint16_t(mine);
     mine += c;
   }
   uint32_t* status = scratch.status + (int64_t(pass) * scratch.blocks + block_id) * kBins + t;
@@ -133,7 +158,7 @@ __global__ void __launch_bounds__(kSortThreads)
   }
   to_global[t] = base + earlier - local;
 #pragma unroll
-  for (int w = 0; w < kSortWarps; ++w) counts[w][t] += local;
+  for (int w = 0; w < kSortWarps; ++w) counts[w][t] = uint16_t(counts[w][t] + local);
   __syncthreads();
 
   // Through shared memory, so that neighbouring threads write to neighbouring places.
@@ -141,7 +166,7 @@ __global__ void __launch_bounds__(kSortThreads)
 #pragma unroll
   for (int i = 0; i < kSortItems; ++i) {
     if (!valid[i]) continue;
-    ranks[i] += counts[warp][keys[i] >> shift & (kBins - 1)];
+    ranks[i] += counts[warp][D::of(keys[i], pass)];
     staged_keys[ranks[i]] = keys[i];
   }
   __syncthreads();
@@ -151,7 +176,7 @@ __global__ void __launch_bounds__(kSortThreads)
     const uint32_t k = i * kSortThreads + t;
     if (k >= total) continue;
     const uint32_t key = staged_keys[k];
-    places[i] = to_global[key >> shift & (kBins - 1)] + k;
+    places[i] = to_global[D::of(key, pass)] + k;
     keys_out[places[i]] = key;
   }
   __syncthreads();

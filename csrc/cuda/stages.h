@@ -37,7 +37,10 @@ AR_HD int front_chunks(TileGrid grid, int samples) {
 }
 
 /// Depth keys of splats without pairs: after all others.
-inline constexpr uint32_t kCulledKey = 0x7fffffff;
+inline constexpr uint32_t kCulledKey = 0xffffffff;
+/// The depth key of a splat is that of its depth's bits, which have the order of depths >= +0, plus this: so that the
+/// bits from the 27th on are the same for all depths from 1/8 to less than 8192, and need not be sorted.
+inline constexpr uint32_t kDepthKeyOffset = 0x02000000;
 
 /// Where the pairs of a splat are, in the order in which they are emitted.
 struct PairRange {
@@ -109,8 +112,9 @@ struct ProjectRowsParams {
   Gaussians<float> gaussians;
   FootprintChoice footprint;
   CullBounds<float> bounds;
-  ProjectedRows<float> rows;  ///< [n]; those with radius 0 are not written
+  ProjectedRows<float> rows;  ///< [n]; those with radius 0 are not written; or all null
   int32_t* radii;             ///< [n]
+  PackedRows<float> packed;   ///< instead of rows and radii
 };
 
 struct ShapeRowsParams : ar::ShapeRowsParams<float> {
@@ -125,12 +129,13 @@ struct EmitParams {
   TileGrid grid;
   int64_t capacity;
   const Counts* counts;
-  const int32_t* order;  ///< [counts->splats] splats by depth
-  PairRange* ranges;     ///< [n] first
-  uint32_t* status;      ///< emit_scratch(n) bytes, zero
-  uint32_t* tiles;       ///< [capacity] tile of each pair
-  int32_t* splat_pairs;  ///< [capacity] splat of each pair, or null:
-  SlotPair* slot_pairs;  ///< [capacity] the same with its slot, for a backward pass
+  const int32_t* order;   ///< [counts->splats] splats by depth
+  PairRange* ranges;      ///< [n] first
+  uint32_t* status;       ///< emit_scratch(n) bytes, zero
+  uint32_t* tile_counts;  ///< tile_sort_scratch(capacity, grid) bytes, zero; sort_by_tile finds its counts there
+  uint32_t* tiles;        ///< [capacity] tile of each pair
+  int32_t* splat_pairs;   ///< [capacity] splat of each pair, or null:
+  SlotPair* slot_pairs;   ///< [capacity] the same with its slot, for a backward pass
 };
 
 /// The lists of splats that blend walks.
@@ -241,6 +246,7 @@ struct BlendVjpParams : ar::BlendVjpParams<float> {
   const TileChunk* chunk_order;
   const PlanState* plan;
   int64_t max_chunks;
+  int32_t* chunks_taken;  ///< [kSampleClasses] set to zero by blend_vjp; chunks of a class that warps have begun with
   const float* checkpoints;
   float* pair_grads;    ///< [max(capacity, n), kPairGradWidth] by slot, or by splat if there are too many pairs
   float* channel_sums;  ///< [max(capacity, n), kChannelGroup] likewise, for more than kFewChannels channels; or null
@@ -281,8 +287,9 @@ struct ProjectRowsVjpParams {
   CameraView<float> camera;
   Gaussians<float> gaussians;
   GaussianGrads<float> grads;
-  ProjectedRowGrads<float> rows;  ///< depths and colors may be null
-  float* camera_grads;            ///< as in ProjectVjpParams
+  ProjectedRowGrads<float> rows;
+  bool add;             ///< to the gradients that are there
+  float* camera_grads;  ///< as in ProjectVjpParams
 };
 
 struct RowGradsParams : ar::RowGradsParams<float> {
@@ -365,7 +372,7 @@ struct PairFeedback {
   uint32_t frame;
 };
 
-/// Pairs by tile, stably. The result is values[tile_sort_result(grid)].
+/// Pairs by tile, stably; those of emit_pairs. The result is values[tile_sort_result(grid)].
 template <class Value> struct TileSort {
   int64_t capacity;
   const Counts* counts;
@@ -375,6 +382,7 @@ template <class Value> struct TileSort {
   PairFeedback feedback;
 };
 int tile_sort_result(TileGrid grid);
+/// `scratch`: EmitParams::tile_counts.
 void sort_by_tile(const TileSort<int32_t>& p, TileGrid grid, void* scratch, cudaStream_t stream);
 void sort_by_tile(const TileSort<SlotPair>& p, TileGrid grid, void* scratch, cudaStream_t stream);
 

@@ -18,16 +18,9 @@ struct TilePiece {
 /// The piece of that number, or a tile of -1: there is none, or there were too many pairs. All lanes must call it.
 __device__ inline TilePiece find_piece(const TileLists& lists, TileGrid grid, int length, int64_t number) {
   if (lists.counts->pairs > lists.capacity) return {-1, 0};
-  // The last tile whose first piece is not behind `number`, in each step among 32 times fewer.
-  int tile = 0;
-  for (int size = int(grid.tiles()), step = 0; size > 1; size = min(step, size)) {
-    step = (size + 31) / 32;
-    const int ahead = lane_id() * step;
-    const bool before = ahead < size && first_piece(lists, length, tile + ahead) <= number;
-    const int skipped = (__popc(__ballot_sync(kAllLanes, before)) - 1) * step;
-    tile += skipped;
-    size -= skipped;
-  }
+  // The last tile whose first piece is not behind `number`.
+  const auto begins = [&](int tile) { return first_piece(lists, length, tile) <= number; };
+  const int tile = partition_point<32>(int(grid.tiles()), begins) - 1;
   const int64_t index = number - first_piece(lists, length, tile);
   const int64_t count = lists.tile_offsets[tile + 1] - lists.tile_offsets[tile];
   return {index * length < count ? tile : -1, int(index)};

@@ -74,6 +74,21 @@ __device__ inline uint32_t warp_or(uint32_t bits) {
 #endif
 }
 
+/// How many of [0, n), from the front, `before` holds for, if it holds for none behind those. Each group of kLanes
+/// lanes looks for its own, in every step among kLanes + 1 times fewer. All lanes of a warp must call it.
+template <int kLanes, class Before> __device__ int partition_point(int n, Before&& before) {
+  const int lane = lane_id() % kLanes, group = lane_id() - lane;
+  int found = 0;
+  for (int left = n; __any_sync(kAllLanes, left > 0);) {
+    const int step = left / (kLanes + 1) + 1, ahead = (lane + 1) * step - 1;
+    const uint32_t votes = __ballot_sync(kAllLanes, ahead < left && before(found + ahead));
+    const int passed = __popc(votes >> group & kAllLanes >> (32 - kLanes)) * step;
+    found += passed;
+    left = min(step - 1, left - passed);
+  }
+  return found;
+}
+
 /// The shared memory of a block whose size its launch gives.
 #if defined(__CUDACC__)
 __device__ inline float4* dynamic_shared() {
@@ -120,12 +135,13 @@ template <int N> __device__ float sum_values(const float (&v)[N]) {
   return sum + __shfl_xor_sync(kAllLanes, sum, 1);
 }
 
-/// Which of N values a lane has after sum_values, or -1.
+/// Which of N values a lane has after sum_values. Lanes that have the same one have the same bits.
 template <int N> __device__ int summed_value(int lane) {
-  if (lane % 4 == 0) return lane / 4;
-  if (N > 8 && lane == 2) return 8;
-  if (N > 9 && lane == 18) return 9;
-  return -1;
+  return N > 8 && lane & 2 ? (N > 9 && lane & 16 ? 9 : 8) : lane / 4;
+}
+/// Whether it is the first lane that has the value.
+template <int N> __device__ bool has_value_first(int lane) {
+  return lane % 4 == 0 || (N > 8 && lane == 2) || (N > 9 && lane == 18);
 }
 
 }  // namespace ar::cuda

@@ -1,0 +1,196 @@
+// The kernels that sort splats by depth, and that find the pairs of each tile, run on the host, against the algorithms
+// of the standard library.
+#include <cstring>
+#include <numeric>
+#include <random>
+
+#include "cuda_on_host.h"
+// After it: kernels.
+#include <gtest/gtest.h>
+
+#include "cuda/bin.cuh"
+
+namespace ar::cuda {
+namespace {
+
+constexpr float kCulled = -1;
+
+uint32_t key_of(float depth) {
+  if (depth == kCulled) return kCulledKey;
+  uint32_t key;
+  std::memcpy(&key, &depth, sizeof key);
+  return key + kDepthKeyOffset;
+}
+
+/// Sorts as count_depths and sort_by_depth do, but for passes behind the first `passes`: what these leave must be the
+/// result.
+void expect_sorted(const std::vector<float>& depths, int passes = kDepthPasses) {
+  const auto n = int64_t(depths.size());
+  std::vector<uint32_t> keys[2] = {{}, std::vector<uint32_t>(n)};
+  for (float depth : depths) keys[0].push_back(key_of(depth));
+  std::vector<int32_t> order[2] = {std::vector<int32_t>(n, -1), std::vector<int32_t>(n, -1)};
+  std::vector<PairRange> ranges;
+  std::vector<int32_t> expected;
+  int64_t pairs = 0;
+  for (int32_t i = 0; i < n; ++i) {
+    const int count = depths[i] == kCulled ? 0 : i % 3 + 1;
+    ranges.push_back({0, count});
+    pairs += count;
+    if (count > 0) expected.push_back(i);
+  }
+  std::stable_sort(expected.begin(), expected.end(), [&](int32_t a, int32_t b) { return depths[a] < depths[b]; });
+
+  std::vector<uint32_t> memory(DepthScratch::words(n, kDepthPasses));
+  const DepthScratch scratch(memory.data(), n, kDepthPasses);
+  Counts counts = {};
+  const DepthSort sort = {
+      n, {keys[0].data(), keys[1].data()}, {order[0].data(), order[1].data()}, ranges.data(), &counts};
+  cuda_on_host::launch(2, kCountThreads,
+                       [&] { count_depths_kernel(sort.keys[0], sort.ranges, n, scratch.histograms, sort.counts); });
+  ASSERT_EQ(counts.splats, int64_t(expected.size()));
+  ASSERT_EQ(counts.pairs, pairs);
+  for_each_depth_pass(sort, scratch, [&](auto kernel, auto... arguments) {
+    if (passes-- > 0) cuda_on_host::launch(int(scratch.blocks), DepthDigits::kThreads, [&] { kernel(arguments...); });
+  });
+  order[0].resize(expected.size());
+  ASSERT_EQ(order[0], expected);
+}
+
+std::vector<float> random_depths(int n, float nearest, float farthest, int one_culled_in = 3) {
+  std::mt19937 bits(7);
+  std::uniform_real_distribution<float> uniform(std::log(nearest), std::log(farthest));
+  std::vector<float> depths;
+  for (int i = 0; i < n; ++i) depths.push_back(bits() % one_culled_in == 0 ? kCulled : std::exp(uniform(bits)));
+  return depths;
+}
+
+TEST(BinKernels, Depths) { expect_sorted(random_depths(2 * kSortTile + 100, 0.2f, 100)); }
+
+/// Where all depths lie between 1/8 and 8192 the last pass has nothing to do, and may be left out.
+TEST(BinKernels, TheLastPassIsForDepthsThatAreVeryDifferent) {
+  std::vector<float> depths = random_depths(kSortTile + 700, 0.125f, 8191);
+  depths[5] = 0.125f, depths[6] = std::nextafter(8192.0f, 0.0f);
+  expect_sorted(depths, 3);
+  expect_sorted(depths);
+  for (const float other : {std::nextafter(0.125f, 0.0f), 8192.0f}) {
+    depths[700] = other;
+    expect_sorted(depths);
+  }
+  for (float& depth : depths) depth = depth == kCulled ? kCulled : 65536 * depth;  // all of them far away
+  expect_sorted(depths);
+}
+
+TEST(BinKernels, DepthsOfEveryMagnitude) { expect_sorted(random_depths(kSortTile + 1, 1e-37f, 1e37f)); }
+
+TEST(BinKernels, FewAndNoDepths) {
+  expect_sorted({2});
+  expect_sorted({kCulled, kCulled});
+  expect_sorted({3, kCulled, 0, 1, 3, 0});
+}
+
+TEST(BinKernels, TiesKeepInputOrder) {
+  std::vector<float> depths = random_depths(kSortTile, 0.2f, 4);
+  for (float& depth : depths) depth = depth == kCulled ? kCulled : std::ceil(depth);
+  expect_sorted(depths);
+}
+
+/// Splats from a fraction of a pixel to the whole image, in an image with more rows of tiles than a warp has lanes.
+std::vector<SplatRow<float>> random_splats(int n, TileGrid grid) {
+  using F = Mip;
+  std::mt19937 bits(7);
+  const auto uniform = [&](float low, float high) { return std::uniform_real_distribution<float>(low, high)(bits); };
+  std::vector<SplatRow<float>> splats(n);
+  for (SplatRow<float>& splat : splats) {
+    const float a = std::exp(uniform(-2, 11)), b = std::exp(uniform(-2, 6));
+    const F::Shape<float> shape = F::prepare(Cov2d<float>{b, 0, a, a * b}, FootprintOptions{0});
+    splat.mean = {uniform(0, float(grid.width)), uniform(0, float(grid.height))};
+    set_shape<F>(splat, shape);
+    splat.opacity = uniform(0.1f, 1);
+    splat.level = F::level(shape, splat.opacity);
+  }
+  return splats;
+}
+
+TEST(BinKernels, PairsOfSplats) {
+  constexpr TileGrid grid = {170, 700};
+  constexpr int n = 2 * kEmitThreads + 30;
+  const int footprint = find_footprint("mip");
+  const std::vector<SplatRow<float>> splats = random_splats(n, grid);
+  std::vector<int32_t> order(n);
+  std::iota(order.begin(), order.end(), 0);
+  std::shuffle(order.begin(), order.end(), std::mt19937(7));
+  std::vector<PairRange> ranges(n), expected_ranges(n);
+  std::vector<uint32_t> expected_tiles;
+  std::vector<int32_t> expected_splats;
+  int many = 0;
+  for (const int32_t i : order) {
+    expected_ranges[i].first = int32_t(expected_tiles.size());
+    for_each_tile(support_of(splats[i], footprint), grid, [&](int64_t tile) {
+      expected_tiles.push_back(uint32_t(tile));
+      expected_splats.push_back(i);
+    });
+    ranges[i].count = expected_ranges[i].count = int32_t(expected_tiles.size()) - expected_ranges[i].first;
+    many += ranges[i].count > kManyTiles;
+  }
+  ASSERT_GT(many, n / 10);
+  ASSERT_LT(many, n / 2);
+
+  const auto pairs = int64_t(expected_tiles.size());
+  const Counts counts = {pairs, n};
+  for (const bool with_slots : {false, true}) {
+    std::vector<uint32_t> status(emit_scratch(n) / sizeof(uint32_t)), tiles(pairs);
+    std::vector<int32_t> splat_pairs(pairs);
+    std::vector<SlotPair> slot_pairs(pairs);
+    std::vector<uint32_t> scratch(TileScratch::words(pairs, tile_passes(grid))), expected_scratch(scratch.size());
+    for (const uint32_t tile : expected_tiles) {
+      for (int d = 0; d < tile_passes(grid); ++d) ++expected_scratch[d * TileDigits::kBins + TileDigits::of(tile, d)];
+    }
+    EmitParams emit = {};
+    emit.splats = &splats[0].mean.x;
+    emit.n = n;
+    emit.footprint = footprint;
+    emit.grid = grid;
+    emit.capacity = pairs;
+    emit.counts = &counts;
+    emit.order = order.data();
+    emit.ranges = ranges.data();
+    emit.status = status.data();
+    emit.tile_counts = scratch.data();
+    emit.tiles = tiles.data();
+    emit.splat_pairs = with_slots ? nullptr : splat_pairs.data();
+    emit.slot_pairs = with_slots ? slot_pairs.data() : nullptr;
+    cuda_on_host::launch((n + kEmitThreads - 1) / kEmitThreads, kEmitThreads,
+                         [&] { emit_pairs_kernel(emit, tile_passes(grid)); });
+    EXPECT_EQ(tiles, expected_tiles);
+    EXPECT_EQ(scratch, expected_scratch);
+    for (int64_t k = 0; k < pairs; ++k) {
+      ASSERT_EQ(with_slots ? slot_pairs[k].splat : splat_pairs[k], expected_splats[k]) << k;
+      ASSERT_EQ(with_slots ? slot_pairs[k].slot : k, k);
+    }
+    for (int i = 0; i < n && with_slots; ++i) ASSERT_EQ(ranges[i].first, expected_ranges[i].first) << i;
+  }
+}
+
+TEST(BinKernels, FirstPairsOfTiles) {
+  std::mt19937 bits(7);
+  for (const int tile_count : {1, 15, 100}) {
+    for (const int pairs : {0, 1, 8, 9, 10, 81, 5000}) {
+      std::vector<uint32_t> tiles(pairs);
+      for (uint32_t& tile : tiles) tile = uint32_t(bits() % tile_count) * 2 % tile_count;  // some tiles have none
+      std::sort(tiles.begin(), tiles.end());
+      std::vector<int64_t> offsets(tile_count + 1, -1), expected;
+      for (int tile = 0; tile <= tile_count; ++tile)
+        expected.push_back(std::lower_bound(tiles.begin(), tiles.end(), uint32_t(tile)) - tiles.begin());
+      const Counts counts = {pairs, pairs};
+      uint64_t word = 0;
+      cuda_on_host::launch(tile_count / kRangeTiles + 1, kRangeTiles * kRangeLanes, [&] {
+        tile_offsets_kernel(tiles.data(), &counts, pairs, tile_count, offsets.data(), {&word, 3});
+      });
+      EXPECT_EQ(offsets, expected) << tile_count << " tiles, " << pairs << " pairs";
+      EXPECT_EQ(word, uint64_t(3) << 32 | uint64_t(pairs));
+    }
+  }
+}
+
+}  // namespace
+}  // namespace ar::cuda
