@@ -38,13 +38,8 @@ template <class F, int C, class Layout> struct MovingVjpShared {
   int last[Layout::kWarps];  ///< place behind the last splat that a warp composited
 };
 
-/// Which of the sums of a pair a lane has after put_warp_sums. Of few channels every lane has one; lanes that have the
-/// same one have the same bits.
-template <int C> __device__ int sum_of_lane() {
-  const int lane = lane_id();
-  if (C > kFewChannels) return lane / 4;
-  return (lane & 2) == 0 ? lane / 4 : C == 4 && lane >= 16 ? 9 : 8;
-}
+/// Which of the sums of a pair a lane has after put_warp_sums. Of few channels every lane has one.
+template <int C> __device__ int sum_of_lane() { return summed_value<(C <= kFewChannels) ? 6 + C : 8>(lane_id()); }
 
 /// Sums PairGrad and `channels` over a warp. `sums` is where MovingVjpShared has sum sum_of_lane() of the pair. All
 /// lanes must call it.
@@ -58,7 +53,6 @@ template <int C> __device__ void put_warp_sums(const PairGrad<float>& grad, cons
   if constexpr (C <= kFewChannels) {
 #pragma unroll
     for (int c = 0; c < C; ++c) values[6 + c] = channels.v[c];
-    static_assert(C == 3 || C == 4);
     *sums = sum_values(values);  // by all lanes, which costs less than to find the first of each sum
   } else {
     static_assert(C == 8);
