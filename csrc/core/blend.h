@@ -70,9 +70,10 @@ template <class P, class Terms, class V>
 AR_HD Blended<V> blend_placed_sample(const Terms& terms, Vec2<V> z, V raw, const Bounds<V>& bounds, V& transmittance,
                                      Vec2<V>& place) {
   using T = ScalarOf<V>;
+  // The reciprocal takes long: it does not wait for the mask.
+  const V capped_odds = odds(min(raw, V(T(kAlphaMax))));
   const Blended<V> blended = blend_sample(raw, transmittance);
-  const V alpha = select(blended.mask, min(raw, V(T(kAlphaMax))), V(T(0)));
-  place = P::move_in(terms, z, alpha, place, bounds);
+  place = P::move_in(terms, z, select(blended.mask, capped_odds, V(T(0))), place, bounds);
   return blended;
 }
 
@@ -86,7 +87,7 @@ AR_HD MaskOf<V> replay_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskO
   const MaskOf<V> mask = (raw >= V(T(kAlphaMin))) & before;
   const V alpha = select(mask, min(raw, V(T(kAlphaMax))), V(T(0)));
   transmittance = transmittance - transmittance * alpha;
-  place = P::move_in(terms, z, alpha, place, bounds);
+  place = P::move_in(terms, z, odds(alpha), place, bounds);
   return mask;
 }
 

@@ -16,9 +16,8 @@ namespace {
 template <class F, int C> void launch_moving_blend(const BlendParams& p, int first, cudaStream_t stream) {
   const bool listed = is_small_image(p.grid);
   if (listed) {
-    using Layout = ListedLayout<F>;
-    const auto blocks = unsigned(p.grid.tiles() * Layout::kBlocks);
-    launch(listed_blend_kernel<F, C, Layout>, {blocks, Layout::kThreads}, stream, p, first);
+    const auto blocks = unsigned(p.grid.tiles() * kListedBlocks<F>);
+    launch(listed_blend_kernel<F, C>, {blocks, 32}, stream, p, first);
   }
   using Layout = EvenLayout<F, false>;
   launch(moving_blend_kernel<F, C, Layout>, {unsigned(p.grid.tiles()), Layout::kThreads}, stream, p, first, listed);
@@ -26,7 +25,7 @@ template <class F, int C> void launch_moving_blend(const BlendParams& p, int fir
 template <class F> void blend_moving(const BlendParams& p, cudaStream_t stream) {
   if (is_small_image(p.grid)) {
     const auto pieces = unsigned(max_pieces(p.lists.capacity, kFilterPiece, p.grid));
-    launch(filter_kernel<F, ListedLayout<F>>, {pieces, kFilterPiece}, stream, p);
+    launch(filter_kernel<F>, {pieces, kFilterPiece}, stream, p);
   }
   if (!p.channels.data) return launch_moving_blend<F, 3>(p, 0, stream);
   if (p.channels.count <= kFewChannels) return launch_moving_blend<F, 4>(p, 0, stream);
@@ -63,7 +62,7 @@ int64_t max_reach_words(int footprint, int64_t capacity, TileGrid grid) {
   visit_footprint(footprint, Footprints{}, [&](auto f) {
     using F = decltype(f);
     if constexpr (F::kMoves) {
-      if (is_small_image(grid)) words = filter_words<ListedLayout<F>>(capacity, grid);
+      if (is_small_image(grid)) words = filter_words(capacity, grid);
     }
   });
   return words;

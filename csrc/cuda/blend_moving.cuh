@@ -30,15 +30,16 @@ struct CellLayout {
 
   /// This warp's group.
   __device__ static int group() { return int(blockIdx.x) % kBlocks * kWarps + int(threadIdx.x) / 32; }
+  /// The place of the group's pixel i among the tile's, row by row, whatever the layout.
+  __device__ static int pixel_number(int i) {
+    const int g = group();
+    return (g / kColumns * kHigh + i / kWide) * kMovingTile + g % kColumns * kWide + i % kWide;
+  }
+  __device__ static int pixel_number() { return pixel_number(lane_id() / kLanes); }  ///< of this thread's pixel
   /// This thread's pixel, relative to the tile's first.
   __device__ static Vec2<float> pixel() {
     const int g = group(), i = lane_id() / kLanes;
     return {float(g % kColumns * kWide + i % kWide), float(g / kColumns * kHigh + i / kWide)};
-  }
-  /// Its place among the tile's pixels, row by row, whatever the layout.
-  __device__ static int pixel_number() {
-    const Vec2<float> p = pixel();
-    return int(p.y) * kMovingTile + int(p.x);
   }
   /// The first of this thread's samples of its pixel.
   __device__ static int first_sample() { return lane_id() % kLanes * kCells; }
@@ -100,10 +101,7 @@ template <class F, class Layout, bool kTogether = false> struct MovingSamples {
     }
   }
   __device__ static bool exists(int i) { return Layout::first_sample() + i < F::kSamples; }
-  __device__ static Vec2<float> node(int i) {
-    const Vec2<double> n = F::node(Layout::first_sample() + i);
-    return {float(n.x), float(n.y)};
-  }
+  __device__ static Vec2<float> node(int i) { return F::template node<float>(Layout::first_sample() + i); }
   __device__ bool open() const {
     bool any = false;
 #pragma unroll
@@ -111,32 +109,32 @@ template <class F, class Layout, bool kTogether = false> struct MovingSamples {
     return any;
   }
 
-  /// Where checkpoint `number` has sample i of this pixel: its transmittance, and its place in the two planes behind.
-  __device__ static int64_t in_checkpoint(int64_t number, int i) {
+  static constexpr int kCheckpoint = state_planes(F::kSamples) * kMovingPixels;           ///< numbers of a checkpoint
+  static constexpr int kPlane = kTogether ? F::kSamples * kMovingPixels : kMovingPixels;  ///< from a plane to the next
+  /// Where a checkpoint has sample i of this pixel: its transmittance, and its place in the two planes behind.
+  __device__ static int in_checkpoint(int i) {
     const int sample = Layout::first_sample() + i, pixel = Layout::pixel_number();
-    const int64_t in_plane = kTogether ? pixel * F::kSamples + sample : 3 * sample * kMovingPixels + pixel;
-    return number * state_planes(F::kSamples) * kMovingPixels + in_plane;
+    return kTogether ? pixel * F::kSamples + sample : 3 * sample * kMovingPixels + pixel;
   }
-  static constexpr int kPlane = kTogether ? F::kSamples * kMovingPixels : kMovingPixels;  ///< from one to the next
-  __device__ void store(float* checkpoints, int64_t number) const {
+  __device__ void store(float* checkpoint) const {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
       if (!exists(i)) continue;
-      float* to = checkpoints + in_checkpoint(number, i);
+      float* to = checkpoint + in_checkpoint(i);
       to[0] = abs(transmittance[i]);
       to[kPlane] = place[i].x;
       to[2 * kPlane] = place[i].y;
     }
   }
-  /// In front of pair k, a multiple of the spacing. Samples that have composited their last splat, `last` pairs from
-  /// the first, may have no checkpoint there, and need none.
-  __device__ void load(const float* checkpoints, const StatePlaces& places, int k, const int (&last)[kCells]) {
+  /// In front of pair k, where `checkpoint` is, unless k is 0. Samples that have composited their last splat, `last`
+  /// pairs from the first, may have no checkpoint there, and need none.
+  __device__ void load(const float* checkpoint, int k, const int (&last)[kCells]) {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
       transmittance[i] = 1;
       place[i] = node(i);
       if (k == 0 || k >= last[i]) continue;
-      const float* from = checkpoints + in_checkpoint(places.first + k / places.spacing - 1, i);
+      const float* from = checkpoint + in_checkpoint(i);
       transmittance[i] = from[0];
       place[i] = {from[kPlane], from[2 * kPlane]};
     }
@@ -166,11 +164,19 @@ template <class F, int C, class Layout, int kBatch> struct MovingStage {
     if (threadIdx.x < kBatch) reach[threadIdx.x] = bits;
   }
 
-  /// Of the splats [k, k + 32), those that reach this warp's pixels. All lanes must call it.
+  /// Of the splats [k, k + 32), those that reach this warp's pixels: that of k + j is bit 31 - j. All must call it.
   __device__ uint32_t reached(int k) const {
-    return __ballot_sync(kAllLanes, reach[k + lane_id()] >> (threadIdx.x / 32) & 1);
+    return __ballot_sync(kAllLanes, reach[k + 31 - lane_id()] >> (threadIdx.x / 32) & 1);
   }
 };
+
+/// Takes the first splat out of `reached`, as MovingStage has them, and returns its number: the highest bit is found
+/// with one slow instruction, the lowest with two.
+__device__ inline int take_first(uint32_t& reached) {
+  const int first = __clz(int(reached));
+  reached ^= 1u << (31 - first);
+  return first;
+}
 
 /// A lane's share of blending a pixel.
 template <class F, int C, class Layout, bool kTogether = false> struct MovingBlend {
@@ -181,10 +187,8 @@ template <class F, int C, class Layout, bool kTogether = false> struct MovingBle
 
   __device__ explicit MovingBlend(bool inside) : samples(inside) {}
 
-  /// Composites pair k, whose splat is staged, into the samples of the pixel at p.
-  __device__ void add(const TileSplat<F, C>& staged, Vec2<float> p, int k) {
-    TileSplatRef<F, C> splat = staged;
-    const Vec2<float> of_pixel = transform(splat.terms.w, p, splat.terms.node[0]);
+  /// Composites pair k into the samples of a pixel, whose whitened coordinates for the splat are of_pixel.
+  __device__ void add(TileSplatRef<F, C>& splat, Vec2<float> of_pixel, int k) {
     float contribution = 0;
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
@@ -225,10 +229,10 @@ template <class F, int C, class Layout, bool kTogether = false> struct MovingBle
   }
 };
 
-/// A block per tile; C channels from `first` on. `overflow_only`: another kernel blends the tiles, unless there were
-/// too many pairs.
+/// A block per tile; C channels from `first` on, of three in so few registers that an SM holds 1024 threads.
+/// `overflow_only`: another kernel blends the tiles, unless there were too many pairs.
 template <class F, int C, class Layout>
-__global__ void __launch_bounds__(Layout::kThreads)
+__global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThreads : 1)
     moving_blend_kernel(const BlendParams params, int first, bool overflow_only) {
   constexpr int kBatch = Layout::kThreads < 256 ? Layout::kThreads : 256;
   __shared__ MovingStage<F, C, Layout, kBatch> stage;
@@ -252,10 +256,12 @@ __global__ void __launch_bounds__(Layout::kThreads)
     for (int from = 0; from < count; from += 32) {
       if (!__any_sync(kAllLanes, blend.samples.open())) break;
       if (keep && k + from > 0 && (k + from) % places.spacing == 0)
-        blend.samples.store(params.checkpoints, places.first + (k + from) / places.spacing - 1);
-      for (uint32_t mask = stage.reached(from); mask != 0; mask &= mask - 1) {
-        const int j = from + __ffs(mask) - 1;
-        blend.add(stage.splats[j], p, k + j);
+        blend.samples.store(params.checkpoints +
+                            (places.first + (k + from) / places.spacing - 1) * blend.samples.kCheckpoint);
+      for (uint32_t left = stage.reached(from); left != 0;) {
+        const int j = from + take_first(left);
+        TileSplatRef<F, C> splat = stage.splats[j];
+        blend.add(splat, transform(splat.terms.w, p, splat.terms.node[0]), k + j);
       }
     }
   }

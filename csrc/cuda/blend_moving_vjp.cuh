@@ -28,8 +28,8 @@ static_assert(kStateChunk == 32, "a warp's chunk is a mask of 32 bits");
 /// What a block keeps in shared memory. Sums of a pair: PairGrad, C channels, MeanSums.
 template <class F, int C, class Layout> struct MovingVjpShared {
   static constexpr int kMeans = 6 + C, kSums = kMeans + 2;
-  /// Splats that a block takes between barriers: two chunks, if a block of any device has room for their sums.
-  static constexpr int kBatch = Layout::kWarps * kSums <= 192 ? 2 * kStateChunk : kStateChunk;
+  /// Splats that a block takes between barriers. With more there would be less fast memory for the places of samples.
+  static constexpr int kBatch = kStateChunk;
   MovingStage<F, C, Layout, kBatch> stage;
   float sums[Layout::kWarps][kBatch][kSums];            ///< of a warp's pixels
   uint32_t hits[Layout::kWarps][kBatch / kStateChunk];  ///< splats that have sums of a warp
@@ -38,10 +38,13 @@ template <class F, int C, class Layout> struct MovingVjpShared {
   int last[Layout::kWarps];  ///< place behind the last splat that a warp composited
 };
 
-/// Sums PairGrad and `channels` over a warp, in `sums` as MovingVjpShared has them. All lanes must call it.
+/// Which of the sums of a pair a lane has after put_warp_sums. Of few channels every lane has one.
+template <int C> __device__ int sum_of_lane() { return summed_value<(C <= kFewChannels) ? 6 + C : 8>(lane_id()); }
+
+/// Sums PairGrad and `channels` over a warp. `sums` is where MovingVjpShared has sum sum_of_lane() of the pair. All
+/// lanes must call it.
 template <int C> __device__ void put_warp_sums(const PairGrad<float>& grad, const Values<C>& channels, float* sums) {
   const ShapeGrad<float>& shape = grad.shape;
-  const int lane = lane_id();
   const float of_shape[6] = {shape.offset.x, shape.offset.y, shape.shape.xx,
                              shape.shape.xy, shape.shape.yy, grad.weighted};
   float values[C <= kFewChannels ? 6 + C : 8] = {};
@@ -50,14 +53,14 @@ template <int C> __device__ void put_warp_sums(const PairGrad<float>& grad, cons
   if constexpr (C <= kFewChannels) {
 #pragma unroll
     for (int c = 0; c < C; ++c) values[6 + c] = channels.v[c];
-    const float sum = sum_values(values);
-    if (has_value_first<6 + C>(lane)) sums[summed_value<6 + C>(lane)] = sum;
+    *sums = sum_values(values);  // by all lanes, which costs less than to find the first of each sum
   } else {
     static_assert(C == 8);
     const float sum = sum_values(values), of_channels = sum_values(channels.v);
+    const int lane = lane_id();
     if (lane % 4 != 0) return;
-    if (lane < 24) sums[lane / 4] = sum;
-    sums[6 + lane / 4] = of_channels;
+    if (lane < 24) *sums = sum;
+    sums[6] = of_channels;
   }
 }
 
@@ -122,8 +125,11 @@ template <class F> struct MapMemory {
 /// device with smaller scenes.
 template <class F> inline constexpr int kMovingSegment = F::kSamples <= 4 ? 512 : 1024;
 /// Samples shared out for segments, of which there are many, with small splats: few pixels per warp, and blocks small
-/// enough for two on an SM.
-template <class F> using SegmentLayout = CellLayout<F::kSamples <= 4 ? 1 : 2, F::kSamples <= 4 ? 4 : 8>;
+/// enough for two on an SM. A single sample has a lane, so that none is idle.
+template <class F>
+using SegmentLayout = CellLayout<F::kSamples <= 4 ? 1 : 2, F::kSamples == 1   ? 1
+                                                           : F::kSamples == 4 ? 4
+                                                                              : 8>;
 
 /// A thread per sample of a tile: from the maps of its segments to what each gets from behind.
 template <class F, int kSegment>
@@ -140,13 +146,17 @@ __global__ void __launch_bounds__(kMovingPixels) chain_maps_kernel(const BlendVj
   const int64_t first = first_piece(params.lists, kSegment, tile);
   const MapMemory<F> memory(params.adjoint_maps, sample, number);
   Adjoint adjoint = memory.adjoint(first + segment);
-  AdjointMap map = memory.map(first + --segment);
-  for (; segment > 0; --segment) {
-    AdjointMap next = {};
-    if (segment > 1) next = memory.map(first + segment - 1);  // while the one at hand is applied
-    adjoint = map(adjoint);
-    memory.put(first + segment, adjoint);
-    map = next;
+  constexpr int kAhead = 8;  // segments whose maps are read at once, since each of them waits for memory
+  for (; segment > 1; segment -= kAhead) {
+    AdjointMap maps[kAhead];
+#pragma unroll
+    for (int i = 0; i < kAhead; ++i) maps[i] = memory.map(first + max(segment - 1 - i, 1));
+#pragma unroll
+    for (int i = 0; i < kAhead; ++i) {
+      if (segment - 1 - i < 1) return;
+      adjoint = maps[i](adjoint);
+      memory.put(first + segment - 1 - i, adjoint);
+    }
   }
 }
 
@@ -159,6 +169,7 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
   using Shared = MovingVjpShared<F, C, Layout>;
   using Samples = MovingSamples<F, Layout, (kSegment > 0)>;
   constexpr int S = F::kSamples, kCells = Layout::kCells, kBatch = Shared::kBatch, kColumns = kMaps ? 4 : 1;
+  constexpr bool kMany = C > kFewChannels;  // `first` may be above 0, and there may be more channels than C
   static_assert(kSegment % kBatch == 0 && Layout::kBlocks == 1);
   Shared& shared = *reinterpret_cast<Shared*>(dynamic_shared());
   TilePiece piece = {0, 0};
@@ -176,7 +187,8 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
   const StatePlaces places(params.lists, list, params.grid, tile);
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int lane = lane_id(), warp = threadIdx.x / 32, channel_count = params.channels.count;
-  const bool with_means = params.mean_sums != MeanSums::kNone, all_at_once = with_means && channel_count > C;
+  const bool with_means = params.mean_sums != MeanSums::kNone;
+  const bool all_at_once = kMany && with_means && channel_count > C;
   const bool with_shape = !all_at_once || first == 0;
   const Vec2<float> p = Layout::pixel();
   const Pixel pixel(list, params.grid, p);
@@ -240,14 +252,15 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
     }
   }
 
+  float* const lane_sums = &shared.sums[warp][0][sum_of_lane<C>()];
   Vec2<float> places_in_front[kStateChunk][kCells];
   // Composites those of the staged splats [from, from + 32) that reach the warp; the first of them is pair k. Returns
   // those that a sample of the warp shows, and keeps the places of the samples in front of all.
   const auto replay = [&](int from, int k) {
     uint32_t shown = 0;
     int kept = 0;
-    for (uint32_t mask = shared.stage.reached(from); mask != 0; mask &= mask - 1, ++kept) {
-      const int bit = __ffs(mask) - 1;
+    for (uint32_t left = shared.stage.reached(from); left != 0; ++kept) {
+      const int bit = take_first(left);
       const auto& terms = shared.stage.splats[from + bit].terms;
       const Vec2<float> of_pixel = transform(terms.w, p, terms.node[0]);
       bool any = false;
@@ -269,8 +282,9 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
   for (int k1 = stop; k1 > begin; k1 = k0, k0 -= kBatch) {
     const int count = k1 - k0;
     if (kSegment == 0 && places.spacing > kStateChunk) {  // with too many pairs: from the checkpoint to the batch
-      int k = k0 / places.spacing * places.spacing;
-      samples.load(params.checkpoints, places, k, last);
+      const int checkpoint = k0 / places.spacing;
+      int k = checkpoint * places.spacing;
+      samples.load(params.checkpoints + (places.first + checkpoint - 1) * Samples::kCheckpoint, k, last);
       for (; k < k0; k += kBatch) {
         __syncthreads();
         shared.stage.load(splats, params.channels, first, list, shared.stage.splat_of(list, k, k0));
@@ -297,7 +311,8 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
           samples = at_batch;
           for (int ahead = 0; ahead < from; ahead += kStateChunk) replay(ahead, k0 + ahead);
         } else {
-          samples.load(params.checkpoints, places, k0 + from, last);
+          const int64_t number = places.first + (k0 + from) / kStateChunk - 1;
+          samples.load(params.checkpoints + number * Samples::kCheckpoint, k0 + from, last);
         }
         shown = replay(from, k0 + from);
       }
@@ -305,7 +320,7 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
       for (uint32_t mask = shown; mask != 0;) {
         const int bit = 31 - __clz(mask), j = from + bit;
         mask ^= 1u << bit;
-        const int kept = __popc(reached & ((1u << bit) - 1));
+        const int kept = __popc(reached >> (31 - bit)) - 1;
         TileSplatRef<F, C> splat = shared.stage.splats[j];
         const Vec2<float> of_pixel = transform(splat.terms.w, p, splat.terms.node[0]);
         float g_color = g.v[0] * splat.channels.v[0];
@@ -338,44 +353,49 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
           contribution = i == 0 ? grad.contribution : contribution + grad.contribution;
         }
         if (kMaps) continue;
-        float* sums = shared.sums[warp][j];
         if (with_means && with_shape) {
           const Vec2<float> offset = {Layout::sum_lanes(sum.shape.offset.x), Layout::sum_lanes(sum.shape.offset.y)};
           const Vec2<float> size = {float(params.grid.width), float(params.grid.height)};
           Vec2<float> means = mean_sums_of(params.mean_sums, size, transform_transposed(shared.mean_maps[j], offset));
           if (Layout::first_sample() > 0) means = {0, 0};  // once for a pixel
           means = {warp_sum(means.x), warp_sum(means.y)};
-          if (lane < 2) sums[Shared::kMeans + lane] = lane == 0 ? means.x : means.y;
+          if (lane < 2) shared.sums[warp][j][Shared::kMeans + lane] = lane == 0 ? means.x : means.y;
         }
         sum.shape = F::collect(splat.terms, sum.shape, sum.weighted);
-        put_warp_sums(sum, times(contribution, g), sums);
+        put_warp_sums(sum, times(contribution, g), lane_sums + j * Shared::kSums);
       }
       if (lane == 0) shared.hits[warp][from / kStateChunk] = shown;
     }
     if (kMaps) continue;
     __syncthreads();
-    const int used = with_means ? Shared::kSums : Shared::kMeans;
-    for (int t = threadIdx.x; t < count * used; t += Layout::kThreads) {
-      const int j = t / used, v = t % used;
-      float sum = 0;
+    const auto write_sums = [&](auto used) {  // a constant, so that to divide by it costs little
+      for (int t = threadIdx.x; t < count * used; t += Layout::kThreads) {
+        const int j = t / used, v = t % used;
+        float sum = 0;
 #pragma unroll
-      for (int w = 0; w < Layout::kWarps; ++w) {
-        if (shared.hits[w][j / kStateChunk] >> (j % kStateChunk) & 1) sum += shared.sums[w][j][v];
-      }
-      const int32_t row = shared.rows[j];
-      const auto put = [&](int column) {
-        if (first > 0 && !list.overflow) sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
-        put_sum(params.pair_grads, kPairGradWidth, list.overflow, row, column, sum);
-      };
-      if (v >= 6 && v < Shared::kMeans) {
-        if (C > kFewChannels) {
-          put_sum(params.channel_sums, kChannelGroup, list.overflow, row, first % kChannelGroup + v - 6, sum);
-        } else {
-          put(v == 9 ? kPairFourthChannel : v);
+        for (int w = 0; w < Layout::kWarps; ++w) {
+          if (shared.hits[w][j / kStateChunk] >> (j % kStateChunk) & 1) sum += shared.sums[w][j][v];
         }
-      } else if (with_shape) {
-        put(v < 6 ? v : kPairMeans + v - Shared::kMeans);
+        const int32_t row = shared.rows[j];
+        const auto put = [&](int column) {
+          if (kMany && first > 0 && !list.overflow) sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
+          put_sum(params.pair_grads, kPairGradWidth, list.overflow, row, column, sum);
+        };
+        if (v >= 6 && v < Shared::kMeans) {
+          if (kMany) {
+            put_sum(params.channel_sums, kChannelGroup, list.overflow, row, first % kChannelGroup + v - 6, sum);
+          } else {
+            put(v == 9 ? kPairFourthChannel : v);
+          }
+        } else if (with_shape) {
+          put(v < 6 ? v : kPairMeans + v - Shared::kMeans);
+        }
       }
+    };
+    if (with_means) {
+      write_sums(std::integral_constant<int, Shared::kSums>());
+    } else {
+      write_sums(std::integral_constant<int, Shared::kMeans>());
     }
   }
   if constexpr (kMaps) {

@@ -74,7 +74,7 @@
 //   whitened_node(Terms<T>, Vec2<V> of_pixel, Vec2<V> place) -> Vec2<V>    z of a sample
 //   log_alpha(Terms<T>, Vec2<V> z) -> V  log2(opacity * I)
 //   move_in, alpha_and_move_in_vjp       move and alpha_and_move_vjp, from z, and a place or a displacement with its
-//                                        bounds
+//                                        bounds; move_in takes alpha / (1 - alpha)
 #pragma once
 
 #include <cstddef>

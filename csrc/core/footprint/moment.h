@@ -32,9 +32,9 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   AR_HD static double radius_variance(FootprintOptions) { return kPixelVariance; }
   AR_HD static double support_variance(FootprintOptions) { return kVariance; }
 
-  /// Centre of a cell [px from the pixel's centre].
-  AR_HD static constexpr Vec2<double> node(int s) {
-    return {(s % kSide + 0.5) / kSide - 0.5, (s / kSide + 0.5) / kSide - 0.5};
+  /// Centre of a cell [px from the pixel's centre]. One rounding, so that T is as good as double.
+  template <typename T = double> AR_HD static constexpr Vec2<T> node(int s) {
+    return {edge<T>(2 * (s % kSide) + 1), edge<T>(2 * (s / kSide) + 1)};
   }
 
   template <typename T> AR_HD static GaussianShape<T> prepare(Cov2d<T> cov, FootprintOptions) {
@@ -59,7 +59,8 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   template <typename T, class V>
   AR_HD static Vec2<V> move(const Terms<T>& t, Vec2<V> p, int s, V alpha, Vec2<V> moved) {
     const V reach = V(T(kMoveReach));
-    return move_in(t, Gaussian::whitened(t, p + place<T, V>(s), 0), alpha, moved, {{-reach, -reach}, {reach, reach}});
+    return move_in(t, Gaussian::whitened(t, p + place<T, V>(s), 0), odds(alpha), moved,
+                   {{-reach, -reach}, {reach, reach}});
   }
 
   template <typename T, class V>
@@ -72,8 +73,8 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
 
   /// Where the node of sample s may be [px from the pixel's centre]: its cell.
   template <typename T> AR_HD static Bounds<T> cell(int s) {
-    const Vec2<double> n = node(s);
-    return {{T(n.x - kMoveReach), T(n.y - kMoveReach)}, {T(n.x + kMoveReach), T(n.y + kMoveReach)}};
+    const int x = 2 * (s % kSide), y = 2 * (s / kSide);
+    return {{edge<T>(x), edge<T>(y)}, {edge<T>(x + 2), edge<T>(y + 2)}};
   }
 
   /// Whitened coordinates of a node. `place`: of the node, relative to the pixel's centre; `of_pixel`: the whitened
@@ -84,11 +85,11 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
             madd(V(t.w.yx), place.x, madd(V(t.w.yy), place.y, of_pixel.y))};
   }
 
-  /// move() from the node's whitened coordinates z. `at` is the node's place or its displacement; what is returned is
-  /// the same behind the splat, within `bounds`.
+  /// move() from the node's whitened coordinates z and r = alpha / (1 - alpha). `at` is the node's place or its
+  /// displacement; what is returned is the same behind the splat, within `bounds`.
   template <typename T, class V>
-  AR_HD static Vec2<V> move_in(const Terms<T>& t, Vec2<V> z, V alpha, Vec2<V> at, const Bounds<V>& bounds) {
-    const Vec2<V> next = step(t, z, odds(alpha), at);
+  AR_HD static Vec2<V> move_in(const Terms<T>& t, Vec2<V> z, V r, Vec2<V> at, const Bounds<V>& bounds) {
+    const Vec2<V> next = step(t, z, r, at);
     return {min(max(next.x, bounds.lo.x), bounds.hi.x), min(max(next.y, bounds.lo.y), bounds.hi.y)};
   }
 
@@ -119,7 +120,10 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   /// v / kBase2^2, since (Sigma + v I)^-1 d = w^T z / kBase2^2.
   static constexpr double kStep = kVariance / (kBase2 * kBase2);
 
-  template <typename T, class V> AR_HD static Vec2<V> place(int s) { return {V(T(node(s).x)), V(T(node(s).y))}; }
+  /// `half_cells` half cells from the pixel's edge [px from its centre].
+  template <typename T> AR_HD static constexpr T edge(int half_cells) { return T(half_cells - kSide) / T(2 * kSide); }
+
+  template <typename T, class V> AR_HD static Vec2<V> place(int s) { return {V(node<T>(s).x), V(node<T>(s).y)}; }
 
   /// at + v r (Sigma + v I)^-1 d, before the bound.
   template <typename T, class V> AR_HD static Vec2<V> step(const Terms<T>& t, Vec2<V> z, V r, Vec2<V> at) {
