@@ -41,6 +41,21 @@ template <int kDegree> struct ShRows {
     }
     __syncwarp();
   }
+  /// Begins to load `count` coefficients of the rows of the lanes in `lanes`; base is lane 0's row. They are here after
+  /// wait_for_copies().
+  __device__ void begin_load(const Vec3<float>* base, int stride, int count, uint32_t lanes) {
+    const float* from = &base->x + lane_id();
+    float* to = value[0] + lane_id();
+    const int here = 3 * count - lane_id();
+#pragma unroll 8
+    for (int row = 0; row < 32; ++row, from += 3 * stride, to += kStride) {
+      if (!(lanes >> row & 1)) continue;
+#pragma unroll
+      for (int e = 0; e < 3 * kCount; e += 32) {
+        if (e < here) copy_async(to + e, from + e);
+      }
+    }
+  }
   /// Stores rows [0, rows) of `stride` coefficients.
   __device__ void store(Vec3<float>* base, int stride, int rows) const {
     __syncwarp();
