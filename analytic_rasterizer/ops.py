@@ -105,6 +105,36 @@ def _(a):
     return *floats, colors, *ints[:3], splits[0], [like.new_empty(rows), ints[3], splits[1]]
 
 
+@_register("count_rows")
+def _(a):
+    return a.means3D.new_empty(len(a.viewmatrix), len(a.means3D), dtype=torch.int32)
+
+
+@_register("pack_rows_")
+def _(a):
+    return None
+
+
+@_register("pack_rows_vjp")
+def _(a):
+    camera = (a.viewmatrix, a.projmatrix, a.campos, a.lens) if a.lens is not None else (None,) * 4
+    gaussians = (a.means3D, a.opacities, a.shs, a.colors_precomp, a.scales, a.rotations, a.cov3D_precomp)
+    return _gradients(a, (*gaussians, *camera))
+
+
+@_register("blend_rows")
+def _(a):
+    n, size, saved = len(a.rows), (a.image_height, a.image_width), []
+    if a.keep:
+        saved = [*_lists(a.rows, n, a, True), *_state(a.rows, a), a.rows.new_empty(n, 4), a.rows.new_empty(n)]
+    return a.rows.new_empty(3, *size), a.rows.new_empty(size), saved
+
+
+@_register("blend_rows_vjp_")
+def _(a):
+    return a.background.new_empty(3 if a.needs_background else 0)
+
+
 @_register("bin")
 def _(a):
     context = torch.library.get_ctx()

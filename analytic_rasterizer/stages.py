@@ -154,8 +154,8 @@ def project(
     cameras = [settings] if isinstance(settings, GaussianRasterizationSettings) else list(settings)
     if not cameras:
         raise ValueError("settings must hold at least one camera, got none")
-    gaussians = gaussian_arguments(
-        cameras[0],
+    gaussians, batch = project_arguments(
+        cameras,
         means3D,
         opacities,
         shs=shs,
@@ -164,6 +164,28 @@ def project(
         rotations=rotations,
         cov3D_precomp=cov3D_precomp,
     )
+    *rows, saved = torch.ops.analytic_rasterizer.project(**gaussians, **batch)
+    return Splats(
+        **dict(zip(_ROWS, rows)),
+        dets=saved[0],
+        width=batch["image_width"],
+        height=batch["image_height"],
+        footprint=batch["footprint"],
+        option=batch["option"],
+    )
+
+
+def project_arguments(
+    cameras: Sequence[GaussianRasterizationSettings], means3D: torch.Tensor, opacities: torch.Tensor, **optional: Any
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Arguments of the op `project`, and of others that take the same, for one camera or more: the Gaussians, and the
+    cameras with the footprint.
+
+    Raises:
+        TypeError, ValueError, RuntimeError: As `project`.
+    """
+    gaussians = gaussian_arguments(cameras[0], means3D, opacities, **optional)
+    shs = optional["shs"]
     arguments = [camera_arguments(camera, means3D, shs) for camera in cameras]
     if any(a["lens"] is not None for a in arguments):
         arguments = [camera_arguments(camera, means3D, shs, full=True) for camera in cameras]
@@ -181,15 +203,7 @@ def project(
         "tanfovx": [a["tanfovx"] for a in arguments],
         "tanfovy": [a["tanfovy"] for a in arguments],
     }
-    *rows, saved = torch.ops.analytic_rasterizer.project(**gaussians, **batch, **shared)
-    return Splats(
-        **dict(zip(_ROWS, rows)),
-        dets=saved[0],
-        width=shared["image_width"],
-        height=shared["image_height"],
-        footprint=shared["footprint"],
-        option=shared["option"],
-    )
+    return gaussians, batch | shared
 
 
 def bin(splats: Splats, *, background: torch.Tensor | None = None, keep: bool = True) -> TileLists:

@@ -1,10 +1,12 @@
 """The programs in benchmarks/ run, on a scene so small that their numbers mean nothing."""
 
+import dataclasses
 import importlib
 import inspect
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 import types
@@ -16,7 +18,7 @@ import torch
 from conftest import DEADLINE, ROOT
 
 import analytic_rasterizer as ar
-from analytic_rasterizer import io
+from analytic_rasterizer import io, viewer
 from analytic_rasterizer.dialects import DIALECTS
 from analytic_rasterizer.dialects.gsplat import rasterization
 
@@ -453,3 +455,45 @@ def test_order_of_each_ray(small_scene):
     left, right = (slice(None), 8, 11), (slice(None), 8, 20)
     assert by_center[left][0] > by_center[left][1] and by_center[right][0] > by_center[right][1]
     assert (by_ray[left][0] > by_ray[left][1]) != (by_ray[right][0] > by_ray[right][1])
+
+
+def test_viewer_gpu(small_scene, monkeypatch, capsys):
+    """The page's shaders under OpenGL draw what the rasterizer does, also from a prepared file; other pictures are
+    noticed."""
+    pytest.importorskip("moderngl", reason="needs moderngl")
+    if shutil.which("node") is None:
+        pytest.skip("needs node, which reads the shaders out of the page")
+    benchmark = importlib.import_module("viewer_gpu")
+    try:
+        benchmark.create_context().release()
+    except SystemExit as error:
+        pytest.skip(str(error))
+
+    def run(*arguments):
+        monkeypatch.setattr(sys, "argv", ["viewer_gpu.py", *map(str, arguments)])
+        benchmark.main()
+        return capsys.readouterr().out
+
+    shaders, job, written = (small_scene / name for name in ("shaders.json", "job.npz", "out.json"))
+    given = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--sizes", "40x30,20x15"]
+    run("--write-shaders", shaders)
+    run(*given, "--shaders", shaders, "--prepare", job)
+    rounds = ["--rounds", "2", "--json", written]
+    for scene in (given, [job]):
+        out = run(*scene, *rounds)
+        results = json.loads(written.read_text())
+        assert list(results["differences"]) == list(viewer.PAGE_FOOTPRINTS)
+        for name, of_bits in results["differences"].items():
+            assert f"| {name} " in out
+            # Some devices cut half floats off where others round.
+            assert of_bits["32-bit floats"]["largest"] <= 1 and of_bits["16-bit floats"]["largest"] <= 2
+        assert [row["size"] for row in results["rows"]] == ["40x30"] * 9 + ["20x15"] * 9
+        for row in results["rows"]:
+            assert row["rounds"] == 2 and row["clock_ms"] > 0 and row["clock_ratio"] > 0
+            assert len(row["ms"]) == 2 and all(len(view) == 2 for view in row["ms"])
+
+    prepared = benchmark.Job.load(job)
+    swapped = prepared.expected | {"analytic": prepared.expected["point"]}
+    dataclasses.replace(prepared, expected=swapped).save(job)
+    run(job, *rounds, "--footprints", "analytic")
+    assert json.loads(written.read_text())["differences"]["analytic"]["32-bit floats"]["largest"] > 1

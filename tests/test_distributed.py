@@ -17,7 +17,8 @@ from conftest import DEADLINE, needs_cuda
 from scenes import Camera
 
 import analytic_rasterizer as ar
-from analytic_rasterizer import distributed
+from analytic_rasterizer import _C, distributed
+from analytic_rasterizer.distributed import agreement
 
 WORLD = 3
 COUNT, HIDDEN = 60, slice(37, 46)
@@ -223,15 +224,44 @@ def work(rank, world, folder, kind):
         with mock.patch.object(dist, "all_to_all_single", wraps=dist.all_to_all_single) as calls:
             made = make(*arguments)
         made["sent"] = [call.args[1].nbytes for call in calls.call_args_list]
-        torch.save((made, make(*arguments)), f"{folder}/{name}-{place}.pt")
+        with mock.patch.object(agreement, "_ROOM", 9):  # the counts of two cameras; those of others follow
+            again = make(*arguments)
+        torch.save((made, again), f"{folder}/{name}-{place}.pt")
     if rank >= world - 2:
         torch.save(mistakes(rank - (world - 2), device), f"{folder}/mistakes-{rank - (world - 2)}.pt")
+        torch.save(not_finite(rank - (world - 2), device), f"{folder}/not-finite-{rank - (world - 2)}.pt")
+        torch.save(twice(rank - (world - 2), device), f"{folder}/twice-{rank - (world - 2)}.pt")
     if rank == world - 1:
         torch.save(without_sending(device), f"{folder}/silent.pt")
     else:
         torch.save(error_of(lambda: distributed.rasterize([], None, None, group=GROUPS[1])), f"{folder}/outside.pt")
     dist.barrier()
     dist.destroy_process_group()
+
+
+def scene_not_finite(scenario, device):
+    """The scene, of which some Gaussians that are seen have colours that are not."""
+    scene = scene_of(scenario.dtype, device)
+    scene["shs"][5, 1] = float("nan")
+    scene["shs"][50, 0] = float("inf")
+    return scene
+
+
+def not_finite(rank, device):
+    scenario = SCENARIOS["two-ranks"]
+    rows = slice(0, scenario.shards[0]) if rank == 0 else slice(scenario.shards[0], COUNT)
+    scene = {name: value[rows] for name, value in scene_not_finite(scenario, device).items()}
+    return make(scenario, scene, settings_of(scenario, device), GROUPS[2])
+
+
+def twice(rank, device):
+    """The error of a second way back."""
+    scenario = SCENARIOS["two-ranks"]
+    scene = scenes.leaves({name: value[rank::2] for name, value in scene_of(scenario.dtype, device).items()})
+    batch = distributed.rasterize(settings_of(scenario, device), **scene, group=GROUPS[2])
+    loss = batch.anchor + sum(view.image.sum() for view in batch.views)
+    loss.backward(retain_graph=True)
+    return error_of(loss.backward)
 
 
 def without_sending(device):
@@ -384,6 +414,7 @@ def test_radii_and_gradients_of_means2d_are_where_the_gaussians_are(ran):
 
 
 def test_a_second_run_makes_the_same_bits(ran):
+    """In it the counts of most cameras do not fit the first message."""
     _, made, again, _ = ran
     for first, second in zip(made, again):
         for name, value in second.items():
@@ -391,14 +422,107 @@ def test_a_second_run_makes_the_same_bits(ran):
 
 
 def test_as_many_bytes_are_sent_as_the_documentation_says(ran):
-    """docs/distributed.md, "What is sent": per splat 12 numbers forth, 10 back, and 2 for absolute gradients."""
+    """docs/distributed.md, "What is sent": per splat 12 numbers forth, 9 back, and 2 for absolute gradients."""
     scenario, made, _, _ = ran
-    for rank in made:
-        forth, back = 12 * sum(len(ids) for ids in rank["ids"]), 10 * sum(len(ids) for ids in rank["gaussian_ids"])
-        if scenario.means2d_abs:
-            back = back // 10 * 12
+    for place, rank in enumerate(made):
+        forth, back = sum(len(ids) for ids in rank["ids"]), sum(len(ids) for ids in rank["gaussian_ids"])
+        if place in (0, scenario.ranks - 1):  # what stays there is not sent
+            stays = sum(len(rank["ids"][camera]) for camera in rank["cameras"])
+            forth, back = forth - stays, back - stays
         size = 8 if scenario.dtype == torch.float64 else 4
-        assert rank["sent"] == ([] if scenario.ranks == 1 else [forth * size, back * size])
+        bytes_sent = [12 * size * forth, (11 if scenario.means2d_abs else 9) * size * back]
+        assert rank["sent"] == ([] if scenario.ranks == 1 else bytes_sent)
+
+
+def test_colors_that_are_not_finite(runs):
+    """Such Gaussians are in no picture and have no gradient; their rows are sent."""
+    scenario = SCENARIOS["two-ranks"]
+    scene = scene_not_finite(scenario, runs.kind)
+    made = [runs.load(f"not-finite-{rank}") for rank in range(2)]
+    expected = plain(scenario, scene, settings_of(scenario, runs.kind))
+    for rank in made:
+        for k, camera in enumerate(rank["cameras"]):
+            assert torch.equal(rank["images"][k], expected["images"][camera])
+    for name, whole in expected["gradients"].items():
+        found = torch.cat([rank["gradients"][name] for rank in made])
+        assert found[[5, 50]].eq(0).all() and found.isfinite().all() and whole[[5, 50]].eq(0).all()
+    for camera, radii in enumerate(expected["radii"]):
+        found = torch.cat([rank["radii"][camera] for rank in made])
+        assert len(found) == len(radii) + 2 and torch.equal(found[found > 0], radii)
+
+
+def test_the_way_back_is_taken_once(runs):
+    for rank in range(2):
+        kind, message = runs.load(f"twice-{rank}")
+        assert kind == "RuntimeError" and "runs once" in message
+
+
+OPS = ("count_rows", "pack_rows_", "pack_rows_vjp", "blend_rows", "blend_rows_vjp_")
+
+
+@pytest.fixture
+def calls(device):
+    """Arguments of the ops for two cameras, and the rows and gradients that they make."""
+    ops, scenario = torch.ops.analytic_rasterizer, SCENARIOS["one-rank"]
+    settings = [settings_of(scenario, device)[0]] * 2
+    gaussians = dict.fromkeys(("colors_precomp", "cov3D_precomp")) | scene_of(scenario.dtype, device)
+    own, batch = ar.stages.project_arguments(settings, **gaussians)
+    arguments = own | batch
+    ends = ops.count_rows(**arguments)
+    n = int(ends[0, -1])
+    rows = torch.zeros(2 * n, _C.ROW_WIDTH, device=device)
+    radii, ids = (torch.zeros(2 * n, dtype=torch.int32, device=device) for _ in range(2))
+    packed = arguments | {"rows": rows, "radii": radii, "ids": ids, "ends": ends, "first_id": 7}
+    packed["firsts"] = torch.tensor([n, 0], device=device)
+    ops.pack_rows_(**packed)
+    places = {"firsts": [n, 0], "counts": [n, n]}
+    image = {name: batch[name] for name in ("image_height", "image_width", "footprint", "option")}
+    background = settings[0].bg
+    blended = {"rows": rows[:n], "background": background, **image, "keep": True}
+    color, alpha, saved = ops.blend_rows(**blended)
+    width = _C.ROW_GRAD_WIDTHS[1]
+    back = {
+        "dL_drows": torch.zeros(n, width, device=device),
+        "dL_dimage": torch.ones_like(color),
+        "dL_dalpha": torch.ones_like(alpha),
+        "background": background,
+        **image,
+        "saved": saved,
+        "needs_background": True,
+    }
+    ops.blend_rows_vjp_(**back)
+    dL_drows = torch.cat([back["dL_drows"]] * 2)
+    needs = [name in ("means3D", "opacities", "shs", "scales", "rotations") for name in arguments][:11]
+    adjoint = arguments | {"dL_drows": dL_drows, "ids": ids, "needs": needs} | places
+    return dict(zip(OPS, (arguments, packed, adjoint, blended, back)))
+
+
+@pytest.mark.parametrize("op", OPS)
+def test_opcheck(op, calls):
+    """Schema, fake kernel, and dispatch under tracing."""
+    torch.library.opcheck(getattr(torch.ops.analytic_rasterizer, op).default, (), calls[op])
+
+
+@pytest.mark.parametrize(
+    "op, change, message",
+    [
+        ("pack_rows_", {"rows": torch.zeros(3, 5)}, "rows must be a contiguous matrix of 12 columns"),
+        ("pack_rows_", {"firsts": torch.zeros(2)}, "firsts must hold 2 contiguous int64"),
+        ("pack_rows_vjp", {"firsts": [0, 10**6]}, "firsts and counts must be places of 2 cameras among"),
+        ("pack_rows_", {"radii": torch.zeros(1, dtype=torch.int32)}, "radii must hold"),
+        ("pack_rows_", {"shs": None}, "shs or colors_precomp must be given, got neither"),
+        ("pack_rows_vjp", {"dL_drows": torch.zeros(4, 10)}, "dL_drows must be a contiguous matrix of 9 columns"),
+        ("pack_rows_vjp", {"ids": torch.zeros(4, dtype=torch.int32)}, "ids must hold"),
+        ("blend_rows", {"rows": torch.zeros(4, 12).double()}, "rows must be a contiguous matrix of 12 columns"),
+        ("blend_rows", {"background": torch.zeros(4)}, r"background must have shape \(3,\)"),
+        ("blend_rows_vjp_", {"saved": []}, "saved must be what blend_rows saved with keep=True, got 0 tensors"),
+        ("blend_rows_vjp_", {"dL_drows": torch.zeros(4, 9)}, "dL_drows must have a row for each of"),
+    ],
+)
+@pytest.mark.parametrize("device", ["cpu"])
+def test_the_ops_say_what_is_wrong(op, change, message, calls):
+    with pytest.raises(ValueError, match=message):
+        getattr(torch.ops.analytic_rasterizer, op)(**calls[op] | change)
 
 
 def test_depths_are_equal_in_pairs():

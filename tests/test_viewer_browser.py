@@ -648,6 +648,28 @@ def test_on_a_phone_the_controls_leave_the_scene_free(browser):
         assert left == right >= 0
 
 
+@pytest.mark.parametrize("width, height", [(360, 640), (320, 240), (641, 360), (844, 390), (1280, 720)])
+def test_nothing_covers_the_handle_of_the_divider(controls, width, height):
+    controls.set_viewport_size({"width": width, "height": height})
+    if controls.is_hidden("#footprint"):
+        controls.keyboard.press("h")
+    controls.keyboard.press("c")
+    assert controls.is_visible("#compare-options")  # the panel is as high as it gets
+    corners = controls.evaluate(
+        """() => {
+          const divider = document.getElementById('divider'), box = divider.getBoundingClientRect();
+          const handle = getComputedStyle(divider, '::after');
+          const [left, top, width, height] = ['left', 'top', 'width', 'height'].map(k => parseFloat(handle[k]));
+          const x = box.left + left, y = box.top + top + parseFloat(handle.marginTop);
+          const at = [[1, 1], [width - 1, 1], [1, height - 1], [width - 1, height - 1]];
+          return at.map(([dx, dy]) => [x + dx, y + dy, document.elementFromPoint(x + dx, y + dy).id]);
+        }"""
+    )
+    (x, y, _), (x_end, _, _), (_, y_end, _), _ = corners
+    assert x < width / 2 < x_end and 0 < y < y_end < height
+    assert [name for *_, name in corners] == ["divider"] * 4
+
+
 def test_a_screenshot_is_saved(controls):
     with controls.expect_download() as download:
         controls.keyboard.press("p")

@@ -6,5 +6,6 @@ of its rows. docs/distributed.md has the method and how much is sent.
 
 from .bands import Band, rasterize_bands
 from .cameras import Batch, View, rasterize
+from .rows import OwnSplats
 
-__all__ = ["Band", "Batch", "View", "rasterize", "rasterize_bands"]
+__all__ = ["Band", "Batch", "OwnSplats", "View", "rasterize", "rasterize_bands"]

@@ -1,25 +1,29 @@
-"""What the ranks tell each other before splats are sent, so that what is wrong on one of them raises on all."""
+"""What the ranks tell each other before splats are sent, so that what is wrong on one of them raises on all.
+
+It is one message of each rank to all others, of integers that may come from the device. It travels between the devices
+where the group serves them, and the host waits for it once.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterable, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 import torch.distributed as dist
 
-from ..arguments import camera_arguments
-from ..settings import GaussianRasterizationSettings
 from ..stages import Splats
 from .exchange import DIFFERENTIABLE
 
 _KINDS = (("cpu", torch.float32), ("cpu", torch.float64), ("cuda", torch.float32))  # that `project` takes
 _MAX_GAUSSIANS = torch.iinfo(torch.int32).max
 _DIGESTS = ("settings",)  # facts whose values say nothing
+_ROOM = 64  # integers of a message
 
 Made = TypeVar("Made")
-Facts = dict[str, int]
+Facts = dict[str, Any]  # integers, or () int64 tensors
 
 REQUIREMENTS = {
     "kind": "means3D must have one dtype and one kind of device on every rank",
@@ -40,33 +44,59 @@ def place_in(group: dist.ProcessGroup | None) -> tuple[int, int]:
     return rank, dist.get_world_size(group)
 
 
+class Agreed(NamedTuple):
+    """What the ranks told each other.
+
+    Attributes:
+        facts: Of every rank.
+        counts: Of every rank, as many for all; empty where `agree` was given none.
+    """
+
+    facts: list[dict[str, int]]
+    counts: list[list[int]]
+
+
 def agree(
-    make: Callable[[], tuple[Made, Facts]], requirements: dict[str, str | None], group: dist.ProcessGroup | None
-) -> tuple[Made, list[Facts]]:
-    """What `make` returns on this rank, and the facts of all ranks. For several ranks.
+    make: Callable[[], tuple[Made, Facts, torch.Tensor | None]],
+    requirements: dict[str, str | None],
+    group: dist.ProcessGroup | None,
+    meanwhile: Callable[[Made], None] = lambda _: None,
+) -> tuple[Made, Agreed]:
+    """What `make` returns on this rank, and what all ranks told each other. For several ranks. The host waits once.
 
     Args:
-        make: Returns what it made, and the facts that `requirements` names.
+        make: Returns what it made, the facts that `requirements` names, and None or counts, a vector of int64 whose
+            length is the fact "cameras".
         requirements: By fact what to say of ranks that differ in it; None: they may.
+        meanwhile: Called with what was made while the message is on its way, to give the device something to do. What
+            it raises the other ranks do not hear of.
 
     Raises:
         TypeError, ValueError, RuntimeError: On every rank the same, if `make` raised on one of them, which the message
             names, or if they differ in what they must not.
     """
     world = dist.get_world_size(group)
-    error = made = None
+    error = made = counts = None
     try:
-        made, facts = make()
+        made, facts, counts = make()
     except Exception as raised:  # the others must hear of it before they wait for splats
         error, facts = raised, dict.fromkeys(requirements, 0)
-    rows = gather([int(error is not None), *(facts[name] for name in requirements)], world, group)
+    numbers = [facts[name] for name in requirements]
+    room = _ROOM - 1 - len(numbers)
+    message = _message([int(error is not None), *numbers], counts if counts is None else counts[:room], group)
+    wait = _begin_gathering(message, world, group)
+    try:
+        if error is None:
+            meanwhile(made)
+    finally:
+        rows = wait().tolist()
     if any(row[0] for row in rows):
         reports: list[Any] = [None] * world
         kind = next((k for k in (TypeError, ValueError) if isinstance(error, k)), RuntimeError)
         dist.all_gather_object(reports, None if error is None else (kind, str(error)), group=group)
         failed = next(r for r in range(world) if reports[r] is not None)
-        kind, message = reports[failed]
-        raise kind(f"on rank {failed}: {message}") from error
+        kind, text = reports[failed]
+        raise kind(f"on rank {failed}: {text}") from error
     of_ranks = [dict(zip(requirements, row[1:])) for row in rows]
     for name, requirement in requirements.items():
         for other, of_rank in enumerate(of_ranks):
@@ -76,12 +106,39 @@ def agree(
     count = sum(of_rank["gaussians"] for of_rank in of_ranks)
     if count > _MAX_GAUSSIANS:
         raise ValueError(f"all ranks together must have at most {_MAX_GAUSSIANS} Gaussians, got {count}")
-    return made, of_ranks
+    return made, Agreed(of_ranks, _counts_of(rows, counts, room, world, group))
+
+
+def _counts_of(
+    rows: list[list[int]], counts: torch.Tensor | None, room: int, world: int, group: dist.ProcessGroup | None
+) -> list[list[int]]:
+    """The counts of every rank, of whose messages `room` numbers hold the first ones."""
+    if counts is None:
+        return [[] for _ in rows]
+    first = [row[_ROOM - room :][: len(counts)] for row in rows]
+    if len(counts) <= room:
+        return first
+    rest = _gathered(counts[room:].to(_channel(group)), world, group)
+    return [a + b for a, b in zip(first, rest)]
+
+
+def _message(numbers: list[Any], counts: torch.Tensor | None, group: dist.ProcessGroup | None) -> torch.Tensor:
+    """(_ROOM,) int64, the numbers and behind them the counts. Waits for no device."""
+    device = _channel(group)
+    on_host = [0 if torch.is_tensor(number) else number for number in numbers]
+    on_host = torch.tensor(on_host + [0] * (_ROOM - len(on_host)), pin_memory=device.type == "cuda")
+    message = on_host.to(device, non_blocking=True)
+    for place, number in enumerate(numbers):
+        if torch.is_tensor(number):
+            message[place] = number
+    if counts is not None:
+        message[len(numbers) : len(numbers) + len(counts)] = counts
+    return message
 
 
 def facts_of(
     means3D: torch.Tensor,
-    differentiable: Sequence[torch.Tensor],
+    differentiable: Iterable[torch.Tensor],
     group: dist.ProcessGroup | None,
     name: str = "means3D",
 ) -> Facts:
@@ -106,26 +163,29 @@ def rows_of(shard: Sequence[Splats]) -> list[torch.Tensor]:
     return [getattr(splats, name) for splats in shard for name in DIFFERENTIABLE]
 
 
-def digest_of(
-    cameras: list[GaussianRasterizationSettings],
-    others: Any,
-    means3D: torch.Tensor,
-    shs: torch.Tensor | None,
-) -> int:
-    """64 bits of `others` and of everything that all ranks must have in common, also whether cameras require gradients
-    (`lens`)."""
+def digest_of(arguments: Iterable[dict[str, Any]], others: Any) -> torch.Tensor:
+    """() int64, of `others` and of what the arguments, by name, say of cameras: their tensors bit for bit. On the
+    device of the tensors, for which nobody waits."""
     numbers, tensors = [others], []
-    for settings in cameras:
-        for name, value in camera_arguments(settings, means3D, shs).items():
-            (tensors if torch.is_tensor(value) else numbers).append(value if torch.is_tensor(value) else (name, value))
-    digest = hashlib.blake2b(repr(numbers).encode(), digest_size=8)
-    digest.update(
-        torch.cat([t.detach().reshape(-1) for t in tensors]).cpu().numpy().tobytes()
-    )  # one copy from the device
-    return int.from_bytes(digest.digest(), "little", signed=True)
+    for of_cameras in arguments:
+        for name, value in of_cameras.items():
+            if torch.is_tensor(value):
+                tensors.append(value.detach().reshape(-1))
+            numbers.append((name, tuple(value.shape) if torch.is_tensor(value) else value))
+    digest = hashlib.blake2b(repr(numbers).encode(), digest_size=8).digest()
+    bits = torch.cat(tensors).view(torch.int32).long()
+    return (bits * _weights(len(bits), bits.device)).sum() + int.from_bytes(digest, "little", signed=True)
 
 
-def _text(name: str, facts: Facts) -> str:
+@lru_cache(maxsize=16)
+def _weights(count: int, device: torch.device) -> torch.Tensor:
+    """(count,) int64, odd and without order, so that sums of their products with other bits, modulo 2^64, differ."""
+    weights = torch.arange(1, count + 1, device=device) * -7046029254386353131
+    weights = (weights ^ (weights >> 29)) * -4658895280553007687
+    return weights | 1
+
+
+def _text(name: str, facts: dict[str, int]) -> str:
     value = facts[name]
     return " on ".join(str(part) for part in reversed(_KINDS[value])) if name == "kind" else str(value)
 
@@ -135,10 +195,48 @@ def _devices_of(group: dist.ProcessGroup | None) -> list[str]:
     return [pair.partition(":")[0] for pair in dist.get_backend_config(group).split(",")]
 
 
+def _channel(group: dist.ProcessGroup | None) -> torch.device:
+    """Where messages are that hold numbers of the device, the same kind of device on every rank."""
+    if "cuda" in _devices_of(group) and torch.cuda.is_available():
+        return torch.device("cuda", torch.cuda.current_device())
+    return torch.device("cpu")
+
+
+def _begin_gathering(message: torch.Tensor, world: int, group: dist.ProcessGroup | None) -> Callable[[], torch.Tensor]:
+    """A function, to be called once, that waits for the messages of all ranks and returns them, (world, integers) on
+    the CPU. On CUDA it does not wait for what the device is given between this call and that one."""
+    received = message.new_empty(world, len(message))
+    work = dist.all_gather(list(received.unbind()), message, group=group, async_op=True)
+    if not received.is_cuda:
+        work.wait()
+        return lambda: received
+    on_host = torch.empty(received.shape, dtype=received.dtype, pin_memory=True)
+    arrived = torch.cuda.Event()
+    with torch.cuda.stream(_side_stream(received.device)):
+        work.wait()  # lets the stream wait, not the host
+        on_host.copy_(received, non_blocking=True)
+        arrived.record()
+    in_use = [message, received, work]  # until then
+
+    def wait() -> torch.Tensor:
+        arrived.synchronize()
+        in_use.clear()
+        return on_host
+
+    return wait
+
+
+@lru_cache(maxsize=16)
+def _side_stream(device: torch.device) -> torch.cuda.Stream:
+    return torch.cuda.Stream(device)
+
+
+def _gathered(message: torch.Tensor, world: int, group: dist.ProcessGroup | None) -> list[list[int]]:
+    """The integers of every rank, as many from each."""
+    return _begin_gathering(message, world, group)().tolist()
+
+
 def gather(numbers: list[int], world: int, group: dist.ProcessGroup | None) -> list[list[int]]:
-    """The same number of integers from every rank."""
-    device = "cpu" if "cpu" in _devices_of(group) else torch.device("cuda", torch.cuda.current_device())
-    sent = torch.tensor(numbers, dtype=torch.int64, device=device)
-    received = [torch.empty_like(sent) for _ in range(world)]
-    dist.all_gather(received, sent, group=group)
-    return torch.stack(received).tolist()
+    """The same number of integers of the host from every rank: through the host where the group serves it."""
+    device = "cpu" if "cpu" in _devices_of(group) else _channel(group)
+    return _gathered(torch.tensor(numbers, dtype=torch.int64, device=device), world, group)

@@ -11,6 +11,7 @@ import torch
 import torch.distributed as dist
 
 from .._C import TILE
+from ..arguments import camera_arguments
 from ..settings import GaussianRasterizationSettings
 from ..stages import Splats, bin, blend, project
 from .agreement import REQUIREMENTS, Facts, agree, digest_of, facts_of, gather, place_in, rows_of
@@ -30,7 +31,8 @@ class Band:
         rank: Of this process, in `rows`.
         image: (3, rows of this band, W).
         alpha: (1, rows of this band, W), 1 - transmittance, in 0 to 1.
-        shard: The splats of the Gaussians of this rank in the whole image, as in `Batch.shard`.
+        shard: The splats of the Gaussians of this rank in the whole image. After the backward pass `means2d.grad`
+            (n, 2) is the gradient with respect to the projected means, per px.
         means2d_abs: (n, 2), as in `Batch.means2d_abs`; None unless asked for.
         first_id: Global id of the first Gaussian of this rank.
         count: Number of Gaussians of all ranks.
@@ -94,7 +96,7 @@ def rasterize_bands(
     """
     rank, world = place_in(group)
 
-    def make() -> tuple[tuple, Facts | None]:
+    def make() -> tuple[tuple, Facts | None, None]:
         if not isinstance(settings, GaussianRasterizationSettings):
             raise TypeError(f"settings must be GaussianRasterizationSettings, got {type(settings).__name__}")
         check_camera(settings)
@@ -103,19 +105,19 @@ def rasterize_bands(
         shard = project(settings, means3D, opacities, cov3D_precomp=cov3D_precomp, **gaussians)
         absolute = torch.zeros_like(shard.means2d, requires_grad=True) if means2d_abs else None
         if world == 1:
-            return (shard, absolute, None), None
+            return (shard, absolute, None), None, None
         facts = facts_of(means3D, [*rows_of([shard]), *([] if absolute is None else [absolute])], group)
-        facts["settings"] = digest_of([settings], means2d_abs, means3D, shs)
-        return (shard, absolute, _touched(shard, settings.bg)), facts
+        facts["settings"] = digest_of([camera_arguments(settings, means3D, shs)], means2d_abs)
+        return (shard, absolute, _touched(shard, settings.bg)), facts, None
 
     if world == 1:
-        (shard, absolute, _), _ = make()
+        (shard, absolute, _), *_ = make()
         rows = ((0, shard.height),)
         own, of_means, anchor = shard, absolute, means3D.new_zeros(())
         first_id, count = 0, len(means3D)
     else:
-        (shard, absolute, touched), facts = agree(make, _REQUIREMENTS, group)
-        first_id, count, join = summary_of(facts, rank)
+        (shard, absolute, touched), agreed = agree(make, _REQUIREMENTS, group)
+        first_id, count, join = summary_of(agreed.facts, rank)
         pairs = [sum(of_row) for of_row in zip(*gather(touched.pairs, world, group))]
         bands = balanced_bands(pairs, world)
         places = [((touched.first < end) & (touched.last >= first)).nonzero()[:, 0] for first, end in bands]

@@ -24,8 +24,9 @@ from ..arguments import check_tensors
 from ..effects import AUTO
 from ..settings import GaussianRasterizationSettings
 from ..stages import Splats, bin, blend, project
-from .agreement import REQUIREMENTS, Facts, agree, digest_of, facts_of, gather, place_in, rows_of
-from .exchange import Route, exchange
+from .agreement import REQUIREMENTS, Facts, agree, digest_of, facts_of, place_in
+from .exchange import Route
+from .rows import OwnSplats, Shard, Step, agreeing, counted, rendered
 
 _REQUIREMENTS = {
     "cameras": "settings must hold as many cameras on every rank",
@@ -41,8 +42,8 @@ class View(NamedTuple):
         camera: Its place in the settings.
         image: (3, H, W).
         alpha: (1, H, W), 1 - transmittance, in 0 to 1.
-        splats: What all ranks sent: a batch of this one camera, with global gaussian_ids. With more than one rank its
-            radii are empty, (0,): they are in `Batch.shard`, where the Gaussians are.
+        splats: What all ranks sent: a batch of this one camera, with global gaussian_ids. With more than one rank they
+            have no gradient, and radii are empty, (0,): they are in `Batch.shard`, where the Gaussians are.
     """
 
     camera: int
@@ -69,7 +70,7 @@ class Batch:
     """
 
     views: tuple[View, ...]
-    shard: tuple[Splats, ...]
+    shard: tuple[OwnSplats, ...]
     means2d_abs: tuple[torch.Tensor, ...]
     first_id: int
     count: int
@@ -96,7 +97,8 @@ def rasterize(
     torch.distributed without a process group, makes what `project`, `bin` and `blend` make of camera after camera, bit
     for bit, and sends nothing. Differentiable in what `project` is differentiable in, and in the backgrounds. The
     gradient with respect to a camera is, on each rank, the part of the rank's own Gaussians: the sum over the ranks is
-    the whole. Waits for the device.
+    the whole. The host waits once for the device, for the numbers of rows. On several ranks the backward pass runs
+    once, retain_graph or not.
 
     Args:
         settings: Of all cameras, the same on every rank, bit for bit. Image sizes and footprints may differ. bg is
@@ -117,54 +119,69 @@ def rasterize(
         RuntimeError: Another error on some rank, up to the moment when splats are sent.
     """
     rank, world = place_in(group)
-
-    def make() -> tuple[tuple, Facts | None]:
-        cameras, settled = _checked_cameras(settings, owners, world, shs, colors_precomp)
-        gaussians = {"shs": shs, "colors_precomp": colors_precomp, "scales": scales, "rotations": rotations}
-        shard = _projected(cameras, means3D, opacities, cov3D_precomp=cov3D_precomp, **gaussians)
-        absolute = tuple(torch.zeros_like(s.means2d, requires_grad=True) for s in shard) if means2d_abs else ()
-        facts = None
-        if world > 1:
-            digest = digest_of(cameras, [settled, means2d_abs], means3D, shs)
-            own = facts_of(means3D, [*rows_of(shard), *absolute], group)
-            facts = {"cameras": len(cameras), "settings": digest, **own}
-        return (cameras, settled, shard, absolute), facts
-
+    gaussians = {
+        "shs": shs,
+        "colors_precomp": colors_precomp,
+        "scales": scales,
+        "rotations": rotations,
+        "cov3D_precomp": cov3D_precomp,
+    }
     if world == 1:
-        (cameras, owners, shard, absolute), _ = make()
-        first_id, count = 0, len(means3D)
-        own, own_absolute, anchor = shard, absolute, means3D.new_zeros(())
-    else:
-        (cameras, owners, shard, absolute), facts = agree(make, _REQUIREMENTS, group)
-        first_id, count, join = summary_of(facts, rank)
-        counts = gather([len(s.means2d) for s in shard], world, group)
-        route = Route(counts, [[c for c, owner in enumerate(owners) if owner == r] for r in range(world)], rank, group)
-        own, own_absolute, anchor = exchange(route, shard, absolute, first_id, join)
-    for splats in shard:
+        cameras, _ = _checked_cameras(settings, owners, world, shs, colors_precomp)
+        return _of_one_rank(cameras, means3D, opacities, means2d_abs, gaussians)
+
+    def make() -> tuple[tuple, Facts, torch.Tensor]:
+        cameras, settled = _checked_cameras(settings, owners, world, shs, colors_precomp)
+        groups = counted(cameras, means3D, opacities, **gaussians)
+        digest = digest_of([group.batch for group in groups], [settled, means2d_abs, [g.cameras for g in groups]])
+        tensors = [t for group in groups for t in group.tensors if t is not None]
+        facts = {"cameras": len(cameras), "settings": digest, **facts_of(means3D, tensors, group)}
+        if means2d_abs:
+            facts["requires_grad"] = facts["grad_enabled"]
+        cameras_of = [[c for c, owner in enumerate(settled) if owner == r] for r in range(world)]
+        own = Shard(groups, [c for of_rank in cameras_of for c in of_rank])
+        return (cameras, cameras_of, own), facts, own.counts
+
+    (cameras, cameras_of, own), agreed = agree(make, _REQUIREMENTS, group, meanwhile=lambda made: made[-1].begin())
+    first_id, count, join = summary_of(agreed.facts, rank)
+    counts = [[n for _, n in sorted(zip(own.order, of_rank))] for of_rank in agreed.counts]
+    route = Route(counts, cameras_of, rank, group)
+    backgrounds = [cameras[c].bg for c in route.own]
+    keep = torch.is_grad_enabled() and (join or any(bg.requires_grad for bg in backgrounds))
+    step = Step(own, route, first_id, join, keep, means2d_abs, backgrounds)
+    anchor, images, alphas = rendered(step)
+    shard, received = step.take()
+    views = tuple(View(*of_camera) for of_camera in zip(route.own, images, alphas, received))
+    return Batch(views, shard, step.means2d_abs, first_id, count, anchor)
+
+
+def _of_one_rank(
+    cameras: list[GaussianRasterizationSettings],
+    means3D: torch.Tensor,
+    opacities: torch.Tensor,
+    means2d_abs: bool,
+    gaussians: dict[str, Any],
+) -> Batch:
+    shard = _projected(cameras, means3D, opacities, **gaussians)
+    absolute = tuple(torch.zeros_like(s.means2d, requires_grad=True) for s in shard) if means2d_abs else ()
+    views = []
+    for camera, splats in enumerate(shard):
         if splats.means2d.requires_grad:
             splats.means2d.retain_grad()
-    views = []
-    for k, camera in enumerate(c for c in range(len(cameras)) if owners[c] == rank):
         bg = cameras[camera].bg
-        lists = bin(own[k], background=bg.detach(), keep=torch.is_grad_enabled())
-        of_means = own_absolute[k] if means2d_abs else None
-        image, alpha = blend(own[k], lists, background=bg, means2d_abs=of_means)
-        views.append(View(camera, image[0], alpha[0], own[k]))
-    return Batch(tuple(views), shard, absolute, first_id, count, anchor)
+        lists = bin(splats, background=bg.detach(), keep=torch.is_grad_enabled())
+        image, alpha = blend(splats, lists, background=bg, means2d_abs=absolute[camera] if means2d_abs else None)
+        views.append(View(camera, image[0], alpha[0], splats))
+    own = tuple(OwnSplats(s.means2d, s.radii, s.gaussian_ids, s.width, s.height) for s in shard)
+    return Batch(tuple(views), own, absolute, 0, len(means3D), means3D.new_zeros(()))
 
 
 def _projected(
     cameras: list[GaussianRasterizationSettings], means3D: torch.Tensor, opacities: torch.Tensor, **gaussians: Any
 ) -> tuple[Splats, ...]:
     """The splats of each camera. Cameras that may share a call of `project` do: it adds up their gradients in place."""
-    groups: dict[tuple, list[int]] = {}
-    for camera, s in enumerate(cameras):
-        moves = any(getattr(t, "requires_grad", False) for t in (s.viewmatrix, s.projmatrix, s.campos))
-        size = s.image_height, s.image_width
-        key = (*size, s.scale_modifier, s.sh_degree, str(s.footprint), id(s.effects), moves)
-        groups.setdefault(key, []).append(camera)
     shard: dict[int, Splats] = {}
-    for group in groups.values():
+    for group in agreeing(cameras).values():
         splats = project([cameras[camera] for camera in group], means3D, opacities, **gaussians)
         shard |= zip(group, splats.split())
     return tuple(shard[camera] for camera in range(len(cameras)))

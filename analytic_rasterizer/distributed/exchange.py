@@ -42,9 +42,14 @@ class Route:
         return [c for cameras in self.cameras for c in cameras]
 
     @property
+    def own(self) -> list[int]:
+        """The cameras of this rank."""
+        return self.cameras[self.rank]
+
+    @property
     def sizes(self) -> list[int]:
         """Rows of each camera of this rank, from all ranks."""
-        return [sum(of_rank[c] for of_rank in self.counts) for c in self.cameras[self.rank]]
+        return [sum(of_rank[c] for of_rank in self.counts) for c in self.own]
 
     def forth(self, tensors: Sequence[torch.Tensor], shapes: list[torch.Size]) -> list[torch.Tensor]:
         """From the Gaussians to the cameras.
@@ -55,8 +60,8 @@ class Route:
         Returns:
             The same for each camera of this rank, with the rows of all ranks.
         """
-        own, widths = self.cameras[self.rank], [shape.numel() for shape in shapes]
-        received = self._send(torch.cat([t.reshape(-1) for t in tensors]), sum(widths), True)
+        own, widths = self.own, [shape.numel() for shape in shapes]
+        received = self.send(torch.cat([t.reshape(-1) for t in tensors]), sum(widths), True)
         pieces = received.split([of_rank[c] * width for of_rank in self.counts for c in own for width in widths])
         columns = len(own) * len(widths)  # of the table of pieces, which has a line for each rank
         joined = [torch.cat(pieces[k::columns]) for k in range(columns)]
@@ -64,23 +69,37 @@ class Route:
 
     def back(self, tensors: Sequence[torch.Tensor], shapes: list[torch.Size]) -> list[torch.Tensor]:
         """From the cameras to the Gaussians: the opposite of `forth`. Of a rank without cameras an empty tensor."""
-        own, widths = self.cameras[self.rank], [shape.numel() for shape in shapes]
+        own, widths = self.own, [shape.numel() for shape in shapes]
         lines = [[of_rank[c] for of_rank in self.counts] for c in own for _ in shapes]
         pieces = [t.split(line) for t, line in zip(tensors, lines)]
         of_ranks = [line[rank].reshape(-1) for rank in range(len(self.counts)) for line in pieces]
         flat = torch.cat(of_ranks or list(tensors))
         sizes = [self.counts[self.rank][c] for c in self.order for _ in shapes]
         numbers = [size * widths[k % len(widths)] for k, size in enumerate(sizes)]
-        return _shaped(self._send(flat, sum(widths), False).split(numbers), sizes, shapes)
+        return _shaped(self.send(flat, sum(widths), False).split(numbers), sizes, shapes)
 
-    def _send(self, flat: torch.Tensor, width: int, forth: bool) -> torch.Tensor:
-        """Rows of `width` numbers, in whatever order within those for a rank."""
-        sent = [width * sum(self.counts[self.rank][c] for c in cameras) for cameras in self.cameras]
-        received = [width * sum(of_rank[c] for c in self.cameras[self.rank]) for of_rank in self.counts]
-        if not forth:
-            sent, received = received, sent
+    def rows(self, forth: bool) -> tuple[list[int], list[int]]:
+        """How many this rank receives from each rank and sends to each, on the way to the cameras or back."""
+        sent = [sum(self.counts[self.rank][c] for c in cameras) for cameras in self.cameras]
+        received = [sum(of_rank[c] for c in self.own) for of_rank in self.counts]
+        return (received, sent) if forth else (sent, received)
+
+    def send(self, flat: torch.Tensor, width: int, forth: bool) -> torch.Tensor:
+        """Sends rows of `width` numbers to the cameras or back, in whatever order within those for a rank."""
+        received, sent = ([width * n for n in numbers] for numbers in self.rows(forth))
         out = flat.new_empty(sum(received))
-        dist.all_to_all_single(out, flat, received, sent, group=self.group)
+        kept, last = sent[self.rank], len(sent) - 1
+        if self.rank not in (0, last):
+            dist.all_to_all_single(out, flat, received, sent, group=self.group)
+            return out
+        # What stays, which lies at an end, is copied meanwhile: NCCL is slower at it.
+        received[self.rank] = sent[self.rank] = 0
+        at_start = self.rank == 0
+        parts = [(t[:kept], t[kept:]) if at_start else (t[len(t) - kept :], t[: len(t) - kept]) for t in (out, flat)]
+        (stays_to, comes), (stays, goes) = parts
+        work = dist.all_to_all_single(comes, goes, received, sent, group=self.group, async_op=True)
+        stays_to.copy_(stays)
+        work.wait()
         return out
 
 

@@ -21,16 +21,15 @@ from ..losses import l1_ssim
 from .density import MOMENTS
 from .model import Gaussians
 from .ranks import Ranks, even_counts
-from .trainer import Shown, Trainer
+from .trainer import Trainer
 
 BETAS = (0.9, 0.999)  # of one process, the defaults of FusedAdam
 UNEVEN = 1.1  # the largest shard, in means of all, above which Gaussians move to other ranks
 
 
 class Seen(NamedTuple):
-    """A picture of a step, and where the gradients are that density control looks at."""
+    """A picture of a step that density control looks at, and where its gradients are."""
 
-    picture: Shown
     ids: Tensor  # (n,) int32, the Gaussians of this rank that it shows
     means2d: Tensor  # (n, 2) whose grad is with respect to their projected means, px, or sums of absolute values
     size: tuple[int, int]  # width and height of the rendering, px
@@ -99,16 +98,18 @@ class ShardedTrainer(Trainer):
             loss = loss + opacity_weight * gaussians.opacities.sum() / batch.count
         if scale_weight:
             loss = loss + scale_weight * gaussians.scales.sum() / (3 * batch.count)
-        # What else there is of the batch is let go of: the graph frees it on the way back.
-        leaves = batch.means2d_abs or [splats.means2d for splats in batch.shard]
-        sizes = [(splats.width, splats.height) for splats in batch.shard]
-        ids = [splats.gaussian_ids for splats in batch.shard]
-        return loss, [Seen(*of_picture) for of_picture in zip(shown, ids, leaves, sizes)]
+        # What else there is of the batch is let go of, before the backward pass needs the memory.
+        seen = []
+        for camera, (picture, splats) in enumerate(zip(shown, batch.shard)):
+            if self.density.watches(picture.scale):
+                leaf = batch.means2d_abs[camera] if batch.means2d_abs else splats.means2d
+                seen.append(Seen(splats.gaussian_ids, leaf, (splats.width, splats.height)))
+        return loss, seen
 
     def _observe(self, seen: list[Seen]) -> None:
         """Density control sees the gradients that each picture would have in one process."""
-        for picture, ids, leaf, size in seen:
-            if not self.density.watches(picture.scale) or len(ids) == 0:
+        for ids, leaf, size in seen:
+            if len(ids) == 0:
                 continue
             # From px to normalized device coordinates, and from the mean over all ranks' pictures to that over one's.
             # Column by column: a tensor of two numbers from the host would wait for the device.

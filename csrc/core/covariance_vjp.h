@@ -6,6 +6,15 @@
 
 namespace ar {
 
+/// Writes a gradient, or adds it.
+template <class Out, class V> AR_HD void put(const Out&, V& to, V gradient) {
+  if constexpr (Out::kAdd) {
+    to = to + gradient;
+  } else {
+    to = gradient;
+  }
+}
+
 /// The gradient with respect to Sigma = A R S^2 R^T A^T, taken to the columns t_k of A R: H_kl = t_k . dL/dSigma t_l
 /// and dL/dSigma t_k. With these every factor's gradient is a product (docs/numerics.md, "Gradient in the turned
 /// frame").
@@ -114,10 +123,9 @@ AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, co
 }
 
 /// Writes the gradients of scale and rotation, or of cov3d, and returns that of the Jacobian.
-template <class B, typename T>
-AR_HD JacobianGrad<T> project_covariance_vjp(const Gaussians<T>& g, const GaussianGrads<T>& out, int64_t i,
-                                             const Factors<T>& f, const SplatGrad<T>& grad,
-                                             const BlurContext<B, T>& context) {
+template <class B, typename T, class Out>
+AR_HD JacobianGrad<T> project_covariance_vjp(const Gaussians<T>& g, const Out& out, int64_t i, const Factors<T>& f,
+                                             const SplatGrad<T>& grad, const BlurContext<B, T>& context) {
   const Vec3<T>&ax = f.jacobian.x, &ay = f.jacobian.y;
   if (g.cov3ds) {
     Sym2<T> s;
@@ -131,12 +139,13 @@ AR_HD JacobianGrad<T> project_covariance_vjp(const Gaussians<T>& g, const Gaussi
     const Vec3<T> u = s.xx * ax + s.xy * ay, v = s.xy * ax + s.yy * ay;  // s A
     const Sym3<T>& c = g.cov3ds[i];
     if (out.cov3ds) {
-      out.cov3ds[i] = {u.x * ax.x + v.x * ay.x,
-                       u.x * ax.y + u.y * ax.x + v.x * ay.y + v.y * ay.x,
-                       u.x * ax.z + u.z * ax.x + v.x * ay.z + v.z * ay.x,
-                       u.y * ax.y + v.y * ay.y,
-                       u.y * ax.z + u.z * ax.y + v.y * ay.z + v.z * ay.y,
-                       u.z * ax.z + v.z * ay.z};
+      const Sym3<T> gradient = {u.x * ax.x + v.x * ay.x,
+                                u.x * ax.y + u.y * ax.x + v.x * ay.y + v.y * ay.x,
+                                u.x * ax.z + u.z * ax.x + v.x * ay.z + v.z * ay.x,
+                                u.y * ax.y + v.y * ay.y,
+                                u.y * ax.z + u.z * ax.y + v.y * ay.z + v.z * ay.y,
+                                u.z * ax.z + v.z * ay.z};
+      put(out, out.cov3ds[i], gradient);
     }
     const Vec3<T> dL_dax = T(2) * (c * u), dL_day = T(2) * (c * v);
     return {dL_dax, dL_day, dot(dL_dax, ax) + dot(dL_day, ay)};
@@ -144,11 +153,11 @@ AR_HD JacobianGrad<T> project_covariance_vjp(const Gaussians<T>& g, const Gaussi
   const TurnedGrad<T> h = turned_vjp(f, grad, context);
   const Vec3<T>& s = f.scale;
   const Vec3<T> by_scale = T(2) * mul(s, h.diagonal);
-  if (out.scales) out.scales[i] = g.scale_modifier * by_scale;
+  if (out.scales) put(out, out.scales[i], g.scale_modifier * by_scale);
   if (out.rotations) {
     // A turn about an axis mixes the other two, as far as they differ.
     const Vec3<T> gap = {(s.y - s.z) * (s.y + s.z), (s.z - s.x) * (s.z + s.x), (s.x - s.y) * (s.x + s.y)};
-    out.rotations[i] = rotation_vjp(f.quaternion, T(2) * mul(gap, h.off));
+    put(out, out.rotations[i], rotation_vjp(f.quaternion, T(2) * mul(gap, h.off)));
   }
   const Vec3<T> by_x = T(2) * mul(s, mul(s, h.x) + h.scaled_x), by_y = T(2) * mul(s, mul(s, h.y) + h.scaled_y);
   return {f.rotation * by_x, f.rotation * by_y, dot(s, by_scale)};

@@ -77,6 +77,12 @@ template <typename T> AR_HD bool read_row(const ProjectedRows<T>& rows, int64_t 
   return within(out.mean.x, 1e9) && within(out.mean.y, 1e9) && out.depth >= T(0) && is_drawable(out);
 }
 
+/// The same of a row in one piece.
+template <typename T> AR_HD bool read_row(const PackedRow<T>& row, ProjectedGaussian<T>& out) {
+  out = {row.mean, {row.cov.xx, row.cov.xy, row.cov.yy, row.det}, row.opacity, row.depth};
+  return within(out.mean.x, 1e9) && within(out.mean.y, 1e9) && out.depth >= T(0) && is_drawable(out);
+}
+
 /// False if Gaussian i is culled: behind the near plane, not finite, or degenerate.
 template <class Cam, typename T>
 AR_HD bool project_gaussian(const Cam& camera, const Gaussians<T>& g, int64_t i, ProjectedGaussian<T>& out) {
@@ -147,12 +153,32 @@ AR_HD bool splat_color(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
   return finite;
 }
 
+/// Writes the place of Gaussian i in packed rows, where it has one. `radius` is 0 if its colour is not finite; then the
+/// row touches no pixel.
+template <typename T>
+AR_HD void write_packed(const PackedRows<T>& to, int64_t i, const ProjectedGaussian<T>& p, Vec3<T> color, int radius) {
+  const int64_t place = *to.first + to.ends[i] - 1;
+  if (place >= to.room) return;
+  PackedRow<T> row = {p.mean, {p.cov.xx, p.cov.xy, p.cov.yy}, p.opacity, p.depth, color, p.cov.det, {}};
+  if (radius == 0) row.det = T(-1);
+  row.id = decltype(row.id)(to.first_id + i);
+  to.rows[place] = row;
+  to.radii[place] = radius;
+  to.ids[place] = int32_t(i);
+}
+
+/// Whether `dL_dsh` of Gaussian i are coefficients to which others are added; else they are overwritten.
+template <class Out, typename T>
+AR_HD bool adds_to(const Gaussians<T>& g, const Out& out, int64_t i, const Vec3<T>* dL_dsh) {
+  return Out::kAdd && dL_dsh == out.shs + i * g.sh_stride;
+}
+
 /// Writes the gradient of the colour's parameters and returns the gradient with respect to the vector from the camera
 /// to the mean. `sh` are the coefficients, `dL_dsh` takes their gradient, or is null; they may be the same memory.
-template <class Cam, typename T>
-AR_HD Vec3<T> splat_color_vjp(const Cam& camera, const Gaussians<T>& g, const GaussianGrads<T>& out, int64_t i,
-                              const Vec3<T>* sh, Vec3<T>* dL_dsh, Vec3<T> dL_dcolor) {
-  if (g.colors && out.colors) out.colors[i] = dL_dcolor;
+template <class Cam, typename T, class Out>
+AR_HD Vec3<T> splat_color_vjp(const Cam& camera, const Gaussians<T>& g, const Out& out, int64_t i, const Vec3<T>* sh,
+                              Vec3<T>* dL_dsh, Vec3<T> dL_dcolor) {
+  if (g.colors && out.colors) put(out, out.colors[i], dL_dcolor);
   if (!g.shs) return {T(0), T(0), T(0)};
   constexpr int kCount = sh_count(Cam::kShDegree);
   T basis[kCount] = {}, weight[kCount];
@@ -165,11 +191,12 @@ AR_HD Vec3<T> splat_color_vjp(const Cam& camera, const Gaussians<T>& g, const Ga
   AR_UNROLL
   for (int k = 0; k < kCount; ++k) weight[k] = k < used ? dot(free, sh[k]) : T(0);
   if (dL_dsh) {
+    const bool adds = adds_to(g, out, i, dL_dsh);
     AR_UNROLL
     for (int k = 0; k < kCount; ++k) {
-      if (k < used) dL_dsh[k] = basis[k] * free;
+      if (k < used) dL_dsh[k] = adds ? dL_dsh[k] + basis[k] * free : basis[k] * free;
     }
-    for (int k = used; k < g.sh_stride; ++k) dL_dsh[k] = {T(0), T(0), T(0)};
+    for (int k = used; k < g.sh_stride && !adds; ++k) dL_dsh[k] = {T(0), T(0), T(0)};
   }
   if (g.sh_degree == 0) return {T(0), T(0), T(0)};
   const Vec3<T> dL_dunit = sh_basis_vjp<Cam::kShDegree>(g.sh_degree, d.unit, weight);
@@ -243,6 +270,30 @@ AR_HD ProjectedGrad<T> projected_grad(FootprintChoice footprint, const Cov2d<T>&
   return grad;
 }
 
+/// Whether a number in row `row` is not zero.
+template <typename T> AR_HD bool has_gradient(const ProjectedRowGrads<T>& rows, int64_t row) {
+  const Vec2<T> mean = rows.means2d[row];
+  const Sym2<T> cov = rows.cov2d[row];
+  bool found = mean.x != T(0) || mean.y != T(0) || cov.xx != T(0) || cov.xy != T(0) || cov.yy != T(0) ||
+               rows.opacities[row] != T(0);
+  if (rows.depths) found = found || rows.depths[row] != T(0);
+  if (rows.colors) {
+    const Vec3<T> color = rows.colors[row];
+    found = found || color.x != T(0) || color.y != T(0) || color.z != T(0);
+  }
+  return found;
+}
+
+/// Writes the gradient with respect to packed row i.
+template <typename T>
+AR_HD void write_packed_grad(T* to, int width, Vec2<T> mean, Sym2<T> cov, T opacity, Vec3<T> color, Vec2<T> absolute) {
+  to[kPackedMean] = mean.x, to[kPackedMean + 1] = mean.y;
+  to[kPackedCov] = cov.xx, to[kPackedCov + 1] = cov.xy, to[kPackedCov + 2] = cov.yy;
+  to[kPackedOpacity] = opacity;
+  to[kPackedColor] = color.x, to[kPackedColor + 1] = color.y, to[kPackedColor + 2] = color.z;
+  if (width > kPackedAbsolute) to[kPackedAbsolute] = absolute.x, to[kPackedAbsolute + 1] = absolute.y;
+}
+
 /// From the gradient of row `row` of ProjectedRows. `opacity` is the row's.
 template <typename T> AR_HD ProjectedGrad<T> projected_grad(const ProjectedRowGrads<T>& rows, int64_t row, T opacity) {
   const Sym2<T> g = rows.cov2d[row];
@@ -253,10 +304,9 @@ template <typename T> AR_HD ProjectedGrad<T> projected_grad(const ProjectedRowGr
 /// Writes every gradient of Gaussian i, and adds that of a full camera to `camera_grad`, if not null. `grad_of` turns
 /// the covariance and the opacity in the image into a ProjectedGrad. `sh` and `dL_dsh` as for splat_color_vjp; out.shs
 /// is not touched.
-template <class Cam, typename T, class GradOf>
+template <class Cam, typename T, class GradOf, class Out>
 AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, const GradOf& grad_of, ShownGrad<T> shown,
-                       const Vec3<T>* sh, Vec3<T>* dL_dsh, const GaussianGrads<T>& out,
-                       CameraGrad<T>* camera_grad = nullptr) {
+                       const Vec3<T>* sh, Vec3<T>* dL_dsh, const Out& out, CameraGrad<T>* camera_grad = nullptr) {
   const ProjectedMean<T> mean = project_mean(camera, g.means[i]);
   const Factors<T> factors = project_covariance(camera, g, i, mean.view);
   const SeenCov<T> seen = seen_covariance(camera, g, i, mean.view, factors);
@@ -293,8 +343,8 @@ AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
     }
   }
   if (!same_direction) dL_dmean += dL_ddirection;
-  if (out.means) out.means[i] = dL_dmean;
-  if (out.opacities) out.opacities[i] = projected.weighted / g.opacities[i];
+  if (out.means) put(out, out.means[i], dL_dmean);
+  if (out.opacities) put(out, out.opacities[i], projected.weighted / g.opacities[i]);
   if (out.means2d) {
     T* row = out.means2d + i * out.means2d_stride;
     row[0] = T(0.5) * camera.size.x * grad.dL_dmean.x;
@@ -317,9 +367,13 @@ template <typename T> AR_HD void write_mean_sums(const GaussianGrads<T>& out, in
 }
 
 /// Zero gradient, for a Gaussian that touched no pixel. Coefficients go to `dL_dsh`, if not null.
-template <typename T>
-AR_HD void zero_grads(const Gaussians<T>& g, int64_t i, const GaussianGrads<T>& out, Vec3<T>* dL_dsh) {
+template <typename T, class Out>
+AR_HD void zero_grads(const Gaussians<T>& g, int64_t i, const Out& out, Vec3<T>* dL_dsh) {
   const Vec3<T> zero = {T(0), T(0), T(0)};
+  if constexpr (Out::kAdd) {
+    for (int k = 0; dL_dsh && !adds_to(g, out, i, dL_dsh) && k < g.sh_stride; ++k) dL_dsh[k] = zero;
+    return;
+  }
   if (out.means) out.means[i] = zero;
   if (out.scales) out.scales[i] = zero;
   if (out.rotations) out.rotations[i] = {T(0), T(0), T(0), T(0)};
@@ -331,7 +385,7 @@ AR_HD void zero_grads(const Gaussians<T>& g, int64_t i, const GaussianGrads<T>& 
   }
   for (int k = 0; dL_dsh && k < g.sh_stride; ++k) dL_dsh[k] = zero;
 }
-template <typename T> AR_HD void zero_grads(const Gaussians<T>& g, int64_t i, const GaussianGrads<T>& out) {
+template <typename T, class Out> AR_HD void zero_grads(const Gaussians<T>& g, int64_t i, const Out& out) {
   zero_grads(g, i, out, out.shs ? out.shs + i * g.sh_stride : nullptr);
 }
 

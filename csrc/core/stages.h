@@ -68,8 +68,9 @@ enum class MeanSums : int32_t {
   kNorm,      ///< the length of the gradient, in the units of GaussianGrads::means2d; the second sum is zero
 };
 
-/// Gradients with respect to the members of Gaussians. They are overwritten, not added to. Null where not wanted.
+/// Gradients with respect to the members of Gaussians, which are overwritten. Null where not wanted.
 template <typename T> struct GaussianGrads {
+  static constexpr bool kAdd = false;
   Vec3<T>* means;
   Vec3<T>* scales;
   Vec4<T>* rotations;
@@ -81,6 +82,24 @@ template <typename T> struct GaussianGrads {
   T* means2d;          ///< [n, means2d_stride], in 3DGS's units: per (0.5 W, 0.5 H) px
   int means2d_stride;  ///< 3, or 4
   MeanSums mean_sums;  ///< with stride 3 the two sums are added up in column 2; with 4 they are columns 2 and 3
+};
+
+/// The same, to which the gradients of another camera are added. There is no means2d.
+template <typename T> struct AddedGrads : GaussianGrads<T> {
+  static constexpr bool kAdd = true;
+};
+
+/// A column of a table: an Element in every row.
+template <class Element> struct Column {
+  Element* first = nullptr;
+  int64_t stride = sizeof(Element);  ///< bytes from one row to the next
+
+  Column() = default;
+  AR_HD Column(Element* first_, int64_t stride_ = sizeof(Element)) : first(first_), stride(stride_) {}
+  AR_HD explicit operator bool() const { return first != nullptr; }
+  AR_HD const Element& operator[](int64_t i) const {
+    return *reinterpret_cast<const Element*>(reinterpret_cast<const char*>(first) + i * stride);
+  }
 };
 
 /// Scalars per splat, for every footprint.
@@ -175,14 +194,45 @@ template <typename T> struct ProjectedRows {
   Vec3<T>* colors;   ///< or null
 };
 
-/// Gradient with respect to ProjectedRows, for the adjoint of `project`.
+/// A row of ProjectedRows in one piece, as it travels between ranks. Scalars only, so that an array is a matrix of T.
+template <typename T> struct alignas(16) PackedRow {
+  Vec2<T> mean;
+  Sym2<T> cov;
+  T opacity, depth;
+  Vec3<T> color;
+  T det;                                                    ///< negative: touches no pixel
+  std::conditional_t<sizeof(T) == 4, int32_t, int64_t> id;  ///< of the Gaussian among those of all ranks
+};
+inline constexpr int kPackedWidth = 12, kPackedDepth = 6;
+static_assert(sizeof(PackedRow<float>) == kPackedWidth * sizeof(float));
+static_assert(sizeof(PackedRow<double>) == kPackedWidth * sizeof(double));
+static_assert(offsetof(PackedRow<float>, depth) == kPackedDepth * sizeof(float));
+
+/// The gradient with respect to a PackedRow: columns of a row of scalars. cov.xy: with respect to the one number that
+/// fills both places; `absolute`, which may be missing: sums over pixels of |dL/dmean|.
+inline constexpr int kPackedMean = 0, kPackedCov = 2, kPackedOpacity = 5, kPackedColor = 6, kPackedAbsolute = 9;
+inline constexpr int kPackedGradWidth = 9, kPackedGradWidthAbsolute = 11;
+
+/// Gradient with respect to ProjectedRows, for the adjoint of `project`. A row of zeros is that of a Gaussian without
+/// gradient.
 template <typename T> struct ProjectedRowGrads {
   const int32_t* rows;  ///< [n] row of each Gaussian, or -1
-  const Vec2<T>* means2d;
-  const Sym2<T>* cov2d;  ///< xy: with respect to the one number that fills both places
-  const T* opacities;
-  const T* depths;
-  const Vec3<T>* colors;
+  Column<const Vec2<T>> means2d;
+  Column<const Sym2<T>> cov2d;  ///< xy: with respect to the one number that fills both places
+  Column<const T> opacities;
+  Column<const T> depths;        ///< or null
+  Column<const Vec3<T>> colors;  ///< or null
+};
+
+/// Where `project_rows` writes PackedRow instead of ProjectedRows: those of the Gaussians that may be seen, as `ends`
+/// counts them.
+template <typename T> struct PackedRows {
+  PackedRow<T>* rows;    ///< [room] of several cameras; null: they are not wanted
+  int64_t room;          ///< what would lie behind it is not written
+  const int64_t* first;  ///< [1] place of this camera's rows
+  const int32_t* ends;   ///< [gaussians] how many up to this one, itself included, have a radius without their colours
+  int32_t *radii, *ids;  ///< [room] radius, 0 if the colour is not finite; Gaussian
+  int64_t first_id;      ///< PackedRow::id of Gaussian 0
 };
 
 /// Public rows to splats. The caller may have put any numbers into the rows: a row that makes no splat touches no tile.
@@ -191,7 +241,10 @@ template <typename T> struct ShapeRowsParams {
   ProjectedRows<T> rows;  ///< read; without colours the splats are black
   FootprintChoice footprint;
   TileGrid grid;
-  T* splats;  ///< [n] SplatRow
+  T* splats;                   ///< [n] SplatRow
+  const PackedRow<T>* packed;  ///< [n] read in the place of `rows`; or null
+  /// [n, 4] cov2d and its determinant, and [n] opacities of `packed`, which its adjoint needs; or null.
+  T *kept_covs, *kept_opacities;
 };
 
 /// Sums of pairs to the gradient with respect to the public rows. It is written for every row, zero for one without
@@ -204,6 +257,18 @@ template <typename T> struct RowGradsParams {
   Sym2<T>* dL_dcov2d;  ///< xy: with respect to the one number that fills both places
   T* dL_dopacities;
   Vec2<T>* absolute;  ///< [n] sums over pixels of |dL/dmeans2d|, or null
+  // In the place of `rows`: what shape_rows kept; and of the gradients: rows of kPackedGradWidth numbers or more, with
+  // the gradient with respect to the colours, which were blended. Or null.
+  const T *kept_covs, *kept_opacities;
+  T* packed;
+  int packed_width;
+
+  AR_HD Cov2d<T> cov(int64_t i) const {
+    if (kept_covs) return {kept_covs[4 * i], kept_covs[4 * i + 1], kept_covs[4 * i + 2], kept_covs[4 * i + 3]};
+    const Sym2<T> c = rows.cov2d[i];
+    return {c.xx, c.xy, c.yy, rows.dets[i]};
+  }
+  AR_HD T opacity(int64_t i) const { return kept_opacities ? kept_opacities[i] : rows.opacities[i]; }
 };
 
 /// Parameters of `blend`: the splats of every tile, in order of depth, to an image.

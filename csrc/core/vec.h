@@ -36,6 +36,12 @@ template <typename T> struct Mat3 {
 };
 
 template <class V> AR_HD Vec2<V> operator+(Vec2<V> a, Vec2<V> b) { return {a.x + b.x, a.y + b.y}; }
+template <class V> AR_HD Vec4<V> operator+(Vec4<V> a, Vec4<V> b) {
+  return {a.x + b.x, a.y + b.y, a.z + b.z, a.w + b.w};
+}
+template <typename T> AR_HD Sym3<T> operator+(const Sym3<T>& a, const Sym3<T>& b) {
+  return {a.xx + b.xx, a.xy + b.xy, a.xz + b.xz, a.yy + b.yy, a.yz + b.yz, a.zz + b.zz};
+}
 template <class V> AR_HD Sym2<V> operator+(Sym2<V> a, Sym2<V> b) { return {a.xx + b.xx, a.xy + b.xy, a.yy + b.yy}; }
 
 template <typename T> AR_HD Vec3<T> operator+(Vec3<T> a, Vec3<T> b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }

@@ -71,13 +71,13 @@ template <template <typename> class Cam, typename T> void project(const cpu::Pro
   });
 }
 
-/// The radii are those of project().
+/// The radii are those of project(), without colours those of Gaussians whose colours are finite.
 template <template <typename> class Cam, typename T> void project_rows(const cpu::ProjectRowsParams<T>& p) {
   const Gaussians<T>& g = p.gaussians;
   for_each_chunk(g.n, p.threads, [&](int64_t, int64_t begin, int64_t end) {
     const auto camera = load_camera_as<Cam<T>>(p.camera);
     for (int64_t i = begin; i < end; ++i) {
-      p.radii[i] = 0;
+      if (p.radii) p.radii[i] = 0;
       ProjectedGaussian<T> projected;
       if (!may_be_visible(camera, g, i, p.bounds) || !project_gaussian(camera, g, i, projected)) continue;
       SplatRow<T> splat = {};
@@ -85,12 +85,16 @@ template <template <typename> class Cam, typename T> void project_rows(const cpu
       if (radius == 0) continue;
       const bool touches = splat.level > T(0);
       bool finite = true;
-      if (p.rows.colors) {
+      if (p.rows.colors || p.packed.rows) {
         finite = splat_color(camera, g, i, coefficients_of(g.shs, g.sh_stride, i), splat.color);
-        p.rows.colors[i] = finite ? splat.color : Vec3<T>{T(0), T(0), T(0)};
+        if (!finite) splat.color = {T(0), T(0), T(0)};
       }
-      if (touches && !finite) continue;
+      const bool culled = touches && !finite;
+      if (p.packed.rows) write_packed(p.packed, i, projected, splat.color, culled ? 0 : radius);
+      if (p.rows.colors) p.rows.colors[i] = splat.color;
+      if (culled || !p.radii) continue;
       p.radii[i] = radius;
+      if (!p.rows.means2d) continue;
       p.rows.means2d[i] = projected.mean;
       p.rows.cov2d[i] = {projected.cov.xx, projected.cov.xy, projected.cov.yy};
       p.rows.dets[i] = projected.cov.det;
@@ -139,14 +143,15 @@ template <template <typename> class Cam, typename T> void project_vjp(const cpu:
   });
 }
 
-template <template <typename> class Cam, typename T> void project_rows_vjp(const cpu::ProjectRowsVjpParams<T>& p) {
+template <template <typename> class Cam, typename T, class Out>
+void project_rows_vjp(const cpu::ProjectRowsVjpParams<T>& p, const Out& out) {
   const Gaussians<T>& g = p.gaussians;
   for_each_chunk(g.n, p.threads, [&](int64_t chunk, int64_t begin, int64_t end) {
     const auto camera = load_camera_as<Cam<T>>(p.camera);
     for (int64_t i = begin; i < end; ++i) {
       const int64_t row = p.rows.rows[i];
-      if (row < 0) {
-        zero_grads(g, i, p.grads);
+      if (row < 0 || !has_gradient(p.rows, row)) {
+        zero_grads(g, i, out);
         continue;
       }
       ShownGrad<T> shown = {};
@@ -154,10 +159,16 @@ template <template <typename> class Cam, typename T> void project_rows_vjp(const
       if (p.rows.depths) shown.depth = p.rows.depths[row];
       const auto grad_of = [&](const Cov2d<T>&, T opacity) { return projected_grad(p.rows, row, opacity); };
       ar::project_vjp(camera, g, i, grad_of, shown, coefficients_of(g.shs, g.sh_stride, i),
-                      coefficients_of(p.grads.shs, g.sh_stride, i), p.grads,
-                      p.camera_grads ? &p.camera_grads[chunk] : nullptr);
+                      coefficients_of(out.shs, g.sh_stride, i), out, p.camera_grads ? &p.camera_grads[chunk] : nullptr);
     }
   });
+}
+template <template <typename> class Cam, typename T> void project_rows_vjp(const cpu::ProjectRowsVjpParams<T>& p) {
+  if (p.add) {
+    project_rows_vjp<Cam>(p, AddedGrads<T>{p.grads});
+  } else {
+    project_rows_vjp<Cam>(p, p.grads);
+  }
 }
 
 }  // namespace ar::AR_ISA

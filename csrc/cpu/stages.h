@@ -39,7 +39,8 @@ template <typename T> struct ProjectParams : ar::ProjectParams<T> {
 template <typename T> struct ProjectRowsParams : ar::ProjectParams<T> {
   CullBounds<T> bounds;
   int threads;
-  ProjectedRows<T> rows;  ///< [gaussians] each; what belongs to a radius of 0 is not written
+  ProjectedRows<T> rows;  ///< [gaussians] each; what belongs to a radius of 0 is not written; or all null
+  PackedRows<T> packed;   ///< instead of rows and radii
 };
 
 template <typename T> struct ShapeRowsParams : ar::ShapeRowsParams<T> {
@@ -134,7 +135,8 @@ template <typename T> struct ProjectVjpParams : ar::ProjectVjpParams<T> {
 };
 
 template <typename T> struct ProjectRowsVjpParams : ar::ProjectVjpParams<T> {
-  ProjectedRowGrads<T> rows;  ///< depths and colors may be null: zero
+  ProjectedRowGrads<T> rows;
+  bool add;  ///< to the gradients that are there
   int threads;
   CameraGrad<T>* camera_grads;
 };

@@ -6,8 +6,10 @@
 namespace ar::cuda {
 namespace {
 
-/// With too many pairs there is a row per splat that all tiles add to. The sums of shapes stay from group to group.
-__global__ void clear_splat_sums_kernel(const BlendVjpParams params, int group) {
+/// No chunk has been begun. With too many pairs there is a row per splat that all tiles add to, and which must be zero;
+/// the sums of shapes stay from group to group.
+__global__ void clear_sums_kernel(const BlendVjpParams params, int group) {
+  if (blockIdx.x == 0 && threadIdx.x < kSampleClasses) params.chunks_taken[threadIdx.x] = 0;
   if (params.lists.counts->pairs <= params.lists.capacity) return;
   const auto clear = [&](float* to, int width) {
     const int64_t n = params.lists.n * width;
@@ -57,7 +59,7 @@ int64_t max_adjoint_maps(int footprint, int64_t capacity, TileGrid grid) {
 }
 
 void blend_vjp(int footprint, const BlendVjpParams& p, int group, cudaStream_t stream) {
-  launch(clear_splat_sums_kernel, {kClearBlocks, kBlendThreads}, stream, p, group);
+  launch(clear_sums_kernel, {kClearBlocks, kBlendThreads}, stream, p, group);
   visit_tile_footprints<AdaptiveBoxesVjp>(footprint, stream, [&](auto f, cudaStream_t side) {
     using F = decltype(f);
     if constexpr (F::kMoves) {

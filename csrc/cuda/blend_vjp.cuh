@@ -1,6 +1,8 @@
 // Kernels of blend_vjp for up to four channels.
 #pragma once
 
+#include <algorithm>
+
 #include "cuda/composite.cuh"
 #include "cuda/launch.cuh"
 
@@ -71,24 +73,20 @@ inline constexpr int kVjpWarps = F::kSamples > kVjpSamples<F, kSums> ? F::kSampl
                                  : F::kSamples <= 8                  ? 2
                                                                      : 1;
 
-/// A warp per chunk, for many samples a block, back to front, over all pixels of the tile: every pair is summed in one
-/// place, so the sums need no atomics, whose order would change from run to run.
+/// A warp's share of a chunk, back to front over all pixels of the tile: every pair is summed in one place, so the sums
+/// need no atomics, whose order would change from run to run. `first`: the first of the samples that the warp takes.
 template <class F, int C, Sums kSums>
-__global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
-    blend_vjp_kernel(const BlendVjpParams params) {
-  constexpr int S = F::kSamples, kLength = chunk_length(S), kWarps = kVjpWarps<F, kSums>, kSumCount = 6 + C;
+__device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, int64_t item, int first,
+                                                VjpPixels<kVjpSamples<F, kSums>, C>& stage,
+                                                VjpGroup<F, C, F::kSamples / kVjpSamples<F, kSums>>& group) {
+  constexpr int S = F::kSamples, kLength = chunk_length(S), kSumCount = 6 + C;
   constexpr int kOwn = kVjpSamples<F, kSums>, kGroup = S / kOwn;  // samples of a warp, warps of a chunk
   // Where the code for a subtile is short, each has its own: of 58 instructions 11 would work out where its pixels are.
   constexpr bool kUnroll = S == 1 && sizeof(TileSplat<F, C>) <= 48;
   constexpr bool kGrads = kSums != Sums::kMeans, kMeans = kSums != Sums::kGrads;
   // A shared-out sample's number is not known when the code is compiled: keep its node indexable.
   using VjpSplat = std::conditional_t<kGroup == 1, TileSplatRef<F, C>, const TileSplat<F, C>&>;
-  using Pixels = VjpPixels<kOwn, C>;
-  using Group = VjpGroup<F, C, kGroup>;
-  const int lane = lane_id(), warp = threadIdx.x / 32, first = warp % kGroup * kOwn;
-  auto* pixels = reinterpret_cast<Pixels*>(dynamic_shared());
-  Pixels& stage = pixels[warp];
-  Group& group = reinterpret_cast<Group*>(pixels + kWarps)[warp / kGroup];
+  const int lane = lane_id(), warp = threadIdx.x / 32;
   const auto group_sync = [] {
     if constexpr (kGroup > 1) {
       __syncthreads();
@@ -96,9 +94,6 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
       __syncwarp();
     }
   };
-  const SampleParts& chunks = params.plan->counts.chunks;
-  const int64_t item = chunks.first[sample_class(S)] + (int64_t(blockIdx.x) * kWarps + warp) / kGroup;
-  if (item >= chunks.first[sample_class(S) + 1]) return;
   const auto [tile, chunk, plane] = params.chunk_order[item];
   const TileList list = list_of(params.lists, params.grid, tile);
   const int begin = chunk * kLength, end = list.overflow ? list.count : min(list.count, begin + kLength);
@@ -296,13 +291,43 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
   }
 }
 
+/// Whether a warp has a chunk for itself. Then it takes the next one when it is done, and need not wait for the others
+/// of its block, which have other chunks. Warps that share a chunk end with their block.
+template <class F, Sums kSums> inline constexpr bool kTakesChunks = kVjpSamples<F, kSums> == F::kSamples;
+
+template <class F, int C, Sums kSums>
+__global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
+    blend_vjp_kernel(const BlendVjpParams params) {
+  constexpr int kWarps = kVjpWarps<F, kSums>, kOwn = kVjpSamples<F, kSums>, kGroup = F::kSamples / kOwn;
+  auto* pixels = reinterpret_cast<VjpPixels<kOwn, C>*>(dynamic_shared());
+  auto* groups = reinterpret_cast<VjpGroup<F, C, kGroup>*>(pixels + kWarps);
+  const int warp = threadIdx.x / 32, first = warp % kGroup * kOwn;
+  const int32_t* firsts = params.plan->counts.chunks.first + sample_class(F::kSamples);
+  const int begin = firsts[0], end = firsts[1];
+  if constexpr (kTakesChunks<F, kSums>) {
+    for (;;) {
+      int taken = 0;
+      if (lane_id() == 0) taken = atomicAdd(&params.chunks_taken[sample_class(F::kSamples)], 1);
+      const int item = begin + shuffle(taken, 0);
+      if (item >= end) return;
+      blend_chunk_vjp<F, C, kSums>(params, item, first, pixels[warp], groups[warp]);
+    }
+  } else {
+    const int64_t item = begin + (int64_t(blockIdx.x) * kWarps + warp) / kGroup;
+    if (item < end) blend_chunk_vjp<F, C, kSums>(params, item, first, pixels[warp], groups[warp / kGroup]);
+  }
+}
+
 /// Blocks that fill any device.
 inline constexpr int kClearBlocks = 132 * 8;
+inline constexpr unsigned kTakingBlocks = 256 * 8;
 
 template <class F, int C, Sums kSums> void launch_blend_vjp(const BlendVjpParams& p, cudaStream_t stream) {
   constexpr int kOwn = kVjpSamples<F, kSums>, kWarps = kVjpWarps<F, kSums>, kGroup = F::kSamples / kOwn;
   const size_t bytes = kWarps * sizeof(VjpPixels<kOwn, C>) + kWarps / kGroup * sizeof(VjpGroup<F, C, kGroup>);
-  launch(blend_vjp_kernel<F, C, kSums>, {blocks_of(p.max_chunks, kWarps / kGroup), 32 * kWarps, bytes}, stream, p);
+  unsigned blocks = blocks_of(p.max_chunks, kWarps / kGroup);
+  if (kTakesChunks<F, kSums>) blocks = std::min(blocks, kTakingBlocks);
+  launch(blend_vjp_kernel<F, C, kSums>, {blocks, 32 * kWarps, bytes}, stream, p);
 }
 template <class F, int C> void blend_vjp_few(const BlendVjpParams& p, cudaStream_t stream) {
   constexpr bool kAtOnce = kVjpSamples<F, Sums::kGrads> == F::kSamples;

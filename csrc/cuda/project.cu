@@ -30,6 +30,7 @@ void project_vjp(const ProjectVjpParams& p, cudaStream_t stream) {
   launch_rows(project_vjp_kernel<Plain>, project_vjp_kernel<Full>, p, stream);
 }
 void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream) {
+  if (p.add) return launch_rows(add_project_rows_vjp_kernel<Plain>, add_project_rows_vjp_kernel<Full>, p, stream);
   launch_rows(project_rows_vjp_kernel<Plain>, project_rows_vjp_kernel<Full>, p, stream);
 }
 

@@ -79,9 +79,10 @@ __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const Pro
   int radius = 0;
   if (i < g.n && may_be_visible(camera, g, i, params.bounds) && project_gaussian(camera, g, i, projected))
     radius = shape_splat(projected, params.footprint, camera.grid, splat);
-  if (params.rows.colors) {
+  const bool has_row = radius > 0;
+  if (params.rows.colors || params.packed.rows) {
     ShRows<Cam::kShDegree>& rows = sh_rows[threadIdx.x / 32];
-    const uint32_t seen = __ballot_sync(kAllLanes, radius > 0);
+    const uint32_t seen = __ballot_sync(kAllLanes, has_row);
     if (g.shs && seen) rows.begin_load(g.shs + (i - lane_id()) * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), seen);
     wait_for_copies();
     if (radius > 0 && !splat_color(camera, g, i, rows.row(), splat.color)) {
@@ -90,8 +91,12 @@ __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const Pro
     }
   }
   if (i >= g.n) return;
+  if (params.packed.rows) {
+    if (has_row) write_packed(params.packed, i, projected, splat.color, radius);
+    return;
+  }
   params.radii[i] = radius;
-  if (radius == 0) return;
+  if (radius == 0 || !params.rows.means2d) return;
   const Cov2d<float>& cov = projected.cov;
   params.rows.means2d[i] = projected.mean;
   params.rows.cov2d[i] = {cov.xx, cov.xy, cov.yy};
@@ -106,9 +111,21 @@ __global__ void __launch_bounds__(kProjectThreads) shape_rows_kernel(const Shape
   if (i >= params.n) return;
   ProjectedGaussian<float> projected;
   SplatRow<float> splat = {};
-  if (read_row(params.rows, i, projected) && shape_splat(projected, params.footprint, params.grid, splat) == 0)
-    splat.level = 0;
-  if (params.rows.colors) splat.color = params.rows.colors[i];
+  bool valid;
+  if (params.packed) {
+    const PackedRow<float> row = params.packed[i];
+    valid = read_row(row, projected);
+    splat.color = row.color;
+  } else {
+    valid = read_row(params.rows, i, projected);
+    if (params.rows.colors) splat.color = params.rows.colors[i];
+  }
+  if (params.kept_covs) {
+    const Cov2d<float>& cov = projected.cov;
+    reinterpret_cast<float4*>(params.kept_covs)[i] = {cov.xx, cov.xy, cov.yy, cov.det};
+    params.kept_opacities[i] = projected.opacity;
+  }
+  if (valid && shape_splat(projected, params.footprint, params.grid, splat) == 0) splat.level = 0;
   const Vec3<float>& color = splat.color;
   if (!(within(color.x, kMaxColor) && within(color.y, kMaxColor) && within(color.z, kMaxColor))) splat.level = 0;
   const int count = splat.level > 0 ? count_tiles(splat, params.footprint.index, params.grid) : 0;

@@ -154,7 +154,7 @@ struct FromRows {
 
   __device__ PairRange range(int64_t i) const {
     const int32_t row = params.rows.rows[i];
-    return {row, row >= 0 ? 1 : 0};
+    return {row, row >= 0 && has_gradient(params.rows, row) ? 1 : 0};
   }
   struct Nothing {};
   __device__ Nothing sum(int64_t, PairRange) const { return {}; }
@@ -173,8 +173,8 @@ struct FromRows {
 /// Blocks that a multiprocessor holds at once.
 inline constexpr int kVjpBlocks = 6;
 
-template <class Cam, class From, class Params>
-__device__ void project_vjp_body(const Params& params, const From& from) {
+template <class Cam, class From, class Params, class Out>
+__device__ void project_vjp_body(const Params& params, const From& from, const Out& out) {
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
   __shared__ GaussianRows gaussian_rows[kProjectThreads / 32];
   // Shared, and read where it is used, the camera takes no registers. Shared variables may not have initialisers, as
@@ -190,10 +190,9 @@ __device__ void project_vjp_body(const Params& params, const From& from) {
   if (first >= params.gaussians.n) return;
   const uint32_t lit = __ballot_sync(kAllLanes, range.count > 0);
   const int n = int(min(int64_t(32), params.gaussians.n - first));
-  const GaussianGrads<float>& out = params.grads;
   float* camera_grads = params.camera_grads ? params.camera_grads + first / 32 * kCameraGradWidth : nullptr;
   if (lit == 0) {
-    zero_grads_of_warp(params.gaussians, out, first, n);
+    if (!Out::kAdd) zero_grads_of_warp(params.gaussians, out, first, n);
     if (Cam::kFull && camera_grads) zero_rows(camera_grads, kCameraGradWidth);
     return;
   }
@@ -220,7 +219,7 @@ __device__ void project_vjp_body(const Params& params, const From& from) {
   } else if (i < g.n) {
     zero_grads(g, i, out, dL_dsh);
   }
-  if (staged) rows.store(out.shs + first * g.sh_stride, g.sh_stride, n);
+  if (staged) rows.template store<Out::kAdd>(out.shs + first * g.sh_stride, g.sh_stride, n);
   if constexpr (Cam::kFull) {
     if (camera_grads) store_warp_sums(camera_grad, camera_grads);
   }
@@ -229,30 +228,45 @@ __device__ void project_vjp_body(const Params& params, const From& from) {
 template <class Cam>
 __global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kVjpBlocks)
     project_vjp_kernel(const ProjectVjpParams params) {
-  project_vjp_body<Cam>(params, FromPairs{params});
+  project_vjp_body<Cam>(params, FromPairs{params}, params.grads);
 }
 template <class Cam>
 __global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kVjpBlocks)
     project_rows_vjp_kernel(const ProjectRowsVjpParams params) {
-  project_vjp_body<Cam>(params, FromRows{params});
+  project_vjp_body<Cam>(params, FromRows{params}, params.grads);
+}
+template <class Cam>
+__global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kVjpBlocks)
+    add_project_rows_vjp_kernel(const ProjectRowsVjpParams params) {
+  project_vjp_body<Cam>(params, FromRows{params}, AddedGrads<float>{params.grads});
 }
 
 __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGradsParams params) {
+  __shared__ float packed_rows[kProjectThreads * kPackedGradWidthAbsolute];
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
   const PairRange range = i < params.n ? params.sums.ranges[i] : PairRange{0, 0};
   const SplatSums sums = sum_pairs(params.sums, i, range);
-  if (i >= params.n) return;
   Vec2<float> dL_dmean = {0, 0};
   Sym2<float> dL_dcov = {0, 0, 0};
   float dL_dopacity = 0;
   if (range.count > 0) {
-    const Sym2<float> c = params.rows.cov2d[i];
-    const Cov2d<float> cov = {c.xx, c.xy, c.yy, params.rows.dets[i]};
+    const Cov2d<float> cov = params.cov(i);
     const ProjectedGrad<float> grad = projected_grad(params.footprint, cov, sums.grad());
     dL_dmean = grad.splat.dL_dmean;
     dL_dcov = cov_grad(cov, grad.splat);
-    dL_dopacity = grad.weighted / params.rows.opacities[i];
+    dL_dopacity = grad.weighted / params.opacity(i);
   }
+  if (params.packed) {  // the rows of a block, with neighbouring threads at neighbouring addresses
+    const int width = params.packed_width;
+    write_packed_grad(packed_rows + threadIdx.x * width, width, dL_dmean, {dL_dcov.xx, 2 * dL_dcov.xy, dL_dcov.yy},
+                      dL_dopacity, sums.color(), sums.mean_sums());
+    __syncthreads();
+    const int64_t first = int64_t(blockIdx.x) * kProjectThreads;
+    const int numbers = int(min(int64_t(kProjectThreads), params.n - first)) * width;
+    for (int e = threadIdx.x; e < numbers; e += kProjectThreads) params.packed[first * width + e] = packed_rows[e];
+    return;
+  }
+  if (i >= params.n) return;
   params.dL_dmeans2d[i] = dL_dmean;
   params.dL_dcov2d[i] = {dL_dcov.xx, 2 * dL_dcov.xy, dL_dcov.yy};
   params.dL_dopacities[i] = dL_dopacity;

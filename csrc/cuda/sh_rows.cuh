@@ -27,8 +27,8 @@ template <int kDegree> struct ShRows {
       }
     }
   }
-  /// Stores rows [0, rows) of `stride` coefficients.
-  __device__ void store(Vec3<float>* base, int stride, int rows) const {
+  /// Stores rows [0, rows) of `stride` coefficients, or adds them to those that are there.
+  template <bool kAdd> __device__ void store(Vec3<float>* base, int stride, int rows) const {
     __syncwarp();
     if (stride == 16 && reinterpret_cast<uintptr_t>(base) % 16 == 0) {
       auto* to = reinterpret_cast<float4*>(base);
@@ -36,14 +36,21 @@ template <int kDegree> struct ShRows {
       for (int e = 0; e < 12; ++e) {
         const int k = e * 32 + lane_id(), row = k / 12;
         const float* from = value[row] + 4 * (k % 12);
-        if (row < rows) to[k] = {from[0], from[1], from[2], from[3]};
+        if (row >= rows) continue;
+        float4 stored = {from[0], from[1], from[2], from[3]};
+        if (kAdd) {
+          const float4 old = to[k];
+          stored = {old.x + stored.x, old.y + stored.y, old.z + stored.z, old.w + stored.w};
+        }
+        to[k] = stored;
       }
       return;
     }
     const int width = 3 * stride;
     float* to = &base->x;
     for (int row = 0; row < rows; ++row) {
-      for (int e = lane_id(); e < width; e += 32) to[row * width + e] = value[row][e];
+      for (int e = lane_id(); e < width; e += 32)
+        to[row * width + e] = kAdd ? to[row * width + e] + value[row][e] : value[row][e];
     }
   }
   __device__ Vec3<float>* row() { return reinterpret_cast<Vec3<float>*>(value[lane_id()]); }

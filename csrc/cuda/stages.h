@@ -112,8 +112,9 @@ struct ProjectRowsParams {
   Gaussians<float> gaussians;
   FootprintChoice footprint;
   CullBounds<float> bounds;
-  ProjectedRows<float> rows;  ///< [n]; those with radius 0 are not written
+  ProjectedRows<float> rows;  ///< [n]; those with radius 0 are not written; or all null
   int32_t* radii;             ///< [n]
+  PackedRows<float> packed;   ///< instead of rows and radii
 };
 
 struct ShapeRowsParams : ar::ShapeRowsParams<float> {
@@ -245,6 +246,7 @@ struct BlendVjpParams : ar::BlendVjpParams<float> {
   const TileChunk* chunk_order;
   const PlanState* plan;
   int64_t max_chunks;
+  int32_t* chunks_taken;  ///< [kSampleClasses] set to zero by blend_vjp; chunks of a class that warps have begun with
   const float* checkpoints;
   float* pair_grads;    ///< [max(capacity, n), kPairGradWidth] by slot, or by splat if there are too many pairs
   float* channel_sums;  ///< [max(capacity, n), kChannelGroup] likewise, for more than kFewChannels channels; or null
@@ -285,8 +287,9 @@ struct ProjectRowsVjpParams {
   CameraView<float> camera;
   Gaussians<float> gaussians;
   GaussianGrads<float> grads;
-  ProjectedRowGrads<float> rows;  ///< depths and colors may be null
-  float* camera_grads;            ///< as in ProjectVjpParams
+  ProjectedRowGrads<float> rows;
+  bool add;             ///< to the gradients that are there
+  float* camera_grads;  ///< as in ProjectVjpParams
 };
 
 struct RowGradsParams : ar::RowGradsParams<float> {

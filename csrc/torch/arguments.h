@@ -70,6 +70,7 @@ using Inputs = SceneArguments<double>;
 struct Grads : SceneTensors<Tensor> {
   MeanSums mean_sums = MeanSums::kNone;  ///< that means2D holds
   bool with_camera = false;              ///< one of the camera's tensors wants a gradient
+  bool add = false;                      ///< those of the Gaussians are added to what is there
 };
 
 /// A footprint by its key, and the number of its option.
@@ -111,6 +112,16 @@ struct ProjectArguments : SceneArguments<std::vector<double>>, FootprintArgument
       if (name != "means2D") visit(name, value);
     });
     FootprintArguments::each(visit);
+  }
+};
+
+/// Which rows of packed rows belong to C cameras: `counts[c]` from `firsts[c]` on.
+struct PackedPlaces {
+  std::vector<int64_t> firsts, counts;
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("firsts", firsts);
+    visit("counts", counts);
   }
 };
 
@@ -314,6 +325,77 @@ struct AdamArguments {
     visit("bias_correction=True", bias_correction);
     visit("heads=[]", heads);
     visit("head_rates=[]", head_rates);
+  }
+};
+
+/// Arguments of `pack_rows_`: what `project` takes, which Gaussians have rows, and where. What does not fit the room is
+/// left out.
+struct PackArguments : ProjectArguments {
+  WrittenTensor<'a'> rows;   ///< (room, kPackedWidth)
+  WrittenTensor<'b'> radii;  ///< (room,) int32
+  WrittenTensor<'c'> ids;    ///< (room,) int32
+  Tensor ends;               ///< (C, P) int32, of `count_rows`
+  Tensor firsts;             ///< (C,) int64 on the device, place of each camera's first row
+  int64_t first_id = 0;      ///< what ids in `rows` begin with
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("rows", rows);
+    visit("radii", radii);
+    visit("ids", ids);
+    ProjectArguments::each(visit);
+    visit("ends", ends);
+    visit("firsts", firsts);
+    visit("first_id", first_id);
+  }
+};
+
+/// Arguments of `pack_rows_vjp`.
+struct PackVjpArguments : ProjectArguments, PackedPlaces {
+  Tensor dL_drows;          ///< (n, kPackedGradWidth or more)
+  Tensor ids;               ///< (n,) int32, of `pack_rows_`
+  std::vector<bool> needs;  ///< of ProjectArguments' tensors
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("dL_drows", dL_drows);
+    ProjectArguments::each(visit);
+    visit("ids", ids);
+    PackedPlaces::each(visit);
+    visit("needs", needs);
+  }
+};
+
+/// Arguments of `blend_rows`: packed rows of one camera, in the order of their Gaussians, and what `bin` and `blend`
+/// take besides.
+struct BlendRowsArguments : ImageArguments {
+  Tensor rows, background;  ///< (n, kPackedWidth), (3,)
+  bool keep = false;
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("rows", rows);
+    visit("background", background);
+    ImageArguments::each(visit);
+    visit("keep=False", keep);
+  }
+};
+
+/// Arguments of `blend_rows_vjp_`.
+struct BlendRowsVjpArguments : ImageArguments {
+  /// (n, kPackedGradWidth), or (n, kPackedGradWidthAbsolute) where sums of absolute gradients are wanted. It may lie in
+  /// the memory of the splats in `saved`, which are then no more.
+  WrittenTensor<'a'> dL_drows;
+  OptionalTensor dL_dimage, dL_dalpha;  ///< (3, H, W), (H, W)
+  Tensor background;
+  std::vector<Tensor> saved;
+  bool needs_background = false;
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("dL_drows", dL_drows);
+    visit("dL_dimage", dL_dimage);
+    visit("dL_dalpha", dL_dalpha);
+    visit("background", background);
+    ImageArguments::each(visit);
+    visit("saved", saved);
+    visit("needs_background", needs_background);
   }
 };
 

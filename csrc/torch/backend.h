@@ -89,9 +89,21 @@ struct PairSums {
 struct RowTensors {
   Tensor means2d, cov2d, dets, opacities, depths, colors;
   Tensor absolute;  ///< of a gradient (n, 2): sums over pixels of |dL/dmeans2d|, if PairSums has them
+  /// In the place of all others (n, kPackedWidth) PackedRow, or of a gradient (n, kPackedGradWidth or more).
+  Tensor packed;
+  Tensor kept_covs, kept_opacities;  ///< (n, 4), (n,): all that row_grads reads of packed rows
 
   /// Those that every splat has.
   std::array<Tensor*, 5> numbers() { return {&means2d, &cov2d, &dets, &opacities, &depths}; }
+};
+
+/// Where `project_rows` leaves packed rows (PackedRows in core/stages.h).
+struct PackedTensors {
+  Tensor rows;        ///< (room, kPackedWidth)
+  Tensor radii, ids;  ///< (room,) int32
+  Tensor ends;        ///< (P,) int32
+  Tensor first;       ///< () int64
+  int64_t first_id;
 };
 
 /// What `inspect` finds, in the order in which the op returns it.
@@ -160,9 +172,12 @@ class Backend {
   /// Splats of every Gaussian that may be seen. Writes `radii` (P,) int32, and into `channels` the columns it makes.
   virtual SplatTensors project(const Inputs& in, const Pass& pass, const ChannelTensors& channels,
                                const Tensor& radii) = 0;
-  /// Writes the public rows of all Gaussians (P, ...) and radii; rows of those with radius 0 are undefined.
+  /// Writes the public rows of all Gaussians (P, ...) and radii; rows of those with radius 0 are undefined. Without
+  /// rows it writes only radii, which are not zero for colours that are not finite.
   virtual void project_rows(const Inputs& in, const Pass& pass, const RowTensors& rows, const Tensor& radii) = 0;
-  /// Splats from public rows.
+  /// The same in packed rows, of those Gaussians alone that have a radius.
+  virtual void pack_rows(const Inputs& in, const Pass& pass, const PackedTensors& packed) = 0;
+  /// Splats from public rows. Writes `kept_covs` and `kept_opacities` if they are given.
   virtual SplatTensors shape_rows(const RowTensors& rows, const Pass& pass) = 0;
   /// Lists by tile and depth, and samples per tile, for which the first three channels of `background` are looked at.
   virtual ListTensors bin(const SplatTensors& splats, const Pass& pass, const Tensor& background) = 0;
@@ -177,7 +192,8 @@ class Backend {
   /// Writes `grads`; returns sums of the camera's gradient, (parts, kCameraGradWidth), if it is wanted.
   virtual Tensor project_vjp(const Inputs& in, const ListTensors& lists, const Pass& pass, const PairSums& sums,
                              const ChannelTensors& channels, const Grads& grads) = 0;
-  /// The same from the gradient of public rows; `rows` (P,) int32 has the row of each Gaussian, or -1.
+  /// The same from the gradient of public rows; `rows` (P,) int32 has the row of each Gaussian, or -1. Adds to `grads`
+  /// if grads.add.
   virtual Tensor project_rows_vjp(const Inputs& in, const Tensor& rows, const RowTensors& dL_drows,
                                   const Grads& grads) = 0;
   /// Writes the gradient with respect to means2d, cov2d and opacities of public rows, and `absolute`.

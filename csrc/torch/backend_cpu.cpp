@@ -115,12 +115,20 @@ template <typename T> class CpuBackend final : public Backend {
     stages_of(pass.footprint).of(p.camera).project_rows(p);
   }
 
+  void pack_rows(const Inputs& in, const Pass& pass, const PackedTensors& packed) override {
+    cpu::ProjectRowsParams<T> p = {};
+    set_projection<T>(p, in, pass, Tensor());
+    p.threads = thread_count();
+    p.packed = packed_rows_of<T>(packed);
+    if (p.packed.rows) stages_of(pass.footprint).of(p.camera).project_rows(p);
+  }
+
   SplatTensors shape_rows(const RowTensors& rows, const Pass& pass) override {
-    const int64_t n = rows.means2d.size(0);
+    const int64_t n = row_count(rows);
     SplatTensors out;
     out.splats = at::empty({n, kSplatWidth}, floats_);
     out.ids = at::arange(n, ints_);
-    out.depths = rows.depths;
+    out.depths = rows.packed.defined() ? rows.packed.select(1, kPackedDepth).contiguous() : rows.depths;
     cpu::ShapeRowsParams<T> p = {};
     set_shape_rows<T>(p, rows, pass, out.splats);
     p.threads = thread_count();
@@ -264,6 +272,7 @@ template <typename T> class CpuBackend final : public Backend {
     cpu::ProjectRowsVjpParams<T> p = {};
     set_projection_vjp<T>(p, in, grads);
     p.rows = projected_row_grads_of<T>(rows, dL_drows);
+    p.add = grads.add;
     p.threads = thread_count();
     const Tensor camera_grads = make_camera_grads(p, grads);
     cpu::stages_of<T>(0).of(p.camera).project_rows_vjp(p);  // the same whatever the footprint

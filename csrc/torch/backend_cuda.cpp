@@ -160,8 +160,17 @@ class CudaBackend final : public Backend {
     check_stage("project_rows", false);
   }
 
+  void pack_rows(const Inputs& in, const Pass& pass, const PackedTensors& packed) override {
+    cuda::ProjectRowsParams p = {};
+    set_projection<float>(p, in, pass, Tensor());
+    p.packed = packed_rows_of<float>(packed);
+    if (!p.packed.rows) return;
+    cuda::project_rows(p, stream_);
+    check_stage("pack_rows", false);
+  }
+
   SplatTensors shape_rows(const RowTensors& rows, const Pass& pass) override {
-    SplatTensors out = make_splats(rows.means2d.size(0));
+    SplatTensors out = make_splats(row_count(rows));
     cuda::ShapeRowsParams p = {};
     set_shape_rows<float>(p, rows, pass, out.splats);
     p.keys = structs_of<uint32_t>(out.keys);
@@ -330,6 +339,8 @@ class CudaBackend final : public Backend {
     p.plan = const_structs_of<cuda::PlanState>(state.chunks);
     p.chunk_order = const_structs_of<cuda::TileChunk>(state.chunks) + kPlanRows;
     p.max_chunks = state.chunks.size(0) - kPlanRows;
+    const Tensor chunks_taken = at::empty({cuda::kSampleClasses}, ints_);
+    p.chunks_taken = pointer<int32_t>(chunks_taken);
     p.checkpoints = const_pointer<float>(state.checkpoints);
     p.segments.count = cuda::list_segments(pass.footprint.choice.index, count, pass.grid);
     p.segments.samples = pass.footprint.samples;
@@ -391,6 +402,7 @@ class CudaBackend final : public Backend {
     cuda::ProjectRowsVjpParams p = {};
     set_projection_vjp<float>(p, in, grads);
     p.rows = projected_row_grads_of<float>(rows, dL_drows);
+    p.add = grads.add;
     const Tensor camera_grads = make_camera_grads(p, grads);
     cuda::project_rows_vjp(p, stream_);
     check_stage("project_rows_vjp", false);

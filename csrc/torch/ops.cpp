@@ -57,6 +57,11 @@ template <class Visit> void each_op(const Visit& visit) {
   visit(Op<VjpArguments<RasterizeArguments>, rasterize_vjp>{}, "rasterize_vjp", gradients);
   visit(Op<ProjectArguments, project>{}, "project", projected);
   visit(Op<VjpArguments<ProjectArguments>, project_vjp>{}, "project_vjp", gradients);
+  visit(Op<ProjectArguments, count_rows>{}, "count_rows", "Tensor ends");
+  visit(Op<PackArguments, pack_rows>{}, "pack_rows_", "");
+  visit(Op<PackVjpArguments, pack_rows_vjp>{}, "pack_rows_vjp", gradients);
+  visit(Op<BlendRowsArguments, blend_rows>{}, "blend_rows", blended);
+  visit(Op<BlendRowsVjpArguments, blend_rows_vjp>{}, "blend_rows_vjp_", "Tensor dL_dbackground");
   visit(Op<BinArguments, bin>{}, "bin", "Tensor[] lists");
   visit(Op<BlendArguments, blend>{}, "blend", blended);
   visit(Op<VjpArguments<BlendArguments>, blend_vjp>{}, "blend_vjp", gradients);
@@ -163,6 +168,8 @@ PYBIND11_MODULE(_C, m) {
       },
       "Edge of the tiles that a footprint is binned for [px].");
   m.attr("SPLAT_WIDTH") = ar::kSplatWidth;
+  m.attr("ROW_WIDTH") = ar::kPackedWidth;
+  m.attr("ROW_GRAD_WIDTHS") = std::make_pair(ar::kPackedGradWidth, ar::kPackedGradWidthAbsolute);
   m.attr("NEAR") = ar::kNear;
   m.attr("FRUSTUM_CLAMP") = ar::kFrustumClamp;
   m.attr("ALPHA_MIN") = ar::kAlphaMin;

@@ -26,6 +26,17 @@ Results rasterize_vjp(VjpArguments<RasterizeArguments> a);
 Results project(ProjectArguments a);
 Results project_vjp(VjpArguments<ProjectArguments> a);
 
+/// What several ranks do in the place of `project`, `bin` and `blend`: rows of splats in one piece, which travel
+/// (packed.cpp). `ends` (C, P) int32: how many Gaussians up to each one have a row of each camera. Waits for no device.
+Results count_rows(ProjectArguments a);
+/// Nothing: writes to rows, radii and ids.
+Results pack_rows(PackArguments a);
+Results pack_rows_vjp(PackVjpArguments a);
+/// image (3, H, W), alpha (H, W), saved: with `keep` ListTensors, BlendState, and what row_grads reads of the rows.
+Results blend_rows(BlendRowsArguments a);
+/// dL_dbackground (3,), empty where it is not wanted; writes dL_drows.
+Results blend_rows_vjp(BlendRowsVjpArguments a);
+
 /// lists: ListTensors of camera after camera.
 Results bin(BinArguments a);
 

@@ -1,13 +1,18 @@
 #include "torch/scene_grads.h"
 
+#include <ATen/ops/aminmax.h>
 #include <ATen/ops/arange.h>
 #include <ATen/ops/cat.h>
 #include <ATen/ops/empty_like.h>
+#include <ATen/ops/full.h>
+#include <ATen/ops/stack.h>
 #include <ATen/ops/where.h>
+#include <ATen/ops/zeros_like.h>
 
 #include <algorithm>
 
 #include "core/camera.h"
+#include "torch/checks.h"
 
 namespace ar::ops {
 namespace {
@@ -74,6 +79,50 @@ std::vector<Tensor> list_of(Grads grads, const Tensor& like) {
   std::vector<Tensor> list;
   grads.each_tensor([&](const char*, Tensor& t) { list.push_back(or_empty(t, like)); });
   return list;
+}
+
+std::vector<Tensor> gradients_of(const ProjectArguments& a, const std::vector<bool>& needs,
+                                 const std::function<Tensor(int64_t c, const Inputs&, const Grads&)>& adjoint) {
+  const int64_t cameras = a.viewmatrix.size(0);
+  Grads grads;
+  std::array<std::vector<Tensor>, kCameraTensors> of_cameras;
+  for (int64_t c = 0; c < cameras; ++c) {
+    Inputs in = inputs_of(a, c);
+    check(in);
+    if (c == 0) grads = make_grads(in, needs);
+    grads.add = c > 0;
+    const Tensor camera = adjoint(c, in, grads);
+    if (grads.with_camera) set_camera_grads(camera, needs, grads);
+    const std::vector<Tensor> list = list_of(grads, in.means3D);
+    for (size_t k = 0; k < kCameraTensors; ++k) of_cameras[k].push_back(list[kGaussianTensors + k]);
+  }
+  const std::vector<Tensor> sums = list_of(grads, a.means3D);
+  std::vector<Tensor> out;
+  ProjectArguments(a).each_tensor([&](std::string_view, const OptionalTensor& tensor) {
+    const size_t k = out.size();
+    out.push_back(!needs[k] || !tensor   ? at::empty({0}, a.means3D.options())
+                  : cameras == 0         ? at::zeros_like(*tensor)
+                  : k < kGaussianTensors ? sums[k]
+                                         : at::stack(of_cameras[k - kGaussianTensors]));
+  });
+  out.erase(out.begin() + 1);  // means2D
+  return out;
+}
+
+/// Whether int32 `ids` number rows of `count`; on a device, where the answer would have to be waited for, it is not
+/// asked for.
+bool may_be_rows_of(const Tensor& ids, int64_t count) {
+  if (ids.numel() == 0 || !ids.is_cpu()) return true;
+  const auto [least, most] = at::aminmax(ids);
+  return least.item<int64_t>() >= 0 && most.item<int64_t>() < count;
+}
+
+/// (count,) int32: at the place of each id its number, counted from `first`, and -1 at all others. Ids that are no
+/// places, which nobody has checked on a device, are left out.
+Tensor places_of(const Tensor& ids, int64_t count, int64_t first) {
+  const Tensor places = at::full({count + 1}, -1, ids.options());  // the last one takes what has no place
+  places.index_put_({ids.to(at::kLong).clamp(-1, count)}, at::arange(first, first + ids.numel(), ids.options()));
+  return places.slice(0, 0, count);
 }
 
 Tensor background_grad(const Tensor& dL_dcolor, const BlendState& state, const ListTensors& lists, TileGrid grid) {

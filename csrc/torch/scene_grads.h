@@ -1,6 +1,7 @@
 // Tensors of the gradients with respect to a scene and its camera, for the ops whose adjoint ends there.
 #pragma once
 
+#include <functional>
 #include <vector>
 
 #include "torch/backend.h"
@@ -22,6 +23,19 @@ void set_camera_grads(const Tensor& parts, const std::vector<bool>& needs, Grads
 /// For an op to return: an empty tensor like `like` stands for one that is not wanted.
 inline Tensor or_empty(const Tensor& t, const Tensor& like) { return t.defined() ? t : at::empty({0}, like.options()); }
 std::vector<Tensor> list_of(Grads grads, const Tensor& like);
+
+/// Gradients with respect to the tensors of `project` but means2D, which has a place in `needs`: of the Gaussians the
+/// sum over all cameras, of the cameras side by side. `adjoint` is that of one camera (Backend::project_rows_vjp).
+std::vector<Tensor> gradients_of(const ProjectArguments& a, const std::vector<bool>& needs,
+                                 const std::function<Tensor(int64_t c, const Inputs&, const Grads&)>& adjoint);
+
+/// Whether int32 `ids` number rows of `count`; on a device, where the answer would have to be waited for, it is not
+/// asked for.
+bool may_be_rows_of(const Tensor& ids, int64_t count);
+
+/// (count,) int32: at the place of each id its number, counted from `first`, and -1 at all others. Ids that are no
+/// places, which nobody has checked on a device, are left out.
+Tensor places_of(const Tensor& ids, int64_t count, int64_t first);
 
 /// Gradient with respect to a background: it shows through what no splat covers.
 Tensor background_grad(const Tensor& dL_dcolor, const BlendState& state, const ListTensors& lists, TileGrid grid);

@@ -1,16 +1,12 @@
 // The stages of the pass as ops of their own, for one or several cameras: project, bin, blend. And the weight of a
 // footprint by itself.
-#include <ATen/ops/aminmax.h>
-#include <ATen/ops/arange.h>
 #include <ATen/ops/cat.h>
-#include <ATen/ops/full.h>
 #include <ATen/ops/full_like.h>
 #include <ATen/ops/stack.h>
 #include <ATen/ops/zeros_like.h>
 
 #include <algorithm>
 #include <array>
-#include <type_traits>
 #include <vector>
 
 #include "torch/checks.h"
@@ -19,9 +15,6 @@
 
 namespace ar::ops {
 namespace {
-
-/// Gaussians whose gradients from a camera after the first are made at a time.
-constexpr int64_t kGradientBlock = 1 << 18;
 
 /// The rows of camera `c` in a tensor that holds those of camera after camera.
 Tensor rows_of(const Tensor& t, const Tensor& row_splits, int64_t c) {
@@ -42,37 +35,6 @@ RowTensors make_rows(int64_t n, bool with_colors, const at::TensorOptions& optio
   rows.depths = at::empty({n}, options);
   rows.colors = at::empty({with_colors ? n : 0, 3}, options);
   return rows;
-}
-
-/// The Gaussians from `begin` to `end` alone, as the kernels read them.
-Inputs part_of(Inputs in, int64_t begin, int64_t end) {
-  size_t place = 0;
-  const auto cut = [&](Tensor& t) { t = t.slice(0, begin, end); };
-  in.each_tensor([&](const char*, auto& t) {
-    if (place++ >= kGaussianTensors) return;
-    if constexpr (std::is_same_v<decltype(t), Tensor&>) {
-      cut(t);
-    } else if (t) {
-      cut(*t);
-    }
-  });
-  return in;
-}
-
-/// Whether int32 `ids` number rows of `count`; on a device, where the answer would have to be waited for, it is not
-/// asked for.
-bool may_be_rows_of(const Tensor& ids, int64_t count) {
-  if (ids.numel() == 0 || !ids.is_cpu()) return true;
-  const auto [least, most] = at::aminmax(ids);
-  return least.item<int64_t>() >= 0 && most.item<int64_t>() < count;
-}
-
-/// (count,) int32: at the place of each id its number, counted from `first`, and -1 at all others. Ids that are no
-/// places, which nobody has checked on a device, are left out.
-Tensor places_of(const Tensor& ids, int64_t count, int64_t first) {
-  const Tensor places = at::full({count + 1}, -1, ids.options());  // the last one takes what has no place
-  places.index_put_({ids.to(at::kLong).clamp(-1, count)}, at::arange(first, first + ids.numel(), ids.options()));
-  return places.slice(0, 0, count);
 }
 
 /// What one camera has of a blending.
@@ -159,46 +121,11 @@ Results project_vjp(VjpArguments<ProjectArguments> arguments) {
   dL_drows.opacities = gradient(2, "dL_dopacities", {n});
   dL_drows.depths = gradient(3, "dL_ddepths", {n});
   if (a.shs || a.colors_precomp) dL_drows.colors = gradient(4, "dL_dcolors", {n, 3});
-  // Sums over the cameras of the gradients with respect to the Gaussians; those of the cameras side by side.
-  std::array<Tensor, kGaussianTensors> sums;
-  std::array<std::vector<Tensor>, kCameraTensors> of_cameras;
-  for (int64_t c = 0; c < cameras; ++c) {
-    Inputs in = inputs_of(a, c);
-    check(in);
-    const std::unique_ptr<Backend> backend = make_backend(in.means3D);
+  return {gradients_of(a, needs, [&](int64_t c, const Inputs& in, const Grads& grads) {
     const int64_t first = splits[c].item<int64_t>(), last = splits[c + 1].item<int64_t>();
     const Tensor rows = places_of(ids.slice(0, first, last), count, first);
-    // Block by block, so that no camera but the first needs memory for the gradients of all Gaussians. Those of the
-    // camera are sums over all of them.
-    const bool whole = c == 0 || (in.lens && needs_camera(needs));
-    const int64_t block = whole ? std::max<int64_t>(count, 1) : kGradientBlock;
-    for (int64_t begin = 0; begin == 0 || begin < count; begin += block) {
-      const int64_t end = std::min(begin + block, count);
-      const Inputs part = part_of(in, begin, end);
-      Grads grads = make_grads(part, needs);
-      const Tensor camera = backend->project_rows_vjp(part, rows.slice(0, begin, end), dL_drows, grads);
-      if (grads.with_camera) set_camera_grads(camera, needs, grads);
-      const std::vector<Tensor> list = list_of(grads, in.means3D);
-      for (size_t k = 0; k < kGaussianTensors; ++k) {
-        if (c == 0) {
-          sums[k] = list[k];
-        } else {
-          sums[k].slice(0, begin, end).add_(list[k]);
-        }
-      }
-      for (size_t k = 0; begin == 0 && k < kCameraTensors; ++k) of_cameras[k].push_back(list[kGaussianTensors + k]);
-    }
-  }
-  std::vector<Tensor> out;
-  arguments.of_op.each_tensor([&](std::string_view name, const OptionalTensor& tensor) {
-    const size_t k = out.size();
-    out.push_back(!needs[k] || !tensor   ? at::empty({0}, options)
-                  : cameras == 0         ? at::zeros_like(*tensor)
-                  : k < kGaussianTensors ? sums[k]
-                                         : at::stack(of_cameras[k - kGaussianTensors]));
-  });
-  out.erase(out.begin() + 1);  // means2D
-  return {out};
+    return make_backend(in.means3D)->project_rows_vjp(in, rows, dL_drows, grads);
+  })};
 }
 
 Results bin(BinArguments a) {

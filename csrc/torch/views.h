@@ -69,11 +69,31 @@ template <typename T> ProjectedRows<T> projected_rows_of(const RowTensors& rows)
 template <typename T> ProjectedRowGrads<T> projected_row_grads_of(const Tensor& rows, const RowTensors& dL_drows) {
   ProjectedRowGrads<T> out;
   out.rows = const_pointer<int32_t>(rows);
+  if (const T* packed = const_pointer<T>(dL_drows.packed)) {
+    const int64_t stride = dL_drows.packed.size(1) * int64_t(sizeof(T));
+    out.means2d = {reinterpret_cast<const Vec2<T>*>(packed + kPackedMean), stride};
+    out.cov2d = {reinterpret_cast<const Sym2<T>*>(packed + kPackedCov), stride};
+    out.opacities = {packed + kPackedOpacity, stride};
+    out.colors = {reinterpret_cast<const Vec3<T>*>(packed + kPackedColor), stride};
+    return out;
+  }
   out.means2d = const_pointer<Vec2<T>>(dL_drows.means2d);
   out.cov2d = const_pointer<Sym2<T>>(dL_drows.cov2d);
   out.opacities = const_pointer<T>(dL_drows.opacities);
   out.depths = const_pointer<T>(dL_drows.depths);
   out.colors = const_pointer<Vec3<T>>(dL_drows.colors);
+  return out;
+}
+
+template <typename T> PackedRows<T> packed_rows_of(const PackedTensors& packed) {
+  PackedRows<T> out;
+  out.rows = reinterpret_cast<PackedRow<T>*>(pointer<T>(packed.rows));
+  out.room = packed.rows.size(0);
+  out.first = const_pointer<int64_t>(packed.first);
+  out.ends = const_pointer<int32_t>(packed.ends);
+  out.radii = pointer<int32_t>(packed.radii);
+  out.ids = pointer<int32_t>(packed.ids);
+  out.first_id = packed.first_id;
   return out;
 }
 
@@ -102,20 +122,31 @@ template <typename T, class Params> void set_projection_vjp(Params& p, const Inp
   p.grads = grads_of<T>(in, grads);
 }
 
+inline int64_t row_count(const RowTensors& rows) {
+  return rows.packed.defined() ? rows.packed.size(0) : rows.means2d.size(0);
+}
+
 template <typename T>
 void set_shape_rows(ShapeRowsParams<T>& p, const RowTensors& rows, const Pass& pass, const Tensor& splats) {
-  p.n = rows.means2d.size(0);
+  p.n = row_count(rows);
   p.rows = projected_rows_of<T>(rows);
   p.footprint = pass.footprint.choice;
   p.grid = pass.grid;
   p.splats = pointer<T>(splats);
+  p.packed = reinterpret_cast<const PackedRow<T>*>(const_pointer<T>(rows.packed));
+  p.kept_covs = pointer<T>(rows.kept_covs);
+  p.kept_opacities = pointer<T>(rows.kept_opacities);
 }
 
 template <typename T>
 void set_row_grads(RowGradsParams<T>& p, const RowTensors& rows, const Pass& pass, const RowTensors& dL_drows) {
-  p.n = rows.means2d.size(0);
+  p.n = row_count(dL_drows);
   p.rows = projected_rows_of<T>(rows);
   p.footprint = pass.footprint.choice;
+  p.kept_covs = const_pointer<T>(rows.kept_covs);
+  p.kept_opacities = const_pointer<T>(rows.kept_opacities);
+  p.packed = pointer<T>(dL_drows.packed);
+  p.packed_width = dL_drows.packed.defined() ? int(dL_drows.packed.size(1)) : 0;
   p.dL_dmeans2d = pointer<Vec2<T>>(dL_drows.means2d);
   p.dL_dcov2d = pointer<Sym2<T>>(dL_drows.cov2d);
   p.dL_dopacities = pointer<T>(dL_drows.opacities);

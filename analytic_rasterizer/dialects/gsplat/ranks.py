@@ -61,18 +61,19 @@ class Sharing:
         if world == 1:
             return check(), None
 
-        def make() -> tuple[Checked, dict[str, int]]:
+        def make() -> tuple[Checked, dict[str, int], None]:
             checked = check()
             given = [t for t in tensors.values() if t is not None]
             digest = hashlib.blake2b(repr((settings, str(checked[-1]))).encode(), digest_size=8).digest()
             cameras = tensors["viewmats"], tensors["Ks"]
-            return checked, facts_of(tensors["means"], given, None, "means") | {
+            facts = facts_of(tensors["means"], given, None, "means") | {
                 "cameras": len(tensors["viewmats"]),
                 "settings": int.from_bytes(digest, "little", signed=True),
                 "moving": int(torch.is_grad_enabled() and any(t.requires_grad for t in cameras)),
             }
+            return checked, facts, None
 
-        checked, facts = agree(make, _REQUIREMENTS, None)
+        checked, (facts, _) = agree(make, _REQUIREMENTS, None)
         first_id, _, join = summary_of(facts, rank)
         moving = any(of_rank["moving"] for of_rank in facts)
         return checked, cls(rank, world, facts[0]["cameras"], first_id, join, moving)

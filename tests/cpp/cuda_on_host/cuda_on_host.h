@@ -34,12 +34,12 @@ inline constexpr int kMaxThreads = 1024;
 
 struct Context {
   ucontext_t registers;
-  std::vector<char> stack;
   bool done = false;
 };
 
 inline ucontext_t scheduler;
 inline std::vector<Context> contexts;
+inline std::vector<std::vector<char>> stacks;  // of the contexts; they stay for those of the next blocks
 
 /// Where threads exchange a value each: all must have come before any goes on. What the last exchange gave stays until
 /// the one after the next, which no thread can complete before all have read it.
@@ -110,13 +110,14 @@ inline void launch(int blocks, int threads, std::function<void()> body) {
     contexts = std::vector<Context>(threads);
     for (Meeting& meeting : of_warps) meeting.arrived = meeting.number = 0;
     of_block.arrived = of_block.number = 0;
-    for (Context& context : contexts) {
-      context.stack.resize(kStack);
-      getcontext(&context.registers);
-      context.registers.uc_stack.ss_sp = context.stack.data();
-      context.registers.uc_stack.ss_size = kStack;
-      context.registers.uc_link = &scheduler;
-      makecontext(&context.registers, run_thread, 0);
+    while (stacks.size() < contexts.size()) stacks.emplace_back(kStack);
+    for (int t = 0; t < threads; ++t) {
+      ucontext_t& registers = contexts[t].registers;
+      getcontext(&registers);
+      registers.uc_stack.ss_sp = stacks[t].data();
+      registers.uc_stack.ss_size = kStack;
+      registers.uc_link = &scheduler;
+      makecontext(&registers, run_thread, 0);
     }
     for (int left = threads; left > 0;) {
       for (int t = 0; t < threads; ++t) {
@@ -165,6 +166,11 @@ inline float __int_as_float(int x) {
   float y;
   std::memcpy(&y, &x, sizeof y);
   return y;
+}
+inline uint32_t __float_as_uint(float x) {
+  uint32_t bits;
+  std::memcpy(&bits, &x, sizeof bits);
+  return bits;
 }
 inline int __float_as_int(float x) {
   int y;

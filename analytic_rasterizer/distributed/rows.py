@@ -1,0 +1,392 @@
+"""The cameras of a step: rows of splats from the ranks of their Gaussians to those of the cameras, and back.
+
+A row is a splat in one piece (PackedRow in csrc/core/stages.h). Rows are written where they are sent from and blended
+where they arrive, and so are their gradients: nothing is packed or unpacked.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import accumulate
+from typing import Any, ClassVar, NamedTuple
+
+import torch
+from torch.autograd.function import once_differentiable
+
+from .. import _C
+from ..settings import GaussianRasterizationSettings
+from ..stages import Splats, project_arguments
+from .exchange import Route
+
+_OPS = torch.ops.analytic_rasterizer
+_TENSORS = ("means3D", "opacities", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")
+_CAMERA_TENSORS = ("viewmatrix", "projmatrix", "campos", "lens")
+_ID_OF = {torch.float32: torch.int32, torch.float64: torch.int64}  # integers as wide as the numbers they travel among
+
+
+class OwnSplats(NamedTuple):
+    """The splats of this rank's Gaussians in one camera, as far as density control needs them.
+
+    Attributes:
+        means2d: (n, 2) px. After the backward pass `grad` is the gradient with respect to it, per px.
+        radii: (n,) int32, px. On several ranks 0 of a Gaussian whose colour is not finite.
+        gaussian_ids: (n,) int32, the row of each splat's Gaussian on this rank, ascending.
+        width, height: Of the image, px.
+    """
+
+    means2d: torch.Tensor
+    radii: torch.Tensor
+    gaussian_ids: torch.Tensor
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class Together:
+    """Cameras that the ops take together, and the Gaussians of this rank for them.
+
+    Attributes:
+        cameras: Their places in the settings.
+        gaussians, batch: Arguments of the ops.
+        ends: (C, P) int32: how many Gaussians, up to each one, have a row of each camera; None: no longer needed.
+    """
+
+    cameras: list[int]
+    gaussians: dict[str, Any]
+    batch: dict[str, Any]
+    ends: torch.Tensor | None
+
+    @property
+    def tensors(self) -> list[torch.Tensor | None]:
+        """Those that the rows depend on, some of which are missing."""
+        return [self.gaussians[name] for name in _TENSORS] + [self.batch[name] for name in _CAMERA_TENSORS]
+
+    def arguments(self, tensors: Sequence[torch.Tensor | None]) -> dict[str, Any]:
+        """All arguments, with such tensors in the place of `tensors`."""
+        return self.gaussians | self.batch | dict(zip((*_TENSORS, *_CAMERA_TENSORS), tensors))
+
+    def counts(self) -> torch.Tensor:
+        """(C,) int64, rows of each camera, on the device."""
+        ends = self.ends
+        return ends[:, -1].long() if ends.shape[1] else ends.new_zeros(len(ends), dtype=torch.int64)
+
+
+def counted(
+    cameras: list[GaussianRasterizationSettings], means3D: torch.Tensor, opacities: torch.Tensor, **gaussians: Any
+) -> list[Together]:
+    """The cameras by what they have in common, and which Gaussians they see. Waits for no device."""
+    found = []
+    for places in agreeing(cameras).values():
+        own, batch = project_arguments([cameras[c] for c in places], means3D, opacities, **gaussians)
+        with torch.no_grad():
+            ends = _OPS.count_rows(**own, **batch)
+        found.append(Together(places, own, batch, ends))
+    return found
+
+
+def agreeing(cameras: list[GaussianRasterizationSettings]) -> dict[tuple, list[int]]:
+    """The places of cameras that may share a call of `project`, which adds up their gradients in place."""
+    groups: dict[tuple, list[int]] = {}
+    for camera, s in enumerate(cameras):
+        moves = any(getattr(t, "requires_grad", False) for t in (s.viewmatrix, s.projmatrix, s.campos))
+        size = s.image_height, s.image_width
+        key = (*size, s.scale_modifier, s.sh_degree, str(s.footprint), id(s.effects), moves)
+        groups.setdefault(key, []).append(camera)
+    return groups
+
+
+@lru_cache(maxsize=64)
+def _index(places: tuple[int, ...], device: torch.device) -> torch.Tensor:
+    return torch.tensor(places, device=device)
+
+
+def _at(values: torch.Tensor, places: Sequence[int]) -> torch.Tensor:
+    """The values at these places of a vector. Once an index is on its device nobody waits for it."""
+    if list(places) == list(range(len(values))):
+        return values
+    return values[_index(tuple(places), values.device)]
+
+
+class Shard:
+    """The rows of this rank's Gaussians in all cameras, in the order in which they are sent.
+
+    They can be written before the host knows how many they are: where each camera's begin is known on the device, and
+    how much room they need is guessed from the steps before. What has been guessed wrong is written again.
+
+    Attributes:
+        groups: All cameras.
+        order: The cameras in the order in which their rows are sent.
+        counts: (C,) int64, rows of each camera in this order, on the device.
+    """
+
+    _guesses: ClassVar[dict[tuple, tuple[int, int]]] = {}  # room and id of the first Gaussian, by what is rendered
+
+    def __init__(self, groups: list[Together], order: list[int]):
+        self.groups, self.order = groups, order
+        grouped = [c for group in groups for c in group.cameras]
+        self.counts = _at(torch.cat([group.counts() for group in groups]), [grouped.index(c) for c in order])
+        firsts = _at(self.counts.cumsum(0) - self.counts, [order.index(c) for c in grouped])
+        self._firsts = firsts.split([len(group.cameras) for group in groups])
+        self._key = len(order), self.counts.device
+        self._made: tuple[torch.Tensor, ...] | None = None
+        self._first_id = 0
+
+    def begin(self) -> None:
+        """Writes rows as far as they can be guessed."""
+        guess = self._guesses.get(self._key)
+        if guess is None:
+            return
+        room, first_id = guess
+        most = len(self.order) * len(self.groups[0].gaussians["means3D"])
+        with suppress(torch.OutOfMemoryError):  # there may be enough for as many as there are
+            self._write(min(room, most), first_id)
+
+    def finish(self, total: int, first_id: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """All rows (total, ROW_WIDTH), their radii and ids (total,), the ids in the rows counting from `first_id`."""
+        if self._made is None or len(self._made[0]) < total or self._first_id != first_id:
+            self._made = None
+            self._write(total, first_id)
+        room = max(total + total // 16, self._guesses.get(self._key, (0, 0))[0] * 15 // 16)
+        self._guesses[self._key] = room, first_id
+        rows, radii, ids = (t[:total] for t in self._made)
+        self._made, self.groups[:] = None, [replace(group, ends=None) for group in self.groups]
+        return rows, radii, ids
+
+    @torch.no_grad()
+    def _write(self, room: int, first_id: int) -> None:
+        like = self.groups[0].gaussians["means3D"]
+        rows = like.new_empty(room, _C.ROW_WIDTH)
+        radii, ids = (like.new_empty(room, dtype=torch.int32) for _ in range(2))
+        for group, firsts in zip(self.groups, self._firsts):
+            arguments = group.gaussians | group.batch
+            _OPS.pack_rows_(rows, radii, ids, **arguments, ends=group.ends, firsts=firsts, first_id=first_id)
+        self._made, self._first_id = (rows, radii, ids), first_id
+
+
+@dataclass
+class Step:
+    """A step between its agreement and its backward pass.
+
+    Attributes:
+        shard: The rows of this rank's Gaussians.
+        route: Which rows go where.
+        first_id: Global id of the first Gaussian of this rank.
+        join: Whether any rank needs a gradient with respect to Gaussians or cameras.
+        keep: Whether there will be a backward pass.
+        absolute: Whether sums of absolute gradients are wanted.
+        backgrounds: (3,) of the cameras of this rank.
+        own: Made by the forward pass: the splats of this rank's Gaussians, by camera.
+        received: The splats of this rank's cameras.
+        means2d_abs: (n, 2) for each camera, which the backward pass gives gradients; empty unless wanted.
+    """
+
+    shard: Shard
+    route: Route
+    first_id: int
+    join: bool
+    keep: bool
+    absolute: bool
+    backgrounds: list[torch.Tensor]
+    own: tuple[OwnSplats, ...] = ()
+    received: tuple[Splats, ...] = ()
+    means2d_abs: tuple[torch.Tensor, ...] = ()
+
+    def __post_init__(self):
+        self.groups = self.shard.groups
+        counts = self.route.counts[self.route.rank]
+        ends = list(accumulate(counts[c] for c in self.route.order))
+        self._first = {c: end - counts[c] for c, end in zip(self.route.order, ends)}  # of the rows that are sent
+        self._total = ends[-1]
+        self._ids: torch.Tensor | None = None
+        self._blended: list[list[torch.Tensor]] | None = []  # what is saved of each camera; None: it has been used
+        self._means2d: dict[int, weakref.ref] = {}
+
+    def take(self) -> tuple[tuple[OwnSplats, ...], tuple[Splats, ...]]:
+        """What the forward pass made of splats, own and received, which the step then lets go of."""
+        made = self.own, self.received
+        self.own = self.received = ()
+        return made
+
+    def places(self, group: Together) -> dict[str, list[int]]:
+        """Where the rows of cameras are, by the names of the ops."""
+        counts = self.route.counts[self.route.rank]
+        return {"firsts": [self._first[c] for c in group.cameras], "counts": [counts[c] for c in group.cameras]}
+
+    def run(self) -> tuple[torch.Tensor, ...]:
+        """Images (3, H, W) of this rank's cameras, and then their alphas (1, H, W)."""
+        sent = self._rows_of_shard()
+        rows = self._of_cameras(self.route.send(sent.view(-1), _C.ROW_WIDTH, True).view(-1, _C.ROW_WIDTH))
+        del sent  # before the memory is needed
+        sizes = {c: group.batch for group in self.groups for c in group.cameras}
+        images, alphas, received = [], [], []
+        for camera, of_camera, background in zip(self.route.own, rows, self.backgrounds):
+            image = _image_arguments(sizes[camera])
+            color, alpha, saved = _OPS.blend_rows(of_camera, background.detach(), **image, keep=self.keep)
+            images.append(color)
+            alphas.append(alpha[None])
+            self._blended.append(saved)
+            received.append(_splats_of(of_camera, image))
+        self.received = tuple(received)
+        return *images, *alphas
+
+    def _rows_of_shard(self) -> torch.Tensor:
+        """The rows of this rank's Gaussians in all cameras, in the order in which they are sent."""
+        rows, radii, ids = self.shard.finish(self._total, self.first_id)
+        like = rows
+        own: dict[int, OwnSplats] = {}
+        for group in self.groups:
+            size = group.batch["image_width"], group.batch["image_height"]
+            for camera, first, count in zip(group.cameras, *self.places(group).values()):
+                part = slice(first, first + count)
+                means2d = rows[part, :2].contiguous()  # a copy: the rows go when they have been sent
+                own[camera] = OwnSplats(means2d, radii[part], ids[part], *size)
+        self.own = tuple(own[c] for c in range(len(own)))
+        self._ids = ids
+        if self.absolute:
+            self.means2d_abs = tuple(like.new_zeros(()).expand(len(s.means2d), 2) for s in self.own)
+        self._means2d = {
+            c: weakref.ref(own[c].means2d) for group in self.groups if self._trains(group) for c in group.cameras
+        }
+        return rows
+
+    def _trains(self, group: Together) -> bool:
+        """Whether the rows of this rank's Gaussians have a gradient."""
+        return self.keep and any(t is not None and t.requires_grad for t in group.tensors)
+
+    def _of_cameras(self, received: torch.Tensor) -> list[torch.Tensor]:
+        """Rows by camera of this rank, of all ranks in turn, from rows by rank."""
+        own, counts = self.route.own, self.route.counts
+        if len(own) <= 1:
+            return [received] * len(own)
+        blocks = received.split([of_rank[c] for of_rank in counts for c in own])
+        return [torch.cat(blocks[k :: len(own)]) for k in range(len(own))]
+
+    def _of_ranks(self, by_camera: list[torch.Tensor], like: torch.Tensor) -> torch.Tensor:
+        """The opposite of `_of_cameras`."""
+        if len(by_camera) <= 1:
+            return by_camera[0] if by_camera else like.new_empty(0)
+        counts = self.route.counts
+        blocks = [rows.split([n[c] for n in counts]) for c, rows in zip(self.route.own, by_camera)]
+        return torch.cat([of_camera[rank] for rank in range(len(counts)) for of_camera in blocks])
+
+    def run_back(
+        self, dL_dimages: Sequence[Any], dL_dalphas: Sequence[Any], needs: Sequence[bool], tensors: list[Any]
+    ) -> list[Any]:
+        """Gradients with respect to the backgrounds and then `tensors`, those of group after group; `needs` are theirs.
+
+        Gives own means2d and means2d_abs their gradients.
+        """
+        blended, self._blended = self._blended, None
+        if blended is None:
+            raise RuntimeError("the backward pass of distributed.rasterize runs once: it overwrites what was saved")
+        width = _C.ROW_GRAD_WIDTHS[int(self.absolute)]
+        sizes = {c: group.batch for group in self.groups for c in group.cameras}
+        of_backgrounds, by_camera = [], []
+        for k, (camera, bg) in enumerate(zip(self.route.own, self.backgrounds)):
+            saved, blended[k] = blended[k], []
+            rows = saved[0].view(-1)[: len(saved[0]) * width].view(-1, width)  # in the place of splats
+            of_bg = _OPS.blend_rows_vjp_(
+                rows,
+                dL_dimages[k],
+                None if dL_dalphas[k] is None else dL_dalphas[k][0],
+                bg.detach(),
+                **_image_arguments(sizes[camera]),
+                saved=saved,
+                needs_background=needs[k],
+            )
+            of_backgrounds.append(of_bg if needs[k] else None)
+            by_camera.append(rows)
+            del saved, rows
+        count = len(self.backgrounds)
+        if not self.join:
+            return [*of_backgrounds, *[None] * len(tensors)]
+        flat = self._of_ranks(by_camera, self.groups[0].gaussians["means3D"]).reshape(-1)
+        by_camera.clear()
+        own = self.route.send(flat, width, False).view(-1, width)
+        del flat
+        self._give(own)
+        found, step = [], len(_TENSORS) + len(_CAMERA_TENSORS)
+        for k, group in enumerate(self.groups):
+            part = slice(step * k, step * (k + 1))
+            needed = needs[count:][part]
+            if not any(needed):
+                found += [None] * step
+                continue
+            arguments = group.arguments(tensors[part])
+            made = _OPS.pack_rows_vjp(own, **arguments, ids=self._ids, **self.places(group), needs=needed)
+            found += [t.view_as(tensor) if need else None for t, tensor, need in zip(made, tensors[part], needed)]
+        return [*of_backgrounds, *found]
+
+    def _give(self, own: torch.Tensor) -> None:
+        """Gives what the batch holds its gradients, from those with respect to the rows of this rank's Gaussians."""
+        counts = self.route.counts[self.route.rank]
+        for camera, first in self._first.items():
+            rows = own[first : first + counts[camera]]
+            means2d = self._means2d.get(camera, lambda: None)()
+            if means2d is not None:
+                means2d.grad = rows[:, :2]
+            if self.absolute:
+                self.means2d_abs[camera].grad = rows[:, -2:]
+
+
+class _Rasterize(torch.autograd.Function):
+    """The step as one node. `join` requires a gradient where any rank needs one, so that all take part in the way back.
+
+    Returns:
+        The anchor, the images and the alphas of this rank's cameras.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, step: Step, join: torch.Tensor | None, *tensors: torch.Tensor | None):
+        ctx.set_materialize_grads(False)
+        ctx.step = step
+        ctx.save_for_backward(*tensors[len(step.backgrounds) :])
+        anchor = step.groups[0].gaussians["means3D"].new_zeros(())
+        return anchor, *step.run()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, _: torch.Tensor | None, *gradients: torch.Tensor | None):
+        step, count = ctx.step, len(gradients) // 2
+        needs = list(ctx.needs_input_grad[2:])
+        found = step.run_back(gradients[:count], gradients[count:], needs, list(ctx.saved_tensors))
+        return None, None, *found
+
+
+def rendered(step: Step) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.Tensor]]:
+    """The anchor, and image (3, H, W) and alpha (1, H, W) of this rank's cameras."""
+    like = step.groups[0].gaussians["means3D"]
+    join = like.new_zeros((), requires_grad=True) if step.join else None
+    tensors = [t for group in step.groups for t in group.tensors]
+    anchor, *made = _Rasterize.apply(step, join, *step.backgrounds, *tensors)
+    count = len(made) // 2
+    return anchor, made[:count], made[count:]
+
+
+def _image_arguments(batch: dict[str, Any]) -> dict[str, Any]:
+    return {name: batch[name] for name in ("image_height", "image_width", "footprint", "option")}
+
+
+def _splats_of(rows: torch.Tensor, image: dict[str, Any]) -> Splats:
+    """Rows of one camera by the names of their columns, without copying them."""
+    ids = rows.view(_ID_OF[rows.dtype])[:, 11].int()
+    return Splats(
+        means2d=rows[:, :2],
+        cov2d=rows[:, 2:5],
+        opacities=rows[:, 5],
+        depths=rows[:, 6],
+        colors=rows[:, 7:10],
+        radii=ids.new_empty(0),
+        gaussian_ids=ids,
+        camera_ids=ids.new_zeros(1).expand(len(rows)),
+        row_splits=torch.tensor([0, len(rows)]),
+        dets=rows[:, 10],
+        width=image["image_width"],
+        height=image["image_height"],
+        footprint=image["footprint"],
+        option=image["option"],
+    )

@@ -1,0 +1,536 @@
+"""What a frame of the viewer's page costs on a graphics device, without a browser: the page's own shaders under OpenGL.
+
+    pip install moderngl
+    python benchmarks/viewer_gpu.py SCENE --views VIEWS [--sizes 512x384,1920x1080] [--footprints point analytic ...]
+
+The sources of the shaders, their constants and the table of `analytic` are taken from the modules of the page, which
+node runs; what is around them is drawn as project.js and draw.js do it, with the same textures, geometry and blending.
+Needs a context of OpenGL 4.3, which takes shaders of GLSL ES 3.00; on Linux it comes from EGL and needs no window.
+
+Each picture of the first size, blended in 32-bit floats (as when the camera rests) and in half floats (as when it
+moves), is compared with that of the CPU rasterizer. Frames are then timed in half floats, footprints in turn, round
+after round. A frame is a projection of all Gaussians and one drawing; the order by depth, which a worker of the page
+finds, is not in it. "device" is the time between two timestamps of the graphics device, with another frame before them
+so that it never waits for commands; "clock" is the time from the first call until everything is drawn. Medians over
+rounds, averaged over views.
+
+For a machine without node, or without this package, prepare there where they are:
+
+    python benchmarks/viewer_gpu.py --write-shaders FILE.json                  then --shaders FILE.json
+    python benchmarks/viewer_gpu.py SCENE --views VIEWS --prepare FILE.npz     then FILE.npz in place of the scene
+
+The second holds scene, cameras, shaders and the pictures to compare with, and needs numpy and moderngl only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+MODULES = ("constants.js", "logistic.js", "shaders.js")
+EXTRACT = """
+import { CONSTANTS, FOOTPRINTS, boxNodes, parseFootprint } from './constants.js';
+import { windowTable } from './logistic.js';
+import {
+  ADD, FULL_SCREEN, SPLATS_PER_INSTANCE, SPLATS_PER_ROW, drawFragmentShader, drawVertexShader, projectShader,
+  texelsOfHarmonics,
+} from './shaders.js';
+
+const DEGREES = [0, 1, 2, 3];
+const footprints = {}, projections = {};
+for (const [name] of FOOTPRINTS) {
+  const { kind, samples, variance } = parseFootprint(name);
+  const nodes = kind === 'box' ? boxNodes(samples) : [[0, 0]];
+  const passes = atOnce => Array.from({ length: Math.ceil(nodes.length / atOnce) },
+    (_, k) => drawFragmentShader(kind, nodes.slice(k * atOnce, (k + 1) * atOnce)));
+  footprints[name] = {
+    kind, variance, samples: nodes.length, vertex: drawVertexShader(kind, samples),
+    fragments: { 4: passes(4), 8: passes(8) },
+  };
+  projections[kind] = DEGREES.map(degree => projectShader(kind, degree));
+}
+console.log(JSON.stringify({
+  near: CONSTANTS.kNear, frustum_clamp: CONSTANTS.kFrustumClamp, splats_per_row: SPLATS_PER_ROW,
+  splats_per_instance: SPLATS_PER_INSTANCE, texels_of_harmonics: DEGREES.map(texelsOfHarmonics),
+  window: Array.from(windowTable()), full_screen: FULL_SCREEN, add: ADD, projections, footprints,
+}));
+"""
+HALF, FULL = "f2", "f4"  # what is blended, as moderngl calls it
+WARM_UP = 1.0  # s of drawing before frames are timed: devices raise their clocks
+BITS = {HALF: "16-bit floats", FULL: "32-bit floats"}
+
+
+def main() -> None:
+    args = parse_arguments()
+    if args.write_shaders:
+        Path(args.write_shaders).write_text(json.dumps(extract_shaders()))
+        return
+    job = Job.load(args.scene) if is_prepared(args.scene) else prepare(args)
+    if args.prepare:
+        job.save(args.prepare)
+        return
+    context = create_context()
+    device = f"{context.info['GL_RENDERER']}, OpenGL {context.info['GL_VERSION']}"
+    print(f"{job.name}: {len(job.geometry)} Gaussians of SH degree {job.degree}, {len(job.cameras)} sizes, {device}")
+    renderer = Renderer(context, job)
+    names = args.footprints or list(job.shaders["footprints"])
+    differences = compare(renderer, job, names)
+    print(f"\n{format_differences(differences, job)}" if differences else "\nNot compared: no pictures of these views.")
+    if args.pictures:
+        save_pictures(renderer, job, names, Path(args.pictures))
+    results = {"device": device, "scene": job.name, "gaussians": len(job.geometry), "sh_degree": job.degree}
+    results |= {"differences": differences, "rows": []}
+    for size in job.cameras:
+        rows = measure(renderer, job, size, names, args.rounds, args.seconds)
+        print(f"\n{format_rows(rows, size)}", flush=True)
+        results["rows"] += rows
+        if args.json:
+            Path(args.json).write_text(json.dumps(results, indent=2))
+
+
+def parse_arguments() -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    add = parser.add_argument
+    add("scene", nargs="?", help=".ply, compressed .ply, .spz, .npz of scene_files.py, or what --prepare wrote")
+    add("--views", help="file of views")
+    add("--limit-views", type=int, help="use only so many of them")
+    add("--sizes", default="512x384,1920x1080", help="of the pictures (default: %(default)s)")
+    add("--footprints", nargs="+", metavar="NAME", help="those of the page (default: all)")
+    add("--rounds", type=int, default=30, help="timed rounds after warming up (default: %(default)s)")
+    add("--seconds", type=float, default=60.0, help="for the rounds of a size, at most (default: %(default)s)")
+    add("--json", help="also write everything measured to this file")
+    add("--pictures", help="also write pictures of the first view and size to this folder, as PNG; needs pillow")
+    add("--shaders", help="file that --write-shaders wrote, instead of node")
+    add("--write-shaders", metavar="FILE", help="write the shaders of the page to this file, and end")
+    add("--prepare", metavar="FILE", help="write all that measuring needs to this .npz, and end")
+    args = parser.parse_args()
+    if not args.write_shaders:
+        if args.scene is None:
+            parser.error("a scene is needed")
+        if not is_prepared(args.scene) and args.views is None:
+            parser.error("--views is needed")
+    return args
+
+
+# --------------------------------------------------------------------------------------- preparing
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole of the page: lengths in pixels, `w2c` 16 numbers by rows."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    w2c: list[float]
+
+
+@dataclass(frozen=True)
+class Job:
+    """What is to be drawn, in the form that the page has it.
+
+    Attributes:
+        name: Of the scene.
+        degree: Of its spherical harmonics.
+        geometry, harmonics: float32 (P, 12) and float16 (P, numbers), as `viewer.PackedScene` describes them.
+        shaders: What `extract_shaders` returns.
+        cameras: By size, "WxH", one for each view.
+        expected: By footprint, the pictures of all views at the first size: uint8 (views, 3, height, width).
+    """
+
+    name: str
+    degree: int
+    geometry: np.ndarray
+    harmonics: np.ndarray
+    shaders: dict
+    cameras: dict[str, list[Camera]]
+    expected: dict[str, np.ndarray]
+
+    def save(self, path: str) -> None:
+        cameras = {size: [vars(camera) for camera in of_size] for size, of_size in self.cameras.items()}
+        meta = {"name": self.name, "degree": self.degree, "shaders": self.shaders, "cameras": cameras}
+        arrays = {"geometry": self.geometry, "harmonics": self.harmonics}
+        arrays |= {f"expected {name}": pictures for name, pictures in self.expected.items()}
+        with open(path, "wb") as file:
+            np.savez_compressed(file, job=np.array(json.dumps(meta)), **arrays)
+
+    @staticmethod
+    def load(path: str) -> Job:
+        with np.load(path) as file:
+            meta = json.loads(str(file["job"]))
+            meta["cameras"] = {size: [Camera(**c) for c in of_size] for size, of_size in meta["cameras"].items()}
+            prefix = "expected "
+            expected = {key.removeprefix(prefix): file[key] for key in file if key.startswith(prefix)}
+            return Job(**meta, geometry=file["geometry"], harmonics=file["harmonics"], expected=expected)
+
+
+def is_prepared(path: str) -> bool:
+    if Path(path).suffix != ".npz":
+        return False
+    with np.load(path) as file:
+        return "job" in file
+
+
+def extract_shaders() -> dict:
+    """The sources and numbers of the page, by its own modules."""
+    from analytic_rasterizer.viewer import pages
+
+    with tempfile.TemporaryDirectory() as folder:
+        for name in MODULES:
+            (Path(folder) / name).write_text(pages.page_file(name))
+        (Path(folder) / "package.json").write_text('{"type": "module"}')
+        (Path(folder) / "extract.js").write_text(EXTRACT)
+        try:
+            done = subprocess.run(["node", "extract.js"], cwd=folder, capture_output=True, text=True, check=True)
+        except FileNotFoundError:
+            sys.exit("The shaders are read out of the page by node, which is not installed: see --write-shaders.")
+    return json.loads(done.stdout)
+
+
+def prepare(args: argparse.Namespace) -> Job:
+    """The job of a scene and views, with pictures of the CPU rasterizer."""
+    from common import parse_size
+    from scene_files import load_scene
+
+    from analytic_rasterizer import io, render_stages, viewer
+
+    shaders = json.loads(Path(args.shaders).read_text()) if args.shaders else extract_shaders()
+    scene, views = load_scene(args.scene), io.load_views(args.views)[: args.limit_views]
+    packed = viewer.pack_scene(scene, views, name=Path(args.scene).name)
+    count = len(scene.means)
+
+    def resized(view: io.View, size: str) -> io.View:
+        width, height = parse_size(size)
+        x, y = width / view.width, height / view.height
+        cx, cy = (view.width / 2 if view.cx is None else view.cx), (view.height / 2 if view.cy is None else view.cy)
+        return replace(view, width=width, height=height, fx=x * view.fx, fy=y * view.fy, cx=x * cx, cy=y * cy)
+
+    def camera(view: io.View) -> Camera:
+        lens = {key: getattr(view, key) for key in ("width", "height", "fx", "fy", "cx", "cy")}
+        return Camera(**lens, w2c=view.w2c.flatten().tolist())
+
+    def picture(view: io.View, footprint: str) -> np.ndarray:
+        settings = view.settings(sh_degree=scene.sh_degree, footprint=footprint)
+        return to_bytes(render_stages(settings, **scene.arguments()).color.numpy())
+
+    sizes = args.sizes.split(",")
+    names = args.footprints or list(shaders["footprints"])
+    return Job(
+        packed.meta["name"],
+        scene.sh_degree,
+        np.frombuffer(packed.geometry, "<f4").reshape(count, -1),
+        np.frombuffer(packed.harmonics, "<f2").reshape(count, -1),
+        shaders,
+        {size: [camera(resized(view, size)) for view in views] for size in sizes},
+        {name: np.stack([picture(resized(view, sizes[0]), name) for view in views]) for name in names},
+    )
+
+
+def to_bytes(picture: np.ndarray) -> np.ndarray:
+    return np.rint(255 * picture.clip(0, 1)).astype(np.uint8)
+
+
+# --------------------------------------------------------------------------------------- drawing
+
+
+def create_context():
+    """A context of moderngl without a window; ends the program with a sentence where there is none."""
+    try:
+        import moderngl
+    except ImportError:
+        sys.exit("This benchmark needs moderngl: pip install moderngl")
+    try:
+        backend = {"backend": "egl"} if sys.platform == "linux" else {}
+        context = moderngl.create_context(require=430, standalone=True, **backend)
+    except Exception as error:  # moderngl raises Exception itself
+        sys.exit(f"There is no OpenGL 4.3 here, or no EGL to reach it by: {error}")
+    return context
+
+
+class Renderer:
+    """What project.js and draw.js do, for one scene."""
+
+    def __init__(self, context, job: Job):
+        self.context, self.job, self.shaders = context, job, job.shaders
+        count, width = len(job.geometry), self.shaders["splats_per_row"]
+        self.rows = -(-count // width)
+        texels = self.shaders["texels_of_harmonics"][job.degree]
+        self.harmonics_per_row = context.info["GL_MAX_TEXTURE_SIZE"] // texels
+        self.samples_per_pass = 8 if context.info["GL_MAX_DRAW_BUFFERS"] >= 8 else 4
+        self.geometry = self.filled(3 * width, 4, "f4", job.geometry)
+        self.harmonics = self.filled(texels * self.harmonics_per_row, 4, "f2", job.harmonics)
+        self.window = self.filled(2, 4, "f4", np.array(self.shaders["window"], np.float32))
+        self.order = self.texture(width, self.rows, 1, "u4")
+        self.splats = [self.texture(width, self.rows, 4, "u4") for _ in range(3)]
+        self.splats_target = context.framebuffer(self.splats)
+        self.visible = 0
+        corners = 4 * np.arange(self.shaders["splats_per_instance"])[:, None] + [0, 1, 2, 2, 1, 3]
+        self.corners = context.buffer(corners.astype(np.uint16).tobytes())
+        self.programs, self.targets = {}, {}
+        self.queries = [context.query(time=True) for _ in range(2)]
+
+    def texture(self, width: int, height: int, components: int, dtype: str, data=None):
+        texture = self.context.texture((width, height), components, data, alignment=1, dtype=dtype)
+        texture.filter = (self.context.NEAREST, self.context.NEAREST)
+        texture.repeat_x = texture.repeat_y = False
+        return texture
+
+    def filled(self, width: int, components: int, dtype: str, data: np.ndarray):
+        """A texture of as many rows as the data take; the rest of the last row is zero."""
+        per_row = width * components
+        rows = -(-data.size // per_row)
+        padded = np.zeros(rows * per_row, data.dtype)
+        padded[: data.size] = data.reshape(-1)
+        return self.texture(width, rows, components, dtype, padded.tobytes())
+
+    def target(self, name: str, camera: Camera, dtype: str, count: int = 1):
+        """A framebuffer with `count` textures of the size of the picture."""
+        key = (name, camera.width, camera.height, dtype, count)
+        if key not in self.targets:
+            pictures = [self.texture(camera.width, camera.height, 4, dtype) for _ in range(count)]
+            self.targets[key] = self.context.framebuffer(pictures)
+        return self.targets[key]
+
+    def program(self, vertex: str, fragment: str, indices=None):
+        """A program and the empty vertex array that it draws."""
+        key = (vertex, fragment)
+        if key not in self.programs:
+            program = self.context.program(vertex_shader=vertex, fragment_shader=fragment)
+            self.programs[key] = program, self.context.vertex_array(program, [], indices, index_element_size=2)
+        return self.programs[key]
+
+    @staticmethod
+    def set_uniforms(program, textures: dict, **values) -> None:
+        for unit, (name, texture) in enumerate(textures.items()):
+            if name in program:
+                texture.use(unit)
+                program[name].value = unit
+        for name, value in values.items():
+            program[name].value = value
+
+    def sort(self, camera: Camera) -> None:
+        """The order of sort.js: the farthest first, in depths rounded as the rasterizer rounds them."""
+        x, y, z, w = np.array(camera.w2c[8:12], np.float32)
+        means = self.job.geometry
+        depth = x * means[:, 0] + y * means[:, 1] + z * means[:, 2] + w
+        visible = np.flatnonzero(depth > np.float32(self.shaders["near"]))
+        order = visible[np.argsort(depth[visible], kind="stable")][::-1]
+        padded = np.zeros(self.rows * self.shaders["splats_per_row"], np.uint32)
+        padded[: len(order)] = order
+        self.order.write(padded.tobytes())
+        self.visible = len(order)
+
+    def project(self, camera: Camera, name: str) -> None:
+        footprint, context = self.shaders["footprints"][name], self.context
+        source = self.shaders["projections"][footprint["kind"]][self.job.degree]
+        program, vertices = self.program(self.shaders["full_screen"], source)
+        self.splats_target.use()
+        context.viewport = (0, 0, self.shaders["splats_per_row"], self.rows)
+        context.disable(context.BLEND)
+        view = np.array(camera.w2c).reshape(4, 4)
+        clamp = self.shaders["frustum_clamp"] / 2
+        values = {
+            "uCount": len(self.job.geometry),
+            "uHarmonicsPerRow": self.harmonics_per_row,
+            "uView": [tuple(row) for row in view[:3]],
+            "uEye": tuple(-view[:3, :3].T @ view[:3, 3]),
+            "uPinhole": (camera.fx, camera.fy, camera.cx, camera.cy),
+            "uLimit": (clamp * camera.width / camera.fx, clamp * camera.height / camera.fy),
+            "uVariance": footprint["variance"],
+        }
+        values = {name: value for name, value in values.items() if name in program}
+        self.set_uniforms(program, {"uGeometry": self.geometry, "uHarmonics": self.harmonics}, **values)
+        vertices.render(context.TRIANGLES, vertices=3)
+
+    def draw(self, camera: Camera, name: str, dtype: str):
+        """Draws the splats of the last projection; returns the framebuffer that holds the picture."""
+        footprint, context = self.shaders["footprints"][name], self.context
+        context.viewport = (0, 0, camera.width, camera.height)
+        context.enable(context.BLEND)
+        if footprint["samples"] == 1:
+            picture = self.target("picture", camera, dtype)
+            self.draw_samples(picture, camera, footprint["vertex"], footprint["fragments"]["8"][0])
+            return picture
+        # Every sample has a picture of its own; the result is their mean.
+        at_once = 4 if dtype == FULL else self.samples_per_pass
+        picture = self.target("sum", camera, FULL)
+        for k, fragment in enumerate(footprint["fragments"][str(at_once)]):
+            samples = self.target("samples", camera, dtype, min(at_once, footprint["samples"]))
+            self.draw_samples(samples, camera, footprint["vertex"], fragment)
+            picture.use()
+            if k == 0:
+                picture.clear()
+            context.blend_func = context.ONE, context.ONE
+            program, vertices = self.program(self.shaders["full_screen"], self.shaders["add"])
+            for sample in samples.color_attachments:
+                self.set_uniforms(program, {"uPicture": sample}, uFactor=1 / footprint["samples"])
+                vertices.render(context.TRIANGLES, vertices=3)
+        return picture
+
+    def draw_samples(self, target, camera: Camera, vertex: str, fragment: str) -> None:
+        context = self.context
+        program, vertices = self.program(vertex, fragment, self.corners)
+        target.use()
+        target.clear()
+        context.blend_func = context.ONE, context.ONE_MINUS_SRC_ALPHA
+        names = ("uMean", "uWhitening", "uColor")
+        textures = dict(zip(names, self.splats)) | {"uOrder": self.order, "uWindow": self.window}
+        self.set_uniforms(program, textures, uVisible=self.visible, uSize=(camera.width, camera.height))
+        instances = -(-self.visible // self.shaders["splats_per_instance"])
+        if instances > 0:
+            vertices.render(context.TRIANGLES, instances=instances)
+
+    def render(self, camera: Camera, name: str, dtype: str):
+        self.project(camera, name)
+        return self.draw(camera, name, dtype)
+
+    def picture(self, camera: Camera, name: str, dtype: str) -> np.ndarray:
+        """The picture over black, as uint8 (3, height, width) with row 0 at the top. Sorts."""
+        self.sort(camera)
+        target = self.render(camera, name, dtype)
+        values = np.frombuffer(target.read(components=4, dtype="f4"), np.float32)
+        return to_bytes(values.reshape(camera.height, camera.width, 4)[..., :3].transpose(2, 0, 1))
+
+
+# --------------------------------------------------------------------------------------- measuring
+
+
+def compare(renderer: Renderer, job: Job, names: list[str]) -> dict[str, dict]:
+    """By footprint and what is blended: the largest difference from the expected pictures [levels of 255], its 99.99th
+    percentile, and the part of the values that differ."""
+    cameras = next(iter(job.cameras.values()))
+    differences = {}
+    for name in names:
+        if name not in job.expected:
+            continue
+        differences[name] = {}
+        for dtype, bits in BITS.items():
+            ours = np.stack([renderer.picture(camera, name, dtype) for camera in cameras])
+            levels = np.abs(ours.astype(np.int16) - job.expected[name])
+            differences[name][bits] = {
+                "largest": int(levels.max()),
+                "99.99%": float(np.quantile(levels, 0.9999)),
+                "differing": float((levels > 0).mean()),
+            }
+    return differences
+
+
+def save_pictures(renderer: Renderer, job: Job, names: list[str], folder: Path) -> None:
+    from PIL import Image
+
+    folder.mkdir(parents=True, exist_ok=True)
+    camera = next(iter(job.cameras.values()))[0]
+    for name in names:
+        picture = renderer.picture(camera, name, FULL).transpose(1, 2, 0)
+        Image.fromarray(np.ascontiguousarray(picture)).save(folder / f"{name.replace(':samples=', '_')}.png")
+
+
+def time_frame(renderer: Renderer, camera: Camera, name: str) -> dict[str, float]:
+    """Milliseconds of one frame in half floats: by the clock, and of its two parts on the device."""
+    context = renderer.context
+    context.finish()
+    start = time.perf_counter()
+    renderer.render(camera, name, HALF)
+    context.finish()
+    clock = 1e3 * (time.perf_counter() - start)
+    renderer.render(camera, name, HALF)  # the device is at work on it while it is sent what is timed
+    with renderer.queries[0]:
+        renderer.project(camera, name)
+    with renderer.queries[1]:
+        renderer.draw(camera, name, HALF)
+    project, draw = (query.elapsed / 1e6 for query in renderer.queries)
+    return {"clock": clock, "device": project + draw, "project": project, "draw": draw}
+
+
+def measure(renderer: Renderer, job: Job, size: str, names: list[str], rounds: int, seconds: float) -> list[dict]:
+    """A row for each footprint at a size. Ends before `rounds` rounds after so many seconds."""
+    cameras = job.cameras[size]
+
+    def time_round() -> dict[str, list[dict]]:
+        times = {name: [] for name in names}
+        for camera in cameras:
+            renderer.sort(camera)
+            for name in names:
+                times[name].append(time_frame(renderer, camera, name))
+        return times
+
+    start = time.perf_counter()
+    while True:  # the first round compiles shaders
+        time_round()
+        if time.perf_counter() - start > WARM_UP:
+            break
+    samples = {name: [[] for _ in cameras] for name in names}
+    start, taken = time.perf_counter(), 0
+    while taken < rounds and (taken == 0 or time.perf_counter() - start < seconds):
+        for name, of_views in time_round().items():
+            for view, times in zip(samples[name], of_views):
+                view.append(times)
+        taken += 1
+    rows = []
+    for name in names:
+        keys = samples[name][0][0]
+        mean = {
+            f"{key}_ms": statistics.mean(statistics.median(times[key] for times in view) for view in samples[name])
+            for key in keys
+        }
+        rows.append({"size": size, "footprint": name, "rounds": taken, **mean, "ms": samples[name]})
+    if "point" in names:
+        for key in ("clock", "device", "draw"):
+            ratios = {name: ratio_to_point(samples, name, key) for name in names}
+            for row in rows:
+                row[f"{key}_ratio"] = ratios[row["footprint"]]
+    return rows
+
+
+def ratio_to_point(samples: dict[str, list], name: str, key: str) -> float:
+    """The median over rounds of the ratio to `point` in the same round, averaged over views."""
+    return statistics.mean(
+        statistics.median(ours[key] / point[key] for ours, point in zip(view, of_point))
+        for view, of_point in zip(samples[name], samples["point"])
+    )
+
+
+# --------------------------------------------------------------------------------------- tables
+
+
+def table(header: list[str], rows: list[list]) -> str:
+    cells = [header, *([str(cell) for cell in row] for row in rows)]
+    widths = [max(len(row[k]) for row in cells) for k in range(len(header))]
+    lines = ["| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths)) + " |" for row in cells]
+    return "\n".join([lines[0], "|" + "|".join("-" * (width + 2) for width in widths) + "|", *lines[1:]])
+
+
+def format_differences(differences: dict[str, dict], job: Job) -> str:
+    header = [f"{next(iter(job.cameras))}, levels of 255"]
+    header += [f"{bits}: {column}" for bits in BITS.values() for column in ("largest", "99.99%", "differing")]
+    rows = []
+    for name, of_name in differences.items():
+        row = [name]
+        for found in of_name.values():
+            row += [found["largest"], f"{found['99.99%']:.2f}", f"{100 * found['differing']:.3f}%"]
+        rows.append(row)
+    return table(header, rows)
+
+
+def format_rows(rows: list[dict], size: str) -> str:
+    keys = ["device_ms", "project_ms", "draw_ms", "clock_ms"]
+    ratios = [key for key in ("device_ratio", "draw_ratio", "clock_ratio") if key in rows[0]]
+    header = [size, *(key.replace("_", " ") for key in keys), *(key.replace("_", " ") for key in ratios)]
+    lines = [[row["footprint"], *(f"{row[k]:.3f}" for k in [*keys, *ratios])] for row in rows]
+    return f"{table(header, lines)}\n{rows[-1]['rounds']} rounds"
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,193 @@
+// What several ranks do in the place of the stages: a splat in one piece (PackedRow), which is made where its Gaussian
+// is, travels, and is binned and blended where its camera is; and the way back. In two steps, of which the first counts
+// the rows for all cameras without waiting for the device: before their number is known there is no room for them.
+#include <ATen/ops/cumsum.h>
+#include <ATen/ops/zeros.h>
+
+#include <vector>
+
+#include "torch/check_tensors.h"
+#include "torch/checks.h"
+#include "torch/ops.h"
+#include "torch/scene_grads.h"
+
+namespace ar::ops {
+namespace {
+
+/// Of a matrix of rows, their gradients, or what belongs to them.
+void check_matrix_of(const Tensor& t, const char* name, const Tensor& like, int64_t width) {
+  TORCH_CHECK_VALUE(t.dim() == 2 && t.size(1) == width && t.is_contiguous() && t.device() == like.device() &&
+                        t.scalar_type() == like.scalar_type(),
+                    name, " must be a contiguous matrix of ", width, " columns, of the dtype and device of the others");
+  check_row_count(t.size(0), name);
+}
+void check_ints(const Tensor& t, const char* name, int64_t count, const Tensor& like) {
+  TORCH_CHECK_VALUE(
+      t.numel() == count && t.is_contiguous() && t.device() == like.device() && t.scalar_type() == at::kInt, name,
+      " must hold ", count, " contiguous int32 on the device of the others");
+}
+void check_places(const PackedPlaces& places, int64_t cameras, int64_t rows) {
+  bool ok = int64_t(places.firsts.size()) == cameras && int64_t(places.counts.size()) == cameras;
+  for (int64_t c = 0; ok && c < cameras; ++c) {
+    const int64_t first = places.firsts[c], count = places.counts[c];
+    ok = first >= 0 && count >= 0 && first + count <= rows;
+  }
+  TORCH_CHECK_VALUE(ok, "firsts and counts must be places of ", cameras, " cameras among ", rows, " rows");
+}
+
+void check_packed_gradient(const Tensor& dL_drows, const Tensor& like) {
+  const bool absolute = dL_drows.dim() == 2 && dL_drows.size(1) == kPackedGradWidthAbsolute;
+  check_matrix_of(dL_drows, "dL_drows", like, absolute ? kPackedGradWidthAbsolute : kPackedGradWidth);
+}
+
+/// The three colours in the splats.
+ChannelTensors own_colors(const Tensor& background) {
+  ChannelTensors channels;
+  channels.by_gaussian = false;
+  channels.count = channels.color_channels = 3;
+  channels.background = background;
+  return channels;
+}
+
+Tensor checked_background(const Tensor& background) {
+  TORCH_CHECK_VALUE(background.dim() == 1 && background.size(0) == 3, "background must have shape (3,)");
+  check_floating(background, "background");
+  return background.contiguous();
+}
+
+/// What `blend_rows` leaves for its adjoint.
+struct SavedRows {
+  static constexpr size_t kMembers = ListTensors::kMembers + BlendState::kMembers + 2;
+  ListTensors lists;
+  BlendState state;
+  RowTensors kept;
+
+  explicit SavedRows(const std::vector<Tensor>& list) {
+    TORCH_CHECK_VALUE(list.size() == kMembers, "saved must be what blend_rows saved with keep=True, got ", list.size(),
+                      " tensors");
+    lists = from_list<ListTensors>(list, 0);
+    state = from_list<BlendState>(list, ListTensors::kMembers);
+    kept.kept_covs = list[kMembers - 2];
+    kept.kept_opacities = list[kMembers - 1];
+  }
+};
+
+}  // namespace
+
+Results count_rows(ProjectArguments a) {
+  const Pass pass(a, a.means3D);
+  const int64_t cameras = check_cameras(a);
+  const at::TensorOptions ints = a.means3D.options().dtype(at::kInt);
+  Tensor ends;
+  for (int64_t c = 0; c < cameras; ++c) {
+    Inputs in = inputs_of(a, c);
+    check(in);
+    check_values(in, false);
+    if (c == 0) ends = at::empty({cameras, in.count()}, ints);
+    const Tensor radii = at::empty({in.count()}, ints);
+    make_backend(in.means3D)->project_rows(in, pass, RowTensors(), radii);
+    Tensor of_camera = ends[c];
+    at::cumsum_out(of_camera, radii.gt(0), 0, at::kInt);
+  }
+  return {cameras ? ends : at::zeros({0, a.count()}, ints)};
+}
+
+Results pack_rows(PackArguments a) {
+  const Pass pass(a, a.means3D);
+  const int64_t cameras = check_cameras(a), rows = a.rows.size(0);
+  TORCH_CHECK_VALUE(a.shs || a.colors_precomp, "shs or colors_precomp must be given, got neither");
+  check_matrix_of(a.rows, "rows", a.means3D, kPackedWidth);
+  check_ints(a.radii, "radii", rows, a.means3D);
+  check_ints(a.ids, "ids", rows, a.means3D);
+  check_ints(a.ends, "ends", cameras * a.count(), a.means3D);
+  TORCH_CHECK_VALUE(a.firsts.numel() == cameras && a.firsts.is_contiguous() && a.firsts.scalar_type() == at::kLong &&
+                        a.firsts.device() == a.means3D.device(),
+                    "firsts must hold ", cameras, " contiguous int64 on the device of the others");
+  for (int64_t c = 0; c < cameras; ++c) {
+    Inputs in = inputs_of(a, c);
+    check(in);
+    make_backend(in.means3D)->pack_rows(in, pass, {a.rows, a.radii, a.ids, a.ends[c], a.firsts[c], a.first_id});
+  }
+  return {};
+}
+
+Results pack_rows_vjp(PackVjpArguments a) {
+  const int64_t cameras = check_cameras(a), rows = a.ids.numel(), count = a.count();
+  check_needs(a.needs, kSceneTensors - 1);
+  std::vector<bool> needs = a.needs;
+  needs.insert(needs.begin() + 1, false);  // means2D, which is no argument
+  check_camera_needs(needs, a.lens);
+  check_packed_gradient(a.dL_drows, a.means3D);
+  check_ints(a.ids, "ids", a.dL_drows.size(0), a.means3D);
+  check_places(a, cameras, rows);
+  TORCH_CHECK_VALUE(may_be_rows_of(a.ids, count), "ids must be what pack_rows_ wrote");
+  RowTensors dL_drows;
+  dL_drows.packed = a.dL_drows;
+  return {gradients_of(a, needs, [&](int64_t c, const Inputs& in, const Grads& grads) {
+    const Tensor places = places_of(a.ids.slice(0, a.firsts[c], a.firsts[c] + a.counts[c]), count, a.firsts[c]);
+    return make_backend(in.means3D)->project_rows_vjp(in, places, dL_drows, grads);
+  })};
+}
+
+Results blend_rows(BlendRowsArguments a) {
+  Pass pass(a, a.rows);
+  pass.keep = a.keep;
+  check_floating(a.rows, "rows");
+  check_matrix_of(a.rows, "rows", a.background, kPackedWidth);
+  check_image_size(a.image_height, a.image_width);
+  const ChannelTensors channels = own_colors(checked_background(a.background));
+  const std::unique_ptr<Backend> backend = make_backend(a.rows);
+  RowTensors rows;
+  rows.packed = a.rows;
+  if (a.keep) {
+    rows.kept_covs = at::empty({a.rows.size(0), 4}, a.rows.options());
+    rows.kept_opacities = at::empty({a.rows.size(0)}, a.rows.options());
+  }
+  const ListTensors lists = backend->bin(backend->shape_rows(rows, pass), pass, channels.background);
+  ImageSwitches wanted = {};
+  wanted[kAlpha] = true;
+  const ImageTensors image = make_images(channels, wanted, pass.grid);
+  BlendState state = make_state(pass, a.rows);
+  backend->blend(lists, pass, channels, image, state);
+  std::vector<Tensor> saved;
+  if (a.keep) {
+    append_to(saved, lists);
+    append_to(saved, state);
+    saved.push_back(rows.kept_covs);
+    saved.push_back(rows.kept_opacities);
+  }
+  return {image.color, image.others[kAlpha], saved};
+}
+
+Results blend_rows_vjp(BlendRowsVjpArguments a) {
+  const Pass pass(a, a.background);
+  const SavedRows saved(a.saved);
+  const Tensor like = a.background;
+  check_image_size(a.image_height, a.image_width);
+  check_saved(saved.lists, saved.state, like, pass);
+  const int64_t n = saved.lists.splats.size(0);
+  check_packed_gradient(a.dL_drows, like);
+  check_matrix_of(saved.kept.kept_covs, "saved", like, 4);
+  TORCH_CHECK_VALUE(
+      a.dL_drows.size(0) == n && saved.kept.kept_covs.size(0) == n && saved.kept.kept_opacities.numel() == n,
+      "dL_drows must have a row for each of ", n, " splats");
+  const std::vector<OptionalTensor> given = {a.dL_dimage, a.dL_dalpha};
+  ImageTensors gradient;
+  gradient.color = gradient_of(given, 0, "dL_dimage", like, {3, a.image_height, a.image_width});
+  gradient.others[kAlpha] = gradient_of(given, 1, "dL_dalpha", like, {a.image_height, a.image_width});
+  const ChannelTensors channels = own_colors(checked_background(a.background));
+  Tensor background;
+  if (a.needs_background)
+    background = gradient.color.defined() ? background_grad(gradient.color, saved.state, saved.lists, pass.grid)
+                                          : at::zeros({3}, like.options());
+  const std::unique_ptr<Backend> backend = make_backend(like);
+  const bool absolute = a.dL_drows.size(1) == kPackedGradWidthAbsolute;
+  const PairSums sums = backend->blend_vjp(saved.lists, saved.state, pass, channels, gradient,
+                                           absolute ? MeanSums::kAbsolute : MeanSums::kNone);
+  RowTensors dL_drows;
+  dL_drows.packed = a.dL_drows;
+  backend->row_grads(saved.kept, saved.lists, pass, sums, dL_drows);
+  return {or_empty(background, like)};
+}
+
+}  // namespace ar::ops
