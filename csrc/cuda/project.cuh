@@ -45,18 +45,20 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
     radius = project_shape(camera, g, i, params.footprint, splat, depth);
   ShRows<Cam::kShDegree>& rows = sh_rows[threadIdx.x / 32];
   const uint32_t lit = __ballot_sync(kAllLanes, splat.level > 0);
-  if (g.shs && lit) rows.load(g.shs + (i - lane_id()) * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
+  if (g.shs && lit) rows.begin_load(g.shs + (i - lane_id()) * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
   uint32_t not_finite = 0;
   if (params.given.data) not_finite = rows_not_finite(params.given, i - lane_id(), lit);
-  int count = 0;
+  // While the harmonics are on their way.
+  int count = splat.level > 0 ? count_tiles(splat, params.footprint.index, params.grid) : 0;
+  wait_for_copies();
   if (splat.level > 0) {
     if (splat_color(camera, g, i, rows.row(), splat.color) && !(not_finite >> lane_id() & 1)) {
-      count = count_tiles(splat, params.footprint.index, params.grid);
       if (params.channels.data) write_channels(params.channels, i, splat.color, depth);
       if (given_colors(params)) splat.color = first_channels(params.given.row(int32_t(i)), params.given.count);
     } else {
       radius = 0;
       splat.level = 0;
+      count = 0;
     }
   }
   if (i >= g.n) return;
@@ -81,7 +83,8 @@ __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const Pro
   if (params.rows.colors || params.packed.rows) {
     ShRows<Cam::kShDegree>& rows = sh_rows[threadIdx.x / 32];
     const uint32_t seen = __ballot_sync(kAllLanes, has_row);
-    if (g.shs && seen) rows.load(g.shs + (i - lane_id()) * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), seen);
+    if (g.shs && seen) rows.begin_load(g.shs + (i - lane_id()) * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), seen);
+    wait_for_copies();
     if (radius > 0 && !splat_color(camera, g, i, rows.row(), splat.color)) {
       if (splat.level > 0) radius = 0;
       splat.color = {0, 0, 0};

@@ -9,12 +9,23 @@ namespace ar::cuda {
 struct SplatSums {
   float value[kPairGradWidth];
 
-  __device__ void add(const float* row) {
-    const float4* quads = reinterpret_cast<const float4*>(row);
+  /// Adds the first `count` of kRows rows, whose loads wait together.
+  template <int kRows> __device__ void add(const float* rows, int count) {
+    constexpr int kQuads = kPairGradWidth / 4;
+    const float4* quads = reinterpret_cast<const float4*>(rows);
+    float4 v[kRows][kQuads];
 #pragma unroll
-    for (int q = 0; q < kPairGradWidth / 4; ++q) {
-      const float4 v = quads[q];
-      value[4 * q] += v.x, value[4 * q + 1] += v.y, value[4 * q + 2] += v.z, value[4 * q + 3] += v.w;
+    for (int r = 0; r < kRows; ++r) {
+#pragma unroll
+      for (int q = 0; q < kQuads; ++q) v[r][q] = r < count ? quads[r * kQuads + q] : float4{0, 0, 0, 0};
+    }
+#pragma unroll
+    for (int r = 0; r < kRows; ++r) {
+#pragma unroll
+      for (int q = 0; q < kQuads; ++q) {
+        value[4 * q] += v[r][q].x, value[4 * q + 1] += v[r][q].y;
+        value[4 * q + 2] += v[r][q].z, value[4 * q + 3] += v[r][q].w;
+      }
     }
   }
   __device__ PairGrad<float> grad() const { return {{{value[0], value[1]}, {value[2], value[3], value[4]}}, value[5]}; }
@@ -26,23 +37,25 @@ struct SplatSums {
 
 /// A splat with more pairs than this is summed by its whole warp.
 inline constexpr int kManyPairs = 64;
+/// Rows that a lane loads before it waits for the first of them.
+inline constexpr int kRowsAtOnce = 4;
 
 /// Sums the pairs of each lane's splat i, always in the same order. All lanes must call it.
 __device__ inline SplatSums sum_pairs(const PairSumsView& pairs, int64_t i, PairRange range) {
   SplatSums sums = {};
-  const auto add_row = [&](SplatSums& to, int64_t row) { to.add(pairs.pair_grads + row * kPairGradWidth); };
+  const auto row = [&](int64_t k) { return pairs.pair_grads + k * kPairGradWidth; };
   if (pairs.by_splat()) {
-    if (range.count > 0) add_row(sums, i);
+    if (range.count > 0) sums.add<1>(row(i), 1);
     return sums;
   }
   if (range.count <= kManyPairs) {
-    for (int q = range.first; q < range.first + range.count; ++q) add_row(sums, q);
+    for (int q = 0; q < range.count; q += kRowsAtOnce) sums.add<kRowsAtOnce>(row(range.first + q), range.count - q);
   }
   for (uint32_t many = __ballot_sync(kAllLanes, range.count > kManyPairs); many != 0; many &= many - 1) {
     const int source = __ffs(many) - 1;
     const int first = __shfl_sync(kAllLanes, range.first, source), count = __shfl_sync(kAllLanes, range.count, source);
     SplatSums part = {};
-    for (int q = lane_id(); q < count; q += 32) add_row(part, first + q);
+    for (int q = lane_id(); q < count; q += 32) part.add<1>(row(first + q), 1);
 #pragma unroll
     for (int v = 0; v < kPairGradWidth; ++v) {
       const float total = warp_sum(part.value[v]);
@@ -68,6 +81,32 @@ __device__ inline void zero_grads_of_warp(const Gaussians<float>& g, const Gauss
   if (out.shs) zero_rows(&out.shs[first * g.sh_stride].x, 3 * g.sh_stride * n);
 }
 
+/// A warp's Gaussians in shared memory, all but their colours.
+struct GaussianRows {
+  float means[32 * 3], shapes[32 * 7], opacities[32];
+
+  /// Begins to load those of the lanes in `lanes`. `first` is lane 0's. Returns views in which they have the same
+  /// indices, to be read after wait_for_copies().
+  __device__ Gaussians<float> begin_load(const Gaussians<float>& g, int64_t first, uint32_t lanes) {
+    Gaussians<float> out = g;
+    copy_rows_async<3>(means, &g.means[first].x, lanes);
+    copy_rows_async<1>(opacities, g.opacities + first, lanes);
+    out.means = reinterpret_cast<const Vec3<float>*>(means) - first;
+    out.opacities = opacities - first;
+    if (g.cov3ds) {
+      copy_rows_async<6>(shapes, &g.cov3ds[first].xx, lanes);
+      out.cov3ds = reinterpret_cast<const Sym3<float>*>(shapes) - first;
+    } else {
+      float* rotations = shapes + 32 * 3;
+      copy_rows_async<3>(shapes, &g.scales[first].x, lanes);
+      copy_rows_async<4>(rotations, &g.rotations[first].x, lanes);
+      out.scales = reinterpret_cast<const Vec3<float>*>(shapes) - first;
+      out.rotations = reinterpret_cast<const Vec4<float>*>(rotations) - first;
+    }
+    return out;
+  }
+};
+
 /// Sums of the lanes' gradients, one number after the other.
 __device__ inline void store_warp_sums(const CameraGrad<float>& grad, float* to) {
   const float* values = &grad.view_x.x;
@@ -84,13 +123,14 @@ struct FromPairs {
 
   /// What is known of Gaussian i before its gradient is asked for. count: 0 if it has none.
   __device__ PairRange range(int64_t i) const { return params.sums.ranges[i]; }
-  /// Calls use(gradient with respect to the splat as a function of it, what it shows, MeanSums) where range.count > 0.
+  /// What the lanes of a warp must find together.
+  __device__ SplatSums sum(int64_t i, PairRange range) const { return sum_pairs(params.sums, i, range); }
+  /// Calls use(gradient with respect to the splat as a function of it, what it shows, MeanSums). range.count > 0.
   template <class Cam, class Use>
-  __device__ void visit(const Cam& camera, int64_t i, PairRange range, Use&& use) const {
-    const SplatSums sums = sum_pairs(params.sums, i, range);
-    if (range.count == 0) return;
+  __device__ void visit(const Cam& camera, const Gaussians<float>& g, int64_t i, PairRange, const SplatSums& sums,
+                        Use&& use) const {
     ShownGrad<float> shown = {{0, 0, 0}, 0};
-    const float depth = apply_row(camera.view_z, params.gaussians.means[i]);
+    const float depth = apply_row(camera.view_z, g.means[i]);
     if (params.dL_dchannels.data) {
       add_channels_vjp(params.dL_dchannels, i, depth, shown);
     } else {
@@ -116,8 +156,11 @@ struct FromRows {
     const int32_t row = params.rows.rows[i];
     return {row, row >= 0 && has_gradient(params.rows, row) ? 1 : 0};
   }
-  template <class Cam, class Use> __device__ void visit(const Cam&, int64_t, PairRange range, Use&& use) const {
-    if (range.count == 0) return;
+  struct Nothing {};
+  __device__ Nothing sum(int64_t, PairRange) const { return {}; }
+  template <class Cam, class Use>
+  __device__ void visit(const Cam&, const Gaussians<float>&, int64_t, PairRange range, const Nothing&,
+                        Use&& use) const {
     const int64_t row = range.first;
     ShownGrad<float> shown = {{0, 0, 0}, 0};
     if (params.rows.colors) shown.color = params.rows.colors[row];
@@ -127,35 +170,55 @@ struct FromRows {
   }
 };
 
+/// Blocks that a multiprocessor holds at once.
+inline constexpr int kVjpBlocks = 6;
+
 template <class Cam, class From, class Params, class Out>
 __device__ void project_vjp_body(const Params& params, const From& from, const Out& out) {
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
-  const Gaussians<float>& g = params.gaussians;
+  __shared__ GaussianRows gaussian_rows[kProjectThreads / 32];
+  // Shared, and read where it is used, the camera takes no registers. Shared variables may not have initialisers, as
+  // its members do.
+  alignas(16) __shared__ char camera_memory[sizeof(Cam)];
+  Cam& camera = *reinterpret_cast<Cam*>(camera_memory);
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
-  const int64_t first = i - lane_id();  // of the warp
-  if (first >= g.n) return;
-  const PairRange range = i < g.n ? from.range(i) : PairRange{0, 0};
+  const int lane = lane_id(), warp = threadIdx.x / 32;
+  const int64_t first = i - lane;  // of the warp
+  const PairRange range = i < params.gaussians.n ? from.range(i) : PairRange{0, 0};
+  if (threadIdx.x == 0) camera = load_camera_as<Cam>(params.camera);
+  __syncthreads();
+  if (first >= params.gaussians.n) return;
   const uint32_t lit = __ballot_sync(kAllLanes, range.count > 0);
-  const int n = int(min(int64_t(32), g.n - first));
+  const int n = int(min(int64_t(32), params.gaussians.n - first));
   float* camera_grads = params.camera_grads ? params.camera_grads + first / 32 * kCameraGradWidth : nullptr;
   if (lit == 0) {
-    if (!Out::kAdd) zero_grads_of_warp(g, out, first, n);
+    if (!Out::kAdd) zero_grads_of_warp(params.gaussians, out, first, n);
     if (Cam::kFull && camera_grads) zero_rows(camera_grads, kCameraGradWidth);
     return;
   }
-  ShRows<Cam::kShDegree>& rows = sh_rows[threadIdx.x / 32];
-  if (g.shs) rows.load(g.shs + first * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
-  const Cam camera = load_camera_as<Cam>(params.camera);
+  // All that is read is asked for before any of it is waited for.
+  const Gaussians<float> g = gaussian_rows[warp].begin_load(params.gaussians, first, lit);
+  ShRows<Cam::kShDegree>& rows = sh_rows[warp];
+  if (g.shs) rows.begin_load(g.shs + first * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
+  const auto sums = from.sum(i, range);
+  wait_for_copies();
   // Longer rows than the largest degree's hold coefficients without influence.
   const bool staged = out.shs && g.sh_stride <= rows.kCount;
   Vec3<float>* dL_dsh = staged ? rows.row() : out.shs ? out.shs + i * g.sh_stride : nullptr;
   CameraGrad<float> camera_grad = {};
-  from.visit(camera, i, range, [&](const auto& grad_of, const ShownGrad<float>& shown, Vec2<float> mean_sums) {
-    ar::project_vjp(camera, g, i, grad_of, shown, rows.row(), dL_dsh, out,
-                    Cam::kFull && camera_grads ? &camera_grad : nullptr);
-    write_mean_sums(out, i, camera.size, mean_sums);
-  });
-  if (range.count == 0 && i < g.n) zero_grads(g, i, out, dL_dsh);
+  if (range.count > 0) {
+    from.visit(camera, g, i, range, sums, [&](const auto& grad_of, const ShownGrad<float>& shown, Vec2<float> means) {
+      const auto grad_of_splat = [&](const Cov2d<float>& cov, float opacity) {
+        forget_loads();
+        return grad_of(cov, opacity);
+      };
+      ar::project_vjp(camera, g, i, grad_of_splat, shown, rows.row(), dL_dsh, out,
+                      Cam::kFull && camera_grads ? &camera_grad : nullptr);
+      write_mean_sums(out, i, camera.size, means);
+    });
+  } else if (i < g.n) {
+    zero_grads(g, i, out, dL_dsh);
+  }
   if (staged) rows.template store<Out::kAdd>(out.shs + first * g.sh_stride, g.sh_stride, n);
   if constexpr (Cam::kFull) {
     if (camera_grads) store_warp_sums(camera_grad, camera_grads);
@@ -163,17 +226,17 @@ __device__ void project_vjp_body(const Params& params, const From& from, const O
 }
 
 template <class Cam>
-__global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : 5)
+__global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kVjpBlocks)
     project_vjp_kernel(const ProjectVjpParams params) {
   project_vjp_body<Cam>(params, FromPairs{params}, params.grads);
 }
 template <class Cam>
-__global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : 5)
+__global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kVjpBlocks)
     project_rows_vjp_kernel(const ProjectRowsVjpParams params) {
   project_vjp_body<Cam>(params, FromRows{params}, params.grads);
 }
 template <class Cam>
-__global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : 5)
+__global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kVjpBlocks)
     add_project_rows_vjp_kernel(const ProjectRowsVjpParams params) {
   project_vjp_body<Cam>(params, FromRows{params}, AddedGrads<float>{params.grads});
 }

@@ -12,34 +12,20 @@ template <int kDegree> struct ShRows {
   static constexpr int kCount = sh_count(kDegree), kStride = 3 * kCount + 1;
   float value[32][kStride];
 
-  /// Moves the first 4 kQuads numbers of all 32 rows of 4 `quads` in memory, all at once.
-  template <int kQuads> __device__ void load_quads(const float4* base, int quads, uint32_t lanes) {
-    const int lane = lane_id();
-#pragma unroll
-    for (int e = 0; e < kQuads; ++e) {
-      const int k = e * 32 + lane, row = k / kQuads, q = k % kQuads;
+  /// Begins to load `count` coefficients of the rows of the lanes in `lanes`; base is lane 0's row. They are here after
+  /// wait_for_copies().
+  __device__ void begin_load(const Vec3<float>* base, int stride, int count, uint32_t lanes) {
+    const float* from = &base->x + lane_id();
+    float* to = value[0] + lane_id();
+    const int here = 3 * count - lane_id();
+#pragma unroll 8
+    for (int row = 0; row < 32; ++row, from += 3 * stride, to += kStride) {
       if (!(lanes >> row & 1)) continue;
-      const float4 v = base[row * quads + q];
-      float* to = value[row] + 4 * q;
-      to[0] = v.x, to[1] = v.y, to[2] = v.z, to[3] = v.w;
+#pragma unroll
+      for (int e = 0; e < 3 * kCount; e += 32) {
+        if (e < here) copy_async(to + e, from + e);
+      }
     }
-    __syncwarp();
-  }
-
-  /// Loads `count` coefficients of the rows of the lanes in `lanes`; base is lane 0's row.
-  __device__ void load(const Vec3<float>* base, int stride, int count, uint32_t lanes) {
-    if (3 * stride % 4 == 0 && reinterpret_cast<uintptr_t>(base) % 16 == 0) {
-      const auto* quads = reinterpret_cast<const float4*>(base);
-      if (count == 16) return load_quads<12>(quads, 3 * stride / 4, lanes);
-      if (count == 9) return load_quads<7>(quads, 3 * stride / 4, lanes);
-      if (count == 4) return load_quads<3>(quads, 3 * stride / 4, lanes);
-    }
-    for (; lanes != 0; lanes &= lanes - 1) {
-      const int row = __ffs(lanes) - 1;
-      const float* from = &base[int64_t(row) * stride].x;
-      for (int e = lane_id(); e < 3 * count; e += 32) value[row][e] = from[e];
-    }
-    __syncwarp();
   }
   /// Stores rows [0, rows) of `stride` coefficients, or adds them to those that are there.
   template <bool kAdd> __device__ void store(Vec3<float>* base, int stride, int rows) const {

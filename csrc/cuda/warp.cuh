@@ -106,6 +106,35 @@ __device__ inline void prefetch([[maybe_unused]] const void* address) {
 #endif
 }
 
+/// Begins to copy a number from global to shared memory. All lanes see it after wait_for_copies().
+__device__ inline void copy_async(float* to, const float* from) {
+#if __CUDA_ARCH__ >= 800
+  const auto address = uint32_t(__cvta_generic_to_shared(to));
+  asm volatile("cp.async.ca.shared.global [%0], [%1], 4;" ::"r"(address), "l"(from) : "memory");
+#else
+  *to = *from;
+#endif
+}
+/// The same for rows of kWidth numbers, those of the lanes in `lanes`, with neighbouring lanes at neighbouring
+/// addresses.
+template <int kWidth> __device__ void copy_rows_async(float* to, const float* from, uint32_t lanes) {
+#pragma unroll
+  for (int k = 0; k < kWidth; ++k) {
+    const int e = 32 * k + lane_id();
+    if (lanes >> e / kWidth & 1) copy_async(to + e, from + e);
+  }
+}
+/// Waits for all copies that the lanes of this warp have begun.
+__device__ inline void wait_for_copies() {
+#if __CUDA_ARCH__ >= 800
+  asm volatile("cp.async.wait_all;" ::: "memory");
+#endif
+  __syncwarp();
+}
+
+/// What was read from memory before this is read again after it, instead of being kept in registers.
+__device__ inline void forget_loads() { asm volatile("" ::: "memory"); }
+
 /// Sums N = 8, 9 or 10 values over the lanes with 9 or 12 shuffles instead of 5 N: lanes trade the halves that the
 /// other will sum. A lane l gets the sum of value summed_value<N>(l).
 template <int N> __device__ float sum_values(const float (&v)[N]) {
