@@ -23,7 +23,7 @@ using FilterLayout = CellLayout<1, 32, 4>;
 /// A sample per lane, in blocks of a warp, since lists are uneven. The more pixels a warp has, the fewer steps it takes
 /// for each of them, and the more of them wait for the longest list: in tiles with long lists, kLong, it has two.
 template <class F, bool kLong> using ListedLayout = CellLayout<1, (F::kSamples > 4 || kLong) ? 16 : 4, 1>;
-/// Pairs above which a tile's list is long: long enough to be among those that the others end before.
+/// Pairs above which a tile's list is long, so that its walk may be what the others end before.
 inline constexpr int kLongList = 4096;
 
 /// Words of 32 bits that filter_kernel needs.

@@ -62,8 +62,8 @@ struct Results {
   std::vector<int32_t> last;
 };
 
-/// Forwards with one layout, back with another: whole lists, or with kSegment > 0 lists of groups of pixels and
-/// segments of so many pairs.
+/// Forwards with one layout, back with another: whole lists, or with kSegment > 0 lists of pixels, shared out as long
+/// ones above kLong pairs, and segments of so many pairs.
 template <class F, class Forward, class Backward, int kSegment = 0, int kLong = kLongList>
 Results run(Scene<F>& scene) {
   constexpr int S = F::kSamples;
