@@ -54,8 +54,8 @@ template <int S, int C, int kSets> struct PixelState {
 
 template <class F, int C> using BlendStage = Stage<F, C, kBlendThreads>;
 
-/// Composites those of a group of 32 staged splats, [k, k + 32), that reach the warp's subtile; `index` is the place of
-/// the first staged splat in the tile's list.
+/// Composites those of a group of 32 staged splats, [k, k + 32), that reach the warp's subtile; `index` is the place of the
+/// first staged splat in the tile's list.
 template <class F, int C, int kSets>
 __device__ __forceinline__ void composite(const BlendStage<F, C>& stage, int k, int index, Vec2<float> p,
                                           PixelState<F::kSamples, C, kSets>& state) {
@@ -111,7 +111,7 @@ template <int S, int C, bool kKeep> struct PixelCheckpoints {
   __device__ PixelCheckpoints(const BlendParams& params, int tile)
       : base(params.checkpoints + int64_t(params.plan.tile_planes[tile]) * kTilePixels),
         first_chunk(kKeep ? 0 : front_chunks(params.grid, S) - 1),
-        pixel(threadIdx.x % kTilePixels) {}
+        pixel(threadIdx.x) {}
 
   __device__ Checkpoint<C>& kept(int chunk, int s) const {
     return reinterpret_cast<Checkpoint<C>*>(base)[(int64_t(chunk) * S + s) * kTilePixels + pixel];
@@ -154,7 +154,7 @@ template <int S> struct TransmittancePlanes {
 
   __device__ TransmittancePlanes(const BlendParams& params, int tile) {
     const CheckpointLayout layout = params.layout;
-    const int pixel = threadIdx.x % kTilePixels, of_sample = layout.keep ? layout.channels + 1 : 1;
+    const int pixel = threadIdx.x, of_sample = layout.keep ? layout.channels + 1 : 1;
     first_chunk = layout.first_chunk(params.grid, S);
     chunk_stride = int64_t(layout.planes(S)) * kTilePixels;
     sample_stride = int64_t(of_sample) * kTilePixels;
@@ -198,22 +198,21 @@ template <int S> __device__ void store_last(const BlendParams& params, Pixel pix
   for (int s = 0; s < S; ++s) params.last[s * pixel.image + pixel.index] = last[s];
 }
 
-/// Turns the checkpoints of a sample's chunks [begin, end), which hold the channels of the chunk itself, into the
-/// channels of everything behind the chunk, from which blend_vjp starts. `behind`: the channels of what is behind all
-/// of them. These are sums of positive terms, which do not cancel.
+/// Turns the checkpoints of a sample's first `n` chunks, which hold the channels of the chunk itself, into the channels
+/// of everything behind the chunk, from which blend_vjp starts. `behind`: the channels of what is behind all of them.
+/// These are sums of positive terms, which do not cancel.
 template <int S, int C>
-__device__ void accumulate_behind(const PixelCheckpoints<S, C, true>& checkpoints, int begin, int end, int s,
-                                  Values<C> behind) {
+__device__ void accumulate_behind(const PixelCheckpoints<S, C, true>& checkpoints, int n, int s, Values<C> behind) {
   constexpr int kBatch = 8;  // all loads before the first store, so that the loads wait for memory together
-  for (int last = end - 1; last >= begin; last -= kBatch) {
+  for (int last = n - 1; last >= 0; last -= kBatch) {
     Values<C> own[kBatch];
 #pragma unroll
     for (int k = 0; k < kBatch; ++k) {
-      if (last - k >= begin) own[k] = checkpoints.kept(last - k, s).channels;
+      if (last >= k) own[k] = checkpoints.kept(last - k, s).channels;
     }
 #pragma unroll
     for (int k = 0; k < kBatch; ++k) {
-      if (last - k < begin) continue;
+      if (last < k) continue;
       checkpoints.kept(last - k, s).channels = behind;
       behind += own[k];
     }
@@ -276,7 +275,7 @@ __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front
       for (int s = 0; s < S; ++s) {
         Values<C> behind = times(abs(state.transmittance[s]), background);
         behind += state.channels[s];
-        accumulate_behind(checkpoints, 0, written, s, behind);
+        accumulate_behind(checkpoints, written, s, behind);
       }
     }
     return;
@@ -326,54 +325,28 @@ __device__ inline int chunks_of(const BlendParams& params, int tile, int length)
   return int((params.lists.tile_offsets[tile + 1] - params.lists.tile_offsets[tile] + length - 1) / length);
 }
 
-/// The tail chunks of a tile are scanned and summed in parts side by side, by as many threads of each pixel.
-inline constexpr int kTailParts = 4, kPartThreads = kTailParts * kTilePixels;
-
-struct TailPart {
-  int index, begin, end;  ///< chunks [begin, end)
-
-  __device__ TailPart(int front, int chunks) {
-    const int length = (chunks - front + kTailParts - 1) / kTailParts;
-    index = threadIdx.x / kTilePixels;
-    begin = min(front + index * length, chunks);
-    end = min(begin + length, chunks);
-  }
-};
-
 /// Turns the transmittance of each chunk into that in front of the chunk, negative where a sample has stopped before.
 /// Blocks share the open tiles.
-template <int S> __global__ void __launch_bounds__(kPartThreads) tail_scan_kernel(const BlendParams params) {
+template <int S> __global__ void __launch_bounds__(kTilePixels) tail_scan_kernel(const BlendParams params) {
   constexpr int kBatch = 16;
-  __shared__ float part_through[kTailParts][kTilePixels];
-  const int items = params.plan.state->counts.open_tiles[sample_class(S)] * S, pixel = threadIdx.x % kTilePixels;
+  const int items = params.plan.state->counts.open_tiles[sample_class(S)] * S;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const int tile = open_tiles<S>(params)[item / S], s = item % S, chunks = chunks_of(params, tile, chunk_length(S));
     const TransmittancePlanes<S> planes(params, tile);
     const int front = front_chunks(params.grid, S);
-    const TailPart part(front, chunks);
-    float product = 1;
-#pragma unroll 16
-    for (int c = part.begin; c < part.end; ++c) product *= planes.at(c, s);
-    __syncthreads();  // the last tile's reading
-    part_through[part.index][pixel] = product;
-    __syncthreads();
     float transmittance = planes.at(front - 1, s);
-    const auto pass = [&](float through) {
-      if (transmittance > 0) transmittance *= through;
-      if (transmittance < kNearlyStopped) transmittance = -abs(transmittance);
-    };
-    for (int p = 0; p < part.index; ++p) pass(part_through[p][pixel]);
-    for (int first = part.begin; first < part.end; first += kBatch) {
+    for (int first = front; first < chunks; first += kBatch) {
       float through[kBatch];
 #pragma unroll
       for (int k = 0; k < kBatch; ++k) {
-        if (first + k < part.end) through[k] = planes.at(first + k, s);
+        if (first + k < chunks) through[k] = planes.at(first + k, s);
       }
 #pragma unroll
       for (int k = 0; k < kBatch; ++k) {
-        if (first + k >= part.end) break;
+        if (first + k >= chunks) break;
         planes.at(first + k, s) = transmittance;
-        pass(through[k]);
+        if (transmittance > 0) transmittance *= through[k];
+        if (transmittance < kNearlyStopped) transmittance = -abs(transmittance);
       }
     }
   }
@@ -428,54 +401,29 @@ __global__ void __launch_bounds__(kBlendThreads) tail_blend_kernel(const BlendPa
 
 /// Adds the chunks of the open tiles. Blocks share the tiles.
 template <int S, int C, bool kKeep>
-__global__ void __launch_bounds__(kPartThreads) tail_sum_kernel(const BlendParams params) {
-  /// Of a part of the tail: its channels, and the transmittance behind its last chunk that a sample has come to.
-  struct PartSum {
-    Values<C> channels;
-    float last;
-  };
-  __shared__ PartSum sums[kTailParts][kTilePixels];
+__global__ void __launch_bounds__(kTilePixels) tail_sum_kernel(const BlendParams params) {
   const Values<C> background = background_of<C>(params);
-  const int pixel = threadIdx.x % kTilePixels, front = front_chunks(params.grid, S);
-  const Vec2<float> p = pixel_of(pixel / 32, lane_id());
+  const Vec2<float> p = pixel_of(threadIdx.x / 32, lane_id());
   const int items = params.plan.state->counts.open_tiles[sample_class(S)];
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const int tile = open_tiles<S>(params)[item], chunks = chunks_of(params, tile, chunk_length(S));
     const PixelCheckpoints<S, C, kKeep> checkpoints(params, tile);
-    const TailPart part(front, chunks);
     Values<C> total = {};
     float transmittance[S];
 #pragma unroll
     for (int s = 0; s < S; ++s) {
-      PartSum own = {{}, 0};
-#pragma unroll 8
-      for (int c = part.begin; c < part.end; ++c) {
-        if (kKeep || s == 0) own.channels += checkpoints.channels(c, s);
-        const float behind = checkpoints.transmittance(c, s);
-        if (behind != 0) own.last = behind;
-      }
-      __syncthreads();  // the last sample's reading
-      sums[part.index][pixel] = own;
-      __syncthreads();
-      for (int c = checkpoints.first_chunk; c < front; ++c) {
+      float last = -1;
+#pragma unroll 16
+      for (int c = checkpoints.first_chunk; c < chunks; ++c) {
         if (kKeep || s == 0) total += checkpoints.channels(c, s);
+        const float end = checkpoints.transmittance(c, s);
+        if (end != 0) last = end;
       }
-      transmittance[s] = checkpoints.transmittance(front - 1, s);
-#pragma unroll
-      for (int k = 0; k < kTailParts; ++k) {
-        const PartSum of_part = sums[k][pixel];
-        total += of_part.channels;
-        if (of_part.last != 0) transmittance[s] = of_part.last;
-      }
-      if constexpr (kKeep) {
-        __syncthreads();  // the first part changes the channels of the front chunks
-        Values<C> behind = times(abs(transmittance[s]), background);
-        for (int k = kTailParts - 1; k > part.index; --k) behind += sums[k][pixel].channels;
-        accumulate_behind(checkpoints, part.index == 0 ? 0 : part.begin, part.end, s, behind);
-      }
+      transmittance[s] = last;
+      if constexpr (kKeep) accumulate_behind(checkpoints, chunks, s, times(abs(last), background));
     }
     const TileList list = list_of(params.lists, params.grid, tile);
-    if (part.index == 0) store_pixel(params, Pixel(list, params.grid, p), total, transmittance);
+    store_pixel(params, Pixel(list, params.grid, p), total, transmittance);
   }
 }
 
@@ -486,9 +434,9 @@ template <class F, int C, bool kKeep> void launch_blend(const BlendParams& p, cu
   constexpr int S = F::kSamples;
   launch(blend_front_kernel<F, C, kKeep>, {unsigned(p.grid.tiles()), kBlendThreads}, stream, p);
   launch(tail_through_kernel<F>, {kTailBlocks, kBlendThreads}, stream, p);
-  launch(tail_scan_kernel<S>, {kTailBlocks / kTailParts, kPartThreads}, stream, p);
+  launch(tail_scan_kernel<S>, {kTailBlocks, kTilePixels}, stream, p);
   launch(tail_blend_kernel<F, C, kKeep>, {kTailBlocks, kBlendThreads}, stream, p);
-  launch(tail_sum_kernel<S, C, kKeep>, {kTailBlocks / kTailParts, kPartThreads}, stream, p);
+  launch(tail_sum_kernel<S, C, kKeep>, {kTailBlocks, kTilePixels}, stream, p);
 }
 template <class F, int C> void blend_few(const BlendParams& p, cudaStream_t stream) {
   if (p.transmittance) {
