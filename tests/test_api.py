@@ -4,18 +4,14 @@ import copy
 import functools
 import inspect
 import math
-import os
-import pathlib
 import pickle
-import subprocess
-import sys
 
 import pytest
 import reference
 import scenes
 import torch
 import torch.utils._pytree
-from conftest import each_precision
+from conftest import each_precision, run_python
 from scenes import PATHS, RENDERED, Camera, name_of
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -229,15 +225,7 @@ def test_environment_variable(monkeypatch):
 def test_environment_variable_of_a_new_process():
     """As a user sets it: outside, for a script that only knows the old import."""
     code = "import diff_gaussian_rasterization, analytic_rasterizer as ar;print(ar.get_default_footprint())"
-    done = subprocess.run(
-        [sys.executable, "-c", code],
-        capture_output=True,
-        text=True,
-        cwd=pathlib.Path(__file__).resolve().parent.parent,
-        env=os.environ | {"ANALYTIC_RASTERIZER_FOOTPRINT": "cumulant"},
-        check=False,
-    )
-    assert done.stdout.strip() == "cumulant", done.stderr
+    assert run_python(code, ANALYTIC_RASTERIZER_FOOTPRINT="cumulant").strip() == "cumulant"
 
 
 # --- what is accepted --------------------------------------------------------------------------

@@ -12,13 +12,13 @@ import shutil
 import subprocess
 import sys
 import textwrap
-import time
 from unittest import mock
 
 import pytest
 import torch
 import torch.distributed as dist
-from conftest import DEADLINE, ROOT
+from conftest import ROOT
+from processes import DEADLINE, start_processes
 from torch.distributed import distributed_c10d
 
 image = pytest.importorskip("PIL.Image", reason="needs the train extra")
@@ -200,15 +200,7 @@ def made(tmp_path_factory):
     """The folder into which the processes have written."""
     folder = tmp_path_factory.mktemp("ranks")
     write_scene(folder / "scene")
-    context = torch.multiprocessing.start_processes(work, (WORLD, folder), WORLD, join=False, start_method="spawn")
-    end = time.monotonic() + 2 * DEADLINE
-    try:
-        while not context.join(timeout=max(end - time.monotonic(), 0.0)):
-            assert time.monotonic() < end, "the processes hang"
-    finally:
-        for process in context.processes:
-            if process.is_alive():
-                process.kill()
+    start_processes(work, (WORLD, folder), WORLD)
     return folder
 
 
