@@ -116,6 +116,7 @@ class Build(BuildExtension):
     def build_extensions(self):
         os.environ.setdefault("MAX_JOBS", str(os.cpu_count() or 1))
         for extension in self.extensions:
+            extension.depends += extension.sources  # a change of any is looked at, without ninja too
             extension.sources = in_units(extension.sources, Path(self.build_temp) / "units")
         super().build_extensions()
 
