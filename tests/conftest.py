@@ -3,23 +3,21 @@
 import importlib.util
 import os
 import pathlib
-import subprocess
-import sys
-import textwrap
 import threading
 
 import pytest
 import torch
+from processes import run_program
 
 from analytic_rasterizer import _C
+
+# gsply compiles its loops when they first run, which takes a minute; as plain Python they do the same.
+os.environ["NUMBA_DISABLE_JIT"] = "1"
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 SHARED = ROOT.parent / "shared"
 WORKERS_PER_DEVICE = 4
 """Processes of a test run that share a CUDA device, at most."""
-DEADLINE = 900
-"""Seconds after which something counts as hanging. Nothing takes a tenth of it on an idle machine: a busy one, which
-gives a test a small part of its time, must not look like one that hangs."""
 
 needs_cuda = pytest.mark.skipif(
     not (_C.has_cuda and torch.cuda.is_available()),
@@ -37,6 +35,12 @@ each_precision = pytest.mark.parametrize(
 )
 
 
+def pytest_collection_modifyitems(items):
+    """Files whose fixtures take longest come first, so that none of them is what all wait for in the end."""
+    first = ("test_train_ranks.py", "test_distributed.py", "test_distributed_parts.py")
+    items.sort(key=lambda item: item.path.name not in first)
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers():
     """What `-n auto` in pyproject.toml means: every core that this process may use."""
@@ -45,17 +49,10 @@ def pytest_xdist_auto_num_workers():
 
 
 def run_python(code, *arguments, **environment):
-    """Output of a fresh interpreter that runs `code` among the tests; fails where it hangs."""
-    # Not in ROOT, whose package would come before the one that these tests were told to use.
+    """Output of a process of its own that runs `code` among the tests; fails where it hangs."""
     given = [os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(code), *arguments],
-        cwd=ROOT / "tests",
-        env=os.environ | {"PYTHONPATH": os.pathsep.join([*given, str(ROOT)])} | environment,
-        capture_output=True,
-        text=True,
-        timeout=DEADLINE,
-    )
+    path = os.pathsep.join([*given, str(ROOT)])
+    done = run_program(code, *arguments, environment=os.environ | {"PYTHONPATH": path} | environment)
     assert done.returncode == 0, (done.returncode, done.stderr[-4000:])
     return done.stdout
 

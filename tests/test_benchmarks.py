@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 import pytest
 import scenes
 import torch
-from conftest import DEADLINE, ROOT
+from conftest import ROOT
+from processes import DEADLINE
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io, viewer

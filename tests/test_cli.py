@@ -11,7 +11,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import DEADLINE, ROOT, SHARED
+from conftest import ROOT, SHARED
+from processes import DEADLINE
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io

@@ -7,11 +7,10 @@ one core. They are told their dialect by the environment, as their users tell it
 import importlib.util
 import json
 import os
-import subprocess
-import sys
 
 import pytest
-from conftest import DEADLINE, ROOT, SHARED, needs_cuda
+from conftest import ROOT, SHARED, needs_cuda
+from processes import DEADLINE, run_program
 
 RUNNER, CONTRACT = SHARED / "compat" / "run.py", SHARED / "compat" / "contract.py"
 CHECKS = 22  # of contract.py
@@ -39,18 +38,12 @@ def cases():
     return [name for name, case in runner.CASES.items() if (runner.REPOS / case[1]).is_dir()]
 
 
-def run(device, *command, dialect=""):
+def run(device, program, *arguments, dialect=""):
     environment = {key: value for key, value in os.environ.items() if not key.startswith("ANALYTIC_RASTERIZER_")}
     environment |= {"PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1", "ANALYTIC_RASTERIZER_DIALECT": dialect}
     paths = [os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
     environment["PYTHONPATH"] = os.pathsep.join([*paths, str(ROOT)])
-    return subprocess.run(
-        [sys.executable, *map(str, command), "--device", device],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=2 * DEADLINE,
-    )
+    return run_program(program, *arguments, "--device", device, environment=environment, timeout=2 * DEADLINE)
 
 
 each_device = pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=needs_cuda)])

@@ -6,14 +6,14 @@ process takes seconds. On the CPU they talk through gloo, on CUDA through NCCL, 
 
 import dataclasses
 import datetime
-import time
 from unittest import mock
 
 import pytest
 import scenes
 import torch
 import torch.distributed as dist
-from conftest import DEADLINE, needs_cuda
+from conftest import needs_cuda
+from processes import DEADLINE, start_processes
 from scenes import Camera
 
 import analytic_rasterizer as ar
@@ -298,17 +298,7 @@ def runs(request, tmp_path_factory):
     if world < 2:
         pytest.skip("needs two CUDA devices: NCCL does not put two ranks on one")
     folder = tmp_path_factory.mktemp("ranks")
-    context = torch.multiprocessing.start_processes(
-        work, (world, str(folder), kind), nprocs=world, join=False, start_method="spawn"
-    )
-    end = time.monotonic() + DEADLINE
-    try:
-        while not context.join(timeout=max(end - time.monotonic(), 0.0)):
-            assert time.monotonic() < end, "the processes hang"
-    finally:
-        for process in context.processes:
-            if process.is_alive():
-                process.kill()
+    start_processes(work, (world, str(folder), kind), world)
     return Runs(kind, world, folder)
 
 

@@ -6,7 +6,6 @@ One set of processes runs everything, first two of them and then all three, and 
 import dataclasses
 import datetime
 import random
-import time
 from itertools import pairwise
 
 import pytest
@@ -14,7 +13,7 @@ import scenes
 import test_gsplat
 import torch
 import torch.distributed as dist
-from conftest import DEADLINE
+from processes import DEADLINE, start_processes
 from scenes import Camera
 from test_distributed import COUNT, error_of, scene_of, with_camera_gradients
 
@@ -195,15 +194,7 @@ def work(rank, folder):
 def made(tmp_path_factory):
     """What every rank made, by number of ranks."""
     folder = tmp_path_factory.mktemp("ranks")
-    context = torch.multiprocessing.start_processes(work, (folder,), max(WORLDS), join=False, start_method="spawn")
-    end = time.monotonic() + DEADLINE
-    try:
-        while not context.join(timeout=max(end - time.monotonic(), 0.0)):
-            assert time.monotonic() < end, "the processes hang"
-    finally:
-        for process in context.processes:
-            if process.is_alive():
-                process.kill()
+    start_processes(work, (folder,), max(WORLDS))
     return {world: [torch.load(folder / f"{world}-{rank}.pt") for rank in range(world)] for world in WORLDS}
 
 

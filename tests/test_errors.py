@@ -223,6 +223,7 @@ def test_plots_are_the_same_every_time(tmp_path):
 
 
 def test_command_prints_the_summary(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(errors, "_figures", lambda results: {})  # those of `small`
     monkeypatch.setattr(errors, "all_cases", lambda: ["cumulant"])
     monkeypatch.setattr(errors, "ROTATION_SAMPLES", 2)
     out = tmp_path / "new"

@@ -8,7 +8,8 @@ import threading
 import pytest
 import scenes
 import torch
-from conftest import DEADLINE, in_threads, needs_cuda, run_python
+from conftest import in_threads, needs_cuda, run_python
+from processes import DEADLINE
 from scenes import KINDS, PATHS, Camera, name_of
 
 import analytic_rasterizer as ar

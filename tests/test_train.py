@@ -12,7 +12,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import DEADLINE, ROOT, SHARED, needs_cuda
+from conftest import ROOT, SHARED, needs_cuda
+from processes import DEADLINE
 
 from analytic_rasterizer import cli, io, render_stages
 from analytic_rasterizer.filters import bake_pixel

@@ -7,18 +7,16 @@ import datetime
 import json
 import math
 import os
-import re
 import shutil
 import subprocess
 import sys
-import textwrap
-import time
 from unittest import mock
 
 import pytest
 import torch
 import torch.distributed as dist
-from conftest import DEADLINE, ROOT
+from conftest import ROOT, in_threads
+from processes import DEADLINE, run_program, start_processes
 from torch.distributed import distributed_c10d
 
 image = pytest.importorskip("PIL.Image", reason="needs the train extra")
@@ -200,15 +198,7 @@ def made(tmp_path_factory):
     """The folder into which the processes have written."""
     folder = tmp_path_factory.mktemp("ranks")
     write_scene(folder / "scene")
-    context = torch.multiprocessing.start_processes(work, (WORLD, folder), WORLD, join=False, start_method="spawn")
-    end = time.monotonic() + 2 * DEADLINE
-    try:
-        while not context.join(timeout=max(end - time.monotonic(), 0.0)):
-            assert time.monotonic() < end, "the processes hang"
-    finally:
-        for process in context.processes:
-            if process.is_alive():
-                process.kill()
+    start_processes(work, (WORLD, folder), WORLD)
     return folder
 
 
@@ -355,14 +345,17 @@ def test_periods_are_passed_once_for_each_multiple(stride):
 # --- the command ------------------------------------------------------------------------------------
 
 
-def torchrun(scene, out, *options, program=None):
-    """`train` on two processes; `program` replaces `-m analytic_rasterizer`."""
-    command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
-    command += [str(program)] if program else ["-m", "analytic_rasterizer"]
-    command += ["train", str(scene), "--out", str(out), "--device", "cpu", "--random-points", "60", *options]
+def command(scene, out, *options):
+    return ["train", str(scene), "--out", str(out), "--device", "cpu", "--random-points", "60", *options]
+
+
+def torchrun(scene, out, *options):
+    """`train` on two processes."""
+    program = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
+    program += ["-m", "analytic_rasterizer", *command(scene, out, *options)]
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": path}
-    return subprocess.run(command, capture_output=True, text=True, timeout=DEADLINE, env=environment, cwd=out.parent)
+    return subprocess.run(program, capture_output=True, text=True, timeout=DEADLINE, env=environment, cwd=out.parent)
 
 
 def test_torchrun_trains_and_writes_once(made, tmp_path):
@@ -385,32 +378,39 @@ def test_torchrun_trains_and_writes_once(made, tmp_path):
 
 @pytest.mark.parametrize("end", ["raise RuntimeError('CUDA is out of memory')", "os.kill(os.getpid(), signal.SIGKILL)"])
 def test_a_rank_that_dies_ends_all_with_one_message(made, tmp_path, end):
-    program = tmp_path / "program.py"
-    program.write_text(
-        textwrap.dedent(
-            f"""
-            import os, signal, sys
-            from analytic_rasterizer import cli
-            from analytic_rasterizer.training import sharded
+    """Without torchrun, which would end the others itself: they find out."""
+    program = f"""
+        import os, signal, sys
+        from analytic_rasterizer import cli
+        from analytic_rasterizer.training import sharded
 
-            step = sharded.ShardedTrainer.step
+        step = sharded.ShardedTrainer.step
 
-            def broken(trainer):
-                if trainer.progress.step >= 6 and trainer.ranks.rank == 1:
-                    {end}
-                step(trainer)
+        def broken(trainer):
+            if trainer.progress.step >= 6 and trainer.ranks.rank == 1:
+                {end}
+            step(trainer)
 
-            sharded.ShardedTrainer.step = broken
-            sys.exit(cli.main(sys.argv[1:]))
-            """
-        )
-    )
-    done = torchrun(made / "scene", tmp_path / "out", "--iterations", "30", program=program)
-    assert done.returncode != 0
-    messages = [line for line in done.stderr.splitlines() if re.match(r"error: ", line)]
-    if "KILL" in end:  # torchrun may end the other rank before it has noticed
-        assert all("on rank 0: another rank is gone" in line for line in messages) and len(messages) <= 1
+        sharded.ShardedTrainer.step = broken
+        sys.exit(cli.main(sys.argv[1:]))
+    """
+    arguments = command(made / "scene", tmp_path / "out", "--iterations", "30")
+    store = dist.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)  # as torchrun has one
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "WORLD_SIZE": "2"}
+    environment |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(store.port)}
+    environment |= {"TORCHELASTIC_RUN_ID": "none", "TORCHELASTIC_USE_AGENT_STORE": "True"}
+    done = [None, None]
+
+    def run(rank):
+        done[rank] = run_program(program, *arguments, environment=environment | {"RANK": str(rank)})
+
+    in_threads(2, run)
+    assert all(of_rank.returncode != 0 for of_rank in done)
+    messages = [line for of_rank in done for line in of_rank.stderr.splitlines() if line.startswith("error: ")]
+    assert len(messages) == 1
+    if "KILL" in end:
+        assert messages[0].startswith("error: on rank 0: another rank is gone")
     else:
-        assert messages == ["error: on rank 1: CUDA is out of memory"]
-    assert "analytic_rasterizer/training" not in done.stderr  # no traceback but torchrun's own
+        assert messages[0] == "error: on rank 1: CUDA is out of memory"
+    assert not any("Traceback" in of_rank.stderr for of_rank in done)
     assert not (tmp_path / "out" / files.CHECKPOINT).exists()

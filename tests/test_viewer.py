@@ -12,7 +12,8 @@ import threading
 import numpy as np
 import pytest
 import torch
-from conftest import DEADLINE, ROOT
+from conftest import ROOT
+from processes import DEADLINE
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C, cli, io, viewer

@@ -13,7 +13,8 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 import torch
-from conftest import DEADLINE, needs_cuda
+from conftest import needs_cuda
+from processes import DEADLINE
 from test_viewer import make_scene, make_view
 
 import analytic_rasterizer as ar
