@@ -54,8 +54,8 @@ template <int S, int C, int kSets> struct PixelState {
 
 template <class F, int C> using BlendStage = Stage<F, C, kBlendThreads>;
 
-/// Composites those of a group of 32 staged splats, [k, k + 32), that reach the warp's subtile; `index` is the place of the
-/// first staged splat in the tile's list.
+/// Composites those of a group of 32 staged splats, [k, k + 32), that reach the warp's subtile; `index` is the place of
+/// the first staged splat in the tile's list.
 template <class F, int C, int kSets>
 __device__ __forceinline__ void composite(const BlendStage<F, C>& stage, int k, int index, Vec2<float> p,
                                           PixelState<F::kSamples, C, kSets>& state) {

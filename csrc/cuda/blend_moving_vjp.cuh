@@ -28,8 +28,9 @@ static_assert(kStateChunk == 32, "a warp's chunk is a mask of 32 bits");
 /// What a block keeps in shared memory. Sums of a pair: PairGrad, C channels, MeanSums.
 template <class F, int C, class Layout> struct MovingVjpShared {
   static constexpr int kMeans = 6 + C, kSums = kMeans + 2;
-  /// Splats that a block takes between barriers. With more there would be less fast memory for the places of samples.
-  static constexpr int kBatch = kStateChunk;
+  /// Splats that a block takes between barriers: two chunks, if a block of any device has room for their sums. With
+  /// many cells one, which leaves more fast memory for the places of samples, and fewer numbers are spilled.
+  static constexpr int kBatch = F::kSamples <= 4 && Layout::kWarps * kSums <= 192 ? 2 * kStateChunk : kStateChunk;
   MovingStage<F, C, Layout, kBatch> stage;
   float sums[Layout::kWarps][kBatch][kSums];            ///< of a warp's pixels
   uint32_t hits[Layout::kWarps][kBatch / kStateChunk];  ///< splats that have sums of a warp
