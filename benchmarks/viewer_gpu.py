@@ -10,9 +10,9 @@ Needs a context of OpenGL 4.3, which takes shaders of GLSL ES 3.00; on Linux it 
 Each picture of the first size, blended in 32-bit floats (as when the camera rests) and in half floats (as when it
 moves), is compared with that of the CPU rasterizer. Frames are then timed in half floats, footprints in turn, round
 after round. A frame is a projection of all Gaussians and one drawing; the order by depth, which a worker of the page
-finds, is not in it. "device" is the time between two timestamps of the graphics device, with another frame before them
-so that it never waits for commands; "clock" is the time from the first call until everything is drawn. Medians over
-rounds, averaged over views.
+finds, is not in it. "device" is the time that the graphics device takes for projecting and drawing, with another frame
+before them so that it never waits for commands; "clock" is the time from the first call until everything is drawn.
+Medians over rounds, averaged over views.
 
 For a machine without node, or without this package, prepare there where they are:
 

@@ -502,6 +502,8 @@ def test_opcheck(op, calls, device):
         ("pack_rows_", {"rows": torch.zeros(3, 5)}, "rows must be a contiguous matrix of 12 columns"),
         ("pack_rows_", {"firsts": torch.zeros(2)}, "firsts must hold 2 contiguous int64"),
         ("pack_rows_vjp", {"firsts": [0, 10**6]}, "firsts and counts must be places of 2 cameras among"),
+        ("pack_rows_vjp", {"firsts": [0, 2**63 - 1]}, "firsts and counts must be places of 2 cameras among"),
+        ("blend_rows", {"rows": torch.zeros(25)[1:].view(2, 12)}, "rows must begin at a multiple of 16 bytes"),
         ("pack_rows_", {"radii": torch.zeros(1, dtype=torch.int32)}, "radii must hold"),
         ("pack_rows_", {"shs": None}, "shs or colors_precomp must be given, got neither"),
         ("pack_rows_vjp", {"dL_drows": torch.zeros(4, 10)}, "dL_drows must be a contiguous matrix of 9 columns"),
@@ -516,6 +518,23 @@ def test_opcheck(op, calls, device):
 def test_the_ops_say_what_is_wrong(op, change, message, calls):
     with pytest.raises(ValueError, match=message):
         getattr(torch.ops.analytic_rasterizer, op)(**calls[op] | change)
+
+
+@pytest.mark.parametrize("change", [{"firsts": torch.tensor([-1000, 0])}, {"ends": None}], ids=["firsts", "ends"])
+@pytest.mark.parametrize("device", ["cpu"])
+def test_places_before_the_first_row_are_not_written(change, calls):
+    arguments = calls["pack_rows_"] | change
+    if arguments["ends"] is None:  # as if nothing had been counted
+        arguments["ends"] = torch.zeros_like(calls["pack_rows_"]["ends"])
+        arguments["firsts"] = torch.zeros(2, dtype=torch.int64)
+    margin, around = 4096, {}
+    for name in ("rows", "radii", "ids"):
+        rows = arguments[name]
+        around[name] = torch.full((len(rows) + 2 * margin, *rows.shape[1:]), 7, dtype=rows.dtype)
+        arguments[name] = around[name][margin:-margin]
+    torch.ops.analytic_rasterizer.pack_rows_(**arguments)
+    for whole in around.values():
+        assert whole[:margin].eq(7).all() and whole[-margin:].eq(7).all()
 
 
 def test_depths_are_equal_in_pairs():

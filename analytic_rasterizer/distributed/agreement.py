@@ -143,7 +143,7 @@ def facts_of(
     name: str = "means3D",
 ) -> Facts:
     """What REQUIREMENTS names. Raises ValueError for a device that the group does not serve; `name` is of the means."""
-    devices = _devices_of(group)
+    devices = _backends_of(group)
     if means3D.device.type not in devices:
         raise ValueError(f"{name} must be on a device of the group, {' or '.join(devices)}, got {means3D.device}")
     if means3D.is_cuda and means3D.device.index != torch.cuda.current_device():
@@ -190,14 +190,16 @@ def _text(name: str, facts: dict[str, int]) -> str:
     return " on ".join(str(part) for part in reversed(_KINDS[value])) if name == "kind" else str(value)
 
 
-def _devices_of(group: dist.ProcessGroup | None) -> list[str]:
-    """Kinds of devices whose tensors the group can send."""
-    return [pair.partition(":")[0] for pair in dist.get_backend_config(group).split(",")]
+def _backends_of(group: dist.ProcessGroup | None) -> dict[str, str]:
+    """The backend of each kind of device whose tensors the group can send."""
+    return dict(pair.split(":", 1) for pair in dist.get_backend_config(group).split(","))
 
 
 def _channel(group: dist.ProcessGroup | None) -> torch.device:
     """Where messages are that hold numbers of the device, the same kind of device on every rank."""
-    if "cuda" in _devices_of(group) and torch.cuda.is_available():
+    backends = _backends_of(group)  # gloo serves both kinds of device, and then the host is the quicker way
+    by_device = backends.get("cuda") == "nccl" or "cpu" not in backends
+    if by_device and torch.cuda.is_available():
         return torch.device("cuda", torch.cuda.current_device())
     return torch.device("cpu")
 
@@ -238,5 +240,5 @@ def _gathered(message: torch.Tensor, world: int, group: dist.ProcessGroup | None
 
 def gather(numbers: list[int], world: int, group: dist.ProcessGroup | None) -> list[list[int]]:
     """The same number of integers of the host from every rank: through the host where the group serves it."""
-    device = "cpu" if "cpu" in _devices_of(group) else _channel(group)
+    device = "cpu" if "cpu" in _backends_of(group) else _channel(group)
     return _gathered(torch.tensor(numbers, dtype=torch.int64, device=device), world, group)

@@ -158,7 +158,7 @@ AR_HD bool splat_color(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
 template <typename T>
 AR_HD void write_packed(const PackedRows<T>& to, int64_t i, const ProjectedGaussian<T>& p, Vec3<T> color, int radius) {
   const int64_t place = *to.first + to.ends[i] - 1;
-  if (place >= to.room) return;
+  if (place < 0 || place >= to.room) return;
   PackedRow<T> row = {p.mean, {p.cov.xx, p.cov.xy, p.cov.yy}, p.opacity, p.depth, color, p.cov.det, {}};
   if (radius == 0) row.det = T(-1);
   row.id = decltype(row.id)(to.first_id + i);

@@ -116,7 +116,7 @@ template <int C> struct ChannelShare {
   __device__ static bool has_sum() { return lane_id() % (32 / C) == 0; }
 };
 
-/// Channels [first, first + C) of kBatch splats; zeros where there are no so many.
+/// Channels [first, first + C) of kBatch splats; zeros where there are fewer.
 template <int kBatch, int C> struct GroupChannels {
   int32_t ids[kBatch];
   Eighth<C> values[kBatch][8];

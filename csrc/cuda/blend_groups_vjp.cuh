@@ -2,10 +2,10 @@
 // warp per subtile, a pixel per lane, back to front. Lanes share the channels as in blend_groups.cuh.
 //
 // The sums of shapes come from dL/dalpha, which is linear in the gradient of the image: each group could add its share
-// to the sums of a pair, which a single block owns. As every share costs as much as the whole, the kernel of a group
-// does it for two groups of 32 channels at once, and that of the second one only sums channels. MeanSums, which are not
-// linear, need the channels of all groups: where they are wanted, the first group makes all sums of shapes, and reads
-// the channels of the others where they lie.
+// to the sums of a pair, which a single block owns. To add a share costs as much as to add the sum of two, so the
+// kernel of every other group of 32 adds the shares of two groups, and that of the second one only sums channels.
+// MeanSums, which are not linear, need the channels of all groups: where they are wanted, the first group makes all
+// sums of shapes, and reads the channels of the others where they lie.
 #pragma once
 
 #include <algorithm>
@@ -304,6 +304,8 @@ template <class F> int shape_groups(const BlendVjpParams& p, int first) {
   if (p.mean_sums != MeanSums::kNone) return first == 0;
   const auto is_wide = [&](int begin) { return group_width<F>(p.channels.count - begin) == kChannelGroup; };
   if (F::kYardstick || !is_wide(first)) return 1;
+  // Two groups at once take 100 KiB, which the blocks of some devices cannot have: 7.5, 8.6, 8.9, 12.0.
+  if (sizeof(GroupVjpShared<F, kChannelGroup, 2>) > max_shared_bytes()) return 1;
   if (first / kChannelGroup % 2 == 1) return 0;
   return is_wide(first + kChannelGroup) ? 2 : 1;
 }

@@ -203,7 +203,7 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
       const int j = at & 31;
       // The same in all lanes, and by a ballot, so that the compiler knows that they branch alike.
       const uint32_t reached = __ballot_sync(kAllLanes, reaching >> j & 1);
-      VjpSplat splat = group.splats[j];
+      VjpSplat splat = group.splats[j];  // not there if it reaches no subtile, and then not looked at
       const Mat2<float> m =
           !kMeans ? mean_map
                   : Mat2<float>{__shfl_sync(kAllLanes, mean_map.xx, j), __shfl_sync(kAllLanes, mean_map.xy, j),
@@ -318,8 +318,9 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
   }
 }
 
-/// Blocks that fill any device.
+/// Eight blocks for each of the 132 multiprocessors of an H200.
 inline constexpr int kClearBlocks = 132 * 8;
+/// As many blocks as any device holds: more would only find that no chunk is left.
 inline constexpr unsigned kTakingBlocks = 256 * 8;
 
 template <class F, int C, Sums kSums> void launch_blend_vjp(const BlendVjpParams& p, cudaStream_t stream) {

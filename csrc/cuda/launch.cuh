@@ -16,6 +16,14 @@ struct LaunchShape {
   size_t shared_bytes = 0;
 };
 
+/// Bytes of shared memory that a block may have on the current device.
+inline size_t max_shared_bytes() {
+  int device = 0, bytes = 0;
+  cudaGetDevice(&device);
+  cudaDeviceGetAttribute(&bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, device);
+  return size_t(bytes);
+}
+
 /// Launches `kernel`. An error is left for cudaGetLastError.
 template <class... Params, class... Arguments>
 void launch(void (*kernel)(Params...), const LaunchShape& shape, cudaStream_t stream, Arguments&&... arguments) {

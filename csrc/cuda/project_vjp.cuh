@@ -81,6 +81,12 @@ __device__ inline void zero_grads_of_warp(const Gaussians<float>& g, const Gauss
   if (out.shs) zero_rows(&out.shs[first * g.sh_stride].x, 3 * g.sh_stride * n);
 }
 
+/// `rows` as a view in which the first row has index `first`. No such array begins in memory, so that the address is
+/// worked out as a number.
+template <class Row> __device__ const Row* view_from(const float* rows, int64_t first) {
+  return reinterpret_cast<const Row*>(reinterpret_cast<uintptr_t>(rows) - uintptr_t(first) * sizeof(Row));
+}
+
 /// A warp's Gaussians in shared memory, all but their colours.
 struct GaussianRows {
   float means[32 * 3], shapes[32 * 7], opacities[32];
@@ -91,17 +97,17 @@ struct GaussianRows {
     Gaussians<float> out = g;
     copy_rows_async<3>(means, &g.means[first].x, lanes);
     copy_rows_async<1>(opacities, g.opacities + first, lanes);
-    out.means = reinterpret_cast<const Vec3<float>*>(means) - first;
-    out.opacities = opacities - first;
+    out.means = view_from<Vec3<float>>(means, first);
+    out.opacities = view_from<float>(opacities, first);
     if (g.cov3ds) {
       copy_rows_async<6>(shapes, &g.cov3ds[first].xx, lanes);
-      out.cov3ds = reinterpret_cast<const Sym3<float>*>(shapes) - first;
+      out.cov3ds = view_from<Sym3<float>>(shapes, first);
     } else {
       float* rotations = shapes + 32 * 3;
       copy_rows_async<3>(shapes, &g.scales[first].x, lanes);
       copy_rows_async<4>(rotations, &g.rotations[first].x, lanes);
-      out.scales = reinterpret_cast<const Vec3<float>*>(shapes) - first;
-      out.rotations = reinterpret_cast<const Vec4<float>*>(rotations) - first;
+      out.scales = view_from<Vec3<float>>(shapes, first);
+      out.rotations = view_from<Vec4<float>>(rotations, first);
     }
     return out;
   }
@@ -171,14 +177,14 @@ struct FromRows {
 };
 
 /// Blocks that a multiprocessor holds at once.
-inline constexpr int kVjpBlocks = 6;
+inline constexpr int kProjectVjpBlocks = 6;
 
 template <class Cam, class From, class Params, class Out>
 __device__ void project_vjp_body(const Params& params, const From& from, const Out& out) {
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
   __shared__ GaussianRows gaussian_rows[kProjectThreads / 32];
-  // Shared, and read where it is used, the camera takes no registers. Shared variables may not have initialisers, as
-  // its members do.
+  // The camera is in shared memory and is read where it is used, so that it takes no registers. Shared variables may
+  // not have initialisers, as its members do.
   alignas(16) __shared__ char camera_memory[sizeof(Cam)];
   Cam& camera = *reinterpret_cast<Cam*>(camera_memory);
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
@@ -226,17 +232,17 @@ __device__ void project_vjp_body(const Params& params, const From& from, const O
 }
 
 template <class Cam>
-__global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kVjpBlocks)
+__global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kProjectVjpBlocks)
     project_vjp_kernel(const ProjectVjpParams params) {
   project_vjp_body<Cam>(params, FromPairs{params}, params.grads);
 }
 template <class Cam>
-__global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kVjpBlocks)
+__global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kProjectVjpBlocks)
     project_rows_vjp_kernel(const ProjectRowsVjpParams params) {
   project_vjp_body<Cam>(params, FromRows{params}, params.grads);
 }
 template <class Cam>
-__global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kVjpBlocks)
+__global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kProjectVjpBlocks)
     add_project_rows_vjp_kernel(const ProjectRowsVjpParams params) {
   project_vjp_body<Cam>(params, FromRows{params}, AddedGrads<float>{params.grads});
 }

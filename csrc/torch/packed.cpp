@@ -21,6 +21,12 @@ void check_matrix_of(const Tensor& t, const char* name, const Tensor& like, int6
                     name, " must be a contiguous matrix of ", width, " columns, of the dtype and device of the others");
   check_row_count(t.size(0), name);
 }
+/// Of PackedRows, which are read in pieces of 16 bytes.
+void check_packed_rows(const Tensor& rows, const Tensor& like) {
+  check_matrix_of(rows, "rows", like, kPackedWidth);
+  TORCH_CHECK_VALUE(reinterpret_cast<uintptr_t>(rows.const_data_ptr()) % 16 == 0,
+                    "rows must begin at a multiple of 16 bytes");
+}
 void check_ints(const Tensor& t, const char* name, int64_t count, const Tensor& like) {
   TORCH_CHECK_VALUE(
       t.numel() == count && t.is_contiguous() && t.device() == like.device() && t.scalar_type() == at::kInt, name,
@@ -30,7 +36,7 @@ void check_places(const PackedPlaces& places, int64_t cameras, int64_t rows) {
   bool ok = int64_t(places.firsts.size()) == cameras && int64_t(places.counts.size()) == cameras;
   for (int64_t c = 0; ok && c < cameras; ++c) {
     const int64_t first = places.firsts[c], count = places.counts[c];
-    ok = first >= 0 && count >= 0 && first + count <= rows;
+    ok = first >= 0 && count >= 0 && first <= rows && count <= rows - first;
   }
   TORCH_CHECK_VALUE(ok, "firsts and counts must be places of ", cameras, " cameras among ", rows, " rows");
 }
@@ -96,10 +102,12 @@ Results pack_rows(PackArguments a) {
   const Pass pass(a, a.means3D);
   const int64_t cameras = check_cameras(a), rows = a.rows.size(0);
   TORCH_CHECK_VALUE(a.shs || a.colors_precomp, "shs or colors_precomp must be given, got neither");
-  check_matrix_of(a.rows, "rows", a.means3D, kPackedWidth);
+  check_packed_rows(a.rows, a.means3D);
   check_ints(a.radii, "radii", rows, a.means3D);
   check_ints(a.ids, "ids", rows, a.means3D);
   check_ints(a.ends, "ends", cameras * a.count(), a.means3D);
+  TORCH_CHECK_VALUE(a.ends.dim() == 2 && a.ends.size(0) == cameras, "ends must have a row for each of ", cameras,
+                    " cameras, got shape ", a.ends.sizes());
   TORCH_CHECK_VALUE(a.firsts.numel() == cameras && a.firsts.is_contiguous() && a.firsts.scalar_type() == at::kLong &&
                         a.firsts.device() == a.means3D.device(),
                     "firsts must hold ", cameras, " contiguous int64 on the device of the others");
@@ -133,7 +141,7 @@ Results blend_rows(BlendRowsArguments a) {
   Pass pass(a, a.rows);
   pass.keep = a.keep;
   check_floating(a.rows, "rows");
-  check_matrix_of(a.rows, "rows", a.background, kPackedWidth);
+  check_packed_rows(a.rows, a.background);
   check_image_size(a.image_height, a.image_width);
   const ChannelTensors channels = own_colors(checked_background(a.background));
   const std::unique_ptr<Backend> backend = make_backend(a.rows);
@@ -168,6 +176,7 @@ Results blend_rows_vjp(BlendRowsVjpArguments a) {
   const int64_t n = saved.lists.splats.size(0);
   check_packed_gradient(a.dL_drows, like);
   check_matrix_of(saved.kept.kept_covs, "saved", like, 4);
+  check_matrix_of(saved.kept.kept_opacities.unsqueeze(-1), "saved", like, 1);
   TORCH_CHECK_VALUE(
       a.dL_drows.size(0) == n && saved.kept.kept_covs.size(0) == n && saved.kept.kept_opacities.numel() == n,
       "dL_drows must have a row for each of ", n, " splats");

@@ -177,7 +177,6 @@ inline int __float_as_int(float x) {
   std::memcpy(&y, &x, sizeof y);
   return y;
 }
-inline uint32_t __float_as_uint(float x) { return uint32_t(__float_as_int(x)); }
 template <class T, class X> T atomicAdd(T* place, X x) {
   const T before = *place;
   *place += x;
