@@ -97,8 +97,8 @@ def rasterize(
     torch.distributed without a process group, makes what `project`, `bin` and `blend` make of camera after camera, bit
     for bit, and sends nothing. Differentiable in what `project` is differentiable in, and in the backgrounds. The
     gradient with respect to a camera is, on each rank, the part of the rank's own Gaussians: the sum over the ranks is
-    the whole. The host waits once for the device, for the numbers of rows. On several ranks the backward pass runs
-    once, retain_graph or not.
+    the whole. The host waits once for the device, for the numbers of rows (twice with more than 57 cameras). On several
+    ranks the backward pass runs once, retain_graph or not.
 
     Args:
         settings: Of all cameras, the same on every rank, bit for bit. Image sizes and footprints may differ. bg is
@@ -116,7 +116,8 @@ def rasterize(
     Raises:
         TypeError, ValueError: Wrong arguments, also those of another rank: what is wrong on one rank raises the same
             error on all of them, which names the rank. Ranks that disagree in settings, dtype or kind of device.
-        RuntimeError: Another error on some rank, up to the moment when splats are sent.
+        RuntimeError: Another error on some rank, up to the message with the counts; later ones end in the time-out of
+            the group.
     """
     rank, world = place_in(group)
     gaussians = {

@@ -1,7 +1,7 @@
 """The cameras of a step: rows of splats from the ranks of their Gaussians to those of the cameras, and back.
 
 A row is a splat in one piece (PackedRow in csrc/core/stages.h). Rows are written where they are sent from and blended
-where they arrive, and so are their gradients: nothing is packed or unpacked.
+where they arrive, and so are their gradients. With one camera per rank they are not copied in between.
 """
 
 from __future__ import annotations
