@@ -19,7 +19,7 @@
 #undef __device__
 #undef __shared__
 #undef __launch_bounds__
-#define __global__
+#define __global__ inline  // several tests include the same kernels
 #define __device__
 #define __shared__ thread_local  // of the one thread that all contexts run on
 #define __launch_bounds__(...)
@@ -157,6 +157,16 @@ template <class T> T __shfl_up_sync(uint32_t, T x, int lanes) {
 }
 template <class T> T __shfl_xor_sync(uint32_t, T x, int lanes) {
   return cuda_on_host::from_lane(x, int(threadIdx.x % 32) ^ lanes);
+}
+
+// What launches ask about the device: that of an H200.
+extern "C" inline cudaError_t cudaGetDevice(int* device) {
+  *device = 0;
+  return cudaSuccess;
+}
+extern "C" inline cudaError_t cudaDeviceGetAttribute(int* value, cudaDeviceAttr attribute, int) {
+  *value = attribute == cudaDevAttrMaxSharedMemoryPerBlockOptin ? 227 * 1024 : 0;
+  return cudaSuccess;
 }
 
 inline int __ffs(uint32_t x) { return __builtin_ffs(int(x)); }
