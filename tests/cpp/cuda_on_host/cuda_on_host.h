@@ -159,6 +159,12 @@ template <class T> T __shfl_xor_sync(uint32_t, T x, int lanes) {
   return cuda_on_host::from_lane(x, int(threadIdx.x % 32) ^ lanes);
 }
 
+namespace ar::cuda {
+/// The shared memory whose size a launch gives, of all kernels: they run one after the other.
+alignas(16) inline float4 dynamic_memory[1 << 13];
+inline float4* dynamic_shared() { return dynamic_memory; }
+}  // namespace ar::cuda
+
 // What launches ask about the device: that of an H200.
 extern "C" inline cudaError_t cudaGetDevice(int* device) {
   *device = 0;

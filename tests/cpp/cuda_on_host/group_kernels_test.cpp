@@ -12,9 +12,6 @@
 
 namespace ar::cuda {
 
-alignas(16) static float4 memory[1 << 13];
-float4* dynamic_shared() { return memory; }
-
 namespace {
 
 constexpr int kWidth = 20, kHeight = 10, kPixels = kWidth * kHeight;
@@ -200,7 +197,7 @@ template <class F> struct Run {
     const int blocks = tiles * way.segments;
     for (int i = 0; way.segments > 1 && i < kShapeGroups; ++i)
       cuda_on_host::launch(blocks, kBlendThreads, [&] { segment_shown_kernel<F, C>(vjp, first + i * C, i > 0); });
-    static_assert(sizeof(GroupVjpShared<F, C, kShapeGroups>) <= sizeof memory);
+    static_assert(sizeof(GroupVjpShared<F, C, kShapeGroups>) <= sizeof dynamic_memory);
     cuda_on_host::launch(blocks, kBlendThreads, [&] { blend_groups_vjp_kernel<F, C, kShapeGroups>(vjp, first); });
   }
 

@@ -12,9 +12,6 @@
 
 namespace ar::cuda {
 
-alignas(16) static float4 memory[1 << 13];
-float4* dynamic_shared() { return memory; }
-
 namespace {
 
 constexpr int kWidth = 21, kHeight = 18, kPixels = kWidth * kHeight, kColors = 3;
@@ -118,7 +115,7 @@ Results run(Scene<F>& scene) {
   vjp.checkpoints = checkpoints.data();
   vjp.pair_grads = out.pair_grads.data();
   vjp.mean_sums = MeanSums::kNorm;
-  static_assert(sizeof(MovingVjpShared<F, kColors, Backward>) <= sizeof memory);
+  static_assert(sizeof(MovingVjpShared<F, kColors, Backward>) <= sizeof dynamic_memory);
   if constexpr (kSegment > 0) {
     const int pieces = int(max_pieces(scene.lists.capacity, kSegment, kGrid));
     std::vector<float> maps(size_t(pieces) * AdjointMap::kNumbers * S * kMovingPixels, NAN);
