@@ -117,9 +117,7 @@ def _(a):
 
 @_register("pack_rows_vjp")
 def _(a):
-    camera = (a.viewmatrix, a.projmatrix, a.campos, a.lens) if a.lens is not None else (None,) * 4
-    gaussians = (a.means3D, a.opacities, a.shs, a.colors_precomp, a.scales, a.rotations, a.cov3D_precomp)
-    return _gradients(a, (*gaussians, *camera))
+    return _scene_gradients(a)
 
 
 @_register("blend_rows")
@@ -160,6 +158,13 @@ def _gradients(a, tensors) -> list[torch.Tensor]:
     return [like.new_empty(t.shape if need and t is not None else 0) for t, need in zip(tensors, a.needs)]
 
 
+def _scene_gradients(a) -> list[torch.Tensor]:
+    """Of the Gaussians and, with a lens, of the cameras."""
+    camera = (a.viewmatrix, a.projmatrix, a.campos, a.lens) if a.lens is not None else (None,) * 4
+    gaussians = (a.means3D, a.opacities, a.shs, a.colors_precomp, a.scales, a.rotations, a.cov3D_precomp)
+    return _gradients(a, (*gaussians, *camera))
+
+
 @_register("rasterize_vjp")
 def _(a):
     camera = (a.viewmatrix.reshape(4, 4), a.projmatrix.reshape(4, 4), a.campos.reshape(3), a.lens)
@@ -170,9 +175,7 @@ def _(a):
 
 @_register("project_vjp")
 def _(a):
-    camera = (a.viewmatrix, a.projmatrix, a.campos, a.lens) if a.lens is not None else (None,) * 4
-    gaussians = (a.means3D, a.opacities, a.shs, a.colors_precomp, a.scales, a.rotations, a.cov3D_precomp)
-    return _gradients(a, (*gaussians, *camera))
+    return _scene_gradients(a)
 
 
 @_register("blend_vjp")

@@ -15,7 +15,7 @@ from ..stages import Splats
 DIFFERENTIABLE = ("means2d", "cov2d", "opacities", "depths", "colors")  # what is sent of a splat
 _FIXED = ("dets", "gaussian_ids")  # and what follows it
 _PARTS = len(DIFFERENTIABLE) + len(_FIXED)
-_ID_OF = {torch.float32: torch.int32, torch.float64: torch.int64}  # integers as wide as the numbers they travel among
+ID_OF = {torch.float32: torch.int32, torch.float64: torch.int64}  # integers as wide as the numbers they travel among
 
 
 @dataclass(frozen=True)
@@ -164,7 +164,7 @@ def exchange(
     """
     like, tensors = shard[0].means2d, []
     for of_camera in (shard[c] for c in route.order):
-        ids = of_camera.gaussian_ids.to(_ID_OF[like.dtype]) + first_id
+        ids = of_camera.gaussian_ids.to(ID_OF[like.dtype]) + first_id
         tensors += [getattr(of_camera, name) for name in DIFFERENTIABLE]
         tensors += [of_camera.dets.detach(), ids.view(like.dtype)]  # the bits of ids, never numbers
     tensors += [absolute[c] for c in route.order if absolute]
@@ -173,7 +173,7 @@ def exchange(
     splats, cameras = [], route.cameras[route.rank]
     for k, camera in enumerate(cameras):
         columns = dict(zip((*DIFFERENTIABLE, *_FIXED), made[_PARTS * k :]))
-        ids = columns["gaussian_ids"].view(_ID_OF[like.dtype]).int()
+        ids = columns["gaussian_ids"].view(ID_OF[like.dtype]).int()
         given = columns | {
             "gaussian_ids": ids,
             "camera_ids": torch.zeros_like(ids),

@@ -20,12 +20,11 @@ from torch.autograd.function import once_differentiable
 from .. import _C
 from ..settings import GaussianRasterizationSettings
 from ..stages import Splats, project_arguments
-from .exchange import Route
+from .exchange import ID_OF, Route
 
 _OPS = torch.ops.analytic_rasterizer
 _TENSORS = ("means3D", "opacities", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")
 _CAMERA_TENSORS = ("viewmatrix", "projmatrix", "campos", "lens")
-_ID_OF = {torch.float32: torch.int32, torch.float64: torch.int64}  # integers as wide as the numbers they travel among
 
 
 class OwnSplats(NamedTuple):
@@ -373,7 +372,7 @@ def _image_arguments(batch: dict[str, Any]) -> dict[str, Any]:
 
 def _splats_of(rows: torch.Tensor, image: dict[str, Any]) -> Splats:
     """Rows of one camera by the names of their columns, without copying them."""
-    ids = rows.view(_ID_OF[rows.dtype])[:, 11].int()
+    ids = rows.view(ID_OF[rows.dtype])[:, 11].int()
     return Splats(
         means2d=rows[:, :2],
         cov2d=rows[:, 2:5],
