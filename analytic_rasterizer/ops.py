@@ -34,7 +34,7 @@ def _lists(like: torch.Tensor, rows: int, a, keep: bool, ids=None) -> list[torch
     """What `bin` makes of `rows` splats of one camera: ListTensors of csrc/torch/backend.h."""
     context = torch.library.get_ctx()
     on_cuda = like.device.type == "cuda"
-    side = _C.tile_size(a.footprint, a.option, on_cuda)
+    side = _C.tile_size(a.footprint, a.option, a.image_width, a.image_height, on_cuda)
     tiles = -(-a.image_height // side) * -(-a.image_width // side)
     pairs = context.new_dynamic_size()
     ints, longs = {"dtype": torch.int32}, {"dtype": torch.int64}

@@ -305,7 +305,7 @@ class Stages(NamedTuple):
         means2d: (V, 2) px.
         pairs: (N,) int32, the splat of each of the N (tile, splat) pairs, by tile, then front to back.
         tile_offsets: (tiles + 1,) int64, first pair of each tile, tiles row by row. Tiles have 16x16 px; those of
-            `moment` on CUDA have 8x8.
+            `moment` on CUDA have 8x8, except with one cell in images of 4096 or more tiles of 8x8 px.
         tile_samples: (tiles,) int32, samples of each tile where the footprint chooses them (`adaptive`), else empty.
         seconds: Time of each stage, s: "project", "bin", "blend".
     """

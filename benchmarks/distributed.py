@@ -56,8 +56,6 @@ def main() -> None:
     args = parse_arguments()
     scene, views = load_scene(args.scene), io.load_views(args.views)
     world = max(args.ranks)
-    if args.device == "cuda" and world > torch.cuda.device_count():
-        raise SystemExit(f"--ranks {world}: there are {torch.cuda.device_count()} CUDA devices")
     with tempfile.TemporaryDirectory() as folder:
         torch.multiprocessing.start_processes(work, (folder, args), world, start_method="spawn")
         results = torch.load(f"{folder}/results.pt")
@@ -72,32 +70,54 @@ def main() -> None:
 
 
 def parse_arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = make_rank_parser(__doc__.split("\n")[0], "box:samples=4")
+    parser.add_argument(
+        "--steps", type=int, default=5, metavar="N", help="that are timed together in a round (default: 5)"
+    )
+    return parse_ranks(parser)
+
+
+def make_rank_parser(description: str, footprint: str) -> argparse.ArgumentParser:
+    """A parser of what benchmarks of several ranks take, for `parse_ranks`."""
+    parser = argparse.ArgumentParser(description=description)
     add = parser.add_argument
     add("scene", help="trained scene: .ply, compressed .ply, .spz, or .npz (see scene_files.py)")
     add("--views", required=True, help="file of views")
     add("--ranks", type=int, nargs="+", default=[1, 2], metavar="N", help="(default: 1 2)")
-    add("--footprint", default="box:samples=4", metavar="NAME[:k=v]")
+    add("--footprint", default=footprint, metavar="NAME[:k=v]", help="(default: %(default)s)")
     add("--scale", type=float, default=1.0, help="resolution, as a factor")
     add("--times", type=int, default=1, metavar="K", help="replace each Gaussian by K smaller ones (default: 1)")
-    add("--steps", type=int, default=5, metavar="N", help="that are timed together in a round (default: 5)")
     add_measuring(parser)
-    return parse(parser)
+    return parser
+
+
+def parse_ranks(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """The arguments. Ends the program where there are not as many devices as ranks."""
+    args = parse(parser)
+    world = max(args.ranks)
+    if args.device == "cuda" and world > torch.cuda.device_count():
+        raise SystemExit(f"--ranks {world}: there are {torch.cuda.device_count()} CUDA devices")
+    return args
 
 
 # --- the processes ----------------------------------------------------------------------------------
 
 
-def work(rank: int, folder: str, args: argparse.Namespace) -> None:
-    """What a process does; the first one writes the results."""
+def join_group(rank: int, world: int, folder: str, args: argparse.Namespace) -> torch.device:
+    """Makes this process one of `world` ranks that meet in the folder; the rank's device."""
     torch.set_num_threads(args.threads)
     device = torch.device("cpu")
     if args.device == "cuda":
         device = torch.device("cuda", rank)
         torch.cuda.set_device(device)
     backend = "gloo" if args.device == "cpu" else "cpu:gloo,cuda:nccl"
-    world = max(args.ranks)
     dist.init_process_group(backend, init_method=f"file://{folder}/rendezvous", rank=rank, world_size=world)
+    return device
+
+
+def work(rank: int, folder: str, args: argparse.Namespace) -> None:
+    """What a process does; the first one writes the results."""
+    device = join_group(rank, max(args.ranks), folder, args)
     groups = {count: dist.new_group(list(range(count))) for count in args.ranks}
     cases = {n: Case(args, Ranks.of_group(group), device) for n, group in groups.items() if rank < n}
     measured: dict[int, list[dict[str, float]]] = {count: [] for count in args.ranks}
@@ -159,29 +179,30 @@ class Case:
         calls, rows, send, route_rows = [], [], dist.all_to_all_single, Route.rows
 
         def noted(out, flat, received, sent, **others):
-            calls.append((received, sent))  # not the tensors, whose memory is counted
+            calls.append((received, sent, flat.shape[1:]))  # not the tensors, whose memory is counted
             return send(out, flat, received, sent, **others)
 
         def noted_rows(route, forth):
-            rows.append(route_rows(route, forth))
-            return rows[-1]
+            received, sent = route_rows(route, forth)
+            rows.append(sum(sent))
+            return received, sent
 
         with mock.patch.object(dist, "all_to_all_single", noted), mock.patch.object(Route, "rows", noted_rows):
             _, extra = added_memory(self.trainer.step, self.device)
         self.trainer.losses.clear()
         if rows:
-            self.splats = sum(self.ranks.exchange(sum(rows[0][1]))) / self.ranks.world
+            self.splats = sum(self.ranks.exchange(rows[0])) / self.ranks.world
         gaussians = self.trainer.gaussians
         moments = (t for field in gaussians for t in self.trainer.optimizer.state[field].values() if torch.is_tensor(t))
         state = sum(t.nbytes for t in (*gaussians, *moments))
         return {"seconds": seconds, "state_bytes": state, "peak_bytes": state + extra} | self._exchange(calls)
 
-    def _exchange(self, calls: list[tuple[list[int], list[int]]]) -> dict[str, float]:
-        """The exchanges of a step by themselves. Calls: numbers received and sent by rank."""
+    def _exchange(self, calls: list[tuple[list[int], list[int], torch.Size]]) -> dict[str, float]:
+        """The exchanges of a step by themselves. Calls: rows received and sent by rank, and the shape of a row."""
         seconds, bytes_sent = 0.0, 0
-        for received, sent in calls:
-            flat, out = (torch.zeros(sum(counts), device=self.device) for counts in (sent, received))
-            bytes_sent += (len(flat) - sent[self.ranks.rank]) * flat.element_size()
+        for received, sent, shape in calls:
+            flat, out = (torch.zeros(sum(counts), *shape, device=self.device) for counts in (sent, received))
+            bytes_sent += flat[sent[self.ranks.rank] :].nbytes
             self._together()
             start = time.perf_counter()
             dist.all_to_all_single(out, flat, received, sent, group=self.ranks.group)

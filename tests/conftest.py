@@ -48,22 +48,37 @@ def pytest_xdist_auto_num_workers():
     return min(cores, WORKERS_PER_DEVICE) if _C.has_cuda and torch.cuda.is_available() else cores
 
 
+def python_path():
+    """PYTHONPATH of processes that find what the tests find, in whatever folder they run: their own path, and ROOT."""
+    given = [os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
+    return os.pathsep.join([*given, str(ROOT)])
+
+
 def run_python(code, *arguments, **environment):
     """Output of a process of its own that runs `code` among the tests; fails where it hangs."""
-    given = [os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
-    path = os.pathsep.join([*given, str(ROOT)])
-    done = run_program(code, *arguments, environment=os.environ | {"PYTHONPATH": path} | environment)
+    done = run_program(code, *arguments, environment=os.environ | {"PYTHONPATH": python_path()} | environment)
     assert done.returncode == 0, (done.returncode, done.stderr[-4000:])
     return done.stdout
 
 
 def in_threads(count, work):
-    """Calls work(0) ... work(count - 1) side by side and waits for all."""
-    threads = [threading.Thread(target=work, args=(i,)) for i in range(count)]
+    """Calls work(0) ... work(count - 1) side by side, waits for all, and raises what the first of them raised."""
+    errors = [None] * count
+
+    def guarded(i):
+        try:
+            work(i)
+        except BaseException as error:  # also what pytest raises for `fail` and `skip`
+            errors[i] = error
+
+    threads = [threading.Thread(target=guarded, args=(i,)) for i in range(count)]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
+    for error in errors:
+        if error is not None:
+            raise error
 
 
 @pytest.fixture

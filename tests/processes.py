@@ -8,11 +8,14 @@ of the package.
 import multiprocessing
 import os
 import pathlib
+import pickle
 import runpy
+import site
 import subprocess
 import sys
 import tempfile
 import textwrap
+import threading
 import time
 import types
 from multiprocessing import forkserver
@@ -23,26 +26,34 @@ DEADLINE = 900
 """Seconds after which something counts as hanging. Nothing takes a tenth of it on an idle machine: a busy one, which
 gives a test a small part of its time, must not look like one that hangs."""
 STARTED_WITH = dict(os.environ)
+_STARTING = threading.Lock()
+"""Two threads that start the server: the environment that the second one sees must not be that of the first."""
 
 
 def start_processes(work, arguments, count):
-    """Calls work(0, *arguments) ... work(count - 1, *arguments) in a process each and waits; fails where they hang."""
+    """Calls work(0, *arguments) ... work(count - 1, *arguments) in a process each and waits; fails where they hang.
+
+    They have the environment of this process. None of them is left, whatever happens.
+    """
     import torch
 
     _start_server()
-    context = torch.multiprocessing.start_processes(work, arguments, count, join=False, start_method="forkserver")
+    # Taken apart when the process has its environment: the modules of `work` may look at it when they are imported.
+    made = dict(os.environ), pickle.dumps((work, arguments))
+    context = torch.multiprocessing.start_processes(_call, made, count, join=False, start_method="forkserver")
     end = time.monotonic() + 2 * DEADLINE
     try:
         while not context.join(timeout=max(end - time.monotonic(), 0.0)):
             assert time.monotonic() < end, "the processes hang"
     finally:
-        for process in context.processes:
-            if process.is_alive():
-                process.kill()
+        _end(context.processes)
 
 
 def run_program(program, *arguments, environment=None, timeout=DEADLINE):
-    """What a process of its own makes of a program, code or the path of a file, as subprocess.run says it."""
+    """What a process of its own makes of a program, code or the path of a file, as subprocess.run says it.
+
+    Raises subprocess.TimeoutExpired where it takes longer; it is not left, whatever happens.
+    """
     _start_server()
     environment = dict(os.environ if environment is None else environment)
     with tempfile.TemporaryDirectory() as folder:
@@ -51,10 +62,12 @@ def run_program(program, *arguments, environment=None, timeout=DEADLINE):
             target=_interpret, args=(program, [str(a) for a in arguments], environment, made)
         )
         process.start()
-        process.join(timeout)
-        if process.exitcode is None:
-            process.kill()
-            raise subprocess.TimeoutExpired(str(program), timeout)
+        try:
+            process.join(timeout)
+            if process.exitcode is None:
+                raise subprocess.TimeoutExpired(str(program), timeout)
+        finally:
+            _end([process])
         output = [pathlib.Path(path).read_text() if os.path.exists(path) else "" for path in made]
     return subprocess.CompletedProcess([program, *arguments], process.exitcode, *output)
 
@@ -62,8 +75,24 @@ def run_program(program, *arguments, environment=None, timeout=DEADLINE):
 def _start_server():
     """Whatever test is the first one: with the environment that all of them had."""
     forkserver.set_forkserver_preload(["torch"])
-    with mock.patch.dict(os.environ, STARTED_WITH, clear=True):
+    with _STARTING, mock.patch.dict(os.environ, STARTED_WITH, clear=True):
         forkserver.ensure_running()
+
+
+def _end(processes):
+    """Kills what still runs, and waits until all of them are gone and write to no file any more."""
+    for process in processes:
+        if process.is_alive():
+            process.kill()
+    for process in processes:
+        process.join()
+
+
+def _call(index, environment, made):
+    """In the process of start_processes."""
+    _take_environment(environment)
+    work, arguments = pickle.loads(made)
+    work(index, *arguments)
 
 
 def _interpret(program, arguments, environment, output):
@@ -74,21 +103,35 @@ def _interpret(program, arguments, environment, output):
         os.dup2(file, stream)
         os.close(file)
     sys.stdout, sys.stderr = (open(stream, "w", closefd=False) for stream in (1, 2))  # noqa: SIM115
-    os.environ.clear()
-    os.environ.update(environment)
+    _take_environment(environment)
     os.chdir(TESTS)
-    # What Python and OpenMP have read already.
-    sys.dont_write_bytecode = "PYTHONDONTWRITEBYTECODE" in environment
-    if "OMP_NUM_THREADS" in environment:
-        sys.modules["torch"].set_num_threads(int(environment["OMP_NUM_THREADS"]))
     is_file = isinstance(program, pathlib.Path)
-    # Not in ROOT, whose package would come before the one that these tests were told to use.
-    given = [os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
-    installed = [path for path in sys.path if path.startswith((sys.prefix, sys.base_prefix))]
-    sys.path[:] = [str(program.parent) if is_file else "", *given, *installed]
+    sys.path[:] = _search_path(str(program.parent) if is_file else "", environment)
     sys.argv[:] = [str(program) if is_file else "-c", *arguments]
     if is_file:
         runpy.run_path(str(program), run_name="__main__")
     else:
         sys.modules["__main__"] = types.ModuleType("__main__")
         exec(compile(textwrap.dedent(program), "<string>", "exec"), sys.modules["__main__"].__dict__)
+
+
+def _take_environment(environment):
+    """With what Python and OpenMP have read of theirs already."""
+    os.environ.clear()
+    os.environ.update(environment)
+    sys.dont_write_bytecode = "PYTHONDONTWRITEBYTECODE" in environment
+    if "OMP_NUM_THREADS" in environment:
+        sys.modules["torch"].set_num_threads(int(environment["OMP_NUM_THREADS"]))
+
+
+def _search_path(folder, environment):
+    """sys.path of a program in `folder`: without ROOT, whose package would come before the one that is to be tested."""
+    given = [os.path.abspath(path) for path in environment.get("PYTHONPATH", "").split(os.pathsep) if path]
+    prefixes = sys.prefix, sys.base_prefix, *([site.USER_SITE] if site.USER_SITE else [])
+    folders = tuple(os.path.join(prefix, "") for prefix in prefixes)  # with a separator at the end
+    own = str(TESTS.parent), str(TESTS)  # which lie below a prefix where the project is in /usr/src
+
+    def is_installed(path):
+        return path not in own and os.path.join(path, "").startswith(folders)
+
+    return [folder, *given, *filter(is_installed, sys.path)]

@@ -32,16 +32,6 @@ KINDS = [
 # One of each path through the rasterizer, for tests where the formula of the weight does not matter: one sample per
 # pixel with a conic and with eigenvectors, several samples, samples that move, a number of samples per tile.
 PATHS = [("cumulant", {}), ("analytic", {}), ("box", {"samples": 4}), ("moment", {"samples": 4}), ("adaptive", {})]
-INPUTS = (
-    "means3D",
-    "means2D",
-    "opacities",
-    "shs",
-    "colors_precomp",
-    "scales",
-    "rotations",
-    "cov3D_precomp",
-)
 
 
 def name_of(variant):

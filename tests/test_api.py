@@ -1,6 +1,7 @@
 """The contract with code that was written for other rasterizers, and with wrong input."""
 
 import copy
+import dataclasses
 import functools
 import inspect
 import math
@@ -811,3 +812,14 @@ def test_opcheck(op, device, name):
     if repeats and name in DISPATCHED:
         checks = (*checks, "test_aot_dispatch_dynamic")
     torch.library.opcheck(function, arguments, test_utils=checks)
+
+
+def test_opcheck_of_bin_in_a_large_image(device):
+    """Where the tiles of `moment` with one cell are larger on CUDA than in small images."""
+    camera = dataclasses.replace(CAMERA, image_width=512, image_height=512)
+    settings = camera.settings(torch.float32, device, footprint="moment", samples=1)
+    scene = {name: value for name, value in scene32(device).items() if name != "means2D"}
+    with Calls() as mode:
+        ar.bin(ar.project(settings, **scene))
+    function, arguments = mode.first["bin"]
+    torch.library.opcheck(function, arguments, test_utils=("test_schema", "test_faketensor"))

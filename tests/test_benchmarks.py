@@ -6,6 +6,7 @@ import inspect
 import json
 import math
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -15,11 +16,12 @@ from typing import Any, NamedTuple
 import pytest
 import scenes
 import torch
-from conftest import ROOT
+from conftest import ROOT, python_path
 from processes import DEADLINE
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io, viewer
+from analytic_rasterizer.analysis.timing import added_memory
 from analytic_rasterizer.dialects import DIALECTS
 from analytic_rasterizer.dialects.gsplat import rasterization
 
@@ -368,20 +370,25 @@ def test_training(device, tmp_path, monkeypatch, capsys):
     assert training.main() == 2
 
 
-def test_distributed(small_scene):
-    """Measured numbers for every number of ranks, and the model's for more; as many bytes as the formula says."""
+def run_on_ranks(name, small_scene, *options):
+    """What a benchmark prints and writes that starts one process, and then two."""
     arguments = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--json", small_scene / "out.json"]
-    options = ["--ranks", "1", "2", "--rounds", "2", "--threads", "1", "--device", "cpu", "--times", "3"]
+    options = ["--ranks", "1", "2", "--rounds", "2", "--threads", "1", "--device", "cpu", *options]
     done = subprocess.run(
-        [sys.executable, ROOT / "benchmarks" / "distributed.py", *map(str, arguments), *options],
+        [sys.executable, ROOT / "benchmarks" / name, *map(str, arguments), *options],
         cwd=small_scene, capture_output=True, text=True, timeout=DEADLINE,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
+        env=os.environ | {"PYTHONPATH": python_path()},
     )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]
-    rows = [line.split() for line in done.stdout.splitlines()[4:]]
+    return done.stdout, json.loads((small_scene / "out.json").read_text())
+
+
+def test_distributed(small_scene):
+    """Measured numbers for every number of ranks, and the model's for more; as many bytes as the formula says."""
+    printed, written = run_on_ranks("distributed.py", small_scene, "--times", "3")
+    rows = [line.split() for line in printed.splitlines()[4:]]
     assert [row[0] for row in rows] == ["1", "2", "4", "8", "64"] and {len(row) for row in rows} == {10}
     assert all(cell != "-" for row in rows[:2] for cell in row) and rows[2][1:8] == ["-"] * 7
-    written = json.loads((small_scene / "out.json").read_text())
     assert all(math.isfinite(value) for of_ranks in written["results"].values() for value in of_ranks.values())
     one, two = (written["results"][ranks] for ranks in ("1", "2"))
     assert one["sent"] == one["exchange"] == 0 < two["exchange"] and one["state_bytes"] == 2 * two["state_bytes"]
@@ -389,6 +396,35 @@ def test_distributed(small_scene):
     # Exact where each rank has half of the splats of each camera; here each has at most all of them.
     assert 0 < two["sent"] <= 2 * written["model"]["2"]["sent"]
     assert written["model"]["64"]["images_per_second"] > written["model"]["4"]["images_per_second"] > 0
+
+
+def test_bands(small_scene):
+    """A row for every number of ranks; two of them hold half of the scene each, and the last all of the image."""
+    printed, written = run_on_ranks("bands.py", small_scene, "--times", "3", "--copies", "2", "--scale", "16")
+    assert "in 2 copies: 300\n" in printed
+    one, two = (written["results"][ranks] for ranks in ("1", "2"))
+    assert min(*one.values(), *two.values()) > 0
+    assert one["scene_bytes"] == 2 * two["scene_bytes"]
+    if added_memory(lambda: torch.ones(2**20), torch.device("cpu"))[1] > 0:  # where memory can be measured
+        image = 640 * 480 * 4 * 4  # of 3 channels and alpha; the system may count some pages late
+        assert min(of_ranks["peak_bytes"] - of_ranks["scene_bytes"] for of_ranks in (one, two)) > 0.8 * image
+
+
+def test_bands_say_what_does_not_fit_whichever_rank_is_heard_of(small_scene, monkeypatch):
+    """A scene that does not fit has no numbers; any other error ends the program."""
+    bands = importlib.import_module("bands")
+
+    def raise_of_rank(text):
+        def start_processes(*_, **__):
+            raise torch.multiprocessing.ProcessRaisedException(text, 0, 1)
+
+        monkeypatch.setattr(torch.multiprocessing, "start_processes", start_processes)
+        return bands.measure(2, None)
+
+    assert raise_of_rank("torch.OutOfMemoryError: CUDA out of memory. Tried to allocate 9 GiB") is None
+    assert raise_of_rank("RuntimeError: on rank 1: CUDA out of memory. Tried to allocate 9 GiB") is None
+    with pytest.raises(torch.multiprocessing.ProcessRaisedException, match="something else"):
+        raise_of_rank("RuntimeError: something else")
 
 
 def test_approximations(small_scene, monkeypatch, capsys):
@@ -498,3 +534,41 @@ def test_viewer_gpu(small_scene, monkeypatch, capsys):
     dataclasses.replace(prepared, expected=swapped).save(job)
     run(job, *rounds, "--footprints", "analytic")
     assert json.loads(written.read_text())["differences"]["analytic"]["32-bit floats"]["largest"] > 1
+
+
+def test_every_kernel(device, monkeypatch, capsys):
+    """The program for compute-sanitizer ends; the parts that render footprints are alike, so that one will do here."""
+    program = importlib.import_module("every_kernel")
+    parts = ["box-4", "channels", "pairs", "effects", "losses", "training"]
+    monkeypatch.setattr(sys, "argv", ["every_kernel.py", *parts, "--device", device])
+    program.main()
+    assert capsys.readouterr().out.split()[-len(parts) :] == parts
+
+
+@pytest.mark.parametrize("footprint, options", scenes.PATHS, ids=map(scenes.name_of, scenes.PATHS))
+def test_every_kernel_has_images_that_need_it(footprint, options):
+    """What its comment says of lists and of pixels that close."""
+    program = importlib.import_module("every_kernel")
+    long_list = re.search(r"kLongList = (\d+);", (ROOT / "csrc" / "cuda" / "blend_listed.cuh").read_text())[1]
+    longest, most_in_8, closed = {}, {}, {}
+    for name, image in program.IMAGES.items():
+        settings = image.camera().settings(torch.float32, footprint=footprint, **options)._replace(sh_degree=3)
+        leaves = scenes.leaves(image.scene("cpu"))
+        del leaves["means2D"]
+        splats = ar.project(settings, **leaves)
+        lists = ar.bin(splats)
+        of_camera = lists.of_camera()
+        ar.blend(splats, lists)[0].sum().backward()
+        longest[name] = int(of_camera["tile_offsets"].diff().max())
+        # With its mean in a tile of 8x8 px, a splat that has pairs has one with that tile.
+        listed = splats.means2d.detach()[of_camera["pairs"].long().unique()]
+        tiles = ((listed + 0.5) / 8).floor()
+        most_in_8[name] = int(tiles.unique(dim=0, return_counts=True)[1].max())
+        # Splats as large as a pixel, of opacities of 0.3 and above, that have a pixel and no gradient: all are closed.
+        inside = ((splats.means2d > 0) & (splats.means2d < torch.tensor([image.width - 1, image.height - 1]))).all(1)
+        closed[name] = int((inside & (leaves["opacities"].grad[splats.gaussian_ids.long(), 0] == 0)).sum())
+    large = [image for name, image in program.IMAGES.items() if name.startswith("large")]
+    assert all((image.width // 8) * (image.height // 8) >= 4096 for image in large)
+    assert most_in_8["small"] > int(long_list) and longest["small"] > int(long_list)
+    assert most_in_8["large, few tiles"] > 1000
+    assert closed["large, opaque"] > 100 and closed["small, opaque"] > 100

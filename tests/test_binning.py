@@ -15,6 +15,8 @@ from conftest import each_precision
 from scenes import KINDS, PATHS, RENDERED, Camera, name_of
 
 import analytic_rasterizer as ar
+from analytic_rasterizer import _C
+from analytic_rasterizer.footprints import resolve_footprint
 
 # The brute force takes as long as there are pixels. Six by four tiles, the last of them cut off at both edges.
 CAMERA = Camera(image_width=86, image_height=54, tanfovx=0.7, tanfovy=0.44).facing_z()
@@ -54,7 +56,7 @@ def stages(scene, variant, dtype=torch.float64, device="cpu"):
 
 
 def tile_size(variant, device):
-    """Tiles on CUDA of samples that move are smaller."""
+    """Tiles on CUDA of samples that move are smaller, in an image as small as this."""
     return 8 if variant[0] == "moment" and device == "cuda" else ar.TILE
 
 
@@ -249,6 +251,14 @@ def test_depths_that_differ_in_the_last_bit(device):
         result, _ = stages(scene, ("mip", {}), dtype, device)
         first = result.pairs[: result.tile_offsets[result.tile_offsets > 0][0]]
         assert first.tolist() == [2, 1, 0], dtype
+
+
+def test_tiles_of_one_cell_are_large_in_large_images():
+    """On CUDA: from 4096 tiles of 8x8 px on. On the CPU all tiles have 16x16 px."""
+    key = resolve_footprint("moment", samples=1).key
+    assert [_C.tile_size(key, 1.0, width, 512, True) for width in (512, 504)] == [16, 8]
+    assert [_C.tile_size(key, 1.0, width, 512, False) for width in (512, 504)] == [16, 16]
+    assert _C.tile_size(resolve_footprint("moment", samples=4).key, 1.0, 512, 512, True) == 8
 
 
 @pytest.mark.parametrize("variant", KINDS, ids=name_of)

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, SHARED
+from conftest import SHARED, python_path
 from processes import DEADLINE
 
 import analytic_rasterizer as ar
@@ -59,7 +59,7 @@ def arguments(files, *extra):
 
 def run(*args, **options):
     """`python -m analytic_rasterizer` in its own process."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    environment = os.environ | {"PYTHONPATH": python_path()}
     return subprocess.run(
         [sys.executable, "-m", "analytic_rasterizer", *map(str, args)],
         capture_output=True,
@@ -257,7 +257,7 @@ def test_interrupt_of_a_process_is_quiet(files):
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        env=os.environ | {"PYTHONPATH": python_path()},
         # A job in the background of a script ignores SIGINT, and its children with it.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )

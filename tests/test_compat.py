@@ -9,7 +9,7 @@ import json
 import os
 
 import pytest
-from conftest import ROOT, SHARED, needs_cuda
+from conftest import ROOT, SHARED, needs_cuda, python_path
 from processes import DEADLINE, run_program
 
 RUNNER, CONTRACT = SHARED / "compat" / "run.py", SHARED / "compat" / "contract.py"
@@ -41,8 +41,7 @@ def cases():
 def run(device, program, *arguments, dialect=""):
     environment = {key: value for key, value in os.environ.items() if not key.startswith("ANALYTIC_RASTERIZER_")}
     environment |= {"PYTHONDONTWRITEBYTECODE": "1", "OMP_NUM_THREADS": "1", "ANALYTIC_RASTERIZER_DIALECT": dialect}
-    paths = [os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
-    environment["PYTHONPATH"] = os.pathsep.join([*paths, str(ROOT)])
+    environment["PYTHONPATH"] = python_path()
     return run_program(program, *arguments, "--device", device, environment=environment, timeout=2 * DEADLINE)
 
 

@@ -15,10 +15,14 @@ import torch.distributed as dist
 from conftest import needs_cuda
 from processes import DEADLINE, start_processes
 from scenes import Camera
+from torch.distributed import distributed_c10d
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C, distributed
+from analytic_rasterizer.cli import launch
 from analytic_rasterizer.distributed import agreement
+from analytic_rasterizer.distributed.exchange import Route
+from analytic_rasterizer.distributed.rows import Shard, together
 
 WORLD = 3
 COUNT, HIDDEN = 60, slice(37, 46)
@@ -27,7 +31,13 @@ CAMERAS = (
     (Camera(image_width=40, image_height=17, eye=(1.5, 0.4, -3.2)), "analytic"),
     (Camera(image_width=18, image_height=33, tanfovx=0.3, bg=(0.5, 0.0, 1.0)), "adaptive"),
     (Camera(image_width=27, image_height=21, eye=(-1.1, 0.2, -4.5)), "cumulant"),
+    (
+        Camera(image_width=27, image_height=21, eye=(0.9, 0.5, -3.6)),
+        "box:samples=4",
+    ),  # projected together with the first
+    (Camera(image_width=31, image_height=18, eye=(9, 0, 0), target=(18, 0, 0), bg=(0.2, 0.7, 0.4)), "moment:samples=4"),
 )
+UNSEEING = 5  # of these cameras: it looks away from all Gaussians
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,6 +55,11 @@ class Scenario:
     def ranks(self):
         return len(self.shards)
 
+    @property
+    def trains(self):
+        """Whether any Gaussian has a gradient that is not zero."""
+        return len(self.frozen) < self.ranks and self.cameras != (UNSEEING,)
+
 
 SCENARIOS = {
     "one-rank": Scenario((60,)),
@@ -52,6 +67,10 @@ SCENARIOS = {
     "two-ranks-float64": Scenario((19, 41), dtype=torch.float64),
     "two-ranks-one-without-gradient": Scenario((30, 30), frozen=(0,), means2d_abs=False),
     "two-ranks-one-without-camera": Scenario((30, 30), cameras=(1,)),
+    "two-ranks-cameras-projected-together": Scenario((23, 37), cameras=(0, 1, 4), owners=(1, 0, 1)),
+    "two-ranks-one-camera-sees-nothing": Scenario((41, 19), cameras=(UNSEEING, 1)),
+    "two-ranks-no-camera-sees-anything": Scenario((41, 19), cameras=(UNSEEING,), owners=(1,)),
+    "two-ranks-only-backgrounds-have-gradients": Scenario((30, 30), cameras=(1,), frozen=(0, 1), means2d_abs=False),
     "three-ranks-one-unseen": Scenario((37, 9, 14)),
     "three-ranks-one-empty": Scenario((0, 45, 15), owners=(2, 0, 0, 2)),
 }
@@ -139,7 +158,7 @@ def plain(scenario, scene, settings):
         "magnitudes": {name: sum(g[k].abs() for g in of_cameras) for k, name in enumerate(leaves)},
         "means2d": [s.means2d.grad for s in shard],
         "absolute": [t.grad for t in made["absolute"]],
-        "views": [v.grad for v in views],
+        "views": [or_zero(v.grad, v) for v in views],
         "bg": [b.grad for b in bgs],
     }
 
@@ -169,6 +188,7 @@ def mistakes(rank, device):
         return lambda: distributed.rasterize(cameras, **arguments, group=GROUPS[2])
 
     moving = settings[3]._replace(viewmatrix=settings[3].viewmatrix.clone().requires_grad_())
+    first, last = (s._replace(viewmatrix=o.viewmatrix) for s, o in zip(settings[::3], settings[::-3]))
     other_view = settings[3]._replace(viewmatrix=settings[3].viewmatrix + 1e-6)
     found = {
         "shape": error_of(call({"means3D": torch.zeros(5, 2, device=device)})),
@@ -182,6 +202,8 @@ def mistakes(rank, device):
         "colors": error_of(call({"shs": None})),
         "bg": error_of(call({"settings": [s._replace(bg=torch.zeros(4, device=device)) for s in settings]})),
         "auto": error_of(call(cameras=[s._replace(effects="auto") for s in settings])),
+        "swapped": error_of(call({"settings": [first, *settings[1:3], last]})),
+        "effects": error_of(call({"settings": with_nears(settings, reversed(NEARS))}, with_nears(settings, NEARS))),
     }
     if device == "cpu":
         double = dataclasses.replace(scenario, dtype=torch.float64)
@@ -191,6 +213,93 @@ def mistakes(rank, device):
     with torch.set_grad_enabled(rank == 0):
         found["grad"] = error_of(call())
     return found
+
+
+NEARS = (0.2, 0.4, 0.2, 0.6)
+
+
+def with_nears(settings, nears):
+    """Cameras that cull up to such depths; those of one depth share their effects."""
+    effects = {near: ar.Effects(near=near) for near in NEARS}
+    return [s._replace(effects=effects[near]) for s, near in zip(settings, nears)]
+
+
+class Guess(dict):
+    """In the place of `Shard._guesses`: the same guess for whatever is rendered."""
+
+    def __init__(self, *guess):
+        super().__init__()
+        self.guess = guess
+
+    def get(self, *_):
+        return self.guess
+
+
+def guessed(guess, arguments):
+    """What a rank makes that guesses so much room and such a first id, and how often it writes rows."""
+    write = mock.patch.object(Shard, "_write", autospec=True, side_effect=Shard._write)
+    with mock.patch.object(Shard, "_guesses", guess), write as writes:
+        made = make(*arguments)
+    return made, writes.call_count
+
+
+class Full:
+    """In the place of `Shard._write` of a rank that has no memory, the first `times` it is asked to write rows."""
+
+    def __init__(self, times):
+        self.left, self.write = times, Shard._write
+
+    def __call__(self, shard, *arguments):
+        self.left -= 1
+        if self.left >= 0:
+            raise RuntimeError("rows do not fit")
+        return self.write(shard, *arguments)
+
+
+def without_memory(rank, device, late):
+    """What each rank of two makes, or raises, where rank 1 fails while the message is on its way."""
+    scenario = SCENARIOS["two-ranks"]
+    first, count = sum(scenario.shards[:rank]), scenario.shards[rank]
+    scene = {name: value[first : first + count] for name, value in scene_of(scenario.dtype, device).items()}
+    settings = settings_of(scenario, device)
+
+    def call(times, group=GROUPS[2], change=None):
+        full = Full(times if rank == 1 else 0)
+        write = mock.patch.object(Shard, "_write", lambda *arguments: full(*arguments))
+        with mock.patch.object(Shard, "_guesses", Guess(COUNT, first)), write:
+            return make(scenario, scene | (change or {}), settings, group)
+
+    found = {"while guessing": call(1)}
+    wrong = {"means3D": torch.zeros(5, 2, device=device)} if rank == 0 else {}
+    found["another rank has raised"] = error_of(lambda: call(1, change=wrong))
+    if device == "cpu":  # NCCL ends the process that waits in vain
+        send = Route.send
+
+        def send_in_vain(*arguments):
+            # Not new_group's own time-out: within that the ranks would have to agree too, however busy the machine.
+            distributed_c10d._set_pg_timeout(datetime.timedelta(seconds=1), late)
+            return send(*arguments)
+
+        with mock.patch.object(Route, "send", send_in_vain):
+            found["for good"] = error_of(lambda: call(2, late))
+    return found
+
+
+SHARING = dataclasses.replace(SCENARIOS["two-ranks"], cameras=(0, 1, 4, 3))
+
+
+def equal_effects(rank, device):
+    """Settings that are the same on both ranks, where cameras share their effects on one of them only.
+
+    There the first and the third are projected together.
+    """
+    scenario = SHARING
+    first, count = sum(scenario.shards[:rank]), scenario.shards[rank]
+    scene = {name: value[first : first + count] for name, value in scene_of(scenario.dtype, device).items()}
+    settings = with_nears(settings_of(scenario, device), NEARS)
+    if rank == 1:
+        settings = [s._replace(effects=dataclasses.replace(s.effects)) for s in settings]
+    return make(scenario, scene, settings, GROUPS[2])
 
 
 GROUPS = {}  # of this process, by number of ranks
@@ -213,6 +322,7 @@ def work(rank, world, folder, kind):
     # The last processes, so that a rank in the group is not that in the world.
     GROUPS.update({ranks: dist.new_group(list(range(world - ranks, world))) for ranks in range(1, world)})
     GROUPS[world] = None
+    late = dist.new_group([world - 2, world - 1])
     for name, scenario in scenarios_of(kind, world).items():
         place = rank - (world - scenario.ranks)
         if place < 0:
@@ -226,17 +336,31 @@ def work(rank, world, folder, kind):
         made["sent"] = [call.args[1].nbytes for call in calls.call_args_list]
         with mock.patch.object(agreement, "_ROOM", 9):  # the counts of two cameras; those of others follow
             again = make(*arguments)
-        torch.save((made, again), f"{folder}/{name}-{place}.pt")
+        guesses = {name: Guess(*guess) for name, guess in guesses_of(first).items()}
+        by_guess = {name: guessed(guess, arguments) for name, guess in guesses.items()}
+        torch.save((made, again, by_guess), f"{folder}/{name}-{place}.pt")
     if rank >= world - 2:
-        torch.save(mistakes(rank - (world - 2), device), f"{folder}/mistakes-{rank - (world - 2)}.pt")
-        torch.save(not_finite(rank - (world - 2), device), f"{folder}/not-finite-{rank - (world - 2)}.pt")
-        torch.save(twice(rank - (world - 2), device), f"{folder}/twice-{rank - (world - 2)}.pt")
+        place = rank - (world - 2)
+        torch.save(mistakes(place, device), f"{folder}/mistakes-{place}.pt")
+        torch.save(not_finite(place, device), f"{folder}/not-finite-{place}.pt")
+        torch.save(equal_effects(place, device), f"{folder}/equal-effects-{place}.pt")
+        torch.save(twice(place, device), f"{folder}/twice-{place}.pt")
+        torch.save(without_memory(place, device, late), f"{folder}/without-memory-{place}.pt")
     if rank == world - 1:
         torch.save(without_sending(device), f"{folder}/silent.pt")
     else:
         torch.save(error_of(lambda: distributed.rasterize([], None, None, group=GROUPS[1])), f"{folder}/outside.pt")
     dist.barrier()
     dist.destroy_process_group()
+
+
+def guesses_of(first_id):
+    """Room for rows and the id of the first Gaussian, as a rank with this first id may guess them."""
+    return {
+        "right": (len(CAMERAS) * COUNT, first_id),
+        "too little room": (3, first_id),
+        "another id": (len(CAMERAS) * COUNT, first_id + 5),
+    }
 
 
 def scene_not_finite(scenario, device):
@@ -308,7 +432,7 @@ def ran(request, runs):
     scenario = scenarios_of(runs.kind, runs.world).get(request.param)
     if scenario is None:
         pytest.skip(f"not of {runs.kind} with {runs.world} devices")
-    made, again = zip(*(runs.load(f"{request.param}-{rank}") for rank in range(scenario.ranks)))
+    made, again, _ = zip(*(runs.load(f"{request.param}-{rank}") for rank in range(scenario.ranks)))
     arguments = scenario, scene_of(scenario.dtype, runs.kind), settings_of(scenario, runs.kind)
     return scenario, made, again, plain(*arguments)
 
@@ -349,7 +473,8 @@ def test_gradients_are_those_of_one_rank(ran):
         assert all((parts[rank] == 0).all() for rank in scenario.frozen)
         error = (torch.cat(parts) - whole).abs()[given]
         bound = (len(scenario.cameras) - 1) * eps * expected["magnitudes"][name][given]
-        assert whole[given].abs().max() > 0 and (error <= bound).all(), (name, (error - bound).max())
+        assert (error <= bound).all(), (name, (error - bound).max())
+        assert whole[given].any() == scenario.trains
         if scenario.ranks == 1:
             assert torch.equal(parts[0], whole)
 
@@ -378,6 +503,9 @@ def test_gradients_of_cameras_are_the_sum_over_ranks(ran, runs):
         pytest.skip("its cameras require no gradient")
     scene, settings = scene_of(scenario.dtype, runs.kind), settings_of(scenario, runs.kind)
     for camera, whole in enumerate(expected["views"]):
+        if scenario.cameras[camera] == UNSEEING:
+            assert len(expected["ids"][camera]) == 0 and not any(rank["views"][camera].any() for rank in made)
+            continue
         terms = camera_terms(settings[camera], scene)
         error = (sum(rank["views"][camera] for rank in made) - whole).abs()
         bound = 2 * (len(terms) - 1) * torch.finfo(scenario.dtype).eps / 2 * terms.abs().sum(0)
@@ -398,7 +526,7 @@ def test_radii_and_gradients_of_means2d_are_where_the_gaussians_are(ran):
             wanted["absolute"] = expected["absolute"][camera]
         for name, value in wanted.items():
             assert torch.equal(torch.cat([rank[name][camera] for rank in made]), value), name
-        assert expected["means2d"][camera].abs().max() > 0
+        assert expected["means2d"][camera].any() == (scenario.cameras[camera] != UNSEEING)
     if HIDDEN.start in (sum(scenario.shards[:k]) for k in range(scenario.ranks)):
         assert [len(rank["ids"][0]) for rank in made][1] == 0  # the scenario holds a rank that sends nothing
 
@@ -409,6 +537,25 @@ def test_a_second_run_makes_the_same_bits(ran):
     for first, second in zip(made, again):
         for name, value in second.items():
             torch.testing.assert_close(first[name], value, rtol=0, atol=0)
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_what_is_guessed_of_rows_changes_no_bit(runs, name):
+    """Rows for which too little room was guessed, or another first id, are written again."""
+    scenario = scenarios_of(runs.kind, runs.world).get(name)
+    if scenario is None or scenario.ranks == 1:
+        pytest.skip(f"not of {runs.kind} with {runs.world} devices" if scenario is None else "writes no rows")
+    written_again = 0
+    for rank in range(scenario.ranks):
+        made, _, by_guess = runs.load(f"{name}-{rank}")
+        rows_of_rank = sum(len(ids) for ids in made["ids"])
+        for guess, (again, writes) in by_guess.items():
+            wrong = guess == "another id" or (guess == "too little room" and rows_of_rank > 3)
+            assert writes == 1 + wrong
+            written_again += wrong
+            for part, value in again.items():
+                torch.testing.assert_close(value, made[part], rtol=0, atol=0)
+    assert written_again >= scenario.ranks
 
 
 def test_as_many_bytes_are_sent_as_the_documentation_says(ran):
@@ -439,6 +586,38 @@ def test_colors_that_are_not_finite(runs):
     for camera, radii in enumerate(expected["radii"]):
         found = torch.cat([rank["radii"][camera] for rank in made])
         assert len(found) == len(radii) + 2 and torch.equal(found[found > 0], radii)
+
+
+def test_effects_may_be_shared_by_cameras_on_one_rank_only(runs):
+    """They are compared by what they say, camera by camera."""
+    scenario = SHARING
+    settings = with_nears(settings_of(scenario, runs.kind), NEARS)
+    expected = plain(scenario, scene_of(scenario.dtype, runs.kind), settings)
+    for rank in range(2):
+        made = runs.load(f"equal-effects-{rank}")
+        for k, camera in enumerate(made["cameras"]):
+            assert torch.equal(made["images"][k], expected["images"][camera])
+
+
+def test_what_fails_while_the_message_is_on_its_way_is_done_again(runs):
+    """So the ranks agree about errors, whatever one of them could not begin."""
+    made = [runs.load(f"two-ranks-{rank}")[0] for rank in range(2)]
+    for rank in range(2):
+        found = runs.load(f"without-memory-{rank}")
+        for name, value in found["while guessing"].items():
+            torch.testing.assert_close(value, made[rank][name], rtol=0, atol=0)
+        assert found["another rank has raised"] == (
+            "ValueError",
+            "on rank 0: means3D must have shape (P, 3), got (5, 2)",
+        )
+
+
+def test_a_rank_that_cannot_write_its_rows_ends_the_others_by_time_out(runs):
+    if runs.kind == "cuda":
+        pytest.skip("NCCL ends the process that waits in vain")
+    waited, raised = (runs.load(f"without-memory-{rank}")["for good"] for rank in range(2))
+    assert raised == ("RuntimeError", "rows do not fit")
+    assert launch._reason(waited[1], 1) == "time-out: another rank did not answer for 1 s (--rank-timeout)"
 
 
 def test_the_way_back_is_taken_once(runs):
@@ -485,6 +664,18 @@ def calls(device):
     needs = [name in ("means3D", "opacities", "shs", "scales", "rotations") for name in arguments][:11]
     adjoint = arguments | {"dL_drows": dL_drows, "ids": ids, "needs": needs} | places
     return dict(zip(OPS, (arguments, packed, adjoint, blended, back)))
+
+
+def test_rows_hold_what_project_returns(calls, device):
+    scenario = SCENARIOS["one-rank"]
+    splats = ar.project(settings_of(scenario, device)[0], **scene_of(scenario.dtype, device))
+    rows, first_id = (calls["pack_rows_"][name] for name in ("rows", "first_id"))
+    rows = rows[: len(splats.means2d)]
+    columns = {name: rows[:, place] for name, place in _C.ROW_COLUMNS.items()}
+    columns["gaussian_ids"] = columns["gaussian_ids"].view(torch.int32) - first_id
+    for name, values in columns.items():
+        assert torch.equal(values, getattr(splats, name)), name
+    assert sum(values[:1].numel() for values in columns.values()) == _C.ROW_WIDTH
 
 
 @pytest.mark.parametrize("op", OPS)
@@ -535,6 +726,35 @@ def test_places_before_the_first_row_are_not_written(change, calls):
     torch.ops.analytic_rasterizer.pack_rows_(**arguments)
     for whole in around.values():
         assert whole[:margin].eq(7).all() and whole[-margin:].eq(7).all()
+
+
+def shard_of(scene):
+    """The rows of a scene in two cameras, and how many there are."""
+    settings = settings_of(dataclasses.replace(SCENARIOS["one-rank"], cameras=(0, 1)), "cpu")
+    optional = dict.fromkeys(("shs", "colors_precomp", "scales", "rotations", "cov3D_precomp"))
+    shard = Shard(together(settings, **optional | scene), [1, 0])
+    return shard, int(shard.counts.sum())
+
+
+def test_a_guess_of_rows_is_for_as_many_gaussians():
+    """What was guessed for another scene would cost time and memory. Few guesses are kept, the last ones."""
+    scene = scene_of(torch.float32, "cpu")
+    scenes_of = [{name: value[:count] for name, value in scene.items()} for count in range(COUNT // 2, COUNT)]
+    with mock.patch.object(Shard, "_guesses", {}):
+        for of_count in scenes_of:
+            shard, total = shard_of(of_count)
+            shard.begin()
+            assert shard._made is None
+            rows, _, ids = shard.finish(total, 0)
+            assert rows.shape == (total, _C.ROW_WIDTH) and len(ids) == total > 0
+        assert len(Shard._guesses) < len(scenes_of)
+        for of_count, known in ((scenes_of[-1], True), (scenes_of[0], False)):
+            shard, total = shard_of(of_count)
+            shard.begin()
+            assert (shard._made is not None) == known
+            if known:
+                made = shard._made[0]
+                assert torch.equal(shard.finish(total, 0)[0], made[:total])
 
 
 def test_depths_are_equal_in_pairs():
@@ -629,6 +849,14 @@ MISTAKES = {
     "colors": ("ValueError", "on rank 1: shs or colors_precomp must be given, got neither"),
     "bg": ("ValueError", "on rank 1: bg must have shape (3,), got (4,) of camera 0"),
     "auto": ("ValueError", 'on rank 0: effects must not be "auto", which looks at all Gaussians, got it of camera 0'),
+    "swapped": (
+        "ValueError",
+        "settings, owners and means2d_abs must be the same on every rank, got a difference between ranks 0 and 1",
+    ),
+    "effects": (
+        "ValueError",
+        "settings, owners and means2d_abs must be the same on every rank, got a difference between ranks 0 and 1",
+    ),
     "dtype": (
         "ValueError",
         "means3D must have one dtype and one kind of device on every rank, got a difference between ranks 0 and 1: "

@@ -75,6 +75,18 @@ def band_of(footprint, dtype, sizes, rank, group=None, camera=None):
     }
 
 
+def background_alone(sizes, rank):
+    """Rows of the bands, and the gradient of the background, which on rank 0 is all that requires one."""
+    settings = settings_of(FOOTPRINTS[0], torch.float32)
+    bg = settings.bg.clone().requires_grad_(rank == 0)
+    gaussians = rows_of(scene_of(torch.float32, "cpu"), sizes, rank)
+    band = distributed.rasterize_bands(settings._replace(bg=bg), **gaussians)
+    first, end = band.rows[rank]
+    of_band = weights(settings.image_height, settings.image_width)[:, first:end]
+    (band.anchor + (torch.cat([band.image, band.alpha]) * of_band).sum()).backward()
+    return band.rows, bg.grad
+
+
 def of_one_process(footprint, dtype, rows):
     """The whole image, and of every band the gradient with respect to splats; and that of Gaussians of their sum."""
     (settings,), (view,), (bg,) = with_camera_gradients([settings_of(footprint, dtype)])
@@ -180,6 +192,7 @@ def work(rank, folder):
         made["float64"] = band_of(FOOTPRINTS[0], torch.float64, SHARDS[world], rank)
         made["again"] = band_of(FOOTPRINTS[0], torch.float32, SHARDS[world], rank)
         made["low"] = band_of(FOOTPRINTS[0], torch.float32, SHARDS[world], rank, camera=LOW)
+        made["background"] = background_alone(SHARDS[world], rank)
         for variant in VARIANTS:
             cameras = {name: t[rank * PER_RANK :][:PER_RANK] for name, t in cameras_of(world).items()}
             scene = rows_of(gaussians_of(variant), SHARDS[world], rank)
@@ -235,6 +248,16 @@ def test_gradients_of_bands_are_those_of_one_process(made, world, name, dtype):
             assert torch.equal(torch.cat([part["gradients"][leaf] for part in parts]), whole), leaf
     assert torch.equal(torch.cat([part["ids"] for part in parts]).sort()[0], torch.cat([p["ids"] for p in parts]))
     assert {part["count"] for part in parts} == {COUNT}
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_every_rank_runs_the_backward_pass_of_one_background(made, world):
+    """Where nothing else on any rank requires a gradient."""
+    (rows, bg), *others = (of_rank["background"] for of_rank in made[world])
+    expected = of_one_process(FOOTPRINTS[0], torch.float32, rows)
+    n, [whole, *_] = expected["alpha"].numel(), expected["bg"]
+    assert ((bg - whole).abs() <= (n - 1) * torch.finfo(torch.float32).eps * whole).all() and (whole > 0).all()
+    assert others == [(rows, None)] * (world - 1)
 
 
 @pytest.mark.parametrize("world", WORLDS)

@@ -683,20 +683,15 @@ def trained(device, count=60, seed=0):
     return params, {name: torch.optim.Adam([value], lr=1e-3) for name, value in params.items()}
 
 
+def activated(params):
+    """What `rasterization` renders of them."""
+    scales, opacities = params["scales"].exp(), params["opacities"].sigmoid()
+    return {name: params[name] for name in ("means", "quats", "colors")} | {"scales": scales, "opacities": opacities}
+
+
 def step_once(params, optimizers, cameras, before=lambda meta: None, **options):
     """One step of training towards grey; what `rasterization` returned."""
-    images, alphas, meta = render(
-        {
-            "means": params["means"],
-            "quats": params["quats"],
-            "scales": params["scales"].exp(),
-            "opacities": params["opacities"].sigmoid(),
-            "colors": params["colors"],
-        },
-        cameras,
-        sh_degree=1,
-        **options,
-    )
+    images, alphas, meta = render(activated(params), cameras, sh_degree=1, **options)
     before(meta)
     (images - 0.5).square().mean().backward()
     for optimizer in optimizers.values():
@@ -767,19 +762,7 @@ def test_mcmc_strategy_runs_on_our_meta(device, packed, column, patched):
     torch.manual_seed(0)
     for step, expected in enumerate((60, 63, 65, 65)):
         values = {"opacities": params["opacities"].sigmoid().reshape(-1)} if column else {}
-        images, _, meta = render(
-            {
-                "means": params["means"],
-                "quats": params["quats"],
-                "scales": params["scales"].exp(),
-                "opacities": params["opacities"].sigmoid(),
-                "colors": params["colors"],
-                **values,
-            },
-            cameras,
-            sh_degree=1,
-            packed=packed,
-        )
+        images, _, meta = render(activated(params) | values, cameras, sh_degree=1, packed=packed)
         strategy.step_pre_backward(params, optimizers, state, step, meta)
         (images - 0.5).square().mean().backward()
         for optimizer in optimizers.values():

@@ -56,13 +56,14 @@ def resident_bytes():
 
 # The smallest block that malloc hands out takes 32 bytes; lost once per call it would make 320,000. The bound is half
 # of that. What comes without a leak are pages of the heap that were never touched before: after the warm-up every
-# size of block has been asked for, so that only few do (20 of 4096 bytes were measured).
-CALLS, WARM_UP = 10_000, 300
+# size of block has been asked for, so that only few do (20 of 4096 bytes were measured). Linux may also put a huge
+# page of 2 MiB in the place of small ones, some of which were never touched. A leak grows in every round; these do not.
+CALLS, WARM_UP, ROUNDS = 10_000, 300, 3
 GROWTH = 160_000
 
 
 def test_memory_does_not_grow(device):
-    """10,000 forward and backward passes, the footprints in turn."""
+    """10,000 forward and backward passes, the footprints in turn; again where memory grew."""
     scene = scenes.to(scene32(count=12, degree=1), device)
     leaves = scenes.leaves(scene)
     rasterizers = [rasterizer_for(variant, SMALL, device) for variant in KINDS]
@@ -83,13 +84,16 @@ def test_memory_does_not_grow(device):
         return (resident_bytes(),)
 
     frames(WARM_UP)
-    before = memory()
-    frames(CALLS)
-    after = memory()
-    growth = after[0] - before[0]
-    print(f"{growth} bytes in {CALLS} calls")
+    for _ in range(ROUNDS):
+        before = memory()
+        frames(CALLS)
+        after = memory()
+        growth = after[0] - before[0]
+        print(f"{growth} bytes in {CALLS} calls")
+        assert after[1:] == before[1:]
+        if growth < GROWTH:
+            break
     assert growth < GROWTH
-    assert after[1:] == before[1:]
 
 
 # --- interrupts and exceptions -----------------------------------------------------------------

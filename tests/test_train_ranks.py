@@ -15,7 +15,7 @@ from unittest import mock
 import pytest
 import torch
 import torch.distributed as dist
-from conftest import ROOT, in_threads
+from conftest import in_threads, python_path
 from processes import DEADLINE, run_program, start_processes
 from torch.distributed import distributed_c10d
 
@@ -353,8 +353,7 @@ def torchrun(scene, out, *options):
     """`train` on two processes."""
     program = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2"]
     program += ["-m", "analytic_rasterizer", *command(scene, out, *options)]
-    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": path}
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": python_path()}
     return subprocess.run(program, capture_output=True, text=True, timeout=DEADLINE, env=environment, cwd=out.parent)
 
 
@@ -396,7 +395,7 @@ def test_a_rank_that_dies_ends_all_with_one_message(made, tmp_path, end):
     """
     arguments = command(made / "scene", tmp_path / "out", "--iterations", "30")
     store = dist.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)  # as torchrun has one
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT), "WORLD_SIZE": "2"}
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": python_path(), "WORLD_SIZE": "2"}
     environment |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(store.port)}
     environment |= {"TORCHELASTIC_RUN_ID": "none", "TORCHELASTIC_USE_AGENT_STORE": "True"}
     done = [None, None]

@@ -15,7 +15,7 @@ STYLES = {  # colour and marker
     "analytic": ("#c2255c", "D"),
     "cumulant": ("#2b8a3e", "^"),
     "box": ("#1c7ed6", "v"),
-    "moment": ("#0c8599", "X"),
+    "moment": ("#0c8599", "p"),
     "adaptive": ("#7048e8", "P"),
     "erf": ("#e599b8", "d"),
     "exact": ("#000000", "*"),

@@ -14,9 +14,6 @@ from typing import Any, NamedTuple, TypeVar
 import torch
 import torch.distributed as dist
 
-from ..stages import Splats
-from .exchange import DIFFERENTIABLE
-
 _KINDS = (("cpu", torch.float32), ("cpu", torch.float64), ("cuda", torch.float32))  # that `project` takes
 _MAX_GAUSSIANS = torch.iinfo(torch.int32).max
 _DIGESTS = ("settings",)  # facts whose values say nothing
@@ -68,8 +65,8 @@ def agree(
         make: Returns what it made, the facts that `requirements` names, and None or counts, a vector of int64 whose
             length is the fact "cameras".
         requirements: By fact what to say of ranks that differ in it; None: they may.
-        meanwhile: Called with what was made while the message is on its way, to give the device something to do. What
-            it raises the other ranks do not hear of.
+        meanwhile: Called with what was made while the message is on its way, to give the device something to do. It
+            must not raise, for the other ranks would not hear of it.
 
     Raises:
         TypeError, ValueError, RuntimeError: On every rank the same, if `make` raised on one of them, which the message
@@ -85,11 +82,9 @@ def agree(
     room = _ROOM - 1 - len(numbers)
     message = _message([int(error is not None), *numbers], counts if counts is None else counts[:room], group)
     wait = _begin_gathering(message, world, group)
-    try:
-        if error is None:
-            meanwhile(made)
-    finally:
-        rows = wait().tolist()
+    if error is None:
+        meanwhile(made)
+    rows = wait().tolist()
     if any(row[0] for row in rows):
         reports: list[Any] = [None] * world
         kind = next((k for k in (TypeError, ValueError) if isinstance(error, k)), RuntimeError)
@@ -158,29 +153,35 @@ def facts_of(
     }
 
 
-def rows_of(shard: Sequence[Splats]) -> list[torch.Tensor]:
-    """The tensors of splats that gradients flow through."""
-    return [getattr(splats, name) for splats in shard for name in DIFFERENTIABLE]
+def digest_of(cameras: Iterable[tuple[Sequence[int], dict[str, Any]]], others: Any) -> torch.Tensor:
+    """() int64, of `others` and of what is said of each camera: tensors bit for bit. The same however cameras are
+    grouped. On the device of the tensors, for which nobody waits.
+
+    Args:
+        cameras: Of each group the places of its cameras, and by name what is said of them: a tensor or a list with an
+            entry for each of them, or something else for all.
+    """
+    numbers: dict[int, list] = {}
+    digest: Any = 0
+    for places, arguments in cameras:
+        for k, place in enumerate(places):
+            numbers[place] = [
+                (name, v.shape[1:] if torch.is_tensor(v) else v[k] if isinstance(v, list) else v)
+                for name, v in arguments.items()
+            ]
+        tensors = [v.detach().flatten(1) for v in arguments.values() if torch.is_tensor(v)]
+        bits = torch.cat(tensors, 1).view(torch.int32).long()
+        digest = digest + (bits * _weights(tuple(places), bits.shape[1], bits.device)).sum()
+    text = repr((others, sorted(numbers.items())))
+    return digest + int.from_bytes(hashlib.blake2b(text.encode(), digest_size=8).digest(), "little", signed=True)
 
 
-def digest_of(arguments: Iterable[dict[str, Any]], others: Any) -> torch.Tensor:
-    """() int64, of `others` and of what the arguments, by name, say of cameras: their tensors bit for bit. On the
-    device of the tensors, for which nobody waits."""
-    numbers, tensors = [others], []
-    for of_cameras in arguments:
-        for name, value in of_cameras.items():
-            if torch.is_tensor(value):
-                tensors.append(value.detach().reshape(-1))
-            numbers.append((name, tuple(value.shape) if torch.is_tensor(value) else value))
-    digest = hashlib.blake2b(repr(numbers).encode(), digest_size=8).digest()
-    bits = torch.cat(tensors).view(torch.int32).long()
-    return (bits * _weights(len(bits), bits.device)).sum() + int.from_bytes(digest, "little", signed=True)
-
-
-@lru_cache(maxsize=16)
-def _weights(count: int, device: torch.device) -> torch.Tensor:
-    """(count,) int64, odd and without order, so that sums of their products with other bits, modulo 2^64, differ."""
-    weights = torch.arange(1, count + 1, device=device) * -7046029254386353131
+@lru_cache(maxsize=64)
+def _weights(places: tuple[int, ...], width: int, device: torch.device) -> torch.Tensor:
+    """(places, width) int64, odd and without order, a row for each place whatever the others are: so that sums of their
+    products with other bits, modulo 2^64, differ."""
+    rows = [torch.arange(1, width + 1, device=device) + (place << 32) for place in places]
+    weights = torch.stack(rows) * -7046029254386353131
     weights = (weights ^ (weights >> 29)) * -4658895280553007687
     return weights | 1
 

@@ -14,9 +14,9 @@ from .._C import TILE
 from ..arguments import camera_arguments
 from ..settings import GaussianRasterizationSettings
 from ..stages import Splats, bin, blend, project
-from .agreement import REQUIREMENTS, Facts, agree, digest_of, facts_of, gather, place_in, rows_of
+from .agreement import REQUIREMENTS, Facts, agree, digest_of, facts_of, gather, place_in
 from .cameras import check_camera, check_colors, summary_of
-from .exchange import Route, exchange
+from .exchange import DIFFERENTIABLE, Route, exchange
 
 _REQUIREMENTS = REQUIREMENTS | {"settings": "settings and means2d_abs must be the same on every rank"}
 _ATTEMPTS = 3  # at lists whose room was guessed, each time better
@@ -106,8 +106,11 @@ def rasterize_bands(
         absolute = torch.zeros_like(shard.means2d, requires_grad=True) if means2d_abs else None
         if world == 1:
             return (shard, absolute, None), None, None
-        facts = facts_of(means3D, [*rows_of([shard]), *([] if absolute is None else [absolute])], group)
-        facts["settings"] = digest_of([camera_arguments(settings, means3D, shs)], means2d_abs)
+        differentiable = [getattr(shard, name) for name in DIFFERENTIABLE] + [absolute] * means2d_abs
+        facts = facts_of(means3D, [*differentiable, settings.bg], group)
+        camera = camera_arguments(settings, means3D, shs)
+        camera = {name: value[None] if torch.is_tensor(value) else value for name, value in camera.items()}
+        facts["settings"] = digest_of([([0], camera)], means2d_abs)
         return (shard, absolute, _touched(shard, settings.bg)), facts, None
 
     if world == 1:
@@ -125,8 +128,7 @@ def rasterize_bands(
         counts = gather([len(of_band) for of_band in places], world, group)
         route = Route(counts, [[r] for r in range(world)], rank, group)
         sent = () if absolute is None else tuple(absolute.index_select(0, of_band) for of_band in places)
-        (own,), of_means, anchor = exchange(route, parts, sent, first_id, join)
-        of_means = None if of_means is None else of_means[0]
+        own, of_means, anchor = exchange(route, parts, sent, first_id, join)
         rows = tuple(tuple(min(cut * touched.side, shard.height) for cut in band) for band in bands)
         # Rows below the band are left out. Those above stay, because moving the origin would round positions.
         own = dataclasses.replace(own, height=max(rows[rank][1], 1))

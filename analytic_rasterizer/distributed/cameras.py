@@ -26,7 +26,7 @@ from ..settings import GaussianRasterizationSettings
 from ..stages import Splats, bin, blend, project
 from .agreement import REQUIREMENTS, Facts, agree, digest_of, facts_of, place_in
 from .exchange import Route
-from .rows import OwnSplats, Shard, Step, agreeing, counted, rendered
+from .rows import OwnSplats, Shard, Step, agreeing, rendered, together
 
 _REQUIREMENTS = {
     "cameras": "settings must hold as many cameras on every rank",
@@ -133,23 +133,21 @@ def rasterize(
 
     def make() -> tuple[tuple, Facts, torch.Tensor]:
         cameras, settled = _checked_cameras(settings, owners, world, shs, colors_precomp)
-        groups = counted(cameras, means3D, opacities, **gaussians)
-        digest = digest_of([group.batch for group in groups], [settled, means2d_abs, [g.cameras for g in groups]])
-        tensors = [t for group in groups for t in group.tensors if t is not None]
+        groups = together(cameras, means3D, opacities, **gaussians)
+        cameras_of = [[c for c, owner in enumerate(settled) if owner == r] for r in range(world)]
+        own = Shard(groups, [c for of_rank in cameras_of for c in of_rank])  # the device counts meanwhile
+        digest = digest_of([(g.cameras, g.batch) for g in groups], [settled, means2d_abs])
+        tensors = [t for of_group in groups for t in of_group.tensors if t is not None] + [s.bg for s in cameras]
         facts = {"cameras": len(cameras), "settings": digest, **facts_of(means3D, tensors, group)}
         if means2d_abs:
             facts["requires_grad"] = facts["grad_enabled"]
-        cameras_of = [[c for c, owner in enumerate(settled) if owner == r] for r in range(world)]
-        own = Shard(groups, [c for of_rank in cameras_of for c in of_rank])
         return (cameras, cameras_of, own), facts, own.counts
 
     (cameras, cameras_of, own), agreed = agree(make, _REQUIREMENTS, group, meanwhile=lambda made: made[-1].begin())
     first_id, count, join = summary_of(agreed.facts, rank)
-    counts = [[n for _, n in sorted(zip(own.order, of_rank))] for of_rank in agreed.counts]
-    route = Route(counts, cameras_of, rank, group)
+    route = Route(agreed.counts, cameras_of, rank, group)
     backgrounds = [cameras[c].bg for c in route.own]
-    keep = torch.is_grad_enabled() and (join or any(bg.requires_grad for bg in backgrounds))
-    step = Step(own, route, first_id, join, keep, means2d_abs, backgrounds)
+    step = Step(own, route, first_id, join, means2d_abs, backgrounds)
     anchor, images, alphas = rendered(step)
     shard, received = step.take()
     views = tuple(View(*of_camera) for of_camera in zip(route.own, images, alphas, received))

@@ -9,8 +9,7 @@ from __future__ import annotations
 import weakref
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import lru_cache
+from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any, ClassVar, NamedTuple
 
@@ -25,6 +24,8 @@ from .exchange import ID_OF, Route
 _OPS = torch.ops.analytic_rasterizer
 _TENSORS = ("means3D", "opacities", "shs", "colors_precomp", "scales", "rotations", "cov3D_precomp")
 _CAMERA_TENSORS = ("viewmatrix", "projmatrix", "campos", "lens")
+_IMAGE = ("image_height", "image_width", "footprint", "option")
+_GUESSES = 16  # that are kept at most
 
 
 class OwnSplats(NamedTuple):
@@ -51,13 +52,11 @@ class Together:
     Attributes:
         cameras: Their places in the settings.
         gaussians, batch: Arguments of the ops.
-        ends: (C, P) int32: how many Gaussians, up to each one, have a row of each camera; None: no longer needed.
     """
 
     cameras: list[int]
     gaussians: dict[str, Any]
     batch: dict[str, Any]
-    ends: torch.Tensor | None
 
     @property
     def tensors(self) -> list[torch.Tensor | None]:
@@ -68,23 +67,15 @@ class Together:
         """All arguments, with such tensors in the place of `tensors`."""
         return self.gaussians | self.batch | dict(zip((*_TENSORS, *_CAMERA_TENSORS), tensors))
 
-    def counts(self) -> torch.Tensor:
-        """(C,) int64, rows of each camera, on the device."""
-        ends = self.ends
-        return ends[:, -1].long() if ends.shape[1] else ends.new_zeros(len(ends), dtype=torch.int64)
 
-
-def counted(
+def together(
     cameras: list[GaussianRasterizationSettings], means3D: torch.Tensor, opacities: torch.Tensor, **gaussians: Any
 ) -> list[Together]:
-    """The cameras by what they have in common, and which Gaussians they see. Waits for no device."""
-    found = []
-    for places in agreeing(cameras).values():
-        own, batch = project_arguments([cameras[c] for c in places], means3D, opacities, **gaussians)
-        with torch.no_grad():
-            ends = _OPS.count_rows(**own, **batch)
-        found.append(Together(places, own, batch, ends))
-    return found
+    """The cameras by what they have in common."""
+    return [
+        Together(places, *project_arguments([cameras[c] for c in places], means3D, opacities, **gaussians))
+        for places in agreeing(cameras).values()
+    ]
 
 
 def agreeing(cameras: list[GaussianRasterizationSettings]) -> dict[tuple, list[int]]:
@@ -98,61 +89,66 @@ def agreeing(cameras: list[GaussianRasterizationSettings]) -> dict[tuple, list[i
     return groups
 
 
-@lru_cache(maxsize=64)
-def _index(places: tuple[int, ...], device: torch.device) -> torch.Tensor:
-    return torch.tensor(places, device=device)
-
-
 def _at(values: torch.Tensor, places: Sequence[int]) -> torch.Tensor:
-    """The values at these places of a vector. Once an index is on its device nobody waits for it."""
+    """The values at these places of a vector. Without an index, for which the host would wait until it is copied."""
     if list(places) == list(range(len(values))):
         return values
-    return values[_index(tuple(places), values.device)]
+    return torch.stack([values[place] for place in places])
 
 
 class Shard:
     """The rows of this rank's Gaussians in all cameras, in the order in which they are sent.
 
     They can be written before the host knows how many they are: where each camera's begin is known on the device, and
-    how much room they need is guessed from the steps before. What has been guessed wrong is written again.
+    how much room they need is guessed from the steps before. What has been guessed wrong is written again. Waits for no
+    device.
 
     Attributes:
         groups: All cameras.
-        order: The cameras in the order in which their rows are sent.
-        counts: (C,) int64, rows of each camera in this order, on the device.
+        counts: (C,) int64, rows of each camera, on the device.
     """
 
-    _guesses: ClassVar[dict[tuple, tuple[int, int]]] = {}  # room and id of the first Gaussian, by what is rendered
+    # Room, and id of the first Gaussian, by how many cameras and Gaussians there are. A wrong guess costs time or
+    # memory, not more: `finish` checks it.
+    _guesses: ClassVar[dict[tuple, tuple[int, int]]] = {}
 
     def __init__(self, groups: list[Together], order: list[int]):
-        self.groups, self.order = groups, order
+        self.groups = groups
+        means3D = groups[0].gaussians["means3D"]
+        with torch.no_grad():
+            # (C, P) int32 of each group: how many Gaussians, up to each one, have a row of each camera.
+            self._ends = [_OPS.count_rows(**group.gaussians, **group.batch) for group in groups]
+        counts = [ends[:, -1].long() if len(means3D) else ends.new_zeros(len(ends)).long() for ends in self._ends]
         grouped = [c for group in groups for c in group.cameras]
-        self.counts = _at(torch.cat([group.counts() for group in groups]), [grouped.index(c) for c in order])
-        firsts = _at(self.counts.cumsum(0) - self.counts, [order.index(c) for c in grouped])
+        self.counts = _at(torch.cat(counts), [grouped.index(c) for c in range(len(order))])
+        sent = _at(self.counts, order)
+        firsts = _at(sent.cumsum(0) - sent, [order.index(c) for c in grouped])
         self._firsts = firsts.split([len(group.cameras) for group in groups])
-        self._key = len(order), self.counts.device
+        self._key = len(order), len(means3D), means3D.device
+        self._most = len(order) * len(means3D)
         self._made: tuple[torch.Tensor, ...] | None = None
         self._first_id = 0
 
     def begin(self) -> None:
-        """Writes rows as far as they can be guessed."""
+        """Writes rows as far as they can be guessed. Does not raise: what fails here, `finish` does again."""
         guess = self._guesses.get(self._key)
         if guess is None:
             return
         room, first_id = guess
-        most = len(self.order) * len(self.groups[0].gaussians["means3D"])
-        with suppress(torch.OutOfMemoryError):  # there may be enough for as many as there are
-            self._write(min(room, most), first_id)
+        with suppress(Exception):
+            self._write(min(room, self._most), first_id)
 
     def finish(self, total: int, first_id: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """All rows (total, ROW_WIDTH), their radii and ids (total,), the ids in the rows counting from `first_id`."""
         if self._made is None or len(self._made[0]) < total or self._first_id != first_id:
             self._made = None
             self._write(total, first_id)
-        room = max(total + total // 16, self._guesses.get(self._key, (0, 0))[0] * 15 // 16)
-        self._guesses[self._key] = room, first_id
+        last, _ = self._guesses.pop(self._key, (0, 0))
+        self._guesses[self._key] = max(total + total // 16, last * 15 // 16), first_id
+        if len(self._guesses) > _GUESSES:
+            del self._guesses[next(iter(self._guesses))]  # not used for longest: density control changes the key
         rows, radii, ids = (t[:total] for t in self._made)
-        self._made, self.groups[:] = None, [replace(group, ends=None) for group in self.groups]
+        self._made, self._ends = None, []
         return rows, radii, ids
 
     @torch.no_grad()
@@ -160,9 +156,9 @@ class Shard:
         like = self.groups[0].gaussians["means3D"]
         rows = like.new_empty(room, _C.ROW_WIDTH)
         radii, ids = (like.new_empty(room, dtype=torch.int32) for _ in range(2))
-        for group, firsts in zip(self.groups, self._firsts):
+        for group, ends, firsts in zip(self.groups, self._ends, self._firsts):
             arguments = group.gaussians | group.batch
-            _OPS.pack_rows_(rows, radii, ids, **arguments, ends=group.ends, firsts=firsts, first_id=first_id)
+            _OPS.pack_rows_(rows, radii, ids, **arguments, ends=ends, firsts=firsts, first_id=first_id)
         self._made, self._first_id = (rows, radii, ids), first_id
 
 
@@ -174,8 +170,7 @@ class Step:
         shard: The rows of this rank's Gaussians.
         route: Which rows go where.
         first_id: Global id of the first Gaussian of this rank.
-        join: Whether any rank needs a gradient with respect to Gaussians or cameras.
-        keep: Whether there will be a backward pass.
+        join: Whether any rank needs a gradient, so that all take part in the backward pass.
         absolute: Whether sums of absolute gradients are wanted.
         backgrounds: (3,) of the cameras of this rank.
         own: Made by the forward pass: the splats of this rank's Gaussians, by camera.
@@ -187,7 +182,6 @@ class Step:
     route: Route
     first_id: int
     join: bool
-    keep: bool
     absolute: bool
     backgrounds: list[torch.Tensor]
     own: tuple[OwnSplats, ...] = ()
@@ -196,10 +190,11 @@ class Step:
 
     def __post_init__(self):
         self.groups = self.shard.groups
+        self._images = {c: {n: group.batch[n] for n in _IMAGE} for group in self.groups for c in group.cameras}
         counts = self.route.counts[self.route.rank]
-        ends = list(accumulate(counts[c] for c in self.route.order))
-        self._first = {c: end - counts[c] for c, end in zip(self.route.order, ends)}  # of the rows that are sent
-        self._total = ends[-1]
+        ends = accumulate(counts[c] for c in self.route.order)
+        sent = {c: slice(end - counts[c], end) for c, end in zip(self.route.order, ends)}
+        self._sent = [sent[c] for c in range(len(sent))]  # the rows of each camera among those that are sent
         self._ids: torch.Tensor | None = None
         self._blended: list[list[torch.Tensor]] | None = []  # what is saved of each camera; None: it has been used
         self._means2d: dict[int, weakref.ref] = {}
@@ -213,18 +208,17 @@ class Step:
     def places(self, group: Together) -> dict[str, list[int]]:
         """Where the rows of cameras are, by the names of the ops."""
         counts = self.route.counts[self.route.rank]
-        return {"firsts": [self._first[c] for c in group.cameras], "counts": [counts[c] for c in group.cameras]}
+        return {"firsts": [self._sent[c].start for c in group.cameras], "counts": [counts[c] for c in group.cameras]}
 
     def run(self) -> tuple[torch.Tensor, ...]:
         """Images (3, H, W) of this rank's cameras, and then their alphas (1, H, W)."""
         sent = self._rows_of_shard()
-        rows = self._of_cameras(self.route.send(sent.view(-1), _C.ROW_WIDTH, True).view(-1, _C.ROW_WIDTH))
+        rows = self.route.by_camera(self.route.send(sent, True))
         del sent  # before the memory is needed
-        sizes = {c: group.batch for group in self.groups for c in group.cameras}
         images, alphas, received = [], [], []
-        for camera, of_camera, background in zip(self.route.own, rows, self.backgrounds):
-            image = _image_arguments(sizes[camera])
-            color, alpha, saved = _OPS.blend_rows(of_camera, background.detach(), **image, keep=self.keep)
+        for camera, of_camera, background in zip(self.route.own, rows.split(self.route.sizes), self.backgrounds):
+            image = self._images[camera]
+            color, alpha, saved = _OPS.blend_rows(of_camera, background.detach(), **image, keep=self.join)
             images.append(color)
             alphas.append(alpha[None])
             self._blended.append(saved)
@@ -234,43 +228,19 @@ class Step:
 
     def _rows_of_shard(self) -> torch.Tensor:
         """The rows of this rank's Gaussians in all cameras, in the order in which they are sent."""
-        rows, radii, ids = self.shard.finish(self._total, self.first_id)
-        like = rows
-        own: dict[int, OwnSplats] = {}
-        for group in self.groups:
-            size = group.batch["image_width"], group.batch["image_height"]
-            for camera, first, count in zip(group.cameras, *self.places(group).values()):
-                part = slice(first, first + count)
-                means2d = rows[part, :2].contiguous()  # a copy: the rows go when they have been sent
-                own[camera] = OwnSplats(means2d, radii[part], ids[part], *size)
-        self.own = tuple(own[c] for c in range(len(own)))
-        self._ids = ids
+        rows, radii, self._ids = self.shard.finish(sum(self.route.counts[self.route.rank]), self.first_id)
+        own = []
+        for camera, part in enumerate(self._sent):
+            means2d = rows[part, _C.ROW_COLUMNS["means2d"]].contiguous()  # the rows go when they have been sent
+            image = self._images[camera]
+            own.append(OwnSplats(means2d, radii[part], self._ids[part], image["image_width"], image["image_height"]))
+        self.own = tuple(own)
         if self.absolute:
-            self.means2d_abs = tuple(like.new_zeros(()).expand(len(s.means2d), 2) for s in self.own)
-        self._means2d = {
-            c: weakref.ref(own[c].means2d) for group in self.groups if self._trains(group) for c in group.cameras
-        }
+            self.means2d_abs = tuple(rows.new_zeros(()).expand(len(s.means2d), 2) for s in own)
+        for group in self.groups:
+            if self.join and any(t is not None and t.requires_grad for t in group.tensors):
+                self._means2d |= {c: weakref.ref(own[c].means2d) for c in group.cameras}
         return rows
-
-    def _trains(self, group: Together) -> bool:
-        """Whether the rows of this rank's Gaussians have a gradient."""
-        return self.keep and any(t is not None and t.requires_grad for t in group.tensors)
-
-    def _of_cameras(self, received: torch.Tensor) -> list[torch.Tensor]:
-        """Rows by camera of this rank, of all ranks in turn, from rows by rank."""
-        own, counts = self.route.own, self.route.counts
-        if len(own) <= 1:
-            return [received] * len(own)
-        blocks = received.split([of_rank[c] for of_rank in counts for c in own])
-        return [torch.cat(blocks[k :: len(own)]) for k in range(len(own))]
-
-    def _of_ranks(self, by_camera: list[torch.Tensor], like: torch.Tensor) -> torch.Tensor:
-        """The opposite of `_of_cameras`."""
-        if len(by_camera) <= 1:
-            return by_camera[0] if by_camera else like.new_empty(0)
-        counts = self.route.counts
-        blocks = [rows.split([n[c] for n in counts]) for c, rows in zip(self.route.own, by_camera)]
-        return torch.cat([of_camera[rank] for rank in range(len(counts)) for of_camera in blocks])
 
     def run_back(
         self, dL_dimages: Sequence[Any], dL_dalphas: Sequence[Any], needs: Sequence[bool], tensors: list[Any]
@@ -283,7 +253,6 @@ class Step:
         if blended is None:
             raise RuntimeError("the backward pass of distributed.rasterize runs once: it overwrites what was saved")
         width = _C.ROW_GRAD_WIDTHS[int(self.absolute)]
-        sizes = {c: group.batch for group in self.groups for c in group.cameras}
         of_backgrounds, by_camera = [], []
         for k, (camera, bg) in enumerate(zip(self.route.own, self.backgrounds)):
             saved, blended[k] = blended[k], []
@@ -293,25 +262,23 @@ class Step:
                 dL_dimages[k],
                 None if dL_dalphas[k] is None else dL_dalphas[k][0],
                 bg.detach(),
-                **_image_arguments(sizes[camera]),
+                **self._images[camera],
                 saved=saved,
                 needs_background=needs[k],
             )
             of_backgrounds.append(of_bg if needs[k] else None)
             by_camera.append(rows)
             del saved, rows
-        count = len(self.backgrounds)
-        if not self.join:
-            return [*of_backgrounds, *[None] * len(tensors)]
-        flat = self._of_ranks(by_camera, self.groups[0].gaussians["means3D"]).reshape(-1)
+        like = self.groups[0].gaussians["means3D"]
+        sent = self.route.by_rank(by_camera) if by_camera else like.new_empty(0, width)
         by_camera.clear()
-        own = self.route.send(flat, width, False).view(-1, width)
-        del flat
+        own = self.route.send(sent, False)
+        del sent
         self._give(own)
         found, step = [], len(_TENSORS) + len(_CAMERA_TENSORS)
         for k, group in enumerate(self.groups):
             part = slice(step * k, step * (k + 1))
-            needed = needs[count:][part]
+            needed = needs[len(self.backgrounds) :][part]
             if not any(needed):
                 found += [None] * step
                 continue
@@ -322,14 +289,13 @@ class Step:
 
     def _give(self, own: torch.Tensor) -> None:
         """Gives what the batch holds its gradients, from those with respect to the rows of this rank's Gaussians."""
-        counts = self.route.counts[self.route.rank]
-        for camera, first in self._first.items():
-            rows = own[first : first + counts[camera]]
+        for camera, part in enumerate(self._sent):
+            rows = own[part]
             means2d = self._means2d.get(camera, lambda: None)()
             if means2d is not None:
-                means2d.grad = rows[:, :2]
+                means2d.grad = rows[:, _C.ROW_GRAD_COLUMNS["means2d"]]
             if self.absolute:
-                self.means2d_abs[camera].grad = rows[:, -2:]
+                self.means2d_abs[camera].grad = rows[:, _C.ROW_GRAD_COLUMNS["means2d_abs"]]
 
 
 class _Rasterize(torch.autograd.Function):
@@ -366,24 +332,16 @@ def rendered(step: Step) -> tuple[torch.Tensor, list[torch.Tensor], list[torch.T
     return anchor, made[:count], made[count:]
 
 
-def _image_arguments(batch: dict[str, Any]) -> dict[str, Any]:
-    return {name: batch[name] for name in ("image_height", "image_width", "footprint", "option")}
-
-
 def _splats_of(rows: torch.Tensor, image: dict[str, Any]) -> Splats:
     """Rows of one camera by the names of their columns, without copying them."""
-    ids = rows.view(ID_OF[rows.dtype])[:, 11].int()
+    columns = {name: rows[:, place] for name, place in _C.ROW_COLUMNS.items()}
+    ids = columns.pop("gaussian_ids").view(ID_OF[rows.dtype]).int()
     return Splats(
-        means2d=rows[:, :2],
-        cov2d=rows[:, 2:5],
-        opacities=rows[:, 5],
-        depths=rows[:, 6],
-        colors=rows[:, 7:10],
+        **columns,
         radii=ids.new_empty(0),
         gaussian_ids=ids,
         camera_ids=ids.new_zeros(1).expand(len(rows)),
         row_splits=torch.tensor([0, len(rows)]),
-        dets=rows[:, 10],
         width=image["image_width"],
         height=image["image_height"],
         footprint=image["footprint"],

@@ -5,6 +5,8 @@
 // of a splat at the sample, before it is capped and thresholded to alpha. V is a scalar or a pack of lanes.
 #pragma once
 
+#include <type_traits>
+
 #include "core/constants.h"
 #include "core/lanes.h"
 #include "core/stages.h"
@@ -24,6 +26,7 @@ template <class V> AR_HD V effective_alpha(V raw) {
 template <class V> struct Blended {
   MaskOf<V> mask;  ///< whether the splat was composited
   V contribution;  ///< T alpha; zero where it was not
+  V if_shown;      ///< the same where it was, and something else where it was not
 };
 
 /// T <- T (1 - alpha). A splat that would take T below kTransmittanceMin is not composited and stops the sample, as in
@@ -32,11 +35,20 @@ template <class V> AR_HD Blended<V> blend_sample(V raw, V& transmittance) {
   using T = ScalarOf<V>;
   const V zero = V(T(0));
   const MaskOf<V> hit = raw >= V(T(kAlphaMin));
-  const V contribution = transmittance * effective_alpha(raw);
-  const V next = transmittance - contribution;
-  const MaskOf<V> open = next >= V(T(kTransmittanceMin));
-  transmittance = select(open, next, -abs(transmittance));
-  return {MaskOf<V>(hit & open), select(open, contribution, zero)};
+  // The same bits in two ways. A thread of a device is quicker where alpha need not be zero without a hit, packs of
+  // lanes where the transmittance is selected once.
+  if constexpr (std::is_same_v<MaskOf<V>, bool>) {
+    const V if_shown = transmittance * min(raw, V(T(kAlphaMax))), next = transmittance - if_shown;
+    const bool mask = hit & (next >= V(T(kTransmittanceMin)));
+    transmittance = select(hit, select(mask, next, -abs(transmittance)), transmittance);
+    return {mask, select(mask, if_shown, zero), if_shown};
+  } else {
+    const V contribution = transmittance * effective_alpha(raw);
+    const V next = transmittance - contribution;
+    const MaskOf<V> open = next >= V(T(kTransmittanceMin));
+    transmittance = select(open, next, -abs(transmittance));
+    return {MaskOf<V>(hit & open), select(open, contribution, zero), contribution};
+  }
 }
 
 /// What a sample carries from splat to splat besides its transmittance: nothing, unless the footprint's samples move
@@ -65,29 +77,29 @@ AR_HD Blended<V> blend_sample(const Terms& terms, Vec2<V> p, int s, V& transmitt
 }
 
 /// The same for a P whose samples move, in the form in which both devices blend: `place` is where the sample's node is,
-/// which stays within `bounds`; z are its whitened coordinates; `raw` is opacity * weight there.
-template <class P, class Terms, class V>
-AR_HD Blended<V> blend_placed_sample(const Terms& terms, Vec2<V> z, V raw, const Bounds<V>& bounds, V& transmittance,
+/// which stays within `cell`, Bounds or UnitCell; z are its whitened coordinates; `raw` is opacity * weight there.
+template <class P, class Terms, class V, class Cell>
+AR_HD Blended<V> blend_placed_sample(const Terms& terms, Vec2<V> z, V raw, const Cell& cell, V& transmittance,
                                      Vec2<V>& place) {
   using T = ScalarOf<V>;
   // The reciprocal takes long: it does not wait for the mask.
   const V capped_odds = odds(min(raw, V(T(kAlphaMax))));
   const Blended<V> blended = blend_sample(raw, transmittance);
-  place = P::move_in(terms, z, select(blended.mask, capped_odds, V(T(0))), place, bounds);
+  place = P::move_in(terms, z, select(blended.mask, capped_odds, V(T(0))), place, cell);
   return blended;
 }
 
 /// Repeats blend_placed_sample in the backward pass, which needs the state in front of every splat. `before`: the splat
 /// is not behind the last one that the forward pass composited into the sample, so that nothing has to be compared with
 /// kTransmittanceMin again. Returns whether the splat was composited.
-template <class P, class Terms, class V>
-AR_HD MaskOf<V> replay_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> before, const Bounds<V>& bounds,
+template <class P, class Terms, class V, class Cell>
+AR_HD MaskOf<V> replay_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> before, const Cell& cell,
                                      V& transmittance, Vec2<V>& place) {
   using T = ScalarOf<V>;
   const MaskOf<V> mask = (raw >= V(T(kAlphaMin))) & before;
   const V alpha = select(mask, min(raw, V(T(kAlphaMax))), V(T(0)));
   transmittance = transmittance - transmittance * alpha;
-  place = P::move_in(terms, z, odds(alpha), place, bounds);
+  place = P::move_in(terms, z, odds(alpha), place, cell);
   return mask;
 }
 
@@ -124,10 +136,9 @@ template <class V> struct MovingBlendGrad {
 /// Adjoint of blend_placed_sample. `raw` is zero where the splat was not composited; `place` is that in front of the
 /// splat. `transmittance`, `behind` and `dL_dplace` are read as they are behind the splat and left as they are in front
 /// of it.
-template <class P, class Terms, class V>
-AR_HD MovingBlendGrad<V> blend_placed_sample_vjp(const Terms& terms, Vec2<V> z, V raw, const Bounds<V>& bounds,
-                                                 V g_color, Vec2<V> place, V& transmittance, V& behind,
-                                                 Vec2<V>& dL_dplace) {
+template <class P, class Terms, class V, class Cell>
+AR_HD MovingBlendGrad<V> blend_placed_sample_vjp(const Terms& terms, Vec2<V> z, V raw, const Cell& cell, V g_color,
+                                                 Vec2<V> place, V& transmittance, V& behind, Vec2<V>& dL_dplace) {
   using T = ScalarOf<V>;
   const V cap = V(T(kAlphaMax)), alpha = min(raw, cap);
   const MaskOf<V> free = (raw > V(T(0))) & (raw <= cap);
@@ -135,7 +146,41 @@ AR_HD MovingBlendGrad<V> blend_placed_sample_vjp(const Terms& terms, Vec2<V> z, 
   const V difference = g_color - behind;
   behind = madd(alpha, difference, behind);
   return {transmittance * alpha,
-          P::alpha_and_move_in_vjp(terms, z, raw, alpha, free, transmittance * difference, place, bounds, dL_dplace)};
+          P::alpha_and_move_in_vjp(terms, z, raw, alpha, free, transmittance * difference, place, cell, dL_dplace)};
+}
+
+/// How `behind` and dL_dplace of blend_placed_sample_vjp go through a part of a list. In front of it
+///   behind = (color + (transmittance behind it) * (behind it)) / (transmittance in front of it),
+///   dL_dplace = of_color + of_behind * (behind it) + of_place (dL_dplace behind it).
+template <class V> struct AdjointMap {
+  V color;
+  Vec2<V> of_color, of_behind;
+  Mat2<V> of_place;
+};
+
+/// Composites one more splat at the end of the part, as replay_placed_sample does. `mask`: the forward pass has
+/// composited it.
+template <class P, class Terms, class V, class Cell>
+AR_HD void map_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> mask, const Cell& cell, V g_color,
+                             V& transmittance, Vec2<V>& place, AdjointMap<V>& map) {
+  using T = ScalarOf<V>;
+  const V cap = V(T(kAlphaMax)), zero = V(T(0)), alpha = select(mask, min(raw, cap), zero);
+  const MoveSlope<V> slope = P::move_in_with_slope(terms, z, alpha, raw <= cap, cell, place);
+  // Behind this splat are B and l. What the map gets is B + alpha (g - B) and J^T l + T (g - B) dalpha.
+  const Vec2<V> of_alpha = {transmittance * slope.alpha.x, transmittance * slope.alpha.y};
+  Mat2<V>& m = map.of_place;
+  const Vec2<V> of_difference = {madd(m.xx, of_alpha.x, madd(m.xy, of_alpha.y, alpha * map.of_behind.x)),
+                                 madd(m.yx, of_alpha.x, madd(m.yy, of_alpha.y, alpha * map.of_behind.y))};
+  map.of_color = {madd(g_color, of_difference.x, map.of_color.x), madd(g_color, of_difference.y, map.of_color.y)};
+  map.of_behind = {map.of_behind.x - of_difference.x, map.of_behind.y - of_difference.y};
+  const V contribution = transmittance * alpha;
+  map.color = madd(g_color, contribution, map.color);
+  transmittance = transmittance - contribution;
+  const Sym2<V>& q = slope.step;
+  const V xx = madd(m.xx, q.xx, madd(m.xy, q.xy, m.xx)), xy = madd(m.xx, q.xy, madd(m.xy, q.yy, m.xy));
+  const V yx = madd(m.yx, q.xx, madd(m.yy, q.xy, m.yx)), yy = madd(m.yx, q.xy, madd(m.yy, q.yy, m.yy));
+  m = {select(slope.free_x, xx, zero), select(slope.free_y, xy, zero), select(slope.free_x, yx, zero),
+       select(slope.free_y, yy, zero)};
 }
 
 /// What a pixel adds to the sums that density control asks for with `sums`, which is not kNone. `size`: of the image

@@ -5,8 +5,10 @@ namespace ar {
 
 /// Edge of a square tile [px], and its logarithm to base 2.
 inline constexpr int kTileBits = 4, kTile = 1 << kTileBits;
-/// The same on CUDA where samples move (csrc/cuda/blend_moving.cuh).
+/// The same on CUDA where samples move (csrc/cuda/blend_moving.cuh), but see moving_grid() of core/stages.h.
 inline constexpr int kMovingTileBits = 3, kMovingTile = 1 << kMovingTileBits;
+/// An image with fewer tiles of that size is small: CUDA has other kernels for samples that move in it.
+inline constexpr int kSmallImageTiles = 4096;
 
 /// A Gaussian is culled unless the camera-space z of its mean exceeds this [world units].
 inline constexpr double kNear = 0.2;

@@ -74,6 +74,28 @@ AR_HD double madd(double a, double b, double c) {
 #endif
 }
 
+/// madd, held within [0, 1]. On a device one instruction, for which NaN is 0.
+AR_HD float saturated_madd(float a, float b, float c) {
+#if defined(__CUDA_ARCH__)
+  float y;
+  asm("fma.rn.sat.f32 %0, %1, %2, %3;" : "=f"(y) : "f"(a), "f"(b), "f"(c));
+  return y;
+#else
+  return min(max(madd(a, b, c), 0.0f), 1.0f);
+#endif
+}
+AR_HD double saturated_madd(double a, double b, double c) { return min(max(madd(a, b, c), 0.0), 1.0); }
+
+/// Whether x is in [0, 1]. On a device one comparison: above 1 are the bits of all other numbers, -0 included.
+AR_HD bool in_unit_interval(float x) {
+#if defined(__CUDA_ARCH__)
+  return __float_as_uint(x) <= __float_as_uint(1.0f);
+#else
+  return x >= 0 && x <= 1;
+#endif
+}
+AR_HD bool in_unit_interval(double x) { return x >= 0 && x <= 1; }
+
 AR_HD float abs(float x) { return std::fabs(x); }
 AR_HD double abs(double x) { return std::fabs(x); }
 AR_HD float log2(float x) { return std::log2(x); }
@@ -107,11 +129,11 @@ AR_HD float divide(float a, float b) {
 }
 AR_HD double divide(double a, double b) { return a / b; }
 
-/// Square root, within 1 ulp on a device; elsewhere exact.
+/// Square root, on a device within 1 ulp, and zero below 2^-126; elsewhere exact.
 AR_HD float approx_sqrt(float x) {
 #if defined(__CUDA_ARCH__)
   float y;
-  asm("sqrt.approx.f32 %0, %1;" : "=f"(y) : "f"(x));
+  asm("sqrt.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
   return y;
 #else
   return std::sqrt(x);

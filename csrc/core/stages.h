@@ -32,6 +32,18 @@ struct TileGrid {
   }
 };
 
+AR_HD bool is_small_image(TileGrid grid) {
+  return TileGrid{grid.width, grid.height, kMovingTileBits}.tiles() < kSmallImageTiles;
+}
+/// The tiles on CUDA where `samples` samples of a pixel move. With one of them in a large image, blending a splat in a
+/// pixel costs so little that tiles are worth being large: fewer pairs have to be listed, and fetched by a block.
+AR_HD constexpr int moving_tile_bits(int samples, bool small_image) {
+  return samples == 1 && !small_image ? kTileBits : kMovingTileBits;
+}
+AR_HD TileGrid moving_grid(int samples, int width, int height) {
+  return {width, height, moving_tile_bits(samples, is_small_image({width, height}))};
+}
+
 template <typename T> struct CameraView {
   const T* view;      ///< [16] world to camera, transposed
   const T* proj;      ///< [16] world to clip space, transposed

@@ -63,9 +63,6 @@ inline int tile_passes(TileGrid grid) {
   return passes;
 }
 
-/// A splat with more pairs than this is written by its whole warp.
-inline constexpr int kManyTiles = 16;
-
 __device__ inline void write_pair(const EmitParams& params, int64_t place, uint32_t tile, int32_t splat) {
   params.tiles[place] = tile;
   if (params.slot_pairs) {
@@ -75,10 +72,18 @@ __device__ inline void write_pair(const EmitParams& params, int64_t place, uint3
   }
 }
 
-/// The pairs of those of a warp's splats that have few each, one splat after the other.
-struct FewPairs {
-  uint32_t tiles[32 * kManyTiles];
-  uint8_t lanes[32 * kManyTiles];  ///< whose splat it is
+/// A pair of a splat with a mask: the lane that has the splat, and the bit of its mask.
+struct MaskedPair {
+  static constexpr int kBits = 8 * sizeof(TileMask);
+  uint16_t value;
+
+  __device__ int lane() const { return value / kBits; }
+  __device__ int row() const { return value % kBits / 8; }
+  __device__ int column() const { return value % 8; }
+};
+/// The pairs of a warp's splats with masks, one splat after the other.
+struct MaskedPairs {
+  MaskedPair of[32 * kManyTiles];
 };
 
 /// Sum of what the blocks before this one published, for all lanes of a warp.
@@ -103,7 +108,7 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
   constexpr int kBins = TileDigits::kBins;
   __shared__ uint32_t histograms[kMostTilePasses * kBins];
   __shared__ uint32_t block_id, before_block;
-  __shared__ FewPairs stages[kEmitThreads / 32];
+  __shared__ MaskedPairs stages[kEmitThreads / 32];
   if (params.counts->pairs > params.capacity) return;
   if (threadIdx.x == 0) block_id = atomicAdd(&params.status[0], 1);
   for (int b = threadIdx.x; b < tile_digits * kBins; b += kEmitThreads) histograms[b] = 0;
@@ -112,24 +117,25 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
   if (int64_t(block_id) * kEmitThreads >= n) return;
   const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
   const int32_t i = r < n ? params.order[r] : 0;
-  const int count = r < n ? params.ranges[i].count : 0;
-  const SplatRow<float> splat = splats[i];
+  PairRange range = {};
+  TileMask mask = 0;
+  if (r < n) range = params.ranges[i], mask = params.masks[i];
   uint32_t sum;
-  const uint32_t before = sum_before<kEmitThreads / 32>(uint32_t(count), 0u, sum);
+  const uint32_t before = sum_before<kEmitThreads / 32>(uint32_t(range.count), 0u, sum);
   uint32_t* status = params.status + 1;
   if (threadIdx.x == 0) write_status(status + block_id, (block_id == 0 ? kUpToBlock : kOfBlock) | sum);
 
   // Tiles are found before their places are known, while the blocks before get to publish theirs; and written by
   // neighbouring lanes to neighbouring places.
-  FewPairs& stage = stages[threadIdx.x / 32];
-  const int own = count <= kManyTiles ? count : 0, up_to = warp_inclusive_sum(own), first = up_to - own;
-  if (own > 0) {
-    int k = first;
-    for_each_tile(support_of(splat, params.footprint), params.grid, [&](int64_t tile) {
-      stage.tiles[k] = uint32_t(tile);
-      stage.lanes[k++] = uint8_t(lane_id());
-    });
+  MaskedPair* stage = stages[threadIdx.x / 32].of;
+  const int own = mask ? range.count : 0, up_to = warp_inclusive_sum(own), first = up_to - own;
+  MaskedPair* next = stage + first;
+#pragma unroll
+  for (int from = 0; from < MaskedPair::kBits; from += 32) {
+    for (uint32_t left = __brev(uint32_t(mask >> from)); left != 0;)
+      *next++ = {uint16_t(MaskedPair::kBits * lane_id() + from + take_first(left))};
   }
+  __syncwarp();
 
   if (threadIdx.x < 32) {
     const uint32_t earlier = look_back(status, int(block_id));
@@ -139,33 +145,34 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
     }
   }
   __syncthreads();
-  const int64_t begin = int64_t(before_block) + before;
+  const auto begin = int32_t(before_block + before);
   const int columns = params.grid.columns();
-  const auto write = [&](int64_t place, uint32_t tile, int32_t id) {
+  const auto write = [&](int32_t place, uint32_t tile, int32_t id) {
     write_pair(params, place, tile, id);
     for (int d = 0; d < tile_digits; ++d) atomicAdd(&histograms[d * kBins + TileDigits::of(tile, d)], 1);
   };
-  if (count > 0 && params.slot_pairs) params.ranges[i].first = int32_t(begin);
+  if (range.count > 0 && params.slot_pairs) params.ranges[i].first = begin;
   const int all = shuffle(up_to, 31);
   for (int from = 0; from < all; from += 32) {
-    const int k = from + lane_id(), source = k < all ? stage.lanes[k] : 0;
-    const int64_t place = shuffle(begin - first, source) + k;
-    const int32_t id = shuffle(i, source);
-    if (k < all) write(place, stage.tiles[k], id);
+    const int k = from + lane_id();
+    const MaskedPair pair = k < all ? stage[k] : MaskedPair{};
+    const int32_t place = shuffle(begin - first, pair.lane()) + k, id = shuffle(i, pair.lane());
+    const int32_t tile = shuffle(range.first, pair.lane()) + pair.row() * columns + pair.column();
+    if (k < all) write(place, uint32_t(tile), id);
   }
-  for (uint32_t many = __ballot_sync(kAllLanes, count > kManyTiles); many != 0; many &= many - 1) {
-    const int source = __ffs(many) - 1;
-    const int32_t id = __shfl_sync(kAllLanes, i, source);
-    int64_t place = __shfl_sync(kAllLanes, begin, source);
+  for (uint32_t others = __brev(__ballot_sync(kAllLanes, range.count > own)); others != 0;) {
+    const int source = take_first(others);
+    const int32_t id = shuffle(i, source);
+    int32_t place = shuffle(begin, source);
     const Support<float> support = support_of(splats[id], params.footprint);
     const Range rows = clamp_range(rows_of(support), params.grid.height), tile_rows = tiles_of(rows, params.grid);
     for (int first = tile_rows.first; first <= tile_rows.last; first += 32) {
       const int row = first + lane_id();
-      const Range range = row <= tile_rows.last ? tile_columns_of(support, params.grid, rows, row) : Range{0, -1};
-      const int width = range.last - range.first + 1;
+      const Range tiles = row <= tile_rows.last ? tile_columns_of(support, params.grid, rows, row) : Range{0, -1};
+      const int width = tiles.last - tiles.first + 1;
       const int widths = warp_inclusive_sum(width);
-      int64_t mine = place + widths - width;
-      for (int c = range.first; c <= range.last; ++c) write(mine++, uint32_t(row) * columns + c, id);
+      int32_t mine = place + widths - width;
+      for (int c = tiles.first; c <= tiles.last; ++c) write(mine++, uint32_t(row) * columns + c, id);
       place += __shfl_sync(kAllLanes, widths, 31);
     }
   }

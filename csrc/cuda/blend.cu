@@ -13,14 +13,24 @@ namespace ar::cuda {
 
 namespace {
 
-template <class F, int C> void launch_moving_blend(const BlendParams& p, int first, cudaStream_t stream) {
-  const bool listed = is_small_image(p.grid);
-  if (listed) {
-    const auto blocks = unsigned(p.grid.tiles() * kListedBlocks<F>);
-    launch(listed_blend_kernel<F, C>, {blocks, 32}, stream, p, first);
+template <class F, int C, bool kKeep>
+void launch_moving_blend_kernels(const BlendParams& p, int first, cudaStream_t stream) {
+  const auto tiles = unsigned(p.grid.tiles());
+  if (is_small_image(p.grid)) {
+    launch(listed_blend_kernel<F, C, kKeep>, {tiles * kListedBlocks<F>, 32}, stream, p, first);
+    using Layout = EvenLayout<F, false, true>;
+    launch(moving_blend_kernel<F, C, Layout, kKeep>, {tiles, Layout::kThreads}, stream, p, first, true);
+  } else {
+    using Layout = EvenLayout<F, false, false>;
+    launch(moving_blend_kernel<F, C, Layout, kKeep>, {tiles, Layout::kThreads}, stream, p, first, false);
   }
-  using Layout = EvenLayout<F, false>;
-  launch(moving_blend_kernel<F, C, Layout>, {unsigned(p.grid.tiles()), Layout::kThreads}, stream, p, first, listed);
+}
+template <class F, int C> void launch_moving_blend(const BlendParams& p, int first, cudaStream_t stream) {
+  if (p.transmittance && first == 0) {
+    launch_moving_blend_kernels<F, C, true>(p, first, stream);
+  } else {
+    launch_moving_blend_kernels<F, C, false>(p, first, stream);
+  }
 }
 template <class F> void blend_moving(const BlendParams& p, cudaStream_t stream) {
   if (is_small_image(p.grid)) {

@@ -186,8 +186,8 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
     __syncthreads();
     for (int from = 0; from < count; from += 32) {
       if (!__any_sync(kAllLanes, open())) break;
-      for (uint32_t mask = stage.reached(from); mask != 0; mask &= mask - 1) {
-        const int j = from + __ffs(mask) - 1;
+      for (uint32_t left = stage.reached(from); left != 0;) {
+        const int j = from + take_first(left);
         TileSplatRef<F, 0> splat = stage.splats[j];
         float contribution = 0;
 #pragma unroll

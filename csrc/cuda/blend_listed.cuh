@@ -18,11 +18,23 @@ inline constexpr int kFilterPiece = 256, kFilterWords = kFilterPiece / 32;
 /// Pairs whose bits a warp takes at once: a word for each lane.
 inline constexpr int kListedBatch = 32 * 32;
 
-/// How filter_kernel sees a tile: each group has one pixel.
-using FilterLayout = CellLayout<1, 32, 4>;
 /// A sample per lane, in blocks of a warp, since lists are uneven. The more pixels a warp has, the fewer steps it takes
-/// for each of them, and the more of them wait for the longest list: in tiles with long lists, kLong, it has two.
-template <class F, bool kLong> using ListedLayout = CellLayout<1, (F::kSamples > 4 || kLong) ? 16 : 4, 1>;
+/// for each of them, and the more of them wait for the longest list: in tiles with long lists, kLong, it has two. With
+/// one sample all lanes of a pixel have it there, and look at as many splats at once (kShared). Elsewhere that takes
+/// longer than to leave lanes without a sample (docs/performance.md).
+template <class F, bool kLong>
+struct ListedLayout : CellLayout<1, (F::kSamples > 4 || kLong) ? 16 : 4, kMovingTile, 1> {
+  using Base = CellLayout<1, (F::kSamples > 4 || kLong) ? 16 : 4, kMovingTile, 1>;
+  static constexpr bool kShared = F::kSamples == 1 && kLong;
+  __device__ static int first_sample() { return kShared ? 0 : Base::first_sample(); }
+  /// This lane's place among those of its sample.
+  __device__ static int ahead() { return kShared ? lane_id() % Base::kLanes : 0; }
+  __device__ static bool owns() { return ahead() == 0; }
+  /// The lanes of this lane's sample.
+  __device__ static uint32_t sharers() {
+    return ((1u << Base::kLanes) - 1) << (lane_id() / Base::kLanes * Base::kLanes);
+  }
+};
 /// Pairs above which a tile's list is long, so that its walk may be what the others end before.
 inline constexpr int kLongList = 4096;
 
@@ -37,35 +49,52 @@ __device__ inline int64_t pixel_words(const TileLists& lists, const TileList& li
   return (first_piece(lists, kFilterPiece, tile) * kMovingPixels + pixel_number * pieces) * kFilterWords;
 }
 
+/// Bit x: the span holds x0 + x, of a row of a tile that begins at x0. The differences are exact wherever they decide.
+__device__ inline uint32_t row_bits(const Span<float>& span, float x0) {
+  const int first = int(std::ceil(min(max(span.lo - x0, 0.0f), float(kMovingTile))));
+  const int behind = int(std::floor(min(max(span.hi - x0, -1.0f), float(kMovingTile - 1)))) + 1;
+  return ((1u << behind) - 1) & ~((1u << first) - 1);
+}
+
+/// The bits of a warp with lanes and bits exchanged: bit b of lane l becomes bit l of lane b. In step s lanes whose
+/// numbers differ by s trade the bits whose numbers do.
+__device__ inline uint32_t transpose_bits(uint32_t bits) {
+#pragma unroll
+  for (int s = 16; s > 0; s /= 2) {
+    const uint32_t lower = kAllLanes / ((1u << s) + 1);  // bits b with b & s = 0
+    const bool upper = lane_id() & s;
+    const uint32_t others = __shfl_xor_sync(kAllLanes, bits, s), keep = upper ? ~lower : lower;
+    bits = (bits & keep) | ((upper ? others >> s : others << s) & ~keep);
+  }
+  return bits;
+}
+
 /// A thread per pair: which pixels its splat reaches.
 template <class F> __global__ void __launch_bounds__(kFilterPiece) filter_kernel(const BlendParams params) {
-  using Layout = FilterLayout;
-  static_assert(Layout::kPixels == 1);  // so that a group's number is that of its pixel
-  __shared__ uint32_t words[Layout::kGroups][kFilterWords];
+  constexpr int kRowsOfWord = 32 / kMovingTile;
+  __shared__ uint32_t words[kMovingPixels][kFilterWords];
   const TilePiece piece = find_piece(params.lists, params.grid, kFilterPiece, blockIdx.x);
   if (piece.tile < 0) return;
   const TileList list = list_of(params.lists, params.grid, piece.tile);
   const int k = piece.index * kFilterPiece + int(threadIdx.x);
-  typename Layout::Reach reach = 0;
+  uint32_t reach[kMovingPixels / 32] = {};  // a bit per pixel
   if (k < list.count) {
     const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
-    reach = Layout::reach(support_of(splats[list.splat(k)]), list.x0, list.y0);
-  }
+    const Support<float> support = support_of(splats[list.splat(k)]);
 #pragma unroll
-  for (int from = 0; from < Layout::kGroups; from += 32) {
-    uint32_t mine = 0;
-#pragma unroll
-    for (int g = 0; g < 32 && from + g < Layout::kGroups; ++g) {
-      const uint32_t word = __ballot_sync(kAllLanes, reach >> (from + g) & 1);
-      if (lane_id() == g) mine = word;
+    for (int row = 0; row < kMovingTile; ++row) {
+      const float y = float(list.y0 + row);
+      reach[row / kRowsOfWord] |= row_bits(columns_of(support, y, y), float(list.x0))
+                                  << row % kRowsOfWord * kMovingTile;
     }
-    if (from + lane_id() < Layout::kGroups) words[from + lane_id()][threadIdx.x / 32] = mine;
   }
+#pragma unroll
+  for (int w = 0; w < kMovingPixels / 32; ++w) words[32 * w + lane_id()][threadIdx.x / 32] = transpose_bits(reach[w]);
   __syncthreads();
-  for (int i = threadIdx.x; i < Layout::kGroups * kFilterWords; i += kFilterPiece) {
-    const int group = i / kFilterWords, word = i % kFilterWords;
-    const int64_t first = pixel_words(params.lists, list, piece.tile, group);
-    params.reach_words[first + piece.index * kFilterWords + word] = words[group][word];
+  for (int i = threadIdx.x; i < kMovingPixels * kFilterWords; i += kFilterPiece) {
+    const int pixel = i / kFilterWords, word = i % kFilterWords;
+    const int64_t first = pixel_words(params.lists, list, piece.tile, pixel);
+    params.reach_words[first + piece.index * kFilterWords + word] = words[pixel][word];
   }
 }
 
@@ -75,6 +104,7 @@ template <class F, int C, int kMostPixels> struct ListedStage {
   int32_t ids[kListedBatch];
   uint16_t places[kListedBatch];    ///< of the pairs in the batch
   uint32_t words[kMostPixels][32];  ///< the batch's bits of each pixel
+  uint8_t lists[kMostPixels][32];   ///< of each pixel, the splats that reach it
 
   /// Takes the pairs of a batch that begins at k, of which each lane has the word of bits of each pixel in `words`, in
   /// order. Returns how many reach any pixel. All lanes must call it.
@@ -97,8 +127,23 @@ template <class F, int C, int kMostPixels> struct ListedStage {
     return all;
   }
 
-  /// Of the pairs [from, from + 32) of those that were taken, `count` in all, those that reach this lane's pixel: that
-  /// of from + j is bit 31 - j. All lanes must call it.
+  /// Lists, for each pixel, those of the pairs [from, from + 32) of those that were taken, `count` in all, that reach
+  /// it. Returns how many reach this lane's. All lanes must call it.
+  template <class Layout> __device__ int list(int from, int count) {
+    const int lane = lane_id(), place = from + lane < count ? places[from + lane] : 0;
+    int mine = 0;
+#pragma unroll
+    for (int i = 0; i < Layout::kPixels; ++i) {
+      const bool reaches = from + lane < count && (words[i][place / 32] >> (place % 32) & 1);
+      const uint32_t reached = __ballot_sync(kAllLanes, reaches);
+      if (reaches) lists[i][__popc(reached & ((1u << lane) - 1))] = uint8_t(lane);
+      if (lane / Layout::kLanes == i) mine = __popc(reached);
+    }
+    return mine;
+  }
+
+  /// Of the pairs [from, from + 32) of those that were taken, `count` in all, those that reach this lane's pixel, in
+  /// the order of take_first. All lanes must call it.
   template <class Layout> __device__ uint32_t reached(int from, int count) const {
     const int lane = 31 - lane_id(), place = from + lane < count ? places[from + lane] : 0;
     uint32_t mine = 0;
@@ -112,18 +157,70 @@ template <class F, int C, int kMostPixels> struct ListedStage {
   }
 };
 
+/// Composites the splats [from, from + 32) of those that were taken, of which `n` reach the pixels of this lane, into
+/// samples that several lanes have; k0: the first pair of the batch. Most splats that reach a pixel do not show in a
+/// sample, since they are small: the lanes of a sample look at as many splats at once, and composite the first that
+/// shows. Then those behind it are looked at again, since the node has moved. `store(k)` leaves the checkpoints up to
+/// pair k.
+template <class F, int C, class Layout, bool kKeep, class Blend, class Stage, class Store>
+__device__ void blend_ahead(const Stage& stage, int k0, int from, int n, Blend& blend, Store&& store) {
+  const int pixel = lane_id() / Layout::kLanes;
+  const uint32_t sharers = Layout::sharers();
+  float& transmittance = blend.samples.transmittance[0];
+  Vec2<float>& place = blend.samples.place[0];
+  int next = Layout::ahead();  // of the pixel's list, for this lane
+  TileSplat<F, C> splat;
+  Vec2<float> row;
+  int k = 0;
+  bool live = false;  // there is such a splat, and none behind it was composited
+  const auto take = [&] {
+    live = next < n && transmittance > 0;
+    if (!live) return;
+    const int j = stage.lists[pixel][next];
+    splat = stage.splats[j];
+    row = blend.corners.row(splat.terms);
+    k = k0 + stage.places[from + j];
+  };
+  take();
+  while (__any_sync(kAllLanes, live)) {
+    float raw = 0;
+    Vec2<float> z = {0, 0};
+    if (live) {
+      z = blend.corners.node(splat.terms, row, 0, place);
+      raw = exp2(F::log_alpha(splat.terms, z));
+    }
+    const bool hit = raw >= float(kAlphaMin);
+    const uint32_t hits = __ballot_sync(kAllLanes, hit) & sharers;
+    const int first = hits ? __ffs(int(hits)) - 1 : lane_id();
+    float behind = transmittance;
+    Vec2<float> moved = place;
+    if (hit) {
+      const Blended<float> b = blend_placed_sample<F>(splat.terms, z, raw, UnitCell<F::kSide>(), behind, moved);
+      if (first == lane_id()) blend.add(b, splat.channels, k);
+    }
+    const int pair = kKeep ? shuffle(k, first) : 0;
+    if (kKeep && hits) store(pair);
+    transmittance = shuffle(behind, first);
+    place = {shuffle(moved.x, first), shuffle(moved.y, first)};
+    live = live && hits != 0 && lane_id() > first && transmittance > 0;
+    if (hits == 0 || first % Layout::kLanes == Layout::kLanes - 1) {
+      next += Layout::kLanes;
+      take();
+    }
+  }
+}
+
 /// Blends the pixels of a warp, as Layout shares them out; C channels from `first` on.
-template <class F, int C, class Layout>
+template <class F, int C, class Layout, bool kKeep>
 __device__ void blend_listed(const BlendParams& params, int first, int tile, const TileList& list,
                              ListedStage<F, C, ListedLayout<F, false>::kPixels>& stage) {
   constexpr int kPixels = Layout::kPixels;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int lane = lane_id();
   const StatePlaces places(params.lists, list, params.grid, tile);
-  const bool keep = params.transmittance && first == 0;
   const Vec2<float> p = Layout::pixel();
   const Pixel pixel(list, params.grid, p);
-  MovingBlend<F, C, Layout, true> blend(pixel.inside);
+  MovingBlend<F, C, Layout, kKeep, true> blend(p, pixel.inside);
   uint32_t words[kPixels];              // of each pixel, this lane's of a batch
   const auto read_words = [&](int k) {  // of the batch that begins at k
     const int mine = k + 32 * lane;
@@ -135,6 +232,11 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
   };
   int checkpoint = kStateChunk;  // the next one is in front of this pair
   float* to = params.checkpoints + places.first * blend.samples.kCheckpoint;
+  const auto store_up_to = [&](int k) {
+#pragma unroll 1
+    for (; kKeep && checkpoint <= k; checkpoint += kStateChunk, to += blend.samples.kCheckpoint)
+      blend.samples.store(to);
+  };
   read_words(0);
   uint32_t open = __ballot_sync(kAllLanes, blend.samples.open());
   for (int k0 = 0; k0 < list.count && open; k0 += kListedBatch) {
@@ -150,7 +252,14 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
       if (from + lane < count) {
         const int32_t id = stage.ids[from + lane];
         const Splat<F, float> splat = splats[id];
-        stage.splats[lane] = {tile_terms(splat, list), channels_of<C>(params.channels, splat, id, first)};
+        stage.splats[lane] = {cell_terms(splat, list), channels_of<C>(params.channels, splat, id, first)};
+      }
+      if constexpr (Layout::kShared) {
+        const int n = stage.template list<Layout>(from, count);
+        __syncwarp();
+        blend_ahead<F, C, Layout, kKeep>(stage, k0, from, n, blend, store_up_to);
+        open = __ballot_sync(kAllLanes, blend.samples.open());
+        continue;
       }
       uint32_t left = stage.template reached<Layout>(from, count);
       if (!blend.samples.open()) left = 0;
@@ -158,24 +267,27 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
       // Each step waits for the one before. What need not, the next splat and how it is seen, is made ready meanwhile.
       int j = __clz(int(left)) % 32;
       TileSplat<F, C> splat = stage.splats[j];
-      Vec2<float> of_pixel = transform(splat.terms.w, p, splat.terms.node[0]);
+      Vec2<float> row = blend.corners.row(splat.terms);
       int k = k0 + stage.places[from + j];
       while (left != 0) {
         left ^= 1u << (31 - j);
         j = __clz(int(left)) % 32;
         const TileSplat<F, C> next = stage.splats[j];
         const int next_place = stage.places[from + j];
-#pragma unroll 1
-        for (; keep && checkpoint <= k; checkpoint += kStateChunk, to += blend.samples.kCheckpoint)
-          blend.samples.store(to);
-        blend.add(splat, of_pixel, k);
+        store_up_to(k);
+        blend.add(splat, row, k);
         splat = next;
-        of_pixel = transform(splat.terms.w, p, splat.terms.node[0]);
+        row = blend.corners.row(splat.terms);
         k = k0 + next_place;
       }
       open = __ballot_sync(kAllLanes, blend.samples.open());
     }
     __syncwarp();
+  }
+  if (Layout::kShared && kKeep) {
+#pragma unroll
+    for (int offset = 1; offset < Layout::kLanes; offset *= 2)
+      blend.last[0] = max(blend.last[0], __shfl_xor_sync(kAllLanes, blend.last[0], offset));
   }
   blend.write(params, first, pixel);
 }
@@ -184,7 +296,7 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
 template <class F> inline constexpr int kListedBlocks = ListedLayout<F, true>::kBlocks;
 
 /// A warp per few pixels of a tile; where its list is short, only the first blocks of a tile have any.
-template <class F, int C, int kLongAbove = kLongList>
+template <class F, int C, bool kKeep, int kLongAbove = kLongList>
 __global__ void __launch_bounds__(32) listed_blend_kernel(const BlendParams params, int first) {
   using Short = ListedLayout<F, false>;
   using Long = ListedLayout<F, true>;
@@ -193,13 +305,14 @@ __global__ void __launch_bounds__(32) listed_blend_kernel(const BlendParams para
   const int tile = params.plan.tile_order[blockIdx.x / Long::kBlocks];
   const TileList list = list_of(params.lists, params.grid, tile);
   if (list.overflow) return;
-  if constexpr (!std::is_same_v<Short, Long>) {
+  if constexpr (Short::kLanes != Long::kLanes) {
     if (list.count <= kLongAbove) {
-      if (int(blockIdx.x) % Long::kBlocks < Short::kBlocks) blend_listed<F, C, Short>(params, first, tile, list, stage);
+      if (int(blockIdx.x) % Long::kBlocks < Short::kBlocks)
+        blend_listed<F, C, Short, kKeep>(params, first, tile, list, stage);
       return;
     }
   }
-  blend_listed<F, C, Long>(params, first, tile, list, stage);
+  blend_listed<F, C, Long, kKeep>(params, first, tile, list, stage);
 }
 
 }  // namespace ar::cuda

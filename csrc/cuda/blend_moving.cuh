@@ -1,31 +1,35 @@
-// Kernel of blend for footprints whose samples move: a block per tile of 8x8 pixels, a lane per few samples of a pixel.
+// Kernel of blend for footprints whose samples move: a block per tile, a lane per few samples of a pixel.
 //
 // What a splat does to a sample depends on where the sample is when they meet, so that the chunks of a list cannot be
 // blended side by side as in blend.cuh: a block walks its whole list. What fills the device instead is that samples are
-// spread over lanes and that tiles are small. It also wastes less: the fewer pixels a warp has, the fewer splats pass
-// through it that touch only some of them. Small images take the kernel of blend_listed.cuh in its place.
+// spread over lanes and that tiles are small where there are several. It also wastes less: the fewer pixels a warp has,
+// the fewer splats pass through it that touch only some of them. Small images take the kernel of blend_listed.cuh in
+// its place.
 #pragma once
 
 #include "cuda/composite.cuh"
 
 namespace ar::cuda {
 
+/// Pixels of all tiles but those of EvenLayout for one sample in large images.
 inline constexpr int kMovingPixels = kMovingTile * kMovingTile;
 /// Of more channels than lie in the rows of pairs, those that are blended at once.
 inline constexpr int kMovingChannels = 8;
 
-/// How the samples of 8x8 pixels are shared out: kCells to a lane, those of a pixel to kLanes neighbours, a power of
-/// two, of which the last may have fewer, or none. The pixels of a warp, a group, are a rectangle. A tile's groups are
-/// spread over kBlocks blocks of kWarps warps.
-template <int kCellsOfLane, int kLanesOfPixel, int kWarpsOfBlock = kLanesOfPixel * kMovingPixels / 32>
+/// How the samples of a tile of kSide x kSide pixels are shared out: kCells to a lane, those of a pixel to kLanes
+/// neighbours, a power of two, of which the last may have fewer, or none. The pixels of a warp, a group, are a
+/// rectangle. A tile's groups are spread over kBlocks blocks of kWarps warps.
+template <int kCellsOfLane, int kLanesOfPixel, int kSideOfTile = kMovingTile,
+          int kWarpsOfBlock = kLanesOfPixel * kSideOfTile * kSideOfTile / 32>
 struct CellLayout {
   static constexpr int kCells = kCellsOfLane, kLanes = kLanesOfPixel;
-  static constexpr int kGroups = kLanes * kMovingPixels / 32;
+  static constexpr int kSide = kSideOfTile, kTilePixels = kSide * kSide;
+  static constexpr int kGroups = kLanes * kTilePixels / 32;
   static constexpr int kWarps = kWarpsOfBlock, kThreads = 32 * kWarps, kBlocks = kGroups / kWarps;
   static_assert((kLanes & (kLanes - 1)) == 0 && kLanes <= 32 && kGroups % kWarps == 0 && kWarps <= 32);
   static constexpr int kPixels = 32 / kLanes;  ///< of a group
   static constexpr int kWide = kPixels == 32 ? 8 : kPixels >= 8 ? 4 : kPixels >= 2 ? 2 : 1, kHigh = kPixels / kWide;
-  static constexpr int kColumns = kMovingTile / kWide;                   ///< groups side by side
+  static constexpr int kColumns = kSide / kWide;                         ///< groups side by side
   using Reach = std::conditional_t<(kGroups > 32), uint64_t, uint32_t>;  ///< a bit for each group
 
   /// This warp's group.
@@ -33,7 +37,7 @@ struct CellLayout {
   /// The place of the group's pixel i among the tile's, row by row, whatever the layout.
   __device__ static int pixel_number(int i) {
     const int g = group();
-    return (g / kColumns * kHigh + i / kWide) * kMovingTile + g % kColumns * kWide + i % kWide;
+    return (g / kColumns * kHigh + i / kWide) * kSide + g % kColumns * kWide + i % kWide;
   }
   __device__ static int pixel_number() { return pixel_number(lane_id() / kLanes); }  ///< of this thread's pixel
   /// This thread's pixel, relative to the tile's first.
@@ -43,12 +47,15 @@ struct CellLayout {
   }
   /// The first of this thread's samples of its pixel.
   __device__ static int first_sample() { return lane_id() % kLanes * kCells; }
+  /// Whether no other lane has the samples too, or this is the one of them that writes.
+  __device__ static bool owns() { return true; }
 
-  /// Bit g: the support reaches the pixels of group g of the tile that begins at (x0, y0).
-  __device__ static Reach reach(const Support<float>& support, int x0, int y0) {
+  /// Bit g: the support reaches the pixels of group g, of the first kCount, of the tile that begins at (x0, y0).
+  template <int kCount = kGroups> __device__ static Reach reach(const Support<float>& support, int x0, int y0) {
+    static_assert(kCount % kColumns == 0);
     Reach reach = 0;
 #pragma unroll
-    for (int g = 0; g < kGroups; g += kColumns) {
+    for (int g = 0; g < kCount; g += kColumns) {
       const float y = float(y0 + g / kColumns * kHigh);
       const Span<float> span = columns_of(support, y, y + float(kHigh - 1));
 #pragma unroll
@@ -58,6 +65,12 @@ struct CellLayout {
       }
     }
     return reach;
+  }
+
+  /// Bit w: it reaches the pixels of warp w of this block.
+  __device__ static uint32_t block_reach(const Support<float>& support, int x0, int y0) {
+    const int rows = int(blockIdx.x) % kBlocks * kWarps / kColumns;  // of groups, those of the blocks before
+    return uint32_t(reach<kWarps>(support, x0, y0 + rows * kHigh));
   }
 
   /// The sum over the lanes of a pixel, in each of them.
@@ -83,25 +96,29 @@ struct StatePlaces {
   }
 };
 
+/// What the cells of a tile need of a splat: lengths are in edges of cells.
+template <class F> __device__ auto cell_terms(const Splat<F, float>& splat, const TileList& list) {
+  auto terms = tile_terms(splat, list);
+  terms.w = 1.0f / F::kSide * terms.w;
+  return terms;
+}
+
 /// A lane's samples on their way through a list. `kTogether`: the samples of a pixel are neighbours in a checkpoint, as
 /// they are among the lanes of warps with few pixels; else the pixels of a sample are.
 template <class F, class Layout, bool kTogether = false> struct MovingSamples {
   static constexpr int kCells = Layout::kCells;
   float transmittance[kCells];
-  Vec2<float> place[kCells];     ///< of the node [px from the pixel's centre]
-  Bounds<float> bounds[kCells];  ///< of the place
+  Vec2<float> place[kCells];  ///< of the node in its cell
 
   /// In front of all splats.
   __device__ explicit MovingSamples(bool inside) {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
       transmittance[i] = inside && exists(i) ? 1.0f : -1.0f;
-      place[i] = node(i);
-      bounds[i] = F::template cell<float>(Layout::first_sample() + i);
+      place[i] = {0.5f, 0.5f};
     }
   }
   __device__ static bool exists(int i) { return Layout::first_sample() + i < F::kSamples; }
-  __device__ static Vec2<float> node(int i) { return F::template node<float>(Layout::first_sample() + i); }
   __device__ bool open() const {
     bool any = false;
 #pragma unroll
@@ -109,17 +126,18 @@ template <class F, class Layout, bool kTogether = false> struct MovingSamples {
     return any;
   }
 
-  static constexpr int kCheckpoint = state_planes(F::kSamples) * kMovingPixels;           ///< numbers of a checkpoint
-  static constexpr int kPlane = kTogether ? F::kSamples * kMovingPixels : kMovingPixels;  ///< from a plane to the next
+  static constexpr int kCheckpoint = state_planes(F::kSamples) * Layout::kTilePixels;  ///< numbers of a checkpoint
+  static constexpr int kPlane =
+      kTogether ? F::kSamples * Layout::kTilePixels : Layout::kTilePixels;  ///< from a plane to the next
   /// Where a checkpoint has sample i of this pixel: its transmittance, and its place in the two planes behind.
   __device__ static int in_checkpoint(int i) {
     const int sample = Layout::first_sample() + i, pixel = Layout::pixel_number();
-    return kTogether ? pixel * F::kSamples + sample : 3 * sample * kMovingPixels + pixel;
+    return kTogether ? pixel * F::kSamples + sample : 3 * sample * Layout::kTilePixels + pixel;
   }
   __device__ void store(float* checkpoint) const {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
-      if (!exists(i)) continue;
+      if (!exists(i) || !Layout::owns()) continue;
       float* to = checkpoint + in_checkpoint(i);
       to[0] = abs(transmittance[i]);
       to[kPlane] = place[i].x;
@@ -132,7 +150,7 @@ template <class F, class Layout, bool kTogether = false> struct MovingSamples {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
       transmittance[i] = 1;
-      place[i] = node(i);
+      place[i] = {0.5f, 0.5f};
       if (k == 0 || k >= last[i]) continue;
       const float* from = checkpoint + in_checkpoint(i);
       transmittance[i] = from[0];
@@ -141,9 +159,36 @@ template <class F, class Layout, bool kTogether = false> struct MovingSamples {
   }
 };
 
+/// Where the cells of a lane are, in edges of cells. How their whitened coordinates are rounded does not depend on the
+/// layout, so that one kernel finds again what another has composited.
+template <class F, class Layout> struct CellCorners {
+  /// Whether all cells of a lane are in the same row of the pixel's, and whether they are all of it.
+  static constexpr bool kInRow = F::kSide % Layout::kCells == 0, kWholeRow = F::kSide == Layout::kCells;
+  float left, top;  ///< the pixel's corner, seen from the centre of the tile's first pixel
+
+  /// `p`: the pixel, relative to the tile's first.
+  __device__ explicit CellCorners(Vec2<float> p)
+      : left(F::kSide * (p.x - 0.5f)),
+        top(F::kSide * (p.y - 0.5f) + (kInRow ? float(Layout::first_sample() / F::kSide) : 0.0f)) {}
+
+  /// Whitened coordinates of the corner of the row of cells, if there is one only.
+  template <class Terms> __device__ Vec2<float> row(const Terms& terms) const {
+    return transform(terms.w, Vec2<float>{left, top}, terms.node[0]);
+  }
+  /// Of the node of cell i at `place` in it. `row`: row(terms).
+  template <class Terms>
+  __device__ Vec2<float> node(const Terms& terms, Vec2<float> row, int i, Vec2<float> place) const {
+    const int sample = Layout::first_sample() + i;
+    if (!kInRow) row = transform(terms.w, Vec2<float>{left, top + float(sample / F::kSide)}, terms.node[0]);
+    const float column = float(kWholeRow ? i : sample % F::kSide);
+    if (!kWholeRow || i > 0) row = {madd(column, terms.w.xx, row.x), madd(column, terms.w.yx, row.y)};
+    return F::whitened_node(terms, row, place);
+  }
+};
+
 /// Up to kBatch splats of a tile that a block works on together.
 template <class F, int C, class Layout, int kBatch> struct MovingStage {
-  static_assert(kBatch <= Layout::kThreads && Layout::kBlocks == 1);
+  static_assert(kBatch % 32 == 0 && kBatch <= Layout::kThreads);
   TileSplat<F, C> splats[kBatch];
   uint32_t reach[kBatch];
 
@@ -158,58 +203,56 @@ template <class F, int C, class Layout, int kBatch> struct MovingStage {
     uint32_t bits = 0;
     if (id >= 0) {
       const Splat<F, float> splat = splats_in[id];
-      bits = Layout::reach(support_of(splat), list.x0, list.y0);  // a block has all groups of its tile
-      if (bits) splats[threadIdx.x] = {tile_terms(splat, list), channels_of<C>(channels, splat, id, first)};
+      bits = Layout::block_reach(support_of(splat), list.x0, list.y0);
+      if (bits) splats[threadIdx.x] = {cell_terms(splat, list), channels_of<C>(channels, splat, id, first)};
     }
     if (threadIdx.x < kBatch) reach[threadIdx.x] = bits;
   }
 
-  /// Of the splats [k, k + 32), those that reach this warp's pixels: that of k + j is bit 31 - j. All must call it.
+  /// Of the splats [k, k + 32), those that reach this warp's pixels, in the order of take_first. All must call it.
   __device__ uint32_t reached(int k) const {
     return __ballot_sync(kAllLanes, reach[k + 31 - lane_id()] >> (threadIdx.x / 32) & 1);
   }
 };
 
-/// Takes the first splat out of `reached`, as MovingStage has them, and returns its number: the highest bit is found
-/// with one slow instruction, the lowest with two.
-__device__ inline int take_first(uint32_t& reached) {
-  const int first = __clz(int(reached));
-  reached ^= 1u << (31 - first);
-  return first;
-}
-
-/// A lane's share of blending a pixel.
-template <class F, int C, class Layout, bool kTogether = false> struct MovingBlend {
+/// A lane's share of blending a pixel. kKeep: what the backward pass needs is kept.
+template <class F, int C, class Layout, bool kKeep, bool kTogether = false> struct MovingBlend {
   static constexpr int kCells = Layout::kCells;
   MovingSamples<F, Layout, kTogether> samples;
+  CellCorners<F, Layout> corners;
   Values<C> sums = {};
-  int last[kCells] = {};
+  int last[kCells] = {};  ///< only with kKeep
 
-  __device__ explicit MovingBlend(bool inside) : samples(inside) {}
+  /// `p`: the pixel, relative to the tile's first.
+  __device__ MovingBlend(Vec2<float> p, bool inside) : samples(inside), corners(p) {}
 
-  /// Composites pair k into the samples of a pixel, whose whitened coordinates for the splat are of_pixel.
-  __device__ void add(TileSplatRef<F, C>& splat, Vec2<float> of_pixel, int k) {
+  /// Adds what pair k shows in the first sample.
+  __device__ void add(const Blended<float>& b, const Values<C>& channels, int k) {
+    sums.add(b.contribution, channels);
+    if (kKeep) last[0] = b.mask ? k + 1 : last[0];
+  }
+  /// Composites pair k into the samples. `row`: corners.row() for its splat.
+  __device__ void add(TileSplatRef<F, C>& splat, Vec2<float> row, int k) {
     float contribution = 0;
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
-      const Vec2<float> z = F::whitened_node(splat.terms, of_pixel, samples.place[i]);
+      const Vec2<float> z = corners.node(splat.terms, row, i, samples.place[i]);
       const Blended<float> b = blend_placed_sample<F>(splat.terms, z, exp2(F::log_alpha(splat.terms, z)),
-                                                      samples.bounds[i], samples.transmittance[i], samples.place[i]);
+                                                      UnitCell<F::kSide>(), samples.transmittance[i], samples.place[i]);
       contribution = i == 0 ? b.contribution : contribution + b.contribution;
-      last[i] = b.mask ? k + 1 : last[i];
+      if (kKeep) last[i] = b.mask ? k + 1 : last[i];
     }
     sums.add(contribution, splat.channels);
   }
 
   /// Adds the lanes of each pixel up and writes its images. All lanes must call it.
   __device__ void write(const BlendParams& params, int first, const Pixel& pixel) {
-    const bool keep = params.transmittance && first == 0;
     float through = 0;
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
-      if (!samples.exists(i)) continue;
+      if (!samples.exists(i) || !Layout::owns()) continue;
       through += abs(samples.transmittance[i]);
-      if (!keep || !pixel.inside) continue;
+      if (!kKeep || !pixel.inside) continue;
       const int64_t place = (Layout::first_sample() + i) * pixel.image + pixel.index;
       params.transmittance[place] = abs(samples.transmittance[i]);
       params.last[place] = last[i];
@@ -217,7 +260,7 @@ template <class F, int C, class Layout, bool kTogether = false> struct MovingBle
     through = Layout::sum_lanes(through);
 #pragma unroll
     for (int c = 0; c < C; ++c) sums.v[c] = Layout::sum_lanes(sums.v[c]);
-    if (!pixel.inside || Layout::first_sample() > 0) return;
+    if (!pixel.inside || Layout::first_sample() > 0 || !Layout::owns()) return;
     const float scale = 1.0f / F::kSamples;
 #pragma unroll
     for (int c = 0; c < C; ++c) {
@@ -231,7 +274,7 @@ template <class F, int C, class Layout, bool kTogether = false> struct MovingBle
 
 /// A block per tile; C channels from `first` on, of three in so few registers that an SM holds 1024 threads.
 /// `overflow_only`: another kernel blends the tiles, unless there were too many pairs.
-template <class F, int C, class Layout>
+template <class F, int C, class Layout, bool kKeep>
 __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThreads : 1)
     moving_blend_kernel(const BlendParams params, int first, bool overflow_only) {
   constexpr int kBatch = Layout::kThreads < 256 ? Layout::kThreads : 256;
@@ -241,10 +284,9 @@ __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThr
   const TileList list = list_of(params.lists, params.grid, tile);
   if (overflow_only && !list.overflow) return;
   const StatePlaces places(params.lists, list, params.grid, tile);
-  const bool keep = params.transmittance && first == 0;
   const Vec2<float> p = Layout::pixel();
   const Pixel pixel(list, params.grid, p);
-  MovingBlend<F, C, Layout> blend(pixel.inside);
+  MovingBlend<F, C, Layout, kKeep> blend(p, pixel.inside);
   int32_t id = stage.splat_of(list, 0, list.count);
   for (int k = 0; k < list.count && __syncthreads_or(blend.samples.open()); k += kBatch) {
     const int count = min(list.count - k, kBatch);
@@ -255,29 +297,27 @@ __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThr
     id = next_id;
     for (int from = 0; from < count; from += 32) {
       if (!__any_sync(kAllLanes, blend.samples.open())) break;
-      if (keep && k + from > 0 && (k + from) % places.spacing == 0)
+      if (kKeep && k + from > 0 && (k + from) % places.spacing == 0)
         blend.samples.store(params.checkpoints +
                             (places.first + (k + from) / places.spacing - 1) * blend.samples.kCheckpoint);
       for (uint32_t left = stage.reached(from); left != 0;) {
         const int j = from + take_first(left);
         TileSplatRef<F, C> splat = stage.splats[j];
-        blend.add(splat, transform(splat.terms.w, p, splat.terms.node[0]), k + j);
+        blend.add(splat, blend.corners.row(splat.terms), k + j);
       }
     }
   }
   blend.write(params, first, pixel);
 }
 
-/// Samples shared out so that there is least to do, forwards and backwards.
-template <class F, bool kBackward>
+/// Samples shared out so that there is least to do, forwards and backwards, in tiles of the size of moving_grid().
+/// Small images are blended by blend_listed.cuh and differentiated in segments (blend_moving_vjp.cuh): their few tiles
+/// have long lists, and the time is that of the longest.
+template <class F, bool kBackward, bool kSmall>
 using EvenLayout =
-    std::conditional_t<F::kSamples == 1, CellLayout<1, 1>,
+    std::conditional_t<F::kSamples == 1, CellLayout<1, 1, 1 << moving_tile_bits(1, kSmall)>,
                        std::conditional_t<F::kSamples == 4, CellLayout<2, 2>,
                                           std::conditional_t<F::kSamples == 9 && !kBackward, CellLayout<5, 2>,
                                                              CellLayout<(F::kSamples + 3) / 4, 4>>>>;
-
-/// Small images are blended by blend_listed.cuh and differentiated in segments (blend_moving_vjp.cuh): their few tiles
-/// have long lists, and the time is that of the longest.
-inline bool is_small_image(TileGrid grid) { return grid.tiles() < 4096; }
 
 }  // namespace ar::cuda

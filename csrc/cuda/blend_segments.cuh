@@ -61,8 +61,8 @@ __device__ void walk_segment(const Splat<F, float>* splats, const Channels<float
     staged.load(channels, first_channel, count, stage.reach);
     __syncthreads();
     for (int from = 0; from < count; from += 32) {
-      for (uint32_t mask = stage.reached(from); mask != 0; mask &= mask - 1) {
-        const int j = from + __ffs(mask) - 1;
+      for (uint32_t left = stage.reached(from); left != 0;) {
+        const int j = from + take_first(left);
         TileSplatRef<F, 0> splat = stage.splats[j];
         float contributions[S];
         bool any = false;
@@ -91,7 +91,7 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
   if (place < 0) return;
   const Segment<S> segment(params.lists, params.grid, params.plan.tile_order[place], int(blockIdx.x) % segments.count,
                            segments.count, params.last);
-  const PixelCheckpoints<S, 3, true> checkpoints(cut, segment.tile);
+  const PixelCheckpoints<S, 3, true> checkpoints(cut, segment.tile, int(threadIdx.x));
   using Share = ChannelShare<C>;
   float transmittance[S];
   Share sums = {};

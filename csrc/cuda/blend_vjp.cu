@@ -25,18 +25,25 @@ template <class F, int C> void launch_segments_vjp(const BlendVjpParams& p, int 
   using Layout = SegmentLayout<F>;
   constexpr int kSegment = kMovingSegment<F>;
   const auto pieces = unsigned(max_pieces(p.lists.capacity, kSegment, p.grid));
-  const LaunchShape shape = {pieces, Layout::kThreads, sizeof(MovingVjpShared<F, C, Layout>)};
-  launch(moving_vjp_kernel<F, C, Layout, kSegment, true>, shape, stream, p, first, false);
+  using Maps = MapLayout<F>;
+  launch(segment_maps_kernel<F, C, kSegment>, {pieces * Maps::kBlocks, Maps::kThreads}, stream, p, first);
   const auto blocks = unsigned(p.grid.tiles() * F::kSamples);
   launch(chain_maps_kernel<F, kSegment>, {blocks, kMovingPixels}, stream, p);
-  launch(moving_vjp_kernel<F, C, Layout, kSegment, false>, shape, stream, p, first, false);
+  const LaunchShape shape = {pieces, Layout::kThreads, sizeof(MovingVjpShared<F, C, Layout, kSegment>)};
+  launch(moving_vjp_kernel<F, C, Layout, kSegment>, shape, stream, p, first, false);
+}
+template <class F, int C, bool kSmall> void launch_tiles_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
+  using Layout = EvenLayout<F, true, kSmall>;
+  const LaunchShape shape = {unsigned(p.grid.tiles()), Layout::kThreads, sizeof(MovingVjpShared<F, C, Layout>)};
+  launch(moving_vjp_kernel<F, C, Layout>, shape, stream, p, first, kSmall);
 }
 template <class F, int C> void launch_moving_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
-  const bool in_segments = is_small_image(p.grid);
-  if (in_segments) launch_segments_vjp<F, C>(p, first, stream);
-  using Layout = EvenLayout<F, true>;
-  const LaunchShape shape = {unsigned(p.grid.tiles()), Layout::kThreads, sizeof(MovingVjpShared<F, C, Layout>)};
-  launch(moving_vjp_kernel<F, C, Layout>, shape, stream, p, first, in_segments);
+  if (is_small_image(p.grid)) {
+    launch_segments_vjp<F, C>(p, first, stream);
+    launch_tiles_vjp<F, C, true>(p, first, stream);
+  } else {
+    launch_tiles_vjp<F, C, false>(p, first, stream);
+  }
 }
 /// The group that begins with channel `first_of_group`; 0 where they are few.
 template <class F> void blend_vjp_moving(const BlendVjpParams& p, int first_of_group, cudaStream_t stream) {
@@ -55,7 +62,7 @@ int64_t max_adjoint_maps(int footprint, int64_t capacity, TileGrid grid) {
     using F = decltype(f);
     if (F::kMoves && is_small_image(grid)) maps = max_pieces(capacity, kMovingSegment<F>, grid) * F::kSamples;
   });
-  return maps * AdjointMap::kNumbers * kMovingPixels;
+  return maps * SegmentMap::kNumbers * kMovingPixels;
 }
 
 int channel_group(int footprint, int left) {

@@ -16,23 +16,96 @@ enum class Sums { kGrads, kMeans, kBoth };
 template <class F, Sums kSums>
 inline constexpr int kVjpSamples = F::kSamples <= 4 || kSums == Sums::kMeans ? F::kSamples : 4;
 
-/// Splats in blend_vjp, and what each of the warps that share them sums.
+/// Whether each lane of blend_vjp holds its eight pixels of a tile in registers, where one sample and three channels
+/// leave room for a splat, and not in shared memory. Then a visit of a subtile neither waits for shared memory nor has
+/// instructions that read and write it, which is worth the warps that there are fewer of on an SM.
+template <class F, int C>
+inline constexpr bool kHoldsPixels = F::kSamples == 1 && C == 3 && sizeof(TileSplat<F, C>) <= 112;
+
+/// Whether it holds what blending carries through those pixels, for all samples, in registers. Then each subtile has
+/// code of its own, and there is room in shared memory to add up the sums of several pairs together. Not with two
+/// samples, as then twice as many warps fit without.
+template <class F, int C>
+inline constexpr bool kHoldsSamples =
+    kHoldsPixels<F, C> || (F::kSamples == 4 && C == 3 && sizeof(TileSplat<F, C>) <= 64);
+
+/// Nine values of each lane for kPairs pairs in shared memory, which are added up over the lanes together. For a pair
+/// that takes 17 instructions, where sum_values takes 60. Lanes are added in the order of sum_values, so that the sums
+/// are the same to the bit.
+struct PairSums {
+  static constexpr int kPairs = 8, kValues = 9;
+  struct Pair {
+    /// The first eight values of every lane, in two groups of four. Two more places keep the groups, and eight[] and
+    /// ninth[] together the pairs, apart in such a way that no reads meet in a bank.
+    float4 eight[2][34];
+    float4 ninth[8];  ///< the ninth value of lanes 0, 4, ... 28, then of lanes 1, 5, ...
+
+    __device__ void put(const float (&values)[kValues]) {
+      const int lane = lane_id();
+#pragma unroll
+      for (int group = 0; group < 2; ++group) {
+        const float* v = values + 4 * group;
+        eight[group][lane] = {v[0], v[1], v[2], v[3]};
+      }
+      reinterpret_cast<float*>(ninth)[lane % 4 * 8 + lane / 4] = values[8];
+    }
+    /// Of the lanes that differ from `lane` in `offset` or in twice it and so on up to 16, added in pairs, those that
+    /// are 16 apart first.
+    template <int offset> __device__ Values<4> sum_from(int group, int lane) const {
+      if constexpr (offset == 32) {
+        const float4 v = eight[group][lane];
+        return {v.x, v.y, v.z, v.w};
+      } else {
+        Values<4> sum = sum_from<2 * offset>(group, lane);
+        sum += sum_from<2 * offset>(group, lane + offset);
+        return sum;
+      }
+    }
+  };
+  Pair pairs[kPairs];
+
+  /// The sums of pair lane / 4: `four` of a group, that of number lane / 2 % 2, and that of the ninth value.
+  __device__ void sum(float (&four)[4], float& ninth) const {
+    const int lane = lane_id(), odd = lane / 4 % 2;
+    const Pair& pair = pairs[lane / 4];
+    const Values<4> half = pair.sum_from<2>(lane / 2 % 2, lane % 2);
+#pragma unroll
+    for (int v = 0; v < 4; ++v) four[v] = half.v[v] + __shfl_xor_sync(kAllLanes, half.v[v], 1);
+    // The four numbers of lanes below 16 and the four of the others, in either order.
+    const float4 a = pair.ninth[lane % 4 * 2 + odd], b = pair.ninth[lane % 4 * 2 + 1 - odd];
+    ninth = ((a.x + b.x) + (a.z + b.z)) + ((a.y + b.y) + (a.w + b.w));
+#pragma unroll
+    for (int offset = 2; offset > 0; offset /= 2) ninth += __shfl_xor_sync(kAllLanes, ninth, offset);
+  }
+};
+
+/// A splat of a batch of 32 that reaches pixels of its tile.
+template <class F, int C> struct alignas(16) ListedSplat {
+  typename F::template Terms<float> terms;
+  Values<C> channels;
+  uint32_t reach_and_place;  ///< bits 0 to 7: the subtiles; from bit 27 on: its place in the batch
+  int32_t row;               ///< of its sums
+};
+/// In use: copied to registers, unless it has too many numbers.
+template <class F, int C>
+using ListedSplatRef =
+    std::conditional_t<sizeof(TileSplat<F, C>) <= 112, const ListedSplat<F, C>, const ListedSplat<F, C>&>;
+
+/// Those splats of a batch in blend_vjp, back to front, and what each of the warps that share them sums.
 template <class F, int C, int kGroup> struct VjpGroup {
-  TileSplat<F, C> splats[32];
-  int32_t rows[kGroup > 1 ? 32 : 1];
+  struct Nothing {};
+  alignas(16) int subtile_last[kSubtiles];  ///< behind the last pair that was composited into a pixel of each subtile
+  ListedSplat<F, C> splats[32];
+  std::conditional_t<kHoldsSamples<F, C>, PairSums, Nothing> pair_sums;
   float sums[kGroup > 1 ? kGroup : 1][kGroup > 1 ? 32 : 1][6 + C];
 };
 
-/// A warp's pixels in blend_vjp, S samples of each.
-template <int S, int C> struct VjpPixels {
+/// kCount pixels in blend_vjp, S samples of each: those of a warp in shared memory, or those that a lane holds.
+template <int S, int C, int kCount> struct VjpPixels {
   static constexpr bool kPacked = C == 3;  // the fourth number of g is sample 0's `last`, as bits
   static constexpr int kLasts = kPacked ? S - 1 : S;
-  struct Sample {
-    float transmittance, behind;
-  };
-  float4 g[kTilePixels];  // gradient with respect to one sample's channels
-  Sample samples[S][kTilePixels];
-  int last[kLasts > 0 ? kLasts : 1][kLasts > 0 ? kTilePixels : 1];
+  float4 g[kCount];  // gradient with respect to one sample's channels
+  int last[kLasts > 0 ? kLasts : 1][kLasts > 0 ? kCount : 1];
 
   __device__ int last_of(int s, int pixel, const float4& g_pixel) const {
     if (kPacked) return s == 0 ? __float_as_int(g_pixel.w) : last[s > 0 ? s - 1 : 0][pixel];
@@ -52,6 +125,14 @@ template <int S, int C> struct VjpPixels {
   }
 };
 
+/// What blending carries through them from splat to splat.
+template <int S, int kCount> struct VjpSamples {
+  struct Sample {
+    float transmittance, behind;
+  };
+  Sample of[S][kCount];
+};
+
 template <int C> __device__ float dot(const Values<C>& a, const Values<C>& b) {
   float sum = a.v[0] * b.v[0];
 #pragma unroll
@@ -61,32 +142,59 @@ template <int C> __device__ float dot(const Values<C>& a, const Values<C>& b) {
 
 /// Blocks of blend_vjp that an SM should hold: bounds the registers.
 template <class F, int C>
-inline constexpr int kVjpBlocks = F::kSamples > 1                ? 1
-                                  : sizeof(TileSplat<F, C>) > 48 ? 5
-                                  : C == 3                       ? 7
-                                                                 : 6;
+inline constexpr int kVjpBlocks = F::kSamples > 1                 ? (kHoldsSamples<F, C> ? 11 : 1)
+                                  : sizeof(TileSplat<F, C>) <= 48 ? (kHoldsPixels<F, C> ? 5 : 6)
+                                                                  : (kHoldsPixels<F, C> ? 4 : 5);
 
 /// Warps of a block of blend_vjp: as many as leave room for a few blocks in shared memory.
 template <class F, Sums kSums>
 inline constexpr int kVjpWarps = F::kSamples > kVjpSamples<F, kSums> ? F::kSamples / kVjpSamples<F, kSums>
                                  : F::kSamples <= 2                  ? 4
-                                 : F::kSamples <= 8                  ? 2
+                                 : F::kSamples == 8                  ? 2
                                                                      : 1;
+
+/// What of a warp's pixels is in shared memory.
+template <class F, int C, Sums kSums> struct SharedPixels {
+  static constexpr int kOwn = kVjpSamples<F, kSums>;
+  VjpPixels<kOwn, C, kHoldsPixels<F, C> ? 1 : kTilePixels> pixels;
+  VjpSamples<kOwn, kHoldsSamples<F, C> ? 1 : kTilePixels> samples;
+};
 
 /// A warp's share of a chunk, back to front over all pixels of the tile: every pair is summed in one place, so the sums
 /// need no atomics, whose order would change from run to run. `first`: the first of the samples that the warp takes.
 template <class F, int C, Sums kSums>
 __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, int64_t item, int first,
-                                                VjpPixels<kVjpSamples<F, kSums>, C>& stage,
+                                                SharedPixels<F, C, kSums>& shared,
                                                 VjpGroup<F, C, F::kSamples / kVjpSamples<F, kSums>>& group) {
   constexpr int S = F::kSamples, kLength = chunk_length(S), kSumCount = 6 + C;
   constexpr int kOwn = kVjpSamples<F, kSums>, kGroup = S / kOwn;  // samples of a warp, warps of a chunk
-  // Where the code for a subtile is short, each has its own: of 58 instructions 11 would work out where its pixels are.
-  constexpr bool kUnroll = S == 1 && sizeof(TileSplat<F, C>) <= 48;
+  // Where the code for a subtile is short, or pixels are in registers, each has its own: of 58 instructions 11 would
+  // work out where its pixels are.
+  constexpr bool kUnroll = kHoldsSamples<F, C> || (S == 1 && sizeof(TileSplat<F, C>) <= 48);
   constexpr bool kGrads = kSums != Sums::kMeans, kMeans = kSums != Sums::kGrads;
   // A shared-out sample's number is not known when the code is compiled: keep its node indexable.
-  using VjpSplat = std::conditional_t<kGroup == 1, TileSplatRef<F, C>, const TileSplat<F, C>&>;
+  using VjpSplat = std::conditional_t<kGroup == 1, ListedSplatRef<F, C>, const ListedSplat<F, C>&>;
+  constexpr bool kHolds = kHoldsPixels<F, C>, kHoldsState = kHoldsSamples<F, C>;
+  static_assert(kGrads || !kHoldsState);  // or there would be no sums to add up in shared memory
   const int lane = lane_id(), warp = threadIdx.x / 32;
+  std::conditional_t<kHolds, VjpPixels<kOwn, C, kSubtiles>, int> held_pixels;
+  std::conditional_t<kHoldsState, VjpSamples<kOwn, kSubtiles>, int> held_samples;
+  auto& pixels = *[&] {
+    if constexpr (kHolds) {
+      return &held_pixels;
+    } else {
+      return &shared.pixels;
+    }
+  }();
+  auto& samples = *[&] {
+    if constexpr (kHoldsState) {
+      return &held_samples;
+    } else {
+      return &shared.samples;
+    }
+  }();
+  const auto place_of = [&](int b) { return kHolds ? b : b * 32 + lane; };           // in `pixels`
+  const auto sample_place = [&](int b) { return kHoldsState ? b : b * 32 + lane; };  // in `samples`
   const auto group_sync = [] {
     if constexpr (kGroup > 1) {
       __syncthreads();
@@ -105,22 +213,24 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
     return x < params.grid.width && y < params.grid.height ? int64_t(y) * params.grid.width + x : int64_t(-1);
   };
 
-  int subtile_last[kSubtiles], tile_last = 0;
+  int tile_last = 0;
 #pragma unroll
   for (int b = 0; b < kSubtiles; ++b) {
     const int64_t i = pixel_index(b);
     int last = 0;
 #pragma unroll
     for (int s = 0; s < S; ++s) last = max(last, i < 0 ? 0 : params.last[s * image + i]);
-    subtile_last[b] = warp_max(last);
-    tile_last = max(tile_last, subtile_last[b]);
+    last = warp_max(last);
+    group.subtile_last[b] = last;
+    tile_last = max(tile_last, last);
   }
-  if (kGrads && !list.overflow) {
-    for (int k = max(begin, min(tile_last, end)) + lane; k < end; k += 32) {  // pairs that nothing reached
-      auto* row = reinterpret_cast<float4*>(params.pair_grads + int64_t(list.slot(k)) * kPairGradWidth);
+  const auto clear_row = [&](int32_t row) {  // of a pair that reaches nothing
+    auto* numbers = reinterpret_cast<float4*>(params.pair_grads + int64_t(row) * kPairGradWidth);
 #pragma unroll
-      for (int q = 0; q < kPairGradWidth / 4; ++q) row[q] = {0, 0, 0, 0};
-    }
+    for (int q = 0; q < kPairGradWidth / 4; ++q) numbers[q] = {0, 0, 0, 0};
+  };
+  if (kGrads && !list.overflow) {
+    for (int k = max(begin, min(tile_last, end)) + lane; k < end; k += 32) clear_row(list.slot(k));
   }
   if (begin >= tile_last) return;
 
@@ -129,6 +239,7 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const Vec2<float> p0 = pixel_of(0, lane);
   constexpr int kTwo23 = 0x4b000000;
+  const uint32_t subtile_bit = lane < kSubtiles ? 1u << lane : 0;
   const int value = summed_value<kSumCount>(lane);  // that sum_values leaves here
   float* const sums = params.pair_grads + (value == 9 ? kPairFourthChannel : value);
   const float* dL_dplanes[C];  // of three channels all are there
@@ -142,12 +253,12 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
 #pragma unroll
   for (int b = 0; b < kSubtiles; ++b) {
     const int64_t i = pixel_index(b);
-    const int q = b * 32 + lane;
+    const int q = place_of(b);
     const float scale = i < 0 ? 0 : 1.0f / S;
     Values<C> g;
 #pragma unroll
     for (int c = 0; c < C; ++c) g.v[c] = i >= 0 && (C == 3 || dL_dplanes[c]) ? scale * dL_dplanes[c][i] : 0;
-    stage.set(q, g);
+    pixels.set(q, g);
 #pragma unroll
     for (int s = 0; s < kOwn; ++s) {
       const int last = i < 0 ? 0 : params.last[(first + s) * image + i];
@@ -156,7 +267,7 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
         transmittance = i < 0 ? 1.0f : params.transmittance[(first + s) * image + i];
         behind = dot(g, background);
       } else {
-        const Checkpoint<C> c = checkpoints[(first + s) * kTilePixels + q];
+        const Checkpoint<C> c = checkpoints[(first + s) * kTilePixels + b * 32 + lane];
         transmittance = abs(c.transmittance);
         behind = dot(g, c.channels) / transmittance;
       }
@@ -165,45 +276,65 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
         const float open = final ? 1 : params.transmittance[(first + s) * image + i] / transmittance;
         behind -= scale * params.dL_dalpha[i] * open;
       }
-      stage.samples[s][q] = {transmittance, behind};
-      stage.set_last(s, q, last);
+      samples.of[s][sample_place(b)] = {transmittance, behind};
+      pixels.set_last(s, q, last);
     }
   }
 
   const auto put = [&](int32_t row, int column, float x) {
     put_sum(params.pair_grads, kPairGradWidth, list.overflow, row, column, x);
   };
+  // Adds up the values of `count` listed splats, from number `from` on.
+  [[maybe_unused]] const auto sum_pairs = [&](int from, int count) {
+    if constexpr (kHoldsState) {
+      __syncwarp();
+      float four[4], ninth;
+      group.pair_sums.sum(four, ninth);
+      __syncwarp();
+      if (lane / 4 >= count) return;
+      float* const row = params.pair_grads + int64_t(group.splats[from + lane / 4].row) * kPairGradWidth;
+      float* const place = row + lane / 2 % 2 * 4;
+      if (!list.overflow) {
+        *reinterpret_cast<float4*>(place) = {four[0], four[1], four[2], four[3]};
+        if (lane % 4 == 0) row[8] = ninth;
+      } else if (lane % 2 == 0) {
+#pragma unroll
+        for (int v = 0; v < 4; ++v) atomicAdd(place + v, four[v]);
+        if (lane % 4 == 0) atomicAdd(row + 8, ninth);
+      }
+    }
+  };
   static_assert(kLength % 32 == 0);  // no batch begins before `begin`
   for (int k1 = min(end, tile_last); k1 > begin; k1 = (k1 - 1) / 32 * 32) {
     const int k0 = (k1 - 1) / 32 * 32, k = k0 + lane;
     uint32_t reach = 0;
-    int32_t row_index = 0;
     Mat2<float> mean_map = {0, 0, 0, 0};
     group_sync();
+    Splat<F, float> own;
+    int32_t id = 0, row_index = 0;
     if (k < k1) {
-      const int32_t id = list.splat(k);
+      id = list.splat(k);
       row_index = list.overflow ? id : list.slot(k);
-      const Splat<F, float> splat = splats[id];
-      reach = subtile_reach(support_of(splat), list.x0, list.y0);
+      own = splats[id];
+      reach = subtile_reach(support_of(own), list.x0, list.y0);
 #pragma unroll
-      for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= subtile_last[b]) << b);
-      if (reach && first == 0)
-        group.splats[lane] = {tile_terms(splat, list), channels_of<C>(params.channels, splat, id)};
-      if (kMeans) mean_map = F::mean_map(splat.shape);
-      if (kGroup > 1 && first == 0) group.rows[lane] = row_index;
+      for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= group.subtile_last[b]) << b);
+      if (kMeans) mean_map = F::mean_map(own.shape);
+      if (kGrads && reach == 0 && first == 0 && !list.overflow) clear_row(row_index);
     }
-    uint32_t reaching = 0;  // of lane b the splats that reach subtile b
-#pragma unroll
-    for (int b = 0; b < kSubtiles; ++b) {
-      const uint32_t splats_of_b = __ballot_sync(kAllLanes, reach >> b & 1);
-      if (lane == b) reaching = splats_of_b;
+    const uint32_t reaching = __ballot_sync(kAllLanes, reach != 0);
+    if (reach && first == 0) {
+      group.splats[__popc(reaching >> lane >> 1)] = {tile_terms(own, list), channels_of<C>(params.channels, own, id),
+                                                     reach | uint32_t(lane) << 27, row_index};
     }
+    const int listed = __popc(reaching);
     group_sync();
-    for (int at = k1 - 1; at >= k0; --at) {
-      const int j = at & 31;
-      // The same in all lanes, and by a ballot, so that the compiler knows that they branch alike.
-      const uint32_t reached = __ballot_sync(kAllLanes, reaching >> j & 1);
-      VjpSplat splat = group.splats[j];  // not there if it reaches no subtile, and then not looked at
+    // `to` is where values for its sums go, or its number in the list.
+    const auto walk = [&](const ListedSplat<F, C>& listed_splat, auto&& to) {
+      VjpSplat splat = listed_splat;
+      // By a ballot, so that the compiler knows that all lanes branch alike.
+      const uint32_t reached = __ballot_sync(kAllLanes, splat.reach_and_place & subtile_bit);
+      const int j = int(splat.reach_and_place >> 27), at = k0 + j;
       const Mat2<float> m =
           !kMeans ? mean_map
                   : Mat2<float>{__shfl_sync(kAllLanes, mean_map.xx, j), __shfl_sync(kAllLanes, mean_map.xy, j),
@@ -213,8 +344,8 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
       Values<C> channels = {};
       Vec2<float> mean_sums = {0, 0};
       const auto visit = [&](int b, Vec2<float> p) {
-        const int q = b * 32 + lane;
-        const float4 g = stage.g[q];
+        const int q = place_of(b);
+        const float4 g = pixels.g[q];
         const Values<4> of_pixel_g = {{g.x, g.y, g.z, g.w}};
         float g_color = madd(g.x, splat.channels.v[0], madd(g.y, splat.channels.v[1], g.z * splat.channels.v[2]));
         if (C > 3) g_color = madd(g.w, splat.channels.v[C - 1], g_color);
@@ -224,11 +355,12 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
         for (int s = 0; s < kOwn; ++s) {
           const int node = kGroup == 1 ? s : first + s;
           const float alpha = F::alpha(splat.terms, p, node);
-          const bool mask = alpha >= float(kAlphaMin) && at < stage.last_of(s, q, g);
+          // Both are worked out: to read the second only after the first would be to wait for it.
+          const bool mask = (alpha >= float(kAlphaMin)) & (at < pixels.last_of(s, q, g));
           if (s == 0 && S == 1 && !__any_sync(kAllLanes, mask)) break;
-          auto sample = stage.samples[s][q];
+          auto sample = samples.of[s][sample_place(b)];
           const BlendGrad<float> grad = blend_sample_vjp(mask, alpha, g_color, sample.transmittance, sample.behind);
-          stage.samples[s][q] = sample;
+          samples.of[s][sample_place(b)] = sample;
           if (kGrads) F::add_alpha_vjp(splat.terms, p, node, alpha, grad.dL_dalpha, shape);
           // Again for the pixel alone: to ask for it must not change the other sums by a bit.
           if (kMeans) F::add_alpha_vjp(splat.terms, p, node, alpha, grad.dL_dalpha, of_pixel);
@@ -256,20 +388,25 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
           visit(b, {madd(8.0f, column, p0.x), madd(4.0f, band, p0.y)});
         }
       }
-      const int32_t row = __shfl_sync(kAllLanes, row_index, j);
+      const int32_t row = splat.row;
       if (kGrads) {
-        if (reached) shape = F::collect(splat.terms, shape, weighted);  // else there are no terms
+        shape = F::collect(splat.terms, shape, weighted);
         float values[kSumCount] = {shape.offset.x, shape.offset.y, shape.shape.xx,
                                    shape.shape.xy, shape.shape.yy, weighted};
 #pragma unroll
         for (int c = 0; c < C; ++c) values[6 + c] = channels.v[c];
-        const float sum = sum_values(values);
-        if constexpr (kGroup > 1) {
-          if (has_value_first<kSumCount>(lane)) group.sums[warp][j][value] = sum;
-        } else if (!list.overflow) {
-          sums[int64_t(row) * kPairGradWidth] = sum;  // of all lanes: to find the first ones takes longer
-        } else if (has_value_first<kSumCount>(lane)) {
-          atomicAdd(&sums[int64_t(row) * kPairGradWidth], sum);
+        if constexpr (kHoldsState) {
+          to.put(values);
+        } else if constexpr (kGroup > 1) {
+          const float sum = sum_values(values);
+          if (has_value_first<kSumCount>(lane)) group.sums[warp][to][value] = sum;
+        } else {
+          const float sum = sum_values(values);
+          if (!list.overflow) {
+            sums[int64_t(row) * kPairGradWidth] = sum;  // of all lanes: to find the first ones takes longer
+          } else if (has_value_first<kSumCount>(lane)) {
+            atomicAdd(&sums[int64_t(row) * kPairGradWidth], sum);
+          }
         }
       }
       if (kMeans) {
@@ -277,15 +414,26 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
         if (lane == 1) put(row, kPairMeans, total.x);
         if (lane == 3) put(row, kPairMeans + 1, total.y);
       }
+    };
+    if constexpr (kHoldsState) {
+      for (int n = 0; n < listed; n += PairSums::kPairs) {
+        const int count = min(listed - n, PairSums::kPairs);
+        const auto* splat = group.splats + n;
+        PairSums::Pair* pair = group.pair_sums.pairs;
+        for (int left = count; left > 0; --left) walk(*splat++, *pair++);
+        sum_pairs(n, count);
+      }
+    } else {
+      for (int n = 0; n < listed; ++n) walk(group.splats[n], n);
     }
     if constexpr (kGroup > 1 && kGrads) {
       __syncthreads();
-      for (int t = threadIdx.x; t < kSumCount * (k1 - k0); t += 32 * kGroup) {
-        const int j = t / kSumCount, v = t % kSumCount;
-        float sum = group.sums[0][j][v];
+      for (int t = threadIdx.x; t < kSumCount * listed; t += 32 * kGroup) {
+        const int n = t / kSumCount, v = t % kSumCount;
+        float sum = group.sums[0][n][v];
 #pragma unroll
-        for (int w = 1; w < kGroup; ++w) sum += group.sums[w][j][v];
-        put(group.rows[j], v == 9 ? kPairFourthChannel : v, sum);
+        for (int w = 1; w < kGroup; ++w) sum += group.sums[w][n][v];
+        put(group.splats[n].row, v == 9 ? kPairFourthChannel : v, sum);
       }
     }
   }
@@ -299,7 +447,7 @@ template <class F, int C, Sums kSums>
 __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
     blend_vjp_kernel(const BlendVjpParams params) {
   constexpr int kWarps = kVjpWarps<F, kSums>, kOwn = kVjpSamples<F, kSums>, kGroup = F::kSamples / kOwn;
-  auto* pixels = reinterpret_cast<VjpPixels<kOwn, C>*>(dynamic_shared());
+  auto* pixels = reinterpret_cast<SharedPixels<F, C, kSums>*>(dynamic_shared());
   auto* groups = reinterpret_cast<VjpGroup<F, C, kGroup>*>(pixels + kWarps);
   const int warp = threadIdx.x / 32, first = warp % kGroup * kOwn;
   const int32_t* firsts = params.plan->counts.chunks.first + sample_class(F::kSamples);
@@ -325,7 +473,7 @@ inline constexpr unsigned kTakingBlocks = 256 * 8;
 
 template <class F, int C, Sums kSums> void launch_blend_vjp(const BlendVjpParams& p, cudaStream_t stream) {
   constexpr int kOwn = kVjpSamples<F, kSums>, kWarps = kVjpWarps<F, kSums>, kGroup = F::kSamples / kOwn;
-  const size_t bytes = kWarps * sizeof(VjpPixels<kOwn, C>) + kWarps / kGroup * sizeof(VjpGroup<F, C, kGroup>);
+  const size_t bytes = kWarps * sizeof(SharedPixels<F, C, kSums>) + kWarps / kGroup * sizeof(VjpGroup<F, C, kGroup>);
   unsigned blocks = blocks_of(p.max_chunks, kWarps / kGroup);
   if (kTakesChunks<F, kSums>) blocks = std::min(blocks, kTakingBlocks);
   launch(blend_vjp_kernel<F, C, kSums>, {blocks, 32 * kWarps, bytes}, stream, p);

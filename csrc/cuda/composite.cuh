@@ -138,22 +138,12 @@ template <class F, int C, int kBatch> struct Stage {
     return min(end - k, kBatch);
   }
 
-  /// Of the splats [k, k + 32), those that reach a subtile. All lanes must call it.
+  /// Of the splats [k, k + 32), those that reach a subtile, in the order of take_first. All lanes must call it.
   __device__ uint32_t reached(int k, int subtile) const {
-    return __ballot_sync(kAllLanes, reach[k + lane_id()] >> subtile & 1);
+    return __ballot_sync(kAllLanes, reach[k + 31 - lane_id()] >> subtile & 1);
   }
   /// The same for this warp's subtile.
   __device__ uint32_t reached(int k) const { return reached(k, threadIdx.x / 32); }
-  /// Calls visit(j) for those splats j of them, in order. All lanes must call it.
-  template <class Visit> __device__ void for_each_reached(int k, Visit&& visit) const {
-    // The first splat is the highest bit: to find that takes one slow instruction, to find the lowest two.
-    uint32_t left = __ballot_sync(kAllLanes, reach[k + 31 - lane_id()] >> (threadIdx.x / 32) & 1);
-    while (left != 0) {
-      const int bit = 31 - __clz(int(left));
-      left ^= 1u << bit;
-      visit(k + 31 - bit);
-    }
-  }
 };
 
 /// A sample at the end of a chunk, kept for a backward pass.

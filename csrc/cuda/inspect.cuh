@@ -7,16 +7,15 @@
 
 namespace ar::cuda {
 
-/// Warps of a block: of smaller tiles only the subtiles in the first column of the upper half are there.
-template <class F> inline constexpr int kInspectWarps = F::kMoves ? 2 : kSubtiles;
-
-/// A block per tile, a warp per subtile.
-template <class F> __global__ void __launch_bounds__(32 * kInspectWarps<F>) inspect_kernel(const InspectParams params) {
-  constexpr int kThreads = 32 * kInspectWarps<F>;
+/// A block per tile of 2^kBits pixels a side, a warp per subtile. Of the subtiles of a large tile a small one has those
+/// in the first column of the upper half.
+template <class F, int kBits>
+__global__ void __launch_bounds__(1 << 2 * kBits) inspect_kernel(const InspectParams params) {
+  constexpr int kThreads = 1 << 2 * kBits;
   __shared__ Stage<F, 0, kThreads> stage;
   __shared__ int32_t ids[kThreads];
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
-  const int tile = int(blockIdx.x), subtile = int(threadIdx.x) / 32 * (F::kMoves ? 2 : 1);
+  const int tile = int(blockIdx.x), subtile = int(threadIdx.x) / 32 * (kBits < kTileBits ? 2 : 1);
   const int lane = lane_id();
   if (!has_samples<F::kSamples>(params.lists, tile)) return;
   const TileList list = list_of(params.lists, params.grid, tile);
@@ -30,8 +29,8 @@ template <class F> __global__ void __launch_bounds__(32 * kInspectWarps<F>) insp
     if (int(threadIdx.x) < count) ids[threadIdx.x] = list.splat(k + threadIdx.x);
     __syncthreads();
     for (int first = 0; first < count; first += 32) {
-      for (uint32_t mask = stage.reached(first, subtile); mask != 0; mask &= mask - 1) {
-        const int j = first + __ffs(mask) - 1, id = ids[j];
+      for (uint32_t left = stage.reached(first, subtile); left != 0;) {
+        const int j = first + take_first(left), id = ids[j];
         const Shown<float> shown = pixel.add(stage.splats[j].terms, p, id);
         const int touched = __popc(__ballot_sync(kAllLanes, shown.weight > 0));
         if (touched == 0) continue;
@@ -55,7 +54,13 @@ template <class F> __global__ void __launch_bounds__(32 * kInspectWarps<F>) insp
 }
 
 template <class F> void launch_inspect(const InspectParams& p, cudaStream_t stream) {
-  launch(inspect_kernel<F>, {unsigned(p.grid.tiles()), 32 * kInspectWarps<F>}, stream, p);
+  const LaunchShape shape = {unsigned(p.grid.tiles()), unsigned(p.grid.side() * p.grid.side())};
+  if (F::kMoves && p.grid.tile_bits == kMovingTileBits) {
+    launch(inspect_kernel < F, F::kMoves ? kMovingTileBits : kTileBits >, shape, stream, p);
+  } else {
+    constexpr bool kLarge = moving_tile_bits(F::kSamples, false) == kTileBits;
+    launch(inspect_kernel < F, !F::kMoves || kLarge ? kTileBits : kMovingTileBits >, shape, stream, p);
+  }
 }
 
 }  // namespace ar::cuda

@@ -2,7 +2,7 @@
 #pragma once
 
 #include "cuda/sh_rows.cuh"
-#include "cuda/stages.h"
+#include "cuda/splat_tiles.cuh"
 
 namespace ar::cuda {
 
@@ -12,19 +12,21 @@ __device__ inline uint32_t depth_key(float depth) {
   return __float_as_uint(depth + 0.0f) + kDepthKeyOffset;  // of -0 too
 }
 
-/// Tiles that a splat touches.
-__device__ inline int count_tiles(const SplatRow<float>& splat, int footprint, TileGrid grid) {
-  int count = 0;
-  for_each_tile_row(support_of(splat, footprint), grid,
-                    [&](int, Range columns) { count += columns.last - columns.first + 1; });
-  return count;
+/// What bin needs of splat i, and zeros for what it counts.
+template <class Params>
+__device__ void write_tiles(const Params& params, int64_t i, const SplatTiles& tiles, float depth) {
+  const bool any = tiles.range.count > 0;
+  params.keys[i] = any ? depth_key(depth) : kCulledKey;
+  params.ranges[i] = tiles.range;
+  if (any) params.masks[i] = tiles.mask;
+  if (i == 0) *params.counts = {0, 0};
 }
 
 /// Of the lanes in `lanes`, those whose row has a number that is not finite or too large. A warp reads a row together.
 __device__ inline uint32_t rows_not_finite(const Channels<float>& channels, int64_t first, uint32_t lanes) {
   uint32_t found = 0;
-  for (; lanes != 0; lanes &= lanes - 1) {
-    const int lane = __ffs(lanes) - 1;
+  for (uint32_t left = __brev(lanes); left != 0;) {
+    const int lane = take_first(left);
     const float* row = channels.row(int32_t(first + lane));
     bool bad = false;
     for (int c = lane_id(); c < channels.count; c += 32) bad |= !within(row[c], kMaxColor);
@@ -49,7 +51,8 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
   uint32_t not_finite = 0;
   if (params.given.data) not_finite = rows_not_finite(params.given, i - lane_id(), lit);
   // While the harmonics are on their way.
-  int count = splat.level > 0 ? count_tiles(splat, params.footprint.index, params.grid) : 0;
+  SplatTiles tiles = {};
+  if (splat.level > 0) tiles = find_tiles(support_of(splat, params.footprint.index), params.grid);
   wait_for_copies();
   if (splat.level > 0) {
     if (splat_color(camera, g, i, rows.row(), splat.color) && !(not_finite >> lane_id() & 1)) {
@@ -58,13 +61,12 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
     } else {
       radius = 0;
       splat.level = 0;
-      count = 0;
+      tiles = {};
     }
   }
   if (i >= g.n) return;
   if (radius > 0) reinterpret_cast<SplatRow<float>*>(params.splats)[i] = splat;
-  params.keys[i] = count > 0 ? depth_key(depth) : kCulledKey;
-  params.ranges[i] = {0, count};
+  write_tiles(params, i, tiles, depth);
   params.radii[i] = radius;
 }
 
@@ -128,10 +130,10 @@ __global__ void __launch_bounds__(kProjectThreads) shape_rows_kernel(const Shape
   if (valid && shape_splat(projected, params.footprint, params.grid, splat) == 0) splat.level = 0;
   const Vec3<float>& color = splat.color;
   if (!(within(color.x, kMaxColor) && within(color.y, kMaxColor) && within(color.z, kMaxColor))) splat.level = 0;
-  const int count = splat.level > 0 ? count_tiles(splat, params.footprint.index, params.grid) : 0;
+  SplatTiles tiles = {};
+  if (splat.level > 0) tiles = find_tiles(support_of(splat, params.footprint.index), params.grid);
   reinterpret_cast<SplatRow<float>*>(params.splats)[i] = splat;
-  params.keys[i] = count > 0 ? depth_key(projected.depth) : kCulledKey;
-  params.ranges[i] = {0, count};
+  write_tiles(params, i, tiles, projected.depth);
 }
 
 }  // namespace ar::cuda

@@ -51,8 +51,8 @@ __device__ inline SplatSums sum_pairs(const PairSumsView& pairs, int64_t i, Pair
   if (range.count <= kManyPairs) {
     for (int q = 0; q < range.count; q += kRowsAtOnce) sums.add<kRowsAtOnce>(row(range.first + q), range.count - q);
   }
-  for (uint32_t many = __ballot_sync(kAllLanes, range.count > kManyPairs); many != 0; many &= many - 1) {
-    const int source = __ffs(many) - 1;
+  for (uint32_t many = __brev(__ballot_sync(kAllLanes, range.count > kManyPairs)); many != 0;) {
+    const int source = take_first(many);
     const int first = __shfl_sync(kAllLanes, range.first, source), count = __shfl_sync(kAllLanes, range.count, source);
     SplatSums part = {};
     for (int q = lane_id(); q < count; q += 32) part.add<1>(row(first + q), 1);

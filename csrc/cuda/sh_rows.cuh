@@ -15,6 +15,7 @@ template <int kDegree> struct ShRows {
   /// Begins to load `count` coefficients of the rows of the lanes in `lanes`; base is lane 0's row. They are here after
   /// wait_for_copies().
   __device__ void begin_load(const Vec3<float>* base, int stride, int count, uint32_t lanes) {
+    if (stride == kPacked && count == kPacked) return begin_load_packed(&base->x, lanes);
     const float* from = &base->x + lane_id();
     float* to = value[0] + lane_id();
     const int here = 3 * count - lane_id();
@@ -54,6 +55,26 @@ template <int kDegree> struct ShRows {
     }
   }
   __device__ Vec3<float>* row() { return reinterpret_cast<Vec3<float>*>(value[lane_id()]); }
+
+ private:
+  /// Coefficients of degree 3 without gaps, as most scenes have them: all lanes copy, two rows with three copies, at
+  /// offsets that are known when this is compiled.
+  static constexpr int kPacked = sh_count(3);
+  __device__ void begin_load_packed(const float* base, uint32_t lanes) {
+    constexpr int kWidth = 3 * kPacked;
+    static_assert(kWidth == 48);
+    const float* from = base + lane_id();
+    const bool second = lane_id() >= 16;  // of the two rows, in the second copy
+    const CopyTarget to(value[0] + lane_id()), middle(value[0] + lane_id() + 32 + (second ? kStride - kWidth : 0));
+    const uint32_t middle_lanes = lanes >> second;
+#pragma unroll
+    for (int row = 0; row < 32; row += 2) {
+      const float* rows = from + row * kWidth;
+      if (lanes & 1u << row) to.copy(row * kStride, rows);
+      if (middle_lanes & 1u << row) middle.copy(row * kStride, rows + 32);
+      if (lanes & 2u << row) to.copy((row + 1) * kStride + 16, rows + 64);
+    }
+  }
 };
 
 }  // namespace ar::cuda

@@ -16,6 +16,9 @@ inline constexpr int kSortTile = 3072;  // items of a block
 template <int kBits> struct Digits {
   static constexpr int kBins = 1 << kBits, kThreads = kBins, kWarps = kThreads / 32;
   static constexpr int kItems = kSortTile / kThreads;  ///< of a thread
+  /// Blocks that a streaming multiprocessor should hold at once. It limits the registers of a thread, which for more
+  /// blocks at once may spill a few.
+  static constexpr int kBlocks = kBits > 8 ? 3 : 4;
 
   __device__ static uint32_t of(uint32_t key, int pass) { return key >> (pass * kBits) & (kBins - 1); }
 };
@@ -75,7 +78,7 @@ template <int kBits, int kPasses> __device__ void count_digits(uint32_t key, boo
 /// arrays of values in turn the other way round, so that the result is where the last pass would leave it. Keys, which
 /// nobody reads afterwards, are where they would be.
 template <int kBits, class Value, bool kFirst>
-__global__ void __launch_bounds__(Digits<kBits>::kThreads)
+__global__ void __launch_bounds__(Digits<kBits>::kThreads, Digits<kBits>::kBlocks)
     sort_pass_kernel(const SortScratch<kBits> scratch, int pass, bool may_skip, int64_t first_count, uint32_t skip,
                      const uint32_t* keys_in, uint32_t* keys_out, Value* values_in, Value* values_out) {
   using D = Digits<kBits>;
@@ -118,6 +121,7 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads)
   for (int i = 0; i < kSortItems; ++i) {
     const uint32_t digit = D::of(keys[i], pass);
     uint32_t peers = __ballot_sync(kAllLanes, valid[i]);
+    if (kFirst && peers == 0) continue;  // culled splats are often neighbours
 #pragma unroll
     for (int b = 0; b < kBits; ++b) {
       const bool bit = digit >> b & 1;

@@ -48,13 +48,19 @@ struct PairRange {
   int32_t first, count;
 };
 
+/// Which tiles a splat touches: bit 8 r + c is the tile r rows below and c columns to the right of tile `first` of its
+/// PairRange, until emit_pairs writes the first pair there. 0 for a splat of more than kManyTiles tiles, or of tiles
+/// that are not among 8x8.
+using TileMask = uint64_t;
+inline constexpr int kManyTiles = 16;
+
 /// A pair, and its place in that order: where blend_vjp leaves its gradient.
 struct alignas(8) SlotPair {
   int32_t splat, slot;
 };
 
-/// Pairs between the checkpoints of a footprint whose samples move, and the planes of kMovingTile^2 floats of one of
-/// them: transmittance and displacement of each sample.
+/// Pairs between the checkpoints of a footprint whose samples move, and the planes of one of them, a float per pixel of
+/// a tile: transmittance and place of each sample.
 inline constexpr int kStateChunk = 32;
 AR_HD constexpr int state_planes(int samples) { return 3 * samples; }
 
@@ -89,23 +95,24 @@ struct PlanCounts {
   int32_t open_tiles[kSampleClasses];
 };
 
-/// Scratch of plan_chunks.
+/// Scratch of plan_chunks: where in its orders the next tile and the next chunk of each class of work go.
 inline constexpr int kLengthClasses = 33, kWorkClasses = kSampleClasses * kLengthClasses;
-struct PlanCounters {
-  int32_t tile_sizes[kWorkClasses], chunk_sizes[kWorkClasses];  ///< pieces of work per class
-  int32_t tile_places[kWorkClasses], chunk_places[kWorkClasses];
+struct PlanNext {
+  int32_t tiles[kWorkClasses], chunks[kWorkClasses];
 };
-/// Zero before use. The counts stay for blend_vjp.
+/// The counts stay for blend_vjp.
 struct PlanState {
   PlanCounts counts;
-  PlanCounters counters;
+  PlanNext next;
 };
 
 struct ProjectParams : ar::ProjectParams<float> {
   CullBounds<float> bounds;
   TileGrid grid;
   uint32_t* keys;     ///< [n] in the order of depth
-  PairRange* ranges;  ///< [n] count
+  PairRange* ranges;  ///< [n] count, and tile of the mask
+  TileMask* masks;    ///< [n] of splats with pairs
+  Counts* counts;     ///< set to zero, for count_depths
 };
 
 struct ProjectRowsParams {
@@ -120,7 +127,9 @@ struct ProjectRowsParams {
 
 struct ShapeRowsParams : ar::ShapeRowsParams<float> {
   uint32_t* keys;     ///< [n]
-  PairRange* ranges;  ///< [n] count
+  PairRange* ranges;  ///< [n] count, and tile of the mask
+  TileMask* masks;    ///< [n] of splats with pairs
+  Counts* counts;     ///< set to zero, for count_depths
 };
 
 struct EmitParams {
@@ -131,7 +140,8 @@ struct EmitParams {
   int64_t capacity;
   const Counts* counts;
   const int32_t* order;   ///< [counts->splats] splats by depth
-  PairRange* ranges;      ///< [n] first
+  PairRange* ranges;      ///< [n] read; with slot_pairs `first` is written
+  const TileMask* masks;  ///< [n]
   uint32_t* status;       ///< emit_scratch(n) bytes, zero
   uint32_t* tile_counts;  ///< tile_sort_scratch(capacity, grid) bytes, zero; sort_by_tile finds its counts there
   uint32_t* tiles;        ///< [capacity] tile of each pair
@@ -232,7 +242,7 @@ struct BlendParams : ar::BlendParams<float> {
   int32_t* tile_open;   ///< [tiles] whether the tile is one of the open ones
   int32_t* open_tiles;  ///< [kSampleClasses, tiles]
   CheckpointLayout layout;
-  float* checkpoints;     ///< [planes, kTile^2]
+  float* checkpoints;     ///< [planes, pixels of a tile]
   uint32_t* reach_words;  ///< [max_reach_words]
   Segments segments;      ///< for more than kFewChannels channels
 };
@@ -314,8 +324,8 @@ void sum_channels(const SumChannelsParams& p, cudaStream_t stream);
 /// Whether kernels blend so many channels that walk the whole list of a tile and need no checkpoints of channels: of
 /// the yardsticks and of footprints whose samples move all do, of others those for more than kFewChannels.
 bool blends_whole_lists(int footprint, int64_t channels);
-/// Planes of kMovingTile^2 floats in BlendParams::checkpoints of a footprint whose samples move, for a backward pass.
-/// None for the others.
+/// Planes of a float per pixel of a tile in BlendParams::checkpoints of a footprint whose samples move, for a backward
+/// pass. None for the others.
 int64_t max_state_planes(int footprint, int64_t capacity);
 /// Numbers in BlendParams::reach_words and BlendVjpParams::adjoint_maps, which only footprints whose samples move need,
 /// and only in small images.

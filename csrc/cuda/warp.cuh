@@ -99,6 +99,14 @@ __device__ inline float4* dynamic_shared() {
 float4* dynamic_shared();  // of a test that runs kernels on the host
 #endif
 
+/// Takes the first out of a set of numbers below 32, of which j is bit 31 - j, and returns it: the highest bit is found
+/// with one slow instruction, the lowest with two.
+__device__ inline int take_first(uint32_t& set) {
+  const int first = __clz(int(set));
+  set ^= 1u << (31 - first);
+  return first;
+}
+
 /// Asks for the line of memory that holds `*address`.
 __device__ inline void prefetch([[maybe_unused]] const void* address) {
 #if defined(__CUDA_ARCH__)
@@ -124,6 +132,34 @@ template <int kWidth> __device__ void copy_rows_async(float* to, const float* fr
     if (lanes >> e / kWidth & 1) copy_async(to + e, from + e);
   }
 }
+/// A place in shared memory to which numbers are copied. The address is worked out once; the empty statement keeps the
+/// compiler from doing so again for every copy.
+class CopyTarget {
+ public:
+  __device__ explicit CopyTarget(float* to) {
+#if __CUDA_ARCH__ >= 800
+    address_ = uint32_t(__cvta_generic_to_shared(to));
+    asm volatile("" : "+r"(address_));
+#else
+    to_ = to;
+#endif
+  }
+  /// As copy_async(to + offset, from).
+  __device__ void copy(int offset, const float* from) const {
+#if __CUDA_ARCH__ >= 800
+    asm volatile("cp.async.ca.shared.global [%0], [%1], 4;" ::"r"(address_ + 4 * offset), "l"(from) : "memory");
+#else
+    copy_async(to_ + offset, from);
+#endif
+  }
+
+ private:
+#if __CUDA_ARCH__ >= 800
+  uint32_t address_;
+#else
+  float* to_;
+#endif
+};
 /// Waits for all copies that the lanes of this warp have begun.
 __device__ inline void wait_for_copies() {
 #if __CUDA_ARCH__ >= 800

@@ -24,6 +24,8 @@ struct SplatTensors {
   Tensor ids;     ///< (n,) int32, CPU: the Gaussian of each, ascending
   Tensor depths;  ///< (n,) CPU
   Tensor keys;    ///< (2, n) int32, CUDA: keys in the order of depth, and room for them
+  Tensor masks;   ///< (n,) int64, CUDA: the tiles of a splat that has few
+  Tensor counts;  ///< (2,) int64, CUDA: zeros, for the numbers of pairs and splats
   Tensor ranges;  ///< (n, 2) int32, CUDA: first pair and number of pairs of each
 };
 
@@ -131,7 +133,7 @@ struct FootprintSpec {
 /// The footprint of this key and number. Raises ValueError if there is none.
 FootprintSpec find_footprint(const std::string& key, double option);
 
-/// The tiles of an image: on CUDA those of samples that move are smaller.
+/// The tiles of an image: on CUDA those of samples that move may be smaller.
 TileGrid grid_of(const FootprintSpec& footprint, int64_t width, int64_t height, bool cuda);
 
 /// What all stages of a pass share.

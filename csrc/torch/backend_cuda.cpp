@@ -9,123 +9,13 @@
 #include <c10/cuda/CUDAStream.h>
 
 #include <algorithm>
-#include <mutex>
-#include <tuple>
-#include <utility>
 
-#include "cuda/pair_guess.h"
-#include "cuda/stages.h"
+#include "torch/cuda_frames.h"
+#include "torch/cuda_views.h"
 #include "torch/views.h"
 
 namespace ar::ops {
 namespace {
-
-/// The guesses of all image sizes, for all threads.
-class SharedGuesses {
- public:
-  static SharedGuesses& instance() {
-    static auto* guesses = new SharedGuesses;  // outlives the CUDA context
-    return *guesses;
-  }
-  template <class Use> auto use(Use&& use) {
-    const std::lock_guard lock(mutex_);
-    return use(guesses_);
-  }
-
- private:
-  SharedGuesses()
-      : words_(at::empty({cuda::PairGuesses::kSlots}, at::TensorOptions().dtype(at::kLong).pinned_memory(true))),
-        guesses_(reinterpret_cast<uint64_t*>(words_.data_ptr<int64_t>())) {}
-
-  std::mutex mutex_;
-  Tensor words_;
-  cuda::PairGuesses guesses_;
-};
-
-bool is_capturing(cudaStream_t stream) {
-  cudaStreamCaptureStatus status = cudaStreamCaptureStatusNone;
-  C10_CUDA_CHECK(cudaStreamIsCapturing(stream, &status));
-  return status != cudaStreamCaptureStatusNone;
-}
-
-/// A pair of events, made when the first time is asked for.
-class Laps {
- public:
-  Laps() = default;
-  Laps(const Laps&) = delete;
-  ~Laps() {
-    for (cudaEvent_t event : events_) {
-      if (event) cudaEventDestroy(event);
-    }
-  }
-  double next(cudaStream_t stream) {
-    cudaEvent_t& now = events_[turn_];
-    const cudaEvent_t before = events_[1 - turn_];
-    turn_ = 1 - turn_;
-    if (!now) C10_CUDA_CHECK(cudaEventCreate(&now));
-    C10_CUDA_CHECK(cudaEventRecord(now, stream));
-    C10_CUDA_CHECK(cudaEventSynchronize(now));
-    float milliseconds = 0;
-    if (before) C10_CUDA_CHECK(cudaEventElapsedTime(&milliseconds, before, now));
-    return milliseconds * 1e-3;
-  }
-
- private:
-  cudaEvent_t events_[2] = {};
-  int turn_ = 0;
-};
-
-/// What the kernels keep in a tensor of int32.
-template <class Element> Element* structs_of(const Tensor& t) {
-  return reinterpret_cast<Element*>(pointer<int32_t>(t));
-}
-template <class Element> const Element* const_structs_of(const Tensor& t) {
-  return reinterpret_cast<const Element*>(const_pointer<int32_t>(t));
-}
-const cuda::Counts* counts_of(const ListTensors& lists) {
-  return reinterpret_cast<const cuda::Counts*>(const_pointer<int64_t>(lists.counts));
-}
-
-constexpr int64_t kCountsWidth = sizeof(cuda::Counts) / sizeof(int64_t);
-
-/// BlendState::chunks begins with the PlanState, in whole rows; TileChunks follow.
-constexpr int64_t kChunkWidth = sizeof(cuda::TileChunk) / sizeof(int32_t);
-constexpr int64_t kPlanRows = (sizeof(cuda::PlanState) / sizeof(int32_t) + kChunkWidth - 1) / kChunkWidth;
-
-cuda::TileLists tile_lists_of(const ListTensors& lists) {
-  cuda::TileLists out = {};
-  out.pairs = const_pointer<int32_t>(lists.pairs);
-  out.stride = int(lists.pairs.size(1));
-  out.tile_offsets = const_pointer<int64_t>(lists.tile_offsets);
-  out.order = const_pointer<int32_t>(lists.ids);
-  out.counts = counts_of(lists);
-  out.n = lists.ids.numel();
-  out.capacity = lists.pairs.size(0);
-  out.tile_samples = const_pointer<int32_t>(lists.tile_samples);
-  return out;
-}
-
-cuda::PairSumsView pair_sums_of(const ListTensors& lists, const Tensor& pair_grads) {
-  cuda::PairSumsView out = {};
-  out.n = lists.ids.numel();
-  out.ranges = const_structs_of<cuda::PairRange>(lists.splat_offsets);
-  out.counts = counts_of(lists);
-  out.capacity = lists.pairs.size(0);
-  out.pair_grads = const_pointer<float>(pair_grads);
-  return out;
-}
-
-/// Without `data` the three colours in the splats.
-Channels<float> channels_of(const ChannelTensors& channels) {
-  Channels<float> out = {};
-  out.count = int(channels.count);
-  if (!channels.rows.defined()) return out;
-  // A row per Gaussian is one per splat here. Without rows there are no pairs that could read one.
-  static const float kNoRow = 0;
-  out.data = channels.rows.numel() ? const_pointer<float>(channels.rows) : &kNoRow;
-  out.stride = channels.count;
-  return out;
-}
 
 class CudaBackend final : public Backend {
  public:
@@ -147,6 +37,8 @@ class CudaBackend final : public Backend {
     p.splats = pointer<float>(out.splats);
     p.keys = structs_of<uint32_t>(out.keys);
     p.ranges = structs_of<cuda::PairRange>(out.ranges);
+    p.masks = masks_of(out);
+    p.counts = reinterpret_cast<cuda::Counts*>(pointer<int64_t>(out.counts));
     cuda::project(p, stream_);
     check_stage("project", false);
     return out;
@@ -175,6 +67,8 @@ class CudaBackend final : public Backend {
     set_shape_rows<float>(p, rows, pass, out.splats);
     p.keys = structs_of<uint32_t>(out.keys);
     p.ranges = structs_of<cuda::PairRange>(out.ranges);
+    p.masks = masks_of(out);
+    p.counts = reinterpret_cast<cuda::Counts*>(pointer<int64_t>(out.counts));
     cuda::shape_rows(p, stream_);
     check_stage("shape_rows", false);
     return out;
@@ -209,9 +103,8 @@ class CudaBackend final : public Backend {
     out.splat_offsets = splats.ranges;
     out.ids = at::empty({n}, ints_);
     out.positions = at::empty({0}, longs_);
-    out.counts = at::empty({kCountsWidth}, longs_);
-    auto* counts = reinterpret_cast<cuda::Counts*>(out.counts.data_ptr<int64_t>());
-    C10_CUDA_CHECK(cudaMemsetAsync(counts, 0, sizeof(cuda::Counts), stream_));
+    out.counts = splats.counts;
+    auto* counts = reinterpret_cast<cuda::Counts*>(pointer<int64_t>(out.counts));
     const Tensor other_order = at::empty({n}, ints_);
     cuda::DepthSort by_depth = {};
     by_depth.n = n;
@@ -244,6 +137,7 @@ class CudaBackend final : public Backend {
     emit.counts = counts;
     emit.order = by_depth.order[0];
     emit.ranges = structs_of<cuda::PairRange>(splats.ranges);
+    emit.masks = masks_of(splats);
     emit.status = reinterpret_cast<uint32_t*>(depth_scratch + depth_bytes);
     out.tile_offsets = at::empty({grid.tiles() + 1}, longs_);
     if (pass.keep) {
@@ -443,23 +337,6 @@ class CudaBackend final : public Backend {
     TORCH_CHECK(error == cudaSuccess, "CUDA error in ", stage, ": ", cudaGetErrorString(error));
   }
 
-  /// What the kernels read without looking: checks.h does not know their sizes.
-  static void check_counts(const ListTensors& lists) {
-    TORCH_CHECK_VALUE(lists.counts.numel() == kCountsWidth, "counts must be what bin returned, got shape ",
-                      lists.counts.sizes());
-  }
-  static void check_plan(const BlendState& state) {
-    const Tensor& chunks = state.chunks;
-    TORCH_CHECK_VALUE(chunks.dim() == 2 && chunks.size(0) >= kPlanRows && chunks.size(1) == kChunkWidth &&
-                          chunks.scalar_type() == at::kInt && state.checkpoints.scalar_type() == at::kFloat,
-                      "chunks and checkpoints must be what blend saved, got shape ", chunks.sizes());
-  }
-
-  static void check_segments(const cuda::Segments& segments, TileGrid grid, const BlendState& state) {
-    const int64_t numbers = grid.tiles() * segments.count * segments.samples * kTile * kTile;
-    TORCH_CHECK_VALUE(state.checkpoints.numel() == numbers, "checkpoints must be what blend saved, got shape ",
-                      state.checkpoints.sizes());
-  }
   /// Planes of every segment of every tile.
   Tensor segment_planes(const cuda::Segments& segments, TileGrid grid, int64_t planes) const {
     return at::empty({grid.tiles() * segments.count * planes * kTile * kTile}, floats_);
@@ -481,7 +358,6 @@ class CudaBackend final : public Backend {
                                            : 0;
     state.checkpoints = at::empty({max_planes * pass.grid.side() * pass.grid.side()}, floats_);
     state.chunks = at::empty({kPlanRows + chunks + tiles, kChunkWidth}, ints_);
-    C10_CUDA_CHECK(cudaMemsetAsync(state.chunks.data_ptr(), 0, sizeof(cuda::PlanState), stream_));
     const Plan plan = {at::empty({chunks + 1, kChunkWidth}, ints_),
                        at::empty({3 + cuda::kSampleClasses, tiles}, ints_)};
     auto* of_tile = pointer<int32_t>(plan.of_tiles);
@@ -505,6 +381,9 @@ class CudaBackend final : public Backend {
     out.splats = at::empty({n, kSplatWidth}, floats_);
     out.keys = at::empty({2, n}, ints_);
     out.ranges = at::empty({n, 2}, ints_);
+    out.masks = at::empty({n}, longs_);
+    // Set to zero by the kernel that makes the first splat.
+    out.counts = n > 0 ? at::empty({kCountsWidth}, longs_) : at::zeros({kCountsWidth}, longs_);
     return out;
   }
   Tensor make_zeros(int64_t bytes) const {

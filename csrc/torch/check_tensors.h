@@ -59,6 +59,14 @@ struct Like {
                      const char* expected) const {
     if (t) check_rows_of(*t, t_name, rest, expected);
   }
+  /// Type, a row for each of this tensor, and 1 to `most` columns; `rows` and `columns`: their letters in the message.
+  void check_channels(Tensor& t, const char* t_name, char rows, char columns, int64_t most) const {
+    check_type(t, t_name);
+    const bool ok = t.dim() == 2 && t.size(0) == tensor.size(0) && t.size(1) >= 1 && t.size(1) <= most;
+    check_shape(ok, t, t_name, "(", rows, ", ", columns, ") with ", rows, " = ", tensor.size(0), " and ", columns,
+                " from 1 to ", most);
+    t = t.contiguous();
+  }
   /// Type, and the shape (4, 4).
   void check_matrix(Tensor& t, const char* t_name) const {
     check_type(t, t_name);

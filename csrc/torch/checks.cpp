@@ -96,7 +96,8 @@ FootprintSpec find_footprint(const std::string& key, double option) {
 }
 
 TileGrid grid_of(const FootprintSpec& footprint, int64_t width, int64_t height, bool cuda) {
-  return {int(width), int(height), cuda && footprint.moves ? kMovingTileBits : kTileBits};
+  if (cuda && footprint.moves) return moving_grid(footprint.samples, int(width), int(height));
+  return {int(width), int(height)};
 }
 
 void check_row_count(int64_t rows, const char* name) {
@@ -141,12 +142,7 @@ void check(Inputs& in) {
     like.check_type(*in.shs, "shs");
     in.shs = in.shs->contiguous();
   }
-  if (in.colors_precomp) {
-    const Tensor& c = *in.colors_precomp;
-    const bool ok = c.dim() == 2 && c.size(0) == p && c.size(1) >= 1 && c.size(1) <= kMaxChannels;
-    check_shape(ok, c, "colors_precomp", "(P, C) with P = ", p, " and C from 1 to ", kMaxChannels);
-    like.check_rows_of(in.colors_precomp, "colors_precomp", {c.size(1)}, "(P, C)");
-  }
+  if (in.colors_precomp) like.check_channels(*in.colors_precomp, "colors_precomp", 'P', 'C', kMaxChannels);
   TORCH_CHECK_VALUE(in.scales.has_value() == in.rotations.has_value(),
                     "scales and rotations must be given together, got only ", in.scales ? "scales" : "rotations");
   TORCH_CHECK_VALUE(in.scales.has_value() != in.cov3D_precomp.has_value(),
@@ -187,10 +183,7 @@ void check(RasterizeArguments& a) {
   if (a.features) {
     const int64_t colors = a.bg.size(0), most = kMaxChannels - 3;
     TORCH_CHECK_VALUE(colors == 3, "features must come with shs or colors_precomp (P, 3), got (P, ", colors, ")");
-    const Tensor& f = *a.features;
-    const bool ok = f.dim() == 2 && f.size(0) == a.count() && f.size(1) >= 1 && f.size(1) <= most;
-    check_shape(ok, f, "features", "(P, K) with P = ", a.count(), " and K from 1 to ", most);
-    like.check_rows_of(a.features, "features", {f.size(1)}, "(P, K)");
+    like.check_channels(*a.features, "features", 'P', 'K', most);
   }
   TORCH_CHECK_VALUE(a.means2d_z == "zero" || a.means2d_z == "sum_abs" || a.means2d_z == "sum_norm",
                     "means2d_z must be zero, sum_abs or sum_norm, got ", a.means2d_z);
@@ -248,12 +241,8 @@ void check(BinArguments& a) {
 void check(BlendArguments& a, const Pass& pass) {
   check_projected(a.means2d, a.cov2d, a.opacities, a.dets, a.row_splits);
   const Like like{a.means2d, "means2d"};
-  const int64_t n = a.means2d.size(0), cameras = a.row_splits.size(0) - 1;
-  like.check_type(a.features, "features");
-  const bool ok =
-      a.features.dim() == 2 && a.features.size(0) == n && a.features.size(1) >= 1 && a.features.size(1) <= kMaxChannels;
-  check_shape(ok, a.features, "features", "(N, K) with N = ", n, " and K from 1 to ", kMaxChannels);
-  a.features = a.features.contiguous();
+  const int64_t cameras = a.row_splits.size(0) - 1;
+  like.check_channels(a.features, "features", 'N', 'K', kMaxChannels);
   const int64_t channels = a.features.size(1);
   like.check_type(a.background, "background");
   check_shape(a.background.sizes() == at::IntArrayRef({cameras, channels}), a.background, "background", "(", cameras,
@@ -309,6 +298,14 @@ Tensor gradient_of(const std::vector<OptionalTensor>& dL_doutputs, size_t place,
   Like{like, "the arguments"}.check_type(gradient, name);
   TORCH_CHECK_VALUE(gradient.sizes() == sizes, name, " must have shape ", text_of(sizes), ", got ", shape_of(gradient));
   return gradient.contiguous();
+}
+
+Tensor only_gradient_of(const std::vector<OptionalTensor>& dL_doutputs, const std::string& output, const Tensor& like,
+                        at::IntArrayRef sizes) {
+  const Tensor gradient = gradient_of(dL_doutputs, 0, ("dL_d" + output).c_str(), like, sizes);
+  TORCH_CHECK_VALUE(gradient.defined(), "dL_doutputs must hold the gradient with respect to the ", output,
+                    ", got none");
+  return gradient;
 }
 
 void check_needs(const std::vector<bool>& needs, size_t count) {

@@ -35,6 +35,9 @@ int64_t check_cameras(const ProjectArguments& a);
 /// have the dtype and device of `like` and these sizes.
 Tensor gradient_of(const std::vector<OptionalTensor>& dL_doutputs, size_t place, const char* name, const Tensor& like,
                    at::IntArrayRef sizes);
+/// The same of an op whose only differentiable output is `output`: without its gradient nobody asks for the adjoint.
+Tensor only_gradient_of(const std::vector<OptionalTensor>& dL_doutputs, const std::string& output, const Tensor& like,
+                        at::IntArrayRef sizes);
 /// Says of so many tensor arguments whether they want a gradient.
 void check_needs(const std::vector<bool>& needs, size_t count);
 

@@ -3,6 +3,7 @@
 #include <pybind11/stl.h>
 #include <torch/library.h>
 
+#include <cstddef>
 #include <new>
 #include <string>
 #include <utility>
@@ -129,6 +130,37 @@ std::vector<std::pair<std::string, int>> lens_members() {
   return members;
 }
 
+/// Columns as Python indexes them: a number, or a slice of several.
+pybind11::object columns_at(int64_t first, int64_t count) {
+  if (count == 1) return pybind11::int_(first);
+  return pybind11::slice(first, first + count, 1);
+}
+
+/// The columns of PackedRow, by the members of Python's Splats.
+pybind11::dict row_columns() {
+  using Row = PackedRow<float>;
+  pybind11::dict columns;
+  const auto add = [&](const char* name, size_t offset, size_t size) {
+    columns[name] = columns_at(offset / sizeof(float), size / sizeof(float));
+  };
+  add("means2d", offsetof(Row, mean), sizeof(Row::mean));
+  add("cov2d", offsetof(Row, cov), sizeof(Row::cov));
+  add("opacities", offsetof(Row, opacity), sizeof(Row::opacity));
+  add("depths", offsetof(Row, depth), sizeof(Row::depth));
+  add("colors", offsetof(Row, color), sizeof(Row::color));
+  add("dets", offsetof(Row, det), sizeof(Row::det));
+  add("gaussian_ids", offsetof(Row, id), sizeof(Row::id));
+  return columns;
+}
+
+/// The columns of the gradient with respect to PackedRow that Python reads.
+pybind11::dict row_grad_columns() {
+  pybind11::dict columns;
+  columns["means2d"] = columns_at(kPackedMean, 2);
+  columns["means2d_abs"] = columns_at(kPackedAbsolute, 2);
+  return columns;
+}
+
 }  // namespace
 
 #if defined(AR_WITH_CUDA)
@@ -163,13 +195,15 @@ PYBIND11_MODULE(_C, m) {
   m.attr("TILE") = ar::kTile;
   m.def(
       "tile_size",
-      [](const std::string& footprint, double option, bool cuda) {
-        return ar::ops::grid_of(ar::ops::find_footprint(footprint, option), 1, 1, cuda).side();
+      [](const std::string& footprint, double option, int64_t width, int64_t height, bool cuda) {
+        return ar::ops::grid_of(ar::ops::find_footprint(footprint, option), width, height, cuda).side();
       },
-      "Edge of the tiles that a footprint is binned for [px].");
+      "Edge of the tiles that a footprint is binned for in an image [px].");
   m.attr("SPLAT_WIDTH") = ar::kSplatWidth;
   m.attr("ROW_WIDTH") = ar::kPackedWidth;
+  m.attr("ROW_COLUMNS") = ar::ops::row_columns();
   m.attr("ROW_GRAD_WIDTHS") = std::make_pair(ar::kPackedGradWidth, ar::kPackedGradWidthAbsolute);
+  m.attr("ROW_GRAD_COLUMNS") = ar::ops::row_grad_columns();
   m.attr("NEAR") = ar::kNear;
   m.attr("FRUSTUM_CLAMP") = ar::kFrustumClamp;
   m.attr("ALPHA_MIN") = ar::kAlphaMin;

@@ -31,12 +31,13 @@ Tensor mean_transmittance(const BlendState& state, const ListTensors& lists, Til
       .div(samples);
 }
 
-}  // namespace
-
+/// Whether one of the camera's tensors wants a gradient.
 bool needs_camera(const std::vector<bool>& needs) {
   const auto first = needs.begin() + kGaussianTensors, last = first + kCameraTensors;
   return std::find(first, last, true) != last;
 }
+
+}  // namespace
 
 void check_camera_needs(const std::vector<bool>& needs, const OptionalTensor& lens) {
   TORCH_CHECK_VALUE(lens || !needs_camera(needs),
@@ -109,16 +110,12 @@ std::vector<Tensor> gradients_of(const ProjectArguments& a, const std::vector<bo
   return out;
 }
 
-/// Whether int32 `ids` number rows of `count`; on a device, where the answer would have to be waited for, it is not
-/// asked for.
 bool may_be_rows_of(const Tensor& ids, int64_t count) {
   if (ids.numel() == 0 || !ids.is_cpu()) return true;
   const auto [least, most] = at::aminmax(ids);
   return least.item<int64_t>() >= 0 && most.item<int64_t>() < count;
 }
 
-/// (count,) int32: at the place of each id its number, counted from `first`, and -1 at all others. Ids that are no
-/// places, which nobody has checked on a device, are left out.
 Tensor places_of(const Tensor& ids, int64_t count, int64_t first) {
   const Tensor places = at::full({count + 1}, -1, ids.options());  // the last one takes what has no place
   places.index_put_({ids.to(at::kLong).clamp(-1, count)}, at::arange(first, first + ids.numel(), ids.options()));

@@ -8,10 +8,8 @@
 
 namespace ar::ops {
 
-/// Whether one of the camera's tensors wants a gradient, by `needs` of check_camera_needs.
-bool needs_camera(const std::vector<bool>& needs);
-/// `needs`: which of the tensors of SceneTensors want a gradient. Without a lens those of the camera have none; raises
-/// ValueError where one of them wants it.
+/// `needs`, here and below: which of the tensors of SceneTensors want a gradient. Without a lens those of the camera
+/// have none; raises ValueError where one of them wants it.
 void check_camera_needs(const std::vector<bool>& needs, const OptionalTensor& lens);
 
 /// Room for the gradients with respect to the Gaussians, and whether those of the camera are wanted.

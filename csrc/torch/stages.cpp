@@ -234,10 +234,8 @@ Results footprint_weight_vjp(VjpArguments<WeightArguments> arguments) {
   check(a);
   check_needs(arguments.needs, 2);
   WeightTensors tensors = {a.offset, a.cov2d};
-  tensors.dL_dweight =
-      gradient_of(arguments.dL_doutputs, 0, "dL_dweight", a.offset, a.offset.sizes().slice(0, a.offset.dim() - 1));
-  TORCH_CHECK_VALUE(tensors.dL_dweight.defined(),
-                    "dL_doutputs must hold the gradient with respect to the weight, got none");
+  const at::IntArrayRef sizes = a.offset.sizes().slice(0, a.offset.dim() - 1);
+  tensors.dL_dweight = only_gradient_of(arguments.dL_doutputs, "weight", a.offset, sizes);
   tensors.dL_doffset = at::empty(a.offset.sizes(), a.offset.options());
   tensors.dL_dcov2d = at::empty(a.cov2d.sizes(), a.offset.options());
   make_backend(a.offset)->weight(tensors, footprint);

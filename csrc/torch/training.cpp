@@ -44,8 +44,8 @@ void note_written(const Tensor& t) {
   if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();
 }
 
-/// What the adjoint returns: the gradient with respect to image, and none with respect to target.
-Results gradients_of(const SsimTensors& t) {
+/// Runs the adjoint. Returns the gradient with respect to image, and none with respect to target.
+Results run_ssim_vjp(const SsimTensors& t) {
   training_kernels(t.image).ssim_vjp(t);
   return {std::vector<Tensor>{t.dL_dimage, at::empty({0}, t.image.options())}};
 }
@@ -61,9 +61,8 @@ Results ssim_map(SsimArguments a) {
 
 Results ssim_map_vjp(VjpArguments<SsimArguments> arguments) {
   SsimTensors t = make_ssim_vjp(arguments.of_op, arguments.saved, arguments.needs);
-  t.dL_dmap = gradient_of(arguments.dL_doutputs, 0, "dL_dmap", t.image, t.image.sizes());
-  TORCH_CHECK_VALUE(t.dL_dmap.defined(), "dL_doutputs must hold the gradient with respect to the map, got none");
-  return gradients_of(t);
+  t.dL_dmap = only_gradient_of(arguments.dL_doutputs, "map", t.image, t.image.sizes());
+  return run_ssim_vjp(t);
 }
 
 Results l1_ssim(L1SsimArguments a) {
@@ -78,9 +77,8 @@ Results l1_ssim_vjp(VjpArguments<L1SsimArguments> arguments) {
   const L1SsimArguments& a = arguments.of_op;
   SsimTensors t = make_ssim_vjp(arguments.of_op, arguments.saved, arguments.needs);
   t.weights = {a.l1_weight, a.ssim_weight, a.constant};
-  t.dL_dloss = gradient_of(arguments.dL_doutputs, 0, "dL_dloss", t.image, {});
-  TORCH_CHECK_VALUE(t.dL_dloss.defined(), "dL_doutputs must hold the gradient with respect to the loss, got none");
-  return gradients_of(t);
+  t.dL_dloss = only_gradient_of(arguments.dL_doutputs, "loss", t.image, {});
+  return run_ssim_vjp(t);
 }
 
 Results activate(ActivateArguments a) {

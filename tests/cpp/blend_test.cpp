@@ -181,7 +181,8 @@ MovingBlendGrad<double> blend_moving_sample_vjp(const Terms& terms, Vec2<double>
           P::alpha_and_move_vjp(terms, at, s, raw, alpha, free, transmittance * difference, state.moved, dL_dmoved)};
 }
 
-// A sample that moves, by its displacement and by its place: two forms of the same, for a stack of splats and back.
+// A sample that moves, by its displacement, by its place, and by its place in its cell: three forms of the same, for a
+// stack of splats and back.
 template <int S> void expect_places_and_displacements_to_agree() {
   using P = Moment<S>;
   using V = Vec2<double>;
@@ -196,8 +197,18 @@ template <int S> void expect_places_and_displacements_to_agree() {
     std::vector<V> fronts, places;
     std::vector<double> front_transmittance, raws, colors = randoms<double>(random, count, 0, 1);
     SampleState<double, true> state = {};
-    double by_moved = 1, by_place = 1;
-    V place = node;
+    double by_moved = 1, by_place = 1, by_cell = 1, by_map = 1;
+    V place = node, in_cell = {0.5, 0.5}, mapped = node;
+    std::vector<V> places_in_cell;
+    const auto cells_of = [](auto terms) {  // lengths in edges of cells
+      terms.w = 1.0 / P::kSide * terms.w;
+      return terms;
+    };
+    const auto z_in_cell = [&](const auto& terms, V at) {
+      return P::whitened_node(cells_of(terms), transform(terms.w, p + cell.lo, terms.node[0]), at);
+    };
+    const UnitCell<P::kSide> unit_cell = {};
+    AdjointMap<double> map = {0, {0, 0}, {0, 0}, {1, 0, 0, 1}};
     for (int k = 0; k < count; ++k) {
       const double xx = random.log_uniform(0.05, 3), yy = random.log_uniform(0.05, 3);
       const double xy = random.uniform(-0.9, 0.9) * std::sqrt(xx * yy);
@@ -215,12 +226,24 @@ template <int S> void expect_places_and_displacements_to_agree() {
       ASSERT_NEAR(a.contribution, b.contribution, 1e-10);
       ASSERT_NEAR(node.x + state.moved.x, place.x, 1e-10);
       ASSERT_NEAR(node.y + state.moved.y, place.y, 1e-10);
+      places_in_cell.push_back(in_cell);
+      blend_placed_sample<P>(cells_of(terms[k]), z_in_cell(terms[k], in_cell), raw, unit_cell, by_cell, in_cell);
+      ASSERT_NEAR(by_cell, by_place, 1e-10);
+      ASSERT_NEAR(cell.lo.x + in_cell.x / P::kSide, place.x, 1e-10);
+      ASSERT_NEAR(cell.lo.y + in_cell.y / P::kSide, place.y, 1e-10);
+      map_placed_sample<P>(terms[k], z, raw, b.mask, cell, colors[k], by_map, mapped, map);
+      ASSERT_EQ(by_map, std::abs(by_place));
+      ASSERT_EQ(mapped.x, place.x);
+      ASSERT_EQ(mapped.y, place.y);
       raws.push_back(b.mask ? raw : 0);
       composited += b.mask;
       held += place.x == cell.lo.x || place.x == cell.hi.x || place.y == cell.lo.y || place.y == cell.hi.y;
     }
-    double behind_moved = 0.7, behind_place = 0.7, transmittance = std::abs(by_place);
-    V dL_dmoved = {0, 0}, dL_dplace = {0, 0};
+    const double behind = 0.7;
+    const V dL_dlast = {0.3, -0.4};
+    double behind_moved = behind, behind_place = behind, transmittance = by_map;
+    double behind_in_cell = behind, transmittance_in_cell = by_map;
+    V dL_dmoved = dL_dlast, dL_dplace = dL_dlast, dL_din_cell = {dL_dlast.x / P::kSide, dL_dlast.y / P::kSide};
     for (int k = count - 1; k >= 0; --k) {
       const MovingBlendGrad<double> a =
           blend_moving_sample_vjp<P>(terms[k], p, s, raws[k] > 0, colors[k], front_transmittance[k],
@@ -228,32 +251,32 @@ template <int S> void expect_places_and_displacements_to_agree() {
       const V z = P::whitened_node(terms[k], P::whitened(terms[k], p, 0), places[k]);
       const MovingBlendGrad<double> b = blend_placed_sample_vjp<P>(terms[k], z, raws[k], cell, colors[k], places[k],
                                                                    transmittance, behind_place, dL_dplace);
-      const double actual[] = {b.contribution,
-                               b.of_splat.weighted,
-                               b.of_splat.sums.offset.x,
-                               b.of_splat.sums.offset.y,
-                               b.of_splat.sums.shape.xx,
-                               b.of_splat.sums.shape.xy,
-                               b.of_splat.sums.shape.yy,
-                               behind_place,
-                               dL_dplace.x,
-                               dL_dplace.y,
-                               transmittance};
-      const double expected[] = {a.contribution,
-                                 a.of_splat.weighted,
-                                 a.of_splat.sums.offset.x,
-                                 a.of_splat.sums.offset.y,
-                                 a.of_splat.sums.shape.xx,
-                                 a.of_splat.sums.shape.xy,
-                                 a.of_splat.sums.shape.yy,
-                                 behind_moved,
-                                 dL_dmoved.x,
-                                 dL_dmoved.y,
-                                 std::abs(front_transmittance[k])};
+      const MovingBlendGrad<double> c =
+          blend_placed_sample_vjp<P>(cells_of(terms[k]), z_in_cell(terms[k], places_in_cell[k]), raws[k], unit_cell,
+                                     colors[k], places_in_cell[k], transmittance_in_cell, behind_in_cell, dL_din_cell);
+      const auto numbers = [](const MovingBlendGrad<double>& grad, double behind, V dL_dplace, double transmittance) {
+        const ShapeGrad<double>& sums = grad.of_splat.sums;
+        return std::vector<double>{
+            grad.contribution, grad.of_splat.weighted, sums.offset.x, sums.offset.y, sums.shape.xx,
+            sums.shape.xy,     sums.shape.yy,          behind,        dL_dplace.x,   dL_dplace.y,
+            transmittance};
+      };
+      const std::vector<double> expected = numbers(a, behind_moved, dL_dmoved, std::abs(front_transmittance[k]));
+      const std::vector<double> actual = numbers(b, behind_place, dL_dplace, transmittance);
+      const std::vector<double> of_cell =
+          numbers(c, behind_in_cell, {P::kSide * dL_din_cell.x, P::kSide * dL_din_cell.y}, transmittance_in_cell);
       // Rounding, which 1 / (1 - alpha)^2 enlarges by up to 1e4, and steps of up to 30 splats in a row.
-      for (int i = 0; i < 11; ++i)
+      for (size_t i = 0; i < expected.size(); ++i) {
         ASSERT_NEAR(actual[i], expected[i], 1e-8 * (1 + std::abs(expected[i]))) << k << " " << i;
+        ASSERT_NEAR(of_cell[i], expected[i], 1e-8 * (1 + std::abs(expected[i]))) << k << " " << i;
+      }
     }
+    const Mat2<double>& m = map.of_place;
+    const V front = transform(
+        m, dL_dlast, V{madd(map.of_behind.x, behind, map.of_color.x), madd(map.of_behind.y, behind, map.of_color.y)});
+    ASSERT_NEAR(map.color + by_map * behind, behind_place, 1e-8);
+    ASSERT_NEAR(front.x, dL_dplace.x, 1e-8 * (1 + std::abs(dL_dplace.x)));
+    ASSERT_NEAR(front.y, dL_dplace.y, 1e-8 * (1 + std::abs(dL_dplace.y)));
   }
   EXPECT_GT(composited, 1000);
   EXPECT_GT(held, 20);

@@ -26,18 +26,23 @@ template <typename T> struct Parameters {
 
   T& number(int k) { return reinterpret_cast<T*>(this)[k]; }
 
+  /// Gaussians or their gradients, of the parameters that the form has.
+  template <class Self, class Pointers> static void point_to(Self& self, Form form, Pointers& g) {
+    g.means = &self.mean;
+    if (form.with_cov3d) {
+      g.cov3ds = &self.cov3d;
+    } else {
+      g.scales = &self.scale;
+      g.rotations = &self.rotation;
+    }
+    g.opacities = &self.opacity;
+    (form.sh_degree < 0 ? g.colors : g.shs) = form.sh_degree < 0 ? &self.color : self.sh;
+  }
+
   Gaussians<T> view(Form form, T scale_modifier = T(1)) const {
     Gaussians<T> g = {};
     g.n = 1;
-    g.means = &mean;
-    if (form.with_cov3d) {
-      g.cov3ds = &cov3d;
-    } else {
-      g.scales = &scale;
-      g.rotations = &rotation;
-    }
-    g.opacities = &opacity;
-    (form.sh_degree < 0 ? g.colors : g.shs) = form.sh_degree < 0 ? &color : sh;
+    point_to(*this, form, g);
     g.sh_stride = kStride;
     g.sh_degree = std::max(form.sh_degree, 0);
     g.scale_modifier = scale_modifier;
@@ -47,15 +52,7 @@ template <typename T> struct Parameters {
   /// As the destination of gradients.
   GaussianGrads<T> targets(Form form, T* means2d) {
     GaussianGrads<T> g = {};
-    g.means = &mean;
-    if (form.with_cov3d) {
-      g.cov3ds = &cov3d;
-    } else {
-      g.scales = &scale;
-      g.rotations = &rotation;
-    }
-    g.opacities = &opacity;
-    (form.sh_degree < 0 ? g.colors : g.shs) = form.sh_degree < 0 ? &color : sh;
+    point_to(*this, form, g);
     g.means2d = means2d;
     g.means2d_stride = 3;
     return g;

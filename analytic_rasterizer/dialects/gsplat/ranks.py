@@ -87,8 +87,8 @@ class Sharing:
 
     def send(
         self, splats: Splats, features: torch.Tensor, absolute: torch.Tensor | None
-    ) -> tuple[list[Splats], torch.Tensor | None]:
-        """The splats of all ranks for each camera of this one, with features in place of colors, and global ids.
+    ) -> tuple[Splats, torch.Tensor | None]:
+        """The splats of all ranks for the cameras of this one, with features in place of colors, and global ids.
 
         Args:
             splats: Of the Gaussians of this rank in the cameras of all ranks.
@@ -96,16 +96,14 @@ class Sharing:
             absolute: (R, 2) or None, what takes the absolute gradients.
 
         Returns:
-            The splats, and what takes the absolute gradients of all of them, one camera after the other.
+            The splats, and what takes the absolute gradients of all of them.
         """
-        shard = replace(splats, colors=features).split()
-        sizes = [len(of_camera.means2d) for of_camera in shard]
-        of_cameras = () if absolute is None else absolute.split(sizes)
-        counts = gather(sizes, self.world, None)
+        counts = gather(splats.row_splits.diff().tolist(), self.world, None)
         owned = [list(range(r * self.cameras, (r + 1) * self.cameras)) for r in range(self.world)]
         route = Route(counts, owned, self.rank, None)
-        own, own_absolute, _ = exchange(route, tuple(shard), of_cameras, self.first_id, self.join)
-        return own, None if own_absolute is None else torch.cat(own_absolute)
+        of_means = [] if absolute is None else [absolute]
+        own, of_own_means, _ = exchange(route, [replace(splats, colors=features)], of_means, self.first_id, self.join)
+        return own, of_own_means
 
 
 class _AllCameras(torch.autograd.Function):

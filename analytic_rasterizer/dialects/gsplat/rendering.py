@@ -4,41 +4,32 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 
 from ..._C import TILE
 from ...camera import camera_matrices
-from ...effects import MAX_SH_DEGREE, Effects
-from ...footprints import Footprint, chosen_footprint, resolve_footprint
+from ...effects import Effects
+from ...footprints import Footprint
 from ...settings import GaussianRasterizationSettings
 from ...stages import Splats, bin, blend, project
+from .arguments import (
+    RASTERIZE_MODES,
+    RENDER_MODES,
+    Sizes,
+    check_choice,
+    check_colors,
+    check_distributed,
+    check_numbers,
+    check_scene,
+    refuse,
+    settle_footprint,
+)
+from .meta import ROWS, KeepAbsolute, Layout, measure, without_culled
 from .ranks import Sharing
 
-RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
-RASTERIZE_MODES = ("classic", "antialiased")
-
-_ALPHA_MIN = 1 / 255  # alpha below which nothing is drawn, here and in gsplat
-_EXTENT = 3.33  # standard deviations in gsplat's radii at most: there an opacity of 1 has fallen to _ALPHA_MIN
-_PIXEL_VARIANCE = 1 / 12  # px^2, of a square pixel
-_LARGEST_RADIUS = 1e9  # px, fits an int32
 _SMALLEST_ALPHA = 1e-10  # that an accumulated depth is divided by, as in gsplat
-_MAX_CHANNELS = 512  # of `blend`
-
-_REFUSED = {
-    "sparse_grad": "gradients are dense tensors",
-    "with_ut": "the unscented transform of 3DGUT is not implemented",
-    "with_eval3d": "Gaussians are evaluated in the image, not along rays",
-    "radial_coeffs": "lenses without distortion only, undistort the images",
-    "tangential_coeffs": "lenses without distortion only, undistort the images",
-    "thin_prism_coeffs": "lenses without distortion only, undistort the images",
-    "ftheta_coeffs": "lenses without distortion only, undistort the images",
-    "viewmats_rs": "the shutter is global",
-}
-"""Arguments of gsplat that are refused, and why."""
 
 
 def rasterization(
@@ -149,16 +140,16 @@ def rasterization(
         "viewmats_rs": viewmats_rs,
     }
 
-    def check() -> tuple[_Sizes, bool, Footprint]:
-        _refuse(asked, camera_model, rolling_shutter)
-        _check_choice("render_mode", render_mode, RENDER_MODES)
-        _check_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
-        _check_numbers(width, height, near_plane, far_plane, radius_clip, eps2d)
-        sizes = _check_scene(means, quats, scales, opacities, covars, viewmats, Ks)
-        per_camera = _check_colors(means, sizes, colors, backgrounds, sh_degree, render_mode)
+    def check() -> tuple[Sizes, bool, Footprint]:
+        refuse(asked, camera_model, rolling_shutter)
+        check_choice("render_mode", render_mode, RENDER_MODES)
+        check_choice("rasterize_mode", rasterize_mode, RASTERIZE_MODES)
+        check_numbers(width, height, near_plane, far_plane, radius_clip, eps2d)
+        sizes = check_scene(means, quats, scales, opacities, covars, viewmats, Ks)
+        per_camera = check_colors(means, sizes, colors, backgrounds, sh_degree, render_mode)
         if distributed:
-            _check_distributed(sizes, per_camera)
-        return sizes, per_camera, _settle_footprint(footprint, rasterize_mode, eps2d)
+            check_distributed(sizes, per_camera)
+        return sizes, per_camera, settle_footprint(footprint, rasterize_mode, eps2d)
 
     sharing = None
     if distributed:
@@ -194,17 +185,17 @@ def rasterization(
         covariances = {"cov3D_precomp": upper_triangle(covars)}
     gaussians = {"means3D": means, "opacities": opacities, **covariances}
     splats = _project(sizes, settings, gaussians, shs, per_camera)
-    measures = _measure(splats, settled, radius_clip)
+    measures = measure(splats, settled, radius_clip)
     if packed:
-        splats, measures = _without_culled(splats, measures)
+        splats, measures = without_culled(splats, measures)
     else:
         splats = dataclasses.replace(splats, opacities=torch.where(measures.drawn, splats.opacities, 0))
-    layout = _Layout.of(splats, sizes, packed)
+    layout = Layout.of(splats, sizes, packed)
 
     means2d = layout.to_meta(splats.means2d + 0.5)
     through, absolute = means2d, None
     if absgrad and means2d.requires_grad:
-        through, absolute = _KeepAbsolute.apply(means2d)
+        through, absolute = KeepAbsolute.apply(means2d)
         absolute = layout.to_rows(absolute)
     splats = dataclasses.replace(splats, means2d=layout.to_rows(through) - 0.5)
 
@@ -213,8 +204,7 @@ def rasterization(
         features = _colors_of_rows(splats, sizes, colors, per_camera) if shs is None else splats.colors
     blended = splats
     if sharing is not None:
-        own, absolute = sharing.send(splats, features, absolute)
-        blended = _join(own)
+        blended, absolute = sharing.send(splats, features, absolute)
         features = blended.colors  # of any number of channels, which `bin` does not take
         blended = dataclasses.replace(blended, colors=features.new_empty(0, 3))
     if with_depth:
@@ -244,134 +234,7 @@ def rasterization(
     return images.unflatten(0, dims), alphas.unflatten(0, dims), meta
 
 
-# --- what is given -----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Sizes:
-    """Leading dimensions, and how many cameras and Gaussians there are for each of their indices."""
-
-    batch: tuple[int, ...]
-    cameras: int
-    gaussians: int
-
-
-def _refuse(asked: dict[str, Any], camera_model: str, rolling_shutter: Any) -> None:
-    for name, value in asked.items():
-        if value is not None and value is not False:
-            raise NotImplementedError(f"{name} is not supported: {_REFUSED[name]}")
-    if rolling_shutter is not None and getattr(rolling_shutter, "name", rolling_shutter) != "GLOBAL":
-        raise NotImplementedError(f"rolling_shutter is not supported: the shutter is global; got {rolling_shutter}")
-    if camera_model in ("fisheye", "ftheta"):
-        raise NotImplementedError(f"camera_model {camera_model!r} is not supported: cameras are pinhole or ortho")
-    _check_choice("camera_model", camera_model, ("pinhole", "ortho"))
-
-
-def _check_distributed(sizes: _Sizes, per_camera: bool) -> None:
-    """Raises ValueError for what ranks cannot share."""
-    if sizes.batch:
-        raise ValueError(f"means must have no leading dimensions where distributed is True, got {sizes.batch}")
-    if per_camera:
-        raise ValueError("colors must be shared by the cameras where distributed is True, got colors per camera")
-
-
-def _check_choice(name: str, value: str, choices: Sequence[str]) -> None:
-    if value not in choices:
-        raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value!r}")
-
-
-def _check_numbers(
-    width: int, height: int, near_plane: float, far_plane: float, radius_clip: float, eps2d: float
-) -> None:
-    for name, value in (("width", width), ("height", height)):
-        if int(value) != value or value < 1:
-            raise ValueError(f"{name} must be a positive integer, got {value}")
-    if not 0 < near_plane < far_plane:
-        raise ValueError(f"near_plane must be above 0 and below far_plane, got {near_plane} and {far_plane}")
-    for name, value in (("radius_clip", radius_clip), ("eps2d", eps2d)):
-        if not 0 <= value < math.inf:
-            raise ValueError(f"{name} must be finite and not negative, got {value}")
-
-
-def _check_tensor(name: str, tensor: Any, like: torch.Tensor, *shapes: tuple[int, ...]) -> None:
-    """Raises unless it is a tensor of one of these shapes, of the dtype and on the device of the means."""
-    if not isinstance(tensor, torch.Tensor):
-        raise TypeError(f"{name} must be a tensor, got {type(tensor).__name__}")
-    if tensor.shape not in shapes:
-        raise ValueError(f"{name} must have shape {' or '.join(map(str, shapes))}, got {tuple(tensor.shape)}")
-    if tensor.device != like.device:
-        raise ValueError(f"{name} must be on the device of means, {like.device}, got {tensor.device}")
-    if tensor.dtype != like.dtype:
-        raise TypeError(f"{name} must have the dtype of means, {like.dtype}, got {tensor.dtype}")
-
-
-def _check_scene(means: Any, quats: Any, scales: Any, opacities: Any, covars: Any, viewmats: Any, Ks: Any) -> _Sizes:
-    """The sizes that means and viewmats have, after checking all against them."""
-    for name, tensor, last in (("means", means, (3,)), ("viewmats", viewmats, (4, 4))):
-        if not isinstance(tensor, torch.Tensor):
-            raise TypeError(f"{name} must be a tensor, got {type(tensor).__name__}")
-        dims = len(last) + 1
-        if tensor.dim() < dims or tensor.shape[1 - dims :] != last:
-            counted = "N" if name == "means" else "C"
-            shape = ", ".join(("...", counted, *map(str, last)))
-            raise ValueError(f"{name} must have shape ({shape}), got {tuple(tensor.shape)}")
-    sizes = _Sizes(tuple(means.shape[:-2]), viewmats.shape[-3], means.shape[-2])
-    of_gaussians, of_cameras = (*sizes.batch, sizes.gaussians), (*sizes.batch, sizes.cameras)
-    if math.prod(of_cameras) == 0:
-        raise ValueError(f"viewmats must hold at least one camera, got shape {tuple(viewmats.shape)}")
-    if covars is None:
-        _check_tensor("quats", quats, means, (*of_gaussians, 4))
-        _check_tensor("scales", scales, means, (*of_gaussians, 3))
-    else:
-        _check_tensor("covars", covars, means, (*of_gaussians, 3, 3))
-    _check_tensor("opacities", opacities, means, of_gaussians)
-    _check_tensor("viewmats", viewmats, means, (*of_cameras, 4, 4))
-    _check_tensor("Ks", Ks, means, (*of_cameras, 3, 3))
-    focal = Ks.detach().diagonal(dim1=-2, dim2=-1)[..., :2]
-    if not Ks.is_cuda and (focal <= 0).any():  # on CUDA it would wait for the device
-        raise ValueError(f"Ks must have positive focal lengths, got {focal[focal <= 0][0].item()}")
-    return sizes
-
-
-def _check_colors(
-    means: torch.Tensor, sizes: _Sizes, colors: Any, backgrounds: Any, sh_degree: int | None, render_mode: str
-) -> bool:
-    """Whether every camera has colours of its own, after checking them."""
-    if not isinstance(colors, torch.Tensor):
-        raise TypeError(f"colors must be a tensor, got {type(colors).__name__}")
-    last = tuple(colors.shape[-1:]) if sh_degree is None else (*colors.shape[-2:-1], 3)
-    shared, own = (
-        (*sizes.batch, sizes.gaussians, *last),
-        (*sizes.batch, sizes.cameras, sizes.gaussians, *last),
-    )
-    _check_tensor("colors", colors, means, shared, own)
-    most = _MAX_CHANNELS if render_mode == "RGB" else _MAX_CHANNELS - 1
-    if sh_degree is None and "RGB" in render_mode and not 1 <= last[0] <= most:
-        raise ValueError(f"colors must have 1 to {most} channels in render_mode {render_mode}, got {last[0]}")
-    if sh_degree is not None:
-        if sh_degree not in range(MAX_SH_DEGREE + 1):
-            raise ValueError(f"sh_degree must be 0 to {MAX_SH_DEGREE}, got {sh_degree}")
-        if last[0] < (sh_degree + 1) ** 2:
-            raise ValueError(f"colors must have {(sh_degree + 1) ** 2} harmonics of degree {sh_degree}, got {last[0]}")
-    if backgrounds is not None:
-        _check_tensor("backgrounds", backgrounds, means, (*sizes.batch, sizes.cameras, last[-1]))
-    return colors.shape == own
-
-
-def _settle_footprint(footprint: str | Footprint | None, rasterize_mode: str, eps2d: float) -> Footprint:
-    if footprint is not None:
-        return resolve_footprint(str(footprint))
-    if (chosen := chosen_footprint()) is not None:
-        return chosen
-    if rasterize_mode == "classic":
-        return resolve_footprint("point", dilation=eps2d)
-    return resolve_footprint("mip", variance=eps2d)
-
-
 # --- projection --------------------------------------------------------------------------------------
-
-_ROWS = ("means2d", "cov2d", "opacities", "depths", "colors", "radii", "gaussian_ids", "camera_ids", "dets")
-"""Fields of `Splats` with a row per splat; colors may have none."""
 
 
 def _camera_settings(
@@ -423,7 +286,7 @@ def _camera_settings(
 
 
 def _project(
-    sizes: _Sizes,
+    sizes: Sizes,
     settings: list[GaussianRasterizationSettings],
     gaussians: dict[str, torch.Tensor],
     shs: torch.Tensor | None,
@@ -462,119 +325,15 @@ def _join(parts: list[Splats]) -> Splats:
     for part in parts:
         cameras.append(cameras[-1] + part.cameras)
         splits.append(splits[-1][-1] + part.row_splits[1:])
-    rows = {name: torch.cat([getattr(part, name) for part in parts]) for name in _ROWS}
+    rows = {name: torch.cat([getattr(part, name) for part in parts]) for name in ROWS}
     rows["camera_ids"] = torch.cat([part.camera_ids + first for part, first in zip(parts, cameras)])
     return dataclasses.replace(parts[0], row_splits=torch.cat(splits), **rows)
-
-
-# --- what meta says ----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Measures:
-    """What `meta` says of splats beside what they are. Without gradient, a row per splat.
-
-    Attributes:
-        drawn: (R,) bool, whether gsplat would draw it.
-        radii: (R, 2) int32, px; 0 where it is not drawn.
-        conics: (R, 3), 1/px^2.
-        opacities: (R,).
-    """
-
-    drawn: torch.Tensor
-    radii: torch.Tensor
-    conics: torch.Tensor
-    opacities: torch.Tensor
-
-
-@torch.no_grad()
-def _measure(splats: Splats, footprint: Footprint, radius_clip: float) -> _Measures:
-    """Radii by gsplat's definition: half the width and height, in whole px, of the ellipse where alpha is 1/255.
-
-    A splat whose rectangle misses the image is not drawn, as in gsplat. This hides nothing: the centre of the nearest
-    pixel is half a pixel further away, so that alpha is below 1/255 there also where the weight is an integral over
-    the pixel.
-    """
-    variance = footprint.option if footprint.name in ("point", "mip") else _PIXEL_VARIANCE
-    xx, xy, yy = splats.cov2d.unbind(1)
-    det = splats.dets + variance * (xx + yy) + variance**2  # without the cancellation of computing it from entries
-    xx, yy = xx + variance, yy + variance
-    conics = torch.stack([yy / det, -xy / det, xx / det], 1)
-    opacities = splats.opacities
-    if footprint.name == "mip":
-        opacities = opacities * (splats.dets / det).sqrt()
-    extent = (2 * (opacities / _ALPHA_MIN).log()).clamp(min=0).sqrt().clamp(max=_EXTENT)
-    rx, ry = ((extent * v.sqrt()).ceil().clamp(max=_LARGEST_RADIUS) for v in (xx, yy))
-    x, y = (splats.means2d + 0.5).unbind(1)
-    on_image = (x + rx > 0) & (x - rx < splats.width) & (y + ry > 0) & (y - ry < splats.height)
-    drawn = on_image & (rx > 0) & (ry > 0) & ((rx > radius_clip) | (ry > radius_clip))
-    radii = torch.where(drawn[:, None], torch.stack([rx, ry], 1), 0).int()
-    return _Measures(drawn, radii, conics, opacities)
-
-
-def _without_culled(splats: Splats, measures: _Measures) -> tuple[Splats, _Measures]:
-    """Only what is drawn. Waits for the device."""
-    kept = measures.drawn.nonzero()[:, 0]
-    before = torch.nn.functional.pad(measures.drawn.cumsum(0), (1, 0))  # rows kept before each row
-    row_splits = before[splats.row_splits.to(before.device)].cpu()
-    rows = {name: getattr(splats, name) for name in _ROWS}
-    rows = {name: values.index_select(0, kept) if len(values) else values for name, values in rows.items()}
-    measured = (getattr(measures, field.name).index_select(0, kept) for field in dataclasses.fields(measures))
-    return dataclasses.replace(splats, row_splits=row_splits, **rows), _Measures(*measured)
-
-
-@dataclass(frozen=True)
-class _Layout:
-    """How `meta` holds rows: as they are, or in a table with a place for every Gaussian in every camera.
-
-    Attributes:
-        shape: (..., C, N) of the table.
-        places: (R,) int64, where in the flattened table each row is; None: packed.
-    """
-
-    shape: tuple[int, ...]
-    places: torch.Tensor | None
-
-    @classmethod
-    def of(cls, splats: Splats, sizes: _Sizes, packed: bool) -> _Layout:
-        """For the rows of `splats`."""
-        places = None if packed else splats.camera_ids.long() * sizes.gaussians + splats.gaussian_ids.long()
-        return cls((*sizes.batch, sizes.cameras, sizes.gaussians), places)
-
-    def to_meta(self, rows: torch.Tensor) -> torch.Tensor:
-        """Rows as `meta` holds them, zero where there is none."""
-        if self.places is None:
-            return rows
-        table = rows.new_zeros(math.prod(self.shape), *rows.shape[1:])
-        return table.index_copy(0, self.places, rows).reshape(*self.shape, *rows.shape[1:])
-
-    def to_rows(self, held: torch.Tensor) -> torch.Tensor:
-        """The rows of what `to_meta` made."""
-        if self.places is None:
-            return held
-        return held.flatten(0, len(self.shape) - 1).index_select(0, self.places)
-
-
-class _KeepAbsolute(torch.autograd.Function):
-    """Passes means2d on, with a second tensor that takes the sums of absolute gradients for `means2d.absgrad`."""
-
-    @staticmethod
-    def forward(ctx, means2d: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """means2d, and zeros."""
-        ctx.means2d = means2d
-        return means2d.view_as(means2d), torch.zeros_like(means2d)
-
-    @staticmethod
-    def backward(ctx, dL_dmeans2d: torch.Tensor, absolute: torch.Tensor) -> torch.Tensor:
-        """The gradient of means2d as it came; the other one becomes the attribute."""
-        ctx.means2d.absgrad = absolute
-        return dL_dmeans2d
 
 
 # --- blending ----------------------------------------------------------------------------------------
 
 
-def _colors_of_rows(splats: Splats, sizes: _Sizes, colors: torch.Tensor, per_camera: bool) -> torch.Tensor:
+def _colors_of_rows(splats: Splats, sizes: Sizes, colors: torch.Tensor, per_camera: bool) -> torch.Tensor:
     """(R, D) of colours that are given per Gaussian, or per camera and Gaussian."""
     table = splats.camera_ids.long()
     if not per_camera:

@@ -74,7 +74,10 @@
 //   whitened_node(Terms<T>, Vec2<V> of_pixel, Vec2<V> place) -> Vec2<V>    z of a sample
 //   log_alpha(Terms<T>, Vec2<V> z) -> V  log2(opacity * I)
 //   move_in, alpha_and_move_in_vjp       move and alpha_and_move_vjp, from z, and a place or a displacement with its
-//                                        bounds; move_in takes alpha / (1 - alpha)
+//                                        Bounds or UnitCell; move_in takes alpha / (1 - alpha)
+//   move_in_with_slope                   move_in of a place that is changed, and its MoveSlope
+//
+// With a UnitCell all lengths are in edges of cells, and places are seen from their cell's corner.
 #pragma once
 
 #include <cstddef>
@@ -140,12 +143,40 @@ template <class V> AR_HD ShapeGrad<V> operator+(ShapeGrad<V> a, ShapeGrad<V> b) 
 /// Where a node may be [px].
 template <class V> struct Bounds {
   Vec2<V> lo, hi;
+
+  static constexpr int kUnits = 1;  ///< of length in a pixel
+  /// at + length along, held within the bounds.
+  AR_HD Vec2<V> held(V length, Vec2<V> along, Vec2<V> at) const {
+    const Vec2<V> next = {madd(length, along.x, at.x), madd(length, along.y, at.y)};
+    return {min(max(next.x, lo.x), hi.x), min(max(next.y, lo.y), hi.y)};
+  }
+  /// Whether a place before it is held stays as it is.
+  AR_HD MaskOf<V> free_x(V x) const { return (x >= lo.x) & (x <= hi.x); }
+  AR_HD MaskOf<V> free_y(V y) const { return (y >= lo.y) & (y <= hi.y); }
+};
+
+/// The same in the unit of length in which the cell of the node is [0, 1] x [0, 1], n of them in a pixel. On a device
+/// that costs fewer instructions.
+template <int n> struct UnitCell {
+  static constexpr int kUnits = n;
+  template <class V> AR_HD Vec2<V> held(V length, Vec2<V> along, Vec2<V> at) const {
+    return {saturated_madd(length, along.x, at.x), saturated_madd(length, along.y, at.y)};
+  }
+  template <class V> AR_HD MaskOf<V> free_x(V x) const { return in_unit_interval(x); }
+  template <class V> AR_HD MaskOf<V> free_y(V y) const { return in_unit_interval(y); }
 };
 
 /// What one sample that moves adds to the sums of one splat.
 template <class V> struct MoveGrad {
   V weighted;         ///< what is added to the sum `weighted`: raw dL_draw
   ShapeGrad<V> sums;  ///< what is added to the five sums
+};
+
+/// How a splat that was composited into a sample that moves depends on the sample's place in front of it.
+template <class V> struct MoveSlope {
+  Vec2<V> alpha;             ///< gradient of alpha
+  Sym2<V> step;              ///< the place behind changes by (1 + step) times the change of the place in front,
+  MaskOf<V> free_x, free_y;  ///< in those coordinates that are not held at a bound
 };
 
 /// What most footprints have in common.

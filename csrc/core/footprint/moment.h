@@ -60,7 +60,7 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   AR_HD static Vec2<V> move(const Terms<T>& t, Vec2<V> p, int s, V alpha, Vec2<V> moved) {
     const V reach = V(T(kMoveReach));
     return move_in(t, Gaussian::whitened(t, p + place<T, V>(s), 0), odds(alpha), moved,
-                   {{-reach, -reach}, {reach, reach}});
+                   Bounds<V>{{-reach, -reach}, {reach, reach}});
   }
 
   template <typename T, class V>
@@ -68,7 +68,7 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
                                               V dL_dalpha, Vec2<V> moved, Vec2<V>& dL_dmoved) {
     const V reach = V(T(kMoveReach));
     return alpha_and_move_in_vjp(t, Gaussian::whitened(t, p + place<T, V>(s), 0), raw, alpha, free, dL_dalpha, moved,
-                                 {{-reach, -reach}, {reach, reach}}, dL_dmoved);
+                                 Bounds<V>{{-reach, -reach}, {reach, reach}}, dL_dmoved);
   }
 
   /// Where the node of sample s may be [px from the pixel's centre]: its cell.
@@ -86,28 +86,25 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   }
 
   /// move() from the node's whitened coordinates z and r = alpha / (1 - alpha). `at` is the node's place or its
-  /// displacement; what is returned is the same behind the splat, within `bounds`.
-  template <typename T, class V>
-  AR_HD static Vec2<V> move_in(const Terms<T>& t, Vec2<V> z, V r, Vec2<V> at, const Bounds<V>& bounds) {
-    const Vec2<V> next = step(t, z, r, at);
-    return {min(max(next.x, bounds.lo.x), bounds.hi.x), min(max(next.y, bounds.lo.y), bounds.hi.y)};
+  /// displacement, in the unit of w^-1; what is returned is the same behind the splat, where `cell` allows it.
+  template <typename T, class V, class Cell>
+  AR_HD static Vec2<V> move_in(const Terms<T>& t, Vec2<V> z, V r, Vec2<V> at, const Cell& cell) {
+    return cell.held(V(T(step<Cell>())) * r, transform_transposed(t.w, z), at);
   }
 
   /// alpha_and_move_vjp() likewise (docs/numerics.md, "Adjoint of moving nodes"): z = w d, y = w dL_dat, both times
   /// kBase2 as the sums are, and r = alpha / (1 - alpha). A coordinate that move_in() has held at a bound does not
   /// depend on anything.
-  template <typename T, class V>
+  template <typename T, class V, class Cell>
   AR_HD static MoveGrad<V> alpha_and_move_in_vjp(const Terms<T>& t, Vec2<V> z, V raw, V alpha, MaskOf<V> free,
-                                                 V dL_dalpha, Vec2<V> at, const Bounds<V>& bounds, Vec2<V>& dL_dat) {
-    const V zero = V(T(0)), scale = V(T(kStep)), unit = V(T(1 / (kBase2 * kBase2)));
+                                                 V dL_dalpha, Vec2<V> at, const Cell& cell, Vec2<V>& dL_dat) {
+    const V zero = V(T(0)), scale = V(T(step<Cell>())), unit = V(T(1 / (kBase2 * kBase2)));
     const V r = odds(alpha), slope = V(T(1)) + r;  // 1 / (1 - alpha), whose square is dr / dalpha
-    const Vec2<V> next = step(t, z, r, at);
-    const MaskOf<V> free_x = (next.x >= bounds.lo.x) & (next.x <= bounds.hi.x);
-    const MaskOf<V> free_y = (next.y >= bounds.lo.y) & (next.y <= bounds.hi.y);
-    const Vec2<V> behind = {select(free_x, dL_dat.x, zero), select(free_y, dL_dat.y, zero)};
+    const Vec2<V> next = moved(scale * r, transform_transposed(t.w, z), at);
+    const Vec2<V> behind = {select(cell.free_x(next.x), dL_dat.x, zero), select(cell.free_y(next.y), dL_dat.y, zero)};
     const Vec2<V> y = transform(t.w, behind);
     const V by_move = scale * madd(z.x, y.x, z.y * y.y) * slope * slope;
-    const V g = select(free, raw * (dL_dalpha + by_move), zero), vr = V(T(kVariance)) * r;
+    const V g = select(free, raw * (dL_dalpha + by_move), zero), vr = V(T(variance<Cell>())) * r;
     const Vec2<V> q = {vr * y.x, vr * y.y};
     const Vec2<V> offset = {madd(g, z.x, -q.x), madd(g, z.y, -q.y)};
     const Sym2<V> shape = {z.x * (offset.x - q.x), madd(z.x, offset.y, -q.x * z.y), z.y * (offset.y - q.y)};
@@ -116,21 +113,44 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     return {g, {offset, shape}};
   }
 
+  /// Moves `at` as move_in() does. With J the derivative of the place behind with respect to that in front, the dL_dat
+  /// of alpha_and_move_in_vjp() in front is J^T times that behind, and dL_dalpha times the gradient of alpha. `free`:
+  /// alpha is not held at its cap.
+  template <typename T, class V, class Cell>
+  AR_HD static MoveSlope<V> move_in_with_slope(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> free, const Cell& cell,
+                                               Vec2<V>& at) {
+    const V zero = V(T(0)), unit = V(T(1 / (kBase2 * kBase2)));
+    const V r = odds(alpha), length = V(T(step<Cell>())) * r;
+    const Vec2<V> along = transform_transposed(t.w, z), next = moved(length, along, at);
+    at = cell.held(length, along, at);
+    // dalpha = -unit alpha along.dat, dr = dalpha / (1 - alpha)^2 = -unit r (1 + r) along.dat
+    const V by_alpha = select(free, -unit * alpha, zero), by_r = select(free, unit * length * (V(T(1)) + r), zero);
+    const Vec2<V> steeper = {by_r * along.x, by_r * along.y};
+    const V xx = madd(V(t.w.xx), V(t.w.xx), V(t.w.yx) * V(t.w.yx));
+    const V xy = madd(V(t.w.xx), V(t.w.xy), V(t.w.yx) * V(t.w.yy));
+    const V yy = madd(V(t.w.xy), V(t.w.xy), V(t.w.yy) * V(t.w.yy));
+    return {{by_alpha * along.x, by_alpha * along.y},
+            {madd(length, xx, -steeper.x * along.x), madd(length, xy, -steeper.x * along.y),
+             madd(length, yy, -steeper.y * along.y)},
+            next.x == at.x,
+            next.y == at.y};
+  }
+
  private:
+  /// Variance of a cell in the unit of length of `Cell`.
+  template <class Cell> static constexpr double variance() { return kVariance * Cell::kUnits * Cell::kUnits; }
   /// v / kBase2^2, since (Sigma + v I)^-1 d = w^T z / kBase2^2.
-  static constexpr double kStep = kVariance / (kBase2 * kBase2);
+  template <class Cell> static constexpr double step() { return variance<Cell>() / (kBase2 * kBase2); }
+
+  /// at + v r (Sigma + v I)^-1 d, before it is held.
+  template <class V> AR_HD static Vec2<V> moved(V length, Vec2<V> along, Vec2<V> at) {
+    return {madd(length, along.x, at.x), madd(length, along.y, at.y)};
+  }
 
   /// `half_cells` half cells from the pixel's edge [px from its centre].
   template <typename T> AR_HD static constexpr T edge(int half_cells) { return T(half_cells - kSide) / T(2 * kSide); }
 
   template <typename T, class V> AR_HD static Vec2<V> place(int s) { return {V(node<T>(s).x), V(node<T>(s).y)}; }
-
-  /// at + v r (Sigma + v I)^-1 d, before the bound.
-  template <typename T, class V> AR_HD static Vec2<V> step(const Terms<T>& t, Vec2<V> z, V r, Vec2<V> at) {
-    const Vec2<V> along = transform_transposed(t.w, z);
-    const V length = V(T(kStep)) * r;
-    return {madd(length, along.x, at.x), madd(length, along.y, at.y)};
-  }
 };
 
 }  // namespace ar

@@ -9,6 +9,7 @@
 #include <gtest/gtest.h>
 
 #include "cuda/bin.cuh"
+#include "cuda/splat_tiles.cuh"
 
 namespace ar::cuda {
 namespace {
@@ -122,18 +123,28 @@ TEST(BinKernels, PairsOfSplats) {
   std::vector<PairRange> ranges(n), expected_ranges(n);
   std::vector<uint32_t> expected_tiles;
   std::vector<int32_t> expected_splats;
-  int many = 0;
+  std::vector<TileMask> masks(n);
+  int many = 0, masked = 0, later_rows = 0;
   for (const int32_t i : order) {
     expected_ranges[i].first = int32_t(expected_tiles.size());
     for_each_tile(support_of(splats[i], footprint), grid, [&](int64_t tile) {
       expected_tiles.push_back(uint32_t(tile));
       expected_splats.push_back(i);
     });
-    ranges[i].count = expected_ranges[i].count = int32_t(expected_tiles.size()) - expected_ranges[i].first;
+    expected_ranges[i].count = int32_t(expected_tiles.size()) - expected_ranges[i].first;
+    const SplatTiles tiles = find_tiles(support_of(splats[i], footprint), grid);
+    ASSERT_EQ(tiles.range.count, expected_ranges[i].count);
+    ranges[i] = tiles.range;
+    masks[i] = tiles.mask;
     many += ranges[i].count > kManyTiles;
+    masked += tiles.mask != 0;
+    for (int row = 0; row < 8; ++row) later_rows += row > 3 && (tiles.mask >> 8 * row & 0xff) != 0;
   }
   ASSERT_GT(many, n / 10);
   ASSERT_LT(many, n / 2);
+  ASSERT_GT(masked, n / 4);
+  ASSERT_LT(masked, n - many);  // some have few tiles, but far from each other
+  ASSERT_GT(later_rows, n / 50);
 
   const auto pairs = int64_t(expected_tiles.size());
   const Counts counts = {pairs, n};
@@ -153,7 +164,9 @@ TEST(BinKernels, PairsOfSplats) {
     emit.capacity = pairs;
     emit.counts = &counts;
     emit.order = order.data();
-    emit.ranges = ranges.data();
+    std::vector<PairRange> written = ranges;
+    emit.ranges = written.data();
+    emit.masks = masks.data();
     emit.status = status.data();
     emit.tile_counts = scratch.data();
     emit.tiles = tiles.data();
@@ -167,7 +180,7 @@ TEST(BinKernels, PairsOfSplats) {
       ASSERT_EQ(with_slots ? slot_pairs[k].splat : splat_pairs[k], expected_splats[k]) << k;
       ASSERT_EQ(with_slots ? slot_pairs[k].slot : k, k);
     }
-    for (int i = 0; i < n && with_slots; ++i) ASSERT_EQ(ranges[i].first, expected_ranges[i].first) << i;
+    for (int i = 0; i < n && with_slots; ++i) ASSERT_EQ(written[i].first, expected_ranges[i].first) << i;
   }
 }
 

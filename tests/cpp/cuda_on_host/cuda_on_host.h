@@ -6,6 +6,7 @@
 #pragma once
 
 #include <cuda_runtime_api.h>
+#include <setjmp.h>
 #include <ucontext.h>
 
 #include <algorithm>
@@ -33,11 +34,12 @@ namespace cuda_on_host {
 inline constexpr int kMaxThreads = 1024;
 
 struct Context {
-  ucontext_t registers;
-  bool done = false;
+  ucontext_t start;
+  jmp_buf registers;
+  bool started = false, done = false;
 };
 
-inline ucontext_t scheduler;
+inline jmp_buf scheduler;
 inline std::vector<Context> contexts;
 inline std::vector<std::vector<char>> stacks;  // of the contexts; they stay for those of the next blocks
 
@@ -60,9 +62,17 @@ inline HostDim threadIdx, blockIdx, gridDim;
 
 namespace cuda_on_host {
 
+// Jumps from stack to stack: swapcontext would ask the system at each of them. (_FORTIFY_SOURCE takes such a jump for a
+// mistake.)
+inline void resume(Context& thread) {
+  if (_setjmp(scheduler)) return;
+  if (thread.started) _longjmp(thread.registers, 1);
+  thread.started = true;
+  setcontext(&thread.start);
+}
 inline void let_others_run() {
   const unsigned me = threadIdx.x;
-  swapcontext(&contexts[me].registers, &scheduler);
+  if (!_setjmp(contexts[me].registers)) _longjmp(scheduler, 1);
   threadIdx.x = me;
 }
 
@@ -97,7 +107,7 @@ inline void run_thread() {
   const unsigned me = threadIdx.x;
   kernel();
   contexts[me].done = true;
-  swapcontext(&contexts[me].registers, &scheduler);
+  _longjmp(scheduler, 1);
 }
 
 /// Calls body() for every thread of every block.
@@ -112,18 +122,18 @@ inline void launch(int blocks, int threads, std::function<void()> body) {
     of_block.arrived = of_block.number = 0;
     while (stacks.size() < contexts.size()) stacks.emplace_back(kStack);
     for (int t = 0; t < threads; ++t) {
-      ucontext_t& registers = contexts[t].registers;
-      getcontext(&registers);
-      registers.uc_stack.ss_sp = stacks[t].data();
-      registers.uc_stack.ss_size = kStack;
-      registers.uc_link = &scheduler;
-      makecontext(&registers, run_thread, 0);
+      ucontext_t& start = contexts[t].start;
+      getcontext(&start);
+      start.uc_stack.ss_sp = stacks[t].data();
+      start.uc_stack.ss_size = kStack;
+      start.uc_link = nullptr;
+      makecontext(&start, run_thread, 0);
     }
     for (int left = threads; left > 0;) {
       for (int t = 0; t < threads; ++t) {
         if (contexts[t].done) continue;
         threadIdx.x = unsigned(t);
-        swapcontext(&scheduler, &contexts[t].registers);
+        resume(contexts[t]);
         left -= contexts[t].done;
       }
     }
@@ -148,6 +158,12 @@ inline uint32_t __match_all_sync(uint32_t, uint32_t x, int* agree) {
   const uint64_t* all = cuda_on_host::exchange_in_warp(x);
   *agree = std::all_of(all, all + 32, [&](uint64_t one) { return one == x; });
   return *agree ? 0xffffffff : 0;
+}
+inline uint32_t __match_any_sync(uint32_t, int x) {
+  const uint64_t* all = cuda_on_host::exchange_in_warp(uint32_t(x));
+  uint32_t peers = 0;
+  for (int lane = 0; lane < 32; ++lane) peers |= uint32_t(all[lane] == uint32_t(x)) << lane;
+  return peers;
 }
 inline bool __any_sync(uint32_t lanes, bool x) { return __ballot_sync(lanes, x) != 0; }
 template <class T> T __shfl_sync(uint32_t, T x, int lane) { return cuda_on_host::from_lane(x, lane); }
@@ -176,6 +192,11 @@ extern "C" inline cudaError_t cudaDeviceGetAttribute(int* value, cudaDeviceAttr 
 }
 
 inline int __ffs(uint32_t x) { return __builtin_ffs(int(x)); }
+inline uint32_t __brev(uint32_t x) {
+  uint32_t reversed = 0;
+  for (int bit = 0; bit < 32; ++bit) reversed |= (x >> bit & 1) << (31 - bit);
+  return reversed;
+}
 inline int __popc(uint32_t x) { return __builtin_popcount(x); }
 inline int __clz(uint32_t x) { return x ? __builtin_clz(x) : 32; }
 inline float __int_as_float(int x) {

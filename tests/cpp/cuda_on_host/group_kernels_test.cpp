@@ -1,14 +1,13 @@
 // The kernels for groups of channels, run on the host: they give what compositing pixel by pixel in float64 gives, in
 // either direction, and the same in groups of 8 and of 32, for lists as a whole, in segments, and of all splats. Sums
 // over the pairs of a splat.
-#include <random>
-
 #include "cuda_on_host.h"
 // After it: kernels.
 #include <gtest/gtest.h>
 
 #include "cuda/blend_groups_vjp.cuh"
 #include "cuda/project_vjp.cuh"
+#include "random_splats.h"
 
 namespace ar::cuda {
 
@@ -28,22 +27,15 @@ template <class F> struct Scene {
   Counts counts = {};
 
   /// `largest`: logarithm of the largest variance.
-  Scene(int count, int channels, float most_opaque, float largest = 2) : channels(channels), splats(count) {
+  Scene(int count, int channels, float most_opaque, float largest = 2) : channels(channels) {
     std::mt19937 bits(7);
-    const auto uniform = [&](float low, float high) { return std::uniform_real_distribution<float>(low, high)(bits); };
     const auto fill = [&](std::vector<float>& to, int size, float low, float high) {
       to.resize(size);
-      for (float& x : to) x = uniform(low, high);
+      for (float& x : to) x = uniform(bits, low, high);
     };
-    for (Splat<F, float>& splat : splats) {
-      const float a = std::exp(uniform(-1, largest)), b = std::exp(uniform(-1, largest)), angle = uniform(0, 3.14f);
-      const float c = std::cos(angle), s = std::sin(angle);
-      const Cov2d<float> cov = {a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c, a * b};
-      splat.mean = {uniform(0, kWidth), uniform(0, kHeight)};
-      splat.shape = GaussianFootprint<F::kSamples, true>::prepare_with(cov, 1 / 12.0f);
-      splat.opacity = uniform(0.02f, most_opaque);
-      splat.level = F::level(splat.shape, splat.opacity);
-    }
+    splats = random_splats<F>(bits, count, kGrid, -1, largest, most_opaque, [](const Cov2d<float>& cov) {
+      return GaussianFootprint<F::kSamples, true>::prepare_with(cov, 1 / 12.0f);
+    });
     fill(rows, count * channels, 0, 1);
     fill(background, channels, 0, 1);
     fill(dL_dimage, channels * kPixels, -0.5f, 0.5f);

@@ -151,10 +151,12 @@ TEST(PackedKernels, SplatsAreThoseOfSeparateColumns) {
   std::vector<float> splats[2], covs(4 * n), opacities(n);
   std::vector<uint32_t> keys[2];
   std::vector<PairRange> ranges[2];
+  std::vector<TileMask> masks[2];
   for (int k = 0; k < 2; ++k) {
     splats[k].resize(kSplatWidth * n);
     keys[k].resize(n);
     ranges[k].resize(n);
+    masks[k].resize(n);
     ShapeRowsParams p = {};
     p.n = n;
     p.footprint = scene.footprint;
@@ -162,6 +164,9 @@ TEST(PackedKernels, SplatsAreThoseOfSeparateColumns) {
     p.splats = splats[k].data();
     p.keys = keys[k].data();
     p.ranges = ranges[k].data();
+    p.masks = masks[k].data();
+    Counts counts = {7, 7};
+    p.counts = &counts;
     if (k == 0) {
       p.rows = rows.view();
     } else {
@@ -170,10 +175,13 @@ TEST(PackedKernels, SplatsAreThoseOfSeparateColumns) {
       p.kept_opacities = opacities.data();
     }
     cuda_on_host::launch(kBlocks, kProjectThreads, [&] { shape_rows_kernel(p); });
+    EXPECT_EQ(counts.pairs, 0);
+    EXPECT_EQ(counts.splats, 0);
   }
   EXPECT_TRUE(same(splats[0], splats[1]));
   EXPECT_TRUE(same(keys[0], keys[1]));
   EXPECT_EQ(std::memcmp(ranges[0].data(), ranges[1].data(), n * sizeof(PairRange)), 0);
+  EXPECT_EQ(masks[0], masks[1]);
   EXPECT_TRUE(same(opacities, rows.opacities));
   for (int i = 0; i < n; ++i) {
     EXPECT_EQ(covs[4 * i + 1], rows.cov2d[3 * i + 1]);

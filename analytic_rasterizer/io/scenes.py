@@ -1,0 +1,170 @@
+"""Files of scenes: .ply, compressed .ply and .spz."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+from .common import SceneError, first_line, optional_import
+
+
+class Scene(NamedTuple):
+    """Gaussians ready for the rasterizer. float32, one row each, all on one device."""
+
+    means: torch.Tensor  # (N, 3) world units
+    scales: torch.Tensor  # (N, 3) standard deviations, world units (not their logarithm)
+    rotations: torch.Tensor  # (N, 4) quaternions (w, x, y, z)
+    opacities: torch.Tensor  # (N, 1) in [0, 1] (not their logit)
+    shs: torch.Tensor  # (N, K, 3) spherical harmonics, K = (sh_degree + 1)^2
+    sh_degree: int
+
+    def to(self, device) -> Scene:
+        """The same scene on another device."""
+        return Scene(*(field.to(device) for field in self[:-1]), self.sh_degree)
+
+    def arguments(self) -> dict[str, torch.Tensor]:
+        """The keywords that `GaussianRasterizer` and `render_stages` know these tensors by."""
+        return {
+            "means3D": self.means,
+            "opacities": self.opacities,
+            "shs": self.shs,
+            "scales": self.scales,
+            "rotations": self.rotations,
+        }
+
+
+def load_scene(path) -> Scene:
+    """Reads a 3DGS `.ply`, a compressed `.ply` (PlayCanvas) or an `.spz` (Niantic) on the CPU.
+
+    Scales and opacities come back activated. Axes are those stored in the file: tools that make
+    `.spz` may have turned the scene (y and z negated), and nothing in the file says so.
+
+    Raises SceneError for anything but a complete file with finite values, ImportError without the
+    `cli` extra.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise SceneError(f"{path}: no such file")
+    gsply = optional_import("gsply")
+    try:
+        if path.suffix == ".spz":
+            data = gsply.read_spz(path)
+        elif path.suffix in (".ply", ".ply_compressed"):
+            _check_ply_header(path)
+            data = gsply.plyread(path)
+        else:
+            raise SceneError(f"expected a .ply or .spz file, got {path.suffix or 'no suffix'!r}")
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from None
+    except (ValueError, OSError) as error:
+        raise SceneError(f"{path}: unreadable or cut short ({first_line(error)})") from None
+
+    tensors = [
+        torch.tensor(field, dtype=torch.float32).contiguous()  # a view of the file's rows
+        for field in (data.means, data.scales, data.quats, data.opacities, data.sh0)
+    ]
+    means, log_scales, rotations, logits, sh0 = tensors
+    count = len(means)
+    shs = sh0[:, None]
+    if data.shN is not None and data.shN.size:
+        shs = torch.cat([shs, torch.tensor(data.shN, dtype=torch.float32)], dim=1)
+    scene = Scene(
+        means,
+        log_scales.exp(),
+        rotations,
+        logits.reshape(count, 1).sigmoid(),
+        shs.contiguous(),
+        math.isqrt(shs.shape[1]) - 1,
+    )
+    for name, field in zip(Scene._fields[:-1], scene[:-1]):
+        bad = count - int(field.flatten(1).isfinite().all(1).sum())
+        if bad:
+            raise SceneError(f"{path}: {name} must be finite, got {bad} of {count} rows not")
+    return scene
+
+
+def save_scene(path, scene: Scene, comments: Sequence[str] = ()) -> None:
+    """Writes a scene as `.ply`, `.compressed.ply` or `.spz`, by its name.
+
+    The two small formats round: see their own documentation. Opacities are kept off 0 and 1 by
+    1e-6, where their logit is infinite. `comments` are lines for the header of a `.ply`. Raises
+    SceneError for another suffix, and for comments that cannot be written.
+    """
+    path = Path(path)
+    if path.suffix not in (".ply", ".spz"):
+        raise SceneError(f"{path}: expected a .ply or .spz name, got {path.suffix!r}")
+    if comments and path.suffix != ".ply":
+        raise SceneError(f"{path}: only a .ply holds comments")
+    if any("\n" in comment or not comment.isascii() for comment in comments):
+        raise SceneError(f"{path}: comments must be single lines of ASCII, got {list(comments)}")
+    gsply = optional_import("gsply")
+    cpu = scene.to("cpu")
+    data = gsply.GSData.from_arrays(
+        means=cpu.means.numpy(),
+        scales=cpu.scales.log().numpy(),
+        quats=torch.nn.functional.normalize(cpu.rotations, dim=1).numpy(),
+        opacities=cpu.opacities.reshape(-1).logit(eps=1e-6).numpy(),
+        sh0=cpu.shs[:, 0].numpy(),
+        shN=cpu.shs[:, 1:].numpy(),
+        format="ply",
+    )
+    (gsply.write_spz if path.suffix == ".spz" else gsply.plywrite)(path, data)
+    if comments:
+        content = path.read_bytes()
+        start = content.index(b"\n", content.index(b"\n") + 1) + 1  # "ply", then "format ..."
+        added = "".join(f"comment {comment}\n" for comment in comments).encode()
+        path.write_bytes(content[:start] + added + content[start:])
+
+
+PLY_COLUMNS = (
+    ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+    + [f"scale_{i}" for i in range(3)]
+    + [f"rot_{i}" for i in range(4)]
+)
+
+
+def _check_ply_header(path: Path) -> None:
+    """Says what is wrong with a .ply that gsply would refuse without a reason, or misread: it
+    takes every vertex property for a float, whatever the header says."""
+    lines = ply_header(path)
+    if any(line.startswith("element chunk") for line in lines):
+        return  # compressed: gsply checks the layout
+    layout = next((line.split()[1:2] for line in lines if line.startswith("format")), [])
+    if layout != ["binary_little_endian"]:
+        raise SceneError(f"expected format binary_little_endian, got {' '.join(layout) or 'none'}")
+    elements = [i for i, line in enumerate(lines) if line.startswith("element")]
+    if not elements or not lines[elements[0]].startswith("element vertex "):
+        raise SceneError("expected the vertices as the first element of the .ply")
+    end = elements[1] if len(elements) > 1 else len(lines)
+    kinds = {}
+    for line in lines[elements[0] + 1 : end]:
+        if line.startswith("property "):
+            words = line.split()
+            kinds[words[-1]] = words[1]
+    missing = [name for name in PLY_COLUMNS if name not in kinds]
+    if missing:
+        raise SceneError(f"missing vertex properties {', '.join(missing)}; is it a 3DGS scene?")
+    for name, kind in kinds.items():
+        if kind != "float":
+            raise SceneError(f"vertex property {name} must be float, got {kind}")
+    rest = sum(name.startswith("f_rest_") for name in kinds)
+    if rest not in (0, 9, 24, 45):
+        raise SceneError(f"expected 0, 9, 24 or 45 f_rest properties (SH degree 0 to 3), got {rest}")
+
+
+def ply_header(path: Path) -> list[str]:
+    """The lines of a .ply's header, comments among them. Raises SceneError where it has none."""
+    lines = []
+    with path.open("rb") as file:
+        if file.readline(8).strip() != b"ply":
+            raise SceneError("not a PLY file: it does not begin with 'ply'")
+        for _ in range(1000):  # a .ply that never ends its header is not read whole
+            line = file.readline(1000).decode("latin-1").strip()
+            if line == "end_header":
+                return lines
+            lines.append(line)
+    raise SceneError("the PLY header has no end_header")

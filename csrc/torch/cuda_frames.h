@@ -1,0 +1,69 @@
+// What the CUDA backend keeps from one frame, or one stage, to the next.
+#pragma once
+
+#include <ATen/ops/empty.h>
+#include <c10/cuda/CUDAException.h>
+
+#include <mutex>
+
+#include "cuda/pair_guess.h"
+#include "torch/pointers.h"
+
+namespace ar::ops {
+
+/// The guesses of all image sizes, for all threads.
+class SharedGuesses {
+ public:
+  static SharedGuesses& instance() {
+    static auto* guesses = new SharedGuesses;  // outlives the CUDA context
+    return *guesses;
+  }
+  template <class Use> auto use(Use&& use) {
+    const std::lock_guard lock(mutex_);
+    return use(guesses_);
+  }
+
+ private:
+  SharedGuesses()
+      : words_(at::empty({cuda::PairGuesses::kSlots}, at::TensorOptions().dtype(at::kLong).pinned_memory(true))),
+        guesses_(reinterpret_cast<uint64_t*>(words_.data_ptr<int64_t>())) {}
+
+  std::mutex mutex_;
+  Tensor words_;
+  cuda::PairGuesses guesses_;
+};
+
+inline bool is_capturing(cudaStream_t stream) {
+  cudaStreamCaptureStatus status = cudaStreamCaptureStatusNone;
+  C10_CUDA_CHECK(cudaStreamIsCapturing(stream, &status));
+  return status != cudaStreamCaptureStatusNone;
+}
+
+/// A pair of events, made when the first time is asked for.
+class Laps {
+ public:
+  Laps() = default;
+  Laps(const Laps&) = delete;
+  ~Laps() {
+    for (cudaEvent_t event : events_) {
+      if (event) cudaEventDestroy(event);
+    }
+  }
+  double next(cudaStream_t stream) {
+    cudaEvent_t& now = events_[turn_];
+    const cudaEvent_t before = events_[1 - turn_];
+    turn_ = 1 - turn_;
+    if (!now) C10_CUDA_CHECK(cudaEventCreate(&now));
+    C10_CUDA_CHECK(cudaEventRecord(now, stream));
+    C10_CUDA_CHECK(cudaEventSynchronize(now));
+    float milliseconds = 0;
+    if (before) C10_CUDA_CHECK(cudaEventElapsedTime(&milliseconds, before, now));
+    return milliseconds * 1e-3;
+  }
+
+ private:
+  cudaEvent_t events_[2] = {};
+  int turn_ = 0;
+};
+
+}  // namespace ar::ops

@@ -1,0 +1,81 @@
+// Tensors as structs of the CUDA kernels, and checks of what the kernels read without looking.
+#pragma once
+
+#include "cuda/stages.h"
+#include "torch/backend.h"
+
+namespace ar::ops {
+
+/// What the kernels keep in a tensor of int32.
+template <class Element> Element* structs_of(const Tensor& t) {
+  return reinterpret_cast<Element*>(pointer<int32_t>(t));
+}
+template <class Element> const Element* const_structs_of(const Tensor& t) {
+  return reinterpret_cast<const Element*>(const_pointer<int32_t>(t));
+}
+inline cuda::TileMask* masks_of(const SplatTensors& splats) {
+  return reinterpret_cast<cuda::TileMask*>(pointer<int64_t>(splats.masks));
+}
+inline const cuda::Counts* counts_of(const ListTensors& lists) {
+  return reinterpret_cast<const cuda::Counts*>(const_pointer<int64_t>(lists.counts));
+}
+
+inline constexpr int64_t kCountsWidth = sizeof(cuda::Counts) / sizeof(int64_t);
+
+/// BlendState::chunks begins with the PlanState, in whole rows; TileChunks follow.
+inline constexpr int64_t kChunkWidth = sizeof(cuda::TileChunk) / sizeof(int32_t);
+inline constexpr int64_t kPlanRows = (sizeof(cuda::PlanState) / sizeof(int32_t) + kChunkWidth - 1) / kChunkWidth;
+
+inline cuda::TileLists tile_lists_of(const ListTensors& lists) {
+  cuda::TileLists out = {};
+  out.pairs = const_pointer<int32_t>(lists.pairs);
+  out.stride = int(lists.pairs.size(1));
+  out.tile_offsets = const_pointer<int64_t>(lists.tile_offsets);
+  out.order = const_pointer<int32_t>(lists.ids);
+  out.counts = counts_of(lists);
+  out.n = lists.ids.numel();
+  out.capacity = lists.pairs.size(0);
+  out.tile_samples = const_pointer<int32_t>(lists.tile_samples);
+  return out;
+}
+
+inline cuda::PairSumsView pair_sums_of(const ListTensors& lists, const Tensor& pair_grads) {
+  cuda::PairSumsView out = {};
+  out.n = lists.ids.numel();
+  out.ranges = const_structs_of<cuda::PairRange>(lists.splat_offsets);
+  out.counts = counts_of(lists);
+  out.capacity = lists.pairs.size(0);
+  out.pair_grads = const_pointer<float>(pair_grads);
+  return out;
+}
+
+/// Without `data` the three colours in the splats.
+inline Channels<float> channels_of(const ChannelTensors& channels) {
+  Channels<float> out = {};
+  out.count = int(channels.count);
+  if (!channels.rows.defined()) return out;
+  // A row per Gaussian is one per splat here. Without rows there are no pairs that could read one.
+  static const float kNoRow = 0;
+  out.data = channels.rows.numel() ? const_pointer<float>(channels.rows) : &kNoRow;
+  out.stride = channels.count;
+  return out;
+}
+
+/// What the kernels read without looking: checks.h does not know their sizes.
+inline void check_counts(const ListTensors& lists) {
+  TORCH_CHECK_VALUE(lists.counts.numel() == kCountsWidth, "counts must be what bin returned, got shape ",
+                    lists.counts.sizes());
+}
+inline void check_plan(const BlendState& state) {
+  const Tensor& chunks = state.chunks;
+  TORCH_CHECK_VALUE(chunks.dim() == 2 && chunks.size(0) >= kPlanRows && chunks.size(1) == kChunkWidth &&
+                        chunks.scalar_type() == at::kInt && state.checkpoints.scalar_type() == at::kFloat,
+                    "chunks and checkpoints must be what blend saved, got shape ", chunks.sizes());
+}
+inline void check_segments(const cuda::Segments& segments, TileGrid grid, const BlendState& state) {
+  const int64_t numbers = grid.tiles() * segments.count * segments.samples * kTile * kTile;
+  TORCH_CHECK_VALUE(state.checkpoints.numel() == numbers, "checkpoints must be what blend saved, got shape ",
+                    state.checkpoints.sizes());
+}
+
+}  // namespace ar::ops

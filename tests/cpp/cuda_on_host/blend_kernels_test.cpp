@@ -1,0 +1,157 @@
+// The kernels of blend for three colours, run on the host: they give what compositing the list of a tile pixel by pixel
+// gives, whether it ends in the front or goes through the tail, with or without what a backward pass needs.
+#include <random>
+
+#include "cuda_on_host.h"
+// After it: kernels.
+#include <gtest/gtest.h>
+
+#include "cuda/blend.cuh"
+
+namespace ar::cuda {
+namespace {
+
+constexpr int kWidth = 27, kHeight = 21, kPixels = kWidth * kHeight;
+constexpr TileGrid kGrid = {kWidth, kHeight};
+
+/// `count` random splats, all of which every tile lists. They are up to `beyond` px off the image.
+template <class F> std::vector<Splat<F, float>> make_splats(int count, float most_opaque, float beyond) {
+  std::mt19937 bits(7);
+  const auto uniform = [&](float low, float high) { return std::uniform_real_distribution<float>(low, high)(bits); };
+  std::vector<Splat<F, float>> splats(count);
+  for (Splat<F, float>& splat : splats) {
+    const float a = std::exp(uniform(-1, 3)), b = std::exp(uniform(-1, 3)), angle = uniform(0, 3.14f);
+    const float c = std::cos(angle), s = std::sin(angle);
+    const Cov2d<float> cov = {a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c, a * b};
+    splat.mean = {uniform(-beyond, kWidth + beyond), uniform(-beyond, kHeight + beyond)};
+    splat.shape = GaussianFootprint<F::kSamples, true>::prepare_with(cov, float(kBoxVariance<F::kSamples>));
+    splat.opacity = uniform(0.01f, most_opaque);
+    splat.level = F::level(splat.shape, splat.opacity);
+    splat.color = {uniform(0, 1), uniform(0, 1), uniform(0, 1)};
+  }
+  return splats;
+}
+
+struct Image {
+  std::vector<float> color = std::vector<float>(3 * kPixels), alpha = std::vector<float>(kPixels), transmittance;
+  std::vector<int32_t> last;
+  explicit Image(int samples) : transmittance(samples * kPixels), last(samples * kPixels) {}
+};
+
+constexpr float kBackground[] = {0.2f, 0.5f, 0.9f};
+
+/// A splat after the other, pixel by pixel.
+template <class F> Image expected_image(const std::vector<Splat<F, float>>& splats) {
+  constexpr int S = F::kSamples;
+  Image out(S);
+  for (int pixel = 0; pixel < kPixels; ++pixel) {
+    const int x = pixel % kWidth, y = pixel / kWidth;
+    TileList list = {};
+    list.x0 = x / kTile * kTile, list.y0 = y / kTile * kTile;
+    const Vec2<float> p = {float(x - list.x0), float(y - list.y0)};
+    double color[3] = {}, through = 0;
+    for (int s = 0; s < S; ++s) {
+      float transmittance = 1;
+      for (size_t k = 0; k < splats.size(); ++k) {
+        const Blended<float> b = blend_sample(F::alpha(tile_terms(splats[k], list), p, s), transmittance);
+        if (!b.mask) continue;
+        const Vec3<float>& c = splats[k].color;
+        color[0] += b.contribution * c.x, color[1] += b.contribution * c.y, color[2] += b.contribution * c.z;
+        out.last[s * kPixels + pixel] = int32_t(k) + 1;
+      }
+      out.transmittance[s * kPixels + pixel] = std::abs(transmittance);
+      through += std::abs(transmittance) / S;
+    }
+    for (int c = 0; c < 3; ++c) out.color[c * kPixels + pixel] = float(color[c] / S + through * kBackground[c]);
+    out.alpha[pixel] = float(1 - through);
+  }
+  return out;
+}
+
+/// What the kernels make.
+template <class F, bool kKeep> Image blended_image(const std::vector<Splat<F, float>>& splats) {
+  constexpr int S = F::kSamples, kLength = chunk_length(S);
+  Image out(S);
+  const int tiles = int(kGrid.tiles()), count = int(splats.size()), chunks = (count + kLength - 1) / kLength;
+  const int front = front_chunks(kGrid, S);
+  std::vector<int32_t> pairs, order, planes, open(tiles), open_tiles(kSampleClasses * tiles);
+  std::vector<int64_t> offsets = {0};
+  std::vector<TileChunk> tail;
+  PlanState state = {};
+  BlendParams p = {};
+  p.layout = {3, kKeep};
+  for (int tile = 0; tile < tiles; ++tile) {
+    for (int k = 0; k < count; ++k) pairs.push_back(k);
+    offsets.push_back(int64_t(pairs.size()));
+    order.push_back(tiles - 1 - tile);
+    planes.push_back(state.counts.planes);
+    state.counts.planes += p.layout.tile_planes(kGrid, S, chunks);
+    for (int chunk = front; chunk < chunks; ++chunk) tail.push_back({tile, chunk, 0});
+  }
+  state.counts.tail = int32_t(tail.size());
+  const Counts counts = {int64_t(pairs.size()), count};
+  std::vector<float> checkpoints(size_t(state.counts.planes) * kTilePixels, NAN);
+  p.grid = kGrid;
+  p.splats = &splats[0].mean.x;
+  p.channels.count = 3;
+  p.background = kBackground;
+  p.image = {out.color.data(), 3, {}};
+  p.alpha = out.alpha.data();
+  if (kKeep) p.transmittance = out.transmittance.data(), p.last = out.last.data();
+  p.lists.pairs = pairs.data();
+  p.lists.stride = 1;
+  p.lists.tile_offsets = offsets.data();
+  p.lists.counts = &counts;
+  p.lists.n = count;
+  p.lists.capacity = int64_t(pairs.size());
+  p.plan.state = &state;
+  p.plan.tile_order = order.data();
+  p.plan.tile_planes = planes.data();
+  p.plan.tail = tail.data();
+  p.tile_open = open.data();
+  p.open_tiles = open_tiles.data();
+  p.checkpoints = checkpoints.data();
+  cuda_on_host::launch(tiles, kBlendThreads, [&] { blend_front_kernel<F, 3, kKeep>(p); });
+  cuda_on_host::launch(3, kBlendThreads, [&] { tail_through_kernel<F>(p); });
+  cuda_on_host::launch(3, 32, [&] { tail_scan_kernel<S>(p); });
+  cuda_on_host::launch(3, kBlendThreads, [&] { tail_blend_kernel<F, 3, kKeep>(p); });
+  cuda_on_host::launch(3, 32, [&] { tail_sum_kernel<S, 3, kKeep>(p); });
+  return out;
+}
+
+template <class F, bool kKeep> void expect_blended(int count, float most_opaque, bool exact, float beyond = 4) {
+  const std::vector<Splat<F, float>> splats = make_splats<F>(count, most_opaque, beyond);
+  const Image expected = expected_image<F>(splats), image = blended_image<F, kKeep>(splats);
+  for (size_t i = 0; i < expected.color.size(); ++i) ASSERT_NEAR(image.color[i], expected.color[i], 1e-5) << i;
+  for (size_t i = 0; i < expected.alpha.size(); ++i) ASSERT_NEAR(image.alpha[i], expected.alpha[i], 1e-5) << i;
+  if (!kKeep) return;
+  ASSERT_EQ(image.last, expected.last);
+  for (size_t i = 0; i < expected.transmittance.size(); ++i) {
+    if (exact) ASSERT_EQ(image.transmittance[i], expected.transmittance[i]) << i;
+    ASSERT_NEAR(image.transmittance[i], expected.transmittance[i], 1e-5) << i;
+  }
+}
+
+template <class F> void expect_front_and_tail() {
+  constexpr int kLength = chunk_length(F::kSamples);
+  // Samples stop, in the front.
+  expect_blended<F, true>(kLength - 3, 0.9f, true);
+  expect_blended<F, false>(kLength - 3, 0.9f, true);
+  expect_blended<F, true>(5, 0.9f, true);
+  // None stops, so that no rounding decides where, and the tail has all the other chunks.
+  expect_blended<F, true>(3 * kLength + 70, 0.02f, false);
+  expect_blended<F, false>(3 * kLength + 70, 0.02f, false);
+}
+
+TEST(BlendKernels, OneSample) { expect_front_and_tail<GaussianPixels<1>>(); }
+TEST(BlendKernels, ManyChunks) {
+  using F = GaussianPixels<1>;
+  constexpr int kCount = 70 * chunk_length(1) + 1;
+  expect_blended<F, true>(kCount, 0.02f, false, 80);
+  expect_blended<F, false>(kCount, 0.02f, false, 80);
+}
+TEST(BlendKernels, TwoSamples) { expect_front_and_tail<GaussianPixels<2>>(); }
+TEST(BlendKernels, SixteenSamples) { expect_blended<GaussianPixels<16>, true>(40, 0.9f, true); }
+
+}  // namespace
+}  // namespace ar::cuda

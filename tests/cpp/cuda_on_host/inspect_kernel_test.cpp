@@ -1,0 +1,75 @@
+// The kernel of inspect, run on the host, in tiles of either size that samples that move have.
+#include "cuda_on_host.h"
+// After it: kernels.
+#include <gtest/gtest.h>
+
+#include "cuda/inspect.cuh"
+#include "random_splats.h"
+
+namespace ar::cuda {
+namespace {
+
+constexpr int kWidth = 27, kHeight = 21, kSplats = 60, kUnwritten = -777;
+
+struct Looks {
+  std::vector<int32_t> median = std::vector<int32_t>(kWidth * kHeight, kUnwritten), dominant = median;
+  std::vector<int32_t> touched = std::vector<int32_t>(kSplats), largest = touched, in_front = touched;
+  std::vector<int32_t> dominated = touched;
+  std::vector<int64_t> units = std::vector<int64_t>(kSplats);
+};
+
+/// Of random splats, all of which are in the list of every tile of 2^kBits pixels a side.
+template <int kBits> Looks inspect_tiles() {
+  using F = Moment<1>;
+  constexpr TileGrid grid = {kWidth, kHeight, kBits};
+  std::mt19937 bits(7);
+  const auto splats = random_splats<F>(bits, kSplats, grid, -2, 2, 0.9f,
+                                       [](const Cov2d<float>& cov) { return F::prepare(cov, FootprintOptions{0}); });
+  std::vector<int32_t> pairs;
+  std::vector<int64_t> offsets = {0};
+  for (int tile = 0; tile < grid.tiles(); ++tile) {
+    for (int k = 0; k < kSplats; ++k) pairs.push_back(k);
+    offsets.push_back(int64_t(pairs.size()));
+  }
+  Counts counts = {int64_t(pairs.size()), kSplats};
+  Looks looks;
+  InspectParams params = {};
+  params.splats = &splats[0].mean.x;
+  params.grid = grid;
+  params.lists.pairs = pairs.data();
+  params.lists.stride = 1;
+  params.lists.tile_offsets = offsets.data();
+  params.lists.counts = &counts;
+  params.lists.n = kSplats;
+  params.lists.capacity = int64_t(pairs.size());
+  params.median = looks.median.data();
+  params.dominant = looks.dominant.data();
+  params.touched = looks.touched.data();
+  params.largest = looks.largest.data();
+  params.in_front = looks.in_front.data();
+  params.dominated = looks.dominated.data();
+  params.units = looks.units.data();
+  cuda_on_host::launch(int(grid.tiles()), grid.side() * grid.side(), [&] { inspect_kernel<F, kBits>(params); });
+  return looks;
+}
+
+/// Every pixel is looked at, and the size of tiles changes nothing but how positions are rounded.
+TEST(InspectKernel, LooksAtEveryPixel) {
+  const Looks small = inspect_tiles<kMovingTileBits>(), large = inspect_tiles<kTileBits>();
+  int different = 0;
+  for (int i = 0; i < kWidth * kHeight; ++i) {
+    ASSERT_NE(small.median[i], kUnwritten) << i;
+    ASSERT_NE(large.median[i], kUnwritten) << i;
+    different += small.median[i] != large.median[i] || small.dominant[i] != large.dominant[i];
+  }
+  EXPECT_LE(different, 2);
+  for (int k = 0; k < kSplats; ++k) {
+    EXPECT_NEAR(small.touched[k], large.touched[k], 2) << k;
+    EXPECT_NEAR(double(small.units[k]), double(large.units[k]),
+                1e-4 * double(small.units[k]) + double(weight_units(0.01f)))
+        << k;
+  }
+}
+
+}  // namespace
+}  // namespace ar::cuda

@@ -1,0 +1,35 @@
+// Random splats for the tests of kernels that blend. Include after cuda_on_host.h.
+#pragma once
+
+#include <cmath>
+#include <random>
+#include <vector>
+
+#include "cuda/composite.cuh"
+
+namespace ar::cuda {
+
+inline float uniform(std::mt19937& bits, float low, float high) {
+  return std::uniform_real_distribution<float>(low, high)(bits);
+}
+
+/// Splats anywhere in an image, with standard deviations along axes in any direction, of variances from exp(`low`) to
+/// exp(`high`) px^2. `prepare` makes a footprint's shape of a covariance.
+template <class F, class Prepare>
+std::vector<Splat<F, float>> random_splats(std::mt19937& bits, int count, TileGrid grid, float low, float high,
+                                           float most_opaque, const Prepare& prepare) {
+  std::vector<Splat<F, float>> splats(count);
+  for (Splat<F, float>& splat : splats) {
+    const float a = std::exp(uniform(bits, low, high)), b = std::exp(uniform(bits, low, high));
+    const float angle = uniform(bits, 0, 3.14f), c = std::cos(angle), s = std::sin(angle);
+    const Cov2d<float> cov = {a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c, a * b};
+    splat.mean = {uniform(bits, 0, float(grid.width)), uniform(bits, 0, float(grid.height))};
+    splat.shape = prepare(cov);
+    splat.opacity = uniform(bits, 0.02f, most_opaque);
+    splat.level = F::level(splat.shape, splat.opacity);
+    splat.color = {uniform(bits, 0, 1), uniform(bits, 0, 1), uniform(bits, 0, 1)};
+  }
+  return splats;
+}
+
+}  // namespace ar::cuda
