@@ -357,6 +357,41 @@ def torchrun(scene, out, *options):
     return subprocess.run(program, capture_output=True, text=True, timeout=DEADLINE, env=environment, cwd=out.parent)
 
 
+def as_torchrun_starts(program, *arguments):
+    """What two processes make of a program, each as `run_program` says it, where torchrun would have started them."""
+    store = dist.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)  # as torchrun has one
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": python_path(), "WORLD_SIZE": "2"}
+    environment |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(store.port)}
+    environment |= {"TORCHELASTIC_RUN_ID": "none", "TORCHELASTIC_USE_AGENT_STORE": "True"}
+    done = [None, None]
+
+    def run(rank):
+        done[rank] = run_program(program, *arguments, environment=environment | {"RANK": str(rank)})
+
+    in_threads(2, run)
+    return done
+
+
+def test_nothing_of_a_process_group_outlives_it():
+    """A thread of it that is left may abort the process when Python ends."""
+    program = """
+        import argparse, importlib, pathlib
+        from analytic_rasterizer.cli.launch import ranks_of
+
+        def threads_of_group():
+            names = [path.read_text() for path in pathlib.Path("/proc/self/task").glob("*/comm")]
+            return sum("gloo" in name for name in names)
+
+        with ranks_of(argparse.Namespace(rank_timeout=60.0, device="cpu")) as ranks:
+            assert ranks.exchange(ranks.rank) == [0, 1]
+            importlib.import_module("torch.distributed.nn.functional")  # which longer programs do at some time
+            assert threads_of_group() > 0
+        assert threads_of_group() == 0
+    """
+    done = as_torchrun_starts(program)
+    assert [of_rank.returncode for of_rank in done] == [0, 0], done
+
+
 def test_torchrun_trains_and_writes_once(made, tmp_path):
     """And what it trains is nearer to the pictures than what it starts from."""
     done = torchrun(made / "scene", tmp_path / "out", "--iterations", "121", "--sh-degree", "0", "--export", "mip")
@@ -394,16 +429,7 @@ def test_a_rank_that_dies_ends_all_with_one_message(made, tmp_path, end):
         sys.exit(cli.main(sys.argv[1:]))
     """
     arguments = command(made / "scene", tmp_path / "out", "--iterations", "30")
-    store = dist.TCPStore("127.0.0.1", 0, is_master=True, wait_for_workers=False)  # as torchrun has one
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": python_path(), "WORLD_SIZE": "2"}
-    environment |= {"MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(store.port)}
-    environment |= {"TORCHELASTIC_RUN_ID": "none", "TORCHELASTIC_USE_AGENT_STORE": "True"}
-    done = [None, None]
-
-    def run(rank):
-        done[rank] = run_program(program, *arguments, environment=environment | {"RANK": str(rank)})
-
-    in_threads(2, run)
+    done = as_torchrun_starts(program, *arguments)
     assert all(of_rank.returncode != 0 for of_rank in done)
     messages = [line for of_rank in done for line in of_rank.stderr.splitlines() if line.startswith("error: ")]
     assert len(messages) == 1
