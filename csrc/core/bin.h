@@ -81,12 +81,26 @@ template <typename T, class V> AR_HD Span<V> columns_of(const Support<T>& s, V y
           select(hi < lo, -far, x + slope * right + half_right + reach)};
 }
 
-/// The same for the single row of pixel centres at y and a support without reach.
-template <typename T, class V> AR_HD Span<V> chord_of(const Support<T>& s, V y) {
-  const V dy = y - V(s.mean.y), zero = V(T(0)), far = V(T(1e9));
-  const V square = (V(s.level) - V(s.det2 * s.inv_a) * dy * dy) * V(s.inv_a);
-  const V half = approx_sqrt(max(square, zero)), centre = madd(V(s.slope), dy, V(s.mean.x));
-  return {select(square < zero, far, centre - half), select(square < zero, -far, centre + half)};
+/// What says whether a support reaches boxes of one size. In the coordinates in which the ellipse is a circle,
+/// z = w (x - mean), a box of pixels lies in a box around its centre: where the circle does not reach the second, the
+/// ellipse does not reach the first. This takes neither a division nor a root, but for a box that the ellipse passes
+/// closely it may say yes although the ellipse does not reach it.
+template <typename T> struct BoxReach {
+  Mat2<T> w;
+  Vec2<T> half;  ///< of the box in z
+  T level;
+};
+
+/// `half`: of the boxes, between the centres of their outermost pixels and with the reach of samples [px].
+template <typename T> AR_HD BoxReach<T> make_box_reach(const Mat2<T>& w, T level, Vec2<T> half) {
+  return {
+      w, {abs(w.xx) * half.x + abs(w.xy) * half.y, abs(w.yx) * half.x + abs(w.yy) * half.y}, level + T(kLevelSlack)};
+}
+
+/// Whether the box is reached whose centre is at z.
+template <typename T, class V> AR_HD MaskOf<V> reaches_box(const BoxReach<T>& s, Vec2<V> z) {
+  const V zero = V(T(0)), x = max(abs(z.x) - V(s.half.x), zero), y = max(abs(z.y) - V(s.half.y), zero);
+  return madd(x, x, y * y) <= V(s.level);
 }
 
 /// Integers in [lo, hi] that lie in [0, n), as [first, last]; empty where last < first.

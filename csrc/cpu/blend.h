@@ -1,5 +1,5 @@
-// Loop of blend. Threads share the tiles; within a tile a step of the loop is a splat, and a pack of lanes is a part of
-// a row of the tile's pixels.
+// Loop of blend. Threads share the tiles; within a tile a step of the loop is a splat, and a pack of lanes is a block
+// of the tile's pixels.
 #pragma once
 
 #include <cmath>
@@ -11,17 +11,14 @@
 
 namespace ar::AR_ISA {
 
-/// Rows of a tile with an open sample.
-template <int kSamples, typename T> uint32_t find_open_rows(const T (&transmittance)[kSamples][kTilePixels]) {
+/// The packs of a tile with an open sample.
+template <int kSamples, typename T> PackSet<T> find_open(const T (&transmittance)[kSamples][kTilePixels]) {
   using V = typename LanesOf<T>::Type;
-  uint32_t open = 0;
-  for (int row = 0; row < kTile; ++row) {
+  PackSet<T> open = {};
+  for (int pack = 0; pack < Packs<T>::kCount; ++pack) {
     V largest(T(0));
-    for (int s = 0; s < kSamples; ++s) {
-      for (int x = 0; x < kTile; x += LanesOf<T>::kCount)
-        largest = max(largest, load(transmittance[s] + row * kTile + x, V()));
-    }
-    open |= uint32_t(bits(largest > V(T(0))) != 0) << row;
+    for (int s = 0; s < kSamples; ++s) largest = max(largest, load(transmittance[s] + pack * Packs<T>::kLanes, V()));
+    open.add(pack, bits(largest > V(T(0))) != 0);
   }
   return open;
 }
@@ -32,7 +29,7 @@ AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* color
   using V = typename LanesOf<T>::Type;
   constexpr int kCount = LanesOf<T>::kCount, kSamples = P::kSamples;
   const TileView view(p.grid, tile);
-  const LaneIndex<T> lanes;
+  const TilePixels<T>& of_tile = kTilePixelsOf<T>;
   const int channels = p.channels.count;
   const bool three = channels == 3, keeps = p.last != nullptr;
   alignas(64) T transmittance[kSamples][kTilePixels];
@@ -41,83 +38,77 @@ AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* color
   Places moving;
   std::fill_n(colors, channels * kTilePixels, T(0));
   for (int s = 0; s < kSamples; ++s) {
-    for (int i = 0; i < kTilePixels; ++i) transmittance[s][i] = i % kTile < view.columns ? T(1) : T(-1);
+    std::fill_n(transmittance[s], kTilePixels, T(-1));  // outside the image
+    for_each_run<T>(view, p.grid, [&](int place, int64_t, int count) AR_HD_LAMBDA {
+      std::fill_n(transmittance[s] + place, count, T(1));
+    });
   }
-  const uint32_t rows_in_image = (1u << view.rows) - 1;
-  uint32_t open_rows = rows_in_image;
   const int32_t* pairs = p.lists.pairs;
   const int64_t begin = p.lists.tile_offsets[tile], end = p.lists.tile_offsets[tile + 1];
   TileSplat<P, T> batch[kBatch];
   for (int64_t first = begin; first < end; first += kBatch) {
-    if (first > begin) {
-      open_rows = rows_in_image & find_open_rows<kSamples, T>(transmittance);
-      if (open_rows == 0) break;
-    }
+    const PackSet<T> open = find_open<kSamples, T>(transmittance);
+    if (open.is_empty()) break;
     const int count = int(std::min<int64_t>(kBatch, end - first));
     for (int i = 0; i < count; ++i) {
       const int64_t ahead = first + i + kPrefetch;
       if (ahead < end) prefetch_splat(p.splats, pairs[ahead]);
-      batch[i] = tile_splat(p.splats, pairs[first + i], adapter, view, lanes);
+      batch[i] = tile_splat(p.splats, pairs[first + i], adapter, view);
     }
     for (int i = 0; i < count; ++i) {
       const auto& terms = batch[i].terms;
-      const TileMask<T>& reach = batch[i].reach;
       const T* shown = p.channels.row(pairs[first + i]);
       const Vec3<V> color = three_channels<V>(shown, three);
       const IndexOf<V> index(int32_t(first + i - begin + 1));
-      for (int c = 0; c < TileMask<T>::kPacks; ++c) {
-        const V x = load(lanes.value + c * kCount, V());
-        for (uint32_t rows = reach.rows[c] & open_rows; rows != 0; rows &= rows - 1) {
-          const int row = __builtin_ctz(rows), pixel = row * kTile + c * kCount;
-          const Vec2<V> at = {x, V(lanes.value[row])};
-          V contribution(T(0));
-          if constexpr (P::kMoves) {
-            const Vec2<V> z = P::whitened(terms, at, 0);
-            bool hit = false;
-            for (int group_first = 0; group_first < kSamples; group_first += Places::kGroup) {
-              typename Places::Group group;
-              if (!moving.look(terms, z, group_first, pixel, group)) continue;
-              hit = true;
-              AR_UNROLL
-              for (int j = 0; j < Places::kGroup; ++j) {
-                const int s = group_first + j;
-                V t = load(transmittance[s] + pixel, V());
-                Vec2<V> place = moving.places.at(s, pixel);
-                const Blended<V> blended =
-                    blend_placed_sample<P>(terms, group.z[j], exp2(group.log_alpha[j]), moving.bounds(s), t, place);
-                store(transmittance[s] + pixel, t);
-                moving.places.set(s, pixel, place);
-                contribution = contribution + blended.contribution;
-                if (keeps) {
-                  store_index(last[s] + pixel, select(blended.mask, index, load_index(last[s] + pixel, V())));
-                }
-              }
-            }
-            if (!hit) continue;
-          } else {
+      for_each_pack(batch[i].reach, open, [&](int pixel) AR_HD_LAMBDA {
+        const Vec2<V> at = {load(of_tile.x + pixel, V()), load(of_tile.y + pixel, V())};
+        V contribution(T(0));
+        if constexpr (P::kMoves) {
+          const Vec2<V> z = P::whitened(terms, at, 0);
+          bool hit = false;
+          for (int group_first = 0; group_first < kSamples; group_first += Places::kGroup) {
+            typename Places::Group group;
+            if (!moving.look(terms, z, group_first, pixel, group)) continue;
+            hit = true;
             AR_UNROLL
-            for (int s = 0; s < kSamples; ++s) {
+            for (int j = 0; j < Places::kGroup; ++j) {
+              const int s = group_first + j;
               V t = load(transmittance[s] + pixel, V());
-              const Blended<V> blended = blend_sample(P::alpha(terms, at, s), t);
+              Vec2<V> place = moving.places.at(s, pixel);
+              const Blended<V> blended =
+                  blend_placed_sample<P>(terms, group.z[j], exp2(group.log_alpha[j]), moving.bounds(s), t, place);
               store(transmittance[s] + pixel, t);
+              moving.places.set(s, pixel, place);
               contribution = contribution + blended.contribution;
               if (keeps) {
                 store_index(last[s] + pixel, select(blended.mask, index, load_index(last[s] + pixel, V())));
               }
             }
           }
-          T* to = channels_at(colors, pixel, channels);
-          const auto add = [&](int channel, V value) {
-            T* sum = to + channel * kCount;
-            store(sum, madd(contribution, value, load(sum, V())));
-          };
-          if (three) {
-            add(0, color.x), add(1, color.y), add(2, color.z);
-          } else {
-            for (int channel = 0; channel < channels; ++channel) add(channel, V(shown[channel]));
+          if (!hit) return;
+        } else {
+          AR_UNROLL
+          for (int s = 0; s < kSamples; ++s) {
+            V t = load(transmittance[s] + pixel, V());
+            const Blended<V> blended = blend_sample(P::alpha(terms, at, s), t);
+            store(transmittance[s] + pixel, t);
+            contribution = contribution + blended.contribution;
+            if (keeps) {
+              store_index(last[s] + pixel, select(blended.mask, index, load_index(last[s] + pixel, V())));
+            }
           }
         }
-      }
+        T* to = channels_at(colors, pixel, channels);
+        const auto add = [&](int channel, V value) {
+          T* sum = to + channel * kCount;
+          store(sum, madd(contribution, value, load(sum, V())));
+        };
+        if (three) {
+          add(0, color.x), add(1, color.y), add(2, color.z);
+        } else {
+          for (int channel = 0; channel < channels; ++channel) add(channel, V(shown[channel]));
+        }
+      });
     }
   }
   const int64_t size = int64_t(p.grid.width) * p.grid.height;
@@ -127,8 +118,8 @@ AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* color
       transmittance[s][i] = std::abs(transmittance[s][i]);
       through[i] += transmittance[s][i] / T(kSamples);
     }
-    if (p.transmittance) store_tile(view, p.grid, transmittance[s], p.transmittance + s * size);
-    if (p.last) store_tile(view, p.grid, last[s], p.last + s * size);
+    if (p.transmittance) store_tile<T>(view, p.grid, transmittance[s], p.transmittance + s * size);
+    if (p.last) store_tile<T>(view, p.grid, last[s], p.last + s * size);
   }
   alignas(64) T plane[kTilePixels];
   for (int channel = 0; channel < channels; ++channel) {
@@ -137,11 +128,11 @@ AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* color
       const V sum = load(channels_at(colors, i, channels) + channel * kCount, V());
       store(plane + i, sum / samples + load(through + i, V()) * background);
     }
-    store_tile(view, p.grid, plane, p.image.plane(channel, size));
+    store_tile<T>(view, p.grid, plane, p.image.plane(channel, size));
   }
   if (p.alpha) {
     for (int i = 0; i < kTilePixels; ++i) through[i] = T(1) - through[i];
-    store_tile(view, p.grid, through, p.alpha);
+    store_tile<T>(view, p.grid, through, p.alpha);
   }
 }
 

@@ -16,7 +16,7 @@ void load_gradient(const cpu::BlendVjpParams<T>& p, const TileView& view, int fi
   const int64_t size = int64_t(p.grid.width) * p.grid.height;
   for (int c = 0; c < count; ++c) {
     alignas(64) T plane[kTilePixels] = {};
-    if (const T* image = p.dL_dimage.plane(first + c, size)) load_tile(view, p.grid, image, plane);
+    if (const T* image = p.dL_dimage.plane(first + c, size)) load_tile<T>(view, p.grid, image, plane);
     for (int i = 0; i < kTilePixels; i += kCount)
       store(channels_at(to, i, count) + c * kCount, load(plane + i, V()) / V(samples));
   }
@@ -41,14 +41,6 @@ template <class V, typename T> AR_HD V dot_channels(const T* gradient, const T* 
   return colors + ((sums[0] + sums[1]) + (sums[2] + sums[3]));
 }
 
-/// Rows of a tile with a sample that composited a pair behind `index`, or `index` itself.
-template <class V> AR_HD uint32_t rows_behind(const int32_t (&row_last)[kTile], IndexOf<V> index) {
-  uint32_t rows = 0;
-  for (int row = 0; row < kTile; row += LanesOf<ScalarOf<V>>::kCount)
-    rows |= bits(index < load_index(row_last + row, V())) << row;
-  return rows;
-}
-
 /// `gradient`: room for the channels of a tile. `replay_memory`: null unless samples move. `adapter`: null where rows
 /// hold P's shape.
 template <class P, typename T>
@@ -57,7 +49,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
   using V = typename LanesOf<T>::Type;
   constexpr int kCount = LanesOf<T>::kCount, kSamples = P::kSamples;
   const TileView view(p.grid, tile);
-  const LaneIndex<T> lanes;
+  const TilePixels<T>& of_tile = kTilePixelsOf<T>;
   const int64_t size = int64_t(p.grid.width) * p.grid.height;
   const Vec2<T> size_px = {T(p.grid.width), T(p.grid.height)};
   // What a pair shows enters dL/dalpha with all channels, the sums only with the window's.
@@ -68,7 +60,8 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
   alignas(64) T behind[kSamples][kTilePixels];
   alignas(64) int32_t last[kSamples][kTilePixels] = {};
   alignas(64) T behind_all[kTilePixels] = {};
-  int32_t row_last[kTile] = {}, tile_last = 0;
+  LastPairs<T> pack_last = {};
+  int32_t tile_last = 0;
   load_gradient(p, view, with_shape ? 0 : p.first, loaded, T(kSamples), gradient);
   if (with_shape) {
     for (int i = 0; i < kTilePixels; i += kCount) {
@@ -82,18 +75,21 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
     if (p.dL_dalpha) {
       // Alpha is what hides the background: a channel with a background of -1 and no splats' colours.
       alignas(64) T dL_dalpha[kTilePixels] = {};
-      load_tile(view, p.grid, p.dL_dalpha, dL_dalpha);
+      load_tile<T>(view, p.grid, p.dL_dalpha, dL_dalpha);
       for (int i = 0; i < kTilePixels; ++i) behind_all[i] -= dL_dalpha[i] / T(kSamples);
     }
   }
   for (int s = 0; s < kSamples; ++s) {
     std::fill_n(transmittance[s], kTilePixels, T(1));
-    load_tile(view, p.grid, p.transmittance + s * size, transmittance[s]);
-    load_tile(view, p.grid, p.last + s * size, last[s]);
+    load_tile<T>(view, p.grid, p.transmittance + s * size, transmittance[s]);
+    load_tile<T>(view, p.grid, p.last + s * size, last[s]);
     std::copy_n(behind_all, kTilePixels, behind[s]);
-    for (int i = 0; i < kTilePixels; ++i) row_last[i / kTile] = std::max(row_last[i / kTile], last[s][i]);
+    for (int i = 0; i < kTilePixels; ++i) {
+      int32_t& of_pack = pack_last.of_pack[i / kCount];
+      of_pack = std::max(of_pack, last[s][i]);
+    }
   }
-  for (int row = 0; row < kTile; ++row) tile_last = std::max(tile_last, row_last[row]);
+  for (const int32_t of_pack : pack_last.of_pack) tile_last = std::max(tile_last, of_pack);
   const int32_t* pairs = p.lists.pairs;
   const int64_t begin = p.lists.tile_offsets[tile], end = p.lists.tile_offsets[tile + 1];
   const auto write_zeros = [&](int64_t k) {
@@ -103,7 +99,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
   };
   for (int64_t k = begin + tile_last; k < end; ++k) write_zeros(k);
   TilePairs<P, T> dL_dplaces = {};
-  Replay<P, T> replay({p, view, last, row_last, begin, tile_last, replay_memory});
+  Replay<P, T> replay({p, view, last, pack_last, begin, tile_last, replay_memory});
   // Of the pairs with the same k / kBatch. Where samples move the replay knows the pixels: no batch is needed.
   TileSplat<P, T> batch[P::kMoves ? 1 : kBatch];
   const auto prefetch_before = [&](int32_t k) {
@@ -123,7 +119,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
     } else if (place == kBatch - 1 || k == tile_last - 1) {
       for (int32_t i = place; i >= 0; --i) {
         prefetch_before(k - place + i);
-        batch[i] = tile_splat(p.splats, pairs[begin + k - place + i], adapter, view, lanes);
+        batch[i] = tile_splat(p.splats, pairs[begin + k - place + i], adapter, view);
       }
     }
     const TileSplat<P, T>& prepared = batch[place];
@@ -139,7 +135,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
     if (!three) std::fill_n(sums, count * kCount, T(0));
     Vec2<V> mean_sums = {zero, zero};
     const auto visit = [&](int pixel) AR_HD_LAMBDA {
-      const Vec2<V> at = {load(lanes.value + pixel % kTile, V()), V(lanes.value[pixel / kTile])};
+      const Vec2<V> at = {load(of_tile.x + pixel, V()), load(of_tile.y + pixel, V())};
       const T* g = channels_at(gradient, pixel, loaded);
       V g_color = zero;
       if (loaded == 3) {
@@ -206,12 +202,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
     if constexpr (P::kMoves) {
       while (replay.has(k)) visit(replay.pixel());
     } else {
-      const TileMask<T>& reach = prepared.reach;
-      const uint32_t open_rows = rows_behind<V>(row_last, index);
-      for (int c = 0; c < TileMask<T>::kPacks; ++c) {
-        for (uint32_t rows = reach.rows[c] & open_rows; rows != 0; rows &= rows - 1)
-          visit(__builtin_ctz(rows) * kTile + c * kCount);
-      }
+      for_each_pack(prepared.reach, pack_last.behind(index), visit);
     }
     const V parts[] = {shape.offset.x, shape.offset.y, shape.shape.xx, shape.shape.xy,
                        shape.shape.yy, weighted,       color.x,        color.y};

@@ -72,7 +72,7 @@ template <class P, typename T> struct ReplayTile {
   const cpu::BlendVjpParams<T>& params;
   const TileView& view;
   const int32_t (&last)[P::kSamples][kTilePixels];  ///< pairs up to the last one composited
-  const int32_t (&row_last)[kTile];                 ///< the largest of them in a row of pixels
+  const LastPairs<T>& pack_last;                    ///< the largest of them in a pack
   int64_t begin;                                    ///< of the tile's pairs
   int32_t count;
   T* memory;  ///< cpu::kReplayNumbers numbers
@@ -176,66 +176,61 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
     TileSplat<P, T> batch[kBatch];
     for (int32_t first = from; first < to; first += kBatch) {
       const int count = std::min(kBatch, to - first);
-      uint32_t open_rows = 0;  // a sample was composited into later, which rows outside the image never are
-      for (int row = 0; row < kTile; ++row) open_rows |= uint32_t(first < tile_.row_last[row]) << row;
+      const PackSet<T> open = tile_.pack_last.behind(IndexOf<V>(first));
       for (int i = 0; i < count; ++i) {
         if (first + i + kPrefetch < to) prefetch_splat(p.splats, pairs[first + i + kPrefetch]);
-        batch[i] = tile_splat<P, T>(p.splats, pairs[first + i], nullptr, view, lanes_);
+        batch[i] = tile_splat<P, T>(p.splats, pairs[first + i], nullptr, view);
       }
       for (int32_t k = first; k < first + count; ++k) {
         if (keep && k % spacing_ == 0) kept_states()[k / spacing_] = samples_.places;
         if (log_is_full()) first_ = k, clear_log();
-        find(batch[k - first], k, open_rows);
+        find(batch[k - first], k, open);
       }
     }
   }
 
   /// Composites pair k, and logs what it finds.
-  AR_HD void find(const TileSplat<P, T>& splat, int32_t k, uint32_t open_rows) {
+  AR_HD void find(const TileSplat<P, T>& splat, int32_t k, const PackSet<T>& open) {
     const auto& terms = splat.terms;
     T* top = top_;
     const IndexOf<V> index(k);
-    for (int c = 0; c < TileMask<T>::kPacks; ++c) {
-      const V x = load(lanes_.value + c * kCount, V());
-      for (uint32_t rows = splat.reach.rows[c] & open_rows; rows != 0; rows &= rows - 1) {
-        const int row = __builtin_ctz(rows), pixel = row * kTile + c * kCount;
-        const Vec2<V> z = P::whitened(terms, Vec2<V>{x, V(lanes_.value[row])}, 0);
-        for (int group_first = 0; group_first < kSamples; group_first += kGroup) {
-          typename Places::Group group;
-          if (!samples_.look(terms, z, group_first, pixel, group)) continue;
-          Entry& entry = end_[-entries_ - 1];
-          uint32_t composited = 0;
-          AR_UNROLL
-          for (int j = 0; j < kGroup; ++j) {
-            const int s = group_first + j;
-            const V raw = exp2(group.log_alpha[j]);
-            const MaskOf<V> mask = (raw >= V(T(kAlphaMin))) & (index < load_index(tile_.last[s] + pixel, V()));
-            const uint32_t lanes = bits(mask);
-            entry.lanes[j] = lanes;
-            if (lanes == 0) continue;
-            const V found = select(mask, raw, V(T(0)));
-            const Vec2<V> place = samples_.places.at(s, pixel);
-            const int stored = lanes_stored(lanes, V());
-            store_lanes(top, lanes, found);
-            store_lanes(top + stored, lanes, place.x);
-            store_lanes(top + 2 * stored, lanes, place.y);
-            top += 3 * stored;
-            composited |= lanes;
-            const V moved_by = odds(min(found, V(T(kAlphaMax))));
-            samples_.places.set(s, pixel, P::move_in(terms, group.z[j], moved_by, place, samples_.bounds(s)));
-          }
-          entry.pair = k;
-          entry.pixel = pixel;
-          entry.first = group_first;
-          entries_ += composited != 0;
+    for_each_pack(splat.reach, open, [&](int pixel) AR_HD_LAMBDA {
+      const Vec2<V> at = {load(kTilePixelsOf<T>.x + pixel, V()), load(kTilePixelsOf<T>.y + pixel, V())};
+      const Vec2<V> z = P::whitened(terms, at, 0);
+      for (int group_first = 0; group_first < kSamples; group_first += kGroup) {
+        typename Places::Group group;
+        if (!samples_.look(terms, z, group_first, pixel, group)) continue;
+        Entry& entry = end_[-entries_ - 1];
+        uint32_t composited = 0;
+        AR_UNROLL
+        for (int j = 0; j < kGroup; ++j) {
+          const int s = group_first + j;
+          const V raw = exp2(group.log_alpha[j]);
+          const MaskOf<V> mask = (raw >= V(T(kAlphaMin))) & (index < load_index(tile_.last[s] + pixel, V()));
+          const uint32_t lanes = bits(mask);
+          entry.lanes[j] = lanes;
+          if (lanes == 0) continue;
+          const V found = select(mask, raw, V(T(0)));
+          const Vec2<V> place = samples_.places.at(s, pixel);
+          const int stored = lanes_stored(lanes, V());
+          store_lanes(top, lanes, found);
+          store_lanes(top + stored, lanes, place.x);
+          store_lanes(top + 2 * stored, lanes, place.y);
+          top += 3 * stored;
+          composited |= lanes;
+          const V moved_by = odds(min(found, V(T(kAlphaMax))));
+          samples_.places.set(s, pixel, P::move_in(terms, group.z[j], moved_by, place, samples_.bounds(s)));
         }
+        entry.pair = k;
+        entry.pixel = pixel;
+        entry.first = group_first;
+        entries_ += composited != 0;
       }
-    }
+    });
     top_ = top;
   }
 
   ReplayTile<P, T> tile_;
-  LaneIndex<T> lanes_;
   TilePlaces<P, T> samples_;
   int32_t spacing_;
   int32_t first_;  ///< pair that the log begins with

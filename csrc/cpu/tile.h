@@ -14,6 +14,64 @@ namespace ar::AR_ISA {
 
 inline constexpr int kTilePixels = kTile * kTile;
 
+/// How the pixels of a tile lie in memory: pack by pack, the packs of a column of the tile one behind the other. A pack
+/// is a block of pixels, as square as its lanes allow, because a splat meets fewer of these than parts of rows.
+template <typename T> struct Packs {
+  static constexpr int kLanes = LanesOf<T>::kCount, kCount = kTilePixels / kLanes;
+  static constexpr int kWidth = kLanes >= 8 ? 4 : kLanes >= 4 ? 2 : 1, kHeight = kLanes / kWidth;
+  static constexpr int kColumns = kTile / kWidth, kRows = kTile / kHeight;  ///< of packs
+
+  /// The place of the pixel in column x and row y of the tile.
+  static constexpr int place(int x, int y) {
+    return (x / kWidth * kRows + y / kHeight) * kLanes + y % kHeight * kWidth + x % kWidth;
+  }
+};
+
+/// Column and row of the pixels of a tile; and those of the first pixels of as many packs as there are rows of packs,
+/// or lanes, if these are more.
+template <typename T> struct TilePixels {
+  static constexpr int kFirst = Packs<T>::kRows < Packs<T>::kLanes ? Packs<T>::kLanes : Packs<T>::kRows;
+  alignas(64) T x[kTilePixels] = {}, y[kTilePixels] = {};
+  alignas(64) T left[kFirst] = {}, top[kFirst] = {};
+  constexpr TilePixels() {
+    for (int row = 0; row < kTile; ++row) {
+      for (int column = 0; column < kTile; ++column) {
+        x[Packs<T>::place(column, row)] = T(column);
+        y[Packs<T>::place(column, row)] = T(row);
+      }
+    }
+    for (int pack = 0; pack < kFirst; ++pack) {
+      left[pack] = x[pack * Packs<T>::kLanes];
+      top[pack] = y[pack * Packs<T>::kLanes];
+    }
+  }
+};
+template <typename T> inline constexpr TilePixels<T> kTilePixelsOf = {};
+
+/// A set of packs of a tile: bit i of all words for pack i.
+template <typename T> struct PackSet {
+  static constexpr int kBits = 64;
+  uint64_t words[(Packs<T>::kCount + kBits - 1) / kBits];
+
+  /// Adds the packs from `first` on whose bit is set.
+  AR_HD void add(int first, uint64_t bits) { words[first / kBits] |= bits << first % kBits; }
+  AR_HD bool is_empty() const {
+    uint64_t any = 0;
+    for (const uint64_t word : words) any |= word;
+    return any == 0;
+  }
+};
+
+/// Calls visit(place of the first pixel) for the packs that are in both sets.
+template <typename T, class Visit>
+AR_HD void for_each_pack(const PackSet<T>& a, const PackSet<T>& b, const Visit& visit) {
+  constexpr int kBits = PackSet<T>::kBits;
+  for (int first = 0; first < Packs<T>::kCount; first += kBits) {
+    for (uint64_t word = a.words[first / kBits] & b.words[first / kBits]; word != 0; word &= word - 1)
+      visit((first + __builtin_ctzll(word)) * Packs<T>::kLanes);
+  }
+}
+
 /// The pixels of one tile, and which of them lie in the image.
 struct TileView {
   int x0, y0, columns, rows;
@@ -27,23 +85,32 @@ struct TileView {
   int64_t pixel(TileGrid grid, int row) const { return int64_t(y0 + row) * grid.width + x0; }
 };
 
-/// Copies the part of a tile that lies in the image, rows of `columns`, between image and tile.
-template <typename T> void load_tile(const TileView& view, TileGrid grid, const T* image, T* tile) {
-  for (int y = 0; y < view.rows; ++y)
-    std::memcpy(tile + y * kTile, image + view.pixel(grid, y), view.columns * sizeof(T));
-}
-template <typename T> void store_tile(const TileView& view, TileGrid grid, const T* tile, T* image) {
-  for (int y = 0; y < view.rows; ++y)
-    std::memcpy(image + view.pixel(grid, y), tile + y * kTile, view.columns * sizeof(T));
+/// Calls copy(place in the tile, place in the image, count) for the pixels of a tile that lie in the image, in runs
+/// that are together in both.
+template <typename T, class Copy> AR_HD void for_each_run(const TileView& view, TileGrid grid, const Copy& copy) {
+  constexpr int kWidth = Packs<T>::kWidth;
+  for (int y = 0; y < view.rows; ++y) {
+    const int64_t first = view.pixel(grid, y);
+    int x = 0;
+    for (; x + kWidth <= view.columns; x += kWidth)
+      copy(Packs<T>::place(x, y), first + x, std::integral_constant<int, kWidth>());
+    if (x < view.columns) copy(Packs<T>::place(x, y), first + x, view.columns - x);
+  }
 }
 
-/// 0, 1, 2, ... as scalars, to be loaded as lanes.
-template <typename T> struct LaneIndex {
-  alignas(64) T value[kTile];
-  LaneIndex() {
-    for (int i = 0; i < kTile; ++i) value[i] = T(i);
-  }
-};
+/// Copies the part of a tile that lies in the image, between image and tile. The tile is laid out for lanes of T.
+template <typename T, typename Number>
+void load_tile(const TileView& view, TileGrid grid, const Number* image, Number* tile) {
+  for_each_run<T>(view, grid, [&](int place, int64_t pixel, auto count) AR_HD_LAMBDA {
+    std::memcpy(tile + place, image + pixel, count * sizeof(Number));
+  });
+}
+template <typename T, typename Number>
+void store_tile(const TileView& view, TileGrid grid, const Number* tile, Number* image) {
+  for_each_run<T>(view, grid, [&](int place, int64_t pixel, auto count) AR_HD_LAMBDA {
+    std::memcpy(image + pixel, tile + place, count * sizeof(Number));
+  });
+}
 
 /// The channels of a tile lie pack by pack: those of one pack of pixels side by side, so that whatever their number a
 /// pixel's are together. Channel c of the pack that begins with `pixel` is at pixel * channels + c * lanes.
@@ -54,34 +121,34 @@ template <class V, typename T> AR_HD Vec3<V> three_channels(const T* shown, bool
   return three ? Vec3<V>{V(shown[0]), V(shown[1]), V(shown[2])} : Vec3<V>{V(T(0)), V(T(0)), V(T(0))};
 }
 
-/// The packs of a tile that a splat can reach: bit r of rows[c] for pack c of row r.
-template <typename T> struct TileMask {
-  static constexpr int kCount = LanesOf<T>::kCount, kPacks = kTile / kCount;
-  uint32_t rows[kPacks];
-};
-
-template <class P, typename T>
-AR_HD TileMask<T> reach_of(const Splat<P, T>& splat, const TileView& view, const LaneIndex<T>& lanes) {
+/// The packs of a tile that a splat reaches, and perhaps some that it passes closely.
+template <class P, typename T> AR_HD PackSet<T> reach_of(const Splat<P, T>& splat, const TileView& view) {
   using V = typename LanesOf<T>::Type;
-  constexpr int kCount = TileMask<T>::kCount, kPacks = TileMask<T>::kPacks;
-  const Support<T> support = support_of(splat);
-  TileMask<T> mask = {};
+  constexpr int kLanes = Packs<T>::kLanes, kRows = Packs<T>::kRows, kWidth = Packs<T>::kWidth;
+  constexpr int kTogether = kLanes > kRows ? kLanes / kRows : 1;  // columns of packs that are looked at together
+  const Vec2<T> middle = {T(0.5 * (kWidth - 1)), T(0.5 * (Packs<T>::kHeight - 1))};  // of a pack, from its first pixel
+  const Mat2<T> w = P::ellipse(splat.shape);
+  const BoxReach<T> reach = make_box_reach(w, splat.level, {middle.x + T(P::kReach), middle.y + T(P::kReach)});
+  const Vec2<T> first = {T(view.x0) - splat.mean.x + middle.x, T(view.y0) - splat.mean.y + middle.y};
+  PackSet<T> reached = {};
   const auto look = [&](int row) AR_HD_LAMBDA {
-    const V y = V(T(view.y0)) + load(lanes.value + row, V());
-    const Span<V> span = P::kReach == 0 ? chord_of(support, y) : columns_of(support, y, y);
+    const TilePixels<T>& of_tile = kTilePixelsOf<T>;
+    const Vec2<V> center = {V(first.x) + load(of_tile.left + row, V()), V(first.y) + load(of_tile.top + row, V())};
+    const Vec2<V> z = transform(w, center);
     AR_UNROLL
-    for (int c = 0; c < kPacks; ++c) {
-      const V first = V(T(view.x0 + c * kCount)), last = V(T(view.x0 + c * kCount + kCount - 1));
-      mask.rows[c] |= bits((span.lo <= last) & (span.hi >= first)) << row;
+    for (int c = 0; c < Packs<T>::kColumns; c += kTogether) {
+      const T to_right = T(c * kWidth);
+      reached.add(c * kRows + row,
+                  bits(reaches_box(reach, Vec2<V>{z.x + V(w.xx * to_right), z.y + V(w.yx * to_right)})));
     }
   };
-  if constexpr (kCount == 1) {  // every pixel is a pack of its own: unrolled, the loop takes half of the build
-    for (int row = 0; row < kTile; ++row) look(row);
+  if constexpr (kLanes == 1) {  // every pixel is a pack of its own: unrolled, the loop takes half of the build
+    for (int row = 0; row < kRows; ++row) look(row);
   } else {
     AR_UNROLL
-    for (int row = 0; row < kTile; row += kCount) look(row);
+    for (int row = 0; row < kRows; row += kLanes) look(row);
   }
-  return mask;
+  return reached;
 }
 
 /// How a tile of `adaptive` reads rows whose shape is not P's, so that the loops are compiled for P only. `collect` as
@@ -124,14 +191,28 @@ template <class P, typename T> AR_HD auto terms_in_tile(const Splat<P, T>& splat
 template <class P, typename T> struct TileSplat {
   Splat<P, T> splat;
   decltype(P::terms(splat.shape, T(1), Vec2<T>{})) terms;
-  TileMask<T> reach;
+  PackSet<T> reach;
 };
 template <class P, typename T>
-AR_HD TileSplat<P, T> tile_splat(const T* splats, int32_t j, const RowAdapter<P, T>* adapter, const TileView& view,
-                                 const LaneIndex<T>& lanes) {
+AR_HD TileSplat<P, T> tile_splat(const T* splats, int32_t j, const RowAdapter<P, T>* adapter, const TileView& view) {
   const Splat<P, T> splat = splat_at(splats, j, adapter);
-  return {splat, terms_in_tile<P>(splat, view), reach_of(splat, view, lanes)};
+  return {splat, terms_in_tile<P>(splat, view), reach_of(splat, view)};
 }
+
+/// Of every pack the number of pairs up to the last one that the forward pass composited into one of its samples.
+template <typename T> struct LastPairs {
+  using V = typename LanesOf<T>::Type;
+  alignas(64) int32_t of_pack[Packs<T>::kCount];
+
+  /// The packs with a sample that composited the pair at `index`, or one behind it.
+  AR_HD PackSet<T> behind(IndexOf<V> index) const {
+    PackSet<T> packs = {};
+    AR_UNROLL
+    for (int i = 0; i < Packs<T>::kCount; i += Packs<T>::kLanes)
+      packs.add(i, bits(index < load_index(of_pack + i, V())));
+    return packs;
+  }
+};
 
 /// visit(P{}, adapter) for what footprint F blends a tile with: its own pixels, or for `adaptive` those of the samples
 /// that were chosen. Boxes are the lists of adaptive.h.

@@ -116,16 +116,30 @@ TEST(Bin, ExtentsAreExact) {
     const double left = -highest([&](double y) { return -chord(w, s.level, y).lo; });
     ASSERT_NEAR(columns.hi, s.mean.x + right + r, 1e-7 * size);
     ASSERT_NEAR(columns.lo, s.mean.x + left - r, 1e-7 * size);
-
-    const double y = random.uniform(-1.2, 1.2) * height;
-    const Span<double> row = chord_of(s, s.mean.y + y), exact = chord(w, s.level, y);
-    if (std::abs(y) > height) {
-      ASSERT_LT(row.hi, row.lo);
-    } else {
-      ASSERT_NEAR(row.lo, s.mean.x + exact.lo, 1e-7 * size);
-      ASSERT_NEAR(row.hi, s.mean.x + exact.hi, 1e-7 * size);
-    }
   }
+}
+
+// No box that the ellipse reaches is passed over, and few that lie well outside are not.
+TEST(Bin, BoxesThatTheSupportReaches) {
+  Random random(5);
+  int reached = 0, far = 0, far_reached = 0;
+  for (int trial = 0; trial < search_trials(100000); ++trial) {
+    const auto [w, s] = random_ellipse(random, 0);
+    const Vec2<double> half = {0.5 * random.below(4), 0.5 * random.below(4)};
+    const double size = 1.5 * std::max(s.half_width, s.half_height) + 4;
+    const Vec2<double> center = {random.uniform(-size, size), random.uniform(-size, size)};
+    const double least =
+        least_in(w, {center.x - half.x, center.y - half.y}, {center.x + half.x, center.y + half.y}) / s.level;
+    const bool says = reaches_box(make_box_reach(w, s.level - kLevelSlack, half), transform(w, center));
+    if (least < 1 - 1e-9) {
+      ++reached;
+      ASSERT_TRUE(says) << "trial " << trial << " least " << least;
+    }
+    far += least > 4;
+    far_reached += least > 4 && says;
+  }
+  EXPECT_GT(reached, search_trials(2000));
+  EXPECT_LT(far_reached, 0.02 * far);
 }
 
 TEST(Bin, RangesSurviveAnySpan) {
@@ -152,7 +166,10 @@ SplatRow<float> random_splat(const Footprint& f, Random& random, TileGrid grid) 
   return splat;
 }
 
-/// Whether bin and then blend's own test of a row let a splat reach a pixel.
+/// The blocks of pixels that the CPU's instruction sets composite together.
+constexpr Vec2<int> kBlocks[] = {{1, 1}, {2, 2}, {4, 2}, {4, 4}};
+
+/// Whether bin and then blend's own test of blocks let a splat reach a pixel.
 bool reaches(const Footprint& f, const SplatRow<float>& splat, TileGrid grid, int x, int y) {
   const Support<float> support = support_of(splat, f.index);
   bool touched = false;
@@ -160,8 +177,15 @@ bool reaches(const Footprint& f, const SplatRow<float>& splat, TileGrid grid, in
     const int64_t wanted = int64_t(y / kTile) * grid.columns() + x / kTile;
     for_each_tile(support, grid, [&](int64_t tile) { touched |= tile == wanted; });
   }
-  const Span<float> span = f.reach == 0 ? chord_of(support, float(y)) : columns_of(support, float(y), float(y));
-  return touched && float(x) >= span.lo && float(x) <= span.hi;
+  const Mat2<float> w = f.in_float.ellipse(splat);
+  for (const Vec2<int> block : kBlocks) {
+    const Vec2<float> middle = {0.5f * float(block.x - 1), 0.5f * float(block.y - 1)};
+    const Vec2<float> center = {float(x / block.x * block.x) - splat.mean.x + middle.x,
+                                float(y / block.y * block.y) - splat.mean.y + middle.y};
+    touched &= reaches_box(make_box_reach(w, splat.level, {middle.x + float(f.reach), middle.y + float(f.reach)}),
+                           transform(w, center));
+  }
+  return touched;
 }
 
 // In float, rounding included.
