@@ -221,7 +221,7 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
 #pragma unroll
     for (int s = 0; s < S; ++s) last = max(last, i < 0 ? 0 : params.last[s * image + i]);
     last = warp_max(last);
-    group.subtile_last[b] = last;
+    if (lane == 0 && first == 0) group.subtile_last[b] = last;  // is read behind group_sync()
     tile_last = max(tile_last, last);
   }
   const auto clear_row = [&](int32_t row) {  // of a pair that reaches nothing
