@@ -51,9 +51,9 @@ def ranks_of(args) -> Iterator[Ranks]:
             raise ValueError(f"--device cuda: {torch.cuda.device_count()} CUDA devices, none for process {place}")
         args.device = f"cuda:{place}"
         torch.cuda.set_device(place)
-    # all_gather_object imports this module at some time, and defaults of its functions hold the group of that time:
-    # imported before there is one, it cannot keep the group and its threads beyond destroy_process_group.
-    # A thread that still runs while Python ends may abort the process.
+    # Parts of torch import this module when they are first used, and defaults of its functions hold the group of that
+    # time: imported before there is one, it cannot keep the group and its threads beyond destroy_process_group. A
+    # thread that still runs while Python ends may abort the process.
     importlib.import_module("torch.distributed.nn.functional")
     try:
         dist.init_process_group(backend, timeout=timedelta(seconds=args.rank_timeout))

@@ -1,4 +1,5 @@
-// Which pixels and tiles a splat can touch: exact extents of its support ellipse.
+// Which pixels and tiles a splat can touch: exact extents of its support ellipse, and a cheaper test for blocks of
+// pixels.
 #pragma once
 
 #include "core/footprint/registry.h"
@@ -68,17 +69,15 @@ template <typename T> AR_HD Span<T> rows_of(const Support<T>& s) {
 /// Extent in x of the part of the support with y in [y0, y1] (pixel centres). Exact, because the
 /// intersection of an ellipse and a band is convex: its extremes are at the ellipse's tips or, where
 /// those lie outside the band, at the band's edge towards them.
-template <typename T, class V> AR_HD Span<V> columns_of(const Support<T>& s, V y0, V y1) {
-  const V height = V(s.half_height), zero = V(T(0));
-  const V lo = max(y0 - V(s.mean.y + s.reach), -height), hi = min(y1 - V(s.mean.y - s.reach), height);
-  const V right = min(max(V(s.tip), lo), hi), left = min(max(V(-s.tip), lo), hi);
-  const V ia = V(s.inv_a), level = V(s.level), det2 = V(s.det2);
-  const V half_right = approx_sqrt(max(level - det2 * right * right * ia, zero) * ia);
-  const V half_left = approx_sqrt(max(level - det2 * left * left * ia, zero) * ia);
-  const V slope = V(s.slope), x = V(s.mean.x), reach = V(s.reach);
-  const V far = V(T(1e9));
-  return {select(hi < lo, far, x + slope * left - half_left - reach),
-          select(hi < lo, -far, x + slope * right + half_right + reach)};
+template <typename T> AR_HD Span<T> columns_of(const Support<T>& s, T y0, T y1) {
+  const T height = s.half_height, zero = T(0);
+  const T lo = max(y0 - (s.mean.y + s.reach), -height), hi = min(y1 - (s.mean.y - s.reach), height);
+  const T right = min(max(s.tip, lo), hi), left = min(max(-s.tip, lo), hi);
+  const T half_right = approx_sqrt(max(s.level - s.det2 * right * right * s.inv_a, zero) * s.inv_a);
+  const T half_left = approx_sqrt(max(s.level - s.det2 * left * left * s.inv_a, zero) * s.inv_a);
+  const T far = T(1e9);
+  return {select(hi < lo, far, s.mean.x + s.slope * left - half_left - s.reach),
+          select(hi < lo, -far, s.mean.x + s.slope * right + half_right + s.reach)};
 }
 
 /// What says whether a support reaches boxes of one size. In the coordinates in which the ellipse is a circle,
@@ -91,10 +90,12 @@ template <typename T> struct BoxReach {
   T level;
 };
 
-/// `half`: of the boxes, between the centres of their outermost pixels and with the reach of samples [px].
-template <typename T> AR_HD BoxReach<T> make_box_reach(const Mat2<T>& w, T level, Vec2<T> half) {
-  return {
-      w, {abs(w.xx) * half.x + abs(w.xy) * half.y, abs(w.yx) * half.x + abs(w.yy) * half.y}, level + T(kLevelSlack)};
+/// `half`: of the boxes, between the centres of their outermost pixels and with the reach of samples [px]. `distance`:
+/// in x and in y no box has its centre farther from the mean [px]. Rounding of z grows with it and with w, which
+/// kLevelSlack does not cover for splats much thinner than a pixel.
+template <typename T> AR_HD BoxReach<T> make_box_reach(const Mat2<T>& w, T level, Vec2<T> half, T distance) {
+  const T margin = T(kBoxRounding) * distance, x = half.x + margin, y = half.y + margin;
+  return {w, {abs(w.xx) * x + abs(w.xy) * y, abs(w.yx) * x + abs(w.yy) * y}, level + T(kLevelSlack)};
 }
 
 /// Whether the box is reached whose centre is at z.

@@ -40,6 +40,9 @@ inline constexpr double kPixelVariance = 1.0 / 12.0;
 /// the level (7e-3 for a needle 1000 px long, docs/numerics.md), so rounding never drops a pair.
 inline constexpr double kLevelSlack = 1e-2;
 
+/// Five roundings of float32: what a whitened coordinate errs by, relative to the sum of its two terms.
+inline constexpr double kBoxRounding = 3e-7;
+
 /// A splat is culled where det Sigma [px^4] is not below this, so that nothing derived from it
 /// overflows a float: standard deviations up to 3e7 px pass.
 inline constexpr double kMaxDet = 1e30;

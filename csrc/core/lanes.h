@@ -1,6 +1,6 @@
 // The functions that a value type V must support to run through the per-pixel formulas. Here for the
 // scalars float and double; cpu/pack.h adds packs of floats. A formula written with these names and
-// the arithmetic operators serves a CUDA thread (V = float), a CPU row (V = Pack) and a test (V =
+// the arithmetic operators serves a CUDA thread (V = float), pixels on a CPU (V = Pack) and a test (V =
 // double). `ScalarOf<V>` is the element type, `V::Mask` or bool the result of comparisons.
 #pragma once
 

@@ -102,7 +102,6 @@ AR_HD Pack sqrt(Pack a) {
 #endif
 
 AR_HD Pack divide(Pack a, Pack b) { return a / b; }
-AR_HD Pack approx_sqrt(Pack a) { return sqrt(a); }
 
 /// Lane i in bit i.
 AR_HD uint32_t bits(bool m) { return m; }

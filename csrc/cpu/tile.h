@@ -27,8 +27,8 @@ template <typename T> struct Packs {
   }
 };
 
-/// Column and row of the pixels of a tile; and those of the first pixels of as many packs as there are rows of packs,
-/// or lanes, if these are more.
+/// Column and row of the pixels of a tile. `left` and `top` are those of the first pixel of each pack, for the packs of
+/// the first column and for as many more as one load of lanes reads.
 template <typename T> struct TilePixels {
   static constexpr int kFirst = Packs<T>::kRows < Packs<T>::kLanes ? Packs<T>::kLanes : Packs<T>::kRows;
   alignas(64) T x[kTilePixels] = {}, y[kTilePixels] = {};
@@ -92,8 +92,7 @@ template <typename T, class Copy> AR_HD void for_each_run(const TileView& view, 
   for (int y = 0; y < view.rows; ++y) {
     const int64_t first = view.pixel(grid, y);
     int x = 0;
-    for (; x + kWidth <= view.columns; x += kWidth)
-      copy(Packs<T>::place(x, y), first + x, std::integral_constant<int, kWidth>());
+    for (; x + kWidth <= view.columns; x += kWidth) copy(Packs<T>::place(x, y), first + x, kWidth);
     if (x < view.columns) copy(Packs<T>::place(x, y), first + x, view.columns - x);
   }
 }
@@ -101,13 +100,13 @@ template <typename T, class Copy> AR_HD void for_each_run(const TileView& view, 
 /// Copies the part of a tile that lies in the image, between image and tile. The tile is laid out for lanes of T.
 template <typename T, typename Number>
 void load_tile(const TileView& view, TileGrid grid, const Number* image, Number* tile) {
-  for_each_run<T>(view, grid, [&](int place, int64_t pixel, auto count) AR_HD_LAMBDA {
+  for_each_run<T>(view, grid, [&](int place, int64_t pixel, int count) AR_HD_LAMBDA {
     std::memcpy(tile + place, image + pixel, count * sizeof(Number));
   });
 }
 template <typename T, typename Number>
 void store_tile(const TileView& view, TileGrid grid, const Number* tile, Number* image) {
-  for_each_run<T>(view, grid, [&](int place, int64_t pixel, auto count) AR_HD_LAMBDA {
+  for_each_run<T>(view, grid, [&](int place, int64_t pixel, int count) AR_HD_LAMBDA {
     std::memcpy(image + pixel, tile + place, count * sizeof(Number));
   });
 }
@@ -126,27 +125,31 @@ template <class P, typename T> AR_HD PackSet<T> reach_of(const Splat<P, T>& spla
   using V = typename LanesOf<T>::Type;
   constexpr int kLanes = Packs<T>::kLanes, kRows = Packs<T>::kRows, kWidth = Packs<T>::kWidth;
   constexpr int kTogether = kLanes > kRows ? kLanes / kRows : 1;  // columns of packs that are looked at together
+  static_assert(kRows % kLanes == 0 || kLanes % kRows == 0);
+  static_assert(Packs<T>::kColumns % kTogether == 0);
   const Vec2<T> middle = {T(0.5 * (kWidth - 1)), T(0.5 * (Packs<T>::kHeight - 1))};  // of a pack, from its first pixel
   const Mat2<T> w = P::ellipse(splat.shape);
-  const BoxReach<T> reach = make_box_reach(w, splat.level, {middle.x + T(P::kReach), middle.y + T(P::kReach)});
-  const Vec2<T> first = {T(view.x0) - splat.mean.x + middle.x, T(view.y0) - splat.mean.y + middle.y};
+  const Vec2<T> origin = {T(view.x0) - splat.mean.x, T(view.y0) - splat.mean.y};
+  const BoxReach<T> reach = make_box_reach(w, splat.level, {middle.x + T(P::kReach), middle.y + T(P::kReach)},
+                                           T(kTile) + max(abs(origin.x), abs(origin.y)));
+  const Vec2<T> first = {origin.x + middle.x, origin.y + middle.y};
   PackSet<T> reached = {};
-  const auto look = [&](int row) AR_HD_LAMBDA {
+  const auto look = [&](int pack) AR_HD_LAMBDA {  // at the packs from this one on, and those as high in other columns
     const TilePixels<T>& of_tile = kTilePixelsOf<T>;
-    const Vec2<V> center = {V(first.x) + load(of_tile.left + row, V()), V(first.y) + load(of_tile.top + row, V())};
+    const Vec2<V> center = {V(first.x) + load(of_tile.left + pack, V()), V(first.y) + load(of_tile.top + pack, V())};
     const Vec2<V> z = transform(w, center);
     AR_UNROLL
     for (int c = 0; c < Packs<T>::kColumns; c += kTogether) {
       const T to_right = T(c * kWidth);
-      reached.add(c * kRows + row,
+      reached.add(c * kRows + pack,
                   bits(reaches_box(reach, Vec2<V>{z.x + V(w.xx * to_right), z.y + V(w.yx * to_right)})));
     }
   };
   if constexpr (kLanes == 1) {  // every pixel is a pack of its own: unrolled, the loop takes half of the build
-    for (int row = 0; row < kRows; ++row) look(row);
+    for (int pack = 0; pack < kRows; ++pack) look(pack);
   } else {
     AR_UNROLL
-    for (int row = 0; row < kRows; row += kLanes) look(row);
+    for (int pack = 0; pack < kRows; pack += kLanes) look(pack);
   }
   return reached;
 }

@@ -130,7 +130,7 @@ TEST(Bin, BoxesThatTheSupportReaches) {
     const Vec2<double> center = {random.uniform(-size, size), random.uniform(-size, size)};
     const double least =
         least_in(w, {center.x - half.x, center.y - half.y}, {center.x + half.x, center.y + half.y}) / s.level;
-    const bool says = reaches_box(make_box_reach(w, s.level - kLevelSlack, half), transform(w, center));
+    const bool says = reaches_box(make_box_reach(w, s.level - kLevelSlack, half, size), transform(w, center));
     if (least < 1 - 1e-9) {
       ++reached;
       ASSERT_TRUE(says) << "trial " << trial << " least " << least;
@@ -166,7 +166,7 @@ SplatRow<float> random_splat(const Footprint& f, Random& random, TileGrid grid) 
   return splat;
 }
 
-/// The blocks of pixels that the CPU's instruction sets composite together.
+/// Blocks of pixels like those that the CPU composites together.
 constexpr Vec2<int> kBlocks[] = {{1, 1}, {2, 2}, {4, 2}, {4, 4}};
 
 /// Whether bin and then blend's own test of blocks let a splat reach a pixel.
@@ -182,8 +182,9 @@ bool reaches(const Footprint& f, const SplatRow<float>& splat, TileGrid grid, in
     const Vec2<float> middle = {0.5f * float(block.x - 1), 0.5f * float(block.y - 1)};
     const Vec2<float> center = {float(x / block.x * block.x) - splat.mean.x + middle.x,
                                 float(y / block.y * block.y) - splat.mean.y + middle.y};
-    touched &= reaches_box(make_box_reach(w, splat.level, {middle.x + float(f.reach), middle.y + float(f.reach)}),
-                           transform(w, center));
+    const Vec2<float> half = {middle.x + float(f.reach), middle.y + float(f.reach)};
+    const float distance = std::max(std::abs(center.x), std::abs(center.y));
+    touched &= reaches_box(make_box_reach(w, splat.level, half, distance), transform(w, center));
   }
   return touched;
 }

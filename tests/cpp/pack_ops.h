@@ -1,8 +1,8 @@
 // PackOps of one instruction set: pack_ops_*.cpp include this with the target switched.
 #pragma once
 
-#include "cpu/pack.h"
-#include "instruction_sets.h"
+#include "cpu/tile.h"
+#include "pack_ops_table.h"
 
 namespace ar::AR_ISA {
 
@@ -35,6 +35,14 @@ const test::PackOps kPackOps = {
       store_lanes(stored, lanes, Pack::load(a));
       load_lanes(stored, lanes, Pack::load(otherwise)).store(out);
       return lanes_stored(lanes, Pack());
+    },
+    [](const float* splat, int width, int height, int64_t tile, bool* reached) {
+      const TileView view(TileGrid{width, height}, tile);
+      const PackSet<float> packs = reach_of(splat_at<Point, float>(splat, 0, nullptr), view);
+      for (int i = 0; i < kTilePixels; ++i) {
+        const int pack = Packs<float>::place(i % kTile, i / kTile) / kLanes;
+        reached[i] = packs.words[pack / PackSet<float>::kBits] >> pack % PackSet<float>::kBits & 1;
+      }
     },
 };
 

@@ -1,6 +1,6 @@
 #if defined(__x86_64__)
 #include "cpu/kernels_std.h"
-#include "instruction_sets.h"
+#include "pack_ops_table.h"
 
 #include "cpu/target_avx512.h"
 

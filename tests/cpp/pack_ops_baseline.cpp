@@ -1,5 +1,5 @@
 #include "cpu/kernels_std.h"
-#include "instruction_sets.h"
+#include "pack_ops_table.h"
 
 #define AR_ISA baseline
 #define AR_LANES 4

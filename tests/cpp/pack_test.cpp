@@ -152,6 +152,38 @@ TEST_P(PackTest, LanesComeBack) {
   }
 }
 
+// Splats of `point` without dilation have the largest whitening, with which rounding grows. Means at a pixel's centre
+// show the thinnest of them.
+TEST_P(PackTest, NoPackThatShowsASplatIsPassedOver) {
+  const Footprint& point = footprint_named("point");
+  FootprintOptions options = point.options;
+  options.number = 0;
+  const TileGrid grid = {64, 48};
+  Random random(6);
+  int visible = 0;
+  for (int trial = 0; trial < search_trials(50000); ++trial) {
+    const double s2 = random.log_uniform(1e-7, 1), s1 = s2 * random.log_uniform(1, random.below(2) ? 10 : 1e4);
+    SplatRow<float> splat = {};
+    point.in_float.prepare(rounded<float>(covariance(s1, s2, random.uniform(0, kPi))), options, splat);
+    splat.mean = {float(random.uniform(0, 63)), float(random.uniform(0, 47))};
+    if (trial % 2) splat.mean = {std::round(splat.mean.x), std::round(splat.mean.y)};
+    splat.opacity = float(random.uniform(0.01, 1));
+    splat.level = point.in_float.level(splat);
+    const int column = int(splat.mean.x) / kTile, row = int(splat.mean.y) / kTile;
+    bool reached[kTile * kTile];
+    GetParam().ops.reach(&splat.mean.x, grid.width, grid.height, int64_t(row) * grid.columns() + column, reached);
+    for (int i = 0; i < kTile * kTile; ++i) {
+      float alpha;
+      const Vec2<float> at = {float(column * kTile + i % kTile), float(row * kTile + i / kTile)};
+      point.in_float.alphas(splat, {at.x - splat.mean.x, at.y - splat.mean.y}, &alpha);
+      if (!(alpha >= float(kAlphaMin))) continue;
+      ++visible;
+      ASSERT_TRUE(reached[i]) << "trial " << trial << " alpha " << alpha << " sigma " << s1 << ", " << s2;
+    }
+  }
+  EXPECT_GT(visible, search_trials(50000));
+}
+
 template <typename T> class LanesTest : public ::testing::Test {};
 using Scalars = ::testing::Types<float, double>;
 TYPED_TEST_SUITE(LanesTest, Scalars);
