@@ -37,6 +37,7 @@ from scene_files import load_scene
 from analytic_rasterizer import io
 from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import added_memory
+from analytic_rasterizer.cli.launch import make_group
 from analytic_rasterizer.distributed.exchange import Route
 from analytic_rasterizer.rotations import rotation_matrices
 from analytic_rasterizer.training import TrainingOptions
@@ -111,7 +112,7 @@ def join_group(rank: int, world: int, folder: str, args: argparse.Namespace) -> 
         device = torch.device("cuda", rank)
         torch.cuda.set_device(device)
     backend = "gloo" if args.device == "cpu" else "cpu:gloo,cuda:nccl"
-    dist.init_process_group(backend, init_method=f"file://{folder}/rendezvous", rank=rank, world_size=world)
+    make_group(backend, init_method=f"file://{folder}/rendezvous", rank=rank, world_size=world)
     return device
 
 

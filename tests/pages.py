@@ -9,7 +9,7 @@ import torch
 
 from analytic_rasterizer import io, render_stages, viewer
 
-PATIENCE = 60
+PATIENCE = 600
 """Seconds to wait for the page: drawing in software on a busy machine takes its time."""
 REDUCTIONS = (pytest.param(1, marks=pytest.mark.gate), 2, 4, 8)
 

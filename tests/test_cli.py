@@ -253,7 +253,7 @@ def test_interrupt_of_a_process_is_quiet(files):
     view = io.load_views(files / "views.json")[0]
     io.save_views(files / "views.json", [replace(view, name=f"{i}") for i in range(3000)])
     process = subprocess.Popen(
-        [sys.executable, "-m", "analytic_rasterizer", *arguments(files)],
+        [sys.executable, "-m", "analytic_rasterizer", *arguments(files, "--scale", "8")],  # minutes
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -421,8 +421,10 @@ def test_a_rank_that_dies_ends_all_with_one_message(made, tmp_path, end):
     program = f"""
         import os, signal, sys
         from analytic_rasterizer import cli
+        from analytic_rasterizer.cli import launch
         from analytic_rasterizer.training import sharded
 
+        launch.STORE_TIMEOUT = 600  # s: on a busy machine too the message is counted
         step = sharded.ShardedTrainer.step
 
         def broken(trainer):

@@ -48,7 +48,7 @@ def browser():
     if path is None:
         pytest.skip("needs chromium: make test-browser")
     with playwright.sync_playwright() as runner:
-        launched = runner.chromium.launch(executable_path=path, args=FLAGS)
+        launched = runner.chromium.launch(executable_path=path, args=FLAGS, timeout=1000 * PATIENCE)
         yield launched
         launched.close()
 
@@ -57,6 +57,7 @@ def browser():
 def open_page(browser, url, *, offline=False, init=None, **options):
     """A page of its own context. Fails for anything that the page complains of in its console."""
     context = browser.new_context(viewport={"width": 320, "height": 240}, offline=offline, **options)
+    context.set_default_timeout(1000 * PATIENCE)
     page = context.new_page()
     complaints = []
     page.on("pageerror", lambda error: complaints.append(str(error)))
@@ -414,6 +415,8 @@ def changed_pose(page, act):
     """Pose after `act`, once the address shows it."""
     before = address(page).get("camera")
     act()
+    # The address follows when the camera rests: where events come slowly, it has shown poses on the way.
+    page.evaluate("() => new Promise(done => requestAnimationFrame(() => setTimeout(done, 500)))")
     wait_for(
         page, f"() => new URLSearchParams(location.hash.slice(1)).get('camera') !== {before!r}".replace("None", "null")
     )
@@ -780,6 +783,7 @@ def test_a_frame_of_the_live_viewer_arrives(browser):
     with viewer.LiveViewer(views=[view], footprint="moment:samples=4") as live:
         live.update(scene)
         context = browser.new_context(viewport={"width": view.width, "height": view.height})
+        context.set_default_timeout(1000 * PATIENCE)
         page = context.new_page()
         addresses = []
         page.on("request", lambda request: addresses.append(request.url))

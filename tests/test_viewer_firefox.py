@@ -65,6 +65,7 @@ class Firefox:
         self.receive()
         self.count = 0
         self.ask("WebDriver:NewSession")
+        self.ask("WebDriver:SetTimeouts", script=1000 * PATIENCE, pageLoad=1000 * PATIENCE)
 
     def receive(self):
         digits = b""
@@ -111,7 +112,7 @@ class Firefox:
         self.send("Marionette:Quit", flags=["eForceQuit"])  # it may end before it answers
         self.socket.close()
         try:
-            self.process.wait(PATIENCE)
+            self.process.wait(60)
         except subprocess.TimeoutExpired:  # what was to be tested has been
             self.process.kill()
 
@@ -204,5 +205,5 @@ def test_keys_and_the_address(firefox):
         firefox.press("c")
         wait_for(lambda: "compare=analytic" in firefox.run("return location.hash"))
         firefox.press("?")
-        assert firefox.run("return document.getElementById('help').open")
+        wait_for(lambda: firefox.run("return document.getElementById('help').open"))
         assert firefox.run("return document.getElementById('message').hidden")

@@ -169,6 +169,7 @@ class Browser:
         protocol = f"viser-v{pytest.importorskip('viser').__version__}"
         address = url.replace("http:", "ws:").rstrip("/")  # as the page does
         options |= {"subprotocols": [protocol], "compression": None, "max_size": None}
+        options |= {"open_timeout": DEADLINE, "ping_interval": None}  # of the server a busy machine may hear late
         self.socket = client.connect(address, **options)
         self.controls = {}  # label: uuid
         self.texts = {}  # uuid: HTML

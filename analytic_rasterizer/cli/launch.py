@@ -51,12 +51,8 @@ def ranks_of(args) -> Iterator[Ranks]:
             raise ValueError(f"--device cuda: {torch.cuda.device_count()} CUDA devices, none for process {place}")
         args.device = f"cuda:{place}"
         torch.cuda.set_device(place)
-    # Parts of torch import this module when they are first used, and defaults of its functions hold the group of that
-    # time: imported before there is one, it cannot keep the group and its threads beyond destroy_process_group. A
-    # thread that still runs while Python ends may abort the process.
-    importlib.import_module("torch.distributed.nn.functional")
     try:
-        dist.init_process_group(backend, timeout=timedelta(seconds=args.rank_timeout))
+        make_group(backend, timeout=timedelta(seconds=args.rank_timeout))
         yield Ranks.of_group()
     except RuntimeError as error:
         reason = _reason(str(error), args.rank_timeout)
@@ -64,6 +60,15 @@ def ranks_of(args) -> Iterator[Ranks]:
             raise
         raise RuntimeError(f"{reason} ({str(error).partition(chr(10))[0]})") from error
     dist.destroy_process_group()  # not after an error: it may wait for ranks that are gone
+
+
+def make_group(backend: str, **options) -> None:
+    """init_process_group, such that nothing of the group outlives destroy_process_group."""
+    # Parts of torch import this module when they are first used, and defaults of its functions hold the group of that
+    # time: imported before there is one, it cannot keep the group and its threads beyond destroy_process_group. A
+    # thread that still runs while Python ends may abort the process.
+    importlib.import_module("torch.distributed.nn.functional")
+    dist.init_process_group(backend, **options)
 
 
 def _reason(message: str, timeout: float) -> str | None:

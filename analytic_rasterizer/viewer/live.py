@@ -241,11 +241,12 @@ class LiveViewer:
             control.on_update(ask)
         client.view_name.on_update(lambda _: self._jump(client))
         client.steps.on_click(lambda event: self._step_view(client, event.target.value))
+        # Before the browser is sent anything that its user could answer by moving.
+        handle.camera.on_update(lambda camera: self._move(client, camera))
         with self._changed:
             self._clients[handle.client_id] = client
         self._show_status(client)
         self._jump(client)
-        handle.camera.on_update(lambda camera: self._move(client, camera))
 
     def _disconnect(self, handle) -> None:
         with self._changed:

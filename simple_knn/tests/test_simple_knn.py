@@ -25,7 +25,7 @@ TINY = 2.0**-149
 RELATIVE = 6 * 2.0**-24
 """Of a squared distance: the difference rounds once, which the square doubles, the square once, the sum of three twice.
 Then the mean, added up in float64, rounds once. Second-order terms are below the factor 1.00001 in `assert_close`."""
-DEADLINE = 180
+DEADLINE = 900
 """Seconds after which something counts as hanging."""
 
 needs_cuda = pytest.mark.skipif(
