@@ -85,7 +85,6 @@ template <typename T> AR_HD Span<T> columns_of(const Support<T>& s, T y0, T y1) 
 /// ellipse does not reach the first. This takes neither a division nor a root, but for a box that the ellipse passes
 /// closely it may say yes although the ellipse does not reach it.
 template <typename T> struct BoxReach {
-  Mat2<T> w;
   Vec2<T> half;  ///< of the box in z
   T level;
 };
@@ -95,7 +94,7 @@ template <typename T> struct BoxReach {
 /// kLevelSlack does not cover for splats much thinner than a pixel.
 template <typename T> AR_HD BoxReach<T> make_box_reach(const Mat2<T>& w, T level, Vec2<T> half, T distance) {
   const T margin = T(kBoxRounding) * distance, x = half.x + margin, y = half.y + margin;
-  return {w, {abs(w.xx) * x + abs(w.xy) * y, abs(w.yx) * x + abs(w.yy) * y}, level + T(kLevelSlack)};
+  return {{abs(w.xx) * x + abs(w.xy) * y, abs(w.yx) * x + abs(w.yy) * y}, level + T(kLevelSlack)};
 }
 
 /// Whether the box is reached whose centre is at z.
