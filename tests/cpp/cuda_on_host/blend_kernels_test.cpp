@@ -7,6 +7,7 @@
 #include <gtest/gtest.h>
 
 #include "cuda/blend.cuh"
+#include "random_splats.h"
 
 namespace ar::cuda {
 namespace {
@@ -17,19 +18,10 @@ constexpr TileGrid kGrid = {kWidth, kHeight};
 /// `count` random splats, all of which every tile lists. They are up to `beyond` px off the image.
 template <class F> std::vector<Splat<F, float>> make_splats(int count, float most_opaque, float beyond) {
   std::mt19937 bits(7);
-  const auto uniform = [&](float low, float high) { return std::uniform_real_distribution<float>(low, high)(bits); };
-  std::vector<Splat<F, float>> splats(count);
-  for (Splat<F, float>& splat : splats) {
-    const float a = std::exp(uniform(-1, 3)), b = std::exp(uniform(-1, 3)), angle = uniform(0, 3.14f);
-    const float c = std::cos(angle), s = std::sin(angle);
-    const Cov2d<float> cov = {a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c, a * b};
-    splat.mean = {uniform(-beyond, kWidth + beyond), uniform(-beyond, kHeight + beyond)};
-    splat.shape = GaussianFootprint<F::kSamples, true>::prepare_with(cov, float(kBoxVariance<F::kSamples>));
-    splat.opacity = uniform(0.01f, most_opaque);
-    splat.level = F::level(splat.shape, splat.opacity);
-    splat.color = {uniform(0, 1), uniform(0, 1), uniform(0, 1)};
-  }
-  return splats;
+  const auto prepare = [](const Cov2d<float>& cov) {
+    return GaussianFootprint<F::kSamples, true>::prepare_with(cov, float(kBoxVariance<F::kSamples>));
+  };
+  return random_splats<F>(bits, count, kGrid, -1, 3, most_opaque, prepare, beyond);
 }
 
 struct Image {
@@ -98,12 +90,7 @@ template <class F, bool kKeep> Image blended_image(const std::vector<Splat<F, fl
   p.image = {out.color.data(), 3, {}};
   p.alpha = out.alpha.data();
   if (kKeep) p.transmittance = out.transmittance.data(), p.last = out.last.data();
-  p.lists.pairs = pairs.data();
-  p.lists.stride = 1;
-  p.lists.tile_offsets = offsets.data();
-  p.lists.counts = &counts;
-  p.lists.n = count;
-  p.lists.capacity = int64_t(pairs.size());
+  p.lists = lists_of(pairs, offsets, counts);
   p.plan.state = &state;
   p.plan.tile_order = order.data();
   p.plan.tile_planes = planes.data();

@@ -50,14 +50,9 @@ template <class F> struct Scene {
 
   /// `overflow`: there are more pairs than room, so that no list was made.
   TileLists lists(bool overflow) const {
-    TileLists out = {};
-    out.pairs = &pairs[0].splat;
-    out.stride = 2;
-    out.tile_offsets = offsets.data();
+    TileLists out = lists_of(pairs, offsets, counts);
     out.order = order.data();
-    out.counts = &counts;
-    out.n = int64_t(splats.size());
-    out.capacity = int64_t(pairs.size()) - overflow;
+    out.capacity -= overflow;
     return out;
   }
 };

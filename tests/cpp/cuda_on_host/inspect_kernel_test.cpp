@@ -36,12 +36,7 @@ template <int kBits> Looks inspect_tiles() {
   InspectParams params = {};
   params.splats = &splats[0].mean.x;
   params.grid = grid;
-  params.lists.pairs = pairs.data();
-  params.lists.stride = 1;
-  params.lists.tile_offsets = offsets.data();
-  params.lists.counts = &counts;
-  params.lists.n = kSplats;
-  params.lists.capacity = int64_t(pairs.size());
+  params.lists = lists_of(pairs, offsets, counts);
   params.median = looks.median.data();
   params.dominant = looks.dominant.data();
   params.touched = looks.touched.data();

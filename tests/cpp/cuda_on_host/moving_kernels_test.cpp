@@ -36,12 +36,7 @@ template <class F> struct Scene {
       offsets.push_back(int64_t(pairs.size()));
     }
     counts = {int64_t(pairs.size()), count};
-    lists.pairs = &pairs[0].splat;
-    lists.stride = 2;
-    lists.tile_offsets = offsets.data();
-    lists.counts = &counts;
-    lists.n = count;
-    lists.capacity = int64_t(pairs.size());
+    lists = lists_of(pairs, offsets, counts);
   }
 };
 

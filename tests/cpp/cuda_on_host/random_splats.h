@@ -1,4 +1,4 @@
-// Random splats for the tests of kernels that blend. Include after cuda_on_host.h.
+// Random splats, and lists of them, for the tests of kernels that blend. Include after cuda_on_host.h.
 #pragma once
 
 #include <cmath>
@@ -13,23 +13,37 @@ inline float uniform(std::mt19937& bits, float low, float high) {
   return std::uniform_real_distribution<float>(low, high)(bits);
 }
 
-/// Splats anywhere in an image, with standard deviations along axes in any direction, of variances from exp(`low`) to
-/// exp(`high`) px^2. `prepare` makes a footprint's shape of a covariance.
+/// Splats anywhere in an image and up to `beyond` px off it, with standard deviations along axes in any direction, of
+/// variances from exp(`low`) to exp(`high`) px^2. `prepare` makes a footprint's shape of a covariance.
 template <class F, class Prepare>
 std::vector<Splat<F, float>> random_splats(std::mt19937& bits, int count, TileGrid grid, float low, float high,
-                                           float most_opaque, const Prepare& prepare) {
+                                           float most_opaque, const Prepare& prepare, float beyond = 0) {
   std::vector<Splat<F, float>> splats(count);
   for (Splat<F, float>& splat : splats) {
     const float a = std::exp(uniform(bits, low, high)), b = std::exp(uniform(bits, low, high));
     const float angle = uniform(bits, 0, 3.14f), c = std::cos(angle), s = std::sin(angle);
     const Cov2d<float> cov = {a * c * c + b * s * s, (a - b) * c * s, a * s * s + b * c * c, a * b};
-    splat.mean = {uniform(bits, 0, float(grid.width)), uniform(bits, 0, float(grid.height))};
+    splat.mean = {uniform(bits, -beyond, float(grid.width) + beyond),
+                  uniform(bits, -beyond, float(grid.height) + beyond)};
     splat.shape = prepare(cov);
     splat.opacity = uniform(bits, 0.02f, most_opaque);
     splat.level = F::level(splat.shape, splat.opacity);
     splat.color = {uniform(bits, 0, 1), uniform(bits, 0, 1), uniform(bits, 0, 1)};
   }
   return splats;
+}
+
+/// Lists of pairs that lie tile by tile: splats, or splats with slots. They point into what is given.
+template <class Pair>
+TileLists lists_of(const std::vector<Pair>& pairs, const std::vector<int64_t>& tile_offsets, const Counts& counts) {
+  TileLists lists = {};
+  lists.pairs = reinterpret_cast<const int32_t*>(pairs.data());
+  lists.stride = int(sizeof(Pair) / sizeof(int32_t));
+  lists.tile_offsets = tile_offsets.data();
+  lists.counts = &counts;
+  lists.n = counts.splats;
+  lists.capacity = int64_t(pairs.size());
+  return lists;
 }
 
 }  // namespace ar::cuda

@@ -68,13 +68,9 @@ template <class F> struct Scene {
     params.last = last.data();
     params.dL_dimage = {dL_dimage.data(), kColors, {}};
     params.dL_dalpha = dL_dalpha.data();
-    params.lists.pairs = &pairs[0].splat;
-    params.lists.stride = 2;
-    params.lists.tile_offsets = offsets.data();
+    params.lists = lists_of(pairs, offsets, counts);
     params.lists.order = order.data();
-    params.lists.counts = &counts;
-    params.lists.n = count;
-    params.lists.capacity = int64_t(pairs.size()) - overflow;
+    params.lists.capacity -= overflow;
     params.plan = &plan;
     params.chunk_order = chunks.data();
     params.checkpoints = checkpoints.data();
