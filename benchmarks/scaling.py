@@ -62,7 +62,7 @@ def main() -> None:
     if args.out:
         out = Path(args.out)
         out.mkdir(parents=True, exist_ok=True)
-        tables.save_figure(plot_rows(rows, args.device), out, "scaling")
+        tables.save_figure(plot_rows(rows, describe_machine(args.device)), out, "scaling")
         if by_threads:
             tables.save_figure(plot_threads(by_threads), out, "threads")
     save_json(args, {"rows": rows, "threads": by_threads})
@@ -228,27 +228,32 @@ def format_threads(by_threads: dict[int, dict]) -> str:
     return tables.format_table(header, rows)
 
 
-def plot_rows(rows: list[dict], device: str):
+def plot_rows(rows: list[dict], machine: str):
     """Above: time per pair. Below: memory per pair and per pixel. Left: as Gaussians grow. Right: as pixels do."""
-    figure, axes = tables.new_figure(11, 7, 2, 2, sharex="col", sharey="row")
-    labels = {"gaussians": "Gaussians", "pixels": "pixels"}
-    for column, (series, label) in enumerate(labels.items()):
-        kept = [row for row in rows if row["series"] == series and "error" not in row]
+    figure, axes = tables.new_figure(8, 6, 2, 2, sharex="col", sharey="row")
+    for column, series in enumerate(("gaussians", "pixels")):
+        of_series = [row for row in rows if row["series"] == series]
+        kept = [row for row in of_series if "error" not in row]
         pixels = [row["width"] * row["height"] for row in kept]
         x = pixels if series == "pixels" else [row["gaussians"] for row in kept]
         time, memory = axes[:, column]
         for part in PARTS:
             time.plot(x, [per_pair(row, part) for row in kept], "o-", color=COLORS[part], label=part)
-        memory.plot(x, [per_pair(row, "memory_bytes") for row in kept], "s-", color="#7048e8", label="per pair")
-        per_pixel = [row["memory_bytes"] / count for row, count in zip(kept, pixels)]
+        per_pixel = [row["memory_bytes"] / area for row, area in zip(kept, pixels)]
         memory.plot(x, per_pixel, "D-", color="#7a7f87", label="per pixel")
-        memory.set_xlabel(label)
+        memory.plot(x, [per_pair(row, "memory_bytes") for row in kept], "s-", color="#7048e8", label="per pair")
+        count, width, height = (of_series[-1][key] for key in ("gaussians", "width", "height"))
+        density = f"pixels, {count / (width * height):.2g} Gaussians in each"
+        memory.set_xlabel(density if series == "pixels" else f"Gaussians in {width}x{height}")
         for ax in (time, memory):
-            ax.set_yscale("log")
-    axes[0, 0].set_ylabel("ns per pair")
-    axes[1, 0].set_ylabel(f"bytes {memory_name(device)}")
-    axes[0, 0].legend(frameon=False, fontsize=9)
-    tables.add_titles(figure, axes, describe_machine(device))
+            ax.set(xscale="log", yscale="log")
+            ax.yaxis.set_major_formatter("{x:g}")
+            ax.tick_params("x", which="minor", labelbottom=False)
+    for [ax, _], label in zip(axes, ("time per pair [ns]", "memory [bytes]")):
+        ax.set_ylabel(label)
+    for ax in axes[:, 1]:
+        ax.legend(frameon=False, fontsize=9, reverse=True)
+    figure.suptitle(machine, fontsize=11)
     return figure
 
 
