@@ -311,7 +311,7 @@ __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThr
 }
 
 /// Samples shared out so that there is least to do, forwards and backwards, in tiles of the size of moving_grid().
-/// Small images are blended by blend_listed.cuh and differentiated in segments (blend_moving_vjp.cuh): their few tiles
+/// Small images are blended by blend_listed.cuh and differentiated in segments (blend_moving_maps.cuh): their few tiles
 /// have long lists, and the time is that of the longest.
 template <class F, bool kBackward, bool kSmall>
 using EvenLayout =

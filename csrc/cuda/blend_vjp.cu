@@ -1,5 +1,6 @@
 // Launches of blend_vjp.
 #include "cuda/blend_groups_vjp.cuh"
+#include "cuda/blend_moving_maps.cuh"
 #include "cuda/blend_moving_vjp.cuh"
 #include "cuda/blend_vjp.cuh"
 

@@ -6,6 +6,7 @@
 
 #include "core/inspect.h"
 #include "cuda/blend_listed.cuh"
+#include "cuda/blend_moving_maps.cuh"
 #include "cuda/blend_moving_vjp.cuh"
 #include "random_splats.h"
 

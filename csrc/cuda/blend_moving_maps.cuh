@@ -1,0 +1,191 @@
+// Segments of the lists of small images, and what goes through them backwards, for footprints whose samples move.
+//
+// In small images a block has a segment of a tile's list, so that long lists are differentiated side by side. What the
+// samples carry from splat to splat on the way back goes through a segment as an affine map. So one kernel finds the
+// map of every segment, from front to back, and another chains them from the last segment to the first. Then that of
+// blend_moving_vjp.cuh has the sums, each segment from what it gets from behind.
+#pragma once
+
+#include <algorithm>
+
+#include "cuda/blend_moving_grads.cuh"
+#include "cuda/tile_pieces.cuh"
+
+namespace ar::cuda {
+
+/// What a sample carries from a splat to the one in front of it: the gradient-weighted colour behind, and the gradient
+/// with respect to its place.
+struct Adjoint {
+  float behind;
+  Vec2<float> dL_dplace;
+};
+
+/// How that goes through a segment: the image of zero, and what a change of each of the three numbers adds. A change of
+/// the place does not reach `behind`.
+struct SegmentMap {
+  static constexpr int kNumbers = 10;
+  Adjoint of_zero, by_behind;
+  Vec2<float> by_x, by_y;
+
+  __device__ Adjoint operator()(const Adjoint& a) const {
+    const auto place = [&](float zero, float behind, float x, float y) {
+      return madd(y, a.dL_dplace.y, madd(x, a.dL_dplace.x, madd(behind, a.behind, zero)));
+    };
+    return {madd(by_behind.behind, a.behind, of_zero.behind),
+            {place(of_zero.dL_dplace.x, by_behind.dL_dplace.x, by_x.x, by_y.x),
+             place(of_zero.dL_dplace.y, by_behind.dL_dplace.y, by_x.y, by_y.y)}};
+  }
+};
+
+/// Where the maps of a pixel's sample are. In place of `of_zero` of a segment is, in the end, what its front gives to
+/// the segment before.
+template <class F> struct MapMemory {
+  static constexpr int kPlane = F::kSamples * kMovingPixels;
+  float* first;  ///< of the sample
+
+  __device__ MapMemory(float* maps, int sample, int pixel_number) : first(maps + pixel_number * F::kSamples + sample) {}
+  __device__ float& at(int64_t piece, int number) const {
+    return first[(piece * SegmentMap::kNumbers + number) * kPlane];
+  }
+  __device__ Adjoint adjoint(int64_t piece, int number = 0) const {
+    return {at(piece, number), {at(piece, number + 1), at(piece, number + 2)}};
+  }
+  __device__ SegmentMap map(int64_t piece) const {
+    return {adjoint(piece), adjoint(piece, 3), {at(piece, 6), at(piece, 7)}, {at(piece, 8), at(piece, 9)}};
+  }
+  __device__ void put(int64_t piece, const Adjoint& a, int number = 0) const {
+    at(piece, number) = a.behind;
+    at(piece, number + 1) = a.dL_dplace.x;
+    at(piece, number + 2) = a.dL_dplace.y;
+  }
+  __device__ void put(int64_t piece, const SegmentMap& m) const {
+    put(piece, m.of_zero);
+    put(piece, m.by_behind, 3);
+    at(piece, 6) = m.by_x.x, at(piece, 7) = m.by_x.y;
+    at(piece, 8) = m.by_y.x, at(piece, 9) = m.by_y.y;
+  }
+};
+
+/// Pairs of a segment. Longer ones need fewer maps, which count where there are many samples; shorter ones fill a
+/// device with smaller scenes.
+template <class F> inline constexpr int kMovingSegment = F::kSamples <= 4 ? 512 : 1024;
+/// Samples shared out for segments, of which there are many, with small splats: few pixels per warp, and blocks small
+/// enough for two on an SM. A single sample has a lane, so that none is idle.
+template <class F>
+using SegmentLayout = CellLayout<F::kSamples <= 4 ? 1 : 2, F::kSamples == 1   ? 1
+                                                           : F::kSamples == 4 ? 4
+                                                                              : 8>;
+
+/// Samples shared out for the maps of segments, which no lanes add up: with many cells a sample to a lane, so that a
+/// warp has few pixels and passes over more splats. A block has 16 warps at most.
+template <class F>
+using MapLayout = std::conditional_t<(F::kSamples > 4), CellLayout<1, 16, kMovingTile, 16>, SegmentLayout<F>>;
+
+/// A block per segment of kSegment pairs and part of a tile: the maps of its samples, but of the first segments of
+/// tiles, which nobody needs.
+template <class F, int C, int kSegment, class Layout = MapLayout<F>>
+__global__ void __launch_bounds__(Layout::kThreads, 1024 / Layout::kThreads)
+    segment_maps_kernel(const BlendVjpParams params, int first) {
+  using Samples = MovingSamples<F, Layout, true>;
+  constexpr int kCells = Layout::kCells, kBatch = std::min(Layout::kThreads, 256);
+  __shared__ MovingStage<F, C, Layout, kBatch> stage;
+  __shared__ int last_of_warps[Layout::kWarps];
+  const int64_t number = int(blockIdx.x) / Layout::kBlocks;  // of the piece
+  const TilePiece piece = find_piece(params.lists, params.grid, kSegment, number);
+  if (piece.tile < 0 || piece.index == 0) return;
+  const TileList list = list_of(params.lists, params.grid, piece.tile);
+  const StatePlaces places(params.lists, list, params.grid, piece.tile);
+  const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
+  const Vec2<float> p = Layout::pixel();
+  const Pixel pixel(list, params.grid, p);
+  const SampleGrad<F, C> grad(params, pixel, first);
+  const CellCorners<F, Layout> corners(p);
+  Samples samples(pixel.inside);
+  const LastSplats<F, Layout> last(params.last, pixel, last_of_warps);
+  const int begin = piece.index * kSegment, end = begin + kSegment, stop = min(last.block, end);
+  samples.load(params.checkpoints + (places.first + begin / kStateChunk - 1) * Samples::kCheckpoint, begin,
+               last.samples);
+  AdjointMap<float> maps[kCells];
+  float before[kCells];  // the transmittance
+#pragma unroll
+  for (int i = 0; i < kCells; ++i) {
+    maps[i] = {0, {0, 0}, {0, 0}, {1, 0, 0, 1}};
+    before[i] = samples.transmittance[i];
+  }
+  int32_t id = stage.splat_of(list, begin, stop);
+  for (int k = begin; k < stop; k += kBatch) {
+    const int count = min(kBatch, min(last.warp, stop) - k);  // of what this warp needs
+    const int32_t next_id = stage.splat_of(list, k + kBatch, stop);
+    __syncthreads();  // all have read the last batch
+    stage.load(splats, params.channels, first, list, id);
+    __syncthreads();
+    if (next_id >= 0) prefetch(splats + next_id);  // so that the next batch need not wait for memory
+    id = next_id;
+    for (int from = 0; from < count; from += 32) {
+      for (uint32_t left = stage.reached(from); left != 0;) {
+        const int j = from + take_first(left);
+        TileSplatRef<F, C> splat = stage.splats[j];
+        const Vec2<float> row = corners.row(splat.terms);
+        Vec2<float> z[kCells];
+        float raw[kCells];
+        bool mask[kCells], any = false;
+#pragma unroll
+        for (int i = 0; i < kCells; ++i) {
+          z[i] = corners.node(splat.terms, row, i, samples.place[i]);
+          raw[i] = exp2(F::log_alpha(splat.terms, z[i]));
+          mask[i] = raw[i] >= float(kAlphaMin) && k + j < last.samples[i];
+          any |= mask[i];
+        }
+        if (!__any_sync(kAllLanes, any)) continue;
+        const float g_color = grad.times(splat.channels, params, pixel, [&] { return list.splat(k + j); });
+#pragma unroll
+        for (int i = 0; i < kCells; ++i)
+          map_placed_sample<F>(splat.terms, z[i], raw[i], mask[i], UnitCell<F::kSide>(), g_color,
+                               samples.transmittance[i], samples.place[i], maps[i]);
+      }
+    }
+  }
+#pragma unroll
+  for (int i = 0; i < kCells; ++i) {
+    if (last.samples[i] <= begin) continue;
+    const AdjointMap<float>& m = maps[i];
+    SegmentMap map = {{divide(m.color, before[i]), m.of_color},
+                      {divide(samples.transmittance[i], before[i]), m.of_behind},
+                      {m.of_place.xx, m.of_place.yx},
+                      {m.of_place.xy, m.of_place.yy}};
+    // Behind the segment with a sample's last splat is the background.
+    if (last.samples[i] <= end) map.of_zero = map({grad.through, {0, 0}});
+    MapMemory<F>(params.adjoint_maps, Layout::first_sample() + i, Layout::pixel_number()).put(number, map);
+  }
+}
+
+/// A thread per sample of a tile: from the maps of its segments to what each gets from behind.
+template <class F, int kSegment>
+__global__ void __launch_bounds__(kMovingPixels) chain_maps_kernel(const BlendVjpParams params) {
+  constexpr int S = F::kSamples;
+  const int tile = int(blockIdx.x) / S, t = int(blockIdx.x) % S * kMovingPixels + int(threadIdx.x);
+  const int number = t / S, sample = t % S;
+  const TileList list = list_of(params.lists, params.grid, tile);
+  const Pixel pixel(list, params.grid, {float(number % kMovingTile), float(number / kMovingTile)});
+  if (list.overflow || !pixel.inside) return;
+  // The map of the segment with the last splat of the sample already is what its front gives.
+  int segment = (params.last[sample * pixel.image + pixel.index] - 1) / kSegment;
+  if (segment <= 1) return;
+  const int64_t first = first_piece(params.lists, kSegment, tile);
+  const MapMemory<F> memory(params.adjoint_maps, sample, number);
+  Adjoint adjoint = memory.adjoint(first + segment);
+  constexpr int kAhead = 8;  // segments whose maps are read at once, since each of them waits for memory
+  for (; segment > 1; segment -= kAhead) {
+    SegmentMap maps[kAhead];
+#pragma unroll
+    for (int i = 0; i < kAhead; ++i) maps[i] = memory.map(first + max(segment - 1 - i, 1));
+#pragma unroll
+    for (int i = 0; i < kAhead; ++i) {
+      if (segment - 1 - i < 1) return;
+      adjoint = maps[i](adjoint);
+      memory.put(first + segment - 1 - i, adjoint);
+    }
+  }
+}
+
+}  // namespace ar::cuda
