@@ -35,19 +35,8 @@ template <class F, int C, int kShapeGroups> struct GroupVjpShared {
   uint8_t reach[kBatch];
 };
 
-/// The gradient of a pixel with respect to a channel of one of its S samples.
-struct SampleGradient {
-  const BlendVjpParams& params;
-  Pixel pixel;
-  int samples;
-
-  __device__ float operator()(int channel) const {
-    const float* plane = channel < params.channels.count ? params.dL_dimage.plane(channel, pixel.image) : nullptr;
-    return pixel.inside && plane ? 1.0f / samples * plane[pixel.index] : 0.0f;
-  }
-};
-
-/// That of this lane's pixels and channels of the group that begins with channel `first`.
+/// The gradient with respect to one of S samples of this lane's pixels, in its channels of the group that begins with
+/// channel `first`.
 template <int S, int C>
 __device__ ChannelShare<C> share_of_gradient(const BlendVjpParams& params, const TileList& list, int first) {
   using Share = ChannelShare<C>;
@@ -55,9 +44,8 @@ __device__ ChannelShare<C> share_of_gradient(const BlendVjpParams& params, const
 #pragma unroll
   for (int i = 0; i < Share::kPixels; ++i) {
     const Pixel pixel(list, params.grid, pixel_of(threadIdx.x / 32, Share::lane_of(i)));
-    const SampleGradient gradient = {params, pixel, S};
 #pragma unroll
-    for (int k = 0; k < Share::kOwn; ++k) g.v[i][k] = gradient(first + Share::channel(k));
+    for (int k = 0; k < Share::kOwn; ++k) g.v[i][k] = sample_gradient<S>(params, pixel, first + Share::channel(k));
   }
   return g;
 }
@@ -98,17 +86,12 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, kShapeGro
   __syncthreads();
   // Pairs that nothing reached. A later group of the same width finds the zeros of the first.
   if ((first == 0 || C == kSmallGroup) && !list.overflow && segment.number + 1 == segments.count) {
-    for (int k = segment.end + threadIdx.x / 8; k < list.count; k += kBlendThreads / 8) {
-      const int q = threadIdx.x % 8;
-      const int64_t slot = list.slot(k);
-      const float4 zero = {0, 0, 0, 0};
-      if (q < kPairGradWidth / 4) reinterpret_cast<float4*>(params.pair_grads + slot * kPairGradWidth)[q] = zero;
-      if (params.channel_sums && q < C / 4) reinterpret_cast<float4*>(params.channel_sums + slot * C)[q] = zero;
-    }
+    for (int k = segment.end + threadIdx.x / kClearThreads; k < list.count; k += kBlendThreads / kClearThreads)
+      clear_pair<C>(params, list.slot(k), true);
   }
   if (segment.begin == segment.end) return;
 
-  const SampleGradient gradient = {params, pixel, S};
+  const auto gradient = [&params, pixel](int c) { return sample_gradient<S>(params, pixel, c); };
   Share g[std::max(kShapeGroups, 1)];
   g[0] = share_of_gradient<S, C>(params, list, first);
   if constexpr (kShapeGroups == 2) g[1] = share_of_gradient<S, C>(params, list, first + C);
@@ -264,8 +247,8 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, 1>)
   const int tile = listed_tile<S>(params, int(blockIdx.x) / segments.count), number = int(blockIdx.x) % segments.count;
   if (tile < 0 || number == 0) return;
   const Segment<S> segment(params.lists, params.grid, tile, number, segments.count, params.last);
-  const SampleGradient gradient = {params, segment.pixel, S};
   const int channel_count = params.channels.count;
+  const auto gradient = [&params, pixel = segment.pixel](int c) { return sample_gradient<S>(params, pixel, c); };
   const bool all_at_once = params.mean_sums != MeanSums::kNone && first == 0;
   const ChannelShare<C> g = share_of_gradient<S, C>(params, segment.list, first);
   float transmittance[S], shown[S];

@@ -13,21 +13,17 @@ template <class F, int C> struct SampleGrad {
   /// Several kernels have the channels, and this one, the first, adds those of the others to the gradient of alpha.
   bool with_others;
 
-  __device__ static float channel(const BlendVjpParams& params, const Pixel& pixel, int c) {
-    const float* plane = c < params.channels.count ? params.dL_dimage.plane(c, pixel.image) : nullptr;
-    return pixel.inside && plane ? 1.0f / F::kSamples * plane[pixel.index] : 0.0f;
-  }
-
   __device__ SampleGrad(const BlendVjpParams& params, const Pixel& pixel, int first)
       : with_others(C > kFewChannels && params.mean_sums != MeanSums::kNone && params.channels.count > C &&
                     first == 0) {
 #pragma unroll
     for (int c = 0; c < C; ++c) {
-      channels.v[c] = channel(params, pixel, first + c);
+      channels.v[c] = sample_gradient<F::kSamples>(params, pixel, first + c);
       if (first + c < params.channels.count) through += channels.v[c] * params.background[first + c];
     }
     if (with_others) {
-      for (int c = C; c < params.channels.count; ++c) through += channel(params, pixel, c) * params.background[c];
+      for (int c = C; c < params.channels.count; ++c)
+        through += sample_gradient<F::kSamples>(params, pixel, c) * params.background[c];
     }
     // Alpha is 1 - transmittance: its gradient acts like one more channel whose background is -1.
     if (first == 0 && params.dL_dalpha && pixel.inside) through -= 1.0f / F::kSamples * params.dL_dalpha[pixel.index];
@@ -41,7 +37,8 @@ template <class F, int C> struct SampleGrad {
     for (int c = 1; c < C; ++c) product = madd(channels.v[c], color.v[c], product);
     if (with_others) {
       const float* row = params.channels.row(id());
-      for (int c = C; c < params.channels.count; ++c) product = madd(channel(params, pixel, c), row[c], product);
+      for (int c = C; c < params.channels.count; ++c)
+        product = madd(sample_gradient<F::kSamples>(params, pixel, c), row[c], product);
     }
     return product;
   }

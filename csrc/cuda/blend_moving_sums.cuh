@@ -1,5 +1,5 @@
 // The sums of pairs in blend_vjp for footprints whose samples move: each warp of a block leaves those of its pixels in
-// shared memory, where they are added up.
+// shared memory, where they are added up and written.
 #pragma once
 
 #include <algorithm>
@@ -33,6 +33,18 @@ template <class F, int C, class Layout, int kSegment = 0> struct MovingVjpShared
   Mat2<float> mean_maps[kBatch];
   int last[Layout::kWarps];  ///< of LastSplats
 
+  /// Loads the batch that begins with pair k0, `id` = stage.splat_of(), with channels from `first` on and with_means
+  /// what MeanSums need, and hands out the slots. All threads must call it.
+  __device__ void load(const Splat<F, float>* splats, const BlendVjpParams& params, int first, const TileList& list,
+                       int k0, int32_t id, bool with_means) {
+    stage.load(splats, params.channels, first, list, id);
+    if (id >= 0) {
+      const int t = threadIdx.x;
+      rows[t] = list.overflow ? id : list.slot(k0 + t);
+      if (with_means) mean_maps[t] = F::mean_map(splats[id].shape);
+    }
+    set_slots();
+  }
   /// Hands out the slots of the staged pairs. All threads must call it, after the pairs have been loaded by the same
   /// threads and before any other reads them.
   __device__ void set_slots() {
@@ -79,6 +91,33 @@ template <class F, int C, class Layout, int kSegment = 0> struct MovingVjpShared
     }
     return sum;
   }
+
+  /// Writes the sums of pairs [begin, end), kUsed of each: a constant, so that to divide by it costs little. `first`:
+  /// the first of the channels; the kernels of those before have left their shares of the six other sums.
+  /// `with_shape`: these sums and MeanSums too.
+  template <int kUsed>
+  __device__ void write(const BlendVjpParams& params, int first, bool with_shape, const TileList& list, int begin,
+                        int end, int first_slot) const {
+    constexpr bool kMany = C > kFewChannels;
+    for (int t = begin * kUsed + int(threadIdx.x); t < end * kUsed; t += Layout::kThreads) {
+      const int j = t / kUsed, v = t % kUsed;
+      float sum = total(j, v, first_slot);
+      const int32_t row = rows[j];
+      const auto put = [&](int column) {
+        if (kMany && first > 0 && !list.overflow) sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
+        put_sum(params.pair_grads, kPairGradWidth, list.overflow, row, column, sum);
+      };
+      if (v >= 6 && v < kMeans) {
+        if (kMany) {
+          put_sum(params.channel_sums, kChannelGroup, list.overflow, row, first % kChannelGroup + v - 6, sum);
+        } else {
+          put(v == 9 ? kPairFourthChannel : v);
+        }
+      } else if (with_shape) {
+        put(v < 6 ? v : kPairMeans + v - kMeans);
+      }
+    }
+  }
 };
 
 /// Which of the sums of a pair a lane has after put_warp_sums. Of few channels every lane has one.
@@ -105,6 +144,20 @@ template <int C> __device__ void put_warp_sums(const PairGrad<float>& grad, cons
     if (lane < 24) *sums = sum;
     sums[6] = of_channels;
   }
+}
+
+/// Sums MeanSums over a warp, where each lane has ShapeGrad::offset summed over its samples. `sums` is where
+/// MovingVjpShared has those of the pair. All lanes must call it.
+template <class Layout>
+__device__ void put_warp_means(const BlendVjpParams& params, const Mat2<float>& mean_map, Vec2<float> offset,
+                               float* sums) {
+  const int lane = lane_id();
+  offset = {Layout::sum_lanes(offset.x), Layout::sum_lanes(offset.y)};
+  const Vec2<float> size = {float(params.grid.width), float(params.grid.height)};
+  Vec2<float> means = mean_sums_of(params.mean_sums, size, transform_transposed(mean_map, offset));
+  if (Layout::first_sample() > 0) means = {0, 0};  // once for a pixel
+  means = {warp_sum(means.x), warp_sum(means.y)};
+  if (lane < 2) sums[lane] = lane == 0 ? means.x : means.y;
 }
 
 }  // namespace ar::cuda

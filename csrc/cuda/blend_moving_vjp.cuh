@@ -24,6 +24,63 @@ namespace ar::cuda {
 /// numbers in memory.
 template <int C> inline constexpr int kMovingVjpThreads = C == 3 ? 1024 : 512;
 
+/// Where a lane's samples are in front of each splat of a chunk that reaches its warp.
+template <class Layout> using PlacesInFront = Vec2<float>[kStateChunk][Layout::kCells];
+
+/// Composites those of the staged splats [from, from + 32) that reach the warp; the first of them is pair k. Returns
+/// those that a sample of the warp shows, and keeps the places of the samples in front of all. `last`: of LastSplats.
+template <class F, class Layout, class Stage, class Samples>
+__device__ uint32_t replay_chunk(const Stage& stage, int from, int k, const CellCorners<F, Layout>& corners,
+                                 const int (&last)[Layout::kCells], Samples& samples, PlacesInFront<Layout>& in_front) {
+  uint32_t shown = 0;
+  int kept = 0;
+  for (uint32_t left = stage.reached(from); left != 0; ++kept) {
+    const int bit = take_first(left);
+    const auto& terms = stage.splats[from + bit].terms;
+    const Vec2<float> row = corners.row(terms);
+    bool any = false;
+#pragma unroll
+    for (int i = 0; i < Layout::kCells; ++i) {
+      const Vec2<float> z = corners.node(terms, row, i, samples.place[i]);
+      in_front[kept][i] = samples.place[i];
+      any |= replay_placed_sample<F>(terms, z, exp2(F::log_alpha(terms, z)), k + bit < last[i], UnitCell<F::kSide>(),
+                                     samples.transmittance[i], samples.place[i]);
+    }
+    shown |= uint32_t(any) << bit;
+  }
+  return warp_or(shown);
+}
+
+/// The sums of a pair over a lane's samples.
+struct MovingSums {
+  PairGrad<float> grad;  ///< before F::collect
+  float contribution;
+};
+
+/// Takes a lane's samples, and what they carry, from behind pair j of the batch that begins with pair k0 to its front,
+/// where they are at `places`. `row`: corners.row() for its splat; `g_color`: its colour times the gradient.
+template <class F, int C, class Layout, class Samples>
+__device__ MovingSums walk_back(TileSplatRef<F, C>& splat, Vec2<float> row, int k0, int j, float g_color,
+                                const CellCorners<F, Layout>& corners, const int (&last)[Layout::kCells],
+                                const Vec2<float> (&places)[Layout::kCells], Samples& samples,
+                                Adjoint (&adjoint)[Layout::kCells]) {
+  MovingSums sums = {};
+#pragma unroll
+  for (int i = 0; i < Layout::kCells; ++i) {
+    const Vec2<float> place = places[i];
+    const Vec2<float> z = corners.node(splat.terms, row, i, place);
+    const float raw = exp2(F::log_alpha(splat.terms, z));
+    const bool composited = raw >= float(kAlphaMin) && k0 + j < last[i];
+    const MovingBlendGrad<float> of_sample =
+        blend_placed_sample_vjp<F>(splat.terms, z, composited ? raw : 0.0f, UnitCell<F::kSide>(), g_color, place,
+                                   samples.transmittance[i], adjoint[i].behind, adjoint[i].dL_dplace);
+    const PairGrad<float> grad = {of_sample.of_splat.sums, of_sample.of_splat.weighted};
+    sums.grad = i == 0 ? grad : sums.grad + grad;
+    sums.contribution = i == 0 ? of_sample.contribution : sums.contribution + of_sample.contribution;
+  }
+  return sums;
+}
+
 /// A block per tile, or with kSegment > 0 per segment of so many pairs of a tile's list, from what the segment gets
 /// from behind. `overflow_only`: other kernels do the work, unless there were too many pairs.
 template <class F, int C, class Layout, int kSegment = 0>
@@ -60,52 +117,26 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
   const LastSplats<F, Layout> lasts(params.last, pixel, shared.last);
   const int (&last)[kCells] = lasts.samples;
   if (first % kChannelGroup == 0 && !list.overflow) {  // pairs that nothing reached
-    constexpr int kQuads = kChannelGroup / 4;
     const int rest = min(list.count, end);
-    for (int k = max(lasts.block, begin) + threadIdx.x / kQuads; k < rest; k += Layout::kThreads / kQuads) {
-      const int q = threadIdx.x % kQuads;
-      const int64_t slot = list.slot(k);
-      const float4 zero = {0, 0, 0, 0};
-      if (first == 0 && q < kPairGradWidth / 4)
-        reinterpret_cast<float4*>(params.pair_grads + slot * kPairGradWidth)[q] = zero;
-      if (params.channel_sums) reinterpret_cast<float4*>(params.channel_sums + slot * kChannelGroup)[q] = zero;
-    }
+    for (int k = max(lasts.block, begin) + threadIdx.x / kClearThreads; k < rest; k += Layout::kThreads / kClearThreads)
+      clear_pair<kChannelGroup>(params, list.slot(k), first == 0);
   }
 
-  const int64_t number = kSegment > 0 ? int64_t(blockIdx.x) : 0;  // of the piece
-  const auto maps_of = [&](int i) {
-    return MapMemory<F>(params.adjoint_maps, Layout::first_sample() + i, Layout::pixel_number());
-  };
   const SampleGrad<F, C> grad(params, pixel, first);
   Adjoint adjoint[kCells];
 #pragma unroll
   for (int i = 0; i < kCells; ++i) {
     adjoint[i] = {grad.through, {0, 0}};
-    if (kSegment > 0 && last[i] > end) adjoint[i] = maps_of(i).adjoint(number + 1);
+    if (kSegment > 0 && last[i] > end) {
+      const MapMemory<F> maps(params.adjoint_maps, Layout::first_sample() + i, Layout::pixel_number());
+      adjoint[i] = maps.adjoint(int64_t(blockIdx.x) + 1);
+    }
   }
 
   const int own_sum = sum_of_lane<C>();
-  Vec2<float> places_in_front[kStateChunk][kCells];
-  // Composites those of the staged splats [from, from + 32) that reach the warp; the first of them is pair k. Returns
-  // those that a sample of the warp shows, and keeps the places of the samples in front of all.
+  PlacesInFront<Layout> in_front;
   const auto replay = [&](int from, int k) {
-    uint32_t shown = 0;
-    int kept = 0;
-    for (uint32_t left = shared.stage.reached(from); left != 0; ++kept) {
-      const int bit = take_first(left);
-      const auto& terms = shared.stage.splats[from + bit].terms;
-      const Vec2<float> row = corners.row(terms);
-      bool any = false;
-#pragma unroll
-      for (int i = 0; i < kCells; ++i) {
-        const Vec2<float> z = corners.node(terms, row, i, samples.place[i]);
-        places_in_front[kept][i] = samples.place[i];
-        any |= replay_placed_sample<F>(terms, z, exp2(F::log_alpha(terms, z)), k + bit < last[i], UnitCell<F::kSide>(),
-                                       samples.transmittance[i], samples.place[i]);
-      }
-      shown |= uint32_t(any) << bit;
-    }
-    return warp_or(shown);
+    return replay_chunk<F, Layout>(shared.stage, from, k, corners, last, samples, in_front);
   };
 
   const int stop = min(lasts.block, end);
@@ -126,13 +157,7 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
     }
     const int32_t next_id = k0 > begin ? shared.stage.splat_of(list, k0 - kBatch, k0) : -1;
     __syncthreads();  // all have read what the last batch left
-    shared.stage.load(splats, params.channels, first, list, id);
-    if (id >= 0) {
-      const int t = threadIdx.x;
-      shared.rows[t] = list.overflow ? id : list.slot(k0 + t);
-      if (with_means) shared.mean_maps[t] = F::mean_map(splats[id].shape);
-    }
-    shared.set_slots();
+    shared.load(splats, params, first, list, k0, id, with_means);
     __syncthreads();
     if (next_id >= 0) prefetch(splats + next_id);  // so that the next batch need not wait for memory
     id = next_id;
@@ -161,60 +186,21 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
           float* const sums = shared.sums_of(j, first_slot);
           const Vec2<float> row = corners.row(splat.terms);
           const float g_color = grad.times(splat.channels, params, pixel, [&] { return list.splat(k0 + j); });
-          PairGrad<float> sum = {};
-          float contribution = 0;
-#pragma unroll
-          for (int i = 0; i < kCells; ++i) {
-            const Vec2<float> place = places_in_front[kept][i];
-            const Vec2<float> z = corners.node(splat.terms, row, i, place);
-            const float raw = exp2(F::log_alpha(splat.terms, z));
-            const bool composited = raw >= float(kAlphaMin) && k0 + j < last[i];
-            const MovingBlendGrad<float> of_sample =
-                blend_placed_sample_vjp<F>(splat.terms, z, composited ? raw : 0.0f, UnitCell<F::kSide>(), g_color,
-                                           place, samples.transmittance[i], adjoint[i].behind, adjoint[i].dL_dplace);
-            const PairGrad<float> pair = {of_sample.of_splat.sums, of_sample.of_splat.weighted};
-            sum = i == 0 ? pair : sum + pair;
-            contribution = i == 0 ? of_sample.contribution : contribution + of_sample.contribution;
-          }
-          if (with_means && with_shape) {
-            const Vec2<float> offset = {Layout::sum_lanes(sum.shape.offset.x), Layout::sum_lanes(sum.shape.offset.y)};
-            const Vec2<float> size = {float(params.grid.width), float(params.grid.height)};
-            Vec2<float> means = mean_sums_of(params.mean_sums, size, transform_transposed(shared.mean_maps[j], offset));
-            if (Layout::first_sample() > 0) means = {0, 0};  // once for a pixel
-            means = {warp_sum(means.x), warp_sum(means.y)};
-            if (lane < 2) sums[Shared::kMeans + lane] = lane == 0 ? means.x : means.y;
-          }
-          sum.shape = F::collect(splat.terms, sum.shape, sum.weighted);
-          put_warp_sums(sum, times(contribution, grad.channels), sums + own_sum);
+          auto [of_pair, contribution] =
+              walk_back<F, C, Layout>(splat, row, k0, j, g_color, corners, last, in_front[kept], samples, adjoint);
+          if (with_means && with_shape)
+            put_warp_means<Layout>(params, shared.mean_maps[j], of_pair.shape.offset, sums + Shared::kMeans);
+          of_pair.shape = F::collect(splat.terms, of_pair.shape, of_pair.weighted);
+          put_warp_sums(of_pair, times(contribution, grad.channels), sums + own_sum);
         }
         if (lane == 0) shared.hits[warp][from / kStateChunk] = shown;
       }
       __syncthreads();
-      const auto write_sums = [&](auto used) {  // a constant, so that to divide by it costs little
-        const int first_pair = part * kStateChunk, end_pair = min(count, part_end * kStateChunk);
-        for (int t = first_pair * used + int(threadIdx.x); t < end_pair * used; t += Layout::kThreads) {
-          const int j = t / used, v = t % used;
-          float sum = shared.total(j, v, first_slot);
-          const int32_t row = shared.rows[j];
-          const auto put = [&](int column) {
-            if (kMany && first > 0 && !list.overflow) sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
-            put_sum(params.pair_grads, kPairGradWidth, list.overflow, row, column, sum);
-          };
-          if (v >= 6 && v < Shared::kMeans) {
-            if (kMany) {
-              put_sum(params.channel_sums, kChannelGroup, list.overflow, row, first % kChannelGroup + v - 6, sum);
-            } else {
-              put(v == 9 ? kPairFourthChannel : v);
-            }
-          } else if (with_shape) {
-            put(v < 6 ? v : kPairMeans + v - Shared::kMeans);
-          }
-        }
-      };
+      const int first_pair = part * kStateChunk, end_pair = min(count, part_end * kStateChunk);
       if (with_means) {
-        write_sums(std::integral_constant<int, Shared::kSums>());
+        shared.template write<Shared::kSums>(params, first, with_shape, list, first_pair, end_pair, first_slot);
       } else {
-        write_sums(std::integral_constant<int, Shared::kMeans>());
+        shared.template write<Shared::kMeans>(params, first, with_shape, list, first_pair, end_pair, first_slot);
       }
       if (part > 0) __syncthreads();  // all have read the sums
     }

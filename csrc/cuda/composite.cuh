@@ -186,6 +186,24 @@ struct Pixel {
   }
 };
 
+/// The gradient with respect to a channel of one of a pixel's S samples.
+template <int S> __device__ float sample_gradient(const BlendVjpParams& params, const Pixel& pixel, int channel) {
+  const float* plane = channel < params.channels.count ? params.dL_dimage.plane(channel, pixel.image) : nullptr;
+  return pixel.inside && plane ? 1.0f / S * plane[pixel.index] : 0.0f;
+}
+
+/// Threads that clear_pair takes for a pair.
+inline constexpr int kClearThreads = kChannelGroup / 4;
+
+/// Zeros for the pair in `slot`, which no sample composites: in the rows of channel_sums, of kWidth numbers, and with
+/// `shapes` in those of pair_grads. kClearThreads neighbouring threads must call it.
+template <int kWidth> __device__ void clear_pair(const BlendVjpParams& params, int64_t slot, bool shapes) {
+  const int q = threadIdx.x % kClearThreads;
+  const float4 zero = {0, 0, 0, 0};
+  if (shapes && q < kPairGradWidth / 4) reinterpret_cast<float4*>(params.pair_grads + slot * kPairGradWidth)[q] = zero;
+  if (params.channel_sums && q < kWidth / 4) reinterpret_cast<float4*>(params.channel_sums + slot * kWidth)[q] = zero;
+}
+
 /// Sums gradients of a splat in row `row` of pairs, or of splats, where all tiles add to it.
 __device__ inline void put_sum(float* rows, int width, bool overflow, int32_t row, int column, float x) {
   float* place = rows + int64_t(row) * width + column;
