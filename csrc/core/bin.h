@@ -24,8 +24,8 @@ template <typename T> AR_HD Support<T> make_support(Vec2<T> mean, const Mat2<T>&
   // det w without cancellation: one entry of a Cholesky factor is zero, eigenframes are orthogonal
   const T det = difference_of_products(w.xx, w.yy, w.xy, w.yx);
   const T l = level + T(kLevelSlack);
-  const T scale = sqrt(l) / abs(det);
-  return {mean, l, reach, scale * sqrt(c), scale * sqrt(a), -scale * b / sqrt(c), -b / a, T(1) / a, det * det};
+  const T scale = sqrt(l) / abs(det), inv_a = T(1) / a;
+  return {mean, l, reach, scale * sqrt(c), scale * sqrt(a), -scale * b / sqrt(c), -b * inv_a, inv_a, det * det};
 }
 
 template <class F, typename T> AR_HD Support<T> support_of(const Splat<F, T>& splat) {

@@ -35,11 +35,12 @@ template <typename T> AR_HD T max_sigma(const Gaussians<T>& g, int64_t i) {
 }
 
 /// Whether Gaussian i may touch the image, from its mean and its largest standard deviation: cheap, and never false for
-/// one that project() keeps.
+/// one that project() keeps. `p` becomes the projected mean.
 template <class Cam, typename T>
-AR_HD bool may_be_visible(const Cam& camera, const Gaussians<T>& g, int64_t i, CullBounds<T> bounds) {
+AR_HD bool may_be_visible(const Cam& camera, const Gaussians<T>& g, int64_t i, CullBounds<T> bounds,
+                          ProjectedMean<T>& p) {
   const T largest = max_sigma(g, i), opacity = g.opacities[i];  // loads first: they wait together
-  const ProjectedMean<T> p = project_mean(camera, g.means[i]);
+  p = project_mean(camera, g.means[i]);
   if (!p.valid) return false;
   T variance = bounds.variance;
   if constexpr (Cam::kFull) {
@@ -52,6 +53,12 @@ AR_HD bool may_be_visible(const Cam& camera, const Gaussians<T>& g, int64_t i, C
   const T reach = T(2) + sigma * sqrt(level);
   return p.pixel.x + reach >= T(0) && p.pixel.x - reach <= camera.size.x - T(1) && p.pixel.y + reach >= T(0) &&
          p.pixel.y - reach <= camera.size.y - T(1);
+}
+
+template <class Cam, typename T>
+AR_HD bool may_be_visible(const Cam& camera, const Gaussians<T>& g, int64_t i, CullBounds<T> bounds) {
+  ProjectedMean<T> mean;
+  return may_be_visible(camera, g, i, bounds, mean);
 }
 
 /// A Gaussian in the image, whatever the footprint.
@@ -83,10 +90,10 @@ template <typename T> AR_HD bool read_row(const PackedRow<T>& row, ProjectedGaus
   return within(out.mean.x, 1e9) && within(out.mean.y, 1e9) && out.depth >= T(0) && is_drawable(out);
 }
 
-/// False if Gaussian i is culled: behind the near plane, not finite, or degenerate.
+/// False if Gaussian i, whose projected mean is `mean`, is culled: behind the near plane, not finite, or degenerate.
 template <class Cam, typename T>
-AR_HD bool project_gaussian(const Cam& camera, const Gaussians<T>& g, int64_t i, ProjectedGaussian<T>& out) {
-  const ProjectedMean<T> mean = project_mean(camera, g.means[i]);
+AR_HD bool project_gaussian(const Cam& camera, const Gaussians<T>& g, int64_t i, const ProjectedMean<T>& mean,
+                            ProjectedGaussian<T>& out) {
   if (!mean.valid) return false;
   const Factors<T> factors = project_covariance(camera, g, i, mean.view);
   if (g.scales &&
@@ -107,9 +114,11 @@ template <typename T> AR_HD int splat_radius(Cov2d<T> cov, T variance) {
 }
 
 /// Gives a splat its shape, all but its colour. Returns 3DGS's radius, 0 if it is culled: off the image, or of a shape
-/// that no float holds. A splat that is kept may still touch no tile (level <= 0).
+/// that no float holds. A splat that is kept may still touch no tile (level <= 0). `support`, if not null, is set where
+/// one is kept.
 template <typename T>
-AR_HD int shape_splat(const ProjectedGaussian<T>& p, FootprintChoice footprint, TileGrid grid, SplatRow<T>& splat) {
+AR_HD int shape_splat(const ProjectedGaussian<T>& p, FootprintChoice footprint, TileGrid grid, SplatRow<T>& splat,
+                      Support<T>* support = nullptr) {
   splat.mean = p.mean;
   splat.opacity = p.opacity;
   splat.level = T(0);
@@ -131,8 +140,10 @@ AR_HD int shape_splat(const ProjectedGaussian<T>& p, FootprintChoice footprint, 
   const int radius = splat_radius(p.cov, radius_variance);
   const bool on_image = p.mean.x + T(radius) >= T(0) && p.mean.x - T(radius) <= T(grid.width - 1) &&
                         p.mean.y + T(radius) >= T(0) && p.mean.y - T(radius) <= T(grid.height - 1);
-  const bool touches = level > T(0) && touches_image(make_support(p.mean, w, level, reach), grid);
+  const Support<T> found = make_support(p.mean, w, level, reach);
+  const bool touches = level > T(0) && touches_image(found, grid);
   if (touches) splat.level = level;
+  if (support) *support = found;
   return touches || on_image ? radius : 0;
 }
 
@@ -203,22 +214,22 @@ AR_HD Vec3<T> splat_color_vjp(const Cam& camera, const Gaussians<T>& g, const Ou
   return d.inv_length * (dL_dunit - dot(dL_dunit, d.unit) * d.unit);
 }
 
-/// Projects Gaussian i, all but its colour. Returns 3DGS's radius, 0 if it is culled.
+/// Projects Gaussian i, all but its colour. Returns 3DGS's radius, 0 if it is culled. `support` as for shape_splat.
 template <class Cam, typename T>
-AR_HD int project_shape(const Cam& camera, const Gaussians<T>& g, int64_t i, FootprintChoice footprint,
-                        SplatRow<T>& splat, T& depth) {
+AR_HD int project_shape(const Cam& camera, const Gaussians<T>& g, int64_t i, const ProjectedMean<T>& mean,
+                        FootprintChoice footprint, SplatRow<T>& splat, T& depth, Support<T>* support = nullptr) {
   ProjectedGaussian<T> p;
   splat.level = T(0);
-  if (!project_gaussian(camera, g, i, p)) return 0;
+  if (!project_gaussian(camera, g, i, mean, p)) return 0;
   depth = p.depth;
-  return shape_splat(p, footprint, camera.grid, splat);
+  return shape_splat(p, footprint, camera.grid, splat, support);
 }
 
 /// Projects Gaussian i. Culls it too where its colour is not finite.
 template <class Cam, typename T>
 AR_HD int project(const Cam& camera, const Gaussians<T>& g, int64_t i, FootprintChoice footprint, SplatRow<T>& splat,
                   T& depth) {
-  const int radius = project_shape(camera, g, i, footprint, splat, depth);
+  const int radius = project_shape(camera, g, i, project_mean(camera, g.means[i]), footprint, splat, depth);
   if (!(splat.level > T(0))) return radius;
   if (splat_color(camera, g, i, g.shs ? g.shs + i * g.sh_stride : nullptr, splat.color)) return radius;
   splat.level = T(0);

@@ -79,7 +79,8 @@ template <template <typename> class Cam, typename T> void project_rows(const cpu
     for (int64_t i = begin; i < end; ++i) {
       if (p.radii) p.radii[i] = 0;
       ProjectedGaussian<T> projected;
-      if (!may_be_visible(camera, g, i, p.bounds) || !project_gaussian(camera, g, i, projected)) continue;
+      ProjectedMean<T> mean;
+      if (!may_be_visible(camera, g, i, p.bounds, mean) || !project_gaussian(camera, g, i, mean, projected)) continue;
       SplatRow<T> splat = {};
       const int radius = shape_splat(projected, p.footprint, camera.grid, splat);
       if (radius == 0) continue;

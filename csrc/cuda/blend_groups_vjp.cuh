@@ -140,7 +140,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, kShapeGro
       const int t = threadIdx.x, k = k0 + t;
       if (k < k1) {
         const Splat<F, float> splat = splats[id];
-        reach = subtile_reach(support_of(splat), list.x0, list.y0);
+        reach = subtile_reach<F>(splat, list.x0, list.y0);
 #pragma unroll
         for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= shared.last[b]) << b);
         if (reach) shared.splats[t] = {tile_terms(splat, list), {}};

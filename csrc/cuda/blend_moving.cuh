@@ -29,8 +29,7 @@ struct CellLayout {
   static_assert((kLanes & (kLanes - 1)) == 0 && kLanes <= 32 && kGroups % kWarps == 0 && kWarps <= 32);
   static constexpr int kPixels = 32 / kLanes;  ///< of a group
   static constexpr int kWide = kPixels == 32 ? 8 : kPixels >= 8 ? 4 : kPixels >= 2 ? 2 : 1, kHigh = kPixels / kWide;
-  static constexpr int kColumns = kSide / kWide;                         ///< groups side by side
-  using Reach = std::conditional_t<(kGroups > 32), uint64_t, uint32_t>;  ///< a bit for each group
+  static constexpr int kColumns = kSide / kWide;  ///< groups side by side
 
   /// This warp's group.
   __device__ static int group() { return int(blockIdx.x) % kBlocks * kWarps + int(threadIdx.x) / 32; }
@@ -50,27 +49,11 @@ struct CellLayout {
   /// Whether no other lane has the samples too, or this is the one of them that writes.
   __device__ static bool owns() { return true; }
 
-  /// Bit g: the support reaches the pixels of group g, of the first kCount, of the tile that begins at (x0, y0).
-  template <int kCount = kGroups> __device__ static Reach reach(const Support<float>& support, int x0, int y0) {
-    static_assert(kCount % kColumns == 0);
-    Reach reach = 0;
-#pragma unroll
-    for (int g = 0; g < kCount; g += kColumns) {
-      const float y = float(y0 + g / kColumns * kHigh);
-      const Span<float> span = columns_of(support, y, y + float(kHigh - 1));
-#pragma unroll
-      for (int c = 0; c < kColumns; ++c) {
-        const float x = float(x0 + c * kWide);
-        reach |= Reach(span.lo <= x + float(kWide - 1) && span.hi >= x) << (g + c);
-      }
-    }
-    return reach;
-  }
-
-  /// Bit w: it reaches the pixels of warp w of this block.
-  __device__ static uint32_t block_reach(const Support<float>& support, int x0, int y0) {
+  /// Bit w: the splat reaches the pixels of warp w of this block, or passes them closely. The tile begins at (x0, y0).
+  template <class F> __device__ static uint32_t block_reach(const Splat<F, float>& splat, int x0, int y0) {
+    static_assert(kWarps % kColumns == 0);
     const int rows = int(blockIdx.x) % kBlocks * kWarps / kColumns;  // of groups, those of the blocks before
-    return uint32_t(reach<kWarps>(support, x0, y0 + rows * kHigh));
+    return reached_boxes<kWide, kHigh, kColumns, kWarps / kColumns, F>(splat, x0, y0 + rows * kHigh);
   }
 
   /// The sum over the lanes of a pixel, in each of them.
@@ -203,7 +186,7 @@ template <class F, int C, class Layout, int kBatch> struct MovingStage {
     uint32_t bits = 0;
     if (id >= 0) {
       const Splat<F, float> splat = splats_in[id];
-      bits = Layout::block_reach(support_of(splat), list.x0, list.y0);
+      bits = Layout::template block_reach<F>(splat, list.x0, list.y0);
       if (bits) splats[threadIdx.x] = {cell_terms(splat, list), channels_of<C>(channels, splat, id, first)};
     }
     if (threadIdx.x < kBatch) reach[threadIdx.x] = bits;

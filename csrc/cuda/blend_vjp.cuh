@@ -29,6 +29,12 @@ template <class F, int C>
 inline constexpr bool kHoldsSamples =
     kHoldsPixels<F, C> || (F::kSamples == 4 && C == 3 && sizeof(TileSplat<F, C>) <= 64);
 
+/// Whether it takes two subtiles, one below the other, under one branch: 8x8 pixels. Then two pixels of a lane have
+/// instructions that do not wait for each other, and there are half as many branches, each of which waits for a uniform
+/// register. Where weights are expensive, subtiles that are visited in vain cost more than that gains.
+template <class F, int C>
+inline constexpr bool kTakesTwo = kHoldsPixels<F, C> && sizeof(typename F::template Terms<float>) <= 8 * sizeof(float);
+
 /// Nine values of each lane for kPairs pairs in shared memory, which are added up over the lanes together. For a pair
 /// that takes 17 instructions, where sum_values takes 60. Lanes are added in the order of sum_values, so that the sums
 /// are the same to the bit.
@@ -316,7 +322,7 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
       id = list.splat(k);
       row_index = list.overflow ? id : list.slot(k);
       own = splats[id];
-      reach = subtile_reach(support_of(own), list.x0, list.y0);
+      reach = subtile_reach<F>(own, list.x0, list.y0);
 #pragma unroll
       for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= group.subtile_last[b]) << b);
       if (kMeans) mean_map = F::mean_map(own.shape);
@@ -357,7 +363,7 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
           const float alpha = F::alpha(splat.terms, p, node);
           // Both are worked out: to read the second only after the first would be to wait for it.
           const bool mask = (alpha >= float(kAlphaMin)) & (at < pixels.last_of(s, q, g));
-          if (s == 0 && S == 1 && !__any_sync(kAllLanes, mask)) break;
+          if (s == 0 && S == 1 && !kTakesTwo<F, C> && !__any_sync(kAllLanes, mask)) break;
           auto sample = samples.of[s][sample_place(b)];
           const BlendGrad<float> grad = blend_sample_vjp(mask, alpha, g_color, sample.transmittance, sample.behind);
           samples.of[s][sample_place(b)] = sample;
@@ -374,7 +380,16 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
           mean_sums = mean_sums + mean_sums_of(params.mean_sums, size, dL_dmean);
         }
       };
-      if constexpr (kUnroll) {
+      if constexpr (kTakesTwo<F, C>) {
+#pragma unroll
+        for (int q = 0; q < kSubtiles / 2; ++q) {
+          const int upper = q % 2 + q / 2 * 4, lower = upper + 2;
+          if (!(reached & (1u << upper | 1u << lower))) continue;
+          const Vec2<float> p = {p0.x + float(q % 2 * 8), p0.y + float(q / 2 * 8)};
+          visit(upper, p);
+          visit(lower, {p.x, p.y + 4});
+        }
+      } else if constexpr (kUnroll) {
 #pragma unroll
         for (int b = 0; b < kSubtiles; ++b) {
           if (reached >> b & 1) visit(b, {p0.x + float(8 * (b & 1)), p0.y + float(4 * (b >> 1))});

@@ -47,16 +47,54 @@ __device__ inline TileList list_of(const TileLists& lists, TileGrid grid, int ti
   return list;
 }
 
-/// Bit b: the support reaches subtile b.
-__device__ inline uint32_t subtile_reach(const Support<float>& support, int x0, int y0) {
-  uint32_t reach = 0;
+/// Whether exact extents of a splat are worth what they cost: where weights are expensive, so that it takes longer to
+/// composite a splat into pixels that it only passes closely.
+template <class F>
+inline constexpr bool kExactReach = F::kSamples == 1 && sizeof(typename F::template Terms<float>) > 8 * sizeof(float);
+
+/// Which boxes of kWide x kHigh pixels a splat reaches; some that it passes closely may be among them. There are
+/// kColumns boxes side by side and kRows of these one below the other, the first pixel at (x0, y0). Box b is at column
+/// b % kColumns and row b / kColumns.
+template <int kWide, int kHigh, int kColumns, int kRows, class F>
+__device__ uint32_t reached_boxes(const Splat<F, float>& splat, int x0, int y0) {
+  static_assert(kColumns * kRows <= 32);
+  uint32_t reached = 0;
+  if constexpr (kExactReach<F>) {
+    const Support<float> support = support_of(splat);
 #pragma unroll
-  for (int band = 0; band < 4; ++band) {
-    const Span<float> span = columns_of(support, float(y0 + 4 * band), float(y0 + 4 * band + 3));
-    reach |= uint32_t(span.lo <= float(x0 + 7) && span.hi >= float(x0)) << (2 * band);
-    reach |= uint32_t(span.lo <= float(x0 + 15) && span.hi >= float(x0 + 8)) << (2 * band + 1);
+    for (int row = 0; row < kRows; ++row) {
+      const float y = float(y0 + row * kHigh);
+      const Span<float> span = columns_of(support, y, y + float(kHigh - 1));
+#pragma unroll
+      for (int column = 0; column < kColumns; ++column) {
+        const float x = float(x0 + column * kWide);
+        reached |= uint32_t(span.lo <= x + float(kWide - 1) && span.hi >= x) << (row * kColumns + column);
+      }
+    }
+  } else {
+    const Mat2<float> w = F::ellipse(splat.shape);
+    const Vec2<float> middle = {0.5f * (kWide - 1), 0.5f * (kHigh - 1)};  // of a box, from its first pixel
+    const Vec2<float> first = {float(x0) - splat.mean.x, float(y0) - splat.mean.y};
+    const float distance = float(max(kWide * kColumns, kHigh * kRows)) + max(abs(first.x), abs(first.y));
+    const BoxReach<float> box =
+        make_box_reach(w, splat.level, {middle.x + float(F::kReach), middle.y + float(F::kReach)}, distance);
+#pragma unroll
+    for (int row = 0; row < kRows; ++row) {
+      const Vec2<float> z = transform(w, Vec2<float>{first.x + middle.x, first.y + (middle.y + float(row * kHigh))});
+#pragma unroll
+      for (int column = 0; column < kColumns; ++column) {
+        const float right = float(column * kWide);
+        const Vec2<float> center = {madd(w.xx, right, z.x), madd(w.yx, right, z.y)};
+        reached |= uint32_t(reaches_box(box, center)) << (row * kColumns + column);
+      }
+    }
   }
-  return reach;
+  return reached;
+}
+
+/// Bit b: the splat reaches subtile b, or passes it closely.
+template <class F> __device__ uint32_t subtile_reach(const Splat<F, float>& splat, int x0, int y0) {
+  return reached_boxes<8, 4, 2, 4, F>(splat, x0, y0);
 }
 
 /// Values of C channels.
@@ -130,7 +168,7 @@ template <class F, int C, int kBatch> struct Stage {
       if (k + t < end) {
         const int32_t id = list.splat(k + t);
         const Splat<F, float> splat = splats_in[id];
-        bits = subtile_reach(support_of(splat), list.x0, list.y0);
+        bits = subtile_reach<F>(splat, list.x0, list.y0);
         if (bits) splats[t] = {tile_terms(splat, list), channels_of<C>(channels, splat, id)};
       }
       reach[t] = uint8_t(bits);

@@ -41,10 +41,12 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
   const Cam camera = load_camera_as<Cam>(params.camera);
   SplatRow<float> splat = {};
+  Support<float> support = {};
   float depth = 0;
   int radius = 0;
-  if (i < g.n && may_be_visible(camera, g, i, params.bounds))
-    radius = project_shape(camera, g, i, params.footprint, splat, depth);
+  ProjectedMean<float> mean;
+  if (i < g.n && may_be_visible(camera, g, i, params.bounds, mean))
+    radius = project_shape(camera, g, i, mean, params.footprint, splat, depth, &support);
   ShRows<Cam::kShDegree>& rows = sh_rows[threadIdx.x / 32];
   const uint32_t lit = __ballot_sync(kAllLanes, splat.level > 0);
   if (g.shs && lit) rows.begin_load(g.shs + (i - lane_id()) * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
@@ -52,7 +54,7 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
   if (params.given.data) not_finite = rows_not_finite(params.given, i - lane_id(), lit);
   // While the harmonics are on their way.
   SplatTiles tiles = {};
-  if (splat.level > 0) tiles = find_tiles(support_of(splat, params.footprint.index), params.grid);
+  if (splat.level > 0) tiles = find_tiles(support, params.grid);
   wait_for_copies();
   if (splat.level > 0) {
     if (splat_color(camera, g, i, rows.row(), splat.color) && !(not_finite >> lane_id() & 1)) {
@@ -79,7 +81,8 @@ __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const Pro
   ProjectedGaussian<float> projected = {};
   SplatRow<float> splat = {};
   int radius = 0;
-  if (i < g.n && may_be_visible(camera, g, i, params.bounds) && project_gaussian(camera, g, i, projected))
+  ProjectedMean<float> mean;
+  if (i < g.n && may_be_visible(camera, g, i, params.bounds, mean) && project_gaussian(camera, g, i, mean, projected))
     radius = shape_splat(projected, params.footprint, camera.grid, splat);
   const bool has_row = radius > 0;
   if (params.rows.colors || params.packed.rows) {

@@ -140,9 +140,11 @@ Results rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
     }
 
     const std::unique_ptr<Backend> backend = make_backend(a.means3D);
+    const MeanSums mean_sums = needs[1] && a.means2D ? mean_sums_of(a) : MeanSums::kNone;
+    const PairSums sums = backend->blend_vjp(saved.lists, saved.state, pass, channels, dL_dimage, mean_sums);
+    // Memory is asked for where the device has something to do meanwhile.
     Grads grads = make_grads(a, needs);
-    if (grads.means2D.defined()) grads.mean_sums = mean_sums_of(a);
-    const PairSums sums = backend->blend_vjp(saved.lists, saved.state, pass, channels, dL_dimage, grads.mean_sums);
+    grads.mean_sums = mean_sums;
     const Tensor camera = backend->project_vjp(a, saved.lists, pass, sums, channels, grads);
     if (grads.with_camera) set_camera_grads(camera, needs, grads);
     Tensor background, features;

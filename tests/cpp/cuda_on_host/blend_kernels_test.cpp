@@ -114,7 +114,9 @@ template <class F, bool kKeep> void expect_blended(int count, float most_opaque,
   if (!kKeep) return;
   ASSERT_EQ(image.last, expected.last);
   for (size_t i = 0; i < expected.transmittance.size(); ++i) {
-    if (exact) ASSERT_EQ(image.transmittance[i], expected.transmittance[i]) << i;
+    if (exact) {
+      ASSERT_EQ(image.transmittance[i], expected.transmittance[i]) << i;
+    }
     ASSERT_NEAR(image.transmittance[i], expected.transmittance[i], 1e-5) << i;
   }
 }

@@ -155,9 +155,8 @@ template <class F> struct Run {
           float transmittance = 1;
           for (int k = 0; k < count; ++k) {
             const Splat<F, float>& splat = scene.splats[k];
-            const float raw = subtile_reach(support_of(splat), list.x0, list.y0) >> t / 32 & 1
-                                  ? F::alpha(tile_terms(splat, list), p, s)
-                                  : 0;
+            const float raw =
+                subtile_reach<F>(splat, list.x0, list.y0) >> t / 32 & 1 ? F::alpha(tile_terms(splat, list), p, s) : 0;
             blend_sample(raw, transmittance);
             if ((k + 1) % length > 0) continue;
             auto* kept = reinterpret_cast<Checkpoint<3>*>(&checkpoints[size_t(planes[tile]) * kTilePixels]);
