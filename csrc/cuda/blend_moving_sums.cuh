@@ -27,8 +27,8 @@ template <class F, int C, class Layout, int kSegment = 0> struct MovingVjpShared
   MovingStage<F, C, Layout, kBatch> stage;
   float sums[kSlots][kSums];               ///< of a warp's pixels
   uint32_t hits[Layout::kWarps][kChunks];  ///< splats that have sums of a warp
-  int slots[kSparse ? kBatch + 1 : 1];  ///< those of pair j are [slots[j], slots[j + 1]), as if there was room for all
-  int chunk_slots[kChunks];
+  int slots[kSparse ? kBatch + 1 : 1];   ///< those of pair j are [slots[j], slots[j + 1]), as if there was room for all
+  alignas(16) int chunk_slots[kChunks];  ///< may be read 16 bytes at a time, which must not hold a slot as well
   int32_t rows[kBatch];
   Mat2<float> mean_maps[kBatch];
   int last[Layout::kWarps];  ///< of LastSplats

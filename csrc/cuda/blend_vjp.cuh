@@ -335,8 +335,9 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
     }
     const int listed = __popc(reaching);
     group_sync();
-    // `to` is where values for its sums go, or its number in the list.
-    const auto walk = [&](const ListedSplat<F, C>& listed_splat, auto&& to) {
+    // `to` is where values for its sums go, or its number in the list; `kind` which MeanSums, known to the compiler,
+    // since pixels must not branch on it.
+    const auto walk = [&](const ListedSplat<F, C>& listed_splat, auto&& to, auto kind) {
       VjpSplat splat = listed_splat;
       // By a ballot, so that the compiler knows that all lanes branch alike.
       const uint32_t reached = __ballot_sync(kAllLanes, splat.reach_and_place & subtile_bit);
@@ -377,7 +378,7 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
         for (int c = 0; c < C; ++c) channels.v[c] = madd(contribution, of_pixel_g.v[c], channels.v[c]);
         if (kMeans) {
           const Vec2<float> dL_dmean = transform_transposed(m, of_pixel.offset);
-          mean_sums = mean_sums + mean_sums_of(params.mean_sums, size, dL_dmean);
+          mean_sums = mean_sums + mean_sums_of(decltype(kind)::value, size, dL_dmean);
         }
       };
       if constexpr (kTakesTwo<F, C>) {
@@ -425,21 +426,29 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
         }
       }
       if (kMeans) {
-        const Vec2<float> total = {warp_sum(mean_sums.x), warp_sum(mean_sums.y)};
-        if (lane == 1) put(row, kPairMeans, total.x);
-        if (lane == 3) put(row, kPairMeans + 1, total.y);
+        const float total = warp_sum_of_two(mean_sums.x, mean_sums.y);
+        if (lane % 16 == 0) put(row, kPairMeans + lane / 16, total);
       }
     };
-    if constexpr (kHoldsState) {
-      for (int n = 0; n < listed; n += PairSums::kPairs) {
-        const int count = min(listed - n, PairSums::kPairs);
-        const auto* splat = group.splats + n;
-        PairSums::Pair* pair = group.pair_sums.pairs;
-        for (int left = count; left > 0; --left) walk(*splat++, *pair++);
-        sum_pairs(n, count);
+    const auto walk_listed = [&](auto kind) {
+      if constexpr (kHoldsState) {
+        for (int n = 0; n < listed; n += PairSums::kPairs) {
+          const int count = min(listed - n, PairSums::kPairs);
+          const auto* splat = group.splats + n;
+          PairSums::Pair* pair = group.pair_sums.pairs;
+          for (int left = count; left > 0; --left) walk(*splat++, *pair++, kind);
+          sum_pairs(n, count);
+        }
+      } else {
+        for (int n = 0; n < listed; ++n) walk(group.splats[n], n, kind);
       }
+    };
+    if constexpr (!kMeans) {
+      walk_listed(std::integral_constant<MeanSums, MeanSums::kNone>());
+    } else if (params.mean_sums == MeanSums::kNorm) {
+      walk_listed(std::integral_constant<MeanSums, MeanSums::kNorm>());
     } else {
-      for (int n = 0; n < listed; ++n) walk(group.splats[n], n);
+      walk_listed(std::integral_constant<MeanSums, MeanSums::kAbsolute>());
     }
     if constexpr (kGroup > 1 && kGrads) {
       __syncthreads();

@@ -19,6 +19,17 @@ template <typename T> __device__ T warp_sum(T v) {
 template <typename T> __device__ T shuffle(T v, int lane) { return __shfl_sync(kAllLanes, v, lane); }
 template <typename T> __device__ T shuffle_up(T v, int offset) { return __shfl_up_sync(kAllLanes, v, offset); }
 
+/// Sums two values over the lanes, with 5 shuffles instead of 10 and the same bits as warp_sum: lanes below 16 get the
+/// sum of x, the others that of y.
+__device__ inline float warp_sum_of_two(float x, float y) {
+  const bool upper = lane_id() & 16;
+  const float keep = upper ? y : x, give = upper ? x : y;
+  float sum = keep + __shfl_xor_sync(kAllLanes, give, 16);
+#pragma unroll
+  for (int offset = 8; offset > 0; offset /= 2) sum += __shfl_xor_sync(kAllLanes, sum, offset);
+  return sum;
+}
+
 /// Sum of the lanes up to and with this one. `T` has a + that need not commute, and the two functions above.
 template <typename T> __device__ T warp_inclusive_sum(T v) {
 #pragma unroll
