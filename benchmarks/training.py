@@ -62,6 +62,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "finest three times": {"scale_repeats": (3, 1, 1, 1)},
     "SSIM 0.1": {"ssim_weight": 0.1},
     "4 pictures a step": {"pictures_per_step": 4},
+    "sparse Adam": {"sparse_adam": True},
     "mcmc 300k": {"density": "mcmc", "max_gaussians": 300_000},
     "mcmc 600k": {"density": "mcmc", "max_gaussians": 600_000},
 }

@@ -38,7 +38,15 @@ from capture_files import (  # noqa: E402
 from analytic_rasterizer import training  # noqa: E402
 from analytic_rasterizer.arguments import camera_arguments  # noqa: E402
 from analytic_rasterizer.losses import l1_ssim, ssim  # noqa: E402
-from analytic_rasterizer.training import TrainingOptions, captures, colmap, files, pictures, schedule  # noqa: E402
+from analytic_rasterizer.training import (  # noqa: E402
+    TrainingOptions,
+    captures,
+    colmap,
+    density,
+    files,
+    pictures,
+    schedule,
+)
 from analytic_rasterizer.training import model as g  # noqa: E402
 from analytic_rasterizer.training.evaluation import evaluate, psnr  # noqa: E402
 
@@ -419,6 +427,67 @@ def test_psnr_rises_and_the_results_say_so(device, synthetic, tmp_path, options)
         assert 150 < metrics["gaussians"] <= 400
 
 
+@torch.no_grad()
+def scatter(gaussians) -> None:
+    """Puts Gaussians where no picture shows them, and others where only some pictures do."""
+    gaussians.means[::3, 1] += 50
+    gaussians.means[1::3] *= 4
+
+
+def rows_shown(trainer) -> list[torch.Tensor]:
+    """Which Gaussians each picture of the next step shows."""
+    supersampling = trainer.options.supersampling
+    with torch.no_grad():
+        return [trainer.gaussians.render(s.settings, supersampling=supersampling)[1] > 0 for s in trainer._next()]
+
+
+def state_of(trainer) -> list[torch.Tensor]:
+    """Copies of parameters and moments, a row for each Gaussian."""
+    moments = [trainer.optimizer.state[field].get(m) for field in trainer.gaussians for m in density.MOMENTS]
+    return [t.detach().clone() for t in (*trainer.gaussians, *(m for m in moments if m is not None))]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"pictures_per_step": 3},
+        {"supersampling": 2, "footprint": "point"},
+        {"filter_3d": True},
+        {"opacity_weight": 0.1, "scale_weight": 0.1},
+        {"density": "mcmc", "noise": 0.0},
+    ],
+    ids=str,
+)
+def test_a_sparse_step_moves_what_its_pictures_show(device, synthetic, tmp_path, options):
+    """The first step as one on all Gaussians does; the others keep parameters and moments in every step."""
+    common = {"density": "none", "densify_from": 1000, **options}
+    dense, sparse = (make_run(synthetic, tmp_path, device, sparse_adam=s, **common).trainer for s in (False, True))
+    for trainer in (dense, sparse):
+        scatter(trainer.gaussians)
+    # Of Gaussians that this step's pictures do not show, some have been moved before.
+    had_moments = False
+    for step in range(8):
+        shown = rows_shown(sparse)
+        rows, before = torch.stack(shown).any(0), state_of(sparse)
+        assert 0 < rows.sum() < 100 and (len(shown) == 1 or not torch.equal(rows, shown[0]))
+        sparse.step()
+        after = state_of(sparse)
+        if step == 0:
+            start = before[0].new_zeros(())
+            dense.step()
+            for expected, got in zip(state_of(dense), after):
+                assert torch.equal(expected[rows], got[rows])
+            assert all((moment[~rows] == start).all() for moment in after[5:])
+            moved = [not torch.equal(new[~rows], old[~rows]) for new, old in zip(dense.gaussians, before)]
+            assert any(moved) == any(sparse.options.regularizers)
+        for old, new in zip(before, after):
+            assert torch.equal(old[~rows], new[~rows])
+        assert not torch.equal(before[0][rows], after[0][rows]) and not torch.equal(before[3][rows], after[3][rows])
+        had_moments = had_moments or (step > 0 and bool((before[-1][~rows] != 0).any()))
+    assert had_moments
+
+
 def test_supersampled_pictures_are_means_of_larger_ones(device):
     """With the gradient of the mean; within what the two cameras' roundings to float32 differ by."""
     view = circle(3)[0]
@@ -475,15 +544,19 @@ def cpu_test_pictures(folder):
         {"density": "mcmc", "background": "random", "pictures_per_step": 2},
         {"density": "3dgs", "sh_degree": 0},
         {"sh_degree": 0, "density": "mcmc"},
+        {"sparse_adam": True},
+        {"sparse_adam": True, "density": "mcmc", "pictures_per_step": 2},
     ],
-    ids=["3dgs", "absgrad", "mcmc", "3dgs-constant-colors", "mcmc-constant-colors"],
+    ids=["3dgs", "absgrad", "mcmc", "3dgs-constant-colors", "mcmc-constant-colors", "sparse", "sparse-mcmc"],
 )
 def test_resumed_training_gives_the_same_bits(device, synthetic, tmp_path, options):
     """Through a file, at a step between two changes of density, and against a run without a break."""
     common = {"iterations": 75, "densify_until": 0.9, **options}  # changes after steps 40 and 60
-    whole = make_run(synthetic, tmp_path / "whole", device, **common)
+    whole, part = (make_run(synthetic, tmp_path / name, device, **common) for name in ("whole", "part"))
+    if whole.options.sparse_adam:
+        for run in (whole, part):
+            scatter(run.trainer.gaussians)
     whole.train()
-    part = make_run(synthetic, tmp_path / "part", device, **common)
     for _ in range(47):
         part.trainer.step()
     part.save()
@@ -503,6 +576,7 @@ def test_resumed_training_gives_the_same_bits(device, synthetic, tmp_path, optio
         {"density": "3dgs", "gradient_scales": "all"},
         {"density": "none", "sh_degree": 0},
         {"background": "random"},
+        {"sparse_adam": True},
     ],
     ids=str,
 )
@@ -513,6 +587,7 @@ def test_one_op_has_the_bits_of_autograd(device, synthetic, tmp_path, options):
     assert all(run.trainer.in_one_op for run in runs)
     runs[1].trainer.in_one_op = False
     for run in runs:
+        scatter(run.trainer.gaussians)
         run.train()
     one, other = (run.trainer.density for run in runs)
     if options.get("density") != "none":
@@ -686,9 +761,10 @@ def test_training_by_time_on_a_capture(capture, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     "kind", [pytest.param(k, id=f"cuda-{k}", marks=needs_cuda) for k in ("3dgs", "absgrad", "mcmc")]
 )
-def test_steps_do_not_wait_for_the_device(synthetic, tmp_path, kind):
+@pytest.mark.parametrize("sparse", [pytest.param(False, id="dense"), pytest.param(True, id="sparse")])
+def test_steps_do_not_wait_for_the_device(synthetic, tmp_path, kind, sparse):
     """Outside of the steps that change the number of Gaussians, once the frames of every size are known."""
-    run = make_run(synthetic, tmp_path, "cuda", iterations=1000, density=kind, densify_from=900)
+    run = make_run(synthetic, tmp_path, "cuda", iterations=1000, density=kind, densify_from=900, sparse_adam=sparse)
     for _ in range(100):
         run.trainer.step()
     torch.cuda.set_sync_debug_mode("error")
@@ -920,6 +996,8 @@ def test_options_survive_a_file():
     options = TrainingOptions(scales=[1, 2], density="mcmc", footprint="box")
     assert options.footprint == "box:samples=4" and options.scale_repeats == (2, 1)
     assert TrainingOptions.from_dict(json.loads(json.dumps(options.to_dict()))) == options
+    older = {name: value for name, value in options.to_dict().items() if name != "sparse_adam"}
+    assert TrainingOptions.from_dict(older) == options and not options.sparse_adam
     with pytest.raises(ValueError, match="among those of TrainingOptions, got speed"):
         TrainingOptions.from_dict({"speed": 1})
 
@@ -950,6 +1028,32 @@ def test_the_command_takes_a_preset_and_resumes_with_it(synthetic, tmp_path, cap
     capsys.readouterr()
     assert cli.main([*arguments, "--preset", "3dgs", "--resume"]) == 2
     assert capsys.readouterr().err == "error: --color-rate: a resumed training keeps the options of its checkpoint\n"
+
+
+def test_the_command_takes_sparse_adam_and_resumes_with_it(synthetic, tmp_path, capsys):
+    start = g.gaussians_at(*g.random_points(60, 0), 0)
+    scatter(start)
+    io.save_scene(tmp_path / "start.ply", start.to_scene())
+    small = ["--iterations", "12", "--points", str(tmp_path / "start.ply")]
+    small += ["--sh-degree", "0", "--no-evaluate", "--device", "cpu"]
+    dense, sparse = (["train", str(synthetic), "--out", str(tmp_path / name), *small] for name in ("dense", "sparse"))
+    assert cli.main(dense) == 0 and cli.main([*sparse, "--sparse-adam"]) == 0
+    for name in ("dense", "sparse"):
+        stored = json.loads((tmp_path / name / files.OPTIONS).read_text())["options"]
+        assert stored["sparse_adam"] is (name == "sparse")
+    scenes = [(tmp_path / name / files.SCENE).read_bytes() for name in ("dense", "sparse")]
+    assert scenes[0] != scenes[1]
+    # Whether or not it is given once more; a dense training does not become a sparse one.
+    assert cli.main([*sparse, "--resume"]) == 0 and cli.main([*sparse, "--resume", "--sparse-adam"]) == 0
+    capsys.readouterr()
+    assert cli.main([*dense, "--resume", "--sparse-adam"]) == 2
+    assert capsys.readouterr().err == "error: --sparse-adam: a resumed training keeps the options of its checkpoint\n"
+    # A checkpoint from before there was the option.
+    state = files.read_checkpoint(tmp_path / "dense" / files.CHECKPOINT)
+    del state["options"]["sparse_adam"]
+    files.write_checkpoint(tmp_path / "dense" / files.CHECKPOINT, state)
+    assert cli.main([*dense, "--resume"]) == 0
+    assert (tmp_path / "dense" / files.SCENE).read_bytes() == scenes[0]
 
 
 def test_ssim_is_that_of_torchmetrics():

@@ -24,7 +24,7 @@ pytest.importorskip("tqdm", reason="needs the train extra")
 pytest.importorskip("scipy", reason="needs the train extra")
 pytest.importorskip("gsply", reason="needs the train extra")
 
-from test_train import TINY, circle, opengl_pose, write_pictures  # noqa: E402
+from test_train import TINY, circle, opengl_pose, rows_shown, scatter, write_pictures  # noqa: E402
 
 from analytic_rasterizer import training  # noqa: E402
 from analytic_rasterizer.cli import launch  # noqa: E402
@@ -41,6 +41,7 @@ COMMON = TINY | {"iterations": STEPS, "scales": (1, 2), "random_points": 120, "d
 COMMON |= {"densify_from": 10, "densify_every": 10, "density": "3dgs", "gradient_scales": "all"}
 VARIANTS = {
     "absgrad": {"density": "absgrad", "gradient_scales": "finest", "filter_3d": True, "reset_every": 35},
+    "sparse": {"sparse_adam": True},
     "mcmc": {
         "density": "mcmc",
         "max_gaussians": 150,
@@ -91,6 +92,7 @@ def work(rank, world, folder):
         for name, more in VARIANTS.items():
             repeat(scene, folder / name, two, more)
         gradients(scene, folder, two)
+        sparse_step(scene, folder, two)
         train_until(make_run(scene, folder / "chain", two), BREAKS[0])
         if two.is_first:
             shutil.copytree(folder / "chain", folder / "chain-by-2")
@@ -117,9 +119,12 @@ def work(rank, world, folder):
 
 def repeat(scene, out, ranks, more):
     """A training to its end, and once more with a break after about half of it."""
-    whole = make_run(scene, out / "whole", ranks, **more)
+    whole, part = (make_run(scene, out / name, ranks, **more) for name in ("whole", "part"))
+    if whole.options.sparse_adam:
+        for run in (whole, part):
+            scatter(run.trainer.gaussians)
     whole.train()
-    train_until(make_run(scene, out / "part", ranks, **more), HALF)
+    train_until(part, HALF)
     part = make_run(scene, out / "part", ranks, resume=True)
     assert part.progress.step == HALF
     part.train()
@@ -130,7 +135,7 @@ def gradients(scene, folder, ranks):
     run = make_run(scene, folder / "gradients", ranks)
     trainer = run.trainer
     trainer._set_rates()
-    loss, seen = trainer._loss()
+    loss, seen, _ = trainer._loss()
     loss.backward()
     made = {name: ranks.gather_rows(field.grad) for name, field in trainer.gaussians._asdict().items()}
     trainer._observe(seen)
@@ -140,6 +145,16 @@ def gradients(scene, folder, ranks):
     made["after"] = [ranks.gather_rows(field) for field in trainer.gaussians]
     if ranks.is_first:
         torch.save(made, folder / "gradients.pt")
+
+
+def sparse_step(scene, folder, ranks):
+    """Parameters and moments after a step that updates only what its pictures show."""
+    trainer = make_run(scene, folder / "sparse-step", ranks, sparse_adam=True).trainer
+    scatter(trainer.gaussians)
+    trainer.step()
+    after = [ranks.gather_rows(rows) for rows in state_rows(trainer)]
+    if ranks.is_first:
+        torch.save(after, folder / "sparse-step.pt")
 
 
 def save_again(run, out):
@@ -258,11 +273,8 @@ def test_two_ranks_then_one_then_three(made):
 def test_gradients_are_those_of_one_process(made):
     """A sum over two cameras has one rounding, whatever its order; the rest is the same arithmetic."""
     got = torch.load(made / "gradients.pt")
-    run = make_run(made / "scene", made / "one", ALONE, pictures_per_step=CAMERAS)
-    start = model.Gaussians(*(field.detach() for field in run.trainer.gaussians))
-    one = ShardedTrainer(run.options, start, run.trainer.pictures, (1.0, 1.0, 1.0), "cpu", ALONE)
-    one._set_rates()
-    loss, seen = one._loss()
+    one = sharded_alone(made)
+    loss, seen, _ = one._loss()
     loss.backward()
     # A rounding for each part of the sum, and one for each part's division.
     assert loss.item() == pytest.approx(got["loss"], rel=4 * torch.finfo(torch.float32).eps)
@@ -272,12 +284,39 @@ def test_gradients_are_those_of_one_process(made):
     one._observe(seen)
     # The mean over two pictures has half the gradient of each.
     torch.testing.assert_close(2 * one.density.gradient_sums, got["sums"])
+    optimizer_of_two(one).step()
+    for name, field, after in zip(model.Gaussians._fields, one.gaussians, got["after"]):
+        assert torch.equal(field, after), name
+
+
+def sharded_alone(made, **more):
+    """One process that takes the pictures of two in a step."""
+    run = make_run(made / "scene", made / "one", ALONE, pictures_per_step=CAMERAS, **more)
+    start = model.Gaussians(*(field.detach() for field in run.trainer.gaussians))
+    one = ShardedTrainer(run.options, start, run.trainer.pictures, (1.0, 1.0, 1.0), "cpu", ALONE)
+    one._set_rates()
+    return one
+
+
+def optimizer_of_two(one):
+    """An optimizer of its Gaussians with the rates of two ranks."""
     rates = [2**0.5 * group["lr"] for group in one.optimizer.param_groups]
     groups = [{"params": [field], "lr": rate} for field, rate in zip(one.gaussians, rates)]
     groups[-1] |= {"head": 1, "head_lr": 2**0.5 * one.optimizer.param_groups[-1]["head_lr"]}
-    FusedAdam(groups, betas=(0.9**2, 0.999**2), eps=1e-15).step()
-    for name, field, after in zip(model.Gaussians._fields, one.gaussians, got["after"]):
-        assert torch.equal(field, after), name
+    return FusedAdam(groups, betas=(0.9**2, 0.999**2), eps=1e-15)
+
+
+def test_a_sparse_step_updates_what_a_picture_of_any_rank_shows(made):
+    one = sharded_alone(made, sparse_adam=True)
+    scatter(one.gaussians)
+    shown, optimizer = rows_shown(one), optimizer_of_two(one)
+    loss, _, rows = one._loss()
+    assert torch.equal(rows, shown[0] | shown[1]) and not torch.equal(*shown) and 0 < rows.sum() < len(rows)
+    loss.backward()
+    optimizer.step(rows=rows)
+    expected = [*one.gaussians, *(optimizer.state[field][moment] for field in one.gaussians for moment in MOMENTS)]
+    for field, after in zip(expected, torch.load(made / "sparse-step.pt"), strict=True):
+        assert torch.equal(field, after)
 
 
 def test_evaluation_is_that_of_one_process(made):

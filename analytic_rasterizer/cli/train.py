@@ -31,6 +31,7 @@ MAIN = {
     "black)",
     "filter_3d": "widen Gaussians by the 3D filter of Mip-Splatting",
     "seed": "of everything that is drawn",
+    "sparse_adam": "a step moves only the Gaussians that its pictures show, as sparse Adam of 3DGS does",
     "density": f"density control: {', '.join(DENSITIES)}",
     "max_gaussians": "grow no further than this, and evenly towards it; 0: no limit",
 }

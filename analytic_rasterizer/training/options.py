@@ -100,6 +100,9 @@ class TrainingOptions:
         opacity_rate, scale_rate, rotation_rate: Learning rates of logit opacities, log scales and quaternions.
         rates_from: Steps after which the learning rates other than that of the means begin to fall.
         rates_half_life: Steps in which they then fall to a half, exponentially; 0: they stay.
+        sparse_adam: Whether a step of the optimizer updates only the Gaussians that at least one of its pictures shows
+            (3DGS's radii > 0), as 3DGS's `--optimizer_type sparse_adam` does. The others keep parameters and moments,
+            whatever regularizers would do to them.
         density: "3dgs": clone and split by the gradient of the projected means; "absgrad": the same by the sum of its
             absolute values over pixels [AbsGS]; "mcmc": relocate and add by opacity [3DGS-MCMC]; "none".
         densify_from: Steps before the first change.
@@ -150,6 +153,7 @@ class TrainingOptions:
     rotation_rate: float = 2e-3
     rates_from: int = 7000
     rates_half_life: int = 7000
+    sparse_adam: bool = False
     density: str = "absgrad"
     densify_from: int = 500
     densify_until: float = 0.75

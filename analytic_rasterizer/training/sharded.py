@@ -11,12 +11,14 @@ Training", 2024: learning rates times sqrt(N), and decay rates to the power of N
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ..distributed import OwnSplats
 from ..losses import l1_ssim
 from .density import MOMENTS
 from .model import Gaussians
@@ -77,8 +79,11 @@ class ShardedTrainer(Trainer):
             group["betas"] = tuple(beta**self.stride for beta in BETAS)
         self.optimizer.param_groups[-1]["head_lr"] *= math.sqrt(self.stride)
 
-    def _loss(self) -> tuple[Tensor, list[Seen]]:
-        """This rank's part of the loss, whose sum over the ranks is the loss of the step; and what `_observe` takes."""
+    def _loss(self) -> tuple[Tensor, list[Seen], Tensor | None]:
+        """This rank's part of the loss, whose sum over the ranks is the loss of the step; and the rest as in `Trainer`.
+
+        A picture of any rank shows what is to be updated: this rank has projected its own Gaussians into all of them.
+        """
         options, shown = self.options, self._next()
         gaussians = self.gaussians.activated()
         batch = gaussians.render_together(
@@ -98,13 +103,22 @@ class ShardedTrainer(Trainer):
             loss = loss + opacity_weight * gaussians.opacities.sum() / batch.count
         if scale_weight:
             loss = loss + scale_weight * gaussians.scales.sum() / (3 * batch.count)
+        rows = self._visible(batch.shard) if options.sparse_adam else None
         # What else there is of the batch is let go of, before the backward pass needs the memory.
         seen = []
         for camera, (picture, splats) in enumerate(zip(shown, batch.shard)):
             if self.density.watches(picture.scale):
                 leaf = batch.means2d_abs[camera] if batch.means2d_abs else splats.means2d
                 seen.append(Seen(splats.gaussian_ids, leaf, (splats.width, splats.height)))
-        return loss, seen
+        return loss, seen, rows
+
+    def _visible(self, shard: Sequence[OwnSplats]) -> Tensor:
+        """Which Gaussians of this rank at least one of the pictures shows, (P,) bool. Waits for no device."""
+        means = self.gaussians.means
+        rows = torch.zeros(len(means), dtype=torch.bool, device=means.device)
+        for splats in shard:
+            rows[splats.gaussian_ids.long()] |= splats.radii > 0  # a picture has each of them once
+        return rows
 
     def _observe(self, seen: list[Seen]) -> None:
         """Density control sees the gradients that each picture would have in one process."""

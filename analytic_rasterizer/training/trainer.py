@@ -106,8 +106,9 @@ class Trainer:
         progress, optimizer = self.progress, self.optimizer
         stride = self.stride
         self._set_rates()
-        self.losses.append(self._differentiate_in_one_op() if self.in_one_op else self._differentiate())
-        optimizer.update()
+        loss, rows = self._differentiate_in_one_op() if self.in_one_op else self._differentiate()
+        self.losses.append(loss)
+        optimizer.update(rows)
         optimizer.zero_grad(set_to_none=True)
         progress.advance(stride)
         changed = self.density.after_step(progress.step, progress.share, stride)
@@ -153,18 +154,21 @@ class Trainer:
             shown.append(Shown(scale, view, chosen, background))
         return shown
 
-    def _differentiate(self) -> Tensor:
-        """The loss of the next step. Its gradients are those of the parameters, and density control has seen them."""
-        loss, seen = self._loss()
+    def _differentiate(self) -> tuple[Tensor, Tensor | None]:
+        """The loss of the next step, and the rows that the optimizer updates, as `_loss` returns them.
+
+        Gradients of the loss are those of the parameters, and density control has seen them.
+        """
+        loss, seen, rows = self._loss()
         # In this thread: otherwise one of the device's does it, and handing over and back takes longer than the kernels
         # of a small picture.
         with torch.autograd.set_multithreading_enabled(False):
             loss.backward(self.one)
         self._observe(seen)
-        return loss.detach()
+        return loss.detach(), rows
 
     @torch.no_grad()
-    def _differentiate_in_one_op(self) -> Tensor:
+    def _differentiate_in_one_op(self) -> tuple[Tensor, Tensor | None]:
         """The same, bit for bit, without what autograd costs the host."""
         (shown,) = self._next()
         gaussians, density = self.gaussians, self.density
@@ -184,7 +188,7 @@ class Trainer:
         if columns:
             density.observe(gradients[-1], radii)
         self.last = image, truth
-        return loss
+        return loss, radii > 0 if self.options.sparse_adam else None
 
     def _camera(self, shown: Shown) -> dict[str, Any]:
         """Camera and footprint of a picture by the names of the ops; made once for every picture and degree."""
@@ -194,8 +198,8 @@ class Trainer:
             self._cameras[shown.scale, shown.view] = camera
         return camera
 
-    def _loss(self) -> tuple[Tensor, Any]:
-        """The loss of the next step, and what `_observe` takes."""
+    def _loss(self) -> tuple[Tensor, Any, Tensor | None]:
+        """The loss of the next step, what `_observe` takes, and with `sparse_adam` which Gaussians a picture shows."""
         options = self.options
         gaussians = self.gaussians.activated()
         losses, seen = [], []
@@ -212,7 +216,8 @@ class Trainer:
             loss = loss + opacity_weight * gaussians.opacities.mean()
         if scale_weight:
             loss = loss + scale_weight * gaussians.scales.mean()
-        return loss, seen
+        rows = torch.stack([radii > 0 for _, radii in seen]).any(0) if options.sparse_adam else None
+        return loss, seen, rows
 
     def _observe(self, seen: list[tuple[Tensor | None, Tensor]]) -> None:
         """Lets density control look at the gradients of a step."""
