@@ -25,6 +25,7 @@ from __future__ import annotations
 import argparse
 import gc
 import statistics
+import textwrap
 from functools import partial
 from pathlib import Path
 
@@ -42,6 +43,7 @@ SIGMA, OPACITY = 2.0, 0.02  # px
 FOCAL = 4.0  # of the width: off the axis splats are at most 1.6% wider
 DEPTHS = 2.0, 12.0
 PARTS = (*STAGES, "backward")
+SERIES = ("gaussians", "pixels")
 COLORS = dict(zip(PARTS, ("#1c7ed6", "#e08214", "#2b8a3e", "#c2255c")))
 MIB = 2**20
 
@@ -59,13 +61,15 @@ def main() -> None:
     if len(args.threads) > 1:
         by_threads = measure_threads(args)
         print(f"\n{args.count} Gaussians, {args.size[0]}x{args.size[1]}\n{format_threads(by_threads)}")
+    save_json(args, {"rows": rows, "threads": by_threads})
     if args.out:
         out = Path(args.out)
         out.mkdir(parents=True, exist_ok=True)
-        tables.save_figure(plot_rows(rows, describe_machine(args.device)), out, "scaling")
+        if any("error" not in row for row in rows):
+            figure = plot_rows(rows, describe_machine(args.device), memory_name(args.device))
+            tables.save_figure(figure, out, "scaling")
         if by_threads:
             tables.save_figure(plot_threads(by_threads), out, "threads")
-    save_json(args, {"rows": rows, "threads": by_threads})
 
 
 def parse_arguments() -> argparse.Namespace:
@@ -228,30 +232,38 @@ def format_threads(by_threads: dict[int, dict]) -> str:
     return tables.format_table(header, rows)
 
 
-def plot_rows(rows: list[dict], machine: str):
-    """Above: time per pair. Below: memory per pair and per pixel. Left: as Gaussians grow. Right: as pixels do."""
-    figure, axes = tables.new_figure(8, 6, 2, 2, sharex="col", sharey="row")
-    for column, series in enumerate(("gaussians", "pixels")):
-        of_series = [row for row in rows if row["series"] == series]
-        kept = [row for row in of_series if "error" not in row]
+def plot_rows(rows: list[dict], machine: str, memory: str):
+    """Above: time per pair. Below: memory per pair and per pixel. Left: as Gaussians grow. Right: as pixels do.
+
+    `machine` is the title, `memory` what memory is meant. Of a series of which no row fitted into memory there is no
+    column; at least one row must have.
+    """
+    kept_of = {name: [row for row in rows if row["series"] == name and "error" not in row] for name in SERIES}
+    kept_of = {name: kept for name, kept in kept_of.items() if kept}
+    figure, axes = tables.new_figure(4 * len(kept_of), 6, len(kept_of), 2, sharex="col", sharey="row")
+    for column, (series, kept) in enumerate(kept_of.items()):
         pixels = [row["width"] * row["height"] for row in kept]
         x = pixels if series == "pixels" else [row["gaussians"] for row in kept]
-        time, memory = axes[:, column]
+        above, below = axes[:, column]
         for part in PARTS:
-            time.plot(x, [per_pair(row, part) for row in kept], "o-", color=COLORS[part], label=part)
+            above.plot(x, [per_pair(row, part) for row in kept], "o-", color=COLORS[part], label=part)
         per_pixel = [row["memory_bytes"] / area for row, area in zip(kept, pixels)]
-        memory.plot(x, per_pixel, "D-", color="#7a7f87", label="per pixel")
-        memory.plot(x, [per_pair(row, "memory_bytes") for row in kept], "s-", color="#7048e8", label="per pair")
-        count, width, height = (of_series[-1][key] for key in ("gaussians", "width", "height"))
+        below.plot(x, per_pixel, "D-", color="#7a7f87", label="per pixel")
+        below.plot(x, [per_pair(row, "memory_bytes") for row in kept], "s-", color="#7048e8", label="per pair")
+        count, width, height = (kept[-1][key] for key in ("gaussians", "width", "height"))
         density = f"pixels, {count / (width * height):.2g} Gaussians in each"
-        memory.set_xlabel(density if series == "pixels" else f"Gaussians in {width}x{height}")
-        for ax in (time, memory):
-            ax.set(xscale="log", yscale="log")
-            ax.yaxis.set_major_formatter("{x:g}")
-            ax.tick_params("x", which="minor", labelbottom=False)
-    for [ax, _], label in zip(axes, ("time per pair [ns]", "memory [bytes]")):
+        below.set_xlabel(density if series == "pixels" else f"Gaussians in {width}x{height}")
+    for ax in axes.flat:
+        ax.set(xscale="log", yscale="log")
+        ax.yaxis.set_major_formatter("{x:g}")
+        ax.tick_params("x", which="minor", labelbottom=False)
+        for axis in (ax.xaxis, ax.yaxis):
+            low, high = axis.get_view_interval()
+            if high < 12 * low:  # perhaps without a power of ten
+                tables.label_log_axis(axis)
+    for [ax, *_], label in zip(axes, ("time per pair [ns]", textwrap.fill(f"memory [bytes]: {memory}", 22))):
         ax.set_ylabel(label)
-    for ax in axes[:, 1]:
+    for ax in axes[:, -1]:
         ax.legend(frameon=False, fontsize=9, reverse=True)
     figure.suptitle(machine, fontsize=11)
     return figure

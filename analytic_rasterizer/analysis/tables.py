@@ -53,16 +53,21 @@ def new_figure(width: float, height: float, columns: int = 1, rows: int = 1, **o
     return figure, axes
 
 
+def label_log_axis(axis) -> None:
+    """Labels a logarithmic axis between powers of ten too, so that it has labels however short it is."""
+    ticker = optional_import("matplotlib.ticker", "analysis")
+    low, high = axis.get_view_interval()
+    subs = (1, 2, 5) if high / low >= 12 else (1, 1.2, 1.5, 2, 3, 5, 7)
+    axis.set_major_locator(ticker.LogLocator(subs=subs))
+    axis.set_major_formatter("{x:g}")
+    axis.set_minor_formatter(ticker.NullFormatter())
+
+
 def add_titles(figure, axes, title: str, xlabel: str = "") -> None:
     """Logarithmic x axes with labels, the title, and the legend of the last axes at the right."""
-    ticker = optional_import("matplotlib.ticker", "analysis")
     for ax in axes.flat:
         ax.set_xscale("log")
-        low, high = ax.get_xlim()
-        subs = (1, 2, 5) if high / low >= 12 else (1, 1.2, 1.5, 2, 3, 5, 7)
-        ax.xaxis.set_major_locator(ticker.LogLocator(subs=subs))
-        ax.xaxis.set_major_formatter("{x:g}")
-        ax.xaxis.set_minor_formatter(ticker.NullFormatter())
+        label_log_axis(ax.xaxis)
     for ax in axes[-1]:
         ax.set_xlabel(xlabel or ax.get_xlabel())
     handles, labels = axes[-1, -1].get_legend_handles_labels()

@@ -114,8 +114,8 @@ template <typename T> AR_HD int splat_radius(Cov2d<T> cov, T variance) {
 }
 
 /// Gives a splat its shape, all but its colour. Returns 3DGS's radius, 0 if it is culled: off the image, or of a shape
-/// that no float holds. A splat that is kept may still touch no tile (level <= 0). `support`, if not null, is set where
-/// one is kept.
+/// that no float holds. A splat that is kept may still touch no tile (level <= 0). `support`, if not null, is that of
+/// the splat where splat.level > 0.
 template <typename T>
 AR_HD int shape_splat(const ProjectedGaussian<T>& p, FootprintChoice footprint, TileGrid grid, SplatRow<T>& splat,
                       Support<T>* support = nullptr) {

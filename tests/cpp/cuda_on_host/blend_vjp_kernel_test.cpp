@@ -212,16 +212,19 @@ template <class F, Sums kSums> void expect_sums_of_pixels(MeanSums mean_sums) {
   std::vector<float> sums(size_t(scene.rows) * kPairGradWidth, NAN);
   scene.template run<kSums>(2, kOthers, int(scene.chunks.size()), sums);
   const ExpectedSums expected = expected_sums(scene);
-  double most = 0;
+  int compared = 0;
   for (size_t i = 0; i < sums.size(); ++i) {
     const int column = int(i % kPairGradWidth);
     if (column >= (kSums == Sums::kGrads ? kPairMeans : kPairMeans + 2)) continue;
     // Each of up to 256 splats divides the transmittance, and adds to what is behind: a few roundings for each of them.
-    const double error = std::abs(sums[i] - expected.sums[i]), tolerance = 4 * 256 * 0x1p-24 * expected.size[i];
-    if (expected.size[i] > 0) most = std::max(most, error / expected.size[i]);
-    ASSERT_LE(error, tolerance + 1e-30) << "column " << column << " of row " << i / kPairGradWidth << ": " << sums[i];
+    // Sums of means, whose sizes are bounds far above them, are held to fewer.
+    const double roundings = column < kPairMeans ? 4 * 256 : 256;
+    const double error = std::abs(sums[i] - expected.sums[i]), tolerance = roundings * 0x1p-24 * expected.size[i];
+    // What no pixel shows is exactly zero.
+    ASSERT_LE(error, tolerance) << "column " << column << " of row " << i / kPairGradWidth << ": " << sums[i];
+    compared += expected.size[i] > 0;
   }
-  ASSERT_GT(most, 0);
+  ASSERT_GT(compared, int(sums.size()) / 10);
 }
 
 template <class F> class BlendVjpKernel : public testing::Test {};
