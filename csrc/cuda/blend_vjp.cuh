@@ -3,168 +3,11 @@
 
 #include <algorithm>
 
-#include "cuda/composite.cuh"
+#include "cuda/blend_vjp_pixels.cuh"
+#include "cuda/blend_vjp_sums.cuh"
 #include "cuda/launch.cuh"
 
 namespace ar::cuda {
-
-/// What a kernel of blend_vjp sums: gradients, MeanSums, or both at once.
-enum class Sums { kGrads, kMeans, kBoth };
-
-/// Samples of a pixel that a warp of blend_vjp takes. More are shared out to the warps of a block: one warp would be
-/// busy for long with their chunk. Only MeanSums need a pixel's sum at once.
-template <class F, Sums kSums>
-inline constexpr int kVjpSamples = F::kSamples <= 4 || kSums == Sums::kMeans ? F::kSamples : 4;
-
-/// Whether each lane of blend_vjp holds its eight pixels of a tile in registers, where one sample and three channels
-/// leave room for a splat, and not in shared memory. Then a visit of a subtile neither waits for shared memory nor has
-/// instructions that read and write it, which is worth the warps that there are fewer of on an SM.
-template <class F, int C>
-inline constexpr bool kHoldsPixels = F::kSamples == 1 && C == 3 && sizeof(TileSplat<F, C>) <= 112;
-
-/// Whether it holds what blending carries through those pixels, for all samples, in registers. Then each subtile has
-/// code of its own, and there is room in shared memory to add up the sums of several pairs together. Not with two
-/// samples, as then twice as many warps fit without.
-template <class F, int C>
-inline constexpr bool kHoldsSamples =
-    kHoldsPixels<F, C> || (F::kSamples == 4 && C == 3 && sizeof(TileSplat<F, C>) <= 64);
-
-/// Whether it takes two subtiles, one below the other, under one branch: 8x8 pixels. Then two pixels of a lane have
-/// instructions that do not wait for each other, and there are half as many branches, each of which waits for a uniform
-/// register. Where weights are expensive, subtiles that are visited in vain cost more than that gains.
-template <class F, int C>
-inline constexpr bool kTakesTwo = kHoldsPixels<F, C> && sizeof(typename F::template Terms<float>) <= 8 * sizeof(float);
-
-/// Nine values of each lane for kPairs pairs in shared memory, which are added up over the lanes together. For a pair
-/// that takes 17 instructions, where sum_values takes 60. Lanes are added in the order of sum_values, so that the sums
-/// are the same to the bit.
-struct PairSums {
-  static constexpr int kPairs = 8, kValues = 9;
-  struct Pair {
-    /// The first eight values of every lane, in two groups of four. Two more places keep the groups, and eight[] and
-    /// ninth[] together the pairs, apart in such a way that no reads meet in a bank.
-    float4 eight[2][34];
-    float4 ninth[8];  ///< the ninth value of lanes 0, 4, ... 28, then of lanes 1, 5, ...
-
-    __device__ void put(const float (&values)[kValues]) {
-      const int lane = lane_id();
-#pragma unroll
-      for (int group = 0; group < 2; ++group) {
-        const float* v = values + 4 * group;
-        eight[group][lane] = {v[0], v[1], v[2], v[3]};
-      }
-      reinterpret_cast<float*>(ninth)[lane % 4 * 8 + lane / 4] = values[8];
-    }
-    /// Of the lanes that differ from `lane` in `offset` or in twice it and so on up to 16, added in pairs, those that
-    /// are 16 apart first.
-    template <int offset> __device__ Values<4> sum_from(int group, int lane) const {
-      if constexpr (offset == 32) {
-        const float4 v = eight[group][lane];
-        return {v.x, v.y, v.z, v.w};
-      } else {
-        Values<4> sum = sum_from<2 * offset>(group, lane);
-        sum += sum_from<2 * offset>(group, lane + offset);
-        return sum;
-      }
-    }
-  };
-  Pair pairs[kPairs];
-
-  /// The sums of pair lane / 4: `four` of a group, that of number lane / 2 % 2, and that of the ninth value.
-  __device__ void sum(float (&four)[4], float& ninth) const {
-    const int lane = lane_id(), odd = lane / 4 % 2;
-    const Pair& pair = pairs[lane / 4];
-    const Values<4> half = pair.sum_from<2>(lane / 2 % 2, lane % 2);
-#pragma unroll
-    for (int v = 0; v < 4; ++v) four[v] = half.v[v] + __shfl_xor_sync(kAllLanes, half.v[v], 1);
-    // The four numbers of lanes below 16 and the four of the others, in either order.
-    const float4 a = pair.ninth[lane % 4 * 2 + odd], b = pair.ninth[lane % 4 * 2 + 1 - odd];
-    ninth = ((a.x + b.x) + (a.z + b.z)) + ((a.y + b.y) + (a.w + b.w));
-#pragma unroll
-    for (int offset = 2; offset > 0; offset /= 2) ninth += __shfl_xor_sync(kAllLanes, ninth, offset);
-  }
-};
-
-/// A splat of a batch of 32 that reaches pixels of its tile.
-template <class F, int C> struct alignas(16) ListedSplat {
-  typename F::template Terms<float> terms;
-  Values<C> channels;
-  uint32_t reach_and_place;  ///< bits 0 to 7: the subtiles; from bit 27 on: its place in the batch
-  int32_t row;               ///< of its sums
-};
-/// In use: copied to registers, unless it has too many numbers.
-template <class F, int C>
-using ListedSplatRef =
-    std::conditional_t<sizeof(TileSplat<F, C>) <= 112, const ListedSplat<F, C>, const ListedSplat<F, C>&>;
-
-/// Those splats of a batch in blend_vjp, back to front, and what each of the warps that share them sums.
-template <class F, int C, int kGroup> struct VjpGroup {
-  struct Nothing {};
-  alignas(16) int subtile_last[kSubtiles];  ///< behind the last pair that was composited into a pixel of each subtile
-  ListedSplat<F, C> splats[32];
-  std::conditional_t<kHoldsSamples<F, C>, PairSums, Nothing> pair_sums;
-  float sums[kGroup > 1 ? kGroup : 1][kGroup > 1 ? 32 : 1][6 + C];
-};
-
-/// kCount pixels in blend_vjp, S samples of each: those of a warp in shared memory, or those that a lane holds.
-template <int S, int C, int kCount> struct VjpPixels {
-  static constexpr bool kPacked = C == 3;  // the fourth number of g is sample 0's `last`, as bits
-  static constexpr int kLasts = kPacked ? S - 1 : S;
-  float4 g[kCount];  // gradient with respect to one sample's channels
-  int last[kLasts > 0 ? kLasts : 1][kLasts > 0 ? kCount : 1];
-
-  __device__ int last_of(int s, int pixel, const float4& g_pixel) const {
-    if (kPacked) return s == 0 ? __float_as_int(g_pixel.w) : last[s > 0 ? s - 1 : 0][pixel];
-    return last[kPacked ? 0 : s][pixel];
-  }
-  __device__ void set(int pixel, const Values<C>& values) {
-    g[pixel] = {values.v[0], values.v[1], values.v[2], kPacked ? 0 : values.v[C - 1]};
-  }
-  __device__ void set_last(int s, int pixel, int value) {
-    if (!kPacked) {
-      last[kPacked ? 0 : s][pixel] = value;
-    } else if (s == 0) {
-      g[pixel].w = __int_as_float(value);
-    } else {
-      last[s > 0 ? s - 1 : 0][pixel] = value;
-    }
-  }
-};
-
-/// What blending carries through them from splat to splat.
-template <int S, int kCount> struct VjpSamples {
-  struct Sample {
-    float transmittance, behind;
-  };
-  Sample of[S][kCount];
-};
-
-template <int C> __device__ float dot(const Values<C>& a, const Values<C>& b) {
-  float sum = a.v[0] * b.v[0];
-#pragma unroll
-  for (int c = 1; c < C; ++c) sum = sum + a.v[c] * b.v[c];
-  return sum;
-}
-
-/// Blocks of blend_vjp that an SM should hold: bounds the registers.
-template <class F, int C>
-inline constexpr int kVjpBlocks = F::kSamples > 1                 ? (kHoldsSamples<F, C> ? 11 : 1)
-                                  : sizeof(TileSplat<F, C>) <= 48 ? (kHoldsPixels<F, C> ? 5 : 6)
-                                                                  : (kHoldsPixels<F, C> ? 4 : 5);
-
-/// Warps of a block of blend_vjp: as many as leave room for a few blocks in shared memory.
-template <class F, Sums kSums>
-inline constexpr int kVjpWarps = F::kSamples > kVjpSamples<F, kSums> ? F::kSamples / kVjpSamples<F, kSums>
-                                 : F::kSamples <= 2                  ? 4
-                                 : F::kSamples == 8                  ? 2
-                                                                     : 1;
-
-/// What of a warp's pixels is in shared memory.
-template <class F, int C, Sums kSums> struct SharedPixels {
-  static constexpr int kOwn = kVjpSamples<F, kSums>;
-  VjpPixels<kOwn, C, kHoldsPixels<F, C> ? 1 : kTilePixels> pixels;
-  VjpSamples<kOwn, kHoldsSamples<F, C> ? 1 : kTilePixels> samples;
-};
 
 /// A warp's share of a chunk, back to front over all pixels of the tile: every pair is summed in one place, so the sums
 /// need no atomics, whose order would change from run to run. `first`: the first of the samples that the warp takes.
@@ -462,10 +305,6 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
     }
   }
 }
-
-/// Whether a warp has a chunk for itself. Then it takes the next one when it is done, and need not wait for the others
-/// of its block, which have other chunks. Warps that share a chunk end with their block.
-template <class F, Sums kSums> inline constexpr bool kTakesChunks = kVjpSamples<F, kSums> == F::kSamples;
 
 template <class F, int C, Sums kSums>
 __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)

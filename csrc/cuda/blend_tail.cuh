@@ -1,0 +1,182 @@
+// The four kernels of blend that finish the tiles that blend_front has left open, as described in blend.cuh.
+#pragma once
+
+#include "cuda/blend_output.cuh"
+#include "cuda/blend_stage.cuh"
+
+namespace ar::cuda {
+
+/// Multiplies the transmittance by what the splats in shared memory let through, without a threshold at which to stop.
+template <class F, int C>
+__device__ void pass_all(BlendStage<F, C>& stage, int count, Vec2<float> p, float (&transmittance)[F::kSamples]) {
+  const int reached = stage.list_reached(count);
+  stage.for_each_listed(0, reached, [&](TileSplatRef<F, C> splat, auto) {
+#pragma unroll
+    for (int s = 0; s < F::kSamples; ++s)
+      transmittance[s] -= transmittance[s] * effective_alpha(F::alpha(splat.terms, p, s));
+  });
+}
+
+/// Blocks share the chunks. Writes the transmittance of each chunk alone.
+template <class F>
+__global__ void __launch_bounds__(kBlendThreads, kTailThroughBlocks<F>) tail_through_kernel(const BlendParams params) {
+  constexpr int S = F::kSamples, kLength = chunk_length(S);
+  __shared__ BlendStage<F, 0> stage;
+  const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
+  const Vec2<float> p = pixel_of(threadIdx.x / 32, lane_id());
+  const int items = params.plan.state->counts.tail;
+  for (int item = blockIdx.x; item < items; item += gridDim.x) {
+    const TileChunk tail = params.plan.tail[item];
+    if (!has_samples<S>(params.lists, tail.tile) || !params.tile_open[tail.tile]) continue;
+    const TileList list = list_of(params.lists, params.grid, tail.tile);
+    const int end = min(list.count, (tail.chunk + 1) * kLength);
+    float transmittance[S];
+#pragma unroll
+    for (int s = 0; s < S; ++s) transmittance[s] = 1;
+    for (int k = tail.chunk * kLength; k < end; k += stage.kBatch) {
+      __syncthreads();
+      const int count = stage.load(splats, params.channels, list, k, end);
+      __syncthreads();
+      pass_all<F>(stage, count, p, transmittance);
+    }
+    const TransmittancePlanes<S> planes(params, tail.tile, int(threadIdx.x));
+#pragma unroll
+    for (int s = 0; s < S; ++s) planes.at(tail.chunk, s) = transmittance[s];
+  }
+}
+
+/// A sample with less transmittance than this would be stopped by the next splat that it meets, since alpha is at least
+/// kAlphaMin, and so it may count as stopped already. The margin above kTransmittanceMin is for the rounding of
+/// products of chunks, which differs from that of single splats.
+inline constexpr float kNearlyStopped = float(kTransmittanceMin * (1 + kAlphaMin / 2));
+
+__device__ inline int chunks_of(const BlendParams& params, int tile, int length) {
+  return int((params.lists.tile_offsets[tile + 1] - params.lists.tile_offsets[tile] + length - 1) / length);
+}
+
+/// The kernels that go through all tail chunks of a tile, a pixel per lane, have a block per warp: the pixels of a long
+/// list are spread over several multiprocessors, as one alone reads too slowly. A part of a tile is 32 pixels.
+inline constexpr int kTailParts = kTilePixels / 32;
+
+/// Turns the transmittance of each chunk into that in front of the chunk, negative where a sample has stopped before.
+/// Blocks share the parts of the open tiles.
+template <int S> __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params) {
+  constexpr int kBatch = 32;
+  const int items = params.plan.state->counts.open_tiles[sample_class(S)] * S * kTailParts;
+  for (int item = blockIdx.x; item < items; item += gridDim.x) {
+    const int tile = open_tiles<S>(params)[item / (S * kTailParts)], s = item / kTailParts % S;
+    const int chunks = chunks_of(params, tile, chunk_length(S)), front = front_chunks(params.grid, S);
+    const TransmittancePlanes<S> planes(params, tile, item % kTailParts * 32 + lane_id());
+    float transmittance = planes.at(front - 1, s), next[kBatch];
+    const auto load = [&](int first) {
+#pragma unroll
+      for (int k = 0; k < kBatch; ++k) {
+        if (first + k < chunks) next[k] = planes.at(first + k, s);
+      }
+    };
+    load(front);
+    for (int first = front; first < chunks; first += kBatch) {
+      float through[kBatch];
+#pragma unroll
+      for (int k = 0; k < kBatch; ++k) through[k] = next[k];
+      load(first + kBatch);  // before the stores, behind which loads would wait
+#pragma unroll
+      for (int k = 0; k < kBatch; ++k) {
+        if (first + k >= chunks) break;
+        planes.at(first + k, s) = transmittance;
+        if (transmittance > 0) transmittance *= through[k];
+        if (transmittance < kNearlyStopped) transmittance = -abs(transmittance);
+      }
+    }
+  }
+}
+
+/// Blocks share the chunks. Writes the channels of each chunk and the transmittance at its end, which is zero where the
+/// sample had stopped before the chunk.
+template <class F, int C, bool kKeep>
+__global__ void __launch_bounds__(kBlendThreads, kTailBlendBlocks<F>) tail_blend_kernel(const BlendParams params) {
+  constexpr int S = F::kSamples, kLength = chunk_length(S), kSets = kKeep ? S : 1;
+  __shared__ BlendStage<F, C> stage;
+  const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
+  const Vec2<float> p = pixel_of(threadIdx.x / 32, lane_id());
+  const int items = params.plan.state->counts.tail;
+  for (int item = blockIdx.x; item < items; item += gridDim.x) {
+    const TileChunk tail = params.plan.tail[item];
+    if (!has_samples<S>(params.lists, tail.tile) || !params.tile_open[tail.tile]) continue;
+    const TileList list = list_of(params.lists, params.grid, tail.tile);
+    const int end = min(list.count, (tail.chunk + 1) * kLength);
+    const PixelCheckpoints<S, C, kKeep> checkpoints(params, tail.tile, int(threadIdx.x));
+    PixelState<S, C, kSets> state;
+    state.start(false);
+    bool started[S];
+#pragma unroll
+    for (int s = 0; s < S; ++s) {
+      const float transmittance = checkpoints.transmittance(tail.chunk, s);
+      started[s] = transmittance > 0;
+      if (started[s]) state.transmittance[s] = transmittance;
+    }
+    int k = tail.chunk * kLength;
+    while (k < end && __syncthreads_or(state.open())) {
+      const int count = stage.load(splats, params.channels, list, k, end);
+      __syncthreads();
+      composite_all<F>(stage, count, k, p, state);
+      k += count;
+    }
+    const Pixel pixel(list, params.grid, p);
+#pragma unroll
+    for (int s = 0; s < S; ++s) {
+      const float transmittance = started[s] ? state.transmittance[s] : 0;
+      if constexpr (kKeep) {
+        checkpoints.kept(tail.chunk, s) = {state.channels[s], transmittance};
+        if (pixel.inside && state.last[s] > 0) atomicMax(&params.last[s * pixel.image + pixel.index], state.last[s]);
+      } else {
+        checkpoints.transmittance(tail.chunk, s) = transmittance;
+      }
+    }
+    if constexpr (!kKeep) checkpoints.set_total(tail.chunk, state.channels[0]);
+    __syncthreads();
+  }
+}
+
+/// Adds the chunks of the open tiles. Blocks share the parts of the tiles.
+template <int S, int C, bool kKeep> __global__ void __launch_bounds__(32) tail_sum_kernel(const BlendParams params) {
+  constexpr int kBatch = kKeep && C > 3 ? 16 : 32;  // chunks that are loaded together, into registers
+  const Values<C> background = background_of<C>(params);
+  const int items = params.plan.state->counts.open_tiles[sample_class(S)] * kTailParts;
+  for (int item = blockIdx.x; item < items; item += gridDim.x) {
+    const int tile = open_tiles<S>(params)[item / kTailParts], part = item % kTailParts;
+    const int chunks = chunks_of(params, tile, chunk_length(S));
+    const PixelCheckpoints<S, C, kKeep> checkpoints(params, tile, part * 32 + lane_id());
+    Values<C> total = {};
+    float transmittance[S];
+#pragma unroll
+    for (int s = 0; s < S; ++s) {
+      float last = -1;
+      for (int first = checkpoints.first_chunk; first < chunks; first += kBatch) {
+        Values<C> own[kBatch];
+        float ends[kBatch];
+#pragma unroll
+        for (int k = 0; k < kBatch; ++k) {
+          ends[k] = 0;
+          if (first + k >= chunks) continue;
+          if (kKeep || s == 0) own[k] = checkpoints.channels(first + k, s);
+          ends[k] = checkpoints.transmittance(first + k, s);
+        }
+#pragma unroll
+        for (int k = 0; k < kBatch; ++k) {
+          if ((kKeep || s == 0) && first + k < chunks) total += own[k];
+          if (ends[k] != 0) last = ends[k];
+        }
+      }
+      transmittance[s] = last;
+      if constexpr (kKeep) accumulate_behind<kBatch>(checkpoints, chunks, s, times(abs(last), background));
+    }
+    const TileList list = list_of(params.lists, params.grid, tile);
+    store_pixel(params, Pixel(list, params.grid, pixel_of(part, lane_id())), total, transmittance);
+  }
+}
+
+/// Blocks of the kernels of the tail, which share the work: eight for each of the 132 multiprocessors of an H200.
+inline constexpr int kTailBlocks = 132 * 8;
+
+}  // namespace ar::cuda
