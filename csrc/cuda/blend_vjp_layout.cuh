@@ -14,6 +14,9 @@ enum class Sums { kGrads, kMeans, kBoth };
 template <class F, Sums kSums>
 inline constexpr int kVjpSamples = F::kSamples <= 4 || kSums == Sums::kMeans ? F::kSamples : 4;
 
+/// Warps that share a chunk, each with its own samples.
+template <class F, Sums kSums> inline constexpr int kVjpGroup = F::kSamples / kVjpSamples<F, kSums>;
+
 /// Whether each lane of blend_vjp holds its eight pixels of a tile in registers, where one sample and three channels
 /// leave room for a splat, and not in shared memory. Then a visit of a subtile neither waits for shared memory nor has
 /// instructions that read and write it, which is worth the warps that there are fewer of on an SM.
@@ -33,6 +36,11 @@ inline constexpr bool kHoldsSamples =
 template <class F, int C>
 inline constexpr bool kTakesTwo = kHoldsPixels<F, C> && sizeof(typename F::template Terms<float>) <= 8 * sizeof(float);
 
+/// Whether each subtile has code of its own: where that is short, or pixels are in registers. Of 58 instructions 11
+/// would work out where a subtile's pixels are.
+template <class F, int C>
+inline constexpr bool kUnrollsSubtiles = kHoldsSamples<F, C> || (F::kSamples == 1 && sizeof(TileSplat<F, C>) <= 48);
+
 /// Blocks of blend_vjp that an SM should hold: bounds the registers.
 template <class F, int C>
 inline constexpr int kVjpBlocks = F::kSamples > 1                 ? (kHoldsSamples<F, C> ? 11 : 1)
@@ -41,13 +49,13 @@ inline constexpr int kVjpBlocks = F::kSamples > 1                 ? (kHoldsSampl
 
 /// Warps of a block of blend_vjp: as many as leave room for a few blocks in shared memory.
 template <class F, Sums kSums>
-inline constexpr int kVjpWarps = F::kSamples > kVjpSamples<F, kSums> ? F::kSamples / kVjpSamples<F, kSums>
-                                 : F::kSamples <= 2                  ? 4
-                                 : F::kSamples == 8                  ? 2
-                                                                     : 1;
+inline constexpr int kVjpWarps = kVjpGroup<F, kSums> > 1 ? kVjpGroup<F, kSums>
+                                 : F::kSamples <= 2      ? 4
+                                 : F::kSamples == 8      ? 2
+                                                         : 1;
 
 /// Whether a warp has a chunk for itself. Then it takes the next one when it is done, and need not wait for the others
 /// of its block, which have other chunks. Warps that share a chunk end with their block.
-template <class F, Sums kSums> inline constexpr bool kTakesChunks = kVjpSamples<F, kSums> == F::kSamples;
+template <class F, Sums kSums> inline constexpr bool kTakesChunks = kVjpGroup<F, kSums> == 1;
 
 }  // namespace ar::cuda

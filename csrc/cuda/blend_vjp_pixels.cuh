@@ -1,4 +1,5 @@
-// The pixels of a tile in blend_vjp for up to four channels, and what blending carries through them from splat to splat.
+// The pixels of a tile in blend_vjp for up to four channels, and what blending carries through them from splat to
+// splat.
 #pragma once
 
 #include "cuda/blend_vjp_layout.cuh"
@@ -30,12 +31,13 @@ template <int S, int C, int kCount> struct VjpPixels {
   }
 };
 
-/// What blending carries through them from splat to splat.
+/// What blending carries through a sample from splat to splat: `transmittance` and `behind` of blend_sample_vjp.
+struct VjpSample {
+  float transmittance, behind;
+};
+/// Those of kCount pixels.
 template <int S, int kCount> struct VjpSamples {
-  struct Sample {
-    float transmittance, behind;
-  };
-  Sample of[S][kCount];
+  VjpSample of[S][kCount];
 };
 
 /// What of a warp's pixels is in shared memory.
@@ -44,6 +46,79 @@ template <class F, int C, Sums kSums> struct SharedPixels {
   VjpPixels<kOwn, C, kHoldsPixels<F, C> ? 1 : kTilePixels> pixels;
   VjpSamples<kOwn, kHoldsSamples<F, C> ? 1 : kTilePixels> samples;
 };
+
+/// A lane's pixels, one of each subtile, and their samples: in registers, or the lane's own in shared memory.
+template <class F, int C, Sums kSums> class LanePixels {
+ public:
+  static constexpr bool kHolds = kHoldsPixels<F, C>, kHoldsState = kHoldsSamples<F, C>;
+  static constexpr int kOwn = kVjpSamples<F, kSums>;
+  using Shared = SharedPixels<F, C, kSums>;
+
+  __device__ explicit LanePixels(Shared& shared) : shared_(shared) {}
+
+  /// The gradient with respect to the channels of a sample of subtile b's pixel. last_of() takes it too, as its fourth
+  /// number may be the `last` of a sample.
+  __device__ __forceinline__ float4 gradient(int b) { return pixels().g[place(b)]; }
+  __device__ __forceinline__ void set_gradient(int b, const Values<C>& g) { pixels().set(place(b), g); }
+  /// The place behind the last splat that was composited into sample s. `g`: gradient(b).
+  __device__ __forceinline__ int last_of(int s, int b, const float4& g) { return pixels().last_of(s, place(b), g); }
+  __device__ __forceinline__ void set_last(int s, int b, int last) { pixels().set_last(s, place(b), last); }
+  __device__ __forceinline__ VjpSample& sample(int s, int b) {
+    return samples().of[s][kHoldsState ? b : b * 32 + lane_];
+  }
+
+ private:
+  __device__ __forceinline__ int place(int b) const { return kHolds ? b : b * 32 + lane_; }
+  __device__ __forceinline__ auto& pixels() {
+    if constexpr (kHolds) {
+      return pixels_;
+    } else {
+      return shared_.pixels;
+    }
+  }
+  __device__ __forceinline__ auto& samples() {
+    if constexpr (kHoldsState) {
+      return samples_;
+    } else {
+      return shared_.samples;
+    }
+  }
+
+  const int lane_ = lane_id();
+  Shared& shared_;
+  std::conditional_t<kHolds, VjpPixels<kOwn, C, kSubtiles>, int> pixels_;
+  std::conditional_t<kHoldsState, VjpSamples<kOwn, kSubtiles>, int> samples_;
+};
+
+/// Calls visit(b, p) for the subtiles b of a set, the pixel of this lane being at p. `first`: where that of subtile 0
+/// is.
+template <class F, int C, class Visit>
+__device__ __forceinline__ void visit_subtiles(uint32_t subtiles, Vec2<float> first, Visit&& visit) {
+  if constexpr (kTakesTwo<F, C>) {
+#pragma unroll
+    for (int q = 0; q < kSubtiles / 2; ++q) {
+      const int upper = q % 2 + q / 2 * 4, lower = upper + 2;
+      if (!(subtiles & (1u << upper | 1u << lower))) continue;
+      const Vec2<float> p = {first.x + float(q % 2 * 8), first.y + float(q / 2 * 8)};
+      visit(upper, p);
+      visit(lower, Vec2<float>{p.x, p.y + 4});
+    }
+  } else if constexpr (kUnrollsSubtiles<F, C>) {
+#pragma unroll
+    for (int b = 0; b < kSubtiles; ++b) {
+      if (subtiles >> b & 1) visit(b, Vec2<float>{first.x + float(8 * (b & 1)), first.y + float(4 * (b >> 1))});
+    }
+  } else {
+    constexpr int kTwo23 = 0x4b000000;
+    for (uint32_t left = subtiles; left != 0; left &= left - 1) {
+      const int b = __ffs(left) - 1;
+      // pixel_of(b, lane); an integer below 2^23 set into the mantissa of 2^23 is that float, plus 2^23
+      const float column = __int_as_float(kTwo23 | (b & 1)) - 8388608.0f;
+      const float band = __int_as_float(kTwo23 | (b >> 1)) - 8388608.0f;
+      visit(b, Vec2<float>{madd(8.0f, column, first.x), madd(4.0f, band, first.y)});
+    }
+  }
+}
 
 template <int C> __device__ float dot(const Values<C>& a, const Values<C>& b) {
   float sum = a.v[0] * b.v[0];

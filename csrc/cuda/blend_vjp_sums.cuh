@@ -1,4 +1,5 @@
-// The splats that a warp of blend_vjp goes through, for up to four channels, and how their sums over all lanes are made.
+// The splats that a warp of blend_vjp goes through, for up to four channels, and how their sums over all lanes are
+// made.
 #pragma once
 
 #include "cuda/blend_vjp_layout.cuh"
