@@ -33,8 +33,7 @@ inline constexpr bool kHoldsSamples =
 /// Whether it takes two subtiles, one below the other, under one branch: 8x8 pixels. Then two pixels of a lane have
 /// instructions that do not wait for each other, and there are half as many branches, each of which waits for a uniform
 /// register. Where weights are expensive, subtiles that are visited in vain cost more than that gains.
-template <class F, int C>
-inline constexpr bool kTakesTwo = kHoldsPixels<F, C> && sizeof(typename F::template Terms<float>) <= 8 * sizeof(float);
+template <class F, int C> inline constexpr bool kTakesTwo = kHoldsPixels<F, C> && !F::kExpensive;
 
 /// Whether each subtile has code of its own: where that is short, or pixels are in registers. Of 58 instructions 11
 /// would work out where a subtile's pixels are.

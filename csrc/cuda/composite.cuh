@@ -47,19 +47,14 @@ __device__ inline TileList list_of(const TileLists& lists, TileGrid grid, int ti
   return list;
 }
 
-/// Whether exact extents of a splat are worth what they cost: where weights are expensive, so that it takes longer to
-/// composite a splat into pixels that it only passes closely.
-template <class F>
-inline constexpr bool kExactReach = F::kSamples == 1 && sizeof(typename F::template Terms<float>) > 8 * sizeof(float);
-
-/// Which boxes of kWide x kHigh pixels a splat reaches; some that it passes closely may be among them. There are
-/// kColumns boxes side by side and kRows of these one below the other, the first pixel at (x0, y0). Box b is at column
-/// b % kColumns and row b / kColumns.
+/// Which boxes of kWide x kHigh pixels a splat reaches. Some that it passes closely may be among them; only where
+/// weights are expensive, exact extents are worth what they cost. There are kColumns boxes side by side and kRows of
+/// these one below the other, the first pixel at (x0, y0). Box b is at column b % kColumns and row b / kColumns.
 template <int kWide, int kHigh, int kColumns, int kRows, class F>
 __device__ uint32_t reached_boxes(const Splat<F, float>& splat, int x0, int y0) {
   static_assert(kColumns * kRows <= 32);
   uint32_t reached = 0;
-  if constexpr (kExactReach<F>) {
+  if constexpr (F::kExpensive) {
     const Support<float> support = support_of(splat);
 #pragma unroll
     for (int row = 0; row < kRows; ++row) {

@@ -12,6 +12,8 @@
 //   kKey                 its own key: "box4". Footprints of one name differ in an option. Default: the name
 //   kOption              the option that users may set, see Option. Default: none
 //   kYardstick           true: meant to compare others with; compiled for one instruction set. Default: false
+//   kExpensive           true: CUDA kernels would rather find out exactly which pixels a splat reaches than work out
+//                        weights in vain. Default: false
 //   Pixels               a type with the same Shape, terms, alpha, adjoint, ellipse and samples, for which blending is
 //                        compiled instead, once for all footprints that name it. Default: F
 //   kSamples             samples of a pixel, each with its own transmittance. Default: 1
@@ -184,7 +186,7 @@ struct FootprintDefaults {
   using Pixels = void;                             // the footprint itself
   static constexpr std::nullptr_t kKey = nullptr;  // the name
   static constexpr Option kOption = {};
-  static constexpr bool kYardstick = false;
+  static constexpr bool kYardstick = false, kExpensive = false;
   static constexpr int kSamples = 1;
   static constexpr double kReach = 0, kExtraLevel = 0;
   static constexpr bool kMoves = false;

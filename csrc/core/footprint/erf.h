@@ -11,6 +11,7 @@ namespace ar {
 /// the eigenframe of Sigma. The adjoint holds the frame fixed, as that of `analytic` does by default.
 struct Erf : FootprintDefaults {
   static constexpr const char* kName = "erf";
+  static constexpr bool kExpensive = true;
   static constexpr bool kYardstick = true;
   static constexpr double kExtraLevel = 2 * box_excess(1 / kPixelVariance);
 

@@ -16,6 +16,7 @@ namespace ar {
 /// integrated in closed form, and the wide axis in strips around the places where the pixel's edges cross the ridge.
 struct Exact : FootprintDefaults {
   static constexpr const char* kName = "exact";
+  static constexpr bool kExpensive = true;
   static constexpr bool kYardstick = true;
   static constexpr double kExtraLevel = 2 * box_excess(1 / kPixelVariance);
 
