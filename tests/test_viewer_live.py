@@ -6,6 +6,7 @@ import struct
 import sys
 import threading
 import time
+import types
 import urllib.error
 import urllib.request
 from contextlib import contextmanager
@@ -332,6 +333,32 @@ def test_what_is_shown_is_a_copy(live_viewer, device):
     scene.means.zero_()  # as an optimiser changes its parameters
     with connected(live_viewer.url) as browser:
         browser.wait_for_picture(expected_frame(kept, front(), "analytic"))
+
+
+def test_a_camera_that_is_read_late_does_not_bring_back_what_was(live_viewer):
+    """A browser's first message is handled beside the jump to the first view, by another thread."""
+
+    class Camera:
+        wxyz, fov, image_width, image_height = REST, FOV, 64, 48
+
+        def __init__(self, position, meanwhile=lambda: None):
+            self.at, self.meanwhile = position, meanwhile
+
+        @property
+        def position(self):
+            self.meanwhile()
+            return self.at
+
+    client = types.SimpleNamespace(view=None, moved=0.0)
+    newer = threading.Thread(target=live_viewer._move, args=(client, Camera((0.0, 0.0, 1.0))))
+
+    def run_newer():
+        newer.start()
+        newer.join(0.5)  # as far as it gets: it waits for the older one
+
+    live_viewer._move(client, Camera((0.0, 0.0, 2.0), run_newer))
+    newer.join(DEADLINE)
+    assert torch.equal(client.view.w2c, seen((0.0, 0.0, 1.0)).w2c)
 
 
 def test_views_can_be_stepped_through(live_viewer):

@@ -258,11 +258,13 @@ class LiveViewer:
         self._changed.notify_all()
 
     def _move(self, client: _Client, camera) -> None:
-        try:
-            view = camera_view(camera.position, camera.wxyz, camera.fov, camera.image_width, camera.image_height)
-        except ValueError:
-            return  # a window without area, or a browser that sends nonsense
+        """Shows what this camera sees, as it is now: threads of the server and of `_jump` call this at any time."""
         with self._changed:
+            # What is read before the lock is held may be older than what another thread stores meanwhile.
+            try:
+                view = camera_view(camera.position, camera.wxyz, camera.fov, camera.image_width, camera.image_height)
+            except ValueError:
+                return  # a window without area, or a browser that sends nonsense
             if client.view is not None:
                 client.moved = time.monotonic()
             client.view = view
