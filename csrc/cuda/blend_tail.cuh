@@ -17,19 +17,28 @@ __device__ void pass_all(BlendStage<F, C>& stage, int count, Vec2<float> p, floa
   });
 }
 
-/// Blocks share the chunks. Writes the transmittance of each chunk alone.
+/// Calls visit(chunk, list of its tile, end of the chunk in it) for the tail chunks, with S samples, of the open tiles.
+/// Blocks share them.
+template <int S, class Visit>
+__device__ __forceinline__ void for_each_tail_chunk(const BlendParams& params, Visit&& visit) {
+  const int items = params.plan.state->counts.tail;
+  for (int item = blockIdx.x; item < items; item += gridDim.x) {
+    const TileChunk tail = params.plan.tail[item];
+    if (!has_samples<S>(params.lists, tail.tile) || !params.tile_open[tail.tile]) continue;
+    const TileList list = list_of(params.lists, params.grid, tail.tile);
+    const int end = min(list.count, (tail.chunk + 1) * chunk_length(S));
+    visit(tail, list, end);
+  }
+}
+
+/// Writes the transmittance of each tail chunk alone.
 template <class F>
 __global__ void __launch_bounds__(kBlendThreads, kTailThroughBlocks<F>) tail_through_kernel(const BlendParams params) {
   constexpr int S = F::kSamples, kLength = chunk_length(S);
   __shared__ BlendStage<F, 0> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const Vec2<float> p = pixel_of(threadIdx.x / 32, lane_id());
-  const int items = params.plan.state->counts.tail;
-  for (int item = blockIdx.x; item < items; item += gridDim.x) {
-    const TileChunk tail = params.plan.tail[item];
-    if (!has_samples<S>(params.lists, tail.tile) || !params.tile_open[tail.tile]) continue;
-    const TileList list = list_of(params.lists, params.grid, tail.tile);
-    const int end = min(list.count, (tail.chunk + 1) * kLength);
+  for_each_tail_chunk<S>(params, [&](const TileChunk& tail, const TileList& list, int end) {
     float transmittance[S];
 #pragma unroll
     for (int s = 0; s < S; ++s) transmittance[s] = 1;
@@ -42,7 +51,7 @@ __global__ void __launch_bounds__(kBlendThreads, kTailThroughBlocks<F>) tail_thr
     const TransmittancePlanes<S> planes(params, tail.tile, int(threadIdx.x));
 #pragma unroll
     for (int s = 0; s < S; ++s) planes.at(tail.chunk, s) = transmittance[s];
-  }
+  });
 }
 
 /// A sample with less transmittance than this would be stopped by the next splat that it meets, since alpha is at least
@@ -91,20 +100,15 @@ template <int S> __global__ void __launch_bounds__(32) tail_scan_kernel(const Bl
   }
 }
 
-/// Blocks share the chunks. Writes the channels of each chunk and the transmittance at its end, which is zero where the
-/// sample had stopped before the chunk.
+/// Writes the channels of each tail chunk and the transmittance at its end, which is zero where the sample had stopped
+/// before the chunk.
 template <class F, int C, bool kKeep>
 __global__ void __launch_bounds__(kBlendThreads, kTailBlendBlocks<F>) tail_blend_kernel(const BlendParams params) {
   constexpr int S = F::kSamples, kLength = chunk_length(S), kSets = kKeep ? S : 1;
   __shared__ BlendStage<F, C> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const Vec2<float> p = pixel_of(threadIdx.x / 32, lane_id());
-  const int items = params.plan.state->counts.tail;
-  for (int item = blockIdx.x; item < items; item += gridDim.x) {
-    const TileChunk tail = params.plan.tail[item];
-    if (!has_samples<S>(params.lists, tail.tile) || !params.tile_open[tail.tile]) continue;
-    const TileList list = list_of(params.lists, params.grid, tail.tile);
-    const int end = min(list.count, (tail.chunk + 1) * kLength);
+  for_each_tail_chunk<S>(params, [&](const TileChunk& tail, const TileList& list, int end) {
     const PixelCheckpoints<S, C, kKeep> checkpoints(params, tail.tile, int(threadIdx.x));
     PixelState<S, C, kSets> state;
     state.start(false);
@@ -135,7 +139,7 @@ __global__ void __launch_bounds__(kBlendThreads, kTailBlendBlocks<F>) tail_blend
     }
     if constexpr (!kKeep) checkpoints.set_total(tail.chunk, state.channels[0]);
     __syncthreads();
-  }
+  });
 }
 
 /// Adds the chunks of the open tiles. Blocks share the parts of the tiles.
