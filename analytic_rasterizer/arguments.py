@@ -45,10 +45,12 @@ def gaussian_arguments(
     check_device(device)
     check_tensors(device, opacities=opacities)
     for name, tensor in optional.items():
+        if tensor is None:
+            continue
         if isinstance(tensor, torch.Tensor) and tensor.dim() == 1 and tensor.numel() == 0:
             optional[name] = None
-        elif tensor is not None:
-            check_tensors(device, **{name: tensor})
+        elif not isinstance(tensor, torch.Tensor) or tensor.device != device:
+            check_tensors(device, **{name: tensor})  # raises
     effects = settings.effects
     if isinstance(effects, Effects) and effects.filter_3d is not None:
         if optional["scales"] is None:

@@ -22,6 +22,14 @@ from .settings import GaussianRasterizationSettings
 NOTHING = Effects()
 """Asks for no output."""
 
+_call = _C.Call("rasterize")
+
+
+def _rasterize(**arguments: Any) -> tuple:
+    """The operator. torch.compile knows it, but not the quicker way to it."""
+    op = torch.ops.analytic_rasterizer.rasterize if torch.compiler.is_compiling() else _call
+    return op(**arguments)
+
 
 def rasterize_gaussians(
     means3D: torch.Tensor,
@@ -98,7 +106,7 @@ def render(
         outputs = settings.effects if outputs is NOTHING else outputs.with_outputs_of(settings.effects)
     debug = bool(settings.debug)
     if outputs is NOTHING and bg.dim() < 3:
-        return torch.ops.analytic_rasterizer.rasterize(**gaussians, **camera, bg=bg, debug=debug)[::2]
+        return _rasterize(**gaussians, **camera, bg=bg, debug=debug)[::2]
     return _render_with_outputs(gaussians, camera, outputs, bg, debug)
 
 
@@ -116,9 +124,7 @@ def _render_with_outputs(
     with_summaries = effects.median_depth or effects.dominant_index or effects.gaussian_stats
     blended = {name: getattr(effects, name) for name in _C.IMAGES}
     blended["alpha"] |= bg_image is not None
-    color, images, radii, saved = torch.ops.analytic_rasterizer.rasterize(
-        **gaussians, **camera, bg=bg, **blended, keep=with_summaries, debug=debug
-    )
+    color, images, radii, saved = _rasterize(**gaussians, **camera, bg=bg, **blended, keep=with_summaries, debug=debug)
     outputs = dict(zip((name for name in _C.IMAGES if blended[name]), (image[None] for image in images)))
     if bg_image is not None:
         behind = (1 - outputs["alpha"]) * bg_image

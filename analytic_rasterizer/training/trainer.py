@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .. import io, ops  # noqa: F401  (registers the fake kernels)
+from .. import _C, io
 from ..arguments import camera_arguments
 from ..effects import Effects
 from ..filters import apply_3d_filter, compute_3d_filter
@@ -23,7 +23,7 @@ from .pictures import Pictures
 from .ranks import ALONE, Ranks
 from .schedule import PictureOrder, Progress, means_rate_at, rates_factor_at, sh_degree_at
 
-_picture_gradients = torch.ops.analytic_rasterizer.picture_gradients.default
+_picture_gradients = _C.Call("picture_gradients")
 
 SH_REST_SHARE = 1 / 20  # of the learning rate of the constant
 FILTER_PERIOD = 100  # steps between two 3D filters, while Gaussians move

@@ -7,23 +7,32 @@
 
 namespace ar::cuda {
 
-/// With keys as depth_key makes them the last of the passes has nothing to do for depths of 1/8 to 8192.
-inline constexpr int kDepthBits = 9, kDepthPasses = 4;
+// With keys as depth_key makes them the last of the passes has nothing to do for depths of 1/8 to 8192.
 using DepthDigits = Digits<kDepthBits>;
 using DepthScratch = SortScratch<kDepthBits>;
 inline constexpr int kCountThreads = 512, kCountBlocks = 132 * 2;
 
+/// Sets memory to zero. Called by all threads of a grid, of which this is one.
+__device__ inline void set_to_zero(const ZeroedMemory& memory, int64_t thread, int64_t threads) {
+  auto* pieces = static_cast<uint4*>(memory.data);
+  const int64_t count = memory.bytes / int64_t(sizeof(uint4));
+  for (int64_t k = thread; k < count; k += threads) pieces[k] = {0, 0, 0, 0};
+}
+
 /// Histograms of all digits of the depth keys of splats with pairs; how many of these there are, and
-/// how many pairs.
-__global__ void __launch_bounds__(kCountThreads) count_depths_kernel(const uint32_t* keys, const PairRange* ranges,
-                                                                     int64_t n, uint32_t* histograms, Counts* counts) {
-  constexpr int kBins = DepthDigits::kBins;
-  __shared__ uint32_t local[kDepthPasses * kBins];
-  for (int b = threadIdx.x; b < kDepthPasses * kBins; b += kCountThreads) local[b] = 0;
+/// how many pairs. Also sets to zero what the kernels behind this one count in.
+__global__ void __launch_bounds__(kCountThreads)
+    count_depths_kernel(const uint32_t* keys, const PairRange* ranges, int64_t n, uint32_t* histograms, Counts* counts,
+                        const ZeroedMemory one, const ZeroedMemory other) {
+  __shared__ uint32_t local[kDepthHistogramWords];
+  for (int b = threadIdx.x; b < kDepthHistogramWords; b += kCountThreads) local[b] = 0;
+  const int64_t thread = int64_t(blockIdx.x) * kCountThreads + threadIdx.x;
+  const int64_t stride = int64_t(gridDim.x) * kCountThreads, rounded = (n + 31) / 32 * 32;
+  set_to_zero(one, thread, stride);
+  set_to_zero(other, thread, stride);
   __syncthreads();
   unsigned long long pairs = 0, splats = 0;
-  const int64_t stride = int64_t(gridDim.x) * kCountThreads, rounded = (n + 31) / 32 * 32;
-  for (int64_t i = int64_t(blockIdx.x) * kCountThreads + threadIdx.x; i < rounded; i += stride) {
+  for (int64_t i = thread; i < rounded; i += stride) {
     const uint32_t key = i < n ? keys[i] : kCulledKey;
     const bool valid = key != kCulledKey;
     count_digits<kDepthBits, kDepthPasses>(key, valid, local);
@@ -31,7 +40,7 @@ __global__ void __launch_bounds__(kCountThreads) count_depths_kernel(const uint3
     splats += valid;
   }
   __syncthreads();
-  for (int b = threadIdx.x; b < kDepthPasses * kBins; b += kCountThreads) {
+  for (int b = threadIdx.x; b < kDepthHistogramWords; b += kCountThreads) {
     if (local[b]) atomicAdd(&histograms[b], local[b]);
   }
   unsigned long long all_pairs, all_splats;

@@ -12,14 +12,20 @@ __device__ inline uint32_t depth_key(float depth) {
   return __float_as_uint(depth + 0.0f) + kDepthKeyOffset;  // of -0 too
 }
 
-/// What bin needs of splat i, and zeros for what it counts.
+/// What bin needs of splat i.
 template <class Params>
 __device__ void write_tiles(const Params& params, int64_t i, const SplatTiles& tiles, float depth) {
   const bool any = tiles.range.count > 0;
   params.keys[i] = any ? depth_key(depth) : kCulledKey;
   params.ranges[i] = tiles.range;
   if (any) params.masks[i] = tiles.mask;
-  if (i == 0) *params.counts = {0, 0};
+}
+
+/// Zeros for what count_depths counts. The first block alone: the others have enough to do.
+template <class Params> __device__ void clear_counts(const Params& params) {
+  if (blockIdx.x > 0) return;
+  for (int k = threadIdx.x; k < kDepthHistogramWords; k += kProjectThreads) params.depth_histograms[k] = 0;
+  if (threadIdx.x == 0) *params.counts = {0, 0};
 }
 
 /// Of the lanes in `lanes`, those whose row has a number that is not finite or too large. A warp reads a row together.
@@ -37,6 +43,7 @@ __device__ inline uint32_t rows_not_finite(const Channels<float>& channels, int6
 
 template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_kernel(const ProjectParams params) {
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
+  clear_counts(params);
   const Gaussians<float>& g = params.gaussians;
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
   const Cam camera = load_camera_as<Cam>(params.camera);
@@ -112,6 +119,7 @@ __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const Pro
 }
 
 __global__ void __launch_bounds__(kProjectThreads) shape_rows_kernel(const ShapeRowsParams params) {
+  clear_counts(params);
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
   if (i >= params.n) return;
   ProjectedGaussian<float> projected;

@@ -37,6 +37,10 @@ AR_HD int front_chunks(TileGrid grid, int samples) {
   return pairs > chunk_length(samples) ? pairs / chunk_length(samples) : 1;
 }
 
+/// A sort by depth counts the values of so many digits of so many bits.
+inline constexpr int kDepthBits = 9, kDepthPasses = 4;
+inline constexpr int kDepthHistogramWords = kDepthPasses << kDepthBits;
+
 /// Depth keys of splats without pairs: after all others.
 inline constexpr uint32_t kCulledKey = 0xffffffff;
 /// The depth key of a splat is that of its depth's bits, which have the order of depths >= +0, plus this: so that the
@@ -112,7 +116,9 @@ struct ProjectParams : ar::ProjectParams<float> {
   uint32_t* keys;     ///< [n] in the order of depth
   PairRange* ranges;  ///< [n] count, and tile of the mask
   TileMask* masks;    ///< [n] of splats with pairs
-  Counts* counts;     ///< set to zero, for count_depths
+  // Set to zero, for count_depths.
+  Counts* counts;
+  uint32_t* depth_histograms;  ///< [kDepthHistogramWords]
 };
 
 struct ProjectRowsParams {
@@ -129,7 +135,9 @@ struct ShapeRowsParams : ar::ShapeRowsParams<float> {
   uint32_t* keys;     ///< [n]
   PairRange* ranges;  ///< [n] count, and tile of the mask
   TileMask* masks;    ///< [n] of splats with pairs
-  Counts* counts;     ///< set to zero, for count_depths
+  // Set to zero, for count_depths.
+  Counts* counts;
+  uint32_t* depth_histograms;  ///< [kDepthHistogramWords]
 };
 
 struct EmitParams {
@@ -358,7 +366,8 @@ void weight_vjp(int footprint, const WeightParams<double>& p, cudaStream_t strea
 /// Most splats, and most pairs, that can be sorted: 2^30 - 1.
 int64_t max_items();
 
-/// Bytes of scratch memory, all of which must be zero; multiples of 16.
+/// Bytes of scratch memory, all of which must be zero; multiples of 16. That of the sort by depth begins with its
+/// histograms.
 int64_t depth_sort_scratch(int64_t n);
 int64_t tile_sort_scratch(int64_t capacity, TileGrid grid);
 inline constexpr int kEmitThreads = 256;
@@ -374,8 +383,14 @@ struct DepthSort {
   const PairRange* ranges;
   Counts* counts;
 };
-/// First adds to the counts, then sorts.
-void count_depths(const DepthSort& p, void* scratch, cudaStream_t stream);
+/// Memory that is set to zero; aligned to 16 bytes, and a multiple of them.
+struct ZeroedMemory {
+  void* data;
+  int64_t bytes;
+};
+/// First adds to the counts, for which only the histograms at the beginning of the scratch must be zero, and sets what
+/// later kernels need to zero; then sorts.
+void count_depths(const DepthSort& p, void* scratch, ZeroedMemory one, ZeroedMemory other, cudaStream_t stream);
 void sort_by_depth(const DepthSort& p, void* scratch, cudaStream_t stream);
 
 void emit_pairs(const EmitParams& p, cudaStream_t stream);

@@ -23,10 +23,9 @@ struct SplatTensors {
   Tensor splats;  ///< (n, kSplatWidth) SplatRow
   Tensor ids;     ///< (n,) int32, CPU: the Gaussian of each, ascending
   Tensor depths;  ///< (n,) CPU
-  Tensor keys;    ///< (2, n) int32, CUDA: keys in the order of depth, and room for them
-  Tensor masks;   ///< (n,) int64, CUDA: the tiles of a splat that has few
   Tensor counts;  ///< (2,) int64, CUDA: zeros, for the numbers of pairs and splats
   Tensor ranges;  ///< (n, 2) int32, CUDA: first pair and number of pairs of each
+  Tensor memory;  ///< bytes, CUDA: SplatMemory (cuda_views.h)
 };
 
 /// Splats by tile, front to back: what `bin` makes and `blend` reads. Members that a device does not use are empty.
@@ -152,10 +151,11 @@ struct Pass {
         exact(at::globalContext().deterministicAlgorithms()) {}
 };
 
-/// Room for the members of BlendState that are the same on every device.
+/// With pass.keep, room for the members of BlendState that are the same on every device.
 inline BlendState make_state(const Pass& pass, const Tensor& like) {
+  if (!pass.keep) return {};
   const FootprintSpec& footprint = pass.footprint;
-  const std::vector<int64_t> planes = {pass.keep ? footprint.samples : 0, pass.grid.height, pass.grid.width};
+  const std::vector<int64_t> planes = {footprint.samples, pass.grid.height, pass.grid.width};
   // Where samples are chosen not every tile writes all planes.
   const auto make = [&](const at::TensorOptions& o) {
     return footprint.chosen ? at::zeros(planes, o) : at::empty(planes, o);

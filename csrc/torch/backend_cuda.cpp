@@ -35,10 +35,7 @@ class CudaBackend final : public Backend {
     set_channels<float>(p, channels);
     p.grid = pass.grid;
     p.splats = pointer<float>(out.splats);
-    p.keys = structs_of<uint32_t>(out.keys);
-    p.ranges = structs_of<cuda::PairRange>(out.ranges);
-    p.masks = masks_of(out);
-    p.counts = reinterpret_cast<cuda::Counts*>(pointer<int64_t>(out.counts));
+    set_for_bin(p, out);
     cuda::project(p, stream_);
     check_stage("project", false);
     return out;
@@ -65,10 +62,7 @@ class CudaBackend final : public Backend {
     SplatTensors out = make_splats(row_count(rows));
     cuda::ShapeRowsParams p = {};
     set_shape_rows<float>(p, rows, pass, out.splats);
-    p.keys = structs_of<uint32_t>(out.keys);
-    p.ranges = structs_of<cuda::PairRange>(out.ranges);
-    p.masks = masks_of(out);
-    p.counts = reinterpret_cast<cuda::Counts*>(pointer<int64_t>(out.counts));
+    set_for_bin(p, out);
     cuda::shape_rows(p, stream_);
     check_stage("shape_rows", false);
     return out;
@@ -92,11 +86,8 @@ class CudaBackend final : public Backend {
     TORCH_CHECK(capacity > 0 || !capturing,
                 "a frame of this size must have been rendered before it is captured in a CUDA graph, without "
                 "torch.use_deterministic_algorithms");
-    // Memory that must be zero, cleared in one go.
-    const int64_t depth_bytes = cuda::depth_sort_scratch(n), emit_bytes = cuda::emit_scratch(n);
-    const int64_t tile_bytes = capacity > 0 ? cuda::tile_sort_scratch(capacity, grid) : 0;
-    const Tensor scratch = make_zeros(depth_bytes + emit_bytes + tile_bytes);
-    auto* depth_scratch = static_cast<std::byte*>(scratch.data_ptr());
+    PairMemory pairs = capacity > 0 ? make_pair_memory(capacity, pass) : PairMemory();
+    const SplatMemory memory(splats.memory, n);
 
     ListTensors out;
     out.splats = splats.splats;
@@ -105,27 +96,24 @@ class CudaBackend final : public Backend {
     out.positions = at::empty({0}, longs_);
     out.counts = splats.counts;
     auto* counts = reinterpret_cast<cuda::Counts*>(pointer<int64_t>(out.counts));
-    const Tensor other_order = at::empty({n}, ints_);
     cuda::DepthSort by_depth = {};
     by_depth.n = n;
-    by_depth.keys[0] = structs_of<uint32_t>(splats.keys);
-    by_depth.keys[1] = by_depth.keys[0] + n;
+    by_depth.keys[0] = memory.keys[0];
+    by_depth.keys[1] = memory.keys[1];
     by_depth.order[0] = pointer<int32_t>(out.ids);
-    by_depth.order[1] = pointer<int32_t>(other_order);
+    by_depth.order[1] = memory.order;
     by_depth.ranges = structs_of<cuda::PairRange>(splats.ranges);
     by_depth.counts = counts;
-    cuda::count_depths(by_depth, depth_scratch, stream_);
+    cuda::count_depths(by_depth, memory.depth_scratch, memory.to_clear, pairs.scratch, stream_);
     check_stage("count_depths", pass.debug);
-    Tensor tile_memory = scratch;
-    std::byte* tile_scratch = depth_scratch + depth_bytes + emit_bytes;
     if (capacity == 0) {
-      const int64_t pairs = out.counts[0].item<int64_t>();
-      guesses.use([&](cuda::PairGuesses& g) { g.counted(frame, n, pairs); });
-      capacity = std::clamp<int64_t>(pairs, 1, cuda::max_items());
-      tile_memory = make_zeros(cuda::tile_sort_scratch(capacity, grid));
-      tile_scratch = static_cast<std::byte*>(tile_memory.data_ptr());
+      const int64_t counted = out.counts[0].item<int64_t>();
+      guesses.use([&](cuda::PairGuesses& g) { g.counted(frame, n, counted); });
+      capacity = std::clamp<int64_t>(counted, 1, cuda::max_items());
+      pairs = make_pair_memory(capacity, pass);
+      C10_CUDA_CHECK(cudaMemsetAsync(pairs.scratch.data, 0, size_t(pairs.scratch.bytes), stream_));
     }
-    cuda::sort_by_depth(by_depth, depth_scratch, stream_);
+    cuda::sort_by_depth(by_depth, memory.depth_scratch, stream_);
     check_stage("sort_by_depth", pass.debug);
 
     cuda::EmitParams emit = {};
@@ -137,15 +125,14 @@ class CudaBackend final : public Backend {
     emit.counts = counts;
     emit.order = by_depth.order[0];
     emit.ranges = structs_of<cuda::PairRange>(splats.ranges);
-    emit.masks = masks_of(splats);
-    emit.status = reinterpret_cast<uint32_t*>(depth_scratch + depth_bytes);
+    emit.masks = memory.masks;
+    emit.status = reinterpret_cast<uint32_t*>(memory.emit_scratch);
     out.tile_offsets = at::empty({grid.tiles() + 1}, longs_);
     if (pass.keep) {
-      make_pairs<cuda::SlotPair>(emit, &cuda::EmitParams::slot_pairs, {frame.word, frame.number}, tile_scratch, out,
+      make_pairs<cuda::SlotPair>(emit, &cuda::EmitParams::slot_pairs, {frame.word, frame.number}, pairs, out,
                                  pass.debug);
     } else {
-      make_pairs<int32_t>(emit, &cuda::EmitParams::splat_pairs, {frame.word, frame.number}, tile_scratch, out,
-                          pass.debug);
+      make_pairs<int32_t>(emit, &cuda::EmitParams::splat_pairs, {frame.word, frame.number}, pairs, out, pass.debug);
     }
 
     out.tile_samples = at::empty({footprint.chosen ? grid.tiles() : 0}, ints_);
@@ -175,8 +162,10 @@ class CudaBackend final : public Backend {
     p.lists = tile_lists_of(lists);
 
     p.layout = {cuda::compiled_channels(!channels.rows.defined()), pass.keep};
-    const Plan plan = make_plan(p, pass, cuda::blends_whole_lists(footprint.choice.index, channels.count), state);
-    const Tensor reach = at::empty({cuda::max_reach_words(footprint.choice.index, p.lists.capacity, grid)}, ints_);
+    const Tensor plan = make_plan(p, pass, cuda::blends_whole_lists(footprint.choice.index, channels.count), state);
+    Tensor reach;
+    const int64_t reach_words = cuda::max_reach_words(footprint.choice.index, p.lists.capacity, grid);
+    if (reach_words > 0) reach = at::empty({reach_words}, ints_);
     p.reach_words = structs_of<uint32_t>(reach);
     p.segments.count = cuda::list_segments(footprint.choice.index, channels.count, grid);
     if (p.segments.count == 1) {
@@ -195,7 +184,7 @@ class CudaBackend final : public Backend {
     cut.channels = {nullptr, 0, nullptr, 3};
     cut.image = {pointer<float>(first_image), 3, {}};
     cut.layout = {3, true};
-    const Plan first_plan = make_plan(cut, first_pass, false, first_state);
+    const Tensor first_plan = make_plan(cut, first_pass, false, first_state);
     const Tensor sums = segment_planes(p.segments, grid, cuda::kChannelGroup);
     state.checkpoints = segment_planes(p.segments, grid, footprint.samples);
     p.segments.samples = footprint.samples;
@@ -247,8 +236,9 @@ class CudaBackend final : public Backend {
     }
     p.pair_grads = pointer<float>(out.pairs);
     p.mean_sums = mean_sums;
-    const Tensor maps =
-        at::empty({cuda::max_adjoint_maps(pass.footprint.choice.index, p.lists.capacity, pass.grid)}, floats_);
+    Tensor maps;
+    const int64_t numbers = cuda::max_adjoint_maps(pass.footprint.choice.index, p.lists.capacity, pass.grid);
+    if (numbers > 0) maps = at::empty({numbers}, floats_);
     p.adjoint_maps = pointer<float>(maps);
 
     cuda::SumChannelsParams sum = {};
@@ -342,14 +332,9 @@ class CudaBackend final : public Backend {
     return at::empty({grid.tiles() * segments.count * planes * kTile * kTile}, floats_);
   }
 
-  /// Memory of a plan that its kernels need while they run.
-  struct Plan {
-    Tensor tail;
-    Tensor of_tiles;  ///< tiles in order, their planes, whether they are open, and the open ones by samples
-  };
   /// Plans the blending of lists in chunks, or each as a `whole`: sets the members of `p` and `state` that belong to
-  /// it.
-  Plan make_plan(cuda::BlendParams& p, const Pass& pass, bool whole, BlendState& state) const {
+  /// it. Returns memory that its kernels need while they run.
+  Tensor make_plan(cuda::BlendParams& p, const Pass& pass, bool whole, BlendState& state) const {
     const FootprintSpec& footprint = pass.footprint;
     const int64_t tiles = pass.grid.tiles(), capacity = p.lists.capacity;
     const int64_t chunks = whole ? 0 : capacity / cuda::chunk_length(footprint.chosen ? 1 : footprint.samples);
@@ -358,20 +343,22 @@ class CudaBackend final : public Backend {
                                            : 0;
     state.checkpoints = at::empty({max_planes * pass.grid.side() * pass.grid.side()}, floats_);
     state.chunks = at::empty({kPlanRows + chunks + tiles, kChunkWidth}, ints_);
-    const Plan plan = {at::empty({chunks + 1, kChunkWidth}, ints_),
-                       at::empty({3 + cuda::kSampleClasses, tiles}, ints_)};
-    auto* of_tile = pointer<int32_t>(plan.of_tiles);
+    const auto set_parts = [&](MemoryParts parts) {
+      p.plan.tail = parts.take<cuda::TileChunk>(chunks + 1);
+      p.plan.tile_order = parts.take<int32_t>(tiles);
+      p.plan.tile_planes = parts.take<int32_t>(tiles);
+      p.tile_open = parts.take<int32_t>(tiles);
+      p.open_tiles = parts.take<int32_t>(cuda::kSampleClasses * tiles);
+      return parts.bytes();
+    };
+    const Tensor memory = at::empty({set_parts(MemoryParts(Tensor()))}, bytes_);
+    set_parts(MemoryParts(memory));
     p.plan.state = structs_of<cuda::PlanState>(state.chunks);
     p.plan.chunk_order = structs_of<cuda::TileChunk>(state.chunks) + kPlanRows;
-    p.plan.tile_order = of_tile;
-    p.plan.tile_planes = of_tile + tiles;
-    p.plan.tail = structs_of<cuda::TileChunk>(plan.tail);
-    p.tile_open = of_tile + 2 * tiles;
-    p.open_tiles = of_tile + 3 * tiles;
     p.checkpoints = pointer<float>(state.checkpoints);
     cuda::plan_chunks(p.lists, pass.grid, footprint.samples, whole, p.layout, p.plan, stream_);
     check_stage("plan_chunks", pass.debug);
-    return plan;
+    return memory;
   }
 
   SplatTensors make_splats(int64_t n) const {
@@ -379,17 +366,42 @@ class CudaBackend final : public Backend {
     TORCH_CHECK_VALUE(n <= cuda::max_items(), "CUDA takes at most ", cuda::max_items(), " Gaussians, got ", n);
     SplatTensors out;
     out.splats = at::empty({n, kSplatWidth}, floats_);
-    out.keys = at::empty({2, n}, ints_);
     out.ranges = at::empty({n, 2}, ints_);
-    out.masks = at::empty({n}, longs_);
+    out.memory = at::empty({SplatMemory(Tensor(), n).bytes}, bytes_);
     // Set to zero by the kernel that makes the first splat.
     out.counts = n > 0 ? at::empty({kCountsWidth}, longs_) : at::zeros({kCountsWidth}, longs_);
     return out;
   }
-  Tensor make_zeros(int64_t bytes) const {
-    const Tensor memory = at::empty({bytes}, bytes_);
-    C10_CUDA_CHECK(cudaMemsetAsync(memory.data_ptr(), 0, size_t(bytes), stream_));
-    return memory;
+  /// Sets what bin will read of `splats`.
+  template <class Params> static void set_for_bin(Params& p, const SplatTensors& splats) {
+    const SplatMemory memory(splats.memory, splats.splats.size(0));
+    p.keys = memory.keys[0];
+    p.masks = memory.masks;
+    p.ranges = structs_of<cuda::PairRange>(splats.ranges);
+    p.counts = reinterpret_cast<cuda::Counts*>(pointer<int64_t>(splats.counts));
+    p.depth_histograms = reinterpret_cast<uint32_t*>(memory.depth_scratch);
+  }
+
+  /// Memory of so many pairs while they are sorted by tile, besides that of the result.
+  struct PairMemory {
+    Tensor memory;
+    cuda::ZeroedMemory scratch = {};
+    uint32_t* tiles[2] = {};
+    void* values = nullptr;  ///< SlotPair, or int32_t without a backward pass
+  };
+  PairMemory make_pair_memory(int64_t capacity, const Pass& pass) const {
+    const int64_t value_bytes = pass.keep ? sizeof(cuda::SlotPair) : sizeof(int32_t);
+    PairMemory out;
+    const auto set_parts = [&](MemoryParts parts) {
+      out.scratch.bytes = cuda::tile_sort_scratch(capacity, pass.grid);
+      out.scratch.data = parts.take<std::byte>(out.scratch.bytes);
+      for (uint32_t*& tiles : out.tiles) tiles = parts.take<uint32_t>(capacity);
+      out.values = parts.take<std::byte>(capacity * value_bytes);
+      return parts.bytes();
+    };
+    out.memory = at::empty({set_parts(MemoryParts(Tensor()))}, bytes_);
+    set_parts(MemoryParts(out.memory));
+    return out;
   }
 
   /// Room for the camera's gradient, if it is wanted.
@@ -402,28 +414,26 @@ class CudaBackend final : public Backend {
 
   /// Emits pairs of a splat, or of a splat and its slot, into the member `to`, and sorts them by tile.
   template <class Value>
-  void make_pairs(cuda::EmitParams emit, Value* cuda::EmitParams::* to, cuda::PairFeedback feedback, void* scratch,
-                  ListTensors& out, bool debug) const {
+  void make_pairs(cuda::EmitParams emit, Value* cuda::EmitParams::* to, cuda::PairFeedback feedback,
+                  const PairMemory& memory, ListTensors& out, bool debug) const {
     constexpr int64_t kStride = sizeof(Value) / sizeof(int32_t);
-    const Tensor tiles = at::empty({2, emit.capacity}, ints_);
-    const Tensor values[2] = {at::empty({emit.capacity, kStride}, ints_), at::empty({emit.capacity, kStride}, ints_)};
+    out.pairs = at::empty({emit.capacity, kStride}, ints_);
+    const int result = cuda::tile_sort_result(emit.grid);
     cuda::TileSort<Value> sort = {};
     sort.capacity = emit.capacity;
     sort.counts = emit.counts;
     sort.tile_offsets = pointer<int64_t>(out.tile_offsets);
     sort.feedback = feedback;
-    for (int k = 0; k < 2; ++k) {
-      sort.tiles[k] = structs_of<uint32_t>(tiles) + k * emit.capacity;
-      sort.values[k] = structs_of<Value>(values[k]);
-    }
-    emit.tile_counts = static_cast<uint32_t*>(scratch);
+    for (int k = 0; k < 2; ++k) sort.tiles[k] = memory.tiles[k];
+    sort.values[result] = structs_of<Value>(out.pairs);
+    sort.values[1 - result] = static_cast<Value*>(memory.values);
+    emit.tile_counts = static_cast<uint32_t*>(memory.scratch.data);
     emit.tiles = sort.tiles[0];
     emit.*to = sort.values[0];
     cuda::emit_pairs(emit, stream_);
     check_stage("emit_pairs", debug);
-    cuda::sort_by_tile(sort, emit.grid, scratch, stream_);
+    cuda::sort_by_tile(sort, emit.grid, memory.scratch.data, stream_);
     check_stage("sort_by_tile", debug);
-    out.pairs = values[cuda::tile_sort_result(emit.grid)];
   }
 
   c10::cuda::CUDAGuard guard_;

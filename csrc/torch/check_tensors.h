@@ -72,14 +72,16 @@ struct Like {
     check_type(t, t_name);
     const bool ok = (t.dim() == 2 || (t.dim() == 3 && t.size(0) == 1)) && t.size(-1) == 4 && t.size(-2) == 4;
     check_shape(ok, t, t_name, "(4, 4) or (1, 4, 4)");
-    t = t.reshape({4, 4}).contiguous();
+    if (t.dim() == 3) t = t.reshape({4, 4});
+    t = t.contiguous();
   }
   /// Type, and the shape (size,).
   void check_vector(Tensor& t, const char* t_name, int64_t size) const {
     check_type(t, t_name);
     const bool ok = t.numel() == size && (t.dim() == 1 || (t.dim() == 2 && t.size(0) == 1));
     check_shape(ok, t, t_name, "(", size, ",) or (1, ", size, ")");
-    t = t.reshape({size}).contiguous();
+    if (t.dim() == 2) t = t.reshape({size});
+    t = t.contiguous();
   }
 };
 

@@ -13,12 +13,51 @@ template <class Element> Element* structs_of(const Tensor& t) {
 template <class Element> const Element* const_structs_of(const Tensor& t) {
   return reinterpret_cast<const Element*>(const_pointer<int32_t>(t));
 }
-inline cuda::TileMask* masks_of(const SplatTensors& splats) {
-  return reinterpret_cast<cuda::TileMask*>(pointer<int64_t>(splats.masks));
-}
 inline const cuda::Counts* counts_of(const ListTensors& lists) {
   return reinterpret_cast<const cuda::Counts*>(const_pointer<int64_t>(lists.counts));
 }
+
+/// Hands out parts of a piece of memory, one after the other; of a null pointer to learn how much they take.
+class MemoryParts {
+ public:
+  explicit MemoryParts(const Tensor& memory)
+      : begin_(memory.defined() ? static_cast<std::byte*>(memory.data_ptr()) : nullptr) {}
+
+  template <class Element> Element* take(int64_t count) {
+    const int64_t first = bytes_;
+    bytes_ += (count * int64_t(sizeof(Element)) + 15) / 16 * 16;  // so that every part is aligned
+    return begin_ ? reinterpret_cast<Element*>(begin_ + first) : nullptr;
+  }
+  int64_t bytes() const { return bytes_; }
+
+ private:
+  std::byte* begin_;
+  int64_t bytes_ = 0;
+};
+
+/// What `project` and `shape_rows` leave for bin beside the splats, and memory that bin needs for n of them. In one
+/// piece, because the host spends a few microseconds on every tensor.
+struct SplatMemory {
+  std::byte *depth_scratch, *emit_scratch;
+  cuda::ZeroedMemory to_clear = {};  ///< both, but for the histograms, which are clear already
+  uint32_t* keys[2];                 ///< in the order of depth, and room for them
+  int32_t* order;                    ///< room for an order
+  cuda::TileMask* masks;             ///< the tiles of a splat that has few
+  int64_t bytes;                     ///< of all
+
+  SplatMemory(const Tensor& memory, int64_t n) {
+    MemoryParts parts(memory);
+    constexpr int64_t kHistograms = cuda::kDepthHistogramWords * sizeof(uint32_t);
+    const int64_t depth_bytes = cuda::depth_sort_scratch(n), emit_bytes = cuda::emit_scratch(n);
+    depth_scratch = parts.take<std::byte>(depth_bytes);
+    emit_scratch = parts.take<std::byte>(emit_bytes);  // right behind it: both are multiples of 16 bytes
+    if (depth_scratch) to_clear = {depth_scratch + kHistograms, depth_bytes - kHistograms + emit_bytes};
+    for (uint32_t*& k : keys) k = parts.take<uint32_t>(n);
+    order = parts.take<int32_t>(n);
+    masks = parts.take<cuda::TileMask>(n);
+    bytes = parts.bytes();
+  }
+};
 
 inline constexpr int64_t kCountsWidth = sizeof(cuda::Counts) / sizeof(int64_t);
 

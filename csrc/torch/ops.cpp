@@ -14,6 +14,7 @@
 #include "core/sh.h"
 #include "cpu/stages.h"
 #include "torch/backend.h"
+#include "torch/call.h"
 #include "torch/ops.h"
 
 namespace ar::ops {
@@ -188,6 +189,7 @@ PYBIND11_MODULE(_C, m) {
         return all;
       },
       "What the headers say of every footprint, in the order of the registry.");
+  ar::ops::define_call(m);
   m.def("instruction_set", &ar::cpu::instruction_set, "Instruction set that the CPU path runs on.");
   m.attr("IMAGES") = ar::ops::image_names();
   m.attr("LENS") = ar::ops::lens_members();

@@ -23,6 +23,12 @@ uint32_t key_of(float depth) {
   return key + kDepthKeyOffset;
 }
 
+/// Memory in which a kernel should find zeros but does not yet, in whole pieces of 16 bytes.
+std::vector<uint32_t> garbage(int64_t words) { return std::vector<uint32_t>((words + 3) / 4 * 4, 0xdeadbeef); }
+ZeroedMemory memory_from(std::vector<uint32_t>& words, int64_t first) {
+  return {words.data() + first, int64_t((words.size() - first) * sizeof(uint32_t))};
+}
+
 /// Sorts as count_depths and sort_by_depth do, but for passes behind the first `passes`: what these leave must be the
 /// result.
 void expect_sorted(const std::vector<float>& depths, int passes = kDepthPasses) {
@@ -41,13 +47,17 @@ void expect_sorted(const std::vector<float>& depths, int passes = kDepthPasses) 
   }
   std::stable_sort(expected.begin(), expected.end(), [&](int32_t a, int32_t b) { return depths[a] < depths[b]; });
 
-  std::vector<uint32_t> memory(DepthScratch::words(n, kDepthPasses));
+  std::vector<uint32_t> memory = garbage(DepthScratch::words(n, kDepthPasses)), other = garbage(5000);
+  std::fill_n(memory.begin(), kDepthHistogramWords, 0u);
   const DepthScratch scratch(memory.data(), n, kDepthPasses);
   Counts counts = {};
   const DepthSort sort = {
       n, {keys[0].data(), keys[1].data()}, {order[0].data(), order[1].data()}, ranges.data(), &counts};
-  cuda_on_host::launch(2, kCountThreads,
-                       [&] { count_depths_kernel(sort.keys[0], sort.ranges, n, scratch.histograms, sort.counts); });
+  cuda_on_host::launch(2, kCountThreads, [&] {
+    count_depths_kernel(sort.keys[0], sort.ranges, n, scratch.histograms, sort.counts,
+                        memory_from(memory, kDepthHistogramWords), memory_from(other, 0));
+  });
+  ASSERT_EQ(other, std::vector<uint32_t>(other.size()));
   ASSERT_EQ(counts.splats, int64_t(expected.size()));
   ASSERT_EQ(counts.pairs, pairs);
   for_each_depth_pass(sort, scratch, [&](auto kernel, auto... arguments) {

@@ -1,0 +1,132 @@
+// A way for Python to an op that takes it a fraction of the time of torch.ops, which goes through the schema of an op
+// for every call: for ops with many arguments that are called once per frame. The dispatcher is the same.
+#include "torch/call.h"
+
+#include <ATen/core/dispatch/Dispatcher.h>
+#include <pybind11/stl.h>
+#include <torch/csrc/autograd/python_variable.h>
+#include <torch/csrc/Exceptions.h>
+
+#include <optional>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace ar::ops {
+namespace {
+
+namespace py = pybind11;
+using c10::IValue;
+
+/// An argument of an op: its name, as Python has it, and how a Python object becomes a value for it.
+struct Parameter {
+  py::str name;
+  bool may_be_none;
+  c10::TypeKind kind;
+  std::optional<IValue> default_value;
+
+  explicit Parameter(const c10::Argument& argument)
+      : name(py::reinterpret_steal<py::str>(PyUnicode_InternFromString(argument.name().c_str()))),
+        may_be_none(argument.type()->kind() == c10::TypeKind::OptionalType),
+        default_value(argument.default_value()) {
+    c10::TypePtr type = argument.type();
+    if (may_be_none) type = type->expectRef<c10::OptionalType>().getElementType();
+    kind = type->kind();
+  }
+
+  IValue value_of(py::handle given) const {
+    if (may_be_none && given.is_none()) return IValue();
+    switch (kind) {
+      case c10::TypeKind::TensorType:
+        if (!THPVariable_Check(given.ptr()))
+          throw py::type_error(std::string(name) + " must be a tensor, got " + Py_TYPE(given.ptr())->tp_name);
+        return THPVariable_Unpack(given.ptr());
+      case c10::TypeKind::IntType:
+        return cast<int64_t>(given, "an int");
+      case c10::TypeKind::FloatType:
+        return cast<double>(given, "a float");
+      case c10::TypeKind::BoolType:
+        return cast<bool>(given, "a bool");
+      case c10::TypeKind::StringType:
+        return cast<std::string>(given, "a string");
+      default:
+        throw py::type_error(std::string(name) + " is of a type that Call does not take");
+    }
+  }
+
+ private:
+  template <class Value> Value cast(py::handle given, const char* what) const {
+    try {
+      return given.cast<Value>();
+    } catch (const py::cast_error&) {
+      throw py::type_error(std::string(name) + " must be " + what + ", got " + Py_TYPE(given.ptr())->tp_name);
+    }
+  }
+};
+
+py::object object_of(const at::Tensor& tensor) { return py::reinterpret_steal<py::object>(THPVariable_Wrap(tensor)); }
+
+/// A result: a tensor, or a list of them.
+py::object object_of(const IValue& value) {
+  if (value.isTensor()) return object_of(value.toTensor());
+  const c10::List<at::Tensor> tensors = value.toTensorList();
+  py::list list(tensors.size());
+  for (size_t k = 0; k < tensors.size(); ++k) list[k] = object_of(tensors.get(k));
+  return list;
+}
+
+class Call {
+ public:
+  explicit Call(const std::string& name)
+      : op_(c10::Dispatcher::singleton().findSchemaOrThrow(("analytic_rasterizer::" + name).c_str(), "")) {
+    for (const c10::Argument& argument : op_.schema().arguments()) parameters_.emplace_back(argument);
+  }
+
+  py::tuple operator()(const py::args& by_place, const py::kwargs& by_name) const {
+    HANDLE_TH_ERRORS
+    torch::jit::Stack stack;
+    stack.reserve(parameters_.size());
+    size_t taken = 0;
+    for (const Parameter& parameter : parameters_) {
+      const size_t place = stack.size();
+      const bool has_place = place < by_place.size();
+      PyObject* given = has_place ? PyTuple_GET_ITEM(by_place.ptr(), Py_ssize_t(place))
+                                  : PyDict_GetItemWithError(by_name.ptr(), parameter.name.ptr());
+      taken += given != nullptr;
+      if (given) {
+        stack.push_back(parameter.value_of(given));
+      } else if (parameter.default_value) {
+        stack.push_back(*parameter.default_value);
+      } else {
+        fail("needs the argument " + std::string(parameter.name));
+      }
+    }
+    if (taken != by_place.size() + by_name.size()) fail("got an argument that it does not have, or has already");
+    {
+      const py::gil_scoped_release no_gil;
+      op_.callBoxed(stack);
+    }
+    py::tuple results(stack.size());
+    for (size_t k = 0; k < stack.size(); ++k) results[k] = object_of(stack[k]);
+    return results;
+    END_HANDLE_TH_ERRORS_PYBIND
+  }
+
+ private:
+  [[noreturn]] void fail(const std::string& why) const { throw py::type_error(op_.schema().name() + " " + why); }
+
+  c10::OperatorHandle op_;
+  std::vector<Parameter> parameters_;
+};
+
+}  // namespace
+
+void define_call(py::module_& m) {
+  py::class_<Call>(m, "Call",
+                   "An op of torch.ops.analytic_rasterizer, to be called with keyword arguments. Takes the host less "
+                   "time than torch.ops; torch.compile does not look into it.")
+      .def(py::init<const std::string&>(), py::arg("name"))
+      .def("__call__", &Call::operator());
+}
+
+}  // namespace ar::ops

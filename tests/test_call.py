@@ -1,0 +1,114 @@
+"""`_C.Call`, the quick way from Python to an op: the same results, gradients and errors as by torch.ops."""
+
+import re
+
+import pytest
+import scenes
+import torch
+from torch._subclasses import FakeTensorMode
+
+import analytic_rasterizer as ar
+from analytic_rasterizer import _C
+from analytic_rasterizer.arguments import camera_arguments, gaussian_arguments
+
+CAMERA = scenes.Camera()
+
+
+def arguments_of_op(device):
+    settings = CAMERA.settings(torch.float32, device)
+    scene = scenes.cast(scenes.random_scene(1, 20, degree=1), torch.float32, device)
+    scene["means2D"] = torch.zeros_like(scene["means3D"])
+    optional = {**scenes.leaves(scene), "colors_precomp": None, "cov3D_precomp": None}
+    gaussians = gaussian_arguments(settings, optional.pop("means3D"), optional.pop("opacities"), **optional)
+    return {**gaussians, **camera_arguments(settings, gaussians["means3D"], gaussians["shs"]), "bg": settings.bg}
+
+
+def results_and_gradients(op, arguments):
+    color, images, radii, saved = op(**arguments)
+    gradients = [t for t in arguments.values() if torch.is_tensor(t) and t.requires_grad]
+    return [color, *images, radii, *torch.autograd.grad(color.square().sum(), gradients)], len(saved)
+
+
+def test_it_is_the_op(device):
+    arguments = arguments_of_op(device)
+    arguments |= {"alpha": True, "depth": True}
+    made, saved = results_and_gradients(_C.Call("rasterize"), arguments)
+    expected, expected_saved = results_and_gradients(torch.ops.analytic_rasterizer.rasterize, arguments)
+    assert len(made) == len(expected)
+    assert all(torch.equal(a, b) for a, b in zip(made, expected))
+    assert saved == expected_saved > 0
+    with torch.no_grad():
+        color, images, _, saved = _C.Call("rasterize")(**arguments)
+    assert torch.equal(color, expected[0])
+    assert len(images) == 2
+    assert saved == []
+    assert not color.requires_grad
+
+
+def test_arguments_by_place(device):
+    generator = torch.Generator().manual_seed(0)
+    given = [torch.rand(4, n, generator=generator).to(device) for n in (3, 4, 1)]
+    made = _C.Call("activate")(given[0], given[1], logit_opacities=given[2])
+    assert all(torch.equal(a, b) for a, b in zip(made, torch.ops.analytic_rasterizer.activate(*given)))
+
+
+CHANGES = {
+    "missing": ({"bg": ...}, TypeError, "analytic_rasterizer::rasterize needs the argument bg"),
+    "unknown": ({"background": 1}, TypeError, "got an argument that it does not have"),
+    "no tensor": ({"shs": [1.0]}, TypeError, "shs must be a tensor, got list"),
+    "none": ({"opacities": None}, TypeError, "opacities must be a tensor, got NoneType"),
+    "no int": ({"image_height": "16"}, TypeError, "image_height must be an int, got str"),
+    "no float": ({"tanfovx": None}, TypeError, "tanfovx must be a float, got NoneType"),
+    "no string": ({"footprint": 3}, TypeError, "footprint must be a string, got int"),
+    "of the op, ValueError": ({"image_height": -1}, ValueError, "image_height must be in"),
+    "of the op, TypeError": ({"bg": torch.zeros(3, dtype=torch.int32)}, TypeError, "bg must have the dtype"),
+}
+
+
+@pytest.mark.parametrize("case", CHANGES)
+def test_errors(case):
+    change, error, message = CHANGES[case]
+    arguments = {name: value for name, value in {**arguments_of_op("cpu"), **change}.items() if value is not ...}
+    with pytest.raises(error, match=re.escape(message)):
+        _C.Call("rasterize")(**arguments)
+
+
+def test_wrong_calls():
+    with pytest.raises(RuntimeError, match="analytic_rasterizer::nothing"):
+        _C.Call("nothing")
+    three = [torch.zeros(4, n) for n in (3, 4, 1)]
+    with pytest.raises(TypeError, match="got an argument that it does not have, or has already"):
+        _C.Call("activate")(*three, log_scales=three[0])
+    with pytest.raises(TypeError, match="got an argument that it does not have, or has already"):
+        _C.Call("activate")(*three, three[0])
+    parameters = [torch.zeros(4, 3)]
+    with pytest.raises(TypeError, match="is of a type that Call does not take"):  # lists
+        _C.Call("adam_")(parameters)
+
+
+def test_fake_tensors():
+    """What looks into the dispatcher sees the op: here modes that trace shapes."""
+    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
+        arguments = arguments_of_op("cpu")
+        fake = {name: mode.from_tensor(v.detach()) if torch.is_tensor(v) else v for name, v in arguments.items()}
+        color, _, radii, _ = _C.Call("rasterize")(**fake)
+    assert type(color).__name__ == "FakeTensor"
+    assert color.shape == (3, CAMERA.image_height, CAMERA.image_width)
+    assert radii.shape == (20,)
+
+
+def test_torch_compile(device):
+    """It traces through the rasterizer without a break, by torch.ops."""
+    settings = CAMERA.settings(torch.float32, device)
+    scene = scenes.cast(scenes.random_scene(1, 20, degree=1), torch.float32, device)
+    scene["means2D"] = torch.zeros_like(scene["means3D"])
+    rasterizer = ar.GaussianRasterizer(settings)
+
+    def picture(gaussians):
+        return 2 * rasterizer(**gaussians)[0]
+
+    leaves = scenes.leaves(scene)
+    made = torch.compile(picture, backend="eager", fullgraph=True)(leaves)
+    assert torch.equal(made, picture(scene))
+    made.sum().backward()
+    assert leaves["means3D"].grad.abs().max() > 0
