@@ -25,12 +25,15 @@ class MemoryParts {
 
   template <class Element> Element* take(int64_t count) {
     const int64_t first = bytes_;
-    bytes_ += (count * int64_t(sizeof(Element)) + 15) / 16 * 16;  // so that every part is aligned
+    bytes_ += (count * int64_t(sizeof(Element)) + kAlignment - 1) / kAlignment * kAlignment;
     return begin_ ? reinterpret_cast<Element*>(begin_ + first) : nullptr;
   }
   int64_t bytes() const { return bytes_; }
 
  private:
+  /// As tensors are. A warp whose 128 bytes begin elsewhere than a line of the cache does reads two lines.
+  static constexpr int64_t kAlignment = 512;
+
   std::byte* begin_;
   int64_t bytes_ = 0;
 };
@@ -49,8 +52,8 @@ struct SplatMemory {
     MemoryParts parts(memory);
     constexpr int64_t kHistograms = cuda::kDepthHistogramWords * sizeof(uint32_t);
     const int64_t depth_bytes = cuda::depth_sort_scratch(n), emit_bytes = cuda::emit_scratch(n);
-    depth_scratch = parts.take<std::byte>(depth_bytes);
-    emit_scratch = parts.take<std::byte>(emit_bytes);  // right behind it: both are multiples of 16 bytes
+    depth_scratch = parts.take<std::byte>(depth_bytes + emit_bytes);
+    emit_scratch = depth_scratch ? depth_scratch + depth_bytes : nullptr;
     if (depth_scratch) to_clear = {depth_scratch + kHistograms, depth_bytes - kHistograms + emit_bytes};
     for (uint32_t*& k : keys) k = parts.take<uint32_t>(n);
     order = parts.take<int32_t>(n);

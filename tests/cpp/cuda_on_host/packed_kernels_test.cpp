@@ -166,7 +166,9 @@ TEST(PackedKernels, SplatsAreThoseOfSeparateColumns) {
     p.ranges = ranges[k].data();
     p.masks = masks[k].data();
     Counts counts = {7, 7};
+    std::vector<uint32_t> histograms(kDepthHistogramWords + 1, 7);
     p.counts = &counts;
+    p.depth_histograms = histograms.data();
     if (k == 0) {
       p.rows = rows.view();
     } else {
@@ -177,6 +179,9 @@ TEST(PackedKernels, SplatsAreThoseOfSeparateColumns) {
     cuda_on_host::launch(kBlocks, kProjectThreads, [&] { shape_rows_kernel(p); });
     EXPECT_EQ(counts.pairs, 0);
     EXPECT_EQ(counts.splats, 0);
+    EXPECT_EQ(histograms.back(), 7u);
+    histograms.pop_back();
+    EXPECT_EQ(histograms, std::vector<uint32_t>(kDepthHistogramWords));
   }
   EXPECT_TRUE(same(splats[0], splats[1]));
   EXPECT_TRUE(same(keys[0], keys[1]));
