@@ -10,7 +10,7 @@ from .camera import make_lens
 from .effects import MAX_SH_DEGREE, Effects
 from .filters import apply_3d_filter
 from .footprints import check_device
-from .settings import GaussianRasterizationSettings
+from .settings import GaussianRasterizationSettings, whole_number
 from .sh import used_sh_degree
 
 _NOTHING = Effects()
@@ -67,18 +67,23 @@ def camera_arguments(
 ) -> dict[str, Any]:
     """The camera, the degree of the harmonics and the footprint by the names of the ops.
 
-    A plain camera, which is all that 3DGS has, comes without a `lens`; `full` asks for one all the same. A matrix or a
-    camera centre that requires a gradient makes a full camera too, for only that has one.
+    A plain camera, which is all that 3DGS has, comes without a `lens`; `full` asks for one all the same. A matrix, a
+    camera centre or a tangent that requires a gradient makes a full camera too, for only that has one.
+
+    Raises:
+        TypeError, ValueError: A matrix is no tensor or on another device; the size or the degree is no whole number.
     """
     s, effects = settings, settings.effects
     view, proj, campos = s.viewmatrix, s.projmatrix, s.campos
     check_tensors(means3D.device, viewmatrix=view, projmatrix=proj, campos=campos)
     footprint = s.footprint_in_use()
-    degree, lens, tanfovx, tanfovy = int(s.sh_degree), None, s.tanfovx, s.tanfovy
+    degree, lens, tanfovx, tanfovy = whole_number("sh_degree", s.sh_degree), None, s.tanfovx, s.tanfovy
     if effects is not None:
         degree = used_sh_degree(effects, degree, shs)
     effects = effects if isinstance(effects, Effects) else _NOTHING
-    if (view.requires_grad or proj.requires_grad or campos.requires_grad) and torch.is_grad_enabled():
+    wanted = view.requires_grad or proj.requires_grad or campos.requires_grad
+    wanted = wanted or any(isinstance(t, torch.Tensor) and t.requires_grad for t in (tanfovx, tanfovy))
+    if wanted and torch.is_grad_enabled():
         effects = effects.with_camera_gradients()
     if full or degree >= MAX_SH_DEGREE or (effects is not _NOTHING and effects.changes_camera):
         lens = make_lens(effects, s, means3D)
@@ -89,8 +94,8 @@ def camera_arguments(
         "projmatrix": proj,
         "campos": campos,
         "lens": lens,
-        "image_height": int(s.image_height),
-        "image_width": int(s.image_width),
+        "image_height": whole_number("image_height", s.image_height),
+        "image_width": whole_number("image_width", s.image_width),
         "tanfovx": float(tanfovx),
         "tanfovy": float(tanfovy),
         "scale_modifier": float(s.scale_modifier),

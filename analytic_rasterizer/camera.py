@@ -7,7 +7,7 @@ import torch
 from . import _C
 from .effects import Effects
 from .rotations import product
-from .settings import GaussianRasterizationSettings
+from .settings import GaussianRasterizationSettings, whole_number
 
 _DEPTH_RANGE = (0.01, 100.0)  # of clip-space z, which nothing reads
 
@@ -32,8 +32,8 @@ def camera_settings(
 ) -> GaussianRasterizationSettings:
     """Settings of a pinhole camera, or with `Effects(orthographic=True)` of an orthographic one.
 
-    With `Effects(camera_gradients=True)` gradients flow to every tensor that is given. The matrices are computed in
-    float64 and rounded once.
+    Gradients flow to every tensor that is given and requires one. The matrices are computed in float64 and rounded
+    once.
 
     Args:
         world_to_camera: (4, 4), acts on column vectors; camera axes x right, y down, z forward. Its upper left
@@ -47,8 +47,10 @@ def camera_settings(
         effects, **options: As in the settings, the footprint among them.
 
     Raises:
-        ValueError: world_to_camera has a wrong shape, or a focal length that is a number is not positive.
+        ValueError: world_to_camera has a wrong shape, a focal length that is a number is not positive, or width or
+            height is not a whole number.
     """
+    width, height = whole_number("width", width), whole_number("height", height)
     if world_to_camera.shape != (4, 4):
         raise ValueError(f"world_to_camera must have shape (4, 4), got {tuple(world_to_camera.shape)}")
     for name, value in (("fx", fx), ("fy", fy)):
@@ -64,7 +66,9 @@ def camera_settings(
     scale = torch.stack([1 / tangent for tangent in tangents])
     center = torch.stack([2 * cx / width - 1, 2 * cy / height - 1])
     projection, position = camera_matrices(view, scale, center, orthographic)
-    if not (isinstance(effects, Effects) and effects.camera_gradients):
+    # Numbers, unless their gradient may be asked for: reading them later makes the host wait for the device.
+    asked_for = isinstance(effects, Effects) and effects.camera_gradients
+    if not (asked_for or any(t.requires_grad for t in tangents)):
         tangents = tuple(t.item() for t in tangents)
     to = {"dtype": dtype, "device": view.device if device is None else device}
     return GaussianRasterizationSettings(

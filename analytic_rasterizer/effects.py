@@ -136,7 +136,7 @@ class Effects:
         dominant_index: The Gaussian that has the largest weight in a pixel.
         gaussian_stats: How much of every Gaussian is seen, for pruning.
         camera_gradients: Gradients with respect to viewmatrix, projmatrix, campos, tanfovx and tanfovy of the settings
-            that are tensors and require one. A matrix or campos that requires one switches it on by itself.
+            that are tensors and require one. Any of them that requires one switches it on by itself.
             `camera_settings` derives them from a pose and fx, fy, cx, cy.
         orthographic: No perspective. tanfovx and tanfovy are half the width and height of the picture in world
             units, and projmatrix must leave w at 1.

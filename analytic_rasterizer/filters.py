@@ -81,7 +81,8 @@ def apply_3d_filter(
     Args:
         scales: (P, 3) standard deviations, world units.
         opacities: (P, 1) or (P,).
-        filter_3d: (P,) world units, from `compute_3d_filter`.
+        filter_3d: (P,) world units, from `compute_3d_filter`; 0 where there is none. Where it is negative or not a
+            number, the scales become NaN, so that the Gaussian is culled, or named where the settings ask for debug.
 
     Returns:
         (scales, opacities) of the same shapes.
@@ -96,9 +97,10 @@ def apply_3d_filter(
     if opacities.numel() != len(scales):
         raise ValueError(f"opacities must have shape (P, 1) or (P,), got {tuple(opacities.shape)}")
     # hypot neither overflows nor loses small scales, and its gradient is finite unless both arguments are 0.
-    width = filter_3d[:, None].expand_as(scales)
-    filtered = torch.where(width > 0, torch.hypot(scales, torch.where(width > 0, width, 1)), scales)
-    share = torch.where(width > 0, scales / torch.where(width > 0, filtered, 1), 1).prod(1)
+    width = torch.where(filter_3d < 0, torch.nan, filter_3d)[:, None].expand_as(scales)
+    none = width == 0
+    filtered = torch.where(none, scales, torch.hypot(scales, torch.where(none, 1, width)))
+    share = torch.where(none, 1, scales / torch.where(none, 1, filtered)).prod(1)
     return filtered, opacities * share.reshape(opacities.shape)
 
 

@@ -30,6 +30,33 @@ def depths(means3D: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
     return x * view[0, 2] + y * view[1, 2] + z * view[2, 2] + view[3, 2]
 
 
+def split_background(
+    bg: torch.Tensor, colors_precomp: torch.Tensor | None, size: tuple[int, int]
+) -> tuple[torch.Tensor, torch.Tensor | None]:
+    """What the operator takes as background, and the image that comes behind its result: (C,) and None, or zeros and
+    (C, H, W).
+
+    Raises:
+        ValueError: `bg` is an image of another shape.
+    """
+    if bg.dim() != 3:
+        return bg, None
+    channels = 3 if colors_precomp is None else colors_precomp.shape[-1]
+    if bg.shape != (channels, *size):
+        raise ValueError(f"bg must have shape {(channels, *size)}, got {tuple(bg.shape)}")
+    return bg.new_zeros(channels), bg
+
+
+def before_background(color: torch.Tensor, alpha: torch.Tensor, background: torch.Tensor) -> torch.Tensor:
+    """`color` (C or more, H, W) before an image (C, H, W). There is nothing behind the channels that follow, features.
+
+    Args:
+        alpha: (1, H, W).
+    """
+    behind = (1 - alpha) * background
+    return torch.cat([color[: len(background)] + behind, color[len(background) :]])
+
+
 @torch.no_grad()
 def summaries(
     effects: Effects, saved: list[torch.Tensor], z: torch.Tensor, size: tuple[int, int], footprint: str, option: float

@@ -16,7 +16,7 @@ from . import (
 )
 from .arguments import camera_arguments, check_tensors, gaussian_arguments
 from .effects import NEAR, Effects, Outputs
-from .outputs import depths, summaries
+from .outputs import before_background, depths, split_background, summaries
 from .settings import GaussianRasterizationSettings
 
 NOTHING = Effects()
@@ -83,6 +83,8 @@ def render(
 
     The other arguments, what is returned, and errors are those of `GaussianRasterizer.forward`.
     """
+    if not isinstance(settings, GaussianRasterizationSettings):
+        raise TypeError(f"settings must be a GaussianRasterizationSettings, got {type(settings).__name__}")
     gaussians = gaussian_arguments(
         settings,
         means3D,
@@ -115,20 +117,14 @@ def _render_with_outputs(
 ) -> tuple:
     """(color, radii), and `Outputs` where `effects` asks for some. `bg` may be an image (C, H, W)."""
     size = camera["image_height"], camera["image_width"]
-    bg_image = None
-    if bg.dim() == 3:
-        channels = 3 if gaussians["colors_precomp"] is None else gaussians["colors_precomp"].shape[-1]
-        if bg.shape != (channels, *size):
-            raise ValueError(f"bg must have shape {(channels, *size)}, got {tuple(bg.shape)}")
-        bg, bg_image = bg.new_zeros(channels), bg
+    bg, bg_image = split_background(bg, gaussians["colors_precomp"], size)
     with_summaries = effects.median_depth or effects.dominant_index or effects.gaussian_stats
     blended = {name: getattr(effects, name) for name in _C.IMAGES}
     blended["alpha"] |= bg_image is not None
     color, images, radii, saved = _rasterize(**gaussians, **camera, bg=bg, **blended, keep=with_summaries, debug=debug)
     outputs = dict(zip((name for name in _C.IMAGES if blended[name]), (image[None] for image in images)))
     if bg_image is not None:
-        behind = (1 - outputs["alpha"]) * bg_image
-        color = torch.cat([color[: len(bg_image)] + behind, color[len(bg_image) :]])  # there is nothing behind features
+        color = before_background(color, outputs["alpha"], bg_image)
         if not effects.alpha:
             del outputs["alpha"]
     if not effects.has_outputs:

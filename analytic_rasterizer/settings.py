@@ -11,6 +11,29 @@ from .effects import AUTO, Effects
 from .footprints import Footprint, get_default_footprint, resolve_footprint
 
 
+def whole_number(name: str, value: Any) -> int:
+    """The whole number that `value` is: an int, or what programs have in its place, such as 24.0 or a tensor of one.
+
+    Raises:
+        TypeError: It is not a number.
+        ValueError: It is not whole.
+    """
+    if type(value) is int:
+        return value
+    message = f"{name} must be a whole number, got {value!r}"
+    if isinstance(value, (str, bytes)):
+        raise TypeError(message)
+    try:
+        number = int(value)
+    except TypeError:
+        raise TypeError(message) from None
+    except (ValueError, OverflowError):  # of NaN and infinity
+        raise ValueError(message) from None
+    if number != value:
+        raise ValueError(message)
+    return number
+
+
 class _Fields(NamedTuple):
     image_height: int
     image_width: int

@@ -22,7 +22,8 @@ from . import (
     ops,  # noqa: F401  (registers the fake kernels)
 )
 from .arguments import camera_arguments, check_tensors, gaussian_arguments
-from .outputs import depths
+from .effects import Effects
+from .outputs import before_background, depths, split_background
 from .settings import GaussianRasterizationSettings
 
 
@@ -135,7 +136,8 @@ def project(
 
     Args:
         settings: Of the camera, or of each of several. They must agree in image size, scale modifier, degree of the
-            harmonics and footprint; background and debug are not read. Outputs of their effects are not made.
+            harmonics, footprint and 3D filter; background and debug are not read. Outputs of their effects are not
+            made.
         means3D: (P, 3) centres, world units.
         opacities: (P, 1) or (P,).
         shs: (P, M, 3) spherical harmonics, or colors_precomp (P, 3), for `Splats.colors`; or neither.
@@ -184,6 +186,9 @@ def project_arguments(
     Raises:
         TypeError, ValueError, RuntimeError: As `project`.
     """
+    for number, camera in enumerate(cameras):
+        if not _same_filter(camera, cameras[0]):
+            raise ValueError(f"settings must agree in filter_3d, but camera {number} has another one than camera 0")
     gaussians = gaussian_arguments(cameras[0], means3D, opacities, **optional)
     shs = optional["shs"]
     arguments = [camera_arguments(camera, means3D, shs) for camera in cameras]
@@ -204,6 +209,12 @@ def project_arguments(
         "tanfovy": [a["tanfovy"] for a in arguments],
     }
     return gaussians, batch | shared
+
+
+def _same_filter(a: GaussianRasterizationSettings, b: GaussianRasterizationSettings) -> bool:
+    """Whether both widen the Gaussians by the same 3D filter, or neither does."""
+    one, other = (s.effects.filter_3d if isinstance(s.effects, Effects) else None for s in (a, b))
+    return one is other or (one is not None and other is not None and torch.equal(one, other))
 
 
 def bin(splats: Splats, *, background: torch.Tensor | None = None, keep: bool = True) -> TileLists:
@@ -349,9 +360,13 @@ def render_stages(
     )
     camera = camera_arguments(settings, means3D, shs)
     check_tensors(means3D.device, bg=settings.bg)
-    color, _, radii, saved, seconds = torch.ops.analytic_rasterizer.rasterize_timed(
-        **gaussians, **camera, bg=settings.bg
+    size = camera["image_height"], camera["image_width"]
+    bg, bg_image = split_background(settings.bg, gaussians["colors_precomp"], size)
+    color, images, radii, saved, seconds = torch.ops.analytic_rasterizer.rasterize_timed(
+        **gaussians, **camera, bg=bg, alpha=bg_image is not None
     )
+    if bg_image is not None:
+        color = before_background(color, images[0], bg_image)
     lists = dict(zip(_C.LISTS, saved))
     ids, splats, pairs = lists["ids"], lists["splats"], lists["pairs"]
     if means3D.is_cuda:  # every Gaussian has a row; here only those that are kept

@@ -6,6 +6,7 @@ import functools
 import inspect
 import math
 import pickle
+import types
 
 import pytest
 import reference
@@ -316,6 +317,25 @@ def test_a_second_derivative_is_refused(device):
         first.sum().backward()
 
 
+def test_a_derivative_in_forward_mode_is_refused(device):
+    """Not implemented: a tangent must not be lost without a word."""
+    scene = scene32(device)
+    offset, cov2d = torch.tensor([0.3, 0.2], device=device), torch.tensor([1.0, 0.0, 2.0], device=device)
+    rasterizer = ar.GaussianRasterizer(CAMERA.settings(torch.float32, device))
+    functions = {
+        "rasterize has no .* tangent of means3D": (
+            lambda m: rasterizer(**{**scene, "means3D": m})[0],
+            scene["means3D"],
+        ),
+        "footprint_weight has no .* tangent of offset": (lambda d: ar.footprint_weight(d, cov2d), offset),
+    }
+    for message, (function, value) in functions.items():
+        with pytest.raises(NotImplementedError, match=message):
+            torch.func.jvp(function, (value,), (torch.ones_like(value),))
+        with torch.autograd.forward_ad.dual_level(), pytest.raises(NotImplementedError, match=message):
+            function(torch.autograd.forward_ad.make_dual(value, torch.ones_like(value)))
+
+
 def test_strided_inputs(device):
     """Columns of a larger tensor, transposed matrices: everything as if contiguous."""
     scene = scene32(device)
@@ -349,8 +369,9 @@ def test_strided_inputs(device):
         lambda f: {"tanfovx": torch.tensor(f["tanfovx"]).double(), "tanfovy": torch.tensor(0.5)},
         lambda f: {"scale_modifier": 1},
         lambda f: {"prefiltered": True},
+        lambda f: {"image_height": float(f["image_height"]), "image_width": torch.tensor(f["image_width"])},
     ],
-    ids=["batched matrices", "0-dim tanfov", "0-dim tanfovs", "int modifier", "prefiltered"],
+    ids=["batched matrices", "0-dim tanfov", "0-dim tanfovs", "int modifier", "prefiltered", "other whole numbers"],
 )
 def test_settings_in_other_forms(device, change):
     fields = CAMERA.fields(torch.float32, device)
@@ -358,6 +379,24 @@ def test_settings_in_other_forms(device, change):
     actual = render(scene32(device), Settings(**(fields | change(fields))))
     assert torch.equal(actual[0], expected[0])
     assert torch.equal(actual[1], expected[1])
+
+
+@pytest.mark.parametrize("value, error", [(24.5, ValueError), ("24", TypeError), (math.nan, ValueError)])
+@pytest.mark.parametrize("name", ["image_height", "image_width", "sh_degree"])
+def test_sizes_and_degrees_are_whole_numbers(name, value, error):
+    fields = CAMERA.fields(torch.float32, "cpu") | {name: value}
+    with pytest.raises(error, match=f"{name} must be a whole number, got"):
+        render(scene32(), Settings(**fields))
+    size = {"width": 32, "height": 24} | ({name.split("_")[1]: value} if name != "sh_degree" else {})
+    if name != "sh_degree":
+        with pytest.raises(error, match=f"{name.split('_')[1]} must be a whole number, got"):
+            ar.camera_settings(torch.eye(4), **size, fx=30.0, fy=30.0)
+
+
+def test_settings_of_another_class_belong_to_the_dialects():
+    settings = types.SimpleNamespace(**CAMERA.fields(torch.float32, "cpu"))
+    with pytest.raises(TypeError, match="settings must be a GaussianRasterizationSettings, got SimpleNamespace"):
+        render(scene32(), settings)
 
 
 def test_flat_opacities(device):

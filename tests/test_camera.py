@@ -131,6 +131,31 @@ def test_gradcheck_of_the_pose_and_the_focal_lengths(variant, orthographic):
     assert torch.autograd.gradcheck(run, inputs, eps=1e-6, atol=1e-6, rtol=1e-5, nondet_tol=0, fast_mode=True)
 
 
+def test_a_focal_length_that_requires_a_gradient_switches_gradients_of_the_camera_on():
+    """All of its gradient: that through projmatrix, and that through the tangents of the projected covariances."""
+    scene = scenes.smooth_scene(40, degree=1) | {"means2D": None}
+    focal = torch.tensor([30.0, 28.0], dtype=torch.float64, requires_grad=True)
+
+    def picture(fx, fy):
+        settings = pinhole(torch.zeros(6), fx, fy, 17.9, 13.1, None)
+        return ar.GaussianRasterizer(settings)(**scene)[0]
+
+    assert torch.autograd.gradcheck(picture, tuple(focal.detach().clone().requires_grad_()), atol=1e-6, fast_mode=True)
+
+    def stages(fx, fy):
+        arguments = {name: value for name, value in scene.items() if name != "means2D"}
+        splats = ar.project(pinhole(torch.zeros(6), fx, fy, 17.9, 13.1, None), **arguments)
+        return ar.blend(splats, ar.bin(splats))[0]
+
+    assert torch.autograd.gradcheck(stages, tuple(focal.detach().clone().requires_grad_()), atol=1e-6, fast_mode=True)
+    # By itself, in settings of the program's own, and where nobody wants it.
+    settings = pinhole(torch.zeros(6), 30.0, 28.0, 17.9, 13.1, None)
+    tangent = torch.tensor(settings.tanfovx, requires_grad=True)
+    assert ar.GaussianRasterizer(settings._replace(tanfovx=tangent))(**scene)[0].requires_grad
+    with torch.no_grad():
+        assert torch.equal(picture(*focal), picture(30.0, 28.0))
+
+
 def test_gradcheck_where_the_clamp_holds():
     """Wide splats outside the picture: x/z is clamped, and tan(fov) and the principal point move the clamp."""
     scene = scenes.smooth_scene(41, degree=1, count=3)

@@ -130,6 +130,15 @@ def test_settings_of_a_class_of_the_program(name):
         )
 
 
+def test_settings_of_a_class_of_the_program_may_have_footprint_and_effects():
+    own = types.SimpleNamespace(**fields_of("gs2023"), footprint="box:samples=8", effects=ar.Effects(alpha=True))
+    made = drop_in.GaussianRasterizer(own)(**arguments_of("gs2023"))
+    keywords = {"footprint": own.footprint, "effects": own.effects}
+    assert_same(made[:2], render("gs2023", **keywords)[:2])
+    assert torch.equal(made[2].alpha, render("gs2023", **keywords)[2].alpha)
+    assert not torch.equal(made[0], render("gs2023")[0])
+
+
 def test_settings_of_a_class_of_the_program_are_inferred_too():
     own = types.SimpleNamespace(**fields_of("monogs"))
     assert_same(drop_in.GaussianRasterizer(own)(**arguments_of("monogs")), render("monogs"))

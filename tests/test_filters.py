@@ -68,6 +68,24 @@ def test_gradients_are_right_and_finite_where_scales_vanish():
     assert (filtered[0] == 0.1).all() and faded[0] == 0
 
 
+@pytest.mark.parametrize("wrong", [math.nan, -0.1])
+def test_a_gaussian_whose_filter_makes_no_sense_is_culled(wrong):
+    scene = {name: v for name, v in scenes.random_scene(1, 20).items() if name != "means2D"}
+    width = torch.full((20,), 0.05, dtype=F64)
+    width[3] = wrong
+    settings = scenes.Camera().settings(F64, "cpu")
+    filtered = settings._replace(effects=ar.Effects(filter_3d=width))
+    color, radii = ar.GaussianRasterizer(filtered)(means2D=None, **scene)
+    assert radii[3] == 0 and color.isfinite().all()
+    others = [k for k in range(20) if k != 3]
+    without = settings._replace(effects=ar.Effects(filter_3d=width[others]))
+    expected, _ = ar.GaussianRasterizer(without)(means2D=None, **{name: v[others] for name, v in scene.items()})
+    # torch rounds the same number differently at other places of a tensor, by a few of 1.1e-16.
+    assert torch.allclose(color, expected, rtol=0, atol=1e-13)
+    with pytest.raises(ValueError, match="must be finite, got nan at"):
+        ar.GaussianRasterizer(filtered._replace(debug=True))(means2D=None, **scene)
+
+
 def test_filter_removes_what_only_a_finer_camera_could_show():
     """From twice as near a filtered splat is as wide as the training view could tell."""
     point = torch.zeros(1, 3, dtype=F64)

@@ -380,6 +380,29 @@ def test_settings_of_a_batch_must_agree():
         ar.project([], **scene)
 
 
+def test_a_3d_filter_is_that_of_all_cameras():
+    """It widens the Gaussians, which all cameras share."""
+    scene = scene_of(torch.float32, "cpu")
+    settings = settings_of(torch.float32, "cpu")
+    width = torch.full((len(scene["means3D"]),), 0.1)
+    filtered, again = (settings._replace(effects=ar.Effects(filter_3d=w)) for w in (width, width.clone()))
+    assert torch.equal(ar.project([filtered, again], **scene).cov2d, ar.project([filtered] * 2, **scene).cov2d)
+    other = settings._replace(effects=ar.Effects(filter_3d=2 * width))
+    for cameras in ([settings, filtered], [filtered, settings], [filtered, again, other]):
+        with pytest.raises(ValueError, match=f"settings must agree in filter_3d, but camera {len(cameras) - 1} has"):
+            ar.project(cameras, **scene)
+
+
+def test_stages_of_a_picture_before_an_image(device):
+    settings = settings_of(torch.float32, device)
+    settings = settings._replace(bg=torch.rand(3, settings.image_height, settings.image_width).to(device))
+    scene = scene_of(torch.float32, device)
+    color, _ = ar.GaussianRasterizer(settings)(means2D=None, **scene)
+    assert torch.equal(ar.render_stages(settings, **scene).color, color)
+    with pytest.raises(ValueError, match=r"bg must have shape \(3, "):
+        ar.render_stages(settings._replace(bg=settings.bg[:, 1:]), **scene)
+
+
 @pytest.mark.parametrize(
     "change, message",
     [

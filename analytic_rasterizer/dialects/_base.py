@@ -222,14 +222,16 @@ def _class_of(positional: int, keywords: dict[str, Any]) -> type:
 def as_settings(settings: Any) -> LibrarySettings:
     """Settings themselves, or those that an object with attributes of their names stands for.
 
-    The originals read attributes and nothing else, so that programs get by with a class of their own.
+    The originals read attributes and nothing else, so that programs get by with a class of their own. `footprint` and
+    `effects` are read too, if it has them.
 
     Raises:
         TypeError: A field is missing, see `GaussianRasterizationSettings`.
     """
     if isinstance(settings, LibrarySettings):
         return settings
-    return GaussianRasterizationSettings(**{n: getattr(settings, n) for n in _known_fields if hasattr(settings, n)})
+    known = [*_known_fields, "footprint", "effects"]
+    return GaussianRasterizationSettings(**{n: getattr(settings, n) for n in known if hasattr(settings, n)})
 
 
 def forward_like(render_method):

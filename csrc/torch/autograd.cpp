@@ -146,6 +146,16 @@ bool wants_gradient(const Op& op, const Stack& stack, size_t first) {
   return false;
 }
 
+/// Raises if a tensor has a tangent: without a derivative forwards it would be lost without a word.
+void refuse_tangents(const Op& op, const Stack& stack, size_t first) {
+  for (const size_t i : op.tensors) {
+    const IValue& value = stack[first + i];
+    TORCH_CHECK_NOT_IMPLEMENTED(!is_given(value) || !value.toTensor()._fw_grad(/*level=*/0).defined(),
+                                op.forward.schema().name(), " has no derivative in forward mode, which a tangent of ",
+                                op.forward.schema().arguments()[i].name(), " asks for; it has one in reverse mode");
+  }
+}
+
 void differentiate(const c10::OperatorHandle& handle, Stack* stack) {
   // One entry per op for ever: looked up by name of the schema, which the dispatcher keeps at one place.
   static auto* ops = new std::unordered_map<const c10::FunctionSchema*, std::unique_ptr<Op>>;
@@ -158,6 +168,7 @@ void differentiate(const c10::OperatorHandle& handle, Stack* stack) {
     op = entry.get();
   }
   const size_t first = stack->size() - op->arguments;
+  refuse_tangents(*op, *stack, first);
   if (!wants_gradient(*op, *stack, first)) {
     const at::AutoDispatchBelowADInplaceOrView guard;
     op->forward.callBoxed(*stack);
