@@ -121,17 +121,13 @@ Results pack_rows(PackArguments a) {
 
 Results pack_rows_vjp(PackVjpArguments a) {
   const int64_t cameras = check_cameras(a), rows = a.ids.numel(), count = a.count();
-  check_needs(a.needs, kSceneTensors - 1);
-  std::vector<bool> needs = a.needs;
-  needs.insert(needs.begin() + 1, false);  // means2D, which is no argument
-  check_camera_needs(needs, a.lens);
   check_packed_gradient(a.dL_drows, a.means3D);
   check_ints(a.ids, "ids", a.dL_drows.size(0), a.means3D);
   check_places(a, cameras, rows);
   TORCH_CHECK_VALUE(may_be_rows_of(a.ids, count), "ids must be what pack_rows_ wrote");
   RowTensors dL_drows;
   dL_drows.packed = a.dL_drows;
-  return {gradients_of(a, needs, [&](int64_t c, const Inputs& in, const Grads& grads) {
+  return {gradients_of(a, a.needs, [&](int64_t c, const Inputs& in, const Grads& grads) {
     const Tensor places = places_of(a.ids.slice(0, a.firsts[c], a.firsts[c] + a.counts[c]), count, a.firsts[c]);
     return make_backend(in.means3D)->project_rows_vjp(in, places, dL_drows, grads);
   })};

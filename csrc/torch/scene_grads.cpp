@@ -82,8 +82,11 @@ std::vector<Tensor> list_of(Grads grads, const Tensor& like) {
   return list;
 }
 
-std::vector<Tensor> gradients_of(const ProjectArguments& a, const std::vector<bool>& needs,
+std::vector<Tensor> gradients_of(const ProjectArguments& a, std::vector<bool> needs,
                                  const std::function<Tensor(int64_t c, const Inputs&, const Grads&)>& adjoint) {
+  check_needs(needs, kSceneTensors - 1);
+  needs.insert(needs.begin() + 1, false);  // means2D
+  check_camera_needs(needs, a.lens);
   const int64_t cameras = a.viewmatrix.size(0);
   Grads grads;
   std::array<std::vector<Tensor>, kCameraTensors> of_cameras;

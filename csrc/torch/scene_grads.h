@@ -22,9 +22,10 @@ void set_camera_grads(const Tensor& parts, const std::vector<bool>& needs, Grads
 inline Tensor or_empty(const Tensor& t, const Tensor& like) { return t.defined() ? t : at::empty({0}, like.options()); }
 std::vector<Tensor> list_of(Grads grads, const Tensor& like);
 
-/// Gradients with respect to the tensors of `project` but means2D, which has a place in `needs`: of the Gaussians the
-/// sum over all cameras, of the cameras side by side. `adjoint` is that of one camera (Backend::project_rows_vjp).
-std::vector<Tensor> gradients_of(const ProjectArguments& a, const std::vector<bool>& needs,
+/// Gradients with respect to the tensors of `project` but means2D, which is no argument of it and has no place in
+/// `needs`: of the Gaussians the sum over all cameras, of the cameras side by side. `adjoint` is that of one camera
+/// (Backend::project_rows_vjp). Checks `needs`.
+std::vector<Tensor> gradients_of(const ProjectArguments& a, std::vector<bool> needs,
                                  const std::function<Tensor(int64_t c, const Inputs&, const Grads&)>& adjoint);
 
 /// Whether int32 `ids` number rows of `count`; on a device, where the answer would have to be waited for, it is not

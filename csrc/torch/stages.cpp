@@ -99,10 +99,6 @@ Results project(ProjectArguments a) {
 Results project_vjp(VjpArguments<ProjectArguments> arguments) {
   const ProjectArguments& a = arguments.of_op;
   const int64_t cameras = check_cameras(a);
-  check_needs(arguments.needs, kSceneTensors - 1);
-  std::vector<bool> needs = arguments.needs;
-  needs.insert(needs.begin() + 1, false);  // means2D, which is no argument
-  check_camera_needs(needs, a.lens);
   TORCH_CHECK_VALUE(arguments.saved.size() == 3, "saved must be what project saved, got ", arguments.saved.size(),
                     " tensors");
   const Tensor ids = arguments.saved[1], splits = arguments.saved[2];
@@ -121,7 +117,7 @@ Results project_vjp(VjpArguments<ProjectArguments> arguments) {
   dL_drows.opacities = gradient(2, "dL_dopacities", {n});
   dL_drows.depths = gradient(3, "dL_ddepths", {n});
   if (a.shs || a.colors_precomp) dL_drows.colors = gradient(4, "dL_dcolors", {n, 3});
-  return {gradients_of(a, needs, [&](int64_t c, const Inputs& in, const Grads& grads) {
+  return {gradients_of(a, arguments.needs, [&](int64_t c, const Inputs& in, const Grads& grads) {
     const int64_t first = splits[c].item<int64_t>(), last = splits[c + 1].item<int64_t>();
     const Tensor rows = places_of(ids.slice(0, first, last), count, first);
     return make_backend(in.means3D)->project_rows_vjp(in, rows, dL_drows, grads);
