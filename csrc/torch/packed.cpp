@@ -183,8 +183,7 @@ Results blend_rows_vjp(BlendRowsVjpArguments a) {
   const ChannelTensors channels = own_colors(checked_background(a.background));
   Tensor background;
   if (a.needs_background)
-    background = gradient.color.defined() ? background_grad(gradient.color, saved.state, saved.lists, pass.grid)
-                                          : at::zeros({3}, like.options());
+    background = background_grad(gradient.color, channels.background, saved.state, saved.lists, pass.grid);
   const std::unique_ptr<Backend> backend = make_backend(like);
   const bool absolute = a.dL_drows.size(1) == kPackedGradWidthAbsolute;
   const PairSums sums = backend->blend_vjp(saved.lists, saved.state, pass, channels, gradient,

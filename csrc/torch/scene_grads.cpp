@@ -129,4 +129,10 @@ Tensor background_grad(const Tensor& dL_dcolor, const BlendState& state, const L
   return dL_dcolor.mul(mean_transmittance(state, lists, grid)).sum(at::IntArrayRef({1, 2}));
 }
 
+Tensor background_grad(const Tensor& dL_dimage, const Tensor& background, const BlendState& state,
+                       const ListTensors& lists, TileGrid grid) {
+  if (!dL_dimage.defined()) return at::zeros_like(background);
+  return background_grad(dL_dimage.narrow(0, 0, background.size(0)), state, lists, grid);
+}
+
 }  // namespace ar::ops

@@ -36,7 +36,11 @@ bool may_be_rows_of(const Tensor& ids, int64_t count);
 /// places, which nobody has checked on a device, are left out.
 Tensor places_of(const Tensor& ids, int64_t count, int64_t first);
 
-/// Gradient with respect to a background: it shows through what no splat covers.
+/// Gradient with respect to a background, whose channels are the first of the image's: it shows through what no splat
+/// covers. Zero where there is no gradient with respect to the image.
+Tensor background_grad(const Tensor& dL_dimage, const Tensor& background, const BlendState& state,
+                       const ListTensors& lists, TileGrid grid);
+/// The same from the gradient with respect to these channels.
 Tensor background_grad(const Tensor& dL_dcolor, const BlendState& state, const ListTensors& lists, TileGrid grid);
 
 }  // namespace ar::ops

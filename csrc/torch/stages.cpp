@@ -202,8 +202,7 @@ Results blend_vjp(VjpArguments<BlendArguments> arguments) {
     backend->row_grads(part.rows, part.lists, pass, sums, rows);
     Tensor background;
     if (needs[4])
-      background = dL_dimage.defined() ? background_grad(gradient.color, state, part.lists, pass.grid).unsqueeze(0)
-                                       : at::zeros({1, channels}, options);
+      background = background_grad(gradient.color, part.channels.background, state, part.lists, pass.grid).unsqueeze(0);
     const Tensor grads[] = {rows.means2d, rows.cov2d, rows.opacities, sums.dL_dchannels, background, rows.absolute};
     for (size_t k = 0; k < parts.size(); ++k) parts[k].push_back(grads[k]);
   }
