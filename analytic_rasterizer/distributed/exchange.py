@@ -94,11 +94,11 @@ class _Exchange(torch.autograd.Function):
     """Sends rows to the owners of the cameras, and their gradients back.
 
     Args:
-        rows: (n, k), in the order in which they are sent.
-        fixed: (n, 2) numbers that travel behind them and have no gradient.
+        join: A tensor that requires a gradient where any rank needs one, so that all take part in the way back.
         absolute: (n, 2) that takes absolute gradients, or (n, 0). It is not sent: zeros stand for it at the owners, and
             their gradient comes back.
-        join: A tensor that requires a gradient where any rank needs one, so that all take part in the way back.
+        fixed: (n, 2) numbers that travel behind the columns and have no gradient.
+        columns: Matrices of n rows, in the order in which they are sent, of k columns together.
 
     Returns:
         The anchor, (m, k + 2) rows of the cameras of this rank, and what stands for `absolute`.
@@ -108,21 +108,22 @@ class _Exchange(torch.autograd.Function):
     def forward(
         ctx: Any,
         route: Route,
-        rows: torch.Tensor,
-        fixed: torch.Tensor,
-        absolute: torch.Tensor,
         join: torch.Tensor | None,
+        absolute: torch.Tensor,
+        fixed: torch.Tensor,
+        *columns: torch.Tensor,
     ) -> tuple[torch.Tensor, ...]:
-        received = route.by_camera(route.send(torch.cat([rows, fixed], 1), True))
-        ctx.route, ctx.width = route, rows.shape[1]
-        return rows.new_zeros(()), received, rows.new_zeros(len(received), absolute.shape[1])
+        received = route.by_camera(route.send(torch.cat([*columns, fixed], 1), True))
+        ctx.route, ctx.widths = route, [t.shape[1] for t in columns]
+        return fixed.new_zeros(()), received, fixed.new_zeros(len(received), absolute.shape[1])
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, _: torch.Tensor, dL_drows: torch.Tensor, dL_dabsolute: torch.Tensor):
-        gradient = torch.cat([dL_drows[:, : ctx.width], dL_dabsolute], 1)
+        gradient = torch.cat([dL_drows[:, : sum(ctx.widths)], dL_dabsolute], 1)
         returned = ctx.route.send(ctx.route.by_rank(gradient.split(ctx.route.sizes)), False)
-        return None, returned[:, : ctx.width], None, returned[:, ctx.width :], None
+        *columns, absolute = returned.split([*ctx.widths, dL_dabsolute.shape[1]], 1)
+        return None, None, absolute, None, *columns
 
 
 def exchange(
@@ -143,12 +144,12 @@ def exchange(
 
     columns = [joined(name) for name in DIFFERENTIABLE]
     like, shapes = columns[0], [t.shape[1:] for t in columns]
-    rows = torch.cat([t.reshape(len(t), shape.numel()) for t, shape in zip(columns, shapes)], 1)
+    matrices = [t.reshape(len(t), shape.numel()) for t, shape in zip(columns, shapes)]
     ids = joined("gaussian_ids").to(ID_OF[like.dtype]) + first_id
     fixed = torch.stack([joined("dets").detach(), ids.view(like.dtype)], 1)  # the bits of ids, never numbers
-    of_means = torch.cat(list(absolute)) if absolute else like.new_empty(len(rows), 0)
+    of_means = torch.cat(list(absolute)) if absolute else like.new_empty(len(like), 0)
     anchor, received, of_own_means = _Exchange.apply(
-        route, rows, fixed, of_means, like.new_zeros((), requires_grad=True) if join else None
+        route, like.new_zeros((), requires_grad=True) if join else None, of_means, fixed, *matrices
     )
     *own, dets, ids = received.split([*(shape.numel() for shape in shapes), 1, 1], 1)
     ids = ids.detach()[:, 0].contiguous().view(ID_OF[like.dtype]).int()
