@@ -411,11 +411,8 @@ def as_torchrun_starts(program, *arguments):
     return done
 
 
-def test_nothing_of_a_process_group_outlives_it():
-    """A thread of it that is left may abort the process when Python ends."""
-    program = """
-        import argparse, contextlib, importlib, pathlib
-        from analytic_rasterizer.cli.launch import ranks_of
+COUNT_THREADS = """
+        import contextlib, pathlib
 
         def threads_of_group():
             names = []
@@ -423,6 +420,14 @@ def test_nothing_of_a_process_group_outlives_it():
                 with contextlib.suppress(OSError):  # it has ended meanwhile
                     names.append(path.read_text())
             return sum("gloo" in name for name in names)
+"""
+
+
+def test_nothing_of_a_process_group_outlives_it():
+    """A thread of it that is left may abort the process when Python ends."""
+    program = f"""{COUNT_THREADS}
+        import argparse, importlib
+        from analytic_rasterizer.cli.launch import ranks_of
 
         with ranks_of(argparse.Namespace(rank_timeout=60.0, device="cpu")) as ranks:
             assert ranks.exchange(ranks.rank) == [0, 1]
@@ -434,6 +439,29 @@ def test_nothing_of_a_process_group_outlives_it():
     assert [of_rank.returncode for of_rank in done] == [0, 0], done
     if any("False" in of_rank.stdout for of_rank in done):
         pytest.skip("this version of torch gives the threads of a group other names")
+
+
+def test_nothing_of_a_process_group_outlives_an_interrupted_training(made, tmp_path):
+    program = f"""{COUNT_THREADS}
+        import signal, sys
+        from analytic_rasterizer import cli
+        from analytic_rasterizer.training import sharded
+
+        step = sharded.ShardedTrainer.step
+
+        def interrupted(trainer):
+            step(trainer)
+            if trainer.progress.step >= 6 and trainer.ranks.rank == 1:
+                signal.raise_signal(signal.SIGINT)
+
+        sharded.ShardedTrainer.step = interrupted
+        code = cli.main(sys.argv[1:])
+        assert threads_of_group() == 0
+        sys.exit(code)
+    """
+    done = as_torchrun_starts(program, *command(made / "scene", tmp_path / "out", "--iterations", "30"))
+    assert [of_rank.returncode for of_rank in done] == [130, 130], done
+    assert 0 < checkpoint_in(tmp_path / "out")["progress"]["step"] < 30
 
 
 def test_torchrun_trains_and_writes_once(made, tmp_path):

@@ -83,14 +83,16 @@ def add_parser(subcommands) -> None:
 
 
 def run(args) -> None:
-    """Trains, writes the results, and prints what the test views say."""
+    """Trains, writes the results, and prints what the test views say. Raises KeyboardInterrupt if interrupted."""
     use_machine(args)
     with ranks_of(args) as ranks:
-        run_on(ranks, args)
+        complete = run_on(ranks, args)
+    if not complete:  # all ranks have agreed on that, and ended their group like any other
+        raise KeyboardInterrupt
 
 
-def run_on(ranks: Ranks, args) -> None:
-    """`run`, on every rank."""
+def run_on(ranks: Ranks, args) -> bool:
+    """`run`, on every rank. Returns whether the training came to its end."""
     given = {field.name: getattr(args, field.name) for field in fields(TrainingOptions) if hasattr(args, field.name)}
     if args.port is not None and not args.watch:
         raise ValueError("--port is for --watch")
@@ -131,15 +133,17 @@ def run_on(ranks: Ranks, args) -> None:
     with training.start_viewer(args.port or 0) if args.watch else nullcontext() as viewer:
         if viewer is not None:
             print(f"watch at {viewer.url}", flush=True)
-        finish(training, training.train(viewer), args)
+        complete = training.train(viewer)
+        finish(training, complete, args)
+    return complete
 
 
 def finish(training: Run, complete: bool, args) -> None:
-    """Says what was written, and tests it. Raises KeyboardInterrupt for a training that was interrupted."""
+    """Says what was written, and tests it if the training came to its end."""
     say = print if training.ranks.is_first else lambda line: None
     if not complete:
         say(f"stopped after {training.progress.step} steps and saved; go on with --resume")
-        raise KeyboardInterrupt
+        return
     say(f"{Path(args.out) / SCENE}: {training.count()} Gaussians")
     if args.export:
         say(f"{training.export_mip()}: for viewers that do not integrate over pixels")
