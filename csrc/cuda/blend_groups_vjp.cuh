@@ -87,7 +87,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, kShapeGro
   // Pairs that nothing reached. A later group of the same width finds the zeros of the first.
   if ((first == 0 || C == kSmallGroup) && !list.overflow && segment.number + 1 == segments.count) {
     for (int k = segment.end + threadIdx.x / kClearThreads; k < list.count; k += kBlendThreads / kClearThreads)
-      clear_pair<C>(params, list.slot(k), true);
+      clear_pair_together<C>(params, list.slot(k), true);
   }
   if (segment.begin == segment.end) return;
 

@@ -119,7 +119,7 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
   if (first % kChannelGroup == 0 && !list.overflow) {  // pairs that nothing reached
     const int rest = min(list.count, end);
     for (int k = max(lasts.block, begin) + threadIdx.x / kClearThreads; k < rest; k += Layout::kThreads / kClearThreads)
-      clear_pair<kChannelGroup>(params, list.slot(k), first == 0);
+      clear_pair_together<kChannelGroup>(params, list.slot(k), first == 0);
   }
 
   const SampleGrad<F, C> grad(params, pixel, first);

@@ -29,7 +29,7 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
   const int tile_last = find_last<F>(params, chunk, first, group);
   if (kSums != Sums::kMeans && !chunk.list.overflow) {  // pairs that no pixel has composited
     for (int k = max(chunk.begin, min(tile_last, chunk.end)) + lane_id(); k < chunk.end; k += 32)
-      clear_row(params, chunk.list.slot(k));
+      clear_pair(params, chunk.list.slot(k));
   }
   if (chunk.begin >= tile_last) return;
   const auto* checkpoints =

@@ -51,13 +51,6 @@ __device__ __forceinline__ int find_last(const BlendVjpParams& params, const Vjp
   return tile_last;
 }
 
-/// Zeros for a pair that reaches nothing.
-__device__ inline void clear_row(const BlendVjpParams& params, int32_t row) {
-  auto* numbers = reinterpret_cast<float4*>(params.pair_grads + int64_t(row) * kPairGradWidth);
-#pragma unroll
-  for (int q = 0; q < kPairGradWidth / 4; ++q) numbers[q] = {0, 0, 0, 0};
-}
-
 /// Sets the pixels and their samples to what they are behind the chunk. `final`: no pixel has composited anything
 /// behind it, so that there is only the background; or else what is there is in `checkpoints`, those at the end of the
 /// chunk.

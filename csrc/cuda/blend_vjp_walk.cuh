@@ -39,7 +39,7 @@ template <class F, int C, Sums kSums> class ChunkWalk {
 #pragma unroll
         for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= group_.subtile_last[b]) << b);
         if (kMeans) mean_map = F::mean_map(own.shape);
-        if (kGrads && reach == 0 && lists && !list_.overflow) clear_row(params_, row);
+        if (kGrads && reach == 0 && lists && !list_.overflow) clear_pair(params_, row);
       }
       const uint32_t reaching = __ballot_sync(kAllLanes, reach != 0);
       if (reach && lists) {

@@ -225,16 +225,23 @@ template <int S> __device__ float sample_gradient(const BlendVjpParams& params, 
   return pixel.inside && plane ? 1.0f / S * plane[pixel.index] : 0.0f;
 }
 
-/// Threads that clear_pair takes for a pair.
+/// Zeros for a pair that no sample composites, in `row` of pair_grads: by one thread.
+__device__ inline void clear_pair(const BlendVjpParams& params, int64_t row) {
+  auto* numbers = reinterpret_cast<float4*>(params.pair_grads + row * kPairGradWidth);
+#pragma unroll
+  for (int q = 0; q < kPairGradWidth / 4; ++q) numbers[q] = {0, 0, 0, 0};
+}
+
+/// Threads that clear_pair_together takes for a pair.
 inline constexpr int kClearThreads = kChannelGroup / 4;
 
-/// Zeros for the pair in `slot`, which no sample composites: in the rows of channel_sums, of kWidth numbers, and with
-/// `shapes` in those of pair_grads. kClearThreads neighbouring threads must call it.
-template <int kWidth> __device__ void clear_pair(const BlendVjpParams& params, int64_t slot, bool shapes) {
+/// The same by kClearThreads neighbouring threads, all of which must call it, for a pair that has a row of channel_sums
+/// too, of kWidth numbers. That of pair_grads is cleared with `shapes`.
+template <int kWidth> __device__ void clear_pair_together(const BlendVjpParams& params, int64_t row, bool shapes) {
   const int q = threadIdx.x % kClearThreads;
   const float4 zero = {0, 0, 0, 0};
-  if (shapes && q < kPairGradWidth / 4) reinterpret_cast<float4*>(params.pair_grads + slot * kPairGradWidth)[q] = zero;
-  if (params.channel_sums && q < kWidth / 4) reinterpret_cast<float4*>(params.channel_sums + slot * kWidth)[q] = zero;
+  if (shapes && q < kPairGradWidth / 4) reinterpret_cast<float4*>(params.pair_grads + row * kPairGradWidth)[q] = zero;
+  if (params.channel_sums && q < kWidth / 4) reinterpret_cast<float4*>(params.channel_sums + row * kWidth)[q] = zero;
 }
 
 /// Sums gradients of a splat in row `row` of pairs, or of splats, where all tiles add to it.
