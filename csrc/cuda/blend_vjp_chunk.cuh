@@ -24,7 +24,8 @@ struct VjpChunk {
         image(int64_t(grid.width) * grid.height),
         size({float(grid.width), float(grid.height)}) {}
 
-  /// Number in the image of a lane's pixel of subtile b; -1 outside.
+  /// Number in the image of a lane's pixel of subtile b; -1 outside. No Pixel: with those, kernels of 8 and 16 samples
+  /// get more registers.
   __device__ int64_t pixel_index(int b, int lane) const {
     const Vec2<float> p = pixel_of(b, lane);
     const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
