@@ -1,17 +1,20 @@
-// The kernel of blend_vjp for few channels, run on the host: its sums are those of every pixel by itself; warps that
-// take chunk after chunk leave what a warp for every chunk leaves, and no chunk is taken twice.
+// The kernel of blend_vjp for few channels, run on the host: its sums are those of every pixel by itself, within what
+// float32 may be off; warps that take chunk after chunk leave what a warp for every chunk leaves, and no chunk is taken
+// twice.
 #include "cuda_on_host.h"
 // After it: kernels.
 #include <gtest/gtest.h>
 
+#include "core/footprint/registry.h"
 #include "cuda/blend_vjp.cuh"
 #include "random_splats.h"
+#include "rounded.h"
 
 namespace ar::cuda {
 namespace {
 
 constexpr TileGrid kGrid = {4 * kTile - 3, 3 * kTile - 5};
-constexpr int kColors = 3, kOthers = 2;  ///< chunks in front of those of the kernel's samples
+constexpr int kOthers = 2;  ///< chunks in front of those of the kernel's samples
 
 std::vector<float> random_numbers(std::mt19937& bits, size_t count, float low, float high) {
   std::vector<float> numbers(count);
@@ -19,9 +22,20 @@ std::vector<float> random_numbers(std::mt19937& bits, size_t count, float low, f
   return numbers;
 }
 
-/// Random inputs of the kernel. The state that a forward pass would have left is random too. `overflow`: every tile
-/// lists all splats, as one chunk, and all tiles add to a row per splat.
-template <class F> struct Scene {
+/// The footprint that is projected for pixels of F.
+template <class F> struct ProjectedFor {
+  using Footprint = F;
+};
+template <int S> struct ProjectedFor<GaussianPixels<S>> {
+  using Footprint = Box<S>;
+};
+template <int S> struct ProjectedFor<AdaptiveBoxVjp<S>> {
+  using Footprint = Adaptive;
+};
+
+/// Random inputs of the kernel for C channels. The state that a forward pass would have left is random too. `overflow`:
+/// every tile lists all splats, as one chunk, and all tiles add to a row per splat.
+template <class F, int C> struct Scene {
   static constexpr int S = F::kSamples, kLength = chunk_length(S);
 
   std::vector<Splat<F, float>> splats;
@@ -29,7 +43,7 @@ template <class F> struct Scene {
   std::vector<int64_t> offsets = {0};
   std::vector<int32_t> order, last;
   std::vector<TileChunk> chunks;
-  std::vector<float> background = {0.2f, 0.5f, 0.9f}, dL_dimage, dL_dalpha, transmittance, checkpoints;
+  std::vector<float> background = {0.2f, 0.5f, 0.9f, 0.4f}, channels, dL_dimage, dL_dalpha, transmittance, checkpoints;
   PlanState plan = {};
   Counts counts = {};
   BlendVjpParams params = {};
@@ -38,9 +52,10 @@ template <class F> struct Scene {
   Scene(MeanSums mean_sums, bool overflow) {
     std::mt19937 bits(7);
     const int count = overflow ? 40 : kLength + 60, tiles = int(kGrid.tiles()), pixels = kGrid.width * kGrid.height;
-    splats = random_splats<F>(bits, count, kGrid, -1, 3, 0.9f, [](const Cov2d<float>& cov) {
-      return GaussianFootprint<S, true>::prepare_with(cov, 1 / 12.0f);
-    });
+    using Projected = typename ProjectedFor<F>::Footprint;
+    const auto prepare = [](const Cov2d<float>& cov) { return Projected::prepare(cov, {}); };
+    for (const auto& splat : random_splats<Projected>(bits, count, kGrid, -1, 3, 0.9f, prepare))
+      splats.push_back({splat.mean, splat.shape, splat.opacity, splat.level, splat.color});
     for (int k = 0; k < count; ++k) order.push_back(k);
     for (int k = 0; k < kOthers; ++k) chunks.push_back({k, 0, 0});
     int planes = 0;
@@ -48,24 +63,34 @@ template <class F> struct Scene {
       const int length = overflow ? count : tile % 4 == 1 ? kLength + 10 + tile : 5 * tile % 37;
       for (int k = 0; k < length; ++k) pairs.push_back({(k + tile) % count, int32_t(pairs.size())});
       offsets.push_back(int64_t(pairs.size()));
-      for (int chunk = 0; chunk * kLength < length; ++chunk, planes += 4 * S) {  // of kColors + 1 numbers
+      for (int chunk = 0; chunk * kLength < length; ++chunk, planes += (C + 1) * S) {
         chunks.push_back({tile, chunk, planes});
       }
     }
     rows = overflow ? count : int(pairs.size());
     counts = {int64_t(pairs.size()), count};
-    dL_dimage = random_numbers(bits, kColors * pixels, -0.5f, 0.5f);
+    dL_dimage = random_numbers(bits, C * pixels, -0.5f, 0.5f);
     dL_dalpha = random_numbers(bits, pixels, -0.5f, 0.5f);
     transmittance = random_numbers(bits, S * pixels, 0.01f, 1);
     checkpoints = random_numbers(bits, size_t(planes) * kTilePixels, 0.01f, 1);
-    for (int i = 0; i < S * pixels; ++i) last.push_back(int(uniform(bits, 0, 1.2f * count)));
+    for (int i = 0; i < S * pixels; ++i) {  // some to the end of their lists
+      const int x = i % pixels % kGrid.width, y = i % pixels / kGrid.width,
+                tile = y / kTile * kGrid.columns() + x / kTile;
+      const int length = int(offsets[tile + 1] - offsets[tile]);
+      last.push_back(std::min(int(uniform(bits, 0, 1.2f * length)), length));
+    }
     params.grid = kGrid;
     params.splats = &splats[0].mean.x;
-    params.channels.count = kColors;
+    params.channels.count = C;
+    if (C != 3) {
+      channels = random_numbers(bits, size_t(C) * count, 0, 1);
+      params.channels.data = channels.data();
+      params.channels.stride = C;
+    }
     params.background = background.data();
     params.transmittance = transmittance.data();
     params.last = last.data();
-    params.dL_dimage = {dL_dimage.data(), kColors, {}};
+    params.dL_dimage = {dL_dimage.data(), C, {}};
     params.dL_dalpha = dL_dalpha.data();
     params.lists = lists_of(pairs, offsets, counts);
     params.lists.order = order.data();
@@ -76,14 +101,22 @@ template <class F> struct Scene {
     params.mean_sums = mean_sums;
   }
 
-  /// Runs `blocks` blocks for chunks [first, end) and adds to `sums`. Returns how often a warp asked for a chunk.
+  /// Channel c of a splat.
+  float channel(int splat, int c) const {
+    const Vec3<float>& color = splats[splat].color;
+    return C != 3 ? channels[size_t(splat) * C + c] : c == 0 ? color.x : c == 1 ? color.y : color.z;
+  }
+
+  /// Runs `blocks` blocks, or those that it takes where warps share a chunk, for chunks [first, end) and adds to
+  /// `sums`. Returns how often a warp asked for a chunk.
   template <Sums kSums> int run(int blocks, int first, int end, std::vector<float>& sums) {
+    if (!kTakesChunks<F, kSums>) blocks = end - first;
     for (int c = 0; c <= kSampleClasses; ++c) plan.counts.chunks.first[c] = c > sample_class(S) ? end : first;
     int32_t taken[kSampleClasses] = {};
     params.chunks_taken = taken;
     params.pair_grads = sums.data();
     for (float4& numbers : dynamic_memory) numbers = {NAN, NAN, NAN, NAN};
-    cuda_on_host::launch(blocks, 32 * kVjpWarps<F, kSums>, [&] { blend_vjp_kernel<F, kColors, kSums>(params); });
+    cuda_on_host::launch(blocks, 32 * kVjpWarps<F, kSums>, [&] { blend_vjp_kernel<F, C, kSums>(params); });
     return taken[sample_class(S)];
   }
 };
@@ -93,7 +126,7 @@ template <class F, Sums kSums> void expect_the_same_from_few_warps(bool overflow
   static_assert(kTakesChunks<F, kSums>);
   constexpr int kBlocks = 2, kWarps = kBlocks * kVjpWarps<F, kSums>;
   constexpr int kColumns = kSums == Sums::kGrads ? kPairMeans : kPairMeans + 2;
-  Scene<F> scene(kSums == Sums::kGrads ? MeanSums::kNone : MeanSums::kNorm, overflow);
+  Scene<F, 3> scene(kSums == Sums::kGrads ? MeanSums::kNone : MeanSums::kNorm, overflow);
   const int end = int(scene.chunks.size());
   ASSERT_GT(end - kOthers, kWarps);
   const size_t numbers = size_t(scene.rows) * kPairGradWidth;
@@ -116,23 +149,58 @@ template <class F, Sums kSums> void expect_the_same_from_few_warps(bool overflow
   }
 }
 
-/// What the kernel should leave in the rows of pairs, in float64, pixel by pixel; and the sums of the absolute values
-/// of all terms.
-struct ExpectedSums {
-  std::vector<double> sums, size;
+/// A sum in float64, and a bound of the error that float32 makes in its terms and in adding them.
+struct Sum {
+  double value = 0, error = 0;
+  void add(Rounded term) { value += term.value, error += term.error; }
 };
-template <class F> ExpectedSums expected_sums(const Scene<F>& scene) {
+
+/// The same numbers of a splat's shape, without an error.
+template <class F> typename F::template Shape<Rounded> exactly(const typename F::template Shape<float>& shape) {
+  float numbers[kShapeWidth];
+  Rounded exact[kShapeWidth];
+  typename F::template Shape<Rounded> out;
+  static_assert(sizeof shape == sizeof numbers && sizeof out == sizeof exact);
+  std::memcpy(numbers, &shape, sizeof shape);
+  std::copy(std::begin(numbers), std::end(numbers), std::begin(exact));
+  std::memcpy(static_cast<void*>(&out), exact, sizeof exact);
+  return out;
+}
+
+/// A splat of a tile's list.
+template <class F> struct ListedTerms {
+  typename F::template Terms<Rounded> terms;
+  typename F::template Terms<float> in_float;  ///< which say what was composited
+  Mat2<Rounded> mean_map;
+  int splat, row;
+};
+
+/// What the kernel should leave in the rows of pairs, pixel by pixel.
+///
+/// Each sample's terms are worked out by themselves, in the order of the kernel's operations as far as it is theirs, by
+/// numbers that bound their errors. What adding them does to the kernel's sums is counted in Rounded::summed(): in a
+/// lane those over S samples and eight pixels; then those over 32 lanes, in five steps, and over the warps that share a
+/// chunk. collect() comes between the two and is linear. So its roundings for a lane are no larger than those for the
+/// lane's terms one by one, and what was rounded in its arguments goes through it with these.
+template <class F, int C> std::vector<Sum> expected_sums(const Scene<F, C>& scene) {
   constexpr int S = F::kSamples, kLength = chunk_length(S);
+  constexpr int kInLane = (kSubtiles + 1) * S, kAcross = 5 + kVjpGroup<F, Sums::kGrads>;
   const int pixels = kGrid.width * kGrid.height;
-  const Vec2<double> image_size = {double(kGrid.width), double(kGrid.height)};
-  ExpectedSums out = {std::vector<double>(size_t(scene.rows) * kPairGradWidth),
-                      std::vector<double>(size_t(scene.rows) * kPairGradWidth)};
+  const Vec2<Rounded> image_size = {double(kGrid.width), double(kGrid.height)};
+  std::vector<Sum> out(size_t(scene.rows) * kPairGradWidth);
   for (size_t item = kOthers; item < scene.chunks.size(); ++item) {
     const auto [tile, chunk, plane] = scene.chunks[item];
-    const int x0 = tile % kGrid.columns() * kTile, y0 = tile / kGrid.columns() * kTile;
-    const auto* list = &scene.pairs[scene.offsets[tile]];
-    const int begin = chunk * kLength;
+    const int x0 = tile % kGrid.columns() * kTile, y0 = tile / kGrid.columns() * kTile, begin = chunk * kLength;
     const int end = std::min(int(scene.offsets[tile + 1] - scene.offsets[tile]), begin + kLength);
+    std::vector<ListedTerms<F>> listed;
+    for (int k = begin; k < end; ++k) {
+      const auto& [id, row] = scene.pairs[scene.offsets[tile] + k];
+      const Splat<F, float>& splat = scene.splats[id];
+      const Vec2<float> origin = {float(x0) - splat.mean.x, float(y0) - splat.mean.y};
+      const auto shape = exactly<F>(splat.shape);
+      listed.push_back({F::terms(shape, Rounded(splat.opacity), Vec2<Rounded>{origin.x, origin.y}),
+                        F::terms(splat.shape, splat.opacity, origin), F::mean_map(shape), id, row});
+    }
     const auto for_each_pixel = [&](auto&& visit) {
       for (int y = 0; y < kTile && y0 + y < kGrid.height; ++y) {
         for (int x = 0; x < kTile && x0 + x < kGrid.width; ++x) visit(x, y, (y0 + y) * kGrid.width + x0 + x);
@@ -144,98 +212,115 @@ template <class F> ExpectedSums expected_sums(const Scene<F>& scene) {
     });
     const bool final = tile_last <= end;  // nothing of a later chunk was composited
     for_each_pixel([&](int x, int y, int i) {
-      double g[kColors], transmittance[S], behind[S];
-      for (int c = 0; c < kColors; ++c) g[c] = scene.dL_dimage[c * pixels + i] / double(S);
+      const Rounded scale = 1.0 / S;
+      Rounded g[C], transmittance[S], behind[S];
+      for (int c = 0; c < C; ++c) g[c] = scale * scene.dL_dimage[c * pixels + i];
       const int place = (y / 4 * 2 + x / 8) * 32 + y % 4 * 8 + x % 8;  // of its subtile and lane
       for (int s = 0; s < S; ++s) {
-        const float* checkpoint = &scene.checkpoints[(size_t(plane) * kTilePixels) + (s * kTilePixels + place) * 4];
-        const double at_end = scene.transmittance[s * pixels + i];
-        transmittance[s] = final ? at_end : checkpoint[kColors];
-        behind[s] = -scene.dL_dalpha[i] / double(S) * at_end / transmittance[s];
-        for (int c = 0; c < kColors; ++c)
-          behind[s] += g[c] * (final ? scene.background[c] : checkpoint[c] / transmittance[s]);
+        const float* checkpoint = &scene.checkpoints[size_t(plane) * kTilePixels + (s * kTilePixels + place) * (C + 1)];
+        const Rounded at_end = scene.transmittance[s * pixels + i];
+        const float* colors = final ? scene.background.data() : checkpoint;
+        transmittance[s] = final ? at_end : Rounded(checkpoint[C]);
+        behind[s] = g[0] * colors[0];
+        for (int c = 1; c < C; ++c) behind[s] = behind[s] + g[c] * colors[c];
+        if (!final) behind[s] = behind[s] / transmittance[s];
+        behind[s] = behind[s] - scale * scene.dL_dalpha[i] * (final ? Rounded(1) : at_end / transmittance[s]);
       }
+      const Vec2<Rounded> p = {double(x), double(y)};
       for (int k = std::min(end, tile_last) - 1; k >= begin; --k) {
-        const auto& [id, row] = list[k];
-        const Splat<F, float>& splat = scene.splats[id];
-        const GaussianShape<double> shape = {{splat.shape.w.xx, splat.shape.w.xy, splat.shape.w.yx, splat.shape.w.yy},
-                                             splat.shape.amp};
-        const Vec2<float> origin = {float(x0) - splat.mean.x, float(y0) - splat.mean.y};
-        const auto terms = F::terms(shape, double(splat.opacity), {double(origin.x), double(origin.y)});
-        const auto float_terms = F::terms(splat.shape, splat.opacity, origin);  // which say what was composited
-        const Vec2<double> p = {double(x), double(y)};
-        const double color[] = {splat.color.x, splat.color.y, splat.color.z};
-        double g_color = 0, contribution = 0, weighted = 0, largest = 0;
-        for (int c = 0; c < kColors; ++c) g_color += g[c] * color[c];
-        ShapeGrad<double> of_pixel = {{0, 0}, {0, 0, 0}}, absolute = of_pixel;
+        const ListedTerms<F>& listed_splat = listed[k - begin];
+        const auto& terms = listed_splat.terms;
+        Sum* const sums = &out[size_t(listed_splat.row) * kPairGradWidth];
+        const auto color = [&](int c) { return Rounded(scene.channel(listed_splat.splat, c)); };
+        Rounded g_color = madd(g[0], color(0), madd(g[1], color(1), g[2] * color(2)));
+        if (C == 4) g_color = madd(g[C - 1], color(C - 1), g_color);
+        ShapeGrad<Rounded> of_pixel = {};
+        bool shown = false;
         for (int s = 0; s < S; ++s) {
-          const float alpha = F::alpha(float_terms, Vec2<float>{float(x), float(y)}, s);
-          const bool mask = alpha >= float(kAlphaMin) && k < scene.last[s * pixels + i];
-          if (!mask) continue;
-          const double raw = F::alpha(terms, p, s), of_behind = std::abs(behind[s]);
-          const BlendGrad<double> grad = blend_sample_vjp(mask, raw, g_color, transmittance[s], behind[s]);
+          const float in_float = F::alpha(listed_splat.in_float, Vec2<float>{float(x), float(y)}, s);
+          if (in_float < float(kAlphaMin) || k >= scene.last[s * pixels + i]) continue;
+          shown = true;
+          const Rounded raw = F::alpha(terms, p, s);
+          const auto grad = blend_sample_vjp<Rounded>({true}, raw, g_color, transmittance[s], behind[s]);
+          ShapeGrad<Rounded> of_sample = {};
+          F::add_alpha_vjp(terms, p, s, raw, grad.dL_dalpha, of_sample);
           F::add_alpha_vjp(terms, p, s, raw, grad.dL_dalpha, of_pixel);
-          const double most = transmittance[s] * (std::abs(g_color) + of_behind);
-          F::add_alpha_vjp(terms, p, s, raw, most, absolute);
-          contribution += grad.contribution;
-          weighted += grad.dL_dalpha * raw;
-          largest += most * raw;
+          const auto in_lane = [](Rounded number) { return number.summed(kInLane); };
+          const Rounded weighted = in_lane(grad.dL_dalpha * raw);
+          const ShapeGrad<Rounded> shape =
+              F::collect(terms,
+                         ShapeGrad<Rounded>{
+                             {in_lane(of_sample.offset.x), in_lane(of_sample.offset.y)},
+                             {in_lane(of_sample.shape.xx), in_lane(of_sample.shape.xy), in_lane(of_sample.shape.yy)}},
+                         weighted);
+          const Rounded values[] = {shape.offset.x, shape.offset.y, shape.shape.xx,
+                                    shape.shape.xy, shape.shape.yy, weighted};
+          for (int v = 0; v < kPairChannels; ++v) sums[v].add(values[v].summed(kAcross));
+          for (int c = 0; c < C; ++c) {
+            const Rounded of_channel = in_lane(grad.contribution * g[c]);
+            sums[c == 3 ? kPairFourthChannel : kPairChannels + c].add(of_channel.summed(kAcross));
+          }
         }
-        double* const sums = &out.sums[size_t(row) * kPairGradWidth];
-        double* const size = &out.size[size_t(row) * kPairGradWidth];
-        const double values[] = {of_pixel.offset.x, of_pixel.offset.y, of_pixel.shape.xx,
-                                 of_pixel.shape.xy, of_pixel.shape.yy, weighted};
-        const double sizes[] = {absolute.offset.x, absolute.offset.y, absolute.shape.xx,
-                                absolute.shape.xy, absolute.shape.yy, largest};
-        // A lane's products of z may cancel in its sums over samples: the size is that of z.
-        const double z = std::sqrt(std::abs(sizes[2]) * largest) + std::sqrt(std::abs(sizes[4]) * largest);
-        for (int v = 0; v < 6; ++v)
-          sums[v] += values[v], size[v] += v == 5 ? largest : z + std::abs(sizes[v]) + largest;
-        for (int c = 0; c < kColors; ++c)
-          sums[6 + c] += contribution * g[c], size[6 + c] += std::abs(contribution * g[c]);
-        const Mat2<double> map = F::mean_map(shape);
-        const Vec2<double> means =
-            mean_sums_of(scene.params.mean_sums, image_size, transform_transposed(map, of_pixel.offset));
-        sums[kPairMeans] += means.x, sums[kPairMeans + 1] += means.y;
-        const double norm = std::abs(map.xx) + std::abs(map.xy) + std::abs(map.yx) + std::abs(map.yy);
-        const double unit = scene.params.mean_sums == MeanSums::kNorm ? image_size.x : 1;
-        for (int v = 0; v < 2; ++v) size[kPairMeans + v] += unit * norm * (z + largest);
+        if (!shown || scene.params.mean_sums == MeanSums::kNone) continue;
+        const Vec2<Rounded> means = mean_sums_of(scene.params.mean_sums, image_size,
+                                                 transform_transposed(listed_splat.mean_map, of_pixel.offset));
+        sums[kPairMeans].add(means.x.summed(kSubtiles + kAcross));
+        sums[kPairMeans + 1].add(means.y.summed(kSubtiles + kAcross));
       }
     });
   }
   return out;
 }
 
-template <class F, Sums kSums> void expect_sums_of_pixels(MeanSums mean_sums) {
-  SCOPED_TRACE(testing::Message() << F::kSamples << " samples, MeanSums " << int(mean_sums));
-  Scene<F> scene(mean_sums, false);
+template <class F, int C> void expect_sums_of_pixels(MeanSums mean_sums) {
+  SCOPED_TRACE(testing::Message() << "MeanSums " << int(mean_sums));
+  const bool with_means = mean_sums != MeanSums::kNone;
+  Scene<F, C> scene(mean_sums, false);
   std::vector<float> sums(size_t(scene.rows) * kPairGradWidth, NAN);
-  scene.template run<kSums>(2, kOthers, int(scene.chunks.size()), sums);
-  const ExpectedSums expected = expected_sums(scene);
+  const int end = int(scene.chunks.size());
+  if constexpr (kVjpGroup<F, Sums::kGrads> > 1) {  // as blend_vjp_few
+    scene.template run<Sums::kGrads>(2, kOthers, end, sums);
+    if (with_means) scene.template run<Sums::kMeans>(2, kOthers, end, sums);
+  } else if (with_means) {
+    scene.template run<Sums::kBoth>(2, kOthers, end, sums);
+  } else {
+    scene.template run<Sums::kGrads>(2, kOthers, end, sums);
+  }
+  const std::vector<Sum> expected = expected_sums(scene);
   int compared = 0;
   for (size_t i = 0; i < sums.size(); ++i) {
     const int column = int(i % kPairGradWidth);
-    if (column >= (kSums == Sums::kGrads ? kPairMeans : kPairMeans + 2)) continue;
-    // Each of up to 256 splats divides the transmittance, and adds to what is behind: a few roundings for each of them.
-    // Sums of means, whose sizes are bounds far above them, are held to fewer.
-    const double roundings = column < kPairMeans ? 4 * 256 : 256;
-    const double error = std::abs(sums[i] - expected.sums[i]), tolerance = roundings * 0x1p-24 * expected.size[i];
-    // What no pixel shows is exactly zero.
-    ASSERT_LE(error, tolerance) << "column " << column << " of row " << i / kPairGradWidth << ": " << sums[i];
-    compared += expected.size[i] > 0;
+    if (column >= kPairMeans && (column == kPairFourthChannel ? C < 4 : !with_means)) continue;
+    // Which is 0 where no pixel shows the splat.
+    ASSERT_LE(std::abs(sums[i] - expected[i].value), expected[i].error)
+        << "column " << column << " of row " << i / kPairGradWidth << ": " << sums[i];
+    compared += expected[i].error > 0;
   }
   ASSERT_GT(compared, int(sums.size()) / 10);
+}
+
+template <class F, int C> struct Kernel {
+  using Pixels = F;
+  static constexpr int kChannels = C;
+};
+template <class K> class BlendVjpSums : public testing::Test {};
+/// What a warp holds and shares out differs among them (blend_vjp_layout.cuh), and what it sums.
+using Kernels = testing::Types<Kernel<GaussianPixels<1>, 3>, Kernel<GaussianPixels<1>, 4>, Kernel<GaussianPixels<2>, 3>,
+                               Kernel<GaussianPixels<4>, 3>, Kernel<GaussianPixels<4>, 4>, Kernel<GaussianPixels<8>, 3>,
+                               Kernel<AdaptiveBoxVjp<1>, 3>, Kernel<AdaptiveBoxVjp<1>, 4>, Kernel<AdaptiveBoxVjp<4>, 3>,
+                               Kernel<Cumulant, 3>, Kernel<Cumulant, 4>, Kernel<Analytic<FrameGradient::kFrozen>, 3>,
+                               Kernel<Analytic<FrameGradient::kFrozen>, 4>>;
+TYPED_TEST_SUITE(BlendVjpSums, Kernels);
+
+TYPED_TEST(BlendVjpSums, AreThoseOfThePixels) {
+  using F = typename TypeParam::Pixels;
+  for (const MeanSums mean_sums : {MeanSums::kNone, MeanSums::kAbsolute, MeanSums::kNorm})
+    expect_sums_of_pixels<F, TypeParam::kChannels>(mean_sums);
 }
 
 template <class F> class BlendVjpKernel : public testing::Test {};
 using Gaussians = testing::Types<GaussianPixels<1>, GaussianPixels<4>>;
 TYPED_TEST_SUITE(BlendVjpKernel, Gaussians);
-
-TYPED_TEST(BlendVjpKernel, SumsAreThoseOfThePixels) {
-  expect_sums_of_pixels<TypeParam, Sums::kGrads>(MeanSums::kNone);
-  expect_sums_of_pixels<TypeParam, Sums::kBoth>(MeanSums::kAbsolute);
-  expect_sums_of_pixels<TypeParam, Sums::kBoth>(MeanSums::kNorm);
-}
 
 TYPED_TEST(BlendVjpKernel, FewWarpsLeaveWhatAWarpForEachChunkLeaves) {
   for (const bool overflow : {false, true}) {
