@@ -4,7 +4,6 @@
 #include <ATen/ops/constant_pad_nd.h>
 #include <ATen/ops/empty_like.h>
 #include <ATen/ops/tensor.h>
-#include <ATen/ops/zeros_like.h>
 
 #include <vector>
 
@@ -152,12 +151,7 @@ Results rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
       Tensor& grad = a.features ? features : grads.colors_precomp;
       grad = sums.dL_dchannels.narrow(1, channels.first_given, channels.given.size(1)).contiguous();
     }
-    if (needs[kSceneTensors]) {
-      const Tensor& color = dL_dimage.color;
-      background = color.defined()
-                       ? background_grad(color.narrow(0, 0, a.bg.size(0)), saved.state, saved.lists, pass.grid)
-                       : at::zeros_like(a.bg);
-    }
+    if (needs[kSceneTensors]) background = background_grad(dL_dimage.color, a.bg, saved.state, saved.lists, pass.grid);
     std::vector<Tensor> list = list_of(grads, a.means3D);
     list.push_back(or_empty(background, a.means3D));
     list.push_back(or_empty(features, a.means3D));

@@ -125,14 +125,11 @@ Tensor places_of(const Tensor& ids, int64_t count, int64_t first) {
   return places.slice(0, 0, count);
 }
 
-Tensor background_grad(const Tensor& dL_dcolor, const BlendState& state, const ListTensors& lists, TileGrid grid) {
-  return dL_dcolor.mul(mean_transmittance(state, lists, grid)).sum(at::IntArrayRef({1, 2}));
-}
-
 Tensor background_grad(const Tensor& dL_dimage, const Tensor& background, const BlendState& state,
                        const ListTensors& lists, TileGrid grid) {
   if (!dL_dimage.defined()) return at::zeros_like(background);
-  return background_grad(dL_dimage.narrow(0, 0, background.size(0)), state, lists, grid);
+  const Tensor dL_dcolor = dL_dimage.narrow(0, 0, background.size(0));
+  return dL_dcolor.mul(mean_transmittance(state, lists, grid)).sum(at::IntArrayRef({1, 2}));
 }
 
 }  // namespace ar::ops

@@ -40,7 +40,5 @@ Tensor places_of(const Tensor& ids, int64_t count, int64_t first);
 /// covers. Zero where there is no gradient with respect to the image.
 Tensor background_grad(const Tensor& dL_dimage, const Tensor& background, const BlendState& state,
                        const ListTensors& lists, TileGrid grid);
-/// The same from the gradient with respect to these channels.
-Tensor background_grad(const Tensor& dL_dcolor, const BlendState& state, const ListTensors& lists, TileGrid grid);
 
 }  // namespace ar::ops
