@@ -114,35 +114,53 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
 
 /// Pairs in the order of depth, a splat's by rows of tiles; and the histograms of the digits of their tiles.
 __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitParams params, int tile_digits) {
-  constexpr int kBins = TileDigits::kBins;
+  constexpr int kBins = TileDigits::kBins, kWarps = kEmitThreads / 32;
   __shared__ uint32_t histograms[kMostTilePasses * kBins];
   __shared__ uint32_t block_id, before_block;
-  __shared__ MaskedPairs stages[kEmitThreads / 32];
-  if (params.counts->pairs > params.capacity) return;
+  __shared__ MaskedPairs stages[kEmitRows][kWarps];
+  const int64_t n = params.counts->splats;
+  // As many blocks stay as have splats, whichever of them they get.
+  if (params.counts->pairs > params.capacity || int64_t(blockIdx.x) * kEmitSplats >= n) return;
   if (threadIdx.x == 0) block_id = atomicAdd(&params.status[0], 1);
   for (int b = threadIdx.x; b < tile_digits * kBins; b += kEmitThreads) histograms[b] = 0;
   __syncthreads();
-  const int64_t r = int64_t(block_id) * kEmitThreads + threadIdx.x, n = params.counts->splats;
-  if (int64_t(block_id) * kEmitThreads >= n) return;
   const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
-  const int32_t i = r < n ? params.order[r] : 0;
-  PairRange range = {};
-  TileMask mask = 0;
-  if (r < n) range = params.ranges[i], mask = params.masks[i];
-  uint32_t sum;
-  const uint32_t before = sum_before<kEmitThreads / 32>(uint32_t(range.count), 0u, sum);
+  int32_t ids[kEmitRows];
+  PairRange ranges[kEmitRows] = {};
+  TileMask masks[kEmitRows] = {};
+#pragma unroll
+  for (int row = 0; row < kEmitRows; ++row) {
+    const int64_t r = int64_t(block_id) * kEmitSplats + row * kEmitThreads + threadIdx.x;
+    ids[row] = r < n ? params.order[r] : -1;
+  }
+#pragma unroll
+  for (int row = 0; row < kEmitRows; ++row) {
+    if (ids[row] >= 0) ranges[row] = params.ranges[ids[row]], masks[row] = params.masks[ids[row]];
+  }
+  uint32_t before[kEmitRows], sum = 0;  // of the pairs of the block
+#pragma unroll
+  for (int row = 0; row < kEmitRows; ++row) {
+    uint32_t of_row;
+    before[row] = sum + sum_before<kWarps>(uint32_t(ranges[row].count), 0u, of_row);
+    sum += of_row;
+  }
   uint32_t* status = params.status + 1;
   if (threadIdx.x == 0) write_status(status + block_id, (block_id == 0 ? kUpToBlock : kOfBlock) | sum);
 
   // Tiles are found before their places are known, while the blocks before get to publish theirs; and written by
   // neighbouring lanes to neighbouring places.
-  MaskedPair* stage = stages[threadIdx.x / 32].of;
-  const int own = mask ? range.count : 0, up_to = warp_inclusive_sum(own), first = up_to - own;
-  MaskedPair* next = stage + first;
+  const int warp = threadIdx.x / 32;
+  int up_to[kEmitRows];  // pairs in the stage, of the lanes up to this one
 #pragma unroll
-  for (int from = 0; from < MaskedPair::kBits; from += 32) {
-    for (uint32_t left = __brev(uint32_t(mask >> from)); left != 0;)
-      *next++ = {uint16_t(MaskedPair::kBits * lane_id() + from + take_first(left))};
+  for (int row = 0; row < kEmitRows; ++row) {
+    const int own = masks[row] ? ranges[row].count : 0;
+    up_to[row] = warp_inclusive_sum(own);
+    MaskedPair* next = stages[row][warp].of + up_to[row] - own;
+#pragma unroll
+    for (int from = 0; from < MaskedPair::kBits; from += 32) {
+      for (uint32_t left = __brev(uint32_t(masks[row] >> from)); left != 0;)
+        *next++ = {uint16_t(MaskedPair::kBits * lane_id() + from + take_first(left))};
+    }
   }
   __syncwarp();
 
@@ -154,35 +172,39 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
     }
   }
   __syncthreads();
-  const auto begin = int32_t(before_block + before);
   const int columns = params.grid.columns();
   const auto write = [&](int32_t place, uint32_t tile, int32_t id) {
     write_pair(params, place, tile, id);
     for (int d = 0; d < tile_digits; ++d) atomicAdd(&histograms[d * kBins + TileDigits::of(tile, d)], 1);
   };
-  if (range.count > 0 && params.slot_pairs) params.ranges[i].first = begin;
-  const int all = shuffle(up_to, 31);
-  for (int from = 0; from < all; from += 32) {
-    const int k = from + lane_id();
-    const MaskedPair pair = k < all ? stage[k] : MaskedPair{};
-    const int32_t place = shuffle(begin - first, pair.lane()) + k, id = shuffle(i, pair.lane());
-    const int32_t tile = shuffle(range.first, pair.lane()) + pair.row() * columns + pair.column();
-    if (k < all) write(place, uint32_t(tile), id);
-  }
-  for (uint32_t others = __brev(__ballot_sync(kAllLanes, range.count > own)); others != 0;) {
-    const int source = take_first(others);
-    const int32_t id = shuffle(i, source);
-    int32_t place = shuffle(begin, source);
-    const Support<float> support = support_of(splats[id], params.footprint);
-    const Range rows = clamp_range(rows_of(support), params.grid.height), tile_rows = tiles_of(rows, params.grid);
-    for (int first = tile_rows.first; first <= tile_rows.last; first += 32) {
-      const int row = first + lane_id();
-      const Range tiles = row <= tile_rows.last ? tile_columns_of(support, params.grid, rows, row) : Range{0, -1};
-      const int width = tiles.last - tiles.first + 1;
-      const int widths = warp_inclusive_sum(width);
-      int32_t mine = place + widths - width;
-      for (int c = tiles.first; c <= tiles.last; ++c) write(mine++, uint32_t(row) * columns + c, id);
-      place += __shfl_sync(kAllLanes, widths, 31);
+#pragma unroll
+  for (int row = 0; row < kEmitRows; ++row) {
+    const PairRange range = ranges[row];
+    const int own = masks[row] ? range.count : 0, first = up_to[row] - own, all = shuffle(up_to[row], 31);
+    const auto begin = int32_t(before_block + before[row]);
+    if (range.count > 0 && params.slot_pairs) params.ranges[ids[row]].first = begin;
+    for (int from = 0; from < all; from += 32) {
+      const int k = from + lane_id();
+      const MaskedPair pair = k < all ? stages[row][warp].of[k] : MaskedPair{};
+      const int32_t place = shuffle(begin - first, pair.lane()) + k, id = shuffle(ids[row], pair.lane());
+      const int32_t tile = shuffle(range.first, pair.lane()) + pair.row() * columns + pair.column();
+      if (k < all) write(place, uint32_t(tile), id);
+    }
+    for (uint32_t others = __brev(__ballot_sync(kAllLanes, range.count > own)); others != 0;) {
+      const int source = take_first(others);
+      const int32_t id = shuffle(ids[row], source);
+      int32_t place = shuffle(begin, source);
+      const Support<float> support = support_of(splats[id], params.footprint);
+      const Range rows = clamp_range(rows_of(support), params.grid.height), tile_rows = tiles_of(rows, params.grid);
+      for (int top = tile_rows.first; top <= tile_rows.last; top += 32) {
+        const int y = top + lane_id();
+        const Range tiles = y <= tile_rows.last ? tile_columns_of(support, params.grid, rows, y) : Range{0, -1};
+        const int width = tiles.last - tiles.first + 1;
+        const int widths = warp_inclusive_sum(width);
+        int32_t mine = place + widths - width;
+        for (int c = tiles.first; c <= tiles.last; ++c) write(mine++, uint32_t(y) * columns + c, id);
+        place += shuffle(widths, 31);
+      }
     }
   }
   __syncthreads();

@@ -370,9 +370,11 @@ int64_t max_items();
 /// histograms.
 int64_t depth_sort_scratch(int64_t n);
 int64_t tile_sort_scratch(int64_t capacity, TileGrid grid);
-inline constexpr int kEmitThreads = 256;
+/// Threads of a block of emit_pairs, and splats of each: the more splats a block has, the fewer blocks wait in a row
+/// for those before them.
+inline constexpr int kEmitThreads = 256, kEmitRows = 2, kEmitSplats = kEmitThreads * kEmitRows;
 inline int64_t emit_scratch(int64_t n) {
-  return ((1 + (n + kEmitThreads - 1) / kEmitThreads) * int64_t(sizeof(uint32_t)) + 15) / 16 * 16;
+  return ((1 + (n + kEmitSplats - 1) / kEmitSplats) * int64_t(sizeof(uint32_t)) + 15) / 16 * 16;
 }
 
 /// Splats by depth, ties in input order. The result is order[0].

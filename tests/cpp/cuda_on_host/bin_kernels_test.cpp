@@ -124,7 +124,7 @@ std::vector<SplatRow<float>> random_splats(int n, TileGrid grid) {
 
 TEST(BinKernels, PairsOfSplats) {
   constexpr TileGrid grid = {170, 700};
-  constexpr int n = 2 * kEmitThreads + 30;
+  constexpr int n = kEmitSplats + kEmitThreads + 30;
   const int footprint = find_footprint("mip");
   const std::vector<SplatRow<float>> splats = random_splats(n, grid);
   std::vector<int32_t> order(n);
@@ -182,7 +182,8 @@ TEST(BinKernels, PairsOfSplats) {
     emit.tiles = tiles.data();
     emit.splat_pairs = with_slots ? nullptr : splat_pairs.data();
     emit.slot_pairs = with_slots ? slot_pairs.data() : nullptr;
-    cuda_on_host::launch((n + kEmitThreads - 1) / kEmitThreads, kEmitThreads,
+    // One block more than has splats, as where some are culled.
+    cuda_on_host::launch((n + kEmitSplats - 1) / kEmitSplats + 1, kEmitThreads,
                          [&] { emit_pairs_kernel(emit, tile_passes(grid)); });
     EXPECT_EQ(tiles, expected_tiles);
     EXPECT_EQ(scratch, expected_scratch);
