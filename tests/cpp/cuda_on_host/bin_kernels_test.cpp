@@ -105,6 +105,46 @@ TEST(BinKernels, TiesKeepInputOrder) {
   expect_sorted(depths);
 }
 
+SlotPair value_of(int32_t k, SlotPair) { return {k * 7, k}; }
+int32_t value_of(int32_t k, int32_t) { return k; }
+bool operator==(SlotPair a, SlotPair b) { return a.splat == b.splat && a.slot == b.slot; }
+
+/// Sorts pairs as sort_by_tile does, with room for more than there are.
+template <class Value> void expect_sorted_by_tile(int pairs, TileGrid grid) {
+  std::mt19937 bits(7);
+  const int passes = tile_passes(grid), room = pairs + pairs / 3 + 1;
+  std::vector<uint32_t> tiles[2] = {std::vector<uint32_t>(room), std::vector<uint32_t>(room)};
+  std::vector<Value> values[2] = {std::vector<Value>(room), std::vector<Value>(room)};
+  std::vector<uint32_t> memory(TileScratch::words(room, passes));
+  const TileScratch scratch(memory.data(), room, passes);
+  std::vector<int32_t> order(pairs);
+  std::iota(order.begin(), order.end(), 0);
+  for (const int32_t k : order) {
+    tiles[0][k] = uint32_t(bits() % grid.tiles());
+    values[0][k] = value_of(k, Value());
+    for (int d = 0; d < passes; ++d) ++scratch.histograms[d * TileDigits::kBins + TileDigits::of(tiles[0][k], d)];
+  }
+  std::stable_sort(order.begin(), order.end(), [&](int32_t a, int32_t b) { return tiles[0][a] < tiles[0][b]; });
+  for (int pass = 0; pass < passes; ++pass) {
+    const int from = pass % 2;
+    cuda_on_host::launch(int(scratch.blocks), TileDigits::kThreads, [&] {
+      sort_pass_kernel<kTileBits, Value, false>(scratch, pass, false, 0, 0, tiles[from].data(), tiles[1 - from].data(),
+                                                values[from].data(), values[1 - from].data());
+    });
+  }
+  for (int k = 0; k < pairs; ++k) ASSERT_TRUE(values[passes % 2][k] == value_of(order[k], Value())) << k;
+}
+
+TEST(BinKernels, PairsByTile) {
+  constexpr int kBlock = TileDigits::kTile;
+  for (const TileGrid grid : {TileGrid{100, 90}, TileGrid{700, 300}}) {  // one digit, and two
+    for (const int pairs : {0, 1, 40, kBlock, 2 * kBlock + 100}) {
+      expect_sorted_by_tile<int32_t>(pairs, grid);
+      expect_sorted_by_tile<SlotPair>(pairs, grid);
+    }
+  }
+}
+
 /// Splats from a fraction of a pixel to the whole image, in an image with more rows of tiles than a warp has lanes.
 std::vector<SplatRow<float>> random_splats(int n, TileGrid grid) {
   using F = Mip;
