@@ -219,7 +219,15 @@ AR_HD void add_jacobian_vjp(const FullCamera<T>& camera, const Jacobian<T>& j, V
   }
 }
 
-/// No smaller than |A| at any mean of this depth, world units to px: |J| <= f/z |(1, 0, -x/z; 0, 1, -y/z)|
+/// No smaller than |W|^2, W the upper left 3x3 of the view: no eigenvalue of W W^T is larger than the largest sum of a
+/// row of its absolute values. 1 for a rotation, but for rounding.
+template <typename T> AR_HD T largest_zoom2(const Camera<T>& camera) {
+  const Vec3<T> x = xyz(camera.view_x), y = xyz(camera.view_y), z = xyz(camera.view_z);
+  const T xy = abs(dot(x, y)), xz = abs(dot(x, z)), yz = abs(dot(y, z));
+  return max(dot(x, x) + xy + xz, max(xy + dot(y, y) + yz, xz + yz + dot(z, z)));
+}
+
+/// No smaller than |J| at any mean of this depth, camera units to px: |J| <= f/z |(1, 0, -x/z; 0, 1, -y/z)|
 /// <= f/z sqrt(1 + (x/z)^2 + (y/z)^2), with x/z and y/z clamped.
 template <typename T> AR_HD T largest_stretch(const Camera<T>& camera, T z) {
   return max(camera.focal.x, camera.focal.y) / z *

@@ -48,7 +48,7 @@ AR_HD bool may_be_visible(const Cam& camera, const Gaussians<T>& g, int64_t i, C
     variance += blur.streak.x * blur.streak.x + blur.streak.y * blur.streak.y + blur.variance;
   }
   const T stretch = largest_stretch(camera, p.view.z);
-  const T sigma = sqrt(stretch * stretch * largest * largest + variance);
+  const T sigma = sqrt(largest_zoom2(camera) * stretch * stretch * largest * largest + variance);
   const T level = bounds.level + (opacity > T(1) ? T(2) * std::log(opacity) : T(0));
   const T reach = T(2) + sigma * sqrt(level);
   return p.pixel.x + reach >= T(0) && p.pixel.x - reach <= camera.size.x - T(1) && p.pixel.y + reach >= T(0) &&

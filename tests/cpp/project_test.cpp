@@ -503,19 +503,35 @@ TEST_P(ProjectTest, ABlurDrawsNoNegativeCovariance) {
   }
 }
 
-/// `view_of`: the camera of a trial.
+/// The view of a world whose axes are stretched by these factors: its upper left 3x3 is no rotation.
+View<float> of_stretched_world(View<float> view, Vec3<double> by) {
+  const double factors[3] = {by.x, by.y, by.z};
+  for (int c = 0; c < 3; ++c) {
+    for (int r = 0; r < 4; ++r) {
+      view.test.view[4 * c + r] *= float(factors[c]);
+      view.test.proj[4 * c + r] *= float(factors[c]);
+    }
+  }
+  return view;
+}
+
+/// `view_of`: the camera of a trial. Every other trial stretches the world.
 template <class Cam, class Function>
 void expect_nothing_kept_that_may_not_be_visible(const Footprint& f, const Function& view_of) {
   Random random(2);
   int kept = 0;
   for (int trial = 0; trial < search_trials(200000); ++trial) {
     const View<float>& at = view_of(trial);
-    const auto camera = at.template load<Cam>();
+    Vec3<double> by = {1, 1, 1};
+    if (trial % 2) by = {random.log_uniform(0.1, 10), random.log_uniform(0.1, 10), random.log_uniform(0.1, 10)};
+    const View<float> stretched = of_stretched_world(at, by);
+    const auto camera = stretched.template load<Cam>();
     const double z = random.log_uniform(0.15, 100), scale = at.lens.orthographic() ? 4 : z,
                  size = scale * random.log_uniform(1e-4, 3);
     const auto length = [&] { return float(size * random.log_uniform(0.01, 1) * (random.below(2) ? 1 : -1)); };
     Parameters<float> p = {};
     p.mean = at.test.world(scale * random.uniform(-3, 3), scale * random.uniform(-3, 3), z);
+    p.mean = {float(p.mean.x / by.x), float(p.mean.y / by.y), float(p.mean.z / by.z)};
     p.scale = {length(), length(), length()};
     p.rotation = {float(random.normal()), float(random.normal()), float(random.normal()), float(random.normal())};
     p.opacity = float(random.log_uniform(0.003, random.below(10) ? 1 : 50));
