@@ -147,7 +147,7 @@ def bake_pixel(
     for camera in cameras:
         seen = sampling_interval(means3D, camera).isfinite()
         if isinstance(camera.effects, Effects) and camera.effects.orthographic:
-            sight = camera.viewmatrix[:3, 2].to(means3D).expand_as(means3D)
+            sight = camera.viewmatrix.reshape(4, 4)[:3, 2].to(means3D).expand_as(means3D)
         else:
             sight = torch.nn.functional.normalize(means3D - camera.campos.to(means3D).reshape(1, 3), dim=1)
         sight = torch.einsum("pik,pi->pk", axes, sight)  # in the frames of the Gaussians

@@ -5,7 +5,7 @@ import math
 import pytest
 import scenes
 import torch
-from scenes import Camera
+from scenes import Camera, ParallelCamera
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import filters
@@ -147,6 +147,18 @@ def test_a_baked_pixel_averages_over_the_cameras_that_see_a_gaussian():
     assert both.item() == pytest.approx(sum(kept).item() / 2)
     none = ar.bake_pixel(*(t[:0] for t in (means, scales, rotations, opacities)), [near])
     assert [tuple(t.shape) for t in none] == [(0, 3), (0,)]
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+def test_matrices_with_a_leading_dimension_bake_the_same(orthographic):
+    scene = scenes.random_scene(3, 40)
+    kind, tangents = (ParallelCamera, {"tanfovx": 4.0, "tanfovy": 3.0}) if orthographic else (Camera, {})
+    view = kind(eye=(0, 0, -8), **tangents).settings(F64)._replace(effects=ar.Effects(orthographic=orthographic))
+    batched = view._replace(viewmatrix=view.viewmatrix[None], projmatrix=view.projmatrix[None])
+    inputs = [scene[name] for name in ("means3D", "scales", "rotations", "opacities")]
+    one, other = (ar.bake_pixel(*inputs, [camera]) for camera in (view, batched))
+    assert not torch.equal(one[0], inputs[1])
+    assert torch.equal(one[0], other[0]) and torch.equal(one[1], other[1])
 
 
 def test_bad_shapes_are_refused_before_baking():
