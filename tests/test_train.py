@@ -912,6 +912,17 @@ def test_evaluate_compares_footprints(trained, capsys):
     assert np.array_equal(truth, cpu_test_pictures_at(trained).colors[2][0].permute(1, 2, 0).numpy())
 
 
+@pytest.mark.parametrize("scales, got", [("1,0", "(1, 0)"), ("-1", "(-1,)")])
+def test_evaluate_refuses_scales_that_are_none(trained, capsys, scales, got):
+    message = f"scales must be whole numbers of at least 1, got {got}"
+    assert cli.main(["evaluate", str(trained), f"--scales={scales}"]) == 2
+    assert capsys.readouterr().err == f"error: {message}\n"
+    with pytest.raises(ValueError, match=re.escape(message)):
+        training.load_pictures([], tuple(map(int, scales.split(","))), captures.WHITE, "cpu")
+    with pytest.raises(ValueError, match=re.escape("got (1.5,)")):
+        TrainingOptions(scales=(1.5,))
+
+
 def cpu_test_pictures_at(trained):
     return cpu_test_pictures(json.loads((trained / files.OPTIONS).read_text())["source"]["scene"])
 

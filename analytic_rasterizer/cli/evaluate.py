@@ -12,6 +12,7 @@ from ..footprints import resolve_footprint
 from ..training import TrainingOptions, evaluate, load_capture, load_lpips, load_pictures, save_pictures
 from ..training.evaluation import LPIPS_WEIGHTS, MEASURES
 from ..training.files import OPTIONS, SCENE, write_json
+from ..training.options import check_scales
 from ..training.ranks import Ranks, even_counts
 from ..training.trainer import background_of
 from .arguments import add_machine_options, count, use_machine, whole_numbers, writable_folder
@@ -58,6 +59,7 @@ def run_on(ranks: Ranks, args) -> None:
     except (ValueError, KeyError) as error:
         raise io.SceneError(f"{folder / OPTIONS}: not what `train` writes ({error})") from None
     scales = tuple(dict.fromkeys(args.scales or options.scales))
+    check_scales(scales)  # raises before anything is read
     footprints = [str(resolve_footprint(name)) for name in args.footprints or [options.footprint]]
     capture = load_capture(args.data or source["scene"], source["images"], source["test_every"])
     if not capture.test:

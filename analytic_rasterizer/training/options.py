@@ -63,6 +63,12 @@ def repeats_of(scales: tuple[int, ...], finest_repeats: int) -> tuple[int, ...]:
     return tuple(finest_repeats if several and scale == min(scales) else 1 for scale in scales)
 
 
+def check_scales(scales: tuple[int, ...], name: str = "scales") -> None:
+    """Raises ValueError, naming the argument, unless there are scales, all of them whole numbers of at least 1."""
+    whole = all(scale >= 1 and scale % 1 == 0 for scale in scales)
+    _check(name, len(scales) > 0 and whole, "whole numbers of at least 1", scales)
+
+
 @dataclass(frozen=True)
 class TrainingOptions:
     """How to train. Positions in time that are called steps are steps; shares are of the whole training, 0 to 1.
@@ -181,9 +187,8 @@ class TrainingOptions:
         steps = ("densify_from", "reset_every", "means_rate_steps", "rates_from", "rates_half_life")
         for name in (*steps, "max_gaussians"):
             _check(name, getattr(self, name) >= 0, "at least 0", getattr(self, name))
-        for name in ("scales", "scale_repeats"):
-            value = getattr(self, name)
-            _check(name, len(value) > 0 and all(v >= 1 for v in value), "whole numbers of at least 1", value)
+        check_scales(self.scales)
+        check_scales(self.scale_repeats, "scale_repeats")
         _check("scales", len(set(self.scales)) == len(self.scales), "different from each other", self.scales)
         fits = len(self.scale_repeats) == len(self.scales)
         _check("scale_repeats", fits, f"{len(self.scales)} numbers, one per scale", self.scale_repeats)

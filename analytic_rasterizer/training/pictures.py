@@ -16,6 +16,7 @@ from torch.nn import functional
 from .. import io
 from ..settings import GaussianRasterizationSettings
 from .captures import Photograph
+from .options import check_scales
 
 
 class Pictures(NamedTuple):
@@ -62,7 +63,9 @@ def load_pictures(
 
     Raises:
         io.SceneError: A picture that cannot be read, holds numbers that are not finite, or is too small for the scales.
+        ValueError: Scales that are not whole numbers of at least 1.
     """
+    check_scales(scales)
     pictures = Pictures([], {scale: [] for scale in scales}, {scale: [] for scale in scales})
     with ThreadPoolExecutor() as pool:
         for item, (view, files) in zip(items, pool.map(lambda item: read_photograph(item, scales), items)):
