@@ -191,12 +191,19 @@ def test_colmap_folder(capture):
     assert len(training.load_capture(capture, "photographs", test_every=0).train) == 9
 
 
-def test_nerfstudio_folder(tmp_path):
+def write_nerfstudio(folder, change=lambda content: None) -> None:
     views = circle(9, (35, 33))
-    write_pictures(tmp_path / "images", views, opaque=True)
+    write_pictures(folder / "images", views, opaque=True)
     frames = [{"file_path": f"images/{v.name}.png", "transform_matrix": opengl_pose(v)} for v in views]
     content = {"w": 35, "h": 33, "fl_x": 36.0, "fl_y": 36.0, "cx": 17.0, "cy": 16.0, "frames": frames}
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    change(content)
+    (folder / "transforms.json").write_text(json.dumps(content))
+
+
+def test_nerfstudio_folder(tmp_path):
+    # As nerfstudio writes it for pictures without distortion.
+    zeros = {"camera_model": "OPENCV", "k1": 0.0, "k2": 0, "p1": 0.0, "p2": -0.0, "distortion_params": [0.0] * 6}
+    write_nerfstudio(tmp_path, lambda content: content.update(zeros, is_fisheye=False))
     header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
     header += "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
     (tmp_path / "sparse_pc.ply").write_text(header + "0 1 2 255 0 51\n3 4 5 0 255 0\n")
@@ -206,6 +213,38 @@ def test_nerfstudio_folder(tmp_path):
     points, colors = found.points
     assert points.tolist() == [[0, 1, 2], [3, 4, 5]]
     torch.testing.assert_close(colors, torch.tensor([[1.0, 0.0, 0.2], [0.0, 1.0, 0.0]]))
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (
+            lambda content: content.update(camera_model="OPENCV", k1=0.0, k2=-0.05),
+            "frame 0: cameras must be pinholes, got k2 = -0.05; undistort the pictures first",
+        ),
+        (lambda content: content["frames"][3].update(p1=1e-4), "frame 3: cameras must be pinholes, got p1 = 0.0001;"),
+        (
+            lambda content: content["frames"][8].update(distortion_params=[0.0, 0.1]),
+            "frame 8: cameras must be pinholes, got distortion_params = [0.0, 0.1];",
+        ),
+        (lambda content: content.update(is_fisheye=True), "frame 0: cameras must be pinholes, got is_fisheye = True;"),
+        (lambda content: content.update(k1=math.nan), "frame 0: cameras must be pinholes, got k1 = nan;"),
+        (
+            lambda content: content.update(camera_model="OPENCV_FISHEYE"),
+            "camera_model must be a pinhole camera, got 'OPENCV_FISHEYE'",
+        ),
+        (
+            lambda content: content["frames"][2].update(camera_model="EQUIRECTANGULAR"),
+            "camera_model must be a pinhole camera, got 'EQUIRECTANGULAR'",
+        ),
+    ],
+)
+def test_nerfstudio_cameras_with_distortion(tmp_path, capsys, change, message):
+    write_nerfstudio(tmp_path / "scene", change)
+    assert cli.main(["train", str(tmp_path / "scene"), "--out", str(tmp_path / "out"), "--device", "cpu"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {tmp_path / 'scene' / 'transforms.json'}: {message}") and error.count("\n") == 1
+    assert not (tmp_path / "out").exists()
 
 
 def test_multi_scale_blender_folder(tmp_path):

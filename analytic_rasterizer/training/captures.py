@@ -20,6 +20,8 @@ from . import colmap
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 TEST_PERIOD = 8
 RECONSTRUCTIONS = ("sparse/0", "sparse", "colmap/sparse/0")
+# What a transforms file may say of the lens; nothing, or zeros, for a pinhole.
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "distortion_params", "is_fisheye")
 
 
 class Photograph(NamedTuple):
@@ -48,7 +50,8 @@ def load_capture(folder, images: str = "images", test_every: int = TEST_PERIOD) 
             among them; 0 for none.
 
     Raises:
-        io.SceneError: No such layout; missing pictures; no pictures to train with; all cameras at one place.
+        io.SceneError: No such layout; missing pictures; no pictures to train with; all cameras at one place; lens
+            distortion.
         OSError: A file that cannot be read.
         ValueError: test_every is negative or 1.
     """
@@ -101,14 +104,28 @@ def extent_of(views: list[io.View]) -> float:
 
 
 def transforms(path: Path) -> list[Photograph]:
-    """The views of a transforms file and where their pictures are, in the order of the file."""
+    """The views of a transforms file and where their pictures are, in the order of the file.
+
+    Raises io.SceneError for what `io.load_views` refuses, and for lens distortion, which that ignores.
+    """
     views = io.load_views(path)
+    data = json.loads(path.read_text(encoding="utf-8"))
     found = []
-    for view, frame in zip(views, json.loads(path.read_text(encoding="utf-8"))["frames"]):
+    for i, (view, frame) in enumerate(zip(views, data["frames"])):
+        check_lens(data | frame, f"{path}: frame {i}")
         file = path.parent / str(frame.get("file_path", ""))
         # NeRF-synthetic leaves out the suffix, and its names may hold points.
         found.append(Photograph(view, {1: file if file.is_file() else file.with_name(file.name + ".png")}))
     return found
+
+
+def check_lens(entry: dict, where: str) -> None:
+    """Raises io.SceneError for a view of a transforms file whose lens is not that of a pinhole camera."""
+    for name in DISTORTION:
+        value = entry.get(name)
+        if any(value if isinstance(value, list) else [value]):
+            got = f"{name} = {value}"
+            raise io.SceneError(f"{where}: cameras must be pinholes, got {got}; undistort the pictures first")
 
 
 def multi_scale_blender(folder: Path, split: str) -> list[Photograph]:
