@@ -77,6 +77,34 @@ def test_colmap_files(tmp_path, write, model):
     torch.testing.assert_close(read_colors, colors / 255)
 
 
+@WRITERS
+def test_colmap_pictures_of_the_same_name_in_several_folders(tmp_path, capsys, write):
+    """Each has a name and a picture of its own in the results."""
+    folders = ["cam2/", "cam1/", "", "cam3/"]
+    views = [replace(v, name=f"{folders[i % 4]}{i // 4:04d}") for i, v in enumerate(circle(12))]
+    points, colors = g.random_points(60, seed=5)
+    write(tmp_path / "scene" / "sparse" / "0", views, points, (255 * colors).to(torch.uint8))
+    for folder in folders:
+        (tmp_path / "scene" / "images" / folder).mkdir(parents=True, exist_ok=True)
+    write_pictures(tmp_path / "scene" / "images", views, opaque=True)
+    read = colmap.load_views(tmp_path / "scene" / "sparse" / "0")
+    assert [name for name, _ in read[:5]] == [*(f"000{i}.png" for i in range(3)), "cam1/0000.png", "cam1/0001.png"]
+    expected = [f"000{i}{end}" for end in ("", "_2", "_3", "_4") for i in range(3)]
+    assert [view.name for _, view in read] == expected
+    for name, view in read:
+        (of_file,) = (v for v in views if f"{v.name}.png" == name)
+        torch.testing.assert_close(view.w2c, of_file.w2c)
+    arguments = ["train", str(tmp_path / "scene"), "--out", str(tmp_path / "out"), "--device", "cpu", "--no-evaluate"]
+    assert cli.main([*arguments, "--iterations", "1", "--sh-degree", "0", "--test-every", "3"]) == 0
+    assert cli.main(["evaluate", str(tmp_path / "out"), "--lpips", "none", "--pictures", "4"]) == 0
+    tested = expected[::3]
+    cameras = io.load_views(tmp_path / "out" / files.CAMERAS)
+    assert [view.name for view in cameras] == [name for name in expected if name not in tested]
+    assert json.loads((tmp_path / "out" / "evaluation.json").read_text())["views"] == tested
+    drawn = (tmp_path / "out" / "evaluation").glob("*.png")
+    assert sorted(path.stem for path in drawn) == [f"moment_samples_4_1_{name}" for name in tested]
+
+
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
 def test_colmap_files_cut_short(tmp_path, name):
     view = io.View("a", 40, 30, 50.0, 50.0, looking_at_origin(0.1))

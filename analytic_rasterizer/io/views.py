@@ -117,7 +117,7 @@ def load_views(path, size: tuple[int, int] | None = None) -> list[View]:
         views = _views(data, path.parent, size)
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from None
-    return _with_distinct_names(views)
+    return with_distinct_names(views)
 
 
 def save_views(path, views: list[View]) -> None:
@@ -256,7 +256,7 @@ def _picture_name(name, i: int) -> str:
     return f"view_{i:03d}"
 
 
-def _with_distinct_names(views: list[View]) -> list[View]:
+def with_distinct_names(views: list[View]) -> list[View]:
     """Appends _2, _3, ... to names met before, so that no picture overwrites another."""
     taken: set[str] = set()
     for i, view in enumerate(views):

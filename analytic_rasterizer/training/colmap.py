@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from .. import io
+from ..io.views import with_distinct_names
 from ..rotations import rotation_matrices
 
 # Model ids and names, with the number of parameters: f, cx, cy or fx, fy, cx, cy.
@@ -30,6 +31,9 @@ def is_reconstruction(folder: Path) -> bool:
 
 def load_views(folder: Path) -> list[tuple[str, io.View]]:
     """(name of the picture's file, view) of every registered picture, sorted by name.
+
+    Views are named after their files, without folder and suffix; where files in several folders have the same name, the
+    views of all but the first have _2, _3, ... behind it.
 
     Raises io.SceneError for a file that is cut short or holds numbers that are not finite, and for cameras with lens
     distortion, OSError for a missing file.
@@ -55,7 +59,8 @@ def load_views(folder: Path) -> list[tuple[str, io.View]]:
         w2c[:3, :3] = rotation_matrices(torch.tensor(pose[:4], dtype=torch.float64))
         w2c[:3, 3] = torch.tensor(pose[4:], dtype=torch.float64)
         views.append((file_name, io.View(name=Path(file_name).stem, w2c=w2c, **intrinsics[camera])))
-    return sorted(views, key=lambda item: item[0])
+    views.sort(key=lambda item: item[0])
+    return list(zip([name for name, _ in views], with_distinct_names([view for _, view in views])))
 
 
 def load_points(folder: Path) -> tuple[Tensor, Tensor]:
