@@ -106,7 +106,8 @@ def parse_arguments() -> argparse.Namespace:
     add("--footprint", default=TrainingOptions.footprint)
     add("--iterations", type=int, default=7000)
     add("--seconds", type=float, default=0.0, help="instead of iterations")
-    add("--random-points", type=int, default=100_000)
+    points = "(default: 100000, or the limit of the variant where that is less)"
+    add("--random-points", type=int, default=TrainingOptions.random_points, metavar="N", help=points)
     add("--device", choices=("cpu", "cuda"), default="cuda" if has_cuda() else "cpu")
     add("--json", type=Path, metavar="FILE", help="every run")
     args = parser.parse_args()

@@ -438,6 +438,12 @@ def test_broken_captures_are_one_line_and_leave_no_results(synthetic, tmp_path, 
         (["--background", "green"], "background must be one of black, white, random, got green"),
         (["--preset", "quick", "--opacity-rate", "0"], "opacity_rate must be positive and finite, got 0.0"),
         (["--density", "mcmc", "--max-gaussians", "0"], 'max_gaussians must be at least 1 with density "mcmc"'),
+        (["--random-points", "-1"], "random_points must be at least 0, got -1"),
+        (
+            ["--random-points", "500", "--max-gaussians", "300", "--density", "mcmc"],
+            "random_points must be at most max_gaussians, 300, got 500",
+        ),
+        (["--max-gaussians", "1"], "training needs at least 2 points to start from, got 1"),
         (["--preset", "slow"], "argument --preset: invalid choice: 'slow'"),
         (["--port", "8000"], "--port is for --watch"),
         (["--watch", "--port", "65536"], "must be a port from 0 to 65535, got 65536"),
@@ -951,6 +957,67 @@ def test_cameras_json_gives_the_training_views(trained):
         # `looking_at_origin` rounds its rotation to float32, and a file that holds rotations is read as if exact.
         torch.testing.assert_close(view.w2c, expected.w2c, rtol=0, atol=4 * 2**-22)
         assert (view.width, view.height) == (32, 32) and view.fx == pytest.approx(36.0)
+
+
+@pytest.mark.parametrize("density", ["absgrad", "mcmc"])
+def test_random_points_keep_to_the_limit(synthetic, tmp_path, density):
+    """By default there are as many as it allows, and those of a start with so many."""
+    run = make_run(synthetic, tmp_path, density=density, max_gaussians=130, random_points=0, iterations=75)
+    assert run.options.random_points == 130 and run.points_found is None
+    assert torch.equal(run.trainer.gaussians.means.detach(), g.random_points(130, 0)[0])
+    counts = []
+    while run.progress.share < 1:
+        run.trainer.step()
+        counts.append(run.count())
+    assert counts[0] == max(counts) == 130
+
+
+def test_number_of_random_points():
+    def number(**given):
+        return TrainingOptions(**given).random_points
+
+    assert number() == number(max_gaussians=0) == TrainingOptions.preset("3dgs").random_points == 100_000
+    assert number(max_gaussians=99_999) == 99_999 and number(random_points=200_000) == 200_000
+    # As files of trainings have it that began before this was refused; they can still be evaluated and resumed.
+    earlier = TrainingOptions.from_dict({"random_points": 500, "max_gaussians": 300})
+    assert earlier.random_points == 500
+    with pytest.raises(ValueError, match="random_points must be at most max_gaussians, 300, got 500"):
+        training.trainer.starting_gaussians(earlier, None)
+
+
+@pytest.mark.parametrize("given", [False, True], ids=["of the capture", "given"])
+def test_of_more_points_than_the_limit_some_are_drawn(capture, tmp_path, capsys, given):
+    arguments = ["train", str(capture), "--images", "photographs", "--device", "cpu", "--iterations", "1"]
+    arguments += ["--sh-degree", "0", "--no-evaluate", "--means-rate", "1e-30", "--means-rate-end", "1e-30"]
+    points, _ = g.random_points(60, seed=5)
+    if given:
+        points = points + 1
+        header = "ply\nformat ascii 1.0\nelement vertex 60\n" + "".join(f"property double {a}\n" for a in "xyz")
+        rows = "".join(" ".join(map(repr, row)) + "\n" for row in points.tolist())
+        (tmp_path / "p.ply").write_text(f"{header}end_header\n{rows}")
+        arguments += ["--points", str(tmp_path / "p.ply")]
+
+    def start(name, *extra):
+        assert cli.main([*arguments, "--out", str(tmp_path / name), *extra]) == 0
+        state = files.read_checkpoint(tmp_path / name / files.CHECKPOINT)
+        return state["gaussians"]["means"], "drawn at random" in capsys.readouterr().err
+
+    everything, said = start("60", "--max-gaussians", "60")
+    assert torch.equal(everything, points) and not said
+    some, said = start("40", "--max-gaussians", "40")
+    assert len(some) == 40 and said
+    places = [torch.where((points == row).all(1))[0].item() for row in some]
+    assert places == sorted(set(places)) and places != list(range(40))
+    assert torch.equal(start("again", "--max-gaussians", "40")[0], some)
+    assert not torch.equal(start("seed", "--max-gaussians", "40", "--seed", "1")[0], some)
+
+
+def test_a_scene_of_more_gaussians_than_the_limit_is_refused(synthetic, trained, tmp_path, capsys):
+    arguments = ["train", str(synthetic), "--out", str(tmp_path / "out"), "--device", "cpu", "--max-gaussians", "30"]
+    count, path = len(io.load_scene(trained / files.SCENE).means), trained / files.SCENE
+    assert cli.main([*arguments, "--points", str(path)]) == 2
+    expected = f"error: max_gaussians must be at least {count}, the Gaussians of {path}, or 0, got 30\n"
+    assert capsys.readouterr().err == expected and not (tmp_path / "out").exists()
 
 
 def test_training_starts_from_a_scene(synthetic, trained, tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import typing
 from contextlib import nullcontext
 from dataclasses import fields
@@ -33,7 +34,9 @@ MAIN = {
     "seed": "of everything that is drawn",
     "sparse_adam": "a step moves only the Gaussians that its pictures show, as sparse Adam of 3DGS does",
     "density": f"density control: {', '.join(DENSITIES)}",
-    "max_gaussians": "grow no further than this, and evenly towards it; 0: no limit",
+    "max_gaussians": "start with no more than this, and grow no further, evenly towards it; 0: no limit",
+    "random_points": "Gaussians at the start where SCENE has no points (default: 100000, or --max-gaussians where that "
+    "is less)",
 }
 
 
@@ -130,6 +133,9 @@ def run_on(ranks: Ranks, args) -> bool:
         resume=args.resume,
         ranks=ranks,
     )
+    limit, found = training.options.gaussian_limit, training.points_found
+    if found is not None and found > limit and ranks.is_first:
+        print(f"starts from {limit:,} of {found:,} points, drawn at random (--max-gaussians)", file=sys.stderr)
     with training.start_viewer(args.port or 0) if args.watch else nullcontext() as viewer:
         if viewer is not None:
             print(f"watch at {viewer.url}", flush=True)

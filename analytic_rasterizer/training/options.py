@@ -14,6 +14,7 @@ BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 RANDOM_BACKGROUND = "random"
 
 
+RANDOM_POINTS = 100_000  # by default, where the limit of Gaussians is not below that
 FINEST_REPEATS = 2  # how often the finest of several scales occurs by default, where the others occur once
 
 
@@ -94,7 +95,8 @@ class TrainingOptions:
             where the pictures have alpha by convention (NeRF-synthetic), and black for photographs.
         filter_3d: Whether Gaussians are widened by the 3D filter of Mip-Splatting.
         seed: Of the starting points, the order of the pictures, and everything else that is drawn.
-        random_points: Gaussians at the start where the capture has no points.
+        random_points: Gaussians at the start where the capture has no points; not more than `max_gaussians`. 0:
+            100,000, or `max_gaussians` where that is less.
         ssim_weight: Share of 1 - SSIM in the loss, next to the mean absolute error.
         initial_opacity: Of the first Gaussians.
         initial_scale: Of the first Gaussians, in distances to their neighbours.
@@ -121,9 +123,9 @@ class TrainingOptions:
         prune_opacity: Least opacity that is kept.
         split_above: Scale above which a Gaussian is split rather than cloned, in extents of the scene.
         prune_above: Scale above which a Gaussian is pruned after the first reset, in extents of the scene.
-        max_gaussians: Most Gaussians; 0: no limit, which "mcmc" does not take. With "3dgs" and "absgrad" the limit
-            rises evenly from the number at the start to this, until `densify_until`, and those with the largest
-            gradients grow first; with "mcmc" the number rises by `grow_share` until it is reached.
+        max_gaussians: Most Gaussians, at the start too; 0: no limit, which "mcmc" does not take. With "3dgs" and
+            "absgrad" the limit rises evenly from the number at the start to this, until `densify_until`, and those with
+            the largest gradients grow first; with "mcmc" the number rises by `grow_share` until it is reached.
         grow_share: Of "mcmc": Gaussians that are added at a time, as a share of those that are there.
         noise: Of "mcmc": strength of the noise on the means, in learning rates of the means.
         opacity_weight: Weight of the mean opacity in the loss; -1: 0.01 for "mcmc", otherwise 0.
@@ -146,7 +148,7 @@ class TrainingOptions:
     background: str = ""
     filter_3d: bool = False
     seed: int = 0
-    random_points: int = 100_000
+    random_points: int = 0
     ssim_weight: float = 0.2
     initial_opacity: float = 0.1
     initial_scale: float = 1.0
@@ -182,11 +184,13 @@ class TrainingOptions:
         repeats = tuple(self.scale_repeats) or repeats_of(self.scales, FINEST_REPEATS)
         object.__setattr__(self, "scale_repeats", repeats)
         object.__setattr__(self, "footprint", str(resolve_footprint(self.footprint)))
-        for name in ("iterations", "pictures_per_step", "supersampling", "sh_every", "random_points", "densify_every"):
+        for name in ("iterations", "pictures_per_step", "supersampling", "sh_every", "densify_every"):
             _check(name, getattr(self, name) >= 1, "at least 1", getattr(self, name))
         steps = ("densify_from", "reset_every", "means_rate_steps", "rates_from", "rates_half_life")
-        for name in (*steps, "max_gaussians"):
+        for name in (*steps, "max_gaussians", "random_points"):
             _check(name, getattr(self, name) >= 0, "at least 0", getattr(self, name))
+        # More than the limit is refused where the points are made: options of finished trainings can still be read.
+        object.__setattr__(self, "random_points", self.random_points or min(RANDOM_POINTS, self.gaussian_limit))
         check_scales(self.scales)
         check_scales(self.scale_repeats, "scale_repeats")
         _check("scales", len(set(self.scales)) == len(self.scales), "different from each other", self.scales)

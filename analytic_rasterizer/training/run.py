@@ -60,10 +60,15 @@ class Run:
         options: None: the defaults, or with `resume` those of the checkpoint.
         device: "cpu", "cuda" or "cuda:N".
         images, test_every: As `load_capture`.
-        points: A .ply to start from: a 3DGS scene, or points with colours. None: what the capture has.
+        points: A .ply to start from: a 3DGS scene, or points with colours. None: what the capture has. Of more points
+            than `max_gaussians`, so many are drawn at random.
         save_every: Steps between checkpoints, besides the last; 0: none.
         resume: Go on from the checkpoint in `out`, which may be that of another number of ranks.
         ranks: The processes that train together, each with a part of the Gaussians.
+
+    Attributes:
+        points_found: How many points there are in the capture or the .ply that the training starts from, of which it
+            takes at most `max_gaussians`; None where it starts from a scene, a checkpoint, or random points.
 
     Raises:
         io.SceneError, OSError, ImportError, ValueError: Before anything is written.
@@ -91,12 +96,12 @@ class Run:
         self.options = options or TrainingOptions()
         self.source = {"scene": str(scene), "images": images, "test_every": test_every}
         self.capture = load_capture(scene, images, test_every)
+        if state is None:  # raises before the pictures are read
+            start, self.points_found = first_gaussians(self.options, self.capture, points)
+        else:
+            start, self.points_found = Gaussians(**state["gaussians"]), None
         background = background_of(self.options, self.capture.background)
         pictures = self._load(self.capture.train, background)
-        if state is None:
-            start = first_gaussians(self.options, self.capture, points)
-        else:
-            start = Gaussians(**state["gaussians"])
         if ranks.world == 1:
             self.trainer = Trainer(self.options, start, pictures, background, self.device)
         else:
@@ -291,14 +296,23 @@ class Run:
         self.clock.start()
 
 
-def first_gaussians(options: TrainingOptions, capture: Capture, points) -> Gaussians:
-    """From a .ply if one is given, a scene or points; otherwise from the capture's points, or at random places."""
-    if points is None:
-        return starting_gaussians(options, capture.points)
-    points = Path(points)
-    if is_scene(points):
-        return Gaussians.from_scene(io.load_scene(points), options.sh_degree)
-    return starting_gaussians(options, load_points(points))
+def first_gaussians(options: TrainingOptions, capture: Capture, points) -> tuple[Gaussians, int | None]:
+    """From a .ply if one is given, a scene or points; otherwise from the capture's points, or at random places.
+
+    Also returns how many points there were, of which `starting_gaussians` takes at most `max_gaussians`; None where the
+    Gaussians are those of a scene, or random.
+
+    Raises:
+        ValueError: A scene of more Gaussians than `max_gaussians`; what `starting_gaussians` raises.
+    """
+    if points is not None and is_scene(Path(points)):
+        scene = io.load_scene(points)
+        if len(scene.means) > options.gaussian_limit:
+            expected = f"at least {len(scene.means)}, the Gaussians of {points}, or 0"
+            raise ValueError(f"max_gaussians must be {expected}, got {options.max_gaussians}")
+        return Gaussians.from_scene(scene, options.sh_degree), None
+    found = capture.points if points is None else load_points(points)
+    return starting_gaussians(options, found), None if found is None else len(found[0])
 
 
 @contextmanager

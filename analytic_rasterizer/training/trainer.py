@@ -302,10 +302,23 @@ class Trainer:
 def starting_gaussians(options: TrainingOptions, points: tuple[Tensor, Tensor] | None) -> Gaussians:
     """Gaussians at points (positions and colours (P, 3)), or at random places where there are none. On the CPU.
 
+    Of more points than `max_gaussians`, so many are drawn by the seed; they keep their order.
+
     Raises:
         io.SceneError: Fewer than two points.
+        ValueError: More random points than `max_gaussians`.
     """
-    means, colors = random_points(options.random_points, options.seed) if points is None else points
+    limit = options.gaussian_limit
+    if points is None:
+        if options.random_points > limit:
+            raise ValueError(f"random_points must be at most max_gaussians, {limit}, got {options.random_points}")
+        means, colors = random_points(options.random_points, options.seed)
+    else:
+        means, colors = points
+        if len(means) > limit:
+            generator = torch.Generator().manual_seed(options.seed)
+            rows = torch.randperm(len(means), generator=generator)[:limit].sort().values
+            means, colors = means[rows], colors[rows]
     if len(means) < 2:
         raise io.SceneError(f"training needs at least 2 points to start from, got {len(means)}")
     return gaussians_at(means, colors, options.sh_degree, options.initial_opacity, options.initial_scale)
