@@ -438,6 +438,7 @@ def test_broken_captures_are_one_line_and_leave_no_results(synthetic, tmp_path, 
         (["--background", "green"], "background must be one of black, white, random, got green"),
         (["--preset", "quick", "--opacity-rate", "0"], "opacity_rate must be positive and finite, got 0.0"),
         (["--density", "mcmc", "--max-gaussians", "0"], 'max_gaussians must be at least 1 with density "mcmc"'),
+        (["--seed", "99999999999999"], "seed must be -2^39 to 2^40 - 1, got 99999999999999"),
         (["--random-points", "-1"], "random_points must be at least 0, got -1"),
         (
             ["--random-points", "500", "--max-gaussians", "300", "--density", "mcmc"],
@@ -1100,6 +1101,19 @@ def test_order_shows_every_pair_in_turn():
     assert rounds[0] != rounds[1]
     assert schedule.PictureOrder(3, options)(13) == rounds[1][4]  # without what came before
     assert [schedule.PictureOrder(3, replace(options, seed=2))(i) for i in range(9)] != rounds[0]
+
+
+def test_seeds_reach_to_where_no_order_can_be_drawn():
+    for seed in (-(2**39), -1, 2**40 - 1):
+        options = TrainingOptions(seed=seed)
+        for number in (0, 2**24 - 1):  # of a pass
+            assert schedule.PictureOrder(20, options)(20 * number)[1] == 1
+        assert len(g.random_points(2, seed)[0]) == 2
+    for seed in (-(2**39) - 1, 2**40):
+        with pytest.raises(ValueError, match=rf"seed must be -2\^39 to 2\^40 - 1, got {seed}"):
+            TrainingOptions(seed=seed)
+        with pytest.raises((ValueError, RuntimeError)):  # which one depends on the version of torch
+            torch.Generator().manual_seed(seed << 24)
 
 
 def test_progress_by_seconds_grows_at_the_last_pace():

@@ -94,7 +94,7 @@ class TrainingOptions:
         background: "black", "white", "random" (drawn anew for every step; needs pictures with alpha), or "" for white
             where the pictures have alpha by convention (NeRF-synthetic), and black for photographs.
         filter_3d: Whether Gaussians are widened by the 3D filter of Mip-Splatting.
-        seed: Of the starting points, the order of the pictures, and everything else that is drawn.
+        seed: Of the starting points, the order of the pictures, and everything else that is drawn; -2^39 to 2^40 - 1.
         random_points: Gaussians at the start where the capture has no points; not more than `max_gaussians`. 0:
             100,000, or `max_gaussians` where that is less.
         ssim_weight: Share of 1 - SSIM in the loss, next to the mean absolute error.
@@ -194,6 +194,8 @@ class TrainingOptions:
         check_scales(self.scales)
         check_scales(self.scale_repeats, "scale_repeats")
         _check("scales", len(set(self.scales)) == len(self.scales), "different from each other", self.scales)
+        # The order of a pass is drawn from seed 2^24 + its number, in 64 bits with or without a sign.
+        _check("seed", -(2**39) <= self.seed < 2**40, "-2^39 to 2^40 - 1", self.seed)
         fits = len(self.scale_repeats) == len(self.scales)
         _check("scale_repeats", fits, f"{len(self.scales)} numbers, one per scale", self.scale_repeats)
         _check("sh_degree", 0 <= self.sh_degree <= 3, "0 to 3", self.sh_degree)
