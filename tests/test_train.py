@@ -1215,6 +1215,26 @@ def test_the_command_takes_sparse_adam_and_resumes_with_it(synthetic, tmp_path, 
     assert (tmp_path / "dense" / files.SCENE).read_bytes() == scenes[0]
 
 
+def test_resuming_takes_the_points_of_the_start_or_none(synthetic, trained, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(trained / files.SCENE, "a.ply")
+    shutil.copy(trained / files.SCENE, "b.ply")
+    small = ["--iterations", "2", "--sh-degree", "1", "--no-evaluate", "--device", "cpu"]
+    began, alone = (["train", str(synthetic), "--out", name, *small] for name in ("began", "alone"))
+    assert cli.main([*began, "--points", "a.ply"]) == 0
+    assert cli.main([*alone, "--random-points", "50"]) == 0
+    assert json.loads((tmp_path / "began" / files.OPTIONS).read_text())["source"]["points"] == "a.ply"
+    for again in ([], ["--points", str(tmp_path / "a.ply")], ["--points", "a.ply"]):
+        assert cli.main([*began, "--resume", *again]) == 0
+    written = {path: path.read_bytes() for folder in ("began", "alone") for path in (tmp_path / folder).iterdir()}
+    capsys.readouterr()
+    for command, expected in ((began, "a.ply or None"), (alone, "None")):
+        assert cli.main([*command, "--resume", "--points", "b.ply"]) == 2
+        error = f"error: points must be {expected} where a training is resumed, got b.ply\n"
+        assert capsys.readouterr().err == error
+    assert all(path.read_bytes() == content for path, content in written.items())
+
+
 def test_ssim_is_that_of_torchmetrics():
     """Inside, where windows are whole: torchmetrics reflects at the edges, 3DGS's loss has zeros there."""
     functional = pytest.importorskip("torchmetrics.functional", reason="needs the train extra")

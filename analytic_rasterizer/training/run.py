@@ -61,7 +61,8 @@ class Run:
         device: "cpu", "cuda" or "cuda:N".
         images, test_every: As `load_capture`.
         points: A .ply to start from: a 3DGS scene, or points with colours. None: what the capture has. Of more points
-            than `max_gaussians`, so many are drawn at random.
+            than `max_gaussians`, so many are drawn at random. With `resume` None, or the same as when the training
+            began.
         save_every: Steps between checkpoints, besides the last; 0: none.
         resume: Go on from the checkpoint in `out`, which may be that of another number of ranks.
         ranks: The processes that train together, each with a part of the Gaussians.
@@ -95,6 +96,7 @@ class Run:
             options = TrainingOptions.from_dict(state["options"])
         self.options = options or TrainingOptions()
         self.source = {"scene": str(scene), "images": images, "test_every": test_every}
+        self.source["points"] = points_of_source(points, state)
         self.capture = load_capture(scene, images, test_every)
         if state is None:  # raises before the pictures are read
             start, self.points_found = first_gaussians(self.options, self.capture, points)
@@ -294,6 +296,20 @@ class Run:
             if self.ranks.is_first:
                 bar.write(f"warning: {error}; training goes on", file=sys.stderr)
         self.clock.start()
+
+
+def points_of_source(points, state: dict[str, Any] | None) -> str | None:
+    """What a training began with, of the `points` that are given now and its checkpoint, if it is resumed.
+
+    Raises ValueError for other points than it began with, which would have no effect.
+    """
+    if state is None:
+        return None if points is None else str(points)
+    before = state["source"].get("points")
+    if points is not None and (before is None or Path(points).resolve() != Path(before).resolve()):
+        expected = "None" if before is None else f"{before} or None"
+        raise ValueError(f"points must be {expected} where a training is resumed, got {points}")
+    return before
 
 
 def first_gaussians(options: TrainingOptions, capture: Capture, points) -> tuple[Gaussians, int | None]:
