@@ -171,6 +171,7 @@ end_header
         (None, ["--footprint", "box:colour=3"], "colour"),
         (None, ["--footprint", "box:samples"], "samples"),
         (None, ["--footprint", "mip", "--samples", "4"], "samples"),
+        (None, ["--samples", "4"], "--samples is an option of a footprint, which --footprint names"),
         (None, ["--samples", "x"], "argument --samples: invalid int value: 'x'"),
         (None, ["--scale", "0"], "argument --scale: must be a positive number, got 0"),
         (None, ["--scale", "nan"], "argument --scale: must be a positive number, got nan"),

@@ -358,6 +358,8 @@ def test_the_command_takes_the_footprint_of_the_file(files):
         (["scene.ply", "--footprint", "box:samples=3"], "samples must be one of"),
         (["scene.ply", "--views", "missing.json"], "missing.json"),
         (["scene.ply", "--export", "out.txt"], "--export must end in .html"),
+        (["scene.ply", "--export", "out.html", "--port", "8000"], "--port is for serving"),
+        (["scene.ply", "--export", "out.html", "--device", "cpu"], "--device and --threads are for --server"),
         (["scene.ply", "--export", "missing/out.html"], "No such file or directory"),
         (["broken.ply"], "broken.ply"),
         (["empty.ply"], "no Gaussians"),

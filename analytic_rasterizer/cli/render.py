@@ -23,12 +23,15 @@ def add_parser(subcommands) -> None:
     add("--out", required=True, metavar="DIR", help="folder for the pictures")
     footprint = "how a pixel sees a splat (default: the library's, analytic)"
     add("--footprint", metavar="NAME[:k=v,..]", help=footprint)
-    add("--samples", type=int, help="samples of a pixel: 1, 2, 4, 8 or 16 of box, 1, 4, 9 or 16 of moment")
+    samples = "of --footprint: samples of a pixel, 1, 2, 4, 8 or 16 of box, 1, 4, 9 or 16 of moment"
+    add("--samples", type=int, metavar="N", help=samples)
     parser.set_defaults(run=run)
 
 
 def run(args) -> None:
     """Renders every view, saves it, and prints what each one cost."""
+    if args.samples is not None and args.footprint is None:
+        raise ValueError("--samples is an option of a footprint, which --footprint names: --footprint box --samples 4")
     tqdm = io.optional_import("tqdm").tqdm
     io.optional_import("PIL.Image")  # raises before anything is rendered
     use_machine(args)

@@ -32,7 +32,7 @@ def add_parser(subcommands) -> None:
         help="what the page starts with (default: what the file says it was trained with, otherwise the library's, "
         "analytic)",
     )
-    parser.add_argument("--port", type=port, default=0, metavar="N", help="port to serve on (default: any free one)")
+    parser.add_argument("--port", type=port, metavar="N", help="port to serve on (default: any free one)")
     parser.add_argument("--no-browser", action="store_true", help="print the address and open nothing")
     parser.add_argument(
         "--export", metavar="FILE.html", help="write page and scene into one file that opens anywhere, and end"
@@ -44,7 +44,7 @@ def add_parser(subcommands) -> None:
     )
     add_view_options(parser)
     add_machine_options(parser)
-    parser.set_defaults(run=run)
+    parser.set_defaults(run=run, device=None)  # so that a device that is given is known
 
 
 def run(args) -> None:
@@ -52,10 +52,12 @@ def run(args) -> None:
     if args.server:
         run_live(args)
         return
-    if args.threads is not None or args.device != "cpu":
+    if args.threads is not None or args.device is not None:
         raise ValueError("--device and --threads are for --server: otherwise the browser draws")
     if args.export and Path(args.export).suffix != ".html":
         raise ValueError(f"--export must end in .html, got {args.export}")
+    if args.export and args.port is not None:
+        raise ValueError("--port is for serving: --export writes a file and ends")
     footprint = args.footprint
     if footprint is not None:  # raises before the scene is read
         footprint = viewer.page_footprint(resolve_footprint(footprint))
@@ -69,7 +71,7 @@ def run(args) -> None:
         print(f"{args.export}: {packed.meta['count']} Gaussians, {size / 1e6:.1f} MB")
         return
     del scene  # the packed scene is all that is served
-    with viewer.start_server(packed, args.port) as server:
+    with viewer.start_server(packed, args.port or 0) as server:
         announce(args, packed.meta["count"], packed.meta["footprint"], server.url)
         try:
             server.serve_forever()
@@ -82,13 +84,14 @@ def run_live(args) -> None:
     if args.export:
         raise ValueError("--export writes the page that needs no server: leave out --server")
     footprint = None if args.footprint is None else resolve_footprint(args.footprint)
+    args.device = args.device or "cpu"
     use_machine(args)
     io.optional_import("viser", "view")  # raises before the scene is read
     scene, views = read(args)
     footprint = footprint or viewer.footprint_of_file(args.scene)
     name = Path(args.scene).name
     options = {"views": views, "footprint": footprint, "background": args.background, "name": name}
-    with viewer.LiveViewer(args.port, **options) as live:
+    with viewer.LiveViewer(args.port or 0, **options) as live:
         live.update(scene.to(args.device), copy=False)
         announce(args, len(scene.means), live.footprint, live.url)
         try:
