@@ -15,8 +15,8 @@ __device__ inline int work_class(int samples, int length) {
   return sample_class(samples) * kLengthClasses + __clz(length);
 }
 
-/// Takes a place of the class `of` where `wanted`, and thereby counts it. Lanes of one class go together: atomics to
-/// one place are slow. All lanes must call it.
+/// Takes a place of the class `of` where `wanted`. Lanes of one class go together: atomics to one place are slow. All
+/// lanes must call it.
 __device__ inline int take_place(int32_t* next, int of, bool wanted) {
   const uint32_t peers = __match_any_sync(kAllLanes, wanted ? of : -1);
   const int leader = __ffs(int(peers)) - 1;
@@ -50,8 +50,7 @@ __global__ void __launch_bounds__(kCountWorkThreads)
   const int c = threadIdx.x;
   if (c < kWorkClasses) tile_sizes[c] = chunk_sizes[c] = 0;
   __syncthreads();
-  for (int64_t begin = 0; begin < tiles; begin += kAtOnce * kCountWorkThreads) {
-    const int64_t first = begin + threadIdx.x;
+  for (int64_t first = threadIdx.x; first < tiles; first += kAtOnce * kCountWorkThreads) {
     int n[kAtOnce], samples[kAtOnce];
 #pragma unroll
     for (int k = 0; k < kAtOnce; ++k) {
@@ -60,11 +59,11 @@ __global__ void __launch_bounds__(kCountWorkThreads)
     }
 #pragma unroll
     for (int k = 0; k < kAtOnce; ++k) {
-      const bool valid = first + k * kCountWorkThreads < tiles;
+      if (first + k * kCountWorkThreads >= tiles) break;
       const int length = whole ? kWholeList : chunk_length(samples[k]), full = n[k] / length, rest = n[k] % length;
-      take_place(tile_sizes, work_class(samples[k], n[k]), valid);
-      if (valid && full > 0) atomicAdd(&chunk_sizes[work_class(samples[k], length)], full);
-      take_place(chunk_sizes, work_class(samples[k], rest), valid && rest > 0);
+      atomicAdd(&tile_sizes[work_class(samples[k], n[k])], 1);
+      if (full > 0) atomicAdd(&chunk_sizes[work_class(samples[k], length)], full);
+      if (rest > 0) atomicAdd(&chunk_sizes[work_class(samples[k], rest)], 1);
     }
   }
   __syncthreads();

@@ -10,16 +10,15 @@
 
 namespace ar::cuda {
 
-/// A sort by digits of kBits bits. Of the threads of a block, there is one for each value of a digit.
+inline constexpr int kSortTile = 3072;  // items of a block
+
+/// A sort by digits of kBits bits. A block has a thread for each value of a digit.
 template <int kBits> struct Digits {
-  static constexpr int kBins = 1 << kBits, kThreads = 512, kWarps = kThreads / 32;
-  static_assert(kBins <= kThreads);
-  /// Items of a thread, and of a block. Splats, of which there are few, are spread over more blocks. With fewer blocks
-  /// fewer wait for each other: the wait grows with the square root of their number.
-  static constexpr int kItems = kBits > 8 ? 6 : 12, kTile = kItems * kThreads;
+  static constexpr int kBins = 1 << kBits, kThreads = kBins, kWarps = kThreads / 32;
+  static constexpr int kItems = kSortTile / kThreads;  ///< of a thread
   /// Blocks that a streaming multiprocessor should hold at once. It limits the registers of a thread, which for more
   /// blocks at once may spill a few.
-  static constexpr int kBlocks = kBits > 8 ? 3 : 2;
+  static constexpr int kBlocks = kBits > 8 ? 3 : 4;
 
   __device__ static uint32_t of(uint32_t key, int pass) { return key >> (pass * kBits) & (kBins - 1); }
 };
@@ -35,6 +34,8 @@ __device__ inline void write_status(uint32_t* status, uint32_t value) {
   *static_cast<volatile uint32_t*>(status) = value;
 }
 
+inline int64_t sort_blocks(int64_t capacity) { return (capacity + kSortTile - 1) / kSortTile; }
+
 /// Scratch of a sort of `capacity` items by `passes` digits. Zero before use.
 template <int kBits> struct SortScratch {
   static constexpr int kBins = Digits<kBits>::kBins;
@@ -44,17 +45,13 @@ template <int kBits> struct SortScratch {
   uint32_t* status;      ///< [passes, blocks, kBins]
   int64_t blocks;
 
-  static int64_t blocks_of(int64_t capacity) {
-    constexpr int kTile = Digits<kBits>::kTile;
-    return (capacity + kTile - 1) / kTile;
-  }
-  static int64_t words(int64_t capacity, int passes) { return passes * (kBins * (1 + blocks_of(capacity)) + 1); }
+  static int64_t words(int64_t capacity, int passes) { return passes * (kBins * (1 + sort_blocks(capacity)) + 1); }
   SortScratch(uint32_t* memory, int64_t capacity, int passes)
       : passes(passes),
         histograms(memory),
         tickets(memory + passes * kBins),
         status(memory + passes * (kBins + 1)),
-        blocks(blocks_of(capacity)) {}
+        blocks(sort_blocks(capacity)) {}
 };
 
 /// Adds the digits of a warp's keys to histograms in shared memory.
@@ -86,22 +83,18 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads, Digits<kBits>::kBlock
                      const uint32_t* keys_in, uint32_t* keys_out, Value* values_in, Value* values_out) {
   using D = Digits<kBits>;
   constexpr int kBins = D::kBins, kSortThreads = D::kThreads, kSortWarps = D::kWarps, kSortItems = D::kItems;
-  constexpr int kSortTile = D::kTile;
   __shared__ uint16_t counts[kSortWarps][kBins];  // of a warp's digits, then their first places in the block
   __shared__ uint32_t to_global[kBins];           // place in the output - place in the block
-  __shared__ uint32_t staged[kSortTile];
+  __shared__ Value staged[kSortTile];
   __shared__ uint32_t block_id;
   const int t = threadIdx.x, warp = t / 32, lane = lane_id();
-  const bool has_digit = t < kBins;  // and is that of digit t
   if (t == 0) block_id = atomicAdd(&scratch.tickets[pass], 1);
   uint32_t items;
-  const uint32_t base = sum_before<kSortWarps>(has_digit ? scratch.histograms[pass * kBins + t] : 0u, 0u, items);
+  const uint32_t base = sum_before<kSortWarps>(scratch.histograms[pass * kBins + t], 0u, items);
 #pragma unroll
-  for (int w = 0; w < kSortWarps; ++w) {
-    if (has_digit) counts[w][t] = 0;
-  }
+  for (int w = 0; w < kSortWarps; ++w) counts[w][t] = 0;
   if (may_skip) {
-    if (__syncthreads_or(has_digit && scratch.histograms[(scratch.passes - 1) * kBins + t] == items)) {
+    if (__syncthreads_or(scratch.histograms[(scratch.passes - 1) * kBins + t] == items)) {
       if (pass == scratch.passes - 1) return;
       Value* other = values_in;
       values_in = values_out;
@@ -148,17 +141,17 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads, Digits<kBits>::kBlock
 
   uint32_t mine = 0;  // of digit t, in this block
 #pragma unroll
-  for (int w = 0; w < kSortWarps && has_digit; ++w) {
+  for (int w = 0; w < kSortWarps; ++w) {
     const uint32_t c = counts[w][t];
     counts[w][t] = uint16_t(mine);
     mine += c;
   }
   uint32_t* status = scratch.status + (int64_t(pass) * scratch.blocks + block_id) * kBins + t;
-  if (has_digit) write_status(status, (block_id == 0 ? kUpToBlock : kOfBlock) | mine);
+  write_status(status, (block_id == 0 ? kUpToBlock : kOfBlock) | mine);
   uint32_t total;  // items of this block
   const uint32_t local = sum_before<kSortWarps>(mine, 0u, total);
   uint32_t earlier = 0;  // of digit t, in the blocks before
-  if (block_id > 0 && has_digit) {
+  if (block_id > 0) {
     for (const uint32_t* other = status - kBins;; other -= kBins) {
       uint32_t s;
       while ((s = read_status(other)) == 0) {}
@@ -167,18 +160,18 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads, Digits<kBits>::kBlock
     }
     write_status(status, kUpToBlock | (earlier + mine));
   }
-  if (has_digit) to_global[t] = base + earlier - local;
+  to_global[t] = base + earlier - local;
 #pragma unroll
-  for (int w = 0; w < kSortWarps && has_digit; ++w) counts[w][t] = uint16_t(counts[w][t] + local);
+  for (int w = 0; w < kSortWarps; ++w) counts[w][t] = uint16_t(counts[w][t] + local);
   __syncthreads();
 
-  // Through shared memory, so that neighbouring threads write to neighbouring places; a word of every item at a time,
-  // which takes less of it.
+  // Through shared memory, so that neighbouring threads write to neighbouring places.
+  auto* staged_keys = reinterpret_cast<uint32_t*>(staged);
 #pragma unroll
   for (int i = 0; i < kSortItems; ++i) {
     if (!valid[i]) continue;
     ranks[i] += counts[warp][D::of(keys[i], pass)];
-    staged[ranks[i]] = keys[i];
+    staged_keys[ranks[i]] = keys[i];
   }
   __syncthreads();
   uint32_t places[kSortItems];
@@ -186,32 +179,25 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads, Digits<kBits>::kBlock
   for (int i = 0; i < kSortItems; ++i) {
     const uint32_t k = i * kSortThreads + t;
     if (k >= total) continue;
-    const uint32_t key = staged[k];
+    const uint32_t key = staged_keys[k];
     places[i] = to_global[D::of(key, pass)] + k;
     keys_out[places[i]] = key;
   }
-  constexpr int kWords = sizeof(Value) / sizeof(uint32_t);
-  const auto* words_in = reinterpret_cast<const uint32_t*>(values_in);
-  uint32_t words[kSortItems][kWords];
-#pragma unroll
-  for (int w = 0; w < kWords; ++w) {
-    __syncthreads();
-#pragma unroll
-    for (int i = 0; i < kSortItems; ++i) {
-      if (valid[i]) staged[ranks[i]] = kFirst ? uint32_t(first + 32 * i) : words_in[(first + 32 * i) * kWords + w];
-    }
-    __syncthreads();
-#pragma unroll
-    for (int i = 0; i < kSortItems; ++i) {
-      const uint32_t k = i * kSortThreads + t;
-      words[i][w] = k < total ? staged[k] : 0;
-    }
-  }
+  __syncthreads();
 #pragma unroll
   for (int i = 0; i < kSortItems; ++i) {
-    Value value;
-    memcpy(&value, words[i], sizeof value);
-    if (i * kSortThreads + t < total) values_out[places[i]] = value;
+    if (!valid[i]) continue;
+    if constexpr (kFirst) {
+      staged[ranks[i]] = Value(first + 32 * i);
+    } else {
+      staged[ranks[i]] = values_in[first + 32 * i];
+    }
+  }
+  __syncthreads();
+#pragma unroll
+  for (int i = 0; i < kSortItems; ++i) {
+    const uint32_t k = i * kSortThreads + t;
+    if (k < total) values_out[places[i]] = staged[k];
   }
 }
 

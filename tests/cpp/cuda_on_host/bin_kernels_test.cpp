@@ -75,11 +75,11 @@ std::vector<float> random_depths(int n, float nearest, float farthest, int one_c
   return depths;
 }
 
-TEST(BinKernels, Depths) { expect_sorted(random_depths(2 * DepthDigits::kTile + 100, 0.2f, 100)); }
+TEST(BinKernels, Depths) { expect_sorted(random_depths(2 * kSortTile + 100, 0.2f, 100)); }
 
 /// Where all depths lie between 1/8 and 8192 the last pass has nothing to do, and may be left out.
 TEST(BinKernels, TheLastPassIsForDepthsThatAreVeryDifferent) {
-  std::vector<float> depths = random_depths(DepthDigits::kTile + 700, 0.125f, 8191);
+  std::vector<float> depths = random_depths(kSortTile + 700, 0.125f, 8191);
   depths[5] = 0.125f, depths[6] = std::nextafter(8192.0f, 0.0f);
   expect_sorted(depths, 3);
   expect_sorted(depths);
@@ -91,7 +91,7 @@ TEST(BinKernels, TheLastPassIsForDepthsThatAreVeryDifferent) {
   expect_sorted(depths);
 }
 
-TEST(BinKernels, DepthsOfEveryMagnitude) { expect_sorted(random_depths(DepthDigits::kTile + 1, 1e-37f, 1e37f)); }
+TEST(BinKernels, DepthsOfEveryMagnitude) { expect_sorted(random_depths(kSortTile + 1, 1e-37f, 1e37f)); }
 
 TEST(BinKernels, FewAndNoDepths) {
   expect_sorted({2});
@@ -100,7 +100,7 @@ TEST(BinKernels, FewAndNoDepths) {
 }
 
 TEST(BinKernels, TiesKeepInputOrder) {
-  std::vector<float> depths = random_depths(DepthDigits::kTile, 0.2f, 4);
+  std::vector<float> depths = random_depths(kSortTile, 0.2f, 4);
   for (float& depth : depths) depth = depth == kCulled ? kCulled : std::ceil(depth);
   expect_sorted(depths);
 }
@@ -136,7 +136,7 @@ template <class Value> void expect_sorted_by_tile(int pairs, TileGrid grid) {
 }
 
 TEST(BinKernels, PairsByTile) {
-  constexpr int kBlock = TileDigits::kTile;
+  constexpr int kBlock = kSortTile;
   for (const TileGrid grid : {TileGrid{100, 90}, TileGrid{700, 300}}) {  // one digit, and two
     for (const int pairs : {0, 1, 40, kBlock, 2 * kBlock + 100}) {
       expect_sorted_by_tile<int32_t>(pairs, grid);
