@@ -240,8 +240,14 @@ def _check_number(name: str, value, at_least: float = -math.inf, above: float = 
         raise ValueError(f"{name} must be finite{limit}, got {value}")
 
 
+def _is_integer_tensor(value) -> bool:
+    return isinstance(value, torch.Tensor) and not value.is_floating_point()
+
+
 def _times(exposure, velocity):
     """exposure * velocity: a tensor if one of the two is a tensor, otherwise a list."""
+    # Integers would round the other factor.
+    exposure, velocity = (t.double() if _is_integer_tensor(t) else t for t in (exposure, velocity))
     if isinstance(exposure, torch.Tensor) and not isinstance(velocity, torch.Tensor):
         velocity = exposure.new_tensor(velocity)
     if isinstance(velocity, torch.Tensor):

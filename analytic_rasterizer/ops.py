@@ -90,7 +90,7 @@ def _(a):
     if not a.keep:
         on_cuda = a.means3D.device.type == "cuda"
         saved = _lists(a.means3D, len(a.means3D) if on_cuda else torch.library.get_ctx().new_dynamic_size(), a, False)
-    return *rasterized, saved, torch.empty(3, dtype=torch.float64)
+    return *rasterized, saved, torch.empty(3, dtype=torch.float64, device="cpu")
 
 
 @_register("project")
@@ -99,7 +99,7 @@ def _(a):
     rows, cameras = torch.library.get_ctx().new_dynamic_size(), len(a.viewmatrix)
     colored = a.shs is not None or a.colors_precomp is not None
     ints = [like.new_empty(rows, dtype=torch.int32) for _ in range(4)]
-    splits = [torch.empty(cameras + 1, dtype=torch.int64) for _ in range(2)]
+    splits = [torch.empty(cameras + 1, dtype=torch.int64, device="cpu") for _ in range(2)]
     floats = [like.new_empty(rows, *rest) for rest in ((2,), (3,), (), ())]
     colors = like.new_empty(rows if colored else 0, 3)
     return *floats, colors, *ints[:3], splits[0], [like.new_empty(rows), ints[3], splits[1]]

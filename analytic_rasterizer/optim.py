@@ -108,7 +108,11 @@ class FusedAdam(torch.optim.Optimizer):
             for name in ("weight_decay", "amsgrad", "maximize"):
                 if group.get(name):
                     raise ValueError(f"FusedAdam has no {name}, but the state has {name} = {group[name]}")
+        # torch's state has no heads; those of the groups stay.
+        heads = [{k: group[k] for k in ("head", "head_lr") if k in group} for group in self.param_groups]
         super().load_state_dict(state_dict)
+        for group, head, given in zip(self.param_groups, heads, state_dict["param_groups"]):
+            group.update({k: value for k, value in head.items() if k not in given})
 
 
 class SparseGaussianAdam(torch.optim.Adam):

@@ -92,7 +92,7 @@ class Splats:
             self.colors.split(sizes) if len(self.colors) == len(self.means2d) else [self.colors] * len(sizes)
         )
         rows["camera_ids"] = [torch.zeros_like(ids) for ids in rows["camera_ids"]]
-        rows["row_splits"] = [torch.tensor([0, size]) for size in sizes]
+        rows["row_splits"] = [torch.tensor([0, size], device="cpu") for size in sizes]
         return [replace(self, **dict(zip(rows, of_camera))) for of_camera in zip(*rows.values())]
 
 

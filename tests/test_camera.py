@@ -377,6 +377,19 @@ def test_motion_is_the_mean_over_the_exposure(moves, device, best):
     assert (blurred - mean).abs().max() < 0.005 * still.max() + 1 / 255
 
 
+def test_integers_of_a_motion_are_numbers_like_others():
+    scene = scenes.random_scene(1, 30, degree=1)
+
+    def blurred(exposure, velocity):
+        effects = ar.Effects(motion=ar.Motion(exposure, velocity))
+        return ar.GaussianRasterizer(CAMERA.settings(torch.float64, "cpu", effects=effects))(**scene)[0]
+
+    for exposure, velocity in ((torch.tensor(1), (0.5, 0.0, 0.0)), (torch.tensor(0.5), torch.tensor([1, 0, 0]))):
+        numbers = blurred(float(exposure), [float(v) for v in velocity])
+        assert torch.allclose(blurred(exposure, velocity), numbers, rtol=0, atol=1e-14)
+        assert (numbers - blurred(0.0, (0.0, 0.0, 0.0))).abs().max() > 1e-3
+
+
 def test_blur_keeps_the_light(device, best):
     """The mass of a faint splat, opacity times the integral of its Gaussian, is the same with any blur."""
     scene = plate(9, 1, 4.0, best, sigma=(0.15, 0.3))

@@ -1,5 +1,6 @@
 """Every dialect called in the ways in which programs call it: the same picture, or an error that helps."""
 
+import inspect
 import types
 
 import pytest
@@ -128,6 +129,17 @@ def test_settings_of_a_class_of_the_program(name):
             tuple(rasterizer.render_depth(**scene).values()),
             tuple(rasterizer_of(name, settings_of(name, bg=own.bg)).render_depth(**scene).values()),
         )
+
+
+@each_dialect
+def test_settings_of_a_class_of_the_program_in_the_function(name):
+    own = types.SimpleNamespace(**fields_of(name))
+    drop_in.set_dialect(name)
+    function = inspect.signature(drop_in.rasterize_gaussians).parameters
+    names = {"sh": "shs", "cov3Ds_precomp": "cov3D_precomp", "raster_settings": None}
+    given = {p: own if p == "raster_settings" else arguments_of(name).get(names.get(p, p)) for p in function}
+    settings = given | {"raster_settings": settings_of(name)}
+    assert_same(drop_in.rasterize_gaussians(**given), drop_in.rasterize_gaussians(**settings))
 
 
 def test_settings_of_a_class_of_the_program_may_have_footprint_and_effects():

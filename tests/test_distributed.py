@@ -881,3 +881,17 @@ def test_a_mistake_of_one_rank_raises_on_all(runs, mistake):
 def test_a_rank_outside_the_group_raises(runs):
     kind, message = runs.load("outside")
     assert kind == "ValueError" and message.startswith("group must hold this process, got one without rank ")
+
+
+def test_another_default_device_changes_nothing():
+    """ "meta" stands for any other device."""
+    settings = [scenes.Camera(sh_degree=1).settings(torch.float32, "cpu")] * 2
+    scene = scene_of(torch.float32, "cpu")
+    expected = distributed.rasterize(settings, **scene).views
+    torch.set_default_device("meta")
+    try:
+        made = distributed.rasterize(settings, **scene).views
+    finally:
+        torch.set_default_device(None)
+    assert len(made) == len(expected) == 2
+    assert all(torch.equal(a.image, b.image) for a, b in zip(made, expected))

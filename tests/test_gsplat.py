@@ -148,6 +148,19 @@ def projected(reference, scene, cameras, mode, model="pinhole"):
     return dict(zip(names, (means2d, depths, conics, opacities, radii)))
 
 
+@pytest.mark.parametrize("model", ["pinhole", "ortho"])
+def test_the_last_row_of_a_view_is_not_read(device, model):
+    scene, cameras = scene_of(torch.float32, device), cameras_of(torch.float32, device)
+    views = cameras["viewmats"]
+    other = views.clone()
+    other[:, 3] = torch.tensor([0.1, -0.2, 0.3, 1.5])
+    other.requires_grad_()
+    made = render(scene, cameras | {"viewmats": other}, camera_model=model)[0]
+    assert torch.equal(made, render(scene, cameras, camera_model=model)[0])
+    made.square().sum().backward()
+    assert (other.grad[:, 3] == 0).all() and (other.grad[:, :3] != 0).any()
+
+
 @each_precision
 @BOTH_LAYOUTS
 @pytest.mark.parametrize("mode", dialect.RASTERIZE_MODES)

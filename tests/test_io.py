@@ -164,6 +164,17 @@ def test_save_scene_keeps_opaque_gaussians_finite(tmp_path):
     torch.testing.assert_close(loaded.opacities, scene.opacities, rtol=0, atol=2e-6)
 
 
+def test_harmonics_of_degree_four_go_where_they_can_be_read(tmp_path):
+    shs = torch.rand(5, 25, 3, generator=torch.Generator().manual_seed(0))
+    scene = io.Scene(torch.ones(5, 3), torch.ones(5, 3), torch.ones(5, 4), torch.full((5, 1), 0.5), shs, 4)
+    for name in ("a.ply", "a.spz"):
+        with pytest.raises(io.SceneError, match="only a .compressed.ply holds harmonics of degree 4"):
+            io.save_scene(tmp_path / name, scene)
+        assert not (tmp_path / name).exists()
+    io.save_scene(tmp_path / "a.compressed.ply", scene)
+    assert io.load_scene(tmp_path / "a.compressed.ply").sh_degree == 4
+
+
 def test_save_scene_refuses_other_suffixes(tmp_path):
     with pytest.raises(io.SceneError, match=r"expected a \.ply or \.spz name, got '\.obj'"):
         io.save_scene(tmp_path / "scene.obj", random_scene())
@@ -175,6 +186,11 @@ def broken(name, write):
 
 def cut(path, keep):
     path.write_bytes(path.read_bytes()[:keep])
+    return path
+
+
+def with_bytes(path, old, new):
+    path.write_bytes(path.read_bytes().replace(old, new))
     return path
 
 
@@ -238,6 +254,10 @@ COLOURED = [*ply_columns(0)[:9], "red", *ply_columns(0)[9:]]
             "red must be float, got uchar",
         ),
         (lambda d: cut(hand_written(d), -1), "cut short"),
+        (
+            lambda d: with_bytes(hand_written(d), b"element vertex 5", b"element vertex 99999999999"),
+            "expected as many vertices as the file is long, got 99999999999",
+        ),
         (lambda d: cut(saved(d, "a.compressed.ply"), -1), "cut short"),
         (lambda d: cut(saved(d, "a.compressed.ply"), 3000), "cut short"),
         (lambda d: cut(saved(d, "a.spz"), -20), "cut short .Could not gunzip"),
@@ -381,6 +401,27 @@ def test_names_are_safe_and_distinct(tmp_path):
     assert [view.name for view in views] == [
         *("b", "b_2", "view_002", "x_y", "view_004", "view_005", "view_006", "frame.0001", "b_3")
     ]
+
+
+def test_a_byte_order_mark_is_passed_over(tmp_path):
+    views = [io.View("a", 40, 30, 50.0, 51.0, torch.eye(4, dtype=torch.float64))]
+    io.save_views(tmp_path / "v.json", views)
+    text = (tmp_path / "v.json").read_text()
+    (tmp_path / "v.json").write_text(text, encoding="utf-8-sig")
+    assert [view.name for view in io.load_views(tmp_path / "v.json")] == ["a"]
+
+
+def test_another_default_device_changes_nothing(tmp_path):
+    """Files are read to the CPU. "meta" stands for any other device."""
+    io.save_scene(tmp_path / "a.ply", scene := io.load_scene(hand_written(tmp_path)))
+    io.save_views(tmp_path / "v.json", [io.View("a", 40, 30, 50.0, 51.0, torch.eye(4, dtype=torch.float64))])
+    torch.set_default_device("meta")
+    try:
+        again, (view,) = io.load_scene(tmp_path / "a.ply"), io.load_views(tmp_path / "v.json")
+    finally:
+        torch.set_default_device(None)
+    assert again.means.device.type == view.w2c.device.type == "cpu"
+    assert torch.equal(again.means, scene.means)
 
 
 def test_views_round_trip(tmp_path):

@@ -293,6 +293,17 @@ def test_resuming_changes_no_bit(device):
         assert all(type(other.state[p]["step"]) is int for p in parameters_of(other))
 
 
+def test_a_state_of_torch_keeps_the_heads_of_the_groups():
+    parameter = torch.ones(3, 4, requires_grad=True)
+    theirs = Adam([{"params": [parameter], "lr": 1e-4}])
+    ours = FusedAdam([{"params": [parameter], "lr": 1e-4, "head": 1, "head_lr": 2.5e-3}])
+    ours.load_state_dict(theirs.state_dict())
+    assert (ours.param_groups[0]["head"], ours.param_groups[0]["head_lr"]) == (1, 2.5e-3)
+    other = FusedAdam([{"params": [parameter], "lr": 1e-4, "head": 2, "head_lr": 1e-3}])
+    other.load_state_dict(ours.state_dict())  # a state that has them goes before
+    assert (other.param_groups[0]["head"], other.param_groups[0]["head_lr"]) == (1, 2.5e-3)
+
+
 @pytest.mark.parametrize("option", [{"weight_decay": 0.1}, {"amsgrad": True}, {"maximize": True}])
 def test_a_state_of_another_rule_is_refused(option):
     theirs = Adam([torch.ones(3, requires_grad=True)], **option)

@@ -403,6 +403,23 @@ def test_stages_of_a_picture_before_an_image(device):
         ar.render_stages(settings._replace(bg=settings.bg[:, 1:]), **scene)
 
 
+def test_another_default_device_changes_nothing():
+    """ "meta" stands for any other device."""
+    scene, settings = scene_of(torch.float32, "cpu"), settings_of(torch.float32, "cpu")
+
+    def pictures():
+        splats = ar.project([settings, settings], **scene)
+        return [ar.blend(part, ar.bin(part))[0] for part in splats.split()]
+
+    expected = pictures()
+    torch.set_default_device("meta")
+    try:
+        made = pictures()
+    finally:
+        torch.set_default_device(None)
+    assert all(torch.equal(a, b) for a, b in zip(made, expected))
+
+
 @pytest.mark.parametrize(
     "change, message",
     [

@@ -130,6 +130,22 @@ def test_colmap_text_cut_short(tmp_path, name):
             colmap.load_points(tmp_path / "0") if name == "points3D" else colmap.load_views(tmp_path / "0")
 
 
+@pytest.mark.parametrize(
+    "camera, message",
+    [
+        ("1 PINHOLE 100 80 50 51 49 40 7", "expected 6 numbers of a PINHOLE camera, got 7"),
+        ("1 PINHOLE nan 80 50 51 49 40", "expected width and height in pixels, got nan 80"),
+        ("1 PINHOLE 100.7 80 50 51 49 40", "expected width and height in pixels, got 100.7 80"),
+    ],
+)
+def test_wrong_cameras_of_a_colmap_text(tmp_path, camera, message):
+    view = io.View("a", 40, 30, 50.0, 50.0, looking_at_origin(0.1))
+    write_colmap_text(tmp_path / "0", [view], torch.zeros(1, 3), torch.zeros(1, 3, dtype=torch.int32))
+    (tmp_path / "0" / "cameras.txt").write_text(camera + "\n")
+    with pytest.raises(io.SceneError, match=message):
+        colmap.load_views(tmp_path / "0")
+
+
 @WRITERS
 def test_colmap_cameras_with_distortion(tmp_path, write):
     view = io.View("a", 40, 30, 50.0, 50.0, looking_at_origin(0.1))
@@ -312,6 +328,24 @@ def test_points_of_a_ply(tmp_path, layout):
     assert points.tolist() == [[1, 2, 3], [4, 5, 6]] and (colors == 0.5).all()  # no green: no colours
     (tmp_path / "p.ply").write_bytes("\n".join(header).encode() + body[: len(body) // 2])
     with pytest.raises(io.SceneError, match=r"cut short|expected 2 finite points"):
+        training.load_points(tmp_path / "p.ply")
+
+
+def test_points_of_a_text_with_other_line_ends(tmp_path):
+    lines = ["ply", "format ascii 1.0", "element vertex 2", *(f"property float {axis}" for axis in "xyz"), "end_header"]
+    (tmp_path / "p.ply").write_bytes("\r\n".join([*lines, "1 2 3", "4 5 6", ""]).encode())
+    assert training.load_points(tmp_path / "p.ply")[0].tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+@pytest.mark.parametrize("rows", [["1 2 3", "4 5"], ["1 2 3", "four 5 6"], ["1 2 3", "\xff"]])
+def test_points_of_a_wrong_text(tmp_path, rows):
+    lines = ["ply", "format ascii 1.0", "element vertex 2", *(f"property float {axis}" for axis in "xyz"), "end_header"]
+    (tmp_path / "p.ply").write_bytes("\n".join([*lines, *rows]).encode("latin-1"))
+    with pytest.raises(io.SceneError, match="expected 3 numbers in every row"):
+        training.load_points(tmp_path / "p.ply")
+    lines[2] = "element vertex many"
+    (tmp_path / "p.ply").write_bytes("\n".join([*lines, *rows]).encode("latin-1"))
+    with pytest.raises(io.SceneError, match="expected a number of vertices, got many"):
         training.load_points(tmp_path / "p.ply")
 
 

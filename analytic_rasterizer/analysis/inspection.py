@@ -138,7 +138,7 @@ class SceneReport:
         palette = optional_import("matplotlib.colors", "analysis").ListedColormap(colors)
         for ax, view in zip(axes[0, 1:], maps):
             rows, columns = view.tile_samples.shape
-            index = torch.bucketize(view.tile_samples, torch.tensor(TILE_SAMPLES)).numpy()
+            index = torch.bucketize(view.tile_samples, torch.tensor(TILE_SAMPLES, device="cpu")).numpy()
             extent = (0, TILE * columns, TILE * rows, 0)
             ax.imshow(index, palette, vmin=-0.5, vmax=3.5, extent=extent, interpolation="nearest")
             ax.set(xlim=(0, view.width), ylim=(view.height, 0), xlabel="px")

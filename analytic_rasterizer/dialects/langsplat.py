@@ -4,7 +4,7 @@ Repositories: minghanqin/LangSplat. `include_feature` says whether the features 
 image is zero.
 """
 
-from ._base import FIELDS, forward_like, with_channels
+from ._base import FIELDS, as_settings, forward_like, with_channels
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
 
@@ -63,7 +63,7 @@ def rasterize_gaussians(
     raster_settings,
 ) -> tuple:
     """The functional form of `GaussianRasterizer.forward`."""
-    return raster_settings.render(
+    return as_settings(raster_settings).render(
         means3D,
         means2D,
         opacities,

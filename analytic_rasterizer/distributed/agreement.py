@@ -121,7 +121,8 @@ def _message(numbers: list[Any], counts: torch.Tensor | None, group: dist.Proces
     """(_ROOM,) int64, the numbers and behind them the counts. Waits for no device."""
     device = _channel(group)
     on_host = [0 if torch.is_tensor(number) else number for number in numbers]
-    on_host = torch.tensor(on_host + [0] * (_ROOM - len(on_host)), pin_memory=device.type == "cuda")
+    filled = on_host + [0] * (_ROOM - len(on_host))
+    on_host = torch.tensor(filled, pin_memory=device.type == "cuda", device="cpu")
     message = on_host.to(device, non_blocking=True)
     for place, number in enumerate(numbers):
         if torch.is_tensor(number):
@@ -213,7 +214,7 @@ def _begin_gathering(message: torch.Tensor, world: int, group: dist.ProcessGroup
     if not received.is_cuda:
         work.wait()
         return lambda: received
-    on_host = torch.empty(received.shape, dtype=received.dtype, pin_memory=True)
+    on_host = torch.empty(received.shape, dtype=received.dtype, pin_memory=True, device="cpu")
     arrived = torch.cuda.Event()
     with torch.cuda.stream(_side_stream(received.device)):
         work.wait()  # lets the stream wait, not the host

@@ -202,4 +202,4 @@ def _part(splats: Splats, rows: torch.Tensor) -> Splats:
     """Those rows, of one camera."""
     names = ("means2d", "cov2d", "opacities", "depths", "colors", "radii", "gaussian_ids", "camera_ids", "dets")
     taken = {name: getattr(splats, name).index_select(0, rows) for name in names}
-    return dataclasses.replace(splats, row_splits=torch.tensor([0, len(rows)]), **taken)
+    return dataclasses.replace(splats, row_splits=torch.tensor([0, len(rows)], device="cpu"), **taken)

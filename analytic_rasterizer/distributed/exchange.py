@@ -160,6 +160,6 @@ def exchange(
         gaussian_ids=ids,
         camera_ids=torch.cat([ids.new_full((size,), k) for k, size in enumerate(route.sizes)]),
         radii=ids.new_empty(0),
-        row_splits=torch.tensor([0, *accumulate(route.sizes)]),
+        row_splits=torch.tensor([0, *accumulate(route.sizes)], device="cpu"),
     )
     return splats, of_own_means if absolute else None, anchor

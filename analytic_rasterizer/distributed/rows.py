@@ -341,7 +341,7 @@ def _splats_of(rows: torch.Tensor, image: dict[str, Any]) -> Splats:
         radii=ids.new_empty(0),
         gaussian_ids=ids,
         camera_ids=ids.new_zeros(1).expand(len(rows)),
-        row_splits=torch.tensor([0, len(rows)]),
+        row_splits=torch.tensor([0, len(rows)], device="cpu"),
         width=image["image_width"],
         height=image["image_height"],
         footprint=image["footprint"],

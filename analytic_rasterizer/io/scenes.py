@@ -64,14 +64,14 @@ def load_scene(path) -> Scene:
         raise SceneError(f"{path}: unreadable or cut short ({first_line(error)})") from None
 
     tensors = [
-        torch.tensor(field, dtype=torch.float32).contiguous()  # a view of the file's rows
+        torch.tensor(field, dtype=torch.float32, device="cpu").contiguous()  # a view of the file's rows
         for field in (data.means, data.scales, data.quats, data.opacities, data.sh0)
     ]
     means, log_scales, rotations, logits, sh0 = tensors
     count = len(means)
     shs = sh0[:, None]
     if data.shN is not None and data.shN.size:
-        shs = torch.cat([shs, torch.tensor(data.shN, dtype=torch.float32)], dim=1)
+        shs = torch.cat([shs, torch.tensor(data.shN, dtype=torch.float32, device="cpu")], dim=1)
     scene = Scene(
         means,
         log_scales.exp(),
@@ -92,11 +92,14 @@ def save_scene(path, scene: Scene, comments: Sequence[str] = ()) -> None:
 
     The two small formats round: see their own documentation. Opacities are kept off 0 and 1 by
     1e-6, where their logit is infinite. `comments` are lines for the header of a `.ply`. Raises
-    SceneError for another suffix, and for comments that cannot be written.
+    SceneError for another suffix, for harmonics of degree 4 in anything but a `.compressed.ply`,
+    and for comments that cannot be written.
     """
     path = Path(path)
     if path.suffix not in (".ply", ".spz"):
         raise SceneError(f"{path}: expected a .ply or .spz name, got {path.suffix!r}")
+    if scene.sh_degree > 3 and not path.name.endswith(".compressed.ply"):
+        raise SceneError(f"{path}: only a .compressed.ply holds harmonics of degree {scene.sh_degree}")
     if comments and path.suffix != ".ply":
         raise SceneError(f"{path}: only a .ply holds comments")
     if any("\n" in comment or not comment.isascii() for comment in comments):
@@ -154,6 +157,10 @@ def _check_ply_header(path: Path) -> None:
     rest = sum(name.startswith("f_rest_") for name in kinds)
     if rest not in (0, 9, 24, 45):
         raise SceneError(f"expected 0, 9, 24 or 45 f_rest properties (SH degree 0 to 3), got {rest}")
+    words = lines[elements[0]].split()
+    count = int(words[2]) if len(words) == 3 and words[2].isdecimal() else -1
+    if count < 0 or 4 * count * len(kinds) > path.stat().st_size:
+        raise SceneError(f"expected as many vertices as the file is long, got {' '.join(words[2:])}")
 
 
 def ply_header(path: Path) -> list[str]:

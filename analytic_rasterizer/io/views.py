@@ -82,7 +82,7 @@ class View:
             view.fy,
             view.cx,
             view.cy,
-            bg=torch.tensor(background, dtype=torch.float32),
+            bg=torch.tensor(background, dtype=torch.float32, device="cpu"),
             sh_degree=sh_degree,
             footprint=footprint,
             device=device,
@@ -108,7 +108,7 @@ def load_views(path, size: tuple[int, int] | None = None) -> list[View]:
     """
     path = Path(path)
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(path.read_text(encoding="utf-8-sig"))
     except OSError as error:
         raise SceneError(f"{path}: {error.strerror}") from None
     except (ValueError, RecursionError) as error:
@@ -158,7 +158,7 @@ def _listed_view(i: int, entry: dict) -> View:
     if "w2c" in entry:
         w2c = _pose(entry["w2c"], f"{where}: w2c")
     elif "rotation" in entry:
-        w2c = torch.eye(4, dtype=torch.float64)
+        w2c = torch.eye(4, dtype=torch.float64, device="cpu")
         w2c[:3, :3] = _numbers(entry["rotation"], (3, 3), f"{where}: rotation").T
         position = _numbers(_get(entry, "position", where), (3,), f"{where}: position")
         w2c[:3, 3] = -w2c[:3, :3] @ position
@@ -281,7 +281,7 @@ def _pose(value, where: str) -> torch.Tensor:
 
 def _check_rotation(pose: torch.Tensor, where: str) -> None:
     rotation = pose[:3, :3]
-    error = (rotation @ rotation.T - torch.eye(3, dtype=pose.dtype)).abs().max().item()
+    error = (rotation @ rotation.T - torch.eye(3, dtype=pose.dtype, device=pose.device)).abs().max().item()
     if error > 1e-2 or torch.linalg.det(rotation) < 0:  # files are rounded to a few digits
         raise SceneError(f"{where} must hold a rotation, got {rotation.tolist()}")
 
@@ -297,7 +297,7 @@ def _numbers(value, shape: tuple[int, ...], where: str) -> torch.Tensor:
     if not fits(value, shape):
         size = " x ".join(map(str, shape))
         raise SceneError(f"{where} must hold {size} finite numbers, got {_shorten(value)}")
-    return torch.tensor(value, dtype=torch.float64)
+    return torch.tensor(value, dtype=torch.float64, device="cpu")
 
 
 def _is_number(value) -> bool:

@@ -7,6 +7,7 @@ reconstructions (sparse/0, sparse or colmap/sparse/0; binary or text) and nerfst
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -109,7 +110,7 @@ def transforms(path: Path) -> list[Photograph]:
     Raises io.SceneError for what `io.load_views` refuses, and for lens distortion, which that ignores.
     """
     views = io.load_views(path)
-    data = json.loads(path.read_text(encoding="utf-8"))
+    data = json.loads(path.read_text(encoding="utf-8-sig"))
     found = []
     for i, (view, frame) in enumerate(zip(views, data["frames"])):
         check_lens(data | frame, f"{path}: frame {i}")
@@ -136,13 +137,13 @@ def multi_scale_blender(folder: Path, split: str) -> list[Photograph]:
     """
     path = folder / "metadata.json"
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))[split]
+        data = json.loads(path.read_text(encoding="utf-8-sig"))[split]
         rows = list(zip(*(data[key] for key in ("file_path", "cam2world", "width", "height", "focal"))))
     except (ValueError, KeyError, TypeError) as error:
         raise io.SceneError(f"{path}: not the metadata of the multi-scale Blender set ({error!r})") from None
     found: list[Photograph] = []
     for name, pose, width, height, focal in rows:
-        c2w = torch.tensor(pose, dtype=torch.float64)
+        c2w = torch.tensor(pose, dtype=torch.float64, device="cpu")
         if c2w.shape != (4, 4) or not c2w.isfinite().all():
             raise io.SceneError(f"{path}: cam2world of {name} must hold 4 x 4 finite numbers")
         c2w[:3, 1:3] *= -1
@@ -197,7 +198,10 @@ def load_points(path: Path) -> tuple[Tensor, Tensor]:
     elements = [i for i, line in enumerate(lines) if line.startswith("element")]
     if not elements or not lines[elements[0]].startswith("element vertex "):
         raise io.SceneError(f"{path}: expected the vertices as the first element of the .ply")
-    count = int(lines[elements[0]].split()[2])
+    count = lines[elements[0]].split()[2]
+    if not count.isdecimal():
+        raise io.SceneError(f"{path}: expected a number of vertices, got {count}")
+    count = int(count)
     end = elements[1] if len(elements) > 1 else len(lines)
     properties = [line.split()[1:] for line in lines[elements[0] + 1 : end] if line.startswith("property ")]
     known = all(len(words) == 2 and words[0] in PLY_TYPES for words in properties)
@@ -205,11 +209,14 @@ def load_points(path: Path) -> tuple[Tensor, Tensor]:
     if not known or not {"x", "y", "z"} <= set(names):
         raise io.SceneError(f"{path}: expected vertices of numbers with x, y and z, got {', '.join(names)}")
     dtype = np.dtype([(name, PLY_TYPES[kind]) for kind, name in properties])
-    body = path.read_bytes().split(b"end_header\n", 1)[-1]
+    body = re.split(rb"end_header\r?\n", path.read_bytes(), maxsplit=1)[-1]
     if layout == "binary_little_endian" and len(body) >= count * dtype.itemsize:
         rows = np.frombuffer(body, dtype, count)
     elif layout == "ascii":
-        rows = np.array([tuple(line.split()[: len(names)]) for line in body.decode().splitlines()[:count]], dtype)
+        try:
+            rows = np.array([tuple(line.split()[: len(names)]) for line in body.decode().splitlines()[:count]], dtype)
+        except ValueError as error:  # too few words, words that are no numbers, or no text at all
+            raise io.SceneError(f"{path}: expected {len(names)} numbers in every row ({error})") from None
     else:
         raise io.SceneError(f"{path}: cut short, or neither ascii nor binary_little_endian but {layout}")
     points = torch.from_numpy(np.stack([rows[axis].astype(np.float32) for axis in "xyz"], 1))

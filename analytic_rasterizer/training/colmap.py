@@ -55,9 +55,9 @@ def load_views(folder: Path) -> list[tuple[str, io.View]]:
             raise io.SceneError(f"{folder}/images: {file_name} was taken by camera {camera}, which cameras lacks")
         if not all(map(math.isfinite, pose)) or not any(pose[:4]):
             raise io.SceneError(f"{folder}/images: the pose of {file_name} must be finite, got {pose}")
-        w2c = torch.eye(4, dtype=torch.float64)
-        w2c[:3, :3] = rotation_matrices(torch.tensor(pose[:4], dtype=torch.float64))
-        w2c[:3, 3] = torch.tensor(pose[4:], dtype=torch.float64)
+        w2c = torch.eye(4, dtype=torch.float64, device="cpu")
+        w2c[:3, :3] = rotation_matrices(torch.tensor(pose[:4], dtype=torch.float64, device="cpu"))
+        w2c[:3, 3] = torch.tensor(pose[4:], dtype=torch.float64, device="cpu")
         views.append((file_name, io.View(name=Path(file_name).stem, w2c=w2c, **intrinsics[camera])))
     views.sort(key=lambda item: item[0])
     return list(zip([name for name, _ in views], with_distinct_names([view for _, view in views])))
@@ -154,10 +154,15 @@ def _floats(path: Path, words: list[str]) -> list[float]:
 def _text_cameras(path: Path) -> Iterator[tuple]:
     for words in _lines(path):
         camera, model, *numbers = words if len(words) > 1 else (*words, "")
-        if len(numbers) < 2 + PINHOLES.get(model, 0):
+        expected = 2 + PINHOLES.get(model, 0)
+        if len(numbers) < expected:
             raise io.SceneError(f"{path}: cut short")
-        width, height, *parameters = _floats(path, numbers)
-        yield camera, model, int(width), int(height), parameters
+        if model in PINHOLES and len(numbers) > expected:
+            raise io.SceneError(f"{path}: expected {expected} numbers of a {model} camera, got {len(numbers)}")
+        for size in numbers[:2]:
+            if not size.isdecimal():
+                raise io.SceneError(f"{path}: expected width and height in pixels, got {' '.join(numbers[:2])}")
+        yield camera, model, int(numbers[0]), int(numbers[1]), _floats(path, numbers[2:])
 
 
 def _text_images(path: Path) -> Iterator[tuple]:

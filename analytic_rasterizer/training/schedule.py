@@ -87,7 +87,7 @@ class PictureOrder:
         number, place = divmod(n, len(self.pairs))
         if self.drawn[0] != number:
             generator = torch.Generator().manual_seed((self.seed << 24) + number)
-            self.drawn = number, torch.randperm(len(self.pairs), generator=generator).tolist()
+            self.drawn = number, torch.randperm(len(self.pairs), generator=generator, device="cpu").tolist()
         return self.pairs[self.drawn[1][place]]
 
 

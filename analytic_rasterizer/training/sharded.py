@@ -166,7 +166,7 @@ class ShardedTrainer(Trainer):
     def take_losses(self) -> list[float]:
         """As of `Trainer`: the losses of all ranks together."""
         parts = self.ranks.exchange(torch.stack(self.losses).tolist() if self.losses else [])
-        self.losses = [torch.tensor(math.fsum(of_step), dtype=torch.float64) for of_step in zip(*parts)]
+        self.losses = [torch.tensor(math.fsum(of_step), dtype=torch.float64, device="cpu") for of_step in zip(*parts)]
         return super().take_losses()
 
     def state_dict(self) -> dict[str, Any]:

@@ -317,7 +317,7 @@ def starting_gaussians(options: TrainingOptions, points: tuple[Tensor, Tensor] |
         means, colors = points
         if len(means) > limit:
             generator = torch.Generator().manual_seed(options.seed)
-            rows = torch.randperm(len(means), generator=generator)[:limit].sort().values
+            rows = torch.randperm(len(means), generator=generator, device="cpu")[:limit].sort().values
             means, colors = means[rows], colors[rows]
     if len(means) < 2:
         raise io.SceneError(f"training needs at least 2 points to start from, got {len(means)}")

@@ -49,7 +49,7 @@ def camera_view(position, wxyz, fov: float, width: int, height: int) -> io.View:
     Raises:
         ValueError: Numbers that are not finite or out of their range.
     """
-    pose = torch.as_tensor(np.concatenate([position, wxyz]), dtype=torch.float64)
+    pose = torch.as_tensor(np.concatenate([position, wxyz]), dtype=torch.float64, device="cpu")
     if not (pose.shape == (7,) and pose.isfinite().all() and pose[3:].norm() > 0):
         raise ValueError(f"position and wxyz must be 3 and 4 finite numbers, wxyz not zero, got {pose.tolist()}")
     if not 0 < fov < math.pi:
@@ -57,7 +57,7 @@ def camera_view(position, wxyz, fov: float, width: int, height: int) -> io.View:
     if not (1 <= width <= LARGEST_SIDE and 1 <= height <= LARGEST_SIDE):
         raise ValueError(f"width and height must be from 1 to {LARGEST_SIDE}, got {width} and {height}")
     w, x, y, z = pose[3:] / pose[3:].norm()
-    w2c = torch.eye(4, dtype=torch.float64)
+    w2c = torch.eye(4, dtype=torch.float64, device="cpu")
     w2c[:3, :3] = torch.stack(  # the rows are the axes of the camera
         [
             torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]),

@@ -119,9 +119,9 @@ class LiveViewer:
 
         self.name = name
         self.interval = interval
-        self.views = views or [overview(torch.zeros(3, dtype=torch.float64), 1.0)]
+        self.views = views or [overview(torch.zeros(3, dtype=torch.float64, device="cpu"), 1.0)]
         self._views_given = bool(views)
-        self._middle = torch.zeros(3, dtype=torch.float64)  # of the first scene, which cameras turn about
+        self._middle = torch.zeros(3, dtype=torch.float64, device="cpu")  # of the first scene, which cameras turn about
         self._radius = 1.0
         self._snapshot: Snapshot | None = None
         self._next_copy = -math.inf

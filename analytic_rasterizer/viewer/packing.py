@@ -136,14 +136,14 @@ def pack_scene(
             raise ValueError(f"{name}: {field} must be finite")
 
     scene = scene.to("cpu")
-    geometry = torch.zeros(count, GEOMETRY_WIDTH)
+    geometry = torch.zeros(count, GEOMETRY_WIDTH, device="cpu")
     geometry[:, 0:3] = scene.means
     geometry[:, 3:4] = scene.opacities
     geometry[:, 4:7] = scene.scales
     geometry[:, 8:12] = _unit_quaternions(scene.rotations)
 
     used = 3 * (scene.sh_degree + 1) ** 2
-    harmonics = torch.zeros(count, -(-used // 4) * 4, dtype=torch.float16)
+    harmonics = torch.zeros(count, -(-used // 4) * 4, dtype=torch.float16, device="cpu")
     harmonics[:, :used] = scene.shs.reshape(count, -1)[:, :used].clamp(-LARGEST_HALF, LARGEST_HALF)
 
     center, radius = extent(scene)
@@ -166,7 +166,7 @@ def _unit_quaternions(rotations: torch.Tensor) -> torch.Tensor:
     """Quaternions of any length, normalised; zero becomes the identity, as in the rasterizer."""
     wide = rotations.double()
     length = wide.norm(dim=1, keepdim=True)
-    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=torch.float64, device="cpu")
     return torch.where(length > 0, wide / length.clamp_min(torch.finfo(torch.float64).tiny), identity).float()
 
 
@@ -184,7 +184,7 @@ def extent(scene: io.Scene) -> tuple[torch.Tensor, float]:
 def overview(center: torch.Tensor, radius: float) -> io.View:
     """A camera that looks along +z at the centre, with most of the scene in the picture."""
     width, height = DEFAULT_SIZE
-    w2c = torch.eye(4, dtype=torch.float64)
+    w2c = torch.eye(4, dtype=torch.float64, device="cpu")
     w2c[:3, 3] = -center
     w2c[2, 3] += 2 * radius * DEFAULT_FOCAL / height + 0.2
     return io.View("overview", width, height, DEFAULT_FOCAL, DEFAULT_FOCAL, w2c)
