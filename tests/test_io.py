@@ -168,7 +168,7 @@ def test_harmonics_of_degree_four_go_where_they_can_be_read(tmp_path):
     shs = torch.rand(5, 25, 3, generator=torch.Generator().manual_seed(0))
     scene = io.Scene(torch.ones(5, 3), torch.ones(5, 3), torch.ones(5, 4), torch.full((5, 1), 0.5), shs, 4)
     for name in ("a.ply", "a.spz"):
-        with pytest.raises(io.SceneError, match="only a .compressed.ply holds harmonics of degree 4"):
+        with pytest.raises(io.SceneError, match="holds harmonics of degree 4"):
             io.save_scene(tmp_path / name, scene)
         assert not (tmp_path / name).exists()
     io.save_scene(tmp_path / "a.compressed.ply", scene)
