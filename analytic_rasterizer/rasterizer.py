@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from torch.overrides import has_torch_function
 
 from . import (
     _C,
@@ -26,9 +27,9 @@ _call = _C.Call("rasterize")
 
 
 def _rasterize(**arguments: Any) -> tuple:
-    """The operator. torch.compile knows it, but not the quicker way to it."""
-    op = torch.ops.analytic_rasterizer.rasterize if torch.compiler.is_compiling() else _call
-    return op(**arguments)
+    """The operator. Its quicker way is not known to torch.compile, nor to what overrides functions of torch."""
+    quick = not torch.compiler.is_compiling() and not has_torch_function(tuple(arguments.values()))
+    return (_call if quick else torch.ops.analytic_rasterizer.rasterize)(**arguments)
 
 
 def rasterize_gaussians(

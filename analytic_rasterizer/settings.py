@@ -15,17 +15,17 @@ def whole_number(name: str, value: Any) -> int:
     """The whole number that `value` is: an int, or what programs have in its place, such as 24.0 or a tensor of one.
 
     Raises:
-        TypeError: It is not a number.
+        TypeError: It is not one number.
         ValueError: It is not whole.
     """
     if type(value) is int:
         return value
     message = f"{name} must be a whole number, got {value!r}"
-    if isinstance(value, (str, bytes)):
+    if isinstance(value, (str, bytes, bool)):
         raise TypeError(message)
     try:
         number = int(value)
-    except TypeError:
+    except (TypeError, RuntimeError):  # of tensors with several numbers, with some versions of torch
         raise TypeError(message) from None
     except (ValueError, OverflowError):  # of NaN and infinity
         raise ValueError(message) from None

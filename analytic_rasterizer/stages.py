@@ -214,7 +214,9 @@ def project_arguments(
 def _same_filter(a: GaussianRasterizationSettings, b: GaussianRasterizationSettings) -> bool:
     """Whether both widen the Gaussians by the same 3D filter, or neither does."""
     one, other = (s.effects.filter_3d if isinstance(s.effects, Effects) else None for s in (a, b))
-    return one is other or (one is not None and other is not None and torch.equal(one, other))
+    if one is other or one is None or other is None:
+        return one is other
+    return one.device == other.device and one.shape == other.shape and torch.equal(one, other)
 
 
 def bin(splats: Splats, *, background: torch.Tensor | None = None, keep: bool = True) -> TileLists:
@@ -366,7 +368,7 @@ def render_stages(
         **gaussians, **camera, bg=bg, alpha=bg_image is not None
     )
     if bg_image is not None:
-        color = before_background(color, images[0], bg_image)
+        color = before_background(color, images[0][None], bg_image)
     lists = dict(zip(_C.LISTS, saved))
     ids, splats, pairs = lists["ids"], lists["splats"], lists["pairs"]
     if means3D.is_cuda:  # every Gaussian has a row; here only those that are kept

@@ -381,7 +381,17 @@ def test_settings_in_other_forms(device, change):
     assert torch.equal(actual[1], expected[1])
 
 
-@pytest.mark.parametrize("value, error", [(24.5, ValueError), ("24", TypeError), (math.nan, ValueError)])
+@pytest.mark.parametrize(
+    "value, error",
+    [
+        (24.5, ValueError),
+        (math.nan, ValueError),
+        ("24", TypeError),
+        (True, TypeError),
+        (torch.ones(2), (TypeError, ValueError)),
+    ],
+    ids=str,
+)
 @pytest.mark.parametrize("name", ["image_height", "image_width", "sh_degree"])
 def test_sizes_and_degrees_are_whole_numbers(name, value, error):
     fields = CAMERA.fields(torch.float32, "cpu") | {name: value}

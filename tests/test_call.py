@@ -54,7 +54,7 @@ def test_arguments_by_place(device):
 
 CHANGES = {
     "missing": ({"bg": ...}, TypeError, "analytic_rasterizer::rasterize needs the argument bg"),
-    "unknown": ({"background": 1}, TypeError, "got an argument that it does not have"),
+    "unknown": ({"background": 1}, TypeError, "rasterize got background, which it does not have"),
     "no tensor": ({"shs": [1.0]}, TypeError, "shs must be a tensor, got list"),
     "none": ({"opacities": None}, TypeError, "opacities must be a tensor, got NoneType"),
     "no int": ({"image_height": "16"}, TypeError, "image_height must be an int, got str"),
@@ -77,9 +77,9 @@ def test_wrong_calls():
     with pytest.raises(RuntimeError, match="analytic_rasterizer::nothing"):
         _C.Call("nothing")
     three = [torch.zeros(4, n) for n in (3, 4, 1)]
-    with pytest.raises(TypeError, match="got an argument that it does not have, or has already"):
+    with pytest.raises(TypeError, match="activate got log_scales, which it does not have, or has by its place"):
         _C.Call("activate")(*three, log_scales=three[0])
-    with pytest.raises(TypeError, match="got an argument that it does not have, or has already"):
+    with pytest.raises(TypeError, match="activate takes 3 arguments, got 4"):
         _C.Call("activate")(*three, three[0])
     parameters = [torch.zeros(4, 3)]
     with pytest.raises(TypeError, match="is of a type that Call does not take"):  # lists
@@ -95,6 +95,27 @@ def test_fake_tensors():
     assert type(color).__name__ == "FakeTensor"
     assert color.shape == (3, CAMERA.image_height, CAMERA.image_width)
     assert radii.shape == (20,)
+
+
+class Logged(torch.Tensor):
+    """A tensor that sees the functions of torch that it goes through."""
+
+    seen: list = []
+
+    @classmethod
+    def __torch_function__(cls, function, types, args=(), kwargs=None):
+        cls.seen.append(function)
+        return super().__torch_function__(function, types, args, kwargs)
+
+
+def test_what_overrides_functions_of_torch_sees_the_op(device):
+    scene = scenes.cast(scenes.random_scene(1, 20, degree=1), torch.float32, device) | {"means2D": None}
+    rasterizer = ar.GaussianRasterizer(CAMERA.settings(torch.float32, device))
+    expected, _ = rasterizer(**scene)
+    made, _ = rasterizer(**scene | {"means3D": scene["means3D"].as_subclass(Logged)})
+    assert isinstance(made, Logged)
+    assert torch.equal(made.as_subclass(torch.Tensor), expected)
+    assert any("rasterize" in str(function) for function in Logged.seen)
 
 
 def test_torch_compile(device):

@@ -69,7 +69,8 @@ def test_gradients_are_right_and_finite_where_scales_vanish():
 
 
 @pytest.mark.parametrize("wrong", [math.nan, -0.1])
-def test_a_gaussian_whose_filter_makes_no_sense_is_culled(wrong):
+def test_a_gaussian_whose_filter_makes_no_sense_is_culled(wrong, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # for the file that debug leaves
     scene = {name: v for name, v in scenes.random_scene(1, 20).items() if name != "means2D"}
     width = torch.full((20,), 0.05, dtype=F64)
     width[3] = wrong

@@ -1257,16 +1257,21 @@ def test_resuming_takes_the_points_of_the_start_or_none(synthetic, trained, tmp_
     began, alone = (["train", str(synthetic), "--out", name, *small] for name in ("began", "alone"))
     assert cli.main([*began, "--points", "a.ply"]) == 0
     assert cli.main([*alone, "--random-points", "50"]) == 0
-    assert json.loads((tmp_path / "began" / files.OPTIONS).read_text())["source"]["points"] == "a.ply"
+    assert json.loads((tmp_path / "began" / files.OPTIONS).read_text())["source"]["points"] == str(tmp_path / "a.ply")
     for again in ([], ["--points", str(tmp_path / "a.ply")], ["--points", "a.ply"]):
         assert cli.main([*began, "--resume", *again]) == 0
     written = {path: path.read_bytes() for folder in ("began", "alone") for path in (tmp_path / folder).iterdir()}
     capsys.readouterr()
-    for command, expected in ((began, "a.ply or None"), (alone, "None")):
+    for command, expected in ((began, f"{tmp_path / 'a.ply'} or None"), (alone, "None")):
         assert cli.main([*command, "--resume", "--points", "b.ply"]) == 2
         error = f"error: points must be {expected} where a training is resumed, got b.ply\n"
         assert capsys.readouterr().err == error
     assert all(path.read_bytes() == content for path, content in written.items())
+    # A checkpoint from before they were noted.
+    state = files.read_checkpoint(tmp_path / "alone" / files.CHECKPOINT)
+    del state["source"]["points"]
+    files.write_checkpoint(tmp_path / "alone" / files.CHECKPOINT, state)
+    assert cli.main([*alone, "--resume", "--points", "b.ply"]) == 0
 
 
 def test_ssim_is_that_of_torchmetrics():

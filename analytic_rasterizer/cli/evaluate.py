@@ -59,7 +59,7 @@ def run_on(ranks: Ranks, args) -> None:
     except (ValueError, KeyError) as error:
         raise io.SceneError(f"{folder / OPTIONS}: not what `train` writes ({error})") from None
     scales = tuple(dict.fromkeys(args.scales or options.scales))
-    check_scales(scales)  # raises before anything is read
+    check_scales(scales)  # raises before the capture is read
     footprints = [str(resolve_footprint(name)) for name in args.footprints or [options.footprint]]
     capture = load_capture(args.data or source["scene"], source["images"], source["test_every"])
     if not capture.test:

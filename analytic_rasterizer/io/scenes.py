@@ -160,7 +160,8 @@ def _check_ply_header(path: Path) -> None:
     words = lines[elements[0]].split()
     count = int(words[2]) if len(words) == 3 and words[2].isdecimal() else -1
     if count < 0 or 4 * count * len(kinds) > path.stat().st_size:
-        raise SceneError(f"expected as many vertices as the file is long, got {' '.join(words[2:])}")
+        size = path.stat().st_size
+        raise SceneError(f"expected a number of vertices that fits {size} bytes, got {' '.join(words[2:])}")
 
 
 def ply_header(path: Path) -> list[str]:

@@ -194,7 +194,7 @@ class TrainingOptions:
         check_scales(self.scales)
         check_scales(self.scale_repeats, "scale_repeats")
         _check("scales", len(set(self.scales)) == len(self.scales), "different from each other", self.scales)
-        # The order of a pass is drawn from seed 2^24 + its number, in 64 bits with or without a sign.
+        # The order of a pass is drawn from seed * 2^24 + its number, in 64 bits with or without a sign.
         _check("seed", -(2**39) <= self.seed < 2**40, "-2^39 to 2^40 - 1", self.seed)
         fits = len(self.scale_repeats) == len(self.scales)
         _check("scale_repeats", fits, f"{len(self.scales)} numbers, one per scale", self.scale_repeats)

@@ -303,10 +303,11 @@ def points_of_source(points, state: dict[str, Any] | None) -> str | None:
 
     Raises ValueError for other points than it began with, which would have no effect.
     """
-    if state is None:
-        return None if points is None else str(points)
-    before = state["source"].get("points")
-    if points is not None and (before is None or Path(points).resolve() != Path(before).resolve()):
+    given = None if points is None else str(Path(points).resolve())
+    if state is None or "points" not in state["source"]:  # of an earlier version: nobody knows
+        return given
+    before = state["source"]["points"]
+    if points is not None and given != before:
         expected = "None" if before is None else f"{before} or None"
         raise ValueError(f"points must be {expected} where a training is resumed, got {points}")
     return before

@@ -36,10 +36,10 @@ int64_t tile_sort_scratch(int64_t capacity, TileGrid grid) {
 
 int tile_sort_result(TileGrid grid) { return tile_passes(grid) % 2; }
 
-void count_depths(const DepthSort& p, void* memory, ZeroedMemory one, ZeroedMemory other, cudaStream_t stream) {
+void count_depths(const DepthSort& p, void* memory, ZeroedMemory rest, ZeroedMemory of_tiles, cudaStream_t stream) {
   const DepthScratch scratch(static_cast<uint32_t*>(memory), p.n, kDepthPasses);
   launch(count_depths_kernel, {kCountBlocks, kCountThreads}, stream, p.keys[0], p.ranges, p.n, scratch.histograms,
-         p.counts, one, other);
+         p.counts, rest, of_tiles);
 }
 
 void sort_by_depth(const DepthSort& p, void* memory, cudaStream_t stream) {

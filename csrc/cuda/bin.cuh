@@ -23,13 +23,13 @@ __device__ inline void set_to_zero(const ZeroedMemory& memory, int64_t thread, i
 /// how many pairs. Also sets to zero what the kernels behind this one count in.
 __global__ void __launch_bounds__(kCountThreads)
     count_depths_kernel(const uint32_t* keys, const PairRange* ranges, int64_t n, uint32_t* histograms, Counts* counts,
-                        const ZeroedMemory one, const ZeroedMemory other) {
+                        const ZeroedMemory rest, const ZeroedMemory of_tiles) {
   __shared__ uint32_t local[kDepthHistogramWords];
   for (int b = threadIdx.x; b < kDepthHistogramWords; b += kCountThreads) local[b] = 0;
   const int64_t thread = int64_t(blockIdx.x) * kCountThreads + threadIdx.x;
   const int64_t stride = int64_t(gridDim.x) * kCountThreads, rounded = (n + 31) / 32 * 32;
-  set_to_zero(one, thread, stride);
-  set_to_zero(other, thread, stride);
+  set_to_zero(rest, thread, stride);
+  set_to_zero(of_tiles, thread, stride);
   __syncthreads();
   unsigned long long pairs = 0, splats = 0;
   for (int64_t i = thread; i < rounded; i += stride) {

@@ -366,8 +366,8 @@ void weight_vjp(int footprint, const WeightParams<double>& p, cudaStream_t strea
 /// Most splats, and most pairs, that can be sorted: 2^30 - 1.
 int64_t max_items();
 
-/// Bytes of scratch memory, all of which must be zero; multiples of 16. That of the sort by depth begins with its
-/// histograms.
+/// Bytes of scratch memory, multiples of 16. That of the sort by depth begins with its histograms, which must be zero
+/// before count_depths; this sets the rest, and the other two, to zero.
 int64_t depth_sort_scratch(int64_t n);
 int64_t tile_sort_scratch(int64_t capacity, TileGrid grid);
 /// Threads of a block of emit_pairs, and splats of each: the more splats a block has, the fewer blocks wait in a row
@@ -390,9 +390,9 @@ struct ZeroedMemory {
   void* data;
   int64_t bytes;
 };
-/// First adds to the counts, for which only the histograms at the beginning of the scratch must be zero, and sets what
-/// later kernels need to zero; then sorts.
-void count_depths(const DepthSort& p, void* scratch, ZeroedMemory one, ZeroedMemory other, cudaStream_t stream);
+/// First adds to the histograms and the counts, which whatever made the keys has set to zero, and sets the rest of the
+/// scratch to zero; then sorts. Once for each time that keys are made.
+void count_depths(const DepthSort& p, void* scratch, ZeroedMemory rest, ZeroedMemory of_tiles, cudaStream_t stream);
 void sort_by_depth(const DepthSort& p, void* scratch, cudaStream_t stream);
 
 void emit_pairs(const EmitParams& p, cudaStream_t stream);

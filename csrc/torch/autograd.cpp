@@ -146,7 +146,7 @@ bool wants_gradient(const Op& op, const Stack& stack, size_t first) {
   return false;
 }
 
-/// Raises if a tensor has a tangent: without a derivative forwards it would be lost without a word.
+/// Raises if a tensor has a tangent: the ops have no derivative in forward mode, so that it would be dropped silently.
 void refuse_tangents(const Op& op, const Stack& stack, size_t first) {
   for (const size_t i : op.tensors) {
     const IValue& value = stack[first + i];

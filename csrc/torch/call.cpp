@@ -1,5 +1,6 @@
 // A way for Python to an op that takes it a fraction of the time of torch.ops, which goes through the schema of an op
-// for every call: for ops with many arguments that are called once per frame. The dispatcher is the same.
+// for every call: for ops with many arguments that are called once per frame. The dispatcher is the same, and with it
+// autograd and modes that trace; what overrides functions of torch (__torch_function__) is passed by.
 #include "torch/call.h"
 
 #include <ATen/core/dispatch/Dispatcher.h>
@@ -101,7 +102,7 @@ class Call {
         fail("needs the argument " + std::string(parameter.name));
       }
     }
-    if (taken != by_place.size() + by_name.size()) fail("got an argument that it does not have, or has already");
+    if (taken != by_place.size() + by_name.size()) fail_with_more(by_place, by_name);
     {
       const py::gil_scoped_release no_gil;
       op_.callBoxed(stack);
@@ -113,6 +114,14 @@ class Call {
   }
 
  private:
+  [[noreturn]] void fail_with_more(const py::args& by_place, const py::kwargs& by_name) const {
+    for (const auto& [name, value] : by_name) {
+      bool free = false;
+      for (size_t k = by_place.size(); k < parameters_.size(); ++k) free = free || parameters_[k].name.equal(name);
+      if (!free) fail("got " + std::string(py::str(name)) + ", which it does not have, or has by its place");
+    }
+    fail("takes " + std::to_string(parameters_.size()) + " arguments, got " + std::to_string(by_place.size()));
+  }
   [[noreturn]] void fail(const std::string& why) const { throw py::type_error(op_.schema().name() + " " + why); }
 
   c10::OperatorHandle op_;
@@ -123,8 +132,8 @@ class Call {
 
 void define_call(py::module_& m) {
   py::class_<Call>(m, "Call",
-                   "An op of torch.ops.analytic_rasterizer, to be called with keyword arguments. Takes the host less "
-                   "time than torch.ops; torch.compile does not look into it.")
+                   "An op of torch.ops.analytic_rasterizer, which returns a tuple of its results. Takes the host less "
+                   "time than torch.ops; torch.compile and __torch_function__ do not know it.")
       .def(py::init<const std::string&>(), py::arg("name"))
       .def("__call__", &Call::operator());
 }
