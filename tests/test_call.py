@@ -1,6 +1,7 @@
 """`_C.Call`, the quick way from Python to an op: the same results, gradients and errors as by torch.ops."""
 
 import re
+from typing import ClassVar
 
 import pytest
 import scenes
@@ -100,7 +101,7 @@ def test_fake_tensors():
 class Logged(torch.Tensor):
     """A tensor that sees the functions of torch that it goes through."""
 
-    seen: list = []
+    seen: ClassVar[list] = []
 
     @classmethod
     def __torch_function__(cls, function, types, args=(), kwargs=None):
