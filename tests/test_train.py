@@ -331,6 +331,14 @@ def test_points_of_a_ply(tmp_path, layout):
         training.load_points(tmp_path / "p.ply")
 
 
+def test_a_list_of_cameras_is_no_capture(tmp_path):
+    view = io.View("a", 40, 30, 50.0, 50.0, looking_at_origin(0.1))
+    io.save_views(tmp_path / "transforms_train.json", [view])
+    io.save_views(tmp_path / "transforms_test.json", [view])
+    with pytest.raises(io.SceneError, match=r"transforms_\w+.json: expected a transforms file, .* got a list of"):
+        captures.load_capture(tmp_path)
+
+
 def test_points_of_a_text_with_other_line_ends(tmp_path):
     lines = ["ply", "format ascii 1.0", "element vertex 2", *(f"property float {axis}" for axis in "xyz"), "end_header"]
     (tmp_path / "p.ply").write_bytes("\r\n".join([*lines, "1 2 3", "4 5 6", ""]).encode())

@@ -107,10 +107,13 @@ def extent_of(views: list[io.View]) -> float:
 def transforms(path: Path) -> list[Photograph]:
     """The views of a transforms file and where their pictures are, in the order of the file.
 
-    Raises io.SceneError for what `io.load_views` refuses, and for lens distortion, which that ignores.
+    Raises io.SceneError for what `io.load_views` refuses, for lists of cameras, which it reads too, and for lens
+    distortion, which it ignores.
     """
     views = io.load_views(path)
     data = json.loads(path.read_text(encoding="utf-8-sig"))
+    if not isinstance(data, dict):
+        raise io.SceneError(f"{path}: expected a transforms file, which says where pictures are, got a list of cameras")
     found = []
     for i, (view, frame) in enumerate(zip(views, data["frames"])):
         check_lens(data | frame, f"{path}: frame {i}")
