@@ -43,14 +43,10 @@ def gaussian_arguments(
     check_tensors(None, means3D=means3D)
     device = means3D.device
     check_device(device)
-    check_tensors(device, opacities=opacities)
     for name, tensor in optional.items():
-        if tensor is None:
-            continue
         if isinstance(tensor, torch.Tensor) and tensor.dim() == 1 and tensor.numel() == 0:
             optional[name] = None
-        elif not isinstance(tensor, torch.Tensor) or tensor.device != device:
-            check_tensors(device, **{name: tensor})  # raises
+    check_tensors(device, opacities=opacities, **{name: t for name, t in optional.items() if t is not None})
     effects = settings.effects
     if isinstance(effects, Effects) and effects.filter_3d is not None:
         if optional["scales"] is None:

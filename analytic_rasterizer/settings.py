@@ -20,17 +20,20 @@ def whole_number(name: str, value: Any) -> int:
     """
     if type(value) is int:
         return value
-    message = f"{name} must be a whole number, got {value!r}"
+
+    def wrong(error: type[Exception]) -> Exception:  # made where it is raised: a tensor's text waits for its device
+        return error(f"{name} must be a whole number, got {value!r}")
+
     if isinstance(value, (str, bytes, bool)):
-        raise TypeError(message)
+        raise wrong(TypeError)
     try:
         number = int(value)
     except (TypeError, RuntimeError):  # of tensors with several numbers, with some versions of torch
-        raise TypeError(message) from None
+        raise wrong(TypeError) from None
     except (ValueError, OverflowError):  # of NaN and infinity
-        raise ValueError(message) from None
+        raise wrong(ValueError) from None
     if number != value:
-        raise ValueError(message)
+        raise wrong(ValueError)
     return number
 
 

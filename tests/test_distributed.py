@@ -888,10 +888,7 @@ def test_another_default_device_changes_nothing():
     settings = [scenes.Camera(sh_degree=1).settings(torch.float32, "cpu")] * 2
     scene = scene_of(torch.float32, "cpu")
     expected = distributed.rasterize(settings, **scene).views
-    torch.set_default_device("meta")
-    try:
+    with torch.device("meta"):
         made = distributed.rasterize(settings, **scene).views
-    finally:
-        torch.set_default_device(None)
     assert len(made) == len(expected) == 2
     assert all(torch.equal(a.image, b.image) for a, b in zip(made, expected))

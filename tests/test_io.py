@@ -415,11 +415,8 @@ def test_another_default_device_changes_nothing(tmp_path):
     """Files are read to the CPU. "meta" stands for any other device."""
     io.save_scene(tmp_path / "a.ply", scene := io.load_scene(hand_written(tmp_path)))
     io.save_views(tmp_path / "v.json", [io.View("a", 40, 30, 50.0, 51.0, torch.eye(4, dtype=torch.float64))])
-    torch.set_default_device("meta")
-    try:
+    with torch.device("meta"):
         again, (view,) = io.load_scene(tmp_path / "a.ply"), io.load_views(tmp_path / "v.json")
-    finally:
-        torch.set_default_device(None)
     assert again.means.device.type == view.w2c.device.type == "cpu"
     assert torch.equal(again.means, scene.means)
 

@@ -157,10 +157,9 @@ def _check_ply_header(path: Path) -> None:
     rest = sum(name.startswith("f_rest_") for name in kinds)
     if rest not in (0, 9, 24, 45):
         raise SceneError(f"expected 0, 9, 24 or 45 f_rest properties (SH degree 0 to 3), got {rest}")
-    words = lines[elements[0]].split()
+    words, size = lines[elements[0]].split(), path.stat().st_size
     count = int(words[2]) if len(words) == 3 and words[2].isdecimal() else -1
-    if count < 0 or 4 * count * len(kinds) > path.stat().st_size:
-        size = path.stat().st_size
+    if count < 0 or 4 * count * len(kinds) > size:
         raise SceneError(f"expected a number of vertices that fits {size} bytes, got {' '.join(words[2:])}")
 
 

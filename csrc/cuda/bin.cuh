@@ -7,7 +7,6 @@
 
 namespace ar::cuda {
 
-// With keys as depth_key makes them the last of the passes has nothing to do for depths of 1/8 to 8192.
 using DepthDigits = Digits<kDepthBits>;
 using DepthScratch = SortScratch<kDepthBits>;
 inline constexpr int kCountThreads = 512, kCountBlocks = 132 * 2;

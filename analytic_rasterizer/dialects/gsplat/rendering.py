@@ -260,7 +260,7 @@ def _camera_settings(
     background = viewmats.new_zeros(3)  # which `project` does not read
     views, intrinsics = viewmats.reshape(-1, 4, 4).double(), Ks.reshape(-1, 3, 3).double()
     # gsplat reads no more of a view than its first three rows. The last one is w of an orthographic camera.
-    last = torch.cat([views.new_zeros(len(views), 1, 3), views.new_ones(len(views), 1, 1)], 2)
+    last = torch.eye(4, dtype=views.dtype, device=views.device)[3].expand(len(views), 1, 4)
     views = torch.cat([views[:, :3], last], 1)
     fx, fy, cx, cy = (intrinsics[:, row, column] for row, column in ((0, 0), (1, 1), (0, 2), (1, 2)))
     scale = torch.stack([2 * fx / width, 2 * fy / height], 1)
