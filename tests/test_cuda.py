@@ -423,6 +423,30 @@ def test_nothing_to_see_has_no_gradient(name):
     assert torch.equal(run_without_gradient(nothing, settings, "cuda"), actual.color)
 
 
+def fill_free_memory():
+    """With numbers that show where they are read, or where nothing is written."""
+    parts = [torch.full((1 << k,), math.nan, device="cuda") for k in range(8, 23) for _ in range(4)]
+    torch.cuda.synchronize()
+    del parts
+
+
+@each_path
+def test_gradients_of_many_culled_gaussians(variant):
+    """In runs of a hundred: warps with nothing but culled Gaussians, whose zeros are written beside blend_vjp, and
+    warps with some."""
+    scene, settings = scene32(), settings_for(variant)
+    culled = torch.arange(len(scene["means3D"])) // 100 % 3 > 0
+    scene["means3D"] = scene["means3D"] - 50.0 * culled[:, None] * torch.tensor([0.0, 0.0, 1.0])
+    compare(scene, settings)
+    for _ in range(3):
+        fill_free_memory()
+        actual = run(scene, settings, "cuda")
+        assert (actual.radii[culled] == 0).all()
+        for name, grad in actual.grads.items():
+            assert (grad[culled] == 0).all(), name
+            assert grad.isfinite().all(), name
+
+
 # --- the same bits every time ------------------------------------------------------------------
 
 
@@ -660,6 +684,40 @@ def test_cuda_graph(variant):
         torch.cuda.synchronize()
         assert torch.equal(color.cpu(), run_without_gradient(case, settings, "cuda"))
         assert torch.equal(radii.cpu(), run(case, settings, "cuda").radii)
+
+
+@each_path
+def test_cuda_graph_with_gradients(variant):
+    """Streams beside the caller's are part of what is captured, of both passes."""
+    scene, settings = scene32(), settings_for(variant)
+    leaves = scenes.leaves(scenes.to(scene, "cuda"))
+    rasterizer = ar.GaussianRasterizer(scenes.settings_to(settings, "cuda"))
+    weights = torch.linspace(-1, 1, 3 * CAMERA.image_height * CAMERA.image_width, device="cuda")
+    weights = weights.reshape(3, CAMERA.image_height, CAMERA.image_width)
+
+    def step():
+        color, _ = rasterizer(**leaves)
+        return color, torch.autograd.grad((color * weights).sum(), list(leaves.values()))
+
+    side = torch.cuda.Stream()
+    side.wait_stream(torch.cuda.current_stream())
+    with torch.cuda.stream(side):
+        for _ in range(3):
+            step()
+    torch.cuda.current_stream().wait_stream(side)
+    torch.cuda.synchronize()
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph):
+        color, grads = step()
+    for factor in (1.0, 0.7, 1.0):
+        with torch.no_grad():
+            leaves["opacities"].copy_(scene["opacities"] * factor)
+        graph.replay()
+        torch.cuda.synchronize()
+        expected_color, expected = step()
+        assert torch.equal(color, expected_color)
+        for name, ours, theirs in zip(leaves, grads, expected, strict=True):
+            assert torch.equal(ours, theirs), name
 
 
 @each_path

@@ -258,10 +258,9 @@ __device__ inline void put_sum(float* rows, int width, bool overflow, int32_t ro
 /// side, as a few tiles of many samples would else keep the device waiting.
 template <class F, class Boxes, class Function> void for_each_tile_footprint(cudaStream_t stream, Function&& f) {
   if constexpr (std::is_same_v<F, Adaptive>) {
-    SideStreams sides(stream);
+    const SideStreams<3> sides(stream);
     int k = 0;
     for_each_footprint(Boxes{}, [&](auto tile_footprint) { f(tile_footprint, sides.stream(k++)); });
-    sides.join();
   } else {
     f(PixelsOf<F>{}, stream);
   }

@@ -29,6 +29,9 @@ void project_rows(const ProjectRowsParams& p, cudaStream_t stream) {
 void project_vjp(const ProjectVjpParams& p, cudaStream_t stream) {
   launch_rows(project_vjp_kernel<Plain>, project_vjp_kernel<Full>, p, stream);
 }
+void zero_culled_grads(const ZeroGradsParams& p, cudaStream_t stream) {
+  launch(zero_culled_grads_kernel, {kZeroBlocks, kProjectThreads}, stream, p);
+}
 void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream) {
   if (p.add) return launch_rows(add_project_rows_vjp_kernel<Plain>, add_project_rows_vjp_kernel<Full>, p, stream);
   launch_rows(project_rows_vjp_kernel<Plain>, project_rows_vjp_kernel<Full>, p, stream);

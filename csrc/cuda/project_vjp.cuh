@@ -1,4 +1,5 @@
-// Kernels of project_vjp, project_rows_vjp and row_grads, a thread per Gaussian or row; and of sum_channels.
+// Kernels of project_vjp, project_rows_vjp and row_grads, a thread per Gaussian or row; of zero_culled_grads; and of
+// sum_channels.
 #pragma once
 
 #include "cuda/project.cuh"
@@ -125,6 +126,8 @@ __device__ inline void store_warp_sums(const CameraGrad<float>& grad, float* to)
 
 /// What project_vjp starts from: sums over pairs.
 struct FromPairs {
+  /// Whether another kernel writes the zeros of a warp without pairs.
+  static constexpr bool kZeroed = true;
   const ProjectVjpParams& params;
 
   /// What is known of Gaussian i before its gradient is asked for. count: 0 if it has none.
@@ -156,6 +159,7 @@ struct FromPairs {
 
 /// What project_rows_vjp starts from: gradients with respect to public rows.
 struct FromRows {
+  static constexpr bool kZeroed = false;
   const ProjectRowsVjpParams& params;
 
   __device__ PairRange range(int64_t i) const {
@@ -198,7 +202,7 @@ __device__ void project_vjp_body(const Params& params, const From& from, const O
   const int n = int(min(int64_t(32), params.gaussians.n - first));
   float* camera_grads = params.camera_grads ? params.camera_grads + first / 32 * kCameraGradWidth : nullptr;
   if (lit == 0) {
-    if (!Out::kAdd) zero_grads_of_warp(params.gaussians, out, first, n);
+    if (!Out::kAdd && !From::kZeroed) zero_grads_of_warp(params.gaussians, out, first, n);
     if (Cam::kFull && camera_grads) zero_rows(camera_grads, kCameraGradWidth);
     return;
   }
@@ -245,6 +249,24 @@ template <class Cam>
 __global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kProjectVjpBlocks)
     add_project_rows_vjp_kernel(const ProjectRowsVjpParams params) {
   project_vjp_body<Cam>(params, FromRows{params}, AddedGrads<float>{params.grads});
+}
+
+/// Blocks of zero_culled_grads_kernel: one for each of the 132 multiprocessors of an H200. So few, and of so few
+/// registers that sixteen would fit, find room beside the blocks of blend_vjp, which is bound by its instructions while
+/// this waits for memory.
+inline constexpr int kZeroBlocks = 132, kZeroBlocksThatFit = 16;
+
+__global__ void __launch_bounds__(kProjectThreads, kZeroBlocksThatFit)
+    zero_culled_grads_kernel(const ZeroGradsParams params) {
+  const int64_t n = params.gaussians.n, step = int64_t(gridDim.x) * kProjectThreads;
+  const auto count_of = [&](int64_t i) { return i < n ? params.ranges[i].count : 0; };
+  int64_t first = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x - lane_id();
+  int count = count_of(first + lane_id());
+  for (; first < n; first += step) {
+    const bool any = __any_sync(kAllLanes, count > 0);
+    count = count_of(first + step + lane_id());  // the next one's, so that it arrives during the stores
+    if (!any) zero_grads_of_warp(params.gaussians, params.grads, first, int(min(int64_t(32), n - first)));
+  }
 }
 
 __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGradsParams params) {

@@ -1,31 +1,30 @@
 // Streams beside the caller's, for kernels that need not wait for each other.
 #pragma once
 
-#include <cuda_runtime.h>
+#include <cuda_runtime_api.h>
 
 #include <map>
 
 namespace ar::cuda {
 
-/// Work on `stream(k)` between construction and join() runs side by side, after all that was on the caller's
-/// stream before; what follows there waits for it. Each thread has streams of its own.
-class SideStreams {
+/// Work on `stream(k)` runs side by side while this lives, after all that was on the caller's stream before; what
+/// follows there waits for it. Each thread has streams of its own. Those of another kCount are others, so that a fork
+/// of one does not wait for what runs on the other's.
+template <int kCount> class SideStreams {
  public:
-  static constexpr int kCount = 3;
-
   explicit SideStreams(cudaStream_t caller) : own_(of_this_thread()), caller_(caller) {
     cudaEventRecord(own_.fork, caller);
     for (cudaStream_t side : own_.streams) cudaStreamWaitEvent(side, own_.fork, 0);
   }
-  /// The caller's for k = 0, then the others in turn.
-  cudaStream_t stream(int k) const { return k == 0 ? caller_ : own_.streams[(k - 1) % kCount]; }
-
-  void join() {
+  SideStreams(const SideStreams&) = delete;
+  ~SideStreams() {
     for (int k = 0; k < kCount; ++k) {
       cudaEventRecord(own_.joins[k], own_.streams[k]);
       cudaStreamWaitEvent(caller_, own_.joins[k], 0);
     }
   }
+  /// The caller's for k = 0, then the others in turn.
+  cudaStream_t stream(int k) const { return k == 0 ? caller_ : own_.streams[(k - 1) % kCount]; }
 
  private:
   struct Own {
@@ -33,11 +32,15 @@ class SideStreams {
     cudaEvent_t fork, joins[kCount];
 
     Own() {
+      // Allowed while a graph is captured too: nothing here is part of it.
+      cudaStreamCaptureMode mode = cudaStreamCaptureModeRelaxed;
+      cudaThreadExchangeStreamCaptureMode(&mode);
       cudaEventCreateWithFlags(&fork, cudaEventDisableTiming);
       for (int k = 0; k < kCount; ++k) {
         cudaStreamCreateWithFlags(&streams[k], cudaStreamNonBlocking);
         cudaEventCreateWithFlags(&joins[k], cudaEventDisableTiming);
       }
+      cudaThreadExchangeStreamCaptureMode(&mode);
     }
     Own(const Own&) = delete;
     ~Own() {

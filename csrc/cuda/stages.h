@@ -304,6 +304,13 @@ struct ProjectVjpParams : ar::ProjectVjpParams<float> {
   float* camera_grads;  ///< [warps_of(n), kCameraGradWidth] CameraGrad of each 32 Gaussians, or null
 };
 
+/// What zero_culled_grads writes: gradients of those Gaussians that project_vjp leaves out.
+struct ZeroGradsParams {
+  Gaussians<float> gaussians;
+  GaussianGrads<float> grads;
+  const PairRange* ranges;  ///< [n]
+};
+
 struct ProjectRowsVjpParams {
   CameraView<float> camera;
   Gaussians<float> gaussians;
@@ -323,7 +330,10 @@ AR_HD constexpr int64_t warps_of(int64_t n) { return (n + 31) / 32; }
 void project(const ProjectParams& p, cudaStream_t stream);
 void project_rows(const ProjectRowsParams& p, cudaStream_t stream);
 void shape_rows(const ShapeRowsParams& p, cudaStream_t stream);
+/// Leaves out the gradients of each 32 Gaussians in a row none of which has pairs. zero_culled_grads writes them,
+/// before it or beside it.
 void project_vjp(const ProjectVjpParams& p, cudaStream_t stream);
+void zero_culled_grads(const ZeroGradsParams& p, cudaStream_t stream);
 void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream);
 void row_grads(const RowGradsParams& p, cudaStream_t stream);
 void sum_channels(const SumChannelsParams& p, cudaStream_t stream);

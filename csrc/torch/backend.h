@@ -189,6 +189,9 @@ class Backend {
   virtual void inspect(const ListTensors& lists, const Pass& pass, const SummaryTensors& summary) = 0;
 
   // Backward.
+  /// Before blend_vjp, and beside it where the device can: zeros in `grads` for what project_vjp, which must follow,
+  /// leaves out.
+  virtual void zero_culled_grads(const Inputs&, const ListTensors&, const Pass&, const Grads&) {}
   virtual PairSums blend_vjp(const ListTensors& lists, const BlendState& state, const Pass& pass,
                              const ChannelTensors& channels, const ImageTensors& dL_dimage, MeanSums mean_sums) = 0;
   /// Writes `grads`; returns sums of the camera's gradient, (parts, kCameraGradWidth), if it is wanted.

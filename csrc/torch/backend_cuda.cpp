@@ -9,7 +9,9 @@
 #include <c10/cuda/CUDAStream.h>
 
 #include <algorithm>
+#include <optional>
 
+#include "cuda/side_streams.h"
 #include "torch/cuda_frames.h"
 #include "torch/cuda_views.h"
 #include "torch/views.h"
@@ -203,6 +205,18 @@ class CudaBackend final : public Backend {
     check_stage("inspect", false);
   }
 
+  void zero_culled_grads(const Inputs& in, const ListTensors& lists, const Pass& pass, const Grads& grads) override {
+    cuda::ZeroGradsParams p = {};
+    p.gaussians = gaussians_of<float>(in);
+    p.grads = grads_of<float>(in, grads);
+    p.ranges = const_structs_of<cuda::PairRange>(lists.splat_offsets);
+    if (p.gaussians.n == 0) return;
+    // Launched before blend_vjp, whose blocks would else all have to be placed first.
+    cuda::zero_culled_grads(p, fork());
+    if (pass.debug) join();
+    check_stage("zero_culled_grads", pass.debug);
+  }
+
   PairSums blend_vjp(const ListTensors& lists, const BlendState& state, const Pass& pass,
                      const ChannelTensors& channels, const ImageTensors& dL_dimage, MeanSums mean_sums) override {
     check_counts(lists);
@@ -279,6 +293,7 @@ class CudaBackend final : public Backend {
     p.sums = pair_sums_of(lists, sums.pairs);
     const Tensor camera_grads = make_camera_grads(p, grads);
     cuda::project_vjp(p, stream_);
+    join();
     check_stage("project_vjp", pass.debug);
     return camera_grads;
   }
@@ -320,6 +335,11 @@ class CudaBackend final : public Backend {
   double lap() override { return laps_.next(stream_); }
 
  private:
+  /// A stream for what may run beside the caller's until join(). An exception in between joins too, with this backend's
+  /// end.
+  cudaStream_t fork() { return side_.emplace(stream_).stream(1); }
+  void join() { side_.reset(); }
+
   /// Raises what a launch left behind; with `wait` waits for the stage to end first.
   void check_stage(const char* stage, bool wait) const {
     cudaError_t error = cudaGetLastError();
@@ -440,6 +460,7 @@ class CudaBackend final : public Backend {
   c10::cuda::CUDAStream stream_;
   at::TensorOptions floats_, ints_, longs_, bytes_;
   Laps laps_;
+  std::optional<cuda::SideStreams<1>> side_;
 };
 
 }  // namespace

@@ -138,12 +138,15 @@ Results rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
         dL_dimage.others[k] = gradient_of(arguments.dL_doutputs, place++, name.c_str(), a.means3D, {height, width});
     }
 
-    const std::unique_ptr<Backend> backend = make_backend(a.means3D);
     const MeanSums mean_sums = needs[1] && a.means2D ? mean_sums_of(a) : MeanSums::kNone;
-    const PairSums sums = backend->blend_vjp(saved.lists, saved.state, pass, channels, dL_dimage, mean_sums);
-    // Memory is asked for where the device has something to do meanwhile.
+    // Memory for the gradients is asked for before blend_vjp: they may be written beside it, and what it gives back
+    // when it returns is still in use on the device. And before the backend, which at its end waits for what it has
+    // begun.
     Grads grads = make_grads(a, needs);
     grads.mean_sums = mean_sums;
+    const std::unique_ptr<Backend> backend = make_backend(a.means3D);
+    backend->zero_culled_grads(a, saved.lists, pass, grads);
+    const PairSums sums = backend->blend_vjp(saved.lists, saved.state, pass, channels, dL_dimage, mean_sums);
     const Tensor camera = backend->project_vjp(a, saved.lists, pass, sums, channels, grads);
     if (grads.with_camera) set_camera_grads(camera, needs, grads);
     Tensor background, features;

@@ -1,5 +1,5 @@
-// The kernel of project_vjp, run on the host: for rows of visible and culled Gaussians, whatever they are made of, it
-// writes what the core's functions give one Gaussian after the other, to the bit.
+// The kernels of project_vjp, run on the host: for rows of visible and culled Gaussians, whatever they are made of,
+// they write what the core's functions give one Gaussian after the other, to the bit.
 #include <random>
 
 #include "cuda_on_host.h"
@@ -119,6 +119,18 @@ TEST_P(ProjectVjpKernel, WritesWhatTheCoreGives) {
   p.grads = results.grads;
   cuda_on_host::launch((kCount + kProjectThreads - 1) / kProjectThreads, kProjectThreads,
                        [&] { project_vjp_kernel<Camera<float>>(p); });
+  // What project_vjp leaves out, and only that: one block, which goes on to the last warps.
+  Outputs zeros(g);
+  const auto zero = [&](const Outputs& out) {
+    const ZeroGradsParams to_zero = {g, out.grads, ranges.data()};
+    cuda_on_host::launch(1, kProjectThreads, [&] { zero_culled_grads_kernel(to_zero); });
+  };
+  zero(zeros);
+  for (int i = 0; i < kCount; ++i) {
+    ASSERT_EQ(std::isnan(results.means[3 * i]), i / 32 == 1) << i;
+    ASSERT_EQ(std::isnan(zeros.means[3 * i]), i / 32 != 1) << i;
+  }
+  zero(results);
 
   const Camera<float> camera = load_camera(p.camera);
   for (int i = 0; i < kCount; ++i) {
