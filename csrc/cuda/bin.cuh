@@ -10,6 +10,8 @@ namespace ar::cuda {
 using DepthDigits = Digits<kDepthBits>;
 using DepthScratch = SortScratch<kDepthBits>;
 inline constexpr int kCountThreads = 512, kCountBlocks = 132 * 2;
+/// Keys of a thread of count_depths whose loads wait together.
+inline constexpr int kCountAtOnce = 4;
 
 /// Sets memory to zero. Called by all threads of a grid, of which this is one.
 __device__ inline void set_to_zero(const ZeroedMemory& memory, int64_t thread, int64_t threads) {
@@ -31,12 +33,23 @@ __global__ void __launch_bounds__(kCountThreads)
   set_to_zero(of_tiles, thread, stride);
   __syncthreads();
   unsigned long long pairs = 0, splats = 0;
-  for (int64_t i = thread; i < rounded; i += stride) {
-    const uint32_t key = i < n ? keys[i] : kCulledKey;
-    const bool valid = key != kCulledKey;
-    count_digits<kDepthBits, kDepthPasses>(key, valid, local);
-    if (valid) pairs += ranges[i].count;
-    splats += valid;
+  for (int64_t from = thread; from < rounded; from += kCountAtOnce * stride) {
+    uint32_t key[kCountAtOnce];
+    int pairs_of[kCountAtOnce];
+#pragma unroll
+    for (int k = 0; k < kCountAtOnce; ++k) {
+      const int64_t i = from + k * stride;
+      key[k] = i < n ? keys[i] : kCulledKey;
+    }
+#pragma unroll
+    for (int k = 0; k < kCountAtOnce; ++k) pairs_of[k] = key[k] != kCulledKey ? ranges[from + k * stride].count : 0;
+#pragma unroll
+    for (int k = 0; k < kCountAtOnce; ++k) {
+      const bool valid = key[k] != kCulledKey;
+      count_digits<kDepthBits, kDepthPasses>(key[k], valid, local);
+      pairs += pairs_of[k];
+      splats += valid;
+    }
   }
   __syncthreads();
   for (int b = threadIdx.x; b < kDepthHistogramWords; b += kCountThreads) {
@@ -125,8 +138,7 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
   __syncthreads();
   const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
   int32_t ids[kEmitRows];
-  PairRange ranges[kEmitRows] = {};
-  TileMask masks[kEmitRows] = {};
+  SplatTiles touched[kEmitRows] = {};
 #pragma unroll
   for (int row = 0; row < kEmitRows; ++row) {
     const int64_t r = int64_t(block_id) * kEmitSplats + row * kEmitThreads + threadIdx.x;
@@ -134,13 +146,13 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
   }
 #pragma unroll
   for (int row = 0; row < kEmitRows; ++row) {
-    if (ids[row] >= 0) ranges[row] = params.ranges[ids[row]], masks[row] = params.masks[ids[row]];
+    if (ids[row] >= 0) touched[row] = params.splat_tiles[ids[row]];
   }
   uint32_t before[kEmitRows], sum = 0;  // of the pairs of the block
 #pragma unroll
   for (int row = 0; row < kEmitRows; ++row) {
     uint32_t of_row;
-    before[row] = sum + sum_before<kWarps>(uint32_t(ranges[row].count), 0u, of_row);
+    before[row] = sum + sum_before<kWarps>(uint32_t(touched[row].count), 0u, of_row);
     sum += of_row;
   }
   uint32_t* status = params.status + 1;
@@ -152,12 +164,12 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
   int up_to[kEmitRows];  // pairs in the stage, of the lanes up to this one
 #pragma unroll
   for (int row = 0; row < kEmitRows; ++row) {
-    const int own = masks[row] ? ranges[row].count : 0;
+    const int own = touched[row].mask ? touched[row].count : 0;
     up_to[row] = warp_inclusive_sum(own);
     MaskedPair* next = stages[row][warp].of + up_to[row] - own;
 #pragma unroll
     for (int from = 0; from < MaskedPair::kBits; from += 32) {
-      for (uint32_t left = __brev(uint32_t(masks[row] >> from)); left != 0;)
+      for (uint32_t left = __brev(uint32_t(touched[row].mask >> from)); left != 0;)
         *next++ = {uint16_t(MaskedPair::kBits * lane_id() + from + take_first(left))};
     }
   }
@@ -178,18 +190,18 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
   };
 #pragma unroll
   for (int row = 0; row < kEmitRows; ++row) {
-    const PairRange range = ranges[row];
-    const int own = masks[row] ? range.count : 0, first = up_to[row] - own, all = shuffle(up_to[row], 31);
+    const SplatTiles& of_splat = touched[row];
+    const int own = of_splat.mask ? of_splat.count : 0, first = up_to[row] - own, all = shuffle(up_to[row], 31);
     const auto begin = int32_t(before_block + before[row]);
-    if (range.count > 0 && params.slot_pairs) params.ranges[ids[row]].first = begin;
+    if (of_splat.count > 0 && params.slot_pairs) params.ranges[ids[row]].first = begin;
     for (int from = 0; from < all; from += 32) {
       const int k = from + lane_id();
       const MaskedPair pair = k < all ? stages[row][warp].of[k] : MaskedPair{};
       const int32_t place = shuffle(begin - first, pair.lane()) + k, id = shuffle(ids[row], pair.lane());
-      const int32_t tile = shuffle(range.first, pair.lane()) + pair.row() * columns + pair.column();
+      const int32_t tile = shuffle(of_splat.first, pair.lane()) + pair.row() * columns + pair.column();
       if (k < all) write(place, uint32_t(tile), id);
     }
-    for (uint32_t others = __brev(__ballot_sync(kAllLanes, range.count > own)); others != 0;) {
+    for (uint32_t others = __brev(__ballot_sync(kAllLanes, of_splat.count > own)); others != 0;) {
       const int source = take_first(others);
       const int32_t id = shuffle(ids[row], source);
       int32_t place = shuffle(begin, source);

@@ -15,10 +15,10 @@ __device__ inline uint32_t depth_key(float depth) {
 /// What bin needs of splat i.
 template <class Params>
 __device__ void write_tiles(const Params& params, int64_t i, const SplatTiles& tiles, float depth) {
-  const bool any = tiles.range.count > 0;
+  const bool any = tiles.count > 0;
   params.keys[i] = any ? depth_key(depth) : kCulledKey;
-  params.ranges[i] = tiles.range;
-  if (any) params.masks[i] = tiles.mask;
+  params.ranges[i] = {0, tiles.count};
+  if (any) params.tiles[i] = tiles;
 }
 
 /// Zeros for what count_depths counts. The first block alone: the others have enough to do.

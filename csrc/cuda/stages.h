@@ -53,11 +53,15 @@ struct PairRange {
   int32_t first, count;
 };
 
-/// Which tiles a splat touches: bit 8 r + c is the tile r rows below and c columns to the right of tile `first` of its
-/// PairRange, until emit_pairs writes the first pair there. 0 for a splat of more than kManyTiles tiles, or of tiles
-/// that are not among 8x8.
+/// Tiles among 8x8: bit 8 r + c is the one in row r and column c.
 using TileMask = uint64_t;
 inline constexpr int kManyTiles = 16;
+/// The tiles that a splat touches. Together, because bin reads them in the order of depth, which is far from that in
+/// memory.
+struct alignas(16) SplatTiles {
+  TileMask mask;  ///< from tile `first` on; 0: more than kManyTiles tiles, or some that are not among 8x8
+  int32_t first, count;
+};
 
 /// A pair, and its place in that order: where blend_vjp leaves its gradient.
 struct alignas(8) SlotPair {
@@ -115,8 +119,8 @@ struct ProjectParams : ar::ProjectParams<float> {
   CullBounds<float> bounds;
   TileGrid grid;
   uint32_t* keys;     ///< [n] in the order of depth
-  PairRange* ranges;  ///< [n] count, and tile of the mask
-  TileMask* masks;    ///< [n] of splats with pairs
+  PairRange* ranges;  ///< [n] the count alone
+  SplatTiles* tiles;  ///< [n] of splats with pairs
   // Set to zero, for count_depths.
   Counts* counts;
   uint32_t* depth_histograms;  ///< [kDepthHistogramWords]
@@ -134,8 +138,8 @@ struct ProjectRowsParams {
 
 struct ShapeRowsParams : ar::ShapeRowsParams<float> {
   uint32_t* keys;     ///< [n]
-  PairRange* ranges;  ///< [n] count, and tile of the mask
-  TileMask* masks;    ///< [n] of splats with pairs
+  PairRange* ranges;  ///< [n] the count alone
+  SplatTiles* tiles;  ///< [n] of splats with pairs
   // Set to zero, for count_depths.
   Counts* counts;
   uint32_t* depth_histograms;  ///< [kDepthHistogramWords]
@@ -149,8 +153,8 @@ struct EmitParams {
   int64_t capacity;
   const Counts* counts;
   const int32_t* order;   ///< [counts->splats] splats by depth
-  PairRange* ranges;      ///< [n] read; with slot_pairs `first` is written
-  const TileMask* masks;  ///< [n]
+  const SplatTiles* splat_tiles;  ///< [n]
+  PairRange* ranges;              ///< [n] with slot_pairs `first` is written
   uint32_t* status;       ///< emit_scratch(n) bytes, zero
   uint32_t* tile_counts;  ///< tile_sort_scratch(capacity, grid) bytes, zero; sort_by_tile finds its counts there
   uint32_t* tiles;        ///< [capacity] tile of each pair

@@ -127,7 +127,7 @@ class CudaBackend final : public Backend {
     emit.counts = counts;
     emit.order = by_depth.order[0];
     emit.ranges = structs_of<cuda::PairRange>(splats.ranges);
-    emit.masks = memory.masks;
+    emit.splat_tiles = memory.tiles;
     emit.status = reinterpret_cast<uint32_t*>(memory.emit_scratch);
     out.tile_offsets = at::empty({grid.tiles() + 1}, longs_);
     if (pass.keep) {
@@ -396,7 +396,7 @@ class CudaBackend final : public Backend {
   template <class Params> static void set_for_bin(Params& p, const SplatTensors& splats) {
     const SplatMemory memory(splats.memory, splats.splats.size(0));
     p.keys = memory.keys[0];
-    p.masks = memory.masks;
+    p.tiles = memory.tiles;
     p.ranges = structs_of<cuda::PairRange>(splats.ranges);
     p.counts = reinterpret_cast<cuda::Counts*>(pointer<int64_t>(splats.counts));
     p.depth_histograms = reinterpret_cast<uint32_t*>(memory.depth_scratch);

@@ -45,8 +45,8 @@ struct SplatMemory {
   cuda::ZeroedMemory to_clear = {};  ///< both, but for the histograms, which are clear already
   uint32_t* keys[2];                 ///< in the order of depth, and room for them
   int32_t* order;                    ///< room for an order
-  cuda::TileMask* masks;             ///< the tiles of a splat that has few
-  int64_t bytes;                     ///< of all
+  cuda::SplatTiles* tiles;
+  int64_t bytes;  ///< of all
 
   SplatMemory(const Tensor& memory, int64_t n) {
     MemoryParts parts(memory);
@@ -57,7 +57,7 @@ struct SplatMemory {
     if (depth_scratch) to_clear = {depth_scratch + kHistograms, depth_bytes - kHistograms + emit_bytes};
     for (uint32_t*& k : keys) k = parts.take<uint32_t>(n);
     order = parts.take<int32_t>(n);
-    masks = parts.take<cuda::TileMask>(n);
+    tiles = parts.take<cuda::SplatTiles>(n);
     bytes = parts.bytes();
   }
 };

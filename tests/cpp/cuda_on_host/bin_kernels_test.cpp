@@ -170,10 +170,10 @@ TEST(BinKernels, PairsOfSplats) {
   std::vector<int32_t> order(n);
   std::iota(order.begin(), order.end(), 0);
   std::shuffle(order.begin(), order.end(), std::mt19937(7));
-  std::vector<PairRange> ranges(n), expected_ranges(n);
+  std::vector<PairRange> expected_ranges(n);
   std::vector<uint32_t> expected_tiles;
   std::vector<int32_t> expected_splats;
-  std::vector<TileMask> masks(n);
+  std::vector<SplatTiles> splat_tiles(n);
   int many = 0, masked = 0, later_rows = 0;
   for (const int32_t i : order) {
     expected_ranges[i].first = int32_t(expected_tiles.size());
@@ -182,11 +182,9 @@ TEST(BinKernels, PairsOfSplats) {
       expected_splats.push_back(i);
     });
     expected_ranges[i].count = int32_t(expected_tiles.size()) - expected_ranges[i].first;
-    const SplatTiles tiles = find_tiles(support_of(splats[i], footprint), grid);
-    ASSERT_EQ(tiles.range.count, expected_ranges[i].count);
-    ranges[i] = tiles.range;
-    masks[i] = tiles.mask;
-    many += ranges[i].count > kManyTiles;
+    const SplatTiles& tiles = splat_tiles[i] = find_tiles(support_of(splats[i], footprint), grid);
+    ASSERT_EQ(tiles.count, expected_ranges[i].count);
+    many += tiles.count > kManyTiles;
     masked += tiles.mask != 0;
     for (int row = 0; row < 8; ++row) later_rows += row > 3 && (tiles.mask >> 8 * row & 0xff) != 0;
   }
@@ -214,9 +212,9 @@ TEST(BinKernels, PairsOfSplats) {
     emit.capacity = pairs;
     emit.counts = &counts;
     emit.order = order.data();
-    std::vector<PairRange> written = ranges;
+    std::vector<PairRange> written(n);
     emit.ranges = written.data();
-    emit.masks = masks.data();
+    emit.splat_tiles = splat_tiles.data();
     emit.status = status.data();
     emit.tile_counts = scratch.data();
     emit.tiles = tiles.data();

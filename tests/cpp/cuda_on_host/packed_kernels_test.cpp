@@ -151,12 +151,12 @@ TEST(PackedKernels, SplatsAreThoseOfSeparateColumns) {
   std::vector<float> splats[2], covs(4 * n), opacities(n);
   std::vector<uint32_t> keys[2];
   std::vector<PairRange> ranges[2];
-  std::vector<TileMask> masks[2];
+  std::vector<SplatTiles> tiles[2];
   for (int k = 0; k < 2; ++k) {
     splats[k].resize(kSplatWidth * n);
     keys[k].resize(n);
     ranges[k].resize(n);
-    masks[k].resize(n);
+    tiles[k].resize(n);
     ShapeRowsParams p = {};
     p.n = n;
     p.footprint = scene.footprint;
@@ -164,7 +164,7 @@ TEST(PackedKernels, SplatsAreThoseOfSeparateColumns) {
     p.splats = splats[k].data();
     p.keys = keys[k].data();
     p.ranges = ranges[k].data();
-    p.masks = masks[k].data();
+    p.tiles = tiles[k].data();
     Counts counts = {7, 7};
     std::vector<uint32_t> histograms(kDepthHistogramWords + 1, 7);
     p.counts = &counts;
@@ -186,7 +186,7 @@ TEST(PackedKernels, SplatsAreThoseOfSeparateColumns) {
   EXPECT_TRUE(same(splats[0], splats[1]));
   EXPECT_TRUE(same(keys[0], keys[1]));
   EXPECT_EQ(std::memcmp(ranges[0].data(), ranges[1].data(), n * sizeof(PairRange)), 0);
-  EXPECT_EQ(masks[0], masks[1]);
+  EXPECT_EQ(std::memcmp(tiles[0].data(), tiles[1].data(), n * sizeof(SplatTiles)), 0);
   EXPECT_TRUE(same(opacities, rows.opacities));
   for (int i = 0; i < n; ++i) {
     EXPECT_EQ(covs[4 * i + 1], rows.cov2d[3 * i + 1]);
