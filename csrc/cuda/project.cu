@@ -30,7 +30,11 @@ void project_vjp(const ProjectVjpParams& p, cudaStream_t stream) {
   launch_rows(project_vjp_kernel<Plain>, project_vjp_kernel<Full>, p, stream);
 }
 void zero_culled_grads(const ZeroGradsParams& p, cudaStream_t stream) {
-  launch(zero_culled_grads_kernel, {kZeroBlocks, kProjectThreads}, stream, p);
+  // All kernels on a multiprocessor share one division of its memory into cache and shared memory. Where this one gets
+  // much cache, no block of blend_vjp, which needs much shared memory, begins before this has ended.
+  cudaFuncSetAttribute(zero_culled_grads_kernel, cudaFuncAttributePreferredSharedMemoryCarveout,
+                       cudaSharedmemCarveoutMaxShared);
+  launch(zero_culled_grads_kernel, {kZeroBlocks, kZeroThreads}, stream, p);
 }
 void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream) {
   if (p.add) return launch_rows(add_project_rows_vjp_kernel<Plain>, add_project_rows_vjp_kernel<Full>, p, stream);

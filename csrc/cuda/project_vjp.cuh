@@ -66,9 +66,14 @@ __device__ inline SplatSums sum_pairs(const PairSumsView& pairs, int64_t i, Pair
   return sums;
 }
 
-/// Zeros, with neighbouring lanes at neighbouring addresses.
+/// Zeros, with neighbouring lanes at neighbouring addresses. Nobody reads them soon, so that they should leave the
+/// cache first.
 __device__ inline void zero_rows(float* to, int count) {
-  for (int e = lane_id(); e < count; e += 32) to[e] = 0;
+  if (count % 4 == 0 && reinterpret_cast<uintptr_t>(to) % 16 == 0) {
+    for (int e = lane_id(); e < count / 4; e += 32) store_streaming(reinterpret_cast<float4*>(to) + e, {0, 0, 0, 0});
+  } else {
+    for (int e = lane_id(); e < count; e += 32) to[e] = 0;
+  }
 }
 __device__ inline void zero_grads_of_warp(const Gaussians<float>& g, const GaussianGrads<float>& out, int64_t first,
                                           int n) {
@@ -251,16 +256,16 @@ __global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kProjectVjpB
   project_vjp_body<Cam>(params, FromRows{params}, AddedGrads<float>{params.grads});
 }
 
-/// Blocks of zero_culled_grads_kernel: one for each of the 132 multiprocessors of an H200. So few, and of so few
-/// registers that sixteen would fit, find room beside the blocks of blend_vjp, which is bound by its instructions while
-/// this waits for memory.
-inline constexpr int kZeroBlocks = 132, kZeroBlocksThatFit = 16;
+/// Blocks of zero_culled_grads_kernel: one for each of the 132 multiprocessors of an H200. So few, of so few threads
+/// and registers, find room beside the blocks of blend_vjp, which is bound by its instructions while this waits for
+/// memory.
+inline constexpr int kZeroBlocks = 132, kZeroThreads = 64, kZeroBlocksThatFit = 32;
 
-__global__ void __launch_bounds__(kProjectThreads, kZeroBlocksThatFit)
+__global__ void __launch_bounds__(kZeroThreads, kZeroBlocksThatFit)
     zero_culled_grads_kernel(const ZeroGradsParams params) {
-  const int64_t n = params.gaussians.n, step = int64_t(gridDim.x) * kProjectThreads;
+  const int64_t n = params.gaussians.n, step = int64_t(gridDim.x) * kZeroThreads;
   const auto count_of = [&](int64_t i) { return i < n ? params.ranges[i].count : 0; };
-  int64_t first = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x - lane_id();
+  int64_t first = int64_t(blockIdx.x) * kZeroThreads + threadIdx.x - lane_id();
   int count = count_of(first + lane_id());
   for (; first < n; first += step) {
     const bool any = __any_sync(kAllLanes, count > 0);

@@ -118,6 +118,15 @@ __device__ inline int take_first(uint32_t& set) {
   return first;
 }
 
+/// Stores what nobody reads soon.
+__device__ inline void store_streaming(float4* to, const float4& value) {
+#if defined(__CUDA_ARCH__)
+  __stcs(to, value);
+#else
+  *to = value;
+#endif
+}
+
 /// Asks for the line of memory that holds `*address`.
 __device__ inline void prefetch([[maybe_unused]] const void* address) {
 #if defined(__CUDA_ARCH__)

@@ -10,6 +10,7 @@
 
 #include <algorithm>
 #include <optional>
+#include <tuple>
 
 #include "cuda/side_streams.h"
 #include "torch/cuda_frames.h"
@@ -88,7 +89,8 @@ class CudaBackend final : public Backend {
     TORCH_CHECK(capacity > 0 || !capturing,
                 "a frame of this size must have been rendered before it is captured in a CUDA graph, without "
                 "torch.use_deterministic_algorithms");
-    PairMemory pairs = capacity > 0 ? make_pair_memory(capacity, pass) : PairMemory();
+    const auto make_pair_memory = [&] { return make_memory<PairMemory>(bytes_, capacity, grid, pass.keep); };
+    auto [pair_memory, pairs] = make_pair_memory();
     const SplatMemory memory(splats.memory, n);
 
     ListTensors out;
@@ -112,7 +114,7 @@ class CudaBackend final : public Backend {
       const int64_t counted = out.counts[0].item<int64_t>();
       guesses.use([&](cuda::PairGuesses& g) { g.counted(frame, n, counted); });
       capacity = std::clamp<int64_t>(counted, 1, cuda::max_items());
-      pairs = make_pair_memory(capacity, pass);
+      std::tie(pair_memory, pairs) = make_pair_memory();
       C10_CUDA_CHECK(cudaMemsetAsync(pairs.scratch.data, 0, size_t(pairs.scratch.bytes), stream_));
     }
     cuda::sort_by_depth(by_depth, memory.depth_scratch, stream_);
@@ -363,16 +365,12 @@ class CudaBackend final : public Backend {
                                            : 0;
     state.checkpoints = at::empty({max_planes * pass.grid.side() * pass.grid.side()}, floats_);
     state.chunks = at::empty({kPlanRows + chunks + tiles, kChunkWidth}, ints_);
-    const auto set_parts = [&](MemoryParts parts) {
-      p.plan.tail = parts.take<cuda::TileChunk>(chunks + 1);
-      p.plan.tile_order = parts.take<int32_t>(tiles);
-      p.plan.tile_planes = parts.take<int32_t>(tiles);
-      p.tile_open = parts.take<int32_t>(tiles);
-      p.open_tiles = parts.take<int32_t>(cuda::kSampleClasses * tiles);
-      return parts.bytes();
-    };
-    const Tensor memory = at::empty({set_parts(MemoryParts(Tensor()))}, bytes_);
-    set_parts(MemoryParts(memory));
+    const auto [memory, parts] = make_memory<PlanMemory>(bytes_, tiles, chunks);
+    p.plan.tail = parts.tail;
+    p.plan.tile_order = parts.tile_order;
+    p.plan.tile_planes = parts.tile_planes;
+    p.tile_open = parts.tile_open;
+    p.open_tiles = parts.open_tiles;
     p.plan.state = structs_of<cuda::PlanState>(state.chunks);
     p.plan.chunk_order = structs_of<cuda::TileChunk>(state.chunks) + kPlanRows;
     p.checkpoints = pointer<float>(state.checkpoints);
@@ -402,28 +400,6 @@ class CudaBackend final : public Backend {
     p.depth_histograms = reinterpret_cast<uint32_t*>(memory.depth_scratch);
   }
 
-  /// Memory of so many pairs while they are sorted by tile, besides that of the result.
-  struct PairMemory {
-    Tensor memory;
-    cuda::ZeroedMemory scratch = {};
-    uint32_t* tiles[2] = {};
-    void* values = nullptr;  ///< SlotPair, or int32_t without a backward pass
-  };
-  PairMemory make_pair_memory(int64_t capacity, const Pass& pass) const {
-    const int64_t value_bytes = pass.keep ? sizeof(cuda::SlotPair) : sizeof(int32_t);
-    PairMemory out;
-    const auto set_parts = [&](MemoryParts parts) {
-      out.scratch.bytes = cuda::tile_sort_scratch(capacity, pass.grid);
-      out.scratch.data = parts.take<std::byte>(out.scratch.bytes);
-      for (uint32_t*& tiles : out.tiles) tiles = parts.take<uint32_t>(capacity);
-      out.values = parts.take<std::byte>(capacity * value_bytes);
-      return parts.bytes();
-    };
-    out.memory = at::empty({set_parts(MemoryParts(Tensor()))}, bytes_);
-    set_parts(MemoryParts(out.memory));
-    return out;
-  }
-
   /// Room for the camera's gradient, if it is wanted.
   template <class Params> Tensor make_camera_grads(Params& p, const Grads& grads) const {
     if (!grads.with_camera) return Tensor();
@@ -446,7 +422,7 @@ class CudaBackend final : public Backend {
     sort.feedback = feedback;
     for (int k = 0; k < 2; ++k) sort.tiles[k] = memory.tiles[k];
     sort.values[result] = structs_of<Value>(out.pairs);
-    sort.values[1 - result] = static_cast<Value*>(memory.values);
+    sort.values[1 - result] = reinterpret_cast<Value*>(memory.values);
     emit.tile_counts = static_cast<uint32_t*>(memory.scratch.data);
     emit.tiles = sort.tiles[0];
     emit.*to = sort.values[0];

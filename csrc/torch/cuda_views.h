@@ -1,6 +1,8 @@
 // Tensors as structs of the CUDA kernels, and checks of what the kernels read without looking.
 #pragma once
 
+#include <utility>
+
 #include "cuda/stages.h"
 #include "torch/backend.h"
 
@@ -38,8 +40,15 @@ class MemoryParts {
   int64_t bytes_ = 0;
 };
 
-/// What `project` and `shape_rows` leave for bin beside the splats, and memory that bin needs for n of them. In one
-/// piece, because the host spends a few microseconds on every tensor.
+/// Memory for Parts(memory, arguments...), and those parts of it. In one piece, because the host spends a few
+/// microseconds on every tensor.
+template <class Parts, class... Arguments>
+std::pair<Tensor, Parts> make_memory(const at::TensorOptions& bytes, const Arguments&... arguments) {
+  const Tensor memory = at::empty({Parts(Tensor(), arguments...).bytes}, bytes);
+  return {memory, Parts(memory, arguments...)};
+}
+
+/// What `project` and `shape_rows` leave for bin beside the splats, and memory that bin needs for n of them.
 struct SplatMemory {
   std::byte *depth_scratch, *emit_scratch;
   cuda::ZeroedMemory to_clear = {};  ///< both, but for the histograms, which are clear already
@@ -58,6 +67,38 @@ struct SplatMemory {
     for (uint32_t*& k : keys) k = parts.take<uint32_t>(n);
     order = parts.take<int32_t>(n);
     tiles = parts.take<cuda::SplatTiles>(n);
+    bytes = parts.bytes();
+  }
+};
+
+/// Pairs while they are sorted by tile, but for the result.
+struct PairMemory {
+  cuda::ZeroedMemory scratch;
+  uint32_t* tiles[2];
+  std::byte* values;  ///< SlotPair, or int32_t without a backward pass
+  int64_t bytes;      ///< of all
+
+  PairMemory(const Tensor& memory, int64_t capacity, TileGrid grid, bool with_slots) {
+    MemoryParts parts(memory);
+    scratch.bytes = cuda::tile_sort_scratch(capacity, grid);
+    scratch.data = parts.take<std::byte>(scratch.bytes);
+    for (uint32_t*& t : tiles) t = parts.take<uint32_t>(capacity);
+    values = parts.take<std::byte>(capacity * int64_t(with_slots ? sizeof(cuda::SlotPair) : sizeof(int32_t)));
+    bytes = parts.bytes();
+  }
+};
+
+/// What the kernels of blend need while they run, of lists that are cut into up to `chunks` chunks.
+struct PlanMemory {
+  cuda::TileChunk* tail;
+  int32_t *tile_order, *tile_planes, *tile_open, *open_tiles;
+  int64_t bytes;  ///< of all
+
+  PlanMemory(const Tensor& memory, int64_t tiles, int64_t chunks) {
+    MemoryParts parts(memory);
+    tail = parts.take<cuda::TileChunk>(chunks + 1);
+    for (int32_t** t : {&tile_order, &tile_planes, &tile_open}) *t = parts.take<int32_t>(tiles);
+    open_tiles = parts.take<int32_t>(cuda::kSampleClasses * tiles);
     bytes = parts.bytes();
   }
 };

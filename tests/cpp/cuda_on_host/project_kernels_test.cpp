@@ -123,7 +123,7 @@ TEST_P(ProjectVjpKernel, WritesWhatTheCoreGives) {
   Outputs zeros(g);
   const auto zero = [&](const Outputs& out) {
     const ZeroGradsParams to_zero = {g, out.grads, ranges.data()};
-    cuda_on_host::launch(1, kProjectThreads, [&] { zero_culled_grads_kernel(to_zero); });
+    cuda_on_host::launch(1, kZeroThreads, [&] { zero_culled_grads_kernel(to_zero); });
   };
   zero(zeros);
   for (int i = 0; i < kCount; ++i) {
