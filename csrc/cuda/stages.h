@@ -152,10 +152,10 @@ struct EmitParams {
   TileGrid grid;
   int64_t capacity;
   const Counts* counts;
-  const int32_t* order;   ///< [counts->splats] splats by depth
+  const int32_t* order;           ///< [counts->splats] splats by depth
   const SplatTiles* splat_tiles;  ///< [n]
   PairRange* ranges;              ///< [n] with slot_pairs `first` is written
-  uint32_t* status;       ///< emit_scratch(n) bytes, zero
+  uint32_t* status;               ///< emit_scratch(n) bytes, zero
   uint32_t* tile_counts;  ///< tile_sort_scratch(capacity, grid) bytes, zero; sort_by_tile finds its counts there
   uint32_t* tiles;        ///< [capacity] tile of each pair
   int32_t* splat_pairs;   ///< [capacity] splat of each pair, or null:
