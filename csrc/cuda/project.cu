@@ -1,4 +1,7 @@
 // Launches of the projection, for every camera type and whatever the footprint.
+#include <mutex>
+#include <set>
+
 #include "cuda/launch.cuh"
 #include "cuda/project_vjp.cuh"
 
@@ -13,6 +16,20 @@ template <class Params> void launch_rows(void (*kernel)(Params), const Params& p
 template <class Params>
 void launch_rows(void (*plain)(Params), void (*full)(Params), const Params& p, cudaStream_t stream) {
   launch_rows(p.camera.lens ? full : plain, p, p.gaussians.n, stream);
+}
+
+/// All kernels on a multiprocessor share one division of its memory into cache and shared memory. While it runs one
+/// that got much cache, no block of blend_vjp begins there, which needs much shared memory. This is asked for once on
+/// each device: when it was asked for at every launch, the memory of the process grew with every launch.
+void let_blend_vjp_begin_beside_zero_culled_grads() {
+  static std::mutex mutex;
+  static std::set<int> devices;
+  int device = 0;
+  cudaGetDevice(&device);
+  const std::lock_guard lock(mutex);
+  if (!devices.insert(device).second) return;
+  cudaFuncSetAttribute(zero_culled_grads_kernel, cudaFuncAttributePreferredSharedMemoryCarveout,
+                       cudaSharedmemCarveoutMaxShared);
 }
 
 using Plain = Camera<float>;
@@ -30,10 +47,7 @@ void project_vjp(const ProjectVjpParams& p, cudaStream_t stream) {
   launch_rows(project_vjp_kernel<Plain>, project_vjp_kernel<Full>, p, stream);
 }
 void zero_culled_grads(const ZeroGradsParams& p, cudaStream_t stream) {
-  // All kernels on a multiprocessor share one division of its memory into cache and shared memory. Where this one gets
-  // much cache, no block of blend_vjp, which needs much shared memory, begins before this has ended.
-  cudaFuncSetAttribute(zero_culled_grads_kernel, cudaFuncAttributePreferredSharedMemoryCarveout,
-                       cudaSharedmemCarveoutMaxShared);
+  let_blend_vjp_begin_beside_zero_culled_grads();
   launch(zero_culled_grads_kernel, {kZeroBlocks, kZeroThreads}, stream, p);
 }
 void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream) {

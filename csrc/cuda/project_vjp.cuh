@@ -259,7 +259,7 @@ __global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kProjectVjpB
 /// Blocks of zero_culled_grads_kernel: one for each of the 132 multiprocessors of an H200. So few, of so few threads
 /// and registers, find room beside the blocks of blend_vjp, which is bound by its instructions while this waits for
 /// memory.
-inline constexpr int kZeroBlocks = 132, kZeroThreads = 64, kZeroBlocksThatFit = 32;
+inline constexpr int kZeroBlocks = 132, kZeroThreads = 128, kZeroBlocksThatFit = 16;
 
 __global__ void __launch_bounds__(kZeroThreads, kZeroBlocksThatFit)
     zero_culled_grads_kernel(const ZeroGradsParams params) {
