@@ -50,42 +50,28 @@ void for_each_pair(const cpu::BinParams<T>& p, int64_t part_index, const Visit& 
 
 /// Sorts by depth, counts the pairs of each tile, and turns the counts into places.
 template <typename T> void count_pairs(cpu::BinParams<T>& p) {
-  cpu::sort_by_depth(p.depths, p.n, p.threads, p.order);
+  p.order.reset(new int32_t[p.n]);
+  cpu::sort_by_depth(p.depths, p.n, p.threads, p.order.get());
   const int64_t tiles = p.grid.tiles();
   // Parts only speed things up. Their histograms may not outgrow the splats.
   p.parts = std::clamp<int64_t>(p.n / std::max<int64_t>(tiles, 1), 1, p.threads);
-  p.cursors.assign(p.parts * tiles, 0);
+  p.cursors.reset(new int64_t[p.parts * tiles]);
   cpu::parallel_for(p.parts, p.threads, [&](int64_t part) {
-    int64_t* count = p.cursors.data() + part * tiles;
+    int64_t* count = p.cursors.get() + part * tiles;
+    for (int64_t tile = 0; tile < tiles; ++tile) count[tile] = 0;
     for_each_pair(p, part, [&](int32_t j, int64_t tile) {
       ++count[tile];
       if (p.splat_offsets) ++p.splat_offsets[j];
     });
   });
-  int64_t total = 0;
-  for (int64_t tile = 0; tile < tiles; ++tile) {
-    p.tile_offsets[tile] = total;
-    for (int64_t part = 0; part < p.parts; ++part) {
-      const int64_t count = p.cursors[part * tiles + tile];
-      p.cursors[part * tiles + tile] = total;
-      total += count;
-    }
-  }
-  p.tile_offsets[tiles] = total;
-  if (p.splat_offsets) {
-    int64_t sum = 0;
-    for (int64_t j = 0; j <= p.n; ++j) {
-      const int64_t count = p.splat_offsets[j];
-      p.splat_offsets[j] = sum;
-      sum += count;
-    }
-  }
+  p.tile_offsets[tiles] = cpu::place_items(p.cursors.get(), p.parts, tiles, p.threads, p.tile_offsets);
+  if (p.splat_offsets) cpu::sum_before(p.splat_offsets, p.n + 1, p.threads);
 }
 
 template <typename T> void scatter_pairs(cpu::BinParams<T>& p) {
   const int64_t tiles = p.grid.tiles();
   cpu::parallel_for(p.parts, p.threads, [&](int64_t part) {
-    int64_t* cursor = p.cursors.data() + part * tiles;
+    int64_t* cursor = p.cursors.get() + part * tiles;
     int32_t current = -1;
     int64_t next = 0;  // place in positions: a splat's pairs come one after the other
     for_each_pair(p, part, [&](int32_t j, int64_t tile) {

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <cstdint>
+#include <memory>
 #include <string_view>
 #include <vector>
 
@@ -59,9 +60,9 @@ template <typename T> struct BinParams {
   int64_t* splat_offsets;  ///< [n + 1] into positions, zero before count_pairs; or null
   int32_t* pairs;          ///< [tile_offsets[tiles]] splat of each pair, by tile, then depth
   int64_t* positions;      ///< [same] places of a splat's pairs, by splat, or null
-  // Kept from count_pairs to scatter_pairs:
-  std::vector<int32_t> order;    ///< splats by depth, ties in input order
-  std::vector<int64_t> cursors;  ///< [parts, tiles] next place in pairs
+  // Kept from count_pairs to scatter_pairs. No vectors, which one thread would fill with zeros:
+  std::unique_ptr<int32_t[]> order;    ///< [n] splats by depth, ties in input order
+  std::unique_ptr<int64_t[]> cursors;  ///< [parts, tiles] next place in pairs
   int64_t parts;
 };
 

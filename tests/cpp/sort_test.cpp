@@ -12,11 +12,11 @@ namespace {
 template <typename T> class SortTest : public ::testing::Test {
  protected:
   static void expect_stable_order(const std::vector<T>& depths) {
-    std::vector<int32_t> expected(depths.size()), order;
+    std::vector<int32_t> expected(depths.size()), order(depths.size());
     std::iota(expected.begin(), expected.end(), 0);
     std::stable_sort(expected.begin(), expected.end(), [&](int32_t a, int32_t b) { return depths[a] < depths[b]; });
     for (const int threads : {1, 2, 7}) {
-      cpu::sort_by_depth(depths.data(), int64_t(depths.size()), threads, order);
+      cpu::sort_by_depth(depths.data(), int64_t(depths.size()), threads, order.data());
       ASSERT_EQ(order, expected) << threads << " threads";
     }
   }
@@ -53,6 +53,44 @@ TYPED_TEST(SortTest, NeighboursAndPowersOfTwo) {
     depths.push_back(TypeParam(0));
   }
   this->expect_stable_order(depths);
+}
+
+TEST(SumBefore, OfEveryLength) {
+  Random random(3);
+  for (const int n : {0, 1, 5, 4096, 8191, 8192, 50001}) {
+    std::vector<int64_t> numbers(n);
+    for (int64_t& number : numbers) number = random.below(100);
+    std::vector<int64_t> expected(n);
+    int64_t all = 0;
+    for (int i = 0; i < n; ++i) expected[i] = all, all += numbers[i];
+    for (const int threads : {1, 2, 7}) {
+      std::vector<int64_t> sums = numbers;
+      EXPECT_EQ(cpu::sum_before(sums.data(), n, threads), all);
+      EXPECT_EQ(sums, expected) << n << " numbers, " << threads << " threads";
+    }
+  }
+}
+
+TEST(PlaceItems, ByKindThenPart) {
+  Random random(4);
+  for (const int kinds : {1, 7, 256, 257, 9000}) {
+    for (const int parts : {1, 5}) {
+      std::vector<int64_t> counts(parts * kinds), expected(parts * kinds), expected_firsts(kinds);
+      for (int64_t& count : counts) count = random.below(4);
+      int64_t all = 0;
+      for (int kind = 0; kind < kinds; ++kind) {
+        expected_firsts[kind] = all;
+        for (int part = 0; part < parts; ++part)
+          expected[part * kinds + kind] = all, all += counts[part * kinds + kind];
+      }
+      for (const int threads : {1, 2, 7}) {
+        std::vector<int64_t> places = counts, firsts(kinds, -1);
+        EXPECT_EQ(cpu::place_items(places.data(), parts, kinds, threads, firsts.data()), all);
+        EXPECT_EQ(places, expected) << kinds << " kinds, " << parts << " parts, " << threads << " threads";
+        EXPECT_EQ(firsts, expected_firsts);
+      }
+    }
+  }
 }
 
 }  // namespace
