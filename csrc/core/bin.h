@@ -141,6 +141,37 @@ template <typename T, class Visit> AR_HD void for_each_tile_row(const Support<T>
   for (int row = tile_rows.first; row <= tile_rows.last; ++row) visit(row, tile_columns_of(s, grid, rows, row));
 }
 
+/// Tiles among 8x8: bit 8 r + c is the one in row r and column c.
+using TileMask = uint64_t;
+
+/// The tiles that a support touches, and where the mask of them begins.
+struct TileBox {
+  TileMask mask;  ///< 0: none, or not all are among 8x8
+  int row, column, count;
+};
+template <typename T> AR_HD TileBox find_tiles(const Support<T>& support, TileGrid grid) {
+  // A mask begins with the first of the tiles that the support's bounding box touches.
+  const Range rows = tiles_of(clamp_range(rows_of(support), grid.height), grid);
+  const T half = support.half_width + support.reach;
+  const Span<T> columns = {support.mean.x - half, support.mean.x + half};
+  TileBox found = {0, rows.first, tiles_of(clamp_range(columns, grid.width), grid).first, 0};
+  int begin = 0, end = 0;  // of all columns, from the first; rounding may put one in front of the bounding box
+  for_each_tile_row(support, grid, [&](int, Range range) AR_HD_LAMBDA {
+    const int first = range.first - found.column, width = range.last - range.first + 1;
+    uint32_t bits = 0;
+    if (width > 0) {
+      found.count += width;
+      begin = min(begin, first), end = max(end, first + width);
+      bits = ((1u << width % 32) - 1) << first % 32u;
+    }
+    found.mask = found.mask >> 8 | TileMask(bits) << 56;
+  });
+  const int count = rows.last - rows.first + 1;
+  const bool fits = begin == 0 && end <= 8 && count <= 8;
+  found.mask = fits && count > 0 ? found.mask >> 8 * (8 - count) : 0;
+  return found;
+}
+
 /// Calls visit(tile index) for every tile the support touches, rows first, columns ascending.
 template <typename T, class Visit> AR_HD void for_each_tile(const Support<T>& s, TileGrid grid, Visit&& visit) {
   for_each_tile_row(s, grid, [&](int row, Range columns) AR_HD_LAMBDA {

@@ -6,7 +6,6 @@
 #include "core/bin.h"
 #include "cpu/isa.h"
 #include "cpu/parallel.h"
-#include "cpu/prefetch.h"
 #include "cpu/sort.h"
 #include "cpu/stages.h"
 
@@ -19,26 +18,53 @@ template <class F> using TilesOf = std::conditional_t<std::is_same_v<F, Adaptive
 /// memory.
 inline constexpr int64_t kAhead = 12;
 
-/// Asks for what the splats soon to come need: their rows and counts first, and where their pairs are written once
+/// Asks for what the splats soon to come need: their tiles and offsets first, and where their pairs are written once
 /// those have arrived.
 template <typename T> AR_HD void prefetch_pairs_of(const cpu::BinParams<T>& p, int64_t k, int64_t end) {
   if (k + 2 * kAhead < end) {
     const int32_t j = p.order[k + 2 * kAhead];
-    prefetch_splat(p.splats, j);
-    if (p.splat_offsets) __builtin_prefetch(p.splat_offsets + j, 1);
+    __builtin_prefetch(&p.tiles[j]);
+    if (p.positions) __builtin_prefetch(p.splat_offsets + j);
   }
   if (p.positions && k + kAhead < end) __builtin_prefetch(p.positions + p.splat_offsets[p.order[k + kAhead]], 1);
+}
+
+/// Splats whose tiles are found as one item of work.
+inline constexpr int64_t kFindSplats = 4096;
+
+/// Finds the tiles of all splats, in their order in memory, and counts those of each.
+template <class F, typename T> void find_tiles_of(cpu::BinParams<T>& p) {
+  const auto* splats = reinterpret_cast<const Splat<F, T>*>(p.splats);
+  cpu::parallel_for((p.n + kFindSplats - 1) / kFindSplats, p.threads, [&](int64_t item) {
+    for (int64_t j = item * kFindSplats, end = min(j + kFindSplats, p.n); j < end; ++j) {
+      TileBox box = {0, 0, 0, 0};
+      if (splats[j].level > T(0)) box = find_tiles(support_of(splats[j]), p.grid);
+      p.tiles[j] = {box.mask, box.count > 0 ? box.row : -1, box.column};
+      if (p.splat_offsets) p.splat_offsets[j] = box.count;
+    }
+  });
+  if (p.splat_offsets) p.splat_offsets[p.n] = 0;
 }
 
 template <class F, typename T, class Visit>
 void for_each_pair_of(const cpu::BinParams<T>& p, int64_t part_index, const Visit& visit) {
   const auto* splats = reinterpret_cast<const Splat<F, T>*>(p.splats);
   const cpu::Part part = cpu::part_of(p.n, p.parts, part_index);
+  const int64_t columns = p.grid.columns();
   for (int64_t k = part.begin; k < part.end; ++k) {
     prefetch_pairs_of(p, k, part.end);
     const int32_t j = p.order[k];
-    if (!(splats[j].level > T(0))) continue;
-    for_each_tile(support_of(splats[j]), p.grid, [&](int64_t tile) { visit(j, tile); });
+    const cpu::SplatTiles& tiles = p.tiles[j];
+    if (tiles.row < 0) continue;
+    if (tiles.mask == 0) {
+      for_each_tile(support_of(splats[j]), p.grid, [&](int64_t tile) { visit(j, tile); });
+      continue;
+    }
+    const int64_t first = tiles.row * columns + tiles.column;
+    for (TileMask left = tiles.mask; left != 0; left &= left - 1) {
+      const int bit = __builtin_ctzll(left);
+      visit(j, first + (bit >> 3) * columns + (bit & 7));
+    }
   }
 }
 /// visit(splat index, tile) for the pairs of one part of the splats, in depth order.
@@ -48,8 +74,10 @@ void for_each_pair(const cpu::BinParams<T>& p, int64_t part_index, const Visit& 
                   [&](auto f) AR_HD_LAMBDA { for_each_pair_of<TilesOf<decltype(f)>>(p, part_index, visit); });
 }
 
-/// Sorts by depth, counts the pairs of each tile, and turns the counts into places.
+/// Finds the tiles of splats, sorts these by depth, counts the pairs of each tile, and turns the counts into places.
 template <typename T> void count_pairs(cpu::BinParams<T>& p) {
+  p.tiles.reset(new cpu::SplatTiles[p.n]);
+  visit_footprint(p.footprint, Footprints{}, [&](auto f) AR_HD_LAMBDA { find_tiles_of<TilesOf<decltype(f)>>(p); });
   p.order.reset(new int32_t[p.n]);
   cpu::sort_by_depth(p.depths, p.n, p.threads, p.order.get());
   const int64_t tiles = p.grid.tiles();
@@ -59,10 +87,7 @@ template <typename T> void count_pairs(cpu::BinParams<T>& p) {
   cpu::parallel_for(p.parts, p.threads, [&](int64_t part) {
     int64_t* count = p.cursors.get() + part * tiles;
     for (int64_t tile = 0; tile < tiles; ++tile) count[tile] = 0;
-    for_each_pair(p, part, [&](int32_t j, int64_t tile) {
-      ++count[tile];
-      if (p.splat_offsets) ++p.splat_offsets[j];
-    });
+    for_each_pair(p, part, [&](int32_t, int64_t tile) { ++count[tile]; });
   });
   p.tile_offsets[tiles] = cpu::place_items(p.cursors.get(), p.parts, tiles, p.threads, p.tile_offsets);
   if (p.splat_offsets) cpu::sum_before(p.splat_offsets, p.n + 1, p.threads);

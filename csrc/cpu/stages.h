@@ -7,6 +7,7 @@
 #include <string_view>
 #include <vector>
 
+#include "core/bin.h"
 #include "core/project.h"
 #include "core/weight.h"
 
@@ -48,6 +49,12 @@ template <typename T> struct ShapeRowsParams : ar::ShapeRowsParams<T> {
   int threads;
 };
 
+/// The tiles of a splat, in 16 bytes: splats are visited in depth order, which is random in memory.
+struct SplatTiles {
+  TileMask mask;        ///< from tile (row, column) on; 0: they are worked out again, since they are not among 8x8
+  int32_t row, column;  ///< row -1: none
+};
+
 /// count_pairs fills the offsets and scatter_pairs, once the caller has made room, `pairs` and `positions`.
 template <typename T> struct BinParams {
   const T* splats;
@@ -57,12 +64,13 @@ template <typename T> struct BinParams {
   TileGrid grid;
   int threads;
   int64_t* tile_offsets;   ///< [tiles + 1] into pairs
-  int64_t* splat_offsets;  ///< [n + 1] into positions, zero before count_pairs; or null
+  int64_t* splat_offsets;  ///< [n + 1] into positions, or null
   int32_t* pairs;          ///< [tile_offsets[tiles]] splat of each pair, by tile, then depth
   int64_t* positions;      ///< [same] places of a splat's pairs, by splat, or null
   // Kept from count_pairs to scatter_pairs. No vectors, which one thread would fill with zeros:
-  std::unique_ptr<int32_t[]> order;    ///< [n] splats by depth, ties in input order
-  std::unique_ptr<int64_t[]> cursors;  ///< [parts, tiles] next place in pairs
+  std::unique_ptr<SplatTiles[]> tiles;  ///< [n]
+  std::unique_ptr<int32_t[]> order;     ///< [n] splats by depth, ties in input order
+  std::unique_ptr<int64_t[]> cursors;   ///< [parts, tiles] next place in pairs
   int64_t parts;
 };
 

@@ -61,7 +61,7 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
   if (params.given.data) not_finite = rows_not_finite(params.given, i - lane_id(), lit);
   // While the harmonics are on their way.
   SplatTiles tiles = {};
-  if (splat.level > 0) tiles = find_tiles(support, params.grid);
+  if (splat.level > 0) tiles = splat_tiles_of(support, params.grid);
   wait_for_copies();
   if (splat.level > 0) {
     if (splat_color(camera, g, i, rows.row(), splat.color) && !(not_finite >> lane_id() & 1)) {
@@ -142,7 +142,7 @@ __global__ void __launch_bounds__(kProjectThreads) shape_rows_kernel(const Shape
   const Vec3<float>& color = splat.color;
   if (!(within(color.x, kMaxColor) && within(color.y, kMaxColor) && within(color.z, kMaxColor))) splat.level = 0;
   SplatTiles tiles = {};
-  if (splat.level > 0) tiles = find_tiles(support_of(splat, params.footprint.index), params.grid);
+  if (splat.level > 0) tiles = splat_tiles_of(support_of(splat, params.footprint.index), params.grid);
   reinterpret_cast<SplatRow<float>*>(params.splats)[i] = splat;
   write_tiles(params, i, tiles, projected.depth);
 }

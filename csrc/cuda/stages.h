@@ -9,6 +9,7 @@
 
 #include <cuda_runtime_api.h>
 
+#include "core/bin.h"
 #include "core/camera.h"
 #include "core/project.h"
 #include "core/weight.h"
@@ -53,8 +54,7 @@ struct PairRange {
   int32_t first, count;
 };
 
-/// Tiles among 8x8: bit 8 r + c is the one in row r and column c.
-using TileMask = uint64_t;
+/// A splat of more tiles than this gets no mask of them.
 inline constexpr int kManyTiles = 16;
 /// The tiles that a splat touches. Together, because bin reads them in the order of depth, which is far from that in
 /// memory.

@@ -147,7 +147,7 @@ template <typename T> class CpuBackend final : public Backend {
     out.splats = splats.splats;
     out.ids = splats.ids;
     out.tile_offsets = at::empty({grid.tiles() + 1}, longs_);
-    out.splat_offsets = pass.keep ? at::zeros({n + 1}, longs_) : at::empty({0}, longs_);
+    out.splat_offsets = at::empty({pass.keep ? n + 1 : 0}, longs_);
     cpu::BinParams<T> p = {};
     p.splats = const_pointer<T>(splats.splats);
     p.depths = const_pointer<T>(splats.depths);

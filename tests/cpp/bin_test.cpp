@@ -75,6 +75,31 @@ TEST(Bin, TilesAreThoseThatTheSupportTouches) {
   }
 }
 
+TEST(Bin, MasksAreOfTheSameTiles) {
+  const TileGrid grids[] = {{100, 70}, {1, 400}, {900, 700}, {900, 700, 3}};
+  Random random(1);
+  int masks = 0, without = 0;
+  for (int trial = 0; trial < search_trials(5000); ++trial) {
+    const TileGrid grid = grids[trial % 4];
+    const Support<double> support = random_ellipse(random, kReaches[trial % 3]).support;
+    std::vector<int64_t> tiles, found;
+    for_each_tile(support, grid, [&](int64_t tile) { tiles.push_back(tile); });
+    const TileBox box = find_tiles(support, grid);
+    ASSERT_EQ(box.count, int(tiles.size()));
+    for (int bit = 0; bit < 64; ++bit) {
+      if (box.mask >> bit & 1) found.push_back(int64_t(box.row + bit / 8) * grid.columns() + box.column + bit % 8);
+    }
+    if (box.mask) {
+      ASSERT_EQ(found, tiles) << "trial " << trial;
+      ++masks;
+    } else if (!tiles.empty()) {
+      ++without;
+    }
+  }
+  EXPECT_GT(masks, search_trials(1000));
+  EXPECT_GT(without, search_trials(50));
+}
+
 /// Ends of the chord at y, offsets from the mean, from the quadratic itself; ends meet outside.
 Span<double> chord(const Mat2<double>& w, double level, double y) {
   const double a = w.xx * w.xx + w.yx * w.yx, b = (w.xx * w.xy + w.yx * w.yy) * y;

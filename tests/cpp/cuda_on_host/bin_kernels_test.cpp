@@ -182,7 +182,7 @@ TEST(BinKernels, PairsOfSplats) {
       expected_splats.push_back(i);
     });
     expected_ranges[i].count = int32_t(expected_tiles.size()) - expected_ranges[i].first;
-    const SplatTiles& tiles = splat_tiles[i] = find_tiles(support_of(splats[i], footprint), grid);
+    const SplatTiles& tiles = splat_tiles[i] = splat_tiles_of(support_of(splats[i], footprint), grid);
     ASSERT_EQ(tiles.count, expected_ranges[i].count);
     many += tiles.count > kManyTiles;
     masked += tiles.mask != 0;
