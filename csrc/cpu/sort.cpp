@@ -24,7 +24,7 @@ uint64_t depth_key(double depth) {
   return key;
 }
 
-/// Numbers that one thread adds up at a time, and kinds of items.
+/// As many numbers as make it worthwhile that another thread adds them up, and kinds of items that are placed together.
 constexpr int64_t kSumBlock = 4096, kKindBlock = 256;
 
 }  // namespace
