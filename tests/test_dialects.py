@@ -211,6 +211,24 @@ def test_functional_form(name):
 
 
 @pytest.mark.parametrize("name", ORIGINALS)
+def test_functional_form_with_settings_of_the_library(name):
+    """They render as the library does, and take nothing that belongs to a dialect."""
+    arguments, plain = arguments_of(name), scene_of()
+    order = list(inspect.signature(dialects.dialect_module(name).rasterize_gaussians).parameters)[:-1]
+    names = {"sh": "shs", "cov3Ds_precomp": "cov3D_precomp"}
+    settings = CAMERA.settings(torch.float32)
+
+    def rendered(given):
+        made = [given.get(names.get(key, key)) for key in order]
+        return dialects.dialect_module(name).rasterize_gaussians(*made, settings)
+
+    assert all(map(torch.equal, rendered(plain), ar.GaussianRasterizer(settings)(**plain)))
+    if set(order) & set(arguments) - set(plain):
+        with pytest.raises(TypeError, match="settings must be of a dialect that takes .*, got those of the library"):
+            rendered(arguments)
+
+
+@pytest.mark.parametrize("name", ORIGINALS)
 def test_outputs_of_the_effects_come_last(name):
     made = render(name)
     effects = ar.Effects(alpha=True, median_depth=True)

@@ -8,7 +8,7 @@ import torch
 
 from ..optim import SparseGaussianAdam
 from ._base import GaussianRasterizer as Rasterizer
-from ._base import as_settings, forward_like, given
+from ._base import forward_like, given, render_by
 from .gs2024 import GaussianRasterizationSettings as Settings
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam", "rasterize_gaussians"]
@@ -52,6 +52,6 @@ def rasterize_gaussians(
     means3D, means2D, dc, sh, colors_precomp, opacities, scales, rotations, cov3Ds_precomp, raster_settings
 ) -> tuple:
     """The functional form of `GaussianRasterizer.forward`."""
-    return as_settings(raster_settings).render(
-        means3D, means2D, opacities, dc, sh, colors_precomp, scales, rotations, cov3Ds_precomp
+    return render_by(
+        raster_settings, means3D, means2D, opacities, sh, colors_precomp, scales, rotations, cov3Ds_precomp, dc=dc
     )

@@ -5,7 +5,7 @@ Repositories: lkeab/gaussian-grouping. `sh_objs` (P, 1, 16) holds the identity o
 
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
-from ._base import as_settings, forward_like, given, with_channels
+from ._base import forward_like, given, render_by, with_channels
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
 
@@ -55,6 +55,5 @@ def rasterize_gaussians(
     means3D, means2D, sh, sh_objs, colors_precomp, opacities, scales, rotations, cov3Ds_precomp, raster_settings
 ) -> tuple:
     """The functional form of `GaussianRasterizer.forward`."""
-    return as_settings(raster_settings).render(
-        means3D, means2D, opacities, sh, sh_objs, colors_precomp, scales, rotations, cov3Ds_precomp
-    )
+    arguments = means3D, means2D, opacities, sh, colors_precomp, scales, rotations, cov3Ds_precomp
+    return render_by(raster_settings, *arguments, sh_objs=sh_objs)

@@ -10,7 +10,7 @@ import torch
 
 from ..effects import Effects
 from ..rotations import product
-from ._base import FIELDS, as_settings, forward_like
+from ._base import FIELDS, forward_like, render_by
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
 
@@ -119,6 +119,5 @@ def rasterize_gaussians(
     raster_settings,
 ) -> tuple:
     """The functional form of `GaussianRasterizer.forward`."""
-    return as_settings(raster_settings).render(
-        means3D, means2D, opacities, sh, colors_precomp, scales, rotations, cov3Ds_precomp, theta, rho
-    )
+    arguments = means3D, means2D, opacities, sh, colors_precomp, scales, rotations, cov3Ds_precomp
+    return render_by(raster_settings, *arguments, theta=theta, rho=rho)
