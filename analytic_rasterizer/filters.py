@@ -62,7 +62,8 @@ def sampling_interval(means3D: torch.Tensor, camera: Any) -> torch.Tensor:
     effects = camera.effects if isinstance(camera.effects, Effects) else Effects()
     clip = camera.projmatrix.reshape(4, 4).to(means3D)
     z = depths(means3D, camera.viewmatrix.to(means3D))
-    projected = means3D @ clip[:3] + clip[3]
+    columns = means3D.split(1, dim=1)  # not `@`, which autocast and TF32 round
+    projected = columns[0] * clip[0] + columns[1] * clip[1] + columns[2] * clip[2] + clip[3]
     inside = (projected[:, :2].abs() <= (1 + 2 * MARGIN) * projected[:, 3:].abs()).all(1)
     # The finer of the two axes.
     focal = max(camera.image_width / camera.tanfovx, camera.image_height / camera.tanfovy) / 2
@@ -150,7 +151,7 @@ def bake_pixel(
             sight = camera.viewmatrix.reshape(4, 4)[:3, 2].to(means3D).expand_as(means3D)
         else:
             sight = torch.nn.functional.normalize(means3D - camera.campos.to(means3D).reshape(1, 3), dim=1)
-        sight = torch.einsum("pik,pi->pk", axes, sight)  # in the frames of the Gaussians
+        sight = (axes * sight[:, :, None]).sum(1)  # in the frames of the Gaussians; not by einsum, as above
         total += torch.where(seen, projected_area(scales, sight) / projected_area(widened, sight), 0)
         count += seen
     known = count > 0

@@ -96,6 +96,26 @@ def test_filter_removes_what_only_a_finer_camera_could_show():
     assert abs(pixels - math.sqrt(0.2)) < 1e-3 and opacities < 1e-6
 
 
+@pytest.mark.parametrize("bake", [False, True])
+def test_autocast_rounds_nothing(bake):
+    """Under autocast matrix products have 8 bits: which points a camera sees must not be found with them."""
+    generator = torch.Generator().manual_seed(1)
+    settings = Camera(eye=(0, 0, -8)).settings(torch.float32)
+    means = torch.rand(4000, 3, generator=generator) * 16 - 8  # on both sides of every border of the picture
+    scales, rotations = torch.rand(4000, 3, generator=generator), torch.randn(4000, 4, generator=generator)
+    opacities = torch.rand(4000, 1, generator=generator)
+
+    def made():
+        if bake:
+            return ar.bake_pixel(means, scales, rotations, opacities, [settings])
+        return [filters.sampling_interval(means, settings)]
+
+    expected = made()
+    assert 400 < filters.sampling_interval(means, settings).isfinite().sum() < 3600
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert all(map(torch.equal, made(), expected))
+
+
 def test_errors():
     with pytest.raises(ValueError, match=r"cameras must hold .* got none"):
         ar.compute_3d_filter(torch.zeros(2, 3), [])

@@ -873,6 +873,13 @@ def test_covariances_and_their_inverses(device, dtype, reference):
         dialect.quat_scale_to_covar_preci(torch.zeros(3), torch.zeros(3))
 
 
+def test_autocast_does_not_round_covariances():
+    scene = scene_of(torch.float32, "cpu")
+    expected = dialect.quat_scale_to_covar_preci(scene["quats"], scene["scales"])
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert all(map(torch.equal, dialect.quat_scale_to_covar_preci(scene["quats"], scene["scales"]), expected))
+
+
 BINOMS = torch.tensor([[math.comb(n, k) for k in range(51)] for n in range(51)], dtype=torch.float64)
 
 
