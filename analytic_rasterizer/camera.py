@@ -7,7 +7,7 @@ import torch
 from . import _C
 from .effects import Effects
 from .rotations import product
-from .settings import GaussianRasterizationSettings, whole_number
+from .settings import GaussianRasterizationSettings, one_number, whole_number
 
 _DEPTH_RANGE = (0.01, 100.0)  # of clip-space z, which nothing reads
 
@@ -148,7 +148,9 @@ def make_lens(effects: Effects, settings, like: torch.Tensor) -> torch.Tensor:
     """
     members = effects.lens_members()
     tangents = (settings.tanfovx, settings.tanfovy)
-    members["tan_half_fov"] = tangents if effects.camera_gradients else [float(t) for t in tangents]
+    if not effects.camera_gradients:
+        tangents = [one_number(name, t) for name, t in zip(("tanfovx", "tanfovy"), tangents)]
+    members["tan_half_fov"] = tangents
     if effects.off_center:
         members["center"] = view_center(settings.viewmatrix, settings.projmatrix, effects.camera_gradients)
     # Neighbouring numbers are copied to the device together; the last member is never a tensor.

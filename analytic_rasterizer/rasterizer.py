@@ -84,8 +84,6 @@ def render(
 
     The other arguments, what is returned, and errors are those of `GaussianRasterizer.forward`.
     """
-    if not isinstance(settings, GaussianRasterizationSettings):
-        raise TypeError(f"settings must be a GaussianRasterizationSettings, got {type(settings).__name__}")
     gaussians = gaussian_arguments(
         settings,
         means3D,

@@ -11,7 +11,7 @@ CUDA (float32).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ from . import (
 from .arguments import camera_arguments, check_tensors, gaussian_arguments
 from .effects import Effects
 from .outputs import before_background, depths, split_background
-from .settings import GaussianRasterizationSettings
+from .settings import GaussianRasterizationSettings, check_settings
 
 
 @dataclass(frozen=True)
@@ -147,13 +147,15 @@ def project(
         `Splats` of all cameras.
 
     Raises:
-        TypeError: Not a tensor, or a wrong dtype.
+        TypeError: Not a tensor, a wrong dtype, or settings of another class.
         ValueError: Wrong shape, device or value, or settings that disagree.
         RuntimeError: CUDA tensors, and an extension without CUDA.
 
     Source: [EWA, Eq. 29-31]; docs/numerics.md.
     """
-    cameras = [settings] if isinstance(settings, GaussianRasterizationSettings) else list(settings)
+    # Settings of another class may be a tuple, too: their fields are no cameras.
+    several = isinstance(settings, Iterable) and not hasattr(settings, "viewmatrix")
+    cameras = list(settings) if several else [settings]
     if not cameras:
         raise ValueError("settings must hold at least one camera, got none")
     gaussians, batch = project_arguments(
@@ -187,6 +189,7 @@ def project_arguments(
         TypeError, ValueError, RuntimeError: As `project`.
     """
     for number, camera in enumerate(cameras):
+        check_settings(camera)
         if not _same_filter(camera, cameras[0]):
             raise ValueError(f"settings must agree in filter_3d, but camera {number} has another one than camera 0")
     gaussians = gaussian_arguments(cameras[0], means3D, opacities, **optional)

@@ -1,5 +1,6 @@
 """The contract with code that was written for other rasterizers, and with wrong input."""
 
+import collections
 import copy
 import dataclasses
 import functools
@@ -631,6 +632,13 @@ WRONG_TYPES = {
         ({"bg": t(3).double()}, rf"bg must .*{DOUBLE}"),
         ({"viewmatrix": t(4, 4).double()}, rf"viewmatrix must .*{DOUBLE}"),
     ],
+    "no number": [
+        ({"tanfovx": None}, r"tanfovx must be a number, got None"),
+        ({"tanfovy": "wide"}, r"tanfovy must be a number, got 'wide'"),
+        ({"tanfovy": t(2)}, r"tanfovy must be a number, got tensor"),
+        ({"tanfovx": None, "sh_degree": 4}, r"tanfovx must be a number, got None"),  # of a full camera
+        ({"scale_modifier": None}, r"scale_modifier must be a number, got None"),
+    ],
 }
 WRONG = [
     pytest.param(error, changes, pattern, id=f"{group} {i}")
@@ -664,6 +672,28 @@ def test_errors(device, error, changes, pattern, stages, tmp_path, monkeypatch):
             ar.render_stages(settings, **scene)
         else:
             render(scene, settings)
+
+
+def test_a_scale_modifier_that_requires_a_gradient_is_refused(device):
+    """It would get none. Where no gradients are made it is a number like others."""
+    settings = CAMERA.settings(torch.float32, device)._replace(scale_modifier=t(()).requires_grad_())
+    with pytest.raises(ValueError, match="scale_modifier must not require a gradient"):
+        render(scene32(device), settings)
+    with torch.no_grad():
+        assert torch.equal(render(scene32(device), settings)[0], render(scene32(device))[0])
+
+
+def test_settings_of_another_class_are_named(device):
+    """Also where they are a tuple, whose fields could be taken for the settings of several cameras."""
+    settings, scene = CAMERA.settings(torch.float32, device), scene32(device)
+    del scene["means2D"]
+    other = collections.namedtuple("Settings", settings._fields)(*settings)
+    for call in (ar.project, ar.render_stages):
+        for wrong, name in ((other, "Settings"), (None, "NoneType")):
+            with pytest.raises(TypeError, match=f"settings must be a GaussianRasterizationSettings, got {name}"):
+                call(wrong, **scene)
+    with pytest.raises(TypeError, match="settings must be a GaussianRasterizationSettings, got Settings"):
+        ar.project([settings, other], **scene)
 
 
 @pytest.mark.parametrize(
