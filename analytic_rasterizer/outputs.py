@@ -31,19 +31,23 @@ def depths(means3D: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
 
 
 def split_background(
-    bg: torch.Tensor, colors_precomp: torch.Tensor | None, size: tuple[int, int]
+    bg: torch.Tensor, colors_precomp: torch.Tensor | None, size: tuple[int, int], debug: bool = False
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
     """What the operator takes as background, and the image that comes behind its result: (C,) and None, or zeros and
     (C, H, W).
 
     Raises:
-        ValueError: `bg` is an image of another shape.
+        ValueError: `bg` is an image of another shape, or not finite. On CUDA, where looking waits for the device, it is
+            looked at for `debug` only.
     """
     if bg.dim() != 3:
         return bg, None
     channels = 3 if colors_precomp is None else colors_precomp.shape[-1]
     if bg.shape != (channels, *size):
         raise ValueError(f"bg must have shape {(channels, *size)}, got {tuple(bg.shape)}")
+    if (bg.device.type == "cpu" or debug) and not torch.compiler.is_compiling() and not bg.isfinite().all():
+        place = tuple((~bg.isfinite()).nonzero()[0].tolist())
+        raise ValueError(f"bg must be finite, got {bg[place].item()} at {place}")
     return bg.new_zeros(channels), bg
 
 

@@ -116,7 +116,7 @@ def _render_with_outputs(
 ) -> tuple:
     """(color, radii), and `Outputs` where `effects` asks for some. `bg` may be an image (C, H, W)."""
     size = camera["image_height"], camera["image_width"]
-    bg, bg_image = split_background(bg, gaussians["colors_precomp"], size)
+    bg, bg_image = split_background(bg, gaussians["colors_precomp"], size, debug)
     with_summaries = effects.median_depth or effects.dominant_index or effects.gaussian_stats
     blended = {name: getattr(effects, name) for name in _C.IMAGES}
     blended["alpha"] |= bg_image is not None
