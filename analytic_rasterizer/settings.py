@@ -121,8 +121,7 @@ class GaussianRasterizationSettings(_Fields):
     ) -> None:
         """Checks and keeps what is not in the tuple."""
         if footprint is not None:
-            settled = isinstance(footprint, Footprint) and not options
-            self.footprint = footprint if settled else resolve_footprint(str(footprint), **options)
+            self.footprint = resolve_footprint(footprint, **options)
         elif options:
             known = ", ".join((*self._fields, "footprint", "effects"))
             raise TypeError(f"settings must be among: {known}; got {', '.join(options)}")

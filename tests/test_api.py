@@ -696,6 +696,24 @@ def test_settings_of_another_class_are_named(device):
         ar.project([settings, other], **scene)
 
 
+def test_footprints_are_taken_where_their_names_are():
+    """So that a program can put the default back that it found."""
+    box = ar.resolve_footprint("box:samples=8")
+    assert ar.resolve_footprint(box) == box and ar.resolve_footprint(box, samples=2).samples == 2
+    found = ar.get_default_footprint()
+    try:
+        ar.set_default_footprint(box)
+        assert ar.get_default_footprint() == box
+        ar.set_default_footprint(found)
+        assert ar.get_default_footprint() == found
+    finally:
+        ar.set_default_footprint(None)
+    offset, cov2d = torch.zeros(2), torch.tensor([0.5, 0.1, 0.4])
+    assert torch.equal(ar.footprint_weight(offset, cov2d, box), ar.footprint_weight(offset, cov2d, "box:samples=8"))
+    with pytest.raises(ValueError, match="name must be a footprint where options are given, got None with samples"):
+        ar.set_default_footprint(None, samples=4)
+
+
 @pytest.mark.parametrize(
     "keywords, pattern",
     [

@@ -146,7 +146,7 @@ def check_colors(
 def settle_footprint(footprint: str | Footprint | None, rasterize_mode: str, eps2d: float) -> Footprint:
     """The footprint of a call: as `rasterization` says of its argument. Raises ValueError for one that is not known."""
     if footprint is not None:
-        return resolve_footprint(str(footprint))
+        return resolve_footprint(footprint)
     if (chosen := chosen_footprint()) is not None:
         return chosen
     if rasterize_mode == "classic":
