@@ -824,6 +824,11 @@ def test_relocation_of_wrong_inputs():
         ((opacity, scale, count.float()), TypeError, "N must be of integers, got torch.float32"),
         ((opacity.tolist(), scale, count), TypeError, "opacity_old must be a tensor, got list"),
         ((opacity, scale, count, None, 0), ValueError, "n_max must be at least 1, got 0"),
+        ((opacity, scale, count, None, 1001), ValueError, "n_max must be at most 1000, got 1001"),
+        ((opacity, scale, count, None, 2.5), ValueError, "n_max must be a whole number, got 2.5"),
+        ((opacity.long(), scale, count), TypeError, "opacity_old must have a floating-point dtype, got torch.int64"),
+        ((opacity, scale.int(), count), TypeError, "scale_old must have a floating-point dtype, got torch.int32"),
+        ((opacity, scale, count + 0j), TypeError, "N must be of integers, got torch.complex64"),
     ]:
         with pytest.raises(error, match=message):
             ar.compute_relocation(*wrong)
