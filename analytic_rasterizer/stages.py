@@ -112,7 +112,13 @@ class TileLists:
     cameras: int
 
     def of_camera(self, camera: int = 0) -> dict[str, torch.Tensor]:
-        """The lists of one camera, by the names of ListTensors."""
+        """The lists of one camera, by the names of ListTensors.
+
+        Raises:
+            IndexError: There is no such camera.
+        """
+        if not 0 <= camera < self.cameras:
+            raise IndexError(f"camera must be 0 to {self.cameras - 1}, got {camera}")
         first = camera * len(_C.LISTS)
         return dict(zip(_C.LISTS, self.tensors[first : first + len(_C.LISTS)]))
 
@@ -235,9 +241,13 @@ def bin(splats: Splats, *, background: torch.Tensor | None = None, keep: bool = 
         `TileLists` of all cameras.
 
     Raises:
-        ValueError: The footprint is `adaptive`, which chooses samples by colours, and the splats have none.
+        TypeError: background is no tensor, or has another dtype than the splats.
+        ValueError: The footprint is `adaptive`, which chooses samples by colours, and the splats have none; or
+            background has a wrong shape or device.
     """
     s = splats
+    if background is not None:
+        check_tensors(s.means2d.device, background=background)
     tensors = torch.ops.analytic_rasterizer.bin(
         means2d=s.means2d.detach(),
         cov2d=s.cov2d.detach(),
@@ -295,6 +305,8 @@ def blend(
         if background.shape not in (shape, shape[1:]):
             raise ValueError(f"background must have shape {shape[1:]} or {shape}, got {tuple(background.shape)}")
         background = background.expand(shape)
+    if means2d_abs is not None:
+        check_tensors(s.means2d.device, means2d_abs=means2d_abs)
     image, alpha, _ = torch.ops.analytic_rasterizer.blend(
         means2d=s.means2d,
         cov2d=s.cov2d,

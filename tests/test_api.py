@@ -745,6 +745,12 @@ def test_mark_visible_errors(device):
         rasterizer.markVisible(t(5, 3, device=device).long())
     with pytest.raises(TypeError, match=r"positions must .*got"):
         rasterizer.markVisible([[0.0, 0.0, 0.0]])
+    with pytest.raises(ValueError, match=r"positions must be on the device of viewmatrix, .*got meta"):
+        rasterizer.markVisible(t(5, 3, device=META))
+    for view, error in ((t(3, 3, device=device), ValueError), (None, TypeError)):
+        with pytest.raises(error, match=r"viewmatrix must .*got"):
+            settings = rasterizer.raster_settings._replace(viewmatrix=view)
+            ar.GaussianRasterizer(settings).markVisible(t(5, 3, device=device))
 
 
 def test_debug_writes_a_snapshot_on_failure(device, tmp_path, monkeypatch):
