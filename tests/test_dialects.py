@@ -198,6 +198,11 @@ def test_returned_values(device, name):
         assert torch.allclose(ours, theirs, rtol=0, atol=tolerance)
 
 
+def test_visible_filter_names_what_is_wrong():
+    with pytest.raises(ValueError, match=r"means3D must have shape \(P, 3\), got \(\)"):
+        drop_in.GaussianRasterizer(settings_of("scaffold")).visible_filter(torch.tensor(1.0))
+
+
 @pytest.mark.parametrize("name", ORIGINALS)
 def test_functional_form(name):
     """rasterize_gaussians has the arguments of forward in the order of the original, opacities after the colours."""
@@ -224,7 +229,7 @@ def test_functional_form_with_settings_of_the_library(name):
 
     assert all(map(torch.equal, rendered(plain), ar.GaussianRasterizer(settings)(**plain)))
     if set(order) & set(arguments) - set(plain):
-        with pytest.raises(TypeError, match="settings must be of a dialect that takes .*, got those of the library"):
+        with pytest.raises(TypeError, match=r"settings must be of a dialect that takes .*, got those of the library"):
             rendered(arguments)
 
 
@@ -692,6 +697,37 @@ def test_wrong_features(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"exactly one|shs"):
         both = {"colors_precomp": torch.zeros(COUNT, 3), "sh_objs": torch.zeros(COUNT, 1, 16)}
         render("grouping", scene=scene_of() | both)
+
+
+@pytest.mark.parametrize(
+    "name, further, error, message",
+    [
+        ("accel", {"dc": [1.0]}, TypeError, "dc must be a tensor, got list"),
+        ("accel", {"dc": torch.zeros(5, 1, 3)}, ValueError, r"dc must have shape \(P, 1, 3\) .*, got \(5, 1, 3\) and"),
+        ("accel", {"dc": torch.zeros(COUNT, 3)}, ValueError, r"dc must have shape \(P, 1, 3\) .*, got \(25, 3\) and"),
+        ("accel", {"dc": torch.zeros(COUNT, 1, 3).double()}, TypeError, "dc must have the dtype of shs"),
+        ("grouping", {"sh_objs": [1.0]}, TypeError, "sh_objs must be a tensor, got list"),
+        ("grouping", {"sh_objs": torch.tensor(1.0)}, ValueError, r"sh_objs must have shape .*, got \(\)"),
+        ("feature3dgs", {"semantic_feature": [1.0]}, TypeError, "semantic_feature must be a tensor, got list"),
+        ("feature3dgs", {"semantic_feature": torch.zeros(COUNT)}, ValueError, r"semantic_feature must have shape"),
+        ("depth", {"means2D_densify": [1.0]}, TypeError, "means2D_densify must be a tensor, got list"),
+        ("depth", {"means2D_densify": torch.zeros(5, 3)}, ValueError, r"means2D_densify must have .*, got \(5, 3\)"),
+        ("monogs", {"theta": [0.0, 0.0, 0.0]}, TypeError, "theta must be a tensor, got list"),
+    ],
+)
+def test_wrong_further_arguments(name, further, error, message):
+    with pytest.raises(error, match=message):
+        render(name, scene=arguments_of(name) | further)
+
+
+@pytest.mark.parametrize("missing", [None, torch.empty(0)], ids=["none", "empty"])
+def test_densify_without_means2d(missing):
+    """What is missing may be None or an empty tensor, here as elsewhere."""
+    probe_at = torch.zeros(COUNT, 3, requires_grad=True)
+    render("depth", scene=scene_of() | {"means2D": missing, "means2D_densify": probe_at})[0].sum().backward()
+    expected = torch.zeros(COUNT, 3, requires_grad=True)
+    render("depth", scene=scene_of() | {"means2D": expected, "means2D_densify": missing})[0].sum().backward()
+    assert probe_at.grad.abs().max() > 0 and torch.equal(probe_at.grad, expected.grad)
 
 
 def test_lightgaussian_counts(device):

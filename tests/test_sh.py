@@ -85,7 +85,7 @@ def test_bad_numbers_and_arguments():
         ar.needed_sh_degree(shs, None)
     with pytest.raises(TypeError, match="shs must be a tensor, got list"):
         ar.needed_sh_degree([1.0])
-    with pytest.raises(TypeError, match="shs must have a floating-point dtype, got torch.int64"):
+    with pytest.raises(TypeError, match=r"shs must have a floating-point dtype, got torch.int64"):
         ar.needed_sh_degree(shs.long())
 
 

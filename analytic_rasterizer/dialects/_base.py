@@ -274,6 +274,8 @@ class GaussianRasterizer(LibraryRasterizer):
             As `forward`.
         """
         check_tensors(None, means3D=means3D)
+        if means3D.dim() != 2 or means3D.shape[1] != 3:
+            raise ValueError(f"means3D must have shape (P, 3), got {tuple(means3D.shape)}")
         splats = project(
             as_settings(self.raster_settings),
             means3D,
@@ -373,4 +375,5 @@ def with_channels(
 
 def given(tensor: torch.Tensor | None) -> bool:
     """Whether an input is there: 3DGS passes those that are not as None or as an empty tensor."""
-    return tensor is not None and not (tensor.dim() == 1 and tensor.numel() == 0)
+    missing = isinstance(tensor, torch.Tensor) and tensor.dim() == 1 and tensor.numel() == 0
+    return tensor is not None and not missing

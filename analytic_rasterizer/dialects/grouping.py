@@ -3,6 +3,7 @@
 Repositories: lkeab/gaussian-grouping. `sh_objs` (P, 1, 16) holds the identity of each Gaussian, as features.
 """
 
+from ..arguments import check_tensors
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
 from ._base import forward_like, given, render_by, with_channels
@@ -38,6 +39,9 @@ class GaussianRasterizationSettings(Settings):
         """
         arguments = means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp
         if given(sh_objs):
+            check_tensors(None, sh_objs=sh_objs)
+            if sh_objs.dim() not in (2, 3):
+                raise ValueError(f"sh_objs must have shape (P, 1, K) or (P, K), got {tuple(sh_objs.shape)}")
             objects, (color, radii, *further) = with_channels(self, sh_objs.flatten(1), *arguments)
         else:
             color, radii, *further = super().render(*arguments)
