@@ -75,11 +75,11 @@ def summaries(
         footprint, option: Key and number of the footprint that it was rendered with.
     """
     median, dominant, pixels, largest, total, in_front, dominated = torch.ops.analytic_rasterizer.inspect(
-        saved, len(z), *size, footprint, option
+        saved, z.shape[0], *size, footprint, option
     )
     outputs = {}
     if effects.median_depth:
-        of_pixel = z[median.clamp_min(0).long()] if len(z) else z.new_zeros(median.shape)
+        of_pixel = z[median.clamp_min(0).long()] if z.shape[0] else z.new_zeros(median.shape)
         outputs["median_depth"] = of_pixel.masked_fill(median < 0, 0)[None]
     if effects.dominant_index:
         outputs["dominant_index"] = dominant[None]
