@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 from . import _C
@@ -158,9 +160,9 @@ def make_lens(effects: Effects, settings, like: torch.Tensor) -> torch.Tensor:
     """
     members = effects.lens_members()
     tangents = (settings.tanfovx, settings.tanfovy)
-    if not effects.camera_gradients:
-        tangents = [one_number(name, t) for name, t in zip(("tanfovx", "tanfovy"), tangents)]
-    members["tan_half_fov"] = tangents
+    for name, tangent in zip(("tanfovx", "tanfovy"), tangents):
+        _check_tangent(name, tangent)
+    members["tan_half_fov"] = tangents if effects.camera_gradients else [float(t) for t in tangents]
     if effects.off_center:
         members["center"] = view_center(settings.viewmatrix, settings.projmatrix, effects.camera_gradients)
     # Neighbouring numbers are copied to the device together; the last member is never a tensor.
@@ -176,6 +178,19 @@ def make_lens(effects: Effects, settings, like: torch.Tensor) -> torch.Tensor:
                 floats.append(float(number))
     last = _copied(floats, like)
     return torch.cat([*parts, last]) if parts else last
+
+
+def _check_tangent(name: str, tangent: float | torch.Tensor) -> None:
+    """Raises for what is no tangent of half a field of view. The value of a tensor is examined on the CPU only."""
+    if isinstance(tangent, torch.Tensor):
+        if tangent.numel() != 1:
+            raise TypeError(f"{name} must be a number, got {tangent!r}")
+        if tangent.device.type != "cpu" or torch.compiler.is_compiling():
+            return
+        tangent = tangent.detach()
+    number = one_number(name, tangent)
+    if not 0 < number < math.inf:
+        raise ValueError(f"{name} must be positive and finite, got {number}")
 
 
 def _copied(numbers: list[float], like: torch.Tensor) -> torch.Tensor:

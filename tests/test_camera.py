@@ -593,6 +593,23 @@ def test_wrong_arguments(error, message, make):
         make()
 
 
+@pytest.mark.parametrize(
+    "tangent, error, message",
+    [
+        (torch.tensor(-0.5), ValueError, "tanfovx must be positive and finite, got -0.5"),
+        (torch.tensor(0.0, requires_grad=True), ValueError, "tanfovx must be positive and finite, got 0.0"),
+        (-0.5, ValueError, "tanfovx must be positive and finite, got -0.5"),
+        (torch.ones(2), TypeError, "tanfovx must be a number, got tensor"),
+        (None, TypeError, "tanfovx must be a number, got None"),
+    ],
+)
+def test_tangents_of_a_camera_with_gradients_are_checked(tangent, error, message):
+    """As those of one without; on the CPU, because on CUDA a tensor would have to be waited for."""
+    settings = CAMERA.settings(effects=ar.Effects(camera_gradients=True))._replace(tanfovx=tangent)
+    with pytest.raises(error, match=message):
+        ar.GaussianRasterizer(settings)(**scenes.random_scene(1, 5, degree=1))
+
+
 def test_a_lens_that_is_not_finite_raises():
     """As a camera does; on CUDA only with debug, because it would have to be waited for."""
     scene = scenes.random_scene(1, 5, degree=1)
