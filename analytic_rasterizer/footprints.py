@@ -74,8 +74,8 @@ def _number(name: str, value: Any) -> float:
         number = float(value)
     except (TypeError, ValueError):
         raise ValueError(f"{name} must be a number, got {value!r}") from None
-    if not 0.0 <= number < float("inf"):
-        raise ValueError(f"{name} must be finite and not negative, got {number}")
+    if not 0.0 <= number <= torch.finfo(torch.float32).max:  # above it the kernels would have infinity
+        raise ValueError(f"{name} must be finite in float32 and not negative, got {number}")
     return number
 
 

@@ -362,6 +362,8 @@ def render_stages(
 ) -> Stages:
     """Renders without gradient, keeping and timing what each stage makes. For inspection; waits for the device.
 
+    Outputs that the effects of the settings ask for are not made.
+
     Arguments and errors are those of `GaussianRasterizer.forward`.
     """
     gaussians = gaussian_arguments(

@@ -727,6 +727,7 @@ def test_footprints_are_taken_where_their_names_are():
         ({"footprint": "mip", "variance": -0.1}, r"variance must .*got -0.1"),
         ({"footprint": "mip", "variance": "wide"}, r"variance must .*got 'wide'"),
         ({"footprint": "point", "dilation": math.inf}, r"dilation must .*got inf"),
+        ({"footprint": "point", "dilation": 1e300}, r"dilation must be finite in float32 .*got 1e\+300"),
         ({"footprint": "analytic", "frame_gradient": "thawed"}, r"frame_gradient must .*'thawed'"),
     ],
     ids=str,
