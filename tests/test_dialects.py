@@ -567,6 +567,10 @@ def test_sparse_adam_against_its_definition(device):
             assert torch.allclose(optimizer.state[p]["exp_avg_sq"].cpu(), v, rtol=1e-12)
     with pytest.raises(ValueError, match=r"visibility must have shape \(6,\), got \(5,\)"):
         optimizer.step(torch.ones(5, dtype=torch.bool, device=device), 6)
+    with pytest.raises(TypeError, match="visibility must be a tensor, got list"):
+        optimizer.step([True] * 6, 6)
+    with pytest.raises(ValueError, match=rf"rows must be on the device of the parameters, {device}.*, got meta"):
+        optimizer.step(torch.ones(6, dtype=torch.bool, device="meta"), 6)
 
 
 @pytest.mark.parametrize("shape", [(3,), (1, 3)])
