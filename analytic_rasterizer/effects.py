@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from numbers import Integral, Real
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -124,6 +124,15 @@ class Motion:
                     _check_number(f"every number of {name}", number)
             if not fits:
                 raise ValueError(f"{name} must have {length} finite numbers, got {value!r}")
+
+    def __eq__(self, other: object):
+        if not isinstance(other, Motion):
+            return NotImplemented
+        return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+
+    def __hash__(self):
+        # Not of the values: equal tensors have different hashes, and lists have none.
+        return hash((Motion, *(getattr(self, f.name) is None for f in fields(self))))
 
 
 @dataclass(frozen=True)
@@ -248,6 +257,15 @@ def _check_number(name: str, value, at_least: float = -math.inf, above: float = 
     if not (math.isfinite(value) and value >= at_least and value > above):
         limit = f" and above {above}" if above > -math.inf else f" and at least {at_least}" if at_least == 0 else ""
         raise ValueError(f"{name} must be finite{limit}, got {value}")
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Whether two numbers, tuples or tensors are equal. `==` of tensors has no truth value."""
+    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
+        return a is b or (a.shape == b.shape and a.device == b.device and torch.equal(a, b))
+    if (isinstance(a, torch.Tensor) and a.dim()) or (isinstance(b, torch.Tensor) and b.dim()):
+        return False
+    return bool(a == b)
 
 
 def _is_integer_tensor(value) -> bool:

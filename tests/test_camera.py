@@ -408,6 +408,18 @@ def test_numbers_of_a_velocity_may_be_tensors(exposure):
     assert torch.allclose(gradient(speed, (speed, 0.0, 0.1)), expected, rtol=1e-12)
 
 
+def test_motions_with_tensors_can_be_compared():
+    def motion(speed, exposure=0.5):
+        return ar.Motion(exposure, velocity=torch.tensor([speed, 0.0, 0.1]), screen_velocity=[1.0, 2.0])
+
+    assert motion(1.0) == motion(1.0) and hash(motion(1.0)) == hash(motion(1.0))
+    assert motion(1.0) != motion(2.0) and motion(1.0) != motion(1.0, exposure=0.6)
+    assert motion(1.0) != ar.Motion(0.5, velocity=(1.0, 0.0, 0.1), screen_velocity=[1.0, 2.0])
+    assert motion(1.0) != 0.5 and ar.Motion(0.5) != motion(1.0)
+    assert motion(1.0, torch.tensor(0.5)) == motion(1.0, torch.tensor(0.5))
+    assert len({ar.Effects(motion=motion(1.0)), ar.Effects(motion=motion(1.0))}) == 1
+
+
 def test_numbers_of_numpy_are_numbers():
     lens = ar.Defocus(np.float32(0.5), np.int64(3))
     effects = ar.Effects(near=np.float32(0.5), far=np.float32(8), sh_degree=np.int64(1), defocus=lens)
