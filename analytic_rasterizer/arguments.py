@@ -7,22 +7,14 @@ from typing import Any
 import torch
 
 from .camera import make_lens
+from .checks import check_tensors
 from .effects import MAX_SH_DEGREE, Effects
 from .filters import apply_3d_filter
 from .footprints import check_device
-from .settings import GaussianRasterizationSettings, whole_number
+from .settings import GaussianRasterizationSettings, check_settings, one_number, whole_number
 from .sh import used_sh_degree
 
 _NOTHING = Effects()
-
-
-def check_tensors(device: torch.device | None, **tensors: Any) -> None:
-    """Raises unless all are tensors, and on `device` if it is given."""
-    for name, tensor in tensors.items():
-        if not isinstance(tensor, torch.Tensor):
-            raise TypeError(f"{name} must be a tensor, got {type(tensor).__name__}")
-        if device is not None and tensor.device != device:
-            raise ValueError(f"{name} must be on the device of means3D, {device}, got {tensor.device}")
 
 
 def gaussian_arguments(
@@ -36,10 +28,11 @@ def gaussian_arguments(
         **optional: Inputs that may be missing: None, or as 3DGS passes them an empty tensor on whatever device.
 
     Raises:
-        TypeError: Something is no tensor.
+        TypeError: Something is no tensor, or `settings` is something else.
         ValueError: A tensor is on another device than means3D, or the filter has no scales to widen.
         RuntimeError: CUDA tensors, and an extension without CUDA.
     """
+    check_settings(settings)
     check_tensors(None, means3D=means3D)
     device = means3D.device
     check_device(device)
@@ -53,7 +46,7 @@ def gaussian_arguments(
             given = "neither" if optional["cov3D_precomp"] is None else "cov3D_precomp"
             raise ValueError(f"filter_3d needs scales and rotations, got {given}")
         # The scale modifier does not widen the filter: it is a property of the training pictures.
-        filter_3d = effects.filter_3d / settings.scale_modifier
+        filter_3d = effects.filter_3d / one_number("scale_modifier", settings.scale_modifier)
         optional["scales"], opacities = apply_3d_filter(optional["scales"], opacities, filter_3d)
     return {"means3D": means3D, "opacities": opacities, **optional}
 
@@ -67,9 +60,15 @@ def camera_arguments(
     camera centre or a tangent that requires a gradient makes a full camera too, for only that has one.
 
     Raises:
-        TypeError, ValueError: A matrix is no tensor or on another device; the size or the degree is no whole number.
+        TypeError, ValueError: A matrix is no tensor or on another device; the size or the degree is no whole number; a
+            tangent or the scale modifier is no number; the scale modifier requires a gradient.
     """
     s, effects = settings, settings.effects
+    if isinstance(s.scale_modifier, torch.Tensor) and s.scale_modifier.requires_grad and torch.is_grad_enabled():
+        raise ValueError(
+            "scale_modifier must not require a gradient, it gets none: multiply the scales by it, or pass "
+            "scale_modifier.detach()"
+        )
     view, proj, campos = s.viewmatrix, s.projmatrix, s.campos
     check_tensors(means3D.device, viewmatrix=view, projmatrix=proj, campos=campos)
     footprint = s.footprint_in_use()
@@ -92,9 +91,9 @@ def camera_arguments(
         "lens": lens,
         "image_height": whole_number("image_height", s.image_height),
         "image_width": whole_number("image_width", s.image_width),
-        "tanfovx": float(tanfovx),
-        "tanfovy": float(tanfovy),
-        "scale_modifier": float(s.scale_modifier),
+        "tanfovx": one_number("tanfovx", tanfovx),
+        "tanfovy": one_number("tanfovy", tanfovy),
+        "scale_modifier": one_number("scale_modifier", s.scale_modifier),
         "sh_degree": degree,
         "footprint": footprint.key,
         "option": footprint.option,

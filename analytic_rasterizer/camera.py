@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 from . import _C
+from .checks import check_tensors
 from .effects import Effects
 from .rotations import product
-from .settings import GaussianRasterizationSettings, whole_number
+from .settings import GaussianRasterizationSettings, one_number, whole_number
 
 _DEPTH_RANGE = (0.01, 100.0)  # of clip-space z, which nothing reads
 
@@ -47,14 +50,19 @@ def camera_settings(
         effects, **options: As in the settings, the footprint among them.
 
     Raises:
+        TypeError: world_to_camera or bg is no tensor, or one of the numbers is none.
         ValueError: world_to_camera has a wrong shape, a focal length that is a number is not positive, or width or
             height is not a whole number.
     """
     width, height = whole_number("width", width), whole_number("height", height)
+    check_tensors(None, world_to_camera=world_to_camera, **({} if bg is None else {"bg": bg}))
     if world_to_camera.shape != (4, 4):
         raise ValueError(f"world_to_camera must have shape (4, 4), got {tuple(world_to_camera.shape)}")
-    for name, value in (("fx", fx), ("fy", fy)):
-        if not isinstance(value, torch.Tensor) and not value > 0:
+    for name, value in (("fx", fx), ("fy", fy), ("cx", cx), ("cy", cy)):
+        if isinstance(value, torch.Tensor):  # whose value is not examined: on a device that would have to wait
+            if value.numel() != 1:
+                raise ValueError(f"{name} must be one number, got a tensor of shape {tuple(value.shape)}")
+        elif not (value is None and name in ("cx", "cy")) and not one_number(name, value) > 0 and name in ("fx", "fy"):
             raise ValueError(f"{name} must be positive, got {value}")
     view = world_to_camera.double()
     fx, fy, cx, cy = (
@@ -122,8 +130,12 @@ def moved(world_to_camera: torch.Tensor, tangent: torch.Tensor) -> torch.Tensor:
         tangent: (6,) of se(3) along and around the camera's axes: translation, world units, then rotation, rad.
 
     Raises:
+        TypeError: Not a tensor, or world_to_camera is of integers.
         ValueError: Wrong shapes.
     """
+    check_tensors(None, world_to_camera=world_to_camera, tangent=tangent)
+    if not world_to_camera.is_floating_point():  # they would round the motion away
+        raise TypeError(f"world_to_camera must have a floating-point dtype, got {world_to_camera.dtype}")
     if world_to_camera.shape != (4, 4) or tangent.shape != (6,):
         raise ValueError(
             "world_to_camera must have shape (4, 4) and tangent (6,), got "
@@ -148,6 +160,8 @@ def make_lens(effects: Effects, settings, like: torch.Tensor) -> torch.Tensor:
     """
     members = effects.lens_members()
     tangents = (settings.tanfovx, settings.tanfovy)
+    for name, tangent in zip(("tanfovx", "tanfovy"), tangents):
+        _check_tangent(name, tangent)
     members["tan_half_fov"] = tangents if effects.camera_gradients else [float(t) for t in tangents]
     if effects.off_center:
         members["center"] = view_center(settings.viewmatrix, settings.projmatrix, effects.camera_gradients)
@@ -164,6 +178,19 @@ def make_lens(effects: Effects, settings, like: torch.Tensor) -> torch.Tensor:
                 floats.append(float(number))
     last = _copied(floats, like)
     return torch.cat([*parts, last]) if parts else last
+
+
+def _check_tangent(name: str, tangent: float | torch.Tensor) -> None:
+    """Raises for what is no tangent of half a field of view. The value of a tensor is examined on the CPU only."""
+    if isinstance(tangent, torch.Tensor):
+        if tangent.numel() != 1:
+            raise TypeError(f"{name} must be a number, got {tangent!r}")
+        if tangent.device.type != "cpu" or torch.compiler.is_compiling():
+            return
+        tangent = tangent.detach()
+    number = one_number(name, tangent)
+    if not 0 < number < math.inf:
+        raise ValueError(f"{name} must be positive and finite, got {number}")
 
 
 def _copied(numbers: list[float], like: torch.Tensor) -> torch.Tensor:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from dataclasses import dataclass, field, fields, replace
+from numbers import Integral, Real
+from typing import Any, NamedTuple
 
 import torch
 
@@ -97,10 +98,10 @@ class Motion:
         angular_velocity: (3,) of the camera around them, rad / s.
         screen_velocity: (2,) of the whole picture, px / s.
 
-    Velocities may be tuples or tensors, which are differentiable.
+    Velocities may be tensors, or tuples of numbers and tensors with one; tensors are differentiable.
 
     Raises:
-        TypeError: `exposure` is not a number or a tensor.
+        TypeError: `exposure` is not a number or a tensor, or a velocity is not numbers.
         ValueError: A number outside of its domain, or a wrong shape.
     """
 
@@ -115,10 +116,23 @@ class Motion:
             value = getattr(self, name)
             if isinstance(value, torch.Tensor):
                 fits = value.shape == (length,)
+            elif value is not None and (isinstance(value, str) or not hasattr(value, "__len__")):
+                raise TypeError(f"{name} must be a tuple or a tensor of {length} numbers, got {value!r}")
             else:
-                fits = value is None or (len(value) == length and all(math.isfinite(v) for v in value))
+                fits = value is None or len(value) == length
+                for number in value if value is not None and fits else ():
+                    _check_number(f"every number of {name}", number)
             if not fits:
                 raise ValueError(f"{name} must have {length} finite numbers, got {value!r}")
+
+    def __eq__(self, other: object):
+        if not isinstance(other, Motion):
+            return NotImplemented
+        return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+
+    def __hash__(self):
+        # Not of the values: equal tensors have different hashes, and lists have none.
+        return hash((Motion, *(getattr(self, f.name) is None for f in fields(self))))
 
 
 @dataclass(frozen=True)
@@ -175,13 +189,18 @@ class Effects:
         for name in (*OUTPUTS, "camera_gradients", "orthographic", "off_center"):
             if not isinstance(getattr(self, name), bool):
                 raise TypeError(f"{name} must be a bool, got {getattr(self, name)!r}")
-        for name, kind in (("filter_3d", torch.Tensor), ("defocus", Defocus), ("motion", Motion), ("sh_degree", int)):
+        for name, kind in (("filter_3d", torch.Tensor), ("defocus", Defocus), ("motion", Motion)):
             value = getattr(self, name)
-            if isinstance(value, bool) or not (value is None or isinstance(value, kind)):
+            if not (value is None or isinstance(value, kind)):
                 raise TypeError(f"{name} must be a {kind.__name__} or None, got {value!r}")
+        degree = self.sh_degree
+        if isinstance(degree, bool) or not (degree is None or isinstance(degree, Integral)):
+            raise TypeError(f"sh_degree must be a whole number or None, got {degree!r}")
         if self.sh_degree is not None and not 0 <= self.sh_degree <= MAX_SH_DEGREE:
             raise ValueError(f"sh_degree must be 0 to {MAX_SH_DEGREE}, got {self.sh_degree}")
         _check_number("near", self.near, **({"at_least": 0} if self.orthographic else {"above": 0}))
+        if isinstance(self.far, torch.Tensor) or self.far != math.inf:
+            _check_number("far", self.far)
         if not self.far > self.near:
             raise ValueError(f"far must be above near, {self.near}, got {self.far}")
 
@@ -233,11 +252,20 @@ def _check_number(name: str, value, at_least: float = -math.inf, above: float = 
         if value.numel() != 1:
             raise ValueError(f"{name} must be one number, got a tensor of shape {tuple(value.shape)}")
         return  # the value is not examined: on a device that would have to be waited for
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
+    if isinstance(value, bool) or not isinstance(value, Real):  # numpy's are Real too
         raise TypeError(f"{name} must be a number, got {value!r}")
     if not (math.isfinite(value) and value >= at_least and value > above):
         limit = f" and above {above}" if above > -math.inf else f" and at least {at_least}" if at_least == 0 else ""
         raise ValueError(f"{name} must be finite{limit}, got {value}")
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Whether two numbers, tuples or tensors are equal. `==` of tensors has no truth value."""
+    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
+        return a is b or (a.shape == b.shape and a.device == b.device and torch.equal(a, b))
+    if (isinstance(a, torch.Tensor) and a.dim()) or (isinstance(b, torch.Tensor) and b.dim()):
+        return False
+    return bool(a == b)
 
 
 def _is_integer_tensor(value) -> bool:
@@ -245,7 +273,11 @@ def _is_integer_tensor(value) -> bool:
 
 
 def _times(exposure, velocity):
-    """exposure * velocity: a tensor if one of the two is a tensor, otherwise a list."""
+    """exposure * velocity: a tensor if one of the two is or holds a tensor, otherwise a list."""
+    devices = () if isinstance(velocity, torch.Tensor) else [v.device for v in velocity if isinstance(v, torch.Tensor)]
+    if devices:  # not by new_tensor below, which would drop their gradients
+        numbers = (torch.as_tensor(v, dtype=torch.float64, device=devices[0]).reshape(()) for v in velocity)
+        velocity = torch.stack(list(numbers))
     # Integers would round the other factor.
     exposure, velocity = (t.double() if _is_integer_tensor(t) else t for t in (exposure, velocity))
     if isinstance(exposure, torch.Tensor) and not isinstance(velocity, torch.Tensor):

@@ -13,9 +13,11 @@ from typing import Any
 
 import torch
 
+from .checks import check_tensors
 from .effects import Effects
 from .outputs import depths
 from .rotations import rotation_matrices
+from .settings import GaussianRasterizationSettings
 
 VARIANCE = 0.2  # of the filter, in squares of the finest sampling interval
 PIXEL_VARIANCE = 1 / 12  # of the square pixel along an axis, in squares of its width
@@ -40,18 +42,39 @@ def compute_3d_filter(means3D: torch.Tensor, cameras: Sequence[Any], variance: f
         (P,) world units, of the dtype and device of means3D.
 
     Raises:
-        ValueError: No cameras, or means3D has a wrong shape.
+        TypeError: means3D is no tensor, or a camera is something else.
+        ValueError: No cameras, or means3D has a wrong shape, or the variance is negative or not finite.
     """
+    check_tensors(None, means3D=means3D)
     if means3D.dim() != 2 or means3D.shape[1] != 3:
         raise ValueError(f"means3D must have shape (P, 3), got {tuple(means3D.shape)}")
-    if not cameras:
-        raise ValueError("cameras must hold the settings of at least one view, got none")
+    cameras = checked_cameras(cameras)
+    if not 0 <= variance < math.inf:
+        raise ValueError(f"variance must be finite and not negative, got {variance}")
     interval = means3D.new_full((len(means3D),), torch.inf)
     for camera in cameras:
         interval = torch.minimum(interval, sampling_interval(means3D, camera))
     seen = interval.isfinite()
     largest = interval[seen].max() if seen.any() else interval.new_zeros(())
     return torch.where(seen, interval, largest) * math.sqrt(variance)
+
+
+def checked_cameras(cameras: Any) -> list[GaussianRasterizationSettings]:
+    """The settings of the views.
+
+    Raises:
+        TypeError: They are not settings, or those of one view that are in no sequence.
+        ValueError: There are none.
+    """
+    if isinstance(cameras, GaussianRasterizationSettings):  # a tuple, too
+        raise TypeError("cameras must be a sequence with the settings of each view, got those of one view")
+    cameras = list(cameras or ())
+    if not cameras:
+        raise ValueError("cameras must hold the settings of at least one view, got none")
+    for camera in cameras:
+        if not isinstance(camera, GaussianRasterizationSettings):
+            raise TypeError(f"cameras must hold GaussianRasterizationSettings, got {type(camera).__name__}")
+    return cameras
 
 
 def sampling_interval(means3D: torch.Tensor, camera: Any) -> torch.Tensor:
@@ -62,7 +85,8 @@ def sampling_interval(means3D: torch.Tensor, camera: Any) -> torch.Tensor:
     effects = camera.effects if isinstance(camera.effects, Effects) else Effects()
     clip = camera.projmatrix.reshape(4, 4).to(means3D)
     z = depths(means3D, camera.viewmatrix.to(means3D))
-    projected = means3D @ clip[:3] + clip[3]
+    columns = means3D.split(1, dim=1)  # not `@`, which autocast and TF32 round
+    projected = columns[0] * clip[0] + columns[1] * clip[1] + columns[2] * clip[2] + clip[3]
     inside = (projected[:, :2].abs() <= (1 + 2 * MARGIN) * projected[:, 3:].abs()).all(1)
     # The finer of the two axes.
     focal = max(camera.image_width / camera.tanfovx, camera.image_height / camera.tanfovy) / 2
@@ -88,14 +112,21 @@ def apply_3d_filter(
         (scales, opacities) of the same shapes.
 
     Raises:
-        ValueError: The shapes do not fit.
+        TypeError: Something is no tensor, or the dtypes differ.
+        ValueError: The shapes or devices do not fit.
     """
+    check_tensors(None, scales=scales, opacities=opacities, filter_3d=filter_3d)
     if scales.dim() != 2 or scales.shape[1] != 3 or filter_3d.shape != scales.shape[:1]:
         raise ValueError(
             f"scales must have shape (P, 3) and filter_3d (P,), got {tuple(scales.shape)} and {tuple(filter_3d.shape)}"
         )
-    if opacities.numel() != len(scales):
+    if opacities.shape not in ((len(scales),), (len(scales), 1)):
         raise ValueError(f"opacities must have shape (P, 1) or (P,), got {tuple(opacities.shape)}")
+    for name, tensor in (("opacities", opacities), ("filter_3d", filter_3d)):
+        if tensor.dtype != scales.dtype:
+            raise TypeError(f"{name} must have the dtype of scales, {scales.dtype}, got {tensor.dtype}")
+        if tensor.device != scales.device:
+            raise ValueError(f"{name} must be on the device of scales, {scales.device}, got {tensor.device}")
     # hypot neither overflows nor loses small scales, and its gradient is finite unless both arguments are 0.
     width = torch.where(filter_3d < 0, torch.nan, filter_3d)[:, None].expand_as(scales)
     none = width == 0
@@ -136,8 +167,9 @@ def bake_pixel(
         (scales, opacities) of the same shapes.
 
     Raises:
-        ValueError: No cameras, or the shapes do not fit.
+        TypeError, ValueError: As `compute_3d_filter` and `apply_3d_filter`.
     """
+    cameras = checked_cameras(cameras)  # a list: they are gone through twice
     width = compute_3d_filter(means3D, cameras, PIXEL_VARIANCE)
     widened, _ = apply_3d_filter(scales, opacities, width)  # checks the shapes
     if rotations.shape != (len(scales), 4):
@@ -150,7 +182,7 @@ def bake_pixel(
             sight = camera.viewmatrix.reshape(4, 4)[:3, 2].to(means3D).expand_as(means3D)
         else:
             sight = torch.nn.functional.normalize(means3D - camera.campos.to(means3D).reshape(1, 3), dim=1)
-        sight = torch.einsum("pik,pi->pk", axes, sight)  # in the frames of the Gaussians
+        sight = (axes * sight[:, :, None]).sum(1)  # in the frames of the Gaussians; not by einsum, as above
         total += torch.where(seen, projected_area(scales, sight) / projected_area(widened, sight), 0)
         count += seen
     known = count > 0

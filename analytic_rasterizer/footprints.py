@@ -74,17 +74,17 @@ def _number(name: str, value: Any) -> float:
         number = float(value)
     except (TypeError, ValueError):
         raise ValueError(f"{name} must be a number, got {value!r}") from None
-    if not 0.0 <= number < float("inf"):
-        raise ValueError(f"{name} must be finite and not negative, got {number}")
+    if not 0.0 <= number <= torch.finfo(torch.float32).max:  # above it the kernels would have infinity
+        raise ValueError(f"{name} must be finite in float32 and not negative, got {number}")
     return number
 
 
-def resolve_footprint(name: str, **options: Any) -> Footprint:
+def resolve_footprint(name: str | Footprint, **options: Any) -> Footprint:
     """Settles a footprint's options.
 
     Args:
         name: One of `FOOTPRINTS`, optionally followed by options: `"box:samples=8"`,
-            `"point:dilation=0"`.
+            `"point:dilation=0"`. Or a `Footprint`.
         **options: The same as keywords; they win over those in `name`.
             point: `dilation` (px^2 added to the covariance, default 0.3).
             mip: `variance` (px^2, default 0.1).
@@ -97,6 +97,10 @@ def resolve_footprint(name: str, **options: Any) -> Footprint:
     Raises:
         ValueError: Unknown name, unknown option, or a value outside its domain.
     """
+    if isinstance(name, Footprint):
+        if not options:
+            return name
+        name = str(name)
     if not isinstance(name, str):
         raise ValueError(f"footprint must be one of {', '.join(FOOTPRINTS)}, got {name!r}")
     name, _, text = name.partition(":")
@@ -127,16 +131,18 @@ _ANALYTIC = resolve_footprint("analytic")
 _default: Footprint | None = None
 
 
-def set_default_footprint(name: str | None, **options: Any) -> None:
+def set_default_footprint(name: str | Footprint | None, **options: Any) -> None:
     """Chooses the footprint of settings that name none, for the whole process.
 
     `None` returns to the environment variable ANALYTIC_RASTERIZER_FOOTPRINT, or else to the filter of the dialect that
     the settings are of (docs/dialects.md), or else to `analytic`.
 
     Raises:
-        ValueError: As `resolve_footprint()`.
+        ValueError: As `resolve_footprint()`; or options of no footprint.
     """
     global _default
+    if name is None and options:
+        raise ValueError(f"name must be a footprint where options are given, got None with {', '.join(options)}")
     _default = None if name is None else resolve_footprint(name, **options)
 
 
@@ -176,7 +182,7 @@ def check_device(device: torch.device) -> None:
 
 
 def footprint_weight(
-    offset: torch.Tensor, cov2d: torch.Tensor, footprint: str = "analytic", **options: Any
+    offset: torch.Tensor, cov2d: torch.Tensor, footprint: str | Footprint = "analytic", **options: Any
 ) -> torch.Tensor:
     """Weight I(d, Sigma) of a splat of peak 1 in one pixel. Differentiable.
 

@@ -76,12 +76,12 @@ def _(a):
     like, size, channels = a.means3D, (a.image_height, a.image_width), _channels(a)
     saved = []
     if a.keep:
-        rows = len(like) if like.device.type == "cuda" else torch.library.get_ctx().new_dynamic_size()
+        rows = like.shape[0] if like.device.type == "cuda" else torch.library.get_ctx().new_dynamic_size()
         extra = a.depth + a.inverse_depth
-        made = like.new_empty(len(like), channels + extra) if extra or a.features is not None else like.new_empty(0)
+        made = like.new_empty(like.shape[0], channels + extra) if extra or a.features is not None else like.new_empty(0)
         saved = [*_lists(like, rows, a, True), *_state(like, a), made]
     images = [like.new_empty(size) for name in _C.IMAGES if getattr(a, name)]
-    return like.new_empty(channels, *size), images, like.new_empty(len(like), dtype=torch.int32), saved
+    return like.new_empty(channels, *size), images, like.new_empty(like.shape[0], dtype=torch.int32), saved
 
 
 @_register("rasterize_timed")
@@ -89,14 +89,16 @@ def _(a):
     *rasterized, saved = torch.ops.analytic_rasterizer.rasterize(**vars(a))
     if not a.keep:
         on_cuda = a.means3D.device.type == "cuda"
-        saved = _lists(a.means3D, len(a.means3D) if on_cuda else torch.library.get_ctx().new_dynamic_size(), a, False)
+        saved = _lists(
+            a.means3D, a.means3D.shape[0] if on_cuda else torch.library.get_ctx().new_dynamic_size(), a, False
+        )
     return *rasterized, saved, torch.empty(3, dtype=torch.float64, device="cpu")
 
 
 @_register("project")
 def _(a):
     like = a.means3D
-    rows, cameras = torch.library.get_ctx().new_dynamic_size(), len(a.viewmatrix)
+    rows, cameras = torch.library.get_ctx().new_dynamic_size(), a.viewmatrix.shape[0]
     colored = a.shs is not None or a.colors_precomp is not None
     ints = [like.new_empty(rows, dtype=torch.int32) for _ in range(4)]
     splits = [torch.empty(cameras + 1, dtype=torch.int64, device="cpu") for _ in range(2)]
@@ -107,7 +109,7 @@ def _(a):
 
 @_register("count_rows")
 def _(a):
-    return a.means3D.new_empty(len(a.viewmatrix), len(a.means3D), dtype=torch.int32)
+    return a.means3D.new_empty(a.viewmatrix.shape[0], a.means3D.shape[0], dtype=torch.int32)
 
 
 @_register("pack_rows_")
@@ -122,7 +124,7 @@ def _(a):
 
 @_register("blend_rows")
 def _(a):
-    n, size, saved = len(a.rows), (a.image_height, a.image_width), []
+    n, size, saved = a.rows.shape[0], (a.image_height, a.image_width), []
     if a.keep:
         saved = [*_lists(a.rows, n, a, True), *_state(a.rows, a), a.rows.new_empty(n, 4), a.rows.new_empty(n)]
     return a.rows.new_empty(3, *size), a.rows.new_empty(size), saved
@@ -136,14 +138,14 @@ def _(a):
 @_register("bin")
 def _(a):
     context = torch.library.get_ctx()
-    cameras = len(a.row_splits) - 1
-    rows = [len(a.means2d)] if cameras == 1 else [context.new_dynamic_size() for _ in range(cameras)]
+    cameras = a.row_splits.shape[0] - 1
+    rows = [a.means2d.shape[0]] if cameras == 1 else [context.new_dynamic_size() for _ in range(cameras)]
     return [tensor for n in rows for tensor in _lists(a.means2d, n, a, a.keep)]
 
 
 @_register("blend")
 def _(a):
-    cameras, size = len(a.row_splits) - 1, (a.image_height, a.image_width)
+    cameras, size = a.row_splits.shape[0] - 1, (a.image_height, a.image_width)
     saved = [tensor for _ in range(cameras) for tensor in _state(a.means2d, a)] if a.keep else []
     return (
         a.means2d.new_empty(cameras, a.features.shape[1], *size),
@@ -245,9 +247,9 @@ def _(a):
 @_register("picture_gradients")
 def _(a):
     gradients = [t.new_empty(t.shape) for t in (a.means, a.log_scales, a.quats, a.logit_opacities, a.shs)]
-    gradients += [a.means.new_empty(len(a.means), a.mean_columns)] if a.mean_columns else []
+    gradients += [a.means.new_empty(a.means.shape[0], a.mean_columns)] if a.mean_columns else []
     image = a.means.new_empty(3, a.image_height, a.image_width)
-    radii = a.means.new_empty(len(a.means), dtype=torch.int32)
+    radii = a.means.new_empty(a.means.shape[0], dtype=torch.int32)
     return a.means.new_empty(()), image, radii, gradients
 
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from . import ops  # noqa: F401  (registers the fake kernels)
+from .checks import check_tensors
 from .footprints import check_device
 
 _adam = torch.ops.analytic_rasterizer.adam_.default
@@ -140,6 +141,7 @@ class SparseGaussianAdam(torch.optim.Adam):
             TypeError, ValueError, RuntimeError: As from `FusedAdam.step`; visibility has another shape, a group has
                 several tensors, or a tensor is not made of N rows.
         """
+        check_tensors(None, visibility=visibility)
         if visibility.shape != (N,):
             raise ValueError(f"visibility must have shape ({N},), got {tuple(visibility.shape)}")
         for group in self.param_groups:
@@ -212,7 +214,10 @@ def _update(
             states.append(state)
     if not parameters:
         return
-    check_device(parameters[0].device)
+    device = parameters[0].device
+    check_device(device)
+    if rows is not None and rows.device != device:  # the op would do nothing for rows on the meta device
+        raise ValueError(f"rows must be on the device of the parameters, {device}, got {rows.device}")
     _adam(parameters, gradients, means, squares, rates, steps, *betas, eps, rows, bias_correction, heads, head_rates)
     for state, step in zip(states, steps):
         state["step"] = step

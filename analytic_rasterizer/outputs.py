@@ -31,19 +31,23 @@ def depths(means3D: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
 
 
 def split_background(
-    bg: torch.Tensor, colors_precomp: torch.Tensor | None, size: tuple[int, int]
+    bg: torch.Tensor, colors_precomp: torch.Tensor | None, size: tuple[int, int], debug: bool = False
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
     """What the operator takes as background, and the image that comes behind its result: (C,) and None, or zeros and
     (C, H, W).
 
     Raises:
-        ValueError: `bg` is an image of another shape.
+        ValueError: `bg` is an image of another shape, or not finite. On CUDA, where looking waits for the device, it is
+            looked at for `debug` only.
     """
     if bg.dim() != 3:
         return bg, None
     channels = 3 if colors_precomp is None else colors_precomp.shape[-1]
     if bg.shape != (channels, *size):
         raise ValueError(f"bg must have shape {(channels, *size)}, got {tuple(bg.shape)}")
+    if (bg.device.type == "cpu" or debug) and not torch.compiler.is_compiling() and not bg.isfinite().all():
+        place = tuple((~bg.isfinite()).nonzero()[0].tolist())
+        raise ValueError(f"bg must be finite, got {bg[place].item()} at {place}")
     return bg.new_zeros(channels), bg
 
 
@@ -71,11 +75,11 @@ def summaries(
         footprint, option: Key and number of the footprint that it was rendered with.
     """
     median, dominant, pixels, largest, total, in_front, dominated = torch.ops.analytic_rasterizer.inspect(
-        saved, len(z), *size, footprint, option
+        saved, z.shape[0], *size, footprint, option
     )
     outputs = {}
     if effects.median_depth:
-        of_pixel = z[median.clamp_min(0).long()] if len(z) else z.new_zeros(median.shape)
+        of_pixel = z[median.clamp_min(0).long()] if z.shape[0] else z.new_zeros(median.shape)
         outputs["median_depth"] = of_pixel.masked_fill(median < 0, 0)[None]
     if effects.dominant_index:
         outputs["dominant_index"] = dominant[None]

@@ -84,8 +84,6 @@ def render(
 
     The other arguments, what is returned, and errors are those of `GaussianRasterizer.forward`.
     """
-    if not isinstance(settings, GaussianRasterizationSettings):
-        raise TypeError(f"settings must be a GaussianRasterizationSettings, got {type(settings).__name__}")
     gaussians = gaussian_arguments(
         settings,
         means3D,
@@ -118,7 +116,7 @@ def _render_with_outputs(
 ) -> tuple:
     """(color, radii), and `Outputs` where `effects` asks for some. `bg` may be an image (C, H, W)."""
     size = camera["image_height"], camera["image_width"]
-    bg, bg_image = split_background(bg, gaussians["colors_precomp"], size)
+    bg, bg_image = split_background(bg, gaussians["colors_precomp"], size, debug)
     with_summaries = effects.median_depth or effects.dominant_index or effects.gaussian_stats
     blended = {name: getattr(effects, name) for name in _C.IMAGES}
     blended["alpha"] |= bg_image is not None
@@ -154,12 +152,17 @@ class GaussianRasterizer(torch.nn.Module):
 
         Raises:
             TypeError: Not a tensor, or not of the dtype of the settings' viewmatrix.
-            ValueError: Wrong shape.
+            ValueError: Wrong shape or device.
         """
         check_tensors(None, positions=positions)
+        view = self.raster_settings.viewmatrix
+        check_tensors(None, viewmatrix=view)
+        if view.shape not in ((4, 4), (1, 4, 4)):
+            raise ValueError(f"viewmatrix must have shape (4, 4) or (1, 4, 4), got {tuple(view.shape)}")
+        if positions.device != view.device:
+            raise ValueError(f"positions must be on the device of viewmatrix, {view.device}, got {positions.device}")
         if positions.dim() != 2 or positions.shape[1] != 3:
             raise ValueError(f"positions must have shape (P, 3), got {tuple(positions.shape)}")
-        view = self.raster_settings.viewmatrix.reshape(4, 4)
         if positions.dtype != view.dtype:
             raise TypeError(f"positions must have dtype {view.dtype}, got {positions.dtype}")
         effects = getattr(self.raster_settings, "effects", None)  # settings of a class of the program have none

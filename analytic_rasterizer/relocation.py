@@ -10,6 +10,10 @@ import math
 
 import torch
 
+from .settings import whole_number
+
+_MOST = 1000  # whose binomials fit a float64
+
 
 @functools.lru_cache(maxsize=8)
 def _coefficients(n_max: int) -> torch.Tensor:
@@ -44,8 +48,8 @@ def compute_relocation(
         Opacities and scales, of the shapes and dtypes of the old ones.
 
     Raises:
-        TypeError: Not a tensor, or N is not of integers.
-        ValueError: Wrong shape or device, or n_max is below 1.
+        TypeError: Not a tensor, N is not of integers, or the others are of integers.
+        ValueError: Wrong shape or device, or n_max is not a whole number from 1 to 1000.
 
     Source: [MCMC, Eq. 9].
     """
@@ -60,10 +64,16 @@ def compute_relocation(
             raise ValueError(f"{name} must have shape ({count},) or ({count}, 1), got {tuple(tensor.shape)}")
     if scale_old.dim() < 1 or len(scale_old) != count:
         raise ValueError(f"scale_old must have shape ({count}, 3), got {tuple(scale_old.shape)}")
-    if N.is_floating_point():
+    for name, tensor in (("opacity_old", opacity_old), ("scale_old", scale_old)):
+        if not tensor.is_floating_point():  # new opacities and scales would be rounded to integers
+            raise TypeError(f"{name} must have a floating-point dtype, got {tensor.dtype}")
+    if N.is_floating_point() or N.is_complex():
         raise TypeError(f"N must be of integers, got {N.dtype}")
+    n_max = whole_number("n_max", n_max)
     if n_max < 1:
         raise ValueError(f"n_max must be at least 1, got {n_max}")
+    if n_max > _MOST:
+        raise ValueError(f"n_max must be at most {_MOST}, got {n_max}")
     times = N.reshape(-1).long().clamp(1, n_max)
     old = opacity_old.reshape(-1).double().clamp(max=1 - 2.0**-24)
     new = -torch.expm1(torch.log1p(-old) / times)

@@ -37,6 +37,18 @@ def whole_number(name: str, value: Any) -> int:
     return number
 
 
+def one_number(name: str, value: Any) -> float:
+    """The number that `value` is: a float, or what programs have in its place, such as a tensor of one.
+
+    Raises:
+        TypeError: It is not one number.
+    """
+    try:
+        return float(value)
+    except (TypeError, ValueError, RuntimeError):  # which of them depends on the type and on the version of torch
+        raise TypeError(f"{name} must be a number, got {value!r}") from None
+
+
 class _Fields(NamedTuple):
     image_height: int
     image_width: int
@@ -109,8 +121,7 @@ class GaussianRasterizationSettings(_Fields):
     ) -> None:
         """Checks and keeps what is not in the tuple."""
         if footprint is not None:
-            settled = isinstance(footprint, Footprint) and not options
-            self.footprint = footprint if settled else resolve_footprint(str(footprint), **options)
+            self.footprint = resolve_footprint(footprint, **options)
         elif options:
             known = ", ".join((*self._fields, "footprint", "effects"))
             raise TypeError(f"settings must be among: {known}; got {', '.join(options)}")
@@ -143,6 +154,12 @@ class GaussianRasterizationSettings(_Fields):
         fields = ", ".join(f"{k}={v!r}" for k, v in self._asdict().items())
         effects = "" if self.effects is None else f", effects={self.effects}"
         return f"{type(self).__name__}({fields}, footprint={str(self.footprint)!r}{effects})"
+
+
+def check_settings(settings: Any) -> None:
+    """Raises TypeError unless it is a `GaussianRasterizationSettings`."""
+    if not isinstance(settings, GaussianRasterizationSettings):
+        raise TypeError(f"settings must be a GaussianRasterizationSettings, got {type(settings).__name__}")
 
 
 # Downstream code probes the signature to tell dialects apart: it must be 3DGS 2023's.

@@ -7,7 +7,9 @@ import math
 import torch
 from torch.utils.weak import WeakTensorKeyDictionary
 
+from .checks import check_tensors
 from .effects import AUTO, MAX_SH_DEGREE, Effects
+from .settings import one_number
 
 
 @torch.no_grad()
@@ -25,8 +27,12 @@ def sh_band_bounds(shs: torch.Tensor) -> list[float]:
         One bound per degree from 0 on, in units of colour.
 
     Raises:
+        TypeError: Not a tensor of floating-point numbers.
         ValueError: Wrong shape.
     """
+    check_tensors(None, shs=shs)
+    if not shs.is_floating_point():
+        raise TypeError(f"shs must have a floating-point dtype, got {shs.dtype}")
     degree = math.isqrt(shs.shape[1]) - 1 if shs.dim() == 3 else -1
     if shs.dim() != 3 or shs.shape[2] != 3 or not 0 <= degree <= MAX_SH_DEGREE or (degree + 1) ** 2 != shs.shape[1]:
         raise ValueError(f"shs must have shape (P, M, 3) with M = 1, 4, 9, 16 or 25, got {tuple(shs.shape)}")
@@ -50,9 +56,10 @@ def needed_sh_degree(shs: torch.Tensor, tolerance: float = 1 / 255) -> int:
         The degree, 0 to 4.
 
     Raises:
+        TypeError: Not a tensor of floating-point numbers, or a tolerance that is no number.
         ValueError: Wrong shape, or a tolerance that is negative or not finite.
     """
-    if not 0 <= tolerance < math.inf:
+    if not 0 <= one_number("tolerance", tolerance) < math.inf:
         raise ValueError(f"tolerance must be finite and not negative, got {tolerance}")
     bounds = sh_band_bounds(shs)
     if not math.isfinite(sum(bounds)):
@@ -78,7 +85,7 @@ def used_sh_degree(effects: Effects | str, degree: int, shs: torch.Tensor | None
     """
     if effects != AUTO:
         return degree if effects.sh_degree is None else min(degree, effects.sh_degree)
-    if shs is None or shs.dim() != 3 or (shs.requires_grad and torch.is_grad_enabled()):
+    if shs is None or degree < 0 or shs.dim() != 3 or (shs.requires_grad and torch.is_grad_enabled()):
         return degree
     used = shs[:, : (degree + 1) ** 2]
     if used.shape[1] < (degree + 1) ** 2 or shs.is_inference():  # a tensor of inference mode has no version

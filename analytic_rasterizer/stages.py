@@ -11,7 +11,7 @@ CUDA (float32).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
@@ -24,7 +24,7 @@ from . import (
 from .arguments import camera_arguments, check_tensors, gaussian_arguments
 from .effects import Effects
 from .outputs import before_background, depths, split_background
-from .settings import GaussianRasterizationSettings
+from .settings import GaussianRasterizationSettings, check_settings
 
 
 @dataclass(frozen=True)
@@ -112,7 +112,13 @@ class TileLists:
     cameras: int
 
     def of_camera(self, camera: int = 0) -> dict[str, torch.Tensor]:
-        """The lists of one camera, by the names of ListTensors."""
+        """The lists of one camera, by the names of ListTensors.
+
+        Raises:
+            IndexError: There is no such camera.
+        """
+        if not 0 <= camera < self.cameras:
+            raise IndexError(f"camera must be 0 to {self.cameras - 1}, got {camera}")
         first = camera * len(_C.LISTS)
         return dict(zip(_C.LISTS, self.tensors[first : first + len(_C.LISTS)]))
 
@@ -147,13 +153,15 @@ def project(
         `Splats` of all cameras.
 
     Raises:
-        TypeError: Not a tensor, or a wrong dtype.
+        TypeError: Not a tensor, a wrong dtype, or settings of another class.
         ValueError: Wrong shape, device or value, or settings that disagree.
         RuntimeError: CUDA tensors, and an extension without CUDA.
 
     Source: [EWA, Eq. 29-31]; docs/numerics.md.
     """
-    cameras = [settings] if isinstance(settings, GaussianRasterizationSettings) else list(settings)
+    # Settings of another class may be a tuple, too: their fields are no cameras.
+    several = isinstance(settings, Iterable) and not hasattr(settings, "viewmatrix")
+    cameras = list(settings) if several else [settings]
     if not cameras:
         raise ValueError("settings must hold at least one camera, got none")
     gaussians, batch = project_arguments(
@@ -187,6 +195,7 @@ def project_arguments(
         TypeError, ValueError, RuntimeError: As `project`.
     """
     for number, camera in enumerate(cameras):
+        check_settings(camera)
         if not _same_filter(camera, cameras[0]):
             raise ValueError(f"settings must agree in filter_3d, but camera {number} has another one than camera 0")
     gaussians = gaussian_arguments(cameras[0], means3D, opacities, **optional)
@@ -232,9 +241,13 @@ def bin(splats: Splats, *, background: torch.Tensor | None = None, keep: bool = 
         `TileLists` of all cameras.
 
     Raises:
-        ValueError: The footprint is `adaptive`, which chooses samples by colours, and the splats have none.
+        TypeError: background is no tensor, or has another dtype than the splats.
+        ValueError: The footprint is `adaptive`, which chooses samples by colours, and the splats have none; or
+            background has a wrong shape or device.
     """
     s = splats
+    if background is not None:
+        check_tensors(s.means2d.device, background=background)
     tensors = torch.ops.analytic_rasterizer.bin(
         means2d=s.means2d.detach(),
         cov2d=s.cov2d.detach(),
@@ -292,6 +305,8 @@ def blend(
         if background.shape not in (shape, shape[1:]):
             raise ValueError(f"background must have shape {shape[1:]} or {shape}, got {tuple(background.shape)}")
         background = background.expand(shape)
+    if means2d_abs is not None:
+        check_tensors(s.means2d.device, means2d_abs=means2d_abs)
     image, alpha, _ = torch.ops.analytic_rasterizer.blend(
         means2d=s.means2d,
         cov2d=s.cov2d,
@@ -346,6 +361,8 @@ def render_stages(
     cov3D_precomp: torch.Tensor | None = None,
 ) -> Stages:
     """Renders without gradient, keeping and timing what each stage makes. For inspection; waits for the device.
+
+    Outputs that the effects of the settings ask for are not made.
 
     Arguments and errors are those of `GaussianRasterizer.forward`.
     """

@@ -1,5 +1,6 @@
 """The contract with code that was written for other rasterizers, and with wrong input."""
 
+import collections
 import copy
 import dataclasses
 import functools
@@ -631,6 +632,13 @@ WRONG_TYPES = {
         ({"bg": t(3).double()}, rf"bg must .*{DOUBLE}"),
         ({"viewmatrix": t(4, 4).double()}, rf"viewmatrix must .*{DOUBLE}"),
     ],
+    "no number": [
+        ({"tanfovx": None}, r"tanfovx must be a number, got None"),
+        ({"tanfovy": "wide"}, r"tanfovy must be a number, got 'wide'"),
+        ({"tanfovy": t(2)}, r"tanfovy must be a number, got tensor"),
+        ({"tanfovx": None, "sh_degree": 4}, r"tanfovx must be a number, got None"),  # of a full camera
+        ({"scale_modifier": None}, r"scale_modifier must be a number, got None"),
+    ],
 }
 WRONG = [
     pytest.param(error, changes, pattern, id=f"{group} {i}")
@@ -666,6 +674,46 @@ def test_errors(device, error, changes, pattern, stages, tmp_path, monkeypatch):
             render(scene, settings)
 
 
+def test_a_scale_modifier_that_requires_a_gradient_is_refused(device):
+    """It would get none. Where no gradients are made it is a number like others."""
+    settings = CAMERA.settings(torch.float32, device)._replace(scale_modifier=t(()).requires_grad_())
+    with pytest.raises(ValueError, match="scale_modifier must not require a gradient"):
+        render(scene32(device), settings)
+    with torch.no_grad():
+        assert torch.equal(render(scene32(device), settings)[0], render(scene32(device))[0])
+
+
+def test_settings_of_another_class_are_named(device):
+    """Also where they are a tuple, whose fields could be taken for the settings of several cameras."""
+    settings, scene = CAMERA.settings(torch.float32, device), scene32(device)
+    del scene["means2D"]
+    other = collections.namedtuple("Settings", settings._fields)(*settings)
+    for call in (ar.project, ar.render_stages):
+        for wrong, name in ((other, "Settings"), (None, "NoneType")):
+            with pytest.raises(TypeError, match=f"settings must be a GaussianRasterizationSettings, got {name}"):
+                call(wrong, **scene)
+    with pytest.raises(TypeError, match="settings must be a GaussianRasterizationSettings, got Settings"):
+        ar.project([settings, other], **scene)
+
+
+def test_footprints_are_taken_where_their_names_are():
+    """So that a program can put the default back that it found."""
+    box = ar.resolve_footprint("box:samples=8")
+    assert ar.resolve_footprint(box) == box and ar.resolve_footprint(box, samples=2).samples == 2
+    found = ar.get_default_footprint()
+    try:
+        ar.set_default_footprint(box)
+        assert ar.get_default_footprint() == box
+        ar.set_default_footprint(found)
+        assert ar.get_default_footprint() == found
+    finally:
+        ar.set_default_footprint(None)
+    offset, cov2d = torch.zeros(2), torch.tensor([0.5, 0.1, 0.4])
+    assert torch.equal(ar.footprint_weight(offset, cov2d, box), ar.footprint_weight(offset, cov2d, "box:samples=8"))
+    with pytest.raises(ValueError, match="name must be a footprint where options are given, got None with samples"):
+        ar.set_default_footprint(None, samples=4)
+
+
 @pytest.mark.parametrize(
     "keywords, pattern",
     [
@@ -679,6 +727,7 @@ def test_errors(device, error, changes, pattern, stages, tmp_path, monkeypatch):
         ({"footprint": "mip", "variance": -0.1}, r"variance must .*got -0.1"),
         ({"footprint": "mip", "variance": "wide"}, r"variance must .*got 'wide'"),
         ({"footprint": "point", "dilation": math.inf}, r"dilation must .*got inf"),
+        ({"footprint": "point", "dilation": 1e300}, r"dilation must be finite in float32 .*got 1e\+300"),
         ({"footprint": "analytic", "frame_gradient": "thawed"}, r"frame_gradient must .*'thawed'"),
     ],
     ids=str,
@@ -697,6 +746,12 @@ def test_mark_visible_errors(device):
         rasterizer.markVisible(t(5, 3, device=device).long())
     with pytest.raises(TypeError, match=r"positions must .*got"):
         rasterizer.markVisible([[0.0, 0.0, 0.0]])
+    with pytest.raises(ValueError, match=r"positions must be on the device of viewmatrix, .*got meta"):
+        rasterizer.markVisible(t(5, 3, device=META))
+    for view, error in ((t(3, 3, device=device), ValueError), (None, TypeError)):
+        with pytest.raises(error, match=r"viewmatrix must .*got"):
+            settings = rasterizer.raster_settings._replace(viewmatrix=view)
+            ar.GaussianRasterizer(settings).markVisible(t(5, 3, device=device))
 
 
 def test_debug_writes_a_snapshot_on_failure(device, tmp_path, monkeypatch):

@@ -134,3 +134,29 @@ def test_torch_compile(device):
     assert torch.equal(made, picture(scene))
     made.sum().backward()
     assert leaves["means3D"].grad.abs().max() > 0
+
+
+class Pictures(torch.nn.Module):
+    """A rasterizer as torch.export takes it."""
+
+    def __init__(self, settings):
+        super().__init__()
+        self.rasterizer = ar.GaussianRasterizer(settings)
+
+    def forward(self, means3D, opacities, shs, scales, rotations):
+        color, radii, *_ = self.rasterizer(means3D, None, opacities, shs, None, scales, rotations)
+        return color, radii
+
+
+@pytest.mark.parametrize("effects", [None, ar.Effects(alpha=True, depth=True)], ids=["plain", "images"])
+def test_torch_export_for_any_number_of_gaussians(device, effects):
+    names = "means3D", "opacities", "shs", "scales", "rotations"
+    module = Pictures(CAMERA.settings(torch.float32, device, effects=effects))
+    few, many = (
+        tuple(scenes.cast(scenes.random_scene(1, count, degree=1), torch.float32, device)[name] for name in names)
+        for count in (20, 33)
+    )
+    count = torch.export.Dim("count", min=2, max=1000)
+    exported = torch.export.export(module, few, dynamic_shapes=({0: count},) * len(names)).module()
+    for scene in (few, many):
+        assert all(map(torch.equal, exported(*scene), module(*scene)))

@@ -1,5 +1,6 @@
 """Gradients of the camera, other projections, the lens and the shutter, on every device."""
 
+import numpy as np
 import pytest
 import reference
 import scenes
@@ -390,6 +391,44 @@ def test_integers_of_a_motion_are_numbers_like_others():
         assert (numbers - blurred(0.0, (0.0, 0.0, 0.0))).abs().max() > 1e-3
 
 
+@pytest.mark.parametrize("exposure", [0.5, torch.tensor(0.5)], ids=["number", "tensor"])
+def test_numbers_of_a_velocity_may_be_tensors(exposure):
+    """Each gets the gradient that the same number of a whole tensor gets."""
+    scene = scenes.random_scene(1, 30, degree=1)
+
+    def gradient(speed, velocity):
+        effects = ar.Effects(motion=ar.Motion(exposure, velocity))
+        color, _ = ar.GaussianRasterizer(CAMERA.settings(torch.float64, "cpu", effects=effects))(**scene)
+        return torch.autograd.grad(color.square().sum(), speed)[0]
+
+    speed = torch.tensor(0.7, dtype=torch.float64, requires_grad=True)
+    whole = torch.tensor([0.7, 0.0, 0.1], dtype=torch.float64, requires_grad=True)
+    expected = gradient(whole, whole)[0]
+    assert expected.abs() > 1e-3
+    assert torch.allclose(gradient(speed, (speed, 0.0, 0.1)), expected, rtol=1e-12)
+
+
+def test_motions_with_tensors_can_be_compared():
+    def motion(speed, exposure=0.5):
+        return ar.Motion(exposure, velocity=torch.tensor([speed, 0.0, 0.1]), screen_velocity=[1.0, 2.0])
+
+    assert motion(1.0) == motion(1.0) and hash(motion(1.0)) == hash(motion(1.0))
+    assert motion(1.0) != motion(2.0) and motion(1.0) != motion(1.0, exposure=0.6)
+    assert motion(1.0) != ar.Motion(0.5, velocity=(1.0, 0.0, 0.1), screen_velocity=[1.0, 2.0])
+    assert motion(1.0) != 0.5 and ar.Motion(0.5) != motion(1.0)
+    assert motion(1.0, torch.tensor(0.5)) == motion(1.0, torch.tensor(0.5))
+    assert len({ar.Effects(motion=motion(1.0)), ar.Effects(motion=motion(1.0))}) == 1
+
+
+def test_numbers_of_numpy_are_numbers():
+    lens = ar.Defocus(np.float32(0.5), np.int64(3))
+    effects = ar.Effects(near=np.float32(0.5), far=np.float32(8), sh_degree=np.int64(1), defocus=lens)
+    same = ar.Effects(near=0.5, far=8.0, sh_degree=1, defocus=ar.Defocus(0.5, 3))
+    scene = scenes.random_scene(1, 30, degree=1)
+    images = [ar.GaussianRasterizer(CAMERA.settings(effects=e))(**scene)[0] for e in (effects, same)]
+    assert torch.equal(*images)
+
+
 def test_blur_keeps_the_light(device, best):
     """The mass of a faint splat, opacity times the integral of its Gaussian, is the same with any blur."""
     scene = plate(9, 1, 4.0, best, sigma=(0.15, 0.3))
@@ -535,14 +574,27 @@ def test_the_filter_of_the_effects_is_apply_3d_filter(device, best):
         (ValueError, "near must be finite and at least 0, got -1", lambda: ar.Effects(near=-1, orthographic=True)),
         (ValueError, "far must be above near, 0.2, got 0.1", lambda: ar.Effects(far=0.1)),
         (ValueError, "sh_degree must be 0 to 4, got 5", lambda: ar.Effects(sh_degree=5)),
-        (TypeError, "sh_degree must be a int or None, got True", lambda: ar.Effects(sh_degree=True)),
+        (ValueError, "far must be finite, got nan", lambda: ar.Effects(far=float("nan"))),
+        (ValueError, r"far must be one number, got a tensor of shape \(2,\)", lambda: ar.Effects(far=torch.ones(2))),
+        (TypeError, "far must be a number, got None", lambda: ar.Effects(far=None)),
+        (TypeError, "sh_degree must be a whole number or None, got True", lambda: ar.Effects(sh_degree=True)),
         (TypeError, "defocus must be a Defocus or None, got 0.1", lambda: ar.Effects(defocus=0.1)),
         (TypeError, "orthographic must be a bool, got 1", lambda: ar.Effects(orthographic=1)),
         (ValueError, "aperture must be finite and at least 0, got -0.1", lambda: ar.Defocus(-0.1, 1)),
         (ValueError, "focus must be finite and above 0, got 0", lambda: ar.Defocus(0.1, 0)),
         (ValueError, "exposure must be finite and at least 0, got nan", lambda: ar.Motion(float("nan"))),
         (ValueError, "velocity must have 3 finite numbers", lambda: ar.Motion(0.1, velocity=(1, 2))),
+        (TypeError, "velocity must be a tuple or a tensor of 3 numbers, got 1", lambda: ar.Motion(0.1, velocity=1)),
+        (TypeError, "of velocity must be a number, got None", lambda: ar.Motion(0.1, velocity=(1, 2, None))),
+        (ValueError, "of velocity must be finite, got inf", lambda: ar.Motion(0.1, velocity=(1, 2, float("inf")))),
         (ValueError, r"world_to_camera must have shape \(4, 4\)", lambda: ar.camera_settings(torch.eye(3), 4, 4, 1, 1)),
+        (TypeError, "world_to_camera must be a tensor, got list", lambda: ar.camera_settings([1.0], 4, 4, 1, 1)),
+        (TypeError, "fy must be a number, got None", lambda: ar.camera_settings(torch.eye(4), 4, 4, 1, None)),
+        (TypeError, "cx must be a number, got 'left'", lambda: ar.camera_settings(torch.eye(4), 4, 4, 1, 1, "left")),
+        (ValueError, r"fx must be one number", lambda: ar.camera_settings(torch.eye(4), 4, 4, torch.ones(2), 1)),
+        (TypeError, "bg must be a tensor, got int", lambda: ar.camera_settings(torch.eye(4), 4, 4, 1, 1, bg=0)),
+        (TypeError, "tangent must be a tensor, got list", lambda: ar.moved(torch.eye(4), [0.0] * 6)),
+        (TypeError, "floating-point dtype, got torch.int64", lambda: ar.moved(torch.eye(4).long(), torch.ones(6))),
         (ValueError, "fx must be positive, got -1", lambda: ar.camera_settings(torch.eye(4), 4, 4, -1, 1)),
         (ValueError, r"tangent \(6,\), got \(4, 4\) and \(3,\)", lambda: ar.moved(torch.eye(4), torch.zeros(3))),
         (TypeError, 'effects must be an Effects or "auto", got', lambda: CAMERA.settings(effects="all")),
@@ -551,6 +603,23 @@ def test_the_filter_of_the_effects_is_apply_3d_filter(device, best):
 def test_wrong_arguments(error, message, make):
     with pytest.raises(error, match=message):
         make()
+
+
+@pytest.mark.parametrize(
+    "tangent, error, message",
+    [
+        (torch.tensor(-0.5), ValueError, "tanfovx must be positive and finite, got -0.5"),
+        (torch.tensor(0.0, requires_grad=True), ValueError, "tanfovx must be positive and finite, got 0.0"),
+        (-0.5, ValueError, "tanfovx must be positive and finite, got -0.5"),
+        (torch.ones(2), TypeError, "tanfovx must be a number, got tensor"),
+        (None, TypeError, "tanfovx must be a number, got None"),
+    ],
+)
+def test_tangents_of_a_camera_with_gradients_are_checked(tangent, error, message):
+    """As those of one without; on the CPU, because on CUDA a tensor would have to be waited for."""
+    settings = CAMERA.settings(effects=ar.Effects(camera_gradients=True))._replace(tanfovx=tangent)
+    with pytest.raises(error, match=message):
+        ar.GaussianRasterizer(settings)(**scenes.random_scene(1, 5, degree=1))
 
 
 def test_a_lens_that_is_not_finite_raises():

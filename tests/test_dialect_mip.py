@@ -55,6 +55,12 @@ def test_mip_refuses_jitter(device):
         render("mip", device, subpixel_offset=torch.zeros(40, 30, 2, device=device))
 
 
+@pytest.mark.parametrize("offset", [torch.full((30, 40, 2), 0.25).numpy(), [0.25, 0.25], 0.25], ids=type)
+def test_an_offset_that_is_no_tensor_is_not_taken_for_none(offset):
+    with pytest.raises(TypeError, match="subpixel_offset must be a tensor, got"):
+        render("mip", "cpu", subpixel_offset=offset)
+
+
 @pytest.mark.parametrize("inference", [False, True])
 def test_mip_looks_at_a_tensor_once(device, monkeypatch, inference):
     """And on CUDA no longer at new ones, once 8 were zero."""

@@ -198,6 +198,11 @@ def test_returned_values(device, name):
         assert torch.allclose(ours, theirs, rtol=0, atol=tolerance)
 
 
+def test_visible_filter_names_what_is_wrong():
+    with pytest.raises(ValueError, match=r"means3D must have shape \(P, 3\), got \(\)"):
+        drop_in.GaussianRasterizer(settings_of("scaffold")).visible_filter(torch.tensor(1.0))
+
+
 @pytest.mark.parametrize("name", ORIGINALS)
 def test_functional_form(name):
     """rasterize_gaussians has the arguments of forward in the order of the original, opacities after the colours."""
@@ -208,6 +213,24 @@ def test_functional_form(name):
     module, settings = dialects.dialect_module(name), settings_of(name)
     made = module.rasterize_gaussians(*[arguments.get(key) for key in order], settings)
     assert all(map(torch.equal, made, module.GaussianRasterizer(settings)(**arguments)))
+
+
+@pytest.mark.parametrize("name", ORIGINALS)
+def test_functional_form_with_settings_of_the_library(name):
+    """They render as the library does, and take nothing that belongs to a dialect."""
+    arguments, plain = arguments_of(name), scene_of()
+    order = list(inspect.signature(dialects.dialect_module(name).rasterize_gaussians).parameters)[:-1]
+    names = {"sh": "shs", "cov3Ds_precomp": "cov3D_precomp"}
+    settings = CAMERA.settings(torch.float32)
+
+    def rendered(given):
+        made = [given.get(names.get(key, key)) for key in order]
+        return dialects.dialect_module(name).rasterize_gaussians(*made, settings)
+
+    assert all(map(torch.equal, rendered(plain), ar.GaussianRasterizer(settings)(**plain)))
+    if set(order) & set(arguments) - set(plain):
+        with pytest.raises(TypeError, match=r"settings must be of a dialect that takes .*, got those of the library"):
+            rendered(arguments)
 
 
 @pytest.mark.parametrize("name", ORIGINALS)
@@ -544,6 +567,10 @@ def test_sparse_adam_against_its_definition(device):
             assert torch.allclose(optimizer.state[p]["exp_avg_sq"].cpu(), v, rtol=1e-12)
     with pytest.raises(ValueError, match=r"visibility must have shape \(6,\), got \(5,\)"):
         optimizer.step(torch.ones(5, dtype=torch.bool, device=device), 6)
+    with pytest.raises(TypeError, match="visibility must be a tensor, got list"):
+        optimizer.step([True] * 6, 6)
+    with pytest.raises(ValueError, match=rf"rows must be on the device of the parameters, {device}.*, got meta"):
+        optimizer.step(torch.ones(6, dtype=torch.bool, device="meta"), 6)
 
 
 @pytest.mark.parametrize("shape", [(3,), (1, 3)])
@@ -676,6 +703,37 @@ def test_wrong_features(tmp_path, monkeypatch):
         render("grouping", scene=scene_of() | both)
 
 
+@pytest.mark.parametrize(
+    "name, further, error, message",
+    [
+        ("accel", {"dc": [1.0]}, TypeError, "dc must be a tensor, got list"),
+        ("accel", {"dc": torch.zeros(5, 1, 3)}, ValueError, r"dc must have shape \(P, 1, 3\) .*, got \(5, 1, 3\) and"),
+        ("accel", {"dc": torch.zeros(COUNT, 3)}, ValueError, r"dc must have shape \(P, 1, 3\) .*, got \(25, 3\) and"),
+        ("accel", {"dc": torch.zeros(COUNT, 1, 3).double()}, TypeError, "dc must have the dtype of shs"),
+        ("grouping", {"sh_objs": [1.0]}, TypeError, "sh_objs must be a tensor, got list"),
+        ("grouping", {"sh_objs": torch.tensor(1.0)}, ValueError, r"sh_objs must have shape .*, got \(\)"),
+        ("feature3dgs", {"semantic_feature": [1.0]}, TypeError, "semantic_feature must be a tensor, got list"),
+        ("feature3dgs", {"semantic_feature": torch.zeros(COUNT)}, ValueError, r"semantic_feature must have shape"),
+        ("depth", {"means2D_densify": [1.0]}, TypeError, "means2D_densify must be a tensor, got list"),
+        ("depth", {"means2D_densify": torch.zeros(5, 3)}, ValueError, r"means2D_densify must have .*, got \(5, 3\)"),
+        ("monogs", {"theta": [0.0, 0.0, 0.0]}, TypeError, "theta must be a tensor, got list"),
+    ],
+)
+def test_wrong_further_arguments(name, further, error, message):
+    with pytest.raises(error, match=message):
+        render(name, scene=arguments_of(name) | further)
+
+
+@pytest.mark.parametrize("missing", [None, torch.empty(0)], ids=["none", "empty"])
+def test_densify_without_means2d(missing):
+    """What is missing may be None or an empty tensor, here as elsewhere."""
+    probe_at = torch.zeros(COUNT, 3, requires_grad=True)
+    render("depth", scene=scene_of() | {"means2D": missing, "means2D_densify": probe_at})[0].sum().backward()
+    expected = torch.zeros(COUNT, 3, requires_grad=True)
+    render("depth", scene=scene_of() | {"means2D": expected, "means2D_densify": missing})[0].sum().backward()
+    assert probe_at.grad.abs().max() > 0 and torch.equal(probe_at.grad, expected.grad)
+
+
 def test_lightgaussian_counts(device):
     counts, scores, color, radii = render("lightgaussian", device, f_count=True)
     expected = plain(device, footprint="point", gaussian_stats=True)
@@ -806,6 +864,11 @@ def test_relocation_of_wrong_inputs():
         ((opacity, scale, count.float()), TypeError, "N must be of integers, got torch.float32"),
         ((opacity.tolist(), scale, count), TypeError, "opacity_old must be a tensor, got list"),
         ((opacity, scale, count, None, 0), ValueError, "n_max must be at least 1, got 0"),
+        ((opacity, scale, count, None, 1001), ValueError, "n_max must be at most 1000, got 1001"),
+        ((opacity, scale, count, None, 2.5), ValueError, "n_max must be a whole number, got 2.5"),
+        ((opacity.long(), scale, count), TypeError, "opacity_old must have a floating-point dtype, got torch.int64"),
+        ((opacity, scale.int(), count), TypeError, "scale_old must have a floating-point dtype, got torch.int32"),
+        ((opacity, scale, count + 0j), TypeError, "N must be of integers, got torch.complex64"),
     ]:
         with pytest.raises(error, match=message):
             ar.compute_relocation(*wrong)

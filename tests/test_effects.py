@@ -1,5 +1,6 @@
 """Channels, backgrounds and outputs beside the colours, on every device."""
 
+import math
 import pickle
 
 import pytest
@@ -291,6 +292,16 @@ def test_wrong_shapes(device, colors, bg, message):
     settings = with_bg(CAMERA.settings(torch.float32), torch.zeros(bg))
     with pytest.raises(ValueError, match=message):
         ar.GaussianRasterizer(scenes.settings_to(settings, device))(**scenes.to(scene, device))
+
+
+@pytest.mark.parametrize("number", [math.nan, -math.inf])
+def test_a_background_image_that_is_not_finite_is_refused(device, number):
+    """As a colour is; on CUDA only with debug, because it would have to be waited for."""
+    image = torch.zeros(3, 29, 37, device=device)
+    image[1, 2, 3] = number
+    settings = CAMERA.settings(torch.float32, device)._replace(bg=image, debug=device == "cuda")
+    with pytest.raises(ValueError, match=rf"bg must be finite, got {number} at \(1, 2, 3\)"):
+        ar.GaussianRasterizer(settings)(**scenes.cast(scenes.random_scene(1, 5), torch.float32, device))
 
 
 def test_effects_and_settings():

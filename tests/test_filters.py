@@ -96,6 +96,26 @@ def test_filter_removes_what_only_a_finer_camera_could_show():
     assert abs(pixels - math.sqrt(0.2)) < 1e-3 and opacities < 1e-6
 
 
+@pytest.mark.parametrize("bake", [False, True])
+def test_autocast_rounds_nothing(bake):
+    """Under autocast matrix products have 8 bits: which points a camera sees must not be found with them."""
+    generator = torch.Generator().manual_seed(1)
+    settings = Camera(eye=(0, 0, -8)).settings(torch.float32)
+    means = torch.rand(4000, 3, generator=generator) * 16 - 8  # on both sides of every border of the picture
+    scales, rotations = torch.rand(4000, 3, generator=generator), torch.randn(4000, 4, generator=generator)
+    opacities = torch.rand(4000, 1, generator=generator)
+
+    def made():
+        if bake:
+            return ar.bake_pixel(means, scales, rotations, opacities, [settings])
+        return [filters.sampling_interval(means, settings)]
+
+    expected = made()
+    assert 400 < filters.sampling_interval(means, settings).isfinite().sum() < 3600
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert all(map(torch.equal, made(), expected))
+
+
 def test_errors():
     with pytest.raises(ValueError, match=r"cameras must hold .* got none"):
         ar.compute_3d_filter(torch.zeros(2, 3), [])
@@ -105,6 +125,30 @@ def test_errors():
         ar.apply_3d_filter(torch.ones(2, 3), torch.ones(2, 1), torch.ones(3))
     with pytest.raises(ValueError, match=r"opacities must have shape \(P, 1\) or \(P,\), got \(3, 1\)"):
         ar.apply_3d_filter(torch.ones(2, 3), torch.ones(3, 1), torch.ones(2))
+    with pytest.raises(ValueError, match=r"opacities must have shape \(P, 1\) or \(P,\), got \(2, 3\)"):
+        ar.apply_3d_filter(torch.ones(6, 3), torch.ones(2, 3), torch.ones(6))
+    with pytest.raises(TypeError, match=r"filter_3d must have the dtype of scales, torch.float32, got torch.float64"):
+        ar.apply_3d_filter(torch.ones(2, 3), torch.ones(2), torch.ones(2).double())
+    with pytest.raises(TypeError, match=r"scales must be a tensor, got list"):
+        ar.apply_3d_filter([1.0], torch.ones(2), torch.ones(2))
+    with pytest.raises(TypeError, match=r"means3D must be a tensor, got list"):
+        ar.compute_3d_filter([1.0], [camera(8)])
+    with pytest.raises(TypeError, match=r"cameras must be a sequence .*, got those of one view"):
+        ar.compute_3d_filter(torch.zeros(2, 3), camera(8))
+    with pytest.raises(TypeError, match=r"cameras must hold GaussianRasterizationSettings, got str"):
+        ar.compute_3d_filter(torch.zeros(2, 3), ["view"])
+    with pytest.raises(ValueError, match=r"variance must be finite and not negative, got -1"):
+        ar.compute_3d_filter(torch.zeros(2, 3), [camera(8)], variance=-1)
+
+
+def test_cameras_may_be_an_iterator():
+    """bake_pixel goes through them twice."""
+    generator = torch.Generator().manual_seed(1)
+    means, scales, rotations = (torch.rand(5, n, generator=generator, dtype=F64) for n in (3, 3, 4))
+    gaussians = means, scales, rotations, torch.ones(5, 1, dtype=F64)
+    expected = ar.bake_pixel(*gaussians, [camera(8), camera(3)])
+    assert (expected[0] > scales).all()
+    assert all(map(torch.equal, ar.bake_pixel(*gaussians, map(camera, (8, 3))), expected))
 
 
 def test_a_baked_pixel_widens_by_its_variance_and_keeps_what_the_camera_sees():

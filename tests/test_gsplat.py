@@ -648,6 +648,10 @@ def test_2dgs_is_refused_by_name():
         ({"sh_degree": 5, "colors": torch.ones(6, 36, 3)}, ValueError, "sh_degree must be 0 to 4, got 5"),
         ({"backgrounds": torch.ones(3)}, ValueError, r"backgrounds must have shape \(2, 3\), got \(3,\)"),
         ({"width": 0}, ValueError, "width must be a positive integer, got 0"),
+        ({"width": math.nan}, ValueError, "width must be a whole number, got nan"),
+        ({"height": None}, TypeError, "height must be a whole number, got None"),
+        ({"near_plane": None}, TypeError, "near_plane must be a number, got None"),
+        ({"radius_clip": "small"}, TypeError, "radius_clip must be a number, got 'small'"),
         ({"near_plane": 0.0}, ValueError, "near_plane must be above 0 and below far_plane, got 0.0"),
         ({"far_plane": 0.001}, ValueError, "near_plane must be above 0 and below far_plane"),
         ({"eps2d": -1.0}, ValueError, "eps2d must be finite and not negative, got -1.0"),
@@ -871,6 +875,13 @@ def test_covariances_and_their_inverses(device, dtype, reference):
     assert torch.equal(identity, torch.diag(torch.tensor([1.0, 4.0, 9.0])))
     with pytest.raises(ValueError, match=r"quats must have shape \(\.\.\., 4\) and scales \(\.\.\., 3\)"):
         dialect.quat_scale_to_covar_preci(torch.zeros(3), torch.zeros(3))
+
+
+def test_autocast_does_not_round_covariances():
+    scene = scene_of(torch.float32, "cpu")
+    expected = dialect.quat_scale_to_covar_preci(scene["quats"], scene["scales"])
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert all(map(torch.equal, dialect.quat_scale_to_covar_preci(scene["quats"], scene["scales"]), expected))
 
 
 BINOMS = torch.tensor([[math.comb(n, k) for k in range(51)] for n in range(51)], dtype=torch.float64)

@@ -81,3 +81,15 @@ def test_bad_numbers_and_arguments():
         ar.needed_sh_degree(shs[:, :8])
     with pytest.raises(ValueError, match="tolerance must be finite and not negative, got -1"):
         ar.needed_sh_degree(shs, -1)
+    with pytest.raises(TypeError, match="tolerance must be a number, got None"):
+        ar.needed_sh_degree(shs, None)
+    with pytest.raises(TypeError, match="shs must be a tensor, got list"):
+        ar.needed_sh_degree([1.0])
+    with pytest.raises(TypeError, match=r"shs must have a floating-point dtype, got torch.int64"):
+        ar.needed_sh_degree(shs.long())
+
+
+def test_a_negative_degree_is_named_under_auto():
+    settings = Camera(sh_degree=-1).settings(effects="auto")
+    with pytest.raises(ValueError, match="sh_degree must be 0 to 3, got -1"):
+        ar.GaussianRasterizer(settings)(**scenes.random_scene(1, 5))

@@ -433,6 +433,18 @@ def test_blend_says_what_is_wrong(change, message):
         ar.blend(splats, ar.bin(splats), **change)
 
 
+def test_what_is_no_tensor_and_no_camera_is_named():
+    splats = ar.project(settings_of(torch.float32, "cpu"), **scene_of(torch.float32, "cpu"))
+    lists = ar.bin(splats)
+    with pytest.raises(TypeError, match="background must be a tensor, got list"):
+        ar.bin(splats, background=[0, 0, 0])
+    with pytest.raises(TypeError, match="means2d_abs must be a tensor, got list"):
+        ar.blend(splats, lists, means2d_abs=[0, 0])
+    for camera in (-1, 1):
+        with pytest.raises(IndexError, match=f"camera must be 0 to 0, got {camera}"):
+            lists.of_camera(camera)
+
+
 def test_lists_of_other_splats_are_refused(device):
     settings, scene = settings_of(torch.float32, device), scene_of(torch.float32, device)
     splats = ar.project(settings, **scene)

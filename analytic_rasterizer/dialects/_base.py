@@ -15,7 +15,6 @@ from ..effects import Effects, Outputs
 from ..footprints import Footprint, chosen_footprint, resolve_footprint
 from ..rasterizer import NOTHING, render
 from ..rasterizer import GaussianRasterizer as LibraryRasterizer
-from ..rasterizer import rasterize_gaussians as library_rasterize_gaussians
 from ..settings import GaussianRasterizationSettings as LibrarySettings
 from ..stages import project
 from ._refused import refusal, refuse
@@ -275,6 +274,8 @@ class GaussianRasterizer(LibraryRasterizer):
             As `forward`.
         """
         check_tensors(None, means3D=means3D)
+        if means3D.dim() != 2 or means3D.shape[1] != 3:
+            raise ValueError(f"means3D must have shape (P, 3), got {tuple(means3D.shape)}")
         splats = project(
             as_settings(self.raster_settings),
             means3D,
@@ -306,13 +307,29 @@ def rasterize_gaussians(
     raster_settings: LibrarySettings,
 ) -> tuple:
     """The functional form of `GaussianRasterizer.forward`; it returns what the dialect of the settings returns."""
-    arguments = means3D, means2D, opacities, sh, colors_precomp, scales, rotations, cov3Ds_precomp
-    raster_settings = as_settings(raster_settings)
-    if isinstance(raster_settings, GaussianRasterizationSettings):
-        return raster_settings.render(*arguments)
-    return library_rasterize_gaussians(
-        means3D, means2D, sh, colors_precomp, opacities, scales, rotations, cov3Ds_precomp, raster_settings
+    return render_by(
+        raster_settings, means3D, means2D, opacities, sh, colors_precomp, scales, rotations, cov3Ds_precomp
     )
+
+
+def render_by(raster_settings: Any, *arguments: torch.Tensor | None, **further: torch.Tensor | None) -> tuple:
+    """Renders as settings of any kind say; what the functional forms of the dialects share.
+
+    Args:
+        raster_settings: Of a dialect, of the library, or what `as_settings` takes.
+        *arguments: `ARGUMENTS`, in that order.
+        **further: What a dialect takes besides, or None.
+
+    Raises:
+        TypeError: Something further for settings that do not take it.
+    """
+    settings = as_settings(raster_settings)
+    further = {name: tensor for name, tensor in further.items() if tensor is not None}
+    if isinstance(settings, GaussianRasterizationSettings):
+        return settings.render(**dict(zip(ARGUMENTS, arguments)), **further)
+    if further:
+        raise TypeError(f"settings must be of a dialect that takes {', '.join(further)}, got those of the library")
+    return render(settings, NOTHING, *arguments)
 
 
 def with_channels(
@@ -358,4 +375,5 @@ def with_channels(
 
 def given(tensor: torch.Tensor | None) -> bool:
     """Whether an input is there: 3DGS passes those that are not as None or as an empty tensor."""
-    return tensor is not None and not (tensor.dim() == 1 and tensor.numel() == 0)
+    missing = isinstance(tensor, torch.Tensor) and tensor.dim() == 1 and tensor.numel() == 0
+    return tensor is not None and not missing

@@ -6,9 +6,10 @@ whether the module has a SparseGaussianAdam, and call with `dc` if it has: it is
 
 import torch
 
+from ..arguments import check_tensors
 from ..optim import SparseGaussianAdam
 from ._base import GaussianRasterizer as Rasterizer
-from ._base import as_settings, forward_like, given
+from ._base import forward_like, given, render_by
 from .gs2024 import GaussianRasterizationSettings as Settings
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "SparseGaussianAdam", "rasterize_gaussians"]
@@ -36,10 +37,23 @@ class GaussianRasterizationSettings(Settings):
     ) -> tuple:
         """As 3DGS 2024, with the constant harmonics `dc` (P, 1, 3) apart from `shs` (P, M - 1, 3), the others."""
         if given(dc):
-            shs = torch.cat([dc, shs], 1) if given(shs) else dc
+            check_tensors(None, dc=dc)
+            shs = _joined(dc, shs) if given(shs) else dc
         return super().render(
             means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, **further
         )
+
+
+def _joined(dc: torch.Tensor, shs: torch.Tensor) -> torch.Tensor:
+    """All harmonics (P, M, 3). Raises TypeError or ValueError where the two do not fit together."""
+    check_tensors(dc.device, shs=shs)
+    if shs.dim() != 3 or dc.shape != (len(shs), 1, shs.shape[2]):
+        raise ValueError(
+            f"dc must have shape (P, 1, 3) and shs (P, M - 1, 3), got {tuple(dc.shape)} and {tuple(shs.shape)}"
+        )
+    if dc.dtype != shs.dtype:  # cat would make both of the wider one
+        raise TypeError(f"dc must have the dtype of shs, {shs.dtype}, got {dc.dtype}")
+    return torch.cat([dc, shs], 1)
 
 
 class GaussianRasterizer(Rasterizer):
@@ -52,6 +66,6 @@ def rasterize_gaussians(
     means3D, means2D, dc, sh, colors_precomp, opacities, scales, rotations, cov3Ds_precomp, raster_settings
 ) -> tuple:
     """The functional form of `GaussianRasterizer.forward`."""
-    return as_settings(raster_settings).render(
-        means3D, means2D, opacities, dc, sh, colors_precomp, scales, rotations, cov3Ds_precomp
+    return render_by(
+        raster_settings, means3D, means2D, opacities, sh, colors_precomp, scales, rotations, cov3Ds_precomp, dc=dc
     )

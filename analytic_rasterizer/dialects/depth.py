@@ -5,10 +5,11 @@ blended like a colour on zero. Its settings are those of 3DGS 2023: the dialect 
 `means2D_densify` is given.
 """
 
+from ..arguments import check_tensors
 from ..effects import Effects
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
-from ._base import forward_like, rasterize_gaussians
+from ._base import forward_like, given, rasterize_gaussians
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
 
@@ -36,8 +37,14 @@ class GaussianRasterizationSettings(Settings):
         **further,
     ) -> tuple:
         """As 3DGS 2023; `means2D_densify`, of the shape of means2D, receives the gradient that means2D receives."""
-        if means2D_densify is not None:
-            means2D = means2D_densify if means2D is None else means2D + means2D_densify
+        if given(means2D_densify):
+            check_tensors(None, means2D_densify=means2D_densify)
+            if given(means2D) and means2D_densify.shape != means2D.shape:
+                raise ValueError(
+                    f"means2D_densify must have the shape of means2D, {tuple(means2D.shape)}, got "
+                    f"{tuple(means2D_densify.shape)}"
+                )
+            means2D = means2D + means2D_densify if given(means2D) else means2D_densify
         return super().render(
             means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp, **further
         )

@@ -3,10 +3,11 @@
 Repositories: ShijieZhou-UCLA/feature-3dgs. `semantic_feature` (P, 1, K) holds a feature of each Gaussian.
 """
 
+from ..arguments import check_tensors
 from ..effects import Effects
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
-from ._base import as_settings, forward_like, with_channels
+from ._base import forward_like, render_by, with_channels
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
 
@@ -35,6 +36,10 @@ class GaussianRasterizationSettings(Settings):
         """As 3DGS 2023; `semantic_feature` (P, 1, K), or (P, K), is blended on zero with the colours' weights."""
         if semantic_feature is None:
             raise ValueError("semantic_feature must be given in dialect feature3dgs, got None")
+        check_tensors(None, semantic_feature=semantic_feature)
+        if semantic_feature.dim() not in (2, 3):
+            shape = tuple(semantic_feature.shape)
+            raise ValueError(f"semantic_feature must have shape (P, 1, K) or (P, K), got {shape}")
         arguments = means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp
         features, (color, radii, *further) = with_channels(self, semantic_feature.flatten(1), *arguments)
         return color, features, radii, *further
@@ -62,6 +67,5 @@ def rasterize_gaussians(
     raster_settings,
 ) -> tuple:
     """The functional form of `GaussianRasterizer.forward`."""
-    return as_settings(raster_settings).render(
-        means3D, means2D, opacities, sh, colors_precomp, semantic_feature, scales, rotations, cov3Ds_precomp
-    )
+    arguments = means3D, means2D, opacities, sh, colors_precomp, scales, rotations, cov3Ds_precomp
+    return render_by(raster_settings, *arguments, semantic_feature=semantic_feature)

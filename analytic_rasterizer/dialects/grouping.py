@@ -3,9 +3,10 @@
 Repositories: lkeab/gaussian-grouping. `sh_objs` (P, 1, 16) holds the identity of each Gaussian, as features.
 """
 
+from ..arguments import check_tensors
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
-from ._base import as_settings, forward_like, given, with_channels
+from ._base import forward_like, given, render_by, with_channels
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
 
@@ -38,6 +39,9 @@ class GaussianRasterizationSettings(Settings):
         """
         arguments = means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp
         if given(sh_objs):
+            check_tensors(None, sh_objs=sh_objs)
+            if sh_objs.dim() not in (2, 3):
+                raise ValueError(f"sh_objs must have shape (P, 1, K) or (P, K), got {tuple(sh_objs.shape)}")
             objects, (color, radii, *further) = with_channels(self, sh_objs.flatten(1), *arguments)
         else:
             color, radii, *further = super().render(*arguments)
@@ -55,6 +59,5 @@ def rasterize_gaussians(
     means3D, means2D, sh, sh_objs, colors_precomp, opacities, scales, rotations, cov3Ds_precomp, raster_settings
 ) -> tuple:
     """The functional form of `GaussianRasterizer.forward`."""
-    return as_settings(raster_settings).render(
-        means3D, means2D, opacities, sh, sh_objs, colors_precomp, scales, rotations, cov3Ds_precomp
-    )
+    arguments = means3D, means2D, opacities, sh, colors_precomp, scales, rotations, cov3Ds_precomp
+    return render_by(raster_settings, *arguments, sh_objs=sh_objs)

@@ -4,7 +4,7 @@ Repositories: minghanqin/LangSplat. `include_feature` says whether the features 
 image is zero.
 """
 
-from ._base import FIELDS, as_settings, forward_like, with_channels
+from ._base import FIELDS, forward_like, render_by, with_channels
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
 
@@ -63,14 +63,5 @@ def rasterize_gaussians(
     raster_settings,
 ) -> tuple:
     """The functional form of `GaussianRasterizer.forward`."""
-    return as_settings(raster_settings).render(
-        means3D,
-        means2D,
-        opacities,
-        sh,
-        colors_precomp,
-        language_feature_precomp,
-        scales,
-        rotations,
-        cov3Ds_precomp,
-    )
+    arguments = means3D, means2D, opacities, sh, colors_precomp, scales, rotations, cov3Ds_precomp
+    return render_by(raster_settings, *arguments, language_feature_precomp=language_feature_precomp)

@@ -10,6 +10,7 @@ import weakref
 
 import torch
 
+from ..arguments import check_tensors
 from ..footprints import Footprint
 from ._base import FIELDS, GaussianRasterizer, _resolved, rasterize_gaussians
 from ._base import GaussianRasterizationSettings as Settings
@@ -46,12 +47,14 @@ class GaussianRasterizationSettings(Settings):
         """As 3DGS 2023. `subpixel_offset` moves the centres of the pixels, all of them alike.
 
         Raises:
+            TypeError: subpixel_offset is neither a tensor nor None.
             ValueError: subpixel_offset has another shape, or differs from pixel to pixel; or that of an earlier call
                 was not zero, see `_offset_of`.
         """
         _raise_for_an_earlier_call()
         settings = self
-        if isinstance(self.subpixel_offset, torch.Tensor):
+        if self.subpixel_offset is not None:
+            check_tensors(None, subpixel_offset=self.subpixel_offset)
             offset = _offset_of(self.subpixel_offset, (self.image_height, self.image_width, 2), self.debug)
             if offset != (0.0, 0.0):
                 settings = self._moved(*offset)

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import torch
 
+from ..arguments import check_tensors
 from ..effects import Effects
 from ..rotations import product
-from ._base import FIELDS, as_settings, forward_like
+from ._base import FIELDS, forward_like, render_by
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
 
@@ -83,11 +84,13 @@ class GaussianRasterizationSettings(Settings):
         """These settings with gradients to theta and rho.
 
         Raises:
+            TypeError: One of them is no tensor.
             ValueError: One of them does not hold three numbers.
         """
         zero = self.campos.new_zeros(3)
         theta, rho = (zero if t is None else t for t in (theta, rho))
         for name, tensor in (("theta", theta), ("rho", rho)):
+            check_tensors(None, **{name: tensor})
             if tensor.numel() != 3:
                 raise ValueError(f"{name} must hold 3 numbers, got shape {tuple(tensor.shape)}")
         view, proj, campos = _Moved.apply(
@@ -119,6 +122,5 @@ def rasterize_gaussians(
     raster_settings,
 ) -> tuple:
     """The functional form of `GaussianRasterizer.forward`."""
-    return as_settings(raster_settings).render(
-        means3D, means2D, opacities, sh, colors_precomp, scales, rotations, cov3Ds_precomp, theta, rho
-    )
+    arguments = means3D, means2D, opacities, sh, colors_precomp, scales, rotations, cov3Ds_precomp
+    return render_by(raster_settings, *arguments, theta=theta, rho=rho)

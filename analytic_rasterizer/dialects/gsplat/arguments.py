@@ -12,6 +12,7 @@ import torch
 from ..._C import MAX_CHANNELS
 from ...effects import MAX_SH_DEGREE
 from ...footprints import Footprint, chosen_footprint, resolve_footprint
+from ...settings import one_number, whole_number
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 RASTERIZE_MODES = ("classic", "antialiased")
@@ -67,14 +68,14 @@ def check_choice(name: str, value: str, choices: Sequence[str]) -> None:
 def check_numbers(
     width: int, height: int, near_plane: float, far_plane: float, radius_clip: float, eps2d: float
 ) -> None:
-    """Raises ValueError for numbers that no picture can be rendered with."""
+    """Raises ValueError for numbers that no picture can be rendered with, TypeError for what is no number."""
     for name, value in (("width", width), ("height", height)):
-        if int(value) != value or value < 1:
+        if whole_number(name, value) < 1:
             raise ValueError(f"{name} must be a positive integer, got {value}")
-    if not 0 < near_plane < far_plane:
+    if not 0 < one_number("near_plane", near_plane) < one_number("far_plane", far_plane):
         raise ValueError(f"near_plane must be above 0 and below far_plane, got {near_plane} and {far_plane}")
     for name, value in (("radius_clip", radius_clip), ("eps2d", eps2d)):
-        if not 0 <= value < math.inf:
+        if not 0 <= one_number(name, value) < math.inf:
             raise ValueError(f"{name} must be finite and not negative, got {value}")
 
 
@@ -146,7 +147,7 @@ def check_colors(
 def settle_footprint(footprint: str | Footprint | None, rasterize_mode: str, eps2d: float) -> Footprint:
     """The footprint of a call: as `rasterization` says of its argument. Raises ValueError for one that is not known."""
     if footprint is not None:
-        return resolve_footprint(str(footprint))
+        return resolve_footprint(footprint)
     if (chosen := chosen_footprint()) is not None:
         return chosen
     if rasterize_mode == "classic":

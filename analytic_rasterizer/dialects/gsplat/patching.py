@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from ... import relocation
-from ...rotations import rotation_matrices
+from ...rotations import product, rotation_matrices
 from .rendering import rasterization, upper_triangle
 
 
@@ -73,7 +73,7 @@ def quat_scale_to_covar_preci(
 
     def squared(factors: torch.Tensor) -> torch.Tensor:
         square = rotations * factors[..., None, :]
-        square = square @ square.mT
+        square = product(square, square.mT)
         return upper_triangle(square) if triu else square
 
     return squared(scales) if compute_covar else None, squared(1 / scales) if compute_preci else None
