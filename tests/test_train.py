@@ -1203,6 +1203,39 @@ def test_options_survive_a_file():
         TrainingOptions.from_dict({"speed": 1})
 
 
+def test_numbers_of_numpy_are_those_of_python(synthetic, tmp_path):
+    """A checkpoint with a number of NumPy in its options could not be read again."""
+    given = {"iterations": np.int64(3), "scales": np.array([1, 2]), "opacity_rate": np.float64(0.04)}
+    given |= {"color_rate": np.float32(0.5), "seed": torch.tensor(3), "sh_degree": 1.0, "sparse_adam": np.bool_(True)}
+    run = make_run(synthetic, tmp_path, **given)
+    plain = {"iterations": 3, "scales": (1, 2), "opacity_rate": 0.04, "color_rate": 0.5, "seed": 3, "sh_degree": 1}
+    for name, value in (plain | {"sparse_adam": True, "scale_repeats": (2, 1)}).items():
+        assert getattr(run.options, name) == value and type(getattr(run.options, name)) is type(value)
+    assert {type(scale) for scale in run.options.scales} == {int}
+    run.train()
+    assert make_run(synthetic, tmp_path, resume=True).options == run.options
+
+
+@pytest.mark.parametrize(
+    "name, value, error, message",
+    [
+        ("iterations", 40.5, ValueError, "iterations must be a whole number, got 40.5"),
+        ("iterations", "40", TypeError, "iterations must be a whole number, got '40'"),
+        ("max_gaussians", math.inf, ValueError, "max_gaussians must be a whole number, got inf"),
+        ("seed", 1.5, ValueError, "seed must be a whole number, got 1.5"),
+        ("scales", 4, TypeError, "scales must be a sequence of whole numbers, got 4"),
+        ("scales", "12", TypeError, "scales must be a sequence of whole numbers, got '12'"),
+        ("scales", (1, 2.5), ValueError, "scales must be whole numbers, got (1, 2.5)"),
+        ("opacity_rate", "fast", TypeError, "opacity_rate must be a number, got 'fast'"),
+        ("filter_3d", "no", TypeError, "filter_3d must be a bool, got 'no'"),
+        ("density", None, TypeError, "density must be a string, got None"),
+    ],
+)
+def test_options_of_a_wrong_type(name, value, error, message):
+    with pytest.raises(error, match=re.escape(message)):
+        TrainingOptions(**{name: value})
+
+
 def test_presets_give_way_to_what_is_given():
     assert TrainingOptions.preset("quick") == TrainingOptions(iterations=7000)
     assert TrainingOptions(scales=(4, 1, 2)).scale_repeats == (1, 2, 1)  # the finest twice
