@@ -1315,6 +1315,28 @@ def test_resuming_takes_the_points_of_the_start_or_none(synthetic, trained, tmp_
     assert cli.main([*alone, "--resume", "--points", "b.ply"]) == 0
 
 
+def test_resuming_takes_the_pictures_of_the_start_or_none(capture, tmp_path, capsys):
+    """A training that was resumed without its --images went on with the pictures of another folder."""
+    folder, out = tmp_path / "scene", tmp_path / "out"
+    shutil.copytree(capture, folder)
+    shutil.copytree(folder / "photographs", folder / "images")
+    command = ["train", str(folder), "--out", str(out), "--iterations", "2", "--no-evaluate", "--device", "cpu"]
+    chosen = ["--images", "photographs", "--test-every", "4"]
+    assert cli.main([*command, *chosen]) == 0
+    for again in ([], chosen):
+        assert cli.main([*command, "--resume", *again]) == 0
+        source = json.loads((out / files.OPTIONS).read_text())["source"]
+        assert (source["images"], source["test_every"]) == ("photographs", 4)
+    written = {path: path.read_bytes() for path in out.iterdir()}
+    capsys.readouterr()
+    refused = {"--images": ("images", "photographs", "images"), "--test-every": ("test_every", "4", "8")}
+    for option, (name, before, given) in refused.items():
+        assert cli.main([*command, "--resume", option, given]) == 2
+        error = f"error: {name} must be {before} or None where a training is resumed, got {given}\n"
+        assert capsys.readouterr().err == error
+    assert {path: path.read_bytes() for path in out.iterdir()} == written
+
+
 def test_ssim_is_that_of_torchmetrics():
     """Inside, where windows are whole: torchmetrics reflects at the edges, 3DGS's loss has zeros there."""
     functional = pytest.importorskip("torchmetrics.functional", reason="needs the train extra")

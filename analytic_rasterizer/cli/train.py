@@ -12,6 +12,7 @@ from pathlib import Path
 from .. import io
 from ..footprints import resolve_footprint
 from ..training import Run, TrainingOptions
+from ..training.captures import IMAGES, TEST_PERIOD
 from ..training.files import CHECKPOINT, SCENE, read_checkpoint
 from ..training.options import BACKGROUNDS, DENSITIES, DOWNSAMPLINGS, PRESETS, RANDOM_BACKGROUND, preset_values
 from ..training.ranks import Ranks
@@ -52,8 +53,10 @@ def add_parser(subcommands) -> None:
     add = parser.add_argument
     add("scene", metavar="SCENE", help="folder of pictures with cameras")
     add("--out", required=True, metavar="DIR", help="folder for the results")
-    add("--images", default="images", metavar="NAME", help="folder in SCENE of a reconstruction's photographs")
-    add("--test-every", type=int, default=8, metavar="N", help="keep every N-th photograph for the test; 0: none")
+    images = f"folder in SCENE of a reconstruction's photographs (default: {IMAGES})"
+    add("--images", metavar="NAME", help=images)  # what is not given is None, for --resume
+    test_every = f"keep every N-th photograph for the test; 0: none (default: {TEST_PERIOD})"
+    add("--test-every", type=int, metavar="N", help=test_every)
     add("--points", metavar="FILE.ply", help="start from this: a 3DGS scene, or points with colours")
     preset = "options that belong together: quick, 7,000 steps; 3dgs, the recipe of 3DGS; what is given wins"
     add("--preset", choices=tuple(PRESETS), help=preset)

@@ -19,7 +19,7 @@ from .. import io
 from . import colmap
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-TEST_PERIOD = 8
+IMAGES, TEST_PERIOD = "images", 8
 RECONSTRUCTIONS = ("sparse/0", "sparse", "colmap/sparse/0")
 # What a transforms file may say of the lens; nothing, or zeros, for a pinhole.
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "distortion_params", "is_fisheye")
@@ -41,7 +41,7 @@ class Capture(NamedTuple):
     points: tuple[Tensor, Tensor] | None  # positions and colours in [0, 1], (P, 3) float32 each, on the CPU
 
 
-def load_capture(folder, images: str = "images", test_every: int = TEST_PERIOD) -> Capture:
+def load_capture(folder, images: str = IMAGES, test_every: int = TEST_PERIOD) -> Capture:
     """Reads the cameras of a folder, and looks whether all of its pictures are there.
 
     Args:
