@@ -1112,10 +1112,30 @@ def test_evaluate_says_how_to_get_the_weights_of_lpips(trained, capsys, monkeypa
     assert "LPIPS" not in captured.out
 
 
-def test_evaluate_of_another_folder_is_one_line(tmp_path, capsys):
+@pytest.mark.parametrize("content", [None, "[]", "{}", '{"source": {}, "options": {}}', '{"source": 3, "options": {}}'])
+def test_evaluate_of_another_folder_is_one_line(tmp_path, capsys, content):
+    if content is not None:
+        (tmp_path / files.OPTIONS).write_text(content)
     assert cli.main(["evaluate", str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and "options.json" in error and error.count("\n") == 1
+
+
+def test_evaluate_finds_the_capture_from_another_folder(synthetic, tmp_path, capsys, monkeypatch):
+    shutil.copytree(synthetic, tmp_path / "scene")
+    monkeypatch.chdir(tmp_path)
+    small = ["--iterations", "2", "--random-points", "50", "--no-evaluate", "--device", "cpu"]
+    assert cli.main(["train", "scene", "--out", "out", *small]) == 0
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    evaluate = ["evaluate", str(tmp_path / "out"), "--lpips", "none", "--device", "cpu"]
+    assert cli.main(evaluate) == 0
+    # Another capture is named where it is the one without test pictures.
+    shutil.copytree(synthetic, tmp_path / "untested")
+    (tmp_path / "untested" / "transforms_test.json").unlink()
+    capsys.readouterr()
+    assert cli.main([*evaluate, "--data", "../untested"]) == 2
+    assert capsys.readouterr().err == "error: ../untested: there are no test pictures\n"
 
 
 def test_example_trains(synthetic, tmp_path):
