@@ -529,7 +529,7 @@ def test_views_file_that_is_not_there(tmp_path):
 def test_size_of_an_unreadable_picture(tmp_path):
     (tmp_path / "train").mkdir()
     (tmp_path / "train" / "r_0.png").write_text("no picture")
-    with pytest.raises(io.SceneError, match=r"r_0\.png: cannot identify image file"):
+    with pytest.raises(io.SceneError, match=r"r_0\.png: unreadable or cut short \(cannot identify image file"):
         io.load_views(write_json(tmp_path, {"camera_angle_x": 0.7, "frames": [FRAME]}))
 
 

@@ -5,8 +5,10 @@ import math
 import re
 import shutil
 import signal
+import struct
 import subprocess
 import sys
+import zlib
 from dataclasses import replace
 
 import numpy as np
@@ -406,6 +408,14 @@ def test_sixteen_bits_are_rounded_to_eight(tmp_path):
 # -------------------------------------------------------------------------------------- errors
 
 
+def png_of_size(width: int, height: int) -> bytes:
+    """The start of a black PNG, which says its size."""
+    header = b"IHDR" + struct.pack(">2I5B", width, height, 1, 0, 0, 0, 0)
+    rest = b"IDAT" + zlib.compress(b"")
+    parts = [struct.pack(">I", len(part) - 4) + part + struct.pack(">I", zlib.crc32(part)) for part in (header, rest)]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
 def change_transforms(folder, change) -> None:
     path = folder / "transforms_train.json"
     content = json.loads(path.read_text())
@@ -433,6 +443,14 @@ BROKEN = {
     "nan": (nan_picture, r"r_4.png: pixels must be finite, got nan at x 7, y 3"),
     "cut short": (
         lambda f: (f / "train" / "r_1.png").write_bytes((f / "train" / "r_1.png").read_bytes()[:200]),
+        "r_1.png: unreadable or cut short",
+    ),
+    "too large for Pillow": (
+        lambda f: (f / "train" / "r_1.png").write_bytes(png_of_size(20000, 10000)),
+        r"r_1.png: unreadable or cut short \(Image size \(200000000 pixels\) exceeds limit",
+    ),
+    "broken header": (
+        lambda f: (f / "train" / "r_1.png").write_bytes(b"P6 3x2 255\n"),
         "r_1.png: unreadable or cut short",
     ),
     "one camera": (

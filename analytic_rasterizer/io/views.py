@@ -12,7 +12,7 @@ import torch
 
 from ..camera import camera_settings
 from ..settings import GaussianRasterizationSettings
-from .common import SceneError, first_line, optional_import
+from .common import SceneError, first_line, opened_picture
 
 
 @dataclass(frozen=True)
@@ -236,12 +236,8 @@ def _picture_size(folder: Path, frames: list[dict]) -> tuple[int, int] | None:
             continue
         for picture in (folder / name, folder / f"{name}.png"):
             if picture.is_file():
-                image = optional_import("PIL.Image")
-                try:
-                    with image.open(picture) as opened:
-                        return opened.size
-                except OSError as error:
-                    raise SceneError(f"{picture}: {first_line(error)}") from None
+                with opened_picture(picture) as opened:
+                    return opened.size
     return None
 
 

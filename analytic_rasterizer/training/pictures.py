@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from .. import io
+from ..io.common import opened_picture
 from ..settings import GaussianRasterizationSettings
 from .captures import Photograph
 from .options import check_scales
@@ -95,19 +96,16 @@ def read_photograph(item: Photograph, scales: tuple[int, ...]) -> tuple[io.View,
 
 def read_picture(path: Path) -> Tensor:
     """(H, W, 4) uint8 of straight alpha. Raises io.SceneError."""
-    image = io.optional_import("PIL.Image", "train")
-    try:
-        with image.open(path) as opened:
-            if opened.mode == "F" or opened.mode.startswith("I"):
-                numbers = np.array(opened).astype(np.float64)
-                if not np.isfinite(numbers).all():
-                    y, x = np.argwhere(~np.isfinite(numbers))[0]
-                    raise io.SceneError(f"{path}: pixels must be finite, got {numbers[y, x]} at x {x}, y {y}")
-                peak = 1 if opened.mode == "F" else 65535
-                opened = image.fromarray((255 * (numbers / peak).clip(0, 1)).round().astype(np.uint8))
+    with opened_picture(path, "train") as opened:
+        if opened.mode != "F" and not opened.mode.startswith("I"):
             return torch.from_numpy(np.array(opened.convert("RGBA")))
-    except (OSError, SyntaxError) as error:  # Pillow raises SyntaxError for some broken PNG files
-        raise io.SceneError(f"{path}: unreadable or cut short ({error})") from None
+        numbers = np.array(opened).astype(np.float64)
+        peak = 1 if opened.mode == "F" else 65535
+    if not np.isfinite(numbers).all():
+        y, x = np.argwhere(~np.isfinite(numbers))[0]
+        raise io.SceneError(f"{path}: pixels must be finite, got {numbers[y, x]} at x {x}, y {y}")
+    grey = (255 * (numbers / peak).clip(0, 1)).round().astype(np.uint8)
+    return torch.from_numpy(np.stack([grey, grey, grey, np.full_like(grey, 255)], 2))
 
 
 def cut(path: Path, view: io.View, multiple: int) -> tuple[io.View, Tensor]:
