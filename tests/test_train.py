@@ -764,6 +764,22 @@ def picture_arguments(device, **changed):
     return dict(zip(names, gaussians)) | others | camera | changed
 
 
+@pytest.mark.parametrize("options", [{}, {"density": "mcmc"}, {"background": "random", "filter_3d": True}], ids=str)
+def test_another_default_dtype_changes_nothing(synthetic, tmp_path, options):
+    measured = []
+    for name, dtype in (("single", torch.float32), ("double", torch.float64)):
+        torch.set_default_dtype(dtype)
+        try:
+            run = make_run(synthetic, tmp_path / name, iterations=60, **options)
+            run.train()
+            measured.append(run.evaluate()["test"])
+        finally:
+            torch.set_default_dtype(torch.float32)
+    assert measured[0] == measured[1]
+    scenes = [(tmp_path / name / files.SCENE).read_bytes() for name in ("single", "double")]
+    assert scenes[0] == scenes[1]
+
+
 def test_opcheck_of_picture_gradients(device):
     op = torch.ops.analytic_rasterizer.picture_gradients.default
     for columns in (0, 3, 4):

@@ -28,7 +28,7 @@ Perceptual = Callable[[Tensor, Tensor], Tensor]
 def psnr(image: Tensor, target: Tensor) -> Tensor:
     """Peak signal-to-noise ratio of two images in [0, 1], dB, after clamping the first. The second may be uint8."""
     if target.dtype == torch.uint8:
-        target = target / 255
+        target = target.to(image.dtype) / 255
     return -10 * (image.clamp(0, 1) - target).square().mean().log10()
 
 

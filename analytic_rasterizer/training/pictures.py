@@ -29,7 +29,7 @@ class Pictures(NamedTuple):
 
     def truth(self, scale: int, view: int, background: Tensor | None = None) -> Tensor:
         """(3, H, W) float32 in [0, 1] on the device; `background` (3,) is for pictures with alpha."""
-        color = self._color(scale, view) / 255
+        color = self._color(scale, view).float() / 255
         return color if background is None else color[:3] + (1 - color[3:]) * background[:, None, None]
 
     def target(self, scale: int, view: int, background: Tensor | None = None) -> Tensor:

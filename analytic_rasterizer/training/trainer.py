@@ -88,7 +88,9 @@ class Trainer:
         self.progress = Progress(options.iterations if options.seconds == 0 else None, options.seconds)
         self.order = PictureOrder(len(pictures.views), options)
         self.filter_3d: Tensor | None = None
-        self.one = torch.ones((), device=self.device)  # the gradient of the loss with respect to itself
+        self.one = torch.ones(
+            (), dtype=torch.float32, device=self.device
+        )  # the gradient of the loss with respect to itself
         self.losses: list[Tensor] = []
         self.last: tuple[Tensor, Tensor] | None = None
         self._resolved: tuple[int, dict] | None = None  # degree of the harmonics, and the settings of it
@@ -147,7 +149,7 @@ class Trainer:
             view, scale = self.order(n)
             chosen, background = settings[scale][view], None
             if self.random_background:
-                background = torch.rand(3, generator=self.generator, device=self.device)
+                background = torch.rand(3, generator=self.generator, dtype=torch.float32, device=self.device)
                 chosen = chosen._replace(bg=background)
             if effects is not None:
                 chosen = chosen._replace(effects=effects)
