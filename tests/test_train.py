@@ -780,6 +780,16 @@ def test_another_default_dtype_changes_nothing(synthetic, tmp_path, options):
     assert scenes[0] == scenes[1]
 
 
+@pytest.mark.parametrize("options", [{}, {"density": "mcmc"}], ids=str)
+def test_training_where_gradients_are_switched_off(synthetic, tmp_path, options):
+    with torch.no_grad():
+        run = make_run(synthetic, tmp_path / "off", iterations=40, **options)
+        run.train()
+    make_run(synthetic, tmp_path / "on", iterations=40, **options).train()
+    scenes = [(tmp_path / name / files.SCENE).read_bytes() for name in ("off", "on")]
+    assert scenes[0] == scenes[1]
+
+
 def test_opcheck_of_picture_gradients(device):
     op = torch.ops.analytic_rasterizer.picture_gradients.default
     for columns in (0, 3, 4):
