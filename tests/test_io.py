@@ -390,6 +390,18 @@ def test_size_from_the_first_picture_there_is(tmp_path, picture):
     assert [(view.width, view.height, view.fx) for view in views] == [(62, 34, pytest.approx(31 / math.tan(0.35)))] * 2
 
 
+def test_every_picture_has_its_own_size(tmp_path):
+    """The angle spans the width of each: pixels of a portrait beside a landscape were oblong."""
+    sizes = [(40, 20), (20, 40)]
+    for i, size in enumerate(sizes):
+        image.new("RGB", size).save(tmp_path / f"{i}.png")
+    frames = [FRAME | {"file_path": f"{i}.png"} for i in range(2)]
+    views = io.load_views(write_json(tmp_path, {"camera_angle_x": 0.7, "frames": frames}))
+    assert [(view.width, view.height) for view in views] == sizes
+    for view in views:
+        assert view.fx == view.fy == pytest.approx(view.width / 2 / math.tan(0.35))
+
+
 def test_stated_size_goes_before_the_callers(tmp_path):
     (view,) = io.load_views(write_json(tmp_path, TRANSFORMS), size=(7, 5))
     assert (view.width, view.height) == (120, 80)
