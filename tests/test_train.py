@@ -383,6 +383,19 @@ def test_cut_pictures_see_the_same(tmp_path):
         pictures.cut(tmp_path / "a.png", view, 32)
 
 
+def test_pictures_that_were_turned_are_refused(tmp_path):
+    """Their cameras were scaled by another factor in x than in y."""
+    view = io.View("a", 99, 66, 50.0, 50.0, torch.eye(4, dtype=torch.float64))
+    for size in ((66, 99), (33, 49), (17, 25)):
+        image.new("RGB", size).save(tmp_path / "a.png")
+        with pytest.raises(io.SceneError, match=rf"camera, 99 x 66 px, got {size[0]} x {size[1]}"):
+            pictures.cut(tmp_path / "a.png", view, 1)
+    for size in ((99, 66), (50, 33), (25, 17), (2, 2), (64, 64), (150, 80)):  # squeezed ones have oblong pixels
+        image.new("RGB", size).save(tmp_path / "a.png")
+        cut, _ = pictures.cut(tmp_path / "a.png", view, 1)
+        assert (cut.width, cut.height) == size
+
+
 def test_reduced_pictures_average_straight_colors():
     rgba = torch.tensor([[[255, 0, 0, 255], [0, 255, 0, 0]]], dtype=torch.uint8).repeat(2, 1, 1)
     assert pictures.reduce(rgba, 1, captures.WHITE)[:, 0].T.tolist() == [[255, 0, 0], [255, 255, 255]]

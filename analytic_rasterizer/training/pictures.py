@@ -112,9 +112,16 @@ def cut(path: Path, view: io.View, multiple: int) -> tuple[io.View, Tensor]:
     """The picture (H, W, 4), and its view, both cut about the centre to multiples of `multiple` px.
 
     The principal point moves along. Where the picture is not of the size that the view states, the view is scaled.
+
+    Raises io.SceneError for pictures that are too small, or that were turned by a quarter after their camera was found.
     """
     rgba = read_picture(path)
     height, width = rgba.shape[:2]
+    full = view.width, view.height
+    if not _is_reduced(width, height, *full) and _is_reduced(height, width, *full):
+        raise io.SceneError(
+            f"{path}: expected the orientation of its camera, {view.width} x {view.height} px, got {width} x {height}"
+        )
     x, y = width / view.width, height / view.height
     cx = x * (view.width / 2 if view.cx is None else view.cx)
     cy = y * (view.height / 2 if view.cy is None else view.cy)
@@ -124,6 +131,12 @@ def cut(path: Path, view: io.View, multiple: int) -> tuple[io.View, Tensor]:
         raise io.SceneError(f"{path}: {width} x {height} px are too few for these scales")
     view = replace(view, width=size[0], height=size[1], fx=x * view.fx, fy=y * view.fy, cx=cx - left, cy=cy - top)
     return view, rgba[top : top + size[1], left : left + size[0]]
+
+
+def _is_reduced(width: int, height: int, full_width: int, full_height: int) -> bool:
+    """Whether a picture can be another with so many pixels at another scale, both sides rounded up or down."""
+    lowest = max((width - 1) / full_width, (height - 1) / full_height)
+    return lowest < min((width + 1) / full_width, (height + 1) / full_height)
 
 
 def reduce(
