@@ -333,6 +333,36 @@ def test_points_of_a_ply(tmp_path, layout):
         training.load_points(tmp_path / "p.ply")
 
 
+def points_with_colors(path, kind: str, colors) -> torch.Tensor:
+    """The colours of a .ply with points of these colours, (P, 3)."""
+    names = ["x", "y", "z", "red", "green", "blue"]
+    kinds = ["float"] * 3 + [kind] * 3
+    header = [
+        "ply",
+        "format ascii 1.0",
+        f"element vertex {len(colors)}",
+        *(f"property {kind} {name}" for kind, name in zip(kinds, names)),
+    ]
+    rows = [f"0 1 {i} {' '.join(map(str, color))}" for i, color in enumerate(colors)]
+    path.write_text("\n".join([*header, "end_header", *rows, ""]))
+    return training.load_points(path)[1]
+
+
+@pytest.mark.parametrize(
+    "kind, largest", [("uchar", 255), ("int", 255), ("ushort", 65535), ("float", 255), ("float", 1), ("double", 1)]
+)
+def test_colors_of_points_in_every_type(tmp_path, kind, largest):
+    """Those that are fractions were taken for black, and NaN came to the training."""
+    colors = [(0, largest, largest), (largest, 0, 0)]
+    assert points_with_colors(tmp_path / "p.ply", kind, colors).tolist() == [[0, 1, 1], [1, 0, 0]]
+
+
+@pytest.mark.parametrize("kind, color", [("float", "nan"), ("float", 256), ("float", -0.5), ("char", -1), ("int", 256)])
+def test_colors_of_points_out_of_range(tmp_path, kind, color):
+    with pytest.raises(io.SceneError, match=r"p\.ply: expected colours from 0 to 255, got "):
+        points_with_colors(tmp_path / "p.ply", kind, [(0, 1, color)])
+
+
 def test_a_list_of_cameras_is_no_capture(tmp_path):
     view = io.View("a", 40, 30, 50.0, 50.0, looking_at_origin(0.1))
     io.save_views(tmp_path / "transforms_train.json", [view])

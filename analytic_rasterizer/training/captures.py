@@ -193,7 +193,10 @@ def is_scene(path: Path) -> bool:
 def load_points(path: Path) -> tuple[Tensor, Tensor]:
     """Positions (P, 3) float32, and colours (P, 3) float32 in [0, 1], grey where there are none, of a .ply of points.
 
-    Raises io.SceneError for anything but a complete binary little-endian or ASCII file with finite x, y, z.
+    Colours reach to 255 in the file, to 65535 as ushort, and to 1 where they are fractions and none is larger.
+
+    Raises io.SceneError for anything but a complete binary little-endian or ASCII file with finite x, y, z and
+    with colours in their range.
     """
     path = Path(path)
     lines = header_of(path)
@@ -209,8 +212,8 @@ def load_points(path: Path) -> tuple[Tensor, Tensor]:
     properties = [line.split()[1:] for line in lines[elements[0] + 1 : end] if line.startswith("property ")]
     known = all(len(words) == 2 and words[0] in PLY_TYPES for words in properties)
     names = [words[-1] for words in properties]
-    if not known or not {"x", "y", "z"} <= set(names):
-        raise io.SceneError(f"{path}: expected vertices of numbers with x, y and z, got {', '.join(names)}")
+    if not known or not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
+        raise io.SceneError(f"{path}: expected vertices of numbers with x, y and z, each once, got {', '.join(names)}")
     dtype = np.dtype([(name, PLY_TYPES[kind]) for kind, name in properties])
     body = re.split(rb"end_header\r?\n", path.read_bytes(), maxsplit=1)[-1]
     if layout == "binary_little_endian" and len(body) >= count * dtype.itemsize:
@@ -226,9 +229,19 @@ def load_points(path: Path) -> tuple[Tensor, Tensor]:
     if len(rows) != count or not points.isfinite().all():
         raise io.SceneError(f"{path}: expected {count} finite points, got {int(points.isfinite().all(1).sum())}")
     if {"red", "green", "blue"} <= set(names):
-        colors = np.stack([rows[name].astype(np.float32) / 255 for name in ("red", "green", "blue")], 1)
-        return points, torch.from_numpy(colors)
+        stored = np.stack([rows[name] for name in ("red", "green", "blue")], 1)
+        colors = torch.from_numpy(_in_unit_range(stored))
+        if not ((colors >= 0) & (colors <= 1)).all():
+            raise io.SceneError(f"{path}: expected colours from 0 to 255, got {stored.min()} to {stored.max()}")
+        return points, colors
     return points, torch.full_like(points, 0.5)
+
+
+def _in_unit_range(colors: np.ndarray) -> np.ndarray:
+    """Colours (P, 3) of a file as float32 in [0, 1], by the type and the largest of them."""
+    wide = colors.dtype == np.uint16
+    fractions = np.issubdtype(colors.dtype, np.floating) and not (colors > 1).any()
+    return colors.astype(np.float32) / np.float32(65535 if wide else 1 if fractions else 255)
 
 
 def _split(items: list[Photograph], test_every: int) -> tuple[list[Photograph], list[Photograph]]:
