@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -431,6 +432,14 @@ def test_another_default_device_changes_nothing(tmp_path):
         again, (view,) = io.load_scene(tmp_path / "a.ply"), io.load_views(tmp_path / "v.json")
     assert again.means.device.type == view.w2c.device.type == "cpu"
     assert torch.equal(again.means, scene.means)
+
+
+def test_views_are_equal_by_their_values():
+    """Comparing two views raised an error of torch about the truth of a tensor."""
+    view, again, moved = (io.View("a", 40, 30, 50.0, 51.0, torch.eye(4, dtype=torch.float64)) for _ in range(3))
+    moved.w2c[0, 3] = 1
+    assert view == again and hash(view) == hash(again) and view in [moved, again]
+    assert view != moved and view != replace(view, cx=3.0) and view != "a" and {view, again} == {view}
 
 
 def test_views_round_trip(tmp_path):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import torch
@@ -27,6 +27,18 @@ class View:
     w2c: torch.Tensor  # (4, 4) float64, world to camera, OpenCV axes
     cx: float | None = None  # principal point; None is the centre
     cy: float | None = None
+
+    def __eq__(self, other) -> bool:  # that of a dataclass fails at the tensor
+        if not isinstance(other, View):
+            return NotImplemented
+        same_pose = self.w2c is other.w2c or torch.equal(self.w2c, other.w2c)
+        return same_pose and self._other_fields() == other._other_fields()
+
+    def __hash__(self) -> int:
+        return hash(self._other_fields())
+
+    def _other_fields(self) -> tuple:
+        return tuple(getattr(self, field.name) for field in fields(self) if field.name != "w2c")
 
     def size(self, scale: float = 1.0) -> tuple[int, int]:
         """(width, height) of the picture at `scale`: rounded, at least 1."""
