@@ -100,6 +100,8 @@ def run(args) -> None:
 def run_on(ranks: Ranks, args) -> bool:
     """`run`, on every rank. Returns whether the training came to its end."""
     given = {field.name: getattr(args, field.name) for field in fields(TrainingOptions) if hasattr(args, field.name)}
+    if given.get("seconds") and "iterations" in given:
+        raise ValueError("--seconds is instead of --iterations: leave out one of them")
     if args.port is not None and not args.watch:
         raise ValueError("--port is for --watch")
     if args.watch and is_launched():

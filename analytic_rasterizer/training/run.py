@@ -91,6 +91,8 @@ class Run:
         resume: bool = False,
         ranks: Ranks = ALONE,
     ):
+        if save_every < 0:
+            raise ValueError(f"save_every must be at least 0, got {save_every}")
         torch.backends.cudnn.allow_tf32 = False  # the variances of SSIM are small differences
         self.out, self.device, self.save_every, self.ranks = Path(out), torch.device(device), save_every, ranks
         state = read_checkpoint(self.out / CHECKPOINT, mapped=ranks.world > 1) if resume else None
