@@ -1232,12 +1232,24 @@ def test_example_trains(synthetic, tmp_path):
     assert "iterations=7000" in source and "(1, 2, 4, 8)" in source
     source = source.replace("iterations=7000", "iterations=3, random_points=50").replace("(1, 2, 4, 8)", "(1, 2)")
     (tmp_path / "train.py").write_text(source)
-    done = subprocess.run(
-        [sys.executable, "train.py", str(synthetic), "out", "mip"],
-        cwd=tmp_path, capture_output=True, text=True, timeout=DEADLINE,
-    )  # fmt: skip
+
+    def run(folder):
+        command = [sys.executable, "train.py", str(folder), "out", "mip"]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=DEADLINE)
+
+    done = run(synthetic)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.startswith("mip: PSNR ") and (tmp_path / "out" / "mip" / files.SCENE).exists()
+    shutil.copytree(synthetic, tmp_path / "untested")
+    (tmp_path / "untested" / "transforms_test.json").unlink()
+    done = run(tmp_path / "untested")
+    assert done.returncode == 1 and done.stderr.endswith("has no test pictures; out/mip has the scene\n")
+
+
+def test_evaluate_needs_pictures():
+    empty = pictures.Pictures([], {1: []}, {1: []})
+    with pytest.raises(ValueError, match="pictures must have at least one view, got none"):
+        evaluate(truth_gaussians().to_scene(), empty, "box")
 
 
 # -------------------------------------------------------------------------- schedules, measures

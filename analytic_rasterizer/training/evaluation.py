@@ -82,7 +82,12 @@ def evaluate(
     Returns:
         By scale, as text, and "mean" over scales: {"psnr", "ssim", "lpips"}; scales also have "views", a list with
         the same for each view.
+
+    Raises:
+        ValueError: There are no pictures.
     """
+    if not pictures.views:
+        raise ValueError("pictures must have at least one view, got none")
     gaussians = Activated(*scene[:5])
     results: dict[str, dict] = {}
     for scale, settings in pictures.resolve(footprint=footprint, sh_degree=scene.sh_degree, **options).items():
