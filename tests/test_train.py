@@ -363,6 +363,16 @@ def test_colors_of_points_out_of_range(tmp_path, kind, color):
         points_with_colors(tmp_path / "p.ply", kind, [(0, 1, color)])
 
 
+@pytest.mark.parametrize("content", ["{}", "[1, 2]", "3", "no JSON"])
+def test_metadata_of_another_program_is_passed_over(synthetic, tmp_path, content):
+    shutil.copytree(synthetic, tmp_path / "scene")
+    (tmp_path / "scene" / "metadata.json").write_text(content)
+    assert len(captures.load_capture(tmp_path / "scene").train) == 10
+    (tmp_path / "scene" / "transforms_train.json").unlink()
+    with pytest.raises(io.SceneError, match=r"metadata\.json: not the metadata of the multi-scale Blender set"):
+        captures.load_capture(tmp_path / "scene")
+
+
 def test_a_list_of_cameras_is_no_capture(tmp_path):
     view = io.View("a", 40, 30, 50.0, 50.0, looking_at_origin(0.1))
     io.save_views(tmp_path / "transforms_train.json", [view])

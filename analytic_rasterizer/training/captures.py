@@ -62,7 +62,10 @@ def load_capture(folder, images: str = IMAGES, test_every: int = TEST_PERIOD) ->
     if not folder.is_dir():
         raise io.SceneError(f"{folder}: no such folder")
     sparse = next((folder / name for name in RECONSTRUCTIONS if colmap.is_reconstruction(folder / name)), None)
-    if (folder / "metadata.json").exists():
+    others = sparse is not None or any(
+        (folder / name).exists() for name in ("transforms_train.json", "transforms.json")
+    )
+    if (folder / "metadata.json").exists() and not (others and not _has_splits(folder / "metadata.json")):
         train, test = (multi_scale_blender(folder, split) for split in ("train", "test"))
         capture = Capture(train, test, WHITE, None)
     elif (folder / "transforms_train.json").exists():
@@ -130,6 +133,14 @@ def check_lens(entry: dict, where: str) -> None:
         if any(value if isinstance(value, list) else [value]):
             got = f"{name} = {value}"
             raise io.SceneError(f"{where}: cameras must be pinholes, got {got}; undistort the pictures first")
+
+
+def _has_splits(path: Path) -> bool:
+    """Whether a metadata.json may be that of the multi-scale Blender set: other programs write files of this name."""
+    try:
+        return {"train", "test"} <= set(json.loads(path.read_text(encoding="utf-8-sig")))
+    except (ValueError, TypeError):
+        return False
 
 
 def multi_scale_blender(folder: Path, split: str) -> list[Photograph]:
