@@ -176,6 +176,37 @@ def test_harmonics_of_degree_four_go_where_they_can_be_read(tmp_path):
     assert io.load_scene(tmp_path / "a.compressed.ply").sh_degree == 4
 
 
+@pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "a.spz"])
+def test_what_cannot_be_saved_leaves_the_file(tmp_path, name):
+    """An .spz of fields of different lengths could not be read, and NaN became a place or an opacity."""
+    scene = io.load_scene(hand_written(tmp_path))
+    path, count = tmp_path / "saved" / name, len(scene.means)
+    path.parent.mkdir()
+    path.write_bytes(b"before")
+    wrong = [
+        (scene._replace(scales=scene.scales[1:]), rf"scales must have shape \({count}, 3\), got \({count - 1}, 3\)"),
+        (scene._replace(opacities=scene.opacities[1:]), r"opacities must have shape"),
+        (scene._replace(shs=scene.shs[:, :1].repeat(1, 5, 1)), r"shs must have shape"),
+        (scene._replace(sh_degree=scene.sh_degree + 1), r"shs must have shape"),
+    ]
+    if name != "a.ply":  # which holds what it is given
+        for field in scene._fields[:-1]:
+            broken = getattr(scene, field).clone()
+            broken[1] = math.nan
+            wrong.append((scene._replace(**{field: broken}), f"{field} must be finite.*, got 1 of {count} rows not"))
+        wrong.append((scene._replace(scales=-scene.scales), "scales must be finite and not negative"))
+    for given, message in wrong:
+        with pytest.raises(io.SceneError, match=message):
+            io.save_scene(path, given)
+    assert path.read_bytes() == b"before" and list(path.parent.iterdir()) == [path]
+
+
+def test_scenes_with_gradients_are_saved(tmp_path):
+    scene = io.load_scene(hand_written(tmp_path))
+    io.save_scene(tmp_path / "b.ply", io.Scene(*(f.clone().requires_grad_() for f in scene[:-1]), scene.sh_degree))
+    assert torch.equal(io.load_scene(tmp_path / "b.ply").means, scene.means)
+
+
 def test_save_scene_refuses_other_suffixes(tmp_path):
     with pytest.raises(io.SceneError, match=r"expected a \.ply or \.spz name, got '\.obj'"):
         io.save_scene(tmp_path / "scene.obj", random_scene())

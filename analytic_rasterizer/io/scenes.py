@@ -92,8 +92,10 @@ def save_scene(path, scene: Scene, comments: Sequence[str] = ()) -> None:
 
     The two small formats round: see their own documentation. Opacities are kept off 0 and 1 by
     1e-6, where their logit is infinite. `comments` are lines for the header of a `.ply`. Raises
-    SceneError for another suffix, for harmonics of degree 4 in anything but a `.compressed.ply`,
-    and for comments that cannot be written.
+    SceneError, before a file is touched, for another suffix, for tensors of other shapes than those
+    of `Scene`, for harmonics of degree 4 in anything but a `.compressed.ply`, for comments that
+    cannot be written, and for numbers that are not finite in the small formats, which would make
+    others of them.
     """
     path = Path(path)
     if path.suffix not in (".ply", ".spz"):
@@ -104,8 +106,10 @@ def save_scene(path, scene: Scene, comments: Sequence[str] = ()) -> None:
         raise SceneError(f"{path}: only a .ply holds comments")
     if any("\n" in comment or not comment.isascii() for comment in comments):
         raise SceneError(f"{path}: comments must be single lines of ASCII, got {list(comments)}")
+    cpu = Scene(*(field.detach() for field in scene[:-1]), scene.sh_degree).to("cpu")
+    cpu = cpu._replace(opacities=cpu.opacities.reshape(-1, 1))
+    _check_fields(path, cpu)
     gsply = optional_import("gsply")
-    cpu = scene.to("cpu")
     data = gsply.GSData.from_arrays(
         means=cpu.means.numpy(),
         scales=cpu.scales.log().numpy(),
@@ -121,6 +125,28 @@ def save_scene(path, scene: Scene, comments: Sequence[str] = ()) -> None:
         start = content.index(b"\n", content.index(b"\n") + 1) + 1  # "ply", then "format ..."
         added = "".join(f"comment {comment}\n" for comment in comments).encode()
         path.write_bytes(content[:start] + added + content[start:])
+
+
+def _check_fields(path: Path, scene: Scene) -> None:
+    """What gsply would write without a word, into a file that cannot be read or holds other numbers."""
+    count = len(scene.means)
+    width = {
+        "means": (3,),
+        "scales": (3,),
+        "rotations": (4,),
+        "opacities": (1,),
+        "shs": ((scene.sh_degree + 1) ** 2, 3),
+    }
+    for name, expected in width.items():
+        field = getattr(scene, name)
+        if field.shape != (count, *expected):
+            raise SceneError(f"{path}: {name} must have shape {(count, *expected)}, got {tuple(field.shape)}")
+        good = field.flatten(1).isfinite().all(1)
+        if name == "scales":
+            good &= (field >= 0).all(1)
+        if not good.all() and (path.suffix == ".spz" or path.name.endswith(".compressed.ply")):
+            expected = "finite and not negative" if name == "scales" else "finite"
+            raise SceneError(f"{path}: {name} must be {expected}, got {count - int(good.sum())} of {count} rows not")
 
 
 PLY_COLUMNS = (
