@@ -201,6 +201,18 @@ def test_what_cannot_be_saved_leaves_the_file(tmp_path, name):
     assert path.read_bytes() == b"before" and list(path.parent.iterdir()) == [path]
 
 
+@pytest.mark.parametrize("largest, step", [(2000.0, 2**-12), (3000.0, 2**-11), (4e6, 0.5)])
+def test_spz_holds_distant_gaussians(tmp_path, largest, step):
+    """They were moved to 2,048 units."""
+    scene = io.load_scene(hand_written(tmp_path))
+    scene.means[1] = torch.tensor([largest, -largest, 1.0])
+    io.save_scene(tmp_path / "a.spz", scene)
+    torch.testing.assert_close(io.load_scene(tmp_path / "a.spz").means, scene.means, rtol=0, atol=step / 2)
+    scene.means[0, 2] = -5e6
+    with pytest.raises(io.SceneError, match=r"a\.spz: an \.spz holds means up to 2\^22, got 5e\+06"):
+        io.save_scene(tmp_path / "a.spz", scene)
+
+
 def test_scenes_with_gradients_are_saved(tmp_path):
     scene = io.load_scene(hand_written(tmp_path))
     io.save_scene(tmp_path / "b.ply", io.Scene(*(f.clone().requires_grad_() for f in scene[:-1]), scene.sh_degree))

@@ -94,8 +94,8 @@ def save_scene(path, scene: Scene, comments: Sequence[str] = ()) -> None:
     1e-6, where their logit is infinite. `comments` are lines for the header of a `.ply`. Raises
     SceneError, before a file is touched, for another suffix, for tensors of other shapes than those
     of `Scene`, for harmonics of degree 4 in anything but a `.compressed.ply`, for comments that
-    cannot be written, and for numbers that are not finite in the small formats, which would make
-    others of them.
+    cannot be written, and in the small formats for what would become other numbers: those that are
+    not finite, and in an `.spz` means beyond 2^22.
     """
     path = Path(path)
     if path.suffix not in (".ply", ".spz"):
@@ -119,7 +119,10 @@ def save_scene(path, scene: Scene, comments: Sequence[str] = ()) -> None:
         shN=cpu.shs[:, 1:].numpy(),
         format="ply",
     )
-    (gsply.write_spz if path.suffix == ".spz" else gsply.plywrite)(path, data)
+    if path.suffix == ".spz":
+        gsply.write_spz(path, data, fractional_bits=_fractional_bits(path, cpu.means))
+    else:
+        gsply.plywrite(path, data)
     if comments:
         content = path.read_bytes()
         start = content.index(b"\n", content.index(b"\n") + 1) + 1  # "ply", then "format ..."
@@ -147,6 +150,18 @@ def _check_fields(path: Path, scene: Scene) -> None:
         if not good.all() and (path.suffix == ".spz" or path.name.endswith(".compressed.ply")):
             expected = "finite and not negative" if name == "scales" else "finite"
             raise SceneError(f"{path}: {name} must be {expected}, got {count - int(good.sum())} of {count} rows not")
+
+
+def _fractional_bits(path: Path, means: torch.Tensor) -> int:
+    """How many of the 24 bits of a coordinate in an .spz are fractional: the usual 12, or what the largest leaves.
+
+    gsply would move what lies further away than the bits before the point reach.
+    """
+    largest = means.abs().max().item() if len(means) else 0.0
+    bits = 23 - math.frexp(largest)[1]
+    if bits < 1:
+        raise SceneError(f"{path}: an .spz holds means up to 2^22, got {largest:g}")
+    return min(bits, 12)
 
 
 PLY_COLUMNS = (
