@@ -477,6 +477,13 @@ def test_another_default_device_changes_nothing(tmp_path):
     assert torch.equal(again.means, scene.means)
 
 
+def test_views_with_numbers_of_numpy_are_saved(tmp_path):
+    pose = torch.eye(4, dtype=torch.float64)
+    view = io.View("a", np.int64(40), np.uint16(30), np.float32(50.5), np.float64(51), pose, cx=np.float32(3.5))
+    io.save_views(tmp_path / "v.json", [view])
+    assert io.load_views(tmp_path / "v.json") == [view] == [io.View("a", 40, 30, 50.5, 51.0, pose, cx=3.5)]
+
+
 def test_views_are_equal_by_their_values():
     """Comparing two views raised an error of torch about the truth of a tensor."""
     view, again, moved = (io.View("a", 40, 30, 50.0, 51.0, torch.eye(4, dtype=torch.float64)) for _ in range(3))

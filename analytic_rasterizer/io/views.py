@@ -8,6 +8,7 @@ import re
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from ..camera import camera_settings
@@ -27,6 +28,12 @@ class View:
     w2c: torch.Tensor  # (4, 4) float64, world to camera, OpenCV axes
     cx: float | None = None  # principal point; None is the centre
     cy: float | None = None
+
+    def __post_init__(self):
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.generic):  # which JSON does not hold
+                object.__setattr__(self, field.name, value.item())
 
     def __eq__(self, other) -> bool:  # that of a dataclass fails at the tensor
         if not isinstance(other, View):
