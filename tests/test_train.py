@@ -9,7 +9,7 @@ import struct
 import subprocess
 import sys
 import zlib
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -578,6 +578,21 @@ def test_bad_arguments_are_one_line(synthetic, tmp_path, capsys, extra, message)
     assert code == 2 and message in error
     assert error.startswith("error: ") and error.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_help_of_train_has_every_default(capsys):
+    """Those that are 0 were left out."""
+    with pytest.raises(SystemExit):
+        cli.main(["train", "--help"])
+    shown = " ".join(capsys.readouterr().out.split())
+    for field in fields(TrainingOptions):
+        if (
+            field.default not in ((), "")
+            and field.default is not False
+            and field.name not in ("scales", "random_points")
+        ):
+            option = f"--{field.name.replace('_', '-')} X "
+            assert f"(default: {field.default})" in shown.split(option)[1].split(" --")[0], field.name
 
 
 # ------------------------------------------------------------------------------------ training

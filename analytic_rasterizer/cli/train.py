@@ -78,7 +78,7 @@ def add_parser(subcommands) -> None:
         flag = "--" + field.name.replace("_", "-")
         default = ",".join(map(str, field.default)) if isinstance(field.default, tuple) else field.default
         text = MAIN.get(field.name, "")
-        text += f" (default: {default})" if "default" not in text and default not in ("", False) else ""
+        text += f" (default: {default})" if "default" not in text and str(default) not in ("", "False") else ""
         # What is not given is absent, so that a checkpoint's options are only compared with what is.
         if types[field.name] is bool:
             group.add_argument(flag, action="store_true", default=argparse.SUPPRESS, help=text)
