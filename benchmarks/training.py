@@ -79,6 +79,9 @@ def main() -> int:
         return 2
     options = {name: TrainingOptions(**(args.common | fitting(variants[name], args.common))) for name in chosen}
     capture = load_capture(args.scene, args.images)
+    if not capture.test:
+        print(f"error: {args.scene}: there are no test pictures", file=sys.stderr)
+        return 2
     scales = args.common["scales"]
     background = background_of(TrainingOptions(**args.common), capture.background)
     train, test = (load_pictures(items, scales, background, args.device) for items in (capture.train, capture.test))

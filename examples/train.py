@@ -20,5 +20,8 @@ for footprint in footprints or ["analytic", "box:samples=4", "moment:samples=4"]
     name = footprint.replace(":", "_").replace("=", "_")
     run = Run(folder, Path(out) / name, options, device="cuda" if torch.cuda.is_available() else "cpu")
     run.train()
-    measured = run.evaluate()["test"]["mean"]
+    metrics = run.evaluate()
+    if "test" not in metrics:
+        sys.exit(f"{folder} has no test pictures; {run.out} has the scene")
+    measured = metrics["test"]["mean"]
     print(f"{footprint}: PSNR {measured['psnr']:.2f} dB, SSIM {measured['ssim']:.4f}, mean over scales")

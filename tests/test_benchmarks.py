@@ -368,6 +368,11 @@ def test_training(device, tmp_path, monkeypatch, capsys):
     assert (runs[2]["options"]["scale_repeats"], runs[2]["options"]["density"]) == ([1, 1], "3dgs")
     monkeypatch.setattr(sys, "argv", ["training.py", str(tmp_path), "--variants", "none"])
     assert training.main() == 2
+    (tmp_path / "transforms_test.json").unlink()
+    monkeypatch.setattr(sys, "argv", ["training.py", str(tmp_path)])
+    capsys.readouterr()
+    assert training.main() == 2  # before anything is trained
+    assert capsys.readouterr().err == f"error: {tmp_path}: there are no test pictures\n"
 
 
 def run_on_ranks(name, small_scene, *options):

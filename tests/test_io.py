@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -173,6 +174,49 @@ def test_harmonics_of_degree_four_go_where_they_can_be_read(tmp_path):
         assert not (tmp_path / name).exists()
     io.save_scene(tmp_path / "a.compressed.ply", scene)
     assert io.load_scene(tmp_path / "a.compressed.ply").sh_degree == 4
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "a.spz"])
+def test_what_cannot_be_saved_leaves_the_file(tmp_path, name):
+    """An .spz of fields of different lengths could not be read, and NaN became a place or an opacity."""
+    scene = io.load_scene(hand_written(tmp_path))
+    path, count = tmp_path / "saved" / name, len(scene.means)
+    path.parent.mkdir()
+    path.write_bytes(b"before")
+    wrong = [
+        (scene._replace(scales=scene.scales[1:]), rf"scales must have shape \({count}, 3\), got \({count - 1}, 3\)"),
+        (scene._replace(opacities=scene.opacities[1:]), r"opacities must have shape"),
+        (scene._replace(shs=scene.shs[:, :1].repeat(1, 5, 1)), r"shs must have shape"),
+        (scene._replace(sh_degree=scene.sh_degree + 1), r"shs must have shape"),
+    ]
+    if name != "a.ply":  # which holds what it is given
+        for field in scene._fields[:-1]:
+            broken = getattr(scene, field).clone()
+            broken[1] = math.nan
+            wrong.append((scene._replace(**{field: broken}), f"{field} must be finite.*, got 1 of {count} rows not"))
+        wrong.append((scene._replace(scales=-scene.scales), "scales must be finite and not negative"))
+    for given, message in wrong:
+        with pytest.raises(io.SceneError, match=message):
+            io.save_scene(path, given)
+    assert path.read_bytes() == b"before" and list(path.parent.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("largest, step", [(2000.0, 2**-12), (3000.0, 2**-11), (4e6, 0.5)])
+def test_spz_holds_distant_gaussians(tmp_path, largest, step):
+    """They were moved to 2,048 units."""
+    scene = io.load_scene(hand_written(tmp_path))
+    scene.means[1] = torch.tensor([largest, -largest, 1.0])
+    io.save_scene(tmp_path / "a.spz", scene)
+    torch.testing.assert_close(io.load_scene(tmp_path / "a.spz").means, scene.means, rtol=0, atol=step / 2)
+    scene.means[0, 2] = -5e6
+    with pytest.raises(io.SceneError, match=r"a\.spz: an \.spz holds means up to 2\^22, got 5e\+06"):
+        io.save_scene(tmp_path / "a.spz", scene)
+
+
+def test_scenes_with_gradients_are_saved(tmp_path):
+    scene = io.load_scene(hand_written(tmp_path))
+    io.save_scene(tmp_path / "b.ply", io.Scene(*(f.clone().requires_grad_() for f in scene[:-1]), scene.sh_degree))
+    assert torch.equal(io.load_scene(tmp_path / "b.ply").means, scene.means)
 
 
 def test_save_scene_refuses_other_suffixes(tmp_path):
@@ -390,6 +434,18 @@ def test_size_from_the_first_picture_there_is(tmp_path, picture):
     assert [(view.width, view.height, view.fx) for view in views] == [(62, 34, pytest.approx(31 / math.tan(0.35)))] * 2
 
 
+def test_every_picture_has_its_own_size(tmp_path):
+    """The angle spans the width of each: pixels of a portrait beside a landscape were oblong."""
+    sizes = [(40, 20), (20, 40)]
+    for i, size in enumerate(sizes):
+        image.new("RGB", size).save(tmp_path / f"{i}.png")
+    frames = [FRAME | {"file_path": f"{i}.png"} for i in range(2)]
+    views = io.load_views(write_json(tmp_path, {"camera_angle_x": 0.7, "frames": frames}))
+    assert [(view.width, view.height) for view in views] == sizes
+    for view in views:
+        assert view.fx == view.fy == pytest.approx(view.width / 2 / math.tan(0.35))
+
+
 def test_stated_size_goes_before_the_callers(tmp_path):
     (view,) = io.load_views(write_json(tmp_path, TRANSFORMS), size=(7, 5))
     assert (view.width, view.height) == (120, 80)
@@ -419,6 +475,21 @@ def test_another_default_device_changes_nothing(tmp_path):
         again, (view,) = io.load_scene(tmp_path / "a.ply"), io.load_views(tmp_path / "v.json")
     assert again.means.device.type == view.w2c.device.type == "cpu"
     assert torch.equal(again.means, scene.means)
+
+
+def test_views_with_numbers_of_numpy_are_saved(tmp_path):
+    pose = torch.eye(4, dtype=torch.float64)
+    view = io.View("a", np.int64(40), np.uint16(30), np.float32(50.5), np.float64(51), pose, cx=np.float32(3.5))
+    io.save_views(tmp_path / "v.json", [view])
+    assert io.load_views(tmp_path / "v.json") == [view] == [io.View("a", 40, 30, 50.5, 51.0, pose, cx=3.5)]
+
+
+def test_views_are_equal_by_their_values():
+    """Comparing two views raised an error of torch about the truth of a tensor."""
+    view, again, moved = (io.View("a", 40, 30, 50.0, 51.0, torch.eye(4, dtype=torch.float64)) for _ in range(3))
+    moved.w2c[0, 3] = 1
+    assert view == again and hash(view) == hash(again) and view in [moved, again]
+    assert view != moved and view != replace(view, cx=3.0) and view != "a" and {view, again} == {view}
 
 
 def test_views_round_trip(tmp_path):
@@ -529,7 +600,7 @@ def test_views_file_that_is_not_there(tmp_path):
 def test_size_of_an_unreadable_picture(tmp_path):
     (tmp_path / "train").mkdir()
     (tmp_path / "train" / "r_0.png").write_text("no picture")
-    with pytest.raises(io.SceneError, match=r"r_0\.png: cannot identify image file"):
+    with pytest.raises(io.SceneError, match=r"r_0\.png: unreadable or cut short \(cannot identify image file"):
         io.load_views(write_json(tmp_path, {"camera_angle_x": 0.7, "frames": [FRAME]}))
 
 

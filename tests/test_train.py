@@ -5,9 +5,11 @@ import math
 import re
 import shutil
 import signal
+import struct
 import subprocess
 import sys
-from dataclasses import replace
+import zlib
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -331,6 +333,46 @@ def test_points_of_a_ply(tmp_path, layout):
         training.load_points(tmp_path / "p.ply")
 
 
+def points_with_colors(path, kind: str, colors) -> torch.Tensor:
+    """The colours of a .ply with points of these colours, (P, 3)."""
+    names = ["x", "y", "z", "red", "green", "blue"]
+    kinds = ["float"] * 3 + [kind] * 3
+    header = [
+        "ply",
+        "format ascii 1.0",
+        f"element vertex {len(colors)}",
+        *(f"property {kind} {name}" for kind, name in zip(kinds, names)),
+    ]
+    rows = [f"0 1 {i} {' '.join(map(str, color))}" for i, color in enumerate(colors)]
+    path.write_text("\n".join([*header, "end_header", *rows, ""]))
+    return training.load_points(path)[1]
+
+
+@pytest.mark.parametrize(
+    "kind, largest", [("uchar", 255), ("int", 255), ("ushort", 65535), ("float", 255), ("float", 1), ("double", 1)]
+)
+def test_colors_of_points_in_every_type(tmp_path, kind, largest):
+    """Those that are fractions were taken for black, and NaN came to the training."""
+    colors = [(0, largest, largest), (largest, 0, 0)]
+    assert points_with_colors(tmp_path / "p.ply", kind, colors).tolist() == [[0, 1, 1], [1, 0, 0]]
+
+
+@pytest.mark.parametrize("kind, color", [("float", "nan"), ("float", 256), ("float", -0.5), ("char", -1), ("int", 256)])
+def test_colors_of_points_out_of_range(tmp_path, kind, color):
+    with pytest.raises(io.SceneError, match=r"p\.ply: expected colours from 0 to 255, got "):
+        points_with_colors(tmp_path / "p.ply", kind, [(0, 1, color)])
+
+
+@pytest.mark.parametrize("content", ["{}", "[1, 2]", "3", "no JSON"])
+def test_metadata_of_another_program_is_passed_over(synthetic, tmp_path, content):
+    shutil.copytree(synthetic, tmp_path / "scene")
+    (tmp_path / "scene" / "metadata.json").write_text(content)
+    assert len(captures.load_capture(tmp_path / "scene").train) == 10
+    (tmp_path / "scene" / "transforms_train.json").unlink()
+    with pytest.raises(io.SceneError, match=r"metadata\.json: not the metadata of the multi-scale Blender set"):
+        captures.load_capture(tmp_path / "scene")
+
+
 def test_a_list_of_cameras_is_no_capture(tmp_path):
     view = io.View("a", 40, 30, 50.0, 50.0, looking_at_origin(0.1))
     io.save_views(tmp_path / "transforms_train.json", [view])
@@ -381,6 +423,19 @@ def test_cut_pictures_see_the_same(tmp_path):
         pictures.cut(tmp_path / "a.png", view, 32)
 
 
+def test_pictures_that_were_turned_are_refused(tmp_path):
+    """Their cameras were scaled by another factor in x than in y."""
+    view = io.View("a", 99, 66, 50.0, 50.0, torch.eye(4, dtype=torch.float64))
+    for size in ((66, 99), (33, 49), (17, 25)):
+        image.new("RGB", size).save(tmp_path / "a.png")
+        with pytest.raises(io.SceneError, match=rf"camera, 99 x 66 px, got {size[0]} x {size[1]}"):
+            pictures.cut(tmp_path / "a.png", view, 1)
+    for size in ((99, 66), (50, 33), (25, 17), (2, 2), (64, 64), (150, 80)):  # squeezed ones have oblong pixels
+        image.new("RGB", size).save(tmp_path / "a.png")
+        cut, _ = pictures.cut(tmp_path / "a.png", view, 1)
+        assert (cut.width, cut.height) == size
+
+
 def test_reduced_pictures_average_straight_colors():
     rgba = torch.tensor([[[255, 0, 0, 255], [0, 255, 0, 0]]], dtype=torch.uint8).repeat(2, 1, 1)
     assert pictures.reduce(rgba, 1, captures.WHITE)[:, 0].T.tolist() == [[255, 0, 0], [255, 255, 255]]
@@ -404,6 +459,14 @@ def test_sixteen_bits_are_rounded_to_eight(tmp_path):
 
 
 # -------------------------------------------------------------------------------------- errors
+
+
+def png_of_size(width: int, height: int) -> bytes:
+    """The start of a black PNG, which says its size."""
+    header = b"IHDR" + struct.pack(">2I5B", width, height, 1, 0, 0, 0, 0)
+    rest = b"IDAT" + zlib.compress(b"")
+    parts = [struct.pack(">I", len(part) - 4) + part + struct.pack(">I", zlib.crc32(part)) for part in (header, rest)]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
 def change_transforms(folder, change) -> None:
@@ -433,6 +496,14 @@ BROKEN = {
     "nan": (nan_picture, r"r_4.png: pixels must be finite, got nan at x 7, y 3"),
     "cut short": (
         lambda f: (f / "train" / "r_1.png").write_bytes((f / "train" / "r_1.png").read_bytes()[:200]),
+        "r_1.png: unreadable or cut short",
+    ),
+    "too large for Pillow": (
+        lambda f: (f / "train" / "r_1.png").write_bytes(png_of_size(20000, 10000)),
+        r"r_1.png: unreadable or cut short \(Image size \(200000000 pixels\) exceeds limit",
+    ),
+    "broken header": (
+        lambda f: (f / "train" / "r_1.png").write_bytes(b"P6 3x2 255\n"),
         "r_1.png: unreadable or cut short",
     ),
     "one camera": (
@@ -491,6 +562,8 @@ def test_broken_captures_are_one_line_and_leave_no_results(synthetic, tmp_path, 
         (["--port", "8000"], "--port is for --watch"),
         (["--watch", "--port", "65536"], "must be a port from 0 to 65535, got 65536"),
         (["--export", "mip", "--footprint", "point"], "--export mip is for footprints that integrate over pixels"),
+        (["--save-every", "-1"], "save_every must be at least 0, got -1"),
+        (["--seconds", "5", "--iterations", "10"], "--seconds is instead of --iterations: leave out one of them"),
         (["--test-every", "1"], "test_every must be 0 or at least 2, got 1"),
         (["--resume"], "checkpoint.pt: no such file; there is no training to resume"),
         (["--points", "none.ply"], "none.ply"),
@@ -505,6 +578,21 @@ def test_bad_arguments_are_one_line(synthetic, tmp_path, capsys, extra, message)
     assert code == 2 and message in error
     assert error.startswith("error: ") and error.count("\n") == 1
     assert not (tmp_path / "out").exists()
+
+
+def test_help_of_train_has_every_default(capsys):
+    """Those that are 0 were left out."""
+    with pytest.raises(SystemExit):
+        cli.main(["train", "--help"])
+    shown = " ".join(capsys.readouterr().out.split())
+    for field in fields(TrainingOptions):
+        if (
+            field.default not in ((), "")
+            and field.default is not False
+            and field.name not in ("scales", "random_points")
+        ):
+            option = f"--{field.name.replace('_', '-')} X "
+            assert f"(default: {field.default})" in shown.split(option)[1].split(" --")[0], field.name
 
 
 # ------------------------------------------------------------------------------------ training
@@ -744,6 +832,32 @@ def picture_arguments(device, **changed):
         "bg": torch.zeros(3, device=device),
     }
     return dict(zip(names, gaussians)) | others | camera | changed
+
+
+@pytest.mark.parametrize("options", [{}, {"density": "mcmc"}, {"background": "random", "filter_3d": True}], ids=str)
+def test_another_default_dtype_changes_nothing(synthetic, tmp_path, options):
+    measured = []
+    for name, dtype in (("single", torch.float32), ("double", torch.float64)):
+        torch.set_default_dtype(dtype)
+        try:
+            run = make_run(synthetic, tmp_path / name, iterations=60, **options)
+            run.train()
+            measured.append(run.evaluate()["test"])
+        finally:
+            torch.set_default_dtype(torch.float32)
+    assert measured[0] == measured[1]
+    scenes = [(tmp_path / name / files.SCENE).read_bytes() for name in ("single", "double")]
+    assert scenes[0] == scenes[1]
+
+
+@pytest.mark.parametrize("options", [{}, {"density": "mcmc"}], ids=str)
+def test_training_where_gradients_are_switched_off(synthetic, tmp_path, options):
+    with torch.no_grad():
+        run = make_run(synthetic, tmp_path / "off", iterations=40, **options)
+        run.train()
+    make_run(synthetic, tmp_path / "on", iterations=40, **options).train()
+    scenes = [(tmp_path / name / files.SCENE).read_bytes() for name in ("off", "on")]
+    assert scenes[0] == scenes[1]
 
 
 def test_opcheck_of_picture_gradients(device):
@@ -1112,10 +1226,30 @@ def test_evaluate_says_how_to_get_the_weights_of_lpips(trained, capsys, monkeypa
     assert "LPIPS" not in captured.out
 
 
-def test_evaluate_of_another_folder_is_one_line(tmp_path, capsys):
+@pytest.mark.parametrize("content", [None, "[]", "{}", '{"source": {}, "options": {}}', '{"source": 3, "options": {}}'])
+def test_evaluate_of_another_folder_is_one_line(tmp_path, capsys, content):
+    if content is not None:
+        (tmp_path / files.OPTIONS).write_text(content)
     assert cli.main(["evaluate", str(tmp_path)]) == 2
     error = capsys.readouterr().err
     assert error.startswith("error: ") and "options.json" in error and error.count("\n") == 1
+
+
+def test_evaluate_finds_the_capture_from_another_folder(synthetic, tmp_path, capsys, monkeypatch):
+    shutil.copytree(synthetic, tmp_path / "scene")
+    monkeypatch.chdir(tmp_path)
+    small = ["--iterations", "2", "--random-points", "50", "--no-evaluate", "--device", "cpu"]
+    assert cli.main(["train", "scene", "--out", "out", *small]) == 0
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    evaluate = ["evaluate", str(tmp_path / "out"), "--lpips", "none", "--device", "cpu"]
+    assert cli.main(evaluate) == 0
+    # Another capture is named where it is the one without test pictures.
+    shutil.copytree(synthetic, tmp_path / "untested")
+    (tmp_path / "untested" / "transforms_test.json").unlink()
+    capsys.readouterr()
+    assert cli.main([*evaluate, "--data", "../untested"]) == 2
+    assert capsys.readouterr().err == "error: ../untested: there are no test pictures\n"
 
 
 def test_example_trains(synthetic, tmp_path):
@@ -1123,12 +1257,24 @@ def test_example_trains(synthetic, tmp_path):
     assert "iterations=7000" in source and "(1, 2, 4, 8)" in source
     source = source.replace("iterations=7000", "iterations=3, random_points=50").replace("(1, 2, 4, 8)", "(1, 2)")
     (tmp_path / "train.py").write_text(source)
-    done = subprocess.run(
-        [sys.executable, "train.py", str(synthetic), "out", "mip"],
-        cwd=tmp_path, capture_output=True, text=True, timeout=DEADLINE,
-    )  # fmt: skip
+
+    def run(folder):
+        command = [sys.executable, "train.py", str(folder), "out", "mip"]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=DEADLINE)
+
+    done = run(synthetic)
     assert done.returncode == 0, done.stderr[-2000:]
     assert done.stdout.startswith("mip: PSNR ") and (tmp_path / "out" / "mip" / files.SCENE).exists()
+    shutil.copytree(synthetic, tmp_path / "untested")
+    (tmp_path / "untested" / "transforms_test.json").unlink()
+    done = run(tmp_path / "untested")
+    assert done.returncode == 1 and done.stderr.endswith("has no test pictures; out/mip has the scene\n")
+
+
+def test_evaluate_needs_pictures():
+    empty = pictures.Pictures([], {1: []}, {1: []})
+    with pytest.raises(ValueError, match="pictures must have at least one view, got none"):
+        evaluate(truth_gaussians().to_scene(), empty, "box")
 
 
 # -------------------------------------------------------------------------- schedules, measures
@@ -1201,6 +1347,39 @@ def test_options_survive_a_file():
     assert TrainingOptions.from_dict(older) == options and not options.sparse_adam
     with pytest.raises(ValueError, match="among those of TrainingOptions, got speed"):
         TrainingOptions.from_dict({"speed": 1})
+
+
+def test_numbers_of_numpy_are_those_of_python(synthetic, tmp_path):
+    """A checkpoint with a number of NumPy in its options could not be read again."""
+    given = {"iterations": np.int64(3), "scales": np.array([1, 2]), "opacity_rate": np.float64(0.04)}
+    given |= {"color_rate": np.float32(0.5), "seed": torch.tensor(3), "sh_degree": 1.0, "sparse_adam": np.bool_(True)}
+    run = make_run(synthetic, tmp_path, **given)
+    plain = {"iterations": 3, "scales": (1, 2), "opacity_rate": 0.04, "color_rate": 0.5, "seed": 3, "sh_degree": 1}
+    for name, value in (plain | {"sparse_adam": True, "scale_repeats": (2, 1)}).items():
+        assert getattr(run.options, name) == value and type(getattr(run.options, name)) is type(value)
+    assert {type(scale) for scale in run.options.scales} == {int}
+    run.train()
+    assert make_run(synthetic, tmp_path, resume=True).options == run.options
+
+
+@pytest.mark.parametrize(
+    "name, value, error, message",
+    [
+        ("iterations", 40.5, ValueError, "iterations must be a whole number, got 40.5"),
+        ("iterations", "40", TypeError, "iterations must be a whole number, got '40'"),
+        ("max_gaussians", math.inf, ValueError, "max_gaussians must be a whole number, got inf"),
+        ("seed", 1.5, ValueError, "seed must be a whole number, got 1.5"),
+        ("scales", 4, TypeError, "scales must be a sequence of whole numbers, got 4"),
+        ("scales", "12", TypeError, "scales must be a sequence of whole numbers, got '12'"),
+        ("scales", (1, 2.5), ValueError, "scales must be whole numbers, got (1, 2.5)"),
+        ("opacity_rate", "fast", TypeError, "opacity_rate must be a number, got 'fast'"),
+        ("filter_3d", "no", TypeError, "filter_3d must be a bool, got 'no'"),
+        ("density", None, TypeError, "density must be a string, got None"),
+    ],
+)
+def test_options_of_a_wrong_type(name, value, error, message):
+    with pytest.raises(error, match=re.escape(message)):
+        TrainingOptions(**{name: value})
 
 
 def test_presets_give_way_to_what_is_given():
@@ -1280,6 +1459,28 @@ def test_resuming_takes_the_points_of_the_start_or_none(synthetic, trained, tmp_
     del state["source"]["points"]
     files.write_checkpoint(tmp_path / "alone" / files.CHECKPOINT, state)
     assert cli.main([*alone, "--resume", "--points", "b.ply"]) == 0
+
+
+def test_resuming_takes_the_pictures_of_the_start_or_none(capture, tmp_path, capsys):
+    """A training that was resumed without its --images went on with the pictures of another folder."""
+    folder, out = tmp_path / "scene", tmp_path / "out"
+    shutil.copytree(capture, folder)
+    shutil.copytree(folder / "photographs", folder / "images")
+    command = ["train", str(folder), "--out", str(out), "--iterations", "2", "--no-evaluate", "--device", "cpu"]
+    chosen = ["--images", "photographs", "--test-every", "4"]
+    assert cli.main([*command, *chosen]) == 0
+    for again in ([], chosen):
+        assert cli.main([*command, "--resume", *again]) == 0
+        source = json.loads((out / files.OPTIONS).read_text())["source"]
+        assert (source["images"], source["test_every"]) == ("photographs", 4)
+    written = {path: path.read_bytes() for path in out.iterdir()}
+    capsys.readouterr()
+    refused = {"--images": ("images", "photographs", "images"), "--test-every": ("test_every", "4", "8")}
+    for option, (name, before, given) in refused.items():
+        assert cli.main([*command, "--resume", option, given]) == 2
+        error = f"error: {name} must be {before} or None where a training is resumed, got {given}\n"
+        assert capsys.readouterr().err == error
+    assert {path: path.read_bytes() for path in out.iterdir()} == written
 
 
 def test_ssim_is_that_of_torchmetrics():

@@ -56,14 +56,15 @@ def run_on(ranks: Ranks, args) -> None:
     try:
         described = json.loads((folder / OPTIONS).read_text(encoding="utf-8"))
         source, options = described["source"], TrainingOptions.from_dict(described["options"])
-    except (ValueError, KeyError) as error:
+        place, images, test_every = args.data or source["scene"], source["images"], source["test_every"]
+    except (ValueError, KeyError, TypeError) as error:
         raise io.SceneError(f"{folder / OPTIONS}: not what `train` writes ({error})") from None
     scales = tuple(dict.fromkeys(args.scales or options.scales))
     check_scales(scales)  # raises before the capture is read
     footprints = [str(resolve_footprint(name)) for name in args.footprints or [options.footprint]]
-    capture = load_capture(args.data or source["scene"], source["images"], source["test_every"])
+    capture = load_capture(place, images, test_every)
     if not capture.test:
-        raise io.SceneError(f"{source['scene']}: there are no test pictures")
+        raise io.SceneError(f"{place}: there are no test pictures")
     scene = part_of(io.load_scene(folder / SCENE), ranks).to(args.device)
     background = background_of(options, capture.background) or capture.background
     pictures = load_pictures(

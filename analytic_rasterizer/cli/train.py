@@ -12,6 +12,7 @@ from pathlib import Path
 from .. import io
 from ..footprints import resolve_footprint
 from ..training import Run, TrainingOptions
+from ..training.captures import IMAGES, TEST_PERIOD
 from ..training.files import CHECKPOINT, SCENE, read_checkpoint
 from ..training.options import BACKGROUNDS, DENSITIES, DOWNSAMPLINGS, PRESETS, RANDOM_BACKGROUND, preset_values
 from ..training.ranks import Ranks
@@ -52,8 +53,10 @@ def add_parser(subcommands) -> None:
     add = parser.add_argument
     add("scene", metavar="SCENE", help="folder of pictures with cameras")
     add("--out", required=True, metavar="DIR", help="folder for the results")
-    add("--images", default="images", metavar="NAME", help="folder in SCENE of a reconstruction's photographs")
-    add("--test-every", type=int, default=8, metavar="N", help="keep every N-th photograph for the test; 0: none")
+    images = f"folder in SCENE of a reconstruction's photographs (default: {IMAGES})"
+    add("--images", metavar="NAME", help=images)  # what is not given is None, for --resume
+    test_every = f"keep every N-th photograph for the test; 0: none (default: {TEST_PERIOD})"
+    add("--test-every", type=int, metavar="N", help=test_every)
     add("--points", metavar="FILE.ply", help="start from this: a 3DGS scene, or points with colours")
     preset = "options that belong together: quick, 7,000 steps; 3dgs, the recipe of 3DGS; what is given wins"
     add("--preset", choices=tuple(PRESETS), help=preset)
@@ -75,7 +78,7 @@ def add_parser(subcommands) -> None:
         flag = "--" + field.name.replace("_", "-")
         default = ",".join(map(str, field.default)) if isinstance(field.default, tuple) else field.default
         text = MAIN.get(field.name, "")
-        text += f" (default: {default})" if "default" not in text and default not in ("", False) else ""
+        text += f" (default: {default})" if "default" not in text and str(default) not in ("", "False") else ""
         # What is not given is absent, so that a checkpoint's options are only compared with what is.
         if types[field.name] is bool:
             group.add_argument(flag, action="store_true", default=argparse.SUPPRESS, help=text)
@@ -97,6 +100,8 @@ def run(args) -> None:
 def run_on(ranks: Ranks, args) -> bool:
     """`run`, on every rank. Returns whether the training came to its end."""
     given = {field.name: getattr(args, field.name) for field in fields(TrainingOptions) if hasattr(args, field.name)}
+    if given.get("seconds") and "iterations" in given:
+        raise ValueError("--seconds is instead of --iterations: leave out one of them")
     if args.port is not None and not args.watch:
         raise ValueError("--port is for --watch")
     if args.watch and is_launched():

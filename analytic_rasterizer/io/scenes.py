@@ -92,8 +92,10 @@ def save_scene(path, scene: Scene, comments: Sequence[str] = ()) -> None:
 
     The two small formats round: see their own documentation. Opacities are kept off 0 and 1 by
     1e-6, where their logit is infinite. `comments` are lines for the header of a `.ply`. Raises
-    SceneError for another suffix, for harmonics of degree 4 in anything but a `.compressed.ply`,
-    and for comments that cannot be written.
+    SceneError, before a file is touched, for another suffix, for tensors of other shapes than those
+    of `Scene`, for harmonics of degree 4 in anything but a `.compressed.ply`, for comments that
+    cannot be written, and in the small formats for what would become other numbers: those that are
+    not finite, and in an `.spz` means beyond 2^22.
     """
     path = Path(path)
     if path.suffix not in (".ply", ".spz"):
@@ -104,8 +106,10 @@ def save_scene(path, scene: Scene, comments: Sequence[str] = ()) -> None:
         raise SceneError(f"{path}: only a .ply holds comments")
     if any("\n" in comment or not comment.isascii() for comment in comments):
         raise SceneError(f"{path}: comments must be single lines of ASCII, got {list(comments)}")
+    cpu = Scene(*(field.detach() for field in scene[:-1]), scene.sh_degree).to("cpu")
+    cpu = cpu._replace(opacities=cpu.opacities.reshape(-1, 1))
+    _check_fields(path, cpu)
     gsply = optional_import("gsply")
-    cpu = scene.to("cpu")
     data = gsply.GSData.from_arrays(
         means=cpu.means.numpy(),
         scales=cpu.scales.log().numpy(),
@@ -115,12 +119,49 @@ def save_scene(path, scene: Scene, comments: Sequence[str] = ()) -> None:
         shN=cpu.shs[:, 1:].numpy(),
         format="ply",
     )
-    (gsply.write_spz if path.suffix == ".spz" else gsply.plywrite)(path, data)
+    if path.suffix == ".spz":
+        gsply.write_spz(path, data, fractional_bits=_fractional_bits(path, cpu.means))
+    else:
+        gsply.plywrite(path, data)
     if comments:
         content = path.read_bytes()
         start = content.index(b"\n", content.index(b"\n") + 1) + 1  # "ply", then "format ..."
         added = "".join(f"comment {comment}\n" for comment in comments).encode()
         path.write_bytes(content[:start] + added + content[start:])
+
+
+def _check_fields(path: Path, scene: Scene) -> None:
+    """What gsply would write without a word, into a file that cannot be read or holds other numbers."""
+    count = len(scene.means)
+    width = {
+        "means": (3,),
+        "scales": (3,),
+        "rotations": (4,),
+        "opacities": (1,),
+        "shs": ((scene.sh_degree + 1) ** 2, 3),
+    }
+    for name, expected in width.items():
+        field = getattr(scene, name)
+        if field.shape != (count, *expected):
+            raise SceneError(f"{path}: {name} must have shape {(count, *expected)}, got {tuple(field.shape)}")
+        good = field.flatten(1).isfinite().all(1)
+        if name == "scales":
+            good &= (field >= 0).all(1)
+        if not good.all() and (path.suffix == ".spz" or path.name.endswith(".compressed.ply")):
+            expected = "finite and not negative" if name == "scales" else "finite"
+            raise SceneError(f"{path}: {name} must be {expected}, got {count - int(good.sum())} of {count} rows not")
+
+
+def _fractional_bits(path: Path, means: torch.Tensor) -> int:
+    """How many of the 24 bits of a coordinate in an .spz are fractional: the usual 12, or what the largest leaves.
+
+    gsply would move what lies further away than the bits before the point reach.
+    """
+    largest = means.abs().max().item() if len(means) else 0.0
+    bits = 23 - math.frexp(largest)[1]
+    if bits < 1:
+        raise SceneError(f"{path}: an .spz holds means up to 2^22, got {largest:g}")
+    return min(bits, 12)
 
 
 PLY_COLUMNS = (

@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 import math
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from ..camera import camera_settings
 from ..settings import GaussianRasterizationSettings
-from .common import SceneError, first_line, optional_import
+from .common import SceneError, first_line, opened_picture
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,24 @@ class View:
     w2c: torch.Tensor  # (4, 4) float64, world to camera, OpenCV axes
     cx: float | None = None  # principal point; None is the centre
     cy: float | None = None
+
+    def __post_init__(self):
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.generic):  # which JSON does not hold
+                object.__setattr__(self, field.name, value.item())
+
+    def __eq__(self, other) -> bool:  # that of a dataclass fails at the tensor
+        if not isinstance(other, View):
+            return NotImplemented
+        same_pose = self.w2c is other.w2c or torch.equal(self.w2c, other.w2c)
+        return same_pose and self._other_fields() == other._other_fields()
+
+    def __hash__(self) -> int:
+        return hash(self._other_fields())
+
+    def _other_fields(self) -> tuple:
+        return tuple(getattr(self, field.name) for field in fields(self) if field.name != "w2c")
 
     def size(self, scale: float = 1.0) -> tuple[int, int]:
         """(width, height) of the picture at `scale`: rounded, at least 1."""
@@ -100,8 +119,8 @@ def load_views(path, size: tuple[int, int] | None = None) -> list[View]:
     - a list of {width, height, fx, fy, w2c} with w2c world-to-camera, 16 numbers by rows or 4 x 4.
 
     cx, cy are optional everywhere (the image spans [0, width]; the centre is width / 2), lens
-    distortion is ignored. A transforms file that states no image size takes `size` = (width,
-    height), or that of the first of its pictures that exists.
+    distortion is ignored. Views of a transforms file that states no image size have `size` = (width,
+    height), or that of their pictures; where a picture is missing, that of the first that exists.
 
     Raises SceneError, naming the file and the entry, for what is missing, malformed, not finite or
     not positive, and for an empty list.
@@ -134,9 +153,10 @@ def _views(data, folder: Path, size) -> list[View]:
     if isinstance(data, dict) and "frames" in data:
         frames = _entries(data["frames"], "frames")
         _check_camera_model(data.get("camera_model"))
+        sizes = [size] * len(frames)
         if size is None and not any("w" in frame for frame in [data, *frames]):
-            size = _picture_size(folder, frames)
-        return [_transforms_view(i, frame, data, size) for i, frame in enumerate(frames)]
+            sizes = _picture_sizes(folder, frames)
+        return [_transforms_view(i, frame, data, size) for i, (frame, size) in enumerate(zip(frames, sizes))]
     if not isinstance(data, list):
         raise SceneError(f"expected a list of views or an object with 'frames', got {_kind(data)}")
     return [_listed_view(i, entry) for i, entry in enumerate(_entries(data, "the list of views"))]
@@ -228,20 +248,20 @@ def _check_camera_model(model) -> None:
         raise SceneError(f"camera_model must be a pinhole camera, got {model!r}")
 
 
-def _picture_size(folder: Path, frames: list[dict]) -> tuple[int, int] | None:
-    """Size of the first picture that a frame names and that exists."""
-    for frame in frames:
-        name = frame.get("file_path")
-        if not isinstance(name, str):
-            continue
-        for picture in (folder / name, folder / f"{name}.png"):
-            if picture.is_file():
-                image = optional_import("PIL.Image")
-                try:
-                    with image.open(picture) as opened:
-                        return opened.size
-                except OSError as error:
-                    raise SceneError(f"{picture}: {first_line(error)}") from None
+def _picture_sizes(folder: Path, frames: list[dict]) -> list[tuple[int, int] | None]:
+    """Sizes of the pictures that the frames name; of those that do not exist, that of the first that does, or None."""
+    sizes = [_picture_size(folder, frame.get("file_path")) for frame in frames]
+    usual = next((size for size in sizes if size is not None), None)
+    return [usual if size is None else size for size in sizes]
+
+
+def _picture_size(folder: Path, name) -> tuple[int, int] | None:
+    if not isinstance(name, str):
+        return None
+    for picture in (folder / name, folder / f"{name}.png"):
+        if picture.is_file():
+            with opened_picture(picture) as opened:
+                return opened.size
     return None
 
 

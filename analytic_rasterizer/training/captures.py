@@ -19,7 +19,7 @@ from .. import io
 from . import colmap
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-TEST_PERIOD = 8
+IMAGES, TEST_PERIOD = "images", 8
 RECONSTRUCTIONS = ("sparse/0", "sparse", "colmap/sparse/0")
 # What a transforms file may say of the lens; nothing, or zeros, for a pinhole.
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "distortion_params", "is_fisheye")
@@ -41,7 +41,7 @@ class Capture(NamedTuple):
     points: tuple[Tensor, Tensor] | None  # positions and colours in [0, 1], (P, 3) float32 each, on the CPU
 
 
-def load_capture(folder, images: str = "images", test_every: int = TEST_PERIOD) -> Capture:
+def load_capture(folder, images: str = IMAGES, test_every: int = TEST_PERIOD) -> Capture:
     """Reads the cameras of a folder, and looks whether all of its pictures are there.
 
     Args:
@@ -62,7 +62,10 @@ def load_capture(folder, images: str = "images", test_every: int = TEST_PERIOD) 
     if not folder.is_dir():
         raise io.SceneError(f"{folder}: no such folder")
     sparse = next((folder / name for name in RECONSTRUCTIONS if colmap.is_reconstruction(folder / name)), None)
-    if (folder / "metadata.json").exists():
+    others = sparse is not None or any(
+        (folder / name).exists() for name in ("transforms_train.json", "transforms.json")
+    )
+    if (folder / "metadata.json").exists() and not (others and not _has_splits(folder / "metadata.json")):
         train, test = (multi_scale_blender(folder, split) for split in ("train", "test"))
         capture = Capture(train, test, WHITE, None)
     elif (folder / "transforms_train.json").exists():
@@ -132,6 +135,14 @@ def check_lens(entry: dict, where: str) -> None:
             raise io.SceneError(f"{where}: cameras must be pinholes, got {got}; undistort the pictures first")
 
 
+def _has_splits(path: Path) -> bool:
+    """Whether a metadata.json may be that of the multi-scale Blender set: other programs write files of this name."""
+    try:
+        return {"train", "test"} <= set(json.loads(path.read_text(encoding="utf-8-sig")))
+    except (ValueError, TypeError):
+        return False
+
+
 def multi_scale_blender(folder: Path, split: str) -> list[Photograph]:
     """A split of the multi-scale Blender set: pictures of one camera at several sizes follow each other.
 
@@ -193,7 +204,10 @@ def is_scene(path: Path) -> bool:
 def load_points(path: Path) -> tuple[Tensor, Tensor]:
     """Positions (P, 3) float32, and colours (P, 3) float32 in [0, 1], grey where there are none, of a .ply of points.
 
-    Raises io.SceneError for anything but a complete binary little-endian or ASCII file with finite x, y, z.
+    Colours reach to 255 in the file, to 65535 as ushort, and to 1 where they are fractions and none is larger.
+
+    Raises io.SceneError for anything but a complete binary little-endian or ASCII file with finite x, y, z and
+    with colours in their range.
     """
     path = Path(path)
     lines = header_of(path)
@@ -209,8 +223,8 @@ def load_points(path: Path) -> tuple[Tensor, Tensor]:
     properties = [line.split()[1:] for line in lines[elements[0] + 1 : end] if line.startswith("property ")]
     known = all(len(words) == 2 and words[0] in PLY_TYPES for words in properties)
     names = [words[-1] for words in properties]
-    if not known or not {"x", "y", "z"} <= set(names):
-        raise io.SceneError(f"{path}: expected vertices of numbers with x, y and z, got {', '.join(names)}")
+    if not known or not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
+        raise io.SceneError(f"{path}: expected vertices of numbers with x, y and z, each once, got {', '.join(names)}")
     dtype = np.dtype([(name, PLY_TYPES[kind]) for kind, name in properties])
     body = re.split(rb"end_header\r?\n", path.read_bytes(), maxsplit=1)[-1]
     if layout == "binary_little_endian" and len(body) >= count * dtype.itemsize:
@@ -226,9 +240,19 @@ def load_points(path: Path) -> tuple[Tensor, Tensor]:
     if len(rows) != count or not points.isfinite().all():
         raise io.SceneError(f"{path}: expected {count} finite points, got {int(points.isfinite().all(1).sum())}")
     if {"red", "green", "blue"} <= set(names):
-        colors = np.stack([rows[name].astype(np.float32) / 255 for name in ("red", "green", "blue")], 1)
-        return points, torch.from_numpy(colors)
+        stored = np.stack([rows[name] for name in ("red", "green", "blue")], 1)
+        colors = torch.from_numpy(_in_unit_range(stored))
+        if not ((colors >= 0) & (colors <= 1)).all():
+            raise io.SceneError(f"{path}: expected colours from 0 to 255, got {stored.min()} to {stored.max()}")
+        return points, colors
     return points, torch.full_like(points, 0.5)
+
+
+def _in_unit_range(colors: np.ndarray) -> np.ndarray:
+    """Colours (P, 3) of a file as float32 in [0, 1], by the type and the largest of them."""
+    wide = colors.dtype == np.uint16
+    fractions = np.issubdtype(colors.dtype, np.floating) and not (colors > 1).any()
+    return colors.astype(np.float32) / np.float32(65535 if wide else 1 if fractions else 255)
 
 
 def _split(items: list[Photograph], test_every: int) -> tuple[list[Photograph], list[Photograph]]:

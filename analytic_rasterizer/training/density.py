@@ -191,7 +191,7 @@ class GradientDensity(FixedDensity):
 
     def forget(self) -> None:
         means = self.gaussians.means
-        self.gradient_sums = torch.zeros(len(means), device=means.device)
+        self.gradient_sums = torch.zeros(len(means), dtype=torch.float32, device=means.device)
         self.views = torch.zeros(len(means), dtype=torch.int32, device=means.device)
 
     def _grow(self, gradients: Tensor, over: float) -> None:
@@ -292,7 +292,7 @@ class MonteCarloDensity(FixedDensity):
         means, log_scales, rotations, logits = self.gaussians[:4]
         strength = torch.sigmoid(NOISE_SHARPNESS * (NOISE_OPACITY - logits.sigmoid()))
         strength = strength * (self.options.noise * self.optimizer.param_groups[0]["lr"])
-        noise = torch.randn(means.shape, generator=self.generator, device=means.device) * strength
+        noise = strength * normal_numbers(means, self.generator)
         axes = rotation_matrices(rotations)
         along = (2 * log_scales).exp() * (axes * noise[:, :, None]).sum(1)  # in the Gaussian's frame
         means += (axes * along[:, None, :]).sum(2)
@@ -312,10 +312,15 @@ def select(gaussians: Gaussians, rows: Tensor | slice) -> Gaussians:
 def split(parents: Gaussians, generator: torch.Generator) -> Gaussians:
     """Two Gaussians for each parent, drawn from its distribution, smaller and otherwise like it."""
     twice = Gaussians(*(torch.cat([field, field]) for field in parents))
-    normal = torch.randn(len(twice.means), 3, generator=generator, device=twice.means.device)
+    normal = normal_numbers(twice.means, generator)
     along = twice.log_scales.exp() * normal
     offsets = (rotation_matrices(twice.rotations) * along[:, None, :]).sum(2)
     return twice._replace(means=twice.means + offsets, log_scales=twice.log_scales - math.log(SHRINKAGE))
+
+
+def normal_numbers(like: Tensor, generator: torch.Generator) -> Tensor:
+    """As many numbers from a normal distribution, of the same dtype."""
+    return torch.randn(like.shape, generator=generator, dtype=like.dtype, device=like.device)
 
 
 def draw(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:

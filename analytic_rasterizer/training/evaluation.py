@@ -28,7 +28,7 @@ Perceptual = Callable[[Tensor, Tensor], Tensor]
 def psnr(image: Tensor, target: Tensor) -> Tensor:
     """Peak signal-to-noise ratio of two images in [0, 1], dB, after clamping the first. The second may be uint8."""
     if target.dtype == torch.uint8:
-        target = target / 255
+        target = target.to(image.dtype) / 255
     return -10 * (image.clamp(0, 1) - target).square().mean().log10()
 
 
@@ -82,7 +82,12 @@ def evaluate(
     Returns:
         By scale, as text, and "mean" over scales: {"psnr", "ssim", "lpips"}; scales also have "views", a list with
         the same for each view.
+
+    Raises:
+        ValueError: There are no pictures.
     """
+    if not pictures.views:
+        raise ValueError("pictures must have at least one view, got none")
     gaussians = Activated(*scene[:5])
     results: dict[str, dict] = {}
     for scale, settings in pictures.resolve(footprint=footprint, sh_degree=scene.sh_degree, **options).items():

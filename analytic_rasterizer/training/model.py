@@ -140,8 +140,8 @@ def random_points(count: int, seed: int) -> tuple[Tensor, Tensor]:
     Random colours, of which nothing is known, would only have to be unlearned.
     """
     generator = torch.Generator().manual_seed(seed)
-    uniform = torch.rand(count, 3, generator=generator, device="cpu")
-    return HALF_EDGE * (2 * uniform - 1), torch.full((count, 3), 0.5, device="cpu")
+    uniform = torch.rand(count, 3, generator=generator, dtype=torch.float32, device="cpu")
+    return HALF_EDGE * (2 * uniform - 1), torch.full_like(uniform, 0.5)
 
 
 def gaussians_at(points: Tensor, colors: Tensor, sh_degree: int, opacity: float = 0.1, scale: float = 1.0) -> Gaussians:
@@ -153,11 +153,9 @@ def gaussians_at(points: Tensor, colors: Tensor, sh_degree: int, opacity: float 
     return Gaussians(
         points,
         (scale * neighbour_distance(points)).log()[:, None].repeat(1, 3),
-        torch.tensor([[1.0, 0, 0, 0]], device="cpu").repeat(count, 1),
-        torch.full((count, 1), opacity, device="cpu").logit(),
-        torch.cat(
-            [(colors[:, None] - 0.5) / SH_C0, torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3, device="cpu")], dim=1
-        ),
+        points.new_tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
+        points.new_full((count, 1), opacity).logit(),
+        torch.cat([(colors[:, None] - 0.5) / SH_C0, points.new_zeros(count, (sh_degree + 1) ** 2 - 1, 3)], dim=1),
     )
 
 

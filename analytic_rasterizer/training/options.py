@@ -6,7 +6,10 @@ import math
 from dataclasses import asdict, dataclass, fields
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from ..footprints import resolve_footprint
+from ..settings import whole_number
 
 DOWNSAMPLINGS = ("box", "bicubic")
 DENSITIES = ("3dgs", "absgrad", "mcmc", "none")
@@ -131,7 +134,10 @@ class TrainingOptions:
         opacity_weight: Weight of the mean opacity in the loss; -1: 0.01 for "mcmc", otherwise 0.
         scale_weight: Weight of the mean scale in the loss, likewise.
 
+    Numbers of NumPy and tensors with one number become those of Python, which the files of a training can hold.
+
     Raises:
+        TypeError: A value of another type, naming the option.
         ValueError: A value outside its range, naming the option.
     """
 
@@ -179,11 +185,10 @@ class TrainingOptions:
     scale_weight: float = -1.0
 
     def __post_init__(self):
-        # Lists, as JSON and the command line have them, become tuples.
-        object.__setattr__(self, "scales", tuple(self.scales))
-        repeats = tuple(self.scale_repeats) or repeats_of(self.scales, FINEST_REPEATS)
-        object.__setattr__(self, "scale_repeats", repeats)
-        object.__setattr__(self, "footprint", str(resolve_footprint(self.footprint)))
+        object.__setattr__(self, "footprint", str(resolve_footprint(str(self.footprint))))
+        for field in fields(self):
+            object.__setattr__(self, field.name, _plain(field.name, getattr(self, field.name), type(field.default)))
+        object.__setattr__(self, "scale_repeats", self.scale_repeats or repeats_of(self.scales, FINEST_REPEATS))
         for name in ("iterations", "pictures_per_step", "supersampling", "sh_every", "densify_every"):
             _check(name, getattr(self, name) >= 1, "at least 1", getattr(self, name))
         steps = ("densify_from", "reset_every", "means_rate_steps", "rates_from", "rates_half_life")
@@ -260,6 +265,33 @@ class TrainingOptions:
         if unknown:
             raise ValueError(f"options must be among those of TrainingOptions, got {', '.join(sorted(unknown))}")
         return cls(**values)
+
+
+def _plain(name: str, value: Any, kind: type) -> Any:
+    """The value as Python's own `kind`; sequences, as JSON and the command line have them, become tuples of int.
+
+    Raises:
+        TypeError: It is none.
+        ValueError: A number that is not whole where it has to be.
+    """
+    if kind is int:
+        return whole_number(name, value)
+    if kind is tuple:
+        if isinstance(value, (str, bytes)) or not hasattr(value, "__iter__"):
+            raise TypeError(f"{name} must be a sequence of whole numbers, got {value!r}")
+        items = tuple(value)
+        try:
+            return tuple(whole_number(name, item) for item in items)
+        except (TypeError, ValueError) as error:
+            raise type(error)(f"{name} must be whole numbers, got {items}") from None
+    if kind is bool and isinstance(value, np.bool_):
+        return bool(value)
+    if kind is float and hasattr(value, "__float__") and not isinstance(value, (bool, np.bool_)):
+        return float(value)
+    if not isinstance(value, kind):
+        expected = {float: "a number", bool: "a bool", str: "a string"}[kind]
+        raise TypeError(f"{name} must be {expected}, got {value!r}")
+    return value
 
 
 def _check(name: str, fits: bool, expected: str, got: Any) -> None:

@@ -14,6 +14,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from .. import io
+from ..io.common import opened_picture
 from ..settings import GaussianRasterizationSettings
 from .captures import Photograph
 from .options import check_scales
@@ -28,7 +29,7 @@ class Pictures(NamedTuple):
 
     def truth(self, scale: int, view: int, background: Tensor | None = None) -> Tensor:
         """(3, H, W) float32 in [0, 1] on the device; `background` (3,) is for pictures with alpha."""
-        color = self._color(scale, view) / 255
+        color = self._color(scale, view).float() / 255
         return color if background is None else color[:3] + (1 - color[3:]) * background[:, None, None]
 
     def target(self, scale: int, view: int, background: Tensor | None = None) -> Tensor:
@@ -95,28 +96,32 @@ def read_photograph(item: Photograph, scales: tuple[int, ...]) -> tuple[io.View,
 
 def read_picture(path: Path) -> Tensor:
     """(H, W, 4) uint8 of straight alpha. Raises io.SceneError."""
-    image = io.optional_import("PIL.Image", "train")
-    try:
-        with image.open(path) as opened:
-            if opened.mode == "F" or opened.mode.startswith("I"):
-                numbers = np.array(opened).astype(np.float64)
-                if not np.isfinite(numbers).all():
-                    y, x = np.argwhere(~np.isfinite(numbers))[0]
-                    raise io.SceneError(f"{path}: pixels must be finite, got {numbers[y, x]} at x {x}, y {y}")
-                peak = 1 if opened.mode == "F" else 65535
-                opened = image.fromarray((255 * (numbers / peak).clip(0, 1)).round().astype(np.uint8))
+    with opened_picture(path, "train") as opened:
+        if opened.mode != "F" and not opened.mode.startswith("I"):
             return torch.from_numpy(np.array(opened.convert("RGBA")))
-    except (OSError, SyntaxError) as error:  # Pillow raises SyntaxError for some broken PNG files
-        raise io.SceneError(f"{path}: unreadable or cut short ({error})") from None
+        numbers = np.array(opened).astype(np.float64)
+        peak = 1 if opened.mode == "F" else 65535
+    if not np.isfinite(numbers).all():
+        y, x = np.argwhere(~np.isfinite(numbers))[0]
+        raise io.SceneError(f"{path}: pixels must be finite, got {numbers[y, x]} at x {x}, y {y}")
+    grey = (255 * (numbers / peak).clip(0, 1)).round().astype(np.uint8)
+    return torch.from_numpy(np.stack([grey, grey, grey, np.full_like(grey, 255)], 2))
 
 
 def cut(path: Path, view: io.View, multiple: int) -> tuple[io.View, Tensor]:
     """The picture (H, W, 4), and its view, both cut about the centre to multiples of `multiple` px.
 
     The principal point moves along. Where the picture is not of the size that the view states, the view is scaled.
+
+    Raises io.SceneError for pictures that are too small, or that were turned by a quarter after their camera was found.
     """
     rgba = read_picture(path)
     height, width = rgba.shape[:2]
+    full = view.width, view.height
+    if not _is_reduced(width, height, *full) and _is_reduced(height, width, *full):
+        raise io.SceneError(
+            f"{path}: expected the orientation of its camera, {view.width} x {view.height} px, got {width} x {height}"
+        )
     x, y = width / view.width, height / view.height
     cx = x * (view.width / 2 if view.cx is None else view.cx)
     cy = y * (view.height / 2 if view.cy is None else view.cy)
@@ -126,6 +131,12 @@ def cut(path: Path, view: io.View, multiple: int) -> tuple[io.View, Tensor]:
         raise io.SceneError(f"{path}: {width} x {height} px are too few for these scales")
     view = replace(view, width=size[0], height=size[1], fx=x * view.fx, fy=y * view.fy, cx=cx - left, cy=cy - top)
     return view, rgba[top : top + size[1], left : left + size[0]]
+
+
+def _is_reduced(width: int, height: int, full_width: int, full_height: int) -> bool:
+    """Whether a picture can be another with so many pixels at another scale, both sides rounded up or down."""
+    lowest = max((width - 1) / full_width, (height - 1) / full_height)
+    return lowest < min((width + 1) / full_width, (height + 1) / full_height)
 
 
 def reduce(

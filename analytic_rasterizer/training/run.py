@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
@@ -15,7 +16,7 @@ import torch
 
 from .. import io
 from ..filters import bake_pixel
-from .captures import Capture, Photograph, is_scene, load_capture, load_points
+from .captures import IMAGES, TEST_PERIOD, Capture, Photograph, is_scene, load_capture, load_points
 from .evaluation import evaluate, psnr
 from .files import (
     CAMERAS,
@@ -59,7 +60,8 @@ class Run:
         out: Folder for the results, made if it is missing.
         options: None: the defaults, or with `resume` those of the checkpoint.
         device: "cpu", "cuda" or "cuda:N".
-        images, test_every: As `load_capture`.
+        images, test_every: As `load_capture`; None: "images" and 8. With `resume` None, or the same as when the
+            training began.
         points: A .ply to start from: a 3DGS scene, or points with colours. None: what the capture has. Of more points
             than `max_gaussians`, so many are drawn at random. With `resume` None, or the same as when the training
             began.
@@ -82,22 +84,25 @@ class Run:
         options: TrainingOptions | None = None,
         *,
         device: str = "cpu",
-        images: str = "images",
-        test_every: int = 8,
+        images: str | None = None,
+        test_every: int | None = None,
         points=None,
         save_every: int = 5000,
         resume: bool = False,
         ranks: Ranks = ALONE,
     ):
+        if save_every < 0:
+            raise ValueError(f"save_every must be at least 0, got {save_every}")
         torch.backends.cudnn.allow_tf32 = False  # the variances of SSIM are small differences
         self.out, self.device, self.save_every, self.ranks = Path(out), torch.device(device), save_every, ranks
         state = read_checkpoint(self.out / CHECKPOINT, mapped=ranks.world > 1) if resume else None
         if state is not None:
             options = TrainingOptions.from_dict(state["options"])
         self.options = options or TrainingOptions()
-        self.source = {"scene": str(scene), "images": images, "test_every": test_every}
+        # Where the scene is, from wherever `evaluate` is called.
+        self.source = {"scene": os.path.abspath(scene), **pictures_of_source(images, test_every, state)}
         self.source["points"] = points_of_source(points, state)
-        self.capture = load_capture(scene, images, test_every)
+        self.capture = load_capture(scene, self.source["images"], self.source["test_every"])
         if state is None:  # raises before the pictures are read
             start, self.points_found = first_gaussians(self.options, self.capture, points)
         else:
@@ -296,6 +301,20 @@ class Run:
             if self.ranks.is_first:
                 bar.write(f"warning: {error}; training goes on", file=sys.stderr)
         self.clock.start()
+
+
+def pictures_of_source(images: str | None, test_every: int | None, state: dict[str, Any] | None) -> dict[str, Any]:
+    """`images` and `test_every` of a training: those that are given or usual, or of its checkpoint, if it is resumed.
+
+    Raises ValueError for others than it began with: it would go on with other pictures.
+    """
+    usual = {"images": IMAGES, "test_every": TEST_PERIOD} if state is None else state["source"]
+    chosen = {}
+    for name, given in (("images", images), ("test_every", test_every)):
+        chosen[name] = usual[name] if given is None else given
+        if state is not None and chosen[name] != usual[name]:
+            raise ValueError(f"{name} must be {usual[name]} or None where a training is resumed, got {given}")
+    return chosen
 
 
 def points_of_source(points, state: dict[str, Any] | None) -> str | None:

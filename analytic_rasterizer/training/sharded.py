@@ -156,6 +156,7 @@ class ShardedTrainer(Trainer):
         self.density.gaussians = new
         self.density.forget()
 
+    @torch.enable_grad()
     def warm_up(self) -> None:
         """Renders and differentiates the pictures of the first step without taking it."""
         state = self.generator.get_state()

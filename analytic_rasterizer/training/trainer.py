@@ -88,7 +88,7 @@ class Trainer:
         self.progress = Progress(options.iterations if options.seconds == 0 else None, options.seconds)
         self.order = PictureOrder(len(pictures.views), options)
         self.filter_3d: Tensor | None = None
-        self.one = torch.ones((), device=self.device)  # the gradient of the loss with respect to itself
+        self.one = torch.ones((), dtype=torch.float32, device=self.device)  # dL/dL
         self.losses: list[Tensor] = []
         self.last: tuple[Tensor, Tensor] | None = None
         self._resolved: tuple[int, dict] | None = None  # degree of the harmonics, and the settings of it
@@ -147,13 +147,14 @@ class Trainer:
             view, scale = self.order(n)
             chosen, background = settings[scale][view], None
             if self.random_background:
-                background = torch.rand(3, generator=self.generator, device=self.device)
+                background = torch.rand(3, generator=self.generator, dtype=torch.float32, device=self.device)
                 chosen = chosen._replace(bg=background)
             if effects is not None:
                 chosen = chosen._replace(effects=effects)
             shown.append(Shown(scale, view, chosen, background))
         return shown
 
+    @torch.enable_grad()  # whatever the caller has switched off
     def _differentiate(self) -> tuple[Tensor, Tensor | None]:
         """The loss of the next step, and the rows that the optimizer updates, as `_loss` returns them.
 
@@ -239,6 +240,7 @@ class Trainer:
     def _compute_filter(self) -> None:
         self.filter_3d = compute_3d_filter(self.gaussians.means.detach(), self._settings()[min(self.options.scales)])
 
+    @torch.enable_grad()
     def warm_up(self) -> None:
         """Renders and differentiates one picture of each scale without a step, so that no step loads kernels."""
         for scale, settings in self._settings().items():

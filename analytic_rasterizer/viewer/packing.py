@@ -136,7 +136,7 @@ def pack_scene(
             raise ValueError(f"{name}: {field} must be finite")
 
     scene = scene.to("cpu")
-    geometry = torch.zeros(count, GEOMETRY_WIDTH, device="cpu")
+    geometry = torch.zeros(count, GEOMETRY_WIDTH, dtype=torch.float32, device="cpu")
     geometry[:, 0:3] = scene.means
     geometry[:, 3:4] = scene.opacities
     geometry[:, 4:7] = scene.scales

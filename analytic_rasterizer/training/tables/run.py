@@ -8,6 +8,7 @@ the folder itself are written anew after every scene.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -146,7 +147,8 @@ def _check(jobs: list[Job], table: Table) -> None:
             continue
         described = _read(job.folder / OPTIONS)
         source = described["source"]
-        if (source["scene"], source["images"]) != (str(job.place), table.images(job.row, job.scene)):
+        same_place = os.path.abspath(source["scene"]) == os.path.abspath(job.place)
+        if not same_place or source["images"] != table.images(job.row, job.scene):
             raise ValueError(f"{job.folder} was trained on {source['scene']}; choose another --out")
         stored = TrainingOptions.from_dict(described["options"])
         differing = [f.name for f in fields(stored) if getattr(stored, f.name) != getattr(job.options, f.name)]
