@@ -62,8 +62,11 @@ def camera_settings(
         if isinstance(value, torch.Tensor):  # whose value is not examined: on a device that would have to wait
             if value.numel() != 1:
                 raise ValueError(f"{name} must be one number, got a tensor of shape {tuple(value.shape)}")
-        elif not (value is None and name in ("cx", "cy")) and not one_number(name, value) > 0 and name in ("fx", "fy"):
-            raise ValueError(f"{name} must be positive, got {value}")
+        elif name in ("fx", "fy"):
+            if not one_number(name, value) > 0:
+                raise ValueError(f"{name} must be positive, got {value}")
+        elif value is not None:
+            one_number(name, value)
     view = world_to_camera.double()
     fx, fy, cx, cy = (
         torch.as_tensor(v, dtype=torch.float64, device=view.device).reshape(())
