@@ -188,14 +188,14 @@ def _(a):
 
 @_register("inspect")
 def _(a):
-    splats, ids = a.saved[:2]
+    (splats, ids), count = a.saved[:2], a.depths.shape[0]
     image = [ids.new_empty(a.image_height, a.image_width) for _ in range(2)]
     return [
         *image,
-        ids.new_empty(a.count),
-        splats.new_empty(a.count, dtype=torch.float32),
-        ids.new_empty(a.count, dtype=torch.int64),
-        *(ids.new_empty(a.count) for _ in range(2)),
+        ids.new_empty(count),
+        splats.new_empty(count, dtype=torch.float32),
+        ids.new_empty(count, dtype=torch.int64),
+        *(ids.new_empty(count) for _ in range(2)),
     ]
 
 

@@ -75,7 +75,7 @@ def summaries(
         footprint, option: Key and number of the footprint that it was rendered with.
     """
     median, dominant, pixels, largest, total, in_front, dominated = torch.ops.analytic_rasterizer.inspect(
-        saved, z.shape[0], *size, footprint, option
+        saved, z, *size, footprint, option
     )
     outputs = {}
     if effects.median_depth:

@@ -144,11 +144,16 @@ class Pictures(torch.nn.Module):
         self.rasterizer = ar.GaussianRasterizer(settings)
 
     def forward(self, means3D, opacities, shs, scales, rotations):
-        color, radii, *_ = self.rasterizer(means3D, None, opacities, shs, None, scales, rotations)
-        return color, radii
+        color, radii, *outputs = self.rasterizer(means3D, None, opacities, shs, None, scales, rotations)
+        stats = outputs[0].gaussian_stats if outputs else None
+        return color, radii, *(stats or ())
 
 
-@pytest.mark.parametrize("effects", [None, ar.Effects(alpha=True, depth=True)], ids=["plain", "images"])
+@pytest.mark.parametrize(
+    "effects",
+    [None, ar.Effects(alpha=True, depth=True), ar.Effects(median_depth=True, gaussian_stats=True)],
+    ids=["plain", "images", "summaries"],
+)
 def test_torch_export_for_any_number_of_gaussians(device, effects):
     names = "means3D", "opacities", "shs", "scales", "rotations"
     module = Pictures(CAMERA.settings(torch.float32, device, effects=effects))

@@ -82,9 +82,9 @@ def test_pixels_of_a_gaussian_that_cannot_be_counted(device):
     names = [argument.name for argument in OPS.rasterize.default._schema.arguments]
     defaults = {"lens": None, "colors_precomp": None, "cov3D_precomp": None, "shs": None}
     *_, saved = OPS.rasterize(**{name: value for name, value in (defaults | given).items() if name in names})
-    OPS.inspect(saved, 3, settings.image_height, settings.image_width, **footprint)
+    OPS.inspect(saved, scene["means3D"][:, 2], settings.image_height, settings.image_width, **footprint)
     with pytest.raises(ValueError, match=rf"fewer than {2**31} pixels, got 65536 x 32768"):
-        OPS.inspect(saved, 3, 2**16, 2**15, **footprint)
+        OPS.inspect(saved, scene["means3D"][:, 2], 2**16, 2**15, **footprint)
 
 
 def test_too_many_images_for_a_loss(device):

@@ -181,14 +181,15 @@ struct BlendArguments : ImageArguments {
 };
 
 /// Arguments of `inspect`: what every pixel shows of the Gaussians that `lists` of rasterize hold, and how much of each
-/// of the `count` Gaussians is seen.
+/// Gaussian is seen.
 struct InspectArguments : ImageArguments {
   std::vector<Tensor> saved;
-  int64_t count = 0;
+  Tensor depths;  ///< (P,) of all Gaussians. Only P is read, which as a number would be fixed for a compiled program
+  int64_t count() const { return depths.size(0); }
 
   template <class Visit> void each(Visit&& visit) {
     visit("saved", saved);
-    visit("count", count);
+    visit("depths", depths);
     ImageArguments::each(visit);
   }
 };

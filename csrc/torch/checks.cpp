@@ -275,8 +275,8 @@ void check(InspectArguments& a, const ListTensors& lists, const Pass& pass) {
   const bool by_id = !lists.splats.is_cuda() && n > 0;
   TORCH_CHECK_VALUE(!by_id || lists.ids.min().item<int64_t>() >= 0, "ids must not be negative");
   const int64_t needed = by_id ? lists.ids.max().item<int64_t>() + 1 : n;
-  TORCH_CHECK_VALUE(a.count >= needed && a.count < (int64_t(1) << 31),
-                    "count must be the number of Gaussians, at least ", needed, ", got ", a.count);
+  const bool fits = a.depths.dim() == 1 && a.count() >= needed && a.count() < (int64_t(1) << 31);
+  check_shape(fits, a.depths, "depths", "(P,) with P the number of Gaussians, at least ", needed);
 }
 
 void check(WeightArguments& a) {

@@ -170,11 +170,11 @@ Results inspect(InspectArguments a) {
   SummaryTensors summary;
   summary.median = at::empty({a.image_height, a.image_width}, ints);
   summary.dominant = at::empty_like(summary.median);
-  summary.touched = at::zeros({a.count}, ints);
-  summary.largest = at::zeros({a.count}, options.dtype(at::kFloat));
-  summary.total = at::zeros({a.count}, options.dtype(at::kLong));
-  summary.in_front = at::zeros({a.count}, ints);
-  summary.dominated = at::zeros({a.count}, ints);
+  summary.touched = at::zeros({a.count()}, ints);
+  summary.largest = at::zeros({a.count()}, options.dtype(at::kFloat));
+  summary.total = at::zeros({a.count()}, options.dtype(at::kLong));
+  summary.in_front = at::zeros({a.count()}, ints);
+  summary.dominated = at::zeros({a.count()}, ints);
   make_backend(lists.splats)->inspect(lists, pass, summary);
   return {std::vector<Tensor>{summary.median, summary.dominant, summary.touched, summary.largest, summary.total,
                               summary.in_front, summary.dominated}};
