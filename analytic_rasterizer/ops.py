@@ -71,15 +71,19 @@ def _channels(a) -> int:
     return features + (a.shs.shape[-1] if a.colors_precomp is None else a.colors_precomp.shape[1])
 
 
+def _splat_count(a):
+    """Splats of rasterize: on CUDA the Gaussians, on the CPU those that the view shows."""
+    return a.means3D.shape[0] if a.means3D.device.type == "cuda" else torch.library.get_ctx().new_dynamic_size()
+
+
 @_register("rasterize")
 def _(a):
     like, size, channels = a.means3D, (a.image_height, a.image_width), _channels(a)
     saved = []
     if a.keep:
-        rows = like.shape[0] if like.device.type == "cuda" else torch.library.get_ctx().new_dynamic_size()
         extra = a.depth + a.inverse_depth
         made = like.new_empty(like.shape[0], channels + extra) if extra or a.features is not None else like.new_empty(0)
-        saved = [*_lists(like, rows, a, True), *_state(like, a), made]
+        saved = [*_lists(like, _splat_count(a), a, True), *_state(like, a), made]
     images = [like.new_empty(size) for name in _C.IMAGES if getattr(a, name)]
     return like.new_empty(channels, *size), images, like.new_empty(like.shape[0], dtype=torch.int32), saved
 
@@ -88,10 +92,7 @@ def _(a):
 def _(a):
     *rasterized, saved = torch.ops.analytic_rasterizer.rasterize(**vars(a))
     if not a.keep:
-        on_cuda = a.means3D.device.type == "cuda"
-        saved = _lists(
-            a.means3D, a.means3D.shape[0] if on_cuda else torch.library.get_ctx().new_dynamic_size(), a, False
-        )
+        saved = _lists(a.means3D, _splat_count(a), a, False)
     return *rasterized, saved, torch.empty(3, dtype=torch.float64, device="cpu")
 
 

@@ -21,7 +21,8 @@ from . import (
     _C,
     ops,  # noqa: F401  (registers the fake kernels)
 )
-from .arguments import camera_arguments, check_tensors, gaussian_arguments
+from .arguments import camera_arguments, gaussian_arguments
+from .checks import check_tensors
 from .effects import Effects
 from .outputs import before_background, depths, split_background
 from .settings import GaussianRasterizationSettings, check_settings

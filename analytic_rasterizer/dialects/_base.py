@@ -10,7 +10,7 @@ from typing import Any
 import torch
 
 from .. import _C
-from ..arguments import check_tensors
+from ..checks import check_tensors
 from ..effects import Effects, Outputs
 from ..footprints import Footprint, chosen_footprint, resolve_footprint
 from ..rasterizer import NOTHING, render
@@ -330,6 +330,14 @@ def render_by(raster_settings: Any, *arguments: torch.Tensor | None, **further: 
     if further:
         raise TypeError(f"settings must be of a dialect that takes {', '.join(further)}, got those of the library")
     return render(settings, NOTHING, *arguments)
+
+
+def feature_rows(name: str, features: torch.Tensor) -> torch.Tensor:
+    """(P, K) of an argument (P, 1, K) or (P, K). Raises TypeError or ValueError, naming it, for anything else."""
+    check_tensors(None, **{name: features})
+    if features.dim() not in (2, 3):
+        raise ValueError(f"{name} must have shape (P, 1, K) or (P, K), got {tuple(features.shape)}")
+    return features.flatten(1)
 
 
 def with_channels(

@@ -13,7 +13,8 @@ import math
 import torch
 
 from .. import _C
-from ..arguments import camera_arguments, check_tensors, gaussian_arguments
+from ..arguments import camera_arguments, gaussian_arguments
+from ..checks import check_tensors
 from ..losses import ssim
 from ..rasterizer import GaussianRasterizer
 from ..settings import GaussianRasterizationSettings

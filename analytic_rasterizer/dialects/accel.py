@@ -6,7 +6,7 @@ whether the module has a SparseGaussianAdam, and call with `dc` if it has: it is
 
 import torch
 
-from ..arguments import check_tensors
+from ..checks import check_tensors
 from ..optim import SparseGaussianAdam
 from ._base import GaussianRasterizer as Rasterizer
 from ._base import forward_like, given, render_by

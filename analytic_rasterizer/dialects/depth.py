@@ -5,7 +5,7 @@ blended like a colour on zero. Its settings are those of 3DGS 2023: the dialect 
 `means2D_densify` is given.
 """
 
-from ..arguments import check_tensors
+from ..checks import check_tensors
 from ..effects import Effects
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer

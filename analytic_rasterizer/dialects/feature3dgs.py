@@ -3,11 +3,10 @@
 Repositories: ShijieZhou-UCLA/feature-3dgs. `semantic_feature` (P, 1, K) holds a feature of each Gaussian.
 """
 
-from ..arguments import check_tensors
 from ..effects import Effects
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
-from ._base import forward_like, render_by, with_channels
+from ._base import feature_rows, forward_like, render_by, with_channels
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
 
@@ -36,12 +35,9 @@ class GaussianRasterizationSettings(Settings):
         """As 3DGS 2023; `semantic_feature` (P, 1, K), or (P, K), is blended on zero with the colours' weights."""
         if semantic_feature is None:
             raise ValueError("semantic_feature must be given in dialect feature3dgs, got None")
-        check_tensors(None, semantic_feature=semantic_feature)
-        if semantic_feature.dim() not in (2, 3):
-            shape = tuple(semantic_feature.shape)
-            raise ValueError(f"semantic_feature must have shape (P, 1, K) or (P, K), got {shape}")
+        rows = feature_rows("semantic_feature", semantic_feature)
         arguments = means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp
-        features, (color, radii, *further) = with_channels(self, semantic_feature.flatten(1), *arguments)
+        features, (color, radii, *further) = with_channels(self, rows, *arguments)
         return color, features, radii, *further
 
     def returned(self, color, radii, outputs):

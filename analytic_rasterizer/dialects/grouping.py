@@ -3,10 +3,9 @@
 Repositories: lkeab/gaussian-grouping. `sh_objs` (P, 1, 16) holds the identity of each Gaussian, as features.
 """
 
-from ..arguments import check_tensors
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
-from ._base import forward_like, given, render_by, with_channels
+from ._base import feature_rows, forward_like, given, render_by, with_channels
 
 __all__ = ["GaussianRasterizationSettings", "GaussianRasterizer", "rasterize_gaussians"]
 
@@ -39,10 +38,7 @@ class GaussianRasterizationSettings(Settings):
         """
         arguments = means3D, means2D, opacities, shs, colors_precomp, scales, rotations, cov3D_precomp
         if given(sh_objs):
-            check_tensors(None, sh_objs=sh_objs)
-            if sh_objs.dim() not in (2, 3):
-                raise ValueError(f"sh_objs must have shape (P, 1, K) or (P, K), got {tuple(sh_objs.shape)}")
-            objects, (color, radii, *further) = with_channels(self, sh_objs.flatten(1), *arguments)
+            objects, (color, radii, *further) = with_channels(self, feature_rows("sh_objs", sh_objs), *arguments)
         else:
             color, radii, *further = super().render(*arguments)
             objects = color.new_zeros(CHANNELS, *color.shape[1:])

@@ -10,7 +10,7 @@ import weakref
 
 import torch
 
-from ..arguments import check_tensors
+from ..checks import check_tensors
 from ..footprints import Footprint
 from ._base import FIELDS, GaussianRasterizer, _resolved, rasterize_gaussians
 from ._base import GaussianRasterizationSettings as Settings

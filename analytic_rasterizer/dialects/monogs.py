@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import torch
 
-from ..arguments import check_tensors
+from ..checks import check_tensors
 from ..effects import Effects
 from ..rotations import product
 from ._base import FIELDS, forward_like, render_by

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import torch
 import torch.distributed as dist
 
-from ..arguments import check_tensors
+from ..checks import check_tensors
 from ..effects import AUTO
 from ..settings import GaussianRasterizationSettings
 from ..stages import Splats, bin, blend, project

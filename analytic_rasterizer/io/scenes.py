@@ -133,17 +133,17 @@ def save_scene(path, scene: Scene, comments: Sequence[str] = ()) -> None:
 def _check_fields(path: Path, scene: Scene) -> None:
     """What gsply would write without a word, into a file that cannot be read or holds other numbers."""
     count = len(scene.means)
-    width = {
+    shapes = {
         "means": (3,),
         "scales": (3,),
         "rotations": (4,),
         "opacities": (1,),
         "shs": ((scene.sh_degree + 1) ** 2, 3),
     }
-    for name, expected in width.items():
+    for name, row in shapes.items():
         field = getattr(scene, name)
-        if field.shape != (count, *expected):
-            raise SceneError(f"{path}: {name} must have shape {(count, *expected)}, got {tuple(field.shape)}")
+        if field.shape != (count, *row):
+            raise SceneError(f"{path}: {name} must have shape {(count, *row)}, got {tuple(field.shape)}")
         good = field.flatten(1).isfinite().all(1)
         if name == "scales":
             good &= (field >= 0).all(1)

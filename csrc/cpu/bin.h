@@ -4,10 +4,8 @@
 #include <algorithm>
 
 #include "core/bin.h"
-#include "cpu/isa.h"
-#include "cpu/parallel.h"
+#include "cpu/chunks.h"
 #include "cpu/sort.h"
-#include "cpu/stages.h"
 
 namespace ar::AR_ISA {
 
@@ -29,14 +27,11 @@ template <typename T> AR_HD void prefetch_pairs_of(const cpu::BinParams<T>& p, i
   if (p.positions && k + kAhead < end) __builtin_prefetch(p.positions + p.splat_offsets[p.order[k + kAhead]], 1);
 }
 
-/// Splats whose tiles are found as one item of work.
-inline constexpr int64_t kFindSplats = 4096;
-
 /// Finds the tiles of all splats, in their order in memory, and counts those of each.
 template <class F, typename T> void find_tiles_of(cpu::BinParams<T>& p) {
   const auto* splats = reinterpret_cast<const Splat<F, T>*>(p.splats);
-  cpu::parallel_for((p.n + kFindSplats - 1) / kFindSplats, p.threads, [&](int64_t item) {
-    for (int64_t j = item * kFindSplats, end = min(j + kFindSplats, p.n); j < end; ++j) {
+  for_each_chunk(p.n, p.threads, [&](int64_t, int64_t begin, int64_t end) {
+    for (int64_t j = begin; j < end; ++j) {
       TileBox box = {0, 0, 0, 0};
       if (splats[j].level > T(0)) box = find_tiles(support_of(splats[j]), p.grid);
       p.tiles[j] = {box.mask, box.count > 0 ? box.row : -1, box.column};

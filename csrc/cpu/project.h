@@ -4,18 +4,10 @@
 #include <algorithm>
 
 #include "core/project.h"
-#include "cpu/isa.h"
-#include "cpu/parallel.h"
+#include "cpu/chunks.h"
 #include "cpu/prefetch.h"
-#include "cpu/stages.h"
 
 namespace ar::AR_ISA {
-
-/// body(chunk, begin, end) for all chunks of [0, n).
-template <class Body> void for_each_chunk(int64_t n, int threads, const Body& body) {
-  cpu::parallel_for(cpu::chunks_of(n), threads,
-                    [&](int64_t chunk) { body(chunk, chunk * cpu::kChunk, std::min(n, (chunk + 1) * cpu::kChunk)); });
-}
 
 template <typename T> AR_HD bool all_finite(const T* row, int count) {
   for (int c = 0; c < count; ++c) {

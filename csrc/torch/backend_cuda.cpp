@@ -366,11 +366,7 @@ class CudaBackend final : public Backend {
     state.checkpoints = at::empty({max_planes * pass.grid.side() * pass.grid.side()}, floats_);
     state.chunks = at::empty({kPlanRows + chunks + tiles, kChunkWidth}, ints_);
     const auto [memory, parts] = make_memory<PlanMemory>(bytes_, tiles, chunks);
-    p.plan.tail = parts.tail;
-    p.plan.tile_order = parts.tile_order;
-    p.plan.tile_planes = parts.tile_planes;
-    p.tile_open = parts.tile_open;
-    p.open_tiles = parts.open_tiles;
+    parts.set(p);
     p.plan.state = structs_of<cuda::PlanState>(state.chunks);
     p.plan.chunk_order = structs_of<cuda::TileChunk>(state.chunks) + kPlanRows;
     p.checkpoints = pointer<float>(state.checkpoints);

@@ -101,6 +101,13 @@ struct PlanMemory {
     open_tiles = parts.take<int32_t>(cuda::kSampleClasses * tiles);
     bytes = parts.bytes();
   }
+  void set(cuda::BlendParams& p) const {
+    p.plan.tail = tail;
+    p.plan.tile_order = tile_order;
+    p.plan.tile_planes = tile_planes;
+    p.tile_open = tile_open;
+    p.open_tiles = open_tiles;
+  }
 };
 
 inline constexpr int64_t kCountsWidth = sizeof(cuda::Counts) / sizeof(int64_t);
