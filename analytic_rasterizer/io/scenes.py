@@ -177,18 +177,11 @@ def _check_ply_header(path: Path) -> None:
     lines = ply_header(path)
     if any(line.startswith("element chunk") for line in lines):
         return  # compressed: gsply checks the layout
-    layout = next((line.split()[1:2] for line in lines if line.startswith("format")), [])
-    if layout != ["binary_little_endian"]:
-        raise SceneError(f"expected format binary_little_endian, got {' '.join(layout) or 'none'}")
-    elements = [i for i, line in enumerate(lines) if line.startswith("element")]
-    if not elements or not lines[elements[0]].startswith("element vertex "):
-        raise SceneError("expected the vertices as the first element of the .ply")
-    end = elements[1] if len(elements) > 1 else len(lines)
-    kinds = {}
-    for line in lines[elements[0] + 1 : end]:
-        if line.startswith("property "):
-            words = line.split()
-            kinds[words[-1]] = words[1]
+    layout = ply_layout(lines)
+    if layout != "binary_little_endian":
+        raise SceneError(f"expected format binary_little_endian, got {layout}")
+    number, properties = ply_vertices(lines)
+    kinds = {words[-1]: words[0] for words in properties}
     missing = [name for name in PLY_COLUMNS if name not in kinds]
     if missing:
         raise SceneError(f"missing vertex properties {', '.join(missing)}; is it a 3DGS scene?")
@@ -198,10 +191,25 @@ def _check_ply_header(path: Path) -> None:
     rest = sum(name.startswith("f_rest_") for name in kinds)
     if rest not in (0, 9, 24, 45):
         raise SceneError(f"expected 0, 9, 24 or 45 f_rest properties (SH degree 0 to 3), got {rest}")
-    words, size = lines[elements[0]].split(), path.stat().st_size
-    count = int(words[2]) if len(words) == 3 and words[2].isdecimal() else -1
-    if count < 0 or 4 * count * len(kinds) > size:
-        raise SceneError(f"expected a number of vertices that fits {size} bytes, got {' '.join(words[2:])}")
+    size = path.stat().st_size
+    if not number.isdecimal() or 4 * int(number) * len(kinds) > size:
+        raise SceneError(f"expected a number of vertices that fits {size} bytes, got {number}")
+
+
+def ply_layout(header: list[str]) -> str:
+    """The format of a .ply: binary_little_endian, ascii or another; "none" where the header names none."""
+    return next((line.split()[1] for line in header if line.startswith("format ")), "none")
+
+
+def ply_vertices(header: list[str]) -> tuple[str, list[list[str]]]:
+    """What a .ply's header says of its vertices: how many there are, as it is written, and the type and the name of
+    each property. Raises SceneError where they are not its first element."""
+    elements = [i for i, line in enumerate(header) if line.startswith("element")]
+    if not elements or not header[elements[0]].startswith("element vertex "):
+        raise SceneError("expected the vertices as the first element of the .ply")
+    end = elements[1] if len(elements) > 1 else len(header)
+    properties = [line.split()[1:] for line in header[elements[0] + 1 : end] if line.startswith("property ")]
+    return " ".join(header[elements[0]].split()[2:]), properties
 
 
 def ply_header(path: Path) -> list[str]:

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from .. import io
+from ..io.scenes import ply_layout, ply_vertices
 from . import colmap
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -211,16 +212,15 @@ def load_points(path: Path) -> tuple[Tensor, Tensor]:
     """
     path = Path(path)
     lines = header_of(path)
-    layout = next((line.split()[1] for line in lines if line.startswith("format ")), "none")
-    elements = [i for i, line in enumerate(lines) if line.startswith("element")]
-    if not elements or not lines[elements[0]].startswith("element vertex "):
-        raise io.SceneError(f"{path}: expected the vertices as the first element of the .ply")
-    count = lines[elements[0]].split()[2]
+    layout = ply_layout(lines)
+    try:
+        number, properties = ply_vertices(lines)
+    except io.SceneError as error:
+        raise io.SceneError(f"{path}: {error}") from None
+    count = number.split()[0]
     if not count.isdecimal():
         raise io.SceneError(f"{path}: expected a number of vertices, got {count}")
     count = int(count)
-    end = elements[1] if len(elements) > 1 else len(lines)
-    properties = [line.split()[1:] for line in lines[elements[0] + 1 : end] if line.startswith("property ")]
     known = all(len(words) == 2 and words[0] in PLY_TYPES for words in properties)
     names = [words[-1] for words in properties]
     if not known or not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
