@@ -47,12 +47,12 @@ struct Op {
 bool is_given(const IValue& value) { return value.isTensor() && value.toTensor().defined(); }
 
 struct Node : torch::autograd::Function<Node> {
-  /// Runs the op on `stack` and returns all tensors of its outputs in a row; `sizes` says how many each of them has.
-  /// `tensors` are the arguments that are tensors, but for those that are missing.
-  static variable_list forward(AutogradContext* ctx, at::TensorList tensors, const Op* op, Stack* stack,
-                               std::vector<int64_t>* sizes) {
-    const at::AutoDispatchBelowADInplaceOrView guard;
-    Stack others = *stack;  // the arguments that are no tensors; tensors are kept as autograd wants them
+  /// Makes the node of an op that has run with `arguments` and left `results`. Returns all tensors of the results in a
+  /// row; `sizes` says how many each of them has. `tensors` are the arguments that are tensors, but for those that are
+  /// missing.
+  static variable_list forward(AutogradContext* ctx, at::TensorList tensors, const Op* op, const Stack* arguments,
+                               const Stack* results, std::vector<int64_t>* sizes) {
+    Stack others = *arguments;  // those that are no tensors; tensors are kept as autograd wants them
     std::vector<bool> given;
     for (const size_t i : op->tensors) {
       given.push_back(is_given(others[i]));
@@ -64,12 +64,11 @@ struct Node : torch::autograd::Function<Node> {
       listed.insert(listed.end(), list.begin(), list.end());
       others[i] = int64_t(list.size());
     }
-    op->forward.callBoxed(*stack);
-    variable_list out, integers;
+    variable_list out;
     size_t differentiable = 0;
     bool counting = true;
     for (size_t k = 0; k < op->outputs; ++k) {
-      const IValue& value = (*stack)[k];
+      const IValue& value = (*results)[k];
       const bool last = k + 1 == op->outputs && op->saves();
       const std::vector<Tensor> list =
           value.isTensor() ? std::vector<Tensor>{value.toTensor()} : value.toTensorVector();
@@ -102,7 +101,7 @@ struct Node : torch::autograd::Function<Node> {
     for (size_t k = 0; k < given.size(); ++k) {
       if (given[k]) places.push_back(k);
     }
-    variable_list grads(places.size() + 3);  // op, stack and sizes have none
+    variable_list grads(places.size() + 4);  // op, arguments, results and sizes have none
     bool any = false;
     c10::List<OptionalTensor> gradients;
     for (size_t k = 0; k < differentiable; ++k) {
@@ -129,8 +128,10 @@ struct Node : torch::autograd::Function<Node> {
     op->vjp.callBoxed(stack);
     const std::vector<Tensor> out = stack[0].toTensorVector();
     for (size_t k = 0; k < places.size(); ++k) {
+      if (!needs[places[k]]) continue;
+      const Tensor& grad = out[places[k]];
       // An op takes a matrix as (1, 4, 4) too.
-      if (needs[places[k]]) grads[k] = out[places[k]].view_as(saved[k]);
+      grads[k] = grad.dim() == saved[k].dim() ? grad : grad.view_as(saved[k]);
     }
     return grads;
   }
@@ -181,8 +182,14 @@ void differentiate(const c10::OperatorHandle& handle, Stack* stack) {
   for (const size_t i : op->tensors) {
     if (is_given(arguments[i])) tensors.push_back(arguments[i].toTensor());
   }
+  // The op runs before its node is made, so that a device has work meanwhile.
+  Stack results = arguments;
+  {
+    const at::AutoDispatchBelowADInplaceOrView guard;
+    op->forward.callBoxed(results);
+  }
   std::vector<int64_t> sizes;
-  const variable_list out = Node::apply(at::TensorList(tensors), op, &arguments, &sizes);
+  const variable_list out = Node::apply(at::TensorList(tensors), op, &arguments, &results, &sizes);
   auto next = out.begin();
   for (size_t k = 0; k < op->outputs; ++k) {
     const bool is_list = handle.schema().returns()[k].type()->kind() == c10::TypeKind::ListType;
