@@ -82,10 +82,9 @@ template <class P, class Terms, class V, class Cell>
 AR_HD Blended<V> blend_placed_sample(const Terms& terms, Vec2<V> z, V raw, const Cell& cell, V& transmittance,
                                      Vec2<V>& place) {
   using T = ScalarOf<V>;
-  // The reciprocal takes long: it does not wait for the mask.
-  const V capped_odds = odds(min(raw, V(T(kAlphaMax))));
+  const V alpha = min(raw, V(T(kAlphaMax)));
   const Blended<V> blended = blend_sample(raw, transmittance);
-  place = P::move_in(terms, z, select(blended.mask, capped_odds, V(T(0))), place, cell);
+  place = P::move_in(terms, z, alpha, select(blended.mask, alpha, V(T(0))), place, cell);
   return blended;
 }
 
@@ -99,7 +98,7 @@ AR_HD MaskOf<V> replay_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskO
   const MaskOf<V> mask = (raw >= V(T(kAlphaMin))) & before;
   const V alpha = select(mask, min(raw, V(T(kAlphaMax))), V(T(0)));
   transmittance = transmittance - transmittance * alpha;
-  place = P::move_in(terms, z, odds(alpha), place, cell);
+  place = P::move_in(terms, z, alpha, alpha, place, cell);
   return mask;
 }
 

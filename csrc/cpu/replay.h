@@ -218,8 +218,8 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
           store_lanes(top + 2 * stored, lanes, place.y);
           top += 3 * stored;
           composited |= lanes;
-          const V moved_by = odds(min(found, V(T(kAlphaMax))));
-          samples_.places.set(s, pixel, P::move_in(terms, group.z[j], moved_by, place, samples_.bounds(s)));
+          const V alpha = min(found, V(T(kAlphaMax)));
+          samples_.places.set(s, pixel, P::move_in(terms, group.z[j], alpha, alpha, place, samples_.bounds(s)));
         }
         entry.pair = k;
         entry.pixel = pixel;

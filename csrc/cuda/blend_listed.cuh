@@ -170,7 +170,6 @@ __device__ void blend_ahead(const Stage& stage, int k0, int from, int n, Blend& 
   Vec2<float>& place = blend.samples.place[0];
   int next = Layout::ahead();  // of the pixel's list, for this lane
   TileSplat<F, C> splat;
-  Vec2<float> row;
   int k = 0;
   bool live = false;  // there is such a splat, and none behind it was composited
   const auto take = [&] {
@@ -178,7 +177,6 @@ __device__ void blend_ahead(const Stage& stage, int k0, int from, int n, Blend& 
     if (!live) return;
     const int j = stage.lists[pixel][next];
     splat = stage.splats[j];
-    row = blend.corners.row(splat.terms);
     k = k0 + stage.places[from + j];
   };
   take();
@@ -186,7 +184,7 @@ __device__ void blend_ahead(const Stage& stage, int k0, int from, int n, Blend& 
     float raw = 0;
     Vec2<float> z = {0, 0};
     if (live) {
-      z = blend.corners.node(splat.terms, row, 0, place);
+      z = blend.corners.node(splat.terms, 0, place);
       raw = exp2(F::log_alpha(splat.terms, z));
     }
     const bool hit = raw >= float(kAlphaMin);
@@ -264,10 +262,9 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
       uint32_t left = stage.template reached<Layout>(from, count);
       if (!blend.samples.open()) left = 0;
       __syncwarp();
-      // Each step waits for the one before. What need not, the next splat and how it is seen, is made ready meanwhile.
+      // Each step waits for the one before. The next splat, which need not, is read meanwhile.
       int j = __clz(int(left)) % 32;
       TileSplat<F, C> splat = stage.splats[j];
-      Vec2<float> row = blend.corners.row(splat.terms);
       int k = k0 + stage.places[from + j];
       while (left != 0) {
         left ^= 1u << (31 - j);
@@ -275,9 +272,8 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
         const TileSplat<F, C> next = stage.splats[j];
         const int next_place = stage.places[from + j];
         store_up_to(k);
-        blend.add(splat, row, k);
+        blend.add(splat, k);
         splat = next;
-        row = blend.corners.row(splat.terms);
         k = k0 + next_place;
       }
       open = __ballot_sync(kAllLanes, blend.samples.open());

@@ -142,30 +142,26 @@ template <class F, class Layout, bool kTogether = false> struct MovingSamples {
   }
 };
 
-/// Where the cells of a lane are, in edges of cells. How their whitened coordinates are rounded does not depend on the
-/// layout, so that one kernel finds again what another has composited.
+/// Where the cells of a lane are, in edges of cells from the centre of the tile's first pixel. How whitened coordinates
+/// are rounded does not depend on the layout, so that one kernel finds again what another has composited.
 template <class F, class Layout> struct CellCorners {
-  /// Whether all cells of a lane are in the same row of the pixel's, and whether they are all of it.
-  static constexpr bool kInRow = F::kSide % Layout::kCells == 0, kWholeRow = F::kSide == Layout::kCells;
-  float left, top;  ///< the pixel's corner, seen from the centre of the tile's first pixel
+  /// Cells are numbered row by row, so that cells i and i + kColumns are in one column; all may be in one row.
+  static constexpr int kColumns = Layout::kCells < F::kSide ? Layout::kCells : F::kSide;
+  static constexpr int kRows = F::kSide % Layout::kCells == 0 ? 1 : Layout::kCells;
+  float left[kColumns], top[kRows];
 
   /// `p`: the pixel, relative to the tile's first.
-  __device__ explicit CellCorners(Vec2<float> p)
-      : left(F::kSide * (p.x - 0.5f)),
-        top(F::kSide * (p.y - 0.5f) + (kInRow ? float(Layout::first_sample() / F::kSide) : 0.0f)) {}
-
-  /// Whitened coordinates of the corner of the row of cells, if there is one only.
-  template <class Terms> __device__ Vec2<float> row(const Terms& terms) const {
-    return transform(terms.w, Vec2<float>{left, top}, terms.node[0]);
+  __device__ explicit CellCorners(Vec2<float> p) {
+    const Vec2<float> corner = {F::kSide * (p.x - 0.5f), F::kSide * (p.y - 0.5f)};
+#pragma unroll
+    for (int i = 0; i < kColumns; ++i) left[i] = corner.x + float((Layout::first_sample() + i) % F::kSide);
+#pragma unroll
+    for (int i = 0; i < kRows; ++i) top[i] = corner.y + float((Layout::first_sample() + i) / F::kSide);
   }
-  /// Of the node of cell i at `place` in it. `row`: row(terms).
-  template <class Terms>
-  __device__ Vec2<float> node(const Terms& terms, Vec2<float> row, int i, Vec2<float> place) const {
-    const int sample = Layout::first_sample() + i;
-    if (!kInRow) row = transform(terms.w, Vec2<float>{left, top + float(sample / F::kSide)}, terms.node[0]);
-    const float column = float(kWholeRow ? i : sample % F::kSide);
-    if (!kWholeRow || i > 0) row = {madd(column, terms.w.xx, row.x), madd(column, terms.w.yx, row.y)};
-    return F::whitened_node(terms, row, place);
+
+  /// Whitened coordinates of the node of cell i, which is at `place` in it.
+  template <class Terms> __device__ Vec2<float> node(const Terms& terms, int i, Vec2<float> place) const {
+    return F::whitened(terms, Vec2<float>{left[i % kColumns] + place.x, top[i % kRows] + place.y}, 0);
   }
 };
 
@@ -214,12 +210,12 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = false> stru
     sums.add(b.contribution, channels);
     if (kKeep) last[0] = b.mask ? k + 1 : last[0];
   }
-  /// Composites pair k into the samples. `row`: corners.row() for its splat.
-  __device__ void add(TileSplatRef<F, C>& splat, Vec2<float> row, int k) {
+  /// Composites pair k into the samples.
+  __device__ void add(TileSplatRef<F, C>& splat, int k) {
     float contribution = 0;
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
-      const Vec2<float> z = corners.node(splat.terms, row, i, samples.place[i]);
+      const Vec2<float> z = corners.node(splat.terms, i, samples.place[i]);
       const Blended<float> b = blend_placed_sample<F>(splat.terms, z, exp2(F::log_alpha(splat.terms, z)),
                                                       UnitCell<F::kSide>(), samples.transmittance[i], samples.place[i]);
       contribution = i == 0 ? b.contribution : contribution + b.contribution;
@@ -285,8 +281,7 @@ __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThr
                             (places.first + (k + from) / places.spacing - 1) * blend.samples.kCheckpoint);
       for (uint32_t left = stage.reached(from); left != 0;) {
         const int j = from + take_first(left);
-        TileSplatRef<F, C> splat = stage.splats[j];
-        blend.add(splat, blend.corners.row(splat.terms), k + j);
+        blend.add(stage.splats[j], k + j);
       }
     }
   }

@@ -125,13 +125,12 @@ __global__ void __launch_bounds__(Layout::kThreads, 1024 / Layout::kThreads)
       for (uint32_t left = stage.reached(from); left != 0;) {
         const int j = from + take_first(left);
         TileSplatRef<F, C> splat = stage.splats[j];
-        const Vec2<float> row = corners.row(splat.terms);
         Vec2<float> z[kCells];
         float raw[kCells];
         bool mask[kCells], any = false;
 #pragma unroll
         for (int i = 0; i < kCells; ++i) {
-          z[i] = corners.node(splat.terms, row, i, samples.place[i]);
+          z[i] = corners.node(splat.terms, i, samples.place[i]);
           raw[i] = exp2(F::log_alpha(splat.terms, z[i]));
           mask[i] = raw[i] >= float(kAlphaMin) && k + j < last.samples[i];
           any |= mask[i];

@@ -37,11 +37,10 @@ __device__ uint32_t replay_chunk(const Stage& stage, int from, int k, const Cell
   for (uint32_t left = stage.reached(from); left != 0; ++kept) {
     const int bit = take_first(left);
     const auto& terms = stage.splats[from + bit].terms;
-    const Vec2<float> row = corners.row(terms);
     bool any = false;
 #pragma unroll
     for (int i = 0; i < Layout::kCells; ++i) {
-      const Vec2<float> z = corners.node(terms, row, i, samples.place[i]);
+      const Vec2<float> z = corners.node(terms, i, samples.place[i]);
       in_front[kept][i] = samples.place[i];
       any |= replay_placed_sample<F>(terms, z, exp2(F::log_alpha(terms, z)), k + bit < last[i], UnitCell<F::kSide>(),
                                      samples.transmittance[i], samples.place[i]);
@@ -58,9 +57,9 @@ struct MovingSums {
 };
 
 /// Takes a lane's samples, and what they carry, from behind pair j of the batch that begins with pair k0 to its front,
-/// where they are at `places`. `row`: corners.row() for its splat; `g_color`: its colour times the gradient.
+/// where they are at `places`. `g_color`: the colour of its splat times the gradient.
 template <class F, int C, class Layout, class Samples>
-__device__ MovingSums walk_back(TileSplatRef<F, C>& splat, Vec2<float> row, int k0, int j, float g_color,
+__device__ MovingSums walk_back(TileSplatRef<F, C>& splat, int k0, int j, float g_color,
                                 const CellCorners<F, Layout>& corners, const int (&last)[Layout::kCells],
                                 const Vec2<float> (&places)[Layout::kCells], Samples& samples,
                                 Adjoint (&adjoint)[Layout::kCells]) {
@@ -68,7 +67,7 @@ __device__ MovingSums walk_back(TileSplatRef<F, C>& splat, Vec2<float> row, int 
 #pragma unroll
   for (int i = 0; i < Layout::kCells; ++i) {
     const Vec2<float> place = places[i];
-    const Vec2<float> z = corners.node(splat.terms, row, i, place);
+    const Vec2<float> z = corners.node(splat.terms, i, place);
     const float raw = exp2(F::log_alpha(splat.terms, z));
     const bool composited = raw >= float(kAlphaMin) && k0 + j < last[i];
     const MovingBlendGrad<float> of_sample =
@@ -184,10 +183,9 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
           const int kept = __popc(reached >> (31 - bit)) - 1;
           TileSplatRef<F, C> splat = shared.stage.splats[j];
           float* const sums = shared.sums_of(j, first_slot);
-          const Vec2<float> row = corners.row(splat.terms);
           const float g_color = grad.times(splat.channels, params, pixel, [&] { return list.splat(k0 + j); });
           auto [of_pair, contribution] =
-              walk_back<F, C, Layout>(splat, row, k0, j, g_color, corners, last, in_front[kept], samples, adjoint);
+              walk_back<F, C, Layout>(splat, k0, j, g_color, corners, last, in_front[kept], samples, adjoint);
           if (with_means && with_shape)
             put_warp_means<Layout>(params, shared.mean_maps[j], of_pair.shape.offset, sums + Shared::kMeans);
           of_pair.shape = F::collect(splat.terms, of_pair.shape, of_pair.weighted);

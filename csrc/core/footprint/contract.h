@@ -68,15 +68,16 @@
 //                                        composited, and `free` says where it depends on raw; `moved` is that in front
 //                                        of the splat; dL_dmoved is read behind the splat and left in front of it
 //
-// Blending, on both devices, uses the same functions in another form, which computes once what the samples of a pixel
-// share: the whitened coordinates z of the pixel's centre. A sample has a place, node + displacement, seen from there:
+// Blending, on both devices, uses the same functions in another form, from whitened coordinates z. A sample has a
+// place, node + displacement, seen from the pixel's centre:
 //
 //   cell(s) -> Bounds<T>                 where the place of sample s may be [px]
-//   whitened(Terms<T>, Vec2<V> p, 0) -> Vec2<V>                            z of the pixel's centre
-//   whitened_node(Terms<T>, Vec2<V> of_pixel, Vec2<V> place) -> Vec2<V>    z of a sample
+//   whitened(Terms<T>, Vec2<V> p, 0) -> Vec2<V>                            z of a point
+//   whitened_node(Terms<T>, Vec2<V> of_pixel, Vec2<V> place) -> Vec2<V>    z of a sample, from that of the pixel's
+//                                        centre, which the CPU works out once for all samples
 //   log_alpha(Terms<T>, Vec2<V> z) -> V  log2(opacity * I)
 //   move_in, alpha_and_move_in_vjp       move and alpha_and_move_vjp, from z, and a place or a displacement with its
-//                                        Bounds or UnitCell; move_in takes alpha / (1 - alpha)
+//                                        Bounds or UnitCell; move_in also takes alpha as if the splat was composited
 //   move_in_with_slope                   move_in of a place that is changed, and its MoveSlope
 //
 // With a UnitCell all lengths are in edges of cells, and places are seen from their cell's corner.

@@ -59,7 +59,7 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   template <typename T, class V>
   AR_HD static Vec2<V> move(const Terms<T>& t, Vec2<V> p, int s, V alpha, Vec2<V> moved) {
     const V reach = V(T(kMoveReach));
-    return move_in(t, Gaussian::whitened(t, p + place<T, V>(s), 0), odds(alpha), moved,
+    return move_in(t, Gaussian::whitened(t, p + place<T, V>(s), 0), alpha, alpha, moved,
                    Bounds<V>{{-reach, -reach}, {reach, reach}});
   }
 
@@ -85,11 +85,12 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
             madd(V(t.w.yx), place.x, madd(V(t.w.yy), place.y, of_pixel.y))};
   }
 
-  /// move() from the node's whitened coordinates z and r = alpha / (1 - alpha). `at` is the node's place or its
-  /// displacement, in the unit of w^-1; what is returned is the same behind the splat, where `cell` allows it.
+  /// move() from the node's whitened coordinates z. `at` is the node's place or its displacement, in the unit of w^-1;
+  /// what is returned is the same behind the splat, where `cell` allows it. `composited` is alpha where the splat was
+  /// composited, and zero where it was not, of which the division by 1 - alpha does not have to know.
   template <typename T, class V, class Cell>
-  AR_HD static Vec2<V> move_in(const Terms<T>& t, Vec2<V> z, V r, Vec2<V> at, const Cell& cell) {
-    return cell.held(V(T(step<Cell>())) * r, transform_transposed(t.w, z), at);
+  AR_HD static Vec2<V> move_in(const Terms<T>& t, Vec2<V> z, V alpha, V composited, Vec2<V> at, const Cell& cell) {
+    return cell.held(length_of<T, V, Cell>(alpha, composited), transform_transposed(t.w, z), at);
   }
 
   /// alpha_and_move_vjp() likewise (docs/numerics.md, "Adjoint of moving nodes"): z = w d, y = w dL_dat, both times
@@ -120,7 +121,7 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   AR_HD static MoveSlope<V> move_in_with_slope(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> free, const Cell& cell,
                                                Vec2<V>& at) {
     const V zero = V(T(0)), unit = V(T(1 / (kBase2 * kBase2)));
-    const V r = odds(alpha), length = V(T(step<Cell>())) * r;
+    const V length = length_of<T, V, Cell>(alpha, alpha), r = V(T(1 / step<Cell>())) * length;
     const Vec2<V> along = transform_transposed(t.w, z), next = moved(length, along, at);
     at = cell.held(length, along, at);
     // dalpha = -unit alpha along.dat, dr = dalpha / (1 - alpha)^2 = -unit r (1 + r) along.dat
@@ -141,6 +142,12 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   template <class Cell> static constexpr double variance() { return kVariance * Cell::kUnits * Cell::kUnits; }
   /// v / kBase2^2, since (Sigma + v I)^-1 d = w^T z / kBase2^2.
   template <class Cell> static constexpr double step() { return variance<Cell>() / (kBase2 * kBase2); }
+  /// step() alpha / (1 - alpha), or zero where `composited` is zero and not alpha. The factor is in the divisor, where
+  /// it costs nothing.
+  template <typename T, class V, class Cell> AR_HD static V length_of(V alpha, V composited) {
+    const V per_step = V(T(1 / step<Cell>()));
+    return composited * divide(V(T(1)), madd(-per_step, alpha, per_step));
+  }
 
   /// at + v r (Sigma + v I)^-1 d, before it is held.
   template <class V> AR_HD static Vec2<V> moved(V length, Vec2<V> along, Vec2<V> at) {
