@@ -281,7 +281,8 @@ __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThr
                             (places.first + (k + from) / places.spacing - 1) * blend.samples.kCheckpoint);
       for (uint32_t left = stage.reached(from); left != 0;) {
         const int j = from + take_first(left);
-        blend.add(stage.splats[j], k + j);
+        TileSplatRef<F, C> splat = stage.splats[j];
+        blend.add(splat, k + j);
       }
     }
   }
