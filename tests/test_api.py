@@ -801,6 +801,25 @@ def test_saved_ids_that_are_no_gaussians(device):
     assert torch.allclose(2 * function(**named)[0][ids[:2].long()], expected[ids[:2].long()])
 
 
+@pytest.mark.parametrize("full", [False, True], ids=["plain", "full"])
+def test_what_was_saved_for_other_arguments_is_refused(device, full):
+    """For other images, of which the channels would be read where there are none, and for other Gaussians."""
+    function, arguments = calls(("analytic", {}), device, full)["rasterize_vjp"]
+    named = dict(zip((argument.name for argument in function._schema.arguments), arguments))
+    zeros = torch.zeros_like(named["means3D"][:, 0])
+    image = torch.zeros(named["image_height"], named["image_width"], device=device)
+    with pytest.raises(ValueError, match="saved must end with the channels of the forward pass"):
+        function(**named | {"inverse_depth": True, "dL_doutputs": [*named["dL_doutputs"], image]})
+    if full:
+        for wrong in (zeros[:0], named["saved"][-1][:-1], named["saved"][-1].double(), named["saved"][-1].t()):
+            with pytest.raises(ValueError, match="saved must end with the channels of the forward pass"):
+                function(**named | {"saved": [*named["saved"][:-1], wrong]})
+    rows = {name for name in named if torch.is_tensor(named[name]) and len(named[name]) == len(zeros)}
+    fewer = {name: named[name][:3] for name in rows} | {"saved": [*named["saved"][:-1], named["saved"][-1][:3]]}
+    with pytest.raises(ValueError, match="saved must be what the forward pass saved for the same 3 Gaussians"):
+        function(**named | fewer)
+
+
 @pytest.mark.skipif(_C.has_cuda, reason="needs an extension that was built without CUDA")
 def test_cuda_tensors_without_cuda_say_what_to_do():
     with pytest.raises(RuntimeError, match="built without CUDA"):
