@@ -287,7 +287,7 @@ def test_gradients_accumulate_and_the_graph_can_be_kept(device):
 
 
 def test_image_gradients_of_any_layout(device):
-    """An expanded gradient (sum), a strided one (transpose), and a partial one (slice)."""
+    """An expanded gradient (sum), a strided one (transpose), a lazily negated one, and a partial one (slice)."""
     scene = scene32(device)
     leaves = scenes.leaves(scene)
     color, _ = render(leaves)
@@ -296,6 +296,8 @@ def test_image_gradients_of_any_layout(device):
     assert not ones.is_contiguous()
     by_strided = torch.autograd.grad(color, leaves["means3D"], ones, retain_graph=True)[0]
     assert torch.equal(by_sum, by_strided)
+    negated = torch._neg_view(torch.full_like(color, -1.0))
+    assert torch.equal(by_sum, torch.autograd.grad(color, leaves["means3D"], negated, retain_graph=True)[0])
     parts = [
         torch.autograd.grad(color[:, rows].sum(), leaves["means3D"], retain_graph=True)[0]
         for rows in (slice(0, 20), slice(20, 37))

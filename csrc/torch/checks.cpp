@@ -297,7 +297,7 @@ Tensor gradient_of(const std::vector<OptionalTensor>& dL_doutputs, size_t place,
   const Tensor& gradient = *dL_doutputs[place];
   Like{like, "the arguments"}.check_type(gradient, name);
   TORCH_CHECK_VALUE(gradient.sizes() == sizes, name, " must have shape ", text_of(sizes), ", got ", shape_of(gradient));
-  return gradient.contiguous();
+  return gradient.resolve_neg().contiguous();  // the dispatcher resolves no tensor in a list of optional ones
 }
 
 Tensor only_gradient_of(const std::vector<OptionalTensor>& dL_doutputs, const std::string& output, const Tensor& like,
