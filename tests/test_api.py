@@ -803,6 +803,16 @@ def test_saved_ids_that_are_no_gaussians(device):
     assert torch.allclose(2 * function(**named)[0][ids[:2].long()], expected[ids[:2].long()])
 
 
+def test_saved_splits_that_do_not_rise(device):
+    function, arguments = calls(("box", {"samples": 1}), device, False)["project_vjp"]
+    named = dict(zip((argument.name for argument in function._schema.arguments), arguments))
+    *kept, splits = named["saved"]
+    last = splits[-1].item()
+    for wrong in ([0, -(2**63), last], [0, last + 1, last], [1, last, last], [0, last], [[0, last, last]]):
+        with pytest.raises(ValueError, match="saved must be what project saved"):
+            function(**named | {"saved": [*kept, torch.tensor(wrong)]})
+
+
 @pytest.mark.parametrize("full", [False, True], ids=["plain", "full"])
 def test_what_was_saved_for_other_arguments_is_refused(device, full):
     """For other images, of which the channels would be read where there are none, and for other Gaussians."""

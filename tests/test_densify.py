@@ -234,6 +234,7 @@ def test_opcheck_of_observe(device):
         (3, torch.zeros(8, dtype=torch.int32), ValueError, "radii must have shape"),
         (4, 3, ValueError, "first_column must be 0 to 2, got 3"),
         (4, -1, ValueError, "first_column must be 0 to 2, got -1"),
+        (4, 2**63 - 1, ValueError, "first_column must be 0 to 2, got 9223372036854775807"),
     ],
 )
 def test_errors_of_observe(place, wrong, error, message):

@@ -90,7 +90,7 @@ void check(ObserveArguments& a) {
   a.radii = a.radii.contiguous();
   const int64_t columns = a.gradients.dim() == 2 && a.gradients.size(1) == 4 ? 4 : 3;
   like.check_rows_of(a.gradients, "gradients", {columns}, "(P, 3) or (P, 4)");
-  TORCH_CHECK_VALUE(a.first_column >= 0 && a.first_column + 2 <= columns, "first_column must be 0 to ", columns - 2,
+  TORCH_CHECK_VALUE(a.first_column >= 0 && a.first_column <= columns - 2, "first_column must be 0 to ", columns - 2,
                     ", got ", a.first_column);
 }
 
