@@ -698,7 +698,7 @@ def test_opcheck(op, calls, device):
         ("pack_rows_", {"radii": torch.zeros(1, dtype=torch.int32)}, "radii must be contiguous int32 of shape"),
         ("pack_rows_", {"shs": None}, "shs or colors_precomp must be given, got neither"),
         ("pack_rows_", {"rows": torch.zeros(())}, "rows must be a contiguous matrix of 12 columns"),
-        ("pack_rows_", {"firsts": torch.zeros(1, 2).long()}, r"firsts must be .* of shape \(2,\).*, got shape \(1, 2\)"),
+        ("pack_rows_", {"firsts": torch.zeros(1, 2).long()}, r"firsts must be .* of shape \(2,\)"),
         ("pack_rows_vjp", {"dL_drows": torch.zeros(4, 10)}, "dL_drows must be a contiguous matrix of 9 columns"),
         ("pack_rows_vjp", {"ids": torch.zeros(4, dtype=torch.int32)}, "ids must be contiguous int32 of shape"),
         ("blend_rows", {"rows": torch.zeros(4, 12).double()}, "rows must be a contiguous matrix of 12 columns"),
