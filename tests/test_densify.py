@@ -246,6 +246,16 @@ def test_errors_of_observe(place, wrong, error, message):
     assert torch.equal(arguments[0], before[0]) and torch.equal(arguments[1], before[1])
 
 
+@pytest.mark.parametrize("written, read", [(0, 2), (1, 3), (0, 3), (0, 1)])
+def test_what_observe_writes_to_is_apart_from_all_else(written, read):
+    arguments = [*observed(7), 2]
+    arguments[written] = arguments[read].view(-1)[:7].view(arguments[written].dtype)
+    before = [argument.clone() for argument in arguments[:4]]
+    with pytest.raises(ValueError, match="gradient_sums and views must not share memory"):
+        observe(*arguments)
+    assert all(map(torch.equal, arguments, before))
+
+
 def picture_of(gaussians) -> torch.Tensor:
     """Of means at the origin, with constant colours; exact where splats lie at the same place and depth."""
     view = io.View("", 48, 48, 60.0, 60.0, torch.eye(4, dtype=torch.float64))
