@@ -287,7 +287,7 @@ def test_gradients_accumulate_and_the_graph_can_be_kept(device):
 
 
 def test_image_gradients_of_any_layout(device):
-    """An expanded gradient (sum), a strided one (transpose), and a partial one (slice)."""
+    """An expanded gradient (sum), a strided one (transpose), a lazily negated one, and a partial one (slice)."""
     scene = scene32(device)
     leaves = scenes.leaves(scene)
     color, _ = render(leaves)
@@ -296,6 +296,8 @@ def test_image_gradients_of_any_layout(device):
     assert not ones.is_contiguous()
     by_strided = torch.autograd.grad(color, leaves["means3D"], ones, retain_graph=True)[0]
     assert torch.equal(by_sum, by_strided)
+    negated = torch._neg_view(torch.full_like(color, -1.0))
+    assert torch.equal(by_sum, torch.autograd.grad(color, leaves["means3D"], negated, retain_graph=True)[0])
     parts = [
         torch.autograd.grad(color[:, rows].sum(), leaves["means3D"], retain_graph=True)[0]
         for rows in (slice(0, 20), slice(20, 37))
@@ -799,6 +801,35 @@ def test_saved_ids_that_are_no_gaussians(device):
         return
     # Of the second camera, whose rows are right, the gradients remain.
     assert torch.allclose(2 * function(**named)[0][ids[:2].long()], expected[ids[:2].long()])
+
+
+def test_saved_splits_that_do_not_rise(device):
+    function, arguments = calls(("box", {"samples": 1}), device, False)["project_vjp"]
+    named = dict(zip((argument.name for argument in function._schema.arguments), arguments))
+    *kept, splits = named["saved"]
+    last = splits[-1].item()
+    for wrong in ([0, -(2**63), last], [0, last + 1, last], [1, last, last], [0, last], [[0, last, last]]):
+        with pytest.raises(ValueError, match="saved must be what project saved"):
+            function(**named | {"saved": [*kept, torch.tensor(wrong)]})
+
+
+@pytest.mark.parametrize("full", [False, True], ids=["plain", "full"])
+def test_what_was_saved_for_other_arguments_is_refused(device, full):
+    """For other images, of which the channels would be read where there are none, and for other Gaussians."""
+    function, arguments = calls(("analytic", {}), device, full)["rasterize_vjp"]
+    named = dict(zip((argument.name for argument in function._schema.arguments), arguments))
+    zeros = torch.zeros_like(named["means3D"][:, 0])
+    image = torch.zeros(named["image_height"], named["image_width"], device=device)
+    with pytest.raises(ValueError, match="saved must end with the channels of the forward pass"):
+        function(**named | {"inverse_depth": True, "dL_doutputs": [*named["dL_doutputs"], image]})
+    if full:
+        for wrong in (zeros[:0], named["saved"][-1][:-1], named["saved"][-1].double(), named["saved"][-1].t()):
+            with pytest.raises(ValueError, match="saved must end with the channels of the forward pass"):
+                function(**named | {"saved": [*named["saved"][:-1], wrong]})
+    rows = {name for name in named if torch.is_tensor(named[name]) and len(named[name]) == len(zeros)}
+    fewer = {name: named[name][:3] for name in rows} | {"saved": [*named["saved"][:-1], named["saved"][-1][:3]]}
+    with pytest.raises(ValueError, match="saved must be what the forward pass saved for the same 3 Gaussians"):
+        function(**named | fewer)
 
 
 @pytest.mark.skipif(_C.has_cuda, reason="needs an extension that was built without CUDA")

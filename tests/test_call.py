@@ -59,6 +59,8 @@ CHANGES = {
     "no tensor": ({"shs": [1.0]}, TypeError, "shs must be a tensor, got list"),
     "none": ({"opacities": None}, TypeError, "opacities must be a tensor, got NoneType"),
     "no int": ({"image_height": "16"}, TypeError, "image_height must be an int, got str"),
+    "too large an int": ({"image_height": 2**70}, ValueError, f"image_height must fit in 64 bits, got {2**70}"),
+    "too large a float": ({"tanfovx": 10**400}, ValueError, f"tanfovx must fit in 64 bits, got {10**400}"),
     "no float": ({"tanfovx": None}, TypeError, "tanfovx must be a float, got NoneType"),
     "no string": ({"footprint": 3}, TypeError, "footprint must be a string, got int"),
     "of the op, ValueError": ({"image_height": -1}, ValueError, "image_height must be in"),

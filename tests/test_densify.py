@@ -234,6 +234,7 @@ def test_opcheck_of_observe(device):
         (3, torch.zeros(8, dtype=torch.int32), ValueError, "radii must have shape"),
         (4, 3, ValueError, "first_column must be 0 to 2, got 3"),
         (4, -1, ValueError, "first_column must be 0 to 2, got -1"),
+        (4, 2**63 - 1, ValueError, "first_column must be 0 to 2, got 9223372036854775807"),
     ],
 )
 def test_errors_of_observe(place, wrong, error, message):
@@ -243,6 +244,16 @@ def test_errors_of_observe(place, wrong, error, message):
     with pytest.raises(error, match=message):
         observe(*arguments)
     assert torch.equal(arguments[0], before[0]) and torch.equal(arguments[1], before[1])
+
+
+@pytest.mark.parametrize("written, read", [(0, 2), (1, 3), (0, 3), (0, 1)])
+def test_what_observe_writes_to_is_apart_from_all_else(written, read):
+    arguments = [*observed(7), 2]
+    arguments[written] = arguments[read].view(-1)[:7].view(arguments[written].dtype)
+    before = [argument.clone() for argument in arguments[:4]]
+    with pytest.raises(ValueError, match="gradient_sums and views must not share memory"):
+        observe(*arguments)
+    assert all(map(torch.equal, arguments, before))
 
 
 def picture_of(gaussians) -> torch.Tensor:

@@ -52,6 +52,24 @@ def test_thread_count_changes_no_bit(variant, dtype):
     assert_identical(results[0], results[2])
 
 
+@pytest.mark.parametrize("size", [(600, 400), (3, 50000), (50000, 3)], ids=str)
+def test_thread_count_changes_no_bit_of_the_gradient_of_one_background(size):
+    """A single number, of which torch's threads would each add up a part."""
+    width, height = size
+    camera = Camera(image_width=width, image_height=height)
+    scene = scenes.cast(scenes.random_scene(1, 40), torch.float32) | {"colors_precomp": torch.ones(40, 1)}
+    del scene["shs"]
+    weights = torch.randn(1, height, width, generator=torch.Generator().manual_seed(1))
+    found = set()
+    for threads in (1, 2, 3, 4, 7):
+        torch.set_num_threads(threads)
+        bg = torch.zeros(1, requires_grad=True)
+        color, _ = ar.GaussianRasterizer(camera.settings(torch.float32)._replace(bg=bg))(**scene)
+        color.backward(weights)
+        found.add(bg.grad.item())
+    assert len(found) == 1
+
+
 @each_path
 def test_repeated_runs_are_identical(device, variant):
     torch.set_num_threads(7)

@@ -691,14 +691,16 @@ def test_opcheck(op, calls, device):
     "op, change, message",
     [
         ("pack_rows_", {"rows": torch.zeros(3, 5)}, "rows must be a contiguous matrix of 12 columns"),
-        ("pack_rows_", {"firsts": torch.zeros(2)}, "firsts must hold 2 contiguous int64"),
+        ("pack_rows_", {"firsts": torch.zeros(2)}, r"firsts must be contiguous int64 of shape \(2,\)"),
         ("pack_rows_vjp", {"firsts": [0, 10**6]}, "firsts and counts must be places of 2 cameras among"),
         ("pack_rows_vjp", {"firsts": [0, 2**63 - 1]}, "firsts and counts must be places of 2 cameras among"),
         ("blend_rows", {"rows": torch.zeros(25)[1:].view(2, 12)}, "rows must begin at a multiple of 16 bytes"),
-        ("pack_rows_", {"radii": torch.zeros(1, dtype=torch.int32)}, "radii must hold"),
+        ("pack_rows_", {"radii": torch.zeros(1, dtype=torch.int32)}, "radii must be contiguous int32 of shape"),
         ("pack_rows_", {"shs": None}, "shs or colors_precomp must be given, got neither"),
+        ("pack_rows_", {"rows": torch.zeros(())}, "rows must be a contiguous matrix of 12 columns"),
+        ("pack_rows_", {"firsts": torch.zeros(1, 2).long()}, r"firsts must be .* of shape \(2,\)"),
         ("pack_rows_vjp", {"dL_drows": torch.zeros(4, 10)}, "dL_drows must be a contiguous matrix of 9 columns"),
-        ("pack_rows_vjp", {"ids": torch.zeros(4, dtype=torch.int32)}, "ids must hold"),
+        ("pack_rows_vjp", {"ids": torch.zeros(4, dtype=torch.int32)}, "ids must be contiguous int32 of shape"),
         ("blend_rows", {"rows": torch.zeros(4, 12).double()}, "rows must be a contiguous matrix of 12 columns"),
         ("blend_rows", {"background": torch.zeros(4)}, r"background must have shape \(3,\)"),
         ("blend_rows_vjp_", {"saved": []}, "saved must be what blend_rows saved with keep=True, got 0 tensors"),
@@ -709,6 +711,26 @@ def test_opcheck(op, calls, device):
 def test_the_ops_say_what_is_wrong(op, change, message, calls):
     with pytest.raises(ValueError, match=message):
         getattr(torch.ops.analytic_rasterizer, op)(**calls[op] | change)
+
+
+WRITTEN = {"pack_rows_": ("rows", "radii", "ids"), "blend_rows_vjp_": ("dL_drows",)}
+
+
+@pytest.mark.parametrize("op", WRITTEN)
+def test_autograd_notices_what_the_ops_write_to(op, calls):
+    versions = [calls[op][name]._version for name in WRITTEN[op]]
+    getattr(torch.ops.analytic_rasterizer, op)(**calls[op])
+    assert all(calls[op][name]._version > version for name, version in zip(WRITTEN[op], versions))
+
+
+def test_nothing_is_packed_where_one_camera_is_wrong(calls):
+    arguments = calls["pack_rows_"]
+    for name in WRITTEN["pack_rows_"]:
+        arguments[name].zero_()
+    tangents = [*arguments["tanfovx"][:-1], -1.0]
+    with pytest.raises(ValueError, match="tanfovx must be positive and finite, got -1"):
+        torch.ops.analytic_rasterizer.pack_rows_(**arguments | {"tanfovx": tangents})
+    assert not any(arguments[name].any() for name in WRITTEN["pack_rows_"])
 
 
 @pytest.mark.parametrize("change", [{"firsts": torch.tensor([-1000, 0])}, {"ends": None}], ids=["firsts", "ends"])

@@ -14,8 +14,9 @@ void sort_values(const TileSort<Value>& p, TileGrid grid, uint32_t* memory, cuda
   const TileScratch scratch(memory, p.capacity, passes);
   for (int pass = 0; pass < passes; ++pass) {
     // After an overflow the histograms are empty, and with them the sort.
-    launch(sort_pass_kernel<kTileBits, Value, false>, {unsigned(scratch.blocks), TileDigits::kThreads}, stream, scratch,
-           pass, false, 0, 0, p.tiles[pass % 2], p.tiles[1 - pass % 2], p.values[pass % 2], p.values[1 - pass % 2]);
+    launch(sort_pass_kernel<kTileDigitBits, Value, false>, {unsigned(scratch.blocks), TileDigits::kThreads}, stream,
+           scratch, pass, false, 0, 0, p.tiles[pass % 2], p.tiles[1 - pass % 2], p.values[pass % 2],
+           p.values[1 - pass % 2]);
   }
   launch(tile_offsets_kernel, {blocks_of(grid.tiles() + 1, kRangeTiles), kRangeTiles * kRangeLanes}, stream,
          p.tiles[passes % 2], p.counts, p.capacity, grid.tiles(), p.tile_offsets, p.feedback);

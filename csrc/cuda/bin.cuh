@@ -75,12 +75,12 @@ template <class Run> void for_each_depth_pass(const DepthSort& p, const DepthScr
 }
 
 /// Tiles are sorted by as many digits as the number of the last one has.
-inline constexpr int kTileBits = 8, kMostTilePasses = 4;
-using TileDigits = Digits<kTileBits>;
-using TileScratch = SortScratch<kTileBits>;
+inline constexpr int kTileDigitBits = 8, kMostTilePasses = 4;
+using TileDigits = Digits<kTileDigitBits>;
+using TileScratch = SortScratch<kTileDigitBits>;
 inline int tile_passes(TileGrid grid) {
   int passes = 1;
-  while (grid.tiles() > int64_t(1) << (passes * kTileBits)) ++passes;
+  while (grid.tiles() > int64_t(1) << (passes * kTileDigitBits)) ++passes;
   return passes;
 }
 

@@ -279,6 +279,11 @@ template <char kLetter> struct WrittenTensors : std::vector<Tensor> {};
 /// A tensor that an op writes to, likewise.
 template <char kLetter> struct WrittenTensor : Tensor {};
 
+/// So that autograd notices where a backward pass still needs the values of before. Inference tensors have no version.
+inline void note_written(const Tensor& t) {
+  if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();
+}
+
 /// Arguments of `observe_`: a picture's gradients and radii, and the sums that they are added to (core/density.h).
 struct ObserveArguments {
   WrittenTensor<'a'> gradient_sums;  ///< (P,)

@@ -10,6 +10,7 @@
 
 #include <optional>
 #include <string>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
@@ -60,6 +61,8 @@ struct Parameter {
     try {
       return given.cast<Value>();
     } catch (const py::cast_error&) {
+      if (std::is_arithmetic_v<Value> && PyLong_Check(given.ptr()))
+        throw py::value_error(std::string(name) + " must fit in 64 bits, got " + std::string(py::str(given)));
       throw py::type_error(std::string(name) + " must be " + what + ", got " + Py_TYPE(given.ptr())->tp_name);
     }
   }

@@ -70,11 +70,7 @@ void check_projected(Tensor& means2d, Tensor& cov2d, Tensor& opacities, Tensor& 
       row_splits.device().is_cpu() && row_splits.dim() == 1 && row_splits.size(0) >= 1 && row_splits.is_contiguous(),
       "row_splits must be a vector on the CPU, of one number more than there are cameras, got shape ",
       shape_of(row_splits), " on ", row_splits.device());
-  const int64_t* splits = row_splits.const_data_ptr<int64_t>();
-  const int64_t cameras = row_splits.size(0) - 1;
-  bool ok = splits[0] == 0 && splits[cameras] == n;
-  for (int64_t c = 0; c < cameras; ++c) ok = ok && splits[c] <= splits[c + 1];
-  TORCH_CHECK_VALUE(ok, "row_splits must rise from 0 to the number of rows, ", n);
+  TORCH_CHECK_VALUE(rises_to(row_splits, n), "row_splits must rise from 0 to the number of rows, ", n);
 }
 
 /// Raises for a number that no Gaussian should have. Without debug such a Gaussian is culled, or taken as it is.
@@ -113,6 +109,11 @@ FootprintSpec find_footprint(const std::string& key, double option) {
 TileGrid grid_of(const FootprintSpec& footprint, int64_t width, int64_t height, bool cuda) {
   if (cuda && footprint.moves) return moving_grid(footprint.samples, int(width), int(height));
   return {int(width), int(height)};
+}
+
+bool rises_to(const Tensor& row_splits, int64_t rows) {
+  const int64_t *begin = row_splits.const_data_ptr<int64_t>(), *end = begin + row_splits.numel();
+  return *begin == 0 && end[-1] == rows && std::is_sorted(begin, end);
 }
 
 void check_row_count(int64_t rows, const char* name) {
@@ -312,7 +313,7 @@ Tensor gradient_of(const std::vector<OptionalTensor>& dL_doutputs, size_t place,
   const Tensor& gradient = *dL_doutputs[place];
   Like{like, "the arguments"}.check_type(gradient, name);
   TORCH_CHECK_VALUE(gradient.sizes() == sizes, name, " must have shape ", text_of(sizes), ", got ", shape_of(gradient));
-  return gradient.contiguous();
+  return gradient.resolve_neg().contiguous();  // the dispatcher resolves no tensor in a list of optional ones
 }
 
 Tensor only_gradient_of(const std::vector<OptionalTensor>& dL_doutputs, const std::string& output, const Tensor& like,

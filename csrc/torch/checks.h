@@ -46,6 +46,9 @@ void check_needs(const std::vector<bool>& needs, size_t count);
 void check_saved(const ListTensors& lists, const BlendState& state, const Tensor& like, const Pass& pass);
 void check_lists(const ListTensors& lists, const Tensor& like, const Pass& pass);
 
+/// Whether `row_splits`, a contiguous vector of int64 on the CPU that is not empty, rise from 0 to `rows`.
+bool rises_to(const Tensor& row_splits, int64_t rows);
+
 /// Rows that int32 can number: those of the splats of all cameras.
 void check_row_count(int64_t rows, const char* name);
 /// Sizes that tensors and tiles can be indexed with.

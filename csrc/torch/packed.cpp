@@ -27,10 +27,12 @@ void check_packed_rows(const Tensor& rows, const Tensor& like) {
   TORCH_CHECK_VALUE(reinterpret_cast<uintptr_t>(rows.const_data_ptr()) % 16 == 0,
                     "rows must begin at a multiple of 16 bytes");
 }
-void check_ints(const Tensor& t, const char* name, int64_t count, const Tensor& like) {
-  TORCH_CHECK_VALUE(
-      t.numel() == count && t.is_contiguous() && t.device() == like.device() && t.scalar_type() == at::kInt, name,
-      " must hold ", count, " contiguous int32 on the device of the others");
+void check_ints(const Tensor& t, const char* name, at::ScalarType dtype, const std::vector<int64_t>& sizes,
+                const Tensor& like) {
+  TORCH_CHECK_VALUE(t.sizes() == at::IntArrayRef(sizes) && t.is_contiguous() && t.device() == like.device() &&
+                        t.scalar_type() == dtype,
+                    name, " must be contiguous ", dtype == at::kInt ? "int32" : "int64", " of shape ", text_of(sizes),
+                    " on the device of the others, got shape ", shape_of(t));
 }
 void check_places(const PackedPlaces& places, int64_t cameras, int64_t rows) {
   bool ok = int64_t(places.firsts.size()) == cameras && int64_t(places.counts.size()) == cameras;
@@ -100,29 +102,30 @@ Results count_rows(ProjectArguments a) {
 
 Results pack_rows(PackArguments a) {
   const Pass pass(a, a.means3D);
-  const int64_t cameras = check_cameras(a), rows = a.rows.size(0);
+  const int64_t cameras = check_cameras(a);
   TORCH_CHECK_VALUE(a.shs || a.colors_precomp, "shs or colors_precomp must be given, got neither");
   check_packed_rows(a.rows, a.means3D);
-  check_ints(a.radii, "radii", rows, a.means3D);
-  check_ints(a.ids, "ids", rows, a.means3D);
-  check_ints(a.ends, "ends", cameras * a.count(), a.means3D);
-  TORCH_CHECK_VALUE(a.ends.dim() == 2 && a.ends.size(0) == cameras, "ends must have a row for each of ", cameras,
-                    " cameras, got shape ", a.ends.sizes());
-  TORCH_CHECK_VALUE(a.firsts.numel() == cameras && a.firsts.is_contiguous() && a.firsts.scalar_type() == at::kLong &&
-                        a.firsts.device() == a.means3D.device(),
-                    "firsts must hold ", cameras, " contiguous int64 on the device of the others");
+  const int64_t rows = a.rows.size(0);
+  check_ints(a.radii, "radii", at::kInt, {rows}, a.means3D);
+  check_ints(a.ids, "ids", at::kInt, {rows}, a.means3D);
+  check_ints(a.ends, "ends", at::kInt, {cameras, a.count()}, a.means3D);
+  check_ints(a.firsts, "firsts", at::kLong, {cameras}, a.means3D);
+  std::vector<Inputs> views;
+  for (int64_t c = 0; c < cameras; ++c) check(views.emplace_back(inputs_of(a, c)));
   for (int64_t c = 0; c < cameras; ++c) {
-    Inputs in = inputs_of(a, c);
-    check(in);
+    const Inputs& in = views[c];
     make_backend(in.means3D)->pack_rows(in, pass, {a.rows, a.radii, a.ids, a.ends[c], a.firsts[c], a.first_id});
   }
+  note_written(a.rows);
+  note_written(a.radii);
+  note_written(a.ids);
   return {};
 }
 
 Results pack_rows_vjp(PackVjpArguments a) {
   const int64_t cameras = check_cameras(a), rows = a.ids.numel(), count = a.count();
   check_packed_gradient(a.dL_drows, a.means3D);
-  check_ints(a.ids, "ids", a.dL_drows.size(0), a.means3D);
+  check_ints(a.ids, "ids", at::kInt, {a.dL_drows.size(0)}, a.means3D);
   check_places(a, cameras, rows);
   TORCH_CHECK_VALUE(may_be_rows_of(a.ids, count), "ids must be what pack_rows_ wrote");
   RowTensors dL_drows;
@@ -191,6 +194,7 @@ Results blend_rows_vjp(BlendRowsVjpArguments a) {
   RowTensors dL_drows;
   dL_drows.packed = a.dL_drows;
   backend->row_grads(saved.kept, saved.lists, pass, sums, dL_drows);
+  note_written(a.dL_drows);
   return {or_empty(background, like)};
 }
 

@@ -7,6 +7,7 @@
 
 #include <vector>
 
+#include "torch/check_tensors.h"
 #include "torch/checks.h"
 #include "torch/ops.h"
 #include "torch/scene_grads.h"
@@ -62,6 +63,23 @@ struct Saved {
     lists = from_list<ListTensors>(list, 0);
     state = from_list<BlendState>(list, ListTensors::kMembers);
     channels = list.back();
+  }
+
+  /// Raises unless this was saved for the Gaussians of `a`, and with the rows of channels that `needed` has.
+  void check_scene(const RasterizeArguments& a, const ChannelTensors& needed) const {
+    const Tensor& ids = lists.ids;
+    const int64_t p = a.count();
+    const int32_t* numbers = ids.is_cpu() ? const_pointer<int32_t>(ids) : nullptr;
+    // On the CPU ids ascend; on CUDA, where the device would have to be waited for, every Gaussian has a splat.
+    const bool same_gaussians =
+        ids.is_cuda() ? ids.numel() == p : !numbers || (numbers[0] >= 0 && numbers[ids.numel() - 1] < p);
+    TORCH_CHECK_VALUE(same_gaussians, "saved must be what the forward pass saved for the same ", p, " Gaussians");
+    if (!needed.made_by_projection()) return;
+    const std::vector<int64_t> sizes = {p, needed.count};
+    TORCH_CHECK_VALUE(channels.sizes() == at::IntArrayRef(sizes) && channels.is_contiguous() &&
+                          channels.scalar_type() == a.means3D.scalar_type() && channels.device() == a.means3D.device(),
+                      "saved must end with the channels of the forward pass for the same arguments, of shape ",
+                      text_of(sizes), ", got ", shape_of(channels));
   }
 };
 
@@ -127,6 +145,7 @@ Results rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
     const Saved saved(arguments.saved);
     check_saved(saved.lists, saved.state, a.means3D, pass);
     const ChannelTensors channels = channels_of(a, saved.channels);
+    saved.check_scene(a, channels);
     const int64_t height = a.image_height, width = a.image_width;
     ImageTensors dL_dimage;
     dL_dimage.color =

@@ -129,7 +129,10 @@ Tensor background_grad(const Tensor& dL_dimage, const Tensor& background, const 
                        const ListTensors& lists, TileGrid grid) {
   if (!dL_dimage.defined()) return at::zeros_like(background);
   const Tensor dL_dcolor = dL_dimage.narrow(0, 0, background.size(0));
-  return dL_dcolor.mul(mean_transmittance(state, lists, grid)).sum(at::IntArrayRef({1, 2}));
+  // The longer axis first, then the other: of a single channel torch would divide 2^15 or more terms among its threads,
+  // and the bits of their sum would depend on how many these are.
+  const int64_t longer = grid.height > grid.width ? 1 : 2;
+  return dL_dcolor.mul(mean_transmittance(state, lists, grid)).sum(longer).sum(1);
 }
 
 }  // namespace ar::ops

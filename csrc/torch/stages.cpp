@@ -103,8 +103,9 @@ Results project_vjp(VjpArguments<ProjectArguments> arguments) {
                     " tensors");
   const Tensor ids = arguments.saved[1], splits = arguments.saved[2];
   const int64_t n = ids.numel(), count = a.count();
-  TORCH_CHECK_VALUE(splits.numel() == cameras + 1 && splits.device().is_cpu() && splits.scalar_type() == at::kLong &&
-                        ids.scalar_type() == at::kInt && splits[-1].item<int64_t>() == n && may_be_rows_of(ids, count),
+  const bool are_splits = splits.device().is_cpu() && splits.scalar_type() == at::kLong && splits.dim() == 1 &&
+                          splits.size(0) == cameras + 1 && splits.is_contiguous() && rises_to(splits, n);
+  TORCH_CHECK_VALUE(are_splits && ids.dim() == 1 && ids.scalar_type() == at::kInt && may_be_rows_of(ids, count),
                     "saved must be what project saved for the same arguments");
   const auto options = a.means3D.options();
   const auto gradient = [&](size_t place, const char* name, std::vector<int64_t> sizes) {

@@ -39,11 +39,6 @@ SsimTensors make_ssim_vjp(SsimArguments& a, const std::vector<Tensor>& saved, co
   return t;
 }
 
-/// So that autograd notices where a backward pass still needs the values of before. Inference tensors have no version.
-void note_written(const Tensor& t) {
-  if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();
-}
-
 /// Runs the adjoint. Returns the gradient with respect to image, and none with respect to target.
 Results run_ssim_vjp(const SsimTensors& t) {
   training_kernels(t.image).ssim_vjp(t);

@@ -1,4 +1,6 @@
 // What the ops of a training step accept.
+#include <ATen/MemoryOverlap.h>
+
 #include <cmath>
 #include <vector>
 
@@ -90,8 +92,14 @@ void check(ObserveArguments& a) {
   a.radii = a.radii.contiguous();
   const int64_t columns = a.gradients.dim() == 2 && a.gradients.size(1) == 4 ? 4 : 3;
   like.check_rows_of(a.gradients, "gradients", {columns}, "(P, 3) or (P, 4)");
-  TORCH_CHECK_VALUE(a.first_column >= 0 && a.first_column + 2 <= columns, "first_column must be 0 to ", columns - 2,
+  TORCH_CHECK_VALUE(a.first_column >= 0 && a.first_column <= columns - 2, "first_column must be 0 to ", columns - 2,
                     ", got ", a.first_column);
+  const auto apart = [](const Tensor& x, const Tensor& y) {
+    return at::get_overlap_status(x, y) == at::MemOverlapStatus::No;
+  };
+  TORCH_CHECK_VALUE(apart(sums, a.views) && apart(sums, a.gradients) && apart(sums, a.radii) &&
+                        apart(a.views, a.gradients) && apart(a.views, a.radii),
+                    "gradient_sums and views must not share memory with each other or with gradients and radii");
 }
 
 void check(PictureArguments& a) {

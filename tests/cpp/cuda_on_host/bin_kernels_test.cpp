@@ -128,8 +128,9 @@ template <class Value> void expect_sorted_by_tile(int pairs, TileGrid grid) {
   for (int pass = 0; pass < passes; ++pass) {
     const int from = pass % 2;
     cuda_on_host::launch(int(scratch.blocks), TileDigits::kThreads, [&] {
-      sort_pass_kernel<kTileBits, Value, false>(scratch, pass, false, 0, 0, tiles[from].data(), tiles[1 - from].data(),
-                                                values[from].data(), values[1 - from].data());
+      sort_pass_kernel<kTileDigitBits, Value, false>(scratch, pass, false, 0, 0, tiles[from].data(),
+                                                     tiles[1 - from].data(), values[from].data(),
+                                                     values[1 - from].data());
     });
   }
   for (int k = 0; k < pairs; ++k) ASSERT_TRUE(values[passes % 2][k] == value_of(order[k], Value())) << k;
