@@ -42,9 +42,12 @@ def one_number(name: str, value: Any) -> float:
 
     Raises:
         TypeError: It is not one number.
+        ValueError: It is larger than any float.
     """
     try:
         return float(value)
+    except OverflowError:
+        raise ValueError(f"{name} must be a number that a float can hold, got a larger one") from None
     except (TypeError, ValueError, RuntimeError):  # which of them depends on the type and on the version of torch
         raise TypeError(f"{name} must be a number, got {value!r}") from None
 

@@ -339,6 +339,22 @@ def test_a_derivative_in_forward_mode_is_refused(device):
             function(torch.autograd.forward_ad.make_dual(value, torch.ones_like(value)))
 
 
+@pytest.mark.parametrize("transform", [torch.func.grad, torch.func.vjp, torch.func.jacrev])
+def test_transforms_of_torch_func_are_refused(device, transform):
+    """torch refuses nodes of autograd that are made in C++, in words that do not say what to do."""
+    scene = scene32(device)
+    rasterizer = ar.GaussianRasterizer(CAMERA.settings(torch.float32, device))
+
+    def brightness(means):
+        return rasterizer(**{**scene, "means3D": means})[0].sum()
+
+    with pytest.raises(NotImplementedError, match=r"rasterize has no derivative in torch.func .* torch.autograd"):
+        if transform is torch.func.vjp:
+            transform(brightness, scene["means3D"])
+        else:
+            transform(brightness)(scene["means3D"])
+
+
 def test_strided_inputs(device):
     """Columns of a larger tensor, transposed matrices: everything as if contiguous."""
     scene = scene32(device)
@@ -613,6 +629,7 @@ WRONG_SHAPES = {
         ({"tanfovx": 0.0}, r"tanfovx must .*got 0"),
         ({"tanfovy": math.nan}, r"tanfovy must .*got nan"),
         ({"scale_modifier": math.nan}, r"scale_modifier must .*got nan"),
+        ({"tanfovx": 10**400}, r"tanfovx must be a number that a float can hold"),
         ({"sh_degree": 5}, r"sh_degree must .*got 5"),
         ({"sh_degree": -1}, r"sh_degree must .*got -1"),
     ],

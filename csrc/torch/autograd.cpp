@@ -147,6 +147,14 @@ bool wants_gradient(const Op& op, const Stack& stack, size_t first) {
   return false;
 }
 
+/// Raises under torch.func.grad, vjp and jacrev, in which torch allows no nodes that are made in C++.
+void refuse_transforms(const Op& op) {
+  TORCH_CHECK_NOT_IMPLEMENTED(
+      !c10::impl::tls_is_dispatch_key_included(c10::DispatchKey::FuncTorchDynamicLayerBackMode),
+      op.forward.schema().name(),
+      " has no derivative in torch.func (grad, vjp, jacrev); it has one in torch.autograd (backward, grad)");
+}
+
 /// Raises if a tensor has a tangent: the ops have no derivative in forward mode, so that it would be dropped silently.
 void refuse_tangents(const Op& op, const Stack& stack, size_t first) {
   for (const size_t i : op.tensors) {
@@ -175,6 +183,7 @@ void differentiate(const c10::OperatorHandle& handle, Stack* stack) {
     op->forward.callBoxed(*stack);
     return;
   }
+  refuse_transforms(*op);
   if (op->keep) (*stack)[first + *op->keep] = true;
   Stack arguments(stack->begin() + int64_t(first), stack->end());
   torch::jit::drop(*stack, op->arguments);

@@ -213,6 +213,7 @@ void check_values(const RasterizeArguments& a) {
 }
 
 int64_t check_cameras(const ProjectArguments& a) {
+  check_shape(a.means3D.dim() == 2 && a.means3D.size(1) == 3, a.means3D, "means3D", "(P, 3)");
   const bool ok = a.viewmatrix.dim() == 3 && a.viewmatrix.size(1) == 4 && a.viewmatrix.size(2) == 4;
   check_shape(ok, a.viewmatrix, "viewmatrix", "(C, 4, 4)");
   const int64_t cameras = a.viewmatrix.size(0);
