@@ -445,6 +445,18 @@ def test_what_is_no_tensor_and_no_camera_is_named():
             lists.of_camera(camera)
 
 
+@pytest.mark.parametrize("op", ["project", "count_rows"])
+def test_a_number_in_place_of_means_is_named(op):
+    gaussians, cameras = ar.stages.project_arguments(
+        [settings_of(torch.float32, "cpu")],
+        **scene_of(torch.float32, "cpu"),
+        **dict.fromkeys(("colors_precomp", "cov3D_precomp")),
+    )
+    gaussians["means3D"] = torch.tensor(1.0)
+    with pytest.raises(ValueError, match=r"means3D must have shape \(P, 3\)"):
+        getattr(torch.ops.analytic_rasterizer, op)(**gaussians, **cameras)
+
+
 def test_lists_of_other_splats_are_refused(device):
     settings, scene = settings_of(torch.float32, device), scene_of(torch.float32, device)
     splats = ar.project(settings, **scene)
