@@ -1203,6 +1203,32 @@ def test_evaluate_compares_footprints(trained, capsys):
     assert np.array_equal(truth, cpu_test_pictures_at(trained).colors[2][0].permute(1, 2, 0).numpy())
 
 
+def refuse_constant(name):
+    raise AssertionError(f"{name} is no JSON")
+
+
+def test_a_picture_without_error_has_a_psnr_that_json_can_hold(tmp_path):
+    """Of a camera that looks away from everything: its picture is the background and nothing else."""
+    away = looking_at_origin(0.0)
+    away[2, 3] = -40
+    seen, empty = circle(4), [io.View("away", 32, 32, 36.0, 36.0, away), io.View("seen", 32, 32, 36.0, 36.0, away)]
+    write_nerf_synthetic(tmp_path / "scene", seen, empty)
+    (tmp_path / "scene" / "test" / "seen.png").unlink()
+    shutil.copy(tmp_path / "scene" / "train" / "r_0.png", tmp_path / "scene" / "test" / "seen.png")
+    arguments = ["train", str(tmp_path / "scene"), "--out", str(tmp_path / "out"), "--device", "cpu"]
+    assert cli.main([*arguments, "--iterations", "1", "--sh-degree", "0", "--random-points", "50"]) == 0
+    assert cli.main(["evaluate", str(tmp_path / "out"), "--lpips", "none", "--pictures", "0"]) == 0
+    metrics = json.loads((tmp_path / "out" / files.METRICS).read_text(), parse_constant=refuse_constant)
+    evaluation = (tmp_path / "out" / "evaluation.json").read_text()
+    of_evaluation = json.loads(evaluation, parse_constant=refuse_constant)["results"]["moment:samples=4"]
+    for measured in (metrics["test"], of_evaluation):
+        views = measured["1"]["views"]
+        assert views[0] == {"psnr": None, "ssim": pytest.approx(1)} and 0 < views[1]["psnr"] < 99
+        assert measured["1"]["psnr"] is None and measured["mean"]["psnr"] is None
+    files.write_log(tmp_path / files.LOG, [{"step": 10, "psnr": math.inf}, {"step": 20, "psnr": 30.5}])
+    assert (tmp_path / files.LOG).read_text() == '{"step": 10, "psnr": null}\n{"step": 20, "psnr": 30.5}\n'
+
+
 @pytest.mark.parametrize("scales, got", [("1,0", "(1, 0)"), ("-1", "(-1,)")])
 def test_evaluate_refuses_scales_that_are_none(trained, capsys, scales, got):
     message = f"scales must be whole numbers of at least 1, got {got}"
