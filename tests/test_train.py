@@ -262,6 +262,54 @@ def test_nerfstudio_folder(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "lists, train, test",
+    [
+        ({"train": (1, 2, 3), "val": (4, 5), "test": (0, 8)}, (1, 2, 3), (0, 8)),
+        ({"train": (7, 6, 5), "val": (0,), "test": ()}, (5, 6, 7), (0,)),
+        ({"val": (3,), "test": (4, 5)}, (0, 1, 2, 6, 7, 8), (4, 5)),
+        ({"train": (0, 2)}, (0, 2), ()),
+        ({"train": (), "test": ()}, (1, 2, 3, 4, 5, 6, 7), (0, 8)),
+    ],
+)
+def test_nerfstudio_lists_of_pictures(tmp_path, lists, train, test):
+    """Written with and without ./ before them, for the frames are too, and in any order."""
+    names = {f"{split}_filenames": [f"./images/r_{i}.png" for i in chosen] for split, chosen in lists.items()}
+    write_nerfstudio(tmp_path, lambda content: content.update(names))
+    found = training.load_capture(tmp_path)
+    assert [item.view.name for item in found.train] == [f"r_{i}" for i in train]
+    assert [item.view.name for item in found.test] == [f"r_{i}" for i in test]
+
+
+@pytest.mark.parametrize(
+    "lists, message",
+    [
+        (
+            {"train_filenames": ["images/r_1.png", "r_2.png"]},
+            "train_filenames must name pictures of the frames, got r_2.png",
+        ),
+        ({"test_filenames": "images/r_1.png"}, "test_filenames must be a list of names, got 'images/r_1.png'"),
+        ({"val_filenames": [1]}, "val_filenames must be a list of names, got [1]"),
+    ],
+)
+def test_nerfstudio_lists_of_other_things(tmp_path, lists, message):
+    write_nerfstudio(tmp_path, lambda content: content.update(lists))
+    with pytest.raises(io.SceneError) as raised:
+        training.load_capture(tmp_path)
+    assert str(raised.value) == f"{tmp_path / 'transforms.json'}: {message}"
+
+
+def test_nerfstudio_masks_are_ignored_and_the_user_is_told(tmp_path):
+    def add_masks(content):
+        for frame in content["frames"][::3]:
+            frame["mask_path"] = "masks/r.png"
+
+    write_nerfstudio(tmp_path, add_masks)
+    with pytest.warns(UserWarning, match="transforms.json: the masks of 3 pictures are ignored") as told:
+        assert len(training.load_capture(tmp_path).train) == 7
+    assert len(told) == 1 and told[0].filename == __file__
+
+
+@pytest.mark.parametrize(
     "change, message",
     [
         (

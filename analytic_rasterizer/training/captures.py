@@ -7,7 +7,9 @@ reconstructions (sparse/0, sparse or colmap/sparse/0; binary or text) and nerfst
 from __future__ import annotations
 
 import json
+import os
 import re
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -51,6 +53,8 @@ def load_capture(folder, images: str = IMAGES, test_every: int = TEST_PERIOD) ->
         test_every: Where the capture does not say what is for the test: one in so many pictures, the first by name
             among them; 0 for none.
 
+    Warns of masks in a nerfstudio capture, which are ignored.
+
     Raises:
         io.SceneError: No such layout; missing pictures; no pictures to train with; all cameras at one place; lens
             distortion.
@@ -77,8 +81,7 @@ def load_capture(folder, images: str = IMAGES, test_every: int = TEST_PERIOD) ->
         named = [Photograph(view, {1: folder / images / name}) for name, view in colmap.load_views(sparse)]
         capture = Capture(*_split(named, test_every), BLACK, colmap.load_points(sparse))
     elif (folder / "transforms.json").exists():
-        named = sorted(transforms(folder / "transforms.json"), key=lambda item: str(item.files[1]))
-        capture = Capture(*_split(named, test_every), BLACK, initial_points(folder))
+        capture = Capture(*nerfstudio(folder / "transforms.json", test_every), BLACK, initial_points(folder))
     else:
         raise io.SceneError(
             f"{folder}: expected transforms_train.json, metadata.json, transforms.json, or COLMAP's cameras, images "
@@ -121,10 +124,46 @@ def transforms(path: Path) -> list[Photograph]:
     found = []
     for i, (view, frame) in enumerate(zip(views, data["frames"])):
         check_lens(data | frame, f"{path}: frame {i}")
-        file = path.parent / str(frame.get("file_path", ""))
-        # NeRF-synthetic leaves out the suffix, and its names may hold points.
-        found.append(Photograph(view, {1: file if file.is_file() else file.with_name(file.name + ".png")}))
+        found.append(Photograph(view, {1: _picture(path.parent, str(frame.get("file_path", "")))}))
     return found
+
+
+def _picture(folder: Path, name: str) -> Path:
+    """The file that a transforms file names."""
+    file = folder / name
+    # NeRF-synthetic leaves out the suffix, and its names may hold points.
+    return file if file.is_file() else file.with_name(file.name + ".png")
+
+
+def nerfstudio(path: Path, test_every: int) -> tuple[list[Photograph], list[Photograph]]:
+    """Pictures to train with and to test with, by name: what the lists of a transforms.json say, if it has any.
+
+    They are train_filenames, val_filenames and test_filenames. The test takes the last, or where that is missing the
+    one before. Without the first, the training takes the pictures that neither of the others has.
+
+    Warns of masks, which are ignored.
+
+    Raises io.SceneError for what `transforms` refuses, and for lists of anything but pictures of the file.
+    """
+    items = sorted(transforms(path), key=lambda item: str(item.files[1]))
+    data = json.loads(path.read_text(encoding="utf-8-sig"))
+    masks = sum("mask_path" in frame for frame in data["frames"])
+    if masks:
+        warnings.warn(f"{path}: the masks of {masks} pictures are ignored, all of their pixels count", stacklevel=3)
+    files, lists = [os.path.normpath(item.files[1]) for item in items], {}
+    for split in ("train", "val", "test"):
+        names = data.get(f"{split}_filenames") or []
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise io.SceneError(f"{path}: {split}_filenames must be a list of names, got {names!r}")
+        lists[split] = {os.path.normpath(_picture(path.parent, name)): name for name in names}
+        unknown = [name for file, name in lists[split].items() if file not in files]
+        if unknown:
+            raise io.SceneError(f"{path}: {split}_filenames must name pictures of the frames, got {unknown[0]}")
+    if not any(lists.values()):
+        return _split(items, test_every)
+    train = lists["train"] or set(files) - lists["val"].keys() - lists["test"].keys()
+    test = lists["test"] or lists["val"]
+    return tuple([item for file, item in zip(files, items) if file in chosen] for chosen in (train, test))
 
 
 def check_lens(entry: dict, where: str) -> None:
