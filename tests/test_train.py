@@ -932,7 +932,8 @@ def test_errors_of_picture_gradients(changed, error, message):
         torch.ops.analytic_rasterizer.picture_gradients(**picture_arguments("cpu", **changed))
 
 
-def test_ctrl_c_saves_and_resumes(synthetic, tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_and_sigterm_save_and_training_resumes(synthetic, tmp_path, capsys, monkeypatch, number):
     """The step that runs is completed; the end is the same as without the interruption."""
     arguments = ["train", str(synthetic), "--device", "cpu", "--iterations", "60", "--random-points", "50"]
     arguments += ["--sh-degree", "0", "--scales", "1"]
@@ -941,13 +942,13 @@ def test_ctrl_c_saves_and_resumes(synthetic, tmp_path, capsys, monkeypatch):
 
     def interrupted(trainer):
         if trainer.progress.step == 33:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
         step(trainer)
 
     monkeypatch.setattr(training.Trainer, "step", interrupted)
-    before = signal.getsignal(signal.SIGINT)
+    before = signal.getsignal(number)
     assert cli.main([*arguments, "--out", str(tmp_path / "part")]) == 130
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(number) is before
     assert "stopped after 34 steps and saved; go on with --resume" in capsys.readouterr().out
     assert (tmp_path / "part" / files.SCENE).exists()
     monkeypatch.undo()
@@ -969,6 +970,35 @@ def test_a_second_ctrl_c_ends_at_once(synthetic, tmp_path, monkeypatch):
     monkeypatch.setattr(run.trainer, "step", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run.train()
+
+
+def test_a_second_sigterm_kills(synthetic, tmp_path, monkeypatch):
+    run = make_run(synthetic, tmp_path, iterations=3)
+    step, handlers = run.trainer.step, []
+
+    def interrupted():
+        step()
+        signal.raise_signal(signal.SIGTERM)
+        handlers.append(signal.getsignal(signal.SIGTERM))
+
+    monkeypatch.setattr(run.trainer, "step", interrupted)
+    assert not run.train() and handlers == [signal.SIG_DFL]
+
+
+def test_a_handler_of_the_program_for_sigterm_stays(synthetic, tmp_path, monkeypatch):
+    run, received = make_run(synthetic, tmp_path, iterations=3), []
+    step = run.trainer.step
+
+    def signalled():
+        step()
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(run.trainer, "step", signalled)
+    before = signal.signal(signal.SIGTERM, lambda number, _: received.append(number))
+    try:
+        assert run.train() and len(received) == 3
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def full_disk(state, path) -> None:

@@ -47,8 +47,8 @@ def add_parser(subcommands) -> None:
         help="train a scene from photographs",
         description="Train Gaussians on the pictures of SCENE, a folder of a NeRF-synthetic scene, of the multi-scale "
         "Blender set, of a COLMAP reconstruction or of a nerfstudio capture. Writes scene.ply, cameras.json, "
-        "metrics.json, log.jsonl, options.json and checkpoint.pt to DIR. Ctrl-C saves and ends; --resume goes on. "
-        "Under torchrun, several processes train one scene together.",
+        "metrics.json, log.jsonl, options.json and checkpoint.pt to DIR. Ctrl-C or SIGTERM saves and ends; --resume "
+        "goes on. Under torchrun, several processes train one scene together.",
     )
     add = parser.add_argument
     add("scene", metavar="SCENE", help="folder of pictures with cameras")

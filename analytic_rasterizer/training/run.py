@@ -129,7 +129,7 @@ class Run:
         return self.trainer.progress
 
     def train(self, viewer: LiveViewer | None = None) -> bool:
-        """Trains to the end, or until Ctrl-C, and writes everything. Returns whether it came to the end.
+        """Trains to the end, or until Ctrl-C or SIGTERM, and writes everything. Returns whether it came to the end.
 
         Args:
             viewer: Is shown the scene, between steps; no step waits for its frames. It is left running.
@@ -353,19 +353,27 @@ def first_gaussians(options: TrainingOptions, capture: Capture, points) -> tuple
 
 @contextmanager
 def interruption() -> Iterator[threading.Event]:
-    """Ctrl-C sets the event, so that the step that runs is completed; a second Ctrl-C raises KeyboardInterrupt."""
+    """Ctrl-C or SIGTERM sets the event, so that the step that runs is completed; a second one ends the process at once.
+
+    A second Ctrl-C raises KeyboardInterrupt. A handler of the program for SIGTERM is left in place.
+    """
     stopped = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stopped  # only the main thread may look at signals
         return
-    before = signal.getsignal(signal.SIGINT)
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    if signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
+        del usual[signal.SIGTERM]
+    before = {number: signal.getsignal(number) for number in usual}
 
-    def stop(*_) -> None:
+    def stop(number: int, _) -> None:
         stopped.set()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(number, usual[number])
 
-    signal.signal(signal.SIGINT, stop)
     try:
+        for number in usual:
+            signal.signal(number, stop)
         yield stopped
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
