@@ -1555,7 +1555,7 @@ def test_resuming_takes_the_points_of_the_start_or_none(synthetic, trained, tmp_
     capsys.readouterr()
     for command, expected in ((began, f"{tmp_path / 'a.ply'} or None"), (alone, "None")):
         assert cli.main([*command, "--resume", "--points", "b.ply"]) == 2
-        error = f"error: points must be {expected} where a training is resumed, got b.ply\n"
+        error = f"error: points must be {expected} where a training is resumed, got {tmp_path / 'b.ply'}\n"
         assert capsys.readouterr().err == error
     assert all(path.read_bytes() == content for path, content in written.items())
     # A checkpoint from before they were noted.

@@ -100,8 +100,7 @@ class Run:
             options = TrainingOptions.from_dict(state["options"])
         self.options = options or TrainingOptions()
         # Where the scene is, from wherever `evaluate` is called.
-        self.source = {"scene": os.path.abspath(scene), **pictures_of_source(images, test_every, state)}
-        self.source["points"] = points_of_source(points, state)
+        self.source = {"scene": os.path.abspath(scene), **source_of(images, test_every, points, state)}
         self.capture = load_capture(scene, self.source["images"], self.source["test_every"])
         if state is None:  # raises before the pictures are read
             start, self.points_found = first_gaussians(self.options, self.capture, points)
@@ -303,33 +302,21 @@ class Run:
         self.clock.start()
 
 
-def pictures_of_source(images: str | None, test_every: int | None, state: dict[str, Any] | None) -> dict[str, Any]:
-    """`images` and `test_every` of a training: those that are given or usual, or of its checkpoint, if it is resumed.
+def source_of(images: str | None, test_every: int | None, points, state: dict[str, Any] | None) -> dict[str, Any]:
+    """Where pictures and points come from: as given or usual, or as in the checkpoint of a training that is resumed.
 
-    Raises ValueError for others than it began with: it would go on with other pictures.
+    Raises ValueError for another source than it began with: it would go on with other pictures, or points of no effect.
     """
-    usual = {"images": IMAGES, "test_every": TEST_PERIOD} if state is None else state["source"]
-    chosen = {}
-    for name, given in (("images", images), ("test_every", test_every)):
-        chosen[name] = usual[name] if given is None else given
-        if state is not None and chosen[name] != usual[name]:
-            raise ValueError(f"{name} must be {usual[name]} or None where a training is resumed, got {given}")
+    given = {"images": images, "test_every": test_every, "points": points and str(Path(points).resolve())}
+    usual = {"images": IMAGES, "test_every": TEST_PERIOD, "points": None}
+    if state is not None:
+        usual = given | state["source"]  # which has no points in earlier versions: nobody knows them
+    chosen = {name: usual[name] if value is None else value for name, value in given.items()}
+    for name, value in chosen.items():
+        if state is not None and value != usual[name]:
+            expected = "None" if usual[name] is None else f"{usual[name]} or None"
+            raise ValueError(f"{name} must be {expected} where a training is resumed, got {value}")
     return chosen
-
-
-def points_of_source(points, state: dict[str, Any] | None) -> str | None:
-    """What a training began with, of the `points` that are given now and its checkpoint, if it is resumed.
-
-    Raises ValueError for other points than it began with, which would have no effect.
-    """
-    given = None if points is None else str(Path(points).resolve())
-    if state is None or "points" not in state["source"]:  # of an earlier version: nobody knows
-        return given
-    before = state["source"]["points"]
-    if points is not None and given != before:
-        expected = "None" if before is None else f"{before} or None"
-        raise ValueError(f"points must be {expected} where a training is resumed, got {points}")
-    return before
 
 
 def first_gaussians(options: TrainingOptions, capture: Capture, points) -> tuple[Gaussians, int | None]:
