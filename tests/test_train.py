@@ -365,6 +365,26 @@ def test_multi_scale_blender_folder(tmp_path):
     assert [loaded.settings[scale][1].image_width for scale in (1, 2, 4)] == [32, 16, 8]
 
 
+@pytest.mark.parametrize(
+    "key, value, message",
+    [
+        ("file_path", 3, "file_path must be names of pictures, got 3"),
+        ("cam2world", "x", "cam2world of train/a.png must hold 4 x 4 finite numbers, got \"x\""),
+        ("width", 0, "width of train/a.png must be a whole number from 1 to 2^20, got 0"),
+        ("height", math.inf, "height of train/a.png must be a whole number from 1 to 2^20, got Infinity"),
+        ("focal", "far", "focal of train/a.png must be a positive finite number, got \"far\""),
+    ],
+)
+def test_metadata_with_other_things_than_numbers(tmp_path, capsys, key, value, message):
+    """Some of them were tracebacks, others named no file."""
+    pose = opengl_pose(circle(1)[0])
+    rows = {"file_path": ["train/a.png"], "cam2world": [pose], "width": [32.0], "height": [32.0], "focal": [36.0]}
+    metadata = {"train": rows | {key: [value]}, "test": rows}
+    (tmp_path / "metadata.json").write_text(json.dumps(metadata))
+    assert cli.main(["train", str(tmp_path), "--out", str(tmp_path / "out"), "--device", "cpu"]) == 2
+    assert capsys.readouterr().err == f"error: {tmp_path / 'metadata.json'}: {message}\n"
+
+
 @pytest.mark.parametrize("layout", ["binary_little_endian", "ascii"])
 def test_points_of_a_ply(tmp_path, layout):
     rows = np.array(

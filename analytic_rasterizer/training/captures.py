@@ -19,6 +19,7 @@ from torch import Tensor
 
 from .. import io
 from ..io.scenes import ply_layout, ply_vertices
+from ..io.views import checked_pixels, checked_pose, checked_positive
 from . import colmap
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -132,7 +133,7 @@ def _picture(folder: Path, name: str) -> Path:
     """The file that a transforms file names."""
     file = folder / name
     # NeRF-synthetic leaves out the suffix, and its names may hold points.
-    return file if file.is_file() else file.with_name(file.name + ".png")
+    return file if file.is_file() else Path(f"{file}.png")
 
 
 def nerfstudio(path: Path, test_every: int) -> tuple[list[Photograph], list[Photograph]]:
@@ -147,7 +148,7 @@ def nerfstudio(path: Path, test_every: int) -> tuple[list[Photograph], list[Phot
     """
     items = sorted(transforms(path), key=lambda item: str(item.files[1]))
     data = json.loads(path.read_text(encoding="utf-8-sig"))
-    masks = sum("mask_path" in frame for frame in data["frames"])
+    masks = sum(frame.get("mask_path") is not None for frame in data["frames"])
     if masks:
         warnings.warn(f"{path}: the masks of {masks} pictures are ignored, all of their pixels count", stacklevel=3)
     files, lists = [os.path.normpath(item.files[1]) for item in items], {}
@@ -197,16 +198,20 @@ def multi_scale_blender(folder: Path, split: str) -> list[Photograph]:
         raise io.SceneError(f"{path}: not the metadata of the multi-scale Blender set ({error!r})") from None
     found: list[Photograph] = []
     for name, pose, width, height, focal in rows:
-        c2w = torch.tensor(pose, dtype=torch.float64, device="cpu")
-        if c2w.shape != (4, 4) or not c2w.isfinite().all():
-            raise io.SceneError(f"{path}: cam2world of {name} must hold 4 x 4 finite numbers")
+        if not isinstance(name, str):
+            raise io.SceneError(f"{path}: file_path must be names of pictures, got {name!r}")
+        c2w = checked_pose(pose, f"{path}: cam2world of {name}")
+        width, height = (
+            checked_pixels(value, f"{path}: {key} of {name}") for key, value in (("width", width), ("height", height))
+        )
+        focal = checked_positive(focal, f"{path}: focal of {name}")
         c2w[:3, 1:3] *= -1
         w2c = torch.linalg.inv(c2w)
         largest = found[-1].view if found else None
         if largest is not None and largest.width > width and torch.equal(largest.w2c, w2c):
             found[-1].files[round(largest.width / width)] = folder / name
         else:
-            view = io.View(Path(name).stem, round(width), round(height), float(focal), float(focal), w2c)
+            view = io.View(Path(name).stem, width, height, focal, focal, w2c)
             found.append(Photograph(view, {1: folder / name}))
     return found
 
