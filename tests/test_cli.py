@@ -165,7 +165,7 @@ end_header
         (lambda files: (files / "views.json").unlink(), [], "views.json: No such file"),
         (views_text("[]"), [], "views.json: the list of views must be a list with at least one"),
         (views_text("{"), [], "views.json: not valid JSON"),
-        (unwritable, [], "out: File exists"),
+        (unwritable, [], "out: expected a folder for the results, got a file"),
         (None, ["--footprint", "circle"], "circle"),
         (None, ["--footprint", "box:samples=3"], "samples"),
         (None, ["--footprint", "box:colour=3"], "colour"),
@@ -305,7 +305,8 @@ def test_inspect_prints_json_alone(files, capsys):
         (["--max-views", "0"], "argument --max-views: must be a positive whole number, got 0"),
         (["--training-views", "none.json"], "none.json: No such file"),
         (["--picture", "a.gif"], "--picture must end in .png, .svg or .pdf, got a.gif"),
-        (["--json", "views.json/report.json"], "File exists"),
+        (["--json", "views.json/report.json"], "views.json: expected a folder for the results, got a file"),
+        (["--json", "."], ".: expected a file for the results, got a folder"),
     ],
 )
 def test_errors_of_inspect_are_one_line(files, capsys, monkeypatch, extra, message):

@@ -369,10 +369,10 @@ def test_multi_scale_blender_folder(tmp_path):
     "key, value, message",
     [
         ("file_path", 3, "file_path must be names of pictures, got 3"),
-        ("cam2world", "x", "cam2world of train/a.png must hold 4 x 4 finite numbers, got \"x\""),
+        ("cam2world", "x", 'cam2world of train/a.png must hold 4 x 4 finite numbers, got "x"'),
         ("width", 0, "width of train/a.png must be a whole number from 1 to 2^20, got 0"),
         ("height", math.inf, "height of train/a.png must be a whole number from 1 to 2^20, got Infinity"),
-        ("focal", "far", "focal of train/a.png must be a positive finite number, got \"far\""),
+        ("focal", "far", 'focal of train/a.png must be a positive finite number, got "far"'),
     ],
 )
 def test_metadata_with_other_things_than_numbers(tmp_path, capsys, key, value, message):

@@ -97,9 +97,22 @@ def use_machine(args) -> None:
 def writable_folder(path: str) -> Path:
     """The folder, made if it is missing; OSError before any work is done when it cannot be used."""
     folder = Path(path)
+    if folder.is_file():
+        raise NotADirectoryError(f"{folder}: expected a folder for the results, got a file")
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=folder):
         return folder
+
+
+def writable_file(path: str) -> Path:
+    """The file, in a folder that is made if it is missing; OSError before any work is done where it cannot be written.
+
+    A file that is there stays as it is, until it is written.
+    """
+    writable_folder(Path(path).parent)
+    if Path(path).is_dir():
+        raise IsADirectoryError(f"{path}: expected a file for the results, got a folder")
+    return Path(path)
 
 
 def _number(kind, accepts, expected: str):

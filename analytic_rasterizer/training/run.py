@@ -121,6 +121,8 @@ class Run:
                 )
             self.trainer.load_state_dict(state)
             self.clock.total, self.history = state["seconds"], state["history"]
+        if self.out.is_file():
+            raise NotADirectoryError(f"{self.out}: expected a folder for the results, got a file")
         self.out.mkdir(parents=True, exist_ok=True)
 
     @property
