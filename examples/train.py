@@ -14,6 +14,8 @@ import torch
 
 from analytic_rasterizer.training import Run, TrainingOptions
 
+if len(sys.argv) < 3:
+    sys.exit(__doc__)
 folder, out, *footprints = sys.argv[1:]
 for footprint in footprints or ["analytic", "box:samples=4", "moment:samples=4"]:
     options = TrainingOptions(footprint=footprint, scales=(1, 2, 4, 8), iterations=7000)

@@ -55,7 +55,7 @@ def add_parser(subcommands) -> None:
     add("--out", required=True, metavar="DIR", help="folder for the results")
     images = f"folder in SCENE of a reconstruction's photographs (default: {IMAGES})"
     add("--images", metavar="NAME", help=images)  # what is not given is None, for --resume
-    test_every = f"keep every N-th photograph for the test; 0: none (default: {TEST_PERIOD})"
+    test_every = f"where SCENE does not say: keep every N-th photograph for the test; 0: none (default: {TEST_PERIOD})"
     add("--test-every", type=int, metavar="N", help=test_every)
     add("--points", metavar="FILE.ply", help="start from this: a 3DGS scene, or points with colours")
     preset = "options that belong together: quick, 7,000 steps; 3dgs, the recipe of 3DGS; what is given wins"
