@@ -1,10 +1,12 @@
 """The command line: what it writes, what it prints, and how it fails."""
 
+import errno
 import json
 import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from dataclasses import replace
 
@@ -213,6 +215,15 @@ def test_folder_without_permission(files, capsys):
     (files / "out").mkdir(mode=0o500)
     assert cli.main(arguments(files)) == 2
     assert "Permission denied" in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_written_is_named_and_no_file_in_it(files, capsys, monkeypatch):
+    def read_only(dir):
+        raise OSError(errno.EROFS, "Read-only file system", str(dir / "tmp12345"))
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", read_only)
+    assert cli.main(arguments(files)) == 2
+    assert capsys.readouterr().err == f"error: {files / 'out'}: Read-only file system\n"
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")

@@ -1021,6 +1021,15 @@ def test_a_handler_of_the_program_for_sigterm_stays(synthetic, tmp_path, monkeyp
         signal.signal(signal.SIGTERM, before)
 
 
+def test_a_folder_that_became_read_only_is_reported_by_the_name_of_the_file(tmp_path, monkeypatch):
+    def read_only(path, **_):
+        raise OSError(30, "Read-only file system", str(path))
+
+    monkeypatch.setattr(type(tmp_path), "unlink", read_only)
+    with pytest.raises(OSError, match=r"options\.json: cannot be written \(Read-only file system\)"):
+        files.write_safely(tmp_path / files.OPTIONS, read_only)
+
+
 def full_disk(state, path) -> None:
     path.write_bytes(b"half of it")
     raise OSError(28, "No space left on device")

@@ -100,8 +100,11 @@ def writable_folder(path: str) -> Path:
     if folder.is_file():
         raise NotADirectoryError(f"{folder}: expected a folder for the results, got a file")
     folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryFile(dir=folder):
-        return folder
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError as error:  # which names the temporary file
+        raise OSError(error.errno, error.strerror, str(folder)) from None
 
 
 def writable_file(path: str) -> Path:
