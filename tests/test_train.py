@@ -1293,6 +1293,14 @@ def test_training_starts_from_a_scene(synthetic, trained, tmp_path):
     assert run.trainer.gaussians.shs.shape[1] == 9 and (run.trainer.gaussians.shs[:, 4:] == 0).all()
 
 
+def test_training_does_not_start_from_a_scene_without_gaussians(synthetic, trained, tmp_path, capsys):
+    scene = io.load_scene(trained / files.SCENE)
+    io.save_scene(tmp_path / "none.ply", io.Scene(*(field[:0] for field in scene[:5]), scene.sh_degree))
+    arguments = ["train", str(synthetic), "--out", str(tmp_path / "out"), "--device", "cpu"]
+    assert cli.main([*arguments, "--points", str(tmp_path / "none.ply")]) == 2
+    assert capsys.readouterr().err == f"error: {tmp_path / 'none.ply'}: the scene has no Gaussians\n"
+
+
 def test_evaluate_compares_footprints(trained, capsys):
     arguments = ["evaluate", str(trained), "--footprint", "box:samples=4", "point", "--scales", "1,2,4"]
     assert cli.main([*arguments, "--lpips", "none", "--pictures", "1"]) == 0

@@ -328,10 +328,12 @@ def first_gaussians(options: TrainingOptions, capture: Capture, points) -> tuple
     Gaussians are those of a scene, or random.
 
     Raises:
-        ValueError: A scene of more Gaussians than `max_gaussians`; what `starting_gaussians` raises.
+        ValueError: A scene without Gaussians, or with more than `max_gaussians`; what `starting_gaussians` raises.
     """
     if points is not None and is_scene(Path(points)):
         scene = io.load_scene(points)
+        if not len(scene.means):  # from which nothing would ever grow
+            raise io.SceneError(f"{points}: the scene has no Gaussians")
         if len(scene.means) > options.gaussian_limit:
             expected = f"at least {len(scene.means)}, the Gaussians of {points}, or 0"
             raise ValueError(f"max_gaussians must be {expected}, got {options.max_gaussians}")
