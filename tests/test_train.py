@@ -431,6 +431,13 @@ def test_colors_of_points_out_of_range(tmp_path, kind, color):
         points_with_colors(tmp_path / "p.ply", kind, [(0, 1, color)])
 
 
+@pytest.mark.parametrize("color", [10**30, -(10**30)])  # of smaller ones, earlier versions of NumPy keep some bits
+def test_colors_of_points_that_their_type_does_not_hold(tmp_path, color):
+    """They were a traceback."""
+    with pytest.raises(io.SceneError, match=r"p\.ply: expected 6 numbers in every row"):
+        points_with_colors(tmp_path / "p.ply", "uchar", [(0, 1, color)])
+
+
 @pytest.mark.parametrize("content", ["{}", "[1, 2]", "3", "no JSON"])
 def test_metadata_of_another_program_is_passed_over(synthetic, tmp_path, content):
     shutil.copytree(synthetic, tmp_path / "scene")

@@ -276,7 +276,7 @@ def load_points(path: Path) -> tuple[Tensor, Tensor]:
     elif layout == "ascii":
         try:
             rows = np.array([tuple(line.split()[: len(names)]) for line in body.decode().splitlines()[:count]], dtype)
-        except ValueError as error:  # too few words, words that are no numbers, or no text at all
+        except (ValueError, OverflowError) as error:  # too few words, words that are no numbers of the type, or no text
             raise io.SceneError(f"{path}: expected {len(names)} numbers in every row ({error})") from None
     else:
         raise io.SceneError(f"{path}: cut short, or neither ascii nor binary_little_endian but {layout}")
