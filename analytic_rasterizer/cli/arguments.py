@@ -107,15 +107,11 @@ def writable_folder(path: str) -> Path:
         raise OSError(error.errno, error.strerror, str(folder)) from None
 
 
-def writable_file(path: str) -> Path:
-    """The file, in a folder that is made if it is missing; OSError before any work is done where it cannot be written.
-
-    A file that is there stays as it is, until it is written.
-    """
+def check_writable_file(path: str) -> None:
+    """Makes the file's folder if it is missing; OSError before any work is done when the file cannot be written."""
     writable_folder(Path(path).parent)
     if Path(path).is_dir():
         raise IsADirectoryError(f"{path}: expected a file for the results, got a folder")
-    return Path(path)
 
 
 def _number(kind, accepts, expected: str):
