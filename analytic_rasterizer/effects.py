@@ -61,6 +61,22 @@ class Outputs(NamedTuple):
 OUTPUTS = Outputs._fields
 
 
+def _equal(self: Any, other: object):
+    """`__eq__` of a dataclass whose fields may hold tensors: those are compared by their values."""
+    if not isinstance(other, type(self)):
+        return NotImplemented
+    return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+
+
+def _same(a: Any, b: Any) -> bool:
+    """Whether two numbers, tuples or tensors are equal. `==` of tensors has no truth value."""
+    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
+        return a is b or (a.shape == b.shape and a.device == b.device and torch.equal(a, b))
+    if (isinstance(a, torch.Tensor) and a.dim()) or (isinstance(b, torch.Tensor) and b.dim()):
+        return False
+    return bool(a == b)
+
+
 @dataclass(frozen=True)
 class Defocus:
     """A thin lens: what is not at its focus becomes a disc, taken as the Gaussian of the same variance.
@@ -125,10 +141,7 @@ class Motion:
             if not fits:
                 raise ValueError(f"{name} must have {length} finite numbers, got {value!r}")
 
-    def __eq__(self, other: object):
-        if not isinstance(other, Motion):
-            return NotImplemented
-        return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
+    __eq__ = _equal
 
     def __hash__(self):
         # Not of the values: equal tensors have different hashes, and lists have none.
@@ -180,10 +193,12 @@ class Effects:
     off_center: bool = False
     near: float = NEAR
     far: float = math.inf
-    filter_3d: torch.Tensor | None = field(default=None, compare=False)
+    filter_3d: torch.Tensor | None = field(default=None, hash=False)  # equal tensors have different hashes
     defocus: Defocus | None = None
     motion: Motion | None = None
     sh_degree: int | None = None
+
+    __eq__ = _equal
 
     def __post_init__(self):
         for name in (*OUTPUTS, "camera_gradients", "orthographic", "off_center"):
@@ -257,15 +272,6 @@ def _check_number(name: str, value, at_least: float = -math.inf, above: float = 
     if not (math.isfinite(value) and value >= at_least and value > above):
         limit = f" and above {above}" if above > -math.inf else f" and at least {at_least}" if at_least == 0 else ""
         raise ValueError(f"{name} must be finite{limit}, got {value}")
-
-
-def _same(a: Any, b: Any) -> bool:
-    """Whether two numbers, tuples or tensors are equal. `==` of tensors has no truth value."""
-    if isinstance(a, torch.Tensor) and isinstance(b, torch.Tensor):
-        return a is b or (a.shape == b.shape and a.device == b.device and torch.equal(a, b))
-    if (isinstance(a, torch.Tensor) and a.dim()) or (isinstance(b, torch.Tensor) and b.dim()):
-        return False
-    return bool(a == b)
 
 
 def _is_integer_tensor(value) -> bool:

@@ -70,6 +70,9 @@ class _Fields(NamedTuple):
 class GaussianRasterizationSettings(_Fields):
     """How to render: a tuple of the 12 fields of 3DGS 2023 in its order. Footprint and effects are further attributes.
 
+    Settings are equal where both their tuples and their attributes are. Tuples compare tensors of several numbers by
+    identity, and raise a RuntimeError where two of them are not the same object.
+
     Args:
         image_height, image_width: Size of the image, px.
         tanfovx, tanfovy: Tangent of half the field of view.
@@ -140,6 +143,20 @@ class GaussianRasterizationSettings(_Fields):
             ValueError: The environment variable ANALYTIC_RASTERIZER_FOOTPRINT holds no footprint.
         """
         return self.footprint or get_default_footprint()
+
+    def __eq__(self, other: object) -> bool:
+        if isinstance(other, GaussianRasterizationSettings) and self._attributes() != other._attributes():
+            return False
+        return super().__eq__(other)
+
+    def __ne__(self, other: object) -> bool:  # tuple has one of its own
+        return not self == other
+
+    __hash__ = _Fields.__hash__
+
+    def _attributes(self) -> tuple:
+        """What is not in the tuple."""
+        return self.footprint, self.effects, self.means2d_z
 
     def _replace(self, **kwargs: Any) -> GaussianRasterizationSettings:
         fields = [kwargs.pop(name, value) for name, value in zip(self._fields, self)]

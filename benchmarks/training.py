@@ -32,6 +32,7 @@ from tqdm import tqdm
 from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import describe_machine
 from analytic_rasterizer.training import Trainer, TrainingOptions, evaluate, load_capture, load_pictures
+from analytic_rasterizer.training.files import write_json
 from analytic_rasterizer.training.options import PRESETS, preset_values
 from analytic_rasterizer.training.schedule import Clock
 from analytic_rasterizer.training.trainer import background_of, starting_gaussians
@@ -92,7 +93,7 @@ def main() -> int:
         for name in chosen:
             runs.append({"variant": name, "seed": seed, **train_once(options[name], seed, capture, train, test, args)})
             if args.json:
-                args.json.write_text(json.dumps(report, indent=1) + "\n")
+                write_json(args.json, report)
     print(format_runs(runs, scales))
     return 0
 

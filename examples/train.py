@@ -14,12 +14,15 @@ import torch
 
 from analytic_rasterizer.training import Run, TrainingOptions
 
+if len(sys.argv) < 3:
+    sys.exit(__doc__)
 folder, out, *footprints = sys.argv[1:]
 for footprint in footprints or ["analytic", "box:samples=4", "moment:samples=4"]:
     options = TrainingOptions(footprint=footprint, scales=(1, 2, 4, 8), iterations=7000)
     name = footprint.replace(":", "_").replace("=", "_")
     run = Run(folder, Path(out) / name, options, device="cuda" if torch.cuda.is_available() else "cpu")
-    run.train()
+    if not run.train():
+        sys.exit(f"stopped after {run.progress.step} steps and saved to {run.out}")
     metrics = run.evaluate()
     if "test" not in metrics:
         sys.exit(f"{folder} has no test pictures; {run.out} has the scene")

@@ -130,6 +130,25 @@ def test_settings_are_a_tuple(extra):
     assert by_keyword.footprint == by_position.footprint
 
 
+def test_settings_are_equal_where_footprint_and_effects_are_too():
+    settings = Settings(**CAMERA.fields())
+    variants = [
+        settings,
+        settings._replace(footprint="box", samples=4),
+        settings._replace(footprint="box", samples=8),
+        settings._replace(effects=ar.Effects(alpha=True)),
+        settings._replace(effects=ar.Effects(filter_3d=torch.ones(3))),
+        settings._replace(effects="auto"),
+        settings._replace(image_width=46),
+    ]
+    for i, one in enumerate(variants):
+        for j, other in enumerate(variants):
+            assert (one == other, one != other) == (i == j, i != j)
+    same = variants[1]._replace(samples=4, footprint="box")
+    assert same is not variants[1] and same == variants[1] and hash(same) == hash(variants[1])
+    assert settings == tuple(settings) and tuple(settings) == settings and settings != tuple(variants[-1])
+
+
 def test_missing_and_unknown_fields():
     fields = CAMERA.fields()
     with pytest.raises(TypeError):

@@ -420,6 +420,13 @@ def test_motions_with_tensors_can_be_compared():
     assert len({ar.Effects(motion=motion(1.0)), ar.Effects(motion=motion(1.0))}) == 1
 
 
+def test_effects_with_tensors_can_be_compared():
+    one, same, other = (ar.Effects(filter_3d=torch.full((3,), size)) for size in (0.1, 0.1, 0.2))
+    assert one == same and hash(one) == hash(same)
+    assert one != other and one != ar.Effects() and ar.Effects() != one
+    assert ar.Effects(near=torch.tensor(0.5)) == ar.Effects(near=0.5) and ar.Effects() != "auto"
+
+
 def test_numbers_of_numpy_are_numbers():
     lens = ar.Defocus(np.float32(0.5), np.int64(3))
     effects = ar.Effects(near=np.float32(0.5), far=np.float32(8), sh_degree=np.int64(1), defocus=lens)

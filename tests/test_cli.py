@@ -1,10 +1,12 @@
 """The command line: what it writes, what it prints, and how it fails."""
 
+import errno
 import json
 import os
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from dataclasses import replace
 
@@ -165,7 +167,7 @@ end_header
         (lambda files: (files / "views.json").unlink(), [], "views.json: No such file"),
         (views_text("[]"), [], "views.json: the list of views must be a list with at least one"),
         (views_text("{"), [], "views.json: not valid JSON"),
-        (unwritable, [], "out: File exists"),
+        (unwritable, [], "out: expected a folder for the results, got a file"),
         (None, ["--footprint", "circle"], "circle"),
         (None, ["--footprint", "box:samples=3"], "samples"),
         (None, ["--footprint", "box:colour=3"], "colour"),
@@ -213,6 +215,15 @@ def test_folder_without_permission(files, capsys):
     (files / "out").mkdir(mode=0o500)
     assert cli.main(arguments(files)) == 2
     assert "Permission denied" in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_written_is_named_and_no_file_in_it(files, capsys, monkeypatch):
+    def read_only(dir):
+        raise OSError(errno.EROFS, "Read-only file system", str(dir / "tmp12345"))
+
+    monkeypatch.setattr(tempfile, "TemporaryFile", read_only)
+    assert cli.main(arguments(files)) == 2
+    assert capsys.readouterr().err == f"error: {files / 'out'}: Read-only file system\n"
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="needs a machine without CUDA")
@@ -305,7 +316,8 @@ def test_inspect_prints_json_alone(files, capsys):
         (["--max-views", "0"], "argument --max-views: must be a positive whole number, got 0"),
         (["--training-views", "none.json"], "none.json: No such file"),
         (["--picture", "a.gif"], "--picture must end in .png, .svg or .pdf, got a.gif"),
-        (["--json", "views.json/report.json"], "File exists"),
+        (["--json", "views.json/report.json"], "views.json: expected a folder for the results, got a file"),
+        (["--json", "."], ".: expected a file for the results, got a folder"),
     ],
 )
 def test_errors_of_inspect_are_one_line(files, capsys, monkeypatch, extra, message):

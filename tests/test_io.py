@@ -304,6 +304,10 @@ COLOURED = [*ply_columns(0)[:9], "red", *ply_columns(0)[9:]]
         ),
         (lambda d: cut(saved(d, "a.compressed.ply"), -1), "cut short"),
         (lambda d: cut(saved(d, "a.compressed.ply"), 3000), "cut short"),
+        (
+            lambda d: with_bytes(saved(d, "a.compressed.ply"), b"element vertex ", b"element vertex 9999999999"),
+            r"expected numbers of elements that fit \d+ bytes, got 9999999999\d",
+        ),
         (lambda d: cut(saved(d, "a.spz"), -20), "cut short .Could not gunzip"),
         (lambda d: text_file(d, "a.spz", "not a scene"), "Not an SPZ file"),
         (lambda d: with_value(d, "y", np.nan), "means must be finite, got 2 of 5"),

@@ -262,6 +262,54 @@ def test_nerfstudio_folder(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "lists, train, test",
+    [
+        ({"train": (1, 2, 3), "val": (4, 5), "test": (0, 8)}, (1, 2, 3), (0, 8)),
+        ({"train": (7, 6, 5), "val": (0,), "test": ()}, (5, 6, 7), (0,)),
+        ({"val": (3,), "test": (4, 5)}, (0, 1, 2, 6, 7, 8), (4, 5)),
+        ({"train": (0, 2)}, (0, 2), ()),
+        ({"train": (), "test": ()}, (1, 2, 3, 4, 5, 6, 7), (0, 8)),
+    ],
+)
+def test_nerfstudio_lists_of_pictures(tmp_path, lists, train, test):
+    """Written with and without ./ before them, for the frames are too, and in any order."""
+    names = {f"{split}_filenames": [f"./images/r_{i}.png" for i in chosen] for split, chosen in lists.items()}
+    write_nerfstudio(tmp_path, lambda content: content.update(names))
+    found = training.load_capture(tmp_path)
+    assert [item.view.name for item in found.train] == [f"r_{i}" for i in train]
+    assert [item.view.name for item in found.test] == [f"r_{i}" for i in test]
+
+
+@pytest.mark.parametrize(
+    "lists, message",
+    [
+        (
+            {"train_filenames": ["images/r_1.png", "r_2.png"]},
+            "train_filenames must name pictures of the frames, got r_2.png",
+        ),
+        ({"test_filenames": "images/r_1.png"}, "test_filenames must be a list of names, got 'images/r_1.png'"),
+        ({"val_filenames": [1]}, "val_filenames must be a list of names, got [1]"),
+    ],
+)
+def test_nerfstudio_lists_of_other_things(tmp_path, lists, message):
+    write_nerfstudio(tmp_path, lambda content: content.update(lists))
+    with pytest.raises(io.SceneError) as raised:
+        training.load_capture(tmp_path)
+    assert str(raised.value) == f"{tmp_path / 'transforms.json'}: {message}"
+
+
+def test_nerfstudio_masks_are_ignored_and_the_user_is_told(tmp_path):
+    def add_masks(content):
+        for frame in content["frames"][::3]:
+            frame["mask_path"] = "masks/r.png"
+
+    write_nerfstudio(tmp_path, add_masks)
+    with pytest.warns(UserWarning, match="transforms.json: the masks of 3 pictures are ignored") as told:
+        assert len(training.load_capture(tmp_path).train) == 7
+    assert len(told) == 1 and told[0].filename == __file__
+
+
+@pytest.mark.parametrize(
     "change, message",
     [
         (
@@ -317,6 +365,26 @@ def test_multi_scale_blender_folder(tmp_path):
     assert [loaded.settings[scale][1].image_width for scale in (1, 2, 4)] == [32, 16, 8]
 
 
+@pytest.mark.parametrize(
+    "key, value, message",
+    [
+        ("file_path", 3, "file_path must be names of pictures, got 3"),
+        ("cam2world", "x", 'cam2world of train/a.png must hold 4 x 4 finite numbers, got "x"'),
+        ("width", 0, "width of train/a.png must be a whole number from 1 to 2^20, got 0"),
+        ("height", math.inf, "height of train/a.png must be a whole number from 1 to 2^20, got Infinity"),
+        ("focal", "far", 'focal of train/a.png must be a positive finite number, got "far"'),
+    ],
+)
+def test_metadata_with_other_things_than_numbers(tmp_path, capsys, key, value, message):
+    """Some of them were tracebacks, others named no file."""
+    pose = opengl_pose(circle(1)[0])
+    rows = {"file_path": ["train/a.png"], "cam2world": [pose], "width": [32.0], "height": [32.0], "focal": [36.0]}
+    metadata = {"train": rows | {key: [value]}, "test": rows}
+    (tmp_path / "metadata.json").write_text(json.dumps(metadata))
+    assert cli.main(["train", str(tmp_path), "--out", str(tmp_path / "out"), "--device", "cpu"]) == 2
+    assert capsys.readouterr().err == f"error: {tmp_path / 'metadata.json'}: {message}\n"
+
+
 @pytest.mark.parametrize("layout", ["binary_little_endian", "ascii"])
 def test_points_of_a_ply(tmp_path, layout):
     rows = np.array(
@@ -361,6 +429,13 @@ def test_colors_of_points_in_every_type(tmp_path, kind, largest):
 def test_colors_of_points_out_of_range(tmp_path, kind, color):
     with pytest.raises(io.SceneError, match=r"p\.ply: expected colours from 0 to 255, got "):
         points_with_colors(tmp_path / "p.ply", kind, [(0, 1, color)])
+
+
+@pytest.mark.parametrize("color", [10**30, -(10**30)])  # of smaller ones, earlier versions of NumPy keep some bits
+def test_colors_of_points_that_their_type_does_not_hold(tmp_path, color):
+    """They were a traceback."""
+    with pytest.raises(io.SceneError, match=r"p\.ply: expected 6 numbers in every row"):
+        points_with_colors(tmp_path / "p.ply", "uchar", [(0, 1, color)])
 
 
 @pytest.mark.parametrize("content", ["{}", "[1, 2]", "3", "no JSON"])
@@ -884,7 +959,8 @@ def test_errors_of_picture_gradients(changed, error, message):
         torch.ops.analytic_rasterizer.picture_gradients(**picture_arguments("cpu", **changed))
 
 
-def test_ctrl_c_saves_and_resumes(synthetic, tmp_path, capsys, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_and_sigterm_save_and_training_resumes(synthetic, tmp_path, capsys, monkeypatch, number):
     """The step that runs is completed; the end is the same as without the interruption."""
     arguments = ["train", str(synthetic), "--device", "cpu", "--iterations", "60", "--random-points", "50"]
     arguments += ["--sh-degree", "0", "--scales", "1"]
@@ -893,13 +969,13 @@ def test_ctrl_c_saves_and_resumes(synthetic, tmp_path, capsys, monkeypatch):
 
     def interrupted(trainer):
         if trainer.progress.step == 33:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
         step(trainer)
 
     monkeypatch.setattr(training.Trainer, "step", interrupted)
-    before = signal.getsignal(signal.SIGINT)
+    before = signal.getsignal(number)
     assert cli.main([*arguments, "--out", str(tmp_path / "part")]) == 130
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(number) is before
     assert "stopped after 34 steps and saved; go on with --resume" in capsys.readouterr().out
     assert (tmp_path / "part" / files.SCENE).exists()
     monkeypatch.undo()
@@ -921,6 +997,44 @@ def test_a_second_ctrl_c_ends_at_once(synthetic, tmp_path, monkeypatch):
     monkeypatch.setattr(run.trainer, "step", interrupted)
     with pytest.raises(KeyboardInterrupt):
         run.train()
+
+
+def test_a_second_sigterm_kills(synthetic, tmp_path, monkeypatch):
+    run = make_run(synthetic, tmp_path, iterations=3)
+    step, handlers = run.trainer.step, []
+
+    def interrupted():
+        step()
+        signal.raise_signal(signal.SIGTERM)
+        handlers.append(signal.getsignal(signal.SIGTERM))
+
+    monkeypatch.setattr(run.trainer, "step", interrupted)
+    assert not run.train() and handlers == [signal.SIG_DFL]
+
+
+def test_a_handler_of_the_program_for_sigterm_stays(synthetic, tmp_path, monkeypatch):
+    run, received = make_run(synthetic, tmp_path, iterations=3), []
+    step = run.trainer.step
+
+    def signalled():
+        step()
+        signal.raise_signal(signal.SIGTERM)
+
+    monkeypatch.setattr(run.trainer, "step", signalled)
+    before = signal.signal(signal.SIGTERM, lambda number, _: received.append(number))
+    try:
+        assert run.train() and len(received) == 3
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def test_a_folder_that_became_read_only_is_reported_by_the_name_of_the_file(tmp_path, monkeypatch):
+    def read_only(path, **_):
+        raise OSError(30, "Read-only file system", str(path))
+
+    monkeypatch.setattr(type(tmp_path), "unlink", read_only)
+    with pytest.raises(OSError, match=r"options\.json: cannot be written \(Read-only file system\)"):
+        files.write_safely(tmp_path / files.OPTIONS, read_only)
 
 
 def full_disk(state, path) -> None:
@@ -1186,6 +1300,14 @@ def test_training_starts_from_a_scene(synthetic, trained, tmp_path):
     assert run.trainer.gaussians.shs.shape[1] == 9 and (run.trainer.gaussians.shs[:, 4:] == 0).all()
 
 
+def test_training_does_not_start_from_a_scene_without_gaussians(synthetic, trained, tmp_path, capsys):
+    scene = io.load_scene(trained / files.SCENE)
+    io.save_scene(tmp_path / "none.ply", io.Scene(*(field[:0] for field in scene[:5]), scene.sh_degree))
+    arguments = ["train", str(synthetic), "--out", str(tmp_path / "out"), "--device", "cpu"]
+    assert cli.main([*arguments, "--points", str(tmp_path / "none.ply")]) == 2
+    assert capsys.readouterr().err == f"error: {tmp_path / 'none.ply'}: the scene has no Gaussians\n"
+
+
 def test_evaluate_compares_footprints(trained, capsys):
     arguments = ["evaluate", str(trained), "--footprint", "box:samples=4", "point", "--scales", "1,2,4"]
     assert cli.main([*arguments, "--lpips", "none", "--pictures", "1"]) == 0
@@ -1201,6 +1323,32 @@ def test_evaluate_compares_footprints(trained, capsys):
     assert drawn.size == (3 * 16, 16)
     truth = np.array(drawn)[:, :16]
     assert np.array_equal(truth, cpu_test_pictures_at(trained).colors[2][0].permute(1, 2, 0).numpy())
+
+
+def refuse_constant(name):
+    raise AssertionError(f"{name} is no JSON")
+
+
+def test_a_picture_without_error_has_a_psnr_that_json_can_hold(tmp_path):
+    """Of a camera that looks away from everything: its picture is the background and nothing else."""
+    away = looking_at_origin(0.0)
+    away[2, 3] = -40
+    seen, empty = circle(4), [io.View("away", 32, 32, 36.0, 36.0, away), io.View("seen", 32, 32, 36.0, 36.0, away)]
+    write_nerf_synthetic(tmp_path / "scene", seen, empty)
+    (tmp_path / "scene" / "test" / "seen.png").unlink()
+    shutil.copy(tmp_path / "scene" / "train" / "r_0.png", tmp_path / "scene" / "test" / "seen.png")
+    arguments = ["train", str(tmp_path / "scene"), "--out", str(tmp_path / "out"), "--device", "cpu"]
+    assert cli.main([*arguments, "--iterations", "1", "--sh-degree", "0", "--random-points", "50"]) == 0
+    assert cli.main(["evaluate", str(tmp_path / "out"), "--lpips", "none", "--pictures", "0"]) == 0
+    metrics = json.loads((tmp_path / "out" / files.METRICS).read_text(), parse_constant=refuse_constant)
+    evaluation = (tmp_path / "out" / "evaluation.json").read_text()
+    of_evaluation = json.loads(evaluation, parse_constant=refuse_constant)["results"]["moment:samples=4"]
+    for measured in (metrics["test"], of_evaluation):
+        views = measured["1"]["views"]
+        assert views[0] == {"psnr": None, "ssim": pytest.approx(1)} and 0 < views[1]["psnr"] < 99
+        assert measured["1"]["psnr"] is None and measured["mean"]["psnr"] is None
+    files.write_log(tmp_path / files.LOG, [{"step": 10, "psnr": math.inf}, {"step": 20, "psnr": 30.5}])
+    assert (tmp_path / files.LOG).read_text() == '{"step": 10, "psnr": null}\n{"step": 20, "psnr": 30.5}\n'
 
 
 @pytest.mark.parametrize("scales, got", [("1,0", "(1, 0)"), ("-1", "(-1,)")])
@@ -1451,7 +1599,7 @@ def test_resuming_takes_the_points_of_the_start_or_none(synthetic, trained, tmp_
     capsys.readouterr()
     for command, expected in ((began, f"{tmp_path / 'a.ply'} or None"), (alone, "None")):
         assert cli.main([*command, "--resume", "--points", "b.ply"]) == 2
-        error = f"error: points must be {expected} where a training is resumed, got b.ply\n"
+        error = f"error: points must be {expected} where a training is resumed, got {tmp_path / 'b.ply'}\n"
         assert capsys.readouterr().err == error
     assert all(path.read_bytes() == content for path, content in written.items())
     # A checkpoint from before they were noted.

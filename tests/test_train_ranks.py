@@ -441,7 +441,8 @@ def test_nothing_of_a_process_group_outlives_it():
         pytest.skip("this version of torch gives the threads of a group other names")
 
 
-def test_nothing_of_a_process_group_outlives_an_interrupted_training(made, tmp_path):
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM"])
+def test_nothing_of_a_process_group_outlives_an_interrupted_training(made, tmp_path, name):
     program = f"""{COUNT_THREADS}
         import signal, sys
         from analytic_rasterizer import cli
@@ -452,7 +453,7 @@ def test_nothing_of_a_process_group_outlives_an_interrupted_training(made, tmp_p
         def interrupted(trainer):
             step(trainer)
             if trainer.progress.step >= 6 and trainer.ranks.rank == 1:
-                signal.raise_signal(signal.SIGINT)
+                signal.raise_signal(signal.{name})
 
         sharded.ShardedTrainer.step = interrupted
         code = cli.main(sys.argv[1:])

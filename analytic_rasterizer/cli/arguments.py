@@ -97,9 +97,21 @@ def use_machine(args) -> None:
 def writable_folder(path: str) -> Path:
     """The folder, made if it is missing; OSError before any work is done when it cannot be used."""
     folder = Path(path)
+    if folder.is_file():
+        raise NotADirectoryError(f"{folder}: expected a folder for the results, got a file")
     folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryFile(dir=folder):
-        return folder
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError as error:  # which names the temporary file
+        raise OSError(error.errno, error.strerror, str(folder)) from None
+
+
+def check_writable_file(path: str) -> None:
+    """Makes the file's folder if it is missing; OSError before any work is done when the file cannot be written."""
+    writable_folder(Path(path).parent)
+    if Path(path).is_dir():
+        raise IsADirectoryError(f"{path}: expected a file for the results, got a folder")
 
 
 def _number(kind, accepts, expected: str):

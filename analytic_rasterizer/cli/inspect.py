@@ -7,7 +7,7 @@ from pathlib import Path
 
 from .. import io
 from ..analysis.planner import inspect_scene
-from .arguments import add_scale, add_scene, count, tolerance, use_machine, writable_folder
+from .arguments import add_scale, add_scene, check_writable_file, count, tolerance, use_machine
 
 
 def add_parser(subcommands) -> None:
@@ -45,7 +45,7 @@ def run(args) -> None:
     training = None if args.training_views is None else io.load_views(args.training_views, args.size)
     for path in (args.json, args.picture):
         if path not in (None, "-"):
-            writable_folder(Path(path).parent)
+            check_writable_file(path)
     scene = io.load_scene(args.scene).to(args.device)
     found = inspect_scene(scene, views, args.tolerance, training, scale=args.scale, background=args.background)
     if args.picture:

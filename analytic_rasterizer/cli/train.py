@@ -47,15 +47,15 @@ def add_parser(subcommands) -> None:
         help="train a scene from photographs",
         description="Train Gaussians on the pictures of SCENE, a folder of a NeRF-synthetic scene, of the multi-scale "
         "Blender set, of a COLMAP reconstruction or of a nerfstudio capture. Writes scene.ply, cameras.json, "
-        "metrics.json, log.jsonl, options.json and checkpoint.pt to DIR. Ctrl-C saves and ends; --resume goes on. "
-        "Under torchrun, several processes train one scene together.",
+        "metrics.json, log.jsonl, options.json and checkpoint.pt to DIR. Ctrl-C or SIGTERM saves and ends; --resume "
+        "goes on. Under torchrun, several processes train one scene together.",
     )
     add = parser.add_argument
     add("scene", metavar="SCENE", help="folder of pictures with cameras")
     add("--out", required=True, metavar="DIR", help="folder for the results")
     images = f"folder in SCENE of a reconstruction's photographs (default: {IMAGES})"
     add("--images", metavar="NAME", help=images)  # what is not given is None, for --resume
-    test_every = f"keep every N-th photograph for the test; 0: none (default: {TEST_PERIOD})"
+    test_every = f"where SCENE does not say: keep every N-th photograph for the test; 0: none (default: {TEST_PERIOD})"
     add("--test-every", type=int, metavar="N", help=test_every)
     add("--points", metavar="FILE.ply", help="start from this: a 3DGS scene, or points with colours")
     preset = "options that belong together: quick, 7,000 steps; 3dgs, the recipe of 3DGS; what is given wins"

@@ -174,9 +174,14 @@ PLY_COLUMNS = (
 def _check_ply_header(path: Path) -> None:
     """Says what is wrong with a .ply that gsply would refuse without a reason, or misread: it
     takes every vertex property for a float, whatever the header says."""
-    lines = ply_header(path)
+    lines, size = ply_header(path), path.stat().st_size
     if any(line.startswith("element chunk") for line in lines):
-        return  # compressed: gsply checks the layout
+        # Compressed: gsply checks the layout, but allocates memory for whatever numbers there are.
+        numbers = [line.split()[-1] for line in lines if line.startswith("element ")]
+        unfit = [number for number in numbers if not number.isdecimal() or int(number) > size]
+        if unfit:
+            raise SceneError(f"expected numbers of elements that fit {size} bytes, got {unfit[0]}")
+        return
     layout = ply_layout(lines)
     if layout != "binary_little_endian":
         raise SceneError(f"expected format binary_little_endian, got {layout}")
@@ -191,7 +196,6 @@ def _check_ply_header(path: Path) -> None:
     rest = sum(name.startswith("f_rest_") for name in kinds)
     if rest not in (0, 9, 24, 45):
         raise SceneError(f"expected 0, 9, 24 or 45 f_rest properties (SH degree 0 to 3), got {rest}")
-    size = path.stat().st_size
     if not number.isdecimal() or 4 * int(number) * len(kinds) > size:
         raise SceneError(f"expected a number of vertices that fits {size} bytes, got {number}")
 

@@ -176,7 +176,7 @@ def _listed_view(i: int, entry: dict) -> View:
     """A view of cameras.json or of the plain list."""
     where = f"view {i}"
     if "w2c" in entry:
-        w2c = _pose(entry["w2c"], f"{where}: w2c")
+        w2c = checked_pose(entry["w2c"], f"{where}: w2c")
     elif "rotation" in entry:
         w2c = torch.eye(4, dtype=torch.float64, device="cpu")
         w2c[:3, :3] = _numbers(entry["rotation"], (3, 3), f"{where}: rotation").T
@@ -188,10 +188,10 @@ def _listed_view(i: int, entry: dict) -> View:
     name = entry.get("img_name", entry.get("name", ""))
     return View(
         name=_picture_name(name, i),
-        width=_pixels(_get(entry, "width", where), f"{where}: width"),
-        height=_pixels(_get(entry, "height", where), f"{where}: height"),
-        fx=_positive(_get(entry, "fx", where), f"{where}: fx"),
-        fy=_positive(_get(entry, "fy", where), f"{where}: fy"),
+        width=checked_pixels(_get(entry, "width", where), f"{where}: width"),
+        height=checked_pixels(_get(entry, "height", where), f"{where}: height"),
+        fx=checked_positive(_get(entry, "fx", where), f"{where}: fx"),
+        fy=checked_positive(_get(entry, "fy", where), f"{where}: fy"),
         w2c=w2c,
         cx=_optional(entry, "cx", where),
         cy=_optional(entry, "cy", where),
@@ -203,10 +203,10 @@ def _transforms_view(i: int, frame: dict, shared: dict, size) -> View:
     entry = shared | frame  # a frame's own intrinsics go before the shared ones
     _check_camera_model(entry.get("camera_model"))
     if "w" in entry or "h" in entry:
-        width = _pixels(_get(entry, "w", where), f"{where}: w")
-        height = _pixels(_get(entry, "h", where), f"{where}: h")
+        width = checked_pixels(_get(entry, "w", where), f"{where}: w")
+        height = checked_pixels(_get(entry, "h", where), f"{where}: h")
     elif size is not None:
-        width, height = (_pixels(number, "size") for number in size)
+        width, height = (checked_pixels(number, "size") for number in size)
     else:
         raise SceneError(
             f"{where}: no image size: expected 'w' and 'h', a picture at 'file_path', "
@@ -217,7 +217,7 @@ def _transforms_view(i: int, frame: dict, shared: dict, size) -> View:
         raise SceneError(f"{where}: expected 'fl_x' or 'camera_angle_x'")
     fy = _focal(entry, "fl_y", "camera_angle_y", height, where)
     matrix = f"{where}: transform_matrix"
-    c2w = _pose(_get(entry, "transform_matrix", where), matrix)
+    c2w = checked_pose(_get(entry, "transform_matrix", where), matrix)
     c2w[:3, 1:3] *= -1  # OpenGL looks along -z with y up
     return View(
         name=_picture_name(entry.get("file_path", ""), i),
@@ -234,10 +234,10 @@ def _transforms_view(i: int, frame: dict, shared: dict, size) -> View:
 def _focal(entry: dict, length: str, angle: str, extent: int, where: str) -> float | None:
     """Focal length in pixels, from itself or from the angle that `extent` pixels span."""
     if length in entry:
-        return _positive(entry[length], f"{where}: {length}")
+        return checked_positive(entry[length], f"{where}: {length}")
     if angle not in entry:
         return None
-    value = _positive(entry[angle], f"{where}: {angle}")
+    value = checked_positive(entry[angle], f"{where}: {angle}")
     if value >= math.pi:
         raise SceneError(f"{where}: {angle} must be below pi (radians), got {value}")
     return extent / (2 * math.tan(value / 2))
@@ -289,8 +289,8 @@ def with_distinct_names(views: list[View]) -> list[View]:
     return views
 
 
-def _pose(value, where: str) -> torch.Tensor:
-    """A rigid transform: 4 x 4, or 16 numbers by rows."""
+def checked_pose(value, where: str) -> torch.Tensor:
+    """A rigid transform of a file: 4 x 4, or 16 numbers by rows. Raises SceneError, which begins with `where`."""
     flat = isinstance(value, list) and len(value) == 16
     pose = _numbers(value, (16,) if flat else (4, 4), where).reshape(4, 4)
     if not torch.allclose(pose[3], pose.new_tensor([0, 0, 0, 1]), atol=1e-4):
@@ -325,13 +325,15 @@ def _is_number(value) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e30
 
 
-def _positive(value, where: str) -> float:
+def checked_positive(value, where: str) -> float:
+    """A positive number of a file. Raises SceneError, whose message begins with `where`."""
     if not _is_number(value) or value < 1e-6:
         raise SceneError(f"{where} must be a positive finite number, got {_shorten(value)}")
     return float(value)
 
 
-def _pixels(value, where: str) -> int:
+def checked_pixels(value, where: str) -> int:
+    """A width or height of a file, px. Raises SceneError, whose message begins with `where`."""
     if not _is_number(value) or value < 1 or value != int(value) or value > 2**20:
         raise SceneError(f"{where} must be a whole number from 1 to 2^20, got {_shorten(value)}")
     return int(value)

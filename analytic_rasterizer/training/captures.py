@@ -7,7 +7,9 @@ reconstructions (sparse/0, sparse or colmap/sparse/0; binary or text) and nerfst
 from __future__ import annotations
 
 import json
+import os
 import re
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -17,6 +19,7 @@ from torch import Tensor
 
 from .. import io
 from ..io.scenes import ply_layout, ply_vertices
+from ..io.views import checked_pixels, checked_pose, checked_positive
 from . import colmap
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -51,6 +54,8 @@ def load_capture(folder, images: str = IMAGES, test_every: int = TEST_PERIOD) ->
         test_every: Where the capture does not say what is for the test: one in so many pictures, the first by name
             among them; 0 for none.
 
+    Warns of masks in a nerfstudio capture, which are ignored.
+
     Raises:
         io.SceneError: No such layout; missing pictures; no pictures to train with; all cameras at one place; lens
             distortion.
@@ -77,8 +82,7 @@ def load_capture(folder, images: str = IMAGES, test_every: int = TEST_PERIOD) ->
         named = [Photograph(view, {1: folder / images / name}) for name, view in colmap.load_views(sparse)]
         capture = Capture(*_split(named, test_every), BLACK, colmap.load_points(sparse))
     elif (folder / "transforms.json").exists():
-        named = sorted(transforms(folder / "transforms.json"), key=lambda item: str(item.files[1]))
-        capture = Capture(*_split(named, test_every), BLACK, initial_points(folder))
+        capture = Capture(*nerfstudio(folder / "transforms.json", test_every), BLACK, initial_points(folder))
     else:
         raise io.SceneError(
             f"{folder}: expected transforms_train.json, metadata.json, transforms.json, or COLMAP's cameras, images "
@@ -121,10 +125,46 @@ def transforms(path: Path) -> list[Photograph]:
     found = []
     for i, (view, frame) in enumerate(zip(views, data["frames"])):
         check_lens(data | frame, f"{path}: frame {i}")
-        file = path.parent / str(frame.get("file_path", ""))
-        # NeRF-synthetic leaves out the suffix, and its names may hold points.
-        found.append(Photograph(view, {1: file if file.is_file() else file.with_name(file.name + ".png")}))
+        found.append(Photograph(view, {1: _picture(path.parent, str(frame.get("file_path", "")))}))
     return found
+
+
+def _picture(folder: Path, name: str) -> Path:
+    """The file that a transforms file names."""
+    file = folder / name
+    # NeRF-synthetic leaves out the suffix, and its names may hold points.
+    return file if file.is_file() else Path(f"{file}.png")
+
+
+def nerfstudio(path: Path, test_every: int) -> tuple[list[Photograph], list[Photograph]]:
+    """Pictures to train with and to test with, by name: what the lists of a transforms.json say, if it has any.
+
+    They are train_filenames, val_filenames and test_filenames. The test takes the last, or where that is missing the
+    one before. Without the first, the training takes the pictures that neither of the others has.
+
+    Warns of masks, which are ignored.
+
+    Raises io.SceneError for what `transforms` refuses, and for lists of anything but pictures of the file.
+    """
+    items = sorted(transforms(path), key=lambda item: str(item.files[1]))
+    data = json.loads(path.read_text(encoding="utf-8-sig"))
+    masks = sum(frame.get("mask_path") is not None for frame in data["frames"])
+    if masks:
+        warnings.warn(f"{path}: the masks of {masks} pictures are ignored, all of their pixels count", stacklevel=3)
+    files, lists = [os.path.normpath(item.files[1]) for item in items], {}
+    for split in ("train", "val", "test"):
+        names = data.get(f"{split}_filenames") or []
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise io.SceneError(f"{path}: {split}_filenames must be a list of names, got {names!r}")
+        lists[split] = {os.path.normpath(_picture(path.parent, name)): name for name in names}
+        unknown = [name for file, name in lists[split].items() if file not in files]
+        if unknown:
+            raise io.SceneError(f"{path}: {split}_filenames must name pictures of the frames, got {unknown[0]}")
+    if not any(lists.values()):
+        return _split(items, test_every)
+    train = lists["train"] or set(files) - lists["val"].keys() - lists["test"].keys()
+    test = lists["test"] or lists["val"]
+    return tuple([item for file, item in zip(files, items) if file in chosen] for chosen in (train, test))
 
 
 def check_lens(entry: dict, where: str) -> None:
@@ -158,16 +198,20 @@ def multi_scale_blender(folder: Path, split: str) -> list[Photograph]:
         raise io.SceneError(f"{path}: not the metadata of the multi-scale Blender set ({error!r})") from None
     found: list[Photograph] = []
     for name, pose, width, height, focal in rows:
-        c2w = torch.tensor(pose, dtype=torch.float64, device="cpu")
-        if c2w.shape != (4, 4) or not c2w.isfinite().all():
-            raise io.SceneError(f"{path}: cam2world of {name} must hold 4 x 4 finite numbers")
+        if not isinstance(name, str):
+            raise io.SceneError(f"{path}: file_path must be names of pictures, got {name!r}")
+        c2w = checked_pose(pose, f"{path}: cam2world of {name}")
+        width, height = (
+            checked_pixels(value, f"{path}: {key} of {name}") for key, value in (("width", width), ("height", height))
+        )
+        focal = checked_positive(focal, f"{path}: focal of {name}")
         c2w[:3, 1:3] *= -1
         w2c = torch.linalg.inv(c2w)
         largest = found[-1].view if found else None
         if largest is not None and largest.width > width and torch.equal(largest.w2c, w2c):
             found[-1].files[round(largest.width / width)] = folder / name
         else:
-            view = io.View(Path(name).stem, round(width), round(height), float(focal), float(focal), w2c)
+            view = io.View(Path(name).stem, width, height, focal, focal, w2c)
             found.append(Photograph(view, {1: folder / name}))
     return found
 
@@ -232,7 +276,7 @@ def load_points(path: Path) -> tuple[Tensor, Tensor]:
     elif layout == "ascii":
         try:
             rows = np.array([tuple(line.split()[: len(names)]) for line in body.decode().splitlines()[:count]], dtype)
-        except ValueError as error:  # too few words, words that are no numbers, or no text at all
+        except (ValueError, OverflowError) as error:  # too few words, words that are no numbers of the type, or no text
             raise io.SceneError(f"{path}: expected {len(names)} numbers in every row ({error})") from None
     else:
         raise io.SceneError(f"{path}: cut short, or neither ascii nor binary_little_endian but {layout}")

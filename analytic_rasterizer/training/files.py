@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -35,17 +37,28 @@ def write_safely(path: Path, write: Callable[[Path], None]) -> None:
         reason = getattr(error, "strerror", None) or str(error).partition("\n")[0]
         raise OSError(f"{path}: cannot be written ({reason}); an earlier file of this name is unchanged") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # where files cannot be removed either, the first error is the one to report
+            temporary.unlink(missing_ok=True)
 
 
 def write_json(path: Path, value: Any) -> None:
-    text = json.dumps(value, indent=1) + "\n"
+    """Numbers that are not finite, such as the PSNR of a picture without any error, become null."""
+    text = json.dumps(_as_json(value), indent=1, allow_nan=False) + "\n"
     write_safely(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
+def _as_json(value: Any) -> Any:
+    """What JSON has a word for: it has none for infinity and NaN, and other programs refuse files with Python's."""
+    if isinstance(value, dict):
+        return {key: _as_json(of_key) for key, of_key in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_as_json(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def write_log(path: Path, entries: list[dict]) -> None:
-    """One JSON object per line."""
-    text = "".join(json.dumps(entry) + "\n" for entry in entries)
+    """One JSON object per line, with null as in `write_json`."""
+    text = "".join(json.dumps(_as_json(entry), allow_nan=False) + "\n" for entry in entries)
     write_safely(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 

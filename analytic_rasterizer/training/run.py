@@ -100,8 +100,7 @@ class Run:
             options = TrainingOptions.from_dict(state["options"])
         self.options = options or TrainingOptions()
         # Where the scene is, from wherever `evaluate` is called.
-        self.source = {"scene": os.path.abspath(scene), **pictures_of_source(images, test_every, state)}
-        self.source["points"] = points_of_source(points, state)
+        self.source = {"scene": os.path.abspath(scene), **source_of(images, test_every, points, state)}
         self.capture = load_capture(scene, self.source["images"], self.source["test_every"])
         if state is None:  # raises before the pictures are read
             start, self.points_found = first_gaussians(self.options, self.capture, points)
@@ -122,6 +121,8 @@ class Run:
                 )
             self.trainer.load_state_dict(state)
             self.clock.total, self.history = state["seconds"], state["history"]
+        if self.out.is_file():
+            raise NotADirectoryError(f"{self.out}: expected a folder for the results, got a file")
         self.out.mkdir(parents=True, exist_ok=True)
 
     @property
@@ -129,7 +130,7 @@ class Run:
         return self.trainer.progress
 
     def train(self, viewer: LiveViewer | None = None) -> bool:
-        """Trains to the end, or until Ctrl-C, and writes everything. Returns whether it came to the end.
+        """Trains to the end, or until Ctrl-C or SIGTERM, and writes everything. Returns whether it came to the end.
 
         Args:
             viewer: Is shown the scene, between steps; no step waits for its frames. It is left running.
@@ -303,33 +304,21 @@ class Run:
         self.clock.start()
 
 
-def pictures_of_source(images: str | None, test_every: int | None, state: dict[str, Any] | None) -> dict[str, Any]:
-    """`images` and `test_every` of a training: those that are given or usual, or of its checkpoint, if it is resumed.
+def source_of(images: str | None, test_every: int | None, points, state: dict[str, Any] | None) -> dict[str, Any]:
+    """Where pictures and points come from: as given or usual, or as in the checkpoint of a training that is resumed.
 
-    Raises ValueError for others than it began with: it would go on with other pictures.
+    Raises ValueError for another source than it began with: it would go on with other pictures, or points of no effect.
     """
-    usual = {"images": IMAGES, "test_every": TEST_PERIOD} if state is None else state["source"]
-    chosen = {}
-    for name, given in (("images", images), ("test_every", test_every)):
-        chosen[name] = usual[name] if given is None else given
-        if state is not None and chosen[name] != usual[name]:
-            raise ValueError(f"{name} must be {usual[name]} or None where a training is resumed, got {given}")
+    given = {"images": images, "test_every": test_every, "points": points and str(Path(points).resolve())}
+    usual = {"images": IMAGES, "test_every": TEST_PERIOD, "points": None}
+    if state is not None:
+        usual = given | state["source"]  # which has no points in earlier versions: nobody knows them
+    chosen = {name: usual[name] if value is None else value for name, value in given.items()}
+    for name, value in chosen.items():
+        if state is not None and value != usual[name]:
+            expected = "None" if usual[name] is None else f"{usual[name]} or None"
+            raise ValueError(f"{name} must be {expected} where a training is resumed, got {value}")
     return chosen
-
-
-def points_of_source(points, state: dict[str, Any] | None) -> str | None:
-    """What a training began with, of the `points` that are given now and its checkpoint, if it is resumed.
-
-    Raises ValueError for other points than it began with, which would have no effect.
-    """
-    given = None if points is None else str(Path(points).resolve())
-    if state is None or "points" not in state["source"]:  # of an earlier version: nobody knows
-        return given
-    before = state["source"]["points"]
-    if points is not None and given != before:
-        expected = "None" if before is None else f"{before} or None"
-        raise ValueError(f"points must be {expected} where a training is resumed, got {points}")
-    return before
 
 
 def first_gaussians(options: TrainingOptions, capture: Capture, points) -> tuple[Gaussians, int | None]:
@@ -339,10 +328,12 @@ def first_gaussians(options: TrainingOptions, capture: Capture, points) -> tuple
     Gaussians are those of a scene, or random.
 
     Raises:
-        ValueError: A scene of more Gaussians than `max_gaussians`; what `starting_gaussians` raises.
+        ValueError: A scene without Gaussians, or with more than `max_gaussians`; what `starting_gaussians` raises.
     """
     if points is not None and is_scene(Path(points)):
         scene = io.load_scene(points)
+        if not len(scene.means):  # from which nothing would ever grow
+            raise io.SceneError(f"{points}: the scene has no Gaussians")
         if len(scene.means) > options.gaussian_limit:
             expected = f"at least {len(scene.means)}, the Gaussians of {points}, or 0"
             raise ValueError(f"max_gaussians must be {expected}, got {options.max_gaussians}")
@@ -353,19 +344,27 @@ def first_gaussians(options: TrainingOptions, capture: Capture, points) -> tuple
 
 @contextmanager
 def interruption() -> Iterator[threading.Event]:
-    """Ctrl-C sets the event, so that the step that runs is completed; a second Ctrl-C raises KeyboardInterrupt."""
+    """Ctrl-C or SIGTERM sets the event, so that the step that runs is completed; a second one ends the process at once.
+
+    A second Ctrl-C raises KeyboardInterrupt. A handler of the program for SIGTERM is left in place.
+    """
     stopped = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stopped  # only the main thread may look at signals
         return
-    before = signal.getsignal(signal.SIGINT)
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    if signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
+        del usual[signal.SIGTERM]
+    before = {number: signal.getsignal(number) for number in usual}
 
-    def stop(*_) -> None:
+    def stop(number: int, _) -> None:
         stopped.set()
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(number, usual[number])
 
-    signal.signal(signal.SIGINT, stop)
     try:
+        for number in usual:
+            signal.signal(number, stop)
         yield stopped
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
