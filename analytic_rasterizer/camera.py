@@ -51,8 +51,8 @@ def camera_settings(
 
     Raises:
         TypeError: world_to_camera or bg is no tensor, or one of the numbers is none.
-        ValueError: world_to_camera has a wrong shape, a focal length that is a number is not positive, or width or
-            height is not a whole number.
+        ValueError: world_to_camera has a wrong shape, a focal length that is a number is not positive and finite, a
+            principal point that is one is not finite, or width or height is not a whole number.
     """
     width, height = whole_number("width", width), whole_number("height", height)
     check_tensors(None, world_to_camera=world_to_camera, **({} if bg is None else {"bg": bg}))
@@ -63,10 +63,10 @@ def camera_settings(
             if value.numel() != 1:
                 raise ValueError(f"{name} must be one number, got a tensor of shape {tuple(value.shape)}")
         elif name in ("fx", "fy"):
-            if not one_number(name, value) > 0:
-                raise ValueError(f"{name} must be positive, got {value}")
-        elif value is not None:
-            one_number(name, value)
+            if not 0 < one_number(name, value) < math.inf:
+                raise ValueError(f"{name} must be positive and finite, got {value}")
+        elif value is not None and not math.isfinite(one_number(name, value)):
+            raise ValueError(f"{name} must be finite, got {value}")
     view = world_to_camera.double()
     fx, fy, cx, cy = (
         torch.as_tensor(v, dtype=torch.float64, device=view.device).reshape(())

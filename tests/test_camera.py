@@ -1,5 +1,7 @@
 """Gradients of the camera, other projections, the lens and the shutter, on every device."""
 
+import math
+
 import numpy as np
 import pytest
 import reference
@@ -602,7 +604,13 @@ def test_the_filter_of_the_effects_is_apply_3d_filter(device, best):
         (TypeError, "bg must be a tensor, got int", lambda: ar.camera_settings(torch.eye(4), 4, 4, 1, 1, bg=0)),
         (TypeError, "tangent must be a tensor, got list", lambda: ar.moved(torch.eye(4), [0.0] * 6)),
         (TypeError, "floating-point dtype, got torch.int64", lambda: ar.moved(torch.eye(4).long(), torch.ones(6))),
-        (ValueError, "fx must be positive, got -1", lambda: ar.camera_settings(torch.eye(4), 4, 4, -1, 1)),
+        (ValueError, "fx must be positive and finite, got -1", lambda: ar.camera_settings(torch.eye(4), 4, 4, -1, 1)),
+        (
+            ValueError,
+            "fy must be positive and finite, got inf",
+            lambda: ar.camera_settings(torch.eye(4), 4, 4, 1, math.inf),
+        ),
+        (ValueError, "cx must be finite, got nan", lambda: ar.camera_settings(torch.eye(4), 4, 4, 1, 1, math.nan)),
         (ValueError, r"tangent \(6,\), got \(4, 4\) and \(3,\)", lambda: ar.moved(torch.eye(4), torch.zeros(3))),
         (TypeError, 'effects must be an Effects or "auto", got', lambda: CAMERA.settings(effects="all")),
     ],

@@ -91,5 +91,5 @@ def test_bad_numbers_and_arguments():
 
 def test_a_negative_degree_is_named_under_auto():
     settings = Camera(sh_degree=-1).settings(effects="auto")
-    with pytest.raises(ValueError, match="sh_degree must be 0 to 3, got -1"):
+    with pytest.raises(ValueError, match="sh_degree must be 0 to 4, got -1"):
         ar.GaussianRasterizer(settings)(**scenes.random_scene(1, 5))

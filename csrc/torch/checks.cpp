@@ -144,7 +144,8 @@ void check(Inputs& in) {
   }
   const int64_t columns = in.means2D && in.means2D->dim() == 2 && in.means2D->size(1) == 4 ? 4 : 3;
   like.check_rows_of(in.means2D, "means2D", {columns}, "(P, 3) or (P, 4)");
-  const int degrees = in.lens ? FullCamera<float>::kShDegree : Camera<float>::kShDegree;
+  const bool with_lens = in.lens || in.sh_degree < 0;  // what no camera has is told of the one that has most
+  const int degrees = with_lens ? FullCamera<float>::kShDegree : Camera<float>::kShDegree;
   TORCH_CHECK_VALUE(in.sh_degree >= 0 && in.sh_degree <= degrees, "sh_degree must be 0 to ", degrees, ", got ",
                     in.sh_degree);
   if (in.shs) {
