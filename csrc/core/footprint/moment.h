@@ -142,9 +142,9 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   template <class Cell> static constexpr double variance() { return kVariance * Cell::kUnits * Cell::kUnits; }
   /// v / kBase2^2, since (Sigma + v I)^-1 d = w^T z / kBase2^2.
   template <class Cell> static constexpr double step() { return variance<Cell>() / (kBase2 * kBase2); }
-  /// step() alpha / (1 - alpha), or zero where `composited` is zero and not alpha. The factor is in the divisor, where it
-  /// costs nothing on a device. On processors without fused multiply-adds the divisor is rounded twice, so that up to
-  /// 1 / (1 - kAlphaMax) = 100 roundings of the length are lost, 6e-6 of it in float.
+  /// step() alpha / (1 - alpha), or zero where `composited` is zero and not alpha. The factor is in the divisor, where
+  /// it costs nothing on a device. On processors without fused multiply-adds the divisor is rounded twice, so that up
+  /// to 1 / (1 - kAlphaMax) = 100 roundings of the length are lost, 6e-6 of it in float.
   template <typename T, class V, class Cell> AR_HD static V length_of(V alpha, V composited) {
     const V per_step = V(T(1 / step<Cell>()));
     return composited * divide(V(T(1)), madd(-per_step, alpha, per_step));
