@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 from .. import _C
+from ..training.files import results_folder
 from .launch import report
 
 # What a user can cause: bad values and files (ValueError, TypeError, OSError), a missing extra
@@ -96,10 +97,7 @@ def use_machine(args) -> None:
 
 def writable_folder(path: str) -> Path:
     """The folder, made if it is missing; OSError before any work is done when it cannot be used."""
-    folder = Path(path)
-    if folder.is_file():
-        raise NotADirectoryError(f"{folder}: expected a folder for the results, got a file")
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = results_folder(path)
     try:
         with tempfile.TemporaryFile(dir=folder):
             return folder

@@ -11,7 +11,7 @@ import os
 import re
 import warnings
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -76,8 +76,8 @@ def load_capture(folder, images: str = IMAGES, test_every: int = TEST_PERIOD) ->
         capture = Capture(train, test, WHITE, None)
     elif (folder / "transforms_train.json").exists():
         test_file = folder / "transforms_test.json"
-        test = transforms(test_file) if test_file.exists() else []
-        capture = Capture(transforms(folder / "transforms_train.json"), test, WHITE, initial_points(folder))
+        test = transforms(test_file)[0] if test_file.exists() else []
+        capture = Capture(transforms(folder / "transforms_train.json")[0], test, WHITE, initial_points(folder))
     elif sparse is not None:
         named = [Photograph(view, {1: folder / images / name}) for name, view in colmap.load_views(sparse)]
         capture = Capture(*_split(named, test_every), BLACK, colmap.load_points(sparse))
@@ -112,8 +112,8 @@ def extent_of(views: list[io.View]) -> float:
     return 1.1 * (centers - centers.mean(0)).norm(dim=1).max().item()
 
 
-def transforms(path: Path) -> list[Photograph]:
-    """The views of a transforms file and where their pictures are, in the order of the file.
+def transforms(path: Path) -> tuple[list[Photograph], dict[str, Any]]:
+    """The views of a transforms file and where their pictures are, in the order of the file; and all that it says.
 
     Raises io.SceneError for what `io.load_views` refuses, for lists of cameras, which it reads too, and for lens
     distortion, which it ignores.
@@ -126,7 +126,7 @@ def transforms(path: Path) -> list[Photograph]:
     for i, (view, frame) in enumerate(zip(views, data["frames"])):
         check_lens(data | frame, f"{path}: frame {i}")
         found.append(Photograph(view, {1: _picture(path.parent, str(frame.get("file_path", "")))}))
-    return found
+    return found, data
 
 
 def _picture(folder: Path, name: str) -> Path:
@@ -146,8 +146,8 @@ def nerfstudio(path: Path, test_every: int) -> tuple[list[Photograph], list[Phot
 
     Raises io.SceneError for what `transforms` refuses, and for lists of anything but pictures of the file.
     """
-    items = sorted(transforms(path), key=lambda item: str(item.files[1]))
-    data = json.loads(path.read_text(encoding="utf-8-sig"))
+    items, data = transforms(path)
+    items.sort(key=lambda item: str(item.files[1]))
     masks = sum(frame.get("mask_path") is not None for frame in data["frames"])
     if masks:
         warnings.warn(f"{path}: the masks of {masks} pictures are ignored, all of their pixels count", stacklevel=3)

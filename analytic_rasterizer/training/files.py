@@ -21,6 +21,15 @@ OPTIONS, METRICS, LOG = "options.json", "metrics.json", "log.jsonl"
 CHECKPOINT_FORMAT = 3
 
 
+def results_folder(path) -> Path:
+    """The folder `path`, made if it is missing. Raises NotADirectoryError for a file, OSError if it cannot be made."""
+    folder = Path(path)
+    if folder.is_file():
+        raise NotADirectoryError(f"{folder}: expected a folder for the results, got a file")
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
 def write_safely(path: Path, write: Callable[[Path], None]) -> None:
     """Lets `write` fill a file beside `path`, and gives it that name once it is complete and on the disk.
 

@@ -27,6 +27,7 @@ from .files import (
     OPTIONS,
     SCENE,
     read_checkpoint,
+    results_folder,
     write_cameras,
     write_checkpoint,
     write_json,
@@ -121,9 +122,7 @@ class Run:
                 )
             self.trainer.load_state_dict(state)
             self.clock.total, self.history = state["seconds"], state["history"]
-        if self.out.is_file():
-            raise NotADirectoryError(f"{self.out}: expected a folder for the results, got a file")
-        self.out.mkdir(parents=True, exist_ok=True)
+        results_folder(self.out)
 
     @property
     def progress(self):
