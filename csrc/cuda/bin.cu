@@ -8,18 +8,23 @@
 namespace ar::cuda {
 namespace {
 
+template <int kBits, class Value> LaunchShape sort_shape(int64_t blocks) {
+  return {unsigned(blocks), Digits<kBits>::kThreads, sizeof(SortShared<kBits, Value>)};
+}
+
 template <class Value>
 void sort_values(const TileSort<Value>& p, TileGrid grid, uint32_t* memory, cudaStream_t stream) {
-  const int passes = tile_passes(grid);
-  const TileScratch scratch(memory, p.capacity, passes);
-  for (int pass = 0; pass < passes; ++pass) {
-    // After an overflow the histograms are empty, and with them the sort.
-    launch(sort_pass_kernel<kTileDigitBits, Value, false>, {unsigned(scratch.blocks), TileDigits::kThreads}, stream,
-           scratch, pass, false, 0, 0, p.tiles[pass % 2], p.tiles[1 - pass % 2], p.values[pass % 2],
-           p.values[1 - pass % 2]);
-  }
+  const TileDigits digits(grid);
+  digits.with_bits([&](auto bits) {
+    const SortScratch<bits> scratch(memory, p.capacity, digits.passes);
+    for (int pass = 0; pass < digits.passes; ++pass) {
+      launch(sort_pass_kernel<bits, Value, false>, sort_shape<bits, Value>(scratch.blocks), stream, scratch, pass,
+             false, &p.counts->pairs, p.capacity, p.tiles[pass % 2], p.tiles[1 - pass % 2], p.values[pass % 2],
+             p.values[1 - pass % 2]);
+    }
+  });
   launch(tile_offsets_kernel, {blocks_of(grid.tiles() + 1, kRangeTiles), kRangeTiles * kRangeLanes}, stream,
-         p.tiles[passes % 2], p.counts, p.capacity, grid.tiles(), p.tile_offsets, p.feedback);
+         p.tiles[digits.passes % 2], p.counts, p.capacity, grid.tiles(), p.tile_offsets, p.feedback);
 }
 
 }  // namespace
@@ -32,10 +37,11 @@ static int64_t aligned_bytes(int64_t words) { return (words * int64_t(sizeof(uin
 int64_t depth_sort_scratch(int64_t n) { return aligned_bytes(DepthScratch::words(n, kDepthPasses)); }
 
 int64_t tile_sort_scratch(int64_t capacity, TileGrid grid) {
-  return aligned_bytes(TileScratch::words(capacity, tile_passes(grid)));
+  const TileDigits digits(grid);
+  return digits.with_bits([&](auto bits) { return aligned_bytes(SortScratch<bits>::words(capacity, digits.passes)); });
 }
 
-int tile_sort_result(TileGrid grid) { return tile_passes(grid) % 2; }
+int tile_sort_result(TileGrid grid) { return TileDigits(grid).passes % 2; }
 
 void count_depths(const DepthSort& p, void* memory, ZeroedMemory rest, ZeroedMemory of_tiles, cudaStream_t stream) {
   const DepthScratch scratch(static_cast<uint32_t*>(memory), p.n, kDepthPasses);
@@ -46,13 +52,13 @@ void count_depths(const DepthSort& p, void* memory, ZeroedMemory rest, ZeroedMem
 void sort_by_depth(const DepthSort& p, void* memory, cudaStream_t stream) {
   if (p.n == 0) return;
   const DepthScratch scratch(static_cast<uint32_t*>(memory), p.n, kDepthPasses);
-  const LaunchShape shape = {unsigned(scratch.blocks), DepthDigits::kThreads};
+  const LaunchShape shape = sort_shape<kDepthBits, int32_t>(scratch.blocks);
   for_each_depth_pass(p, scratch, [&](auto kernel, auto... arguments) { launch(kernel, shape, stream, arguments...); });
 }
 
 void emit_pairs(const EmitParams& p, cudaStream_t stream) {
   if (p.n == 0) return;
-  launch(emit_pairs_kernel, {blocks_of(p.n, kEmitSplats), kEmitThreads}, stream, p, tile_passes(p.grid));
+  launch(emit_pairs_kernel, {blocks_of(p.n, kEmitSplats), kEmitThreads}, stream, p, TileDigits(p.grid));
 }
 
 void sort_by_tile(const TileSort<int32_t>& p, TileGrid grid, void* scratch, cudaStream_t stream) {

@@ -1,6 +1,8 @@
 // Kernels of bin that sort splats by depth, write the pairs of each, and find those of each tile.
 #pragma once
 
+#include <type_traits>
+
 #include "core/bin.h"
 #include "cuda/sort.cuh"
 #include "cuda/stages.h"
@@ -9,6 +11,7 @@ namespace ar::cuda {
 
 using DepthDigits = Digits<kDepthBits>;
 using DepthScratch = SortScratch<kDepthBits>;
+static_assert(kCulledKey == kNoKey);
 inline constexpr int kCountThreads = 512, kCountBlocks = 132 * 2;
 /// Keys of a thread of count_depths whose loads wait together.
 inline constexpr int kCountAtOnce = 4;
@@ -66,23 +69,35 @@ __global__ void __launch_bounds__(kCountThreads)
 
 /// Calls run(kernel, arguments...) for the passes of a sort by depth, in order.
 template <class Run> void for_each_depth_pass(const DepthSort& p, const DepthScratch& scratch, Run&& run) {
-  run(sort_pass_kernel<kDepthBits, int32_t, true>, scratch, 0, true, p.n, kCulledKey, p.keys[0], p.keys[1], p.order[0],
+  const int64_t* count = &p.counts->splats;
+  run(sort_pass_kernel<kDepthBits, int32_t, true>, scratch, 0, true, count, p.n, p.keys[0], p.keys[1], p.order[0],
       p.order[1]);
   for (int pass = 1; pass < kDepthPasses; ++pass) {
-    run(sort_pass_kernel<kDepthBits, int32_t, false>, scratch, pass, true, 0, 0, p.keys[pass % 2], p.keys[1 - pass % 2],
-        p.order[pass % 2], p.order[1 - pass % 2]);
+    const bool last = pass == kDepthPasses - 1;
+    run(sort_pass_kernel<kDepthBits, int32_t, false>, scratch, pass, true, count, p.n, p.keys[pass % 2],
+        last ? nullptr : p.keys[1 - pass % 2], p.order[pass % 2], p.order[1 - pass % 2]);
   }
 }
 
-/// Tiles are sorted by as many digits as the number of the last one has.
-inline constexpr int kTileDigitBits = 8, kMostTilePasses = 4;
-using TileDigits = Digits<kTileDigitBits>;
-using TileScratch = SortScratch<kTileDigitBits>;
-inline int tile_passes(TileGrid grid) {
-  int passes = 1;
-  while (grid.tiles() > int64_t(1) << (passes * kTileDigitBits)) ++passes;
-  return passes;
-}
+/// The digits by which pairs are sorted by tile: as few and as short ones as the number of the last tile has.
+struct TileDigits {
+  static constexpr int kMostBits = 8, kMostPasses = 4;
+  int passes = 1, bits = kMostBits - 1;
+
+  explicit TileDigits(TileGrid grid) {
+    const int64_t tiles = grid.tiles();
+    while (tiles > int64_t(1) << (passes * kMostBits)) ++passes;
+    if (tiles > int64_t(1) << (passes * bits)) bits = kMostBits;
+  }
+  __device__ int bins() const { return 1 << bits; }
+  __device__ uint32_t of(uint32_t tile, int pass) const { return tile >> (pass * bits) & (bins() - 1); }
+  /// Calls run(bits) with a constant.
+  template <class Run> auto with_bits(Run&& run) const {
+    constexpr std::integral_constant<int, kMostBits> most = {};
+    constexpr std::integral_constant<int, kMostBits - 1> fewer = {};
+    return bits == kMostBits ? run(most) : run(fewer);
+  }
+};
 
 __device__ inline void write_pair(const EmitParams& params, int64_t place, uint32_t tile, int32_t splat) {
   params.tiles[place] = tile;
@@ -93,7 +108,7 @@ __device__ inline void write_pair(const EmitParams& params, int64_t place, uint3
   }
 }
 
-/// A pair of a splat with a mask: the lane that has the splat, and the bit of its mask.
+/// A pair of a splat with few tiles: the lane that has the splat, and the bit of its mask.
 struct MaskedPair {
   static constexpr int kBits = 8 * sizeof(TileMask);
   uint16_t value;
@@ -102,10 +117,13 @@ struct MaskedPair {
   __device__ int row() const { return value % kBits / 8; }
   __device__ int column() const { return value % 8; }
 };
-/// The pairs of a warp's splats with masks, one splat after the other.
+/// The pairs of a warp's splats with few tiles, one splat after the other.
 struct MaskedPairs {
   MaskedPair of[32 * kManyTiles];
 };
+
+/// The mask of a splat of at most kManyTiles tiles, or 0.
+__device__ inline TileMask few_tiles(const SplatTiles& tiles) { return tiles.count <= kManyTiles ? tiles.mask : 0; }
 
 /// Sum of what the blocks before this one published, for all lanes of a warp.
 __device__ inline uint32_t look_back(const uint32_t* status, int block) {
@@ -125,16 +143,17 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
 }
 
 /// Pairs in the order of depth, a splat's by rows of tiles; and the histograms of the digits of their tiles.
-__global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitParams params, int tile_digits) {
-  constexpr int kBins = TileDigits::kBins, kWarps = kEmitThreads / 32;
-  __shared__ uint32_t histograms[kMostTilePasses * kBins];
+__global__ void __launch_bounds__(kEmitThreads, 5) emit_pairs_kernel(const EmitParams params, const TileDigits digits) {
+  constexpr int kWarps = kEmitThreads / 32;
+  __shared__ uint32_t histograms[TileDigits::kMostPasses << TileDigits::kMostBits];
   __shared__ uint32_t block_id, before_block;
   __shared__ MaskedPairs stages[kEmitRows][kWarps];
   const int64_t n = params.counts->splats;
   // As many blocks stay as have splats, whichever of them they get.
   if (params.counts->pairs > params.capacity || int64_t(blockIdx.x) * kEmitSplats >= n) return;
   if (threadIdx.x == 0) block_id = atomicAdd(&params.status[0], 1);
-  for (int b = threadIdx.x; b < tile_digits * kBins; b += kEmitThreads) histograms[b] = 0;
+  const int bins = digits.bins();
+  for (int b = threadIdx.x; b < digits.passes * bins; b += kEmitThreads) histograms[b] = 0;
   __syncthreads();
   const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
   int32_t ids[kEmitRows];
@@ -164,12 +183,13 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
   int up_to[kEmitRows];  // pairs in the stage, of the lanes up to this one
 #pragma unroll
   for (int row = 0; row < kEmitRows; ++row) {
-    const int own = touched[row].mask ? touched[row].count : 0;
+    const TileMask mask = few_tiles(touched[row]);
+    const int own = mask ? touched[row].count : 0;
     up_to[row] = warp_inclusive_sum(own);
     MaskedPair* next = stages[row][warp].of + up_to[row] - own;
 #pragma unroll
     for (int from = 0; from < MaskedPair::kBits; from += 32) {
-      for (uint32_t left = __brev(uint32_t(touched[row].mask >> from)); left != 0;)
+      for (uint32_t left = __brev(uint32_t(mask >> from)); left != 0;)
         *next++ = {uint16_t(MaskedPair::kBits * lane_id() + from + take_first(left))};
     }
   }
@@ -186,12 +206,12 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
   const int columns = params.grid.columns();
   const auto write = [&](int32_t place, uint32_t tile, int32_t id) {
     write_pair(params, place, tile, id);
-    for (int d = 0; d < tile_digits; ++d) atomicAdd(&histograms[d * kBins + TileDigits::of(tile, d)], 1);
+    for (int d = 0; d < digits.passes; ++d) atomicAdd(&histograms[d * bins + digits.of(tile, d)], 1);
   };
 #pragma unroll
   for (int row = 0; row < kEmitRows; ++row) {
     const SplatTiles& of_splat = touched[row];
-    const int own = of_splat.mask ? of_splat.count : 0, first = up_to[row] - own, all = shuffle(up_to[row], 31);
+    const int own = few_tiles(of_splat) ? of_splat.count : 0, first = up_to[row] - own, all = shuffle(up_to[row], 31);
     const auto begin = int32_t(before_block + before[row]);
     if (of_splat.count > 0 && params.slot_pairs) params.ranges[ids[row]].first = begin;
     for (int from = 0; from < all; from += 32) {
@@ -205,6 +225,16 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
       const int source = take_first(others);
       const int32_t id = shuffle(ids[row], source);
       int32_t place = shuffle(begin, source);
+      if (const TileMask mask = shuffle(of_splat.mask, source)) {
+        const int32_t tile = shuffle(of_splat.first, source) + lane_id() / 8 * columns + lane_id() % 8;
+#pragma unroll
+        for (int from = 0; from < MaskedPair::kBits; from += 32) {
+          const auto bits = uint32_t(mask >> from), lane = 1u << lane_id();
+          if (bits & lane) write(place + __popc(bits & (lane - 1)), uint32_t(tile + from / 8 * columns), id);
+          place += __popc(bits);
+        }
+        continue;
+      }
       const Support<float> support = support_of(splats[id], params.footprint);
       const Range rows = clamp_range(rows_of(support), params.grid.height), tile_rows = tiles_of(rows, params.grid);
       for (int top = tile_rows.first; top <= tile_rows.last; top += 32) {
@@ -219,7 +249,7 @@ __global__ void __launch_bounds__(kEmitThreads) emit_pairs_kernel(const EmitPara
     }
   }
   __syncthreads();
-  for (int b = threadIdx.x; b < tile_digits * kBins; b += kEmitThreads) {
+  for (int b = threadIdx.x; b < digits.passes * bins; b += kEmitThreads) {
     if (histograms[b]) atomicAdd(&params.tile_counts[b], histograms[b]);
   }
 }

@@ -10,31 +10,40 @@
 
 namespace ar::cuda {
 
-inline constexpr int kSortTile = 3072;  // items of a block
-
-/// A sort by digits of kBits bits. A block has a thread for each value of a digit.
+/// A sort by digits of kBits bits. A block has at least a thread for each value of a digit.
 template <int kBits> struct Digits {
-  static constexpr int kBins = 1 << kBits, kThreads = kBins, kWarps = kThreads / 32;
-  static constexpr int kItems = kSortTile / kThreads;  ///< of a thread
-  /// Blocks that a streaming multiprocessor should hold at once. It limits the registers of a thread, which for more
-  /// blocks at once may spill a few.
-  static constexpr int kBlocks = kBits > 8 ? 3 : 4;
+  static constexpr int kBins = 1 << kBits, kThreads = kBits > 8 ? 512 : 256, kWarps = kThreads / 32;
+  static constexpr int kItems = kBits > 8 ? 10 : 12;  ///< of a thread
+  static constexpr int kTile = kThreads * kItems;     ///< items of a block
+  /// Blocks that a streaming multiprocessor should hold at once. It limits the registers of a thread.
+  static constexpr int kBlocks = kBits > 8 ? 2 : 3;
 
   __device__ static uint32_t of(uint32_t key, int pass) { return key >> (pass * kBits) & (kBins - 1); }
 };
+
+/// What stands for no item: in the first pass it is left out.
+inline constexpr uint32_t kNoKey = 0xffffffff;
 
 // What a block publishes: a count, and what it counts. One word, so that both arrive together.
 inline constexpr uint32_t kOfBlock = 1u << 30, kUpToBlock = 2u << 30, kCountMask = kOfBlock - 1;
 inline constexpr int64_t kMaxSortItems = kCountMask;
 
 __device__ inline uint32_t read_status(const uint32_t* status) {
-  return *static_cast<const volatile uint32_t*>(status);
+#if defined(__CUDA_ARCH__)
+  uint32_t value;
+  asm volatile("ld.relaxed.gpu.global.u32 %0, [%1];" : "=r"(value) : "l"(status) : "memory");
+  return value;
+#else
+  return *status;
+#endif
 }
 __device__ inline void write_status(uint32_t* status, uint32_t value) {
-  *static_cast<volatile uint32_t*>(status) = value;
+#if defined(__CUDA_ARCH__)
+  asm volatile("st.relaxed.gpu.global.u32 [%0], %1;" ::"l"(status), "r"(value) : "memory");
+#else
+  *status = value;
+#endif
 }
-
-inline int64_t sort_blocks(int64_t capacity) { return (capacity + kSortTile - 1) / kSortTile; }
 
 /// Scratch of a sort of `capacity` items by `passes` digits. Zero before use.
 template <int kBits> struct SortScratch {
@@ -45,18 +54,20 @@ template <int kBits> struct SortScratch {
   uint32_t* status;      ///< [passes, blocks, kBins]
   int64_t blocks;
 
-  static int64_t words(int64_t capacity, int passes) { return passes * (kBins * (1 + sort_blocks(capacity)) + 1); }
+  static int64_t blocks_of(int64_t capacity) { return (capacity + Digits<kBits>::kTile - 1) / Digits<kBits>::kTile; }
+  static int64_t words(int64_t capacity, int passes) { return passes * (kBins * (1 + blocks_of(capacity)) + 1); }
   SortScratch(uint32_t* memory, int64_t capacity, int passes)
       : passes(passes),
         histograms(memory),
         tickets(memory + passes * kBins),
         status(memory + passes * (kBins + 1)),
-        blocks(sort_blocks(capacity)) {}
+        blocks(blocks_of(capacity)) {}
 };
 
 /// Adds the digits of a warp's keys to histograms in shared memory.
 template <int kBits, int kPasses> __device__ void count_digits(uint32_t key, bool valid, uint32_t* histograms) {
   constexpr int kBins = Digits<kBits>::kBins;
+  if (!__any_sync(kAllLanes, valid)) return;  // culled splats are often neighbours
 #pragma unroll
   for (int pass = 0; pass < kPasses; ++pass) {
     const uint32_t digit = Digits<kBits>::of(key, pass);
@@ -64,140 +75,175 @@ template <int kBits, int kPasses> __device__ void count_digits(uint32_t key, boo
     int agree = 0;
     __match_all_sync(kAllLanes, valid ? digit : kBins, &agree);
     if (agree) {
-      if (valid && lane_id() == 0) atomicAdd(&histograms[pass * kBins + digit], 32);
+      if (lane_id() == 0) atomicAdd(&histograms[pass * kBins + digit], 32);
     } else if (valid) {
       atomicAdd(&histograms[pass * kBins + digit], 1);
     }
   }
 }
 
-/// One pass. `kFirst`: there are first_count keys, those equal to `skip` are left out, and the values are
-/// the places of the others. The number of items of later passes is the histogram's.
+/// The lanes whose `bits` agree with this lane's in the bit `mask`. Written out because the compiler takes seven
+/// instructions for it, and this is most of what a sort does.
+__device__ inline uint32_t lanes_that_agree(uint32_t bits, uint32_t mask) {
+#if defined(__CUDA_ARCH__)
+  uint32_t lanes;
+  asm("{\n\t"
+      ".reg .pred is_set;\n\t"
+      "and.b32 %0, %1, %2;\n\t"
+      "setp.ne.u32 is_set, %0, 0;\n\t"
+      "vote.sync.ballot.b32 %0, is_set, 0xffffffff;\n\t"
+      "@!is_set not.b32 %0, %0;\n\t"
+      "}"
+      : "=r"(lanes)
+      : "r"(bits), "r"(mask));
+  return lanes;
+#else
+  const uint32_t set = __ballot_sync(kAllLanes, (bits & mask) != 0);
+  return bits & mask ? set : ~set;
+#endif
+}
+
+/// The sum of what the blocks before this one published, each in a row of `width` words: their own counts, up to the
+/// nearest one that knows the sum up to itself. `status`: this block's word. Waits for those that have not got so far.
+__device__ inline uint32_t sum_of_earlier(const uint32_t* status, int64_t block, int width) {
+  constexpr int kAtOnce = 8;  // rows whose loads wait together
+  uint32_t sum = 0;
+  for (int64_t back = 1; block > 0;) {
+    uint32_t row[kAtOnce];
+#pragma unroll
+    for (int k = 0; k < kAtOnce; ++k) row[k] = read_status(status - min(back + k, block) * width);
+#pragma unroll
+    for (int k = 0; k < kAtOnce; ++k) {
+      if (row[k] == 0) break;
+      sum += row[k] & kCountMask;
+      if (row[k] & kUpToBlock) return sum;
+      ++back;
+    }
+  }
+  return sum;
+}
+
+/// Shared memory of a block.
+template <int kBits, class Value> struct SortShared {
+  using D = Digits<kBits>;
+  uint32_t next[D::kWarps][D::kBins];  ///< how often a warp has each digit, then the place in the block of its next one
+  uint32_t to_global[D::kBins];        ///< place in the output - place in the block
+  uint32_t keys[D::kTile];             ///< in the order of this pass
+  Value values[D::kTile];
+  uint32_t block;
+};
+
+/// One pass. There are *count items, none if these are more than `capacity`. `kFirst`: their keys are among `capacity`
+/// ones, the others of which are kNoKey, and their values are the places of their keys.
 ///
 /// `may_skip`: where all items have the same last digit, the last pass ends at once, and those before it have their two
-/// arrays of values in turn the other way round, so that the result is where the last pass would leave it. Keys, which
-/// nobody reads afterwards, are where they would be.
+/// arrays of values in turn the other way round, so that the result is where the last pass would leave it.
+/// `keys_out` may be null: then nobody reads them.
 template <int kBits, class Value, bool kFirst>
 __global__ void __launch_bounds__(Digits<kBits>::kThreads, Digits<kBits>::kBlocks)
-    sort_pass_kernel(const SortScratch<kBits> scratch, int pass, bool may_skip, int64_t first_count, uint32_t skip,
+    sort_pass_kernel(const SortScratch<kBits> scratch, int pass, bool may_skip, const int64_t* count, int64_t capacity,
                      const uint32_t* keys_in, uint32_t* keys_out, Value* values_in, Value* values_out) {
   using D = Digits<kBits>;
-  constexpr int kBins = D::kBins, kSortThreads = D::kThreads, kSortWarps = D::kWarps, kSortItems = D::kItems;
-  __shared__ uint16_t counts[kSortWarps][kBins];  // of a warp's digits, then their first places in the block
-  __shared__ uint32_t to_global[kBins];           // place in the output - place in the block
-  __shared__ Value staged[kSortTile];
-  __shared__ uint32_t block_id;
-  const int t = threadIdx.x, warp = t / 32, lane = lane_id();
-  if (t == 0) block_id = atomicAdd(&scratch.tickets[pass], 1);
-  uint32_t items;
-  const uint32_t base = sum_before<kSortWarps>(scratch.histograms[pass * kBins + t], 0u, items);
-#pragma unroll
-  for (int w = 0; w < kSortWarps; ++w) counts[w][t] = 0;
-  if (may_skip) {
-    if (__syncthreads_or(scratch.histograms[(scratch.passes - 1) * kBins + t] == items)) {
-      if (pass == scratch.passes - 1) return;
-      Value* other = values_in;
-      values_in = values_out;
-      values_out = other;
-    }
-  } else {
-    __syncthreads();
+  constexpr int kBins = D::kBins, kItems = D::kItems;
+  auto& shared = *reinterpret_cast<SortShared<kBits, Value>*>(dynamic_shared());
+  const int t = threadIdx.x, lane = lane_id(), warp = t / 32;
+  const bool has_digit = t < kBins;  // digit t
+  if (t == 0) shared.block = atomicAdd(&scratch.tickets[pass], 1);
+  const uint32_t of_all = has_digit ? scratch.histograms[pass * kBins + t] : 0;
+  const int64_t items = *count, n = items > capacity ? 0 : kFirst ? capacity : items;
+  uint32_t* next = shared.next[warp];
+  for (int digit = lane; digit < kBins; digit += 32) next[digit] = 0;
+  const uint32_t* last = scratch.histograms + (scratch.passes - 1) * kBins;
+  if (__syncthreads_or(may_skip && has_digit && last[t] == items)) {
+    if (pass == scratch.passes - 1) return;
+    Value* other = values_in;
+    values_in = values_out;
+    values_out = other;
   }
-  const int64_t n = kFirst ? first_count : items, begin = int64_t(block_id) * kSortTile;
+  const int64_t block = shared.block, begin = block * D::kTile;
   if (begin >= n) return;
 
-  // A warp's items are consecutive, row after row of 32: the order of ranks is the order of items.
-  uint32_t keys[kSortItems], ranks[kSortItems];
-  bool valid[kSortItems];
-  const int64_t first = begin + warp * 32 * kSortItems + lane;
+  // A warp's items are consecutive, row after row of 32: the order of places is the order of items.
+  const int64_t first = begin + warp * 32 * kItems + lane;
+  const bool whole = begin + D::kTile <= n;
+  uint32_t keys[kItems];
 #pragma unroll
-  for (int i = 0; i < kSortItems; ++i) {
-    valid[i] = first + 32 * i < n;
-    keys[i] = valid[i] ? keys_in[first + 32 * i] : 0;
-    if (kFirst) valid[i] = valid[i] && keys[i] != skip;
+  for (int i = 0; i < kItems; ++i) keys[i] = whole || first + 32 * i < n ? keys_in[first + 32 * i] : kNoKey;
+#pragma unroll
+  for (int i = 0; i < kItems; ++i) {
+    // Behind the last item there may be others that stand for none. They get the last places of the last block.
+    if (!kFirst || keys[i] != kNoKey) atomicAdd(&next[D::of(keys[i], pass)], 1);
   }
-  const uint32_t before = (1u << lane) - 1;
+  [[maybe_unused]] Value values[kItems];
+  if constexpr (!kFirst) {
 #pragma unroll
-  for (int i = 0; i < kSortItems; ++i) {
-    const uint32_t digit = D::of(keys[i], pass);
-    uint32_t peers = __ballot_sync(kAllLanes, valid[i]);
+    for (int i = 0; i < kItems; ++i) {
+      if (whole || first + 32 * i < n) values[i] = values_in[first + 32 * i];
+    }
+  }
+  __syncthreads();
+
+  // Counts are published early: other blocks wait for them.
+  uint32_t mine = 0;  // of digit t, in this block
+  uint32_t* status = scratch.status + (pass * scratch.blocks + block) * kBins + t;
+  if (has_digit) {
+#pragma unroll
+    for (int w = 0; w < D::kWarps; ++w) mine += shared.next[w][t];
+    write_status(status, (block == 0 ? kUpToBlock : kOfBlock) | mine);
+  }
+  // Both sums at once.
+  uint64_t all;
+  const uint64_t before = sum_before<D::kWarps>(uint64_t(of_all) << 32 | mine, uint64_t(0), all);
+  const auto in_block = uint32_t(before), in_all = uint32_t(before >> 32);
+  if (has_digit) {
+    uint32_t place = in_block;
+#pragma unroll
+    for (int w = 0; w < D::kWarps; ++w) {
+      const uint32_t of_warp = shared.next[w][t];
+      shared.next[w][t] = place;
+      place += of_warp;
+    }
+  }
+  __syncthreads();
+
+  const uint32_t lanes_before = (1u << lane) - 1, lanes_behind = ~lanes_before << 1;
+#pragma unroll
+  for (int i = 0; i < kItems; ++i) {
+    const bool valid = !kFirst || keys[i] != kNoKey;
+    uint32_t peers = kFirst ? __ballot_sync(kAllLanes, valid) : kAllLanes;
     if (kFirst && peers == 0) continue;  // culled splats are often neighbours
+    const uint32_t digit = D::of(keys[i], pass);
 #pragma unroll
-    for (int b = 0; b < kBits; ++b) {
-      const bool bit = digit >> b & 1;
-      const uint32_t with = __ballot_sync(kAllLanes, bit);
-      peers &= bit ? with : ~with;
+    for (int b = 0; b < kBits; ++b) peers &= lanes_that_agree(digit, 1u << b);
+    const uint32_t place = next[digit] + __popc(peers & lanes_before);
+    __syncwarp();
+    if (valid) {
+      if ((peers & lanes_behind) == 0) next[digit] = place + 1;
+      shared.keys[place] = keys[i];
+      if constexpr (kFirst) {
+        shared.values[place] = Value(first + 32 * i);
+      } else {
+        shared.values[place] = values[i];
+      }
     }
-    const int leader = valid[i] ? __ffs(peers) - 1 : lane;
-    uint32_t start = 0;
-    if (valid[i] && lane == leader) {
-      start = counts[warp][digit];
-      counts[warp][digit] = uint16_t(start + __popc(peers));
-    }
-    ranks[i] = __shfl_sync(kAllLanes, start, leader) + __popc(peers & before);
     __syncwarp();
   }
+  if (has_digit) {
+    const uint32_t earlier = sum_of_earlier(status, block, kBins);
+    if (block > 0) write_status(status, kUpToBlock | (earlier + mine));
+    shared.to_global[t] = in_all + earlier - in_block;
+  }
   __syncthreads();
 
-  uint32_t mine = 0;  // of digit t, in this block
+  // From shared memory, so that neighbouring threads write to neighbouring places.
+  const uint32_t here = kFirst ? uint32_t(all) : uint32_t(min(n - begin, int64_t(D::kTile)));
 #pragma unroll
-  for (int w = 0; w < kSortWarps; ++w) {
-    const uint32_t c = counts[w][t];
-    counts[w][t] = uint16_t(mine);
-    mine += c;
-  }
-  uint32_t* status = scratch.status + (int64_t(pass) * scratch.blocks + block_id) * kBins + t;
-  write_status(status, (block_id == 0 ? kUpToBlock : kOfBlock) | mine);
-  uint32_t total;  // items of this block
-  const uint32_t local = sum_before<kSortWarps>(mine, 0u, total);
-  uint32_t earlier = 0;  // of digit t, in the blocks before
-  if (block_id > 0) {
-    for (const uint32_t* other = status - kBins;; other -= kBins) {
-      uint32_t s;
-      while ((s = read_status(other)) == 0) {}
-      earlier += s & kCountMask;
-      if (s & kUpToBlock) break;
-    }
-    write_status(status, kUpToBlock | (earlier + mine));
-  }
-  to_global[t] = base + earlier - local;
-#pragma unroll
-  for (int w = 0; w < kSortWarps; ++w) counts[w][t] = uint16_t(counts[w][t] + local);
-  __syncthreads();
-
-  // Through shared memory, so that neighbouring threads write to neighbouring places.
-  auto* staged_keys = reinterpret_cast<uint32_t*>(staged);
-#pragma unroll
-  for (int i = 0; i < kSortItems; ++i) {
-    if (!valid[i]) continue;
-    ranks[i] += counts[warp][D::of(keys[i], pass)];
-    staged_keys[ranks[i]] = keys[i];
-  }
-  __syncthreads();
-  uint32_t places[kSortItems];
-#pragma unroll
-  for (int i = 0; i < kSortItems; ++i) {
-    const uint32_t k = i * kSortThreads + t;
-    if (k >= total) continue;
-    const uint32_t key = staged_keys[k];
-    places[i] = to_global[D::of(key, pass)] + k;
-    keys_out[places[i]] = key;
-  }
-  __syncthreads();
-#pragma unroll
-  for (int i = 0; i < kSortItems; ++i) {
-    if (!valid[i]) continue;
-    if constexpr (kFirst) {
-      staged[ranks[i]] = Value(first + 32 * i);
-    } else {
-      staged[ranks[i]] = values_in[first + 32 * i];
-    }
-  }
-  __syncthreads();
-#pragma unroll
-  for (int i = 0; i < kSortItems; ++i) {
-    const uint32_t k = i * kSortThreads + t;
-    if (k < total) values_out[places[i]] = staged[k];
+  for (int i = 0; i < kItems; ++i) {
+    const uint32_t k = i * D::kThreads + t;
+    if (k >= here) break;
+    const uint32_t key = shared.keys[k], place = shared.to_global[D::of(key, pass)] + k;
+    if (keys_out) keys_out[place] = key;
+    values_out[place] = shared.values[k];
   }
 }
 

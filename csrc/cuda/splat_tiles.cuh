@@ -9,7 +9,7 @@ namespace ar::cuda {
 /// The tiles that a splat touches.
 __device__ inline SplatTiles splat_tiles_of(const Support<float>& support, TileGrid grid) {
   const TileBox box = find_tiles(support, grid);
-  return {box.count <= kManyTiles ? box.mask : 0, box.row * grid.columns() + box.column, box.count};
+  return {box.mask, box.row * grid.columns() + box.column, box.count};
 }
 
 }  // namespace ar::cuda

@@ -54,12 +54,12 @@ struct PairRange {
   int32_t first, count;
 };
 
-/// A splat of more tiles than this gets no mask of them.
+/// The tiles of a splat with more than this are written by a warp together.
 inline constexpr int kManyTiles = 16;
 /// The tiles that a splat touches. Together, because bin reads them in the order of depth, which is far from that in
 /// memory.
 struct alignas(16) SplatTiles {
-  TileMask mask;  ///< from tile `first` on; 0: more than kManyTiles tiles, or some that are not among 8x8
+  TileMask mask;  ///< from tile `first` on; 0: some are not among 8x8
   int32_t first, count;
 };
 

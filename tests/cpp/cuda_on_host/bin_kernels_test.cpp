@@ -15,6 +15,7 @@ namespace ar::cuda {
 namespace {
 
 constexpr float kCulled = -1;
+constexpr int kDepthTile = DepthDigits::kTile;
 
 uint32_t key_of(float depth) {
   if (depth == kCulled) return kCulledKey;
@@ -75,11 +76,11 @@ std::vector<float> random_depths(int n, float nearest, float farthest, int one_c
   return depths;
 }
 
-TEST(BinKernels, Depths) { expect_sorted(random_depths(2 * kSortTile + 100, 0.2f, 100)); }
+TEST(BinKernels, Depths) { expect_sorted(random_depths(2 * kDepthTile + 100, 0.2f, 100)); }
 
 /// Where all depths lie between 1/8 and 8192 the last pass has nothing to do, and may be left out.
 TEST(BinKernels, TheLastPassIsForDepthsThatAreVeryDifferent) {
-  std::vector<float> depths = random_depths(kSortTile + 700, 0.125f, 8191);
+  std::vector<float> depths = random_depths(kDepthTile + 700, 0.125f, 8191);
   depths[5] = 0.125f, depths[6] = std::nextafter(8192.0f, 0.0f);
   expect_sorted(depths, 3);
   expect_sorted(depths);
@@ -91,7 +92,7 @@ TEST(BinKernels, TheLastPassIsForDepthsThatAreVeryDifferent) {
   expect_sorted(depths);
 }
 
-TEST(BinKernels, DepthsOfEveryMagnitude) { expect_sorted(random_depths(kSortTile + 1, 1e-37f, 1e37f)); }
+TEST(BinKernels, DepthsOfEveryMagnitude) { expect_sorted(random_depths(kDepthTile + 1, 1e-37f, 1e37f)); }
 
 TEST(BinKernels, FewAndNoDepths) {
   expect_sorted({2});
@@ -100,7 +101,7 @@ TEST(BinKernels, FewAndNoDepths) {
 }
 
 TEST(BinKernels, TiesKeepInputOrder) {
-  std::vector<float> depths = random_depths(kSortTile, 0.2f, 4);
+  std::vector<float> depths = random_depths(kDepthTile, 0.2f, 4);
   for (float& depth : depths) depth = depth == kCulled ? kCulled : std::ceil(depth);
   expect_sorted(depths);
 }
@@ -112,38 +113,82 @@ bool operator==(SlotPair a, SlotPair b) { return a.splat == b.splat && a.slot ==
 /// Sorts pairs as sort_by_tile does, with room for more than there are.
 template <class Value> void expect_sorted_by_tile(int pairs, TileGrid grid) {
   std::mt19937 bits(7);
-  const int passes = tile_passes(grid), room = pairs + pairs / 3 + 1;
+  const TileDigits digits(grid);
+  const int room = pairs + pairs / 3 + 1;
   std::vector<uint32_t> tiles[2] = {std::vector<uint32_t>(room), std::vector<uint32_t>(room)};
   std::vector<Value> values[2] = {std::vector<Value>(room), std::vector<Value>(room)};
-  std::vector<uint32_t> memory(TileScratch::words(room, passes));
-  const TileScratch scratch(memory.data(), room, passes);
   std::vector<int32_t> order(pairs);
   std::iota(order.begin(), order.end(), 0);
   for (const int32_t k : order) {
     tiles[0][k] = uint32_t(bits() % grid.tiles());
     values[0][k] = value_of(k, Value());
-    for (int d = 0; d < passes; ++d) ++scratch.histograms[d * TileDigits::kBins + TileDigits::of(tiles[0][k], d)];
   }
   std::stable_sort(order.begin(), order.end(), [&](int32_t a, int32_t b) { return tiles[0][a] < tiles[0][b]; });
-  for (int pass = 0; pass < passes; ++pass) {
-    const int from = pass % 2;
-    cuda_on_host::launch(int(scratch.blocks), TileDigits::kThreads, [&] {
-      sort_pass_kernel<kTileDigitBits, Value, false>(scratch, pass, false, 0, 0, tiles[from].data(),
-                                                     tiles[1 - from].data(), values[from].data(),
-                                                     values[1 - from].data());
-    });
+  const std::vector<uint32_t> unsorted = tiles[0];
+  const int64_t count = pairs;
+  digits.with_bits([&](auto bits) {
+    using D = Digits<bits>;
+    std::vector<uint32_t> memory(SortScratch<bits>::words(room, digits.passes));
+    const SortScratch<bits> scratch(memory.data(), room, digits.passes);
+    for (int k = 0; k < pairs; ++k) {
+      for (int d = 0; d < digits.passes; ++d) ++scratch.histograms[d * D::kBins + D::of(unsorted[k], d)];
+    }
+    for (int pass = 0; pass < digits.passes; ++pass) {
+      const int from = pass % 2;
+      cuda_on_host::launch(int(scratch.blocks), D::kThreads, [&] {
+        sort_pass_kernel<bits, Value, false>(scratch, pass, false, &count, room, tiles[from].data(),
+                                             tiles[1 - from].data(), values[from].data(), values[1 - from].data());
+      });
+    }
+  });
+  for (int k = 0; k < pairs; ++k) {
+    ASSERT_TRUE(values[digits.passes % 2][k] == value_of(order[k], Value())) << k;
+    ASSERT_EQ(tiles[digits.passes % 2][k], unsorted[order[k]]) << k;
   }
-  for (int k = 0; k < pairs; ++k) ASSERT_TRUE(values[passes % 2][k] == value_of(order[k], Value())) << k;
+}
+
+TEST(BinKernels, DigitsOfTiles) {
+  const auto expect_digits = [](TileGrid grid, int passes, int bits) {
+    const TileDigits digits(grid);
+    EXPECT_EQ(digits.passes, passes) << grid.tiles() << " tiles";
+    EXPECT_EQ(digits.bits, bits) << grid.tiles() << " tiles";
+    EXPECT_LE(grid.tiles(), int64_t(1) << (passes * bits));
+  };
+  expect_digits({16, 16}, 1, 7);
+  expect_digits({16 * 128, 16}, 1, 7);
+  expect_digits({16 * 129, 16}, 1, 8);
+  expect_digits({16 * 257, 16}, 2, 7);
+  expect_digits({1920, 1080}, 2, 7);
+  expect_digits({16 * 128, 16 * 128}, 2, 7);
+  expect_digits({16 * 128, 16 * 129}, 2, 8);
+  expect_digits({7680, 4320}, 3, 7);
+  expect_digits({16 * 2048, 16 * 2048}, 3, 8);
+  expect_digits({16 * 30000, 16 * 30000}, 4, 8);
 }
 
 TEST(BinKernels, PairsByTile) {
-  constexpr int kBlock = kSortTile;
-  for (const TileGrid grid : {TileGrid{100, 90}, TileGrid{700, 300}}) {  // one digit, and two
-    for (const int pairs : {0, 1, 40, kBlock, 2 * kBlock + 100}) {
+  // One digit of seven and of eight bits, and two of either.
+  for (const TileGrid grid : {TileGrid{100, 90}, TileGrid{200, 240}, TileGrid{700, 300}, TileGrid{2100, 2100}}) {
+    for (const int pairs : {0, 1, 40, Digits<8>::kTile, 2 * Digits<8>::kTile + 100}) {
       expect_sorted_by_tile<int32_t>(pairs, grid);
       expect_sorted_by_tile<SlotPair>(pairs, grid);
     }
   }
+}
+
+/// More pairs than room: none is there to be sorted.
+TEST(BinKernels, NoPairIsSortedAfterAnOverflow) {
+  constexpr int kRoom = 50;
+  std::vector<uint32_t> memory(SortScratch<7>::words(kRoom, 1)), tiles(kRoom, 3), sorted(kRoom);
+  std::vector<int32_t> values(kRoom, 5), sorted_values(kRoom);
+  const SortScratch<7> scratch(memory.data(), kRoom, 1);
+  const int64_t count = kRoom + 1;
+  cuda_on_host::launch(int(scratch.blocks), Digits<7>::kThreads, [&] {
+    sort_pass_kernel<7, int32_t, false>(scratch, 0, false, &count, kRoom, tiles.data(), sorted.data(), values.data(),
+                                        sorted_values.data());
+  });
+  EXPECT_EQ(sorted, std::vector<uint32_t>(kRoom));
+  EXPECT_EQ(sorted_values, std::vector<int32_t>(kRoom));
 }
 
 /// Splats from a fraction of a pixel to the whole image, in an image with more rows of tiles than a warp has lanes.
@@ -175,7 +220,7 @@ TEST(BinKernels, PairsOfSplats) {
   std::vector<uint32_t> expected_tiles;
   std::vector<int32_t> expected_splats;
   std::vector<SplatTiles> splat_tiles(n);
-  int many = 0, masked = 0, later_rows = 0;
+  int few = 0, many = 0, too_long = 0, later_rows = 0;
   for (const int32_t i : order) {
     expected_ranges[i].first = int32_t(expected_tiles.size());
     for_each_tile(support_of(splats[i], footprint), grid, [&](int64_t tile) {
@@ -185,14 +230,14 @@ TEST(BinKernels, PairsOfSplats) {
     expected_ranges[i].count = int32_t(expected_tiles.size()) - expected_ranges[i].first;
     const SplatTiles& tiles = splat_tiles[i] = splat_tiles_of(support_of(splats[i], footprint), grid);
     ASSERT_EQ(tiles.count, expected_ranges[i].count);
-    many += tiles.count > kManyTiles;
-    masked += tiles.mask != 0;
+    many += tiles.count > kManyTiles && tiles.mask != 0;
+    too_long += tiles.count > 0 && tiles.mask == 0;
+    few += few_tiles(tiles) != 0;
     for (int row = 0; row < 8; ++row) later_rows += row > 3 && (tiles.mask >> 8 * row & 0xff) != 0;
   }
-  ASSERT_GT(many, n / 10);
-  ASSERT_LT(many, n / 2);
-  ASSERT_GT(masked, n / 4);
-  ASSERT_LT(masked, n - many);  // some have few tiles, but far from each other
+  ASSERT_GT(few, n / 4);
+  ASSERT_GT(many, n / 30);
+  ASSERT_GT(too_long, n / 10);
   ASSERT_GT(later_rows, n / 50);
 
   const auto pairs = int64_t(expected_tiles.size());
@@ -201,9 +246,10 @@ TEST(BinKernels, PairsOfSplats) {
     std::vector<uint32_t> status(emit_scratch(n) / sizeof(uint32_t)), tiles(pairs);
     std::vector<int32_t> splat_pairs(pairs);
     std::vector<SlotPair> slot_pairs(pairs);
-    std::vector<uint32_t> scratch(TileScratch::words(pairs, tile_passes(grid))), expected_scratch(scratch.size());
+    const TileDigits digits(grid);
+    std::vector<uint32_t> counts_of_digits(digits.passes * digits.bins()), expected_counts(counts_of_digits.size());
     for (const uint32_t tile : expected_tiles) {
-      for (int d = 0; d < tile_passes(grid); ++d) ++expected_scratch[d * TileDigits::kBins + TileDigits::of(tile, d)];
+      for (int d = 0; d < digits.passes; ++d) ++expected_counts[d * digits.bins() + digits.of(tile, d)];
     }
     EmitParams emit = {};
     emit.splats = &splats[0].mean.x;
@@ -217,15 +263,15 @@ TEST(BinKernels, PairsOfSplats) {
     emit.ranges = written.data();
     emit.splat_tiles = splat_tiles.data();
     emit.status = status.data();
-    emit.tile_counts = scratch.data();
+    emit.tile_counts = counts_of_digits.data();
     emit.tiles = tiles.data();
     emit.splat_pairs = with_slots ? nullptr : splat_pairs.data();
     emit.slot_pairs = with_slots ? slot_pairs.data() : nullptr;
     // One block more than has splats, as where some are culled.
     cuda_on_host::launch((n + kEmitSplats - 1) / kEmitSplats + 1, kEmitThreads,
-                         [&] { emit_pairs_kernel(emit, tile_passes(grid)); });
+                         [&] { emit_pairs_kernel(emit, digits); });
     EXPECT_EQ(tiles, expected_tiles);
-    EXPECT_EQ(scratch, expected_scratch);
+    EXPECT_EQ(counts_of_digits, expected_counts);
     for (int64_t k = 0; k < pairs; ++k) {
       ASSERT_EQ(with_slots ? slot_pairs[k].splat : splat_pairs[k], expected_splats[k]) << k;
       ASSERT_EQ(with_slots ? slot_pairs[k].slot : k, k);
