@@ -58,7 +58,9 @@ void sort_by_depth(const DepthSort& p, void* memory, cudaStream_t stream) {
 
 void emit_pairs(const EmitParams& p, cudaStream_t stream) {
   if (p.n == 0) return;
-  launch(emit_pairs_kernel, {blocks_of(p.n, kEmitSplats), kEmitThreads}, stream, p, TileDigits(p.grid));
+  const TileDigits digits(p.grid);
+  launch(emit_pairs_kernel, {blocks_of(p.n, kEmitSplats), kEmitThreads}, stream, p, digits);
+  launch(emit_long_pairs_kernel, {kLongBlocks, kEmitThreads}, stream, p, digits);
 }
 
 void sort_by_tile(const TileSort<int32_t>& p, TileGrid grid, void* scratch, cudaStream_t stream) {

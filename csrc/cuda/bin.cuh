@@ -12,7 +12,7 @@ namespace ar::cuda {
 using DepthDigits = Digits<kDepthBits>;
 using DepthScratch = SortScratch<kDepthBits>;
 static_assert(kCulledKey == kNoKey);
-inline constexpr int kCountThreads = 512, kCountBlocks = 132 * 2;
+inline constexpr int kCountThreads = 1024, kCountBlocks = 132;
 /// Keys of a thread of count_depths whose loads wait together.
 inline constexpr int kCountAtOnce = 4;
 
@@ -99,14 +99,38 @@ struct TileDigits {
   }
 };
 
-__device__ inline void write_pair(const EmitParams& params, int64_t place, uint32_t tile, int32_t splat) {
-  params.tiles[place] = tile;
-  if (params.slot_pairs) {
-    params.slot_pairs[place] = {splat, int32_t(place)};
-  } else {
-    params.splat_pairs[place] = splat;
+/// Writes the pairs of a block, and counts the digits of their tiles.
+class PairWriter {
+ public:
+  static constexpr int kMostCounts = TileDigits::kMostPasses << TileDigits::kMostBits;
+
+  /// `counts`: [kMostCounts] in shared memory. Of all threads, which may call write() after the next __syncthreads().
+  __device__ PairWriter(const EmitParams& params, const TileDigits& digits, uint32_t* counts)
+      : params_(params), digits_(digits), counts_(counts) {
+    for (int b = threadIdx.x; b < digits.passes * digits.bins(); b += kEmitThreads) counts[b] = 0;
   }
-}
+  __device__ void write(int64_t place, uint32_t tile, int32_t splat) {
+    params_.tiles[place] = tile;
+    if (params_.slot_pairs) {
+      params_.slot_pairs[place] = {splat, int32_t(place)};
+    } else {
+      params_.splat_pairs[place] = splat;
+    }
+    for (int d = 0; d < digits_.passes; ++d) atomicAdd(&counts_[d * digits_.bins() + digits_.of(tile, d)], 1);
+  }
+  /// Of all threads.
+  __device__ void finish() {
+    __syncthreads();
+    for (int b = threadIdx.x; b < digits_.passes * digits_.bins(); b += kEmitThreads) {
+      if (counts_[b]) atomicAdd(&params_.tile_counts[b], counts_[b]);
+    }
+  }
+
+ private:
+  const EmitParams& params_;
+  const TileDigits& digits_;
+  uint32_t* counts_;
+};
 
 /// A pair of a splat with few tiles: the lane that has the splat, and the bit of its mask.
 struct MaskedPair {
@@ -142,20 +166,23 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
   return sum;
 }
 
-/// Pairs in the order of depth, a splat's by rows of tiles; and the histograms of the digits of their tiles.
+/// Words of EmitParams::status: a ticket for each block, how many splats are long, and what each block publishes.
+inline constexpr int kTickets = 0, kLongSplats = 1, kOfBlocks = 2;
+
+/// Pairs in the order of depth, a splat's by rows of tiles; and the histograms of the digits of their tiles. Long
+/// splats are left to emit_long_pairs.
 __global__ void __launch_bounds__(kEmitThreads, 5) emit_pairs_kernel(const EmitParams params, const TileDigits digits) {
   constexpr int kWarps = kEmitThreads / 32;
-  __shared__ uint32_t histograms[TileDigits::kMostPasses << TileDigits::kMostBits];
+  __shared__ uint32_t digit_counts[PairWriter::kMostCounts];
   __shared__ uint32_t block_id, before_block;
   __shared__ MaskedPairs stages[kEmitRows][kWarps];
   const int64_t n = params.counts->splats;
   // As many blocks stay as have splats, whichever of them they get.
   if (params.counts->pairs > params.capacity || int64_t(blockIdx.x) * kEmitSplats >= n) return;
-  if (threadIdx.x == 0) block_id = atomicAdd(&params.status[0], 1);
-  const int bins = digits.bins();
-  for (int b = threadIdx.x; b < digits.passes * bins; b += kEmitThreads) histograms[b] = 0;
+  uint32_t* published = params.status + kOfBlocks;
+  if (threadIdx.x == 0) block_id = atomicAdd(&params.status[kTickets], 1);
+  PairWriter writer(params, digits, digit_counts);
   __syncthreads();
-  const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
   int32_t ids[kEmitRows];
   SplatTiles touched[kEmitRows] = {};
 #pragma unroll
@@ -174,8 +201,7 @@ __global__ void __launch_bounds__(kEmitThreads, 5) emit_pairs_kernel(const EmitP
     before[row] = sum + sum_before<kWarps>(uint32_t(touched[row].count), 0u, of_row);
     sum += of_row;
   }
-  uint32_t* status = params.status + 1;
-  if (threadIdx.x == 0) write_status(status + block_id, (block_id == 0 ? kUpToBlock : kOfBlock) | sum);
+  if (threadIdx.x == 0) write_status(published + block_id, (block_id == 0 ? kUpToBlock : kOfBlock) | sum);
 
   // Tiles are found before their places are known, while the blocks before get to publish theirs; and written by
   // neighbouring lanes to neighbouring places.
@@ -196,62 +222,77 @@ __global__ void __launch_bounds__(kEmitThreads, 5) emit_pairs_kernel(const EmitP
   __syncwarp();
 
   if (threadIdx.x < 32) {
-    const uint32_t earlier = look_back(status, int(block_id));
+    const uint32_t earlier = look_back(published, int(block_id));
     if (threadIdx.x == 0) {
-      if (block_id > 0) write_status(status + block_id, kUpToBlock | (earlier + sum));
+      if (block_id > 0) write_status(published + block_id, kUpToBlock | (earlier + sum));
       before_block = earlier;
     }
   }
   __syncthreads();
   const int columns = params.grid.columns();
-  const auto write = [&](int32_t place, uint32_t tile, int32_t id) {
-    write_pair(params, place, tile, id);
-    for (int d = 0; d < digits.passes; ++d) atomicAdd(&histograms[d * bins + digits.of(tile, d)], 1);
-  };
 #pragma unroll
   for (int row = 0; row < kEmitRows; ++row) {
     const SplatTiles& of_splat = touched[row];
     const int own = few_tiles(of_splat) ? of_splat.count : 0, first = up_to[row] - own, all = shuffle(up_to[row], 31);
     const auto begin = int32_t(before_block + before[row]);
-    if (of_splat.count > 0 && params.slot_pairs) params.ranges[ids[row]].first = begin;
+    const bool is_long = of_splat.count > 0 && of_splat.mask == 0;
+    if (is_long || (of_splat.count > 0 && params.slot_pairs)) params.ranges[ids[row]].first = begin;
+    if (is_long) params.long_splats[atomicAdd(&params.status[kLongSplats], 1)] = ids[row];
     for (int from = 0; from < all; from += 32) {
       const int k = from + lane_id();
       const MaskedPair pair = k < all ? stages[row][warp].of[k] : MaskedPair{};
       const int32_t place = shuffle(begin - first, pair.lane()) + k, id = shuffle(ids[row], pair.lane());
       const int32_t tile = shuffle(of_splat.first, pair.lane()) + pair.row() * columns + pair.column();
-      if (k < all) write(place, uint32_t(tile), id);
+      if (k < all) writer.write(place, uint32_t(tile), id);
     }
-    for (uint32_t others = __brev(__ballot_sync(kAllLanes, of_splat.count > own)); others != 0;) {
-      const int source = take_first(others);
+    for (uint32_t many = __brev(__ballot_sync(kAllLanes, of_splat.count > own && !is_long)); many != 0;) {
+      const int source = take_first(many);
       const int32_t id = shuffle(ids[row], source);
+      const int32_t tile = shuffle(of_splat.first, source) + lane_id() / 8 * columns + lane_id() % 8;
+      const TileMask mask = shuffle(of_splat.mask, source);
       int32_t place = shuffle(begin, source);
-      if (const TileMask mask = shuffle(of_splat.mask, source)) {
-        const int32_t tile = shuffle(of_splat.first, source) + lane_id() / 8 * columns + lane_id() % 8;
 #pragma unroll
-        for (int from = 0; from < MaskedPair::kBits; from += 32) {
-          const auto bits = uint32_t(mask >> from), lane = 1u << lane_id();
-          if (bits & lane) write(place + __popc(bits & (lane - 1)), uint32_t(tile + from / 8 * columns), id);
-          place += __popc(bits);
-        }
-        continue;
-      }
-      const Support<float> support = support_of(splats[id], params.footprint);
-      const Range rows = clamp_range(rows_of(support), params.grid.height), tile_rows = tiles_of(rows, params.grid);
-      for (int top = tile_rows.first; top <= tile_rows.last; top += 32) {
-        const int y = top + lane_id();
-        const Range tiles = y <= tile_rows.last ? tile_columns_of(support, params.grid, rows, y) : Range{0, -1};
-        const int width = tiles.last - tiles.first + 1;
-        const int widths = warp_inclusive_sum(width);
-        int32_t mine = place + widths - width;
-        for (int c = tiles.first; c <= tiles.last; ++c) write(mine++, uint32_t(y) * columns + c, id);
-        place += shuffle(widths, 31);
+      for (int from = 0; from < MaskedPair::kBits; from += 32) {
+        const auto bits = uint32_t(mask >> from), lane = 1u << lane_id();
+        if (bits & lane) writer.write(place + __popc(bits & (lane - 1)), uint32_t(tile + from / 8 * columns), id);
+        place += __popc(bits);
       }
     }
   }
+  writer.finish();
+}
+
+inline constexpr int kLongBlocks = 132 * 4;
+
+/// The pairs of long splats, a warp for each. The nearest splats are often long, so that some blocks of emit_pairs
+/// would have hundreds of them.
+__global__ void __launch_bounds__(kEmitThreads)
+    emit_long_pairs_kernel(const EmitParams params, const TileDigits digits) {
+  constexpr int kWarps = kEmitThreads / 32;
+  __shared__ uint32_t digit_counts[PairWriter::kMostCounts];
+  const int count = int(params.status[kLongSplats]);
+  const int first = int(blockIdx.x) * kWarps;
+  if (first >= count) return;
+  PairWriter writer(params, digits, digit_counts);
   __syncthreads();
-  for (int b = threadIdx.x; b < digits.passes * bins; b += kEmitThreads) {
-    if (histograms[b]) atomicAdd(&params.tile_counts[b], histograms[b]);
+  const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
+  for (int k = first + threadIdx.x / 32; k < count; k += int(gridDim.x) * kWarps) {
+    const int32_t id = params.long_splats[k];
+    int32_t place = params.ranges[id].first;
+    const Support<float> support = support_of(splats[id], params.footprint);
+    const Range rows = clamp_range(rows_of(support), params.grid.height), tile_rows = tiles_of(rows, params.grid);
+    for (int top = tile_rows.first; top <= tile_rows.last; top += 32) {
+      const int y = top + lane_id();
+      const Range tiles = y <= tile_rows.last ? tile_columns_of(support, params.grid, rows, y) : Range{0, -1};
+      const int width = tiles.last - tiles.first + 1;
+      const int widths = warp_inclusive_sum(width);
+      int32_t mine = place + widths - width;
+      const int row = y * int(params.grid.columns());
+      for (int column = tiles.first; column <= tiles.last; ++column) writer.write(mine++, uint32_t(row + column), id);
+      place += shuffle(widths, 31);
+    }
   }
+  writer.finish();
 }
 
 /// Tiles of a block, and the lanes that look for the first pair of each.

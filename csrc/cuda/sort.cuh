@@ -82,27 +82,6 @@ template <int kBits, int kPasses> __device__ void count_digits(uint32_t key, boo
   }
 }
 
-/// The lanes whose `bits` agree with this lane's in the bit `mask`. Written out because the compiler takes seven
-/// instructions for it, and this is most of what a sort does.
-__device__ inline uint32_t lanes_that_agree(uint32_t bits, uint32_t mask) {
-#if defined(__CUDA_ARCH__)
-  uint32_t lanes;
-  asm("{\n\t"
-      ".reg .pred is_set;\n\t"
-      "and.b32 %0, %1, %2;\n\t"
-      "setp.ne.u32 is_set, %0, 0;\n\t"
-      "vote.sync.ballot.b32 %0, is_set, 0xffffffff;\n\t"
-      "@!is_set not.b32 %0, %0;\n\t"
-      "}"
-      : "=r"(lanes)
-      : "r"(bits), "r"(mask));
-  return lanes;
-#else
-  const uint32_t set = __ballot_sync(kAllLanes, (bits & mask) != 0);
-  return bits & mask ? set : ~set;
-#endif
-}
-
 /// The sum of what the blocks before this one published, each in a row of `width` words: their own counts, up to the
 /// nearest one that knows the sum up to itself. `status`: this block's word. Waits for those that have not got so far.
 __device__ inline uint32_t sum_of_earlier(const uint32_t* status, int64_t block, int width) {
@@ -213,8 +192,7 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads, Digits<kBits>::kBlock
     uint32_t peers = kFirst ? __ballot_sync(kAllLanes, valid) : kAllLanes;
     if (kFirst && peers == 0) continue;  // culled splats are often neighbours
     const uint32_t digit = D::of(keys[i], pass);
-#pragma unroll
-    for (int b = 0; b < kBits; ++b) peers &= lanes_that_agree(digit, 1u << b);
+    peers &= lanes_alike<kBits>(digit);
     const uint32_t place = next[digit] + __popc(peers & lanes_before);
     __syncwarp();
     if (valid) {

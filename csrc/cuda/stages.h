@@ -154,7 +154,8 @@ struct EmitParams {
   const Counts* counts;
   const int32_t* order;           ///< [counts->splats] splats by depth
   const SplatTiles* splat_tiles;  ///< [n]
-  PairRange* ranges;              ///< [n] with slot_pairs `first` is written
+  PairRange* ranges;              ///< [n] `first` is written: of long splats, and with slot_pairs of all
+  int32_t* long_splats;           ///< [n] for splats whose tiles are not among 8x8, in no order
   uint32_t* status;               ///< emit_scratch(n) bytes, zero
   uint32_t* tile_counts;  ///< tile_sort_scratch(capacity, grid) bytes, zero; sort_by_tile finds its counts there
   uint32_t* tiles;        ///< [capacity] tile of each pair
@@ -389,7 +390,7 @@ int64_t tile_sort_scratch(int64_t capacity, TileGrid grid);
 /// for those before them.
 inline constexpr int kEmitThreads = 256, kEmitRows = 2, kEmitSplats = kEmitThreads * kEmitRows;
 inline int64_t emit_scratch(int64_t n) {
-  return ((1 + (n + kEmitSplats - 1) / kEmitSplats) * int64_t(sizeof(uint32_t)) + 15) / 16 * 16;
+  return ((2 + (n + kEmitSplats - 1) / kEmitSplats) * int64_t(sizeof(uint32_t)) + 15) / 16 * 16;
 }
 
 /// Splats by depth, ties in input order. The result is order[0].

@@ -85,6 +85,34 @@ __device__ inline uint32_t warp_or(uint32_t bits) {
 #endif
 }
 
+/// The lanes whose `bits` agree with this lane's in those of `mask`, a single bit. Written out because the compiler
+/// takes seven instructions for it.
+__device__ inline uint32_t lanes_that_agree(uint32_t bits, uint32_t mask) {
+#if defined(__CUDA_ARCH__)
+  uint32_t lanes;
+  asm("{\n\t"
+      ".reg .pred is_set;\n\t"
+      "and.b32 %0, %1, %2;\n\t"
+      "setp.ne.u32 is_set, %0, 0;\n\t"
+      "vote.sync.ballot.b32 %0, is_set, 0xffffffff;\n\t"
+      "@!is_set not.b32 %0, %0;\n\t"
+      "}"
+      : "=r"(lanes)
+      : "r"(bits), "r"(mask));
+  return lanes;
+#else
+  const uint32_t set = __ballot_sync(kAllLanes, (bits & mask) != 0);
+  return bits & mask ? set : ~set;
+#endif
+}
+/// The lanes with the same number below 2^kBits.
+template <int kBits> __device__ uint32_t lanes_alike(uint32_t number) {
+  uint32_t lanes = kAllLanes;
+#pragma unroll
+  for (int b = 0; b < kBits; ++b) lanes &= lanes_that_agree(number, 1u << b);
+  return lanes;
+}
+
 /// How many of [0, n), from the front, `before` holds for, if it holds for none behind those. Each group of kLanes
 /// lanes looks for its own, in every step among kLanes + 1 times fewer. All lanes of a warp must call it.
 template <int kLanes, class Before> __device__ int partition_point(int n, Before&& before) {

@@ -130,6 +130,7 @@ class CudaBackend final : public Backend {
     emit.order = by_depth.order[0];
     emit.ranges = structs_of<cuda::PairRange>(splats.ranges);
     emit.splat_tiles = memory.tiles;
+    emit.long_splats = reinterpret_cast<int32_t*>(memory.keys[0]);  // nobody needs keys any more
     emit.status = reinterpret_cast<uint32_t*>(memory.emit_scratch);
     out.tile_offsets = at::empty({grid.tiles() + 1}, longs_);
     if (pass.keep) {

@@ -262,6 +262,8 @@ TEST(BinKernels, PairsOfSplats) {
     std::vector<PairRange> written(n);
     emit.ranges = written.data();
     emit.splat_tiles = splat_tiles.data();
+    std::vector<int32_t> long_splats(n);
+    emit.long_splats = long_splats.data();
     emit.status = status.data();
     emit.tile_counts = counts_of_digits.data();
     emit.tiles = tiles.data();
@@ -270,6 +272,7 @@ TEST(BinKernels, PairsOfSplats) {
     // One block more than has splats, as where some are culled.
     cuda_on_host::launch((n + kEmitSplats - 1) / kEmitSplats + 1, kEmitThreads,
                          [&] { emit_pairs_kernel(emit, digits); });
+    cuda_on_host::launch(2, kEmitThreads, [&] { emit_long_pairs_kernel(emit, digits); });
     EXPECT_EQ(tiles, expected_tiles);
     EXPECT_EQ(counts_of_digits, expected_counts);
     for (int64_t k = 0; k < pairs; ++k) {
