@@ -24,8 +24,10 @@ template <typename T> AR_HD Support<T> make_support(Vec2<T> mean, const Mat2<T>&
   // det w without cancellation: one entry of a Cholesky factor is zero, eigenframes are orthogonal
   const T det = difference_of_products(w.xx, w.yy, w.xy, w.yx);
   const T l = level + T(kLevelSlack);
-  const T scale = sqrt(l) / abs(det), inv_a = T(1) / a;
-  return {mean, l, reach, scale * sqrt(c), scale * sqrt(a), -scale * b / sqrt(c), -b * inv_a, inv_a, det * det};
+  // Approximations: kLevelSlack is for much larger errors.
+  const T scale = divide(approx_sqrt(l), abs(det)), inv_a = divide(T(1), a), root_c = approx_sqrt(c);
+  return {mean,       l,     reach,    scale * root_c, scale * approx_sqrt(a), -scale * divide(b, root_c),
+          -b * inv_a, inv_a, det * det};
 }
 
 template <class F, typename T> AR_HD Support<T> support_of(const Splat<F, T>& splat) {

@@ -62,7 +62,7 @@ template <typename T> AR_HD Camera<T> load_camera(const CameraView<T>& c, Vec2<T
           matrix_row(c.proj, 3),
           {c.position[0], c.position[1], c.position[2]},
           {T(c.width), T(c.height)},
-          {T(c.width) / (two * tan_half_fov.x), T(c.height) / (two * tan_half_fov.y)},
+          {quotient(T(c.width), two * tan_half_fov.x), quotient(T(c.height), two * tan_half_fov.y)},
           {clamp * tan_half_fov.x, clamp * tan_half_fov.y},
           {c.width, c.height}};
 }
@@ -100,7 +100,7 @@ template <class Cam, typename T> AR_HD ProjectedMean<T> project_mean(const Cam& 
   ProjectedMean<T> p;
   p.view = {apply_row(camera.view_x, mean), apply_row(camera.view_y, mean), apply_row(camera.view_z, mean)};
   p.clip_w = apply_row(camera.clip_w, mean);
-  const T inv_w = T(1) / p.clip_w;
+  const T inv_w = quotient(T(1), p.clip_w);
   p.ndc = {inv_w * apply_row(camera.clip_x, mean), inv_w * apply_row(camera.clip_y, mean)};
   p.pixel = {T(0.5) * ((p.ndc.x + T(1)) * camera.size.x - T(1)), T(0.5) * ((p.ndc.y + T(1)) * camera.size.y - T(1))};
   p.valid = in_range(camera, p.view.z) && p.clip_w > T(0) && within(p.view.x, 1e18) && within(p.view.y, 1e18) &&
@@ -110,7 +110,8 @@ template <class Cam, typename T> AR_HD ProjectedMean<T> project_mean(const Cam& 
 
 /// Gradients with respect to clip-space x, y and w of a mean.
 template <typename T> AR_HD Vec3<T> clip_vjp(const Camera<T>& camera, const ProjectedMean<T>& p, Vec2<T> dL_dpixel) {
-  const T gx = T(0.5) * camera.size.x * dL_dpixel.x / p.clip_w, gy = T(0.5) * camera.size.y * dL_dpixel.y / p.clip_w;
+  const T gx = quotient(T(0.5) * camera.size.x * dL_dpixel.x, p.clip_w);
+  const T gy = quotient(T(0.5) * camera.size.y * dL_dpixel.y, p.clip_w);
   return {gx, gy, -(gx * p.ndc.x + gy * p.ndc.y)};
 }
 
@@ -149,14 +150,14 @@ template <typename T> struct JacobianGrad {
 /// With x/z and y/z clamped to `center` -+ the camera's limit.
 template <typename T> AR_HD Jacobian<T> perspective_jacobian(const Camera<T>& camera, Vec3<T> view, Vec2<T> center) {
   Jacobian<T> j;
-  const T rx = view.x / view.z, ry = view.y / view.z;
+  const T rx = quotient(view.x, view.z), ry = quotient(view.y, view.z);
   j.ratio_x = min(max(rx, center.x - camera.limit.x), center.x + camera.limit.x);
   j.ratio_y = min(max(ry, center.y - camera.limit.y), center.y + camera.limit.y);
   j.clamped_x = j.ratio_x != rx;
   j.clamped_y = j.ratio_y != ry;
   const Vec3<T> depth = xyz(camera.view_z);
-  j.x = (camera.focal.x / view.z) * (xyz(camera.view_x) - j.ratio_x * depth);
-  j.y = (camera.focal.y / view.z) * (xyz(camera.view_y) - j.ratio_y * depth);
+  j.x = quotient(camera.focal.x, view.z) * (xyz(camera.view_x) - j.ratio_x * depth);
+  j.y = quotient(camera.focal.y, view.z) * (xyz(camera.view_y) - j.ratio_y * depth);
   return j;
 }
 template <typename T> AR_HD Jacobian<T> make_jacobian(const Camera<T>& camera, Vec3<T> view) {
@@ -170,22 +171,23 @@ template <typename T> AR_HD Jacobian<T> make_jacobian(const FullCamera<T>& camer
 /// Gradients with respect to the clamped ratios.
 template <typename T> AR_HD Vec2<T> ratio_vjp(const Camera<T>& camera, Vec3<T> view, const JacobianGrad<T>& grad) {
   const Vec3<T> depth = xyz(camera.view_z);
-  return {-(camera.focal.x / view.z) * dot(grad.x, depth), -(camera.focal.y / view.z) * dot(grad.y, depth)};
+  return {-quotient(camera.focal.x, view.z) * dot(grad.x, depth),
+          -quotient(camera.focal.y, view.z) * dot(grad.y, depth)};
 }
 
 /// Gradient with respect to the camera-space mean.
 template <typename T>
 AR_HD Vec3<T> jacobian_vjp(const Camera<T>& camera, const Jacobian<T>& j, Vec3<T> view, const JacobianGrad<T>& grad) {
   const Vec2<T> by_ratio = ratio_vjp(camera, view, grad);
-  Vec3<T> g = {T(0), T(0), -grad.log_size / view.z};
+  Vec3<T> g = {T(0), T(0), -quotient(grad.log_size, view.z)};
   // Where the ratio is clamped it is constant: its gradient is zero, in z too.
   if (!j.clamped_x) {
-    g.x += by_ratio.x / view.z;
-    g.z -= by_ratio.x * j.ratio_x / view.z;
+    g.x += quotient(by_ratio.x, view.z);
+    g.z -= quotient(by_ratio.x * j.ratio_x, view.z);
   }
   if (!j.clamped_y) {
-    g.y += by_ratio.y / view.z;
-    g.z -= by_ratio.y * j.ratio_y / view.z;
+    g.y += quotient(by_ratio.y, view.z);
+    g.z -= quotient(by_ratio.y * j.ratio_y, view.z);
   }
   return g;
 }
@@ -228,15 +230,15 @@ template <typename T> AR_HD T largest_zoom2(const Camera<T>& camera) {
 }
 
 /// No smaller than |J| at any mean of this depth, camera units to px: |J| <= f/z |(1, 0, -x/z; 0, 1, -y/z)|
-/// <= f/z sqrt(1 + (x/z)^2 + (y/z)^2), with x/z and y/z clamped.
+/// <= f/z sqrt(1 + (x/z)^2 + (y/z)^2), with x/z and y/z clamped. But for rounding.
 template <typename T> AR_HD T largest_stretch(const Camera<T>& camera, T z) {
-  return max(camera.focal.x, camera.focal.y) / z *
-         sqrt(T(1) + camera.limit.x * camera.limit.x + camera.limit.y * camera.limit.y);
+  return divide(max(camera.focal.x, camera.focal.y), z) *
+         approx_sqrt(T(1) + camera.limit.x * camera.limit.x + camera.limit.y * camera.limit.y);
 }
 template <typename T> AR_HD T largest_stretch(const FullCamera<T>& camera, T z) {
   if (camera.lens.orthographic()) return max(camera.focal.x, camera.focal.y);
   const T x = camera.limit.x + abs(camera.lens.center.x), y = camera.limit.y + abs(camera.lens.center.y);
-  return max(camera.focal.x, camera.focal.y) / z * sqrt(T(1) + x * x + y * y);
+  return divide(max(camera.focal.x, camera.focal.y), z) * approx_sqrt(T(1) + x * x + y * y);
 }
 
 /// From where a Gaussian is seen, and 1 / the length of what was normalised: the way from the camera to the mean.
@@ -245,7 +247,7 @@ template <typename T> struct Direction {
   T inv_length;
 };
 template <typename T> AR_HD Direction<T> normalize_direction(Vec3<T> d) {
-  const T inv = T(1) / sqrt(dot(d, d));
+  const T inv = quotient(T(1), sqrt(dot(d, d)));
   return {inv * d, inv};
 }
 template <typename T> AR_HD Direction<T> view_direction(const Camera<T>& camera, Vec3<T> mean) {

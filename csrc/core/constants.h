@@ -40,6 +40,9 @@ inline constexpr double kPixelVariance = 1.0 / 12.0;
 /// the level (7e-3 for a needle 1000 px long, docs/numerics.md), so rounding never drops a pair.
 inline constexpr double kLevelSlack = 1e-2;
 
+/// Makes up for the rounding of an upper bound of how far a Gaussian reaches, some ten operations.
+inline constexpr double kReachMargin = 1 + 2e-6;
+
 /// Five roundings of float32: what a whitened coordinate errs by, relative to the sum of its two terms.
 inline constexpr double kBoxRounding = 3e-7;
 

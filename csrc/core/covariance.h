@@ -14,14 +14,16 @@ template <typename T> struct UnitQuaternion {
 
 /// Deviates from 3DGS, which expects unit quaternions from the caller: any length survives.
 template <typename T> AR_HD UnitQuaternion<T> normalize_quaternion(Vec4<T> q) {
-  // Vec4 (x, y, z, w) holds the quaternion's (w, x, y, z). Dividing by the largest first keeps the
-  // squares of tiny and huge ones in range.
+  // Vec4 (x, y, z, w) holds the quaternion's (w, x, y, z). Dividing by the largest first keeps the squares of tiny and
+  // huge ones in range, and a power of two before that, which rounds nothing, the divisions.
   const T largest = max(max(abs(q.x), abs(q.y)), max(abs(q.z), abs(q.w)));
   // max() may drop a NaN; the sum does not.
   if (abs(q.x) + abs(q.y) + abs(q.z) + abs(q.w) == T(0)) return {T(1), T(0), T(0), T(0), T(0)};
-  const T w = q.x / largest, x = q.y / largest, y = q.z / largest, z = q.w / largest;
-  const T inv = T(1) / sqrt(w * w + x * x + y * y + z * z);
-  return {w * inv, x * inv, y * inv, z * inv, min(inv / largest, T(kMaxQuaternionGrad))};
+  const T power = inverse_power_of_two(largest), scaled = power * largest;
+  const T w = quotient(power * q.x, scaled), x = quotient(power * q.y, scaled), y = quotient(power * q.z, scaled),
+          z = quotient(power * q.w, scaled);
+  const T inv = quotient(T(1), sqrt(w * w + x * x + y * y + z * z));
+  return {w * inv, x * inv, y * inv, z * inv, min(power * quotient(inv, scaled), T(kMaxQuaternionGrad))};
 }
 
 template <typename T> AR_HD Mat3<T> rotation_matrix(UnitQuaternion<T> q) {

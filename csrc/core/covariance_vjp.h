@@ -37,7 +37,7 @@ template <bool kBlurred, typename T>
 AR_HD void add_log_amp_vjp(const Factors<T>& f, const TurnedCov<T>& m, T weight, T v, TurnedGrad<T>& h) {
   if (weight == T(0) || v == T(0)) return;
   const Vec3<T>&tx = f.turned_x, &ty = f.turned_y, square = mul(f.scale, f.scale);
-  const T l = T(0.5) * weight * v / blur(m.cov, v).det, inv = T(1) / sqrt(m.cov.det);
+  const T l = quotient(T(0.5) * weight * v, blur(m.cov, v).det), inv = quotient(T(1), sqrt(m.cov.det));
   const Vec3<T> n = inv * cross(tx, ty), nn = mul(n, n), cx = inv * m.x, cy = inv * m.y;
   // t_k . adj(M) t_l / det M
   Vec3<T> own = {square.y * nn.z + square.z * nn.y, square.z * nn.x + square.x * nn.z,
@@ -100,7 +100,7 @@ AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, co
   if (grad.frame == GradFrame::kAxes) {
     // (w t_k).(w t_l) = t_k . M^-1 t_l is known without w. A window that holds all of a thin needle's width
     // gives much of it, g.yy, which no turn changes: products of w would leave eps (s1/s2)^2 of it.
-    const T c = m.cov.det > T(0) ? g.yy / m.cov.det : T(0);
+    const T c = m.cov.det > T(0) ? quotient(g.yy, m.cov.det) : T(0);
     const Vec3<T> rx = (g.xx - g.yy) * qx + g.xy * qy, ry = g.xy * qx;
     h.off += shifted_products(qx, rx) + shifted_products(qy, ry) - c * mul(square, shifted_products(n, n));
     h.x += w.xx * rx + w.yx * ry;

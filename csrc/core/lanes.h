@@ -6,6 +6,7 @@
 
 #include <cmath>
 #include <cstdint>
+#include <cstring>
 
 #include "core/constants.h"
 #include "core/platform.h"
@@ -114,10 +115,58 @@ AR_HD double exp2(double x) { return std::exp2(x); }
 /// Complement of the error function, relative to itself within 4 ulp while it is a normal number.
 AR_HD float erfc(float x) { return std::erfc(x); }
 AR_HD double erfc(double x) { return std::erfc(x); }
-AR_HD float sqrt(float x) { return std::sqrt(x); }
+// A root and a quotient as the compiler's own are, but on a device without the branch that those take for numbers near
+// the ends of the range of floats. It would take instructions, and around it none can be moved.
+
+/// The root, rounded correctly where x is not below 2^-126.
+AR_HD float sqrt(float x) {
+#if defined(__CUDA_ARCH__)
+  float inverse;
+  asm("rsqrt.approx.f32 %0, %1;" : "=f"(inverse) : "f"(x));
+  const float root = x * inverse, half = 0.5f * inverse;
+  const float improved = __fmaf_rn(__fmaf_rn(-root, root, x), half, root);
+  return x == 0 || x > 3.4e38f ? x : improved;
+#else
+  return std::sqrt(x);
+#endif
+}
 AR_HD double sqrt(double x) { return std::sqrt(x); }
 
-/// a / b. On a device within 2 ulp, for |b| in [2^-126, 2^126]; elsewhere exact.
+/// a / b, rounded correctly where |b| is in [2^-126, 2^126] and neither a nor the quotient is below 2^-100.
+AR_HD float quotient(float a, float b) {
+#if defined(__CUDA_ARCH__)
+  float approximate;
+  asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(approximate) : "f"(b));
+  const float inverse = __fmaf_rn(__fmaf_rn(-b, approximate, 1.0f), approximate, approximate);
+  float q = a * inverse;
+  q = __fmaf_rn(__fmaf_rn(-b, q, a), inverse, q);
+  q = __fmaf_rn(__fmaf_rn(-b, q, a), inverse, q);
+  return q == q ? q : a * approximate;  // NaN here: infinite or zero, or really NaN
+#else
+  return a / b;
+#endif
+}
+AR_HD double quotient(double a, double b) { return a / b; }
+
+/// A power of two that takes |x| to [1, 2), or as near as it can where x is not a normal number.
+AR_HD float inverse_power_of_two(float x) {
+  uint32_t bits;
+  memcpy(&bits, &x, sizeof bits);
+  const uint32_t exponent = bits & 0x7f800000u;
+  bits = exponent < 0x7e800000u ? 0x7f000000u - exponent : 0x00800000u;
+  memcpy(&x, &bits, sizeof x);
+  return x;
+}
+AR_HD double inverse_power_of_two(double x) {
+  uint64_t bits;
+  memcpy(&bits, &x, sizeof bits);
+  const uint64_t exponent = bits & 0x7ff0000000000000u;
+  bits = exponent < 0x7fd0000000000000u ? 0x7fe0000000000000u - exponent : 0x0010000000000000u;
+  memcpy(&x, &bits, sizeof x);
+  return x;
+}
+
+/// a / b, quicker than quotient(). On a device within 2 ulp, for |b| in [2^-126, 2^126]; elsewhere exact.
 AR_HD float divide(float a, float b) {
 #if defined(__CUDA_ARCH__)
   float reciprocal;

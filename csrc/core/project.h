@@ -48,9 +48,9 @@ AR_HD bool may_be_visible(const Cam& camera, const Gaussians<T>& g, int64_t i, C
     variance += blur.streak.x * blur.streak.x + blur.streak.y * blur.streak.y + blur.variance;
   }
   const T stretch = largest_stretch(camera, p.view.z);
-  const T sigma = sqrt(largest_zoom2(camera) * stretch * stretch * largest * largest + variance);
+  const T sigma = approx_sqrt(largest_zoom2(camera) * stretch * stretch * largest * largest + variance);
   const T level = bounds.level + (opacity > T(1) ? T(2) * std::log(opacity) : T(0));
-  const T reach = T(2) + sigma * sqrt(level);
+  const T reach = T(2) + T(kReachMargin) * sigma * approx_sqrt(level);
   return p.pixel.x + reach >= T(0) && p.pixel.x - reach <= camera.size.x - T(1) && p.pixel.y + reach >= T(0) &&
          p.pixel.y - reach <= camera.size.y - T(1);
 }
@@ -355,7 +355,7 @@ AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
   }
   if (!same_direction) dL_dmean += dL_ddirection;
   if (out.means) put(out, out.means[i], dL_dmean);
-  if (out.opacities) put(out, out.opacities[i], projected.weighted / g.opacities[i]);
+  if (out.opacities) put(out, out.opacities[i], quotient(projected.weighted, g.opacities[i]));
   if (out.means2d) {
     T* row = out.means2d + i * out.means2d_stride;
     row[0] = T(0.5) * camera.size.x * grad.dL_dmean.x;

@@ -77,7 +77,7 @@ __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front
       for (int s = 0; s < S; ++s) {
         Values<C> behind = times(abs(state.transmittance[s]), background);
         behind += state.channels[s];
-        accumulate_behind<8>(checkpoints, written, s, behind);
+        accumulate_behind<8>(checkpoints, 0, written, s, behind);
       }
     }
   } else if constexpr (!kKeep) {
@@ -90,7 +90,7 @@ __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front
 
 template <class F, int C, bool kKeep> void launch_blend(const BlendParams& p, cudaStream_t stream) {
   constexpr int S = F::kSamples;
-  const LaunchShape of_chunks = {kTailBlocks, kBlendThreads}, of_parts = {kTailBlocks, 32};
+  const LaunchShape of_chunks = {kTailBlocks, kBlendThreads}, of_parts = {kTailBlocks, kTailThreads};
   launch(blend_front_kernel<F, C, kKeep>, {unsigned(p.grid.tiles()), kBlendThreads}, stream, p);
   launch(tail_through_kernel<F>, of_chunks, stream, p);
   launch(tail_scan_kernel<S>, of_parts, stream, p);

@@ -106,21 +106,22 @@ template <int S> __device__ void store_last(const BlendParams& params, Pixel pix
   for (int s = 0; s < S; ++s) params.last[s * pixel.image + pixel.index] = last[s];
 }
 
-/// Turns the checkpoints of a sample's first `n` chunks, which hold the channels of the chunk itself, into the channels
-/// of everything behind the chunk, from which blend_vjp starts. `behind`: the channels of what is behind all of them.
-/// These are sums of positive terms, which do not cancel. kBatch: chunks that are loaded before the first store, so
-/// that the loads wait for memory together.
+/// Turns the checkpoints of a sample's chunks [first, end), which hold the channels of the chunk itself, into the
+/// channels of everything behind the chunk, from which blend_vjp starts. `behind`: the channels of what is behind all
+/// of them. These are sums of positive terms, which do not cancel. kBatch: chunks that are loaded before the first
+/// store, so that the loads wait for memory together.
 template <int kBatch, int S, int C>
-__device__ void accumulate_behind(const PixelCheckpoints<S, C, true>& checkpoints, int n, int s, Values<C> behind) {
-  for (int last = n - 1; last >= 0; last -= kBatch) {
+__device__ void accumulate_behind(const PixelCheckpoints<S, C, true>& checkpoints, int first, int end, int s,
+                                  Values<C> behind) {
+  for (int last = end - 1; last >= first; last -= kBatch) {
     Values<C> own[kBatch];
 #pragma unroll
     for (int k = 0; k < kBatch; ++k) {
-      if (last >= k) own[k] = checkpoints.kept(last - k, s).channels;
+      if (last - k >= first) own[k] = checkpoints.kept(last - k, s).channels;
     }
 #pragma unroll
     for (int k = 0; k < kBatch; ++k) {
-      if (last < k) continue;
+      if (last - k < first) continue;
       checkpoints.kept(last - k, s).channels = behind;
       behind += own[k];
     }

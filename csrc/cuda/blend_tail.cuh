@@ -63,40 +63,74 @@ __device__ inline int chunks_of(const BlendParams& params, int tile, int length)
   return int((params.lists.tile_offsets[tile + 1] - params.lists.tile_offsets[tile] + length - 1) / length);
 }
 
-/// The kernels that go through all tail chunks of a tile, a pixel per lane, have a block per warp: the pixels of a long
-/// list are spread over several multiprocessors, as one alone reads too slowly. A part of a tile is 32 pixels.
-inline constexpr int kTailParts = kTilePixels / 32;
+/// The kernels that go through all tail chunks of a tile have a pixel per lane, and a block for each 32 pixels: those
+/// of a long list are spread over several multiprocessors, as one alone reads too slowly. A part of a tile is 32
+/// pixels. The warps of a block share the tail chunks, since one alone waits for memory most of the time.
+inline constexpr int kTailParts = kTilePixels / 32, kTailWarps = 4, kTailThreads = 32 * kTailWarps;
+
+/// The tail chunks [first, end) of a warp.
+struct TailShare {
+  int first, end;
+
+  __device__ TailShare(int front, int chunks) {
+    const int share = (chunks - front + kTailWarps - 1) / kTailWarps;
+    first = min(front + int(threadIdx.x / 32) * share, chunks);
+    end = min(first + share, chunks);
+  }
+};
+
+/// Calls visit(chunk, transmittance that it lets through) for the chunks of a warp in order, for sample s of its pixel.
+/// Many loads wait together, and are begun before what `visit` stores, behind which they would wait.
+template <int S, class Visit>
+__device__ __forceinline__ void for_each_through(const TransmittancePlanes<S>& planes, const TailShare& share, int s,
+                                                 Visit&& visit) {
+  constexpr int kBatch = 32;
+  float next[kBatch];
+  const auto load = [&](int first) {
+#pragma unroll
+    for (int k = 0; k < kBatch; ++k) {
+      if (first + k < share.end) next[k] = planes.at(first + k, s);
+    }
+  };
+  load(share.first);
+  for (int first = share.first; first < share.end; first += kBatch) {
+    float through[kBatch];
+#pragma unroll
+    for (int k = 0; k < kBatch; ++k) through[k] = next[k];
+    load(first + kBatch);
+#pragma unroll
+    for (int k = 0; k < kBatch; ++k) {
+      if (first + k >= share.end) break;
+      visit(first + k, through[k]);
+    }
+  }
+}
 
 /// Turns the transmittance of each chunk into that in front of the chunk, negative where a sample has stopped before.
 /// Blocks share the parts of the open tiles.
-template <int S> __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params) {
-  constexpr int kBatch = 32;
+template <int S> __global__ void __launch_bounds__(kTailThreads) tail_scan_kernel(const BlendParams params) {
+  __shared__ float products[kTailWarps][32];
   const int items = params.plan.state->counts.open_tiles[sample_class(S)] * S * kTailParts;
+  const int warp = int(threadIdx.x) / 32, lane = lane_id();
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const int tile = open_tiles<S>(params)[item / (S * kTailParts)], s = item / kTailParts % S;
-    const int chunks = chunks_of(params, tile, chunk_length(S)), front = front_chunks(params.grid, S);
-    const TransmittancePlanes<S> planes(params, tile, item % kTailParts * 32 + lane_id());
-    float transmittance = planes.at(front - 1, s), next[kBatch];
-    const auto load = [&](int first) {
-#pragma unroll
-      for (int k = 0; k < kBatch; ++k) {
-        if (first + k < chunks) next[k] = planes.at(first + k, s);
-      }
+    const int front = front_chunks(params.grid, S);
+    const TailShare share(front, chunks_of(params, tile, chunk_length(S)));
+    const TransmittancePlanes<S> planes(params, tile, item % kTailParts * 32 + lane);
+    float transmittance = planes.at(front - 1, s), product = 1;
+    for_each_through(planes, share, s, [&](int, float through) { product *= through; });
+    products[warp][lane] = product;
+    __syncthreads();
+    const auto pass = [&](float through) {
+      if (transmittance > 0) transmittance *= through;
+      if (transmittance < kNearlyStopped) transmittance = -abs(transmittance);
     };
-    load(front);
-    for (int first = front; first < chunks; first += kBatch) {
-      float through[kBatch];
-#pragma unroll
-      for (int k = 0; k < kBatch; ++k) through[k] = next[k];
-      load(first + kBatch);  // before the stores, behind which loads would wait
-#pragma unroll
-      for (int k = 0; k < kBatch; ++k) {
-        if (first + k >= chunks) break;
-        planes.at(first + k, s) = transmittance;
-        if (transmittance > 0) transmittance *= through[k];
-        if (transmittance < kNearlyStopped) transmittance = -abs(transmittance);
-      }
-    }
+    for (int w = 0; w < warp; ++w) pass(products[w][lane]);
+    for_each_through(planes, share, s, [&](int chunk, float through) {
+      planes.at(chunk, s) = transmittance;
+      pass(through);
+    });
+    __syncthreads();  // before the next products
   }
 }
 
@@ -142,41 +176,65 @@ __global__ void __launch_bounds__(kBlendThreads, kTailBlendBlocks<F>) tail_blend
   });
 }
 
-/// Adds the chunks of the open tiles. Blocks share the parts of the tiles.
-template <int S, int C, bool kKeep> __global__ void __launch_bounds__(32) tail_sum_kernel(const BlendParams params) {
+/// Adds the chunks of the open tiles. Blocks share the parts of the tiles. The order of the sum depends on the number
+/// of tail chunks alone, so that the picture is the same with and without a backward pass.
+template <int S, int C, bool kKeep>
+__global__ void __launch_bounds__(kTailThreads) tail_sum_kernel(const BlendParams params) {
   constexpr int kBatch = kKeep && C > 3 ? 16 : 32;  // chunks that are loaded together, into registers
+  __shared__ float sums[kTailWarps][C][32], lasts[kTailWarps][32];
+  const int warp = int(threadIdx.x) / 32, lane = lane_id();
   const Values<C> background = background_of<C>(params);
   const int items = params.plan.state->counts.open_tiles[sample_class(S)] * kTailParts;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const int tile = open_tiles<S>(params)[item / kTailParts], part = item % kTailParts;
-    const int chunks = chunks_of(params, tile, chunk_length(S));
-    const PixelCheckpoints<S, C, kKeep> checkpoints(params, tile, part * 32 + lane_id());
+    const PixelCheckpoints<S, C, kKeep> checkpoints(params, tile, part * 32 + lane);
+    TailShare share(front_chunks(params.grid, S), chunks_of(params, tile, chunk_length(S)));
+    if (warp == 0) share.first = checkpoints.first_chunk;
     Values<C> total = {};
     float transmittance[S];
 #pragma unroll
     for (int s = 0; s < S; ++s) {
-      float last = -1;
-      for (int first = checkpoints.first_chunk; first < chunks; first += kBatch) {
+      const bool has_channels = kKeep || s == 0;
+      Values<C> sum = {};
+      float last = 0;  // at the end of the last of these chunks that the sample reached
+      for (int first = share.first; first < share.end; first += kBatch) {
         Values<C> own[kBatch];
         float ends[kBatch];
 #pragma unroll
         for (int k = 0; k < kBatch; ++k) {
           ends[k] = 0;
-          if (first + k >= chunks) continue;
-          if (kKeep || s == 0) own[k] = checkpoints.channels(first + k, s);
+          if (first + k >= share.end) continue;
+          if (has_channels) own[k] = checkpoints.channels(first + k, s);
           ends[k] = checkpoints.transmittance(first + k, s);
         }
 #pragma unroll
         for (int k = 0; k < kBatch; ++k) {
-          if ((kKeep || s == 0) && first + k < chunks) total += own[k];
+          if (has_channels && first + k < share.end) sum += own[k];
           if (ends[k] != 0) last = ends[k];
         }
       }
+      lasts[warp][lane] = last;
+#pragma unroll
+      for (int c = 0; c < C; ++c) sums[warp][c][lane] = sum.v[c];
+      __syncthreads();
+      for (int w = 0; w < kTailWarps; ++w) {
+        if (lasts[w][lane] != 0) last = lasts[w][lane];
+#pragma unroll
+        for (int c = 0; c < C; ++c) total.v[c] += sums[w][c][lane];
+      }
       transmittance[s] = last;
-      if constexpr (kKeep) accumulate_behind<kBatch>(checkpoints, chunks, s, times(abs(last), background));
+      if constexpr (kKeep) {
+        Values<C> behind = times(abs(last), background);
+        for (int w = kTailWarps - 1; w > warp; --w) {
+#pragma unroll
+          for (int c = 0; c < C; ++c) behind.v[c] += sums[w][c][lane];
+        }
+        accumulate_behind<kBatch>(checkpoints, share.first, share.end, s, behind);
+      }
+      __syncthreads();  // before the next sums
     }
     const TileList list = list_of(params.lists, params.grid, tile);
-    store_pixel(params, Pixel(list, params.grid, pixel_of(part, lane_id())), total, transmittance);
+    if (warp == 0) store_pixel(params, Pixel(list, params.grid, pixel_of(part, lane)), total, transmittance);
   }
 }
 

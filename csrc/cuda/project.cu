@@ -1,4 +1,5 @@
 // Launches of the projection, for every camera type and whatever the footprint.
+#include <algorithm>
 #include <mutex>
 #include <set>
 
@@ -38,7 +39,9 @@ using Full = FullCamera<float>;
 }  // namespace
 
 void project(const ProjectParams& p, cudaStream_t stream) {
-  launch_rows(project_kernel<Plain>, project_kernel<Full>, p, stream);
+  const unsigned blocks = std::min(blocks_of(p.gaussians.n, kProjectThreads), kProjectBlocks);
+  if (blocks > 0)
+    launch(p.camera.lens ? project_kernel<Full> : project_kernel<Plain>, {blocks, kProjectThreads}, stream, p);
 }
 void project_rows(const ProjectRowsParams& p, cudaStream_t stream) {
   launch_rows(project_rows_kernel<Plain>, project_rows_kernel<Full>, p, stream);

@@ -41,42 +41,52 @@ __device__ inline uint32_t rows_not_finite(const Channels<float>& channels, int6
   return found;
 }
 
+/// The most blocks of project_kernel, four times as many as an H200 has room for. More Gaussians than they have threads
+/// are taken in turns, so that the camera is loaded once for several of them.
+inline constexpr unsigned kProjectBlocks = 132 * 32;
+
 template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_kernel(const ProjectParams params) {
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
+  // Shared variables may not have initialisers, as the camera's members do.
+  alignas(16) __shared__ char camera_memory[sizeof(Cam)];
+  Cam& camera = *reinterpret_cast<Cam*>(camera_memory);
+  if (threadIdx.x == 0) camera = load_camera_as<Cam>(params.camera);
   clear_counts(params);
+  __syncthreads();
   const Gaussians<float>& g = params.gaussians;
-  const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
-  const Cam camera = load_camera_as<Cam>(params.camera);
-  SplatRow<float> splat = {};
-  Support<float> support = {};
-  float depth = 0;
-  int radius = 0;
-  ProjectedMean<float> mean;
-  if (i < g.n && may_be_visible(camera, g, i, params.bounds, mean))
-    radius = project_shape(camera, g, i, mean, params.footprint, splat, depth, &support);
   ShRows<Cam::kShDegree>& rows = sh_rows[threadIdx.x / 32];
-  const uint32_t lit = __ballot_sync(kAllLanes, splat.level > 0);
-  if (g.shs && lit) rows.begin_load(g.shs + (i - lane_id()) * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
-  uint32_t not_finite = 0;
-  if (params.given.data) not_finite = rows_not_finite(params.given, i - lane_id(), lit);
-  // While the harmonics are on their way.
-  SplatTiles tiles = {};
-  if (splat.level > 0) tiles = splat_tiles_of(support, params.grid);
-  wait_for_copies();
-  if (splat.level > 0) {
-    if (splat_color(camera, g, i, rows.row(), splat.color) && !(not_finite >> lane_id() & 1)) {
-      if (params.channels.data) write_channels(params.channels, i, splat.color, depth);
-      if (given_colors(params)) splat.color = first_channels(params.given.row(int32_t(i)), params.given.count);
-    } else {
-      radius = 0;
-      splat.level = 0;
-      tiles = {};
+  for (int64_t block = blockIdx.x; block * kProjectThreads < g.n; block += gridDim.x) {
+    const int64_t i = block * kProjectThreads + threadIdx.x;
+    SplatRow<float> splat = {};
+    Support<float> support = {};
+    float depth = 0;
+    int radius = 0;
+    ProjectedMean<float> mean;
+    if (i < g.n && may_be_visible(camera, g, i, params.bounds, mean))
+      radius = project_shape(camera, g, i, mean, params.footprint, splat, depth, &support);
+    const uint32_t lit = __ballot_sync(kAllLanes, splat.level > 0);
+    if (g.shs && lit) rows.begin_load(g.shs + (i - lane_id()) * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
+    uint32_t not_finite = 0;
+    if (params.given.data) not_finite = rows_not_finite(params.given, i - lane_id(), lit);
+    // While the harmonics are on their way.
+    SplatTiles tiles = {};
+    if (splat.level > 0) tiles = splat_tiles_of(support, params.grid);
+    wait_for_copies();
+    if (splat.level > 0) {
+      if (splat_color(camera, g, i, rows.row(), splat.color) && !(not_finite >> lane_id() & 1)) {
+        if (params.channels.data) write_channels(params.channels, i, splat.color, depth);
+        if (given_colors(params)) splat.color = first_channels(params.given.row(int32_t(i)), params.given.count);
+      } else {
+        radius = 0;
+        splat.level = 0;
+        tiles = {};
+      }
     }
+    if (i >= g.n) continue;
+    if (radius > 0) reinterpret_cast<SplatRow<float>*>(params.splats)[i] = splat;
+    write_tiles(params, i, tiles, depth);
+    params.radii[i] = radius;
   }
-  if (i >= g.n) return;
-  if (radius > 0) reinterpret_cast<SplatRow<float>*>(params.splats)[i] = splat;
-  write_tiles(params, i, tiles, depth);
-  params.radii[i] = radius;
 }
 
 template <class Cam>

@@ -222,9 +222,9 @@ template <typename T> struct SplatGrad {
 /// Gradient of log amp with respect to Sigma: (Sigma^-1 - Sigma'^-1) / 2 = v adj(Sigma) adj(Sigma') / (2 det det'),
 /// whose terms do not cancel.
 template <typename T> AR_HD Sym2<T> log_amp_grad(Cov2d<T> c, T v) {
-  const T scale = T(0.5) * v / blur(c, v).det, square = c.xy * c.xy;
-  return {scale * ((c.yy * (c.yy + v) + square) / c.det), -scale * (c.xy / c.det * (c.xx + c.yy + v)),
-          scale * ((c.xx * (c.xx + v) + square) / c.det)};
+  const T scale = quotient(T(0.5) * v, blur(c, v).det), square = c.xy * c.xy;
+  return {scale * quotient(c.yy * (c.yy + v) + square, c.det), -scale * (quotient(c.xy, c.det) * (c.xx + c.yy + v)),
+          scale * quotient(c.xx * (c.xx + v) + square, c.det)};
 }
 
 /// All of the gradient with respect to Sigma, as one matrix: for a Sigma that is known by its entries only.

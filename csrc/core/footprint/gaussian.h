@@ -17,9 +17,9 @@ template <typename T> struct GaussianShape {
 /// Whitening matrix of c: Cholesky factor with the narrow axis conditioned on the wide one.
 template <typename T> AR_HD Mat2<T> whiten(Cov2d<T> c, bool wide_x) {
   const T wide = wide_x ? c.xx : c.yy;
-  const T along = T(1) / sqrt(wide);
-  const T across = sqrt(wide / c.det);  // 1 / std. dev. of the narrow axis given the wide one
-  const T slope = -across * (c.xy / wide);
+  const T along = quotient(T(1), sqrt(wide));
+  const T across = sqrt(quotient(wide, c.det));  // 1 / std. dev. of the narrow axis given the wide one
+  const T slope = -across * quotient(c.xy, wide);
   return wide_x ? Mat2<T>{along, T(0), slope, across} : Mat2<T>{T(0), along, across, slope};
 }
 template <typename T> AR_HD Mat2<T> whiten(Cov2d<T> c) { return whiten(c, c.xx >= c.yy); }
@@ -139,7 +139,7 @@ template <int S, bool kCompensated> struct GaussianFootprint : GaussianPixels<S>
 
   template <typename T> AR_HD static Shape<T> prepare_with(Cov2d<T> cov, T variance) {
     const Cov2d<T> blurred = blur(cov, variance);
-    return {whiten(blurred), kCompensated ? sqrt(cov.det / blurred.det) : T(1)};
+    return {whiten(blurred), kCompensated ? sqrt(quotient(cov.det, blurred.det)) : T(1)};
   }
 
   template <typename T>

@@ -1,5 +1,5 @@
-// The kernels of project_vjp, run on the host: for rows of visible and culled Gaussians, whatever they are made of,
-// they write what the core's functions give one Gaussian after the other, to the bit.
+// The kernels of project and project_vjp, run on the host: for rows of visible and culled Gaussians, whatever they are
+// made of, they write what the core's functions give one Gaussian after the other, to the bit.
 #include <random>
 
 #include "cuda_on_host.h"
@@ -62,37 +62,113 @@ void expect_same_bits(const std::vector<float>& a, const std::vector<float>& b, 
   }
 }
 
+/// Gaussians in front of a camera, as a case wants them.
+class Scene {
+ public:
+  Scene(const Case& c, Numbers& numbers)
+      : means_(numbers.uniform(3 * kCount, -1, 1)),
+        scales_(numbers.uniform(3 * kCount, 0.02f, 0.3f)),
+        rotations_(numbers.uniform(4 * kCount, -1, 1)),
+        opacities_(numbers.uniform(kCount, 0.1f, 0.9f)),
+        shs_(numbers.uniform(size_t(3) * c.sh_stride * kCount, -1, 1)),
+        colors_(numbers.uniform(3 * kCount, 0, 1)) {
+    for (int i = 0; i < kCount; ++i) {
+      const float a = scales_[3 * i], b = scales_[3 * i + 1], d = scales_[3 * i + 2];
+      cov3ds_.push_back({a, 0.3f * std::min(a, b), 0, b, 0.2f * std::min(b, d), d});
+    }
+    g.n = kCount;
+    g.means = reinterpret_cast<const Vec3<float>*>(means_.data());
+    if (c.cov3ds) {
+      g.cov3ds = cov3ds_.data();
+    } else {
+      g.scales = reinterpret_cast<const Vec3<float>*>(scales_.data());
+      g.rotations = reinterpret_cast<const Vec4<float>*>(rotations_.data());
+    }
+    g.opacities = opacities_.data();
+    if (c.sh_stride > 0) {
+      g.shs = reinterpret_cast<const Vec3<float>*>(shs_.data());
+    } else {
+      g.colors = reinterpret_cast<const Vec3<float>*>(colors_.data());
+    }
+    g.sh_stride = c.sh_stride;
+    g.sh_degree = c.sh_degree;
+    g.scale_modifier = 1.5f;
+  }
+
+  Gaussians<float> g = {};
+  CameraView<float> camera = {kView, kProj, kPosition, kWidth, kHeight, 1 / 1.5f, 0.5f};
+
+ private:
+  static constexpr float kView[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0.1f, -0.2f, 4, 1};
+  static constexpr float kProj[16] = {1.5f, 0, 0, 0, 0, 2, 0, 0, 0, 0, 1, 1, 0.15f, -0.4f, 4, 4};
+  static constexpr float kPosition[3] = {-0.1f, 0.2f, -4};
+  std::vector<float> means_, scales_, rotations_, opacities_, shs_, colors_;
+  std::vector<Sym3<float>> cov3ds_;
+};
+
+class ProjectKernel : public testing::TestWithParam<Case> {};
+
+TEST_P(ProjectKernel, WritesWhatTheCoreGives) {
+  Numbers numbers;
+  const Scene scene(GetParam(), numbers);
+  const Gaussians<float>& g = scene.g;
+  ProjectParams p = {};
+  p.camera = scene.camera;
+  p.gaussians = g;
+  p.footprint.index = find_footprint("box1");
+  // From closer by, so that some Gaussians touch no tile or are culled.
+  constexpr float kZoom = 5;
+  float proj[16];
+  for (int k = 0; k < 16; ++k) proj[k] = scene.camera.proj[k] * (k % 4 < 2 ? kZoom : 1);
+  p.camera.proj = proj;
+  p.camera.tan_half_fov_x /= kZoom;
+  p.camera.tan_half_fov_y /= kZoom;
+  p.grid = {kWidth, kHeight};
+  p.bounds = cull_bounds<float>(p.footprint);
+  std::vector<SplatRow<float>> splats(kCount);
+  std::vector<int32_t> radii(kCount, -1);
+  std::vector<uint32_t> keys(kCount), histograms(kDepthHistogramWords, 7);
+  std::vector<PairRange> ranges(kCount, {-1, -1});
+  std::vector<SplatTiles> tiles(kCount);
+  Counts counts = {5, 5};
+  p.splats = &splats[0].mean.x;
+  p.radii = radii.data();
+  p.keys = keys.data();
+  p.ranges = ranges.data();
+  p.tiles = tiles.data();
+  p.counts = &counts;
+  p.depth_histograms = histograms.data();
+  // A single block, which takes all Gaussians in turns.
+  cuda_on_host::launch(1, kProjectThreads, [&] { project_kernel<Camera<float>>(p); });
+  EXPECT_EQ(histograms, std::vector<uint32_t>(histograms.size()));
+  EXPECT_EQ(counts.pairs + counts.splats, 0);
+
+  const Camera<float> camera = load_camera(p.camera);
+  int shown = 0;
+  for (int i = 0; i < kCount; ++i) {
+    SplatRow<float> splat = {};
+    float depth = 0;
+    const int radius = ar::project(camera, g, i, p.footprint, splat, depth);
+    ASSERT_EQ(radii[i], radius) << i;
+    if (radius > 0) ASSERT_EQ(std::memcmp(&splats[i], &splat, sizeof splat), 0) << i;
+    const bool lit = splat.level > 0;
+    const SplatTiles expected = lit ? splat_tiles_of(support_of(splat, p.footprint.index), p.grid) : SplatTiles{};
+    shown += expected.count > 0;
+    ASSERT_EQ(ranges[i].count, expected.count) << i;
+    ASSERT_EQ(keys[i], expected.count > 0 ? depth_key(depth) : kCulledKey) << i;
+    if (expected.count > 0) ASSERT_EQ(std::memcmp(&tiles[i], &expected, sizeof expected), 0) << i;
+  }
+  EXPECT_GT(shown, kCount / 10);
+  EXPECT_LT(shown, kCount);
+}
+
 class ProjectVjpKernel : public testing::TestWithParam<Case> {};
 
 TEST_P(ProjectVjpKernel, WritesWhatTheCoreGives) {
   const Case c = GetParam();
   Numbers numbers;
-  const auto means = numbers.uniform(3 * kCount, -1, 1), scales = numbers.uniform(3 * kCount, 0.02f, 0.3f),
-             rotations = numbers.uniform(4 * kCount, -1, 1), opacities = numbers.uniform(kCount, 0.1f, 0.9f),
-             shs = numbers.uniform(size_t(3) * c.sh_stride * kCount, -1, 1), colors = numbers.uniform(3 * kCount, 0, 1);
-  std::vector<Sym3<float>> cov3ds;
-  for (int i = 0; i < kCount; ++i) {
-    const float a = scales[3 * i], b = scales[3 * i + 1], d = scales[3 * i + 2];
-    cov3ds.push_back({a, 0.3f * std::min(a, b), 0, b, 0.2f * std::min(b, d), d});
-  }
-  Gaussians<float> g = {};
-  g.n = kCount;
-  g.means = reinterpret_cast<const Vec3<float>*>(means.data());
-  if (c.cov3ds) {
-    g.cov3ds = cov3ds.data();
-  } else {
-    g.scales = reinterpret_cast<const Vec3<float>*>(scales.data());
-    g.rotations = reinterpret_cast<const Vec4<float>*>(rotations.data());
-  }
-  g.opacities = opacities.data();
-  if (c.sh_stride > 0) {
-    g.shs = reinterpret_cast<const Vec3<float>*>(shs.data());
-  } else {
-    g.colors = reinterpret_cast<const Vec3<float>*>(colors.data());
-  }
-  g.sh_stride = c.sh_stride;
-  g.sh_degree = c.sh_degree;
-  g.scale_modifier = 1.5f;
+  const Scene scene(c, numbers);
+  const Gaussians<float>& g = scene.g;
 
   // A third of the Gaussians have no pairs, and none of the second warp; one has so many that its warp sums them.
   std::vector<PairRange> ranges;
@@ -108,11 +184,8 @@ TEST_P(ProjectVjpKernel, WritesWhatTheCoreGives) {
   for (float& x : pair_grads) x = std::round(numbers.uniform(-64, 64)) / 64;
   const Counts counts = {pairs, kCount};
 
-  const float view[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0.1f, -0.2f, 4, 1};
-  const float proj[16] = {1.5f, 0, 0, 0, 0, 2, 0, 0, 0, 0, 1, 1, 0.15f, -0.4f, 4, 4};
-  const float position[3] = {-0.1f, 0.2f, -4};
   ProjectVjpParams p = {};
-  p.camera = {view, proj, position, kWidth, kHeight, 1 / 1.5f, 0.5f};
+  p.camera = scene.camera;
   p.gaussians = g;
   p.sums = {kCount, ranges.data(), &counts, c.more_pairs_than_room ? 1 : pairs, pair_grads.data()};
   const Outputs results(g), expected(g);
@@ -157,13 +230,19 @@ TEST_P(ProjectVjpKernel, WritesWhatTheCoreGives) {
   expect_same_bits(results.means2d, expected.means2d, "means2d");
 }
 
+constexpr auto kName = [](const testing::TestParamInfo<Case>& info) { return info.param.name; };
+
+INSTANTIATE_TEST_SUITE_P(Of, ProjectKernel,
+                         testing::Values(Case{"Degree3", 3, 16, false, false}, Case{"Degree1", 1, 4, false, false},
+                                         Case{"Cov3ds", 3, 16, true, false}, Case{"Colors", 0, 0, false, false}),
+                         kName);
 INSTANTIATE_TEST_SUITE_P(Of, ProjectVjpKernel,
                          testing::Values(Case{"Degree3", 3, 16, false, false},
                                          Case{"Degree2OfRoomFor3", 2, 16, false, false},
                                          Case{"Degree1", 1, 4, false, false}, Case{"LongRows", 3, 20, false, false},
                                          Case{"Cov3ds", 3, 16, true, false}, Case{"Colors", 0, 0, false, false},
                                          Case{"TooManyPairs", 3, 16, false, true}),
-                         [](const auto& info) { return info.param.name; });
+                         kName);
 
 }  // namespace
 }  // namespace ar::cuda

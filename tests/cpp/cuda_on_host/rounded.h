@@ -66,6 +66,7 @@ inline Rounded operator/(Rounded a, Rounded b) {
   return Rounded::of(quotient, least > 0 ? (a.error + std::abs(quotient) * b.error) / least : INFINITY);
 }
 inline Rounded divide(Rounded a, Rounded b) { return a / b; }
+inline Rounded quotient(Rounded a, Rounded b) { return a / b; }
 inline Rounded madd(Rounded a, Rounded b, Rounded c) { return a * b + c; }  // with one rounding or, on a host, two
 
 inline RoundedMask compared(bool value, Rounded a, Rounded b) {
