@@ -4,6 +4,7 @@
 // double). `ScalarOf<V>` is the element type, `V::Mask` or bool the result of comparisons.
 #pragma once
 
+#include <cfloat>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -118,14 +119,14 @@ AR_HD double erfc(double x) { return std::erfc(x); }
 // A root and a quotient as the compiler's own are, but on a device without the branch that those take for numbers near
 // the ends of the range of floats. It would take instructions, and around it none can be moved.
 
-/// The root, rounded correctly where x is not below 2^-126.
+/// The root, rounded correctly where x is not below 2^-100.
 AR_HD float sqrt(float x) {
 #if defined(__CUDA_ARCH__)
   float inverse;
   asm("rsqrt.approx.f32 %0, %1;" : "=f"(inverse) : "f"(x));
   const float root = x * inverse, half = 0.5f * inverse;
   const float improved = __fmaf_rn(__fmaf_rn(-root, root, x), half, root);
-  return x == 0 || x > 3.4e38f ? x : improved;
+  return x == 0 || x > FLT_MAX ? x : improved;
 #else
   return std::sqrt(x);
 #endif

@@ -90,12 +90,13 @@ __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front
 
 template <class F, int C, bool kKeep> void launch_blend(const BlendParams& p, cudaStream_t stream) {
   constexpr int S = F::kSamples;
-  const LaunchShape of_chunks = {kTailBlocks, kBlendThreads}, of_parts = {kTailBlocks, kTailThreads};
+  const LaunchShape of_chunks = {kTailBlocks, kBlendThreads}, of_parts = {kTailBlocks, 32},
+                    of_sums = {kTailBlocks, kTailSumThreads};
   launch(blend_front_kernel<F, C, kKeep>, {unsigned(p.grid.tiles()), kBlendThreads}, stream, p);
   launch(tail_through_kernel<F>, of_chunks, stream, p);
   launch(tail_scan_kernel<S>, of_parts, stream, p);
   launch(tail_blend_kernel<F, C, kKeep>, of_chunks, stream, p);
-  launch(tail_sum_kernel<S, C, kKeep>, of_parts, stream, p);
+  launch(tail_sum_kernel<S, C, kKeep>, of_sums, stream, p);
 }
 template <class F, int C> void blend_few(const BlendParams& p, cudaStream_t stream) {
   if (p.transmittance) {

@@ -65,72 +65,39 @@ __device__ inline int chunks_of(const BlendParams& params, int tile, int length)
 
 /// The kernels that go through all tail chunks of a tile have a pixel per lane, and a block for each 32 pixels: those
 /// of a long list are spread over several multiprocessors, as one alone reads too slowly. A part of a tile is 32
-/// pixels. The warps of a block share the tail chunks, since one alone waits for memory most of the time.
-inline constexpr int kTailParts = kTilePixels / 32, kTailWarps = 4, kTailThreads = 32 * kTailWarps;
-
-/// The tail chunks [first, end) of a warp.
-struct TailShare {
-  int first, end;
-
-  __device__ TailShare(int front, int chunks) {
-    const int share = (chunks - front + kTailWarps - 1) / kTailWarps;
-    first = min(front + int(threadIdx.x / 32) * share, chunks);
-    end = min(first + share, chunks);
-  }
-};
-
-/// Calls visit(chunk, transmittance that it lets through) for the chunks of a warp in order, for sample s of its pixel.
-/// Many loads wait together, and are begun before what `visit` stores, behind which they would wait.
-template <int S, class Visit>
-__device__ __forceinline__ void for_each_through(const TransmittancePlanes<S>& planes, const TailShare& share, int s,
-                                                 Visit&& visit) {
-  constexpr int kBatch = 32;
-  float next[kBatch];
-  const auto load = [&](int first) {
-#pragma unroll
-    for (int k = 0; k < kBatch; ++k) {
-      if (first + k < share.end) next[k] = planes.at(first + k, s);
-    }
-  };
-  load(share.first);
-  for (int first = share.first; first < share.end; first += kBatch) {
-    float through[kBatch];
-#pragma unroll
-    for (int k = 0; k < kBatch; ++k) through[k] = next[k];
-    load(first + kBatch);
-#pragma unroll
-    for (int k = 0; k < kBatch; ++k) {
-      if (first + k >= share.end) break;
-      visit(first + k, through[k]);
-    }
-  }
-}
+/// pixels.
+inline constexpr int kTailParts = kTilePixels / 32;
 
 /// Turns the transmittance of each chunk into that in front of the chunk, negative where a sample has stopped before.
 /// Blocks share the parts of the open tiles.
-template <int S> __global__ void __launch_bounds__(kTailThreads) tail_scan_kernel(const BlendParams params) {
-  __shared__ float products[kTailWarps][32];
+template <int S> __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params) {
+  constexpr int kBatch = 32;
   const int items = params.plan.state->counts.open_tiles[sample_class(S)] * S * kTailParts;
-  const int warp = int(threadIdx.x) / 32, lane = lane_id();
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const int tile = open_tiles<S>(params)[item / (S * kTailParts)], s = item / kTailParts % S;
-    const int front = front_chunks(params.grid, S);
-    const TailShare share(front, chunks_of(params, tile, chunk_length(S)));
-    const TransmittancePlanes<S> planes(params, tile, item % kTailParts * 32 + lane);
-    float transmittance = planes.at(front - 1, s), product = 1;
-    for_each_through(planes, share, s, [&](int, float through) { product *= through; });
-    products[warp][lane] = product;
-    __syncthreads();
-    const auto pass = [&](float through) {
-      if (transmittance > 0) transmittance *= through;
-      if (transmittance < kNearlyStopped) transmittance = -abs(transmittance);
+    const int chunks = chunks_of(params, tile, chunk_length(S)), front = front_chunks(params.grid, S);
+    const TransmittancePlanes<S> planes(params, tile, item % kTailParts * 32 + lane_id());
+    float transmittance = planes.at(front - 1, s), next[kBatch];
+    const auto load = [&](int first) {
+#pragma unroll
+      for (int k = 0; k < kBatch; ++k) {
+        if (first + k < chunks) next[k] = planes.at(first + k, s);
+      }
     };
-    for (int w = 0; w < warp; ++w) pass(products[w][lane]);
-    for_each_through(planes, share, s, [&](int chunk, float through) {
-      planes.at(chunk, s) = transmittance;
-      pass(through);
-    });
-    __syncthreads();  // before the next products
+    load(front);
+    for (int first = front; first < chunks; first += kBatch) {
+      float through[kBatch];
+#pragma unroll
+      for (int k = 0; k < kBatch; ++k) through[k] = next[k];
+      load(first + kBatch);  // before the stores, behind which loads would wait
+#pragma unroll
+      for (int k = 0; k < kBatch; ++k) {
+        if (first + k >= chunks) break;
+        planes.at(first + k, s) = transmittance;
+        if (transmittance > 0) transmittance *= through[k];
+        if (transmittance < kNearlyStopped) transmittance = -abs(transmittance);
+      }
+    }
   }
 }
 
@@ -176,12 +143,26 @@ __global__ void __launch_bounds__(kBlendThreads, kTailBlendBlocks<F>) tail_blend
   });
 }
 
+/// Warps of a block that share the tail chunks of a part, since one alone waits for memory most of the time.
+inline constexpr int kTailSumWarps = 4, kTailSumThreads = 32 * kTailSumWarps;
+
+/// The tail chunks [first, end) of a warp.
+struct TailShare {
+  int first, end;
+
+  __device__ TailShare(int front, int chunks) {
+    const int share = (chunks - front + kTailSumWarps - 1) / kTailSumWarps;
+    first = min(front + int(threadIdx.x / 32) * share, chunks);
+    end = min(first + share, chunks);
+  }
+};
+
 /// Adds the chunks of the open tiles. Blocks share the parts of the tiles. The order of the sum depends on the number
 /// of tail chunks alone, so that the picture is the same with and without a backward pass.
 template <int S, int C, bool kKeep>
-__global__ void __launch_bounds__(kTailThreads) tail_sum_kernel(const BlendParams params) {
-  constexpr int kBatch = kKeep && C > 3 ? 16 : 32;  // chunks that are loaded together, into registers
-  __shared__ float sums[kTailWarps][C][32], lasts[kTailWarps][32];
+__global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendParams params) {
+  constexpr int kBatch = kKeep ? 16 : 32;  // chunks that are loaded together, into registers
+  __shared__ float sums[kTailSumWarps][C][32], lasts[kTailSumWarps][32];
   const int warp = int(threadIdx.x) / 32, lane = lane_id();
   const Values<C> background = background_of<C>(params);
   const int items = params.plan.state->counts.open_tiles[sample_class(S)] * kTailParts;
@@ -217,7 +198,7 @@ __global__ void __launch_bounds__(kTailThreads) tail_sum_kernel(const BlendParam
 #pragma unroll
       for (int c = 0; c < C; ++c) sums[warp][c][lane] = sum.v[c];
       __syncthreads();
-      for (int w = 0; w < kTailWarps; ++w) {
+      for (int w = 0; w < kTailSumWarps; ++w) {
         if (lasts[w][lane] != 0) last = lasts[w][lane];
 #pragma unroll
         for (int c = 0; c < C; ++c) total.v[c] += sums[w][c][lane];
@@ -225,7 +206,7 @@ __global__ void __launch_bounds__(kTailThreads) tail_sum_kernel(const BlendParam
       transmittance[s] = last;
       if constexpr (kKeep) {
         Values<C> behind = times(abs(last), background);
-        for (int w = kTailWarps - 1; w > warp; --w) {
+        for (int w = kTailSumWarps - 1; w > warp; --w) {
 #pragma unroll
           for (int c = 0; c < C; ++c) behind.v[c] += sums[w][c][lane];
         }

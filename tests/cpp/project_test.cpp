@@ -580,5 +580,31 @@ TEST(Culling, KeepsWhatAWideFootprintDraws) {
   FAIL() << "no mean is 3 px off the image";
 }
 
+/// Quaternions of the same direction are normalised to the same bits, however long they are, as long as none of their
+/// numbers is below the smallest normal one.
+TEST(NormalizeQuaternion, OfAnyLength) {
+  const Vec4<float> direction = {0.8f, -0.31f, 0.47f, 0.11f};
+  const UnitQuaternion<float> expected = normalize_quaternion(direction);
+  EXPECT_NEAR(expected.w * expected.w + expected.x * expected.x + expected.y * expected.y + expected.z * expected.z, 1,
+              1e-6);
+  for (int power = -120; power <= 127; ++power) {
+    const float f = std::ldexp(1.0f, power);
+    const UnitQuaternion<float> q =
+        normalize_quaternion<float>({f * direction.x, f * direction.y, f * direction.z, f * direction.w});
+    ASSERT_EQ(q.w, expected.w) << power;
+    ASSERT_EQ(q.x, expected.x) << power;
+    ASSERT_EQ(q.y, expected.y) << power;
+    ASSERT_EQ(q.z, expected.z) << power;
+    ASSERT_EQ(q.inv_norm, std::min(std::ldexp(expected.inv_norm, -power), float(kMaxQuaternionGrad))) << power;
+  }
+  // The smallest and the largest floats.
+  for (const float f : {std::numeric_limits<float>::denorm_min(), 1e-40f, std::numeric_limits<float>::max()}) {
+    const UnitQuaternion<float> q = normalize_quaternion<float>({f, 0, -f, 0});
+    EXPECT_EQ(q.w, -q.y) << f;
+    EXPECT_NEAR(q.w, std::sqrt(0.5), 1e-7) << f;
+    EXPECT_EQ(q.x, 0) << f;
+  }
+}
+
 }  // namespace
 }  // namespace ar::test

@@ -100,9 +100,9 @@ template <class F, bool kKeep> Image blended_image(const std::vector<Splat<F, fl
   p.checkpoints = checkpoints.data();
   cuda_on_host::launch(tiles, kBlendThreads, [&] { blend_front_kernel<F, 3, kKeep>(p); });
   cuda_on_host::launch(3, kBlendThreads, [&] { tail_through_kernel<F>(p); });
-  cuda_on_host::launch(3, kTailThreads, [&] { tail_scan_kernel<S>(p); });
+  cuda_on_host::launch(3, 32, [&] { tail_scan_kernel<S>(p); });
   cuda_on_host::launch(3, kBlendThreads, [&] { tail_blend_kernel<F, 3, kKeep>(p); });
-  cuda_on_host::launch(3, kTailThreads, [&] { tail_sum_kernel<S, 3, kKeep>(p); });
+  cuda_on_host::launch(3, kTailSumThreads, [&] { tail_sum_kernel<S, 3, kKeep>(p); });
   return out;
 }
 
