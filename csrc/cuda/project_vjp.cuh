@@ -200,17 +200,10 @@ __device__ void project_vjp_body(const Params& params, const From& from, const O
   const int lane = lane_id(), warp = threadIdx.x / 32;
   const int64_t first = i - lane;  // of the warp
   const PairRange range = i < params.gaussians.n ? from.range(i) : PairRange{0, 0};
-  const uint32_t lit = __ballot_sync(kAllLanes, range.count > 0);
-  // All that is read is asked for before any of it is waited for.
-  Gaussians<float> g = params.gaussians;
-  ShRows<Cam::kShDegree>& rows = sh_rows[warp];
-  if (lit) {
-    g = gaussian_rows[warp].begin_load(params.gaussians, first, lit);
-    if (g.shs) rows.begin_load(g.shs + first * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
-  }
   if (threadIdx.x == 0) camera = load_camera_as<Cam>(params.camera);
   __syncthreads();
   if (first >= params.gaussians.n) return;
+  const uint32_t lit = __ballot_sync(kAllLanes, range.count > 0);
   const int n = int(min(int64_t(32), params.gaussians.n - first));
   float* camera_grads = params.camera_grads ? params.camera_grads + first / 32 * kCameraGradWidth : nullptr;
   if (lit == 0) {
@@ -218,6 +211,10 @@ __device__ void project_vjp_body(const Params& params, const From& from, const O
     if (Cam::kFull && camera_grads) zero_rows(camera_grads, kCameraGradWidth);
     return;
   }
+  // All that is read is asked for before any of it is waited for.
+  const Gaussians<float> g = gaussian_rows[warp].begin_load(params.gaussians, first, lit);
+  ShRows<Cam::kShDegree>& rows = sh_rows[warp];
+  if (g.shs) rows.begin_load(g.shs + first * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
   const auto sums = from.sum(i, range);
   wait_for_copies();
   // Longer rows than the largest degree's hold coefficients without influence.
