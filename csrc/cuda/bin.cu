@@ -9,6 +9,7 @@ namespace ar::cuda {
 namespace {
 
 template <int kBits, class Value> LaunchShape sort_shape(int64_t blocks) {
+  static_assert(sizeof(SortShared<kBits, Value>) <= 64 * 1024);
   return {unsigned(blocks), Digits<kBits>::kThreads, sizeof(SortShared<kBits, Value>)};
 }
 

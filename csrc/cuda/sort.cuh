@@ -102,13 +102,20 @@ __device__ inline uint32_t sum_of_earlier(const uint32_t* status, int64_t block,
   return sum;
 }
 
-/// Shared memory of a block.
+/// Shared memory of a block: no more than 64 KiB, the most that a block may have on devices of compute capability 7.5.
 template <int kBits, class Value> struct SortShared {
   using D = Digits<kBits>;
-  uint32_t next[D::kWarps][D::kBins];  ///< how often a warp has each digit, then the place in the block of its next one
+  static_assert(D::kTile < 1 << 16);
+  struct Sorted {  ///< in the order of this pass
+    uint32_t keys[D::kTile];
+    Value values[D::kTile];
+  };
+  union {
+    uint32_t counts[D::kWarps][D::kBins];  ///< of the digits of each warp's items, until their places are known; then
+    Sorted sorted;
+  };
+  uint16_t next[D::kWarps][D::kBins];  ///< place in the block of a warp's next item with each digit
   uint32_t to_global[D::kBins];        ///< place in the output - place in the block
-  uint32_t keys[D::kTile];             ///< in the order of this pass
-  Value values[D::kTile];
   uint32_t block;
 };
 
@@ -130,8 +137,8 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads, Digits<kBits>::kBlock
   if (t == 0) shared.block = atomicAdd(&scratch.tickets[pass], 1);
   const uint32_t of_all = has_digit ? scratch.histograms[pass * kBins + t] : 0;
   const int64_t items = *count, n = items > capacity ? 0 : kFirst ? capacity : items;
-  uint32_t* next = shared.next[warp];
-  for (int digit = lane; digit < kBins; digit += 32) next[digit] = 0;
+  uint32_t* counts = shared.counts[warp];
+  for (int digit = lane; digit < kBins; digit += 32) counts[digit] = 0;
   const uint32_t* last = scratch.histograms + (scratch.passes - 1) * kBins;
   if (__syncthreads_or(may_skip && has_digit && last[t] == items)) {
     if (pass == scratch.passes - 1) return;
@@ -151,7 +158,7 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads, Digits<kBits>::kBlock
 #pragma unroll
   for (int i = 0; i < kItems; ++i) {
     // Behind the last item there may be others that stand for none. They get the last places of the last block.
-    if (!kFirst || keys[i] != kNoKey) atomicAdd(&next[D::of(keys[i], pass)], 1);
+    if (!kFirst || keys[i] != kNoKey) atomicAdd(&counts[D::of(keys[i], pass)], 1);
   }
   [[maybe_unused]] Value values[kItems];
   if constexpr (!kFirst) {
@@ -167,7 +174,7 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads, Digits<kBits>::kBlock
   uint32_t* status = scratch.status + (pass * scratch.blocks + block) * kBins + t;
   if (has_digit) {
 #pragma unroll
-    for (int w = 0; w < D::kWarps; ++w) mine += shared.next[w][t];
+    for (int w = 0; w < D::kWarps; ++w) mine += shared.counts[w][t];
     write_status(status, (block == 0 ? kUpToBlock : kOfBlock) | mine);
   }
   // Both sums at once.
@@ -178,9 +185,8 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads, Digits<kBits>::kBlock
     uint32_t place = in_block;
 #pragma unroll
     for (int w = 0; w < D::kWarps; ++w) {
-      const uint32_t of_warp = shared.next[w][t];
-      shared.next[w][t] = place;
-      place += of_warp;
+      shared.next[w][t] = uint16_t(place);
+      place += shared.counts[w][t];
     }
   }
   __syncthreads();
@@ -193,15 +199,16 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads, Digits<kBits>::kBlock
     if (kFirst && peers == 0) continue;  // culled splats are often neighbours
     const uint32_t digit = D::of(keys[i], pass);
     peers &= lanes_alike<kBits>(digit);
-    const uint32_t place = next[digit] + __popc(peers & lanes_before);
+    uint16_t& next = shared.next[warp][digit];
+    const uint32_t place = next + __popc(peers & lanes_before);
     __syncwarp();
     if (valid) {
-      if ((peers & lanes_behind) == 0) next[digit] = place + 1;
-      shared.keys[place] = keys[i];
+      if ((peers & lanes_behind) == 0) next = uint16_t(place + 1);
+      shared.sorted.keys[place] = keys[i];
       if constexpr (kFirst) {
-        shared.values[place] = Value(first + 32 * i);
+        shared.sorted.values[place] = Value(first + 32 * i);
       } else {
-        shared.values[place] = values[i];
+        shared.sorted.values[place] = values[i];
       }
     }
     __syncwarp();
@@ -219,9 +226,9 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads, Digits<kBits>::kBlock
   for (int i = 0; i < kItems; ++i) {
     const uint32_t k = i * D::kThreads + t;
     if (k >= here) break;
-    const uint32_t key = shared.keys[k], place = shared.to_global[D::of(key, pass)] + k;
+    const uint32_t key = shared.sorted.keys[k], place = shared.to_global[D::of(key, pass)] + k;
     if (keys_out) keys_out[place] = key;
-    values_out[place] = shared.values[k];
+    values_out[place] = shared.sorted.values[k];
   }
 }
 
