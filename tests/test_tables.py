@@ -390,6 +390,15 @@ def test_results_of_other_options_or_pictures_are_left_alone(blender, tmp_path, 
     assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before
 
 
+def test_a_folder_of_something_else_is_named(blender, tmp_path):
+    folder = tmp_path / TABLES["blender-stst"].training / "box" / "lego"
+    folder.mkdir(parents=True)
+    for described in ({}, [], {"source": "lego"}, {"source": {"scene": "lego", "images": None}, "options": {"a": 1}}):
+        (folder / "options.json").write_text(json.dumps(described))
+        with pytest.raises(io.SceneError, match=r"lego.options\.json: not what `train` writes"):
+            run("blender-stst", blender, tmp_path, rows=["box"], scenes=["lego"])
+
+
 def test_a_broken_scene_is_found_before_any_is_trained(blender, tmp_path):
     shutil.copytree(blender, tmp_path / "data")
     (tmp_path / "data" / "lego" / "train" / "r_1.png").unlink()

@@ -146,11 +146,14 @@ def _check(jobs: list[Job], table: Table) -> None:
         if not (job.folder / OPTIONS).exists():
             continue
         described = _read(job.folder / OPTIONS)
-        source = described["source"]
-        same_place = os.path.abspath(source["scene"]) == os.path.abspath(job.place)
-        if not same_place or source["images"] != table.images(job.row, job.scene):
-            raise ValueError(f"{job.folder} was trained on {source['scene']}; choose another --out")
-        stored = TrainingOptions.from_dict(described["options"])
+        try:
+            trained_on, images = described["source"]["scene"], described["source"]["images"]
+            stored = TrainingOptions.from_dict(described["options"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise io.SceneError(f"{job.folder / OPTIONS}: not what `train` writes ({error})") from None
+        same_place = os.path.abspath(trained_on) == os.path.abspath(job.place)
+        if not same_place or images != table.images(job.row, job.scene):
+            raise ValueError(f"{job.folder} was trained on {trained_on}; choose another --out")
         differing = [f.name for f in fields(stored) if getattr(stored, f.name) != getattr(job.options, f.name)]
         if differing:
             raise ValueError(f"{job.folder} was trained with other {', '.join(differing)}; choose another --out")
