@@ -24,8 +24,8 @@ template <typename T> AR_HD Support<T> make_support(Vec2<T> mean, const Mat2<T>&
   // det w without cancellation: one entry of a Cholesky factor is zero, eigenframes are orthogonal
   const T det = difference_of_products(w.xx, w.yy, w.xy, w.yx);
   const T l = level + T(kLevelSlack);
-  // Approximations: kLevelSlack is for much larger errors.
-  const T scale = divide(approx_sqrt(l), abs(det)), inv_a = divide(T(1), a), root_c = approx_sqrt(c);
+  // Extents may be approximations, since kLevelSlack is for much larger errors; the slope of a needle may not.
+  const T scale = divide(approx_sqrt(l), abs(det)), inv_a = quotient(T(1), a), root_c = approx_sqrt(c);
   return {mean,       l,     reach,    scale * root_c, scale * approx_sqrt(a), -scale * divide(b, root_c),
           -b * inv_a, inv_a, det * det};
 }

@@ -149,7 +149,7 @@ AR_HD float quotient(float a, float b) {
 }
 AR_HD double quotient(double a, double b) { return a / b; }
 
-/// A power of two that takes |x| to [1, 2), or as near as it can where x is not a normal number.
+/// A power of two that takes |x| to [1, 2) where it is in [2^-126, 2^127), and otherwise as near as it can.
 AR_HD float inverse_power_of_two(float x) {
   uint32_t bits;
   memcpy(&bits, &x, sizeof bits);

@@ -355,7 +355,7 @@ AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
   }
   if (!same_direction) dL_dmean += dL_ddirection;
   if (out.means) put(out, out.means[i], dL_dmean);
-  if (out.opacities) put(out, out.opacities[i], quotient(projected.weighted, g.opacities[i]));
+  if (out.opacities) put(out, out.opacities[i], projected.weighted / g.opacities[i]);
   if (out.means2d) {
     T* row = out.means2d + i * out.means2d_stride;
     row[0] = T(0.5) * camera.size.x * grad.dL_dmean.x;

@@ -9,7 +9,8 @@ namespace ar::cuda {
 namespace {
 
 template <int kBits, class Value> LaunchShape sort_shape(int64_t blocks) {
-  static_assert(sizeof(SortShared<kBits, Value>) <= 64 * 1024);
+  // What a block may have on devices of compute capability 7.5, less a little for the kernel's static variables.
+  static_assert(sizeof(SortShared<kBits, Value>) <= 63 * 1024);
   return {unsigned(blocks), Digits<kBits>::kThreads, sizeof(SortShared<kBits, Value>)};
 }
 

@@ -65,6 +65,7 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
     if (i < g.n && may_be_visible(camera, g, i, params.bounds, mean))
       radius = project_shape(camera, g, i, mean, params.footprint, splat, depth, &support);
     const uint32_t lit = __ballot_sync(kAllLanes, splat.level > 0);
+    __syncwarp();  // all lanes have read the rows of the Gaussians before
     if (g.shs && lit) rows.begin_load(g.shs + (i - lane_id()) * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
     uint32_t not_finite = 0;
     if (params.given.data) not_finite = rows_not_finite(params.given, i - lane_id(), lit);

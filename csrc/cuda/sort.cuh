@@ -102,7 +102,7 @@ __device__ inline uint32_t sum_of_earlier(const uint32_t* status, int64_t block,
   return sum;
 }
 
-/// Shared memory of a block: no more than 64 KiB, the most that a block may have on devices of compute capability 7.5.
+/// Shared memory of a block.
 template <int kBits, class Value> struct SortShared {
   using D = Digits<kBits>;
   static_assert(D::kTile < 1 << 16);

@@ -90,7 +90,8 @@ __device__ inline uint32_t warp_or(uint32_t bits) {
 __device__ inline uint32_t lanes_that_agree(uint32_t bits, uint32_t mask) {
 #if defined(__CUDA_ARCH__)
   uint32_t lanes;
-  asm("{\n\t"
+  asm volatile(
+      "{\n\t"
       ".reg .pred is_set;\n\t"
       "and.b32 %0, %1, %2;\n\t"
       "setp.ne.u32 is_set, %0, 0;\n\t"
