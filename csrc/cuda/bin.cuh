@@ -170,7 +170,7 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
 inline constexpr int kTickets = 0, kLongSplats = 1, kOfBlocks = 2;
 
 /// Pairs in the order of depth, a splat's by rows of tiles; and the histograms of the digits of their tiles. Long
-/// splats are left to emit_long_pairs. Five blocks fit on a multiprocessor.
+/// splats, whose tiles are not among 8x8, are left to emit_long_pairs. Five blocks fit on a multiprocessor.
 __global__ void __launch_bounds__(kEmitThreads, 5) emit_pairs_kernel(const EmitParams params, const TileDigits digits) {
   constexpr int kWarps = kEmitThreads / 32;
   __shared__ uint32_t digit_counts[PairWriter::kMostCounts];
