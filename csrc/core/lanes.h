@@ -8,6 +8,8 @@
 #include <cmath>
 #include <cstdint>
 #include <cstring>
+#include <limits>
+#include <type_traits>
 
 #include "core/constants.h"
 #include "core/platform.h"
@@ -149,20 +151,18 @@ AR_HD float quotient(float a, float b) {
 }
 AR_HD double quotient(double a, double b) { return a / b; }
 
-/// A power of two that takes |x| to [1, 2) where it is in [2^-126, 2^127), and otherwise as near as it can.
-AR_HD float inverse_power_of_two(float x) {
-  uint32_t bits;
+/// A power of two that takes |x| to [1, 2) where x is a normal number but for the largest, and otherwise as near as it
+/// can.
+template <typename T> AR_HD T inverse_power_of_two(T x) {
+  using Bits = std::conditional_t<sizeof(T) == sizeof(uint32_t), uint32_t, uint64_t>;
+  static_assert(std::numeric_limits<T>::is_iec559 && sizeof(T) == sizeof(Bits));
+  // Of the field of the exponent: its lowest bit, and its highest value of a number, whose power of two has the lowest.
+  constexpr Bits lowest = Bits(1) << (std::numeric_limits<T>::digits - 1);
+  constexpr Bits field = (~Bits(0) >> 1) & ~(lowest - 1), highest = field - lowest;
+  Bits bits;
   memcpy(&bits, &x, sizeof bits);
-  const uint32_t exponent = bits & 0x7f800000u;
-  bits = exponent < 0x7e800000u ? 0x7f000000u - exponent : 0x00800000u;
-  memcpy(&x, &bits, sizeof x);
-  return x;
-}
-AR_HD double inverse_power_of_two(double x) {
-  uint64_t bits;
-  memcpy(&bits, &x, sizeof bits);
-  const uint64_t exponent = bits & 0x7ff0000000000000u;
-  bits = exponent < 0x7fd0000000000000u ? 0x7fe0000000000000u - exponent : 0x0010000000000000u;
+  const Bits exponent = bits & field;
+  bits = exponent < highest ? highest - exponent : lowest;
   memcpy(&x, &bits, sizeof x);
   return x;
 }

@@ -9,7 +9,6 @@
 
 namespace ar::cuda {
 
-using DepthDigits = Digits<kDepthBits>;
 using DepthScratch = SortScratch<kDepthBits>;
 static_assert(kCulledKey == kNoKey);
 inline constexpr int kCountThreads = 1024, kCountBlocks = 132;

@@ -9,14 +9,17 @@
 namespace ar::cuda {
 namespace {
 
-template <class Params> void launch_rows(void (*kernel)(Params), const Params& p, int64_t n, cudaStream_t stream) {
-  if (n > 0) launch(kernel, {blocks_of(n, kProjectThreads), kProjectThreads}, stream, p);
+/// With a thread for each of n rows, but no more than `most_blocks`.
+template <class Params>
+void launch_rows(void (*kernel)(Params), const Params& p, int64_t n, cudaStream_t stream, unsigned most_blocks = ~0u) {
+  if (n > 0) launch(kernel, {std::min(blocks_of(n, kProjectThreads), most_blocks), kProjectThreads}, stream, p);
 }
 
 /// The kernel for the camera: `plain` or `full`.
 template <class Params>
-void launch_rows(void (*plain)(Params), void (*full)(Params), const Params& p, cudaStream_t stream) {
-  launch_rows(p.camera.lens ? full : plain, p, p.gaussians.n, stream);
+void launch_rows(void (*plain)(Params), void (*full)(Params), const Params& p, cudaStream_t stream,
+                 unsigned most_blocks = ~0u) {
+  launch_rows(p.camera.lens ? full : plain, p, p.gaussians.n, stream, most_blocks);
 }
 
 /// All kernels on a multiprocessor share one division of its memory into cache and shared memory. While it runs one
@@ -39,9 +42,7 @@ using Full = FullCamera<float>;
 }  // namespace
 
 void project(const ProjectParams& p, cudaStream_t stream) {
-  const unsigned blocks = std::min(blocks_of(p.gaussians.n, kProjectThreads), kProjectBlocks);
-  if (blocks > 0)
-    launch(p.camera.lens ? project_kernel<Full> : project_kernel<Plain>, {blocks, kProjectThreads}, stream, p);
+  launch_rows(project_kernel<Plain>, project_kernel<Full>, p, stream, kProjectBlocks);
 }
 void project_rows(const ProjectRowsParams& p, cudaStream_t stream) {
   launch_rows(project_rows_kernel<Plain>, project_rows_kernel<Full>, p, stream);

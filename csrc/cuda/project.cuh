@@ -41,18 +41,29 @@ __device__ inline uint32_t rows_not_finite(const Channels<float>& channels, int6
   return found;
 }
 
+/// A camera in shared memory, from where it is read where it is used, so that it takes no registers. Shared variables
+/// may not have initialisers, as its members do.
+template <class Cam> struct SharedCamera {
+  alignas(16) char memory[sizeof(Cam)];
+
+  /// All threads of a block must call it.
+  __device__ const Cam& load(const CameraView<float>& view) {
+    Cam& camera = *reinterpret_cast<Cam*>(memory);
+    if (threadIdx.x == 0) camera = load_camera_as<Cam>(view);
+    __syncthreads();
+    return camera;
+  }
+};
+
 /// The most blocks of project_kernel, four times as many as an H200 has room for. More Gaussians than they have threads
 /// are taken in turns, so that the camera is loaded once for several of them.
 inline constexpr unsigned kProjectBlocks = 132 * 32;
 
 template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_kernel(const ProjectParams params) {
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
-  // Shared variables may not have initialisers, as the camera's members do.
-  alignas(16) __shared__ char camera_memory[sizeof(Cam)];
-  Cam& camera = *reinterpret_cast<Cam*>(camera_memory);
-  if (threadIdx.x == 0) camera = load_camera_as<Cam>(params.camera);
+  __shared__ SharedCamera<Cam> shared_camera;
+  const Cam& camera = shared_camera.load(params.camera);
   clear_counts(params);
-  __syncthreads();
   const Gaussians<float>& g = params.gaussians;
   ShRows<Cam::kShDegree>& rows = sh_rows[threadIdx.x / 32];
   for (int64_t block = blockIdx.x; block * kProjectThreads < g.n; block += gridDim.x) {

@@ -192,16 +192,12 @@ template <class Cam, class From, class Params, class Out>
 __device__ void project_vjp_body(const Params& params, const From& from, const Out& out) {
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
   __shared__ GaussianRows gaussian_rows[kProjectThreads / 32];
-  // The camera is in shared memory and is read where it is used, so that it takes no registers. Shared variables may
-  // not have initialisers, as its members do.
-  alignas(16) __shared__ char camera_memory[sizeof(Cam)];
-  Cam& camera = *reinterpret_cast<Cam*>(camera_memory);
+  __shared__ SharedCamera<Cam> shared_camera;
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
   const int lane = lane_id(), warp = threadIdx.x / 32;
   const int64_t first = i - lane;  // of the warp
   const PairRange range = i < params.gaussians.n ? from.range(i) : PairRange{0, 0};
-  if (threadIdx.x == 0) camera = load_camera_as<Cam>(params.camera);
-  __syncthreads();
+  const Cam& camera = shared_camera.load(params.camera);
   if (first >= params.gaussians.n) return;
   const uint32_t lit = __ballot_sync(kAllLanes, range.count > 0);
   const int n = int(min(int64_t(32), params.gaussians.n - first));

@@ -86,8 +86,9 @@ template <int kBits, int kPasses> __device__ void count_digits(uint32_t key, boo
 /// nearest one that knows the sum up to itself. `status`: this block's word. Waits for those that have not got so far.
 __device__ inline uint32_t sum_of_earlier(const uint32_t* status, int64_t block, int width) {
   constexpr int kAtOnce = 8;  // rows whose loads wait together
+  if (block == 0) return 0;
   uint32_t sum = 0;
-  for (int64_t back = 1; block > 0;) {
+  for (int64_t back = 1;;) {
     uint32_t row[kAtOnce];
 #pragma unroll
     for (int k = 0; k < kAtOnce; ++k) row[k] = read_status(status - min(back + k, block) * width);
@@ -99,7 +100,6 @@ __device__ inline uint32_t sum_of_earlier(const uint32_t* status, int64_t block,
       ++back;
     }
   }
-  return sum;
 }
 
 /// Shared memory of a block.

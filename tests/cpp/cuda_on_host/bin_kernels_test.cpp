@@ -15,7 +15,7 @@ namespace ar::cuda {
 namespace {
 
 constexpr float kCulled = -1;
-constexpr int kDepthTile = DepthDigits::kTile;
+constexpr int kDepthTile = Digits<kDepthBits>::kTile;
 
 uint32_t key_of(float depth) {
   if (depth == kCulled) return kCulledKey;
@@ -62,7 +62,8 @@ void expect_sorted(const std::vector<float>& depths, int passes = kDepthPasses) 
   ASSERT_EQ(counts.splats, int64_t(expected.size()));
   ASSERT_EQ(counts.pairs, pairs);
   for_each_depth_pass(sort, scratch, [&](auto kernel, auto... arguments) {
-    if (passes-- > 0) cuda_on_host::launch(int(scratch.blocks), DepthDigits::kThreads, [&] { kernel(arguments...); });
+    if (passes-- > 0)
+      cuda_on_host::launch(int(scratch.blocks), Digits<kDepthBits>::kThreads, [&] { kernel(arguments...); });
   });
   order[0].resize(expected.size());
   ASSERT_EQ(order[0], expected);
