@@ -1,6 +1,7 @@
 """The binding of the CUDA kernels to torch compiles, also where torch has no CUDA and there is no GPU."""
 
 import pathlib
+import re
 import shutil
 import subprocess
 
@@ -35,3 +36,12 @@ def test_the_cuda_ops_compile(tmp_path):
     command += [f"-I{path}" for path in include]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-4000:]
+
+
+def test_kernels_begin_by_waiting():
+    """They are launched before those ahead of them have ended (csrc/cuda/launch.cuh)."""
+    texts = [path.read_text() for path in sorted((ROOT / "csrc" / "cuda").glob("*.cu*"))]
+    kernels = [kernel for text in texts for kernel in re.split(r"\b__global__\b", text)[1:]]
+    begins = {re.search(r"\b(\w+)_kernel\(", kernel)[1]: re.search(r"\{\s*(.*)", kernel)[1] for kernel in kernels}
+    assert len(begins) == len(kernels) > 30
+    assert [name for name, line in begins.items() if line != "wait_for_earlier_kernels();"] == []

@@ -11,16 +11,19 @@ namespace {
 constexpr int kThreads = 256;
 
 template <typename T> __global__ void activate_kernel(const ActivateParams<T> p) {
+  wait_for_earlier_kernels();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i < p.n) ar::activate(p, i);
 }
 
 template <typename T> __global__ void activate_vjp_kernel(const ActivateVjpParams<T> p) {
+  wait_for_earlier_kernels();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i < p.n) ar::activate_vjp(p, i);
 }
 
 template <typename T> __global__ void observe_kernel(const ObserveParams<T> p) {
+  wait_for_earlier_kernels();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
   if (i < p.n) ar::observe(p, i);
 }

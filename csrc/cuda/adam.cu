@@ -58,6 +58,7 @@ template <typename T> __device__ void update_packed(const AdamParams<T>& p, cons
 }
 
 template <typename T> __global__ void __launch_bounds__(kThreads) adam_kernel(const __grid_constant__ AdamParams<T> p) {
+  wait_for_earlier_kernels();
   const AdamPart part = part_of_item(p, blockIdx.x, kBlockNumbers<T>);
   const AdamTensor<T>& t = p.tensors[part.tensor];
   if (!t.aligned) {

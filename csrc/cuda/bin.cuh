@@ -4,6 +4,7 @@
 #include <type_traits>
 
 #include "core/bin.h"
+#include "cuda/launch.cuh"
 #include "cuda/sort.cuh"
 #include "cuda/stages.h"
 
@@ -27,6 +28,7 @@ __device__ inline void set_to_zero(const ZeroedMemory& memory, int64_t thread, i
 __global__ void __launch_bounds__(kCountThreads)
     count_depths_kernel(const uint32_t* keys, const PairRange* ranges, int64_t n, uint32_t* histograms, Counts* counts,
                         const ZeroedMemory rest, const ZeroedMemory of_tiles) {
+  wait_for_earlier_kernels();
   __shared__ uint32_t local[kDepthHistogramWords];
   for (int b = threadIdx.x; b < kDepthHistogramWords; b += kCountThreads) local[b] = 0;
   const int64_t thread = int64_t(blockIdx.x) * kCountThreads + threadIdx.x;
@@ -171,6 +173,7 @@ inline constexpr int kTickets = 0, kLongSplats = 1, kOfBlocks = 2;
 /// Pairs in the order of depth, a splat's by rows of tiles; and the histograms of the digits of their tiles. Long
 /// splats, whose tiles are not among 8x8, are left to emit_long_pairs. Five blocks fit on a multiprocessor.
 __global__ void __launch_bounds__(kEmitThreads, 5) emit_pairs_kernel(const EmitParams params, const TileDigits digits) {
+  wait_for_earlier_kernels();
   constexpr int kWarps = kEmitThreads / 32;
   __shared__ uint32_t digit_counts[PairWriter::kMostCounts];
   __shared__ uint32_t block_id, before_block;
@@ -268,6 +271,7 @@ inline constexpr int kLongBlocks = 132 * 4;
 /// would have hundreds of them.
 __global__ void __launch_bounds__(kEmitThreads)
     emit_long_pairs_kernel(const EmitParams params, const TileDigits digits) {
+  wait_for_earlier_kernels();
   constexpr int kWarps = kEmitThreads / 32;
   __shared__ uint32_t digit_counts[PairWriter::kMostCounts];
   const int count = int(params.status[kLongSplats]);
@@ -302,6 +306,7 @@ inline constexpr int kRangeTiles = 16, kRangeLanes = 8;
 __global__ void __launch_bounds__(kRangeTiles* kRangeLanes)
     tile_offsets_kernel(const uint32_t* tiles, const Counts* counts, int64_t capacity, int64_t tile_count,
                         int64_t* tile_offsets, PairFeedback feedback) {
+  wait_for_earlier_kernels();
   const int64_t pairs = counts->pairs;
   if (blockIdx.x == 0 && threadIdx.x == 0 && feedback.word)
     *feedback.word = uint64_t(feedback.frame) << 32 | min(uint64_t(pairs), uint64_t(0xffffffff));

@@ -30,6 +30,7 @@ namespace ar::cuda {
 /// A block per tile.
 template <class F, int C, bool kKeep>
 __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front_kernel(const BlendParams params) {
+  wait_for_earlier_kernels();
   constexpr int S = F::kSamples, kLength = chunk_length(S), kSets = kKeep ? S : 1;
   __shared__ BlendStage<F, C> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);

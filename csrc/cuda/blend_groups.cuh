@@ -155,6 +155,7 @@ inline constexpr int kGroupBlocks = F::kSamples > 4    ? 1
 template <class F, int C>
 __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
     blend_groups_kernel(const BlendParams params, int first_group) {
+  wait_for_earlier_kernels();
   constexpr int S = F::kSamples;
   using Share = ChannelShare<C>;
   __shared__ Stage<F, 0, kGroupBatch> stage;

@@ -11,6 +11,7 @@
 #include <algorithm>
 
 #include "cuda/blend_segments.cuh"
+#include "cuda/launch.cuh"
 
 namespace ar::cuda {
 
@@ -61,6 +62,7 @@ inline constexpr int kGroupVjpBlocks = F::kSamples > 4                        ? 
 template <class F, int C, int kShapeGroups>
 __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, kShapeGroups>)
     blend_groups_vjp_kernel(const BlendVjpParams params, int first) {
+  wait_for_earlier_kernels();
   constexpr int S = F::kSamples, kBatch = kVjpBatch<C, kShapeGroups>;
   constexpr bool kWithShape = kShapeGroups > 0;
   using Share = ChannelShare<C>;
@@ -242,6 +244,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, kShapeGro
 template <class F, int C>
 __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, 1>)
     segment_shown_kernel(const BlendVjpParams params, int first, bool add) {
+  wait_for_earlier_kernels();
   constexpr int S = F::kSamples;
   const Segments& segments = params.segments;
   const int tile = listed_tile<S>(params, int(blockIdx.x) / segments.count), number = int(blockIdx.x) % segments.count;

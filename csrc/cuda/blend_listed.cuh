@@ -9,6 +9,7 @@
 #pragma once
 
 #include "cuda/blend_moving.cuh"
+#include "cuda/launch.cuh"
 #include "cuda/tile_pieces.cuh"
 
 namespace ar::cuda {
@@ -71,6 +72,7 @@ __device__ inline uint32_t transpose_bits(uint32_t bits) {
 
 /// A thread per pair: which pixels its splat reaches.
 template <class F> __global__ void __launch_bounds__(kFilterPiece) filter_kernel(const BlendParams params) {
+  wait_for_earlier_kernels();
   constexpr int kRowsOfWord = 32 / kMovingTile;
   __shared__ uint32_t words[kMovingPixels][kFilterWords];
   const TilePiece piece = find_piece(params.lists, params.grid, kFilterPiece, blockIdx.x);
@@ -294,6 +296,7 @@ template <class F> inline constexpr int kListedBlocks = ListedLayout<F, true>::k
 /// A warp per few pixels of a tile; where its list is short, only the first blocks of a tile have any.
 template <class F, int C, bool kKeep, int kLongAbove = kLongList>
 __global__ void __launch_bounds__(32) listed_blend_kernel(const BlendParams params, int first) {
+  wait_for_earlier_kernels();
   using Short = ListedLayout<F, false>;
   using Long = ListedLayout<F, true>;
   static_assert(Short::kThreads == 32 && Long::kThreads == 32 && Long::kBlocks % Short::kBlocks == 0);

@@ -8,6 +8,7 @@
 #pragma once
 
 #include "cuda/composite.cuh"
+#include "cuda/launch.cuh"
 
 namespace ar::cuda {
 
@@ -256,6 +257,7 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = false> stru
 template <class F, int C, class Layout, bool kKeep>
 __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThreads : 1)
     moving_blend_kernel(const BlendParams params, int first, bool overflow_only) {
+  wait_for_earlier_kernels();
   constexpr int kBatch = Layout::kThreads < 256 ? Layout::kThreads : 256;
   __shared__ MovingStage<F, C, Layout, kBatch> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);

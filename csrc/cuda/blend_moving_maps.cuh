@@ -9,6 +9,7 @@
 #include <algorithm>
 
 #include "cuda/blend_moving_grads.cuh"
+#include "cuda/launch.cuh"
 #include "cuda/tile_pieces.cuh"
 
 namespace ar::cuda {
@@ -86,6 +87,7 @@ using MapLayout = std::conditional_t<(F::kSamples > 4), CellLayout<1, 16, kMovin
 template <class F, int C, int kSegment, class Layout = MapLayout<F>>
 __global__ void __launch_bounds__(Layout::kThreads, 1024 / Layout::kThreads)
     segment_maps_kernel(const BlendVjpParams params, int first) {
+  wait_for_earlier_kernels();
   using Samples = MovingSamples<F, Layout, true>;
   constexpr int kCells = Layout::kCells, kBatch = std::min(Layout::kThreads, 256);
   __shared__ MovingStage<F, C, Layout, kBatch> stage;
@@ -161,6 +163,7 @@ __global__ void __launch_bounds__(Layout::kThreads, 1024 / Layout::kThreads)
 /// A thread per sample of a tile: from the maps of its segments to what each gets from behind.
 template <class F, int kSegment>
 __global__ void __launch_bounds__(kMovingPixels) chain_maps_kernel(const BlendVjpParams params) {
+  wait_for_earlier_kernels();
   constexpr int S = F::kSamples;
   const int tile = int(blockIdx.x) / S, t = int(blockIdx.x) % S * kMovingPixels + int(threadIdx.x);
   const int number = t / S, sample = t % S;

@@ -16,6 +16,7 @@
 #include "cuda/blend_moving_grads.cuh"
 #include "cuda/blend_moving_maps.cuh"
 #include "cuda/blend_moving_sums.cuh"
+#include "cuda/launch.cuh"
 #include "cuda/tile_pieces.cuh"
 
 namespace ar::cuda {
@@ -85,6 +86,7 @@ __device__ MovingSums walk_back(TileSplatRef<F, C>& splat, int k0, int j, float 
 template <class F, int C, class Layout, int kSegment = 0>
 __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThreads<C> / Layout::kThreads))
     moving_vjp_kernel(const BlendVjpParams params, int first, bool overflow_only) {
+  wait_for_earlier_kernels();
   using Shared = MovingVjpShared<F, C, Layout, kSegment>;
   using Samples = MovingSamples<F, Layout, (kSegment > 0)>;
   constexpr int S = F::kSamples, kCells = Layout::kCells, kBatch = Shared::kBatch;

@@ -6,6 +6,7 @@
 
 #include "cuda/blend.cuh"
 #include "cuda/blend_groups.cuh"
+#include "cuda/launch.cuh"
 
 namespace ar::cuda {
 
@@ -85,6 +86,7 @@ __device__ void walk_segment(const Splat<F, float>* splats, const Channels<float
 template <class F, int C>
 __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
     segment_blend_kernel(const BlendParams params, const BlendParams cut, int first) {
+  wait_for_earlier_kernels();
   constexpr int S = F::kSamples;
   const Segments& segments = params.segments;
   const int place = tile_place<S>(params, int(blockIdx.x) / segments.count);
@@ -122,6 +124,7 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
 /// Adds the segments of a group of `width` channels up, of tiles with S samples. A block per tile.
 template <int S>
 __global__ void __launch_bounds__(kTilePixels) segment_sum_kernel(const BlendParams params, int first, int width) {
+  wait_for_earlier_kernels();
   const int tile = int(blockIdx.x);
   if (!has_samples<S>(params.lists, tile)) return;
   const TileList list = list_of(params.lists, params.grid, tile);

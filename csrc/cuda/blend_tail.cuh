@@ -3,6 +3,7 @@
 
 #include "cuda/blend_output.cuh"
 #include "cuda/blend_stage.cuh"
+#include "cuda/launch.cuh"
 
 namespace ar::cuda {
 
@@ -34,6 +35,7 @@ __device__ __forceinline__ void for_each_tail_chunk(const BlendParams& params, V
 /// Writes the transmittance of each tail chunk alone.
 template <class F>
 __global__ void __launch_bounds__(kBlendThreads, kTailThroughBlocks<F>) tail_through_kernel(const BlendParams params) {
+  wait_for_earlier_kernels();
   constexpr int S = F::kSamples, kLength = chunk_length(S);
   __shared__ BlendStage<F, 0> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
@@ -71,6 +73,7 @@ inline constexpr int kTailParts = kTilePixels / 32;
 /// Turns the transmittance of each chunk into that in front of the chunk, negative where a sample has stopped before.
 /// Blocks share the parts of the open tiles.
 template <int S> __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params) {
+  wait_for_earlier_kernels();
   constexpr int kBatch = 32;
   const int items = params.plan.state->counts.open_tiles[sample_class(S)] * S * kTailParts;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
@@ -105,6 +108,7 @@ template <int S> __global__ void __launch_bounds__(32) tail_scan_kernel(const Bl
 /// before the chunk.
 template <class F, int C, bool kKeep>
 __global__ void __launch_bounds__(kBlendThreads, kTailBlendBlocks<F>) tail_blend_kernel(const BlendParams params) {
+  wait_for_earlier_kernels();
   constexpr int S = F::kSamples, kLength = chunk_length(S), kSets = kKeep ? S : 1;
   __shared__ BlendStage<F, C> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
@@ -161,6 +165,7 @@ struct TailShare {
 /// of tail chunks alone, so that the picture is the same with and without a backward pass.
 template <int S, int C, bool kKeep>
 __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendParams params) {
+  wait_for_earlier_kernels();
   constexpr int kBatch = kKeep ? 16 : 32;  // chunks that are loaded together, into registers
   __shared__ float sums[kTailSumWarps][C][32], lasts[kTailSumWarps][32];
   const int warp = int(threadIdx.x) / 32, lane = lane_id();

@@ -3,6 +3,7 @@
 #include "cuda/blend_moving_maps.cuh"
 #include "cuda/blend_moving_vjp.cuh"
 #include "cuda/blend_vjp.cuh"
+#include "cuda/launch.cuh"
 
 namespace ar::cuda {
 namespace {
@@ -10,6 +11,7 @@ namespace {
 /// No chunk has been begun. With too many pairs there is a row per splat that all tiles add to, and which must be zero;
 /// the sums of shapes stay from group to group. The group begins with channel `first` and has `width` of them.
 __global__ void clear_sums_kernel(const BlendVjpParams params, int first, int width) {
+  wait_for_earlier_kernels();
   if (blockIdx.x == 0 && threadIdx.x < kSampleClasses) params.chunks_taken[threadIdx.x] = 0;
   if (params.lists.counts->pairs <= params.lists.capacity) return;
   const auto clear = [&](float* to, int width) {

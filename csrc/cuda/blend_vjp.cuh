@@ -42,6 +42,7 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
 template <class F, int C, Sums kSums>
 __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
     blend_vjp_kernel(const BlendVjpParams params) {
+  wait_for_earlier_kernels();
   constexpr int kWarps = kVjpWarps<F, kSums>, kGroup = kVjpGroup<F, kSums>;
   auto* shared = reinterpret_cast<SharedPixels<F, C, kSums>*>(dynamic_shared());
   auto* groups = reinterpret_cast<VjpGroup<F, C, kGroup>*>(shared + kWarps);

@@ -34,6 +34,7 @@ inline constexpr int kChooseThreads = 256;
 template <class F, int kWarps>
 __global__ void __launch_bounds__(kChooseThreads)
     choose_samples_kernel(const ChooseParams params, SampleLimits<float> limits) {
+  wait_for_earlier_kernels();
   constexpr int kThreads = 32 * kWarps;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int64_t tile = (int64_t(blockIdx.x) * kChooseThreads + threadIdx.x) / kThreads;

@@ -11,6 +11,7 @@ namespace ar::cuda {
 /// in the first column of the upper half.
 template <class F, int kBits>
 __global__ void __launch_bounds__(1 << 2 * kBits) inspect_kernel(const InspectParams params) {
+  wait_for_earlier_kernels();
   constexpr int kThreads = 1 << 2 * kBits;
   __shared__ Stage<F, 0, kThreads> stage;
   __shared__ int32_t ids[kThreads];

@@ -1,6 +1,7 @@
 // Kernels that plan the blending work: how lists are cut into chunks, and in which order work is begun.
 #pragma once
 
+#include "cuda/launch.cuh"
 #include "cuda/stages.h"
 #include "cuda/warp.cuh"
 
@@ -44,6 +45,7 @@ struct PlannedTile {
 /// Counts the work of each class, and begins the counts of the plan. A single block.
 __global__ void __launch_bounds__(kCountWorkThreads)
     count_work_kernel(const TileLists lists, int64_t tiles, int most_samples, bool whole, PlanState* state) {
+  wait_for_earlier_kernels();
   static_assert(kWorkClasses < kCountWorkThreads);
   constexpr int kAtOnce = 8;  // tiles of a thread whose loads wait together
   __shared__ int32_t tile_sizes[kWorkClasses], chunk_sizes[kWorkClasses];
@@ -102,6 +104,7 @@ __device__ inline void write_run(TileChunk* list, const ChunkRun& run, const Til
 /// Places come from atomics: which tile gets which differs from run to run, and changes no result.
 __global__ void __launch_bounds__(kPlanThreads) plan_kernel(const TileLists lists, TileGrid grid, int most_samples,
                                                             bool whole, CheckpointLayout layout, const ChunkPlan plan) {
+  wait_for_earlier_kernels();
   PlanNext& next = plan.state->next;
   PlanCounts& counts = plan.state->counts;
   const int64_t i = int64_t(blockIdx.x) * kPlanThreads + threadIdx.x;

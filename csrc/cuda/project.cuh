@@ -1,6 +1,7 @@
 // Kernels of project, project_rows and shape_rows: a thread per Gaussian, or per row.
 #pragma once
 
+#include "cuda/launch.cuh"
 #include "cuda/sh_rows.cuh"
 #include "cuda/splat_tiles.cuh"
 
@@ -60,6 +61,7 @@ template <class Cam> struct SharedCamera {
 inline constexpr unsigned kProjectBlocks = 132 * 32;
 
 template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_kernel(const ProjectParams params) {
+  wait_for_earlier_kernels();
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
   __shared__ SharedCamera<Cam> shared_camera;
   const Cam& camera = shared_camera.load(params.camera);
@@ -103,6 +105,7 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
 
 template <class Cam>
 __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const ProjectRowsParams params) {
+  wait_for_earlier_kernels();
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
   const Gaussians<float>& g = params.gaussians;
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
@@ -141,6 +144,7 @@ __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const Pro
 }
 
 __global__ void __launch_bounds__(kProjectThreads) shape_rows_kernel(const ShapeRowsParams params) {
+  wait_for_earlier_kernels();
   clear_counts(params);
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
   if (i >= params.n) return;

@@ -2,6 +2,7 @@
 // sum_channels.
 #pragma once
 
+#include "cuda/launch.cuh"
 #include "cuda/project.cuh"
 
 namespace ar::cuda {
@@ -185,8 +186,8 @@ struct FromRows {
   }
 };
 
-/// Blocks that a multiprocessor holds at once.
-inline constexpr int kProjectVjpBlocks = 6;
+/// Blocks that a multiprocessor holds at once. With one more a thread would have 80 registers and spill others.
+inline constexpr int kProjectVjpBlocks = 5;
 
 template <class Cam, class From, class Params, class Out>
 __device__ void project_vjp_body(const Params& params, const From& from, const Out& out) {
@@ -208,14 +209,13 @@ __device__ void project_vjp_body(const Params& params, const From& from, const O
     return;
   }
   // All that is read is asked for before any of it is waited for.
-  const Gaussians<float> g = gaussian_rows[warp].begin_load(params.gaussians, first, lit);
+  Gaussians<float> g = gaussian_rows[warp].begin_load(params.gaussians, first, lit);
   ShRows<Cam::kShDegree>& rows = sh_rows[warp];
   if (g.shs) rows.begin_load(g.shs + first * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
   const auto sums = from.sum(i, range);
   wait_for_copies();
-  // Longer rows than the largest degree's hold coefficients without influence.
-  const bool staged = out.shs && g.sh_stride <= rows.kCount;
-  Vec3<float>* dL_dsh = staged ? rows.row() : out.shs ? out.shs + i * g.sh_stride : nullptr;
+  Vec3<float>* dL_dsh = out.shs ? rows.row() : nullptr;
+  g.sh_stride = min(g.sh_stride, rows.kCount);  // of what is in `rows`
   CameraGrad<float> camera_grad = {};
   if (range.count > 0) {
     from.visit(camera, g, i, range, sums, [&](const auto& grad_of, const ShownGrad<float>& shown, Vec2<float> means) {
@@ -230,7 +230,8 @@ __device__ void project_vjp_body(const Params& params, const From& from, const O
   } else if (i < g.n) {
     zero_grads(g, i, out, dL_dsh);
   }
-  if (staged) rows.template store<Out::kAdd>(out.shs + first * g.sh_stride, g.sh_stride, n);
+  const int stride = params.gaussians.sh_stride;
+  if (out.shs) rows.template store<Out::kAdd>(out.shs + first * stride, stride, n);
   if constexpr (Cam::kFull) {
     if (camera_grads) store_warp_sums(camera_grad, camera_grads);
   }
@@ -239,16 +240,19 @@ __device__ void project_vjp_body(const Params& params, const From& from, const O
 template <class Cam>
 __global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kProjectVjpBlocks)
     project_vjp_kernel(const ProjectVjpParams params) {
+  wait_for_earlier_kernels();
   project_vjp_body<Cam>(params, FromPairs{params}, params.grads);
 }
 template <class Cam>
 __global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kProjectVjpBlocks)
     project_rows_vjp_kernel(const ProjectRowsVjpParams params) {
+  wait_for_earlier_kernels();
   project_vjp_body<Cam>(params, FromRows{params}, params.grads);
 }
 template <class Cam>
 __global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kProjectVjpBlocks)
     add_project_rows_vjp_kernel(const ProjectRowsVjpParams params) {
+  wait_for_earlier_kernels();
   project_vjp_body<Cam>(params, FromRows{params}, AddedGrads<float>{params.grads});
 }
 
@@ -259,6 +263,7 @@ inline constexpr int kZeroBlocks = 132, kZeroThreads = 128, kZeroBlocksThatFit =
 
 __global__ void __launch_bounds__(kZeroThreads, kZeroBlocksThatFit)
     zero_culled_grads_kernel(const ZeroGradsParams params) {
+  wait_for_earlier_kernels();
   const int64_t n = params.gaussians.n, step = int64_t(gridDim.x) * kZeroThreads;
   const auto count_of = [&](int64_t i) { return i < n ? params.ranges[i].count : 0; };
   int64_t first = int64_t(blockIdx.x) * kZeroThreads + threadIdx.x - lane_id();
@@ -271,6 +276,7 @@ __global__ void __launch_bounds__(kZeroThreads, kZeroBlocksThatFit)
 }
 
 __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGradsParams params) {
+  wait_for_earlier_kernels();
   __shared__ float packed_rows[kProjectThreads * kPackedGradWidthAbsolute];
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
   const PairRange range = i < params.n ? params.sums.ranges[i] : PairRange{0, 0};
@@ -304,6 +310,7 @@ __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGra
 
 /// Channels that lie in the rows of pairs: a thread per splat.
 __global__ void __launch_bounds__(kProjectThreads) sum_few_channels_kernel(const SumChannelsParams params) {
+  wait_for_earlier_kernels();
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x, n = params.sums.n;
   const PairRange range = i < n ? params.sums.ranges[i] : PairRange{0, 0};
   const SplatSums sums = sum_pairs(params.sums, i, range);
@@ -322,6 +329,7 @@ inline constexpr int kSumThreads = 256, kSumLanes = 8;
 /// together; many splats side by side, because a splat has few pairs and would wait for memory most of the time. The
 /// threads of a block share the splats with many pairs.
 template <int C> __global__ void __launch_bounds__(kSumThreads) sum_channels_kernel(const SumChannelsParams params) {
+  wait_for_earlier_kernels();
   constexpr int kQuads = C / 4, kRows = kSumLanes / kQuads, kSplats = kSumThreads / kSumLanes;
   constexpr int kAhead = 4, kMany = 16 * kAhead * kRows;
   static_assert(kRows > 0);

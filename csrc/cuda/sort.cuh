@@ -6,6 +6,7 @@
 // their place by looking back at the blocks before them.
 #pragma once
 
+#include "cuda/launch.cuh"
 #include "cuda/warp.cuh"
 
 namespace ar::cuda {
@@ -129,6 +130,7 @@ template <int kBits, class Value, bool kFirst>
 __global__ void __launch_bounds__(Digits<kBits>::kThreads, Digits<kBits>::kBlocks)
     sort_pass_kernel(const SortScratch<kBits> scratch, int pass, bool may_skip, const int64_t* count, int64_t capacity,
                      const uint32_t* keys_in, uint32_t* keys_out, Value* values_in, Value* values_out) {
+  wait_for_earlier_kernels();
   using D = Digits<kBits>;
   constexpr int kBins = D::kBins, kItems = D::kItems;
   auto& shared = *reinterpret_cast<SortShared<kBits, Value>*>(dynamic_shared());

@@ -118,6 +118,7 @@ template <typename T> __device__ void sum_block(T& a, T& b) {
 /// block_sums: sums of |x - y| and of the similarity, of each block; or null.
 template <typename T, typename Target>
 __global__ void __launch_bounds__(kThreads) ssim_kernel(const SsimParams<T, Target> p, T* block_sums) {
+  wait_for_earlier_kernels();
   constexpr int kRun = Tile<T>::kRun;
   __shared__ Shared<T, 2, kSsimMoments> shared;
   const Place place = place_of<T>(int(blockIdx.x), p.height, p.width);
@@ -184,6 +185,7 @@ __global__ void __launch_bounds__(kThreads) ssim_kernel(const SsimParams<T, Targ
 /// One block: the loss from the sums of all blocks.
 template <typename T, typename Target>
 __global__ void loss_kernel(const SsimParams<T, Target> p, const T* block_sums, int64_t blocks) {
+  wait_for_earlier_kernels();
   double l1_sum = 0, ssim_sum = 0;
   for (int64_t i = threadIdx.x; i < blocks; i += kThreads) {
     l1_sum += double(block_sums[2 * i]);
@@ -195,6 +197,7 @@ __global__ void loss_kernel(const SsimParams<T, Target> p, const T* block_sums, 
 
 template <typename T, typename Target>
 __global__ void __launch_bounds__(kThreads) ssim_vjp_kernel(const SsimVjpParams<T, Target> p) {
+  wait_for_earlier_kernels();
   constexpr int kRun = Tile<T>::kRun;
   __shared__ Shared<T, kSsimPartials, kSsimPartials> shared;
   const Place place = place_of<T>(int(blockIdx.x), p.height, p.width);

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "core/weight.h"
+#include "cuda/launch.cuh"
 #include "cuda/stages.h"
 #include "cuda/warp.cuh"
 
@@ -10,11 +11,13 @@ namespace ar::cuda {
 inline constexpr int kWeightThreads = 128;
 
 template <class F, typename T> __global__ void weight_kernel(const WeightParams<T> params) {
+  wait_for_earlier_kernels();
   const int64_t i = int64_t(blockIdx.x) * kWeightThreads + threadIdx.x;
   if (i < params.n) params.weights[i] = ar::weight<F>(params.covs[i], params.offsets[i], params.options);
 }
 
 template <class F, typename T> __global__ void weight_vjp_kernel(const WeightParams<T> params) {
+  wait_for_earlier_kernels();
   const int64_t i = int64_t(blockIdx.x) * kWeightThreads + threadIdx.x;
   if (i >= params.n) return;
   const WeightGrad<T> g = ar::weight_vjp<F>(params.covs[i], params.offsets[i], params.options, params.dL_dweights[i]);
