@@ -75,7 +75,8 @@ void sort_by_tile(const TileSort<SlotPair>& p, TileGrid grid, void* scratch, cud
 void plan_chunks(const TileLists& lists, TileGrid grid, int samples, bool whole, CheckpointLayout layout,
                  const ChunkPlan& plan, cudaStream_t stream) {
   const LaunchShape shape = {blocks_of(grid.tiles(), kPlanThreads), kPlanThreads};
-  launch(count_work_kernel, {1, kCountWorkThreads}, stream, lists, grid.tiles(), samples, whole, plan.state);
+  const LaunchShape counters = {PlanState::kCounters, kCountWorkThreads};
+  launch(count_work_kernel, counters, stream, lists, grid.tiles(), samples, whole, plan.state);
   launch(plan_kernel, shape, stream, lists, grid, samples, whole, layout, plan);
 }
 

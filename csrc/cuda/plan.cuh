@@ -42,44 +42,55 @@ struct PlannedTile {
   __device__ int chunks() const { return full() + (rest() > 0); }
 };
 
-/// Counts the work of each class, and begins the counts of the plan. A single block.
+/// Counts the work of each class, in as many parts as there are blocks, and begins the counts of the plan.
 __global__ void __launch_bounds__(kCountWorkThreads)
     count_work_kernel(const TileLists lists, int64_t tiles, int most_samples, bool whole, PlanState* state) {
   wait_for_earlier_kernels();
   static_assert(kWorkClasses < kCountWorkThreads);
-  constexpr int kAtOnce = 8;  // tiles of a thread whose loads wait together
-  __shared__ int32_t tile_sizes[kWorkClasses], chunk_sizes[kWorkClasses];
+  constexpr int kAtOnce = 2;  // tiles of a thread whose loads wait together
+  __shared__ WorkSizes sizes;
   const int c = threadIdx.x;
-  if (c < kWorkClasses) tile_sizes[c] = chunk_sizes[c] = 0;
+  if (c < kWorkClasses) sizes.tiles[c] = sizes.chunks[c] = 0;
   __syncthreads();
-  for (int64_t first = threadIdx.x; first < tiles; first += kAtOnce * kCountWorkThreads) {
+  const int64_t stride = int64_t(gridDim.x) * kCountWorkThreads;
+  for (int64_t first = blockIdx.x * kCountWorkThreads + threadIdx.x; first < tiles; first += kAtOnce * stride) {
     int n[kAtOnce], samples[kAtOnce];
 #pragma unroll
     for (int k = 0; k < kAtOnce; ++k) {
-      const PlannedTile tile(lists, min(first + k * kCountWorkThreads, tiles - 1), most_samples, whole);
+      const PlannedTile tile(lists, min(first + k * stride, tiles - 1), most_samples, whole);
       n[k] = tile.n, samples[k] = tile.samples;
     }
 #pragma unroll
     for (int k = 0; k < kAtOnce; ++k) {
-      if (first + k * kCountWorkThreads >= tiles) break;
+      if (first + k * stride >= tiles) break;
       const int length = whole ? kWholeList : chunk_length(samples[k]), full = n[k] / length, rest = n[k] % length;
-      atomicAdd(&tile_sizes[work_class(samples[k], n[k])], 1);
-      if (full > 0) atomicAdd(&chunk_sizes[work_class(samples[k], length)], full);
-      if (rest > 0) atomicAdd(&chunk_sizes[work_class(samples[k], rest)], 1);
+      atomicAdd(&sizes.tiles[work_class(samples[k], n[k])], 1);
+      if (full > 0) atomicAdd(&sizes.chunks[work_class(samples[k], length)], full);
+      if (rest > 0) atomicAdd(&sizes.chunks[work_class(samples[k], rest)], 1);
     }
   }
   __syncthreads();
+  if (c < kWorkClasses) {
+    WorkSizes& counted = state->counted[blockIdx.x];
+    counted.tiles[c] = sizes.tiles[c], counted.chunks[c] = sizes.chunks[c];
+  }
+  if (blockIdx.x != 0) return;
   PlanCounts& counts = state->counts;
-  const auto begin = [&](const int32_t* sizes, int32_t* next, SampleParts& parts) {
-    int all;
-    const int first = sum_before<kCountWorkThreads / 32>(c < kWorkClasses ? sizes[c] : 0, 0, all);
-    if (c < kWorkClasses) next[c] = first;
-    if (c <= kWorkClasses && c % kLengthClasses == 0) parts.first[c / kLengthClasses] = first;
-  };
-  begin(tile_sizes, state->next.tiles, counts.tiles);
-  begin(chunk_sizes, state->next.chunks, counts.chunks);
+  if (c < kWorkClasses) state->placed.tiles[c] = state->placed.chunks[c] = 0;
   if (c < kSampleClasses) counts.open_tiles[c] = 0;
   if (c == 0) counts.planes = counts.tail = 0;
+}
+
+/// Where the work of each class begins, from what was counted; `of(sizes)` are the sizes meant. One block also writes
+/// where the work of each number of samples begins. Of all threads of a block; afterwards they must wait.
+template <class Of> __device__ void find_begins(PlanState& state, WorkSizes& begins, SampleParts& parts, Of&& of) {
+  static_assert(kWorkClasses < kPlanThreads);
+  const int c = threadIdx.x;
+  int size = 0, all;
+  for (int k = 0; k < PlanState::kCounters && c < kWorkClasses; ++k) size += of(state.counted[k])[c];
+  const int first = sum_before<kPlanThreads / 32>(size, 0, all);
+  if (c < kWorkClasses) of(begins)[c] = first;
+  if (blockIdx.x == 0 && c <= kWorkClasses && c % kLengthClasses == 0) parts.first[c / kLengthClasses] = first;
 }
 
 /// A tile's chunks [begin, end) and their places in a list of chunks, from `place` on.
@@ -105,7 +116,8 @@ __device__ inline void write_run(TileChunk* list, const ChunkRun& run, const Til
 __global__ void __launch_bounds__(kPlanThreads) plan_kernel(const TileLists lists, TileGrid grid, int most_samples,
                                                             bool whole, CheckpointLayout layout, const ChunkPlan plan) {
   wait_for_earlier_kernels();
-  PlanNext& next = plan.state->next;
+  __shared__ WorkSizes begins;
+  WorkSizes& placed = plan.state->placed;
   PlanCounts& counts = plan.state->counts;
   const int64_t i = int64_t(blockIdx.x) * kPlanThreads + threadIdx.x;
   const bool valid = i < grid.tiles();
@@ -115,19 +127,24 @@ __global__ void __launch_bounds__(kPlanThreads) plan_kernel(const TileLists list
   const int chunks = full + (rest > 0), front = front_chunks(grid, samples), tail = max(chunks - front, 0);
   const int planes = valid && !whole ? layout.tile_planes(grid, samples, chunks) : 0;
   // All atomics first: they wait together.
+  const int full_class = work_class(samples, planned.length), rest_class = work_class(samples, rest);
+  const int tile_class = work_class(samples, planned.n);
   const int plane = planes > 0 ? atomicAdd(&counts.planes, planes) : 0;
-  const int full_place = full > 0 ? atomicAdd(&next.chunks[work_class(samples, planned.length)], full) : 0;
+  const int full_place = full > 0 ? atomicAdd(&placed.chunks[full_class], full) : 0;
   const int tail_place = tail > 0 ? atomicAdd(&counts.tail, tail) : 0;
-  const int tile_place = take_place(next.tiles, work_class(samples, planned.n), valid);
-  const int rest_place = take_place(next.chunks, work_class(samples, rest), rest > 0);
+  const int tile_place = take_place(placed.tiles, tile_class, valid);
+  const int rest_place = take_place(placed.chunks, rest_class, rest > 0);
+  find_begins(*plan.state, begins, counts.tiles, [](auto& sizes) { return sizes.tiles; });
+  find_begins(*plan.state, begins, counts.chunks, [](auto& sizes) { return sizes.chunks; });
+  __syncthreads();
   const int of_chunk = layout.planes(samples);
   const TileChunk first = {tile, 0, plane - layout.first_chunk(grid, samples) * of_chunk};
   if (valid) {
-    plan.tile_order[tile_place] = tile;
+    plan.tile_order[begins.tiles[tile_class] + tile_place] = tile;
     plan.tile_planes[tile] = plane;
   }
-  write_run(plan.chunk_order, {full_place, 0, full}, first, of_chunk);
-  if (rest > 0) plan.chunk_order[rest_place] = {tile, full, first.plane + full * of_chunk};
+  write_run(plan.chunk_order, {begins.chunks[full_class] + full_place, 0, full}, first, of_chunk);
+  if (rest > 0) plan.chunk_order[begins.chunks[rest_class] + rest_place] = {tile, full, first.plane + full * of_chunk};
   write_run(plan.tail, {tail_place, front, front + tail}, first, of_chunk);
 }
 

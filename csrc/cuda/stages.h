@@ -104,15 +104,17 @@ struct PlanCounts {
   int32_t open_tiles[kSampleClasses];
 };
 
-/// Scratch of plan_chunks: where in its orders the next tile and the next chunk of each class of work go.
+/// Tiles and chunks of each class of work.
 inline constexpr int kLengthClasses = 33, kWorkClasses = kSampleClasses * kLengthClasses;
-struct PlanNext {
+struct WorkSizes {
   int32_t tiles[kWorkClasses], chunks[kWorkClasses];
 };
-/// The counts stay for blend_vjp.
+/// The counts stay for blend_vjp, the rest is scratch of plan_chunks.
 struct PlanState {
+  static constexpr int kCounters = 8;  ///< blocks that count work
   PlanCounts counts;
-  PlanNext next;
+  WorkSizes counted[kCounters];  ///< by each of these blocks
+  WorkSizes placed;              ///< so far
 };
 
 struct ProjectParams : ar::ProjectParams<float> {

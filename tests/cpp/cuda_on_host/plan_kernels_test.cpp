@@ -48,7 +48,8 @@ void expect_planned(const Case& c) {
   PlanState state;
   std::memset(&state, 0x55, sizeof state);  // nothing need be zero
   ChunkPlan plan = {&state, chunk_order.data(), tile_order.data(), tile_planes.data(), c.whole ? nullptr : tail.data()};
-  cuda_on_host::launch(1, kCountWorkThreads, [&] { count_work_kernel(lists, tiles, kMostSamples, c.whole, &state); });
+  cuda_on_host::launch(PlanState::kCounters, kCountWorkThreads,
+                       [&] { count_work_kernel(lists, tiles, kMostSamples, c.whole, &state); });
   cuda_on_host::launch((tiles + kPlanThreads - 1) / kPlanThreads, kPlanThreads,
                        [&] { plan_kernel(lists, c.grid, kMostSamples, c.whole, layout, plan); });
 
