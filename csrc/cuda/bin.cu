@@ -47,8 +47,8 @@ int tile_sort_result(TileGrid grid) { return TileDigits(grid).passes % 2; }
 
 void count_depths(const DepthSort& p, void* memory, ZeroedMemory rest, ZeroedMemory of_tiles, cudaStream_t stream) {
   const DepthScratch scratch(static_cast<uint32_t*>(memory), p.n, kDepthPasses);
-  launch(count_depths_kernel, {kCountBlocks, kCountThreads}, stream, p.keys[0], p.ranges, p.n, scratch.histograms,
-         p.counts, rest, of_tiles);
+  launch(count_depths_kernel, {kCountBlocks, kCountThreads}, stream, p.keys[0], p.ranges, p.with_slots, p.n,
+         scratch.histograms, p.counts, rest, of_tiles);
 }
 
 void sort_by_depth(const DepthSort& p, void* memory, cudaStream_t stream) {

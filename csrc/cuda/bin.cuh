@@ -23,11 +23,37 @@ __device__ inline void set_to_zero(const ZeroedMemory& memory, int64_t thread, i
   for (int64_t k = thread; k < count; k += threads) pieces[k] = {0, 0, 0, 0};
 }
 
+/// Adds to a count and returns what it was.
+__device__ inline int64_t add_to_count(int64_t& count, int64_t more) {
+  return int64_t(atomicAdd(reinterpret_cast<unsigned long long*>(&count), static_cast<unsigned long long>(more)));
+}
+
+/// Hands out the slots of rows of 32 splats, from counts.pairs on, of which a warp thereby takes its part. All lanes
+/// must call it.
+template <int kRows>
+__device__ void take_slots(const int (&pairs_of)[kRows], PairRange* ranges, int64_t stride, Counts& counts) {
+  int64_t before[kRows], all = 0;  // of the pairs of these rows
+#pragma unroll
+  for (int k = 0; k < kRows; ++k) {
+    const int up_to = warp_inclusive_sum(pairs_of[k]);
+    before[k] = all + up_to - pairs_of[k];
+    all += shuffle(up_to, 31);
+  }
+  if (all == 0) return;
+  int64_t first = 0;
+  if (lane_id() == 0) first = add_to_count(counts.pairs, all);
+  first = shuffle(first, 0);
+#pragma unroll
+  for (int k = 0; k < kRows; ++k) {
+    if (pairs_of[k] > 0) ranges[k * stride].first = int32_t(first + before[k]);
+  }
+}
+
 /// Histograms of all digits of the depth keys of splats with pairs; how many of these there are, and
 /// how many pairs. Also sets to zero what the kernels behind this one count in.
 __global__ void __launch_bounds__(kCountThreads)
-    count_depths_kernel(const uint32_t* keys, const PairRange* ranges, int64_t n, uint32_t* histograms, Counts* counts,
-                        const ZeroedMemory rest, const ZeroedMemory of_tiles) {
+    count_depths_kernel(const uint32_t* keys, PairRange* ranges, bool with_slots, int64_t n, uint32_t* histograms,
+                        Counts* counts, const ZeroedMemory rest, const ZeroedMemory of_tiles) {
   wait_for_earlier_kernels();
   __shared__ uint32_t local[kDepthHistogramWords];
   for (int b = threadIdx.x; b < kDepthHistogramWords; b += kCountThreads) local[b] = 0;
@@ -36,7 +62,7 @@ __global__ void __launch_bounds__(kCountThreads)
   set_to_zero(rest, thread, stride);
   set_to_zero(of_tiles, thread, stride);
   __syncthreads();
-  unsigned long long pairs = 0, splats = 0;
+  int64_t pairs = 0, splats = 0;
   for (int64_t from = thread; from < rounded; from += kCountAtOnce * stride) {
     uint32_t key[kCountAtOnce];
     int pairs_of[kCountAtOnce];
@@ -51,20 +77,21 @@ __global__ void __launch_bounds__(kCountThreads)
     for (int k = 0; k < kCountAtOnce; ++k) {
       const bool valid = key[k] != kCulledKey;
       count_digits<kDepthBits, kDepthPasses>(key[k], valid, local);
-      pairs += pairs_of[k];
+      if (!with_slots) pairs += pairs_of[k];
       splats += valid;
     }
+    if (with_slots) take_slots(pairs_of, ranges + from, stride, *counts);
   }
   __syncthreads();
   for (int b = threadIdx.x; b < kDepthHistogramWords; b += kCountThreads) {
     if (local[b]) atomicAdd(&histograms[b], local[b]);
   }
-  unsigned long long all_pairs, all_splats;
-  sum_before<kCountThreads / 32>(pairs, 0ull, all_pairs);
-  sum_before<kCountThreads / 32>(splats, 0ull, all_splats);
+  int64_t all_pairs, all_splats;
+  sum_before<kCountThreads / 32>(pairs, int64_t(0), all_pairs);
+  sum_before<kCountThreads / 32>(splats, int64_t(0), all_splats);
   if (threadIdx.x == 0) {
-    atomicAdd(reinterpret_cast<unsigned long long*>(&counts->pairs), all_pairs);
-    atomicAdd(reinterpret_cast<unsigned long long*>(&counts->splats), all_splats);
+    if (!with_slots) add_to_count(counts->pairs, all_pairs);
+    add_to_count(counts->splats, all_splats);
   }
 }
 
@@ -110,10 +137,11 @@ class PairWriter {
       : params_(params), digits_(digits), counts_(counts) {
     for (int b = threadIdx.x; b < digits.passes * digits.bins(); b += kEmitThreads) counts[b] = 0;
   }
-  __device__ void write(int64_t place, uint32_t tile, int32_t splat) {
+  /// `slot` is of no use where slots are not asked for.
+  __device__ void write(int64_t place, uint32_t tile, int32_t splat, int32_t slot) {
     params_.tiles[place] = tile;
     if (params_.slot_pairs) {
-      params_.slot_pairs[place] = {splat, int32_t(place)};
+      params_.slot_pairs[place] = {splat, slot};
     } else {
       params_.splat_pairs[place] = splat;
     }
@@ -187,6 +215,7 @@ __global__ void __launch_bounds__(kEmitThreads, 5) emit_pairs_kernel(const EmitP
   __syncthreads();
   int32_t ids[kEmitRows];
   SplatTiles touched[kEmitRows] = {};
+  int32_t slots[kEmitRows] = {};  // the first of each splat
 #pragma unroll
   for (int row = 0; row < kEmitRows; ++row) {
     const int64_t r = int64_t(block_id) * kEmitSplats + row * kEmitThreads + threadIdx.x;
@@ -194,7 +223,10 @@ __global__ void __launch_bounds__(kEmitThreads, 5) emit_pairs_kernel(const EmitP
   }
 #pragma unroll
   for (int row = 0; row < kEmitRows; ++row) {
-    if (ids[row] >= 0) touched[row] = params.splat_tiles[ids[row]];
+    if (ids[row] >= 0) {
+      touched[row] = params.splat_tiles[ids[row]];
+      if (params.slot_pairs) slots[row] = params.ranges[ids[row]].first;
+    }
   }
   uint32_t before[kEmitRows], sum = 0;  // of the pairs of the block
 #pragma unroll
@@ -237,27 +269,32 @@ __global__ void __launch_bounds__(kEmitThreads, 5) emit_pairs_kernel(const EmitP
     const SplatTiles& of_splat = touched[row];
     const int own = few_tiles(of_splat) ? of_splat.count : 0, first = up_to[row] - own, all = shuffle(up_to[row], 31);
     const auto begin = int32_t(before_block + before[row]);
-    const bool is_long = of_splat.count > 0 && of_splat.mask == 0;
-    if (is_long || (of_splat.count > 0 && params.slot_pairs)) params.ranges[ids[row]].first = begin;
-    if (is_long) params.long_splats[atomicAdd(&params.status[kLongSplats], 1)] = ids[row];
+    const int32_t to_slot = slots[row] - begin;  // from a pair's place
+    if (of_splat.count > 0 && of_splat.mask == 0) {
+      const uint32_t at = atomicAdd(&params.status[kLongSplats], 1);
+      params.long_splats[at] = ids[row];
+      params.long_places[at] = begin;
+    }
     for (int from = 0; from < all; from += 32) {
       const int k = from + lane_id();
       const MaskedPair pair = k < all ? stages[row][warp].of[k] : MaskedPair{};
       const int32_t place = shuffle(begin - first, pair.lane()) + k, id = shuffle(ids[row], pair.lane());
       const int32_t tile = shuffle(of_splat.first, pair.lane()) + pair.row() * columns + pair.column();
-      if (k < all) writer.write(place, uint32_t(tile), id);
+      const int32_t slot = place + shuffle(to_slot, pair.lane());
+      if (k < all) writer.write(place, uint32_t(tile), id, slot);
     }
-    for (uint32_t many = __brev(__ballot_sync(kAllLanes, of_splat.count > own && !is_long)); many != 0;) {
+    for (uint32_t many = __brev(__ballot_sync(kAllLanes, of_splat.count > own && of_splat.mask != 0)); many != 0;) {
       const int source = take_first(many);
-      const int32_t id = shuffle(ids[row], source);
+      const int32_t id = shuffle(ids[row], source), slot_from = shuffle(to_slot, source);
       const int32_t tile = shuffle(of_splat.first, source) + lane_id() / 8 * columns + lane_id() % 8;
       const TileMask mask = shuffle(of_splat.mask, source);
-      int32_t place = shuffle(begin, source);
+      int32_t first_place = shuffle(begin, source);
 #pragma unroll
       for (int from = 0; from < MaskedPair::kBits; from += 32) {
         const auto bits = uint32_t(mask >> from), lane = 1u << lane_id();
-        if (bits & lane) writer.write(place + __popc(bits & (lane - 1)), uint32_t(tile + from / 8 * columns), id);
-        place += __popc(bits);
+        const int32_t place = first_place + __popc(bits & (lane - 1));
+        if (bits & lane) writer.write(place, uint32_t(tile + from / 8 * columns), id, place + slot_from);
+        first_place += __popc(bits);
       }
     }
   }
@@ -282,7 +319,8 @@ __global__ void __launch_bounds__(kEmitThreads)
   const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
   for (int k = first + threadIdx.x / 32; k < count; k += int(gridDim.x) * kWarps) {
     const int32_t id = params.long_splats[k];
-    int32_t place = params.ranges[id].first;
+    int32_t place = params.long_places[k];
+    const int32_t to_slot = params.slot_pairs ? params.ranges[id].first - place : 0;
     const Support<float> support = support_of(splats[id], params.footprint);
     const Range rows = clamp_range(rows_of(support), params.grid.height), tile_rows = tiles_of(rows, params.grid);
     for (int top = tile_rows.first; top <= tile_rows.last; top += 32) {
@@ -292,7 +330,8 @@ __global__ void __launch_bounds__(kEmitThreads)
       const int widths = warp_inclusive_sum(width);
       int32_t mine = place + widths - width;
       const int row = y * int(params.grid.columns());
-      for (int column = tiles.first; column <= tiles.last; ++column) writer.write(mine++, uint32_t(row + column), id);
+      for (int column = tiles.first; column <= tiles.last; ++column, ++mine)
+        writer.write(mine, uint32_t(row + column), id, mine + to_slot);
       place += shuffle(widths, 31);
     }
   }

@@ -49,7 +49,8 @@ inline constexpr uint32_t kCulledKey = 0xffffffff;
 /// bits from the 27th on are the same for all depths from 1/8 to less than 8192, and need not be sorted.
 inline constexpr uint32_t kDepthKeyOffset = 0x02000000;
 
-/// Where the pairs of a splat are, in the order in which they are emitted.
+/// How many pairs a splat has, and the first of its slots, where blend_vjp leaves their gradients. The slots of a splat
+/// are adjacent, and so are those of 32 splats that are neighbours in memory, whose slots project_vjp reads together.
 struct PairRange {
   int32_t first, count;
 };
@@ -63,7 +64,7 @@ struct alignas(16) SplatTiles {
   int32_t first, count;
 };
 
-/// A pair, and its place in that order: where blend_vjp leaves its gradient.
+/// A splat in the list of a tile, and the slot of this pair.
 struct alignas(8) SlotPair {
   int32_t splat, slot;
 };
@@ -156,8 +157,9 @@ struct EmitParams {
   const Counts* counts;
   const int32_t* order;           ///< [counts->splats] splats by depth
   const SplatTiles* splat_tiles;  ///< [n]
-  PairRange* ranges;              ///< [n] `first` is written: of long splats, and with slot_pairs of all
-  int32_t* long_splats;           ///< [n] for splats whose tiles are not among 8x8, in no order
+  const PairRange* ranges;        ///< [n], read with slot_pairs alone
+  int32_t* long_splats;           ///< [n] for splats whose tiles are not among 8x8, in no order,
+  int32_t* long_places;           ///< [n] and where their pairs begin
   uint32_t* status;               ///< emit_scratch(n) bytes, zero
   uint32_t* tile_counts;  ///< tile_sort_scratch(capacity, grid) bytes, zero; sort_by_tile finds its counts there
   uint32_t* tiles;        ///< [capacity] tile of each pair
@@ -400,7 +402,8 @@ struct DepthSort {
   int64_t n;
   uint32_t* keys[2];  ///< [n]; both are overwritten
   int32_t* order[2];  ///< [n]
-  const PairRange* ranges;
+  PairRange* ranges;  ///< [n]
+  bool with_slots;    ///< whether count_depths hands out slots; which splat gets which differs from run to run
   Counts* counts;
 };
 /// Memory that is set to zero; aligned to 16 bytes, and a multiple of them.

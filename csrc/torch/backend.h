@@ -24,7 +24,7 @@ struct SplatTensors {
   Tensor ids;     ///< (n,) int32, CPU: the Gaussian of each, ascending
   Tensor depths;  ///< (n,) CPU
   Tensor counts;  ///< (2,) int64, CUDA: zeros, for the numbers of pairs and splats
-  Tensor ranges;  ///< (n, 2) int32, CUDA: first pair and number of pairs of each
+  Tensor ranges;  ///< (n, 2) int32, CUDA: first slot, for a backward pass, and number of pairs of each
   Tensor memory;  ///< bytes, CUDA: SplatMemory (cuda_views.h)
 };
 

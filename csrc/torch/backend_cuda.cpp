@@ -107,6 +107,7 @@ class CudaBackend final : public Backend {
     by_depth.order[0] = pointer<int32_t>(out.ids);
     by_depth.order[1] = memory.order;
     by_depth.ranges = structs_of<cuda::PairRange>(splats.ranges);
+    by_depth.with_slots = pass.keep;
     by_depth.counts = counts;
     cuda::count_depths(by_depth, memory.depth_scratch, memory.to_clear, pairs.scratch, stream_);
     check_stage("count_depths", pass.debug);
@@ -128,9 +129,10 @@ class CudaBackend final : public Backend {
     emit.capacity = capacity;
     emit.counts = counts;
     emit.order = by_depth.order[0];
-    emit.ranges = structs_of<cuda::PairRange>(splats.ranges);
+    emit.ranges = by_depth.ranges;
     emit.splat_tiles = memory.tiles;
     emit.long_splats = reinterpret_cast<int32_t*>(memory.keys[0]);  // nobody needs keys any more
+    emit.long_places = reinterpret_cast<int32_t*>(memory.keys[1]);
     emit.status = reinterpret_cast<uint32_t*>(memory.emit_scratch);
     out.tile_offsets = at::empty({grid.tiles() + 1}, longs_);
     if (pass.keep) {
