@@ -22,8 +22,11 @@
 namespace ar::cuda {
 
 /// Threads that an SM should hold: bounds the registers, as waiting for the samples in front costs more than a few
-/// numbers in memory.
-template <int C> inline constexpr int kMovingVjpThreads = C == 3 ? 1024 : 512;
+/// numbers in memory. With many cells in large images fewer, since the caches do not hold the places of all those.
+template <class F, int C, int kSegment>
+inline constexpr int kMovingVjpThreads = C > 3                              ? 512
+                                         : F::kSamples > 4 && kSegment == 0 ? 768
+                                                                            : 1024;
 
 /// Where a lane's samples are in front of each splat of a chunk that reaches its warp.
 template <class Layout> using PlacesInFront = Vec2<float>[kStateChunk][Layout::kCells];
@@ -84,7 +87,7 @@ __device__ MovingSums walk_back(TileSplatRef<F, C>& splat, int k0, int j, float 
 /// A block per tile, or with kSegment > 0 per segment of so many pairs of a tile's list, from what the segment gets
 /// from behind. `overflow_only`: other kernels do the work, unless there were too many pairs.
 template <class F, int C, class Layout, int kSegment = 0>
-__global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThreads<C> / Layout::kThreads))
+__global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThreads<F, C, kSegment> / Layout::kThreads))
     moving_vjp_kernel(const BlendVjpParams params, int first, bool overflow_only) {
   wait_for_earlier_kernels();
   using Shared = MovingVjpShared<F, C, Layout, kSegment>;

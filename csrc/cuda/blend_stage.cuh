@@ -130,9 +130,9 @@ __device__ void composite_all(BlendStage<F, C>& stage, int count, int index, Vec
 /// Blocks of blend_front and tail_blend that a streaming multiprocessor should hold at once. It limits the registers of
 /// a thread.
 template <class F, int C>
-inline constexpr int kFrontBlocks = F::kSamples > 1                ? 1
-                                    : sizeof(TileSplat<F, C>) > 96 ? 4
-                                                                   : 5;
+inline constexpr int kFrontBlocks = F::kSamples > 1                                 ? 1
+                                    : F::kExpensive || sizeof(TileSplat<F, C>) > 96 ? 4
+                                                                                    : 5;
 template <class F> inline constexpr int kTailBlendBlocks = F::kSamples > 4 ? 1 : F::kSamples > 1 ? 3 : 4;
 /// Of tail_through.
 template <class F> inline constexpr int kTailThroughBlocks = F::kSamples > 1 ? 3 : kFrontBlocks<F, 0>;

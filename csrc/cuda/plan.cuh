@@ -87,7 +87,8 @@ template <class Of> __device__ void find_begins(PlanState& state, WorkSizes& beg
   static_assert(kWorkClasses < kPlanThreads);
   const int c = threadIdx.x;
   int size = 0, all;
-  for (int k = 0; k < PlanState::kCounters && c < kWorkClasses; ++k) size += of(state.counted[k])[c];
+#pragma unroll
+  for (int k = 0; k < PlanState::kCounters; ++k) size += c < kWorkClasses ? of(state.counted[k])[c] : 0;
   const int first = sum_before<kPlanThreads / 32>(size, 0, all);
   if (c < kWorkClasses) of(begins)[c] = first;
   if (blockIdx.x == 0 && c <= kWorkClasses && c % kLengthClasses == 0) parts.first[c / kLengthClasses] = first;

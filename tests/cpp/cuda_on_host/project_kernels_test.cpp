@@ -230,6 +230,26 @@ TEST_P(ProjectVjpKernel, WritesWhatTheCoreGives) {
   expect_same_bits(results.means2d, expected.means2d, "means2d");
 }
 
+/// More groups of 32 Gaussians than a warp looks at together, some of which no view shows.
+TEST(ZeroCulledGrads, GoesThroughAllGroups) {
+  for (const int n : {1, 31, 130, 32 * 4 * 4, 32 * 4 * 9 + 7, 32 * 4 * 13 - 32}) {
+    Numbers numbers;
+    std::vector<PairRange> ranges(n);
+    for (int i = 0; i < n; ++i) ranges[i].count = i / 32 % 3 == 1 && numbers.bits() % 9 == 0;
+    std::vector<float> opacities(n, 7);
+    ZeroGradsParams p = {};
+    p.gaussians.n = n;
+    p.grads.opacities = opacities.data();
+    p.ranges = ranges.data();
+    cuda_on_host::launch(1, kZeroThreads, [&] { zero_culled_grads_kernel(p); });
+    for (int i = 0; i < n; ++i) {
+      const auto begin = ranges.begin() + i / 32 * 32, end = ranges.begin() + std::min(n, i / 32 * 32 + 32);
+      const bool shown = std::any_of(begin, end, [](PairRange r) { return r.count > 0; });
+      ASSERT_EQ(opacities[i], shown ? 7 : 0) << i << " of " << n;
+    }
+  }
+}
+
 constexpr auto kName = [](const testing::TestParamInfo<Case>& info) { return info.param.name; };
 
 INSTANTIATE_TEST_SUITE_P(Of, ProjectKernel,
