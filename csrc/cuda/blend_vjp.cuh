@@ -44,9 +44,8 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
     blend_vjp_kernel(const BlendVjpParams params) {
   wait_for_earlier_kernels();
   constexpr int kWarps = kVjpWarps<F, kSums>, kGroup = kVjpGroup<F, kSums>;
-  char* const memory = reinterpret_cast<char*>(dynamic_shared());
-  auto* shared = reinterpret_cast<SharedPixels<F, C, kSums>*>(memory);
-  auto* groups = reinterpret_cast<VjpGroup<F, C, kGroup>*>(memory + kWarps * kSharedPixelBytes<F, C, kSums>);
+  auto* shared = reinterpret_cast<SharedPixels<F, C, kSums>*>(dynamic_shared());
+  auto* groups = reinterpret_cast<VjpGroup<F, C, kGroup>*>(shared + kWarps);
   const int warp = threadIdx.x / 32, first = warp % kGroup * kVjpSamples<F, kSums>;
   const int32_t* firsts = params.plan->counts.chunks.first + sample_class(F::kSamples);
   const int begin = firsts[0], end = firsts[1];
@@ -64,14 +63,6 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
   }
 }
 
-/// Whether a multiprocessor of an H200, on which each block takes 1 KiB more of shared memory than it asks for, has
-/// room for so many blocks and one of zero_culled_grads_kernel. While that had the place of one of them, and of its
-/// warps, blend_vjp took up to a sixth longer.
-constexpr bool leaves_room(int blocks, size_t bytes) {
-  constexpr size_t kAll = 228 * 1024, kOfEach = 1024;
-  return size_t(blocks) * (bytes + kOfEach) + kOfEach <= kAll;
-}
-
 /// Eight blocks for each of the 132 multiprocessors of an H200.
 inline constexpr int kClearBlocks = 132 * 8;
 /// As many blocks as any device holds: more would only find that no chunk is left.
@@ -79,8 +70,7 @@ inline constexpr unsigned kTakingBlocks = 256 * 8;
 
 template <class F, int C, Sums kSums> void launch_blend_vjp(const BlendVjpParams& p, cudaStream_t stream) {
   constexpr int kWarps = kVjpWarps<F, kSums>, kGroup = kVjpGroup<F, kSums>;
-  constexpr size_t bytes = kWarps * kSharedPixelBytes<F, C, kSums> + kWarps / kGroup * sizeof(VjpGroup<F, C, kGroup>);
-  static_assert(!kHoldsPixels<F, C> || leaves_room(kVjpBlocks<F, C>, bytes), "zeros would take the place of a block");
+  const size_t bytes = kWarps * sizeof(SharedPixels<F, C, kSums>) + kWarps / kGroup * sizeof(VjpGroup<F, C, kGroup>);
   unsigned blocks = blocks_of(p.max_chunks, kWarps / kGroup);
   if (kTakesChunks<F, kSums>) blocks = std::min(blocks, kTakingBlocks);
   launch(blend_vjp_kernel<F, C, kSums>, {blocks, 32 * kWarps, bytes}, stream, p);

@@ -40,11 +40,13 @@ template <class F, int C> inline constexpr bool kTakesTwo = kHoldsPixels<F, C> &
 template <class F, int C>
 inline constexpr bool kUnrollsSubtiles = kHoldsSamples<F, C> || (F::kSamples == 1 && sizeof(TileSplat<F, C>) <= 48);
 
-/// Blocks of blend_vjp that an SM should hold: bounds the registers.
+/// Blocks of blend_vjp that an SM should hold: bounds the registers. Where lanes hold pixels, a fifth block would leave
+/// them too few registers, and each chunk would take so much longer that the last ones end later.
 template <class F, int C>
 inline constexpr int kVjpBlocks = F::kSamples > 1                 ? (kHoldsSamples<F, C> ? 11 : 1)
-                                  : sizeof(TileSplat<F, C>) <= 48 ? (kHoldsPixels<F, C> ? 5 : 6)
-                                                                  : (kHoldsPixels<F, C> ? 4 : 5);
+                                  : kHoldsPixels<F, C>            ? 4
+                                  : sizeof(TileSplat<F, C>) <= 48 ? 6
+                                                                  : 5;
 
 /// Warps of a block of blend_vjp: as many as leave room for a few blocks in shared memory.
 template <class F, Sums kSums>

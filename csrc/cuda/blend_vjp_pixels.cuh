@@ -46,9 +46,6 @@ template <class F, int C, Sums kSums> struct SharedPixels {
   VjpPixels<kOwn, C, kHoldsPixels<F, C> ? 1 : kTilePixels> pixels;
   VjpSamples<kOwn, kHoldsSamples<F, C> ? 1 : kTilePixels> samples;
 };
-/// Bytes that a warp needs for them.
-template <class F, int C, Sums kSums>
-inline constexpr size_t kSharedPixelBytes = kHoldsPixels<F, C> ? 0 : sizeof(SharedPixels<F, C, kSums>);
 
 /// A lane's pixels, one of each subtile, and their samples: in registers, or the lane's own in shared memory.
 template <class F, int C, Sums kSums> class LanePixels {

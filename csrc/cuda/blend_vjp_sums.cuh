@@ -74,7 +74,7 @@ template <class F, int C, int kGroup> struct VjpGroup {
   alignas(16) int subtile_last[kSubtiles];  ///< behind the last pair that was composited into a pixel of each subtile
   ListedSplat<F, C> splats[32];
   std::conditional_t<kHoldsSamples<F, C>, PairSums, Nothing> pair_sums;
-  std::conditional_t<(kGroup > 1), float[kGroup][32][6 + C], Nothing> sums;
+  float sums[kGroup > 1 ? kGroup : 1][kGroup > 1 ? 32 : 1][6 + C];
 };
 
 }  // namespace ar::cuda

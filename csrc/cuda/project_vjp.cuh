@@ -264,26 +264,14 @@ inline constexpr int kZeroBlocks = 132, kZeroThreads = 128, kZeroBlocksThatFit =
 __global__ void __launch_bounds__(kZeroThreads, kZeroBlocksThatFit)
     zero_culled_grads_kernel(const ZeroGradsParams params) {
   wait_for_earlier_kernels();
-  constexpr int kAhead = 4;  // of a warp's groups of 32 Gaussians, those whose counts are on their way
   const int64_t n = params.gaussians.n, step = int64_t(gridDim.x) * kZeroThreads;
-  const auto count_of = [&](int64_t group) {
-    return group + lane_id() < n ? params.ranges[group + lane_id()].count : 0;
-  };
-  int64_t next = int64_t(blockIdx.x) * kZeroThreads + threadIdx.x - lane_id();
-  int counts[kAhead];
-#pragma unroll
-  for (int k = 0; k < kAhead; ++k) counts[k] = count_of(next + k * step);
-  while (next < n) {
-    uint32_t shown = 0;
-#pragma unroll
-    for (int k = 0; k < kAhead; ++k) shown |= uint32_t(__any_sync(kAllLanes, counts[k] > 0)) << k;
-#pragma unroll
-    for (int k = 0; k < kAhead; ++k) counts[k] = count_of(next + (kAhead + k) * step);
-#pragma unroll 1
-    for (int k = 0; k < kAhead && next < n; ++k, next += step) {
-      if (shown >> k & 1) continue;
-      zero_grads_of_warp(params.gaussians, params.grads, next, int(min(int64_t(32), n - next)));
-    }
+  const auto count_of = [&](int64_t i) { return i < n ? params.ranges[i].count : 0; };
+  int64_t first = int64_t(blockIdx.x) * kZeroThreads + threadIdx.x - lane_id();
+  int count = count_of(first + lane_id());
+  for (; first < n; first += step) {
+    const bool any = __any_sync(kAllLanes, count > 0);
+    count = count_of(first + step + lane_id());  // the next one's, so that it arrives during the stores
+    if (!any) zero_grads_of_warp(params.gaussians, params.grads, first, int(min(int64_t(32), n - first)));
   }
 }
 
