@@ -257,8 +257,8 @@ __global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kProjectVjpB
 }
 
 /// Blocks of zero_culled_grads_kernel: one for each of the 132 multiprocessors of an H200. So few, of so few threads
-/// and registers, find room beside the blocks of blend_vjp, which is bound by its instructions while this waits for
-/// memory.
+/// and registers, take the place of no more than one block of blend_vjp, which is bound by its instructions while this
+/// waits for memory.
 inline constexpr int kZeroBlocks = 132, kZeroThreads = 128, kZeroBlocksThatFit = 16;
 
 __global__ void __launch_bounds__(kZeroThreads, kZeroBlocksThatFit)
