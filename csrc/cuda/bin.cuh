@@ -35,7 +35,7 @@ __device__ void take_slots(const int (&pairs_of)[kRows], PairRange* ranges, int6
   int64_t before[kRows], all = 0;  // of the pairs of these rows
 #pragma unroll
   for (int k = 0; k < kRows; ++k) {
-    const int up_to = warp_inclusive_sum(pairs_of[k]);
+    const int64_t up_to = warp_inclusive_sum(int64_t(pairs_of[k]));
     before[k] = all + up_to - pairs_of[k];
     all += shuffle(up_to, 31);
   }
@@ -49,8 +49,8 @@ __device__ void take_slots(const int (&pairs_of)[kRows], PairRange* ranges, int6
   }
 }
 
-/// Histograms of all digits of the depth keys of splats with pairs; how many of these there are, and
-/// how many pairs. Also sets to zero what the kernels behind this one count in.
+/// Histograms of all digits of the depth keys of splats with pairs; how many of these there are, and how many pairs.
+/// With slots hands these out, in ranges[].first. Also sets to zero what the kernels behind this one count in.
 __global__ void __launch_bounds__(kCountThreads)
     count_depths_kernel(const uint32_t* keys, PairRange* ranges, bool with_slots, int64_t n, uint32_t* histograms,
                         Counts* counts, const ZeroedMemory rest, const ZeroedMemory of_tiles) {

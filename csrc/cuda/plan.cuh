@@ -8,6 +8,8 @@
 namespace ar::cuda {
 
 inline constexpr int kCountWorkThreads = 1024, kPlanThreads = 256;
+/// Tiles of a thread of count_work whose loads wait together.
+inline constexpr int kTilesAtOnce = 2;
 
 /// The class of a piece of work. Work is handed out by samples, and of those longest first, so that no block starts on
 /// a long piece when the others are done. Lengths are classed by powers of two; within a class the order does not
@@ -47,21 +49,20 @@ __global__ void __launch_bounds__(kCountWorkThreads)
     count_work_kernel(const TileLists lists, int64_t tiles, int most_samples, bool whole, PlanState* state) {
   wait_for_earlier_kernels();
   static_assert(kWorkClasses < kCountWorkThreads);
-  constexpr int kAtOnce = 2;  // tiles of a thread whose loads wait together
   __shared__ WorkSizes sizes;
   const int c = threadIdx.x;
   if (c < kWorkClasses) sizes.tiles[c] = sizes.chunks[c] = 0;
   __syncthreads();
   const int64_t stride = int64_t(gridDim.x) * kCountWorkThreads;
-  for (int64_t first = blockIdx.x * kCountWorkThreads + threadIdx.x; first < tiles; first += kAtOnce * stride) {
-    int n[kAtOnce], samples[kAtOnce];
+  for (int64_t first = blockIdx.x * kCountWorkThreads + threadIdx.x; first < tiles; first += kTilesAtOnce * stride) {
+    int n[kTilesAtOnce], samples[kTilesAtOnce];
 #pragma unroll
-    for (int k = 0; k < kAtOnce; ++k) {
+    for (int k = 0; k < kTilesAtOnce; ++k) {
       const PlannedTile tile(lists, min(first + k * stride, tiles - 1), most_samples, whole);
       n[k] = tile.n, samples[k] = tile.samples;
     }
 #pragma unroll
-    for (int k = 0; k < kAtOnce; ++k) {
+    for (int k = 0; k < kTilesAtOnce; ++k) {
       if (first + k * stride >= tiles) break;
       const int length = whole ? kWholeList : chunk_length(samples[k]), full = n[k] / length, rest = n[k] % length;
       atomicAdd(&sizes.tiles[work_class(samples[k], n[k])], 1);

@@ -411,8 +411,8 @@ struct ZeroedMemory {
   void* data;
   int64_t bytes;
 };
-/// First adds to the histograms and the counts, which whatever made the keys has set to zero, and sets the rest of the
-/// scratch to zero; then sorts. Once for each time that keys are made.
+/// First adds to the histograms and the counts, which whatever made the keys has set to zero, hands out slots, and sets
+/// the rest of the scratch to zero; then sorts. Once for each time that keys are made.
 void count_depths(const DepthSort& p, void* scratch, ZeroedMemory rest, ZeroedMemory of_tiles, cudaStream_t stream);
 void sort_by_depth(const DepthSort& p, void* scratch, cudaStream_t stream);
 

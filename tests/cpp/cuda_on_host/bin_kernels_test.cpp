@@ -124,6 +124,21 @@ TEST(BinKernels, FewAndNoDepths) {
   expect_sorted({3, kCulled, 0, 1, 3, 0});
 }
 
+/// More pairs of 32 splats than an int holds are told as more than there is room for.
+TEST(BinKernels, CountsMorePairsThanAnIntHolds) {
+  std::vector<uint32_t> keys(32, key_of(1));
+  std::vector<PairRange> ranges(keys.size(), {0, 1 << 27});
+  for (const bool with_slots : {false, true}) {
+    std::vector<uint32_t> histograms(kDepthHistogramWords);
+    Counts counts = {};
+    cuda_on_host::launch(1, kCountThreads, [&] {
+      count_depths_kernel(keys.data(), ranges.data(), with_slots, 32, histograms.data(), &counts, {}, {});
+    });
+    EXPECT_EQ(counts.pairs, int64_t(1) << 32);
+    EXPECT_EQ(counts.splats, 32);
+  }
+}
+
 TEST(BinKernels, TiesKeepInputOrder) {
   std::vector<float> depths = random_depths(kDepthTile, 0.2f, 4);
   for (float& depth : depths) depth = depth == kCulled ? kCulled : std::ceil(depth);

@@ -230,7 +230,7 @@ TEST_P(ProjectVjpKernel, WritesWhatTheCoreGives) {
   expect_same_bits(results.means2d, expected.means2d, "means2d");
 }
 
-/// More groups of 32 Gaussians than a warp looks at together, some of which no view shows.
+/// More groups of 32 Gaussians than there are warps, of which the view shows a third.
 TEST(ZeroCulledGrads, GoesThroughAllGroups) {
   for (const int n : {1, 31, 130, 32 * 4 * 4, 32 * 4 * 9 + 7, 32 * 4 * 13 - 32}) {
     Numbers numbers;
