@@ -58,7 +58,7 @@ def ssim(image: torch.Tensor, target: torch.Tensor, reduction: str = "mean") -> 
     pixels near the border, or mirror the image there, and give other numbers.)
 
     In float32 the variances are differences of rounded numbers, in 3DGS as here. That shows where images are flat and
-    bright: there the similarity of a pixel is good to 2e-3, and the mean to 1e-4 (docs/losses.md).
+    bright: there the similarity of a pixel is good to 2e-3, and the mean to 1e-4; docs/losses.md has what was measured.
 
     Args:
         image: As in `l1_ssim`.

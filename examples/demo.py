@@ -1,4 +1,4 @@
-"""A resolution target made of Gaussians, rendered with every footprint and compared with the truth.
+"""A resolution target made of Gaussians, rendered with seven footprints and compared with the truth.
 
     python examples/demo.py --out DIR
 
@@ -411,7 +411,7 @@ def main(argv: list[str] | None = None) -> int:
 
 def parse_arguments(argv: list[str] | None):
     parser = arguments.Parser(
-        description="Render a resolution target made of Gaussians with every footprint at four resolutions, compare "
+        description="Render a resolution target made of Gaussians with seven footprints at four resolutions, compare "
         "with a supersampled reference, and write DIR/contact_sheet.png, the pictures, results.json, and the target "
         "itself as target.ply with views.json."
     )

@@ -3,7 +3,8 @@
     python examples/train.py FOLDER OUT [FOOTPRINT ...]
 
 FOLDER holds a NeRF-synthetic scene, a COLMAP reconstruction or a nerfstudio capture. With several footprints each
-trains a scene of its own, in OUT/FOOTPRINT, from the same start. Needs `pip install analytic_rasterizer[train]`.
+trains a scene of its own, in OUT/FOOTPRINT, from the same start; without any, `analytic`, `box:samples=4` and
+`moment:samples=4` do, 7,000 steps each. What is in these folders is overwritten. Needs `pip install ".[train]"`.
 `python -m analytic_rasterizer train` does the same with more options.
 """
 

@@ -670,6 +670,17 @@ def test_help_of_train_has_every_default(capsys):
             assert f"(default: {field.default})" in shown.split(option)[1].split(" --")[0], field.name
 
 
+def test_help_of_train_says_what_every_option_is(capsys):
+    """From the docstring of TrainingOptions, where the command has no words of its own."""
+    with pytest.raises(SystemExit):
+        cli.main(["train", "--help"])
+    shown = " ".join(capsys.readouterr().out.split())
+    for field in fields(TrainingOptions):
+        text = shown.rsplit(f" --{field.name.replace('_', '-')} ", 1)[1].split(" --")[0].removeprefix("X ")
+        assert len(text.split("(default:")[0]) > 4, field.name
+    assert "share of 1 - SSIM in the loss, next to the mean absolute error (default: 0.2)" in shown
+
+
 # ------------------------------------------------------------------------------------ training
 
 TINY = {"sh_degree": 1, "random_points": 150, "densify_from": 20, "densify_every": 20, "max_gaussians": 400}

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import inspect
+import re
 import sys
 import typing
 from contextlib import nullcontext
@@ -41,6 +43,16 @@ MAIN = {
 }
 
 
+def attribute_texts(described: type) -> dict[str, str]:
+    """What the docstring of a class says of each of its attributes, as help texts; nothing with python -OO."""
+    section = (inspect.getdoc(described) or "").partition("Attributes:\n")[2].partition("\n\n")[0]
+    texts = {}
+    for names, text in re.findall(r"^    (\w[\w, ]*): (.*(?:\n        .*)*)", section, re.MULTILINE):
+        text = " ".join(text.split()).replace("`", "").replace("%", "%%").rstrip(".")
+        texts |= dict.fromkeys(names.split(", "), text[:1].lower() + text[1:])
+    return texts
+
+
 def add_parser(subcommands) -> None:
     parser = subcommands.add_parser(
         "train",
@@ -72,12 +84,12 @@ def add_parser(subcommands) -> None:
     add_machine_options(parser, device=None)
     add_rank_options(parser)
     rest = parser.add_argument_group("fine tuning", "see docs/training.md")
-    types = typing.get_type_hints(TrainingOptions)
+    types, texts = typing.get_type_hints(TrainingOptions), attribute_texts(TrainingOptions)
     for field in fields(TrainingOptions):
         group = parser if field.name in MAIN else rest
         flag = "--" + field.name.replace("_", "-")
         default = ",".join(map(str, field.default)) if isinstance(field.default, tuple) else field.default
-        text = MAIN.get(field.name, "")
+        text = MAIN.get(field.name) or texts.get(field.name, "")
         text += f" (default: {default})" if "default" not in text and str(default) not in ("", "False") else ""
         # What is not given is absent, so that a checkpoint's options are only compared with what is.
         if types[field.name] is bool:

@@ -108,7 +108,9 @@ class TrainingOptions:
         means_rate_steps: Steps after which the rate of the means has reached its end, whatever the length of the
             training (3DGS: 30,000); 0: when the training ends.
         color_rate: Learning rate of the constant of the harmonics; the others learn at 1/20 of it.
-        opacity_rate, scale_rate, rotation_rate: Learning rates of logit opacities, log scales and quaternions.
+        opacity_rate: Learning rate of the logit opacities.
+        scale_rate: Learning rate of the log scales.
+        rotation_rate: Learning rate of the quaternions.
         rates_from: Steps after which the learning rates other than that of the means begin to fall.
         rates_half_life: Steps in which they then fall to a half, exponentially; 0: they stay.
         sparse_adam: Whether a step of the optimizer updates only the Gaussians that at least one of its pictures shows
@@ -132,7 +134,7 @@ class TrainingOptions:
         grow_share: Of "mcmc": Gaussians that are added at a time, as a share of those that are there.
         noise: Of "mcmc": strength of the noise on the means, in learning rates of the means.
         opacity_weight: Weight of the mean opacity in the loss; -1: 0.01 for "mcmc", otherwise 0.
-        scale_weight: Weight of the mean scale in the loss, likewise.
+        scale_weight: Weight of the mean scale in the loss; -1: 0.01 for "mcmc", otherwise 0.
 
     Numbers of NumPy and tensors with one number become those of Python, which the files of a training can hold.
 

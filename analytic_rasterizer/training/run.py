@@ -58,7 +58,7 @@ class Run:
 
     Args:
         scene: Folder of a capture, see `load_capture`.
-        out: Folder for the results, made if it is missing.
+        out: Folder for the results, made if it is missing. Those of another training there are overwritten.
         options: None: the defaults, or with `resume` those of the checkpoint.
         device: "cpu", "cuda" or "cuda:N".
         images, test_every: As `load_capture`; None: "images" and 8. With `resume` None, or the same as when the

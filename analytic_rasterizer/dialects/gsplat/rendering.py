@@ -116,7 +116,8 @@ def rasterization(
             something if the radii are positive: means2d (2,) px with pixel centres at 0.5, through which gradients of
             the images flow, so that `retain_grad` works; depths, differentiable; radii (2,) int32, px along x and y;
             conics (3,), the inverse of the covariance with the filter's variance (1/12 px^2 for footprints other than
-            `point` and `mip`); opacities, with the amplitude of `mip`; the last three without gradient. batch_ids,
+            `point` and `mip`); opacities, in mode "antialiased" with the amplitude of `mip`; the last three without
+            gradient, but for opacities in mode "classic", which are those given. batch_ids,
             camera_ids, gaussian_ids: (R,) int64 if packed, else None. width, height, tile_size, tile_width,
             tile_height, n_batches, n_cameras: numbers. With `distributed` the rows, and C of a table, are those of the
             rank's own Gaussians in the cameras of all ranks: gaussian_ids count within the rank, camera_ids over all
