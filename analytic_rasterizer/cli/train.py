@@ -47,9 +47,9 @@ def attribute_texts(described: type) -> dict[str, str]:
     """What the docstring of a class says of each of its attributes, as help texts; nothing with python -OO."""
     section = (inspect.getdoc(described) or "").partition("Attributes:\n")[2].partition("\n\n")[0]
     texts = {}
-    for names, text in re.findall(r"^    (\w[\w, ]*): (.*(?:\n        .*)*)", section, re.MULTILINE):
+    for name, text in re.findall(r"^    (\w+): (.*(?:\n        .*)*)", section, re.MULTILINE):
         text = " ".join(text.split()).replace("`", "").replace("%", "%%").rstrip(".")
-        texts |= dict.fromkeys(names.split(", "), text[:1].lower() + text[1:])
+        texts[name] = text[:1].lower() + text[1:]
     return texts
 
 

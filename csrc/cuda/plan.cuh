@@ -55,19 +55,16 @@ __global__ void __launch_bounds__(kCountWorkThreads)
   __syncthreads();
   const int64_t stride = int64_t(gridDim.x) * kCountWorkThreads;
   for (int64_t first = blockIdx.x * kCountWorkThreads + threadIdx.x; first < tiles; first += kTilesAtOnce * stride) {
-    int n[kTilesAtOnce], samples[kTilesAtOnce];
-#pragma unroll
-    for (int k = 0; k < kTilesAtOnce; ++k) {
-      const PlannedTile tile(lists, min(first + k * stride, tiles - 1), most_samples, whole);
-      n[k] = tile.n, samples[k] = tile.samples;
-    }
+    const auto planned = [&](int64_t tile) { return PlannedTile(lists, min(tile, tiles - 1), most_samples, whole); };
+    const PlannedTile at_once[kTilesAtOnce] = {planned(first), planned(first + stride)};
 #pragma unroll
     for (int k = 0; k < kTilesAtOnce; ++k) {
       if (first + k * stride >= tiles) break;
-      const int length = whole ? kWholeList : chunk_length(samples[k]), full = n[k] / length, rest = n[k] % length;
-      atomicAdd(&sizes.tiles[work_class(samples[k], n[k])], 1);
-      if (full > 0) atomicAdd(&sizes.chunks[work_class(samples[k], length)], full);
-      if (rest > 0) atomicAdd(&sizes.chunks[work_class(samples[k], rest)], 1);
+      const PlannedTile& tile = at_once[k];
+      const int full = tile.full(), rest = tile.rest();
+      atomicAdd(&sizes.tiles[work_class(tile.samples, tile.n)], 1);
+      if (full > 0) atomicAdd(&sizes.chunks[work_class(tile.samples, tile.length)], full);
+      if (rest > 0) atomicAdd(&sizes.chunks[work_class(tile.samples, rest)], 1);
     }
   }
   __syncthreads();
