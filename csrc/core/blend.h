@@ -126,29 +126,35 @@ template <class V> AR_HD BlendGrad<V> blend_sample_vjp(MaskOf<V> mask, V raw, V 
   return {transmittance * alpha, select(free, transmittance * difference, zero)};
 }
 
-/// Adjoint of compositing one splat into one sample that moves.
+/// What compositing one splat into samples that move adds to the sums of the splat.
 template <class V> struct MovingBlendGrad {
-  V contribution;        ///< as in BlendGrad
-  MoveGrad<V> of_splat;  ///< what is added to the splat's sums
+  V contribution;  ///< as in BlendGrad
+  MoveGrad<V> of_splat;
 };
-
-/// Adjoint of blend_placed_sample. `raw` is zero where the splat was not composited; `place` is that in front of the
-/// splat. `transmittance`, `behind` and `dL_dplace` are read as they are behind the splat and left as they are in front
-/// of it.
-template <class P, class Terms, class V, class Cell>
-AR_HD MovingBlendGrad<V> blend_placed_sample_vjp(const Terms& terms, Vec2<V> z, V raw, const Cell& cell, V g_color,
-                                                 Vec2<V> place, V& transmittance, V& behind, Vec2<V>& dL_dplace) {
-  using T = ScalarOf<V>;
-  const V cap = V(T(kAlphaMax)), alpha = min(raw, cap);
-  const MaskOf<V> free = (raw > V(T(0))) & (raw <= cap);
-  transmittance = madd(transmittance, odds(alpha), transmittance);  // 1 / (1 - alpha) = 1 + odds
-  const V difference = g_color - behind;
-  behind = madd(alpha, difference, behind);
-  return {transmittance * alpha,
-          P::alpha_and_move_in_vjp(terms, z, raw, alpha, free, transmittance * difference, place, cell, dL_dplace)};
+/// Sums that nothing has been added to: -0, since the compiler knows that -0 + x is x.
+template <class V> AR_HD MovingBlendGrad<V> no_moving_blend_grad() {
+  const V zero = V(ScalarOf<V>(-0.0));
+  return {zero, {zero, {{zero, zero}, {zero, zero, zero}}}};
 }
 
-/// How `behind` and dL_dplace of blend_placed_sample_vjp go through a part of a list. In front of it
+/// Adjoint of blend_placed_sample, added to `sums`. `raw` is zero where the splat was not composited; `place` is that
+/// in front of the splat. `transmittance`, `behind` and dL_dplace, in the unit kMoveGradUnit of P, are read as they are
+/// behind the splat and left as they are in front of it.
+template <class P, class Terms, class V, class Cell>
+AR_HD void add_placed_sample_vjp(const Terms& terms, Vec2<V> z, V raw, const Cell& cell, V g_color, Vec2<V> place,
+                                 V& transmittance, V& behind, Vec2<V>& dL_dplace, MovingBlendGrad<V>& sums) {
+  using T = ScalarOf<V>;
+  const V cap = V(T(kAlphaMax)), alpha = min(raw, cap);
+  const V contribution = transmittance * odds(alpha);  // T behind the splat is 1 - alpha times that in front
+  transmittance = transmittance + contribution;
+  const V difference = g_color - behind;
+  behind = madd(alpha, difference, behind);
+  sums.contribution = sums.contribution + contribution;
+  P::add_alpha_and_move_in_vjp(terms, z, alpha, raw <= cap, contribution * difference, place, cell, dL_dplace,
+                               sums.of_splat);
+}
+
+/// How `behind` and dL_dplace of add_placed_sample_vjp go through a part of a list. In front of it
 ///   behind = (color + (transmittance behind it) * (behind it)) / (transmittance in front of it),
 ///   dL_dplace = of_color + of_behind * (behind it) + of_place (dL_dplace behind it).
 template <class V> struct AdjointMap {

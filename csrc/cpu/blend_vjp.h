@@ -148,6 +148,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
       ShapeGrad<V> of_pixel = {{zero, zero}, {zero, zero, zero}};
       if constexpr (P::kMoves) {
         const Vec2<V> z = P::whitened(terms, at, 0);
+        MovingBlendGrad<V> grad = no_moving_blend_grad<V>();
         do {
           auto found = replay.take();
           AR_UNROLL
@@ -159,17 +160,17 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
             found.read(j, replay.bounds(s).lo, raw, place);
             V t = load(transmittance[s] + pixel, V()), b = load(behind[s] + pixel, V());
             Vec2<V> dL_dplace = dL_dplaces.at(s, pixel);
-            const MovingBlendGrad<V> grad = blend_placed_sample_vjp<P>(
-                terms, P::whitened_node(terms, z, place), raw, replay.bounds(s), g_color, place, t, b, dL_dplace);
+            add_placed_sample_vjp<P>(terms, P::whitened_node(terms, z, place), raw, replay.bounds(s), g_color, place, t,
+                                     b, dL_dplace, grad);
             store(transmittance[s] + pixel, t);
             store(behind[s] + pixel, b);
             dL_dplaces.set(s, pixel, dL_dplace);
-            contribution = contribution + grad.contribution;
-            weighted = weighted + grad.of_splat.weighted;
-            shape = shape + grad.of_splat.sums;
-            if (with_means) of_pixel = of_pixel + grad.of_splat.sums;
           }
         } while (replay.has(k) && replay.pixel() == pixel);
+        contribution = grad.contribution;
+        weighted = weighted + grad.of_splat.weighted;
+        of_pixel = grad.of_splat.sums;
+        shape = shape + of_pixel;
       } else {
         AR_UNROLL
         for (int s = 0; s < kSamples; ++s) {

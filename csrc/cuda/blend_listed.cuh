@@ -274,7 +274,7 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
         const TileSplat<F, C> next = stage.splats[j];
         const int next_place = stage.places[from + j];
         store_up_to(k);
-        blend.add(splat, k);
+        blend.add(splat, k + 1, blend.last);
         splat = next;
         k = k0 + next_place;
       }

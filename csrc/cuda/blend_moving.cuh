@@ -166,11 +166,21 @@ template <class F, class Layout> struct CellCorners {
   }
 };
 
-/// Up to kBatch splats of a tile that a block works on together.
-template <class F, int C, class Layout, int kBatch> struct MovingStage {
+/// How lists of the splats that reach a warp are read: several entries at a time, if a lane has few samples.
+template <class Layout> struct MovingLists {
+  static constexpr int kAhead = Layout::kCells <= 2 ? 4 : 1;
+  /// Of up to kMost splats; `kUnit`: of ReachLists.
+  template <int kUnit, int kMost> using Type = ReachLists<uint32_t, kUnit, kAhead, Layout::kWarps, kMost>;
+};
+
+/// Up to kBatch splats of a tile that a block works on together, and lists of up to kListed of these that reach each
+/// warp's pixels. `kPlaces`: entries of lists are places in memory, else numbers of splats.
+template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kPlaces = false> struct MovingStage {
   static_assert(kBatch % 32 == 0 && kBatch <= Layout::kThreads);
+  using Lists = typename MovingLists<Layout>::template Type<kPlaces ? sizeof(TileSplat<F, C>) : 1, kListed>;
   TileSplat<F, C> splats[kBatch];
   uint32_t reach[kBatch];
+  Lists lists;
 
   /// This thread's splat of those in [k, k + kBatch) and before `end` of the list, or -1.
   __device__ static int32_t splat_of(const TileList& list, int k, int end) {
@@ -211,8 +221,8 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = false> stru
     sums.add(b.contribution, channels);
     if (kKeep) last[0] = b.mask ? k + 1 : last[0];
   }
-  /// Composites pair k into the samples.
-  __device__ void add(TileSplatRef<F, C>& splat, int k) {
+  /// Composites a splat into the samples; shown[i] becomes `place` where it was composited into sample i, if kKeep.
+  __device__ void add(TileSplatRef<F, C>& splat, int place, int (&shown)[kCells]) {
     float contribution = 0;
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
@@ -220,7 +230,7 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = false> stru
       const Blended<float> b = blend_placed_sample<F>(splat.terms, z, exp2(F::log_alpha(splat.terms, z)),
                                                       UnitCell<F::kSide>(), samples.transmittance[i], samples.place[i]);
       contribution = i == 0 ? b.contribution : contribution + b.contribution;
-      if (kKeep) last[i] = b.mask ? k + 1 : last[i];
+      if (kKeep) shown[i] = b.mask ? place : shown[i];
     }
     sums.add(contribution, splat.channels);
   }
@@ -252,6 +262,27 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = false> stru
   }
 };
 
+/// Composites those of the staged splats [from, to) that reach the warp's pixels; the first that is staged is pair k0.
+template <class F, int C, class Layout, bool kKeep, class Stage>
+__device__ void blend_staged(Stage& stage, int from, int to, int k0, MovingBlend<F, C, Layout, kKeep>& blend) {
+  constexpr int kBetweenVotes = 16, kCells = Layout::kCells;
+  const int listed = stage.lists.list(stage.reach, from, to);
+  int shown[kCells];  // the entry of the last that was composited into each sample
+#pragma unroll
+  for (int i = 0; i < kCells; ++i) shown[i] = -1;
+  for (int n = 0; n < listed; n += kBetweenVotes) {
+    if (n > 0 && !__any_sync(kAllLanes, blend.samples.open())) break;
+    stage.lists.for_each(n, min(listed, n + kBetweenVotes), [&](uint32_t entry) {
+      TileSplatRef<F, C> splat = Stage::Lists::splat_of(stage.splats, entry);
+      blend.add(splat, int(entry), shown);
+    });
+  }
+#pragma unroll
+  for (int i = 0; kKeep && i < kCells; ++i)
+    if (shown[i] >= 0) blend.last[i] = k0 + Stage::Lists::number_of(uint32_t(shown[i])) + 1;
+  __syncwarp();  // all have read the list
+}
+
 /// A block per tile; C channels from `first` on, of three in so few registers that an SM holds 1024 threads.
 /// `overflow_only`: another kernel blends the tiles, unless there were too many pairs.
 template <class F, int C, class Layout, bool kKeep>
@@ -259,7 +290,11 @@ __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThr
     moving_blend_kernel(const BlendParams params, int first, bool overflow_only) {
   wait_for_earlier_kernels();
   constexpr int kBatch = Layout::kThreads < 256 ? Layout::kThreads : 256;
-  __shared__ MovingStage<F, C, Layout, kBatch> stage;
+  constexpr int kListed = kKeep ? kStateChunk : kBatch;
+  // Where a lane has many samples whose last splats have to be kept, lists would take too many registers.
+  constexpr bool kLists = !kKeep || Layout::kCells <= 2;
+  using Stage = MovingStage<F, C, Layout, kBatch, kListed, true>;
+  __shared__ Stage stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int tile = params.plan.tile_order[blockIdx.x];
   const TileList list = list_of(params.lists, params.grid, tile);
@@ -276,15 +311,19 @@ __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThr
     __syncthreads();
     if (next_id >= 0) prefetch(splats + next_id);  // so that the next batch need not wait for memory
     id = next_id;
-    for (int from = 0; from < count; from += 32) {
+    for (int from = 0; from < count; from += kListed) {
       if (!__any_sync(kAllLanes, blend.samples.open())) break;
       if (kKeep && k + from > 0 && (k + from) % places.spacing == 0)
         blend.samples.store(params.checkpoints +
                             (places.first + (k + from) / places.spacing - 1) * blend.samples.kCheckpoint);
-      for (uint32_t left = stage.reached(from); left != 0;) {
-        const int j = from + take_first(left);
-        TileSplatRef<F, C> splat = stage.splats[j];
-        blend.add(splat, k + j);
+      if constexpr (kLists) {
+        blend_staged(stage, from, min(count, from + kListed), k, blend);
+      } else {
+        for (uint32_t left = stage.reached(from); left != 0;) {
+          const int j = from + take_first(left);
+          TileSplatRef<F, C> splat = stage.splats[j];
+          blend.add(splat, k + j + 1, blend.last);
+        }
       }
     }
   }

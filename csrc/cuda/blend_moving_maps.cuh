@@ -15,7 +15,7 @@
 namespace ar::cuda {
 
 /// What a sample carries from a splat to the one in front of it: the gradient-weighted colour behind, and the gradient
-/// with respect to its place.
+/// with respect to its place, in kMoveGradUnit of the footprint.
 struct Adjoint {
   float behind;
   Vec2<float> dL_dplace;
@@ -124,8 +124,8 @@ __global__ void __launch_bounds__(Layout::kThreads, 1024 / Layout::kThreads)
     if (next_id >= 0) prefetch(splats + next_id);  // so that the next batch need not wait for memory
     id = next_id;
     for (int from = 0; from < count; from += 32) {
-      for (uint32_t left = stage.reached(from); left != 0;) {
-        const int j = from + take_first(left);
+      const int listed = stage.lists.list(stage.reach, from, from + 32);
+      stage.lists.for_each(0, listed, [&](uint32_t j) {
         TileSplatRef<F, C> splat = stage.splats[j];
         Vec2<float> z[kCells];
         float raw[kCells];
@@ -134,16 +134,17 @@ __global__ void __launch_bounds__(Layout::kThreads, 1024 / Layout::kThreads)
         for (int i = 0; i < kCells; ++i) {
           z[i] = corners.node(splat.terms, i, samples.place[i]);
           raw[i] = exp2(F::log_alpha(splat.terms, z[i]));
-          mask[i] = raw[i] >= float(kAlphaMin) && k + j < last.samples[i];
+          mask[i] = raw[i] >= float(kAlphaMin) && k + int(j) < last.samples[i];
           any |= mask[i];
         }
-        if (!__any_sync(kAllLanes, any)) continue;
+        if (!__any_sync(kAllLanes, any)) return;
         const float g_color = grad.times(splat.channels, params, pixel, [&] { return list.splat(k + j); });
 #pragma unroll
         for (int i = 0; i < kCells; ++i)
           map_placed_sample<F>(splat.terms, z[i], raw[i], mask[i], UnitCell<F::kSide>(), g_color,
                                samples.transmittance[i], samples.place[i], maps[i]);
-      }
+      });
+      __syncwarp();  // all have read the list
     }
   }
 #pragma unroll

@@ -16,10 +16,9 @@ template <class F, int C, class Layout, int kSegment = 0> struct MovingVjpShared
   /// In segments most pairs reach few of the many warps. There sums have slots only for the warps that a pair reaches,
   /// so that the warps have to wait for each other after more pairs.
   static constexpr bool kSparse = kSegment > 0 && Layout::kWarps > 2;
-  /// Splats that a block takes between barriers: without kSparse two chunks, if a block of any device has room for
-  /// their sums. With many cells one, which leaves more fast memory for the places of samples, and fewer numbers are
-  /// spilled.
-  static constexpr int kDense = F::kSamples <= 4 && Layout::kWarps * kSums <= 192 ? 2 * kStateChunk : kStateChunk;
+  /// Splats that a block takes between barriers: without kSparse two chunks with one cell. With more cells one, which
+  /// leaves more shared memory for the places of samples.
+  static constexpr int kDense = F::kSamples == 1 ? 2 * kStateChunk : kStateChunk;
   static constexpr int kBatch = kSparse ? std::min(kSegment, 16 * Layout::kWarps) : kDense;
   static constexpr int kChunks = kBatch / kStateChunk;
   /// No fewer than a chunk may need.

@@ -21,74 +21,136 @@
 
 namespace ar::cuda {
 
-/// Threads that an SM should hold: bounds the registers, as waiting for the samples in front costs more than a few
+/// Blocks that an SM should hold: bounds the registers, as waiting for the samples in front costs more than a few
 /// numbers in memory. With many cells in large images fewer, since the caches do not hold the places of all those.
-template <class F, int C, int kSegment>
-inline constexpr int kMovingVjpThreads = C > 3                              ? 512
-                                         : F::kSamples > 4 && kSegment == 0 ? 768
-                                                                            : 1024;
+template <class F, int C, class Layout, int kSegment>
+inline constexpr int kMovingVjpBlocks = std::max(1, (C > 3                              ? 512
+                                                     : F::kSamples > 4 && kSegment == 0 ? 768
+                                                                                        : 1024) /
+                                                        Layout::kThreads);
 
-/// Where a lane's samples are in front of each splat of a chunk that reaches its warp.
-template <class Layout> using PlacesInFront = Vec2<float>[kStateChunk][Layout::kCells];
+/// Where a lane's samples are in front of each splat of a chunk that reaches its warp. Those in front of the first few
+/// splats are in shared memory, as many as there is room for. The others, if there are any, are in local memory, of
+/// which the caches hold a part only: a thousand lanes on an SM have half a KiB of places each.
+template <class Layout> class PlacesInFront {
+  static constexpr int kCells = Layout::kCells, kTogether = kCells % 2 == 0 ? 2 : 1;
+  struct alignas(kTogether * sizeof(Vec2<float>)) Together {
+    Vec2<float> of[kTogether];
+  };
+  using OfWarp = Together[kCells / kTogether][32];
 
-/// Composites those of the staged splats [from, from + 32) that reach the warp; the first of them is pair k. Returns
-/// those that a sample of the warp shows, and keeps the places of the samples in front of all. `last`: of LastSplats.
-template <class F, class Layout, class Stage, class Samples>
-__device__ uint32_t replay_chunk(const Stage& stage, int from, int k, const CellCorners<F, Layout>& corners,
-                                 const int (&last)[Layout::kCells], Samples& samples, PlacesInFront<Layout>& in_front) {
+ public:
+  using Places = Vec2<float>[kCells];
+  /// Bytes of shared memory that a block needs for each splat.
+  static constexpr size_t kBytes = Layout::kWarps * sizeof(OfWarp);
+  /// The number of splats whose places are in shared memory has to be a multiple of this one.
+  static constexpr int kUnit = MovingLists<Layout>::kAhead;
+  /// More than these few would take more from the cache than they save.
+  static constexpr int kMost = 8;
+
+  /// The shared memory from byte `begin` on is for the places in front of so many splats.
+  __device__ PlacesInFront(size_t begin, int splats)
+      : begin_(int(begin) + int(threadIdx.x) / 32 * splats * int(sizeof(OfWarp))), in_shared_(splats) {}
+
+  __device__ int in_shared() const { return in_shared_; }
+  /// In front of splat n of the list; kShared: n < in_shared().
+  template <bool kShared> __device__ void put(int n, const Places& places) {
+#pragma unroll
+    for (int i = 0; i < kCells; i += kTogether) {
+      Together together;
+#pragma unroll
+      for (int j = 0; j < kTogether; ++j) together.of[j] = places[i + j];
+      if constexpr (kShared) {
+        shared()[n][i / kTogether][lane_id()] = together;
+      } else {
+        local_[n][i / kTogether] = together;
+      }
+    }
+  }
+  __device__ void get(int n, Places& places) const {
+    if (n < in_shared_) {
+      take([&](int i) { return shared()[n][i][lane_id()]; }, places);
+    } else {
+      take([&](int i) { return local_[n][i]; }, places);
+    }
+  }
+
+ private:
+  /// Not a pointer that is kept: the compiler has to see that it is one to shared memory.
+  __device__ OfWarp* shared() const {
+    return reinterpret_cast<OfWarp*>(reinterpret_cast<char*>(dynamic_shared()) + begin_);
+  }
+  template <class From> __device__ static void take(From&& from, Places& places) {
+#pragma unroll
+    for (int i = 0; i < kCells; i += kTogether) {
+      const Together together = from(i / kTogether);
+#pragma unroll
+      for (int j = 0; j < kTogether; ++j) places[i + j] = together.of[j];
+    }
+  }
+
+  int begin_, in_shared_;
+  Together local_[kStateChunk][kCells / kTogether];
+};
+
+/// Composites those of the staged splats [from, from + 32) that reach the warp, and lists them; `k0`: the pair that is
+/// staged first. Puts the places of the samples in front of each into `in_front`, unless that is null, and returns
+/// which of them a sample of the warp shows. `last`: of LastSplats.
+template <class F, class Layout, class Stage, class Samples, class InFront>
+__device__ uint32_t replay_chunk(Stage& stage, int from, int k0, const CellCorners<F, Layout>& corners,
+                                 const int (&last)[Layout::kCells], Samples& samples, InFront in_front) {
+  constexpr bool kKeeps = !std::is_null_pointer_v<InFront>;
+  __syncwarp();  // all have read the last list
+  const int listed = stage.lists.list(stage.reach, from, from + kStateChunk);
   uint32_t shown = 0;
-  int kept = 0;
-  for (uint32_t left = stage.reached(from); left != 0; ++kept) {
-    const int bit = take_first(left);
-    const auto& terms = stage.splats[from + bit].terms;
+  int n = 0;
+  const auto composite = [&](uint32_t entry, auto is_shared) {
+    const auto& terms = Stage::Lists::splat_of(stage.splats, entry).terms;
+    if constexpr (kKeeps) in_front->template put<decltype(is_shared)::value>(n, samples.place);
     bool any = false;
 #pragma unroll
     for (int i = 0; i < Layout::kCells; ++i) {
       const Vec2<float> z = corners.node(terms, i, samples.place[i]);
-      in_front[kept][i] = samples.place[i];
-      any |= replay_placed_sample<F>(terms, z, exp2(F::log_alpha(terms, z)), k + bit < last[i], UnitCell<F::kSide>(),
-                                     samples.transmittance[i], samples.place[i]);
+      any |= replay_placed_sample<F>(terms, z, exp2(F::log_alpha(terms, z)), k0 + int(entry) < last[i],
+                                     UnitCell<F::kSide>(), samples.transmittance[i], samples.place[i]);
     }
-    shown |= uint32_t(any) << bit;
-  }
+    if (any) shown |= 1u << n;
+    ++n;
+  };
+  int in_shared = listed;
+  if constexpr (kKeeps) in_shared = min(in_shared, in_front->in_shared());
+  stage.lists.for_each(0, in_shared, [&](uint32_t entry) { composite(entry, std::true_type()); });
+  if constexpr (kKeeps)
+    stage.lists.for_each(in_shared, listed, [&](uint32_t entry) { composite(entry, std::false_type()); });
   return warp_or(shown);
 }
 
-/// The sums of a pair over a lane's samples.
-struct MovingSums {
-  PairGrad<float> grad;  ///< before F::collect
-  float contribution;
-};
-
 /// Takes a lane's samples, and what they carry, from behind pair j of the batch that begins with pair k0 to its front,
-/// where they are at `places`. `g_color`: the colour of its splat times the gradient.
+/// where they are at `places`, and sums over them; of_splat.sums as they are before F::collect. `g_color`: the colour
+/// of its splat times the gradient.
 template <class F, int C, class Layout, class Samples>
-__device__ MovingSums walk_back(TileSplatRef<F, C>& splat, int k0, int j, float g_color,
-                                const CellCorners<F, Layout>& corners, const int (&last)[Layout::kCells],
-                                const Vec2<float> (&places)[Layout::kCells], Samples& samples,
-                                Adjoint (&adjoint)[Layout::kCells]) {
-  MovingSums sums = {};
+__device__ MovingBlendGrad<float> walk_back(TileSplatRef<F, C>& splat, int k0, int j, float g_color,
+                                            const CellCorners<F, Layout>& corners, const int (&last)[Layout::kCells],
+                                            const Vec2<float> (&places)[Layout::kCells], Samples& samples,
+                                            Adjoint (&adjoint)[Layout::kCells]) {
+  MovingBlendGrad<float> sums = no_moving_blend_grad<float>();
 #pragma unroll
   for (int i = 0; i < Layout::kCells; ++i) {
-    const Vec2<float> place = places[i];
-    const Vec2<float> z = corners.node(splat.terms, i, place);
+    const Vec2<float> z = corners.node(splat.terms, i, places[i]);
     const float raw = exp2(F::log_alpha(splat.terms, z));
     const bool composited = raw >= float(kAlphaMin) && k0 + j < last[i];
-    const MovingBlendGrad<float> of_sample =
-        blend_placed_sample_vjp<F>(splat.terms, z, composited ? raw : 0.0f, UnitCell<F::kSide>(), g_color, place,
-                                   samples.transmittance[i], adjoint[i].behind, adjoint[i].dL_dplace);
-    const PairGrad<float> grad = {of_sample.of_splat.sums, of_sample.of_splat.weighted};
-    sums.grad = i == 0 ? grad : sums.grad + grad;
-    sums.contribution = i == 0 ? of_sample.contribution : sums.contribution + of_sample.contribution;
+    add_placed_sample_vjp<F>(splat.terms, z, composited ? raw : 0.0f, UnitCell<F::kSide>(), g_color, places[i],
+                             samples.transmittance[i], adjoint[i].behind, adjoint[i].dL_dplace, sums);
   }
   return sums;
 }
 
 /// A block per tile, or with kSegment > 0 per segment of so many pairs of a tile's list, from what the segment gets
-/// from behind. `overflow_only`: other kernels do the work, unless there were too many pairs.
+/// from behind. `overflow_only`: other kernels do the work, unless there were too many pairs. `in_shared`: of
+/// PlacesInFront, whose memory is that behind Shared.
 template <class F, int C, class Layout, int kSegment = 0>
-__global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThreads<F, C, kSegment> / Layout::kThreads))
-    moving_vjp_kernel(const BlendVjpParams params, int first, bool overflow_only) {
+__global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layout, kSegment>)
+    moving_vjp_kernel(const BlendVjpParams params, int first, bool overflow_only, int in_shared) {
   wait_for_earlier_kernels();
   using Shared = MovingVjpShared<F, C, Layout, kSegment>;
   using Samples = MovingSamples<F, Layout, (kSegment > 0)>;
@@ -138,9 +200,9 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
   }
 
   const int own_sum = sum_of_lane<C>();
-  PlacesInFront<Layout> in_front;
-  const auto replay = [&](int from, int k) {
-    return replay_chunk<F, Layout>(shared.stage, from, k, corners, last, samples, in_front);
+  PlacesInFront<Layout> in_front(sizeof(Shared), in_shared);
+  const auto replay = [&](int from, int k0, auto in_front) {  // pair k0 is staged first
+    return replay_chunk<F, Layout>(shared.stage, from, k0, corners, last, samples, in_front);
   };
 
   const int stop = min(lasts.block, end);
@@ -156,7 +218,7 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
         __syncthreads();
         shared.stage.load(splats, params.channels, first, list, shared.stage.splat_of(list, k, k0));
         __syncthreads();
-        for (int from = 0; from < kBatch; from += kStateChunk) replay(from, k + from);
+        for (int from = 0; from < kBatch; from += kStateChunk) replay(from, k, nullptr);
       }
     }
     const int32_t next_id = k0 > begin ? shared.stage.splat_of(list, k0 - kBatch, k0) : -1;
@@ -174,29 +236,32 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
         if (k0 + from < lasts.warp) {
           if (kSegment == 0 && places.spacing > kStateChunk) {
             samples = at_batch;
-            for (int ahead = 0; ahead < from; ahead += kStateChunk) replay(ahead, k0 + ahead);
+            for (int ahead = 0; ahead < from; ahead += kStateChunk) replay(ahead, k0, nullptr);
           } else {
             const int64_t number = places.first + (k0 + from) / kStateChunk - 1;
             samples.load(params.checkpoints + number * Samples::kCheckpoint, k0 + from, last);
           }
-          shown = replay(from, k0 + from);
+          shown = replay(from, k0, &in_front);
         }
-        const uint32_t reached = shared.stage.reached(from);
+        const auto& listed = shared.stage.lists.of_warps[warp];
         for (uint32_t mask = shown; mask != 0;) {
-          const int bit = 31 - __clz(mask), j = from + bit;
-          mask ^= 1u << bit;
-          const int kept = __popc(reached >> (31 - bit)) - 1;
+          const int n = 31 - __clz(mask), j = int(listed[n]);
+          mask ^= 1u << n;
           TileSplatRef<F, C> splat = shared.stage.splats[j];
           float* const sums = shared.sums_of(j, first_slot);
           const float g_color = grad.times(splat.channels, params, pixel, [&] { return list.splat(k0 + j); });
-          auto [of_pair, contribution] =
-              walk_back<F, C, Layout>(splat, k0, j, g_color, corners, last, in_front[kept], samples, adjoint);
+          Vec2<float> places_in_front[kCells];
+          in_front.get(n, places_in_front);
+          const auto [contribution, of_splat] =
+              walk_back<F, C, Layout>(splat, k0, j, g_color, corners, last, places_in_front, samples, adjoint);
           if (with_means && with_shape)
-            put_warp_means<Layout>(params, shared.mean_maps[j], of_pair.shape.offset, sums + Shared::kMeans);
-          of_pair.shape = F::collect(splat.terms, of_pair.shape, of_pair.weighted);
+            put_warp_means<Layout>(params, shared.mean_maps[j], of_splat.sums.offset, sums + Shared::kMeans);
+          const PairGrad<float> of_pair = {F::collect(splat.terms, of_splat.sums, of_splat.weighted),
+                                           of_splat.weighted};
           put_warp_sums(of_pair, times(contribution, grad.channels), sums + own_sum);
         }
-        if (lane == 0) shared.hits[warp][from / kStateChunk] = shown;
+        const uint32_t hits = warp_or(shown >> lane & 1 ? 1u << (listed[lane] - from) : 0u);
+        if (lane == 0) shared.hits[warp][from / kStateChunk] = hits;
       }
       __syncthreads();
       const int first_pair = part * kStateChunk, end_pair = min(count, part_end * kStateChunk);
@@ -208,6 +273,20 @@ __global__ void __launch_bounds__(Layout::kThreads, std::max(1, kMovingVjpThread
       if (part > 0) __syncthreads();  // all have read the sums
     }
   }
+}
+
+/// Launches moving_vjp_kernel with as much of PlacesInFront in shared memory as leaves room for kMovingVjpBlocks on an
+/// SM.
+template <class F, int C, class Layout, int kSegment>
+void launch_moving_vjp_kernel(const BlendVjpParams& p, unsigned blocks, int first, bool overflow_only,
+                              cudaStream_t stream) {
+  using InFront = PlacesInFront<Layout>;
+  constexpr size_t kShared = sizeof(MovingVjpShared<F, C, Layout, kSegment>);
+  const size_t room = shared_bytes_of_blocks(kMovingVjpBlocks<F, C, Layout, kSegment>);
+  const size_t splats = room > kShared ? (room - kShared) / InFront::kBytes : 0;
+  const int in_shared = int(std::min<size_t>(splats, InFront::kMost)) / InFront::kUnit * InFront::kUnit;
+  const LaunchShape shape = {blocks, Layout::kThreads, kShared + in_shared * InFront::kBytes};
+  launch(moving_vjp_kernel<F, C, Layout, kSegment>, shape, stream, p, first, overflow_only, in_shared);
 }
 
 }  // namespace ar::cuda

@@ -38,53 +38,22 @@ template <int S, int C, int kSets> struct PixelState {
   }
 };
 
-/// The splats that a block blends together; and for each warp a list of those that reach its pixels, which costs less
-/// per splat than to look for the next bit of a mask.
+/// The splats that a block blends together, and lists of those that reach each warp's pixels.
 template <class F, int C> struct BlendStage : Stage<F, C, kBlendThreads> {
   static constexpr int kBatch = kBlendThreads;
   /// With one sample, where little else is done for a splat, a list holds places in memory, and is read four at a time.
   /// With more it holds the splats' numbers.
   static constexpr bool kPlaces = F::kSamples == 1;
-  using Entry = std::conditional_t<kPlaces, uint32_t, uint8_t>;
-  static constexpr int kUnit = kPlaces ? sizeof(TileSplat<F, C>) : 1, kAhead = kPlaces ? 4 : 1;
-  struct alignas(kAhead * sizeof(Entry)) Entries {
-    Entry of[kAhead];
-  };
-  alignas(Entries) Entry lists[kSubtiles][kBatch];
+  using Lists = std::conditional_t<kPlaces, ReachLists<uint32_t, sizeof(TileSplat<F, C>), 4, kSubtiles, kBatch>,
+                                   ReachLists<uint8_t, 1, 1, kSubtiles, kBatch>>;
+  Lists lists;
 
   /// Lists those of the `count` staged splats that reach this warp's pixels, and returns how many there are. All lanes
   /// must call it.
-  __device__ int list_reached(int count) {
-    const int warp = threadIdx.x / 32;
-    Entry* list = lists[warp];
-    int n = 0;
-    for (int k = 0; k < count; k += 32) {
-      const bool reached = this->reach[k + lane_id()] >> warp & 1;
-      const uint32_t all = __ballot_sync(kAllLanes, reached);
-      if (reached) list[n + __popc(all & ((1u << lane_id()) - 1))] = Entry((k + lane_id()) * kUnit);
-      n += __popc(all);
-    }
-    __syncwarp();
-    return n;
-  }
-  /// The number of a listed splat among those that are staged.
-  __device__ static int number_of(Entry entry) { return int(entry) / kUnit; }
-  /// Calls visit(splat, entry) for the splats [from, to) of the list; `from` is a multiple of kAhead.
+  __device__ int list_reached(int count) { return lists.list(this->reach, 0, count); }
+  /// Calls visit(splat, entry) for the splats [from, to) of the list.
   template <class Visit> __device__ __forceinline__ void for_each_listed(int from, int to, Visit&& visit) const {
-    const Entry* list = lists[threadIdx.x / 32];
-    const auto* memory = reinterpret_cast<const char*>(this->splats);
-    const auto see = [&](Entry entry) {
-      visit(*reinterpret_cast<const TileSplat<F, C>*>(memory + entry * (sizeof(TileSplat<F, C>) / kUnit)), entry);
-    };
-    int k = from;
-#pragma unroll 1
-    for (; k + kAhead <= to; k += kAhead) {
-      const Entries entries = *reinterpret_cast<const Entries*>(list + k);
-#pragma unroll
-      for (int i = 0; i < kAhead; ++i) see(entries.of[i]);
-    }
-#pragma unroll 1
-    for (; k < to; ++k) see(list[k]);
+    lists.for_each(from, to, [&](auto entry) { visit(Lists::splat_of(this->splats, entry), entry); });
   }
 };
 
@@ -124,7 +93,7 @@ __device__ void composite_all(BlendStage<F, C>& stage, int count, int index, Vec
       }
     });
   }
-  if (Stage::kPlaces && entries[0] >= 0) state.last[0] = index + Stage::number_of(uint32_t(entries[0])) + 1;
+  if (Stage::kPlaces && entries[0] >= 0) state.last[0] = index + Stage::Lists::number_of(uint32_t(entries[0])) + 1;
 }
 
 /// Blocks of blend_front and tail_blend that a streaming multiprocessor should hold at once. It limits the registers of

@@ -32,13 +32,11 @@ template <class F, int C> void launch_segments_vjp(const BlendVjpParams& p, int 
   launch(segment_maps_kernel<F, C, kSegment>, {pieces * Maps::kBlocks, Maps::kThreads}, stream, p, first);
   const auto blocks = unsigned(p.grid.tiles() * F::kSamples);
   launch(chain_maps_kernel<F, kSegment>, {blocks, kMovingPixels}, stream, p);
-  const LaunchShape shape = {pieces, Layout::kThreads, sizeof(MovingVjpShared<F, C, Layout, kSegment>)};
-  launch(moving_vjp_kernel<F, C, Layout, kSegment>, shape, stream, p, first, false);
+  launch_moving_vjp_kernel<F, C, Layout, kSegment>(p, pieces, first, false, stream);
 }
 template <class F, int C, bool kSmall> void launch_tiles_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
   using Layout = EvenLayout<F, true, kSmall>;
-  const LaunchShape shape = {unsigned(p.grid.tiles()), Layout::kThreads, sizeof(MovingVjpShared<F, C, Layout>)};
-  launch(moving_vjp_kernel<F, C, Layout>, shape, stream, p, first, kSmall);
+  launch_moving_vjp_kernel<F, C, Layout, 0>(p, unsigned(p.grid.tiles()), first, kSmall, stream);
 }
 template <class F, int C> void launch_moving_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
   if (is_small_image(p.grid)) {

@@ -145,6 +145,54 @@ __device__ Values<C> channels_of(const Channels<float>& channels, const Splat<F,
   }
 }
 
+/// For each warp of a block a list of up to kMost staged splats that reach its pixels, which costs less per splat than
+/// to look for the next bit of a mask. A list holds the numbers of splats times kUnit, and is read kAhead entries at a
+/// time: where kUnit is the size of a splat, an entry is its place in memory.
+template <class EntryType, int kUnit, int kAhead, int kWarps, int kMost> struct ReachLists {
+  using Entry = EntryType;
+  struct alignas(kAhead * sizeof(Entry)) Entries {
+    Entry of[kAhead];
+  };
+  alignas(Entries) Entry of_warps[kWarps][kMost];
+
+  /// Lists those of the staged splats [from, to) that reach this warp's pixels, and returns how many there are. Bit w
+  /// of reach[k]: splat k reaches those of warp w; all up to the next multiple of 32 are read. All lanes must call it.
+  template <class Bits> __device__ int list(const Bits* reach, int from, int to) {
+    const int warp = threadIdx.x / 32;
+    int n = 0;
+    for (int k = from; k < to; k += 32) {
+      const bool reached = reach[k + lane_id()] >> warp & 1;
+      const uint32_t all = __ballot_sync(kAllLanes, reached);
+      if (reached) of_warps[warp][n + __popc(all & ((1u << lane_id()) - 1))] = Entry((k + lane_id()) * kUnit);
+      n += __popc(all);
+    }
+    __syncwarp();
+    return n;
+  }
+  /// The number of a listed splat.
+  __device__ static int number_of(Entry entry) { return int(entry) / kUnit; }
+  /// The splat itself, which is staged in `splats`.
+  template <class Splat> __device__ static const Splat& splat_of(const Splat* splats, Entry entry) {
+    static_assert(sizeof(Splat) % kUnit == 0);
+    return *reinterpret_cast<const Splat*>(reinterpret_cast<const char*>(splats) + entry * (sizeof(Splat) / kUnit));
+  }
+  /// Calls visit(entry) for those in [from, to) of the list of this warp; `from` is a multiple of kAhead.
+  template <class Visit> __device__ __forceinline__ void for_each(int from, int to, Visit&& visit) const {
+    const Entry* list = of_warps[threadIdx.x / 32];
+    int k = from;
+    if constexpr (kAhead > 1) {
+#pragma unroll 1
+      for (; k + kAhead <= to; k += kAhead) {
+        const Entries entries = *reinterpret_cast<const Entries*>(list + k);
+#pragma unroll
+        for (int i = 0; i < kAhead; ++i) visit(entries.of[i]);
+      }
+    }
+#pragma unroll 1
+    for (; k < to; ++k) visit(list[k]);
+  }
+};
+
 template <class F> __device__ auto tile_terms(const Splat<F, float>& splat, const TileList& list) {
   return F::terms(splat.shape, splat.opacity, {float(list.x0) - splat.mean.x, float(list.y0) - splat.mean.y});
 }

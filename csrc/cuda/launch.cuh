@@ -7,6 +7,7 @@
 
 #include <cuda_runtime.h>
 
+#include <algorithm>
 #include <atomic>
 #include <utility>
 
@@ -53,6 +54,17 @@ inline size_t max_shared_bytes() {
   cudaGetDevice(&device);
   cudaDeviceGetAttribute(&bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, device);
   return size_t(bytes);
+}
+
+/// Bytes of shared memory that each of so many blocks may have that are on a multiprocessor of the current device at
+/// once.
+inline size_t shared_bytes_of_blocks(int blocks) {
+  int device = 0, all = 0, reserved = 0;
+  cudaGetDevice(&device);
+  cudaDeviceGetAttribute(&all, cudaDevAttrMaxSharedMemoryPerMultiprocessor, device);
+  cudaDeviceGetAttribute(&reserved, cudaDevAttrReservedSharedMemoryPerBlock, device);  // by the system, of each block
+  const size_t own = std::max(all / blocks - reserved, 0);
+  return std::min(own, max_shared_bytes());
 }
 
 /// Launches `kernel`. An error is left for cudaGetLastError.

@@ -178,7 +178,7 @@ MovingBlendGrad<double> blend_moving_sample_vjp(const Terms& terms, Vec2<double>
   const double difference = g_color - behind;
   behind = madd(alpha, difference, behind);
   return {transmittance * alpha,
-          P::alpha_and_move_vjp(terms, at, s, raw, alpha, free, transmittance * difference, state.moved, dL_dmoved)};
+          P::alpha_and_move_vjp(terms, at, s, alpha, free, transmittance * difference, state.moved, dL_dmoved)};
 }
 
 // A sample that moves, by its displacement, by its place, and by its place in its cell: three forms of the same, for a
@@ -243,17 +243,19 @@ template <int S> void expect_places_and_displacements_to_agree() {
     const V dL_dlast = {0.3, -0.4};
     double behind_moved = behind, behind_place = behind, transmittance = by_map;
     double behind_in_cell = behind, transmittance_in_cell = by_map;
-    V dL_dmoved = dL_dlast, dL_dplace = dL_dlast, dL_din_cell = {dL_dlast.x / P::kSide, dL_dlast.y / P::kSide};
+    constexpr double kUnit = P::kMoveGradUnit, kCellUnit = kUnit / P::kSide;
+    V dL_dmoved = dL_dlast, dL_dplace = {kUnit * dL_dlast.x, kUnit * dL_dlast.y};
+    V dL_din_cell = {kCellUnit * dL_dlast.x, kCellUnit * dL_dlast.y};
     for (int k = count - 1; k >= 0; --k) {
       const MovingBlendGrad<double> a =
           blend_moving_sample_vjp<P>(terms[k], p, s, raws[k] > 0, colors[k], front_transmittance[k],
                                      SampleState<double, true>{fronts[k]}, behind_moved, dL_dmoved);
       const V z = P::whitened_node(terms[k], P::whitened(terms[k], p, 0), places[k]);
-      const MovingBlendGrad<double> b = blend_placed_sample_vjp<P>(terms[k], z, raws[k], cell, colors[k], places[k],
-                                                                   transmittance, behind_place, dL_dplace);
-      const MovingBlendGrad<double> c =
-          blend_placed_sample_vjp<P>(cells_of(terms[k]), z_in_cell(terms[k], places_in_cell[k]), raws[k], unit_cell,
-                                     colors[k], places_in_cell[k], transmittance_in_cell, behind_in_cell, dL_din_cell);
+      MovingBlendGrad<double> b = no_moving_blend_grad<double>(), c = b;
+      add_placed_sample_vjp<P>(terms[k], z, raws[k], cell, colors[k], places[k], transmittance, behind_place, dL_dplace,
+                               b);
+      add_placed_sample_vjp<P>(cells_of(terms[k]), z_in_cell(terms[k], places_in_cell[k]), raws[k], unit_cell,
+                               colors[k], places_in_cell[k], transmittance_in_cell, behind_in_cell, dL_din_cell, c);
       const auto numbers = [](const MovingBlendGrad<double>& grad, double behind, V dL_dplace, double transmittance) {
         const ShapeGrad<double>& sums = grad.of_splat.sums;
         return std::vector<double>{
@@ -262,9 +264,10 @@ template <int S> void expect_places_and_displacements_to_agree() {
             transmittance};
       };
       const std::vector<double> expected = numbers(a, behind_moved, dL_dmoved, std::abs(front_transmittance[k]));
-      const std::vector<double> actual = numbers(b, behind_place, dL_dplace, transmittance);
+      const std::vector<double> actual =
+          numbers(b, behind_place, {dL_dplace.x / kUnit, dL_dplace.y / kUnit}, transmittance);
       const std::vector<double> of_cell =
-          numbers(c, behind_in_cell, {P::kSide * dL_din_cell.x, P::kSide * dL_din_cell.y}, transmittance_in_cell);
+          numbers(c, behind_in_cell, {dL_din_cell.x / kCellUnit, dL_din_cell.y / kCellUnit}, transmittance_in_cell);
       // Rounding, which 1 / (1 - alpha)^2 enlarges by up to 1e4, and steps of up to 30 splats in a row.
       for (size_t i = 0; i < expected.size(); ++i) {
         ASSERT_NEAR(actual[i], expected[i], 1e-8 * (1 + std::abs(expected[i]))) << k << " " << i;
@@ -272,8 +275,9 @@ template <int S> void expect_places_and_displacements_to_agree() {
       }
     }
     const Mat2<double>& m = map.of_place;
-    const V front = transform(
-        m, dL_dlast, V{madd(map.of_behind.x, behind, map.of_color.x), madd(map.of_behind.y, behind, map.of_color.y)});
+    const V front =
+        transform(m, V{kUnit * dL_dlast.x, kUnit * dL_dlast.y},
+                  V{madd(map.of_behind.x, behind, map.of_color.x), madd(map.of_behind.y, behind, map.of_color.y)});
     ASSERT_NEAR(map.color + by_map * behind, behind_place, 1e-8);
     ASSERT_NEAR(front.x, dL_dplace.x, 1e-8 * (1 + std::abs(dL_dplace.x)));
     ASSERT_NEAR(front.y, dL_dplace.y, 1e-8 * (1 + std::abs(dL_dplace.y)));

@@ -200,7 +200,7 @@ TEST_P(FootprintTest, MovesMatchDifferences) {
     capped += raw > kAlphaMax;
     Vec2<double> dL_dmoved = by_moved;
     const MoveGrad<double> grad =
-        f.in_double.alpha_and_move_vjp(row, p, s, raw, alpha, raw <= kAlphaMax, by_alpha, moved, dL_dmoved);
+        f.in_double.alpha_and_move_vjp(row, p, s, alpha, raw <= kAlphaMax, by_alpha, moved, dL_dmoved);
     const SplatGrad<double> of_splat = f.in_double.prepare_vjp(cov, row, grad.sums, grad.weighted, f.options);
     const Sym2<double> by_cov = cov_grad(cov, of_splat);
     const Vec2<double> still = {0, 0};

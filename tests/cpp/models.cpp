@@ -40,16 +40,16 @@ template <class F, class P, typename T> Model<T> make_model() {
     if constexpr (P::kMoves) return P::move(terms_of<P>(row), d, s, alpha, moved);
     return moved;
   };
-  m.alpha_and_move_vjp = [](const SplatRow<T>& row, Vec2<T> d, int s, T raw, T alpha, bool free, T dL_dalpha,
-                            Vec2<T> moved, Vec2<T>& dL_dmoved) {
+  m.alpha_and_move_vjp = [](const SplatRow<T>& row, Vec2<T> d, int s, T alpha, bool free, T dL_dalpha, Vec2<T> moved,
+                            Vec2<T>& dL_dmoved) {
     const auto terms = terms_of<P>(row);
     if constexpr (P::kMoves) {
-      return P::alpha_and_move_vjp(terms, d, s, raw, alpha, free, dL_dalpha, moved, dL_dmoved);
+      return P::alpha_and_move_vjp(terms, d, s, alpha, free, dL_dalpha, moved, dL_dmoved);
     } else {
       MoveGrad<T> grad = {};
       if (!free) return grad;
-      P::add_alpha_vjp(terms, d, s, raw, dL_dalpha, grad.sums);
-      grad.weighted = raw * dL_dalpha;
+      P::add_alpha_vjp(terms, d, s, alpha, dL_dalpha, grad.sums);
+      grad.weighted = alpha * dL_dalpha;
       return grad;
     }
   };

@@ -25,7 +25,7 @@ template <typename T> struct Model {
   /// do not move.
   T (*alpha)(const SplatRow<T>& row, Vec2<T> d, int s);
   Vec2<T> (*move)(const SplatRow<T>& row, Vec2<T> d, int s, T alpha, Vec2<T> moved);
-  MoveGrad<T> (*alpha_and_move_vjp)(const SplatRow<T>& row, Vec2<T> d, int s, T raw, T alpha, bool free, T dL_dalpha,
+  MoveGrad<T> (*alpha_and_move_vjp)(const SplatRow<T>& row, Vec2<T> d, int s, T alpha, bool free, T dL_dalpha,
                                     Vec2<T> moved, Vec2<T>& dL_dmoved);
   ShapeGrad<T> (*collect)(const SplatRow<T>& row, ShapeGrad<T> sums, T weighted);
   SplatGrad<T> (*prepare_vjp)(Cov2d<T> cov, const SplatRow<T>& row, ShapeGrad<T> sums, T weighted,

@@ -164,9 +164,8 @@ Rendered<double> render_plainly(const Footprint& f, const Scene<double>& scene) 
         double g_color = 0;
         for (int c = 0; c < count; ++c) g_color += gradient[c] * scene.shown(i, c);
         const double difference = g_color - behind;
-        const MoveGrad<double> grad =
-            model.alpha_and_move_vjp(splats[i], d, s, raw, alpha, raw <= kAlphaMax, steps[k].transmittance * difference,
-                                     steps[k].moved, dL_dmoved);
+        const MoveGrad<double> grad = model.alpha_and_move_vjp(
+            splats[i], d, s, alpha, raw <= kAlphaMax, steps[k].transmittance * difference, steps[k].moved, dL_dmoved);
         behind += alpha * difference;
         add(grad.sums, of_pixel[k].shape);
         of_pixel[k].weighted += grad.weighted;

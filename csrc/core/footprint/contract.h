@@ -63,10 +63,10 @@
 //   move(Terms<T>, Vec2<V> p, s, alpha, Vec2<V> moved) -> Vec2<V>
 //                                        the displacement behind a splat. alpha is that which was composited; where it
 //                                        is 0 the splat was not, and nothing moves
-//   alpha_and_move_vjp(Terms<T>, Vec2<V> p, s, raw, alpha, free, dL_dalpha, moved, Vec2<V>& dL_dmoved) -> MoveGrad<V>
-//                                        the adjoint of alpha and move. raw = opacity * I; alpha is what was
-//                                        composited, and `free` says where it depends on raw; `moved` is that in front
-//                                        of the splat; dL_dmoved is read behind the splat and left in front of it
+//   alpha_and_move_vjp(Terms<T>, Vec2<V> p, s, alpha, free, dL_dalpha, moved, Vec2<V>& dL_dmoved) -> MoveGrad<V>
+//                                        the adjoint of alpha and move. alpha is what was composited, and `free` says
+//                                        where that is opacity * I and not the cap; `moved` is that in front of the
+//                                        splat; dL_dmoved is read behind the splat and left in front of it
 //
 // Blending, on both devices, uses the same functions in another form, from whitened coordinates z. A sample has a
 // place, node + displacement, seen from the pixel's centre:
@@ -76,11 +76,15 @@
 //   whitened_node(Terms<T>, Vec2<V> of_pixel, Vec2<V> place) -> Vec2<V>    z of a sample, from that of the pixel's
 //                                        centre, which the CPU works out once for all samples
 //   log_alpha(Terms<T>, Vec2<V> z) -> V  log2(opacity * I)
-//   move_in, alpha_and_move_in_vjp       move and alpha_and_move_vjp, from z, and a place or a displacement with its
-//                                        Bounds or UnitCell; move_in also takes alpha as if the splat was composited
+//   move_in, add_alpha_and_move_in_vjp   move and alpha_and_move_vjp, from z, and a place or a displacement with its
+//                                        Bounds or UnitCell; move_in also takes alpha as if the splat was composited,
+//                                        and the adjoint adds to sums
 //   move_in_with_slope                   move_in of a place that is changed, and its MoveSlope
 //
-// With a UnitCell all lengths are in edges of cells, and places are seen from their cell's corner.
+// With a UnitCell all lengths are in edges of cells, and places are seen from their cell's corner. Gradients with
+// respect to places are carried from splat to splat in the unit that is cheapest for the footprint:
+//
+//   kMoveGradUnit                        so many times what they are
 #pragma once
 
 #include <cstddef>
@@ -177,7 +181,7 @@ template <class V> struct MoveGrad {
 
 /// How a splat that was composited into a sample that moves depends on the sample's place in front of it.
 template <class V> struct MoveSlope {
-  Vec2<V> alpha;             ///< gradient of alpha
+  Vec2<V> alpha;             ///< gradient of alpha, times kMoveGradUnit
   Sym2<V> step;              ///< the place behind changes by (1 + step) times the change of the place in front,
   MaskOf<V> free_x, free_y;  ///< in those coordinates that are not held at a bound
 };

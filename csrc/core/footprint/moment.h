@@ -28,6 +28,7 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
 
   static constexpr bool kMoves = true;
   static constexpr double kMoveReach = 0.5 / kSide;
+  static constexpr double kMoveGradUnit = kBase2 * kBase2;  ///< z has kBase2 as a factor, and so have the sums
 
   AR_HD static double radius_variance(FootprintOptions) { return kPixelVariance; }
   AR_HD static double support_variance(FootprintOptions) { return kVariance; }
@@ -64,11 +65,15 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   }
 
   template <typename T, class V>
-  AR_HD static MoveGrad<V> alpha_and_move_vjp(const Terms<T>& t, Vec2<V> p, int s, V raw, V alpha, MaskOf<V> free,
-                                              V dL_dalpha, Vec2<V> moved, Vec2<V>& dL_dmoved) {
-    const V reach = V(T(kMoveReach));
-    return alpha_and_move_in_vjp(t, Gaussian::whitened(t, p + place<T, V>(s), 0), raw, alpha, free, dL_dalpha, moved,
-                                 Bounds<V>{{-reach, -reach}, {reach, reach}}, dL_dmoved);
+  AR_HD static MoveGrad<V> alpha_and_move_vjp(const Terms<T>& t, Vec2<V> p, int s, V alpha, MaskOf<V> free, V dL_dalpha,
+                                              Vec2<V> moved, Vec2<V>& dL_dmoved) {
+    const V zero = V(T(0)), reach = V(T(kMoveReach)), unit = V(T(kMoveGradUnit));
+    MoveGrad<V> grad = {zero, {{zero, zero}, {zero, zero, zero}}};
+    Vec2<V> in_units = {dL_dmoved.x * unit, dL_dmoved.y * unit};
+    add_alpha_and_move_in_vjp(t, Gaussian::whitened(t, p + place<T, V>(s), 0), alpha, free, alpha * dL_dalpha, moved,
+                              Bounds<V>{{-reach, -reach}, {reach, reach}}, in_units, grad);
+    dL_dmoved = {divide(in_units.x, unit), divide(in_units.y, unit)};
+    return grad;
   }
 
   /// Where the node of sample s may be [px from the pixel's centre]: its cell.
@@ -93,39 +98,40 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     return cell.held(length_of<T, V, Cell>(alpha, composited), transform_transposed(t.w, z), at);
   }
 
-  /// alpha_and_move_vjp() likewise (docs/numerics.md, "Adjoint of moving nodes"): z = w d, y = w dL_dat, both times
-  /// kBase2 as the sums are, and r = alpha / (1 - alpha). A coordinate that move_in() has held at a bound does not
-  /// depend on anything.
+  /// alpha_and_move_vjp() likewise, added to `sums` (docs/numerics.md, "Adjoint of moving nodes", with q for v r y).
+  /// dL_dat is in kMoveGradUnit. `weighted` is alpha dL_dalpha, and zero where the splat was not composited, as alpha
+  /// is. A coordinate that move_in() has held at a bound does not depend on anything.
   template <typename T, class V, class Cell>
-  AR_HD static MoveGrad<V> alpha_and_move_in_vjp(const Terms<T>& t, Vec2<V> z, V raw, V alpha, MaskOf<V> free,
-                                                 V dL_dalpha, Vec2<V> at, const Cell& cell, Vec2<V>& dL_dat) {
-    const V zero = V(T(0)), scale = V(T(step<Cell>())), unit = V(T(1 / (kBase2 * kBase2)));
-    const V r = odds(alpha), slope = V(T(1)) + r;  // 1 / (1 - alpha), whose square is dr / dalpha
-    const Vec2<V> next = moved(scale * r, transform_transposed(t.w, z), at);
+  AR_HD static void add_alpha_and_move_in_vjp(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> free, V weighted,
+                                              Vec2<V> at, const Cell& cell, Vec2<V>& dL_dat, MoveGrad<V>& sums) {
+    const V zero = V(T(0)), unit = V(T(1 / kMoveGradUnit)), r = odds(alpha), length = V(T(step<Cell>())) * r;
+    const Vec2<V> next = moved(length, transform_transposed(t.w, z), at);
     const Vec2<V> behind = {select(cell.free_x(next.x), dL_dat.x, zero), select(cell.free_y(next.y), dL_dat.y, zero)};
-    const Vec2<V> y = transform(t.w, behind);
-    const V by_move = scale * madd(z.x, y.x, z.y * y.y) * slope * slope;
-    const V g = select(free, raw * (dL_dalpha + by_move), zero), vr = V(T(variance<Cell>())) * r;
-    const Vec2<V> q = {vr * y.x, vr * y.y};
+    const Vec2<V> y = transform(t.w, behind), q = {length * y.x, length * y.y};
+    // alpha v z.y / (1 - alpha)^2 = z.q / (1 - alpha), where 1 / (1 - alpha) = 1 + r
+    const V g = select(free, madd(madd(unit, r, unit), madd(z.x, q.x, z.y * q.y), weighted), zero);
     const Vec2<V> offset = {madd(g, z.x, -q.x), madd(g, z.y, -q.y)};
-    const Sym2<V> shape = {z.x * (offset.x - q.x), madd(z.x, offset.y, -q.x * z.y), z.y * (offset.y - q.y)};
-    const Vec2<V> by_place = transform_transposed(t.w, offset);
-    dL_dat = {madd(-unit, by_place.x, behind.x), madd(-unit, by_place.y, behind.y)};
-    return {g, {offset, shape}};
+    sums.weighted = sums.weighted + g;
+    sums.sums.offset = sums.sums.offset + offset;
+    Sym2<V>& shape = sums.sums.shape;
+    shape = {madd(z.x, offset.x - q.x, shape.xx), madd(z.x, offset.y, madd(-q.x, z.y, shape.xy)),
+             madd(z.y, offset.y - q.y, shape.yy)};
+    dL_dat = {madd(-V(t.w.xx), offset.x, madd(-V(t.w.yx), offset.y, behind.x)),
+              madd(-V(t.w.xy), offset.x, madd(-V(t.w.yy), offset.y, behind.y))};
   }
 
   /// Moves `at` as move_in() does. With J the derivative of the place behind with respect to that in front, the dL_dat
-  /// of alpha_and_move_in_vjp() in front is J^T times that behind, and dL_dalpha times the gradient of alpha. `free`:
+  /// of add_alpha_and_move_in_vjp() in front is J^T times that behind, and dL_dalpha times MoveSlope::alpha. `free`:
   /// alpha is not held at its cap.
   template <typename T, class V, class Cell>
   AR_HD static MoveSlope<V> move_in_with_slope(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> free, const Cell& cell,
                                                Vec2<V>& at) {
-    const V zero = V(T(0)), unit = V(T(1 / (kBase2 * kBase2)));
+    const V zero = V(T(0)), unit = V(T(1 / kMoveGradUnit));
     const V length = length_of<T, V, Cell>(alpha, alpha), r = V(T(1 / step<Cell>())) * length;
     const Vec2<V> along = transform_transposed(t.w, z), next = moved(length, along, at);
     at = cell.held(length, along, at);
     // dalpha = -unit alpha along.dat, dr = dalpha / (1 - alpha)^2 = -unit r (1 + r) along.dat
-    const V by_alpha = select(free, -unit * alpha, zero), by_r = select(free, unit * length * (V(T(1)) + r), zero);
+    const V by_alpha = select(free, -alpha, zero), by_r = select(free, unit * length * (V(T(1)) + r), zero);
     const Vec2<V> steeper = {by_r * along.x, by_r * along.y};
     const V xx = madd(V(t.w.xx), V(t.w.xx), V(t.w.yx) * V(t.w.yx));
     const V xy = madd(V(t.w.xx), V(t.w.xy), V(t.w.yx) * V(t.w.yy));
@@ -141,7 +147,7 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   /// Variance of a cell in the unit of length of `Cell`.
   template <class Cell> static constexpr double variance() { return kVariance * Cell::kUnits * Cell::kUnits; }
   /// v / kBase2^2, since (Sigma + v I)^-1 d = w^T z / kBase2^2.
-  template <class Cell> static constexpr double step() { return variance<Cell>() / (kBase2 * kBase2); }
+  template <class Cell> static constexpr double step() { return variance<Cell>() / kMoveGradUnit; }
   /// step() alpha / (1 - alpha), or zero where `composited` is zero and not alpha. The factor is in the divisor, where
   /// it costs nothing on a device. On processors without fused multiply-adds the divisor is rounded twice, so that up
   /// to 1 / (1 - kAlphaMax) = 100 roundings of the length are lost, 6e-6 of it in float.

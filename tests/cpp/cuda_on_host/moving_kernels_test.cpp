@@ -113,7 +113,10 @@ Results run(Scene<F>& scene) {
   vjp.checkpoints = checkpoints.data();
   vjp.pair_grads = out.pair_grads.data();
   vjp.mean_sums = MeanSums::kNorm;
-  static_assert(sizeof(MovingVjpShared<F, kColors, Backward, kSegment>) <= sizeof dynamic_memory);
+  // Some of the places of a chunk in shared memory, the others not.
+  constexpr int kInShared = PlacesInFront<Backward>::kUnit;
+  static_assert(sizeof(MovingVjpShared<F, kColors, Backward, kSegment>) + kInShared * PlacesInFront<Backward>::kBytes <=
+                sizeof dynamic_memory);
   if constexpr (kSegment > 0) {
     const int pieces = int(max_pieces(scene.lists.capacity, kSegment, kGrid));
     std::vector<float> maps(size_t(pieces) * SegmentMap::kNumbers * S * kMovingPixels, NAN);
@@ -122,9 +125,10 @@ Results run(Scene<F>& scene) {
                          [&] { segment_maps_kernel<F, kColors, kSegment>(vjp, 0); });
     cuda_on_host::launch(tiles * S, kMovingPixels, [&] { chain_maps_kernel<F, kSegment>(vjp); });
     cuda_on_host::launch(pieces, Backward::kThreads,
-                         [&] { moving_vjp_kernel<F, kColors, Backward, kSegment>(vjp, 0, false); });
+                         [&] { moving_vjp_kernel<F, kColors, Backward, kSegment>(vjp, 0, false, kInShared); });
   } else {
-    cuda_on_host::launch(tiles, Backward::kThreads, [&] { moving_vjp_kernel<F, kColors, Backward>(vjp, 0, false); });
+    cuda_on_host::launch(tiles, Backward::kThreads,
+                         [&] { moving_vjp_kernel<F, kColors, Backward>(vjp, 0, false, kInShared); });
   }
   return out;
 }
