@@ -271,7 +271,7 @@ __device__ void blend_staged(Stage& stage, int from, int to, int k0, MovingBlend
 #pragma unroll
   for (int i = 0; i < kCells; ++i) shown[i] = -1;
   for (int n = 0; n < listed; n += kBetweenVotes) {
-    if (n > 0 && !__any_sync(kAllLanes, blend.samples.open())) break;
+    if (!__any_sync(kAllLanes, blend.samples.open())) break;
     stage.lists.for_each(n, min(listed, n + kBetweenVotes), [&](uint32_t entry) {
       TileSplatRef<F, C> splat = Stage::Lists::splat_of(stage.splats, entry);
       blend.add(splat, int(entry), shown);
@@ -312,7 +312,7 @@ __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThr
     if (next_id >= 0) prefetch(splats + next_id);  // so that the next batch need not wait for memory
     id = next_id;
     for (int from = 0; from < count; from += kListed) {
-      if (!__any_sync(kAllLanes, blend.samples.open())) break;
+      if (kKeep && !__any_sync(kAllLanes, blend.samples.open())) break;  // no checkpoint is needed
       if (kKeep && k + from > 0 && (k + from) % places.spacing == 0)
         blend.samples.store(params.checkpoints +
                             (places.first + (k + from) / places.spacing - 1) * blend.samples.kCheckpoint);
