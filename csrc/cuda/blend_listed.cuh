@@ -22,7 +22,7 @@ inline constexpr int kListedBatch = 32 * 32;
 /// A sample per lane, in blocks of a warp, since lists are uneven. The more pixels a warp has, the fewer steps it takes
 /// for each of them, and the more of them wait for the longest list: in tiles with long lists, kLong, it has two. With
 /// one sample all lanes of a pixel have it there, and look at as many splats at once (kShared). Elsewhere that takes
-/// longer than to leave lanes without a sample (docs/performance.md).
+/// longer than to leave lanes without a sample (docs/performance-log.md).
 template <class F, bool kLong>
 struct ListedLayout : CellLayout<1, (F::kSamples > 4 || kLong) ? 16 : 4, kMovingTile, 1> {
   using Base = CellLayout<1, (F::kSamples > 4 || kLong) ? 16 : 4, kMovingTile, 1>;
