@@ -68,7 +68,8 @@ AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* color
           bool hit = false;
           for (int group_first = 0; group_first < kSamples; group_first += Places::kGroup) {
             typename Places::Group group;
-            if (!moving.look(terms, z, group_first, pixel, group)) continue;
+            // With one sample, to branch on what has just been found takes longer than to composite in vain.
+            if (!moving.look(terms, z, group_first, pixel, group) && kSamples > 1) continue;
             hit = true;
             AR_UNROLL
             for (int j = 0; j < Places::kGroup; ++j) {
