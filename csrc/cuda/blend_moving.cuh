@@ -166,18 +166,15 @@ template <class F, class Layout> struct CellCorners {
   }
 };
 
-/// How lists of the splats that reach a warp are read: several entries at a time, if a lane has few samples.
-template <class Layout> struct MovingLists {
-  static constexpr int kAhead = Layout::kCells <= 2 ? 4 : 1;
-  /// Of up to kMost splats; `kUnit`: of ReachLists.
-  template <int kUnit, int kMost> using Type = ReachLists<uint32_t, kUnit, kAhead, Layout::kWarps, kMost>;
-};
+/// Entries of a list of the splats that reach a warp that are read at a time: several, if a lane has few samples.
+template <class Layout> inline constexpr int kListAhead = Layout::kCells <= 2 ? 4 : 1;
 
 /// Up to kBatch splats of a tile that a block works on together, and lists of up to kListed of these that reach each
 /// warp's pixels. `kPlaces`: entries of lists are places in memory, else numbers of splats.
 template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kPlaces = false> struct MovingStage {
   static_assert(kBatch % 32 == 0 && kBatch <= Layout::kThreads);
-  using Lists = typename MovingLists<Layout>::template Type<kPlaces ? sizeof(TileSplat<F, C>) : 1, kListed>;
+  using Lists =
+      ReachLists<uint32_t, kPlaces ? sizeof(TileSplat<F, C>) : 1, kListAhead<Layout>, Layout::kWarps, kListed>;
   TileSplat<F, C> splats[kBatch];
   uint32_t reach[kBatch];
   Lists lists;

@@ -44,7 +44,7 @@ template <class Layout> class PlacesInFront {
   /// Bytes of shared memory that a block needs for each splat.
   static constexpr size_t kBytes = Layout::kWarps * sizeof(OfWarp);
   /// The number of splats whose places are in shared memory has to be a multiple of this one.
-  static constexpr int kUnit = MovingLists<Layout>::kAhead;
+  static constexpr int kUnit = kListAhead<Layout>;
   /// More than these few would take more from the cache than they save.
   static constexpr int kMost = 8;
 
@@ -201,8 +201,8 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layou
 
   const int own_sum = sum_of_lane<C>();
   PlacesInFront<Layout> in_front(sizeof(Shared), in_shared);
-  const auto replay = [&](int from, int k0, auto in_front) {  // pair k0 is staged first
-    return replay_chunk<F, Layout>(shared.stage, from, k0, corners, last, samples, in_front);
+  const auto replay = [&](int from, int k0, auto keep_in) {  // pair k0 is staged first
+    return replay_chunk<F, Layout>(shared.stage, from, k0, corners, last, samples, keep_in);
   };
 
   const int stop = min(lasts.block, end);
