@@ -43,12 +43,13 @@ class Image(NamedTuple):
 
 
 # 512x512 pixels are 4096 tiles of 8x8: enough for the kernels of large images. Lists of thousands of splats have chunks
-# behind the front, and several segments; those above kLongList of csrc/cuda/blend_listed.cuh have a layout of their
-# own. Where Gaussians are opaque, pixels close (so little light is left that 3DGS stops) before their lists end.
+# behind the front, and several segments; those of kLongList pairs or more (csrc/cuda/long_lists.cuh) are cut in large
+# images too, and have a layout of their own. Where Gaussians are opaque, pixels close (so little light is left that
+# 3DGS stops) before their lists end.
 # test_every_kernel_has_images_that_need_it in test_benchmarks.py asserts all this.
 IMAGES = {
     "large": Image(512, 512, 600),
-    "large, few tiles": Image(512, 512, 6000, opacity=(0.004, 0.2), sigma=(0.001, 0.02), spread=0.04),
+    "large, few tiles": Image(512, 512, 18000, opacity=(0.004, 0.2), sigma=(0.001, 0.02), spread=0.04),
     "large, opaque": Image(512, 512, 1500, opacity=(0.3, 0.99), sigma=(0.02, 0.1), spread=0.3),
     "small": Image(40, 30, 12000, spread=0.5),
     "small, opaque": Image(40, 30, 1000, opacity=(0.3, 0.99), sigma=(0.1, 0.5)),

@@ -554,7 +554,7 @@ def test_every_kernel(device, monkeypatch, capsys):
 def test_every_kernel_has_images_that_need_it(footprint, options):
     """What its comment says of lists and of pixels that close."""
     program = importlib.import_module("every_kernel")
-    long_list = re.search(r"kLongList = (\d+);", (ROOT / "csrc" / "cuda" / "blend_listed.cuh").read_text())[1]
+    long_list = re.search(r"kLongList = (\d+);", (ROOT / "csrc" / "cuda" / "long_lists.cuh").read_text())[1]
     longest, most_in_8, closed = {}, {}, {}
     for name, image in program.IMAGES.items():
         settings = image.camera().settings(torch.float32, footprint=footprint, **options)._replace(sh_degree=3)
@@ -575,5 +575,5 @@ def test_every_kernel_has_images_that_need_it(footprint, options):
     large = [image for name, image in program.IMAGES.items() if name.startswith("large")]
     assert all((image.width // 8) * (image.height // 8) >= 4096 for image in large)
     assert most_in_8["small"] > int(long_list) and longest["small"] > int(long_list)
-    assert most_in_8["large, few tiles"] > 1000
+    assert most_in_8["large, few tiles"] > int(long_list)
     assert closed["large, opaque"] > 100 and closed["small, opaque"] > 100

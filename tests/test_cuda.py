@@ -293,6 +293,28 @@ def test_moving_samples_in_large_images(samples):
     compare(scene32(), settings_for(("moment", {"samples": samples}), camera))
 
 
+@pytest.mark.parametrize("samples, channels", [(1, 3), (1, 40), (4, 3), (9, 3), (16, 3), (16, 5)])
+def test_long_lists_of_moving_samples_in_large_images(samples, channels):
+    """A few tiles with thousands of splats, whose lists are cut, beside many with few, whose lists are not."""
+    few = {"opacity": (0.004, 0.2), "sigma": (0.001, 0.02), "spread": 0.04}
+    dense, around = scenes.random_scene(1, 20000, degree=2, **few), scenes.random_scene(2, 1000, degree=2, spread=1.5)
+    scene = scenes.cast({name: torch.cat([dense[name], around[name]]) for name in dense}, torch.float32)
+    camera = replace(CAMERA, image_height=520, image_width=528)
+    settings = settings_for(("moment", {"samples": samples}), camera)
+    if channels != 3:
+        del scene["shs"]
+        g = torch.Generator().manual_seed(5)
+        scene["colors_precomp"] = scenes.rand(g, len(scene["means3D"]), channels).float()
+        settings = settings._replace(bg=scenes.rand(g, channels).float())
+    else:
+        stages = ar.render_stages(scenes.settings_to(settings, "cuda"), **scenes.to(without_means2d(scene), "cuda"))
+        lists = stages.tile_offsets.diff()
+        assert lists.max() > 4096, "no list is cut"
+        assert ((lists > 0) & (lists < 4096)).sum() > 100, "all lists are cut"
+    compare(scene, settings, flips=1e-3, layers=500)
+    assert_identical(run(scene, settings, "cuda"), run(scene, settings, "cuda"))
+
+
 @pytest.mark.parametrize("samples", [1, 4])
 def test_looks_at_moving_samples_in_large_images(samples):
     """What `inspect` finds, in tiles of either size that samples that move have."""

@@ -72,12 +72,12 @@ void sort_by_tile(const TileSort<SlotPair>& p, TileGrid grid, void* scratch, cud
   sort_values(p, grid, static_cast<uint32_t*>(scratch), stream);
 }
 
-void plan_chunks(const TileLists& lists, TileGrid grid, int samples, bool whole, CheckpointLayout layout,
+void plan_chunks(const TileLists& lists, TileGrid grid, int samples, const ListCut& cut, CheckpointLayout layout,
                  const ChunkPlan& plan, cudaStream_t stream) {
   const LaunchShape shape = {blocks_of(grid.tiles(), kPlanThreads), kPlanThreads};
   const LaunchShape counters = {PlanState::kCounters, kCountWorkThreads};
-  launch(count_work_kernel, counters, stream, lists, grid.tiles(), samples, whole, plan.state);
-  launch(plan_kernel, shape, stream, lists, grid, samples, whole, layout, plan);
+  launch(count_work_kernel, counters, stream, lists, grid.tiles(), samples, cut, plan.state);
+  launch(plan_kernel, shape, stream, lists, grid, samples, cut, layout, plan);
 }
 
 }  // namespace ar::cuda

@@ -13,34 +13,34 @@ namespace ar::cuda {
 
 namespace {
 
-template <class F, int C, bool kKeep>
-void launch_moving_blend_kernels(const BlendParams& p, int first, cudaStream_t stream) {
-  const auto tiles = unsigned(p.grid.tiles());
-  if (is_small_image(p.grid)) {
-    launch(listed_blend_kernel<F, C, kKeep>, {tiles * kListedBlocks<F>, 32}, stream, p, first);
-    using Layout = EvenLayout<F, false, true>;
-    launch(moving_blend_kernel<F, C, Layout, kKeep>, {tiles, Layout::kThreads}, stream, p, first, true);
-  } else {
-    using Layout = EvenLayout<F, false, false>;
-    launch(moving_blend_kernel<F, C, Layout, kKeep>, {tiles, Layout::kThreads}, stream, p, first, false);
-  }
+/// C channels from `first` on, in tiles of kSide x kSide pixels. The kernel for lists that are not cut begins beside
+/// that for those that are, whose longest may take longest of all.
+template <class F, int C, int kSide, bool kKeep>
+void launch_moving_blend_kernels(const BlendParams& p, const ListCut& cut, int first, cudaStream_t stream) {
+  constexpr int kBlocks = kListedBlocks<F, kSide>;
+  using Layout = EvenLayout<F, false, kSide>;
+  const int lists = is_small_image(p.grid) ? cut.max_lists : std::min(cut.max_lists, kListedWarps / kBlocks);
+  if (lists > 0) launch(listed_blend_kernel<F, C, kSide, kKeep>, {unsigned(lists * kBlocks), 32}, stream, p, first);
+  const LaunchShape tiles = {unsigned(p.grid.tiles() + 1), Layout::kThreads};
+  launch(moving_blend_kernel<F, C, Layout, kKeep>, tiles, stream, p, first, lists > 0);
 }
-template <class F, int C> void launch_moving_blend(const BlendParams& p, int first, cudaStream_t stream) {
+template <class F, int C, int kSide>
+void launch_moving_blend(const BlendParams& p, const ListCut& cut, int first, cudaStream_t stream) {
   if (p.transmittance && first == 0) {
-    launch_moving_blend_kernels<F, C, true>(p, first, stream);
+    launch_moving_blend_kernels<F, C, kSide, true>(p, cut, first, stream);
   } else {
-    launch_moving_blend_kernels<F, C, false>(p, first, stream);
+    launch_moving_blend_kernels<F, C, kSide, false>(p, cut, first, stream);
   }
 }
-template <class F> void blend_moving(const BlendParams& p, cudaStream_t stream) {
-  if (is_small_image(p.grid)) {
-    const auto pieces = unsigned(max_pieces(p.lists.capacity, kFilterPiece, p.grid));
-    launch(filter_kernel<F>, {pieces, kFilterPiece}, stream, p);
-  }
-  if (!p.channels.data) return launch_moving_blend<F, 3>(p, 0, stream);
-  if (p.channels.count <= kFewChannels) return launch_moving_blend<F, 4>(p, 0, stream);
+template <class F, int kSide> void blend_moving(const BlendParams& p, cudaStream_t stream) {
+  const ListCut cut = moving_list_cut(F::kSamples, p.lists.capacity, p.grid);
+  const int64_t pieces = int64_t(cut.max_segments) * moving_segment(F::kSamples) / kFilterPiece;
+  const auto blocks = unsigned(is_small_image(p.grid) ? pieces : std::min<int64_t>(pieces, kFilterBlocks));
+  if (blocks > 0) launch(filter_kernel<F, kSide>, {blocks, kFilterPiece}, stream, p);
+  if (!p.channels.data) return launch_moving_blend<F, 3, kSide>(p, cut, 0, stream);
+  if (p.channels.count <= kFewChannels) return launch_moving_blend<F, 4, kSide>(p, cut, 0, stream);
   for (int first = 0; first < p.channels.count; first += kMovingChannels)
-    launch_moving_blend<F, kMovingChannels>(p, first, stream);
+    launch_moving_blend<F, kMovingChannels, kSide>(p, cut, first, stream);
 }
 
 bool always_whole_lists(int footprint) {
@@ -67,15 +67,17 @@ int64_t max_state_planes(int footprint, int64_t capacity) {
   return capacity / kStateChunk * planes;
 }
 
-int64_t max_reach_words(int footprint, int64_t capacity, TileGrid grid) {
-  int64_t words = 0;
+ListCut whole_list_cut(int footprint, int64_t capacity, TileGrid grid) {
+  ListCut cut = {true};
   visit_footprint(footprint, Footprints{}, [&](auto f) {
     using F = decltype(f);
-    if constexpr (F::kMoves) {
-      if (is_small_image(grid)) words = filter_words(capacity, grid);
-    }
+    if (F::kMoves) cut = moving_list_cut(F::kSamples, capacity, grid);
   });
-  return words;
+  return cut;
+}
+
+int64_t max_reach_words(const ListCut& cut, TileGrid grid) {
+  return int64_t(cut.max_segments) * (cut.segment / 32) * grid.side() * grid.side();
 }
 
 int list_segments(int footprint, int64_t channels, TileGrid grid) {
@@ -90,7 +92,7 @@ void blend(int footprint, const BlendParams& p, const BlendParams* cut, cudaStre
   visit_tile_footprints<AdaptiveBoxes>(footprint, stream, [&](auto f, cudaStream_t side) {
     using F = decltype(f);
     if constexpr (F::kMoves) {
-      blend_moving<F>(p, side);
+      with_moving_side<F>(p.grid, [&](auto px) { blend_moving<F, decltype(px)::value>(p, side); });
     } else {
       if constexpr (!F::kYardstick) {
         if (!p.channels.data) return blend_few<F, 3>(p, side);

@@ -1,20 +1,20 @@
-// Kernels of blend for footprints whose samples move, in small images: a list for each pixel.
+// Kernels of blend for footprints whose samples move, for lists that are cut (long_lists.cuh): a list for each pixel.
 //
 // In a small image of a large scene a tile of 8x8 pixels may have hundreds of thousands of splats, most of them smaller
 // than a pixel. What takes the time is the longest sequence of splats that some sample meets one after the other. So
-// the list of every tile is first filtered, all parts of it side by side, into a bit for each splat and pixel: whether
-// it reaches it. Then each warp walks the splats of a few neighbouring pixels, and waits for no other. It takes those
+// the list of a tile is first filtered, all parts of it side by side, into a bit for each splat and pixel: whether it
+// reaches it. Then each warp walks the splats of a few neighbouring pixels, and waits for no other. It takes those
 // that reach any of them 32 at a time. Each lane goes through those of its own pixel alone, so that in one step the
 // pixels of a warp composite different splats.
 #pragma once
 
 #include "cuda/blend_moving.cuh"
 #include "cuda/launch.cuh"
-#include "cuda/tile_pieces.cuh"
+#include "cuda/long_lists.cuh"
 
 namespace ar::cuda {
 
-/// Pairs of a tile's list that a block of filter_kernel looks at.
+/// Pairs of a tile's list that a block of filter_kernel looks at at a time.
 inline constexpr int kFilterPiece = 256, kFilterWords = kFilterPiece / 32;
 /// Pairs whose bits a warp takes at once: a word for each lane.
 inline constexpr int kListedBatch = 32 * 32;
@@ -23,9 +23,9 @@ inline constexpr int kListedBatch = 32 * 32;
 /// for each of them, and the more of them wait for the longest list: in tiles with long lists, kLong, it has two. With
 /// one sample all lanes of a pixel have it there, and look at as many splats at once (kShared). Elsewhere that takes
 /// longer than to leave lanes without a sample (docs/performance-log.md).
-template <class F, bool kLong>
-struct ListedLayout : CellLayout<1, (F::kSamples > 4 || kLong) ? 16 : 4, kMovingTile, 1> {
-  using Base = CellLayout<1, (F::kSamples > 4 || kLong) ? 16 : 4, kMovingTile, 1>;
+template <class F, int kSide, bool kLong>
+struct ListedLayout : CellLayout<1, (F::kSamples > 4 || kLong) ? 16 : 4, kSide, 1> {
+  using Base = CellLayout<1, (F::kSamples > 4 || kLong) ? 16 : 4, kSide, 1>;
   static constexpr bool kShared = F::kSamples == 1 && kLong;
   __device__ static int first_sample() { return kShared ? 0 : Base::first_sample(); }
   /// This lane's place among those of its sample.
@@ -36,24 +36,19 @@ struct ListedLayout : CellLayout<1, (F::kSamples > 4 || kLong) ? 16 : 4, kMoving
     return ((1u << Base::kLanes) - 1) << (lane_id() / Base::kLanes * Base::kLanes);
   }
 };
-/// Pairs above which a tile's list is long, so that its walk may be what the others end before.
-inline constexpr int kLongList = 4096;
-
-/// Words of 32 bits that filter_kernel needs.
-inline int64_t filter_words(int64_t capacity, TileGrid grid) {
-  return max_pieces(capacity, kFilterPiece, grid) * kFilterWords * kMovingPixels;
+/// Where the bits of a pixel of a tile of kPixels pixels are: that of pair k is bit k % 32 of word k / 32. `first`: of
+/// the segments of the tile's list.
+template <class F, int kPixels> __device__ int64_t pixel_words(int first, const TileList& list, int pixel_number) {
+  constexpr int kSegment = moving_segment(F::kSamples);
+  const int segments = (list.count + kSegment - 1) / kSegment;
+  return (int64_t(first) * kPixels + pixel_number * segments) * (kSegment / 32);
 }
 
-/// Where the bits of a pixel of a tile are: that of pair k is bit k % 32 of word k / 32.
-__device__ inline int64_t pixel_words(const TileLists& lists, const TileList& list, int tile, int pixel_number) {
-  const int pieces = (list.count + kFilterPiece - 1) / kFilterPiece;
-  return (first_piece(lists, kFilterPiece, tile) * kMovingPixels + pixel_number * pieces) * kFilterWords;
-}
-
-/// Bit x: the span holds x0 + x, of a row of a tile that begins at x0. The differences are exact wherever they decide.
-__device__ inline uint32_t row_bits(const Span<float>& span, float x0) {
-  const int first = int(std::ceil(min(max(span.lo - x0, 0.0f), float(kMovingTile))));
-  const int behind = int(std::floor(min(max(span.hi - x0, -1.0f), float(kMovingTile - 1)))) + 1;
+/// Bit x: the span holds x0 + x, of a row of a tile of kSide pixels that begins at x0. The differences are exact
+/// wherever they decide.
+template <int kSide> __device__ uint32_t row_bits(const Span<float>& span, float x0) {
+  const int first = int(std::ceil(min(max(span.lo - x0, 0.0f), float(kSide))));
+  const int behind = int(std::floor(min(max(span.hi - x0, -1.0f), float(kSide - 1)))) + 1;
   return ((1u << behind) - 1) & ~((1u << first) - 1);
 }
 
@@ -70,33 +65,38 @@ __device__ inline uint32_t transpose_bits(uint32_t bits) {
   return bits;
 }
 
-/// A thread per pair: which pixels its splat reaches.
-template <class F> __global__ void __launch_bounds__(kFilterPiece) filter_kernel(const BlendParams params) {
+/// A thread per pair of a list that is cut: which pixels its splat reaches.
+template <class F, int kSide> __global__ void __launch_bounds__(kFilterPiece) filter_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
-  constexpr int kRowsOfWord = 32 / kMovingTile;
-  __shared__ uint32_t words[kMovingPixels][kFilterWords];
-  const TilePiece piece = find_piece(params.lists, params.grid, kFilterPiece, blockIdx.x);
-  if (piece.tile < 0) return;
-  const TileList list = list_of(params.lists, params.grid, piece.tile);
-  const int k = piece.index * kFilterPiece + int(threadIdx.x);
-  uint32_t reach[kMovingPixels / 32] = {};  // a bit per pixel
-  if (k < list.count) {
-    const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
-    const Support<float> support = support_of(splats[list.splat(k)]);
+  let_next_kernel_begin();
+  constexpr int kRowsOfWord = 32 / kSide, kPixels = kSide * kSide;
+  constexpr int kPieces = moving_segment(F::kSamples) / kFilterPiece;  // of a segment
+  __shared__ uint32_t words[kPixels][kFilterWords];
+  const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
+  const PlanState& plan = *params.plan.state;
+  for (int number = blockIdx.x; number < plan.counts.segments * kPieces; number += gridDim.x) {
+    const ListSegment segment(plan, params.plan.chunk_order, number / kPieces);
+    const TileList list = list_of(params.lists, params.grid, segment.tile);
+    const int piece = segment.index * kPieces + number % kPieces, k = piece * kFilterPiece + int(threadIdx.x);
+    uint32_t reach[kPixels / 32] = {};  // a bit per pixel
+    if (k < list.count) {
+      const Support<float> support = support_of(splats[list.splat(k)]);
 #pragma unroll
-    for (int row = 0; row < kMovingTile; ++row) {
-      const float y = float(list.y0 + row);
-      reach[row / kRowsOfWord] |= row_bits(columns_of(support, y, y), float(list.x0))
-                                  << row % kRowsOfWord * kMovingTile;
+      for (int row = 0; row < kSide; ++row) {
+        const float y = float(list.y0 + row);
+        reach[row / kRowsOfWord] |= row_bits<kSide>(columns_of(support, y, y), float(list.x0))
+                                    << row % kRowsOfWord * kSide;
+      }
     }
-  }
+    __syncthreads();  // all have read the words of the last piece
 #pragma unroll
-  for (int w = 0; w < kMovingPixels / 32; ++w) words[32 * w + lane_id()][threadIdx.x / 32] = transpose_bits(reach[w]);
-  __syncthreads();
-  for (int i = threadIdx.x; i < kMovingPixels * kFilterWords; i += kFilterPiece) {
-    const int pixel = i / kFilterWords, word = i % kFilterWords;
-    const int64_t first = pixel_words(params.lists, list, piece.tile, pixel);
-    params.reach_words[first + piece.index * kFilterWords + word] = words[pixel][word];
+    for (int w = 0; w < kPixels / 32; ++w) words[32 * w + lane_id()][threadIdx.x / 32] = transpose_bits(reach[w]);
+    __syncthreads();
+    for (int i = threadIdx.x; i < kPixels * kFilterWords; i += kFilterPiece) {
+      const int pixel = i / kFilterWords, word = i % kFilterWords;
+      params.reach_words[pixel_words<F, kPixels>(segment.first(), list, pixel) + piece * kFilterWords + word] =
+          words[pixel][word];
+    }
   }
 }
 
@@ -210,10 +210,10 @@ __device__ void blend_ahead(const Stage& stage, int k0, int from, int n, Blend& 
   }
 }
 
-/// Blends the pixels of a warp, as Layout shares them out; C channels from `first` on.
-template <class F, int C, class Layout, bool kKeep>
-__device__ void blend_listed(const BlendParams& params, int first, int tile, const TileList& list,
-                             ListedStage<F, C, ListedLayout<F, false>::kPixels>& stage) {
+/// Blends the pixels of a warp, as Layout shares them out; C channels from `first` on. `first_segment`: of the list.
+template <class F, int C, class Layout, bool kKeep, class Stage>
+__device__ void blend_listed(const BlendParams& params, int first, int tile, const TileList& list, int first_segment,
+                             Stage& stage) {
   constexpr int kPixels = Layout::kPixels;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int lane = lane_id();
@@ -226,7 +226,8 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
     const int mine = k + 32 * lane;
 #pragma unroll
     for (int i = 0; i < kPixels; ++i) {
-      const uint32_t* from = params.reach_words + pixel_words(params.lists, list, tile, Layout::pixel_number(i));
+      const uint32_t* from =
+          params.reach_words + pixel_words<F, Layout::kTilePixels>(first_segment, list, Layout::pixel_number(i));
       words[i] = mine < list.count ? from[mine / 32] : 0u;
     }
   };
@@ -290,28 +291,35 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
   blend.write(params, first, pixel);
 }
 
+/// In large images, blocks of filter_kernel and warps of listed_blend_kernel: as many as leave most of a large device
+/// to the kernel that is to begin beside them, which only does when all of them have begun.
+inline constexpr int kFilterBlocks = 264, kListedWarps = 1056;
 /// Blocks of listed_blend_kernel for each tile.
-template <class F> inline constexpr int kListedBlocks = ListedLayout<F, true>::kBlocks;
+template <class F, int kSide> inline constexpr int kListedBlocks = ListedLayout<F, kSide, true>::kBlocks;
 
-/// A warp per few pixels of a tile; where its list is short, only the first blocks of a tile have any.
-template <class F, int C, bool kKeep, int kLongAbove = kLongList>
+/// A warp per few pixels of a tile whose list is cut; where it is not kLongFrom pairs long, only the first blocks of a
+/// tile have any. There may be blocks for fewer tiles than are blended.
+template <class F, int C, int kSide, bool kKeep, int kLongFrom = kLongList>
 __global__ void __launch_bounds__(32) listed_blend_kernel(const BlendParams params, int first) {
+  let_next_kernel_begin();
   wait_for_earlier_kernels();
-  using Short = ListedLayout<F, false>;
-  using Long = ListedLayout<F, true>;
+  using Short = ListedLayout<F, kSide, false>;
+  using Long = ListedLayout<F, kSide, true>;
   static_assert(Short::kThreads == 32 && Long::kThreads == 32 && Long::kBlocks % Short::kBlocks == 0);
   __shared__ ListedStage<F, C, Short::kPixels> stage;
-  const int tile = params.plan.tile_order[blockIdx.x / Long::kBlocks];
-  const TileList list = list_of(params.lists, params.grid, tile);
-  if (list.overflow) return;
-  if constexpr (Short::kLanes != Long::kLanes) {
-    if (list.count <= kLongAbove) {
-      if (int(blockIdx.x) % Long::kBlocks < Short::kBlocks)
-        blend_listed<F, C, Short, kKeep>(params, first, tile, list, stage);
-      return;
+  const int lists = params.plan.state->counts.long_lists;
+  for (int place = int(blockIdx.x) / Long::kBlocks; place < lists; place += int(gridDim.x) / Long::kBlocks) {
+    const LongList cut = params.plan.long_lists[place];
+    const TileList list = list_of(params.lists, params.grid, cut.tile);
+    if constexpr (Short::kLanes != Long::kLanes) {
+      if (list.count < kLongFrom) {
+        if (int(blockIdx.x) % Long::kBlocks < Short::kBlocks)
+          blend_listed<F, C, Short, kKeep>(params, first, cut.tile, list, cut.first, stage);
+        continue;
+      }
     }
+    blend_listed<F, C, Long, kKeep>(params, first, cut.tile, list, cut.first, stage);
   }
-  blend_listed<F, C, Long, kKeep>(params, first, tile, list, stage);
 }
 
 }  // namespace ar::cuda

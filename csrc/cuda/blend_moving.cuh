@@ -3,8 +3,8 @@
 // What a splat does to a sample depends on where the sample is when they meet, so that the chunks of a list cannot be
 // blended side by side as in blend.cuh: a block walks its whole list. What fills the device instead is that samples are
 // spread over lanes and that tiles are small where there are several. It also wastes less: the fewer pixels a warp has,
-// the fewer splats pass through it that touch only some of them. Small images take the kernel of blend_listed.cuh in
-// its place.
+// the fewer splats pass through it that touch only some of them. Lists that are cut (long_lists.cuh), in small images
+// all, have the kernels of blend_listed.cuh in its place.
 #pragma once
 
 #include "cuda/composite.cuh"
@@ -12,8 +12,6 @@
 
 namespace ar::cuda {
 
-/// Pixels of all tiles but those of EvenLayout for one sample in large images.
-inline constexpr int kMovingPixels = kMovingTile * kMovingTile;
 /// Of more channels than lie in the rows of pairs, those that are blended at once.
 inline constexpr int kMovingChannels = 8;
 
@@ -280,12 +278,13 @@ __device__ void blend_staged(Stage& stage, int from, int to, int k0, MovingBlend
   __syncwarp();  // all have read the list
 }
 
-/// A block per tile; C channels from `first` on, of three in so few registers that an SM holds 1024 threads.
-/// `overflow_only`: another kernel blends the tiles, unless there were too many pairs.
+/// A block per tile, which has nothing to do if the tile's list is cut, and one more; C channels from `first` on, of
+/// three in so few registers that an SM holds 1024 threads. `beside`: the kernels for lists that are cut, which it
+/// needs nothing of.
 template <class F, int C, class Layout, bool kKeep>
 __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThreads : 1)
-    moving_blend_kernel(const BlendParams params, int first, bool overflow_only) {
-  wait_for_earlier_kernels();
+    moving_blend_kernel(const BlendParams params, int first, bool beside) {
+  if (begin_beside_earlier_kernels(beside)) return;
   constexpr int kBatch = Layout::kThreads < 256 ? Layout::kThreads : 256;
   constexpr int kListed = kKeep ? kStateChunk : kBatch;
   // Where a lane has many samples whose last splats have to be kept, lists would take too many registers.
@@ -294,8 +293,10 @@ __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThr
   __shared__ Stage stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int tile = params.plan.tile_order[blockIdx.x];
+  const bool is_cut = int(blockIdx.x) < params.plan.state->counts.long_lists;
   const TileList list = list_of(params.lists, params.grid, tile);
-  if (overflow_only && !list.overflow) return;
+  // With too many pairs no list is cut. The compiler needs fewer registers if both are asked here.
+  if (is_cut && !list.overflow) return;
   const StatePlaces places(params.lists, list, params.grid, tile);
   const Vec2<float> p = Layout::pixel();
   const Pixel pixel(list, params.grid, p);
@@ -327,14 +328,21 @@ __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThr
   blend.write(params, first, pixel);
 }
 
-/// Samples shared out so that there is least to do, forwards and backwards, in tiles of the size of moving_grid().
-/// Small images are blended by blend_listed.cuh and differentiated in segments (blend_moving_maps.cuh): their few tiles
-/// have long lists, and the time is that of the longest.
-template <class F, bool kBackward, bool kSmall>
+/// Samples shared out so that there is least to do, forwards and backwards, in tiles of the size of moving_grid(), for
+/// lists that are not cut. In small images these are those with too many pairs.
+template <class F, bool kBackward, int kSide>
 using EvenLayout =
-    std::conditional_t<F::kSamples == 1, CellLayout<1, 1, 1 << moving_tile_bits(1, kSmall)>,
+    std::conditional_t<F::kSamples == 1, CellLayout<1, 1, kSide>,
                        std::conditional_t<F::kSamples == 4, CellLayout<2, 2>,
                                           std::conditional_t<F::kSamples == 9 && !kBackward, CellLayout<5, 2>,
                                                              CellLayout<(F::kSamples + 3) / 4, 4>>>>;
+
+/// Calls `visit` with the side of the tiles of moving_grid() as a constant.
+template <class F, class Visit> void with_moving_side(TileGrid grid, Visit&& visit) {
+  if constexpr (F::kSamples == 1) {
+    if (grid.side() == kTile) return visit(std::integral_constant<int, kTile>());
+  }
+  visit(std::integral_constant<int, kMovingTile>());
+}
 
 }  // namespace ar::cuda

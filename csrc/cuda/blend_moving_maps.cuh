@@ -1,6 +1,6 @@
-// Segments of the lists of small images, and what goes through them backwards, for footprints whose samples move.
+// Segments of lists (long_lists.cuh), and what goes through them backwards, for footprints whose samples move.
 //
-// In small images a block has a segment of a tile's list, so that long lists are differentiated side by side. What the
+// A block has a segment of a tile's list, so that long lists are differentiated side by side. What the
 // samples carry from splat to splat on the way back goes through a segment as an affine map. So one kernel finds the
 // map of every segment, from front to back, and another chains them from the last segment to the first. Then that of
 // blend_moving_vjp.cuh has the sums, each segment from what it gets from behind.
@@ -10,7 +10,7 @@
 
 #include "cuda/blend_moving_grads.cuh"
 #include "cuda/launch.cuh"
-#include "cuda/tile_pieces.cuh"
+#include "cuda/long_lists.cuh"
 
 namespace ar::cuda {
 
@@ -40,8 +40,8 @@ struct SegmentMap {
 
 /// Where the maps of a pixel's sample are. In place of `of_zero` of a segment is, in the end, what its front gives to
 /// the segment before.
-template <class F> struct MapMemory {
-  static constexpr int kPlane = F::kSamples * kMovingPixels;
+template <class F, int kTilePixels> struct MapMemory {
+  static constexpr int kPlane = F::kSamples * kTilePixels;
   float* first;  ///< of the sample
 
   __device__ MapMemory(float* maps, int sample, int pixel_number) : first(maps + pixel_number * F::kSamples + sample) {}
@@ -67,24 +67,23 @@ template <class F> struct MapMemory {
   }
 };
 
-/// Pairs of a segment. Longer ones need fewer maps, which count where there are many samples; shorter ones fill a
-/// device with smaller scenes.
-template <class F> inline constexpr int kMovingSegment = F::kSamples <= 4 ? 512 : 1024;
 /// Samples shared out for segments, of which there are many, with small splats: few pixels per warp, and blocks small
 /// enough for two on an SM. A single sample has a lane, so that none is idle.
-template <class F>
-using SegmentLayout = CellLayout<F::kSamples <= 4 ? 1 : 2, F::kSamples == 1   ? 1
-                                                           : F::kSamples == 4 ? 4
-                                                                              : 8>;
+template <class F, int kSide>
+using SegmentLayout = CellLayout<F::kSamples <= 4 ? 1 : 2,
+                                 F::kSamples == 1   ? 1
+                                 : F::kSamples == 4 ? 4
+                                                    : 8,
+                                 kSide>;
 
 /// Samples shared out for the maps of segments, which no lanes add up: with many cells a sample to a lane, so that a
 /// warp has few pixels and passes over more splats. A block has 16 warps at most.
-template <class F>
-using MapLayout = std::conditional_t<(F::kSamples > 4), CellLayout<1, 16, kMovingTile, 16>, SegmentLayout<F>>;
+template <class F, int kSide>
+using MapLayout = std::conditional_t<(F::kSamples > 4), CellLayout<1, 16, kSide, 16>, SegmentLayout<F, kSide>>;
 
 /// A block per segment of kSegment pairs and part of a tile: the maps of its samples, but of the first segments of
 /// tiles, which nobody needs.
-template <class F, int C, int kSegment, class Layout = MapLayout<F>>
+template <class F, int C, int kSide, int kSegment, class Layout = MapLayout<F, kSide>>
 __global__ void __launch_bounds__(Layout::kThreads, 1024 / Layout::kThreads)
     segment_maps_kernel(const BlendVjpParams params, int first) {
   wait_for_earlier_kernels();
@@ -92,11 +91,10 @@ __global__ void __launch_bounds__(Layout::kThreads, 1024 / Layout::kThreads)
   constexpr int kCells = Layout::kCells, kBatch = std::min(Layout::kThreads, 256);
   __shared__ MovingStage<F, C, Layout, kBatch> stage;
   __shared__ int last_of_warps[Layout::kWarps];
-  const int64_t number = int(blockIdx.x) / Layout::kBlocks;  // of the piece
-  const TilePiece piece = find_piece(params.lists, params.grid, kSegment, number);
-  if (piece.tile < 0 || piece.index == 0) return;
-  const TileList list = list_of(params.lists, params.grid, piece.tile);
-  const StatePlaces places(params.lists, list, params.grid, piece.tile);
+  const ListSegment segment(*params.plan, params.chunk_order, int(blockIdx.x) / Layout::kBlocks);
+  if (segment.tile < 0 || segment.index == 0) return;
+  const TileList list = list_of(params.lists, params.grid, segment.tile);
+  const StatePlaces places(params.lists, list, params.grid, segment.tile);
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const Vec2<float> p = Layout::pixel();
   const Pixel pixel(list, params.grid, p);
@@ -104,7 +102,7 @@ __global__ void __launch_bounds__(Layout::kThreads, 1024 / Layout::kThreads)
   const CellCorners<F, Layout> corners(p);
   Samples samples(pixel.inside);
   const LastSplats<F, Layout> last(params.last, pixel, last_of_warps);
-  const int begin = piece.index * kSegment, end = begin + kSegment, stop = min(last.block, end);
+  const int begin = segment.index * kSegment, end = begin + kSegment, stop = min(last.block, end);
   samples.load(params.checkpoints + (places.first + begin / kStateChunk - 1) * Samples::kCheckpoint, begin,
                last.samples);
   AdjointMap<float> maps[kCells];
@@ -157,25 +155,29 @@ __global__ void __launch_bounds__(Layout::kThreads, 1024 / Layout::kThreads)
                       {m.of_place.xy, m.of_place.yy}};
     // Behind the segment with a sample's last splat is the background.
     if (last.samples[i] <= end) map.of_zero = map({grad.through, {0, 0}});
-    MapMemory<F>(params.adjoint_maps, Layout::first_sample() + i, Layout::pixel_number()).put(number, map);
+    const MapMemory<F, Layout::kTilePixels> memory(params.adjoint_maps, Layout::first_sample() + i,
+                                                   Layout::pixel_number());
+    memory.put(segment.number, map);
   }
 }
 
-/// A thread per sample of a tile: from the maps of its segments to what each gets from behind.
-template <class F, int kSegment>
-__global__ void __launch_bounds__(kMovingPixels) chain_maps_kernel(const BlendVjpParams params) {
+/// A thread per sample of a tile whose list is cut: from the maps of its segments to what each gets from behind.
+template <class F, int kSide, int kSegment>
+__global__ void __launch_bounds__(kSide* kSide) chain_maps_kernel(const BlendVjpParams params) {
   wait_for_earlier_kernels();
-  constexpr int S = F::kSamples;
-  const int tile = int(blockIdx.x) / S, t = int(blockIdx.x) % S * kMovingPixels + int(threadIdx.x);
+  constexpr int S = F::kSamples, kPixels = kSide * kSide;
+  const int place = int(blockIdx.x) / S, t = int(blockIdx.x) % S * kPixels + int(threadIdx.x);
   const int number = t / S, sample = t % S;
-  const TileList list = list_of(params.lists, params.grid, tile);
-  const Pixel pixel(list, params.grid, {float(number % kMovingTile), float(number / kMovingTile)});
-  if (list.overflow || !pixel.inside) return;
+  if (place >= params.plan->counts.long_lists) return;
+  const LongList cut = params.long_lists[place];
+  const TileList list = list_of(params.lists, params.grid, cut.tile);
+  const Pixel pixel(list, params.grid, {float(number % kSide), float(number / kSide)});
+  if (!pixel.inside) return;
   // The map of the segment with the last splat of the sample already is what its front gives.
   int segment = (params.last[sample * pixel.image + pixel.index] - 1) / kSegment;
   if (segment <= 1) return;
-  const int64_t first = first_piece(params.lists, kSegment, tile);
-  const MapMemory<F> memory(params.adjoint_maps, sample, number);
+  const int64_t first = cut.first;
+  const MapMemory<F, kPixels> memory(params.adjoint_maps, sample, number);
   Adjoint adjoint = memory.adjoint(first + segment);
   constexpr int kAhead = 8;  // segments whose maps are read at once, since each of them waits for memory
   for (; segment > 1; segment -= kAhead) {

@@ -1,5 +1,5 @@
 // Kernel of blend_vjp for footprints whose samples move: a block per tile, a lane per few cells of a pixel, back to
-// front. In small images it has a block per segment of a tile's list, from what blend_moving_maps.cuh has found.
+// front. Lists that are cut have a block per segment, from what blend_moving_maps.cuh has found.
 //
 // The state of a sample in front of a splat cannot be had from the state behind it, since the displacement depends on
 // itself through alpha. So a warp composites each chunk of 32 splats once more, from the checkpoint that blend has left
@@ -17,7 +17,7 @@
 #include "cuda/blend_moving_maps.cuh"
 #include "cuda/blend_moving_sums.cuh"
 #include "cuda/launch.cuh"
-#include "cuda/tile_pieces.cuh"
+#include "cuda/long_lists.cuh"
 
 namespace ar::cuda {
 
@@ -145,12 +145,11 @@ __device__ MovingBlendGrad<float> walk_back(TileSplatRef<F, C>& splat, int k0, i
   return sums;
 }
 
-/// A block per tile, or with kSegment > 0 per segment of so many pairs of a tile's list, from what the segment gets
-/// from behind. `overflow_only`: other kernels do the work, unless there were too many pairs. `in_shared`: of
-/// PlacesInFront, whose memory is that behind Shared.
+/// A block per tile whose list is not cut; or with kSegment > 0 per segment, of so many pairs, of those that are, from
+/// what the segment gets from behind. `in_shared`: of PlacesInFront, whose memory is that behind Shared.
 template <class F, int C, class Layout, int kSegment = 0>
 __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layout, kSegment>)
-    moving_vjp_kernel(const BlendVjpParams params, int first, bool overflow_only, int in_shared) {
+    moving_vjp_kernel(const BlendVjpParams params, int first, int in_shared) {
   wait_for_earlier_kernels();
   using Shared = MovingVjpShared<F, C, Layout, kSegment>;
   using Samples = MovingSamples<F, Layout, (kSegment > 0)>;
@@ -158,17 +157,16 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layou
   constexpr bool kMany = C > kFewChannels;  // `first` may be above 0, and there may be more channels than C
   static_assert(kSegment % kBatch == 0 && Layout::kBlocks == 1);
   Shared& shared = *reinterpret_cast<Shared*>(dynamic_shared());
-  TilePiece piece = {0, 0};
+  int tile = 0, segment_index = 0;
   if constexpr (kSegment > 0) {
-    piece = find_piece(params.lists, params.grid, kSegment, blockIdx.x);
+    const ListSegment segment(*params.plan, params.chunk_order, int(blockIdx.x));
+    tile = segment.tile, segment_index = segment.index;
   } else {
-    piece.tile = listed_tile<S>(params, int(blockIdx.x));
+    tile = listed_tile<S>(params, params.plan->counts.segments + int(blockIdx.x));
   }
-  const int tile = piece.tile;
   if (tile < 0) return;
   const TileList list = list_of(params.lists, params.grid, tile);
-  if (overflow_only && !list.overflow) return;
-  const int begin = piece.index * kSegment, end = kSegment > 0 ? begin + kSegment : kWholeList;
+  const int begin = segment_index * kSegment, end = kSegment > 0 ? begin + kSegment : kWholeList;
   const StatePlaces places(params.lists, list, params.grid, tile);
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int lane = lane_id(), warp = threadIdx.x / 32, channel_count = params.channels.count;
@@ -194,7 +192,8 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layou
   for (int i = 0; i < kCells; ++i) {
     adjoint[i] = {grad.through, {0, 0}};
     if (kSegment > 0 && last[i] > end) {
-      const MapMemory<F> maps(params.adjoint_maps, Layout::first_sample() + i, Layout::pixel_number());
+      const MapMemory<F, Layout::kTilePixels> maps(params.adjoint_maps, Layout::first_sample() + i,
+                                                   Layout::pixel_number());
       adjoint[i] = maps.adjoint(int64_t(blockIdx.x) + 1);
     }
   }
@@ -278,15 +277,14 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layou
 /// Launches moving_vjp_kernel with as much of PlacesInFront in shared memory as leaves room for kMovingVjpBlocks on an
 /// SM.
 template <class F, int C, class Layout, int kSegment>
-void launch_moving_vjp_kernel(const BlendVjpParams& p, unsigned blocks, int first, bool overflow_only,
-                              cudaStream_t stream) {
+void launch_moving_vjp_kernel(const BlendVjpParams& p, unsigned blocks, int first, cudaStream_t stream) {
   using InFront = PlacesInFront<Layout>;
   constexpr size_t kShared = sizeof(MovingVjpShared<F, C, Layout, kSegment>);
   const size_t room = shared_bytes_of_blocks(kMovingVjpBlocks<F, C, Layout, kSegment>);
   const size_t splats = room > kShared ? (room - kShared) / InFront::kBytes : 0;
   const int in_shared = int(std::min<size_t>(splats, InFront::kMost)) / InFront::kUnit * InFront::kUnit;
   const LaunchShape shape = {blocks, Layout::kThreads, kShared + in_shared * InFront::kBytes};
-  launch(moving_vjp_kernel<F, C, Layout, kSegment>, shape, stream, p, first, overflow_only, in_shared);
+  launch(moving_vjp_kernel<F, C, Layout, kSegment>, shape, stream, p, first, in_shared);
 }
 
 }  // namespace ar::cuda

@@ -23,47 +23,36 @@ __global__ void clear_sums_kernel(const BlendVjpParams params, int first, int wi
   if (params.channel_sums) clear(params.channel_sums, width);
 }
 
-/// Lists in segments, side by side.
-template <class F, int C> void launch_segments_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
-  using Layout = SegmentLayout<F>;
-  constexpr int kSegment = kMovingSegment<F>;
-  const auto pieces = unsigned(max_pieces(p.lists.capacity, kSegment, p.grid));
-  using Maps = MapLayout<F>;
-  launch(segment_maps_kernel<F, C, kSegment>, {pieces * Maps::kBlocks, Maps::kThreads}, stream, p, first);
-  const auto blocks = unsigned(p.grid.tiles() * F::kSamples);
-  launch(chain_maps_kernel<F, kSegment>, {blocks, kMovingPixels}, stream, p);
-  launch_moving_vjp_kernel<F, C, Layout, kSegment>(p, pieces, first, false, stream);
+/// Lists that are cut: their segments side by side.
+template <class F, int C, int kSide>
+void launch_segments_vjp(const BlendVjpParams& p, const ListCut& cut, int first, cudaStream_t stream) {
+  using Maps = MapLayout<F, kSide>;
+  constexpr int kSegment = moving_segment(F::kSamples);
+  const auto segments = unsigned(cut.max_segments), lists = unsigned(cut.max_lists);
+  const LaunchShape maps = {segments * Maps::kBlocks, Maps::kThreads};
+  launch(segment_maps_kernel<F, C, kSide, kSegment>, maps, stream, p, first);
+  launch(chain_maps_kernel<F, kSide, kSegment>, {lists * F::kSamples, kSide * kSide}, stream, p);
+  launch_moving_vjp_kernel<F, C, SegmentLayout<F, kSide>, kSegment>(p, segments, first, stream);
 }
-template <class F, int C, bool kSmall> void launch_tiles_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
-  using Layout = EvenLayout<F, true, kSmall>;
-  launch_moving_vjp_kernel<F, C, Layout, 0>(p, unsigned(p.grid.tiles()), first, kSmall, stream);
+template <class F, int C, int kSide>
+void launch_moving_vjp(const BlendVjpParams& p, const ListCut& cut, int first, cudaStream_t stream) {
+  if (cut.max_segments > 0) launch_segments_vjp<F, C, kSide>(p, cut, first, stream);
+  launch_moving_vjp_kernel<F, C, EvenLayout<F, true, kSide>, 0>(p, unsigned(p.grid.tiles()), first, stream);
 }
-template <class F, int C> void launch_moving_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
-  if (is_small_image(p.grid)) {
-    launch_segments_vjp<F, C>(p, first, stream);
-    launch_tiles_vjp<F, C, true>(p, first, stream);
-  } else {
-    launch_tiles_vjp<F, C, false>(p, first, stream);
-  }
-}
-/// The group that begins with channel `first_of_group`; 0 where they are few.
-template <class F> void blend_vjp_moving(const BlendVjpParams& p, int first_of_group, cudaStream_t stream) {
-  if (!p.channels.data) return launch_moving_vjp<F, 3>(p, 0, stream);
-  if (p.channels.count <= kFewChannels) return launch_moving_vjp<F, 4>(p, 0, stream);
+/// The group that begins with channel `first_of_group`; 0 where they are few. In tiles of kSide x kSide pixels.
+template <class F, int kSide> void blend_vjp_moving(const BlendVjpParams& p, int first_of_group, cudaStream_t stream) {
+  const ListCut cut = moving_list_cut(F::kSamples, p.lists.capacity, p.grid);
+  if (!p.channels.data) return launch_moving_vjp<F, 3, kSide>(p, cut, 0, stream);
+  if (p.channels.count <= kFewChannels) return launch_moving_vjp<F, 4, kSide>(p, cut, 0, stream);
   const int end = std::min(first_of_group + kChannelGroup, p.channels.count);
   for (int first = first_of_group; first < end; first += kMovingChannels)
-    launch_moving_vjp<F, kMovingChannels>(p, first, stream);
+    launch_moving_vjp<F, kMovingChannels, kSide>(p, cut, first, stream);
 }
 
 }  // namespace
 
-int64_t max_adjoint_maps(int footprint, int64_t capacity, TileGrid grid) {
-  int64_t maps = 0;
-  visit_footprint(footprint, Footprints{}, [&](auto f) {
-    using F = decltype(f);
-    if (F::kMoves && is_small_image(grid)) maps = max_pieces(capacity, kMovingSegment<F>, grid) * F::kSamples;
-  });
-  return maps * SegmentMap::kNumbers * kMovingPixels;
+int64_t max_adjoint_maps(int samples, const ListCut& cut, TileGrid grid) {
+  return int64_t(cut.max_segments) * SegmentMap::kNumbers * samples * grid.side() * grid.side();
 }
 
 int channel_group(int footprint, int left) {
@@ -78,7 +67,7 @@ void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t s
   visit_tile_footprints<AdaptiveBoxesVjp>(footprint, stream, [&](auto f, cudaStream_t side) {
     using F = decltype(f);
     if constexpr (F::kMoves) {
-      blend_vjp_moving<F>(p, first, side);
+      with_moving_side<F>(p.grid, [&](auto px) { blend_vjp_moving<F, decltype(px)::value>(p, first, side); });
     } else {
       if constexpr (!F::kYardstick) {
         if (!p.channels.data) return blend_vjp_few<F, 3>(p, side);

@@ -20,6 +20,23 @@ __device__ inline void wait_for_earlier_kernels() {
 #endif
 }
 
+/// Lets the next kernel on the stream begin beside this one, as soon as all blocks of this one have come here or ended.
+/// It still waits at wait_for_earlier_kernels().
+__device__ inline void let_next_kernel_begin() {
+#if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
+  asm volatile("griddepcontrol.launch_dependents;" ::: "memory");
+#endif
+}
+
+/// In the place of wait_for_earlier_kernels(): with `beside` this kernel runs while the one before it does, and those
+/// that have let that one begin. It must not need their results. As the next kernel waits for this one alone, its last
+/// block has nothing to do but to end after the kernel before: returns whether this is that block.
+__device__ inline bool begin_beside_earlier_kernels(bool beside) {
+  const bool is_last = blockIdx.x == gridDim.x - 1;
+  if (!beside || is_last) wait_for_earlier_kernels();
+  return is_last;
+}
+
 /// Whether kernels may be put on the current device before those ahead of them have ended. The device has to be able
 /// to, its driver also while a graph is captured, and the code has to wait: what is compiled at load time from code for
 /// older devices does not. All kernels are compiled for the same devices, so that `kernel` stands for all.

@@ -32,21 +32,25 @@ __device__ inline int take_place(int32_t* next, int of, bool wanted) {
 struct PlannedTile {
   int samples, n;  ///< pairs
   int length;      ///< of a chunk
+  bool is_long;    ///< as ListCut means it
 
-  __device__ PlannedTile(const TileLists& lists, int64_t tile, int most_samples, bool whole) {
+  __device__ PlannedTile(const TileLists& lists, int64_t tile, int most_samples, const ListCut& cut) {
     const bool overflow = lists.counts->pairs > lists.capacity;
     n = overflow ? 1 : int(lists.tile_offsets[tile + 1] - lists.tile_offsets[tile]);
     samples = lists.tile_samples ? lists.tile_samples[tile] : most_samples;
-    length = whole ? kWholeList : chunk_length(samples);
+    is_long = cut.max_segments > 0 && !overflow && n >= cut.long_from(lists.counts->pairs);
+    length = is_long ? cut.segment : cut.whole ? kWholeList : chunk_length(samples);
   }
-  __device__ int full() const { return n / length; }
-  __device__ int rest() const { return n % length; }
-  __device__ int chunks() const { return full() + (rest() > 0); }
+  /// The last segment of a long list is one of them, however long it is.
+  __device__ int full() const { return (is_long ? n + length - 1 : n) / length; }
+  __device__ int rest() const { return is_long ? 0 : n % length; }
+  /// The class of the full chunks. Segments have that of their list, whose order they keep.
+  __device__ int full_class() const { return work_class(samples, is_long ? n : length); }
 };
 
 /// Counts the work of each class, in as many parts as there are blocks, and begins the counts of the plan.
 __global__ void __launch_bounds__(kCountWorkThreads)
-    count_work_kernel(const TileLists lists, int64_t tiles, int most_samples, bool whole, PlanState* state) {
+    count_work_kernel(const TileLists lists, int64_t tiles, int most_samples, ListCut cut, PlanState* state) {
   wait_for_earlier_kernels();
   static_assert(kWorkClasses < kCountWorkThreads);
   __shared__ WorkSizes sizes;
@@ -55,7 +59,7 @@ __global__ void __launch_bounds__(kCountWorkThreads)
   __syncthreads();
   const int64_t stride = int64_t(gridDim.x) * kCountWorkThreads;
   for (int64_t first = blockIdx.x * kCountWorkThreads + threadIdx.x; first < tiles; first += kTilesAtOnce * stride) {
-    const auto planned = [&](int64_t tile) { return PlannedTile(lists, min(tile, tiles - 1), most_samples, whole); };
+    const auto planned = [&](int64_t tile) { return PlannedTile(lists, min(tile, tiles - 1), most_samples, cut); };
     const PlannedTile at_once[kTilesAtOnce] = {planned(first), planned(first + stride)};
 #pragma unroll
     for (int k = 0; k < kTilesAtOnce; ++k) {
@@ -63,7 +67,7 @@ __global__ void __launch_bounds__(kCountWorkThreads)
       const PlannedTile& tile = at_once[k];
       const int full = tile.full(), rest = tile.rest();
       atomicAdd(&sizes.tiles[work_class(tile.samples, tile.n)], 1);
-      if (full > 0) atomicAdd(&sizes.chunks[work_class(tile.samples, tile.length)], full);
+      if (full > 0) atomicAdd(&sizes.chunks[tile.full_class()], full);
       if (rest > 0) atomicAdd(&sizes.chunks[work_class(tile.samples, rest)], 1);
     }
   }
@@ -79,16 +83,44 @@ __global__ void __launch_bounds__(kCountWorkThreads)
   if (c == 0) counts.planes = counts.tail = 0;
 }
 
-/// Where the work of each class begins, from what was counted; `of(sizes)` are the sizes meant. One block also writes
-/// where the work of each number of samples begins. Of all threads of a block; afterwards they must wait.
-template <class Of> __device__ void find_begins(PlanState& state, WorkSizes& begins, SampleParts& parts, Of&& of) {
+/// What was counted of the class whose number is that of this thread; `of(sizes)`: the sizes meant.
+template <class Of> __device__ int size_of_class(const PlanState& state, Of&& of) {
   static_assert(kWorkClasses < kPlanThreads);
   const int c = threadIdx.x;
-  int size = 0, all;
+  int size = 0;
 #pragma unroll
   for (int k = 0; k < PlanState::kCounters; ++k) size += c < kWorkClasses ? of(state.counted[k])[c] : 0;
+  return size;
+}
+
+/// The lists that are cut: of the classes of long lists the first ones, as many as there is room for.
+struct CutLists {
+  int lists = 0, segments = 0;
+  int chunks_of_class;  ///< of this thread's class: what was counted, or a chunk for each list where they are not cut
+
+  /// `lists_of_class`, `counted`: of this thread's class. All threads of a block must call it.
+  __device__ CutLists(const ListCut& cut, const TileLists& tile_lists, int lists_of_class, int counted)
+      : chunks_of_class(counted) {
+    const int64_t pairs = tile_lists.counts->pairs;
+    if (cut.max_segments == 0 || pairs > tile_lists.capacity) return;
+    constexpr int kWarps = kPlanThreads / 32;
+    const bool are_long = int(threadIdx.x) % kLengthClasses <= __clz(cut.long_from(pairs));
+    int all;
+    const int up_to = counted + sum_before<kWarps>(are_long ? counted : 0, 0, all);
+    const bool are_cut = are_long && up_to <= cut.max_segments;
+    if (are_long && !are_cut) chunks_of_class = lists_of_class;
+    sum_before<kWarps>(are_cut ? lists_of_class : 0, 0, lists);
+    sum_before<kWarps>(are_cut ? counted : 0, 0, segments);
+  }
+};
+
+/// Where the work of each class begins, from the size of this thread's. One block also writes where the work of each
+/// number of samples begins. Of all threads of a block; afterwards they must wait.
+__device__ inline void find_begins(int size, int32_t (&begins)[kWorkClasses], SampleParts& parts) {
+  const int c = threadIdx.x;
+  int all;
   const int first = sum_before<kPlanThreads / 32>(size, 0, all);
-  if (c < kWorkClasses) of(begins)[c] = first;
+  if (c < kWorkClasses) begins[c] = first;
   if (blockIdx.x == 0 && c <= kWorkClasses && c % kLengthClasses == 0) parts.first[c / kLengthClasses] = first;
 }
 
@@ -112,8 +144,9 @@ __device__ inline void write_run(TileChunk* list, const ChunkRun& run, const Til
 }
 
 /// Places come from atomics: which tile gets which differs from run to run, and changes no result.
-__global__ void __launch_bounds__(kPlanThreads) plan_kernel(const TileLists lists, TileGrid grid, int most_samples,
-                                                            bool whole, CheckpointLayout layout, const ChunkPlan plan) {
+__global__ void __launch_bounds__(kPlanThreads)
+    plan_kernel(const TileLists lists, TileGrid grid, int most_samples, ListCut cut, CheckpointLayout layout,
+                const ChunkPlan plan) {
   wait_for_earlier_kernels();
   __shared__ WorkSizes begins;
   WorkSizes& placed = plan.state->placed;
@@ -121,28 +154,38 @@ __global__ void __launch_bounds__(kPlanThreads) plan_kernel(const TileLists list
   const int64_t i = int64_t(blockIdx.x) * kPlanThreads + threadIdx.x;
   const bool valid = i < grid.tiles();
   const auto tile = int32_t(valid ? i : 0);
-  const PlannedTile planned(lists, tile, most_samples, whole);
+  const PlannedTile planned(lists, tile, most_samples, cut);
   const int samples = planned.samples, full = valid ? planned.full() : 0, rest = valid ? planned.rest() : 0;
-  const int chunks = full + (rest > 0), front = front_chunks(grid, samples), tail = max(chunks - front, 0);
-  const int planes = valid && !whole ? layout.tile_planes(grid, samples, chunks) : 0;
+  const int chunks = full + (rest > 0), front = front_chunks(grid, samples);
+  const int tail = cut.whole ? 0 : max(chunks - front, 0);
+  const int planes = valid && !cut.whole ? layout.tile_planes(grid, samples, chunks) : 0;
   // All atomics first: they wait together.
-  const int full_class = work_class(samples, planned.length), rest_class = work_class(samples, rest);
+  const int full_class = planned.full_class(), rest_class = work_class(samples, rest);
   const int tile_class = work_class(samples, planned.n);
   const int plane = planes > 0 ? atomicAdd(&counts.planes, planes) : 0;
   const int full_place = full > 0 ? atomicAdd(&placed.chunks[full_class], full) : 0;
   const int tail_place = tail > 0 ? atomicAdd(&counts.tail, tail) : 0;
   const int tile_place = take_place(placed.tiles, tile_class, valid);
   const int rest_place = take_place(placed.chunks, rest_class, rest > 0);
-  find_begins(*plan.state, begins, counts.tiles, [](auto& sizes) { return sizes.tiles; });
-  find_begins(*plan.state, begins, counts.chunks, [](auto& sizes) { return sizes.chunks; });
+  const int tiles_of_class = size_of_class(*plan.state, [](auto& sizes) { return sizes.tiles; });
+  const int chunks_of_class = size_of_class(*plan.state, [](auto& sizes) { return sizes.chunks; });
+  const CutLists cut_lists(cut, lists, tiles_of_class, chunks_of_class);
+  find_begins(tiles_of_class, begins.tiles, counts.tiles);
+  find_begins(cut_lists.chunks_of_class, begins.chunks, counts.chunks);
   __syncthreads();
   const int of_chunk = layout.planes(samples);
   const TileChunk first = {tile, 0, plane - layout.first_chunk(grid, samples) * of_chunk};
+  const int place = begins.tiles[tile_class] + tile_place;
+  const bool is_cut = planned.is_long && begins.tiles[tile_class] < cut_lists.lists;
+  const ChunkRun as_one = {begins.chunks[tile_class] + tile_place, 0, min(full, 1)};
+  const ChunkRun run = planned.is_long && !is_cut ? as_one : ChunkRun{begins.chunks[full_class] + full_place, 0, full};
   if (valid) {
-    plan.tile_order[begins.tiles[tile_class] + tile_place] = tile;
+    plan.tile_order[place] = tile;
     plan.tile_planes[tile] = plane;
+    if (is_cut) plan.long_lists[place] = {tile, run.place, full};
   }
-  write_run(plan.chunk_order, {begins.chunks[full_class] + full_place, 0, full}, first, of_chunk);
+  if (i == 0) counts.long_lists = cut_lists.lists, counts.segments = cut_lists.segments;
+  write_run(plan.chunk_order, run, first, of_chunk);
   if (rest > 0) plan.chunk_order[begins.chunks[rest_class] + rest_place] = {tile, full, first.plane + full * of_chunk};
   write_run(plan.tail, {tail_place, front, front + tail}, first, of_chunk);
 }

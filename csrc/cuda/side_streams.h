@@ -17,19 +17,25 @@ template <int kCount> class SideStreams {
     for (cudaStream_t side : own_.streams) cudaStreamWaitEvent(side, own_.fork, 0);
   }
   SideStreams(const SideStreams&) = delete;
-  ~SideStreams() {
-    for (int k = 0; k < kCount; ++k) {
-      cudaEventRecord(own_.joins[k], own_.streams[k]);
-      cudaStreamWaitEvent(caller_, own_.joins[k], 0);
-    }
-  }
+  ~SideStreams() { wait_for_all(); }
+  /// What the caller's stream is given from now on waits until all of the others have come so far. A kernel that one of
+  /// them is given next is then placed on the device first, not behind all blocks of one on the caller's.
+  void begin_first() const { wait_for_all(); }
   /// The caller's for k = 0, then the others in turn.
   cudaStream_t stream(int k) const { return k == 0 ? caller_ : own_.streams[(k - 1) % kCount]; }
 
  private:
+  /// What follows on the caller's stream waits for what the others have been given so far.
+  void wait_for_all() const {
+    for (int k = 0; k < kCount; ++k) {
+      cudaEventRecord(own_.events[k], own_.streams[k]);
+      cudaStreamWaitEvent(caller_, own_.events[k], 0);
+    }
+  }
+
   struct Own {
     cudaStream_t streams[kCount];
-    cudaEvent_t fork, joins[kCount];
+    cudaEvent_t fork, events[kCount];
 
     Own() {
       // Allowed while a graph is captured too: nothing here is part of it.
@@ -38,7 +44,7 @@ template <int kCount> class SideStreams {
       cudaEventCreateWithFlags(&fork, cudaEventDisableTiming);
       for (int k = 0; k < kCount; ++k) {
         cudaStreamCreateWithFlags(&streams[k], cudaStreamNonBlocking);
-        cudaEventCreateWithFlags(&joins[k], cudaEventDisableTiming);
+        cudaEventCreateWithFlags(&events[k], cudaEventDisableTiming);
       }
       cudaThreadExchangeStreamCaptureMode(&mode);
     }
@@ -47,7 +53,7 @@ template <int kCount> class SideStreams {
       cudaEventDestroy(fork);
       for (int k = 0; k < kCount; ++k) {
         cudaStreamDestroy(streams[k]);
-        cudaEventDestroy(joins[k]);
+        cudaEventDestroy(events[k]);
       }
     }
   };

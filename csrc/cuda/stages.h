@@ -74,8 +74,22 @@ struct alignas(8) SlotPair {
 inline constexpr int kStateChunk = 32;
 AR_HD constexpr int state_planes(int samples) { return 3 * samples; }
 
-/// No fewer pieces of up to `length` pairs than `pairs` pairs in the lists of a grid's tiles make.
-inline int64_t max_pieces(int64_t pairs, int length, TileGrid grid) { return pairs / length + grid.tiles(); }
+/// How plan_chunks cuts the lists of tiles into chunks.
+struct ListCut {
+  bool whole;  ///< a chunk is a whole list, unless that is long; else it has chunk_length pairs, and no list is long
+  /// Long lists have `at_least` pairs, a power of two, and also 1/`shares` of the pairs of all lists. With 0 all are
+  /// long. They are cut into chunks of `segment` pairs, called segments, that are worked on side by side.
+  int at_least = 0, shares = 1, segment = 0;
+  /// Segments and lists for which there is room. With less than all would need only the longest are cut, with 0 none.
+  int max_segments = 0, max_lists = 0;
+
+  /// The number of pairs from which on a list is long, where there are `pairs` in all: a power of two, or 0.
+  AR_HD int long_from(int64_t pairs) const {
+    int64_t from = at_least;
+    while (from > 0 && from < pairs / shares) from *= 2;
+    return int(from);
+  }
+};
 
 /// 1, 2 and 3, 4 to 7, 8 to 15, or 16 samples.
 inline constexpr int kSampleClasses = 5;
@@ -100,6 +114,8 @@ struct SampleParts {
 struct PlanCounts {
   int32_t planes, tail;       ///< planes of checkpoints; chunks behind the front ones
   SampleParts tiles, chunks;  ///< of the plan's orders
+  /// Lists that are cut, which are the first of ChunkPlan::tile_order, and their segments, the first of chunk_order.
+  int32_t long_lists, segments;
   /// Tiles that the front chunks left with an open sample and pairs, by sample_class: those of different samples are
   /// blended side by side.
   int32_t open_tiles[kSampleClasses];
@@ -193,6 +209,13 @@ struct TileChunk {
   int32_t plane;  ///< first plane of its checkpoints, if the tile has any
 };
 
+/// A list that is cut into segments.
+struct LongList {
+  int32_t tile;
+  int32_t first, segments;  ///< the place of the first of its segments, which follow each other, and how many there are
+};
+static_assert(sizeof(LongList) == sizeof(TileChunk), "they are rows of one array");
+
 /// How the state of a tile's pixels between chunks lies in memory: planes of kTile^2 floats. For a backward pass a
 /// chunk's planes hold, for each sample and pixel, its channels and its transmittance. Without one they are the
 /// transmittance of each sample and a single set of channels, and only the last front chunk and those behind have any.
@@ -228,7 +251,8 @@ struct ChunkPlan {
   TileChunk* chunk_order;  ///< [chunks] by samples, longest first
   int32_t* tile_order;     ///< [tiles] by samples, longest first
   int32_t* tile_planes;    ///< [tiles] first plane of a tile's checkpoints, if it has any
-  TileChunk* tail;         ///< [counts.tail] chunks behind the front ones, or null where lists are not cut
+  TileChunk* tail;         ///< [counts.tail] chunks behind the front ones, or null where chunks are whole lists
+  LongList* long_lists;    ///< [counts.long_lists] in the order of their tiles in tile_order, or null
 };
 
 /// The parts of a tile's list that are blended side by side where many channels meet few tiles.
@@ -261,7 +285,7 @@ struct BlendParams : ar::BlendParams<float> {
   int32_t* open_tiles;  ///< [kSampleClasses, tiles]
   CheckpointLayout layout;
   float* checkpoints;     ///< [planes, pixels of a tile]
-  uint32_t* reach_words;  ///< [max_reach_words]
+  uint32_t* reach_words;  ///< [max_reach_words], or null where no list may be cut
   Segments segments;      ///< for more than kFewChannels channels
 };
 
@@ -273,6 +297,7 @@ struct InspectParams : ar::InspectParams<float> {
 struct BlendVjpParams : ar::BlendVjpParams<float> {
   TileLists lists;
   const TileChunk* chunk_order;
+  const LongList* long_lists;
   const PlanState* plan;
   int64_t max_chunks;
   int32_t* chunks_taken;  ///< [kSampleClasses] set to zero by blend_vjp; chunks of a class that warps have begun with
@@ -355,10 +380,11 @@ bool blends_whole_lists(int footprint, int64_t channels);
 /// Planes of a float per pixel of a tile in BlendParams::checkpoints of a footprint whose samples move, for a backward
 /// pass. None for the others.
 int64_t max_state_planes(int footprint, int64_t capacity);
-/// Numbers in BlendParams::reach_words and BlendVjpParams::adjoint_maps, which only footprints whose samples move need,
-/// and only in small images.
-int64_t max_reach_words(int footprint, int64_t capacity, TileGrid grid);
-int64_t max_adjoint_maps(int footprint, int64_t capacity, TileGrid grid);
+/// How lists are cut where blends_whole_lists().
+ListCut whole_list_cut(int footprint, int64_t capacity, TileGrid grid);
+/// Numbers in BlendParams::reach_words and BlendVjpParams::adjoint_maps, which only lists need that are cut.
+int64_t max_reach_words(const ListCut& cut, TileGrid grid);
+int64_t max_adjoint_maps(int samples, const ListCut& cut, TileGrid grid);
 /// Segments of each tile's list that many channels are blended in.
 int list_segments(int footprint, int64_t channels, TileGrid grid);
 /// Channels that a group-less blending is compiled for: 3 in the splats themselves, or 4 in rows.
@@ -438,8 +464,8 @@ int tile_sort_result(TileGrid grid);
 void sort_by_tile(const TileSort<int32_t>& p, TileGrid grid, void* scratch, cudaStream_t stream);
 void sort_by_tile(const TileSort<SlotPair>& p, TileGrid grid, void* scratch, cudaStream_t stream);
 
-/// `whole`: a chunk per tile, whatever its length, and no checkpoints.
-void plan_chunks(const TileLists& lists, TileGrid grid, int samples, bool whole, CheckpointLayout layout,
+/// `layout`: of checkpoints, which are planned unless cut.whole.
+void plan_chunks(const TileLists& lists, TileGrid grid, int samples, const ListCut& cut, CheckpointLayout layout,
                  const ChunkPlan& plan, cudaStream_t stream);
 
 }  // namespace ar::cuda

@@ -169,9 +169,10 @@ class CudaBackend final : public Backend {
     p.lists = tile_lists_of(lists);
 
     p.layout = {cuda::compiled_channels(!channels.rows.defined()), pass.keep};
-    const Tensor plan = make_plan(p, pass, cuda::blends_whole_lists(footprint.choice.index, channels.count), state);
+    const cuda::ListCut cut = cut_of(lists, pass, channels);
+    const Tensor plan = make_plan(p, pass, cut, state);
     Tensor reach;
-    const int64_t reach_words = cuda::max_reach_words(footprint.choice.index, p.lists.capacity, grid);
+    const int64_t reach_words = cuda::max_reach_words(cut, grid);
     if (reach_words > 0) reach = at::empty({reach_words}, ints_);
     p.reach_words = structs_of<uint32_t>(reach);
     p.segments.count = cuda::list_segments(footprint.choice.index, channels.count, grid);
@@ -187,17 +188,17 @@ class CudaBackend final : public Backend {
     p.transmittance = pointer<float>(first_state.transmittance);
     p.last = pointer<int32_t>(first_state.last);
     const Tensor first_image = at::empty({3, grid.height, grid.width}, floats_);
-    cuda::BlendParams cut = p;
-    cut.channels = {nullptr, 0, nullptr, 3};
-    cut.image = {pointer<float>(first_image), 3, {}};
-    cut.layout = {3, true};
-    const Tensor first_plan = make_plan(cut, first_pass, false, first_state);
+    cuda::BlendParams in_chunks = p;
+    in_chunks.channels = {nullptr, 0, nullptr, 3};
+    in_chunks.image = {pointer<float>(first_image), 3, {}};
+    in_chunks.layout = {3, true};
+    const Tensor first_plan = make_plan(in_chunks, first_pass, {false}, first_state);
     const Tensor sums = segment_planes(p.segments, grid, cuda::kChannelGroup);
     state.checkpoints = segment_planes(p.segments, grid, footprint.samples);
     p.segments.samples = footprint.samples;
     p.segments.sums = pointer<float>(sums);
     p.segments.transmittance = pointer<float>(state.checkpoints);
-    cuda::blend(footprint.choice.index, p, &cut, stream_);
+    cuda::blend(footprint.choice.index, p, &in_chunks, stream_);
     check_stage("blend", pass.debug);
   }
 
@@ -216,8 +217,9 @@ class CudaBackend final : public Backend {
     p.grads = grads_of<float>(in, grads);
     p.ranges = const_structs_of<cuda::PairRange>(lists.splat_offsets);
     if (p.gaussians.n == 0) return;
-    // Launched before blend_vjp, whose blocks would else all have to be placed first.
-    cuda::zero_culled_grads(p, fork());
+    // Before blend_vjp, whose blocks stay where they are placed until there is no work left for them.
+    side_.emplace(stream_).begin_first();
+    cuda::zero_culled_grads(p, side_->stream(1));
     if (pass.debug) join();
     check_stage("zero_culled_grads", pass.debug);
   }
@@ -225,7 +227,8 @@ class CudaBackend final : public Backend {
   PairSums blend_vjp(const ListTensors& lists, const BlendState& state, const Pass& pass,
                      const ChannelTensors& channels, const ImageTensors& dL_dimage, MeanSums mean_sums) override {
     check_counts(lists);
-    check_plan(state);
+    const cuda::ListCut cut = cut_of(lists, pass, channels);
+    check_plan(state, cut);
     const int64_t n = lists.ids.numel(), rows = std::max(lists.pairs.size(0), n);
     const int count = int(channels.count);
     PairSums out;
@@ -240,7 +243,8 @@ class CudaBackend final : public Backend {
     p.lists = tile_lists_of(lists);
     p.plan = const_structs_of<cuda::PlanState>(state.chunks);
     p.chunk_order = const_structs_of<cuda::TileChunk>(state.chunks) + kPlanRows;
-    p.max_chunks = state.chunks.size(0) - kPlanRows;
+    p.max_chunks = state.chunks.size(0) - kPlanRows - cut.max_lists;
+    p.long_lists = reinterpret_cast<const cuda::LongList*>(p.chunk_order + p.max_chunks);
     const Tensor chunks_taken = at::empty({cuda::kSampleClasses}, ints_);
     p.chunks_taken = pointer<int32_t>(chunks_taken);
     p.checkpoints = const_pointer<float>(state.checkpoints);
@@ -256,7 +260,7 @@ class CudaBackend final : public Backend {
     p.pair_grads = pointer<float>(out.pairs);
     p.mean_sums = mean_sums;
     Tensor maps;
-    const int64_t numbers = cuda::max_adjoint_maps(pass.footprint.choice.index, p.lists.capacity, pass.grid);
+    const int64_t numbers = cuda::max_adjoint_maps(pass.footprint.samples, cut, pass.grid);
     if (numbers > 0) maps = at::empty({numbers}, floats_);
     p.adjoint_maps = pointer<float>(maps);
 
@@ -340,9 +344,7 @@ class CudaBackend final : public Backend {
   double lap() override { return laps_.next(stream_); }
 
  private:
-  /// A stream for what may run beside the caller's until join(). An exception in between joins too, with this backend's
-  /// end.
-  cudaStream_t fork() { return side_.emplace(stream_).stream(1); }
+  /// Ends what runs beside the caller's stream. An exception before it does so too, with this backend's end.
   void join() { side_.reset(); }
 
   /// Raises what a launch left behind; with `wait` waits for the stage to end first.
@@ -357,23 +359,32 @@ class CudaBackend final : public Backend {
     return at::empty({grid.tiles() * segments.count * planes * kTile * kTile}, floats_);
   }
 
-  /// Plans the blending of lists in chunks, or each as a `whole`: sets the members of `p` and `state` that belong to
-  /// it. Returns memory that its kernels need while they run.
-  Tensor make_plan(cuda::BlendParams& p, const Pass& pass, bool whole, BlendState& state) const {
+  /// How lists are cut for `blend` and `blend_vjp`.
+  static cuda::ListCut cut_of(const ListTensors& lists, const Pass& pass, const ChannelTensors& channels) {
+    const int footprint = pass.footprint.choice.index;
+    if (!cuda::blends_whole_lists(footprint, channels.count)) return {false};
+    return cuda::whole_list_cut(footprint, tile_lists_of(lists).capacity, pass.grid);
+  }
+  /// Plans the blending of lists that are cut so: sets the members of `p` and `state` that belong to it. Returns memory
+  /// that its kernels need while they run.
+  Tensor make_plan(cuda::BlendParams& p, const Pass& pass, const cuda::ListCut& cut, BlendState& state) const {
     const FootprintSpec& footprint = pass.footprint;
     const int64_t tiles = pass.grid.tiles(), capacity = p.lists.capacity;
-    const int64_t chunks = whole ? 0 : capacity / cuda::chunk_length(footprint.chosen ? 1 : footprint.samples);
-    const int64_t max_planes = !whole ? p.layout.max_planes(pass.grid, footprint.samples, capacity, footprint.chosen)
+    const int64_t chunks =
+        cut.whole ? cut.max_segments : capacity / cuda::chunk_length(footprint.chosen ? 1 : footprint.samples);
+    const int64_t max_planes = !cut.whole
+                                   ? p.layout.max_planes(pass.grid, footprint.samples, capacity, footprint.chosen)
                                : pass.keep ? cuda::max_state_planes(footprint.choice.index, capacity)
                                            : 0;
     state.checkpoints = at::empty({max_planes * pass.grid.side() * pass.grid.side()}, floats_);
-    state.chunks = at::empty({kPlanRows + chunks + tiles, kChunkWidth}, ints_);
-    const auto [memory, parts] = make_memory<PlanMemory>(bytes_, tiles, chunks);
+    state.chunks = at::empty({kPlanRows + chunks + tiles + cut.max_lists, kChunkWidth}, ints_);
+    const auto [memory, parts] = make_memory<PlanMemory>(bytes_, tiles, cut.whole ? 0 : chunks);
     parts.set(p);
     p.plan.state = structs_of<cuda::PlanState>(state.chunks);
     p.plan.chunk_order = structs_of<cuda::TileChunk>(state.chunks) + kPlanRows;
+    p.plan.long_lists = reinterpret_cast<cuda::LongList*>(p.plan.chunk_order + chunks + tiles);
     p.checkpoints = pointer<float>(state.checkpoints);
-    cuda::plan_chunks(p.lists, pass.grid, footprint.samples, whole, p.layout, p.plan, stream_);
+    cuda::plan_chunks(p.lists, pass.grid, footprint.samples, cut, p.layout, p.plan, stream_);
     check_stage("plan_chunks", pass.debug);
     return memory;
   }

@@ -112,7 +112,7 @@ struct PlanMemory {
 
 inline constexpr int64_t kCountsWidth = sizeof(cuda::Counts) / sizeof(int64_t);
 
-/// BlendState::chunks begins with the PlanState, in whole rows; TileChunks follow.
+/// BlendState::chunks begins with the PlanState, in whole rows; TileChunks follow, and LongLists where lists are cut.
 inline constexpr int64_t kChunkWidth = sizeof(cuda::TileChunk) / sizeof(int32_t);
 inline constexpr int64_t kPlanRows = (sizeof(cuda::PlanState) / sizeof(int32_t) + kChunkWidth - 1) / kChunkWidth;
 
@@ -156,9 +156,9 @@ inline void check_counts(const ListTensors& lists) {
   TORCH_CHECK_VALUE(lists.counts.numel() == kCountsWidth, "counts must be what bin returned, got shape ",
                     lists.counts.sizes());
 }
-inline void check_plan(const BlendState& state) {
+inline void check_plan(const BlendState& state, const cuda::ListCut& cut) {
   const Tensor& chunks = state.chunks;
-  TORCH_CHECK_VALUE(chunks.dim() == 2 && chunks.size(0) >= kPlanRows && chunks.size(1) == kChunkWidth &&
+  TORCH_CHECK_VALUE(chunks.dim() == 2 && chunks.size(0) >= kPlanRows + cut.max_lists && chunks.size(1) == kChunkWidth &&
                         chunks.scalar_type() == at::kInt && state.checkpoints.scalar_type() == at::kFloat,
                     "chunks and checkpoints must be what blend saved, got shape ", chunks.sizes());
 }

@@ -8,6 +8,7 @@
 #include "cuda/blend_listed.cuh"
 #include "cuda/blend_moving_maps.cuh"
 #include "cuda/blend_moving_vjp.cuh"
+#include "cuda/plan.cuh"
 #include "random_splats.h"
 
 namespace ar::cuda {
@@ -16,6 +17,7 @@ namespace {
 
 constexpr int kWidth = 21, kHeight = 18, kPixels = kWidth * kHeight, kColors = 3;
 constexpr TileGrid kGrid = {kWidth, kHeight, kMovingTileBits};
+constexpr int kMost = 1 << 20;
 
 /// A random scene, of which every tile lists all splats, or all but one the first `others`.
 template <class F> struct Scene {
@@ -33,7 +35,8 @@ template <class F> struct Scene {
                               [](const Cov2d<float>& cov) { return F::prepare(cov, FootprintOptions{0}); });
     for (float& x : dL_dimage) x = uniform(bits, -0.5f, 0.5f);
     for (int tile = 0; tile < grid.tiles(); ++tile) {
-      for (int k = 0; k < (tile == 4 ? count : others); ++k) pairs.push_back({k, int32_t(pairs.size())});
+      for (int k = 0; k < (tile == (grid.tiles() - 1) / 2 ? count : others); ++k)
+        pairs.push_back({k, int32_t(pairs.size())});
       offsets.push_back(int64_t(pairs.size()));
     }
     counts = {int64_t(pairs.size()), count};
@@ -46,11 +49,39 @@ struct Results {
   std::vector<int32_t> last;
 };
 
-/// Forwards with one layout, back with another: whole lists, or with kSegment > 0 lists of pixels, shared out as long
-/// ones above kLong pairs, and segments of so many pairs.
+/// The plan of a scene's lists.
+struct Plan {
+  PlanState state;
+  std::vector<TileChunk> chunks;
+  std::vector<int32_t> order, planes;
+  std::vector<LongList> lists;
+  ChunkPlan view = {};
+
+  template <class F>
+  Plan(const Scene<F>& scene, const ListCut& cut)
+      : chunks(size_t(scene.grid.tiles() + cut.max_segments)),
+        order(size_t(scene.grid.tiles())),
+        planes(order.size()),
+        lists(size_t(cut.max_lists)) {
+    view.state = &state;
+    view.chunk_order = chunks.data();
+    view.tile_order = order.data();
+    view.tile_planes = planes.data();
+    view.long_lists = lists.data();
+    cuda_on_host::launch(PlanState::kCounters, kCountWorkThreads,
+                         [&] { count_work_kernel(scene.lists, scene.grid.tiles(), F::kSamples, cut, &state); });
+    cuda_on_host::launch(1, kPlanThreads,
+                         [&] { plan_kernel(scene.lists, scene.grid, F::kSamples, cut, {kColors, true}, view); });
+  }
+};
+
+/// Whole lists forwards with one layout, back with another. With kSegment > 0 those of `long_from` pairs or more are
+/// cut: forwards into lists of pixels, shared out as long ones from kLong pairs on; back into segments of so many
+/// pairs.
 template <class F, class Forward, class Backward, int kSegment = 0, int kLong = kLongList>
-Results run(Scene<F>& scene) {
-  constexpr int S = F::kSamples;
+Results run(Scene<F>& scene, int long_from = 0) {
+  constexpr int S = F::kSamples, kSide = Forward::kSide;
+  static_assert(Backward::kSide == kSide);
   const int tiles = int(scene.grid.tiles());
   Results out;
   out.image.resize(kColors * kPixels);
@@ -59,11 +90,12 @@ Results run(Scene<F>& scene) {
   out.last.resize(S * kPixels);
   out.pair_grads.resize(scene.pairs.size() * kPairGradWidth);
   std::vector<float> checkpoints(scene.pairs.size() / kStateChunk * state_planes(S) * Forward::kTilePixels, NAN);
-  PlanState state = {};
-  std::vector<int32_t> order;
-  std::vector<TileChunk> chunks;
-  for (int tile = 0; tile < tiles; ++tile) order.push_back(tile), chunks.push_back({tile, 0, 0});
-  for (int c = 0; c <= kSampleClasses; ++c) state.counts.chunks.first[c] = c > sample_class(S) ? tiles : 0;
+  const auto cut_into = [&](int segment) {
+    if (kSegment == 0) return ListCut{true};
+    return ListCut{true, long_from, kMost, segment, int(scene.lists.capacity / segment) + tiles, tiles};
+  };
+  const ListCut cut = cut_into(moving_segment(S)), cut_back = cut_into(kSegment);
+  const Plan plan(scene, cut), plan_back(scene, cut_back);
 
   BlendParams blend = {};
   blend.grid = scene.grid;
@@ -75,20 +107,20 @@ Results run(Scene<F>& scene) {
   blend.transmittance = out.transmittance.data();
   blend.last = out.last.data();
   blend.lists = scene.lists;
-  blend.plan.tile_order = order.data();
+  blend.plan = plan.view;
   blend.checkpoints = checkpoints.data();
-  std::vector<uint32_t> reach_words(filter_words(scene.lists.capacity, kGrid));
+  std::vector<uint32_t> reach_words(size_t(cut.max_segments) * (moving_segment(S) / 32) * Forward::kTilePixels);
   blend.reach_words = reach_words.data();
   const auto render = [&](BlendParams p, auto keep) {
     constexpr bool kKeep = decltype(keep)::value;
     if constexpr (kSegment > 0) {
-      cuda_on_host::launch(int(max_pieces(scene.lists.capacity, kFilterPiece, kGrid)), kFilterPiece,
-                           [&] { filter_kernel<F>(p); });
-      cuda_on_host::launch(tiles * kListedBlocks<F>, 32, [&] { listed_blend_kernel<F, kColors, kKeep, kLong>(p, 0); });
-    } else {
-      cuda_on_host::launch(tiles, Forward::kThreads,
-                           [&] { moving_blend_kernel<F, kColors, Forward, kKeep>(p, 0, false); });
+      // Fewer blocks than pieces and tiles.
+      cuda_on_host::launch(cut.max_segments / 2, kFilterPiece, [&] { filter_kernel<F, kSide>(p); });
+      cuda_on_host::launch((tiles + 1) / 2 * kListedBlocks<F, kSide>, 32,
+                           [&] { listed_blend_kernel<F, kColors, kSide, kKeep, kLong>(p, 0); });
     }
+    cuda_on_host::launch(tiles + 1, Forward::kThreads,
+                         [&] { moving_blend_kernel<F, kColors, Forward, kKeep>(p, 0, false); });
   };
   render(blend, std::true_type());
   std::vector<float> image_alone(kColors * kPixels);
@@ -107,29 +139,33 @@ Results run(Scene<F>& scene) {
   vjp.last = blend.last;
   vjp.dL_dimage = {scene.dL_dimage.data(), kColors, {}};
   vjp.lists = scene.lists;
-  vjp.plan = &state;
-  vjp.chunk_order = chunks.data();
-  vjp.max_chunks = tiles;
+  vjp.plan = &plan_back.state;
+  vjp.chunk_order = plan_back.chunks.data();
+  vjp.long_lists = plan_back.lists.data();
   vjp.checkpoints = checkpoints.data();
   vjp.pair_grads = out.pair_grads.data();
   vjp.mean_sums = MeanSums::kNorm;
-  // Some of the places of a chunk in shared memory, the others not.
-  constexpr int kInShared = PlacesInFront<Backward>::kUnit;
-  static_assert(sizeof(MovingVjpShared<F, kColors, Backward, kSegment>) + kInShared * PlacesInFront<Backward>::kBytes <=
-                sizeof dynamic_memory);
+  const auto differentiate = [&](auto layout, auto segment, int blocks) {
+    using Layout = decltype(layout);
+    constexpr int kLength = decltype(segment)::value;
+    // Some of the places of a chunk in shared memory, the others not.
+    constexpr int kInShared = PlacesInFront<Layout>::kUnit;
+    static_assert(sizeof(MovingVjpShared<F, kColors, Layout, kLength>) + kInShared * PlacesInFront<Layout>::kBytes <=
+                  sizeof dynamic_memory);
+    cuda_on_host::launch(blocks, Layout::kThreads,
+                         [&] { moving_vjp_kernel<F, kColors, Layout, kLength>(vjp, 0, kInShared); });
+  };
   if constexpr (kSegment > 0) {
-    const int pieces = int(max_pieces(scene.lists.capacity, kSegment, kGrid));
-    std::vector<float> maps(size_t(pieces) * SegmentMap::kNumbers * S * kMovingPixels, NAN);
+    using Maps = MapLayout<F, kSide>;
+    const int segments = cut_back.max_segments;
+    std::vector<float> maps(size_t(segments) * SegmentMap::kNumbers * S * Forward::kTilePixels, NAN);
     vjp.adjoint_maps = maps.data();
-    cuda_on_host::launch(pieces * MapLayout<F>::kBlocks, MapLayout<F>::kThreads,
-                         [&] { segment_maps_kernel<F, kColors, kSegment>(vjp, 0); });
-    cuda_on_host::launch(tiles * S, kMovingPixels, [&] { chain_maps_kernel<F, kSegment>(vjp); });
-    cuda_on_host::launch(pieces, Backward::kThreads,
-                         [&] { moving_vjp_kernel<F, kColors, Backward, kSegment>(vjp, 0, false, kInShared); });
-  } else {
-    cuda_on_host::launch(tiles, Backward::kThreads,
-                         [&] { moving_vjp_kernel<F, kColors, Backward>(vjp, 0, false, kInShared); });
+    cuda_on_host::launch(segments * Maps::kBlocks, Maps::kThreads,
+                         [&] { segment_maps_kernel<F, kColors, kSide, kSegment>(vjp, 0); });
+    cuda_on_host::launch(tiles * S, kSide * kSide, [&] { chain_maps_kernel<F, kSide, kSegment>(vjp); });
+    differentiate(SegmentLayout<F, kSide>(), std::integral_constant<int, kSegment>(), segments);
   }
+  differentiate(Backward(), std::integral_constant<int, 0>(), tiles);
   return out;
 }
 
@@ -191,8 +227,8 @@ TYPED_TEST_SUITE(MovingKernels, Moments);
 TYPED_TEST(MovingKernels, AgreeWhateverTheLayouts) {
   using F = TypeParam;
   using Fine = CellLayout<F::kSamples <= 4 ? 1 : 2, 8>;
-  using Forward = EvenLayout<F, false, true>;
-  using Backward = EvenLayout<F, true, true>;
+  using Forward = EvenLayout<F, false, kMovingTile>;
+  using Backward = EvenLayout<F, true, kMovingTile>;
   Scene<F> scene(150, 150, 0.95f);
   const Results fine = run<F, Fine, Fine>(scene);
   expect_composited(scene, fine);
@@ -203,8 +239,8 @@ TYPED_TEST(MovingKernels, AgreeWhateverTheLayouts) {
 TEST(MovingKernelsOfOneCell, AgreeWhateverTheTiles) {
   using F = Moment<1>;
   Scene<F> fine(150, 150, 0.95f), coarse(150, 150, 0.95f, {kWidth, kHeight});
-  const Results a = run<F, EvenLayout<F, false, true>, EvenLayout<F, true, true>>(fine);
-  const Results b = run<F, EvenLayout<F, false, false>, EvenLayout<F, true, false>>(coarse);
+  const Results a = run<F, EvenLayout<F, false, kMovingTile>, EvenLayout<F, true, kMovingTile>>(fine);
+  const Results b = run<F, EvenLayout<F, false, kTile>, EvenLayout<F, true, kTile>>(coarse);
   EXPECT_EQ(a.last, b.last);
   for (int i = 0; i < kPixels; ++i) ASSERT_NEAR(a.transmittance[i], b.transmittance[i], kRounding) << i;
   for (size_t i = 0; i < a.image.size(); ++i) ASSERT_NEAR(a.image[i], b.image[i], kRounding) << i;
@@ -220,29 +256,31 @@ TEST(MovingKernelsOfOneCell, HaveCoarseTilesForOneCellInLargeImagesOnly) {
   EXPECT_EQ(moving_grid(1, 512, 504).side(), kMovingTile);
 }
 
-/// A list of several batches of pairs and segments, in which some samples stay open, and some stop in the midst.
-TYPED_TEST(MovingKernels, AgreeInListsOfPixelsAndSegments) {
-  using F = TypeParam;
-  Scene<F> scene(1100, 70, 0.1f);
-  const Results whole = run<F, EvenLayout<F, false, true>, EvenLayout<F, true, true>>(scene);
+/// A list of several batches of pairs and segments, in which some samples stay open, and some stop in the midst: as a
+/// whole, and cut.
+template <class F, int kSide> void expect_same_if_cut(TileGrid grid) {
+  using Forward = EvenLayout<F, false, kSide>;
+  using Backward = EvenLayout<F, true, kSide>;
+  Scene<F> scene(1100, 70, 0.1f, grid);
+  const Results whole = run<F, Forward, Backward>(scene);
   EXPECT_GT(*std::max_element(whole.last.begin(), whole.last.end()), kListedBatch);
-  const auto listed = [&](auto segment, auto longer) {
-    return run<F, EvenLayout<F, false, true>, SegmentLayout<F>, decltype(segment)::value, decltype(longer)::value>(
-        scene);
-  };
-  const std::integral_constant<int, 64> segment;
-  const Results short_lists = listed(segment, std::integral_constant<int, kLongList>());
+  const Results short_lists = run<F, Forward, Backward, 64>(scene);
   expect_same(short_lists, whole);
-  const std::integral_constant<int, kMovingSegment<F>> as_rendered;
-  expect_same(listed(as_rendered, std::integral_constant<int, kLongList>()), whole);
+  expect_same(run<F, Forward, Backward, moving_segment(F::kSamples)>(scene), whole);
+  // The long list alone, beside others that are not cut.
+  expect_same(run<F, Forward, Backward, 64>(scene, 1024), whole);
   if (F::kSamples > 4) return;  // long lists are shared out in the same way
-  const Results a_long_list = listed(segment, std::integral_constant<int, 1000>());
+  const Results a_long_list = run<F, Forward, Backward, 64, 1000>(scene);
   // Colours are added up by other lanes.
   for (size_t i = 0; i < a_long_list.image.size(); ++i)
     ASSERT_NEAR(a_long_list.image[i], short_lists.image[i], kRounding) << i;
   EXPECT_EQ(a_long_list.transmittance, short_lists.transmittance);
   EXPECT_EQ(a_long_list.last, short_lists.last);
   EXPECT_EQ(a_long_list.pair_grads, short_lists.pair_grads);
+}
+TYPED_TEST(MovingKernels, AgreeInListsOfPixelsAndSegments) { expect_same_if_cut<TypeParam, kMovingTile>(kGrid); }
+TEST(MovingKernelsOfOneCell, AgreeInListsOfPixelsAndSegmentsOfCoarseTiles) {
+  expect_same_if_cut<Moment<1>, kTile>({kWidth, kHeight});
 }
 
 }  // namespace

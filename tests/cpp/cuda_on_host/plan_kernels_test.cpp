@@ -18,9 +18,20 @@ int class_of(int samples, int length) { return work_class(samples, length); }
 struct Case {
   TileGrid grid;
   int most_pairs;  ///< of a tile
-  bool chosen, keep, whole;
-  bool overflow = false;
+  bool chosen, keep;
+  ListCut cut;
+  bool overflow = false, expect_cut = false;
 };
+
+/// Whether lists of n pairs are cut: those that are long, while there is room for those of their class and longer ones.
+bool is_cut(const Case& c, const std::vector<int>& lists, int64_t pairs, int n) {
+  if (c.cut.max_segments == 0 || c.overflow || n < c.cut.long_from(pairs)) return false;
+  int segments = 0;
+  for (int other : lists) {
+    if (class_of(1, other) <= class_of(1, n)) segments += (other + c.cut.segment - 1) / c.cut.segment;
+  }
+  return segments <= c.cut.max_segments;
+}
 
 void expect_planned(const Case& c) {
   constexpr int kMostSamples = 4;
@@ -40,18 +51,31 @@ void expect_planned(const Case& c) {
   lists.capacity = c.overflow ? offsets.back() - 1 : offsets.back();
   if (c.chosen) lists.tile_samples = samples.data();
   const auto pairs = [&](int tile) { return c.overflow ? 1 : int(offsets[tile + 1] - offsets[tile]); };
-  const auto length = [&](int tile) { return c.whole ? kWholeList : chunk_length(samples[tile]); };
+  std::vector<int> all_pairs;
+  for (int tile = 0; tile < tiles; ++tile) all_pairs.push_back(pairs(tile));
+  std::map<int, bool> cut_lists;  // by their lengths
+  for (int n : all_pairs) {
+    if (cut_lists.count(n) == 0) cut_lists[n] = is_cut(c, all_pairs, offsets.back(), n);
+  }
+  const bool whole = c.cut.whole;
+  const auto length = [&](int tile) {
+    return cut_lists[pairs(tile)] ? c.cut.segment : whole ? kWholeList : chunk_length(samples[tile]);
+  };
 
   const CheckpointLayout layout = {3, c.keep};
-  std::vector<TileChunk> chunk_order(size_t(tiles + offsets.back() / chunk_length(1))), tail(chunk_order.size());
+  std::vector<TileChunk> chunk_order(size_t(tiles + offsets.back() / chunk_length(1) + c.cut.max_segments));
+  std::vector<TileChunk> tail(chunk_order.size());
+  std::vector<LongList> long_lists(size_t(c.cut.max_lists));
   std::vector<int32_t> tile_order(tiles, -1), tile_planes(tiles, -1);
   PlanState state;
   std::memset(&state, 0x55, sizeof state);  // nothing need be zero
-  ChunkPlan plan = {&state, chunk_order.data(), tile_order.data(), tile_planes.data(), c.whole ? nullptr : tail.data()};
+  ChunkPlan plan = {
+      &state,           chunk_order.data(), tile_order.data(), tile_planes.data(), whole ? nullptr : tail.data(),
+      long_lists.data()};
   cuda_on_host::launch(PlanState::kCounters, kCountWorkThreads,
-                       [&] { count_work_kernel(lists, tiles, kMostSamples, c.whole, &state); });
+                       [&] { count_work_kernel(lists, tiles, kMostSamples, c.cut, &state); });
   cuda_on_host::launch((tiles + kPlanThreads - 1) / kPlanThreads, kPlanThreads,
-                       [&] { plan_kernel(lists, c.grid, kMostSamples, c.whole, layout, plan); });
+                       [&] { plan_kernel(lists, c.grid, kMostSamples, c.cut, layout, plan); });
 
   std::set<std::pair<int, int>> expected_tail;
   std::map<std::pair<int, int>, int> expected_chunks;  // their lengths
@@ -61,9 +85,9 @@ void expect_planned(const Case& c) {
     int chunk = 0;
     for (int k = 0; k < pairs(tile); k += length(tile), ++chunk) {
       expected_chunks[{tile, chunk}] = std::min(length(tile), pairs(tile) - k);
-      if (chunk >= front) expected_tail.insert({tile, chunk});
+      if (chunk >= front && !whole) expected_tail.insert({tile, chunk});
     }
-    if (!c.whole) planes += layout.tile_planes(c.grid, samples[tile], chunk);
+    if (!whole) planes += layout.tile_planes(c.grid, samples[tile], chunk);
     for (int after = s + 1; after <= kSampleClasses; ++after) ++parts_of_tiles[after], parts_of_chunks[after] += chunk;
   }
   const PlanCounts& made = state.counts;
@@ -89,7 +113,7 @@ void expect_planned(const Case& c) {
     const TileChunk& part = chunk_order[k];
     const auto found = expected_chunks.find({part.tile, part.chunk});
     ASSERT_TRUE(found != expected_chunks.end()) << part.tile << " " << part.chunk;
-    const int of_class = class_of(samples[part.tile], found->second);
+    const int of_class = class_of(samples[part.tile], whole ? pairs(part.tile) : found->second);
     EXPECT_GE(of_class, last_class);
     last_class = of_class;
     expected_chunks[found->first] = -1;  // seen
@@ -97,12 +121,33 @@ void expect_planned(const Case& c) {
     EXPECT_EQ(part.plane, tile_planes[part.tile] + (part.chunk - first) * of_chunk);
   }
   for (const auto& [chunk, seen] : expected_chunks) ASSERT_EQ(seen, -1) << chunk.first << " " << chunk.second;
-  for (int tile = 0; tile < tiles && !c.whole; ++tile) {
+  for (int tile = 0; tile < tiles && !whole; ++tile) {
     const int chunks = (pairs(tile) + length(tile) - 1) / length(tile);
     const int own = layout.tile_planes(c.grid, samples[tile], chunks);
     for (int plane = 0; plane < own; ++plane) ASSERT_TRUE(used.insert(tile_planes[tile] + plane).second) << tile;
   }
   EXPECT_EQ(int(used.size()), planes);
+  // Lists that are cut come first, and so do their segments, one list after the other.
+  int long_count = 0;
+  for (int n : all_pairs) long_count += cut_lists[n];
+  ASSERT_EQ(made.long_lists, long_count);
+  EXPECT_EQ(long_count > 0, c.expect_cut);
+  std::vector<bool> seen(size_t(made.segments), false);
+  for (int k = 0; k < long_count; ++k) {
+    const LongList& list = long_lists[k];
+    EXPECT_EQ(list.tile, tile_order[k]);
+    EXPECT_TRUE(cut_lists[pairs(list.tile)]);
+    EXPECT_EQ(list.segments, (pairs(list.tile) + c.cut.segment - 1) / c.cut.segment);
+    for (int segment = 0; segment < list.segments; ++segment) {
+      ASSERT_LT(list.first + segment, made.segments);
+      EXPECT_EQ(chunk_order[list.first + segment].tile, list.tile);
+      EXPECT_EQ(chunk_order[list.first + segment].chunk, segment);
+      EXPECT_FALSE(seen[list.first + segment]);
+      seen[list.first + segment] = true;
+    }
+  }
+  EXPECT_EQ(std::count(seen.begin(), seen.end(), false), 0);
+
   for (int k = 0; k < made.tail; ++k) EXPECT_EQ(expected_tail.erase({tail[k].tile, tail[k].chunk}), 1u);
   for (const TileChunk& part : std::vector<TileChunk>(tail.begin(), tail.begin() + made.tail)) {
     const int s = samples[part.tile];
@@ -112,17 +157,42 @@ void expect_planned(const Case& c) {
 
 constexpr TileGrid kSmall = {240, 135}, kLarge = {2400, 2000};
 
-TEST(PlanKernels, LongLists) { expect_planned({kSmall, 30000, false, true, false}); }
-TEST(PlanKernels, LongListsWithoutBackward) { expect_planned({kSmall, 30000, false, false, false}); }
+constexpr ListCut kChunks = {false}, kWhole = {true};
+
+TEST(PlanKernels, LongLists) { expect_planned({kSmall, 30000, false, true, kChunks}); }
+TEST(PlanKernels, LongListsWithoutBackward) { expect_planned({kSmall, 30000, false, false, kChunks}); }
 TEST(PlanKernels, ManyTiles) {
   // Threads of count_work go on to further tiles.
   ASSERT_GT(kLarge.tiles(), kTilesAtOnce * PlanState::kCounters * kCountWorkThreads);
-  expect_planned({kLarge, 900, false, true, false});
+  expect_planned({kLarge, 900, false, true, kChunks});
 }
-TEST(PlanKernels, ChosenSamples) { expect_planned({kSmall, 5000, true, true, false}); }
-TEST(PlanKernels, ChosenSamplesWithoutBackward) { expect_planned({kSmall, 5000, true, false, false}); }
-TEST(PlanKernels, WholeLists) { expect_planned({kSmall, 5000, true, true, true}); }
-TEST(PlanKernels, MorePairsThanRoom) { expect_planned({kSmall, 5000, false, true, false, true}); }
+TEST(PlanKernels, ChosenSamples) { expect_planned({kSmall, 5000, true, true, kChunks}); }
+TEST(PlanKernels, ChosenSamplesWithoutBackward) { expect_planned({kSmall, 5000, true, false, kChunks}); }
+TEST(PlanKernels, WholeLists) { expect_planned({kSmall, 5000, true, true, kWhole}); }
+TEST(PlanKernels, MorePairsThanRoom) { expect_planned({kSmall, 5000, false, true, kChunks, true}); }
+
+// Whole lists, of which the long ones are cut.
+constexpr int kMost = 1 << 20;
+TEST(PlanKernels, CutsLongLists) {
+  expect_planned({kSmall, 5000, false, true, {true, 1024, 1 << 20, 512, kMost, 1000}, false, true});
+}
+TEST(PlanKernels, CutsWhatIsLongerThanAFairShare) {
+  // There are some 200,000 pairs.
+  ASSERT_EQ((ListCut{true, 256, 100}.long_from(200000)), 2048);
+  expect_planned({kSmall, 5000, false, true, {true, 256, 100, 128, kMost, 1000}, false, true});
+}
+TEST(PlanKernels, CutsAllLists) {
+  expect_planned({kSmall, 5000, false, true, {true, 0, 1, 512, kMost, 1000}, false, true});
+}
+TEST(PlanKernels, CutsTheLongestIfThereIsNoRoomForMore) {
+  expect_planned({kSmall, 5000, false, true, {true, 256, 1 << 20, 128, 400, 1000}, false, true});
+}
+TEST(PlanKernels, CutsNothingWithoutRoom) {
+  expect_planned({kSmall, 5000, false, true, {true, 256, 1 << 20, 128, 4, 1000}});
+}
+TEST(PlanKernels, CutsNothingWithMorePairsThanRoom) {
+  expect_planned({kSmall, 5000, false, true, {true, 0, 1, 512, kMost, 1000}, true});
+}
 
 }  // namespace
 }  // namespace ar::cuda

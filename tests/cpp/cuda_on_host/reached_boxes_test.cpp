@@ -168,19 +168,19 @@ template <class F, class Layout> void expect_the_warp_of_each_pixel() {
   EXPECT_EQ(found, Layout::kLanes * Layout::kSide * Layout::kSide);
 }
 
-template <class F> void expect_the_warps_of_all_layouts() {
-  expect_the_warp_of_each_pixel<F, EvenLayout<F, false, false>>();
-  expect_the_warp_of_each_pixel<F, EvenLayout<F, true, false>>();
-  expect_the_warp_of_each_pixel<F, EvenLayout<F, true, true>>();
-  expect_the_warp_of_each_pixel<F, SegmentLayout<F>>();
-  expect_the_warp_of_each_pixel<F, MapLayout<F>>();
+template <class F, int kSide> void expect_the_warps_of_all_layouts() {
+  expect_the_warp_of_each_pixel<F, EvenLayout<F, false, kSide>>();
+  expect_the_warp_of_each_pixel<F, EvenLayout<F, true, kSide>>();
+  expect_the_warp_of_each_pixel<F, SegmentLayout<F, kSide>>();
+  expect_the_warp_of_each_pixel<F, MapLayout<F, kSide>>();
 }
 
 TEST(BlockReach, HasTheWarpOfEachPixel) {
-  expect_the_warps_of_all_layouts<Moment<1>>();
-  expect_the_warps_of_all_layouts<Moment<4>>();
-  expect_the_warps_of_all_layouts<Moment<9>>();
-  expect_the_warps_of_all_layouts<Moment<16>>();
+  expect_the_warps_of_all_layouts<Moment<1>, kMovingTile>();
+  expect_the_warps_of_all_layouts<Moment<1>, kTile>();
+  expect_the_warps_of_all_layouts<Moment<4>, kMovingTile>();
+  expect_the_warps_of_all_layouts<Moment<9>, kMovingTile>();
+  expect_the_warps_of_all_layouts<Moment<16>, kMovingTile>();
 }
 
 }  // namespace

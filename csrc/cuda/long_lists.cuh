@@ -1,0 +1,48 @@
+// The lists of tiles that are cut into segments, which kernels work on side by side.
+#pragma once
+
+#include <algorithm>
+
+#include "cuda/composite.cuh"
+
+namespace ar::cuda {
+
+/// A segment of a list that is cut.
+struct ListSegment {
+  int number;  ///< among all segments; those of a list follow each other
+  int tile;    ///< -1: there is no segment of that number
+  int index;   ///< pairs [index length, (index + 1) length) of the tile's list
+
+  __device__ ListSegment(const PlanState& plan, const TileChunk* chunk_order, int number)
+      : number(number), tile(-1), index(0) {
+    if (number >= plan.counts.segments) return;
+    tile = chunk_order[number].tile;
+    index = chunk_order[number].chunk;
+  }
+  /// The number of the first segment of its list.
+  __device__ int first() const { return number - index; }
+};
+
+/// Pairs of a segment where `samples` samples move. Longer ones need fewer maps, which count where there are many
+/// samples; shorter ones fill a device with smaller scenes.
+AR_HD constexpr int moving_segment(int samples) { return samples <= 4 ? 512 : 1024; }
+
+/// In small images all lists are cut: their few tiles have long ones, and the time is that of the longest. Large ones
+/// have many tiles that keep a device busy, and to cut a list takes more work than to walk it. There only those are cut
+/// that a block would still walk when all others have ended: of so many pairs or more, and no fewer than the share that
+/// each of so many blocks has which a large device holds at once.
+inline constexpr int kLongList = 4096, kBlocksAtOnce = 528;
+/// In large images there is room for segments of one in so many pairs. If more are in long lists, they are in many
+/// lists, which keep a device busy.
+inline constexpr int kPairsForEachCut = 4;
+
+inline ListCut moving_list_cut(int samples, int64_t capacity, TileGrid grid) {
+  const int length = moving_segment(samples);
+  const int64_t segments = capacity / length, lists = capacity / kLongList;
+  if (is_small_image(grid)) return {true, 0, 1, length, int(segments + grid.tiles()), int(grid.tiles())};
+  if (lists == 0) return {true};
+  const int64_t room = segments / kPairsForEachCut + lists;
+  return {true, kLongList, kBlocksAtOnce, length, int(room), int(std::min(room / (kLongList / length), grid.tiles()))};
+}
+
+}  // namespace ar::cuda
