@@ -29,8 +29,9 @@ def compute_3d_filter(means3D: torch.Tensor, cameras: Sequence[Any], variance: f
     """Standard deviation of every Gaussian's filter, from the camera that samples it most finely.
 
     A camera samples a point at depth z at intervals of z / focal length, in world units; an orthographic camera at
-    intervals of 1 / focal length. A point takes the smallest interval among the cameras that see it, with a
-    margin around the image. A point that no camera sees takes the largest interval of all other points.
+    intervals of 1 / focal length. Where a view scales, they are divided by the length of its axes. A point takes the
+    smallest interval among the cameras that see it, with a margin around the image. A point that no camera sees takes
+    the largest interval of all other points.
 
     Args:
         means3D: (P, 3) centres, world units.
@@ -88,8 +89,15 @@ def sampling_interval(means3D: torch.Tensor, camera: Any) -> torch.Tensor:
     columns = means3D.split(1, dim=1)  # not `@`, which autocast and TF32 round
     projected = columns[0] * clip[0] + columns[1] * clip[1] + columns[2] * clip[2] + clip[3]
     inside = (projected[:, :2].abs() <= (1 + 2 * MARGIN) * projected[:, 3:].abs()).all(1)
-    # The finer of the two axes.
-    focal = max(camera.image_width / camera.tanfovx, camera.image_height / camera.tanfovy) / 2
+    # Of the finer of the two axes, pixels per world unit at z = 1. A view may scale: its rows, the columns of the
+    # transposed matrix, then are no unit vectors.
+    scales = camera.viewmatrix.detach().reshape(4, 4).to(means3D)[:3, :2].norm(dim=0)
+    focal = (
+        torch.maximum(
+            scales[0] * (camera.image_width / camera.tanfovx), scales[1] * (camera.image_height / camera.tanfovy)
+        )
+        / 2
+    )
     inside &= (z > effects.near) & (z < effects.far)
     return torch.where(inside, (torch.ones_like(z) if effects.orthographic else z) / focal, torch.inf)
 

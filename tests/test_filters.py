@@ -45,6 +45,19 @@ def test_points_behind_and_beside_a_camera_do_not_count():
     assert torch.allclose(filters, torch.tensor([fine, 71 / 64 * math.sqrt(0.2), fine, coarse], dtype=F64))
 
 
+def test_a_view_may_scale():
+    """Twice as large camera coordinates make the same picture, and sample the world at the same intervals."""
+    points = torch.randn(20, 3, dtype=F64, generator=torch.Generator().manual_seed(0))
+    settings = camera(8)
+    larger = torch.diag(torch.tensor([2.0, 2, 2, 1], dtype=F64))  # of row vectors, behind the view
+    perspective = torch.linalg.inv(settings.viewmatrix) @ settings.projmatrix
+    scaled = settings._replace(viewmatrix=settings.viewmatrix @ larger)
+    scaled = scaled._replace(projmatrix=scaled.viewmatrix @ perspective)
+    expected = ar.compute_3d_filter(points, [settings])
+    assert expected.unique().numel() > 10
+    assert torch.allclose(ar.compute_3d_filter(points, [scaled]), expected)
+
+
 def test_filtered_gaussians_keep_their_mass_and_gain_variance():
     scene = scenes.random_scene(1, 50)
     width = torch.rand(50, dtype=F64) * 0.2

@@ -261,6 +261,21 @@ def test_nerfstudio_folder(tmp_path):
     torch.testing.assert_close(colors, torch.tensor([[1.0, 0.0, 0.2], [0.0, 1.0, 0.0]]))
 
 
+def test_nerfstudio_names_its_points(tmp_path):
+    header = (
+        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
+    )
+    (tmp_path / "sparse_pc.ply").write_text(header + "9 9 9\n")
+    (tmp_path / "points").mkdir()
+    (tmp_path / "points" / "of_colmap.ply").write_text(header + "0 1 2\n")
+    write_nerfstudio(tmp_path, lambda content: content.update(ply_file_path="points/of_colmap.ply"))
+    assert training.load_capture(tmp_path).points[0].tolist() == [[0, 1, 2]]
+    for wrong in ("points/others.ply", 3):
+        write_nerfstudio(tmp_path, lambda content, wrong=wrong: content.update(ply_file_path=wrong))
+        with pytest.raises(io.SceneError, match=f"ply_file_path must name a file beside it, got {wrong!r}"):
+            training.load_capture(tmp_path)
+
+
 @pytest.mark.parametrize(
     "lists, train, test",
     [

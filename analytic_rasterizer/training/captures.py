@@ -82,7 +82,7 @@ def load_capture(folder, images: str = IMAGES, test_every: int = TEST_PERIOD) ->
         named = [Photograph(view, {1: folder / images / name}) for name, view in colmap.load_views(sparse)]
         capture = Capture(*_split(named, test_every), BLACK, colmap.load_points(sparse))
     elif (folder / "transforms.json").exists():
-        capture = Capture(*nerfstudio(folder / "transforms.json", test_every), BLACK, initial_points(folder))
+        capture = nerfstudio(folder / "transforms.json", test_every)
     else:
         raise io.SceneError(
             f"{folder}: expected transforms_train.json, metadata.json, transforms.json, or COLMAP's cameras, images "
@@ -136,17 +136,27 @@ def _picture(folder: Path, name: str) -> Path:
     return file if file.is_file() else Path(f"{file}.png")
 
 
-def nerfstudio(path: Path, test_every: int) -> tuple[list[Photograph], list[Photograph]]:
-    """Pictures to train with and to test with, by name: what the lists of a transforms.json say, if it has any.
+def nerfstudio(path: Path, test_every: int) -> Capture:
+    """The capture of a transforms.json: its pictures by name, and the points of the file that it names.
 
-    They are train_filenames, val_filenames and test_filenames. The test takes the last, or where that is missing the
-    one before. Without the first, the training takes the pictures that neither of the others has.
+    Which pictures to train with and to test with is what its lists train_filenames, val_filenames and test_filenames
+    say, if it has any. The test takes the last, or where that is missing the one before. Without the first, the
+    training takes the pictures that neither of the others has. Without ply_file_path, points are looked for under their
+    usual names.
 
     Warns of masks, which are ignored.
 
-    Raises io.SceneError for what `transforms` refuses, and for lists of anything but pictures of the file.
+    Raises io.SceneError for what `transforms` and `load_points` refuse, for lists of anything but pictures of the file,
+    and for points that are not there.
     """
     items, data = transforms(path)
+    points_file = data.get("ply_file_path")
+    if points_file is None:
+        points = initial_points(path.parent)
+    elif isinstance(points_file, str) and (path.parent / points_file).is_file():
+        points = load_points(path.parent / points_file)
+    else:
+        raise io.SceneError(f"{path}: ply_file_path must name a file beside it, got {points_file!r}")
     items.sort(key=lambda item: str(item.files[1]))
     masks = sum(frame.get("mask_path") is not None for frame in data["frames"])
     if masks:
@@ -161,10 +171,11 @@ def nerfstudio(path: Path, test_every: int) -> tuple[list[Photograph], list[Phot
         if unknown:
             raise io.SceneError(f"{path}: {split}_filenames must name pictures of the frames, got {unknown[0]}")
     if not any(lists.values()):
-        return _split(items, test_every)
+        return Capture(*_split(items, test_every), BLACK, points)
     train = lists["train"] or set(files) - lists["val"].keys() - lists["test"].keys()
     test = lists["test"] or lists["val"]
-    return tuple([item for file, item in zip(files, items) if file in chosen] for chosen in (train, test))
+    chosen = ([item for file, item in zip(files, items) if file in names] for names in (train, test))
+    return Capture(*chosen, BLACK, points)
 
 
 def check_lens(entry: dict, where: str) -> None:
