@@ -92,12 +92,9 @@ def sampling_interval(means3D: torch.Tensor, camera: Any) -> torch.Tensor:
     # Of the finer of the two axes, pixels per world unit at z = 1. A view may scale: its rows, the columns of the
     # transposed matrix, then are no unit vectors.
     scales = camera.viewmatrix.detach().reshape(4, 4).to(means3D)[:3, :2].norm(dim=0)
-    focal = (
-        torch.maximum(
-            scales[0] * (camera.image_width / camera.tanfovx), scales[1] * (camera.image_height / camera.tanfovy)
-        )
-        / 2
-    )
+    in_x = scales[0] * (camera.image_width / (2 * camera.tanfovx))
+    in_y = scales[1] * (camera.image_height / (2 * camera.tanfovy))
+    focal = torch.maximum(in_x, in_y)
     inside &= (z > effects.near) & (z < effects.far)
     return torch.where(inside, (torch.ones_like(z) if effects.orthographic else z) / focal, torch.inf)
 
