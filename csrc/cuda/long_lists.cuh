@@ -32,16 +32,16 @@ AR_HD constexpr int moving_segment(int samples) { return samples <= 4 ? 512 : 10
 /// that a block would still walk when all others have ended: of so many pairs or more, and no fewer than the share that
 /// each of so many blocks has which a large device holds at once.
 inline constexpr int kLongList = 4096, kBlocksAtOnce = 528;
-/// In large images there is room for segments of one in so many pairs. If more are in long lists, they are in many
-/// lists, which keep a device busy.
-inline constexpr int kPairsForEachCut = 4;
+/// In large images there is room for so many segments, and those of one in so many pairs. If more pairs are in long
+/// lists, these are many, and keep a device busy.
+inline constexpr int kLongSegments = 4096, kPairsForEachCut = 4;
 
 inline ListCut moving_list_cut(int samples, int64_t capacity, TileGrid grid) {
   const int length = moving_segment(samples);
   const int64_t segments = capacity / length, lists = capacity / kLongList;
   if (is_small_image(grid)) return {true, 0, 1, length, int(segments + grid.tiles()), int(grid.tiles())};
   if (lists == 0) return {true};
-  const int64_t room = segments / kPairsForEachCut + lists;
+  const int64_t room = std::min(segments + lists, kLongSegments + segments / kPairsForEachCut);
   return {true, kLongList, kBlocksAtOnce, length, int(room), int(std::min(room / (kLongList / length), grid.tiles()))};
 }
 

@@ -8,6 +8,7 @@
 // After it: kernels.
 #include <gtest/gtest.h>
 
+#include "cuda/long_lists.cuh"
 #include "cuda/plan.cuh"
 
 namespace ar::cuda {
@@ -189,6 +190,29 @@ TEST(PlanKernels, CutsTheLongestIfThereIsNoRoomForMore) {
 }
 TEST(PlanKernels, CutsNothingWithoutRoom) {
   expect_planned({kSmall, 5000, false, true, {true, 256, 1 << 20, 128, 4, 1000}});
+}
+TEST(PlanKernels, HaveRoomForTheSegmentsOfLongLists) {
+  // In a small image for all lists, the shortest of which make a segment each.
+  const ListCut small = moving_list_cut(4, 100000, kSmall);
+  EXPECT_EQ(small.long_from(100000), 0);
+  EXPECT_GE(small.max_segments, 100000 / small.segment + kSmall.tiles());
+  EXPECT_EQ(small.max_lists, kSmall.tiles());
+  // In a large one none if none can be long; all as long as they are few; and always those of a quarter of the pairs.
+  EXPECT_EQ(moving_list_cut(4, kLongList - 1, kLarge).max_segments, 0);
+  for (const int samples : {1, 16}) {
+    const int segment = moving_segment(samples), of_long_list = kLongList / segment;
+    const ListCut few = moving_list_cut(samples, 3 * (kLongList + 1), kLarge);
+    EXPECT_EQ(few.long_from(3 * (kLongList + 1)), kLongList);
+    EXPECT_GE(few.max_segments, 3 * (of_long_list + 1));
+    EXPECT_GE(few.max_lists, 3);
+    const int64_t pairs = 100000000;
+    const ListCut many = moving_list_cut(samples, pairs, kLarge);
+    EXPECT_GE(many.long_from(pairs), pairs / kBlocksAtOnce);
+    EXPECT_LT(many.long_from(pairs), 2 * pairs / kBlocksAtOnce);
+    EXPECT_GE(many.max_segments, pairs / 4 / segment + kBlocksAtOnce);  // no more lists are that long
+    EXPECT_LT(many.max_segments, pairs / 3 / segment);
+    EXPECT_GE(many.max_lists, std::min<int64_t>(many.max_segments / of_long_list, kLarge.tiles()));
+  }
 }
 TEST(PlanKernels, CutsNothingWithMorePairsThanRoom) {
   expect_planned({kSmall, 5000, false, true, {true, 0, 1, 512, kMost, 1000}, true});
