@@ -43,7 +43,7 @@ class Image(NamedTuple):
 
 
 # 512x512 pixels are 4096 tiles of 8x8: enough for the kernels of large images. Lists of thousands of splats have chunks
-# behind the front, and several segments; those of kLongList pairs or more (csrc/cuda/long_lists.cuh) are cut in large
+# behind the front, and several segments; those of kLongList pairs or more (csrc/cuda/cut_lists.cuh) are cut in large
 # images too, and have a layout of their own. Where Gaussians are opaque, pixels close (so little light is left that
 # 3DGS stops) before their lists end.
 # test_every_kernel_has_images_that_need_it in test_benchmarks.py asserts all this.

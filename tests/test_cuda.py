@@ -293,13 +293,20 @@ def test_moving_samples_in_large_images(samples):
     compare(scene32(), settings_for(("moment", {"samples": samples}), camera))
 
 
-@pytest.mark.parametrize("samples, channels", [(1, 3), (1, 40), (4, 3), (9, 3), (16, 3), (16, 5)])
-def test_long_lists_of_moving_samples_in_large_images(samples, channels):
-    """A few tiles with thousands of splats, whose lists are cut, beside many with few, whose lists are not."""
+LARGE = replace(CAMERA, image_height=520, image_width=528)
+
+
+def long_and_short_lists():
+    """In an image of LARGE's size a few tiles with thousands of splats, whose lists `moment` cuts; many with few."""
     few = {"opacity": (0.004, 0.2), "sigma": (0.001, 0.02), "spread": 0.04}
     dense, around = scenes.random_scene(1, 20000, degree=2, **few), scenes.random_scene(2, 1000, degree=2, spread=1.5)
-    scene = scenes.cast({name: torch.cat([dense[name], around[name]]) for name in dense}, torch.float32)
-    camera = replace(CAMERA, image_height=520, image_width=528)
+    return scenes.cast({name: torch.cat([dense[name], around[name]]) for name in dense}, torch.float32)
+
+
+@pytest.mark.parametrize("samples, channels", [(1, 3), (1, 40), (4, 3), (9, 3), (16, 3), (16, 5)])
+def test_long_lists_of_moving_samples_in_large_images(samples, channels):
+    """They are cut, beside others that are not."""
+    scene, camera = long_and_short_lists(), LARGE
     settings = settings_for(("moment", {"samples": samples}), camera)
     if channels != 3:
         del scene["shs"]
@@ -311,7 +318,8 @@ def test_long_lists_of_moving_samples_in_large_images(samples, channels):
         lists = stages.tile_offsets.diff()
         assert lists.max() > 4096, "no list is cut"
         assert ((lists > 0) & (lists < 4096)).sum() > 100, "all lists are cut"
-    compare(scene, settings, flips=1e-3, layers=500)
+    color = compare(scene, settings, flips=1e-3, layers=500)
+    assert_same_without_gradient(scene, settings, color)
     assert_identical(run(scene, settings, "cuda"), run(scene, settings, "cuda"))
 
 
@@ -328,6 +336,17 @@ def test_looks_at_moving_samples_in_large_images(samples):
         assert ((getattr(found, name).cpu() - getattr(expected, name)).abs() > 1e-4).double().mean() < 1e-3, name
     pixels, wanted = found.gaussian_stats.pixels.cpu().double(), expected.gaussian_stats.pixels.double()
     assert (pixels - wanted).abs().sum() < 1e-3 * wanted.sum()
+
+
+@pytest.mark.parametrize("samples", [1, 4])
+def test_more_pairs_than_room_where_lists_would_be_cut(samples):
+    """There is room for segments, and no list to cut."""
+    scene, settings = long_and_short_lists(), settings_for(("moment", {"samples": samples}), LARGE)
+    _C.force_pair_capacity(1 << 14)
+    try:
+        compare(scene, settings, flips=1e-3, layers=500)
+    finally:
+        _C.force_pair_capacity(0)
 
 
 @every_footprint
@@ -711,11 +730,19 @@ def test_cuda_graph(variant):
 @each_path
 def test_cuda_graph_with_gradients(variant):
     """Streams beside the caller's are part of what is captured, of both passes."""
-    scene, settings = scene32(), settings_for(variant)
+    replay_a_graph_with_gradients(scene32(), settings_for(variant))
+
+
+def test_cuda_graph_with_lists_that_are_cut():
+    """Kernels that work side by side on the caller's stream."""
+    replay_a_graph_with_gradients(long_and_short_lists(), settings_for(("moment", {"samples": 1}), LARGE))
+
+
+def replay_a_graph_with_gradients(scene, settings):
     leaves = scenes.leaves(scenes.to(scene, "cuda"))
     rasterizer = ar.GaussianRasterizer(scenes.settings_to(settings, "cuda"))
-    weights = torch.linspace(-1, 1, 3 * CAMERA.image_height * CAMERA.image_width, device="cuda")
-    weights = weights.reshape(3, CAMERA.image_height, CAMERA.image_width)
+    size = 3, settings.image_height, settings.image_width
+    weights = torch.linspace(-1, 1, math.prod(size), device="cuda").reshape(size)
 
     def step():
         color, _ = rasterizer(**leaves)

@@ -13,8 +13,8 @@ namespace ar::cuda {
 
 namespace {
 
-/// C channels from `first` on, in tiles of kSide x kSide pixels. The kernel for lists that are not cut begins beside
-/// that for those that are, whose longest may take longest of all.
+/// C channels from `first` on, in tiles of kSide x kSide pixels. The kernel for lists that are cut is launched first,
+/// because the longest of them may outlast everything else, and the kernel for the other lists begins beside it.
 template <class F, int C, int kSide, bool kKeep>
 void launch_moving_blend_kernels(const BlendParams& p, const ListCut& cut, int first, cudaStream_t stream) {
   constexpr int kBlocks = kListedBlocks<F, kSide>;
@@ -88,7 +88,7 @@ int list_segments(int footprint, int64_t channels, TileGrid grid) {
 
 void choose_samples(const ChooseParams& p, cudaStream_t stream) { launch_choose_samples<Adaptive>(p, stream); }
 
-void blend(int footprint, const BlendParams& p, const BlendParams* cut, cudaStream_t stream) {
+void blend(int footprint, const BlendParams& p, const BlendParams* in_chunks, cudaStream_t stream) {
   visit_tile_footprints<AdaptiveBoxes>(footprint, stream, [&](auto f, cudaStream_t side) {
     using F = decltype(f);
     if constexpr (F::kMoves) {
@@ -97,7 +97,7 @@ void blend(int footprint, const BlendParams& p, const BlendParams* cut, cudaStre
       if constexpr (!F::kYardstick) {
         if (!p.channels.data) return blend_few<F, 3>(p, side);
         if (p.channels.count <= kFewChannels) return blend_few<F, 4>(p, side);
-        if (p.segments.count > 1) return blend_segments<F>(p, *cut, side);
+        if (p.segments.count > 1) return blend_segments<F>(p, *in_chunks, side);
       }
       blend_groups<F>(with_channels(p), side);
     }

@@ -1,4 +1,4 @@
-// Kernels of blend for footprints whose samples move, for lists that are cut (long_lists.cuh): a list for each pixel.
+// Kernels of blend for footprints whose samples move, for lists that are cut (cut_lists.cuh): a list for each pixel.
 //
 // In a small image of a large scene a tile of 8x8 pixels may have hundreds of thousands of splats, most of them smaller
 // than a pixel. What takes the time is the longest sequence of splats that some sample meets one after the other. So
@@ -9,8 +9,8 @@
 #pragma once
 
 #include "cuda/blend_moving.cuh"
+#include "cuda/cut_lists.cuh"
 #include "cuda/launch.cuh"
-#include "cuda/long_lists.cuh"
 
 namespace ar::cuda {
 
@@ -67,7 +67,7 @@ __device__ inline uint32_t transpose_bits(uint32_t bits) {
 
 /// A thread per pair of a list that is cut: which pixels its splat reaches.
 template <class F, int kSide> __global__ void __launch_bounds__(kFilterPiece) filter_kernel(const BlendParams params) {
-  wait_for_earlier_kernels();
+  wait_for_earlier_kernels();  // first: moving_blend_kernel, which does not wait, reads the plan
   let_next_kernel_begin();
   constexpr int kRowsOfWord = 32 / kSide, kPixels = kSide * kSide;
   constexpr int kPieces = moving_segment(F::kSamples) / kFilterPiece;  // of a segment
@@ -301,15 +301,15 @@ template <class F, int kSide> inline constexpr int kListedBlocks = ListedLayout<
 /// tile have any. There may be blocks for fewer tiles than are blended.
 template <class F, int C, int kSide, bool kKeep, int kLongFrom = kLongList>
 __global__ void __launch_bounds__(32) listed_blend_kernel(const BlendParams params, int first) {
-  let_next_kernel_begin();
+  let_next_kernel_begin();  // so that moving_blend_kernel does not wait for filter_kernel either
   wait_for_earlier_kernels();
   using Short = ListedLayout<F, kSide, false>;
   using Long = ListedLayout<F, kSide, true>;
   static_assert(Short::kThreads == 32 && Long::kThreads == 32 && Long::kBlocks % Short::kBlocks == 0);
   __shared__ ListedStage<F, C, Short::kPixels> stage;
-  const int lists = params.plan.state->counts.long_lists;
+  const int lists = params.plan.state->counts.cut_lists;
   for (int place = int(blockIdx.x) / Long::kBlocks; place < lists; place += int(gridDim.x) / Long::kBlocks) {
-    const LongList cut = params.plan.long_lists[place];
+    const CutList cut = params.plan.cut_lists[place];
     const TileList list = list_of(params.lists, params.grid, cut.tile);
     if constexpr (Short::kLanes != Long::kLanes) {
       if (list.count < kLongFrom) {

@@ -3,7 +3,7 @@
 // What a splat does to a sample depends on where the sample is when they meet, so that the chunks of a list cannot be
 // blended side by side as in blend.cuh: a block walks its whole list. What fills the device instead is that samples are
 // spread over lanes and that tiles are small where there are several. It also wastes less: the fewer pixels a warp has,
-// the fewer splats pass through it that touch only some of them. Lists that are cut (long_lists.cuh), in small images
+// the fewer splats pass through it that touch only some of them. Lists that are cut (cut_lists.cuh), in small images
 // all, have the kernels of blend_listed.cuh in its place.
 #pragma once
 
@@ -279,8 +279,8 @@ __device__ void blend_staged(Stage& stage, int from, int to, int k0, MovingBlend
 }
 
 /// A block per tile, which has nothing to do if the tile's list is cut, and one more; C channels from `first` on, of
-/// three in so few registers that an SM holds 1024 threads. `beside`: the kernels for lists that are cut, which it
-/// needs nothing of.
+/// three in so few registers that an SM holds 1024 threads. `beside`: the kernels for lists that are cut
+/// were launched just before, and may still run.
 template <class F, int C, class Layout, bool kKeep>
 __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThreads : 1)
     moving_blend_kernel(const BlendParams params, int first, bool beside) {
@@ -293,7 +293,7 @@ __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThr
   __shared__ Stage stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int tile = params.plan.tile_order[blockIdx.x];
-  const bool is_cut = int(blockIdx.x) < params.plan.state->counts.long_lists;
+  const bool is_cut = int(blockIdx.x) < params.plan.state->counts.cut_lists;
   const TileList list = list_of(params.lists, params.grid, tile);
   // With too many pairs no list is cut. The compiler needs fewer registers if both are asked here.
   if (is_cut && !list.overflow) return;
@@ -329,7 +329,7 @@ __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThr
 }
 
 /// Samples shared out so that there is least to do, forwards and backwards, in tiles of the size of moving_grid(), for
-/// lists that are not cut. In small images these are those with too many pairs.
+/// lists that are not cut. In small images none is walked as a whole unless there are more pairs than room.
 template <class F, bool kBackward, int kSide>
 using EvenLayout =
     std::conditional_t<F::kSamples == 1, CellLayout<1, 1, kSide>,

@@ -1,4 +1,4 @@
-// Segments of lists (long_lists.cuh), and what goes through them backwards, for footprints whose samples move.
+// Segments of lists (cut_lists.cuh), and what goes through them backwards, for footprints whose samples move.
 //
 // A block has a segment of a tile's list, so that long lists are differentiated side by side. What the
 // samples carry from splat to splat on the way back goes through a segment as an affine map. So one kernel finds the
@@ -9,8 +9,8 @@
 #include <algorithm>
 
 #include "cuda/blend_moving_grads.cuh"
+#include "cuda/cut_lists.cuh"
 #include "cuda/launch.cuh"
-#include "cuda/long_lists.cuh"
 
 namespace ar::cuda {
 
@@ -168,8 +168,8 @@ __global__ void __launch_bounds__(kSide* kSide) chain_maps_kernel(const BlendVjp
   constexpr int S = F::kSamples, kPixels = kSide * kSide;
   const int place = int(blockIdx.x) / S, t = int(blockIdx.x) % S * kPixels + int(threadIdx.x);
   const int number = t / S, sample = t % S;
-  if (place >= params.plan->counts.long_lists) return;
-  const LongList cut = params.long_lists[place];
+  if (place >= params.plan->counts.cut_lists) return;
+  const CutList cut = params.cut_lists[place];
   const TileList list = list_of(params.lists, params.grid, cut.tile);
   const Pixel pixel(list, params.grid, {float(number % kSide), float(number / kSide)});
   if (!pixel.inside) return;

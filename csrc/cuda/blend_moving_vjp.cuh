@@ -16,13 +16,13 @@
 #include "cuda/blend_moving_grads.cuh"
 #include "cuda/blend_moving_maps.cuh"
 #include "cuda/blend_moving_sums.cuh"
+#include "cuda/cut_lists.cuh"
 #include "cuda/launch.cuh"
-#include "cuda/long_lists.cuh"
 
 namespace ar::cuda {
 
 /// Blocks that an SM should hold: bounds the registers, as waiting for the samples in front costs more than a few
-/// numbers in memory. With many cells in large images fewer, since the caches do not hold the places of all those.
+/// numbers in memory. With many cells in whole lists fewer, since the caches do not hold the places of all those.
 template <class F, int C, class Layout, int kSegment>
 inline constexpr int kMovingVjpBlocks = std::max(1, (C > 3                              ? 512
                                                      : F::kSamples > 4 && kSegment == 0 ? 768

@@ -82,10 +82,10 @@ __device__ void walk_segment(const Splat<F, float>* splats, const Channels<float
 }
 
 /// A block per tile and segment. Writes what the segment adds to the channels [first, first + C) of each pixel, times
-/// the samples. `cut`: of the kernels that went first.
+/// the samples. `in_chunks`: of the kernels that went first.
 template <class F, int C>
 __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
-    segment_blend_kernel(const BlendParams params, const BlendParams cut, int first) {
+    segment_blend_kernel(const BlendParams params, const BlendParams in_chunks, int first) {
   wait_for_earlier_kernels();
   constexpr int S = F::kSamples;
   const Segments& segments = params.segments;
@@ -93,7 +93,7 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
   if (place < 0) return;
   const Segment<S> segment(params.lists, params.grid, params.plan.tile_order[place], int(blockIdx.x) % segments.count,
                            segments.count, params.last);
-  const PixelCheckpoints<S, 3, true> checkpoints(cut, segment.tile, int(threadIdx.x));
+  const PixelCheckpoints<S, 3, true> checkpoints(in_chunks, segment.tile, int(threadIdx.x));
   using Share = ChannelShare<C>;
   float transmittance[S];
   Share sums = {};
@@ -142,15 +142,15 @@ __global__ void __launch_bounds__(kTilePixels) segment_sum_kernel(const BlendPar
   }
 }
 
-/// `cut`: parameters of the kernels that go first, for the three colours in the splats, as for a backward pass.
-template <class F> void blend_segments(const BlendParams& p, const BlendParams& cut, cudaStream_t stream) {
-  blend_few<F, 3>(cut, stream);
+/// `in_chunks`: parameters of the kernels that go first, for the three colours in the splats, as for a backward pass.
+template <class F> void blend_segments(const BlendParams& p, const BlendParams& in_chunks, cudaStream_t stream) {
+  blend_few<F, 3>(in_chunks, stream);
   const unsigned tiles = unsigned(p.grid.tiles());
   for (int first = 0, width; first < p.channels.count; first += width) {
     width = group_width<F>(p.channels.count - first);
     const auto kernel =
         width == kSmallGroup ? segment_blend_kernel<F, kSmallGroup> : segment_blend_kernel<F, kChannelGroup>;
-    launch(kernel, {tiles * p.segments.count, kBlendThreads}, stream, p, cut, first);
+    launch(kernel, {tiles * p.segments.count, kBlendThreads}, stream, p, in_chunks, first);
     launch(segment_sum_kernel<F::kSamples>, {tiles, kTilePixels}, stream, p, first, width);
   }
 }

@@ -247,7 +247,7 @@ template <int S, class Params> __device__ int tile_place(const Params& params, i
 }
 
 /// The tile of block `block` of a kernel of blend_vjp for tiles with S samples whose lists are walked as a whole; -1 if
-/// there is none. Where lists are cut, their segments are counted as blocks before.
+/// there is none. Where lists are cut, `block` is the number of their segments plus the place among the other lists.
 template <int S> __device__ int listed_tile(const BlendVjpParams& params, int block) {
   const SampleParts& tiles = params.plan->counts.chunks;  // a chunk is a tile's whole list
   const int place = tiles.first[sample_class(S)] + block;

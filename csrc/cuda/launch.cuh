@@ -1,8 +1,13 @@
 // How the host launches kernels, and how kernels begin.
 //
 // A kernel may be put on the device while the one before it on the stream ends (programmatic stream serialization),
-// which saves 1 to 2 us for each. So that it touches nothing before then, every kernel begins by
+// which saves 1 to 2 us for each. So that it touches nothing before then, every kernel but one begins by
 // wait_for_earlier_kernels(): all of its threads, since the next kernel waits for this one alone.
+//
+// The exception is a kernel that works beside the one before it, B beside A. A calls let_next_kernel_begin(), so that B
+// is put on the device when all blocks of A are, and B does not wait. What B reads has to be complete by then. So of
+// the kernels in front of B, one waits before it lets the next begin: all before that one have ended when any after it
+// begins. And B ends after A, for the kernel behind B waits for B alone (begin_beside_earlier_kernels).
 #pragma once
 
 #include <cuda_runtime.h>
@@ -21,7 +26,7 @@ __device__ inline void wait_for_earlier_kernels() {
 }
 
 /// Lets the next kernel on the stream begin beside this one, as soon as all blocks of this one have come here or ended.
-/// It still waits at wait_for_earlier_kernels().
+/// At wait_for_earlier_kernels() it waits until this one has ended all the same.
 __device__ inline void let_next_kernel_begin() {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
   asm volatile("griddepcontrol.launch_dependents;" ::: "memory");

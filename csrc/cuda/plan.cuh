@@ -93,13 +93,13 @@ template <class Of> __device__ int size_of_class(const PlanState& state, Of&& of
   return size;
 }
 
-/// The lists that are cut: of the classes of long lists the first ones, as many as there is room for.
-struct CutLists {
+/// The lists that are cut: those of the first classes of long lists, as many as make no more than so many segments.
+struct CutClasses {
   int lists = 0, segments = 0;
   int chunks_of_class;  ///< of this thread's class: what was counted, or a chunk for each list where they are not cut
 
   /// `lists_of_class`, `counted`: of this thread's class. All threads of a block must call it.
-  __device__ CutLists(const ListCut& cut, const TileLists& tile_lists, int lists_of_class, int counted)
+  __device__ CutClasses(const ListCut& cut, const TileLists& tile_lists, int lists_of_class, int counted)
       : chunks_of_class(counted) {
     const int64_t pairs = tile_lists.counts->pairs;
     if (cut.max_segments == 0 || pairs > tile_lists.capacity) return;
@@ -107,7 +107,7 @@ struct CutLists {
     const bool are_long = int(threadIdx.x) % kLengthClasses <= __clz(cut.long_from(pairs));
     int all;
     const int up_to = counted + sum_before<kWarps>(are_long ? counted : 0, 0, all);
-    const bool are_cut = are_long && up_to <= cut.max_segments;
+    const bool are_cut = are_long && up_to <= min(int64_t(cut.max_segments), cut.segment_limit(pairs));
     if (are_long && !are_cut) chunks_of_class = lists_of_class;
     sum_before<kWarps>(are_cut ? lists_of_class : 0, 0, lists);
     sum_before<kWarps>(are_cut ? counted : 0, 0, segments);
@@ -169,22 +169,22 @@ __global__ void __launch_bounds__(kPlanThreads)
   const int rest_place = take_place(placed.chunks, rest_class, rest > 0);
   const int tiles_of_class = size_of_class(*plan.state, [](auto& sizes) { return sizes.tiles; });
   const int chunks_of_class = size_of_class(*plan.state, [](auto& sizes) { return sizes.chunks; });
-  const CutLists cut_lists(cut, lists, tiles_of_class, chunks_of_class);
+  const CutClasses cut_classes(cut, lists, tiles_of_class, chunks_of_class);
   find_begins(tiles_of_class, begins.tiles, counts.tiles);
-  find_begins(cut_lists.chunks_of_class, begins.chunks, counts.chunks);
+  find_begins(cut_classes.chunks_of_class, begins.chunks, counts.chunks);
   __syncthreads();
   const int of_chunk = layout.planes(samples);
   const TileChunk first = {tile, 0, plane - layout.first_chunk(grid, samples) * of_chunk};
   const int place = begins.tiles[tile_class] + tile_place;
-  const bool is_cut = planned.is_long && begins.tiles[tile_class] < cut_lists.lists;
+  const bool is_cut = planned.is_long && begins.tiles[tile_class] < cut_classes.lists;
   const ChunkRun as_one = {begins.chunks[tile_class] + tile_place, 0, min(full, 1)};
   const ChunkRun run = planned.is_long && !is_cut ? as_one : ChunkRun{begins.chunks[full_class] + full_place, 0, full};
   if (valid) {
     plan.tile_order[place] = tile;
     plan.tile_planes[tile] = plane;
-    if (is_cut) plan.long_lists[place] = {tile, run.place, full};
+    if (is_cut) plan.cut_lists[place] = {tile, run.place, full};
   }
-  if (i == 0) counts.long_lists = cut_lists.lists, counts.segments = cut_lists.segments;
+  if (i == 0) counts.cut_lists = cut_classes.lists, counts.segments = cut_classes.segments;
   write_run(plan.chunk_order, run, first, of_chunk);
   if (rest > 0) plan.chunk_order[begins.chunks[rest_class] + rest_place] = {tile, full, first.plane + full * of_chunk};
   write_run(plan.tail, {tail_place, front, front + tail}, first, of_chunk);

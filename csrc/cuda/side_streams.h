@@ -19,7 +19,8 @@ template <int kCount> class SideStreams {
   SideStreams(const SideStreams&) = delete;
   ~SideStreams() { wait_for_all(); }
   /// What the caller's stream is given from now on waits until all of the others have come so far. A kernel that one of
-  /// them is given next is then placed on the device first, not behind all blocks of one on the caller's.
+  /// them is given next is then usually placed on the device first, not behind all blocks of one on the caller's. No
+  /// result depends on it, and in a captured graph it does nothing.
   void begin_first() const { wait_for_all(); }
   /// The caller's for k = 0, then the others in turn.
   cudaStream_t stream(int k) const { return k == 0 ? caller_ : own_.streams[(k - 1) % kCount]; }

@@ -77,13 +77,23 @@ AR_HD constexpr int state_planes(int samples) { return 3 * samples; }
 /// How plan_chunks cuts the lists of tiles into chunks.
 struct ListCut {
   bool whole;  ///< a chunk is a whole list, unless that is long; else it has chunk_length pairs, and no list is long
-  /// Long lists have `at_least` pairs, a power of two, and also 1/`shares` of the pairs of all lists. With 0 all are
-  /// long. They are cut into chunks of `segment` pairs, called segments, that are worked on side by side.
+  /// Long lists are cut into chunks of `segment` pairs, called segments, that are worked on side by side. Lists are
+  /// long from long_from() pairs on, which `at_least` and `shares` decide; with at_least 0 all are.
   int at_least = 0, shares = 1, segment = 0;
-  /// Segments and lists for which there is room. With less than all would need only the longest are cut, with 0 none.
+  /// Segments and lists for which there is memory: for all that may be cut. Without any no list is.
   int max_segments = 0, max_lists = 0;
 
-  /// The number of pairs from which on a list is long, where there are `pairs` in all: a power of two, or 0.
+  /// The most segments that are made where all lists together have so many pairs. If the long lists need more, only the
+  /// longest of them are cut. It does not depend on how much memory there is, so that the same lists are always cut in
+  /// the same way.
+  AR_HD int64_t segment_limit(int64_t pairs) const {
+    constexpr int kAlways = 4096, kPairsForEach = 4;  // in addition those of one pair in four
+    if (at_least == 0) return max_segments;
+    const int64_t all = pairs / segment + pairs / at_least, few = kAlways + pairs / segment / kPairsForEach;
+    return all < few ? all : few;
+  }
+  /// The number of pairs from which on a list is long, where there are `pairs` in all: at_least, doubled until it is no
+  /// smaller than pairs / shares. So it is a power of two, or 0.
   AR_HD int long_from(int64_t pairs) const {
     int64_t from = at_least;
     while (from > 0 && from < pairs / shares) from *= 2;
@@ -115,7 +125,7 @@ struct PlanCounts {
   int32_t planes, tail;       ///< planes of checkpoints; chunks behind the front ones
   SampleParts tiles, chunks;  ///< of the plan's orders
   /// Lists that are cut, which are the first of ChunkPlan::tile_order, and their segments, the first of chunk_order.
-  int32_t long_lists, segments;
+  int32_t cut_lists, segments;
   /// Tiles that the front chunks left with an open sample and pairs, by sample_class: those of different samples are
   /// blended side by side.
   int32_t open_tiles[kSampleClasses];
@@ -209,12 +219,12 @@ struct TileChunk {
   int32_t plane;  ///< first plane of its checkpoints, if the tile has any
 };
 
-/// A list that is cut into segments.
-struct LongList {
+/// A list that is cut into segments (ListCut).
+struct CutList {
   int32_t tile;
   int32_t first, segments;  ///< the place of the first of its segments, which follow each other, and how many there are
 };
-static_assert(sizeof(LongList) == sizeof(TileChunk), "they are rows of one array");
+static_assert(sizeof(CutList) == sizeof(TileChunk), "they are rows of one array");
 
 /// How the state of a tile's pixels between chunks lies in memory: planes of kTile^2 floats. For a backward pass a
 /// chunk's planes hold, for each sample and pixel, its channels and its transmittance. Without one they are the
@@ -252,10 +262,11 @@ struct ChunkPlan {
   int32_t* tile_order;     ///< [tiles] by samples, longest first
   int32_t* tile_planes;    ///< [tiles] first plane of a tile's checkpoints, if it has any
   TileChunk* tail;         ///< [counts.tail] chunks behind the front ones, or null where chunks are whole lists
-  LongList* long_lists;    ///< [counts.long_lists] in the order of their tiles in tile_order, or null
+  CutList* cut_lists;      ///< [counts.cut_lists] in the order of their tiles in tile_order, or null
 };
 
-/// The parts of a tile's list that are blended side by side where many channels meet few tiles.
+/// The parts of a tile's list that are blended side by side where many channels meet few tiles. They are not those of
+/// ListCut.
 struct Segments {
   int count;             ///< of each tile; 1: the list is walked as one, and there is nothing else here
   int samples;           ///< the most that a tile has
@@ -297,7 +308,7 @@ struct InspectParams : ar::InspectParams<float> {
 struct BlendVjpParams : ar::BlendVjpParams<float> {
   TileLists lists;
   const TileChunk* chunk_order;
-  const LongList* long_lists;
+  const CutList* cut_lists;
   const PlanState* plan;
   int64_t max_chunks;
   int32_t* chunks_taken;  ///< [kSampleClasses] set to zero by blend_vjp; chunks of a class that warps have begun with
@@ -391,10 +402,10 @@ int list_segments(int footprint, int64_t channels, TileGrid grid);
 constexpr int compiled_channels(bool in_splats) { return in_splats ? 3 : kFewChannels; }
 /// Only for a footprint that chooses.
 void choose_samples(const ChooseParams& p, cudaStream_t stream);
-/// Without p.channels.data the three colours in the splats. `cut`: only where lists have several segments, parameters
-/// to blend the splats' three colours with as for a backward pass; their transmittance, last and alpha are those of
-/// `p`.
-void blend(int footprint, const BlendParams& p, const BlendParams* cut, cudaStream_t stream);
+/// Without p.channels.data the three colours in the splats. `in_chunks`: only where lists have several segments,
+/// parameters to blend the splats' three colours with as for a backward pass; their transmittance, last and alpha are
+/// those of `p`.
+void blend(int footprint, const BlendParams& p, const BlendParams* in_chunks, cudaStream_t stream);
 /// Width of the group that the first of `left` channels are in, where there are more than kFewChannels in all.
 int channel_group(int footprint, int left);
 /// The group of channels that begins with `first`; 0 where they are few.

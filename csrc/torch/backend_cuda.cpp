@@ -228,7 +228,7 @@ class CudaBackend final : public Backend {
                      const ChannelTensors& channels, const ImageTensors& dL_dimage, MeanSums mean_sums) override {
     check_counts(lists);
     const cuda::ListCut cut = cut_of(lists, pass, channels);
-    check_plan(state, cut);
+    check_plan(state, cut, pass.grid);
     const int64_t n = lists.ids.numel(), rows = std::max(lists.pairs.size(0), n);
     const int count = int(channels.count);
     PairSums out;
@@ -244,7 +244,7 @@ class CudaBackend final : public Backend {
     p.plan = const_structs_of<cuda::PlanState>(state.chunks);
     p.chunk_order = const_structs_of<cuda::TileChunk>(state.chunks) + kPlanRows;
     p.max_chunks = state.chunks.size(0) - kPlanRows - cut.max_lists;
-    p.long_lists = reinterpret_cast<const cuda::LongList*>(p.chunk_order + p.max_chunks);
+    p.cut_lists = reinterpret_cast<const cuda::CutList*>(p.chunk_order + p.max_chunks);
     const Tensor chunks_taken = at::empty({cuda::kSampleClasses}, ints_);
     p.chunks_taken = pointer<int32_t>(chunks_taken);
     p.checkpoints = const_pointer<float>(state.checkpoints);
@@ -382,7 +382,7 @@ class CudaBackend final : public Backend {
     parts.set(p);
     p.plan.state = structs_of<cuda::PlanState>(state.chunks);
     p.plan.chunk_order = structs_of<cuda::TileChunk>(state.chunks) + kPlanRows;
-    p.plan.long_lists = reinterpret_cast<cuda::LongList*>(p.plan.chunk_order + chunks + tiles);
+    p.plan.cut_lists = reinterpret_cast<cuda::CutList*>(p.plan.chunk_order + chunks + tiles);
     p.checkpoints = pointer<float>(state.checkpoints);
     cuda::plan_chunks(p.lists, pass.grid, footprint.samples, cut, p.layout, p.plan, stream_);
     check_stage("plan_chunks", pass.debug);

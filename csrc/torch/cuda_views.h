@@ -156,10 +156,13 @@ inline void check_counts(const ListTensors& lists) {
   TORCH_CHECK_VALUE(lists.counts.numel() == kCountsWidth, "counts must be what bin returned, got shape ",
                     lists.counts.sizes());
 }
-inline void check_plan(const BlendState& state, const cuda::ListCut& cut) {
+inline void check_plan(const BlendState& state, const cuda::ListCut& cut, TileGrid grid) {
   const Tensor& chunks = state.chunks;
-  TORCH_CHECK_VALUE(chunks.dim() == 2 && chunks.size(0) >= kPlanRows + cut.max_lists && chunks.size(1) == kChunkWidth &&
-                        chunks.scalar_type() == at::kInt && state.checkpoints.scalar_type() == at::kFloat,
+  // Of whole lists it is known how many rows there are.
+  const int64_t rows = kPlanRows + (cut.whole ? cut.max_segments + grid.tiles() + cut.max_lists : 0);
+  TORCH_CHECK_VALUE(chunks.dim() == 2 && (cut.whole ? chunks.size(0) == rows : chunks.size(0) >= rows) &&
+                        chunks.size(1) == kChunkWidth && chunks.scalar_type() == at::kInt &&
+                        state.checkpoints.scalar_type() == at::kFloat,
                     "chunks and checkpoints must be what blend saved, got shape ", chunks.sizes());
 }
 inline void check_segments(const cuda::Segments& segments, TileGrid grid, const BlendState& state) {

@@ -54,7 +54,7 @@ struct Plan {
   PlanState state;
   std::vector<TileChunk> chunks;
   std::vector<int32_t> order, planes;
-  std::vector<LongList> lists;
+  std::vector<CutList> lists;
   ChunkPlan view = {};
 
   template <class F>
@@ -67,7 +67,7 @@ struct Plan {
     view.chunk_order = chunks.data();
     view.tile_order = order.data();
     view.tile_planes = planes.data();
-    view.long_lists = lists.data();
+    view.cut_lists = lists.data();
     cuda_on_host::launch(PlanState::kCounters, kCountWorkThreads,
                          [&] { count_work_kernel(scene.lists, scene.grid.tiles(), F::kSamples, cut, &state); });
     cuda_on_host::launch(1, kPlanThreads,
@@ -141,7 +141,7 @@ Results run(Scene<F>& scene, int long_from = 0) {
   vjp.lists = scene.lists;
   vjp.plan = &plan_back.state;
   vjp.chunk_order = plan_back.chunks.data();
-  vjp.long_lists = plan_back.lists.data();
+  vjp.cut_lists = plan_back.lists.data();
   vjp.checkpoints = checkpoints.data();
   vjp.pair_grads = out.pair_grads.data();
   vjp.mean_sums = MeanSums::kNorm;

@@ -8,7 +8,7 @@
 // After it: kernels.
 #include <gtest/gtest.h>
 
-#include "cuda/long_lists.cuh"
+#include "cuda/cut_lists.cuh"
 #include "cuda/plan.cuh"
 
 namespace ar::cuda {
@@ -22,6 +22,7 @@ struct Case {
   bool chosen, keep;
   ListCut cut;
   bool overflow = false, expect_cut = false;
+  int64_t more_room = 0;  ///< pairs
 };
 
 /// Whether lists of n pairs are cut: those that are long, while there is room for those of their class and longer ones.
@@ -31,7 +32,7 @@ bool is_cut(const Case& c, const std::vector<int>& lists, int64_t pairs, int n) 
   for (int other : lists) {
     if (class_of(1, other) <= class_of(1, n)) segments += (other + c.cut.segment - 1) / c.cut.segment;
   }
-  return segments <= c.cut.max_segments;
+  return segments <= std::min<int64_t>(c.cut.max_segments, c.cut.segment_limit(pairs));
 }
 
 void expect_planned(const Case& c) {
@@ -49,30 +50,30 @@ void expect_planned(const Case& c) {
   TileLists lists = {};
   lists.tile_offsets = offsets.data();
   lists.counts = &counts;
-  lists.capacity = c.overflow ? offsets.back() - 1 : offsets.back();
+  lists.capacity = c.overflow ? offsets.back() - 1 : offsets.back() + c.more_room;
   if (c.chosen) lists.tile_samples = samples.data();
   const auto pairs = [&](int tile) { return c.overflow ? 1 : int(offsets[tile + 1] - offsets[tile]); };
   std::vector<int> all_pairs;
   for (int tile = 0; tile < tiles; ++tile) all_pairs.push_back(pairs(tile));
-  std::map<int, bool> cut_lists;  // by their lengths
+  std::map<int, bool> cut_by_length;  // by their lengths
   for (int n : all_pairs) {
-    if (cut_lists.count(n) == 0) cut_lists[n] = is_cut(c, all_pairs, offsets.back(), n);
+    if (cut_by_length.count(n) == 0) cut_by_length[n] = is_cut(c, all_pairs, offsets.back(), n);
   }
   const bool whole = c.cut.whole;
   const auto length = [&](int tile) {
-    return cut_lists[pairs(tile)] ? c.cut.segment : whole ? kWholeList : chunk_length(samples[tile]);
+    return cut_by_length[pairs(tile)] ? c.cut.segment : whole ? kWholeList : chunk_length(samples[tile]);
   };
 
   const CheckpointLayout layout = {3, c.keep};
   std::vector<TileChunk> chunk_order(size_t(tiles + offsets.back() / chunk_length(1) + c.cut.max_segments));
   std::vector<TileChunk> tail(chunk_order.size());
-  std::vector<LongList> long_lists(size_t(c.cut.max_lists));
+  std::vector<CutList> cut_lists(size_t(c.cut.max_lists));
   std::vector<int32_t> tile_order(tiles, -1), tile_planes(tiles, -1);
   PlanState state;
   std::memset(&state, 0x55, sizeof state);  // nothing need be zero
   ChunkPlan plan = {
-      &state,           chunk_order.data(), tile_order.data(), tile_planes.data(), whole ? nullptr : tail.data(),
-      long_lists.data()};
+      &state,          chunk_order.data(), tile_order.data(), tile_planes.data(), whole ? nullptr : tail.data(),
+      cut_lists.data()};
   cuda_on_host::launch(PlanState::kCounters, kCountWorkThreads,
                        [&] { count_work_kernel(lists, tiles, kMostSamples, c.cut, &state); });
   cuda_on_host::launch((tiles + kPlanThreads - 1) / kPlanThreads, kPlanThreads,
@@ -130,14 +131,14 @@ void expect_planned(const Case& c) {
   EXPECT_EQ(int(used.size()), planes);
   // Lists that are cut come first, and so do their segments, one list after the other.
   int long_count = 0;
-  for (int n : all_pairs) long_count += cut_lists[n];
-  ASSERT_EQ(made.long_lists, long_count);
+  for (int n : all_pairs) long_count += cut_by_length[n];
+  ASSERT_EQ(made.cut_lists, long_count);
   EXPECT_EQ(long_count > 0, c.expect_cut);
   std::vector<bool> seen(size_t(made.segments), false);
   for (int k = 0; k < long_count; ++k) {
-    const LongList& list = long_lists[k];
+    const CutList& list = cut_lists[k];
     EXPECT_EQ(list.tile, tile_order[k]);
-    EXPECT_TRUE(cut_lists[pairs(list.tile)]);
+    EXPECT_TRUE(cut_by_length[pairs(list.tile)]);
     EXPECT_EQ(list.segments, (pairs(list.tile) + c.cut.segment - 1) / c.cut.segment);
     for (int segment = 0; segment < list.segments; ++segment) {
       ASSERT_LT(list.first + segment, made.segments);
@@ -178,8 +179,8 @@ TEST(PlanKernels, CutsLongLists) {
   expect_planned({kSmall, 5000, false, true, {true, 1024, 1 << 20, 512, kMost, 1000}, false, true});
 }
 TEST(PlanKernels, CutsWhatIsLongerThanAFairShare) {
-  // There are some 200,000 pairs.
-  ASSERT_EQ((ListCut{true, 256, 100}.long_from(200000)), 2048);
+  // There are some 100,000 pairs.
+  ASSERT_EQ((ListCut{true, 256, 100}.long_from(100000)), 1024);
   expect_planned({kSmall, 5000, false, true, {true, 256, 100, 128, kMost, 1000}, false, true});
 }
 TEST(PlanKernels, CutsAllLists) {
@@ -187,6 +188,12 @@ TEST(PlanKernels, CutsAllLists) {
 }
 TEST(PlanKernels, CutsTheLongestIfThereIsNoRoomForMore) {
   expect_planned({kSmall, 5000, false, true, {true, 256, 1 << 20, 128, 400, 1000}, false, true});
+}
+TEST(PlanKernels, CutsTheSameListsHoweverMuchRoomThereIs) {
+  // Some 100,000 pairs would make 12,000 segments.
+  const ListCut cut = {true, 16, 1 << 20, 8, kMost, 1000};
+  ASSERT_LT(cut.segment_limit(100000), 8000);
+  for (const int64_t more_room : {0, 1 << 20}) expect_planned({kSmall, 5000, false, true, cut, false, true, more_room});
 }
 TEST(PlanKernels, CutsNothingWithoutRoom) {
   expect_planned({kSmall, 5000, false, true, {true, 256, 1 << 20, 128, 4, 1000}});
@@ -212,6 +219,9 @@ TEST(PlanKernels, HaveRoomForTheSegmentsOfLongLists) {
     EXPECT_GE(many.max_segments, pairs / 4 / segment + kBlocksAtOnce);  // no more lists are that long
     EXPECT_LT(many.max_segments, pairs / 3 / segment);
     EXPECT_GE(many.max_lists, std::min<int64_t>(many.max_segments / of_long_list, kLarge.tiles()));
+    // With more room, as after a frame with more pairs, as many segments of the same pairs are made.
+    EXPECT_GT(moving_list_cut(samples, 2 * pairs, kLarge).max_segments, many.max_segments);
+    EXPECT_EQ(moving_list_cut(samples, 2 * pairs, kLarge).segment_limit(pairs), many.max_segments);
   }
 }
 TEST(PlanKernels, CutsNothingWithMorePairsThanRoom) {

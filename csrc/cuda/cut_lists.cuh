@@ -29,20 +29,21 @@ AR_HD constexpr int moving_segment(int samples) { return samples <= 4 ? 512 : 10
 
 /// In small images all lists are cut: their few tiles have long ones, and the time is that of the longest. Large ones
 /// have many tiles that keep a device busy, and to cut a list takes more work than to walk it. There only those are cut
-/// that a block would still walk when all others have ended: of so many pairs or more, and no fewer than the share that
-/// each of so many blocks has which a large device holds at once.
-inline constexpr int kLongList = 4096, kBlocksAtOnce = 528;
-/// In large images there is room for so many segments, and those of one in so many pairs. If more pairs are in long
-/// lists, these are many, and keep a device busy.
-inline constexpr int kLongSegments = 4096, kPairsForEachCut = 4;
+/// that a block would still walk when all others have ended. A large device holds 528 blocks of 256 threads at once,
+/// four on each of 132 multiprocessors, and each of them walks 1/528 of the pairs. So the limit is kLongList, doubled
+/// until it is at least pairs / kBlocksAtOnce.
+inline constexpr int kLongList = 4096;
+inline constexpr int kBlocksAtOnce = 528;
 
 inline ListCut moving_list_cut(int samples, int64_t capacity, TileGrid grid) {
   const int length = moving_segment(samples);
   const int64_t segments = capacity / length, lists = capacity / kLongList;
   if (is_small_image(grid)) return {true, 0, 1, length, int(segments + grid.tiles()), int(grid.tiles())};
   if (lists == 0) return {true};
-  const int64_t room = std::min(segments + lists, kLongSegments + segments / kPairsForEachCut);
-  return {true, kLongList, kBlocksAtOnce, length, int(room), int(std::min(room / (kLongList / length), grid.tiles()))};
+  ListCut cut = {true, kLongList, kBlocksAtOnce, length};
+  cut.max_segments = int(cut.segment_limit(capacity));
+  cut.max_lists = int(std::min<int64_t>(cut.max_segments / (kLongList / length), grid.tiles()));
+  return cut;
 }
 
 }  // namespace ar::cuda
