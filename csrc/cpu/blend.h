@@ -62,7 +62,7 @@ AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* color
       const IndexOf<V> index(int32_t(first + i - begin + 1));
       for_each_pack(batch[i].reach, open, [&](int pixel) AR_HD_LAMBDA {
         const Vec2<V> at = {load(of_tile.x + pixel, V()), load(of_tile.y + pixel, V())};
-        V contribution(T(0));
+        V contribution(T(-0.0));  // the compiler knows that -0 + x is x
         if constexpr (P::kMoves) {
           const Vec2<V> z = P::whitened(terms, at, 0);
           bool hit = false;

@@ -41,6 +41,10 @@ template <class P, typename T> struct TilePlaces<P, T, true> {
   }
 
   AR_HD Bounds<V> bounds(int s) const {
+    if constexpr (kSamples == kGroup) {  // loops over samples are unrolled: s is a constant, and so are the bounds
+      const Bounds<T> cell = P::template cell<T>(s);
+      return {{V(cell.lo.x), V(cell.lo.y)}, {V(cell.hi.x), V(cell.hi.y)}};
+    }
     return {{V(cells[s].lo.x), V(cells[s].lo.y)}, {V(cells[s].hi.x), V(cells[s].hi.y)}};
   }
 
