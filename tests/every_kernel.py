@@ -25,7 +25,8 @@ from analytic_rasterizer.losses import l1_ssim, ssim
 
 
 class Image(NamedTuple):
-    """Of so many Gaussians, faint ones unless said otherwise; the others as for `scenes.random_scene`."""
+    """Of so many Gaussians, faint ones unless said otherwise; the others as for `scenes.random_scene`. With `around`
+    so many more, all over the picture."""
 
     width: int
     height: int
@@ -33,13 +34,16 @@ class Image(NamedTuple):
     opacity: tuple[float, float] = (0.004, 0.05)
     sigma: tuple[float, float] = (0.01, 0.5)
     spread: float = 1.5
+    around: int = 0
 
     def camera(self) -> scenes.Camera:
         return scenes.Camera(image_width=self.width, image_height=self.height)
 
     def scene(self, device: str) -> dict[str, torch.Tensor]:
         numbers = {"opacity": self.opacity, "sigma": self.sigma, "spread": self.spread}
-        return scenes.cast(scenes.random_scene(1, self.count, degree=3, **numbers), torch.float32, device)
+        scene = scenes.random_scene(1, self.count, degree=3, **numbers)
+        around = scenes.random_scene(2, self.around, degree=3, opacity=self.opacity, spread=1.5)
+        return scenes.cast({k: torch.cat([v, around[k]]) for k, v in scene.items()}, torch.float32, device)
 
 
 # 512x512 pixels are 4096 tiles of 8x8: enough for the kernels of large images. Lists of thousands of splats have chunks
@@ -49,7 +53,7 @@ class Image(NamedTuple):
 # test_every_kernel_has_images_that_need_it in test_benchmarks.py asserts all this.
 IMAGES = {
     "large": Image(512, 512, 600),
-    "large, few tiles": Image(512, 512, 18000, opacity=(0.004, 0.2), sigma=(0.001, 0.02), spread=0.04),
+    "large, few tiles": Image(512, 512, 18000, opacity=(0.004, 0.2), sigma=(0.001, 0.02), spread=0.04, around=300),
     "large, opaque": Image(512, 512, 1500, opacity=(0.3, 0.99), sigma=(0.02, 0.1), spread=0.3),
     "small": Image(40, 30, 12000, spread=0.5),
     "small, opaque": Image(40, 30, 1000, opacity=(0.3, 0.99), sigma=(0.1, 0.5)),
@@ -63,7 +67,9 @@ def render(device: str, channels: int = 3, images: Sequence[str] = tuple(IMAGES)
         leaves = scenes.leaves(image.scene(device))
         if channels != 3:
             del leaves["shs"]
-            leaves["colors_precomp"] = torch.rand(image.count, channels, device=device, requires_grad=True)
+            leaves["colors_precomp"] = torch.rand(
+                image.count + image.around, channels, device=device, requires_grad=True
+            )
         fields = image.camera().fields(torch.float32, device)
         fields |= {"sh_degree": 3, "bg": torch.zeros(channels, device=device)}
         rasterizer = ar.GaussianRasterizer(ar.GaussianRasterizationSettings(**fields, **settings))

@@ -555,7 +555,7 @@ def test_every_kernel_has_images_that_need_it(footprint, options):
     """What its comment says of lists and of pixels that close."""
     program = importlib.import_module("every_kernel")
     long_list = re.search(r"kLongList = (\d+);", (ROOT / "csrc" / "cuda" / "cut_lists.cuh").read_text())[1]
-    longest, most_in_8, closed = {}, {}, {}
+    longest, most_in_8, closed, short = {}, {}, {}, {}
     for name, image in program.IMAGES.items():
         settings = image.camera().settings(torch.float32, footprint=footprint, **options)._replace(sh_degree=3)
         leaves = scenes.leaves(image.scene("cpu"))
@@ -564,7 +564,8 @@ def test_every_kernel_has_images_that_need_it(footprint, options):
         lists = ar.bin(splats)
         of_camera = lists.of_camera()
         ar.blend(splats, lists)[0].sum().backward()
-        longest[name] = int(of_camera["tile_offsets"].diff().max())
+        lists = of_camera["tile_offsets"].diff()
+        longest[name], short[name] = int(lists.max()), int(((lists > 0) & (lists < int(long_list))).sum())
         # With its mean in a tile of 8x8 px, a splat that has pairs has one with that tile.
         listed = splats.means2d.detach()[of_camera["pairs"].long().unique()]
         tiles = ((listed + 0.5) / 8).floor()
@@ -575,5 +576,5 @@ def test_every_kernel_has_images_that_need_it(footprint, options):
     large = [image for name, image in program.IMAGES.items() if name.startswith("large")]
     assert all((image.width // 8) * (image.height // 8) >= 4096 for image in large)
     assert most_in_8["small"] > int(long_list) and longest["small"] > int(long_list)
-    assert most_in_8["large, few tiles"] > int(long_list)
+    assert most_in_8["large, few tiles"] > int(long_list) and short["large, few tiles"] > 100
     assert closed["large, opaque"] > 100 and closed["small, opaque"] > 100
