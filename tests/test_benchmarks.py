@@ -499,6 +499,49 @@ def test_order_of_each_ray(small_scene):
     assert (by_ray[left][0] > by_ray[left][1]) != (by_ray[right][0] > by_ray[right][1])
 
 
+def test_timeline_of_a_trace(small_scene):
+    """What is no kernel, and what the pass was queued behind, is left out; * marks what runs beside something else."""
+    timeline = importlib.import_module("timeline")
+    events = [
+        ("at::native::spin_kernel(long)", 7, 50.0, 30.0),
+        ("void ar::cuda::blend_kernel<ar::Point, 3>(ar::cuda::BlendParams)", 7, 100.0, 40.0),
+        ("ar::cuda::zero_kernel(int)", 13, 110.0, 60.0),
+        ("ar::cuda::project_kernel(int)", 7, 139.0, 5.0),
+        ("ar::cuda::last_kernel(int)", 7, 169.5, 8.5),
+    ]
+    trace = [{"cat": "kernel", "name": n, "ts": ts, "dur": d, "args": {"stream": s}} for n, s, ts, d in events]
+    trace = {"traceEvents": [{"cat": "cpu_op", "name": "x", "ts": 0.0}, {"name": "process_name"}, *trace[::-1]]}
+    header, *rows = timeline.format_kernels(timeline.kernels_of(trace)).split("\n")
+    assert header.split() == ["kernel", "begins", "ends", "takes", "stream"]
+    assert [row.rsplit(maxsplit=4)[1:] for row in rows] == [
+        ["0.0", "40.0", "40.0", "7*"],
+        ["10.0", "70.0", "60.0", "13*"],
+        ["39.0", "44.0", "5.0", "7*"],
+        ["69.5", "78.0", "8.5", "7"],
+    ]
+    assert rows[0].startswith("blend_kernel<Point, 3>(BlendParams)")
+    assert timeline.kernels_of({"traceEvents": []}) == []
+
+
+def test_timeline(small_scene, monkeypatch, capsys):
+    """Also without a device, where it says so."""
+    timeline = importlib.import_module("timeline")
+    arguments = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--view", 1, "--sh-degree", 3]
+    monkeypatch.setattr(sys, "argv", ["timeline.py", *map(str, arguments)])
+    if not torch.cuda.is_available() or not ar._C.has_cuda:
+        with pytest.raises(SystemExit):
+            timeline.main()
+        assert "no CUDA device" in capsys.readouterr().err
+        return
+    timeline.main()
+    printed = capsys.readouterr().out
+    for footprint in timeline.FOOTPRINTS:
+        assert footprint in printed
+    for kernel in ("project_kernel", "blend", "project_vjp_kernel"):
+        assert printed.count(kernel) >= len(timeline.FOOTPRINTS)
+    assert timeline.SLEEPER not in printed
+
+
 def test_viewer_gpu(small_scene, monkeypatch, capsys):
     """The page's shaders under OpenGL draw what the rasterizer does, also from a prepared file; other pictures are
     noticed."""
