@@ -28,12 +28,23 @@ WARM_UP = 15  # passes over the views before timing on CUDA
 def make_parser(description: str, footprints: list[str]) -> argparse.ArgumentParser:
     """A parser of what every benchmark takes: a scene, views, footprints, and how to measure."""
     parser = argparse.ArgumentParser(description=description)
+    add_scene(parser, footprints)
+    add_measuring(parser)
+    return parser
+
+
+def add_scene(parser: argparse.ArgumentParser, footprints: list[str]) -> None:
+    """Adds a scene, views and footprints."""
     add = parser.add_argument
     add("scene", help="trained scene: .ply, compressed .ply, .spz, or .npz (see scene_files.py)")
     add("--views", required=True, help="file of views")
     add("--footprints", nargs="+", default=footprints, metavar="NAME[:k=v]")
-    add_measuring(parser)
-    return parser
+
+
+def add_sh_degree(parser: argparse.ArgumentParser) -> None:
+    """Adds a degree for `scene_files.load_padded`."""
+    text = "pad the SH with zeros to this degree, as trainers hold them"
+    parser.add_argument("--sh-degree", type=int, choices=range(4), help=text)
 
 
 def add_measuring(parser: argparse.ArgumentParser) -> None:

@@ -41,6 +41,16 @@ def pad_sh(scene: io.Scene, degree: int) -> io.Scene:
     return scene._replace(shs=torch.nn.functional.pad(scene.shs, (0, 0, 0, missing)), sh_degree=degree)
 
 
+def load_padded(path: str, degree: int | None) -> io.Scene:
+    """The scene of `load_scene`, padded to a degree if there is one. Ends the program where that is below its own."""
+    scene = load_scene(path)
+    if degree is None:
+        return scene
+    if degree < scene.sh_degree:
+        raise SystemExit(f"--sh-degree {degree} is below the scene's, {scene.sh_degree}")
+    return pad_sh(scene, degree)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description="Turn a scene into an .npz.")
     parser.add_argument("scene", help="trained scene: .ply, compressed .ply or .spz")

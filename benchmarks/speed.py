@@ -32,9 +32,9 @@ import argparse
 from functools import partial
 
 import torch
-from common import CLOCKS, make_parser, mean_of, measure, parse, print_setup, save_json
+from common import CLOCKS, add_sh_degree, make_parser, mean_of, measure, parse, print_setup, save_json
 from peers import find_peers, mean_difference
-from scene_files import load_scene, pad_sh
+from scene_files import load_padded
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
@@ -48,12 +48,7 @@ HOST = ("host op", "host rasterizer", "host f+b")
 
 def main() -> None:
     args = parse_arguments()
-    scene = load_scene(args.scene)
-    if args.sh_degree is not None:
-        if args.sh_degree < scene.sh_degree:
-            raise SystemExit(f"--sh-degree {args.sh_degree} is below the scene's, {scene.sh_degree}")
-        scene = pad_sh(scene, args.sh_degree)
-    scene, views = scene.to(args.device), io.load_views(args.views)
+    scene, views = load_padded(args.scene, args.sh_degree).to(args.device), io.load_views(args.views)
     results, per_view = measure_scene(args, scene, views)
     print_setup(scene, views, args.device)
     print(format_results(results, args.device))
@@ -63,9 +58,7 @@ def main() -> None:
 
 def parse_arguments() -> argparse.Namespace:
     parser = make_parser(__doc__.split("\n")[0], FOOTPRINTS)
-    parser.add_argument(
-        "--sh-degree", type=int, choices=range(4), help="pad the SH with zeros to this degree, as trainers hold them"
-    )
+    add_sh_degree(parser)
     add_against(parser)
     return parse(parser)
 

@@ -16,8 +16,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from common import has_cuda
-from scene_files import load_scene, pad_sh
+from common import add_scene, add_sh_degree, has_cuda
+from scene_files import load_padded
 
 from analytic_rasterizer import io
 from analytic_rasterizer.analysis.tables import format_table
@@ -40,10 +40,7 @@ class Kernel(NamedTuple):
 
 def main() -> None:
     args = parse_arguments()
-    scene = load_scene(args.scene)
-    if args.sh_degree is not None:
-        scene = pad_sh(scene, args.sh_degree)
-    scene, view = scene.to("cuda"), io.load_views(args.views)[args.view]
+    scene, view = load_padded(args.scene, args.sh_degree).to("cuda"), io.load_views(args.views)[args.view]
     print(f"{len(scene.means)} Gaussians, {view.width}x{view.height}, {describe_machine('cuda')}")
     for footprint in args.footprints:
         print(f"\n{footprint}\n{format_kernels(record(Case(scene, view, footprint)))}")
@@ -51,12 +48,9 @@ def main() -> None:
 
 def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    add = parser.add_argument
-    add("scene", help="trained scene: .ply, compressed .ply, .spz, or .npz (see scene_files.py)")
-    add("--views", required=True, help="file of views")
-    add("--view", type=int, default=0, help="number of the view in it (default: %(default)s)")
-    add("--footprints", nargs="+", default=FOOTPRINTS, metavar="NAME[:k=v]")
-    add("--sh-degree", type=int, choices=range(4), help="pad the SH with zeros to this degree, as trainers hold them")
+    add_scene(parser, FOOTPRINTS)
+    add_sh_degree(parser)
+    parser.add_argument("--view", type=int, default=0, help="number of the view (default: %(default)s)")
     args = parser.parse_args()
     if not has_cuda():
         parser.error("no CUDA device, or analytic_rasterizer was built without CUDA")

@@ -67,9 +67,8 @@ def render(device: str, channels: int = 3, images: Sequence[str] = tuple(IMAGES)
         leaves = scenes.leaves(image.scene(device))
         if channels != 3:
             del leaves["shs"]
-            leaves["colors_precomp"] = torch.rand(
-                image.count + image.around, channels, device=device, requires_grad=True
-            )
+            count = len(leaves["means3D"])
+            leaves["colors_precomp"] = torch.rand(count, channels, device=device, requires_grad=True)
         fields = image.camera().fields(torch.float32, device)
         fields |= {"sh_degree": 3, "bg": torch.zeros(channels, device=device)}
         rasterizer = ar.GaussianRasterizer(ar.GaussianRasterizationSettings(**fields, **settings))

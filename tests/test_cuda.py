@@ -23,6 +23,7 @@ from analytic_rasterizer import _C
 pytestmark = needs_cuda
 
 CAMERA = Camera(image_height=150, image_width=201, bg=(0.2, 0.5, 0.9), sh_degree=2)
+LARGE = replace(CAMERA, image_height=520, image_width=528)  # 66x65 tiles of 8x8 pixels
 SCENES = {
     "few": {"seed": 0, "count": 40},
     "some": {"seed": 1, "count": 3000, "sigma": (0.005, 0.3)},
@@ -289,11 +290,7 @@ def test_image_sizes(variant, size):
 def test_moving_samples_in_large_images(samples):
     """From 4096 tiles of 8x8 pixels on, samples are shared out among lanes in another way, and backwards perhaps in
     another one than forwards."""
-    camera = replace(CAMERA, image_height=520, image_width=528)
-    compare(scene32(), settings_for(("moment", {"samples": samples}), camera))
-
-
-LARGE = replace(CAMERA, image_height=520, image_width=528)
+    compare(scene32(), settings_for(("moment", {"samples": samples}), LARGE))
 
 
 def long_and_short_lists():
@@ -306,8 +303,7 @@ def long_and_short_lists():
 @pytest.mark.parametrize("samples, channels", [(1, 3), (1, 40), (4, 3), (9, 3), (16, 3), (16, 5)])
 def test_long_lists_of_moving_samples_in_large_images(samples, channels):
     """They are cut, beside others that are not."""
-    scene, camera = long_and_short_lists(), LARGE
-    settings = settings_for(("moment", {"samples": samples}), camera)
+    scene, settings = long_and_short_lists(), settings_for(("moment", {"samples": samples}), LARGE)
     if channels != 3:
         del scene["shs"]
         g = torch.Generator().manual_seed(5)
@@ -327,7 +323,7 @@ def test_long_lists_of_moving_samples_in_large_images(samples, channels):
 def test_looks_at_moving_samples_in_large_images(samples):
     """What `inspect` finds, in tiles of either size that samples that move have."""
     effects = ar.Effects(median_depth=True, dominant_index=True, gaussian_stats=True)
-    settings = settings_for(("moment", {"samples": samples}), replace(CAMERA, image_height=520, image_width=528))
+    settings = settings_for(("moment", {"samples": samples}), LARGE)
     settings, scene = settings._replace(effects=effects), scene32()
     with torch.no_grad():
         expected = ar.GaussianRasterizer(settings)(**scene)[2]

@@ -41,11 +41,9 @@ template <class P, typename T> struct TilePlaces<P, T, true> {
   }
 
   AR_HD Bounds<V> bounds(int s) const {
-    if constexpr (kSamples == kGroup) {  // loops over samples are unrolled: s is a constant, and so are the bounds
-      const Bounds<T> cell = P::template cell<T>(s);
-      return {{V(cell.lo.x), V(cell.lo.y)}, {V(cell.hi.x), V(cell.hi.y)}};
-    }
-    return {{V(cells[s].lo.x), V(cells[s].lo.y)}, {V(cells[s].hi.x), V(cells[s].hi.y)}};
+    // With one group loops over samples are unrolled, so that s is a constant, and so are the bounds.
+    const Bounds<T> cell = kSamples == kGroup ? P::template cell<T>(s) : cells[s];
+    return {{V(cell.lo.x), V(cell.lo.y)}, {V(cell.hi.x), V(cell.hi.y)}};
   }
 
   /// Samples that are composited together, one behind the other: as many as have their numbers in registers.

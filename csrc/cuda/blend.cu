@@ -54,10 +54,6 @@ bool always_whole_lists(int footprint) {
 
 }  // namespace
 
-bool blends_whole_lists(int footprint, int64_t channels) {
-  return always_whole_lists(footprint) || channels > kFewChannels;
-}
-
 int64_t max_state_planes(int footprint, int64_t capacity) {
   int planes = 0;
   visit_footprint(footprint, Footprints{}, [&](auto f) {
@@ -67,8 +63,8 @@ int64_t max_state_planes(int footprint, int64_t capacity) {
   return capacity / kStateChunk * planes;
 }
 
-ListCut whole_list_cut(int footprint, int64_t capacity, TileGrid grid) {
-  ListCut cut = {true};
+ListCut list_cut(int footprint, int64_t channels, int64_t capacity, TileGrid grid) {
+  ListCut cut = {always_whole_lists(footprint) || channels > kFewChannels};
   visit_footprint(footprint, Footprints{}, [&](auto f) {
     using F = decltype(f);
     if (F::kMoves) cut = moving_list_cut(F::kSamples, capacity, grid);

@@ -13,6 +13,7 @@
 #include "core/camera.h"
 #include "core/project.h"
 #include "core/weight.h"
+#include "cuda/chunk_plan.h"
 
 namespace ar::cuda {
 
@@ -23,20 +24,6 @@ inline constexpr int kPairChannels = 6, kPairMeans = 9, kPairFourthChannel = 11;
 inline constexpr int kFewChannels = 4;
 /// Channels of a group, and of a last one where no more are left.
 inline constexpr int kChannelGroup = 32, kSmallGroup = 8;
-
-/// Pairs of a tile that blend_vjp takes as one piece of work, and between which blend leaves checkpoints. Checkpoints
-/// hold every sample, so many samples get longer chunks.
-inline constexpr int chunk_length(int samples) { return samples <= 4 ? 256 : 64 * samples; }
-/// Length of a chunk that holds any list.
-inline constexpr int kWholeList = 1 << 30;
-
-/// Chunks of a tile that blend goes through one after the other, which reads no pair behind the point where all pixels
-/// have stopped. The remaining chunks are blended side by side. With many tiles there is enough to do side by side;
-/// with few, a long list must not keep a single block busy.
-AR_HD int front_chunks(TileGrid grid, int samples) {
-  const int pairs = grid.tiles() >= 2048 ? 2048 : 256;
-  return pairs > chunk_length(samples) ? pairs / chunk_length(samples) : 1;
-}
 
 /// A sort by depth counts the values of so many digits of so many bits. With keys as depth_key makes them the last of
 /// its passes has nothing to do for depths of 1/8 to 8192.
@@ -74,74 +61,10 @@ struct alignas(8) SlotPair {
 inline constexpr int kStateChunk = 32;
 AR_HD constexpr int state_planes(int samples) { return 3 * samples; }
 
-/// How plan_chunks cuts the lists of tiles into chunks.
-struct ListCut {
-  bool whole;  ///< a chunk is a whole list, unless that is long; else it has chunk_length pairs, and no list is long
-  /// Long lists are cut into chunks of `segment` pairs, called segments, that are worked on side by side. Lists are
-  /// long from long_from() pairs on, which `at_least` and `shares` decide; with at_least 0 all are.
-  int at_least = 0, shares = 1, segment = 0;
-  /// Segments and lists for which there is memory: for all that may be cut. Without any no list is.
-  int max_segments = 0, max_lists = 0;
-
-  /// The most segments that are made where all lists together have so many pairs. If the long lists need more, only the
-  /// longest of them are cut. It does not depend on how much memory there is, so that the same lists are always cut in
-  /// the same way.
-  AR_HD int64_t segment_limit(int64_t pairs) const {
-    constexpr int kAlways = 4096, kPairsForEach = 4;  // in addition those of one pair in four
-    if (at_least == 0) return max_segments;
-    const int64_t all = pairs / segment + pairs / at_least, few = kAlways + pairs / segment / kPairsForEach;
-    return all < few ? all : few;
-  }
-  /// The number of pairs from which on a list is long, where there are `pairs` in all: at_least, doubled until it is no
-  /// smaller than pairs / shares. So it is a power of two, or 0.
-  AR_HD int long_from(int64_t pairs) const {
-    int64_t from = at_least;
-    while (from > 0 && from < pairs / shares) from *= 2;
-    return int(from);
-  }
-};
-
-/// 1, 2 and 3, 4 to 7, 8 to 15, or 16 samples.
-inline constexpr int kSampleClasses = 5;
-AR_HD constexpr int sample_class(int samples) {
-  int c = 0;
-  for (; samples > 1; samples /= 2) ++c;
-  return c;
-}
-
 /// What bin counts.
 struct alignas(8) Counts {
   int64_t pairs;
   int64_t splats;  ///< with pairs
-};
-
-/// Where the work of a plan is by sample_class: [first[c], first[c + 1]).
-struct SampleParts {
-  int32_t first[kSampleClasses + 1];
-};
-
-/// What plan_chunks and blend count.
-struct PlanCounts {
-  int32_t planes, tail;       ///< planes of checkpoints; chunks behind the front ones
-  SampleParts tiles, chunks;  ///< of the plan's orders
-  /// Lists that are cut, which are the first of ChunkPlan::tile_order, and their segments, the first of chunk_order.
-  int32_t cut_lists, segments;
-  /// Tiles that the front chunks left with an open sample and pairs, by sample_class: those of different samples are
-  /// blended side by side.
-  int32_t open_tiles[kSampleClasses];
-};
-
-/// Tiles and chunks of each class of work.
-inline constexpr int kLengthClasses = 33, kWorkClasses = kSampleClasses * kLengthClasses;
-struct WorkSizes {
-  int32_t tiles[kWorkClasses], chunks[kWorkClasses];
-};
-/// The counts stay for blend_vjp, the rest is scratch of plan_chunks.
-struct PlanState {
-  static constexpr int kCounters = 8;  ///< blocks that count work
-  PlanCounts counts;
-  WorkSizes counted[kCounters];  ///< by each of these blocks
-  WorkSizes placed;              ///< so far
 };
 
 struct ProjectParams : ar::ProjectParams<float> {
@@ -212,57 +135,6 @@ struct ChooseParams {
   int background_count;  ///< channels that it has; those missing are black
   FootprintOptions options;
   int32_t* tile_samples;  ///< [tiles]
-};
-
-struct TileChunk {
-  int32_t tile, chunk;
-  int32_t plane;  ///< first plane of its checkpoints, if the tile has any
-};
-
-/// A list that is cut into segments (ListCut).
-struct CutList {
-  int32_t tile;
-  int32_t first, segments;  ///< the place of the first of its segments, which follow each other, and how many there are
-};
-static_assert(sizeof(CutList) == sizeof(TileChunk), "they are rows of one array");
-
-/// How the state of a tile's pixels between chunks lies in memory: planes of kTile^2 floats. For a backward pass a
-/// chunk's planes hold, for each sample and pixel, its channels and its transmittance. Without one they are the
-/// transmittance of each sample and a single set of channels, and only the last front chunk and those behind have any.
-struct CheckpointLayout {
-  int channels;
-  bool keep;
-
-  AR_HD int planes(int samples) const { return keep ? samples * (channels + 1) : samples + channels; }
-  /// The first chunk with planes.
-  AR_HD int first_chunk(TileGrid grid, int samples) const { return keep ? 0 : front_chunks(grid, samples) - 1; }
-  /// Planes of a tile with so many chunks. The last chunk needs none where no sample is left open in front of it.
-  AR_HD int tile_planes(TileGrid grid, int samples, int chunks) const {
-    const int front = front_chunks(grid, samples);
-    const int used = chunks > front ? chunks - first_chunk(grid, samples) : keep ? chunks - 1 : 0;
-    return (used > 0 ? used : 0) * planes(samples);
-  }
-  /// No fewer planes than plan_chunks makes of `pairs` pairs where no tile has more than `samples`. A tile of x chunks
-  /// of pairs, rounded up to less than x + 1, has that many planes where it has tail chunks (x > front), less front - 1
-  /// without a backward pass; and no more than x where it has none.
-  int64_t max_planes(TileGrid grid, int samples, int64_t pairs, bool chosen) const {
-    // Chosen samples: those with the most planes per pair. For a backward pass all from 4 on have the same.
-    const int densest = chosen && !keep ? 4 : samples, front = front_chunks(grid, samples);
-    const int64_t full = pairs / chunk_length(densest) * planes(densest) + planes(densest) + planes(samples);
-    const int64_t with_tail = grid.tiles() * planes(samples);
-    const int64_t rounding = keep ? full / front : front == 1 ? full : 0;
-    return full + (rounding < with_tail ? rounding : with_tail);
-  }
-};
-
-/// How the lists are cut into chunks, and in which order work is begun; made by plan_chunks.
-struct ChunkPlan {
-  PlanState* state;
-  TileChunk* chunk_order;  ///< [chunks] by samples, longest first
-  int32_t* tile_order;     ///< [tiles] by samples, longest first
-  int32_t* tile_planes;    ///< [tiles] first plane of a tile's checkpoints, if it has any
-  TileChunk* tail;         ///< [counts.tail] chunks behind the front ones, or null where chunks are whole lists
-  CutList* cut_lists;      ///< [counts.cut_lists] in the order of their tiles in tile_order, or null
 };
 
 /// The parts of a tile's list that are blended side by side where many channels meet few tiles. They are not those of
@@ -385,14 +257,13 @@ void sum_channels(const SumChannelsParams& p, cudaStream_t stream);
 
 // Blending. `footprint` is a place in the registry (blend.cu, blend_vjp.cu).
 
-/// Whether kernels blend so many channels that walk the whole list of a tile and need no checkpoints of channels: of
-/// the yardsticks and of footprints whose samples move all do, of others those for more than kFewChannels.
-bool blends_whole_lists(int footprint, int64_t channels);
+/// How the kernels for so many channels have lists cut. They walk the whole list of a tile, and need no checkpoints of
+/// channels, with the yardsticks and footprints whose samples move, and with others where there are more than
+/// kFewChannels.
+ListCut list_cut(int footprint, int64_t channels, int64_t capacity, TileGrid grid);
 /// Planes of a float per pixel of a tile in BlendParams::checkpoints of a footprint whose samples move, for a backward
 /// pass. None for the others.
 int64_t max_state_planes(int footprint, int64_t capacity);
-/// How lists are cut where blends_whole_lists().
-ListCut whole_list_cut(int footprint, int64_t capacity, TileGrid grid);
 /// Numbers in BlendParams::reach_words and BlendVjpParams::adjoint_maps, which only lists need that are cut.
 int64_t max_reach_words(const ListCut& cut, TileGrid grid);
 int64_t max_adjoint_maps(int samples, const ListCut& cut, TileGrid grid);

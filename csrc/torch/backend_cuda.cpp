@@ -169,7 +169,7 @@ class CudaBackend final : public Backend {
     p.lists = tile_lists_of(lists);
 
     p.layout = {cuda::compiled_channels(!channels.rows.defined()), pass.keep};
-    const cuda::ListCut cut = cut_of(lists, pass, channels);
+    const cuda::ListCut cut = list_cut_of(lists, pass, channels.count);
     const Tensor plan = make_plan(p, pass, cut, state);
     Tensor reach;
     const int64_t reach_words = cuda::max_reach_words(cut, grid);
@@ -227,7 +227,7 @@ class CudaBackend final : public Backend {
   PairSums blend_vjp(const ListTensors& lists, const BlendState& state, const Pass& pass,
                      const ChannelTensors& channels, const ImageTensors& dL_dimage, MeanSums mean_sums) override {
     check_counts(lists);
-    const cuda::ListCut cut = cut_of(lists, pass, channels);
+    const cuda::ListCut cut = list_cut_of(lists, pass, channels.count);
     check_plan(state, cut, pass.grid);
     const int64_t n = lists.ids.numel(), rows = std::max(lists.pairs.size(0), n);
     const int count = int(channels.count);
@@ -241,10 +241,7 @@ class CudaBackend final : public Backend {
     set_blend<float>(p, lists, pass, channels, gradient, state);
     p.channels = channels_of(channels);
     p.lists = tile_lists_of(lists);
-    p.plan = const_structs_of<cuda::PlanState>(state.chunks);
-    p.chunk_order = const_structs_of<cuda::TileChunk>(state.chunks) + kPlanRows;
-    p.max_chunks = state.chunks.size(0) - kPlanRows - cut.max_lists;
-    p.cut_lists = reinterpret_cast<const cuda::CutList*>(p.chunk_order + p.max_chunks);
+    set_plan(p, state.chunks, cut);
     const Tensor chunks_taken = at::empty({cuda::kSampleClasses}, ints_);
     p.chunks_taken = pointer<int32_t>(chunks_taken);
     p.checkpoints = const_pointer<float>(state.checkpoints);
@@ -359,12 +356,6 @@ class CudaBackend final : public Backend {
     return at::empty({grid.tiles() * segments.count * planes * kTile * kTile}, floats_);
   }
 
-  /// How lists are cut for `blend` and `blend_vjp`.
-  static cuda::ListCut cut_of(const ListTensors& lists, const Pass& pass, const ChannelTensors& channels) {
-    const int footprint = pass.footprint.choice.index;
-    if (!cuda::blends_whole_lists(footprint, channels.count)) return {false};
-    return cuda::whole_list_cut(footprint, tile_lists_of(lists).capacity, pass.grid);
-  }
   /// Plans the blending of lists that are cut so: sets the members of `p` and `state` that belong to it. Returns memory
   /// that its kernels need while they run.
   Tensor make_plan(cuda::BlendParams& p, const Pass& pass, const cuda::ListCut& cut, BlendState& state) const {
@@ -380,9 +371,7 @@ class CudaBackend final : public Backend {
     state.chunks = at::empty({kPlanRows + chunks + tiles + cut.max_lists, kChunkWidth}, ints_);
     const auto [memory, parts] = make_memory<PlanMemory>(bytes_, tiles, cut.whole ? 0 : chunks);
     parts.set(p);
-    p.plan.state = structs_of<cuda::PlanState>(state.chunks);
-    p.plan.chunk_order = structs_of<cuda::TileChunk>(state.chunks) + kPlanRows;
-    p.plan.cut_lists = reinterpret_cast<cuda::CutList*>(p.plan.chunk_order + chunks + tiles);
+    set_plan(p, state.chunks, cut);
     p.checkpoints = pointer<float>(state.checkpoints);
     cuda::plan_chunks(p.lists, pass.grid, footprint.samples, cut, p.layout, p.plan, stream_);
     check_stage("plan_chunks", pass.debug);

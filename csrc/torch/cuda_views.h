@@ -112,7 +112,7 @@ struct PlanMemory {
 
 inline constexpr int64_t kCountsWidth = sizeof(cuda::Counts) / sizeof(int64_t);
 
-/// BlendState::chunks begins with the PlanState, in whole rows; TileChunks follow, and LongLists where lists are cut.
+/// BlendState::chunks begins with the PlanState, in whole rows; TileChunks follow, and CutLists where lists are cut.
 inline constexpr int64_t kChunkWidth = sizeof(cuda::TileChunk) / sizeof(int32_t);
 inline constexpr int64_t kPlanRows = (sizeof(cuda::PlanState) / sizeof(int32_t) + kChunkWidth - 1) / kChunkWidth;
 
@@ -155,6 +155,25 @@ inline Channels<float> channels_of(const ChannelTensors& channels) {
 inline void check_counts(const ListTensors& lists) {
   TORCH_CHECK_VALUE(lists.counts.numel() == kCountsWidth, "counts must be what bin returned, got shape ",
                     lists.counts.sizes());
+}
+/// How lists are cut for `blend` and `blend_vjp`.
+inline cuda::ListCut list_cut_of(const ListTensors& lists, const Pass& pass, int64_t channels) {
+  return cuda::list_cut(pass.footprint.choice.index, channels, tile_lists_of(lists).capacity, pass.grid);
+}
+inline int64_t max_chunks(const Tensor& chunks, const cuda::ListCut& cut) {
+  return chunks.size(0) - kPlanRows - cut.max_lists;
+}
+/// Sets what lies in BlendState::chunks.
+inline void set_plan(cuda::BlendParams& p, const Tensor& chunks, const cuda::ListCut& cut) {
+  p.plan.state = structs_of<cuda::PlanState>(chunks);
+  p.plan.chunk_order = structs_of<cuda::TileChunk>(chunks) + kPlanRows;
+  p.plan.cut_lists = reinterpret_cast<cuda::CutList*>(p.plan.chunk_order + max_chunks(chunks, cut));
+}
+inline void set_plan(cuda::BlendVjpParams& p, const Tensor& chunks, const cuda::ListCut& cut) {
+  p.plan = const_structs_of<cuda::PlanState>(chunks);
+  p.chunk_order = const_structs_of<cuda::TileChunk>(chunks) + kPlanRows;
+  p.max_chunks = max_chunks(chunks, cut);
+  p.cut_lists = reinterpret_cast<const cuda::CutList*>(p.chunk_order + p.max_chunks);
 }
 inline void check_plan(const BlendState& state, const cuda::ListCut& cut, TileGrid grid) {
   const Tensor& chunks = state.chunks;
