@@ -257,6 +257,19 @@ def test_moving_samples_with_a_list_for_each_pixel(samples):
     assert all(torch.equal(grad, second.grads[name]) for name, grad in first.grads.items())
 
 
+@pytest.mark.parametrize("samples", [1, 4])
+def test_longest_lists_of_moving_samples(samples):
+    """A warp for each pixel of a tile that lists more than kLongestList splats (csrc/cuda/cut_lists.cuh)."""
+    scene = splats_smaller_than_a_pixel()
+    scene["means3D"] *= 0.2
+    settings = settings_for(("moment", {"samples": samples}), Camera(image_height=24, image_width=40))
+    stages = ar.render_stages(scenes.settings_to(settings, "cuda"), **scenes.to(without_means2d(scene), "cuda"))
+    assert stages.tile_offsets.diff().max() > 16384, "no list is among the longest"
+    color = compare(scene, settings, flips=1e-2, layers=2350)  # as in test_long_lists
+    assert_same_without_gradient(scene, settings, color)
+    assert_identical(run(scene, settings, "cuda"), run(scene, settings, "cuda"))
+
+
 def test_a_list_for_each_pixel_changes_no_alpha():
     """With more pairs than room every tile goes through all splats, in tiles of the same size: the same alphas. The
     colours of a pixel with a list of its own are added up by several lanes, and n positive terms with n - 1 roundings.

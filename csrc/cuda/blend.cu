@@ -17,12 +17,11 @@ namespace {
 /// because the longest of them may outlast everything else, and the kernel for the other lists begins beside it.
 template <class F, int C, int kSide, bool kKeep>
 void launch_moving_blend_kernels(const BlendParams& p, const ListCut& cut, int first, cudaStream_t stream) {
-  constexpr int kBlocks = kListedBlocks<F, kSide>;
   using Layout = EvenLayout<F, false, kSide>;
-  const int lists = is_small_image(p.grid) ? cut.max_lists : std::min(cut.max_lists, kListedWarps / kBlocks);
-  if (lists > 0) launch(listed_blend_kernel<F, C, kSide, kKeep>, {unsigned(lists * kBlocks), 32}, stream, p, first);
+  const unsigned blocks = cut.max_lists > 0 ? ListedLayouts<F, kSide>::blocks(cut, p.grid) : 0;
+  if (blocks > 0) launch(listed_blend_kernel<F, C, kSide, kKeep>, {blocks, 32}, stream, p, first);
   const LaunchShape tiles = {unsigned(p.grid.tiles() + 1), Layout::kThreads};
-  launch(moving_blend_kernel<F, C, Layout, kKeep>, tiles, stream, p, first, lists > 0);
+  launch(moving_blend_kernel<F, C, Layout, kKeep>, tiles, stream, p, first, blocks > 0);
 }
 template <class F, int C, int kSide>
 void launch_moving_blend(const BlendParams& p, const ListCut& cut, int first, cudaStream_t stream) {

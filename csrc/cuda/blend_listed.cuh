@@ -5,11 +5,11 @@
 // the list of a tile is first filtered, all parts of it side by side, into a bit for each splat and pixel: whether it
 // reaches it. Then each warp walks the splats of a few neighbouring pixels, and waits for no other. It takes those
 // that reach any of them 32 at a time. Each lane goes through those of its own pixel alone, so that in one step the
-// pixels of a warp composite different splats.
+// pixels of a warp composite different splats. With one cell, and in the longest lists with four, each pixel takes its
+// own splats and several lanes have the same sample (blend_queued.cuh).
 #pragma once
 
-#include "cuda/blend_moving.cuh"
-#include "cuda/cut_lists.cuh"
+#include "cuda/blend_queued.cuh"
 #include "cuda/launch.cuh"
 
 namespace ar::cuda {
@@ -19,30 +19,9 @@ inline constexpr int kFilterPiece = 256, kFilterWords = kFilterPiece / 32;
 /// Pairs whose bits a warp takes at once: a word for each lane.
 inline constexpr int kListedBatch = 32 * 32;
 
-/// A sample per lane, in blocks of a warp, since lists are uneven. The more pixels a warp has, the fewer steps it takes
-/// for each of them, and the more of them wait for the longest list: in tiles with long lists, kLong, it has two. With
-/// one sample all lanes of a pixel have it there, and look at as many splats at once (kShared). Elsewhere that takes
-/// longer than to leave lanes without a sample (docs/performance-log.md).
-template <class F, int kSide, bool kLong>
-struct ListedLayout : CellLayout<1, (F::kSamples > 4 || kLong) ? 16 : 4, kSide, 1> {
-  using Base = CellLayout<1, (F::kSamples > 4 || kLong) ? 16 : 4, kSide, 1>;
-  static constexpr bool kShared = F::kSamples == 1 && kLong;
-  __device__ static int first_sample() { return kShared ? 0 : Base::first_sample(); }
-  /// This lane's place among those of its sample.
-  __device__ static int ahead() { return kShared ? lane_id() % Base::kLanes : 0; }
-  __device__ static bool owns() { return ahead() == 0; }
-  /// The lanes of this lane's sample.
-  __device__ static uint32_t sharers() {
-    return ((1u << Base::kLanes) - 1) << (lane_id() / Base::kLanes * Base::kLanes);
-  }
-};
-/// Where the bits of a pixel of a tile of kPixels pixels are: that of pair k is bit k % 32 of word k / 32. `first`: of
-/// the segments of the tile's list.
-template <class F, int kPixels> __device__ int64_t pixel_words(int first, const TileList& list, int pixel_number) {
-  constexpr int kSegment = moving_segment(F::kSamples);
-  const int segments = (list.count + kSegment - 1) / kSegment;
-  return (int64_t(first) * kPixels + pixel_number * segments) * (kSegment / 32);
-}
+/// A warp of kPixelsOfWarp pixels, a sample for each lane. The more pixels a warp has, the fewer steps it takes for
+/// each of them, and the more of them wait for the longest list.
+template <class F, int kSide, int kPixelsOfWarp> struct SampleLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, 1> {};
 
 /// Bit x: the span holds x0 + x, of a row of a tile of kSide pixels that begins at x0. The differences are exact
 /// wherever they decide.
@@ -106,7 +85,6 @@ template <class F, int C, int kMostPixels> struct ListedStage {
   int32_t ids[kListedBatch];
   uint16_t places[kListedBatch];    ///< of the pairs in the batch
   uint32_t words[kMostPixels][32];  ///< the batch's bits of each pixel
-  uint8_t lists[kMostPixels][32];   ///< of each pixel, the splats that reach it
 
   /// Takes the pairs of a batch that begins at k, of which each lane has the word of bits of each pixel in `words`, in
   /// order. Returns how many reach any pixel. All lanes must call it.
@@ -129,21 +107,6 @@ template <class F, int C, int kMostPixels> struct ListedStage {
     return all;
   }
 
-  /// Lists, for each pixel, those of the pairs [from, from + 32) of those that were taken, `count` in all, that reach
-  /// it. Returns how many reach this lane's. All lanes must call it.
-  template <class Layout> __device__ int list(int from, int count) {
-    const int lane = lane_id(), place = from + lane < count ? places[from + lane] : 0;
-    int mine = 0;
-#pragma unroll
-    for (int i = 0; i < Layout::kPixels; ++i) {
-      const bool reaches = from + lane < count && (words[i][place / 32] >> (place % 32) & 1);
-      const uint32_t reached = __ballot_sync(kAllLanes, reaches);
-      if (reaches) lists[i][__popc(reached & ((1u << lane) - 1))] = uint8_t(lane);
-      if (lane / Layout::kLanes == i) mine = __popc(reached);
-    }
-    return mine;
-  }
-
   /// Of the pairs [from, from + 32) of those that were taken, `count` in all, those that reach this lane's pixel, in
   /// the order of take_first. All lanes must call it.
   template <class Layout> __device__ uint32_t reached(int from, int count) const {
@@ -158,57 +121,6 @@ template <class F, int C, int kMostPixels> struct ListedStage {
     return mine;
   }
 };
-
-/// Composites the splats [from, from + 32) of those that were taken, of which `n` reach the pixels of this lane, into
-/// samples that several lanes have; k0: the first pair of the batch. Most splats that reach a pixel do not show in a
-/// sample, since they are small: the lanes of a sample look at as many splats at once, and composite the first that
-/// shows. Then those behind it are looked at again, since the node has moved. `store(k)` leaves the checkpoints up to
-/// pair k.
-template <class F, int C, class Layout, bool kKeep, class Blend, class Stage, class Store>
-__device__ void blend_ahead(const Stage& stage, int k0, int from, int n, Blend& blend, Store&& store) {
-  const int pixel = lane_id() / Layout::kLanes;
-  const uint32_t sharers = Layout::sharers();
-  float& transmittance = blend.samples.transmittance[0];
-  Vec2<float>& place = blend.samples.place[0];
-  int next = Layout::ahead();  // of the pixel's list, for this lane
-  TileSplat<F, C> splat;
-  int k = 0;
-  bool live = false;  // there is such a splat, and none behind it was composited
-  const auto take = [&] {
-    live = next < n && transmittance > 0;
-    if (!live) return;
-    const int j = stage.lists[pixel][next];
-    splat = stage.splats[j];
-    k = k0 + stage.places[from + j];
-  };
-  take();
-  while (__any_sync(kAllLanes, live)) {
-    float raw = 0;
-    Vec2<float> z = {0, 0};
-    if (live) {
-      z = blend.corners.node(splat.terms, 0, place);
-      raw = exp2(F::log_alpha(splat.terms, z));
-    }
-    const bool hit = raw >= float(kAlphaMin);
-    const uint32_t hits = __ballot_sync(kAllLanes, hit) & sharers;
-    const int first = hits ? __ffs(int(hits)) - 1 : lane_id();
-    float behind = transmittance;
-    Vec2<float> moved = place;
-    if (hit) {
-      const Blended<float> b = blend_placed_sample<F>(splat.terms, z, raw, UnitCell<F::kSide>(), behind, moved);
-      if (first == lane_id()) blend.add(b, splat.channels, k);
-    }
-    const int pair = kKeep ? shuffle(k, first) : 0;
-    if (kKeep && hits) store(pair);
-    transmittance = shuffle(behind, first);
-    place = {shuffle(moved.x, first), shuffle(moved.y, first)};
-    live = live && hits != 0 && lane_id() > first && transmittance > 0;
-    if (hits == 0 || first % Layout::kLanes == Layout::kLanes - 1) {
-      next += Layout::kLanes;
-      take();
-    }
-  }
-}
 
 /// Blends the pixels of a warp, as Layout shares them out; C channels from `first` on. `first_segment`: of the list.
 template <class F, int C, class Layout, bool kKeep, class Stage>
@@ -255,13 +167,6 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
         const Splat<F, float> splat = splats[id];
         stage.splats[lane] = {cell_terms(splat, list), channels_of<C>(params.channels, splat, id, first)};
       }
-      if constexpr (Layout::kShared) {
-        const int n = stage.template list<Layout>(from, count);
-        __syncwarp();
-        blend_ahead<F, C, Layout, kKeep>(stage, k0, from, n, blend, store_up_to);
-        open = __ballot_sync(kAllLanes, blend.samples.open());
-        continue;
-      }
       uint32_t left = stage.template reached<Layout>(from, count);
       if (!blend.samples.open()) left = 0;
       __syncwarp();
@@ -283,42 +188,74 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
     }
     __syncwarp();
   }
-  if (Layout::kShared && kKeep) {
-#pragma unroll
-    for (int offset = 1; offset < Layout::kLanes; offset *= 2)
-      blend.last[0] = max(blend.last[0], __shfl_xor_sync(kAllLanes, blend.last[0], offset));
-  }
   blend.write(params, first, pixel);
 }
 
 /// In large images, blocks of filter_kernel and warps of listed_blend_kernel: as many as leave most of a large device
 /// to the kernel that is to begin beside them, which only does when all of them have begun.
-inline constexpr int kFilterBlocks = 264, kListedWarps = 1056;
-/// Blocks of listed_blend_kernel for each tile.
-template <class F, int kSide> inline constexpr int kListedBlocks = ListedLayout<F, kSide, true>::kBlocks;
+inline constexpr int kFilterBlocks = 264, kListedWarps = 1024;
+/// In small images, for so many of the longest lists each warp has one task.
+inline constexpr int kLongestAtOnce = 128;
 
-/// A warp per few pixels of a tile whose list is cut; where it is not kLongFrom pairs long, only the first blocks of a
-/// tile have any. There may be blocks for fewer tiles than are blended.
-template <class F, int C, int kSide, bool kKeep, int kLongFrom = kLongList>
+/// How the pixels of a tile are shared out among warps. Which of these layouts is quickest was measured
+/// (docs/performance-log.md, "`moment`: a queue for each pixel").
+template <class F, int kSide> struct ListedLayouts {
+  /// Lanes look ahead in all lists, or in the longest.
+  static constexpr bool kAllAhead = F::kSamples == 1, kLongestAhead = F::kSamples <= kMostAhead;
+  using Longest = AheadLayout<F, kSide, 1>;
+  using Ahead = AheadLayout<F, kSide, 2>;
+  using Long = SampleLayout<F, kSide, 2>;  ///< where they do not look ahead, from kLongList pairs on
+  using Short = SampleLayout<F, kSide, F::kSamples <= 4 ? 8 : 2>;
+  /// Blocks of a list; of one that is short, the first of them have its pixels.
+  static constexpr int kOfLongest = CellLayout<1, 32, kSide, 1>::kBlocks, kOfOthers = Long::kBlocks;
+  static_assert(kOfLongest % kOfOthers == 0 && kOfOthers % Short::kBlocks == 0);
+
+  /// How many are launched: a multiple of those that one of the longest lists takes, so that a block is at the same
+  /// place in every tile that it goes on to.
+  static unsigned blocks(const ListCut& cut, TileGrid grid) {
+    const int64_t longest = std::min(cut.max_lists, kLongestAtOnce), lists = cut.max_lists;
+    const int64_t wanted = is_small_image(grid) ? longest * kOfLongest + lists * kOfOthers : kListedWarps;
+    const int64_t blocks = std::min(wanted, lists * kOfLongest);
+    return unsigned((blocks + kOfLongest - 1) / kOfLongest * kOfLongest);
+  }
+};
+
+/// What a warp keeps of the splats that it is about to composite.
+template <class F, int C, int kSide> union WarpStage {
+  ListedStage<F, C, ListedLayouts<F, kSide>::Short::kPixels> listed;
+  QueuedStage<F, C> queued;
+};
+
+/// A warp per few pixels of a tile whose list is cut, those of the longest lists first.
+template <class F, int C, int kSide, bool kKeep>
 __global__ void __launch_bounds__(32) listed_blend_kernel(const BlendParams params, int first) {
   let_next_kernel_begin();  // so that moving_blend_kernel does not wait for filter_kernel either
   wait_for_earlier_kernels();
-  using Short = ListedLayout<F, kSide, false>;
-  using Long = ListedLayout<F, kSide, true>;
-  static_assert(Short::kThreads == 32 && Long::kThreads == 32 && Long::kBlocks % Short::kBlocks == 0);
-  __shared__ ListedStage<F, C, Short::kPixels> stage;
-  const int lists = params.plan.state->counts.cut_lists;
-  for (int place = int(blockIdx.x) / Long::kBlocks; place < lists; place += int(gridDim.x) / Long::kBlocks) {
+  using Layouts = ListedLayouts<F, kSide>;
+  using Short = typename Layouts::Short;
+  __shared__ WarpStage<F, C, kSide> stage;
+  const PlanCounts& counts = params.plan.state->counts;
+  const int longest = counts.longest_lists, of_longest = longest * Layouts::kOfLongest;
+  const int blocks = of_longest + (counts.cut_lists - longest) * Layouts::kOfOthers;
+  for (int block = blockIdx.x; block < blocks; block += gridDim.x) {
+    const bool is_longest = block < of_longest;
+    const int place = is_longest ? block / Layouts::kOfLongest : longest + (block - of_longest) / Layouts::kOfOthers;
     const CutList cut = params.plan.cut_lists[place];
     const TileList list = list_of(params.lists, params.grid, cut.tile);
-    if constexpr (Short::kLanes != Long::kLanes) {
-      if (list.count < kLongFrom) {
-        if (int(blockIdx.x) % Long::kBlocks < Short::kBlocks)
-          blend_listed<F, C, Short, kKeep>(params, first, cut.tile, list, cut.first, stage);
+    if constexpr (Layouts::kLongestAhead) {
+      if (is_longest) {
+        using Longest = typename Layouts::Longest;
+        blend_queued<F, C, Longest, kKeep>(params, first, cut.tile, list, cut.first, stage.queued);
         continue;
       }
     }
-    blend_listed<F, C, Long, kKeep>(params, first, cut.tile, list, cut.first, stage);
+    if constexpr (Layouts::kAllAhead) {
+      blend_queued<F, C, typename Layouts::Ahead, kKeep>(params, first, cut.tile, list, cut.first, stage.queued);
+    } else if (list.count >= kLongList) {
+      blend_listed<F, C, typename Layouts::Long, kKeep>(params, first, cut.tile, list, cut.first, stage.listed);
+    } else if (block % Layouts::kOfOthers < Short::kBlocks) {
+      blend_listed<F, C, Short, kKeep>(params, first, cut.tile, list, cut.first, stage.listed);
+    }
   }
 }
 

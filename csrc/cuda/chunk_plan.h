@@ -13,6 +13,8 @@ namespace ar::cuda {
 inline constexpr int chunk_length(int samples) { return samples <= 4 ? 256 : 64 * samples; }
 /// Length of a chunk that holds any list.
 inline constexpr int kWholeList = 1 << 30;
+/// More pairs than a list has.
+inline constexpr int kNoList = 1 << 30;
 
 /// Chunks of a tile that blend goes through one after the other, which reads no pair behind the point where all pixels
 /// have stopped. The remaining chunks are blended side by side. With many tiles there is enough to do side by side;
@@ -30,6 +32,8 @@ struct ListCut {
   int at_least = 0, shares = 1, segment = 0;
   /// Segments and lists for which there is memory: for all that may be cut. Without any no list is.
   int max_segments = 0, max_lists = 0;
+  /// Lists of so many pairs, a power of two, are counted among the longest.
+  int longest_from = kNoList;
 
   /// The most segments that are made where all lists together have so many pairs. If the long lists need more, only the
   /// longest of them are cut. It does not depend on how much memory there is, so that the same lists are always cut in
@@ -68,6 +72,7 @@ struct PlanCounts {
   SampleParts tiles, chunks;  ///< of the plan's orders
   /// Lists that are cut, which are the first of ChunkPlan::tile_order, and their segments, the first of chunk_order.
   int32_t cut_lists, segments;
+  int32_t longest_lists;  ///< the first of those that are cut: of ListCut::longest_from pairs or more
   /// Tiles that the front chunks left with an open sample and pairs, by sample_class: those of different samples are
   /// blended side by side.
   int32_t open_tiles[kSampleClasses];

@@ -95,7 +95,7 @@ template <class Of> __device__ int size_of_class(const PlanState& state, Of&& of
 
 /// The lists that are cut: those of the first classes of long lists, as many as make no more than so many segments.
 struct CutClasses {
-  int lists = 0, segments = 0;
+  int lists = 0, segments = 0, longest = 0;
   int chunks_of_class;  ///< of this thread's class: what was counted, or a chunk for each list where they are not cut
 
   /// `lists_of_class`, `counted`: of this thread's class. All threads of a block must call it.
@@ -104,13 +104,15 @@ struct CutClasses {
     const int64_t pairs = tile_lists.counts->pairs;
     if (cut.max_segments == 0 || pairs > tile_lists.capacity) return;
     constexpr int kWarps = kPlanThreads / 32;
-    const bool are_long = int(threadIdx.x) % kLengthClasses <= __clz(cut.long_from(pairs));
+    const int of_length = int(threadIdx.x) % kLengthClasses;
+    const bool are_long = of_length <= __clz(cut.long_from(pairs));
     int all;
     const int up_to = counted + sum_before<kWarps>(are_long ? counted : 0, 0, all);
     const bool are_cut = are_long && up_to <= min(int64_t(cut.max_segments), cut.segment_limit(pairs));
     if (are_long && !are_cut) chunks_of_class = lists_of_class;
     sum_before<kWarps>(are_cut ? lists_of_class : 0, 0, lists);
     sum_before<kWarps>(are_cut ? counted : 0, 0, segments);
+    sum_before<kWarps>(are_cut && of_length <= __clz(cut.longest_from) ? lists_of_class : 0, 0, longest);
   }
 };
 
@@ -184,7 +186,10 @@ __global__ void __launch_bounds__(kPlanThreads)
     plan.tile_planes[tile] = plane;
     if (is_cut) plan.cut_lists[place] = {tile, run.place, full};
   }
-  if (i == 0) counts.cut_lists = cut_classes.lists, counts.segments = cut_classes.segments;
+  if (i == 0) {
+    counts.cut_lists = cut_classes.lists, counts.longest_lists = cut_classes.longest;
+    counts.segments = cut_classes.segments;
+  }
   write_run(plan.chunk_order, run, first, of_chunk);
   if (rest > 0) plan.chunk_order[begins.chunks[rest_class] + rest_place] = {tile, full, first.plane + full * of_chunk};
   write_run(plan.tail, {tail_place, front, front + tail}, first, of_chunk);

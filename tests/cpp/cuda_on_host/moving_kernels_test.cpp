@@ -76,10 +76,10 @@ struct Plan {
 };
 
 /// Whole lists forwards with one layout, back with another. With kSegment > 0 those of `long_from` pairs or more are
-/// cut: forwards into lists of pixels, shared out as long ones from kLong pairs on; back into segments of so many
+/// cut: forwards into lists of pixels, those of `longest_from` with a warp for each; back into segments of so many
 /// pairs.
-template <class F, class Forward, class Backward, int kSegment = 0, int kLong = kLongList>
-Results run(Scene<F>& scene, int long_from = 0) {
+template <class F, class Forward, class Backward, int kSegment = 0>
+Results run(Scene<F>& scene, int long_from = 0, int longest_from = kLongestList) {
   constexpr int S = F::kSamples, kSide = Forward::kSide;
   static_assert(Backward::kSide == kSide);
   const int tiles = int(scene.grid.tiles());
@@ -92,7 +92,7 @@ Results run(Scene<F>& scene, int long_from = 0) {
   std::vector<float> checkpoints(scene.pairs.size() / kStateChunk * state_planes(S) * Forward::kTilePixels, NAN);
   const auto cut_into = [&](int segment) {
     if (kSegment == 0) return ListCut{true};
-    return ListCut{true, long_from, kMost, segment, int(scene.lists.capacity / segment) + tiles, tiles};
+    return ListCut{true, long_from, kMost, segment, int(scene.lists.capacity / segment) + tiles, tiles, longest_from};
   };
   const ListCut cut = cut_into(moving_segment(S)), cut_back = cut_into(kSegment);
   const Plan plan(scene, cut), plan_back(scene, cut_back);
@@ -116,8 +116,8 @@ Results run(Scene<F>& scene, int long_from = 0) {
     if constexpr (kSegment > 0) {
       // Fewer blocks than pieces and tiles.
       cuda_on_host::launch(cut.max_segments / 2, kFilterPiece, [&] { filter_kernel<F, kSide>(p); });
-      cuda_on_host::launch((tiles + 1) / 2 * kListedBlocks<F, kSide>, 32,
-                           [&] { listed_blend_kernel<F, kColors, kSide, kKeep, kLong>(p, 0); });
+      cuda_on_host::launch(ListedLayouts<F, kSide>::kOfLongest, 32,
+                           [&] { listed_blend_kernel<F, kColors, kSide, kKeep>(p, 0); });
     }
     cuda_on_host::launch(tiles + 1, Forward::kThreads,
                          [&] { moving_blend_kernel<F, kColors, Forward, kKeep>(p, 0, false); });
@@ -263,14 +263,14 @@ template <class F, int kSide> void expect_same_if_cut(TileGrid grid) {
   using Backward = EvenLayout<F, true, kSide>;
   Scene<F> scene(1100, 70, 0.1f, grid);
   const Results whole = run<F, Forward, Backward>(scene);
-  EXPECT_GT(*std::max_element(whole.last.begin(), whole.last.end()), kListedBatch);
+  EXPECT_GT(*std::max_element(whole.last.begin(), whole.last.end()), std::max(kListedBatch, kQueued));
   const Results short_lists = run<F, Forward, Backward, 64>(scene);
   expect_same(short_lists, whole);
   expect_same(run<F, Forward, Backward, moving_segment(F::kSamples)>(scene), whole);
   // The long list alone, beside others that are not cut.
   expect_same(run<F, Forward, Backward, 64>(scene, 1024), whole);
-  if (F::kSamples > 4) return;  // long lists are shared out in the same way
-  const Results a_long_list = run<F, Forward, Backward, 64, 1000>(scene);
+  if (F::kSamples > kMostAhead) return;
+  const Results a_long_list = run<F, Forward, Backward, 64>(scene, 0, 512);
   // Colours are added up by other lanes.
   for (size_t i = 0; i < a_long_list.image.size(); ++i)
     ASSERT_NEAR(a_long_list.image[i], short_lists.image[i], kRounding) << i;

@@ -133,6 +133,10 @@ void expect_planned(const Case& c) {
   int long_count = 0;
   for (int n : all_pairs) long_count += cut_by_length[n];
   ASSERT_EQ(made.cut_lists, long_count);
+  int longest_count = 0;
+  for (int n : all_pairs) longest_count += cut_by_length[n] && n >= c.cut.longest_from;
+  EXPECT_EQ(made.longest_lists, longest_count);
+  EXPECT_EQ(longest_count > 0, c.cut.longest_from < kNoList);
   EXPECT_EQ(long_count > 0, c.expect_cut);
   std::vector<bool> seen(size_t(made.segments), false);
   for (int k = 0; k < long_count; ++k) {
@@ -176,7 +180,7 @@ TEST(PlanKernels, MorePairsThanRoom) { expect_planned({kSmall, 5000, false, true
 // Whole lists, of which the long ones are cut.
 constexpr int kMost = 1 << 20;
 TEST(PlanKernels, CutsLongLists) {
-  expect_planned({kSmall, 5000, false, true, {true, 1024, 1 << 20, 512, kMost, 1000}, false, true});
+  expect_planned({kSmall, 5000, false, true, {true, 1024, 1 << 20, 512, kMost, 1000, 2048}, false, true});
 }
 TEST(PlanKernels, CutsWhatIsLongerThanAFairShare) {
   // There are some 100,000 pairs.
@@ -184,10 +188,10 @@ TEST(PlanKernels, CutsWhatIsLongerThanAFairShare) {
   expect_planned({kSmall, 5000, false, true, {true, 256, 100, 128, kMost, 1000}, false, true});
 }
 TEST(PlanKernels, CutsAllLists) {
-  expect_planned({kSmall, 5000, false, true, {true, 0, 1, 512, kMost, 1000}, false, true});
+  expect_planned({kSmall, 5000, false, true, {true, 0, 1, 512, kMost, 1000, 1024}, false, true});
 }
 TEST(PlanKernels, CutsTheLongestIfThereIsNoRoomForMore) {
-  expect_planned({kSmall, 5000, false, true, {true, 256, 1 << 20, 128, 400, 1000}, false, true});
+  expect_planned({kSmall, 5000, false, true, {true, 256, 1 << 20, 128, 400, 1000, 256}, false, true});
 }
 TEST(PlanKernels, CutsTheSameListsHoweverMuchRoomThereIs) {
   // Some 100,000 pairs would make 12,000 segments.

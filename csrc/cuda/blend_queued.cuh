@@ -1,0 +1,245 @@
+// Blending of pixels that look ahead in their lists (blend_listed.cuh), for footprints whose samples move.
+//
+// Each pixel of a warp has a queue of the splats that reach it, and takes the next ones when it has composited those
+// before, wherever in the tile's list they are: it does not wait for splats that reach only its neighbours. Several
+// lanes have the same sample.
+#pragma once
+
+#include "cuda/blend_moving.cuh"
+#include "cuda/cut_lists.cuh"
+
+namespace ar::cuda {
+
+/// A warp of kPixelsOfWarp pixels. Of its lanes a sample has several, kAhead, which are neighbours.
+template <class F, int kSide, int kPixelsOfWarp> struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, 1> {
+  using Base = CellLayout<1, 32 / kPixelsOfWarp, kSide, 1>;
+  static constexpr int kAhead = Base::kLanes / F::kSamples;  ///< lanes of a sample
+  static_assert(Base::kLanes % F::kSamples == 0);
+  __device__ static int first_sample() { return lane_id() % Base::kLanes / kAhead; }
+  /// This lane's place among those of its sample.
+  __device__ static int ahead() { return lane_id() % kAhead; }
+  __device__ static bool owns() { return ahead() == 0; }
+  /// The lanes of this lane's sample.
+  __device__ static uint32_t sharers() { return (kAllLanes >> (32 - kAhead)) << (lane_id() / kAhead * kAhead); }
+};
+
+/// Where the bits of a pixel of a tile of kPixels pixels are: that of pair k is bit k % 32 of word k / 32. `first`: of
+/// the segments of the tile's list.
+template <class F, int kPixels> __device__ int64_t pixel_words(int first, const TileList& list, int pixel_number) {
+  constexpr int kSegment = moving_segment(F::kSamples);
+  const int segments = (list.count + kSegment - 1) / kSegment;
+  return (int64_t(first) * kPixels + pixel_number * segments) * (kSegment / 32);
+}
+
+/// Places in the queues of a warp.
+inline constexpr int kQueued = 1024;
+
+/// For each pixel of a warp, the pairs that reach it, front to back: a queue, which is filled from the bits of
+/// filter_kernel.
+template <class Layout> struct PairQueues {
+  using Bits = uint16_t;                                  ///< what a lane takes at a time
+  static constexpr int kBits = 16;                        ///< of pairs that follow each other
+  static constexpr int kRounds = 2;                       ///< how many times ahead they are read
+  static constexpr int kAtOnce = kBits * Layout::kLanes;  ///< pairs of which a pixel's lanes take the bits at a time
+  static constexpr uint32_t kRoom = 2 * kAtOnce;
+  using Memory = int32_t[Layout::kPixels][kRoom];
+  static_assert(sizeof(Memory) == kQueued * sizeof(int32_t));
+
+  int32_t* pairs;               ///< of this lane's pixel
+  const Bits* words;            ///< of this lane, from those that are read next on
+  int lane;                     ///< among those of the pixel
+  int count;                    ///< pairs of the list; 0 when no more are wanted
+  int next = 0;                 ///< the pair whose bit is the first that the pixel's lanes take next
+  uint32_t begin = 0, end = 0;  ///< of the pairs in the queue, counted from the first that was ever in it
+  uint32_t bits[kRounds];       ///< that this lane takes next
+
+  /// `reach_words`: of the pixel. All lanes must call it.
+  __device__ PairQueues(Memory& memory, const uint32_t* reach_words, int count)
+      : pairs(memory[lane_id() / Layout::kLanes]), lane(lane_id() % Layout::kLanes), count(count) {
+    words = reinterpret_cast<const Bits*>(reach_words) + lane;
+#pragma unroll
+    for (int i = 0; i < kRounds; ++i) bits[i] = read_bits(i * kAtOnce);
+    fill();
+  }
+  /// This lane's bits of those `ahead` pairs behind `next`.
+  __device__ uint32_t read_bits(int ahead) const {
+    const int k = next + ahead;
+    return k + kBits * lane < count ? words[k / kBits] : 0u;
+  }
+  /// Takes bits until more pairs than kAtOnce are queued, if there are so many. All lanes must call it.
+  __device__ void fill() {
+    __syncwarp();  // all have read what they took
+    const auto wanted = [&] { return next < count && end - begin <= kRoom - kAtOnce; };
+    for (bool wants; __any_sync(kAllLanes, wants = wanted());) {
+      uint32_t mine = wants ? bits[0] : 0;
+      const int found = __popc(mine);
+      int behind = found;  // of the pixel's lanes up to this one
+#pragma unroll
+      for (int offset = 1; offset < Layout::kLanes; offset *= 2) {
+        const int before = shuffle_up(behind, offset);
+        if (lane >= offset) behind += before;
+      }
+      uint32_t place = end + uint32_t(behind - found);
+      for (const int before = next + kBits * lane - 1; mine != 0; mine &= mine - 1)
+        pairs[place++ % kRoom] = before + __ffs(int(mine));
+      end += uint32_t(shuffle(behind, lane_id() | (Layout::kLanes - 1)));
+      if (!wants) continue;
+      next += kAtOnce;
+#pragma unroll
+      for (int i = 0; i + 1 < kRounds; ++i) bits[i] = bits[i + 1];
+      bits[kRounds - 1] = read_bits((kRounds - 1) * kAtOnce);
+    }
+    __syncwarp();
+  }
+  /// How many there are, of no more than `most`.
+  __device__ int ready(int most) const { return min(int(end - begin), most); }
+  __device__ int pair(int i) const { return pairs[(begin + uint32_t(i)) % kRoom]; }
+  /// Drops the pairs of the pixel, and all that follow.
+  __device__ void close() {
+    count = 0;
+    begin = end;
+  }
+};
+
+/// The splats that each pixel of a warp is about to composite, and the queues that they come from.
+template <class F, int C> struct QueuedStage {
+  TileSplat<F, C> splats[32];
+  int32_t pairs[32];
+  int32_t queues[kQueued];
+};
+
+/// Splats of a list on their way from memory into QueuedStage: the next ones of the pixel of this lane, which has one
+/// of them.
+template <class F, int C, class Layout> struct QueuedSplats {
+  const Splat<F, float>* splats_in;
+  const Channels<float>& channels_in;
+  const TileList& list;
+  int first_channel;
+  int n = 0, next_n = 0;  ///< of the pixel: splats that are read, and those behind
+  int pair, next_pair;
+  int32_t next_id;
+  Splat<F, float> splat;
+  Values<C> channels;
+
+  /// Reads the splats that were next, and takes the pairs behind them from the queue.
+  template <class Queues> __device__ void advance(Queues& queues) {
+    n = next_n;
+    pair = next_pair;
+    if (queues.lane < n) {
+      splat = splats_in[next_id];
+      channels = channels_of<C>(channels_in, splat, next_id, first_channel);
+    }
+    take_next(queues);
+  }
+  template <class Queues> __device__ void take_next(Queues& queues) {
+    next_n = queues.ready(Layout::kLanes);
+    if (queues.lane < next_n) {
+      next_pair = queues.pair(queues.lane);
+      next_id = list.splat(next_pair);
+    }
+    queues.begin += uint32_t(next_n);
+  }
+  template <class Stage> __device__ void put(Stage& stage, int lane) const {
+    if (lane >= n) return;
+    stage.splats[lane_id()] = {cell_terms(splat, list), channels};
+    stage.pairs[lane_id()] = pair;
+  }
+};
+
+/// Composites the staged splats of each pixel, `n` of this lane's, from first_staged on. Most splats that reach a pixel
+/// do not show in a sample, since they are small: the lanes of a sample look at as many splats at once, and composite
+/// the first that shows. Then those behind it are looked at again, since the node has moved. `store(k)` leaves the
+/// checkpoints up to pair k. All lanes must call it.
+template <class F, class Layout, bool kKeep, class Stage, class Blend, class Store>
+__device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& blend, Store&& store) {
+  constexpr int kAhead = Layout::kAhead;
+  const uint32_t sharers = Layout::sharers();
+  float& transmittance = blend.samples.transmittance[0];
+  Vec2<float>& place = blend.samples.place[0];
+  int next = Layout::ahead();  // of the pixel's staged splats, for this lane
+  bool live = false;           // there is such a splat, and none behind it was composited
+  auto splat = stage.splats[first_staged];
+  int k = 0;
+  const auto take = [&] {
+    live = next < n && transmittance > 0;
+    if (!live) return;
+    splat = stage.splats[first_staged + next];
+    k = stage.pairs[first_staged + next];
+  };
+  take();
+  while (__any_sync(kAllLanes, live)) {
+    const Vec2<float> z = blend.corners.node(splat.terms, 0, place);
+    const float shows = exp2(F::log_alpha(splat.terms, z)), raw = live ? shows : 0.0f;
+    const bool hit = raw >= float(kAlphaMin);
+    const uint32_t hits = __ballot_sync(kAllLanes, hit) & sharers;
+    const int first = hits ? __ffs(int(hits)) - 1 : lane_id();
+    float behind = transmittance;
+    Vec2<float> moved = place;
+    const Blended<float> b = blend_placed_sample<F>(splat.terms, z, raw, UnitCell<F::kSide>(), behind, moved);
+    if (!hit) moved = place;  // a lane without a splat may have worked with anything
+    if (hit && first == lane_id()) blend.add(b, splat.channels, k);
+    if constexpr (kKeep) {
+      const int pair = shuffle(k, first);
+      if (hits) store(pair);
+    }
+    transmittance = shuffle(behind, first);
+    place = {shuffle(moved.x, first), shuffle(moved.y, first)};
+    live = live && hits != 0 && lane_id() > first && transmittance > 0;
+    if (hits == 0 || first % kAhead == kAhead - 1) {
+      next += kAhead;
+      take();
+    }
+  }
+}
+
+/// Blends the pixels of a warp by looking ahead, as Layout shares them out; C channels from `first` on.
+/// `first_segment`: of the list.
+template <class F, int C, class Layout, bool kKeep, class Stage>
+__device__ void blend_queued(const BlendParams& params, int first, int tile, const TileList& list, int first_segment,
+                             Stage& stage) {
+  constexpr int kLanes = Layout::kLanes;
+  const StatePlaces places(params.lists, list, params.grid, tile);
+  const Vec2<float> p = Layout::pixel();
+  const Pixel pixel(list, params.grid, p);
+  MovingBlend<F, C, Layout, kKeep, true> blend(p, pixel.inside);
+  int checkpoint = kStateChunk;  // the next one is in front of this pair
+  float* to = params.checkpoints + places.first * blend.samples.kCheckpoint;
+  const auto store_up_to = [&](int k) {
+#pragma unroll 1
+    for (; kKeep && checkpoint <= k; checkpoint += kStateChunk, to += blend.samples.kCheckpoint)
+      blend.samples.store(to);
+  };
+  using Queues = PairQueues<Layout>;
+  const int64_t words = pixel_words<F, Layout::kTilePixels>(first_segment, list, Layout::pixel_number());
+  Queues queues(reinterpret_cast<typename Queues::Memory&>(stage.queues), params.reach_words + words,
+                pixel.inside ? list.count : 0);
+  // While splats are composited, those behind them are read, and before that which ones these are.
+  QueuedSplats<F, C, Layout> next = {reinterpret_cast<const Splat<F, float>*>(params.splats), params.channels, list,
+                                     first};
+  next.take_next(queues);
+  queues.fill();
+  next.advance(queues);
+  const int first_staged = lane_id() / kLanes * kLanes;
+  const uint32_t lanes_of_pixel = (kAllLanes >> (32 - kLanes)) << (lane_id() / kLanes * kLanes);
+  while (__any_sync(kAllLanes, next.n > 0)) {
+    next.put(stage, queues.lane);
+    const int n = next.n;
+    queues.fill();
+    next.advance(queues);
+    __syncwarp();
+    blend_ahead<F, Layout, kKeep>(stage, first_staged, n, blend, store_up_to);
+    if (!(__ballot_sync(kAllLanes, blend.samples.open()) & lanes_of_pixel)) {
+      queues.close();
+      next.n = next.next_n = 0;
+    }
+    __syncwarp();  // all have read the splats
+  }
+  if constexpr (kKeep) {
+#pragma unroll
+    for (int offset = 1; offset < Layout::kAhead; offset *= 2)
+      blend.last[0] = max(blend.last[0], __shfl_xor_sync(kAllLanes, blend.last[0], offset));
+  }
+  blend.write(params, first, pixel);
+}
+
+}  // namespace ar::cuda
