@@ -143,13 +143,7 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
       words[i] = mine < list.count ? from[mine / 32] : 0u;
     }
   };
-  int checkpoint = kStateChunk;  // the next one is in front of this pair
-  float* to = params.checkpoints + places.first * blend.samples.kCheckpoint;
-  const auto store_up_to = [&](int k) {
-#pragma unroll 1
-    for (; kKeep && checkpoint <= k; checkpoint += kStateChunk, to += blend.samples.kCheckpoint)
-      blend.samples.store(to);
-  };
+  CheckpointsAhead checkpoints = {kStateChunk, params.checkpoints + places.first * blend.samples.kCheckpoint};
   read_words(0);
   uint32_t open = __ballot_sync(kAllLanes, blend.samples.open());
   for (int k0 = 0; k0 < list.count && open; k0 += kListedBatch) {
@@ -179,7 +173,7 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
         j = __clz(int(left)) % 32;
         const TileSplat<F, C> next = stage.splats[j];
         const int next_place = stage.places[from + j];
-        store_up_to(k);
+        if (kKeep) checkpoints.store_up_to(k, blend.samples);
         blend.add(splat, k + 1, blend.last);
         splat = next;
         k = k0 + next_place;

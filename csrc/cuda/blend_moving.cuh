@@ -141,6 +141,18 @@ template <class F, class Layout, bool kTogether = false> struct MovingSamples {
   }
 };
 
+/// The checkpoints of a lane's samples that have not been left yet, of a list that is cut.
+struct CheckpointsAhead {
+  int pair;   ///< the next one is in front of this pair
+  float* to;  ///< and there
+
+  /// Leaves `samples` in those up to pair k.
+  template <class Samples> __device__ void store_up_to(int k, const Samples& samples) {
+#pragma unroll 1
+    for (; pair <= k; pair += kStateChunk, to += Samples::kCheckpoint) samples.store(to);
+  }
+};
+
 /// Where the cells of a lane are, in edges of cells from the centre of the tile's first pixel. How whitened coordinates
 /// are rounded does not depend on the layout, so that one kernel finds again what another has composited.
 template <class F, class Layout> struct CellCorners {

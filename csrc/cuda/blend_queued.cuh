@@ -91,9 +91,9 @@ template <class Layout> struct PairQueues {
     }
     __syncwarp();
   }
-  /// How many there are, of no more than `most`.
-  __device__ int ready(int most) const { return min(int(end - begin), most); }
-  __device__ int pair(int i) const { return pairs[(begin + uint32_t(i)) % kRoom]; }
+  /// How many there are for the lanes of the pixel, one each, and this lane's.
+  __device__ int ready() const { return min(int(end - begin), Layout::kLanes); }
+  __device__ int pair() const { return pairs[(begin + uint32_t(lane)) % kRoom]; }
   /// Drops the pairs of the pixel, and all that follow.
   __device__ void close() {
     count = 0;
@@ -132,9 +132,9 @@ template <class F, int C, class Layout> struct QueuedSplats {
     take_next(queues);
   }
   template <class Queues> __device__ void take_next(Queues& queues) {
-    next_n = queues.ready(Layout::kLanes);
+    next_n = queues.ready();
     if (queues.lane < next_n) {
-      next_pair = queues.pair(queues.lane);
+      next_pair = queues.pair();
       next_id = list.splat(next_pair);
     }
     queues.begin += uint32_t(next_n);
@@ -148,10 +148,10 @@ template <class F, int C, class Layout> struct QueuedSplats {
 
 /// Composites the staged splats of each pixel, `n` of this lane's, from first_staged on. Most splats that reach a pixel
 /// do not show in a sample, since they are small: the lanes of a sample look at as many splats at once, and composite
-/// the first that shows. Then those behind it are looked at again, since the node has moved. `store(k)` leaves the
-/// checkpoints up to pair k. All lanes must call it.
-template <class F, class Layout, bool kKeep, class Stage, class Blend, class Store>
-__device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& blend, Store&& store) {
+/// the first that shows. Then those behind it are looked at again, since the node has moved. All lanes must call
+/// it.
+template <class F, class Layout, bool kKeep, class Stage, class Blend>
+__device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& blend, CheckpointsAhead& checkpoints) {
   constexpr int kAhead = Layout::kAhead;
   const uint32_t sharers = Layout::sharers();
   float& transmittance = blend.samples.transmittance[0];
@@ -180,7 +180,7 @@ __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& 
     if (hit && first == lane_id()) blend.add(b, splat.channels, k);
     if constexpr (kKeep) {
       const int pair = shuffle(k, first);
-      if (hits) store(pair);
+      if (hits) checkpoints.store_up_to(pair, blend.samples);
     }
     transmittance = shuffle(behind, first);
     place = {shuffle(moved.x, first), shuffle(moved.y, first)};
@@ -202,13 +202,7 @@ __device__ void blend_queued(const BlendParams& params, int first, int tile, con
   const Vec2<float> p = Layout::pixel();
   const Pixel pixel(list, params.grid, p);
   MovingBlend<F, C, Layout, kKeep, true> blend(p, pixel.inside);
-  int checkpoint = kStateChunk;  // the next one is in front of this pair
-  float* to = params.checkpoints + places.first * blend.samples.kCheckpoint;
-  const auto store_up_to = [&](int k) {
-#pragma unroll 1
-    for (; kKeep && checkpoint <= k; checkpoint += kStateChunk, to += blend.samples.kCheckpoint)
-      blend.samples.store(to);
-  };
+  CheckpointsAhead checkpoints = {kStateChunk, params.checkpoints + places.first * blend.samples.kCheckpoint};
   using Queues = PairQueues<Layout>;
   const int64_t words = pixel_words<F, Layout::kTilePixels>(first_segment, list, Layout::pixel_number());
   Queues queues(reinterpret_cast<typename Queues::Memory&>(stage.queues), params.reach_words + words,
@@ -227,7 +221,7 @@ __device__ void blend_queued(const BlendParams& params, int first, int tile, con
     queues.fill();
     next.advance(queues);
     __syncwarp();
-    blend_ahead<F, Layout, kKeep>(stage, first_staged, n, blend, store_up_to);
+    blend_ahead<F, Layout, kKeep>(stage, first_staged, n, blend, checkpoints);
     if (!(__ballot_sync(kAllLanes, blend.samples.open()) & lanes_of_pixel)) {
       queues.close();
       next.n = next.next_n = 0;

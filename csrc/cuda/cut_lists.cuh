@@ -33,10 +33,10 @@ AR_HD constexpr int moving_segment(int samples) { return samples <= 4 ? 512 : 10
 /// four on each of 132 multiprocessors, and each of them walks 1/528 of the pairs. So the limit is kLongList, doubled
 /// until it is at least pairs / kBlocksAtOnce.
 inline constexpr int kLongList = 4096;
+inline constexpr int kBlocksAtOnce = 528;
 /// Lists of so many pairs would outlast all others in the forward pass if a warp took several of their pixels. With up
 /// to kMostAhead samples it takes one, whose samples have several lanes each.
 inline constexpr int kLongestList = 16384, kMostAhead = 4;
-inline constexpr int kBlocksAtOnce = 528;
 
 inline ListCut moving_list_cut(int samples, int64_t capacity, TileGrid grid) {
   const int length = moving_segment(samples), longest_from = samples <= kMostAhead ? kLongestList : kNoList;

@@ -76,8 +76,8 @@ struct Plan {
 };
 
 /// Whole lists forwards with one layout, back with another. With kSegment > 0 those of `long_from` pairs or more are
-/// cut: forwards into lists of pixels, those of `longest_from` with a warp for each; back into segments of so many
-/// pairs.
+/// cut: forwards into lists of pixels, those of `longest_from` with a warp for each pixel; back into segments of so
+/// many pairs.
 template <class F, class Forward, class Backward, int kSegment = 0>
 Results run(Scene<F>& scene, int long_from = 0, int longest_from = kLongestList) {
   constexpr int S = F::kSamples, kSide = Forward::kSide;
