@@ -123,7 +123,7 @@ template <class F, int C, int kMostPixels> struct ListedStage {
 };
 
 /// Blends the pixels of a warp, as Layout shares them out; C channels from `first` on. `first_segment`: of the list.
-template <class F, int C, class Layout, bool kKeep, class Stage>
+template <class F, int C, class Layout, bool kKeep, int kSegment, class Stage>
 __device__ void blend_listed(const BlendParams& params, int first, int tile, const TileList& list, int first_segment,
                              Stage& stage) {
   constexpr int kPixels = Layout::kPixels;
@@ -143,7 +143,7 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
       words[i] = mine < list.count ? from[mine / 32] : 0u;
     }
   };
-  CheckpointsAhead checkpoints = {kStateChunk, params.checkpoints + places.first * blend.samples.kCheckpoint};
+  CheckpointsAhead<kSegment> checkpoints = {kStateChunk, params.checkpoints + places.first * blend.samples.kCheckpoint};
   read_words(0);
   uint32_t open = __ballot_sync(kAllLanes, blend.samples.open());
   for (int k0 = 0; k0 < list.count && open; k0 += kListedBatch) {
@@ -220,8 +220,9 @@ template <class F, int C, int kSide> union WarpStage {
   QueuedStage<F, C> queued;
 };
 
-/// A warp per few pixels of a tile whose list is cut, those of the longest lists first.
-template <class F, int C, int kSide, bool kKeep>
+/// A warp per few pixels of a tile whose list is cut, those of the longest lists first. `kSegment`: pairs of a segment
+/// in the backward pass.
+template <class F, int C, int kSide, bool kKeep, int kSegment = moving_segment(F::kSamples)>
 __global__ void __launch_bounds__(32) listed_blend_kernel(const BlendParams params, int first) {
   let_next_kernel_begin();  // so that moving_blend_kernel does not wait for filter_kernel either
   wait_for_earlier_kernels();
@@ -239,16 +240,18 @@ __global__ void __launch_bounds__(32) listed_blend_kernel(const BlendParams para
     if constexpr (Layouts::kLongestAhead) {
       if (is_longest) {
         using Longest = typename Layouts::Longest;
-        blend_queued<F, C, Longest, kKeep>(params, first, cut.tile, list, cut.first, stage.queued);
+        blend_queued<F, C, Longest, kKeep, kSegment>(params, first, cut.tile, list, cut.first, stage.queued);
         continue;
       }
     }
     if constexpr (Layouts::kAllAhead) {
-      blend_queued<F, C, typename Layouts::Ahead, kKeep>(params, first, cut.tile, list, cut.first, stage.queued);
+      blend_queued<F, C, typename Layouts::Ahead, kKeep, kSegment>(params, first, cut.tile, list, cut.first,
+                                                                   stage.queued);
     } else if (list.count >= kLongList) {
-      blend_listed<F, C, typename Layouts::Long, kKeep>(params, first, cut.tile, list, cut.first, stage.listed);
+      blend_listed<F, C, typename Layouts::Long, kKeep, kSegment>(params, first, cut.tile, list, cut.first,
+                                                                  stage.listed);
     } else if (block % Layouts::kOfOthers < Short::kBlocks) {
-      blend_listed<F, C, Short, kKeep>(params, first, cut.tile, list, cut.first, stage.listed);
+      blend_listed<F, C, Short, kKeep, kSegment>(params, first, cut.tile, list, cut.first, stage.listed);
     }
   }
 }

@@ -117,14 +117,11 @@ template <class F, class Layout, bool kTogether = false> struct MovingSamples {
     return kTogether ? pixel * F::kSamples + sample : 3 * sample * Layout::kTilePixels + pixel;
   }
   __device__ void store(float* checkpoint) const {
-#pragma unroll
-    for (int i = 0; i < kCells; ++i) {
-      if (!exists(i) || !Layout::owns()) continue;
-      float* to = checkpoint + in_checkpoint(i);
-      to[0] = abs(transmittance[i]);
-      to[kPlane] = place[i].x;
-      to[2 * kPlane] = place[i].y;
-    }
+    store(checkpoint, [](int) { return true; });
+  }
+  /// Only those samples that load() reads from a checkpoint in front of pair k.
+  __device__ void store(float* checkpoint, int k, const int (&last)[kCells]) const {
+    store(checkpoint, [&](int i) { return k < last[i]; });
   }
   /// In front of pair k, where `checkpoint` is, unless k is 0. Samples that have composited their last splat, `last`
   /// pairs from the first, may have no checkpoint there, and need none.
@@ -139,17 +136,17 @@ template <class F, class Layout, bool kTogether = false> struct MovingSamples {
       place[i] = {from[kPlane], from[2 * kPlane]};
     }
   }
-};
 
-/// The checkpoints of a lane's samples that have not been left yet, of a list that is cut.
-struct CheckpointsAhead {
-  int pair;   ///< the next one is in front of this pair
-  float* to;  ///< and there
-
-  /// Leaves `samples` in those up to pair k.
-  template <class Samples> __device__ void store_up_to(int k, const Samples& samples) {
-#pragma unroll 1
-    for (; pair <= k; pair += kStateChunk, to += Samples::kCheckpoint) samples.store(to);
+ private:
+  template <class Wanted> __device__ void store(float* checkpoint, Wanted&& wanted) const {
+#pragma unroll
+    for (int i = 0; i < kCells; ++i) {
+      if (!exists(i) || !Layout::owns() || !wanted(i)) continue;
+      float* to = checkpoint + in_checkpoint(i);
+      to[0] = abs(transmittance[i]);
+      to[kPlane] = place[i].x;
+      to[2 * kPlane] = place[i].y;
+    }
   }
 };
 

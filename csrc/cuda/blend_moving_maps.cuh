@@ -81,8 +81,8 @@ using SegmentLayout = CellLayout<F::kSamples <= 4 ? 1 : 2,
 template <class F, int kSide>
 using MapLayout = std::conditional_t<(F::kSamples > 4), CellLayout<1, 16, kSide, 16>, SegmentLayout<F, kSide>>;
 
-/// A block per segment of kSegment pairs and part of a tile: the maps of its samples, but of the first segments of
-/// tiles, which nobody needs.
+/// A block per segment of kSegment pairs and part of a tile: the maps of its samples, and the checkpoints within it.
+/// Not for the first segments of tiles, whose maps nobody needs and whose checkpoints blend has left.
 template <class F, int C, int kSide, int kSegment, class Layout = MapLayout<F, kSide>>
 __global__ void __launch_bounds__(Layout::kThreads, 1024 / Layout::kThreads)
     segment_maps_kernel(const BlendVjpParams params, int first) {
@@ -103,8 +103,10 @@ __global__ void __launch_bounds__(Layout::kThreads, 1024 / Layout::kThreads)
   Samples samples(pixel.inside);
   const LastSplats<F, Layout> last(params.last, pixel, last_of_warps);
   const int begin = segment.index * kSegment, end = begin + kSegment, stop = min(last.block, end);
-  samples.load(params.checkpoints + (places.first + begin / kStateChunk - 1) * Samples::kCheckpoint, begin,
-               last.samples);
+  const auto checkpoint_at = [&](int k) {
+    return params.checkpoints + (places.first + k / kStateChunk - 1) * Samples::kCheckpoint;
+  };
+  samples.load(checkpoint_at(begin), begin, last.samples);
   AdjointMap<float> maps[kCells];
   float before[kCells];  // the transmittance
 #pragma unroll
@@ -121,8 +123,9 @@ __global__ void __launch_bounds__(Layout::kThreads, 1024 / Layout::kThreads)
     __syncthreads();
     if (next_id >= 0) prefetch(splats + next_id);  // so that the next batch need not wait for memory
     id = next_id;
-    for (int from = 0; from < count; from += 32) {
-      const int listed = stage.lists.list(stage.reach, from, from + 32);
+    for (int from = 0; from < count; from += kStateChunk) {
+      if (first == 0 && k + from > begin) samples.store(checkpoint_at(k + from), k + from, last.samples);
+      const int listed = stage.lists.list(stage.reach, from, from + kStateChunk);
       stage.lists.for_each(0, listed, [&](uint32_t j) {
         TileSplatRef<F, C> splat = stage.splats[j];
         Vec2<float> z[kCells];

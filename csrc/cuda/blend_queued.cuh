@@ -31,6 +31,25 @@ template <class F, int kPixels> __device__ int64_t pixel_words(int first, const 
   return (int64_t(first) * kPixels + pixel_number * segments) * (kSegment / 32);
 }
 
+/// The checkpoints of a lane's samples that blend has still to leave, of a list that is cut into segments of kSegment
+/// pairs: one in front of each segment, and all within the first one. Those within the others are left by
+/// segment_maps_kernel, which goes through them side by side, where here every sample would wait for them.
+template <int kSegment> struct CheckpointsAhead {
+  int pair;   ///< the next one is in front of this pair
+  float* to;  ///< and there
+
+  /// Leaves `samples` in those up to pair k.
+  template <class Samples> __device__ void store_up_to(int k, const Samples& samples) {
+#pragma unroll 1
+    while (pair <= k) {
+      samples.store(to);
+      const int chunks = pair < kSegment ? 1 : kSegment / kStateChunk;
+      pair += chunks * kStateChunk;
+      to += chunks * Samples::kCheckpoint;
+    }
+  }
+};
+
 /// Places in the queues of a warp.
 inline constexpr int kQueued = 1024;
 
@@ -39,7 +58,6 @@ inline constexpr int kQueued = 1024;
 template <class Layout> struct PairQueues {
   using Bits = uint16_t;                                  ///< what a lane takes at a time
   static constexpr int kBits = 16;                        ///< of pairs that follow each other
-  static constexpr int kRounds = 2;                       ///< how many times ahead they are read
   static constexpr int kAtOnce = kBits * Layout::kLanes;  ///< pairs of which a pixel's lanes take the bits at a time
   static constexpr uint32_t kRoom = 2 * kAtOnce;
   using Memory = int32_t[Layout::kPixels][kRoom];
@@ -51,43 +69,38 @@ template <class Layout> struct PairQueues {
   int count;                    ///< pairs of the list; 0 when no more are wanted
   int next = 0;                 ///< the pair whose bit is the first that the pixel's lanes take next
   uint32_t begin = 0, end = 0;  ///< of the pairs in the queue, counted from the first that was ever in it
-  uint32_t bits[kRounds];       ///< that this lane takes next
+  uint32_t bits;                ///< that this lane takes next
 
   /// `reach_words`: of the pixel. All lanes must call it.
   __device__ PairQueues(Memory& memory, const uint32_t* reach_words, int count)
       : pairs(memory[lane_id() / Layout::kLanes]), lane(lane_id() % Layout::kLanes), count(count) {
     words = reinterpret_cast<const Bits*>(reach_words) + lane;
-#pragma unroll
-    for (int i = 0; i < kRounds; ++i) bits[i] = read_bits(i * kAtOnce);
+    bits = has_bits() ? words[0] : 0u;
     fill();
   }
-  /// This lane's bits of those `ahead` pairs behind `next`.
-  __device__ uint32_t read_bits(int ahead) const {
-    const int k = next + ahead;
-    return k + kBits * lane < count ? words[k / kBits] : 0u;
-  }
+  /// Whether any of the pairs from `next` on are this lane's.
+  __device__ bool has_bits() const { return next + kBits * lane < count; }
   /// Takes bits until more pairs than kAtOnce are queued, if there are so many. All lanes must call it.
   __device__ void fill() {
     __syncwarp();  // all have read what they took
     const auto wanted = [&] { return next < count && end - begin <= kRoom - kAtOnce; };
     for (bool wants; __any_sync(kAllLanes, wants = wanted());) {
-      uint32_t mine = wants ? bits[0] : 0;
+      uint32_t mine = wants ? bits : 0;
+      const int before = next + kBits * lane - 1;
       const int found = __popc(mine);
       int behind = found;  // of the pixel's lanes up to this one
 #pragma unroll
       for (int offset = 1; offset < Layout::kLanes; offset *= 2) {
-        const int before = shuffle_up(behind, offset);
-        if (lane >= offset) behind += before;
+        const int of_lanes_before = shuffle_up(behind, offset);
+        if (lane >= offset) behind += of_lanes_before;
       }
       uint32_t place = end + uint32_t(behind - found);
-      for (const int before = next + kBits * lane - 1; mine != 0; mine &= mine - 1)
-        pairs[place++ % kRoom] = before + __ffs(int(mine));
+      for (; mine != 0; mine &= mine - 1) pairs[place++ % kRoom] = before + __ffs(int(mine));
       end += uint32_t(shuffle(behind, lane_id() | (Layout::kLanes - 1)));
-      if (!wants) continue;
-      next += kAtOnce;
-#pragma unroll
-      for (int i = 0; i + 1 < kRounds; ++i) bits[i] = bits[i + 1];
-      bits[kRounds - 1] = read_bits((kRounds - 1) * kAtOnce);
+      // The bits behind these are read straight into their place, so that nothing waits for them before they are taken.
+      next += wants ? kAtOnce : 0;
+      bits = wants ? 0 : bits;
+      if (wants && has_bits()) bits = words[next / kBits];
     }
     __syncwarp();
   }
@@ -117,7 +130,7 @@ template <class F, int C, class Layout> struct QueuedSplats {
   int first_channel;
   int n = 0, next_n = 0;  ///< of the pixel: splats that are read, and those behind
   int pair, next_pair;
-  int32_t next_id;
+  int32_t next_id = 0;  ///< of any splat, where there is none behind
   Splat<F, float> splat;
   Values<C> channels;
 
@@ -125,10 +138,9 @@ template <class F, int C, class Layout> struct QueuedSplats {
   template <class Queues> __device__ void advance(Queues& queues) {
     n = next_n;
     pair = next_pair;
-    if (queues.lane < n) {
-      splat = splats_in[next_id];
-      channels = channels_of<C>(channels_in, splat, next_id, first_channel);
-    }
+    // By all lanes, and so straight into the registers: the compiler would wait to copy what only some lanes read.
+    splat = splats_in[next_id];
+    channels = channels_of<C>(channels_in, splat, next_id, first_channel);
     take_next(queues);
   }
   template <class Queues> __device__ void take_next(Queues& queues) {
@@ -140,6 +152,7 @@ template <class F, int C, class Layout> struct QueuedSplats {
     queues.begin += uint32_t(next_n);
   }
   template <class Stage> __device__ void put(Stage& stage, int lane) const {
+    keep_register(splat.level);  // which is read together with the colour
     if (lane >= n) return;
     stage.splats[lane_id()] = {cell_terms(splat, list), channels};
     stage.pairs[lane_id()] = pair;
@@ -150,51 +163,63 @@ template <class F, int C, class Layout> struct QueuedSplats {
 /// do not show in a sample, since they are small: the lanes of a sample look at as many splats at once, and composite
 /// the first that shows. Then those behind it are looked at again, since the node has moved. All lanes must call
 /// it.
-template <class F, class Layout, bool kKeep, class Stage, class Blend>
-__device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& blend, CheckpointsAhead& checkpoints) {
+template <class F, class Layout, bool kKeep, class Stage, class Blend, class Checkpoints>
+__device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& blend, Checkpoints& checkpoints) {
   constexpr int kAhead = Layout::kAhead;
-  const uint32_t sharers = Layout::sharers();
+  constexpr bool kOnce = kAhead == Layout::kLanes;  // a sample has a lane for each of the staged splats
+  const int own = lane_id(), first_lane = own / kAhead * kAhead;
   float& transmittance = blend.samples.transmittance[0];
   Vec2<float>& place = blend.samples.place[0];
-  int next = Layout::ahead();  // of the pixel's staged splats, for this lane
-  bool live = false;           // there is such a splat, and none behind it was composited
-  auto splat = stage.splats[first_staged];
-  int k = 0;
-  const auto take = [&] {
-    live = next < n && transmittance > 0;
-    if (!live) return;
-    splat = stage.splats[first_staged + next];
-    k = stage.pairs[first_staged + next];
+  int taken = first_staged + Layout::ahead();  // this lane's, whether there is one or not
+  auto splat = stage.splats[taken];
+  int pair = stage.pairs[taken];
+  // Lanes of the sample with a splat, none behind which has been composited.
+  const auto lanes_with_splats = [&] {
+    const int count = min(n - (taken - Layout::ahead() - first_staged), kAhead);
+    return transmittance > 0 && count > 0 ? kAllLanes >> (32 - count) << first_lane : 0u;
   };
-  take();
-  while (__any_sync(kAllLanes, live)) {
+  uint32_t live = lanes_with_splats();
+  // Lanes with a pair in front of which there is a checkpoint to be left.
+  const auto lanes_at_checkpoint = [&] { return kKeep ? __ballot_sync(kAllLanes, pair >= checkpoints.pair) : 0u; };
+  uint32_t at_checkpoint = lanes_at_checkpoint();
+  while (true) {
     const Vec2<float> z = blend.corners.node(splat.terms, 0, place);
-    const float shows = exp2(F::log_alpha(splat.terms, z)), raw = live ? shows : 0.0f;
-    const bool hit = raw >= float(kAlphaMin);
-    const uint32_t hits = __ballot_sync(kAllLanes, hit) & sharers;
-    const int first = hits ? __ffs(int(hits)) - 1 : lane_id();
+    const float raw = exp2(F::log_alpha(splat.terms, z));
+    const bool hit = (live >> own & 1) != 0 && raw >= float(kAlphaMin);
+    const uint32_t all_hits = __ballot_sync(kAllLanes, hit), hits = all_hits & Layout::sharers();
+    if (kOnce && all_hits == 0) break;
+    const int first = __ffs(int(hits)) - 1;  // the lane whose splat is composited, if there is one
     float behind = transmittance;
     Vec2<float> moved = place;
     const Blended<float> b = blend_placed_sample<F>(splat.terms, z, raw, UnitCell<F::kSide>(), behind, moved);
-    if (!hit) moved = place;  // a lane without a splat may have worked with anything
-    if (hit && first == lane_id()) blend.add(b, splat.channels, k);
-    if constexpr (kKeep) {
-      const int pair = shuffle(k, first);
-      if (hits) checkpoints.store_up_to(pair, blend.samples);
+    if (first == own) blend.add(b, splat.channels, pair);
+    if (kKeep && (hits & -hits & at_checkpoint) != 0)
+      checkpoints.store_up_to(stage.pairs[taken - own + first], blend.samples);
+    behind = shuffle(behind, first);
+    moved = {shuffle(moved.x, first), shuffle(moved.y, first)};
+    if (hits != 0) {
+      transmittance = behind;
+      place = moved;
+      live = behind > 0 ? live & (kAllLanes - 1) << first : 0;
     }
-    transmittance = shuffle(behind, first);
-    place = {shuffle(moved.x, first), shuffle(moved.y, first)};
-    live = live && hits != 0 && lane_id() > first && transmittance > 0;
-    if (hits == 0 || first % kAhead == kAhead - 1) {
-      next += kAhead;
-      take();
+    if constexpr (!kOnce) {
+      if (hits == 0 || live == 0) {
+        taken += kAhead;
+        live = lanes_with_splats();
+        if (live != 0) {
+          splat = stage.splats[taken];
+          pair = stage.pairs[taken];
+        }
+      }
+      if (!__any_sync(kAllLanes, live != 0)) break;
+      at_checkpoint = lanes_at_checkpoint();
     }
   }
 }
 
 /// Blends the pixels of a warp by looking ahead, as Layout shares them out; C channels from `first` on.
 /// `first_segment`: of the list.
-template <class F, int C, class Layout, bool kKeep, class Stage>
+template <class F, int C, class Layout, bool kKeep, int kSegment, class Stage>
 __device__ void blend_queued(const BlendParams& params, int first, int tile, const TileList& list, int first_segment,
                              Stage& stage) {
   constexpr int kLanes = Layout::kLanes;
@@ -202,7 +227,7 @@ __device__ void blend_queued(const BlendParams& params, int first, int tile, con
   const Vec2<float> p = Layout::pixel();
   const Pixel pixel(list, params.grid, p);
   MovingBlend<F, C, Layout, kKeep, true> blend(p, pixel.inside);
-  CheckpointsAhead checkpoints = {kStateChunk, params.checkpoints + places.first * blend.samples.kCheckpoint};
+  CheckpointsAhead<kSegment> checkpoints = {kStateChunk, params.checkpoints + places.first * blend.samples.kCheckpoint};
   using Queues = PairQueues<Layout>;
   const int64_t words = pixel_words<F, Layout::kTilePixels>(first_segment, list, Layout::pixel_number());
   Queues queues(reinterpret_cast<typename Queues::Memory&>(stage.queues), params.reach_words + words,

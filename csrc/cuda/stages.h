@@ -184,9 +184,9 @@ struct BlendVjpParams : ar::BlendVjpParams<float> {
   const PlanState* plan;
   int64_t max_chunks;
   int32_t* chunks_taken;  ///< [kSampleClasses] set to zero by blend_vjp; chunks of a class that warps have begun with
-  const float* checkpoints;
-  float* pair_grads;    ///< [max(capacity, n), kPairGradWidth] by slot, or by splat if there are too many pairs
-  float* channel_sums;  ///< [max(capacity, n), channel_group] likewise, for more than kFewChannels channels; or null
+  float* checkpoints;     ///< as in BlendParams; of lists that are cut, blend_vjp leaves most of them
+  float* pair_grads;      ///< [max(capacity, n), kPairGradWidth] by slot, or by splat if there are too many pairs
+  float* channel_sums;    ///< [max(capacity, n), channel_group] likewise, for more than kFewChannels channels; or null
   MeanSums mean_sums;
   Segments segments;    ///< as in BlendParams
   float* adjoint_maps;  ///< [max_adjoint_maps]

@@ -244,10 +244,10 @@ class CudaBackend final : public Backend {
     set_plan(p, state.chunks, cut);
     const Tensor chunks_taken = at::empty({cuda::kSampleClasses}, ints_);
     p.chunks_taken = pointer<int32_t>(chunks_taken);
-    p.checkpoints = const_pointer<float>(state.checkpoints);
+    p.checkpoints = pointer<float>(state.checkpoints);
     p.segments.count = cuda::list_segments(pass.footprint.choice.index, count, pass.grid);
     p.segments.samples = pass.footprint.samples;
-    p.segments.transmittance = const_cast<float*>(p.checkpoints);
+    p.segments.transmittance = p.checkpoints;
     Tensor shown;
     if (p.segments.count > 1) {
       check_segments(p.segments, pass.grid, state);

@@ -117,7 +117,7 @@ Results run(Scene<F>& scene, int long_from = 0, int longest_from = kLongestList)
       // Fewer blocks than pieces and tiles.
       cuda_on_host::launch(cut.max_segments / 2, kFilterPiece, [&] { filter_kernel<F, kSide>(p); });
       cuda_on_host::launch(ListedLayouts<F, kSide>::kOfLongest, 32,
-                           [&] { listed_blend_kernel<F, kColors, kSide, kKeep>(p, 0); });
+                           [&] { listed_blend_kernel<F, kColors, kSide, kKeep, kSegment>(p, 0); });
     }
     cuda_on_host::launch(tiles + 1, Forward::kThreads,
                          [&] { moving_blend_kernel<F, kColors, Forward, kKeep>(p, 0, false); });
