@@ -48,7 +48,11 @@ def rendered(scene, view, footprint, background=(0.0, 0.0, 0.0)):
 def assert_same(ours, expected, largest=LARGEST, rms=ROOT_MEAN_SQUARE):
     error = 255 * (ours - expected)
     levels = np.abs(np.rint(255 * ours.clip(0, 1)) - np.rint(255 * expected.clip(0, 1)))
-    assert levels.max() <= largest, (levels.max(), np.abs(error).max())
+    worst = np.unravel_index(levels.argmax(), levels.shape)
+    assert levels.max() <= largest, (
+        f"{(levels > largest).sum()} of {levels.size} values are off, most of all that at (channel, row, column) "
+        f"{tuple(map(int, worst))}: {ours[worst]} in place of {expected[worst]}"
+    )
     assert np.sqrt(np.mean(error**2)) <= rms
 
 
