@@ -163,8 +163,9 @@ __device__ inline void prefetch([[maybe_unused]] const void* address) {
 #endif
 }
 
-/// Keeps the register of `x` until here. If the compiler sees that nothing needs one of several numbers that are read
-/// together, it uses that register for something else, and for that waits until all of them have arrived.
+/// Asks the compiler to keep the register of `x` until here, which it need not do. If it sees that nothing needs one of
+/// several numbers that are read together, it uses that register for something else, and for that waits until all of
+/// them have arrived.
 __device__ inline void keep_register([[maybe_unused]] float x) {
 #if defined(__CUDA_ARCH__)
   asm volatile("" ::"f"(x));
