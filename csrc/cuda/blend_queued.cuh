@@ -237,7 +237,7 @@ __device__ void blend_queued(const BlendParams& params, int first, int tile, con
                                      first};
   next.take_next(queues);
   queues.fill();
-  next.advance(queues);
+  if (list.count > 0) next.advance(queues);  // of an empty scene there is no splat that all lanes could read
   const int first_staged = lane_id() / kLanes * kLanes;
   const uint32_t lanes_of_pixel = (kAllLanes >> (32 - kLanes)) << (lane_id() / kLanes * kLanes);
   while (__any_sync(kAllLanes, next.n > 0)) {
