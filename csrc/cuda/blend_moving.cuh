@@ -76,6 +76,8 @@ struct StatePlaces {
     first = tile * room;
     spacing = int(((list.count - 1) / (room + 1) / kStateChunk + 1) * kStateChunk);
   }
+  /// The number of the checkpoint in front of chunk k / kStateChunk, where every chunk but the first has one.
+  __device__ int64_t of_chunk_at(int k) const { return first + k / kStateChunk - 1; }
 };
 
 /// What the cells of a tile need of a splat: lengths are in edges of cells.

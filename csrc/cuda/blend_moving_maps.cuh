@@ -103,9 +103,7 @@ __global__ void __launch_bounds__(Layout::kThreads, 1024 / Layout::kThreads)
   Samples samples(pixel.inside);
   const LastSplats<F, Layout> last(params.last, pixel, last_of_warps);
   const int begin = segment.index * kSegment, end = begin + kSegment, stop = min(last.block, end);
-  const auto checkpoint_at = [&](int k) {
-    return params.checkpoints + (places.first + k / kStateChunk - 1) * Samples::kCheckpoint;
-  };
+  const auto checkpoint_at = [&](int k) { return params.checkpoints + places.of_chunk_at(k) * Samples::kCheckpoint; };
   samples.load(checkpoint_at(begin), begin, last.samples);
   AdjointMap<float> maps[kCells];
   float before[kCells];  // the transmittance

@@ -237,7 +237,7 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layou
             samples = at_batch;
             for (int ahead = 0; ahead < from; ahead += kStateChunk) replay(ahead, k0, nullptr);
           } else {
-            const int64_t number = places.first + (k0 + from) / kStateChunk - 1;
+            const int64_t number = places.of_chunk_at(k0 + from);
             samples.load(params.checkpoints + number * Samples::kCheckpoint, k0 + from, last);
           }
           shown = replay(from, k0, &in_front);
