@@ -342,6 +342,34 @@ def test_a_lost_context_comes_back(browser):
         assert page.is_hidden("#message")
 
 
+def test_a_picture_whose_context_is_lost_is_drawn_again(browser):
+    scene, view = random_scene(500), turned_view()
+    with serve(scene, [view]) as server, open_page(browser, f"{server.url}?view=0&size=16x16") as page:
+        wait_until_ready(page)
+        said = page.evaluate(
+            """async ([footprint, width, height]) => {
+              const loser = canvas.getContext('webgl2').getExtension('WEBGL_lose_context');
+              let said;
+              canvas.addEventListener('webglcontextlost', () => {
+                try {
+                  analyticPixels();
+                } catch (error) {
+                  said = error.message;
+                }
+                setTimeout(() => loser.restoreContext());
+              });
+              const drawn = analyticRender(0, footprint, width, height);
+              loser.loseContext();  // while the order of the splats is waited for
+              await drawn;
+              return said;
+            }""",
+            ["box:samples=8", view.width, view.height],
+        )
+        assert said == "There is no picture: the graphics device was lost since."
+        assert_same(pixels(page, view.width, view.height), rendered(scene, view, "box:samples=8"))
+        assert page.is_hidden("#message")
+
+
 def test_without_webgl_there_is_a_sentence(browser):
     init = "HTMLCanvasElement.prototype.getContext = () => null"
     with serve(random_scene(10), [facing()]) as server, open_page(browser, server.url, init=init) as page:

@@ -191,9 +191,12 @@ export class Renderer {
     gl.readPixels(0, 0, 1, 1, gl.RGBA, type, this.bits === 8 ? new Uint8Array(4) : new Float32Array(4));
   }
 
-  /// The picture over the background as the rasterizer orders it: (3, height, width), not clamped.
+  /// The picture over the background as the rasterizer orders it: (3, height, width), not clamped. Throws an Error where
+  /// there is none, as after the device was lost.
   read(name) {
-    const gl = this.gl, { framebuffer, width, height } = this.pictures.get(name), pixels = width * height;
+    const gl = this.gl, picture = this.pictures.get(name);
+    if (!picture || gl.isContextLost()) throw new Error('There is no picture: the graphics device was lost since.');
+    const { framebuffer, width, height } = picture, pixels = width * height;
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
     let values = new Float32Array(4 * pixels);
     if (this.bits === 8) {
@@ -203,6 +206,7 @@ export class Renderer {
     } else {
       gl.readPixels(0, 0, width, height, gl.RGBA, gl.FLOAT, values);
     }
+    if (gl.isContextLost()) throw new Error('The graphics device was lost while the picture was read.');
     const planes = new Float32Array(3 * pixels);
     for (let p = 0; p < pixels; ++p) {
       const rest = 1 - values[4 * p + 3];

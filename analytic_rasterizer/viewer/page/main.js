@@ -215,7 +215,7 @@ class Viewer {
   /// Has a frame drawn soon.
   wake() {
     this.again = this.drawing;
-    if (this.frameRequested || this.drawing || this.lost) return;
+    if (!this.controls || this.frameRequested || this.drawing || this.lost) return;  // automation has no controls
     this.frameRequested = true;
     requestAnimationFrame(() => this.frame());
   }
@@ -376,11 +376,33 @@ class Viewer {
     this.canvas.height = pinhole.height;
     this.canvas.style.width = `${pinhole.width}px`;
     this.canvas.style.height = `${pinhole.height}px`;
-    this.renderer.projection.setOrder(await this.sorter.sort(pinhole.w2c, true));
-    this.renderer.render('left', pinhole, parsed, true);
-    this.renderer.present('left', null, 0, false);
-    this.renderer.finish('left');
+    const order = await this.sorter.sort(pinhole.w2c, true);
+    do {
+      await this.device();
+    } while (!this.drawSettled(order, pinhole, parsed));
     return pinhole;
+  }
+
+  /// Waits until there is a device, where it was lost.
+  async device() {
+    if (!this.renderer.gl.isContextLost()) return;
+    // The listener of the constructor, which makes everything anew, is called before this one.
+    await new Promise(resolve => this.canvas.addEventListener('webglcontextrestored', resolve, { once: true }));
+    if (this.lost) throw new Error('The graphics device was lost, and cannot be used again.');
+  }
+
+  /// Draws a settled picture. False if the device was lost meanwhile, so that there is none.
+  drawSettled(order, pinhole, footprint) {
+    const { renderer } = this;
+    try {
+      renderer.projection.setOrder(order);
+      renderer.render('left', pinhole, footprint, true);
+      renderer.present('left', null, 0, false);
+      renderer.finish('left');
+    } catch (error) {
+      if (!renderer.gl.isContextLost()) throw error;
+    }
+    return !renderer.gl.isContextLost();
   }
 
   /// Times every footprint in turn, `rounds` times. Milliseconds per frame: the median and every round.
