@@ -134,6 +134,12 @@ template <class F, int C, class Layout> struct QueuedSplats {
   Splat<F, float> splat;
   Values<C> channels;
 
+  __device__ QueuedSplats(const BlendParams& params, const TileList& list, int first_channel)
+      : splats_in(reinterpret_cast<const Splat<F, float>*>(params.splats)),
+        channels_in(params.channels),
+        list(list),
+        first_channel(first_channel) {}
+
   /// Reads the splats that were next, and takes the pairs behind them from the queue.
   template <class Queues> __device__ void advance(Queues& queues) {
     n = next_n;
@@ -152,8 +158,11 @@ template <class F, int C, class Layout> struct QueuedSplats {
     queues.begin += uint32_t(next_n);
   }
   template <class Stage> __device__ void put(Stage& stage, int lane) const {
-    keep_register(splat.level);  // which is read together with the colour
-    if (lane >= n) return;
+    // Every listed splat has a level above 0. To ask for it keeps its register, which is read together with the colour:
+    // if nothing needed that number, the compiler would use its register for another one, and for that wait for
+    // the splats when they are asked for rather than when they are needed. With more cells the comparison costs more
+    // than it gains (docs/performance-log.md).
+    if (lane >= n || (F::kSamples == 1 && !(splat.level > 0))) return;
     stage.splats[lane_id()] = {cell_terms(splat, list), channels};
     stage.pairs[lane_id()] = pair;
   }
@@ -233,8 +242,7 @@ __device__ void blend_queued(const BlendParams& params, int first, int tile, con
   Queues queues(reinterpret_cast<typename Queues::Memory&>(stage.queues), params.reach_words + words,
                 pixel.inside ? list.count : 0);
   // While splats are composited, those behind them are read, and before that which ones these are.
-  QueuedSplats<F, C, Layout> next = {reinterpret_cast<const Splat<F, float>*>(params.splats), params.channels, list,
-                                     first};
+  QueuedSplats<F, C, Layout> next(params, list, first);
   next.take_next(queues);
   queues.fill();
   if (list.count > 0) next.advance(queues);  // of an empty scene there is no splat that all lanes could read

@@ -163,15 +163,6 @@ __device__ inline void prefetch([[maybe_unused]] const void* address) {
 #endif
 }
 
-/// Asks the compiler to keep the register of `x` until here, which it need not do. If it sees that nothing needs one of
-/// several numbers that are read together, it uses that register for something else, and for that waits until all of
-/// them have arrived.
-__device__ inline void keep_register([[maybe_unused]] float x) {
-#if defined(__CUDA_ARCH__)
-  asm volatile("" ::"f"(x));
-#endif
-}
-
 /// Begins to copy a number from global to shared memory. All lanes see it after wait_for_copies().
 __device__ inline void copy_async(float* to, const float* from) {
 #if __CUDA_ARCH__ >= 800

@@ -64,7 +64,7 @@ namespace cuda_on_host {
 
 // Jumps from stack to stack: swapcontext would ask the system at each of them. (_FORTIFY_SOURCE takes such a jump for a
 // mistake.)
-inline void resume(Context& thread) {
+[[gnu::noinline]] inline void resume(Context& thread) {
   if (_setjmp(scheduler)) return;
   if (thread.started) _longjmp(thread.registers, 1);
   thread.started = true;
