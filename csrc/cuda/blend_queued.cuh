@@ -157,12 +157,13 @@ template <class F, int C, class Layout> struct QueuedSplats {
     }
     queues.begin += uint32_t(next_n);
   }
-  template <class Stage> __device__ void put(Stage& stage, int lane) const {
-    // Every listed splat has a level above 0. To ask for it keeps its register, which is read together with the colour:
-    // if nothing needed that number, the compiler would use its register for another one, and for that wait for
-    // the splats when they are asked for rather than when they are needed. With more cells the comparison costs more
-    // than it gains (docs/performance-log.md).
-    if (lane >= n || (F::kSamples == 1 && !(splat.level > 0))) return;
+  /// Puts the splat that was read into the stage. `light`: what the steps before have left of it.
+  ///
+  /// Every listed splat has a level above 0, so that the comparison is never true. Without it nothing would need the
+  /// level, which is read together with the colour: the compiler would use its register for something else, and for
+  /// that wait until the splat has arrived. And without `light` it would compare, and wait, in front of the steps.
+  template <class Stage> __device__ void put(Stage& stage, int lane, float light) const {
+    if (lane >= n || splat.level <= min(light, 0.0f)) return;
     stage.splats[lane_id()] = {cell_terms(splat, list), channels};
     stage.pairs[lane_id()] = pair;
   }
@@ -180,11 +181,12 @@ __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& 
   float& transmittance = blend.samples.transmittance[0];
   Vec2<float>& place = blend.samples.place[0];
   int taken = first_staged + Layout::ahead();  // this lane's, whether there is one or not
+  int left = n;                                // splats from that of the sample's first lane on
   auto splat = stage.splats[taken];
   int pair = stage.pairs[taken];
   // Lanes of the sample with a splat, none behind which has been composited.
   const auto lanes_with_splats = [&] {
-    const int count = min(n - (taken - Layout::ahead() - first_staged), kAhead);
+    const int count = min(left, kAhead);
     return transmittance > 0 && count > 0 ? kAllLanes >> (32 - count) << first_lane : 0u;
   };
   uint32_t live = lanes_with_splats();
@@ -213,7 +215,7 @@ __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& 
     }
     if constexpr (!kOnce) {
       if (hits == 0 || live == 0) {
-        taken += kAhead;
+        taken += kAhead, left -= kAhead;
         live = lanes_with_splats();
         if (live != 0) {
           splat = stage.splats[taken];
@@ -249,7 +251,7 @@ __device__ void blend_queued(const BlendParams& params, int first, int tile, con
   const int first_staged = lane_id() / kLanes * kLanes;
   const uint32_t lanes_of_pixel = (kAllLanes >> (32 - kLanes)) << (lane_id() / kLanes * kLanes);
   while (__any_sync(kAllLanes, next.n > 0)) {
-    next.put(stage, queues.lane);
+    next.put(stage, queues.lane, blend.samples.transmittance[0]);
     const int n = next.n;
     queues.fill();
     next.advance(queues);

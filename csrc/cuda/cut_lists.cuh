@@ -25,7 +25,7 @@ struct ListSegment {
 
 /// Pairs of a segment where `samples` samples move. Longer ones need fewer maps, which count where there are many
 /// samples; shorter ones fill a device with smaller scenes.
-AR_HD constexpr int moving_segment(int samples) { return samples <= 4 ? 512 : 1024; }
+AR_HD constexpr int moving_segment(int samples) { return samples == 1 ? 256 : samples <= 4 ? 512 : 1024; }
 
 /// In small images all lists are cut: their few tiles have long ones, and the time is that of the longest. Large ones
 /// have many tiles that keep a device busy, and to cut a list takes more work than to walk it. There only those are cut
