@@ -104,8 +104,8 @@ AR_HD MaskOf<V> replay_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskO
 
 /// Adjoint of compositing one splat into one sample.
 template <class V> struct BlendGrad {
-  V contribution;  ///< T alpha, zero outside the mask: dL/dcolor is this times the pixel's gradient
-  V dL_dalpha;     ///< zero outside the mask and where alpha is capped
+  V contribution;         ///< T alpha, zero outside the mask: dL/dcolor is this times the pixel's gradient
+  AlphaGrad<V> of_alpha;  ///< zero outside the mask and where alpha is capped
 };
 
 /// Adjoint of blend_sample, called from the last splat to the first.
@@ -122,8 +122,10 @@ template <class V> AR_HD BlendGrad<V> blend_sample_vjp(MaskOf<V> mask, V raw, V 
   transmittance = divide(transmittance, V(T(1)) - alpha);
   const V difference = g_color - behind;
   behind = madd(alpha, difference, behind);
+  const V contribution = transmittance * alpha;
   const MaskOf<V> free = mask & (raw <= cap);
-  return {transmittance * alpha, select(free, transmittance * difference, zero)};
+  return {contribution,
+          {select(free, transmittance * difference, zero), select(free, contribution * difference, zero)}};
 }
 
 /// What compositing one splat into samples that move adds to the sums of the splat.

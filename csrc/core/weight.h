@@ -46,7 +46,7 @@ AR_HD WeightGrad<T> weight_vjp(Sym2<T> entries, Vec2<T> d, FootprintOptions opti
   AR_UNROLL
   for (int s = 0; s < F::kSamples; ++s) {
     const T w = F::alpha(terms, d, s);
-    F::add_alpha_vjp(terms, d, s, w, g, sums);
+    F::add_alpha_vjp(terms, d, s, AlphaGrad<T>{g, g * w}, sums);
     weighted += g * w;
   }
   const SplatGrad<T> grad = F::prepare_vjp(cov, shape, F::collect(terms, sums, weighted), weighted, options);

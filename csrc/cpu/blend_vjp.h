@@ -181,10 +181,10 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
           store(transmittance[s] + pixel, t);
           store(behind[s] + pixel, b);
           contribution = contribution + grad.contribution;
-          weighted = madd(grad.dL_dalpha, alpha, weighted);
-          P::add_alpha_vjp(terms, at, s, alpha, grad.dL_dalpha, shape);
+          weighted = weighted + grad.of_alpha.weighted;
+          P::add_alpha_vjp(terms, at, s, grad.of_alpha, shape);
           // Again for the pixel alone: to ask for it must not change the other sums by a bit.
-          if (with_means) P::add_alpha_vjp(terms, at, s, alpha, grad.dL_dalpha, of_pixel);
+          if (with_means) P::add_alpha_vjp(terms, at, s, grad.of_alpha, of_pixel);
         }
       }
       g += window * kCount;

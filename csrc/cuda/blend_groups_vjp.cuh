@@ -191,9 +191,9 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, kShapeGro
         for (int s = 0; s < S; ++s) {
           const bool hit = alpha[s] >= float(kAlphaMin) && k0 + j < last[s];
           const BlendGrad<float> grad = blend_sample_vjp(hit, alpha[s], g_color, transmittance[s], behind[s]);
-          if (kWithShape) F::add_alpha_vjp(splat.terms, p, s, alpha[s], grad.dL_dalpha, shape);
+          if (kWithShape) F::add_alpha_vjp(splat.terms, p, s, grad.of_alpha, shape);
           contribution += grad.contribution;
-          weighted += grad.dL_dalpha * alpha[s];
+          weighted += grad.of_alpha.weighted;
         }
         float* sums = shared.sums[warp][j];
         if constexpr (kWithShape) {

@@ -144,11 +144,11 @@ template <class F, int C, Sums kSums> class ChunkWalk {
       VjpSample sample = pixels_.sample(s, b);
       const BlendGrad<float> grad = blend_sample_vjp(mask, alpha, g_color, sample.transmittance, sample.behind);
       pixels_.sample(s, b) = sample;
-      if (kGrads) F::add_alpha_vjp(splat.terms, p, node, alpha, grad.dL_dalpha, shape);
+      if (kGrads) F::add_alpha_vjp(splat.terms, p, node, grad.of_alpha, shape);
       // Again for the pixel alone: to ask for it must not change the other sums by a bit.
-      if (kMeans) F::add_alpha_vjp(splat.terms, p, node, alpha, grad.dL_dalpha, of_pixel);
+      if (kMeans) F::add_alpha_vjp(splat.terms, p, node, grad.of_alpha, of_pixel);
       contribution = s == 0 ? grad.contribution : contribution + grad.contribution;
-      weighted += grad.dL_dalpha * alpha;
+      weighted += grad.of_alpha.weighted;
     }
 #pragma unroll
     for (int c = 0; c < C; ++c) channels.v[c] = madd(contribution, of_pixel_g.v[c], channels.v[c]);

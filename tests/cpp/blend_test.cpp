@@ -54,7 +54,7 @@ Gradients<T> blend_all_vjp(const std::vector<T>& alphas, const std::vector<T>& c
   for (int k = int(alphas.size()) - 1; k >= 0; --k) {
     const bool mask = std::binary_search(forward.used.begin(), forward.used.end(), k);
     const BlendGrad<T> b = blend_sample_vjp(mask, alphas[k], g * colors[k], out.transmittance, behind);
-    out.alphas[k] = b.dL_dalpha;
+    out.alphas[k] = b.of_alpha.dL_dalpha;
     out.colors[k] = g * b.contribution;
   }
   return out;

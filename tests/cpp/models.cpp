@@ -32,7 +32,8 @@ template <class F, class P, typename T> Model<T> make_model() {
   m.sums = [](const SplatRow<T>& row, Vec2<T> d, const T* dL_dalphas) {
     const auto terms = terms_of<P>(row);
     ShapeGrad<T> sums = {};
-    for (int s = 0; s < P::kSamples; ++s) P::add_alpha_vjp(terms, d, s, P::alpha(terms, d, s), dL_dalphas[s], sums);
+    for (int s = 0; s < P::kSamples; ++s)
+      P::add_alpha_vjp(terms, d, s, AlphaGrad<T>{dL_dalphas[s], P::alpha(terms, d, s) * dL_dalphas[s]}, sums);
     return sums;
   };
   m.alpha = [](const SplatRow<T>& row, Vec2<T> d, int s) { return P::alpha(terms_of<P>(row), d, s); };
@@ -48,7 +49,7 @@ template <class F, class P, typename T> Model<T> make_model() {
     } else {
       MoveGrad<T> grad = {};
       if (!free) return grad;
-      P::add_alpha_vjp(terms, d, s, alpha, dL_dalpha, grad.sums);
+      P::add_alpha_vjp(terms, d, s, AlphaGrad<T>{dL_dalpha, alpha * dL_dalpha}, grad.sums);
       grad.weighted = alpha * dL_dalpha;
       return grad;
     }

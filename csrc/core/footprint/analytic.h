@@ -160,13 +160,13 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
   /// With I = mass F(u/s1) G(v/s2): offset = mass (F' G, F G'), shape = the derivatives by log s1, the frame
   /// term, by log s2; all of mass F G with one division.
   template <typename T, class V>
-  AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> p, int, V, V dL_dalpha, ShapeGrad<V>& sums) {
+  AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> p, int, AlphaGrad<V> grad, ShapeGrad<V>& sums) {
     const Vec2<V> e = transform(t.frame, p, t.origin);
     const LogisticWindow<V> fw(e.x, t.u), gw(e.y, t.v);
     const V inverse = divide(V(T(1)), fw.denominator * gw.denominator);
     const LogisticValue<V> f(fw, inverse * gw.denominator, e.x, t.u, t.du),
         g(gw, inverse * fw.denominator, e.y, t.v, t.dv);
-    const V scale = dL_dalpha * V(t.mass), scaled_f = scale * f.value, scaled_g = scale * g.value;
+    const V scale = grad.dL_dalpha * V(t.mass), scaled_f = scale * f.value, scaled_g = scale * g.value;
     sums.offset = {madd(scaled_g, f.by_t, sums.offset.x), madd(scaled_f, g.by_t, sums.offset.y)};
     sums.shape.xx = madd(scaled_g, f.by_sigma, sums.shape.xx);
     sums.shape.yy = madd(scaled_f, g.by_sigma, sums.shape.yy);

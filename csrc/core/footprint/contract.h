@@ -44,12 +44,12 @@
 // Once per pixel and sample, with p = pixel centre - that point of the tile [px] and s the number of the sample:
 //
 //   alpha(Terms<T>, Vec2<V> p, s) -> V   opacity * I
-//   add_alpha_vjp(Terms<T>, Vec2<V> p, s, alpha, dL_dalpha, ShapeGrad<V>& sums)
+//   add_alpha_vjp(Terms<T>, Vec2<V> p, s, AlphaGrad<V>, ShapeGrad<V>& sums)
 //                                        adds this sample's part to the five sums
 //
 // The five numbers of ShapeGrad are summed over pixels and samples in whatever coordinates make them cheap; prepare_vjp
-// gives them meaning. `weighted` is the sum of alpha dL_dalpha, which the gradient with respect to the opacity needs
-// anyway.
+// gives them meaning. `weighted` is the sum of AlphaGrad::weighted, which the gradient with respect to the opacity
+// needs anyway.
 //
 // Samples may carry a state besides their transmittance, as those of moment.h do. With
 //
@@ -136,6 +136,12 @@ struct Option {
   const char* value = nullptr;  ///< value of the option that selects this footprint; null: it is a number at run time
   double number = 0;            ///< its default
   bool is_default = true;       ///< of footprints of the same name: this one is taken if the option is not given
+};
+
+/// The gradient with respect to an alpha, and that times the alpha, which is with respect to its logarithm. A footprint
+/// takes what it needs, and what nothing uses the compiler leaves out.
+template <class V> struct AlphaGrad {
+  V dL_dalpha, weighted;
 };
 
 /// Five sums over pixels. What they mean is up to the footprint: see its add_alpha_vjp and prepare_vjp.

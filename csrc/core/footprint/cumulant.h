@@ -100,12 +100,12 @@ struct Cumulant : FootprintDefaults {
   /// With -log2 I = |z|^2 + h(p_x, a) + h(p_y, c), z = w d, p = w^T z, e = w dh/dp / 2 and E = dw w^-1:
   /// -d log2 I / 2 = -(z + e).w dmu + tr(E (z z^T + e z^T + z e^T + w diag(dh/da, dh/dc) w^T)).
   template <typename T, class V>
-  AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> pixel, int, V alpha, V dL_dalpha, ShapeGrad<V>& sums) {
+  AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> pixel, int, AlphaGrad<V> grad, ShapeGrad<V>& sums) {
     const Mat2<T>& w = t.w;
     const Vec2<V> z = transform(w, pixel, t.origin), p = transform_transposed(w, z);
     const V px = t.x.capped(p.x), py = t.y.capped(p.y);
     const Vec2<V> e = transform(w, Vec2<V>{t.x.half_by_p(p.x, px), t.y.half_by_p(p.y, py)});
-    const V ha = t.x.by_t(px), hc = t.y.by_t(py), g = dL_dalpha * alpha;
+    const V ha = t.x.by_t(px), hc = t.y.by_t(py), g = grad.weighted;
     const Vec2<V> u = {z.x + e.x, z.y + e.y}, ax = {V(w.xx) * ha, V(w.xy) * hc}, ay = {V(w.yx) * ha, V(w.yy) * hc};
     const V xx = madd(z.x, u.x + e.x, madd(ax.x, V(w.xx), ax.y * V(w.xy)));
     const V xy = madd(z.x, u.y, madd(e.x, z.y, madd(ax.x, V(w.yx), ax.y * V(w.yy))));

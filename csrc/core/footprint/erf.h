@@ -62,10 +62,10 @@ struct Erf : FootprintDefaults {
 
   /// The moments of z = w d over the window: sums as those of `point`.
   template <typename T, class V>
-  AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> p, int, V, V dL_dalpha, ShapeGrad<V>& sums) {
+  AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> p, int, AlphaGrad<V> grad, ShapeGrad<V>& sums) {
     const Vec2<V> z = transform(t.w, p, t.origin);
     const NormalMoments<V> f = along(z.x, t.width.x), g = along(z.y, t.width.y);
-    const V scale = dL_dalpha * V(t.mass), of_f = scale * g.value, of_g = scale * f.value;
+    const V scale = grad.dL_dalpha * V(t.mass), of_f = scale * g.value, of_g = scale * f.value;
     sums.offset = {madd(of_f, f.first, sums.offset.x), madd(of_g, g.first, sums.offset.y)};
     sums.shape = {madd(of_f, f.second, sums.shape.xx), madd(scale * f.first, g.first, sums.shape.xy),
                   madd(of_g, g.second, sums.shape.yy)};

@@ -69,9 +69,9 @@ struct Exact : FootprintDefaults {
   }
 
   template <typename T, class V>
-  AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> p, int, V, V dL_dalpha, ShapeGrad<V>& sums) {
+  AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> p, int, AlphaGrad<V> grad, ShapeGrad<V>& sums) {
     const Moments<V> m = moments(t, p);
-    const V g = dL_dalpha * V(t.opacity);
+    const V g = grad.dL_dalpha * V(t.opacity);
     sums.offset = {madd(g, m.first.x, sums.offset.x), madd(g, m.first.y, sums.offset.y)};
     sums.shape = {madd(g, m.second.xx, sums.shape.xx), madd(g, m.second.xy, sums.shape.xy),
                   madd(g, m.second.yy, sums.shape.yy)};

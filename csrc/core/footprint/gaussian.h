@@ -122,9 +122,9 @@ template <int S> struct GaussianPixels : FootprintDefaults {
   }
 
   template <typename T, class V>
-  AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> p, int s, V alpha, V dL_dalpha, ShapeGrad<V>& sums) {
+  AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> p, int s, AlphaGrad<V> grad, ShapeGrad<V>& sums) {
     const Vec2<V> z = whitened(t, p, s);
-    const V g = dL_dalpha * alpha, gx = g * z.x, gy = g * z.y;
+    const V gx = grad.weighted * z.x, gy = grad.weighted * z.y;
     sums.offset = sums.offset + Vec2<V>{gx, gy};
     sums.shape = {madd(gx, z.x, sums.shape.xx), madd(gx, z.y, sums.shape.xy), madd(gy, z.y, sums.shape.yy)};
   }

@@ -53,8 +53,8 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   }
 
   template <typename T, class V>
-  AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> p, int s, V alpha, V dL_dalpha, ShapeGrad<V>& sums) {
-    Gaussian::add_alpha_vjp(t, p + place<T, V>(s), 0, alpha, dL_dalpha, sums);
+  AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> p, int s, AlphaGrad<V> grad, ShapeGrad<V>& sums) {
+    Gaussian::add_alpha_vjp(t, p + place<T, V>(s), 0, grad, sums);
   }
 
   template <typename T, class V>

@@ -243,10 +243,10 @@ template <class F, int C> std::vector<Sum> expected_sums(const Scene<F, C>& scen
           const Rounded raw = F::alpha(terms, p, s);
           const auto grad = blend_sample_vjp<Rounded>({true}, raw, g_color, transmittance[s], behind[s]);
           ShapeGrad<Rounded> of_sample = {};
-          F::add_alpha_vjp(terms, p, s, raw, grad.dL_dalpha, of_sample);
-          F::add_alpha_vjp(terms, p, s, raw, grad.dL_dalpha, of_pixel);
+          F::add_alpha_vjp(terms, p, s, grad.of_alpha, of_sample);
+          F::add_alpha_vjp(terms, p, s, grad.of_alpha, of_pixel);
           const auto in_lane = [](Rounded number) { return number.summed(kInLane); };
-          const Rounded weighted = in_lane(grad.dL_dalpha * raw);
+          const Rounded weighted = in_lane(grad.of_alpha.weighted);
           const ShapeGrad<Rounded> shape =
               F::collect(terms,
                          ShapeGrad<Rounded>{

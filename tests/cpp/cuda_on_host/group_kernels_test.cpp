@@ -271,9 +271,9 @@ template <class F> Results reference(const Scene<F>& scene, MeanSums mean_sums) 
       for (int s = 0; s < S; ++s) {
         const double alpha = F::alpha(terms, p, s);
         const BlendGrad<double> grad = blend_sample_vjp(bool(hits[k][s]), alpha, g_color, transmittance[s], behind[s]);
-        F::add_alpha_vjp(terms, p, s, alpha, grad.dL_dalpha, sums);
+        F::add_alpha_vjp(terms, p, s, grad.of_alpha, sums);
         contribution += grad.contribution;
-        weighted += grad.dL_dalpha * alpha;
+        weighted += grad.of_alpha.weighted;
       }
       for (int c = 0; c < scene.channels; ++c) channels[k][c] += contribution * scene.dL_dimage[c * kPixels + i] / S;
       Vec2<double> means = {0, 0};
