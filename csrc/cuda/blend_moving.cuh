@@ -15,23 +15,32 @@ namespace ar::cuda {
 /// Of more channels than lie in the rows of pairs, those that are blended at once.
 inline constexpr int kMovingChannels = 8;
 
+/// The group of a layout whose groups are taken (blend_moving_segments.cuh) that the calling warp has.
+__device__ inline int& taken_group() {
+  __shared__ int groups[32];
+  return groups[threadIdx.x / 32];
+}
+
 /// How the samples of a tile of kSide x kSide pixels are shared out: kCells to a lane, those of a pixel to kLanes
 /// neighbours, a power of two, of which the last may have fewer, or none. The pixels of a warp, a group, are a
 /// rectangle. A tile's groups are spread over kBlocks blocks of kWarps warps.
 template <int kCellsOfLane, int kLanesOfPixel, int kSideOfTile = kMovingTile,
-          int kWarpsOfBlock = kLanesOfPixel * kSideOfTile * kSideOfTile / 32>
+          int kWarpsOfBlock = kLanesOfPixel * kSideOfTile * kSideOfTile / 32, bool kTaken = false>
 struct CellLayout {
   static constexpr int kCells = kCellsOfLane, kLanes = kLanesOfPixel;
   static constexpr int kSide = kSideOfTile, kTilePixels = kSide * kSide;
   static constexpr int kGroups = kLanes * kTilePixels / 32;
-  static constexpr int kWarps = kWarpsOfBlock, kThreads = 32 * kWarps, kBlocks = kGroups / kWarps;
+  static constexpr int kWarps = kWarpsOfBlock, kThreads = 32 * kWarps, kBlocks = kTaken ? 1 : kGroups / kWarps;
   static_assert((kLanes & (kLanes - 1)) == 0 && kLanes <= 32 && kGroups % kWarps == 0 && kWarps <= 32);
   static constexpr int kPixels = 32 / kLanes;  ///< of a group
   static constexpr int kWide = kPixels == 32 ? 8 : kPixels >= 8 ? 4 : kPixels >= 2 ? 2 : 1, kHigh = kPixels / kWide;
   static constexpr int kColumns = kSide / kWide;  ///< groups side by side
 
   /// This warp's group.
-  __device__ static int group() { return int(blockIdx.x) % kBlocks * kWarps + int(threadIdx.x) / 32; }
+  __device__ static int group() {
+    if constexpr (kTaken) return taken_group();
+    return int(blockIdx.x) % kBlocks * kWarps + int(threadIdx.x) / 32;
+  }
   /// The place of the group's pixel i among the tile's, row by row, whatever the layout.
   __device__ static int pixel_number(int i) {
     const int g = group();
@@ -48,12 +57,16 @@ struct CellLayout {
   /// Whether no other lane has the samples too, or this is the one of them that writes.
   __device__ static bool owns() { return true; }
 
-  /// Bit w: the splat reaches the pixels of warp w of this block, or passes them closely. The tile begins at (x0, y0).
+  /// Bit w: the splat reaches the pixels of warp w of this block, or of group w if they are taken, or passes them
+  /// closely. The tile begins at (x0, y0).
   template <class F> __device__ static uint32_t block_reach(const Splat<F, float>& splat, int x0, int y0) {
-    static_assert(kWarps % kColumns == 0);
-    const int rows = int(blockIdx.x) % kBlocks * kWarps / kColumns;  // of groups, those of the blocks before
-    return reached_boxes<kWide, kHigh, kColumns, kWarps / kColumns, F>(splat, x0, y0 + rows * kHigh);
+    constexpr int kOfBlock = kGroups / kBlocks;
+    static_assert(kOfBlock % kColumns == 0);
+    const int rows = kTaken ? 0 : int(blockIdx.x) % kBlocks * kOfBlock / kColumns;  // of the blocks before
+    return reached_boxes<kWide, kHigh, kColumns, kOfBlock / kColumns, F>(splat, x0, y0 + rows * kHigh);
   }
+  /// The bit of block_reach() of this warp's pixels.
+  __device__ static int own_bit() { return kTaken ? group() : int(threadIdx.x) / 32; }
 
   /// The sum over the lanes of a pixel, in each of them.
   __device__ static float sum_lanes(float x) {
@@ -181,7 +194,7 @@ template <class Layout> inline constexpr int kListAhead = Layout::kCells <= 2 ? 
 /// Up to kBatch splats of a tile that a block works on together, and lists of up to kListed of these that reach each
 /// warp's pixels. `kPlaces`: entries of lists are places in memory, else numbers of splats.
 template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kPlaces = false> struct MovingStage {
-  static_assert(kBatch % 32 == 0 && kBatch <= Layout::kThreads);
+  static_assert(kBatch % 32 == 0);
   using Lists =
       ReachLists<uint32_t, kPlaces ? sizeof(TileSplat<F, C>) : 1, kListAhead<Layout>, Layout::kWarps, kListed>;
   TileSplat<F, C> splats[kBatch];
@@ -190,19 +203,25 @@ template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kPlac
 
   /// This thread's splat of those in [k, k + kBatch) and before `end` of the list, or -1.
   __device__ static int32_t splat_of(const TileList& list, int k, int end) {
+    static_assert(kBatch <= Layout::kThreads);
     const int t = threadIdx.x;
     return t < kBatch && k + t < end ? list.splat(k + t) : -1;
   }
   /// Loads the splats, `id` = splat_of(), with channels from `first` on.
   __device__ void load(const Splat<F, float>* splats_in, const Channels<float>& channels, int first,
                        const TileList& list, int32_t id) {
+    if (threadIdx.x < kBatch) load_one(int(threadIdx.x), splats_in, channels, first, list, id);
+  }
+  /// Loads splat `id` in place t, or none if it is -1.
+  __device__ void load_one(int t, const Splat<F, float>* splats_in, const Channels<float>& channels, int first,
+                           const TileList& list, int32_t id) {
     uint32_t bits = 0;
     if (id >= 0) {
       const Splat<F, float> splat = splats_in[id];
       bits = Layout::template block_reach<F>(splat, list.x0, list.y0);
-      if (bits) splats[threadIdx.x] = {cell_terms(splat, list), channels_of<C>(channels, splat, id, first)};
+      if (bits) splats[t] = {cell_terms(splat, list), channels_of<C>(channels, splat, id, first)};
     }
-    if (threadIdx.x < kBatch) reach[threadIdx.x] = bits;
+    reach[t] = bits;
   }
 
   /// Of the splats [k, k + 32), those that reach this warp's pixels, in the order of take_first. All must call it.

@@ -45,12 +45,12 @@ template <class F, int C> struct SampleGrad {
 };
 
 /// The place behind the last splat that was composited, in its tile's list: into each of a lane's samples, and into any
-/// of its warp and its block.
-template <class F, class Layout> struct LastSplats {
-  int samples[Layout::kCells], warp = 0, block = 0;
+/// of its warp.
+template <class F, class Layout> struct SamplesLast {
+  int samples[Layout::kCells], warp = 0;
 
-  /// `of_warps`: in shared memory. All threads of a block must call it.
-  __device__ LastSplats(const int32_t* last, const Pixel& pixel, int (&of_warps)[Layout::kWarps]) {
+  /// All lanes must call it.
+  __device__ SamplesLast(const int32_t* last, const Pixel& pixel) {
 #pragma unroll
     for (int i = 0; i < Layout::kCells; ++i) {
       const int sample = Layout::first_sample() + i;
@@ -58,6 +58,16 @@ template <class F, class Layout> struct LastSplats {
       warp = max(warp, samples[i]);
     }
     warp = warp_max(warp);
+  }
+};
+/// And into any of its block.
+template <class F, class Layout> struct LastSplats : SamplesLast<F, Layout> {
+  using SamplesLast<F, Layout>::warp;
+  int block = 0;
+
+  /// `of_warps`: in shared memory. All threads of a block must call it.
+  __device__ LastSplats(const int32_t* last, const Pixel& pixel, int (&of_warps)[Layout::kWarps])
+      : SamplesLast<F, Layout>(last, pixel) {
     if (lane_id() == 0) of_warps[threadIdx.x / 32] = warp;
     __syncthreads();
 #pragma unroll

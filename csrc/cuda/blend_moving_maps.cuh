@@ -67,6 +67,9 @@ template <class F, int kTilePixels> struct MapMemory {
   }
 };
 
+/// Groups of a segment that a warp has on average.
+inline constexpr int kGroupsOfWarp = 2;
+
 /// Samples shared out for segments, of which there are many, with small splats: few pixels per warp, and blocks small
 /// enough for two on an SM. A single sample has a lane, so that none is idle.
 template <class F, int kSide>
@@ -75,11 +78,15 @@ using SegmentLayout = CellLayout<F::kSamples <= 4 ? 1 : 2,
                                  : F::kSamples == 4 ? 4
                                                     : 8,
                                  kSide>;
+/// The same, whose groups are taken, by fewer warps.
+template <class F, int kSide, class Cells = SegmentLayout<F, kSide>>
+using TakenLayout =
+    CellLayout<Cells::kCells, Cells::kLanes, kSide, (Cells::kGroups + kGroupsOfWarp - 1) / kGroupsOfWarp, true>;
 
 /// Samples shared out for the maps of segments, which no lanes add up: with many cells a sample to a lane, so that a
 /// warp has few pixels and passes over more splats. A block has 16 warps at most.
 template <class F, int kSide>
-using MapLayout = std::conditional_t<(F::kSamples > 4), CellLayout<1, 16, kSide, 16>, SegmentLayout<F, kSide>>;
+using MapLayout = std::conditional_t<(F::kSamples > 4), CellLayout<1, 16, kSide, 4>, SegmentLayout<F, kSide>>;
 
 /// A block per segment of kSegment pairs and part of a tile: the maps of its samples, and the checkpoints within it.
 /// Not for the first segments of tiles, whose maps nobody needs and whose checkpoints blend has left.
@@ -169,6 +176,7 @@ __global__ void __launch_bounds__(kSide* kSide) chain_maps_kernel(const BlendVjp
   constexpr int S = F::kSamples, kPixels = kSide * kSide;
   const int place = int(blockIdx.x) / S, t = int(blockIdx.x) % S * kPixels + int(threadIdx.x);
   const int number = t / S, sample = t % S;
+  if (blockIdx.x == 0 && threadIdx.x == 0) params.chunks_taken[0] = 0;  // moving_vjp_kernel has begun no segment
   if (place >= params.plan->counts.cut_lists) return;
   const CutList cut = params.cut_lists[place];
   const TileList list = list_of(params.lists, params.grid, cut.tile);

@@ -10,30 +10,49 @@ namespace ar::cuda {
 
 static_assert(kStateChunk == 32, "a warp's chunk is a mask of 32 bits");
 
+/// Writes the sums total(j, v) of the first `count` pairs of a batch, kUsed of each: a constant, so that to divide by
+/// it costs little. `first`: the first of the channels; the kernels of those before have left their shares of the six
+/// other sums. `with_shape`: these sums and MeanSums too. `rows`: of the pairs' sums.
+template <int kUsed, int C, int kThreads, class Total>
+__device__ void write_pairs(const BlendVjpParams& params, int first, bool with_shape, const TileList& list,
+                            const int32_t* rows, int count, Total&& total) {
+  constexpr bool kMany = C > kFewChannels;
+  constexpr int kMeans = 6 + C;
+  for (int t = int(threadIdx.x); t < count * kUsed; t += kThreads) {
+    const int j = t / kUsed, v = t % kUsed;
+    float sum = total(j, v);
+    const int32_t row = rows[j];
+    const auto put = [&](int column) {
+      if (kMany && first > 0 && !list.overflow) sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
+      put_sum(params.pair_grads, kPairGradWidth, list.overflow, row, column, sum);
+    };
+    if (v >= 6 && v < kMeans) {
+      if (kMany) {
+        put_sum(params.channel_sums, kChannelGroup, list.overflow, row, first % kChannelGroup + v - 6, sum);
+      } else {
+        put(v == 9 ? kPairFourthChannel : v);
+      }
+    } else if (with_shape) {
+      put(v < 6 ? v : kPairMeans + v - kMeans);
+    }
+  }
+}
+
 /// What a block keeps in shared memory. Sums of a pair: PairGrad, C channels, MeanSums.
-template <class F, int C, class Layout, int kSegment = 0> struct MovingVjpShared {
+template <class F, int C, class Layout> struct MovingVjpShared {
   static constexpr int kMeans = 6 + C, kSums = kMeans + 2;
-  /// In segments most pairs reach few of the many warps. There sums have slots only for the warps that a pair reaches,
-  /// so that the warps have to wait for each other after more pairs.
-  static constexpr bool kSparse = kSegment > 0 && Layout::kWarps > 2;
-  /// Splats that a block takes between barriers: without kSparse two chunks with one cell. With more cells one, which
-  /// leaves more shared memory for the places of samples.
-  static constexpr int kDense = F::kSamples == 1 ? 2 * kStateChunk : kStateChunk;
-  static constexpr int kBatch = kSparse ? std::min(kSegment, 16 * Layout::kWarps) : kDense;
-  static constexpr int kChunks = kBatch / kStateChunk;
-  /// No fewer than a chunk may need.
-  static constexpr int kSlots = Layout::kWarps * (kSparse ? kStateChunk : kBatch);
+  /// Splats that a block takes between barriers: two chunks with one cell. With more cells one, which leaves more
+  /// shared memory for the places of samples.
+  static constexpr int kBatch = F::kSamples == 1 ? 2 * kStateChunk : kStateChunk, kChunks = kBatch / kStateChunk;
   MovingStage<F, C, Layout, kBatch> stage;
-  float sums[kSlots][kSums];               ///< of a warp's pixels
-  uint32_t hits[Layout::kWarps][kChunks];  ///< splats that have sums of a warp
-  int slots[kSparse ? kBatch + 1 : 1];   ///< those of pair j are [slots[j], slots[j + 1]), as if there was room for all
-  alignas(16) int chunk_slots[kChunks];  ///< may be read 16 bytes at a time, which must not hold a slot as well
+  float sums[Layout::kWarps][kBatch][kSums];  ///< of a warp's pixels
+  uint32_t hits[Layout::kWarps][kChunks];     ///< splats that have sums of a warp
   int32_t rows[kBatch];
   Mat2<float> mean_maps[kBatch];
   int last[Layout::kWarps];  ///< of LastSplats
 
   /// Loads the batch that begins with pair k0, `id` = stage.splat_of(), with channels from `first` on and with_means
-  /// what MeanSums need, and hands out the slots. All threads must call it.
+  /// what MeanSums need. All threads must call it.
   __device__ void load(const Splat<F, float>* splats, const BlendVjpParams& params, int first, const TileList& list,
                        int k0, int32_t id, bool with_means) {
     stage.load(splats, params.channels, first, list, id);
@@ -42,87 +61,22 @@ template <class F, int C, class Layout, int kSegment = 0> struct MovingVjpShared
       rows[t] = list.overflow ? id : list.slot(k0 + t);
       if (with_means) mean_maps[t] = F::mean_map(splats[id].shape);
     }
-    set_slots();
-  }
-  /// Hands out the slots of the staged pairs. All threads must call it, after the pairs have been loaded by the same
-  /// threads and before any other reads them.
-  __device__ void set_slots() {
-    if constexpr (kSparse) {
-      static_assert(kBatch % 32 == 0 && kStateChunk == 32);
-      const int t = threadIdx.x, own = t < kBatch ? __popc(stage.reach[t]) : 0;
-      const int up_to = warp_inclusive_sum(own);
-      if (t < kBatch && lane_id() == 31) chunk_slots[t / 32] = up_to;
-      __syncthreads();
-      int before = 0;
-      for (int c = 0; c < t / 32 && c < kChunks; ++c) before += chunk_slots[c];
-      if (t < kBatch) slots[t + 1] = before + up_to;
-      if (t == 0) slots[0] = 0;
-    }
-  }
-  /// The first of the chunks whose sums are made together, the last of which is in front of chunk `end`.
-  __device__ int first_chunk(int end) const {
-    if constexpr (!kSparse) return 0;
-    int first = end - 1;
-    while (first > 0 && slots[end * kStateChunk] - slots[(first - 1) * kStateChunk] <= kSlots) --first;
-    return first;
-  }
-  __device__ int first_slot(int chunk) const { return kSparse ? slots[kSparse ? chunk * kStateChunk : 0] : 0; }
-  /// The sums of this warp for pair j. `first`: slots[] of the first pair whose sums are made together.
-  __device__ float* sums_of(int j, int first) {
-    const int warp = threadIdx.x / 32;
-    if constexpr (!kSparse) return sums[warp * kBatch + j];
-    return sums[slots[j] - first + __popc(stage.reach[j] & ((1u << warp) - 1))];
   }
   /// Value v of the sums of all warps for pair j.
-  __device__ float total(int j, int v, int first) const {
+  __device__ float total(int j, int v) const {
     float sum = 0;
-    const auto hit = [&](int warp) { return hits[warp][j / kStateChunk] >> (j % kStateChunk) & 1; };
-    if constexpr (kSparse) {
-      int slot = slots[j] - first;
-      for (uint32_t left = stage.reach[j]; left != 0; left &= left - 1, ++slot) {
-        if (hit(__ffs(int(left)) - 1)) sum += sums[slot][v];
-      }
-    } else {
 #pragma unroll
-      for (int w = 0; w < Layout::kWarps; ++w) {
-        if (hit(w)) sum += sums[w * kBatch + j][v];
-      }
+    for (int w = 0; w < Layout::kWarps; ++w) {
+      if (hits[w][j / kStateChunk] >> (j % kStateChunk) & 1) sum += sums[w][j][v];
     }
     return sum;
-  }
-
-  /// Writes the sums of pairs [begin, end), kUsed of each: a constant, so that to divide by it costs little. `first`:
-  /// the first of the channels; the kernels of those before have left their shares of the six other sums.
-  /// `with_shape`: these sums and MeanSums too.
-  template <int kUsed>
-  __device__ void write(const BlendVjpParams& params, int first, bool with_shape, const TileList& list, int begin,
-                        int end, int first_slot) const {
-    constexpr bool kMany = C > kFewChannels;
-    for (int t = begin * kUsed + int(threadIdx.x); t < end * kUsed; t += Layout::kThreads) {
-      const int j = t / kUsed, v = t % kUsed;
-      float sum = total(j, v, first_slot);
-      const int32_t row = rows[j];
-      const auto put = [&](int column) {
-        if (kMany && first > 0 && !list.overflow) sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
-        put_sum(params.pair_grads, kPairGradWidth, list.overflow, row, column, sum);
-      };
-      if (v >= 6 && v < kMeans) {
-        if (kMany) {
-          put_sum(params.channel_sums, kChannelGroup, list.overflow, row, first % kChannelGroup + v - 6, sum);
-        } else {
-          put(v == 9 ? kPairFourthChannel : v);
-        }
-      } else if (with_shape) {
-        put(v < 6 ? v : kPairMeans + v - kMeans);
-      }
-    }
   }
 };
 
 /// Which of the sums of a pair a lane has after put_warp_sums. Of few channels every lane has one.
 template <int C> __device__ int sum_of_lane() { return summed_value<(C <= kFewChannels) ? 6 + C : 8>(lane_id()); }
 
-/// Sums PairGrad and `channels` over a warp. `sums` is where MovingVjpShared has sum sum_of_lane() of the pair. All
+/// Sums PairGrad and `channels` over a warp. `sums` is where the block has sum sum_of_lane() of the pair. All
 /// lanes must call it.
 template <int C> __device__ void put_warp_sums(const PairGrad<float>& grad, const Values<C>& channels, float* sums) {
   const ShapeGrad<float>& shape = grad.shape;

@@ -14,9 +14,7 @@
 #include <algorithm>
 
 #include "cuda/blend_moving_grads.cuh"
-#include "cuda/blend_moving_maps.cuh"
 #include "cuda/blend_moving_sums.cuh"
-#include "cuda/cut_lists.cuh"
 #include "cuda/launch.cuh"
 
 namespace ar::cuda {
@@ -53,6 +51,12 @@ template <class Layout> class PlacesInFront {
       : begin_(int(begin) + int(threadIdx.x) / 32 * splats * int(sizeof(OfWarp))), in_shared_(splats) {}
 
   __device__ int in_shared() const { return in_shared_; }
+  /// For the splats that leave room for so many blocks on an SM, each with `bytes` of shared memory besides.
+  static int in_shared_of_blocks(int blocks, size_t bytes) {
+    const size_t room = shared_bytes_of_blocks(blocks), splats = room > bytes ? (room - bytes) / kBytes : 0;
+    return int(std::min<size_t>(splats, kMost)) / kUnit * kUnit;
+  }
+
   /// In front of splat n of the list; kShared: n < in_shared().
   template <bool kShared> __device__ void put(int n, const Places& places) {
 #pragma unroll
@@ -101,7 +105,7 @@ __device__ uint32_t replay_chunk(Stage& stage, int from, int k0, const CellCorne
                                  const int (&last)[Layout::kCells], Samples& samples, InFront in_front) {
   constexpr bool kKeeps = !std::is_null_pointer_v<InFront>;
   __syncwarp();  // all have read the last list
-  const int listed = stage.lists.list(stage.reach, from, from + kStateChunk);
+  const int listed = stage.lists.list(stage.reach, from, from + kStateChunk, Layout::own_bit());
   uint32_t shown = 0;
   int n = 0;
   const auto composite = [&](uint32_t entry, auto is_shared) {
@@ -145,28 +149,20 @@ __device__ MovingBlendGrad<float> walk_back(TileSplatRef<F, C>& splat, int k0, i
   return sums;
 }
 
-/// A block per tile whose list is not cut; or with kSegment > 0 per segment, of so many pairs, of those that are, from
-/// what the segment gets from behind. `in_shared`: of PlacesInFront, whose memory is that behind Shared.
-template <class F, int C, class Layout, int kSegment = 0>
-__global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layout, kSegment>)
+/// A block per tile whose list is not cut. `in_shared`: of PlacesInFront, whose memory is that behind Shared.
+template <class F, int C, class Layout>
+__global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layout, 0>)
     moving_vjp_kernel(const BlendVjpParams params, int first, int in_shared) {
   wait_for_earlier_kernels();
-  using Shared = MovingVjpShared<F, C, Layout, kSegment>;
-  using Samples = MovingSamples<F, Layout, (kSegment > 0)>;
+  using Shared = MovingVjpShared<F, C, Layout>;
+  using Samples = MovingSamples<F, Layout>;
   constexpr int S = F::kSamples, kCells = Layout::kCells, kBatch = Shared::kBatch;
   constexpr bool kMany = C > kFewChannels;  // `first` may be above 0, and there may be more channels than C
-  static_assert(kSegment % kBatch == 0 && Layout::kBlocks == 1);
+  static_assert(Layout::kBlocks == 1);
   Shared& shared = *reinterpret_cast<Shared*>(dynamic_shared());
-  int tile = 0, segment_index = 0;
-  if constexpr (kSegment > 0) {
-    const ListSegment segment(*params.plan, params.chunk_order, int(blockIdx.x));
-    tile = segment.tile, segment_index = segment.index;
-  } else {
-    tile = listed_tile<S>(params, params.plan->counts.segments + int(blockIdx.x));
-  }
+  const int tile = listed_tile<S>(params, params.plan->counts.segments + int(blockIdx.x));
   if (tile < 0) return;
   const TileList list = list_of(params.lists, params.grid, tile);
-  const int begin = segment_index * kSegment, end = kSegment > 0 ? begin + kSegment : kWholeList;
   const StatePlaces places(params.lists, list, params.grid, tile);
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int lane = lane_id(), warp = threadIdx.x / 32, channel_count = params.channels.count;
@@ -181,22 +177,14 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layou
   const LastSplats<F, Layout> lasts(params.last, pixel, shared.last);
   const int (&last)[kCells] = lasts.samples;
   if (first % kChannelGroup == 0 && !list.overflow) {  // pairs that nothing reached
-    const int rest = min(list.count, end);
-    for (int k = max(lasts.block, begin) + threadIdx.x / kClearThreads; k < rest; k += Layout::kThreads / kClearThreads)
+    for (int k = lasts.block + threadIdx.x / kClearThreads; k < list.count; k += Layout::kThreads / kClearThreads)
       clear_pair_together<kChannelGroup>(params, list.slot(k), first == 0);
   }
 
   const SampleGrad<F, C> grad(params, pixel, first);
   Adjoint adjoint[kCells];
 #pragma unroll
-  for (int i = 0; i < kCells; ++i) {
-    adjoint[i] = {grad.through, {0, 0}};
-    if (kSegment > 0 && last[i] > end) {
-      const MapMemory<F, Layout::kTilePixels> maps(params.adjoint_maps, Layout::first_sample() + i,
-                                                   Layout::pixel_number());
-      adjoint[i] = maps.adjoint(int64_t(blockIdx.x) + 1);
-    }
-  }
+  for (int i = 0; i < kCells; ++i) adjoint[i] = {grad.through, {0, 0}};
 
   const int own_sum = sum_of_lane<C>();
   PlacesInFront<Layout> in_front(sizeof(Shared), in_shared);
@@ -204,12 +192,12 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layou
     return replay_chunk<F, Layout>(shared.stage, from, k0, corners, last, samples, keep_in);
   };
 
-  const int stop = min(lasts.block, end);
+  const int stop = lasts.block;
   int k0 = (stop - 1) / kBatch * kBatch;
   int32_t id = shared.stage.splat_of(list, k0, stop);
-  for (int k1 = stop; k1 > begin; k1 = k0, k0 -= kBatch) {
+  for (int k1 = stop; k1 > 0; k1 = k0, k0 -= kBatch) {
     const int count = k1 - k0;
-    if (kSegment == 0 && places.spacing > kStateChunk) {  // with too many pairs: from the checkpoint to the batch
+    if (places.spacing > kStateChunk) {  // with too many pairs: from the checkpoint to the batch
       const int checkpoint = k0 / places.spacing;
       int k = checkpoint * places.spacing;
       samples.load(params.checkpoints + (places.first + checkpoint - 1) * Samples::kCheckpoint, k, last);
@@ -220,71 +208,62 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layou
         for (int from = 0; from < kBatch; from += kStateChunk) replay(from, k, nullptr);
       }
     }
-    const int32_t next_id = k0 > begin ? shared.stage.splat_of(list, k0 - kBatch, k0) : -1;
+    const int32_t next_id = k0 > 0 ? shared.stage.splat_of(list, k0 - kBatch, k0) : -1;
     __syncthreads();  // all have read what the last batch left
     shared.load(splats, params, first, list, k0, id, with_means);
     __syncthreads();
     if (next_id >= 0) prefetch(splats + next_id);  // so that the next batch need not wait for memory
     id = next_id;
     const Samples at_batch = samples;
-    for (int part_end = Shared::kChunks, part = 0; part_end > 0; part_end = part) {
-      part = shared.first_chunk(part_end);
-      const int first_slot = shared.first_slot(part);
-      for (int from = (part_end - 1) * kStateChunk; from >= part * kStateChunk; from -= kStateChunk) {
-        uint32_t shown = 0;
-        if (k0 + from < lasts.warp) {
-          if (kSegment == 0 && places.spacing > kStateChunk) {
-            samples = at_batch;
-            for (int ahead = 0; ahead < from; ahead += kStateChunk) replay(ahead, k0, nullptr);
-          } else {
-            const int64_t number = places.of_chunk_at(k0 + from);
-            samples.load(params.checkpoints + number * Samples::kCheckpoint, k0 + from, last);
-          }
-          shown = replay(from, k0, &in_front);
+    for (int from = (Shared::kChunks - 1) * kStateChunk; from >= 0; from -= kStateChunk) {
+      uint32_t shown = 0;
+      if (k0 + from < lasts.warp) {
+        if (places.spacing > kStateChunk) {
+          samples = at_batch;
+          for (int ahead = 0; ahead < from; ahead += kStateChunk) replay(ahead, k0, nullptr);
+        } else {
+          const int64_t number = places.of_chunk_at(k0 + from);
+          samples.load(params.checkpoints + number * Samples::kCheckpoint, k0 + from, last);
         }
-        const auto& listed = shared.stage.lists.of_warps[warp];
-        for (uint32_t mask = shown; mask != 0;) {
-          const int n = 31 - __clz(mask), j = int(listed[n]);
-          mask ^= 1u << n;
-          TileSplatRef<F, C> splat = shared.stage.splats[j];
-          float* const sums = shared.sums_of(j, first_slot);
-          const float g_color = grad.times(splat.channels, params, pixel, [&] { return list.splat(k0 + j); });
-          Vec2<float> places_in_front[kCells];
-          in_front.get(n, places_in_front);
-          const auto [contribution, of_splat] =
-              walk_back<F, C, Layout>(splat, k0, j, g_color, corners, last, places_in_front, samples, adjoint);
-          if (with_means && with_shape)
-            put_warp_means<Layout>(params, shared.mean_maps[j], of_splat.sums.offset, sums + Shared::kMeans);
-          const PairGrad<float> of_pair = {F::collect(splat.terms, of_splat.sums, of_splat.weighted),
-                                           of_splat.weighted};
-          put_warp_sums(of_pair, times(contribution, grad.channels), sums + own_sum);
-        }
-        const uint32_t hits = warp_or(shown >> lane & 1 ? 1u << (listed[lane] - from) : 0u);
-        if (lane == 0) shared.hits[warp][from / kStateChunk] = hits;
+        shown = replay(from, k0, &in_front);
       }
-      __syncthreads();
-      const int first_pair = part * kStateChunk, end_pair = min(count, part_end * kStateChunk);
-      if (with_means) {
-        shared.template write<Shared::kSums>(params, first, with_shape, list, first_pair, end_pair, first_slot);
-      } else {
-        shared.template write<Shared::kMeans>(params, first, with_shape, list, first_pair, end_pair, first_slot);
+      const auto& listed = shared.stage.lists.of_warps[warp];
+      for (uint32_t mask = shown; mask != 0;) {
+        const int n = 31 - __clz(mask), j = int(listed[n]);
+        mask ^= 1u << n;
+        TileSplatRef<F, C> splat = shared.stage.splats[j];
+        float* const sums = shared.sums[warp][j];
+        const float g_color = grad.times(splat.channels, params, pixel, [&] { return list.splat(k0 + j); });
+        Vec2<float> places_in_front[kCells];
+        in_front.get(n, places_in_front);
+        const auto [contribution, of_splat] =
+            walk_back<F, C, Layout>(splat, k0, j, g_color, corners, last, places_in_front, samples, adjoint);
+        if (with_means && with_shape)
+          put_warp_means<Layout>(params, shared.mean_maps[j], of_splat.sums.offset, sums + Shared::kMeans);
+        const PairGrad<float> of_pair = {F::collect(splat.terms, of_splat.sums, of_splat.weighted), of_splat.weighted};
+        put_warp_sums(of_pair, times(contribution, grad.channels), sums + own_sum);
       }
-      if (part > 0) __syncthreads();  // all have read the sums
+      const uint32_t hits = warp_or(shown >> lane & 1 ? 1u << (listed[lane] - from) : 0u);
+      if (lane == 0) shared.hits[warp][from / kStateChunk] = hits;
+    }
+    __syncthreads();
+    const auto total = [&](int j, int v) { return shared.total(j, v); };
+    if (with_means) {
+      write_pairs<Shared::kSums, C, Layout::kThreads>(params, first, with_shape, list, shared.rows, count, total);
+    } else {
+      write_pairs<Shared::kMeans, C, Layout::kThreads>(params, first, with_shape, list, shared.rows, count, total);
     }
   }
 }
 
 /// Launches moving_vjp_kernel with as much of PlacesInFront in shared memory as leaves room for kMovingVjpBlocks on an
 /// SM.
-template <class F, int C, class Layout, int kSegment>
+template <class F, int C, class Layout>
 void launch_moving_vjp_kernel(const BlendVjpParams& p, unsigned blocks, int first, cudaStream_t stream) {
-  using InFront = PlacesInFront<Layout>;
-  constexpr size_t kShared = sizeof(MovingVjpShared<F, C, Layout, kSegment>);
-  const size_t room = shared_bytes_of_blocks(kMovingVjpBlocks<F, C, Layout, kSegment>);
-  const size_t splats = room > kShared ? (room - kShared) / InFront::kBytes : 0;
-  const int in_shared = int(std::min<size_t>(splats, InFront::kMost)) / InFront::kUnit * InFront::kUnit;
-  const LaunchShape shape = {blocks, Layout::kThreads, kShared + in_shared * InFront::kBytes};
-  launch(moving_vjp_kernel<F, C, Layout, kSegment>, shape, stream, p, first, in_shared);
+  constexpr size_t kShared = sizeof(MovingVjpShared<F, C, Layout>);
+  const int in_shared = PlacesInFront<Layout>::in_shared_of_blocks(kMovingVjpBlocks<F, C, Layout, 0>, kShared);
+  const LaunchShape shape = {blocks, Layout::kThreads, kShared + in_shared * PlacesInFront<Layout>::kBytes};
+  launch(moving_vjp_kernel<F, C, Layout>, shape, stream, p, first, in_shared);
 }
 
 }  // namespace ar::cuda

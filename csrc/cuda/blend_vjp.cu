@@ -1,6 +1,7 @@
 // Launches of blend_vjp.
 #include "cuda/blend_groups_vjp.cuh"
 #include "cuda/blend_moving_maps.cuh"
+#include "cuda/blend_moving_segments.cuh"
 #include "cuda/blend_moving_vjp.cuh"
 #include "cuda/blend_vjp.cuh"
 #include "cuda/launch.cuh"
@@ -32,12 +33,12 @@ void launch_segments_vjp(const BlendVjpParams& p, const ListCut& cut, int first,
   const LaunchShape maps = {segments * Maps::kBlocks, Maps::kThreads};
   launch(segment_maps_kernel<F, C, kSide, kSegment>, maps, stream, p, first);
   launch(chain_maps_kernel<F, kSide, kSegment>, {lists * F::kSamples, kSide * kSide}, stream, p);
-  launch_moving_vjp_kernel<F, C, SegmentLayout<F, kSide>, kSegment>(p, segments, first, stream);
+  launch_segment_vjp_kernel<F, C, TakenLayout<F, kSide>, kSegment>(p, cut.max_segments, first, stream);
 }
 template <class F, int C, int kSide>
 void launch_moving_vjp(const BlendVjpParams& p, const ListCut& cut, int first, cudaStream_t stream) {
   if (cut.max_segments > 0) launch_segments_vjp<F, C, kSide>(p, cut, first, stream);
-  launch_moving_vjp_kernel<F, C, EvenLayout<F, true, kSide>, 0>(p, unsigned(p.grid.tiles()), first, stream);
+  launch_moving_vjp_kernel<F, C, EvenLayout<F, true, kSide>>(p, unsigned(p.grid.tiles()), first, stream);
 }
 /// The group that begins with channel `first_of_group`; 0 where they are few. In tiles of kSide x kSide pixels.
 template <class F, int kSide> void blend_vjp_moving(const BlendVjpParams& p, int first_of_group, cudaStream_t stream) {
@@ -53,6 +54,14 @@ template <class F, int kSide> void blend_vjp_moving(const BlendVjpParams& p, int
 
 int64_t max_adjoint_maps(int samples, const ListCut& cut, TileGrid grid) {
   return int64_t(cut.max_segments) * SegmentMap::kNumbers * samples * grid.side() * grid.side();
+}
+
+int64_t max_group_sums(const ListCut& cut) {
+  // Of three channels; of more, a multiprocessor has half as many warps. A block has up to 16 groups, of eight
+  // channels.
+  constexpr int kGroups = 32 * kGroupsOfWarp, kSums = 6 + 3 + 2, kOfBlock = 16, kMostSums = 6 + kMovingChannels + 2;
+  return kSegmentBatch * std::min<int64_t>(int64_t(multiprocessors()) * kGroups * kSums,
+                                           int64_t(cut.max_segments) * kOfBlock * kMostSums);
 }
 
 int channel_group(int footprint, int left) {

@@ -158,10 +158,14 @@ template <class EntryType, int kUnit, int kAhead, int kWarps, int kMost> struct 
   /// Lists those of the staged splats [from, to) that reach this warp's pixels, and returns how many there are. Bit w
   /// of reach[k]: splat k reaches those of warp w; all up to the next multiple of 32 are read. All lanes must call it.
   template <class Bits> __device__ int list(const Bits* reach, int from, int to) {
+    return list(reach, from, to, int(threadIdx.x) / 32);
+  }
+  /// Those whose bit `number` is set.
+  template <class Bits> __device__ int list(const Bits* reach, int from, int to, int number) {
     const int warp = threadIdx.x / 32;
     int n = 0;
     for (int k = from; k < to; k += 32) {
-      const bool reached = reach[k + lane_id()] >> warp & 1;
+      const bool reached = reach[k + lane_id()] >> number & 1;
       const uint32_t all = __ballot_sync(kAllLanes, reached);
       if (reached) of_warps[warp][n + __popc(all & ((1u << lane_id()) - 1))] = Entry((k + lane_id()) * kUnit);
       n += __popc(all);

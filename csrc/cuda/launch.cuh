@@ -70,6 +70,14 @@ struct LaunchShape {
   size_t shared_bytes = 0;
 };
 
+/// Multiprocessors of the current device.
+inline unsigned multiprocessors() {
+  int device = 0, count = 1;
+  cudaGetDevice(&device);
+  cudaDeviceGetAttribute(&count, cudaDevAttrMultiProcessorCount, device);
+  return unsigned(count);
+}
+
 /// Bytes of shared memory that a block may have on the current device.
 inline size_t max_shared_bytes() {
   int device = 0, bytes = 0;

@@ -190,6 +190,8 @@ struct BlendVjpParams : ar::BlendVjpParams<float> {
   MeanSums mean_sums;
   Segments segments;    ///< as in BlendParams
   float* adjoint_maps;  ///< [max_adjoint_maps]
+  float* group_sums;     ///< [max_group_sums]
+  int64_t max_group_sums;
 };
 
 /// Sums over the pairs of every splat.
@@ -264,9 +266,11 @@ ListCut list_cut(int footprint, int64_t channels, int64_t capacity, TileGrid gri
 /// Planes of a float per pixel of a tile in BlendParams::checkpoints of a footprint whose samples move, for a backward
 /// pass. None for the others.
 int64_t max_state_planes(int footprint, int64_t capacity);
-/// Numbers in BlendParams::reach_words and BlendVjpParams::adjoint_maps, which only lists need that are cut.
+/// Numbers in BlendParams::reach_words, and in BlendVjpParams::adjoint_maps and group_sums, which only lists need that
+/// are cut.
 int64_t max_reach_words(const ListCut& cut, TileGrid grid);
 int64_t max_adjoint_maps(int samples, const ListCut& cut, TileGrid grid);
+int64_t max_group_sums(const ListCut& cut);
 /// Segments of each tile's list that many channels are blended in.
 int list_segments(int footprint, int64_t channels, TileGrid grid);
 /// Channels that a group-less blending is compiled for: 3 in the splats themselves, or 4 in rows.

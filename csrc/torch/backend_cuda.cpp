@@ -260,6 +260,10 @@ class CudaBackend final : public Backend {
     const int64_t numbers = cuda::max_adjoint_maps(pass.footprint.samples, cut, pass.grid);
     if (numbers > 0) maps = at::empty({numbers}, floats_);
     p.adjoint_maps = pointer<float>(maps);
+    Tensor group_sums;
+    p.max_group_sums = cuda::max_group_sums(cut);
+    if (p.max_group_sums > 0) group_sums = at::empty({p.max_group_sums}, floats_);
+    p.group_sums = pointer<float>(group_sums);
 
     cuda::SumChannelsParams sum = {};
     sum.sums = pair_sums_of(lists, out.pairs);

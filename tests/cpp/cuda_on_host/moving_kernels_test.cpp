@@ -7,6 +7,7 @@
 #include "core/inspect.h"
 #include "cuda/blend_listed.cuh"
 #include "cuda/blend_moving_maps.cuh"
+#include "cuda/blend_moving_segments.cuh"
 #include "cuda/blend_moving_vjp.cuh"
 #include "cuda/plan.cuh"
 #include "random_splats.h"
@@ -143,18 +144,10 @@ Results run(Scene<F>& scene, int long_from = 0, int longest_from = kLongestList)
   vjp.chunk_order = plan_back.chunks.data();
   vjp.cut_lists = plan_back.lists.data();
   vjp.checkpoints = checkpoints.data();
+  int32_t segments_taken = -1;  // chain_maps_kernel has to set it to zero
+  vjp.chunks_taken = &segments_taken;
   vjp.pair_grads = out.pair_grads.data();
   vjp.mean_sums = MeanSums::kNorm;
-  const auto differentiate = [&](auto layout, auto segment, int blocks) {
-    using Layout = decltype(layout);
-    constexpr int kLength = decltype(segment)::value;
-    // Some of the places of a chunk in shared memory, the others not.
-    constexpr int kInShared = PlacesInFront<Layout>::kUnit;
-    static_assert(sizeof(MovingVjpShared<F, kColors, Layout, kLength>) + kInShared * PlacesInFront<Layout>::kBytes <=
-                  sizeof dynamic_memory);
-    cuda_on_host::launch(blocks, Layout::kThreads,
-                         [&] { moving_vjp_kernel<F, kColors, Layout, kLength>(vjp, 0, kInShared); });
-  };
   if constexpr (kSegment > 0) {
     using Maps = MapLayout<F, kSide>;
     const int segments = cut_back.max_segments;
@@ -163,9 +156,20 @@ Results run(Scene<F>& scene, int long_from = 0, int longest_from = kLongestList)
     cuda_on_host::launch(segments * Maps::kBlocks, Maps::kThreads,
                          [&] { segment_maps_kernel<F, kColors, kSide, kSegment>(vjp, 0); });
     cuda_on_host::launch(tiles * S, kSide * kSide, [&] { chain_maps_kernel<F, kSide, kSegment>(vjp); });
-    differentiate(SegmentLayout<F, kSide>(), std::integral_constant<int, kSegment>(), segments);
+    using Layout = TakenLayout<F, kSide>;
+    using Shared = SegmentVjpShared<F, kColors, Layout, kSegment>;
+    constexpr int kBlocks = 3, kInShared = PlacesInFront<Layout>::kUnit;  // fewer blocks than segments
+    static_assert(sizeof(Shared) + kInShared * PlacesInFront<Layout>::kBytes <= sizeof dynamic_memory);
+    std::vector<typename Shared::SumsOfGroup> group_sums(kBlocks * Layout::kGroups);
+    vjp.group_sums = &group_sums[0][0][0];
+    cuda_on_host::launch(kBlocks, Layout::kThreads,
+                         [&] { segment_vjp_kernel<F, kColors, Layout, kSegment>(vjp, 0, kInShared); });
   }
-  differentiate(Backward(), std::integral_constant<int, 0>(), tiles);
+  // Some of the places of a chunk in shared memory, the others not.
+  constexpr int kInShared = PlacesInFront<Backward>::kUnit;
+  static_assert(sizeof(MovingVjpShared<F, kColors, Backward>) + kInShared * PlacesInFront<Backward>::kBytes <=
+                sizeof dynamic_memory);
+  cuda_on_host::launch(tiles, Backward::kThreads, [&] { moving_vjp_kernel<F, kColors, Backward>(vjp, 0, kInShared); });
   return out;
 }
 
