@@ -3,7 +3,7 @@
 // A block has a segment of a tile's list, so that long lists are differentiated side by side. What the
 // samples carry from splat to splat on the way back goes through a segment as an affine map. So one kernel finds the
 // map of every segment, from front to back, and another chains them from the last segment to the first. Then that of
-// blend_moving_vjp.cuh has the sums, each segment from what it gets from behind.
+// blend_moving_segments.cuh has the sums, each segment from what it gets from behind.
 #pragma once
 
 #include <algorithm>
@@ -67,11 +67,13 @@ template <class F, int kTilePixels> struct MapMemory {
   }
 };
 
-/// Groups of a segment that a warp has on average.
-inline constexpr int kGroupsOfWarp = 2;
+/// Groups of a segment for each warp of its block (blend_moving_segments.cuh). With one cell, whose tiles of 8x8 pixels
+/// have two groups, a block of one warp would take too long.
+inline constexpr int kMostGroupsOfWarp = 2;
+template <class F> inline constexpr int kGroupsOfWarp = F::kSamples == 1 ? 1 : kMostGroupsOfWarp;
 
-/// Samples shared out for segments, of which there are many, with small splats: few pixels per warp, and blocks small
-/// enough for two on an SM. A single sample has a lane, so that none is idle.
+/// Samples shared out for segments, of which there are many, with small splats: few pixels per warp. A single sample
+/// has a lane, so that none is idle.
 template <class F, int kSide>
 using SegmentLayout = CellLayout<F::kSamples <= 4 ? 1 : 2,
                                  F::kSamples == 1   ? 1
@@ -80,11 +82,10 @@ using SegmentLayout = CellLayout<F::kSamples <= 4 ? 1 : 2,
                                  kSide>;
 /// The same, whose groups are taken, by fewer warps.
 template <class F, int kSide, class Cells = SegmentLayout<F, kSide>>
-using TakenLayout =
-    CellLayout<Cells::kCells, Cells::kLanes, kSide, (Cells::kGroups + kGroupsOfWarp - 1) / kGroupsOfWarp, true>;
+using TakenLayout = CellLayout<Cells::kCells, Cells::kLanes, kSide, Cells::kGroups / kGroupsOfWarp<F>, true>;
 
 /// Samples shared out for the maps of segments, which no lanes add up: with many cells a sample to a lane, so that a
-/// warp has few pixels and passes over more splats. A block has 16 warps at most.
+/// warp has few pixels and passes over more splats; and in small blocks, since warps do not have equally much to do.
 template <class F, int kSide>
 using MapLayout = std::conditional_t<(F::kSamples > 4), CellLayout<1, 16, kSide, 4>, SegmentLayout<F, kSide>>;
 
@@ -176,7 +177,7 @@ __global__ void __launch_bounds__(kSide* kSide) chain_maps_kernel(const BlendVjp
   constexpr int S = F::kSamples, kPixels = kSide * kSide;
   const int place = int(blockIdx.x) / S, t = int(blockIdx.x) % S * kPixels + int(threadIdx.x);
   const int number = t / S, sample = t % S;
-  if (blockIdx.x == 0 && threadIdx.x == 0) params.chunks_taken[0] = 0;  // moving_vjp_kernel has begun no segment
+  if (blockIdx.x == 0 && threadIdx.x == 0) params.chunks_taken[0] = 0;  // segment_vjp_kernel has begun none
   if (place >= params.plan->counts.cut_lists) return;
   const CutList cut = params.cut_lists[place];
   const TileList list = list_of(params.lists, params.grid, cut.tile);

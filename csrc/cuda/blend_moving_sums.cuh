@@ -1,5 +1,5 @@
-// The sums of pairs in blend_vjp for footprints whose samples move: each warp of a block leaves those of its pixels in
-// shared memory, where they are added up and written.
+// The sums of pairs in blend_vjp for footprints whose samples move: each warp of a block leaves those of its pixels,
+// in shared memory or, of segments, in BlendVjpParams::group_sums; they are added up and written.
 #pragma once
 
 #include <algorithm>

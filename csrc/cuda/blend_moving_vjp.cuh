@@ -1,5 +1,5 @@
 // Kernel of blend_vjp for footprints whose samples move: a block per tile, a lane per few cells of a pixel, back to
-// front. Lists that are cut have a block per segment, from what blend_moving_maps.cuh has found.
+// front. Lists that are cut have the kernel of blend_moving_segments.cuh.
 //
 // The state of a sample in front of a splat cannot be had from the state behind it, since the displacement depends on
 // itself through alpha. So a warp composites each chunk of 32 splats once more, from the checkpoint that blend has left

@@ -59,7 +59,7 @@ int64_t max_adjoint_maps(int samples, const ListCut& cut, TileGrid grid) {
 int64_t max_group_sums(const ListCut& cut) {
   // Of three channels; of more, a multiprocessor has half as many warps. A block has up to 16 groups, of eight
   // channels.
-  constexpr int kGroups = 32 * kGroupsOfWarp, kSums = 6 + 3 + 2, kOfBlock = 16, kMostSums = 6 + kMovingChannels + 2;
+  constexpr int kGroups = 32 * kMostGroupsOfWarp, kSums = 6 + 3 + 2, kOfBlock = 16, kMostSums = 6 + kMovingChannels + 2;
   return kSegmentBatch * std::min<int64_t>(int64_t(multiprocessors()) * kGroups * kSums,
                                            int64_t(cut.max_segments) * kOfBlock * kMostSums);
 }
