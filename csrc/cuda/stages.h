@@ -190,7 +190,7 @@ struct BlendVjpParams : ar::BlendVjpParams<float> {
   MeanSums mean_sums;
   Segments segments;    ///< as in BlendParams
   float* adjoint_maps;  ///< [max_adjoint_maps]
-  float* group_sums;     ///< [max_group_sums]
+  float* group_sums;    ///< [max_group_sums]
   int64_t max_group_sums;
 };
 
