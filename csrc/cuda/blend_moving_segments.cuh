@@ -175,12 +175,8 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layou
         group_vjp<F, C, Layout, kSegment>(params, first, in_shared, shared, sums[Layout::group()], list, places,
                                           segment, k0, k1, with_means, with_shape);
       __syncthreads();
-      const auto total = [&](int j, int v) { return shared.total(sums, j, v); };
-      if (with_means) {
-        write_pairs<Shared::kSums, C, Layout::kThreads>(params, first, with_shape, list, shared.rows, k1 - k0, total);
-      } else {
-        write_pairs<Shared::kMeans, C, Layout::kThreads>(params, first, with_shape, list, shared.rows, k1 - k0, total);
-      }
+      write_pairs<C, Layout::kThreads>(params, first, with_means, with_shape, list, shared.rows, k1 - k0,
+                                       [&](int j, int v) { return shared.total(sums, j, v); });
     }
   }
 }

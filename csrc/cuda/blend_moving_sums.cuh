@@ -10,12 +10,10 @@ namespace ar::cuda {
 
 static_assert(kStateChunk == 32, "a warp's chunk is a mask of 32 bits");
 
-/// Writes the sums total(j, v) of the first `count` pairs of a batch, kUsed of each: a constant, so that to divide by
-/// it costs little. `first`: the first of the channels; the kernels of those before have left their shares of the six
-/// other sums. `with_shape`: these sums and MeanSums too. `rows`: of the pairs' sums.
+/// write_pairs() for kUsed sums of each pair: a constant, so that to divide by it costs little.
 template <int kUsed, int C, int kThreads, class Total>
-__device__ void write_pairs(const BlendVjpParams& params, int first, bool with_shape, const TileList& list,
-                            const int32_t* rows, int count, Total&& total) {
+__device__ void write_sums(const BlendVjpParams& params, int first, bool with_shape, const TileList& list,
+                           const int32_t* rows, int count, Total&& total) {
   constexpr bool kMany = C > kFewChannels;
   constexpr int kMeans = 6 + C;
   for (int t = int(threadIdx.x); t < count * kUsed; t += kThreads) {
@@ -35,6 +33,20 @@ __device__ void write_pairs(const BlendVjpParams& params, int first, bool with_s
     } else if (with_shape) {
       put(v < 6 ? v : kPairMeans + v - kMeans);
     }
+  }
+}
+
+/// Writes the sums total(j, v) of the first `count` pairs of a batch, with those for MeanSums if with_means. `first`:
+/// the first of the channels; the kernels of those before have left their shares of the six other sums. `with_shape`:
+/// these sums and MeanSums too. `rows`: of the pairs' sums.
+template <int C, int kThreads, class Total>
+__device__ void write_pairs(const BlendVjpParams& params, int first, bool with_means, bool with_shape,
+                            const TileList& list, const int32_t* rows, int count, Total&& total) {
+  constexpr int kMeans = 6 + C;
+  if (with_means) {
+    write_sums<kMeans + 2, C, kThreads>(params, first, with_shape, list, rows, count, total);
+  } else {
+    write_sums<kMeans, C, kThreads>(params, first, with_shape, list, rows, count, total);
   }
 }
 

@@ -247,12 +247,8 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layou
       if (lane == 0) shared.hits[warp][from / kStateChunk] = hits;
     }
     __syncthreads();
-    const auto total = [&](int j, int v) { return shared.total(j, v); };
-    if (with_means) {
-      write_pairs<Shared::kSums, C, Layout::kThreads>(params, first, with_shape, list, shared.rows, count, total);
-    } else {
-      write_pairs<Shared::kMeans, C, Layout::kThreads>(params, first, with_shape, list, shared.rows, count, total);
-    }
+    write_pairs<C, Layout::kThreads>(params, first, with_means, with_shape, list, shared.rows, count,
+                                     [&](int j, int v) { return shared.total(j, v); });
   }
 }
 

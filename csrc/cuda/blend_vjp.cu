@@ -57,6 +57,7 @@ int64_t max_adjoint_maps(int samples, const ListCut& cut, TileGrid grid) {
 }
 
 int64_t max_group_sums(const ListCut& cut) {
+  if (cut.max_segments == 0) return 0;  // and the device need not be asked
   // Of three channels; of more, a multiprocessor has half as many warps. A block has up to 16 groups, of eight
   // channels.
   constexpr int kGroups = 32 * kMostGroupsOfWarp, kSums = 6 + 3 + 2, kOfBlock = 16, kMostSums = 6 + kMovingChannels + 2;
