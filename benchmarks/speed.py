@@ -1,9 +1,10 @@
 """What each footprint costs: time per stage and memory, on any scene and views, on the CPU or with CUDA.
 
     python benchmarks/speed.py SCENE --views VIEWS [--footprints box:samples=1 analytic ...] [--device cuda]
-                               [--against gsplat,module:NAME ...]
+                               [--against gsplat,module:NAME ...] [--queued]
 
-The table gives medians over rounds, averaged over views, and the ratio to the first footprint.
+The table gives medians over rounds, averaged over views, and the ratio to the first footprint. NAME@N is a footprint
+in a picture of N times the width and height, averaged over N x N pixels.
 "forward" is without gradient; "forward+backward" differentiates sum(image * w) for fixed random w in
 all inputs, means2D among them. "extra" is the memory that a forward and backward pass needs beyond
 inputs, image and gradients: peak less what is there before, less image and gradients.
@@ -13,7 +14,8 @@ them all, and memory is the resident memory of the process.
 
 With CUDA footprints are warmed up and timed one after another, because the room for pairs follows the
 frames before. Times are between two events around a call on an idle device: the longer of launching
-and computing. "host" is the time until a call returns, without waiting for the device: the op itself
+and computing. With --queued the device is busy with other work until a call has been launched, so that only computing
+counts; stages are timed as ever. "host" is the time until a call returns, without waiting for the device: the op itself
 and `GaussianRasterizer`, both without gradient, and forward and backward of the latter. Memory is what
 torch's allocator handed out; room for pairs follows the largest of the footprint's views of one size,
 with reserve.
@@ -38,8 +40,9 @@ from scene_files import load_padded
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
+from analytic_rasterizer.analysis.pareto import parse_method
 from analytic_rasterizer.analysis.tables import format_table
-from analytic_rasterizer.analysis.timing import Case, seconds_of
+from analytic_rasterizer.analysis.timing import Case, event_seconds, seconds_of
 
 FOOTPRINTS = ["box:samples=1", "point", "mip", "cumulant", "analytic", "box:samples=2", "box:samples=4"]
 STAGES = ("project", "bin", "blend")
@@ -59,14 +62,15 @@ def main() -> None:
 def parse_arguments() -> argparse.Namespace:
     parser = make_parser(__doc__.split("\n")[0], FOOTPRINTS)
     add_sh_degree(parser)
-    add_against(parser)
+    add_against_and_queued(parser)
     return parse(parser)
 
 
-def add_against(parser: argparse.ArgumentParser) -> None:
-    """Adds --against, a list of names; empty without it."""
+def add_against_and_queued(parser: argparse.ArgumentParser) -> None:
+    """Adds --against, a list of names, empty without it; and --queued."""
     add, split = parser.add_argument, lambda text: text.split(",")
     add("--against", type=split, default=[], metavar="PEER[,PEER...]", help="other rasterizers: peers.py")
+    add("--queued", action="store_true", help="with CUDA, leave out the time that the host takes")
 
 
 def measure_scene(args: argparse.Namespace, scene: io.Scene, views: list[io.View]) -> tuple[dict, dict]:
@@ -78,7 +82,7 @@ def measure_scene(args: argparse.Namespace, scene: io.Scene, views: list[io.View
     together = [{name: of_name} for name, of_name in cases.items()] if by_themselves else [cases]
     measured = {}
     for part in together:
-        measured |= measure(part, partial(time_round, device=args.device), args.device, args.rounds)
+        measured |= measure(part, partial(time_round, device=args.device, queued=args.queued), args.device, args.rounds)
     for name, of_name in cases.items():
         for case, view, result in zip(of_name, views, measured[name]):
             if name in peers:
@@ -105,10 +109,11 @@ def format_results(results: dict[str, dict], device: str) -> str:
 
 
 class SpeedCase(Case):
-    """A case whose stages and op can be run by themselves."""
+    """A case whose stages and op can be run by themselves, of a footprint or NAME@N."""
 
-    def __init__(self, scene: io.Scene, view: io.View, footprint: str):
-        super().__init__(scene, view, footprint)
+    def __init__(self, scene: io.Scene, view: io.View, method: str):
+        method = parse_method(method)
+        super().__init__(scene, view, method.footprint, method.supersampling)
         footprint = self.settings.footprint
         given = {**self.gaussians, **self.settings._asdict(), "footprint": footprint.key}
         given["option"] = footprint.option
@@ -129,10 +134,12 @@ class SpeedCase(Case):
         return 120 * len(self.gaussians["means3D"]) + 64 * pairs + 64 * pixels
 
 
-def time_round(case: Case, device: str) -> dict:
+def time_round(case: Case, device: str, queued: bool = False) -> dict:
     """Seconds of the stages, of a forward pass without gradient, and of one with its backward pass; with CUDA also
     until calls return when the device has nothing else to do. Of a peer's case only those of whole passes."""
     clock, result = CLOCKS[device], {}
+    if queued and device == "cuda":
+        clock = partial(event_seconds, queued=True)
     own = isinstance(case, SpeedCase)
     if own:
         stages = case.stages()

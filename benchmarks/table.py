@@ -1,11 +1,13 @@
 """The table of docs/performance.md: footprints and peers, forward / forward + backward, on several scenes.
 
     python benchmarks/table.py "plant hd=plant.ply,plant_hd.json" "plant lo=plant.ply,plant_lo.json" ...
-                               [--footprints NAME ...] [--against gsplat,module:NAME ...] [--device cuda] [--json FILE]
+                               [--footprints NAME ...] [--against gsplat,module:NAME ...] [--queued]
+                               [--device cuda] [--json FILE]
 
 Every column is LABEL=SCENE,VIEWS. Within a column all rows are measured in turn, as `speed.py --against` does, which
-also says what is timed; milliseconds, medians of the rounds, means of the views. Printed is Markdown, and below it how
-far the pictures of peers are from ours. The SH of a scene are padded to degree 3 with zeros, as trainers hold them.
+also says what is timed and what NAME may be; milliseconds, medians of the rounds, means of the views. Printed is
+Markdown, and below it how far the pictures of peers are from ours. The SH of a scene are padded to degree 3 with zeros,
+as trainers hold them.
 """
 
 from __future__ import annotations
@@ -14,7 +16,7 @@ import argparse
 
 from common import add_measuring, parse, save_json
 from scene_files import load_scene, pad_sh
-from speed import add_against, measure_scene
+from speed import add_against_and_queued, measure_scene
 
 from analytic_rasterizer import io
 from analytic_rasterizer.analysis.tables import markdown_table
@@ -45,7 +47,7 @@ def parse_arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("columns", nargs="+", type=_column, metavar="LABEL=SCENE,VIEWS")
     parser.add_argument("--footprints", nargs="+", default=FOOTPRINTS, metavar="NAME[:k=v]")
-    add_against(parser)
+    add_against_and_queued(parser)
     add_measuring(parser)
     args = parse(parser)
     args.columns = dict(args.columns)

@@ -21,10 +21,9 @@ from scene_files import load_padded
 
 from analytic_rasterizer import io
 from analytic_rasterizer.analysis.tables import format_table
-from analytic_rasterizer.analysis.timing import WARM_UP, Case, describe_machine
+from analytic_rasterizer.analysis.timing import QUEUED_BEHIND, WARM_UP, Case, describe_machine
 
 FOOTPRINTS = ["box:samples=1", "moment:samples=4"]
-QUEUED_BEHIND = 50_000_000  # clock cycles of the device, longer than the host takes to launch a pass
 SLEEPER = "spin_kernel"  # the kernel of torch that takes them
 LAUNCH = 2.0  # microseconds by which a kernel may begin before the one that it waits for has ended
 

@@ -86,7 +86,7 @@ def many_channels(device: str) -> None:
 
 
 def too_many_pairs(device: str) -> None:
-    """On CUDA there are no lists then: every tile goes through all splats."""
+    """On CUDA tiles share the lists of cells then."""
     if device == "cuda":
         _C.force_pair_capacity(64)
     try:

@@ -77,14 +77,14 @@ def test_dialects(monkeypatch, capsys):
 def test_speed(device, small_scene, monkeypatch, capsys):
     """A row for every footprint, with numbers in all of its columns."""
     speed = importlib.import_module("speed")
-    footprints = ["box:samples=1", "mip"]
+    footprints = ["box:samples=1", "mip", "mip@2"]
     arguments = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--json", small_scene / "out.json"]
-    options = ["--rounds", "1", "--sh-degree", "2", "--threads", "1", "--device", device]
+    options = ["--rounds", "1", "--queued", "--sh-degree", "2", "--threads", "1", "--device", device]
     monkeypatch.setattr(sys, "argv", ["speed.py", *map(str, arguments), *options, "--footprints", *footprints])
     speed.main()
     lines = capsys.readouterr().out.splitlines()
     assert "50 Gaussians of SH degree 2, 2 views of 40x30" in lines[0]
-    assert [line.split()[0] for line in lines[2:4]] == footprints
+    assert [line.split()[0] for line in lines[2:5]] == footprints
     written = json.loads((small_scene / "out.json").read_text())
     assert list(written["results"]) == footprints
     for name, result in written["results"].items():

@@ -271,17 +271,21 @@ def test_longest_lists_of_moving_samples(samples):
 
 
 def test_a_list_for_each_pixel_changes_no_alpha():
-    """With more pairs than room every tile goes through all splats, in tiles of the same size: the same alphas. The
+    """With more pairs than room tiles of the same size go through the splats of a cell of them: the same alphas. The
     colours of a pixel with a list of its own are added up by several lanes, and n positive terms with n - 1 roundings.
     """
-    scene = splats_smaller_than_a_pixel()
-    effects = ar.Effects(alpha=True)
     settings = settings_for(("moment", {"samples": 1}), Camera(image_height=24, image_width=40))
+    scene = splats_smaller_than_a_pixel()
+    stages = ar.render_stages(settings, **without_means2d(scene))
+    in_image = stages.ids[stages.pairs.unique()]  # so that there are more pairs than Gaussians
+    scene = {name: value[in_image] for name, value in scene.items()}
+    effects = ar.Effects(alpha=True)
     rasterizer = ar.GaussianRasterizer(scenes.settings_to(settings._replace(effects=effects), "cuda"))
     with torch.no_grad():
         color, _, outputs = rasterizer(**scenes.to(scene, "cuda"))
         _C.force_pair_capacity(64)
         try:
+            assert_more_pairs_than_room(scene, settings)
             other_color, _, other_outputs = rasterizer(**scenes.to(scene, "cuda"))
         finally:
             _C.force_pair_capacity(0)
@@ -353,6 +357,7 @@ def test_more_pairs_than_room_where_lists_would_be_cut(samples):
     scene, settings = long_and_short_lists(), settings_for(("moment", {"samples": samples}), LARGE)
     _C.force_pair_capacity(1 << 14)
     try:
+        assert_more_pairs_than_room(scene, settings)
         compare(scene, settings, flips=1e-3, layers=500)
     finally:
         _C.force_pair_capacity(0)
@@ -373,23 +378,44 @@ def test_a_splat_that_fills_the_screen(variant):
 
 @pytest.fixture
 def little_room():
-    """Room for 64 pairs, whatever comes."""
+    """Room for 64 pairs, or for one of each Gaussian, whatever comes."""
     _C.force_pair_capacity(64)
     yield
     _C.force_pair_capacity(0)
 
 
+def assert_more_pairs_than_room(scene, settings):
+    """And that the lists of cells fit instead."""
+    with torch.no_grad():
+        on_device = scenes.to(without_means2d(scene), "cuda")
+        lists = ar.bin(ar.project(scenes.settings_to(settings, "cuda"), **on_device)).of_camera()
+    pairs, _, listed, cell_bits = lists["counts"].tolist()
+    assert pairs > len(lists["pairs"]) >= listed > 0 and cell_bits > 0
+    assert lists["tile_offsets"][-1] == listed
+
+
 @every_footprint
 def test_too_many_pairs(variant, little_room):
-    """No list is written then: every tile goes through all splats."""
+    """Tiles share the lists of cells then."""
     for scene, camera in ((scene32(), CAMERA), (scene32("few"), replace(CAMERA, image_width=50, image_height=40))):
         settings = settings_for(variant, camera)
+        assert_more_pairs_than_room(scene, settings)
         color = compare(scene, settings)
         first = run(scene, settings, "cuda")
         assert torch.equal(first.color, color)
         # Gradients are added by atomics here: the one case in which their last bits may differ.
         assert torch.equal(run(scene, settings, "cuda").color, color)
         assert_same_without_gradient(scene, settings, color)
+
+
+def test_stages_have_a_list_for_each_tile(little_room):
+    """Which is what their caller looks at."""
+    scene, settings = scenes.to(without_means2d(scene32()), "cuda"), settings_for(("box", {}), CAMERA, "cuda")
+    little = ar.render_stages(settings, **scene)
+    _C.force_pair_capacity(1 << 20)
+    enough = ar.render_stages(settings, **scene)
+    for name in ("color", "pairs", "tile_offsets"):
+        assert torch.equal(getattr(little, name), getattr(enough, name)), name
 
 
 @each_path

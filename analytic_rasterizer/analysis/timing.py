@@ -19,6 +19,7 @@ from ..rasterizer import GaussianRasterizer
 
 ROUNDS = {"cpu": 5, "cuda": 20}
 SLOW = 20  # calls that take so many times as long as the base are timed only once on the CPU
+QUEUED_BEHIND = 50_000_000  # clock cycles of a CUDA device, longer than the host takes to launch a pass
 WARM_UP = 40  # calls before timing on CUDA: the first 32 frames of a size wait for the device
 
 
@@ -146,9 +147,14 @@ def seconds_of(call: Callable[[], object], clock: Callable[[], float] = time.per
     return clock() - start
 
 
-def event_seconds(call: Callable[[], object]) -> float:
-    """Time on the CUDA device from before a call to after it."""
+def event_seconds(call: Callable[[], object], queued: bool = False) -> float:
+    """Time on the CUDA device from before a call to after it.
+
+    With `queued` the device is kept busy until the host has launched the call, so that its time does not count.
+    """
     start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    if queued:
+        torch.cuda._sleep(QUEUED_BEHIND)
     start.record()
     call()
     end.record()

@@ -164,7 +164,7 @@ def _touched(splats: Splats, background: torch.Tensor) -> _Touched:
         lists = bin(splats, background=background.detach(), keep=False).of_camera()
         pairs, offsets = lists["pairs"], lists["tile_offsets"]
         if not pairs.is_cuda or int(lists["counts"][0]) <= len(pairs):
-            break  # on CUDA there may have been more pairs than were expected, and then there are no lists
+            break  # on CUDA there may have been more pairs than were expected, and then tiles share lists
     else:
         raise RuntimeError("the lists of tiles did not fit the memory that was guessed for them")
     tiles = len(offsets) - 1

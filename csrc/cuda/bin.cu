@@ -21,12 +21,12 @@ void sort_values(const TileSort<Value>& p, TileGrid grid, uint32_t* memory, cuda
     const SortScratch<bits> scratch(memory, p.capacity, digits.passes);
     for (int pass = 0; pass < digits.passes; ++pass) {
       launch(sort_pass_kernel<bits, Value, false>, sort_shape<bits, Value>(scratch.blocks), stream, scratch, pass,
-             false, &p.counts->pairs, p.capacity, p.tiles[pass % 2], p.tiles[1 - pass % 2], p.values[pass % 2],
+             false, &p.counts->listed, p.capacity, p.tiles[pass % 2], p.tiles[1 - pass % 2], p.values[pass % 2],
              p.values[1 - pass % 2]);
     }
   });
   launch(tile_offsets_kernel, {blocks_of(grid.tiles() + 1, kRangeTiles), kRangeTiles * kRangeLanes}, stream,
-         p.tiles[digits.passes % 2], p.counts, p.capacity, grid.tiles(), p.tile_offsets, p.feedback);
+         p.tiles[digits.passes % 2], p.counts, grid.tiles(), p.tile_offsets, p.feedback);
 }
 
 }  // namespace

@@ -301,21 +301,99 @@ __global__ void __launch_bounds__(kEmitThreads, 5) emit_pairs_kernel(const EmitP
   writer.finish();
 }
 
+/// The tiles that a splat may touch: those of its bounding box, and of a pixel around it for rounding.
+struct BoxOfTiles {
+  Range rows = {0, -1}, columns = {0, -1};
+
+  __device__ BoxOfTiles() {}
+  __device__ BoxOfTiles(const Support<float>& support, TileGrid grid)
+      : rows(of_pixels(support.mean.y, support.half_height + support.reach, grid.height, grid)),
+        columns(of_pixels(support.mean.x, support.half_width + support.reach, grid.width, grid)) {}
+  /// The same in cells of 2^bits x 2^bits tiles.
+  __device__ BoxOfTiles in_cells(int bits) const {
+    BoxOfTiles cells;
+    cells.rows = {rows.first >> bits, rows.last >> bits};
+    cells.columns = {columns.first >> bits, columns.last >> bits};
+    return cells;
+  }
+  __device__ int64_t count() const { return int64_t(rows.last - rows.first + 1) * (columns.last - columns.first + 1); }
+
+ private:
+  __device__ static Range of_pixels(float middle, float half, int size, TileGrid grid) {
+    return tiles_of(clamp_range(Span<float>{middle - half - 1, middle + half + 1}, size), grid);
+  }
+};
+
+/// If there is no room for the pairs of splats and tiles: those of splats and cells, in the order of depth, by one
+/// block. It takes some milliseconds per million splats, once, where the host would have to be waited for.
+__device__ inline void emit_cell_pairs(const EmitParams& params, PairWriter& writer) {
+  constexpr int kWarps = kEmitThreads / 32;
+  const TileGrid grid = params.grid;
+  const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
+  const int64_t n = params.counts->splats, n_rounded = (n + kEmitThreads - 1) / kEmitThreads * kEmitThreads;
+  const auto tiles_of_splat = [&](int64_t r) {
+    return BoxOfTiles(support_of(splats[params.order[r]], params.footprint), grid);
+  };
+  // The smallest cells of 2^1 to 2^kSizes tiles that there is room for; or one, the whole image, where a splat has one
+  // pair at most.
+  constexpr int kSizes = 6;
+  int64_t of_sizes[kSizes] = {};
+#pragma unroll 4
+  for (int64_t r = threadIdx.x; r < n; r += kEmitThreads) {
+    const BoxOfTiles tiles = tiles_of_splat(r);
+#pragma unroll
+    for (int k = 0; k < kSizes; ++k) of_sizes[k] += tiles.in_cells(k + 1).count();
+  }
+  int bits = 0;
+  while (1 << bits < max(grid.columns(), grid.rows())) ++bits;
+#pragma unroll
+  for (int k = kSizes - 1; k >= 0; --k) {
+    int64_t all;
+    sum_before<kWarps>(of_sizes[k], int64_t(0), all);
+    if (all <= params.capacity) bits = k + 1;
+  }
+
+  const int64_t columns = grid.columns();
+  int64_t before = 0;  // of the pairs of earlier splats
+  for (int64_t r = threadIdx.x; r < n_rounded; r += kEmitThreads) {
+    const BoxOfTiles cells = r < n ? tiles_of_splat(r).in_cells(bits) : BoxOfTiles();
+    int64_t all;
+    int64_t place = before + sum_before<kWarps>(cells.count(), int64_t(0), all);
+    before += all;
+    for (int64_t row = cells.rows.first; row <= cells.rows.last; ++row) {
+      for (int64_t column = cells.columns.first; column <= cells.columns.last; ++column, ++place) {
+        const int32_t id = params.order[r];
+        writer.write(place, uint32_t((row << bits) * columns + (column << bits)), id, id);
+      }
+    }
+  }
+  if (threadIdx.x == 0) {
+    params.counts->listed = before;
+    params.counts->cell_bits = bits;
+  }
+}
+
 /// Blocks of emit_long_pairs, which share the long splats.
 inline constexpr int kLongBlocks = 132 * 4;
 
 /// The pairs of long splats, a warp for each. The nearest splats are often long, so that some blocks of emit_pairs
-/// would have hundreds of them.
+/// would have hundreds of them. Also says how many pairs there are in lists.
 __global__ void __launch_bounds__(kEmitThreads)
     emit_long_pairs_kernel(const EmitParams params, const TileDigits digits) {
   wait_for_earlier_kernels();
   constexpr int kWarps = kEmitThreads / 32;
   __shared__ uint32_t digit_counts[PairWriter::kMostCounts];
-  const int count = int(params.status[kLongSplats]);
+  const bool in_cells = params.counts->pairs > params.capacity;
+  if (blockIdx.x == 0 && threadIdx.x == 0 && !in_cells) params.counts->listed = params.counts->pairs;
+  const int count = in_cells ? 1 : int(params.status[kLongSplats]);
   const int first = int(blockIdx.x) * kWarps;
   if (first >= count) return;
   PairWriter writer(params, digits, digit_counts);
   __syncthreads();
+  if (in_cells) {
+    emit_cell_pairs(params, writer);
+    return writer.finish();
+  }
   const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
   for (int k = first + threadIdx.x / 32; k < count; k += int(gridDim.x) * kWarps) {
     const int32_t id = params.long_splats[k];
@@ -343,15 +421,13 @@ inline constexpr int kRangeTiles = 16, kRangeLanes = 8;
 
 /// Each tile finds its first pair. Tells the host how many pairs there are.
 __global__ void __launch_bounds__(kRangeTiles* kRangeLanes)
-    tile_offsets_kernel(const uint32_t* tiles, const Counts* counts, int64_t capacity, int64_t tile_count,
-                        int64_t* tile_offsets, PairFeedback feedback) {
+    tile_offsets_kernel(const uint32_t* tiles, const Counts* counts, int64_t tile_count, int64_t* tile_offsets,
+                        PairFeedback feedback) {
   wait_for_earlier_kernels();
-  const int64_t pairs = counts->pairs;
   if (blockIdx.x == 0 && threadIdx.x == 0 && feedback.word)
-    *feedback.word = uint64_t(feedback.frame) << 32 | min(uint64_t(pairs), uint64_t(0xffffffff));
-  if (pairs > capacity) return;
+    *feedback.word = uint64_t(feedback.frame) << 32 | min(uint64_t(counts->pairs), uint64_t(0xffffffff));
   const int64_t tile = int64_t(blockIdx.x) * kRangeTiles + threadIdx.x / kRangeLanes;
-  const int first = partition_point<kRangeLanes>(int(pairs), [&](int k) { return tiles[k] < tile; });
+  const int first = partition_point<kRangeLanes>(int(counts->listed), [&](int k) { return tiles[k] < tile; });
   if (tile <= tile_count && threadIdx.x % kRangeLanes == 0) tile_offsets[tile] = first;
 }
 

@@ -149,7 +149,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, kShapeGro
         if (with_means) shared.mean_maps[t] = F::mean_map(splat.shape);
 #pragma unroll
         for (int i = 0; i < kShapeGroups; ++i) shared.channels[i].ids[t] = id;
-        shared.rows[t] = list.overflow ? id : list.slot(k);
+        shared.rows[t] = list.slot(k);
       }
       shared.reach[t] = uint8_t(reach);
     }

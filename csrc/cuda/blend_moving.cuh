@@ -77,16 +77,17 @@ struct CellLayout {
 };
 
 /// Where the checkpoints of a tile's samples are: the one in front of pair i spacing, i > 0, is number first + i - 1.
-/// With too many pairs the tiles share equally what room there is.
+/// The tiles of a cell share the room of its list equally.
 struct StatePlaces {
   int64_t first;
   int spacing;  ///< a multiple of kStateChunk
 
   __device__ StatePlaces(const TileLists& lists, const TileList& list, TileGrid grid, int tile)
-      : first(list.overflow ? 0 : lists.tile_offsets[tile] / kStateChunk), spacing(kStateChunk) {
+      : first(lists.tile_offsets[tile] / kStateChunk), spacing(kStateChunk) {
     if (!list.overflow) return;
-    const int64_t room = lists.capacity / kStateChunk / grid.tiles();
-    first = tile * room;
+    const TileInCell of_cell(lists, grid, tile);
+    const int64_t room = int64_t(list.count / kStateChunk) >> 2 * of_cell.bits;
+    first = lists.tile_offsets[of_cell.first_tile] / kStateChunk + of_cell.index * room;
     spacing = int(((list.count - 1) / (room + 1) / kStateChunk + 1) * kStateChunk);
   }
   /// The number of the checkpoint in front of chunk k / kStateChunk, where every chunk but the first has one.

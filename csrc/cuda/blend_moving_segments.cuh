@@ -13,14 +13,25 @@
 
 namespace ar::cuda {
 
+/// Whether what the groups of a tile have for each pair of a batch is added up in shared memory. Where they are many
+/// that would leave room for too few blocks, and it is in BlendVjpParams::group_sums.
+template <class Layout> inline constexpr bool kSumsInside = Layout::kGroups <= 2;
 /// Pairs of a segment that a block takes between barriers.
-inline constexpr int kSegmentBatch = 128;
+template <class Layout> inline constexpr int kSegmentBatch = kSumsInside<Layout> ? 64 : 128;
+
+/// So many `Sums`, or none.
+template <class Sums, int kCount> struct SumsOfGroups {
+  Sums of_group[kCount];
+};
+template <class Sums> struct SumsOfGroups<Sums, 0> {};
+
 /// What a block keeps in shared memory. Sums of a pair: PairGrad, C channels, MeanSums.
 template <class F, int C, class Layout, int kSegment> struct SegmentVjpShared {
   static constexpr int kMeans = 6 + C, kSums = kMeans + 2;
-  static constexpr int kBatch = std::min(kSegment, kSegmentBatch), kChunks = kBatch / kStateChunk;
-  /// What a group leaves in BlendVjpParams::group_sums for each pair of a batch.
+  static constexpr int kBatch = std::min(kSegment, kSegmentBatch<Layout>), kChunks = kBatch / kStateChunk;
+  /// What a group leaves for each pair of a batch.
   using SumsOfGroup = float[kBatch][kSums];
+  SumsOfGroups<SumsOfGroup, kSumsInside<Layout> ? Layout::kGroups : 0> inside;
   MovingStage<F, C, Layout, kBatch> stage;
   uint32_t hits[Layout::kGroups][kChunks];  ///< splats that have sums of a group
   int32_t rows[kBatch];
@@ -36,10 +47,18 @@ template <class F, int C, class Layout, int kSegment> struct SegmentVjpShared {
       const int32_t id = k0 + t < k1 ? list.splat(k0 + t) : -1;
       stage.load_one(t, splats, params.channels, first, list, id);
       if (id < 0) continue;
-      rows[t] = list.overflow ? id : list.slot(k0 + t);
+      rows[t] = list.slot(k0 + t);
       if (with_means) mean_maps[t] = F::mean_map(splats[id].shape);
     }
     if (threadIdx.x == 0) next_group = 0;
+  }
+  /// Where the groups leave their sums. `outside`: BlendVjpParams::group_sums.
+  __device__ SumsOfGroup* sums_of_groups(float* outside) {
+    if constexpr (kSumsInside<Layout>) {
+      return inside.of_group;
+    } else {
+      return reinterpret_cast<SumsOfGroup*>(outside) + int64_t(blockIdx.x) * Layout::kGroups;
+    }
   }
   /// Takes a group for the warp; false if there is none left. All lanes must call it.
   __device__ bool take_group() {
@@ -67,11 +86,11 @@ __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared
                           SegmentVjpShared<F, C, Layout, kSegment>& shared,
                           typename SegmentVjpShared<F, C, Layout, kSegment>::SumsOfGroup& group_sums,
                           const TileList& list, const StatePlaces& places, const ListSegment& segment, int k0, int k1,
-                          bool with_means, bool with_shape) {
+                          bool with_means) {
   using Shared = SegmentVjpShared<F, C, Layout, kSegment>;
   using Samples = MovingSamples<F, Layout, true>;
   constexpr int kCells = Layout::kCells;
-  const int lane = lane_id(), group = Layout::group(), begin = segment.index * kSegment, end = begin + kSegment;
+  const int group = Layout::group(), begin = segment.index * kSegment, end = begin + kSegment;
   const Vec2<float> p = Layout::pixel();
   const Pixel pixel(list, params.grid, p);
   const CellCorners<F, Layout> corners(p);
@@ -92,7 +111,6 @@ __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared
     if (last[i] <= k1) continue;
     adjoint[i] = k1 == end ? map_of(i).adjoint(segment.number + 1) : map_of(i).adjoint(segment.number, kCarried);
   }
-  const int own_sum = sum_of_lane<C>();
   PlacesInFront<Layout> in_front(sizeof(Shared), in_shared);
   for (int from = (Shared::kChunks - 1) * kStateChunk; from >= 0; from -= kStateChunk) {
     uint32_t shown = 0;
@@ -100,24 +118,9 @@ __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared
       samples.load(params.checkpoints + places.of_chunk_at(k0 + from) * Samples::kCheckpoint, k0 + from, last);
       shown = replay_chunk<F, Layout>(shared.stage, from, k0, corners, last, samples, &in_front);
     }
-    const auto& listed = shared.stage.lists.of_warps[threadIdx.x / 32];
-    for (uint32_t mask = shown; mask != 0;) {
-      const int n = 31 - __clz(mask), j = int(listed[n]);
-      mask ^= 1u << n;
-      TileSplatRef<F, C> splat = shared.stage.splats[j];
-      float* const sums = group_sums[j];
-      const float g_color = grad.times(splat.channels, params, pixel, [&] { return list.splat(k0 + j); });
-      Vec2<float> places_in_front[kCells];
-      in_front.get(n, places_in_front);
-      const auto [contribution, of_splat] =
-          walk_back<F, C, Layout>(splat, k0, j, g_color, corners, last, places_in_front, samples, adjoint);
-      if (with_means && with_shape)
-        put_warp_means<Layout>(params, shared.mean_maps[j], of_splat.sums.offset, sums + Shared::kMeans);
-      const PairGrad<float> of_pair = {F::collect(splat.terms, of_splat.sums, of_splat.weighted), of_splat.weighted};
-      put_warp_sums(of_pair, times(contribution, grad.channels), sums + own_sum);
-    }
-    const uint32_t hits = warp_or(shown >> lane & 1 ? 1u << (listed[lane] - from) : 0u);
-    if (lane == 0) shared.hits[group][from / kStateChunk] = hits;
+    const uint32_t hits = chunk_vjp<F, C, Layout>(params, shared, group_sums, list, k0, from, shown, pixel, corners,
+                                                  last, grad, in_front, with_means, samples, adjoint);
+    if (lane_id() == 0) shared.hits[group][from / kStateChunk] = hits;
   }
   if (k0 == begin) return;
 #pragma unroll
@@ -133,8 +136,7 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layou
   using Shared = SegmentVjpShared<F, C, Layout, kSegment>;
   static_assert(kSegment % Shared::kBatch == 0);
   Shared& shared = *reinterpret_cast<Shared*>(dynamic_shared());
-  auto* const sums =
-      reinterpret_cast<typename Shared::SumsOfGroup*>(params.group_sums) + int64_t(blockIdx.x) * Layout::kGroups;
+  auto* const sums = shared.sums_of_groups(params.group_sums);
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const bool with_means = params.mean_sums != MeanSums::kNone;
   const bool all_at_once = C > kFewChannels && with_means && params.channels.count > C;
@@ -173,7 +175,7 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layou
       __syncthreads();
       while (shared.take_group())
         group_vjp<F, C, Layout, kSegment>(params, first, in_shared, shared, sums[Layout::group()], list, places,
-                                          segment, k0, k1, with_means, with_shape);
+                                          segment, k0, k1, with_means && with_shape);
       __syncthreads();
       write_pairs<C, Layout::kThreads>(params, first, with_means, with_shape, list, shared.rows, k1 - k0,
                                        [&](int j, int v) { return shared.total(sums, j, v); });
@@ -188,8 +190,9 @@ void launch_segment_vjp_kernel(const BlendVjpParams& p, int segments, int first,
   using Shared = SegmentVjpShared<F, C, Layout, kSegment>;
   constexpr int kBlocks = kMovingVjpBlocks<F, C, Layout, kSegment>;
   const int in_shared = PlacesInFront<Layout>::in_shared_of_blocks(kBlocks, sizeof(Shared));
-  const int64_t with_sums = p.max_group_sums / int64_t(Layout::kGroups * sizeof(typename Shared::SumsOfGroup) / 4);
-  const int64_t blocks = std::min<int64_t>({segments, multiprocessors() * kBlocks, with_sums});
+  int64_t blocks = std::min<int64_t>(segments, multiprocessors() * kBlocks);
+  if (!kSumsInside<Layout>)
+    blocks = std::min(blocks, p.max_group_sums / int64_t(Layout::kGroups * sizeof(typename Shared::SumsOfGroup) / 4));
   const LaunchShape shape = {unsigned(blocks), Layout::kThreads,
                              sizeof(Shared) + in_shared * PlacesInFront<Layout>::kBytes};
   launch(segment_vjp_kernel<F, C, Layout, kSegment>, shape, stream, p, first, in_shared);

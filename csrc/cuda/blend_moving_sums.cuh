@@ -1,5 +1,5 @@
 // The sums of pairs in blend_vjp for footprints whose samples move: each warp of a block leaves those of its pixels,
-// in shared memory or, of segments, in BlendVjpParams::group_sums; they are added up and written.
+// in shared memory or, of some segments, in BlendVjpParams::group_sums; they are added up and written.
 #pragma once
 
 #include <algorithm>
@@ -70,7 +70,7 @@ template <class F, int C, class Layout> struct MovingVjpShared {
     stage.load(splats, params.channels, first, list, id);
     if (id >= 0) {
       const int t = threadIdx.x;
-      rows[t] = list.overflow ? id : list.slot(k0 + t);
+      rows[t] = list.slot(k0 + t);
       if (with_means) mean_maps[t] = F::mean_map(splats[id].shape);
     }
   }

@@ -149,6 +149,33 @@ __device__ MovingBlendGrad<float> walk_back(TileSplatRef<F, C>& splat, int k0, i
   return sums;
 }
 
+/// Takes a warp's samples from behind the chunk of 32 pairs that begins at the staged one `from` to its front, and
+/// leaves in `sums` those of its splats that replay_chunk() has `shown`. `k0`: the pair that is staged first. Returns
+/// which pairs of the chunk have sums. All lanes must call it.
+template <class F, int C, class Layout, class Shared, class Samples>
+__device__ uint32_t chunk_vjp(const BlendVjpParams& params, Shared& shared, float (*sums)[Shared::kSums],
+                              const TileList& list, int k0, int from, uint32_t shown, const Pixel& pixel,
+                              const CellCorners<F, Layout>& corners, const int (&last)[Layout::kCells],
+                              const SampleGrad<F, C>& grad, const PlacesInFront<Layout>& in_front, bool with_means,
+                              Samples& samples, Adjoint (&adjoint)[Layout::kCells]) {
+  const auto& listed = shared.stage.lists.of_warps[threadIdx.x / 32];
+  const int own_sum = sum_of_lane<C>();
+  for (uint32_t mask = shown; mask != 0;) {
+    const int n = 31 - __clz(mask), j = int(listed[n]);
+    mask ^= 1u << n;
+    TileSplatRef<F, C> splat = shared.stage.splats[j];
+    const float g_color = grad.times(splat.channels, params, pixel, [&] { return list.splat(k0 + j); });
+    Vec2<float> places_in_front[Layout::kCells];
+    in_front.get(n, places_in_front);
+    const auto [contribution, of_splat] =
+        walk_back<F, C, Layout>(splat, k0, j, g_color, corners, last, places_in_front, samples, adjoint);
+    if (with_means) put_warp_means<Layout>(params, shared.mean_maps[j], of_splat.sums.offset, sums[j] + Shared::kMeans);
+    const PairGrad<float> of_pair = {F::collect(splat.terms, of_splat.sums, of_splat.weighted), of_splat.weighted};
+    put_warp_sums(of_pair, times(contribution, grad.channels), sums[j] + own_sum);
+  }
+  return warp_or(shown >> lane_id() & 1 ? 1u << (listed[lane_id()] - from) : 0u);
+}
+
 /// A block per tile whose list is not cut. `in_shared`: of PlacesInFront, whose memory is that behind Shared.
 template <class F, int C, class Layout>
 __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layout, 0>)
@@ -186,7 +213,6 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layou
 #pragma unroll
   for (int i = 0; i < kCells; ++i) adjoint[i] = {grad.through, {0, 0}};
 
-  const int own_sum = sum_of_lane<C>();
   PlacesInFront<Layout> in_front(sizeof(Shared), in_shared);
   const auto replay = [&](int from, int k0, auto keep_in) {  // pair k0 is staged first
     return replay_chunk<F, Layout>(shared.stage, from, k0, corners, last, samples, keep_in);
@@ -227,23 +253,9 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layou
         }
         shown = replay(from, k0, &in_front);
       }
-      const auto& listed = shared.stage.lists.of_warps[warp];
-      for (uint32_t mask = shown; mask != 0;) {
-        const int n = 31 - __clz(mask), j = int(listed[n]);
-        mask ^= 1u << n;
-        TileSplatRef<F, C> splat = shared.stage.splats[j];
-        float* const sums = shared.sums[warp][j];
-        const float g_color = grad.times(splat.channels, params, pixel, [&] { return list.splat(k0 + j); });
-        Vec2<float> places_in_front[kCells];
-        in_front.get(n, places_in_front);
-        const auto [contribution, of_splat] =
-            walk_back<F, C, Layout>(splat, k0, j, g_color, corners, last, places_in_front, samples, adjoint);
-        if (with_means && with_shape)
-          put_warp_means<Layout>(params, shared.mean_maps[j], of_splat.sums.offset, sums + Shared::kMeans);
-        const PairGrad<float> of_pair = {F::collect(splat.terms, of_splat.sums, of_splat.weighted), of_splat.weighted};
-        put_warp_sums(of_pair, times(contribution, grad.channels), sums + own_sum);
-      }
-      const uint32_t hits = warp_or(shown >> lane & 1 ? 1u << (listed[lane] - from) : 0u);
+      const uint32_t hits =
+          chunk_vjp<F, C, Layout>(params, shared, shared.sums[warp], list, k0, from, shown, pixel, corners, last, grad,
+                                  in_front, with_means && with_shape, samples, adjoint);
       if (lane == 0) shared.hits[warp][from / kStateChunk] = hits;
     }
     __syncthreads();

@@ -9,8 +9,8 @@
 namespace ar::cuda {
 namespace {
 
-/// No chunk has been begun. With too many pairs there is a row per splat that all tiles add to, and which must be zero;
-/// the sums of shapes stay from group to group. The group begins with channel `first` and has `width` of them.
+/// No chunk has been begun. With more pairs than room there is a row per splat that all tiles add to, and which must be
+/// zero; the sums of shapes stay from group to group. The group begins with channel `first` and has `width` of them.
 __global__ void clear_sums_kernel(const BlendVjpParams params, int first, int width) {
   wait_for_earlier_kernels();
   if (blockIdx.x == 0 && threadIdx.x < kSampleClasses) params.chunks_taken[threadIdx.x] = 0;
@@ -56,13 +56,23 @@ int64_t max_adjoint_maps(int samples, const ListCut& cut, TileGrid grid) {
   return int64_t(cut.max_segments) * SegmentMap::kNumbers * samples * grid.side() * grid.side();
 }
 
-int64_t max_group_sums(const ListCut& cut) {
+int64_t max_group_sums(int footprint, const ListCut& cut, TileGrid grid) {
   if (cut.max_segments == 0) return 0;  // and the device need not be asked
+  int pairs = 0;                        // of a batch whose sums are there
+  visit_footprint(footprint, Footprints{}, [&](auto f) {
+    using F = decltype(f);
+    if constexpr (F::kMoves) {
+      with_moving_side<F>(grid, [&](auto px) {
+        using Layout = TakenLayout<F, decltype(px)::value>;
+        if (!kSumsInside<Layout>) pairs = kSegmentBatch<Layout>;
+      });
+    }
+  });
   // Of three channels; of more, a multiprocessor has half as many warps. A block has up to 16 groups, of eight
   // channels.
   constexpr int kGroups = 32 * kMostGroupsOfWarp, kSums = 6 + 3 + 2, kOfBlock = 16, kMostSums = 6 + kMovingChannels + 2;
-  return kSegmentBatch * std::min<int64_t>(int64_t(multiprocessors()) * kGroups * kSums,
-                                           int64_t(cut.max_segments) * kOfBlock * kMostSums);
+  return pairs * std::min<int64_t>(int64_t(multiprocessors()) * kGroups * kSums,
+                                   int64_t(cut.max_segments) * kOfBlock * kMostSums);
 }
 
 int channel_group(int footprint, int left) {

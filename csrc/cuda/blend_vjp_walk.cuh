@@ -33,7 +33,7 @@ template <class F, int C, Sums kSums> class ChunkWalk {
       int32_t id = 0, row = 0;
       if (k < k1) {
         id = list_.splat(k);
-        row = list_.overflow ? id : list_.slot(k);
+        row = list_.slot(k);
         own = splats_[id];
         reach = subtile_reach<F>(own, list_.x0, list_.y0);
 #pragma unroll

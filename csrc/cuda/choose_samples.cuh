@@ -19,7 +19,7 @@ __device__ inline Passed shuffle_up(Passed p, int offset) {
   return {shuffle_up(p.product, offset), shuffle_up(p.sum, offset)};
 }
 
-/// The emit kernel's test, for lists that hold all splats.
+/// The emit kernel's test, for lists of cells of tiles.
 template <class F> __device__ bool reaches_tile(const Splat<F, float>& splat, const TileList& list) {
   const Span<float> span = columns_of(support_of(splat), float(list.y0), float(list.y0 + kTile - 1));
   return span.lo <= float(list.x0 + kTile - 1) && span.hi >= float(list.x0);

@@ -29,10 +29,23 @@ struct TileList {
   int x0, y0;
   const int32_t* pairs;
   int stride, count;
-  bool overflow;  ///< the list is all splats
+  bool overflow;  ///< the list is that of a cell: it has splats that do not reach this tile
 
   __device__ int32_t splat(int k) const { return pairs[int64_t(k) * stride]; }
   __device__ int32_t slot(int k) const { return pairs[int64_t(k) * stride + 1]; }
+};
+
+/// Where a tile is among those that share a list.
+struct TileInCell {
+  int first_tile;  ///< of the cell
+  int index;       ///< of the tile in its cell, of 4^bits
+  int bits;
+
+  __device__ TileInCell(const TileLists& lists, TileGrid grid, int tile) : bits(int(lists.counts->cell_bits)) {
+    const int columns = grid.columns(), row = tile / columns, column = tile % columns, inside = (1 << bits) - 1;
+    index = (row & inside) << bits | (column & inside);
+    first_tile = (row & ~inside) * columns + (column & ~inside);
+  }
 };
 
 __device__ inline TileList list_of(const TileLists& lists, TileGrid grid, int tile) {
@@ -40,10 +53,10 @@ __device__ inline TileList list_of(const TileLists& lists, TileGrid grid, int ti
   list.x0 = tile % grid.columns() << grid.tile_bits;
   list.y0 = tile / grid.columns() << grid.tile_bits;
   list.overflow = lists.counts->pairs > lists.capacity;
-  list.stride = list.overflow ? 1 : lists.stride;
-  const int64_t first = list.overflow ? 0 : lists.tile_offsets[tile];
-  list.pairs = list.overflow ? lists.order : lists.pairs + first * lists.stride;
-  list.count = int(list.overflow ? lists.counts->splats : lists.tile_offsets[tile + 1] - first);
+  list.stride = lists.stride;
+  const int64_t* offsets = lists.tile_offsets + (list.overflow ? TileInCell(lists, grid, tile).first_tile : tile);
+  list.pairs = lists.pairs + offsets[0] * lists.stride;
+  list.count = int(offsets[1] - offsets[0]);
   return list;
 }
 

@@ -11,7 +11,8 @@ namespace ar::cuda {
 /// Remembers the frames of one grid of tiles. A frame that turns out to have more pairs than there is room for is slow,
 /// not wrong, so the first frames are counted, and wait for the device; afterwards the largest frame so far, and a
 /// reserve, are room enough in all but the rarest cases. The number of Gaussians may change from frame to frame: with
-/// more of them than were ever seen the room grows in proportion, with fewer it stays.
+/// more of them than were ever seen the room grows in proportion, with fewer it stays. There is always room for a pair
+/// of each, which is what EmitParams needs.
 class PairGuess {
  public:
   /// Frames that are counted at the start.
@@ -25,7 +26,7 @@ class PairGuess {
     if (most_gaussians_ < 0 || (may_wait && to_count_ > 0)) return 0;
     double pairs = double(largest_);
     if (gaussians > most_gaussians_) pairs *= double(gaussians) / double(std::max<int64_t>(most_gaussians_, 1));
-    const double room = pairs * 1.25 + kReserve;
+    const double room = std::max(pairs * 1.25 + kReserve, double(gaussians));
     recent_[frame % kRecent] = {frame, gaussians, room < double(most) ? int64_t(room) : most};
     return recent_[frame % kRecent].room;
   }
@@ -82,7 +83,7 @@ class PairGuesses {
     uint64_t* word;    ///< where the device is to write the frame's number << 32 | pairs
   };
 
-  /// `most`: pairs that the frame can have.
+  /// `most`: pairs that the frame can have, at least as many as Gaussians.
   Frame begin(int device, TileGrid grid, int64_t gaussians, int64_t most, bool may_wait) {
     const int slot = slot_of(device, grid);
     Slot& s = slots_[slot];
@@ -92,7 +93,7 @@ class PairGuesses {
     const uint32_t written = uint32_t(word >> 32);
     // Numbers go round; a slot's are those since it was given away.
     if (written != 0 && int32_t(written - s.first_frame) >= 0) s.guess.reported(written, int64_t(word & 0xffffffff));
-    Frame frame = {slot, frame_, forced_, words_ + slot};
+    Frame frame = {slot, frame_, std::max(forced_, gaussians), words_ + slot};
     if (forced_ == 0) frame.capacity = s.guess.capacity(frame_, gaussians, most, may_wait);
     return frame;
   }
@@ -103,7 +104,7 @@ class PairGuesses {
     if (int32_t(frame.number - s.first_frame) >= 0) s.guess.counted(gaussians, pairs);
   }
 
-  /// Makes this room from now on, whatever was seen; 0: begins anew.
+  /// Makes this room from now on, or that for a pair of each Gaussian, whatever was seen; 0: begins anew.
   void force(int64_t capacity) {
     forced_ = capacity;
     for (Slot& s : slots_) s = Slot{};

@@ -26,7 +26,7 @@ __device__ void write_tiles(const Params& params, int64_t i, const SplatTiles& t
 template <class Params> __device__ void clear_counts(const Params& params) {
   if (blockIdx.x > 0) return;
   for (int k = threadIdx.x; k < kDepthHistogramWords; k += kProjectThreads) params.depth_histograms[k] = 0;
-  if (threadIdx.x == 0) *params.counts = {0, 0};
+  if (threadIdx.x == 0) *params.counts = {};
 }
 
 /// Of the lanes in `lanes`, those whose row has a number that is not finite or too large. A warp reads a row together.

@@ -3,8 +3,9 @@
 // waits for the device.
 //
 // Sizes that depend on the data stay on the device. The caller guesses how many pairs there will be and gives room for
-// `capacity` of them. If there are more, no pair is written, and blending goes through all splats in depth order for
-// every tile: slow, but with the same result and without waiting for the host.
+// `capacity` of them, at least one per splat. If there are more, tiles do not get lists of their own: a square of them,
+// a cell, shares one, whose splats blending tests against each tile. The cells are as small as room allows. That is
+// slower, but gives the same result without waiting for the host.
 #pragma once
 
 #include <cuda_runtime_api.h>
@@ -65,6 +66,10 @@ AR_HD constexpr int state_planes(int samples) { return 3 * samples; }
 struct alignas(8) Counts {
   int64_t pairs;
   int64_t splats;  ///< with pairs
+  /// Pairs that are written: all, or those of splats and cells if there is no room for these.
+  int64_t listed;
+  /// A cell has so many tiles, as a power of two, side by side and one below the other, from tile 0 on.
+  int64_t cell_bits;
 };
 
 struct ProjectParams : ar::ProjectParams<float> {
@@ -102,8 +107,8 @@ struct EmitParams {
   int64_t n;
   int footprint;  ///< place in the registry
   TileGrid grid;
-  int64_t capacity;
-  const Counts* counts;
+  int64_t capacity;               ///< >= counts->splats
+  Counts* counts;                 ///< `listed` and `cell_bits` are set
   const int32_t* order;           ///< [counts->splats] splats by depth
   const SplatTiles* splat_tiles;  ///< [n]
   const PairRange* ranges;        ///< [n], read with slot_pairs alone
@@ -111,7 +116,7 @@ struct EmitParams {
   int32_t* long_places;           ///< [n] and where their pairs begin
   uint32_t* status;               ///< emit_scratch(n) bytes, zero
   uint32_t* tile_counts;  ///< tile_sort_scratch(capacity, grid) bytes, zero; sort_by_tile finds its counts there
-  uint32_t* tiles;        ///< [capacity] tile of each pair
+  uint32_t* tiles;        ///< [capacity] tile of each pair, or the first one of its cell
   int32_t* splat_pairs;   ///< [capacity] splat of each pair, or null:
   SlotPair* slot_pairs;   ///< [capacity] the same with its slot, for a backward pass
 };
@@ -120,8 +125,7 @@ struct EmitParams {
 struct TileLists {
   const int32_t* pairs;         ///< [capacity, stride] splats by tile, then depth, and their slots
   int stride;                   ///< 1, or 2 with slots
-  const int64_t* tile_offsets;  ///< [tiles + 1]
-  const int32_t* order;         ///< [counts->splats] all splats with pairs by depth
+  const int64_t* tile_offsets;  ///< [tiles + 1]; the list of a cell is that of its first tile
   const Counts* counts;
   int64_t n, capacity;
   const int32_t* tile_samples;  ///< [tiles] samples in use, or null: all
@@ -270,7 +274,7 @@ int64_t max_state_planes(int footprint, int64_t capacity);
 /// are cut.
 int64_t max_reach_words(const ListCut& cut, TileGrid grid);
 int64_t max_adjoint_maps(int samples, const ListCut& cut, TileGrid grid);
-int64_t max_group_sums(const ListCut& cut);
+int64_t max_group_sums(int footprint, const ListCut& cut, TileGrid grid);
 /// Segments of each tile's list that many channels are blended in.
 int list_segments(int footprint, int64_t channels, TileGrid grid);
 /// Channels that a group-less blending is compiled for: 3 in the splats themselves, or 4 in rows.

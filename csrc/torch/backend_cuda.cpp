@@ -20,6 +20,10 @@
 namespace ar::ops {
 namespace {
 
+/// From so many Gaussians on, frames of samples that move are always counted for a backward pass: their checkpoints
+/// take hundreds of bytes per pair that there is room for, and to wait for the count takes little of such a frame.
+constexpr int64_t kCountedGaussians = 1 << 23;
+
 class CudaBackend final : public Backend {
  public:
   explicit CudaBackend(const Tensor& like)
@@ -85,7 +89,8 @@ class CudaBackend final : public Backend {
     const auto frame = guesses.use([&](cuda::PairGuesses& g) {
       return g.begin(floats_.device().index(), grid, n, std::min(most, cuda::max_items()), !capturing);
     });
-    int64_t capacity = pass.exact ? 0 : frame.capacity;
+    const bool many = footprint.moves && pass.keep && n >= kCountedGaussians && !capturing;
+    int64_t capacity = pass.exact || many ? 0 : frame.capacity;
     TORCH_CHECK(capacity > 0 || !capturing,
                 "a frame of this size must have been rendered before it is captured in a CUDA graph, without "
                 "torch.use_deterministic_algorithms");
@@ -156,6 +161,10 @@ class CudaBackend final : public Backend {
       check_stage("choose_samples", pass.debug);
     }
     return out;
+  }
+
+  bool tiles_share_lists(const ListTensors& lists) override {
+    return lists.counts[0].item<int64_t>() > lists.pairs.size(0);
   }
 
   void blend(const ListTensors& lists, const Pass& pass, const ChannelTensors& channels, const ImageTensors& image,
@@ -261,7 +270,7 @@ class CudaBackend final : public Backend {
     if (numbers > 0) maps = at::empty({numbers}, floats_);
     p.adjoint_maps = pointer<float>(maps);
     Tensor group_sums;
-    p.max_group_sums = cuda::max_group_sums(cut);
+    p.max_group_sums = cuda::max_group_sums(pass.footprint.choice.index, cut, pass.grid);
     if (p.max_group_sums > 0) group_sums = at::empty({p.max_group_sums}, floats_);
     p.group_sums = pointer<float>(group_sums);
 
@@ -446,7 +455,7 @@ class CudaBackend final : public Backend {
 
 std::unique_ptr<Backend> make_cuda_backend(const Tensor& like) { return std::make_unique<CudaBackend>(like); }
 
-/// For tests: room for so many pairs in every frame; 0: guesses again, from the start.
+/// For tests: room for so many pairs in every frame, and for one of each Gaussian; 0: guesses again, from the start.
 void force_pair_capacity(int64_t capacity) {
   SharedGuesses::instance().use([&](cuda::PairGuesses& g) { g.force(capacity); });
 }

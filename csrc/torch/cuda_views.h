@@ -121,7 +121,6 @@ inline cuda::TileLists tile_lists_of(const ListTensors& lists) {
   out.pairs = const_pointer<int32_t>(lists.pairs);
   out.stride = int(lists.pairs.size(1));
   out.tile_offsets = const_pointer<int64_t>(lists.tile_offsets);
-  out.order = const_pointer<int32_t>(lists.ids);
   out.counts = counts_of(lists);
   out.n = lists.ids.numel();
   out.capacity = lists.pairs.size(0);

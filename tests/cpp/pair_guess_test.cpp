@@ -138,11 +138,20 @@ TEST(PairGuessTest, AWriteThatComesLateIsNotOfTheSlotsNewSize) {
   EXPECT_LE(renderer.guesses.begin(0, {next, 480}, 10, kMost, false).capacity, 200000);
 }
 
+TEST(PairGuessTest, HasRoomForAPairOfEveryGaussian) {
+  Renderer renderer;
+  renderer.count_frames(5000000, 1000);  // nearly all of them out of sight
+  EXPECT_GE(renderer.frame(5000000, 1000), 5000000);
+  EXPECT_GE(renderer.frame(5000000, 1000, false), 5000000);
+  renderer.guesses.force(64);
+  EXPECT_EQ(renderer.frame(1000, 10), 1000);
+}
+
 TEST(PairGuessTest, ForcedRoomIsForgottenWithAllElse) {
   Renderer renderer;
   renderer.count_frames(1000, 1000000);
-  renderer.guesses.force(64);
-  EXPECT_EQ(renderer.frame(1000, 1000000), 64);
+  renderer.guesses.force(2000);
+  EXPECT_EQ(renderer.frame(1000, 1000000), 2000);
   renderer.guesses.force(0);
   EXPECT_EQ(renderer.frame(1000, 1000000), 0);
 }

@@ -9,6 +9,7 @@
 #include <gtest/gtest.h>
 
 #include "cuda/bin.cuh"
+#include "cuda/composite.cuh"
 #include "cuda/splat_tiles.cuh"
 
 namespace ar::cuda {
@@ -247,65 +248,63 @@ std::vector<SplatRow<float>> random_splats(int n, TileGrid grid) {
   return splats;
 }
 
-TEST(BinKernels, PairsOfSplats) {
-  constexpr TileGrid grid = {170, 700};
-  constexpr int n = kEmitSplats + kEmitThreads + 30;
-  const int footprint = find_footprint("mip");
-  const std::vector<SplatRow<float>> splats = random_splats(n, grid);
-  std::vector<int32_t> order(n);
-  std::iota(order.begin(), order.end(), 0);
-  std::shuffle(order.begin(), order.end(), std::mt19937(7));
-  std::vector<uint32_t> expected_tiles;
-  std::vector<SlotPair> expected_pairs;
-  std::vector<PairRange> ranges(n);
-  int32_t slots = 0;  // in another order than the pairs
-  for (int i = 0; i < n; ++i) {
-    ranges[i] = {slots, 0};
-    for_each_tile(support_of(splats[i], footprint), grid, [&](int64_t) { ++ranges[i].count; });
-    slots += ranges[i].count;
-  }
-  std::vector<SplatTiles> splat_tiles(n);
-  int few = 0, many = 0, too_long = 0, later_rows = 0;
-  for (const int32_t i : order) {
-    int32_t slot = ranges[i].first;
-    for_each_tile(support_of(splats[i], footprint), grid, [&](int64_t tile) {
-      expected_tiles.push_back(uint32_t(tile));
-      expected_pairs.push_back({i, slot++});
-    });
-    const SplatTiles& tiles = splat_tiles[i] = splat_tiles_of(support_of(splats[i], footprint), grid);
-    ASSERT_EQ(tiles.count, ranges[i].count);
-    many += tiles.count > kManyTiles && tiles.mask != 0;
-    too_long += tiles.count > 0 && tiles.mask == 0;
-    few += few_tiles(tiles) != 0;
-    for (int row = 0; row < 8; ++row) later_rows += row > 3 && (tiles.mask >> 8 * row & 0xff) != 0;
-  }
-  ASSERT_GT(few, n / 4);
-  ASSERT_GT(many, n / 30);
-  ASSERT_GT(too_long, n / 10);
-  ASSERT_GT(later_rows, n / 50);
+/// Whether all of `some` are among `all`, in the same order.
+bool is_subsequence(const std::vector<int>& some, const std::vector<int>& all) {
+  size_t found = 0;
+  for (const int x : all) found += found < some.size() && some[found] == x;
+  return found == some.size();
+}
 
-  const auto pairs = int64_t(expected_tiles.size());
-  const Counts counts = {pairs, n};
-  for (const bool with_slots : {false, true}) {
-    std::vector<uint32_t> status(emit_scratch(n) / sizeof(uint32_t)), tiles(pairs);
-    std::vector<int32_t> splat_pairs(pairs);
-    std::vector<SlotPair> slot_pairs(pairs);
-    const TileDigits digits(grid);
-    std::vector<uint32_t> counts_of_digits(digits.passes * digits.bins()), expected_counts(counts_of_digits.size());
-    for (const uint32_t tile : expected_tiles) {
-      for (int d = 0; d < digits.passes; ++d) ++expected_counts[d * digits.bins() + digits.of(tile, d)];
+/// Splats and what bin makes of them before it writes pairs.
+struct ToEmit {
+  static constexpr TileGrid kGrid = {170, 700};
+  static constexpr int n = kEmitSplats + kEmitThreads + 30;
+
+  const int footprint = find_footprint("mip");
+  const std::vector<SplatRow<float>> splats = random_splats(n, kGrid);
+  const TileDigits digits = TileDigits(kGrid);
+  std::vector<int32_t> order = std::vector<int32_t>(n);
+  std::vector<PairRange> ranges = std::vector<PairRange>(n);
+  std::vector<SplatTiles> splat_tiles = std::vector<SplatTiles>(n);
+  int32_t pairs = 0;
+
+  ToEmit() {
+    std::iota(order.begin(), order.end(), 0);
+    std::shuffle(order.begin(), order.end(), std::mt19937(7));
+    for (int i = 0; i < n; ++i) {  // slots are in another order than the pairs
+      splat_tiles[i] = splat_tiles_of(support(i), kGrid);
+      ranges[i] = {pairs, splat_tiles[i].count};
+      pairs += ranges[i].count;
     }
+  }
+  Support<float> support(int i) const { return support_of(splats[i], footprint); }
+};
+
+/// Pairs as the kernels write them, with room for `capacity`.
+struct Emitted {
+  std::vector<uint32_t> tiles, counts_of_digits;
+  std::vector<SlotPair> slot_pairs;
+  std::vector<int32_t> splat_pairs;
+  Counts counts;
+
+  Emitted(const ToEmit& from, bool with_slots, int64_t capacity)
+      : tiles(capacity),
+        counts_of_digits(from.digits.passes * from.digits.bins()),
+        slot_pairs(with_slots ? capacity : 0),
+        splat_pairs(with_slots ? 0 : capacity),
+        counts{from.pairs, from.n} {
+    std::vector<uint32_t> status(emit_scratch(from.n) / sizeof(uint32_t));
+    std::vector<int32_t> long_splats(from.n), long_places(from.n);
     EmitParams emit = {};
-    emit.splats = &splats[0].mean.x;
-    emit.n = n;
-    emit.footprint = footprint;
-    emit.grid = grid;
-    emit.capacity = pairs;
+    emit.splats = &from.splats[0].mean.x;
+    emit.n = from.n;
+    emit.footprint = from.footprint;
+    emit.grid = from.kGrid;
+    emit.capacity = capacity;
     emit.counts = &counts;
-    emit.order = order.data();
-    emit.ranges = with_slots ? ranges.data() : nullptr;
-    emit.splat_tiles = splat_tiles.data();
-    std::vector<int32_t> long_splats(n), long_places(n);
+    emit.order = from.order.data();
+    emit.ranges = with_slots ? from.ranges.data() : nullptr;
+    emit.splat_tiles = from.splat_tiles.data();
     emit.long_splats = long_splats.data();
     emit.long_places = long_places.data();
     emit.status = status.data();
@@ -314,19 +313,89 @@ TEST(BinKernels, PairsOfSplats) {
     emit.splat_pairs = with_slots ? nullptr : splat_pairs.data();
     emit.slot_pairs = with_slots ? slot_pairs.data() : nullptr;
     // One block more than has splats, as where some are culled.
-    cuda_on_host::launch((n + kEmitSplats - 1) / kEmitSplats + 1, kEmitThreads,
-                         [&] { emit_pairs_kernel(emit, digits); });
-    cuda_on_host::launch(2, kEmitThreads, [&] { emit_long_pairs_kernel(emit, digits); });
-    EXPECT_EQ(tiles, expected_tiles);
+    cuda_on_host::launch((from.n + kEmitSplats - 1) / kEmitSplats + 1, kEmitThreads,
+                         [&] { emit_pairs_kernel(emit, from.digits); });
+    cuda_on_host::launch(2, kEmitThreads, [&] { emit_long_pairs_kernel(emit, from.digits); });
+    tiles.resize(counts.listed);
+    std::vector<uint32_t> expected_counts(counts_of_digits.size());
+    for (const uint32_t tile : tiles) {
+      for (int d = 0; d < from.digits.passes; ++d) ++expected_counts[d * from.digits.bins() + from.digits.of(tile, d)];
+    }
     EXPECT_EQ(counts_of_digits, expected_counts);
-    for (int64_t k = 0; k < pairs; ++k) {
+  }
+  int splat(int64_t k) const { return slot_pairs.empty() ? splat_pairs[k] : slot_pairs[k].splat; }
+};
+
+TEST(BinKernels, PairsOfSplats) {
+  const ToEmit from;
+  std::vector<uint32_t> expected_tiles;
+  std::vector<SlotPair> expected_pairs;
+  int few = 0, many = 0, too_long = 0, later_rows = 0;
+  for (const int32_t i : from.order) {
+    int32_t slot = from.ranges[i].first;
+    for_each_tile(from.support(i), from.kGrid, [&](int64_t tile) {
+      expected_tiles.push_back(uint32_t(tile));
+      expected_pairs.push_back({i, slot++});
+    });
+    const SplatTiles& tiles = from.splat_tiles[i];
+    ASSERT_EQ(slot - from.ranges[i].first, tiles.count);
+    many += tiles.count > kManyTiles && tiles.mask != 0;
+    too_long += tiles.count > 0 && tiles.mask == 0;
+    few += few_tiles(tiles) != 0;
+    for (int row = 0; row < 8; ++row) later_rows += row > 3 && (tiles.mask >> 8 * row & 0xff) != 0;
+  }
+  ASSERT_GT(few, from.n / 4);
+  ASSERT_GT(many, from.n / 30);
+  ASSERT_GT(too_long, from.n / 10);
+  ASSERT_GT(later_rows, from.n / 50);
+
+  for (const bool with_slots : {false, true}) {
+    const Emitted emitted(from, with_slots, from.pairs);
+    EXPECT_EQ(emitted.counts.listed, from.pairs);
+    EXPECT_EQ(emitted.tiles, expected_tiles);
+    for (int64_t k = 0; k < from.pairs; ++k) {
       if (with_slots) {
-        ASSERT_TRUE(slot_pairs[k] == expected_pairs[k]) << k;
+        ASSERT_TRUE(emitted.slot_pairs[k] == expected_pairs[k]) << k;
       } else {
-        ASSERT_EQ(splat_pairs[k], expected_pairs[k].splat) << k;
+        ASSERT_EQ(emitted.splat_pairs[k], expected_pairs[k].splat) << k;
       }
     }
   }
+}
+
+/// With less room cells get larger, down to one for all, and the list of each has every splat of its tiles by depth.
+TEST(BinKernels, PairsOfSplatsAndCellsWhereThereIsNoRoomForTiles) {
+  const ToEmit from;
+  int64_t last_bits = 0;
+  for (const int64_t capacity : {int64_t(from.pairs) - 1, int64_t(from.pairs) / 2, int64_t(from.n)}) {
+    for (const bool with_slots : {false, true}) {
+      const Emitted emitted(from, with_slots, capacity);
+      ASSERT_LE(emitted.counts.listed, capacity);
+      std::vector<std::vector<int>> lists(from.kGrid.tiles());
+      for (int64_t k = 0; k < emitted.counts.listed; ++k) {
+        lists[emitted.tiles[k]].push_back(emitted.splat(k));
+        if (with_slots) ASSERT_EQ(emitted.slot_pairs[k].slot, emitted.slot_pairs[k].splat);
+      }
+      TileLists view = {};
+      view.counts = &emitted.counts;
+      const int64_t bits = emitted.counts.cell_bits;
+      std::vector<std::vector<int>> of_tiles(lists.size());
+      for (const int32_t i : from.order) {
+        for_each_tile(from.support(i), from.kGrid, [&](int64_t tile) { of_tiles[tile].push_back(i); });
+      }
+      for (int tile = 0; tile < from.kGrid.tiles(); ++tile) {
+        const TileInCell of_cell(view, from.kGrid, tile);
+        ASSERT_TRUE(of_cell.index >= 0 && of_cell.index < 1 << 2 * bits) << tile;
+        if (of_cell.first_tile != tile) ASSERT_TRUE(lists[tile].empty()) << tile;
+        const std::vector<int>& list = lists[of_cell.first_tile];
+        ASSERT_TRUE(is_subsequence(of_tiles[tile], list)) << tile << " with cells of 4^" << bits << " tiles";
+      }
+      ASSERT_GT(bits, 0);
+      ASSERT_GE(bits, last_bits);
+      last_bits = bits;
+    }
+  }
+  ASSERT_EQ(last_bits, 6) << "one cell for 11 x 44 tiles";
 }
 
 TEST(BinKernels, FirstPairsOfTiles) {
@@ -339,13 +408,12 @@ TEST(BinKernels, FirstPairsOfTiles) {
       std::vector<int64_t> offsets(tile_count + 1, -1), expected;
       for (int tile = 0; tile <= tile_count; ++tile)
         expected.push_back(std::lower_bound(tiles.begin(), tiles.end(), uint32_t(tile)) - tiles.begin());
-      const Counts counts = {pairs, pairs};
+      const Counts counts = {pairs + 7, pairs, pairs};
       uint64_t word = 0;
-      cuda_on_host::launch(tile_count / kRangeTiles + 1, kRangeTiles * kRangeLanes, [&] {
-        tile_offsets_kernel(tiles.data(), &counts, pairs, tile_count, offsets.data(), {&word, 3});
-      });
+      cuda_on_host::launch(tile_count / kRangeTiles + 1, kRangeTiles * kRangeLanes,
+                           [&] { tile_offsets_kernel(tiles.data(), &counts, tile_count, offsets.data(), {&word, 3}); });
       EXPECT_EQ(offsets, expected) << tile_count << " tiles, " << pairs << " pairs";
-      EXPECT_EQ(word, uint64_t(3) << 32 | uint64_t(pairs));
+      EXPECT_EQ(word, uint64_t(3) << 32 | uint64_t(pairs + 7));
     }
   }
 }

@@ -34,14 +34,14 @@ template <int S> struct ProjectedFor<AdaptiveBoxVjp<S>> {
 };
 
 /// Random inputs of the kernel for C channels. The state that a forward pass would have left is random too. `overflow`:
-/// every tile lists all splats, as one chunk, and all tiles add to a row per splat.
+/// all tiles share one list, of one chunk, and add to a row per splat.
 template <class F, int C> struct Scene {
   static constexpr int S = F::kSamples, kLength = chunk_length(S);
 
   std::vector<Splat<F, float>> splats;
   std::vector<SlotPair> pairs;
   std::vector<int64_t> offsets = {0};
-  std::vector<int32_t> order, last;
+  std::vector<int32_t> last;
   std::vector<TileChunk> chunks;
   std::vector<float> background = {0.2f, 0.5f, 0.9f, 0.4f}, channels, dL_dimage, dL_dalpha, transmittance, checkpoints;
   PlanState plan = {};
@@ -56,7 +56,6 @@ template <class F, int C> struct Scene {
     const auto prepare = [](const Cov2d<float>& cov) { return Projected::prepare(cov, {}); };
     for (const auto& splat : random_splats<Projected>(bits, count, kGrid, -1, 3, 0.9f, prepare))
       splats.push_back({splat.mean, splat.shape, splat.opacity, splat.level, splat.color});
-    for (int k = 0; k < count; ++k) order.push_back(k);
     for (int k = 0; k < kOthers; ++k) chunks.push_back({k, 0, 0});
     int planes = 0;
     for (int tile = 0; tile < tiles; ++tile) {
@@ -93,8 +92,7 @@ template <class F, int C> struct Scene {
     params.dL_dimage = {dL_dimage.data(), C, {}};
     params.dL_dalpha = dL_dalpha.data();
     params.lists = lists_of(pairs, offsets, counts);
-    params.lists.order = order.data();
-    params.lists.capacity -= overflow;
+    if (overflow) share_first_list(params.lists, offsets, counts);
     params.plan = &plan;
     params.chunk_order = chunks.data();
     params.checkpoints = checkpoints.data();

@@ -22,7 +22,6 @@ template <class F> struct Scene {
   std::vector<Splat<F, float>> splats;
   std::vector<SlotPair> pairs;
   std::vector<int64_t> offsets = {0};
-  std::vector<int32_t> order;
   std::vector<float> rows, background, dL_dimage, dL_dalpha;
   Counts counts = {};
 
@@ -44,16 +43,7 @@ template <class F> struct Scene {
       for (int k = 0; k < count; ++k) pairs.push_back({k, int32_t(pairs.size())});
       offsets.push_back(int64_t(pairs.size()));
     }
-    for (int k = 0; k < count; ++k) order.push_back(k);
     counts = {int64_t(pairs.size()), count};
-  }
-
-  /// `overflow`: there are more pairs than room, so that no list was made.
-  TileLists lists(bool overflow) const {
-    TileLists out = lists_of(pairs, offsets, counts);
-    out.order = order.data();
-    out.capacity -= overflow;
-    return out;
   }
 };
 
@@ -68,7 +58,7 @@ struct Way {
   int width = kSmallGroup;  ///< of a group of no more than kSmallGroup channels
   MeanSums mean_sums = MeanSums::kNone;
   int segments = 1;
-  bool overflow = false;
+  bool overflow = false;  ///< there is no room for a list of each tile
 };
 
 template <class F> struct Run {
@@ -81,6 +71,8 @@ template <class F> struct Run {
   BlendParams blend = {};
   BlendVjpParams vjp = {};
   PlanState state = {};
+  std::vector<int64_t> offsets = scene.offsets;
+  Counts counts = scene.counts;
   std::vector<int32_t> order;
   std::vector<TileChunk> chunks;
   std::vector<float> checkpoints, transmittances, sums, shown, pair_grads, channel_sums;
@@ -103,7 +95,9 @@ template <class F> struct Run {
     blend.alpha = out.alpha.data();
     blend.transmittance = out.transmittance.data();
     blend.last = out.last.data();
-    blend.lists = vjp.lists = scene.lists(way.overflow);
+    blend.lists = lists_of(scene.pairs, offsets, counts);
+    if (way.overflow) share_first_list(blend.lists, offsets, counts);
+    vjp.lists = blend.lists;
     blend.plan.tile_order = order.data();
     vjp.transmittance = blend.transmittance;
     vjp.last = blend.last;

@@ -287,6 +287,28 @@ TEST(MovingKernelsOfOneCell, AgreeInListsOfPixelsAndSegmentsOfCoarseTiles) {
   expect_same_if_cut<Moment<1>, kTile>({kWidth, kHeight});
 }
 
+/// The larger a cell, the fewer checkpoints has each of its tiles: one, and none.
+TYPED_TEST(MovingKernels, AgreeWhereTilesShareAList) {
+  using F = TypeParam;
+  using Forward = EvenLayout<F, false, kMovingTile>;
+  using Backward = EvenLayout<F, true, kMovingTile>;
+  Scene<F> scene(700, 700, 0.02f);
+  const Results own = run<F, Forward, Backward>(scene);
+  EXPECT_GT(*std::max_element(own.last.begin(), own.last.end()), 640);
+  const std::vector<double> expected = sums_of_splats(scene, own);
+  for (const int cell_bits : {2, 20}) {
+    Scene<F> shared = scene;
+    shared.lists = lists_of(shared.pairs, shared.offsets, shared.counts);
+    share_first_list(shared.lists, shared.offsets, shared.counts, cell_bits);
+    const Results results = run<F, Forward, Backward>(shared);
+    EXPECT_EQ(results.last, own.last);
+    EXPECT_EQ(results.transmittance, own.transmittance);
+    for (size_t i = 0; i < own.image.size(); ++i) ASSERT_NEAR(results.image[i], own.image[i], kRounding) << i;
+    for (size_t i = 0; i < expected.size(); ++i)
+      ASSERT_NEAR(results.pair_grads[i], expected[i], kRounding * (1 + std::abs(expected[i]))) << i;
+  }
+}
+
 /// Nothing is read of splats that are not there, which AddressSanitizer would see.
 TYPED_TEST(MovingKernels, ShowTheBackgroundOfAnEmptyScene) {
   using F = TypeParam;

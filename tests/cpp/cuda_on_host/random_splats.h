@@ -46,4 +46,13 @@ TileLists lists_of(const std::vector<Pair>& pairs, const std::vector<int64_t>& t
   return lists;
 }
 
+/// As where there is no room for these lists: all tiles are of one cell of 4^cell_bits tiles, and share the first list.
+/// Its slots are its splats.
+inline void share_first_list(TileLists& lists, std::vector<int64_t>& tile_offsets, Counts& counts, int cell_bits = 20) {
+  std::fill(tile_offsets.begin() + 1, tile_offsets.end(), tile_offsets[1]);
+  counts.listed = tile_offsets[1];
+  counts.cell_bits = cell_bits;
+  lists.capacity = counts.pairs - 1;
+}
+
 }  // namespace ar::cuda
