@@ -5,8 +5,8 @@
 // the list of a tile is first filtered, all parts of it side by side, into a bit for each splat and pixel: whether it
 // reaches it. Then each warp walks the splats of a few neighbouring pixels, and waits for no other. It takes those
 // that reach any of them 32 at a time. Each lane goes through those of its own pixel alone, so that in one step the
-// pixels of a warp composite different splats. With one cell, and in the longest lists with four, each pixel takes its
-// own splats and several lanes have the same sample (blend_queued.cuh).
+// pixels of a warp composite different splats. With one cell, and in the longest lists with four and 16, each pixel
+// takes its own splats and several lanes have the same sample (blend_queued.cuh).
 #pragma once
 
 #include "cuda/blend_queued.cuh"
@@ -195,7 +195,7 @@ inline constexpr int kLongestAtOnce = 128;
 /// (docs/performance-log.md, "`moment`: a queue for each pixel").
 template <class F, int kSide> struct ListedLayouts {
   /// Lanes look ahead in all lists, or in the longest.
-  static constexpr bool kAllAhead = F::kSamples == 1, kLongestAhead = F::kSamples <= kMostAhead;
+  static constexpr bool kAllAhead = F::kSamples == 1, kLongestAhead = shares_warp_evenly(F::kSamples);
   using Longest = AheadLayout<F, kSide, 1>;
   using Ahead = AheadLayout<F, kSide, 2>;
   using Long = SampleLayout<F, kSide, 2>;  ///< where they do not look ahead, from kLongList pairs on

@@ -34,12 +34,13 @@ AR_HD constexpr int moving_segment(int samples) { return samples == 1 ? 256 : sa
 /// until it is at least pairs / kBlocksAtOnce.
 inline constexpr int kLongList = 4096;
 inline constexpr int kBlocksAtOnce = 528;
-/// Lists of so many pairs would outlast all others in the forward pass if a warp took several of their pixels. With up
-/// to kMostAhead samples it takes one, whose samples have several lanes each.
-inline constexpr int kLongestList = 16384, kMostAhead = 4;
+/// Lists of so many pairs would outlast all others in the forward pass if a warp took several of their pixels. So it
+/// takes one, each of whose samples has several lanes; but not with nine samples, which do not share a warp evenly.
+inline constexpr int kLongestList = 16384;
+AR_HD constexpr bool shares_warp_evenly(int samples) { return 32 % samples == 0; }
 
 inline ListCut moving_list_cut(int samples, int64_t capacity, TileGrid grid) {
-  const int length = moving_segment(samples), longest_from = samples <= kMostAhead ? kLongestList : kNoList;
+  const int length = moving_segment(samples), longest_from = shares_warp_evenly(samples) ? kLongestList : kNoList;
   const int64_t segments = capacity / length, lists = capacity / kLongList;
   if (is_small_image(grid)) return {true, 0, 1, length, int(segments + grid.tiles()), int(grid.tiles()), longest_from};
   if (lists == 0) return {true};
