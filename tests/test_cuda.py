@@ -257,7 +257,7 @@ def test_moving_samples_with_a_list_for_each_pixel(samples):
     assert all(torch.equal(grad, second.grads[name]) for name, grad in first.grads.items())
 
 
-@pytest.mark.parametrize("samples", [1, 4, 16])
+@pytest.mark.parametrize("samples", [1, 4, 9, 16])
 def test_longest_lists_of_moving_samples(samples):
     """A warp for each pixel of a tile that lists more than kLongestList splats (csrc/cuda/cut_lists.cuh)."""
     scene = splats_smaller_than_a_pixel()

@@ -5,7 +5,7 @@
 // the list of a tile is first filtered, all parts of it side by side, into a bit for each splat and pixel: whether it
 // reaches it. Then each warp walks the splats of a few neighbouring pixels, and waits for no other. It takes those
 // that reach any of them 32 at a time. Each lane goes through those of its own pixel alone, so that in one step the
-// pixels of a warp composite different splats. With one cell, and in the longest lists with four and 16, each pixel
+// pixels of a warp composite different splats. With one cell, and in the longest lists with more, each pixel
 // takes its own splats and several lanes have the same sample (blend_queued.cuh).
 #pragma once
 
@@ -194,8 +194,8 @@ inline constexpr int kLongestAtOnce = 128;
 /// How the pixels of a tile are shared out among warps. Which of these layouts is quickest was measured
 /// (docs/performance-log.md, "`moment`: a queue for each pixel").
 template <class F, int kSide> struct ListedLayouts {
-  /// Lanes look ahead in all lists, or in the longest.
-  static constexpr bool kAllAhead = F::kSamples == 1, kLongestAhead = shares_warp_evenly(F::kSamples);
+  /// Lanes look ahead in all lists, and not only in the longest.
+  static constexpr bool kAllAhead = F::kSamples == 1;
   using Longest = AheadLayout<F, kSide, 1>;
   using Ahead = AheadLayout<F, kSide, 2>;
   using Long = SampleLayout<F, kSide, 2>;  ///< where they do not look ahead, from kLongList pairs on
@@ -237,12 +237,10 @@ __global__ void __launch_bounds__(32) listed_blend_kernel(const BlendParams para
     const int place = is_longest ? block / Layouts::kOfLongest : longest + (block - of_longest) / Layouts::kOfOthers;
     const CutList cut = params.plan.cut_lists[place];
     const TileList list = list_of(params.lists, params.grid, cut.tile);
-    if constexpr (Layouts::kLongestAhead) {
-      if (is_longest) {
-        using Longest = typename Layouts::Longest;
-        blend_queued<F, C, Longest, kKeep, kSegment>(params, first, cut.tile, list, cut.first, stage.queued);
-        continue;
-      }
+    if (is_longest) {
+      using Longest = typename Layouts::Longest;
+      blend_queued<F, C, Longest, kKeep, kSegment>(params, first, cut.tile, list, cut.first, stage.queued);
+      continue;
     }
     if constexpr (Layouts::kAllAhead) {
       blend_queued<F, C, typename Layouts::Ahead, kKeep, kSegment>(params, first, cut.tile, list, cut.first,

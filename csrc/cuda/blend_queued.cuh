@@ -10,17 +10,26 @@
 
 namespace ar::cuda {
 
-/// A warp of kPixelsOfWarp pixels. Of its lanes a sample has several, kAhead, which are neighbours.
+/// A warp of kPixelsOfWarp pixels. Of its lanes a sample has several, kAhead, which are neighbours. The last lanes of a
+/// warp may be left over, and have none.
 template <class F, int kSide, int kPixelsOfWarp> struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, 1> {
   using Base = CellLayout<1, 32 / kPixelsOfWarp, kSide, 1>;
   static constexpr int kAhead = Base::kLanes / F::kSamples;  ///< lanes of a sample
-  static_assert(Base::kLanes % F::kSamples == 0);
+  static_assert(kAhead > 0 && (Base::kLanes % F::kSamples == 0 || Base::kLanes == 32));
   __device__ static int first_sample() { return lane_id() % Base::kLanes / kAhead; }
   /// This lane's place among those of its sample.
   __device__ static int ahead() { return lane_id() % kAhead; }
   __device__ static bool owns() { return ahead() == 0; }
-  /// The lanes of this lane's sample.
-  __device__ static uint32_t sharers() { return (kAllLanes >> (32 - kAhead)) << (lane_id() / kAhead * kAhead); }
+  /// The lanes of this lane's sample, and the first of them.
+  __device__ static uint32_t sharers() { return (kAllLanes >> (32 - kAhead)) << first_sharer(); }
+  __device__ static int first_sharer() { return lane_id() / kAhead * kAhead; }
+  /// The largest x of these lanes. All lanes must call it.
+  __device__ static int max_of_sharers(int x) {
+#pragma unroll
+    for (int offset = 1; offset < kAhead; offset *= 2)
+      x = max(x, shuffle(x, first_sharer() + (ahead() + offset) % kAhead));
+    return x;
+  }
 };
 
 /// Where the bits of a pixel of a tile of kPixels pixels are: that of pair k is bit k % 32 of word k / 32. `first`: of
@@ -116,8 +125,10 @@ template <class Layout> struct PairQueues {
 
 /// The splats that each pixel of a warp is about to composite, and the queues that they come from.
 template <class F, int C> struct QueuedStage {
-  TileSplat<F, C> splats[32];
-  int32_t pairs[32];
+  /// With nine samples the three lanes of each look beyond the last of 32, at what no lane is to composite.
+  static constexpr int kSplats = 32 % F::kSamples == 0 ? 32 : 34;
+  TileSplat<F, C> splats[kSplats];
+  int32_t pairs[kSplats];
   int32_t queues[kQueued];
 };
 
@@ -177,7 +188,7 @@ template <class F, class Layout, bool kKeep, class Stage, class Blend, class Che
 __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& blend, Checkpoints& checkpoints) {
   constexpr int kAhead = Layout::kAhead;
   constexpr bool kOnce = kAhead == Layout::kLanes;  // a sample has a lane for each of the staged splats
-  const int own = lane_id(), first_lane = own / kAhead * kAhead;
+  const int own = lane_id(), first_lane = Layout::first_sharer();
   float& transmittance = blend.samples.transmittance[0];
   Vec2<float>& place = blend.samples.place[0];
   int taken = first_staged + Layout::ahead();  // this lane's, whether there is one or not
@@ -263,11 +274,7 @@ __device__ void blend_queued(const BlendParams& params, int first, int tile, con
     }
     __syncwarp();  // all have read the splats
   }
-  if constexpr (kKeep) {
-#pragma unroll
-    for (int offset = 1; offset < Layout::kAhead; offset *= 2)
-      blend.last[0] = max(blend.last[0], __shfl_xor_sync(kAllLanes, blend.last[0], offset));
-  }
+  if constexpr (kKeep) blend.last[0] = Layout::max_of_sharers(blend.last[0]);
   blend.write(params, first, pixel);
 }
 

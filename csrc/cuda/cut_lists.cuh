@@ -35,17 +35,16 @@ AR_HD constexpr int moving_segment(int samples) { return samples == 1 ? 256 : sa
 inline constexpr int kLongList = 4096;
 inline constexpr int kBlocksAtOnce = 528;
 /// Lists of so many pairs would outlast all others in the forward pass if a warp took several of their pixels. So it
-/// takes one, each of whose samples has several lanes; but not with nine samples, which do not share a warp evenly.
+/// takes one, each of whose samples has several lanes.
 inline constexpr int kLongestList = 16384;
-AR_HD constexpr bool shares_warp_evenly(int samples) { return 32 % samples == 0; }
 
 inline ListCut moving_list_cut(int samples, int64_t capacity, TileGrid grid) {
-  const int length = moving_segment(samples), longest_from = shares_warp_evenly(samples) ? kLongestList : kNoList;
+  const int length = moving_segment(samples);
   const int64_t segments = capacity / length, lists = capacity / kLongList;
-  if (is_small_image(grid)) return {true, 0, 1, length, int(segments + grid.tiles()), int(grid.tiles()), longest_from};
+  if (is_small_image(grid)) return {true, 0, 1, length, int(segments + grid.tiles()), int(grid.tiles()), kLongestList};
   if (lists == 0) return {true};
   ListCut cut = {true, kLongList, kBlocksAtOnce, length};
-  cut.longest_from = longest_from;
+  cut.longest_from = kLongestList;
   cut.max_segments = int(cut.segment_limit(capacity));
   cut.max_lists = int(std::min<int64_t>(cut.max_segments / (kLongList / length), grid.tiles()));
   return cut;
