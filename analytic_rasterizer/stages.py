@@ -104,6 +104,9 @@ _ROWS = tuple(field.name for field in fields(Splats))[:9]  # in the order in whi
 class TileLists:
     """Which splats may show in every tile, front to back. `bin` makes it for `blend`.
 
+    On CUDA tiles share lists in the rare frame that has more pairs of a splat and a tile than there was room for: those
+    where `counts[0]` is larger than the length of `pairs`. `render_stages` has a list for each tile in every case.
+
     Attributes:
         tensors: The lists, camera after camera, in a form of the device's own (ListTensors in csrc/torch/backend.h).
         cameras: Number of cameras.

@@ -15,7 +15,8 @@ them all, and memory is the resident memory of the process.
 With CUDA footprints are warmed up and timed one after another, because the room for pairs follows the
 frames before. Times are between two events around a call on an idle device: the longer of launching
 and computing. With --queued the device is busy with other work until a call has been launched, so that only computing
-counts; stages are timed as ever. "host" is the time until a call returns, without waiting for the device: the op itself
+counts; stages are timed as ever. Of a peer that waits for the device within a call that cannot leave out all of the
+host's time. "host" is the time until a call returns, without waiting for the device: the op itself
 and `GaussianRasterizer`, both without gradient, and forward and backward of the latter. Memory is what
 torch's allocator handed out; room for pairs follows the largest of the footprint's views of one size,
 with reserve.

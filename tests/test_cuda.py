@@ -410,7 +410,9 @@ def test_too_many_pairs(variant, little_room):
 
 def test_stages_have_a_list_for_each_tile(little_room):
     """Which is what their caller looks at."""
-    scene, settings = scenes.to(without_means2d(scene32()), "cuda"), settings_for(("box", {}), CAMERA, "cuda")
+    scene, settings = scene32(), settings_for(("box", {}))
+    assert_more_pairs_than_room(scene, settings)
+    scene, settings = scenes.to(without_means2d(scene), "cuda"), scenes.settings_to(settings, "cuda")
     little = ar.render_stages(settings, **scene)
     _C.force_pair_capacity(1 << 20)
     enough = ar.render_stages(settings, **scene)
@@ -423,9 +425,10 @@ def test_stages_have_a_list_for_each_tile(little_room):
 def test_many_channels_with_too_many_pairs(variant, channels, little_room):
     """All tiles add to a row per splat, which every group of channels must find cleared."""
     g = torch.Generator().manual_seed(5)
+    settings = settings_for(variant, replace(CAMERA, image_width=50, image_height=40))
+    assert_more_pairs_than_room(scene32("few"), settings)
     scene = {name: value for name, value in scene32("few").items() if name != "shs"}
     scene["colors_precomp"] = scenes.rand(g, len(scene["means3D"]), channels).float()
-    settings = settings_for(variant, replace(CAMERA, image_width=50, image_height=40))
     settings = settings._replace(bg=scenes.rand(g, channels).float())
     color = compare(scene, settings)
     assert_same_without_gradient(scene, settings, color)

@@ -150,7 +150,8 @@ def seconds_of(call: Callable[[], object], clock: Callable[[], float] = time.per
 def event_seconds(call: Callable[[], object], queued: bool = False) -> float:
     """Time on the CUDA device from before a call to after it.
 
-    With `queued` the device is kept busy until the host has launched the call, so that its time does not count.
+    With `queued` the device is kept busy until the host has launched the call, so that the host's time does not count;
+    but what a call launches after it has itself waited for the device is not queued.
     """
     start, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
     if queued:

@@ -19,7 +19,7 @@ from ..losses import ssim
 from ..rasterizer import GaussianRasterizer
 from ..settings import GaussianRasterizationSettings
 
-_TILE_OFFSETS = _C.LISTS.index("tile_offsets")  # in what the op saves
+_TILE_OFFSETS, _COUNTS = map(_C.LISTS.index, ("tile_offsets", "counts"))  # in what the op saves
 
 
 def _settings(
@@ -105,7 +105,8 @@ def rasterize_gaussians(
     color, _, radii, saved = torch.ops.analytic_rasterizer.rasterize(
         **gaussians, **camera, bg=background, keep=True, debug=bool(debug)
     )
-    num_rendered = int(saved[_TILE_OFFSETS][-1])
+    # On CUDA tiles may share lists, which then have fewer pairs.
+    num_rendered = int(saved[_COUNTS][0] if means3D.is_cuda else saved[_TILE_OFFSETS][-1])
     footprint = torch.frombuffer(bytearray(str(settings.footprint_in_use()).encode()), dtype=torch.uint8)
     return num_rendered, color, radii, opacity.detach(), footprint, color.new_empty(0)
 

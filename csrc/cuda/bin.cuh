@@ -325,7 +325,9 @@ struct BoxOfTiles {
 };
 
 /// If there is no room for the pairs of splats and tiles: those of splats and cells, in the order of depth, by one
-/// block. It takes some milliseconds per million splats, once, where the host would have to be waited for.
+/// block. The slot of such a pair is its splat, whose row all cells add to. One block takes some milliseconds per
+/// million splats, but only in the rare frame that was not foreseen: the alternative is that the host waits in every
+/// frame.
 __device__ inline void emit_cell_pairs(const EmitParams& params, PairWriter& writer) {
   constexpr int kWarps = kEmitThreads / 32;
   const TileGrid grid = params.grid;
@@ -336,7 +338,7 @@ __device__ inline void emit_cell_pairs(const EmitParams& params, PairWriter& wri
   };
   // The smallest cells of 2^1 to 2^kSizes tiles that there is room for; or one, the whole image, where a splat has one
   // pair at most.
-  constexpr int kSizes = 6;
+  constexpr int kSizes = 8;
   int64_t of_sizes[kSizes] = {};
 #pragma unroll 4
   for (int64_t r = threadIdx.x; r < n; r += kEmitThreads) {

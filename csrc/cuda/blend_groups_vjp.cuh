@@ -87,7 +87,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, kShapeGro
   if (lane == 0) shared.last[warp] = own_last;
   __syncthreads();
   // Pairs that nothing reached. A later group of the same width finds the zeros of the first.
-  if ((first == 0 || C == kSmallGroup) && !list.overflow && segment.number + 1 == segments.count) {
+  if ((first == 0 || C == kSmallGroup) && !list.of_cell && segment.number + 1 == segments.count) {
     for (int k = segment.end + threadIdx.x / kClearThreads; k < list.count; k += kBlendThreads / kClearThreads)
       clear_pair_together<C>(params, list.slot(k), true);
   }
@@ -226,13 +226,13 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, kShapeGro
         }
         if (v >= C) {
           const int column = v - C < kPairChannels ? v - C : kPairMeans + v - C - kPairChannels;
-          if (first > 0 && !list.overflow) sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
-          put_sum(params.pair_grads, kPairGradWidth, list.overflow, row, column, sum);
+          if (first > 0 && !list.of_cell) sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
+          put_sum(params.pair_grads, kPairGradWidth, list.of_cell, row, column, sum);
         } else if (params.channel_sums) {
-          put_sum(params.channel_sums, C, list.overflow, row, v, sum);
+          put_sum(params.channel_sums, C, list.of_cell, row, v, sum);
         } else if (v < kFewChannels) {
           const int column = v == 3 ? kPairFourthChannel : kPairChannels + v;
-          put_sum(params.pair_grads, kPairGradWidth, list.overflow, row, column, sum);
+          put_sum(params.pair_grads, kPairGradWidth, list.of_cell, row, column, sum);
         }
       }
     }

@@ -84,11 +84,11 @@ struct StatePlaces {
 
   __device__ StatePlaces(const TileLists& lists, const TileList& list, TileGrid grid, int tile)
       : first(lists.tile_offsets[tile] / kStateChunk), spacing(kStateChunk) {
-    if (!list.overflow) return;
+    if (!list.of_cell) return;
     const TileInCell of_cell(lists, grid, tile);
-    const int64_t room = int64_t(list.count / kStateChunk) >> 2 * of_cell.bits;
-    first = lists.tile_offsets[of_cell.first_tile] / kStateChunk + of_cell.index * room;
-    spacing = int(((list.count - 1) / (room + 1) / kStateChunk + 1) * kStateChunk);
+    const int room = list.count / kStateChunk / of_cell.tiles;
+    first = lists.tile_offsets[of_cell.first_tile] / kStateChunk + int64_t(of_cell.index) * room;
+    spacing = ((list.count - 1) / (room + 1) / kStateChunk + 1) * kStateChunk;
   }
   /// The number of the checkpoint in front of chunk k / kStateChunk, where every chunk but the first has one.
   __device__ int64_t of_chunk_at(int k) const { return first + k / kStateChunk - 1; }
@@ -327,7 +327,7 @@ __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThr
   const bool is_cut = int(blockIdx.x) < params.plan.state->counts.cut_lists;
   const TileList list = list_of(params.lists, params.grid, tile);
   // With too many pairs no list is cut. The compiler needs fewer registers if both are asked here.
-  if (is_cut && !list.overflow) return;
+  if (is_cut && !list.of_cell) return;
   const StatePlaces places(params.lists, list, params.grid, tile);
   const Vec2<float> p = Layout::pixel();
   const Pixel pixel(list, params.grid, p);

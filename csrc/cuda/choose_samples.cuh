@@ -51,7 +51,7 @@ __global__ void __launch_bounds__(kChooseThreads)
     const Splat<F, float> splat = next;
     if (k + kThreads < list.count) next = splats[list.splat(k + kThreads)];
     TileShare<float> share = {0, 0, 0};
-    if (k < list.count && (!list.overflow || reaches_tile(splat, list)))
+    if (k < list.count && (!list.of_cell || reaches_tile(splat, list)))
       share = tile_share(splat.shape, splat.opacity, {center.x - splat.mean.x, center.y - splat.mean.y});
     const Vec3<float> color = k < list.count ? splat.color : Vec3<float>{0, 0, 0};
     SampleEstimate<float> alone = {};

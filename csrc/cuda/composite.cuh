@@ -29,7 +29,7 @@ struct TileList {
   int x0, y0;
   const int32_t* pairs;
   int stride, count;
-  bool overflow;  ///< the list is that of a cell: it has splats that do not reach this tile
+  bool of_cell;  ///< the list is that of a cell: it has splats that do not reach this tile
 
   __device__ int32_t splat(int k) const { return pairs[int64_t(k) * stride]; }
   __device__ int32_t slot(int k) const { return pairs[int64_t(k) * stride + 1]; }
@@ -38,13 +38,17 @@ struct TileList {
 /// Where a tile is among those that share a list.
 struct TileInCell {
   int first_tile;  ///< of the cell
-  int index;       ///< of the tile in its cell, of 4^bits
-  int bits;
+  int tiles;       ///< of the cell, as far as it is in the image
+  int index;       ///< of the tile among these
 
-  __device__ TileInCell(const TileLists& lists, TileGrid grid, int tile) : bits(int(lists.counts->cell_bits)) {
-    const int columns = grid.columns(), row = tile / columns, column = tile % columns, inside = (1 << bits) - 1;
-    index = (row & inside) << bits | (column & inside);
-    first_tile = (row & ~inside) * columns + (column & ~inside);
+  __device__ TileInCell(const TileLists& lists, TileGrid grid, int tile) {
+    const int bits = int(lists.counts->cell_bits), side = 1 << bits, columns = grid.columns();
+    const int row = tile / columns, column = tile % columns;
+    const int first_row = row >> bits << bits, first_column = column >> bits << bits;
+    const int width = min(side, columns - first_column);
+    first_tile = first_row * columns + first_column;
+    tiles = width * min(side, grid.rows() - first_row);
+    index = (row - first_row) * width + column - first_column;
   }
 };
 
@@ -52,9 +56,9 @@ __device__ inline TileList list_of(const TileLists& lists, TileGrid grid, int ti
   TileList list;
   list.x0 = tile % grid.columns() << grid.tile_bits;
   list.y0 = tile / grid.columns() << grid.tile_bits;
-  list.overflow = lists.counts->pairs > lists.capacity;
+  list.of_cell = lists.counts->pairs > lists.capacity;
   list.stride = lists.stride;
-  const int64_t* offsets = lists.tile_offsets + (list.overflow ? TileInCell(lists, grid, tile).first_tile : tile);
+  const int64_t* offsets = lists.tile_offsets + (list.of_cell ? TileInCell(lists, grid, tile).first_tile : tile);
   list.pairs = lists.pairs + offsets[0] * lists.stride;
   list.count = int(offsets[1] - offsets[0]);
   return list;
@@ -310,9 +314,9 @@ template <int kWidth> __device__ void clear_pair_together(const BlendVjpParams& 
 }
 
 /// Sums gradients of a splat in row `row` of pairs, or of splats, where all tiles add to it.
-__device__ inline void put_sum(float* rows, int width, bool overflow, int32_t row, int column, float x) {
+__device__ inline void put_sum(float* rows, int width, bool of_cell, int32_t row, int column, float x) {
   float* place = rows + int64_t(row) * width + column;
-  if (overflow) {
+  if (of_cell) {
     atomicAdd(place, x);
   } else {
     *place = x;

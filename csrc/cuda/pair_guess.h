@@ -12,7 +12,8 @@ namespace ar::cuda {
 /// not wrong, so the first frames are counted, and wait for the device; afterwards the largest frame so far, and a
 /// reserve, are room enough in all but the rarest cases. The number of Gaussians may change from frame to frame: with
 /// more of them than were ever seen the room grows in proportion, with fewer it stays. There is always room for a pair
-/// of each, which is what EmitParams needs.
+/// of each, which is what EmitParams needs, and some more, without which splats on the borders of cells would leave no
+/// cell but the whole image.
 class PairGuess {
  public:
   /// Frames that are counted at the start.
@@ -26,7 +27,7 @@ class PairGuess {
     if (most_gaussians_ < 0 || (may_wait && to_count_ > 0)) return 0;
     double pairs = double(largest_);
     if (gaussians > most_gaussians_) pairs *= double(gaussians) / double(std::max<int64_t>(most_gaussians_, 1));
-    const double room = std::max(pairs * 1.25 + kReserve, double(gaussians));
+    const double room = std::max(1.25 * pairs, 1.125 * double(gaussians)) + kReserve;
     recent_[frame % kRecent] = {frame, gaussians, room < double(most) ? int64_t(room) : most};
     return recent_[frame % kRecent].room;
   }

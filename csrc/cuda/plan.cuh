@@ -35,10 +35,10 @@ struct PlannedTile {
   bool is_long;    ///< as ListCut means it
 
   __device__ PlannedTile(const TileLists& lists, int64_t tile, int most_samples, const ListCut& cut) {
-    const bool overflow = lists.counts->pairs > lists.capacity;
-    n = overflow ? 1 : int(lists.tile_offsets[tile + 1] - lists.tile_offsets[tile]);
+    const bool in_cells = lists.counts->pairs > lists.capacity;
+    n = in_cells ? 1 : int(lists.tile_offsets[tile + 1] - lists.tile_offsets[tile]);
     samples = lists.tile_samples ? lists.tile_samples[tile] : most_samples;
-    is_long = cut.max_segments > 0 && !overflow && n >= cut.long_from(lists.counts->pairs);
+    is_long = cut.max_segments > 0 && !in_cells && n >= cut.long_from(lists.counts->pairs);
     length = is_long ? cut.segment : cut.whole ? kWholeList : chunk_length(samples);
   }
   /// The last segment of a long list is one of them, however long it is.

@@ -52,7 +52,8 @@ struct alignas(16) SplatTiles {
   int32_t first, count;
 };
 
-/// A splat in the list of a tile, and the slot of this pair.
+/// A splat in the list of a tile, and the slot of this pair. Where tiles share lists it is the splat again, to whose
+/// row all of them add.
 struct alignas(8) SlotPair {
   int32_t splat, slot;
 };
@@ -68,7 +69,7 @@ struct alignas(8) Counts {
   int64_t splats;  ///< with pairs
   /// Pairs that are written: all, or those of splats and cells if there is no room for these.
   int64_t listed;
-  /// A cell has so many tiles, as a power of two, side by side and one below the other, from tile 0 on.
+  /// A cell is a square of 2^cell_bits x 2^cell_bits tiles, the first of which begins with tile 0.
   int64_t cell_bits;
 };
 

@@ -23,7 +23,7 @@ struct SplatTensors {
   Tensor splats;  ///< (n, kSplatWidth) SplatRow
   Tensor ids;     ///< (n,) int32, CPU: the Gaussian of each, ascending
   Tensor depths;  ///< (n,) CPU
-  Tensor counts;  ///< (2,) int64, CUDA: zeros, for the numbers of pairs and splats
+  Tensor counts;  ///< (4,) int64, CUDA: the numbers of Counts (csrc/cuda/stages.h), which `project` sets to zero
   Tensor ranges;  ///< (n, 2) int32, CUDA: first slot, for a backward pass, and number of pairs of each
   Tensor memory;  ///< bytes, CUDA: SplatMemory (cuda_views.h)
 };
@@ -33,7 +33,7 @@ struct ListTensors {
   Tensor splats;  ///< (n, kSplatWidth)
   Tensor ids;     ///< (n,) int32; CPU: the Gaussian of each splat; CUDA: splats in the order of depth
   Tensor pairs;   ///< CPU: (N,) int32 splats; CUDA: (room, 2) splats and slots, or (room, 1) without a backward pass
-  Tensor tile_offsets;   ///< (tiles + 1,) int64, first pair of each tile
+  Tensor tile_offsets;   ///< (tiles + 1,) int64, first pair of each tile; of a cell, where tiles share lists
   Tensor splat_offsets;  ///< CPU: (n + 1,) int64 into positions; CUDA: (n, 2) int32 first slot and number of slots
   Tensor positions;      ///< CPU: (N,) int64 places in `pairs` of each splat's pairs
   Tensor counts;         ///< CUDA: the numbers of Counts (csrc/cuda/stages.h)

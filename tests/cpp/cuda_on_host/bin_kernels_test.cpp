@@ -385,7 +385,7 @@ TEST(BinKernels, PairsOfSplatsAndCellsWhereThereIsNoRoomForTiles) {
       }
       for (int tile = 0; tile < from.kGrid.tiles(); ++tile) {
         const TileInCell of_cell(view, from.kGrid, tile);
-        ASSERT_TRUE(of_cell.index >= 0 && of_cell.index < 1 << 2 * bits) << tile;
+        ASSERT_TRUE(of_cell.index >= 0 && of_cell.index < of_cell.tiles) << tile;
         if (of_cell.first_tile != tile) ASSERT_TRUE(lists[tile].empty()) << tile;
         const std::vector<int>& list = lists[of_cell.first_tile];
         ASSERT_TRUE(is_subsequence(of_tiles[tile], list)) << tile << " with cells of 4^" << bits << " tiles";

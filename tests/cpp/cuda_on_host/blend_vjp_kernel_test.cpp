@@ -91,8 +91,8 @@ template <class F, int C> struct Scene {
     params.last = last.data();
     params.dL_dimage = {dL_dimage.data(), C, {}};
     params.dL_dalpha = dL_dalpha.data();
+    if (overflow) share_lists(pairs, offsets, counts, kGrid);
     params.lists = lists_of(pairs, offsets, counts);
-    if (overflow) share_first_list(params.lists, offsets, counts);
     params.plan = &plan;
     params.chunk_order = chunks.data();
     params.checkpoints = checkpoints.data();

@@ -71,6 +71,7 @@ template <class F> struct Run {
   BlendParams blend = {};
   BlendVjpParams vjp = {};
   PlanState state = {};
+  std::vector<SlotPair> pairs = scene.pairs;
   std::vector<int64_t> offsets = scene.offsets;
   Counts counts = scene.counts;
   std::vector<int32_t> order;
@@ -95,9 +96,8 @@ template <class F> struct Run {
     blend.alpha = out.alpha.data();
     blend.transmittance = out.transmittance.data();
     blend.last = out.last.data();
-    blend.lists = lists_of(scene.pairs, offsets, counts);
-    if (way.overflow) share_first_list(blend.lists, offsets, counts);
-    vjp.lists = blend.lists;
+    if (way.overflow) share_lists(pairs, offsets, counts, kGrid);
+    blend.lists = vjp.lists = lists_of(pairs, offsets, counts);
     blend.plan.tile_order = order.data();
     vjp.transmittance = blend.transmittance;
     vjp.last = blend.last;

@@ -46,13 +46,22 @@ TileLists lists_of(const std::vector<Pair>& pairs, const std::vector<int64_t>& t
   return lists;
 }
 
-/// As where there is no room for these lists: all tiles are of one cell of 4^cell_bits tiles, and share the first list.
-/// Its slots are its splats.
-inline void share_first_list(TileLists& lists, std::vector<int64_t>& tile_offsets, Counts& counts, int cell_bits = 20) {
-  std::fill(tile_offsets.begin() + 1, tile_offsets.end(), tile_offsets[1]);
-  counts.listed = tile_offsets[1];
+/// Makes of lists that all have the same splats those of cells of 4^cell_bits tiles, as where there is no room for
+/// them. Their slots are their splats.
+inline void share_lists(std::vector<SlotPair>& pairs, std::vector<int64_t>& tile_offsets, Counts& counts, TileGrid grid,
+                        int cell_bits = 20) {
+  const std::vector<SlotPair> list(pairs.begin(), pairs.begin() + tile_offsets[1]);
+  pairs.clear();
+  for (int tile = 0; tile < grid.tiles(); ++tile) {
+    tile_offsets[tile] = int64_t(pairs.size());
+    if (tile % grid.columns() % (1 << cell_bits) == 0 && tile / grid.columns() % (1 << cell_bits) == 0) {
+      for (const SlotPair& pair : list) pairs.push_back({pair.splat, pair.splat});
+    }
+  }
+  tile_offsets.back() = int64_t(pairs.size());
+  counts.listed = int64_t(pairs.size());
+  counts.pairs = counts.listed + 1;
   counts.cell_bits = cell_bits;
-  lists.capacity = counts.pairs - 1;
 }
 
 }  // namespace ar::cuda
