@@ -208,7 +208,7 @@ __global__ void __launch_bounds__(kEmitThreads, 5) emit_pairs_kernel(const EmitP
   __shared__ MaskedPairs stages[kEmitRows][kWarps];
   const int64_t n = params.counts->splats;
   // As many blocks stay as have splats, whichever of them they get.
-  if (params.counts->pairs > params.capacity || int64_t(blockIdx.x) * kEmitSplats >= n) return;
+  if (params.counts->in_cells(params.capacity) || int64_t(blockIdx.x) * kEmitSplats >= n) return;
   uint32_t* published = params.status + kOfBlocks;
   if (threadIdx.x == 0) block_id = atomicAdd(&params.status[kTickets], 1);
   PairWriter writer(params, digits, digit_counts);
@@ -385,7 +385,7 @@ __global__ void __launch_bounds__(kEmitThreads)
   wait_for_earlier_kernels();
   constexpr int kWarps = kEmitThreads / 32;
   __shared__ uint32_t digit_counts[PairWriter::kMostCounts];
-  const bool in_cells = params.counts->pairs > params.capacity;
+  const bool in_cells = params.counts->in_cells(params.capacity);
   if (blockIdx.x == 0 && threadIdx.x == 0 && !in_cells) params.counts->listed = params.counts->pairs;
   const int count = in_cells ? 1 : int(params.status[kLongSplats]);
   const int first = int(blockIdx.x) * kWarps;

@@ -5,8 +5,8 @@
 // the list of a tile is first filtered, all parts of it side by side, into a bit for each splat and pixel: whether it
 // reaches it. Then each warp walks the splats of a few neighbouring pixels, and waits for no other. It takes those
 // that reach any of them 32 at a time. Each lane goes through those of its own pixel alone, so that in one step the
-// pixels of a warp composite different splats. With one cell, and in the longest lists with more, each pixel
-// takes its own splats and several lanes have the same sample (blend_queued.cuh).
+// pixels of a warp composite different splats. With one cell, and in the longest lists with more, each pixel takes
+// its own splats and several lanes have the same sample (blend_queued.cuh).
 #pragma once
 
 #include "cuda/blend_queued.cuh"

@@ -14,7 +14,7 @@ namespace {
 __global__ void clear_sums_kernel(const BlendVjpParams params, int first, int width) {
   wait_for_earlier_kernels();
   if (blockIdx.x == 0 && threadIdx.x < kSampleClasses) params.chunks_taken[threadIdx.x] = 0;
-  if (params.lists.counts->pairs <= params.lists.capacity) return;
+  if (!params.lists.counts->in_cells(params.lists.capacity)) return;
   const auto clear = [&](float* to, int width) {
     const int64_t n = params.lists.n * width;
     for (int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x; i < n; i += int64_t(gridDim.x) * blockDim.x)

@@ -56,7 +56,7 @@ __device__ inline TileList list_of(const TileLists& lists, TileGrid grid, int ti
   TileList list;
   list.x0 = tile % grid.columns() << grid.tile_bits;
   list.y0 = tile / grid.columns() << grid.tile_bits;
-  list.of_cell = lists.counts->pairs > lists.capacity;
+  list.of_cell = lists.counts->in_cells(lists.capacity);
   list.stride = lists.stride;
   const int64_t* offsets = lists.tile_offsets + (list.of_cell ? TileInCell(lists, grid, tile).first_tile : tile);
   list.pairs = lists.pairs + offsets[0] * lists.stride;

@@ -35,7 +35,7 @@ struct PlannedTile {
   bool is_long;    ///< as ListCut means it
 
   __device__ PlannedTile(const TileLists& lists, int64_t tile, int most_samples, const ListCut& cut) {
-    const bool in_cells = lists.counts->pairs > lists.capacity;
+    const bool in_cells = lists.counts->in_cells(lists.capacity);
     n = in_cells ? 1 : int(lists.tile_offsets[tile + 1] - lists.tile_offsets[tile]);
     samples = lists.tile_samples ? lists.tile_samples[tile] : most_samples;
     is_long = cut.max_segments > 0 && !in_cells && n >= cut.long_from(lists.counts->pairs);
@@ -102,7 +102,7 @@ struct CutClasses {
   __device__ CutClasses(const ListCut& cut, const TileLists& tile_lists, int lists_of_class, int counted)
       : chunks_of_class(counted) {
     const int64_t pairs = tile_lists.counts->pairs;
-    if (cut.max_segments == 0 || pairs > tile_lists.capacity) return;
+    if (cut.max_segments == 0 || tile_lists.counts->in_cells(tile_lists.capacity)) return;
     constexpr int kWarps = kPlanThreads / 32;
     const int of_length = int(threadIdx.x) % kLengthClasses;
     const bool are_long = of_length <= __clz(cut.long_from(pairs));

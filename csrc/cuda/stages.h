@@ -71,6 +71,9 @@ struct alignas(8) Counts {
   int64_t listed;
   /// A cell is a square of 2^cell_bits x 2^cell_bits tiles, the first of which begins with tile 0.
   int64_t cell_bits;
+
+  /// Whether tiles share the lists of cells, as there is room for `capacity` pairs only.
+  AR_HD bool in_cells(int64_t capacity) const { return pairs > capacity; }
 };
 
 struct ProjectParams : ar::ProjectParams<float> {
@@ -208,7 +211,7 @@ struct PairSumsView {
   const float* pair_grads;
 
   /// Whether there were too many pairs: then pair_grads has a row per splat.
-  AR_HD bool by_splat() const { return counts->pairs > capacity; }
+  AR_HD bool by_splat() const { return counts->in_cells(capacity); }
 };
 
 /// From rows of pairs to gradients with respect to channels [first, first + count) of every splat.

@@ -185,7 +185,7 @@ class Backend {
   virtual ListTensors bin(const SplatTensors& splats, const Pass& pass, const Tensor& background) = 0;
   /// Whether there was no room for a list of each tile, which with Pass::exact there is but for more pairs than a list
   /// can have. Waits for the device.
-  virtual bool tiles_share_lists(const ListTensors& lists) = 0;
+  virtual bool tiles_share_lists(const ListTensors&) { return false; }
   /// Writes `image` and, with pass.keep, the tensors of make_state; makes the others of `state`.
   virtual void blend(const ListTensors& lists, const Pass& pass, const ChannelTensors& channels,
                      const ImageTensors& image, BlendState& state) = 0;

@@ -181,8 +181,6 @@ template <typename T> class CpuBackend final : public Backend {
     return out;
   }
 
-  bool tiles_share_lists(const ListTensors&) override { return false; }
-
   void blend(const ListTensors& lists, const Pass& pass, const ChannelTensors& channels, const ImageTensors& image,
              BlendState& state) override {
     state.checkpoints = at::empty({0}, floats_);
