@@ -598,7 +598,7 @@ def test_every_kernel_has_images_that_need_it(footprint, options):
     """What its comment says of lists and of pixels that close."""
     program = importlib.import_module("every_kernel")
     long_list = re.search(r"kLongList = (\d+);", (ROOT / "csrc" / "cuda" / "cut_lists.cuh").read_text())[1]
-    longest, most_in_8, closed, short = {}, {}, {}, {}
+    longest, most_in_tile, closed, short = {}, {}, {}, {}
     for name, image in program.IMAGES.items():
         settings = image.camera().settings(torch.float32, footprint=footprint, **options)._replace(sh_degree=3)
         leaves = scenes.leaves(image.scene("cpu"))
@@ -609,15 +609,16 @@ def test_every_kernel_has_images_that_need_it(footprint, options):
         ar.blend(splats, lists)[0].sum().backward()
         lists = of_camera["tile_offsets"].diff()
         longest[name], short[name] = int(lists.max()), int(((lists > 0) & (lists < int(long_list))).sum())
-        # With its mean in a tile of 8x8 px, a splat that has pairs has one with that tile.
+        # With its mean in a tile, of the smallest that there are, a splat that has pairs has one with that tile.
+        side = 8 if name.startswith("large") else 4
         listed = splats.means2d.detach()[of_camera["pairs"].long().unique()]
-        tiles = ((listed + 0.5) / 8).floor()
-        most_in_8[name] = int(tiles.unique(dim=0, return_counts=True)[1].max())
+        tiles = ((listed + 0.5) / side).floor()
+        most_in_tile[name] = int(tiles.unique(dim=0, return_counts=True)[1].max())
         # Splats as large as a pixel, of opacities of 0.3 and above, that have a pixel and no gradient: all are closed.
         inside = ((splats.means2d > 0) & (splats.means2d < torch.tensor([image.width - 1, image.height - 1]))).all(1)
         closed[name] = int((inside & (leaves["opacities"].grad[splats.gaussian_ids.long(), 0] == 0)).sum())
     large = [image for name, image in program.IMAGES.items() if name.startswith("large")]
     assert all((image.width // 8) * (image.height // 8) >= 4096 for image in large)
-    assert most_in_8["small"] > int(long_list) and longest["small"] > int(long_list)
-    assert most_in_8["large, few tiles"] > int(long_list) and short["large, few tiles"] > 100
+    assert most_in_tile["small"] > int(long_list) and longest["small"] > int(long_list)
+    assert most_in_tile["large, few tiles"] > int(long_list) and short["large, few tiles"] > 100
     assert closed["large, opaque"] > 100 and closed["small, opaque"] > 100

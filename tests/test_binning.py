@@ -57,7 +57,9 @@ def stages(scene, variant, dtype=torch.float64, device="cpu"):
 
 def tile_size(variant, device):
     """Tiles on CUDA of samples that move are smaller, in an image as small as this."""
-    return 8 if variant[0] == "moment" and device == "cuda" else ar.TILE
+    if variant[0] != "moment" or device != "cuda":
+        return ar.TILE
+    return 4 if variant[1]["samples"] > 4 else 8
 
 
 def tile_grid(size):
@@ -253,12 +255,14 @@ def test_depths_that_differ_in_the_last_bit(device):
         assert first.tolist() == [2, 1, 0], dtype
 
 
-def test_tiles_of_one_cell_are_large_in_large_images():
-    """On CUDA: from 4096 tiles of 8x8 px on. On the CPU all tiles have 16x16 px."""
-    key = resolve_footprint("moment", samples=1).key
-    assert [_C.tile_size(key, 1.0, width, 512, True) for width in (512, 504)] == [16, 8]
+@pytest.mark.parametrize(
+    "samples, large, small", [(1, 16, 8), (4, 8, 8), (9, 8, 4), (16, 8, 4)], ids=["1", "4", "9", "16"]
+)
+def test_tiles_of_moving_samples_depend_on_the_image(samples, large, small):
+    """On CUDA: an image is large from 4096 tiles of 8x8 px on. On the CPU all tiles have 16x16 px."""
+    key = resolve_footprint("moment", samples=samples).key
+    assert [_C.tile_size(key, 1.0, width, 512, True) for width in (512, 504)] == [large, small]
     assert [_C.tile_size(key, 1.0, width, 512, False) for width in (512, 504)] == [16, 16]
-    assert _C.tile_size(resolve_footprint("moment", samples=4).key, 1.0, 512, 512, True) == 8
 
 
 @pytest.mark.parametrize("variant", KINDS, ids=name_of)

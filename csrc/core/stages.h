@@ -36,9 +36,12 @@ AR_HD bool is_small_image(TileGrid grid) {
   return TileGrid{grid.width, grid.height, kMovingTileBits}.tiles() < kSmallImageTiles;
 }
 /// The tiles on CUDA where `samples` samples of a pixel move. With one of them in a large image, blending a splat in a
-/// pixel costs so little that tiles are worth being large: fewer pairs have to be listed, and fetched by a block.
+/// pixel costs so little that tiles are worth being large: fewer pairs have to be listed, and fetched by a block. With
+/// nine or more in a small image, where most splats are smaller than a tile, tiles are small: their lists are shorter,
+/// and a splat reaches more of a block's samples.
 AR_HD constexpr int moving_tile_bits(int samples, bool small_image) {
-  return samples == 1 && !small_image ? kTileBits : kMovingTileBits;
+  if (samples == 1 && !small_image) return kTileBits;
+  return samples >= 9 && small_image ? kMovingTileBits - 1 : kMovingTileBits;
 }
 AR_HD TileGrid moving_grid(int samples, int width, int height) {
   return {width, height, moving_tile_bits(samples, is_small_image({width, height}))};

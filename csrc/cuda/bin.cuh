@@ -333,16 +333,14 @@ __device__ inline void emit_cell_pairs(const EmitParams& params, PairWriter& wri
   const TileGrid grid = params.grid;
   const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
   const int64_t n = params.counts->splats, n_rounded = (n + kEmitThreads - 1) / kEmitThreads * kEmitThreads;
-  const auto tiles_of_splat = [&](int64_t r) {
-    return BoxOfTiles(support_of(splats[params.order[r]], params.footprint), grid);
-  };
+  const auto tiles_of_splat = [&](int32_t id) { return BoxOfTiles(support_of(splats[id], params.footprint), grid); };
   // The smallest cells of 2^1 to 2^kSizes tiles that there is room for; or one, the whole image, where a splat has one
   // pair at most.
   constexpr int kSizes = 8;
   int64_t of_sizes[kSizes] = {};
 #pragma unroll 4
   for (int64_t r = threadIdx.x; r < n; r += kEmitThreads) {
-    const BoxOfTiles tiles = tiles_of_splat(r);
+    const BoxOfTiles tiles = tiles_of_splat(params.order[r]);
 #pragma unroll
     for (int k = 0; k < kSizes; ++k) of_sizes[k] += tiles.in_cells(k + 1).count();
   }
@@ -358,15 +356,14 @@ __device__ inline void emit_cell_pairs(const EmitParams& params, PairWriter& wri
   const int64_t columns = grid.columns();
   int64_t before = 0;  // of the pairs of earlier splats
   for (int64_t r = threadIdx.x; r < n_rounded; r += kEmitThreads) {
-    const BoxOfTiles cells = r < n ? tiles_of_splat(r).in_cells(bits) : BoxOfTiles();
+    const int32_t id = r < n ? params.order[r] : -1;
+    const BoxOfTiles cells = id >= 0 ? tiles_of_splat(id).in_cells(bits) : BoxOfTiles();
     int64_t all;
     int64_t place = before + sum_before<kWarps>(cells.count(), int64_t(0), all);
     before += all;
     for (int64_t row = cells.rows.first; row <= cells.rows.last; ++row) {
-      for (int64_t column = cells.columns.first; column <= cells.columns.last; ++column, ++place) {
-        const int32_t id = params.order[r];
+      for (int64_t column = cells.columns.first; column <= cells.columns.last; ++column, ++place)
         writer.write(place, uint32_t((row << bits) * columns + (column << bits)), id, id);
-      }
     }
   }
   if (threadIdx.x == 0) {

@@ -19,7 +19,7 @@ template <class F, int C, int kSide, bool kKeep>
 void launch_moving_blend_kernels(const BlendParams& p, const ListCut& cut, int first, cudaStream_t stream) {
   using Layout = EvenLayout<F, false, kSide>;
   const unsigned blocks = cut.max_lists > 0 ? ListedLayouts<F, kSide>::blocks(cut, p.grid) : 0;
-  if (blocks > 0) launch(listed_blend_kernel<F, C, kSide, kKeep>, {blocks, 32}, stream, p, first);
+  if (blocks > 0) launch(listed_blend_kernel<F, C, kSide, kKeep>, {blocks, 32 * kListedWarps<F>}, stream, p, first);
   const LaunchShape tiles = {unsigned(p.grid.tiles() + 1), Layout::kThreads};
   launch(moving_blend_kernel<F, C, Layout, kKeep>, tiles, stream, p, first, blocks > 0);
 }
@@ -33,8 +33,8 @@ void launch_moving_blend(const BlendParams& p, const ListCut& cut, int first, cu
 }
 template <class F, int kSide> void blend_moving(const BlendParams& p, cudaStream_t stream) {
   const ListCut cut = moving_list_cut(F::kSamples, p.lists.capacity, p.grid);
-  const int64_t pieces = int64_t(cut.max_segments) * moving_segment(F::kSamples) / kFilterPiece;
-  const auto blocks = unsigned(is_small_image(p.grid) ? pieces : std::min<int64_t>(pieces, kFilterBlocks));
+  const int64_t pieces = int64_t(cut.max_segments) * moving_segment(F::kSamples, kSide) / kFilterPiece;
+  const auto blocks = unsigned(cuts_all_lists(p.grid) ? pieces : std::min<int64_t>(pieces, kFilterBlocks));
   if (blocks > 0) launch(filter_kernel<F, kSide>, {blocks, kFilterPiece}, stream, p);
   if (!p.channels.data) return launch_moving_blend<F, 3, kSide>(p, cut, 0, stream);
   if (p.channels.count <= kFewChannels) return launch_moving_blend<F, 4, kSide>(p, cut, 0, stream);
@@ -87,7 +87,7 @@ void blend(int footprint, const BlendParams& p, const BlendParams* in_chunks, cu
   visit_tile_footprints<AdaptiveBoxes>(footprint, stream, [&](auto f, cudaStream_t side) {
     using F = decltype(f);
     if constexpr (F::kMoves) {
-      with_moving_side<F>(p.grid, [&](auto px) { blend_moving<F, decltype(px)::value>(p, side); });
+      with_tile_side<F>(p.grid, [&](auto px) { blend_moving<F, decltype(px)::value>(p, side); });
     } else {
       if constexpr (!F::kYardstick) {
         if (!p.channels.data) return blend_few<F, 3>(p, side);

@@ -6,7 +6,7 @@
 // reaches it. Then each warp walks the splats of a few neighbouring pixels, and waits for no other. It takes those
 // that reach any of them 32 at a time. Each lane goes through those of its own pixel alone, so that in one step the
 // pixels of a warp composite different splats. With one cell, and in the longest lists with more, each pixel takes
-// its own splats and several lanes have the same sample (blend_queued.cuh).
+// its own splats and many lanes have the same sample (blend_queued.cuh).
 #pragma once
 
 #include "cuda/blend_queued.cuh"
@@ -21,7 +21,8 @@ inline constexpr int kListedBatch = 32 * 32;
 
 /// A warp of kPixelsOfWarp pixels, a sample for each lane. The more pixels a warp has, the fewer steps it takes for
 /// each of them, and the more of them wait for the longest list.
-template <class F, int kSide, int kPixelsOfWarp> struct SampleLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, 1> {};
+template <class F, int kSide, int kPixelsOfWarp, int kWarps>
+struct SampleLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarps> {};
 
 /// Bit x: the span holds x0 + x, of a row of a tile of kSide pixels that begins at x0. The differences are exact
 /// wherever they decide.
@@ -48,8 +49,8 @@ __device__ inline uint32_t transpose_bits(uint32_t bits) {
 template <class F, int kSide> __global__ void __launch_bounds__(kFilterPiece) filter_kernel(const BlendParams params) {
   wait_for_earlier_kernels();  // first: moving_blend_kernel, which does not wait, reads the plan
   let_next_kernel_begin();
-  constexpr int kRowsOfWord = 32 / kSide, kPixels = kSide * kSide;
-  constexpr int kPieces = moving_segment(F::kSamples) / kFilterPiece;  // of a segment
+  constexpr int kRowsOfWord = 32 / kSide, kPixels = kSide * kSide, kWords = (kPixels + 31) / 32;
+  constexpr int kPieces = moving_segment(F::kSamples, kSide) / kFilterPiece;  // of a segment
   __shared__ uint32_t words[kPixels][kFilterWords];
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const PlanState& plan = *params.plan.state;
@@ -57,7 +58,7 @@ template <class F, int kSide> __global__ void __launch_bounds__(kFilterPiece) fi
     const ListSegment segment(plan, params.plan.chunk_order, number / kPieces);
     const TileList list = list_of(params.lists, params.grid, segment.tile);
     const int piece = segment.index * kPieces + number % kPieces, k = piece * kFilterPiece + int(threadIdx.x);
-    uint32_t reach[kPixels / 32] = {};  // a bit per pixel
+    uint32_t reach[kWords] = {};  // a bit per pixel
     if (k < list.count) {
       const Support<float> support = support_of(splats[list.splat(k)]);
 #pragma unroll
@@ -69,11 +70,14 @@ template <class F, int kSide> __global__ void __launch_bounds__(kFilterPiece) fi
     }
     __syncthreads();  // all have read the words of the last piece
 #pragma unroll
-    for (int w = 0; w < kPixels / 32; ++w) words[32 * w + lane_id()][threadIdx.x / 32] = transpose_bits(reach[w]);
+    for (int w = 0; w < kWords; ++w) {
+      const uint32_t of_pixel = transpose_bits(reach[w]);
+      if (kPixels % 32 == 0 || lane_id() < kPixels) words[32 * w + lane_id()][threadIdx.x / 32] = of_pixel;
+    }
     __syncthreads();
     for (int i = threadIdx.x; i < kPixels * kFilterWords; i += kFilterPiece) {
       const int pixel = i / kFilterWords, word = i % kFilterWords;
-      params.reach_words[pixel_words<F, kPixels>(segment.first(), list, pixel) + piece * kFilterWords + word] =
+      params.reach_words[pixel_words<F, kSide>(segment.first(), list, pixel) + piece * kFilterWords + word] =
           words[pixel][word];
     }
   }
@@ -139,7 +143,7 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
 #pragma unroll
     for (int i = 0; i < kPixels; ++i) {
       const uint32_t* from =
-          params.reach_words + pixel_words<F, Layout::kTilePixels>(first_segment, list, Layout::pixel_number(i));
+          params.reach_words + pixel_words<F, Layout::kSide>(first_segment, list, Layout::pixel_number(i));
       words[i] = mine < list.count ? from[mine / 32] : 0u;
     }
   };
@@ -187,28 +191,33 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
 
 /// In large images, blocks of filter_kernel and warps of listed_blend_kernel: as many as leave most of a large device
 /// to the kernel that is to begin beside them, which only does when all of them have begun.
-inline constexpr int kFilterBlocks = 264, kListedWarps = 1024;
+inline constexpr int kFilterBlocks = 264, kWarpsBeside = 1024;
 /// In small images, for so many of the longest lists each warp has one task.
 inline constexpr int kLongestAtOnce = 128;
 
+/// Warps of a block of listed_blend_kernel. They share a pixel of the longest lists, so that a sample has 32, 32, 10 or
+/// 8 lanes with 1, 4, 9 or 16 samples.
+template <class F> inline constexpr int kListedWarps = F::kSamples == 1 ? 1 : 4;
+
 /// How the pixels of a tile are shared out among warps. Which of these layouts is quickest was measured
-/// (docs/performance-log.md, "`moment`: a queue for each pixel").
+/// (docs/performance-log.md, "`moment`: a queue for each pixel" and "`moment`: small tiles, and pixels of four warps").
 template <class F, int kSide> struct ListedLayouts {
-  /// Lanes look ahead in all lists, and not only in the longest.
-  static constexpr bool kAllAhead = F::kSamples == 1;
-  using Longest = AheadLayout<F, kSide, 1>;
+  static constexpr int kWarps = kListedWarps<F>;
+  using Longest = AheadLayout<F, kSide, 1, kWarps>;
+  /// Other lists, of which there are none with more than four samples. With one, lanes look ahead in these too.
+  static constexpr bool kAhead = F::kSamples == 1, kWalked = F::kSamples == 4;
   using Ahead = AheadLayout<F, kSide, 2>;
-  using Long = SampleLayout<F, kSide, 2>;  ///< where they do not look ahead, from kLongList pairs on
-  using Short = SampleLayout<F, kSide, F::kSamples <= 4 ? 8 : 2>;
+  using Long = SampleLayout<F, kSide, 2, kWarps>;  ///< from kLongList pairs on
+  using Short = SampleLayout<F, kSide, kWalked ? 8 : 2, kWarps>;
   /// Blocks of a list; of one that is short, the first of them have its pixels.
-  static constexpr int kOfLongest = CellLayout<1, 32, kSide, 1>::kBlocks, kOfOthers = Long::kBlocks;
+  static constexpr int kOfLongest = Longest::kBlocks, kOfOthers = Long::kBlocks;
   static_assert(kOfLongest % kOfOthers == 0 && kOfOthers % Short::kBlocks == 0);
 
   /// How many are launched: a multiple of those that one of the longest lists takes, so that a block is at the same
   /// place in every tile that it goes on to.
   static unsigned blocks(const ListCut& cut, TileGrid grid) {
     const int64_t longest = std::min(cut.max_lists, kLongestAtOnce), lists = cut.max_lists;
-    const int64_t wanted = is_small_image(grid) ? longest * kOfLongest + lists * kOfOthers : kListedWarps;
+    const int64_t wanted = is_small_image(grid) ? longest * kOfLongest + lists * kOfOthers : kWarpsBeside / kWarps;
     const int64_t blocks = std::min(wanted, lists * kOfLongest);
     return unsigned((blocks + kOfLongest - 1) / kOfLongest * kOfLongest);
   }
@@ -216,19 +225,21 @@ template <class F, int kSide> struct ListedLayouts {
 
 /// What a warp keeps of the splats that it is about to composite.
 template <class F, int C, int kSide> union WarpStage {
-  ListedStage<F, C, ListedLayouts<F, kSide>::Short::kPixels> listed;
-  QueuedStage<F, C> queued;
+  using Layouts = ListedLayouts<F, kSide>;
+  QueuedStage<F, C, Layouts::Longest::kPlaces> queued;
+  std::conditional_t<Layouts::kWalked, ListedStage<F, C, Layouts::Short::kPixels>, char> listed;
 };
 
 /// A warp per few pixels of a tile whose list is cut, those of the longest lists first. `kSegment`: pairs of a segment
 /// in the backward pass.
-template <class F, int C, int kSide, bool kKeep, int kSegment = moving_segment(F::kSamples)>
-__global__ void __launch_bounds__(32) listed_blend_kernel(const BlendParams params, int first) {
+template <class F, int C, int kSide, bool kKeep, int kSegment = moving_segment(F::kSamples, kSide)>
+__global__ void __launch_bounds__(32 * kListedWarps<F>) listed_blend_kernel(const BlendParams params, int first) {
   let_next_kernel_begin();  // so that moving_blend_kernel does not wait for filter_kernel either
   wait_for_earlier_kernels();
   using Layouts = ListedLayouts<F, kSide>;
   using Short = typename Layouts::Short;
-  __shared__ WarpStage<F, C, kSide> stage;
+  __shared__ WarpStage<F, C, kSide> stages[Layouts::kWarps];
+  WarpStage<F, C, kSide>& stage = stages[threadIdx.x / 32];
   const PlanCounts& counts = params.plan.state->counts;
   const int longest = counts.longest_lists, of_longest = longest * Layouts::kOfLongest;
   const int blocks = of_longest + (counts.cut_lists - longest) * Layouts::kOfOthers;
@@ -242,14 +253,17 @@ __global__ void __launch_bounds__(32) listed_blend_kernel(const BlendParams para
       blend_queued<F, C, Longest, kKeep, kSegment>(params, first, cut.tile, list, cut.first, stage.queued);
       continue;
     }
-    if constexpr (Layouts::kAllAhead) {
+    if constexpr (Layouts::kAhead) {
       blend_queued<F, C, typename Layouts::Ahead, kKeep, kSegment>(params, first, cut.tile, list, cut.first,
                                                                    stage.queued);
-    } else if (list.count >= kLongList) {
-      blend_listed<F, C, typename Layouts::Long, kKeep, kSegment>(params, first, cut.tile, list, cut.first,
-                                                                  stage.listed);
-    } else if (block % Layouts::kOfOthers < Short::kBlocks) {
-      blend_listed<F, C, Short, kKeep, kSegment>(params, first, cut.tile, list, cut.first, stage.listed);
+    }
+    if constexpr (Layouts::kWalked) {
+      if (list.count >= kLongList) {
+        blend_listed<F, C, typename Layouts::Long, kKeep, kSegment>(params, first, cut.tile, list, cut.first,
+                                                                    stage.listed);
+      } else if (block % Layouts::kOfOthers < Short::kBlocks) {
+        blend_listed<F, C, Short, kKeep, kSegment>(params, first, cut.tile, list, cut.first, stage.listed);
+      }
     }
   }
 }

@@ -23,15 +23,17 @@ __device__ inline int& taken_group() {
 
 /// How the samples of a tile of kSide x kSide pixels are shared out: kCells to a lane, those of a pixel to kLanes
 /// neighbours, a power of two, of which the last may have fewer, or none. The pixels of a warp, a group, are a
-/// rectangle. A tile's groups are spread over kBlocks blocks of kWarps warps.
+/// rectangle. A tile's groups are spread over kBlocks blocks of kWarps warps, of which kWarpsOfGroup share a group.
 template <int kCellsOfLane, int kLanesOfPixel, int kSideOfTile = kMovingTile,
-          int kWarpsOfBlock = kLanesOfPixel * kSideOfTile * kSideOfTile / 32, bool kTaken = false>
+          int kWarpsOfBlock = kLanesOfPixel * kSideOfTile * kSideOfTile / 32, bool kTaken = false,
+          int kWarpsOfGroup = 1>
 struct CellLayout {
   static constexpr int kCells = kCellsOfLane, kLanes = kLanesOfPixel;
   static constexpr int kSide = kSideOfTile, kTilePixels = kSide * kSide;
   static constexpr int kGroups = kLanes * kTilePixels / 32;
-  static constexpr int kWarps = kWarpsOfBlock, kThreads = 32 * kWarps, kBlocks = kTaken ? 1 : kGroups / kWarps;
-  static_assert((kLanes & (kLanes - 1)) == 0 && kLanes <= 32 && kGroups % kWarps == 0 && kWarps <= 32);
+  static constexpr int kWarps = kWarpsOfBlock, kThreads = 32 * kWarps;
+  static constexpr int kBlocks = kTaken ? 1 : kGroups * kWarpsOfGroup / kWarps;
+  static_assert((kLanes & (kLanes - 1)) == 0 && kLanes <= 32 && kGroups * kWarpsOfGroup % kWarps == 0 && kWarps <= 32);
   static constexpr int kPixels = 32 / kLanes;  ///< of a group
   static constexpr int kWide = kPixels == 32 ? 8 : kPixels >= 8 ? 4 : kPixels >= 2 ? 2 : 1, kHigh = kPixels / kWide;
   static constexpr int kColumns = kSide / kWide;  ///< groups side by side
@@ -39,7 +41,7 @@ struct CellLayout {
   /// This warp's group.
   __device__ static int group() {
     if constexpr (kTaken) return taken_group();
-    return int(blockIdx.x) % kBlocks * kWarps + int(threadIdx.x) / 32;
+    return (int(blockIdx.x) % kBlocks * kWarps + int(threadIdx.x) / 32) / kWarpsOfGroup;
   }
   /// The place of the group's pixel i among the tile's, row by row, whatever the layout.
   __device__ static int pixel_number(int i) {
@@ -103,7 +105,7 @@ template <class F> __device__ auto cell_terms(const Splat<F, float>& splat, cons
 
 /// A lane's samples on their way through a list. `kTogether`: the samples of a pixel are neighbours in a checkpoint, as
 /// they are among the lanes of warps with few pixels; else the pixels of a sample are.
-template <class F, class Layout, bool kTogether = false> struct MovingSamples {
+template <class F, class Layout, bool kTogether = (Layout::kSide < kMovingTile)> struct MovingSamples {
   static constexpr int kCells = Layout::kCells;
   float transmittance[kCells];
   Vec2<float> place[kCells];  ///< of the node in its cell
@@ -232,7 +234,7 @@ template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kPlac
 };
 
 /// A lane's share of blending a pixel. kKeep: what the backward pass needs is kept.
-template <class F, int C, class Layout, bool kKeep, bool kTogether = false> struct MovingBlend {
+template <class F, int C, class Layout, bool kKeep, bool kTogether = (Layout::kSide < kMovingTile)> struct MovingBlend {
   static constexpr int kCells = Layout::kCells;
   MovingSamples<F, Layout, kTogether> samples;
   CellCorners<F, Layout> corners;
@@ -359,21 +361,16 @@ __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThr
   blend.write(params, first, pixel);
 }
 
+/// Lanes of a pixel that has a lane for each sample.
+template <class F> inline constexpr int kLanesOfPixel = F::kSamples == 9 ? 16 : F::kSamples;
+
 /// Samples shared out so that there is least to do, forwards and backwards, in tiles of the size of moving_grid(), for
 /// lists that are not cut. In small images none is walked as a whole unless there are more pairs than room.
 template <class F, bool kBackward, int kSide>
 using EvenLayout =
-    std::conditional_t<F::kSamples == 1, CellLayout<1, 1, kSide>,
+    std::conditional_t<F::kSamples == 1 || (kSide < kMovingTile), CellLayout<1, kLanesOfPixel<F>, kSide>,
                        std::conditional_t<F::kSamples == 4, CellLayout<2, 2>,
                                           std::conditional_t<F::kSamples == 9 && !kBackward, CellLayout<5, 2>,
                                                              CellLayout<(F::kSamples + 3) / 4, 4>>>>;
-
-/// Calls `visit` with the side of the tiles of moving_grid() as a constant.
-template <class F, class Visit> void with_moving_side(TileGrid grid, Visit&& visit) {
-  if constexpr (F::kSamples == 1) {
-    if (grid.side() == kTile) return visit(std::integral_constant<int, kTile>());
-  }
-  visit(std::integral_constant<int, kMovingTile>());
-}
 
 }  // namespace ar::cuda

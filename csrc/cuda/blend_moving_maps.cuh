@@ -70,19 +70,17 @@ template <class F, int kTilePixels> struct MapMemory {
 /// Groups of a segment for each warp of its block (blend_moving_segments.cuh). With one cell, whose tiles of 8x8 pixels
 /// have two groups, a block of one warp would take too long.
 inline constexpr int kMostGroupsOfWarp = 2;
-template <class F> inline constexpr int kGroupsOfWarp = F::kSamples == 1 ? 1 : kMostGroupsOfWarp;
+template <class F, int kSide>
+inline constexpr int kGroupsOfWarp = F::kSamples == 1 || kSide < kMovingTile ? 1 : kMostGroupsOfWarp;
 
 /// Samples shared out for segments, of which there are many, with small splats: few pixels per warp. A single sample
 /// has a lane, so that none is idle.
 template <class F, int kSide>
-using SegmentLayout = CellLayout<F::kSamples <= 4 ? 1 : 2,
-                                 F::kSamples == 1   ? 1
-                                 : F::kSamples == 4 ? 4
-                                                    : 8,
-                                 kSide>;
+using SegmentLayout = std::conditional_t<(F::kSamples <= 4 || kSide < kMovingTile),
+                                         CellLayout<1, kLanesOfPixel<F>, kSide>, CellLayout<2, 8, kSide>>;
 /// The same, whose groups are taken, by fewer warps.
 template <class F, int kSide, class Cells = SegmentLayout<F, kSide>>
-using TakenLayout = CellLayout<Cells::kCells, Cells::kLanes, kSide, Cells::kGroups / kGroupsOfWarp<F>, true>;
+using TakenLayout = CellLayout<Cells::kCells, Cells::kLanes, kSide, Cells::kGroups / kGroupsOfWarp<F, kSide>, true>;
 
 /// Samples shared out for the maps of segments, which no lanes add up: with many cells a sample to a lane, so that a
 /// warp has few pixels and passes over more splats; and in small blocks, since warps do not have equally much to do.

@@ -53,9 +53,9 @@ __device__ void write_pairs(const BlendVjpParams& params, int first, bool with_m
 /// What a block keeps in shared memory. Sums of a pair: PairGrad, C channels, MeanSums.
 template <class F, int C, class Layout> struct MovingVjpShared {
   static constexpr int kMeans = 6 + C, kSums = kMeans + 2;
-  /// Splats that a block takes between barriers: two chunks with one cell. With more cells one, which leaves more
-  /// shared memory for the places of samples.
-  static constexpr int kBatch = F::kSamples == 1 ? 2 * kStateChunk : kStateChunk, kChunks = kBatch / kStateChunk;
+  /// Splats that a block takes between barriers: two chunks with one cell of a lane. With more cells one, which leaves
+  /// more shared memory for the places of samples.
+  static constexpr int kBatch = Layout::kCells == 1 ? 2 * kStateChunk : kStateChunk, kChunks = kBatch / kStateChunk;
   MovingStage<F, C, Layout, kBatch> stage;
   float sums[Layout::kWarps][kBatch][kSums];  ///< of a warp's pixels
   uint32_t hits[Layout::kWarps][kChunks];     ///< splats that have sums of a warp

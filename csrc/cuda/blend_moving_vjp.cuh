@@ -20,11 +20,12 @@
 namespace ar::cuda {
 
 /// Blocks that an SM should hold: bounds the registers, as waiting for the samples in front costs more than a few
-/// numbers in memory. With many cells in whole lists fewer, since the caches do not hold the places of all those.
+/// numbers in memory. With more than two cells of a lane in whole lists fewer, since the caches do not hold the places
+/// of all those.
 template <class F, int C, class Layout, int kSegment>
-inline constexpr int kMovingVjpBlocks = std::max(1, (C > 3                              ? 512
-                                                     : F::kSamples > 4 && kSegment == 0 ? 768
-                                                                                        : 1024) /
+inline constexpr int kMovingVjpBlocks = std::max(1, (C > 3                                 ? 512
+                                                     : Layout::kCells > 2 && kSegment == 0 ? 768
+                                                                                           : 1024) /
                                                         Layout::kThreads);
 
 /// Where a lane's samples are in front of each splat of a chunk that reaches its warp. Those in front of the first few

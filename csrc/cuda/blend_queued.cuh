@@ -2,7 +2,8 @@
 //
 // Each pixel of a warp has a queue of the splats that reach it, and takes the next ones when it has composited those
 // before, wherever in the tile's list they are: it does not wait for splats that reach only its neighbours. Several
-// lanes have the same sample.
+// lanes have the same sample. Where the last pixels of a picture would be waited for, the warps of a block share the
+// samples of one.
 #pragma once
 
 #include "cuda/blend_moving.cuh"
@@ -10,19 +11,43 @@
 
 namespace ar::cuda {
 
-/// A warp of kPixelsOfWarp pixels. Of its lanes a sample has several, kAhead, which are neighbours. The last lanes of a
-/// warp may be left over, and have none.
-template <class F, int kSide, int kPixelsOfWarp> struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, 1> {
-  using Base = CellLayout<1, 32 / kPixelsOfWarp, kSide, 1>;
-  static constexpr int kAhead = Base::kLanes / F::kSamples;  ///< lanes of a sample
-  static_assert(kAhead > 0 && (Base::kLanes % F::kSamples == 0 || Base::kLanes == 32));
-  __device__ static int first_sample() { return lane_id() % Base::kLanes / kAhead; }
+/// A warp of kPixelsOfWarp pixels, or one pixel for the kWarpsOfPixel warps of a block, each with its own samples. Of
+/// the lanes of a warp a sample has several, kAhead, which are neighbours. The last lanes may be left over, and have
+/// none, and so may the last warp.
+template <class F, int kSide, int kPixelsOfWarp, int kWarpsOfPixel = 1>
+struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, false, kWarpsOfPixel> {
+  using Base = CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, false, kWarpsOfPixel>;
+  /// Samples that a warp has of a pixel, and lanes of a sample.
+  static constexpr int kOfWarp = (F::kSamples + kWarpsOfPixel - 1) / kWarpsOfPixel, kAhead = Base::kLanes / kOfWarp;
+  static_assert(kAhead > 0 && (Base::kLanes % kOfWarp == 0 || Base::kLanes == 32));
+  static_assert(kWarpsOfPixel == 1 || kPixelsOfWarp == 1);
+  /// Places for staged splats: 32, and some behind them, which hold none, as the lanes of a sample look at kAhead at
+  /// once.
+  static constexpr int kPlaces = (32 + kAhead - 1) / kAhead * kAhead;
+  __device__ static int first_sample() {
+    const int of_warp = lane_id() % Base::kLanes / kAhead;
+    return of_warp < kOfWarp ? int(threadIdx.x) / 32 % kWarpsOfPixel * kOfWarp + of_warp : F::kSamples;
+  }
   /// This lane's place among those of its sample.
   __device__ static int ahead() { return lane_id() % kAhead; }
   __device__ static bool owns() { return ahead() == 0; }
   /// The lanes of this lane's sample, and the first of them.
   __device__ static uint32_t sharers() { return (kAllLanes >> (32 - kAhead)) << first_sharer(); }
   __device__ static int first_sharer() { return lane_id() / kAhead * kAhead; }
+  /// The sum over the lanes of a pixel, in each of them. All threads must call it.
+  __device__ static float sum_lanes(float x) {
+    x = Base::sum_lanes(x);
+    if constexpr (kWarpsOfPixel > 1) {
+      __shared__ float of_warp[kWarpsOfPixel];
+      __syncthreads();  // all have read the last sum
+      if (lane_id() == 0) of_warp[threadIdx.x / 32] = x;
+      __syncthreads();
+      x = of_warp[0];
+#pragma unroll
+      for (int warp = 1; warp < kWarpsOfPixel; ++warp) x += of_warp[warp];
+    }
+    return x;
+  }
   /// The largest x of these lanes. All lanes must call it.
   __device__ static int max_of_sharers(int x) {
 #pragma unroll
@@ -32,10 +57,10 @@ template <class F, int kSide, int kPixelsOfWarp> struct AheadLayout : CellLayout
   }
 };
 
-/// Where the bits of a pixel of a tile of kPixels pixels are: that of pair k is bit k % 32 of word k / 32. `first`: of
-/// the segments of the tile's list.
-template <class F, int kPixels> __device__ int64_t pixel_words(int first, const TileList& list, int pixel_number) {
-  constexpr int kSegment = moving_segment(F::kSamples);
+/// Where the bits of a pixel of a tile of kSide x kSide pixels are: that of pair k is bit k % 32 of word k / 32.
+/// `first`: of the segments of the tile's list.
+template <class F, int kSide> __device__ int64_t pixel_words(int first, const TileList& list, int pixel_number) {
+  constexpr int kPixels = kSide * kSide, kSegment = moving_segment(F::kSamples, kSide);
   const int segments = (list.count + kSegment - 1) / kSegment;
   return (int64_t(first) * kPixels + pixel_number * segments) * (kSegment / 32);
 }
@@ -124,11 +149,9 @@ template <class Layout> struct PairQueues {
 };
 
 /// The splats that each pixel of a warp is about to composite, and the queues that they come from.
-template <class F, int C> struct QueuedStage {
-  /// With nine samples the three lanes of each look beyond the last of 32, at what no lane is to composite.
-  static constexpr int kSplats = 32 % F::kSamples == 0 ? 32 : 34;
-  TileSplat<F, C> splats[kSplats];
-  int32_t pairs[kSplats];
+template <class F, int C, int kPlaces> struct QueuedStage {
+  TileSplat<F, C> splats[kPlaces];
+  int32_t pairs[kPlaces];
   int32_t queues[kQueued];
 };
 
@@ -251,7 +274,7 @@ __device__ void blend_queued(const BlendParams& params, int first, int tile, con
   MovingBlend<F, C, Layout, kKeep, true> blend(p, pixel.inside);
   CheckpointsAhead<kSegment> checkpoints = {kStateChunk, params.checkpoints + places.first * blend.samples.kCheckpoint};
   using Queues = PairQueues<Layout>;
-  const int64_t words = pixel_words<F, Layout::kTilePixels>(first_segment, list, Layout::pixel_number());
+  const int64_t words = pixel_words<F, Layout::kSide>(first_segment, list, Layout::pixel_number());
   Queues queues(reinterpret_cast<typename Queues::Memory&>(stage.queues), params.reach_words + words,
                 pixel.inside ? list.count : 0);
   // While splats are composited, those behind them are read, and before that which ones these are.

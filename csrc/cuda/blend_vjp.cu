@@ -28,7 +28,7 @@ __global__ void clear_sums_kernel(const BlendVjpParams params, int first, int wi
 template <class F, int C, int kSide>
 void launch_segments_vjp(const BlendVjpParams& p, const ListCut& cut, int first, cudaStream_t stream) {
   using Maps = MapLayout<F, kSide>;
-  constexpr int kSegment = moving_segment(F::kSamples);
+  constexpr int kSegment = moving_segment(F::kSamples, kSide);
   const auto segments = unsigned(cut.max_segments), lists = unsigned(cut.max_lists);
   const LaunchShape maps = {segments * Maps::kBlocks, Maps::kThreads};
   launch(segment_maps_kernel<F, C, kSide, kSegment>, maps, stream, p, first);
@@ -62,7 +62,7 @@ int64_t max_group_sums(int footprint, const ListCut& cut, TileGrid grid) {
   visit_footprint(footprint, Footprints{}, [&](auto f) {
     using F = decltype(f);
     if constexpr (F::kMoves) {
-      with_moving_side<F>(grid, [&](auto px) {
+      with_tile_side<F>(grid, [&](auto px) {
         using Layout = TakenLayout<F, decltype(px)::value>;
         if (!kSumsInside<Layout>) pairs = kSegmentBatch<Layout>;
       });
@@ -87,7 +87,7 @@ void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t s
   visit_tile_footprints<AdaptiveBoxesVjp>(footprint, stream, [&](auto f, cudaStream_t side) {
     using F = decltype(f);
     if constexpr (F::kMoves) {
-      with_moving_side<F>(p.grid, [&](auto px) { blend_vjp_moving<F, decltype(px)::value>(p, first, side); });
+      with_tile_side<F>(p.grid, [&](auto px) { blend_vjp_moving<F, decltype(px)::value>(p, first, side); });
     } else {
       if constexpr (!F::kYardstick) {
         if (!p.channels.data) return blend_vjp_few<F, 3>(p, side);

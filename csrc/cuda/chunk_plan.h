@@ -32,7 +32,7 @@ struct ListCut {
   int at_least = 0, shares = 1, segment = 0;
   /// Segments and lists for which there is memory: for all that may be cut. Without any no list is.
   int max_segments = 0, max_lists = 0;
-  /// Lists of so many pairs, a power of two, are counted among the longest.
+  /// Lists of so many pairs, a power of two, or more are counted among the longest; 0: all that are long.
   int longest_from = kNoList;
 
   /// The most segments that are made where all lists together have so many pairs. If the long lists need more, only the

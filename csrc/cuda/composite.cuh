@@ -323,6 +323,16 @@ __device__ inline void put_sum(float* rows, int width, bool of_cell, int32_t row
   }
 }
 
+/// Calls `visit` with the side of the grid's tiles, one of those that F has, as a constant.
+template <class F, class Visit> void with_tile_side(TileGrid grid, Visit&& visit) {
+  constexpr int kLarge = 1 << (F::kMoves ? moving_tile_bits(F::kSamples, false) : kTileBits);
+  constexpr int kSmall = 1 << (F::kMoves ? moving_tile_bits(F::kSamples, true) : kTileBits);
+  if constexpr (kLarge != kSmall) {
+    if (grid.side() == kLarge) return visit(std::integral_constant<int, kLarge>());
+  }
+  visit(std::integral_constant<int, kSmall>());
+}
+
 /// Calls f(F{}, stream) for the footprint F of every kind of tile: where samples are chosen those of Boxes, side by
 /// side, as a few tiles of many samples would else keep the device waiting.
 template <class F, class Boxes, class Function> void for_each_tile_footprint(cudaStream_t stream, Function&& f) {

@@ -23,30 +23,37 @@ struct ListSegment {
   __device__ int first() const { return number - index; }
 };
 
-/// Pairs of a segment where `samples` samples move. Longer ones need fewer maps, which count where there are many
-/// samples; shorter ones fill a device with smaller scenes.
-AR_HD constexpr int moving_segment(int samples) { return samples == 1 ? 256 : samples <= 4 ? 512 : 1024; }
+/// Pairs of a segment where `samples` samples move, in tiles of side x side pixels. Longer ones need fewer maps, which
+/// count where there are many samples; shorter ones fill a device with smaller scenes.
+AR_HD constexpr int moving_segment(int samples, int side) {
+  if (samples == 1 || side < kMovingTile) return 256;
+  return samples <= 4 ? 512 : 1024;
+}
 
-/// In small images all lists are cut: their few tiles have long ones, and the time is that of the longest. Large ones
-/// have many tiles that keep a device busy, and to cut a list takes more work than to walk it. There only those are cut
+/// In small images all lists are cut: their few tiles have long ones, and the time is that of the longest. Not so if
+/// tiles are small, and four times as many.
+inline bool cuts_all_lists(TileGrid grid) { return is_small_image(grid) && grid.tile_bits >= kMovingTileBits; }
+
+/// Elsewhere many tiles keep a device busy, and to cut a list takes more work than to walk it. There only those are cut
 /// that a block would still walk when all others have ended. A large device holds 528 blocks of 256 threads at once,
 /// four on each of 132 multiprocessors, and each of them walks 1/528 of the pairs. So the limit is kLongList, doubled
 /// until it is at least pairs / kBlocksAtOnce.
 inline constexpr int kLongList = 4096;
 inline constexpr int kBlocksAtOnce = 528;
-/// Lists of so many pairs would outlast all others in the forward pass if a warp took several of their pixels. So it
-/// takes one, each of whose samples has several lanes.
-inline constexpr int kLongestList = 16384;
+/// Lists of so many pairs or more would outlast all others in the forward pass if a warp took several of their pixels.
+/// So it takes one, or some samples of one, each of which has many lanes. With more than four samples that is so for all
+/// lists that are cut.
+AR_HD constexpr int longest_list(int samples) { return samples <= 4 ? 16384 : 0; }
 
 inline ListCut moving_list_cut(int samples, int64_t capacity, TileGrid grid) {
-  const int length = moving_segment(samples);
-  const int64_t segments = capacity / length, lists = capacity / kLongList;
-  if (is_small_image(grid)) return {true, 0, 1, length, int(segments + grid.tiles()), int(grid.tiles()), kLongestList};
-  if (lists == 0) return {true};
+  const int length = moving_segment(samples, grid.side()), tiles = int(grid.tiles());
+  const int64_t segments = capacity / length;
+  if (cuts_all_lists(grid)) return {true, 0, 1, length, int(segments + tiles), tiles, longest_list(samples)};
+  if (capacity < kLongList) return {true};
   ListCut cut = {true, kLongList, kBlocksAtOnce, length};
-  cut.longest_from = kLongestList;
+  cut.longest_from = longest_list(samples);
   cut.max_segments = int(cut.segment_limit(capacity));
-  cut.max_lists = int(std::min<int64_t>(cut.max_segments / (kLongList / length), grid.tiles()));
+  cut.max_lists = std::min(cut.max_segments / (kLongList / length), tiles);
   return cut;
 }
 

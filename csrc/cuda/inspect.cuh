@@ -1,28 +1,33 @@
 // Kernel of inspect: statistics of every pixel (core/inspect.h), and of every Gaussian over all pixels.
 #pragma once
 
+#include <algorithm>
+
 #include "core/inspect.h"
 #include "cuda/composite.cuh"
 #include "cuda/launch.cuh"
 
 namespace ar::cuda {
 
-/// A block per tile of 2^kBits pixels a side, a warp per subtile. Of the subtiles of a large tile a small one has those
-/// in the first column of the upper half.
-template <class F, int kBits>
-__global__ void __launch_bounds__(1 << 2 * kBits) inspect_kernel(const InspectParams params) {
+/// Threads for a tile of kSide x kSide pixels.
+template <int kSide> inline constexpr int kInspectThreads = std::max(32, kSide* kSide);
+
+/// A block per tile of kSide x kSide pixels, a warp per subtile. Of the subtiles of a large tile a small one has those
+/// in the first column of the upper half; the smallest has a part of one.
+template <class F, int kSide>
+__global__ void __launch_bounds__(kInspectThreads<kSide>) inspect_kernel(const InspectParams params) {
   wait_for_earlier_kernels();
-  constexpr int kThreads = 1 << 2 * kBits;
+  constexpr int kThreads = kInspectThreads<kSide>;
   __shared__ Stage<F, 0, kThreads> stage;
   __shared__ int32_t ids[kThreads];
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
-  const int tile = int(blockIdx.x), subtile = int(threadIdx.x) / 32 * (kBits < kTileBits ? 2 : 1);
+  const int tile = int(blockIdx.x), subtile = int(threadIdx.x) / 32 * (kSide < kTile ? 2 : 1);
   const int lane = lane_id();
   if (!has_samples<F::kSamples>(params.lists, tile)) return;
   const TileList list = list_of(params.lists, params.grid, tile);
   const Vec2<float> p = pixel_of(subtile, lane);
   const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
-  const bool inside = x < params.grid.width && y < params.grid.height;
+  const bool inside = max(p.x, p.y) < kSide && x < params.grid.width && y < params.grid.height;
   PixelSummary<float, F> pixel;
   pixel.start(inside);
   for (int k = 0; k < list.count && __syncthreads_or(pixel.open()); k += kThreads) {
@@ -55,13 +60,10 @@ __global__ void __launch_bounds__(1 << 2 * kBits) inspect_kernel(const InspectPa
 }
 
 template <class F> void launch_inspect(const InspectParams& p, cudaStream_t stream) {
-  const LaunchShape shape = {unsigned(p.grid.tiles()), unsigned(p.grid.side() * p.grid.side())};
-  if (F::kMoves && p.grid.tile_bits == kMovingTileBits) {
-    launch(inspect_kernel < F, F::kMoves ? kMovingTileBits : kTileBits >, shape, stream, p);
-  } else {
-    constexpr bool kLarge = moving_tile_bits(F::kSamples, false) == kTileBits;
-    launch(inspect_kernel < F, !F::kMoves || kLarge ? kTileBits : kMovingTileBits >, shape, stream, p);
-  }
+  with_tile_side<F>(p.grid, [&](auto px) {
+    constexpr int kSide = decltype(px)::value;
+    launch(inspect_kernel<F, kSide>, {unsigned(p.grid.tiles()), kInspectThreads<kSide>}, stream, p);
+  });
 }
 
 }  // namespace ar::cuda

@@ -8,6 +8,13 @@
 
 namespace ar::cuda {
 
+/// When the pairs of a frame are counted, for which the host has to wait for the device.
+enum class Counting {
+  kNever,     ///< there is no room, 0, where nothing at all is known
+  kIfNeeded,  ///< where it is better than a guess
+  kAlways,
+};
+
 /// Remembers the frames of one grid of tiles. A frame that turns out to have more pairs than there is room for is slow,
 /// not wrong, so the first frames are counted, and wait for the device; afterwards the largest frame so far, and a
 /// reserve, are room enough in all but the rarest cases. The number of Gaussians may change from frame to frame: with
@@ -21,10 +28,10 @@ class PairGuess {
   /// Frames that are counted after one that had more pairs than room.
   static constexpr int kRecountedFrames = 8;
 
-  /// Room for frame `frame`, at most `most`, or 0: count its pairs. Without `may_wait` frames are counted only where
-  /// nothing at all is known.
-  int64_t capacity(uint32_t frame, int64_t gaussians, int64_t most, bool may_wait) {
-    if (most_gaussians_ < 0 || (may_wait && to_count_ > 0)) return 0;
+  /// Room for frame `frame`, at most `most`, or 0: count its pairs.
+  int64_t capacity(uint32_t frame, int64_t gaussians, int64_t most, Counting counting) {
+    if (most_gaussians_ < 0 || counting == Counting::kAlways) return 0;
+    if (counting == Counting::kIfNeeded && to_count_ > 0) return 0;
     double pairs = double(largest_);
     if (gaussians > most_gaussians_) pairs *= double(gaussians) / double(std::max<int64_t>(most_gaussians_, 1));
     const double room = std::max(1.25 * pairs, 1.125 * double(gaussians)) + kReserve;
@@ -85,7 +92,7 @@ class PairGuesses {
   };
 
   /// `most`: pairs that the frame can have, at least as many as Gaussians.
-  Frame begin(int device, TileGrid grid, int64_t gaussians, int64_t most, bool may_wait) {
+  Frame begin(int device, TileGrid grid, int64_t gaussians, int64_t most, Counting counting) {
     const int slot = slot_of(device, grid);
     Slot& s = slots_[slot];
     s.used = ++uses_;
@@ -94,9 +101,10 @@ class PairGuesses {
     const uint32_t written = uint32_t(word >> 32);
     // Numbers go round; a slot's are those since it was given away.
     if (written != 0 && int32_t(written - s.first_frame) >= 0) s.guess.reported(written, int64_t(word & 0xffffffff));
-    Frame frame = {slot, frame_, std::max(forced_, gaussians), words_ + slot};
-    if (forced_ == 0) frame.capacity = s.guess.capacity(frame_, gaussians, most, may_wait);
-    return frame;
+    const bool is_forced = forced_ > 0 && counting != Counting::kAlways;
+    return {slot, frame_,
+            is_forced ? std::max(forced_, gaussians) : s.guess.capacity(frame_, gaussians, most, counting),
+            words_ + slot};
   }
 
   /// What counting the pairs of a frame gave.
@@ -105,7 +113,7 @@ class PairGuesses {
     if (int32_t(frame.number - s.first_frame) >= 0) s.guess.counted(gaussians, pairs);
   }
 
-  /// Makes this room from now on, or that for a pair of each Gaussian, whatever was seen; 0: begins anew.
+  /// Makes this room from now on, or that for a pair of each Gaussian, where a frame is not counted; 0: begins anew.
   void force(int64_t capacity) {
     forced_ = capacity;
     for (Slot& s : slots_) s = Slot{};

@@ -120,8 +120,8 @@ template <int kBits, class Value> struct SortShared {
   uint32_t block;
 };
 
-/// One pass. There are *count items, none if these are more than `capacity`. `kFirst`: their keys are among `capacity`
-/// ones, the others of which are kNoKey, and their values are the places of their keys.
+/// One pass. There are *count items, at most `capacity`. `kFirst`: their keys are among `capacity` ones, the others of
+/// which are kNoKey, and their values are the places of their keys.
 ///
 /// `may_skip`: where all items have the same last digit, the last pass ends at once, and those before it have their two
 /// arrays of values in turn the other way round, so that the result is where the last pass would leave it.
@@ -138,7 +138,7 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads, Digits<kBits>::kBlock
   const bool has_digit = t < kBins;  // digit t
   if (t == 0) shared.block = atomicAdd(&scratch.tickets[pass], 1);
   const uint32_t of_all = has_digit ? scratch.histograms[pass * kBins + t] : 0;
-  const int64_t items = *count, n = items > capacity ? 0 : kFirst ? capacity : items;
+  const int64_t items = *count, n = kFirst ? capacity : items;
   uint32_t* counts = shared.counts[warp];
   for (int digit = lane; digit < kBins; digit += 32) counts[digit] = 0;
   const uint32_t* last = scratch.histograms + (scratch.passes - 1) * kBins;

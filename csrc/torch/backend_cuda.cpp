@@ -20,10 +20,6 @@
 namespace ar::ops {
 namespace {
 
-/// From so many Gaussians on, frames of samples that move are always counted for a backward pass: their checkpoints
-/// take hundreds of bytes per pair that there is room for, and to wait for the count takes little of such a frame.
-constexpr int64_t kCountedGaussians = 1 << 23;
-
 class CudaBackend final : public Backend {
  public:
   explicit CudaBackend(const Tensor& like)
@@ -83,15 +79,14 @@ class CudaBackend final : public Backend {
     // An image that cannot be made raises here, before anything is counted for it.
     TORCH_CHECK_VALUE(grid.tiles() < std::numeric_limits<int32_t>::max() / cuda::kSampleClasses,
                       "the image has too many tiles: ", grid.tiles());
-    const bool capturing = is_capturing(stream_);
+    const cuda::Counting counting = counting_of(pass, n, stream_);
     const int64_t most = std::clamp<int64_t>(n, 1, cuda::max_items() / grid.tiles() + 1) * grid.tiles();
     auto& guesses = SharedGuesses::instance();
     const auto frame = guesses.use([&](cuda::PairGuesses& g) {
-      return g.begin(floats_.device().index(), grid, n, std::min(most, cuda::max_items()), !capturing);
+      return g.begin(floats_.device().index(), grid, n, std::min(most, cuda::max_items()), counting);
     });
-    const bool many = footprint.moves && pass.keep && n >= kCountedGaussians && !capturing;
-    int64_t capacity = pass.exact || many ? 0 : frame.capacity;
-    TORCH_CHECK(capacity > 0 || !capturing,
+    int64_t capacity = frame.capacity;
+    TORCH_CHECK(capacity > 0 || !is_capturing(stream_),
                 "a frame of this size must have been rendered before it is captured in a CUDA graph, without "
                 "torch.use_deterministic_algorithms");
     const auto make_pair_memory = [&] { return make_memory<PairMemory>(bytes_, capacity, grid, pass.keep); };

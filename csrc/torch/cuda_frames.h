@@ -7,6 +7,7 @@
 #include <mutex>
 
 #include "cuda/pair_guess.h"
+#include "torch/backend.h"
 #include "torch/pointers.h"
 
 namespace ar::ops {
@@ -37,6 +38,17 @@ inline bool is_capturing(cudaStream_t stream) {
   cudaStreamCaptureStatus status = cudaStreamCaptureStatusNone;
   C10_CUDA_CHECK(cudaStreamIsCapturing(stream, &status));
   return status != cudaStreamCaptureStatusNone;
+}
+
+/// From so many Gaussians on, frames of samples that move are always counted for a backward pass: their checkpoints
+/// take hundreds of bytes per pair that there is room for, and to wait for the count takes little of such a frame.
+inline constexpr int64_t kCountedGaussians = 1 << 23;
+
+inline cuda::Counting counting_of(const Pass& pass, int64_t gaussians, cudaStream_t stream) {
+  if (pass.exact) return cuda::Counting::kAlways;
+  if (is_capturing(stream)) return cuda::Counting::kNever;
+  const bool many = pass.footprint.moves && pass.keep && gaussians >= kCountedGaussians;
+  return many ? cuda::Counting::kAlways : cuda::Counting::kIfNeeded;
 }
 
 /// A pair of events, made when the first time is asked for.

@@ -16,8 +16,8 @@ class Renderer {
   explicit Renderer(int width = 640, int lag = 2) : width_(width), lag_(lag) {}
 
   /// Room for a frame with so many pairs; 0 if they were counted.
-  int64_t frame(int64_t gaussians, int64_t pairs, bool may_wait = true) {
-    const PairGuesses::Frame frame = guesses.begin(0, {width_, 480}, gaussians, kMost, may_wait);
+  int64_t frame(int64_t gaussians, int64_t pairs, Counting counting = Counting::kIfNeeded) {
+    const PairGuesses::Frame frame = guesses.begin(0, {width_, 480}, gaussians, kMost, counting);
     queue_.push_back({frame, pairs});
     if (frame.capacity == 0) guesses.counted(frame, gaussians, pairs);
     while (queue_.size() > size_t(frame.capacity == 0 ? 0 : lag_)) write_next();
@@ -99,50 +99,60 @@ TEST(PairGuessTest, GrowsInProportionOnlyUntilTheDeviceHasSpoken) {
 
 TEST(PairGuessTest, WaitsOnlyWhereItMay) {
   Renderer renderer;
-  EXPECT_EQ(renderer.guesses.begin(0, {640, 480}, 1000, kMost, false).capacity, 0) << "nothing is known";
+  EXPECT_EQ(renderer.guesses.begin(0, {640, 480}, 1000, kMost, Counting::kNever).capacity, 0) << "nothing is known";
   renderer.frame(1000, 1000000);
-  EXPECT_GE(renderer.frame(1000, 1000000, false), 1250000);
+  EXPECT_GE(renderer.frame(1000, 1000000, Counting::kNever), 1250000);
   EXPECT_EQ(renderer.frame(1000, 1000000), 0);
+}
+
+TEST(PairGuessTest, ALargerFrameThatIsCountedAnywayIsNoReasonToCountOthers) {
+  Renderer renderer;
+  renderer.count_frames(1000, 1000000);
+  EXPECT_EQ(renderer.frame(1000, 100000000, Counting::kAlways), 0);
+  for (int frame = 0; frame < 10; ++frame) EXPECT_GE(renderer.frame(1000, 1000000), 125000000);
 }
 
 TEST(PairGuessTest, NeverExceedsTheMost) {
   Renderer renderer;
   for (int frame = 0; frame < 2 * PairGuess::kCountedFrames; ++frame)
-    EXPECT_LE(renderer.guesses.begin(0, {640, 480}, 10, 1 << 20, true).capacity, 1 << 20);
+    EXPECT_LE(renderer.guesses.begin(0, {640, 480}, 10, 1 << 20, Counting::kIfNeeded).capacity, 1 << 20);
   renderer.count_frames(10, (int64_t(1) << 32) - 1);
-  EXPECT_EQ(renderer.guesses.begin(0, {640, 480}, 10, 1 << 20, false).capacity, 1 << 20);
+  EXPECT_EQ(renderer.guesses.begin(0, {640, 480}, 10, 1 << 20, Counting::kNever).capacity, 1 << 20);
 }
 
 TEST(PairGuessTest, KeepsTheSizesUsedLast) {
   Renderer renderer;
   renderer.count_frames(1000, 1000000);
-  for (int width = 1; width < PairGuesses::kSlots; ++width) renderer.guesses.begin(0, {width, 480}, 10, kMost, true);
+  for (int width = 1; width < PairGuesses::kSlots; ++width)
+    renderer.guesses.begin(0, {width, 480}, 10, kMost, Counting::kIfNeeded);
   EXPECT_GT(renderer.frame(1000, 1000000), 0) << "there was a slot for each";
-  for (int width = 1; width <= PairGuesses::kSlots; ++width) renderer.guesses.begin(0, {width, 480}, 10, kMost, true);
+  for (int width = 1; width <= PairGuesses::kSlots; ++width)
+    renderer.guesses.begin(0, {width, 480}, 10, kMost, Counting::kIfNeeded);
   EXPECT_EQ(renderer.frame(1000, 1000000), 0) << "its slot was given away";
 }
 
 TEST(PairGuessTest, AWriteThatComesLateIsNotOfTheSlotsNewSize) {
   Renderer renderer;
   renderer.frame(1000, 1000000);
-  const PairGuesses::Frame late = renderer.guesses.begin(0, {640, 480}, 1000, kMost, false);
-  for (int width = 1; width <= PairGuesses::kSlots; ++width) renderer.guesses.begin(0, {width, 480}, 10, kMost, true);
+  const PairGuesses::Frame late = renderer.guesses.begin(0, {640, 480}, 1000, kMost, Counting::kNever);
+  for (int width = 1; width <= PairGuesses::kSlots; ++width)
+    renderer.guesses.begin(0, {width, 480}, 10, kMost, Counting::kIfNeeded);
   int next = -1;  // the size that has the slot now
   for (int width = 1; width <= PairGuesses::kSlots; ++width) {
-    const PairGuesses::Frame frame = renderer.guesses.begin(0, {width, 480}, 10, kMost, true);
+    const PairGuesses::Frame frame = renderer.guesses.begin(0, {width, 480}, 10, kMost, Counting::kIfNeeded);
     if (frame.slot == late.slot) next = width;
     renderer.guesses.counted(frame, 10, 100);
   }
   ASSERT_GT(next, 0);
   *late.word = uint64_t(late.number) << 32 | 900000000;
-  EXPECT_LE(renderer.guesses.begin(0, {next, 480}, 10, kMost, false).capacity, 200000);
+  EXPECT_LE(renderer.guesses.begin(0, {next, 480}, 10, kMost, Counting::kNever).capacity, 200000);
 }
 
 TEST(PairGuessTest, HasRoomForAPairOfEveryGaussian) {
   Renderer renderer;
   renderer.count_frames(5000000, 1000);  // nearly all of them out of sight
   EXPECT_GE(renderer.frame(5000000, 1000), 5000000);
-  EXPECT_GE(renderer.frame(5000000, 1000, false), 5000000);
+  EXPECT_GE(renderer.frame(5000000, 1000, Counting::kNever), 5000000);
   renderer.guesses.force(64);
   EXPECT_EQ(renderer.frame(1000, 10), 1000);
 }
@@ -152,6 +162,7 @@ TEST(PairGuessTest, ForcedRoomIsForgottenWithAllElse) {
   renderer.count_frames(1000, 1000000);
   renderer.guesses.force(2000);
   EXPECT_EQ(renderer.frame(1000, 1000000), 2000);
+  EXPECT_EQ(renderer.frame(1000, 1000000, Counting::kAlways), 0);
   renderer.guesses.force(0);
   EXPECT_EQ(renderer.frame(1000, 1000000), 0);
 }

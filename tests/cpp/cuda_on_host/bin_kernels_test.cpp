@@ -216,21 +216,6 @@ TEST(BinKernels, PairsByTile) {
   }
 }
 
-/// More pairs than room: none is there to be sorted.
-TEST(BinKernels, NoPairIsSortedAfterAnOverflow) {
-  constexpr int kRoom = 50;
-  std::vector<uint32_t> memory(SortScratch<7>::words(kRoom, 1)), tiles(kRoom, 3), sorted(kRoom);
-  std::vector<int32_t> values(kRoom, 5), sorted_values(kRoom);
-  const SortScratch<7> scratch(memory.data(), kRoom, 1);
-  const int64_t count = kRoom + 1;
-  cuda_on_host::launch(int(scratch.blocks), Digits<7>::kThreads, [&] {
-    sort_pass_kernel<7, int32_t, false>(scratch, 0, false, &count, kRoom, tiles.data(), sorted.data(), values.data(),
-                                        sorted_values.data());
-  });
-  EXPECT_EQ(sorted, std::vector<uint32_t>(kRoom));
-  EXPECT_EQ(sorted_values, std::vector<int32_t>(kRoom));
-}
-
 /// Splats from a fraction of a pixel to the whole image, in an image with more rows of tiles than a warp has lanes.
 std::vector<SplatRow<float>> random_splats(int n, TileGrid grid) {
   using F = Mip;

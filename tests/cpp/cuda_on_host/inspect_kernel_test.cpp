@@ -1,4 +1,4 @@
-// The kernel of inspect, run on the host, in tiles of either size that samples that move have.
+// The kernel of inspect, run on the host, in tiles of every size that samples that move have.
 #include "cuda_on_host.h"
 // After it: kernels.
 #include <gtest/gtest.h>
@@ -20,6 +20,7 @@ struct Looks {
 
 /// Of random splats, all of which are in the list of every tile of 2^kBits pixels a side.
 template <int kBits> Looks inspect_tiles() {
+  constexpr int kSide = 1 << kBits;
   using F = Moment<1>;
   constexpr TileGrid grid = {kWidth, kHeight, kBits};
   std::mt19937 bits(7);
@@ -44,13 +45,12 @@ template <int kBits> Looks inspect_tiles() {
   params.in_front = looks.in_front.data();
   params.dominated = looks.dominated.data();
   params.units = looks.units.data();
-  cuda_on_host::launch(int(grid.tiles()), grid.side() * grid.side(), [&] { inspect_kernel<F, kBits>(params); });
+  cuda_on_host::launch(int(grid.tiles()), kInspectThreads<kSide>, [&] { inspect_kernel<F, kSide>(params); });
   return looks;
 }
 
 /// Every pixel is looked at, and the size of tiles changes nothing but how positions are rounded.
-TEST(InspectKernel, LooksAtEveryPixel) {
-  const Looks small = inspect_tiles<kMovingTileBits>(), large = inspect_tiles<kTileBits>();
+void expect_the_same(const Looks& small, const Looks& large) {
   int different = 0;
   for (int i = 0; i < kWidth * kHeight; ++i) {
     ASSERT_NE(small.median[i], kUnwritten) << i;
@@ -64,6 +64,11 @@ TEST(InspectKernel, LooksAtEveryPixel) {
                 1e-4 * double(small.units[k]) + double(weight_units(0.01f)))
         << k;
   }
+}
+TEST(InspectKernel, LooksAtEveryPixel) {
+  const Looks usual = inspect_tiles<kMovingTileBits>();
+  expect_the_same(usual, inspect_tiles<kTileBits>());
+  expect_the_same(inspect_tiles<kMovingTileBits - 1>(), usual);
 }
 
 }  // namespace

@@ -77,10 +77,10 @@ struct Plan {
 };
 
 /// Whole lists forwards with one layout, back with another. With kSegment > 0 those of `long_from` pairs or more are
-/// cut: forwards into lists of pixels, those of `longest_from` with a warp for each pixel; back into segments of so
-/// many pairs.
+/// cut: forwards into lists of pixels, those of `longest_from` with a warp or more for each pixel; back into segments
+/// of so many pairs.
 template <class F, class Forward, class Backward, int kSegment = 0>
-Results run(Scene<F>& scene, int long_from = 0, int longest_from = kLongestList) {
+Results run(Scene<F>& scene, int long_from = 0, int longest_from = longest_list(F::kSamples)) {
   constexpr int S = F::kSamples, kSide = Forward::kSide;
   static_assert(Backward::kSide == kSide);
   const int tiles = int(scene.grid.tiles());
@@ -95,7 +95,7 @@ Results run(Scene<F>& scene, int long_from = 0, int longest_from = kLongestList)
     if (kSegment == 0) return ListCut{true};
     return ListCut{true, long_from, kMost, segment, int(scene.lists.capacity / segment) + tiles, tiles, longest_from};
   };
-  const ListCut cut = cut_into(moving_segment(S)), cut_back = cut_into(kSegment);
+  const ListCut cut = cut_into(moving_segment(S, kSide)), cut_back = cut_into(kSegment);
   const Plan plan(scene, cut), plan_back(scene, cut_back);
 
   BlendParams blend = {};
@@ -110,14 +110,14 @@ Results run(Scene<F>& scene, int long_from = 0, int longest_from = kLongestList)
   blend.lists = scene.lists;
   blend.plan = plan.view;
   blend.checkpoints = checkpoints.data();
-  std::vector<uint32_t> reach_words(size_t(cut.max_segments) * (moving_segment(S) / 32) * Forward::kTilePixels);
+  std::vector<uint32_t> reach_words(size_t(cut.max_segments) * (moving_segment(S, kSide) / 32) * Forward::kTilePixels);
   blend.reach_words = reach_words.data();
   const auto render = [&](BlendParams p, auto keep) {
     constexpr bool kKeep = decltype(keep)::value;
     if constexpr (kSegment > 0) {
       // Fewer blocks than pieces and tiles.
       cuda_on_host::launch(cut.max_segments / 2, kFilterPiece, [&] { filter_kernel<F, kSide>(p); });
-      cuda_on_host::launch(ListedLayouts<F, kSide>::kOfLongest, 32,
+      cuda_on_host::launch(ListedLayouts<F, kSide>::kOfLongest, 32 * kListedWarps<F>,
                            [&] { listed_blend_kernel<F, kColors, kSide, kKeep, kSegment>(p, 0); });
     }
     cuda_on_host::launch(tiles + 1, Forward::kThreads,
@@ -240,24 +240,37 @@ TYPED_TEST(MovingKernels, AgreeWhateverTheLayouts) {
   expect_same(run<F, Fine, Backward>(scene), fine);
 }
 
-TEST(MovingKernelsOfOneCell, AgreeWhateverTheTiles) {
-  using F = Moment<1>;
-  Scene<F> fine(150, 150, 0.95f), coarse(150, 150, 0.95f, {kWidth, kHeight});
-  const Results a = run<F, EvenLayout<F, false, kMovingTile>, EvenLayout<F, true, kMovingTile>>(fine);
-  const Results b = run<F, EvenLayout<F, false, kTile>, EvenLayout<F, true, kTile>>(coarse);
+/// Tiles of kFine pixels a side, and of twice as many.
+template <class F, int kFine> void expect_same_in_other_tiles(TileGrid fine_grid, TileGrid coarse_grid) {
+  constexpr int kCoarse = 2 * kFine;
+  Scene<F> fine(150, 150, 0.95f, fine_grid), coarse(150, 150, 0.95f, coarse_grid);
+  const Results a = run<F, EvenLayout<F, false, kFine>, EvenLayout<F, true, kFine>>(fine);
+  const Results b = run<F, EvenLayout<F, false, kCoarse>, EvenLayout<F, true, kCoarse>>(coarse);
   EXPECT_EQ(a.last, b.last);
-  for (int i = 0; i < kPixels; ++i) ASSERT_NEAR(a.transmittance[i], b.transmittance[i], kRounding) << i;
+  for (size_t i = 0; i < a.transmittance.size(); ++i)
+    ASSERT_NEAR(a.transmittance[i], b.transmittance[i], kRounding) << i;
   for (size_t i = 0; i < a.image.size(); ++i) ASSERT_NEAR(a.image[i], b.image[i], kRounding) << i;
   const std::vector<double> of_fine = sums_of_splats(fine, a), of_coarse = sums_of_splats(coarse, b);
   for (size_t i = 0; i < of_fine.size(); ++i)
     ASSERT_NEAR(of_coarse[i], of_fine[i], 3 * kRounding * (1 + std::abs(of_fine[i]))) << i;
 }
 
-TEST(MovingKernelsOfOneCell, HaveCoarseTilesForOneCellInLargeImagesOnly) {
+constexpr TileGrid kLargeTiles = {kWidth, kHeight}, kSmallTiles = {kWidth, kHeight, kMovingTileBits - 1};
+TEST(MovingKernelsInOtherTiles, Agree) {
+  expect_same_in_other_tiles<Moment<1>, kMovingTile>(kGrid, kLargeTiles);
+  expect_same_in_other_tiles<Moment<9>, kMovingTile / 2>(kSmallTiles, kGrid);
+  expect_same_in_other_tiles<Moment<16>, kMovingTile / 2>(kSmallTiles, kGrid);
+}
+
+TEST(MovingKernelsInOtherTiles, AreForTheNumberOfCellsAndTheImage) {
   EXPECT_EQ(moving_grid(1, 1920, 1080).side(), kTile);
   EXPECT_EQ(moving_grid(4, 1920, 1080).side(), kMovingTile);
   EXPECT_EQ(moving_grid(1, 512, 512).side(), kTile);
   EXPECT_EQ(moving_grid(1, 512, 504).side(), kMovingTile);
+  EXPECT_EQ(moving_grid(4, 512, 504).side(), kMovingTile);
+  EXPECT_EQ(moving_grid(9, 512, 504).side(), kMovingTile / 2);
+  EXPECT_EQ(moving_grid(16, 512, 512).side(), kMovingTile);
+  EXPECT_EQ(moving_grid(16, 512, 504).side(), kMovingTile / 2);
 }
 
 /// A list of several batches of pairs and segments, in which some samples stay open, and some stop in the midst: as a
@@ -270,9 +283,10 @@ template <class F, int kSide> void expect_same_if_cut(TileGrid grid) {
   EXPECT_GT(*std::max_element(whole.last.begin(), whole.last.end()), std::max(kListedBatch, kQueued));
   const Results short_lists = run<F, Forward, Backward, 64>(scene);
   expect_same(short_lists, whole);
-  expect_same(run<F, Forward, Backward, moving_segment(F::kSamples)>(scene), whole);
+  expect_same(run<F, Forward, Backward, moving_segment(F::kSamples, kSide)>(scene), whole);
   // The long list alone, beside others that are not cut.
   expect_same(run<F, Forward, Backward, 64>(scene, 1024), whole);
+  if (longest_list(F::kSamples) == 0) return;  // all were among the longest
   const Results a_long_list = run<F, Forward, Backward, 64>(scene, 0, 512);
   // Colours are added up by other lanes.
   for (size_t i = 0; i < a_long_list.image.size(); ++i)
@@ -282,8 +296,10 @@ template <class F, int kSide> void expect_same_if_cut(TileGrid grid) {
   EXPECT_EQ(a_long_list.pair_grads, short_lists.pair_grads);
 }
 TYPED_TEST(MovingKernels, AgreeInListsOfPixelsAndSegments) { expect_same_if_cut<TypeParam, kMovingTile>(kGrid); }
-TEST(MovingKernelsOfOneCell, AgreeInListsOfPixelsAndSegmentsOfCoarseTiles) {
-  expect_same_if_cut<Moment<1>, kTile>({kWidth, kHeight});
+TEST(MovingKernelsInOtherTiles, AgreeInListsOfPixelsAndSegments) {
+  expect_same_if_cut<Moment<1>, kTile>(kLargeTiles);
+  expect_same_if_cut<Moment<9>, kMovingTile / 2>(kSmallTiles);
+  expect_same_if_cut<Moment<16>, kMovingTile / 2>(kSmallTiles);
 }
 
 /// No two tiles have a checkpoint in the same place, or one beyond the room for all.

@@ -181,6 +181,8 @@ TEST(BlockReach, HasTheWarpOfEachPixel) {
   expect_the_warps_of_all_layouts<Moment<4>, kMovingTile>();
   expect_the_warps_of_all_layouts<Moment<9>, kMovingTile>();
   expect_the_warps_of_all_layouts<Moment<16>, kMovingTile>();
+  expect_the_warps_of_all_layouts<Moment<9>, kMovingTile / 2>();
+  expect_the_warps_of_all_layouts<Moment<16>, kMovingTile / 2>();
 }
 
 }  // namespace
