@@ -41,8 +41,8 @@ inline bool cuts_all_lists(TileGrid grid) { return is_small_image(grid) && grid.
 inline constexpr int kLongList = 4096;
 inline constexpr int kBlocksAtOnce = 528;
 /// Lists of so many pairs or more would outlast all others in the forward pass if a warp took several of their pixels.
-/// So it takes one, or some samples of one, each of which has many lanes. With more than four samples that is so for all
-/// lists that are cut.
+/// So it takes one, or some samples of one, each of which has many lanes. With more than four samples that is so for
+/// all lists that are cut.
 AR_HD constexpr int longest_list(int samples) { return samples <= 4 ? 16384 : 0; }
 
 inline ListCut moving_list_cut(int samples, int64_t capacity, TileGrid grid) {
