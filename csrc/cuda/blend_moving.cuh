@@ -236,6 +236,9 @@ template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kPlac
 /// A lane's share of blending a pixel. kKeep: what the backward pass needs is kept.
 template <class F, int C, class Layout, bool kKeep, bool kTogether = (Layout::kSide < kMovingTile)> struct MovingBlend {
   static constexpr int kCells = Layout::kCells;
+  /// Whether the warp asks if any of its samples shows a splat before it composites it. That pays where a lane has
+  /// several cells and a warp so few pixels that often none does, but not with kKeep, which takes more registers.
+  static constexpr bool kVotes = !kKeep && kCells > 1 && Layout::kPixels <= 8;
   MovingSamples<F, Layout, kTogether> samples;
   CellCorners<F, Layout> corners;
   Values<C> sums = {};
@@ -250,13 +253,32 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = (Layout::kS
     if (kKeep) last[0] = b.mask ? k + 1 : last[0];
   }
   /// Composites a splat into the samples; shown[i] becomes `place` where it was composited into sample i, if kKeep.
+  /// With kVotes all lanes must call it.
   __device__ void add(TileSplatRef<F, C>& splat, int place, int (&shown)[kCells]) {
+    struct Look {
+      Vec2<float> z;
+      float raw;
+    };
+    const auto look = [&](int i) {
+      const Vec2<float> z = corners.node(splat.terms, i, samples.place[i]);
+      return Look{z, exp2(F::log_alpha(splat.terms, z))};
+    };
+    [[maybe_unused]] Look looks[kCells];
+    if constexpr (kVotes) {
+      bool shows = false;
+#pragma unroll
+      for (int i = 0; i < kCells; ++i) {
+        looks[i] = look(i);
+        shows |= (looks[i].raw >= float(kAlphaMin)) & (samples.transmittance[i] > 0);
+      }
+      if (!__any_sync(kAllLanes, shows)) return;
+    }
     float contribution = 0;
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
-      const Vec2<float> z = corners.node(splat.terms, i, samples.place[i]);
-      const Blended<float> b = blend_placed_sample<F>(splat.terms, z, exp2(F::log_alpha(splat.terms, z)),
-                                                      UnitCell<F::kSide>(), samples.transmittance[i], samples.place[i]);
+      const auto [z, raw] = kVotes ? looks[i] : look(i);
+      const Blended<float> b =
+          blend_placed_sample<F>(splat.terms, z, raw, UnitCell<F::kSide>(), samples.transmittance[i], samples.place[i]);
       contribution = i == 0 ? b.contribution : contribution + b.contribution;
       if (kKeep) shown[i] = b.mask ? place : shown[i];
     }
