@@ -48,8 +48,8 @@ class Image(NamedTuple):
 
 # 512x512 pixels are 4096 tiles of 8x8: enough for the kernels of large images. Lists of thousands of splats have chunks
 # behind the front, and several segments; those of kLongList pairs or more (csrc/cuda/cut_lists.cuh) are cut in large
-# images too, and have a layout of their own. Where Gaussians are opaque, pixels close (so little light is left that
-# 3DGS stops) before their lists end.
+# images too, and alone in small ones with 9 and 16 cells, and have a layout of their own. Where Gaussians are opaque,
+# pixels close (so little light is left that 3DGS stops) before their lists end.
 # test_every_kernel_has_images_that_need_it in test_benchmarks.py asserts all this.
 IMAGES = {
     "large": Image(512, 512, 600),
@@ -90,7 +90,7 @@ def too_many_pairs(device: str) -> None:
     if device == "cuda":
         _C.force_pair_capacity(64)
     try:
-        for footprint, options in scenes.PATHS:
+        for footprint, options in [*scenes.PATHS, ("moment", {"samples": 16})]:
             render(device, images=("large", "small", "small, opaque"), footprint=footprint, **options)
     finally:
         if device == "cuda":

@@ -20,7 +20,7 @@ from test_distributed import COUNT, error_of, scene_of, with_camera_gradients
 import analytic_rasterizer as ar
 from analytic_rasterizer import distributed
 from analytic_rasterizer.dialects.gsplat import rasterization
-from analytic_rasterizer.distributed.bands import balanced_bands
+from analytic_rasterizer.distributed.bands import _touched, balanced_bands
 
 WORLDS = (2, 3)
 FOOTPRINTS = ("box:samples=4", "adaptive", "moment:samples=4", "exact")
@@ -280,6 +280,27 @@ def test_one_process_has_one_band():
     assert made["rows"] == ((0, 87),) and torch.equal(made["whole"][0], expected["image"])
     for name, gradient in expected["gradients"].items():
         assert torch.equal(made["gradients"][name], gradient), name
+
+
+@pytest.mark.parametrize("size", [(512, 512), (201, 150)], ids=["large", "small"])
+@pytest.mark.parametrize("footprint", ["mip", *(f"moment:samples={cells}" for cells in (1, 4, 9, 16))])
+def test_rows_of_tiles_that_splats_touch(footprint, size, device):
+    """Whatever the size of tiles: every pair is in one of the rows, and a splat in those between its first and last."""
+    camera = Camera(image_width=size[0], image_height=size[1])
+    scene = scenes.cast(scenes.random_scene(3, 500, degree=1), torch.float32, device)
+    del scene["means2D"]
+    settings = scenes.settings_to(settings_of(footprint, torch.float32, camera), device)
+    splats = ar.project(settings, **scene)
+    touched = _touched(splats, settings.bg)
+    lists = ar.bin(splats, keep=False).of_camera()
+    rows = -(-camera.image_height // touched.side)
+    tiles = rows * -(-camera.image_width // touched.side)
+    assert len(lists["tile_offsets"]) == tiles + 1 and len(touched.pairs) == rows
+    assert sum(touched.pairs) == int(lists["tile_offsets"][-1]) > 500
+    row_of_mean = ((splats.means2d[:, 1] + 0.5) / touched.side).floor().clamp(0, rows - 1)
+    seen = touched.first <= touched.last
+    assert seen.sum() > 100
+    assert ((touched.first <= row_of_mean) & (row_of_mean <= touched.last))[seen].all()
 
 
 def test_bands_are_balanced():

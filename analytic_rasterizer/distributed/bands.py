@@ -10,7 +10,7 @@ from itertools import accumulate, pairwise
 import torch
 import torch.distributed as dist
 
-from .._C import TILE
+from .._C import tile_size
 from ..arguments import camera_arguments
 from ..settings import GaussianRasterizationSettings
 from ..stages import Splats, bin, blend, project
@@ -167,12 +167,11 @@ def _touched(splats: Splats, background: torch.Tensor) -> _Touched:
             break  # on CUDA there may have been more pairs than were expected, and then tiles share lists
     else:
         raise RuntimeError("the lists of tiles did not fit the memory that was guessed for them")
-    tiles = len(offsets) - 1
-    side = next(s for s in (TILE, TILE // 2) if -(-splats.width // s) * -(-splats.height // s) == tiles)
+    side = tile_size(splats.footprint, splats.option, splats.width, splats.height, pairs.is_cuda)
     columns, rows = -(-splats.width // side), -(-splats.height // side)
     of_tiles = offsets.diff()
     pairs = (pairs if pairs.dim() == 1 else pairs[:, 0])[: offsets[-1]].long()
-    row = torch.arange(tiles, device=offsets.device).div(columns, rounding_mode="floor").repeat_interleave(of_tiles)
+    row = torch.arange(columns * rows, device=offsets.device).div(columns, rounding_mode="floor").repeat_interleave(of_tiles)
     n = len(splats.means2d)
     first, last = row.new_full((n,), rows), row.new_full((n,), -1)
     first.scatter_reduce_(0, pairs, row, "amin")

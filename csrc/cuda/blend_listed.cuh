@@ -189,8 +189,10 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
   blend.write(params, first, pixel);
 }
 
-/// In large images, blocks of filter_kernel and warps of listed_blend_kernel: as many as leave most of a large device
-/// to the kernel that is to begin beside them, which only does when all of them have begun.
+/// Blocks of filter_kernel where not all lists are cut, and warps of listed_blend_kernel in large images: as many as
+/// leave most of a large device to the kernel that is to begin beside them, which only does when all of them have
+/// begun. In small images with tiles of 4x4 pixels that kernel has so little to do that lists need not leave it
+/// anything.
 inline constexpr int kFilterBlocks = 264, kWarpsBeside = 1024;
 /// In small images, for so many of the longest lists each warp has one task.
 inline constexpr int kLongestAtOnce = 128;
@@ -209,7 +211,8 @@ template <class F, int kSide> struct ListedLayouts {
   using Ahead = AheadLayout<F, kSide, 2>;
   using Long = SampleLayout<F, kSide, 2, kWarps>;  ///< from kLongList pairs on
   using Short = SampleLayout<F, kSide, kWalked ? 8 : 2, kWarps>;
-  /// Blocks of a list; of one that is short, the first of them have its pixels.
+  /// Blocks of a list; of one that is short, the first of them have its pixels. With more than four samples kOfOthers
+  /// only says how many more blocks there are.
   static constexpr int kOfLongest = Longest::kBlocks, kOfOthers = Long::kBlocks;
   static_assert(kOfLongest % kOfOthers == 0 && kOfOthers % Short::kBlocks == 0);
 
@@ -230,7 +233,8 @@ template <class F, int C, int kSide> union WarpStage {
   std::conditional_t<Layouts::kWalked, ListedStage<F, C, Layouts::Short::kPixels>, char> listed;
 };
 
-/// A warp per few pixels of a tile whose list is cut, those of the longest lists first. `kSegment`: pairs of a segment
+/// A warp per few pixels of a tile whose list is cut, or a block per pixel of the longest lists, which come first.
+/// `kSegment`: pairs of a segment
 /// in the backward pass.
 template <class F, int C, int kSide, bool kKeep, int kSegment = moving_segment(F::kSamples, kSide)>
 __global__ void __launch_bounds__(32 * kListedWarps<F>) listed_blend_kernel(const BlendParams params, int first) {

@@ -3,8 +3,8 @@
 // What a splat does to a sample depends on where the sample is when they meet, so that the chunks of a list cannot be
 // blended side by side as in blend.cuh: a block walks its whole list. What fills the device instead is that samples are
 // spread over lanes and that tiles are small where there are several. It also wastes less: the fewer pixels a warp has,
-// the fewer splats pass through it that touch only some of them. Lists that are cut (cut_lists.cuh), in small images
-// all, have the kernels of blend_listed.cuh in its place.
+// the fewer splats pass through it that touch only some of them. Lists that are cut, which cut_lists.cuh decides, have
+// the kernels of blend_listed.cuh in its place.
 #pragma once
 
 #include "cuda/composite.cuh"
@@ -103,9 +103,12 @@ template <class F> __device__ auto cell_terms(const Splat<F, float>& splat, cons
   return terms;
 }
 
+/// Whether the samples of a pixel are neighbours in a checkpoint of a list that is not cut.
+template <class Layout> inline constexpr bool kSamplesTogether = Layout::kSide < kMovingTile;
+
 /// A lane's samples on their way through a list. `kTogether`: the samples of a pixel are neighbours in a checkpoint, as
 /// they are among the lanes of warps with few pixels; else the pixels of a sample are.
-template <class F, class Layout, bool kTogether = (Layout::kSide < kMovingTile)> struct MovingSamples {
+template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> struct MovingSamples {
   static constexpr int kCells = Layout::kCells;
   float transmittance[kCells];
   Vec2<float> place[kCells];  ///< of the node in its cell
@@ -234,7 +237,7 @@ template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kPlac
 };
 
 /// A lane's share of blending a pixel. kKeep: what the backward pass needs is kept.
-template <class F, int C, class Layout, bool kKeep, bool kTogether = (Layout::kSide < kMovingTile)> struct MovingBlend {
+template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTogether<Layout>> struct MovingBlend {
   static constexpr int kCells = Layout::kCells;
   /// Whether the warp asks if any of its samples shows a splat before it composites it. That pays where a lane has
   /// several cells and a warp so few pixels that often none does, but not with kKeep, which takes more registers.
@@ -383,14 +386,14 @@ __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThr
   blend.write(params, first, pixel);
 }
 
-/// Lanes of a pixel that has a lane for each sample.
-template <class F> inline constexpr int kLanesOfPixel = F::kSamples == 9 ? 16 : F::kSamples;
+/// Lanes of a pixel where each sample has one: a power of two.
+template <class F> inline constexpr int kLanesForSamples = F::kSamples == 9 ? 16 : F::kSamples;
 
 /// Samples shared out so that there is least to do, forwards and backwards, in tiles of the size of moving_grid(), for
-/// lists that are not cut. In small images none is walked as a whole unless there are more pairs than room.
+/// lists that are not cut. Where all are, as cuts_all_lists() says, that is only so with more pairs than room.
 template <class F, bool kBackward, int kSide>
 using EvenLayout =
-    std::conditional_t<F::kSamples == 1 || (kSide < kMovingTile), CellLayout<1, kLanesOfPixel<F>, kSide>,
+    std::conditional_t<F::kSamples == 1 || (kSide < kMovingTile), CellLayout<1, kLanesForSamples<F>, kSide>,
                        std::conditional_t<F::kSamples == 4, CellLayout<2, 2>,
                                           std::conditional_t<F::kSamples == 9 && !kBackward, CellLayout<5, 2>,
                                                              CellLayout<(F::kSamples + 3) / 4, 4>>>>;

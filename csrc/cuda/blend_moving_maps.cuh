@@ -68,7 +68,7 @@ template <class F, int kTilePixels> struct MapMemory {
 };
 
 /// Groups of a segment for each warp of its block (blend_moving_segments.cuh). With one cell, whose tiles of 8x8 pixels
-/// have two groups, a block of one warp would take too long.
+/// have two groups, a block of one warp would take too long; in tiles of 4x4 pixels fewer warps were slower.
 inline constexpr int kMostGroupsOfWarp = 2;
 template <class F, int kSide>
 inline constexpr int kGroupsOfWarp = F::kSamples == 1 || kSide < kMovingTile ? 1 : kMostGroupsOfWarp;
@@ -77,7 +77,7 @@ inline constexpr int kGroupsOfWarp = F::kSamples == 1 || kSide < kMovingTile ? 1
 /// has a lane, so that none is idle.
 template <class F, int kSide>
 using SegmentLayout = std::conditional_t<(F::kSamples <= 4 || kSide < kMovingTile),
-                                         CellLayout<1, kLanesOfPixel<F>, kSide>, CellLayout<2, 8, kSide>>;
+                                         CellLayout<1, kLanesForSamples<F>, kSide>, CellLayout<2, 8, kSide>>;
 /// The same, whose groups are taken, by fewer warps.
 template <class F, int kSide, class Cells = SegmentLayout<F, kSide>>
 using TakenLayout = CellLayout<Cells::kCells, Cells::kLanes, kSide, Cells::kGroups / kGroupsOfWarp<F, kSide>, true>;

@@ -30,8 +30,8 @@ AR_HD constexpr int moving_segment(int samples, int side) {
   return samples <= 4 ? 512 : 1024;
 }
 
-/// In small images all lists are cut: their few tiles have long ones, and the time is that of the longest. Not so if
-/// tiles are small, and four times as many.
+/// In small images all lists are cut: their few tiles have long ones, and the time is that of the longest. Not so with
+/// tiles of 4x4 pixels, of which there are four times as many, with shorter lists: of these only long ones are cut.
 inline bool cuts_all_lists(TileGrid grid) { return is_small_image(grid) && grid.tile_bits >= kMovingTileBits; }
 
 /// Elsewhere many tiles keep a device busy, and to cut a list takes more work than to walk it. There only those are cut

@@ -318,13 +318,12 @@ template <class F> void expect_checkpoints_apart(const Scene<F>& scene) {
 }
 
 /// The larger a cell, the fewer checkpoints has each of its tiles: some, two, and one.
-TYPED_TEST(MovingKernels, AgreeWhereTilesShareLists) {
-  using F = TypeParam;
-  using Forward = EvenLayout<F, false, kMovingTile>;
-  using Backward = EvenLayout<F, true, kMovingTile>;
+template <class F, int kSide> void expect_same_if_tiles_share_lists(TileGrid grid) {
+  using Forward = EvenLayout<F, false, kSide>;
+  using Backward = EvenLayout<F, true, kSide>;
   for (const auto& [count, cell_bits] : {std::pair(701, 1), {700, 2}, {300, 20}}) {
     SCOPED_TRACE(testing::Message() << count << " splats, cells of 4^" << cell_bits << " tiles");
-    Scene<F> scene(count, count, 0.02f);
+    Scene<F> scene(count, count, 0.02f, grid);
     const Results own = run<F, Forward, Backward>(scene);
     EXPECT_GT(*std::max_element(own.last.begin(), own.last.end()), count * 9 / 10);
     const std::vector<double> expected = sums_of_splats(scene, own);
@@ -339,6 +338,15 @@ TYPED_TEST(MovingKernels, AgreeWhereTilesShareLists) {
     for (size_t i = 0; i < expected.size(); ++i)
       ASSERT_NEAR(results.pair_grads[i], expected[i], kRounding * (1 + std::abs(expected[i]))) << i;
   }
+}
+
+TYPED_TEST(MovingKernels, AgreeWhereTilesShareLists) {
+  expect_same_if_tiles_share_lists<TypeParam, kMovingTile>(kGrid);
+}
+TEST(MovingKernelsInOtherTiles, AgreeWhereTilesShareLists) {
+  expect_same_if_tiles_share_lists<Moment<1>, kTile>(kLargeTiles);
+  expect_same_if_tiles_share_lists<Moment<9>, kMovingTile / 2>(kSmallTiles);
+  expect_same_if_tiles_share_lists<Moment<16>, kMovingTile / 2>(kSmallTiles);
 }
 
 /// Nothing is read of splats that are not there, which AddressSanitizer would see.

@@ -211,7 +211,7 @@ TEST(PlanKernels, HaveRoomForTheSegmentsOfLongLists) {
   // In a large one none if none can be long; all as long as they are few; and always those of a quarter of the pairs.
   EXPECT_EQ(moving_list_cut(4, kLongList - 1, kLarge).max_segments, 0);
   for (const int samples : {1, 16}) {
-    const int segment = moving_segment(samples), of_long_list = kLongList / segment;
+    const int segment = moving_segment(samples, kLarge.side()), of_long_list = kLongList / segment;
     const ListCut few = moving_list_cut(samples, 3 * (kLongList + 1), kLarge);
     EXPECT_EQ(few.long_from(3 * (kLongList + 1)), kLongList);
     EXPECT_GE(few.max_segments, 3 * (of_long_list + 1));
