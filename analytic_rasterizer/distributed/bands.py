@@ -171,7 +171,7 @@ def _touched(splats: Splats, background: torch.Tensor) -> _Touched:
     columns, rows = -(-splats.width // side), -(-splats.height // side)
     of_tiles = offsets.diff()
     pairs = (pairs if pairs.dim() == 1 else pairs[:, 0])[: offsets[-1]].long()
-    row = torch.arange(columns * rows, device=offsets.device).div(columns, rounding_mode="floor").repeat_interleave(of_tiles)
+    row = torch.arange(rows, device=offsets.device).repeat_interleave(of_tiles.view(rows, columns).sum(1))
     n = len(splats.means2d)
     first, last = row.new_full((n,), rows), row.new_full((n,), -1)
     first.scatter_reduce_(0, pairs, row, "amin")
