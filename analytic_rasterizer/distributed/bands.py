@@ -169,14 +169,14 @@ def _touched(splats: Splats, background: torch.Tensor) -> _Touched:
         raise RuntimeError("the lists of tiles did not fit the memory that was guessed for them")
     side = tile_size(splats.footprint, splats.option, splats.width, splats.height, pairs.is_cuda)
     columns, rows = -(-splats.width // side), -(-splats.height // side)
-    of_tiles = offsets.diff()
+    of_rows = offsets.diff().view(rows, columns).sum(1)
     pairs = (pairs if pairs.dim() == 1 else pairs[:, 0])[: offsets[-1]].long()
-    row = torch.arange(rows, device=offsets.device).repeat_interleave(of_tiles.view(rows, columns).sum(1))
+    row = torch.arange(rows, device=offsets.device).repeat_interleave(of_rows)
     n = len(splats.means2d)
     first, last = row.new_full((n,), rows), row.new_full((n,), -1)
     first.scatter_reduce_(0, pairs, row, "amin")
     last.scatter_reduce_(0, pairs, row, "amax")
-    return _Touched(first, last, of_tiles.view(rows, columns).sum(1).tolist(), side)
+    return _Touched(first, last, of_rows.tolist(), side)
 
 
 def balanced_bands(pairs: list[int], world: int) -> list[tuple[int, int]]:
