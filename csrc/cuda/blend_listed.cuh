@@ -234,8 +234,7 @@ template <class F, int C, int kSide> union WarpStage {
 };
 
 /// A warp per few pixels of a tile whose list is cut, or a block per pixel of the longest lists, which come first.
-/// `kSegment`: pairs of a segment
-/// in the backward pass.
+/// `kSegment`: pairs of a segment in the backward pass.
 template <class F, int C, int kSide, bool kKeep, int kSegment = moving_segment(F::kSamples, kSide)>
 __global__ void __launch_bounds__(32 * kListedWarps<F>) listed_blend_kernel(const BlendParams params, int first) {
   let_next_kernel_begin();  // so that moving_blend_kernel does not wait for filter_kernel either
