@@ -56,10 +56,9 @@ def stages(scene, variant, dtype=torch.float64, device="cpu"):
 
 
 def tile_size(variant, device):
-    """Tiles on CUDA of samples that move are smaller, in an image as small as this."""
-    if variant[0] != "moment" or device != "cuda":
-        return ar.TILE
-    return 4 if variant[1]["samples"] > 4 else 8
+    """Tiles on CUDA of samples that move, or that are spread over lanes, are smaller in an image as small as this."""
+    smaller = {("moment", 1): 8, ("moment", 4): 8, ("moment", 9): 4, ("moment", 16): 4, ("box", 4): 8, ("box", 16): 4}
+    return smaller.get((variant[0], variant[1].get("samples")), ar.TILE) if device == "cuda" else ar.TILE
 
 
 def tile_grid(size):
@@ -263,6 +262,14 @@ def test_tiles_of_moving_samples_depend_on_the_image(samples, large, small):
     key = resolve_footprint("moment", samples=samples).key
     assert [_C.tile_size(key, 1.0, width, 512, True) for width in (512, 504)] == [large, small]
     assert [_C.tile_size(key, 1.0, width, 512, False) for width in (512, 504)] == [16, 16]
+
+
+@pytest.mark.parametrize("samples, large, small", [(1, 16, 16), (2, 16, 16), (4, 16, 8), (8, 16, 16), (16, 4, 4)])
+def test_tiles_of_samples_spread_over_lanes(samples, large, small):
+    """On CUDA: four samples are spread in images of less than 4096 tiles of 16x16 px, and sixteen in all."""
+    key = resolve_footprint("box", samples=samples).key
+    assert [_C.tile_size(key, 1.0, width, 1024, True) for width in (1024, 1008)] == [large, small]
+    assert [_C.tile_size(key, 1.0, width, 1024, False) for width in (1024, 1008)] == [16, 16]
 
 
 @pytest.mark.parametrize("variant", KINDS, ids=name_of)

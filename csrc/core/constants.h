@@ -9,6 +9,8 @@ inline constexpr int kTileBits = 4, kTile = 1 << kTileBits;
 inline constexpr int kMovingTileBits = 3, kMovingTile = 1 << kMovingTileBits;
 /// An image with fewer tiles of that size is small: CUDA has other kernels for samples that move in it.
 inline constexpr int kSmallImageTiles = 4096;
+/// Tiles of 16x16 pixels from which on four samples of a pixel are not spread over lanes (spread_grid() there).
+inline constexpr int kSpreadImageTiles = 4096;
 
 /// A Gaussian is culled unless the camera-space z of its mean exceeds this [world units].
 inline constexpr double kNear = 0.2;

@@ -43,6 +43,16 @@ AR_HD constexpr int moving_tile_bits(int samples, bool small_image) {
   if (samples == 1 && !small_image) return kTileBits;
   return samples >= 9 && small_image ? kMovingTileBits - 1 : kMovingTileBits;
 }
+/// The tiles on CUDA where the samples of a pixel may be spread over so many lanes (Spread of contract.h): if they are,
+/// of as many pixels as have 256 samples. Sixteen always are. Four are in images in which there would be few tiles of
+/// 16x16 pixels, with long lists; in others, to list more pairs would cost more than smaller tiles save.
+AR_HD constexpr int spread_tile_bits(int lanes, bool small_image) {
+  return lanes == 16 ? kTileBits - 2 : lanes == 4 && small_image ? kTileBits - 1 : kTileBits;
+}
+AR_HD TileGrid spread_grid(int lanes, int width, int height) {
+  const bool small_image = TileGrid{width, height}.tiles() < kSpreadImageTiles;
+  return {width, height, spread_tile_bits(lanes, small_image)};
+}
 AR_HD TileGrid moving_grid(int samples, int width, int height) {
   return {width, height, moving_tile_bits(samples, is_small_image({width, height}))};
 }

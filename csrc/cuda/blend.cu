@@ -42,6 +42,16 @@ template <class F, int kSide> void blend_moving(const BlendParams& p, cudaStream
     launch_moving_blend<F, kMovingChannels, kSide>(p, cut, first, stream);
 }
 
+/// Samples do not move.
+template <class F> void blend_still(const BlendParams& p, const BlendParams* in_chunks, cudaStream_t stream) {
+  if constexpr (!F::kYardstick) {
+    if (!p.channels.data) return blend_few<F, 3>(p, stream);
+    if (p.channels.count <= kFewChannels) return blend_few<F, 4>(p, stream);
+    if (p.segments.count > 1) return blend_segments<F>(p, *in_chunks, stream);
+  }
+  blend_groups<F>(with_channels(p), stream);
+}
+
 bool always_whole_lists(int footprint) {
   bool always = false;
   visit_footprint(footprint, Footprints{}, [&](auto f) {
@@ -76,9 +86,19 @@ int64_t max_reach_words(const ListCut& cut, TileGrid grid) {
 }
 
 int list_segments(int footprint, int64_t channels, TileGrid grid) {
-  constexpr int64_t kBlocks = 1056, kMost = 16;  // eight for each SM of a large device
-  if (always_whole_lists(footprint) || channels <= kFewChannels || 2 * grid.tiles() > kBlocks) return 1;
-  return int(std::min(kMost, kBlocks / grid.tiles()));
+  constexpr int64_t kMost = 16;
+  if (always_whole_lists(footprint) || channels <= kFewChannels || 2 * grid.tiles() > kManyBlocks) return 1;
+  return int(std::min(kMost, kManyBlocks / grid.tiles()));
+}
+
+int samples_of_lane(int footprint, TileGrid grid) {
+  int samples = 0;
+  visit_footprint(footprint, Footprints{}, [&](auto f) {
+    using F = decltype(f);
+    samples = F::kSamples;
+    if constexpr (!F::kMoves) with_lanes<F>(grid, [&](auto lanes) { samples = decltype(lanes)::kSamples; });
+  });
+  return samples;
 }
 
 void choose_samples(const ChooseParams& p, cudaStream_t stream) { launch_choose_samples<Adaptive>(p, stream); }
@@ -89,12 +109,7 @@ void blend(int footprint, const BlendParams& p, const BlendParams* in_chunks, cu
     if constexpr (F::kMoves) {
       with_tile_side<F>(p.grid, [&](auto px) { blend_moving<F, decltype(px)::value>(p, side); });
     } else {
-      if constexpr (!F::kYardstick) {
-        if (!p.channels.data) return blend_few<F, 3>(p, side);
-        if (p.channels.count <= kFewChannels) return blend_few<F, 4>(p, side);
-        if (p.segments.count > 1) return blend_segments<F>(p, *in_chunks, side);
-      }
-      blend_groups<F>(with_channels(p), side);
+      with_lanes<F>(p.grid, [&](auto lanes) { blend_still<decltype(lanes)>(p, in_chunks, side); });
     }
   });
 }

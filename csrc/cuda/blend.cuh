@@ -37,10 +37,10 @@ __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front
   PlanCounts& counts = params.plan.state->counts;
   const int place = tile_place<S>(params, int(blockIdx.x));
   if (place < 0) return;
-  const int tile = params.plan.tile_order[place], front_length = front_chunks(params.grid, S);
+  const int tile = params.plan.tile_order[place], front_length = front_of<S>(params);
   const TileList list = list_of(params.lists, params.grid, tile);
-  const Vec2<float> p = pixel_of(threadIdx.x / 32, lane_id());
-  const Pixel pixel(list, params.grid, p);
+  const Vec2<float> p = place_of<F>(threadIdx.x / 32, lane_id());
+  const Pixel pixel(list, params.grid, pixel_of<F>(threadIdx.x / 32, lane_id()));
   const int front = list.of_cell ? list.count : min(list.count, front_length * kLength);
   const bool several = !list.of_cell && list.count > kLength;
   const PixelCheckpoints<S, C, kKeep> checkpoints(params, tile, int(threadIdx.x));
@@ -68,10 +68,10 @@ __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front
     params.tile_open[tile] = more;
     if (more) open_tiles<S>(params)[atomicAdd(&counts.open_tiles[sample_class(S)], 1)] = tile;
   }
-  if (kKeep) store_last(params, pixel, state.last);
+  if (kKeep) store_last<F>(params, pixel, state.last);
   if (!more) {
     total += state.total();
-    store_pixel(params, pixel, total, state.transmittance);
+    store_pixel<F>(params, pixel, total, state.transmittance);
     if constexpr (kKeep) {
       const Values<C> background = background_of<C>(params);
 #pragma unroll
@@ -97,7 +97,7 @@ template <class F, int C, bool kKeep> void launch_blend(const BlendParams& p, cu
   launch(tail_through_kernel<F>, of_chunks, stream, p);
   launch(tail_scan_kernel<S>, of_parts, stream, p);
   launch(tail_blend_kernel<F, C, kKeep>, of_chunks, stream, p);
-  launch(tail_sum_kernel<S, C, kKeep>, of_sums, stream, p);
+  launch(tail_sum_kernel<F, C, kKeep>, of_sums, stream, p);
 }
 template <class F, int C> void blend_few(const BlendParams& p, cudaStream_t stream) {
   if (p.transmittance) {

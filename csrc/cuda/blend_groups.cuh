@@ -64,6 +64,31 @@ template <int C> struct ChannelShare {
       for (int k = 0; k < kOwn; ++k) v[i][k] = madd(contributions[i], own[k], v[i][k]);
     }
   }
+  /// Sums over the lanes that a pixel's samples are spread over, which are at places of other lanes, too.
+  template <int kLanes> __device__ void add_lanes() {
+    static_assert(kLanes == 1 || kLanes == 4 || kLanes == 16);
+    if constexpr (kLanes == 1) return;
+    const auto exchange = [&](int other, int offset) {
+#pragma unroll
+      for (int i = 0; i < kPixels; ++i) {
+        float given[kOwn];
+#pragma unroll
+        for (int k = 0; k < kOwn; ++k) given[k] = __shfl_xor_sync(kAllLanes, v[i][(k + other) % kOwn], offset);
+#pragma unroll
+        for (int k = 0; k < kOwn; ++k) v[i][k] += given[k];
+      }
+    };
+    exchange(0, 1);
+    exchange(0, 2);
+    if constexpr (kLanes == 16) {
+      exchange(kHalf, 4);  // whose first half are this lane's second
+#pragma unroll
+      for (int i = 0; i < kPixels; i += 2) {
+#pragma unroll
+        for (int k = 0; k < kOwn; ++k) v[i][k] = v[i + 1][k] = v[i][k] + v[i + 1][k];
+      }
+    }
+  }
   /// The scalar product with one number per channel, for this lane's own pixel.
   __device__ float dot(const float (&own)[kOwn]) const {
     float parts[kPixels];
@@ -166,8 +191,8 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   const int first = first_group + int(blockIdx.y) * C, lane = lane_id();
   const int tile = params.plan.tile_order[place];
   const TileList list = list_of(params.lists, params.grid, tile);
-  const Vec2<float> p = pixel_of(threadIdx.x / 32, lane);
-  const Pixel pixel(list, params.grid, p);
+  const Vec2<float> p = place_of<F>(threadIdx.x / 32, lane);
+  const Pixel pixel(list, params.grid, pixel_of<F>(threadIdx.x / 32, lane));
   float transmittance[S];
   Share sums = {};
   int last[S];
@@ -207,18 +232,21 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   for (int s = 0; s < S; ++s) {
     through += abs(transmittance[s]);
     if (first == 0 && params.transmittance && pixel.inside) {
-      params.transmittance[s * pixel.image + pixel.index] = abs(transmittance[s]);
-      params.last[s * pixel.image + pixel.index] = last[s];
+      params.transmittance[sample_index<F>(pixel, s)] = abs(transmittance[s]);
+      params.last[sample_index<F>(pixel, s)] = last[s];
     }
   }
-  const float scale = 1.0f / S;
-  if (first == 0 && params.alpha && pixel.inside) params.alpha[pixel.index] = 1 - scale * through;
+  through = sum_of_pixel<F>(through);
+  sums.template add_lanes<F::kLanes>();
+  const float scale = kSampleShare<F>;
+  if (first == 0 && params.alpha && pixel.inside && writes_pixel<F>(lane))
+    params.alpha[pixel.index] = 1 - scale * through;
   float throughs[Share::kPixels];
   Share::spread(through, throughs);
 #pragma unroll
   for (int i = 0; i < Share::kPixels; ++i) {
-    const Pixel of_place(list, params.grid, pixel_of(threadIdx.x / 32, Share::lane_of(i)));
-    if (!of_place.inside) continue;
+    const Pixel of_place(list, params.grid, pixel_of<F>(threadIdx.x / 32, Share::lane_of(i)));
+    if (!of_place.inside || !writes_pixel<F>(Share::lane_of(i))) continue;
 #pragma unroll
     for (int k = 0; k < Share::kOwn; ++k) {
       const int c = first + Share::channel(k);

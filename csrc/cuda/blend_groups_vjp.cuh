@@ -36,17 +36,17 @@ template <class F, int C, int kShapeGroups> struct GroupVjpShared {
   uint8_t reach[kBatch];
 };
 
-/// The gradient with respect to one of S samples of this lane's pixels, in its channels of the group that begins with
+/// The gradient with respect to one of the samples of this lane's pixels, in its channels of the group that begins with
 /// channel `first`.
-template <int S, int C>
+template <class F, int C>
 __device__ ChannelShare<C> share_of_gradient(const BlendVjpParams& params, const TileList& list, int first) {
   using Share = ChannelShare<C>;
   Share g;
 #pragma unroll
   for (int i = 0; i < Share::kPixels; ++i) {
-    const Pixel pixel(list, params.grid, pixel_of(threadIdx.x / 32, Share::lane_of(i)));
+    const Pixel pixel(list, params.grid, pixel_of<F>(threadIdx.x / 32, Share::lane_of(i)));
 #pragma unroll
-    for (int k = 0; k < Share::kOwn; ++k) g.v[i][k] = sample_gradient<S>(params, pixel, first + Share::channel(k));
+    for (int k = 0; k < Share::kOwn; ++k) g.v[i][k] = sample_gradient<F>(params, pixel, first + Share::channel(k));
   }
   return g;
 }
@@ -70,7 +70,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, kShapeGro
   const Segments& segments = params.segments;
   const int tile = listed_tile<S>(params, int(blockIdx.x) / segments.count);
   if (tile < 0) return;
-  const Segment<S> segment(params.lists, params.grid, tile, int(blockIdx.x) % segments.count, segments.count,
+  const Segment<F> segment(params.lists, params.grid, tile, int(blockIdx.x) % segments.count, segments.count,
                            params.last);
   const TileList& list = segment.list;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
@@ -93,10 +93,10 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, kShapeGro
   }
   if (segment.begin == segment.end) return;
 
-  const auto gradient = [&params, pixel](int c) { return sample_gradient<S>(params, pixel, c); };
+  const auto gradient = [&params, pixel](int c) { return sample_gradient<F>(params, pixel, c); };
   Share g[std::max(kShapeGroups, 1)];
-  g[0] = share_of_gradient<S, C>(params, list, first);
-  if constexpr (kShapeGroups == 2) g[1] = share_of_gradient<S, C>(params, list, first + C);
+  g[0] = share_of_gradient<F, C>(params, list, first);
+  if constexpr (kShapeGroups == 2) g[1] = share_of_gradient<F, C>(params, list, first + C);
   float through = 0;  // what the background gives
 #pragma unroll
   for (int i = 0; i < kShapeGroups; ++i) {
@@ -112,11 +112,11 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, kShapeGro
     for (int c = C; c < channel_count; ++c) through += gradient(c) * params.background[c];
   }
   // Alpha is 1 - transmittance: its gradient acts like one more channel whose background is -1.
-  if (first == 0 && params.dL_dalpha && pixel.inside) through -= 1.0f / S * params.dL_dalpha[pixel.index];
+  if (first == 0 && params.dL_dalpha && pixel.inside) through -= kSampleShare<F> * params.dL_dalpha[pixel.index];
   float transmittance[S], behind[S];  // at the end of the segment
 #pragma unroll
   for (int s = 0; s < S; ++s) {
-    transmittance[s] = pixel.inside ? params.transmittance[s * pixel.image + pixel.index] : 1;
+    transmittance[s] = pixel.inside ? params.transmittance[sample_index<F>(pixel, s)] : 1;
     behind[s] = through;
     if (last[s] <= segment.end) continue;
     float rest = transmittance[s] * through;
@@ -200,7 +200,9 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, kShapeGro
           Vec2<float> means = {0, 0};
           if (with_means) {
             const Vec2<float> size = {float(params.grid.width), float(params.grid.height)};
-            means = mean_sums_of(params.mean_sums, size, transform_transposed(shared.mean_maps[j], shape.offset));
+            const Vec2<float> offset = {sum_of_pixel<F>(shape.offset.x), sum_of_pixel<F>(shape.offset.y)};
+            means = mean_sums_of(params.mean_sums, size, transform_transposed(shared.mean_maps[j], offset));
+            if (!writes_pixel<F>(lane)) means = {0, 0};
           }
           shape = F::collect(splat.terms, shape, weighted);
           const float values[kShapeSums] = {shape.offset.x, shape.offset.y, shape.shape.xx, shape.shape.xy,
@@ -249,11 +251,11 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, 1>)
   const Segments& segments = params.segments;
   const int tile = listed_tile<S>(params, int(blockIdx.x) / segments.count), number = int(blockIdx.x) % segments.count;
   if (tile < 0 || number == 0) return;
-  const Segment<S> segment(params.lists, params.grid, tile, number, segments.count, params.last);
+  const Segment<F> segment(params.lists, params.grid, tile, number, segments.count, params.last);
   const int channel_count = params.channels.count;
-  const auto gradient = [&params, pixel = segment.pixel](int c) { return sample_gradient<S>(params, pixel, c); };
+  const auto gradient = [&params, pixel = segment.pixel](int c) { return sample_gradient<F>(params, pixel, c); };
   const bool all_at_once = params.mean_sums != MeanSums::kNone && first == 0;
-  const ChannelShare<C> g = share_of_gradient<S, C>(params, segment.list, first);
+  const ChannelShare<C> g = share_of_gradient<F, C>(params, segment.list, first);
   float transmittance[S], shown[S];
 #pragma unroll
   for (int s = 0; s < S; ++s) {

@@ -18,12 +18,12 @@ template <class F, int C> struct SampleGrad {
                     first == 0) {
 #pragma unroll
     for (int c = 0; c < C; ++c) {
-      channels.v[c] = sample_gradient<F::kSamples>(params, pixel, first + c);
+      channels.v[c] = sample_gradient<F>(params, pixel, first + c);
       if (first + c < params.channels.count) through += channels.v[c] * params.background[first + c];
     }
     if (with_others) {
       for (int c = C; c < params.channels.count; ++c)
-        through += sample_gradient<F::kSamples>(params, pixel, c) * params.background[c];
+        through += sample_gradient<F>(params, pixel, c) * params.background[c];
     }
     // Alpha is 1 - transmittance: its gradient acts like one more channel whose background is -1.
     if (first == 0 && params.dL_dalpha && pixel.inside) through -= 1.0f / F::kSamples * params.dL_dalpha[pixel.index];
@@ -38,7 +38,7 @@ template <class F, int C> struct SampleGrad {
     if (with_others) {
       const float* row = params.channels.row(id());
       for (int c = C; c < params.channels.count; ++c)
-        product = madd(sample_gradient<F::kSamples>(params, pixel, c), row[c], product);
+        product = madd(sample_gradient<F>(params, pixel, c), row[c], product);
     }
     return product;
   }

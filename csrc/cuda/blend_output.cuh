@@ -11,6 +11,11 @@ template <int S> __device__ int32_t* open_tiles(const BlendParams& params) {
   return params.open_tiles + sample_class(S) * params.grid.tiles();
 }
 
+/// Chunks of the front of a tile with S samples.
+template <int S> __device__ int front_of(const BlendParams& params) {
+  return front_chunks(params.grid, params.lists.counts->pairs, S);
+}
+
 /// Checkpoints of a pixel of a tile, with the layout of CheckpointLayout.
 template <int S, int C, bool kKeep> struct PixelCheckpoints {
   float* base;  ///< of the tile's first plane
@@ -18,7 +23,7 @@ template <int S, int C, bool kKeep> struct PixelCheckpoints {
 
   __device__ PixelCheckpoints(const BlendParams& params, int tile, int pixel)
       : base(params.checkpoints + int64_t(params.plan.tile_planes[tile]) * kTilePixels),
-        first_chunk(kKeep ? 0 : front_chunks(params.grid, S) - 1),
+        first_chunk(kKeep ? 0 : front_of<S>(params) - 1),
         pixel(pixel) {}
 
   __device__ Checkpoint<C>& kept(int chunk, int s) const {
@@ -63,7 +68,7 @@ template <int S> struct TransmittancePlanes {
   __device__ TransmittancePlanes(const BlendParams& params, int tile, int pixel) {
     const CheckpointLayout layout = params.layout;
     const int of_sample = layout.keep ? layout.channels + 1 : 1;
-    first_chunk = layout.first_chunk(params.grid, S);
+    first_chunk = layout.first_chunk(front_of<S>(params));
     chunk_stride = int64_t(layout.planes(S)) * kTilePixels;
     sample_stride = int64_t(of_sample) * kTilePixels;
     base =
@@ -81,18 +86,21 @@ template <int C> __device__ Values<C> background_of(const BlendParams& params) {
   return background;
 }
 
-/// Writes a pixel whose samples are complete. `total` is the sum of their channels.
-template <int S, int C>
-__device__ void store_pixel(const BlendParams& params, Pixel pixel, const Values<C>& total,
-                            const float (&transmittance)[S]) {
-  if (!pixel.inside) return;
+/// Writes a pixel whose samples are complete. `total` is the sum of their channels. All lanes of a warp must call it.
+template <class F, int C>
+__device__ void store_pixel(const BlendParams& params, Pixel pixel, Values<C> total,
+                            const float (&transmittance)[F::kSamples]) {
   float through = 0;
 #pragma unroll
-  for (int s = 0; s < S; ++s) {
+  for (int s = 0; s < F::kSamples; ++s) {
     through += abs(transmittance[s]);
-    if (params.transmittance) params.transmittance[s * pixel.image + pixel.index] = abs(transmittance[s]);
+    if (params.transmittance && pixel.inside) params.transmittance[sample_index<F>(pixel, s)] = abs(transmittance[s]);
   }
-  const float scale = 1.0f / S;
+  through = sum_of_pixel<F>(through);
+#pragma unroll
+  for (int c = 0; c < C; ++c) total.v[c] = sum_of_pixel<F>(total.v[c]);
+  if (!pixel.inside || !writes_pixel<F>(lane_id())) return;
+  const float scale = kSampleShare<F>;
 #pragma unroll
   for (int c = 0; c < C; ++c) {
     if (C > 3 && c >= params.channels.count) break;
@@ -100,10 +108,10 @@ __device__ void store_pixel(const BlendParams& params, Pixel pixel, const Values
   }
   if (params.alpha) params.alpha[pixel.index] = 1 - scale * through;
 }
-template <int S> __device__ void store_last(const BlendParams& params, Pixel pixel, const int (&last)[S]) {
+template <class F> __device__ void store_last(const BlendParams& params, Pixel pixel, const int (&last)[F::kSamples]) {
   if (!pixel.inside) return;
 #pragma unroll
-  for (int s = 0; s < S; ++s) params.last[s * pixel.image + pixel.index] = last[s];
+  for (int s = 0; s < F::kSamples; ++s) params.last[sample_index<F>(pixel, s)] = last[s];
 }
 
 /// Turns the checkpoints of a sample's chunks [first, end), which hold the channels of the chunk itself, into the

@@ -11,7 +11,8 @@
 namespace ar::cuda {
 
 /// A block's segment: the part [begin, end) of the list of a tile.
-template <int S> struct Segment {
+template <class F> struct Segment {
+  static constexpr int S = F::kSamples;
   TileList list;
   Vec2<float> p;
   Pixel pixel;  ///< of this lane
@@ -22,8 +23,8 @@ template <int S> struct Segment {
   /// All threads of a block must call it.
   __device__ Segment(const TileLists& lists, TileGrid grid, int tile, int number, int count, const int32_t* lasts)
       : list(list_of(lists, grid, tile)),
-        p(pixel_of(threadIdx.x / 32, lane_id())),
-        pixel(list, grid, p),
+        p(place_of<F>(threadIdx.x / 32, lane_id())),
+        pixel(list, grid, pixel_of<F>(threadIdx.x / 32, lane_id())),
         tile(tile),
         number(number) {
     __shared__ int block_last;
@@ -32,7 +33,7 @@ template <int S> struct Segment {
     int own_last = 0;
 #pragma unroll
     for (int s = 0; s < S; ++s) {
-      last[s] = pixel.inside ? lasts[s * pixel.image + pixel.index] : 0;
+      last[s] = pixel.inside ? lasts[sample_index<F>(pixel, s)] : 0;
       own_last = max(own_last, last[s]);
     }
     own_last = warp_max(own_last);
@@ -50,7 +51,7 @@ template <int S> struct Segment {
 /// warp composited. `transmittance`: of this lane's samples in front of the segment.
 template <class F, int C, class Visit>
 __device__ void walk_segment(const Splat<F, float>* splats, const Channels<float>& channels, int first_channel,
-                             const Segment<F::kSamples>& segment, float (&transmittance)[F::kSamples], Visit&& visit) {
+                             const Segment<F>& segment, float (&transmittance)[F::kSamples], Visit&& visit) {
   constexpr int S = F::kSamples;
   __shared__ Stage<F, 0, kGroupBatch> stage;
   __shared__ GroupChannels<kGroupBatch, C> staged;
@@ -91,7 +92,7 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
   const Segments& segments = params.segments;
   const int place = tile_place<S>(params, int(blockIdx.x) / segments.count);
   if (place < 0) return;
-  const Segment<S> segment(params.lists, params.grid, params.plan.tile_order[place], int(blockIdx.x) % segments.count,
+  const Segment<F> segment(params.lists, params.grid, params.plan.tile_order[place], int(blockIdx.x) % segments.count,
                            segments.count, params.last);
   const PixelCheckpoints<S, 3, true> checkpoints(in_chunks, segment.tile, int(threadIdx.x));
   using Share = ChannelShare<C>;
@@ -121,22 +122,25 @@ __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)
   }
 }
 
-/// Adds the segments of a group of `width` channels up, of tiles with S samples. A block per tile.
-template <int S>
+/// Adds the segments of a group of `width` channels up, of tiles with as many samples as F has. A block per tile.
+template <class F>
 __global__ void __launch_bounds__(kTilePixels) segment_sum_kernel(const BlendParams params, int first, int width) {
   wait_for_earlier_kernels();
   const int tile = int(blockIdx.x);
-  if (!has_samples<S>(params.lists, tile)) return;
+  if (!has_samples<F::kSamples>(params.lists, tile)) return;
   const TileList list = list_of(params.lists, params.grid, tile);
-  const Pixel pixel(list, params.grid, pixel_of(threadIdx.x / 32, lane_id()));
-  if (!pixel.inside) return;
+  const Pixel pixel(list, params.grid, pixel_of<F>(threadIdx.x / 32, lane_id()));
+  const bool writes = pixel.inside && writes_pixel<F>(lane_id());
   const Segments& segments = params.segments;
-  const float scale = 1.0f / S;
+  const float scale = kSampleShare<F>;
   float through = 0;
-  for (int s = 0; s < S; ++s) through += params.transmittance[s * pixel.image + pixel.index];
+  for (int s = 0; s < F::kSamples && pixel.inside; ++s) through += params.transmittance[sample_index<F>(pixel, s)];
+  through = sum_of_pixel<F>(through);
   for (int c = 0; c < width && first + c < params.channels.count; ++c) {
     float sum = 0;
     for (int k = 0; k < segments.count; ++k) sum += segments.sum_at(tile, k, c)[threadIdx.x];
+    sum = sum_of_pixel<F>(sum);
+    if (!writes) continue;
     params.image.plane(first + c, pixel.image)[pixel.index] =
         scale * sum + scale * through * params.background[first + c];
   }
@@ -151,7 +155,7 @@ template <class F> void blend_segments(const BlendParams& p, const BlendParams& 
     const auto kernel =
         width == kSmallGroup ? segment_blend_kernel<F, kSmallGroup> : segment_blend_kernel<F, kChannelGroup>;
     launch(kernel, {tiles * p.segments.count, kBlendThreads}, stream, p, in_chunks, first);
-    launch(segment_sum_kernel<F::kSamples>, {tiles, kTilePixels}, stream, p, first, width);
+    launch(segment_sum_kernel<F>, {tiles, kTilePixels}, stream, p, first, width);
   }
 }
 

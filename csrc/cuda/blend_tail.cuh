@@ -39,7 +39,7 @@ __global__ void __launch_bounds__(kBlendThreads, kTailThroughBlocks<F>) tail_thr
   constexpr int S = F::kSamples, kLength = chunk_length(S);
   __shared__ BlendStage<F, 0> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
-  const Vec2<float> p = pixel_of(threadIdx.x / 32, lane_id());
+  const Vec2<float> p = place_of<F>(threadIdx.x / 32, lane_id());
   for_each_tail_chunk<S>(params, [&](const TileChunk& tail, const TileList& list, int end) {
     float transmittance[S];
 #pragma unroll
@@ -78,7 +78,7 @@ template <int S> __global__ void __launch_bounds__(32) tail_scan_kernel(const Bl
   const int items = params.plan.state->counts.open_tiles[sample_class(S)] * S * kTailParts;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const int tile = open_tiles<S>(params)[item / (S * kTailParts)], s = item / kTailParts % S;
-    const int chunks = chunks_of(params, tile, chunk_length(S)), front = front_chunks(params.grid, S);
+    const int chunks = chunks_of(params, tile, chunk_length(S)), front = front_of<S>(params);
     const TransmittancePlanes<S> planes(params, tile, item % kTailParts * 32 + lane_id());
     float transmittance = planes.at(front - 1, s), next[kBatch];
     const auto load = [&](int first) {
@@ -112,7 +112,7 @@ __global__ void __launch_bounds__(kBlendThreads, kTailBlendBlocks<F>) tail_blend
   constexpr int S = F::kSamples, kLength = chunk_length(S), kSets = kKeep ? S : 1;
   __shared__ BlendStage<F, C> stage;
   const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
-  const Vec2<float> p = pixel_of(threadIdx.x / 32, lane_id());
+  const Vec2<float> p = place_of<F>(threadIdx.x / 32, lane_id());
   for_each_tail_chunk<S>(params, [&](const TileChunk& tail, const TileList& list, int end) {
     const PixelCheckpoints<S, C, kKeep> checkpoints(params, tail.tile, int(threadIdx.x));
     PixelState<S, C, kSets> state;
@@ -131,13 +131,13 @@ __global__ void __launch_bounds__(kBlendThreads, kTailBlendBlocks<F>) tail_blend
       composite_all<F>(stage, count, k, p, state);
       k += count;
     }
-    const Pixel pixel(list, params.grid, p);
+    const Pixel pixel(list, params.grid, pixel_of<F>(threadIdx.x / 32, lane_id()));
 #pragma unroll
     for (int s = 0; s < S; ++s) {
       const float transmittance = started[s] ? state.transmittance[s] : 0;
       if constexpr (kKeep) {
         checkpoints.kept(tail.chunk, s) = {state.channels[s], transmittance};
-        if (pixel.inside && state.last[s] > 0) atomicMax(&params.last[s * pixel.image + pixel.index], state.last[s]);
+        if (pixel.inside && state.last[s] > 0) atomicMax(&params.last[sample_index<F>(pixel, s)], state.last[s]);
       } else {
         checkpoints.transmittance(tail.chunk, s) = transmittance;
       }
@@ -163,10 +163,10 @@ struct TailShare {
 
 /// Adds the chunks of the open tiles. Blocks share the parts of the tiles. The order of the sum depends on the number
 /// of tail chunks alone, so that the picture is the same with and without a backward pass.
-template <int S, int C, bool kKeep>
+template <class F, int C, bool kKeep>
 __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
-  constexpr int kBatch = kKeep ? 16 : 32;  // chunks that are loaded together, into registers
+  constexpr int S = F::kSamples, kBatch = kKeep ? 16 : 32;  // chunks that are loaded together, into registers
   __shared__ float sums[kTailSumWarps][C][32], lasts[kTailSumWarps][32];
   const int warp = int(threadIdx.x) / 32, lane = lane_id();
   const Values<C> background = background_of<C>(params);
@@ -174,7 +174,7 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const int tile = open_tiles<S>(params)[item / kTailParts], part = item % kTailParts;
     const PixelCheckpoints<S, C, kKeep> checkpoints(params, tile, part * 32 + lane);
-    TailShare share(front_chunks(params.grid, S), chunks_of(params, tile, chunk_length(S)));
+    TailShare share(front_of<S>(params), chunks_of(params, tile, chunk_length(S)));
     if (warp == 0) share.first = checkpoints.first_chunk;
     Values<C> total = {};
     float transmittance[S];
@@ -220,11 +220,11 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
       __syncthreads();  // before the next sums
     }
     const TileList list = list_of(params.lists, params.grid, tile);
-    if (warp == 0) store_pixel(params, Pixel(list, params.grid, pixel_of(part, lane)), total, transmittance);
+    if (warp == 0) store_pixel<F>(params, Pixel(list, params.grid, pixel_of<F>(part, lane)), total, transmittance);
   }
 }
 
-/// Blocks of the kernels of the tail, which share the work: eight for each of the 132 multiprocessors of an H200.
-inline constexpr int kTailBlocks = 132 * 8;
+/// Blocks of the kernels of the tail, which share the work.
+inline constexpr int kTailBlocks = kManyBlocks;
 
 }  // namespace ar::cuda

@@ -50,6 +50,15 @@ template <class F, int kSide> void blend_vjp_moving(const BlendVjpParams& p, int
     launch_moving_vjp<F, kMovingChannels, kSide>(p, cut, first, stream);
 }
 
+/// Samples do not move.
+template <class F> void blend_vjp_still(const BlendVjpParams& p, int first_of_group, cudaStream_t stream) {
+  if constexpr (!F::kYardstick) {
+    if (!p.channels.data) return blend_vjp_few<F, 3>(p, stream);
+    if (p.channels.count <= kFewChannels) return blend_vjp_few<F, 4>(p, stream);
+  }
+  blend_vjp_group<F>(with_channels(p), first_of_group, stream);
+}
+
 }  // namespace
 
 int64_t max_adjoint_maps(int samples, const ListCut& cut, TileGrid grid) {
@@ -89,11 +98,7 @@ void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t s
     if constexpr (F::kMoves) {
       with_tile_side<F>(p.grid, [&](auto px) { blend_vjp_moving<F, decltype(px)::value>(p, first, side); });
     } else {
-      if constexpr (!F::kYardstick) {
-        if (!p.channels.data) return blend_vjp_few<F, 3>(p, side);
-        if (p.channels.count <= kFewChannels) return blend_vjp_few<F, 4>(p, side);
-      }
-      blend_vjp_group<F>(with_channels(p), first, side);
+      with_lanes<F>(p.grid, [&](auto lanes) { blend_vjp_still<decltype(lanes)>(p, first, side); });
     }
   });
 }

@@ -63,8 +63,7 @@ __global__ void __launch_bounds__(32 * kVjpWarps<F, kSums>, kVjpBlocks<F, C>)
   }
 }
 
-/// Eight blocks for each of the 132 multiprocessors of an H200.
-inline constexpr int kClearBlocks = 132 * 8;
+inline constexpr int kClearBlocks = kManyBlocks;
 /// As many blocks as any device holds: more would only find that no chunk is left.
 inline constexpr unsigned kTakingBlocks = 256 * 8;
 

@@ -26,8 +26,8 @@ struct VjpChunk {
 
   /// Number in the image of a lane's pixel of subtile b; -1 outside. No Pixel: with those, kernels of 8 and 16 samples
   /// get more registers.
-  __device__ int64_t pixel_index(int b, int lane) const {
-    const Vec2<float> p = pixel_of(b, lane);
+  template <class F> __device__ int64_t pixel_index(int b, int lane) const {
+    const Vec2<float> p = pixel_of<F>(b, lane);
     const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
     return x < grid.width && y < grid.height ? int64_t(y) * grid.width + x : int64_t(-1);
   }
@@ -41,10 +41,10 @@ __device__ __forceinline__ int find_last(const BlendVjpParams& params, const Vjp
   int tile_last = 0;
 #pragma unroll
   for (int b = 0; b < kSubtiles; ++b) {
-    const int64_t i = chunk.pixel_index(b, lane);
+    const int64_t i = chunk.pixel_index<F>(b, lane);
     int last = 0;
 #pragma unroll
-    for (int s = 0; s < F::kSamples; ++s) last = max(last, i < 0 ? 0 : params.last[s * chunk.image + i]);
+    for (int s = 0; s < F::kSamples; ++s) last = max(last, i < 0 ? 0 : params.last[sample_index<F>(chunk.image, i, s)]);
     last = warp_max(last);
     if (lane == 0 && first == 0) group.subtile_last[b] = last;
     tile_last = max(tile_last, last);
@@ -59,7 +59,6 @@ template <class F, int C, Sums kSums>
 __device__ __forceinline__ void start_pixels(const BlendVjpParams& params, const VjpChunk& chunk,
                                              const Checkpoint<C>* checkpoints, int first, bool final,
                                              LanePixels<F, C, kSums>& pixels) {
-  constexpr int S = F::kSamples;
   const int lane = lane_id();
   const float* dL_dplanes[C];  // of three channels all are there
   Values<C> background;
@@ -73,18 +72,18 @@ __device__ __forceinline__ void start_pixels(const BlendVjpParams& params, const
   }
 #pragma unroll
   for (int b = 0; b < kSubtiles; ++b) {
-    const int64_t i = chunk.pixel_index(b, lane);
-    const float scale = i < 0 ? 0 : 1.0f / S;
+    const int64_t i = chunk.pixel_index<F>(b, lane);
+    const float scale = i < 0 ? 0 : kSampleShare<F>;
     Values<C> g;
 #pragma unroll
     for (int c = 0; c < C; ++c) g.v[c] = i >= 0 && (C == 3 || dL_dplanes[c]) ? scale * dL_dplanes[c][i] : 0;
     pixels.set_gradient(b, g);
 #pragma unroll
     for (int s = 0; s < kVjpSamples<F, kSums>; ++s) {
-      const int last = i < 0 ? 0 : params.last[(first + s) * chunk.image + i];
+      const int last = i < 0 ? 0 : params.last[sample_index<F>(chunk.image, i, first + s)];
       float transmittance = 1, behind = 0;
       if (final) {
-        transmittance = i < 0 ? 1.0f : params.transmittance[(first + s) * chunk.image + i];
+        transmittance = i < 0 ? 1.0f : params.transmittance[sample_index<F>(chunk.image, i, first + s)];
         behind = dot(g, background);
       } else {
         const Checkpoint<C> c = checkpoints[(first + s) * kTilePixels + b * 32 + lane];
@@ -93,7 +92,7 @@ __device__ __forceinline__ void start_pixels(const BlendVjpParams& params, const
       }
       // Alpha is 1 - transmittance: its gradient acts like one more channel whose background is -1.
       if (params.dL_dalpha && i >= 0) {
-        const float open = final ? 1 : params.transmittance[(first + s) * chunk.image + i] / transmittance;
+        const float open = final ? 1 : params.transmittance[sample_index<F>(chunk.image, i, first + s)] / transmittance;
         behind -= scale * params.dL_dalpha[i] * open;
       }
       pixels.sample(s, b) = {transmittance, behind};

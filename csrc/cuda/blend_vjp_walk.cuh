@@ -153,8 +153,9 @@ template <class F, int C, Sums kSums> class ChunkWalk {
 #pragma unroll
     for (int c = 0; c < C; ++c) channels.v[c] = madd(contribution, of_pixel_g.v[c], channels.v[c]);
     if (kMeans) {
-      const Vec2<float> dL_dmean = transform_transposed(mean_map, of_pixel.offset);
-      means = means + mean_sums_of(kKind, chunk_.size, dL_dmean);
+      const Vec2<float> offset = {sum_of_pixel<F>(of_pixel.offset.x), sum_of_pixel<F>(of_pixel.offset.y)};
+      const Vec2<float> of_mean = mean_sums_of(kKind, chunk_.size, transform_transposed(mean_map, offset));
+      if (writes_pixel<F>(lane_)) means = means + of_mean;
     }
   }
 
@@ -227,7 +228,7 @@ template <class F, int C, Sums kSums> class ChunkWalk {
   const int first_;  ///< sample
   const int lane_ = lane_id(), warp_ = threadIdx.x / 32;
   const Splat<F, float>* const splats_ = reinterpret_cast<const Splat<F, float>*>(params_.splats);
-  const Vec2<float> p0_ = pixel_of(0, lane_);                         ///< the lane's pixel of subtile 0
+  const Vec2<float> p0_ = place_of<F>(0, lane_);                      ///< of the lane in subtile 0
   const uint32_t subtile_bit_ = lane_ < kSubtiles ? 1u << lane_ : 0;  ///< of subtile number `lane`
   const int value_ = summed_value<kSumCount>(lane_);                  ///< that sum_values leaves here
   float* const sums_ = params_.pair_grads + (value_ == 9 ? kPairFourthChannel : value_);  ///< of row 0

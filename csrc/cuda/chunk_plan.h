@@ -16,12 +16,21 @@ inline constexpr int kWholeList = 1 << 30;
 /// More pairs than a list has.
 inline constexpr int kNoList = 1 << 30;
 
+/// Blocks that a large device works on side by side, about: eight for each of its 132 multiprocessors.
+inline constexpr int kManyBlocks = 1056;
+
 /// Chunks of a tile that blend goes through one after the other, which reads no pair behind the point where all pixels
-/// have stopped. The remaining chunks are blended side by side. With many tiles there is enough to do side by side;
-/// with few, a long list must not keep a single block busy.
-AR_HD int front_chunks(TileGrid grid, int samples) {
-  const int pairs = grid.tiles() >= 2048 ? 2048 : 256;
-  return pairs > chunk_length(samples) ? pairs / chunk_length(samples) : 1;
+/// have stopped; of an image with so many pairs. The remaining chunks are blended side by side, which takes more work.
+/// Few tiles cannot fill the device, so their front is short. Else it is so long that fewer than kManyBlocks tiles have
+/// a tail: those whose list is longer than a block's share of all pairs, and would keep it busy when the others have
+/// ended.
+AR_HD int front_chunks(TileGrid grid, int64_t pairs, int samples) {
+  constexpr int kMost = 1 << 28;
+  int front = 256;
+  if (2 * grid.tiles() > kManyBlocks) {
+    for (front = 2048; front < pairs / kManyBlocks && front < kMost;) front *= 2;
+  }
+  return front > chunk_length(samples) ? front / chunk_length(samples) : 1;
 }
 
 /// How plan_chunks cuts the lists of tiles into chunks.
@@ -111,24 +120,23 @@ struct CheckpointLayout {
   bool keep;
 
   AR_HD int planes(int samples) const { return keep ? samples * (channels + 1) : samples + channels; }
-  /// The first chunk with planes.
-  AR_HD int first_chunk(TileGrid grid, int samples) const { return keep ? 0 : front_chunks(grid, samples) - 1; }
+  /// The first chunk with planes, where there are `front` chunks in front of the tail.
+  AR_HD int first_chunk(int front) const { return keep ? 0 : front - 1; }
   /// Planes of a tile with so many chunks. The last chunk needs none where no sample is left open in front of it.
-  AR_HD int tile_planes(TileGrid grid, int samples, int chunks) const {
-    const int front = front_chunks(grid, samples);
-    const int used = chunks > front ? chunks - first_chunk(grid, samples) : keep ? chunks - 1 : 0;
+  AR_HD int tile_planes(int front, int samples, int chunks) const {
+    const int used = chunks > front ? chunks - first_chunk(front) : keep ? chunks - 1 : 0;
     return (used > 0 ? used : 0) * planes(samples);
   }
-  /// No fewer planes than plan_chunks makes of `pairs` pairs where no tile has more than `samples`. A tile of x chunks
-  /// of pairs, rounded up to less than x + 1, has that many planes where it has tail chunks (x > front), less front - 1
-  /// without a backward pass; and no more than x where it has none.
+  /// No fewer planes than plan_chunks makes of `pairs` pairs, or of fewer, where no tile has more than `samples`. A
+  /// tile of x chunks of pairs, rounded up to less than x + 1, has no more than that many planes where it has a tail,
+  /// as no more than kManyBlocks tiles do; and no more than x where it has none.
   int64_t max_planes(TileGrid grid, int samples, int64_t pairs, bool chosen) const {
     // Chosen samples: those with the most planes per pair. For a backward pass all from 4 on have the same.
-    const int densest = chosen && !keep ? 4 : samples, front = front_chunks(grid, samples);
+    const int densest = chosen && !keep ? 4 : samples;
     const int64_t full = pairs / chunk_length(densest) * planes(densest) + planes(densest) + planes(samples);
-    const int64_t with_tail = grid.tiles() * planes(samples);
-    const int64_t rounding = keep ? full / front : front == 1 ? full : 0;
-    return full + (rounding < with_tail ? rounding : with_tail);
+    const int64_t with_tail = grid.tiles() < kManyBlocks ? grid.tiles() : kManyBlocks;
+    const int64_t rounding = with_tail * planes(samples);
+    return full + (rounding < full ? rounding : full);
   }
 };
 

@@ -19,9 +19,30 @@ inline constexpr int kTilePixels = kTile * kTile;
 inline constexpr int kSubtiles = 8;
 inline constexpr int kBlendThreads = 32 * kSubtiles;
 
+/// Pixels of a subtile side by side, and one below the other. There are fewer where their samples are spread over lanes
+/// (Spread of contract.h), so that all 256 lanes of a block have one.
+template <class F> inline constexpr int kSubtileWide = 8 >> (kTileBits - spread_tile_bits(F::kLanes, true));
+template <class F> inline constexpr int kSubtileHigh = kSubtileWide<F> / 2;
+
 /// A lane's pixel of subtile b, relative to the tile's first.
-__device__ inline Vec2<float> pixel_of(int b, int lane) {
-  return {float((b & 1) * 8 + (lane & 7)), float((b >> 1) * 4 + (lane >> 3))};
+template <class F> __device__ Vec2<float> pixel_of(int b, int lane) {
+  constexpr int kWide = kSubtileWide<F>, kHigh = kSubtileHigh<F>;
+  static_assert(F::kLanes * kWide * kHigh == 32);
+  const int pixel = lane / F::kLanes;
+  return {float((b & 1) * kWide + pixel % kWide), float((b >> 1) * kHigh + pixel / kWide)};
+}
+/// Where the lane's sample is, if it has one of a pixel whose samples are spread over lanes; else its pixel.
+template <class F> __device__ Vec2<float> place_of(int b, int lane) {
+  Vec2<float> place = pixel_of<F>(b, lane);
+  if constexpr (F::kLanes > 1) {
+    Vec2<float> node = {0, 0};
+#pragma unroll
+    for (int s = 0; s < F::kLanes; ++s) {
+      if (lane % F::kLanes == s) node = {float(F::node(s).x), float(F::node(s).y)};
+    }
+    place = place + node;
+  }
+  return place;
 }
 
 /// A tile and its list of splats, front to back.
@@ -106,7 +127,7 @@ __device__ uint32_t reached_boxes(const Splat<F, float>& splat, int x0, int y0) 
 
 /// Bit b: the splat reaches subtile b, or passes it closely.
 template <class F> __device__ uint32_t subtile_reach(const Splat<F, float>& splat, int x0, int y0) {
-  return reached_boxes<8, 4, 2, 4, F>(splat, x0, y0);
+  return reached_boxes<kSubtileWide<F>, kSubtileHigh<F>, 2, 4, F>(splat, x0, y0);
 }
 
 /// Values of C channels.
@@ -288,10 +309,30 @@ struct Pixel {
   }
 };
 
-/// The gradient with respect to a channel of one of a pixel's S samples.
-template <int S> __device__ float sample_gradient(const BlendVjpParams& params, const Pixel& pixel, int channel) {
+/// The share of one sample in its pixel.
+template <class F> inline constexpr float kSampleShare = 1.0f / (F::kSamples * F::kLanes);
+
+/// Place of sample s of this lane's pixel in an array of [samples, H, W].
+template <class F> __device__ int64_t sample_index(int64_t image, int64_t pixel, int s) {
+  return (F::kLanes > 1 ? lane_id() % F::kLanes : s) * image + pixel;
+}
+template <class F> __device__ int64_t sample_index(const Pixel& pixel, int s) {
+  return sample_index<F>(pixel.image, pixel.index, s);
+}
+
+/// The sum over the lanes that a pixel's samples are spread over.
+template <class F> __device__ float sum_of_pixel(float x) {
+#pragma unroll
+  for (int offset = F::kLanes / 2; offset > 0; offset /= 2) x += __shfl_xor_sync(kAllLanes, x, offset);
+  return x;
+}
+/// Whether a lane writes what its pixel has once.
+template <class F> __device__ bool writes_pixel(int lane) { return lane % F::kLanes == 0; }
+
+/// The gradient with respect to a channel of one of a pixel's samples.
+template <class F> __device__ float sample_gradient(const BlendVjpParams& params, const Pixel& pixel, int channel) {
   const float* plane = channel < params.channels.count ? params.dL_dimage.plane(channel, pixel.image) : nullptr;
-  return pixel.inside && plane ? 1.0f / S * plane[pixel.index] : 0.0f;
+  return pixel.inside && plane ? kSampleShare<F> * plane[pixel.index] : 0.0f;
 }
 
 /// Zeros for a pair that no sample composites, in `row` of pair_grads: by one thread.
@@ -323,14 +364,24 @@ __device__ inline void put_sum(float* rows, int width, bool of_cell, int32_t row
   }
 }
 
+template <class F> constexpr int tile_bits_of(bool small_image) {
+  return F::kMoves ? moving_tile_bits(F::kSamples, small_image) : spread_tile_bits(lanes_of<F>(), small_image);
+}
 /// Calls `visit` with the side of the grid's tiles, one of those that F has, as a constant.
 template <class F, class Visit> void with_tile_side(TileGrid grid, Visit&& visit) {
-  constexpr int kLarge = 1 << (F::kMoves ? moving_tile_bits(F::kSamples, false) : kTileBits);
-  constexpr int kSmall = 1 << (F::kMoves ? moving_tile_bits(F::kSamples, true) : kTileBits);
+  constexpr int kLarge = 1 << tile_bits_of<F>(false), kSmall = 1 << tile_bits_of<F>(true);
   if constexpr (kLarge != kSmall) {
     if (grid.side() == kLarge) return visit(std::integral_constant<int, kLarge>());
   }
   visit(std::integral_constant<int, kSmall>());
+}
+
+/// Calls f with what F, whose samples do not move, is blended as in tiles of this grid: F::Spread, or F itself.
+template <class F, class Function> void with_lanes(TileGrid grid, Function&& f) {
+  with_tile_side<F>(grid, [&](auto side) {
+    using Blended = std::conditional_t<(side < kTile), typename F::Spread, F>;
+    f(Blended{});
+  });
 }
 
 /// Calls f(F{}, stream) for the footprint F of every kind of tile: where samples are chosen those of Boxes, side by

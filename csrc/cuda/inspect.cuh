@@ -25,7 +25,7 @@ __global__ void __launch_bounds__(kInspectThreads<kSide>) inspect_kernel(const I
   const int lane = lane_id();
   if (!has_samples<F::kSamples>(params.lists, tile)) return;
   const TileList list = list_of(params.lists, params.grid, tile);
-  const Vec2<float> p = pixel_of(subtile, lane);
+  const Vec2<float> p = pixel_of<F>(subtile, lane);
   const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
   const bool inside = max(p.x, p.y) < kSide && x < params.grid.width && y < params.grid.height;
   PixelSummary<float, F> pixel;

@@ -158,9 +158,9 @@ __global__ void __launch_bounds__(kPlanThreads)
   const auto tile = int32_t(valid ? i : 0);
   const PlannedTile planned(lists, tile, most_samples, cut);
   const int samples = planned.samples, full = valid ? planned.full() : 0, rest = valid ? planned.rest() : 0;
-  const int chunks = full + (rest > 0), front = front_chunks(grid, samples);
+  const int chunks = full + (rest > 0), front = front_chunks(grid, lists.counts->pairs, samples);
   const int tail = cut.whole ? 0 : max(chunks - front, 0);
-  const int planes = valid && !cut.whole ? layout.tile_planes(grid, samples, chunks) : 0;
+  const int planes = valid && !cut.whole ? layout.tile_planes(front, samples, chunks) : 0;
   // All atomics first: they wait together.
   const int full_class = planned.full_class(), rest_class = work_class(samples, rest);
   const int tile_class = work_class(samples, planned.n);
@@ -176,7 +176,7 @@ __global__ void __launch_bounds__(kPlanThreads)
   find_begins(cut_classes.chunks_of_class, begins.chunks, counts.chunks);
   __syncthreads();
   const int of_chunk = layout.planes(samples);
-  const TileChunk first = {tile, 0, plane - layout.first_chunk(grid, samples) * of_chunk};
+  const TileChunk first = {tile, 0, plane - layout.first_chunk(front) * of_chunk};
   const int place = begins.tiles[tile_class] + tile_place;
   const bool is_cut = planned.is_long && begins.tiles[tile_class] < cut_classes.lists;
   const ChunkRun as_one = {begins.chunks[tile_class] + tile_place, 0, min(full, 1)};

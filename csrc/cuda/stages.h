@@ -280,6 +280,8 @@ int64_t max_reach_words(const ListCut& cut, TileGrid grid);
 int64_t max_adjoint_maps(int samples, const ListCut& cut, TileGrid grid);
 int64_t max_group_sums(int footprint, const ListCut& cut, TileGrid grid);
 /// Segments of each tile's list that many channels are blended in.
+/// Samples of a pixel that a lane has: all, unless they are spread over lanes.
+int samples_of_lane(int footprint, TileGrid grid);
 int list_segments(int footprint, int64_t channels, TileGrid grid);
 /// Channels that a group-less blending is compiled for: 3 in the splats themselves, or 4 in rows.
 constexpr int compiled_channels(bool in_splats) { return in_splats ? 3 : kFewChannels; }

@@ -127,12 +127,13 @@ struct FootprintSpec {
   int samples;  ///< the most that a pixel has
   bool chosen;  ///< per tile
   bool moves;   ///< samples carry a state besides their transmittance
+  int lanes;    ///< over which a pixel's samples may be spread on CUDA
 };
 
 /// The footprint of this key and number. Raises ValueError if there is none.
 FootprintSpec find_footprint(const std::string& key, double option);
 
-/// The tiles of an image: on CUDA those of samples that move may be smaller.
+/// The tiles of an image: on CUDA those of samples that move or are spread over lanes may be smaller.
 TileGrid grid_of(const FootprintSpec& footprint, int64_t width, int64_t height, bool cuda);
 
 /// What all stages of a pass share.

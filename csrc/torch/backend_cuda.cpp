@@ -198,8 +198,8 @@ class CudaBackend final : public Backend {
     in_chunks.layout = {3, true};
     const Tensor first_plan = make_plan(in_chunks, first_pass, {false}, first_state);
     const Tensor sums = segment_planes(p.segments, grid, cuda::kChannelGroup);
-    state.checkpoints = segment_planes(p.segments, grid, footprint.samples);
-    p.segments.samples = footprint.samples;
+    p.segments.samples = cuda::samples_of_lane(footprint.choice.index, grid);
+    state.checkpoints = segment_planes(p.segments, grid, p.segments.samples);
     p.segments.sums = pointer<float>(sums);
     p.segments.transmittance = pointer<float>(state.checkpoints);
     cuda::blend(footprint.choice.index, p, &in_chunks, stream_);
@@ -250,7 +250,7 @@ class CudaBackend final : public Backend {
     p.chunks_taken = pointer<int32_t>(chunks_taken);
     p.checkpoints = pointer<float>(state.checkpoints);
     p.segments.count = cuda::list_segments(pass.footprint.choice.index, count, pass.grid);
-    p.segments.samples = pass.footprint.samples;
+    p.segments.samples = cuda::samples_of_lane(pass.footprint.choice.index, pass.grid);
     p.segments.transmittance = p.checkpoints;
     Tensor shown;
     if (p.segments.count > 1) {
@@ -369,19 +369,19 @@ class CudaBackend final : public Backend {
   Tensor make_plan(cuda::BlendParams& p, const Pass& pass, const cuda::ListCut& cut, BlendState& state) const {
     const FootprintSpec& footprint = pass.footprint;
     const int64_t tiles = pass.grid.tiles(), capacity = p.lists.capacity;
-    const int64_t chunks =
-        cut.whole ? cut.max_segments : capacity / cuda::chunk_length(footprint.chosen ? 1 : footprint.samples);
-    const int64_t max_planes = !cut.whole
-                                   ? p.layout.max_planes(pass.grid, footprint.samples, capacity, footprint.chosen)
+    const int samples = cuda::samples_of_lane(footprint.choice.index, pass.grid);
+    const int64_t chunks = cut.whole ? cut.max_segments : capacity / cuda::chunk_length(footprint.chosen ? 1 : samples);
+    const int64_t max_planes = !cut.whole  ? p.layout.max_planes(pass.grid, samples, capacity, footprint.chosen)
                                : pass.keep ? cuda::max_state_planes(footprint.choice.index, capacity)
                                            : 0;
-    state.checkpoints = at::empty({max_planes * pass.grid.side() * pass.grid.side()}, floats_);
+    const int side = cut.whole ? pass.grid.side() : kTile;
+    state.checkpoints = at::empty({max_planes * side * side}, floats_);
     state.chunks = at::empty({kPlanRows + chunks + tiles + cut.max_lists, kChunkWidth}, ints_);
     const auto [memory, parts] = make_memory<PlanMemory>(bytes_, tiles, cut.whole ? 0 : chunks);
     parts.set(p);
     set_plan(p, state.chunks, cut);
     p.checkpoints = pointer<float>(state.checkpoints);
-    cuda::plan_chunks(p.lists, pass.grid, footprint.samples, cut, p.layout, p.plan, stream_);
+    cuda::plan_chunks(p.lists, pass.grid, samples, cut, p.layout, p.plan, stream_);
     check_stage("plan_chunks", pass.debug);
     return memory;
   }

@@ -102,12 +102,14 @@ FootprintSpec find_footprint(const std::string& key, double option) {
     spec.samples = decltype(f)::kSamples;
     spec.chosen = std::is_same_v<decltype(f), Adaptive>;
     spec.moves = decltype(f)::kMoves;
+    spec.lanes = lanes_of<decltype(f)>();
   });
   return spec;
 }
 
 TileGrid grid_of(const FootprintSpec& footprint, int64_t width, int64_t height, bool cuda) {
   if (cuda && footprint.moves) return moving_grid(footprint.samples, int(width), int(height));
+  if (cuda) return spread_grid(footprint.lanes, int(width), int(height));
   return {int(width), int(height)};
 }
 

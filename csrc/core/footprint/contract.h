@@ -17,6 +17,9 @@
 //   Pixels               a type with the same Shape, terms, alpha, adjoint, ellipse and samples, for which blending is
 //                        compiled instead, once for all footprints that name it. Default: F
 //   kSamples             samples of a pixel, each with its own transmittance. Default: 1
+//   Spread               a type with the same Shape, ellipse and level, for which CUDA kernels are compiled instead in
+//                        small images: a single sample, p being where it lies. The samples of a pixel are then spread
+//                        over kLanes lanes, that of lane s at its node(s). Default: void, there is none
 //   kReach               largest |coordinate| of a sample's node [px]. Default: 0
 //   kExtraLevel          no level (below) exceeds 2 ln(255 opacity) + kExtraLevel. Default: 0
 //
@@ -194,7 +197,9 @@ template <class V> struct MoveSlope {
 
 /// What most footprints have in common.
 struct FootprintDefaults {
-  using Pixels = void;                             // the footprint itself
+  using Pixels = void;  // the footprint itself
+  using Spread = void;  // none
+  static constexpr int kLanes = 1;
   static constexpr std::nullptr_t kKey = nullptr;  // the name
   static constexpr Option kOption = {};
   static constexpr bool kYardstick = false, kExpensive = false;
@@ -209,6 +214,15 @@ struct FootprintDefaults {
 
 /// What blending is compiled for.
 template <class F> using PixelsOf = std::conditional_t<std::is_void_v<typename F::Pixels>, F, typename F::Pixels>;
+
+/// Over how many lanes the samples of a pixel may be spread.
+template <class F> constexpr int lanes_of() {
+  if constexpr (std::is_void_v<typename F::Spread>) {
+    return 1;
+  } else {
+    return F::Spread::kLanes;
+  }
+}
 
 /// What is known about the w of a SplatGrad.
 enum class GradFrame {

@@ -76,11 +76,14 @@ template <int S> constexpr double box_reach() {
   return reach;
 }
 
+template <int S> struct GaussianSample;
+
 /// S Gaussians in place of one pixel: all that blending has to know. It is the same code for all footprints that are
 /// Gaussians, whatever variance they have added to the covariance.
 template <int S> struct GaussianPixels : FootprintDefaults {
   static constexpr int kSamples = S;
   static constexpr double kReach = box_reach<S>();
+  using Spread = std::conditional_t<S == 4 || S == 16, GaussianSample<S>, void>;
   template <typename T> using Shape = GaussianShape<T>;
 
   template <typename T> struct Terms {
@@ -130,6 +133,13 @@ template <int S> struct GaussianPixels : FootprintDefaults {
   }
 
   template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return T(1 / kBase2) * shape.w; }
+};
+
+/// One of S such Gaussians, with p where it lies.
+template <int S> struct GaussianSample : GaussianPixels<1> {
+  static constexpr int kLanes = S;
+  static constexpr double kReach = box_reach<S>();
+  AR_HD static constexpr Vec2<double> node(int s) { return box_node<S>(s); }
 };
 
 /// Footprints that prepare a GaussianPixels<S>. kCompensated: the amplitude keeps the mass of the splat.

@@ -13,15 +13,14 @@ namespace ar::cuda {
 namespace {
 
 constexpr int kWidth = 27, kHeight = 21, kPixels = kWidth * kHeight;
-constexpr TileGrid kGrid = {kWidth, kHeight};
 
 /// `count` random splats, all of which every tile lists. They are up to `beyond` px off the image.
 template <class F> std::vector<Splat<F, float>> make_splats(int count, float most_opaque, float beyond) {
   std::mt19937 bits(7);
   const auto prepare = [](const Cov2d<float>& cov) {
-    return GaussianFootprint<F::kSamples, true>::prepare_with(cov, float(kBoxVariance<F::kSamples>));
+    return GaussianFootprint<kPixelSamples<F>, true>::prepare_with(cov, float(kBoxVariance<kPixelSamples<F>>));
   };
-  return random_splats<F>(bits, count, kGrid, -1, 3, most_opaque, prepare, beyond);
+  return random_splats<F>(bits, count, {kWidth, kHeight}, -1, 3, most_opaque, prepare, beyond);
 }
 
 struct Image {
@@ -34,18 +33,20 @@ constexpr float kBackground[] = {0.2f, 0.5f, 0.9f};
 
 /// A splat after the other, pixel by pixel.
 template <class F> Image expected_image(const std::vector<Splat<F, float>>& splats) {
-  constexpr int S = F::kSamples;
+  constexpr int S = kPixelSamples<F>;
+  const int side = grid_for<F>(kWidth, kHeight).side();
   Image out(S);
   for (int pixel = 0; pixel < kPixels; ++pixel) {
     const int x = pixel % kWidth, y = pixel / kWidth;
     TileList list = {};
-    list.x0 = x / kTile * kTile, list.y0 = y / kTile * kTile;
+    list.x0 = x / side * side, list.y0 = y / side * side;
     const Vec2<float> p = {float(x - list.x0), float(y - list.y0)};
     double color[3] = {}, through = 0;
     for (int s = 0; s < S; ++s) {
       float transmittance = 1;
       for (size_t k = 0; k < splats.size(); ++k) {
-        const Blended<float> b = blend_sample(F::alpha(tile_terms(splats[k], list), p, s), transmittance);
+        const float raw = F::alpha(tile_terms(splats[k], list), sample_place<F>(p, s), sample_number<F>(s));
+        const Blended<float> b = blend_sample(raw, transmittance);
         if (!b.mask) continue;
         const Vec3<float>& c = splats[k].color;
         color[0] += b.contribution * c.x, color[1] += b.contribution * c.y, color[2] += b.contribution * c.z;
@@ -63,9 +64,10 @@ template <class F> Image expected_image(const std::vector<Splat<F, float>>& spla
 /// What the kernels make.
 template <class F, bool kKeep> Image blended_image(const std::vector<Splat<F, float>>& splats) {
   constexpr int S = F::kSamples, kLength = chunk_length(S);
-  Image out(S);
+  constexpr TileGrid kGrid = grid_for<F>(kWidth, kHeight);
+  Image out(kPixelSamples<F>);
   const int tiles = int(kGrid.tiles()), count = int(splats.size()), chunks = (count + kLength - 1) / kLength;
-  const int front = front_chunks(kGrid, S);
+  const int front = front_chunks(kGrid, int64_t(tiles) * count, S);
   std::vector<int32_t> pairs, order, planes, open(tiles), open_tiles(kSampleClasses * tiles);
   std::vector<int64_t> offsets = {0};
   std::vector<TileChunk> tail;
@@ -77,7 +79,7 @@ template <class F, bool kKeep> Image blended_image(const std::vector<Splat<F, fl
     offsets.push_back(int64_t(pairs.size()));
     order.push_back(tiles - 1 - tile);
     planes.push_back(state.counts.planes);
-    state.counts.planes += p.layout.tile_planes(kGrid, S, chunks);
+    state.counts.planes += p.layout.tile_planes(front, S, chunks);
     for (int chunk = front; chunk < chunks; ++chunk) tail.push_back({tile, chunk, 0});
   }
   state.counts.tail = int32_t(tail.size());
@@ -102,7 +104,7 @@ template <class F, bool kKeep> Image blended_image(const std::vector<Splat<F, fl
   cuda_on_host::launch(3, kBlendThreads, [&] { tail_through_kernel<F>(p); });
   cuda_on_host::launch(3, 32, [&] { tail_scan_kernel<S>(p); });
   cuda_on_host::launch(3, kBlendThreads, [&] { tail_blend_kernel<F, 3, kKeep>(p); });
-  cuda_on_host::launch(3, kTailSumThreads, [&] { tail_sum_kernel<S, 3, kKeep>(p); });
+  cuda_on_host::launch(3, kTailSumThreads, [&] { tail_sum_kernel<F, 3, kKeep>(p); });
   return out;
 }
 
@@ -141,6 +143,10 @@ TEST(BlendKernels, ManyChunks) {
 }
 TEST(BlendKernels, TwoSamples) { expect_front_and_tail<GaussianPixels<2>>(); }
 TEST(BlendKernels, SixteenSamples) { expect_blended<GaussianPixels<16>, true>(40, 0.9f, true); }
+TEST(BlendKernels, SamplesSpreadOverLanes) {
+  expect_front_and_tail<GaussianSample<4>>();
+  expect_front_and_tail<GaussianSample<16>>();
+}
 
 }  // namespace
 }  // namespace ar::cuda

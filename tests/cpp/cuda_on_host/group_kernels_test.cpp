@@ -14,10 +14,10 @@ namespace ar::cuda {
 namespace {
 
 constexpr int kWidth = 20, kHeight = 10, kPixels = kWidth * kHeight;
-constexpr TileGrid kGrid = {kWidth, kHeight};
 
 /// A random scene, all of whose splats every tile lists.
 template <class F> struct Scene {
+  static constexpr TileGrid kGrid = grid_for<F>(kWidth, kHeight);
   int channels;
   std::vector<Splat<F, float>> splats;
   std::vector<SlotPair> pairs;
@@ -33,7 +33,7 @@ template <class F> struct Scene {
       for (float& x : to) x = uniform(bits, low, high);
     };
     splats = random_splats<F>(bits, count, kGrid, -1, largest, most_opaque, [](const Cov2d<float>& cov) {
-      return GaussianFootprint<F::kSamples, true>::prepare_with(cov, 1 / 12.0f);
+      return GaussianFootprint<kPixelSamples<F>, true>::prepare_with(cov, 1 / 12.0f);
     });
     fill(rows, count * channels, 0, 1);
     fill(background, channels, 0, 1);
@@ -63,6 +63,7 @@ struct Way {
 
 template <class F> struct Run {
   static constexpr int S = F::kSamples;
+  static constexpr TileGrid kGrid = Scene<F>::kGrid;
 
   const Scene<F>& scene;
   const Way way;
@@ -82,8 +83,8 @@ template <class F> struct Run {
   Run(const Scene<F>& scene, Way way) : scene(scene), way(way) {
     out.image.resize(scene.channels * kPixels);
     out.alpha.resize(kPixels);
-    out.transmittance.resize(S * kPixels);
-    out.last.resize(S * kPixels);
+    out.transmittance.resize(kPixelSamples<F> * kPixels);
+    out.last.resize(kPixelSamples<F> * kPixels);
     out.shapes.assign(count, std::vector<float>(kShapeSums));
     out.channels.assign(count, std::vector<float>(scene.channels));
     for (int tile = 0; tile < tiles; ++tile) order.push_back(tile), chunks.push_back({tile, 0, 0});
@@ -144,7 +145,7 @@ template <class F> struct Run {
     for (int tile = 0; tile < tiles; ++tile) {
       for (int t = 0; t < kTilePixels; ++t) {
         const TileList list = list_of(blend.lists, kGrid, tile);
-        const Vec2<float> p = pixel_of(t / 32, t % 32);
+        const Vec2<float> p = place_of<F>(t / 32, t % 32);
         for (int s = 0; s < S; ++s) {
           float transmittance = 1;
           for (int k = 0; k < count; ++k) {
@@ -169,7 +170,7 @@ template <class F> struct Run {
     for_each_group([&](auto width, int first) {
       cuda_on_host::launch(tiles * way.segments, kBlendThreads,
                            [&] { segment_blend_kernel<F, width()>(blend, cut, first); });
-      cuda_on_host::launch(tiles, kTilePixels, [&] { segment_sum_kernel<S>(blend, first, width()); });
+      cuda_on_host::launch(tiles, kTilePixels, [&] { segment_sum_kernel<F>(blend, first, width()); });
     });
   }
 
@@ -219,7 +220,7 @@ template <class F> struct Run {
 
 /// Pixel by pixel, in float64, from the same lists of splats that reach a subtile.
 template <class F> Results reference(const Scene<F>& scene, MeanSums mean_sums) {
-  constexpr int S = F::kSamples;
+  constexpr int S = kPixelSamples<F>;
   const int count = int(scene.splats.size());
   Results out;
   out.image.resize(scene.channels * kPixels);
@@ -243,7 +244,8 @@ template <class F> Results reference(const Scene<F>& scene, MeanSums mean_sums) 
     for (int k = 0; k < count; ++k) {
       const auto terms = terms_of(k);
       for (int s = 0; s < S; ++s) {
-        const Blended<double> b = blend_sample(F::alpha(terms, p, s), transmittance[s]);
+        const Blended<double> b =
+            blend_sample(F::alpha(terms, sample_place<F>(p, s), sample_number<F>(s)), transmittance[s]);
         hits[k][s] = b.mask;
         for (int c = 0; c < scene.channels; ++c) image[c] += b.contribution * scene.rows[k * scene.channels + c] / S;
       }
@@ -263,9 +265,9 @@ template <class F> Results reference(const Scene<F>& scene, MeanSums mean_sums) 
         g_color += scene.dL_dimage[c * kPixels + i] / double(S) * scene.rows[k * scene.channels + c];
       ShapeGrad<double> sums = {{0, 0}, {0, 0, 0}};
       for (int s = 0; s < S; ++s) {
-        const double alpha = F::alpha(terms, p, s);
+        const double alpha = F::alpha(terms, sample_place<F>(p, s), sample_number<F>(s));
         const BlendGrad<double> grad = blend_sample_vjp(bool(hits[k][s]), alpha, g_color, transmittance[s], behind[s]);
-        F::add_alpha_vjp(terms, p, s, grad.of_alpha, sums);
+        F::add_alpha_vjp(terms, sample_place<F>(p, s), sample_number<F>(s), grad.of_alpha, sums);
         contribution += grad.contribution;
         weighted += grad.of_alpha.weighted;
       }
@@ -305,7 +307,7 @@ void expect_near(const Results& a, const Results& b) {
 }
 
 template <class F> class GroupKernels : public testing::Test {};
-using Gaussians = testing::Types<GaussianPixels<1>, GaussianPixels<4>>;
+using Gaussians = testing::Types<GaussianPixels<1>, GaussianPixels<4>, GaussianSample<4>, GaussianSample<16>>;
 TYPED_TEST_SUITE(GroupKernels, Gaussians);
 
 TYPED_TEST(GroupKernels, GiveWhatCompositingPixelByPixelGives) {

@@ -64,6 +64,7 @@ void expect_planned(const Case& c) {
     return cut_by_length[pairs(tile)] ? c.cut.segment : whole ? kWholeList : chunk_length(samples[tile]);
   };
 
+  const auto front_of = [&](int tile) { return front_chunks(c.grid, offsets.back(), samples[tile]); };
   const CheckpointLayout layout = {3, c.keep};
   std::vector<TileChunk> chunk_order(size_t(tiles + offsets.back() / chunk_length(1) + c.cut.max_segments));
   std::vector<TileChunk> tail(chunk_order.size());
@@ -83,13 +84,13 @@ void expect_planned(const Case& c) {
   std::map<std::pair<int, int>, int> expected_chunks;  // their lengths
   int parts_of_tiles[kSampleClasses + 1] = {}, parts_of_chunks[kSampleClasses + 1] = {}, planes = 0;
   for (int tile = 0; tile < tiles; ++tile) {
-    const int s = sample_class(samples[tile]), front = front_chunks(c.grid, samples[tile]);
+    const int s = sample_class(samples[tile]), front = front_of(tile);
     int chunk = 0;
     for (int k = 0; k < pairs(tile); k += length(tile), ++chunk) {
       expected_chunks[{tile, chunk}] = std::min(length(tile), pairs(tile) - k);
       if (chunk >= front && !whole) expected_tail.insert({tile, chunk});
     }
-    if (!whole) planes += layout.tile_planes(c.grid, samples[tile], chunk);
+    if (!whole) planes += layout.tile_planes(front, samples[tile], chunk);
     for (int after = s + 1; after <= kSampleClasses; ++after) ++parts_of_tiles[after], parts_of_chunks[after] += chunk;
   }
   const PlanCounts& made = state.counts;
@@ -119,13 +120,13 @@ void expect_planned(const Case& c) {
     EXPECT_GE(of_class, last_class);
     last_class = of_class;
     expected_chunks[found->first] = -1;  // seen
-    const int s = samples[part.tile], of_chunk = layout.planes(s), first = layout.first_chunk(c.grid, s);
+    const int s = samples[part.tile], of_chunk = layout.planes(s), first = layout.first_chunk(front_of(part.tile));
     EXPECT_EQ(part.plane, tile_planes[part.tile] + (part.chunk - first) * of_chunk);
   }
   for (const auto& [chunk, seen] : expected_chunks) ASSERT_EQ(seen, -1) << chunk.first << " " << chunk.second;
   for (int tile = 0; tile < tiles && !whole; ++tile) {
     const int chunks = (pairs(tile) + length(tile) - 1) / length(tile);
-    const int own = layout.tile_planes(c.grid, samples[tile], chunks);
+    const int own = layout.tile_planes(front_of(tile), samples[tile], chunks);
     for (int plane = 0; plane < own; ++plane) ASSERT_TRUE(used.insert(tile_planes[tile] + plane).second) << tile;
   }
   EXPECT_EQ(int(used.size()), planes);
@@ -157,7 +158,8 @@ void expect_planned(const Case& c) {
   for (int k = 0; k < made.tail; ++k) EXPECT_EQ(expected_tail.erase({tail[k].tile, tail[k].chunk}), 1u);
   for (const TileChunk& part : std::vector<TileChunk>(tail.begin(), tail.begin() + made.tail)) {
     const int s = samples[part.tile];
-    EXPECT_EQ(part.plane, tile_planes[part.tile] + (part.chunk - layout.first_chunk(c.grid, s)) * layout.planes(s));
+    EXPECT_EQ(part.plane,
+              tile_planes[part.tile] + (part.chunk - layout.first_chunk(front_of(part.tile))) * layout.planes(s));
   }
 }
 

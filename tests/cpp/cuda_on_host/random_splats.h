@@ -13,6 +13,28 @@ inline float uniform(std::mt19937& bits, float low, float high) {
   return std::uniform_real_distribution<float>(low, high)(bits);
 }
 
+/// Samples of a pixel, whether a lane has them all or one of them.
+template <class F> inline constexpr int kPixelSamples = F::kSamples * F::kLanes;
+
+/// An image of so many pixels, in tiles of the size that kernels for F take.
+template <class F> constexpr TileGrid grid_for(int width, int height) {
+  return {width, height, spread_tile_bits(F::kLanes, true)};
+}
+
+/// Where F takes sample s of the pixel at p, and its number there.
+template <class F, class V> Vec2<V> sample_place(Vec2<V> p, int s) {
+  if constexpr (F::kLanes > 1) return {p.x + V(float(F::node(s).x)), p.y + V(float(F::node(s).y))};
+  return p;
+}
+template <class F> int sample_number(int s) { return F::kLanes > 1 ? 0 : s; }
+
+/// The place in a tile, of kTilePixels, of the lane that has sample s of the tile's pixel (x, y).
+template <class F> int lane_place(int x, int y, int s) {
+  constexpr int kWide = kSubtileWide<F>, kHigh = kSubtileHigh<F>;
+  const int pixel = y % kHigh * kWide + x % kWide;
+  return (y / kHigh * 2 + x / kWide) * 32 + pixel * F::kLanes + (F::kLanes > 1 ? s : 0);
+}
+
 /// Splats anywhere in an image and up to `beyond` px off it, with standard deviations along axes in any direction, of
 /// variances from exp(`low`) to exp(`high`) px^2. `prepare` makes a footprint's shape of a covariance.
 template <class F, class Prepare>
