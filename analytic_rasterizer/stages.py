@@ -336,9 +336,10 @@ class Stages(NamedTuple):
         depths: (V,) camera-space z, world units.
         means2d: (V, 2) px.
         pairs: (N,) int32, the splat of each of the N (tile, splat) pairs, by tile, then front to back.
-        tile_offsets: (tiles + 1,) int64, first pair of each tile, tiles row by row. Tiles have 16x16 px; those of
-            `moment` on CUDA have 8x8, except with one cell in images of 4096 or more tiles of 8x8 px, where they have
-            16x16, and with 9 and 16 cells in smaller ones, where they have 4x4.
+        tile_offsets: (tiles + 1,) int64, first pair of each tile, tiles row by row. Tiles have 16x16 px. On CUDA those
+            of `moment` have 8x8, except with one cell in images of 4096 or more tiles of 8x8 px, where they have 16x16,
+            and with 9 and 16 cells in smaller ones, where they have 4x4; those of `box` with 16 samples have 4x4, and
+            with 4 in images of fewer than 4096 tiles of 16x16 px 8x8.
         tile_samples: (tiles,) int32, samples of each tile where the footprint chooses them (`adaptive`), else empty.
         seconds: Time of each stage, s: "project", "bin", "blend".
     """

@@ -46,7 +46,8 @@ class Image(NamedTuple):
         return scenes.cast({k: torch.cat([v, around[k]]) for k, v in scene.items()}, torch.float32, device)
 
 
-# 512x512 pixels are 4096 tiles of 8x8: enough for the kernels of large images. Lists of thousands of splats have chunks
+# 512x512 pixels are 4096 tiles of 8x8: enough for the kernels of large images of `moment`. Those of `box` with four
+# samples need 1024x1024, and only they are given so many. Lists of thousands of splats have chunks
 # behind the front, and several segments; those of kLongList pairs or more (csrc/cuda/cut_lists.cuh) are cut in large
 # images too, and alone in small ones with 9 and 16 cells, and have a layout of their own. Where Gaussians are opaque,
 # pixels close (so little light is left that 3DGS stops) before their lists end.
@@ -59,11 +60,12 @@ IMAGES = {
     "small, opaque": Image(40, 30, 1000, opacity=(0.3, 0.99), sigma=(0.1, 0.5)),
     "pixel": Image(1, 1, 300),
 }
+LARGEST = Image(1024, 1024, 600)
 
 
 def render(device: str, channels: int = 3, images: Sequence[str] = tuple(IMAGES), **settings) -> None:
     """Pictures of random scenes and all of their gradients."""
-    for image in map(IMAGES.get, images):
+    for image in map((IMAGES | {"largest": LARGEST}).get, images):
         leaves = scenes.leaves(image.scene(device))
         if channels != 3:
             del leaves["shs"]
@@ -81,7 +83,8 @@ def render(device: str, channels: int = 3, images: Sequence[str] = tuple(IMAGES)
 
 def many_channels(device: str) -> None:
     for count in (1, 5, 32, 70):
-        render(device, channels=count, footprint="box:samples=4")
+        render(device, channels=count, images=(*IMAGES, "largest"), footprint="box:samples=4")
+        render(device, channels=count, footprint="box:samples=16")
         render(device, channels=count, footprint="analytic")
 
 
@@ -90,7 +93,7 @@ def too_many_pairs(device: str) -> None:
     if device == "cuda":
         _C.force_pair_capacity(64)
     try:
-        for footprint, options in [*scenes.PATHS, ("moment", {"samples": 16})]:
+        for footprint, options in [*scenes.PATHS, ("moment", {"samples": 16}), ("box", {"samples": 16})]:
             render(device, images=("large", "small", "small, opaque"), footprint=footprint, **options)
     finally:
         if device == "cuda":
@@ -129,6 +132,7 @@ def training(device: str) -> None:
 
 
 PARTS = {scenes.name_of(variant): partial(render, footprint=variant[0], **variant[1]) for variant in scenes.RENDERED}
+PARTS |= {"largest": partial(render, images=("largest",), footprint="box:samples=4")}
 PARTS |= {"channels": many_channels, "pairs": too_many_pairs}
 PARTS |= {"effects": effects, "losses": losses, "training": training}
 

@@ -40,10 +40,10 @@ def gradients(scene, footprint, dL_dcolor, device, dtype, **options):
 
 @pytest.mark.parametrize("tolerance", TOLERANCES)
 def test_tiles_are_those_of_box(device, tolerance):
-    """Every tile is the tile of `box` with its samples, and gradients add up over the tiles.
+    """Every tile is what `box` with its samples has there, and gradients add up over the tiles.
 
-    Both compute the same numbers in another order: the image to a few roundings, the gradient to the
-    roundings of its sum.
+    Both compute the same numbers in another order, and on CUDA in tiles of other sizes: the image to a few
+    roundings, the gradient to the roundings of its sum.
     """
     dtype = torch.float32
     scene = busy_scene()

@@ -619,6 +619,7 @@ def test_every_kernel_has_images_that_need_it(footprint, options):
         closed[name] = int((inside & (leaves["opacities"].grad[splats.gaussian_ids.long(), 0] == 0)).sum())
     large = [image for name, image in program.IMAGES.items() if name.startswith("large")]
     assert all((image.width // 8) * (image.height // 8) >= 4096 for image in large)
+    assert (program.LARGEST.width // 16) * (program.LARGEST.height // 16) >= 4096
     assert most_in_tile["small"] > int(long_list) and longest["small"] > int(long_list)
     assert most_in_tile["large, few tiles"] > int(long_list) and short["large, few tiles"] > 100
     assert closed["large, opaque"] > 100 and closed["small, opaque"] > 100

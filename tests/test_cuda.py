@@ -24,6 +24,7 @@ pytestmark = needs_cuda
 
 CAMERA = Camera(image_height=150, image_width=201, bg=(0.2, 0.5, 0.9), sh_degree=2)
 LARGE = replace(CAMERA, image_height=520, image_width=528)  # 66x65 tiles of 8x8 pixels
+LARGEST = replace(CAMERA, image_height=1024, image_width=1030)  # 65x64 tiles of 16x16 pixels
 SCENES = {
     "few": {"seed": 0, "count": 40},
     "some": {"seed": 1, "count": 3000, "sigma": (0.005, 0.3)},
@@ -34,10 +35,13 @@ SCENES = {
 COUNTED_FRAMES = 33
 
 every_footprint = pytest.mark.parametrize("variant", RENDERED, ids=name_of)
-each_path = pytest.mark.parametrize("variant", PATHS, ids=name_of)
+# Sixteen samples have a lane each, as four have in small images, and other tiles.
+each_path = pytest.mark.parametrize("variant", [*PATHS, ("box", {"samples": 16})], ids=name_of)
 each_kind = pytest.mark.parametrize("variant", KINDS, ids=name_of)
-# On CUDA, sums of absolute values over many samples have kernels of their own.
-each_sum_of_absolute_values = pytest.mark.parametrize("variant", [*KINDS, ("box", {"samples": 16})], ids=name_of)
+# On CUDA, sums of absolute values over eight samples have kernels of their own, and over sixteen add up lanes.
+each_sum_of_absolute_values = pytest.mark.parametrize(
+    "variant", [*KINDS, ("box", {"samples": 8}), ("box", {"samples": 16})], ids=name_of
+)
 
 
 class Result(NamedTuple):
@@ -143,10 +147,12 @@ def compare_gradients(ours, theirs, tolerances):
 
 
 def assert_same_without_gradient(scene, settings, color):
-    """The image does not depend on whether a backward pass may come: to the bit with one sample. Of several
-    samples the backward pass needs the colour of each, so that they are added up in another order."""
+    """The image does not depend on whether a backward pass may come: to the bit where a lane has one sample. Of
+    several samples the backward pass needs the colour of each, so that they are added up in another order."""
     actual = run_without_gradient(scene, settings, "cuda")
-    if most_samples(settings) == 1:
+    side = _C.tile_size(settings.footprint.key, 1.0, settings.image_width, settings.image_height, True)
+    spread = settings.footprint.name == "box" and side < ar.TILE
+    if most_samples(settings) == 1 or spread:
         assert torch.equal(actual, color)
     else:
         assert (actual - color).abs().max() < 4e-6 * color.abs().max().clamp_min(1)
@@ -302,6 +308,19 @@ def test_image_sizes(variant, size):
     camera = replace(CAMERA, image_width=size[0], image_height=size[1])
     scene = scenes.cast(scenes.random_scene(5, 60, degree=2, sigma=(0.01, 0.3), spread=0.9), torch.float32)
     settings = settings_for(variant, camera)
+    compare(scene, settings)
+
+
+@pytest.mark.parametrize("channels", [3, 4, 40])
+def test_four_samples_in_large_images(channels):
+    """From 4096 tiles of 16x16 pixels on, a lane has all samples of a pixel."""
+    scene, settings = scene32("few"), settings_for(("box", {"samples": 4}), LARGEST)
+    if channels != 3:
+        g = torch.Generator().manual_seed(5)
+        scene = {name: value for name, value in scene.items() if name != "shs"}
+        scene["colors_precomp"] = scenes.rand(g, len(scene["means3D"]), channels).float()
+        settings = settings._replace(bg=scenes.rand(g, channels).float())
+    assert _C.tile_size(settings.footprint.key, 1.0, LARGEST.image_width, LARGEST.image_height, True) == ar.TILE
     compare(scene, settings)
 
 

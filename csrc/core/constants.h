@@ -9,7 +9,8 @@ inline constexpr int kTileBits = 4, kTile = 1 << kTileBits;
 inline constexpr int kMovingTileBits = 3, kMovingTile = 1 << kMovingTileBits;
 /// An image with fewer tiles of that size is small: CUDA has other kernels for samples that move in it.
 inline constexpr int kSmallImageTiles = 4096;
-/// Tiles of 16x16 pixels from which on four samples of a pixel are not spread over lanes (spread_grid() there).
+/// An image with so many tiles of 16x16 pixels or more does not have four samples of a pixel spread over lanes on CUDA
+/// (spread_grid() of core/stages.h).
 inline constexpr int kSpreadImageTiles = 4096;
 
 /// A Gaussian is culled unless the camera-space z of its mean exceeds this [world units].

@@ -43,9 +43,10 @@ AR_HD constexpr int moving_tile_bits(int samples, bool small_image) {
   if (samples == 1 && !small_image) return kTileBits;
   return samples >= 9 && small_image ? kMovingTileBits - 1 : kMovingTileBits;
 }
-/// The tiles on CUDA where the samples of a pixel may be spread over so many lanes (Spread of contract.h): if they are,
-/// of as many pixels as have 256 samples. Sixteen always are. Four are in images in which there would be few tiles of
-/// 16x16 pixels, with long lists; in others, to list more pairs would cost more than smaller tiles save.
+/// The tiles on CUDA where the samples of a pixel may be spread over so many lanes (Spread of contract.h). A tile whose
+/// samples are has 256 of them: 8x8 pixels with 4 samples, 4x4 with 16. Sixteen samples are spread in every image. Four
+/// are in small ones, where there would be few tiles of 16x16 pixels, with long lists; in large ones smaller tiles
+/// would save less than it costs to list more pairs.
 AR_HD constexpr int spread_tile_bits(int lanes, bool small_image) {
   return lanes == 16 ? kTileBits - 2 : lanes == 4 && small_image ? kTileBits - 1 : kTileBits;
 }

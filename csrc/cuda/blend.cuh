@@ -11,7 +11,7 @@
 //   tail_sum       adds up the chunks
 //
 // Since chunks of the tail are handled side by side, few tiles with long lists, as in small images of large scenes,
-// still fill the device. The last bits of the result depend on nothing but the lists.
+// still fill the device. The last bits of the result depend on nothing but the lists of all tiles.
 //
 // kKeep says whether what the backward pass needs is kept: at the end of every chunk a checkpoint with the
 // transmittance and the channels of every sample.

@@ -64,29 +64,31 @@ template <int C> struct ChannelShare {
       for (int k = 0; k < kOwn; ++k) v[i][k] = madd(contributions[i], own[k], v[i][k]);
     }
   }
-  /// Sums over the lanes that a pixel's samples are spread over, which are at places of other lanes, too.
+  /// Adds up what the lanes of a pixel have, where its samples are spread over so many lanes. All of them get the sum.
   template <int kLanes> __device__ void add_lanes() {
     static_assert(kLanes == 1 || kLanes == 4 || kLanes == 16);
-    if constexpr (kLanes == 1) return;
-    const auto exchange = [&](int other, int offset) {
-#pragma unroll
-      for (int i = 0; i < kPixels; ++i) {
-        float given[kOwn];
-#pragma unroll
-        for (int k = 0; k < kOwn; ++k) given[k] = __shfl_xor_sync(kAllLanes, v[i][(k + other) % kOwn], offset);
-#pragma unroll
-        for (int k = 0; k < kOwn; ++k) v[i][k] += given[k];
-      }
-    };
-    exchange(0, 1);
-    exchange(0, 2);
+    if constexpr (kLanes > 1) {  // four neighbours have the same channels
+      add_from_lane(1, 0);
+      add_from_lane(2, 0);
+    }
     if constexpr (kLanes == 16) {
-      exchange(kHalf, 4);  // whose first half are this lane's second
+      add_from_lane(4, kHalf);  // the first eighth that this lane has is the second of that one
 #pragma unroll
-      for (int i = 0; i < kPixels; i += 2) {
+      for (int i = 0; i < kPixels; i += 2) {  // lanes that are 8 apart are of the same pixel
 #pragma unroll
         for (int k = 0; k < kOwn; ++k) v[i][k] = v[i + 1][k] = v[i][k] + v[i + 1][k];
       }
+    }
+  }
+  /// Adds what the lane has whose number differs from this one's by `offset`, beginning with its channel `first`.
+  __device__ void add_from_lane(int offset, int first) {
+#pragma unroll
+    for (int i = 0; i < kPixels; ++i) {
+      float given[kOwn];
+#pragma unroll
+      for (int k = 0; k < kOwn; ++k) given[k] = __shfl_xor_sync(kAllLanes, v[i][(k + first) % kOwn], offset);
+#pragma unroll
+      for (int k = 0; k < kOwn; ++k) v[i][k] += given[k];
     }
   }
   /// The scalar product with one number per channel, for this lane's own pixel.

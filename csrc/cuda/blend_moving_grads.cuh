@@ -26,7 +26,7 @@ template <class F, int C> struct SampleGrad {
         through += sample_gradient<F>(params, pixel, c) * params.background[c];
     }
     // Alpha is 1 - transmittance: its gradient acts like one more channel whose background is -1.
-    if (first == 0 && params.dL_dalpha && pixel.inside) through -= 1.0f / F::kSamples * params.dL_dalpha[pixel.index];
+    if (first == 0 && params.dL_dalpha && pixel.inside) through -= kSampleShare<F> * params.dL_dalpha[pixel.index];
   }
 
   /// Its scalar product with the colour of a splat, `id()`.

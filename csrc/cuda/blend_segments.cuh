@@ -82,7 +82,7 @@ __device__ void walk_segment(const Splat<F, float>* splats, const Channels<float
   }
 }
 
-/// A block per tile and segment. Writes what the segment adds to the channels [first, first + C) of each pixel, times
+/// A block per tile and segment. Writes what the segment adds to the channels [first, first + C) of each lane, times
 /// the samples. `in_chunks`: of the kernels that went first.
 template <class F, int C>
 __global__ void __launch_bounds__(kBlendThreads, F::kSamples > 4 ? 1 : 2)

@@ -90,33 +90,32 @@ template <class F, int C, Sums kSums> class LanePixels {
   std::conditional_t<kHoldsState, VjpSamples<kOwn, kSubtiles>, int> samples_;
 };
 
-/// Calls visit(b, p) for the subtiles b of a set, that of this lane being at p. `first`: where that of subtile 0
-/// is.
+/// Calls visit(b, p) for the subtiles b of a set, p being what place_of(b) gives for this lane; `of_first`: what it
+/// gives for subtile 0.
 template <class F, int C, class Visit>
-__device__ __forceinline__ void visit_subtiles(uint32_t subtiles, Vec2<float> first, Visit&& visit) {
-  constexpr int kWide = kSubtileWide<F>, kHigh = kSubtileHigh<F>;
+__device__ __forceinline__ void visit_subtiles(uint32_t subtiles, Vec2<float> of_first, Visit&& visit) {
   if constexpr (kTakesTwo<F, C>) {
 #pragma unroll
     for (int q = 0; q < kSubtiles / 2; ++q) {
       const int upper = q % 2 + q / 2 * 4, lower = upper + 2;
       if (!(subtiles & (1u << upper | 1u << lower))) continue;
-      const Vec2<float> p = {first.x + float(q % 2 * kWide), first.y + float(q / 2 * 2 * kHigh)};
-      visit(upper, p);
-      visit(lower, Vec2<float>{p.x, p.y + kHigh});
+      visit(upper, place_in<F>(upper, of_first));
+      visit(lower, place_in<F>(lower, of_first));
     }
   } else if constexpr (kUnrollsSubtiles<F, C>) {
 #pragma unroll
     for (int b = 0; b < kSubtiles; ++b) {
-      if (subtiles >> b & 1) visit(b, Vec2<float>{first.x + float(kWide * (b & 1)), first.y + float(kHigh * (b >> 1))});
+      if (subtiles >> b & 1) visit(b, place_in<F>(b, of_first));
     }
   } else {
     constexpr int kTwo23 = 0x4b000000;
     for (uint32_t left = subtiles; left != 0; left &= left - 1) {
       const int b = __ffs(left) - 1;
-      // place_of(b, lane); an integer below 2^23 set into the mantissa of 2^23 is that float, plus 2^23
+      // place_in(b, of_first); an integer below 2^23 set into the mantissa of 2^23 is that float, plus 2^23
       const float column = __int_as_float(kTwo23 | (b & 1)) - 8388608.0f;
       const float band = __int_as_float(kTwo23 | (b >> 1)) - 8388608.0f;
-      visit(b, Vec2<float>{madd(float(kWide), column, first.x), madd(float(kHigh), band, first.y)});
+      visit(b, Vec2<float>{madd(float(kSubtileWide<F>), column, of_first.x),
+                           madd(float(kSubtileHigh<F>), band, of_first.y)});
     }
   }
 }

@@ -228,7 +228,7 @@ template <class F, int C, Sums kSums> class ChunkWalk {
   const int first_;  ///< sample
   const int lane_ = lane_id(), warp_ = threadIdx.x / 32;
   const Splat<F, float>* const splats_ = reinterpret_cast<const Splat<F, float>*>(params_.splats);
-  const Vec2<float> p0_ = place_of<F>(0, lane_);                      ///< of the lane in subtile 0
+  const Vec2<float> p0_ = place_of<F>(0, lane_);                      ///< of the lane's sample in subtile 0
   const uint32_t subtile_bit_ = lane_ < kSubtiles ? 1u << lane_ : 0;  ///< of subtile number `lane`
   const int value_ = summed_value<kSumCount>(lane_);                  ///< that sum_values leaves here
   float* const sums_ = params_.pair_grads + (value_ == 9 ? kPairFourthChannel : value_);  ///< of row 0

@@ -20,10 +20,10 @@ inline constexpr int kNoList = 1 << 30;
 inline constexpr int kManyBlocks = 1056;
 
 /// Chunks of a tile that blend goes through one after the other, which reads no pair behind the point where all pixels
-/// have stopped; of an image with so many pairs. The remaining chunks are blended side by side, which takes more work.
-/// Few tiles cannot fill the device, so their front is short. Else it is so long that fewer than kManyBlocks tiles have
-/// a tail: those whose list is longer than a block's share of all pairs, and would keep it busy when the others have
-/// ended.
+/// have stopped. `pairs` are those of the whole image, `samples` those that a lane has. The remaining chunks are
+/// blended side by side, which takes more work. Few tiles cannot fill the device, so their front is short. Else it is
+/// so long that fewer than kManyBlocks tiles have a tail: those whose list is longer than a block's share of all pairs,
+/// and would keep it busy when the others have ended.
 AR_HD int front_chunks(TileGrid grid, int64_t pairs, int samples) {
   constexpr int kMost = 1 << 28;
   int front = 256;

@@ -1,8 +1,9 @@
 // What the kernels of blend and blend_vjp share: pixels, lists of tiles, and splats staged for a tile.
 //
 // A tile's 16x16 pixels are eight subtiles of 8x4, a warp of lanes each: subtile b at column b % 2 and row b / 2, lane
-// l at column l % 8 and row l / 8 of it. A splat is tested against the subtiles once per tile; warps skip those that do
-// not reach them.
+// l at column l % 8 and row l / 8 of it. With a Spread (core/footprint/contract.h) a lane has one sample instead, the
+// lanes of a pixel are neighbours, and there are fewer pixels; "a lane's pixel" is then the one of its sample. A splat
+// is tested against the subtiles once per tile; warps skip those that do not reach them.
 #pragma once
 
 #include <type_traits>
@@ -31,18 +32,23 @@ template <class F> __device__ Vec2<float> pixel_of(int b, int lane) {
   const int pixel = lane / F::kLanes;
   return {float((b & 1) * kWide + pixel % kWide), float((b >> 1) * kHigh + pixel / kWide)};
 }
-/// Where the lane's sample is, if it has one of a pixel whose samples are spread over lanes; else its pixel.
+/// Where a lane's sample of subtile b is, relative to the tile's first pixel; that of subtile 0 is at `of_first`. Blend
+/// and blend_vjp must find the same place to the bit, so both come here: one addition, of a whole number.
+template <class F> __device__ Vec2<float> place_in(int b, Vec2<float> of_first) {
+  return {of_first.x + float((b & 1) * kSubtileWide<F>), of_first.y + float((b >> 1) * kSubtileHigh<F>)};
+}
+/// The same by the lane's number. Where a lane has all samples of a pixel, it is the pixel.
 template <class F> __device__ Vec2<float> place_of(int b, int lane) {
-  Vec2<float> place = pixel_of<F>(b, lane);
+  Vec2<float> of_first = pixel_of<F>(0, lane);
   if constexpr (F::kLanes > 1) {
     Vec2<float> node = {0, 0};
 #pragma unroll
     for (int s = 0; s < F::kLanes; ++s) {
       if (lane % F::kLanes == s) node = {float(F::node(s).x), float(F::node(s).y)};
     }
-    place = place + node;
+    of_first = of_first + node;
   }
-  return place;
+  return place_in<F>(b, of_first);
 }
 
 /// A tile and its list of splats, front to back.
@@ -365,7 +371,7 @@ __device__ inline void put_sum(float* rows, int width, bool of_cell, int32_t row
 }
 
 template <class F> constexpr int tile_bits_of(bool small_image) {
-  return F::kMoves ? moving_tile_bits(F::kSamples, small_image) : spread_tile_bits(lanes_of<F>(), small_image);
+  return F::kMoves ? moving_tile_bits(F::kSamples, small_image) : spread_tile_bits(spread_lanes<F>(), small_image);
 }
 /// Calls `visit` with the side of the grid's tiles, one of those that F has, as a constant.
 template <class F, class Visit> void with_tile_side(TileGrid grid, Visit&& visit) {

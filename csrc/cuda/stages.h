@@ -149,7 +149,7 @@ struct ChooseParams {
 /// ListCut.
 struct Segments {
   int count;             ///< of each tile; 1: the list is walked as one, and there is nothing else here
-  int samples;           ///< the most that a tile has
+  int samples;           ///< the most that a lane has
   float* transmittance;  ///< [tiles, count, samples, kTile^2] in front of a segment, where the sample is still open
   float* sums;           ///< [tiles, count, kChannelGroup, kTile^2] what a segment adds to the channels of a group
   float* shown;  ///< [tiles, count, samples, kTile^2] the product of that, per sample, with the pixel's gradient
@@ -175,7 +175,7 @@ struct BlendParams : ar::BlendParams<float> {
   int32_t* tile_open;   ///< [tiles] whether the tile is one of the open ones
   int32_t* open_tiles;  ///< [kSampleClasses, tiles]
   CheckpointLayout layout;
-  float* checkpoints;     ///< [planes, pixels of a tile]
+  float* checkpoints;     ///< [planes, kTile^2], a number of each lane; of samples that move, of each pixel of a tile
   uint32_t* reach_words;  ///< [max_reach_words], or null where no list may be cut
   Segments segments;      ///< for more than kFewChannels channels
 };
@@ -280,9 +280,9 @@ int64_t max_reach_words(const ListCut& cut, TileGrid grid);
 int64_t max_adjoint_maps(int samples, const ListCut& cut, TileGrid grid);
 int64_t max_group_sums(int footprint, const ListCut& cut, TileGrid grid);
 /// Segments of each tile's list that many channels are blended in.
+int list_segments(int footprint, int64_t channels, TileGrid grid);
 /// Samples of a pixel that a lane has: all, unless they are spread over lanes.
 int samples_of_lane(int footprint, TileGrid grid);
-int list_segments(int footprint, int64_t channels, TileGrid grid);
 /// Channels that a group-less blending is compiled for: 3 in the splats themselves, or 4 in rows.
 constexpr int compiled_channels(bool in_splats) { return in_splats ? 3 : kFewChannels; }
 /// Only for a footprint that chooses.

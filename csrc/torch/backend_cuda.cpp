@@ -374,7 +374,7 @@ class CudaBackend final : public Backend {
     const int64_t max_planes = !cut.whole  ? p.layout.max_planes(pass.grid, samples, capacity, footprint.chosen)
                                : pass.keep ? cuda::max_state_planes(footprint.choice.index, capacity)
                                            : 0;
-    const int side = cut.whole ? pass.grid.side() : kTile;
+    const int side = cut.whole ? pass.grid.side() : kTile;  // in chunks a plane has a number of each of 256 lanes
     state.checkpoints = at::empty({max_planes * side * side}, floats_);
     state.chunks = at::empty({kPlanRows + chunks + tiles + cut.max_lists, kChunkWidth}, ints_);
     const auto [memory, parts] = make_memory<PlanMemory>(bytes_, tiles, cut.whole ? 0 : chunks);

@@ -102,7 +102,7 @@ FootprintSpec find_footprint(const std::string& key, double option) {
     spec.samples = decltype(f)::kSamples;
     spec.chosen = std::is_same_v<decltype(f), Adaptive>;
     spec.moves = decltype(f)::kMoves;
-    spec.lanes = lanes_of<decltype(f)>();
+    spec.lanes = spread_lanes<decltype(f)>();
   });
   return spec;
 }

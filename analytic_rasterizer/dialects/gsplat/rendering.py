@@ -92,7 +92,7 @@ def rasterization(
             the mode "antialiased". Not read where a footprint was chosen.
         sh_degree: Degree of the harmonics in use, 0 to 4; None: colors are colours.
         packed: Whether `meta` has a row per splat, or a place for every Gaussian in every camera.
-        tile_size: Ignored: tiles have 16 px.
+        tile_size: Ignored: tiles have the size that suits the footprint.
         backgrounds: (..., C, D) colours behind the Gaussians; None: zero. There is no depth behind them.
         render_mode: "RGB" for colours, "D" for accumulated depth, "ED" for expected depth, "RGB+D", "RGB+ED".
         absgrad: Let the backward pass set `meta["means2d"].absgrad`: sums over pixels of absolute gradients.

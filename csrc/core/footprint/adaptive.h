@@ -16,7 +16,7 @@ template <typename T> struct AdaptiveShape {
 template <int S> struct AdaptiveBox : GaussianFootprint<S, true> {
   using Gaussian = GaussianFootprint<S, true>;
   static constexpr double kVariance = kBoxVariance<S>;
-  using Spread = void;  // tiles with other numbers of samples have tiles of the same size
+  using Spread = void;  // tiles with one and with eight samples are in the same grid, and have 16x16 pixels
   template <typename T> using Shape = AdaptiveShape<T>;
 
   AR_HD static double radius_variance(FootprintOptions) { return kPixelVariance; }

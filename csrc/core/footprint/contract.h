@@ -17,9 +17,11 @@
 //   Pixels               a type with the same Shape, terms, alpha, adjoint, ellipse and samples, for which blending is
 //                        compiled instead, once for all footprints that name it. Default: F
 //   kSamples             samples of a pixel, each with its own transmittance. Default: 1
-//   Spread               a type with the same Shape, ellipse and level, for which CUDA kernels are compiled instead in
-//                        small images: a single sample, p being where it lies. The samples of a pixel are then spread
-//                        over kLanes lanes, that of lane s at its node(s). Default: void, there is none
+//   Spread               a type that blends one sample of a pixel, with the same Shape, ellipse and level. CUDA kernels
+//                        are compiled for it where spread_grid() of core/stages.h has small tiles: there each of kLanes
+//                        lanes has a sample, that of lane s at node(s), and p is the place of the sample and not of the
+//                        pixel. kReach is that of the pixel. Default: void, there is none
+//   kLanes               of a Spread: the samples of a pixel. Default: 1
 //   kReach               largest |coordinate| of a sample's node [px]. Default: 0
 //   kExtraLevel          no level (below) exceeds 2 ln(255 opacity) + kExtraLevel. Default: 0
 //
@@ -215,8 +217,8 @@ struct FootprintDefaults {
 /// What blending is compiled for.
 template <class F> using PixelsOf = std::conditional_t<std::is_void_v<typename F::Pixels>, F, typename F::Pixels>;
 
-/// Over how many lanes the samples of a pixel may be spread.
-template <class F> constexpr int lanes_of() {
+/// Over how many lanes the samples of a pixel may be spread: kLanes of its Spread.
+template <class F> constexpr int spread_lanes() {
   if constexpr (std::is_void_v<typename F::Spread>) {
     return 1;
   } else {

@@ -240,7 +240,7 @@ template <class F, int C> std::vector<Sum> expected_sums(const Scene<F, C>& scen
         bool shown = false;
         for (int s = 0; s < kAll; ++s) {
           const int number = sample_number<F>(s);
-          const Vec2<float> in_place = sample_place<F>(Vec2<float>{float(x), float(y)}, s);
+          const Vec2<float> in_place = place_in_tile<F>(x, y, s);
           const float in_float = F::alpha(listed_splat.in_float, in_place, number);
           if (in_float < float(kAlphaMin) || k >= scene.last[s * kPixels + i]) continue;
           shown = true;
@@ -324,6 +324,28 @@ TYPED_TEST(BlendVjpSums, AreThoseOfThePixels) {
   using F = typename TypeParam::Pixels;
   for (const MeanSums mean_sums : {MeanSums::kNone, MeanSums::kAbsolute, MeanSums::kNorm})
     expect_sums_of_pixels<F, TypeParam::kChannels>(mean_sums);
+}
+
+template <class F, int C> void expect_places_of_blend() {
+  for (int lane = 0; lane < 32; ++lane) {
+    uint32_t visited = 0;
+    visit_subtiles<F, C>(0xff, place_of<F>(0, lane), [&](int b, Vec2<float> p) {
+      const Vec2<float> expected = place_of<F>(b, lane);
+      EXPECT_EQ(p.x, expected.x) << b << " " << lane;
+      EXPECT_EQ(p.y, expected.y) << b << " " << lane;
+      visited |= 1u << b;
+    });
+    EXPECT_EQ(visited, 0xff);
+  }
+}
+TEST(BlendVjpPlaces, AreThoseOfBlendToTheBit) {
+  expect_places_of_blend<GaussianPixels<1>, 3>();
+  expect_places_of_blend<GaussianSample<4>, 3>();
+  expect_places_of_blend<GaussianSample<4>, 4>();
+  expect_places_of_blend<GaussianSample<16>, 3>();
+  expect_places_of_blend<GaussianSample<16>, 4>();
+  expect_places_of_blend<AdaptiveBoxVjp<4>, 3>();
+  expect_places_of_blend<AdaptiveBoxVjp<4>, 4>();
 }
 
 template <class F> class BlendVjpKernel : public testing::Test {};

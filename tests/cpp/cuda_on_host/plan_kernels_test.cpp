@@ -102,6 +102,9 @@ void expect_planned(const Case& c) {
     }
   }
   EXPECT_EQ(made.planes, planes);
+  if (!whole && !c.overflow) {
+    EXPECT_LE(made.planes, layout.max_planes(c.grid, kMostSamples, lists.capacity, c.chosen));
+  }
   ASSERT_EQ(made.tail, int(expected_tail.size()));
 
   EXPECT_EQ(std::set<int>(tile_order.begin(), tile_order.end()).size(), size_t(tiles));
@@ -173,6 +176,24 @@ TEST(PlanKernels, ManyTiles) {
   // Threads of count_work go on to further tiles.
   ASSERT_GT(kLarge.tiles(), kTilesAtOnce * PlanState::kCounters * kCountWorkThreads);
   expect_planned({kLarge, 900, false, true, kChunks});
+}
+TEST(PlanKernels, LongListsOfManyTiles) {
+  // Fronts of several chunks, beyond which some lists go.
+  constexpr TileGrid kMany = {400, 400};
+  ASSERT_GT(2 * kMany.tiles(), kManyBlocks);
+  for (const bool keep : {false, true}) {
+    for (const bool chosen : {false, true}) expect_planned({kMany, 12000, chosen, keep, kChunks});
+  }
+}
+TEST(PlanKernels, FrontsAreAShareOfAllPairs) {
+  constexpr TileGrid kFew = {16 * 48, 16 * 11}, kMore = {16 * 23, 16 * 23};
+  ASSERT_EQ(2 * kFew.tiles(), kManyBlocks);
+  EXPECT_EQ(front_chunks(kFew, 1 << 30, 1), 1);
+  EXPECT_EQ(front_chunks(kMore, 0, 1), 2048 / chunk_length(1));
+  EXPECT_EQ(front_chunks(kMore, int64_t(2048) * kManyBlocks, 1), 2048 / chunk_length(1));
+  EXPECT_EQ(front_chunks(kMore, int64_t(2049) * kManyBlocks, 1), 4096 / chunk_length(1));
+  EXPECT_EQ(front_chunks(kMore, int64_t(2049) * kManyBlocks, 8), 4096 / chunk_length(8));
+  EXPECT_EQ(front_chunks(kMore, int64_t(1) << 50, 1), (1 << 28) / chunk_length(1));
 }
 TEST(PlanKernels, ChosenSamples) { expect_planned({kSmall, 5000, true, true, kChunks}); }
 TEST(PlanKernels, ChosenSamplesWithoutBackward) { expect_planned({kSmall, 5000, true, false, kChunks}); }
