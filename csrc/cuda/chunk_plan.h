@@ -25,10 +25,11 @@ inline constexpr int kManyBlocks = 1056;
 /// so long that fewer than kManyBlocks tiles have a tail: those whose list is longer than a block's share of all pairs,
 /// and would keep it busy when the others have ended.
 AR_HD int front_chunks(TileGrid grid, int64_t pairs, int samples) {
-  constexpr int kMost = 1 << 28;
+  constexpr int64_t kMost = 1 << 30;  // with more, tiles share lists, which have no chunks
   int front = 256;
   if (2 * grid.tiles() > kManyBlocks) {
-    for (front = 2048; front < pairs / kManyBlocks && front < kMost;) front *= 2;
+    const int share = int(pairs < kMost ? pairs : kMost) / kManyBlocks;
+    for (front = 2048; front < share;) front *= 2;
   }
   return front > chunk_length(samples) ? front / chunk_length(samples) : 1;
 }
