@@ -12,7 +12,10 @@
 namespace ar::cuda {
 namespace {
 
-constexpr int kWidth = 27, kHeight = 21, kPixels = kWidth * kHeight;
+/// Of the part of an image that is blended: all tiles that begin in it.
+constexpr int kWidth = 27, kHeight = 21;
+/// Pixels in a row and in a column of an image that has no other part, and of one in which fronts are long.
+constexpr int kSmallSide[] = {kWidth, kHeight}, kLargeSide[] = {400, 400};
 
 /// `count` random splats, all of which every tile lists. They are up to `beyond` px off the image.
 template <class F> std::vector<Splat<F, float>> make_splats(int count, float most_opaque, float beyond) {
@@ -23,21 +26,31 @@ template <class F> std::vector<Splat<F, float>> make_splats(int count, float mos
   return random_splats<F>(bits, count, {kWidth, kHeight}, -1, 3, most_opaque, prepare, beyond);
 }
 
+/// Planes of an image of `sides` pixels.
 struct Image {
-  std::vector<float> color = std::vector<float>(3 * kPixels), alpha = std::vector<float>(kPixels), transmittance;
+  int width, pixels;
+  std::vector<float> color, alpha, transmittance;
   std::vector<int32_t> last;
-  explicit Image(int samples) : transmittance(samples * kPixels), last(samples * kPixels) {}
+
+  Image(const int (&sides)[2], int samples)
+      : width(sides[0]),
+        pixels(sides[0] * sides[1]),
+        color(3 * pixels),
+        alpha(pixels),
+        transmittance(samples * pixels),
+        last(samples * pixels) {}
 };
 
 constexpr float kBackground[] = {0.2f, 0.5f, 0.9f};
 
 /// A splat after the other, pixel by pixel.
-template <class F> Image expected_image(const std::vector<Splat<F, float>>& splats) {
+template <class F> Image expected_image(const std::vector<Splat<F, float>>& splats, const int (&sides)[2]) {
   constexpr int S = kPixelSamples<F>;
   const int side = grid_for<F>(kWidth, kHeight).side();
-  Image out(S);
-  for (int pixel = 0; pixel < kPixels; ++pixel) {
-    const int x = pixel % kWidth, y = pixel / kWidth;
+  Image out(sides, S);
+  for (int pixel = 0; pixel < out.pixels; ++pixel) {
+    const int x = pixel % out.width, y = pixel / out.width;
+    if (x / side * side >= kWidth || y / side * side >= kHeight) continue;
     TileList list = {};
     list.x0 = x / side * side, list.y0 = y / side * side;
     double color[3] = {}, through = 0;
@@ -50,42 +63,47 @@ template <class F> Image expected_image(const std::vector<Splat<F, float>>& spla
         if (!b.mask) continue;
         const Vec3<float>& c = splats[k].color;
         color[0] += b.contribution * c.x, color[1] += b.contribution * c.y, color[2] += b.contribution * c.z;
-        out.last[s * kPixels + pixel] = int32_t(k) + 1;
+        out.last[s * out.pixels + pixel] = int32_t(k) + 1;
       }
-      out.transmittance[s * kPixels + pixel] = std::abs(transmittance);
+      out.transmittance[s * out.pixels + pixel] = std::abs(transmittance);
       through += std::abs(transmittance) / S;
     }
-    for (int c = 0; c < 3; ++c) out.color[c * kPixels + pixel] = float(color[c] / S + through * kBackground[c]);
+    for (int c = 0; c < 3; ++c) out.color[c * out.pixels + pixel] = float(color[c] / S + through * kBackground[c]);
     out.alpha[pixel] = float(1 - through);
   }
   return out;
 }
 
-/// What the kernels make.
-template <class F, bool kKeep> Image blended_image(const std::vector<Splat<F, float>>& splats) {
+/// What the kernels make. Only the first tiles have lists.
+template <class F, bool kKeep> Image blended_image(const std::vector<Splat<F, float>>& splats, const int (&sides)[2]) {
   constexpr int S = F::kSamples, kLength = chunk_length(S);
-  constexpr TileGrid kGrid = grid_for<F>(kWidth, kHeight);
-  Image out(kPixelSamples<F>);
-  const int tiles = int(kGrid.tiles()), count = int(splats.size()), chunks = (count + kLength - 1) / kLength;
-  const int front = front_chunks(kGrid, int64_t(tiles) * count, S);
-  std::vector<int32_t> pairs, order, planes, open(tiles), open_tiles(kSampleClasses * tiles);
+  const TileGrid grid = grid_for<F>(sides[0], sides[1]);
+  Image out(sides, kPixelSamples<F>);
+  const int tiles = int(grid.tiles()), count = int(splats.size()), chunks = (count + kLength - 1) / kLength;
+  std::vector<int32_t> pairs, order, planes(tiles), open(tiles), open_tiles(kSampleClasses * tiles);
   std::vector<int64_t> offsets = {0};
   std::vector<TileChunk> tail;
   PlanState state = {};
   BlendParams p = {};
   p.layout = {3, kKeep};
   for (int tile = 0; tile < tiles; ++tile) {
-    for (int k = 0; k < count; ++k) pairs.push_back(k);
+    const int x = tile % grid.columns() * grid.side(), y = tile / grid.columns() * grid.side();
+    if (x < kWidth && y < kHeight) {
+      order.insert(order.begin(), tile);
+      for (int k = 0; k < count; ++k) pairs.push_back(k);
+    }
     offsets.push_back(int64_t(pairs.size()));
-    order.push_back(tiles - 1 - tile);
-    planes.push_back(state.counts.planes);
+  }
+  const int front = front_chunks(grid, int64_t(pairs.size()), S);
+  for (int tile : order) {
+    planes[tile] = state.counts.planes;
     state.counts.planes += p.layout.tile_planes(front, S, chunks);
     for (int chunk = front; chunk < chunks; ++chunk) tail.push_back({tile, chunk, 0});
   }
   state.counts.tail = int32_t(tail.size());
   const Counts counts = {int64_t(pairs.size()), count};
   std::vector<float> checkpoints(size_t(state.counts.planes) * kTilePixels, NAN);
-  p.grid = kGrid;
+  p.grid = grid;
   p.splats = &splats[0].mean.x;
   p.channels.count = 3;
   p.background = kBackground;
@@ -100,7 +118,7 @@ template <class F, bool kKeep> Image blended_image(const std::vector<Splat<F, fl
   p.tile_open = open.data();
   p.open_tiles = open_tiles.data();
   p.checkpoints = checkpoints.data();
-  cuda_on_host::launch(tiles, kBlendThreads, [&] { blend_front_kernel<F, 3, kKeep>(p); });
+  cuda_on_host::launch(int(order.size()), kBlendThreads, [&] { blend_front_kernel<F, 3, kKeep>(p); });
   cuda_on_host::launch(3, kBlendThreads, [&] { tail_through_kernel<F>(p); });
   cuda_on_host::launch(3, 32, [&] { tail_scan_kernel<S>(p); });
   cuda_on_host::launch(3, kBlendThreads, [&] { tail_blend_kernel<F, 3, kKeep>(p); });
@@ -108,9 +126,10 @@ template <class F, bool kKeep> Image blended_image(const std::vector<Splat<F, fl
   return out;
 }
 
-template <class F, bool kKeep> void expect_blended(int count, float most_opaque, bool exact, float beyond = 4) {
+template <class F, bool kKeep>
+void expect_blended(int count, float most_opaque, bool exact, float beyond = 4, const int (&sides)[2] = kSmallSide) {
   const std::vector<Splat<F, float>> splats = make_splats<F>(count, most_opaque, beyond);
-  const Image expected = expected_image<F>(splats), image = blended_image<F, kKeep>(splats);
+  const Image expected = expected_image<F>(splats, sides), image = blended_image<F, kKeep>(splats, sides);
   for (size_t i = 0; i < expected.color.size(); ++i) ASSERT_NEAR(image.color[i], expected.color[i], 1e-5) << i;
   for (size_t i = 0; i < expected.alpha.size(); ++i) ASSERT_NEAR(image.alpha[i], expected.alpha[i], 1e-5) << i;
   if (!kKeep) return;
@@ -140,6 +159,22 @@ TEST(BlendKernels, ManyChunks) {
   constexpr int kCount = 70 * chunk_length(1) + 1;
   expect_blended<F, true>(kCount, 0.02f, false, 80);
   expect_blended<F, false>(kCount, 0.02f, false, 80);
+}
+TEST(BlendKernels, FrontsOfSeveralChunks) {
+  const auto expect_long_front = [](auto f) {
+    using F = decltype(f);
+    constexpr int kLength = chunk_length(F::kSamples);
+    const TileGrid grid = grid_for<F>(kLargeSide[0], kLargeSide[1]);
+    const int front = front_chunks(grid, 0, F::kSamples) * kLength;
+    ASSERT_GT(front, kLength);
+    for (const int count : {front - 3, front + 2 * kLength + 70}) {
+      expect_blended<F, true>(count, 0.02f, false, 80, kLargeSide);
+      expect_blended<F, false>(count, 0.02f, false, 80, kLargeSide);
+    }
+  };
+  expect_long_front(GaussianPixels<1>());
+  expect_long_front(GaussianPixels<2>());
+  expect_long_front(GaussianSample<4>());
 }
 TEST(BlendKernels, TwoSamples) { expect_front_and_tail<GaussianPixels<2>>(); }
 TEST(BlendKernels, EightSamples) { expect_blended<GaussianPixels<8>, true>(40, 0.9f, true); }
