@@ -66,6 +66,14 @@ def settings_for(variant, camera=CAMERA, device="cpu"):
     return camera.settings(torch.float32, device, footprint=footprint, **options)
 
 
+def with_channels(scene, settings, channels):
+    """The scene with random channels in place of colours, and the settings with a background of as many."""
+    g = torch.Generator().manual_seed(5)
+    scene = {name: value for name, value in scene.items() if name != "shs"}
+    scene["colors_precomp"] = scenes.rand(g, len(scene["means3D"]), channels).float()
+    return scene, settings._replace(bg=scenes.rand(g, channels).float())
+
+
 def backward(color):
     """Of sum(color * fixed weights)."""
     g = torch.Generator().manual_seed(3)
@@ -316,10 +324,7 @@ def test_four_samples_in_large_images(channels):
     """From 4096 tiles of 16x16 pixels on, a lane has all samples of a pixel."""
     scene, settings = scene32("few"), settings_for(("box", {"samples": 4}), LARGEST)
     if channels != 3:
-        g = torch.Generator().manual_seed(5)
-        scene = {name: value for name, value in scene.items() if name != "shs"}
-        scene["colors_precomp"] = scenes.rand(g, len(scene["means3D"]), channels).float()
-        settings = settings._replace(bg=scenes.rand(g, channels).float())
+        scene, settings = with_channels(scene, settings, channels)
     assert _C.tile_size(settings.footprint.key, 1.0, LARGEST.image_width, LARGEST.image_height, True) == ar.TILE
     compare(scene, settings)
 
@@ -343,10 +348,7 @@ def test_long_lists_of_moving_samples_in_large_images(samples, channels):
     """They are cut, beside others that are not."""
     scene, settings = long_and_short_lists(), settings_for(("moment", {"samples": samples}), LARGE)
     if channels != 3:
-        del scene["shs"]
-        g = torch.Generator().manual_seed(5)
-        scene["colors_precomp"] = scenes.rand(g, len(scene["means3D"]), channels).float()
-        settings = settings._replace(bg=scenes.rand(g, channels).float())
+        scene, settings = with_channels(scene, settings, channels)
     else:
         stages = ar.render_stages(scenes.settings_to(settings, "cuda"), **scenes.to(without_means2d(scene), "cuda"))
         lists = stages.tile_offsets.diff()
@@ -445,12 +447,9 @@ def test_stages_have_a_list_for_each_tile(little_room):
 @pytest.mark.parametrize("channels", [5, 40, 72])
 def test_many_channels_with_too_many_pairs(variant, channels, little_room):
     """All tiles add to a row per splat, which every group of channels must find cleared."""
-    g = torch.Generator().manual_seed(5)
     settings = settings_for(variant, replace(CAMERA, image_width=50, image_height=40))
     assert_more_pairs_than_room(scene32("few"), settings)
-    scene = {name: value for name, value in scene32("few").items() if name != "shs"}
-    scene["colors_precomp"] = scenes.rand(g, len(scene["means3D"]), channels).float()
-    settings = settings._replace(bg=scenes.rand(g, channels).float())
+    scene, settings = with_channels(scene32("few"), settings, channels)
     color = compare(scene, settings)
     assert_same_without_gradient(scene, settings, color)
 

@@ -42,7 +42,7 @@ template <class F, int kSide> void blend_moving(const BlendParams& p, cudaStream
     launch_moving_blend<F, kMovingChannels, kSide>(p, cut, first, stream);
 }
 
-/// Samples do not move.
+/// Blends with an F whose samples do not move.
 template <class F> void blend_still(const BlendParams& p, const BlendParams* in_chunks, cudaStream_t stream) {
   if constexpr (!F::kYardstick) {
     if (!p.channels.data) return blend_few<F, 3>(p, stream);

@@ -50,7 +50,7 @@ template <class F, int kSide> void blend_vjp_moving(const BlendVjpParams& p, int
     launch_moving_vjp<F, kMovingChannels, kSide>(p, cut, first, stream);
 }
 
-/// Samples do not move.
+/// The same for an F whose samples do not move.
 template <class F> void blend_vjp_still(const BlendVjpParams& p, int first_of_group, cudaStream_t stream) {
   if constexpr (!F::kYardstick) {
     if (!p.channels.data) return blend_vjp_few<F, 3>(p, stream);

@@ -370,6 +370,7 @@ __device__ inline void put_sum(float* rows, int width, bool of_cell, int32_t row
   }
 }
 
+/// log2 of the side of the tiles that F has [px].
 template <class F> constexpr int tile_bits_of(bool small_image) {
   return F::kMoves ? moving_tile_bits(F::kSamples, small_image) : spread_tile_bits(spread_lanes<F>(), small_image);
 }

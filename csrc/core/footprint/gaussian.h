@@ -135,7 +135,7 @@ template <int S> struct GaussianPixels : FootprintDefaults {
   template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return T(1 / kBase2) * shape.w; }
 };
 
-/// One of S such Gaussians, with p where it lies.
+/// One of the S Gaussians of GaussianPixels<S>, for a lane of its own: p is where it lies.
 template <int S> struct GaussianSample : GaussianPixels<1> {
   static constexpr int kLanes = S;
   static constexpr double kReach = box_reach<S>();
