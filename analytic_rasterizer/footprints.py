@@ -20,7 +20,7 @@ for _variant in _C.footprints():
 FOOTPRINTS = tuple(_VARIANTS)
 """Public names of the footprints, in the order of the registry: those of csrc/core/footprint/registry.h."""
 
-YARDSTICKS = tuple(name for name, variants in _VARIANTS.items() if variants[0]["yardstick"])
+REFERENCE_FOOTPRINTS = tuple(name for name, variants in _VARIANTS.items() if variants[0]["reference"])
 """Footprints that are meant to compare others with, and are slow."""
 
 

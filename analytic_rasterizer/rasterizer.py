@@ -185,8 +185,8 @@ class GaussianRasterizer(torch.nn.Module):
         """Renders an image. Differentiable in all eight inputs.
 
         All floating tensors share one dtype (float32; float64 on the CPU) and device. Missing inputs
-        are None or empty tensors. On CUDA the work is queued on the current stream and nothing waits for
-        it once 32 frames of an image size have been rendered.
+        are None or empty tensors. On CUDA the work is queued on the current stream; when the
+        host waits for it is in docs/library.md, "Waiting for the device".
 
         Args:
             means3D: (P, 3) centres, world units.

@@ -7,7 +7,7 @@ import torch
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import FOOTPRINTS
-from analytic_rasterizer.footprints import YARDSTICKS
+from analytic_rasterizer.footprints import REFERENCE_FOOTPRINTS
 
 # Option values that change the code path. A footprint that is not listed is tested with its default.
 OPTIONS = {
@@ -21,13 +21,13 @@ OPTIONS = {
 # Every registered footprint with these: a new one is tested without a change here.
 VARIANTS = [(footprint, options) for footprint in FOOTPRINTS for options in OPTIONS.get(footprint, [{}])]
 # For tests of whole images: every footprint that is meant for rendering, with every option that changes the code path.
-# The weights of yardsticks are tested as everybody's; they render on one slow path.
-RENDERED = [variant for variant in VARIANTS if variant[0] not in YARDSTICKS]
+# The weights of reference footprints are tested as everybody's; they render on one slow path.
+RENDERED = [variant for variant in VARIANTS if variant[0] not in REFERENCE_FOOTPRINTS]
 # One of each footprint, for tests where the options do not matter.
 KINDS = [
     (footprint, {"samples": 4} if footprint in ("box", "moment") else {})
     for footprint in FOOTPRINTS
-    if footprint not in YARDSTICKS
+    if footprint not in REFERENCE_FOOTPRINTS
 ]
 # One of each path through the rasterizer, for tests where the formula of the weight does not matter: one sample per
 # pixel with a conic and with eigenvectors, several samples, samples that move, a number of samples per tile.

@@ -412,8 +412,8 @@ def assert_more_pairs_than_room(scene, settings):
     with torch.no_grad():
         on_device = scenes.to(without_means2d(scene), "cuda")
         lists = ar.bin(ar.project(scenes.settings_to(settings, "cuda"), **on_device)).of_camera()
-    pairs, _, listed, cell_bits = lists["counts"].tolist()
-    assert pairs > len(lists["pairs"]) >= listed > 0 and cell_bits > 0
+    pairs, _, listed, patch_bits = lists["counts"].tolist()
+    assert pairs > len(lists["pairs"]) >= listed > 0 and patch_bits > 0
     assert lists["tile_offsets"][-1] == listed
 
 

@@ -6,12 +6,12 @@ import pytest
 import scenes
 import torch
 from conftest import each_precision, run_python
-from scenes import KINDS, PATHS, RENDERED, YARDSTICKS, Camera, name_of
+from scenes import KINDS, PATHS, REFERENCE_FOOTPRINTS, RENDERED, Camera, name_of
 
 import analytic_rasterizer as ar
 
 each_path = pytest.mark.parametrize("variant", PATHS, ids=name_of)
-each_weight = pytest.mark.parametrize("variant", [*KINDS, *((name, {}) for name in YARDSTICKS)], ids=name_of)
+each_weight = pytest.mark.parametrize("variant", [*KINDS, *((name, {}) for name in REFERENCE_FOOTPRINTS)], ids=name_of)
 each_dtype = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
 
 # Large enough that several threads get tiles, several tiles share splats, and partial sums matter.

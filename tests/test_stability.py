@@ -19,7 +19,7 @@ from hard_cases import CASES, EPS
 from hypothesis import HealthCheck, given
 from hypothesis import settings as hypothesis_settings
 from hypothesis import strategies as st
-from scenes import KINDS, PATHS, RENDERED, VARIANTS, YARDSTICKS, Camera, name_of
+from scenes import KINDS, PATHS, REFERENCE_FOOTPRINTS, RENDERED, VARIANTS, Camera, name_of
 
 import analytic_rasterizer as ar
 
@@ -62,9 +62,9 @@ def check_layers(name, report):
     assert name == "stack_opaque" or seen[-1] > 100
 
 
-@pytest.mark.parametrize("footprint", YARDSTICKS)
+@pytest.mark.parametrize("footprint", REFERENCE_FOOTPRINTS)
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-def test_hard_case_of_a_yardstick(case, footprint):
+def test_hard_case_of_a_reference(case, footprint):
     """Image and gradients are finite."""
     camera, scene = case.build()
     settings = hard_cases.settings_of(camera, torch.float32, torch.float32, (footprint, {}), effects=case.effects)

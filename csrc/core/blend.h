@@ -26,7 +26,7 @@ template <class V> AR_HD V effective_alpha(V raw) {
 template <class V> struct Blended {
   MaskOf<V> mask;  ///< whether the splat was composited
   V contribution;  ///< T alpha; zero where it was not
-  V if_shown;      ///< the same where it was, and something else where it was not
+  V if_shown;      ///< T alpha where it was; to be read only there
 };
 
 /// T <- T (1 - alpha). A splat that would take T below kTransmittanceMin is not composited and stops the sample, as in
@@ -89,8 +89,8 @@ AR_HD Blended<V> blend_placed_sample(const Terms& terms, Vec2<V> z, V raw, const
 }
 
 /// Repeats blend_placed_sample in the backward pass, which needs the state in front of every splat. `before`: the splat
-/// is not behind the last one that the forward pass composited into the sample, so that nothing has to be compared with
-/// kTransmittanceMin again. Returns whether the splat was composited.
+/// is the last one that the forward pass composited into the sample, or in front of it, so that nothing has to be
+/// compared with kTransmittanceMin again. Returns whether the splat was composited.
 template <class P, class Terms, class V, class Cell>
 AR_HD MaskOf<V> replay_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> before, const Cell& cell,
                                      V& transmittance, Vec2<V>& place) {

@@ -32,16 +32,16 @@ template <typename T> struct TileShare {
 /// `d` = centre of the tile - mean [px]. The tile is taken as the Gaussian of its variance.
 template <typename T> AR_HD TileShare<T> tile_share(const AdaptiveShape<T>& shape, T opacity, Vec2<T> d) {
   const Cov2d<T>& cov = shape.cov;
-  const T variance = T(kBoxVariance<8>), deviations = shape.deviations;
+  const T variance = T(kBoxVariance<8>), sqrt_det = shape.sqrt_det;
   const Cov2d<T> fine = blur(cov, variance), pixel = blur(cov, T(kPixelVariance)),
                  tile = blur(cov, T(kTile * kTile / 12.0));
   // One division and one root for each.
-  const T of_tile = T(1) / tile.det, of_fine = T(1) / fine.det, mass = opacity * deviations;
+  const T of_tile = T(1) / tile.det, of_fine = T(1) / fine.det, mass = opacity * sqrt_det;
   const T q = (tile.yy * d.x * d.x - T(2) * tile.xy * d.x * d.y + tile.xx * d.y * d.y) * of_tile;
   const T alpha = mass * sqrt(of_tile) * exp2(T(-0.5 * kLog2e) * q);
   const T detail = mass * sqrt(of_fine) * variance * ((fine.xx + fine.yy) * of_fine);
   // The length of the ellipse on which alpha is the minimum, over the splat's mass.
-  const T level = max(T(0), gaussian_level(deviations / sqrt(pixel.det), opacity));
+  const T level = max(T(0), gaussian_level(sqrt_det / sqrt(pixel.det), opacity));
   const T ring = sqrt(level * T(0.5) * (pixel.xx + pixel.yy)) / mass;
   return {min(alpha, T(kAlphaMax)), detail, T(0.03 * kAlphaMin * kAlphaMin) * min(ring, T(1e4))};
 }

@@ -17,13 +17,13 @@ extern template cpu::Stages<double> all_stages<double>(int);
 }  // namespace double_precision
 #if defined(__x86_64__)
 namespace avx2 {
-template <typename T, bool kYardsticks> void set_blend_stages(int footprint, cpu::Stages<T>& stages);
+template <typename T, bool kReferences> void set_blend_stages(int footprint, cpu::Stages<T>& stages);
 extern template void set_blend_stages<float, false>(int, cpu::Stages<float>&);
 template <typename T> void set_projection_and_bin(cpu::Stages<T>& stages);
 extern template void set_projection_and_bin<float>(cpu::Stages<float>&);
 }  // namespace avx2
 namespace avx512 {
-template <typename T, bool kYardsticks> void set_blend_stages(int footprint, cpu::Stages<T>& stages);
+template <typename T, bool kReferences> void set_blend_stages(int footprint, cpu::Stages<T>& stages);
 extern template void set_blend_stages<float, false>(int, cpu::Stages<float>&);
 template <typename T> void set_projection_and_bin(cpu::Stages<T>& stages);
 extern template void set_projection_and_bin<float>(cpu::Stages<float>&);

@@ -13,11 +13,11 @@
 
 namespace ar::AR_ISA {
 
-/// Blending; yardsticks, which nobody waits for, only if `kYardsticks`.
-template <typename T, bool kYardsticks> void set_blend_stages(int footprint, cpu::Stages<T>& stages) {
+/// Blending; of reference footprints, which nobody waits for, only if `kReferences`.
+template <typename T, bool kReferences> void set_blend_stages(int footprint, cpu::Stages<T>& stages) {
   visit_footprint(footprint, Footprints{}, [&](auto f) {
     using F = decltype(f);
-    if constexpr (kYardsticks || !F::kYardstick) {
+    if constexpr (kReferences || !F::kReference) {
       stages.blend = blend<TilesOf<F>, T>;
       stages.blend_vjp = blend_vjp<TilesOf<F>, T>;
     }

@@ -208,7 +208,7 @@ __global__ void __launch_bounds__(kEmitThreads, 5) emit_pairs_kernel(const EmitP
   __shared__ MaskedPairs stages[kEmitRows][kWarps];
   const int64_t n = params.counts->splats;
   // As many blocks stay as have splats, whichever of them they get.
-  if (params.counts->in_cells(params.capacity) || int64_t(blockIdx.x) * kEmitSplats >= n) return;
+  if (params.counts->in_patches(params.capacity) || int64_t(blockIdx.x) * kEmitSplats >= n) return;
   uint32_t* published = params.status + kOfBlocks;
   if (threadIdx.x == 0) block_id = atomicAdd(&params.status[kTickets], 1);
   PairWriter writer(params, digits, digit_counts);
@@ -309,12 +309,12 @@ struct BoxOfTiles {
   __device__ BoxOfTiles(const Support<float>& support, TileGrid grid)
       : rows(of_pixels(support.mean.y, support.half_height + support.reach, grid.height, grid)),
         columns(of_pixels(support.mean.x, support.half_width + support.reach, grid.width, grid)) {}
-  /// The same in cells of 2^bits x 2^bits tiles.
-  __device__ BoxOfTiles in_cells(int bits) const {
-    BoxOfTiles cells;
-    cells.rows = {rows.first >> bits, rows.last >> bits};
-    cells.columns = {columns.first >> bits, columns.last >> bits};
-    return cells;
+  /// The same in patches of 2^bits x 2^bits tiles.
+  __device__ BoxOfTiles in_patches(int bits) const {
+    BoxOfTiles patches;
+    patches.rows = {rows.first >> bits, rows.last >> bits};
+    patches.columns = {columns.first >> bits, columns.last >> bits};
+    return patches;
   }
   __device__ int64_t count() const { return int64_t(rows.last - rows.first + 1) * (columns.last - columns.first + 1); }
 
@@ -324,25 +324,25 @@ struct BoxOfTiles {
   }
 };
 
-/// If there is no room for the pairs of splats and tiles: those of splats and cells, in the order of depth, by one
-/// block. The slot of such a pair is its splat, whose row all cells add to. One block takes some milliseconds per
+/// If there is no room for the pairs of splats and tiles: those of splats and patches, in the order of depth, by one
+/// block. The slot of such a pair is its splat, whose row all patches add to. One block takes some milliseconds per
 /// million splats, but only in the rare frame that was not foreseen: the alternative is that the host waits in every
 /// frame.
-__device__ inline void emit_cell_pairs(const EmitParams& params, PairWriter& writer) {
+__device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& writer) {
   constexpr int kWarps = kEmitThreads / 32;
   const TileGrid grid = params.grid;
   const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
   const int64_t n = params.counts->splats, n_rounded = (n + kEmitThreads - 1) / kEmitThreads * kEmitThreads;
   const auto tiles_of_splat = [&](int32_t id) { return BoxOfTiles(support_of(splats[id], params.footprint), grid); };
-  // The smallest cells of 2^1 to 2^kSizes tiles that there is room for; or one, the whole image, where a splat has one
-  // pair at most.
+  // The smallest patches of 2^1 to 2^kSizes tiles that there is room for; or one, the whole image, where a splat has
+  // one pair at most.
   constexpr int kSizes = 8;
   int64_t of_sizes[kSizes] = {};
 #pragma unroll 4
   for (int64_t r = threadIdx.x; r < n; r += kEmitThreads) {
     const BoxOfTiles tiles = tiles_of_splat(params.order[r]);
 #pragma unroll
-    for (int k = 0; k < kSizes; ++k) of_sizes[k] += tiles.in_cells(k + 1).count();
+    for (int k = 0; k < kSizes; ++k) of_sizes[k] += tiles.in_patches(k + 1).count();
   }
   int bits = 0;
   while (1 << bits < max(grid.columns(), grid.rows())) ++bits;
@@ -357,18 +357,18 @@ __device__ inline void emit_cell_pairs(const EmitParams& params, PairWriter& wri
   int64_t before = 0;  // of the pairs of earlier splats
   for (int64_t r = threadIdx.x; r < n_rounded; r += kEmitThreads) {
     const int32_t id = r < n ? params.order[r] : -1;
-    const BoxOfTiles cells = id >= 0 ? tiles_of_splat(id).in_cells(bits) : BoxOfTiles();
+    const BoxOfTiles patches = id >= 0 ? tiles_of_splat(id).in_patches(bits) : BoxOfTiles();
     int64_t all;
-    int64_t place = before + sum_before<kWarps>(cells.count(), int64_t(0), all);
+    int64_t place = before + sum_before<kWarps>(patches.count(), int64_t(0), all);
     before += all;
-    for (int64_t row = cells.rows.first; row <= cells.rows.last; ++row) {
-      for (int64_t column = cells.columns.first; column <= cells.columns.last; ++column, ++place)
+    for (int64_t row = patches.rows.first; row <= patches.rows.last; ++row) {
+      for (int64_t column = patches.columns.first; column <= patches.columns.last; ++column, ++place)
         writer.write(place, uint32_t((row << bits) * columns + (column << bits)), id, id);
     }
   }
   if (threadIdx.x == 0) {
     params.counts->listed = before;
-    params.counts->cell_bits = bits;
+    params.counts->patch_bits = bits;
   }
 }
 
@@ -382,15 +382,15 @@ __global__ void __launch_bounds__(kEmitThreads)
   wait_for_earlier_kernels();
   constexpr int kWarps = kEmitThreads / 32;
   __shared__ uint32_t digit_counts[PairWriter::kMostCounts];
-  const bool in_cells = params.counts->in_cells(params.capacity);
-  if (blockIdx.x == 0 && threadIdx.x == 0 && !in_cells) params.counts->listed = params.counts->pairs;
-  const int count = in_cells ? 1 : int(params.status[kLongSplats]);
+  const bool in_patches = params.counts->in_patches(params.capacity);
+  if (blockIdx.x == 0 && threadIdx.x == 0 && !in_patches) params.counts->listed = params.counts->pairs;
+  const int count = in_patches ? 1 : int(params.status[kLongSplats]);
   const int first = int(blockIdx.x) * kWarps;
   if (first >= count) return;
   PairWriter writer(params, digits, digit_counts);
   __syncthreads();
-  if (in_cells) {
-    emit_cell_pairs(params, writer);
+  if (in_patches) {
+    emit_patch_pairs(params, writer);
     return writer.finish();
   }
   const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);

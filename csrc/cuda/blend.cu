@@ -44,7 +44,7 @@ template <class F, int kSide> void blend_moving(const BlendParams& p, cudaStream
 
 /// Blends with an F whose samples do not move.
 template <class F> void blend_still(const BlendParams& p, const BlendParams* in_chunks, cudaStream_t stream) {
-  if constexpr (!F::kYardstick) {
+  if constexpr (!F::kReference) {
     if (!p.channels.data) return blend_few<F, 3>(p, stream);
     if (p.channels.count <= kFewChannels) return blend_few<F, 4>(p, stream);
     if (p.segments.count > 1) return blend_segments<F>(p, *in_chunks, stream);
@@ -56,7 +56,7 @@ bool always_whole_lists(int footprint) {
   bool always = false;
   visit_footprint(footprint, Footprints{}, [&](auto f) {
     using F = decltype(f);
-    always = F::kYardstick || F::kMoves;
+    always = F::kReference || F::kMoves;
   });
   return always;
 }

@@ -41,8 +41,8 @@ __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front
   const TileList list = list_of(params.lists, params.grid, tile);
   const Vec2<float> p = place_of<F>(threadIdx.x / 32, lane_id());
   const Pixel pixel(list, params.grid, pixel_of<F>(threadIdx.x / 32, lane_id()));
-  const int front = list.of_cell ? list.count : min(list.count, front_length * kLength);
-  const bool several = !list.of_cell && list.count > kLength;
+  const int front = list.of_patch ? list.count : min(list.count, front_length * kLength);
+  const bool several = !list.of_patch && list.count > kLength;
   const PixelCheckpoints<S, C, kKeep> checkpoints(params, tile, int(threadIdx.x));
   PixelState<S, C, kSets> state;
   state.start(pixel.inside);

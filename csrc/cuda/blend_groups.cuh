@@ -1,6 +1,6 @@
 // Kernel of blend for any number of channels, in groups of 32 or, for a last one of up to 8, of 8: a block per tile and
 // group walks the whole list, a pixel per lane. The weights are computed again for every group, which costs less than
-// keeping them. Yardstick footprints (`erf`, `exact`) use this kernel for few channels too, because their weights are
+// keeping them. Reference footprints (`erf`, `exact`) use this kernel for few channels too, because their weights are
 // slow anyway, and have groups of 32 only.
 #pragma once
 
@@ -11,7 +11,7 @@ namespace ar::cuda {
 
 /// Channels that the group is compiled for in which the first of `left` channels are blended.
 template <class F> constexpr int group_width(int left) {
-  return F::kYardstick || F::kMoves || left > kSmallGroup ? kChannelGroup : kSmallGroup;
+  return F::kReference || F::kMoves || left > kSmallGroup ? kChannelGroup : kSmallGroup;
 }
 
 /// An eighth of the channels of a splat in a group of C.
@@ -273,7 +273,7 @@ template <class F> void blend_groups(const BlendParams& p, cudaStream_t stream) 
     const dim3 blocks(tiles, unsigned(first / kChannelGroup));
     launch(blend_groups_kernel<F, kChannelGroup>, {blocks, kBlendThreads}, stream, p, 0);
   }
-  if constexpr (!F::kYardstick) {
+  if constexpr (!F::kReference) {
     if (first < p.channels.count) launch(blend_groups_kernel<F, kSmallGroup>, {tiles, kBlendThreads}, stream, p, first);
   }
 }

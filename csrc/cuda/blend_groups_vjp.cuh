@@ -87,7 +87,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, kShapeGro
   if (lane == 0) shared.last[warp] = own_last;
   __syncthreads();
   // Pairs that nothing reached. A later group of the same width finds the zeros of the first.
-  if ((first == 0 || C == kSmallGroup) && !list.of_cell && segment.number + 1 == segments.count) {
+  if ((first == 0 || C == kSmallGroup) && !list.of_patch && segment.number + 1 == segments.count) {
     for (int k = segment.end + threadIdx.x / kClearThreads; k < list.count; k += kBlendThreads / kClearThreads)
       clear_pair_together<C>(params, list.slot(k), true);
   }
@@ -228,13 +228,13 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, kShapeGro
         }
         if (v >= C) {
           const int column = v - C < kPairChannels ? v - C : kPairMeans + v - C - kPairChannels;
-          if (first > 0 && !list.of_cell) sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
-          put_sum(params.pair_grads, kPairGradWidth, list.of_cell, row, column, sum);
+          if (first > 0 && !list.of_patch) sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
+          put_sum(params.pair_grads, kPairGradWidth, list.of_patch, row, column, sum);
         } else if (params.channel_sums) {
-          put_sum(params.channel_sums, C, list.of_cell, row, v, sum);
+          put_sum(params.channel_sums, C, list.of_patch, row, v, sum);
         } else if (v < kFewChannels) {
           const int column = v == 3 ? kPairFourthChannel : kPairChannels + v;
-          put_sum(params.pair_grads, kPairGradWidth, list.of_cell, row, column, sum);
+          put_sum(params.pair_grads, kPairGradWidth, list.of_patch, row, column, sum);
         }
       }
     }
@@ -279,7 +279,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, 1>)
 template <class F, int C, int kShapeGroups>
 void launch_groups_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) {
   const unsigned blocks = unsigned(p.grid.tiles() * p.segments.count);
-  if constexpr (!F::kYardstick) {
+  if constexpr (!F::kReference) {
     for (int i = 0; p.segments.count > 1 && i < kShapeGroups; ++i)
       launch(segment_shown_kernel<F, C>, {blocks, kBlendThreads}, stream, p, first + i * C, i > 0);
   }
@@ -291,7 +291,7 @@ void launch_groups_vjp(const BlendVjpParams& p, int first, cudaStream_t stream) 
 template <class F> int shape_groups(const BlendVjpParams& p, int first) {
   if (p.mean_sums != MeanSums::kNone) return first == 0;
   const auto is_wide = [&](int begin) { return group_width<F>(p.channels.count - begin) == kChannelGroup; };
-  if (F::kYardstick || !is_wide(first)) return 1;
+  if (F::kReference || !is_wide(first)) return 1;
   // Two groups at once take 100 KiB, which the blocks of some devices cannot have: 7.5, 8.6, 8.9, 12.0.
   if (sizeof(GroupVjpShared<F, kChannelGroup, 2>) > max_shared_bytes()) return 1;
   if (first / kChannelGroup % 2 == 1) return 0;
@@ -301,7 +301,7 @@ template <class F> int shape_groups(const BlendVjpParams& p, int first) {
 /// The group that begins with channel `first`.
 template <class F> void blend_vjp_group(const BlendVjpParams& p, int first, cudaStream_t stream) {
   const int shapes = shape_groups<F>(p, first);
-  if constexpr (!F::kYardstick) {
+  if constexpr (!F::kReference) {
     if (group_width<F>(p.channels.count - first) == kSmallGroup) {
       if (shapes == 0) return launch_groups_vjp<F, kSmallGroup, 0>(p, first, stream);
       return launch_groups_vjp<F, kSmallGroup, 1>(p, first, stream);

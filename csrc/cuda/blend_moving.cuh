@@ -12,10 +12,11 @@
 
 namespace ar::cuda {
 
-/// Of more channels than lie in the rows of pairs, those that are blended at once.
+/// Channels that are blended at once, where there are more than lie in the rows of pairs.
 inline constexpr int kMovingChannels = 8;
 
-/// The group of a layout whose groups are taken (blend_moving_segments.cuh) that the calling warp has.
+/// The group of pixels that the calling warp works on, with a layout in which warps take one group after the other
+/// (kTaken of CellLayout, blend_moving_segments.cuh).
 __device__ inline int& taken_group() {
   __shared__ int groups[32];
   return groups[threadIdx.x / 32];
@@ -79,17 +80,17 @@ struct CellLayout {
 };
 
 /// Where the checkpoints of a tile's samples are: the one in front of pair i spacing, i > 0, is number first + i - 1.
-/// The tiles of a cell share the room of its list equally.
+/// The tiles of a patch share the room of its list equally.
 struct StatePlaces {
   int64_t first;
   int spacing;  ///< a multiple of kStateChunk
 
   __device__ StatePlaces(const TileLists& lists, const TileList& list, TileGrid grid, int tile)
       : first(lists.tile_offsets[tile] / kStateChunk), spacing(kStateChunk) {
-    if (!list.of_cell) return;
-    const TileInCell of_cell(lists, grid, tile);
-    const int room = list.count / kStateChunk / of_cell.tiles;
-    first = lists.tile_offsets[of_cell.first_tile] / kStateChunk + int64_t(of_cell.index) * room;
+    if (!list.of_patch) return;
+    const TileInPatch of_patch(lists, grid, tile);
+    const int room = list.count / kStateChunk / of_patch.tiles;
+    first = lists.tile_offsets[of_patch.first_tile] / kStateChunk + int64_t(of_patch.index) * room;
     spacing = ((list.count - 1) / (room + 1) / kStateChunk + 1) * kStateChunk;
   }
   /// The number of the checkpoint in front of chunk k / kStateChunk, where every chunk but the first has one.
@@ -336,9 +337,9 @@ __device__ void blend_staged(Stage& stage, int from, int to, int k0, MovingBlend
   __syncwarp();  // all have read the list
 }
 
-/// A block per tile, which has nothing to do if the tile's list is cut, and one more; C channels from `first` on, of
-/// three in so few registers that an SM holds 1024 threads. `beside`: the kernels for lists that are cut
-/// were launched just before, and may still run.
+/// A block per tile, which returns at once if the tile's list is cut, and one more that only waits
+/// (begin_beside_earlier_kernels). Blends the C channels from `first` on; with three, registers are bounded so that an
+/// SM holds 1024 threads. `beside`: the kernels for lists that are cut were launched just before, and may still run.
 template <class F, int C, class Layout, bool kKeep>
 __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThreads : 1)
     moving_blend_kernel(const BlendParams params, int first, bool beside) {
@@ -354,7 +355,7 @@ __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThr
   const bool is_cut = int(blockIdx.x) < params.plan.state->counts.cut_lists;
   const TileList list = list_of(params.lists, params.grid, tile);
   // With too many pairs no list is cut. The compiler needs fewer registers if both are asked here.
-  if (is_cut && !list.of_cell) return;
+  if (is_cut && !list.of_patch) return;
   const StatePlaces places(params.lists, list, params.grid, tile);
   const Vec2<float> p = Layout::pixel();
   const Pixel pixel(list, params.grid, p);
@@ -390,7 +391,7 @@ __global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThr
 template <class F> inline constexpr int kLanesForSamples = F::kSamples == 9 ? 16 : F::kSamples;
 
 /// Samples shared out so that there is least to do, forwards and backwards, in tiles of the size of moving_grid(), for
-/// lists that are not cut. Where all are, as cuts_all_lists() says, that is only so with more pairs than room.
+/// lists that are not cut. Where cuts_all_lists(), these are only those of frames with more pairs than room.
 template <class F, bool kBackward, int kSide>
 using EvenLayout =
     std::conditional_t<F::kSamples == 1 || (kSide < kMovingTile), CellLayout<1, kLanesForSamples<F>, kSide>,

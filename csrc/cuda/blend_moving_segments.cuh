@@ -162,7 +162,7 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layou
     }
     __syncthreads();
     const int begin = segment.index * kSegment, end = begin + kSegment, stop = min(shared.last, end);
-    if (first % kChannelGroup == 0 && !list.of_cell) {  // pairs that nothing reached
+    if (first % kChannelGroup == 0 && !list.of_patch) {  // pairs that nothing reached
       const int rest = min(list.count, end);
       for (int k = max(shared.last, begin) + threadIdx.x / kClearThreads; k < rest;
            k += Layout::kThreads / kClearThreads)

@@ -21,12 +21,12 @@ __device__ void write_sums(const BlendVjpParams& params, int first, bool with_sh
     float sum = total(j, v);
     const int32_t row = rows[j];
     const auto put = [&](int column) {
-      if (kMany && first > 0 && !list.of_cell) sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
-      put_sum(params.pair_grads, kPairGradWidth, list.of_cell, row, column, sum);
+      if (kMany && first > 0 && !list.of_patch) sum += params.pair_grads[int64_t(row) * kPairGradWidth + column];
+      put_sum(params.pair_grads, kPairGradWidth, list.of_patch, row, column, sum);
     };
     if (v >= 6 && v < kMeans) {
       if (kMany) {
-        put_sum(params.channel_sums, kChannelGroup, list.of_cell, row, first % kChannelGroup + v - 6, sum);
+        put_sum(params.channel_sums, kChannelGroup, list.of_patch, row, first % kChannelGroup + v - 6, sum);
       } else {
         put(v == 9 ? kPairFourthChannel : v);
       }

@@ -204,7 +204,7 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<F, C, Layou
 
   const LastSplats<F, Layout> lasts(params.last, pixel, shared.last);
   const int (&last)[kCells] = lasts.samples;
-  if (first % kChannelGroup == 0 && !list.of_cell) {  // pairs that nothing reached
+  if (first % kChannelGroup == 0 && !list.of_patch) {  // pairs that nothing reached
     for (int k = lasts.block + threadIdx.x / kClearThreads; k < list.count; k += Layout::kThreads / kClearThreads)
       clear_pair_together<kChannelGroup>(params, list.slot(k), first == 0);
   }

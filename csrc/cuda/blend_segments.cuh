@@ -41,7 +41,7 @@ template <class F> struct Segment {
     __syncthreads();
     tile_last = block_last;
     // Whole chunks each, as even as can be; a list that tiles share has no chunks, and is the last segment.
-    const int length = list.of_cell ? kWholeList : chunk_length(S), chunks = (tile_last + length - 1) / length;
+    const int length = list.of_patch ? kWholeList : chunk_length(S), chunks = (tile_last + length - 1) / length;
     begin = number * chunks / count * length;
     end = number + 1 == count ? tile_last : (number + 1) * chunks / count * length;
   }

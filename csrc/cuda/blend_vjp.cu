@@ -14,7 +14,7 @@ namespace {
 __global__ void clear_sums_kernel(const BlendVjpParams params, int first, int width) {
   wait_for_earlier_kernels();
   if (blockIdx.x == 0 && threadIdx.x < kSampleClasses) params.chunks_taken[threadIdx.x] = 0;
-  if (!params.lists.counts->in_cells(params.lists.capacity)) return;
+  if (!params.lists.counts->in_patches(params.lists.capacity)) return;
   const auto clear = [&](float* to, int width) {
     const int64_t n = params.lists.n * width;
     for (int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x; i < n; i += int64_t(gridDim.x) * blockDim.x)
@@ -52,7 +52,7 @@ template <class F, int kSide> void blend_vjp_moving(const BlendVjpParams& p, int
 
 /// The same for an F whose samples do not move.
 template <class F> void blend_vjp_still(const BlendVjpParams& p, int first_of_group, cudaStream_t stream) {
-  if constexpr (!F::kYardstick) {
+  if constexpr (!F::kReference) {
     if (!p.channels.data) return blend_vjp_few<F, 3>(p, stream);
     if (p.channels.count <= kFewChannels) return blend_vjp_few<F, 4>(p, stream);
   }

@@ -27,7 +27,7 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
   LanePixels<F, C, kSums> pixels(shared);
   const VjpChunk chunk(params, params.chunk_order[item], kLength);
   const int tile_last = find_last<F>(params, chunk, first, group);
-  if (kSums != Sums::kMeans && !chunk.list.of_cell) {  // pairs that no pixel has composited
+  if (kSums != Sums::kMeans && !chunk.list.of_patch) {  // pairs that no pixel has composited
     for (int k = max(chunk.begin, min(tile_last, chunk.end)) + lane_id(); k < chunk.end; k += 32)
       clear_pair(params, chunk.list.slot(k));
   }

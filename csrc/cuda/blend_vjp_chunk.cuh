@@ -18,7 +18,7 @@ struct VjpChunk {
   __device__ __forceinline__ VjpChunk(const BlendVjpParams& params, TileChunk chunk, int length)
       : list(list_of(params.lists, params.grid, chunk.tile)),
         begin(chunk.chunk * length),
-        end(list.of_cell ? list.count : min(list.count, begin + length)),
+        end(list.of_patch ? list.count : min(list.count, begin + length)),
         plane(chunk.plane),
         grid(params.grid),
         image(int64_t(grid.width) * grid.height),

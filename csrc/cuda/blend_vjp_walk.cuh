@@ -39,7 +39,7 @@ template <class F, int C, Sums kSums> class ChunkWalk {
 #pragma unroll
         for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= group_.subtile_last[b]) << b);
         if (kMeans) mean_map = F::mean_map(own.shape);
-        if (kGrads && reach == 0 && lists && !list_.of_cell) clear_pair(params_, row);
+        if (kGrads && reach == 0 && lists && !list_.of_patch) clear_pair(params_, row);
       }
       const uint32_t reaching = __ballot_sync(kAllLanes, reach != 0);
       if (reach && lists) {
@@ -161,7 +161,7 @@ template <class F, int C, Sums kSums> class ChunkWalk {
 
   /// Writes a sum of a pair.
   __device__ void put(int32_t row, int column, float x) {
-    put_sum(params_.pair_grads, kPairGradWidth, list_.of_cell, row, column, x);
+    put_sum(params_.pair_grads, kPairGradWidth, list_.of_patch, row, column, x);
   }
 
   /// Adds the lanes' sums up and writes them to the pair's row, or leaves at `to` of walk() what sum_pairs() or
@@ -181,7 +181,7 @@ template <class F, int C, Sums kSums> class ChunkWalk {
       if (has_value_first<kSumCount>(lane_)) group_.sums[warp_][to][value_] = sum;
     } else {
       const float sum = sum_values(values);
-      if (!list_.of_cell) {
+      if (!list_.of_patch) {
         sums_[int64_t(row) * kPairGradWidth] = sum;  // of all lanes: to find the first ones takes longer
       } else if (has_value_first<kSumCount>(lane_)) {
         atomicAdd(&sums_[int64_t(row) * kPairGradWidth], sum);
@@ -198,7 +198,7 @@ template <class F, int C, Sums kSums> class ChunkWalk {
     if (lane_ / 4 >= count) return;
     float* const row = params_.pair_grads + int64_t(group_.splats[from + lane_ / 4].row) * kPairGradWidth;
     float* const place = row + lane_ / 2 % 2 * 4;
-    if (!list_.of_cell) {
+    if (!list_.of_patch) {
       *reinterpret_cast<float4*>(place) = {four[0], four[1], four[2], four[3]};
       if (lane_ % 4 == 0) row[8] = ninth;
     } else if (lane_ % 2 == 0) {

@@ -19,7 +19,7 @@ __device__ inline Passed shuffle_up(Passed p, int offset) {
   return {shuffle_up(p.product, offset), shuffle_up(p.sum, offset)};
 }
 
-/// The emit kernel's test, for lists of cells of tiles.
+/// The emit kernel's test, for lists of patches of tiles.
 template <class F> __device__ bool reaches_tile(const Splat<F, float>& splat, const TileList& list) {
   const Span<float> span = columns_of(support_of(splat), float(list.y0), float(list.y0 + kTile - 1));
   return span.lo <= float(list.x0 + kTile - 1) && span.hi >= float(list.x0);
@@ -51,7 +51,7 @@ __global__ void __launch_bounds__(kChooseThreads)
     const Splat<F, float> splat = next;
     if (k + kThreads < list.count) next = splats[list.splat(k + kThreads)];
     TileShare<float> share = {0, 0, 0};
-    if (k < list.count && (!list.of_cell || reaches_tile(splat, list)))
+    if (k < list.count && (!list.of_patch || reaches_tile(splat, list)))
       share = tile_share(splat.shape, splat.opacity, {center.x - splat.mean.x, center.y - splat.mean.y});
     const Vec3<float> color = k < list.count ? splat.color : Vec3<float>{0, 0, 0};
     SampleEstimate<float> alone = {};

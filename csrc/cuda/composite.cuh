@@ -56,20 +56,20 @@ struct TileList {
   int x0, y0;
   const int32_t* pairs;
   int stride, count;
-  bool of_cell;  ///< the list is that of a cell: it has splats that do not reach this tile
+  bool of_patch;  ///< the list is that of a patch: it has splats that do not reach this tile
 
   __device__ int32_t splat(int k) const { return pairs[int64_t(k) * stride]; }
   __device__ int32_t slot(int k) const { return pairs[int64_t(k) * stride + 1]; }
 };
 
 /// Where a tile is among those that share a list.
-struct TileInCell {
-  int first_tile;  ///< of the cell
-  int tiles;       ///< of the cell, as far as it is in the image
+struct TileInPatch {
+  int first_tile;  ///< of the patch
+  int tiles;       ///< of the patch, as far as it is in the image
   int index;       ///< of the tile among these
 
-  __device__ TileInCell(const TileLists& lists, TileGrid grid, int tile) {
-    const int bits = int(lists.counts->cell_bits), side = 1 << bits, columns = grid.columns();
+  __device__ TileInPatch(const TileLists& lists, TileGrid grid, int tile) {
+    const int bits = int(lists.counts->patch_bits), side = 1 << bits, columns = grid.columns();
     const int row = tile / columns, column = tile % columns;
     const int first_row = row >> bits << bits, first_column = column >> bits << bits;
     const int width = min(side, columns - first_column);
@@ -83,9 +83,9 @@ __device__ inline TileList list_of(const TileLists& lists, TileGrid grid, int ti
   TileList list;
   list.x0 = tile % grid.columns() << grid.tile_bits;
   list.y0 = tile / grid.columns() << grid.tile_bits;
-  list.of_cell = lists.counts->in_cells(lists.capacity);
+  list.of_patch = lists.counts->in_patches(lists.capacity);
   list.stride = lists.stride;
-  const int64_t* offsets = lists.tile_offsets + (list.of_cell ? TileInCell(lists, grid, tile).first_tile : tile);
+  const int64_t* offsets = lists.tile_offsets + (list.of_patch ? TileInPatch(lists, grid, tile).first_tile : tile);
   list.pairs = lists.pairs + offsets[0] * lists.stride;
   list.count = int(offsets[1] - offsets[0]);
   return list;
@@ -295,7 +295,8 @@ template <int S, class Params> __device__ int tile_place(const Params& params, i
 }
 
 /// The tile of block `block` of a kernel of blend_vjp for tiles with S samples whose lists are walked as a whole; -1 if
-/// there is none. Where lists are cut, `block` is the number of their segments plus the place among the other lists.
+/// there is none. Where lists are cut, blocks are numbered with the segments of those first, then the lists that are
+/// not.
 template <int S> __device__ int listed_tile(const BlendVjpParams& params, int block) {
   const SampleParts& tiles = params.plan->counts.chunks;  // a chunk is a tile's whole list
   const int place = tiles.first[sample_class(S)] + block;
@@ -361,9 +362,9 @@ template <int kWidth> __device__ void clear_pair_together(const BlendVjpParams& 
 }
 
 /// Sums gradients of a splat in row `row` of pairs, or of splats, where all tiles add to it.
-__device__ inline void put_sum(float* rows, int width, bool of_cell, int32_t row, int column, float x) {
+__device__ inline void put_sum(float* rows, int width, bool of_patch, int32_t row, int column, float x) {
   float* place = rows + int64_t(row) * width + column;
-  if (of_cell) {
+  if (of_patch) {
     atomicAdd(place, x);
   } else {
     *place = x;

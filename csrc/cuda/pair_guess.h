@@ -19,8 +19,8 @@ enum class Counting {
 /// not wrong, so the first frames are counted, and wait for the device; afterwards the largest frame so far, and a
 /// reserve, are room enough in all but the rarest cases. The number of Gaussians may change from frame to frame: with
 /// more of them than were ever seen the room grows in proportion, with fewer it stays. There is always room for a pair
-/// of each, which is what EmitParams needs, and some more, without which splats on the borders of cells would leave no
-/// cell but the whole image.
+/// of each, which is what EmitParams needs, and some more, without which splats on the borders of patches would leave
+/// no patch but the whole image.
 class PairGuess {
  public:
   /// Frames that are counted at the start.

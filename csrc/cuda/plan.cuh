@@ -35,10 +35,10 @@ struct PlannedTile {
   bool is_long;    ///< as ListCut means it
 
   __device__ PlannedTile(const TileLists& lists, int64_t tile, int most_samples, const ListCut& cut) {
-    const bool in_cells = lists.counts->in_cells(lists.capacity);
-    n = in_cells ? 1 : int(lists.tile_offsets[tile + 1] - lists.tile_offsets[tile]);
+    const bool in_patches = lists.counts->in_patches(lists.capacity);
+    n = in_patches ? 1 : int(lists.tile_offsets[tile + 1] - lists.tile_offsets[tile]);
     samples = lists.tile_samples ? lists.tile_samples[tile] : most_samples;
-    is_long = cut.max_segments > 0 && !in_cells && n >= cut.long_from(lists.counts->pairs);
+    is_long = cut.max_segments > 0 && !in_patches && n >= cut.long_from(lists.counts->pairs);
     length = is_long ? cut.segment : cut.whole ? kWholeList : chunk_length(samples);
   }
   /// The last segment of a long list is one of them, however long it is.
@@ -102,7 +102,7 @@ struct CutClasses {
   __device__ CutClasses(const ListCut& cut, const TileLists& tile_lists, int lists_of_class, int counted)
       : chunks_of_class(counted) {
     const int64_t pairs = tile_lists.counts->pairs;
-    if (cut.max_segments == 0 || tile_lists.counts->in_cells(tile_lists.capacity)) return;
+    if (cut.max_segments == 0 || tile_lists.counts->in_patches(tile_lists.capacity)) return;
     constexpr int kWarps = kPlanThreads / 32;
     const int of_length = int(threadIdx.x) % kLengthClasses;
     const bool are_long = of_length <= __clz(cut.long_from(pairs));

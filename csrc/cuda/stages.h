@@ -4,7 +4,7 @@
 //
 // Sizes that depend on the data stay on the device. The caller guesses how many pairs there will be and gives room for
 // `capacity` of them, at least one per splat. If there are more, tiles do not get lists of their own: a square of them,
-// a cell, shares one, whose splats blending tests against each tile. The cells are as small as room allows. That is
+// a patch, shares one, whose splats blending tests against each tile. The patches are as small as room allows. That is
 // slower, but gives the same result without waiting for the host.
 #pragma once
 
@@ -67,13 +67,13 @@ AR_HD constexpr int state_planes(int samples) { return 3 * samples; }
 struct alignas(8) Counts {
   int64_t pairs;
   int64_t splats;  ///< with pairs
-  /// Pairs that are written: all, or those of splats and cells if there is no room for these.
+  /// Pairs that are written: all, or those of splats and patches if there is no room for these.
   int64_t listed;
-  /// A cell is a square of 2^cell_bits x 2^cell_bits tiles, the first of which begins with tile 0.
-  int64_t cell_bits;
+  /// A patch is a square of 2^patch_bits x 2^patch_bits tiles, the first of which begins with tile 0.
+  int64_t patch_bits;
 
-  /// Whether tiles share the lists of cells, as there is room for `capacity` pairs only.
-  AR_HD bool in_cells(int64_t capacity) const { return pairs > capacity; }
+  /// Whether tiles share the lists of patches, as there is room for `capacity` pairs only.
+  AR_HD bool in_patches(int64_t capacity) const { return pairs > capacity; }
 };
 
 struct ProjectParams : ar::ProjectParams<float> {
@@ -112,7 +112,7 @@ struct EmitParams {
   int footprint;  ///< place in the registry
   TileGrid grid;
   int64_t capacity;               ///< >= counts->splats
-  Counts* counts;                 ///< `listed` and `cell_bits` are set
+  Counts* counts;                 ///< `listed` and `patch_bits` are set
   const int32_t* order;           ///< [counts->splats] splats by depth
   const SplatTiles* splat_tiles;  ///< [n]
   const PairRange* ranges;        ///< [n], read with slot_pairs alone
@@ -120,7 +120,7 @@ struct EmitParams {
   int32_t* long_places;           ///< [n] and where their pairs begin
   uint32_t* status;               ///< emit_scratch(n) bytes, zero
   uint32_t* tile_counts;  ///< tile_sort_scratch(capacity, grid) bytes, zero; sort_by_tile finds its counts there
-  uint32_t* tiles;        ///< [capacity] tile of each pair, or the first one of its cell
+  uint32_t* tiles;        ///< [capacity] tile of each pair, or the first one of its patch
   int32_t* splat_pairs;   ///< [capacity] splat of each pair, or null:
   SlotPair* slot_pairs;   ///< [capacity] the same with its slot, for a backward pass
 };
@@ -129,7 +129,7 @@ struct EmitParams {
 struct TileLists {
   const int32_t* pairs;         ///< [capacity, stride] splats by tile, then depth, and their slots
   int stride;                   ///< 1, or 2 with slots
-  const int64_t* tile_offsets;  ///< [tiles + 1]; the list of a cell is that of its first tile
+  const int64_t* tile_offsets;  ///< [tiles + 1]; the list of a patch is that of its first tile
   const Counts* counts;
   int64_t n, capacity;
   const int32_t* tile_samples;  ///< [tiles] samples in use, or null: all
@@ -211,7 +211,7 @@ struct PairSumsView {
   const float* pair_grads;
 
   /// Whether there were too many pairs: then pair_grads has a row per splat.
-  AR_HD bool by_splat() const { return counts->in_cells(capacity); }
+  AR_HD bool by_splat() const { return counts->in_patches(capacity); }
 };
 
 /// From rows of pairs to gradients with respect to channels [first, first + count) of every splat.
@@ -268,7 +268,7 @@ void sum_channels(const SumChannelsParams& p, cudaStream_t stream);
 // Blending. `footprint` is a place in the registry (blend.cu, blend_vjp.cu).
 
 /// How the kernels for so many channels have lists cut. They walk the whole list of a tile, and need no checkpoints of
-/// channels, with the yardsticks and footprints whose samples move, and with others where there are more than
+/// channels, with reference footprints and those whose samples move, and with others where there are more than
 /// kFewChannels.
 ListCut list_cut(int footprint, int64_t channels, int64_t capacity, TileGrid grid);
 /// Planes of a float per pixel of a tile in BlendParams::checkpoints of a footprint whose samples move, for a backward

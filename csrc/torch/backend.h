@@ -33,7 +33,7 @@ struct ListTensors {
   Tensor splats;  ///< (n, kSplatWidth)
   Tensor ids;     ///< (n,) int32; CPU: the Gaussian of each splat; CUDA: splats in the order of depth
   Tensor pairs;   ///< CPU: (N,) int32 splats; CUDA: (room, 2) splats and slots, or (room, 1) without a backward pass
-  Tensor tile_offsets;   ///< (tiles + 1,) int64, first pair of each tile; of a cell, where tiles share lists
+  Tensor tile_offsets;   ///< (tiles + 1,) int64, first pair of each tile; of a patch, where tiles share lists
   Tensor splat_offsets;  ///< CPU: (n + 1,) int64 into positions; CUDA: (n, 2) int32 first slot and number of slots
   Tensor positions;      ///< CPU: (N,) int64 places in `pairs` of each splat's pairs
   Tensor counts;         ///< CUDA: the numbers of Counts (csrc/cuda/stages.h)

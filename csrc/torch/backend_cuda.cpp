@@ -1,5 +1,5 @@
-// The stages on CUDA tensors, in float32. Nothing here waits for the device, except where there is no earlier frame to
-// guess the number of pairs from, in deterministic mode, with debug, and in lap().
+// The stages on CUDA tensors, in float32. Nothing here waits for the device but the count of pairs, where
+// counting_of() and pair_guess.h ask for it, tiles_share_lists(), lap(), and stages with debug.
 //
 // Arguments have been checked (checks.h). What is relied on here: tensors are contiguous and on one device; lists and
 // state fit each other, the splats and the image.
@@ -185,7 +185,8 @@ class CudaBackend final : public Backend {
       check_stage("blend", pass.debug);
       return;
     }
-    // The colours in the splats go first, into images that nobody looks at.
+    // First the three colours in the splats, into an image that nobody looks at, for what segments need: transmittance
+    // and last splat of every sample.
     Pass first_pass = pass;
     first_pass.keep = true;
     BlendState first_state = pass.keep ? state : make_state(first_pass, lists.splats);

@@ -99,7 +99,7 @@ TORCH_LIBRARY_IMPL(analytic_rasterizer, CUDA, m) { register_kernels(m); }
 #endif
 
 /// What Python knows of a footprint: all of it from its header.
-pybind11::dict describe(const char* key, const char* name, Option option, int samples, bool yardstick) {
+pybind11::dict describe(const char* key, const char* name, Option option, int samples, bool reference) {
   pybind11::dict d;
   d["key"] = key;
   d["name"] = name;
@@ -108,7 +108,7 @@ pybind11::dict describe(const char* key, const char* name, Option option, int sa
   d["number"] = option.number;
   d["is_default"] = option.is_default;
   d["samples"] = samples;
-  d["yardstick"] = yardstick;
+  d["reference"] = reference;
   return d;
 }
 
@@ -184,7 +184,7 @@ PYBIND11_MODULE(_C, m) {
         std::vector<pybind11::dict> all;
         ar::for_each_footprint(ar::Footprints{}, [&](auto f) {
           using F = decltype(f);
-          all.push_back(ar::ops::describe(ar::key_of<F>(), F::kName, F::kOption, F::kSamples, F::kYardstick));
+          all.push_back(ar::ops::describe(ar::key_of<F>(), F::kName, F::kOption, F::kSamples, F::kReference));
         });
         return all;
       },

@@ -8,7 +8,7 @@ namespace ar {
 /// The covariance itself, from which a tile derives what its samples need.
 template <typename T> struct AdaptiveShape {
   Cov2d<T> cov;
-  T deviations;  ///< sqrt(det): product of the standard deviations [px^2]
+  T sqrt_det;  ///< product of the standard deviations [px^2]
 };
 
 /// How a tile of S samples is blended: as Box<S>, but from splats that carry their covariance, because tiles with other
@@ -35,7 +35,7 @@ template <int S> struct AdaptiveBox : GaussianFootprint<S, true> {
   template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return T(1 / kBase2) * ellipse(shape); }
 
   template <typename T> AR_HD static T amplitude(const Shape<T>& shape) {
-    return shape.deviations / sqrt(blur(shape.cov, T(kVariance)).det);
+    return shape.sqrt_det / sqrt(blur(shape.cov, T(kVariance)).det);
   }
 
  protected:

@@ -11,7 +11,7 @@
 //   kName                what users call it: "box"
 //   kKey                 its own key: "box4". Footprints of one name differ in an option. Default: the name
 //   kOption              the option that users may set, see Option. Default: none
-//   kYardstick           true: meant to compare others with; compiled for one instruction set. Default: false
+//   kReference           true: meant to compare others with; compiled for one instruction set. Default: false
 //   kExpensive           true: CUDA kernels would rather find out exactly which pixels a splat reaches than work out
 //                        weights in vain. Default: false
 //   Pixels               a type with the same Shape, terms, alpha, adjoint, ellipse and samples, for which blending is
@@ -204,7 +204,7 @@ struct FootprintDefaults {
   static constexpr int kLanes = 1;
   static constexpr std::nullptr_t kKey = nullptr;  // the name
   static constexpr Option kOption = {};
-  static constexpr bool kYardstick = false, kExpensive = false;
+  static constexpr bool kReference = false, kExpensive = false;
   static constexpr int kSamples = 1;
   static constexpr double kReach = 0, kExtraLevel = 0;
   static constexpr bool kMoves = false;

@@ -11,13 +11,14 @@ namespace ar {
 /// (docs/numerics.md, "The exact integral").
 ///
 /// The wide axis is the image axis of the larger variance, the narrow axis the other one. z.x depends on the wide axis
-/// alone; along it z.y falls at the rate `tilt`, and the line z.y = 0 is the ridge of the Gaussian. If the Gaussian is
-/// wide along the narrow axis too, a product rule over the pixel integrates both. Otherwise the narrow axis is
-/// integrated in closed form, and the wide axis in strips around the places where the pixel's edges cross the ridge.
+/// alone; along it z.y falls at the rate `tilt`, and the line z.y = 0 is the ridge of the Gaussian. Where its
+/// standard deviation across the ridge is at least half a pixel, a product rule over the pixel integrates both axes.
+/// Otherwise the narrow axis is integrated in closed form, and the wide axis in strips around the places where the
+/// pixel's edges cross the ridge.
 struct Exact : FootprintDefaults {
   static constexpr const char* kName = "exact";
   static constexpr bool kExpensive = true;
-  static constexpr bool kYardstick = true;
+  static constexpr bool kReference = true;
   static constexpr double kExtraLevel = 2 * box_excess(1 / kPixelVariance);
 
   /// w: that of whiten(), with the sign of its first row chosen such that tilt >= 0. amp: amplitude of the Gaussian of

@@ -1,4 +1,4 @@
-// The footprints that are Gaussians themselves: point, mip, box, and what cumulant shares with them.
+// What the footprints that are Gaussians themselves share: point, mip, box, moment and adaptive, and in part cumulant.
 //
 // A Gaussian is kept as a whitening matrix w with w^T w = (Sigma + v I)^-1, so that the exponent is
 // -|w d|^2 / 2. Unlike the conic form a dx^2 + 2 b dx dy + c dy^2 it cannot turn positive, and it

@@ -7,7 +7,7 @@
 namespace ar {
 
 /// Gauss-Legendre rule with N nodes on [-1/2, 1/2]; the weights add up to 1. For exp(-x^2 / (2 s^2))
-/// it errs by at most (N!)^4 / ((2N + 1) (2N)! N! 2^N s^(2N)) / (2N)!.
+/// it errs by at most (N!)^3 / ((2N + 1) ((2N)!)^2 2^N s^(2N)).
 template <int N, typename T> struct GaussLegendre {
   AR_HD static constexpr T node(int i) { return i < N / 2 ? -positive(N / 2 - 1 - i).x : positive(i - N / 2).x; }
   AR_HD static constexpr T weight(int i) { return i < N / 2 ? positive(N / 2 - 1 - i).y : positive(i - N / 2).y; }
@@ -43,7 +43,8 @@ template <int N, typename T> struct GaussLegendre {
   }
 };
 
-/// Numbers of nodes for an interval of at most half a standard deviation (few), and of at most two (many).
+/// Numbers of nodes for an interval of at most half a standard deviation (few), and of more (many): at most two for a
+/// pixel, and 3.3 for a panel of exact.h.
 template <typename T> inline constexpr int kFewNodes = sizeof(T) == 4 ? 4 : 6;
 template <typename T> inline constexpr int kManyNodes = sizeof(T) == 4 ? 8 : 12;
 

@@ -348,7 +348,7 @@ TEST(BinKernels, PairsOfSplats) {
   }
 }
 
-/// With less room cells get larger, down to one for all, and the list of each has every splat of its tiles by depth.
+/// With less room patches get larger, down to one for all, and the list of each has every splat of its tiles by depth.
 TEST(BinKernels, PairsOfSplatsAndCellsWhereThereIsNoRoomForTiles) {
   const ToEmit from;
   int64_t last_bits = 0;
@@ -363,24 +363,24 @@ TEST(BinKernels, PairsOfSplatsAndCellsWhereThereIsNoRoomForTiles) {
       }
       TileLists view = {};
       view.counts = &emitted.counts;
-      const int64_t bits = emitted.counts.cell_bits;
+      const int64_t bits = emitted.counts.patch_bits;
       std::vector<std::vector<int>> of_tiles(lists.size());
       for (const int32_t i : from.order) {
         for_each_tile(from.support(i), from.kGrid, [&](int64_t tile) { of_tiles[tile].push_back(i); });
       }
       for (int tile = 0; tile < from.kGrid.tiles(); ++tile) {
-        const TileInCell of_cell(view, from.kGrid, tile);
-        ASSERT_TRUE(of_cell.index >= 0 && of_cell.index < of_cell.tiles) << tile;
-        if (of_cell.first_tile != tile) ASSERT_TRUE(lists[tile].empty()) << tile;
-        const std::vector<int>& list = lists[of_cell.first_tile];
-        ASSERT_TRUE(is_subsequence(of_tiles[tile], list)) << tile << " with cells of 4^" << bits << " tiles";
+        const TileInPatch of_patch(view, from.kGrid, tile);
+        ASSERT_TRUE(of_patch.index >= 0 && of_patch.index < of_patch.tiles) << tile;
+        if (of_patch.first_tile != tile) ASSERT_TRUE(lists[tile].empty()) << tile;
+        const std::vector<int>& list = lists[of_patch.first_tile];
+        ASSERT_TRUE(is_subsequence(of_tiles[tile], list)) << tile << " with patches of 4^" << bits << " tiles";
       }
       ASSERT_GT(bits, 0);
       ASSERT_GE(bits, last_bits);
       last_bits = bits;
     }
   }
-  ASSERT_EQ(last_bits, 6) << "one cell for 11 x 44 tiles";
+  ASSERT_EQ(last_bits, 6) << "one patch for 11 x 44 tiles";
 }
 
 TEST(BinKernels, FirstPairsOfTiles) {

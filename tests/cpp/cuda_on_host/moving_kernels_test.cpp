@@ -317,18 +317,18 @@ template <class F> void expect_checkpoints_apart(const Scene<F>& scene) {
   }
 }
 
-/// The larger a cell, the fewer checkpoints has each of its tiles: some, two, and one.
+/// The larger a patch, the fewer checkpoints has each of its tiles: some, two, and one.
 template <class F, int kSide> void expect_same_if_tiles_share_lists(TileGrid grid) {
   using Forward = EvenLayout<F, false, kSide>;
   using Backward = EvenLayout<F, true, kSide>;
-  for (const auto& [count, cell_bits] : {std::pair(701, 1), {700, 2}, {300, 20}}) {
-    SCOPED_TRACE(testing::Message() << count << " splats, cells of 4^" << cell_bits << " tiles");
+  for (const auto& [count, patch_bits] : {std::pair(701, 1), {700, 2}, {300, 20}}) {
+    SCOPED_TRACE(testing::Message() << count << " splats, patches of 4^" << patch_bits << " tiles");
     Scene<F> scene(count, count, 0.02f, grid);
     const Results own = run<F, Forward, Backward>(scene);
     EXPECT_GT(*std::max_element(own.last.begin(), own.last.end()), count * 9 / 10);
     const std::vector<double> expected = sums_of_splats(scene, own);
     Scene<F> shared = scene;
-    share_lists(shared.pairs, shared.offsets, shared.counts, shared.grid, cell_bits);
+    share_lists(shared.pairs, shared.offsets, shared.counts, shared.grid, patch_bits);
     shared.lists = lists_of(shared.pairs, shared.offsets, shared.counts);
     expect_checkpoints_apart(shared);
     const Results results = run<F, Forward, Backward>(shared);

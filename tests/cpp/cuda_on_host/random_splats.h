@@ -74,22 +74,22 @@ TileLists lists_of(const std::vector<Pair>& pairs, const std::vector<int64_t>& t
   return lists;
 }
 
-/// Makes of lists that all have the same splats those of cells of 4^cell_bits tiles, as where there is no room for
+/// Makes of lists that all have the same splats those of patches of 4^patch_bits tiles, as where there is no room for
 /// them. Their slots are their splats.
 inline void share_lists(std::vector<SlotPair>& pairs, std::vector<int64_t>& tile_offsets, Counts& counts, TileGrid grid,
-                        int cell_bits = 20) {
+                        int patch_bits = 20) {
   const std::vector<SlotPair> list(pairs.begin(), pairs.begin() + tile_offsets[1]);
   pairs.clear();
   for (int tile = 0; tile < grid.tiles(); ++tile) {
     tile_offsets[tile] = int64_t(pairs.size());
-    if (tile % grid.columns() % (1 << cell_bits) == 0 && tile / grid.columns() % (1 << cell_bits) == 0) {
+    if (tile % grid.columns() % (1 << patch_bits) == 0 && tile / grid.columns() % (1 << patch_bits) == 0) {
       for (const SlotPair& pair : list) pairs.push_back({pair.splat, pair.splat});
     }
   }
   tile_offsets.back() = int64_t(pairs.size());
   counts.listed = int64_t(pairs.size());
   counts.pairs = counts.listed + 1;
-  counts.cell_bits = cell_bits;
+  counts.patch_bits = patch_bits;
 }
 
 }  // namespace ar::cuda
