@@ -29,8 +29,8 @@ def add_parser(subcommands) -> None:
     parser.add_argument(
         "--footprint",
         metavar="NAME[:k=v]",
-        help="what the page starts with (default: what the file says it was trained with, otherwise the library's, "
-        "analytic)",
+        help="what the page starts with (default: mip, if the file says that it was trained with an antialiasing "
+        "filter, otherwise the library's, analytic)",
     )
     parser.add_argument("--port", type=port, metavar="N", help="port to serve on (default: any free one)")
     parser.add_argument("--no-browser", action="store_true", help="print the address and open nothing")
