@@ -84,7 +84,7 @@ AR_HD Blended<V> blend_placed_sample(const Terms& terms, Vec2<V> z, V raw, const
   using T = ScalarOf<V>;
   const V alpha = min(raw, V(T(kAlphaMax)));
   const Blended<V> blended = blend_sample(raw, transmittance);
-  place = P::move_in(terms, z, alpha, select(blended.mask, alpha, V(T(0))), place, cell);
+  place = P::move_in(terms, z, alpha, blended.mask, place, cell);
   return blended;
 }
 
@@ -96,9 +96,9 @@ AR_HD MaskOf<V> replay_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskO
                                      V& transmittance, Vec2<V>& place) {
   using T = ScalarOf<V>;
   const MaskOf<V> mask = (raw >= V(T(kAlphaMin))) & before;
-  const V alpha = select(mask, min(raw, V(T(kAlphaMax))), V(T(0)));
-  transmittance = transmittance - transmittance * alpha;
-  place = P::move_in(terms, z, alpha, alpha, place, cell);
+  const V alpha = min(raw, V(T(kAlphaMax)));
+  transmittance = select(mask, transmittance - transmittance * alpha, transmittance);
+  place = P::move_in(terms, z, alpha, mask, place, cell);
   return mask;
 }
 

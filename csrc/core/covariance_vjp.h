@@ -86,11 +86,12 @@ AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, co
   const T v = grad.variance;
   Vec3<T> qx, qy;  // w t_k
   if (grad.frame == GradFrame::kTriangular) {
-    // The second row of whiten() takes from one row of V its projection on the other, (adj(M) + v) t / wide.
-    const bool wide_x = w.xx != T(0);
-    const T along = w.xx + w.xy, across = (wide_x ? w.yy : w.yx) * along * along;
-    qx = along * (wide_x ? tx : ty);
-    qy = across * (wide_x ? m.y + v * ty : m.x + v * tx);
+    // The second row of w takes from one row of V its projection on the other: (adj(M) + v) t over the variance of the
+    // axis that comes first.
+    const bool x_first = w.xx != T(0);
+    const T along = w.xx + w.xy, across = (x_first ? w.yy : w.yx) * along * along;
+    qx = along * (x_first ? tx : ty);
+    qy = across * (x_first ? m.y + v * ty : m.x + v * tx);
   } else {
     qx = w.xx * tx + w.xy * ty;
     qy = w.yx * tx + w.yy * ty;

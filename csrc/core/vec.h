@@ -20,6 +20,11 @@ template <typename T> struct Mat2 {
   T xx, xy, yx, yy;
 };
 
+/// [xx 0; yx yy].
+template <typename T> struct Lower2 {
+  T xx, yx, yy;
+};
+
 /// Symmetric 2x2. As a gradient G it means dL = tr(G dSigma): xy is the matrix entry, so the derivative with respect to
 /// the one number that fills both off-diagonal entries is 2 xy.
 template <typename T> struct Sym2 {
@@ -71,23 +76,40 @@ template <typename T> AR_HD Vec3<T> operator*(const Sym3<T>& m, Vec3<T> v) {
 template <typename T> AR_HD Mat2<T> operator*(T s, const Mat2<T>& m) {
   return {s * m.xx, s * m.xy, s * m.yx, s * m.yy};
 }
+template <typename T> AR_HD Lower2<T> operator*(T s, const Lower2<T>& m) { return {s * m.xx, s * m.yx, s * m.yy}; }
+/// All four entries.
+template <typename T> AR_HD Mat2<T> all_of(const Mat2<T>& m) { return m; }
+template <typename T> AR_HD Mat2<T> all_of(const Lower2<T>& m) { return {m.xx, T(0), m.yx, m.yy}; }
 /// m v with scalar m and lanes v.
 template <typename T, class V> AR_HD Vec2<V> transform(const Mat2<T>& m, Vec2<V> v) {
   return {madd(V(m.xx), v.x, V(m.xy) * v.y), madd(V(m.yx), v.x, V(m.yy) * v.y)};
 }
-/// m v + c with scalar m and c.
-template <typename T, class V> AR_HD Vec2<V> transform(const Mat2<T>& m, Vec2<V> v, Vec2<T> c) {
+template <typename T, class V> AR_HD Vec2<V> transform(const Lower2<T>& m, Vec2<V> v) {
+  return {V(m.xx) * v.x, madd(V(m.yx), v.x, V(m.yy) * v.y)};
+}
+/// m v + c with scalar m, and c of scalars or lanes.
+template <typename T, class V, class C> AR_HD Vec2<V> transform(const Mat2<T>& m, Vec2<V> v, Vec2<C> c) {
   return {madd(V(m.xx), v.x, madd(V(m.xy), v.y, V(c.x))), madd(V(m.yx), v.x, madd(V(m.yy), v.y, V(c.y)))};
+}
+template <typename T, class V, class C> AR_HD Vec2<V> transform(const Lower2<T>& m, Vec2<V> v, Vec2<C> c) {
+  return {madd(V(m.xx), v.x, V(c.x)), madd(V(m.yx), v.x, madd(V(m.yy), v.y, V(c.y)))};
 }
 /// m^T v.
 template <typename T, class V> AR_HD Vec2<V> transform_transposed(const Mat2<T>& m, Vec2<V> v) {
   return {madd(V(m.xx), v.x, V(m.yx) * v.y), madd(V(m.xy), v.x, V(m.yy) * v.y)};
+}
+template <typename T, class V> AR_HD Vec2<V> transform_transposed(const Lower2<T>& m, Vec2<V> v) {
+  return {madd(V(m.xx), v.x, V(m.yx) * v.y), V(m.yy) * v.y};
 }
 /// m^T s m.
 template <typename T> AR_HD Sym2<T> congruence_transposed(const Mat2<T>& m, Sym2<T> s) {
   const T ax = s.xx * m.xx + s.xy * m.yx, ay = s.xx * m.xy + s.xy * m.yy;
   const T bx = s.xy * m.xx + s.yy * m.yx, by = s.xy * m.xy + s.yy * m.yy;
   return {m.xx * ax + m.yx * bx, m.xx * ay + m.yx * by, m.xy * ay + m.yy * by};
+}
+template <typename T> AR_HD Sym2<T> congruence_transposed(const Lower2<T>& m, Sym2<T> s) {
+  const T bx = s.xy * m.xx + s.yy * m.yx, by = s.yy * m.yy;
+  return {m.xx * (s.xx * m.xx + s.xy * m.yx) + m.yx * bx, m.xx * (s.xy * m.yy) + m.yx * by, m.yy * by};
 }
 
 }  // namespace ar

@@ -221,7 +221,7 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
           top += 3 * stored;
           composited |= lanes;
           const V alpha = min(found, V(T(kAlphaMax)));
-          samples_.places.set(s, pixel, P::move_in(terms, group.z[j], alpha, alpha, place, samples_.bounds(s)));
+          samples_.places.set(s, pixel, P::move_in(terms, group.z[j], alpha, mask, place, samples_.bounds(s)));
         }
         entry.pair = k;
         entry.pixel = pixel;

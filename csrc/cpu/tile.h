@@ -162,7 +162,7 @@ template <class P, typename T> struct RowAdapter {
 };
 template <class Box, typename T> typename PixelsOf<Box>::template Shape<T> box_shape(const SplatRow<T>& row) {
   const auto shape = shape_of<Box>(row);
-  return {Box::ellipse(shape), Box::amplitude(shape)};
+  return Box::gaussian(shape);
 }
 template <class Box, typename T>
 ShapeGrad<T> collect_box(const SplatRow<T>& row, const ShapeGrad<T>& sums, T weighted) {

@@ -191,7 +191,8 @@ template <class F, class Layout> struct CellCorners {
 
   /// Whitened coordinates of the node of cell i, which is at `place` in it.
   template <class Terms> __device__ Vec2<float> node(const Terms& terms, int i, Vec2<float> place) const {
-    return F::whitened(terms, Vec2<float>{left[i % kColumns] + place.x, top[i % kRows] + place.y}, 0);
+    const float of_row = F::of_row(terms, top[i % kRows]);
+    return F::whitened_in_row(terms, Vec2<float>{left[i % kColumns] + place.x, place.y}, of_row);
   }
 };
 
@@ -253,7 +254,7 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTog
 
   /// Adds what pair k shows in the first sample.
   __device__ void add(const Blended<float>& b, const Values<C>& channels, int k) {
-    sums.add(b.contribution, channels);
+    if (b.mask) sums.add(b.if_shown, channels);
     if (kKeep) last[0] = b.mask ? k + 1 : last[0];
   }
   /// Composites a splat into the samples; shown[i] becomes `place` where it was composited into sample i, if kKeep.
@@ -267,7 +268,7 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTog
       const Vec2<float> z = corners.node(splat.terms, i, samples.place[i]);
       return Look{z, exp2(F::log_alpha(splat.terms, z))};
     };
-    [[maybe_unused]] Look looks[kCells];
+    [[maybe_unused]] Look looks[kCells] = {};
     if constexpr (kVotes) {
       bool shows = false;
 #pragma unroll
@@ -277,16 +278,13 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTog
       }
       if (!__any_sync(kAllLanes, shows)) return;
     }
-    float contribution = 0;
-#pragma unroll
-    for (int i = 0; i < kCells; ++i) {
+    add_samples<kCells>(sums, splat.channels, [&](int i) {
       const auto [z, raw] = kVotes ? looks[i] : look(i);
       const Blended<float> b =
           blend_placed_sample<F>(splat.terms, z, raw, UnitCell<F::kSide>(), samples.transmittance[i], samples.place[i]);
-      contribution = i == 0 ? b.contribution : contribution + b.contribution;
       if (kKeep) shown[i] = b.mask ? place : shown[i];
-    }
-    sums.add(contribution, splat.channels);
+      return b;
+    });
   }
 
   /// Adds the lanes of each pixel up and writes its images. All lanes must call it.

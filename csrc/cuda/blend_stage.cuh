@@ -61,18 +61,20 @@ template <class F, int C> struct BlendStage : Stage<F, C, kBlendThreads> {
 template <class F, int C, int kSets>
 __device__ __forceinline__ void composite(const TileSplat<F, C>& splat, Vec2<float> p, int place,
                                           PixelState<F::kSamples, C, kSets>& state, int (&last)[F::kSamples]) {
-  float contribution = 0;
-#pragma unroll
-  for (int s = 0; s < F::kSamples; ++s) {
+  const auto composite_sample = [&](int s) {
     const Blended<float> b = blend_sample(F::alpha(splat.terms, p, s), state.transmittance[s]);
-    if (kSets == F::kSamples) {
-      if (b.mask) state.channels[s % kSets].add(b.if_shown, splat.channels);
-    } else {
-      contribution = s == 0 ? b.contribution : contribution + b.contribution;
-    }
     last[s] = b.mask ? place : last[s];
+    return b;
+  };
+  if constexpr (kSets == 1) {
+    add_samples<F::kSamples>(state.channels[0], splat.channels, composite_sample);
+  } else {
+#pragma unroll
+    for (int s = 0; s < F::kSamples; ++s) {
+      const Blended<float> b = composite_sample(s);
+      if (b.mask) state.channels[s].add(b.if_shown, splat.channels);
+    }
   }
-  if (kSets < F::kSamples) state.channels[0].add(contribution, splat.channels);
 }
 
 /// Composites the staged splats into a pixel; `index` is the place of the first of them in the tile's list.

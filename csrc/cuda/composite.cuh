@@ -151,6 +151,25 @@ template <int C> struct Values {
   }
 };
 template <> struct Values<0> {};
+
+/// Adds what a splat contributes to the S samples of a lane. composite(s) does so to sample s and returns what
+/// blend_sample does. Predicates skip single additions at no cost.
+template <int S, int C, class Composite>
+__device__ __forceinline__ void add_samples(Values<C>& sums, const Values<C>& channels, Composite&& composite) {
+  float contribution = 0;
+#pragma unroll
+  for (int s = 0; s < S; ++s) {
+    const Blended<float> b = composite(s);
+    if constexpr (S == 1) {
+      if (b.mask) sums.add(b.if_shown, channels);
+    } else if (s == 0) {
+      contribution = b.contribution;
+    } else if (b.mask) {
+      contribution += b.if_shown;
+    }
+  }
+  if (S > 1) sums.add(contribution, channels);
+}
 template <int C> __device__ Values<C> times(float scale, const Values<C>& values) {
   Values<C> scaled;
 #pragma unroll

@@ -35,7 +35,7 @@ Ellipse random_ellipse(Random& random, double reach) {
   const Vec2<double> mean = random.below(8) ? Vec2<double>{random.uniform(-30, 130), random.uniform(-30, 100)}
                                             : Vec2<double>{random.normal() * 1e4, random.normal() * 1e4};
   const Cov2d<double> cov = covariance(s1, s2, angle);
-  const Mat2<double> w = random.below(2) ? whiten(cov) : Cumulant::ellipse(Cumulant::prepare(cov, {}));
+  const Mat2<double> w = random.below(2) ? whiten_wide_first(cov) : Cumulant::ellipse(Cumulant::prepare(cov, {}));
   const Mat2<double> frame =
       Analytic<FrameGradient::kFrozen>::ellipse(Analytic<FrameGradient::kFrozen>::prepare(cov, {}));
   const Mat2<double>& form = random.below(3) ? w : frame;

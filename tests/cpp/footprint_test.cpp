@@ -410,7 +410,7 @@ TEST(BoxExcess, HoldsForThePixel) {
   for (int trial = 0; trial < search_trials(20000); ++trial) {
     const double s2 = random.log_uniform(1e-3, 3), s1 = s2 * random.log_uniform(1, 1000);
     const Cov2d<double> cov = covariance(s1, s2, random.uniform(0, kPi)), wide = blur(cov, kPixelVariance);
-    const Mat2<double> w = whiten(wide);
+    const Lower2<double> w = whiten(wide);
     const double excess = box_excess(wide.yy / wide.det) + box_excess(wide.xx / wide.det);
     for (int k = 0; k < 20; ++k) {
       const double radius = random.uniform(0, 4);

@@ -71,6 +71,7 @@ template <typename T> Vec2<T> unwhiten(const Mat2<T>& w, Vec2<T> z) {
   const T det = w.xx * w.yy - w.xy * w.yx;
   return {(w.yy * z.x - w.xy * z.y) / det, (w.xx * z.y - w.yx * z.x) / det};
 }
+template <typename T> Vec2<T> unwhiten(const Lower2<T>& w, Vec2<T> z) { return unwhiten(all_of(w), z); }
 
 inline Vec2<double> on_circle(double radius, double angle) {
   return {radius * std::cos(angle), radius * std::sin(angle)};

@@ -102,12 +102,9 @@ void main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2
 /// A root of zero marks what is not drawn.
 export function projectShader(kind, degree) {
   const gaussian = `
-  float wideX = xx + uVariance, wideY = yy + uVariance;
-  float wideDet = det + uVariance * (xx + yy) + uVariance * uVariance;
-  bool alongX = xx >= yy;
-  float wide = alongX ? wideX : wideY;
-  float along = inversesqrt(wide), across = sqrt(wide / wideDet), slope = -across * (xy / wide);
-  whitening = alongX ? vec4(along, 0.0, slope, across) : vec4(0.0, along, across, slope);
+  float wide = xx + uVariance, wideDet = det + uVariance * (xx + yy) + uVariance * uVariance;
+  float across = sqrt(wide / wideDet), slope = -across * (xy / wide);
+  whitening = vec4(inversesqrt(wide), 0.0, slope, across);
   float amplitude = ${kind === 'point' ? '1.0' : 'sqrt(det / wideDet)'};
   peak = log2(opacity * amplitude);
   level = 2.0 * log(opacity * amplitude / kAlphaMin);`;

@@ -24,24 +24,23 @@ template <int S> struct AdaptiveBox : GaussianFootprint<S, true> {
 
   template <typename T> AR_HD static Shape<T> prepare(Cov2d<T> cov, FootprintOptions) { return {cov, sqrt(cov.det)}; }
 
-  template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& shape) {
-    return whitening(shape.cov, T(kVariance));
+  /// What Gaussian has as shape.
+  template <typename T> AR_HD static GaussianShape<T> gaussian(const Shape<T>& shape) {
+    return gaussian_shape(blur(shape.cov, T(kVariance)), amplitude(shape));
   }
+
+  template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& shape) { return wide_first(gaussian(shape)); }
 
   template <typename T> AR_HD static auto terms(const Shape<T>& shape, T opacity, Vec2<T> origin = {T(0), T(0)}) {
-    return Gaussian::terms(GaussianShape<T>{ellipse(shape), amplitude(shape)}, opacity, origin);
+    return Gaussian::terms(gaussian(shape), opacity, origin);
   }
 
-  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return T(1 / kBase2) * ellipse(shape); }
+  template <typename T> AR_HD static Lower2<T> mean_map(const Shape<T>& shape) {
+    return T(1 / kBase2) * whiten(blur(shape.cov, T(kVariance)));
+  }
 
   template <typename T> AR_HD static T amplitude(const Shape<T>& shape) {
     return shape.sqrt_det / sqrt(blur(shape.cov, T(kVariance)).det);
-  }
-
- protected:
-  /// The wide axis is decided by Sigma alone, so that it is the same for every variance in spite of rounding.
-  template <typename T> AR_HD static Mat2<T> whitening(Cov2d<T> cov, T variance) {
-    return whiten(blur(cov, variance), cov.xx >= cov.yy);
   }
 };
 
@@ -52,12 +51,12 @@ template <int S> struct AdaptiveBoxVjp : AdaptiveBox<S> {
   template <typename T> using Shape = AdaptiveShape<T>;
 
   template <typename T> struct Terms : Box::Gaussian::template Terms<T> {
-    Mat2<T> from_common;  ///< whitening matrix here times the inverse of the common one
-    Sym2<T> log_amp;      ///< gradient of log amp here less that of a single sample, in the common coordinates
+    Lower2<T> from_common;  ///< whitening matrix here times the inverse of the common one
+    Sym2<T> log_amp;        ///< gradient of log amp here less that of a single sample, in the common coordinates
   };
 
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& shape, T opacity, Vec2<T> origin = {T(0), T(0)}) {
-    const Mat2<T> turn = from_common(shape.cov);
+    const Lower2<T> turn = from_common(shape.cov);
     return {Box::terms(shape, opacity, origin), turn, log_amp_from_common(shape.cov, turn)};
   }
 
@@ -71,25 +70,23 @@ template <int S> struct AdaptiveBoxVjp : AdaptiveBox<S> {
   template <typename T>
   AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T> cov, const Shape<T>&, ShapeGrad<T> sums, T weighted,
                                         FootprintOptions) {
-    return gaussian_vjp(Box::whitening(cov, T(kPixelVariance)), sums, weighted, T(kPixelVariance));
+    return gaussian_vjp(whiten(blur(cov, T(kPixelVariance))), sums, weighted, T(kPixelVariance));
   }
 
  private:
-  /// w_S w_1^-1, without cancellation: both are Cholesky factors, the same axis first.
-  template <typename T> AR_HD static Mat2<T> from_common(Cov2d<T> cov) {
+  /// w_S w_1^-1, without cancellation: both are Cholesky factors.
+  template <typename T> AR_HD static Lower2<T> from_common(Cov2d<T> cov) {
     const Cov2d<T> own = blur(cov, T(Box::kVariance)), common = blur(cov, T(kPixelVariance));
-    const bool wide_x = cov.xx >= cov.yy;
-    const T wide = wide_x ? own.xx : own.yy, common_wide = wide_x ? common.xx : common.yy;
-    const T across = sqrt(wide / own.det), common_across = sqrt(common_wide / common.det);
-    const T turn = -across * cov.xy * T(kPixelVariance - Box::kVariance) / (wide * sqrt(common_wide));
-    return {sqrt(common_wide / wide), T(0), turn, across / common_across};
+    const T across = sqrt(own.xx / own.det), common_across = sqrt(common.xx / common.det);
+    const T turn = -across * cov.xy * T(kPixelVariance - Box::kVariance) / (own.xx * sqrt(common.xx));
+    return {sqrt(common.xx / own.xx), turn, across / common_across};
   }
   /// With F = w_S w_1^-1 the difference of the gradients, (C_1 - C_S) / 2 = (v_S - v_1) C_1 C_S / 2, is
   /// (v_S - v_1) w_1 w_1^T F^T F / 2 in coordinates w_1, and there kBase2^2 times what a sum of z z^T is.
-  template <typename T> AR_HD static Sym2<T> log_amp_from_common(Cov2d<T> cov, const Mat2<T>& turn) {
-    const Mat2<T> w = Box::whitening(cov, T(kPixelVariance));
+  template <typename T> AR_HD static Sym2<T> log_amp_from_common(Cov2d<T> cov, const Lower2<T>& turn) {
+    const Lower2<T> w = whiten(blur(cov, T(kPixelVariance)));
     const T scale = T(kBase2 * kBase2 * (Box::kVariance - kPixelVariance));
-    const T axx = w.xx * w.xx + w.xy * w.xy, axy = w.xx * w.yx + w.xy * w.yy, ayy = w.yx * w.yx + w.yy * w.yy;
+    const T axx = w.xx * w.xx, axy = w.xx * w.yx, ayy = w.yx * w.yx + w.yy * w.yy;
     const Sym2<T> b = congruence_transposed(turn, Sym2<T>{T(1), T(0), T(1)});
     return {scale * (axx * b.xx + axy * b.xy), scale * (axx * b.xy + axy * b.yy), scale * (axy * b.xy + ayy * b.yy)};
   }

@@ -60,7 +60,7 @@ struct Cumulant : FootprintDefaults {
   template <typename T> using Shape = GaussianShape<T>;
 
   template <typename T> struct Terms {
-    Mat2<T> w;             ///< whitening matrix times kBase2
+    Lower2<T> w;           ///< whitening matrix times kBase2
     CumulantAxis<T> x, y;  ///< of the exponent to base 2, with the conic w^T w
     Vec2<T> origin;        ///< whitened
     T log_peak;            ///< log2(opacity * amp) less the constants of x and y
@@ -71,10 +71,10 @@ struct Cumulant : FootprintDefaults {
 
   template <typename T> AR_HD static Shape<T> prepare(Cov2d<T> cov, FootprintOptions) {
     const Cov2d<T> blurred = blur(cov, T(kPixelVariance));
-    return {whiten(blurred), sqrt(cov.det / blurred.det)};
+    return gaussian_shape(blurred, sqrt(cov.det / blurred.det));
   }
 
-  template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& shape) { return shape.w; }
+  template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& shape) { return wide_first(shape); }
 
   /// The correction adds at most (a^2 + c^2)/124 to the level (docs/numerics.md, "Support").
   template <typename T> AR_HD static T level(const Shape<T>& shape, T opacity) {
@@ -83,7 +83,7 @@ struct Cumulant : FootprintDefaults {
   }
 
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& shape, T opacity, Vec2<T> origin = {T(0), T(0)}) {
-    const Mat2<T> w = T(kBase2) * shape.w;
+    const Lower2<T> w = T(kBase2) * shape.w;
     const T unit = T(kOrder4 * kLog2e), scale = T(1 / (kBase2 * kBase2));
     const T a = conic_xx(w), c = conic_yy(w);
     const T constant = CumulantAxis<T>::constant(a, unit, scale) + CumulantAxis<T>::constant(c, unit, scale);
@@ -101,20 +101,20 @@ struct Cumulant : FootprintDefaults {
   /// -d log2 I / 2 = -(z + e).w dmu + tr(E (z z^T + e z^T + z e^T + w diag(dh/da, dh/dc) w^T)).
   template <typename T, class V>
   AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> pixel, int, AlphaGrad<V> grad, ShapeGrad<V>& sums) {
-    const Mat2<T>& w = t.w;
+    const Lower2<T>& w = t.w;
     const Vec2<V> z = transform(w, pixel, t.origin), p = transform_transposed(w, z);
     const V px = t.x.capped(p.x), py = t.y.capped(p.y);
     const Vec2<V> e = transform(w, Vec2<V>{t.x.half_by_p(p.x, px), t.y.half_by_p(p.y, py)});
     const V ha = t.x.by_t(px), hc = t.y.by_t(py), g = grad.weighted;
-    const Vec2<V> u = {z.x + e.x, z.y + e.y}, ax = {V(w.xx) * ha, V(w.xy) * hc}, ay = {V(w.yx) * ha, V(w.yy) * hc};
-    const V xx = madd(z.x, u.x + e.x, madd(ax.x, V(w.xx), ax.y * V(w.xy)));
-    const V xy = madd(z.x, u.y, madd(e.x, z.y, madd(ax.x, V(w.yx), ax.y * V(w.yy))));
-    const V yy = madd(z.y, u.y + e.y, madd(ay.x, V(w.yx), ay.y * V(w.yy)));
+    const Vec2<V> u = {z.x + e.x, z.y + e.y};
+    const V wx = V(w.xx) * ha;
+    const V xx = madd(z.x, u.x + e.x, wx * V(w.xx)), xy = madd(z.x, u.y, madd(e.x, z.y, wx * V(w.yx)));
+    const V yy = madd(z.y, u.y + e.y, madd(V(w.yx) * ha, V(w.yx), V(w.yy) * hc * V(w.yy)));
     sums.offset = {madd(g, u.x, sums.offset.x), madd(g, u.y, sums.offset.y)};
     sums.shape = {madd(g, xx, sums.shape.xx), madd(g, xy, sums.shape.xy), madd(g, yy, sums.shape.yy)};
   }
 
-  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return T(1 / kBase2) * shape.w; }
+  template <typename T> AR_HD static Lower2<T> mean_map(const Shape<T>& shape) { return T(1 / kBase2) * shape.w; }
 
   template <typename T>
   AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& shape, ShapeGrad<T> sums, T weighted,
@@ -123,8 +123,8 @@ struct Cumulant : FootprintDefaults {
   }
 
  private:
-  template <typename T> AR_HD static T conic_xx(const Mat2<T>& w) { return w.xx * w.xx + w.yx * w.yx; }
-  template <typename T> AR_HD static T conic_yy(const Mat2<T>& w) { return w.xy * w.xy + w.yy * w.yy; }
+  template <typename T> AR_HD static T conic_xx(const Lower2<T>& w) { return w.xx * w.xx + w.yx * w.yx; }
+  template <typename T> AR_HD static T conic_yy(const Lower2<T>& w) { return w.yy * w.yy; }
 };
 
 }  // namespace ar

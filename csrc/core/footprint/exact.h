@@ -21,9 +21,10 @@ struct Exact : FootprintDefaults {
   static constexpr bool kReference = true;
   static constexpr double kExtraLevel = 2 * box_excess(1 / kPixelVariance);
 
-  /// w: that of whiten(), with the sign of its first row chosen such that tilt >= 0. amp: amplitude of the Gaussian of
-  /// covariance Sigma + I/12, which bounds the weight.
-  template <typename T> using Shape = GaussianShape<T>;
+  template <typename T> struct Shape {
+    Mat2<T> w;  ///< that of whiten_wide_first(), with the sign of its first row chosen such that tilt >= 0
+    T amp;      ///< amplitude of the Gaussian of covariance Sigma + I/12, which bounds the weight
+  };
 
   template <typename T> struct Terms {
     Mat2<T> w;
@@ -39,7 +40,7 @@ struct Exact : FootprintDefaults {
   AR_HD static double support_variance(FootprintOptions) { return kPixelVariance; }
 
   template <typename T> AR_HD static Shape<T> prepare(Cov2d<T> cov, FootprintOptions) {
-    Mat2<T> w = whiten(cov);
+    Mat2<T> w = whiten_wide_first(cov);
     if (slope(w) * along(w) > T(0)) {
       w.xx = -w.xx;
       w.xy = -w.xy;
@@ -48,7 +49,7 @@ struct Exact : FootprintDefaults {
   }
 
   /// Ellipse of Sigma + I/12.
-  template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& g) { return whiten(widened(g)); }
+  template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& g) { return whiten_wide_first(widened(g)); }
 
   /// See box_excess().
   template <typename T> AR_HD static T level(const Shape<T>& g, T opacity) {

@@ -10,19 +10,37 @@
 namespace ar {
 
 template <typename T> struct GaussianShape {
-  Mat2<T> w;  ///< whitening matrix [1/px]
-  T amp;      ///< peak: sqrt(det Sigma / det Sigma'), 1 without compensation
+  Lower2<T> w;  ///< whitening matrix [1/px]
+  T amp;        ///< peak: sqrt(det Sigma / det Sigma'), 1 without compensation
+  T turn;       ///< standard deviation of x given y, if y is the wide axis, else zero [px]: see wide_first()
 };
 
-/// Whitening matrix of c: Cholesky factor with the narrow axis conditioned on the wide one.
-template <typename T> AR_HD Mat2<T> whiten(Cov2d<T> c, bool wide_x) {
-  const T wide = wide_x ? c.xx : c.yy;
-  const T along = quotient(T(1), sqrt(wide));
-  const T across = sqrt(quotient(wide, c.det));  // 1 / std. dev. of the narrow axis given the wide one
-  const T slope = -across * quotient(c.xy, wide);
-  return wide_x ? Mat2<T>{along, T(0), slope, across} : Mat2<T>{T(0), along, across, slope};
+/// Whitening matrix of c: a Cholesky factor, x first.
+template <typename T> AR_HD Lower2<T> whiten(Cov2d<T> c) {
+  const T across = sqrt(quotient(c.xx, c.det));  // 1 / std. dev. of y given x
+  return {quotient(T(1), sqrt(c.xx)), -across * quotient(c.xy, c.xx), across};
 }
-template <typename T> AR_HD Mat2<T> whiten(Cov2d<T> c) { return whiten(c, c.xx >= c.yy); }
+/// The same with the wide axis first.
+template <typename T> AR_HD Mat2<T> whiten_wide_first(Cov2d<T> c) {
+  if (c.xx >= c.yy) return all_of(whiten(c));
+  const Lower2<T> w = whiten(Cov2d<T>{c.yy, c.xy, c.xx, c.det});
+  return {T(0), w.xx, w.yy, w.yx};
+}
+
+/// The shape of a Gaussian of covariance c.
+template <typename T> AR_HD GaussianShape<T> gaussian_shape(Cov2d<T> c, T amp) {
+  return {whiten(c), amp, c.xx >= c.yy ? T(0) : approx_sqrt(divide(c.det, c.yy))};
+}
+
+/// whiten_wide_first() of its covariance. What tells which boxes of pixels a splat reaches takes it, since in these
+/// coordinates a box fills more of its bounding box (docs/numerics.md, "Whitening").
+template <typename T> AR_HD Mat2<T> wide_first(const GaussianShape<T>& shape) {
+  const Lower2<T>& w = shape.w;
+  const bool wide_x = shape.turn == T(0);
+  const T across = w.yy * shape.turn;
+  return {wide_x ? w.xx : T(0), wide_x ? T(0) : w.xx * across,
+          wide_x ? w.yx : madd(w.xx, w.xx, w.yx * w.yx) * shape.turn, wide_x ? w.yy : w.yx * across};
+}
 
 /// Exponents are taken to base 2: kBase2^2 = log2(e) / 2 turns |w d|^2 into -log2 of the Gaussian.
 inline constexpr double kBase2 = 0.84932180028801904272;
@@ -35,11 +53,16 @@ template <typename T> AR_HD T gaussian_level(T amp, T opacity) {
 /// Gradient of a sum of Gaussians from sums in whitened coordinates z = kBase2 w d: `offset` = sum g I z,
 /// `shape` = sum g I z z^T. `weighted` = sum g I, zero where the amplitude does not depend on Sigma; `variance` was
 /// added to Sigma.
-template <typename T> AR_HD SplatGrad<T> gaussian_vjp(const Mat2<T>& w, ShapeGrad<T> sums, T weighted, T variance) {
+template <typename T> AR_HD SplatGrad<T> gaussian_vjp(const Lower2<T>& w, ShapeGrad<T> sums, T weighted, T variance) {
   // With kBase2 = 1: d log I = z.w dmu + tr(z z^T w dSigma w^T)/2 + d log amp
   const T half = T(0.5 / (kBase2 * kBase2));
   const Sym2<T> white = {half * sums.shape.xx, half * sums.shape.xy, half * sums.shape.yy};
-  return {transform_transposed(T(1 / kBase2) * w, sums.offset), w, white, weighted, variance, GradFrame::kTriangular};
+  return {transform_transposed(T(1 / kBase2) * w, sums.offset),
+          all_of(w),
+          white,
+          weighted,
+          variance,
+          GradFrame::kTriangular};
 }
 
 /// Variance of each of the S Gaussians of the box footprint [px^2].
@@ -87,19 +110,19 @@ template <int S> struct GaussianPixels : FootprintDefaults {
   template <typename T> using Shape = GaussianShape<T>;
 
   template <typename T> struct Terms {
-    Mat2<T> w;        ///< whitening matrix times kBase2
+    Lower2<T> w;      ///< whitening matrix times kBase2
     T log_peak;       ///< log2(opacity * amp)
     Vec2<T> node[S];  ///< each sample's node in whitened coordinates, seen from the mean
   };
 
-  template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& shape) { return shape.w; }
+  template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& shape) { return wide_first(shape); }
 
   template <typename T> AR_HD static T level(const Shape<T>& shape, T opacity) {
     return gaussian_level(shape.amp, opacity);
   }
 
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& shape, T opacity, Vec2<T> origin = {T(0), T(0)}) {
-    const Mat2<T> w = T(kBase2) * shape.w;
+    const Lower2<T> w = T(kBase2) * shape.w;
     Terms<T> t{w, log2(opacity * shape.amp), {}};
     AR_UNROLL
     for (int s = 0; s < S; ++s) {
@@ -115,9 +138,9 @@ template <int S> struct GaussianPixels : FootprintDefaults {
     return {z.x + V(t.node[s].x), z.y + V(t.node[s].y)};
   }
 
-  /// log2 of alpha at the whitened coordinates z.
+  /// log2 of alpha at the whitened coordinates z, of which the second is known last.
   template <typename T, class V> AR_HD static V log_alpha(const Terms<T>& t, Vec2<V> z) {
-    return madd(-z.x, z.x, madd(-z.y, z.y, V(t.log_peak)));
+    return madd(-z.y, z.y, madd(-z.x, z.x, V(t.log_peak)));
   }
 
   template <typename T, class V> AR_HD static V alpha(const Terms<T>& t, Vec2<V> p, int s) {
@@ -132,7 +155,7 @@ template <int S> struct GaussianPixels : FootprintDefaults {
     sums.shape = {madd(gx, z.x, sums.shape.xx), madd(gx, z.y, sums.shape.xy), madd(gy, z.y, sums.shape.yy)};
   }
 
-  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return T(1 / kBase2) * shape.w; }
+  template <typename T> AR_HD static Lower2<T> mean_map(const Shape<T>& shape) { return T(1 / kBase2) * shape.w; }
 };
 
 /// One of the S Gaussians of GaussianPixels<S>, for a lane of its own: p is where it lies.
@@ -149,7 +172,7 @@ template <int S, bool kCompensated> struct GaussianFootprint : GaussianPixels<S>
 
   template <typename T> AR_HD static Shape<T> prepare_with(Cov2d<T> cov, T variance) {
     const Cov2d<T> blurred = blur(cov, variance);
-    return {whiten(blurred), kCompensated ? sqrt(quotient(cov.det, blurred.det)) : T(1)};
+    return gaussian_shape(blurred, kCompensated ? sqrt(quotient(cov.det, blurred.det)) : T(1));
   }
 
   template <typename T>

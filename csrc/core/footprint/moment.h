@@ -60,7 +60,7 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   template <typename T, class V>
   AR_HD static Vec2<V> move(const Terms<T>& t, Vec2<V> p, int s, V alpha, Vec2<V> moved) {
     const V reach = V(T(kMoveReach));
-    return move_in(t, Gaussian::whitened(t, p + place<T, V>(s), 0), alpha, alpha, moved,
+    return move_in(t, Gaussian::whitened(t, p + place<T, V>(s), 0), alpha, alpha > V(T(0)), moved,
                    Bounds<V>{{-reach, -reach}, {reach, reach}});
   }
 
@@ -86,16 +86,31 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   /// coordinates of that centre.
   template <typename T, class V>
   AR_HD static Vec2<V> whitened_node(const Terms<T>& t, Vec2<V> of_pixel, Vec2<V> place) {
-    return {madd(V(t.w.xx), place.x, madd(V(t.w.xy), place.y, of_pixel.x)),
-            madd(V(t.w.yx), place.x, madd(V(t.w.yy), place.y, of_pixel.y))};
+    return transform(t.w, place, of_pixel);
+  }
+
+  /// Whitened coordinates of the point p from the corner of a row of cells, of which those of one row share `of_row`.
+  template <typename T, class V> AR_HD static V of_row(const Terms<T>& t, V y) {
+    return madd(V(t.w.yy), y, V(t.node[0].y));
+  }
+  template <typename T, class V> AR_HD static Vec2<V> whitened_in_row(const Terms<T>& t, Vec2<V> p, V of_row) {
+    return transform(t.w, p, Vec2<V>{V(t.node[0].x), of_row});
   }
 
   /// move() from the node's whitened coordinates z. `at` is the node's place or its displacement, in the unit of w^-1;
-  /// what is returned is the same behind the splat, where `cell` allows it. `composited` is alpha where the splat was
-  /// composited, and zero where it was not, of which the division by 1 - alpha does not have to know.
+  /// what is returned is the same behind the splat, where `cell` allows it. alpha is as if the splat was composited;
+  /// `mask` says whether it was.
   template <typename T, class V, class Cell>
-  AR_HD static Vec2<V> move_in(const Terms<T>& t, Vec2<V> z, V alpha, V composited, Vec2<V> at, const Cell& cell) {
-    return cell.held(length_of<T, V, Cell>(alpha, composited), transform_transposed(t.w, z), at);
+  AR_HD static Vec2<V> move_in(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> mask, Vec2<V> at, const Cell& cell) {
+    const Vec2<V> along = transform_transposed(t.w, z);
+    // The same bits in two ways: a thread of a device skips single instructions at no cost.
+    if constexpr (std::is_same_v<MaskOf<V>, bool>) {
+      const V length = length_of<T, V, Cell>(alpha, alpha);
+      if (mask) at = cell.held(length, along, at);
+      return at;
+    } else {
+      return cell.held(length_of<T, V, Cell>(alpha, select(mask, alpha, V(T(0)))), along, at);
+    }
   }
 
   /// alpha_and_move_vjp() likewise, added to `sums` (docs/numerics.md, "Adjoint of moving nodes", with q for v r y).
@@ -116,8 +131,7 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     Sym2<V>& shape = sums.sums.shape;
     shape = {madd(z.x, offset.x - q.x, shape.xx), madd(z.x, offset.y, madd(-q.x, z.y, shape.xy)),
              madd(z.y, offset.y - q.y, shape.yy)};
-    dL_dat = {madd(-V(t.w.xx), offset.x, madd(-V(t.w.yx), offset.y, behind.x)),
-              madd(-V(t.w.xy), offset.x, madd(-V(t.w.yy), offset.y, behind.y))};
+    dL_dat = {madd(-V(t.w.xx), offset.x, madd(-V(t.w.yx), offset.y, behind.x)), madd(-V(t.w.yy), offset.y, behind.y)};
   }
 
   /// Moves `at` as move_in() does. With J the derivative of the place behind with respect to that in front, the dL_dat
@@ -134,8 +148,7 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     const V by_alpha = select(free, -alpha, zero), by_r = select(free, unit * length * (V(T(1)) + r), zero);
     const Vec2<V> steeper = {by_r * along.x, by_r * along.y};
     const V xx = madd(V(t.w.xx), V(t.w.xx), V(t.w.yx) * V(t.w.yx));
-    const V xy = madd(V(t.w.xx), V(t.w.xy), V(t.w.yx) * V(t.w.yy));
-    const V yy = madd(V(t.w.xy), V(t.w.xy), V(t.w.yy) * V(t.w.yy));
+    const V xy = V(t.w.yx) * V(t.w.yy), yy = V(t.w.yy) * V(t.w.yy);
     return {{by_alpha * along.x, by_alpha * along.y},
             {madd(length, xx, -steeper.x * along.x), madd(length, xy, -steeper.x * along.y),
              madd(length, yy, -steeper.y * along.y)},
@@ -148,7 +161,7 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   template <class Cell> static constexpr double variance() { return kVariance * Cell::kUnits * Cell::kUnits; }
   /// v / kBase2^2, since (Sigma + v I)^-1 d = w^T z / kBase2^2.
   template <class Cell> static constexpr double step() { return variance<Cell>() / kMoveGradUnit; }
-  /// step() alpha / (1 - alpha), or zero where `composited` is zero and not alpha. The factor is in the divisor, where
+  /// step() composited / (1 - alpha). The factor is in the divisor, where
   /// it costs nothing on a device. On processors without fused multiply-adds the divisor is rounded twice, so that up
   /// to 1 / (1 - kAlphaMax) = 100 roundings of the length are lost, 6e-6 of it in float.
   template <typename T, class V, class Cell> AR_HD static V length_of(V alpha, V composited) {

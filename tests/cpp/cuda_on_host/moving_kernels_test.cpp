@@ -207,8 +207,8 @@ template <class F> void expect_composited(const Scene<F>& scene, const Results& 
     double color[kColors] = {};
     for (int k = 0; k < int(scene.splats.size()); ++k) {
       const Splat<F, float>& splat = scene.splats[k];
-      GaussianShape<double> shape = {{splat.shape.w.xx, splat.shape.w.xy, splat.shape.w.yx, splat.shape.w.yy},
-                                     splat.shape.amp};
+      GaussianShape<double> shape = {
+          {splat.shape.w.xx, splat.shape.w.yx, splat.shape.w.yy}, splat.shape.amp, splat.shape.turn};
       const auto terms = F::terms(shape, double(splat.opacity));
       const Vec2<double> d = {i % kWidth - double(splat.mean.x), i / kWidth - double(splat.mean.y)};
       const double weight = pixel.add(terms, d, k).weight;

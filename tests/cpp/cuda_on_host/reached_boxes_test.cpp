@@ -144,7 +144,7 @@ template <class F, class Layout> void expect_the_warp_of_each_pixel() {
       const Vec2<float> at = {float(i % Layout::kSide), float(i / Layout::kSide)};
       Splat<F, float> splat = {};
       splat.mean = {kX0 + at.x, kY0 + at.y};
-      splat.shape.w = {400, 0, 0, 400};
+      splat.shape.w = {400, 0, 400};
       splat.shape.amp = splat.level = 1;
       const uint32_t reached = Layout::template block_reach<F>(splat, kX0, kY0);
       for (int thread = 0; thread < Layout::kThreads; ++thread) {
