@@ -40,13 +40,13 @@ template <class V> AR_HD Blended<V> blend_sample(V raw, V& transmittance) {
   if constexpr (std::is_same_v<MaskOf<V>, bool>) {
     const V if_shown = transmittance * min(raw, V(T(kAlphaMax))), next = transmittance - if_shown;
     const bool mask = hit & (next >= V(T(kTransmittanceMin)));
-    transmittance = select(hit, select(mask, next, -abs(transmittance)), transmittance);
+    transmittance = select(hit, select(mask, next, minus_abs(transmittance)), transmittance);
     return {mask, select(mask, if_shown, zero), if_shown};
   } else {
-    const V contribution = transmittance * effective_alpha(raw);
+    const V contribution = select(hit, transmittance * min(raw, V(T(kAlphaMax))), zero);
     const V next = transmittance - contribution;
     const MaskOf<V> open = next >= V(T(kTransmittanceMin));
-    transmittance = select(open, next, -abs(transmittance));
+    transmittance = select(open, next, minus_abs(transmittance));
     return {MaskOf<V>(hit & open), select(open, contribution, zero), contribution};
   }
 }

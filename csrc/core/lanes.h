@@ -102,6 +102,8 @@ AR_HD bool in_unit_interval(double x) { return x >= 0 && x <= 1; }
 
 AR_HD float abs(float x) { return std::fabs(x); }
 AR_HD double abs(double x) { return std::fabs(x); }
+AR_HD float minus_abs(float x) { return -std::fabs(x); }
+AR_HD double minus_abs(double x) { return -std::fabs(x); }
 AR_HD float log2(float x) { return std::log2(x); }
 AR_HD double log2(double x) { return std::log2(x); }
 /// On a device within 2 ulp; results below 2^-126 are zero.

@@ -107,6 +107,7 @@ AR_HD Pack divide(Pack a, Pack b) { return a / b; }
 AR_HD uint32_t bits(bool m) { return m; }
 
 AR_HD Pack abs(Pack a) { return Pack((Pack::Raw)((PackIndex::Raw)a.v & 0x7fffffff)); }
+AR_HD Pack minus_abs(Pack a) { return Pack((Pack::Raw)((PackIndex::Raw)a.v | INT32_MIN)); }
 
 /// 2^n times 1 + f p(f); `shifted` holds the integer n in its low bits.
 AR_HD Pack scale_by_power(Pack p, Pack shifted) {

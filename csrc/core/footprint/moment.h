@@ -105,11 +105,11 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     const Vec2<V> along = transform_transposed(t.w, z);
     // The same bits in two ways: a thread of a device skips single instructions at no cost.
     if constexpr (std::is_same_v<MaskOf<V>, bool>) {
-      const V length = length_of<T, V, Cell>(alpha, alpha);
+      const V length = length_of<T, V, Cell>(alpha);
       if (mask) at = cell.held(length, along, at);
       return at;
     } else {
-      return cell.held(length_of<T, V, Cell>(alpha, select(mask, alpha, V(T(0)))), along, at);
+      return cell.held(select(mask, length_of<T, V, Cell>(alpha), V(T(0))), along, at);
     }
   }
 
@@ -141,7 +141,7 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   AR_HD static MoveSlope<V> move_in_with_slope(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> free, const Cell& cell,
                                                Vec2<V>& at) {
     const V zero = V(T(0)), unit = V(T(1 / kMoveGradUnit));
-    const V length = length_of<T, V, Cell>(alpha, alpha), r = V(T(1 / step<Cell>())) * length;
+    const V length = length_of<T, V, Cell>(alpha), r = V(T(1 / step<Cell>())) * length;
     const Vec2<V> along = transform_transposed(t.w, z), next = moved(length, along, at);
     at = cell.held(length, along, at);
     // dalpha = -unit alpha along.dat, dr = dalpha / (1 - alpha)^2 = -unit r (1 + r) along.dat
@@ -161,12 +161,12 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   template <class Cell> static constexpr double variance() { return kVariance * Cell::kUnits * Cell::kUnits; }
   /// v / kBase2^2, since (Sigma + v I)^-1 d = w^T z / kBase2^2.
   template <class Cell> static constexpr double step() { return variance<Cell>() / kMoveGradUnit; }
-  /// step() composited / (1 - alpha). The factor is in the divisor, where
-  /// it costs nothing on a device. On processors without fused multiply-adds the divisor is rounded twice, so that up
-  /// to 1 / (1 - kAlphaMax) = 100 roundings of the length are lost, 6e-6 of it in float.
-  template <typename T, class V, class Cell> AR_HD static V length_of(V alpha, V composited) {
+  /// step() alpha / (1 - alpha). The factor is in the divisor, where it costs nothing on a device. On processors
+  /// without fused multiply-adds the divisor is rounded twice, so that up to 1 / (1 - kAlphaMax) = 100 roundings of the
+  /// length are lost, 6e-6 of it in float.
+  template <typename T, class V, class Cell> AR_HD static V length_of(V alpha) {
     const V per_step = V(T(1 / step<Cell>()));
-    return composited * divide(V(T(1)), madd(-per_step, alpha, per_step));
+    return divide(alpha, madd(-per_step, alpha, per_step));
   }
 
   /// at + v r (Sigma + v I)^-1 d, before it is held.

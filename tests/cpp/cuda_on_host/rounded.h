@@ -95,6 +95,7 @@ inline Rounded sqrt(Rounded x) {
   const double root = std::sqrt(x.value);  // flatter above than below
   return Rounded::of(root, root - std::sqrt(std::max(x.value - x.error, 0.0)));
 }
+inline Rounded approx_sqrt(Rounded x) { return sqrt(x); }  // on a host the same
 // Those of a C library are within an ulp.
 inline Rounded exp2(Rounded x) {
   const double y = std::exp2(x.value);
