@@ -421,6 +421,23 @@ TEST(BoxExcess, HoldsForThePixel) {
   }
 }
 
+// From the matrix with x first follows that with the wide axis first, entry by entry, as nothing cancels: 15 roundings
+// at most, and those of the numbers that are given, which count up to five times.
+TEST(GaussianShapeTest, TurnsToTheWideAxis) {
+  Random random(10);
+  int turned = 0;
+  for (int trial = 0; trial < search_trials(20000); ++trial) {
+    const double s2 = random.log_uniform(1e-2, 100), s1 = s2 * random.log_uniform(1, 1e4);
+    const Cov2d<float> cov = rounded<float>(blur(covariance(s1, s2, random.uniform(0, kPi)), kPixelVariance));
+    const Mat2<double> expected = whiten_wide_first(Cov2d<double>{cov.xx, cov.xy, cov.yy, cov.det});
+    const Mat2<float> w = wide_first(gaussian_shape(cov, 1.0f));
+    turned += cov.yy > cov.xx;
+    const double pairs[][2] = {{w.xx, expected.xx}, {w.xy, expected.xy}, {w.yx, expected.yx}, {w.yy, expected.yy}};
+    for (const auto& [found, value] : pairs) ASSERT_NEAR(found, value, 20 * kEps<float> * std::abs(value));
+  }
+  EXPECT_GT(turned, search_trials(20000) / 3);
+}
+
 // The branches of `exact` meet: across each switch the weight changes by no more than it must.
 TEST(ExactBranches, AgreeWhereTheyMeet) {
   Random random(9);

@@ -89,7 +89,8 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     return transform(t.w, place, of_pixel);
   }
 
-  /// Whitened coordinates of the point p from the corner of a row of cells, of which those of one row share `of_row`.
+  /// Whitened coordinates of the point p, whose y is counted from the height y of a row of cells. What they have of
+  /// that height all cells of the row share: of_row().
   template <typename T, class V> AR_HD static V of_row(const Terms<T>& t, V y) {
     return madd(V(t.w.yy), y, V(t.node[0].y));
   }
