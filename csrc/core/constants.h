@@ -40,7 +40,7 @@ inline constexpr double kRadiusMinGap = 0.1;
 inline constexpr double kPixelVariance = 1.0 / 12.0;
 
 /// Added to the level of every support ellipse. It exceeds the float32 rounding error of |W d|^2 at
-/// the level (7e-3 for a needle 1000 px long, docs/numerics.md), so rounding never drops a pair.
+/// the level (5e-3 for a needle 1000 px long, docs/numerics.md, "Support"), so rounding never drops a pair.
 inline constexpr double kLevelSlack = 1e-2;
 
 /// Makes up for the rounding of an upper bound of how far a Gaussian reaches, some ten operations.

@@ -193,12 +193,12 @@ template <class F, int C, class Layout> struct QueuedSplats {
   }
   /// Puts the splat that was read into the stage. `light`: what the steps before have left of it.
   ///
-  /// Every listed splat has a level above 0, and no `turn` is negative, so that the comparison is never true. Without
-  /// it nothing would need these two, which are read together with numbers that are needed: the compiler would use
-  /// their registers for something else, and for that wait until the splat has arrived. And without `light` it would
-  /// compare, and wait, in front of the steps.
+  /// Every listed splat has a level above 0, and no `x_given_y` is negative, so that the comparison is never true.
+  /// Without it nothing would need these two, which are read together with numbers that are needed: the compiler would
+  /// use their registers for something else, and for that wait until the splat has arrived. And without `light` it
+  /// would compare, and wait, in front of the steps.
   template <class Stage> __device__ void put(Stage& stage, int lane, float light) const {
-    if (lane >= n || splat.level + splat.shape.turn <= min(light, 0.0f)) return;
+    if (lane >= n || splat.level + splat.shape.x_given_y <= min(light, 0.0f)) return;
     stage.splats[lane_id()] = {cell_terms(splat, list), channels};
     stage.pairs[lane_id()] = pair;
   }

@@ -152,8 +152,8 @@ template <int C> struct Values {
 };
 template <> struct Values<0> {};
 
-/// Adds what a splat contributes to the S samples of a lane. composite(s) does so to sample s and returns what
-/// blend_sample does. Predicates skip single additions at no cost.
+/// Adds what a splat contributes in the S samples of a lane. composite(s) composites it into sample s and returns what
+/// blend_sample does. A branch around a single addition becomes a predicate, which costs nothing.
 template <int S, int C, class Composite>
 __device__ __forceinline__ void add_samples(Values<C>& sums, const Values<C>& channels, Composite&& composite) {
   float contribution = 0;

@@ -421,8 +421,8 @@ TEST(BoxExcess, HoldsForThePixel) {
   }
 }
 
-// From the matrix with x first follows that with the wide axis first, entry by entry, as nothing cancels: 15 roundings
-// at most, and those of the numbers that are given, which count up to five times.
+// From the matrix with x first follows that with the wide axis first, entry by entry, as nothing cancels: at most 15
+// roundings, and up to five from the entries of the covariance, each of which is rounded for itself.
 TEST(GaussianShapeTest, TurnsToTheWideAxis) {
   Random random(10);
   int turned = 0;

@@ -102,10 +102,10 @@ void main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2
 /// A root of zero marks what is not drawn.
 export function projectShader(kind, degree) {
   const gaussian = `
-  float wide = xx + uVariance, wideDet = det + uVariance * (xx + yy) + uVariance * uVariance;
-  float across = sqrt(wide / wideDet), slope = -across * (xy / wide);
-  whitening = vec4(inversesqrt(wide), 0.0, slope, across);
-  float amplitude = ${kind === 'point' ? '1.0' : 'sqrt(det / wideDet)'};
+  float blurredX = xx + uVariance, blurredDet = det + uVariance * (xx + yy) + uVariance * uVariance;
+  float across = sqrt(blurredX / blurredDet), slope = -across * (xy / blurredX);
+  whitening = vec4(inversesqrt(blurredX), 0.0, slope, across);
+  float amplitude = ${kind === 'point' ? '1.0' : 'sqrt(det / blurredDet)'};
   peak = log2(opacity * amplitude);
   level = 2.0 * log(opacity * amplitude / kAlphaMin);`;
   const cumulant = `${gaussian}

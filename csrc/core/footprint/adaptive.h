@@ -24,7 +24,7 @@ template <int S> struct AdaptiveBox : GaussianFootprint<S, true> {
 
   template <typename T> AR_HD static Shape<T> prepare(Cov2d<T> cov, FootprintOptions) { return {cov, sqrt(cov.det)}; }
 
-  /// What Gaussian has as shape.
+  /// The shape of the same splat for Gaussian.
   template <typename T> AR_HD static GaussianShape<T> gaussian(const Shape<T>& shape) {
     return gaussian_shape(blur(shape.cov, T(kVariance)), amplitude(shape));
   }
@@ -56,8 +56,8 @@ template <int S> struct AdaptiveBoxVjp : AdaptiveBox<S> {
   };
 
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& shape, T opacity, Vec2<T> origin = {T(0), T(0)}) {
-    const Lower2<T> turn = from_common(shape.cov);
-    return {Box::terms(shape, opacity, origin), turn, log_amp_from_common(shape.cov, turn)};
+    const Lower2<T> f = from_common(shape.cov);
+    return {Box::terms(shape, opacity, origin), f, log_amp_from_common(shape.cov, f)};
   }
 
   template <typename T> AR_HD static ShapeGrad<T> collect(const Terms<T>& t, const ShapeGrad<T>& sums, T weighted) {
@@ -78,16 +78,16 @@ template <int S> struct AdaptiveBoxVjp : AdaptiveBox<S> {
   template <typename T> AR_HD static Lower2<T> from_common(Cov2d<T> cov) {
     const Cov2d<T> own = blur(cov, T(Box::kVariance)), common = blur(cov, T(kPixelVariance));
     const T across = sqrt(own.xx / own.det), common_across = sqrt(common.xx / common.det);
-    const T turn = -across * cov.xy * T(kPixelVariance - Box::kVariance) / (own.xx * sqrt(common.xx));
-    return {sqrt(common.xx / own.xx), turn, across / common_across};
+    const T slope = -across * cov.xy * T(kPixelVariance - Box::kVariance) / (own.xx * sqrt(common.xx));
+    return {sqrt(common.xx / own.xx), slope, across / common_across};
   }
   /// With F = w_S w_1^-1 the difference of the gradients, (C_1 - C_S) / 2 = (v_S - v_1) C_1 C_S / 2, is
   /// (v_S - v_1) w_1 w_1^T F^T F / 2 in coordinates w_1, and there kBase2^2 times what a sum of z z^T is.
-  template <typename T> AR_HD static Sym2<T> log_amp_from_common(Cov2d<T> cov, const Lower2<T>& turn) {
+  template <typename T> AR_HD static Sym2<T> log_amp_from_common(Cov2d<T> cov, const Lower2<T>& f) {
     const Lower2<T> w = whiten(blur(cov, T(kPixelVariance)));
     const T scale = T(kBase2 * kBase2 * (Box::kVariance - kPixelVariance));
     const T axx = w.xx * w.xx, axy = w.xx * w.yx, ayy = w.yx * w.yx + w.yy * w.yy;
-    const Sym2<T> b = congruence_transposed(turn, Sym2<T>{T(1), T(0), T(1)});
+    const Sym2<T> b = congruence_transposed(f, Sym2<T>{T(1), T(0), T(1)});
     return {scale * (axx * b.xx + axy * b.xy), scale * (axx * b.xy + axy * b.yy), scale * (axy * b.xy + ayy * b.yy)};
   }
 };

@@ -31,7 +31,7 @@
 //   radius_variance(FootprintOptions)    variance added to Sigma for the radius that 3DGS reports [px^2]
 //   Shape<T>                             what a splat carries: an aggregate of kShapeWidth numbers T
 //   prepare(Cov2d<T>, FootprintOptions) -> Shape<T>
-//   ellipse(Shape<T>) -> Mat2<T>         the matrix w, and
+//   ellipse(Shape<T>) -> Mat2<T>         a matrix w, with the wide axis first if it is a Cholesky factor, and
 //   level(Shape<T>, opacity) -> T        the level, such that opacity * I(d + node) < 1/255 wherever
 //                                        |w (d + node)|^2 > level; level <= 0 where that holds everywhere
 //   mean_map(Shape<T>) -> m              the matrix, Mat2<T> or Lower2<T>, for which dL/dmean = m^T sums.offset
@@ -81,12 +81,12 @@
 //   whitened(Terms<T>, Vec2<V> p, 0) -> Vec2<V>                            z of a point
 //   whitened_node(Terms<T>, Vec2<V> of_pixel, Vec2<V> place) -> Vec2<V>    z of a sample, from that of the pixel's
 //                                        centre, which the CPU works out once for all samples
-//   of_row(Terms<T>, V y) -> V           what points at height y have in common, for
+//   of_row(Terms<T>, V y) -> V           what points at height y have in common, for CUDA kernels
 //   whitened_in_row(Terms<T>, Vec2<V> p, V of_row) -> Vec2<V>              z of p, whose y is counted from that height
 //   log_alpha(Terms<T>, Vec2<V> z) -> V  log2(opacity * I)
 //   move_in, add_alpha_and_move_in_vjp   move and alpha_and_move_vjp, from z, and a place or a displacement with its
-//                                        Bounds or UnitCell; move_in also takes alpha as if the splat was composited,
-//                                        and the adjoint adds to sums
+//                                        Bounds or UnitCell; move_in takes alpha as if the splat was composited, and
+//                                        a mask that says whether it was; the adjoint adds to sums
 //   move_in_with_slope                   move_in of a place that is changed, and its MoveSlope
 //
 // With a UnitCell all lengths are in edges of cells, and places are seen from their cell's corner. Gradients with
@@ -231,7 +231,8 @@ template <class F> constexpr int spread_lanes() {
 
 /// What is known about the w of a SplatGrad.
 enum class GradFrame {
-  kTriangular,  ///< w is a Cholesky factor of the inverse of Sigma + variance I, either axis first
+  kTriangular,  ///< w is a Cholesky factor of the inverse of Sigma + variance I, either axis first, up to the signs of
+                ///< its rows
   kAxes,        ///< its rows are the axes of Sigma over their standard deviations
   kPixels,      ///< it is the identity: dL_dwhite is the gradient with respect to Sigma itself
 };

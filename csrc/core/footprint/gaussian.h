@@ -12,7 +12,7 @@ namespace ar {
 template <typename T> struct GaussianShape {
   Lower2<T> w;  ///< whitening matrix [1/px]
   T amp;        ///< peak: sqrt(det Sigma / det Sigma'), 1 without compensation
-  T turn;       ///< standard deviation of x given y, if y is the wide axis, else zero [px]: see wide_first()
+  T x_given_y;  ///< standard deviation of x given y, if y is the wide axis, else zero [px]: see wide_first()
 };
 
 /// Whitening matrix of c: a Cholesky factor, x first.
@@ -27,7 +27,8 @@ template <typename T> AR_HD Mat2<T> whiten_wide_first(Cov2d<T> c) {
   return {T(0), w.xx, w.yy, w.yx};
 }
 
-/// The shape of a Gaussian of covariance c.
+/// The shape of a Gaussian of covariance c. x_given_y may be an approximation: it is a factor of all entries of
+/// wide_first(), so that its error makes the ellipse larger or smaller, within kLevelSlack, but does not turn it.
 template <typename T> AR_HD GaussianShape<T> gaussian_shape(Cov2d<T> c, T amp) {
   return {whiten(c), amp, c.xx >= c.yy ? T(0) : approx_sqrt(divide(c.det, c.yy))};
 }
@@ -36,10 +37,10 @@ template <typename T> AR_HD GaussianShape<T> gaussian_shape(Cov2d<T> c, T amp) {
 /// coordinates a box fills more of its bounding box (docs/numerics.md, "Whitening").
 template <typename T> AR_HD Mat2<T> wide_first(const GaussianShape<T>& shape) {
   const Lower2<T>& w = shape.w;
-  const bool wide_x = shape.turn == T(0);
-  const T across = w.yy * shape.turn;
+  const bool wide_x = shape.x_given_y == T(0);
+  const T across = w.yy * shape.x_given_y;
   return {wide_x ? w.xx : T(0), wide_x ? T(0) : w.xx * across,
-          wide_x ? w.yx : madd(w.xx, w.xx, w.yx * w.yx) * shape.turn, wide_x ? w.yy : w.yx * across};
+          wide_x ? w.yx : madd(w.xx, w.xx, w.yx * w.yx) * shape.x_given_y, wide_x ? w.yy : w.yx * across};
 }
 
 /// Exponents are taken to base 2: kBase2^2 = log2(e) / 2 turns |w d|^2 into -log2 of the Gaussian.
@@ -138,7 +139,7 @@ template <int S> struct GaussianPixels : FootprintDefaults {
     return {z.x + V(t.node[s].x), z.y + V(t.node[s].y)};
   }
 
-  /// log2 of alpha at the whitened coordinates z, of which the second is known last.
+  /// log2 of alpha at the whitened coordinates z. z.y takes longer to compute, and so is added last.
   template <typename T, class V> AR_HD static V log_alpha(const Terms<T>& t, Vec2<V> z) {
     return madd(-z.y, z.y, madd(-z.x, z.x, V(t.log_peak)));
   }

@@ -89,8 +89,8 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     return transform(t.w, place, of_pixel);
   }
 
-  /// Whitened coordinates of the point p, whose y is counted from the height y of a row of cells. What they have of
-  /// that height all cells of the row share: of_row().
+  /// Whitened coordinates of a point in a row of cells. p.y is counted from the edge of the row, and of_row() is what
+  /// the height y of that edge adds, the same for all cells of the row.
   template <typename T, class V> AR_HD static V of_row(const Terms<T>& t, V y) {
     return madd(V(t.w.yy), y, V(t.node[0].y));
   }

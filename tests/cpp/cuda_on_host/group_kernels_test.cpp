@@ -231,7 +231,7 @@ template <class F> Results reference(const Scene<F>& scene, MeanSums mean_sums) 
     const Vec2<double> p = {double(i % kWidth), double(i / kWidth)};
     const auto shape_of = [&](int k) {
       const auto& w = scene.splats[k].shape.w;
-      return GaussianShape<double>{{w.xx, w.yx, w.yy}, scene.splats[k].shape.amp, scene.splats[k].shape.turn};
+      return GaussianShape<double>{{w.xx, w.yx, w.yy}, scene.splats[k].shape.amp, scene.splats[k].shape.x_given_y};
     };
     const auto terms_of = [&](int k) {
       const Splat<F, float>& splat = scene.splats[k];

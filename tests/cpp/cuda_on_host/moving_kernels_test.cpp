@@ -208,7 +208,7 @@ template <class F> void expect_composited(const Scene<F>& scene, const Results& 
     for (int k = 0; k < int(scene.splats.size()); ++k) {
       const Splat<F, float>& splat = scene.splats[k];
       GaussianShape<double> shape = {
-          {splat.shape.w.xx, splat.shape.w.yx, splat.shape.w.yy}, splat.shape.amp, splat.shape.turn};
+          {splat.shape.w.xx, splat.shape.w.yx, splat.shape.w.yy}, splat.shape.amp, splat.shape.x_given_y};
       const auto terms = F::terms(shape, double(splat.opacity));
       const Vec2<double> d = {i % kWidth - double(splat.mean.x), i / kWidth - double(splat.mean.y)};
       const double weight = pixel.add(terms, d, k).weight;
