@@ -146,7 +146,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupVjpBlocks<F, C, kShapeGro
 #pragma unroll
         for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= shared.last[b]) << b);
         if (reach) shared.splats[t] = {tile_terms(splat, list), {}};
-        if (with_means) shared.mean_maps[t] = all_of(F::mean_map(splat.shape));
+        if (with_means) shared.mean_maps[t] = F::mean_map(splat.shape);
 #pragma unroll
         for (int i = 0; i < kShapeGroups; ++i) shared.channels[i].ids[t] = id;
         shared.rows[t] = list.slot(k);

@@ -191,8 +191,8 @@ template <class F, class Layout> struct CellCorners {
 
   /// Whitened coordinates of the node of cell i, which is at `place` in it.
   template <class Terms> __device__ Vec2<float> node(const Terms& terms, int i, Vec2<float> place) const {
-    const float of_row = F::of_row(terms, top[i % kRows]);
-    return F::whitened_in_row(terms, Vec2<float>{left[i % kColumns] + place.x, place.y}, of_row);
+    const Vec2<float> row = F::whitened_row(terms, top[i % kRows]);
+    return F::whitened_node(terms, row, Vec2<float>{left[i % kColumns] + place.x, place.y});
   }
 };
 

@@ -48,7 +48,7 @@ template <class F, int C, class Layout, int kSegment> struct SegmentVjpShared {
       stage.load_one(t, splats, params.channels, first, list, id);
       if (id < 0) continue;
       rows[t] = list.slot(k0 + t);
-      if (with_means) mean_maps[t] = all_of(F::mean_map(splats[id].shape));
+      if (with_means) mean_maps[t] = F::mean_map(splats[id].shape);
     }
     if (threadIdx.x == 0) next_group = 0;
   }

@@ -71,7 +71,7 @@ template <class F, int C, class Layout> struct MovingVjpShared {
     if (id >= 0) {
       const int t = threadIdx.x;
       rows[t] = list.slot(k0 + t);
-      if (with_means) mean_maps[t] = all_of(F::mean_map(splats[id].shape));
+      if (with_means) mean_maps[t] = F::mean_map(splats[id].shape);
     }
   }
   /// Value v of the sums of all warps for pair j.

@@ -38,7 +38,7 @@ template <class F, int C, Sums kSums> class ChunkWalk {
         reach = subtile_reach<F>(own, list_.x0, list_.y0);
 #pragma unroll
         for (int b = 0; b < kSubtiles; ++b) reach &= ~(uint32_t(k >= group_.subtile_last[b]) << b);
-        if (kMeans) mean_map = all_of(F::mean_map(own.shape));
+        if (kMeans) mean_map = F::mean_map(own.shape);
         if (kGrads && reach == 0 && lists && !list_.of_patch) clear_pair(params_, row);
       }
       const uint32_t reaching = __ballot_sync(kAllLanes, reach != 0);

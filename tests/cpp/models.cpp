@@ -24,7 +24,7 @@ template <class F, class P, typename T> Model<T> make_model() {
   };
   m.level = [](const SplatRow<T>& row) { return F::level(shape_of<F>(row), row.opacity); };
   m.ellipse = [](const SplatRow<T>& row) { return F::ellipse(shape_of<F>(row)); };
-  m.mean_map = [](const SplatRow<T>& row) { return all_of(P::mean_map(shape_of<P>(row))); };
+  m.mean_map = [](const SplatRow<T>& row) { return P::mean_map(shape_of<P>(row)); };
   m.alphas = [](const SplatRow<T>& row, Vec2<T> d, T* alphas) {
     const auto terms = terms_of<P>(row);
     for (int s = 0; s < P::kSamples; ++s) alphas[s] = P::alpha(terms, d, s);

@@ -35,8 +35,8 @@ template <int S> struct AdaptiveBox : GaussianFootprint<S, true> {
     return Gaussian::terms(gaussian(shape), opacity, origin);
   }
 
-  template <typename T> AR_HD static Lower2<T> mean_map(const Shape<T>& shape) {
-    return T(1 / kBase2) * whiten(blur(shape.cov, T(kVariance)));
+  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) {
+    return all_of(T(1 / kBase2) * whiten(blur(shape.cov, T(kVariance))));
   }
 
   template <typename T> AR_HD static T amplitude(const Shape<T>& shape) {

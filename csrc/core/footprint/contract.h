@@ -34,8 +34,7 @@
 //   ellipse(Shape<T>) -> Mat2<T>         a matrix w, with the wide axis first if it is a Cholesky factor, and
 //   level(Shape<T>, opacity) -> T        the level, such that opacity * I(d + node) < 1/255 wherever
 //                                        |w (d + node)|^2 > level; level <= 0 where that holds everywhere
-//   mean_map(Shape<T>) -> m              the matrix, Mat2<T> or Lower2<T>, for which dL/dmean = m^T sums.offset
-//                                        [dL/dpx]
+//   mean_map(Shape<T>) -> Mat2<T>        the matrix m for which dL/dmean = m^T sums.offset [dL/dpx]
 //   prepare_vjp(Cov2d<T>, Shape<T>, ShapeGrad<T> sums, weighted, FootprintOptions) -> SplatGrad<T>
 //                                        from the sums over all pixels to the gradient of the splat
 //
@@ -79,10 +78,10 @@
 //
 //   cell(s) -> Bounds<T>                 where the place of sample s may be [px]
 //   whitened(Terms<T>, Vec2<V> p, 0) -> Vec2<V>                            z of a point
-//   whitened_node(Terms<T>, Vec2<V> of_pixel, Vec2<V> place) -> Vec2<V>    z of a sample, from that of the pixel's
-//                                        centre, which the CPU works out once for all samples
-//   of_row(Terms<T>, V y) -> V           what points at height y have in common, for CUDA kernels
-//   whitened_in_row(Terms<T>, Vec2<V> p, V of_row) -> Vec2<V>              z of p, whose y is counted from that height
+//   whitened_node(Terms<T>, Vec2<V> from, Vec2<V> place) -> Vec2<V>        z of a point at `place` from another, whose
+//                                        z is `from`: on the CPU the pixel's centre, which all samples share
+//   whitened_row(Terms<T>, V y) -> Vec2<V>                                 z of (0, y): on CUDA the start of a row of
+//                                        cells, which these share
 //   log_alpha(Terms<T>, Vec2<V> z) -> V  log2(opacity * I)
 //   move_in, add_alpha_and_move_in_vjp   move and alpha_and_move_vjp, from z, and a place or a displacement with its
 //                                        Bounds or UnitCell; move_in takes alpha as if the splat was composited, and

@@ -114,7 +114,7 @@ struct Cumulant : FootprintDefaults {
     sums.shape = {madd(g, xx, sums.shape.xx), madd(g, xy, sums.shape.xy), madd(g, yy, sums.shape.yy)};
   }
 
-  template <typename T> AR_HD static Lower2<T> mean_map(const Shape<T>& shape) { return T(1 / kBase2) * shape.w; }
+  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return all_of(T(1 / kBase2) * shape.w); }
 
   template <typename T>
   AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T>, const Shape<T>& shape, ShapeGrad<T> sums, T weighted,

@@ -156,7 +156,7 @@ template <int S> struct GaussianPixels : FootprintDefaults {
     sums.shape = {madd(gx, z.x, sums.shape.xx), madd(gx, z.y, sums.shape.xy), madd(gy, z.y, sums.shape.yy)};
   }
 
-  template <typename T> AR_HD static Lower2<T> mean_map(const Shape<T>& shape) { return T(1 / kBase2) * shape.w; }
+  template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return all_of(T(1 / kBase2) * shape.w); }
 };
 
 /// One of the S Gaussians of GaussianPixels<S>, for a lane of its own: p is where it lies.

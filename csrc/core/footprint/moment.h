@@ -82,20 +82,13 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     return {{edge<T>(x), edge<T>(y)}, {edge<T>(x + 2), edge<T>(y + 2)}};
   }
 
-  /// Whitened coordinates of a node. `place`: of the node, relative to the pixel's centre; `of_pixel`: the whitened
-  /// coordinates of that centre.
-  template <typename T, class V>
-  AR_HD static Vec2<V> whitened_node(const Terms<T>& t, Vec2<V> of_pixel, Vec2<V> place) {
-    return transform(t.w, place, of_pixel);
+  /// Whitened coordinates of a node. `place`: of the node, relative to a point whose whitened coordinates are `from`.
+  template <typename T, class V> AR_HD static Vec2<V> whitened_node(const Terms<T>& t, Vec2<V> from, Vec2<V> place) {
+    return transform(t.w, place, from);
   }
-
-  /// Whitened coordinates of a point in a row of cells. p.y is counted from the edge of the row, and of_row() is what
-  /// the height y of that edge adds, the same for all cells of the row.
-  template <typename T, class V> AR_HD static V of_row(const Terms<T>& t, V y) {
-    return madd(V(t.w.yy), y, V(t.node[0].y));
-  }
-  template <typename T, class V> AR_HD static Vec2<V> whitened_in_row(const Terms<T>& t, Vec2<V> p, V of_row) {
-    return transform(t.w, p, Vec2<V>{V(t.node[0].x), of_row});
+  /// whitened() of the point (0, y), without the products with zero.
+  template <typename T, class V> AR_HD static Vec2<V> whitened_row(const Terms<T>& t, V y) {
+    return {V(t.node[0].x), madd(V(t.w.yy), y, V(t.node[0].y))};
   }
 
   /// move() from the node's whitened coordinates z. `at` is the node's place or its displacement, in the unit of w^-1;

@@ -202,7 +202,7 @@ template <class F, int C> std::vector<Sum> expected_sums(const Scene<F, C>& scen
       const Vec2<float> origin = {float(x0) - splat.mean.x, float(y0) - splat.mean.y};
       const auto shape = exactly<F>(splat.shape);
       listed.push_back({F::terms(shape, Rounded(splat.opacity), Vec2<Rounded>{origin.x, origin.y}),
-                        F::terms(splat.shape, splat.opacity, origin), all_of(F::mean_map(shape)), id, row});
+                        F::terms(splat.shape, splat.opacity, origin), F::mean_map(shape), id, row});
     }
     const auto for_each_pixel = [&](auto&& visit) {
       for (int y = 0; y < kSide && y0 + y < kHeight; ++y) {
