@@ -19,7 +19,7 @@ from ._C import TILE, instruction_set
 from .analysis.planner import SceneReport, inspect_scene, plan
 from .camera import camera_settings, moved
 from .effects import Defocus, Effects, GaussianStats, Motion, Outputs
-from .filters import apply_3d_filter, bake_pixel, compute_3d_filter
+from .filters import apply_3d_filter, bake_dilation, bake_pixel, compute_3d_filter
 from .footprints import (
     FOOTPRINTS,
     Footprint,
@@ -55,6 +55,7 @@ __all__ = [
     "TileLists",
     "activations",
     "apply_3d_filter",
+    "bake_dilation",
     "bake_pixel",
     "bin",
     "blend",

@@ -1,6 +1,8 @@
 """The 3D smoothing filter of Mip-Splatting: no Gaussian is finer than its training pictures could have shown.
 
-`bake_pixel` widens Gaussians likewise, by the pixel itself, for viewers that do not integrate over it.
+`bake_pixel` widens Gaussians likewise, by the pixel itself, for viewers that do not integrate over it. `bake_dilation`
+does it the other way round: for footprints that integrate, it widens the Gaussians of scenes that were trained with
+`point`.
 
 Source: Yu et al., Mip-Splatting: Alias-free 3D Gaussian Splatting, CVPR 2024, Eq. 6-9.
 """
@@ -21,6 +23,7 @@ from .settings import GaussianRasterizationSettings
 
 VARIANCE = 0.2  # of the filter, in squares of the finest sampling interval
 PIXEL_VARIANCE = 1 / 12  # of the square pixel along an axis, in squares of its width
+DILATION = 0.3  # px^2, that of 3DGS
 MARGIN = 0.15  # of the image around it in which a Gaussian still counts as seen
 
 
@@ -177,10 +180,80 @@ def bake_pixel(
     cameras = checked_cameras(cameras)  # a list: they are gone through twice
     width = compute_3d_filter(means3D, cameras, PIXEL_VARIANCE)
     widened, _ = apply_3d_filter(scales, opacities, width)  # checks the shapes
-    if rotations.shape != (len(scales), 4):
-        raise ValueError(f"rotations must have shape ({len(scales)}, 4), got {tuple(rotations.shape)}")
+    check_rotations(rotations, len(scales))
+    share, seen = mean_area_ratio(means3D, rotations, scales, widened, cameras)
+    return torch.where(seen[:, None], widened, scales), opacities * share.reshape(opacities.shape)
+
+
+@torch.no_grad()
+def bake_dilation(
+    means3D: torch.Tensor,
+    scales: torch.Tensor,
+    rotations: torch.Tensor,
+    opacities: torch.Tensor,
+    cameras: Sequence[Any],
+    dilation: float = DILATION,
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Scales and opacities of a scene that was trained with `point`, for footprints that integrate over the pixel.
+
+    `point` adds its dilation to the covariance of every projection, without lowering the peak. What a training with it
+    ends in is therefore thinner than what its pictures show, by so many square pixels of the training views. Here it
+    becomes part of the Gaussians: a projection that integrates over a pixel of a training view then has the variance
+    and the mass that `point` gave it, and other distances and resolutions show the same object.
+
+    - The covariance gains, along every axis, `dilation` - `PIXEL_VARIANCE` squares of the sampling interval h; the
+      pixel itself contributes the rest. 1/h^2 is the mean of 1/h_c^2 over the cameras c that see the Gaussian, each
+      with the interval of `compute_3d_filter`: there is one width in space, but each camera has a dilation of its own.
+    - The opacity is multiplied by the area sqrt(det) of the dilated projection over that of the new one, which is
+      averaged over these cameras, and is at most 1.
+
+    A Gaussian that no camera sees stays as it is.
+
+    Args:
+        means3D: (P, 3) centres, world units.
+        scales: (P, 3) standard deviations, world units.
+        rotations: (P, 4) quaternions (w, x, y, z).
+        opacities: (P, 1) or (P,).
+        cameras: Those that the scene was trained from, as in `compute_3d_filter`.
+        dilation: Of the training, px^2.
+
+    Returns:
+        (scales, opacities) of the same shapes.
+
+    Raises:
+        TypeError, ValueError: As `compute_3d_filter` and `apply_3d_filter`.
+        ValueError: The dilation is less than `PIXEL_VARIANCE`, or not finite.
+    """
+    cameras = checked_cameras(cameras)  # a list: they are gone through three times
+    if not PIXEL_VARIANCE <= dilation < math.inf:
+        raise ValueError(f"dilation must be finite and at least 1/12, the variance of a pixel, got {dilation}")
+    compute_3d_filter(means3D, cameras[:1])  # checks the centres
+    density, count = torch.zeros_like(means3D[:, 0]), torch.zeros_like(means3D[:, 0])  # density: samples per area
+    for camera in cameras:
+        interval = sampling_interval(means3D, camera)
+        density += interval**-2  # 0 where the camera does not see it
+        count += interval.isfinite()
+    interval = torch.where(count > 0, torch.rsqrt(density / count.clamp_min(1)), 0)
+    widened, _ = apply_3d_filter(scales, opacities, interval * math.sqrt(dilation - PIXEL_VARIANCE))
+    dilated, _ = apply_3d_filter(scales, opacities, interval * math.sqrt(dilation))
+    check_rotations(rotations, len(scales))
+    share, _ = mean_area_ratio(means3D, rotations, dilated, widened, cameras)
+    return widened, (opacities * share.reshape(opacities.shape)).clamp_max(1)
+
+
+def check_rotations(rotations: torch.Tensor, count: int) -> None:
+    if rotations.shape != (count, 4):
+        raise ValueError(f"rotations must have shape ({count}, 4), got {tuple(rotations.shape)}")
+
+
+def mean_area_ratio(
+    means3D: torch.Tensor, rotations: torch.Tensor, scales: torch.Tensor, others: torch.Tensor, cameras: list
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """The area of every Gaussian's projection over that with the scales `others`, averaged over the cameras that see
+    it: (P,) the mean, 1 where there is no such camera, and (P,) whether there is one.
+    """
     axes = rotation_matrices(rotations)  # their columns
-    total, count = torch.zeros_like(width), torch.zeros_like(width)
+    total, count = torch.zeros_like(means3D[:, 0]), torch.zeros_like(means3D[:, 0])
     for camera in cameras:
         seen = sampling_interval(means3D, camera).isfinite()
         if isinstance(camera.effects, Effects) and camera.effects.orthographic:
@@ -188,11 +261,9 @@ def bake_pixel(
         else:
             sight = torch.nn.functional.normalize(means3D - camera.campos.to(means3D).reshape(1, 3), dim=1)
         sight = (axes * sight[:, :, None]).sum(1)  # in the frames of the Gaussians; not by einsum, as above
-        total += torch.where(seen, projected_area(scales, sight) / projected_area(widened, sight), 0)
+        total += torch.where(seen, projected_area(scales, sight) / projected_area(others, sight), 0)
         count += seen
-    known = count > 0
-    share = torch.where(known, total / count.clamp_min(1), 1)
-    return torch.where(known[:, None], widened, scales), opacities * share.reshape(opacities.shape)
+    return torch.where(count > 0, total / count.clamp_min(1), 1), count > 0
 
 
 def projected_area(scales: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:

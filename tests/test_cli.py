@@ -330,6 +330,41 @@ def test_inspect_without_matplotlib_names_the_extra(files, capsys, monkeypatch):
     check_error(inspect_arguments(files, "--picture", "a.png"), capsys, "pip install analytic_rasterizer[analysis]")
 
 
+def test_bake_writes_what_the_library_bakes(files, capsys):
+    baked = files / "new" / "baked.ply"
+    scene = io.load_scene(files / "scene.ply")
+    arguments = ["bake", str(files / "scene.ply"), "--views", str(files / "views.json"), "--out", str(baked)]
+    for extra, dilation in (([], 0.3), (["--dilation", "0.5"], 0.5)):
+        assert leave([*arguments, *extra]) == 0
+        assert capsys.readouterr().out == f"{baked}: 30 of 30 Gaussians widened, for 2 views\n"
+        found = io.load_scene(baked)
+        cameras = [view.settings() for view in io.load_views(files / "views.json")]
+        gaussians = scene.means, scene.scales, scene.rotations, scene.opacities
+        scales, opacities = ar.bake_dilation(*gaussians, cameras, dilation)
+        assert torch.allclose(found.scales, scales, rtol=1e-5)
+        assert torch.allclose(found.opacities, opacities, rtol=1e-5, atol=2e-6)  # files keep them off 0 and 1 by 1e-6
+        assert torch.equal(found.means, scene.means) and torch.equal(found.shs, scene.shs)
+    assert b"comment SplatRenderMode: mip\n" in baked.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        (["--out", "{}/baked.spz"], "--out must be the name of a .ply, not a compressed one, got"),
+        (["--out", "{}/baked.compressed.ply"], "--out must be the name of a .ply, not a compressed one, got"),
+        (["--out", "{}/scene.ply/baked.ply"], "scene.ply: expected a folder for the results, got a file"),
+        (["--dilation", "0.05"], "dilation must be finite and at least 1/12, the variance of a pixel, got 0.05"),
+        (["--dilation", "x"], "argument --dilation: must be a positive number, got x"),
+        (["--views", "{}/none.json"], "none.json: No such file"),
+    ],
+)
+def test_errors_of_bake_are_one_line(files, capsys, extra, message):
+    scene, views, out = files / "scene.ply", files / "views.json", files / "baked.ply"
+    given = ["bake", str(scene), "--views", str(views), "--out", str(out)]
+    check_error([*given, *(text.format(files) for text in extra)], capsys, message)
+    assert not out.exists()
+
+
 def test_version_and_help(capsys):
     assert leave(["--version"]) == 0
     assert capsys.readouterr().out == f"analytic_rasterizer {ar.__version__}\n"

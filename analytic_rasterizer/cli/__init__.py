@@ -8,12 +8,12 @@ on stderr and exit code 2.
 from __future__ import annotations
 
 from .. import __version__
-from . import errors, evaluate, inspect, pareto, render, tables, train, view
+from . import bake, errors, evaluate, inspect, pareto, render, tables, train, view
 from .arguments import Parser, run_command
 
 __all__ = ["Parser", "build_parser", "main"]
 
-COMMANDS = (train, evaluate, tables, render, view, inspect, errors, pareto)
+COMMANDS = (train, evaluate, tables, render, view, bake, inspect, errors, pareto)
 
 
 def main(argv: list[str] | None = None) -> int:
