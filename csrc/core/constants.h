@@ -39,8 +39,8 @@ inline constexpr double kRadiusMinGap = 0.1;
 /// Variance of the unit pixel along each axis [px^2].
 inline constexpr double kPixelVariance = 1.0 / 12.0;
 
-/// Added to the level of every support ellipse. It exceeds the float32 rounding error of |W d|^2 at
-/// the level (5e-3 for a needle 1000 px long, docs/numerics.md, "Support"), so rounding never drops a pair.
+/// Added to the level of every support ellipse. It exceeds what float32 rounds there, in the extents of the ellipse and
+/// in |w d|^2 of a pixel, for all but needles of hundreds of px (docs/numerics.md, "Support"), so that no pair is lost.
 inline constexpr double kLevelSlack = 1e-2;
 
 /// Makes up for the rounding of an upper bound of how far a Gaussian reaches, some ten operations.

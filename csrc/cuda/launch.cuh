@@ -68,6 +68,9 @@ struct LaunchShape {
   dim3 blocks;
   unsigned threads;
   size_t shared_bytes = 0;
+  /// If not null: recorded when all blocks have begun, or where kernels may not begin early, when what is ahead of them
+  /// on the stream has ended.
+  cudaEvent_t begun = nullptr;
 };
 
 /// Multiprocessors of the current device.
@@ -97,22 +100,37 @@ inline size_t shared_bytes_of_blocks(int blocks) {
   return std::min(own, max_shared_bytes());
 }
 
+/// Makes an attribute by which a launch records an event when all of its blocks have begun. False where the toolkit is
+/// older than that.
+inline bool set_begun_event([[maybe_unused]] cudaLaunchAttribute& attribute, [[maybe_unused]] cudaEvent_t event) {
+#if CUDART_VERSION >= 12030
+  attribute.id = cudaLaunchAttributeLaunchCompletionEvent;
+  attribute.val.launchCompletionEvent.event = event;
+  return true;
+#else
+  return false;
+#endif
+}
+
 /// Launches `kernel`. An error is left for cudaGetLastError.
 template <class... Params, class... Arguments>
 void launch(void (*kernel)(Params...), const LaunchShape& shape, cudaStream_t stream, Arguments&&... arguments) {
   constexpr size_t kUnasked = 48 * 1024;  // bytes of shared memory that every kernel may have
   if (shape.shared_bytes > kUnasked)
     cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, int(shape.shared_bytes));
-  cudaLaunchAttribute early = {};
-  early.id = cudaLaunchAttributeProgrammaticStreamSerialization;
-  early.val.programmaticStreamSerializationAllowed = may_begin_early(reinterpret_cast<const void*>(kernel));
+  const bool early = may_begin_early(reinterpret_cast<const void*>(kernel));
+  cudaLaunchAttribute attributes[2] = {};
+  attributes[0].id = cudaLaunchAttributeProgrammaticStreamSerialization;
+  attributes[0].val.programmaticStreamSerializationAllowed = early;
+  const bool records = shape.begun && early && set_begun_event(attributes[1], shape.begun);
+  if (shape.begun && !records) cudaEventRecord(shape.begun, stream);
   cudaLaunchConfig_t config = {};
   config.gridDim = shape.blocks;
   config.blockDim = shape.threads;
   config.dynamicSmemBytes = shape.shared_bytes;
   config.stream = stream;
-  config.attrs = &early;
-  config.numAttrs = 1;
+  config.attrs = attributes;
+  config.numAttrs = records ? 2 : 1;
   cudaLaunchKernelEx(&config, kernel, std::forward<Arguments>(arguments)...);
 }
 

@@ -50,9 +50,9 @@ void project_rows(const ProjectRowsParams& p, cudaStream_t stream) {
 void project_vjp(const ProjectVjpParams& p, cudaStream_t stream) {
   launch_rows(project_vjp_kernel<Plain>, project_vjp_kernel<Full>, p, stream);
 }
-void zero_culled_grads(const ZeroGradsParams& p, cudaStream_t stream) {
+void zero_culled_grads(const ZeroGradsParams& p, cudaStream_t stream, cudaEvent_t begun) {
   let_blend_vjp_begin_beside_zero_culled_grads();
-  launch(zero_culled_grads_kernel, {kZeroBlocks, kZeroThreads}, stream, p);
+  launch(zero_culled_grads_kernel, {kZeroBlocks, kZeroThreads, 0, begun}, stream, p);
 }
 void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream) {
   if (p.add) return launch_rows(add_project_rows_vjp_kernel<Plain>, add_project_rows_vjp_kernel<Full>, p, stream);

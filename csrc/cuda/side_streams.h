@@ -18,10 +18,11 @@ template <int kCount> class SideStreams {
   }
   SideStreams(const SideStreams&) = delete;
   ~SideStreams() { wait_for_all(); }
-  /// What the caller's stream is given from now on waits until all of the others have come so far. A kernel that one of
-  /// them is given next is then usually placed on the device first, not behind all blocks of one on the caller's. No
-  /// result depends on it, and in a captured graph it does nothing.
-  void begin_first() const { wait_for_all(); }
+  /// An event for a kernel on one of the others to record when its blocks have begun (`LaunchShape::begun`).
+  cudaEvent_t begun() const { return own_.begun; }
+  /// What the caller's stream is given from now on waits for that event: its kernels are placed on the device behind
+  /// the blocks of that one, which would else wait until theirs leave room. No result depends on it.
+  void wait_until_begun() const { cudaStreamWaitEvent(caller_, own_.begun, 0); }
   /// The caller's for k = 0, then the others in turn.
   cudaStream_t stream(int k) const { return k == 0 ? caller_ : own_.streams[(k - 1) % kCount]; }
 
@@ -36,13 +37,13 @@ template <int kCount> class SideStreams {
 
   struct Own {
     cudaStream_t streams[kCount];
-    cudaEvent_t fork, events[kCount];
+    cudaEvent_t fork, begun, events[kCount];
 
     Own() {
       // Allowed while a graph is captured too: nothing here is part of it.
       cudaStreamCaptureMode mode = cudaStreamCaptureModeRelaxed;
       cudaThreadExchangeStreamCaptureMode(&mode);
-      cudaEventCreateWithFlags(&fork, cudaEventDisableTiming);
+      for (cudaEvent_t* event : {&fork, &begun}) cudaEventCreateWithFlags(event, cudaEventDisableTiming);
       for (int k = 0; k < kCount; ++k) {
         cudaStreamCreateWithFlags(&streams[k], cudaStreamNonBlocking);
         cudaEventCreateWithFlags(&events[k], cudaEventDisableTiming);
@@ -51,7 +52,7 @@ template <int kCount> class SideStreams {
     }
     Own(const Own&) = delete;
     ~Own() {
-      cudaEventDestroy(fork);
+      for (cudaEvent_t event : {fork, begun}) cudaEventDestroy(event);
       for (int k = 0; k < kCount; ++k) {
         cudaStreamDestroy(streams[k]);
         cudaEventDestroy(events[k]);

@@ -222,9 +222,10 @@ class CudaBackend final : public Backend {
     p.grads = grads_of<float>(in, grads);
     p.ranges = const_structs_of<cuda::PairRange>(lists.splat_offsets);
     if (p.gaussians.n == 0) return;
-    // Before blend_vjp, whose blocks stay where they are placed until there is no work left for them.
-    side_.emplace(stream_).begin_first();
-    cuda::zero_culled_grads(p, side_->stream(1));
+    side_.emplace(stream_);
+    cuda::zero_culled_grads(p, side_->stream(1), side_->begun());
+    // blend_vjp comes after its blocks, since those of blend_vjp stay where they are placed until no work is left.
+    side_->wait_until_begun();
     if (pass.debug) join();
     check_stage("zero_culled_grads", pass.debug);
   }
