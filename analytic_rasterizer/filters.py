@@ -1,8 +1,7 @@
 """The 3D smoothing filter of Mip-Splatting: no Gaussian is finer than its training pictures could have shown.
 
 `bake_pixel` widens Gaussians likewise, by the pixel itself, for viewers that do not integrate over it. `bake_dilation`
-does it the other way round: for footprints that integrate, it widens the Gaussians of scenes that were trained with
-`point`.
+serves the opposite case: footprints that integrate, and scenes that were trained with `point`, which does not.
 
 Source: Yu et al., Mip-Splatting: Alias-free 3D Gaussian Splatting, CVPR 2024, Eq. 6-9.
 """
@@ -49,9 +48,7 @@ def compute_3d_filter(means3D: torch.Tensor, cameras: Sequence[Any], variance: f
         TypeError: means3D is no tensor, or a camera is something else.
         ValueError: No cameras, or means3D has a wrong shape, or the variance is negative or not finite.
     """
-    check_tensors(None, means3D=means3D)
-    if means3D.dim() != 2 or means3D.shape[1] != 3:
-        raise ValueError(f"means3D must have shape (P, 3), got {tuple(means3D.shape)}")
+    check_means(means3D)
     cameras = checked_cameras(cameras)
     if not 0 <= variance < math.inf:
         raise ValueError(f"variance must be finite and not negative, got {variance}")
@@ -61,6 +58,12 @@ def compute_3d_filter(means3D: torch.Tensor, cameras: Sequence[Any], variance: f
     seen = interval.isfinite()
     largest = interval[seen].max() if seen.any() else interval.new_zeros(())
     return torch.where(seen, interval, largest) * math.sqrt(variance)
+
+
+def check_means(means3D: torch.Tensor) -> None:
+    check_tensors(None, means3D=means3D)
+    if means3D.dim() != 2 or means3D.shape[1] != 3:
+        raise ValueError(f"means3D must have shape (P, 3), got {tuple(means3D.shape)}")
 
 
 def checked_cameras(cameras: Any) -> list[GaussianRasterizationSettings]:
@@ -196,16 +199,18 @@ def bake_dilation(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Scales and opacities of a scene that was trained with `point`, for footprints that integrate over the pixel.
 
-    `point` adds its dilation to the covariance of every projection, without lowering the peak. What a training with it
-    ends in is therefore thinner than what its pictures show, by so many square pixels of the training views. Here it
-    becomes part of the Gaussians: a projection that integrates over a pixel of a training view then has the variance
-    and the mass that `point` gave it, and other distances and resolutions show the same object.
+    `point` adds its dilation to the covariance of every projection, without lowering the peak. The Gaussians that a
+    training with it ends in are therefore thinner than its pictures show them, by that many px^2 of the training views.
+    Here the dilation becomes part of them. For a single camera, a projection that integrates over the pixel then has
+    the variance and the mass that `point` gave it; other distances and resolutions show the same object.
 
     - The covariance gains, along every axis, `dilation` - `PIXEL_VARIANCE` squares of the sampling interval h; the
-      pixel itself contributes the rest. 1/h^2 is the mean of 1/h_c^2 over the cameras c that see the Gaussian, each
-      with the interval of `compute_3d_filter`: there is one width in space, but each camera has a dilation of its own.
-    - The opacity is multiplied by the area sqrt(det) of the dilated projection over that of the new one, which is
-      averaged over these cameras, and is at most 1.
+      pixel itself contributes the rest. In space a Gaussian has one width, where each camera has a dilation of its own:
+      1/h^2 is the mean of 1/h_c^2 over the cameras c that see the Gaussian, with the interval h_c of
+      `compute_3d_filter`.
+    - The opacity is multiplied by the area sqrt(det) of the projection with `dilation` squares of h, over that with
+      `dilation` - `PIXEL_VARIANCE` squares, averaged over these cameras. The result is limited to 1: where it would be
+      more, mass is lost.
 
     A Gaussian that no camera sees stays as it is.
 
@@ -224,10 +229,10 @@ def bake_dilation(
         TypeError, ValueError: As `compute_3d_filter` and `apply_3d_filter`.
         ValueError: The dilation is less than `PIXEL_VARIANCE`, or not finite.
     """
-    cameras = checked_cameras(cameras)  # a list: they are gone through three times
+    check_means(means3D)
+    cameras = checked_cameras(cameras)  # a list: they are gone through twice
     if not PIXEL_VARIANCE <= dilation < math.inf:
         raise ValueError(f"dilation must be finite and at least 1/12, the variance of a pixel, got {dilation}")
-    compute_3d_filter(means3D, cameras[:1])  # checks the centres
     density, count = torch.zeros_like(means3D[:, 0]), torch.zeros_like(means3D[:, 0])  # density: samples per area
     for camera in cameras:
         interval = sampling_interval(means3D, camera)
@@ -238,10 +243,12 @@ def bake_dilation(
     dilated, _ = apply_3d_filter(scales, opacities, interval * math.sqrt(dilation))
     check_rotations(rotations, len(scales))
     share, _ = mean_area_ratio(means3D, rotations, dilated, widened, cameras)
+    share = share.clamp_max(torch.finfo(share.dtype).max)  # infinite where a projection without width gets none
     return widened, (opacities * share.reshape(opacities.shape)).clamp_max(1)
 
 
 def check_rotations(rotations: torch.Tensor, count: int) -> None:
+    check_tensors(None, rotations=rotations)
     if rotations.shape != (count, 4):
         raise ValueError(f"rotations must have shape ({count}, 4), got {tuple(rotations.shape)}")
 
@@ -249,8 +256,8 @@ def check_rotations(rotations: torch.Tensor, count: int) -> None:
 def mean_area_ratio(
     means3D: torch.Tensor, rotations: torch.Tensor, scales: torch.Tensor, others: torch.Tensor, cameras: list
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """The area of every Gaussian's projection over that with the scales `others`, averaged over the cameras that see
-    it: (P,) the mean, 1 where there is no such camera, and (P,) whether there is one.
+    """Area of each Gaussian's projection with `scales` divided by that with `others`, averaged over the cameras that
+    see it: (P,), 1 where there is none. And whether there is one: (P,), bool.
     """
     axes = rotation_matrices(rotations)  # their columns
     total, count = torch.zeros_like(means3D[:, 0]), torch.zeros_like(means3D[:, 0])

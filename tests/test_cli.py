@@ -336,7 +336,8 @@ def test_bake_writes_what_the_library_bakes(files, capsys):
     arguments = ["bake", str(files / "scene.ply"), "--views", str(files / "views.json"), "--out", str(baked)]
     for extra, dilation in (([], 0.3), (["--dilation", "0.5"], 0.5)):
         assert leave([*arguments, *extra]) == 0
-        assert capsys.readouterr().out == f"{baked}: 30 of 30 Gaussians widened, for 2 views\n"
+        seen = "30 of 30 Gaussians, which are seen in 2 pictures of 50x40 to 64x48, are baked"
+        assert capsys.readouterr().out == f"{baked}: {seen}\n"
         found = io.load_scene(baked)
         cameras = [view.settings() for view in io.load_views(files / "views.json")]
         gaussians = scene.means, scene.scales, scene.rotations, scene.opacities
@@ -345,6 +346,18 @@ def test_bake_writes_what_the_library_bakes(files, capsys):
         assert torch.allclose(found.opacities, opacities, rtol=1e-5, atol=2e-6)  # files keep them off 0 and 1 by 1e-6
         assert torch.equal(found.means, scene.means) and torch.equal(found.shs, scene.shs)
     assert b"comment SplatRenderMode: mip\n" in baked.read_bytes()
+    views = io.load_views(files / "views.json")
+    io.save_views(files / "views.json", [view.scaled(4) for view in views])
+    plain = baked.read_bytes()
+    assert leave([*arguments, "--dilation", "0.5", "--scale", "0.25"]) == 0
+    assert baked.read_bytes() == plain
+    capsys.readouterr()
+    twice = ["bake", str(baked), "--views", str(files / "views.json"), "--out", str(files / "twice.ply")]
+    check_error(twice, capsys, "baked.ply: no dilation to bake: it says that pixels are to be integrated")
+    io.save_views(
+        files / "views.json", [replace(view, w2c=torch.diag(torch.tensor([1.0, -1, -1, 1]).double())) for view in views]
+    )
+    check_error(arguments, capsys, "views.json: no view sees any Gaussian of")
 
 
 @pytest.mark.parametrize(
@@ -353,16 +366,18 @@ def test_bake_writes_what_the_library_bakes(files, capsys):
         (["--out", "{}/baked.spz"], "--out must be the name of a .ply, not a compressed one, got"),
         (["--out", "{}/baked.compressed.ply"], "--out must be the name of a .ply, not a compressed one, got"),
         (["--out", "{}/scene.ply/baked.ply"], "scene.ply: expected a folder for the results, got a file"),
-        (["--dilation", "0.05"], "dilation must be finite and at least 1/12, the variance of a pixel, got 0.05"),
-        (["--dilation", "x"], "argument --dilation: must be a positive number, got x"),
+        (["--dilation", "0.05"], "argument --dilation: must be a number from 1/12, got 0.05"),
+        (["--dilation", "x"], "argument --dilation: must be a number from 1/12, got x"),
+        (["--scale", "0"], "argument --scale: must be a positive number, got 0"),
         (["--views", "{}/none.json"], "none.json: No such file"),
     ],
 )
 def test_errors_of_bake_are_one_line(files, capsys, extra, message):
     scene, views, out = files / "scene.ply", files / "views.json", files / "baked.ply"
     given = ["bake", str(scene), "--views", str(views), "--out", str(out)]
+    before = sorted(files.rglob("*"))
     check_error([*given, *(text.format(files) for text in extra)], capsys, message)
-    assert not out.exists()
+    assert sorted(files.rglob("*")) == before
 
 
 def test_version_and_help(capsys):

@@ -258,7 +258,12 @@ def test_a_baked_dilation_takes_the_mean_density_of_samples():
     share = (0.05**2 + 0.3 * square) / (0.05**2 + (0.3 - 1 / 12) * square)
     assert stronger[0].item() == pytest.approx(0.5 * share)
     assert torch.equal(widened[1], scales[1]) and stronger[1] == opacities[1]  # seen by none
-    assert ar.bake_dilation(means, scales, rotations, opacities * 1.25, [camera(8)])[1].max() <= 1
+    opaque = torch.tensor([0.9, 0.7], dtype=F64)  # times 1.22
+    assert ar.bake_dilation(means, scales, rotations, opaque, [camera(8)])[1][0] == 1
+    flat = torch.tensor([[0.0, 0.1, 0], [0.1, 0.1, 0.1]], dtype=F64)
+    for opacity in (0.5, 0.0):
+        _, found = ar.bake_dilation(means, flat, rotations, torch.full((2,), opacity, dtype=F64), [camera(8)], 1 / 12)
+        assert found[0] == (opacity > 0)  # the factor is infinite
 
 
 def test_a_baked_dilation_shows_with_moment_what_point_showed():
@@ -292,6 +297,8 @@ def test_a_baked_dilation_shows_with_moment_what_point_showed():
 
 def test_bad_arguments_are_refused_before_a_dilation_is_baked():
     means, scales, rotations, opacities = torch.zeros(2, 3), torch.ones(2, 3), torch.ones(2, 4), torch.ones(2, 1)
+    with pytest.raises(TypeError, match="rotations must be a tensor, got list"):
+        ar.bake_dilation(means, scales, [1.0], opacities, [camera(8)])
     for dilation in (0.05, math.inf, math.nan):
         with pytest.raises(ValueError, match="dilation must be finite and at least 1/12"):
             ar.bake_dilation(means, scales, rotations, opacities, [camera(8)], dilation)

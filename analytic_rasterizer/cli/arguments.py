@@ -11,6 +11,7 @@ from pathlib import Path
 import torch
 
 from .. import _C
+from ..filters import PIXEL_VARIANCE
 from ..training.files import results_folder
 from .launch import report
 
@@ -137,6 +138,7 @@ def whole_numbers(text: str) -> tuple[int, ...]:
 
 positive_number = _number(float, lambda v: math.isfinite(v) and v > 0, "a positive number")
 intensity = _number(float, lambda v: 0 <= v <= 1, "a number from 0 to 1")
+dilation = _number(float, lambda v: PIXEL_VARIANCE <= v < math.inf, "a number from 1/12")
 tolerance = _number(float, lambda v: math.isfinite(v) and v >= 0, "a number that is not negative")
 density = _number(int, lambda v: v >= 8, "a whole number from 8")
 count = _number(int, lambda v: v >= 1, "a positive whole number")

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import torch
+
 from .. import io
-from ..filters import DILATION, bake_dilation
+from ..filters import DILATION, bake_dilation, sampling_interval
 from ..training.files import write_scene
-from .arguments import add_machine_options, check_writable_file, count, positive_number, use_machine
+from ..viewer.packing import footprint_of_file
+from .arguments import add_machine_options, check_writable_file, count, dilation, positive_number, use_machine
 
 
 def add_parser(subcommands) -> None:
@@ -16,7 +19,9 @@ def add_parser(subcommands) -> None:
         help="make a scene that was trained with 3DGS ready for footprints that integrate over the pixel",
         description="Widen the Gaussians of SCENE, which was trained with 3DGS or with the footprint point, by the "
         "dilation that these add to every picture, and write the result to FILE. Footprints that integrate over the "
-        "pixel, such as moment, then show what the training showed, at any distance and resolution.",
+        "pixel, such as moment, then show at any distance and resolution what the training showed. The views must have "
+        "the size of the training's pictures. The cameras.json of 3DGS has that of the original ones: after a training "
+        "with -r 4 or --images images_4, give --scale 0.25.",
     )
     add = parser.add_argument
     add("scene", metavar="SCENE", help="3DGS .ply, compressed .ply or .spz")
@@ -25,9 +30,11 @@ def add_parser(subcommands) -> None:
     add("--out", required=True, metavar="FILE", help="the scene to write, a .ply")
     size = "image size for a views file that does not state one"
     add("--size", nargs=2, type=count, metavar=("W", "H"), help=size)
+    scale = "size of the training's pictures, as a factor of what VIEWS says (default: 1)"
+    add("--scale", type=positive_number, default=1.0, metavar="S", help=scale)
     add(
         "--dilation",
-        type=positive_number,
+        type=dilation,
         default=DILATION,
         metavar="V",
         help="of the training, px^2 (default: %(default)s)",
@@ -42,13 +49,24 @@ def run(args) -> None:
     if out.suffix != ".ply" or out.stem.endswith(".compressed"):
         raise ValueError(f"--out must be the name of a .ply, not a compressed one, got {args.out}")
     use_machine(args)
-    views = io.load_views(args.views, args.size)
+    views = [view.scaled(args.scale) for view in io.load_views(args.views, args.size)]
+    loaded = io.load_scene(args.scene)
+    if footprint_of_file(args.scene):
+        raise io.SceneError(f"{args.scene}: no dilation to bake: it says that pixels are to be integrated")
+    if loaded.sh_degree > 3:
+        raise io.SceneError(f"{args.scene}: a .ply holds no harmonics of degree {loaded.sh_degree}")
     check_writable_file(args.out)
-    scene = io.load_scene(args.scene).to(args.device)
+    scene = loaded.to(args.device)
     cameras = [view.settings(device=args.device) for view in views]
+    seen = torch.zeros(len(scene.means), dtype=torch.bool, device=args.device)
+    for camera in cameras:
+        seen |= sampling_interval(scene.means, camera).isfinite()
+    if not seen.any():
+        raise ValueError(f"{args.views}: no view sees any Gaussian of {args.scene}")
     scales, opacities = bake_dilation(
         scene.means, scene.scales, scene.rotations, scene.opacities, cameras, args.dilation
     )
-    widened = int((scales > scene.scales).any(1).sum())
     write_scene(out, scene._replace(scales=scales, opacities=opacities), "moment")
-    print(f"{args.out}: {widened} of {len(scales)} Gaussians widened, for {len(cameras)} views")
+    sizes = sorted({(view.width, view.height) for view in views})
+    pictures = f"{len(views)} pictures of " + " to ".join(f"{w}x{h}" for w, h in dict.fromkeys((sizes[0], sizes[-1])))
+    print(f"{args.out}: {int(seen.sum())} of {len(scales)} Gaussians, which are seen in {pictures}, are baked")

@@ -40,7 +40,7 @@ inline constexpr double kRadiusMinGap = 0.1;
 inline constexpr double kPixelVariance = 1.0 / 12.0;
 
 /// Added to the level of every support ellipse. It exceeds what float32 rounds there, in the extents of the ellipse and
-/// in |w d|^2 of a pixel, for all but needles of hundreds of px (docs/numerics.md, "Support"), so that no pair is lost.
+/// in |w d|^2 of a pixel, but for needles longer than 280 to 1000 px (docs/numerics.md, "Support"): no pair is lost.
 inline constexpr double kLevelSlack = 1e-2;
 
 /// Makes up for the rounding of an upper bound of how far a Gaussian reaches, some ten operations.

@@ -68,8 +68,8 @@ struct LaunchShape {
   dim3 blocks;
   unsigned threads;
   size_t shared_bytes = 0;
-  /// If not null: recorded when all blocks have begun, or where kernels may not begin early, when what is ahead of them
-  /// on the stream has ended.
+  /// If not null: recorded when all blocks have begun, as far as the driver can tell, or where kernels may not begin
+  /// early, when what is ahead of them on the stream has ended. Only order on the device may depend on it, no result.
   cudaEvent_t begun = nullptr;
 };
 
@@ -101,7 +101,7 @@ inline size_t shared_bytes_of_blocks(int blocks) {
 }
 
 /// Makes an attribute by which a launch records an event when all of its blocks have begun. False where the toolkit is
-/// older than that.
+/// older than that. (CUDA promises no more than to try; the driver has to be as new, which may_begin_early() asks.)
 inline bool set_begun_event([[maybe_unused]] cudaLaunchAttribute& attribute, [[maybe_unused]] cudaEvent_t event) {
 #if CUDART_VERSION >= 12030
   attribute.id = cudaLaunchAttributeLaunchCompletionEvent;

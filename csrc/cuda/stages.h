@@ -260,7 +260,7 @@ void shape_rows(const ShapeRowsParams& p, cudaStream_t stream);
 /// Leaves out the gradients of each 32 Gaussians in a row none of which has pairs. zero_culled_grads writes them,
 /// before it or beside it.
 void project_vjp(const ProjectVjpParams& p, cudaStream_t stream);
-/// Records `begun` when all of its blocks are on the device.
+/// `begun`: as in LaunchShape.
 void zero_culled_grads(const ZeroGradsParams& p, cudaStream_t stream, cudaEvent_t begun);
 void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream);
 void row_grads(const RowGradsParams& p, cudaStream_t stream);

@@ -223,9 +223,11 @@ class CudaBackend final : public Backend {
     p.ranges = const_structs_of<cuda::PairRange>(lists.splat_offsets);
     if (p.gaussians.n == 0) return;
     side_.emplace(stream_);
-    cuda::zero_culled_grads(p, side_->stream(1), side_->begun());
-    // blend_vjp comes after its blocks, since those of blend_vjp stay where they are placed until no work is left.
-    side_->wait_until_begun();
+    // blend_vjp comes after its blocks, since those of blend_vjp stay where they are placed until no work is left. In a
+    // captured graph only kernels could wait for that, and what comes next may be none.
+    const bool ordered = !is_capturing(stream_);
+    cuda::zero_culled_grads(p, side_->stream(1), ordered ? side_->begun() : nullptr);
+    if (ordered) side_->wait_until_begun();
     if (pass.debug) join();
     check_stage("zero_culled_grads", pass.debug);
   }
