@@ -330,34 +330,46 @@ def test_inspect_without_matplotlib_names_the_extra(files, capsys, monkeypatch):
     check_error(inspect_arguments(files, "--picture", "a.png"), capsys, "pip install analytic_rasterizer[analysis]")
 
 
-def test_bake_writes_what_the_library_bakes(files, capsys):
+def bake_arguments(files, *extra):
+    scene, views, out = files / "scene.ply", files / "views.json", files / "new" / "baked.ply"
+    return ["bake", str(scene), "--views", str(views), "--out", str(out), *extra]
+
+
+@pytest.mark.parametrize(("extra", "dilation"), [([], 0.3), (["--dilation", "0.5"], 0.5)])
+def test_bake_writes_what_the_library_bakes(files, capsys, extra, dilation):
     baked = files / "new" / "baked.ply"
     scene = io.load_scene(files / "scene.ply")
-    arguments = ["bake", str(files / "scene.ply"), "--views", str(files / "views.json"), "--out", str(baked)]
-    for extra, dilation in (([], 0.3), (["--dilation", "0.5"], 0.5)):
-        assert leave([*arguments, *extra]) == 0
-        seen = "30 of 30 Gaussians, which are seen in 2 pictures of 50x40 to 64x48, are baked"
-        assert capsys.readouterr().out == f"{baked}: {seen}\n"
-        found = io.load_scene(baked)
-        cameras = [view.settings() for view in io.load_views(files / "views.json")]
-        gaussians = scene.means, scene.scales, scene.rotations, scene.opacities
-        scales, opacities = ar.bake_dilation(*gaussians, cameras, dilation)
-        assert torch.allclose(found.scales, scales, rtol=1e-5)
-        assert torch.allclose(found.opacities, opacities, rtol=1e-5, atol=2e-6)  # files keep them off 0 and 1 by 1e-6
-        assert torch.equal(found.means, scene.means) and torch.equal(found.shs, scene.shs)
+    assert leave(bake_arguments(files, *extra)) == 0
+    seen = "30 of 30 Gaussians, which are seen in 2 pictures of 50x40 to 64x48, are baked"
+    assert capsys.readouterr().out == f"{baked}: {seen}\n"
+    found = io.load_scene(baked)
+    cameras = [view.settings() for view in io.load_views(files / "views.json")]
+    gaussians = scene.means, scene.scales, scene.rotations, scene.opacities
+    scales, opacities = ar.bake_dilation(*gaussians, cameras, dilation)
+    assert torch.allclose(found.scales, scales, rtol=1e-5)
+    assert torch.allclose(found.opacities, opacities, rtol=1e-5, atol=2e-6)  # files keep them off 0 and 1 by 1e-6
+    assert torch.equal(found.means, scene.means) and torch.equal(found.shs, scene.shs)
     assert b"comment SplatRenderMode: mip\n" in baked.read_bytes()
-    views = io.load_views(files / "views.json")
-    io.save_views(files / "views.json", [view.scaled(4) for view in views])
+
+
+def test_bake_takes_the_scale_of_the_training(files):
+    baked = files / "new" / "baked.ply"
+    assert leave(bake_arguments(files, "--dilation", "0.5")) == 0
     plain = baked.read_bytes()
-    assert leave([*arguments, "--dilation", "0.5", "--scale", "0.25"]) == 0
+    io.save_views(files / "views.json", [view.scaled(4) for view in io.load_views(files / "views.json")])
+    assert leave(bake_arguments(files, "--dilation", "0.5", "--scale", "0.25")) == 0
     assert baked.read_bytes() == plain
+
+
+def test_bake_refuses_what_has_nothing_to_bake(files, capsys):
+    assert leave(bake_arguments(files)) == 0
     capsys.readouterr()
-    twice = ["bake", str(baked), "--views", str(files / "views.json"), "--out", str(files / "twice.ply")]
-    check_error(twice, capsys, "baked.ply: no dilation to bake: it says that pixels are to be integrated")
-    io.save_views(
-        files / "views.json", [replace(view, w2c=torch.diag(torch.tensor([1.0, -1, -1, 1]).double())) for view in views]
-    )
-    check_error(arguments, capsys, "views.json: no view sees any Gaussian of")
+    twice = ["bake", str(files / "new" / "baked.ply"), "--views", str(files / "views.json"), "--out"]
+    message = "baked.ply: no dilation to bake: it says that pixels are to be integrated"
+    check_error([*twice, str(files / "twice.ply")], capsys, message)
+    away = torch.diag(torch.tensor([1.0, -1, -1, 1], dtype=torch.float64))
+    io.save_views(files / "views.json", [replace(view, w2c=away) for view in io.load_views(files / "views.json")])
+    check_error(bake_arguments(files), capsys, "views.json: no view sees any Gaussian of")
 
 
 @pytest.mark.parametrize(
@@ -373,10 +385,8 @@ def test_bake_writes_what_the_library_bakes(files, capsys):
     ],
 )
 def test_errors_of_bake_are_one_line(files, capsys, extra, message):
-    scene, views, out = files / "scene.ply", files / "views.json", files / "baked.ply"
-    given = ["bake", str(scene), "--views", str(views), "--out", str(out)]
     before = sorted(files.rglob("*"))
-    check_error([*given, *(text.format(files) for text in extra)], capsys, message)
+    check_error(bake_arguments(files, *(text.format(files) for text in extra)), capsys, message)
     assert sorted(files.rglob("*")) == before
 
 

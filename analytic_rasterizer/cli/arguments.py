@@ -58,21 +58,32 @@ def _describe(error: BaseException) -> str:
 
 def add_scene(parser) -> None:
     """SCENE, --views, and how to render them."""
-    add = parser.add_argument
-    add("scene", metavar="SCENE", help="3DGS .ply, compressed .ply or .spz")
-    views = "3DGS cameras.json, Blender or nerfstudio transforms.json, or a list of {width, height, fx, fy, w2c}"
-    add("--views", required=True, help=views)
+    add_files(parser)
     add_view_options(parser)
     add_machine_options(parser)
 
 
+def add_files(parser) -> None:
+    """SCENE and --views."""
+    add = parser.add_argument
+    add("scene", metavar="SCENE", help="3DGS .ply, compressed .ply or .spz")
+    views = "3DGS cameras.json, Blender or nerfstudio transforms.json, or a list of {width, height, fx, fy, w2c}"
+    add("--views", required=True, help=views)
+
+
 def add_view_options(parser) -> None:
     """What views do not say."""
-    add = parser.add_argument
-    size = "image size for a views file that does not state one"
-    add("--size", nargs=2, type=count, metavar=("W", "H"), help=size)
+    add_size(parser)
     background = "colour behind the scene, 0 to 1 (default: black)"
-    add("--background", nargs=3, type=intensity, default=(0.0, 0.0, 0.0), metavar=("R", "G", "B"), help=background)
+    default = (0.0, 0.0, 0.0)
+    parser.add_argument(
+        "--background", nargs=3, type=intensity, default=default, metavar=("R", "G", "B"), help=background
+    )
+
+
+def add_size(parser) -> None:
+    size = "image size for a views file that does not state one"
+    parser.add_argument("--size", nargs=2, type=count, metavar=("W", "H"), help=size)
 
 
 def add_machine_options(parser, device: str | None = "cpu") -> None:
@@ -82,8 +93,9 @@ def add_machine_options(parser, device: str | None = "cpu") -> None:
     parser.add_argument("--device", choices=("cpu", "cuda"), default=device, help=chosen)
 
 
-def add_scale(parser) -> None:
-    parser.add_argument("--scale", type=positive_number, default=1.0, help="resolution, as a factor (default: 1)")
+def add_scale(parser, of: str = "resolution") -> None:
+    """--scale, which is `of` what the views say."""
+    parser.add_argument("--scale", type=positive_number, default=1.0, help=f"{of}, as a factor (default: 1)")
 
 
 def use_machine(args) -> None:

@@ -10,7 +10,15 @@ from .. import io
 from ..filters import DILATION, bake_dilation, sampling_interval
 from ..training.files import write_scene
 from ..viewer.packing import footprint_of_file
-from .arguments import add_machine_options, check_writable_file, count, dilation, positive_number, use_machine
+from .arguments import (
+    add_files,
+    add_machine_options,
+    add_scale,
+    add_size,
+    check_writable_file,
+    dilation,
+    use_machine,
+)
 
 
 def add_parser(subcommands) -> None:
@@ -19,26 +27,17 @@ def add_parser(subcommands) -> None:
         help="make a scene that was trained with 3DGS ready for footprints that integrate over the pixel",
         description="Widen the Gaussians of SCENE, which was trained with 3DGS or with the footprint point, by the "
         "dilation that these add to every picture, and write the result to FILE. Footprints that integrate over the "
-        "pixel, such as moment, then show at any distance and resolution what the training showed. The views must have "
-        "the size of the training's pictures. The cameras.json of 3DGS has that of the original ones: after a training "
-        "with -r 4 or --images images_4, give --scale 0.25.",
+        "pixel, such as moment, then show at any distance and resolution what the training showed. VIEWS are those of "
+        "the training, and must have the size of its pictures. The cameras.json of 3DGS has that of the original ones: "
+        "after a training with -r 4 or --images images_4, give --scale 0.25.",
     )
+    add_files(parser)
+    add_size(parser)
+    add_scale(parser, "size of the training's pictures beside what VIEWS says")
     add = parser.add_argument
-    add("scene", metavar="SCENE", help="3DGS .ply, compressed .ply or .spz")
-    views = "file of the views that the scene was trained from: 3DGS cameras.json, or Blender or nerfstudio "
-    add("--views", required=True, help=f"{views}transforms.json, or a list of {{width, height, fx, fy, w2c}}")
     add("--out", required=True, metavar="FILE", help="the scene to write, a .ply")
-    size = "image size for a views file that does not state one"
-    add("--size", nargs=2, type=count, metavar=("W", "H"), help=size)
-    scale = "size of the training's pictures, as a factor of what VIEWS says (default: 1)"
-    add("--scale", type=positive_number, default=1.0, metavar="S", help=scale)
-    add(
-        "--dilation",
-        type=dilation,
-        default=DILATION,
-        metavar="V",
-        help="of the training, px^2 (default: %(default)s)",
-    )
+    of_training = "of the training, px^2 (default: %(default)s)"
+    add("--dilation", type=dilation, default=DILATION, metavar="V", help=of_training)
     add_machine_options(parser)
     parser.set_defaults(run=run)
 

@@ -17,7 +17,13 @@ template <int kCount> class SideStreams {
     for (cudaStream_t side : own_.streams) cudaStreamWaitEvent(side, own_.fork, 0);
   }
   SideStreams(const SideStreams&) = delete;
-  ~SideStreams() { wait_for_all(); }
+  /// What follows on the caller's stream waits for what the others have been given.
+  ~SideStreams() {
+    for (int k = 0; k < kCount; ++k) {
+      cudaEventRecord(own_.events[k], own_.streams[k]);
+      cudaStreamWaitEvent(caller_, own_.events[k], 0);
+    }
+  }
   /// An event for a kernel on one of the others to record when its blocks have begun (`LaunchShape::begun`).
   cudaEvent_t begun() const { return own_.begun; }
   /// What the caller's stream is given from now on waits for that event: its kernels are placed on the device behind
@@ -27,14 +33,6 @@ template <int kCount> class SideStreams {
   cudaStream_t stream(int k) const { return k == 0 ? caller_ : own_.streams[(k - 1) % kCount]; }
 
  private:
-  /// What follows on the caller's stream waits for what the others have been given so far.
-  void wait_for_all() const {
-    for (int k = 0; k < kCount; ++k) {
-      cudaEventRecord(own_.events[k], own_.streams[k]);
-      cudaStreamWaitEvent(caller_, own_.events[k], 0);
-    }
-  }
-
   struct Own {
     cudaStream_t streams[kCount];
     cudaEvent_t fork, begun, events[kCount];
