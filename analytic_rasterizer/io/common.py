@@ -15,6 +15,15 @@ class SceneError(ValueError):
     """A scene or views file that cannot be used; the message names the file and what is wrong."""
 
 
+@contextmanager
+def naming(path) -> Iterator[None]:
+    """Puts the file's name in front of the message of a SceneError."""
+    try:
+        yield
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from None
+
+
 def optional_import(name: str, extra: str = "cli"):
     """The module `name`; ImportError naming the extra that installs it when it is missing."""
     try:
