@@ -21,11 +21,11 @@ def read_splat(path) -> dict[str, np.ndarray]:
 
     An opacity of 0 or 1 is kept off these by 1e-6, where its logit is infinite.
 
-    Raises SceneError, which does not name the file, for a size that is no multiple of 32 bytes, and OSError.
+    Raises SceneError, which names the file, for a size that is no multiple of 32 bytes, and OSError.
     """
     content = Path(path).read_bytes()
     if len(content) % ROW.itemsize:
-        raise SceneError(f"cut short: expected a multiple of {ROW.itemsize} bytes, got {len(content)}")
+        raise SceneError(f"{path}: cut short: expected a multiple of {ROW.itemsize} bytes, got {len(content)}")
     rows = np.frombuffer(content, ROW)
     rgba = rows["rgba"].astype(np.float64) / 255
     opacities = rgba[:, 3:].clip(1e-6, 1 - 1e-6)
@@ -40,24 +40,19 @@ def read_splat(path) -> dict[str, np.ndarray]:
     }
 
 
-def to_splat(
-    means: np.ndarray, log_scales: np.ndarray, rotations: np.ndarray, logits: np.ndarray, sh0: np.ndarray
-) -> bytes:
+def to_splat(fields: dict[str, np.ndarray]) -> bytes:
     """The content of a .splat.
 
     Args:
-        means: (N, 3) world units.
-        log_scales: (N, 3) logarithms of standard deviations.
-        rotations: (N, 4) unit quaternions (w, x, y, z).
-        logits: (N, 1) of opacities.
-        sh0: (N, 3) coefficients of the constant harmonic. Colours are clamped to [0, 1].
+        fields: As from `read_splat`, finite but for scales of 0, with unit quaternions. Of the harmonics degree 0 is
+            written, and colours are clamped to [0, 1].
     """
-    rows = np.zeros(len(means), ROW)
-    rows["means"] = means
-    rows["scales"] = np.exp(log_scales)
+    rows = np.zeros(len(fields["means"]), ROW)
+    rows["means"] = fields["means"]
+    rows["scales"] = np.exp(fields["log_scales"])
     with np.errstate(over="ignore"):
-        opacities = 1 / (1 + np.exp(-logits.astype(np.float64)))
-    colors = 0.5 + SH_C0 * sh0.astype(np.float64)
+        opacities = 1 / (1 + np.exp(-fields["logit_opacities"].astype(np.float64)))
+    colors = 0.5 + SH_C0 * fields["shs"][:, 0].astype(np.float64)
     rows["rgba"] = np.rint(255 * np.concatenate([colors, opacities], 1)).clip(0, 255)
-    rows["rotations"] = np.rint(128 * rotations + 128).clip(0, 255)
+    rows["rotations"] = np.rint(128 * fields["rotations"] + 128).clip(0, 255)
     return rows.tobytes()

@@ -1,7 +1,7 @@
 """Writing files: every file of the project is written by `write_safely`, which never costs an earlier file.
 
-A file gets a temporary name beside its own first, and its own once it is complete and on the disk. A full disk or Ctrl-C
-then leaves what was there.
+A file has a temporary name beside its own first, and its own once it is complete and on the disk. A full disk or
+Ctrl-C leaves what was there.
 """
 
 from __future__ import annotations
