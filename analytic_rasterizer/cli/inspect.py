@@ -55,5 +55,5 @@ def run(args) -> None:
         if args.json == "-":
             print(text, end="")
             return
-        Path(args.json).write_text(text, encoding="utf-8")
+        io.write_text(args.json, text)
     print(found.to_text())
