@@ -25,6 +25,7 @@ from .launch import report
 USER_ERRORS = (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError, FloatingPointError)
 COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 VIEWS = "3DGS cameras.json, Blender or nerfstudio transforms.json, or a list of {width, height, fx, fy, w2c}"
+LARGER = "larger numbers in --scales make them smaller"
 METAVARS = {int: "N", float: "X", str: "NAME", tuple: "N,N,.."}
 """What `--help` shows for a value, by its type."""
 
@@ -105,17 +106,21 @@ def add_scene(parser) -> None:
     add_machine_options(parser)
 
 
-def add_files(parser) -> None:
+def add_files(parser, purpose: str = "file of views") -> None:
     """SCENE and --views."""
     scene = "file of a scene (.ply, compressed .ply, .spz, .sog, .splat), or a folder: of `train`, or a model of 3DGS"
     parser.add_argument("scene", metavar="SCENE", help=scene)
-    views = f"(default: cameras.json beside SCENE, or of the model of 3DGS) {VIEWS}"
+    views = f"{purpose}: {VIEWS} (default: cameras.json beside SCENE, or of the model of 3DGS)"
     parser.add_argument("--views", metavar="FILE", help=views)
 
 
-def add_footprint(parser, effect: str = "how a pixel sees a splat") -> None:
-    default = "(default: ANALYTIC_RASTERIZER_FOOTPRINT, else what SCENE was trained with)"
-    parser.add_argument("--footprint", metavar="NAME[:k=v,..]", help=f"{effect} {default}")
+def add_footprint(
+    parser,
+    text: str = "how a pixel sees a splat",
+    default: str = "(default: ANALYTIC_RASTERIZER_FOOTPRINT, else what SCENE was trained with)",
+) -> None:
+    """--footprint, and where it comes from otherwise."""
+    parser.add_argument("--footprint", metavar="NAME[:k=v,..]", help=f"{text} {default}")
 
 
 def add_view_options(parser) -> None:

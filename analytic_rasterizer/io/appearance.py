@@ -133,23 +133,32 @@ class FoundScene:
             where = self.path.parent if self.model is None else self.model
             raise SceneError(f"{self.path}: no views: there is no {CAMERAS} in {where}; give a file of views (--views)")
         views = load_views(self.cameras if path is None else path, size)
-        own = path is None or (self.cameras is not None and Path(path).samefile(self.cameras))
+        own = path is None or self.is_cameras(path)
         return [self.trained_view(view) for view in views] if own and trained_size else views
 
+    def is_cameras(self, path) -> bool:
+        """Whether a file of views is `cameras`."""
+        return self.cameras is not None and Path(path).samefile(self.cameras)
+
+    def training_footprint(self, given: str | Footprint | None = None) -> Choice:
+        """What the scene was trained with: `given`, else what is said, else `point`, with which 3DGS trains.
+
+        Raises ValueError where `given` is no footprint.
+        """
+        if given is not None:
+            return Choice(resolve_footprint(given), "as given")
+        return self.trained_with or Choice(UNMARKED, f"{self.path.name} names none, and 3DGS trains with it")
+
     def choose_footprint(self, given: str | Footprint | None = None) -> Choice:
-        """How to show the scene: `given`, else the choice of the process (the environment variable), else what it was
-        trained with, else `point`, with which 3DGS trains.
+        """How to show the scene: `given`, else the choice of the process (the environment variable), else
+        `training_footprint`. The reason says where the scene should be baked.
 
         Raises:
             ValueError: `given` or the environment variable holds no footprint.
         """
-        trained, chosen = self.trained_with, chosen_footprint()
-        if given is not None:
-            choice = Choice(resolve_footprint(given), "as given")
-        elif chosen is not None:
+        choice, chosen = self.training_footprint(given), chosen_footprint()
+        if given is None and chosen is not None:
             choice = Choice(chosen, f"{ENVIRONMENT_VARIABLE} says so")
-        else:
-            choice = trained or Choice(UNMARKED, f"{self.path.name} names none, and 3DGS trains with it")
         return Choice(choice.footprint, choice.reason + self._bake_hint(choice.footprint))
 
     def _bake_hint(self, footprint: Footprint) -> str:
@@ -174,14 +183,11 @@ def find_scene(path) -> FoundScene:
         SceneError: There is no scene.
     """
     given = Path(path)
-    if given.is_dir():
-        path = _file_in(given)
-    else:
-        path = given
+    path = _file_in(given) if given.is_dir() else given
     if not path.exists():
         raise SceneError(f"{path}: no such file or folder")
     metadata, root = read_metadata(path), model_root(path)
-    folders = [path.absolute().parent, *([] if root is None else [root])]
+    folders = [path.parent, *([] if root is None else [root])]
     cameras, cfg_args = (
         next((folder / name for folder in folders if (folder / name).is_file()), None) for name in (CAMERAS, CFG_ARGS)
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import torch
@@ -32,6 +32,17 @@ def save_video(path, pictures: Iterable[torch.Tensor], size: tuple[int, int], fp
     if not (width and height):
         raise ValueError(f"pictures of a film must have at least 2 x 2 px, got {size[0]} x {size[1]}")
 
+    failure: list[Exception] = []  # of the pictures, which is not one of writing
+
+    def frames() -> Iterator[bytes]:
+        try:
+            for picture in pictures:
+                pixels = picture[:, :height, :width].detach().clamp(0, 1).mul(255).round().to("cpu", torch.uint8)
+                yield pixels.permute(1, 2, 0).contiguous().numpy().tobytes()
+        except (OSError, RuntimeError) as error:
+            failure.append(error)
+            raise
+
     def write(temporary: Path) -> None:
         options = ["-crf", str(QUALITY), "-movflags", "+faststart"]
         writer = ffmpeg.write_frames(
@@ -39,10 +50,14 @@ def save_video(path, pictures: Iterable[torch.Tensor], size: tuple[int, int], fp
         )
         writer.send(None)  # starts the program
         try:
-            for picture in pictures:
-                pixels = picture[:, :height, :width].detach().clamp(0, 1).mul(255).round().to("cpu", torch.uint8)
-                writer.send(pixels.permute(1, 2, 0).contiguous().numpy().tobytes())
+            for frame in frames():
+                writer.send(frame)
         finally:
             writer.close()
 
-    write_safely(path, write)
+    try:
+        write_safely(path, write)
+    except OSError:
+        if failure:
+            raise failure[0] from None
+        raise
