@@ -14,6 +14,8 @@ from .rotations import rotation_matrices
 
 HIGHEST = math.radians(80)  # elevation of an orbit: above it the direction of up would turn with the camera
 CONVERGING = 0.05  # share of the views' directions across a common line, below which they do not converge
+SPREAD = 0.02  # variance of the horizontal edges' directions in their plane, below which they have one direction
+LEVEL = 0.1  # their variance out of this plane, in that in it, up to which cameras were held level
 IN_FRONT = 0.75  # share of the views that must have what they converge on in front of them
 
 
@@ -37,7 +39,7 @@ def orbit(views: Sequence[View], center: Tensor, up: Tensor, frames: int) -> lis
     offsets = torch.stack([position(view) for view in views]) - center
     distances = offsets.norm(dim=1)
     distance = distances.median()
-    if not distance > 0:
+    if not distance > 1e-9 * (1 + center.norm()):
         raise ValueError("an orbit needs views that are away from its centre: these are at it")
     away = distances > 0
     heights = (offsets[away] @ up) / distances[away]
@@ -104,6 +106,22 @@ def focus(views: Sequence[View]) -> Tensor | None:
     point = torch.linalg.solve(total, (across @ places[:, :, None]).mean(0)[:, 0])
     in_front = ((point - places) * directions).sum(1) > 0
     return point if in_front.double().mean() >= IN_FRONT else None
+
+
+def level_up(views: Sequence[View]) -> Tensor:
+    """(3,) unit vector that is up in the world, if photographers held their cameras level.
+
+    It is the direction across the horizontal edges of all pictures. Where all pictures were taken in one direction, or
+    cameras were turned, it is the mean of what is up in the pictures; that of the first where these cancel.
+    """
+    edges = torch.stack([view.w2c[0, :3] for view in views])
+    ups = -torch.stack([view.w2c[1, :3] for view in views])
+    mean = ups.mean(0)
+    up = mean if mean.norm() > 0.1 else ups[0]
+    values, vectors = torch.linalg.eigh(edges.T @ edges / len(views))
+    if values[1] > SPREAD and values[0] < LEVEL * values[1]:
+        up = vectors[:, 0] * torch.where(vectors[:, 0] @ up < 0, -1, 1)
+    return torch.nn.functional.normalize(up, dim=0)
 
 
 def position(view: View) -> Tensor:

@@ -52,6 +52,7 @@ def run(args) -> None:
         views = [views[i * len(views) // VIEWS] for i in range(VIEWS)]
         said.append(f"{VIEWS} of the views are measured (--limit-views)")
     views = views[: args.limit_views]
+    pareto.check_given(views, args.scales, methods)
     check_sizes((view.framed(scale, args.crop) for view in views for scale in args.scales), args.device, LARGER)
     out = writable_folder(args.out)
     if found.is_dilated:

@@ -16,7 +16,7 @@ from ..footprints import FOOTPRINTS, Footprint, resolve_footprint
 from ..gaussians import Gaussians
 from ..outputs import normalized
 from ..rasterizer import GaussianRasterizer
-from ..viewer.packing import extent, mean_up
+from ..viewer.packing import extent
 from .arguments import (
     LARGER,
     add_footprint,
@@ -36,6 +36,7 @@ FILM = ".mp4"
 OTHER_FILES = (".png", ".jpg", ".jpeg", ".gif", ".mov", ".avi", ".mkv", ".webm", ".npy")
 PATHS = ("orbit", "views")
 FRAMES, FPS = 120, 30.0
+COVERED = 0.5  # alpha up to which a pixel has no depth: that of mist would be noise
 
 
 def add_parser(subcommands) -> None:
@@ -58,7 +59,7 @@ def add_parser(subcommands) -> None:
     add("--frames", type=count, metavar="N", help=f"pictures along --path (default: {FRAMES})")
     add("--fps", type=positive_number, metavar="X", help=f"pictures of a film per second (default: {FPS:g})")
     add("--alpha", action="store_true", help="write pictures with alpha and without a background")
-    depth = "write DIR/depth/NAME.npy too, mean depths in world units, 0 where nothing is; and .png to look at"
+    depth = "write DIR/depth/NAME.npy too, world units, 0 where less than half is covered; and .png to look at"
     add("--depth", action="store_true", help=depth)
     parser.set_defaults(run=run)
 
@@ -133,7 +134,7 @@ def path_of(args, scene: Gaussians, views: list[io.View]) -> list[io.View]:
     center = camera_path.focus(views)
     if center is None:
         center, _ = extent(scene.to("cpu"))
-    return camera_path.orbit(views, center, torch.tensor(mean_up(views), dtype=torch.float64), frames)
+    return camera_path.orbit(views, center, camera_path.level_up(views), frames)
 
 
 class Renderer:
@@ -176,7 +177,7 @@ class Pictures:
             color = torch.cat([normalized(color, outputs.alpha), outputs.alpha])
         io.save_image(self.folder / f"{name}.png", color)
         if self.depth_folder is not None:
-            self._save_depth(name, normalized(outputs.depth, outputs.alpha)[0])
+            self._save_depth(name, normalized(outputs.depth, outputs.alpha, COVERED)[0])
 
     def _save_depth(self, name: str, depth: torch.Tensor) -> None:
         stored = depth.cpu().numpy()

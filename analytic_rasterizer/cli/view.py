@@ -61,12 +61,14 @@ def run(args) -> None:
     views, said = settle_views(args, found, required=False)
     options = {"footprint": footprint, "background": args.background, "name": found.path.name}
     packed = viewer.pack_scene(io.load_scene(found.path), views, **options)
-    say(*said, f"footprint {footprint}: {reason}")
+    said.append(f"footprint {footprint}: {reason}")
     if args.export:
         size = viewer.export_page(args.export, packed)
+        say(*said)
         print(f"{args.export}: {packed.meta['count']} Gaussians, {size / 1e6:.1f} MB")
         return
     with viewer.start_server(packed, args.port or 0) as server:
+        say(*said)
         announce(args, packed.meta["count"], packed.meta["footprint"], server.url)
         try:
             server.serve_forever()

@@ -89,7 +89,7 @@ def read_cfg_args(path) -> CfgArgs:
     # The parser raises the last two for text that is nested too deeply.
     except (OSError, SyntaxError, ValueError, MemoryError, RecursionError) as error:
         reason = getattr(error, "strerror", None) or str(error).partition("\n")[0] or type(error).__name__
-        warnings.warn(f"{path}: ignored, it is not what 3DGS writes ({reason})", stacklevel=2)
+        warnings.warn(f"{path}: ignored, it is not what 3DGS writes ({reason[:80]})", stacklevel=2)
         return CfgArgs()
     found: dict[str, Any] = {}
     for name in (field.name for field in fields(CfgArgs)):
