@@ -18,12 +18,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..density import MOMENTS
 from ..distributed import OwnSplats
+from ..distributed.ranks import Ranks, even_counts
 from ..gaussians import Gaussians
 from ..losses import l1_ssim
-from .density import MOMENTS
 from .model import render_together
-from .ranks import Ranks, even_counts
 from .trainer import Trainer
 
 BETAS = (0.9, 0.999)  # of one process, the defaults of FusedAdam

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from .. import _C, io
 from ..arguments import camera_arguments
+from ..density import make_density
+from ..distributed.ranks import ALONE, Ranks
 from ..effects import Effects
 from ..filters import apply_3d_filter, compute_3d_filter
 from ..gaussians import Gaussians
@@ -17,11 +19,9 @@ from ..losses import l1_ssim
 from ..optim import FusedAdam
 from ..settings import GaussianRasterizationSettings
 from .captures import WHITE, extent_of
-from .density import make_density
 from .model import gaussians_at, random_points, render
 from .options import BACKGROUNDS, RANDOM_BACKGROUND, TrainingOptions
 from .pictures import Pictures
-from .ranks import ALONE, Ranks
 from .schedule import PictureOrder, Progress, means_rate_at, rates_factor_at, sh_degree_at
 
 _picture_gradients = _C.Call("picture_gradients")

@@ -27,18 +27,19 @@ opacities are also lowered when growth begins, since white Gaussians in front of
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from .. import ops  # noqa: F401  (registers the fake kernels)
-from ..gaussians import Gaussians
-from ..relocation import compute_relocation
-from ..rotations import rotation_matrices
-from .options import TrainingOptions
-from .ranks import ALONE, Ranks
-from .schedule import passes
+from . import ops  # noqa: F401  (registers the fake kernels)
+from .distributed.ranks import ALONE, Ranks
+from .gaussians import Gaussians
+from .relocation import compute_relocation
+from .rotations import rotation_matrices
+
+if TYPE_CHECKING:
+    from .training.options import TrainingOptions
 
 _observe = torch.ops.analytic_rasterizer.observe_.default
 
@@ -296,6 +297,11 @@ class MonteCarloDensity(FixedDensity):
         axes = rotation_matrices(rotations)
         along = (2 * log_scales).exp() * (axes * noise[:, :, None]).sum(1)  # in the Gaussian's frame
         means += (axes * along[:, None, :]).sum(2)
+
+
+def passes(step: int, period: int, stride: int = 1) -> bool:
+    """Whether there is a multiple of `period` among the `stride` steps that end with `step`."""
+    return step // period > (step - stride) // period
 
 
 def make_density(options: TrainingOptions, *args, **kwargs) -> FixedDensity:
