@@ -17,7 +17,7 @@ import torch
 from conftest import ROOT, SHARED, needs_cuda
 from processes import DEADLINE
 
-from analytic_rasterizer import cli, density, io, render_stages
+from analytic_rasterizer import cli, io, optim, render_stages
 from analytic_rasterizer.filters import bake_pixel
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.viewer import footprint_of_file
@@ -751,7 +751,7 @@ def rows_shown(trainer) -> list[torch.Tensor]:
 
 def state_of(trainer) -> list[torch.Tensor]:
     """Copies of parameters and moments, a row for each Gaussian."""
-    moments = [trainer.optimizer.state[field].get(m) for field in trainer.gaussians for m in density.MOMENTS]
+    moments = [trainer.optimizer.state[field].get(m) for field in trainer.gaussians for m in optim.MOMENTS]
     return [t.detach().clone() for t in (*trainer.gaussians, *(m for m in moments if m is not None))]
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from .. import _C, io
 from ..arguments import camera_arguments
-from ..density import make_density
+from ..density import FixedDensity, GradientDensity, GradientOptions, MonteCarloDensity, MonteCarloOptions
 from ..distributed.ranks import ALONE, Ranks
 from ..effects import Effects
 from ..filters import apply_3d_filter, compute_3d_filter
@@ -84,7 +85,7 @@ class Trainer:
         groups = [{"params": [getattr(gaussians, name)], "lr": self.rates[name]} for name in Gaussians._fields]
         groups[-1] |= {"head": 1, "head_lr": options.color_rate}  # the constant
         self.optimizer = FusedAdam(groups, eps=ADAM_EPS)
-        self.density = make_density(options, gaussians, self.optimizer, self.extent, background == WHITE, ranks=ranks)
+        self.density = make_density(options, gaussians, self.optimizer, self.extent, background == WHITE, ranks)
         self.generator = torch.Generator(self.device).manual_seed(options.seed + 1)
         self.progress = Progress(options.iterations if options.seconds == 0 else None, options.seconds)
         self.order = PictureOrder(len(pictures.views), options)
@@ -174,7 +175,7 @@ class Trainer:
         """The same, bit for bit, without what autograd costs the host."""
         (shown,) = self._next()
         gaussians, density = self.gaussians, self.density
-        columns = density.columns if density.watches(shown.scale) else 0
+        columns = density.columns if self._watches(shown.scale) else 0
         truth = self.pictures.target(shown.scale, shown.view, shown.background)
         loss, image, radii, gradients = _picture_gradients(
             *gaussians,
@@ -188,7 +189,7 @@ class Trainer:
         for field, gradient in zip(gaussians, gradients):
             field.grad = gradient
         if columns:
-            density.observe(gradients[-1], radii)
+            density.observe_gradients(gradients[-1], radii)
         self.last = image, truth
         return loss, radii > 0 if self.options.sparse_adam else None
 
@@ -206,7 +207,7 @@ class Trainer:
         gaussians = self.gaussians.arguments()
         losses, seen = [], []
         for scale, view, settings, background in self._next():
-            leaf = self.density.leaf(scale)
+            leaf = self.density.leaf() if self._watches(scale) else None
             image, radii = render(gaussians, settings, leaf, options.supersampling)
             truth = self.pictures.target(scale, view, background)
             losses.append(l1_ssim(image, truth, options.ssim_weight))
@@ -224,8 +225,12 @@ class Trainer:
     def _observe(self, seen: list[tuple[Tensor | None, Tensor]]) -> None:
         """Lets density control look at the gradients of a step."""
         for leaf, radii in seen:
-            if leaf is not None:
-                self.density.observe(leaf.grad, radii)
+            self.density.observe(leaf, radii)
+
+    def _watches(self, scale: int) -> bool:
+        """Whether density control sees the gradients of pictures of this scale."""
+        options = self.options
+        return self.density.watches and (options.gradient_scales != "finest" or scale == min(options.scales))
 
     def _rebalance(self) -> None:
         """Called when the number of Gaussians has changed; there is nothing to do in one process."""
@@ -298,6 +303,26 @@ class Trainer:
         self.generator.set_state(state["generator"].cpu())
         self.filter_3d = None if state["filter_3d"] is None else state["filter_3d"].to(self.device)
         self.losses, self.last = [], None
+
+
+def make_density(
+    options: TrainingOptions,
+    gaussians: Gaussians,
+    optimizer: torch.optim.Optimizer,
+    extent: float,
+    white_background: bool = False,
+    ranks: Ranks = ALONE,
+) -> FixedDensity:
+    """The density control that `options.density` names, with what the options say about it."""
+    common = {"seed": options.seed, "ranks": ranks}
+    if options.density == "none":
+        return FixedDensity(gaussians, optimizer, **common)
+    kind = MonteCarloOptions if options.density == "mcmc" else GradientOptions
+    known = vars(options) | {"absolute": options.density == "absgrad", "white_background": white_background}
+    chosen = kind(**{field.name: known[field.name] for field in fields(kind)})
+    if options.density == "mcmc":
+        return MonteCarloDensity(gaussians, optimizer, chosen, **common)
+    return GradientDensity(gaussians, optimizer, extent, chosen, **common)
 
 
 def starting_gaussians(options: TrainingOptions, points: tuple[Tensor, Tensor] | None) -> Gaussians:
