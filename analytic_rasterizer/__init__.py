@@ -8,6 +8,7 @@ A drop-in replacement for `diff_gaussian_rasterization`. Where to look:
 - `Effects`, `Outputs`, `Defocus`, `Motion`, `camera_settings`: depth, alpha, statistics, cameras (docs/effects.md).
 - `project`, `list_tiles`, `blend`: the three stages of a rendering, each on its own (docs/library.md).
 - `losses`, `activations`, `optim`: the other parts of a training step (docs/losses.md).
+- `density`: how many Gaussians there are, in a training loop of one's own (docs/density.md).
 - `inspect_scene`, `plan`: what a scene calls for (docs/command-line.md).
 
 In modules of their own: `training`, `distributed`, `viewer`, `analysis`, `dialects` and `io` (docs/).
@@ -15,7 +16,7 @@ In modules of their own: `training`, `distributed`, `viewer`, `analysis`, `diale
 
 import torch  # noqa: F401  (its libraries must be loaded before the extension's)
 
-from . import activations, losses, optim
+from . import activations, density, losses, optim
 from ._C import TILE, instruction_set
 from .analysis.planner import SceneReport, inspect_scene, plan
 from .camera import View, camera_settings, moved
@@ -65,6 +66,7 @@ __all__ = [
     "camera_settings",
     "compute_3d_filter",
     "compute_relocation",
+    "density",
     "footprint_weight",
     "get_default_footprint",
     "inspect_scene",

@@ -56,7 +56,7 @@ def after_step(control, norms, step=STEP, progress=0.1, radii=None) -> None:
     control.after_step(step, progress)
 
 
-def moments(control) -> dict[str, g.Gaussians]:
+def moments(control) -> dict[str, Gaussians]:
     state = control.optimizer.state
     return {
         name: control.gaussians.map(lambda field, name=name: state[field][name]) for name in ("exp_avg", "exp_avg_sq")

@@ -477,7 +477,7 @@ def test_torchrun_trains_and_writes_once(made, tmp_path):
     state = checkpoint_in(tmp_path / "out")
     assert state["progress"]["step"] == 121 and state["shards"] == [30, 30]
     test = training.load_pictures(training.load_capture(made / "scene").test, (1,), (1.0, 1.0, 1.0), "cpu")
-    start = model.gaussians_at(*model.random_points(60, 0), 0)
+    start = Gaussians.from_points(*model.random_points(60, 0), 0)
     before = training.evaluate(start, test, TrainingOptions().footprint)["mean"]["psnr"]
     after = json.loads((tmp_path / "out" / files.METRICS).read_text())["test"]["mean"]["psnr"]
     assert after > before + 2

@@ -32,6 +32,7 @@ class FixedDensity:
     Attributes:
         gaussians: Those to render in the next step. `after_step` replaces the tensors, in the optimizer as well.
         extra: The same of `extra`.
+        pruned: How many were pruned the last time, by cause: "opacity" and "size", one-element tensors.
         row_state: Names of the attributes that have a row per Gaussian.
 
     Raises:
@@ -54,6 +55,7 @@ class FixedDensity:
         extra = dict(extra or {})
         _check_parameters(gaussians, optimizer, extra)
         self.gaussians, self.optimizer, self.extra, self.ranks = gaussians, optimizer, extra, ranks
+        self.pruned: dict[str, Tensor] = {}
         self.generator = torch.Generator(gaussians.means.device).manual_seed(seed)
 
     @property
@@ -75,6 +77,13 @@ class FixedDensity:
             return None
         means = self.gaussians.means
         return means.new_empty(len(means), self.columns, requires_grad=True)
+
+    @torch.no_grad()
+    def keep(self, kept: Tensor) -> None:
+        """Takes away all Gaussians but those of the mask (N,) bool. Averages over the others go on."""
+        self._replace(kept, {name: tensor[:0] for name, tensor in self._tensors().items()})
+        for name in self.row_state:
+            setattr(self, name, getattr(self, name)[kept])
 
     def observe(self, leaf: Tensor | None, radii: Tensor) -> None:
         """Looks at one picture, after the backward pass and before the optimizer's step. Nothing waits for the device.

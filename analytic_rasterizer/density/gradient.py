@@ -80,8 +80,8 @@ class GradientDensity(FixedDensity):
         changes = step > options.densify_from and passes(step, options.densify_every, stride)
         if changes:
             self._grow(self.gradient_sums / self.views.clamp_min(1), share / options.densify_until)
-            self._prune(too_large=step > options.reset_every > 0)
             self.forget()
+            self._prune(too_large=step > options.reset_every > 0)
         begins = step - stride < options.densify_from <= step
         if options.reset_every and (passes(step, options.reset_every, stride) or (options.white_background and begins)):
             self._lower_opacities()
@@ -131,10 +131,11 @@ class GradientDensity(FixedDensity):
 
     def _prune(self, too_large: bool) -> None:
         old, options = self.gaussians, self.options
-        kept = old.logit_opacities[:, 0].sigmoid() >= options.prune_opacity
+        kept = opaque = old.logit_opacities[:, 0].sigmoid() >= options.prune_opacity
         if too_large:
-            kept &= old.log_scales.amax(1).exp() <= options.prune_above * self.extent
-        self._replace(kept, {name: tensor[:0] for name, tensor in self._tensors().items()})
+            kept = opaque & (old.log_scales.amax(1).exp() <= options.prune_above * self.extent)
+        self.pruned = {"opacity": (~opaque).sum(), "size": (opaque & ~kept).sum()}
+        self.keep(kept)
 
     def _lower_opacities(self) -> None:
         logits = self.gaussians.logit_opacities

@@ -10,6 +10,7 @@ Needs the libraries of `pip install analytic_rasterizer[train]`; they are import
 
 from .captures import Capture, Photograph, extent_of, load_capture, load_points
 from .evaluation import evaluate, load_lpips, save_pictures
+from .model import random_points
 from .options import PRESETS, TrainingOptions
 from .pictures import Pictures, load_pictures
 from .run import Run
@@ -29,6 +30,7 @@ __all__ = [
     "load_lpips",
     "load_pictures",
     "load_points",
+    "random_points",
     "save_pictures",
     "starting_gaussians",
 ]

@@ -20,7 +20,7 @@ from ..losses import l1_ssim
 from ..optim import FusedAdam
 from ..settings import GaussianRasterizationSettings
 from .captures import WHITE, extent_of
-from .model import gaussians_at, random_points, render
+from .model import random_points, render
 from .options import BACKGROUNDS, RANDOM_BACKGROUND, TrainingOptions
 from .pictures import Pictures
 from .schedule import PictureOrder, Progress, means_rate_at, rates_factor_at, sh_degree_at
@@ -347,7 +347,7 @@ def starting_gaussians(options: TrainingOptions, points: tuple[Tensor, Tensor] |
             means, colors = means[rows], colors[rows]
     if len(means) < 2:
         raise io.SceneError(f"training needs at least 2 points to start from, got {len(means)}")
-    return gaussians_at(means, colors, options.sh_degree, options.initial_opacity, options.initial_scale)
+    return Gaussians.from_points(means, colors, options.sh_degree, options.initial_opacity, options.initial_scale)
 
 
 def background_of(options: TrainingOptions, convention: tuple[float, float, float]) -> tuple | None:
