@@ -98,8 +98,8 @@ class GradientDensity(FixedDensity):
             raise ValueError(f"state must be of {count} Gaussians, as many as there are, got {found}")
         super().load_state_dict(state)
         self.growing, self.first_count = state["growing"], state["first_count"]
-        self.gradient_sums = state["gradient_sums"].to(self.gradient_sums.device)
-        self.views = state["views"].to(self.views.device)
+        self.gradient_sums = state["gradient_sums"].to(self.gradient_sums.device, copy=True)
+        self.views = state["views"].to(self.views.device, copy=True)
 
     def forget(self) -> None:
         means = self.gaussians.means
