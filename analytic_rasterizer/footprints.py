@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from . import _C  # loads the ops
+from .autocast import widened
 
 _VARIANTS: dict[str, list[dict[str, Any]]] = {}  # what the headers say, by public name, in the order of the registry
 for _variant in _C.footprints():
@@ -213,6 +214,7 @@ def footprint_weight(
     Source: point, mip, cumulant, box, exact: docs/numerics.md; analytic, erf: [AS, Eq. 2-9].
     """
     spec = resolve_footprint(footprint, **options)
+    offset, cov2d = widened(offset), widened(cov2d)  # before they are expanded, which adds gradients up
     for name, tensor, last in (("offset", offset, 2), ("cov2d", cov2d, 3)):
         if not isinstance(tensor, torch.Tensor):
             raise TypeError(f"{name} must be a tensor, got {type(tensor).__name__}")
