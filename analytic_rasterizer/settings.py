@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 
 from .effects import AUTO, Effects
-from .footprints import Footprint, get_default_footprint, resolve_footprint
+from .footprints import Footprint, chosen_footprint, get_default_footprint, resolve_footprint
 
 
 def whole_number(name: str, value: Any) -> int:
@@ -143,6 +143,10 @@ class GaussianRasterizationSettings(_Fields):
             ValueError: The environment variable ANALYTIC_RASTERIZER_FOOTPRINT holds no footprint.
         """
         return self.footprint or get_default_footprint()
+
+    def takes_default(self) -> bool:
+        """Whether nobody and nothing chose the footprint to render with, so that it is the library's default."""
+        return self.footprint is None and chosen_footprint() is None
 
     def __eq__(self, other: object) -> bool:
         if isinstance(other, GaussianRasterizationSettings) and self._attributes() != other._attributes():

@@ -133,8 +133,15 @@ class GaussianRasterizationSettings(LibrarySettings):
 
     def own_footprint(self) -> Footprint:
         """The footprint to render with where the user chose none."""
+        return _resolved(self._own_filter() or "analytic")
+
+    def _own_filter(self) -> str | None:
         of_2023 = type(self) is GaussianRasterizationSettings
-        return _resolved(self.filter or (of_2023 and _companion_filter) or "analytic")
+        return self.filter or (_companion_filter if of_2023 else None)
+
+    def takes_default(self) -> bool:
+        """Whether the footprint is the library's default: nobody chose one, and the dialect has no filter either."""
+        return self._own_filter() is None and super().takes_default()
 
     def footprint_in_use(self) -> Footprint:
         """The footprint to render with: of the settings, or chosen for the process, or else the dialect's own.
