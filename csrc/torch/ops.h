@@ -72,4 +72,7 @@ Results observe(ObserveArguments a);
 /// Nothing: writes to params, exp_avgs and exp_avg_sqs.
 Results adam(AdamArguments a);
 
+/// Whether an op of this process has been called for which autograd will ask a gradient.
+bool gradient_was_required();
+
 }  // namespace ar::ops
