@@ -21,7 +21,8 @@ from analytic_rasterizer import render_stages
 from analytic_rasterizer.analysis.reference import UNFILTERED, image_errors, refine, supersampled
 from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.cli import arguments
-from analytic_rasterizer.io import Scene, View, optional_import, save_scene, save_views, to_image
+from analytic_rasterizer.gaussians import Gaussians
+from analytic_rasterizer.io import View, optional_import, save_scene, save_views, to_image
 
 CANVAS = (384, 256)  # the target is drawn in these units; also the default size of the picture
 FOCAL = 460.0  # canvas units
@@ -72,7 +73,7 @@ class Brush:
             along = 0.75 * length / count
             self.stamp(at[:, 0], at[:, 1], along, width / 3, angle, depth, color, opacity)
 
-    def scene(self) -> Scene:
+    def scene(self) -> Gaussians:
         """The Gaussians that project to these stamps under `make_target`'s view."""
         x, y, along, across, angle, depth, opacity = torch.cat(self.parts)[:, :7].unbind(1)
         color = torch.cat(self.parts)[:, 7:]
@@ -86,10 +87,10 @@ class Brush:
             opacity[:, None],
             ((color - 0.5) / math.sqrt(1 / (4 * math.pi)))[:, None],
         )
-        return Scene(*(field.float().contiguous() for field in fields), 0)
+        return Gaussians.from_activated(*(field.float().contiguous() for field in fields))
 
 
-def make_target() -> tuple[Scene, View]:
+def make_target() -> tuple[Gaussians, View]:
     """The target and the view that frames it at CANVAS size, always the same."""
     random = torch.Generator().manual_seed(7)
     brush = Brush()
@@ -291,7 +292,7 @@ def run(out, size: tuple[int, int] = CANVAS, device="cpu") -> dict:
     return results
 
 
-def _render(scene: Scene, view: View, scale: float, footprint: str):
+def _render(scene: Gaussians, view: View, scale: float, footprint: str):
     """(color on the CPU, seconds of the fastest of REPEATS renders)."""
     settings = view.settings(scale, PAPER, 0, footprint, device=scene.means.device)
     runs = [render_stages(settings, **scene.arguments()) for _ in range(REPEATS)]
@@ -304,7 +305,7 @@ def _errors(color: torch.Tensor, truth: torch.Tensor) -> tuple[float, float, flo
     return errors["psnr"], errors["rmse"], errors["max"]
 
 
-def _converged_reference(scene: Scene, view: View, renders: dict):
+def _converged_reference(scene: Gaussians, view: View, renders: dict):
     """({reduction: reference}, density, {reduction: RMSE against half the density})."""
     refined = refine(
         lambda density: _reduced(supersampled(scene, view, density, background=PAPER)),

@@ -18,6 +18,7 @@ from processes import DEADLINE
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io
+from analytic_rasterizer.gaussians import Gaussians
 
 pytest.importorskip("gsply", reason="needs the cli extra")
 image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
@@ -36,13 +37,12 @@ def files(tmp_path):
     """A small scene and two views of it, one with its principal point off centre."""
     g = torch.Generator().manual_seed(0)
     count = 30
-    scene = io.Scene(
+    scene = Gaussians.from_activated(
         2 * torch.rand(count, 3, generator=g) + torch.tensor([-1.0, -1.0, 3.0]),
         0.3 * torch.rand(count, 3, generator=g) + 0.01,
         torch.randn(count, 4, generator=g),
         torch.rand(count, 1, generator=g),
         0.5 * torch.randn(count, 9, 3, generator=g),
-        2,
     )
     eye = torch.eye(4, dtype=torch.float64)
     views = [
@@ -404,7 +404,7 @@ def test_version_and_help(capsys):
 
 def test_shared_views(tmp_path, plant):
     inputs, _ = plant
-    scene = io.Scene(*(inputs[name] for name in ("means3D", "scales", "rotations", "opacities", "shs")), 3)
+    scene = Gaussians.from_activated(*(inputs[name] for name in ("means3D", "scales", "rotations", "opacities", "shs")))
     io.save_scene(tmp_path / "scene.ply", scene)
     views = SHARED / "data" / "plant_sh3_lo.json"
     args = ["render", str(tmp_path / "scene.ply"), "--views", str(views), "--out", str(tmp_path)]

@@ -7,6 +7,7 @@ import torch
 from conftest import needs_cuda
 
 from analytic_rasterizer import io
+from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.optim import FusedAdam
 from analytic_rasterizer.rotations import rotation_matrices
 from analytic_rasterizer.training import TrainingOptions, density
@@ -19,23 +20,23 @@ SMALL, LARGE, HUGE = 0.05, 0.5, 2.0  # scales that are cloned, split, and pruned
 STEP = 600  # one of growth
 
 
-def make_gaussians(scales, opacities) -> g.Gaussians:
+def make_gaussians(scales, opacities) -> Gaussians:
     """Gaussians at random places; scales and opacities are lists of P numbers."""
     generator = torch.Generator().manual_seed(3)
     count = len(scales)
-    fields = g.Gaussians(
+    fields = Gaussians(
         torch.randn(count, 3, generator=generator),
         torch.tensor(scales).log()[:, None].repeat(1, 3),
         torch.randn(count, 4, generator=generator),
         torch.tensor(opacities).logit()[:, None],
         torch.randn(count, 9, 3, generator=generator),
     )
-    return g.Gaussians(*(field.requires_grad_() for field in fields))
+    return fields.map(torch.Tensor.requires_grad_)
 
 
 def make_control(sizes, opacities, white_background=False, device="cpu", **options) -> density.FixedDensity:
     """A control whose optimizer has taken a step."""
-    gaussians = g.Gaussians(*(f.detach().to(device).requires_grad_() for f in make_gaussians(sizes, opacities)))
+    gaussians = make_gaussians(sizes, opacities).map(lambda field: field.detach().to(device).requires_grad_())
     optimizer = FusedAdam([{"params": [field]} for field in gaussians], lr=1e-3, eps=1e-15)
     for field in gaussians:
         field.grad = torch.randn(field.shape, generator=torch.Generator().manual_seed(4)).to(device)
@@ -57,7 +58,7 @@ def after_step(control, norms, step=STEP, progress=0.1, radii=None) -> None:
 def moments(control) -> dict[str, g.Gaussians]:
     state = control.optimizer.state
     return {
-        name: g.Gaussians(*(state[field][name] for field in control.gaussians)) for name in ("exp_avg", "exp_avg_sq")
+        name: control.gaussians.map(lambda field, name=name: state[field][name]) for name in ("exp_avg", "exp_avg_sq")
     }
 
 
@@ -71,8 +72,8 @@ def test_growth_and_pruning_of_a_few():
     assert all(len(field) == 5 and field.requires_grad and field.is_leaf for field in after)
     for old, new in zip(before, after):
         assert torch.equal(new[:3], old[[0, 1, 1]])  # the clone equals its original
-    left, right = density.select(after, slice(3, 4)), density.select(after, slice(4, 5))
-    parent = density.select(before, slice(2, 3))
+    left, right = after.rows(slice(3, 4)), after.rows(slice(4, 5))
+    parent = before.rows(slice(2, 3))
     for half in (left, right):
         torch.testing.assert_close(half.log_scales.exp(), parent.log_scales.exp() / 1.6)
         assert 0 < (half.means - parent.means).norm() < 5 * LARGE
@@ -94,7 +95,7 @@ def test_growth_and_pruning_of_a_few():
 def test_optimizer_goes_on_with_the_new_rows():
     control = make_control([SMALL, LARGE], [0.5, 0.5])
     after_step(control, [1.0, 1.0])
-    before = g.Gaussians(*(field.detach().clone() for field in control.gaussians))
+    before = control.gaussians.map(lambda field: field.detach().clone())
     sum(field.sum() for field in control.gaussians).backward()
     control.optimizer.step()
     assert all((new != old).all() for old, new in zip(before, control.gaussians))
@@ -157,9 +158,9 @@ def test_halves_are_drawn_from_their_parent():
     count = 20_000
     turn = torch.tensor([math.cos(0.4), 0.0, 0.0, math.sin(0.4)])  # 0.8 rad about z
     scales = torch.tensor([1.0, 0.2, 0.1])
-    parent = density.select(make_gaussians([1.0], [0.5]), slice(0, 1))
+    parent = make_gaussians([1.0], [0.5]).rows(slice(0, 1))
     parent = parent._replace(rotations=3 * turn[None], log_scales=scales.log()[None])
-    parents = g.Gaussians(*(field.detach().repeat(count, *[1] * (field.dim() - 1)) for field in parent))
+    parents = parent.map(lambda field: field.detach().repeat(count, *[1] * (field.dim() - 1)))
     halves = density.split(parents, torch.Generator().manual_seed(0))
     offsets = halves.means - parent.means
     c, s = math.cos(0.8), math.sin(0.8)
@@ -263,7 +264,7 @@ def picture_of(gaussians) -> torch.Tensor:
     count = len(gaussians.means)
     constant = gaussians._replace(shs=torch.ones(count, 1, 3))
     with torch.no_grad():
-        return constant.render(view.settings(sh_degree=0, footprint="point:dilation=0"))[0]
+        return g.render(constant.arguments(), view.settings(sh_degree=0, footprint="point:dilation=0"))[0]
 
 
 def test_relocation_leaves_the_middle_of_a_splat_as_it_was():
@@ -272,7 +273,7 @@ def test_relocation_leaves_the_middle_of_a_splat_as_it_was():
     with torch.no_grad():
         control.gaussians.means.zero_()
         control.gaussians.rotations.copy_(torch.tensor([[1.0, 0, 0, 0]]).expand(3, 4))
-    alone = picture_of(density.select(control.gaussians, slice(0, 1)))
+    alone = picture_of(control.gaussians.rows(slice(0, 1)))
     assert control.after_step(STEP, 0.1)
     after = control.gaussians
     opacities = after.logit_opacities.sigmoid()[:, 0]
@@ -347,7 +348,7 @@ def test_gradient_that_grows_does_not_depend_on_the_scale(footprint):
         gaussian = make_gaussians([0.3] * 4, [0.1] * 4)._replace(means=torch.tensor([[0.1, 0.2, 3.0]] * 4))
         means2D = torch.zeros(4, 3, requires_grad=True)
         settings = view.settings(1 / scale, sh_degree=0, footprint=footprint)
-        picture, _ = gaussian._replace(shs=torch.ones(4, 1, 3)).render(settings, means2D)
+        picture, _ = g.render(gaussian._replace(shs=torch.ones(4, 1, 3)).arguments(), settings, means2D)
         (picture * torch.linspace(0, 1, picture.shape[2])).mean().backward()
         gradients.append(means2D.grad[0, 0].item())
     assert gradients[1] == pytest.approx(gradients[0], rel=0.05)

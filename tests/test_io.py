@@ -11,6 +11,7 @@ import torch
 from conftest import SHARED
 
 from analytic_rasterizer import io
+from analytic_rasterizer.gaussians import Gaussians
 
 gsply = pytest.importorskip("gsply", reason="needs the cli extra")
 image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
@@ -49,13 +50,12 @@ def random_rows(columns, count=5, seed=0):
 
 def random_scene(count=300, degree=3, seed=0):
     g = torch.Generator().manual_seed(seed)
-    return io.Scene(
+    return Gaussians.from_activated(
         torch.randn(count, 3, generator=g),
         (0.5 * torch.randn(count, 3, generator=g) - 3).exp(),
         torch.nn.functional.normalize(torch.randn(count, 4, generator=g), dim=1),
         torch.rand(count, 1, generator=g),
         0.2 * torch.randn(count, (degree + 1) ** 2, 3, generator=g),
-        degree,
     )
 
 
@@ -72,7 +72,7 @@ def test_ply_by_hand(tmp_path, degree):
     bands = (degree + 1) ** 2 - 1
     assert scene.sh_degree == degree
     assert scene.shs.shape == (5, bands + 1, 3)
-    assert all(field.dtype == torch.float32 and field.is_contiguous() for field in scene[:-1])
+    assert all(field.dtype == torch.float32 and field.is_contiguous() for field in scene)
     torch.testing.assert_close(scene.means, stack("x", "y", "z"), rtol=0, atol=0)
     torch.testing.assert_close(scene.scales, stack("scale_0", "scale_1", "scale_2").exp())
     torch.testing.assert_close(scene.rotations, stack("rot_0", "rot_1", "rot_2", "rot_3"))
@@ -152,14 +152,14 @@ def test_spz_round_trip(tmp_path, degree):
 
 @pytest.mark.parametrize("name", ["scene.ply", "scene.compressed.ply", "scene.spz"])
 def test_scene_without_gaussians(tmp_path, name):
-    io.save_scene(tmp_path / name, io.Scene(*(f[:0] for f in random_scene(degree=0)[:-1]), 0))
+    io.save_scene(tmp_path / name, random_scene(degree=0).rows(slice(0)))
     loaded = io.load_scene(tmp_path / name)
-    assert [tuple(f.shape) for f in loaded[:-1]] == [(0, 3), (0, 3), (0, 4), (0, 1), (0, 1, 3)]
+    assert [tuple(f.shape) for f in loaded] == [(0, 3), (0, 3), (0, 4), (0, 1), (0, 1, 3)]
 
 
 def test_save_scene_keeps_opaque_gaussians_finite(tmp_path):
     scene = random_scene(degree=0, count=3)
-    scene = scene._replace(opacities=torch.tensor([[0.0], [1.0], [0.5]]))
+    scene = scene.with_activated(opacities=torch.tensor([[0.0], [1.0], [0.5]]))
     io.save_scene(tmp_path / "scene.ply", scene)
     loaded = io.load_scene(tmp_path / "scene.ply")
     torch.testing.assert_close(loaded.opacities, scene.opacities, rtol=0, atol=2e-6)
@@ -167,7 +167,7 @@ def test_save_scene_keeps_opaque_gaussians_finite(tmp_path):
 
 def test_harmonics_of_degree_four_go_where_they_can_be_read(tmp_path):
     shs = torch.rand(5, 25, 3, generator=torch.Generator().manual_seed(0))
-    scene = io.Scene(torch.ones(5, 3), torch.ones(5, 3), torch.ones(5, 4), torch.full((5, 1), 0.5), shs, 4)
+    scene = Gaussians.from_activated(torch.ones(5, 3), torch.ones(5, 3), torch.ones(5, 4), torch.full((5, 1), 0.5), shs)
     for name in ("a.ply", "a.spz"):
         with pytest.raises(io.SceneError, match="holds harmonics of degree 4"):
             io.save_scene(tmp_path / name, scene)
@@ -184,17 +184,21 @@ def test_what_cannot_be_saved_leaves_the_file(tmp_path, name):
     path.parent.mkdir()
     path.write_bytes(b"before")
     wrong = [
-        (scene._replace(scales=scene.scales[1:]), rf"scales must have shape \({count}, 3\), got \({count - 1}, 3\)"),
-        (scene._replace(opacities=scene.opacities[1:]), r"opacities must have shape"),
+        (
+            scene._replace(log_scales=scene.log_scales[1:]),
+            rf"log_scales must have shape \({count}, 3\), got \({count - 1}, 3\)",
+        ),
+        (scene._replace(logit_opacities=scene.logit_opacities[1:]), r"logit_opacities must have shape"),
         (scene._replace(shs=scene.shs[:, :1].repeat(1, 5, 1)), r"shs must have shape"),
-        (scene._replace(sh_degree=scene.sh_degree + 1), r"shs must have shape"),
     ]
     if name != "a.ply":  # which holds what it is given
-        for field in scene._fields[:-1]:
+        for field in scene._fields:
             broken = getattr(scene, field).clone()
             broken[1] = math.nan
-            wrong.append((scene._replace(**{field: broken}), f"{field} must be finite.*, got 1 of {count} rows not"))
-        wrong.append((scene._replace(scales=-scene.scales), "scales must be finite and not negative"))
+            shown = field.removeprefix("log_").removeprefix("logit_")
+            wrong.append((scene._replace(**{field: broken}), f"{shown} must be finite, got 1 of {count} rows not"))
+        infinite = scene._replace(log_scales=torch.full_like(scene.log_scales, math.inf))
+        wrong.append((infinite, "scales must be finite"))
     for given, message in wrong:
         with pytest.raises(io.SceneError, match=message):
             io.save_scene(path, given)
@@ -215,7 +219,7 @@ def test_spz_holds_distant_gaussians(tmp_path, largest, step):
 
 def test_scenes_with_gradients_are_saved(tmp_path):
     scene = io.load_scene(hand_written(tmp_path))
-    io.save_scene(tmp_path / "b.ply", io.Scene(*(f.clone().requires_grad_() for f in scene[:-1]), scene.sh_degree))
+    io.save_scene(tmp_path / "b.ply", scene.map(lambda field: field.clone().requires_grad_()))
     assert torch.equal(io.load_scene(tmp_path / "b.ply").means, scene.means)
 
 

@@ -17,8 +17,10 @@ from pathlib import Path
 
 import torch
 
+from ..camera import View
 from ..footprints import resolve_footprint
-from ..io import Scene, View, optional_import
+from ..gaussians import Gaussians
+from ..io import optional_import
 from . import tables, timing
 from .reference import EXACT, RMSE_SHARE, UNFILTERED, Refined, footprint_variants, image_errors, refine, supersampled
 
@@ -66,7 +68,7 @@ def default_methods() -> list[Method]:
 
 def run(
     out,
-    scene: Scene,
+    scene: Gaussians,
     views: list[View],
     scales=(1, 2, 4, 8),
     methods: list[Method] | None = None,
@@ -135,7 +137,9 @@ def run(
     return results
 
 
-def _measure(scene: Scene, views: list[View], methods: list[Method], results: dict, max_density: int | None) -> dict:
+def _measure(
+    scene: Gaussians, views: list[View], methods: list[Method], results: dict, max_density: int | None
+) -> dict:
     """Reference and methods at one scale; `results` are those of `run`. A picture is known by the name of its view."""
     background = results["background"]
     names = [view.name for view in views]

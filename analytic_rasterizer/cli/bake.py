@@ -65,7 +65,7 @@ def run(args) -> None:
     scales, opacities = bake_dilation(
         scene.means, scene.scales, scene.rotations, scene.opacities, cameras, args.dilation
     )
-    write_scene(out, scene._replace(scales=scales, opacities=opacities), "moment")
+    write_scene(out, scene.with_activated(scales, opacities), "moment")
     sizes = sorted({(view.width, view.height) for view in views})
     pictures = f"{len(views)} pictures of " + " to ".join(f"{w}x{h}" for w, h in dict.fromkeys((sizes[0], sizes[-1])))
     print(f"{args.out}: {int(seen.sum())} of {len(scales)} Gaussians, which are seen in {pictures}, are baked")

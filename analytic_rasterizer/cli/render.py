@@ -7,7 +7,7 @@ from ..analysis import tables
 from ..footprints import FOOTPRINTS
 from .arguments import add_scale, add_scene, use_machine, writable_folder
 
-STAGES = ("project", "bin", "blend")
+STAGES = ("project", "list_tiles", "blend")
 
 
 def add_parser(subcommands) -> None:

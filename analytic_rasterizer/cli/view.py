@@ -7,6 +7,7 @@ from pathlib import Path
 
 from .. import io, viewer
 from ..footprints import resolve_footprint
+from ..gaussians import Gaussians
 from .arguments import add_machine_options, add_view_options, port, use_machine
 
 
@@ -100,7 +101,7 @@ def run_live(args) -> None:
             print()
 
 
-def read(args) -> tuple[io.Scene, list[io.View] | None]:
+def read(args) -> tuple[Gaussians, list[io.View] | None]:
     """The scene and the views that the arguments name."""
     views = None if args.views is None else io.load_views(args.views, args.size)
     return io.load_scene(args.scene), views

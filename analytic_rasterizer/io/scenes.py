@@ -5,42 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import torch
 
+from ..gaussians import HIGHEST_LOGIT, Gaussians
 from .common import SceneError, first_line, optional_import
 
 
-class Scene(NamedTuple):
-    """Gaussians ready for the rasterizer. float32, one row each, all on one device."""
-
-    means: torch.Tensor  # (N, 3) world units
-    scales: torch.Tensor  # (N, 3) standard deviations, world units (not their logarithm)
-    rotations: torch.Tensor  # (N, 4) quaternions (w, x, y, z)
-    opacities: torch.Tensor  # (N, 1) in [0, 1] (not their logit)
-    shs: torch.Tensor  # (N, K, 3) spherical harmonics, K = (sh_degree + 1)^2
-    sh_degree: int
-
-    def to(self, device) -> Scene:
-        """The same scene on another device."""
-        return Scene(*(field.to(device) for field in self[:-1]), self.sh_degree)
-
-    def arguments(self) -> dict[str, torch.Tensor]:
-        """The keywords that `GaussianRasterizer` and `render_stages` know these tensors by."""
-        return {
-            "means3D": self.means,
-            "opacities": self.opacities,
-            "shs": self.shs,
-            "scales": self.scales,
-            "rotations": self.rotations,
-        }
-
-
-def load_scene(path) -> Scene:
+def load_scene(path) -> Gaussians:
     """Reads a 3DGS `.ply`, a compressed `.ply` (PlayCanvas) or an `.spz` (Niantic) on the CPU.
 
-    Scales and opacities come back activated. Axes are those stored in the file: tools that make
+    Axes are those stored in the file: tools that make
     `.spz` may have turned the scene (y and z negated), and nothing in the file says so.
 
     Raises SceneError for anything but a complete file with finite values, ImportError without the
@@ -72,28 +47,21 @@ def load_scene(path) -> Scene:
     shs = sh0[:, None]
     if data.shN is not None and data.shN.size:
         shs = torch.cat([shs, torch.tensor(data.shN, dtype=torch.float32, device="cpu")], dim=1)
-    scene = Scene(
-        means,
-        log_scales.exp(),
-        rotations,
-        logits.reshape(count, 1).sigmoid(),
-        shs.contiguous(),
-        math.isqrt(shs.shape[1]) - 1,
-    )
-    for name, field in zip(Scene._fields[:-1], scene[:-1]):
+    scene = Gaussians(means, log_scales, rotations, logits.reshape(count, 1), shs.contiguous())
+    for name, field in numbers_of(scene).items():
         bad = count - int(field.flatten(1).isfinite().all(1).sum())
         if bad:
             raise SceneError(f"{path}: {name} must be finite, got {bad} of {count} rows not")
     return scene
 
 
-def save_scene(path, scene: Scene, comments: Sequence[str] = ()) -> None:
+def save_scene(path, scene: Gaussians, comments: Sequence[str] = ()) -> None:
     """Writes a scene as `.ply`, `.compressed.ply` or `.spz`, by its name.
 
     The two small formats round: see their own documentation. Opacities are kept off 0 and 1 by
     1e-6, where their logit is infinite. `comments` are lines for the header of a `.ply`. Raises
     SceneError, before a file is touched, for another suffix, for tensors of other shapes than those
-    of `Scene`, for harmonics of degree 4 in anything but a `.compressed.ply`, for comments that
+    of `Gaussians`, for harmonics of degree 4 in anything but a `.compressed.ply`, for comments that
     cannot be written, and in the small formats for what would become other numbers: those that are
     not finite, and in an `.spz` means beyond 2^22.
     """
@@ -106,15 +74,15 @@ def save_scene(path, scene: Scene, comments: Sequence[str] = ()) -> None:
         raise SceneError(f"{path}: only a .ply holds comments")
     if any("\n" in comment or not comment.isascii() for comment in comments):
         raise SceneError(f"{path}: comments must be single lines of ASCII, got {list(comments)}")
-    cpu = Scene(*(field.detach() for field in scene[:-1]), scene.sh_degree).to("cpu")
-    cpu = cpu._replace(opacities=cpu.opacities.reshape(-1, 1))
+    cpu = scene.map(lambda field: field.detach().cpu())
+    cpu = cpu._replace(logit_opacities=cpu.logit_opacities.reshape(-1, 1))
     _check_fields(path, cpu)
     gsply = optional_import("gsply")
     data = gsply.GSData.from_arrays(
         means=cpu.means.numpy(),
-        scales=cpu.scales.log().numpy(),
+        scales=cpu.log_scales.numpy(),
         quats=torch.nn.functional.normalize(cpu.rotations, dim=1).numpy(),
-        opacities=cpu.opacities.reshape(-1).logit(eps=1e-6).numpy(),
+        opacities=cpu.logit_opacities.reshape(-1).clamp(-HIGHEST_LOGIT, HIGHEST_LOGIT).numpy(),
         sh0=cpu.shs[:, 0].numpy(),
         shN=cpu.shs[:, 1:].numpy(),
         format="ply",
@@ -130,26 +98,35 @@ def save_scene(path, scene: Scene, comments: Sequence[str] = ()) -> None:
         path.write_bytes(content[:start] + added + content[start:])
 
 
-def _check_fields(path: Path, scene: Scene) -> None:
+def _check_fields(path: Path, scene: Gaussians) -> None:
     """What gsply would write without a word, into a file that cannot be read or holds other numbers."""
-    count = len(scene.means)
+    count, small = scene.count, path.suffix == ".spz" or path.name.endswith(".compressed.ply")
     shapes = {
         "means": (3,),
-        "scales": (3,),
+        "log_scales": (3,),
         "rotations": (4,),
-        "opacities": (1,),
+        "logit_opacities": (1,),
         "shs": ((scene.sh_degree + 1) ** 2, 3),
     }
     for name, row in shapes.items():
         field = getattr(scene, name)
         if field.shape != (count, *row):
             raise SceneError(f"{path}: {name} must have shape {(count, *row)}, got {tuple(field.shape)}")
+    for name, field in numbers_of(scene).items():
         good = field.flatten(1).isfinite().all(1)
-        if name == "scales":
-            good &= (field >= 0).all(1)
-        if not good.all() and (path.suffix == ".spz" or path.name.endswith(".compressed.ply")):
-            expected = "finite and not negative" if name == "scales" else "finite"
-            raise SceneError(f"{path}: {name} must be {expected}, got {count - int(good.sum())} of {count} rows not")
+        if small and not good.all():
+            raise SceneError(f"{path}: {name} must be finite, got {count - int(good.sum())} of {count} rows not")
+
+
+def numbers_of(scene: Gaussians) -> dict[str, torch.Tensor]:
+    """What must be finite: scales and opacities rather than their parameters, which may be infinite."""
+    return {
+        "means": scene.means,
+        "scales": scene.scales,
+        "rotations": scene.rotations,
+        "opacities": scene.opacities,
+        "shs": scene.shs,
+    }
 
 
 def _fractional_bits(path: Path, means: torch.Tensor) -> int:

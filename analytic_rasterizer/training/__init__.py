@@ -10,7 +10,6 @@ Needs the libraries of `pip install analytic_rasterizer[train]`; they are import
 
 from .captures import Capture, Photograph, extent_of, load_capture, load_points
 from .evaluation import evaluate, load_lpips, save_pictures
-from .model import Gaussians
 from .options import PRESETS, TrainingOptions
 from .pictures import Pictures, load_pictures
 from .run import Run
@@ -19,7 +18,6 @@ from .trainer import Trainer, starting_gaussians
 __all__ = [
     "PRESETS",
     "Capture",
-    "Gaussians",
     "Photograph",
     "Pictures",
     "Run",

@@ -33,9 +33,9 @@ import torch
 from torch import Tensor
 
 from .. import ops  # noqa: F401  (registers the fake kernels)
+from ..gaussians import Gaussians
 from ..relocation import compute_relocation
 from ..rotations import rotation_matrices
-from .model import Gaussians
 from .options import TrainingOptions
 from .ranks import ALONE, Ranks
 from .schedule import passes
@@ -211,8 +211,8 @@ class GradientDensity(FixedDensity):
             chosen = torch.where(grown, gradients, -1).topk(room).indices
             grown = torch.zeros_like(grown).index_fill_(0, chosen, True)
         large = old.log_scales.amax(1).exp() > self.options.split_above * self.extent
-        clones = select(old, grown & ~large)
-        halves = split(select(old, grown & large), self.generator)
+        clones = old.rows(grown & ~large)
+        halves = split(old.rows(grown & large), self.generator)
         added = Gaussians(*(torch.cat(fields) for fields in zip(clones, halves)))
         self.gaussians = replace_rows(old, self.optimizer, ~(grown & large), added)
 
@@ -221,7 +221,7 @@ class GradientDensity(FixedDensity):
         kept = old.logit_opacities[:, 0].sigmoid() >= options.prune_opacity
         if too_large:
             kept &= old.log_scales.amax(1).exp() <= options.prune_above * self.extent
-        self.gaussians = replace_rows(old, self.optimizer, kept, select(old, slice(0)))
+        self.gaussians = replace_rows(old, self.optimizer, kept, old.rows(slice(0)))
 
     def _lower_opacities(self) -> None:
         logits = self.gaussians.logit_opacities
@@ -270,7 +270,7 @@ class MonteCarloDensity(FixedDensity):
         sources = draw(old.logit_opacities[:, 0].sigmoid(), more, self.generator)
         self._share(sources)
         everything = torch.ones(count, dtype=torch.bool, device=old.means.device)
-        self.gaussians = replace_rows(old, self.optimizer, everything, select(old, sources))
+        self.gaussians = replace_rows(old, self.optimizer, everything, old.rows(sources))
 
     def _share(self, sources: Tensor) -> None:
         """Gives Gaussians the opacity and scale of one of as many as will be in their place: 1 + how often each occurs
@@ -305,13 +305,9 @@ def make_density(options: TrainingOptions, *args, **kwargs) -> FixedDensity:
     return kinds[options.density](gaussians, optimizer, extent, options, *white_background, **kwargs)
 
 
-def select(gaussians: Gaussians, rows: Tensor | slice) -> Gaussians:
-    return Gaussians(*(field[rows] for field in gaussians))
-
-
 def split(parents: Gaussians, generator: torch.Generator) -> Gaussians:
     """Two Gaussians for each parent, drawn from its distribution, smaller and otherwise like it."""
-    twice = Gaussians(*(torch.cat([field, field]) for field in parents))
+    twice = parents.map(lambda field: torch.cat([field, field]))
     normal = normal_numbers(twice.means, generator)
     along = twice.log_scales.exp() * normal
     offsets = (rotation_matrices(twice.rotations) * along[:, None, :]).sum(2)

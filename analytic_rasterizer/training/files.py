@@ -14,6 +14,7 @@ import torch
 
 from .. import io
 from ..footprints import resolve_footprint
+from ..gaussians import Gaussians
 
 CHECKPOINT, SCENE, CAMERAS = "checkpoint.pt", "scene.ply", "cameras.json"
 MIP_SCENE = "point_cloud_mip.ply"
@@ -71,7 +72,7 @@ def write_log(path: Path, entries: list[dict]) -> None:
     write_safely(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
 
 
-def write_scene(path: Path, scene: io.Scene, footprint: str) -> None:
+def write_scene(path: Path, scene: Gaussians, footprint: str) -> None:
     """A 3DGS .ply. Unless it was trained with `point`, a comment tells viewers that pixels were integrated."""
     antialiased = resolve_footprint(footprint).name != "point"
     comments = ["SplatRenderMode: mip"] if antialiased else []

@@ -1,16 +1,16 @@
-"""The Gaussians that are trained: how they start, and how they become a scene."""
+"""The Gaussians that are trained: how they start, and how they are rendered."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from .. import distributed, io
-from ..activations import activate
+from ..gaussians import Gaussians
 from ..rasterizer import rasterize_gaussians
 from ..settings import GaussianRasterizationSettings
 
@@ -22,104 +22,50 @@ SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic
 NEIGHBOURS = 3  # whose distances make the first scale
 
 
-class Gaussians(NamedTuple):
-    """What is trained: unconstrained float32 parameters, one row each."""
+def render(
+    gaussians: dict[str, Tensor],
+    settings: GaussianRasterizationSettings,
+    means2D: Tensor | None = None,
+    supersampling: int = 1,
+) -> tuple[Tensor, Tensor]:
+    """The picture (3, H, W), and the radii (P,) int32 in px, 0 for what is not seen.
 
-    means: Tensor  # (P, 3) world units
-    log_scales: Tensor  # (P, 3) logarithms of standard deviations in world units
-    rotations: Tensor  # (P, 4) quaternions (w, x, y, z) of any length
-    logit_opacities: Tensor  # (P, 1)
-    shs: Tensor  # (P, K, 3) spherical harmonics
-
-    def render(
-        self, settings: GaussianRasterizationSettings, means2D: Tensor | None = None, supersampling: int = 1
-    ) -> tuple[Tensor, Tensor]:
-        """As `Activated.render`."""
-        return self.activated().render(settings, means2D, supersampling)
-
-    def activated(self) -> Activated:
-        """What the rasterizer takes. Differentiable."""
-        scales, rotations, opacities = activate(self.log_scales, self.rotations, self.logit_opacities)
-        return Activated(self.means, scales, rotations, opacities, self.shs)
-
-    @torch.no_grad()
-    def to_scene(self) -> io.Scene:
-        """The scene on the same device, without gradients."""
-        means, scales, rotations, opacities, shs = (t.detach() for t in self.activated())
-        return io.Scene(means, scales, rotations, opacities, shs, round(shs.shape[1] ** 0.5) - 1)
-
-    @staticmethod
-    @torch.no_grad()
-    def from_scene(scene: io.Scene, sh_degree: int) -> Gaussians:
-        """Parameters that give this scene; harmonics are cut or filled with zeros to the degree."""
-        shs = scene.shs[:, : (sh_degree + 1) ** 2]
-        missing = (sh_degree + 1) ** 2 - shs.shape[1]
-        # Scales of 0 and opacities of 0 or 1 have no finite parameter.
-        return Gaussians(
-            scene.means,
-            scene.scales.clamp_min(1e-12).log(),
-            scene.rotations,
-            scene.opacities.logit(eps=1e-6),
-            torch.cat([shs, shs.new_zeros(len(shs), missing, 3)], dim=1),
-        )
+    Args:
+        gaussians: `Gaussians.arguments`, so that several pictures share them.
+        means2D: Receives the gradient with respect to the projected means.
+        supersampling: Render so many times larger, and average over squares of pixels. Radii, and the pixels of
+            the footprint, are those of the larger picture.
+    """
+    picture, radii = rasterize_gaussians(
+        gaussians["means3D"],
+        means2D,
+        gaussians["shs"],
+        None,
+        gaussians["opacities"],
+        gaussians["scales"],
+        gaussians["rotations"],
+        None,
+        enlarged(settings, supersampling),
+    )
+    return averaged(picture, supersampling), radii
 
 
-class Activated(NamedTuple):
-    """Gaussians as the rasterizer takes them, one row each, with a graph back to the parameters."""
+def render_together(
+    gaussians: dict[str, Tensor],
+    settings: list[GaussianRasterizationSettings],
+    supersampling: int = 1,
+    means2d_abs: bool = False,
+    group: ProcessGroup | None = None,
+) -> distributed.Batch:
+    """The pictures of several ranks, each of which has a part of the Gaussians: see `distributed.rasterize`.
 
-    means: Tensor  # (P, 3) world units
-    scales: Tensor  # (P, 3) standard deviations, world units
-    rotations: Tensor  # (P, 4) quaternions (w, x, y, z)
-    opacities: Tensor  # (P, 1) in (0, 1)
-    shs: Tensor  # (P, K, 3)
-
-    def render(
-        self, settings: GaussianRasterizationSettings, means2D: Tensor | None = None, supersampling: int = 1
-    ) -> tuple[Tensor, Tensor]:
-        """The picture (3, H, W), and the radii (P,) int32 in px, 0 for what is not seen.
-
-        Args:
-            means2D: Receives the gradient with respect to the projected means.
-            supersampling: Render so many times larger, and average over squares of pixels. Radii, and the pixels of
-                the footprint, are those of the larger picture.
-        """
-        picture, radii = rasterize_gaussians(
-            self.means,
-            means2D,
-            self.shs,
-            None,
-            self.opacities,
-            self.scales,
-            self.rotations,
-            None,
-            enlarged(settings, supersampling),
-        )
-        return averaged(picture, supersampling), radii
-
-    def render_together(
-        self,
-        settings: list[GaussianRasterizationSettings],
-        supersampling: int = 1,
-        means2d_abs: bool = False,
-        group: ProcessGroup | None = None,
-    ) -> distributed.Batch:
-        """The pictures of several ranks, each of which has a part of the Gaussians: see `distributed.rasterize`.
-
-        Args:
-            supersampling: As in `render`. The splats are those of the larger pictures, and alpha is.
-        """
-        batch = distributed.rasterize(
-            [enlarged(of_camera, supersampling) for of_camera in settings],
-            self.means,
-            self.opacities,
-            shs=self.shs,
-            scales=self.scales,
-            rotations=self.rotations,
-            means2d_abs=means2d_abs,
-            group=group,
-        )
-        views = (view._replace(image=averaged(view.image, supersampling)) for view in batch.views)
-        return replace(batch, views=tuple(views))
+    Args:
+        gaussians, supersampling: As in `render`. The splats are those of the larger pictures, and alpha is.
+    """
+    larger = [enlarged(of_camera, supersampling) for of_camera in settings]
+    batch = distributed.rasterize(larger, **gaussians, means2d_abs=means2d_abs, group=group)
+    renderings = (shown._replace(image=averaged(shown.image, supersampling)) for shown in batch.renderings)
+    return replace(batch, renderings=tuple(renderings))
 
 
 def enlarged(settings: GaussianRasterizationSettings, times: int) -> GaussianRasterizationSettings:

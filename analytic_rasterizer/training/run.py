@@ -16,6 +16,7 @@ import torch
 
 from .. import io
 from ..filters import bake_pixel
+from ..gaussians import Gaussians
 from .captures import IMAGES, TEST_PERIOD, Capture, Photograph, is_scene, load_capture, load_points
 from .evaluation import evaluate, psnr
 from .files import (
@@ -35,7 +36,6 @@ from .files import (
     write_safely,
     write_scene,
 )
-from .model import Gaussians
 from .options import TrainingOptions
 from .pictures import Pictures, load_pictures
 from .ranks import ALONE, Ranks
@@ -175,9 +175,9 @@ class Run:
             write_scene(self.out / SCENE, scene, self.options.footprint)
         return progress.share >= 1
 
-    def _whole(self, scene: io.Scene) -> io.Scene:
+    def _whole(self, scene: Gaussians) -> Gaussians:
         """The scene of all ranks, of which `scene` is this one's: on rank 0, on the CPU, without rows on the others."""
-        return scene._replace(**{name: self.ranks.gather_rows(getattr(scene, name)) for name in scene._fields[:5]})
+        return scene.map(self.ranks.gather_rows)
 
     def export_mip(self) -> Path:
         """Writes and returns point_cloud_mip.ply: the scene for viewers that do not integrate, see `bake_pixel`.
@@ -187,7 +187,7 @@ class Run:
         scene = self.trainer.scene()
         cameras = self.trainer.pictures.settings[min(self.options.scales)]
         scales, opacities = bake_pixel(scene.means, scene.scales, scene.rotations, scene.opacities, cameras)
-        baked = self._whole(scene._replace(scales=scales, opacities=opacities))
+        baked = self._whole(scene.with_activated(scales, opacities))
         if self.ranks.is_first:
             write_safely(self.out / MIP_SCENE, lambda temporary: io.save_scene(temporary, baked))
         return self.out / MIP_SCENE
@@ -336,7 +336,7 @@ def first_gaussians(options: TrainingOptions, capture: Capture, points) -> tuple
         if len(scene.means) > options.gaussian_limit:
             expected = f"at least {len(scene.means)}, the Gaussians of {points}, or 0"
             raise ValueError(f"max_gaussians must be {expected}, got {options.max_gaussians}")
-        return Gaussians.from_scene(scene, options.sh_degree), None
+        return scene.with_sh_degree(options.sh_degree).trainable(), None
     found = capture.points if points is None else load_points(points)
     return starting_gaussians(options, found), None if found is None else len(found[0])
 

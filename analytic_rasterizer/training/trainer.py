@@ -12,12 +12,13 @@ from .. import _C, io
 from ..arguments import camera_arguments
 from ..effects import Effects
 from ..filters import apply_3d_filter, compute_3d_filter
+from ..gaussians import Gaussians
 from ..losses import l1_ssim
 from ..optim import FusedAdam
 from ..settings import GaussianRasterizationSettings
 from .captures import WHITE, extent_of
 from .density import make_density
-from .model import Gaussians, gaussians_at, random_points
+from .model import gaussians_at, random_points, render
 from .options import BACKGROUNDS, RANDOM_BACKGROUND, TrainingOptions
 from .pictures import Pictures
 from .ranks import ALONE, Ranks
@@ -71,8 +72,8 @@ class Trainer:
         self.options, self.pictures, self.device, self.ranks = options, pictures, torch.device(device), ranks
         self.random_background = background is None
         self.extent = extent_of(pictures.views)
-        fields = (field.detach().to(self.device, torch.float32, copy=True).contiguous() for field in start)
-        gaussians = Gaussians(*(field.requires_grad_() for field in fields))
+        gaussians = start.map(lambda field: field.detach().to(self.device, torch.float32, copy=True).contiguous())
+        gaussians = gaussians.map(Tensor.requires_grad_)
         self.rates = {
             "means": options.means_rate * self.extent,
             "log_scales": options.scale_rate,
@@ -202,11 +203,11 @@ class Trainer:
     def _loss(self) -> tuple[Tensor, Any, Tensor | None]:
         """The loss of the next step, what `_observe` takes, and with `sparse_adam` which Gaussians a picture shows."""
         options = self.options
-        gaussians = self.gaussians.activated()
+        gaussians = self.gaussians.arguments()
         losses, seen = [], []
         for scale, view, settings, background in self._next():
             leaf = self.density.leaf(scale)
-            image, radii = gaussians.render(settings, leaf, options.supersampling)
+            image, radii = render(gaussians, settings, leaf, options.supersampling)
             truth = self.pictures.target(scale, view, background)
             losses.append(l1_ssim(image, truth, options.ssim_weight))
             seen.append((leaf, radii))
@@ -214,9 +215,9 @@ class Trainer:
         loss = losses[0] if len(losses) == 1 else torch.stack(losses).mean()
         opacity_weight, scale_weight = options.regularizers
         if opacity_weight:
-            loss = loss + opacity_weight * gaussians.opacities.mean()
+            loss = loss + opacity_weight * gaussians["opacities"].mean()
         if scale_weight:
-            loss = loss + scale_weight * gaussians.scales.mean()
+            loss = loss + scale_weight * gaussians["scales"].mean()
         rows = torch.stack([radii > 0 for _, radii in seen]).any(0) if options.sparse_adam else None
         return loss, seen, rows
 
@@ -244,7 +245,7 @@ class Trainer:
     def warm_up(self) -> None:
         """Renders and differentiates one picture of each scale without a step, so that no step loads kernels."""
         for scale, settings in self._settings().items():
-            image, _ = self.gaussians.render(settings[0], supersampling=self.options.supersampling)
+            image, _ = render(self.gaussians.arguments(), settings[0], supersampling=self.options.supersampling)
             truth = self.pictures.target(scale, 0, settings[0].bg if self.random_background else None)
             l1_ssim(image, truth, self.options.ssim_weight).backward()
         self.optimizer.zero_grad(set_to_none=True)
@@ -266,13 +267,12 @@ class Trainer:
         return values
 
     @torch.no_grad()
-    def scene(self) -> io.Scene:
-        """The Gaussians as a scene, with the 3D filter applied where there is one."""
-        scene = self.gaussians.to_scene()
+    def scene(self) -> Gaussians:
+        """The Gaussians without gradients, with the 3D filter applied where there is one."""
+        scene = self.gaussians.map(Tensor.detach)
         if self.filter_3d is None:
             return scene
-        scales, opacities = apply_3d_filter(scene.scales, scene.opacities, self.filter_3d)
-        return scene._replace(scales=scales, opacities=opacities)
+        return scene.with_activated(*apply_3d_filter(scene.scales, scene.opacities, self.filter_3d))
 
     def state_dict(self) -> dict[str, Any]:
         """All that decides how the training goes on. Tensors are those of the training, not copies."""
@@ -287,8 +287,7 @@ class Trainer:
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Goes on from what `state_dict` gave."""
-        fields = (state["gaussians"][name].to(self.device, copy=True) for name in Gaussians._fields)
-        gaussians = Gaussians(*(field.requires_grad_() for field in fields))
+        gaussians = Gaussians(**state["gaussians"]).map(lambda field: field.to(self.device, copy=True).requires_grad_())
         for group, field in zip(self.optimizer.param_groups, gaussians):
             group["params"] = [field]
         self.optimizer.state.clear()

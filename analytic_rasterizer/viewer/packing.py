@@ -12,6 +12,7 @@ import torch
 
 from .. import io
 from ..footprints import Footprint, get_default_footprint, resolve_footprint
+from ..gaussians import Gaussians
 
 PAGE_FOOTPRINTS = (
     "point",
@@ -104,7 +105,7 @@ def _spz_flags(path: Path) -> int:
 
 
 def pack_scene(
-    scene: io.Scene,
+    scene: Gaussians,
     views: list[io.View] | None = None,
     *,
     name: str = "scene",
@@ -170,7 +171,7 @@ def _unit_quaternions(rotations: torch.Tensor) -> torch.Tensor:
     return torch.where(length > 0, wide / length.clamp_min(torch.finfo(torch.float64).tiny), identity).float()
 
 
-def extent(scene: io.Scene) -> tuple[torch.Tensor, float]:
+def extent(scene: Gaussians) -> tuple[torch.Tensor, float]:
     """Centre and radius of most of the Gaussians that can be seen; far outliers are left out."""
     visible = scene.means[scene.opacities[:, 0] > 0.05]
     means = (visible if len(visible) else scene.means).double()
