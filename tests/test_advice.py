@@ -91,7 +91,7 @@ def test_other_calls_say_nothing(fresh):
     stages = {name: value for name, value in SCENE.items() if name != "means2D"}
 
     def calls():
-        ar.blend(splats := ar.project(SETTINGS, **stages), ar.bin(splats))
+        ar.blend(splats := ar.project(SETTINGS, **stages), ar.list_tiles(splats))
         ar.render_stages(SETTINGS, **stages)
         ar.GaussianRasterizer(SETTINGS).markVisible(SCENE["means3D"])
         means, quats, scales, opacities = (SCENE[n] for n in ("means3D", "rotations", "scales", "opacities"))

@@ -60,7 +60,7 @@ def stages(given):
     features, behind = given.pop("features"), given.pop("behind")
     settings = settings_with(given, footprint="adaptive")
     splats = ar.project(settings, **{k: v for k, v in given.items() if k != "means2D"})
-    lists = ar.bin(splats, background=behind.detach())
+    lists = ar.list_tiles(splats, background=behind.detach())
     features = features[splats.gaussian_ids.long()]
     return (*ar.blend(splats, lists, features, behind), splats.means2d, splats.cov2d)
 
@@ -90,7 +90,7 @@ def cameras_of_gsplat(device):
 def of_one_rank(given):
     settings = settings_with(given)
     batch = distributed.rasterize([settings], **{k: v for k, v in given.items() if k != "means2D"})
-    return batch.views[0].image, batch.views[0].alpha
+    return batch.renderings[0].image, batch.renderings[0].alpha
 
 
 def bands(given):
