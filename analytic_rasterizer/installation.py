@@ -48,15 +48,14 @@ def why_not_loaded(error: ImportError) -> str:
 def _without_extension(folder: Path, others: list[Path]) -> str:
     places = [Path(path).resolve() / folder.name for path in sys.path]
     installed = next((place for place in places if place != folder and _extensions_in(place)[0]), None)
-    for_others = f" for Python {platform.python_version()}, only {others[0].name}" if others else ""
+    because = ", as a clone that was not built in place"
+    if others:
+        because = f" for Python {platform.python_version()}, only {others[0].name}"
     if installed is not None:
         way_out = f"start Python in another folder than {folder.parent}, so that the one in {installed.parent} is found"
     else:
         way_out = f"build it there, `pip install -e {folder.parent}`, or install it and start Python in another folder"
-    return (
-        f"analytic_rasterizer was imported from {folder}, which has no compiled extension{for_others} (as in a clone "
-        f"of the repository that was not built in place): {way_out}"
-    )
+    return f"analytic_rasterizer was imported from {folder}, which has no compiled extension{because}: {way_out}"
 
 
 def warn_if_built_for_another(built_for: str) -> None:

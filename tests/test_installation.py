@@ -1,7 +1,7 @@
 """What an import says where the compiled extension is missing, or was built for another torch."""
 
 import os
-import re
+import platform
 import shutil
 import warnings
 
@@ -10,7 +10,6 @@ import torch
 from conftest import ROOT
 from processes import run_program
 
-import analytic_rasterizer
 from analytic_rasterizer import _C, installation
 
 PACKAGES = ("analytic_rasterizer", "diff_gaussian_rasterization", "diff_gaussian_rasterization_ms")
@@ -38,10 +37,9 @@ def failure(*folders, module="analytic_rasterizer"):
 def test_a_clone_that_was_not_built(tmp_path, module):
     package = copy_of_packages(tmp_path)
     sentence = failure(tmp_path, module=module)
-    assert (
-        f"analytic_rasterizer was imported from {package}, which has no compiled extension (as in a clone" in sentence
-    )
-    assert f"`pip install -e {tmp_path}`" in sentence and "circular" not in sentence
+    assert f"was imported from {package}, which has no compiled extension, as a clone that was not built in" in sentence
+    assert f"`pip install -e {tmp_path}`" in sentence
+    assert "circular" not in sentence
 
 
 def test_a_clone_beside_an_installation(tmp_path):
@@ -56,10 +54,8 @@ def test_a_clone_beside_an_installation(tmp_path):
 def test_an_extension_for_another_version_of_python(tmp_path):
     package = copy_of_packages(tmp_path)
     (package / "_C.cpython-27-x86_64-linux-gnu.so").write_bytes(b"")
-    sentence = failure(tmp_path)
-    assert re.search(
-        r"no compiled extension for Python 3\.\d+\.\d+, only _C\.cpython-27-x86_64-linux-gnu\.so", sentence
-    )
+    expected = f"no compiled extension for Python {platform.python_version()}, only _C.cpython-27-x86_64-linux-gnu.so:"
+    assert expected in failure(tmp_path)
 
 
 def test_an_extension_that_was_built_for_another_torch(tmp_path):
@@ -95,11 +91,5 @@ def test_an_extension_of_another_torch_that_can_be_loaded():
         warnings.simplefilter("error")
         for version in (torch.__version__, f"{major}.{minor}.99+cu999"):
             installation.warn_if_built_for_another(f"analytic_rasterizer was built for torch {version}")
-    with pytest.warns(
-        UserWarning, match=rf"was built for torch {major}\.99\.0, and torch {major}\.{minor}.* may crash"
-    ):
+    with pytest.warns(UserWarning, match=rf"for torch {major}\.99\.0, and torch {major}\.{minor}.* calls may crash"):
         installation.warn_if_built_for_another(f"analytic_rasterizer was built for torch {major}.99.0")
-
-
-def test_nothing_is_said_of_this_one():
-    assert analytic_rasterizer.BUILT_FOR == _C.BUILT_FOR
