@@ -67,7 +67,8 @@ class GaussianRasterizationSettings(LibrarySettings):
         inferred_from: Keywords of settings that no other dialect has.
         inferred_from_arguments: Keywords of forward that no other dialect has, where the settings cannot tell.
         inferred_without: Settings of 3DGS 2023 that it lacks, where nothing else can tell.
-        filter: The footprint that its repository renders with, for whoever chose none; None: `analytic`.
+        filter: The footprint that its repository renders with, for whoever chose none; None: the library's default,
+            `analytic`.
         means2d_z: Third column of the gradient of means2D, "zero", "sum_abs" or "sum_norm".
         outputs: An `Effects` with the outputs that its rasterizer returns.
 
