@@ -196,8 +196,9 @@ class GaussianRasterizer(torch.nn.Module):
         """Renders an image. Differentiable in all eight inputs.
 
         All floating tensors share one dtype (float32; float64 on the CPU) and device. Under torch.autocast those of 16
-        bits are used in float32, and get gradients of 16 bits. Missing inputs are None or empty tensors. On CUDA the work is queued on the current stream; when the
-        host waits for it is in docs/library.md, "Waiting for the device".
+        bits are used in float32, and get gradients of 16 bits. Missing inputs are None or empty tensors. On CUDA the
+        work is queued on the current stream; when the host waits for it is in docs/library.md, "Waiting for the
+        device".
 
         Args:
             means3D: (P, 3) centres, world units.
