@@ -1,6 +1,6 @@
 // The ops, each written once for every device: the pass in rasterize.cpp, its stages in stages.cpp, what a training
 // step has besides in training.cpp, a picture of a training from end to end in picture.cpp. Registered with torch in
-// ops.cpp, made differentiable in autograd.cpp.
+// ops.cpp, made differentiable in autograd.cpp, and given float32 under autocast in autocast.cpp.
 #pragma once
 
 #include <vector>
