@@ -61,6 +61,7 @@ class FixedDensity:
 
     Attributes:
         gaussians: May be other tensors after `after_step`.
+        pruned: How many were pruned the last time, by cause: "opacity" and "size", one-element tensors.
         row_state: Names of the attributes that have a row per Gaussian.
     """
 
@@ -77,6 +78,7 @@ class FixedDensity:
     ):
         self.gaussians, self.optimizer, self.ranks = gaussians, optimizer, ranks
         self.extent, self.options, self.white_background = extent, options, white_background
+        self.pruned: dict[str, Tensor] = {}
         self.generator = torch.Generator(gaussians.means.device).manual_seed(options.seed)
 
     def watches(self, scale: int) -> bool:
@@ -109,6 +111,14 @@ class FixedDensity:
 
     def forget(self) -> None:
         """Begins new averages, of as many Gaussians as there are now."""
+
+    @torch.no_grad()
+    def keep(self, kept: Tensor) -> None:
+        """Takes away all Gaussians but those of the mask (P,); averages of the others go on. Not before a step."""
+        old = self.gaussians
+        self.gaussians = replace_rows(old, self.optimizer, kept, old.rows(slice(0)))
+        for name in self.row_state:
+            setattr(self, name, getattr(self, name)[kept])
 
     def observe(self, gradients: Tensor, radii: Tensor) -> None:
         """Looks at the gradients of a picture, (P, columns), and at its radii. Nothing here waits for the device."""
@@ -219,9 +229,10 @@ class GradientDensity(FixedDensity):
 
     def _prune(self, too_large: bool) -> None:
         old, options = self.gaussians, self.options
-        kept = old.logit_opacities[:, 0].sigmoid() >= options.prune_opacity
+        kept = opaque = old.logit_opacities[:, 0].sigmoid() >= options.prune_opacity
         if too_large:
-            kept &= old.log_scales.amax(1).exp() <= options.prune_above * self.extent
+            kept = opaque & (old.log_scales.amax(1).exp() <= options.prune_above * self.extent)
+        self.pruned = {"opacity": (~opaque).sum(), "size": (opaque & ~kept).sum()}
         self.gaussians = replace_rows(old, self.optimizer, kept, old.rows(slice(0)))
 
     def _lower_opacities(self) -> None:
