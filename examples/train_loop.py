@@ -36,7 +36,7 @@ def own_pictures(device):
 
 def train(pictures, points, steps, options):
     """The trained Gaussians, and the loss of every step."""
-    device, extent = pictures.colors[1][0].device, training.extent_of(pictures.views)
+    device, extent = pictures.colors[1][0].device, training.extent_of(pictures.views, points[0])
     gaussians = ar.Gaussians.from_points(*points).to(device).leaves()
     means_rate = 1.6e-4 * extent
     rates = {"means": means_rate, "log_scales": 5e-3, "rotations": 1e-3, "logit_opacities": 0.05, "shs": 1e-4}

@@ -28,7 +28,8 @@ class GradientDensity(FixedDensity):
     [3DGS] with signed gradients, or [AbsGS] with sums of absolute values.
 
     Args:
-        extent: Radius of the scene, world units, positive: `training.extent_of` takes it from the cameras as 3DGS does.
+        extent: Radius of the scene, world units, positive: `training.extent_of` takes it from
+            the cameras, as 3DGS does, and from what they see.
         options: None: the defaults.
         others: As of `FixedDensity`.
 

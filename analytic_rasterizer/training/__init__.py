@@ -8,8 +8,9 @@
 Needs the libraries of `pip install analytic_rasterizer[train]`; they are imported on first use.
 """
 
-from .captures import Capture, Photograph, extent_of, load_capture, load_points
+from .captures import Capture, Photograph, load_capture, load_points
 from .evaluation import evaluate, load_lpips, save_pictures
+from .extent import extent_of
 from .model import random_points
 from .options import PRESETS, TrainingOptions
 from .pictures import Pictures, load_pictures
