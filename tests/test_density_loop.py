@@ -2,11 +2,13 @@
 
 import copy
 import math
+import re
 from dataclasses import fields
 
 import numpy as np
 import pytest
 import torch
+from conftest import ROOT
 
 import analytic_rasterizer as ar
 import train_loop
@@ -384,7 +386,7 @@ def test_points_that_make_no_gaussians(wrong, error, message):
         ar.Gaussians.from_points(**arguments)
 
 
-# -------------------------------------------------------------------------------- the example
+# ----------------------------------------------------------------------- the example, the page
 
 
 @pytest.mark.parametrize("absolute", [True, False])
@@ -415,3 +417,24 @@ def test_example_writes_a_scene(tmp_path, monkeypatch, capsys):
     assert given == [(7000, 100_000)]
     assert io.load_scene(tmp_path / "out" / "scene.ply").count == 200
     assert capsys.readouterr().out.startswith("200 Gaussians, loss ")
+
+
+def test_code_of_the_page(tmp_path, monkeypatch):
+    for name in ("scipy", "gsply", "PIL"):
+        pytest.importorskip(name, reason="needs the train extra")
+    from capture_files import circle, write_nerf_synthetic
+
+    page = (ROOT / "docs" / "density.md").read_text()
+    loop, more, trainer = re.findall(r"```python\n(.*?)```", page, flags=re.S)
+    made, (points, _) = train_loop.own_pictures("cpu")
+    given = {"views": made.views, "points": points, "colors": None, "device": "cpu", "steps": 8}
+    given |= {"settings": made.settings[1], "pictures": [made.target(1, i) for i in range(8)] * 2}
+    exec(loop.replace("max_gaussians=300_000", "max_gaussians=300, densify_from=2, densify_every=2"), given)
+    assert len(points) < given["control"].gaussians.count <= 300
+    given["gaussians"] = ar.Gaussians.from_points(points).leaves()
+    exec(more, given)
+    assert given["features"].shape == (len(points), 16)
+    write_nerf_synthetic(tmp_path / "lego", circle(4), circle(2))
+    monkeypatch.chdir(tmp_path)
+    exec(trainer.replace("iterations=7000", "iterations=3, random_points=60"), given)
+    assert io.load_scene("scene.ply").count == 60 and given["trainer"].progress.step == 3

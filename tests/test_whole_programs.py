@@ -54,6 +54,11 @@ REPOSITORIES = {
 }
 
 
+def seeded(seed):
+    """A generator of the device that the test runs on."""
+    return torch.Generator(torch.get_default_device()).manual_seed(seed)
+
+
 class Camera:
     """Matrices as programs have them: transposed views of those that act on columns."""
 
@@ -89,7 +94,7 @@ class Camera:
 
 def photographs(cameras, exposures=None):
     """Pictures of other Gaussians than those that a program starts from."""
-    generator = torch.Generator().manual_seed(8)
+    generator = seeded(8)
     points = torch.randn(150, 3, generator=generator).clamp(-1.5, 1.5) * 0.6
     colors = torch.rand(150, 3, generator=generator)
     truth = ar.Gaussians.from_points(points, colors, sh_degree=0, opacity=0.9, scale=0.6)
@@ -107,8 +112,8 @@ class Program:
 
     def __init__(self, repository):
         self.repository, self.degree, self.interval = repository, 0, None
-        generator = torch.Generator().manual_seed(7)
-        columns = 0.8 * torch.randn(3, START, generator=generator).numpy().astype(np.float64)
+        generator = seeded(7)
+        columns = 0.8 * torch.randn(3, START, generator=generator).cpu().numpy().astype(np.float64)
         # Of a file's columns x, y and z: all x come first in memory.
         points = torch.tensor(np.vstack(list(columns)).T).float()
         assert points.stride() == (1, START)
@@ -271,7 +276,7 @@ class Program:
 
     def columns(self):
         """What the program stores, by the names of a .ply."""
-        values = {name: tensor.detach().numpy() for name, tensor in self.tensors.items()}
+        values = {name: tensor.detach().cpu().numpy() for name, tensor in self.tensors.items()}
         means, rest = values["means"], values["rest"].transpose(0, 2, 1).reshape(self.count, -1)
         named = dict(zip("xyz", means.T)) | {f"n{axis}": np.zeros(self.count) for axis in "xyz"}
         named |= {f"f_dc_{i}": values["dc"][:, 0, i] for i in range(3)}
@@ -303,7 +308,7 @@ def trained(repository, tmp_path, steps=STEPS):
     """The program after its training, its cameras, the losses and the numbers of Gaussians of all steps."""
     program, cameras = Program(repository), [Camera(0.5 * number) for number in range(VIEWS)]
     pictures = photographs(cameras, repository.exposure)
-    generator = torch.Generator().manual_seed(1)
+    generator = seeded(1)
     losses, counts, lowered = [], [], False
     for step in range(1, steps + 1):
         if repository.filtered and step % PERIOD == 1:
@@ -350,12 +355,18 @@ def assert_same_state(left, right):
 
 
 @pytest.mark.parametrize("name", REPOSITORIES)
-def test_training_program(tmp_path, name):
+def test_training_program(device, tmp_path, name):
     pytest.importorskip("scipy", reason="needs the train extra")
     pytest.importorskip("gsply", reason="needs the cli extra")
     repository = REPOSITORIES[name]
     if repository.chosen:
         dialects.set_dialect(repository.dialect)
+    with torch.device(device):
+        check(repository, tmp_path)
+
+
+def check(repository, tmp_path):
+    """Trains, and looks at what comes of it."""
     program, cameras, losses, counts = trained(repository, tmp_path)
     first, last = np.mean(losses[:30]), np.mean(losses[-30:])
     assert last < 0.5 * first
@@ -367,7 +378,7 @@ def test_training_program(tmp_path, name):
     # What it stored, our files have too, and it reads what we store.
     stored = program.columns()
     write_ply(tmp_path / "point_cloud.ply", stored)
-    scene = io.load_scene(tmp_path / "point_cloud.ply")
+    scene = io.load_scene(tmp_path / "point_cloud.ply").to(torch.get_default_device())
     io.save_scene(tmp_path / "again.ply", scene)
     again = read_ply(tmp_path / "again.ply")
     assert stored.keys() <= again.keys() | {"nx", "ny", "nz"}
