@@ -243,7 +243,7 @@ def test_render_on_cuda_agrees_with_the_cpu(files):
         assert np.abs(left.astype(int) - right).max() <= 2
 
 
-@pytest.mark.parametrize("module", ["gsply", "PIL.Image", "tqdm"])
+@pytest.mark.parametrize("module", ["PIL.Image", "tqdm"])
 def test_missing_library_names_the_extra(files, capsys, monkeypatch, module):
     monkeypatch.setitem(sys.modules, module, None)
     assert cli.main(arguments(files)) == 2

@@ -96,7 +96,7 @@ def metadata_of(lines: Sequence[str], where) -> SceneMetadata:
             except (ValueError, TypeError) as error:
                 warnings.warn(f"{where}: '{line}' is not understood ({first_line(error)})", stacklevel=3)
         else:
-            others.append(line)
+            others.append(line.strip())
     if "footprint" in fields:
         fields["antialiased"] = SceneMetadata(fields["footprint"]).checked().antialiased
     return SceneMetadata(**fields, comments=tuple(others))

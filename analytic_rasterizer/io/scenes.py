@@ -117,15 +117,15 @@ def _read_ply(path: Path) -> dict[str, np.ndarray]:
         # All bands of red come first, then those of green, then those of blue.
         rest = rows.columns([f"f_rest_{i}" for i in range(count)], np.float32)
         shs[:, 1:] = rest.reshape(len(rows), 3, count // 3).transpose(0, 2, 1)
-        means, log_scales = rows.columns(AXES), rows.columns(SCALES, np.float32)
-    _warn_of_rounding(path, means, log_scales)
-    return {
-        "means": means,
-        "log_scales": log_scales,
-        "rotations": rows.columns(ROTATIONS, np.float32),
-        "logit_opacities": rows.columns(["opacity"], np.float32),
-        "shs": shs,
-    }
+        fields = {
+            "means": rows.columns(AXES),
+            "log_scales": rows.columns(SCALES, np.float32),
+            "rotations": rows.columns(ROTATIONS, np.float32),
+            "logit_opacities": rows.columns(["opacity"], np.float32),
+            "shs": shs,
+        }
+    _warn_of_rounding(path, fields["means"], fields["log_scales"])
+    return fields
 
 
 def _warn_of_rounding(path: Path, means: np.ndarray, log_scales: np.ndarray) -> None:
@@ -164,6 +164,8 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None) ->
     if kind is None:
         raise SceneError(f"{path}: expected a .ply, .spz or .splat name, got {path.suffix or 'no suffix'!r}")
     kind = "compressed" if path.name.lower().endswith(".compressed.ply") else kind
+    if not isinstance(metadata, (SceneMetadata, type(None))):
+        raise TypeError(f"metadata must be a SceneMetadata or None, got {type(metadata).__name__}")
     try:
         metadata = (metadata or SceneMetadata()).checked()
     except (ValueError, TypeError) as error:

@@ -21,7 +21,7 @@ from .common import to_image
 
 DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT)
 PROBE = bytes(1 << 16)
-LONGEST_NAME = 150  # characters of a file's name that its temporary name repeats
+LONGEST_NAME = 50  # characters of a name that its temporary name repeats: four bytes each may be too long a name
 
 _numbers = count()
 
