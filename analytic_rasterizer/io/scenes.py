@@ -42,7 +42,8 @@ def load_scene(path, strict: bool = False) -> Gaussians:
         float32, on the CPU. Scales of 0, and in a .ply opacities of 0 and 1, have infinite parameters.
 
     Raises:
-        SceneError: The file, which is named, is not there, no scene, or cut short; no Gaussian in it is finite.
+        SceneError: The file is not there, or no scene, or cut short, or no Gaussian of it is finite. The message names
+            the file.
         ImportError: The extra `cli` is missing, which formats other than .ply and .splat need.
     """
     path, kind = scene_file(path)
@@ -56,7 +57,7 @@ def load_scene(path, strict: bool = False) -> Gaussians:
 
 
 def _tensor(field: np.ndarray) -> torch.Tensor:
-    """A float32 tensor with memory of its own, which the field shares where it can."""
+    """The field as a float32 tensor, copied where it has another type or cannot be changed."""
     with np.errstate(over="ignore"):  # what float32 does not hold becomes infinite, and is left out
         found = np.require(field, np.float32, ["C", "O", "W"])
     return torch.from_numpy(found)
@@ -67,10 +68,11 @@ def _finite(path: Path, scene: Gaussians, strict: bool) -> Gaussians:
     good = torch.ones(scene.count, dtype=torch.bool, device="cpu")
     bad = {}
     for name, field in numbers_of(scene).items():
+        if field.sum(dtype=torch.float64).isfinite():  # then all of them are: no sum of float32 leaves float64
+            continue
         finite = field.flatten(1).isfinite().all(1)
-        if not finite.all():
-            bad[name] = scene.count - int(finite.sum())
-            good &= finite
+        bad[name] = scene.count - int(finite.sum())
+        good &= finite
     if not bad:
         return scene
     if strict or not good.any():

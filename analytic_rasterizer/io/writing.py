@@ -34,8 +34,8 @@ def write_safely(path, write: Callable[[Path], None]) -> None:
 
     Args:
         path: The file to write.
-        write: Is called with the path of a file that does not exist yet, whose name ends as that of `path` does, so
-            that writers which tell formats by the suffix take the right one.
+        write: Is called with the path of a temporary file, which does not exist yet. Its name ends as that of `path`,
+            for writers that choose a format by the suffix.
 
     Raises:
         OSError: The file, which is named, cannot be written: the disk is full, or the reason of the system. An earlier
