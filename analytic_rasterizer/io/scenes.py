@@ -142,6 +142,16 @@ def _warn_of_rounding(path: Path, means: np.ndarray, log_scales: np.ndarray) -> 
         warnings.warn(f"{path}: float32 moves {which}: subtract an offset from the file's positions", stacklevel=4)
 
 
+def written_format(path) -> str:
+    """The format that `save_scene` writes under this name: ply, compressed, spz or splat. Else raises SceneError."""
+    path = Path(path)
+    if path.name.lower().endswith(".compressed.ply"):
+        return "compressed"
+    if path.suffix.lower() not in WRITTEN:
+        raise SceneError(f"{path}: expected a .ply, .spz or .splat name, got {path.suffix or 'no suffix'!r}")
+    return WRITTEN[path.suffix.lower()]
+
+
 def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None) -> None:
     """Writes a scene as .ply, .compressed.ply, .spz (version 3) or .splat, by its name.
 
@@ -161,11 +171,7 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None) ->
         OSError: The file cannot be written; an earlier one is then unchanged.
         ImportError: The extra `cli` is missing, which .compressed.ply and .spz need.
     """
-    path = Path(path)
-    kind = WRITTEN.get(path.suffix.lower())
-    if kind is None:
-        raise SceneError(f"{path}: expected a .ply, .spz or .splat name, got {path.suffix or 'no suffix'!r}")
-    kind = "compressed" if path.name.lower().endswith(".compressed.ply") else kind
+    path, kind = Path(path), written_format(path)
     if not isinstance(metadata, (SceneMetadata, type(None))):
         raise TypeError(f"metadata must be a SceneMetadata or None, got {type(metadata).__name__}")
     try:

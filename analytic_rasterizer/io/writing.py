@@ -19,7 +19,7 @@ from typing import Any
 
 from .common import to_image
 
-DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT)
+DISK_IS_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))  # Windows has no quota of this name
 PROBE = bytes(1 << 16)
 LONGEST_NAME = 50  # characters of a name that its temporary name repeats: four bytes each may be too long a name
 
@@ -61,7 +61,8 @@ def write_safely(path, write: Callable[[Path], None]) -> None:
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
         if earlier is not None:
-            os.chmod(temporary, stat.S_IMODE(earlier.st_mode))
+            with suppress(OSError):  # which some file systems do not have
+                os.chmod(temporary, stat.S_IMODE(earlier.st_mode))
         os.replace(temporary, target)
     # torch.save raises RuntimeError when the disk is full.
     except (OSError, RuntimeError) as error:
