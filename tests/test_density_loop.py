@@ -344,7 +344,7 @@ def test_gaussians_at_points(device):
     axis = torch.arange(3.0)
     points = 0.2 * torch.cartesian_prod(axis, axis, axis).to(device, torch.float64)
     colors = torch.linspace(0, 1, 81, device=device, dtype=torch.float64).reshape(27, 3)
-    made = ar.Gaussians.from_points(points, colors, sh_degree=2, opacity=0.3, scale=0.5)
+    made = ar.Gaussians.from_points(points, colors, sh_degree=2, opacity=0.3, scale=0.5, dtype=torch.float64)
     assert made.sh_degree == 2 and made.count == 27
     assert all(field.dtype == torch.float64 and field.device.type == device for field in made)
     # Every point of the grid has three neighbours at its spacing.
@@ -352,7 +352,11 @@ def test_gaussians_at_points(device):
     torch.testing.assert_close(made.opacities, torch.full_like(points[:, :1], 0.3))
     torch.testing.assert_close(0.5 + 0.28209479177387814 * made.shs[:, 0], colors)
     assert (made.shs[:, 1:] == 0).all() and (made.rotations[:, 0] == 1).all()
+    # Gaps of coordinates that float32 does not resolve.
+    far = ar.Gaussians.from_points(points + 5e6, colors.float(), scale=0.5)
+    torch.testing.assert_close(far.scales, made.scales.float())
     grey = ar.Gaussians.from_points(points[:2])
+    assert all(field.dtype == torch.float32 for field in grey)
     assert (grey.shs == 0).all() and grey.sh_degree == 3
     leaves = made.leaves()
     assert all(leaf.is_leaf and leaf.requires_grad and leaf.is_contiguous() for leaf in leaves)
@@ -372,7 +376,7 @@ def test_gaussians_at_points(device):
         ({"colors": torch.zeros(4, 3)}, ValueError, r"colors must have shape .* got \(4, 3\)"),
         ({"colors": torch.full((5, 3), 200, dtype=torch.uint8)}, TypeError, "colors must have a floating-point dtype"),
         ({"colors": torch.full((5, 3), 200.0)}, ValueError, r"colors must be in \[0, 1\], got 200 to 200"),
-        ({"colors": torch.zeros(5, 3).double()}, ValueError, "colors must be torch.float32 on cpu, as points"),
+        ({"dtype": torch.float16}, ValueError, "dtype must be float32 or float64, got torch.float16"),
         ({"points": torch.full((5, 3), math.inf)}, ValueError, "points must be finite"),
         ({"sh_degree": 4}, ValueError, "sh_degree must be 0 to 3, got 4"),
         ({"opacity": 1}, ValueError, "opacity must be above 0 and below 1, got 1"),
