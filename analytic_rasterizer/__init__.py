@@ -8,6 +8,7 @@ A drop-in replacement for `diff_gaussian_rasterization`. Where to look:
 - `Effects`, `Outputs`, `Defocus`, `Motion`, `camera_settings`: depth, alpha, statistics, cameras (docs/effects.md).
 - `project`, `list_tiles`, `blend`: the three stages of a rendering, each on its own (docs/library.md).
 - `losses`, `activations`, `optim`: the other parts of a training step (docs/losses.md).
+- `density`: how many Gaussians there are, in a training loop of one's own (docs/density.md).
 - `inspect_scene`, `plan`: what a scene calls for (docs/command-line.md).
 
 In modules of their own: `training`, `distributed`, `viewer`, `analysis`, `dialects` and `io` (docs/).
@@ -15,8 +16,14 @@ In modules of their own: `training`, `distributed`, `viewer`, `analysis`, `diale
 
 import torch  # noqa: F401  (its libraries must be loaded before the extension's)
 
-from . import activations, losses, optim
-from ._C import TILE, instruction_set
+from .installation import warn_if_built_for_another, warn_if_replaced, why_not_loaded
+
+try:
+    from ._C import BUILT_FOR, TILE, instruction_set
+except ImportError as error:
+    raise ImportError(why_not_loaded(error)) from error
+
+from . import activations, density, losses, optim
 from .analysis.planner import SceneReport, inspect_scene, plan
 from .camera import View, camera_settings, moved
 from .effects import Defocus, Effects, GaussianStats, Motion, Outputs
@@ -30,7 +37,6 @@ from .footprints import (
     set_default_footprint,
 )
 from .gaussians import Gaussians
-from .installation import warn_if_replaced
 from .outputs import normalized
 from .rasterizer import GaussianRasterizer, rasterize_gaussians
 from .relocation import compute_relocation
@@ -65,6 +71,7 @@ __all__ = [
     "camera_settings",
     "compute_3d_filter",
     "compute_relocation",
+    "density",
     "footprint_weight",
     "get_default_footprint",
     "inspect_scene",
@@ -83,4 +90,5 @@ __all__ = [
     "set_default_footprint",
 ]
 
+warn_if_built_for_another(BUILT_FOR)
 warn_if_replaced()

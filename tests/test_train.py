@@ -17,7 +17,7 @@ import torch
 from conftest import ROOT, SHARED, needs_cuda
 from processes import DEADLINE
 
-from analytic_rasterizer import cli, io, render_stages
+from analytic_rasterizer import cli, io, optim, render_stages
 from analytic_rasterizer.filters import bake_pixel
 from analytic_rasterizer.footprints import resolve_footprint
 from analytic_rasterizer.gaussians import Gaussians
@@ -45,7 +45,6 @@ from analytic_rasterizer.training import (  # noqa: E402
     TrainingOptions,
     captures,
     colmap,
-    density,
     files,
     pictures,
     schedule,
@@ -725,7 +724,7 @@ def test_psnr_rises_and_the_results_say_so(device, synthetic, tmp_path, options)
     log = [json.loads(line) for line in (tmp_path / files.LOG).read_text().splitlines()]
     assert [entry["step"] for entry in log] == [10, 100, 120]
     assert log[-1]["loss"] < 0.5 * log[0]["loss"]
-    start = evaluate(g.gaussians_at(*g.random_points(150, 0), 1), cpu_test_pictures(synthetic), "box")
+    start = evaluate(Gaussians.from_points(*g.random_points(150, 0), 1), cpu_test_pictures(synthetic), "box")
     assert metrics["test"]["mean"]["psnr"] > start["mean"]["psnr"] + 3
     assert metrics["steps"] == 120 and metrics == json.loads((tmp_path / files.METRICS).read_text())
     assert {"1", "2", "mean"} == metrics["test"].keys() and len(metrics["test"]["1"]["views"]) == 3
@@ -752,7 +751,7 @@ def rows_shown(trainer) -> list[torch.Tensor]:
 
 def state_of(trainer) -> list[torch.Tensor]:
     """Copies of parameters and moments, a row for each Gaussian."""
-    moments = [trainer.optimizer.state[field].get(m) for field in trainer.gaussians for m in density.MOMENTS]
+    moments = [trainer.optimizer.state[field].get(m) for field in trainer.gaussians for m in optim.MOMENTS]
     return [t.detach().clone() for t in (*trainer.gaussians, *(m for m in moments if m is not None))]
 
 
@@ -1082,10 +1081,10 @@ def test_full_disk_on_the_way_is_reported_and_at_the_end_keeps_what_was_there(sy
         (save if len(calls) == 1 else full_disk)(state, path)
 
     monkeypatch.setattr(torch, "save", fails_after_the_first)
-    with pytest.raises(OSError, match=r"checkpoint.pt: cannot be written \(No space left on device\)"):
+    with pytest.raises(OSError, match=r"checkpoint.pt: the disk is full; an earlier file of this name is unchanged"):
         run.train()
     assert calls == [10, 20, 30]
-    assert "No space left on device" in capsys.readouterr().err
+    assert "checkpoint.pt: the disk is full" in capsys.readouterr().err
     assert files.read_checkpoint(tmp_path / files.CHECKPOINT)["progress"]["step"] == 10
     assert not [path for path in tmp_path.iterdir() if "partial" in path.name]
 
@@ -1215,9 +1214,8 @@ def test_the_ply_holds_what_was_trained(trained):
     expected = Gaussians(**state["gaussians"])
     read = io.load_scene(trained / files.SCENE)
     assert read.sh_degree == 1
-    for name in ("means", "scales", "opacities", "shs"):
-        torch.testing.assert_close(getattr(read, name), getattr(expected, name), rtol=1e-5, atol=1e-6)
-    torch.testing.assert_close(read.rotations, torch.nn.functional.normalize(expected.rotations, dim=1))
+    for field, wanted in zip(read, expected):
+        assert torch.equal(field, wanted)
 
 
 @pytest.mark.parametrize("footprint, integrated", [("point", False), ("box:samples=4", True), ("mip", True)])
@@ -1244,13 +1242,6 @@ def test_the_exported_scene_has_the_pixel_in_it(synthetic, tmp_path, capsys, dev
     torch.testing.assert_close(baked.scales, scales, rtol=1e-5, atol=1e-6)
     torch.testing.assert_close(baked.opacities, opacities, rtol=1e-4, atol=1e-6)
     assert (baked.scales > scene.scales).all() and (baked.opacities < scene.opacities).all()
-
-
-def test_comments_that_cannot_be_written_are_refused(tmp_path):
-    scene = truth_gaussians().map(torch.Tensor.detach)
-    for name, comment in (("s.spz", "a"), ("s.ply", "a\nb"), ("s.ply", "ä")):
-        with pytest.raises(io.SceneError, match="comments"):
-            io.save_scene(tmp_path / name, scene, [comment])
 
 
 def test_cameras_json_gives_the_training_views(trained):
@@ -1591,7 +1582,7 @@ def test_the_command_takes_a_preset_and_resumes_with_it(synthetic, tmp_path, cap
 
 
 def test_the_command_takes_sparse_adam_and_resumes_with_it(synthetic, tmp_path, capsys):
-    start = g.gaussians_at(*g.random_points(60, 0), 0)
+    start = Gaussians.from_points(*g.random_points(60, 0), 0)
     scatter(start)
     io.save_scene(tmp_path / "start.ply", start)
     small = ["--iterations", "12", "--points", str(tmp_path / "start.ply")]

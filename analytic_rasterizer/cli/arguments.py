@@ -8,8 +8,7 @@ import re
 import sys
 import tempfile
 import warnings
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -68,28 +67,22 @@ def run_command(parse: Callable[[], argparse.Namespace]) -> int:
 
     Returns:
         0, 2 after an error that the user can correct, which is one line on stderr, or 130 when interrupted.
+
+    Warnings are one line on stderr too, without the place in the code that Python names.
     """
+    usual = warnings.formatwarning
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
     try:
-        with warnings_of_one_line():
-            args = parse()
-            args.run(args)
+        args = parse()
+        args.run(args)
         return 0
     except KeyboardInterrupt:
         return 130
     except USER_ERRORS as error:
         report(_describe(error))
         return 2
-
-
-@contextmanager
-def warnings_of_one_line() -> Iterator[None]:
-    """Warnings are printed without the place in the code that they come from."""
-    before = warnings.formatwarning
-    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
-    try:
-        yield
     finally:
-        warnings.formatwarning = before
+        warnings.formatwarning = usual
 
 
 def _describe(error: BaseException) -> str:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import torch
 
 from .. import io
 from ..filters import PIXEL_VARIANCE, bake_dilation, sampling_interval
-from ..io.scenes import WRITTEN
 from .arguments import (
     add_files,
     add_footprint,
@@ -40,7 +37,7 @@ def add_parser(subcommands) -> None:
     reduced = "the training's pictures had 1/N of the size in VIEWS (default: what cfg_args or options.json says, or 1)"
     add_scales(parser, reduction, reduced)
     add = parser.add_argument
-    add("--out", required=True, metavar="FILE", help="the scene to write, in a format by its suffix")
+    add("--out", required=True, metavar="FILE", help="the scene to write: .ply, .compressed.ply, .spz or .splat")
     add_footprint(parser, "what SCENE was trained with", "(default: what it says, else point)")
     of_training = "of the training, px^2 (default: that of the footprint, 0.3)"
     add("--dilation", type=dilation, metavar="V", help=of_training)
@@ -50,8 +47,7 @@ def add_parser(subcommands) -> None:
 
 def run(args) -> None:
     """Bakes the dilation, writes the scene, and says what changed."""
-    if Path(args.out).suffix.lower() not in WRITTEN:
-        raise ValueError(f"--out must end in {', '.join(WRITTEN)}, got {args.out}")
+    io.written_format(args.out)  # raises
     use_machine(args)
     found = io.find_scene(args.scene)
     trained = found.training_footprint(args.footprint)
@@ -71,7 +67,7 @@ def run(args) -> None:
     say(f"trained with {trained.footprint}: {trained.reason}")
     gaussians = scene.means, scene.scales, scene.rotations, scene.opacities
     scales, opacities = bake_dilation(*gaussians, cameras, args.dilation or trained.footprint.option)
-    metadata = io.SceneMetadata(footprint=BAKED_FOR, offset=found.metadata.offset, comments=found.metadata.comments)
+    metadata = io.SceneMetadata(footprint=BAKED_FOR, offset=found.metadata.offset)
     io.save_scene(args.out, scene.with_activated(scales, opacities), metadata)
     reason = f" ({found.size_reason})" if not given and found.size_reason else ""
     pictures = f"{len(views)} pictures of {sizes_in_words(views)}{reason}"

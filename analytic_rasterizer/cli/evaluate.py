@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from .. import io
 from ..analysis.tables import format_table
+from ..distributed.ranks import Ranks, even_counts
 from ..gaussians import Gaussians
 from ..io.models import DIVISORS, CfgArgs
 from ..training import TrainingOptions, evaluate, load_capture, load_lpips, load_pictures, save_pictures
@@ -14,7 +15,6 @@ from ..training.captures import IMAGES, TEST_PERIOD, Capture
 from ..training.evaluation import LPIPS_WEIGHTS, MEASURES
 from ..training.files import OPTIONS, SCENE, write_json
 from ..training.options import check_scales
-from ..training.ranks import Ranks, even_counts
 from ..training.trainer import background_of
 from .arguments import (
     add_machine_options,

@@ -53,7 +53,7 @@ def run(args) -> None:
     """Inspects the scene and prints the report."""
     if args.picture:  # raises before anything is rendered
         io.optional_import("matplotlib.figure", "analysis")
-        if Path(args.picture).suffix not in (".png", ".svg", ".pdf"):
+        if Path(args.picture).suffix.lower() not in (".png", ".svg", ".pdf"):
             raise ValueError(f"--picture must end in .png, .svg or .pdf, got {args.picture}")
     use_machine(args)
     found = io.find_scene(args.scene)

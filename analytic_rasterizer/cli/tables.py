@@ -43,7 +43,6 @@ def run(args) -> None:
     if missing:
         raise ValueError(f"tables {args.name} needs {' and '.join(missing)}")
     use_machine(args)
-    io.optional_import("gsply")  # writes the scenes in the end
     lpips = None
     if not args.no_lpips:
         try:

@@ -44,7 +44,7 @@ def run(args) -> None:
         return
     if args.threads is not None or args.device is not None:
         raise ValueError("--device and --threads are for --server: otherwise the browser draws")
-    if args.export and Path(args.export).suffix != ".html":
+    if args.export and Path(args.export).suffix.lower() != ".html":
         raise ValueError(f"--export must end in .html, got {args.export}")
     if args.export and args.port is not None:
         raise ValueError("--port is for serving: --export writes a file and ends")

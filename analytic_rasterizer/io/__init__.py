@@ -9,7 +9,7 @@ from .appearance import BLACK, WHITE, Choice, FoundScene, find_scene
 from .common import SceneError, optional_import, to_image
 from .metadata import SceneMetadata, read_metadata
 from .points import is_scene, load_points
-from .scenes import PLY_COLUMNS, load_scene, save_scene
+from .scenes import PLY_COLUMNS, load_scene, save_scene, written_format
 from .video import save_video
 from .views import View, load_views, save_views
 from .writing import save_image, write_bytes, write_json, write_safely, write_text
@@ -39,4 +39,5 @@ __all__ = [
     "write_json",
     "write_safely",
     "write_text",
+    "written_format",
 ]

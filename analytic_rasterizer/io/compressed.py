@@ -1,7 +1,7 @@
 """The compressed .ply (PlayCanvas). 256 Gaussians at a time share limits, and have 8 to 11 bits a number between them.
 
-gsply packs and unpacks the bits. It takes any element for what it expects at that place of the file, so that what is
-given to it is put together here, from the file's own elements.
+gsply packs and unpacks the bits. It expects certain elements in a certain order and does not check the order. So the
+elements of the file are found first, and gsply is given a file of only these, in its order.
 """
 
 from __future__ import annotations

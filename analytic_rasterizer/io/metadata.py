@@ -1,7 +1,6 @@
-"""What a file of a scene says beside its Gaussians: how it wants to be rendered, and where it lies.
+"""Metadata of scenes: for which footprint a scene was made, and the offset of its positions.
 
-Each format has a place of its own: a .ply comments, an .spz a flag and an extension, a .sog its meta.json. A .splat has
-none. All of them are read here.
+A .ply holds metadata in comments, an .spz in a flag and an extension, a .sog in its meta.json. A .splat holds none.
 """
 
 from __future__ import annotations
@@ -96,7 +95,7 @@ def metadata_of(lines: Sequence[str], where) -> SceneMetadata:
             except (ValueError, TypeError) as error:
                 warnings.warn(f"{where}: '{line}' is not understood ({first_line(error)})", stacklevel=3)
         else:
-            others.append(line)
+            others.append(line.strip())
     if "footprint" in fields:
         fields["antialiased"] = SceneMetadata(fields["footprint"]).checked().antialiased
     return SceneMetadata(**fields, comments=tuple(others))

@@ -26,12 +26,11 @@ def load_points(path, strict: bool = False) -> tuple[Tensor, Tensor]:
 
     Returns:
         Positions (P, 3) float64, as far from zero as geographic coordinates are, and colours (P, 3) float32 in [0, 1]:
-        those of red, green and blue, grey where there are none. Colours reach to 255 in the file, to 65535 as ushort,
-        and to 1 where they are fractions and none is larger.
+        those of red, green and blue (see `read_colors`), grey where there are none.
 
     Raises:
-        SceneError: The file, which is named, is no complete .ply with such vertices; colours are out of their range; or
-            no vertex is finite.
+        SceneError: The file is no complete .ply with such vertices, or colours are out of their range, or no vertex is
+            finite. The message names the file.
         OSError: The file cannot be read.
     """
     path = Path(path)
@@ -70,8 +69,8 @@ def has_colors(rows: ply.Rows) -> bool:
 def read_colors(rows: ply.Rows) -> np.ndarray:
     """Colours (rows, 3) float32 in [0, 1] of red, green and blue, NaN where one is not a finite number.
 
-    By their type and the largest of them: they reach to 255, to 65535 as ushort, and to 1 where they are fractions and
-    none is larger. Raises SceneError for colours out of that range.
+    Full intensity is 65535 in colours of type ushort, 1 in fractions none of which is larger than 1, and else 255.
+    Raises SceneError for colours out of that range.
     """
     stored = rows.columns(COLORS)
     finite = np.isfinite(stored).all(1) if stored.dtype.kind == "f" else np.ones(len(stored), bool)

@@ -42,7 +42,8 @@ def load_scene(path, strict: bool = False) -> Gaussians:
         float32, on the CPU. Scales of 0, and in a .ply opacities of 0 and 1, have infinite parameters.
 
     Raises:
-        SceneError: The file, which is named, is not there, no scene, or cut short; no Gaussian in it is finite.
+        SceneError: The file is not there, or no scene, or cut short, or no Gaussian of it is finite. The message names
+            the file.
         ImportError: The extra `cli` is missing, which formats other than .ply and .splat need.
     """
     path, kind = scene_file(path)
@@ -56,7 +57,7 @@ def load_scene(path, strict: bool = False) -> Gaussians:
 
 
 def _tensor(field: np.ndarray) -> torch.Tensor:
-    """A float32 tensor with memory of its own, which the field shares where it can."""
+    """The field as a float32 tensor, copied where it has another type or cannot be changed."""
     with np.errstate(over="ignore"):  # what float32 does not hold becomes infinite, and is left out
         found = np.require(field, np.float32, ["C", "O", "W"])
     return torch.from_numpy(found)
@@ -67,10 +68,11 @@ def _finite(path: Path, scene: Gaussians, strict: bool) -> Gaussians:
     good = torch.ones(scene.count, dtype=torch.bool, device="cpu")
     bad = {}
     for name, field in numbers_of(scene).items():
+        if field.sum(dtype=torch.float64).isfinite():  # then all of them are: no sum of float32 leaves float64
+            continue
         finite = field.flatten(1).isfinite().all(1)
-        if not finite.all():
-            bad[name] = scene.count - int(finite.sum())
-            good &= finite
+        bad[name] = scene.count - int(finite.sum())
+        good &= finite
     if not bad:
         return scene
     if strict or not good.any():
@@ -117,15 +119,15 @@ def _read_ply(path: Path) -> dict[str, np.ndarray]:
         # All bands of red come first, then those of green, then those of blue.
         rest = rows.columns([f"f_rest_{i}" for i in range(count)], np.float32)
         shs[:, 1:] = rest.reshape(len(rows), 3, count // 3).transpose(0, 2, 1)
-        means, log_scales = rows.columns(AXES), rows.columns(SCALES, np.float32)
-    _warn_of_rounding(path, means, log_scales)
-    return {
-        "means": means,
-        "log_scales": log_scales,
-        "rotations": rows.columns(ROTATIONS, np.float32),
-        "logit_opacities": rows.columns(["opacity"], np.float32),
-        "shs": shs,
-    }
+        fields = {
+            "means": rows.columns(AXES),
+            "log_scales": rows.columns(SCALES, np.float32),
+            "rotations": rows.columns(ROTATIONS, np.float32),
+            "logit_opacities": rows.columns(["opacity"], np.float32),
+            "shs": shs,
+        }
+    _warn_of_rounding(path, fields["means"], fields["log_scales"])
+    return fields
 
 
 def _warn_of_rounding(path: Path, means: np.ndarray, log_scales: np.ndarray) -> None:
@@ -138,6 +140,16 @@ def _warn_of_rounding(path: Path, means: np.ndarray, log_scales: np.ndarray) -> 
     if moved.mean() > 0.01:  # single specks are none of the scene's
         which = f"{int(moved.sum())} of {len(means)} Gaussians, by up to {shift[moved].max():.2g}"
         warnings.warn(f"{path}: float32 moves {which}: subtract an offset from the file's positions", stacklevel=4)
+
+
+def written_format(path) -> str:
+    """The format that `save_scene` writes under this name: ply, compressed, spz or splat. Else raises SceneError."""
+    path = Path(path)
+    if path.name.lower().endswith(".compressed.ply"):
+        return "compressed"
+    if path.suffix.lower() not in WRITTEN:
+        raise SceneError(f"{path}: expected a .ply, .spz or .splat name, got {path.suffix or 'no suffix'!r}")
+    return WRITTEN[path.suffix.lower()]
 
 
 def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None) -> None:
@@ -159,11 +171,9 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None) ->
         OSError: The file cannot be written; an earlier one is then unchanged.
         ImportError: The extra `cli` is missing, which .compressed.ply and .spz need.
     """
-    path = Path(path)
-    kind = WRITTEN.get(path.suffix.lower())
-    if kind is None:
-        raise SceneError(f"{path}: expected a .ply, .spz or .splat name, got {path.suffix or 'no suffix'!r}")
-    kind = "compressed" if path.name.lower().endswith(".compressed.ply") else kind
+    path, kind = Path(path), written_format(path)
+    if not isinstance(metadata, (SceneMetadata, type(None))):
+        raise TypeError(f"metadata must be a SceneMetadata or None, got {type(metadata).__name__}")
     try:
         metadata = (metadata or SceneMetadata()).checked()
     except (ValueError, TypeError) as error:

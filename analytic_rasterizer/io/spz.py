@@ -50,36 +50,36 @@ def read_spz(path: Path) -> dict[str, np.ndarray]:
 
     Raises SceneError, which names the file, for a broken one; ImportError without gsply, or for version 4 zstandard.
     """
-    read = gsply().read_spz
     with path.open("rb") as file:
         if file.read(len(MAGIC)) == MAGIC:
-            optional_import("zstandard")
+            optional_import("zstandard")  # gsply remembers whether it was there
+    read = gsply().read_spz
     with naming(path), unreadable():
         return fields_of(read(path))
 
 
-def write_spz(path: Path, fields: dict[str, np.ndarray], antialiased: bool, lines: Sequence[str]) -> None:
+def write_spz(temporary: Path, fields: dict[str, np.ndarray], antialiased: bool, lines: Sequence[str]) -> None:
     """Writes an .spz of version 3.
 
     Args:
-        path: The file.
+        temporary: The file, see `write_safely`.
         fields: As from `read_spz`, float32, with unit quaternions.
         antialiased: The flag.
         lines: Text for the extension; none leaves it out.
 
     Raises SceneError for means that the format does not hold, OSError, and ImportError without gsply.
     """
-    gsply().write_spz(path, data_of(fields), version=3, fractional_bits=fractional_bits(fields["means"]))
+    gsply().write_spz(temporary, data_of(fields), version=3, fractional_bits=fractional_bits(fields["means"]))
     text = "\n".join(lines).encode()
     if not antialiased and not text:
         return
-    content = bytearray(gzip.decompress(path.read_bytes()))
+    content = bytearray(gzip.decompress(temporary.read_bytes()))
     header = Header._make(HEADER.unpack_from(content))
     flags = header.flags | (ANTIALIASED if antialiased else 0) | (HAS_EXTENSIONS if text else 0)
     HEADER.pack_into(content, 0, *header._replace(flags=flags))
     if text:
         content += struct.pack("<II", OWN_EXTENSION, len(text)) + text
-    path.write_bytes(gzip.compress(content, 6, mtime=0))
+    temporary.write_bytes(gzip.compress(content, 6, mtime=0))
 
 
 def fractional_bits(means: np.ndarray) -> int:

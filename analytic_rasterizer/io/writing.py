@@ -19,9 +19,9 @@ from typing import Any
 
 from .common import to_image
 
-DISK_IS_FULL = (errno.ENOSPC, errno.EDQUOT)
+DISK_IS_FULL = (errno.ENOSPC, getattr(errno, "EDQUOT", errno.ENOSPC))  # Windows has no quota of this name
 PROBE = bytes(1 << 16)
-LONGEST_NAME = 150  # characters of a file's name that its temporary name repeats
+LONGEST_NAME = 50  # characters of a name that its temporary name repeats: four bytes each may be too long a name
 
 _numbers = count()
 
@@ -34,8 +34,8 @@ def write_safely(path, write: Callable[[Path], None]) -> None:
 
     Args:
         path: The file to write.
-        write: Is called with the path of a file that does not exist yet, whose name ends as that of `path` does, so
-            that writers which tell formats by the suffix take the right one.
+        write: Is called with the path of a temporary file, which does not exist yet. Its name ends as that of `path`,
+            for writers that choose a format by the suffix.
 
     Raises:
         OSError: The file, which is named, cannot be written: the disk is full, or the reason of the system. An earlier
@@ -61,7 +61,8 @@ def write_safely(path, write: Callable[[Path], None]) -> None:
         with temporary.open("rb+") as file:
             os.fsync(file.fileno())
         if earlier is not None:
-            os.chmod(temporary, stat.S_IMODE(earlier.st_mode))
+            with suppress(OSError):  # which some file systems do not have
+                os.chmod(temporary, stat.S_IMODE(earlier.st_mode))
         os.replace(temporary, target)
     # torch.save raises RuntimeError when the disk is full.
     except (OSError, RuntimeError) as error:

@@ -19,6 +19,7 @@ from .. import io
 from ..io import load_points
 from ..io.views import checked_pixels, checked_pose, checked_positive
 from . import colmap
+from .extent import OUTLYING, is_one_pose, outliers_of
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 IMAGES, TEST_PERIOD = "images", 8
@@ -52,10 +53,11 @@ def load_capture(folder, images: str = IMAGES, test_every: int = TEST_PERIOD) ->
         test_every: Where the capture does not say what is for the test: one in so many pictures, the first by name
             among them; 0 for none.
 
-    Warns of masks in a nerfstudio capture, which are ignored.
+    Warns of masks in a nerfstudio capture, which are ignored, and of photographs that are left out because their
+    cameras are far from all others.
 
     Raises:
-        io.SceneError: No such layout; missing pictures; no pictures to train with; all cameras at one place; lens
+        io.SceneError: No such layout; missing pictures; no pictures to train with; all cameras with one pose; lens
             distortion.
         OSError: A file that cannot be read.
         ValueError: test_every is negative or 1.
@@ -86,6 +88,7 @@ def load_capture(folder, images: str = IMAGES, test_every: int = TEST_PERIOD) ->
             f"{folder}: expected transforms_train.json, metadata.json, transforms.json, or COLMAP's cameras, images "
             "and points3D (.bin or .txt) in sparse/0"
         )
+    capture = without_outliers(folder, capture)
     check_capture(folder, capture)
     return capture
 
@@ -98,16 +101,30 @@ def check_capture(folder: Path, capture: Capture) -> None:
         raise io.SceneError(f"{folder}: {len(missing)} of {len(files)} pictures are missing, the first is {missing[0]}")
     if len(capture.train) < 2:
         raise io.SceneError(f"{folder}: training needs at least 2 pictures, got {len(capture.train)}")
-    if not extent_of([item.view for item in capture.train]) > 0:
+    if is_one_pose([item.view for item in capture.train]):
         raise io.SceneError(
-            f"{folder}: training needs cameras at different places, got all {len(capture.train)} at one"
+            f"{folder}: training needs cameras in different directions, or cameras at different places, got all "
+            f"{len(capture.train)} at one place in one direction"
         )
 
 
-def extent_of(views: list[io.View]) -> float:
-    """The radius around the cameras that 3DGS scales the learning rate of the means by, world units."""
-    centers = torch.stack([torch.linalg.inv(view.w2c)[:3, 3] for view in views])
-    return 1.1 * (centers - centers.mean(0)).norm(dim=1).max().item()
+def without_outliers(folder: Path, capture: Capture) -> Capture:
+    """The capture without photographs whose cameras are far from all others, see `outliers_of`. A warning names each.
+
+    A wrong pose teaches nothing, and would spoil the mean of a test.
+    """
+    items = [*capture.train, *capture.test]
+    points = None if capture.points is None else capture.points[0]
+    outliers = outliers_of([item.view for item in items], points)
+    for place, distance in outliers.items():
+        warnings.warn(
+            f"{folder}: {items[place].files[1].name} is left out: its camera is {distance:.3g} from the middle of the "
+            f"cameras, more than {OUTLYING} times as far as all others, so that its pose must be wrong",
+            stacklevel=3,
+        )
+    kept = [item for place, item in enumerate(items) if place not in outliers]
+    count = sum(place not in outliers for place in range(len(capture.train)))
+    return capture._replace(train=kept[:count], test=kept[count:])
 
 
 def transforms(path: Path) -> tuple[list[Photograph], dict[str, Any]]:
