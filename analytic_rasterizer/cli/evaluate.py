@@ -101,7 +101,8 @@ def protocol_of(found: io.FoundScene, args) -> Protocol:
             trained = f"; {found.model or found.path.parent} was trained on {cfg_args.source_path}"
             known = trained if cfg_args.source_path else f", and there is no {OPTIONS} of `train` beside it that does"
             raise ValueError(f"{found.path} does not name its capture: give --data FOLDER{known}")
-        images = cfg_args.images if (Path(args.data) / Path(cfg_args.images or "none").name).is_dir() else IMAGES
+        named = Path(cfg_args.images or IMAGES)  # a folder of the capture, and no path that leaves it
+        images = str(named) if named.name == str(named) and (Path(args.data) / named).is_dir() else IMAGES
         usual = Protocol(args.data, images, TEST_PERIOD, scales_of(cfg_args, args.images or images), None)
     given = {name: getattr(args, name) for name in ("data", "images", "test_every", "scales")}
     chosen = usual._replace(**{name: value for name, value in given.items() if value is not None})
