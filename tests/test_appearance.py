@@ -122,9 +122,10 @@ CHOICES = {
         {"scene.ply": MARKED, "options.json": "[3]"}, "scene.ply", None, None, MIP, "and not which",
     ),
     "the mip of a training": (
-        {"point_cloud_mip.ply": None, "options.json": options_json("moment")},
-        "point_cloud_mip.ply", None, None, UNMARKED, "names none",
+        {"point_cloud_mip.ply": {"footprint": "point:dilation=0"}, "options.json": options_json("moment")},
+        "point_cloud_mip.ply", None, None, "point:dilation=0.0", "point_cloud_mip.ply says so",
     ),
+    "without dilation": ({"a.ply": None}, "a.ply", None, "point:dilation=0", "point:dilation=0.0", "too thin"),
     "a model": ({DEEP: None}, "MODEL", None, None, UNMARKED, "point_cloud.ply names none"),
     "a baked model": ({DEEP: MOMENT}, DEEP, None, None, "moment:samples=4", "point_cloud.ply says so"),
 }  # fmt: skip

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from .. import io
-from ..filters import PIXEL_VARIANCE, bake_dilation, sampling_interval
+from ..filters import bake_dilation, sampling_interval
 from .arguments import (
     add_files,
     add_footprint,
@@ -82,5 +82,5 @@ def check_is_dilated(found: io.FoundScene, trained: io.Choice) -> None:
             f"{found.path}: no dilation to bake: it says that pixels are to be integrated (footprint {footprint}); "
             "--footprint point is for a scene that was trained with 3DGS all the same"
         )
-    if footprint.option < PIXEL_VARIANCE:
+    if not io.is_dilated(footprint):
         raise io.SceneError(f"{found.path}: no dilation to bake: it was trained with {footprint}, without any")

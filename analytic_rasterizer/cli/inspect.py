@@ -10,7 +10,6 @@ from .. import io
 from ..analysis.baking import bake_gain
 from ..analysis.memory import check_sizes
 from ..analysis.planner import inspect_scene
-from ..filters import PIXEL_VARIANCE
 from .arguments import (
     LARGER,
     add_footprint,
@@ -69,7 +68,7 @@ def run(args) -> None:
     scene = io.load_scene(found.path).to(args.device)
     say(*said, f"trained with {trained.footprint}: {trained.reason}")
     gain = None
-    if trained.footprint.name == "point" and trained.footprint.option >= PIXEL_VARIANCE:
+    if io.is_dilated(trained.footprint):
         known = training or (found.load_views(size=args.size) if found.cameras is not None else all_views)
         scene, gain = bake_gain(scene, views, known, trained.footprint, args.background)
     report = inspect_scene(scene, views, args.tolerance, training, scale=1 / args.scales, background=args.background)

@@ -5,7 +5,7 @@ camera with an image size; its axes are OpenCV's (x right, y down, z forward). S
 install analytic_rasterizer[cli]`; they are imported on first use.
 """
 
-from .appearance import BLACK, WHITE, Choice, FoundScene, find_scene
+from .appearance import BLACK, WHITE, Choice, FoundScene, find_scene, is_dilated
 from .common import SceneError, optional_import, to_image
 from .metadata import SceneMetadata, read_metadata
 from .points import is_scene, load_points
@@ -24,6 +24,7 @@ __all__ = [
     "SceneMetadata",
     "View",
     "find_scene",
+    "is_dilated",
     "is_scene",
     "load_points",
     "load_scene",

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from ..camera import View
+from ..filters import PIXEL_VARIANCE
 from ..footprints import ENVIRONMENT_VARIABLE, Footprint, chosen_footprint, resolve_footprint
 from .common import SceneError
 from .metadata import SceneMetadata, read_metadata
@@ -83,9 +84,9 @@ class FoundScene:
 
     @property
     def is_dilated(self) -> bool:
-        """Whether the scene was trained with `point`, as far as known: `bake` is for such scenes."""
+        """Whether the scene was trained with the dilation of `point`, as far as known: `bake` is for such scenes."""
         trained = self.trained_with
-        return trained is None or trained.footprint.name == UNMARKED.name
+        return trained is None or is_dilated(trained.footprint)
 
     @property
     def background(self) -> tuple[tuple[float, float, float], str] | None:
@@ -166,10 +167,15 @@ class FoundScene:
         command = f"bake {self.path} --out FILE"
         if not self.is_dilated:
             return ""
-        if footprint.name == UNMARKED.name:
+        if is_dilated(footprint):
             return f"; right at the size of the training, for others: {command}"
         known = "" if self.trained_with else f"{self.path.name} names no footprint: if 3DGS trained it, "
         return f"; {known}its Gaussians are too thin for {footprint.name} before: {command}"
+
+
+def is_dilated(footprint: Footprint) -> bool:
+    """Whether a footprint adds a dilation that can be baked: one as wide as a pixel, or more."""
+    return footprint.name == UNMARKED.name and footprint.option >= PIXEL_VARIANCE
 
 
 def find_scene(path) -> FoundScene:

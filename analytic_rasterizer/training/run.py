@@ -188,7 +188,7 @@ class Run:
         scales, opacities = bake_pixel(scene.means, scene.scales, scene.rotations, scene.opacities, cameras)
         baked = self._whole(scene.with_activated(scales, opacities))
         if self.ranks.is_first:
-            write_scene(self.out / MIP_SCENE, baked, "point")
+            write_scene(self.out / MIP_SCENE, baked, "point:dilation=0")  # its pixels are in the Gaussians
         return self.out / MIP_SCENE
 
     def start_viewer(self, port: int = 0) -> LiveViewer:
