@@ -11,6 +11,7 @@ import torch
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io
+from analytic_rasterizer.cli.arguments import use_machine
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.io.models import CfgArgs, read_cfg_args
 from analytic_rasterizer.training.options import TrainingOptions
@@ -310,6 +311,11 @@ def test_cfg_args_that_is_no_file_is_ignored(tmp_path):
 # ------------------------------------------------------------------------------------- commands
 
 
+def run(arguments):
+    """The exit code of a command on the CPU, also where there is a GPU."""
+    return cli.main([*arguments, "--device", "cpu"])
+
+
 @pytest.fixture
 def model(tmp_path):
     """A model of 3DGS whose pictures had a quarter of the size in cameras.json."""
@@ -330,7 +336,7 @@ def shown(scene, view, footprint, background):
 
 
 def test_render_shows_a_model_as_it_was_trained(model, tmp_path, capsys):
-    assert cli.main(["render", str(model), "--out", str(tmp_path / "out")]) == 0
+    assert run(["render", str(model), "--out", str(tmp_path / "out")]) == 0
     for view in make_views():
         expected = shown(io.load_scene(model.parent / DEEP), view, "point", io.WHITE)
         assert np.abs(picture(tmp_path / "out" / f"{view.name}.png") - expected).max() <= 1
@@ -345,7 +351,7 @@ def test_render_shows_a_model_as_it_was_trained(model, tmp_path, capsys):
 def test_what_is_given_wins(model, tmp_path, capsys):
     io.save_views(tmp_path / "views.json", make_views(20, 16))
     given = ["--views", str(tmp_path / "views.json"), "--background", "black", "--footprint", "box"]
-    assert cli.main(["render", str(model), "--out", str(tmp_path / "out"), *given]) == 0
+    assert run(["render", str(model), "--out", str(tmp_path / "out"), *given]) == 0
     expected = shown(io.load_scene(model.parent / DEEP), make_views(20, 16)[0], "box", io.BLACK)
     assert np.abs(picture(tmp_path / "out" / "left.png") - expected).max() <= 1
     assert "cfg_args" not in capsys.readouterr().err
@@ -354,7 +360,7 @@ def test_what_is_given_wins(model, tmp_path, capsys):
 def test_bake_takes_the_size_of_the_training(model, tmp_path, capsys):
     ways = {"known": [], "named": ["--views", str(model / "cameras.json")], "given": ["--scales", "4"]}
     for name, given in ways.items():
-        assert cli.main(["bake", str(model), "--out", str(tmp_path / f"{name}.ply"), *given]) == 0
+        assert run(["bake", str(model), "--out", str(tmp_path / f"{name}.ply"), *given]) == 0
         assert "2 pictures of 64x48" in capsys.readouterr().out
     contents = {(tmp_path / f"{name}.ply").read_bytes() for name in ways}
     assert len(contents) == 1
@@ -368,28 +374,28 @@ def test_bake_takes_the_size_of_the_training(model, tmp_path, capsys):
 def test_a_baked_scene_is_shown_with_moment_and_not_baked_again(model, tmp_path, capsys, name):
     (tmp_path / "away").mkdir()
     baked = tmp_path / "away" / name
-    assert cli.main(["bake", str(model), "--out", str(baked)]) == 0
+    assert run(["bake", str(model), "--out", str(baked)]) == 0
     views = ["--views", str(model / "cameras.json"), "--scales", "4"]
-    assert cli.main(["render", str(baked), *views, "--out", str(tmp_path / "out")]) == 0
+    assert run(["render", str(baked), *views, "--out", str(tmp_path / "out")]) == 0
     assert capsys.readouterr().err.endswith(f"footprint moment:samples=4: {name} says so\n")
     expected = shown(io.load_scene(baked), make_views()[0], "moment:samples=4", io.BLACK)
     assert np.abs(picture(tmp_path / "out" / "left.png") - expected).max() <= 1
-    assert cli.main(["bake", str(baked), *views, "--out", str(tmp_path / "twice.ply")]) == 2
+    assert run(["bake", str(baked), *views, "--out", str(tmp_path / "twice.ply")]) == 2
     assert f"{name}: no dilation to bake" in capsys.readouterr().err
-    assert cli.main(["bake", str(baked), *views, "--footprint", "point", "--out", str(tmp_path / "twice.ply")]) == 0
+    assert run(["bake", str(baked), *views, "--footprint", "point", "--out", str(tmp_path / "twice.ply")]) == 0
 
 
 def test_bake_takes_the_dilation_of_the_training(model, tmp_path):
     write(tmp_path, {"a.ply": {"footprint": "point:dilation=0.5"}})
     views = ["--views", str(model / "cameras.json"), "--scales", "4"]
-    assert cli.main(["bake", str(tmp_path / "a.ply"), *views, "--out", str(tmp_path / "b.ply")]) == 0
-    assert cli.main(["bake", str(model), "--dilation", "0.5", "--out", str(tmp_path / "c.ply")]) == 0
+    assert run(["bake", str(tmp_path / "a.ply"), *views, "--out", str(tmp_path / "b.ply")]) == 0
+    assert run(["bake", str(model), "--dilation", "0.5", "--out", str(tmp_path / "c.ply")]) == 0
     assert (tmp_path / "b.ply").read_bytes() == (tmp_path / "c.ply").read_bytes()
 
 
 def test_inspect_says_what_bake_gains(model, capsys, monkeypatch):
     monkeypatch.setenv("ANALYTIC_RASTERIZER_FOOTPRINT", "moment")  # says nothing of the training
-    assert cli.main(["inspect", str(model), "--json", "-"]) == 0
+    assert run(["inspect", str(model), "--json", "-"]) == 0
     captured = capsys.readouterr()
     found = json.loads(captured.out)
     assert found["trained_with"] == UNMARKED and found["views"][0]["width"] == 64
@@ -414,11 +420,11 @@ def test_inspect_says_what_bake_gains(model, capsys, monkeypatch):
 
 
 def test_inspect_names_bake(model, capsys):
-    assert cli.main(["inspect", str(model), "--max-views", "1"]) == 0
+    assert run(["inspect", str(model), "--max-views", "1"]) == 0
     text = capsys.readouterr().out
     assert "how near pictures come to what the training showed: point:dilation=0.3 at the size of these views" in text
     assert f"what follows is for the baked scene: bake {model} --out FILE\n" in text
-    assert cli.main(["inspect", str(model), "--max-views", "1", "--footprint", "moment"]) == 0
+    assert run(["inspect", str(model), "--max-views", "1", "--footprint", "moment"]) == 0
     assert "bake" not in capsys.readouterr().out
 
 
@@ -427,9 +433,23 @@ def test_pareto_measures_some_views_of_a_model(model, tmp_path, capsys):
     pytest.importorskip("torchmetrics", reason="needs the analysis extra")
     io.save_views(model / "cameras.json", [v for i in range(3) for v in make_views(256, 192)])
     options = ["--footprints", "box:samples=1", "--scales", "4", "--rounds", "1", "--max-density", "8"]
-    assert cli.main(["pareto", str(model), "--out", str(tmp_path / "out"), *options]) == 0
+    assert run(["pareto", str(model), "--out", str(tmp_path / "out"), *options]) == 0
     results = json.loads((tmp_path / "out" / "pareto.json").read_text())
     assert (len(results["views"]), results["background"]) == (4, [1, 1, 1])
     assert results["scales"][0]["sizes"][0] == [16, 12]
     error = capsys.readouterr().err
     assert "4 of the views are measured (--limit-views)" in error and "measure what bake makes of it" in error
+
+
+@pytest.mark.parametrize("cuda", [True, False])
+@pytest.mark.parametrize(
+    "arguments",
+    [["render", "--out", "b"], ["inspect"], ["pareto"], ["bake", "--out", "b.ply"], ["view", "--server"], ["evaluate"]],
+    ids=lambda arguments: arguments[0],
+)
+def test_commands_take_the_gpu_where_there_is_one(monkeypatch, arguments, cuda):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: cuda)
+    monkeypatch.setattr("analytic_rasterizer._C.has_cuda", True)
+    args = cli.build_parser().parse_args([arguments[0], "a.ply", *arguments[1:]])
+    use_machine(args)
+    assert args.device == ("cuda" if cuda else "cpu")

@@ -180,7 +180,7 @@ def files(tmp_path):
 
 
 def render(files, *options):
-    return cli.main(["render", str(files / "scene.ply"), *map(str, options)])
+    return cli.main(["render", str(files / "scene.ply"), "--device", "cpu", *map(str, options)])
 
 
 @pytest.mark.parametrize("path", ["orbit", "views"])

@@ -56,7 +56,7 @@ def files(tmp_path):
 
 def arguments(files, *extra):
     scene, views, out = files / "scene.ply", files / "views.json", files / "out"
-    return ["render", str(scene), "--views", str(views), "--out", str(out), *extra]
+    return ["render", str(scene), "--views", str(views), "--out", str(out), "--device", "cpu", *extra]
 
 
 def run(*args, **options):
@@ -329,7 +329,15 @@ def test_interrupt_of_a_process_is_quiet(files):
 
 
 def inspect_arguments(files, *extra):
-    return ["inspect", str(files / "scene.ply"), "--views", str(files / "views.json"), *map(str, extra)]
+    return [
+        "inspect",
+        str(files / "scene.ply"),
+        "--views",
+        str(files / "views.json"),
+        "--device",
+        "cpu",
+        *map(str, extra),
+    ]
 
 
 def test_inspect_prints_the_report_and_writes_its_files(files, capsys):
@@ -378,7 +386,7 @@ def test_inspect_without_matplotlib_names_the_extra(files, capsys, monkeypatch):
 
 def bake_arguments(files, *extra):
     scene, views, out = files / "scene.ply", files / "views.json", files / "new" / "baked.ply"
-    return ["bake", str(scene), "--views", str(views), "--out", str(out), *extra]
+    return ["bake", str(scene), "--views", str(views), "--out", str(out), "--device", "cpu", *extra]
 
 
 @pytest.mark.parametrize(("extra", "dilation"), [([], 0.3), (["--dilation", "0.5"], 0.5)])

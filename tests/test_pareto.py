@@ -383,6 +383,8 @@ def arguments(files, *extra):
         str(files / "views.json"),
         "--out",
         str(files / "out"),
+        "--device",
+        "cpu",
         *extra,
     ]
 
