@@ -170,7 +170,7 @@ class FoundScene:
         if is_dilated(footprint):
             return f"; right at the size of the training, for others: {command}"
         known = "" if self.trained_with else f"{self.path.name} names no footprint: if 3DGS trained it, "
-        return f"; {known}its Gaussians are too thin for {footprint.name} before: {command}"
+        return f"; {known}its Gaussians are too thin for {footprint.name}, so first: {command}"
 
 
 def is_dilated(footprint: Footprint) -> bool:
