@@ -6,9 +6,6 @@
 #include <ATen/ops/arange.h>
 #include <ATen/ops/zeros_like.h>
 #include <ATen/Parallel.h>
-#if defined(__unix__) || defined(__APPLE__)
-#include <pthread.h>
-#endif
 #if defined(__linux__)
 #include <sys/mman.h>
 #endif
@@ -17,16 +14,12 @@
 #include <chrono>
 #include <utility>
 
+#include "cpu/quota.h"
 #include "cpu/stages.h"
 #include "torch/views.h"
 
 namespace ar::ops {
 namespace {
-
-bool is_forked = false;
-#if defined(__unix__) || defined(__APPLE__)
-[[maybe_unused]] const int kWatchesForks = pthread_atfork(nullptr, nullptr, [] { is_forked = true; });
-#endif
 
 /// at::empty, in huge pages where Linux gives them to those who ask. What belongs to splats and pairs is visited in an
 /// order that is random in memory, and most of it is new memory in every pass: fewer pages are fewer misses and faults.
@@ -334,7 +327,10 @@ template <typename T> class CpuBackend final : public Backend {
 
 }  // namespace
 
-int thread_count() { return is_forked ? 1 : at::get_num_threads(); }
+int thread_count() {
+  static const int quota = cpu::cpu_quota();
+  return std::min(at::get_num_threads(), quota);
+}
 
 std::unique_ptr<Backend> make_cpu_backend(const Tensor& like) {
   const at::TensorOptions options = like.options().requires_grad(std::nullopt);
