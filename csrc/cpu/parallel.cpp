@@ -1,7 +1,7 @@
 // The threads that loops share. OpenMP is not used: at the end of a loop every thread of its team must have come, and
-// the first ones spin until then. On a busy machine the last one may have to wait for its turn until those that wait for
-// it have used up theirs. Here helpers take items while there are some. The thread that began the loop takes them as
-// well, so that it waits for no helper that has not begun an item.
+// the first ones spin until then. On a busy machine the last one may have to wait for its turn until those that wait
+// for it have used up theirs. Here helpers take items while there are some. The thread that began the loop takes them
+// as well, so that it waits for no helper that has not begun an item.
 #include "cpu/parallel.h"
 
 #if defined(__unix__) || defined(__APPLE__)
@@ -50,7 +50,7 @@ struct Loop {
   int64_t items;
   RunItem run;
   const void* body;
-  std::exception_ptr error;                   ///< what an item has thrown
+  std::exception_ptr error;                  ///< what an item has thrown
   alignas(64) std::atomic<int64_t> next{0};  ///< the first item that nobody has taken
 };
 
@@ -131,7 +131,9 @@ class Pool {
       close(place);
       const Seats seats = seats_[place].fetch_sub(kInside);
       if (count(seats, kInside) == 1 && (seats & kAwaited)) {
-        { const std::lock_guard lock(mutex_); }
+        {
+          const std::lock_guard lock(mutex_);
+        }
         left_.notify_all();
       }
     }

@@ -4,7 +4,7 @@
 // floating type; lists and state fit each other, the splats and the image; `count` of inspect exceeds every id. The
 // contents of lists were made by an earlier stage and are not checked.
 #include <ATen/ops/arange.h>
-#include <ATen/ops/zeros_like.h>
+#include <ATen/ops/empty_like.h>
 #include <ATen/Parallel.h>
 #if defined(__linux__)
 #include <sys/mman.h>
@@ -14,6 +14,7 @@
 #include <chrono>
 #include <utility>
 
+#include "cpu/parallel.h"
 #include "cpu/quota.h"
 #include "cpu/stages.h"
 #include "torch/views.h"
@@ -225,7 +226,7 @@ template <typename T> class CpuBackend final : public Backend {
       stages.blend_vjp(p);
       return out;
     }
-    out.dL_dchannels = at::zeros_like(channels.rows);
+    out.dL_dchannels = make_zeros_like(channels.rows);
     const Tensor channel_sums = make_buffer({pairs, std::min<int64_t>(count, cpu::kWindow)}, floats_);
     p.channel_sums = pointer<T>(channel_sums);
     p.channel_stride = channel_sums.size(1);
@@ -315,6 +316,18 @@ template <typename T> class CpuBackend final : public Backend {
     const Tensor camera_grads = at::zeros({cpu::chunks_of(p.gaussians.n), kCameraGradWidth}, floats_);
     p.camera_grads = pointer<CameraGrad<T>>(camera_grads);
     return camera_grads;
+  }
+
+  /// at::zeros_like on the threads of the other loops: those of torch spin while they wait for each other.
+  static Tensor make_zeros_like(const Tensor& contiguous) {
+    const Tensor out = at::empty_like(contiguous);
+    T* const numbers = pointer<T>(out);
+    const int64_t n = out.numel(), parts = cpu::chunks_of(n);
+    cpu::parallel_for(parts, thread_count(), [&](int64_t p) {
+      const cpu::Part part = cpu::part_of(n, parts, p);
+      std::fill(numbers + part.begin, numbers + part.end, T(0));
+    });
+    return out;
   }
 
   Tensor make_scratch(int threads, int64_t channels) const {

@@ -3,6 +3,7 @@
 
 #include <gtest/gtest.h>
 #if defined(__unix__)
+#include <sys/resource.h>
 #include <sys/wait.h>
 #include <unistd.h>
 #endif
@@ -11,6 +12,7 @@
 #include <atomic>
 #include <chrono>
 #include <condition_variable>
+#include <fstream>
 #include <memory>
 #include <mutex>
 #include <stdexcept>
@@ -89,9 +91,7 @@ TEST(ParallelTest, NobodyWaitsForThreadsThatDoNotCome) {
   // All threads that there are stay in the first loop until the second one is over.
   cpu::parallel_for(1000, kThreads, [](int64_t) {});
   Meeting inside(kThreads + 1), over(kThreads + 1);
-  std::thread first([&] {
-    cpu::parallel_for(kThreads, kThreads, [&](int64_t) { inside.meet() && over.meet(); });
-  });
+  std::thread first([&] { cpu::parallel_for(kThreads, kThreads, [&](int64_t) { inside.meet() && over.meet(); }); });
   EXPECT_TRUE(inside.meet());
   EXPECT_TRUE(runs_every_item_once(1000, kThreads));
   EXPECT_TRUE(over.meet());
@@ -135,26 +135,27 @@ TEST(ParallelTest, AnExceptionEndsTheLoop) {
 }
 
 #if defined(__unix__)
-/// In a child that is forked while `threads` threads have been at work.
-void expect_that_a_child_works(int threads) {
+/// Whether is_right() in a forked child.
+template <class IsRight> bool in_a_child(const IsRight& is_right) {
   const pid_t child = fork();
-  if (child == 0) {
-    bool is_right = runs_every_item_once(1000, threads);
-    Meeting meeting(2);
-    std::atomic<bool> have_met{true};
-    cpu::parallel_for(2, threads, [&](int64_t) {
-      if (!meeting.meet()) have_met = false;
-    });
-    _exit(is_right && have_met ? 0 : 1);
-  }
+  if (child == 0) _exit(is_right() ? 0 : 1);
   int status = -1;
-  ASSERT_EQ(waitpid(child, &status, 0), child);
-  EXPECT_TRUE(WIFEXITED(status) && WEXITSTATUS(status) == 0) << status;
+  return waitpid(child, &status, 0) == child && WIFEXITED(status) && WEXITSTATUS(status) == 0;
+}
+
+/// Whether loops run, on two threads at the same time.
+bool has_helpers() {
+  Meeting meeting(2);
+  std::atomic<bool> have_met{true};
+  cpu::parallel_for(2, 2, [&](int64_t) {
+    if (!meeting.meet()) have_met = false;
+  });
+  return have_met && runs_every_item_once(1000, 3);
 }
 
 TEST(ParallelTest, AForkedChildHasThreadsOfItsOwn) {
   EXPECT_TRUE(runs_every_item_once(1000, 3));
-  expect_that_a_child_works(3);
+  EXPECT_TRUE(in_a_child(has_helpers));
   EXPECT_TRUE(runs_every_item_once(1000, 3));
 }
 
@@ -162,9 +163,21 @@ TEST(ParallelTest, ForkedWhileAnotherThreadIsInALoop) {
   Meeting inside(3), over(3);
   std::thread other([&] { cpu::parallel_for(2, 2, [&](int64_t) { inside.meet() && over.meet(); }); });
   EXPECT_TRUE(inside.meet());
-  expect_that_a_child_works(2);
+  EXPECT_TRUE(in_a_child(has_helpers));
   EXPECT_TRUE(over.meet());
   other.join();
+}
+#endif
+
+#if defined(__linux__) && !defined(AR_SANITIZED)  // sanitizers need more room
+TEST(ParallelTest, WithoutRoomForThreadsTheCallerDoesAll) {
+  EXPECT_TRUE(in_a_child([] {
+    int64_t pages = 0;
+    std::ifstream("/proc/self/statm") >> pages;
+    const rlim_t room = rlim_t(pages) * sysconf(_SC_PAGESIZE) + (1 << 20);  // less than the stack of a thread
+    const rlimit limit = {room, room};
+    return setrlimit(RLIMIT_AS, &limit) == 0 && runs_every_item_once(1000, 40);
+  }));
 }
 #endif
 
