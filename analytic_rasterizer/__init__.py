@@ -2,11 +2,13 @@
 
 A drop-in replacement for `diff_gaussian_rasterization`. Where to look:
 
+- `Gaussians`, `View`: what is rendered, and from where (docs/library.md).
 - `GaussianRasterizationSettings`, `GaussianRasterizer`: rendering, with the interface of 3DGS 2023.
 - `FOOTPRINTS`, `set_default_footprint`, `footprint_weight`: the weight of a Gaussian in a pixel (docs/footprints.md).
 - `Effects`, `Outputs`, `Defocus`, `Motion`, `camera_settings`: depth, alpha, statistics, cameras (docs/effects.md).
-- `project`, `bin`, `blend`: the three stages of a rendering, each on its own (docs/library.md).
+- `project`, `list_tiles`, `blend`: the three stages of a rendering, each on its own (docs/library.md).
 - `losses`, `activations`, `optim`: the other parts of a training step (docs/losses.md).
+- `density`: how many Gaussians there are, in a training loop of one's own (docs/density.md).
 - `inspect_scene`, `plan`: what a scene calls for (docs/command-line.md).
 
 In modules of their own: `training`, `distributed`, `viewer`, `analysis`, `dialects` and `io` (docs/).
@@ -14,10 +16,16 @@ In modules of their own: `training`, `distributed`, `viewer`, `analysis`, `diale
 
 import torch  # noqa: F401  (its libraries must be loaded before the extension's)
 
-from . import activations, losses, optim
-from ._C import TILE, instruction_set
+from .installation import warn_if_built_for_another, warn_if_replaced, why_not_loaded
+
+try:
+    from ._C import BUILT_FOR, TILE, instruction_set
+except ImportError as error:
+    raise ImportError(why_not_loaded(error)) from error
+
+from . import activations, density, losses, optim
 from .analysis.planner import SceneReport, inspect_scene, plan
-from .camera import camera_settings, moved
+from .camera import View, camera_settings, moved
 from .effects import Defocus, Effects, GaussianStats, Motion, Outputs
 from .filters import apply_3d_filter, bake_dilation, bake_pixel, compute_3d_filter
 from .footprints import (
@@ -28,13 +36,13 @@ from .footprints import (
     resolve_footprint,
     set_default_footprint,
 )
-from .installation import warn_if_replaced
+from .gaussians import Gaussians
 from .outputs import normalized
 from .rasterizer import GaussianRasterizer, rasterize_gaussians
 from .relocation import compute_relocation
 from .settings import GaussianRasterizationSettings
 from .sh import needed_sh_degree
-from .stages import Splats, Stages, TileLists, bin, blend, project, render_stages
+from .stages import Splats, Stages, TileLists, blend, list_tiles, project, render_stages
 
 __version__ = "0.1.0"
 
@@ -47,25 +55,28 @@ __all__ = [
     "GaussianRasterizationSettings",
     "GaussianRasterizer",
     "GaussianStats",
+    "Gaussians",
     "Motion",
     "Outputs",
     "SceneReport",
     "Splats",
     "Stages",
     "TileLists",
+    "View",
     "activations",
     "apply_3d_filter",
     "bake_dilation",
     "bake_pixel",
-    "bin",
     "blend",
     "camera_settings",
     "compute_3d_filter",
     "compute_relocation",
+    "density",
     "footprint_weight",
     "get_default_footprint",
     "inspect_scene",
     "instruction_set",
+    "list_tiles",
     "losses",
     "moved",
     "needed_sh_degree",
@@ -79,4 +90,5 @@ __all__ = [
     "set_default_footprint",
 ]
 
+warn_if_built_for_another(BUILT_FOR)
 warn_if_replaced()

@@ -1,12 +1,15 @@
-"""Cameras: settings from a pose and focal lengths, differentiable in both, and the operators' argument `lens`."""
+"""Cameras: `View`; settings from a pose and focal lengths, differentiable in both; the operators' argument `lens`."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, fields, replace
 
+import numpy as np
 import torch
 
 from . import _C
+from .autocast import widened
 from .checks import check_tensors
 from .effects import Effects
 from .rotations import product
@@ -161,7 +164,7 @@ def make_lens(effects: Effects, settings, like: torch.Tensor) -> torch.Tensor:
         settings: A `GaussianRasterizationSettings`.
         like: A tensor whose dtype and device the result takes.
     """
-    members = effects.lens_members()
+    like, members = widened(like), effects.lens_members()
     tangents = (settings.tanfovx, settings.tanfovy)
     for name, tangent in zip(("tanfovx", "tanfovy"), tangents):
         _check_tangent(name, tangent)
@@ -207,6 +210,7 @@ def _copied(numbers: list[float], like: torch.Tensor) -> torch.Tensor:
 
 def view_center(view: torch.Tensor, proj: torch.Tensor, with_gradient: bool) -> torch.Tensor:
     """(2,) x/z and y/z at the centre of the picture, where clip_x = p_xx x + p_xz z is zero."""
+    view, proj = widened(view), widened(proj)
     view, proj = view.reshape(4, 4)[:3, :3], proj.reshape(4, 4)[:3, :2]  # transposed: they act on row vectors
     if not with_gradient:
         view, proj = view.detach(), proj.detach()
@@ -225,3 +229,96 @@ def is_off_center(settings) -> bool:
     center = view_center(settings.viewmatrix.double(), settings.projmatrix.double(), with_gradient=False)
     tangents = center.new_tensor([float(settings.tanfovx), float(settings.tanfovy)])
     return (1 + (center / tangents).abs().max() > _C.FRUSTUM_CLAMP + 1e-6).item()
+
+
+@dataclass(frozen=True)
+class View:
+    """A pinhole camera. Lengths in pixels; the image spans [0, width] x [0, height]."""
+
+    name: str  # of the picture, without directory and suffix
+    width: int
+    height: int
+    fx: float
+    fy: float
+    w2c: torch.Tensor  # (4, 4) float64, world to camera, OpenCV axes
+    cx: float | None = None  # principal point; None is the centre
+    cy: float | None = None
+
+    def __post_init__(self):
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.generic):  # which JSON does not hold
+                object.__setattr__(self, field.name, value.item())
+
+    def __eq__(self, other) -> bool:  # that of a dataclass fails at the tensor
+        if not isinstance(other, View):
+            return NotImplemented
+        same_pose = self.w2c is other.w2c or torch.equal(self.w2c, other.w2c)
+        return same_pose and self._other_fields() == other._other_fields()
+
+    def __hash__(self) -> int:
+        return hash(self._other_fields())
+
+    def _other_fields(self) -> tuple:
+        return tuple(getattr(self, field.name) for field in fields(self) if field.name != "w2c")
+
+    def size(self, scale: float = 1.0) -> tuple[int, int]:
+        """(width, height) of the picture at `scale`: rounded, at least 1."""
+        return max(1, round(self.width * scale)), max(1, round(self.height * scale))
+
+    def scaled(self, scale: float) -> View:
+        """The view with `size(scale)` pixels over the same field of view.
+
+        Raises ValueError for a scale that is not positive and finite.
+        """
+        if not (math.isfinite(scale) and scale > 0):
+            raise ValueError(f"scale must be positive and finite, got {scale}")
+        width, height = self.size(scale)
+        x, y = width / self.width, height / self.height
+        cx, cy = (c if c is None else c * factor for c, factor in ((self.cx, x), (self.cy, y)))
+        return replace(self, width=width, height=height, fx=x * self.fx, fy=y * self.fy, cx=cx, cy=cy)
+
+    def framed(self, scale: int, crop: tuple[int, int] | None = None) -> View:
+        """The view at 1/`scale` of its size, or the middle `crop` = (width, height) of that.
+
+        Pixels become `scale` times as large: where the size is not a multiple of `scale`, the remainder at the right
+        and at the bottom is cut off. A crop larger than the picture has no effect. A cropped view is a narrower
+        camera, not a part of a picture.
+        """
+        size = [max(1, length // scale) for length in (self.width, self.height)]
+        width, height = size if crop is None else map(min, size, crop)
+        centre = (self.width / 2 if self.cx is None else self.cx, self.height / 2 if self.cy is None else self.cy)
+        cx, cy = (c / scale - (have - want) // 2 for c, have, want in zip(centre, size, (width, height)))
+        return replace(self, width=width, height=height, fx=self.fx / scale, fy=self.fy / scale, cx=cx, cy=cy)
+
+    def settings(
+        self,
+        scale: float = 1.0,
+        background=(0.0, 0.0, 0.0),
+        sh_degree: int = 3,
+        footprint: str | None = None,
+        *,
+        device="cpu",
+        **options,
+    ) -> GaussianRasterizationSettings:
+        """Settings that render this view with `size(scale)` pixels over the same field of view.
+
+        `footprint` and `options` are those of GaussianRasterizationSettings; None leaves the
+        default footprint. Raises ValueError for a scale that is not positive, and what the
+        settings raise.
+        """
+        view = self.scaled(scale)
+        return camera_settings(
+            view.w2c,
+            view.width,
+            view.height,
+            view.fx,
+            view.fy,
+            view.cx,
+            view.cy,
+            bg=torch.tensor(background, dtype=torch.float32, device="cpu"),
+            sh_degree=sh_degree,
+            footprint=footprint,
+            device=device,
+            **options,
+        )

@@ -31,7 +31,7 @@ def _register(name: str):
 
 
 def _lists(like: torch.Tensor, rows: int, a, keep: bool, ids=None) -> list[torch.Tensor]:
-    """What `bin` makes of `rows` splats of one camera: ListTensors of csrc/torch/backend.h."""
+    """What `list_tiles` makes of `rows` splats of one camera: ListTensors of csrc/torch/backend.h."""
     context = torch.library.get_ctx()
     on_cuda = like.device.type == "cuda"
     side = _C.tile_size(a.footprint, a.option, a.image_width, a.image_height, on_cuda)

@@ -1,11 +1,11 @@
-"""The three stages of a rendering, each on its own: `project`, `bin`, `blend`.
+"""The three stages of a rendering, each on its own: `project`, `list_tiles`, `blend`.
 
 `GaussianRasterizer` runs the three in one operator. Call them one by one to render several pictures from one
 projection, several cameras at once, or splats that come from elsewhere. All run on the CPU (float32, float64) and on
 CUDA (float32).
 
     splats = ar.project(settings, means3D, opacities, scales=scales, rotations=rotations)
-    lists = ar.bin(splats)
+    lists = ar.list_tiles(splats)
     image, alpha = ar.blend(splats, lists, features[splats.gaussian_ids])
 """
 
@@ -102,7 +102,7 @@ _ROWS = tuple(field.name for field in fields(Splats))[:9]  # in the order in whi
 
 @dataclass(frozen=True)
 class TileLists:
-    """Which splats may show in every tile, front to back. `bin` makes it for `blend`.
+    """Which splats may show in every tile, front to back. `list_tiles` makes it for `blend`.
 
     On CUDA tiles share lists in the rare frame that has more pairs of a splat and a tile than there was room for: those
     where `counts[0]` is larger than the length of `pairs`. `render_stages` has a list for each tile in every case.
@@ -232,7 +232,7 @@ def _same_filter(a: GaussianRasterizationSettings, b: GaussianRasterizationSetti
     return one.device == other.device and one.shape == other.shape and torch.equal(one, other)
 
 
-def bin(splats: Splats, *, background: torch.Tensor | None = None, keep: bool = True) -> TileLists:
+def list_tiles(splats: Splats, *, background: torch.Tensor | None = None, keep: bool = True) -> TileLists:
     """Lists the splats of every tile, in the order of depth. Without gradient. Splats of equal depth keep their order.
 
     Args:
@@ -281,7 +281,7 @@ def blend(
 
     Args:
         splats: The splats from which `lists` were made.
-        lists: What `bin` returned, with keep=True where a gradient is wanted.
+        lists: What `list_tiles` returned, with keep=True where a gradient is wanted.
         features: (N, K) a row per splat, K from 1 to 512; None: the splats' colours. A feature that is not finite
             spreads to the pixels of its splat.
         background: (K,) for all cameras or (C, K); None: zero.
@@ -341,7 +341,7 @@ class Stages(NamedTuple):
             and with 9 and 16 cells in smaller ones, where they have 4x4; those of `box` with 16 samples have 4x4, and
             with 4 in images of fewer than 4096 tiles of 16x16 px 8x8.
         tile_samples: (tiles,) int32, samples of each tile where the footprint chooses them (`adaptive`), else empty.
-        seconds: Time of each stage, s: "project", "bin", "blend".
+        seconds: Time of each stage, s: "project", "list_tiles", "blend".
     """
 
     color: torch.Tensor
@@ -400,6 +400,6 @@ def render_stages(
         places = kept.cumsum(0) - 1
         splats, pairs = splats[kept], places[pairs[: lists["tile_offsets"][-1], 0].long()].int()
     z = depths(means3D, settings.viewmatrix)[ids.long()]
-    times = dict(zip(("project", "bin", "blend"), seconds.tolist()))
+    times = dict(zip(("project", "list_tiles", "blend"), seconds.tolist()))
     means2d = splats[:, :2].clone()
     return Stages(color, radii, ids, z, means2d, pairs, lists["tile_offsets"], lists["tile_samples"], times)

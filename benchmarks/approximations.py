@@ -35,6 +35,7 @@ import analytic_rasterizer as ar
 from analytic_rasterizer import _C, io
 from analytic_rasterizer.analysis.reference import UNFILTERED, image_errors, supersampled
 from analytic_rasterizer.analysis.tables import markdown_table
+from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.rotations import rotation_matrices
 
 ALPHA_MAX, TRANSMITTANCE_MIN = 0.99, 1e-4
@@ -71,8 +72,8 @@ class Splats:
     color (N, 3), whiten (N, 3, 3) camera space to units of the Gaussian's axes, centre (N, 3) camera space.
     """
 
-    def __init__(self, scene: io.Scene, view: io.View):
-        scene = io.Scene(*(field.double() for field in scene[:-1]), scene.sh_degree)
+    def __init__(self, scene: Gaussians, view: io.View):
+        scene = scene.map(torch.Tensor.double)
         settings = view.settings(sh_degree=scene.sh_degree, footprint=UNFILTERED)
         doubles = {name: getattr(settings, name).double() for name in ("viewmatrix", "projmatrix", "campos", "bg")}
         # As opaque as can be, so that projection culls none for being faint.
@@ -173,7 +174,7 @@ def render(s: Splats, view: io.View, corner: tuple[int, int], size: tuple[int, i
     return image.permute(2, 0, 1)
 
 
-def measure(scene: io.Scene, view: io.View, size: tuple[int, int], samples: int) -> dict[str, float]:
+def measure(scene: Gaussians, view: io.View, size: tuple[int, int], samples: int) -> dict[str, float]:
     """PSNR [dB] against the first picture, of the library's samples and of every variant."""
     size = min(size[0], view.width), min(size[1], view.height)
     corner = (view.width - size[0]) // 2, (view.height - size[1]) // 2

@@ -30,7 +30,8 @@ from analytic_rasterizer import io
 from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import added_memory
 from analytic_rasterizer.distributed import rasterize_bands
-from analytic_rasterizer.training.ranks import Ranks, even_counts
+from analytic_rasterizer.distributed.ranks import Ranks, even_counts
+from analytic_rasterizer.gaussians import Gaussians
 
 COLUMNS = ("seconds", "scene_bytes", "peak_bytes")
 
@@ -97,22 +98,22 @@ def work(rank: int, world: int, folder: str, args: argparse.Namespace) -> None:
 
     _, extra = added_memory(render, device)
     seconds = statistics.median([render() for _ in range(args.rounds)])
-    scene_bytes = sum(field.nbytes for field in own[:-1])
+    scene_bytes = sum(field.nbytes for field in own)
     results = ranks.exchange(dict(zip(COLUMNS, (seconds, scene_bytes, scene_bytes + extra))))
     if rank == 0:
         torch.save({name: max(of_rank[name] for of_rank in results) for name in COLUMNS}, f"{folder}/results.pt")
     dist.destroy_process_group()
 
 
-def shard_of(scene: io.Scene, ranks: Ranks, args: argparse.Namespace, device: torch.device) -> io.Scene:
+def shard_of(scene: Gaussians, ranks: Ranks, args: argparse.Namespace, device: torch.device) -> Gaussians:
     """What a rank holds of all copies."""
     rows = ranks.part_of(even_counts(len(scene.means), ranks.world))
-    own = densified(io.Scene(*(field[rows] for field in scene[:-1]), scene.sh_degree).to(device), args.times)
+    own = densified(scene.rows(rows).to(device), args.times)
     width = scene.means[:, 0].max() - scene.means[:, 0].min()
     aside = torch.arange(args.copies, device=device).repeat_interleave(len(own.means)) * width.to(device)
-    fields = [field.repeat(args.copies, *[1] * (field.dim() - 1)) for field in own[:-1]]
-    fields[0][:, 0] += aside
-    return io.Scene(*fields, scene.sh_degree)
+    copies = own.map(lambda field: field.repeat(args.copies, *[1] * (field.dim() - 1)))
+    copies.means[:, 0] += aside
+    return copies
 
 
 if __name__ == "__main__":

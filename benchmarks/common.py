@@ -19,6 +19,7 @@ from analytic_rasterizer.analysis.timing import (
     seconds_of,
     warm_up_cuda,
 )
+from analytic_rasterizer.gaussians import Gaussians
 
 ROUNDS = {"cpu": 5, "cuda": 30}
 CLOCKS = {"cpu": seconds_of, "cuda": event_seconds}  # seconds of a call
@@ -82,7 +83,7 @@ def has_cuda() -> bool:
     return torch.cuda.is_available() and ar._C.has_cuda
 
 
-def print_setup(scene: io.Scene, views: list[io.View], device: str) -> None:
+def print_setup(scene: Gaussians, views: list[io.View], device: str) -> None:
     gaussians = f"{len(scene.means)} Gaussians of SH degree {scene.sh_degree}"
     print(f"{gaussians}, {len(views)} views of {views[0].width}x{views[0].height}, {describe_machine(device)}")
 

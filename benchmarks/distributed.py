@@ -39,11 +39,11 @@ from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import added_memory
 from analytic_rasterizer.cli.launch import make_group
 from analytic_rasterizer.distributed.exchange import Route
+from analytic_rasterizer.distributed.ranks import Ranks, even_counts
+from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.rotations import rotation_matrices
 from analytic_rasterizer.training import TrainingOptions
-from analytic_rasterizer.training.model import Gaussians
 from analytic_rasterizer.training.pictures import Pictures
-from analytic_rasterizer.training.ranks import Ranks, even_counts
 from analytic_rasterizer.training.sharded import ShardedTrainer
 from analytic_rasterizer.training.trainer import Trainer
 
@@ -157,8 +157,8 @@ class Case:
         self.ranks, self.device, self.steps, self.splats = ranks, device, args.steps, 0.0
         scene = load_scene(args.scene)
         rows = ranks.part_of(even_counts(len(scene.means), ranks.world))
-        own = io.Scene(*(field[rows] for field in scene[:-1]), scene.sh_degree).to(device)
-        start = Gaussians.from_scene(densified(own, args.times), scene.sh_degree)
+        own = scene.rows(rows).to(device)
+        start = densified(own, args.times).trainable()
         # All degrees of the harmonics from the first step on, and no last step.
         options = {"sh_degree": scene.sh_degree, "sh_every": 1, "iterations": 2**30, "density": "none"}
         options = TrainingOptions(footprint=args.footprint, **options)
@@ -220,18 +220,19 @@ class Case:
             torch.cuda.synchronize(self.device)
 
 
-def densified(scene: io.Scene, times: int) -> io.Scene:
+def densified(scene: Gaussians, times: int) -> Gaussians:
     """So many Gaussians in the place of each, drawn from it, whose covariances with that of their means make its own.
 
     Each rank draws anew.
     """
     if times == 1:
         return scene
-    means, scales, rotations, opacities, shs = (field.repeat_interleave(times, 0) for field in scene[:5])
-    generator = torch.Generator(means.device).manual_seed(0)
-    along = (1 - 1 / times) ** 0.5 * scales * torch.randn(means.shape, generator=generator, device=means.device)
-    means = means + (rotation_matrices(rotations) * along[:, None, :]).sum(2)
-    return io.Scene(means, scales / times**0.5, rotations, opacities, shs, scene.sh_degree)
+    several = scene.map(lambda field: field.repeat_interleave(times, 0))
+    means, generator = several.means, torch.Generator(scene.means.device).manual_seed(0)
+    normal = torch.randn(means.shape, generator=generator, device=means.device)
+    along = (1 - 1 / times) ** 0.5 * several.scales * normal
+    means = means + (rotation_matrices(several.rotations) * along[:, None, :]).sum(2)
+    return several._replace(means=means).with_activated(scales=several.scales / times**0.5)
 
 
 def pictures_of_noise(views: list[io.View], scale: float, device: torch.device) -> Pictures:

@@ -24,12 +24,13 @@ from collections.abc import Callable
 
 import torch
 from common import CLOCKS, make_parser, mean_of, measure, parse, print_setup, save_json
-from scene_files import load_scene, pad_sh
+from scene_files import load_scene
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import effects, io
 from analytic_rasterizer.analysis.tables import markdown_table
 from analytic_rasterizer.analysis.timing import Case, fixed_weights
+from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.outputs import depths
 
 FOOTPRINTS = ["box:samples=1", "box:samples=4"]
@@ -89,7 +90,7 @@ def format_results(results: dict[str, dict]) -> str:
 class EffectCase(Case):
     """One view of a scene, rendered plainly until it is changed, and the numbers that effects take from it."""
 
-    def __init__(self, scene: io.Scene, views: list[io.View], view: io.View, footprint: str):
+    def __init__(self, scene: Gaussians, views: list[io.View], view: io.View, footprint: str):
         super().__init__(scene, view, footprint)
         self.scene, self.views, self.view = scene, views, view
         self.leaves = []  # what has a gradient besides the Gaussians: fields of the settings
@@ -180,7 +181,7 @@ class EffectCase(Case):
 
     def with_degree(self, degree: int) -> EffectCase:
         """Harmonics up to `degree` of coefficients for degree 4, zero where the scene has none."""
-        return self.change({"sh_degree": degree}, {"shs": pad_sh(self.scene, 4).shs})
+        return self.change({"sh_degree": degree}, {"shs": self.scene.with_sh_degree(4).shs})
 
 
 def effect(**fields) -> Callable[[EffectCase], EffectCase]:

@@ -25,6 +25,7 @@ import torch
 
 from analytic_rasterizer import _C, io
 from analytic_rasterizer.analysis.timing import Case
+from analytic_rasterizer.gaussians import Gaussians
 
 FURTHER = {"antialiasing": False, "kernel_size": 0.1}
 """Settings that forks of 3DGS 2023 have besides, and what they get; `subpixel_offset` is zero."""
@@ -36,7 +37,7 @@ class GsplatCase(Case):
     needs_cuda = True
     like, mode = "point", "classic"
 
-    def __init__(self, scene: io.Scene, view: io.View):
+    def __init__(self, scene: Gaussians, view: io.View):
         super().__init__(scene, view, self.like)
         self.rasterization = importlib.import_module("gsplat").rasterization
         del self.inputs["means2D"]  # its function has no such argument
@@ -67,7 +68,7 @@ class ModuleCase(Case):
 
     needs_cuda = True
 
-    def __init__(self, scene: io.Scene, view: io.View, module: ModuleType, like: str):
+    def __init__(self, scene: Gaussians, view: io.View, module: ModuleType, like: str):
         super().__init__(scene, view, like)
         self.like = like
         offsets = torch.zeros(view.height, view.width, 2, device=scene.means.device)
@@ -86,7 +87,7 @@ class ModuleCase(Case):
 
 PEERS = {"gsplat": GsplatCase, "gsplat_antialiased": GsplatAntialiasedCase}
 
-Peer = Callable[[io.Scene, io.View], Case]
+Peer = Callable[[Gaussians, io.View], Case]
 
 
 def find_peers(names: list[str], device: str) -> dict[str, Peer]:
@@ -122,6 +123,6 @@ def _find(name: str) -> Peer:
     return partial(ModuleCase, module=module, like=like or "point")
 
 
-def mean_difference(case: Case, scene: io.Scene, view: io.View) -> float:
+def mean_difference(case: Case, scene: Gaussians, view: io.View) -> float:
     """Of a peer's picture from ours with the footprint it stands for: mean of |difference|, colours from 0 to 1."""
     return (case.forward() - Case(scene, view, case.like).forward()).abs().mean().item()

@@ -36,6 +36,7 @@ from speed import STAGES, SpeedCase, time_round
 from analytic_rasterizer import io
 from analytic_rasterizer.analysis import tables
 from analytic_rasterizer.analysis.timing import describe_machine, in_turn
+from analytic_rasterizer.gaussians import Gaussians
 
 GAUSSIANS = {"cpu": "1e4,3e4,1e5,3e5", "cuda": "1e5,3e5,1e6,3e6,1e7,3e7"}
 SIZES = {"cpu": "240x135,480x270,960x540,1920x1080", "cuda": "240x135,480x270,960x540,1920x1080,3840x2160,7680x4320"}
@@ -117,7 +118,7 @@ def parse_count(text: str) -> int:
 # ----------------------------------------------------------------------------------------- what is timed
 
 
-def make_scene(count: int, view: io.View, sh_degree: int, device: str) -> io.Scene:
+def make_scene(count: int, view: io.View, sh_degree: int, device: str) -> Gaussians:
     """Round Gaussians all over the view, at random depths, each SIGMA px wide there."""
     generator = torch.Generator(device).manual_seed(0)
 
@@ -127,13 +128,12 @@ def make_scene(count: int, view: io.View, sh_degree: int, device: str) -> io.Sce
     depths = DEPTHS[0] + (DEPTHS[1] - DEPTHS[0]) * draw(1)
     pixels = draw(2) * torch.tensor([view.width, view.height], device=device)
     from_axis = pixels - torch.tensor([view.width / 2, view.height / 2], device=device)
-    return io.Scene(
+    return Gaussians.from_activated(
         means=torch.cat([from_axis / view.fx * depths, depths], dim=1),
         scales=(SIGMA / view.fx * depths).expand(count, 3).contiguous(),
         rotations=torch.tensor([1.0, 0.0, 0.0, 0.0], device=device).repeat(count, 1),
         opacities=torch.full((count, 1), OPACITY, device=device),
         shs=draw((sh_degree + 1) ** 2, 3) - 0.5,
-        sh_degree=sh_degree,
     )
 
 

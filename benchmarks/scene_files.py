@@ -10,45 +10,39 @@ turns what `analytic_rasterizer.io.load_scene` reads into an .npz that numpy alo
 from __future__ import annotations
 
 import argparse
-import math
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from analytic_rasterizer import io
+from analytic_rasterizer.gaussians import Gaussians
 
-NAMES = io.Scene._fields[:-1]
+NAMES = ("means", "scales", "rotations", "opacities", "shs")
 
 
-def load_scene(path: str) -> io.Scene:
+def load_scene(path: str) -> Gaussians:
     """The scene of an .npz as above, or of anything else that `io.load_scene` reads, on the CPU."""
     if Path(path).suffix != ".npz":
         return io.load_scene(path)
     with np.load(path) as file:
         fields = {name: torch.from_numpy(file[name].astype(np.float32)) for name in NAMES}
-    return io.Scene(**fields, sh_degree=math.isqrt(fields["shs"].shape[1]) - 1)
+    return Gaussians.from_activated(**fields)
 
 
-def save_npz(path: str, scene: io.Scene) -> None:
+def save_npz(path: str, scene: Gaussians) -> None:
     """Writes what `load_scene` reads."""
     np.savez(path, **{name: getattr(scene, name).cpu().numpy() for name in NAMES})
 
 
-def pad_sh(scene: io.Scene, degree: int) -> io.Scene:
-    """The scene with zeros for the coefficients that it lacks up to `degree`, which is at least its own."""
-    missing = (degree + 1) ** 2 - scene.shs.shape[1]
-    return scene._replace(shs=torch.nn.functional.pad(scene.shs, (0, 0, 0, missing)), sh_degree=degree)
-
-
-def load_padded(path: str, degree: int | None) -> io.Scene:
+def load_padded(path: str, degree: int | None) -> Gaussians:
     """The scene of `load_scene`, padded to a degree if there is one. Ends the program where that is below its own."""
     scene = load_scene(path)
     if degree is None:
         return scene
     if degree < scene.sh_degree:
         raise SystemExit(f"--sh-degree {degree} is below the scene's, {scene.sh_degree}")
-    return pad_sh(scene, degree)
+    return scene.with_sh_degree(degree)
 
 
 def main() -> None:

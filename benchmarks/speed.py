@@ -44,9 +44,10 @@ from analytic_rasterizer import io
 from analytic_rasterizer.analysis.pareto import parse_method
 from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import Case, event_seconds, seconds_of
+from analytic_rasterizer.gaussians import Gaussians
 
 FOOTPRINTS = ["box:samples=1", "point", "mip", "cumulant", "analytic", "box:samples=2", "box:samples=4"]
-STAGES = ("project", "bin", "blend")
+STAGES = ("project", "list_tiles", "blend")
 HOST = ("host op", "host rasterizer", "host f+b")
 
 
@@ -74,7 +75,7 @@ def add_against_and_queued(parser: argparse.ArgumentParser) -> None:
     add("--queued", action="store_true", help="with CUDA, leave out the time that the host takes")
 
 
-def measure_scene(args: argparse.Namespace, scene: io.Scene, views: list[io.View]) -> tuple[dict, dict]:
+def measure_scene(args: argparse.Namespace, scene: Gaussians, views: list[io.View]) -> tuple[dict, dict]:
     """(means over the views, numbers of every view), each by footprint and peer; seconds and bytes."""
     peers = find_peers(args.against, args.device)
     cases = {name: [SpeedCase(scene, view, name) for view in views] for name in args.footprints}
@@ -112,7 +113,7 @@ def format_results(results: dict[str, dict], device: str) -> str:
 class SpeedCase(Case):
     """A case whose stages and op can be run by themselves, of a footprint or NAME@N."""
 
-    def __init__(self, scene: io.Scene, view: io.View, method: str):
+    def __init__(self, scene: Gaussians, view: io.View, method: str):
         method = parse_method(method)
         super().__init__(scene, view, method.footprint, method.supersampling)
         footprint = self.settings.footprint

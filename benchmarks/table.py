@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 
 from common import add_measuring, parse, save_json
-from scene_files import load_scene, pad_sh
+from scene_files import load_scene
 from speed import add_against_and_queued, measure_scene
 
 from analytic_rasterizer import io
@@ -32,7 +32,7 @@ def main() -> None:
     args = parse_arguments()
     columns = {}
     for label, (scene_file, views_file) in args.columns.items():
-        scene, views = pad_sh(load_scene(scene_file), SH_DEGREE).to(args.device), io.load_views(views_file)
+        scene, views = load_scene(scene_file).with_sh_degree(SH_DEGREE).to(args.device), io.load_views(views_file)
         columns[label], _ = measure_scene(args, scene, views)
     print(f"{describe_machine(args.device)}; forward / forward + backward, ms\n")
     print(format_columns(columns))

@@ -21,7 +21,17 @@ from analytic_rasterizer import render_stages
 from analytic_rasterizer.analysis.reference import UNFILTERED, image_errors, refine, supersampled
 from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.cli import arguments
-from analytic_rasterizer.io import Scene, View, optional_import, save_scene, save_views, to_image
+from analytic_rasterizer.gaussians import Gaussians
+from analytic_rasterizer.io import (
+    SceneMetadata,
+    View,
+    optional_import,
+    save_image,
+    save_scene,
+    save_views,
+    to_image,
+    write_text,
+)
 
 CANVAS = (384, 256)  # the target is drawn in these units; also the default size of the picture
 FOCAL = 460.0  # canvas units
@@ -72,7 +82,7 @@ class Brush:
             along = 0.75 * length / count
             self.stamp(at[:, 0], at[:, 1], along, width / 3, angle, depth, color, opacity)
 
-    def scene(self) -> Scene:
+    def scene(self) -> Gaussians:
         """The Gaussians that project to these stamps under `make_target`'s view."""
         x, y, along, across, angle, depth, opacity = torch.cat(self.parts)[:, :7].unbind(1)
         color = torch.cat(self.parts)[:, 7:]
@@ -86,10 +96,10 @@ class Brush:
             opacity[:, None],
             ((color - 0.5) / math.sqrt(1 / (4 * math.pi)))[:, None],
         )
-        return Scene(*(field.float().contiguous() for field in fields), 0)
+        return Gaussians.from_activated(*(field.float().contiguous() for field in fields))
 
 
-def make_target() -> tuple[Scene, View]:
+def make_target() -> tuple[Gaussians, View]:
     """The target and the view that frames it at CANVAS size, always the same."""
     random = torch.Generator().manual_seed(7)
     brush = Brush()
@@ -248,7 +258,7 @@ def run(out, size: tuple[int, int] = CANVAS, device="cpu") -> dict:
         raise ValueError(f"size must be positive multiples of 8, got {size[0]} x {size[1]}")
     out = Path(out)
     scene, view = make_target()
-    save_scene(out / "target.ply", scene)
+    save_scene(out / "target.ply", scene, SceneMetadata(footprint="moment"))
     zoom = size[0] / view.width  # pixels are square whatever the size
     view = View(view.name, *size, FOCAL * zoom, FOCAL * zoom, view.w2c)
     save_views(out / "views.json", [view])
@@ -269,9 +279,9 @@ def run(out, size: tuple[int, int] = CANVAS, device="cpu") -> dict:
 
     for picture in pictures:
         name = picture.footprint.replace(":samples=", "")
-        to_image(picture.color).save(out / f"{name}_{picture.reduction}.png")
+        save_image(out / f"{name}_{picture.reduction}.png", picture.color)
     for reduction, color in truth.items():
-        to_image(color).save(out / f"reference_{reduction}.png")
+        save_image(out / f"reference_{reduction}.png", color)
     results = {
         "size": list(size),
         "gaussians": len(scene.means),
@@ -286,12 +296,12 @@ def run(out, size: tuple[int, int] = CANVAS, device="cpu") -> dict:
             {key: value for key, value in picture._asdict().items() if key != "color"} for picture in pictures
         ],
     }
-    (out / "results.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-    draw_sheet(pictures, truth, results).save(out / "contact_sheet.png", optimize=True)
+    write_text(out / "results.json", json.dumps(results, indent=1) + "\n")
+    save_image(out / "contact_sheet.png", draw_sheet(pictures, truth, results), optimize=True)
     return results
 
 
-def _render(scene: Scene, view: View, scale: float, footprint: str):
+def _render(scene: Gaussians, view: View, scale: float, footprint: str):
     """(color on the CPU, seconds of the fastest of REPEATS renders)."""
     settings = view.settings(scale, PAPER, 0, footprint, device=scene.means.device)
     runs = [render_stages(settings, **scene.arguments()) for _ in range(REPEATS)]
@@ -304,7 +314,7 @@ def _errors(color: torch.Tensor, truth: torch.Tensor) -> tuple[float, float, flo
     return errors["psnr"], errors["rmse"], errors["max"]
 
 
-def _converged_reference(scene: Scene, view: View, renders: dict):
+def _converged_reference(scene: Gaussians, view: View, renders: dict):
     """({reduction: reference}, density, {reduction: RMSE against half the density})."""
     refined = refine(
         lambda density: _reduced(supersampled(scene, view, density, background=PAPER)),

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from analytic_rasterizer import io
+from analytic_rasterizer.gaussians import SH_C0, Gaussians
 
 image = pytest.importorskip("PIL.Image", reason="needs the train extra")
 
@@ -76,11 +77,11 @@ def circle(count: int, size=(32, 32)) -> list[io.View]:
     return [io.View(f"r_{i}", *size, 36.0, 36.0, looking_at_origin(0.3 * (i - count / 2))) for i in range(count)]
 
 
-def truth_gaussians() -> g.Gaussians:
+def truth_gaussians() -> Gaussians:
     """A few coloured Gaussians."""
     generator = torch.Generator().manual_seed(5)
     points, _ = g.random_points(12, seed=5)
-    gaussians = g.gaussians_at(points, torch.rand(12, 3, generator=generator), 0)
+    gaussians = Gaussians.from_points(points, torch.rand(12, 3, generator=generator), 0)
     gaussians = gaussians._replace(log_scales=torch.full((12, 3), 0.25).log())
     return gaussians._replace(logit_opacities=torch.full((12, 1), 3.0))
 
@@ -89,9 +90,10 @@ def draw_picture(view, opaque: bool) -> np.ndarray:
     """The Gaussians on transparent, (H, W, 4) uint8 of straight alpha, or on black, (H, W, 3)."""
     truth = truth_gaussians()
     settings = view.settings(1, sh_degree=0, footprint="exact")
-    color, _ = truth.render(settings)
+    color, _ = g.render(truth.arguments(), settings)
     if not opaque:
-        alpha, _ = truth._replace(shs=torch.full((12, 1, 3), 0.5 / g.SH_C0)).render(settings)
+        white = truth._replace(shs=torch.full((12, 1, 3), 0.5 / SH_C0))
+        alpha, _ = g.render(white.arguments(), settings)
         color = torch.cat([color / alpha[:1].clamp_min(1e-3), alpha[:1]])
     return (255 * color.clamp(0, 1)).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
 

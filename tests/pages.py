@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from analytic_rasterizer import io, render_stages, viewer
+from analytic_rasterizer.gaussians import Gaussians
 
 PATIENCE = 600
 """Seconds to wait for the page: drawing in software on a busy machine takes its time."""
@@ -71,11 +72,10 @@ def random_scene(count=2000, degree=3, seed=3):
     x, y = (torch.rand(2, count, generator=g) - 0.5) * torch.tensor([[1.3], [1.0]]) * z
     shs = 0.05 * torch.randn(count, (degree + 1) ** 2, 3, generator=g)
     shs[:, 0] = 3 * (torch.rand(count, 3, generator=g) - 0.5)  # colours from 0.08 to 0.92, before the other bands
-    return io.Scene(
+    return Gaussians.from_activated(
         torch.stack([x, y, z], 1),
         (0.03 * torch.exp(torch.randn(count, 3, generator=g))).clamp(max=0.5),
         torch.randn(count, 4, generator=g),
         torch.sigmoid(1.5 * torch.randn(count, 1, generator=g)),
         shs,
-        degree,
     )

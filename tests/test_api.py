@@ -921,7 +921,7 @@ def _calls(footprint, options, device, full):
         del scene["means2D"], leaves["means2D"]
         ar.render_stages(settings, **scene)
         splats = ar.project([settings, settings], **leaves)
-        image, alpha = ar.blend(splats, ar.bin(splats), torch.ones(len(splats.means2d), 5, device=device))
+        image, alpha = ar.blend(splats, ar.list_tiles(splats), torch.ones(len(splats.means2d), 5, device=device))
         (image.sum() + alpha.sum()).backward()
         offset, cov2d = torch.ones(7, 2, device=device), torch.tensor([2.0, 0.3, 1.0], device=device)
         ar.footprint_weight(offset.requires_grad_(), cov2d, footprint, **dict(options)).sum().backward()
@@ -991,6 +991,6 @@ def test_opcheck_of_bin_in_a_large_image(device):
     settings = camera.settings(torch.float32, device, footprint="moment", samples=1)
     scene = {name: value for name, value in scene32(device).items() if name != "means2D"}
     with Calls() as mode:
-        ar.bin(ar.project(settings, **scene))
+        ar.list_tiles(ar.project(settings, **scene))
     function, arguments = mode.first["bin"]
     torch.library.opcheck(function, arguments, test_utils=("test_schema", "test_faketensor"))

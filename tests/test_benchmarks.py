@@ -24,6 +24,7 @@ from analytic_rasterizer import io, viewer
 from analytic_rasterizer.analysis.timing import added_memory
 from analytic_rasterizer.dialects import DIALECTS
 from analytic_rasterizer.dialects.gsplat import rasterization
+from analytic_rasterizer.gaussians import Gaussians
 
 
 @pytest.fixture
@@ -32,7 +33,7 @@ def small_scene(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     made = scenes.cast(scenes.random_scene(3, 50, degree=1), torch.float32)
     fields = {"means": made["means3D"], **{k: made[k] for k in ("scales", "rotations", "opacities", "shs")}}
-    importlib.import_module("scene_files").save_npz(tmp_path / "scene.npz", io.Scene(**fields, sh_degree=1))
+    importlib.import_module("scene_files").save_npz(tmp_path / "scene.npz", Gaussians.from_activated(**fields))
     camera = scenes.Camera().world_to_camera()
     io.save_views(tmp_path / "views.json", [io.View(name, 40, 30, 33.0, 30.0, camera, 21.0) for name in "ab"])
     return tmp_path
@@ -253,7 +254,7 @@ def test_scaling(device, tmp_path, monkeypatch, capsys):
         # A splat reaches 3.6 px, or 4.1 with a pixel: from its pairs in a large image, or with those cut off at edges.
         assert 1.0 <= row["pairs"] / row["gaussians"] <= 4.0
         assert all(math.isfinite(value) for value in row.values() if not isinstance(value, str))
-        assert min(row["project"], row["bin"], row["blend"], row["memory_bytes"]) > 0
+        assert min(row["project"], row["list_tiles"], row["blend"], row["memory_bytes"]) > 0
     assert rows[1]["pairs"] / rows[0]["pairs"] == pytest.approx(4, rel=0.1)
     assert written["threads"] == {}
     lines = capsys.readouterr().out.splitlines()
@@ -480,13 +481,12 @@ def test_order_of_each_ray(small_scene):
     """Two plates that cross: on each side another one is in front, whichever has the nearer centre."""
     benchmark = importlib.import_module("approximations")
     turn = math.pi / 8  # half of the angle between plate and picture
-    scene = io.Scene(
+    scene = Gaussians.from_activated(
         means=torch.tensor([[0.0, 0.0, 4.0], [0.0, 0.0, 4.01]]),
         scales=torch.tensor([[1.0, 1.0, 0.01]]).repeat(2, 1),
         rotations=torch.tensor([[math.cos(turn), 0, math.sin(turn), 0], [math.cos(turn), 0, -math.sin(turn), 0]]),
         opacities=torch.full((2, 1), 0.99),
         shs=torch.tensor([[[1.5, -1.5, -1.5]], [[-1.5, 1.5, -1.5]]]),
-        sh_degree=0,
     )
     view = io.View("a", 32, 16, 30.0, 30.0, torch.eye(4, dtype=torch.float64))
     splats = benchmark.Splats(scene, view)
@@ -604,7 +604,7 @@ def test_every_kernel_has_images_that_need_it(footprint, options):
         leaves = scenes.leaves(image.scene("cpu"))
         del leaves["means2D"]
         splats = ar.project(settings, **leaves)
-        lists = ar.bin(splats)
+        lists = ar.list_tiles(splats)
         of_camera = lists.of_camera()
         ar.blend(splats, lists)[0].sum().backward()
         lists = of_camera["tile_offsets"].diff()

@@ -166,7 +166,7 @@ def test_lists_are_consistent(variant, device, dtype):
     assert result.color.shape == (3, CAMERA.image_height, CAMERA.image_width)
     assert result.ids.dtype == result.pairs.dtype == result.radii.dtype == torch.int32
     assert result.tile_offsets.dtype == torch.int64
-    assert set(result.seconds) == {"project", "bin", "blend"}
+    assert set(result.seconds) == {"project", "list_tiles", "blend"}
     assert all(value >= 0 for value in result.seconds.values())
     assert (result.ids[1:] > result.ids[:-1]).all()
     # A radius for everything that is listed, and a splat for everything with a radius.

@@ -148,7 +148,7 @@ def test_a_focal_length_that_requires_a_gradient_switches_gradients_of_the_camer
     def stages(fx, fy):
         arguments = {name: value for name, value in scene.items() if name != "means2D"}
         splats = ar.project(pinhole(torch.zeros(6), fx, fy, 17.9, 13.1, None), **arguments)
-        return ar.blend(splats, ar.bin(splats))[0]
+        return ar.blend(splats, ar.list_tiles(splats))[0]
 
     assert torch.autograd.gradcheck(stages, tuple(focal.detach().clone().requires_grad_()), atol=1e-6, fast_mode=True)
     # By itself, in settings of the program's own, and where nobody wants it.

@@ -411,7 +411,7 @@ def assert_more_pairs_than_room(scene, settings):
     """And that the lists of cells fit instead."""
     with torch.no_grad():
         on_device = scenes.to(without_means2d(scene), "cuda")
-        lists = ar.bin(ar.project(scenes.settings_to(settings, "cuda"), **on_device)).of_camera()
+        lists = ar.list_tiles(ar.project(scenes.settings_to(settings, "cuda"), **on_device)).of_camera()
     pairs, _, listed, patch_bits = lists["counts"].tolist()
     assert pairs > len(lists["pairs"]) >= listed > 0 and patch_bits > 0
     assert lists["tile_offsets"][-1] == listed

@@ -6,10 +6,12 @@ import pytest
 import torch
 from conftest import needs_cuda
 
-from analytic_rasterizer import io
+from analytic_rasterizer import density, io
+from analytic_rasterizer.density import gradient, monte_carlo
+from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.optim import FusedAdam
 from analytic_rasterizer.rotations import rotation_matrices
-from analytic_rasterizer.training import TrainingOptions, density
+from analytic_rasterizer.training import TrainingOptions, trainer
 from analytic_rasterizer.training import model as g
 
 observe = torch.ops.analytic_rasterizer.observe_.default
@@ -19,45 +21,45 @@ SMALL, LARGE, HUGE = 0.05, 0.5, 2.0  # scales that are cloned, split, and pruned
 STEP = 600  # one of growth
 
 
-def make_gaussians(scales, opacities) -> g.Gaussians:
+def make_gaussians(scales, opacities) -> Gaussians:
     """Gaussians at random places; scales and opacities are lists of P numbers."""
     generator = torch.Generator().manual_seed(3)
     count = len(scales)
-    fields = g.Gaussians(
+    fields = Gaussians(
         torch.randn(count, 3, generator=generator),
         torch.tensor(scales).log()[:, None].repeat(1, 3),
         torch.randn(count, 4, generator=generator),
         torch.tensor(opacities).logit()[:, None],
         torch.randn(count, 9, 3, generator=generator),
     )
-    return g.Gaussians(*(field.requires_grad_() for field in fields))
+    return fields.map(torch.Tensor.requires_grad_)
 
 
 def make_control(sizes, opacities, white_background=False, device="cpu", **options) -> density.FixedDensity:
     """A control whose optimizer has taken a step."""
-    gaussians = g.Gaussians(*(f.detach().to(device).requires_grad_() for f in make_gaussians(sizes, opacities)))
+    gaussians = make_gaussians(sizes, opacities).map(lambda field: field.detach().to(device).requires_grad_())
     optimizer = FusedAdam([{"params": [field]} for field in gaussians], lr=1e-3, eps=1e-15)
     for field in gaussians:
         field.grad = torch.randn(field.shape, generator=torch.Generator().manual_seed(4)).to(device)
     optimizer.step()
     options = TrainingOptions.preset("3dgs", **options)
-    return density.make_density(options, gaussians, optimizer, EXTENT, white_background)
+    return trainer.make_density(options, gaussians, optimizer, EXTENT, white_background)
 
 
 def after_step(control, norms, step=STEP, progress=0.1, radii=None) -> None:
     """As if a step's gradients by the projected means had these norms."""
-    if control.watches(1):
+    if control.watches:
         gradients = torch.zeros(len(norms), control.columns)
         columns = slice(2, 4) if control.columns == 4 else slice(0, 2)
         gradients[:, columns] = torch.tensor(norms)[:, None] * torch.tensor([0.6, -0.8])
-        control.observe(gradients, torch.ones(len(norms), dtype=torch.int32) if radii is None else radii)
+        control.observe_gradients(gradients, torch.ones(len(norms), dtype=torch.int32) if radii is None else radii)
     control.after_step(step, progress)
 
 
-def moments(control) -> dict[str, g.Gaussians]:
+def moments(control) -> dict[str, Gaussians]:
     state = control.optimizer.state
     return {
-        name: g.Gaussians(*(state[field][name] for field in control.gaussians)) for name in ("exp_avg", "exp_avg_sq")
+        name: control.gaussians.map(lambda field, name=name: state[field][name]) for name in ("exp_avg", "exp_avg_sq")
     }
 
 
@@ -71,8 +73,8 @@ def test_growth_and_pruning_of_a_few():
     assert all(len(field) == 5 and field.requires_grad and field.is_leaf for field in after)
     for old, new in zip(before, after):
         assert torch.equal(new[:3], old[[0, 1, 1]])  # the clone equals its original
-    left, right = density.select(after, slice(3, 4)), density.select(after, slice(4, 5))
-    parent = density.select(before, slice(2, 3))
+    left, right = after.rows(slice(3, 4)), after.rows(slice(4, 5))
+    parent = before.rows(slice(2, 3))
     for half in (left, right):
         torch.testing.assert_close(half.log_scales.exp(), parent.log_scales.exp() / 1.6)
         assert 0 < (half.means - parent.means).norm() < 5 * LARGE
@@ -87,14 +89,14 @@ def test_growth_and_pruning_of_a_few():
     parameters = [group["params"] for group in control.optimizer.param_groups]
     assert all(len(held) == 1 and held[0] is field for held, field in zip(parameters, after))
     assert len(control.optimizer.state) == len(after)
-    assert control.leaf(1).shape == (5, 3)
+    assert control.leaf().shape == (5, 3)
     assert (control.gradient_sums == 0).all() and (control.views == 0).all()
 
 
 def test_optimizer_goes_on_with_the_new_rows():
     control = make_control([SMALL, LARGE], [0.5, 0.5])
     after_step(control, [1.0, 1.0])
-    before = g.Gaussians(*(field.detach().clone() for field in control.gaussians))
+    before = control.gaussians.map(lambda field: field.detach().clone())
     sum(field.sum() for field in control.gaussians).backward()
     control.optimizer.step()
     assert all((new != old).all() for old, new in zip(before, control.gaussians))
@@ -117,7 +119,7 @@ def test_growth_keeps_to_its_times(step, progress, count):
     control = make_control([SMALL], [0.5])
     after_step(control, [1.0], step, progress)
     assert len(control.gaussians.means) == count
-    assert (control.leaf(1) is None) == (progress >= 0.5)
+    assert (control.leaf() is None) == (progress >= 0.5)
 
 
 def test_limit_rises_evenly_and_lets_the_largest_gradients_grow():
@@ -157,10 +159,10 @@ def test_halves_are_drawn_from_their_parent():
     count = 20_000
     turn = torch.tensor([math.cos(0.4), 0.0, 0.0, math.sin(0.4)])  # 0.8 rad about z
     scales = torch.tensor([1.0, 0.2, 0.1])
-    parent = density.select(make_gaussians([1.0], [0.5]), slice(0, 1))
+    parent = make_gaussians([1.0], [0.5]).rows(slice(0, 1))
     parent = parent._replace(rotations=3 * turn[None], log_scales=scales.log()[None])
-    parents = g.Gaussians(*(field.detach().repeat(count, *[1] * (field.dim() - 1)) for field in parent))
-    halves = density.split(parents, torch.Generator().manual_seed(0))
+    parents = parent.map(lambda field: field.detach().repeat(count, *[1] * (field.dim() - 1)))
+    halves = gradient.split(parents, torch.Generator().manual_seed(0))
     offsets = halves.means - parent.means
     c, s = math.cos(0.8), math.sin(0.8)
     axes = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]])
@@ -176,16 +178,10 @@ def test_halves_are_drawn_from_their_parent():
 
 def test_absolute_gradients_are_read_from_their_own_columns():
     control = make_control([SMALL, SMALL], [0.5, 0.5], density="absgrad")
-    assert control.leaf(1).shape == (2, 4)
+    assert control.leaf().shape == (2, 4)
     after_step(control, [2e-4, 4e-4])  # one below the threshold of 3e-4
     assert len(control.gaussians.means) == 3
     assert torch.equal(control.gaussians.means[2], control.gaussians.means[1])
-
-
-def test_gradients_of_coarse_pictures_can_be_left_out():
-    control = make_control([SMALL], [0.5], scales=(2, 4), gradient_scales="finest")
-    assert control.leaf(4) is None and control.leaf(2).shape == (1, 3)
-    assert control.watches(2) and not control.watches(4)
 
 
 def observed(count=300, columns=4, dtype=torch.float32, device="cpu"):
@@ -263,7 +259,7 @@ def picture_of(gaussians) -> torch.Tensor:
     count = len(gaussians.means)
     constant = gaussians._replace(shs=torch.ones(count, 1, 3))
     with torch.no_grad():
-        return constant.render(view.settings(sh_degree=0, footprint="point:dilation=0"))[0]
+        return g.render(constant.arguments(), view.settings(sh_degree=0, footprint="point:dilation=0"))[0]
 
 
 def test_relocation_leaves_the_middle_of_a_splat_as_it_was():
@@ -272,7 +268,7 @@ def test_relocation_leaves_the_middle_of_a_splat_as_it_was():
     with torch.no_grad():
         control.gaussians.means.zero_()
         control.gaussians.rotations.copy_(torch.tensor([[1.0, 0, 0, 0]]).expand(3, 4))
-    alone = picture_of(density.select(control.gaussians, slice(0, 1)))
+    alone = picture_of(control.gaussians.rows(slice(0, 1)))
     assert control.after_step(STEP, 0.1)
     after = control.gaussians
     opacities = after.logit_opacities.sigmoid()[:, 0]
@@ -316,11 +312,11 @@ def test_noise_follows_the_covariance_and_spares_the_opaque():
 def test_draws_follow_the_weights(device):
     """Frequencies of rows, against five standard deviations; rows of weight 0 are never drawn."""
     weights = torch.tensor([0.5, 0.0, 0.25, 1.0, 0.0], device=device)
-    rows = density.draw(weights, 70_000, torch.Generator(device).manual_seed(1))
+    rows = monte_carlo.draw(weights, 70_000, torch.Generator(device).manual_seed(1))
     counts = rows.bincount(minlength=5).cpu()
     expected = 70_000 * weights.cpu() / weights.sum().cpu()
     assert ((counts - expected).abs() <= 5 * expected.sqrt()).all()
-    again = density.draw(weights, 70_000, torch.Generator(device).manual_seed(1))
+    again = monte_carlo.draw(weights, 70_000, torch.Generator(device).manual_seed(1))
     assert torch.equal(rows, again)
 
 
@@ -328,9 +324,9 @@ def test_draws_follow_the_weights(device):
 def test_all_kinds_grow_on_the_device(device, kind):
     control = make_control([SMALL, LARGE, SMALL], [0.5, 0.5, 0.001], device=device, density=kind, max_gaussians=20)
     for step in range(590, 601):
-        if control.watches(1):
+        if control.watches:
             count = len(control.gaussians.means)
-            control.observe(
+            control.observe_gradients(
                 torch.ones(count, control.columns, device=device), torch.ones(count, dtype=torch.int32, device=device)
             )
         control.after_step(step, 0.1)
@@ -347,7 +343,7 @@ def test_gradient_that_grows_does_not_depend_on_the_scale(footprint):
         gaussian = make_gaussians([0.3] * 4, [0.1] * 4)._replace(means=torch.tensor([[0.1, 0.2, 3.0]] * 4))
         means2D = torch.zeros(4, 3, requires_grad=True)
         settings = view.settings(1 / scale, sh_degree=0, footprint=footprint)
-        picture, _ = gaussian._replace(shs=torch.ones(4, 1, 3)).render(settings, means2D)
+        picture, _ = g.render(gaussian._replace(shs=torch.ones(4, 1, 3)).arguments(), settings, means2D)
         (picture * torch.linspace(0, 1, picture.shape[2])).mean().backward()
         gradients.append(means2D.grad[0, 0].item())
     assert gradients[1] == pytest.approx(gradients[0], rel=0.05)

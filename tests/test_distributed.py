@@ -117,13 +117,13 @@ def make(scenario, scene, settings, group=None, requires_grad=True):
     batch = distributed.rasterize(
         settings, **leaves, owners=scenario.owners, means2d_abs=scenario.means2d_abs, group=group
     )
-    (batch.anchor + sum(weighted(view.image, view.alpha) for view in batch.views)).backward()
+    (batch.anchor + sum(weighted(view.image, view.alpha) for view in batch.renderings)).backward()
     return {
-        "cameras": [view.camera for view in batch.views],
-        "images": [view.image.detach() for view in batch.views],
-        "alphas": [view.alpha.detach() for view in batch.views],
-        "gaussian_ids": [view.splats.gaussian_ids for view in batch.views],
-        "bg": [bgs[view.camera].grad for view in batch.views],
+        "cameras": [view.camera for view in batch.renderings],
+        "images": [view.image.detach() for view in batch.renderings],
+        "alphas": [view.alpha.detach() for view in batch.renderings],
+        "gaussian_ids": [view.splats.gaussian_ids for view in batch.renderings],
+        "bg": [bgs[view.camera].grad for view in batch.renderings],
         "views": [or_zero(v.grad, v) for v in views],
         "gradients": {name: or_zero(leaf.grad, leaf) for name, leaf in leaves.items()},
         "ids": [s.gaussian_ids + batch.first_id for s in batch.shard],
@@ -135,7 +135,7 @@ def make(scenario, scene, settings, group=None, requires_grad=True):
 
 
 def plain(scenario, scene, settings):
-    """The same of all Gaussians by `project`, `bin` and `blend`; and the gradients of each camera alone."""
+    """The same of all Gaussians by `project`, `list_tiles` and `blend`; and the gradients of each camera alone."""
     settings, views, bgs = with_camera_gradients(settings, not scenario.frozen)
     leaves = scenes.leaves(scene)
     made = {name: [] for name in ("images", "alphas", "losses", "absolute", "ids", "radii")}
@@ -143,7 +143,7 @@ def plain(scenario, scene, settings):
     for s, splats in zip(settings, shard):
         splats.means2d.retain_grad()
         absolute = torch.zeros_like(splats.means2d, requires_grad=True)
-        lists = ar.bin(splats, background=s.bg.detach())
+        lists = ar.list_tiles(splats, background=s.bg.detach())
         image, alpha = ar.blend(splats, lists, background=s.bg, means2d_abs=absolute)
         row = image[0].detach(), alpha[0].detach(), weighted(image[0], alpha[0]), absolute
         for name, value in zip(made, (*row, splats.gaussian_ids, splats.radii)):
@@ -383,7 +383,7 @@ def twice(rank, device):
     scenario = SCENARIOS["two-ranks"]
     scene = scenes.leaves({name: value[rank::2] for name, value in scene_of(scenario.dtype, device).items()})
     batch = distributed.rasterize(settings_of(scenario, device), **scene, group=GROUPS[2])
-    loss = batch.anchor + sum(view.image.sum() for view in batch.views)
+    loss = batch.anchor + sum(view.image.sum() for view in batch.renderings)
     loss.backward(retain_graph=True)
     return error_of(loss.backward)
 
@@ -483,7 +483,7 @@ def camera_terms(settings, scene):
     """(P, 4, 4) the part of each Gaussian in the gradient of `weighted` with respect to viewmatrix."""
     (settings,), (view,), _ = with_camera_gradients([settings])
     splats = ar.project(settings, **scene)
-    image, alpha = ar.blend(splats, ar.bin(splats, background=settings.bg.detach()), background=settings.bg)
+    image, alpha = ar.blend(splats, ar.list_tiles(splats, background=settings.bg.detach()), background=settings.bg)
     rows = [splats.means2d, splats.cov2d, splats.opacities, splats.depths, splats.colors]
     loss = weighted(image[0], alpha[0])
     grads = torch.autograd.grad(loss, rows, retain_graph=True, materialize_grads=True)
@@ -786,7 +786,7 @@ def test_depths_are_equal_in_pairs():
     splats = ar.project(settings, **scene)
     assert len(splats.depths.unique()) < len(splats.depths)
     swapped = {name: value.roll(COUNT // 2, 0) for name, value in scene.items()}
-    images = [ar.blend(s, ar.bin(s))[0] for s in (splats, ar.project(settings, **swapped))]
+    images = [ar.blend(s, ar.list_tiles(s))[0] for s in (splats, ar.project(settings, **swapped))]
     assert (images[0] - images[1]).abs().max() > 1e-3
 
 
@@ -811,8 +811,8 @@ def test_without_gradient(device):
     scene, settings = scene_of(scenario.dtype, device), settings_of(scenario, device)
     with torch.no_grad():
         batch = distributed.rasterize(settings, **scene)
-    assert [view.image.requires_grad for view in batch.views] == [False] * 4 and batch.means2d_abs == ()
-    assert torch.equal(batch.views[1].image, plain(scenario, scene, settings)["images"][1])
+    assert [view.image.requires_grad for view in batch.renderings] == [False] * 4 and batch.means2d_abs == ()
+    assert torch.equal(batch.renderings[1].image, plain(scenario, scene, settings)["images"][1])
 
 
 @pytest.mark.parametrize(
@@ -909,8 +909,8 @@ def test_another_default_device_changes_nothing():
     """ "meta" stands for any other device."""
     settings = [scenes.Camera(sh_degree=1).settings(torch.float32, "cpu")] * 2
     scene = scene_of(torch.float32, "cpu")
-    expected = distributed.rasterize(settings, **scene).views
+    expected = distributed.rasterize(settings, **scene).renderings
     with torch.device("meta"):
-        made = distributed.rasterize(settings, **scene).views
+        made = distributed.rasterize(settings, **scene).renderings
     assert len(made) == len(expected) == 2
     assert all(torch.equal(a.image, b.image) for a, b in zip(made, expected))

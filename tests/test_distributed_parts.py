@@ -93,7 +93,7 @@ def of_one_process(footprint, dtype, rows):
     leaves = scenes.leaves(scene_of(dtype, "cpu"))
     splats = ar.project(settings, **leaves)
     absolute = torch.zeros_like(splats.means2d, requires_grad=True)
-    lists = ar.bin(splats, background=bg.detach())
+    lists = ar.list_tiles(splats, background=bg.detach())
     image, alpha = ar.blend(splats, lists, background=bg, means2d_abs=absolute)
     both = torch.cat([image[0], alpha[0]])
     of_splats = [splats.means2d, splats.cov2d, splats.opacities, splats.colors]
@@ -295,7 +295,7 @@ def test_rows_of_tiles_that_splats_touch(footprint, size, device):
     settings = scenes.settings_to(settings_of(footprint, torch.float32, camera), device)
     splats = ar.project(settings, **scene)
     touched = _touched(splats, settings.bg)
-    lists = ar.bin(splats, keep=False).of_camera()
+    lists = ar.list_tiles(splats, keep=False).of_camera()
     rows = -(-camera.image_height // touched.side)
     tiles = rows * -(-camera.image_width // touched.side)
     assert len(lists["tile_offsets"]) == tiles + 1 and len(touched.pairs) == rows

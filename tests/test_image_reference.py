@@ -9,6 +9,7 @@ import torch
 import demo
 from analytic_rasterizer import io
 from analytic_rasterizer.analysis import reference
+from analytic_rasterizer.gaussians import Gaussians
 
 pytest.importorskip("tqdm", reason="needs the cli extra")
 special = pytest.importorskip("scipy.special")
@@ -20,13 +21,12 @@ def one_gaussian(sigma, mean, opacity, color, width=24, height=20):
     """(scene, view): an isotropic splat of deviation `sigma` [px] at `mean` [px, centres at integers]."""
     x, y = ((m + 0.5 - size / 2) * DEPTH / FOCAL for m, size in zip(mean, (width, height)))
     scale = sigma * DEPTH / FOCAL
-    scene = io.Scene(
+    scene = Gaussians.from_activated(
         torch.tensor([[x, y, DEPTH]]),
         torch.tensor([[scale, scale, 1e-6]]),
         torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
         torch.tensor([[opacity]]),
         ((torch.tensor([[color]]) - 0.5) / math.sqrt(1 / (4 * math.pi))),
-        0,
     )
     return scene, io.View("one", width, height, FOCAL, FOCAL, torch.eye(4, dtype=torch.float64))
 

@@ -14,6 +14,7 @@ from scenes import Camera
 import analytic_rasterizer as ar
 from analytic_rasterizer import io
 from analytic_rasterizer.analysis import planner
+from analytic_rasterizer.gaussians import Gaussians
 
 TOLERANCE = 1 / 255
 CAMERAS = [Camera(image_height=61, image_width=83), Camera(image_height=52, image_width=40, eye=(-3.0, 1.5, -3.0))]
@@ -29,8 +30,7 @@ def random_scene(device, seed=0, count=800, sizes="mixed", bands="none"):
 
 
 def to_scene(inputs):
-    fields = [inputs[name] for name in ("means3D", "scales", "rotations", "opacities", "shs")]
-    return io.Scene(*fields, math.isqrt(inputs["shs"].shape[1]) - 1)
+    return Gaussians.from_activated(*(inputs[name] for name in ("means3D", "scales", "rotations", "opacities", "shs")))
 
 
 def settings(device, *cameras):
@@ -171,7 +171,7 @@ def test_hidden_gaussians_change_nothing(device):
     beside[40:100] = torch.tensor([0.0, 1000.0, 0.0], device=device)
     faint[100:110] = 0.9 / 255
     means = torch.cat([behind[:40], beside[40:100], scene.means[100:]])
-    scene = scene._replace(means=means, opacities=faint)
+    scene = scene._replace(means=means).with_activated(opacities=faint)
     view = settings(device, CAMERAS[0])
     found = ar.inspect_scene(scene, view, rounds=1)
     assert not found.shown[:110].any()
@@ -180,7 +180,7 @@ def test_hidden_gaussians_change_nothing(device):
     assert hidden.recommendation == f"drop {count}" and hidden.change == 0
     assert "40 behind the near plane" in hidden.reason and "60 beside every picture" in hidden.reason
     assert f"{count - 100} too faint" in hidden.reason
-    left = io.Scene(*(field[found.shown] for field in scene[:-1]), scene.sh_degree)
+    left = scene.rows(found.shown)
     for footprint in (planner.REFERENCE, found.footprint):
         assert torch.equal(picture(scene, view[0], footprint), picture(left, view[0], footprint))
 
@@ -243,7 +243,12 @@ def test_report_in_words_and_json(device):
 def test_bad_numbers(device, tolerance):
     """Gaussians that are not finite are culled, and do not hide what the others call for."""
     scene = random_scene(device, count=200, bands="large")
-    scene.means[3], scene.shs[5, 12], scene.opacities[7], scene.scales[9] = math.nan, math.nan, math.inf, math.inf
+    scene.means[3], scene.shs[5, 12], scene.logit_opacities[7], scene.log_scales[9] = (
+        math.nan,
+        math.nan,
+        math.nan,
+        math.inf,
+    )
     found = ar.inspect_scene(scene, settings(device), tolerance, settings(device), rounds=1)
     check_recommendation(scene, settings(device), found)
     assert not found.shown[[3, 5, 7, 9]].any() and found.effects.sh_degree is None
@@ -254,7 +259,7 @@ def test_bad_numbers(device, tolerance):
 
 def test_empty_scene(device):
     full = random_scene(device, bands="large")
-    scene = io.Scene(*(field[:0] for field in full[:-1]), full.sh_degree)
+    scene = full.rows(slice(0))
     found = ar.inspect_scene(scene, settings(device), training_views=settings(device), rounds=1)
     assert found.effects.sh_degree == 0 and found.shown.shape == (0,)
     assert all(view.shown == 0 and view.rms == 0 for view in found.views)
@@ -265,7 +270,7 @@ def test_empty_scene(device):
 @pytest.mark.parametrize(
     ("changed", "error", "message"),
     [
-        ({"scene": {}}, TypeError, "scene must be an io.Scene, got dict"),
+        ({"scene": {}}, TypeError, "scene must be Gaussians, got dict"),
         ({"views": []}, ValueError, "views must hold at least one view, got none"),
         ({"views": [3]}, TypeError, "views must hold io.View or GaussianRasterizationSettings, got int"),
         ({"views": settings("cpu")[0]}, TypeError, "views must hold io.View or GaussianRasterizationSettings, got int"),

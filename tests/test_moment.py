@@ -93,7 +93,7 @@ def test_long_lists(device, dtype, samples):
         rows = {"means2d": part.means2d, "cov2d": part.cov2d, "opacities": part.opacities}
         rows = {name: value.detach().clone().requires_grad_() for name, value in rows.items()}
         part = dataclasses.replace(part, **rows)
-        lists = ar.bin(part)
+        lists = ar.list_tiles(part)
         assert lists.of_camera()["tile_offsets"].diff().max() > 1024
         image, alpha = ar.blend(part, lists, background=torch.tensor(camera.bg, dtype=dtype, device=device))
         weights = torch.arange(1.0, 28.0, dtype=dtype, device=device).reshape(3, 3, 3).sin()

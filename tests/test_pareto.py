@@ -14,6 +14,7 @@ import analytic_rasterizer as ar
 import demo
 from analytic_rasterizer import cli, io
 from analytic_rasterizer.analysis import pareto, reference, tables, timing
+from analytic_rasterizer.gaussians import Gaussians
 
 pytest.importorskip("gsply", reason="needs the analysis extra")
 pytest.importorskip("torchmetrics", reason="needs the analysis extra")
@@ -410,7 +411,7 @@ def test_missing_library_names_the_extra(files, capsys, monkeypatch, module):
 def test_trained_scene(tmp_path, plant):
     """Four samples go beyond what one weight per splat can, on a scene that was not made for it."""
     inputs, _ = plant
-    scene = io.Scene(*(inputs[name] for name in ("means3D", "scales", "rotations", "opacities", "shs")), 3)
+    scene = Gaussians.from_activated(*(inputs[name] for name in ("means3D", "scales", "rotations", "opacities", "shs")))
     views = io.load_views(SHARED / "data" / "plant_sh3_lo.json")
     methods = [pareto.parse_method(text) for text in ("analytic", "box:samples=1", "box:samples=4")]
     results = pareto.run(tmp_path, scene, views[:1], [1], methods, crop=(96, 64), rounds=1)

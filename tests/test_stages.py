@@ -54,7 +54,7 @@ def test_stages_make_the_picture_of_the_rasterizer(device, dtype, variant):
     scene, again = (scenes.leaves(scene_of(dtype, device)) for _ in range(2))
     color, radii = ar.GaussianRasterizer(settings)(means2D=None, **scene)
     splats = ar.project(settings, **again)
-    image, alpha = ar.blend(splats, ar.bin(splats, background=settings.bg), background=settings.bg)
+    image, alpha = ar.blend(splats, ar.list_tiles(splats, background=settings.bg), background=settings.bg)
     assert image.shape == (1, 3, 21, 27) and alpha.shape == (1, 1, 21, 27)
     assert (image[0] - color).abs().max() <= tolerances(dtype)[0]
     assert torch.equal(radii[splats.gaussian_ids.long()], splats.radii) and len(splats.radii) == (radii > 0).sum()
@@ -72,7 +72,7 @@ def test_several_cameras_are_each_of_them(device, dtype):
     scene = scenes.leaves(scene_of(dtype, device))
     splats = ar.project(settings, **scene)
     assert splats.cameras == 3 and splats.row_splits[-1] == len(splats.means2d)
-    image, alpha = ar.blend(splats, ar.bin(splats))
+    image, alpha = ar.blend(splats, ar.list_tiles(splats))
     g = weights(image.shape, dtype, device)
     together = dict(zip(scene, torch.autograd.grad((image * g).sum(), list(scene.values()))))
     total = {name: torch.zeros_like(value) for name, value in scene.items()}
@@ -81,7 +81,7 @@ def test_several_cameras_are_each_of_them(device, dtype):
         rows = slice(int(splats.row_splits[c]), int(splats.row_splits[c + 1]))
         assert torch.equal(splats.means2d[rows], alone.means2d) and (splats.camera_ids[rows] == c).all()
         assert torch.equal(splats.gaussian_ids[rows], alone.gaussian_ids)
-        own, own_alpha = ar.blend(alone, ar.bin(alone))
+        own, own_alpha = ar.blend(alone, ar.list_tiles(alone))
         assert torch.equal(image[c], own[0]) and torch.equal(alpha[c], own_alpha[0])
         for name, grad in zip(scene, torch.autograd.grad((own[0] * g[c]).sum(), list(scene.values()))):
             total[name] += grad
@@ -96,7 +96,7 @@ def test_cameras_in_a_batch_have_gradients(device, dtype):
     def image_of(views):
         settings = [settings_of(dtype, device, effects=effects)._replace(viewmatrix=view) for view in views]
         splats = ar.project(settings, **scene)
-        return ar.blend(splats, ar.bin(splats))[0]
+        return ar.blend(splats, ar.list_tiles(splats))[0]
 
     views = [CAMERA.fields(dtype, device)["viewmatrix"].requires_grad_() for _ in range(2)]
     image = image_of(views)
@@ -193,7 +193,7 @@ def test_depth_is_a_channel(device, dtype, channels):
     features = splats.colors if features is None else features[splats.gaussian_ids.long()]
     table = torch.cat([features, splats.depths[:, None], 1 / splats.depths[:, None]], 1)
     background = torch.cat([settings.bg, settings.bg.new_zeros(2)])
-    image, alpha = ar.blend(splats, ar.bin(splats), table, background)
+    image, alpha = ar.blend(splats, ar.list_tiles(splats), table, background)
     expected_planes = torch.cat([image[0], alpha[0]])
     assert (planes - expected_planes).abs().max() <= 5 * tolerances(dtype)[0]
     expected = dict(zip(again, torch.autograd.grad((expected_planes * g).sum(), list(again.values()))))
@@ -229,7 +229,7 @@ def test_absolute_gradients_are_of_all_channels(device, dtype, channels):
     splats = ar.project(settings, **{k: v for k, v in scene.items() if k != "colors_precomp"})
     absolute = torch.zeros_like(splats.means2d, requires_grad=True)
     features = scene["colors_precomp"][splats.gaussian_ids.long()]
-    image, _ = ar.blend(splats, ar.bin(splats), features, means2d_abs=absolute)
+    image, _ = ar.blend(splats, ar.list_tiles(splats), features, means2d_abs=absolute)
     (image[0] * g).sum().backward()
     half = torch.tensor([3.0, 2.5], dtype=dtype, device=device)
     torch.testing.assert_close(
@@ -287,7 +287,7 @@ def test_gradcheck_of_blend(variant):
     def sums(means2d, cov2d, opacities, features, background):
         xx, xy, yy = cov2d.detach().unbind(1)
         rows = dataclasses.replace(splats, means2d=means2d, cov2d=cov2d, opacities=opacities, dets=xx * yy - xy * xy)
-        return weighted_sums(ar.blend(rows, ar.bin(rows), features, background))
+        return weighted_sums(ar.blend(rows, ar.list_tiles(rows), features, background))
 
     # Noise of the difference quotient: 1e-16 * |sum| (~1000) / 1e-6.
     assert torch.autograd.gradcheck(sums, leaves, eps=1e-6, atol=1e-6, rtol=1e-6)
@@ -362,7 +362,7 @@ def test_gradients_of_cameras_are_added_up_in_blocks(device):
 def test_lists_are_freed_as_soon_as_their_gradient_is_made(device):
     """Also while the loss is kept, as a training does until its optimizer has taken a step."""
     splats = ar.project(settings_of(torch.float32, device), **scenes.leaves(scene_of(torch.float32, device)))
-    lists = ar.bin(splats)
+    lists = ar.list_tiles(splats)
     held = weakref.ref(lists.tensors[0])
     loss = ar.blend(splats, lists)[0].sum()
     del lists
@@ -409,7 +409,7 @@ def test_another_default_device_changes_nothing():
 
     def pictures():
         splats = ar.project([settings, settings], **scene)
-        return [ar.blend(part, ar.bin(part))[0] for part in splats.split()]
+        return [ar.blend(part, ar.list_tiles(part))[0] for part in splats.split()]
 
     expected = pictures()
     with torch.device("meta"):
@@ -430,14 +430,14 @@ def test_another_default_device_changes_nothing():
 def test_blend_says_what_is_wrong(change, message):
     splats = ar.project(settings_of(torch.float32, "cpu"), **scene_of(torch.float32, "cpu"))
     with pytest.raises(ValueError, match=message):
-        ar.blend(splats, ar.bin(splats), **change)
+        ar.blend(splats, ar.list_tiles(splats), **change)
 
 
 def test_what_is_no_tensor_and_no_camera_is_named():
     splats = ar.project(settings_of(torch.float32, "cpu"), **scene_of(torch.float32, "cpu"))
-    lists = ar.bin(splats)
+    lists = ar.list_tiles(splats)
     with pytest.raises(TypeError, match="background must be a tensor, got list"):
-        ar.bin(splats, background=[0, 0, 0])
+        ar.list_tiles(splats, background=[0, 0, 0])
     with pytest.raises(TypeError, match="means2d_abs must be a tensor, got list"):
         ar.blend(splats, lists, means2d_abs=[0, 0])
     for camera in (-1, 1):
@@ -461,18 +461,18 @@ def test_lists_of_other_splats_are_refused(device):
     settings, scene = settings_of(torch.float32, device), scene_of(torch.float32, device)
     splats = ar.project(settings, **scene)
     fewer = ar.project(settings, **{name: value[:9] for name, value in scene.items()})
-    with pytest.raises(ValueError, match="lists must be the output of bin for these splats"):
-        ar.blend(splats, ar.bin(fewer))
+    with pytest.raises(ValueError, match="lists must be the output of list_tiles for these splats"):
+        ar.blend(splats, ar.list_tiles(fewer))
     larger = ar.project(settings._replace(image_width=99), **scene)
     with pytest.raises(ValueError, match="must be what the forward pass saved"):
-        ar.blend(larger, ar.TileLists(ar.bin(splats).tensors, 1))
+        ar.blend(larger, ar.TileLists(ar.list_tiles(splats).tensors, 1))
 
 
 def test_no_gaussians_no_splats(device):
     settings = settings_of(torch.float32, device)
     scene = {name: value[:0] for name, value in scene_of(torch.float32, device).items()}
     splats = ar.project(settings, **scenes.leaves(scene))
-    image, alpha = ar.blend(splats, ar.bin(splats), background=settings.bg)
+    image, alpha = ar.blend(splats, ar.list_tiles(splats), background=settings.bg)
     assert len(splats.means2d) == 0 and (alpha == 0).all()
     assert torch.equal(image[0], settings.bg[:, None, None].expand(3, 21, 27))
     image.sum().backward()

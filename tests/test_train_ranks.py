@@ -28,10 +28,10 @@ from test_train import TINY, circle, opengl_pose, rows_shown, scatter, write_pic
 
 from analytic_rasterizer import training  # noqa: E402
 from analytic_rasterizer.cli import launch  # noqa: E402
-from analytic_rasterizer.optim import FusedAdam  # noqa: E402
+from analytic_rasterizer.distributed.ranks import ALONE, Ranks, even_counts  # noqa: E402
+from analytic_rasterizer.gaussians import Gaussians  # noqa: E402
+from analytic_rasterizer.optim import MOMENTS, FusedAdam  # noqa: E402
 from analytic_rasterizer.training import TrainingOptions, files, model, schedule  # noqa: E402
-from analytic_rasterizer.training.density import MOMENTS  # noqa: E402
-from analytic_rasterizer.training.ranks import ALONE, Ranks, even_counts  # noqa: E402
 from analytic_rasterizer.training.sharded import UNEVEN, ShardedTrainer  # noqa: E402
 
 WORLD = 3
@@ -285,14 +285,14 @@ def test_gradients_are_those_of_one_process(made):
     # The mean over two pictures has half the gradient of each.
     torch.testing.assert_close(2 * one.density.gradient_sums, got["sums"])
     optimizer_of_two(one).step()
-    for name, field, after in zip(model.Gaussians._fields, one.gaussians, got["after"]):
+    for name, field, after in zip(Gaussians._fields, one.gaussians, got["after"]):
         assert torch.equal(field, after), name
 
 
 def sharded_alone(made, **more):
     """One process that takes the pictures of two in a step."""
     run = make_run(made / "scene", made / "one", ALONE, pictures_per_step=CAMERAS, **more)
-    start = model.Gaussians(*(field.detach() for field in run.trainer.gaussians))
+    start = run.trainer.gaussians.map(torch.Tensor.detach)
     one = ShardedTrainer(run.options, start, run.trainer.pictures, (1.0, 1.0, 1.0), "cpu", ALONE)
     one._set_rates()
     return one
@@ -477,7 +477,7 @@ def test_torchrun_trains_and_writes_once(made, tmp_path):
     state = checkpoint_in(tmp_path / "out")
     assert state["progress"]["step"] == 121 and state["shards"] == [30, 30]
     test = training.load_pictures(training.load_capture(made / "scene").test, (1,), (1.0, 1.0, 1.0), "cpu")
-    start = model.gaussians_at(*model.random_points(60, 0), 0).to_scene()
+    start = Gaussians.from_points(*model.random_points(60, 0), 0)
     before = training.evaluate(start, test, TrainingOptions().footprint)["mean"]["psnr"]
     after = json.loads((tmp_path / "out" / files.METRICS).read_text())["test"]["mean"]["psnr"]
     assert after > before + 2

@@ -5,6 +5,7 @@ that no graphics device is needed.
 """
 
 import base64
+import math
 import os
 import shutil
 from contextlib import contextmanager
@@ -30,6 +31,7 @@ from pages import (
 
 import demo
 from analytic_rasterizer import io, viewer
+from analytic_rasterizer.gaussians import Gaussians
 
 playwright = pytest.importorskip("playwright.sync_api", reason="needs playwright: make test-browser")
 
@@ -139,9 +141,7 @@ def test_random_scene(random_page, footprint, reduction):
 
 def needles():
     """Lines of 1 : 10000, in all directions."""
-    scene = random_scene(300)
-    scene.scales[:] = torch.tensor([0.5, 5e-5, 5e-5])
-    return scene
+    return random_scene(300).with_activated(scales=torch.tensor([0.5, 5e-5, 5e-5]).repeat(300, 1))
 
 
 def huge_and_near():
@@ -150,8 +150,8 @@ def huge_and_near():
     near = torch.arange(8)
     scene.means[near] = torch.tensor([0.0, 0.0, -0.15]) + 0.05 * torch.randn(8, 3, generator=torch.Generator())
     scene.means[near, 2] = -0.15 + 0.02 * near  # the camera is at -0.4
-    scene.scales[near] = 2.0
-    scene.opacities[near] = 0.2
+    scene.log_scales[near] = math.log(2.0)
+    scene.logit_opacities[near] = math.log(0.2 / 0.8)
     return scene
 
 
@@ -159,7 +159,7 @@ def equal_depths():
     """Opaque splats in four planes that face the camera of `facing`: the order of the input decides."""
     scene = random_scene(1200)
     scene.means[:, 2] = 3 + scene.means[:, 2].floor() % 4
-    scene.opacities[:] = 0.9
+    scene.logit_opacities[:] = math.log(0.9 / 0.1)
     return scene
 
 
@@ -207,13 +207,12 @@ def lone_splats(smallest, size=64, columns=16, rows=8):
     scales[:, 2] = 1e-3  # along the optical axis, at whose end the camera is so far away that 1 px is 1
     angle = torch.pi * torch.rand(count, generator=g)
     zero = torch.zeros(count)
-    scene = io.Scene(
+    scene = Gaussians.from_activated(
         torch.cat([offsets, torch.full((count, 1), focal)], 1),
         scales,
         torch.stack([(angle / 2).cos(), zero, zero, (angle / 2).sin()], 1),
         torch.ones(count, 1),
         torch.full((count, 1, 3), 0.5 / 0.28209479177387814),
-        0,
     )
     return scene, io.View("lone", columns * size, rows * size, focal, focal, torch.eye(4, dtype=torch.float64))
 
@@ -252,9 +251,8 @@ def test_trained_scene(browser, name, request):
     if not (SHARED / "data" / f"{name}.npz").exists():
         pytest.skip("needs the optional ../shared scenes next to the project")
     inputs, cameras = request.getfixturevalue("plant")
-    scene = io.Scene(
-        inputs["means3D"], inputs["scales"], inputs["rotations"], inputs["opacities"], inputs["shs"].contiguous(), 3
-    )
+    names = ("means3D", "scales", "rotations", "opacities", "shs")
+    scene = Gaussians.from_activated(*(inputs[name].contiguous() for name in names))
     camera = cameras[0]
     w2c = torch.tensor(camera["w2c"], dtype=torch.float64).reshape(4, 4)
     view = io.View("trained", camera["width"], camera["height"], camera["fx"], camera["fy"], w2c).scaled(0.5)

@@ -20,6 +20,7 @@ from test_viewer import make_scene, make_view
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io, render_stages, viewer
+from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.viewer import frames, live
 
 pytestmark = pytest.mark.gate
@@ -328,7 +329,7 @@ def test_an_update_is_shown_with_its_text(live_viewer):
 
 def test_what_is_shown_is_a_copy(live_viewer, device):
     scene = make_scene().to(device)
-    kept = io.Scene(*(tensor.clone() for tensor in scene[:-1]), scene.sh_degree)
+    kept = scene.map(torch.clone)
     live_viewer.update(scene)
     scene.means.zero_()  # as an optimiser changes its parameters
     with connected(live_viewer.url) as browser:
@@ -484,7 +485,7 @@ def test_while_the_camera_moves_frames_are_small(live_viewer):
     [
         (torch.zeros(3), TypeError),
         (lambda: None, TypeError),
-        (io.Scene(*(torch.zeros(0, n) for n in (3, 3, 4, 1)), torch.zeros(0, 1, 3), 0), ValueError),
+        (Gaussians(*(torch.zeros(0, n) for n in (3, 3, 4, 1)), torch.zeros(0, 1, 3)), ValueError),
         (make_scene()._replace(means=torch.full((30, 3), float("nan"))), ValueError),
     ],
     ids=["tensor", "none", "empty", "nan"],

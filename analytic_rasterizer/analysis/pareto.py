@@ -17,8 +17,10 @@ from pathlib import Path
 
 import torch
 
+from ..camera import View
 from ..footprints import resolve_footprint
-from ..io import Scene, View, optional_import
+from ..gaussians import Gaussians
+from ..io import optional_import, write_text
 from . import tables, timing
 from .reference import EXACT, RMSE_SHARE, UNFILTERED, Refined, footprint_variants, image_errors, refine, supersampled
 
@@ -66,7 +68,7 @@ def default_methods() -> list[Method]:
 
 def run(
     out,
-    scene: Scene,
+    scene: Gaussians,
     views: list[View],
     scales=(1, 2, 4, 8),
     methods: list[Method] | None = None,
@@ -130,12 +132,14 @@ def run(
         results["scales"].append(at_scale)
         tables.save_figure(_plot(results, at_scale), out, f"pareto_{scale}")
         # After every scale, so that a long run that is stopped leaves what it has.
-        (out / "pareto.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-        (out / "pareto.md").write_text(to_markdown(results), encoding="utf-8")
+        write_text(out / "pareto.json", json.dumps(results, indent=1) + "\n")
+        write_text(out / "pareto.md", to_markdown(results))
     return results
 
 
-def _measure(scene: Scene, views: list[View], methods: list[Method], results: dict, max_density: int | None) -> dict:
+def _measure(
+    scene: Gaussians, views: list[View], methods: list[Method], results: dict, max_density: int | None
+) -> dict:
     """Reference and methods at one scale; `results` are those of `run`. A picture is known by the name of its view."""
     background = results["background"]
     names = [view.name for view in views]

@@ -16,10 +16,10 @@ from functools import partial, reduce
 import torch
 
 from .._C import FRUSTUM_CLAMP, TILE
-from ..camera import is_off_center, is_orthographic
+from ..camera import View, is_off_center, is_orthographic
 from ..effects import NEAR, Effects
 from ..filters import apply_3d_filter, compute_3d_filter, sampling_interval
-from ..io import Scene, View
+from ..gaussians import Gaussians
 from ..outputs import depths
 from ..rasterizer import GaussianRasterizer
 from ..settings import GaussianRasterizationSettings
@@ -42,7 +42,7 @@ TIMED_VIEWS = 2
 
 @torch.no_grad()
 def plan(
-    scene: Scene,
+    scene: Gaussians,
     views: Sequence[View | GaussianRasterizationSettings],
     tolerance: float = 1 / 255,
     training_views: Sequence[View | GaussianRasterizationSettings] | None = None,
@@ -57,7 +57,7 @@ def plan(
 
 @torch.no_grad()
 def inspect_scene(
-    scene: Scene,
+    scene: Gaussians,
     views: Sequence[View | GaussianRasterizationSettings],
     tolerance: float = 1 / 255,
     training_views: Sequence[View | GaussianRasterizationSettings] | None = None,
@@ -135,8 +135,8 @@ def inspect_scene(
 
 def _check(scene, views, tolerance, training_views, *options) -> tuple[list, list | None]:
     """Settings of the views and of those of training. `options`: scale and background of `View.settings`."""
-    if not isinstance(scene, Scene):
-        raise TypeError(f"scene must be an io.Scene, got {type(scene).__name__}")
+    if not isinstance(scene, Gaussians):
+        raise TypeError(f"scene must be Gaussians, got {type(scene).__name__}")
     if isinstance(tolerance, bool) or not isinstance(tolerance, (int, float)):
         raise TypeError(f"tolerance must be a number, got {tolerance!r}")
     if not 0 <= tolerance < math.inf:
@@ -169,7 +169,7 @@ class _Survey:
     off_center: list[bool]  # which views are
 
 
-def _survey(scene: Scene, cameras: list, tolerance: float, training: list | None) -> _Survey:
+def _survey(scene: Gaussians, cameras: list, tolerance: float, training: list | None) -> _Survey:
     orthographic = [is_orthographic(camera) for camera in cameras]
     if any(orthographic) != all(orthographic):
         raise ValueError(
@@ -199,7 +199,7 @@ def _survey(scene: Scene, cameras: list, tolerance: float, training: list | None
     return _Survey(effects, everything, sh_band_bounds(shs), ratios, filter_change, off_center)
 
 
-def _prepare(scene: Scene, camera, footprint: str, effects: Effects) -> tuple[GaussianRasterizationSettings, dict]:
+def _prepare(scene: Gaussians, camera, footprint: str, effects: Effects) -> tuple[GaussianRasterizationSettings, dict]:
     """Settings, and Gaussians after the 3D filter, for these effects."""
     gaussians = scene.arguments()
     if effects.filter_3d is not None:
@@ -209,7 +209,7 @@ def _prepare(scene: Scene, camera, footprint: str, effects: Effects) -> tuple[Ga
     return camera._replace(**options), gaussians
 
 
-def _stages(scene: Scene, camera, footprint: str, effects: Effects) -> Stages:
+def _stages(scene: Gaussians, camera, footprint: str, effects: Effects) -> Stages:
     settings, gaussians = _prepare(scene, camera, footprint, effects)
     return render_stages(settings, **gaussians)
 
@@ -235,9 +235,9 @@ def _seconds(cases: dict[str, tuple], cameras: list, rounds: int | None) -> dict
     return {name: sum(timing.best_of(taken, device) for taken in of) for name, of in samples.items()}
 
 
-def _effect_costs(scene: Scene, cameras, footprint, effects: Effects, shown, rounds) -> dict[str, float]:
+def _effect_costs(scene: Gaussians, cameras, footprint, effects: Effects, shown, rounds) -> dict[str, float]:
     """Time with an effect over that without, by effect."""
-    only_shown = Scene(*(field[shown] for field in scene[:-1]), scene.sh_degree)
+    only_shown = scene.rows(shown)
     filter_of_shown = None if effects.filter_3d is None else effects.filter_3d[shown]
     cases = {
         "plain": (scene, footprint, effects),
@@ -267,7 +267,7 @@ def _footprint_finding(candidates: dict[str, Candidate], footprint: str, views: 
     return Finding("footprint", footprint != BASE, candidates[BASE].rms, "measured", best.cost, footprint, reason)
 
 
-def _sh_finding(scene: Scene, survey: _Survey, top_band: float, cost: float | None) -> Finding:
+def _sh_finding(scene: Gaussians, survey: _Survey, top_band: float, cost: float | None) -> Finding:
     name, degree = "spherical harmonics", survey.effects.sh_degree
     if scene.sh_degree == 0:
         return Finding(name, False, 0.0, "bound", None, "degree 0", "the scene has none beyond degree 0")
@@ -293,7 +293,7 @@ def _filter_finding(survey: _Survey, cost: float | None) -> Finding:
     return Finding("3D filter", needed, change, kind, cost, "filter_3d" if needed else "none", reason)
 
 
-def _cull_finding(scene: Scene, cameras: list, shown, on_image, cost: float) -> Finding:
+def _cull_finding(scene: Gaussians, cameras: list, shown, on_image, cost: float) -> Finding:
     behind = reduce(torch.logical_and, (depths(scene.means, camera.viewmatrix) <= NEAR for camera in cameras))
     hidden, faint = ~shown & ~behind, on_image | (scene.opacities.reshape(-1) < 1 / 255)
     count, *parts = (int(which.sum()) for which in (~shown, behind, hidden & faint, hidden & ~faint))

@@ -9,8 +9,10 @@ from typing import Any, NamedTuple
 
 import torch
 
+from ..camera import View
 from ..footprints import FOOTPRINTS, option_values, resolve_footprint
-from ..io import Scene, View, optional_import
+from ..gaussians import Gaussians
+from ..io import optional_import
 from ..rasterizer import GaussianRasterizer
 
 UNFILTERED = "point:dilation=0"  # samples of the scene itself, without any filter
@@ -30,7 +32,7 @@ def footprint_variants() -> list[str]:
 
 
 def supersampled(
-    scene: Scene, view: View, density: int, footprint: str = UNFILTERED, background=(0.0, 0.0, 0.0)
+    scene: Gaussians, view: View, density: int, footprint: str = UNFILTERED, background=(0.0, 0.0, 0.0)
 ) -> torch.Tensor:
     """The mean of density x density samples in every pixel of a view, on a regular grid.
 

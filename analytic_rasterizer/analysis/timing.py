@@ -14,7 +14,9 @@ from typing import Any
 
 import torch
 
-from .. import _C, io
+from .. import _C
+from ..camera import View
+from ..gaussians import Gaussians
 from ..rasterizer import GaussianRasterizer
 
 ROUNDS = {"cpu": 5, "cuda": 20}
@@ -31,7 +33,7 @@ class Case:
     """
 
     def __init__(
-        self, scene: io.Scene, view: io.View, footprint: str, supersampling: int = 1, background=(0.0, 0.0, 0.0)
+        self, scene: Gaussians, view: View, footprint: str, supersampling: int = 1, background=(0.0, 0.0, 0.0)
     ):
         device = scene.means.device
         self.supersampling = supersampling

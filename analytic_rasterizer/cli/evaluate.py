@@ -8,12 +8,13 @@ from pathlib import Path
 
 from .. import io
 from ..analysis.tables import format_table
+from ..distributed.ranks import Ranks, even_counts
 from ..footprints import resolve_footprint
+from ..gaussians import Gaussians
 from ..training import TrainingOptions, evaluate, load_capture, load_lpips, load_pictures, save_pictures
 from ..training.evaluation import LPIPS_WEIGHTS, MEASURES
 from ..training.files import OPTIONS, SCENE, write_json
 from ..training.options import check_scales
-from ..training.ranks import Ranks, even_counts
 from ..training.trainer import background_of
 from .arguments import add_machine_options, count, use_machine, whole_numbers, writable_folder
 from .launch import add_rank_options, ranks_of
@@ -91,10 +92,9 @@ def run_on(ranks: Ranks, args) -> None:
         print(format_results(results, scales))
 
 
-def part_of(scene: io.Scene, ranks: Ranks) -> io.Scene:
+def part_of(scene: Gaussians, ranks: Ranks) -> Gaussians:
     """The Gaussians of this rank."""
-    rows = ranks.part_of(even_counts(len(scene.means), ranks.world))
-    return scene._replace(**{name: getattr(scene, name)[rows] for name in scene._fields[:5]})
+    return scene.rows(ranks.part_of(even_counts(scene.count, ranks.world)))
 
 
 def format_results(results: dict[str, dict], scales: tuple[int, ...]) -> str:

@@ -5,7 +5,7 @@ of its rows. docs/distributed.md has the method and how much is sent.
 """
 
 from .bands import Band, rasterize_bands
-from .cameras import Batch, View, rasterize
+from .cameras import Batch, Rendering, rasterize
 from .rows import OwnSplats
 
-__all__ = ["Band", "Batch", "OwnSplats", "View", "rasterize", "rasterize_bands"]
+__all__ = ["Band", "Batch", "OwnSplats", "Rendering", "rasterize", "rasterize_bands"]

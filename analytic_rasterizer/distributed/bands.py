@@ -12,8 +12,9 @@ import torch.distributed as dist
 
 from .._C import tile_size
 from ..arguments import camera_arguments
+from ..autocast import widened, widened_settings
 from ..settings import GaussianRasterizationSettings
-from ..stages import Splats, bin, blend, project
+from ..stages import Splats, blend, list_tiles, project
 from .agreement import REQUIREMENTS, Facts, agree, digest_of, facts_of, gather, place_in
 from .cameras import check_camera, check_colors, summary_of
 from .exchange import DIFFERENTIABLE, Route, exchange
@@ -95,6 +96,10 @@ def rasterize_bands(
         TypeError, ValueError, RuntimeError: As `rasterize`.
     """
     rank, world = place_in(group)
+    means3D, opacities, shs, colors_precomp = map(widened, (means3D, opacities, shs, colors_precomp))
+    scales, rotations, cov3D_precomp = map(widened, (scales, rotations, cov3D_precomp))
+    if isinstance(settings, GaussianRasterizationSettings):
+        settings = widened_settings(settings)
 
     def make() -> tuple[tuple, Facts | None, None]:
         if not isinstance(settings, GaussianRasterizationSettings):
@@ -135,7 +140,7 @@ def rasterize_bands(
     if shard.means2d.requires_grad:
         shard.means2d.retain_grad()
     bg = settings.bg
-    lists = bin(own, background=bg.detach(), keep=torch.is_grad_enabled())
+    lists = list_tiles(own, background=bg.detach(), keep=torch.is_grad_enabled())
     images, alphas = blend(own, lists, background=bg, means2d_abs=of_means)
     first, end = rows[rank]
     image, alpha = images[0, :, first:end], alphas[0, :, first:end]
@@ -159,9 +164,9 @@ class _Touched:
 
 
 def _touched(splats: Splats, background: torch.Tensor) -> _Touched:
-    """By the lists of `bin`, so that no splat is missed, whatever the footprint."""
+    """By the lists of `list_tiles`, so that no splat is missed, whatever the footprint."""
     for _ in range(_ATTEMPTS):
-        lists = bin(splats, background=background.detach(), keep=False).of_camera()
+        lists = list_tiles(splats, background=background.detach(), keep=False).of_camera()
         pairs, offsets = lists["pairs"], lists["tile_offsets"]
         if not pairs.is_cuda or int(lists["counts"][0]) <= len(pairs):
             break  # on CUDA there may have been more pairs than were expected, and then tiles share lists

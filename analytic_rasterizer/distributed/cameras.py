@@ -5,7 +5,7 @@ ranks that own the cameras, and blends the cameras of its own. Gradients travel 
 consecutive: global ids count the Gaussians of rank 0 first, then those of rank 1, and so on.
 
     batch = distributed.rasterize(settings, means3D, opacities, shs=shs, scales=scales, rotations=rotations)
-    loss = batch.anchor + sum(loss_of(view.image, photographs[view.camera]) for view in batch.views)
+    loss = batch.anchor + sum(loss_of(shown.image, photographs[shown.camera]) for shown in batch.renderings)
     loss.backward()  # on every rank
 
 docs/distributed.md has the method and how much is sent.
@@ -20,10 +20,11 @@ from typing import Any, NamedTuple
 import torch
 import torch.distributed as dist
 
+from ..autocast import way_out_of, widened, widened_settings
 from ..checks import check_tensors
 from ..effects import AUTO
 from ..settings import GaussianRasterizationSettings
-from ..stages import Splats, bin, blend, project
+from ..stages import Splats, blend, list_tiles, project
 from .agreement import REQUIREMENTS, Facts, agree, digest_of, facts_of, place_in
 from .exchange import Route
 from .rows import OwnSplats, Shard, Step, agreeing, rendered, together
@@ -35,8 +36,8 @@ _REQUIREMENTS = {
 }
 
 
-class View(NamedTuple):
-    """A camera of this rank.
+class Rendering(NamedTuple):
+    """What a camera of this rank shows.
 
     Attributes:
         camera: Its place in the settings.
@@ -57,7 +58,7 @@ class Batch:
     """What `rasterize` made of a step.
 
     Attributes:
-        views: The cameras of this rank, ascending; empty where it has none.
+        renderings: The cameras of this rank, ascending; empty where it has none.
         shard: For every camera of the step the splats of the Gaussians of this rank, with ids that count within the
             shard. `radii` are those of density control; after the backward pass `means2d.grad` (n, 2) is dL/d(projected
             mean), per px.
@@ -69,7 +70,7 @@ class Batch:
             one without cameras: add this to its loss.
     """
 
-    views: tuple[View, ...]
+    renderings: tuple[Rendering, ...]
     shard: tuple[OwnSplats, ...]
     means2d_abs: tuple[torch.Tensor, ...]
     first_id: int
@@ -94,10 +95,11 @@ def rasterize(
     """Renders the cameras of a step from Gaussians that are sharded over ranks. Every rank of the group calls it.
 
     The images are those of one rank with all Gaussians, bit for bit; the gradients are, to rounding. One rank, or
-    torch.distributed without a process group, makes what `project`, `bin` and `blend` make of camera after camera, bit
-    for bit, and sends nothing. Differentiable in what `project` is differentiable in, and in the backgrounds. The
-    gradient with respect to a camera is, on each rank, the part of the rank's own Gaussians: the sum over the ranks is
-    the whole. The host waits once for the device, for the numbers of rows (twice with more than 57 cameras). On several
+    torch.distributed without a process group, makes what `project`, `list_tiles` and `blend` make of camera after
+    camera, bit for bit, and sends nothing. Differentiable in what `project` is differentiable in, and in the
+    backgrounds. The gradient with respect to a camera is, on each rank, the part of the rank's own Gaussians: the sum
+    over the ranks is the whole. The host waits once for the device, for the numbers of rows (twice with more than 57
+    cameras). On several
     ranks the backward pass runs once, retain_graph or not.
 
     Args:
@@ -120,12 +122,13 @@ def rasterize(
             the group.
     """
     rank, world = place_in(group)
+    means3D, opacities = widened(means3D), widened(opacities)
     gaussians = {
-        "shs": shs,
-        "colors_precomp": colors_precomp,
-        "scales": scales,
-        "rotations": rotations,
-        "cov3D_precomp": cov3D_precomp,
+        "shs": widened(shs),
+        "colors_precomp": widened(colors_precomp),
+        "scales": widened(scales),
+        "rotations": widened(rotations),
+        "cov3D_precomp": widened(cov3D_precomp),
     }
     if world == 1:
         cameras, _ = _checked_cameras(settings, owners, world, shs, colors_precomp)
@@ -150,8 +153,8 @@ def rasterize(
     step = Step(own, route, first_id, join, means2d_abs, backgrounds)
     anchor, images, alphas = rendered(step)
     shard, received = step.take()
-    views = tuple(View(*of_camera) for of_camera in zip(route.own, images, alphas, received))
-    return Batch(views, shard, step.means2d_abs, first_id, count, anchor)
+    renderings = tuple(Rendering(*of_camera) for of_camera in zip(route.own, images, alphas, received))
+    return Batch(renderings, shard, step.means2d_abs, first_id, count, anchor)
 
 
 def _of_one_rank(
@@ -163,16 +166,16 @@ def _of_one_rank(
 ) -> Batch:
     shard = _projected(cameras, means3D, opacities, **gaussians)
     absolute = tuple(torch.zeros_like(s.means2d, requires_grad=True) for s in shard) if means2d_abs else ()
-    views = []
+    renderings = []
     for camera, splats in enumerate(shard):
         if splats.means2d.requires_grad:
             splats.means2d.retain_grad()
         bg = cameras[camera].bg
-        lists = bin(splats, background=bg.detach(), keep=torch.is_grad_enabled())
+        lists = list_tiles(splats, background=bg.detach(), keep=torch.is_grad_enabled())
         image, alpha = blend(splats, lists, background=bg, means2d_abs=absolute[camera] if means2d_abs else None)
-        views.append(View(camera, image[0], alpha[0], splats))
+        renderings.append(Rendering(camera, image[0], alpha[0], splats))
     own = tuple(OwnSplats(s.means2d, s.radii, s.gaussian_ids, s.width, s.height) for s in shard)
-    return Batch(tuple(views), own, absolute, 0, len(means3D), means3D.new_zeros(()))
+    return Batch(tuple(renderings), own, absolute, 0, len(means3D), means3D.new_zeros(()))
 
 
 def _projected(
@@ -204,6 +207,7 @@ def _checked_cameras(
     for camera, s in enumerate(cameras):
         if not isinstance(s, GaussianRasterizationSettings):
             raise TypeError(f"settings must hold GaussianRasterizationSettings, got {type(s).__name__} at {camera}")
+        cameras[camera] = s = widened_settings(s)
         check_camera(s, f" of camera {camera}")
     check_colors(shs, colors_precomp)
     owners = [camera % world for camera in range(len(cameras))] if owners is None else list(owners)
@@ -221,7 +225,8 @@ def check_camera(settings: GaussianRasterizationSettings, name: str = "") -> Non
     check_tensors(None, viewmatrix=settings.viewmatrix, bg=bg)
     check_tensors(settings.viewmatrix.device, bg=bg)
     if bg.dtype != settings.viewmatrix.dtype:
-        raise TypeError(f"bg must have dtype {settings.viewmatrix.dtype}, got {bg.dtype}{name}")
+        got = f"{bg.dtype}{name}{way_out_of(bg.dtype)}"
+        raise TypeError(f"bg must have dtype {settings.viewmatrix.dtype}, got {got}")
     if bg.shape != (3,):
         raise ValueError(f"bg must have shape (3,), got {tuple(bg.shape)}{name}")
     if isinstance(settings.effects, str) and settings.effects == AUTO:

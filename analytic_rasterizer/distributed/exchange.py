@@ -22,8 +22,8 @@ class Route:
     """Which rows go where.
 
     A rank sends the rows of the cameras of rank 0 first, then those of rank 1, and so on; of a rank camera after
-    camera. What it receives of a camera it puts in the order of the ranks, which makes global ids ascend: `bin` draws
-    splats of equal depth in this order.
+    camera. What it receives of a camera it puts in the order of the ranks, which makes global ids ascend: `list_tiles`
+    draws splats of equal depth in this order.
 
     Attributes:
         counts: (ranks, cameras) rows that a rank has of a camera.

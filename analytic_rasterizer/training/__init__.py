@@ -8,9 +8,11 @@
 Needs the libraries of `pip install analytic_rasterizer[train]`; they are imported on first use.
 """
 
-from .captures import Capture, Photograph, extent_of, load_capture, load_points
+from ..io import load_points
+from .captures import Capture, Photograph, load_capture
 from .evaluation import evaluate, load_lpips, save_pictures
-from .model import Gaussians
+from .extent import extent_of
+from .model import random_points
 from .options import PRESETS, TrainingOptions
 from .pictures import Pictures, load_pictures
 from .run import Run
@@ -19,7 +21,6 @@ from .trainer import Trainer, starting_gaussians
 __all__ = [
     "PRESETS",
     "Capture",
-    "Gaussians",
     "Photograph",
     "Pictures",
     "Run",
@@ -31,6 +32,7 @@ __all__ = [
     "load_lpips",
     "load_pictures",
     "load_points",
+    "random_points",
     "save_pictures",
     "starting_gaussians",
 ]

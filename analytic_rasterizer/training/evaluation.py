@@ -12,11 +12,12 @@ import torch
 from torch import Tensor
 
 from .. import io
+from ..distributed.ranks import ALONE, Ranks
+from ..gaussians import Gaussians
 from ..losses import ssim
 from ..settings import GaussianRasterizationSettings
-from .model import Activated
+from .model import render, render_together
 from .pictures import Pictures
-from .ranks import ALONE, Ranks
 
 LPIPS_WEIGHTS = {"vgg": "vgg16-397923af.pth", "alex": "alexnet-owt-7be5be79.pth"}  # of torchvision
 ERROR_GAIN = 4  # of the pictures of errors
@@ -61,7 +62,7 @@ def load_lpips(network: str, device: str | torch.device, like_3dgs: bool = False
 
 @torch.no_grad()
 def evaluate(
-    scene: io.Scene,
+    scene: Gaussians,
     pictures: Pictures,
     footprint: str,
     lpips: Perceptual | None = None,
@@ -88,7 +89,7 @@ def evaluate(
     """
     if not pictures.views:
         raise ValueError("pictures must have at least one view, got none")
-    gaussians = Activated(*scene[:5])
+    gaussians = scene.arguments()
     results: dict[str, dict] = {}
     for scale, settings in pictures.resolve(footprint=footprint, sh_degree=scene.sh_degree, **options).items():
         measured = {}
@@ -111,27 +112,27 @@ def _means(rows: list[dict[str, float]]) -> dict[str, float]:
 
 
 def rendered(
-    gaussians: Activated, settings: list[GaussianRasterizationSettings], supersampling: int, ranks: Ranks
+    gaussians: dict[str, Tensor], settings: list[GaussianRasterizationSettings], supersampling: int, ranks: Ranks
 ) -> Iterator[tuple[int, Tensor]]:
     """Places in `settings` and pictures (3, H, W) of them; of several ranks they take turns.
 
     Args:
-        gaussians: Of this rank.
+        gaussians: `Gaussians.arguments` of this rank.
     """
     if ranks.world == 1:
         for place, chosen in enumerate(settings):
-            yield place, gaussians.render(chosen, supersampling=supersampling)[0]
+            yield place, render(gaussians, chosen, supersampling=supersampling)[0]
         return
     for first in range(0, len(settings), ranks.world):
-        batch = gaussians.render_together(settings[first : first + ranks.world], supersampling, group=ranks.group)
-        for view in batch.views:
-            yield first + view.camera, view.image
+        batch = render_together(gaussians, settings[first : first + ranks.world], supersampling, group=ranks.group)
+        for rendering in batch.renderings:
+            yield first + rendering.camera, rendering.image
 
 
 @torch.no_grad()
 def save_pictures(
     folder: Path,
-    scene: io.Scene,
+    scene: Gaussians,
     pictures: Pictures,
     footprint: str,
     count: int,
@@ -147,7 +148,7 @@ def save_pictures(
     Returns:
         The files, FOOTPRINT_SCALE_VIEW.png.
     """
-    gaussians, name = Activated(*scene[:5]), re.sub(r"\W+", "_", footprint)
+    gaussians, name = scene.arguments(), re.sub(r"\W+", "_", footprint)
     count, files = min(count, len(pictures.views)), []
     chosen = [i * len(pictures.views) // count for i in range(count)]
     for scale, settings in pictures.resolve(footprint=footprint, sh_degree=scene.sh_degree, **options).items():
@@ -155,6 +156,6 @@ def save_pictures(
         for place, image in rendered(gaussians, [settings[view] for view in chosen], supersampling, ranks):
             image, truth = image.clamp(0, 1), pictures.truth(scale, chosen[place])
             row = torch.cat([truth, image, ERROR_GAIN * (image - truth).abs()], dim=2)
-            io.to_image(row).save(of_scale[place])
+            io.save_image(of_scale[place], row)
         files += of_scale
     return files

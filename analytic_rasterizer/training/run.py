@@ -15,8 +15,10 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from .. import io
+from ..distributed.ranks import ALONE, Ranks
 from ..filters import bake_pixel
-from .captures import IMAGES, TEST_PERIOD, Capture, Photograph, is_scene, load_capture, load_points
+from ..gaussians import Gaussians
+from .captures import IMAGES, TEST_PERIOD, Capture, Photograph, load_capture
 from .evaluation import evaluate, psnr
 from .files import (
     CAMERAS,
@@ -32,13 +34,10 @@ from .files import (
     write_checkpoint,
     write_json,
     write_log,
-    write_safely,
     write_scene,
 )
-from .model import Gaussians
 from .options import TrainingOptions
 from .pictures import Pictures, load_pictures
-from .ranks import ALONE, Ranks
 from .schedule import Clock
 from .sharded import ShardedTrainer, shards_of
 from .trainer import Trainer, background_of, starting_gaussians
@@ -175,9 +174,9 @@ class Run:
             write_scene(self.out / SCENE, scene, self.options.footprint)
         return progress.share >= 1
 
-    def _whole(self, scene: io.Scene) -> io.Scene:
+    def _whole(self, scene: Gaussians) -> Gaussians:
         """The scene of all ranks, of which `scene` is this one's: on rank 0, on the CPU, without rows on the others."""
-        return scene._replace(**{name: self.ranks.gather_rows(getattr(scene, name)) for name in scene._fields[:5]})
+        return scene.map(self.ranks.gather_rows)
 
     def export_mip(self) -> Path:
         """Writes and returns point_cloud_mip.ply: the scene for viewers that do not integrate, see `bake_pixel`.
@@ -187,9 +186,9 @@ class Run:
         scene = self.trainer.scene()
         cameras = self.trainer.pictures.settings[min(self.options.scales)]
         scales, opacities = bake_pixel(scene.means, scene.scales, scene.rotations, scene.opacities, cameras)
-        baked = self._whole(scene._replace(scales=scales, opacities=opacities))
+        baked = self._whole(scene.with_activated(scales, opacities))
         if self.ranks.is_first:
-            write_safely(self.out / MIP_SCENE, lambda temporary: io.save_scene(temporary, baked))
+            write_scene(self.out / MIP_SCENE, baked, "point")
         return self.out / MIP_SCENE
 
     def start_viewer(self, port: int = 0) -> LiveViewer:
@@ -329,15 +328,15 @@ def first_gaussians(options: TrainingOptions, capture: Capture, points) -> tuple
     Raises:
         ValueError: A scene without Gaussians, or with more than `max_gaussians`; what `starting_gaussians` raises.
     """
-    if points is not None and is_scene(Path(points)):
+    if points is not None and io.is_scene(points):
         scene = io.load_scene(points)
         if not len(scene.means):  # from which nothing would ever grow
             raise io.SceneError(f"{points}: the scene has no Gaussians")
         if len(scene.means) > options.gaussian_limit:
             expected = f"at least {len(scene.means)}, the Gaussians of {points}, or 0"
             raise ValueError(f"max_gaussians must be {expected}, got {options.max_gaussians}")
-        return Gaussians.from_scene(scene, options.sh_degree), None
-    found = capture.points if points is None else load_points(points)
+        return scene.with_sh_degree(options.sh_degree).trainable(), None
+    found = capture.points if points is None else io.load_points(points)
     return starting_gaussians(options, found), None if found is None else len(found[0])
 
 

@@ -19,10 +19,12 @@ import torch
 from torch import Tensor
 
 from ..distributed import OwnSplats
+from ..distributed.ranks import Ranks, even_counts
+from ..gaussians import Gaussians
 from ..losses import l1_ssim
-from .density import MOMENTS
-from .model import Gaussians
-from .ranks import Ranks, even_counts
+from ..optim import MOMENTS
+from .extent import extent_of
+from .model import render_together
 from .trainer import Trainer
 
 BETAS = (0.9, 0.999)  # of one process, the defaults of FusedAdam
@@ -57,7 +59,12 @@ class ShardedTrainer(Trainer):
     def __init__(self, options, start: Gaussians, pictures, background, device, ranks: Ranks, counts=None):
         self.counts = even_counts(len(start.means), ranks.world) if counts is None else list(counts)
         rows = ranks.part_of(self.counts)
-        super().__init__(options, Gaussians(*(field[rows] for field in start)), pictures, background, device, ranks)
+        extent = extent_of(pictures.views, start.means)  # of all Gaussians, on every rank
+        super().__init__(options, start.rows(rows), pictures, background, device, ranks, extent)
+
+    @property
+    def count(self) -> int:
+        return sum(self.counts)
 
     @property
     def stride(self) -> int:
@@ -85,29 +92,30 @@ class ShardedTrainer(Trainer):
         A picture of any rank shows what is to be updated: this rank has projected its own Gaussians into all of them.
         """
         options, shown = self.options, self._next()
-        gaussians = self.gaussians.activated()
-        batch = gaussians.render_together(
+        gaussians = self.gaussians.arguments()
+        batch = render_together(
+            gaussians,
             [picture.settings for picture in shown],
             options.supersampling,
             means2d_abs=options.density == "absgrad",
             group=self.ranks.group,
         )
         loss = batch.anchor
-        for view in batch.views:
-            picture = shown[view.camera]
+        for rendering in batch.renderings:
+            picture = shown[rendering.camera]
             truth = self.pictures.target(picture.scale, picture.view, picture.background)
-            loss = loss + l1_ssim(view.image, truth, options.ssim_weight) / len(shown)
-            self.last = view.image.detach(), truth
+            loss = loss + l1_ssim(rendering.image, truth, options.ssim_weight) / len(shown)
+            self.last = rendering.image.detach(), truth
         opacity_weight, scale_weight = options.regularizers
         if opacity_weight:
-            loss = loss + opacity_weight * gaussians.opacities.sum() / batch.count
+            loss = loss + opacity_weight * gaussians["opacities"].sum() / batch.count
         if scale_weight:
-            loss = loss + scale_weight * gaussians.scales.sum() / (3 * batch.count)
+            loss = loss + scale_weight * gaussians["scales"].sum() / (3 * batch.count)
         rows = self._visible(batch.shard) if options.sparse_adam else None
         # What else there is of the batch is let go of, before the backward pass needs the memory.
         seen = []
         for camera, (picture, splats) in enumerate(zip(shown, batch.shard)):
-            if self.density.watches(picture.scale):
+            if self._watches(picture.scale):
                 leaf = batch.means2d_abs[camera] if batch.means2d_abs else splats.means2d
                 seen.append(Seen(splats.gaussian_ids, leaf, (splats.width, splats.height)))
         return loss, seen, rows
@@ -148,7 +156,7 @@ class ShardedTrainer(Trainer):
             return self.ranks.move_rows(rows.detach().contiguous(), before, after)
 
         old, optimizer = self.gaussians, self.optimizer
-        new = Gaussians(*(moved(field).requires_grad_() for field in old))
+        new = old.map(lambda field: moved(field).requires_grad_())
         for group, of_old, of_new in zip(optimizer.param_groups, old, new):
             state = optimizer.state.pop(of_old)
             optimizer.state[of_new] = state | {moment: moved(state[moment]) for moment in MOMENTS}

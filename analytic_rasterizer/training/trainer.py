@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import torch
@@ -10,23 +11,27 @@ from torch import Tensor
 
 from .. import _C, io
 from ..arguments import camera_arguments
+from ..density import FixedDensity, GradientDensity, GradientOptions, MonteCarloDensity, MonteCarloOptions
+from ..distributed.ranks import ALONE, Ranks
 from ..effects import Effects
 from ..filters import apply_3d_filter, compute_3d_filter
+from ..gaussians import Gaussians
 from ..losses import l1_ssim
 from ..optim import FusedAdam
 from ..settings import GaussianRasterizationSettings
-from .captures import WHITE, extent_of
-from .density import make_density
-from .model import Gaussians, gaussians_at, random_points
+from .captures import WHITE
+from .extent import extent_of
+from .health import check_left, check_visible, drop_broken
+from .model import random_points, render
 from .options import BACKGROUNDS, RANDOM_BACKGROUND, TrainingOptions
 from .pictures import Pictures
-from .ranks import ALONE, Ranks
 from .schedule import PictureOrder, Progress, means_rate_at, rates_factor_at, sh_degree_at
 
 _picture_gradients = _C.Call("picture_gradients")
 
 SH_REST_SHARE = 1 / 20  # of the learning rate of the constant
 FILTER_PERIOD = 100  # steps between two 3D filters, while Gaussians move
+CHECK_PERIOD = 100  # steps between looks at the numbers of the Gaussians, each of which waits for the device
 ADAM_EPS = 1e-15
 
 
@@ -42,8 +47,8 @@ class Shown(NamedTuple):
 class Trainer:
     """Trains Gaussians on pictures, step by step.
 
-    On CUDA nothing in a step waits for the device, but the steps that change the number of Gaussians. The same seed
-    gives the same bits; so does a training that goes on from `state_dict`, in another process as well.
+    On CUDA nothing in a step waits for the device, but one step in 100, and those that change the number of Gaussians.
+    The same seed gives the same bits; so does a training that goes on from `state_dict`, in another process as well.
 
     Args:
         start: Parameters, on any device; they are copied.
@@ -51,12 +56,15 @@ class Trainer:
         background: Behind the pictures, 0 to 1; None: random.
         device: To train on, that of the pictures.
         ranks: See `ShardedTrainer`; this class trains in one process.
+        extent: Of the capture, world units; None: that of the pictures and the starting Gaussians, see `extent_of`.
 
     Attributes:
         gaussians: The parameters at present.
         progress: Steps taken, and the share of the training that is over.
         losses: Of the steps since they were last taken away, one-element tensors.
         last: Picture and target (`Pictures.target`) of the last step, for looking at.
+        dropped: Gaussians that were taken away because a number of theirs had left float32.
+        warnings: Sentences for the user; who has told them empties the list.
     """
 
     def __init__(
@@ -67,12 +75,13 @@ class Trainer:
         background: tuple[float, float, float] | None,
         device: str | torch.device,
         ranks: Ranks = ALONE,
+        extent: float | None = None,
     ):
         self.options, self.pictures, self.device, self.ranks = options, pictures, torch.device(device), ranks
         self.random_background = background is None
-        self.extent = extent_of(pictures.views)
-        fields = (field.detach().to(self.device, torch.float32, copy=True).contiguous() for field in start)
-        gaussians = Gaussians(*(field.requires_grad_() for field in fields))
+        self.extent = extent_of(pictures.views, start.means.cpu()) if extent is None else extent
+        gaussians = start.map(lambda field: field.detach().to(self.device, torch.float32, copy=True).contiguous())
+        gaussians = gaussians.map(Tensor.requires_grad_)
         self.rates = {
             "means": options.means_rate * self.extent,
             "log_scales": options.scale_rate,
@@ -83,7 +92,7 @@ class Trainer:
         groups = [{"params": [getattr(gaussians, name)], "lr": self.rates[name]} for name in Gaussians._fields]
         groups[-1] |= {"head": 1, "head_lr": options.color_rate}  # the constant
         self.optimizer = FusedAdam(groups, eps=ADAM_EPS)
-        self.density = make_density(options, gaussians, self.optimizer, self.extent, background == WHITE, ranks=ranks)
+        self.density = make_density(options, gaussians, self.optimizer, self.extent, background == WHITE, ranks)
         self.generator = torch.Generator(self.device).manual_seed(options.seed + 1)
         self.progress = Progress(options.iterations if options.seconds == 0 else None, options.seconds)
         self.order = PictureOrder(len(pictures.views), options)
@@ -91,6 +100,7 @@ class Trainer:
         self.one = torch.ones((), dtype=torch.float32, device=self.device)  # dL/dL
         self.losses: list[Tensor] = []
         self.last: tuple[Tensor, Tensor] | None = None
+        self.dropped, self.warnings = 0, []
         self._resolved: tuple[int, dict] | None = None  # degree of the harmonics, and the settings of it
         self._cameras: dict[tuple[int, int], dict[str, Any]] = {}  # by scale and view, of the same degree
         self.in_one_op = self._fits_one_op()
@@ -101,8 +111,18 @@ class Trainer:
     def gaussians(self) -> Gaussians:
         return self.density.gaussians
 
+    @property
+    def count(self) -> int:
+        """How many Gaussians there are, of all ranks."""
+        return len(self.gaussians.means)
+
     def step(self) -> None:
-        """Takes one step of the optimizer."""
+        """Takes one step of the optimizer.
+
+        Raises:
+            FloatingPointError: At a look, every 100 steps: most Gaussians have left float32.
+            RuntimeError: There is no Gaussian any more, or none that a picture shows.
+        """
         progress, optimizer = self.progress, self.optimizer
         stride = self.stride
         self._set_rates()
@@ -111,10 +131,26 @@ class Trainer:
         optimizer.update(rows)
         optimizer.zero_grad(set_to_none=True)
         progress.advance(stride)
+        if progress.passed(CHECK_PERIOD):
+            self.check()
+        before = self.count
         changed = self.density.after_step(progress.step, progress.share, stride)
         if changed:
             self._rebalance()
+            check_left(self, before)
         if self.options.filter_3d and (changed or progress.passed(FILTER_PERIOD)):
+            self._compute_filter()
+
+    def check(self) -> None:
+        """Takes away Gaussians of which a number has left float32, and raises what `step` does. Collective."""
+        drop_broken(self)
+        check_visible(self)
+
+    def keep(self, kept: Tensor) -> None:
+        """Takes away all Gaussians but those of the mask (P,). Collective."""
+        self.density.keep(kept)
+        self._rebalance()
+        if self.filter_3d is not None:
             self._compute_filter()
 
     @property
@@ -173,7 +209,7 @@ class Trainer:
         """The same, bit for bit, without what autograd costs the host."""
         (shown,) = self._next()
         gaussians, density = self.gaussians, self.density
-        columns = density.columns if density.watches(shown.scale) else 0
+        columns = density.columns if self._watches(shown.scale) else 0
         truth = self.pictures.target(shown.scale, shown.view, shown.background)
         loss, image, radii, gradients = _picture_gradients(
             *gaussians,
@@ -187,7 +223,7 @@ class Trainer:
         for field, gradient in zip(gaussians, gradients):
             field.grad = gradient
         if columns:
-            density.observe(gradients[-1], radii)
+            density.observe_gradients(gradients[-1], radii)
         self.last = image, truth
         return loss, radii > 0 if self.options.sparse_adam else None
 
@@ -202,11 +238,11 @@ class Trainer:
     def _loss(self) -> tuple[Tensor, Any, Tensor | None]:
         """The loss of the next step, what `_observe` takes, and with `sparse_adam` which Gaussians a picture shows."""
         options = self.options
-        gaussians = self.gaussians.activated()
+        gaussians = self.gaussians.arguments()
         losses, seen = [], []
         for scale, view, settings, background in self._next():
-            leaf = self.density.leaf(scale)
-            image, radii = gaussians.render(settings, leaf, options.supersampling)
+            leaf = self.density.leaf() if self._watches(scale) else None
+            image, radii = render(gaussians, settings, leaf, options.supersampling)
             truth = self.pictures.target(scale, view, background)
             losses.append(l1_ssim(image, truth, options.ssim_weight))
             seen.append((leaf, radii))
@@ -214,17 +250,21 @@ class Trainer:
         loss = losses[0] if len(losses) == 1 else torch.stack(losses).mean()
         opacity_weight, scale_weight = options.regularizers
         if opacity_weight:
-            loss = loss + opacity_weight * gaussians.opacities.mean()
+            loss = loss + opacity_weight * gaussians["opacities"].mean()
         if scale_weight:
-            loss = loss + scale_weight * gaussians.scales.mean()
+            loss = loss + scale_weight * gaussians["scales"].mean()
         rows = torch.stack([radii > 0 for _, radii in seen]).any(0) if options.sparse_adam else None
         return loss, seen, rows
 
     def _observe(self, seen: list[tuple[Tensor | None, Tensor]]) -> None:
         """Lets density control look at the gradients of a step."""
         for leaf, radii in seen:
-            if leaf is not None:
-                self.density.observe(leaf.grad, radii)
+            self.density.observe(leaf, radii)
+
+    def _watches(self, scale: int) -> bool:
+        """Whether density control sees the gradients of pictures of this scale."""
+        options = self.options
+        return self.density.watches and (options.gradient_scales != "finest" or scale == min(options.scales))
 
     def _rebalance(self) -> None:
         """Called when the number of Gaussians has changed; there is nothing to do in one process."""
@@ -244,7 +284,7 @@ class Trainer:
     def warm_up(self) -> None:
         """Renders and differentiates one picture of each scale without a step, so that no step loads kernels."""
         for scale, settings in self._settings().items():
-            image, _ = self.gaussians.render(settings[0], supersampling=self.options.supersampling)
+            image, _ = render(self.gaussians.arguments(), settings[0], supersampling=self.options.supersampling)
             truth = self.pictures.target(scale, 0, settings[0].bg if self.random_background else None)
             l1_ssim(image, truth, self.options.ssim_weight).backward()
         self.optimizer.zero_grad(set_to_none=True)
@@ -266,13 +306,12 @@ class Trainer:
         return values
 
     @torch.no_grad()
-    def scene(self) -> io.Scene:
-        """The Gaussians as a scene, with the 3D filter applied where there is one."""
-        scene = self.gaussians.to_scene()
+    def scene(self) -> Gaussians:
+        """The Gaussians without gradients, with the 3D filter applied where there is one."""
+        scene = self.gaussians.map(Tensor.detach)
         if self.filter_3d is None:
             return scene
-        scales, opacities = apply_3d_filter(scene.scales, scene.opacities, self.filter_3d)
-        return scene._replace(scales=scales, opacities=opacities)
+        return scene.with_activated(*apply_3d_filter(scene.scales, scene.opacities, self.filter_3d))
 
     def state_dict(self) -> dict[str, Any]:
         """All that decides how the training goes on. Tensors are those of the training, not copies."""
@@ -283,12 +322,13 @@ class Trainer:
             "progress": self.progress.state_dict(),
             "generator": self.generator.get_state(),
             "filter_3d": self.filter_3d,
+            "extent": self.extent,
+            "dropped": self.dropped,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Goes on from what `state_dict` gave."""
-        fields = (state["gaussians"][name].to(self.device, copy=True) for name in Gaussians._fields)
-        gaussians = Gaussians(*(field.requires_grad_() for field in fields))
+        gaussians = Gaussians(**state["gaussians"]).map(lambda field: field.to(self.device, copy=True).requires_grad_())
         for group, field in zip(self.optimizer.param_groups, gaussians):
             group["params"] = [field]
         self.optimizer.state.clear()
@@ -299,6 +339,29 @@ class Trainer:
         self.generator.set_state(state["generator"].cpu())
         self.filter_3d = None if state["filter_3d"] is None else state["filter_3d"].to(self.device)
         self.losses, self.last = [], None
+        # Checkpoints of earlier versions have neither.
+        self.extent = self.density.extent = state.get("extent", self.extent)
+        self.dropped = state.get("dropped", 0)
+
+
+def make_density(
+    options: TrainingOptions,
+    gaussians: Gaussians,
+    optimizer: torch.optim.Optimizer,
+    extent: float,
+    white_background: bool = False,
+    ranks: Ranks = ALONE,
+) -> FixedDensity:
+    """The density control that `options.density` names, with what the options say about it."""
+    common = {"seed": options.seed, "ranks": ranks}
+    if options.density == "none":
+        return FixedDensity(gaussians, optimizer, **common)
+    kind = MonteCarloOptions if options.density == "mcmc" else GradientOptions
+    known = vars(options) | {"absolute": options.density == "absgrad", "white_background": white_background}
+    chosen = kind(**{field.name: known[field.name] for field in fields(kind)})
+    if options.density == "mcmc":
+        return MonteCarloDensity(gaussians, optimizer, chosen, **common)
+    return GradientDensity(gaussians, optimizer, extent, chosen, **common)
 
 
 def starting_gaussians(options: TrainingOptions, points: tuple[Tensor, Tensor] | None) -> Gaussians:
@@ -323,7 +386,7 @@ def starting_gaussians(options: TrainingOptions, points: tuple[Tensor, Tensor] |
             means, colors = means[rows], colors[rows]
     if len(means) < 2:
         raise io.SceneError(f"training needs at least 2 points to start from, got {len(means)}")
-    return gaussians_at(means, colors, options.sh_degree, options.initial_opacity, options.initial_scale)
+    return Gaussians.from_points(means, colors, options.sh_degree, options.initial_opacity, options.initial_scale)
 
 
 def background_of(options: TrainingOptions, convention: tuple[float, float, float]) -> tuple | None:

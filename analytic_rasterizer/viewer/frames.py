@@ -14,7 +14,8 @@ import torch
 
 from .. import io
 from ..footprints import FOOTPRINTS, OPTIONS, option_values
-from ..rasterizer import rasterize_gaussians
+from ..gaussians import Gaussians
+from ..rasterizer import GaussianRasterizer
 
 MOVING_SECONDS = 0.06
 """What a frame should take while its camera moves; the resolution adapts to it."""
@@ -71,7 +72,7 @@ def camera_view(position, wxyz, fov: float, width: int, height: int) -> io.View:
 
 
 @torch.no_grad()
-def render_frame(scene: io.Scene, view: io.View, footprint: str, background=(0.0, 0.0, 0.0)) -> np.ndarray:
+def render_frame(scene: Gaussians, view: io.View, footprint: str, background=(0.0, 0.0, 0.0)) -> np.ndarray:
     """Renders a view on the device of the scene.
 
     Returns:
@@ -81,9 +82,7 @@ def render_frame(scene: io.Scene, view: io.View, footprint: str, background=(0.0
         ValueError: As `resolve_footprint` and `GaussianRasterizer`.
     """
     settings = view.settings(1.0, background, scene.sh_degree, footprint, device=scene.means.device)
-    color, *_ = rasterize_gaussians(
-        scene.means, None, scene.shs, None, scene.opacities, scene.scales, scene.rotations, None, settings
-    )
+    color, *_ = GaussianRasterizer(settings)(means2D=None, **scene.arguments())
     return color.clamp(0, 1).mul(255).round().to("cpu", torch.uint8).permute(1, 2, 0).contiguous().numpy()
 
 
@@ -112,7 +111,7 @@ def moving_pixels(settled: Cost | None, moving: Cost | None) -> float:
 class Snapshot(NamedTuple):
     """A scene that nobody changes, and when it is complete."""
 
-    scene: io.Scene
+    scene: Gaussians
     ready: torch.cuda.Event | None
     """Recorded on the stream of whoever made the tensors; None on the CPU."""
 
@@ -122,21 +121,21 @@ class Snapshot(NamedTuple):
             return
         stream = torch.cuda.current_stream(self.scene.means.device)
         stream.wait_event(self.ready)
-        for tensor in self.scene[:-1]:
+        for tensor in self.scene:
             tensor.record_stream(stream)
 
 
 @torch.no_grad()
-def take_snapshot(scene: io.Scene | Callable[[], io.Scene], copy: bool) -> Snapshot:
+def take_snapshot(scene: Gaussians | Callable[[], Gaussians], copy: bool) -> Snapshot:
     """What `LiveViewer.update` is given, checked, and where asked for copied."""
     given = scene() if callable(scene) else scene
-    if not isinstance(given, io.Scene):
-        raise TypeError(f"scene must be an io.Scene or a function that returns one, got {type(given).__name__}")
+    if not isinstance(given, Gaussians):
+        raise TypeError(f"scene must be Gaussians or a function that returns them, got {type(given).__name__}")
     if len(given.means) == 0:
         raise ValueError("scene must have Gaussians, got none")
-    tensors = [tensor.detach().to(torch.float32, copy=copy).contiguous() for tensor in given[:-1]]
+    taken = given.map(lambda field: field.detach().to(torch.float32, copy=copy).contiguous())
     ready = None
     if given.means.is_cuda:
         ready = torch.cuda.Event()
         ready.record(torch.cuda.current_stream(given.means.device))
-    return Snapshot(io.Scene(*tensors, given.sh_degree), ready)
+    return Snapshot(taken, ready)

@@ -16,6 +16,7 @@ import torch
 
 from .. import io
 from ..footprints import Footprint, get_default_footprint, resolve_footprint
+from ..gaussians import Gaussians
 from .frames import (
     LIVE_FOOTPRINTS,
     SMALLEST_MOVING_SCALE,
@@ -65,7 +66,7 @@ class LiveViewer:
         viewer = LiveViewer(views=views)
         for step in range(30_000):
             ...
-            viewer.update(model.scene, step=step, text=f"loss {loss:.4f}")  # model.scene() returns an io.Scene
+            viewer.update(model.scene, step=step, text=f"loss {loss:.4f}")  # model.scene() returns Gaussians
         viewer.stop()
 
     Each browser has its own camera and controls. One thread renders for all of them, only while a browser is
@@ -152,7 +153,7 @@ class LiveViewer:
 
     def update(
         self,
-        scene: io.Scene | Callable[[], io.Scene],
+        scene: Gaussians | Callable[[], Gaussians],
         *,
         step: int | None = None,
         text: str = "",
@@ -177,7 +178,7 @@ class LiveViewer:
             Whether the scene was taken.
 
         Raises:
-            TypeError: No `Scene`.
+            TypeError: No `Gaussians`.
             ValueError: The scene has no Gaussians, or at the first call centres that are not finite.
         """
         with self._changed:
@@ -221,7 +222,7 @@ class LiveViewer:
 
     # ------------------------------------------------------------------------------- browsers
 
-    def _begin(self, scene: io.Scene) -> None:
+    def _begin(self, scene: Gaussians) -> None:
         """Puts cameras where the first scene is."""
         if not bool(scene.means.isfinite().all()):
             raise ValueError("means of the first scene must be finite")

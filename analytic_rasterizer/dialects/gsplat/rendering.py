@@ -9,11 +9,12 @@ from typing import Any
 import torch
 
 from ..._C import TILE
+from ...autocast import widened
 from ...camera import camera_matrices
 from ...effects import Effects
 from ...footprints import Footprint
 from ...settings import GaussianRasterizationSettings
-from ...stages import Splats, bin, blend, project
+from ...stages import Splats, blend, list_tiles, project
 from .arguments import (
     RASTERIZE_MODES,
     RENDER_MODES,
@@ -130,6 +131,8 @@ def rasterization(
         ValueError: Wrong shape, device or value. The numbers of cameras are looked at on the CPU only.
         RuntimeError: CUDA tensors, and an extension without CUDA; or a pose in viewmats that is singular.
     """
+    means, quats, scales, opacities, covars = map(widened, (means, quats, scales, opacities, covars))
+    colors, viewmats, Ks, backgrounds = map(widened, (colors, viewmats, Ks, backgrounds))
     asked = {
         "sparse_grad": sparse_grad,
         "with_ut": with_ut,
@@ -206,7 +209,7 @@ def rasterization(
     blended = splats
     if sharing is not None:
         blended, absolute = sharing.send(splats, features, absolute)
-        features = blended.colors  # of any number of channels, which `bin` does not take
+        features = blended.colors  # of any number of channels, which `list_tiles` does not take
         blended = dataclasses.replace(blended, colors=features.new_empty(0, 3))
     if with_depth:
         features = torch.cat([features, blended.depths[:, None]], 1)
@@ -361,6 +364,6 @@ def _blend(
     if splats.footprint == "adaptive":  # it chooses samples by the first three channels
         three = features.detach()[:, :3]
         splats = dataclasses.replace(splats, colors=torch.nn.functional.pad(three, (0, 3 - three.shape[1])))
-    lists = bin(splats, keep=torch.is_grad_enabled())
+    lists = list_tiles(splats, keep=torch.is_grad_enabled())
     images, alphas = blend(splats, lists, features, backgrounds, means2d_abs=absolute)
     return images.permute(0, 2, 3, 1).contiguous(), alphas.permute(0, 2, 3, 1).contiguous()
