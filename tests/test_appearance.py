@@ -76,7 +76,7 @@ CHOICES = {
     "the user": ({"a.ply": MOMENT}, "a.ply", "mip", "point:dilation=0", "point:dilation=0.0", "as given"),
     "the environment": ({"a.ply": MOMENT}, "a.ply", "mip", None, MIP, "ANALYTIC_RASTERIZER_FOOTPRINT says so"),
     "an empty environment": ({"a.ply": MOMENT}, "a.ply", "", None, "moment:samples=4", "a.ply says so"),
-    "thin Gaussians": ({"a.ply": None}, "a.ply", "moment", None, "moment:samples=4", "too thin for moment, so first: bake"),
+    "thin Gaussians": ({"a.ply": None}, "a.ply", "moment", None, "moment:samples=4", "too thin for moment, so first"),
     "thin by the tag": ({"a.ply": POINT}, "a.ply", None, "box", "box:samples=4", "its Gaussians are too thin"),
     "own tag": ({"a.ply": BOX}, "a.ply", None, None, "box:samples=8", "a.ply says so"),
     "own tag of point": ({"a.ply": POINT}, "a.ply", None, None, UNMARKED, "a.ply says so; right at the size of"),
