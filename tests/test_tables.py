@@ -131,8 +131,8 @@ def test_protocols_are_those_of_the_paper():
     plain, starred = ROWS[3], next(row for row in single.rows if row.published == "Ours*")
     assert plain.published == "Ours" and plain.options == starred.options == {"footprint": "analytic"}
     options = TrainingOptions(**blender.training_options(plain, "lego"))
-    assert (options.scales, options.scale_repeats, options.downsampling) == ((1, 2, 4, 8), (2, 1, 1, 1), "box")
-    assert options == TrainingOptions(**(multi.training_options(plain, "room") | {"downsampling": "box"}))
+    assert (options.scales, options.scale_repeats, options.downsampling) == ((1, 2, 4, 8), (2, 1, 1, 1), "blender")
+    assert options == TrainingOptions(**(multi.training_options(plain, "room") | {"downsampling": "blender"}))
     assert multi.training_options(plain, "room")["downsampling"] == "bicubic"
     assert multi.training == larger.training and TABLES["blender-stst"].training == TABLES["blender-stmt"].training
 

@@ -1,0 +1,71 @@
+"""Where a capture is in the world: what is taken off its coordinates, and what its cameras look at."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from .. import io
+
+# Of the distance from zero over the size of a capture. Below, float32 holds positions to 4e-6 of the size, and the
+# smallest steps of a training still move them.
+FARTHEST = 64
+NEAREST_DEPTH, FARTHEST_DEPTH = 0.25, 4.0  # of random points, in depths of what cameras look at
+DEPTH_WITHOUT_FOCUS = 10  # of what cameras look at that do not look at one place, in distances between cameras
+
+
+def centers_of(views: list[io.View]) -> Tensor:
+    """Where the cameras are, (N, 3) float64."""
+    return torch.stack([torch.linalg.inv(view.w2c)[:3, 3] for view in views])
+
+
+def offset_of(views: list[io.View], points: Tensor | None) -> tuple[float, float, float] | None:
+    """What to take off all positions so that float32 holds them well; None where it does as they are.
+
+    It is round: a multiple of a power of ten that is about the size of the capture. Medians, so that a few cameras or
+    points that are far off have no say.
+
+    Args:
+        points: (P, 3) float64, of what the cameras see.
+    """
+    centers = centers_of(views)
+    middle = centers.median(dim=0).values
+    known = [centers] if points is None else [centers, points.double()]
+    size = max((positions - middle).norm(dim=1).median().item() for positions in known) or 1.0
+    if middle.norm().item() <= FARTHEST * size:
+        return None
+    step = 10.0 ** math.ceil(math.log10(size))
+    return tuple(round(number / step) * step + 0.0 for number in middle.tolist())
+
+
+def points_in_view(views: list[io.View], count: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Random positions (count, 3) in front of the cameras, float32, and grey, (count, 3) of colours in [0, 1].
+
+    Each is in a random pixel of a random view, at a depth between NEAREST_DEPTH and FARTHEST_DEPTH of that of the place
+    nearest to all optical axes, uniform in its logarithm. Axes that are parallel, or meet behind the cameras, have no
+    such place; then the depth is DEPTH_WITHOUT_FOCUS times the distance of the cameras from each other.
+    """
+    c2w = torch.linalg.inv(torch.stack([view.w2c for view in views]))
+    centers, axes = c2w[:, :3, 3], c2w[:, :3, 2]
+    extent = (centers - centers.mean(0)).norm(dim=1).median().item()
+    # The distance from an axis is |across (x - center)|.
+    across = torch.eye(3, dtype=axes.dtype) - axes[:, :, None] * axes[:, None, :]
+    focus = torch.linalg.lstsq(across.sum(0), (across @ centers[:, :, None]).sum(0)).solution[:, 0]
+    depth = ((focus - centers) * axes).sum(1).median().item()
+    if not (math.isfinite(depth) and depth > extent / 2):
+        depth = DEPTH_WITHOUT_FOCUS * extent or 1.0
+    generator = torch.Generator().manual_seed(seed)
+    uniform = torch.rand(count, 3, generator=generator, dtype=torch.float64, device="cpu")
+    chosen = torch.randint(len(views), (count,), generator=generator, device="cpu")
+    z = depth * NEAREST_DEPTH * (FARTHEST_DEPTH / NEAREST_DEPTH) ** uniform[:, 2]
+    middles = [(v.width / 2 if v.cx is None else v.cx, v.height / 2 if v.cy is None else v.cy) for v in views]
+    size, middle, focal = (
+        torch.tensor(rows, dtype=torch.float64, device="cpu")[chosen]
+        for rows in ([(v.width, v.height) for v in views], middles, [(v.fx, v.fy) for v in views])
+    )
+    xy = (uniform[:, :2] * size - middle) / focal * z[:, None]
+    in_camera = torch.cat([xy, z[:, None], torch.ones_like(z[:, None])], 1)
+    points = (c2w[chosen] @ in_camera[:, :, None])[:, :3, 0]
+    return points.float(), torch.full((count, 3), 0.5, dtype=torch.float32, device="cpu")
