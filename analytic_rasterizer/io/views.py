@@ -15,6 +15,7 @@ import torch
 from ..camera import View
 from .common import SceneError, first_line, opened_picture
 from .pictures import PictureFiles
+from .writing import write_text
 
 # What an entry of a transforms file may say of the lens; nothing, or zeros, for a pinhole.
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "distortion_params", "is_fisheye")
@@ -74,13 +75,13 @@ def distortion_of(entry: dict) -> dict[str, Any]:
 
 
 def save_views(path, views: list[View]) -> None:
-    """Writes views as the plain list of `load_views`."""
+    """Writes views as the plain list of `load_views`. Raises OSError; an earlier file is then unchanged."""
     entries = []
     for view in views:
         entry = {key: getattr(view, key) for key in ("name", "width", "height", "fx", "fy")}
         entry |= {k: getattr(view, k) for k in ("cx", "cy", "offset") if getattr(view, k) is not None}
         entries.append(entry | {"w2c": view.w2c.flatten().tolist()})
-    Path(path).write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(entries, indent=1) + "\n")
 
 
 def _views(data, folder: Path, size) -> list[View]:

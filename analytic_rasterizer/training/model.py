@@ -95,10 +95,11 @@ def gaussians_at(points: Tensor, colors: Tensor, sh_degree: int, opacity: float 
 
     Raises ImportError without SciPy.
     """
-    count = len(points)
+    count, distances = len(points), neighbour_distance(points)
+    points = points.float()
     return Gaussians(
         points,
-        (scale * neighbour_distance(points)).log()[:, None].repeat(1, 3),
+        (scale * distances).log()[:, None].repeat(1, 3),
         points.new_tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
         points.new_full((count, 1), opacity).logit(),
         torch.cat([(colors[:, None] - 0.5) / SH_C0, points.new_zeros(count, (sh_degree + 1) ** 2 - 1, 3)], dim=1),
