@@ -30,8 +30,8 @@ from analytic_rasterizer import io
 from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import added_memory
 from analytic_rasterizer.distributed import rasterize_bands
+from analytic_rasterizer.distributed.ranks import Ranks, even_counts
 from analytic_rasterizer.gaussians import Gaussians
-from analytic_rasterizer.training.ranks import Ranks, even_counts
 
 COLUMNS = ("seconds", "scene_bytes", "peak_bytes")
 

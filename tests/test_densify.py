@@ -6,11 +6,11 @@ import pytest
 import torch
 from conftest import needs_cuda
 
-from analytic_rasterizer import io
+from analytic_rasterizer import density, io
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.optim import FusedAdam
 from analytic_rasterizer.rotations import rotation_matrices
-from analytic_rasterizer.training import TrainingOptions, density
+from analytic_rasterizer.training import TrainingOptions
 from analytic_rasterizer.training import model as g
 
 observe = torch.ops.analytic_rasterizer.observe_.default

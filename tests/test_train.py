@@ -17,7 +17,7 @@ import torch
 from conftest import ROOT, SHARED, needs_cuda
 from processes import DEADLINE
 
-from analytic_rasterizer import cli, io, render_stages
+from analytic_rasterizer import cli, density, io, render_stages
 from analytic_rasterizer.filters import bake_pixel
 from analytic_rasterizer.footprints import resolve_footprint
 from analytic_rasterizer.gaussians import Gaussians
@@ -46,7 +46,6 @@ from analytic_rasterizer.training import (  # noqa: E402
     TrainingOptions,
     captures,
     colmap,
-    density,
     files,
     pictures,
     schedule,

@@ -28,11 +28,11 @@ from test_train import TINY, circle, opengl_pose, rows_shown, scatter, write_pic
 
 from analytic_rasterizer import training  # noqa: E402
 from analytic_rasterizer.cli import launch  # noqa: E402
+from analytic_rasterizer.density import MOMENTS  # noqa: E402
+from analytic_rasterizer.distributed.ranks import ALONE, Ranks, even_counts  # noqa: E402
 from analytic_rasterizer.gaussians import Gaussians  # noqa: E402
 from analytic_rasterizer.optim import FusedAdam  # noqa: E402
 from analytic_rasterizer.training import TrainingOptions, files, model, schedule  # noqa: E402
-from analytic_rasterizer.training.density import MOMENTS  # noqa: E402
-from analytic_rasterizer.training.ranks import ALONE, Ranks, even_counts  # noqa: E402
 from analytic_rasterizer.training.sharded import UNEVEN, ShardedTrainer  # noqa: E402
 
 WORLD = 3

@@ -8,13 +8,13 @@ from pathlib import Path
 
 from .. import io
 from ..analysis.tables import format_table
+from ..distributed.ranks import Ranks, even_counts
 from ..footprints import resolve_footprint
 from ..gaussians import Gaussians
 from ..training import TrainingOptions, evaluate, load_capture, load_lpips, load_pictures, save_pictures
 from ..training.evaluation import LPIPS_WEIGHTS, MEASURES
 from ..training.files import OPTIONS, SCENE, write_json
 from ..training.options import check_scales
-from ..training.ranks import Ranks, even_counts
 from ..training.trainer import background_of
 from .arguments import add_machine_options, count, use_machine, whole_numbers, writable_folder
 from .launch import add_rank_options, ranks_of

@@ -12,7 +12,7 @@ from datetime import timedelta
 import torch
 import torch.distributed as dist
 
-from ..training.ranks import ALONE, Ranks
+from ..distributed.ranks import ALONE, Ranks
 
 TIMEOUT = 600  # s
 STORE_TIMEOUT = 10  # s, to tell torchrun's store that there is a message

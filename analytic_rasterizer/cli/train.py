@@ -12,12 +12,12 @@ from dataclasses import fields
 from pathlib import Path
 
 from .. import io
+from ..distributed.ranks import Ranks
 from ..footprints import resolve_footprint
 from ..training import Run, TrainingOptions
 from ..training.captures import IMAGES, TEST_PERIOD
 from ..training.files import CHECKPOINT, SCENE, read_checkpoint
 from ..training.options import BACKGROUNDS, DENSITIES, DOWNSAMPLINGS, PRESETS, RANDOM_BACKGROUND, preset_values
-from ..training.ranks import Ranks
 from .arguments import add_machine_options, port, use_machine, whole_numbers
 from .launch import add_rank_options, is_launched, ranks_of
 

@@ -9,8 +9,9 @@ Needs the libraries of `pip install analytic_rasterizer[train]`; they are import
 """
 
 from ..io import load_points
-from .captures import Capture, Photograph, extent_of, load_capture
+from .captures import Capture, Photograph, load_capture
 from .evaluation import evaluate, load_lpips, save_pictures
+from .extent import extent_of
 from .options import PRESETS, TrainingOptions
 from .pictures import Pictures, load_pictures
 from .run import Run

@@ -12,12 +12,12 @@ import torch
 from torch import Tensor
 
 from .. import io
+from ..distributed.ranks import ALONE, Ranks
 from ..gaussians import Gaussians
 from ..losses import ssim
 from ..settings import GaussianRasterizationSettings
 from .model import render, render_together
 from .pictures import Pictures
-from .ranks import ALONE, Ranks
 
 LPIPS_WEIGHTS = {"vgg": "vgg16-397923af.pth", "alex": "alexnet-owt-7be5be79.pth"}  # of torchvision
 ERROR_GAIN = 4  # of the pictures of errors

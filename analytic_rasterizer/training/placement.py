@@ -8,17 +8,13 @@ import torch
 from torch import Tensor
 
 from .. import io
+from .extent import places_of
 
 # Of the distance from zero over the size of a capture. Below, float32 holds positions to 4e-6 of the size, and the
 # smallest steps of a training still move them.
 FARTHEST = 64
 NEAREST_DEPTH, FARTHEST_DEPTH = 0.25, 4.0  # of random points, in depths of what cameras look at
 DEPTH_WITHOUT_FOCUS = 10  # of what cameras look at that do not look at one place, in distances between cameras
-
-
-def centers_of(views: list[io.View]) -> Tensor:
-    """Where the cameras are, (N, 3) float64."""
-    return torch.stack([torch.linalg.inv(view.w2c)[:3, 3] for view in views])
 
 
 def offset_of(views: list[io.View], points: Tensor | None) -> tuple[float, float, float] | None:
@@ -30,7 +26,7 @@ def offset_of(views: list[io.View], points: Tensor | None) -> tuple[float, float
     Args:
         points: (P, 3) float64, of what the cameras see.
     """
-    centers = centers_of(views)
+    centers = places_of(views)
     middle = centers.median(dim=0).values
     known = [centers] if points is None else [centers, points.double()]
     size = max((positions - middle).norm(dim=1).median().item() for positions in known) or 1.0

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from .. import io
+from ..distributed.ranks import ALONE, Ranks
 from ..filters import bake_pixel
 from ..gaussians import Gaussians
 from .captures import IMAGES, TEST_PERIOD, Capture, Photograph, load_capture
@@ -37,7 +38,6 @@ from .files import (
 )
 from .options import TrainingOptions
 from .pictures import Pictures, load_pictures
-from .ranks import ALONE, Ranks
 from .schedule import Clock
 from .sharded import ShardedTrainer, shards_of
 from .trainer import Trainer, background_of, starting_gaussians

@@ -6,6 +6,7 @@ import time
 
 import torch
 
+from ..density import passes
 from .options import TrainingOptions
 
 SH_SHARE = 0.1  # of the training, after which another degree is due at the latest
@@ -89,11 +90,6 @@ class PictureOrder:
             generator = torch.Generator().manual_seed((self.seed << 24) + number)
             self.drawn = number, torch.randperm(len(self.pairs), generator=generator, device="cpu").tolist()
         return self.pairs[self.drawn[1][place]]
-
-
-def passes(step: int, period: int, stride: int = 1) -> bool:
-    """Whether there is a multiple of `period` among the `stride` steps that end with `step`."""
-    return step // period > (step - stride) // period
 
 
 def sh_degree_at(step: int, share: float, options: TrainingOptions) -> int:

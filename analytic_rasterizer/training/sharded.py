@@ -18,12 +18,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..density import MOMENTS
 from ..distributed import OwnSplats
+from ..distributed.ranks import Ranks, even_counts
 from ..gaussians import Gaussians
 from ..losses import l1_ssim
-from .density import MOMENTS
+from .extent import extent_of
 from .model import render_together
-from .ranks import Ranks, even_counts
 from .trainer import Trainer
 
 BETAS = (0.9, 0.999)  # of one process, the defaults of FusedAdam
@@ -58,7 +59,12 @@ class ShardedTrainer(Trainer):
     def __init__(self, options, start: Gaussians, pictures, background, device, ranks: Ranks, counts=None):
         self.counts = even_counts(len(start.means), ranks.world) if counts is None else list(counts)
         rows = ranks.part_of(self.counts)
-        super().__init__(options, start.rows(rows), pictures, background, device, ranks)
+        extent = extent_of(pictures.views, start.means)  # of all Gaussians, on every rank
+        super().__init__(options, start.rows(rows), pictures, background, device, ranks, extent)
+
+    @property
+    def count(self) -> int:
+        return sum(self.counts)
 
     @property
     def stride(self) -> int:

@@ -10,24 +10,27 @@ from torch import Tensor
 
 from .. import _C, io
 from ..arguments import camera_arguments
+from ..density import make_density
+from ..distributed.ranks import ALONE, Ranks
 from ..effects import Effects
 from ..filters import apply_3d_filter, compute_3d_filter
 from ..gaussians import Gaussians
 from ..losses import l1_ssim
 from ..optim import FusedAdam
 from ..settings import GaussianRasterizationSettings
-from .captures import WHITE, extent_of
-from .density import make_density
+from .captures import WHITE
+from .extent import extent_of
+from .health import check_left, check_visible, drop_broken
 from .model import gaussians_at, random_points, render
 from .options import BACKGROUNDS, RANDOM_BACKGROUND, TrainingOptions
 from .pictures import Pictures
-from .ranks import ALONE, Ranks
 from .schedule import PictureOrder, Progress, means_rate_at, rates_factor_at, sh_degree_at
 
 _picture_gradients = _C.Call("picture_gradients")
 
 SH_REST_SHARE = 1 / 20  # of the learning rate of the constant
 FILTER_PERIOD = 100  # steps between two 3D filters, while Gaussians move
+CHECK_PERIOD = 100  # steps between looks at the numbers of the Gaussians, each of which waits for the device
 ADAM_EPS = 1e-15
 
 
@@ -43,8 +46,8 @@ class Shown(NamedTuple):
 class Trainer:
     """Trains Gaussians on pictures, step by step.
 
-    On CUDA nothing in a step waits for the device, but the steps that change the number of Gaussians. The same seed
-    gives the same bits; so does a training that goes on from `state_dict`, in another process as well.
+    On CUDA nothing in a step waits for the device, but one step in 100, and those that change the number of Gaussians.
+    The same seed gives the same bits; so does a training that goes on from `state_dict`, in another process as well.
 
     Args:
         start: Parameters, on any device; they are copied.
@@ -52,12 +55,15 @@ class Trainer:
         background: Behind the pictures, 0 to 1; None: random.
         device: To train on, that of the pictures.
         ranks: See `ShardedTrainer`; this class trains in one process.
+        extent: Of the capture, world units; None: that of the pictures and the starting Gaussians, see `extent_of`.
 
     Attributes:
         gaussians: The parameters at present.
         progress: Steps taken, and the share of the training that is over.
         losses: Of the steps since they were last taken away, one-element tensors.
         last: Picture and target (`Pictures.target`) of the last step, for looking at.
+        dropped: Gaussians that were taken away because a number of theirs had left float32.
+        warnings: Sentences for the user; who has told them empties the list.
     """
 
     def __init__(
@@ -68,10 +74,11 @@ class Trainer:
         background: tuple[float, float, float] | None,
         device: str | torch.device,
         ranks: Ranks = ALONE,
+        extent: float | None = None,
     ):
         self.options, self.pictures, self.device, self.ranks = options, pictures, torch.device(device), ranks
         self.random_background = background is None
-        self.extent = extent_of(pictures.views)
+        self.extent = extent_of(pictures.views, start.means.cpu()) if extent is None else extent
         gaussians = start.map(lambda field: field.detach().to(self.device, torch.float32, copy=True).contiguous())
         gaussians = gaussians.map(Tensor.requires_grad_)
         self.rates = {
@@ -92,6 +99,7 @@ class Trainer:
         self.one = torch.ones((), dtype=torch.float32, device=self.device)  # dL/dL
         self.losses: list[Tensor] = []
         self.last: tuple[Tensor, Tensor] | None = None
+        self.dropped, self.warnings = 0, []
         self._resolved: tuple[int, dict] | None = None  # degree of the harmonics, and the settings of it
         self._cameras: dict[tuple[int, int], dict[str, Any]] = {}  # by scale and view, of the same degree
         self.in_one_op = self._fits_one_op()
@@ -102,8 +110,18 @@ class Trainer:
     def gaussians(self) -> Gaussians:
         return self.density.gaussians
 
+    @property
+    def count(self) -> int:
+        """How many Gaussians there are, of all ranks."""
+        return len(self.gaussians.means)
+
     def step(self) -> None:
-        """Takes one step of the optimizer."""
+        """Takes one step of the optimizer.
+
+        Raises:
+            FloatingPointError: At a look, every 100 steps: most Gaussians have left float32.
+            RuntimeError: There is no Gaussian any more, or none that a picture shows.
+        """
         progress, optimizer = self.progress, self.optimizer
         stride = self.stride
         self._set_rates()
@@ -112,10 +130,26 @@ class Trainer:
         optimizer.update(rows)
         optimizer.zero_grad(set_to_none=True)
         progress.advance(stride)
+        if progress.passed(CHECK_PERIOD):
+            self.check()
+        before = self.count
         changed = self.density.after_step(progress.step, progress.share, stride)
         if changed:
             self._rebalance()
+            check_left(self, before)
         if self.options.filter_3d and (changed or progress.passed(FILTER_PERIOD)):
+            self._compute_filter()
+
+    def check(self) -> None:
+        """Takes away Gaussians of which a number has left float32, and raises what `step` does. Collective."""
+        drop_broken(self)
+        check_visible(self)
+
+    def keep(self, kept: Tensor) -> None:
+        """Takes away all Gaussians but those of the mask (P,). Collective; not before the first step."""
+        self.density.keep(kept)
+        self._rebalance()
+        if self.filter_3d is not None:
             self._compute_filter()
 
     @property
@@ -283,6 +317,8 @@ class Trainer:
             "progress": self.progress.state_dict(),
             "generator": self.generator.get_state(),
             "filter_3d": self.filter_3d,
+            "extent": self.extent,
+            "dropped": self.dropped,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -298,6 +334,9 @@ class Trainer:
         self.generator.set_state(state["generator"].cpu())
         self.filter_3d = None if state["filter_3d"] is None else state["filter_3d"].to(self.device)
         self.losses, self.last = [], None
+        # Checkpoints of earlier versions have neither.
+        self.extent = self.density.extent = state.get("extent", self.extent)
+        self.dropped = state.get("dropped", 0)
 
 
 def starting_gaussians(options: TrainingOptions, points: tuple[Tensor, Tensor] | None) -> Gaussians:

@@ -14,7 +14,7 @@ from typing import Any
 import torch.distributed as dist
 from torch import Tensor
 
-from ..distributed.agreement import gather, place_in
+from .agreement import gather, place_in
 
 
 @dataclass(frozen=True)

@@ -27,18 +27,19 @@ opacities are also lowered when growth begins, since white Gaussians in front of
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from .. import ops  # noqa: F401  (registers the fake kernels)
-from ..gaussians import Gaussians
-from ..relocation import compute_relocation
-from ..rotations import rotation_matrices
-from .options import TrainingOptions
-from .ranks import ALONE, Ranks
-from .schedule import passes
+from . import ops  # noqa: F401  (registers the fake kernels)
+from .distributed.ranks import ALONE, Ranks
+from .gaussians import Gaussians
+from .relocation import compute_relocation
+from .rotations import rotation_matrices
+
+if TYPE_CHECKING:
+    from .training.options import TrainingOptions
 
 _observe = torch.ops.analytic_rasterizer.observe_.default
 
@@ -60,6 +61,7 @@ class FixedDensity:
 
     Attributes:
         gaussians: May be other tensors after `after_step`.
+        pruned: How many were pruned the last time, by cause: "opacity" and "size", one-element tensors.
         row_state: Names of the attributes that have a row per Gaussian.
     """
 
@@ -76,6 +78,7 @@ class FixedDensity:
     ):
         self.gaussians, self.optimizer, self.ranks = gaussians, optimizer, ranks
         self.extent, self.options, self.white_background = extent, options, white_background
+        self.pruned: dict[str, Tensor] = {}
         self.generator = torch.Generator(gaussians.means.device).manual_seed(options.seed)
 
     def watches(self, scale: int) -> bool:
@@ -108,6 +111,14 @@ class FixedDensity:
 
     def forget(self) -> None:
         """Begins new averages, of as many Gaussians as there are now."""
+
+    @torch.no_grad()
+    def keep(self, kept: Tensor) -> None:
+        """Takes away all Gaussians but those of the mask (P,); averages of the others go on. Not before a step."""
+        old = self.gaussians
+        self.gaussians = replace_rows(old, self.optimizer, kept, old.rows(slice(0)))
+        for name in self.row_state:
+            setattr(self, name, getattr(self, name)[kept])
 
     def observe(self, gradients: Tensor, radii: Tensor) -> None:
         """Looks at the gradients of a picture, (P, columns), and at its radii. Nothing here waits for the device."""
@@ -218,9 +229,10 @@ class GradientDensity(FixedDensity):
 
     def _prune(self, too_large: bool) -> None:
         old, options = self.gaussians, self.options
-        kept = old.logit_opacities[:, 0].sigmoid() >= options.prune_opacity
+        kept = opaque = old.logit_opacities[:, 0].sigmoid() >= options.prune_opacity
         if too_large:
-            kept &= old.log_scales.amax(1).exp() <= options.prune_above * self.extent
+            kept = opaque & (old.log_scales.amax(1).exp() <= options.prune_above * self.extent)
+        self.pruned = {"opacity": (~opaque).sum(), "size": (opaque & ~kept).sum()}
         self.gaussians = replace_rows(old, self.optimizer, kept, old.rows(slice(0)))
 
     def _lower_opacities(self) -> None:
@@ -296,6 +308,11 @@ class MonteCarloDensity(FixedDensity):
         axes = rotation_matrices(rotations)
         along = (2 * log_scales).exp() * (axes * noise[:, :, None]).sum(1)  # in the Gaussian's frame
         means += (axes * along[:, None, :]).sum(2)
+
+
+def passes(step: int, period: int, stride: int = 1) -> bool:
+    """Whether there is a multiple of `period` among the `stride` steps that end with `step`."""
+    return step // period > (step - stride) // period
 
 
 def make_density(options: TrainingOptions, *args, **kwargs) -> FixedDensity:

@@ -1,0 +1,96 @@
+"""The size of a capture: what the learning rate of the means and the limits of size are measured in.
+
+[3DGS] takes the radius of the cameras for it. That fits cameras around an object, which are as far from each other as
+from what they see. Those of a tripod are all at one place, and a camera with a wrong pose may be anywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ..camera import View
+
+RADIUS_FACTOR = 1.1  # [3DGS]
+SEEN_SHARE = 0.5  # of the distance of what cameras see: the least extent
+OUTLYING = 10  # times as far from the middle as every other camera
+MOST_OUTLIERS = 5  # at most one in so many cameras is an outlier
+MOST_VIEWS, MOST_POINTS = 256, 4096  # of which a median is taken
+ROUNDING = 1e-9  # of coordinates: cameras no further apart are at one place
+
+
+def extent_of(views: Sequence[View], points: Tensor | None = None) -> float:
+    """The extent of a capture, world units: 1.1 times the largest distance of a camera from the mean of all [3DGS], or
+    half the distance of what the cameras see, if that is more.
+
+    Args:
+        views: The cameras. Outliers count: see `outliers_of`.
+        points: (P, 3) on the CPU, where there is something to see; None: only the cameras count.
+
+    Returns:
+        More than 0: cameras at one place that see nothing have the extent 1.
+    """
+    places = places_of(views)
+    radius = RADIUS_FACTOR * (places - places.mean(0)).norm(dim=1).max().item()
+    seen = 0.0 if points is None else seen_distance(views, points)
+    return max(radius, SEEN_SHARE * seen) or 1.0
+
+
+def seen_distance(views: Sequence[View], points: Tensor) -> float:
+    """The distance from a camera to the points that it shows: the median over points, then over cameras. World units.
+
+    Of many points and cameras a part is looked at. 0 where no camera shows a point.
+    """
+    views = views[:: -(-len(views) // MOST_VIEWS)]
+    points = points.detach()[:: max(-(-len(points) // MOST_POINTS), 1)].double()
+    w2c = torch.stack([view.w2c for view in views]).double()
+    distances = []
+    for view, seen in zip(views, points @ w2c[:, :3, :3].mT + w2c[:, None, :3, 3]):
+        x, y, z = seen.unbind(1)
+        cx = view.width / 2 if view.cx is None else view.cx
+        cy = view.height / 2 if view.cy is None else view.cy
+        column, row = x / z * view.fx + cx, y / z * view.fy + cy
+        shown = (z > 0) & (column >= 0) & (column < view.width) & (row >= 0) & (row < view.height)
+        if shown.any():
+            distances.append(seen[shown].norm(dim=1).median())
+    return torch.stack(distances).median().item() if distances else 0.0
+
+
+def outliers_of(views: Sequence[View], points: Tensor | None = None) -> dict[int, float]:
+    """Cameras so far from all others that their poses must be wrong: places in `views`, and distances in world units.
+
+    The distance is that from the middle, the median of all cameras. An outlier is OUTLYING times as far from it as
+    every camera that is none, and as what the cameras see. At most a fifth of the cameras are outliers, but one may
+    always be among three.
+
+    Args:
+        points: As of `extent_of`.
+    """
+    if len(views) < 3:
+        return {}
+    places = places_of(views)
+    middle = places.median(0).values
+    distances, order = (places - middle).norm(dim=1).sort()
+    # The reach of the cameras that are certainly none, then that of each one more.
+    first = len(views) - max(len(views) // MOST_OUTLIERS, 1)
+    least = max(0.0 if points is None else seen_distance(views, points), ROUNDING * middle.abs().max().item())
+    for i in range(first, len(views)):
+        if distances[i] > OUTLYING * max(distances[i - 1].item(), least):
+            return {order[j].item(): distances[j].item() for j in range(i, len(views))}
+    return {}
+
+
+def is_one_pose(views: Sequence[View]) -> bool:
+    """Whether all cameras are at one place and look in one direction, so that there is one view of the scene."""
+    w2c = torch.stack([view.w2c for view in views]).double()
+    places = places_of(views)
+    apart = (places - places[0]).abs().max().item()
+    turned = (w2c[:, :3, :3] - w2c[0, :3, :3]).abs().max().item()
+    return apart <= ROUNDING * (1 + places.abs().max().item()) and turned <= ROUNDING
+
+
+def places_of(views: Sequence[View]) -> Tensor:
+    """Where the cameras are, (V, 3) float64, world units."""
+    return torch.stack([torch.linalg.inv(view.w2c)[:3, 3] for view in views]).double()

@@ -1,0 +1,137 @@
+"""What a training must not become in silence: without Gaussians, without anything to see, or without numbers."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from ..gaussians import Gaussians
+from ..io.scenes import numbers_of
+from .model import render
+
+if TYPE_CHECKING:
+    from .trainer import Trainer
+
+FAINTEST = 1 / 255  # the rasterizer draws nothing of a lower opacity
+MOST_BROKEN = 0.5  # of the Gaussians: a training that loses more at once diverges
+SUDDEN_LOSS = 0.9  # of the Gaussians at once: a training that goes on, with a warning
+
+OPTION_OF = {
+    "means": "means_rate",
+    "log_scales": "scale_rate",
+    "rotations": "rotation_rate",
+    "logit_opacities": "opacity_rate",
+    "shs": "color_rate",
+}
+
+
+def finite_rows(gaussians: Gaussians) -> Tensor:
+    """Which Gaussians a scene file can hold: all numbers are finite, the scales themselves too. (N,) bool."""
+    return torch.stack([field.flatten(1).isfinite().all(1) for field in numbers_of(gaussians).values()]).all(0)
+
+
+@torch.no_grad()
+def drop_broken(trainer: Trainer) -> int:
+    """Takes away the Gaussians of which a number has left float32, and returns how many of all ranks. Collective.
+
+    Waits for the device.
+
+    Raises:
+        FloatingPointError: They are more than half; names the parameters and their learning rates.
+    """
+    gaussians = trainer.gaussians
+    kept = finite_rows(gaussians)
+    count = len(kept)
+    lost = count - int(kept.sum())
+    fields = [] if lost == 0 else _broken_fields(gaussians)
+    of_ranks = trainer.ranks.exchange((lost, count, fields))
+    lost_of_all = sum(lost for lost, _, _ in of_ranks)
+    count_of_all = sum(count for _, count, _ in of_ranks)
+    if lost_of_all == 0:
+        return 0
+    names = sorted({name for _, _, fields in of_ranks for name in fields}, key=list(OPTION_OF).index)
+    text = (
+        f"{lost_of_all:,} of {count_of_all:,} Gaussians have {' and '.join(names)} outside of float32 "
+        f"by step {trainer.progress.step:,}"
+    )
+    options = " or ".join(flag(OPTION_OF[name]) for name in names)
+    if lost_of_all > MOST_BROKEN * count_of_all:
+        trainer.take_losses()  # which raises where they say earlier that the training diverges
+        raise FloatingPointError(f"{text}: the training diverges; a lower {options} may help")
+    if trainer.dropped == 0:
+        trainer.warnings.append(f"{text}, and are taken away; a lower {options} may help")
+    trainer.dropped += lost_of_all
+    trainer.keep(kept)
+    return lost_of_all
+
+
+def _broken_fields(gaussians: Gaussians) -> list[str]:
+    """The parameters that have left float32."""
+    fields = zip(Gaussians._fields, numbers_of(gaussians).values())
+    return [name for name, field in fields if not field.isfinite().all()]
+
+
+@torch.no_grad()
+def check_visible(trainer: Trainer) -> None:
+    """Raises RuntimeError if no picture shows a Gaussian, so that nothing can be learned any more. Collective.
+
+    Waits for the device.
+    """
+    step, count = trainer.progress.step, trainer.count
+    clearest = trainer.gaussians.logit_opacities.sigmoid().amax().item() if len(trainer.gaussians.means) else 0.0
+    if max(trainer.ranks.exchange(clearest)) < FAINTEST:
+        options = ["opacity_rate"] + (["opacity_weight"] if trainer.options.regularizers[0] else [])
+        raise RuntimeError(
+            f"all {count:,} Gaussians are transparent after step {step:,} (opacities below 1/255), so that nothing can "
+            f"be learned any more; a lower {' or '.join(map(flag, options))} may help"
+        )
+    if trainer.ranks.world == 1 and trainer.last is not None and not _any_shown(trainer):
+        raise RuntimeError(
+            f"no picture shows any of the {count:,} Gaussians after step {step:,}, so that nothing can be learned any "
+            f"more; a lower {flag('means_rate')} or {flag('scale_rate')} may help"
+        )
+
+
+def _any_shown(trainer: Trainer) -> bool:
+    """Whether the last picture is more than background, or another picture would show a Gaussian."""
+    image = trainer.last[0]
+    if bool((image != image[:, :1, :1]).any()):
+        return True
+    arguments = trainer.scene().arguments()
+    settings = trainer.pictures.resolve(footprint=trainer.options.footprint, sh_degree=0)[min(trainer.options.scales)]
+    arguments["shs"] = arguments["shs"][:, :1]
+    return any(bool((render(arguments, of_view)[1] > 0).any()) for of_view in settings)
+
+
+def check_left(trainer: Trainer, before: int) -> None:
+    """Looks at what density control has left of `before` Gaussians: a warning if it is next to nothing. Collective.
+
+    Raises:
+        RuntimeError: Nothing is left; says why, and names the options that decide it.
+    """
+    after, step = trainer.count, trainer.progress.step
+    if after > (1 - SUDDEN_LOSS) * before:
+        return
+    causes = _causes(trainer)
+    if after == 0:
+        raise RuntimeError(f"no Gaussians are left after step {step:,}: of {before:,}, {causes}")
+    trainer.warnings.append(f"step {step:,} has left {after:,} of {before:,} Gaussians: {causes}")
+
+
+def _causes(trainer: Trainer) -> str:
+    """What was pruned, and the options that decide it. Collective; waits for the device."""
+    options, extent = trainer.options, trainer.extent
+    of_ranks = trainer.ranks.exchange({cause: int(count) for cause, count in trainer.density.pruned.items()})
+    opacity, size = (sum(of_rank.get(cause, 0) for of_rank in of_ranks) for cause in ("opacity", "size"))
+    return (
+        f"{opacity:,} were pruned for opacities below {options.prune_opacity:g} ({flag('prune_opacity')}, "
+        f"{flag('reset_every')}, {flag('opacity_rate')}), and {size:,} for scales above {options.prune_above:g} x "
+        f"{extent:.3g} ({flag('prune_above')} x the extent of the capture)"
+    )
+
+
+def flag(name: str) -> str:
+    """An option as the command line spells it."""
+    return "--" + name.replace("_", "-")
