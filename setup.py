@@ -127,7 +127,7 @@ setup(
             "analytic_rasterizer._C",
             SOURCES,
             include_dirs=[str(ROOT / "csrc")],
-            define_macros=[("AR_WITH_CUDA", None)] if WITH_CUDA else [],
+            define_macros=[("AR_TORCH", torch.__version__), *([("AR_WITH_CUDA", None)] if WITH_CUDA else [])],
             extra_compile_args={"cxx": COMPILE_ARGS, "nvcc": NVCC_ARGS},
             extra_link_args=LINK_ARGS,
         )

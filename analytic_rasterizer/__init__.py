@@ -15,8 +15,14 @@ In modules of their own: `training`, `distributed`, `viewer`, `analysis`, `diale
 
 import torch  # noqa: F401  (its libraries must be loaded before the extension's)
 
+from .installation import warn_if_built_for_another, warn_if_replaced, why_not_loaded
+
+try:
+    from ._C import BUILT_FOR, TILE, instruction_set
+except ImportError as error:
+    raise ImportError(why_not_loaded(error)) from error
+
 from . import activations, losses, optim
-from ._C import TILE, instruction_set
 from .analysis.planner import SceneReport, inspect_scene, plan
 from .camera import View, camera_settings, moved
 from .effects import Defocus, Effects, GaussianStats, Motion, Outputs
@@ -30,7 +36,6 @@ from .footprints import (
     set_default_footprint,
 )
 from .gaussians import Gaussians
-from .installation import warn_if_replaced
 from .outputs import normalized
 from .rasterizer import GaussianRasterizer, rasterize_gaussians
 from .relocation import compute_relocation
@@ -83,4 +88,5 @@ __all__ = [
     "set_default_footprint",
 ]
 
+warn_if_built_for_another(BUILT_FOR)
 warn_if_replaced()

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from . import _C
+from .autocast import widened
 from .checks import check_tensors
 from .effects import Effects
 from .rotations import product
@@ -163,7 +164,7 @@ def make_lens(effects: Effects, settings, like: torch.Tensor) -> torch.Tensor:
         settings: A `GaussianRasterizationSettings`.
         like: A tensor whose dtype and device the result takes.
     """
-    members = effects.lens_members()
+    like, members = widened(like), effects.lens_members()
     tangents = (settings.tanfovx, settings.tanfovy)
     for name, tangent in zip(("tanfovx", "tanfovy"), tangents):
         _check_tangent(name, tangent)
@@ -209,6 +210,7 @@ def _copied(numbers: list[float], like: torch.Tensor) -> torch.Tensor:
 
 def view_center(view: torch.Tensor, proj: torch.Tensor, with_gradient: bool) -> torch.Tensor:
     """(2,) x/z and y/z at the centre of the picture, where clip_x = p_xx x + p_xz z is zero."""
+    view, proj = widened(view), widened(proj)
     view, proj = view.reshape(4, 4)[:3, :3], proj.reshape(4, 4)[:3, :2]  # transposed: they act on row vectors
     if not with_gradient:
         view, proj = view.detach(), proj.detach()

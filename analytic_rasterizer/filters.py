@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 
+from .autocast import way_out_of, widened
 from .checks import check_tensors
 from .effects import Effects
 from .footprints import resolve_footprint
@@ -128,6 +129,7 @@ def apply_3d_filter(
         ValueError: The shapes or devices do not fit.
     """
     check_tensors(None, scales=scales, opacities=opacities, filter_3d=filter_3d)
+    scales, opacities, filter_3d = widened(scales), widened(opacities), widened(filter_3d)
     if scales.dim() != 2 or scales.shape[1] != 3 or filter_3d.shape != scales.shape[:1]:
         raise ValueError(
             f"scales must have shape (P, 3) and filter_3d (P,), got {tuple(scales.shape)} and {tuple(filter_3d.shape)}"
@@ -136,7 +138,8 @@ def apply_3d_filter(
         raise ValueError(f"opacities must have shape (P, 1) or (P,), got {tuple(opacities.shape)}")
     for name, tensor in (("opacities", opacities), ("filter_3d", filter_3d)):
         if tensor.dtype != scales.dtype:
-            raise TypeError(f"{name} must have the dtype of scales, {scales.dtype}, got {tensor.dtype}")
+            wanted, way_out = scales.dtype, way_out_of(tensor.dtype)
+            raise TypeError(f"{name} must have the dtype of scales, {wanted}, got {tensor.dtype}{way_out}")
         if tensor.device != scales.device:
             raise ValueError(f"{name} must be on the device of scales, {scales.device}, got {tensor.device}")
     # hypot neither overflows nor loses small scales, and its gradient is finite unless both arguments are 0.

@@ -1,11 +1,77 @@
-"""Whether `import diff_gaussian_rasterization` runs our module: other distributions install one of the same name."""
+"""What can be wrong with an installation, in sentences that say how to mend it.
+
+The compiled extension may be missing, or may have been built for another torch. And another distribution may have put
+its module in the place of ours, diff_gaussian_rasterization.
+"""
 
 from __future__ import annotations
 
+import importlib.machinery
 import importlib.metadata
 import importlib.util
+import platform
+import re
+import sys
 import warnings
 from pathlib import Path
+
+import torch
+
+_INSTALL_AGAIN = "`pip install --force-reinstall --no-deps path/to/analytic_rasterizer`"
+_BUILT_FOR = "analytic_rasterizer was built for torch "  # with the version behind it, in the file of the extension
+
+
+def _extensions_in(folder: Path) -> tuple[list[Path], list[Path]]:
+    """The files of the compiled extension that this Python can load, and those of other versions of Python."""
+    names = {"_C" + suffix for suffix in importlib.machinery.EXTENSION_SUFFIXES}
+    files = sorted([*folder.glob("_C.*so"), *folder.glob("_C.*pyd")])
+    return [f for f in files if f.name in names], [f for f in files if f.name not in names]
+
+
+def why_not_loaded(error: ImportError) -> str:
+    """Why the extension could not be imported, which raised `error`."""
+    folder = Path(__file__).resolve().parent
+    files, others = _extensions_in(folder)
+    if not files:
+        return _without_extension(folder, others)
+    found = re.search(_BUILT_FOR.encode() + rb"([^\0]+)", files[0].read_bytes())
+    if found is None or found[1].decode() == torch.__version__:  # of an earlier version, or damaged
+        return (
+            f"{files[0]} cannot be loaded with torch {torch.__version__} ({error}): install it again, {_INSTALL_AGAIN}"
+        )
+    return (
+        f"analytic_rasterizer was built for torch {found[1].decode()} and cannot be loaded with torch "
+        f"{torch.__version__}, which is installed now ({error}): build it for this one, {_INSTALL_AGAIN}"
+    )
+
+
+def _without_extension(folder: Path, others: list[Path]) -> str:
+    places = [Path(path).resolve() / folder.name for path in sys.path]
+    installed = next((place for place in places if place != folder and _extensions_in(place)[0]), None)
+    because = ", as a clone that was not built in place"
+    if others:
+        because = f" for Python {platform.python_version()}, only {others[0].name}"
+    if installed is not None:
+        way_out = f"start Python in another folder than {folder.parent}, so that the one in {installed.parent} is found"
+    else:
+        way_out = f"build it there, `pip install -e {folder.parent}`, or install it and start Python in another folder"
+    return f"analytic_rasterizer was imported from {folder}, which has no compiled extension{because}: {way_out}"
+
+
+def warn_if_built_for_another(built_for: str) -> None:
+    """Warns where the extension could be loaded, but with another torch than it was built for, which may crash later.
+
+    Args:
+        built_for: What the extension says, `_C.BUILT_FOR`.
+    """
+    built, there = (version.split(".")[:2] for version in (built_for.removeprefix(_BUILT_FOR), torch.__version__))
+    if built != there:
+        warnings.warn(
+            f"{built_for}, and torch {torch.__version__} is installed, so that calls may crash: build it for this one, "
+            f"{_INSTALL_AGAIN}",
+            stacklevel=3,
+        )
+
 
 _NAMES = ("diff_gaussian_rasterization", "diff_gaussian_rasterization_ms")
 
@@ -15,7 +81,7 @@ def _how_to_mend(name: str) -> str:
     owners = importlib.metadata.packages_distributions().get(name, ())
     others = sorted({owner for owner in owners if owner and owner != "analytic_rasterizer"})
     first = f"`pip uninstall -y {' '.join(others)}` and then " if others else ""
-    return f"to mend it, run {first}`pip install --force-reinstall --no-deps path/to/analytic_rasterizer`"
+    return f"to mend it, run {first}{_INSTALL_AGAIN}"
 
 
 def problem_of(name: str) -> str | None:

@@ -34,8 +34,10 @@ class FusedAdam(torch.optim.Optimizer):
     constant learns faster, can be one parameter, which need not be concatenated for the rasterizer.
 
     Args:
-        params: Tensors or groups, as every optimiser of torch takes them: float32 or float64, contiguous, all of one
-            dtype and on one device, the CPU or a CUDA device. Tensors may be empty.
+        params: Tensors or groups, as every optimiser of torch takes them: float32 or float64, all of one dtype and on
+            one device, the CPU or a CUDA device. Tensors may be empty. They may have any strides and are updated in
+            place; one that is not contiguous is copied in every step, before the kernel and back after it. An expanded
+            one, several of whose numbers share memory, is refused.
         lr: Learning rate of groups that name none; each group may have its own.
         betas: Decay rates of the first and the second moment, each in [0, 1), the same in all groups.
         eps: Added to the root of the second moment, at least 0, the same in all groups.
@@ -69,9 +71,9 @@ class FusedAdam(torch.optim.Optimizer):
         Raises:
             TypeError: A parameter is neither float32 nor float64, or not of the dtype of the others; a gradient is of
                 another dtype; rows is not a tensor of bool or uint8.
-            ValueError: Parameters are not on one device, not contiguous, share memory, or do not have P rows; a
-                gradient is sparse; groups differ in betas or eps; a learning rate is not finite or negative; a
-                parameter has fewer than `head` entries along its second dimension, or none.
+            ValueError: Parameters are not on one device, share memory with each other or within themselves, or do not
+                have P rows; a gradient is sparse; groups differ in betas or eps; a learning rate is not finite or
+                negative; a parameter has fewer than `head` entries along its second dimension, or none.
             RuntimeError: CUDA tensors, and an extension without CUDA.
         """
         loss = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 
 from . import _C
+from .autocast import widened
 from .effects import Effects, GaussianStats
 
 
@@ -25,7 +26,7 @@ def normalized(blended: torch.Tensor, alpha: torch.Tensor, smallest: float = 1e-
 
 def depths(means3D: torch.Tensor, view: torch.Tensor) -> torch.Tensor:
     """Camera-space z (P,), world units, of means3D (P, 3) under `view`, the (4, 4) viewmatrix of 3DGS (transposed)."""
-    view = view.reshape(4, 4)
+    means3D, view = widened(means3D), widened(view).reshape(4, 4)
     x, y, z = means3D.unbind(1)  # not `@`, which autocast and TF32 round
     return x * view[0, 2] + y * view[1, 2] + z * view[2, 2] + view[3, 2]
 

@@ -13,9 +13,11 @@ from torch.overrides import has_torch_function
 
 from . import (
     _C,
+    advice,
     ops,  # noqa: F401  (registers the fake kernels)
 )
 from .arguments import camera_arguments, gaussian_arguments
+from .autocast import way_out_of, widened
 from .checks import check_tensors
 from .effects import NEAR, Effects, Outputs
 from .outputs import before_background, depths, split_background, summaries
@@ -27,10 +29,15 @@ NOTHING = Effects()
 _call = _C.Call("rasterize")
 
 
-def _rasterize(**arguments: Any) -> tuple:
+def _rasterize(settings: GaussianRasterizationSettings, **arguments: Any) -> tuple:
     """The operator. Its quicker way is not known to torch.compile, nor to what overrides functions of torch."""
-    quick = not torch.compiler.is_compiling() and not has_torch_function(tuple(arguments.values()))
-    return (_call if quick else torch.ops.analytic_rasterizer.rasterize)(**arguments)
+    if torch.compiler.is_compiling():
+        return torch.ops.analytic_rasterizer.rasterize(**arguments)
+    quick = not has_torch_function(tuple(arguments.values()))
+    results = (_call if quick else torch.ops.analytic_rasterizer.rasterize)(**arguments)
+    if advice.is_due and settings.footprint is None:
+        advice.give(settings)
+    return results
 
 
 def rasterize_gaussians(
@@ -108,20 +115,22 @@ def render(
         outputs = settings.effects if outputs is NOTHING else outputs.with_outputs_of(settings.effects)
     debug = bool(settings.debug)
     if outputs is NOTHING and bg.dim() < 3:
-        return _rasterize(**gaussians, **camera, bg=bg, debug=debug)[::2]
-    return _render_with_outputs(gaussians, camera, outputs, bg, debug)
+        return _rasterize(settings, **gaussians, **camera, bg=bg, debug=debug)[::2]
+    return _render_with_outputs(settings, gaussians, camera, outputs)
 
 
 def _render_with_outputs(
-    gaussians: dict[str, Any], camera: dict[str, Any], effects: Effects, bg: torch.Tensor, debug: bool
+    settings: GaussianRasterizationSettings, gaussians: dict[str, Any], camera: dict[str, Any], effects: Effects
 ) -> tuple:
-    """(color, radii), and `Outputs` where `effects` asks for some. `bg` may be an image (C, H, W)."""
+    """(color, radii), and `Outputs` where `effects` asks for some. `settings.bg` may be an image (C, H, W)."""
+    bg, debug = settings.bg, bool(settings.debug)
     size = camera["image_height"], camera["image_width"]
     bg, bg_image = split_background(bg, gaussians["colors_precomp"], size, debug)
     with_summaries = effects.median_depth or effects.dominant_index or effects.gaussian_stats
     blended = {name: getattr(effects, name) for name in _C.IMAGES}
     blended["alpha"] |= bg_image is not None
-    color, images, radii, saved = _rasterize(**gaussians, **camera, bg=bg, **blended, keep=with_summaries, debug=debug)
+    options = {"bg": bg, **blended, "keep": with_summaries, "debug": debug}
+    color, images, radii, saved = _rasterize(settings, **gaussians, **camera, **options)
     outputs = dict(zip((name for name in _C.IMAGES if blended[name]), (image[None] for image in images)))
     if bg_image is not None:
         color = before_background(color, outputs["alpha"], bg_image)
@@ -158,6 +167,7 @@ class GaussianRasterizer(torch.nn.Module):
         check_tensors(None, positions=positions)
         view = self.raster_settings.viewmatrix
         check_tensors(None, viewmatrix=view)
+        positions, view = widened(positions), widened(view)
         if view.shape not in ((4, 4), (1, 4, 4)):
             raise ValueError(f"viewmatrix must have shape (4, 4) or (1, 4, 4), got {tuple(view.shape)}")
         if positions.device != view.device:
@@ -165,7 +175,8 @@ class GaussianRasterizer(torch.nn.Module):
         if positions.dim() != 2 or positions.shape[1] != 3:
             raise ValueError(f"positions must have shape (P, 3), got {tuple(positions.shape)}")
         if positions.dtype != view.dtype:
-            raise TypeError(f"positions must have dtype {view.dtype}, got {positions.dtype}")
+            got = f"{positions.dtype}{way_out_of(positions.dtype)}"
+            raise TypeError(f"positions must have dtype {view.dtype}, got {got}")
         effects = getattr(self.raster_settings, "effects", None)  # settings of a class of the program have none
         near = effects.near if isinstance(effects, Effects) else NEAR
         with torch.no_grad():
@@ -184,9 +195,10 @@ class GaussianRasterizer(torch.nn.Module):
     ) -> tuple[torch.Tensor, ...]:
         """Renders an image. Differentiable in all eight inputs.
 
-        All floating tensors share one dtype (float32; float64 on the CPU) and device. Missing inputs
-        are None or empty tensors. On CUDA the work is queued on the current stream; when the
-        host waits for it is in docs/library.md, "Waiting for the device".
+        All floating tensors share one dtype (float32; float64 on the CPU) and device. Under torch.autocast those of 16
+        bits are used in float32, and get gradients of 16 bits. Missing inputs are None or empty tensors. On CUDA the
+        work is queued on the current stream; when the host waits for it is in docs/library.md, "Waiting for the
+        device".
 
         Args:
             means3D: (P, 3) centres, world units.

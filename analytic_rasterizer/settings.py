@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 
 from .effects import AUTO, Effects
-from .footprints import Footprint, get_default_footprint, resolve_footprint
+from .footprints import Footprint, chosen_footprint, get_default_footprint, resolve_footprint
 
 
 def whole_number(name: str, value: Any) -> int:
@@ -90,7 +90,7 @@ class GaussianRasterizationSettings(_Fields):
             stage, so that the stage that failed is the one that raises, and check that the camera is finite, which is
             not checked there otherwise.
         footprint: One of `FOOTPRINTS`, optionally with options (`"box:samples=8"`). None: the default at
-            the time of rendering, see `set_default_footprint`.
+            the time of rendering, see `set_default_footprint`, of which a program that trains nothing is warned once.
         effects: What the rendering has beyond three colours of a pinhole camera, see `Effects`; None: nothing. "auto":
             spherical harmonics only up to the degree above which they change no colour by more than 1/255. That degree
             is found once for every tensor of coefficients (`needed_sh_degree`); coefficients that require a gradient
@@ -143,6 +143,10 @@ class GaussianRasterizationSettings(_Fields):
             ValueError: The environment variable ANALYTIC_RASTERIZER_FOOTPRINT holds no footprint.
         """
         return self.footprint or get_default_footprint()
+
+    def takes_default(self) -> bool:
+        """Whether nobody and nothing chose the footprint to render with, so that it is the library's default."""
+        return self.footprint is None and chosen_footprint() is None
 
     def __eq__(self, other: object) -> bool:
         if isinstance(other, GaussianRasterizationSettings) and self._attributes() != other._attributes():

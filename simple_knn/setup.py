@@ -127,7 +127,10 @@ setup(
             "analytic_simple_knn._C",
             SOURCES,
             include_dirs=[str(ROOT / "csrc")],
-            define_macros=[("SIMPLE_KNN_WITH_CUDA", None)] if WITH_CUDA else [],
+            define_macros=[
+                ("SIMPLE_KNN_TORCH", torch.__version__),
+                *([("SIMPLE_KNN_WITH_CUDA", None)] if WITH_CUDA else []),
+            ],
             extra_compile_args={"cxx": COMPILE_ARGS, "nvcc": NVCC_ARGS},
             extra_link_args=LINK_ARGS,
         )

@@ -229,6 +229,125 @@ def test_strided_and_missing_gradients(device):
     FusedAdam([value.clone().requires_grad_()]).step()  # nobody has a gradient
 
 
+def columns_of_a_matrix(t):
+    return t.new_full((*t.shape[:-1], 2 * t.shape[-1] + 1), 7.0)[..., 1::2].copy_(t)
+
+
+def reversed_strides(t):
+    order = range(t.dim() - 1, -1, -1)
+    return t.permute(*order).clone(memory_format=torch.contiguous_format).permute(*order)
+
+
+def every_third_row(t):
+    return t.new_full((3 * len(t), *t.shape[1:]), 7.0)[::3].copy_(t)
+
+
+LAYOUTS = [columns_of_a_matrix, reversed_strides, every_third_row]
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_tensors_of_any_strides_have_the_bits_of_contiguous_ones(device, layout, masked):
+    """And what lies in their memory between their numbers stays what it was."""
+    count = 7001
+    state = make_state([(count, 3), (count, 5, 3), (count, 1)], device=device)
+    arguments = [1e-2, 2e-2, 3e-2], [5] * 3, 0.9, 0.999, 1e-8
+    arguments += (torch.arange(count, device=device) % 3 > 0 if masked else None, True, [1, 6, 0], [0.2, 0.1, 0.0])
+    expected = [[t.clone() for t in tensors] for tensors in state]
+    adam_(*expected, *arguments)
+    for strided in range(4):  # parameters, gradients, or moments
+        placed = [[t.clone() for t in tensors] for tensors in state]
+        placed[strided] = [layout(t) for t in placed[strided]]
+        assert not placed[strided][1].is_contiguous()
+        adam_(*placed, *arguments)
+        assert_bits(placed, expected)
+        for t in placed[strided]:
+            size = t.untyped_storage().nbytes() // t.element_size()
+            whole = t.as_strided((size,), (1,), 0)
+            assert whole.numel() == t.numel() or (whole == 7).sum() == whole.numel() - t.numel()
+
+
+def test_parameters_may_be_columns_of_one_matrix(device):
+    """Their memory is interleaved, and none of it is shared: as with memory of their own."""
+    (matrix,) = draw([(50, 11)], 0, torch.float32, device)
+    whole = matrix.clone()
+    together, apart = (
+        FusedAdam([{"params": [t[:, first:end].detach().requires_grad_()]} for first, end in ((0, 3), (3, 4), (4, 11))])
+        for t in (whole, matrix)
+    )
+    for group in apart.param_groups:
+        group["params"] = [p.detach().clone().requires_grad_() for p in group["params"]]
+    for step in range(2):
+        take_step(together, step)
+        take_step(apart, step)
+    assert torch.equal(whole, torch.cat([p.detach() for p in parameters_of(apart)], 1))
+    assert not torch.equal(whole, matrix)
+
+
+def sparse_step(optimizer, seed):
+    parameters = parameters_of(optimizer)
+    for parameter, gradient in zip(parameters, draw([p.shape for p in parameters], seed)):
+        parameter.grad = gradient.to(parameter)
+    count = len(parameters[0])
+    optimizer.step(torch.arange(count, device=parameters[0].device) % 3 > 0, count)
+
+
+def densify(optimizer):
+    """Rows are added and removed as 3DGS does it, by new parameters with moments that are joined and cut."""
+    for group in optimizer.param_groups:
+        (old,) = group["params"]
+        state = optimizer.state.pop(old)
+        for name in ("exp_avg", "exp_avg_sq"):
+            state[name] = torch.cat((state[name], torch.zeros_like(old[:4])), dim=0)[2:]
+        new = torch.cat((old, old[:4]), dim=0)[2:].detach().requires_grad_()
+        group["params"], optimizer.state[new] = [new], state
+
+
+@pytest.mark.parametrize("kind", [FusedAdam, ar.optim.SparseGaussianAdam])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_life_of_a_parameter_of_any_strides(device, kind, layout):
+    """Steps, densification, and a state_dict in between: the bits of a contiguous one. 3DGS makes its means from a
+    transposed array."""
+    step = sparse_step if kind is ar.optim.SparseGaussianAdam else take_step
+    starts = draw([(40, 3), (40, 1), (40, 15, 3)], 0, torch.float32, device)
+    results = []
+    for place in (layout, torch.clone):
+        parameters = [place(t).requires_grad_() for t in starts]
+        groups = [{"params": [p], "lr": 0.01 * (k + 1)} for k, p in enumerate(parameters)]
+        optimizer = kind(groups, lr=0.0, eps=1e-15)
+        step(optimizer, 1)
+        assert [p.data_ptr() for p in parameters_of(optimizer)] == [p.data_ptr() for p in parameters]
+        again = kind([{"params": [place(p.detach()).requires_grad_()]} for p in parameters], lr=0.0, eps=1e-15)
+        again.load_state_dict(optimizer.state_dict())
+        step(again, 2)
+        densify(again)
+        step(again, 3)
+        moments = [[again.state[p][name] for p in parameters_of(again)] for name in ("exp_avg", "exp_avg_sq")]
+        results.append([[p.detach() for p in parameters_of(again)], *moments])
+    assert_bits(*results)
+
+
+def test_a_parameter_of_any_strides_against_torch(device):
+    (start,) = draw([(30, 4)], 0, device=device)
+    ours, theirs = (kind([reversed_strides(start).requires_grad_()], lr=0.1) for kind in (FusedAdam, Adam))
+    for step in range(4):
+        take_step(ours, step)
+        take_step(theirs, step)
+    (found,), (expected,) = parameters_of(ours), parameters_of(theirs)
+    assert found.stride() == (1, 30)
+    assert ours.state[found]["exp_avg"].stride() == theirs.state[expected]["exp_avg"].stride()
+    torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+    assert found._version == expected._version
+
+
+def test_an_expanded_parameter_is_refused():
+    value = torch.ones(3).expand(5, 3).requires_grad_()
+    value.grad = torch.ones(5, 3)
+    with pytest.raises(ValueError, match=r"params\[0\] must have memory of its own .* \(clone\(\) has\)"):
+        FusedAdam([value]).step()
+    assert torch.equal(value, torch.ones(5, 3))
+
+
 def test_thread_count_changes_no_bit():
     state = make_state([(30_000, 3), (70_001,), (5,)])
     results = []
@@ -371,6 +490,12 @@ def shared(lists):
     lists["exp_avgs"][1] = lists["exp_avg_sqs"][1]
 
 
+def half_of_a_parameter(lists):
+    """The first moments are columns of the matrix whose other columns, and one of theirs, are the parameter."""
+    matrix = torch.ones(4, 5)
+    lists["params"][1], lists["exp_avgs"][1] = matrix[:, :3], matrix[:, 2:]
+
+
 def in_the_gradient(lists):
     lists["grads"][0] = lists["params"][1].view(-1)[:4].view(4, 1)
 
@@ -409,7 +534,13 @@ def replaced(name, k, tensor):
             ValueError,
             r"grads\[1\] must have the shape .* \(4, 3\), got \(3, 4\)",
         ),
-        (replaced("exp_avg_sqs", 1, torch.ones(3, 4).T), ValueError, r"exp_avg_sqs\[1\] must be contiguous"),
+        (replaced("params", 1, torch.ones(3).expand(4, 3)), ValueError, r"params\[1\] must have memory of its own"),
+        (
+            replaced("exp_avg_sqs", 1, torch.ones(6).as_strided((4, 3), (1, 1))),
+            ValueError,
+            r"exp_avg_sqs\[1\] must have memory .* \(4, 3\) with strides \(1, 1\)",
+        ),
+        (half_of_a_parameter, ValueError, "must not share memory"),
         (lambda a: a.update(rows=torch.ones(4)), TypeError, "rows must have dtype bool or uint8, got Float"),
         (lambda a: a.update(rows=torch.ones(3).bool()), ValueError, r"params\[0\] must have a row for each of rows, 3"),
         (lambda a: a.update(rows=torch.ones(4, 1).bool()), ValueError, r"rows must have shape \(P,\), got \(4, 1\)"),
@@ -476,6 +607,7 @@ def test_opcheck(device, dtype):
     rows = torch.tensor([1, 0, 1, 1, 0, 0], dtype=torch.bool, device=device)
     torch.library.opcheck(adam_, (*state, *numbers))
     torch.library.opcheck(adam_, (*state, *numbers, rows, False))
+    torch.library.opcheck(adam_, ([reversed_strides(t) for t in state[0]], *state[1:], *numbers))
 
 
 @needs_cuda

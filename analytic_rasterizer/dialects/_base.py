@@ -67,7 +67,8 @@ class GaussianRasterizationSettings(LibrarySettings):
         inferred_from: Keywords of settings that no other dialect has.
         inferred_from_arguments: Keywords of forward that no other dialect has, where the settings cannot tell.
         inferred_without: Settings of 3DGS 2023 that it lacks, where nothing else can tell.
-        filter: The footprint that its repository renders with, for whoever chose none; None: `analytic`.
+        filter: The footprint that its repository renders with, for whoever chose none; None: the library's default,
+            `analytic`.
         means2d_z: Third column of the gradient of means2D, "zero", "sum_abs" or "sum_norm".
         outputs: An `Effects` with the outputs that its rasterizer returns.
 
@@ -133,8 +134,15 @@ class GaussianRasterizationSettings(LibrarySettings):
 
     def own_footprint(self) -> Footprint:
         """The footprint to render with where the user chose none."""
+        return _resolved(self._own_filter() or "analytic")
+
+    def _own_filter(self) -> str | None:
         of_2023 = type(self) is GaussianRasterizationSettings
-        return _resolved(self.filter or (of_2023 and _companion_filter) or "analytic")
+        return self.filter or (_companion_filter if of_2023 else None)
+
+    def takes_default(self) -> bool:
+        """Whether the footprint is the library's default: nobody chose one, and the dialect has no filter either."""
+        return self._own_filter() is None and super().takes_default()
 
     def footprint_in_use(self) -> Footprint:
         """The footprint to render with: of the settings, or chosen for the process, or else the dialect's own.

@@ -6,6 +6,7 @@ whether the module has a SparseGaussianAdam, and call with `dc` if it has: it is
 
 import torch
 
+from ..autocast import way_out_of, widened
 from ..checks import check_tensors
 from ..optim import SparseGaussianAdam
 from ._base import GaussianRasterizer as Rasterizer
@@ -47,12 +48,13 @@ class GaussianRasterizationSettings(Settings):
 def _joined(dc: torch.Tensor, shs: torch.Tensor) -> torch.Tensor:
     """All harmonics (P, M, 3). Raises TypeError or ValueError where the two do not fit together."""
     check_tensors(dc.device, shs=shs)
+    dc, shs = widened(dc), widened(shs)
     if shs.dim() != 3 or dc.shape != (len(shs), 1, shs.shape[2]):
         raise ValueError(
             f"dc must have shape (P, 1, 3) and shs (P, M - 1, 3), got {tuple(dc.shape)} and {tuple(shs.shape)}"
         )
     if dc.dtype != shs.dtype:  # cat would make both of the wider one
-        raise TypeError(f"dc must have the dtype of shs, {shs.dtype}, got {dc.dtype}")
+        raise TypeError(f"dc must have the dtype of shs, {shs.dtype}, got {dc.dtype}{way_out_of(dc.dtype)}")
     return torch.cat([dc, shs], 1)
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import torch
 
+from ..autocast import widened, widened_settings
 from ..effects import Effects
 from ..outputs import depths
 from ..rasterizer import render
@@ -62,7 +63,8 @@ class GaussianRasterizer(Rasterizer):
             depth: (1, H, W) camera-space z of the point.
             accum_alpha: (1, H, W) how much light is left, 1 - alpha.
         """
-        settings = as_settings(self.raster_settings)
+        settings = widened_settings(as_settings(self.raster_settings))
+        means3D, scales, rotations, cov3D_precomp = map(widened, (means3D, scales, rotations, cov3D_precomp))
         color, radii, outputs = render(
             settings,
             Effects(alpha=True, dominant_index=True),

@@ -10,6 +10,7 @@ import weakref
 
 import torch
 
+from ..autocast import widened
 from ..checks import check_tensors
 from ..footprints import Footprint
 from ._base import FIELDS, GaussianRasterizer, _resolved, rasterize_gaussians
@@ -62,7 +63,7 @@ class GaussianRasterizationSettings(Settings):
 
     def _moved(self, x: float, y: float) -> GaussianRasterizationSettings:
         """These settings with a principal point that is moved by (-x, -y) px, which moves pixels by (x, y)."""
-        column = self.projmatrix.reshape(4, 4).unbind(1)
+        column = widened(self.projmatrix).reshape(4, 4).unbind(1)
         moved = (
             column[0] - 2 * x / self.image_width * column[3],
             column[1] - 2 * y / self.image_height * column[3],

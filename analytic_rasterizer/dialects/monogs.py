@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import torch
 
+from ..autocast import widened
 from ..checks import check_tensors
 from ..effects import Effects
 from ..rotations import product
@@ -93,9 +94,8 @@ class GaussianRasterizationSettings(Settings):
             check_tensors(None, **{name: tensor})
             if tensor.numel() != 3:
                 raise ValueError(f"{name} must hold 3 numbers, got shape {tuple(tensor.shape)}")
-        view, proj, campos = _Moved.apply(
-            theta, rho, self.viewmatrix, self.projmatrix, self.campos, self.projmatrix_raw
-        )
+        camera = map(widened, (self.viewmatrix, self.projmatrix, self.campos, self.projmatrix_raw))
+        view, proj, campos = _Moved.apply(theta, rho, *camera)
         return self._replace(viewmatrix=view, projmatrix=proj, campos=campos)
 
     def returned(self, color, radii, outputs):

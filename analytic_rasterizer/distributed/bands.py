@@ -12,6 +12,7 @@ import torch.distributed as dist
 
 from .._C import tile_size
 from ..arguments import camera_arguments
+from ..autocast import widened, widened_settings
 from ..settings import GaussianRasterizationSettings
 from ..stages import Splats, blend, list_tiles, project
 from .agreement import REQUIREMENTS, Facts, agree, digest_of, facts_of, gather, place_in
@@ -95,6 +96,10 @@ def rasterize_bands(
         TypeError, ValueError, RuntimeError: As `rasterize`.
     """
     rank, world = place_in(group)
+    means3D, opacities, shs, colors_precomp = map(widened, (means3D, opacities, shs, colors_precomp))
+    scales, rotations, cov3D_precomp = map(widened, (scales, rotations, cov3D_precomp))
+    if isinstance(settings, GaussianRasterizationSettings):
+        settings = widened_settings(settings)
 
     def make() -> tuple[tuple, Facts | None, None]:
         if not isinstance(settings, GaussianRasterizationSettings):

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import torch
 import torch.distributed as dist
 
+from ..autocast import way_out_of, widened, widened_settings
 from ..checks import check_tensors
 from ..effects import AUTO
 from ..settings import GaussianRasterizationSettings
@@ -121,12 +122,13 @@ def rasterize(
             the group.
     """
     rank, world = place_in(group)
+    means3D, opacities = widened(means3D), widened(opacities)
     gaussians = {
-        "shs": shs,
-        "colors_precomp": colors_precomp,
-        "scales": scales,
-        "rotations": rotations,
-        "cov3D_precomp": cov3D_precomp,
+        "shs": widened(shs),
+        "colors_precomp": widened(colors_precomp),
+        "scales": widened(scales),
+        "rotations": widened(rotations),
+        "cov3D_precomp": widened(cov3D_precomp),
     }
     if world == 1:
         cameras, _ = _checked_cameras(settings, owners, world, shs, colors_precomp)
@@ -205,6 +207,7 @@ def _checked_cameras(
     for camera, s in enumerate(cameras):
         if not isinstance(s, GaussianRasterizationSettings):
             raise TypeError(f"settings must hold GaussianRasterizationSettings, got {type(s).__name__} at {camera}")
+        cameras[camera] = s = widened_settings(s)
         check_camera(s, f" of camera {camera}")
     check_colors(shs, colors_precomp)
     owners = [camera % world for camera in range(len(cameras))] if owners is None else list(owners)
@@ -222,7 +225,8 @@ def check_camera(settings: GaussianRasterizationSettings, name: str = "") -> Non
     check_tensors(None, viewmatrix=settings.viewmatrix, bg=bg)
     check_tensors(settings.viewmatrix.device, bg=bg)
     if bg.dtype != settings.viewmatrix.dtype:
-        raise TypeError(f"bg must have dtype {settings.viewmatrix.dtype}, got {bg.dtype}{name}")
+        got = f"{bg.dtype}{name}{way_out_of(bg.dtype)}"
+        raise TypeError(f"bg must have dtype {settings.viewmatrix.dtype}, got {got}")
     if bg.shape != (3,):
         raise ValueError(f"bg must have shape (3,), got {tuple(bg.shape)}{name}")
     if isinstance(settings.effects, str) and settings.effects == AUTO:

@@ -303,7 +303,7 @@ struct ObserveArguments {
 
 /// Arguments of `adam_`: a step on several tensors (core/adam.h). The lists have a member for each of them.
 struct AdamArguments {
-  WrittenTensors<'a'> params;  ///< contiguous
+  WrittenTensors<'a'> params;  ///< of any strides, as all others
   std::vector<Tensor> grads;
   WrittenTensors<'b'> exp_avgs;
   WrittenTensors<'c'> exp_avg_sqs;

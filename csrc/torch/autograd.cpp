@@ -9,7 +9,9 @@
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/library.h>
 
-#include "torch/boxing.h"
+#include <atomic>
+
+#include "torch/ops.h"
 
 namespace ar::ops {
 namespace {
@@ -147,6 +149,8 @@ bool wants_gradient(const Op& op, const Stack& stack, size_t first) {
   return false;
 }
 
+std::atomic<bool> any_required = false;
+
 /// Raises under torch.func.grad, vjp and jacrev, in which torch allows no nodes that are made in C++.
 void refuse_transforms(const Op& op) {
   TORCH_CHECK_NOT_IMPLEMENTED(
@@ -184,6 +188,7 @@ void differentiate(const c10::OperatorHandle& handle, Stack* stack) {
     return;
   }
   refuse_transforms(*op);
+  any_required.store(true, std::memory_order_relaxed);
   if (op->keep) (*stack)[first + *op->keep] = true;
   Stack arguments(stack->begin() + int64_t(first), stack->end());
   torch::jit::drop(*stack, op->arguments);
@@ -221,4 +226,7 @@ TORCH_LIBRARY_IMPL(analytic_rasterizer, Autograd, m) {
 }
 
 }  // namespace
+
+bool gradient_was_required() { return any_required.load(std::memory_order_relaxed); }
+
 }  // namespace ar::ops

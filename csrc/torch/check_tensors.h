@@ -19,10 +19,16 @@ inline std::string text_of(at::IntArrayRef sizes) {
 }
 inline std::string shape_of(const Tensor& t) { return text_of(t.sizes()); }
 
+/// What to do with numbers of 16 bits, for the end of a message; nothing for others.
+inline const char* way_out_of(at::ScalarType type) {
+  const bool is_half = type == at::kHalf || type == at::kBFloat16;
+  return is_half ? ": call .float() on it, or use torch.autocast, under which this happens by itself" : "";
+}
+
 /// dtype float32 or float64.
 inline void check_floating(const Tensor& t, const char* name) {
   TORCH_CHECK_TYPE(t.scalar_type() == at::kFloat || t.scalar_type() == at::kDouble, name,
-                   " must have dtype float32 or float64, got ", t.scalar_type());
+                   " must have dtype float32 or float64, got ", t.scalar_type(), way_out_of(t.scalar_type()));
 }
 
 /// `expected`: what makes the text of the shape in the message.
@@ -45,7 +51,7 @@ struct Like {
 
   void check_type(const Tensor& t, const char* t_name) const {
     TORCH_CHECK_TYPE(t.scalar_type() == tensor.scalar_type(), t_name, " must have the dtype of ", name, ", ",
-                     tensor.scalar_type(), ", got ", t.scalar_type());
+                     tensor.scalar_type(), ", got ", t.scalar_type(), way_out_of(t.scalar_type()));
     TORCH_CHECK_VALUE(t.device() == tensor.device(), t_name, " must be on the device of ", name, ", ", tensor.device(),
                       ", got ", t.device());
   }

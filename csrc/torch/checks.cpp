@@ -271,8 +271,8 @@ void check(BlendArguments& a, const Pass& pass) {
   like.check_rows_of(a.means2d_abs, "means2d_abs", {2}, "(N, 2)");
   check_image_size(a.image_height, a.image_width);
   const int64_t members = ListTensors::kMembers;
-  TORCH_CHECK_VALUE(int64_t(a.lists.size()) == members * cameras, "lists must be the output of list_tiles for ", cameras,
-                    " cameras, got ", a.lists.size(), " tensors");
+  TORCH_CHECK_VALUE(int64_t(a.lists.size()) == members * cameras, "lists must be the output of list_tiles for ",
+                    cameras, " cameras, got ", a.lists.size(), " tensors");
   for (int64_t c = 0; c < cameras; ++c) {
     const ListTensors lists = from_list<ListTensors>(a.lists, size_t(members * c));
     check_lists(lists, a.means2d, pass);

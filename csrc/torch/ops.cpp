@@ -162,6 +162,11 @@ pybind11::dict row_grad_columns() {
   return columns;
 }
 
+#define AR_QUOTED(text) #text
+#define AR_TEXT(macro) AR_QUOTED(macro)
+/// installation.py finds it in the file of the extension where that cannot be loaded, with another torch for example.
+constexpr const char* kBuiltFor = "analytic_rasterizer was built for torch " AR_TEXT(AR_TORCH);
+
 }  // namespace
 
 #if defined(AR_WITH_CUDA)
@@ -171,6 +176,7 @@ void force_pair_capacity(int64_t capacity);
 
 PYBIND11_MODULE(_C, m) {
   m.doc() = "Loads the ops of analytic_rasterizer into torch.ops.analytic_rasterizer.";
+  m.attr("BUILT_FOR") = ar::ops::kBuiltFor;
 #if defined(AR_WITH_CUDA)
   m.attr("has_cuda") = true;
   m.def("force_pair_capacity", &ar::ops::force_pair_capacity,
@@ -190,6 +196,8 @@ PYBIND11_MODULE(_C, m) {
       },
       "What the headers say of every footprint, in the order of the registry.");
   ar::ops::define_call(m);
+  m.def("gradient_was_required", &ar::ops::gradient_was_required,
+        "Whether an op of this process has been called for which autograd will ask a gradient.");
   m.def("instruction_set", &ar::cpu::instruction_set, "Instruction set that the CPU path runs on.");
   m.attr("IMAGES") = ar::ops::image_names();
   m.attr("LENS") = ar::ops::lens_members();

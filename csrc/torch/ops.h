@@ -1,6 +1,6 @@
 // The ops, each written once for every device: the pass in rasterize.cpp, its stages in stages.cpp, what a training
 // step has besides in training.cpp, a picture of a training from end to end in picture.cpp. Registered with torch in
-// ops.cpp, made differentiable in autograd.cpp.
+// ops.cpp, made differentiable in autograd.cpp, and given float32 under autocast in autocast.cpp.
 #pragma once
 
 #include <vector>
@@ -71,5 +71,8 @@ Results observe(ObserveArguments a);
 
 /// Nothing: writes to params, exp_avgs and exp_avg_sqs.
 Results adam(AdamArguments a);
+
+/// Whether an op of this process has been called for which autograd will ask a gradient.
+bool gradient_was_required();
 
 }  // namespace ar::ops

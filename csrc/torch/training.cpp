@@ -119,12 +119,17 @@ Results observe(ObserveArguments a) {
 Results adam(AdamArguments a) {
   check(a);
   if (a.params.empty()) return {};
-  training_kernels(a.params[0]).adam(a);
-  for (const std::vector<Tensor>* written :
-       {static_cast<const std::vector<Tensor>*>(&a.params), static_cast<const std::vector<Tensor>*>(&a.exp_avgs),
-        static_cast<const std::vector<Tensor>*>(&a.exp_avg_sqs)}) {
-    for (const Tensor& t : *written) note_written(t);
+  const std::initializer_list<std::vector<Tensor>*> written = {&a.params, &a.exp_avgs, &a.exp_avg_sqs};
+  // Kernels take contiguous tensors. In the place of others they get copies, which are copied back.
+  std::vector<std::pair<Tensor, Tensor>> copied;
+  for (std::vector<Tensor>* list : written) {
+    for (Tensor& t : *list) {
+      note_written(t);
+      if (!t.is_contiguous()) t = copied.emplace_back(t, t.contiguous()).second;
+    }
   }
+  training_kernels(a.params[0]).adam(a);
+  for (const auto& [strided, copy] : copied) strided.copy_(copy);
   return {};
 }
 

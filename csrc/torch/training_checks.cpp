@@ -10,18 +10,67 @@
 namespace ar::ops {
 namespace {
 
+/// The dimensions along which a tensor has more than one number: their sizes, and their strides in bytes.
+std::vector<std::pair<int64_t, int64_t>> extents_of(const Tensor& t) {
+  std::vector<std::pair<int64_t, int64_t>> extents;
+  for (int64_t d = 0; d < t.dim(); ++d) {
+    if (t.size(d) > 1) extents.emplace_back(t.size(d), t.stride(d) * t.element_size());
+  }
+  return extents;
+}
+
+/// Whether two numbers of a tensor may share memory, as those of an expanded one do: unless every step along a
+/// dimension is longer than all that lies within the dimensions of smaller steps.
+bool may_overlap_itself(const Tensor& t) {
+  auto extents = extents_of(t);
+  std::sort(extents.begin(), extents.end(), [](const auto& x, const auto& y) { return x.second < y.second; });
+  int64_t last = 0;  // byte at which the last number begins, of those within the smaller steps
+  for (const auto& [size, stride] : extents) {
+    if (stride <= last) return true;
+    last += (size - 1) * stride;
+  }
+  return false;
+}
+
+/// Bytes from the first number of a tensor to behind its last one, of which others may lie in between.
+int64_t span_of(const Tensor& t) {
+  int64_t last = 0;
+  for (const auto& [size, stride] : extents_of(t)) last += (size - 1) * stride;
+  return last + t.element_size();
+}
+
+/// Whether the numbers of two tensors alternate in memory without sharing any, as columns of one matrix do: divided by
+/// some stride, the addresses of the two leave remainders that lie in intervals apart from each other.
+bool are_interleaved(const Tensor& a, const Tensor& b) {
+  const auto extents_a = extents_of(a), extents_b = extents_of(b);
+  const int64_t distance = static_cast<const char*>(b.const_data_ptr()) - static_cast<const char*>(a.const_data_ptr());
+  const auto apart = [&](int64_t divisor) {
+    const auto width = [&](const auto& extents, int64_t size_of_one) {
+      for (const auto& [size, stride] : extents) size_of_one += stride % divisor ? (size - 1) * stride : 0;
+      return size_of_one;
+    };
+    const int64_t between = (distance % divisor + divisor) % divisor;
+    return width(extents_a, a.element_size()) <= between && between + width(extents_b, b.element_size()) <= divisor;
+  };
+  const auto by_stride = [&](const auto& extent) { return apart(extent.second); };
+  return std::any_of(extents_a.begin(), extents_a.end(), by_stride) ||
+         std::any_of(extents_b.begin(), extents_b.end(), by_stride);
+}
+
 /// Raises where memory that is written is also that of another tensor: what comes out would depend on the order.
 void check_overlaps(const AdamArguments& a) {
   struct Range {
     const char *begin, *end;
     bool written;
+    const Tensor* tensor;
   };
   std::vector<Range> ranges;
   ranges.reserve(4 * a.params.size());
   const auto add = [&](const std::vector<Tensor>& tensors, bool written) {
     for (const Tensor& t : tensors) {
       const char* begin = static_cast<const char*>(t.const_data_ptr());
-      if (t.numel() > 0) ranges.push_back({begin, begin + t.nbytes(), written});
+      const int64_t bytes = t.is_contiguous() ? int64_t(t.nbytes()) : span_of(t);
+      if (t.numel() > 0) ranges.push_back({begin, begin + bytes, written, &t});
     }
   };
   add(a.params, true);
@@ -29,12 +78,19 @@ void check_overlaps(const AdamArguments& a) {
   add(a.exp_avg_sqs, true);
   add(a.grads, false);
   std::sort(ranges.begin(), ranges.end(), [](const Range& x, const Range& y) { return x.begin < y.begin; });
+  bool apart = true;
   const char *end = nullptr, *written_end = nullptr;  // of those that begin earlier
   for (const Range& range : ranges) {
-    TORCH_CHECK_VALUE(range.begin >= (range.written ? end : written_end),
-                      "params, exp_avgs and exp_avg_sqs must not share memory with each other or with grads");
+    apart = apart && range.begin >= (range.written ? end : written_end);
     end = std::max(end, range.end);
     if (range.written) written_end = std::max(written_end, range.end);
+  }
+  if (apart) return;
+  for (auto x = ranges.begin(); x != ranges.end(); ++x) {
+    for (auto y = x + 1; y != ranges.end() && y->begin < x->end; ++y) {
+      TORCH_CHECK_VALUE(!(x->written || y->written) || are_interleaved(*x->tensor, *y->tensor),
+                        "params, exp_avgs and exp_avg_sqs must not share memory with each other or with grads");
+    }
   }
 }
 
@@ -43,7 +99,7 @@ void check_target_type(const Tensor& target, const Like& like) {
   const Tensor& other = like.tensor;
   TORCH_CHECK_TYPE(target.scalar_type() == other.scalar_type() || target.scalar_type() == at::kByte,
                    "target must have the dtype of ", like.name, ", ", other.scalar_type(), ", or uint8, got ",
-                   target.scalar_type());
+                   target.scalar_type(), way_out_of(target.scalar_type()));
   TORCH_CHECK_VALUE(target.device() == other.device(), "target must be on the device of ", like.name, ", ",
                     other.device(), ", got ", target.device());
 }
@@ -148,7 +204,10 @@ void check(AdamArguments& a) {
   };
   const auto check_written = [&](const Tensor& t, const char* list, size_t i) {
     check_tensor(t, list, i);
-    TORCH_CHECK_VALUE(t.is_contiguous(), list, "[", i, "] must be contiguous, got strides ", t.strides());
+    TORCH_CHECK_VALUE(t.is_contiguous() || !may_overlap_itself(t), list, "[", i,
+                      "] must have memory of its own for every number, which an expanded tensor has not (clone() has), "
+                      "got shape ",
+                      shape_of(t), " with strides ", text_of(t.strides()));
   };
   const auto check_rate = [&](double rate, const char* list, size_t i) {
     TORCH_CHECK_VALUE(std::isfinite(float(rate)) && rate >= 0, list, "[", i, "] must be finite and not negative, got ",

@@ -2,7 +2,12 @@
 
 import torch
 
-from . import _C
+try:
+    from . import _C
+except ImportError as error:
+    from .installation import why_not_loaded
+
+    raise ImportError(why_not_loaded(error)) from error
 
 __all__ = ["distCUDA2", "has_cuda"]
 

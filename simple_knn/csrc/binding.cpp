@@ -32,8 +32,13 @@ void mean_distances_cuda(uintptr_t points, int64_t n, uintptr_t scratch, uintptr
 }  // namespace
 }  // namespace simple_knn
 
+#define SIMPLE_KNN_QUOTED(text) #text
+#define SIMPLE_KNN_TEXT(macro) SIMPLE_KNN_QUOTED(macro)
+
 PYBIND11_MODULE(TORCH_EXTENSION_NAME, m) {
   using Released = py::call_guard<py::gil_scoped_release>;
+  // Looked for in the file of this module where it cannot be loaded (analytic_simple_knn/installation.py).
+  m.attr("BUILT_FOR") = "analytic_simple_knn was built for torch " SIMPLE_KNN_TEXT(SIMPLE_KNN_TORCH);
   m.attr("MAX_POINTS") = simple_knn::kMaxPoints;
   m.def("scratch_bytes_cpu", &simple_knn::cpu::scratch_bytes);
   m.def("mean_distances_cpu", &simple_knn::mean_distances_cpu, Released());

@@ -117,3 +117,41 @@ def test_a_compiled_one_comes_first(tmp_path):
         check=True,
     )
     assert done.stdout.strip() == str(tmp_path / "simple_knn" / f"_C{suffix}")
+
+
+def failure_of_import(folder):
+    """The last line that Python prints where the packages in this folder come first."""
+    code = f"import sys; sys.path.insert(0, {str(folder)!r}); import simple_knn._C"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=folder)
+    assert done.returncode != 0
+    last = done.stderr.strip().splitlines()[-1]
+    assert last.startswith("ImportError: ") and "path/to/analytic_rasterizer/simple_knn`" in last
+    return last
+
+
+def copy_of_packages(folder):
+    """Without the compiled module."""
+    left_out = shutil.ignore_patterns("__pycache__", "_C.*so")
+    for package in ("analytic_simple_knn", "simple_knn"):
+        shutil.copytree(ROOT / package, folder / package, ignore=left_out)
+    return folder / "analytic_simple_knn"
+
+
+def test_a_clone_that_was_not_built(tmp_path):
+    package = copy_of_packages(tmp_path)
+    assert f"imported from {package}, which has no compiled module, as a clone that" in failure_of_import(tmp_path)
+    (package / "_C.cpython-27-x86_64-linux-gnu.so").write_bytes(b"")
+    assert "for this version of Python, only _C.cpython-27" in failure_of_import(tmp_path)
+
+
+def test_a_module_that_was_built_for_another_torch(tmp_path):
+    import torch
+
+    package = copy_of_packages(tmp_path)
+    built = pathlib.Path(analytic_simple_knn._C.__file__)
+    library = built.read_bytes()
+    assert f"analytic_simple_knn was built for torch {torch.__version__}" == analytic_simple_knn._C.BUILT_FOR
+    library = library.replace(torch.__version__.encode(), b"0" + torch.__version__.encode()[1:])
+    (package / built.name).write_bytes(library.replace(b"PyInit__C", b"PyInit__D"))
+    expected = f"was built for torch 0{torch.__version__[1:]} and cannot be loaded with torch {torch.__version__} ("
+    assert expected in failure_of_import(tmp_path)

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from ..._C import MAX_CHANNELS
+from ...autocast import way_out_of
 from ...effects import MAX_SH_DEGREE
 from ...footprints import Footprint, chosen_footprint, resolve_footprint
 from ...settings import one_number, whole_number
@@ -88,7 +89,8 @@ def _check_tensor(name: str, tensor: Any, like: torch.Tensor, *shapes: tuple[int
     if tensor.device != like.device:
         raise ValueError(f"{name} must be on the device of means, {like.device}, got {tensor.device}")
     if tensor.dtype != like.dtype:
-        raise TypeError(f"{name} must have the dtype of means, {like.dtype}, got {tensor.dtype}")
+        got = f"{tensor.dtype}{way_out_of(tensor.dtype)}"
+        raise TypeError(f"{name} must have the dtype of means, {like.dtype}, got {got}")
 
 
 def check_scene(means: Any, quats: Any, scales: Any, opacities: Any, covars: Any, viewmats: Any, Ks: Any) -> Sizes:

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from ..._C import TILE
+from ...autocast import widened
 from ...camera import camera_matrices
 from ...effects import Effects
 from ...footprints import Footprint
@@ -130,6 +131,8 @@ def rasterization(
         ValueError: Wrong shape, device or value. The numbers of cameras are looked at on the CPU only.
         RuntimeError: CUDA tensors, and an extension without CUDA; or a pose in viewmats that is singular.
     """
+    means, quats, scales, opacities, covars = map(widened, (means, quats, scales, opacities, covars))
+    colors, viewmats, Ks, backgrounds = map(widened, (colors, viewmats, Ks, backgrounds))
     asked = {
         "sparse_grad": sparse_grad,
         "with_ut": with_ut,

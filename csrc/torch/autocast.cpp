@@ -1,0 +1,38 @@
+// Under torch.autocast the ops compute in float32, as those of torch's own operators do that need it: arguments of 16
+// bits are cast first. The cast is torch's, and differentiable, so that gradients have 16 bits where the arguments had.
+// Without autocast the dispatcher never comes here.
+#include <torch/library.h>
+
+#include "torch/boxing.h"
+
+namespace ar::ops {
+namespace {
+
+using torch::jit::Stack;
+
+template <c10::DispatchKey kAutocast> void in_float32(const c10::OperatorHandle& op, Stack* stack) {
+  const c10::impl::ExcludeDispatchKeyGuard without_autocast(kAutocast);
+  const bool on_cuda = kAutocast == c10::DispatchKey::AutocastCUDA;
+  const size_t first = stack->size() - op.schema().arguments().size();
+  for (size_t i = first; i < stack->size(); ++i) {
+    IValue& value = (*stack)[i];
+    if (!value.isTensor() || !value.toTensor().defined()) continue;
+    const Tensor& t = value.toTensor();
+    const bool is_half = t.scalar_type() == at::kHalf || t.scalar_type() == at::kBFloat16;
+    if (is_half && t.is_cuda() == on_cuda) value = t.to(at::kFloat);
+  }
+  op.callBoxed(stack);
+}
+
+/// The ops that write to none of their arguments; adjoints get what those have cast.
+template <c10::DispatchKey kAutocast> void register_casts(torch::Library& m) {
+  for (const char* name : {"rasterize", "rasterize_timed", "project", "count_rows", "bin", "blend", "inspect",
+                           "footprint_weight", "ssim_map", "l1_ssim", "activate"})
+    m.impl(name, torch::CppFunction::makeFromBoxedFunction<&in_float32<kAutocast>>());
+}
+
+TORCH_LIBRARY_IMPL(analytic_rasterizer, AutocastCPU, m) { register_casts<c10::DispatchKey::AutocastCPU>(m); }
+TORCH_LIBRARY_IMPL(analytic_rasterizer, AutocastCUDA, m) { register_casts<c10::DispatchKey::AutocastCUDA>(m); }
+
+}  // namespace
+}  // namespace ar::ops
