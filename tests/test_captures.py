@@ -22,6 +22,7 @@ pytest.importorskip("gsply", reason="needs the train extra")
 
 from capture_files import (  # noqa: E402
     circle,
+    draw_picture,
     looking_at_origin,
     opengl_pose,
     write_colmap,
@@ -31,7 +32,7 @@ from capture_files import (  # noqa: E402
 )
 
 from analytic_rasterizer import training  # noqa: E402
-from analytic_rasterizer.training import captures, colmap, files, lenses, pictures  # noqa: E402
+from analytic_rasterizer.training import captures, colmap, files, lenses, pictures, placement, run  # noqa: E402
 from analytic_rasterizer.training import model as g  # noqa: E402
 
 
@@ -955,3 +956,133 @@ def test_far_captures_are_those_at_zero(tmp_path):
     torch.testing.assert_close(given.points[0], here.points[0] - torch.tensor([1.0, 0, 0]), rtol=0, atol=1e-6)
     world = training.load_capture(tmp_path / "far", offset=(0.0, 0.0, 0.0))
     assert world.offset is None and world.points[0][0, 0] > 4e5
+
+
+def train(folder, out, *extra) -> int:
+    arguments = ["train", str(folder), "--out", str(out), "--device", "cpu", "--sh-degree", "0", "--no-evaluate"]
+    return cli.main([*arguments, *extra])
+
+
+def test_files_of_a_far_training_have_one_frame(tmp_path, capsys):
+    """Scene and cameras name their offset, a resumed training and the test take it, and the result is that at zero."""
+    scenes = {}
+    for name, writes in (("far", far), ("near", write)):
+        writes(tmp_path / name)
+        write_pictures(tmp_path / name / "images", circle(9, SIZE), opaque=True)
+        out = tmp_path / f"{name}_out"
+        assert train(tmp_path / name, out, "--iterations", "30") == 0
+        assert (
+            cli.main(["evaluate", str(out), "--lpips", "none", "--pictures", "0", "--data", str(tmp_path / name)]) == 0
+        )
+        scenes[name] = io.load_scene(out / files.SCENE), io.load_views(out / files.CAMERAS)
+        result = json.loads((out / "evaluation.json").read_text())["results"]["moment:samples=4"]["mean"]["psnr"]
+        scenes[name] += (result,)
+    offset = (500000.0, 4200000.0, 120.0)
+    out = tmp_path / "far_out"
+    assert io.read_metadata(out / files.SCENE).offset == offset
+    assert io.read_metadata(tmp_path / "near_out" / files.SCENE).offset is None
+    torch.testing.assert_close(scenes["far"][0].means, scenes["near"][0].means, rtol=0, atol=1e-5)
+    assert scenes["far"][2] == pytest.approx(scenes["near"][2], abs=0.1)
+    for a, b in zip(scenes["far"][1], scenes["near"][1]):
+        assert a.offset == offset and b.offset is None
+        torch.testing.assert_close(a.w2c, b.w2c, rtol=0, atol=1e-6)
+    assert "relative to (500000, 4200000, 120)" in capsys.readouterr().err
+    assert train(tmp_path / "far", out, "--resume") == 0
+    # A start from a scene or from points in the world comes to the same places.
+    header = [
+        "ply",
+        "format ascii 1.0",
+        "element vertex 2",
+        *(f"property double {axis}" for axis in "xyz"),
+        "end_header",
+    ]
+    (tmp_path / "world.ply").write_text("\n".join([*header, "500000.25 4200000.5 120.125", "500001 4200000 119", ""]))
+    capture = training.load_capture(tmp_path / "far")
+    first, _ = run.first_gaussians(training.TrainingOptions(), capture, tmp_path / "world.ply")
+    assert first.means.tolist() == [[0.25, 0.5, 0.125], [1, 0, -1]]
+    again, _ = run.first_gaussians(training.TrainingOptions(), capture, out / files.SCENE)
+    assert torch.equal(again.means, scenes["far"][0].means)
+    moved_capture = capture._replace(offset=(500001.0, 4200000.0, 120.0))
+    again, _ = run.first_gaussians(training.TrainingOptions(), moved_capture, out / files.SCENE)
+    torch.testing.assert_close(again.means, scenes["far"][0].means - torch.tensor([1.0, 0, 0]), rtol=0, atol=1e-6)
+
+
+def test_a_checkpoint_without_an_offset_stays_in_the_world(tmp_path):
+    """Earlier versions had none."""
+    far(tmp_path / "far", (20.0, 100.0, -30.0))
+    assert train(tmp_path / "far", tmp_path / "out", "--iterations", "2") == 0
+    path = tmp_path / "out" / files.CHECKPOINT
+    state = torch.load(path, weights_only=True)
+    assert state["source"].pop("offset") is None and state["source"].pop("lens") == "undistort"
+    assert state["source"].pop("cameras") is None
+    torch.save(state, path)
+    assert train(tmp_path / "far", tmp_path / "out", "--resume") == 0
+    resumed = training.Run(tmp_path / "far", tmp_path / "out", resume=True)
+    assert resumed.source["offset"] is None and resumed.source["lens"] == "undistort"
+    with pytest.raises(ValueError, match="lens must be undistort or None where a training is resumed, got refuse"):
+        training.Run(tmp_path / "far", tmp_path / "out", resume=True, lens="refuse")
+
+
+def test_what_was_chosen_is_said(tmp_path, capsys):
+    """Each in a line, by the training and by the test."""
+    write(tmp_path / "scene", "SIMPLE_RADIAL", [-0.1])
+    (tmp_path / "scene" / "sparse" / "0" / "points3D.bin").unlink()
+    assert train(tmp_path / "scene", tmp_path / "out", "--iterations", "1", "--random-points", "50") == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if "step" not in line]
+    assert len(said) == 2 and re.search(RESAMPLED % "SIMPLE_RADIAL", said[0])
+    assert said[1] == "no points in the capture: starts from 50 random ones in the views (--points)"
+    assert cli.main(["evaluate", str(tmp_path / "out"), "--lpips", "none", "--pictures", "0"]) == 0
+    assert re.search(RESAMPLED % "SIMPLE_RADIAL", capsys.readouterr().err)
+    assert json.loads((tmp_path / "out" / "evaluation.json").read_text())["resampled"] == 2
+    options = ["--lens", "refuse", "--random-points", "50"]
+    assert train(tmp_path / "scene", tmp_path / "other", *options) == 2
+    assert capsys.readouterr().err.count("\n") == 1 and not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize("where", [(0, 0, 0), (300, -200, 100)])
+def test_random_points_are_where_the_cameras_look(where):
+    """For cameras around a place, side by side, and at one place, whatever the origin and the unit."""
+    around = circle(12)
+    beside = [io.View(f"{i}", 32, 32, 36.0, 36.0, looking_at_origin(0.0)) for i in range(9)]
+    for i, view in enumerate(beside):
+        view.w2c[0, 3] = 0.02 * i
+    one_place = [io.View(f"{i}", 32, 32, 36.0, 36.0, looking_at_origin(0.5 * i, 0.0)) for i in range(9)]
+    for views, farthest in ((around, 20.0), (beside, 20.0), (one_place, 10.0)):
+        views = [view.in_frame(tuple(-float(number) for number in where)) for view in views]
+        points, colors = placement.points_in_view(views, 500, seed=0)
+        assert points.shape == colors.shape == (500, 3) and points.dtype == torch.float32
+        w2c = torch.stack([view.w2c for view in views])
+        seen = points.double() @ w2c[:, :3, :3].mT + w2c[:, None, :3, 3]
+        x, y, z = seen.unbind(2)
+        inside = (z > 0) & ((36 * x / z).abs() <= 16.01) & ((36 * y / z).abs() <= 16.01)
+        assert inside.any(0).all()
+        distances = (points.double() - torch.tensor(where, dtype=torch.float64)).norm(dim=1)
+        assert distances.max() < farthest
+        assert torch.equal(points, placement.points_in_view(views, 500, seed=0)[0])
+    near = placement.points_in_view(around, 500, seed=0)[0].norm(dim=1)
+    assert near.median() < 6  # the place that they look at is at zero, 4 from each
+
+
+def test_the_pictures_of_a_lens_are_those_of_its_pinhole(tmp_path):
+    """What is trained on is what a pinhole with the same pose would have seen: the truth, drawn at the cut."""
+    view = io.View("a", 240, 180, 230.0, 230.0, looking_at_origin(0.2), 118.0, 92.0)
+    lens = lenses.lens_of("SIMPLE_RADIAL", {"k1": -0.2}, "")
+    wide = replace(view, width=1000, height=800, fx=690.0, fy=690.0, cx=500.0, cy=400.0)
+    drawn = torch.from_numpy(draw_picture(wide, opaque=True)).permute(2, 0, 1)[None].double()
+    # The photograph: directions of its pixels by inverting the map, colours from a larger picture of the pinhole.
+    y, x = np.mgrid[0.5:180, 0.5:240]
+    seen = (x - view.cx) / view.fx, (y - view.cy) / view.fy
+    a, b = seen
+    for _ in range(60):
+        u, v = lens.distorted(a, b)
+        a, b = a - (u - seen[0]), b - (v - seen[1])
+    places = torch.from_numpy(np.stack([2 * (690 * a + 500) / 1000 - 1, 2 * (690 * b + 400) / 800 - 1], -1))[None]
+    photograph = torch.nn.functional.grid_sample(drawn, places, align_corners=False)[0].round().to(torch.uint8)
+    rgba = torch.cat([photograph, torch.full_like(photograph[:1], 255)]).permute(1, 2, 0)
+    found, resampled = lenses.without_lens(rgba, view, lens)
+    expected = draw_picture(found, opaque=True)
+    error = (resampled[..., :3].double() - torch.from_numpy(expected)) / 255
+    assert -10 * error.square().mean().log10() > 45
+    # Half a pixel to the side it is far from that.
+    beside = draw_picture(replace(found, cx=found.cx + 0.5), opaque=True)
+    assert (resampled[..., :3].double() - torch.from_numpy(beside)).square().mean() > 4 * (255 * error).square().mean()

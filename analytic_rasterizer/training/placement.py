@@ -8,13 +8,14 @@ import torch
 from torch import Tensor
 
 from .. import io
-from .extent import places_of
+from .extent import ROUNDING, places_of
 
 # Of the distance from zero over the size of a capture. Below, float32 holds positions to 4e-6 of the size, and the
 # smallest steps of a training still move them.
 FARTHEST = 64
 NEAREST_DEPTH, FARTHEST_DEPTH = 0.25, 4.0  # of random points, in depths of what cameras look at
-DEPTH_WITHOUT_FOCUS = 10  # of what cameras look at that do not look at one place, in distances between cameras
+# How far a place can be that cameras look at, and how far it is where there is none: in distances from their mean.
+FARTHEST_FOCUS, DEPTH_WITHOUT_FOCUS = 100, 10
 
 
 def offset_of(views: list[io.View], points: Tensor | None) -> tuple[float, float, float] | None:
@@ -39,19 +40,11 @@ def offset_of(views: list[io.View], points: Tensor | None) -> tuple[float, float
 def points_in_view(views: list[io.View], count: int, seed: int) -> tuple[Tensor, Tensor]:
     """Random positions (count, 3) in front of the cameras, float32, and grey, (count, 3) of colours in [0, 1].
 
-    Each is in a random pixel of a random view, at a depth between NEAREST_DEPTH and FARTHEST_DEPTH of that of the place
-    nearest to all optical axes, uniform in its logarithm. Axes that are parallel, or meet behind the cameras, have no
-    such place; then the depth is DEPTH_WITHOUT_FOCUS times the distance of the cameras from each other.
+    Each is in a random pixel of a random view, at a depth between NEAREST_DEPTH and FARTHEST_DEPTH of what the cameras
+    look at, see `depth_of_focus`, uniform in its logarithm.
     """
     c2w = torch.linalg.inv(torch.stack([view.w2c for view in views]))
-    centers, axes = c2w[:, :3, 3], c2w[:, :3, 2]
-    extent = (centers - centers.mean(0)).norm(dim=1).median().item()
-    # The distance from an axis is |across (x - center)|.
-    across = torch.eye(3, dtype=axes.dtype) - axes[:, :, None] * axes[:, None, :]
-    focus = torch.linalg.lstsq(across.sum(0), (across @ centers[:, :, None]).sum(0)).solution[:, 0]
-    depth = ((focus - centers) * axes).sum(1).median().item()
-    if not (math.isfinite(depth) and depth > extent / 2):
-        depth = DEPTH_WITHOUT_FOCUS * extent or 1.0
+    depth = depth_of_focus(c2w[:, :3, 3], c2w[:, :3, 2])
     generator = torch.Generator().manual_seed(seed)
     uniform = torch.rand(count, 3, generator=generator, dtype=torch.float64, device="cpu")
     chosen = torch.randint(len(views), (count,), generator=generator, device="cpu")
@@ -65,3 +58,23 @@ def points_in_view(views: list[io.View], count: int, seed: int) -> tuple[Tensor,
     in_camera = torch.cat([xy, z[:, None], torch.ones_like(z[:, None])], 1)
     points = (c2w[chosen] @ in_camera[:, :, None])[:, :3, 0]
     return points.float(), torch.full((count, 3), 0.5, dtype=torch.float32, device="cpu")
+
+
+def depth_of_focus(centers: Tensor, axes: Tensor) -> float:
+    """How far what the cameras look at is in front of them, world units: the median of all.
+
+    It is the place nearest to all optical axes. Where these are parallel, or meet behind the cameras, there is none;
+    then the depth is DEPTH_WITHOUT_FOCUS times the distance of the cameras from their mean, and 1 where they are at one
+    place: then every depth looks the same.
+
+    Args:
+        centers, axes: (N, 3) float64, of unit length.
+    """
+    spread = (centers - centers.mean(0)).norm(dim=1).median().item()
+    if spread <= ROUNDING * centers.abs().max().item():
+        return 1.0
+    # The distance of x from an axis is |across (x - center)|.
+    across = torch.eye(3, dtype=axes.dtype, device="cpu") - axes[:, :, None] * axes[:, None, :]
+    focus = torch.linalg.lstsq(across.sum(0), (across @ centers[:, :, None]).sum(0)).solution[:, 0]
+    depth = ((focus - centers) * axes).sum(1).median().item()
+    return depth if spread / 2 < depth < FARTHEST_FOCUS * spread else DEPTH_WITHOUT_FOCUS * spread
