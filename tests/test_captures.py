@@ -311,12 +311,12 @@ def test_nerfstudio_masks_are_ignored_and_the_user_is_told(tmp_path):
         (lambda content: content.update(k1=math.nan), "frame 0: k1 must be a finite number, got nan"),
         (
             lambda content: content.update(camera_model="OPENCV_FISHEYE"),
-            "camera_model must be a pinhole, or one with a lens of SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV, got "
-            "'OPENCV_FISHEYE'; undistort the pictures first",
+            "camera_model must be that of a pinhole camera, got 'OPENCV_FISHEYE'; of lenses, training takes those of "
+            "SIMPLE_RADIAL, RADIAL, OPENCV, FULL_OPENCV: undistort the pictures first",
         ),
         (
             lambda content: content["frames"][2].update(camera_model="EQUIRECTANGULAR"),
-            "frame 2: camera_model must be a pinhole, or one with a lens of SIMPLE_RADIAL, RADIAL, OPENCV",
+            "frame 2: camera_model must be that of a pinhole camera, got 'EQUIRECTANGULAR'; of lenses, training takes",
         ),
     ],
 )
@@ -752,7 +752,7 @@ FOUND = {
     ),
     "missing pictures": (
         lambda f: without(f, "images/r_3.png", "images/r_5.png"),
-        "2 of 9 pictures are missing, the first is .*r_3.png",
+        r"2 of 9 pictures are missing, the first is .*r_3.png \(--missing skip leaves them out\)",
     ),
     "no folder of pictures": (
         lambda f: [write(f), moved(f, "images", "input")],
@@ -910,6 +910,30 @@ def test_cameras_and_pictures_that_are_chosen(tmp_path):
     for wrong in ("sparse/7", "distorted"):
         with pytest.raises(io.SceneError, match=f"{wrong}: (no such file|expected COLMAP's cameras)"):
             training.load_capture(tmp_path, cameras=wrong)
+
+
+def test_missing_pictures_can_be_left_out(tmp_path):
+    without(tmp_path, "images/r_0.png", "images/r_5.png")
+    found = training.load_capture(tmp_path, missing="skip")
+    assert [item.view.name for item in found.train] == [f"r_{i}" for i in (1, 2, 3, 4, 6, 7)]
+    assert [item.view.name for item in found.test] == ["r_8"]
+    assert found.notes == ("2 of 9 pictures are missing and left out",)
+    with pytest.raises(ValueError, match="missing must be one of refuse, skip, got draw"):
+        training.load_capture(tmp_path, missing="draw")
+
+
+def test_lenses_of_smaller_pictures(tmp_path):
+    """Cameras are scaled to their pictures, and lenses are those of directions, which stay."""
+    views = [replace(view, fx=150.0, fy=150.0) for view in circle(9, (140, 132))]
+    write(tmp_path, "SIMPLE_RADIAL", [-0.1], views=views)
+    smaller = [replace(view, width=70, height=66) for view in views]
+    write_grey(tmp_path / "images_2", smaller, [f"{view.name}.png" for view in views])
+    whole, half = (
+        training.load_pictures(training.load_capture(tmp_path, images).train, (1,), captures.BLACK, "cpu").views[0]
+        for images in ("images", "images_2")
+    )
+    assert half.fx == whole.fx / 2 and abs(half.width - whole.width / 2) <= 1 and whole.width > 140
+    assert abs(half.cx - whole.cx / 2) <= 1
 
 
 def test_lenses_can_be_refused(tmp_path):

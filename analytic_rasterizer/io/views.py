@@ -182,8 +182,8 @@ def _focal(entry: dict, length: str, angle: str, extent: int, where: str) -> flo
 def _check_camera_model(model, where: str = "") -> None:
     if model is not None and model not in PERSPECTIVE_MODELS:
         raise SceneError(
-            f"{where}camera_model must be a pinhole, or one with a lens of {', '.join(PERSPECTIVE_MODELS[2:])}, got "
-            f"{model!r}; undistort the pictures first, with COLMAP's image_undistorter for example"
+            f"{where}camera_model must be that of a pinhole camera, got {model!r}; of lenses, training takes those of "
+            f"{', '.join(PERSPECTIVE_MODELS[2:])}: undistort the pictures first, with COLMAP's image_undistorter for example"
         )
 
 

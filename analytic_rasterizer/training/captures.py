@@ -19,6 +19,7 @@ __all__ = ["BLACK", "WHITE", "Capture", "Photograph", "load_capture"]
 IMAGES, TEST_PERIOD = "images", 8
 RECONSTRUCTIONS = ("sparse/0", "sparse", "colmap/sparse/0")
 LENS_CHOICES = ("undistort", "refuse")
+MISSING_CHOICES = ("refuse", "skip")
 SEARCH_DEPTH = 3  # folders below SCENE where an error looks for reconstructions
 
 
@@ -29,6 +30,7 @@ def load_capture(
     *,
     cameras: str | None = None,
     lens: str = "undistort",
+    missing: str = "refuse",
     offset: tuple[float, float, float] | None = None,
 ) -> Capture:
     """Reads the cameras of a folder, and looks whether all of its pictures are there.
@@ -46,6 +48,7 @@ def load_capture(
             chosen as above.
         lens: "undistort": photographs of cameras with lens distortion are resampled to pinholes; "refuse": they are an
             error.
+        missing: "refuse": pictures that are not there are an error; "skip": their cameras are left out.
         offset: What to take off all positions, so that they are those of a scene with this offset. None: what
             `offset_of` finds, which is nothing unless coordinates are far from zero.
 
@@ -56,16 +59,17 @@ def load_capture(
         io.SceneError: No such layout; missing pictures; no pictures to train with; all cameras with one pose; a lens
             that cannot be undistorted.
         OSError: A file that cannot be read.
-        ValueError: test_every is negative or 1; no such `lens`.
+        ValueError: test_every is negative or 1; no such `lens` or `missing`.
     """
     if test_every < 0 or test_every == 1:
         raise ValueError(f"test_every must be 0 or at least 2, got {test_every}")
-    if lens not in LENS_CHOICES:
-        raise ValueError(f"lens must be one of {', '.join(LENS_CHOICES)}, got {lens}")
+    for name, value, choices in (("lens", lens, LENS_CHOICES), ("missing", missing, MISSING_CHOICES)):
+        if value not in choices:
+            raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value}")
     folder = Path(folder)
     if not folder.is_dir():
         raise io.SceneError(f"{folder}: no such folder")
-    capture = without_outliers(folder, read_cameras(folder, images, test_every, cameras))
+    capture = without_outliers(folder, read_cameras(folder, images, test_every, cameras, missing))
     check_capture(folder, capture)
     if capture.masks:
         warnings.warn(
@@ -90,10 +94,15 @@ def load_capture(
     return _relative_to(capture, offset)._replace(notes=tuple(notes))
 
 
-def read_cameras(folder: Path, images: str, test_every: int, cameras: str | None) -> Capture:
+def read_cameras(folder: Path, images: str, test_every: int, cameras: str | None, missing: str) -> Capture:
     """The capture in world coordinates, as far as files of cameras and points say. Arguments as `load_capture`."""
+
+    def read(place: Path) -> Capture:
+        capture = read_layout(folder, place, images, test_every)
+        return _without_missing(capture) if missing == "skip" else capture
+
     if cameras is not None:
-        return read_layout(folder, folder / cameras, images, test_every)
+        return read(folder / cameras)
     places = _places(folder)
     if not places:
         raise io.SceneError(
@@ -101,29 +110,39 @@ def read_cameras(folder: Path, images: str, test_every: int, cameras: str | None
             f"(.bin or .txt) in sparse/0{_elsewhere(folder)}"
         )
     if len(places) == 1:
-        capture, others = read_layout(folder, places[0], images, test_every), []
+        capture, others = read(places[0]), []
         chosen = places[0]
     else:
         found, errors = {}, {}
         for place in places:
             try:
-                found[place] = read_layout(folder, place, images, test_every)
+                found[place] = read(place)
                 check_capture(folder, found[place])
             except io.SceneError as error:
                 found.pop(place, None)
                 errors[place] = error
         if not found:
             raise errors[places[0]]
-        plain = (place for place, read in found.items() if all(item.lens is None for item in (*read.train, *read.test)))
+        plain = (place for place, its in found.items() if all(item.lens is None for item in (*its.train, *its.test)))
         chosen = next(plain, next(iter(found)))
         capture, others = found[chosen], [place for place in places if place != chosen]
     models = [model for model in _models_beside(chosen) if model != chosen] if chosen.is_dir() else []
     names = [str(place.relative_to(folder)) for place in (*others, *models)]
     if not names:
         return capture
-    return capture._replace(
-        notes=(f"cameras are those of {chosen.relative_to(folder)}; --cameras takes {' or '.join(names)} instead",)
+    note = f"cameras are those of {chosen.relative_to(folder)}; --cameras takes {' or '.join(names)} instead"
+    return capture._replace(notes=(*capture.notes, note))
+
+
+def _without_missing(capture: Capture) -> Capture:
+    """The capture without photographs of which a file is not there, and with a note that counts them."""
+    train, test = (
+        [item for item in items if all(path.is_file() for path in item.files.values())]
+        for items in (capture.train, capture.test)
     )
+    before, after = (len(capture.train) + len(capture.test), len(train) + len(test))
+    notes = () if before == after else (f"{before - after} of {before} pictures are missing and left out",)
+    return capture._replace(train=train, test=test, notes=(*capture.notes, *notes))
 
 
 def _places(folder: Path) -> list[Path]:
@@ -164,7 +183,10 @@ def check_capture(folder: Path, capture: Capture) -> None:
     files = [path for item in (*capture.train, *capture.test) for path in item.files.values()]
     missing = [path for path in files if not path.is_file()]
     if missing:
-        raise io.SceneError(f"{folder}: {len(missing)} of {len(files)} pictures are missing, the first is {missing[0]}")
+        raise io.SceneError(
+            f"{folder}: {len(missing)} of {len(files)} pictures are missing, the first is {missing[0]} (--missing skip "
+            "leaves them out)"
+        )
     if len(capture.train) < 2:
         raise io.SceneError(f"{folder}: training needs at least 2 pictures, got {len(capture.train)}")
     if is_one_pose([item.view for item in capture.train]):

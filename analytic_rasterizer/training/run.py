@@ -18,7 +18,7 @@ from .. import io
 from ..distributed.ranks import ALONE, Ranks
 from ..filters import bake_pixel
 from ..gaussians import Gaussians
-from .captures import IMAGES, LENS_CHOICES, TEST_PERIOD, Capture, Photograph, load_capture
+from .captures import IMAGES, LENS_CHOICES, MISSING_CHOICES, TEST_PERIOD, Capture, Photograph, load_capture
 from .evaluation import evaluate, psnr
 from .files import (
     CAMERAS,
@@ -60,8 +60,8 @@ class Run:
         out: Folder for the results, made if it is missing. Those of another training there are overwritten.
         options: None: the defaults, or with `resume` those of the checkpoint.
         device: "cpu", "cuda" or "cuda:N".
-        images, test_every, cameras, lens: As `load_capture`; None: "images", 8, what it finds, and "undistort". With
-            `resume` None, or the same as when the training began.
+        images, test_every, cameras, lens, missing: As `load_capture`; None: as is usual there. With `resume` None, or
+            the same as when the training began.
         points: A .ply to start from: a 3DGS scene, or points with colours. None: what the capture has. Of more points
             than `max_gaussians`, so many are drawn at random. With `resume` None, or the same as when the training
             began.
@@ -90,6 +90,7 @@ class Run:
         points=None,
         cameras: str | None = None,
         lens: str | None = None,
+        missing: str | None = None,
         save_every: int = 5000,
         resume: bool = False,
         ranks: Ranks = ALONE,
@@ -104,7 +105,7 @@ class Run:
         self.options = options or TrainingOptions()
         # Where the scene is, from wherever `evaluate` is called.
         given = {"images": images, "test_every": test_every, "points": points and str(Path(points).resolve())}
-        given |= {"cameras": cameras, "lens": lens}
+        given |= {"cameras": cameras, "lens": lens, "missing": missing}
         self.source = {"scene": os.path.abspath(scene), **source_of(given, state)}
         self.capture = load_capture(scene, **capture_arguments(self.source | stored_offset(state)))
         self.source["offset"] = self.capture.offset
@@ -321,7 +322,8 @@ def source_of(given: dict[str, Any], state: dict[str, Any] | None) -> dict[str, 
 
     Raises ValueError for another source than it began with: it would go on with other pictures, or points of no effect.
     """
-    usual = {"images": IMAGES, "test_every": TEST_PERIOD, "points": None, "cameras": None, "lens": LENS_CHOICES[0]}
+    usual = {"images": IMAGES, "test_every": TEST_PERIOD, "points": None, "cameras": None}
+    usual |= {"lens": LENS_CHOICES[0], "missing": MISSING_CHOICES[0]}
     if state is not None:
         # Those of earlier versions have no points: nobody knows them.
         usual |= {"points": given["points"]} | {
@@ -346,7 +348,7 @@ def capture_arguments(source: dict[str, Any]) -> dict[str, Any]:
     Where it has an offset, also None, positions are relative to that.
     """
     arguments = {"images": source["images"], "test_every": source["test_every"]}
-    arguments |= {"cameras": source.get("cameras"), "lens": source.get("lens") or LENS_CHOICES[0]}
+    arguments |= {name: source[name] for name in ("cameras", "lens", "missing") if name in source}
     return arguments | ({"offset": tuple(source["offset"] or (0.0, 0.0, 0.0))} if "offset" in source else {})
 
 
