@@ -183,7 +183,8 @@ def _check_camera_model(model, where: str = "") -> None:
     if model is not None and model not in PERSPECTIVE_MODELS:
         raise SceneError(
             f"{where}camera_model must be that of a pinhole camera, got {model!r}; of lenses, training takes those of "
-            f"{', '.join(PERSPECTIVE_MODELS[2:])}: undistort the pictures first, with COLMAP's image_undistorter for example"
+            f"{', '.join(PERSPECTIVE_MODELS[2:])}: undistort the pictures first, with COLMAP's image_undistorter for "
+            "example"
         )
 
 
