@@ -8,6 +8,7 @@ A drop-in replacement for `diff_gaussian_rasterization`. Where to look:
 - `Effects`, `Outputs`, `Defocus`, `Motion`, `camera_settings`: depth, alpha, statistics, cameras (docs/effects.md).
 - `project`, `list_tiles`, `blend`: the three stages of a rendering, each on its own (docs/library.md).
 - `losses`, `activations`, `optim`: the other parts of a training step (docs/losses.md).
+- `density`: how many Gaussians there are, in a training loop of one's own (docs/density.md).
 - `inspect_scene`, `plan`: what a scene calls for (docs/command-line.md).
 
 In modules of their own: `training`, `distributed`, `viewer`, `analysis`, `dialects` and `io` (docs/).
@@ -22,7 +23,7 @@ try:
 except ImportError as error:
     raise ImportError(why_not_loaded(error)) from error
 
-from . import activations, losses, optim
+from . import activations, density, losses, optim
 from .analysis.planner import SceneReport, inspect_scene, plan
 from .camera import View, camera_settings, moved
 from .effects import Defocus, Effects, GaussianStats, Motion, Outputs
@@ -70,6 +71,7 @@ __all__ = [
     "camera_settings",
     "compute_3d_filter",
     "compute_relocation",
+    "density",
     "footprint_weight",
     "get_default_footprint",
     "inspect_scene",

@@ -1,8 +1,12 @@
-"""Optimisers for Gaussians, beside those of torch: a step on all parameters at once, in one kernel on CUDA."""
+"""Optimisers for Gaussians, beside those of torch: a step on all parameters at once, in one kernel on CUDA.
+
+`replace_rows` gives the parameters of any optimiser other rows when the number of Gaussians changes.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
@@ -153,6 +157,88 @@ class SparseGaussianAdam(torch.optim.Adam):
             if parameter.grad is not None and len(parameter) != N:
                 raise ValueError(f"parameters must have {N} rows, got shape {tuple(parameter.shape)}")
         _update(self, visibility.bool(), betas=(0.9, 0.999), bias_correction=False)
+
+
+MOMENTS = ("exp_avg", "exp_avg_sq")  # of Adam, in the state of a parameter
+
+
+@torch.no_grad()
+def replace_rows(
+    optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor], kept: Tensor, added: Mapping[str, Tensor]
+) -> dict[str, Tensor]:
+    """Removes and adds rows of tensors that have one row per Gaussian, and of the optimiser's state for them.
+
+    A parameter of the optimiser is replaced by a new leaf in the same group. Tensors of its state that have the shape
+    of the parameter, such as both moments of Adam, keep the rows of `kept`, and get zeros for the rows of `added`. All
+    else in the state, such as the number of steps, stays as it is. A parameter without state gets none. Tensors that
+    are no parameters, such as labels, only get the new rows.
+
+    Args:
+        optimizer: Any optimiser of torch, `FusedAdam` and `SparseGaussianAdam` among them. Its parameters that are not
+            in `tensors` stay.
+        tensors: Tensors by name, each (P, ...).
+        kept: (P,) bool, the rows to keep, or (n,) int64, their numbers.
+        added: Rows to put after the kept ones, by the same names, each (m, ...); `tensor[:0]` where there are none.
+
+    Returns:
+        The new tensors by name, each (n + m, ...). They have no gradients.
+
+    Raises:
+        ValueError: The names differ, or a tensor requires a gradient and is in none of the optimiser's groups. Nothing
+            has been changed then.
+    """
+    if tensors.keys() != added.keys():
+        raise ValueError(f"added must have the names {', '.join(tensors)}, got {', '.join(added)}")
+    positions = {name: parameter_index(optimizer, name, tensor) for name, tensor in tensors.items()}
+    replaced = {name: torch.cat([old.detach()[kept], added[name].detach()]) for name, old in tensors.items()}
+    for name, old in tensors.items():
+        if positions[name] is None:
+            continue
+        group, index = positions[name]
+        new = replaced[name].requires_grad_(old.requires_grad)
+        if isinstance(old, torch.nn.Parameter):
+            new = replaced[name] = torch.nn.Parameter(new, old.requires_grad)
+        state = optimizer.state.pop(old, None)
+        if state:
+            zeros = torch.zeros_like(added[name])
+            rows = {key: torch.cat([value[kept], zeros]) for key, value in _row_states(old, state)}
+            optimizer.state[new] = state | rows
+        group["params"][index] = new
+    return replaced
+
+
+@torch.no_grad()
+def clear_moments(optimizer: torch.optim.Optimizer, parameter: Tensor, rows: Tensor | slice = slice(None)) -> None:
+    """Sets what the optimiser remembers of the gradients of some rows of a parameter to zero.
+
+    Args:
+        parameter: (P, ...). What the optimiser has no state for is left alone.
+        rows: (P,) bool, (n,) int64, or a slice. By default all.
+    """
+    for _, value in _row_states(parameter, optimizer.state.get(parameter, {})):
+        value[rows] = 0
+
+
+def parameter_index(optimizer: torch.optim.Optimizer, name: str, tensor: Tensor) -> tuple[dict, int] | None:
+    """The group of the optimiser that a tensor is in, and its index there; None: it is in none, and needs no gradient.
+
+    Raises:
+        ValueError: It is in none, but requires a gradient. The message calls it `name`.
+    """
+    for group in optimizer.param_groups:
+        for index, parameter in enumerate(group["params"]):
+            if parameter is tensor:
+                return group, index
+    if tensor.requires_grad:
+        raise ValueError(f"{name} must be a parameter of the optimizer, or require no gradient: no group has it")
+    return None
+
+
+def _row_states(parameter: Tensor, state: dict[str, Any]) -> Iterator[tuple[str, Tensor]]:
+    """What the state of a parameter has for each of its elements."""
+    for key, value in state.items():
+        if isinstance(value, Tensor) and value.shape == parameter.shape:
+            yield key, value
 
 
 def _common(optimizer: torch.optim.Optimizer, name: str) -> Any:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from analytic_rasterizer import io
-from analytic_rasterizer.gaussians import Gaussians
+from analytic_rasterizer.gaussians import SH_C0, Gaussians
 
 image = pytest.importorskip("PIL.Image", reason="needs the train extra")
 
@@ -95,7 +95,7 @@ def truth_gaussians() -> Gaussians:
     """A few coloured Gaussians."""
     generator = torch.Generator().manual_seed(5)
     points, _ = g.random_points(12, seed=5)
-    gaussians = g.gaussians_at(points, torch.rand(12, 3, generator=generator), 0)
+    gaussians = Gaussians.from_points(points, torch.rand(12, 3, generator=generator), 0)
     gaussians = gaussians._replace(log_scales=torch.full((12, 3), 0.25).log())
     return gaussians._replace(logit_opacities=torch.full((12, 1), 3.0))
 
@@ -106,7 +106,7 @@ def draw_picture(view, opaque: bool) -> np.ndarray:
     settings = view.settings(1, sh_degree=0, footprint="exact")
     color, _ = g.render(truth.arguments(), settings)
     if not opaque:
-        white = truth._replace(shs=torch.full((12, 1, 3), 0.5 / g.SH_C0))
+        white = truth._replace(shs=torch.full((12, 1, 3), 0.5 / SH_C0))
         alpha, _ = g.render(white.arguments(), settings)
         color = torch.cat([color / alpha[:1].clamp_min(1e-3), alpha[:1]])
     return (255 * color.clamp(0, 1)).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()

@@ -7,10 +7,11 @@ import torch
 from conftest import needs_cuda
 
 from analytic_rasterizer import density, io
+from analytic_rasterizer.density import gradient, monte_carlo
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.optim import FusedAdam
 from analytic_rasterizer.rotations import rotation_matrices
-from analytic_rasterizer.training import TrainingOptions
+from analytic_rasterizer.training import TrainingOptions, trainer
 from analytic_rasterizer.training import model as g
 
 observe = torch.ops.analytic_rasterizer.observe_.default
@@ -42,20 +43,20 @@ def make_control(sizes, opacities, white_background=False, device="cpu", **optio
         field.grad = torch.randn(field.shape, generator=torch.Generator().manual_seed(4)).to(device)
     optimizer.step()
     options = TrainingOptions.preset("3dgs", **options)
-    return density.make_density(options, gaussians, optimizer, EXTENT, white_background)
+    return trainer.make_density(options, gaussians, optimizer, EXTENT, white_background)
 
 
 def after_step(control, norms, step=STEP, progress=0.1, radii=None) -> None:
     """As if a step's gradients by the projected means had these norms."""
-    if control.watches(1):
+    if control.watches:
         gradients = torch.zeros(len(norms), control.columns)
         columns = slice(2, 4) if control.columns == 4 else slice(0, 2)
         gradients[:, columns] = torch.tensor(norms)[:, None] * torch.tensor([0.6, -0.8])
-        control.observe(gradients, torch.ones(len(norms), dtype=torch.int32) if radii is None else radii)
+        control.observe_gradients(gradients, torch.ones(len(norms), dtype=torch.int32) if radii is None else radii)
     control.after_step(step, progress)
 
 
-def moments(control) -> dict[str, g.Gaussians]:
+def moments(control) -> dict[str, Gaussians]:
     state = control.optimizer.state
     return {
         name: control.gaussians.map(lambda field, name=name: state[field][name]) for name in ("exp_avg", "exp_avg_sq")
@@ -88,7 +89,7 @@ def test_growth_and_pruning_of_a_few():
     parameters = [group["params"] for group in control.optimizer.param_groups]
     assert all(len(held) == 1 and held[0] is field for held, field in zip(parameters, after))
     assert len(control.optimizer.state) == len(after)
-    assert control.leaf(1).shape == (5, 3)
+    assert control.leaf().shape == (5, 3)
     assert (control.gradient_sums == 0).all() and (control.views == 0).all()
 
 
@@ -118,7 +119,7 @@ def test_growth_keeps_to_its_times(step, progress, count):
     control = make_control([SMALL], [0.5])
     after_step(control, [1.0], step, progress)
     assert len(control.gaussians.means) == count
-    assert (control.leaf(1) is None) == (progress >= 0.5)
+    assert (control.leaf() is None) == (progress >= 0.5)
 
 
 def test_limit_rises_evenly_and_lets_the_largest_gradients_grow():
@@ -161,7 +162,7 @@ def test_halves_are_drawn_from_their_parent():
     parent = make_gaussians([1.0], [0.5]).rows(slice(0, 1))
     parent = parent._replace(rotations=3 * turn[None], log_scales=scales.log()[None])
     parents = parent.map(lambda field: field.detach().repeat(count, *[1] * (field.dim() - 1)))
-    halves = density.split(parents, torch.Generator().manual_seed(0))
+    halves = gradient.split(parents, torch.Generator().manual_seed(0))
     offsets = halves.means - parent.means
     c, s = math.cos(0.8), math.sin(0.8)
     axes = torch.tensor([[c, -s, 0], [s, c, 0], [0, 0, 1]])
@@ -177,16 +178,10 @@ def test_halves_are_drawn_from_their_parent():
 
 def test_absolute_gradients_are_read_from_their_own_columns():
     control = make_control([SMALL, SMALL], [0.5, 0.5], density="absgrad")
-    assert control.leaf(1).shape == (2, 4)
+    assert control.leaf().shape == (2, 4)
     after_step(control, [2e-4, 4e-4])  # one below the threshold of 3e-4
     assert len(control.gaussians.means) == 3
     assert torch.equal(control.gaussians.means[2], control.gaussians.means[1])
-
-
-def test_gradients_of_coarse_pictures_can_be_left_out():
-    control = make_control([SMALL], [0.5], scales=(2, 4), gradient_scales="finest")
-    assert control.leaf(4) is None and control.leaf(2).shape == (1, 3)
-    assert control.watches(2) and not control.watches(4)
 
 
 def observed(count=300, columns=4, dtype=torch.float32, device="cpu"):
@@ -317,11 +312,11 @@ def test_noise_follows_the_covariance_and_spares_the_opaque():
 def test_draws_follow_the_weights(device):
     """Frequencies of rows, against five standard deviations; rows of weight 0 are never drawn."""
     weights = torch.tensor([0.5, 0.0, 0.25, 1.0, 0.0], device=device)
-    rows = density.draw(weights, 70_000, torch.Generator(device).manual_seed(1))
+    rows = monte_carlo.draw(weights, 70_000, torch.Generator(device).manual_seed(1))
     counts = rows.bincount(minlength=5).cpu()
     expected = 70_000 * weights.cpu() / weights.sum().cpu()
     assert ((counts - expected).abs() <= 5 * expected.sqrt()).all()
-    again = density.draw(weights, 70_000, torch.Generator(device).manual_seed(1))
+    again = monte_carlo.draw(weights, 70_000, torch.Generator(device).manual_seed(1))
     assert torch.equal(rows, again)
 
 
@@ -329,9 +324,9 @@ def test_draws_follow_the_weights(device):
 def test_all_kinds_grow_on_the_device(device, kind):
     control = make_control([SMALL, LARGE, SMALL], [0.5, 0.5, 0.001], device=device, density=kind, max_gaussians=20)
     for step in range(590, 601):
-        if control.watches(1):
+        if control.watches:
             count = len(control.gaussians.means)
-            control.observe(
+            control.observe_gradients(
                 torch.ones(count, control.columns, device=device), torch.ones(count, dtype=torch.int32, device=device)
             )
         control.after_step(step, 0.1)

@@ -17,7 +17,7 @@ import torch
 from conftest import ROOT, needs_cuda
 from processes import DEADLINE
 
-from analytic_rasterizer import cli, density, io
+from analytic_rasterizer import cli, io, optim
 from analytic_rasterizer.filters import bake_pixel
 from analytic_rasterizer.footprints import resolve_footprint
 from analytic_rasterizer.gaussians import Gaussians
@@ -248,7 +248,7 @@ def test_psnr_rises_and_the_results_say_so(device, synthetic, tmp_path, options)
     log = [json.loads(line) for line in (tmp_path / files.LOG).read_text().splitlines()]
     assert [entry["step"] for entry in log] == [10, 100, 120]
     assert log[-1]["loss"] < 0.5 * log[0]["loss"]
-    start = evaluate(g.gaussians_at(*g.random_points(150, 0), 1), cpu_test_pictures(synthetic), "box")
+    start = evaluate(Gaussians.from_points(*g.random_points(150, 0), 1), cpu_test_pictures(synthetic), "box")
     assert metrics["test"]["mean"]["psnr"] > start["mean"]["psnr"] + 3
     assert metrics["steps"] == 120 and metrics == json.loads((tmp_path / files.METRICS).read_text())
     assert {"1", "2", "mean"} == metrics["test"].keys() and len(metrics["test"]["1"]["views"]) == 3
@@ -275,7 +275,7 @@ def rows_shown(trainer) -> list[torch.Tensor]:
 
 def state_of(trainer) -> list[torch.Tensor]:
     """Copies of parameters and moments, a row for each Gaussian."""
-    moments = [trainer.optimizer.state[field].get(m) for field in trainer.gaussians for m in density.MOMENTS]
+    moments = [trainer.optimizer.state[field].get(m) for field in trainer.gaussians for m in optim.MOMENTS]
     return [t.detach().clone() for t in (*trainer.gaussians, *(m for m in moments if m is not None))]
 
 
@@ -1105,7 +1105,7 @@ def test_the_command_takes_a_preset_and_resumes_with_it(synthetic, tmp_path, cap
 
 
 def test_the_command_takes_sparse_adam_and_resumes_with_it(synthetic, tmp_path, capsys):
-    start = g.gaussians_at(*g.random_points(60, 0), 0)
+    start = Gaussians.from_points(*g.random_points(60, 0), 0)
     scatter(start)
     io.save_scene(tmp_path / "start.ply", start)
     small = ["--iterations", "12", "--points", str(tmp_path / "start.ply")]

@@ -28,10 +28,9 @@ from test_train import TINY, circle, opengl_pose, rows_shown, scatter, write_pic
 
 from analytic_rasterizer import training  # noqa: E402
 from analytic_rasterizer.cli import launch  # noqa: E402
-from analytic_rasterizer.density import MOMENTS  # noqa: E402
 from analytic_rasterizer.distributed.ranks import ALONE, Ranks, even_counts  # noqa: E402
 from analytic_rasterizer.gaussians import Gaussians  # noqa: E402
-from analytic_rasterizer.optim import FusedAdam  # noqa: E402
+from analytic_rasterizer.optim import MOMENTS, FusedAdam  # noqa: E402
 from analytic_rasterizer.training import TrainingOptions, files, model, schedule  # noqa: E402
 from analytic_rasterizer.training.sharded import UNEVEN, ShardedTrainer  # noqa: E402
 
@@ -478,7 +477,7 @@ def test_torchrun_trains_and_writes_once(made, tmp_path):
     state = checkpoint_in(tmp_path / "out")
     assert state["progress"]["step"] == 121 and state["shards"] == [30, 30]
     test = training.load_pictures(training.load_capture(made / "scene").test, (1,), (1.0, 1.0, 1.0), "cpu")
-    start = model.gaussians_at(*model.random_points(60, 0), 0)
+    start = Gaussians.from_points(*model.random_points(60, 0), 0)
     before = training.evaluate(start, test, TrainingOptions().footprint)["mean"]["psnr"]
     after = json.loads((tmp_path / "out" / files.METRICS).read_text())["test"]["mean"]["psnr"]
     assert after > before + 2

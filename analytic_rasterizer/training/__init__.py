@@ -12,6 +12,7 @@ from ..io import load_points
 from .captures import Capture, Photograph, load_capture
 from .evaluation import evaluate, load_lpips, save_pictures
 from .extent import extent_of
+from .model import random_points
 from .options import PRESETS, TrainingOptions
 from .pictures import Pictures, load_pictures
 from .run import Run
@@ -31,6 +32,7 @@ __all__ = [
     "load_lpips",
     "load_pictures",
     "load_points",
+    "random_points",
     "save_pictures",
     "starting_gaussians",
 ]

@@ -1,4 +1,4 @@
-"""The Gaussians that are trained: how they start, and how they are rendered."""
+"""How the Gaussians that are trained are rendered, and where they start without points."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from .. import distributed, io
-from ..gaussians import Gaussians
+from .. import distributed
 from ..rasterizer import rasterize_gaussians
 from ..settings import GaussianRasterizationSettings
 
@@ -18,8 +17,6 @@ if TYPE_CHECKING:
     from torch.distributed import ProcessGroup
 
 HALF_EDGE = 1.3  # of the cube of random points; NeRF-synthetic objects fit in it
-SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic
-NEIGHBOURS = 3  # whose distances make the first scale
 
 
 def render(
@@ -80,36 +77,11 @@ def averaged(picture: Tensor, times: int) -> Tensor:
     return avg_pool2d(picture, times) if times > 1 else picture
 
 
-def random_points(count: int, seed: int) -> tuple[Tensor, Tensor]:
-    """Positions (count, 3) in the cube of NeRF-synthetic scenes, and grey, (count, 3) of colours in [0, 1].
+def random_points(count: int, seed: int = 0) -> tuple[Tensor, Tensor]:
+    """Positions (count, 3) in the cube from -1.3 to 1.3, where NeRF-synthetic scenes are, and grey, (count, 3) of 0.5.
 
     Random colours, of which nothing is known, would only have to be unlearned.
     """
     generator = torch.Generator().manual_seed(seed)
     uniform = torch.rand(count, 3, generator=generator, dtype=torch.float32, device="cpu")
     return HALF_EDGE * (2 * uniform - 1), torch.full_like(uniform, 0.5)
-
-
-def gaussians_at(points: Tensor, colors: Tensor, sh_degree: int, opacity: float = 0.1, scale: float = 1.0) -> Gaussians:
-    """Round Gaussians at (P, 3) points on the CPU, `scale` times as large as the gaps between them.
-
-    Raises ImportError without SciPy.
-    """
-    count, distances = len(points), neighbour_distance(points)
-    points = points.float()
-    return Gaussians(
-        points,
-        (scale * distances).log()[:, None].repeat(1, 3),
-        points.new_tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
-        points.new_full((count, 1), opacity).logit(),
-        torch.cat([(colors[:, None] - 0.5) / SH_C0, points.new_zeros(count, (sh_degree + 1) ** 2 - 1, 3)], dim=1),
-    )
-
-
-def neighbour_distance(points: Tensor) -> Tensor:
-    """Root mean square distance of each of the (P, 3) points to its nearest neighbours, (P,), at least 1e-7."""
-    tree = io.optional_import("scipy.spatial", "train").cKDTree(points.double().numpy())
-    neighbours = min(NEIGHBOURS, len(points) - 1)
-    distances, _ = tree.query(points.double().numpy(), k=neighbours + 1)
-    nearest = torch.from_numpy(distances).reshape(len(points), -1)[:, 1:]  # the first is the point itself
-    return nearest.square().mean(1).sqrt().nan_to_num(0).float().clamp_min(1e-7)

@@ -6,10 +6,9 @@ import math
 from dataclasses import asdict, dataclass, fields
 from typing import Any, NamedTuple
 
-import numpy as np
-
+from ..checks import check_value as _check
+from ..checks import plain_value as _plain
 from ..footprints import resolve_footprint
-from ..settings import whole_number
 
 DOWNSAMPLINGS = ("box", "bicubic", "blender")
 DENSITIES = ("3dgs", "absgrad", "mcmc", "none")
@@ -268,35 +267,3 @@ class TrainingOptions:
         if unknown:
             raise ValueError(f"options must be among those of TrainingOptions, got {', '.join(sorted(unknown))}")
         return cls(**values)
-
-
-def _plain(name: str, value: Any, kind: type) -> Any:
-    """The value as Python's own `kind`; sequences, as JSON and the command line have them, become tuples of int.
-
-    Raises:
-        TypeError: It is none.
-        ValueError: A number that is not whole where it has to be.
-    """
-    if kind is int:
-        return whole_number(name, value)
-    if kind is tuple:
-        if isinstance(value, (str, bytes)) or not hasattr(value, "__iter__"):
-            raise TypeError(f"{name} must be a sequence of whole numbers, got {value!r}")
-        items = tuple(value)
-        try:
-            return tuple(whole_number(name, item) for item in items)
-        except (TypeError, ValueError) as error:
-            raise type(error)(f"{name} must be whole numbers, got {items}") from None
-    if kind is bool and isinstance(value, np.bool_):
-        return bool(value)
-    if kind is float and hasattr(value, "__float__") and not isinstance(value, (bool, np.bool_)):
-        return float(value)
-    if not isinstance(value, kind):
-        expected = {float: "a number", bool: "a bool", str: "a string"}[kind]
-        raise TypeError(f"{name} must be {expected}, got {value!r}")
-    return value
-
-
-def _check(name: str, fits: bool, expected: str, got: Any) -> None:
-    if not fits:
-        raise ValueError(f"{name} must be {expected}, got {got}")

@@ -6,7 +6,7 @@ import time
 
 import torch
 
-from ..density import passes
+from ..density.control import passes
 from .options import TrainingOptions
 
 SH_SHARE = 0.1  # of the training, after which another degree is due at the latest

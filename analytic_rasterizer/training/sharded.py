@@ -18,11 +18,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..density import MOMENTS
 from ..distributed import OwnSplats
 from ..distributed.ranks import Ranks, even_counts
 from ..gaussians import Gaussians
 from ..losses import l1_ssim
+from ..optim import MOMENTS
 from .extent import extent_of
 from .model import render_together
 from .trainer import Trainer
@@ -115,7 +115,7 @@ class ShardedTrainer(Trainer):
         # What else there is of the batch is let go of, before the backward pass needs the memory.
         seen = []
         for camera, (picture, splats) in enumerate(zip(shown, batch.shard)):
-            if self.density.watches(picture.scale):
+            if self._watches(picture.scale):
                 leaf = batch.means2d_abs[camera] if batch.means2d_abs else splats.means2d
                 seen.append(Seen(splats.gaussian_ids, leaf, (splats.width, splats.height)))
         return loss, seen, rows

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 from typing import Any, NamedTuple
 
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor
 
 from .. import _C, io
 from ..arguments import camera_arguments
-from ..density import make_density
+from ..density import FixedDensity, GradientDensity, GradientOptions, MonteCarloDensity, MonteCarloOptions
 from ..distributed.ranks import ALONE, Ranks
 from ..effects import Effects
 from ..filters import apply_3d_filter, compute_3d_filter
@@ -21,7 +22,7 @@ from ..settings import GaussianRasterizationSettings
 from .captures import WHITE
 from .extent import extent_of
 from .health import check_left, check_visible, drop_broken
-from .model import gaussians_at, random_points, render
+from .model import random_points, render
 from .options import BACKGROUNDS, RANDOM_BACKGROUND, TrainingOptions
 from .pictures import Pictures
 from .placement import points_in_view
@@ -92,7 +93,7 @@ class Trainer:
         groups = [{"params": [getattr(gaussians, name)], "lr": self.rates[name]} for name in Gaussians._fields]
         groups[-1] |= {"head": 1, "head_lr": options.color_rate}  # the constant
         self.optimizer = FusedAdam(groups, eps=ADAM_EPS)
-        self.density = make_density(options, gaussians, self.optimizer, self.extent, background == WHITE, ranks=ranks)
+        self.density = make_density(options, gaussians, self.optimizer, self.extent, background == WHITE, ranks)
         self.generator = torch.Generator(self.device).manual_seed(options.seed + 1)
         self.progress = Progress(options.iterations if options.seconds == 0 else None, options.seconds)
         self.order = PictureOrder(len(pictures.views), options)
@@ -147,7 +148,7 @@ class Trainer:
         check_visible(self)
 
     def keep(self, kept: Tensor) -> None:
-        """Takes away all Gaussians but those of the mask (P,). Collective; not before the first step."""
+        """Takes away all Gaussians but those of the mask (P,). Collective."""
         self.density.keep(kept)
         self._rebalance()
         if self.filter_3d is not None:
@@ -209,7 +210,7 @@ class Trainer:
         """The same, bit for bit, without what autograd costs the host."""
         (shown,) = self._next()
         gaussians, density = self.gaussians, self.density
-        columns = density.columns if density.watches(shown.scale) else 0
+        columns = density.columns if self._watches(shown.scale) else 0
         truth = self.pictures.target(shown.scale, shown.view, shown.background)
         loss, image, radii, gradients = _picture_gradients(
             *gaussians,
@@ -223,7 +224,7 @@ class Trainer:
         for field, gradient in zip(gaussians, gradients):
             field.grad = gradient
         if columns:
-            density.observe(gradients[-1], radii)
+            density.observe_gradients(gradients[-1], radii)
         self.last = image, truth
         return loss, radii > 0 if self.options.sparse_adam else None
 
@@ -241,7 +242,7 @@ class Trainer:
         gaussians = self.gaussians.arguments()
         losses, seen = [], []
         for scale, view, settings, background in self._next():
-            leaf = self.density.leaf(scale)
+            leaf = self.density.leaf() if self._watches(scale) else None
             image, radii = render(gaussians, settings, leaf, options.supersampling)
             truth = self.pictures.target(scale, view, background)
             losses.append(l1_ssim(image, truth, options.ssim_weight))
@@ -259,8 +260,12 @@ class Trainer:
     def _observe(self, seen: list[tuple[Tensor | None, Tensor]]) -> None:
         """Lets density control look at the gradients of a step."""
         for leaf, radii in seen:
-            if leaf is not None:
-                self.density.observe(leaf.grad, radii)
+            self.density.observe(leaf, radii)
+
+    def _watches(self, scale: int) -> bool:
+        """Whether density control sees the gradients of pictures of this scale."""
+        options = self.options
+        return self.density.watches and (options.gradient_scales != "finest" or scale == min(options.scales))
 
     def _rebalance(self) -> None:
         """Called when the number of Gaussians has changed; there is nothing to do in one process."""
@@ -340,6 +345,26 @@ class Trainer:
         self.dropped = state.get("dropped", 0)
 
 
+def make_density(
+    options: TrainingOptions,
+    gaussians: Gaussians,
+    optimizer: torch.optim.Optimizer,
+    extent: float,
+    white_background: bool = False,
+    ranks: Ranks = ALONE,
+) -> FixedDensity:
+    """The density control that `options.density` names, with what the options say about it."""
+    common = {"seed": options.seed, "ranks": ranks}
+    if options.density == "none":
+        return FixedDensity(gaussians, optimizer, **common)
+    kind = MonteCarloOptions if options.density == "mcmc" else GradientOptions
+    known = vars(options) | {"absolute": options.density == "absgrad", "white_background": white_background}
+    chosen = kind(**{field.name: known[field.name] for field in fields(kind)})
+    if options.density == "mcmc":
+        return MonteCarloDensity(gaussians, optimizer, chosen, **common)
+    return GradientDensity(gaussians, optimizer, extent, chosen, **common)
+
+
 def starting_gaussians(
     options: TrainingOptions, points: tuple[Tensor, Tensor] | None, views: list[io.View] | None = None
 ) -> Gaussians:
@@ -368,7 +393,7 @@ def starting_gaussians(
             means, colors = means[rows], colors[rows]
     if len(means) < 2:
         raise io.SceneError(f"training needs at least 2 points to start from, got {len(means)}")
-    return gaussians_at(means, colors, options.sh_degree, options.initial_opacity, options.initial_scale)
+    return Gaussians.from_points(means, colors, options.sh_degree, options.initial_opacity, options.initial_scale)
 
 
 def background_of(options: TrainingOptions, convention: tuple[float, float, float]) -> tuple | None:
