@@ -12,9 +12,9 @@ PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", "
 class PictureFiles:
     """The pictures of a folder, by the names that a file of cameras has for them.
 
-    Such a file may come from another system, and may be older than its pictures. Where there is no file of exactly this
-    name, these are the same: "/" and the backslash; lower case and upper case; the spellings of one letter in Unicode;
-    a name without its suffix, and with that of any picture format; and of absolute names, what of their end is there.
+    The file of cameras may come from another system. Where no picture has exactly the name in it, a name also fits
+    with the backslash for "/", in another case, in another Unicode spelling of its letters, and with the suffix of
+    another picture format or none. Of an absolute name, the end is enough.
     """
 
     def __init__(self, folder: Path):

@@ -5,10 +5,10 @@ A pinhole maps a point (x, y, z) in front of the camera to (a, b) = (x/z, y/z). 
 that spans [0, width] x [0, height]. The formulas are those of OpenCV and COLMAP
 (https://colmap.github.io/cameras.html).
 
-A photograph becomes that of a pinhole by one evaluation of the same map for each pixel: it says where in the photograph
-the colour of the pixel is. The map is never inverted. The pinhole keeps focal lengths and principal point, so that the
-middle of the picture stays as it is, and has the largest rectangle about the principal point whose pixels all are in
-the photograph.
+The same map makes the picture of a pinhole: for every pixel of the pinhole it gives the position in the photograph that
+has the colour. So the map is never inverted. The pinhole keeps focal lengths and principal point; the middle of the
+picture stays as it is. Its picture is the largest rectangle about the principal point whose pixels are all in the
+photograph.
 """
 
 from __future__ import annotations
@@ -186,10 +186,10 @@ def _end_of(lens: Lens, farthest: float) -> float:
 def without_lens(rgba: Tensor, view: io.View, lens: Lens) -> tuple[io.View, Tensor]:
     """The picture of the pinhole that `window_of` finds, and its view.
 
-    Samples of the photograph are interpolated between its pixels, at places that are right to 1e-3 px. Where neighbours
-    of the pinhole are farther apart in the photograph than a pixel, the mean is taken over the area between them, and
-    colours count by their alpha. The numbers are those of the file (in general not linear in the light), as those of
-    all reduced pictures are.
+    The photograph is interpolated between its pixels, at positions that are right to 1e-3 px. Where neighbours of the
+    pinhole are farther apart in the photograph than a pixel, the mean is taken over the area between them, and colours
+    count by their alpha. The numbers are those of the file (in general not linear in the light), as those of all
+    reduced pictures are.
 
     Args:
         rgba: (H, W, 4) uint8 of straight alpha; the result is on its device.
@@ -220,11 +220,11 @@ def without_lens(rgba: Tensor, view: io.View, lens: Lens) -> tuple[io.View, Tens
 
 
 def _averages(planes: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Means of planes (1, C, H, W) around places (u, v) in their pixels, (h + 2, w + 2) each; (C, h, w).
+    """Means of planes (1, C, H, W) around positions (u, v) in their pixels, (h + 2, w + 2) each; (C, h, w).
 
-    A pixel of the photograph is a mean over its own area already. Where neighbouring places are s > 1 pixels apart, the
-    mean over s pixels has the variance s^2 / 12 and not 1 / 12; a further mean over sqrt(s^2 - 1) pixels makes up for
-    the difference. It vanishes smoothly where s falls to 1.
+    Where neighbouring positions are s > 1 pixels apart, the mean over an area s pixels wide is wanted. A pixel is a
+    mean over its own width already. In variances, s^2 / 12 is wanted and 1 / 12 is there; a mean over sqrt(s^2 - 1)
+    pixels adds what is missing. This width falls to zero smoothly where s falls to 1.
     """
     inner = slice(1, -1)
     along_x = [(of[inner, 2:] - of[inner, :-2]) / 2 for of in (u, v)]
@@ -239,6 +239,6 @@ def _averages(planes: Tensor, u: Tensor, v: Tensor) -> Tensor:
             dx, dy = (((k + 0.5) / samples - 0.5) * width for k, width in zip((i, j), widths))
             moved = (of[inner, inner] + dx * x + dy * y for of, x, y in zip((u, v), along_x, along_y))
             # grid_sample has a picture span [-1, 1].
-            places = torch.stack([2 * of / length - 1 for of, length in zip(moved, size)], 2)
-            total = total + functional.grid_sample(planes, places[None], "bilinear", "border", align_corners=False)
+            positions = torch.stack([2 * of / length - 1 for of, length in zip(moved, size)], 2)
+            total = total + functional.grid_sample(planes, positions[None], "bilinear", "border", align_corners=False)
     return total[0] / samples**2

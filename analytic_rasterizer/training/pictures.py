@@ -69,17 +69,16 @@ def load_pictures(
 ) -> Pictures:
     """Reads photographs and reduces them.
 
-    A picture of a camera with a lens is resampled to that of a pinhole, see `lenses.without_lens`. A picture is cut
-    about its centre so that all scales see the same, and where it is not of the size that its view states, the view is
-    scaled.
+    A picture of a camera with a lens is resampled to that of a pinhole, see `lenses.without_lens`. All pictures are cut
+    about their centres, so that all scales show the same. Views are scaled to the sizes of their pictures.
 
     Args:
         background: Behind pictures with alpha, 0 to 1; None: keep alpha.
         downsampling: As in `TrainingOptions`.
         on_host: Keep colours in pinned memory of the host, from where each comes when it is asked for.
 
-    Warns of pictures that EXIF says to turn, where their size does not tell whether that was done: they are taken as
-    they are stored.
+    Warns of pictures that EXIF says to turn, unless their sizes show that they fit their cameras as they are stored.
+    They are not turned.
 
     Raises:
         io.SceneError: A picture that cannot be read, holds numbers that are not finite, or is too small for the scales.
@@ -108,8 +107,8 @@ def load_pictures(
     if to_turn:
         named = ", ".join(str(path) for path in to_turn[:NAMED])
         warnings.warn(
-            f"EXIF says to turn or mirror {len(to_turn)} pictures, which are taken as they are stored, as COLMAP does; "
-            f"if they were stored so after their cameras were found, these do not fit: {named}"
+            f"EXIF says to turn or mirror {len(to_turn)} pictures, which are used as they are stored, as COLMAP does; "
+            f"cameras that were found for the turned pictures do not fit them: {named}"
             + (", .." if len(to_turn) > NAMED else ""),
             stacklevel=2,
         )

@@ -1,4 +1,4 @@
-"""Where a capture is in the world: what is taken off its coordinates, and what its cameras look at."""
+"""The position of a capture in the world: the offset of its coordinates, and the region that its cameras look at."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from .extent import ROUNDING, places_of
 # Of the distance from zero over the size of a capture. Below, float32 holds positions to 4e-6 of the size, and the
 # smallest steps of a training still move them.
 FARTHEST = 64
-NEAREST_DEPTH, FARTHEST_DEPTH = 0.25, 4.0  # of random points, in depths of what cameras look at
-# How far a place can be that cameras look at, and how far it is where there is none: in distances from their mean.
+NEAREST_DEPTH, FARTHEST_DEPTH = 0.25, 4.0  # of random points, in depths of the focus
+# Depths of a focus, in distances of the cameras from their mean: the largest, and the one of cameras without a focus.
 FARTHEST_FOCUS, DEPTH_WITHOUT_FOCUS = 100, 10
 
 
@@ -40,8 +40,8 @@ def offset_of(views: list[io.View], points: Tensor | None) -> tuple[float, float
 def points_in_view(views: list[io.View], count: int, seed: int) -> tuple[Tensor, Tensor]:
     """Random positions (count, 3) in front of the cameras, float32, and grey, (count, 3) of colours in [0, 1].
 
-    Each is in a random pixel of a random view, at a depth between NEAREST_DEPTH and FARTHEST_DEPTH of what the cameras
-    look at, see `depth_of_focus`, uniform in its logarithm.
+    Each is in a random pixel of a random view. Its depth is between NEAREST_DEPTH and FARTHEST_DEPTH times
+    `depth_of_focus`, uniform in its logarithm.
     """
     c2w = torch.linalg.inv(torch.stack([view.w2c for view in views]))
     depth = depth_of_focus(c2w[:, :3, 3], c2w[:, :3, 2])
@@ -61,11 +61,10 @@ def points_in_view(views: list[io.View], count: int, seed: int) -> tuple[Tensor,
 
 
 def depth_of_focus(centers: Tensor, axes: Tensor) -> float:
-    """How far what the cameras look at is in front of them, world units: the median of all.
+    """The median depth of the focus, the point nearest to all optical axes, in front of the cameras. World units.
 
-    It is the place nearest to all optical axes. Where these are parallel, or meet behind the cameras, there is none;
-    then the depth is DEPTH_WITHOUT_FOCUS times the distance of the cameras from their mean, and 1 where they are at one
-    place: then every depth looks the same.
+    Cameras whose axes are parallel, or meet behind them, have no focus. For them the depth is DEPTH_WITHOUT_FOCUS times
+    the distance of the cameras from their mean. For cameras at one position it is 1: they see no depth.
 
     Args:
         centers, axes: (N, 3) float64, of unit length.
