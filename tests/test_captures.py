@@ -1110,3 +1110,20 @@ def test_the_pictures_of_a_lens_are_those_of_its_pinhole(tmp_path):
     # Half a pixel to the side it is far from that.
     beside = draw_picture(replace(found, cx=found.cx + 0.5), opaque=True)
     assert (resampled[..., :3].double() - torch.from_numpy(beside)).square().mean() > 4 * (255 * error).square().mean()
+
+
+def test_random_points_of_a_far_nerf_synthetic_scene_are_where_it_is(tmp_path):
+    """The cube is about the offset, which is then where the cameras look, to a twentieth of their distance."""
+    place = (500123.46, 4200456.78, 99.9)
+    moved_views = [replace(view.in_frame(tuple(-number for number in place)), offset=None) for view in circle(10)]
+    write_nerf_synthetic(tmp_path, circle(10), circle(3))
+    for split, views in (("train", moved_views), ("test", moved_views[:3])):
+        path = tmp_path / f"transforms_{split}.json"
+        content = json.loads(path.read_text())
+        for frame, view in zip(content["frames"], views):
+            frame["transform_matrix"] = opengl_pose(view)
+        path.write_text(json.dumps(content))
+    found = training.load_capture(tmp_path)
+    assert found.offset == (500123.5, 4200456.8, 99.9) and not found.starts_in_view
+    for item, expected in zip(found.train, circle(10)):
+        torch.testing.assert_close(item.view.w2c, expected.w2c, rtol=0, atol=0.1)
