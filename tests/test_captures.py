@@ -810,7 +810,7 @@ FOUND = {
     ),
     "a pinhole transforms.json beside a fisheye": (
         lambda f: [write(f, "OPENCV_FISHEYE"), beside(f)],
-        {"notes": "cameras are those of transforms.json; --cameras takes sparse/0 instead"},
+        {"notes": "passed over: .*sparse/0/cameras: camera 1 is OPENCV_FISHEYE"},
     ),
     "two descriptions of one lens": (
         lambda f: [write(f, "OPENCV", [0.1, 0, 0, 0]), beside(f, k1=0.1)],
@@ -818,7 +818,7 @@ FOUND = {
     ),
     "a broken transforms.json beside pinholes": (
         lambda f: [write(f), (f / "transforms.json").write_text("{")],
-        {"notes": "cameras are those of sparse/0; --cameras takes transforms.json instead"},
+        {"notes": "passed over: .*transforms.json: not valid JSON"},
     ),
     "a fisheye in both": (
         lambda f: [write(f, "OPENCV_FISHEYE"), beside(f, camera_model="OPENCV_FISHEYE")],

@@ -109,29 +109,27 @@ def read_cameras(folder: Path, images: str, test_every: int, cameras: str | None
             f"{folder}: expected transforms_train.json, metadata.json, transforms.json, or COLMAP's cameras and images "
             f"(.bin or .txt) in sparse/0{_elsewhere(folder)}"
         )
-    if len(places) == 1:
-        capture, others = read(places[0]), []
-        chosen = places[0]
-    else:
-        found, errors = {}, {}
-        for place in places:
-            try:
-                found[place] = read(place)
+    found, passed_over = {}, {}
+    for place in places:
+        try:
+            found[place] = read(place)
+            if len(places) > 1:
                 check_capture(folder, found[place])
-            except io.SceneError as error:
-                found.pop(place, None)
-                errors[place] = error
-        if not found:
-            raise errors[places[0]]
-        plain = (place for place, its in found.items() if all(item.lens is None for item in (*its.train, *its.test)))
-        chosen = next(plain, next(iter(found)))
-        capture, others = found[chosen], [place for place in places if place != chosen]
-    models = [model for model in _models_beside(chosen) if model != chosen] if chosen.is_dir() else []
-    names = [str(place.relative_to(folder)) for place in (*others, *models)]
-    if not names:
-        return capture
-    note = f"cameras are those of {chosen.relative_to(folder)}; --cameras takes {' or '.join(names)} instead"
-    return capture._replace(notes=(*capture.notes, note))
+        except io.SceneError as error:
+            found.pop(place, None)
+            passed_over[place] = error
+    if not found:
+        raise passed_over[places[0]]
+    plain = (place for place, its in found.items() if all(item.lens is None for item in (*its.train, *its.test)))
+    chosen = next(plain, next(iter(found)))
+    others = [place for place in (*found, *_models_beside(chosen)) if place != chosen]
+    notes = []
+    if others or passed_over:
+        offered = " or ".join(str(place.relative_to(folder)) for place in others)
+        instead = f"; --cameras takes {offered} instead" if others else ""
+        notes.append(f"cameras are those of {chosen.relative_to(folder)}{instead}")
+    notes += [f"passed over: {error}" for error in passed_over.values()]
+    return found[chosen]._replace(notes=(*found[chosen].notes, *notes))
 
 
 def _without_missing(capture: Capture) -> Capture:
@@ -163,7 +161,7 @@ def _places(folder: Path) -> list[Path]:
 
 def _models_beside(model: Path) -> list[Path]:
     """The reconstructions of COLMAP's mapper, which writes one for each part that it could not join: 0, 1, 2, .."""
-    return _models_in(model.parent) if model.name.isdecimal() else [model]
+    return _models_in(model.parent) if model.is_dir() and model.name.isdecimal() else [model]
 
 
 def _models_in(folder: Path) -> list[Path]:
