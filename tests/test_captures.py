@@ -1113,7 +1113,7 @@ def test_the_pictures_of_a_lens_are_those_of_its_pinhole(tmp_path):
 
 
 def test_random_points_of_a_far_nerf_synthetic_scene_are_where_it_is(tmp_path):
-    """The cube is about the offset, which is then where the cameras look, to a twentieth of their distance."""
+    """The cube is where the cameras look, and there the offset is, to a twentieth of their distance."""
     place = (500123.46, 4200456.78, 99.9)
     moved_views = [replace(view.in_frame(tuple(-number for number in place)), offset=None) for view in circle(10)]
     write_nerf_synthetic(tmp_path, circle(10), circle(3))
@@ -1125,5 +1125,10 @@ def test_random_points_of_a_far_nerf_synthetic_scene_are_where_it_is(tmp_path):
         path.write_text(json.dumps(content))
     found = training.load_capture(tmp_path)
     assert found.offset == (500123.5, 4200456.8, 99.9) and not found.starts_in_view
+    options = training.TrainingOptions(random_points=50)
+    start, _ = run.first_gaussians(options, found, None)
+    expected = g.random_points(50, 0)[0].double() + torch.tensor(place, dtype=torch.float64)
+    in_world = start.means.double() + torch.tensor(found.offset, dtype=torch.float64)
+    torch.testing.assert_close(in_world, expected, rtol=0, atol=1e-5)
     for item, expected in zip(found.train, circle(10)):
         torch.testing.assert_close(item.view.w2c, expected.w2c, rtol=0, atol=0.1)

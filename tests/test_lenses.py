@@ -136,7 +136,7 @@ def test_the_middle_stays_as_it_is():
         assert (found.cx, found.cy) == (150.5 - window.left, 100.5 - window.top)
 
 
-def test_smooth_pictures_are_those_of_the_pinhole():
+def test_smooth_pictures_are_those_of_the_pinhole(device):
     """A picture that is a function of the direction, taken through the lens and without it; by bilinear interpolation
     of a function with curvature c it may be c / 8 off in each direction, and by two roundings."""
 
@@ -158,10 +158,10 @@ def test_smooth_pictures_are_those_of_the_pinhole():
         photograph[..., :3] = torch.from_numpy(colors(np.where(known, a, 0), np.where(known, b, 0)).round()).to(
             torch.uint8
         )
-        found, resampled = lenses.without_lens(photograph, view, lens)
+        found, resampled = lenses.without_lens(photograph.to(device), view, lens)
         y, x = np.mgrid[0.5 : found.height, 0.5 : found.width]
         expected = colors((x - found.cx) / found.fx, (y - found.cy) / found.fy)
-        error = np.abs(resampled[1:-1, 1:-1, :3].numpy() - expected[1:-1, 1:-1])
+        error = np.abs(resampled[1:-1, 1:-1, :3].cpu().numpy() - expected[1:-1, 1:-1])
         assert error.max() < 1 + 2 * 127 * (11 / 160) ** 2 / 8 * 1.6, name
 
 

@@ -38,6 +38,7 @@ from .files import (
 )
 from .options import TrainingOptions
 from .pictures import Pictures, load_pictures
+from .placement import focus_of
 from .schedule import Clock
 from .sharded import ShardedTrainer, shards_of
 from .trainer import Trainer, background_of, starting_gaussians
@@ -377,8 +378,13 @@ def first_gaussians(options: TrainingOptions, capture: Capture, points) -> tuple
     if points is not None:
         positions, colors = io.load_points(points)
         found = (positions.double() - offset).float(), colors
-    views = [item.view for item in capture.train] if capture.starts_in_view else None
-    return starting_gaussians(options, found, views), None if found is None else len(found[0])
+    views = [item.view for item in capture.train]
+    start = starting_gaussians(options, found, views if capture.starts_in_view else None)
+    if found is None and not capture.starts_in_view and capture.offset is not None:
+        # The cube of NeRF-synthetic scenes is about the world's zero, which is far from this one.
+        focus, _ = focus_of(views)
+        start = start._replace(means=start.means + (0.0 if focus is None else focus.float()))
+    return start, None if found is None else len(found[0])
 
 
 @contextmanager
