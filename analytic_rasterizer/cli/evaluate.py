@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from .. import io
 from ..analysis.tables import format_table
@@ -79,6 +79,7 @@ class Protocol(NamedTuple):
     images: str
     test_every: int
     scales: tuple[int, ...]
+    reading: dict[str, Any]  # further arguments of load_capture
     options: TrainingOptions | None  # of the training, where it was one of this package
 
 
@@ -92,7 +93,9 @@ def protocol_of(found: io.FoundScene, args) -> Protocol:
     if found.options is not None:
         try:
             source, options = found.options["source"], TrainingOptions.from_dict(found.options["options"])
-            usual = Protocol(source["scene"], source["images"], source["test_every"], options.scales, options)
+            reading = {name: source[name] for name in ("cameras", "lens", "missing") if name in source}
+            named = source["scene"], source["images"], source["test_every"]
+            usual = Protocol(*named, options.scales, reading, options)
         except (ValueError, KeyError, TypeError) as error:
             raise io.SceneError(f"{found.path.parent / OPTIONS}: not what `train` writes ({error})") from None
     else:
@@ -103,7 +106,7 @@ def protocol_of(found: io.FoundScene, args) -> Protocol:
             raise ValueError(f"{found.path} does not name its capture: give --data FOLDER{known}")
         named = Path(cfg_args.images or IMAGES)  # a folder of the capture, and no path that leaves it
         images = str(named) if named.name == str(named) and (Path(args.data) / named).is_dir() else IMAGES
-        usual = Protocol(args.data, images, TEST_PERIOD, scales_of(cfg_args, args.images or images), None)
+        usual = Protocol(args.data, images, TEST_PERIOD, scales_of(cfg_args, args.images or images), {}, None)
     given = {name: getattr(args, name) for name in ("data", "images", "test_every", "scales")}
     chosen = usual._replace(**{name: value for name, value in given.items() if value is not None})
     return chosen._replace(scales=tuple(dict.fromkeys(chosen.scales)))
@@ -124,7 +127,8 @@ def run_on(ranks: Ranks, args) -> None:
     options = protocol.options or TrainingOptions()
     check_scales(protocol.scales)  # raises before the capture is read
     choices = [found.choose_footprint(name) for name in args.footprints or [None]]
-    capture = load_capture(protocol.data, protocol.images, protocol.test_every)
+    offset = found.metadata.offset or (0.0, 0.0, 0.0)  # the scene's frame, also where the capture would choose another
+    capture = load_capture(protocol.data, protocol.images, protocol.test_every, **protocol.reading, offset=offset)
     if not capture.test:
         raise io.SceneError(f"{protocol.data}: there are no test pictures")
     background = background_for(found, protocol, capture, args.background)
@@ -133,7 +137,8 @@ def run_on(ranks: Ranks, args) -> None:
         capture.test, protocol.scales, background, args.device, options.downsampling, on_host=ranks.world > 1
     )
     said = [] if protocol.options else differences(found, protocol, capture, background)
-    tell(*said, *(f"footprint {choice.footprint}: {choice.reason}" for choice in choices))
+    chosen = (f"footprint {choice.footprint}: {choice.reason}" for choice in choices)
+    tell(*capture.notes, *said, *chosen)
     lpips = None
     if args.lpips != "none":
         try:
@@ -151,6 +156,7 @@ def run_on(ranks: Ranks, args) -> None:
     if ranks.is_first:
         views = [view.name for view in pictures.views]
         written = {"scene": str(found.path), "data": str(protocol.data), "views": views}
+        written["resampled"] = sum(item.lens is not None for item in capture.test)
         written |= {"supersampling": common["supersampling"], "results": results}
         write_json(out / "evaluation.json", written)
         print(format_results(results, protocol.scales))
