@@ -243,6 +243,19 @@ def test_size_of_the_pictures_of_a_training_of_3dgs(images, resolution, size):
     assert all(abs(a - b) <= 1 for a, b in zip(found, size)), found  # 3DGS rounds down what division leaves
 
 
+def test_views_are_in_the_frame_of_the_scene(tmp_path):
+    """Of a capture in map coordinates the scene has an offset; views say theirs, or are in the world."""
+    offset = (500000.0, 4200000.0, 100.0)
+    io.save_scene(tmp_path / "scene.ply", make_scene(), io.SceneMetadata(footprint="moment", offset=offset))
+    here = make_views()
+    io.save_views(tmp_path / "cameras.json", [replace(view, offset=offset) for view in here])
+    io.save_views(tmp_path / "world.json", [replace(view, offset=offset).in_frame(None) for view in here])
+    found = io.find_scene(tmp_path / "scene.ply")
+    for path in (None, tmp_path / "world.json"):
+        for view, expected in zip(found.load_views(path), here):
+            torch.testing.assert_close(view.w2c, expected.w2c, rtol=0, atol=1e-8)  # float64 at 4.2e6: 1e-9
+
+
 def test_the_last_iteration_is_a_number(tmp_path):
     names = [f"MODEL/point_cloud/iteration_{n}/point_cloud.ply" for n in (7000, 30000, 9)]
     write(tmp_path, dict.fromkeys(names))

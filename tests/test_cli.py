@@ -319,7 +319,7 @@ def test_interrupt_of_a_process_is_quiet(files):
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + DEADLINE
-    while not (files / "out" / "0.png").exists() and time.monotonic() < deadline:
+    while not (files / "out" / "0.png").exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=DEADLINE)

@@ -15,7 +15,6 @@ from ..training.captures import IMAGES, TEST_PERIOD, Capture
 from ..training.evaluation import LPIPS_WEIGHTS, MEASURES
 from ..training.files import OPTIONS, SCENE, write_json
 from ..training.options import check_scales
-from ..training.run import capture_arguments
 from ..training.trainer import background_of
 from .arguments import (
     add_machine_options,
@@ -77,8 +76,10 @@ class Protocol(NamedTuple):
     """What a scene is compared with, and how."""
 
     data: str  # folder of the capture
-    arguments: dict[str, Any]  # of `load_capture` beside it
+    images: str
+    test_every: int
     scales: tuple[int, ...]
+    reading: dict[str, Any]  # further arguments of load_capture
     options: TrainingOptions | None  # of the training, where it was one of this package
 
 
@@ -92,7 +93,9 @@ def protocol_of(found: io.FoundScene, args) -> Protocol:
     if found.options is not None:
         try:
             source, options = found.options["source"], TrainingOptions.from_dict(found.options["options"])
-            usual = Protocol(source["scene"], capture_arguments(source), options.scales, options)
+            reading = {name: source[name] for name in ("cameras", "lens", "missing") if name in source}
+            named = source["scene"], source["images"], source["test_every"]
+            usual = Protocol(*named, options.scales, reading, options)
         except (ValueError, KeyError, TypeError) as error:
             raise io.SceneError(f"{found.path.parent / OPTIONS}: not what `train` writes ({error})") from None
     else:
@@ -103,13 +106,10 @@ def protocol_of(found: io.FoundScene, args) -> Protocol:
             raise ValueError(f"{found.path} does not name its capture: give --data FOLDER{known}")
         named = Path(cfg_args.images or IMAGES)  # a folder of the capture, and no path that leaves it
         images = str(named) if named.name == str(named) and (Path(args.data) / named).is_dir() else IMAGES
-        arguments = {"images": images, "test_every": TEST_PERIOD}
-        usual = Protocol(args.data, arguments, scales_of(cfg_args, args.images or images), None)
-    given = {name: getattr(args, name) for name in ("images", "test_every") if getattr(args, name) is not None}
-    # Positions of the scene decide what is taken off those of the capture.
-    given["offset"] = found.metadata.offset or (0.0, 0.0, 0.0)
-    scales = tuple(dict.fromkeys(args.scales or usual.scales))
-    return usual._replace(data=args.data or usual.data, arguments=usual.arguments | given, scales=scales)
+        usual = Protocol(args.data, images, TEST_PERIOD, scales_of(cfg_args, args.images or images), {}, None)
+    given = {name: getattr(args, name) for name in ("data", "images", "test_every", "scales")}
+    chosen = usual._replace(**{name: value for name, value in given.items() if value is not None})
+    return chosen._replace(scales=tuple(dict.fromkeys(chosen.scales)))
 
 
 def scales_of(cfg_args: CfgArgs, images: str) -> tuple[int, ...]:
@@ -127,7 +127,8 @@ def run_on(ranks: Ranks, args) -> None:
     options = protocol.options or TrainingOptions()
     check_scales(protocol.scales)  # raises before the capture is read
     choices = [found.choose_footprint(name) for name in args.footprints or [None]]
-    capture = load_capture(protocol.data, **protocol.arguments)
+    offset = found.metadata.offset or (0.0, 0.0, 0.0)  # the scene's frame, also where the capture would choose another
+    capture = load_capture(protocol.data, protocol.images, protocol.test_every, **protocol.reading, offset=offset)
     if not capture.test:
         raise io.SceneError(f"{protocol.data}: there are no test pictures")
     background = background_for(found, protocol, capture, args.background)
@@ -136,7 +137,8 @@ def run_on(ranks: Ranks, args) -> None:
         capture.test, protocol.scales, background, args.device, options.downsampling, on_host=ranks.world > 1
     )
     said = [] if protocol.options else differences(found, protocol, capture, background)
-    tell(*capture.notes, *said, *(f"footprint {choice.footprint}: {choice.reason}" for choice in choices))
+    chosen = (f"footprint {choice.footprint}: {choice.reason}" for choice in choices)
+    tell(*capture.notes, *said, *chosen)
     lpips = None
     if args.lpips != "none":
         try:
@@ -153,8 +155,8 @@ def run_on(ranks: Ranks, args) -> None:
             save_pictures(pictures_folder, scene, pictures, footprint, args.pictures, **common)
     if ranks.is_first:
         views = [view.name for view in pictures.views]
-        resampled = sum(item.lens is not None for item in capture.test)
-        written = {"scene": str(found.path), "data": str(protocol.data), "views": views, "resampled": resampled}
+        written = {"scene": str(found.path), "data": str(protocol.data), "views": views}
+        written["resampled"] = sum(item.lens is not None for item in capture.test)
         written |= {"supersampling": common["supersampling"], "results": results}
         write_json(out / "evaluation.json", written)
         print(format_results(results, protocol.scales))
@@ -181,7 +183,7 @@ def differences(found: io.FoundScene, protocol: Protocol, capture: Capture, back
         said.append("cfg_args: eval=False: the training saw these test pictures")
     view = capture.test[0].view
     trained, _ = found.cfg_args.trained_size(view.width, view.height)
-    tested = view.width / CfgArgs(images=protocol.arguments["images"]).images_reduction / min(protocol.scales)
+    tested = view.width / CfgArgs(images=protocol.images).images_reduction / min(protocol.scales)
     if abs(tested - trained) > SIMILAR * trained:
         said.append(f"cfg_args: the training's pictures were {trained} px wide, these are {tested:.0f} (--scales)")
     return said

@@ -120,9 +120,8 @@ class FoundScene:
         return min(self.options["options"]["scales"])
 
     def load_views(self, path=None, size: tuple[int, int] | None = None, trained_size: bool = True) -> list[View]:
-        """The views of a file, by default of `cameras`, relative to the offset of the scene.
-
-        Those of `cameras` have the size of the training's pictures.
+        """The views of a file, by default of `cameras`, in the frame of the scene. Those of `cameras` have the size of
+        the training's pictures.
 
         Args:
             path: Another file of views.
@@ -136,7 +135,8 @@ class FoundScene:
             where = self.path.parent if self.model is None else self.model
             raise SceneError(f"{self.path}: no views: there is no {CAMERAS} in {where}; give a file of views (--views)")
         views = load_views(self.cameras if path is None else path, size)
-        views = [view.in_frame(self.metadata.offset) for view in views]
+        if self.path.suffix.lower() != ".splat":  # which holds no offset, and is beside views of its own frame
+            views = [view.in_frame(self.metadata.offset) for view in views]
         own = path is None or self.is_cameras(path)
         return [self.trained_view(view) for view in views] if own and trained_size else views
 
