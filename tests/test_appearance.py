@@ -455,6 +455,26 @@ def test_pareto_measures_some_views_of_a_model(model, tmp_path, capsys):
     assert "4 of the views are measured (--limit-views)" in error and "measure what bake makes of it" in error
 
 
+def test_views_are_those_of_a_scene_far_from_zero(tmp_path):
+    """Cameras of the world, or relative to the offset of the scene or to another, show the same."""
+    offset, other = (5e5, 4.2e6, 300.0), (5e5, 4.2e6, 0.0)
+    write(tmp_path, {"a.ply": {"footprint": "box", "offset": offset}})
+    near = [replace(view, offset=offset) for view in make_views()]
+    pictures = []
+    for name, to in (("near", offset), ("other", other), ("world", None)):
+        io.save_views(tmp_path / f"{name}.json", [view.in_frame(to) for view in near])
+        views = ["--views", str(tmp_path / f"{name}.json"), "--out", str(tmp_path / name)]
+        assert run(["render", str(tmp_path / "a.ply"), *views]) == 0
+        pictures.append(picture(tmp_path / name / "right.png"))
+    expected = shown(make_scene(), make_views()[1], "box", io.BLACK)
+    assert expected.max() > 100 and np.abs(pictures[0] - expected).max() <= 1
+    for found in pictures[1:]:
+        assert np.abs(found - pictures[0]).max() <= 1
+    bake = ["bake", str(tmp_path / "a.ply"), "--footprint", "point", "--views", str(tmp_path / "world.json")]
+    assert run([*bake, "--out", str(tmp_path / "b.spz")]) == 0
+    assert io.read_metadata(tmp_path / "b.spz").offset == offset
+
+
 @pytest.mark.parametrize("cuda", [True, False])
 @pytest.mark.parametrize(
     "arguments",

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -171,3 +172,18 @@ def test_a_scene_beside_a_training_is_tested_as_the_training(tmp_path, capsys):
     io.save_scene(out / "scene.ply", io.load_scene(out / "b.ply"))
     assert cli.main(["evaluate", str(out), *QUIET]) == 0
     assert list(evaluation(out)["results"]) == ["point:dilation=0.3"]
+
+
+def test_a_scene_far_from_zero_is_tested_where_it_lies(photographs, scene, tmp_path):
+    """The capture has coordinates of the world, and the file the positions without an offset, and the offset."""
+    offset = (3e5, 5e6, 100.0)
+    shutil.copytree(photographs / "images", tmp_path / "far" / "images")
+    far = [replace(view.in_frame(tuple(-x for x in offset)), offset=None) for view in circle(9)]
+    points = torch.randn(9, 3, dtype=torch.float64) + torch.tensor(offset, dtype=torch.float64)
+    write_colmap(tmp_path / "far" / "sparse" / "0", far, points, torch.zeros(9, 3, dtype=torch.int32))
+    io.save_scene(tmp_path / "b.ply", io.load_scene(scene), io.SceneMetadata(offset=offset))
+    for file, data in ((scene, photographs), (tmp_path / "b.ply", tmp_path / "far")):
+        assert cli.main(["evaluate", str(file), "--data", str(data), "--pictures", "0", *QUIET]) == 0
+    near, moved = (evaluation(tmp_path / f"{name}_evaluation")["results"] for name in "ab")
+    found = [of["point:dilation=0.3"]["1"]["psnr"] for of in (near, moved)]
+    assert found[0] == pytest.approx(found[1], abs=0.02)

@@ -80,8 +80,9 @@ def run_live(args) -> None:
     """Renders for browsers until interrupted."""
     if args.export:
         raise ValueError("--export writes the page that needs no server: leave out --server")
+    given = None if args.footprint is None else resolve_footprint(args.footprint)  # raises before the scene is read
     found = io.find_scene(args.scene)
-    choice = found.choose_footprint(args.footprint)
+    choice = found.choose_footprint(given)
     use_machine(args)
     io.optional_import("viser", "view")  # raises before the scene is read
     views, said = settle_views(args, found, required=False)
