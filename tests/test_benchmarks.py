@@ -43,7 +43,7 @@ def test_effects(device, small_scene, monkeypatch, capsys):
     """Every row, with numbers in all of its columns."""
     effects = importlib.import_module("effects")
     arguments = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--json", small_scene / "out.json"]
-    options = ["--footprints", "box:samples=4", "--rounds", "1", "--scale", "0.5", "--threads", "1", "--device", device]
+    options = ["--footprints", "box:samples=4", "--rounds", "1", "--scales", "2", "--threads", "1", "--device", device]
     monkeypatch.setattr(sys, "argv", ["effects.py", *map(str, arguments), *options])
     effects.main()
     table = capsys.readouterr().out
@@ -438,7 +438,7 @@ def test_distributed(small_scene):
 
 def test_bands(small_scene):
     """A row for every number of ranks; two of them hold half of the scene each, and the last all of the image."""
-    printed, written = run_on_ranks("bands.py", small_scene, "--times", "3", "--copies", "2", "--scale", "16")
+    printed, written = run_on_ranks("bands.py", small_scene, "--times", "3", "--copies", "2", "--scales", "0.0625")
     assert "in 2 copies: 300\n" in printed
     one, two = (written["results"][ranks] for ranks in ("1", "2"))
     assert min(*one.values(), *two.values()) > 0

@@ -14,14 +14,13 @@ from dataclasses import fields, replace
 import numpy as np
 import pytest
 import torch
-from conftest import ROOT, SHARED, needs_cuda
+from conftest import ROOT, needs_cuda
 from processes import DEADLINE
 
-from analytic_rasterizer import cli, io, optim, render_stages
+from analytic_rasterizer import cli, io, optim
 from analytic_rasterizer.filters import bake_pixel
 from analytic_rasterizer.footprints import resolve_footprint
 from analytic_rasterizer.gaussians import Gaussians
-from analytic_rasterizer.viewer import footprint_of_file
 
 image = pytest.importorskip("PIL.Image", reason="needs the train extra")
 pytest.importorskip("tqdm", reason="needs the train extra")
@@ -31,10 +30,8 @@ pytest.importorskip("gsply", reason="needs the train extra")
 from capture_files import (  # noqa: E402
     circle,
     looking_at_origin,
-    opengl_pose,
     truth_gaussians,
     write_colmap,
-    write_colmap_text,
     write_nerf_synthetic,
     write_pictures,
 )
@@ -45,7 +42,6 @@ from analytic_rasterizer.losses import l1_ssim, ssim  # noqa: E402
 from analytic_rasterizer.training import (  # noqa: E402
     TrainingOptions,
     captures,
-    colmap,
     files,
     pictures,
     schedule,
@@ -54,153 +50,6 @@ from analytic_rasterizer.training import model as g  # noqa: E402
 from analytic_rasterizer.training.evaluation import evaluate, psnr  # noqa: E402
 
 # ------------------------------------------------------------------------------------ captures
-
-
-WRITERS = pytest.mark.parametrize("write", [write_colmap, write_colmap_text])
-
-
-@WRITERS
-@pytest.mark.parametrize("model", [0, 1])
-def test_colmap_files(tmp_path, write, model):
-    views = [
-        io.View(name, 40 + i, 30, 50.0, 50.0 + model, looking_at_origin(0.7 * i), 20.5, 14.0)
-        for i, name in enumerate(["c", "a", "b c"])
-    ]
-    points = torch.randn(5, 3, generator=torch.Generator().manual_seed(0))
-    colors = torch.arange(15).reshape(5, 3)
-    write(tmp_path / "0", views, points, colors, model)
-    assert colmap.is_reconstruction(tmp_path / "0")
-    read = colmap.load_views(tmp_path / "0")
-    assert [name for name, _ in read] == ["a.png", "b c.png", "c.png"]
-    for expected, (_, view) in zip(sorted(views, key=lambda v: v.name), read):
-        assert replace(view, w2c=None) == replace(expected, w2c=None)
-        torch.testing.assert_close(view.w2c, expected.w2c)
-    read_points, read_colors = colmap.load_points(tmp_path / "0")
-    assert torch.equal(read_points, points)
-    torch.testing.assert_close(read_colors, colors / 255)
-
-
-@WRITERS
-def test_colmap_pictures_of_the_same_name_in_several_folders(tmp_path, capsys, write):
-    """Each has a name and a picture of its own in the results."""
-    folders = ["cam2/", "cam1/", "", "cam3/"]
-    views = [replace(v, name=f"{folders[i % 4]}{i // 4:04d}") for i, v in enumerate(circle(12))]
-    points, colors = g.random_points(60, seed=5)
-    write(tmp_path / "scene" / "sparse" / "0", views, points, (255 * colors).to(torch.uint8))
-    for folder in folders:
-        (tmp_path / "scene" / "images" / folder).mkdir(parents=True, exist_ok=True)
-    write_pictures(tmp_path / "scene" / "images", views, opaque=True)
-    read = colmap.load_views(tmp_path / "scene" / "sparse" / "0")
-    assert [name for name, _ in read[:5]] == [*(f"000{i}.png" for i in range(3)), "cam1/0000.png", "cam1/0001.png"]
-    expected = [f"000{i}{end}" for end in ("", "_2", "_3", "_4") for i in range(3)]
-    assert [view.name for _, view in read] == expected
-    for name, view in read:
-        (of_file,) = (v for v in views if f"{v.name}.png" == name)
-        torch.testing.assert_close(view.w2c, of_file.w2c)
-    arguments = ["train", str(tmp_path / "scene"), "--out", str(tmp_path / "out"), "--device", "cpu", "--no-evaluate"]
-    assert cli.main([*arguments, "--iterations", "1", "--sh-degree", "0", "--test-every", "3"]) == 0
-    assert cli.main(["evaluate", str(tmp_path / "out"), "--lpips", "none", "--pictures", "4"]) == 0
-    tested = expected[::3]
-    cameras = io.load_views(tmp_path / "out" / files.CAMERAS)
-    assert [view.name for view in cameras] == [name for name in expected if name not in tested]
-    assert json.loads((tmp_path / "out" / "evaluation.json").read_text())["views"] == tested
-    drawn = (tmp_path / "out" / "evaluation").glob("*.png")
-    assert sorted(path.stem for path in drawn) == [f"moment_samples_4_1_{name}" for name in tested]
-
-
-@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_colmap_files_cut_short(tmp_path, name):
-    view = io.View("a", 40, 30, 50.0, 50.0, looking_at_origin(0.1))
-    write_colmap(tmp_path / "0", [view], torch.zeros(2, 3), torch.zeros(2, 3, dtype=torch.int32))
-    path = tmp_path / "0" / f"{name}.bin"
-    whole = path.read_bytes()
-    for size in range(0, len(whole), 3):
-        path.write_bytes(whole[:size])
-        with pytest.raises(io.SceneError, match=rf"{name}.bin: cut short"):
-            colmap.load_points(tmp_path / "0") if name == "points3D" else colmap.load_views(tmp_path / "0")
-
-
-@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
-def test_colmap_text_cut_short(tmp_path, name):
-    """A last line with words missing, as many as make it useless."""
-    view = io.View("a", 40, 30, 50.0, 50.0, looking_at_origin(0.1))
-    write_colmap_text(tmp_path / "0", [view], torch.zeros(1, 3), torch.zeros(1, 3, dtype=torch.int32))
-    path = tmp_path / "0" / f"{name}.txt"
-    words = path.read_text().splitlines()[1].split()
-    for count in range(1, min(len(words), 7)):
-        path.write_text(" ".join(words[:count]) + "\n")
-        with pytest.raises(io.SceneError, match=r"cut short|cameras must be pinholes"):
-            colmap.load_points(tmp_path / "0") if name == "points3D" else colmap.load_views(tmp_path / "0")
-
-
-@pytest.mark.parametrize(
-    "camera, message",
-    [
-        ("1 PINHOLE 100 80 50 51 49 40 7", "expected 6 numbers of a PINHOLE camera, got 7"),
-        ("1 PINHOLE nan 80 50 51 49 40", "expected width and height in pixels, got nan 80"),
-        ("1 PINHOLE 100.7 80 50 51 49 40", "expected width and height in pixels, got 100.7 80"),
-    ],
-)
-def test_wrong_cameras_of_a_colmap_text(tmp_path, camera, message):
-    view = io.View("a", 40, 30, 50.0, 50.0, looking_at_origin(0.1))
-    write_colmap_text(tmp_path / "0", [view], torch.zeros(1, 3), torch.zeros(1, 3, dtype=torch.int32))
-    (tmp_path / "0" / "cameras.txt").write_text(camera + "\n")
-    with pytest.raises(io.SceneError, match=message):
-        colmap.load_views(tmp_path / "0")
-
-
-@WRITERS
-def test_colmap_cameras_with_distortion(tmp_path, write):
-    view = io.View("a", 40, 30, 50.0, 50.0, looking_at_origin(0.1))
-    write(tmp_path / "0", [view], torch.zeros(2, 3), torch.zeros(2, 3, dtype=torch.int32), model=4)
-    with pytest.raises(io.SceneError, match=r"cameras must be pinholes"):
-        colmap.load_views(tmp_path / "0")
-
-
-@WRITERS
-def test_colmap_poses_that_are_not_finite(tmp_path, write):
-    view = io.View("a", 40, 30, 50.0, 50.0, looking_at_origin(0.1))
-    view.w2c[0, 3] = math.nan
-    write(tmp_path / "0", [view], torch.zeros(2, 3), torch.zeros(2, 3, dtype=torch.int32))
-    with pytest.raises(io.SceneError, match=r"the pose of a.png must be finite"):
-        colmap.load_views(tmp_path / "0")
-
-
-@pytest.mark.parametrize("name, count, points", [("bonsai", 292, 82_641), ("fox", 50, None)])
-def test_capture_is_read_as_it_was_taken(name, count, points):
-    """Points have the colours of the pixels that they project to: cameras, cut and pictures belong together."""
-    folder = SHARED / "data" / name
-    if not folder.exists():
-        pytest.skip("needs the optional ../shared scenes next to the project")
-    capture = training.load_capture(folder)
-    means, colors = capture.points
-    assert len(capture.train) + len(capture.test) == count and len(means) == (points or len(means))
-    item = capture.train[8]
-    view, rgba = pictures.cut(item.files[1], item.view, 16)
-    assert rgba.shape == (view.height, view.width, 4) and view.height % 16 == view.width % 16 == 0
-    stages = render_stages(view.settings(), **point_inputs(means))
-    colors = colors[stages.ids.long()]
-
-    def error(shift) -> float:
-        """Median over the points; those hidden by others are in it too."""
-        x, y = (stages.means2d + torch.tensor(shift)).round().long().unbind(1)
-        inside = (x >= 0) & (x < view.width) & (y >= 0) & (y < view.height)
-        assert inside.sum() > 2000
-        return (rgba[y[inside], x[inside], :3] / 255 - colors[inside]).abs().mean(1).median().item()
-
-    for shift in ([2.0, 0.0], [-2.0, 0.0], [0.0, 2.0], [0.0, -2.0]):
-        assert error([0.0, 0.0]) < 0.85 * error(shift)
-
-
-def point_inputs(means) -> dict:
-    count = len(means)
-    return {
-        "means3D": means,
-        "opacities": torch.ones(count, 1),
-        "colors_precomp": torch.ones(count, 3),
-        "scales": torch.full((count, 3), 1e-3),
-        "rotations": torch.eye(4)[:1].repeat(count, 1),
-    }
 
 
 @pytest.fixture(scope="module")
@@ -220,333 +69,6 @@ def capture(tmp_path_factory):
     write_pictures(folder / "photographs", views, opaque=True)
     write_colmap(folder / "sparse" / "0", views, points, (255 * colors).to(torch.uint8))
     return folder
-
-
-def test_nerf_synthetic_folder(synthetic):
-    found = training.load_capture(synthetic)
-    assert (len(found.train), len(found.test), found.background, found.points) == (10, 3, captures.WHITE, None)
-    for item, expected in zip(found.train, circle(10)):
-        assert item.files == {1: synthetic / "train" / f"{expected.name}.png"}
-        torch.testing.assert_close(item.view.w2c, expected.w2c)
-        assert item.view.fx == pytest.approx(36.0)
-
-
-def test_colmap_folder(capture):
-    found = training.load_capture(capture, "photographs")
-    assert [item.view.name for item in found.test] == ["r_0", "r_8"]
-    assert len(found.train) == 7 and found.background == captures.BLACK and found.points[0].shape == (60, 3)
-    assert len(training.load_capture(capture, "photographs", test_every=0).train) == 9
-
-
-def write_nerfstudio(folder, change=lambda content: None) -> None:
-    views = circle(9, (35, 33))
-    write_pictures(folder / "images", views, opaque=True)
-    frames = [{"file_path": f"images/{v.name}.png", "transform_matrix": opengl_pose(v)} for v in views]
-    content = {"w": 35, "h": 33, "fl_x": 36.0, "fl_y": 36.0, "cx": 17.0, "cy": 16.0, "frames": frames}
-    change(content)
-    (folder / "transforms.json").write_text(json.dumps(content))
-
-
-def test_nerfstudio_folder(tmp_path):
-    # As nerfstudio writes it for pictures without distortion.
-    zeros = {"camera_model": "OPENCV", "k1": 0.0, "k2": 0, "p1": 0.0, "p2": -0.0, "distortion_params": [0.0] * 6}
-    write_nerfstudio(tmp_path, lambda content: content.update(zeros, is_fisheye=False))
-    header = "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty float z\n"
-    header += "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
-    (tmp_path / "sparse_pc.ply").write_text(header + "0 1 2 255 0 51\n3 4 5 0 255 0\n")
-    found = training.load_capture(tmp_path)
-    assert [item.view.name for item in found.test] == ["r_0", "r_8"] and len(found.train) == 7
-    assert found.train[0].view.cx == 17.0
-    points, colors = found.points
-    assert points.tolist() == [[0, 1, 2], [3, 4, 5]]
-    torch.testing.assert_close(colors, torch.tensor([[1.0, 0.0, 0.2], [0.0, 1.0, 0.0]]))
-
-
-def test_nerfstudio_names_its_points(tmp_path):
-    header = (
-        "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
-    )
-    (tmp_path / "sparse_pc.ply").write_text(header + "9 9 9\n")
-    (tmp_path / "points").mkdir()
-    (tmp_path / "points" / "of_colmap.ply").write_text(header + "0 1 2\n")
-    write_nerfstudio(tmp_path, lambda content: content.update(ply_file_path="points/of_colmap.ply"))
-    assert training.load_capture(tmp_path).points[0].tolist() == [[0, 1, 2]]
-    for wrong in ("points/others.ply", 3):
-        write_nerfstudio(tmp_path, lambda content, wrong=wrong: content.update(ply_file_path=wrong))
-        with pytest.raises(io.SceneError, match=f"ply_file_path must name a file beside it, got {wrong!r}"):
-            training.load_capture(tmp_path)
-
-
-@pytest.mark.parametrize(
-    "lists, train, test",
-    [
-        ({"train": (1, 2, 3), "val": (4, 5), "test": (0, 8)}, (1, 2, 3), (0, 8)),
-        ({"train": (7, 6, 5), "val": (0,), "test": ()}, (5, 6, 7), (0,)),
-        ({"val": (3,), "test": (4, 5)}, (0, 1, 2, 6, 7, 8), (4, 5)),
-        ({"train": (0, 2)}, (0, 2), ()),
-        ({"train": (), "test": ()}, (1, 2, 3, 4, 5, 6, 7), (0, 8)),
-    ],
-)
-def test_nerfstudio_lists_of_pictures(tmp_path, lists, train, test):
-    """Written with and without ./ before them, for the frames are too, and in any order."""
-    names = {f"{split}_filenames": [f"./images/r_{i}.png" for i in chosen] for split, chosen in lists.items()}
-    write_nerfstudio(tmp_path, lambda content: content.update(names))
-    found = training.load_capture(tmp_path)
-    assert [item.view.name for item in found.train] == [f"r_{i}" for i in train]
-    assert [item.view.name for item in found.test] == [f"r_{i}" for i in test]
-
-
-@pytest.mark.parametrize(
-    "lists, message",
-    [
-        (
-            {"train_filenames": ["images/r_1.png", "r_2.png"]},
-            "train_filenames must name pictures of the frames, got r_2.png",
-        ),
-        ({"test_filenames": "images/r_1.png"}, "test_filenames must be a list of names, got 'images/r_1.png'"),
-        ({"val_filenames": [1]}, "val_filenames must be a list of names, got [1]"),
-    ],
-)
-def test_nerfstudio_lists_of_other_things(tmp_path, lists, message):
-    write_nerfstudio(tmp_path, lambda content: content.update(lists))
-    with pytest.raises(io.SceneError) as raised:
-        training.load_capture(tmp_path)
-    assert str(raised.value) == f"{tmp_path / 'transforms.json'}: {message}"
-
-
-def test_nerfstudio_masks_are_ignored_and_the_user_is_told(tmp_path):
-    def add_masks(content):
-        for frame in content["frames"][::3]:
-            frame["mask_path"] = "masks/r.png"
-
-    write_nerfstudio(tmp_path, add_masks)
-    with pytest.warns(UserWarning, match="transforms.json: the masks of 3 pictures are ignored") as told:
-        assert len(training.load_capture(tmp_path).train) == 7
-    assert len(told) == 1 and told[0].filename == __file__
-
-
-@pytest.mark.parametrize(
-    "change, message",
-    [
-        (
-            lambda content: content.update(camera_model="OPENCV", k1=0.0, k2=-0.05),
-            "frame 0: cameras must be pinholes, got k2 = -0.05; undistort the pictures first",
-        ),
-        (lambda content: content["frames"][3].update(p1=1e-4), "frame 3: cameras must be pinholes, got p1 = 0.0001;"),
-        (
-            lambda content: content["frames"][8].update(distortion_params=[0.0, 0.1]),
-            "frame 8: cameras must be pinholes, got distortion_params = [0.0, 0.1];",
-        ),
-        (lambda content: content.update(is_fisheye=True), "frame 0: cameras must be pinholes, got is_fisheye = True;"),
-        (lambda content: content.update(k1=math.nan), "frame 0: cameras must be pinholes, got k1 = nan;"),
-        (
-            lambda content: content.update(camera_model="OPENCV_FISHEYE"),
-            "camera_model must be a pinhole camera, got 'OPENCV_FISHEYE'",
-        ),
-        (
-            lambda content: content["frames"][2].update(camera_model="EQUIRECTANGULAR"),
-            "camera_model must be a pinhole camera, got 'EQUIRECTANGULAR'",
-        ),
-    ],
-)
-def test_nerfstudio_cameras_with_distortion(tmp_path, capsys, change, message):
-    write_nerfstudio(tmp_path / "scene", change)
-    assert cli.main(["train", str(tmp_path / "scene"), "--out", str(tmp_path / "out"), "--device", "cpu"]) == 2
-    error = capsys.readouterr().err
-    assert error.startswith(f"error: {tmp_path / 'scene' / 'transforms.json'}: {message}") and error.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
-def test_multi_scale_blender_folder(tmp_path):
-    """Pictures of coarse scales are those that are stored, not those that the finest would give."""
-    metadata = {}
-    for split, views in (("train", circle(3)), ("test", circle(2))):
-        keys = ("file_path", "cam2world", "width", "height", "focal")
-        rows = {key: [] for key in keys}
-        (tmp_path / split).mkdir()
-        for view in views:
-            for level in range(3):
-                size, name = 32 >> level, f"{split}/{view.name}_d{level}.png"
-                values = name, opengl_pose(view), float(size), float(size), view.fx / 2**level
-                for key, value in zip(keys, values):
-                    rows[key].append(value)
-                image.new("RGBA", (size, size), (10 + level, 20, 30, 255)).save(tmp_path / name)
-        metadata[split] = rows
-    (tmp_path / "metadata.json").write_text(json.dumps(metadata))
-    found = training.load_capture(tmp_path)
-    assert (len(found.train), len(found.test)) == (3, 2)
-    assert [sorted(item.files) for item in found.train] == [[1, 2, 4]] * 3
-    loaded = training.load_pictures(found.train, (1, 2, 4), captures.WHITE, "cpu")
-    assert [loaded.colors[scale][1][0, 0, 0].item() for scale in (1, 2, 4)] == [10, 11, 12]
-    assert [loaded.settings[scale][1].image_width for scale in (1, 2, 4)] == [32, 16, 8]
-
-
-@pytest.mark.parametrize(
-    "key, value, message",
-    [
-        ("file_path", 3, "file_path must be names of pictures, got 3"),
-        ("cam2world", "x", 'cam2world of train/a.png must hold 4 x 4 finite numbers, got "x"'),
-        ("width", 0, "width of train/a.png must be a whole number from 1 to 2^20, got 0"),
-        ("height", math.inf, "height of train/a.png must be a whole number from 1 to 2^20, got Infinity"),
-        ("focal", "far", 'focal of train/a.png must be a positive finite number, got "far"'),
-    ],
-)
-def test_metadata_with_other_things_than_numbers(tmp_path, capsys, key, value, message):
-    """Some of them were tracebacks, others named no file."""
-    pose = opengl_pose(circle(1)[0])
-    rows = {"file_path": ["train/a.png"], "cam2world": [pose], "width": [32.0], "height": [32.0], "focal": [36.0]}
-    metadata = {"train": rows | {key: [value]}, "test": rows}
-    (tmp_path / "metadata.json").write_text(json.dumps(metadata))
-    assert cli.main(["train", str(tmp_path), "--out", str(tmp_path / "out"), "--device", "cpu"]) == 2
-    assert capsys.readouterr().err == f"error: {tmp_path / 'metadata.json'}: {message}\n"
-
-
-@pytest.mark.parametrize("layout", ["binary_little_endian", "ascii"])
-def test_points_of_a_ply(tmp_path, layout):
-    rows = np.array(
-        [(1, 2, 3, 0, 255), (4, 5, 6, 7, 51)], [("x", "<f8"), ("y", "<f4"), ("z", "<f4"), ("n", "u1"), ("red", "u1")]
-    )
-    kinds = ["double x", "float y", "float z", "uchar n", "uchar red"]
-    header = [f"ply\nformat {layout} 1.0\nelement vertex 2", *(f"property {kind}" for kind in kinds), "end_header\n"]
-    body = rows.tobytes() if layout != "ascii" else "\n".join(" ".join(map(str, row)) for row in rows.tolist()).encode()
-    (tmp_path / "p.ply").write_bytes("\n".join(header).encode() + body)
-    points, colors = training.load_points(tmp_path / "p.ply")
-    assert points.tolist() == [[1, 2, 3], [4, 5, 6]] and (colors == 0.5).all()  # no green: no colours
-    (tmp_path / "p.ply").write_bytes("\n".join(header).encode() + body[: len(body) // 2])
-    with pytest.raises(io.SceneError, match=r"cut short|expected 2 finite points"):
-        training.load_points(tmp_path / "p.ply")
-
-
-def points_with_colors(path, kind: str, colors) -> torch.Tensor:
-    """The colours of a .ply with points of these colours, (P, 3)."""
-    names = ["x", "y", "z", "red", "green", "blue"]
-    kinds = ["float"] * 3 + [kind] * 3
-    header = [
-        "ply",
-        "format ascii 1.0",
-        f"element vertex {len(colors)}",
-        *(f"property {kind} {name}" for kind, name in zip(kinds, names)),
-    ]
-    rows = [f"0 1 {i} {' '.join(map(str, color))}" for i, color in enumerate(colors)]
-    path.write_text("\n".join([*header, "end_header", *rows, ""]))
-    return training.load_points(path)[1]
-
-
-@pytest.mark.parametrize(
-    "kind, largest", [("uchar", 255), ("int", 255), ("ushort", 65535), ("float", 255), ("float", 1), ("double", 1)]
-)
-def test_colors_of_points_in_every_type(tmp_path, kind, largest):
-    """Those that are fractions were taken for black, and NaN came to the training."""
-    colors = [(0, largest, largest), (largest, 0, 0)]
-    assert points_with_colors(tmp_path / "p.ply", kind, colors).tolist() == [[0, 1, 1], [1, 0, 0]]
-
-
-@pytest.mark.parametrize("kind, color", [("float", "nan"), ("float", 256), ("float", -0.5), ("char", -1), ("int", 256)])
-def test_colors_of_points_out_of_range(tmp_path, kind, color):
-    with pytest.raises(io.SceneError, match=r"p\.ply: expected colours from 0 to 255, got "):
-        points_with_colors(tmp_path / "p.ply", kind, [(0, 1, color)])
-
-
-@pytest.mark.parametrize("color", [10**30, -(10**30)])  # of smaller ones, earlier versions of NumPy keep some bits
-def test_colors_of_points_that_their_type_does_not_hold(tmp_path, color):
-    """They were a traceback."""
-    with pytest.raises(io.SceneError, match=r"p\.ply: expected 6 numbers in every row"):
-        points_with_colors(tmp_path / "p.ply", "uchar", [(0, 1, color)])
-
-
-@pytest.mark.parametrize("content", ["{}", "[1, 2]", "3", "no JSON"])
-def test_metadata_of_another_program_is_passed_over(synthetic, tmp_path, content):
-    shutil.copytree(synthetic, tmp_path / "scene")
-    (tmp_path / "scene" / "metadata.json").write_text(content)
-    assert len(captures.load_capture(tmp_path / "scene").train) == 10
-    (tmp_path / "scene" / "transforms_train.json").unlink()
-    with pytest.raises(io.SceneError, match=r"metadata\.json: not the metadata of the multi-scale Blender set"):
-        captures.load_capture(tmp_path / "scene")
-
-
-def test_a_list_of_cameras_is_no_capture(tmp_path):
-    view = io.View("a", 40, 30, 50.0, 50.0, looking_at_origin(0.1))
-    io.save_views(tmp_path / "transforms_train.json", [view])
-    io.save_views(tmp_path / "transforms_test.json", [view])
-    with pytest.raises(io.SceneError, match=r"transforms_\w+.json: expected a transforms file, .* got a list of"):
-        captures.load_capture(tmp_path)
-
-
-def test_points_of_a_text_with_other_line_ends(tmp_path):
-    lines = ["ply", "format ascii 1.0", "element vertex 2", *(f"property float {axis}" for axis in "xyz"), "end_header"]
-    (tmp_path / "p.ply").write_bytes("\r\n".join([*lines, "1 2 3", "4 5 6", ""]).encode())
-    assert training.load_points(tmp_path / "p.ply")[0].tolist() == [[1, 2, 3], [4, 5, 6]]
-
-
-@pytest.mark.parametrize("rows", [["1 2 3", "4 5"], ["1 2 3", "four 5 6"], ["1 2 3", "\xff"]])
-def test_points_of_a_wrong_text(tmp_path, rows):
-    lines = ["ply", "format ascii 1.0", "element vertex 2", *(f"property float {axis}" for axis in "xyz"), "end_header"]
-    (tmp_path / "p.ply").write_bytes("\n".join([*lines, *rows]).encode("latin-1"))
-    with pytest.raises(io.SceneError, match="expected 3 numbers in every row"):
-        training.load_points(tmp_path / "p.ply")
-    lines[2] = "element vertex many"
-    (tmp_path / "p.ply").write_bytes("\n".join([*lines, *rows]).encode("latin-1"))
-    with pytest.raises(io.SceneError, match="expected a number of vertices, got many"):
-        training.load_points(tmp_path / "p.ply")
-
-
-def test_a_ply_that_is_none_is_named(synthetic, tmp_path, capsys):
-    (tmp_path / "p.ply").write_text("nothing")
-    arguments = ["train", str(synthetic), "--out", str(tmp_path / "out"), "--device", "cpu"]
-    assert cli.main([*arguments, "--points", str(tmp_path / "p.ply")]) == 2
-    assert capsys.readouterr().err.startswith(f"error: {tmp_path / 'p.ply'}: not a PLY file")
-
-
-def test_cut_pictures_see_the_same(tmp_path):
-    """What is left of a picture shows a point where it did, in px of the cut; at half the intrinsics' size too."""
-    pixels = torch.randint(256, (29, 45, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0)).numpy()
-    image.fromarray(pixels).save(tmp_path / "a.png")
-    view = io.View("a", 45, 29, 50.0, 51.0, looking_at_origin(0.3), cx=20.0)
-    cut, rgba = pictures.cut(tmp_path / "a.png", view, 8)
-    assert np.array_equal(rgba[..., :3].numpy(), pixels[2:26, 2:42])
-    point = torch.tensor([[0.2, -0.3, 0.4]])
-    whole, part = (render_stages(v.settings(), **point_inputs(point)).means2d for v in (view, cut))
-    torch.testing.assert_close(part, whole - 2, rtol=0, atol=1e-4)
-    double = replace(view, width=90, height=58, fx=100.0, fy=102.0, cx=40.0)
-    again, _ = pictures.cut(tmp_path / "a.png", double, 8)
-    assert again == replace(cut, w2c=again.w2c)
-    with pytest.raises(io.SceneError, match="45 x 29 px are too few"):
-        pictures.cut(tmp_path / "a.png", view, 32)
-
-
-def test_pictures_that_were_turned_are_refused(tmp_path):
-    """Their cameras were scaled by another factor in x than in y."""
-    view = io.View("a", 99, 66, 50.0, 50.0, torch.eye(4, dtype=torch.float64))
-    for size in ((66, 99), (33, 49), (17, 25)):
-        image.new("RGB", size).save(tmp_path / "a.png")
-        with pytest.raises(io.SceneError, match=rf"camera, 99 x 66 px, got {size[0]} x {size[1]}"):
-            pictures.cut(tmp_path / "a.png", view, 1)
-    for size in ((99, 66), (50, 33), (25, 17), (2, 2), (64, 64), (150, 80)):  # squeezed ones have oblong pixels
-        image.new("RGB", size).save(tmp_path / "a.png")
-        cut, _ = pictures.cut(tmp_path / "a.png", view, 1)
-        assert (cut.width, cut.height) == size
-
-
-def test_reduced_pictures_average_straight_colors():
-    rgba = torch.tensor([[[255, 0, 0, 255], [0, 255, 0, 0]]], dtype=torch.uint8).repeat(2, 1, 1)
-    assert pictures.reduce(rgba, 1, captures.WHITE)[:, 0].T.tolist() == [[255, 0, 0], [255, 255, 255]]
-    assert pictures.reduce(rgba, 2, captures.WHITE)[:, 0, 0].tolist() == [191, 191, 128]  # 255 (0.5 * 0.5 + 0.5), 128
-    assert pictures.reduce(rgba, 2, None)[:, 0, 0].tolist() == [64, 64, 0, 128]  # premultiplied
-
-
-@pytest.mark.parametrize("scale", [2, 4])
-def test_bicubic_reduction_is_that_of_pillow(scale):
-    """Within the level of 255 by which Pillow's own rounding between rows and columns may differ."""
-    pixels = torch.randint(256, (16, 24, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
-    rgba = torch.cat([pixels, torch.full((16, 24, 1), 255, dtype=torch.uint8)], dim=2)
-    expected = image.fromarray(pixels.numpy()).resize((24 // scale, 16 // scale), image.Resampling.BICUBIC)
-    got = pictures.reduce(rgba, scale, captures.BLACK, "bicubic").permute(1, 2, 0)
-    assert (got.int() - torch.from_numpy(np.array(expected)).int()).abs().max() <= 1
-
-
-def test_sixteen_bits_are_rounded_to_eight(tmp_path):
-    image.fromarray(np.array([[0, 257 * 100, 65535]], np.uint16)).save(tmp_path / "a.png")
-    assert pictures.read_picture(tmp_path / "a.png")[0, :, 0].tolist() == [0, 100, 255]
 
 
 # -------------------------------------------------------------------------------------- errors
@@ -1219,12 +741,12 @@ def test_the_ply_holds_what_was_trained(trained):
         assert torch.equal(field, wanted)
 
 
-@pytest.mark.parametrize("footprint, tag", [("point", None), ("box:samples=4", "mip"), ("mip", "mip")])
-def test_the_ply_says_that_pixels_were_integrated(tmp_path, footprint, tag):
+@pytest.mark.parametrize("footprint, integrated", [("point", False), ("box:samples=4", True), ("mip", True)])
+def test_the_ply_says_how_pixels_were_integrated(tmp_path, footprint, integrated):
     scene = truth_gaussians().map(torch.Tensor.detach)
     files.write_scene(tmp_path / "s.ply", scene, footprint)
     assert io.read_metadata(tmp_path / "s.ply").footprint == str(resolve_footprint(footprint))
-    assert footprint_of_file(tmp_path / "s.ply") == tag
+    assert bool(io.read_metadata(tmp_path / "s.ply").antialiased) == integrated
     assert torch.equal(io.load_scene(tmp_path / "s.ply").means, scene.means)
 
 
@@ -1234,7 +756,9 @@ def test_the_exported_scene_has_the_pixel_in_it(synthetic, tmp_path, capsys, dev
     arguments += ["--device", device, "--export", "mip"] + ["--filter-3d"] * filter_3d
     assert cli.main(["train", str(synthetic), "--out", str(tmp_path), *arguments]) == 0
     assert f"{tmp_path / files.MIP_SCENE}: for viewers" in capsys.readouterr().out
-    assert footprint_of_file(tmp_path / files.SCENE) == "mip" and footprint_of_file(tmp_path / files.MIP_SCENE) is None
+    said = [io.read_metadata(tmp_path / name) for name in (files.SCENE, files.MIP_SCENE)]
+    assert [found.footprint for found in said] == ["moment:samples=4", "point:dilation=0.0"]
+    assert said[0].antialiased and not said[1].antialiased  # viewers would account for the pixel a second time
     scene, baked = (io.load_scene(tmp_path / name) for name in (files.SCENE, files.MIP_SCENE))
     cameras = [view.settings() for view in circle(10)]  # of the finest scale
     scales, opacities = bake_pixel(scene.means, scene.scales, scene.rotations, scene.opacities, cameras)

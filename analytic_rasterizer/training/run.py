@@ -18,7 +18,7 @@ from .. import io
 from ..distributed.ranks import ALONE, Ranks
 from ..filters import bake_pixel
 from ..gaussians import Gaussians
-from .captures import IMAGES, TEST_PERIOD, Capture, Photograph, load_capture
+from .captures import IMAGES, LENS_CHOICES, MISSING_CHOICES, TEST_PERIOD, Capture, Photograph, load_capture
 from .evaluation import evaluate, psnr
 from .files import (
     CAMERAS,
@@ -38,6 +38,7 @@ from .files import (
 )
 from .options import TrainingOptions
 from .pictures import Pictures, load_pictures
+from .placement import focus_of
 from .schedule import Clock
 from .sharded import ShardedTrainer, shards_of
 from .trainer import Trainer, background_of, starting_gaussians
@@ -60,8 +61,8 @@ class Run:
         out: Folder for the results, made if it is missing. Those of another training there are overwritten.
         options: None: the defaults, or with `resume` those of the checkpoint.
         device: "cpu", "cuda" or "cuda:N".
-        images, test_every: As `load_capture`; None: "images" and 8. With `resume` None, or the same as when the
-            training began.
+        images, test_every, cameras, lens, missing: As `load_capture`; None: as is usual there. With `resume` None, or
+            the same as when the training began.
         points: A .ply to start from: a 3DGS scene, or points with colours. None: what the capture has. Of more points
             than `max_gaussians`, so many are drawn at random. With `resume` None, or the same as when the training
             began.
@@ -70,6 +71,7 @@ class Run:
         ranks: The processes that train together, each with a part of the Gaussians.
 
     Attributes:
+        notes: Sentences of what was chosen among what the capture holds, for the user.
         points_found: How many points there are in the capture or the .ply that the training starts from, of which it
             takes at most `max_gaussians`; None where it starts from a scene, a checkpoint, or random points.
 
@@ -87,6 +89,9 @@ class Run:
         images: str | None = None,
         test_every: int | None = None,
         points=None,
+        cameras: str | None = None,
+        lens: str | None = None,
+        missing: str | None = None,
         save_every: int = 5000,
         resume: bool = False,
         ranks: Ranks = ALONE,
@@ -100,10 +105,18 @@ class Run:
             options = TrainingOptions.from_dict(state["options"])
         self.options = options or TrainingOptions()
         # Where the scene is, from wherever `evaluate` is called.
-        self.source = {"scene": os.path.abspath(scene), **source_of(images, test_every, points, state)}
-        self.capture = load_capture(scene, self.source["images"], self.source["test_every"])
+        given = {"images": images, "test_every": test_every, "points": points and str(Path(points).resolve())}
+        given |= {"cameras": cameras, "lens": lens, "missing": missing}
+        self.source = {"scene": os.path.abspath(scene), **source_of(given, state)}
+        self.capture = load_capture(scene, **capture_arguments(self.source | stored_offset(state)))
+        self.source["offset"] = self.capture.offset
+        self.notes = list(self.capture.notes)
         if state is None:  # raises before the pictures are read
             start, self.points_found = first_gaussians(self.options, self.capture, points)
+            if points is None and self.capture.points is None and self.capture.starts_in_view:
+                self.notes.append(
+                    f"no points in the capture: starts from {start.count:,} random ones in the views (--points)"
+                )
         else:
             start, self.points_found = Gaussians(**state["gaussians"]), None
         background = background_of(self.options, self.capture.background)
@@ -171,7 +184,7 @@ class Run:
         self.save()
         scene = self._whole(trainer.scene())
         if self.ranks.is_first:
-            write_scene(self.out / SCENE, scene, self.options.footprint)
+            write_scene(self.out / SCENE, scene, self.options.footprint, self.capture.offset)
         return progress.share >= 1
 
     def _whole(self, scene: Gaussians) -> Gaussians:
@@ -188,7 +201,8 @@ class Run:
         scales, opacities = bake_pixel(scene.means, scene.scales, scene.rotations, scene.opacities, cameras)
         baked = self._whole(scene.with_activated(scales, opacities))
         if self.ranks.is_first:
-            write_scene(self.out / MIP_SCENE, baked, "point")
+            # Its pixels are in the Gaussians.
+            write_scene(self.out / MIP_SCENE, baked, "point:dilation=0", self.capture.offset)
         return self.out / MIP_SCENE
 
     def start_viewer(self, port: int = 0) -> LiveViewer:
@@ -214,7 +228,10 @@ class Run:
     def describe(self) -> dict[str, Any]:
         """What options.json holds."""
         name = torch.cuda.get_device_name(self.device) if self.device.type == "cuda" else "CPU"
-        return {"source": self.source, "device": name, "torch": torch.__version__, "options": self.options.to_dict()}
+        # What the scene is shown on: a random background is none.
+        background = background_of(self.options, self.capture.background) or self.capture.background
+        described = {"source": self.source, "background": list(background), "device": name}
+        return described | {"torch": torch.__version__, "options": self.options.to_dict()}
 
     def save(self) -> None:
         """Writes the checkpoint and the log. Raises OSError, on all ranks, if that cannot be done."""
@@ -302,21 +319,42 @@ class Run:
         self.clock.start()
 
 
-def source_of(images: str | None, test_every: int | None, points, state: dict[str, Any] | None) -> dict[str, Any]:
+def source_of(given: dict[str, Any], state: dict[str, Any] | None) -> dict[str, Any]:
     """Where pictures and points come from: as given or usual, or as in the checkpoint of a training that is resumed.
+
+    Args:
+        given: By the names of Run's arguments; None where nothing is.
 
     Raises ValueError for another source than it began with: it would go on with other pictures, or points of no effect.
     """
-    given = {"images": images, "test_every": test_every, "points": points and str(Path(points).resolve())}
-    usual = {"images": IMAGES, "test_every": TEST_PERIOD, "points": None}
+    usual = {"images": IMAGES, "test_every": TEST_PERIOD, "points": None, "cameras": None}
+    usual |= {"lens": LENS_CHOICES[0], "missing": MISSING_CHOICES[0]}
     if state is not None:
-        usual = given | state["source"]  # which has no points in earlier versions: nobody knows them
+        # Those of earlier versions have no points: nobody knows them.
+        usual |= {"points": given["points"]} | {
+            name: state["source"][name] for name in usual if name in state["source"]
+        }
     chosen = {name: usual[name] if value is None else value for name, value in given.items()}
     for name, value in chosen.items():
         if state is not None and value != usual[name]:
             expected = "None" if usual[name] is None else f"{usual[name]} or None"
             raise ValueError(f"{name} must be {expected} where a training is resumed, got {value}")
     return chosen
+
+
+def stored_offset(state: dict[str, Any] | None) -> dict[str, Any]:
+    """The offset in the checkpoint of a training that is resumed; earlier versions had none."""
+    return {} if state is None else {"offset": state["source"].get("offset")}
+
+
+def capture_arguments(source: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of `load_capture`, but for the folder, of a training with this source: that of `options.json`.
+
+    Where it has an offset, also None, positions are relative to that.
+    """
+    arguments = {"images": source["images"], "test_every": source["test_every"]}
+    arguments |= {name: source[name] for name in ("cameras", "lens", "missing") if name in source}
+    return arguments | ({"offset": tuple(source["offset"] or (0.0, 0.0, 0.0))} if "offset" in source else {})
 
 
 def first_gaussians(options: TrainingOptions, capture: Capture, points) -> tuple[Gaussians, int | None]:
@@ -328,6 +366,7 @@ def first_gaussians(options: TrainingOptions, capture: Capture, points) -> tuple
     Raises:
         ValueError: A scene without Gaussians, or with more than `max_gaussians`; what `starting_gaussians` raises.
     """
+    offset = torch.tensor(capture.offset or (0.0, 0.0, 0.0), dtype=torch.float64, device="cpu")
     if points is not None and io.is_scene(points):
         scene = io.load_scene(points)
         if not len(scene.means):  # from which nothing would ever grow
@@ -335,9 +374,21 @@ def first_gaussians(options: TrainingOptions, capture: Capture, points) -> tuple
         if len(scene.means) > options.gaussian_limit:
             expected = f"at least {len(scene.means)}, the Gaussians of {points}, or 0"
             raise ValueError(f"max_gaussians must be {expected}, got {options.max_gaussians}")
+        own = offset.new_tensor(io.read_metadata(points).offset or (0.0, 0.0, 0.0))
+        if not torch.equal(own, offset):
+            scene = scene._replace(means=(scene.means.double() + own - offset).to(scene.means.dtype))
         return scene.with_sh_degree(options.sh_degree).trainable(), None
-    found = capture.points if points is None else io.load_points(points)
-    return starting_gaussians(options, found), None if found is None else len(found[0])
+    found = capture.points
+    if points is not None:
+        positions, colors = io.load_points(points)
+        found = (positions.double() - offset).float(), colors
+    views = [item.view for item in capture.train]
+    start = starting_gaussians(options, found, views if capture.starts_in_view else None)
+    if found is None and not capture.starts_in_view and capture.offset is not None:
+        # The cube of NeRF-synthetic scenes is about the world's zero, which is far from this one.
+        focus, _ = focus_of(views)
+        start = start._replace(means=start.means + (0.0 if focus is None else focus.float()))
+    return start, None if found is None else len(found[0])
 
 
 @contextmanager
