@@ -22,7 +22,16 @@ from analytic_rasterizer.analysis.reference import UNFILTERED, image_errors, ref
 from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.cli import arguments
 from analytic_rasterizer.gaussians import Gaussians
-from analytic_rasterizer.io import View, optional_import, save_scene, save_views, to_image
+from analytic_rasterizer.io import (
+    SceneMetadata,
+    View,
+    optional_import,
+    save_image,
+    save_scene,
+    save_views,
+    to_image,
+    write_text,
+)
 
 CANVAS = (384, 256)  # the target is drawn in these units; also the default size of the picture
 FOCAL = 460.0  # canvas units
@@ -249,7 +258,7 @@ def run(out, size: tuple[int, int] = CANVAS, device="cpu") -> dict:
         raise ValueError(f"size must be positive multiples of 8, got {size[0]} x {size[1]}")
     out = Path(out)
     scene, view = make_target()
-    save_scene(out / "target.ply", scene)
+    save_scene(out / "target.ply", scene, SceneMetadata(footprint="moment"))
     zoom = size[0] / view.width  # pixels are square whatever the size
     view = View(view.name, *size, FOCAL * zoom, FOCAL * zoom, view.w2c)
     save_views(out / "views.json", [view])
@@ -270,9 +279,9 @@ def run(out, size: tuple[int, int] = CANVAS, device="cpu") -> dict:
 
     for picture in pictures:
         name = picture.footprint.replace(":samples=", "")
-        to_image(picture.color).save(out / f"{name}_{picture.reduction}.png")
+        save_image(out / f"{name}_{picture.reduction}.png", picture.color)
     for reduction, color in truth.items():
-        to_image(color).save(out / f"reference_{reduction}.png")
+        save_image(out / f"reference_{reduction}.png", color)
     results = {
         "size": list(size),
         "gaussians": len(scene.means),
@@ -287,8 +296,8 @@ def run(out, size: tuple[int, int] = CANVAS, device="cpu") -> dict:
             {key: value for key, value in picture._asdict().items() if key != "color"} for picture in pictures
         ],
     }
-    (out / "results.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-    draw_sheet(pictures, truth, results).save(out / "contact_sheet.png", optimize=True)
+    write_text(out / "results.json", json.dumps(results, indent=1) + "\n")
+    save_image(out / "contact_sheet.png", draw_sheet(pictures, truth, results), optimize=True)
     return results
 
 

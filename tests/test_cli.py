@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import SHARED, python_path
-from processes import DEADLINE
+from processes import DEADLINE, run_program
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import cli, io
@@ -243,11 +243,23 @@ def test_render_on_cuda_agrees_with_the_cpu(files):
         assert np.abs(left.astype(int) - right).max() <= 2
 
 
-@pytest.mark.parametrize("module", ["gsply", "PIL.Image", "tqdm"])
+@pytest.mark.parametrize("module", ["PIL.Image", "tqdm"])
 def test_missing_library_names_the_extra(files, capsys, monkeypatch, module):
     monkeypatch.setitem(sys.modules, module, None)
     assert cli.main(arguments(files)) == 2
     assert "pip install analytic_rasterizer[cli]" in capsys.readouterr().err
+
+
+def test_a_warning_is_one_line(files):
+    """In a process of its own: pytest keeps warnings from stderr."""
+    scene = io.load_scene(files / "scene.ply")
+    scene.means[3, 1] = float("nan")
+    io.save_scene(files / "scene.ply", scene)
+    code = "import sys; from analytic_rasterizer import cli; print(cli.main(sys.argv[1:]), file=sys.stderr)"
+    done = run_program(code, *arguments(files), environment=os.environ | {"PYTHONPATH": python_path()})
+    told = f"warning: {files / 'scene.ply'}: 1 of 30 Gaussians are left out: means of 1 are not finite"
+    assert told in done.stderr.splitlines() and "UserWarning" not in done.stderr
+    assert done.stderr.splitlines()[-1] == "0"
 
 
 def test_interrupt_is_quiet(files, capsys, monkeypatch):
@@ -352,6 +364,16 @@ def test_bake_writes_what_the_library_bakes(files, capsys, extra, dilation):
     assert b"comment SplatRenderMode: mip\n" in baked.read_bytes()
 
 
+@pytest.mark.parametrize("name", ["baked.PLY", "baked.compressed.ply", "baked.spz"])
+def test_a_baked_scene_says_so_in_every_format(files, capsys, name):
+    baked = files / "new" / name
+    assert leave(bake_arguments(files, "--out", str(baked))) == 0
+    assert io.read_metadata(baked).footprint == "moment:samples=4"
+    capsys.readouterr()
+    twice = ["bake", str(baked), "--views", str(files / "views.json"), "--out", str(files / "twice.ply")]
+    check_error(twice, capsys, "no dilation to bake: it says that pixels are to be integrated")
+
+
 def test_bake_takes_the_scale_of_the_training(files):
     baked = files / "new" / "baked.ply"
     assert leave(bake_arguments(files, "--dilation", "0.5")) == 0
@@ -375,8 +397,8 @@ def test_bake_refuses_what_has_nothing_to_bake(files, capsys):
 @pytest.mark.parametrize(
     ("extra", "message"),
     [
-        (["--out", "{}/baked.spz"], "--out must be the name of a .ply, not a compressed one, got"),
-        (["--out", "{}/baked.compressed.ply"], "--out must be the name of a .ply, not a compressed one, got"),
+        (["--out", "{}/baked.obj"], "baked.obj: expected a .ply, .spz or .splat name, got '.obj'"),
+        (["--out", "{}/baked.sog"], "baked.sog: expected a .ply, .spz or .splat name, got '.sog'"),
         (["--out", "{}/scene.ply/baked.ply"], "scene.ply: expected a folder for the results, got a file"),
         (["--dilation", "0.05"], "argument --dilation: must be a number from 1/12, got 0.05"),
         (["--dilation", "x"], "argument --dilation: must be a number from 1/12, got x"),

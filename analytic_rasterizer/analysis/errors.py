@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 
 from ..footprints import footprint_weight
-from ..io import optional_import
+from ..io import optional_import, write_text
 from . import tables
 from .reference import EXACT, footprint_variants
 
@@ -64,7 +64,7 @@ def run(out, samples: int = SAMPLES, monte_carlo: int = MONTE_CARLO) -> dict:
         tables.save_csv(out / f"{name}.csv", rows)
     for name, figure in _figures(results).items():
         tables.save_figure(figure, out, name)
-    (out / "summary.md").write_text(summary, encoding="utf-8")
+    write_text(out / "summary.md", summary)
     return {**results, "summary": summary}
 
 

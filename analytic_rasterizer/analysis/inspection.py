@@ -8,7 +8,7 @@ import torch
 
 from .._C import TILE
 from ..effects import Effects
-from ..io import optional_import
+from ..io import optional_import, write_safely
 from . import tables
 
 NARROW = 0.5  # px
@@ -147,7 +147,7 @@ class SceneReport:
             for color, (samples, value) in zip(colors, view.tile_shares.items()):
                 ax.plot([], [], "s", color=color, label=f"{samples}: {percent(value)}")
             ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=4, frameon=False, fontsize=8)
-        figure.savefig(path, dpi=140)
+        write_safely(path, lambda temporary: figure.savefig(temporary, dpi=140))
 
 
 def _ratio(value: float | None) -> str | None:

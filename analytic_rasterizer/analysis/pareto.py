@@ -20,7 +20,7 @@ import torch
 from ..camera import View
 from ..footprints import resolve_footprint
 from ..gaussians import Gaussians
-from ..io import optional_import
+from ..io import optional_import, write_text
 from . import tables, timing
 from .reference import EXACT, RMSE_SHARE, UNFILTERED, Refined, footprint_variants, image_errors, refine, supersampled
 
@@ -132,8 +132,8 @@ def run(
         results["scales"].append(at_scale)
         tables.save_figure(_plot(results, at_scale), out, f"pareto_{scale}")
         # After every scale, so that a long run that is stopped leaves what it has.
-        (out / "pareto.json").write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
-        (out / "pareto.md").write_text(to_markdown(results), encoding="utf-8")
+        write_text(out / "pareto.json", json.dumps(results, indent=1) + "\n")
+        write_text(out / "pareto.md", to_markdown(results))
     return results
 
 

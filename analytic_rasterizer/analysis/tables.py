@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import csv
 import math
+from io import StringIO
 from pathlib import Path
 
 from ..footprints import resolve_footprint
-from ..io import optional_import
+from ..io import optional_import, write_safely, write_text
 
 STYLES = {  # colour and marker
     "point": ("#7a7f87", "o"),
@@ -78,16 +79,17 @@ def add_titles(figure, axes, title: str, xlabel: str = "") -> None:
 def save_figure(figure, out: Path, name: str) -> None:
     """Writes DIR/NAME.png and DIR/NAME.svg, the same bytes for the same plot."""
     with optional_import("matplotlib", "analysis").rc_context({"svg.hashsalt": name}):
-        figure.savefig(out / f"{name}.png", dpi=140)
-        figure.savefig(out / f"{name}.svg", metadata={"Date": None})
+        write_safely(out / f"{name}.png", lambda temporary: figure.savefig(temporary, dpi=140))
+        write_safely(out / f"{name}.svg", lambda temporary: figure.savefig(temporary, metadata={"Date": None}))
 
 
 def save_csv(path: Path, rows: list[dict]) -> None:
     """Writes rows with the keys of the first as header; None is left empty."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
+    text = StringIO()
+    writer = csv.DictWriter(text, list(rows[0]))
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, text.getvalue())
 
 
 def format_table(header: list[str], rows: list[list]) -> str:

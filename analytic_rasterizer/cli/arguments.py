@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import tempfile
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -37,7 +38,11 @@ def run_command(parse: Callable[[], argparse.Namespace]) -> int:
 
     Returns:
         0, 2 after an error that the user can correct, which is one line on stderr, or 130 when interrupted.
+
+    Warnings are one line on stderr too, without the place in the code that Python names.
     """
+    usual = warnings.formatwarning
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
     try:
         args = parse()
         args.run(args)
@@ -47,6 +52,8 @@ def run_command(parse: Callable[[], argparse.Namespace]) -> int:
     except USER_ERRORS as error:
         report(_describe(error))
         return 2
+    finally:
+        warnings.formatwarning = usual
 
 
 def _describe(error: BaseException) -> str:
@@ -66,7 +73,7 @@ def add_scene(parser) -> None:
 def add_files(parser) -> None:
     """SCENE and --views."""
     add = parser.add_argument
-    add("scene", metavar="SCENE", help="3DGS .ply, compressed .ply or .spz")
+    add("scene", metavar="SCENE", help="3DGS .ply, compressed .ply, .spz, .sog or .splat")
     views = "3DGS cameras.json, Blender or nerfstudio transforms.json, or a list of {width, height, fx, fy, w2c}"
     add("--views", required=True, help=views)
 

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import torch
 
 from .. import io
 from ..filters import DILATION, bake_dilation, sampling_interval
 from ..training.files import write_scene
-from ..viewer.packing import footprint_of_file
 from .arguments import (
     add_files,
     add_machine_options,
@@ -35,7 +32,7 @@ def add_parser(subcommands) -> None:
     add_size(parser)
     add_scale(parser, "size of the training's pictures beside what VIEWS says")
     add = parser.add_argument
-    add("--out", required=True, metavar="FILE", help="the scene to write, a .ply")
+    add("--out", required=True, metavar="FILE", help="the scene to write: .ply, .compressed.ply, .spz or .splat")
     of_training = "of the training, px^2 (default: %(default)s)"
     add("--dilation", type=dilation, default=DILATION, metavar="V", help=of_training)
     add_machine_options(parser)
@@ -44,16 +41,12 @@ def add_parser(subcommands) -> None:
 
 def run(args) -> None:
     """Bakes the dilation, writes the scene, and says what changed."""
-    out = Path(args.out)
-    if out.suffix != ".ply" or out.stem.endswith(".compressed"):
-        raise ValueError(f"--out must be the name of a .ply, not a compressed one, got {args.out}")
+    io.written_format(args.out)  # raises
     use_machine(args)
     views = [view.scaled(args.scale) for view in io.load_views(args.views, args.size)]
     loaded = io.load_scene(args.scene)
-    if footprint_of_file(args.scene):
+    if io.read_metadata(args.scene).antialiased:
         raise io.SceneError(f"{args.scene}: no dilation to bake: it says that pixels are to be integrated")
-    if loaded.sh_degree > 3:
-        raise io.SceneError(f"{args.scene}: a .ply holds no harmonics of degree {loaded.sh_degree}")
     check_writable_file(args.out)
     scene = loaded.to(args.device)
     cameras = [view.settings(device=args.device) for view in views]
@@ -65,7 +58,7 @@ def run(args) -> None:
     scales, opacities = bake_dilation(
         scene.means, scene.scales, scene.rotations, scene.opacities, cameras, args.dilation
     )
-    write_scene(out, scene.with_activated(scales, opacities), "moment")
+    write_scene(args.out, scene.with_activated(scales, opacities), "moment")
     sizes = sorted({(view.width, view.height) for view in views})
     pictures = f"{len(views)} pictures of " + " to ".join(f"{w}x{h}" for w, h in dict.fromkeys((sizes[0], sizes[-1])))
     print(f"{args.out}: {int(seen.sum())} of {len(scales)} Gaussians, which are seen in {pictures}, are baked")

@@ -36,7 +36,7 @@ def run(args) -> None:
     """Inspects the scene and prints the report."""
     if args.picture:  # raises before anything is rendered
         io.optional_import("matplotlib.figure", "analysis")
-        if Path(args.picture).suffix not in (".png", ".svg", ".pdf"):
+        if Path(args.picture).suffix.lower() not in (".png", ".svg", ".pdf"):
             raise ValueError(f"--picture must end in .png, .svg or .pdf, got {args.picture}")
     use_machine(args)
     views = io.load_views(args.views, args.size)
@@ -55,5 +55,5 @@ def run(args) -> None:
         if args.json == "-":
             print(text, end="")
             return
-        Path(args.json).write_text(text, encoding="utf-8")
+        io.write_text(args.json, text)
     print(found.to_text())

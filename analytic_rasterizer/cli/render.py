@@ -46,7 +46,7 @@ def run(args) -> None:
                 args.scale, args.background, scene.sh_degree, args.footprint, device=args.device, **options
             )
             stages = render_stages(settings, **scene.arguments())
-            io.to_image(stages.color).save(out / f"{view.name}.png")
+            io.save_image(out / f"{view.name}.png", stages.color)
             seconds = [stages.seconds[stage] for stage in STAGES]
             counts = [len(scene.means), len(stages.ids), len(stages.pairs)]
             size = f"{settings.image_width}x{settings.image_height}"

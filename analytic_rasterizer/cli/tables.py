@@ -42,7 +42,6 @@ def run(args) -> None:
     if args.data is None or args.out is None:
         raise ValueError(f"{args.name} needs --data FOLDER and --out DIR")
     use_machine(args)
-    io.optional_import("gsply")  # writes the scenes in the end
     lpips = None
     if not args.no_lpips:
         try:

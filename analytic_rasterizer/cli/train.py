@@ -118,7 +118,6 @@ def run_on(ranks: Ranks, args) -> bool:
         raise ValueError("--port is for --watch")
     if args.watch and is_launched():
         raise ValueError("--watch is for one process, got torchrun")
-    io.optional_import("gsply")  # writes the scene in the end
     if args.watch:
         io.optional_import("viser", "view")  # raises before the pictures are read
     checkpoint = Path(args.out) / CHECKPOINT

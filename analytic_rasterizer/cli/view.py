@@ -20,7 +20,7 @@ def add_parser(subcommands) -> None:
         + ". With --server this machine renders every frame, with any footprint that the library has. Nothing is sent "
         "elsewhere. Ctrl-C ends.",
     )
-    parser.add_argument("scene", metavar="SCENE", help="3DGS .ply, compressed .ply or .spz")
+    parser.add_argument("scene", metavar="SCENE", help="3DGS .ply, compressed .ply, .spz, .sog or .splat")
     parser.add_argument(
         "--views",
         metavar="FILE",
@@ -55,7 +55,7 @@ def run(args) -> None:
         return
     if args.threads is not None or args.device is not None:
         raise ValueError("--device and --threads are for --server: otherwise the browser draws")
-    if args.export and Path(args.export).suffix != ".html":
+    if args.export and Path(args.export).suffix.lower() != ".html":
         raise ValueError(f"--export must end in .html, got {args.export}")
     if args.export and args.port is not None:
         raise ValueError("--port is for serving: --export writes a file and ends")

@@ -1,24 +1,35 @@
-"""Scenes and views in and out.
+"""Scenes, points, views and pictures in and out.
 
 A *scene* is a set of Gaussians (`Gaussians`), read from the files that 3DGS tools write. A *view* is a pinhole
-camera with an image size; its axes are OpenCV's (x right, y down, z forward). Reading and writing
-scenes needs the libraries of `pip install analytic_rasterizer[cli]`; they are imported on first
-use.
+camera with an image size; its axes are OpenCV's (x right, y down, z forward). Some formats need the libraries of `pip
+install analytic_rasterizer[cli]`; they are imported on first use.
 """
 
 from .common import SceneError, optional_import, to_image
-from .scenes import PLY_COLUMNS, load_scene, ply_header, save_scene
+from .metadata import SceneMetadata, read_metadata
+from .points import is_scene, load_points
+from .scenes import PLY_COLUMNS, load_scene, save_scene, written_format
 from .views import View, load_views, save_views
+from .writing import save_image, write_bytes, write_json, write_safely, write_text
 
 __all__ = [
     "PLY_COLUMNS",
     "SceneError",
+    "SceneMetadata",
     "View",
+    "is_scene",
+    "load_points",
     "load_scene",
     "load_views",
     "optional_import",
-    "ply_header",
+    "read_metadata",
+    "save_image",
     "save_scene",
     "save_views",
     "to_image",
+    "write_bytes",
+    "write_json",
+    "write_safely",
+    "write_text",
+    "written_format",
 ]

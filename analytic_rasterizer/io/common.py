@@ -15,6 +15,45 @@ class SceneError(ValueError):
     """A scene or views file that cannot be used; the message names the file and what is wrong."""
 
 
+@contextmanager
+def naming(path) -> Iterator[None]:
+    """Puts the file's name in front of the message of a SceneError."""
+    try:
+        yield
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from None
+
+
+@contextmanager
+def unreadable() -> Iterator[None]:
+    """Turns whatever a reader raises for a broken file into a SceneError, and lets a missing library pass."""
+    try:
+        yield
+    except (SceneError, ImportError):
+        raise
+    except Exception as error:  # libraries raise a different type for every way in which a file can be broken
+        reason = first_line(error) or type(error).__name__
+        raise SceneError(f"unreadable or cut short ({reason})") from None
+
+
+FORMATS = {".ply": "ply", ".ply_compressed": "ply", ".spz": "spz", ".sog": "sog", ".splat": "splat"}
+"""Formats of scenes, by suffix."""
+
+
+def scene_file(path) -> tuple[Path, str]:
+    """The path of a file of a scene, and its format, one of FORMATS. Suffixes may have any case.
+
+    Raises SceneError where the file is not there, or has another suffix.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise SceneError(f"{path}: no such file")
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS:
+        raise SceneError(f"{path}: expected a .ply, .spz, .sog or .splat file, got {path.suffix or 'no suffix'!r}")
+    return path, FORMATS[suffix]
+
+
 def optional_import(name: str, extra: str = "cli"):
     """The module `name`; ImportError naming the extra that installs it when it is missing."""
     try:

@@ -1,121 +1,87 @@
-"""Files of scenes: .ply, compressed .ply and .spz."""
+"""Files of scenes: .ply, compressed .ply, .spz, .sog and .splat."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
+import warnings
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from ..gaussians import HIGHEST_LOGIT, Gaussians
-from .common import SceneError, first_line, optional_import
+from . import ply, sog, splat, spz
+from .common import SceneError, first_line, naming, scene_file
+from .compressed import is_compressed, read_compressed, to_compressed
+from .metadata import SceneMetadata
+from .points import AXES, has_colors, read_colors
+from .writing import write_safely
+
+BASE_COLOR = ("f_dc_0", "f_dc_1", "f_dc_2")
+SCALES, ROTATIONS = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range(4)]
+PLY_COLUMNS = [*AXES, *BASE_COLOR, "opacity", *SCALES, *ROTATIONS]
+HARMONICS = [3 * ((degree + 1) ** 2 - 1) for degree in range(5)]  # numbers beyond the base colour, by degree
+WRITTEN = {".ply": "ply", ".ply_compressed": "compressed", ".spz": "spz", ".splat": "splat"}
+LARGEST_SHIFT = 0.1  # of a Gaussian's size: rounding of positions beyond it is told
 
 
-def load_scene(path) -> Gaussians:
-    """Reads a 3DGS `.ply`, a compressed `.ply` (PlayCanvas) or an `.spz` (Niantic) on the CPU.
+def load_scene(path, strict: bool = False) -> Gaussians:
+    """Reads a scene: a 3DGS .ply, a compressed .ply or .sog (PlayCanvas), an .spz (Niantic) or a .splat.
 
-    Axes are those stored in the file: tools that make
-    `.spz` may have turned the scene (y and z negated), and nothing in the file says so.
+    A .ply may be text or have either byte order, any types, and any other elements and properties. Red, green and blue
+    are read where there are no harmonics, as those of degree 0.
 
-    Raises SceneError for anything but a complete file with finite values, ImportError without the
-    `cli` extra.
+    Gaussians that have a number that is not finite are left out, and a warning counts them. Another warning says where
+    positions of double precision lose what matters in float32. Axes are those stored in the file: tools that make .spz
+    may have turned the scene (y and z negated), and nothing in the file says so.
+
+    Args:
+        path: The file. Its suffix, in any case, says which format it has.
+        strict: Refuse a file with numbers that are not finite.
+
+    Returns:
+        float32, on the CPU. Scales of 0, and in a .ply opacities of 0 and 1, have infinite parameters.
+
+    Raises:
+        SceneError: The file is not there, or no scene, or cut short, or no Gaussian of it is finite. The message names
+            the file.
+        ImportError: The extra `cli` is missing, which formats other than .ply and .splat need.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise SceneError(f"{path}: no such file")
-    gsply = optional_import("gsply")
+    path, kind = scene_file(path)
+    readers = {"ply": _read_ply, "spz": spz.read_spz, "sog": sog.read_sog, "splat": splat.read_splat}
     try:
-        if path.suffix == ".spz":
-            data = gsply.read_spz(path)
-        elif path.suffix in (".ply", ".ply_compressed"):
-            _check_ply_header(path)
-            data = gsply.plyread(path)
-        else:
-            raise SceneError(f"expected a .ply or .spz file, got {path.suffix or 'no suffix'!r}")
-    except SceneError as error:
-        raise SceneError(f"{path}: {error}") from None
-    except (ValueError, OSError) as error:
-        raise SceneError(f"{path}: unreadable or cut short ({first_line(error)})") from None
+        fields = readers[kind](path)
+    except OSError as error:
+        raise SceneError(f"{path}: unreadable ({error.strerror or first_line(error)})") from None
+    scene = Gaussians(**{name: _tensor(field) for name, field in fields.items()})
+    return _finite(path, scene, strict)
 
-    tensors = [
-        torch.tensor(field, dtype=torch.float32, device="cpu").contiguous()  # a view of the file's rows
-        for field in (data.means, data.scales, data.quats, data.opacities, data.sh0)
-    ]
-    means, log_scales, rotations, logits, sh0 = tensors
-    count = len(means)
-    shs = sh0[:, None]
-    if data.shN is not None and data.shN.size:
-        shs = torch.cat([shs, torch.tensor(data.shN, dtype=torch.float32, device="cpu")], dim=1)
-    scene = Gaussians(means, log_scales, rotations, logits.reshape(count, 1), shs.contiguous())
+
+def _tensor(field: np.ndarray) -> torch.Tensor:
+    """The field as a float32 tensor, copied where it has another type or cannot be changed."""
+    with np.errstate(over="ignore"):  # what float32 does not hold becomes infinite, and is left out
+        found = np.require(field, np.float32, ["C", "O", "W"])
+    return torch.from_numpy(found)
+
+
+def _finite(path: Path, scene: Gaussians, strict: bool) -> Gaussians:
+    """The Gaussians all of whose numbers are finite."""
+    good = torch.ones(scene.count, dtype=torch.bool, device="cpu")
+    bad = {}
     for name, field in numbers_of(scene).items():
-        bad = count - int(field.flatten(1).isfinite().all(1).sum())
-        if bad:
-            raise SceneError(f"{path}: {name} must be finite, got {bad} of {count} rows not")
-    return scene
-
-
-def save_scene(path, scene: Gaussians, comments: Sequence[str] = ()) -> None:
-    """Writes a scene as `.ply`, `.compressed.ply` or `.spz`, by its name.
-
-    The two small formats round: see their own documentation. Opacities are kept off 0 and 1 by
-    1e-6, where their logit is infinite. `comments` are lines for the header of a `.ply`. Raises
-    SceneError, before a file is touched, for another suffix, for tensors of other shapes than those
-    of `Gaussians`, for harmonics of degree 4 in anything but a `.compressed.ply`, for comments that
-    cannot be written, and in the small formats for what would become other numbers: those that are
-    not finite, and in an `.spz` means beyond 2^22.
-    """
-    path = Path(path)
-    if path.suffix not in (".ply", ".spz"):
-        raise SceneError(f"{path}: expected a .ply or .spz name, got {path.suffix!r}")
-    if scene.sh_degree > 3 and not path.name.endswith(".compressed.ply"):
-        raise SceneError(f"{path}: only a .compressed.ply holds harmonics of degree {scene.sh_degree}")
-    if comments and path.suffix != ".ply":
-        raise SceneError(f"{path}: only a .ply holds comments")
-    if any("\n" in comment or not comment.isascii() for comment in comments):
-        raise SceneError(f"{path}: comments must be single lines of ASCII, got {list(comments)}")
-    cpu = scene.map(lambda field: field.detach().cpu())
-    cpu = cpu._replace(logit_opacities=cpu.logit_opacities.reshape(-1, 1))
-    _check_fields(path, cpu)
-    gsply = optional_import("gsply")
-    data = gsply.GSData.from_arrays(
-        means=cpu.means.numpy(),
-        scales=cpu.log_scales.numpy(),
-        quats=torch.nn.functional.normalize(cpu.rotations, dim=1).numpy(),
-        opacities=cpu.logit_opacities.reshape(-1).clamp(-HIGHEST_LOGIT, HIGHEST_LOGIT).numpy(),
-        sh0=cpu.shs[:, 0].numpy(),
-        shN=cpu.shs[:, 1:].numpy(),
-        format="ply",
-    )
-    if path.suffix == ".spz":
-        gsply.write_spz(path, data, fractional_bits=_fractional_bits(path, cpu.means))
-    else:
-        gsply.plywrite(path, data)
-    if comments:
-        content = path.read_bytes()
-        start = content.index(b"\n", content.index(b"\n") + 1) + 1  # "ply", then "format ..."
-        added = "".join(f"comment {comment}\n" for comment in comments).encode()
-        path.write_bytes(content[:start] + added + content[start:])
-
-
-def _check_fields(path: Path, scene: Gaussians) -> None:
-    """What gsply would write without a word, into a file that cannot be read or holds other numbers."""
-    count, small = scene.count, path.suffix == ".spz" or path.name.endswith(".compressed.ply")
-    shapes = {
-        "means": (3,),
-        "log_scales": (3,),
-        "rotations": (4,),
-        "logit_opacities": (1,),
-        "shs": ((scene.sh_degree + 1) ** 2, 3),
-    }
-    for name, row in shapes.items():
-        field = getattr(scene, name)
-        if field.shape != (count, *row):
-            raise SceneError(f"{path}: {name} must have shape {(count, *row)}, got {tuple(field.shape)}")
-    for name, field in numbers_of(scene).items():
-        good = field.flatten(1).isfinite().all(1)
-        if small and not good.all():
-            raise SceneError(f"{path}: {name} must be finite, got {count - int(good.sum())} of {count} rows not")
+        if field.sum(dtype=torch.float64).isfinite():  # then all of them are: no sum of float32 leaves float64
+            continue
+        finite = field.flatten(1).isfinite().all(1)
+        bad[name] = scene.count - int(finite.sum())
+        good &= finite
+    if not bad:
+        return scene
+    if strict or not good.any():
+        name, number = next(iter(bad.items()))
+        raise SceneError(f"{path}: {name} must be finite, got {number} of {scene.count} rows not")
+    left_out = f"{scene.count - int(good.sum())} of {scene.count} Gaussians are left out"
+    where = ", ".join(f"{name} of {number}" for name, number in bad.items())
+    warnings.warn(f"{path}: {left_out}: {where} are not finite", stacklevel=3)
+    return scene.rows(good)
 
 
 def numbers_of(scene: Gaussians) -> dict[str, torch.Tensor]:
@@ -129,79 +95,153 @@ def numbers_of(scene: Gaussians) -> dict[str, torch.Tensor]:
     }
 
 
-def _fractional_bits(path: Path, means: torch.Tensor) -> int:
-    """How many of the 24 bits of a coordinate in an .spz are fractional: the usual 12, or what the largest leaves.
+def _read_ply(path: Path) -> dict[str, np.ndarray]:
+    """The parameters of a .ply, compressed or not. Raises SceneError, which names the file."""
+    if is_compressed(ply.read_header(path)):
+        return read_compressed(path)
+    _, elements = ply.read_rows(path, ["vertex"])
+    with naming(path):
+        if "vertex" not in elements:
+            raise SceneError("expected vertices, but the .ply has none; is it a 3DGS scene?")
+        rows = elements["vertex"]
+        colored = has_colors(rows) and not set(BASE_COLOR) & set(rows.names)
+        missing = [name for name in PLY_COLUMNS if name not in rows.names and not (colored and name in BASE_COLOR)]
+        if missing:
+            raise SceneError(f"missing vertex properties {', '.join(missing)}; is it a 3DGS scene?")
+        count = sum(name.startswith("f_rest_") for name in rows.names)
+        if count not in HARMONICS:
+            raise SceneError(f"expected 0, 9, 24, 45 or 72 f_rest properties (SH degree 0 to 4), got {count}")
+        shs = np.empty((len(rows), 1 + count // 3, 3), np.float32)
+        if colored:
+            shs[:, 0] = (read_colors(rows) - 0.5) / splat.SH_C0
+        else:
+            shs[:, 0] = rows.columns(BASE_COLOR, np.float32)
+        # All bands of red come first, then those of green, then those of blue.
+        rest = rows.columns([f"f_rest_{i}" for i in range(count)], np.float32)
+        shs[:, 1:] = rest.reshape(len(rows), 3, count // 3).transpose(0, 2, 1)
+        fields = {
+            "means": rows.columns(AXES),
+            "log_scales": rows.columns(SCALES, np.float32),
+            "rotations": rows.columns(ROTATIONS, np.float32),
+            "logit_opacities": rows.columns(["opacity"], np.float32),
+            "shs": shs,
+        }
+    _warn_of_rounding(path, fields["means"], fields["log_scales"])
+    return fields
 
-    gsply would move what lies further away than the bits before the point reach.
-    """
-    largest = means.abs().max().item() if len(means) else 0.0
-    bits = 23 - math.frexp(largest)[1]
-    if bits < 1:
-        raise SceneError(f"{path}: an .spz holds means up to 2^22, got {largest:g}")
-    return min(bits, 12)
 
-
-PLY_COLUMNS = (
-    ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
-    + [f"scale_{i}" for i in range(3)]
-    + [f"rot_{i}" for i in range(4)]
-)
-
-
-def _check_ply_header(path: Path) -> None:
-    """Says what is wrong with a .ply that gsply would refuse without a reason, or misread: it
-    takes every vertex property for a float, whatever the header says."""
-    lines, size = ply_header(path), path.stat().st_size
-    if any(line.startswith("element chunk") for line in lines):
-        # Compressed: gsply checks the layout, but allocates memory for whatever numbers there are.
-        numbers = [line.split()[-1] for line in lines if line.startswith("element ")]
-        unfit = [number for number in numbers if not number.isdecimal() or int(number) > size]
-        if unfit:
-            raise SceneError(f"expected numbers of elements that fit {size} bytes, got {unfit[0]}")
+def _warn_of_rounding(path: Path, means: np.ndarray, log_scales: np.ndarray) -> None:
+    """Says where float32 moves Gaussians by more than their size allows."""
+    if means.dtype == np.float32 or not len(means):
         return
-    layout = ply_layout(lines)
-    if layout != "binary_little_endian":
-        raise SceneError(f"expected format binary_little_endian, got {layout}")
-    number, properties = ply_vertices(lines)
-    kinds = {words[-1]: words[0] for words in properties}
-    missing = [name for name in PLY_COLUMNS if name not in kinds]
-    if missing:
-        raise SceneError(f"missing vertex properties {', '.join(missing)}; is it a 3DGS scene?")
-    for name, kind in kinds.items():
-        if kind != "float":
-            raise SceneError(f"vertex property {name} must be float, got {kind}")
-    rest = sum(name.startswith("f_rest_") for name in kinds)
-    if rest not in (0, 9, 24, 45):
-        raise SceneError(f"expected 0, 9, 24 or 45 f_rest properties (SH degree 0 to 3), got {rest}")
-    if not number.isdecimal() or 4 * int(number) * len(kinds) > size:
-        raise SceneError(f"expected a number of vertices that fits {size} bytes, got {number}")
+    with np.errstate(over="ignore", invalid="ignore"):
+        shift = np.abs(means - means.astype(np.float32)).max(1)
+        moved = shift > LARGEST_SHIFT * np.exp(log_scales.max(1))
+    if moved.mean() > 0.01:  # single specks are none of the scene's
+        which = f"{int(moved.sum())} of {len(means)} Gaussians, by up to {shift[moved].max():.2g}"
+        warnings.warn(f"{path}: float32 moves {which}: subtract an offset from the file's positions", stacklevel=4)
 
 
-def ply_layout(header: list[str]) -> str:
-    """The format of a .ply: binary_little_endian, ascii or another; "none" where the header names none."""
-    return next((line.split()[1] for line in header if line.startswith("format ")), "none")
+def written_format(path) -> str:
+    """The format that `save_scene` writes under this name: ply, compressed, spz or splat. Else raises SceneError."""
+    path = Path(path)
+    if path.name.lower().endswith(".compressed.ply"):
+        return "compressed"
+    if path.suffix.lower() not in WRITTEN:
+        raise SceneError(f"{path}: expected a .ply, .spz or .splat name, got {path.suffix or 'no suffix'!r}")
+    return WRITTEN[path.suffix.lower()]
 
 
-def ply_vertices(header: list[str]) -> tuple[str, list[list[str]]]:
-    """What a .ply's header says of its vertices: how many there are, as it is written, and the type and the name of
-    each property. Raises SceneError where they are not its first element."""
-    elements = [i for i, line in enumerate(header) if line.startswith("element")]
-    if not elements or not header[elements[0]].startswith("element vertex "):
-        raise SceneError("expected the vertices as the first element of the .ply")
-    end = elements[1] if len(elements) > 1 else len(header)
-    properties = [line.split()[1:] for line in header[elements[0] + 1 : end] if line.startswith("property ")]
-    return " ".join(header[elements[0]].split()[2:]), properties
+def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None) -> None:
+    """Writes a scene as .ply, .compressed.ply, .spz (version 3) or .splat, by its name.
+
+    A .ply holds the parameters as they are, but for infinite logits: opacities are then kept off 0 and 1 by 1e-6. The
+    other formats round (docs/library.md says how), and hold unit quaternions. A .splat has no place for metadata and
+    for harmonics beyond degree 0: where they matter a warning says what is lost.
+
+    Args:
+        path: The file, which is replaced once the new one is complete.
+        scene: float32 or float64, on any device.
+        metadata: What the file says beside the Gaussians, such as `SceneMetadata(footprint="moment")`.
+
+    Raises:
+        SceneError: Before a file is touched. Another suffix; tensors of other shapes than those of `Gaussians`;
+            harmonics of degree 4 in an .spz; metadata that cannot be written; in all formats but .ply numbers that are
+            not finite, and in an .spz means beyond 2^22.
+        OSError: The file cannot be written; an earlier one is then unchanged.
+        ImportError: The extra `cli` is missing, which .compressed.ply and .spz need.
+    """
+    path, kind = Path(path), written_format(path)
+    if not isinstance(metadata, (SceneMetadata, type(None))):
+        raise TypeError(f"metadata must be a SceneMetadata or None, got {type(metadata).__name__}")
+    try:
+        metadata = (metadata or SceneMetadata()).checked()
+    except (ValueError, TypeError) as error:
+        raise SceneError(f"{path}: {first_line(error)}") from None
+    scene = scene.map(lambda field: field.detach().to("cpu", torch.float32))
+    scene = scene._replace(logit_opacities=scene.logit_opacities.reshape(-1, 1))
+    with naming(path):
+        _check(scene, kind)
+    logits = scene.logit_opacities
+    kept = logits.clamp(-HIGHEST_LOGIT, HIGHEST_LOGIT)
+    fields = scene._replace(logit_opacities=torch.where(logits.isinf(), kept, logits))
+    fields = {name: field.numpy() for name, field in fields._asdict().items()}
+    if kind == "ply":
+        content = _ply(fields, metadata.lines())
+        write_safely(path, lambda temporary: temporary.write_bytes(content))
+        return
+    fields["rotations"] = _unit(fields["rotations"])
+    if kind == "compressed":
+        content = to_compressed(fields, metadata.lines())
+        write_safely(path, lambda temporary: temporary.write_bytes(content))
+    elif kind == "spz":
+        with naming(path):
+            spz.fractional_bits(fields["means"])  # raises
+        lines = SceneMetadata(metadata.footprint, None, metadata.offset, metadata.comments).lines()
+        write_safely(path, lambda temporary: spz.write_spz(temporary, fields, bool(metadata.antialiased), lines))
+    else:
+        content = splat.to_splat(fields)
+        _warn_of_loss(path, scene, metadata)
+        write_safely(path, lambda temporary: temporary.write_bytes(content))
 
 
-def ply_header(path: Path) -> list[str]:
-    """The lines of a .ply's header, comments among them. Raises SceneError where it has none."""
-    lines = []
-    with path.open("rb") as file:
-        if file.readline(8).strip() != b"ply":
-            raise SceneError("not a PLY file: it does not begin with 'ply'")
-        for _ in range(1000):  # a .ply that never ends its header is not read whole
-            line = file.readline(1000).decode("latin-1").strip()
-            if line == "end_header":
-                return lines
-            lines.append(line)
-    raise SceneError("the PLY header has no end_header")
+def _check(scene: Gaussians, kind: str) -> None:
+    """What would be written without a word, into a file that cannot be read or holds other numbers."""
+    count, bands = scene.count, (scene.sh_degree + 1) ** 2
+    rows = {"means": (3,), "log_scales": (3,), "rotations": (4,), "logit_opacities": (1,), "shs": (bands, 3)}
+    for name, row in rows.items():
+        field = getattr(scene, name)
+        if field.shape != (count, *row):
+            raise SceneError(f"{name} must have shape {(count, *row)}, got {tuple(field.shape)}")
+    if scene.sh_degree > 4 or (kind == "spz" and scene.sh_degree > 3):
+        raise SceneError(f"harmonics of degree {scene.sh_degree} have no place in this format; a .ply holds degree 4")
+    for name, field in numbers_of(scene).items() if kind != "ply" else ():
+        good = field.flatten(1).isfinite().all(1)
+        if not good.all():
+            raise SceneError(f"{name} must be finite, got {count - int(good.sum())} of {count} rows not")
+
+
+def _ply(fields: dict[str, np.ndarray], comments: list[str]) -> bytes:
+    """The content of a .ply as 3DGS writes it, without normals."""
+    shs = fields["shs"]
+    rest = shs[:, 1:].transpose(0, 2, 1).reshape(len(shs), 3 * (shs.shape[1] - 1))
+    names = [*AXES, *BASE_COLOR, *(f"f_rest_{i}" for i in range(rest.shape[1])), "opacity", *SCALES, *ROTATIONS]
+    columns = [fields["means"], shs[:, 0], rest, fields["logit_opacities"], fields["log_scales"], fields["rotations"]]
+    return ply.to_bytes("vertex", names, np.concatenate(columns, 1), comments)
+
+
+def _unit(rotations: np.ndarray) -> np.ndarray:
+    """Quaternions of length 1; zero becomes the identity, as in the rasterizer."""
+    wide = rotations.astype(np.float64)
+    length = np.linalg.norm(wide, axis=1, keepdims=True)
+    identity = np.array([1.0, 0.0, 0.0, 0.0])
+    return np.where(length > 0, wide / np.where(length > 0, length, 1), identity).astype(np.float32)
+
+
+def _warn_of_loss(path: Path, scene: Gaussians, metadata: SceneMetadata) -> None:
+    """Says what a .splat cannot hold."""
+    lost = metadata.lost()
+    if scene.shs[:, 1:].any():
+        lost.append(f"harmonics beyond degree 0 (the scene has degree {scene.sh_degree})")
+    if lost:
+        warnings.warn(f"{path}: a .splat does not hold {', nor '.join(lost)}; a .ply does", stacklevel=3)

@@ -12,6 +12,7 @@ import torch
 
 from ..camera import View
 from .common import SceneError, first_line, opened_picture
+from .writing import write_text
 
 
 def load_views(path, size: tuple[int, int] | None = None) -> list[View]:
@@ -45,13 +46,13 @@ def load_views(path, size: tuple[int, int] | None = None) -> list[View]:
 
 
 def save_views(path, views: list[View]) -> None:
-    """Writes views as the plain list of `load_views`."""
+    """Writes views as the plain list of `load_views`. Raises OSError; an earlier file is then unchanged."""
     entries = []
     for view in views:
         entry = {key: getattr(view, key) for key in ("name", "width", "height", "fx", "fy")}
         entry |= {k: getattr(view, k) for k in ("cx", "cy") if getattr(view, k) is not None}
         entries.append(entry | {"w2c": view.w2c.flatten().tolist()})
-    Path(path).write_text(json.dumps(entries, indent=1) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(entries, indent=1) + "\n")
 
 
 def _views(data, folder: Path, size) -> list[View]:

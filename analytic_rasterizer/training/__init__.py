@@ -8,7 +8,8 @@
 Needs the libraries of `pip install analytic_rasterizer[train]`; they are imported on first use.
 """
 
-from .captures import Capture, Photograph, load_capture, load_points
+from ..io import load_points
+from .captures import Capture, Photograph, load_capture
 from .evaluation import evaluate, load_lpips, save_pictures
 from .extent import extent_of
 from .model import random_points

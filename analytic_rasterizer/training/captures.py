@@ -8,17 +8,15 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from .. import io
-from ..io.scenes import ply_layout, ply_vertices
+from ..io import load_points
 from ..io.views import checked_pixels, checked_pose, checked_positive
 from . import colmap
 from .extent import OUTLYING, is_one_pose, outliers_of
@@ -43,7 +41,7 @@ class Capture(NamedTuple):
     train: list[Photograph]
     test: list[Photograph]
     background: tuple[float, float, float]  # by convention, behind pictures with alpha
-    points: tuple[Tensor, Tensor] | None  # positions and colours in [0, 1], (P, 3) float32 each, on the CPU
+    points: tuple[Tensor, Tensor] | None  # (P, 3) on the CPU: positions, float32 or float64, and colours in [0, 1]
 
 
 def load_capture(folder, images: str = IMAGES, test_every: int = TEST_PERIOD) -> Capture:
@@ -250,81 +248,6 @@ def initial_points(folder: Path) -> tuple[Tensor, Tensor] | None:
         if (folder / name).is_file():
             return load_points(folder / name)
     return None
-
-
-PLY_TYPES = {
-    **dict.fromkeys(("float", "float32"), "<f4"), **dict.fromkeys(("double", "float64"), "<f8"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"), **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("ushort", "uint16"), "<u2"), **dict.fromkeys(("short", "int16"), "<i2"),
-    **dict.fromkeys(("uint", "uint32"), "<u4"), **dict.fromkeys(("int", "int32"), "<i4"),
-}  # fmt: skip
-
-
-def header_of(path: Path) -> list[str]:
-    """The lines of a .ply's header. Raises io.SceneError, naming the file."""
-    try:
-        return io.ply_header(path)
-    except io.SceneError as error:
-        raise io.SceneError(f"{path}: {error}") from None
-
-
-def is_scene(path: Path) -> bool:
-    """Whether a .ply holds Gaussians rather than points. Raises io.SceneError for what is no .ply."""
-    names = {line.split()[-1] for line in header_of(path) if line.startswith("property ")}
-    return set(io.PLY_COLUMNS) <= names
-
-
-def load_points(path: Path) -> tuple[Tensor, Tensor]:
-    """Positions (P, 3) float32, and colours (P, 3) float32 in [0, 1], grey where there are none, of a .ply of points.
-
-    Colours reach to 255 in the file, to 65535 as ushort, and to 1 where they are fractions and none is larger.
-
-    Raises io.SceneError for anything but a complete binary little-endian or ASCII file with finite x, y, z and
-    with colours in their range.
-    """
-    path = Path(path)
-    lines = header_of(path)
-    layout = ply_layout(lines)
-    try:
-        number, properties = ply_vertices(lines)
-    except io.SceneError as error:
-        raise io.SceneError(f"{path}: {error}") from None
-    count = number.split()[0]
-    if not count.isdecimal():
-        raise io.SceneError(f"{path}: expected a number of vertices, got {count}")
-    count = int(count)
-    known = all(len(words) == 2 and words[0] in PLY_TYPES for words in properties)
-    names = [words[-1] for words in properties]
-    if not known or not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
-        raise io.SceneError(f"{path}: expected vertices of numbers with x, y and z, each once, got {', '.join(names)}")
-    dtype = np.dtype([(name, PLY_TYPES[kind]) for kind, name in properties])
-    body = re.split(rb"end_header\r?\n", path.read_bytes(), maxsplit=1)[-1]
-    if layout == "binary_little_endian" and len(body) >= count * dtype.itemsize:
-        rows = np.frombuffer(body, dtype, count)
-    elif layout == "ascii":
-        try:
-            rows = np.array([tuple(line.split()[: len(names)]) for line in body.decode().splitlines()[:count]], dtype)
-        except (ValueError, OverflowError) as error:  # too few words, words that are no numbers of the type, or no text
-            raise io.SceneError(f"{path}: expected {len(names)} numbers in every row ({error})") from None
-    else:
-        raise io.SceneError(f"{path}: cut short, or neither ascii nor binary_little_endian but {layout}")
-    points = torch.from_numpy(np.stack([rows[axis].astype(np.float32) for axis in "xyz"], 1))
-    if len(rows) != count or not points.isfinite().all():
-        raise io.SceneError(f"{path}: expected {count} finite points, got {int(points.isfinite().all(1).sum())}")
-    if {"red", "green", "blue"} <= set(names):
-        stored = np.stack([rows[name] for name in ("red", "green", "blue")], 1)
-        colors = torch.from_numpy(_in_unit_range(stored))
-        if not ((colors >= 0) & (colors <= 1)).all():
-            raise io.SceneError(f"{path}: expected colours from 0 to 255, got {stored.min()} to {stored.max()}")
-        return points, colors
-    return points, torch.full_like(points, 0.5)
-
-
-def _in_unit_range(colors: np.ndarray) -> np.ndarray:
-    """Colours (P, 3) of a file as float32 in [0, 1], by the type and the largest of them."""
-    wide = colors.dtype == np.uint16
-    fractions = np.issubdtype(colors.dtype, np.floating) and not (colors > 1).any()
-    return colors.astype(np.float32) / np.float32(65535 if wide else 1 if fractions else 255)
 
 
 def _split(items: list[Photograph], test_every: int) -> tuple[list[Photograph], list[Photograph]]:

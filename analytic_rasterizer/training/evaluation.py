@@ -156,6 +156,6 @@ def save_pictures(
         for place, image in rendered(gaussians, [settings[view] for view in chosen], supersampling, ranks):
             image, truth = image.clamp(0, 1), pictures.truth(scale, chosen[place])
             row = torch.cat([truth, image, ERROR_GAIN * (image - truth).abs()], dim=2)
-            io.to_image(row).save(of_scale[place])
+            io.save_image(of_scale[place], row)
         files += of_scale
     return files

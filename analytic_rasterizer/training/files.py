@@ -1,20 +1,16 @@
-"""What a training writes. Every file gets a temporary name first, so that a full disk never costs the one before."""
+"""What a training writes, by `io.write_safely`: a full disk never costs the file that was there."""
 
 from __future__ import annotations
 
 import json
-import math
-import os
-from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from .. import io
-from ..footprints import resolve_footprint
 from ..gaussians import Gaussians
+from ..io.writing import as_json, write_json, write_safely, write_text
 
 CHECKPOINT, SCENE, CAMERAS = "checkpoint.pt", "scene.ply", "cameras.json"
 MIP_SCENE = "point_cloud_mip.ply"
@@ -31,52 +27,14 @@ def results_folder(path) -> Path:
     return folder
 
 
-def write_safely(path: Path, write: Callable[[Path], None]) -> None:
-    """Lets `write` fill a file beside `path`, and gives it that name once it is complete and on the disk.
-
-    Raises OSError, naming the file, if it cannot be written; an earlier file of this name is then still there.
-    """
-    # The suffix stays: writers tell formats by it.
-    temporary = path.with_name(f".{path.stem}.partial{path.suffix}")
-    try:
-        write(temporary)
-        with temporary.open("rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except (OSError, RuntimeError) as error:  # torch.save raises RuntimeError when the disk is full
-        reason = getattr(error, "strerror", None) or str(error).partition("\n")[0]
-        raise OSError(f"{path}: cannot be written ({reason}); an earlier file of this name is unchanged") from error
-    finally:
-        with suppress(OSError):  # where files cannot be removed either, the first error is the one to report
-            temporary.unlink(missing_ok=True)
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Numbers that are not finite, such as the PSNR of a picture without any error, become null."""
-    text = json.dumps(_as_json(value), indent=1, allow_nan=False) + "\n"
-    write_safely(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
-
-
-def _as_json(value: Any) -> Any:
-    """What JSON has a word for: it has none for infinity and NaN, and other programs refuse files with Python's."""
-    if isinstance(value, dict):
-        return {key: _as_json(of_key) for key, of_key in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_as_json(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
 def write_log(path: Path, entries: list[dict]) -> None:
     """One JSON object per line, with null as in `write_json`."""
-    text = "".join(json.dumps(_as_json(entry), allow_nan=False) + "\n" for entry in entries)
-    write_safely(path, lambda temporary: temporary.write_text(text, encoding="utf-8"))
+    write_text(path, "".join(json.dumps(as_json(entry), allow_nan=False) + "\n" for entry in entries))
 
 
 def write_scene(path: Path, scene: Gaussians, footprint: str) -> None:
-    """A 3DGS .ply. Unless it was trained with `point`, a comment tells viewers that pixels were integrated."""
-    antialiased = resolve_footprint(footprint).name != "point"
-    comments = ["SplatRenderMode: mip"] if antialiased else []
-    write_safely(path, lambda temporary: io.save_scene(temporary, scene, comments))
+    """The scene in a file that says for which footprint it is."""
+    io.save_scene(path, scene, io.SceneMetadata(footprint=footprint))
 
 
 def write_cameras(path: Path, views: list[io.View]) -> None:

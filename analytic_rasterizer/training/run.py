@@ -18,7 +18,7 @@ from .. import io
 from ..distributed.ranks import ALONE, Ranks
 from ..filters import bake_pixel
 from ..gaussians import Gaussians
-from .captures import IMAGES, TEST_PERIOD, Capture, Photograph, is_scene, load_capture, load_points
+from .captures import IMAGES, TEST_PERIOD, Capture, Photograph, load_capture
 from .evaluation import evaluate, psnr
 from .files import (
     CAMERAS,
@@ -34,7 +34,6 @@ from .files import (
     write_checkpoint,
     write_json,
     write_log,
-    write_safely,
     write_scene,
 )
 from .options import TrainingOptions
@@ -189,7 +188,7 @@ class Run:
         scales, opacities = bake_pixel(scene.means, scene.scales, scene.rotations, scene.opacities, cameras)
         baked = self._whole(scene.with_activated(scales, opacities))
         if self.ranks.is_first:
-            write_safely(self.out / MIP_SCENE, lambda temporary: io.save_scene(temporary, baked))
+            write_scene(self.out / MIP_SCENE, baked, "point")
         return self.out / MIP_SCENE
 
     def start_viewer(self, port: int = 0) -> LiveViewer:
@@ -329,7 +328,7 @@ def first_gaussians(options: TrainingOptions, capture: Capture, points) -> tuple
     Raises:
         ValueError: A scene without Gaussians, or with more than `max_gaussians`; what `starting_gaussians` raises.
     """
-    if points is not None and is_scene(Path(points)):
+    if points is not None and io.is_scene(points):
         scene = io.load_scene(points)
         if not len(scene.means):  # from which nothing would ever grow
             raise io.SceneError(f"{points}: the scene has no Gaussians")
@@ -337,7 +336,7 @@ def first_gaussians(options: TrainingOptions, capture: Capture, points) -> tuple
             expected = f"at least {len(scene.means)}, the Gaussians of {points}, or 0"
             raise ValueError(f"max_gaussians must be {expected}, got {options.max_gaussians}")
         return scene.with_sh_degree(options.sh_degree).trainable(), None
-    found = capture.points if points is None else load_points(points)
+    found = capture.points if points is None else io.load_points(points)
     return starting_gaussians(options, found), None if found is None else len(found[0])
 
 

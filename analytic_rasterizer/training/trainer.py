@@ -386,7 +386,9 @@ def starting_gaussians(options: TrainingOptions, points: tuple[Tensor, Tensor] |
             means, colors = means[rows], colors[rows]
     if len(means) < 2:
         raise io.SceneError(f"training needs at least 2 points to start from, got {len(means)}")
-    return Gaussians.from_points(means, colors, options.sh_degree, options.initial_opacity, options.initial_scale)
+    # Distances are those of the positions as they are given, float64 too.
+    colors, first = colors.to(means.dtype), (options.sh_degree, options.initial_opacity, options.initial_scale)
+    return Gaussians.from_points(means, colors, *first).map(Tensor.float)
 
 
 def background_of(options: TrainingOptions, convention: tuple[float, float, float]) -> tuple | None:

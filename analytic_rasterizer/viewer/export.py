@@ -6,8 +6,8 @@ import base64
 import gzip
 import hashlib
 import re
-from pathlib import Path
 
+from ..io import write_bytes
 from .packing import PackedScene
 from .pages import MODULES, WORKER, content_security_policy, page_file
 
@@ -47,7 +47,7 @@ def export_page(path, scene: PackedScene) -> int:
         "\n".join([*data, f'<script type="module">{script}</script>']),
     )
     content = html.encode()
-    Path(path).write_bytes(content)
+    write_bytes(path, content)
     return len(content)
 
 

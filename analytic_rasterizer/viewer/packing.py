@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import gzip
 import json
-import struct
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 
@@ -75,33 +72,11 @@ def page_footprint(footprint: Footprint) -> str:
 
 
 def footprint_of_file(path) -> str | None:
-    """The footprint that a scene file asks for, or None where it says nothing.
+    """The footprint that the page draws a scene file with: `mip` where it says that pixels are to be integrated.
 
-    Files of scenes that were trained with an antialiasing filter say so: a .ply in a comment, `SplatRenderMode: mip` or
-    `antialiased 1`, and an .spz in a flag of its header. Such scenes are drawn with `mip`.
+    None where the file says nothing. `io.read_metadata` has all that it says.
     """
-    path = Path(path)
-    if path.suffix == ".spz":
-        antialiased = _spz_flags(path) & 1
-    else:
-        comments = [line.split()[1:] for line in io.ply_header(path) if line.startswith("comment ")]
-        antialiased = ["SplatRenderMode:", "mip"] in comments or ["antialiased", "1"] in comments
-    return "mip" if antialiased else None
-
-
-def _spz_flags(path: Path) -> int:
-    """The byte of flags in the header of an .spz, which is compressed up to version 3; 0 if there is no header."""
-    with path.open("rb") as file:
-        start = file.read(2)
-    try:
-        with gzip.open(path) if start == b"\x1f\x8b" else path.open("rb") as file:
-            header = file.read(16)
-    except OSError:
-        return 0
-    if len(header) < 16 or header[:4] != b"NGSP":
-        return 0
-    (flags,) = struct.unpack_from("<14xB", header)
-    return flags
+    return "mip" if io.read_metadata(path).antialiased else None
 
 
 def pack_scene(

@@ -18,7 +18,7 @@ from ... import io
 from ...analysis.timing import describe_machine
 from ..captures import load_capture
 from ..evaluation import Perceptual, evaluate
-from ..files import CHECKPOINT, METRICS, OPTIONS, SCENE, write_json, write_safely
+from ..files import CHECKPOINT, METRICS, OPTIONS, SCENE, write_json, write_text
 from ..options import TrainingOptions, preset_values
 from ..pictures import load_pictures
 from ..run import Run
@@ -222,4 +222,4 @@ def _read(path: Path) -> dict[str, Any]:
 def _write(results: Results, out: Path) -> None:
     write_json(out / f"{results.table.name}.json", as_dict(results))
     text = markdown(results)
-    write_safely(out / f"{results.table.name}.md", lambda file: file.write_text(text, encoding="utf-8"))
+    write_text(out / f"{results.table.name}.md", text)

@@ -1,0 +1,120 @@
+"""Metadata of scenes: for which footprint a scene was made, and the offset of its positions.
+
+A .ply holds metadata in comments, an .spz in a flag and an extension, a .sog in its meta.json. A .splat holds none.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from ..footprints import resolve_footprint
+from . import ply, sog, spz
+from .common import first_line, scene_file
+
+OWN = "analytic_rasterizer"  # the first word of lines that only this package reads
+ANTIALIASED = "SplatRenderMode: mip"  # the line that other programs read
+
+
+@dataclass(frozen=True)
+class SceneMetadata:
+    """What a file of a scene says beside its Gaussians. None where it says nothing.
+
+    Attributes:
+        footprint: The footprint that the scene was trained with or baked for, such as "moment:samples=4". Only files of
+            this package say it.
+        antialiased: Whether the scene wants pixels that are integrated. Other programs say so too, after a training
+            with an antialiasing filter. In an .spz, False is also what programs write that know nothing about it.
+        offset: (x, y, z), world units. Positions in the world are those of the file plus this.
+        comments: Other lines of text.
+    """
+
+    footprint: str | None = None
+    antialiased: bool | None = None
+    offset: tuple[float, float, float] | None = None
+    comments: tuple[str, ...] = ()
+
+    def checked(self) -> SceneMetadata:
+        """The same as it is written: the footprint with all of its options, and `antialiased` as that footprint is.
+
+        Raises ValueError for an unknown footprint, an offset that is not three finite numbers, and comments that are
+        not single lines of ASCII.
+        """
+        found = replace(self, comments=tuple(self.comments))
+        for comment in found.comments:
+            if not comment.isascii() or not comment.isprintable():
+                raise ValueError(f"comments must be single lines of ASCII, got {comment!r}")
+        if found.offset is not None:
+            offset = tuple(float(value) for value in found.offset)
+            if len(offset) != 3 or not all(math.isfinite(value) for value in offset):
+                raise ValueError(f"offset must be three finite numbers, got {self.offset}")
+            found = replace(found, offset=offset)
+        if found.footprint is not None:
+            footprint = resolve_footprint(found.footprint)
+            found = replace(found, footprint=str(footprint), antialiased=footprint.name != "point")
+        return found
+
+    def lines(self) -> list[str]:
+        """The comments of a .ply that say this."""
+        lines = [ANTIALIASED] if self.antialiased else []
+        if self.footprint is not None:
+            lines.append(f"{OWN} footprint {self.footprint}")
+        if self.offset is not None:
+            lines.append(f"{OWN} offset {' '.join(repr(value) for value in self.offset)}")
+        return [*lines, *self.comments]
+
+    def lost(self) -> list[str]:
+        """What is lost with a file that holds no metadata, in words. `point` is what is assumed of such a file."""
+        lost = []
+        if self.antialiased:
+            chosen = self.footprint or "mip"
+            lost.append(f"the footprint (give --footprint {chosen} where it is rendered)")
+        if self.offset is not None and any(self.offset):
+            lost.append(f"the offset {self.offset} of its positions")
+        return lost
+
+
+def metadata_of(lines: Sequence[str], where) -> SceneMetadata:
+    """What the comments of a .ply say. Warns, naming the file `where`, of lines of ours that make no sense."""
+    fields: dict[str, Any] = {}
+    others = []
+    for line in lines:
+        words = line.split()
+        if words[:1] == ["SplatRenderMode:"] and len(words) == 2:  # Brush, PlayCanvas
+            fields["antialiased"] = words[1] == "mip"
+        elif words in (["antialiased", "0"], ["antialiased", "1"]):  # Postshot
+            fields["antialiased"] = words[1] == "1"
+        elif words[:1] == [OWN] and words[1:2] in (["footprint"], ["offset"]):
+            _, name, *values = words
+            try:
+                value = " ".join(values) if name == "footprint" else tuple(map(float, values))
+                fields[name] = getattr(SceneMetadata(**{name: value}).checked(), name)
+            except (ValueError, TypeError) as error:
+                warnings.warn(f"{where}: '{line}' is not understood ({first_line(error)})", stacklevel=3)
+        else:
+            others.append(line.strip())
+    if "footprint" in fields:
+        fields["antialiased"] = SceneMetadata(fields["footprint"]).checked().antialiased
+    return SceneMetadata(**fields, comments=tuple(others))
+
+
+def read_metadata(path) -> SceneMetadata:
+    """What a file of a scene says beside its Gaussians, which are not read.
+
+    Warns of lines of this package that it does not understand: they are ignored.
+
+    Raises SceneError, which names the file, where it is not there or unreadable, or has the suffix of no format that
+    `load_scene` reads.
+    """
+    path, kind = scene_file(path)
+    if kind == "spz":
+        antialiased, lines = spz.read_metadata(path)
+        return replace(metadata_of(lines, path), antialiased=antialiased)
+    if kind == "sog":
+        return SceneMetadata(antialiased=sog.is_antialiased(path))
+    if kind == "splat":
+        return SceneMetadata()
+    return metadata_of(ply.read_header(path).comments, path)
