@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -25,7 +25,7 @@ from .health import check_left, check_visible, drop_broken
 from .model import random_points, render
 from .options import BACKGROUNDS, RANDOM_BACKGROUND, TrainingOptions
 from .pictures import Pictures
-from .schedule import PictureOrder, Progress, means_rate_at, rates_factor_at, sh_degree_at
+from .schedule import PictureOrder, Progress, growth_times, means_rate_at, rates_factor_at, sh_degree_at
 
 _picture_gradients = _C.Call("picture_gradients")
 
@@ -141,6 +141,26 @@ class Trainer:
         if self.options.filter_3d and (changed or progress.passed(FILTER_PERIOD)):
             self._compute_filter()
 
+    def measure(self, elapsed: float) -> None:
+        """Corrects a training by the clock by its seconds so far: the share that is over, and the times of growth.
+
+        In a training by steps nothing changes.
+        """
+        self.progress.measure(elapsed)
+        if self.options.seconds and self.options.density != "none":
+            times = growth_times(self.options, self.progress.expected(self.options.iterations))
+            self.density.options = replace(self.density.options, **times)
+
+    def change_length(self, factor: float) -> None:
+        """Recomputes the schedules where the steps or seconds in all are no longer those of the state that was loaded.
+
+        Args:
+            factor: Their number in the state over that of the options.
+        """
+        self.progress.rescale(factor)
+        if isinstance(self.density, GradientDensity):  # which had ended, or has to end now
+            self.density.growing = self.progress.share < self.density.options.densify_until
+
     def check(self) -> None:
         """Takes away Gaussians of which a number has left float32, and raises what `step` does. Collective."""
         drop_broken(self)
@@ -167,7 +187,7 @@ class Trainer:
     def _set_rates(self) -> None:
         """Gives the optimizer the learning rates of the next step."""
         options, over = self.options, self.progress.share
-        factor = rates_factor_at(self.progress.step, options)
+        factor = rates_factor_at(self.progress.step, options, self.progress.expected(options.iterations))
         for group, rate in zip(self.optimizer.param_groups, self.rates.values()):
             group["lr"] = rate * factor
         self.optimizer.param_groups[-1]["head_lr"] = options.color_rate * factor
@@ -357,7 +377,8 @@ def make_density(
     if options.density == "none":
         return FixedDensity(gaussians, optimizer, **common)
     kind = MonteCarloOptions if options.density == "mcmc" else GradientOptions
-    known = vars(options) | {"absolute": options.density == "absgrad", "white_background": white_background}
+    known = vars(options) | growth_times(options, options.iterations)
+    known |= {"absolute": options.density == "absgrad", "white_background": white_background}
     chosen = kind(**{field.name: known[field.name] for field in fields(kind)})
     if options.density == "mcmc":
         return MonteCarloDensity(gaussians, optimizer, chosen, **common)
