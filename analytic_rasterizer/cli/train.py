@@ -19,6 +19,7 @@ from ..training.captures import IMAGES, TEST_PERIOD
 from ..training.files import CHECKPOINT, SCENE, read_checkpoint
 from ..training.health import flag
 from ..training.options import BACKGROUNDS, DENSITIES, DOWNSAMPLINGS, PRESETS, RANDOM_BACKGROUND, TIMES, preset_values
+from ..training.reports import process_age
 from .arguments import add_machine_options, port, use_machine, whole_numbers
 from .launch import add_rank_options, is_launched, ranks_of
 
@@ -169,6 +170,7 @@ def run_on(ranks: Ranks, args) -> bool:
         raise ValueError(f"{checkpoint} exists: go on with --resume, or choose another --out")
     if args.export and resolve_footprint((stored or options).footprint).name == "point":
         raise ValueError("--export mip is for footprints that integrate over pixels, got point")
+    age = process_age()  # most of it is the import of torch
     training = Run(
         args.scene,
         args.out,
@@ -184,6 +186,8 @@ def run_on(ranks: Ranks, args) -> bool:
         given=chosen,
         ranks=ranks,
     )
+    if age is not None:
+        training.phases = {"start": age, **training.phases}
     if training.change and ranks.is_first:
         print(training.change, flush=True)
     limit, found = training.options.gaussian_limit, training.points_found

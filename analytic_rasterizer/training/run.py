@@ -79,7 +79,7 @@ class Run:
         points_found: How many points there are in the capture or the .ply that the training starts from, of which it
             takes at most `max_gaussians`; None where it starts from a scene, a checkpoint, or random points.
         change: What another length with `resume` means for the schedules, a sentence; "": it is the same.
-        phases: Seconds of wall time by what they were spent on: "load", "steps", "evaluate" and "write".
+        phases: Seconds of wall time by what they were spent on: "load", "warm up", "steps", "write" and "evaluate".
 
     Raises:
         io.SceneError, OSError, ImportError, ValueError: Before anything is written.
@@ -143,7 +143,7 @@ class Run:
         self.log = Log(self.out / LOG, self.history)
         self.board = TensorBoard(self.out, self.progress.step) if tensorboard else None
         results_folder(self.out)
-        self.phases = {"load": time.perf_counter() - began, "steps": 0.0, "evaluate": 0.0, "write": 0.0}
+        self.phases = {"load": time.perf_counter() - began, "warm up": 0.0, "steps": 0.0, "write": 0.0, "evaluate": 0.0}
 
     @property
     def progress(self):
@@ -172,7 +172,7 @@ class Run:
                 self.log.begin()
         trainer, progress = self.trainer, self.progress
         if self.clock.total == 0:
-            with self._phase("load"):
+            with self._phase("warm up"):
                 trainer.warm_up()
         figures = ""
         if viewer is not None:

@@ -17,12 +17,12 @@ from ..effects import Effects
 from ..filters import apply_3d_filter, compute_3d_filter
 from ..gaussians import Gaussians
 from ..losses import l1_ssim
-from ..optim import FusedAdam
 from ..settings import GaussianRasterizationSettings
 from .captures import WHITE
 from .extent import extent_of
 from .health import check_left, check_visible, drop_broken
 from .model import random_points, render
+from .optimizer import TrainingAdam
 from .options import BACKGROUNDS, RANDOM_BACKGROUND, TrainingOptions
 from .pictures import Pictures
 from .schedule import PictureOrder, Progress, growth_times, means_rate_at, rates_factor_at, sh_degree_at
@@ -91,7 +91,7 @@ class Trainer:
         }
         groups = [{"params": [getattr(gaussians, name)], "lr": self.rates[name]} for name in Gaussians._fields]
         groups[-1] |= {"head": 1, "head_lr": options.color_rate}  # the constant
-        self.optimizer = FusedAdam(groups, eps=ADAM_EPS)
+        self.optimizer = TrainingAdam(groups, eps=ADAM_EPS)
         self.density = make_density(options, gaussians, self.optimizer, self.extent, background == WHITE, ranks)
         self.generator = torch.Generator(self.device).manual_seed(options.seed + 1)
         self.progress = Progress(options.iterations if options.seconds == 0 else None, options.seconds)
