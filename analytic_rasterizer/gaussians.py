@@ -42,18 +42,25 @@ class Gaussians(NamedTuple):
 
     @classmethod
     def from_points(
-        cls, points: Tensor, colors: Tensor | None = None, sh_degree: int = 3, opacity: float = 0.1, scale: float = 1.0
+        cls,
+        points: Tensor,
+        colors: Tensor | None = None,
+        sh_degree: int = 3,
+        opacity: float = 0.1,
+        scale: float = 1.0,
+        dtype: torch.dtype = torch.float32,
     ) -> Gaussians:
         """Round Gaussians at points, of the size of the gaps between the points: what a training starts from.
 
         Args:
-            points: (N, 3) world units, float32 or float64, at least two. On any device; the neighbours are found on the
-                CPU.
-            colors: (N, 3) in [0, 1], of the dtype and on the device of points; None: grey, which is the quickest to
-                unlearn.
+            points: (N, 3) world units, of a floating-point dtype, at least two. On any device; the neighbours are found
+                on the CPU.
+            colors: (N, 3) in [0, 1], of a floating-point dtype, on the device of points; None: grey, which is the
+                quickest to unlearn.
             sh_degree: Degree of the spherical harmonics, 0 to 3. All but the constant are 0.
             opacity: Of every Gaussian, above 0 and below 1.
             scale: Standard deviations, in root mean square distances of a point to its three nearest neighbours.
+            dtype: Of the result: float32, or on the CPU also float64.
 
         Raises:
             ImportError: SciPy is missing.
@@ -71,9 +78,8 @@ class Gaussians(NamedTuple):
             if tensor.dim() != 2 or tensor.shape[1] != 3 or len(tensor) != len(points) or len(tensor) < 2:
                 expected = "(N, 3) with N at least 2, both of the same N"
                 raise ValueError(f"{name} must have shape {expected}, got {tuple(tensor.shape)}")
-            if tensor.dtype != points.dtype or tensor.device != points.device:
-                expected = f"{points.dtype} on {points.device}, as points"
-                raise ValueError(f"{name} must be {expected}, got {tensor.dtype} on {tensor.device}")
+            if tensor.device != points.device:
+                raise ValueError(f"{name} must be on the device of points, {points.device}, got {tensor.device}")
         check_value("points", bool(points.isfinite().all()), "finite", "NaN or infinity")
         if not ((colors >= 0) & (colors <= 1)).all():
             raise ValueError(f"colors must be in [0, 1], got {colors.min().item():g} to {colors.max().item():g}")
@@ -81,10 +87,12 @@ class Gaussians(NamedTuple):
         check_value("sh_degree", 0 <= sh_degree <= 3, "0 to 3", sh_degree)
         check_value("opacity", 0 < plain_value("opacity", opacity, float) < 1, "above 0 and below 1", opacity)
         check_value("scale", 0 < plain_value("scale", scale, float) < math.inf, "positive and finite", scale)
-        count = len(points)
+        check_value("dtype", dtype in (torch.float32, torch.float64), "float32 or float64", dtype)
+        count, distances = len(points), neighbour_distance(points)
+        points, colors, distances = (tensor.detach().to(points.device, dtype) for tensor in (points, colors, distances))
         return cls(
             points,
-            (scale * neighbour_distance(points)).log()[:, None].repeat(1, 3),
+            (scale * distances).log()[:, None].repeat(1, 3),
             points.new_tensor([[1.0, 0, 0, 0]]).repeat(count, 1),
             points.new_full((count, 1), opacity).logit(),
             torch.cat([(colors[:, None] - 0.5) / SH_C0, points.new_zeros(count, (sh_degree + 1) ** 2 - 1, 3)], dim=1),
@@ -160,18 +168,18 @@ class Gaussians(NamedTuple):
 
 
 def neighbour_distance(points: Tensor) -> Tensor:
-    """Root mean square distance of each of the (N, 3) points to its three nearest others, (N,), at least 1e-7.
+    """Root mean square distance of each of the (N, 3) points to its three nearest others, at least 1e-7.
 
-    Of the dtype and on the device of points; of fewer than four points all others count.
+    (N,) float64 on the CPU. Of fewer than four points all others count.
 
     Raises:
         ImportError: SciPy is missing.
     """
     from .io.common import optional_import  # which imports this module with its package
 
-    places = points.detach().double().cpu().numpy()
-    tree = optional_import("scipy.spatial", "train").cKDTree(places)
+    positions = points.detach().double().cpu().numpy()
+    tree = optional_import("scipy.spatial", "train").cKDTree(positions)
     neighbours = min(NEIGHBOURS, len(points) - 1)
-    distances, _ = tree.query(places, k=neighbours + 1)
+    distances, _ = tree.query(positions, k=neighbours + 1)
     nearest = torch.from_numpy(distances).reshape(len(points), -1)[:, 1:]  # the first is the point itself
-    return nearest.square().mean(1).sqrt().nan_to_num(0).to(points).clamp_min(1e-7)
+    return nearest.square().mean(1).sqrt().nan_to_num(0).clamp_min(1e-7)

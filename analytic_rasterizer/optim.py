@@ -168,16 +168,17 @@ def replace_rows(
 ) -> dict[str, Tensor]:
     """Removes and adds rows of tensors that have one row per Gaussian, and of the optimiser's state for them.
 
-    A parameter of the optimiser is replaced by a new leaf in the same group. Those tensors of its state that have the
-    parameter's shape, such as both moments of Adam, keep the rows that are kept and get zeros for the added ones;
-    the rest of the state, such as the number of steps, stays. A parameter that has no state yet gets none. Tensors that
-    are not parameters, such as labels, only get the new rows.
+    A parameter of the optimiser is replaced by a new leaf in the same group. Tensors of its state that have the shape
+    of the parameter, such as both moments of Adam, keep the rows of `kept`, and get zeros for the rows of `added`. All
+    else in the state, such as the number of steps, stays as it is. A parameter without state gets none. Tensors that
+    are no parameters, such as labels, only get the new rows.
 
     Args:
-        optimizer: Any optimiser of torch, also `FusedAdam` and `SparseGaussianAdam`. Its other parameters stay.
+        optimizer: Any optimiser of torch, `FusedAdam` and `SparseGaussianAdam` among them. Its parameters that are not
+            in `tensors` stay.
         tensors: Tensors by name, each (P, ...).
-        kept: (P,) bool, which rows stay, or (n,) int64, their numbers.
-        added: Rows that follow those, under the same names, each (m, ...); all zero rows long where nothing is added.
+        kept: (P,) bool, the rows to keep, or (n,) int64, their numbers.
+        added: Rows to put after the kept ones, by the same names, each (m, ...); `tensor[:0]` where there are none.
 
     Returns:
         The new tensors by name, each (n + m, ...). They have no gradients.

@@ -2,11 +2,13 @@
 
 import copy
 import math
+import re
 from dataclasses import fields
 
 import numpy as np
 import pytest
 import torch
+from conftest import ROOT
 
 import analytic_rasterizer as ar
 import train_loop
@@ -342,7 +344,7 @@ def test_gaussians_at_points(device):
     axis = torch.arange(3.0)
     points = 0.2 * torch.cartesian_prod(axis, axis, axis).to(device, torch.float64)
     colors = torch.linspace(0, 1, 81, device=device, dtype=torch.float64).reshape(27, 3)
-    made = ar.Gaussians.from_points(points, colors, sh_degree=2, opacity=0.3, scale=0.5)
+    made = ar.Gaussians.from_points(points, colors, sh_degree=2, opacity=0.3, scale=0.5, dtype=torch.float64)
     assert made.sh_degree == 2 and made.count == 27
     assert all(field.dtype == torch.float64 and field.device.type == device for field in made)
     # Every point of the grid has three neighbours at its spacing.
@@ -350,7 +352,11 @@ def test_gaussians_at_points(device):
     torch.testing.assert_close(made.opacities, torch.full_like(points[:, :1], 0.3))
     torch.testing.assert_close(0.5 + 0.28209479177387814 * made.shs[:, 0], colors)
     assert (made.shs[:, 1:] == 0).all() and (made.rotations[:, 0] == 1).all()
+    # Gaps of coordinates that float32 does not resolve.
+    far = ar.Gaussians.from_points(points + 5e6, colors.float(), scale=0.5)
+    torch.testing.assert_close(far.scales, made.scales.float())
     grey = ar.Gaussians.from_points(points[:2])
+    assert all(field.dtype == torch.float32 for field in grey)
     assert (grey.shs == 0).all() and grey.sh_degree == 3
     leaves = made.leaves()
     assert all(leaf.is_leaf and leaf.requires_grad and leaf.is_contiguous() for leaf in leaves)
@@ -370,7 +376,7 @@ def test_gaussians_at_points(device):
         ({"colors": torch.zeros(4, 3)}, ValueError, r"colors must have shape .* got \(4, 3\)"),
         ({"colors": torch.full((5, 3), 200, dtype=torch.uint8)}, TypeError, "colors must have a floating-point dtype"),
         ({"colors": torch.full((5, 3), 200.0)}, ValueError, r"colors must be in \[0, 1\], got 200 to 200"),
-        ({"colors": torch.zeros(5, 3).double()}, ValueError, "colors must be torch.float32 on cpu, as points"),
+        ({"dtype": torch.float16}, ValueError, "dtype must be float32 or float64, got torch.float16"),
         ({"points": torch.full((5, 3), math.inf)}, ValueError, "points must be finite"),
         ({"sh_degree": 4}, ValueError, "sh_degree must be 0 to 3, got 4"),
         ({"opacity": 1}, ValueError, "opacity must be above 0 and below 1, got 1"),
@@ -384,7 +390,7 @@ def test_points_that_make_no_gaussians(wrong, error, message):
         ar.Gaussians.from_points(**arguments)
 
 
-# -------------------------------------------------------------------------------- the example
+# ----------------------------------------------------------------------- the example, the page
 
 
 @pytest.mark.parametrize("absolute", [True, False])
@@ -415,3 +421,24 @@ def test_example_writes_a_scene(tmp_path, monkeypatch, capsys):
     assert given == [(7000, 100_000)]
     assert io.load_scene(tmp_path / "out" / "scene.ply").count == 200
     assert capsys.readouterr().out.startswith("200 Gaussians, loss ")
+
+
+def test_code_of_the_page(tmp_path, monkeypatch):
+    for name in ("scipy", "gsply", "PIL"):
+        pytest.importorskip(name, reason="needs the train extra")
+    from capture_files import circle, write_nerf_synthetic
+
+    page = (ROOT / "docs" / "density.md").read_text()
+    loop, more, trainer = re.findall(r"```python\n(.*?)```", page, flags=re.S)
+    made, (points, _) = train_loop.own_pictures("cpu")
+    given = {"views": made.views, "points": points, "colors": None, "device": "cpu", "steps": 8}
+    given |= {"settings": made.settings[1], "pictures": [made.target(1, i) for i in range(8)] * 2}
+    exec(loop.replace("max_gaussians=300_000", "max_gaussians=300, densify_from=2, densify_every=2"), given)
+    assert len(points) < given["control"].gaussians.count <= 300
+    given["gaussians"] = ar.Gaussians.from_points(points).leaves()
+    exec(more, given)
+    assert given["features"].shape == (len(points), 16)
+    write_nerf_synthetic(tmp_path / "lego", circle(4), circle(2))
+    monkeypatch.chdir(tmp_path)
+    exec(trainer.replace("iterations=7000", "iterations=3, random_points=60"), given)
+    assert io.load_scene("scene.ply").count == 60 and given["trainer"].progress.step == 3

@@ -17,6 +17,9 @@ def test_wheel_and_sdist_hold_what_modules_read_and_say_that_they_are_annotated(
     assert done.returncode == 0, done.stderr[-4000:]
     (sources,) = info.rglob("SOURCES.txt")
     packed = set(sources.read_text().splitlines())
+    for module in (ROOT / "analytic_rasterizer").rglob("*.py"):
+        name = module.relative_to(ROOT)
+        assert (wheel / name).is_file(), f"{name}: its folder must be among the packages of pyproject.toml"
     pages = (ROOT / "analytic_rasterizer" / "viewer" / "page").glob("*.*")
     for name in ("analytic_rasterizer/py.typed", *(str(page.relative_to(ROOT)) for page in pages)):
         assert (wheel / name).is_file(), name

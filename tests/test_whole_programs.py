@@ -54,6 +54,11 @@ REPOSITORIES = {
 }
 
 
+def seeded(seed):
+    """A generator of the device that the test runs on."""
+    return torch.Generator(torch.get_default_device()).manual_seed(seed)
+
+
 class Camera:
     """Matrices as programs have them: transposed views of those that act on columns."""
 
@@ -89,7 +94,7 @@ class Camera:
 
 def photographs(cameras, exposures=None):
     """Pictures of other Gaussians than those that a program starts from."""
-    generator = torch.Generator().manual_seed(8)
+    generator = seeded(8)
     points = torch.randn(150, 3, generator=generator).clamp(-1.5, 1.5) * 0.6
     colors = torch.rand(150, 3, generator=generator)
     truth = ar.Gaussians.from_points(points, colors, sh_degree=0, opacity=0.9, scale=0.6)
@@ -107,8 +112,8 @@ class Program:
 
     def __init__(self, repository):
         self.repository, self.degree, self.interval = repository, 0, None
-        generator = torch.Generator().manual_seed(7)
-        columns = 0.8 * torch.randn(3, START, generator=generator).numpy().astype(np.float64)
+        generator = seeded(7)
+        columns = 0.8 * torch.randn(3, START, generator=generator).cpu().numpy().astype(np.float64)
         # Of a file's columns x, y and z: all x come first in memory.
         points = torch.tensor(np.vstack(list(columns)).T).float()
         assert points.stride() == (1, START)
@@ -271,7 +276,7 @@ class Program:
 
     def columns(self):
         """What the program stores, by the names of a .ply."""
-        values = {name: tensor.detach().numpy() for name, tensor in self.tensors.items()}
+        values = {name: tensor.detach().cpu().numpy() for name, tensor in self.tensors.items()}
         means, rest = values["means"], values["rest"].transpose(0, 2, 1).reshape(self.count, -1)
         named = dict(zip("xyz", means.T)) | {f"n{axis}": np.zeros(self.count) for axis in "xyz"}
         named |= {f"f_dc_{i}": values["dc"][:, 0, i] for i in range(3)}
@@ -303,7 +308,7 @@ def trained(repository, tmp_path, steps=STEPS):
     """The program after its training, its cameras, the losses and the numbers of Gaussians of all steps."""
     program, cameras = Program(repository), [Camera(0.5 * number) for number in range(VIEWS)]
     pictures = photographs(cameras, repository.exposure)
-    generator = torch.Generator().manual_seed(1)
+    generator = seeded(1)
     losses, counts, lowered = [], [], False
     for step in range(1, steps + 1):
         if repository.filtered and step % PERIOD == 1:
@@ -349,6 +354,15 @@ def assert_same_state(left, right):
         assert float(state["step"]) == float(other["step"]) > 0
 
 
+@pytest.fixture
+def by_default(device):
+    """Makes new tensors on the device."""
+    torch.set_default_device(device)
+    yield
+    torch.set_default_device(None)
+
+
+@pytest.mark.usefixtures("by_default")
 @pytest.mark.parametrize("name", REPOSITORIES)
 def test_training_program(tmp_path, name):
     pytest.importorskip("scipy", reason="needs the train extra")
@@ -367,14 +381,12 @@ def test_training_program(tmp_path, name):
     # What it stored, our files have too, and it reads what we store.
     stored = program.columns()
     write_ply(tmp_path / "point_cloud.ply", stored)
-    scene = io.load_scene(tmp_path / "point_cloud.ply")
+    scene = io.load_scene(tmp_path / "point_cloud.ply").to(torch.get_default_device())
     io.save_scene(tmp_path / "again.ply", scene)
     again = read_ply(tmp_path / "again.ply")
     assert stored.keys() <= again.keys() | {"nx", "ny", "nz"}
-    length = np.sqrt(sum(stored[f"rot_{i}"] ** 2 for i in range(4)))  # which is 1 in ours
     for column in again.keys() & stored.keys():
-        expected = stored[column] / length if column.startswith("rot_") else stored[column]
-        np.testing.assert_allclose(again[column], expected, rtol=1e-6, atol=1e-6)
+        np.testing.assert_array_equal(again[column], stored[column], column)
     with torch.no_grad():
         if repository.filtered:
             scene = scene.with_activated(*program.widened())
@@ -384,5 +396,9 @@ def test_training_program(tmp_path, name):
         if repository.dialect == "accel":
             arguments |= {"dc": arguments["shs"][:, :1], "shs": arguments["shs"][:, 1:]}
         shown, again_radii, *_ = drop_in.GaussianRasterizer(settings)(means2D=None, **arguments)
-    assert torch.equal(radii, again_radii)
-    torch.testing.assert_close(shown, picture, rtol=0, atol=1e-5)
+    # Activations differ in their last bits: a radius may be rounded up to the next number, and a pixel may gain or lose
+    # a splat at the least alpha that is drawn, 1/255.
+    assert ((radii - again_radii).abs() <= 1).all() and torch.equal(radii > 0, again_radii > 0)
+    different = (shown - picture).abs() > 1e-5
+    assert different.float().mean() < 1e-2
+    torch.testing.assert_close(shown, picture, rtol=0, atol=2 / 255)

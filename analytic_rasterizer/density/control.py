@@ -20,7 +20,7 @@ class FixedDensity:
         gaussians: What is trained: leaves that require gradients, each in a group of the optimizer. Fields other
             than the means may also require no gradient and be in no group; they are not trained, but split, reset and
             pruned with the others.
-        optimizer: Any of torch, or of `optim`, that has these parameters. It may have taken steps or not, and may have
+        optimizer: Any of torch, or of `optim`, that has these parameters. It need not have made a step, and may have
             other parameters, which stay as they are.
         extra: More tensors that have a row for each Gaussian, (N, ...), by name, such as features or labels: leaves in
             the optimizer's groups, or tensors without gradient. Their rows are cloned, split, moved and pruned with
@@ -71,8 +71,8 @@ class FixedDensity:
     def leaf(self) -> Tensor | None:
         """What to render the next picture with as `means2D`, so that it gets the gradient that `observe` reads.
 
-        (N, columns), uninitialized: its values are not read. None where the control does not want gradients, which the
-        rasterizer takes as well. Every picture of a step needs one of its own."""
+        (N, columns), uninitialized, for its values are not read. Every picture of a step needs its own. None where the
+        control wants no gradients; the rasterizer accepts that."""
         if not self.watches:
             return None
         means = self.gaussians.means
@@ -119,13 +119,13 @@ class FixedDensity:
     def after_step(self, step: int, share: float, stride: int = 1) -> bool:
         """Changes the Gaussians where it is time; to be called after every step of the optimizer.
 
-        Gradients that are still there are lost where Gaussians change.
+        Where Gaussians change, the new tensors have no gradients.
 
         Args:
             step: Steps taken, this one included.
             share: Of the training that is over, 0 to 1: `step / steps`.
-            stride: How many steps the last one of the optimizer stood for: a period is over when one of these steps is
-                a multiple of it.
+            stride: Steps that the last step of the optimizer stands for, where it stands for several. A period ends
+                if one of them is a multiple of it.
 
         Returns:
             Whether there are other Gaussians now.
