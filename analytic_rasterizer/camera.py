@@ -243,6 +243,8 @@ class View:
     w2c: torch.Tensor  # (4, 4) float64, world to camera, OpenCV axes
     cx: float | None = None  # principal point; None is the centre
     cy: float | None = None
+    # (x, y, z), world units: positions in the world are those of w2c plus this. None: they are the same.
+    offset: tuple[float, float, float] | None = None
 
     def __post_init__(self):
         for field in fields(self):
@@ -261,6 +263,16 @@ class View:
 
     def _other_fields(self) -> tuple:
         return tuple(getattr(self, field.name) for field in fields(self) if field.name != "w2c")
+
+    def in_frame(self, offset: tuple[float, float, float] | None) -> View:
+        """The same camera with positions relative to another offset, as those of a scene with this offset are."""
+        zero = (0.0, 0.0, 0.0)
+        if (self.offset or zero) == (offset or zero):
+            return self
+        shift = [to - of for to, of in zip(offset or zero, self.offset or zero)]
+        w2c = self.w2c.double().clone()
+        w2c[:3, 3] += w2c[:3, :3] @ w2c.new_tensor(shift)
+        return replace(self, w2c=w2c, offset=offset)
 
     def size(self, scale: float = 1.0) -> tuple[int, int]:
         """(width, height) of the picture at `scale`: rounded, at least 1."""

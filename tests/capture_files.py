@@ -13,19 +13,25 @@ from analytic_rasterizer.gaussians import SH_C0, Gaussians
 
 image = pytest.importorskip("PIL.Image", reason="needs the train extra")
 
+from analytic_rasterizer.training import colmap  # noqa: E402
 from analytic_rasterizer.training import model as g  # noqa: E402
 
 
-def write_colmap(folder, views, points, colors, model=1) -> None:
-    """A reconstruction with one camera per view, observations and tracks included."""
+def write_colmap(folder, views, points, colors, model=1, coefficients=None) -> None:
+    """A reconstruction with one camera per view, observations and tracks included.
+
+    Views are named after their files; a name without a suffix is that of a .png.
+    """
     folder.mkdir(parents=True)
     cameras, images = [struct.pack("<Q", len(views))], [struct.pack("<Q", len(views))]
     for i, view in enumerate(views):
-        parameters = camera_parameters(view, model)
+        parameters = camera_parameters(view, model, coefficients)
         cameras.append(struct.pack(f"<iiQQ{len(parameters)}d", i + 1, model, view.width, view.height, *parameters))
         turn = quaternion(view.w2c[:3, :3])
         images.append(struct.pack("<i7di", i + 7, *turn, *view.w2c[:3, 3].tolist(), i + 1))
-        images.append(f"{view.name}.png".encode() + b"\0" + struct.pack("<Qddqddq", 2, 1, 2, -1, 3, 4, 5))
+        images.append(
+            file_name(view).encode("utf-8", "surrogateescape") + b"\0" + struct.pack("<Qddqddq", 2, 1, 2, -1, 3, 4, 5)
+        )
     (folder / "cameras.bin").write_bytes(b"".join(cameras))
     (folder / "images.bin").write_bytes(b"".join(images))
     records = [struct.pack("<Q", len(points))]
@@ -35,26 +41,34 @@ def write_colmap(folder, views, points, colors, model=1) -> None:
     (folder / "points3D.bin").write_bytes(b"".join(records))
 
 
-def write_colmap_text(folder, views, points, colors, model=1) -> None:
+def write_colmap_text(folder, views, points, colors, model=1, coefficients=None) -> None:
     """The same as text."""
     folder.mkdir(parents=True)
-    name = {0: "SIMPLE_PINHOLE", 1: "PINHOLE", 4: "OPENCV"}[model]
+    name = colmap.BY_NUMBER[model].name
     cameras, images, rows = ["# comment"], ["# comment"], ["# comment"]
     for i, view in enumerate(views):
-        cameras.append(" ".join(map(str, [i + 1, name, view.width, view.height, *camera_parameters(view, model)])))
+        parameters = camera_parameters(view, model, coefficients)
+        cameras.append(" ".join(map(str, [i + 1, name, view.width, view.height, *parameters])))
         pose = [*quaternion(view.w2c[:3, :3]), *view.w2c[:3, 3].tolist()]
-        images.append(" ".join(map(str, [i + 7, *pose, i + 1, f"{view.name}.png"])))
+        images.append(" ".join(map(str, [i + 7, *pose, i + 1, file_name(view)])))
         images.append("1.0 2.0 -1" if i % 2 else "")  # a picture may have no observations
     for i, (point, color) in enumerate(zip(points.tolist(), colors.tolist())):
         rows.append(" ".join(map(str, [i, *point, *color, 0.5, 1, 2])))
     for file, lines in (("cameras", cameras), ("images", images), ("points3D", rows)):
-        (folder / f"{file}.txt").write_text("\n".join(lines) + "\n")
+        (folder / f"{file}.txt").write_text("\n".join(lines) + "\n", encoding="utf-8", errors="surrogateescape")
 
 
-def camera_parameters(view, model) -> list[float]:
-    parameters = {0: [view.fx], 1: [view.fx, view.fy]}.get(model, [view.fx] * 2)
+def file_name(view) -> str:
+    return view.name if "." in view.name else f"{view.name}.png"
+
+
+def camera_parameters(view, model, coefficients=None) -> list[float]:
+    """Of a camera of this number in COLMAP; without coefficients all of them are zero."""
+    model = colmap.BY_NUMBER[model]
+    focal = [view.fx] if model.name.startswith(("SIMPLE_", "RADIAL")) else [view.fx, view.fy]
     center = [view.width / 2 if view.cx is None else view.cx, view.height / 2 if view.cy is None else view.cy]
-    return [*parameters, *center, *[0.0] * (4 if model == 4 else 0)]
+    known = [*focal, *center][: model.parameters]
+    return [*known, *(coefficients or [0.0] * (model.parameters - len(known)))]
 
 
 def quaternion(rotation) -> list[float]:
@@ -68,7 +82,7 @@ def looking_at_origin(angle: float, distance: float = 4.0) -> torch.Tensor:
     """World to camera from a place on a circle around y."""
     c, s = math.cos(angle), math.sin(angle)
     w2c = torch.eye(4, dtype=torch.float64)
-    w2c[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    w2c[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=torch.float64)
     w2c[2, 3] = distance
     return w2c
 

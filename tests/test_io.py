@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -633,3 +634,55 @@ def test_pictures_are_clamped_and_rounded():
     picture = np.asarray(io.to_image(color))
     assert picture.shape == (2, 6, 3)
     assert picture[1, :, 2].tolist() == [0, 0, 0, 1, 255, 255]
+
+
+def test_views_may_be_relative_to_an_offset(tmp_path):
+    """Both lists keep it, and the same camera can be had in the frame of another."""
+    training = pytest.importorskip("analytic_rasterizer.training", reason="needs the train extra")
+    w2c = torch.eye(4, dtype=torch.float64)
+    w2c[:3, :3] = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    view = io.View("a", 40, 30, 50.0, 51.0, w2c, offset=(5e5, 4.2e6, 100.0))
+    io.save_views(tmp_path / "plain.json", [view])
+    training.files.write_cameras(tmp_path / "cameras.json", [view])
+    for name in ("plain.json", "cameras.json"):
+        (read,) = io.load_views(tmp_path / name)
+        assert read.offset == view.offset and torch.equal(read.w2c, w2c)
+    world = view.in_frame(None)
+    assert world.offset is None
+    point = torch.tensor([5e5 + 1, 4.2e6 - 2, 103.0, 1], dtype=torch.float64)
+    near = torch.tensor([1.0, -2, 3, 1], dtype=torch.float64)
+    torch.testing.assert_close(world.w2c @ point, view.w2c @ near)
+    back = world.in_frame((5e5, 4.2e6, 100.0))
+    torch.testing.assert_close(back.w2c, w2c, rtol=0, atol=1e-8)
+    assert view.in_frame(view.offset) is view and world.in_frame((0.0, 0.0, 0.0)) is world
+    for wrong in ("far", [1, 2], [1, 2, math.nan]):
+        entry = {"width": 4, "height": 3, "fx": 5, "fy": 5, "offset": wrong, "w2c": w2c.flatten().tolist()}
+        (tmp_path / "wrong.json").write_text(json.dumps([entry]))
+        with pytest.raises(io.SceneError, match=r"wrong\.json: view 0: offset must hold 3 finite numbers"):
+            io.load_views(tmp_path / "wrong.json")
+
+
+def test_ignored_distortion_is_named_once(tmp_path):
+    pose = torch.eye(4).tolist()
+    frames = [{"file_path": f"{i}.png", "transform_matrix": pose} for i in range(3)]
+    content = {"w": 40, "h": 30, "fl_x": 50, "k1": 0.1, "k2": 0.0, "frames": frames}
+    content["frames"][1]["p1"] = 0.01
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.warns(UserWarning, match=r"the lens distortion of 3 views \(k1, p1\) is ignored") as told:
+        io.load_views(tmp_path / "transforms.json")
+    assert len(told) == 1 and told[0].filename == __file__
+    del content["k1"], content["frames"][1]["p1"]
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        io.load_views(tmp_path / "transforms.json")
+
+
+@pytest.mark.parametrize("name", [r"pictures\A.PNG", "./Pictures/a.png", "pictures/a", "/elsewhere/pictures/a.jpg"])
+def test_sizes_come_from_pictures_however_they_are_spelled(tmp_path, name):
+    (tmp_path / "pictures").mkdir()
+    pytest.importorskip("PIL.Image").new("RGB", (12, 9)).save(tmp_path / "pictures" / "a.png")
+    frames = [{"file_path": name, "transform_matrix": torch.eye(4).tolist()}]
+    (tmp_path / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.7, "frames": frames}))
+    (view,) = io.load_views(tmp_path / "transforms.json")
+    assert (view.width, view.height) == (12, 9)

@@ -131,8 +131,8 @@ def test_protocols_are_those_of_the_paper():
     plain, starred = ROWS[3], next(row for row in single.rows if row.published == "Ours*")
     assert plain.published == "Ours" and plain.options == starred.options == {"footprint": "analytic"}
     options = TrainingOptions(**blender.training_options(plain, "lego"))
-    assert (options.scales, options.scale_repeats, options.downsampling) == ((1, 2, 4, 8), (2, 1, 1, 1), "box")
-    assert options == TrainingOptions(**(multi.training_options(plain, "room") | {"downsampling": "box"}))
+    assert (options.scales, options.scale_repeats, options.downsampling) == ((1, 2, 4, 8), (2, 1, 1, 1), "blender")
+    assert options == TrainingOptions(**(multi.training_options(plain, "room") | {"downsampling": "blender"}))
     assert multi.training_options(plain, "room")["downsampling"] == "bicubic"
     assert multi.training == larger.training and TABLES["blender-stst"].training == TABLES["blender-stmt"].training
 
@@ -204,7 +204,8 @@ def test_a_table_is_trained_tested_and_written(blender, tmp_path):
     # The test is `evaluate` on the pictures of the scene, with the options of the row.
     for row, options in (("3dgs-ss", {"footprint": "point", "supersampling": 2}), ("moment", {"footprint": "moment"})):
         scene = io.load_scene(tmp_path / "blender-multi" / row / "lego" / files.SCENE)
-        test = training.load_pictures(training.load_capture(blender / "lego").test, (1, 2, 4, 8), captures.WHITE, "cpu")
+        test = training.load_capture(blender / "lego").test
+        test = training.load_pictures(test, (1, 2, 4, 8), captures.WHITE, "cpu", "blender")
         expected = evaluate(scene, test, **options)
         for scale in ("1", "2", "4", "8", "mean"):
             measured = results.tests[row]["lego"]["test"][scale]
@@ -459,7 +460,9 @@ def test_the_command_prints_the_table_and_measures_lpips_as_the_paper_did(blende
     assert "[1/1] box, lego" in captured.err
     assert "Departs from the protocol: preset quick, iterations = 1, seed = 4." in captured.out
     options = json.loads((tmp_path / "out" / "blender-single" / "box" / "lego" / files.OPTIONS).read_text())["options"]
-    quick = replace(TrainingOptions.preset("quick"), iterations=1, seed=4, footprint="box:samples=4")
+    quick = replace(
+        TrainingOptions.preset("quick"), iterations=1, seed=4, footprint="box:samples=4", downsampling="blender"
+    )
     assert TrainingOptions.from_dict(options) == quick
     # With the network there, another call measures it, and trains nothing.
     asked = []

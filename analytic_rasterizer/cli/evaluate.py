@@ -15,6 +15,7 @@ from ..training import TrainingOptions, evaluate, load_capture, load_lpips, load
 from ..training.evaluation import LPIPS_WEIGHTS, MEASURES
 from ..training.files import OPTIONS, SCENE, write_json
 from ..training.options import check_scales
+from ..training.run import capture_arguments
 from ..training.trainer import background_of
 from .arguments import add_machine_options, count, use_machine, whole_numbers, writable_folder
 from .launch import add_rank_options, ranks_of
@@ -57,13 +58,13 @@ def run_on(ranks: Ranks, args) -> None:
     try:
         described = json.loads((folder / OPTIONS).read_text(encoding="utf-8"))
         source, options = described["source"], TrainingOptions.from_dict(described["options"])
-        place, images, test_every = args.data or source["scene"], source["images"], source["test_every"]
+        place, arguments = args.data or source["scene"], capture_arguments({"offset": None} | source)
     except (ValueError, KeyError, TypeError) as error:
         raise io.SceneError(f"{folder / OPTIONS}: not what `train` writes ({error})") from None
     scales = tuple(dict.fromkeys(args.scales or options.scales))
     check_scales(scales)  # raises before the capture is read
     footprints = [str(resolve_footprint(name)) for name in args.footprints or [options.footprint]]
-    capture = load_capture(place, images, test_every)
+    capture = load_capture(place, **arguments)
     if not capture.test:
         raise io.SceneError(f"{place}: there are no test pictures")
     scene = part_of(io.load_scene(folder / SCENE), ranks).to(args.device)
@@ -71,6 +72,8 @@ def run_on(ranks: Ranks, args) -> None:
     pictures = load_pictures(
         capture.test, scales, background, args.device, options.downsampling, on_host=ranks.world > 1
     )
+    for note in capture.notes if ranks.is_first else ():
+        print(note, file=sys.stderr)
     lpips = None
     if args.lpips != "none":
         try:
@@ -87,7 +90,8 @@ def run_on(ranks: Ranks, args) -> None:
             save_pictures(out, scene, pictures, footprint, args.pictures, **common)
     if ranks.is_first:
         views = [view.name for view in pictures.views]
-        written = {"views": views, "supersampling": common["supersampling"], "results": results}
+        resampled = sum(item.lens is not None for item in capture.test)
+        written = {"views": views, "resampled": resampled, "supersampling": common["supersampling"], "results": results}
         write_json(folder / "evaluation.json", written)
         print(format_results(results, scales))
 

@@ -15,7 +15,7 @@ from .. import io
 from ..distributed.ranks import Ranks
 from ..footprints import resolve_footprint
 from ..training import Run, TrainingOptions
-from ..training.captures import IMAGES, TEST_PERIOD
+from ..training.captures import IMAGES, LENS_CHOICES, MISSING_CHOICES, TEST_PERIOD
 from ..training.files import CHECKPOINT, SCENE, read_checkpoint
 from ..training.health import flag
 from ..training.options import BACKGROUNDS, DENSITIES, DOWNSAMPLINGS, PRESETS, RANDOM_BACKGROUND, TIMES, preset_values
@@ -89,6 +89,12 @@ def add_parser(subcommands) -> None:
     add("--images", metavar="NAME", help=images)  # what is not given is None, for --resume
     test_every = f"where SCENE does not say: keep every N-th photograph for the test; 0: none (default: {TEST_PERIOD})"
     add("--test-every", type=int, metavar="N", help=test_every)
+    cameras = "file or folder in SCENE to read the cameras from, such as transforms.json or sparse/1 (default: found)"
+    add("--cameras", metavar="NAME", help=cameras)
+    lens = "photographs with lens distortion are resampled to pinholes, or an error (default: undistort)"
+    add("--lens", choices=LENS_CHOICES, help=lens)
+    missing = "pictures that are not there are an error, or left out with their cameras (default: refuse)"
+    add("--missing", choices=MISSING_CHOICES, help=missing)
     add("--points", metavar="FILE.ply", help="start from this: a 3DGS scene, or points with colours")
     preset = "options that belong together: quick, 7,000 steps; 3dgs, the recipe of 3DGS; what is given wins"
     add("--preset", choices=tuple(PRESETS), help=preset)
@@ -179,17 +185,20 @@ def run_on(ranks: Ranks, args) -> bool:
         images=args.images,
         test_every=args.test_every,
         points=args.points,
+        cameras=args.cameras,
+        lens=args.lens,
+        missing=args.missing,
         save_every=args.save_every,
         resume=args.resume,
         **length,
         tensorboard=args.tensorboard,
-        given=chosen,
+        chosen=chosen,
         ranks=ranks,
     )
     if age is not None:
         training.phases = {"start": age, **training.phases}
-    if training.change and ranks.is_first:
-        print(training.change, flush=True)
+    for note in training.notes if ranks.is_first else ():
+        print(note, file=sys.stderr)
     limit, found = training.options.gaussian_limit, training.points_found
     if found is not None and found > limit and ranks.is_first:
         print(f"starts from {limit:,} of {found:,} points, drawn at random (--max-gaussians)", file=sys.stderr)

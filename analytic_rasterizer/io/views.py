@@ -5,14 +5,21 @@ from __future__ import annotations
 import json
 import math
 import re
+import warnings
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from ..camera import View
 from .common import SceneError, first_line, opened_picture
+from .pictures import PictureFiles
 from .writing import write_text
+
+# What an entry of a transforms file may say of the lens; nothing, or zeros, for a pinhole.
+DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "distortion_params", "is_fisheye")
+PERSPECTIVE_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
 
 def load_views(path, size: tuple[int, int] | None = None) -> list[View]:
@@ -24,13 +31,29 @@ def load_views(path, size: tuple[int, int] | None = None) -> list[View]:
       world with OpenGL axes; camera_angle_x, or fl_x with fl_y, cx, cy, w, h, globally or by frame;
     - a list of {width, height, fx, fy, w2c} with w2c world-to-camera, 16 numbers by rows or 4 x 4.
 
-    cx, cy are optional everywhere (the image spans [0, width]; the centre is width / 2), lens
-    distortion is ignored. Views of a transforms file that states no image size have `size` = (width,
-    height), or that of their pictures; where a picture is missing, that of the first that exists.
+    cx, cy are optional everywhere (the image spans [0, width]; the centre is width / 2). The first and the last may
+    have `offset`, which positions are relative to, see `View`. Views of a transforms file that states no image size
+    have `size` = (width, height), or that of their pictures; where a picture is missing, that of the first that exists.
+
+    Warns of lens distortion, which is ignored.
 
     Raises SceneError, naming the file and the entry, for what is missing, malformed, not finite or
     not positive, and for an empty list.
     """
+    views, data = read_views(path, size)
+    shared = {key: value for key, value in data.items() if key != "frames"} if isinstance(data, dict) else {}
+    named = [distortion_of(shared | entry) for entry in (data["frames"] if isinstance(data, dict) else data)]
+    if any(named):
+        names = ", ".join(dict.fromkeys(name for names in named for name in names))
+        number = sum(map(bool, named))
+        warnings.warn(
+            f"{path}: the lens distortion of {number} views ({names}) is ignored: they are pinholes", stacklevel=2
+        )
+    return views
+
+
+def read_views(path, size: tuple[int, int] | None = None) -> tuple[list[View], Any]:
+    """What `load_views` returns, with the content of the file. Says nothing of distortion. Raises as that does."""
     path = Path(path)
     try:
         data = json.loads(path.read_text(encoding="utf-8-sig"))
@@ -42,7 +65,13 @@ def load_views(path, size: tuple[int, int] | None = None) -> list[View]:
         views = _views(data, path.parent, size)
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from None
-    return with_distinct_names(views)
+    return with_distinct_names(views), data
+
+
+def distortion_of(entry: dict) -> dict[str, Any]:
+    """What an entry of a transforms file, with what all share, says of the lens beyond a pinhole, by name."""
+    found = {name: entry.get(name) for name in DISTORTION}
+    return {name: value for name, value in found.items() if any(value if isinstance(value, list) else [value])}
 
 
 def save_views(path, views: list[View]) -> None:
@@ -50,7 +79,7 @@ def save_views(path, views: list[View]) -> None:
     entries = []
     for view in views:
         entry = {key: getattr(view, key) for key in ("name", "width", "height", "fx", "fy")}
-        entry |= {k: getattr(view, k) for k in ("cx", "cy") if getattr(view, k) is not None}
+        entry |= {k: getattr(view, k) for k in ("cx", "cy", "offset") if getattr(view, k) is not None}
         entries.append(entry | {"w2c": view.w2c.flatten().tolist()})
     write_text(path, json.dumps(entries, indent=1) + "\n")
 
@@ -101,13 +130,14 @@ def _listed_view(i: int, entry: dict) -> View:
         w2c=w2c,
         cx=_optional(entry, "cx", where),
         cy=_optional(entry, "cy", where),
+        offset=None if entry.get("offset") is None else checked_offset(entry["offset"], f"{where}: offset"),
     )
 
 
 def _transforms_view(i: int, frame: dict, shared: dict, size) -> View:
     where = f"frame {i}"
     entry = shared | frame  # a frame's own intrinsics go before the shared ones
-    _check_camera_model(entry.get("camera_model"))
+    _check_camera_model(entry.get("camera_model"), f"{where}: ")
     if "w" in entry or "h" in entry:
         width = checked_pixels(_get(entry, "w", where), f"{where}: w")
         height = checked_pixels(_get(entry, "h", where), f"{where}: h")
@@ -149,26 +179,29 @@ def _focal(entry: dict, length: str, angle: str, extent: int, where: str) -> flo
     return extent / (2 * math.tan(value / 2))
 
 
-def _check_camera_model(model) -> None:
-    if model not in (None, "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"):
-        raise SceneError(f"camera_model must be a pinhole camera, got {model!r}")
+def _check_camera_model(model, where: str = "") -> None:
+    if model is not None and model not in PERSPECTIVE_MODELS:
+        raise SceneError(
+            f"{where}camera_model must be that of a pinhole camera, got {model!r}; of lenses, training takes those of "
+            f"{', '.join(PERSPECTIVE_MODELS[2:])}: undistort the pictures first, with COLMAP's image_undistorter for "
+            "example"
+        )
 
 
 def _picture_sizes(folder: Path, frames: list[dict]) -> list[tuple[int, int] | None]:
     """Sizes of the pictures that the frames name; of those that do not exist, that of the first that does, or None."""
-    sizes = [_picture_size(folder, frame.get("file_path")) for frame in frames]
+    files = PictureFiles(folder)
+    sizes = [_picture_size(files, frame.get("file_path")) for frame in frames]
     usual = next((size for size in sizes if size is not None), None)
     return [usual if size is None else size for size in sizes]
 
 
-def _picture_size(folder: Path, name) -> tuple[int, int] | None:
-    if not isinstance(name, str):
+def _picture_size(files: PictureFiles, name) -> tuple[int, int] | None:
+    picture = files.find(name) if isinstance(name, str) else None
+    if picture is None or not picture.is_file():
         return None
-    for picture in (folder / name, folder / f"{name}.png"):
-        if picture.is_file():
-            with opened_picture(picture) as opened:
-                return opened.size
-    return None
+    with opened_picture(picture) as opened:
+        return opened.size
 
 
 def _picture_name(name, i: int) -> str:
@@ -229,6 +262,11 @@ def _numbers(value, shape: tuple[int, ...], where: str) -> torch.Tensor:
 def _is_number(value) -> bool:
     """A JSON number that float32 can hold, with room to multiply; not NaN, nor infinite."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) < 1e30
+
+
+def checked_offset(value, where: str) -> tuple[float, float, float]:
+    """Three finite numbers of a file. Raises SceneError, whose message begins with `where`."""
+    return tuple(_numbers(value, (3,), where).tolist())
 
 
 def checked_positive(value, where: str) -> float:

@@ -1,96 +1,179 @@
-"""Captures: photographs with cameras, and where they come from.
-
-Read are NeRF-synthetic scenes (transforms_train.json), the multi-scale Blender set (metadata.json), COLMAP
-reconstructions (sparse/0, sparse or colmap/sparse/0; binary or text) and nerfstudio captures (transforms.json).
-"""
+"""Captures: photographs with cameras, from a folder of any of the `layouts`."""
 
 from __future__ import annotations
 
-import json
-import os
 import warnings
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import torch
-from torch import Tensor
 
 from .. import io
-from ..io import load_points
-from ..io.views import checked_pixels, checked_pose, checked_positive
 from . import colmap
 from .extent import OUTLYING, is_one_pose, outliers_of
+from .layouts import BLACK, WHITE, Capture, Photograph, has_splits, read_layout
+from .lenses import window_of
+from .placement import offset_of
 
-BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+__all__ = ["BLACK", "WHITE", "Capture", "Photograph", "load_capture"]
+
 IMAGES, TEST_PERIOD = "images", 8
 RECONSTRUCTIONS = ("sparse/0", "sparse", "colmap/sparse/0")
-# What a transforms file may say of the lens; nothing, or zeros, for a pinhole.
-DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2", "distortion_params", "is_fisheye")
+LENS_CHOICES = ("undistort", "refuse")
+MISSING_CHOICES = ("refuse", "skip")
+SEARCH_DEPTH = 3  # folders below SCENE where an error looks for reconstructions
 
 
-class Photograph(NamedTuple):
-    """A camera, and the files of its picture by scale: 1 is always there, and makes the scales that are not."""
-
-    view: io.View
-    files: dict[int, Path]
-
-
-class Capture(NamedTuple):
-    """What a folder holds."""
-
-    train: list[Photograph]
-    test: list[Photograph]
-    background: tuple[float, float, float]  # by convention, behind pictures with alpha
-    points: tuple[Tensor, Tensor] | None  # (P, 3) on the CPU: positions, float32 or float64, and colours in [0, 1]
-
-
-def load_capture(folder, images: str = IMAGES, test_every: int = TEST_PERIOD) -> Capture:
+def load_capture(
+    folder,
+    images: str = IMAGES,
+    test_every: int = TEST_PERIOD,
+    *,
+    cameras: str | None = None,
+    lens: str = "undistort",
+    missing: str = "refuse",
+    offset: tuple[float, float, float] | None = None,
+) -> Capture:
     """Reads the cameras of a folder, and looks whether all of its pictures are there.
+
+    Of several reconstructions in `sparse` the one with the most pictures is read. Where a transforms.json is beside a
+    reconstruction, the one without lens distortion is read, or else the reconstruction; one that cannot be used is
+    passed over. `Capture.notes` say what was chosen.
 
     Args:
         folder: With one of the layouts of this module.
         images: Folder in it of the photographs of a COLMAP reconstruction.
         test_every: Where the capture does not say what is for the test: one in so many pictures, the first by name
             among them; 0 for none.
+        cameras: The file or folder in `folder` to read the cameras from, such as "transforms.json" or "sparse/1"; None:
+            chosen as above.
+        lens: "undistort": photographs of cameras with lens distortion are resampled to pinholes; "refuse": they are an
+            error.
+        missing: "refuse": pictures that are not there are an error; "skip": their cameras are left out.
+        offset: What to take off all positions, so that they are those of a scene with this offset. None: what
+            `offset_of` finds, which is nothing unless coordinates are far from zero.
 
-    Warns of masks in a nerfstudio capture, which are ignored, and of photographs that are left out because their
-    cameras are far from all others.
+    Warns of masks, which are ignored, and of photographs that are left out because their cameras are far from all
+    others.
 
     Raises:
-        io.SceneError: No such layout; missing pictures; no pictures to train with; all cameras with one pose; lens
-            distortion.
+        io.SceneError: No such layout; missing pictures; no pictures to train with; all cameras with one pose; a lens
+            that cannot be undistorted.
         OSError: A file that cannot be read.
-        ValueError: test_every is negative or 1.
+        ValueError: test_every is negative or 1; no such `lens` or `missing`.
     """
     if test_every < 0 or test_every == 1:
         raise ValueError(f"test_every must be 0 or at least 2, got {test_every}")
+    for name, value, choices in (("lens", lens, LENS_CHOICES), ("missing", missing, MISSING_CHOICES)):
+        if value not in choices:
+            raise ValueError(f"{name} must be one of {', '.join(choices)}, got {value}")
     folder = Path(folder)
     if not folder.is_dir():
         raise io.SceneError(f"{folder}: no such folder")
-    sparse = next((folder / name for name in RECONSTRUCTIONS if colmap.is_reconstruction(folder / name)), None)
-    others = sparse is not None or any(
-        (folder / name).exists() for name in ("transforms_train.json", "transforms.json")
-    )
-    if (folder / "metadata.json").exists() and not (others and not _has_splits(folder / "metadata.json")):
-        train, test = (multi_scale_blender(folder, split) for split in ("train", "test"))
-        capture = Capture(train, test, WHITE, None)
-    elif (folder / "transforms_train.json").exists():
-        test_file = folder / "transforms_test.json"
-        test = transforms(test_file)[0] if test_file.exists() else []
-        capture = Capture(transforms(folder / "transforms_train.json")[0], test, WHITE, initial_points(folder))
-    elif sparse is not None:
-        named = [Photograph(view, {1: folder / images / name}) for name, view in colmap.load_views(sparse)]
-        capture = Capture(*_split(named, test_every), BLACK, colmap.load_points(sparse))
-    elif (folder / "transforms.json").exists():
-        capture = nerfstudio(folder / "transforms.json", test_every)
-    else:
-        raise io.SceneError(
-            f"{folder}: expected transforms_train.json, metadata.json, transforms.json, or COLMAP's cameras, images "
-            "and points3D (.bin or .txt) in sparse/0"
-        )
-    capture = without_outliers(folder, capture)
+    capture = without_outliers(folder, read_cameras(folder, images, test_every, cameras, missing))
     check_capture(folder, capture)
-    return capture
+    if capture.masks:
+        warnings.warn(
+            f"{folder}: the masks of {capture.masks} pictures are ignored, all of their pixels count", stacklevel=2
+        )
+    photographs = [*capture.train, *capture.test]
+    distorted = [item for item in photographs if item.lens is not None]
+    if distorted and lens == "refuse":
+        raise io.SceneError(
+            f"{folder}: {len(distorted)} of {len(photographs)} photographs have lens distortion, the first is "
+            f"{distorted[0].files[1]} ({distorted[0].lens.model}): leave out --lens refuse, or undistort them first"
+        )
+    notes = list(capture.notes)
+    if distorted:
+        notes.append(_about_lenses(distorted, len(photographs)))
+    if offset is None:
+        positions = None if capture.points is None else capture.points[0]
+        offset = offset_of([item.view for item in photographs], positions)
+        if offset is not None:
+            where = ", ".join(f"{number:.15g}" for number in offset)
+            notes.append(f"coordinates are far from zero: positions are stored relative to ({where})")
+    return _relative_to(capture, offset)._replace(notes=tuple(notes))
+
+
+def read_cameras(folder: Path, images: str, test_every: int, cameras: str | None, missing: str) -> Capture:
+    """The capture in world coordinates, as far as files of cameras and points say. Arguments as `load_capture`."""
+
+    def read(place: Path) -> Capture:
+        capture = read_layout(folder, place, images, test_every)
+        return _without_missing(capture) if missing == "skip" else capture
+
+    if cameras is not None:
+        return read(folder / cameras)
+    places = _places(folder)
+    if not places:
+        raise io.SceneError(
+            f"{folder}: expected transforms_train.json, metadata.json, transforms.json, or COLMAP's cameras and images "
+            f"(.bin or .txt) in sparse/0{_elsewhere(folder)}"
+        )
+    found, passed_over = {}, {}
+    for place in places:
+        try:
+            found[place] = read(place)
+            if len(places) > 1:
+                check_capture(folder, found[place])
+        except io.SceneError as error:
+            found.pop(place, None)
+            passed_over[place] = error
+    if not found:
+        raise passed_over[places[0]]
+    plain = (place for place, its in found.items() if all(item.lens is None for item in (*its.train, *its.test)))
+    chosen = next(plain, next(iter(found)))
+    others = [place for place in (*found, *_models_beside(chosen)) if place != chosen]
+    notes = []
+    if others or passed_over:
+        offered = " or ".join(str(place.relative_to(folder)) for place in others)
+        instead = f"; --cameras takes {offered} instead" if others else ""
+        notes.append(f"cameras are those of {chosen.relative_to(folder)}{instead}")
+    notes += [f"passed over: {error}" for error in passed_over.values()]
+    return found[chosen]._replace(notes=(*found[chosen].notes, *notes))
+
+
+def _without_missing(capture: Capture) -> Capture:
+    """The capture without photographs of which a file is not there, and with a note that counts them."""
+    train, test = (
+        [item for item in items if all(path.is_file() for path in item.files.values())]
+        for items in (capture.train, capture.test)
+    )
+    before, after = (len(capture.train) + len(capture.test), len(train) + len(test))
+    notes = () if before == after else (f"{before - after} of {before} pictures are missing and left out",)
+    return capture._replace(train=train, test=test, notes=(*capture.notes, *notes))
+
+
+def _places(folder: Path) -> list[Path]:
+    """The files and folders that cameras can be read from: one, or a reconstruction and a transforms.json."""
+    sparse = next((folder / name for name in RECONSTRUCTIONS if colmap.is_reconstruction(folder / name)), None)
+    if sparse is None:  # without a model 0 there may be others
+        parents = [(folder / name).parent for name in RECONSTRUCTIONS if "/" in name]
+        sparse = next((models[0] for models in map(_models_in, parents) if models), None)
+    if sparse is not None:
+        sparse = max(_models_beside(sparse), key=colmap.count_pictures)
+    several = [place for place in (sparse, folder / "transforms.json") if place is not None and place.exists()]
+    synthetic, metadata = folder / "transforms_train.json", folder / "metadata.json"
+    others = several or synthetic.exists()
+    if metadata.exists() and not (others and not has_splits(metadata)):
+        return [metadata]
+    return [synthetic] if synthetic.exists() else several
+
+
+def _models_beside(model: Path) -> list[Path]:
+    """The reconstructions of COLMAP's mapper, which writes one for each part that it could not join: 0, 1, 2, .."""
+    return _models_in(model.parent) if model.is_dir() and model.name.isdecimal() else [model]
+
+
+def _models_in(folder: Path) -> list[Path]:
+    numbered = [path for path in folder.iterdir() if path.name.isdecimal()] if folder.is_dir() else []
+    return sorted(filter(colmap.is_reconstruction, numbered), key=lambda path: int(path.name))
+
+
+def _elsewhere(folder: Path) -> str:
+    """How an error that finds nothing in a folder goes on: with a reconstruction in a folder below."""
+    below = (path for depth in range(1, SEARCH_DEPTH + 1) for path in sorted(folder.glob("/".join("*" * depth))))
+    found = next((path.relative_to(folder) for path in below if colmap.is_reconstruction(path)), None)
+    return "" if found is None else f"; there is a reconstruction in {found} (--cameras {found}, --images FOLDER)"
 
 
 def check_capture(folder: Path, capture: Capture) -> None:
@@ -98,7 +181,10 @@ def check_capture(folder: Path, capture: Capture) -> None:
     files = [path for item in (*capture.train, *capture.test) for path in item.files.values()]
     missing = [path for path in files if not path.is_file()]
     if missing:
-        raise io.SceneError(f"{folder}: {len(missing)} of {len(files)} pictures are missing, the first is {missing[0]}")
+        raise io.SceneError(
+            f"{folder}: {len(missing)} of {len(files)} pictures are missing, the first is {missing[0]} (--missing skip "
+            "leaves them out)"
+        )
     if len(capture.train) < 2:
         raise io.SceneError(f"{folder}: training needs at least 2 pictures, got {len(capture.train)}")
     if is_one_pose([item.view for item in capture.train]):
@@ -127,131 +213,25 @@ def without_outliers(folder: Path, capture: Capture) -> Capture:
     return capture._replace(train=kept[:count], test=kept[count:])
 
 
-def transforms(path: Path) -> tuple[list[Photograph], dict[str, Any]]:
-    """The views of a transforms file and where their pictures are, in the order of the file; and all that it says.
-
-    Raises io.SceneError for what `io.load_views` refuses, for lists of cameras, which it reads too, and for lens
-    distortion, which it ignores.
-    """
-    views = io.load_views(path)
-    data = json.loads(path.read_text(encoding="utf-8-sig"))
-    if not isinstance(data, dict):
-        raise io.SceneError(f"{path}: expected a transforms file, which says where pictures are, got a list of cameras")
-    found = []
-    for i, (view, frame) in enumerate(zip(views, data["frames"])):
-        check_lens(data | frame, f"{path}: frame {i}")
-        found.append(Photograph(view, {1: _picture(path.parent, str(frame.get("file_path", "")))}))
-    return found, data
+def _about_lenses(distorted: list[Photograph], number: int) -> str:
+    """What is done with photographs that have a lens, in a sentence."""
+    lost = [1 - window_of(item.lens, item.view).kept for item in distorted]
+    low, high = (f"{100 * share:.1f}" for share in (min(lost), max(lost)))
+    models = ", ".join(sorted({item.lens.model for item in distorted}))
+    return (
+        f"{len(distorted)} of {number} photographs ({models}) are resampled to pinholes, for tests too, and lose "
+        f"{low if low == high else f'{low} to {high}'}% of their area at the border (--lens undistort)"
+    )
 
 
-def _picture(folder: Path, name: str) -> Path:
-    """The file that a transforms file names."""
-    file = folder / name
-    # NeRF-synthetic leaves out the suffix, and its names may hold points.
-    return file if file.is_file() else Path(f"{file}.png")
-
-
-def nerfstudio(path: Path, test_every: int) -> Capture:
-    """The capture of a transforms.json: its pictures by name, and the points of the file that it names.
-
-    Which pictures to train with and to test with is what its lists train_filenames, val_filenames and test_filenames
-    say, if it has any. The test takes the last, or where that is missing the one before. Without the first, the
-    training takes the pictures that neither of the others has. Without ply_file_path, points are looked for under their
-    usual names.
-
-    Warns of masks, which are ignored.
-
-    Raises io.SceneError for what `transforms` and `load_points` refuse, for lists of anything but pictures of the file,
-    and for points that are not there.
-    """
-    items, data = transforms(path)
-    points_file = data.get("ply_file_path")
-    if points_file is None:
-        points = initial_points(path.parent)
-    elif isinstance(points_file, str) and (path.parent / points_file).is_file():
-        points = load_points(path.parent / points_file)
-    else:
-        raise io.SceneError(f"{path}: ply_file_path must name a file beside it, got {points_file!r}")
-    items.sort(key=lambda item: str(item.files[1]))
-    masks = sum(frame.get("mask_path") is not None for frame in data["frames"])
-    if masks:
-        warnings.warn(f"{path}: the masks of {masks} pictures are ignored, all of their pixels count", stacklevel=3)
-    files, lists = [os.path.normpath(item.files[1]) for item in items], {}
-    for split in ("train", "val", "test"):
-        names = data.get(f"{split}_filenames") or []
-        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-            raise io.SceneError(f"{path}: {split}_filenames must be a list of names, got {names!r}")
-        lists[split] = {os.path.normpath(_picture(path.parent, name)): name for name in names}
-        unknown = [name for file, name in lists[split].items() if file not in files]
-        if unknown:
-            raise io.SceneError(f"{path}: {split}_filenames must name pictures of the frames, got {unknown[0]}")
-    if not any(lists.values()):
-        return Capture(*_split(items, test_every), BLACK, points)
-    train = lists["train"] or set(files) - lists["val"].keys() - lists["test"].keys()
-    test = lists["test"] or lists["val"]
-    chosen = ([item for file, item in zip(files, items) if file in names] for names in (train, test))
-    return Capture(*chosen, BLACK, points)
-
-
-def check_lens(entry: dict, where: str) -> None:
-    """Raises io.SceneError for a view of a transforms file whose lens is not that of a pinhole camera."""
-    for name in DISTORTION:
-        value = entry.get(name)
-        if any(value if isinstance(value, list) else [value]):
-            got = f"{name} = {value}"
-            raise io.SceneError(f"{where}: cameras must be pinholes, got {got}; undistort the pictures first")
-
-
-def _has_splits(path: Path) -> bool:
-    """Whether a metadata.json may be that of the multi-scale Blender set: other programs write files of this name."""
-    try:
-        return {"train", "test"} <= set(json.loads(path.read_text(encoding="utf-8-sig")))
-    except (ValueError, TypeError):
-        return False
-
-
-def multi_scale_blender(folder: Path, split: str) -> list[Photograph]:
-    """A split of the multi-scale Blender set: pictures of one camera at several sizes follow each other.
-
-    metadata.json has for each split lists with an entry per picture: file_path, cam2world (OpenGL axes), width,
-    height, and focal in px.
-    """
-    path = folder / "metadata.json"
-    try:
-        data = json.loads(path.read_text(encoding="utf-8-sig"))[split]
-        rows = list(zip(*(data[key] for key in ("file_path", "cam2world", "width", "height", "focal"))))
-    except (ValueError, KeyError, TypeError) as error:
-        raise io.SceneError(f"{path}: not the metadata of the multi-scale Blender set ({error!r})") from None
-    found: list[Photograph] = []
-    for name, pose, width, height, focal in rows:
-        if not isinstance(name, str):
-            raise io.SceneError(f"{path}: file_path must be names of pictures, got {name!r}")
-        c2w = checked_pose(pose, f"{path}: cam2world of {name}")
-        width, height = (
-            checked_pixels(value, f"{path}: {key} of {name}") for key, value in (("width", width), ("height", height))
-        )
-        focal = checked_positive(focal, f"{path}: focal of {name}")
-        c2w[:3, 1:3] *= -1
-        w2c = torch.linalg.inv(c2w)
-        largest = found[-1].view if found else None
-        if largest is not None and largest.width > width and torch.equal(largest.w2c, w2c):
-            found[-1].files[round(largest.width / width)] = folder / name
-        else:
-            view = io.View(Path(name).stem, width, height, focal, focal, w2c)
-            found.append(Photograph(view, {1: folder / name}))
-    return found
-
-
-def initial_points(folder: Path) -> tuple[Tensor, Tensor] | None:
-    """The points that 3DGS's and nerfstudio's folders may hold beside the cameras."""
-    for name in ("points3d.ply", "points3D.ply", "sparse_pc.ply"):
-        if (folder / name).is_file():
-            return load_points(folder / name)
-    return None
-
-
-def _split(items: list[Photograph], test_every: int) -> tuple[list[Photograph], list[Photograph]]:
-    """Pictures to train with and to test with."""
-    if test_every == 0:
-        return items, []
-    return [item for i, item in enumerate(items) if i % test_every], items[::test_every]
+def _relative_to(capture: Capture, offset: tuple[float, float, float] | None) -> Capture:
+    """The capture with positions relative to an offset, those of points in float32."""
+    offset = offset if offset is not None and any(offset) else None
+    points = capture.points
+    if points is not None:
+        positions = points[0] if offset is None else points[0].double() - torch.tensor(offset, dtype=torch.float64)
+        points = positions.float(), points[1]
+    train, test = (
+        [item._replace(view=item.view.in_frame(offset)) for item in items] for items in (capture.train, capture.test)
+    )
+    return capture._replace(train=train, test=test, points=points, offset=offset)

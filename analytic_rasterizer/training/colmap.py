@@ -7,9 +7,11 @@ records. The three files are read here rather than with pycolmap because that is
 from __future__ import annotations
 
 import math
+import re
 import struct
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,63 +20,156 @@ from torch import Tensor
 from .. import io
 from ..io.views import with_distinct_names
 from ..rotations import rotation_matrices
+from .lenses import MODELS as LENSES
+from .lenses import Lens, lens_of
 
-# Model ids and names, with the number of parameters: f, cx, cy or fx, fy, cx, cy.
-PINHOLES = {0: 3, 1: 4, "SIMPLE_PINHOLE": 3, "PINHOLE": 4}
-FILES = ("cameras", "images", "points3D")
+
+class Model(NamedTuple):
+    """A camera model of COLMAP: its number in binary files, its name in texts, and how many parameters it has."""
+
+    number: int
+    name: str
+    parameters: int
+
+
+MODELS = (
+    Model(0, "SIMPLE_PINHOLE", 3),
+    Model(1, "PINHOLE", 4),
+    Model(2, "SIMPLE_RADIAL", 4),
+    Model(3, "RADIAL", 5),
+    Model(4, "OPENCV", 8),
+    Model(5, "OPENCV_FISHEYE", 8),
+    Model(6, "FULL_OPENCV", 12),
+    Model(7, "FOV", 5),
+    Model(8, "SIMPLE_RADIAL_FISHEYE", 4),
+    Model(9, "RADIAL_FISHEYE", 5),
+    Model(10, "THIN_PRISM_FISHEYE", 12),
+    Model(11, "RAD_TAN_THIN_PRISM_FISHEYE", 16),
+    Model(12, "SIMPLE_DIVISION", 4),
+    Model(13, "DIVISION", 5),
+    Model(14, "SIMPLE_FISHEYE", 3),
+    Model(15, "FISHEYE", 4),
+    Model(16, "EUCM", 6),
+    Model(17, "EQUIRECTANGULAR", 2),
+)
+BY_NUMBER = {model.number: model for model in MODELS}
+BY_NAME = {model.name: model for model in MODELS}
+PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")  # f, cx, cy and fx, fy, cx, cy
+
+CAMERAS, IMAGES, POINTS = "cameras", "images", "points3D"
+SUFFIXES = (".bin", ".txt")
+
+
+class Registered(NamedTuple):
+    """A picture with its camera, which is a pinhole but for its lens."""
+
+    name: str  # of the file, below the folder of the pictures
+    view: io.View
+    lens: Lens | None
+    camera: str  # and its model, for messages
 
 
 def is_reconstruction(folder: Path) -> bool:
-    """Whether the folder holds the three files, all binary or all text."""
-    return any(all((folder / f"{name}{suffix}").is_file() for name in FILES) for suffix in (".bin", ".txt"))
+    """Whether the folder holds cameras and images, both binary or both text. Points may be missing."""
+    return _suffix(folder) is not None
 
 
-def load_views(folder: Path) -> list[tuple[str, io.View]]:
-    """(name of the picture's file, view) of every registered picture, sorted by name.
+def _suffix(folder: Path) -> str | None:
+    complete = (s for s in SUFFIXES if all((folder / f"{name}{s}").is_file() for name in (CAMERAS, IMAGES)))
+    return next(complete, None)
+
+
+def count_pictures(folder: Path) -> int:
+    """How many pictures are registered. Raises as `load_views`."""
+    return sum(1 for _ in _images(folder))
+
+
+def load_views(folder: Path) -> list[Registered]:
+    """Every registered picture with its camera, sorted by name.
 
     Views are named after their files, without folder and suffix; where files in several folders have the same name, the
-    views of all but the first have _2, _3, ... behind it.
+    views of all but the first have _2, _3, ... behind it. What cameras are that no picture was taken by is not looked
+    at.
 
-    Raises io.SceneError for a file that is cut short or holds numbers that are not finite, and for cameras with lens
-    distortion, OSError for a missing file.
+    Raises io.SceneError for a file that is cut short or holds numbers that are not finite, and for cameras that are
+    neither pinholes nor have a lens of `lenses.MODELS`, OSError for a missing file.
     """
-    if (folder / "images.bin").exists():
-        cameras, images = _binary_cameras(folder / "cameras.bin"), _binary_images(folder / "images.bin")
-    else:
-        cameras, images = _text_cameras(folder / "cameras.txt"), _text_images(folder / "images.txt")
-    intrinsics, views = {}, []
-    for camera, model, width, height, parameters in cameras:
-        if model not in PINHOLES:
-            raise io.SceneError(f"{folder}/cameras: cameras must be pinholes; undistort the pictures first")
-        *focal, cx, cy = parameters
-        if not all(map(math.isfinite, parameters)) or min(focal) <= 0 or width < 1 or height < 1:
-            raise io.SceneError(f"{folder}/cameras: camera {camera} must have a positive size and focal length")
-        intrinsics[camera] = {"width": width, "height": height, "fx": focal[0], "fy": focal[-1], "cx": cx, "cy": cy}
-    for file_name, pose, camera in images:
-        if camera not in intrinsics:
+    cameras = {camera: rest for camera, *rest in _cameras(folder)}
+    intrinsics: dict = {}
+    found = []
+    for file_name, pose, camera in _images(folder):
+        if camera not in cameras:
             raise io.SceneError(f"{folder}/images: {file_name} was taken by camera {camera}, which cameras lacks")
+        if camera not in intrinsics:
+            intrinsics[camera] = _intrinsics(f"{folder}/cameras: camera {camera}", *cameras[camera])
         if not all(map(math.isfinite, pose)) or not any(pose[:4]):
             raise io.SceneError(f"{folder}/images: the pose of {file_name} must be finite, got {pose}")
         w2c = torch.eye(4, dtype=torch.float64, device="cpu")
         w2c[:3, :3] = rotation_matrices(torch.tensor(pose[:4], dtype=torch.float64, device="cpu"))
         w2c[:3, 3] = torch.tensor(pose[4:], dtype=torch.float64, device="cpu")
-        views.append((file_name, io.View(name=Path(file_name).stem, w2c=w2c, **intrinsics[camera])))
-    views.sort(key=lambda item: item[0])
-    return list(zip([name for name, _ in views], with_distinct_names([view for _, view in views])))
+        pinhole, lens = intrinsics[camera]
+        view = io.View(name=_view_name(file_name), w2c=w2c, **pinhole)
+        found.append(Registered(file_name, view, lens, f"camera {camera} ({cameras[camera][0]})"))
+    found.sort(key=lambda item: item.name)
+    views = with_distinct_names([item.view for item in found])
+    return [item._replace(view=view) for item, view in zip(found, views)]
 
 
-def load_points(folder: Path) -> tuple[Tensor, Tensor]:
-    """Positions (P, 3) float32, world units, and colours (P, 3) float32 in [0, 1]. Raises as `load_views`."""
-    if (folder / "points3D.bin").exists():
-        rows = list(_binary_points(folder / "points3D.bin"))
+def _intrinsics(where: str, model: str, width: int, height: int, parameters: list[float]) -> tuple[dict, Lens | None]:
+    """Members of `View`, and the lens. Raises io.SceneError, which begins with `where`, the camera."""
+    if model not in PINHOLES and model not in LENSES:
+        raise io.SceneError(
+            f"{where} is {model}; trained on are pinholes and {', '.join(LENSES)}: undistort the pictures first, with "
+            "COLMAP's image_undistorter, and train on the folder that it writes"
+        )
+    names = LENSES.get(model, ())
+    count = len(parameters) - len(names)
+    *focal, cx, cy = parameters[:count]
+    if not all(map(math.isfinite, (*focal, cx, cy))) or min(focal) <= 0 or width < 1 or height < 1:
+        raise io.SceneError(f"{where} must have a positive size and focal length")
+    lens = lens_of(model, dict(zip(names, parameters[count:])), where)
+    return {"width": width, "height": height, "fx": focal[0], "fy": focal[-1], "cx": cx, "cy": cy}, lens
+
+
+def _view_name(file_name: str) -> str:
+    """The name of a file without folder and suffix, as text that every program can write."""
+    return re.sub("[\ud800-\udfff]", "_", Path(file_name.replace("\\", "/")).stem)
+
+
+def load_points(folder: Path) -> tuple[Tensor, Tensor] | None:
+    """Positions (P, 3) float64, world units, and colours (P, 3) float32 in [0, 1]; None where there are no points.
+
+    Raises as `load_views`.
+    """
+    preferred = _suffix(folder) or SUFFIXES[0]
+    files = (folder / f"{POINTS}{suffix}" for suffix in sorted(SUFFIXES, key=lambda suffix: suffix != preferred))
+    path = next((path for path in files if path.is_file()), None)
+    if path is None:
+        return None
+    if path.suffix == ".bin":
+        rows = list(_binary_points(path))
     else:
-        rows = [_floats(folder / "points3D.txt", words[1:7]) for words in _lines(folder / "points3D.txt")]
+        rows = [_floats(path, words[1:7]) for words in _lines(path)]
         if any(len(row) != 6 for row in rows):
-            raise io.SceneError(f"{folder / 'points3D.txt'}: cut short")
-    points = torch.from_numpy(np.array(rows, dtype=np.float64).reshape(-1, 6)).float()
+            raise io.SceneError(f"{path}: cut short")
+    if not rows:
+        return None
+    points = torch.from_numpy(np.array(rows, dtype=np.float64))
     if not points.isfinite().all():
         raise io.SceneError(f"{folder}/points3D: points must be finite")
-    return points[:, :3].contiguous(), points[:, 3:] / 255
+    return points[:, :3].contiguous(), points[:, 3:].float() / 255
+
+
+def _cameras(folder: Path) -> Iterator[tuple]:
+    """The camera's name in the file, its model's name, width, height, and parameters."""
+    path = folder / f"{CAMERAS}{_suffix(folder) or SUFFIXES[0]}"
+    return _binary_cameras(path) if path.suffix == ".bin" else _text_cameras(path)
+
+
+def _images(folder: Path) -> Iterator[tuple]:
+    """The picture's name, its pose (a quaternion w, x, y, z and a translation), and its camera."""
+    path = folder / f"{IMAGES}{_suffix(folder) or SUFFIXES[0]}"
+    return _binary_images(path) if path.suffix == ".bin" else _text_images(path)
 
 
 # ------------------------------------------------------------------------------------- binary
@@ -83,9 +178,11 @@ def load_points(folder: Path) -> tuple[Tensor, Tensor]:
 def _binary_cameras(path: Path) -> Iterator[tuple]:
     records = _Records(path)
     for _ in range(records.count):
-        camera, model, width, height = records.take("iiQQ")
-        # The length of an unknown model's record is unknown too; the caller raises before the next one.
-        yield camera, model, width, height, records.take(f"{PINHOLES.get(model, 0)}d")
+        camera, number, width, height = records.take("iiQQ")
+        model = BY_NUMBER.get(number)
+        if model is None:  # how long its record is, nobody knows
+            raise io.SceneError(f"{path}: camera {camera} has a model that is not known here, number {number}")
+        yield camera, model.name, width, height, records.take(f"{model.parameters}d")
 
 
 def _binary_images(path: Path) -> Iterator[tuple]:
@@ -124,7 +221,7 @@ class _Records:
         if end < 0:
             raise io.SceneError(f"{self.path}: cut short")
         self.position = end + 1
-        return self.data[start:end].decode("utf-8", "replace")
+        return self.data[start:end].decode("utf-8", "surrogateescape")  # a name of a file may be no UTF-8
 
     def skip(self, size: int) -> int:
         """Passes over `size` bytes and returns where they start."""
@@ -137,11 +234,19 @@ class _Records:
 # --------------------------------------------------------------------------------------- text
 
 
+def _text_lines(path: Path) -> list[str]:
+    """The lines of a file, which may begin with a byte order mark, and have line ends of any system."""
+    return path.read_text(encoding="utf-8-sig", errors="surrogateescape").split("\n")
+
+
+def _is_content(line: str) -> bool:
+    """Whether the line is neither empty nor a comment."""
+    return bool(line.strip()) and not line.startswith("#")
+
+
 def _lines(path: Path) -> Iterator[list[str]]:
     """The words of every line that is neither empty nor a comment."""
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-        if line.strip() and not line.startswith("#"):
-            yield line.split()
+    return (line.split() for line in _text_lines(path) if _is_content(line))
 
 
 def _floats(path: Path, words: list[str]) -> list[float]:
@@ -154,10 +259,10 @@ def _floats(path: Path, words: list[str]) -> list[float]:
 def _text_cameras(path: Path) -> Iterator[tuple]:
     for words in _lines(path):
         camera, model, *numbers = words if len(words) > 1 else (*words, "")
-        expected = 2 + PINHOLES.get(model, 0)
+        expected = 2 + BY_NAME[model].parameters if model in BY_NAME else 2
         if len(numbers) < expected:
             raise io.SceneError(f"{path}: cut short")
-        if model in PINHOLES and len(numbers) > expected:
+        if model in BY_NAME and len(numbers) > expected:
             raise io.SceneError(f"{path}: expected {expected} numbers of a {model} camera, got {len(numbers)}")
         for size in numbers[:2]:
             if not size.isdecimal():
@@ -166,12 +271,29 @@ def _text_cameras(path: Path) -> Iterator[tuple]:
 
 
 def _text_images(path: Path) -> Iterator[tuple]:
-    lines = iter(path.read_text(encoding="utf-8", errors="replace").splitlines())
-    for line in lines:
-        if not line.strip() or line.startswith("#"):
+    lines = _text_lines(path)
+    at = 0
+    while at < len(lines):
+        line = lines[at]
+        at += 1
+        if not _is_content(line):
             continue
-        next(lines, None)  # every picture has a second line, with its observations, which may be empty
         words = line.split(maxsplit=9)
         if len(words) != 10:
             raise io.SceneError(f"{path}: cut short")
-        yield words[9], _floats(path, words[1:8]), words[8]
+        yield words[9].strip(), _floats(path, words[1:8]), words[8]
+        # The observations of a picture are in a second line, which may be empty, and which some programs leave out.
+        if at < len(lines) and not _is_picture(lines[at]):
+            at += 1
+
+
+def _is_picture(line: str) -> bool:
+    """Whether a line of images.txt is that of a picture, which ends with a name, and not numbers in threes."""
+    words = line.split(maxsplit=10)
+    if not _is_content(line) or len(words) < 10:
+        return False
+    try:
+        float(words[9])
+    except ValueError:
+        return True
+    return len(line.split()) % 3 != 0

@@ -69,9 +69,9 @@ class Log:
                 self.begin()
 
 
-def write_scene(path: Path, scene: Gaussians, footprint: str) -> None:
-    """The scene in a file that says for which footprint it is."""
-    io.save_scene(path, scene, io.SceneMetadata(footprint=footprint))
+def write_scene(path: Path, scene: Gaussians, footprint: str, offset: tuple[float, float, float] | None = None) -> None:
+    """The scene in a file that says for which footprint it is, and what positions are relative to, see `View`."""
+    io.save_scene(path, scene, io.SceneMetadata(footprint=footprint, offset=offset))
 
 
 def write_cameras(path: Path, views: list[io.View]) -> None:
@@ -81,7 +81,7 @@ def write_cameras(path: Path, views: list[io.View]) -> None:
         c2w = torch.linalg.inv(view.w2c)
         entry = {"id": i, "img_name": view.name, "width": view.width, "height": view.height}
         entry |= {"position": c2w[:3, 3].tolist(), "rotation": c2w[:3, :3].tolist(), "fx": view.fx, "fy": view.fy}
-        entry |= {key: getattr(view, key) for key in ("cx", "cy") if getattr(view, key) is not None}
+        entry |= {key: getattr(view, key) for key in ("cx", "cy", "offset") if getattr(view, key) is not None}
         entries.append(entry)
     write_json(path, entries)
 

@@ -10,7 +10,7 @@ from ..checks import check_value as _check
 from ..checks import plain_value as _plain
 from ..footprints import resolve_footprint
 
-DOWNSAMPLINGS = ("box", "bicubic")
+DOWNSAMPLINGS = ("box", "bicubic", "blender")
 DENSITIES = ("3dgs", "absgrad", "mcmc", "none")
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 RANDOM_BACKGROUND = "random"
@@ -91,7 +91,8 @@ class TrainingOptions:
         scale_repeats: How often every picture of a scale occurs in one pass over the pictures; one number per scale.
             Empty: twice for the finest of several scales, once for the others.
         downsampling: How coarse pictures are made: "box", means over squares of pixels, or "bicubic", with the kernel
-            widened to the scale.
+            widened to the scale; in both, colours count by their alpha. "blender": means of colours and of alpha apart,
+            as the files of the multi-scale Blender set were made.
         iterations: Steps of the optimizer.
         seconds: Time to train, s, by the clock, instead of a number of steps; 0: go by `iterations`.
         pictures_per_step: Pictures whose mean loss makes one step.

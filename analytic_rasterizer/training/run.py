@@ -41,7 +41,7 @@ from .pictures import Pictures, load_pictures
 from .reports import Display, TensorBoard, describe
 from .schedule import Clock, describe_change
 from .sharded import ShardedTrainer, shards_of
-from .start import first_gaussians, of_length, source_of
+from .start import capture_arguments, first_gaussians, of_length, source_of, stored_offset
 from .trainer import Trainer, background_of
 
 if TYPE_CHECKING:
@@ -62,8 +62,8 @@ class Run:
         out: Folder for the results, made if it is missing. Those of another training there are overwritten.
         options: None: the defaults, or with `resume` those of the checkpoint.
         device: "cpu", "cuda" or "cuda:N".
-        images, test_every: As `load_capture`; None: "images" and 8. With `resume` None, or the same as when the
-            training began.
+        images, test_every, cameras, lens, missing: As `load_capture`; None: as is usual there. With `resume` None, or
+            the same as when the training began.
         points: A .ply to start from: a 3DGS scene, or points with colours. None: what the capture has. Of more points
             than `max_gaussians`, so many are drawn at random. With `resume` None, or the same as when the training
             began.
@@ -72,13 +72,14 @@ class Run:
         iterations, seconds: With `resume`: how long to train in all, where that is not what the checkpoint says.
             Schedules are computed anew; None: as in the checkpoint, with the same bits.
         tensorboard: Write the numbers of the log for TensorBoard too, to the folder "tensorboard" in `out`.
-        given: Names of options that somebody chose, for whom one without effect is an error.
+        chosen: Names of options that somebody chose, for whom one without effect is an error.
         ranks: The processes that train together, each with a part of the Gaussians.
 
     Attributes:
+        notes: Sentences for the user: what was chosen among what the capture holds, and what another length with
+            `resume` means for the schedules.
         points_found: How many points there are in the capture or the .ply that the training starts from, of which it
             takes at most `max_gaussians`; None where it starts from a scene, a checkpoint, or random points.
-        change: What another length with `resume` means for the schedules, a sentence; "": it is the same.
         phases: Seconds of wall time by what they were spent on: "load", "warm up", "steps", "write" and "evaluate".
 
     Raises:
@@ -95,12 +96,15 @@ class Run:
         images: str | None = None,
         test_every: int | None = None,
         points=None,
+        cameras: str | None = None,
+        lens: str | None = None,
+        missing: str | None = None,
         save_every: int = 5000,
         resume: bool = False,
         iterations: int | None = None,
         seconds: float | None = None,
         tensorboard: bool = False,
-        given: Collection[str] = (),
+        chosen: Collection[str] = (),
         ranks: Ranks = ALONE,
     ):
         if save_every < 0:
@@ -117,10 +121,18 @@ class Run:
             options = of_length(stored, iterations, seconds, state["progress"]["step"], state["seconds"])
         self.options = options or TrainingOptions()
         # Where the scene is, from wherever `evaluate` is called.
-        self.source = {"scene": os.path.abspath(scene), **source_of(images, test_every, points, state)}
-        self.capture = load_capture(scene, self.source["images"], self.source["test_every"])
+        given = {"images": images, "test_every": test_every, "points": points and str(Path(points).resolve())}
+        given |= {"cameras": cameras, "lens": lens, "missing": missing}
+        self.source = {"scene": os.path.abspath(scene), **source_of(given, state)}
+        self.capture = load_capture(scene, **capture_arguments(self.source | stored_offset(state)))
+        self.source["offset"] = self.capture.offset
+        self.notes = list(self.capture.notes)
         if state is None:  # raises before the pictures are read
-            start, self.points_found = first_gaussians(self.options, self.capture, points, given)
+            start, self.points_found = first_gaussians(self.options, self.capture, points, chosen)
+            if points is None and self.capture.points is None and self.capture.starts_in_view:
+                self.notes.append(
+                    f"no points in the capture: starts from {start.count:,} random ones in the views (--points)"
+                )
         else:
             start, self.points_found = Gaussians(**state["gaussians"]), None
         background = background_of(self.options, self.capture.background)
@@ -130,7 +142,7 @@ class Run:
         else:
             counts = None if state is None else shards_of(state, ranks)
             self.trainer = ShardedTrainer(self.options, start, pictures, background, self.device, ranks, counts)
-        self.clock, self.history, self.change = Clock(self.device), [], ""
+        self.clock, self.history = Clock(self.device), []
         if state is not None:
             if state["pictures"] != len(pictures.views):
                 raise io.SceneError(
@@ -254,7 +266,7 @@ class Run:
                 scene = scene.rows(kept)
             scene = self._whole(scene)
             if self.ranks.is_first:
-                write_scene(self.out / SCENE, scene, self.options.footprint)
+                write_scene(self.out / SCENE, scene, self.options.footprint, self.capture.offset)
         self.save()
         if self.board is not None:
             self.board.close()
@@ -284,7 +296,7 @@ class Run:
         baked = scene.with_activated(scales, opacities)
         baked = self._whole(baked.rows(finite_rows(baked)))
         if self.ranks.is_first:
-            write_scene(self.out / MIP_SCENE, baked, "point")
+            write_scene(self.out / MIP_SCENE, baked, "point", self.capture.offset)
         return self.out / MIP_SCENE
 
     def start_viewer(self, port: int = 0) -> LiveViewer:
@@ -364,7 +376,7 @@ class Run:
         by_clock = self.options.seconds != 0
         factor = before.seconds / self.options.seconds if by_clock else before.iterations / self.options.iterations
         self.trainer.change_length(factor)
-        self.change = describe_change(before, self.options, self.progress.step, self.progress.share)
+        self.notes.append(describe_change(before, self.options, self.progress.step, self.progress.share))
 
     def _load(self, photographs: list[Photograph], background: tuple[float, float, float] | None) -> Pictures:
         """Their pictures at the scales of the training."""

@@ -25,6 +25,7 @@ from .model import random_points, render
 from .optimizer import TrainingAdam
 from .options import BACKGROUNDS, RANDOM_BACKGROUND, TrainingOptions
 from .pictures import Pictures
+from .placement import points_in_view
 from .schedule import PictureOrder, Progress, growth_times, means_rate_at, rates_factor_at, sh_degree_at
 
 _picture_gradients = _C.Call("picture_gradients")
@@ -385,10 +386,13 @@ def make_density(
     return GradientDensity(gaussians, optimizer, extent, chosen, **common)
 
 
-def starting_gaussians(options: TrainingOptions, points: tuple[Tensor, Tensor] | None) -> Gaussians:
+def starting_gaussians(
+    options: TrainingOptions, points: tuple[Tensor, Tensor] | None, views: list[io.View] | None = None
+) -> Gaussians:
     """Gaussians at points (positions and colours (P, 3)), or at random places where there are none. On the CPU.
 
-    Of more points than `max_gaussians`, so many are drawn by the seed; they keep their order.
+    Of more points than `max_gaussians`, so many are drawn by the seed; they keep their order. Random places are in
+    front of the views, see `points_in_view`, or without views in the cube of NeRF-synthetic scenes.
 
     Raises:
         io.SceneError: Fewer than two points.
@@ -398,7 +402,10 @@ def starting_gaussians(options: TrainingOptions, points: tuple[Tensor, Tensor] |
     if points is None:
         if options.random_points > limit:
             raise ValueError(f"random_points must be at most max_gaussians, {limit}, got {options.random_points}")
-        means, colors = random_points(options.random_points, options.seed)
+        if views is None:
+            means, colors = random_points(options.random_points, options.seed)
+        else:
+            means, colors = points_in_view(views, options.random_points, options.seed)
     else:
         means, colors = points
         if len(means) > limit:

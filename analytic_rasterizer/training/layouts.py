@@ -1,0 +1,248 @@
+"""The layouts of captures: what each of them says of its photographs.
+
+They are NeRF-synthetic scenes (transforms_train.json), the multi-scale Blender set (metadata.json), COLMAP
+reconstructions (folders of binary or text files) and nerfstudio captures (transforms.json). Cameras are pinholes, or
+have a lens of `lenses`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .. import io
+from ..io import load_points
+from ..io.pictures import PICTURE_SUFFIXES, PictureFiles
+from ..io.views import checked_pixels, checked_pose, checked_positive, distortion_of, read_views
+from . import colmap
+from .lenses import RATIONAL, Lens, lens_of, window_of
+
+BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+MASK_FOLDERS = ("masks", "mask")
+
+
+class Photograph(NamedTuple):
+    """A camera, and the files of its picture by scale: 1 is always there, and makes the scales that are not."""
+
+    view: io.View  # without the lens, and of the size of the whole picture
+    files: dict[int, Path]
+    lens: Lens | None = None  # which `load_pictures` removes from the picture
+
+
+class Capture(NamedTuple):
+    """What a folder holds."""
+
+    train: list[Photograph]
+    test: list[Photograph]
+    background: tuple[float, float, float]  # by convention, behind pictures with alpha
+    points: tuple[Tensor, Tensor] | None  # positions and colours in [0, 1], (P, 3) float32 each, on the CPU
+    # (x, y, z), world units: positions in the world are those of views and points plus this. None: they are the same.
+    offset: tuple[float, float, float] | None = None
+    # Where random points belong if there are no others: in the views, or in the cube of NeRF-synthetic.
+    starts_in_view: bool = False
+    masks: int = 0  # of pictures, which are ignored
+    notes: tuple[str, ...] = ()  # sentences of what was chosen, for the user
+
+
+def read_layout(folder: Path, place: Path, images: str, test_every: int) -> Capture:
+    """The capture whose cameras are in this file or folder."""
+    if place.is_dir():
+        return reconstruction(folder, place, images, test_every)
+    if not place.is_file():
+        raise io.SceneError(f"{place}: no such file or folder of cameras")
+    if place.name == "metadata.json":
+        train, test = (multi_scale_blender(folder, split) for split in ("train", "test"))
+        return Capture(train, test, WHITE, None)
+    if place.name == "transforms_train.json":
+        test_file = place.with_name("transforms_test.json")
+        test = transforms(test_file)[0] if test_file.exists() else []
+        return Capture(transforms(place)[0], test, WHITE, initial_points(folder))
+    return nerfstudio(place, test_every)
+
+
+def reconstruction(folder: Path, sparse: Path, images: str, test_every: int) -> Capture:
+    """The capture of a COLMAP reconstruction whose pictures are in a folder `images` of `folder`.
+
+    Raises io.SceneError for what `colmap.load_views` refuses, and for lenses that cannot be undistorted.
+    """
+    if not colmap.is_reconstruction(sparse):
+        raise io.SceneError(f"{sparse}: expected COLMAP's cameras and images (.bin or .txt)")
+    registered = colmap.load_views(sparse)
+    if not registered:
+        raise io.SceneError(f"{sparse}: there are no pictures in the reconstruction")
+    if not (folder / images).is_dir():
+        there = sorted(path.name for path in folder.iterdir() if path.is_dir() and _count_pictures(path))
+        expected = f"--images NAME takes another folder ({', '.join(there) or 'none'} with pictures)"
+        raise io.SceneError(f"{folder / images}: no such folder; {expected}")
+    files = PictureFiles(folder / images)
+    items = []
+    for item in registered:
+        _check_lens(item.lens, item.view, f"{sparse}/cameras: {item.camera}")
+        items.append(Photograph(item.view, {1: files.find(item.name)}, item.lens))
+    points = colmap.load_points(sparse)
+    masks = _count_masks(folder)
+    return Capture(
+        *_split(folder, items, test_every),
+        BLACK,
+        initial_points(sparse) if points is None else points,
+        starts_in_view=True,
+        masks=masks,
+    )
+
+
+def _check_lens(lens: Lens | None, view: io.View, where: str) -> None:
+    """Raises io.SceneError, which begins with `where`, for a lens that cannot be undistorted."""
+    if lens is None:
+        return
+    try:
+        window_of(lens, view)
+    except io.SceneError as error:
+        raise io.SceneError(f"{where}: {error}; undistort the pictures first, with another model") from None
+
+
+def transforms(path: Path) -> tuple[list[Photograph], dict[str, Any]]:
+    """The views of a transforms file and where their pictures are, in the order of the file; and all that it says.
+
+    Raises io.SceneError for what `io.load_views` refuses, for lists of cameras, which it reads too, and for lenses that
+    cannot be undistorted.
+    """
+    views, data = read_views(path)
+    if not isinstance(data, dict):
+        raise io.SceneError(f"{path}: expected a transforms file, which says where pictures are, got a list of cameras")
+    found = []
+    files = PictureFiles(path.parent)
+    for i, (view, frame) in enumerate(zip(views, data["frames"])):
+        where = f"{path}: frame {i}"
+        lens = _lens_of_frame(data | frame, where)
+        _check_lens(lens, view, where)
+        found.append(Photograph(view, {1: files.find(str(frame.get("file_path", "")))}, lens))
+    return found, data
+
+
+def _lens_of_frame(entry: dict[str, Any], where: str) -> Lens | None:
+    """The lens of a frame of a transforms file, with what all frames share. Raises io.SceneError."""
+    said = distortion_of(entry)
+    model = entry.get("camera_model") or "OPENCV"
+    unknown = {"distortion_params", "is_fisheye"} | (set() if model == RATIONAL else {"k5", "k6"})
+    for name in unknown & said.keys():
+        raise io.SceneError(
+            f"{where}: lenses must be those of OpenCV (k1, k2, k3, k4, p1, p2), got {name} = {said[name]}; undistort "
+            "the pictures first"
+        )
+    return lens_of(model, said, where)
+
+
+def nerfstudio(path: Path, test_every: int) -> Capture:
+    """The capture of a transforms.json: its pictures by name, and the points of the file that it names.
+
+    Which pictures to train with and to test with is what its lists train_filenames, val_filenames and test_filenames
+    say, if it has any. The test takes the last, or where that is missing the one before. Without the first, the
+    training takes the pictures that neither of the others has. Without ply_file_path, points are looked for under their
+    usual names.
+
+    Raises io.SceneError for what `transforms` and `load_points` refuse, for lists of anything but pictures of the file,
+    and for points that are not there.
+    """
+    items, data = transforms(path)
+    points_file = data.get("ply_file_path")
+    if points_file is None:
+        points = initial_points(path.parent)
+    elif isinstance(points_file, str) and (path.parent / points_file.replace("\\", "/")).is_file():
+        points = load_points(path.parent / points_file.replace("\\", "/"))
+    else:
+        raise io.SceneError(f"{path}: ply_file_path must name a file beside it, got {points_file!r}")
+    items.sort(key=lambda item: str(item.files[1]))
+    masks = sum(frame.get("mask_path") is not None for frame in data["frames"]) or _count_masks(path.parent)
+    pictures, lists = PictureFiles(path.parent), {}
+    files = [os.path.normpath(item.files[1]) for item in items]
+    for split in ("train", "val", "test"):
+        names = data.get(f"{split}_filenames") or []
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            raise io.SceneError(f"{path}: {split}_filenames must be a list of names, got {names!r}")
+        lists[split] = {os.path.normpath(pictures.find(name)): name for name in names}
+        unknown = [name for file, name in lists[split].items() if file not in files]
+        if unknown:
+            raise io.SceneError(f"{path}: {split}_filenames must name pictures of the frames, got {unknown[0]}")
+    if any(lists.values()):
+        train = lists["train"] or set(files) - lists["val"].keys() - lists["test"].keys()
+        test = lists["test"] or lists["val"]
+        splits = [[item for file, item in zip(files, items) if file in names] for names in (train, test)]
+    else:
+        splits = _split(path.parent, items, test_every)
+    return Capture(*splits, BLACK, points, starts_in_view=True, masks=masks)
+
+
+def has_splits(path: Path) -> bool:
+    """Whether a metadata.json may be that of the multi-scale Blender set: other programs write files of this name."""
+    try:
+        return {"train", "test"} <= set(json.loads(path.read_text(encoding="utf-8-sig")))
+    except (ValueError, TypeError):
+        return False
+
+
+def multi_scale_blender(folder: Path, split: str) -> list[Photograph]:
+    """A split of the multi-scale Blender set: pictures of one camera at several sizes follow each other.
+
+    metadata.json has for each split lists with an entry per picture: file_path, cam2world (OpenGL axes), width,
+    height, and focal in px.
+    """
+    path = folder / "metadata.json"
+    try:
+        data = json.loads(path.read_text(encoding="utf-8-sig"))[split]
+        rows = list(zip(*(data[key] for key in ("file_path", "cam2world", "width", "height", "focal"))))
+    except (ValueError, KeyError, TypeError) as error:
+        raise io.SceneError(f"{path}: not the metadata of the multi-scale Blender set ({error!r})") from None
+    found: list[Photograph] = []
+    for name, pose, width, height, focal in rows:
+        if not isinstance(name, str):
+            raise io.SceneError(f"{path}: file_path must be names of pictures, got {name!r}")
+        c2w = checked_pose(pose, f"{path}: cam2world of {name}")
+        width, height = (
+            checked_pixels(value, f"{path}: {key} of {name}") for key, value in (("width", width), ("height", height))
+        )
+        focal = checked_positive(focal, f"{path}: focal of {name}")
+        c2w[:3, 1:3] *= -1
+        w2c = torch.linalg.inv(c2w)
+        largest = found[-1].view if found else None
+        if largest is not None and largest.width > width and torch.equal(largest.w2c, w2c):
+            found[-1].files[round(largest.width / width)] = folder / name
+        else:
+            view = io.View(Path(name).stem, width, height, focal, focal, w2c)
+            found.append(Photograph(view, {1: folder / name}))
+    return found
+
+
+def initial_points(folder: Path) -> tuple[Tensor, Tensor] | None:
+    """The points that 3DGS's and nerfstudio's folders may hold beside the cameras."""
+    for name in ("points3d.ply", "points3D.ply", "sparse_pc.ply"):
+        if (folder / name).is_file():
+            return load_points(folder / name)
+    return None
+
+
+def _split(folder: Path, items: list[Photograph], test_every: int) -> tuple[list[Photograph], list[Photograph]]:
+    """Pictures to train with and to test with. Raises io.SceneError where the test leaves fewer than two."""
+    if test_every == 0:
+        return items, []
+    train = [item for i, item in enumerate(items) if i % test_every]
+    if len(train) < 2 <= len(items):
+        raise io.SceneError(
+            f"{folder}: training needs at least 2 pictures, got {len(train)} of {len(items)}, for the others are kept "
+            "for the test; --test-every 0 trains with all"
+        )
+    return train, items[::test_every]
+
+
+def _count_pictures(folder: Path) -> int:
+    """Files of pictures in a folder and those below it."""
+    return sum(path.suffix.lower() in PICTURE_SUFFIXES for path in folder.rglob("*"))
+
+
+def _count_masks(folder: Path) -> int:
+    """How many masks are beside the pictures."""
+    return next((_count_pictures(folder / name) for name in MASK_FOLDERS if (folder / name).is_dir()), 0)
