@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+import warnings
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -206,7 +207,7 @@ class Run:
                 if self.save_every and progress.passed(self.save_every) and not last:
                     self._save_or_say(display)
             self.clock.stop()
-        self._write(display)
+        self._write()
         return progress.share >= 1
 
     def _look(self, display: Display, last: bool) -> dict[str, Any]:
@@ -256,15 +257,10 @@ class Run:
             display.warn(f"{error}; training goes on")
         self.clock.start()
 
-    def _write(self, display: Display) -> None:
+    def _write(self) -> None:
         """The scene, and the checkpoint, which is much larger: that of a full disk costs no scene."""
         with self._phase("write"):
-            scene = self.trainer.scene()
-            kept = finite_rows(scene)  # the 3D filter may have left float32 where parameters have not
-            if not kept.all():
-                display.warn(f"{int((~kept).sum()):,} Gaussians outside of float32 are left out of {SCENE}")
-                scene = scene.rows(kept)
-            scene = self._whole(scene)
+            scene = self._whole(self.trainer.scene(), SCENE)
             if self.ranks.is_first:
                 write_scene(self.out / SCENE, scene, self.options.footprint, self.capture.offset)
         self.save()
@@ -281,8 +277,16 @@ class Run:
             within = sum(self.phases.values()) - others
             self.phases[name] += time.perf_counter() - began - within
 
-    def _whole(self, scene: Gaussians) -> Gaussians:
-        """The scene of all ranks, of which `scene` is this one's: on rank 0, on the CPU, without rows on the others."""
+    def _whole(self, scene: Gaussians, name: str) -> Gaussians:
+        """The scene of all ranks, of which `scene` is this one's: on rank 0, on the CPU, without rows on the others.
+
+        Warns of Gaussians that the file `name` cannot hold, and leaves them out: a filter may leave float32 where
+        parameters have not.
+        """
+        kept = finite_rows(scene)
+        if not kept.all():
+            warnings.warn(f"{int((~kept).sum()):,} Gaussians outside of float32 are left out of {name}", stacklevel=3)
+            scene = scene.rows(kept)
         return scene.map(self.ranks.gather_rows)
 
     def export_mip(self) -> Path:
@@ -293,8 +297,7 @@ class Run:
         scene = self.trainer.scene()
         cameras = self.trainer.pictures.settings[min(self.options.scales)]
         scales, opacities = bake_pixel(scene.means, scene.scales, scene.rotations, scene.opacities, cameras)
-        baked = scene.with_activated(scales, opacities)
-        baked = self._whole(baked.rows(finite_rows(baked)))
+        baked = self._whole(scene.with_activated(scales, opacities), MIP_SCENE)
         if self.ranks.is_first:
             write_scene(self.out / MIP_SCENE, baked, "point", self.capture.offset)
         return self.out / MIP_SCENE

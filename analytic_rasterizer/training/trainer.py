@@ -134,6 +134,8 @@ class Trainer:
         progress.advance(stride)
         if progress.passed(CHECK_PERIOD):
             self.check()
+        elif self._may_change():
+            drop_broken(self)  # before they multiply
         before = self.count
         changed = self.density.after_step(progress.step, progress.share, stride)
         if changed:
@@ -141,6 +143,10 @@ class Trainer:
             check_left(self, before)
         if self.options.filter_3d and (changed or progress.passed(FILTER_PERIOD)):
             self._compute_filter()
+
+    def _may_change(self) -> bool:
+        """Whether density control may change the number of Gaussians after this step."""
+        return self.options.density != "none" and self.progress.passed(self.density.options.densify_every)
 
     def measure(self, elapsed: float) -> None:
         """Corrects a training by the clock by its seconds so far: the share that is over, and the times of growth.
