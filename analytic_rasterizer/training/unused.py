@@ -69,14 +69,14 @@ def _note_times(options: TrainingOptions, note) -> None:
         note(["sh_every"], f"a degree is added every {SH_SHARE * steps:g} steps, a tenth of the training, anyway")
     if steps_at(options.rates_from, steps) >= steps:
         note(["rates_from", "rates_half_life"], f"rates fall from step {options.rates_from:,g} on, and {of_training}")
-    if options.density == "none":
+    if options.density == "none" or options.densify_until == 0:
         return
     changes, times = changes_at(options, steps), growth_times(options, steps)
     end = times["densify_until"] * steps
     if not changes:
         reason = (
-            f"the number of Gaussians never changes: the first change would be after step {changes.start:,}, and the "
-            f"last before step {end:,g}"
+            f"the number of Gaussians never changes: the first change would be at step {changes.start:,}, and growth "
+            f"ends at {end:,g}"
         )
         note({*GROWTH, *GRADIENTS, "grow_share"}, f"{reason} ({of_training})")
     elif options.reset_every >= end:
