@@ -91,6 +91,28 @@ def circle(count: int, size=(32, 32)) -> list[io.View]:
     return [io.View(f"r_{i}", *size, 36.0, 36.0, looking_at_origin(0.3 * (i - count / 2))) for i in range(count)]
 
 
+def tripod(count: int, baseline: float = 0.0) -> list[io.View]:
+    """Cameras that look around from one place 4 before the origin, or from places around it within `baseline`."""
+    views = []
+    for i in range(count):
+        across, up = 0.5 * (i / (count - 1) - 0.5), 0.2 * math.sin(2.1 * i)
+        w2c = torch.eye(4, dtype=torch.float64)
+        w2c[:3, :3] = turn(0, up) @ turn(1, across)
+        place = [baseline * math.sin(5 * i), baseline * math.cos(3 * i), -4.0]
+        w2c[:3, 3] = -w2c[:3, :3] @ torch.tensor(place, dtype=torch.float64)
+        views.append(io.View(f"r_{i}", 32, 32, 36.0, 36.0, w2c))
+    return views
+
+
+def turn(axis: int, angle: float) -> torch.Tensor:
+    """A rotation (3, 3) about a coordinate axis."""
+    c, s = math.cos(angle), math.sin(angle)
+    one, other = (axis + 1) % 3, (axis + 2) % 3
+    rotation = torch.eye(3, dtype=torch.float64)
+    rotation[one, one], rotation[one, other], rotation[other, one], rotation[other, other] = c, -s, s, c
+    return rotation
+
+
 def truth_gaussians() -> Gaussians:
     """A few coloured Gaussians."""
     generator = torch.Generator().manual_seed(5)

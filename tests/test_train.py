@@ -159,7 +159,12 @@ def test_broken_captures_are_one_line_and_leave_no_results(synthetic, tmp_path, 
         (["--scales", "one"], "must be whole numbers with commas between them, got one"),
         (["--scales", "64"], "32 x 32 px are too few for these scales"),
         (["--density", "more"], "density must be one of 3dgs, absgrad, mcmc, none, got more"),
-        (["--densify-until", "1.5"], "densify_until must be 0 to 1, got 1.5"),
+        (
+            ["--densify-until", "1.5"],
+            "densify_until must be 0 to 1, got 1.5 (a share of the training; above 1 it is a ",
+        ),
+        (["--densify-from", "-2"], "densify_from must be 0 to 1, got -2"),
+        (["--rates-from", "nan"], "rates_from must be 0 to 1, got nan"),
         (["--sh-degree", "4"], "sh_degree must be 0 to 3, got 4"),
         (["--background", "green"], "background must be one of black, white, random, got green"),
         (["--preset", "quick", "--opacity-rate", "0"], "opacity_rate must be positive and finite, got 0.0"),
@@ -193,30 +198,46 @@ def test_bad_arguments_are_one_line(synthetic, tmp_path, capsys, extra, message)
     assert not (tmp_path / "out").exists()
 
 
-def test_help_of_train_has_every_default(capsys):
-    """Those that are 0 were left out."""
+def help_of_options(capsys) -> dict[str, tuple[str, str]]:
+    """Metavar and text of every option of a training."""
     with pytest.raises(SystemExit):
         cli.main(["train", "--help"])
-    shown = " ".join(capsys.readouterr().out.split())
+    shown = re.sub(r" (?:main|fine tuning|options):", " --", " ".join(capsys.readouterr().out.split()))
+    found = {}
     for field in fields(TrainingOptions):
-        if (
-            field.default not in ((), "")
-            and field.default is not False
-            and field.name not in ("scales", "random_points")
-        ):
-            option = f"--{field.name.replace('_', '-')} X "
-            assert f"(default: {field.default})" in shown.split(option)[1].split(" --")[0], field.name
+        text = shown.rsplit(f" --{field.name.replace('_', '-')} ", 1)[1].split(" --")[0]
+        metavar = "" if isinstance(field.default, bool) else text.split()[0]
+        found[field.name] = metavar, text.removeprefix(metavar).strip()
+    return found
+
+
+def test_help_of_train_has_every_default(capsys):
+    """Those that are 0 were left out."""
+    options = help_of_options(capsys)
+    for field in fields(TrainingOptions):
+        default = field.default
+        if default not in ((), "") and default is not False and field.name not in ("scales", "random_points"):
+            shown = f"{default:g}" if isinstance(default, float) else default
+            assert f"(default: {shown})" in options[field.name][1], field.name
 
 
 def test_help_of_train_says_what_every_option_is(capsys):
     """From the docstring of TrainingOptions, where the command has no words of its own."""
-    with pytest.raises(SystemExit):
-        cli.main(["train", "--help"])
-    shown = " ".join(capsys.readouterr().out.split())
-    for field in fields(TrainingOptions):
-        text = shown.rsplit(f" --{field.name.replace('_', '-')} ", 1)[1].split(" --")[0].removeprefix("X ")
-        assert len(text.split("(default:")[0]) > 4, field.name
-    assert "share of 1 - SSIM in the loss, next to the mean absolute error (default: 0.2)" in shown
+    options = help_of_options(capsys)
+    for name, (_, text) in options.items():
+        assert len(text.split("(default:")[0]) > 4, name
+    assert options["ssim_weight"] == (
+        "SHARE",
+        "share of 1 - SSIM in the loss, next to the mean absolute error (default: 0.2)",
+    )
+
+
+def test_help_of_train_says_what_values_are(capsys):
+    """Not X for all of them."""
+    metavars = {name: metavar for name, (metavar, _) in help_of_options(capsys).items()}
+    assert "X" not in metavars.values()
+    expected = {"iterations": "N", "scales": "N,N,..", "densify_until": "T", "means_rate": "RATE", "density": "NAME"}
+    assert expected.items() <= metavars.items()
 
 
 # ------------------------------------------------------------------------------------ training

@@ -17,16 +17,36 @@ from ..footprints import resolve_footprint
 from ..training import Run, TrainingOptions
 from ..training.captures import IMAGES, LENS_CHOICES, MISSING_CHOICES, TEST_PERIOD
 from ..training.files import CHECKPOINT, SCENE, read_checkpoint
-from ..training.options import BACKGROUNDS, DENSITIES, DOWNSAMPLINGS, PRESETS, RANDOM_BACKGROUND, preset_values
+from ..training.health import flag
+from ..training.options import BACKGROUNDS, DENSITIES, DOWNSAMPLINGS, PRESETS, RANDOM_BACKGROUND, TIMES, preset_values
+from ..training.reports import process_age
 from .arguments import add_machine_options, port, use_machine, whole_numbers
 from .launch import add_rank_options, is_launched, ranks_of
+
+METAVARS = {
+    **dict.fromkeys(TIMES, "T"),
+    **dict.fromkeys(("ssim_weight", "grow_share"), "SHARE"),
+    **dict.fromkeys(("initial_opacity", "prune_opacity"), "OPACITY"),
+    **dict.fromkeys(("split_above", "prune_above"), "EXTENTS"),
+    **dict.fromkeys(("opacity_weight", "scale_weight"), "WEIGHT"),
+    **dict.fromkeys(("means_rate", "means_rate_end", "rotation_rate"), "RATE"),
+    **dict.fromkeys(("scale_rate", "opacity_rate", "color_rate"), "RATE"),
+    "footprint": "NAME[:k=v,..]",
+    "seconds": "SECONDS",
+    "initial_scale": "FACTOR",
+    "noise": "FACTOR",
+    "gradient": "NORM",
+}
+"""What `--help` shows for a value; otherwise its type decides."""
+METAVARS_OF_TYPES = {int: "N", float: "X", str: "NAME", tuple: "N,N,.."}
+TIMES_TEXT = "T is a time: a number of steps, or up to 1 a share of the training. See docs/training.md"
 
 MAIN = {
     "footprint": "how a pixel sees a splat",
     "scales": "reductions to train at: 1,2,4,8",
     "scale_repeats": "how often pictures of each scale occur in a pass: 3,1,1,1 (default: the finest twice)",
     "downsampling": f"how coarse pictures are made: {', '.join(DOWNSAMPLINGS)}",
-    "iterations": "steps",
+    "iterations": "steps in all, also of a training that goes on",
     "seconds": "train for this long instead, by the clock",
     "pictures_per_step": "pictures whose mean loss makes a step",
     "supersampling": "render pictures so many times larger and average them",
@@ -79,7 +99,9 @@ def add_parser(subcommands) -> None:
     preset = "options that belong together: quick, 7,000 steps; 3dgs, the recipe of 3DGS; what is given wins"
     add("--preset", choices=tuple(PRESETS), help=preset)
     add("--resume", action="store_true", help="go on from the checkpoint in DIR, with its options")
-    add("--save-every", type=int, default=5000, metavar="STEPS", help="between checkpoints (default: 5000; 0: none)")
+    board = "write the numbers of log.jsonl for TensorBoard too, to DIR/tensorboard; needs the extra 'tensorboard'"
+    add("--tensorboard", action="store_true", help=board)
+    add("--save-every", type=int, default=5000, metavar="N", help="steps between checkpoints (default: 5000; 0: none)")
     add("--no-evaluate", action="store_true", help="leave out the test at the end")
     export = "write point_cloud_mip.ply too, for viewers that do not integrate over pixels"
     add("--export", choices=("mip",), help=export)
@@ -89,21 +111,30 @@ def add_parser(subcommands) -> None:
     add("--port", type=port, metavar="N", help="of --watch: port to serve on (default: any free one)")
     add_machine_options(parser, device=None)
     add_rank_options(parser)
-    rest = parser.add_argument_group("fine tuning", "see docs/training.md")
+    rest = parser.add_argument_group("fine tuning", TIMES_TEXT)
     types, texts = typing.get_type_hints(TrainingOptions), attribute_texts(TrainingOptions)
     for field in fields(TrainingOptions):
         group = parser if field.name in MAIN else rest
-        flag = "--" + field.name.replace("_", "-")
-        default = ",".join(map(str, field.default)) if isinstance(field.default, tuple) else field.default
+        default = shown_default(field.default)
         text = MAIN.get(field.name) or texts.get(field.name, "")
-        text += f" (default: {default})" if "default" not in text and str(default) not in ("", "False") else ""
+        text += f" (default: {default})" if "default" not in text and default else ""
         # What is not given is absent, so that a checkpoint's options are only compared with what is.
         if types[field.name] is bool:
-            group.add_argument(flag, action="store_true", default=argparse.SUPPRESS, help=text)
+            group.add_argument(flag(field.name), action="store_true", default=argparse.SUPPRESS, help=text)
         else:
             kind = whole_numbers if isinstance(field.default, tuple) else types[field.name]
-            group.add_argument(flag, type=kind, default=argparse.SUPPRESS, metavar="X", help=text)
+            metavar = METAVARS.get(field.name) or METAVARS_OF_TYPES[type(field.default)]
+            group.add_argument(flag(field.name), type=kind, default=argparse.SUPPRESS, metavar=metavar, help=text)
     parser.set_defaults(run=run)
+
+
+def shown_default(value) -> str:
+    """A default as `--help` shows it, which is not at all where there is nothing to show."""
+    if isinstance(value, tuple):
+        return ",".join(map(str, value))
+    if isinstance(value, bool):
+        return ""
+    return f"{value:.10g}" if isinstance(value, float) else str(value)
 
 
 def run(args) -> None:
@@ -126,23 +157,26 @@ def run_on(ranks: Ranks, args) -> bool:
         raise ValueError("--watch is for one process, got torchrun")
     if args.watch:
         io.optional_import("viser", "view")  # raises before the pictures are read
-    checkpoint = Path(args.out) / CHECKPOINT
-    mapped = ranks.world > 1
-    stored = TrainingOptions.from_dict(read_checkpoint(checkpoint, mapped=mapped)["options"]) if args.resume else None
+    checkpoint, chosen = Path(args.out) / CHECKPOINT, list(given)
+    # Mapped: of a large file little is needed here.
+    stored = TrainingOptions.from_dict(read_checkpoint(checkpoint, mapped=True)["options"]) if args.resume else None
+    length = {name: given[name] for name in ("iterations", "seconds") if stored is not None and name in given}
     if args.preset is not None:
         # Without --scales, a preset is for those of the checkpoint.
         given.setdefault("scales", (stored or TrainingOptions).scales)
         given = preset_values(args.preset, given["scales"]) | given
     options = TrainingOptions(**given)
     if stored is not None:
-        differing = [name for name in given if getattr(options, name) != getattr(stored, name)]
+        kept = [name for name in given if name not in length]
+        differing = [name for name in kept if getattr(options, name) != getattr(stored, name)]
         if differing:
-            named = ", ".join(f"--{name.replace('_', '-')}" for name in differing)
+            named = ", ".join(map(flag, differing))
             raise ValueError(f"{named}: a resumed training keeps the options of its checkpoint")
     elif checkpoint.exists():
         raise ValueError(f"{checkpoint} exists: go on with --resume, or choose another --out")
     if args.export and resolve_footprint((stored or options).footprint).name == "point":
         raise ValueError("--export mip is for footprints that integrate over pixels, got point")
+    age = process_age()  # most of it is the import of torch
     training = Run(
         args.scene,
         args.out,
@@ -156,8 +190,13 @@ def run_on(ranks: Ranks, args) -> bool:
         missing=args.missing,
         save_every=args.save_every,
         resume=args.resume,
+        **length,
+        tensorboard=args.tensorboard,
+        chosen=chosen,
         ranks=ranks,
     )
+    if age is not None:
+        training.phases = {"start": age, **training.phases}
     for note in training.notes if ranks.is_first else ():
         print(note, file=sys.stderr)
     limit, found = training.options.gaussian_limit, training.points_found
@@ -178,6 +217,8 @@ def finish(training: Run, complete: bool, args) -> None:
         say(f"stopped after {training.progress.step} steps and saved; go on with --resume")
         return
     say(f"{Path(args.out) / SCENE}: {training.count()} Gaussians")
+    if training.trainer.dropped:
+        say(f"{training.trainer.dropped:,} Gaussians were taken away because their numbers had left float32")
     if args.export:
         say(f"{training.export_mip()}: for viewers that do not integrate over pixels")
     if not args.no_evaluate:
@@ -186,3 +227,5 @@ def finish(training: Run, complete: bool, args) -> None:
         for scale, values in metrics.get("test", {}).items():
             name = scale if scale == "mean" else f"1/{scale}"
             say(f"test, {name}: PSNR {values['psnr']:.2f} dB, SSIM {values['ssim']:.4f}")
+    if training.ranks.is_first:
+        print(", ".join(f"{name} {seconds:.1f} s" for name, seconds in training.phases.items()), file=sys.stderr)

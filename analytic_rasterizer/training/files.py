@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +29,44 @@ def results_folder(path) -> Path:
 
 
 def write_log(path: Path, entries: list[dict]) -> None:
-    """One JSON object per line, with null as in `write_json`."""
-    write_text(path, "".join(json.dumps(as_json(entry), allow_nan=False) + "\n" for entry in entries))
+    """One JSON object per line, with null as in `write_json`. Raises OSError."""
+    write_text(path, "".join(map(_line, entries)))
+
+
+def _line(entry: dict) -> str:
+    return json.dumps(as_json(entry), allow_nan=False) + "\n"
+
+
+class Log:
+    """log.jsonl, which grows while a training runs.
+
+    Args:
+        entries: What there is already. The list may grow; it is written anew where a line could not be added.
+    """
+
+    def __init__(self, path: Path, entries: list[dict]):
+        self.path, self.entries, self.complete = path, entries, False
+
+    def begin(self) -> None:
+        """Writes the entries, and nothing of an earlier file. Raises OSError."""
+        write_log(self.path, self.entries)
+        self.complete = True
+
+    def add(self, entry: dict) -> None:
+        """Adds a line for the last entry. The system has it then, whatever happens to this process.
+
+        Raises OSError, once, if that cannot be done; the file is complete again as soon as it can.
+        """
+        if self.complete:
+            try:
+                with self.path.open("a", encoding="utf-8") as file:
+                    file.write(_line(entry))
+            except OSError:
+                self.complete = False
+                raise
+        else:
+            with suppress(OSError):
+                self.begin()
 
 
 def write_scene(path: Path, scene: Gaussians, footprint: str, offset: tuple[float, float, float] | None = None) -> None:

@@ -116,7 +116,7 @@ def check_left(trainer: Trainer, before: int) -> None:
         return
     causes = _causes(trainer)
     if after == 0:
-        raise RuntimeError(f"no Gaussians are left after step {step:,}: of {before:,}, {causes}")
+        raise RuntimeError(f"no Gaussians are left after step {step:,}: {causes}")
     trainer.warnings.append(f"step {step:,} has left {after:,} of {before:,} Gaussians: {causes}")
 
 
@@ -127,8 +127,8 @@ def _causes(trainer: Trainer) -> str:
     opacity, size = (sum(of_rank.get(cause, 0) for of_rank in of_ranks) for cause in ("opacity", "size"))
     return (
         f"{opacity:,} were pruned for opacities below {options.prune_opacity:g} ({flag('prune_opacity')}, "
-        f"{flag('reset_every')}, {flag('opacity_rate')}), and {size:,} for scales above {options.prune_above:g} x "
-        f"{extent:.3g} ({flag('prune_above')} x the extent of the capture)"
+        f"{flag('reset_every')}, {flag('opacity_rate')}), {size:,} for scales above "
+        f"{options.prune_above * extent:.3g}, {options.prune_above:g} extents of the capture ({flag('prune_above')})"
     )
 
 

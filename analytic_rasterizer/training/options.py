@@ -16,6 +16,7 @@ BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 RANDOM_BACKGROUND = "random"
 
 
+TIMES = ("densify_from", "densify_until", "rates_from")  # options that are one
 RANDOM_POINTS = 100_000  # by default, where the limit of Gaussians is not below that
 FINEST_REPEATS = 2  # how often the finest of several scales occurs by default, where the others occur once
 
@@ -66,6 +67,11 @@ def repeats_of(scales: tuple[int, ...], finest_repeats: int) -> tuple[int, ...]:
     return tuple(finest_repeats if several and scale == min(scales) else 1 for scale in scales)
 
 
+def is_time(value: float) -> bool:
+    """Whether a number is a time of `TrainingOptions`."""
+    return 0 <= value <= 1 or (1 < value < math.inf and value == int(value))
+
+
 def check_scales(scales: tuple[int, ...], name: str = "scales") -> None:
     """Raises ValueError, naming the argument, unless there are scales, all of them whole numbers of at least 1."""
     whole = all(scale >= 1 and scale % 1 == 0 for scale in scales)
@@ -74,7 +80,7 @@ def check_scales(scales: tuple[int, ...], name: str = "scales") -> None:
 
 @dataclass(frozen=True)
 class TrainingOptions:
-    """How to train. Positions in time that are called steps are steps; shares are of the whole training, 0 to 1.
+    """How to train. A *time* is a number of steps, or up to 1 a share of the training: 0.5 is when half of it is over.
 
     The defaults are what measured best in trainings of 7,000 steps on two scenes (docs/training.md);
     `TrainingOptions.preset` has the recipe of 3DGS [Kerbl et al. 2023].
@@ -111,16 +117,18 @@ class TrainingOptions:
         opacity_rate: Learning rate of the logit opacities.
         scale_rate: Learning rate of the log scales.
         rotation_rate: Learning rate of the quaternions.
-        rates_from: Steps after which the learning rates other than that of the means begin to fall.
+        rates_from: Time after which the learning rates other than that of the means begin to fall.
         rates_half_life: Steps in which they then fall to a half, exponentially; 0: they stay.
         sparse_adam: Whether a step of the optimizer updates only the Gaussians that at least one of its pictures shows
             (3DGS's radii > 0), as 3DGS's `--optimizer_type sparse_adam` does. The others keep parameters and moments,
             whatever regularizers would do to them.
         density: "3dgs": clone and split by the gradient of the projected means; "absgrad": the same by the sum of its
             absolute values over pixels [AbsGS]; "mcmc": relocate and add by opacity [3DGS-MCMC]; "none".
-        densify_from: Steps before the first change.
-        densify_until: Share of the training after which the number of Gaussians stays.
-        densify_every: Steps between changes.
+        densify_from: Time before the first change; -1: 500 steps, or a fourteenth of a training of fewer than 7,000. In
+            a training of fewer than 150 nothing changes, unless this or `densify_every` is given.
+        densify_until: Time after which the number of Gaussians stays.
+        densify_every: Steps between changes; 0: 100, or a seventieth of a training of fewer than 7,000, but
+            at least 10.
         gradient: Mean norm above which a Gaussian is cloned or split, by normalized device coordinates; 0: 2e-4 for
             "3dgs", 3e-4 for "absgrad".
         gradient_scales: Which scales the mean is over: "all", or "finest", the largest pictures alone.
@@ -167,13 +175,13 @@ class TrainingOptions:
     opacity_rate: float = 0.05
     scale_rate: float = 1e-2
     rotation_rate: float = 2e-3
-    rates_from: int = 7000
+    rates_from: float = 7000.0
     rates_half_life: int = 7000
     sparse_adam: bool = False
     density: str = "absgrad"
-    densify_from: int = 500
+    densify_from: float = -1.0
     densify_until: float = 0.75
-    densify_every: int = 100
+    densify_every: int = 0
     gradient: float = 0.0
     gradient_scales: str = "finest"
     reset_every: int = 3000
@@ -191,11 +199,15 @@ class TrainingOptions:
         for field in fields(self):
             object.__setattr__(self, field.name, _plain(field.name, getattr(self, field.name), type(field.default)))
         object.__setattr__(self, "scale_repeats", self.scale_repeats or repeats_of(self.scales, FINEST_REPEATS))
-        for name in ("iterations", "pictures_per_step", "supersampling", "sh_every", "densify_every"):
+        for name in ("iterations", "pictures_per_step", "supersampling", "sh_every"):
             _check(name, getattr(self, name) >= 1, "at least 1", getattr(self, name))
-        steps = ("densify_from", "reset_every", "means_rate_steps", "rates_from", "rates_half_life")
+        steps = ("densify_every", "reset_every", "means_rate_steps", "rates_half_life")
         for name in (*steps, "max_gaussians", "random_points"):
             _check(name, getattr(self, name) >= 0, "at least 0", getattr(self, name))
+        for name in TIMES:
+            value, usual = getattr(self, name), name == "densify_from" and getattr(self, name) == -1
+            explained = f"{value:g} (a share of the training; above 1 it is a whole number of steps)"
+            _check(name, usual or is_time(value), "0 to 1", explained)
         # More than the limit is refused where the points are made: options of finished trainings can still be read.
         object.__setattr__(self, "random_points", self.random_points or min(RANDOM_POINTS, self.gaussian_limit))
         check_scales(self.scales)
@@ -216,7 +228,7 @@ class TrainingOptions:
             "max_gaussians", limited, 'at least 1 with density "mcmc", which grows up to it (the preset 3dgs has 0)', 0
         )
         _check("gradient_scales", self.gradient_scales in ("all", "finest"), "all or finest", self.gradient_scales)
-        for name in ("ssim_weight", "densify_until", "grow_share"):
+        for name in ("ssim_weight", "grow_share"):
             _check(name, 0 <= getattr(self, name) <= 1, "0 to 1", getattr(self, name))
         _check("initial_opacity", 0 < self.initial_opacity < 1, "above 0 and below 1", self.initial_opacity)
         positive = ("initial_scale", "means_rate", "means_rate_end", "color_rate", "opacity_rate", "scale_rate")

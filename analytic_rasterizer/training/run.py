@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-import signal
-import sys
-import threading
-from collections.abc import Iterator
+import time
+import warnings
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from statistics import mean
@@ -18,7 +17,7 @@ from .. import io
 from ..distributed.ranks import ALONE, Ranks
 from ..filters import bake_pixel
 from ..gaussians import Gaussians
-from .captures import IMAGES, LENS_CHOICES, MISSING_CHOICES, TEST_PERIOD, Capture, Photograph, load_capture
+from .captures import Photograph, load_capture
 from .evaluation import evaluate, psnr
 from .files import (
     CAMERAS,
@@ -28,20 +27,23 @@ from .files import (
     MIP_SCENE,
     OPTIONS,
     SCENE,
+    Log,
     read_checkpoint,
     results_folder,
     write_cameras,
     write_checkpoint,
     write_json,
-    write_log,
     write_scene,
 )
+from .health import finite_rows
+from .interruption import interruption
 from .options import TrainingOptions
 from .pictures import Pictures, load_pictures
-from .placement import focus_of
-from .schedule import Clock
+from .reports import Display, TensorBoard, describe
+from .schedule import Clock, describe_change
 from .sharded import ShardedTrainer, shards_of
-from .trainer import Trainer, background_of, starting_gaussians
+from .start import capture_arguments, first_gaussians, of_length, source_of, stored_offset
+from .trainer import Trainer, background_of
 
 if TYPE_CHECKING:
     from ..viewer import LiveViewer
@@ -68,12 +70,18 @@ class Run:
             began.
         save_every: Steps between checkpoints, besides the last; 0: none.
         resume: Go on from the checkpoint in `out`, which may be that of another number of ranks.
+        iterations, seconds: With `resume`: how long to train in all, where that is not what the checkpoint says.
+            Schedules are computed anew; None: as in the checkpoint, with the same bits.
+        tensorboard: Write the numbers of the log for TensorBoard too, to the folder "tensorboard" in `out`.
+        chosen: Names of options that somebody chose, for whom one without effect is an error.
         ranks: The processes that train together, each with a part of the Gaussians.
 
     Attributes:
-        notes: Sentences of what was chosen among what the capture holds, for the user.
+        notes: Sentences for the user: what was chosen among what the capture holds, and what another length with
+            `resume` means for the schedules.
         points_found: How many points there are in the capture or the .ply that the training starts from, of which it
             takes at most `max_gaussians`; None where it starts from a scene, a checkpoint, or random points.
+        phases: Seconds of wall time by what they were spent on: "load", "warm up", "steps", "write" and "evaluate".
 
     Raises:
         io.SceneError, OSError, ImportError, ValueError: Before anything is written.
@@ -94,15 +102,24 @@ class Run:
         missing: str | None = None,
         save_every: int = 5000,
         resume: bool = False,
+        iterations: int | None = None,
+        seconds: float | None = None,
+        tensorboard: bool = False,
+        chosen: Collection[str] = (),
         ranks: Ranks = ALONE,
     ):
         if save_every < 0:
             raise ValueError(f"save_every must be at least 0, got {save_every}")
+        if not resume and (iterations is not None or seconds is not None):
+            raise ValueError("iterations and seconds of Run are for resume; otherwise they are among the options")
+        began = time.perf_counter()
         torch.backends.cudnn.allow_tf32 = False  # the variances of SSIM are small differences
         self.out, self.device, self.save_every, self.ranks = Path(out), torch.device(device), save_every, ranks
         state = read_checkpoint(self.out / CHECKPOINT, mapped=ranks.world > 1) if resume else None
+        stored = None
         if state is not None:
-            options = TrainingOptions.from_dict(state["options"])
+            stored = TrainingOptions.from_dict(state["options"])
+            options = of_length(stored, iterations, seconds, state["progress"]["step"], state["seconds"])
         self.options = options or TrainingOptions()
         # Where the scene is, from wherever `evaluate` is called.
         given = {"images": images, "test_every": test_every, "points": points and str(Path(points).resolve())}
@@ -112,7 +129,7 @@ class Run:
         self.source["offset"] = self.capture.offset
         self.notes = list(self.capture.notes)
         if state is None:  # raises before the pictures are read
-            start, self.points_found = first_gaussians(self.options, self.capture, points)
+            start, self.points_found = first_gaussians(self.options, self.capture, points, chosen)
             if points is None and self.capture.points is None and self.capture.starts_in_view:
                 self.notes.append(
                     f"no points in the capture: starts from {start.count:,} random ones in the views (--points)"
@@ -134,7 +151,12 @@ class Run:
                 )
             self.trainer.load_state_dict(state)
             self.clock.total, self.history = state["seconds"], state["history"]
+            if self.options != stored:
+                self._change_length(stored)
+        self.log = Log(self.out / LOG, self.history)
+        self.board = TensorBoard(self.out, self.progress.step) if tensorboard else None
         results_folder(self.out)
+        self.phases = {"load": time.perf_counter() - began, "warm up": 0.0, "steps": 0.0, "write": 0.0, "evaluate": 0.0}
 
     @property
     def progress(self):
@@ -143,28 +165,35 @@ class Run:
     def train(self, viewer: LiveViewer | None = None) -> bool:
         """Trains to the end, or until Ctrl-C or SIGTERM, and writes everything. Returns whether it came to the end.
 
+        Shows progress: a bar in a terminal, lines elsewhere.
+
         Args:
             viewer: Is shown the scene, between steps; no step waits for its frames. It is left running.
 
         Raises:
-            FloatingPointError: The loss is not finite; files are then those of the last checkpoint.
+            FloatingPointError: The loss is not finite, or most Gaussians have left float32.
+            RuntimeError: There is no Gaussian any more, or none that a picture shows.
             OSError: Results cannot be written. A periodic checkpoint that cannot be is only reported.
+
+        After an error the files are those of the last checkpoint. Only the log is longer.
         """
-        tqdm = io.optional_import("tqdm", "train").tqdm
         self.ranks.exchange(None)  # no rank writes before all are here
-        if self.ranks.is_first:
-            write_json(self.out / OPTIONS, self.describe())
-            write_cameras(self.out / CAMERAS, self.trainer.pictures.views)
-        trainer, progress = self.trainer, self.trainer.progress
+        with self._phase("write"):
+            if self.ranks.is_first:
+                write_json(self.out / OPTIONS, self.describe())
+                write_cameras(self.out / CAMERAS, self.trainer.pictures.views)
+                self.log.begin()
+        trainer, progress = self.trainer, self.progress
         if self.clock.total == 0:
-            trainer.warm_up()
+            with self._phase("warm up"):
+                trainer.warm_up()
         figures = ""
         if viewer is not None:
             viewer.update(trainer.scene, step=progress.step)
         self.clock.start()
-        total = self.options.iterations if self.options.seconds == 0 else None
-        hidden = None if self.ranks.is_first else True  # None: where stderr is no terminal
-        with interruption() as stopped, tqdm(total=total, initial=progress.step, unit="step", disable=hidden) as bar:
+        steps = self.options.iterations if self.options.seconds == 0 else None
+        display = Display(steps, self.options.seconds, progress.step, self.ranks.is_first)
+        with self._phase("steps"), interruption() as stopped, display:
             ended = False
             while progress.share < 1 and not ended:
                 trainer.step()
@@ -172,23 +201,92 @@ class Run:
                 last = progress.share >= 1 or ended
                 first_look = progress.step - progress.stride < FIRST_LOOK <= progress.step
                 if progress.passed(LOOK_PERIOD) or first_look or last:
-                    bar.update(progress.step - bar.n)
-                    look = self._look()
-                    bar.set_postfix(look)
-                    figures = ", ".join(f"{name} {value}" for name, value in look.items())
+                    figures = describe(self._look(display, last))
                 if viewer is not None:
                     viewer.update(trainer.scene, step=progress.step, text=figures, force=last)
                 if self.save_every and progress.passed(self.save_every) and not last:
-                    self._save_or_say(bar)
-        self.clock.stop()
-        self.save()
-        scene = self._whole(trainer.scene())
-        if self.ranks.is_first:
-            write_scene(self.out / SCENE, scene, self.options.footprint, self.capture.offset)
+                    self._save_or_say(display)
+            self.clock.stop()
+        self._write()
         return progress.share >= 1
 
-    def _whole(self, scene: Gaussians) -> Gaussians:
-        """The scene of all ranks, of which `scene` is this one's: on rank 0, on the CPU, without rows on the others."""
+    def _look(self, display: Display, last: bool) -> dict[str, Any]:
+        """Reads the losses and the clock, and notes what they say: in the log, on the screen, for TensorBoard.
+
+        Waits for the device. Returns the entry of the log.
+        """
+        losses = self.trainer.take_losses()
+        if last:
+            self.trainer.check()
+        shown = self.trainer.last  # which other ranks than the first may lack
+        quality = psnr(*shown).item() if shown else None
+        seconds, quality = self.ranks.from_first((self.clock.read(), quality))
+        self.trainer.measure(seconds)
+        entry = {
+            "step": self.progress.step,
+            "seconds": round(seconds, 3),
+            "loss": mean(losses),
+            "psnr": quality,
+            "gaussians": self.count(),
+            "dropped": self.trainer.dropped,
+        }
+        self.history.append(entry)
+        if self.ranks.is_first:
+            try:
+                self.log.add(entry)
+            except OSError as error:
+                display.warn(f"{error}; training goes on")
+            if self.board is not None:
+                self.board.add(entry)
+        display.show(entry, last)
+        self._warn(display)
+        return entry
+
+    def _warn(self, display: Display) -> None:
+        """Tells the user what the trainer has to say."""
+        for text in self.trainer.warnings:
+            display.warn(text)
+        self.trainer.warnings.clear()
+
+    def _save_or_say(self, display: Display) -> None:
+        """A checkpoint on the way. That the disk is full now need not end the training."""
+        self.clock.stop()
+        try:
+            self.save()
+        except OSError as error:
+            display.warn(f"{error}; training goes on")
+        self.clock.start()
+
+    def _write(self) -> None:
+        """The scene, and the checkpoint, which is much larger: that of a full disk costs no scene."""
+        with self._phase("write"):
+            scene = self._whole(self.trainer.scene(), SCENE)
+            if self.ranks.is_first:
+                write_scene(self.out / SCENE, scene, self.options.footprint, self.capture.offset)
+        self.save()
+        if self.board is not None:
+            self.board.close()
+
+    @contextmanager
+    def _phase(self, name: str) -> Iterator[None]:
+        """Counts the time in its block as spent on `name`, and not on the phase around it."""
+        began, others = time.perf_counter(), sum(self.phases.values())
+        try:
+            yield
+        finally:
+            within = sum(self.phases.values()) - others
+            self.phases[name] += time.perf_counter() - began - within
+
+    def _whole(self, scene: Gaussians, name: str) -> Gaussians:
+        """The scene of all ranks, of which `scene` is this one's: on rank 0, on the CPU, without rows on the others.
+
+        Warns of Gaussians that the file `name` cannot hold, and leaves them out: a filter may leave float32 where
+        parameters have not.
+        """
+        kept = finite_rows(scene)
+        if not kept.all():
+            warnings.warn(f"{int((~kept).sum()):,} Gaussians outside of float32 are left out of {name}", stacklevel=3)
+            scene = scene.rows(kept)
         return scene.map(self.ranks.gather_rows)
 
     def export_mip(self) -> Path:
@@ -199,7 +297,7 @@ class Run:
         scene = self.trainer.scene()
         cameras = self.trainer.pictures.settings[min(self.options.scales)]
         scales, opacities = bake_pixel(scene.means, scene.scales, scene.rotations, scene.opacities, cameras)
-        baked = self._whole(scene.with_activated(scales, opacities))
+        baked = self._whole(scene.with_activated(scales, opacities), MIP_SCENE)
         if self.ranks.is_first:
             # Its pixels are in the Gaussians.
             write_scene(self.out / MIP_SCENE, baked, "point:dilation=0", self.capture.offset)
@@ -234,7 +332,8 @@ class Run:
         return described | {"torch": torch.__version__, "options": self.options.to_dict()}
 
     def save(self) -> None:
-        """Writes the checkpoint and the log. Raises OSError, on all ranks, if that cannot be done."""
+        """Writes the checkpoint. Raises OSError, on all ranks, if that cannot be done."""
+        self.trainer.check()
         state = self.trainer.state_dict() | {
             "options": self.options.to_dict(),
             "source": self.source,
@@ -243,12 +342,12 @@ class Run:
             "history": self.history,
         }
         error = None
-        if self.ranks.is_first:
-            try:
-                write_checkpoint(self.out / CHECKPOINT, state)
-                write_log(self.out / LOG, self.history)
-            except OSError as raised:
-                error = raised
+        with self._phase("write"):
+            if self.ranks.is_first:
+                try:
+                    write_checkpoint(self.out / CHECKPOINT, state)
+                except OSError as raised:
+                    error = raised
         reason = self.ranks.from_first(None if error is None else str(error))
         if reason is not None:
             raise error or OSError(reason)
@@ -267,14 +366,24 @@ class Run:
         """Writes and returns metrics.json: `summary`, and `evaluate` on the test views, if any."""
         metrics = self.summary()
         if self.capture.test:
-            # A random background has no truth of its own to test against: the convention's has.
-            background = background_of(self.options, self.capture.background) or self.capture.background
-            pictures = self._load(self.capture.test, background)
-            common = {"supersampling": self.options.supersampling, "ranks": self.ranks}
-            metrics["test"] = evaluate(self.trainer.scene(), pictures, self.options.footprint, **common)
+            with self._phase("evaluate"):
+                # A random background has no truth of its own to test against: the convention's has.
+                background = background_of(self.options, self.capture.background) or self.capture.background
+                pictures = self._load(self.capture.test, background)
+                common = {"supersampling": self.options.supersampling, "ranks": self.ranks}
+                metrics["test"] = evaluate(self.trainer.scene(), pictures, self.options.footprint, **common)
+        phases = {name: round(seconds, 3) for name, seconds in self.phases.items()}
+        metrics["phases"] = self.ranks.from_first(phases)
         if self.ranks.is_first:
             write_json(self.out / METRICS, metrics)
         return metrics
+
+    def _change_length(self, before: TrainingOptions) -> None:
+        """Where the options have another length than those of the checkpoint."""
+        by_clock = self.options.seconds != 0
+        factor = before.seconds / self.options.seconds if by_clock else before.iterations / self.options.iterations
+        self.trainer.change_length(factor)
+        self.notes.append(describe_change(before, self.options, self.progress.step, self.progress.share))
 
     def _load(self, photographs: list[Photograph], background: tuple[float, float, float] | None) -> Pictures:
         """Their pictures at the scales of the training."""
@@ -285,135 +394,4 @@ class Run:
 
     def count(self) -> int:
         """Gaussians of all ranks."""
-        return sum(self.ranks.exchange(len(self.trainer.gaussians.means)))
-
-    def _look(self) -> dict[str, str]:
-        """Reads the losses and the clock, notes them in the history, and says what the bar shows."""
-        losses = self.trainer.take_losses()
-        shown = self.trainer.last  # which other ranks than the first may lack
-        quality = psnr(*shown).item() if shown else None
-        seconds, quality = self.ranks.from_first((self.clock.read(), quality))
-        self.progress.measure(seconds)
-        entry = {
-            "step": self.progress.step,
-            "seconds": round(seconds, 3),
-            "loss": mean(losses),
-            "psnr": quality,
-            "gaussians": self.count(),
-        }
-        self.history.append(entry)
-        return {
-            "loss": f"{entry['loss']:.4f}",
-            "PSNR": f"{entry['psnr']:.1f}",
-            "Gaussians": f"{entry['gaussians']:,}",
-        }
-
-    def _save_or_say(self, bar) -> None:
-        """A checkpoint on the way. That the disk is full now need not end the training."""
-        self.clock.stop()
-        try:
-            self.save()
-        except OSError as error:
-            if self.ranks.is_first:
-                bar.write(f"warning: {error}; training goes on", file=sys.stderr)
-        self.clock.start()
-
-
-def source_of(given: dict[str, Any], state: dict[str, Any] | None) -> dict[str, Any]:
-    """Where pictures and points come from: as given or usual, or as in the checkpoint of a training that is resumed.
-
-    Args:
-        given: By the names of Run's arguments; None where nothing is.
-
-    Raises ValueError for another source than it began with: it would go on with other pictures, or points of no effect.
-    """
-    usual = {"images": IMAGES, "test_every": TEST_PERIOD, "points": None, "cameras": None}
-    usual |= {"lens": LENS_CHOICES[0], "missing": MISSING_CHOICES[0]}
-    if state is not None:
-        # Those of earlier versions have no points: nobody knows them.
-        usual |= {"points": given["points"]} | {
-            name: state["source"][name] for name in usual if name in state["source"]
-        }
-    chosen = {name: usual[name] if value is None else value for name, value in given.items()}
-    for name, value in chosen.items():
-        if state is not None and value != usual[name]:
-            expected = "None" if usual[name] is None else f"{usual[name]} or None"
-            raise ValueError(f"{name} must be {expected} where a training is resumed, got {value}")
-    return chosen
-
-
-def stored_offset(state: dict[str, Any] | None) -> dict[str, Any]:
-    """The offset in the checkpoint of a training that is resumed; earlier versions had none."""
-    return {} if state is None else {"offset": state["source"].get("offset")}
-
-
-def capture_arguments(source: dict[str, Any]) -> dict[str, Any]:
-    """Arguments of `load_capture`, but for the folder, of a training with this source: that of `options.json`.
-
-    Where it has an offset, also None, positions are relative to that.
-    """
-    arguments = {"images": source["images"], "test_every": source["test_every"]}
-    arguments |= {name: source[name] for name in ("cameras", "lens", "missing") if name in source}
-    return arguments | ({"offset": tuple(source["offset"] or (0.0, 0.0, 0.0))} if "offset" in source else {})
-
-
-def first_gaussians(options: TrainingOptions, capture: Capture, points) -> tuple[Gaussians, int | None]:
-    """From a .ply if one is given, a scene or points; otherwise from the capture's points, or at random places.
-
-    Also returns how many points there were, of which `starting_gaussians` takes at most `max_gaussians`; None where the
-    Gaussians are those of a scene, or random.
-
-    Raises:
-        ValueError: A scene without Gaussians, or with more than `max_gaussians`; what `starting_gaussians` raises.
-    """
-    offset = torch.tensor(capture.offset or (0.0, 0.0, 0.0), dtype=torch.float64, device="cpu")
-    if points is not None and io.is_scene(points):
-        scene = io.load_scene(points)
-        if not len(scene.means):  # from which nothing would ever grow
-            raise io.SceneError(f"{points}: the scene has no Gaussians")
-        if len(scene.means) > options.gaussian_limit:
-            expected = f"at least {len(scene.means)}, the Gaussians of {points}, or 0"
-            raise ValueError(f"max_gaussians must be {expected}, got {options.max_gaussians}")
-        own = offset.new_tensor(io.read_metadata(points).offset or (0.0, 0.0, 0.0))
-        if not torch.equal(own, offset):
-            scene = scene._replace(means=(scene.means.double() + own - offset).to(scene.means.dtype))
-        return scene.with_sh_degree(options.sh_degree).trainable(), None
-    found = capture.points
-    if points is not None:
-        positions, colors = io.load_points(points)
-        found = (positions.double() - offset).float(), colors
-    views = [item.view for item in capture.train]
-    start = starting_gaussians(options, found, views if capture.starts_in_view else None)
-    if found is None and not capture.starts_in_view and capture.offset is not None:
-        # The cube of NeRF-synthetic scenes is about the world's zero, which is far from this one.
-        focus, _ = focus_of(views)
-        start = start._replace(means=start.means + (0.0 if focus is None else focus.float()))
-    return start, None if found is None else len(found[0])
-
-
-@contextmanager
-def interruption() -> Iterator[threading.Event]:
-    """Ctrl-C or SIGTERM sets the event, so that the step that runs is completed; a second one ends the process at once.
-
-    A second Ctrl-C raises KeyboardInterrupt. A handler of the program for SIGTERM is left in place.
-    """
-    stopped = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stopped  # only the main thread may look at signals
-        return
-    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
-    if signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
-        del usual[signal.SIGTERM]
-    before = {number: signal.getsignal(number) for number in usual}
-
-    def stop(number: int, _) -> None:
-        stopped.set()
-        signal.signal(number, usual[number])
-
-    try:
-        for number in usual:
-            signal.signal(number, stop)
-        yield stopped
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        return self.trainer.count

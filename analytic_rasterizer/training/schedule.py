@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 
 import torch
@@ -10,6 +11,10 @@ from ..density.control import passes
 from .options import TrainingOptions
 
 SH_SHARE = 0.1  # of the training, after which another degree is due at the latest
+FIRST_CHANGE, CHANGE_PERIOD = 500, 100  # steps, of density control in a training that is not short
+LEAST_PERIOD = 10  # steps, whose pictures make an average
+SHORT = 7000  # steps of the shortest training that is not
+TOO_SHORT = 150  # steps, in fewer than which new Gaussians do not learn enough
 
 
 class Progress:
@@ -34,6 +39,10 @@ class Progress:
         """Whether there was a multiple of `period` among the steps of the last advance."""
         return passes(self.step, period, self.stride)
 
+    def expected(self, usual: int) -> float:
+        """Steps of the whole training, by the clock those at the mean pace so far; `usual` before there is one."""
+        return self.steps or (self.step / self.share if self.share else usual)
+
     def measure(self, elapsed: float) -> None:
         """Corrects the share by the seconds of training so far."""
         if self.seconds and self.step > self.measured[0]:
@@ -41,6 +50,11 @@ class Progress:
             self.share = elapsed / self.seconds
             self.pace = (self.share - share) / (self.step - step)
             self.measured = (self.step, self.share)
+
+    def rescale(self, factor: float) -> None:
+        """To be called where the whole training has become 1 / `factor` as long."""
+        self.share = self.step / self.steps if self.steps else self.share * factor
+        self.measured, self.pace = (self.measured[0], self.measured[1] * factor), self.pace * factor
 
     def state_dict(self) -> dict:
         return {"step": self.step, "share": self.share, "measured": self.measured, "pace": self.pace}
@@ -103,7 +117,58 @@ def means_rate_at(step: int, share: float, options: TrainingOptions) -> float:
     return options.means_rate * (options.means_rate_end / options.means_rate) ** over
 
 
-def rates_factor_at(step: int, options: TrainingOptions) -> float:
-    """Factor of the learning rates other than that of the means."""
-    over = max(step - options.rates_from, 0)
+def rates_factor_at(step: int, options: TrainingOptions, steps: float | None = None) -> float:
+    """Factor of the learning rates other than that of the means; `steps` in all, None: as the options say."""
+    over = max(step - steps_at(options.rates_from, steps or options.iterations), 0)
     return 0.5 ** (over / options.rates_half_life) if options.rates_half_life else 1.0
+
+
+def steps_at(time: float, steps: float) -> float:
+    """A time of the options in steps, of `steps` in all."""
+    return time if time > 1 else time * steps
+
+
+def growth_times(options: TrainingOptions, steps: float) -> dict[str, float]:
+    """When density control acts in a training of `steps`, as it is told: a share for `densify_until`, else steps.
+
+    What the options leave open comes sooner in a short training, in proportion, and never in one that is too short.
+    """
+    pace = min(steps / SHORT, 1)
+    start, until = options.densify_from, options.densify_until
+    if start == -1:
+        start = steps if steps < TOO_SHORT and options.densify_every == 0 else FIRST_CHANGE * pace
+    return {
+        "densify_from": round(start if start > 1 else start * steps),
+        "densify_until": until if until <= 1 else min(until / steps, 1.0),
+        "densify_every": options.densify_every or max(round(CHANGE_PERIOD * pace), LEAST_PERIOD),
+    }
+
+
+def changes_at(options: TrainingOptions, steps: int) -> range:
+    """The steps at which density control changes the number of Gaussians, in a training of so many in one process."""
+    times = growth_times(options, steps)
+    period = times["densify_every"]
+    first = (times["densify_from"] // period + 1) * period
+    return range(first, math.ceil(times["densify_until"] * steps), period)
+
+
+def describe_change(before: TrainingOptions, after: TrainingOptions, step: int, share: float) -> str:
+    """What it means that a training goes on to another length.
+
+    Args:
+        step, share: What is over of the training, of the new length.
+    """
+    if after.seconds:
+        lengths, longer = f"{after.seconds:g} s in all instead of {before.seconds:g}", after.seconds / before.seconds
+    else:
+        lengths = f"{after.iterations:,} steps in all instead of {before.iterations:,}"
+        longer = after.iterations / before.iterations
+    rates = [means_rate_at(step, over, options) for over, options in ((share, after), (share * longer, before))]
+    text = f"goes on after step {step:,} to {lengths}: the learning rate of the means is {rates[0]:.2g} extents of the "
+    text += f"scene, and was {rates[1]:.2g}"
+    if after.density == "none":
+        return text
+    if after.seconds:
+        return f"{text}; the number of Gaussians changes for {after.densify_until:g} of it"
+    ends = [round(min(steps_at(o.densify_until, o.iterations), o.iterations)) for o in (after, before)]
+    return f"{text}; the number of Gaussians changes until step {ends[0]:,}, where that was {ends[1]:,}"

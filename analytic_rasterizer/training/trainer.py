@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -17,16 +17,16 @@ from ..effects import Effects
 from ..filters import apply_3d_filter, compute_3d_filter
 from ..gaussians import Gaussians
 from ..losses import l1_ssim
-from ..optim import FusedAdam
 from ..settings import GaussianRasterizationSettings
 from .captures import WHITE
 from .extent import extent_of
 from .health import check_left, check_visible, drop_broken
 from .model import random_points, render
+from .optimizer import TrainingAdam
 from .options import BACKGROUNDS, RANDOM_BACKGROUND, TrainingOptions
 from .pictures import Pictures
 from .placement import points_in_view
-from .schedule import PictureOrder, Progress, means_rate_at, rates_factor_at, sh_degree_at
+from .schedule import PictureOrder, Progress, growth_times, means_rate_at, rates_factor_at, sh_degree_at
 
 _picture_gradients = _C.Call("picture_gradients")
 
@@ -92,7 +92,7 @@ class Trainer:
         }
         groups = [{"params": [getattr(gaussians, name)], "lr": self.rates[name]} for name in Gaussians._fields]
         groups[-1] |= {"head": 1, "head_lr": options.color_rate}  # the constant
-        self.optimizer = FusedAdam(groups, eps=ADAM_EPS)
+        self.optimizer = TrainingAdam(groups, eps=ADAM_EPS)
         self.density = make_density(options, gaussians, self.optimizer, self.extent, background == WHITE, ranks)
         self.generator = torch.Generator(self.device).manual_seed(options.seed + 1)
         self.progress = Progress(options.iterations if options.seconds == 0 else None, options.seconds)
@@ -134,6 +134,8 @@ class Trainer:
         progress.advance(stride)
         if progress.passed(CHECK_PERIOD):
             self.check()
+        elif self._may_change():
+            drop_broken(self)  # before they multiply
         before = self.count
         changed = self.density.after_step(progress.step, progress.share, stride)
         if changed:
@@ -141,6 +143,30 @@ class Trainer:
             check_left(self, before)
         if self.options.filter_3d and (changed or progress.passed(FILTER_PERIOD)):
             self._compute_filter()
+
+    def _may_change(self) -> bool:
+        """Whether density control may change the number of Gaussians after this step."""
+        return self.options.density != "none" and self.progress.passed(self.density.options.densify_every)
+
+    def measure(self, elapsed: float) -> None:
+        """Corrects a training by the clock by its seconds so far: the share that is over, and the times of growth.
+
+        In a training by steps nothing changes.
+        """
+        self.progress.measure(elapsed)
+        if self.options.seconds and self.options.density != "none":
+            times = growth_times(self.options, self.progress.expected(self.options.iterations))
+            self.density.options = replace(self.density.options, **times)
+
+    def change_length(self, factor: float) -> None:
+        """Recomputes the schedules where the steps or seconds in all are no longer those of the state that was loaded.
+
+        Args:
+            factor: Their number in the state over that of the options.
+        """
+        self.progress.rescale(factor)
+        if isinstance(self.density, GradientDensity):  # which had ended, or has to end now
+            self.density.growing = self.progress.share < self.density.options.densify_until
 
     def check(self) -> None:
         """Takes away Gaussians of which a number has left float32, and raises what `step` does. Collective."""
@@ -168,7 +194,7 @@ class Trainer:
     def _set_rates(self) -> None:
         """Gives the optimizer the learning rates of the next step."""
         options, over = self.options, self.progress.share
-        factor = rates_factor_at(self.progress.step, options)
+        factor = rates_factor_at(self.progress.step, options, self.progress.expected(options.iterations))
         for group, rate in zip(self.optimizer.param_groups, self.rates.values()):
             group["lr"] = rate * factor
         self.optimizer.param_groups[-1]["head_lr"] = options.color_rate * factor
@@ -358,7 +384,8 @@ def make_density(
     if options.density == "none":
         return FixedDensity(gaussians, optimizer, **common)
     kind = MonteCarloOptions if options.density == "mcmc" else GradientOptions
-    known = vars(options) | {"absolute": options.density == "absgrad", "white_background": white_background}
+    known = vars(options) | growth_times(options, options.iterations)
+    known |= {"absolute": options.density == "absgrad", "white_background": white_background}
     chosen = kind(**{field.name: known[field.name] for field in fields(kind)})
     if options.density == "mcmc":
         return MonteCarloDensity(gaussians, optimizer, chosen, **common)
@@ -393,7 +420,9 @@ def starting_gaussians(
             means, colors = means[rows], colors[rows]
     if len(means) < 2:
         raise io.SceneError(f"training needs at least 2 points to start from, got {len(means)}")
-    return Gaussians.from_points(means, colors, options.sh_degree, options.initial_opacity, options.initial_scale)
+    # Distances are those of the positions as they are given, float64 too.
+    colors, first = colors.to(means.dtype), (options.sh_degree, options.initial_opacity, options.initial_scale)
+    return Gaussians.from_points(means, colors, *first).map(Tensor.float)
 
 
 def background_of(options: TrainingOptions, convention: tuple[float, float, float]) -> tuple | None:

@@ -1,7 +1,6 @@
-// The threads that loops share. OpenMP is not used: at the end of a loop every thread of its team must have come, and
-// the first ones spin until then. On a busy machine the last one may have to wait for its turn until those that wait
-// for it have used up theirs. Here helpers take items while there are some. The thread that began the loop takes them
-// as well, so that it waits for no helper that has not begun an item.
+// The threads that loops share. OpenMP is not used: an OpenMP loop ends when every thread of its team has come, and the
+// first ones spin until then. On a busy machine they take the time that the last one needs to get there. Here the
+// calling thread takes items itself, and helpers take others. A loop waits only for helpers that have begun an item.
 #include "cpu/parallel.h"
 
 #if defined(__unix__) || defined(__APPLE__)
@@ -38,8 +37,8 @@ template <class There> bool spin_until(const There& there) {
   return there();
 }
 
-/// Who may join a loop and who has, in one number: the seats that are free, the helpers that have joined, those of them
-/// that are inside, and whether the thread that began the loop sleeps until these have left.
+/// Four fields in one number: seats that are free, helpers that have joined, helpers that are inside, and whether the
+/// calling thread sleeps until the last helper has left.
 using Seats = uint64_t;
 constexpr Seats kInside = 1, kJoined = Seats(1) << 16, kFree = Seats(1) << 32, kAwaited = Seats(1) << 48;
 constexpr int kMostThreads = 0x7fff;
@@ -167,7 +166,6 @@ class Pool {
     } catch (...) {
       const std::lock_guard lock(mutex_);
       if (!loop.error) loop.error = std::current_exception();
-      loop.next.store(loop.items, std::memory_order_relaxed);
     }
   }
 

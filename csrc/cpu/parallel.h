@@ -15,8 +15,8 @@ void run_items(int64_t items, int threads, RunItem run, const void* body);
 
 /// body(item), or body(item, thread), for item in [0, items), in any order, on at most `threads` threads: the calling
 /// one, whose number is 0, and others that are there for all loops (parallel.cpp). Items that run at the same time have
-/// different numbers, all below `threads`. An exception of body ends the loop, and is thrown here. Loops may be nested,
-/// and begun by several threads at once.
+/// different numbers, all below `threads`. Where body throws, items may be left out, and the exception is thrown here.
+/// Loops may be nested, and begun by several threads at once.
 template <class Body> void parallel_for(int64_t items, int threads, const Body& body) {
   const RunItem run = [](const void* pointer, int64_t item, [[maybe_unused]] int thread) {
     const Body& body = *static_cast<const Body*>(pointer);

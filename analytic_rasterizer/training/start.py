@@ -1,0 +1,125 @@
+"""What a training starts from: pictures and points, or a checkpoint, with its options or another length."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import replace
+from typing import Any
+
+import torch
+
+from .. import io
+from ..gaussians import Gaussians
+from .captures import IMAGES, LENS_CHOICES, MISSING_CHOICES, TEST_PERIOD, Capture
+from .health import FAINTEST
+from .options import TrainingOptions
+from .placement import focus_of
+from .trainer import starting_gaussians
+from .unused import check_effect
+
+
+def source_of(given: dict[str, Any], state: dict[str, Any] | None) -> dict[str, Any]:
+    """Where pictures and points come from: as given or usual, or as in the checkpoint of a training that is resumed.
+
+    Args:
+        given: By the names of Run's arguments; None where nothing is.
+
+    Raises ValueError for another source than it began with: it would go on with other pictures, or points of no effect.
+    """
+    usual = {"images": IMAGES, "test_every": TEST_PERIOD, "points": None, "cameras": None}
+    usual |= {"lens": LENS_CHOICES[0], "missing": MISSING_CHOICES[0]}
+    if state is not None:
+        # Those of earlier versions have no points: nobody knows them.
+        usual |= {"points": given["points"]} | {
+            name: state["source"][name] for name in usual if name in state["source"]
+        }
+    chosen = {name: usual[name] if value is None else value for name, value in given.items()}
+    for name, value in chosen.items():
+        if state is not None and value != usual[name]:
+            expected = "None" if usual[name] is None else f"{usual[name]} or None"
+            raise ValueError(f"{name} must be {expected} where a training is resumed, got {value}")
+    return chosen
+
+
+def stored_offset(state: dict[str, Any] | None) -> dict[str, Any]:
+    """The offset in the checkpoint of a training that is resumed; earlier versions had none."""
+    return {} if state is None else {"offset": state["source"].get("offset")}
+
+
+def capture_arguments(source: dict[str, Any]) -> dict[str, Any]:
+    """Arguments of `load_capture`, but for the folder, of a training with this source: that of `options.json`.
+
+    Where it has an offset, also None, positions are relative to that.
+    """
+    arguments = {"images": source["images"], "test_every": source["test_every"]}
+    arguments |= {name: source[name] for name in ("cameras", "lens", "missing") if name in source}
+    return arguments | ({"offset": tuple(source["offset"] or (0.0, 0.0, 0.0))} if "offset" in source else {})
+
+
+def of_length(
+    stored: TrainingOptions, iterations: int | None, seconds: float | None, step: int, elapsed: float
+) -> TrainingOptions:
+    """The options of a checkpoint, or the same for another number of steps or seconds in all.
+
+    Args:
+        stored: Of the checkpoint.
+        iterations, seconds: In all; None: as stored.
+        step, elapsed: Steps and seconds that are over.
+
+    Raises:
+        ValueError: Less than is over, or steps for a training that goes by the clock, or the other way round.
+    """
+    if iterations is not None and iterations != stored.iterations:
+        if stored.seconds:
+            raise ValueError("iterations: this training goes by the clock; give seconds instead")
+        if iterations < step:
+            raise ValueError(f"iterations must be at least {step}, the steps that are over, got {iterations}")
+        return replace(stored, iterations=iterations)
+    if seconds is not None and seconds != stored.seconds:
+        if not stored.seconds:
+            raise ValueError("seconds: this training goes by its steps; give iterations instead")
+        if not seconds >= elapsed:
+            raise ValueError(f"seconds must be at least {elapsed:.1f}, those that are over, got {seconds}")
+        return replace(stored, seconds=seconds)
+    return stored
+
+
+def first_gaussians(
+    options: TrainingOptions, capture: Capture, points, given: Collection[str] = ()
+) -> tuple[Gaussians, int | None]:
+    """From a .ply if one is given, a scene or points; otherwise from the capture's points, or at random places.
+
+    Also returns how many points there were, of which `starting_gaussians` takes at most `max_gaussians`; None where the
+    Gaussians are those of a scene, or random.
+
+    Raises:
+        ValueError: A scene without Gaussians, or with more than `max_gaussians`; what `starting_gaussians` raises; an
+            option among those `given` that has no effect.
+    """
+    offset = torch.tensor(capture.offset or (0.0, 0.0, 0.0), dtype=torch.float64, device="cpu")
+    if points is not None and io.is_scene(points):
+        check_effect(options, given, "a scene")
+        scene = io.load_scene(points)
+        if not len(scene.means):  # from which nothing would ever grow
+            raise io.SceneError(f"{points}: the scene has no Gaussians")
+        if len(scene.means) > options.gaussian_limit:
+            expected = f"at least {len(scene.means)}, the Gaussians of {points}, or 0"
+            raise ValueError(f"max_gaussians must be {expected}, got {options.max_gaussians}")
+        own = offset.new_tensor(io.read_metadata(points).offset or (0.0, 0.0, 0.0))
+        if not torch.equal(own, offset):
+            scene = scene._replace(means=(scene.means.double() + own - offset).to(scene.means.dtype))
+        if not (scene.opacities >= FAINTEST).any():
+            raise io.SceneError(f"{points}: all Gaussians are transparent (opacities below 1/255), none can learn")
+        return scene.with_sh_degree(options.sh_degree).trainable(), None
+    check_effect(options, given, "nothing" if points is None and capture.points is None else "points")
+    found = capture.points
+    if points is not None:
+        positions, colors = io.load_points(points)
+        found = (positions.double() - offset).float(), colors
+    views = [item.view for item in capture.train]
+    start = starting_gaussians(options, found, views if capture.starts_in_view else None)
+    if found is None and not capture.starts_in_view and capture.offset is not None:
+        # The cube of NeRF-synthetic scenes is about the world's zero, which is far from this one.
+        focus, _ = focus_of(views)
+        start = start._replace(means=start.means + (0.0 if focus is None else focus.float()))
+    return start, None if found is None else len(found[0])

@@ -1,0 +1,86 @@
+"""Options that change nothing beside the others: whoever chose one expects something of it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+
+from .health import flag
+from .options import TrainingOptions
+from .schedule import SH_SHARE, changes_at, growth_times, steps_at
+
+GROWTH = ("densify_from", "densify_until", "densify_every", "prune_opacity")  # of every density control
+GRADIENTS = ("gradient", "gradient_scales", "split_above", "prune_above", "reset_every")
+MONTE_CARLO = ("grow_share", "noise")
+
+
+def check_effect(options: TrainingOptions, given: Collection[str], start: str) -> None:
+    """Raises ValueError for the first of the options `given` that has no effect, and says why.
+
+    Args:
+        start: What the training starts from: "a scene", "points", or "nothing".
+    """
+    reasons = without_effect(options, start)
+    for name in given:
+        if name in reasons:
+            raise ValueError(f"{flag(name)} has no effect: {reasons[name]}")
+
+
+def without_effect(options: TrainingOptions, start: str = "nothing") -> dict[str, str]:
+    """The names of all options that have no effect beside the others, with the reason.
+
+    Of a training by the clock nobody knows the steps, so that they are no reason.
+    """
+    reasons: dict[str, str] = {}
+
+    def note(names: Collection[str], reason: str) -> None:
+        for name in names:
+            reasons.setdefault(name, reason)
+
+    if start != "nothing":
+        note(["random_points"], f"the training starts from {start}")
+    if start == "a scene":
+        note(["initial_opacity", "initial_scale"], "the training starts from a scene")
+    if options.density not in ("3dgs", "absgrad"):
+        note(GRADIENTS, f"it is for the density controls 3dgs and absgrad, got {options.density}")
+    if options.density != "mcmc":
+        note(MONTE_CARLO, f"it is for the density control mcmc, got {options.density}")
+    if options.density == "none":
+        note(GROWTH, "the density control none changes nothing")
+    if options.densify_until == 0:
+        note({*GROWTH, *GRADIENTS, "grow_share"} - {"densify_until"}, "densify_until is 0, so that nothing changes")
+    if len(options.scales) == 1:
+        note(["gradient_scales"], "there is one scale")
+        if options.scales == (1,):
+            note(["downsampling"], "the pictures are trained on at their full size")
+    if options.sh_degree == 0:
+        note(["sh_every"], "sh_degree is 0")
+    if options.rates_half_life == 0:
+        note(["rates_from"], "rates_half_life is 0, so that no rate falls")
+    if not options.seconds:
+        _note_times(options, note)
+    return reasons
+
+
+def _note_times(options: TrainingOptions, note) -> None:
+    """What comes after the end, by the steps of the training."""
+    steps = options.iterations
+    of_training = f"the training has {steps:,} steps"
+    if options.sh_every > SH_SHARE * steps:
+        note(["sh_every"], f"a degree is added every {SH_SHARE * steps:g} steps, a tenth of the training, anyway")
+    if steps_at(options.rates_from, steps) >= steps:
+        note(["rates_from", "rates_half_life"], f"rates fall from step {options.rates_from:,g} on, and {of_training}")
+    if options.density == "none" or options.densify_until == 0:
+        return
+    changes, times = changes_at(options, steps), growth_times(options, steps)
+    end = times["densify_until"] * steps
+    if not changes:
+        reason = (
+            f"the number of Gaussians never changes: the first change would be at step {changes.start:,}, and growth "
+            f"ends at {end:,g}"
+        )
+        note({*GROWTH, *GRADIENTS, "grow_share"}, f"{reason} ({of_training})")
+    elif options.reset_every >= end:
+        note(["reset_every"], f"the first would be after step {options.reset_every:,}, and growth ends at {end:,g}")
+    if options.reset_every == 0 or options.reset_every >= max(changes, default=0):
+        reset = f"the first is after step {options.reset_every:,}" if options.reset_every else "reset_every is 0"
+        note(["prune_above"], f"sizes are limited after a reset of the opacities, {reset}, and growth ends at {end:,g}")
