@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from ..density import FixedDensity
+from ..distributed.ranks import Ranks
 from ..gaussians import Gaussians
 from ..io.scenes import numbers_of
 from .model import render
-
-if TYPE_CHECKING:
-    from .trainer import Trainer
+from .options import TrainingOptions
+from .pictures import Pictures
+from .schedule import Progress
 
 FAINTEST = 1 / 255  # the rasterizer draws nothing of a lower opacity
 MOST_BROKEN = 0.5  # of the Gaussians: a training that loses more at once diverges
@@ -25,6 +27,28 @@ OPTION_OF = {
     "logit_opacities": "opacity_rate",
     "shs": "color_rate",
 }
+
+
+class Trainer(Protocol):
+    """What is looked at here of a `training.Trainer`."""
+
+    options: TrainingOptions
+    pictures: Pictures
+    ranks: Ranks
+    density: FixedDensity
+    progress: Progress
+    gaussians: Gaussians
+    count: int
+    extent: float
+    last: tuple[Tensor, Tensor] | None
+    dropped: int
+    warnings: list[str]
+
+    def keep(self, kept: Tensor) -> None: ...
+
+    def take_losses(self) -> list[float]: ...
+
+    def scene(self) -> Gaussians: ...
 
 
 def finite_rows(gaussians: Gaussians) -> Tensor:
