@@ -109,7 +109,7 @@ def check_visible(trainer: Trainer) -> None:
         options = ["opacity_rate"] + (["opacity_weight"] if trainer.options.regularizers[0] else [])
         raise RuntimeError(
             f"all {count:,} Gaussians are transparent after step {step:,} (opacities below 1/255), so that nothing can "
-            f"be learned any more; a lower {' or '.join(map(flag, options))} may help"
+            f"be learned any more; a lower {' or '.join(map(flag, options))} may help{_about_pictures(trainer)}"
         )
     if trainer.ranks.world == 1 and trainer.last is not None and not _any_shown(trainer):
         raise RuntimeError(
@@ -153,7 +153,16 @@ def _causes(trainer: Trainer) -> str:
         f"{opacity:,} were pruned for opacities below {options.prune_opacity:g} ({flag('prune_opacity')}, "
         f"{flag('reset_every')}, {flag('opacity_rate')}), {size:,} for scales above "
         f"{options.prune_above * extent:.3g}, {options.prune_above:g} extents of the capture ({flag('prune_above')})"
+        f"{_about_pictures(trainer)}"
     )
+
+
+def _about_pictures(trainer: Trainer) -> str:
+    """What is wrong with the pictures, if nothing is in any of them."""
+    pictures = trainer.pictures
+    truths = (pictures.truth(min(pictures.colors), view) for view in range(len(pictures.views)))
+    empty = all(bool((truth == truth[:, :1, :1]).all()) for truth in truths)
+    return "; there is nothing in the pictures, each of which has one colour" if empty else ""
 
 
 def flag(name: str) -> str:
