@@ -91,15 +91,14 @@ def in_units(sources: list[str], folder: Path) -> list[str]:
 # No -std: torch sets the standard that its headers need. No contraction: forward and backward must
 # round alike (csrc/core/lanes.h), and bits must not depend on the compiler's choices. Nothing that only a debugger
 # reads is installed; nothing but the module's entry is visible from outside.
-COMPILE_ARGS = ["-O3", "-g0", "-fopenmp", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi"]
+COMPILE_ARGS = ["-O3", "-g0", "-pthread", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi"]
 COMPILE_ARGS += ["-fvisibility=hidden", "-fvisibility-inlines-hidden"]
-# libgomp by name only: the loader takes the copy that torch has already loaded.
-LINK_ARGS = ["-fopenmp", "-Wl,--strip-all"]
+LINK_ARGS = ["-pthread", "-Wl,--strip-all"]
 if os.environ.get("ANALYTIC_RASTERIZER_SANITIZE") == "1":
     # Checks as calls: see CMakeLists.txt. No vptr: it wants the type information of torch's hidden classes.
     SANITIZERS = ["-fsanitize=address,undefined", "-fno-sanitize=vptr", "-fno-sanitize-recover=all"]
     COMPILE_ARGS += ["-O1", "-g1", *SANITIZERS, "--param", "asan-instrumentation-with-call-threshold=0"]
-    LINK_ARGS = ["-fopenmp", *SANITIZERS]
+    LINK_ARGS = ["-pthread", *SANITIZERS]
 NVCC_ARGS = ["-O3", "--fmad=false", "--expt-relaxed-constexpr", "-Xfatbin", "-compress-all"]
 NVCC_ARGS += ["-Xcompiler", "-fno-gnu-unique,-fvisibility=hidden"]
 

@@ -285,7 +285,10 @@ class View:
         """
         if not (math.isfinite(scale) and scale > 0):
             raise ValueError(f"scale must be positive and finite, got {scale}")
-        width, height = self.size(scale)
+        return self.resized(*self.size(scale))
+
+    def resized(self, width: int, height: int) -> View:
+        """The view with so many pixels over the same field of view."""
         x, y = width / self.width, height / self.height
         cx, cy = (c if c is None else c * factor for c, factor in ((self.cx, x), (self.cy, y)))
         return replace(self, width=width, height=height, fx=x * self.fx, fy=y * self.fy, cx=cx, cy=cy)

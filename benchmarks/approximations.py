@@ -1,6 +1,6 @@
 """What else errs, besides integrating over the pixel: how much a picture changes when another approximation is removed.
 
-    python benchmarks/approximations.py SCENE --views VIEWS [--scales 1 4] [--crop 32 32] [--samples 4]
+    python benchmarks/approximations.py SCENE --views VIEWS [--scales 1,4] [--crop 32 32] [--samples 4]
 
 Renders the middle of every view by brute force, in float64: every splat in every sample, samples x samples unfiltered
 samples in a pixel on a regular grid, averaged. The first picture is what every footprint approximates, the integral of
@@ -35,6 +35,7 @@ import analytic_rasterizer as ar
 from analytic_rasterizer import _C, io
 from analytic_rasterizer.analysis.reference import UNFILTERED, image_errors, supersampled
 from analytic_rasterizer.analysis.tables import markdown_table
+from analytic_rasterizer.cli.arguments import add_scales, whole_reductions
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.rotations import rotation_matrices
 
@@ -206,7 +207,7 @@ def parse_arguments() -> argparse.Namespace:
     add("scene", help="trained scene: .ply, compressed .ply, .spz, or .npz (see scene_files.py)")
     add("--views", required=True, help="file of views")
     add("--limit-views", type=int, help="use only so many of them")
-    add("--scales", nargs="+", type=int, default=[1, 4], metavar="N", help="1/N of the views' size (default: 1 4)")
+    add_scales(parser, whole_reductions, "reductions of the views: 2 is half the size (default: 1,4)", (1, 4))
     add("--crop", nargs=2, type=int, default=[32, 32], metavar=("W", "H"), help="the middle of it (default: 32 32)")
     add("--samples", type=int, default=4, metavar="N", help="along a pixel's side (default: 4)")
     add("--threads", type=int, default=torch.get_num_threads(), help="of the CPU")

@@ -1,6 +1,6 @@
 """How long one large view takes on several ranks, and how much memory on each, against one.
 
-    python benchmarks/bands.py SCENE --views VIEWS --ranks 1 2 --scale 4 [--times 8] [--copies 3] [--device cuda]
+    python benchmarks/bands.py SCENE --views VIEWS --ranks 1 2 --scales 0.25 [--times 8] [--copies 3] [--device cuda]
 
 renders the first view with `distributed.rasterize_bands`, without gradients, and gathers the picture on rank 0. The
 ranks are processes of this machine, with NCCL and a device each, or with gloo on the CPU, where they share the cores:
@@ -39,7 +39,7 @@ COLUMNS = ("seconds", "scene_bytes", "peak_bytes")
 def main() -> None:
     args = parse_arguments()
     results = {ranks: measure(ranks, args) for ranks in args.ranks}
-    scene, view = load_scene(args.scene), io.load_views(args.views)[0].scaled(args.scale)
+    scene, view = load_scene(args.scene), io.load_views(args.views)[0].scaled(1 / args.scales)
     print_setup(scene, [view], args.device)
     if args.times * args.copies > 1:
         print(f"each Gaussian as {args.times}, in {args.copies} copies: {args.times * args.copies * len(scene.means)}")
@@ -78,7 +78,7 @@ def work(rank: int, world: int, folder: str, args: argparse.Namespace) -> None:
     """What a process does; the first one writes the results."""
     device = join_group(rank, world, folder, args)
     ranks = Ranks.of_group()
-    scene, view = load_scene(args.scene), io.load_views(args.views)[0].scaled(args.scale)
+    scene, view = load_scene(args.scene), io.load_views(args.views)[0].scaled(1 / args.scales)
     own = shard_of(scene, ranks, args, device)
     settings = view.settings(1.0, BLACK, device=device, sh_degree=scene.sh_degree, footprint=args.footprint)
 

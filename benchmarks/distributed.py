@@ -37,6 +37,7 @@ from scene_files import load_scene
 from analytic_rasterizer import io
 from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import added_memory
+from analytic_rasterizer.cli.arguments import add_scales, reduction
 from analytic_rasterizer.cli.launch import make_group
 from analytic_rasterizer.distributed.exchange import Route
 from analytic_rasterizer.distributed.ranks import Ranks, even_counts
@@ -86,7 +87,7 @@ def make_rank_parser(description: str, footprint: str) -> argparse.ArgumentParse
     add("--views", required=True, help="file of views")
     add("--ranks", type=int, nargs="+", default=[1, 2], metavar="N", help="(default: 1 2)")
     add("--footprint", default=footprint, metavar="NAME[:k=v]", help="(default: %(default)s)")
-    add("--scale", type=float, default=1.0, help="resolution, as a factor")
+    add_scales(parser, reduction, "of the views: 2 is half the size (default: 1)", 1.0)
     add("--times", type=int, default=1, metavar="K", help="replace each Gaussian by K smaller ones (default: 1)")
     add_measuring(parser)
     return parser
@@ -163,7 +164,7 @@ class Case:
         # All degrees of the harmonics from the first step on, and no last step.
         options = {"sh_degree": scene.sh_degree, "sh_every": 1, "iterations": 2**30, "density": "none"}
         options = TrainingOptions(footprint=args.footprint, **options)
-        pictures = pictures_of_noise(io.load_views(args.views), args.scale, device)
+        pictures = pictures_of_noise(io.load_views(args.views), args.scales, device)
         if ranks.world == 1:
             self.trainer = Trainer(options, start, pictures, BLACK, device)
         else:
@@ -236,8 +237,8 @@ def densified(scene: Gaussians, times: int) -> Gaussians:
     return several._replace(means=means).with_activated(scales=several.scales / times**0.5)
 
 
-def pictures_of_noise(views: list[io.View], scale: float, device: torch.device) -> Pictures:
-    settings = [view.settings(scale, BLACK, device=device) for view in views]
+def pictures_of_noise(views: list[io.View], reduction: float, device: torch.device) -> Pictures:
+    settings = [view.settings(1 / reduction, BLACK, device=device) for view in views]
     generator = torch.Generator().manual_seed(0)
     sizes = [(3, s.image_height, s.image_width) for s in settings]
     colors = [torch.randint(256, size, dtype=torch.uint8, generator=generator).to(device) for size in sizes]

@@ -30,6 +30,7 @@ import analytic_rasterizer as ar
 from analytic_rasterizer import effects, io
 from analytic_rasterizer.analysis.tables import markdown_table
 from analytic_rasterizer.analysis.timing import Case, fixed_weights
+from analytic_rasterizer.cli.arguments import add_scales, reduction
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.outputs import depths
 
@@ -41,7 +42,7 @@ CAMERA = ("viewmatrix", "projmatrix", "campos", "tanfovx", "tanfovy")
 def main() -> None:
     args = parse_arguments()
     scene = load_scene(args.scene).to(args.device)
-    views = [view.scaled(args.scale) for view in io.load_views(args.views)[: args.limit_views]]
+    views = [view.scaled(1 / args.scales) for view in io.load_views(args.views)[: args.limit_views]]
     print_setup(scene, views, args.device)
     clock, results = CLOCKS[args.device], {}
 
@@ -64,7 +65,7 @@ def main() -> None:
 def parse_arguments() -> argparse.Namespace:
     parser = make_parser(__doc__.split("\n")[0], FOOTPRINTS)
     parser.add_argument("--limit-views", type=int, help="use only so many of them")
-    parser.add_argument("--scale", type=float, default=1.0, help="of the views' size")
+    add_scales(parser, reduction, "of the views: 2 is half the size (default: 1)", 1.0)
     parser.add_argument(
         "--effects", nargs="+", default=list(ROWS), choices=list(ROWS), metavar="ROW", help=", ".join(ROWS)
     )

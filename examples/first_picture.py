@@ -1,8 +1,14 @@
-"""The smallest program: three Gaussians, one camera, one picture, one gradient step. Runs on the CPU in a second."""
+"""The smallest program: three Gaussians, one camera, one picture, one gradient step. Runs on the CPU in a second.
+
+Writes first_picture.png to the current folder; first_picture.ppm where Pillow is not installed.
+"""
+
+import importlib.util
 
 import torch
 
 import analytic_rasterizer as ar
+from analytic_rasterizer import io
 
 means = torch.tensor([[0.0, 0.0, 4.0], [0.6, 0.2, 5.0], [-0.5, -0.3, 6.0]], requires_grad=True)
 scene = {
@@ -11,10 +17,19 @@ scene = {
     "scales": torch.full((3, 3), 0.3),
     "rotations": torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(3, 1),
 }
-settings = ar.camera_settings(torch.eye(4), width=64, height=48, fx=60.0, fy=60.0, footprint="moment", samples=4)
+settings = ar.camera_settings(torch.eye(4), width=320, height=240, fx=300.0, fy=300.0, footprint="moment", samples=4)
 color, radii = ar.GaussianRasterizer(settings)(means3D=means, means2D=None, **scene)
 color.sum().backward()
 
-assert color.shape == (3, 48, 64) and color.isfinite().all() and means.grad.isfinite().all()
+assert color.shape == (3, 240, 320) and color.isfinite().all() and means.grad.isfinite().all()
 print(f"analytic_rasterizer {ar.__version__}: {ar.instruction_set()}, CUDA {'yes' if ar._C.has_cuda else 'no'}")
 print(f"the picture spans [{color.min():.3f}, {color.max():.3f}], the radii are {radii.tolist()} px")
+
+if importlib.util.find_spec("PIL"):
+    file = "first_picture.png"
+    io.save_image(file, color)
+else:
+    file = "first_picture.ppm"
+    pixels = (255 * color.detach().clamp(0, 1)).round().byte().permute(1, 2, 0)
+    io.write_bytes(file, b"P6 320 240 255\n" + pixels.contiguous().numpy().tobytes())
+print(f"see {file}")

@@ -43,7 +43,7 @@ def test_effects(device, small_scene, monkeypatch, capsys):
     """Every row, with numbers in all of its columns."""
     effects = importlib.import_module("effects")
     arguments = [small_scene / "scene.npz", "--views", small_scene / "views.json", "--json", small_scene / "out.json"]
-    options = ["--footprints", "box:samples=4", "--rounds", "1", "--scale", "0.5", "--threads", "1", "--device", device]
+    options = ["--footprints", "box:samples=4", "--rounds", "1", "--scales", "2", "--threads", "1", "--device", device]
     monkeypatch.setattr(sys, "argv", ["effects.py", *map(str, arguments), *options])
     effects.main()
     table = capsys.readouterr().out
@@ -338,6 +338,38 @@ def test_losses(device, tmp_path, monkeypatch, capsys):
         assert all(0 < value < math.inf for value in times)
 
 
+def test_busy(tmp_path, monkeypatch, capsys):
+    """Rows alone and beside loops, with one thread and with two in turn; no loop is left, and torch's setting stays."""
+    monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
+    busy = importlib.import_module("busy")
+    started, asked, alive = [], [], []
+
+    def start(*args, **kwargs):
+        started.append(subprocess.Popen(*args, **kwargs))
+        return started[-1]
+
+    def ask(count):
+        asked.append(count)
+        alive.append(sum(loop.poll() is None for loop in started))
+
+    monkeypatch.setattr(busy, "subprocess", types.SimpleNamespace(Popen=start, PIPE=subprocess.PIPE))
+    monkeypatch.setattr(torch, "set_num_threads", ask)
+    options = ["--loops", "2", "--threads", "2", "--gaussians", "30", "--sizes", "20x10", "--rounds", "1"]
+    monkeypatch.setattr(sys, "argv", ["busy.py", *options, "--json", str(tmp_path / "out.json")])
+    busy.main()
+    table = capsys.readouterr().out
+    rows = json.loads((tmp_path / "out.json").read_text())["results"]
+    assert [(row["pass"], row["loops"]) for row in rows] == [
+        (name, loops) for loops in (0, 2) for name in ("forward", "with backward")
+    ]
+    assert asked == [1, 2, 1, 2, torch.get_num_threads()] * 4
+    assert alive == [0] * 10 + [2] * 10
+    assert len(started) == 2 and all(loop.returncode for loop in started)
+    for row in rows:
+        assert row["ratio"] == pytest.approx(row["all_threads_ms"] / row["one_thread_ms"])
+        assert f"| {row['size']} | {row['pass']} | {row['loops']} |" in table
+
+
 def test_training(device, tmp_path, monkeypatch, capsys):
     """A row for every variant, and a run for every variant and seed, on pictures of noise."""
     image = pytest.importorskip("PIL.Image", reason="needs the train extra")
@@ -406,7 +438,7 @@ def test_distributed(small_scene):
 
 def test_bands(small_scene):
     """A row for every number of ranks; two of them hold half of the scene each, and the last all of the image."""
-    printed, written = run_on_ranks("bands.py", small_scene, "--times", "3", "--copies", "2", "--scale", "16")
+    printed, written = run_on_ranks("bands.py", small_scene, "--times", "3", "--copies", "2", "--scales", "0.0625")
     assert "in 2 copies: 300\n" in printed
     one, two = (written["results"][ranks] for ranks in ("1", "2"))
     assert min(*one.values(), *two.values()) > 0

@@ -787,6 +787,10 @@ FOUND = {
         {"notes": "cameras are those of sparse/1; --cameras takes sparse/0 or sparse/2 instead"},
     ),
     "models of the same size": (lambda f: models(f, [9, 9]), {"notes": "those of sparse/0; --cameras takes sparse/1"}),
+    "a broken model beside a good one": (
+        lambda f: [models(f, [9, 9]), (f / "sparse" / "0" / "images.bin").write_bytes(b"x")],
+        {"notes": "cameras are those of sparse/1; --cameras takes sparse/0 instead"},
+    ),
     "other files beside a model": (
         lambda f: [
             write(f),

@@ -24,7 +24,7 @@ pytest.importorskip("gsply", reason="needs the cli extra")
 image = pytest.importorskip("PIL.Image", reason="needs the cli extra")
 
 FOOTPRINT_ARGUMENTS = {
-    "default": ([], {}),
+    "default": ([], {"footprint": "point"}),  # what a file wants that says nothing
     "point": (["--footprint", "point"], {"footprint": "point"}),
     "dilation": (["--footprint", "point:dilation=0"], {"footprint": "point", "dilation": 0.0}),
     "box": (["--footprint", "box:samples=2"], {"footprint": "box", "samples": 2}),
@@ -56,7 +56,7 @@ def files(tmp_path):
 
 def arguments(files, *extra):
     scene, views, out = files / "scene.ply", files / "views.json", files / "out"
-    return ["render", str(scene), "--views", str(views), "--out", str(out), *extra]
+    return ["render", str(scene), "--views", str(views), "--out", str(out), "--device", "cpu", *extra]
 
 
 def run(*args, **options):
@@ -75,7 +75,7 @@ def run(*args, **options):
 @pytest.mark.parametrize("which", FOOTPRINT_ARGUMENTS)
 def test_render_writes_what_the_library_renders(files, which, capsys):
     flags, options = FOOTPRINT_ARGUMENTS[which]
-    extra = ["--scale", "0.5", "--background", "0.2", "0.4", "1"]
+    extra = ["--scales", "2", "--background", "0.2", "0.4", "1"]
     assert cli.main(arguments(files, *flags, *extra)) == 0
     scene = io.load_scene(files / "scene.ply")
     views = io.load_views(files / "views.json")
@@ -102,7 +102,9 @@ def test_render_writes_what_the_library_renders(files, which, capsys):
 
 def test_render_in_a_process(files):
     done = run(*arguments(files, "--threads", "1"))
-    assert (done.returncode, done.stderr) == (0, "")
+    assert done.returncode == 0
+    hint = f"right at the size of the training, for others: bake {files / 'scene.ply'} --out FILE"
+    assert done.stderr == f"footprint point:dilation=0.3: scene.ply names none, and 3DGS trains with it; {hint}\n"
     assert [line.split()[0] for line in done.stdout.splitlines()] == [*("view", "front", "off_centre", "mean")]
 
 
@@ -175,10 +177,32 @@ end_header
         (None, ["--footprint", "mip", "--samples", "4"], "samples"),
         (None, ["--samples", "4"], "--samples is an option of a footprint, which --footprint names"),
         (None, ["--samples", "x"], "argument --samples: invalid int value: 'x'"),
-        (None, ["--scale", "0"], "argument --scale: must be a positive number, got 0"),
-        (None, ["--scale", "nan"], "argument --scale: must be a positive number, got nan"),
-        (None, ["--background", "0", "0"], "argument --background: expected 3 arguments"),
-        (None, ["--background", "0", "0", "2"], "must be a number from 0 to 1, got 2"),
+        (None, ["--scales", "0"], "argument --scales: must be reductions, positive numbers (2 is half the size), with"),
+        (None, ["--scales", "2,nan"], "with commas between them, got 2,nan"),
+        (None, ["--scales", "1/2"], "with commas between them, got 1/2"),
+        (None, ["--scales", "1", "2"], "unrecognized arguments: 2; lists have commas and no spaces: 1,2,4"),
+        (None, ["--scale", "0.5"], "use --scales, which takes reductions: 2 is half the size; got 0.5"),
+        (
+            None,
+            ["--scales", "1e-5"],
+            "6400000 x 4800000 px are too large, a side may have 1048576 px; larger numbers",
+        ),
+        (None, ["--scales", "1e-4"], "pictures of 640000 x 480000 px need 1.97e+04 GB, and "),
+        (None, ["--background", "0", "0"], "must be black, white or three numbers from 0 to 1, as R,G,B, got 0 ("),
+        (
+            None,
+            ["--background", "0", "0", "2"],
+            "must be black, white or three numbers from 0 to 1, as R,G,B, got 0,0,2",
+        ),
+        (None, ["--background", "-1", "0", "0"], "as R,G,B, got -1,0,0"),
+        (None, ["--background", "green"], "as R,G,B, got green"),
+        (None, ["--background", "1", "1", "1", "--alpha"], "--alpha leaves the background out"),
+        (None, ["--frames", "3"], "--frames is the number of pictures along a path: give --path"),
+        (None, ["--fps", "3"], "--fps is for a film: give --out FILE.mp4"),
+        (None, ["--path", "spiral"], "argument --path: invalid choice: 'spiral'"),
+        (None, ["--out", "film.gif"], "--out must be a folder, or a film that ends in .mp4, got film.gif"),
+        (None, ["--out", "film.mp4", "--depth"], "--depth is for pictures: give --out DIR, got film.mp4"),
+        (None, ["--out", "film.mp4", "--scales", "1,2"], "a film has one size: give one number to --scales, got 2"),
         (None, ["--threads", "0"], "must be a positive whole number, got 0"),
         (None, ["--size", "3", "-3"], "must be a positive whole number, got -3"),
         (None, ["--device", "abacus"], "argument --device: invalid choice: 'abacus'"),
@@ -196,7 +220,16 @@ def test_errors_are_one_line(files, capsys, prepare, extra, message):
     [
         ([], "the following arguments are required: COMMAND"),
         (["paint"], "invalid choice: 'paint'"),
-        (["render"], "the following arguments are required: SCENE, --views, --out"),
+        (["render"], "the following arguments are required: SCENE, --out"),
+        (["render", "{}", "--out", "{}/out"], "a folder without a scene: expected scene.ply with options.json, which"),
+        (["evaluate", "{}/nosuch"], "nosuch: no such file or folder"),
+        (["bake", "{}/nosuch", "--out", "a.ply"], "nosuch: no such file or folder"),
+        (["tables", "360-stst", "--data", "{}"], "tables 360-stst needs --out DIR"),
+        (["tables", "360-stst"], "tables 360-stst needs --data FOLDER and --out DIR"),
+        (
+            ["view", "a.ply", "--footprint", "moment"],
+            "; with --server every footprint can be shown",
+        ),
     ],
 )
 def test_wrong_commands_are_one_line(tmp_path, capsys, args, message):
@@ -207,7 +240,7 @@ def test_errors_of_a_process(tmp_path):
     done = run("render", "none.ply", "--views", "none.json", "--out", ".", cwd=tmp_path)
     assert done.returncode == 2
     assert done.stdout == ""
-    assert done.stderr == "error: none.json: No such file or directory\n"
+    assert done.stderr == "error: none.ply: no such file or folder\n"
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
@@ -277,7 +310,7 @@ def test_interrupt_of_a_process_is_quiet(files):
     view = io.load_views(files / "views.json")[0]
     io.save_views(files / "views.json", [replace(view, name=f"{i}") for i in range(3000)])
     process = subprocess.Popen(
-        [sys.executable, "-m", "analytic_rasterizer", *arguments(files, "--scale", "8")],  # minutes
+        [sys.executable, "-m", "analytic_rasterizer", *arguments(files, "--scales", "0.125")],  # minutes
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -286,22 +319,31 @@ def test_interrupt_of_a_process_is_quiet(files):
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + DEADLINE
-    while not (files / "out" / "0.png").exists() and time.monotonic() < deadline:
+    while not (files / "out" / "0.png").exists() and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     out, err = process.communicate(timeout=DEADLINE)
-    assert (process.returncode, out, err) == (130, "", "")
+    assert (process.returncode, out) == (130, "")
+    assert err.startswith("footprint point") and err.count("\n") == 1
     assert not (files / "out" / "2999.png").exists()
 
 
 def inspect_arguments(files, *extra):
-    return ["inspect", str(files / "scene.ply"), "--views", str(files / "views.json"), *map(str, extra)]
+    return [
+        "inspect",
+        str(files / "scene.ply"),
+        "--views",
+        str(files / "views.json"),
+        "--device",
+        "cpu",
+        *map(str, extra),
+    ]
 
 
 def test_inspect_prints_the_report_and_writes_its_files(files, capsys):
     pytest.importorskip("matplotlib", reason="needs the analysis extra")
     out = files / "out"
-    extra = ["--json", out / "report.json", "--picture", out / "report.png", "--scale", "2", "--tolerance", "0.01"]
+    extra = ["--json", out / "report.json", "--picture", out / "report.png", "--scales", "0.5", "--tolerance", "0.01"]
     assert cli.main(inspect_arguments(files, *extra, "--training-views", files / "views.json")) == 0
     text, report = capsys.readouterr().out, json.loads((out / "report.json").read_text())
     assert f"recommended: footprint {report['recommendation']['footprint']}" in text
@@ -310,7 +352,7 @@ def test_inspect_prints_the_report_and_writes_its_files(files, capsys):
         ("front", 128, 96),
         ("off_centre", 100, 80),
     ]
-    assert report["views"][0]["finest"] == pytest.approx(2)  # --scale leaves the training views as they are
+    assert report["views"][0]["finest"] == pytest.approx(2)  # --scales leaves the training views as they are
     assert image.open(out / "report.png").width > 1000
 
 
@@ -344,7 +386,7 @@ def test_inspect_without_matplotlib_names_the_extra(files, capsys, monkeypatch):
 
 def bake_arguments(files, *extra):
     scene, views, out = files / "scene.ply", files / "views.json", files / "new" / "baked.ply"
-    return ["bake", str(scene), "--views", str(views), "--out", str(out), *extra]
+    return ["bake", str(scene), "--views", str(views), "--out", str(out), "--device", "cpu", *extra]
 
 
 @pytest.mark.parametrize(("extra", "dilation"), [([], 0.3), (["--dilation", "0.5"], 0.5)])
@@ -379,7 +421,7 @@ def test_bake_takes_the_scale_of_the_training(files):
     assert leave(bake_arguments(files, "--dilation", "0.5")) == 0
     plain = baked.read_bytes()
     io.save_views(files / "views.json", [view.scaled(4) for view in io.load_views(files / "views.json")])
-    assert leave(bake_arguments(files, "--dilation", "0.5", "--scale", "0.25")) == 0
+    assert leave(bake_arguments(files, "--dilation", "0.5", "--scales", "4")) == 0
     assert baked.read_bytes() == plain
 
 
@@ -402,7 +444,15 @@ def test_bake_refuses_what_has_nothing_to_bake(files, capsys):
         (["--out", "{}/scene.ply/baked.ply"], "scene.ply: expected a folder for the results, got a file"),
         (["--dilation", "0.05"], "argument --dilation: must be a number from 1/12, got 0.05"),
         (["--dilation", "x"], "argument --dilation: must be a number from 1/12, got x"),
-        (["--scale", "0"], "argument --scale: must be a positive number, got 0"),
+        (["--scales", "0"], "argument --scales: must be a reduction, a positive number (2 is half the size), got 0"),
+        (
+            ["--scales", "1,2"],
+            "argument --scales: must be a reduction, a positive number (2 is half the size), got 1,2",
+        ),
+        (
+            ["--footprint", "point:dilation=0"],
+            "no dilation to bake: it was trained with point:dilation=0.0, ",
+        ),
         (["--views", "{}/none.json"], "none.json: No such file"),
     ],
 )

@@ -123,7 +123,7 @@ def test_render_command_repeats_the_demo(demo_run, tmp_path):
     out, _ = demo_run
     background = [str(value) for value in demo.PAPER]
     args = ["render", out / "target.ply", "--views", out / "views.json", "--out", tmp_path]
-    args += ["--footprint", "box:samples=4", "--scale", "0.25", "--background", *background]
+    args += ["--footprint", "box:samples=4", "--scales", "4", "--device", "cpu", "--background", *background]
     assert cli.main([str(value) for value in args]) == 0
     again = np.asarray(image.open(tmp_path / "target.png")).astype(int)
     first = np.asarray(image.open(out / "box4_4.png"))

@@ -534,3 +534,13 @@ def test_metadata_of_what_is_no_scene(tmp_path):
         (tmp_path / name).write_bytes(b"nothing")
         with pytest.raises(io.SceneError, match=f"{name}: .*{message}"):
             io.read_metadata(tmp_path / name)
+
+
+def test_a_column_with_a_3d_filter_is_named(tmp_path):
+    """Mip-Splatting keeps its filter apart; without it the scene looks thinner."""
+    io.save_scene(tmp_path / "plain.ply", random_scene(count=1, degree=0))
+    content = (tmp_path / "plain.ply").read_bytes()
+    content = content.replace(b"end_header", b"property float filter_3D\nend_header") + struct.pack("<f", 0.1)
+    (tmp_path / "mip.ply").write_bytes(content)
+    with pytest.warns(UserWarning, match=r"mip\.ply: the column filter_3D, a 3D filter, is not applied"):
+        assert io.load_scene(tmp_path / "mip.ply").count == 1

@@ -423,7 +423,7 @@ def test_a_cuda_step_does_not_wait():
 
 
 def test_after_a_fork():
-    """Threads of OpenMP do not survive a fork; a child must not wait for them."""
+    """Threads do not survive a fork; a child must not wait for those of its parent."""
     code = """
         import os, sys, torch
         from analytic_rasterizer import losses

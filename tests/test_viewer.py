@@ -6,7 +6,6 @@ import hashlib
 import http.client
 import json
 import re
-import struct
 import threading
 
 import numpy as np
@@ -17,6 +16,7 @@ from processes import DEADLINE
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C, cli, io, viewer
+from analytic_rasterizer.analysis.reference import footprint_variants
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.viewer import pages
 
@@ -164,35 +164,14 @@ def files(tmp_path):
     return tmp_path
 
 
-@pytest.mark.parametrize(
-    "comment, footprint",
-    [
-        ("comment SplatRenderMode: mip", "mip"),
-        ("comment antialiased 1", "mip"),
-        ("comment antialiased 0", None),
-        ("comment SplatRenderMode: default", None),
-        ("comment made for antialiased 1 screens", None),
-    ],
-)
-def test_comments_of_a_ply_choose_the_footprint(files, comment, footprint):
-    path = files / "scene.ply"
-    assert viewer.footprint_of_file(path) is None
-    path.write_bytes(path.read_bytes().replace(b"\nelement vertex", f"\n{comment}\nelement vertex".encode(), 1))
-    assert viewer.footprint_of_file(path) == footprint
-    assert len(io.load_scene(path).means) == 30
+DRAWN = [ar.resolve_footprint(name) for name in viewer.PAGE_FOOTPRINTS]
 
 
-@pytest.mark.parametrize("compressed", [True, False])
-def test_the_flag_of_an_spz_chooses_the_footprint(tmp_path, compressed):
-    path = tmp_path / "scene.spz"
-    for flags, footprint in ((0, None), (1, "mip"), (3, "mip"), (2, None)):
-        header = struct.pack("<4sIIBBBB", b"NGSP", 3, 0, 0, 12, flags, 0)
-        path.write_bytes(gzip.compress(header) if compressed else header)
-        assert viewer.footprint_of_file(path) == footprint
-
-
-def test_an_spz_of_our_own_has_no_flag(files):
-    assert viewer.footprint_of_file(files / "scene.spz") is None
+@pytest.mark.parametrize("name", footprint_variants())
+def test_what_the_page_cannot_draw_has_a_neighbour_that_it_can(name):
+    footprint = ar.resolve_footprint(name)
+    drawn = viewer.nearest_page_footprint(footprint)
+    assert drawn in DRAWN and (drawn == footprint) == (footprint in DRAWN)
 
 
 # ------------------------------------------------------------------------------------- server
@@ -349,6 +328,14 @@ def test_the_command_takes_the_footprint_of_the_file(files):
     assert '"footprint": "mip"' in out.read_text(encoding="utf-8")
     assert run_view(path, "--export", out, "--footprint", "cumulant") == 0
     assert '"footprint": "cumulant"' in out.read_text(encoding="utf-8")
+
+
+def test_the_command_shows_what_is_near_to_what_the_page_cannot_draw(files, capsys):
+    io.save_scene(files / "moment.ply", make_scene(), io.SceneMetadata(footprint="moment:samples=4"))
+    assert run_view(files / "moment.ply", "--export", files / "out.html") == 0
+    assert '"footprint": "box:samples=16"' in (files / "out.html").read_text(encoding="utf-8")
+    expected = "footprint box:samples=16: the page cannot draw moment:samples=4 (moment.ply says so), and this is near"
+    assert capsys.readouterr().err == f"{expected}; --server shows it\n"
 
 
 @pytest.mark.parametrize(

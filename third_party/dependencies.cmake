@@ -1,6 +1,7 @@
 # Finds what the CMake build needs on the system. Nothing is downloaded, nothing is vendored.
 
-find_package(OpenMP REQUIRED COMPONENTS CXX)
+set(THREADS_PREFER_PTHREAD_FLAG ON)
+find_package(Threads REQUIRED)
 
 if(BUILD_TESTING)
   find_package(GTest QUIET)

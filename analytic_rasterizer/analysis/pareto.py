@@ -66,6 +66,17 @@ def default_methods() -> list[Method]:
     return [Method(name) for name in footprint_variants()] + supersampled_points
 
 
+def check_given(views: list[View], scales, methods: list[Method] | None = None) -> None:
+    """Raises what `run` raises for its arguments, before anything is measured."""
+    methods = default_methods() if methods is None else methods
+    names, view_names = [method.name for method in methods], [view.name for view in views]
+    for what, given in (("views", view_names), ("methods", names), ("scales", list(scales))):
+        if not given or len(set(given)) < len(given):
+            raise ValueError(f"{what} must be given, and each once, got {', '.join(map(str, given)) or 'none'}")
+    for module in ("matplotlib.figure", "torchmetrics.functional.image"):
+        optional_import(module, "analysis")
+
+
 def run(
     out,
     scene: Gaussians,
@@ -104,12 +115,8 @@ def run(
         ImportError: Without the `analysis` extra.
     """
     methods = default_methods() if methods is None else methods
+    check_given(views, scales, methods)
     names, view_names = [method.name for method in methods], [view.name for view in views]
-    for what, given in (("views", view_names), ("methods", names), ("scales", list(scales))):
-        if not given or len(set(given)) < len(given):
-            raise ValueError(f"{what} must be given, and each once, got {', '.join(map(str, given)) or 'none'}")
-    for module in ("matplotlib.figure", "torchmetrics.functional.image"):
-        optional_import(module, "analysis")  # raises before anything is measured
     out, device = Path(out), scene.means.device.type
     results = {
         "scene": name,
@@ -310,7 +317,7 @@ def describe(results: dict, at_scale: dict) -> list[str]:
         row = next(row for row in at_scale["methods"] if row["method"] == base)
         seconds = " / ".join(f"{1e3 * row[f'{passes}_seconds']:.1f}" for passes in PASSES)
         clock = " of CPU time" if results["clock"] == "CPU time" else ""
-        rounds = f"the fastest of {results['rounds']} rounds in turn"
+        rounds = f"the fastest of {results['rounds']} rounds in turn, and of more where these do not agree"
         lines.append(f"times are ratios to {base}, {seconds} ms{clock}; {rounds}")
     density, second, change = reference["density"], reference["second_estimate"], reference["residual"]
     order = "" if reference["order"] is None else f" (order {reference['order']:.1f})"

@@ -20,7 +20,9 @@ from ..gaussians import Gaussians
 from ..rasterizer import GaussianRasterizer
 
 ROUNDS = {"cpu": 5, "cuda": 20}
-SLOW = 20  # calls that take so many times as long as the base are timed only once on the CPU
+SLOW = 20  # calls that take so many times as long as the base are timed only twice on the CPU
+AGREE = 1.1  # ratio up to which two times are the same
+MORE = 2  # how many times as many rounds are added, at most, where those so far do not agree
 QUEUED_BEHIND = 50_000_000  # clock cycles of a CUDA device, longer than the host takes to launch a pass
 WARM_UP = 40  # calls before timing on CUDA: the first 32 frames of a size wait for the device
 
@@ -108,7 +110,8 @@ def time_calls(
     """Seconds of every call, by key: a list of rounds for every call of a key.
 
     On the CPU the calls take turns after a round that warms up. On CUDA the calls of a key are warmed up and timed by
-    themselves, because the room for their pairs follows the frames before them.
+    themselves, because the room for their pairs follows the frames before them. Where the rounds of a call do not agree
+    (`agree`), its key is timed again for up to MORE times as many rounds: other work on the machine is no result.
 
     Args:
         calls: What to time.
@@ -116,7 +119,7 @@ def time_calls(
         rounds: Timed rounds; None is ROUNDS of the device.
         clock: On the CPU, in seconds.
         base: A key. Where the calls of another take SLOW times as long in the round that warms up, that round counts
-            and they are not timed again. CPU only; None: all are timed again.
+            and they are timed only once more. CPU only; None: all are timed in every round.
         progress: Called before every timed call.
     """
     rounds = rounds or ROUNDS[device]
@@ -125,16 +128,40 @@ def time_calls(
         progress()
         return event_seconds(call) if device == "cuda" else seconds_of(call, clock)
 
+    def until_they_agree(samples, keys):
+        for _ in range(MORE * rounds):
+            doubtful = {key: calls[key] for key in keys if not all(agree(taken, device) for taken in samples[key])}
+            if not doubtful:
+                break
+            for key, added in in_turn(doubtful, measure, 1).items():
+                samples[key] = [[*taken, *more] for taken, more in zip(samples[key], added)]
+        return samples
+
     if device == "cuda":
         samples = {}
         for key, of_key in calls.items():
             warm_up_cuda(of_key, WARM_UP)
-            samples |= in_turn({key: of_key}, measure, rounds)
+            samples |= until_they_agree(in_turn({key: of_key}, measure, rounds), [key])
         return samples
     first = in_turn(calls, measure, 1)
     totals = {key: sum(taken[0] for taken in of_key) for key, of_key in first.items()}
-    again = {key: of for key, of in calls.items() if base is None or totals[key] <= SLOW * totals[base]}
-    return first | in_turn(again, measure, rounds)
+    slow = {key for key in calls if base is not None and totals[key] > SLOW * totals[base]}
+    samples = in_turn({key: of for key, of in calls.items() if key not in slow}, measure, rounds)
+    once_more = in_turn({key: calls[key] for key in slow}, measure, 1)
+    for key, again in once_more.items():
+        samples[key] = [[*taken, *more] for taken, more in zip(first[key], again)]
+    return until_they_agree(samples, list(calls))
+
+
+def agree(samples: list[float], device: str) -> bool:
+    """Whether rounds say how long a call takes: on the CPU the fastest two, on CUDA the middle half, within AGREE."""
+    if len(samples) < 2:
+        return False
+    if device == "cuda":
+        low, _, high = statistics.quantiles(samples, n=4)
+        return high <= AGREE * low
+    fastest, next_one = sorted(samples)[:2]
+    return next_one <= AGREE * fastest
 
 
 def best_of(samples: list[float], device: str) -> float:

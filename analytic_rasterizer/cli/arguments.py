@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
+import sys
 import tempfile
 import warnings
 from collections.abc import Callable
@@ -20,14 +22,41 @@ from .launch import report
 # (ImportError), a device out of memory or absent (RuntimeError, MemoryError), a training that
 # diverges (FloatingPointError).
 USER_ERRORS = (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError, FloatingPointError)
+COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+VIEWS = "3DGS cameras.json, Blender or nerfstudio transforms.json, or a list of {width, height, fx, fy, w2c}"
+LARGER = "larger numbers in --scales make them smaller"
+METAVARS = {int: "N", float: "X", str: "NAME", tuple: "N,N,.."}
+"""What `--help` shows for a value, by its type."""
 
 
 class Parser(argparse.ArgumentParser):
-    """An ArgumentParser whose errors are one line."""
+    """An ArgumentParser whose errors are one line, and which takes the numbers of a colour as three arguments, too."""
+
+    def parse_known_args(self, args=None, namespace=None):
+        return super().parse_known_args(_with_joined_colors(sys.argv[1:] if args is None else args), namespace)
 
     def error(self, message):
+        if re.fullmatch(r"unrecognized arguments:( [\d.]+)+", message):
+            message += "; lists have commas and no spaces: 1,2,4"
         report(f"{message} (see {self.prog} --help)")
         self.exit(2)
+
+
+def _with_joined_colors(args: list[str]) -> list[str]:
+    """--background R G B as --background=R,G,B."""
+    joined = list(args)
+    for i in reversed([i for i, text in enumerate(joined) if text == "--background"]):
+        numbers = joined[i + 1 : i + 4]
+        if len(numbers) == 3 and all(_is_number(text) for text in numbers):
+            joined[i : i + 4] = [f"--background={','.join(numbers)}"]
+    return joined
+
+
+def _is_number(text: str) -> bool:
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False
 
 
 def run_command(parse: Callable[[], argparse.Namespace]) -> int:
@@ -70,22 +99,28 @@ def add_scene(parser) -> None:
     add_machine_options(parser)
 
 
-def add_files(parser) -> None:
+def add_files(parser, purpose: str = "file of views") -> None:
     """SCENE and --views."""
-    add = parser.add_argument
-    add("scene", metavar="SCENE", help="3DGS .ply, compressed .ply, .spz, .sog or .splat")
-    views = "3DGS cameras.json, Blender or nerfstudio transforms.json, or a list of {width, height, fx, fy, w2c}"
-    add("--views", required=True, help=views)
+    scene = "file of a scene (.ply, compressed .ply, .spz, .sog, .splat), or a folder: of `train`, or a model of 3DGS"
+    parser.add_argument("scene", metavar="SCENE", help=scene)
+    views = f"{purpose}: {VIEWS} (default: cameras.json beside SCENE, or of the model of 3DGS)"
+    parser.add_argument("--views", metavar="FILE", help=views)
+
+
+def add_footprint(
+    parser,
+    text: str = "how a pixel sees a splat",
+    default: str = "(default: ANALYTIC_RASTERIZER_FOOTPRINT, else what SCENE was trained with)",
+) -> None:
+    """--footprint, and where it comes from otherwise."""
+    parser.add_argument("--footprint", metavar="NAME[:k=v,..]", help=f"{text} {default}")
 
 
 def add_view_options(parser) -> None:
     """What views do not say."""
     add_size(parser)
-    background = "colour behind the scene, 0 to 1 (default: black)"
-    default = (0.0, 0.0, 0.0)
-    parser.add_argument(
-        "--background", nargs=3, type=intensity, default=default, metavar=("R", "G", "B"), help=background
-    )
+    background = "colour behind the scene: black, white, or three numbers from 0 to 1 (default: that of the training)"
+    parser.add_argument("--background", type=color, metavar="COLOR", help=background)
 
 
 def add_size(parser) -> None:
@@ -93,16 +128,29 @@ def add_size(parser) -> None:
     parser.add_argument("--size", nargs=2, type=count, metavar=("W", "H"), help=size)
 
 
-def add_machine_options(parser, device: str | None = "cpu") -> None:
-    """Threads and the device, by default this one; None: CUDA where there is one, see `use_machine`."""
+def add_machine_options(parser, device: str | None = None) -> None:
+    """Threads and the device; by default CUDA where there is one, see `use_machine`."""
     parser.add_argument("--threads", type=count, metavar="N", help="CPU threads (default: all)")
-    chosen = "(default: cuda where there is one)" if device is None else None
+    chosen = f"(default: {device or 'cuda where there is one'})"
     parser.add_argument("--device", choices=("cpu", "cuda"), default=device, help=chosen)
 
 
-def add_scale(parser, of: str = "resolution") -> None:
-    """--scale, which is `of` what the views say."""
-    parser.add_argument("--scale", type=positive_number, default=1.0, help=f"{of}, as a factor (default: 1)")
+def add_scales(parser, kind: Callable, text: str, default: tuple | None = None) -> None:
+    """--scales, which says reductions in every command: 2 is half the size.
+
+    Args:
+        kind: A type of arguments: `reductions`, `whole_reductions` or `reduction`.
+        text: The help.
+        default: In place of None.
+    """
+    several = "N" if kind is reduction else "N,N,.."
+    parser.add_argument("--scales", type=kind, default=default, metavar=several, help=text)
+    # Otherwise --scale would be taken for --scales, with another meaning than it had.
+    parser.add_argument("--scale", type=_former_scale, help=argparse.SUPPRESS)
+
+
+def _former_scale(text: str):
+    raise argparse.ArgumentTypeError(f"use --scales, which takes reductions: 2 is half the size; got {text}")
 
 
 def use_machine(args) -> None:
@@ -147,18 +195,44 @@ def _number(kind, accepts, expected: str):
     return parse
 
 
-def whole_numbers(text: str) -> tuple[int, ...]:
-    """An argparse type: whole numbers, with commas between them."""
-    try:
-        return tuple(int(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"must be whole numbers with commas between them, got {text}") from None
+def _numbers(kind, accepts, expected: str):
+    """An argparse type: a tuple of such numbers, which have commas between them."""
+
+    def parse(text: str) -> tuple:
+        try:
+            values = tuple(kind(part) for part in text.split(","))
+        except ValueError:
+            values = ()
+        if not values or not all(map(accepts, values)):
+            raise argparse.ArgumentTypeError(f"must be {expected} with commas between them, got {text}")
+        return values
+
+    return parse
 
 
+def color(text: str) -> tuple[float, float, float]:
+    """An argparse type: a colour by its name, or as R,G,B."""
+    if text in COLORS:
+        return COLORS[text]
+    parts = text.split(",")
+    if len(parts) != 3 or not all(_is_number(part) and 0 <= float(part) <= 1 for part in parts):
+        expected = f"{', '.join(COLORS)} or three numbers from 0 to 1, as R,G,B"
+        raise argparse.ArgumentTypeError(f"must be {expected}, got {text}")
+    return tuple(map(float, parts))
+
+
+def _is_reduction(value: float) -> bool:
+    return math.isfinite(value) and value > 0
+
+
+whole_numbers = _numbers(int, lambda v: True, "whole numbers")
+whole_reductions = _numbers(int, lambda v: v >= 1, "reductions, positive whole numbers (2 is half the size),")
+reductions = _numbers(float, _is_reduction, "reductions, positive numbers (2 is half the size),")
+reduction = _number(float, _is_reduction, "a reduction, a positive number (2 is half the size)")
 positive_number = _number(float, lambda v: math.isfinite(v) and v > 0, "a positive number")
-intensity = _number(float, lambda v: 0 <= v <= 1, "a number from 0 to 1")
 dilation = _number(float, lambda v: PIXEL_VARIANCE <= v < math.inf, "a number from 1/12")
 tolerance = _number(float, lambda v: math.isfinite(v) and v >= 0, "a number that is not negative")
 density = _number(int, lambda v: v >= 8, "a whole number from 8")
 count = _number(int, lambda v: v >= 1, "a positive whole number")
+whole_number = _number(int, lambda v: v >= 0, "a whole number that is not negative")
 port = _number(int, lambda v: 0 <= v <= 65535, "a port from 0 to 65535")

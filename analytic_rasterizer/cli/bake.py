@@ -5,17 +5,21 @@ from __future__ import annotations
 import torch
 
 from .. import io
-from ..filters import DILATION, bake_dilation, sampling_interval
-from ..training.files import write_scene
+from ..filters import bake_dilation, sampling_interval
 from .arguments import (
     add_files,
+    add_footprint,
     add_machine_options,
-    add_scale,
+    add_scales,
     add_size,
     check_writable_file,
     dilation,
+    reduction,
     use_machine,
 )
+from .scenes import say, sizes_in_words
+
+BAKED_FOR = "moment:samples=4"  # what the result says of itself
 
 
 def add_parser(subcommands) -> None:
@@ -26,15 +30,17 @@ def add_parser(subcommands) -> None:
         "dilation that these add to every picture, and write the result to FILE. Footprints that integrate over the "
         "pixel, such as moment, then show at any distance and resolution what the training showed. VIEWS are those of "
         "the training, and must have the size of its pictures. The cameras.json of 3DGS has that of the original ones: "
-        "after a training with -r 4 or --images images_4, give --scale 0.25.",
+        "cfg_args beside it says by what they were reduced, or else --scales does.",
     )
     add_files(parser)
     add_size(parser)
-    add_scale(parser, "size of the training's pictures beside what VIEWS says")
+    reduced = "the training's pictures had 1/N of the size in VIEWS (default: what cfg_args or options.json says, or 1)"
+    add_scales(parser, reduction, reduced)
     add = parser.add_argument
     add("--out", required=True, metavar="FILE", help="the scene to write: .ply, .compressed.ply, .spz or .splat")
-    of_training = "of the training, px^2 (default: %(default)s)"
-    add("--dilation", type=dilation, default=DILATION, metavar="V", help=of_training)
+    add_footprint(parser, "what SCENE was trained with", "(default: what it says, else point)")
+    of_training = "of the training, px^2 (default: that of the footprint, 0.3)"
+    add("--dilation", type=dilation, metavar="V", help=of_training)
     add_machine_options(parser)
     parser.set_defaults(run=run)
 
@@ -43,22 +49,38 @@ def run(args) -> None:
     """Bakes the dilation, writes the scene, and says what changed."""
     io.written_format(args.out)  # raises
     use_machine(args)
-    views = [view.scaled(args.scale) for view in io.load_views(args.views, args.size)]
-    loaded = io.load_scene(args.scene)
-    if io.read_metadata(args.scene).antialiased:
-        raise io.SceneError(f"{args.scene}: no dilation to bake: it says that pixels are to be integrated")
+    found = io.find_scene(args.scene)
+    trained = found.training_footprint(args.footprint)
+    check_is_dilated(found, trained)
+    given = args.scales is not None
+    views = found.load_views(args.views, args.size, trained_size=not given)
+    views = [view.scaled(1 / args.scales) for view in views] if given else views
+    loaded = io.load_scene(found.path)
     check_writable_file(args.out)
     scene = loaded.to(args.device)
     cameras = [view.settings(device=args.device) for view in views]
-    seen = torch.zeros(len(scene.means), dtype=torch.bool, device=args.device)
+    seen = torch.zeros(scene.count, dtype=torch.bool, device=args.device)
     for camera in cameras:
         seen |= sampling_interval(scene.means, camera).isfinite()
     if not seen.any():
-        raise ValueError(f"{args.views}: no view sees any Gaussian of {args.scene}")
-    scales, opacities = bake_dilation(
-        scene.means, scene.scales, scene.rotations, scene.opacities, cameras, args.dilation
-    )
-    write_scene(args.out, scene.with_activated(scales, opacities), "moment")
-    sizes = sorted({(view.width, view.height) for view in views})
-    pictures = f"{len(views)} pictures of " + " to ".join(f"{w}x{h}" for w, h in dict.fromkeys((sizes[0], sizes[-1])))
-    print(f"{args.out}: {int(seen.sum())} of {len(scales)} Gaussians, which are seen in {pictures}, are baked")
+        raise ValueError(f"{args.views or found.cameras}: no view sees any Gaussian of {found.path}")
+    say(f"trained with {trained.footprint}: {trained.reason}")
+    gaussians = scene.means, scene.scales, scene.rotations, scene.opacities
+    scales, opacities = bake_dilation(*gaussians, cameras, args.dilation or trained.footprint.option)
+    metadata = io.SceneMetadata(footprint=BAKED_FOR, offset=found.metadata.offset)
+    io.save_scene(args.out, scene.with_activated(scales, opacities), metadata)
+    reason = f" ({found.size_reason})" if not given and found.size_reason else ""
+    pictures = f"{len(views)} pictures of {sizes_in_words(views)}{reason}"
+    print(f"{args.out}: {int(seen.sum())} of {scene.count} Gaussians, which are seen in {pictures}, are baked")
+
+
+def check_is_dilated(found: io.FoundScene, trained: io.Choice) -> None:
+    """Raises SceneError for a scene whose training added no dilation."""
+    footprint = trained.footprint
+    if footprint.name != "point":
+        raise io.SceneError(
+            f"{found.path}: no dilation to bake: it says that pixels are to be integrated (footprint {footprint}); "
+            "--footprint point is for a scene that was trained with 3DGS all the same"
+        )
+    if not io.is_dilated(footprint):
+        raise io.SceneError(f"{found.path}: no dilation to bake: it was trained with {footprint}, without any")

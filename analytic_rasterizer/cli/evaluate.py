@@ -2,45 +2,65 @@
 
 from __future__ import annotations
 
-import json
-import sys
 from pathlib import Path
+from typing import Any, NamedTuple
 
 from .. import io
 from ..analysis.tables import format_table
 from ..distributed.ranks import Ranks, even_counts
-from ..footprints import resolve_footprint
 from ..gaussians import Gaussians
+from ..io.models import DIVISORS, CfgArgs
 from ..training import TrainingOptions, evaluate, load_capture, load_lpips, load_pictures, save_pictures
+from ..training.captures import IMAGES, TEST_PERIOD, Capture
 from ..training.evaluation import LPIPS_WEIGHTS, MEASURES
 from ..training.files import OPTIONS, SCENE, write_json
 from ..training.options import check_scales
-from ..training.run import capture_arguments
 from ..training.trainer import background_of
-from .arguments import add_machine_options, count, use_machine, whole_numbers, writable_folder
+from .arguments import (
+    add_machine_options,
+    add_scales,
+    color,
+    count,
+    use_machine,
+    whole_number,
+    whole_numbers,
+    writable_folder,
+)
 from .launch import add_rank_options, ranks_of
+from .scenes import color_in_words, say
 
 HEADINGS = {"psnr": ("PSNR", "{:.2f}"), "ssim": ("SSIM", "{:.4f}"), "lpips": ("LPIPS", "{:.4f}")}
+SIMILAR = 0.01  # share by which widths of pictures may differ unmentioned
 
 
 def add_parser(subcommands) -> None:
     parser = subcommands.add_parser(
         "evaluate",
         help="measure a trained scene: PSNR, SSIM and LPIPS per scale",
-        description="Compare the scene in DIR, which `train` wrote, with the test pictures of its capture, at one or "
-        "more scales and with one or more footprints. Writes evaluation.json and pictures of truth, rendering and four "
-        "times their difference to DIR/evaluation, and prints a table.",
+        description="Compare SCENE with the test pictures of a capture, at one or more scales and with one or more "
+        "footprints. SCENE is the folder that `train` wrote, a file of Gaussians, or the folder of a model of 3DGS. "
+        "Writes evaluation.json, and to the folder evaluation pictures of truth, rendering and four times their "
+        "difference, and prints a table.",
     )
     add = parser.add_argument
-    add("out", metavar="DIR", help="results of `train`")
-    add("--data", metavar="SCENE", help="folder of the capture (default: the one that was trained with)")
+    add("scene", metavar="SCENE", help="folder that `train` wrote, file of a scene, or folder of a model of 3DGS")
+    add("--data", metavar="FOLDER", help="the capture (default: that of the training, where options.json names it)")
+    add(
+        "--images", metavar="NAME", help=f"folder in it of the photographs (default: that of the training, or {IMAGES})"
+    )
+    test_every = f"where the capture does not say: test with every N-th (default: as the training, or {TEST_PERIOD})"
+    add("--test-every", type=whole_number, metavar="N", help=test_every)
+    out = "folder for the results (default: SCENE where it is a folder, otherwise NAME_evaluation beside it)"
+    add("--out", metavar="DIR", help=out)
     add("--footprint", nargs="+", dest="footprints", metavar="NAME[:k=v]", help="(default: that of the training)")
-    add("--scales", type=whole_numbers, metavar="1,2,..", help="reductions to test at (default: those trained at)")
+    add_scales(parser, whole_numbers, "reductions to test at: 2 is half the size (default: those trained at, or 1)")
+    background = "behind pictures with alpha: black, white or R,G,B (default: that of the training, or of the capture)"
+    add("--background", type=color, metavar="COLOR", help=background)
     supersampling = "render pictures so many times larger and average them (default: as in the training)"
     add("--supersampling", type=count, metavar="N", help=supersampling)
     add("--lpips", choices=(*LPIPS_WEIGHTS, "none"), default="vgg", help="network of LPIPS (default: vgg)")
     add("--pictures", type=int, default=2, metavar="N", help="views to draw per footprint and scale (default: 2)")
-    add_machine_options(parser, device=None)
+    add_machine_options(parser)
     add_rank_options(parser)
     parser.set_defaults(run=run)
 
@@ -52,48 +72,129 @@ def run(args) -> None:
         run_on(ranks, args)
 
 
+class Protocol(NamedTuple):
+    """What a scene is compared with, and how."""
+
+    data: str  # folder of the capture
+    images: str
+    test_every: int
+    scales: tuple[int, ...]
+    reading: dict[str, Any]  # further arguments of load_capture
+    options: TrainingOptions | None  # of the training, where it was one of this package
+
+
+def protocol_of(found: io.FoundScene, args) -> Protocol:
+    """As the scene was trained, where that is known, but for what is given.
+
+    Raises:
+        io.SceneError: options.json is not what `train` writes.
+        ValueError: Nothing names the capture.
+    """
+    if found.options is not None:
+        try:
+            source, options = found.options["source"], TrainingOptions.from_dict(found.options["options"])
+            reading = {name: source[name] for name in ("cameras", "lens", "missing") if name in source}
+            named = source["scene"], source["images"], source["test_every"]
+            usual = Protocol(*named, options.scales, reading, options)
+        except (ValueError, KeyError, TypeError) as error:
+            raise io.SceneError(f"{found.path.parent / OPTIONS}: not what `train` writes ({error})") from None
+    else:
+        cfg_args = found.cfg_args or CfgArgs()
+        if args.data is None:
+            trained = f"; {found.model or found.path.parent} was trained on {cfg_args.source_path}"
+            known = trained if cfg_args.source_path else f", and there is no {OPTIONS} of `train` beside it that does"
+            raise ValueError(f"{found.path} does not name its capture: give --data FOLDER{known}")
+        named = Path(cfg_args.images or IMAGES)  # a folder of the capture, and no path that leaves it
+        images = str(named) if named.name == str(named) and (Path(args.data) / named).is_dir() else IMAGES
+        usual = Protocol(args.data, images, TEST_PERIOD, scales_of(cfg_args, args.images or images), {}, None)
+    given = {name: getattr(args, name) for name in ("data", "images", "test_every", "scales")}
+    chosen = usual._replace(**{name: value for name, value in given.items() if value is not None})
+    return chosen._replace(scales=tuple(dict.fromkeys(chosen.scales)))
+
+
+def scales_of(cfg_args: CfgArgs, images: str) -> tuple[int, ...]:
+    """The reduction of the photographs in the folder `images` that a training of 3DGS had; (1,) if it is not whole."""
+    total = cfg_args.images_reduction * (int(cfg_args.resolution) if cfg_args.resolution in DIVISORS else 1)
+    own = CfgArgs(images=images).images_reduction
+    return (total // own,) if total % own == 0 else (1,)
+
+
 def run_on(ranks: Ranks, args) -> None:
     """`run`, on every rank."""
-    folder = Path(args.out)
-    try:
-        described = json.loads((folder / OPTIONS).read_text(encoding="utf-8"))
-        source, options = described["source"], TrainingOptions.from_dict(described["options"])
-        place, arguments = args.data or source["scene"], capture_arguments({"offset": None} | source)
-    except (ValueError, KeyError, TypeError) as error:
-        raise io.SceneError(f"{folder / OPTIONS}: not what `train` writes ({error})") from None
-    scales = tuple(dict.fromkeys(args.scales or options.scales))
-    check_scales(scales)  # raises before the capture is read
-    footprints = [str(resolve_footprint(name)) for name in args.footprints or [options.footprint]]
-    capture = load_capture(place, **arguments)
+    tell = say if ranks.is_first else lambda *lines: None
+    found = io.find_scene(args.scene)
+    protocol = protocol_of(found, args)
+    options = protocol.options or TrainingOptions()
+    check_scales(protocol.scales)  # raises before the capture is read
+    choices = [found.choose_footprint(name) for name in args.footprints or [None]]
+    offset = found.metadata.offset or (0.0, 0.0, 0.0)  # the scene's frame, also where the capture would choose another
+    capture = load_capture(protocol.data, protocol.images, protocol.test_every, **protocol.reading, offset=offset)
     if not capture.test:
-        raise io.SceneError(f"{place}: there are no test pictures")
-    scene = part_of(io.load_scene(folder / SCENE), ranks).to(args.device)
-    background = background_of(options, capture.background) or capture.background
+        raise io.SceneError(f"{protocol.data}: there are no test pictures")
+    background = background_for(found, protocol, capture, args.background)
+    scene = part_of(io.load_scene(found.path), ranks).to(args.device)
     pictures = load_pictures(
-        capture.test, scales, background, args.device, options.downsampling, on_host=ranks.world > 1
+        capture.test, protocol.scales, background, args.device, options.downsampling, on_host=ranks.world > 1
     )
-    for note in capture.notes if ranks.is_first else ():
-        print(note, file=sys.stderr)
+    said = [] if protocol.options else differences(found, protocol, capture, background)
+    chosen = (f"footprint {choice.footprint}: {choice.reason}" for choice in choices)
+    tell(*capture.notes, *said, *chosen)
     lpips = None
     if args.lpips != "none":
         try:
             lpips = load_lpips(args.lpips, args.device)
         except (ImportError, io.SceneError) as error:
-            if ranks.is_first:
-                print(f"LPIPS is left out: {error}", file=sys.stderr)
-    out = writable_folder(folder / "evaluation")
+            tell(f"LPIPS is left out: {error}")
+    out = writable_folder(args.out or default_out(args.scene, found))
+    pictures_folder = writable_folder(out / "evaluation")
     results = {}
     common = {"supersampling": args.supersampling or options.supersampling, "ranks": ranks}
-    for footprint in footprints:
+    for footprint in dict.fromkeys(str(choice.footprint) for choice in choices):
         results[footprint] = evaluate(scene, pictures, footprint, lpips, **common)
         if args.pictures > 0:
-            save_pictures(out, scene, pictures, footprint, args.pictures, **common)
+            save_pictures(pictures_folder, scene, pictures, footprint, args.pictures, **common)
     if ranks.is_first:
         views = [view.name for view in pictures.views]
-        resampled = sum(item.lens is not None for item in capture.test)
-        written = {"views": views, "resampled": resampled, "supersampling": common["supersampling"], "results": results}
-        write_json(folder / "evaluation.json", written)
-        print(format_results(results, scales))
+        written = {"scene": str(found.path), "data": str(protocol.data), "views": views}
+        written["resampled"] = sum(item.lens is not None for item in capture.test)
+        written |= {"supersampling": common["supersampling"], "results": results}
+        write_json(out / "evaluation.json", written)
+        print(format_results(results, protocol.scales))
+
+
+def background_for(found: io.FoundScene, protocol: Protocol, capture: Capture, given) -> tuple[float, float, float]:
+    """The colour behind pictures with alpha: `given`, that of the training, or that of the capture by convention."""
+    if given is not None:
+        return given
+    if protocol.options is not None:
+        return background_of(protocol.options, capture.background) or capture.background
+    return capture.background if found.background is None else found.background[0]
+
+
+def differences(found: io.FoundScene, protocol: Protocol, capture: Capture, background) -> list[str]:
+    """How a scene that was trained elsewhere is tested, and where that may differ from its training, in lines."""
+    said = [
+        f"{found.path}: {len(capture.test)} test pictures of {protocol.data}, reduced by "
+        f"{', '.join(map(str, protocol.scales))}; background {color_in_words(background)}"
+    ]
+    if found.cfg_args is None:
+        return said
+    if found.cfg_args.eval is False:
+        said.append("cfg_args: eval=False: the training saw these test pictures")
+    view = capture.test[0].view
+    trained, _ = found.cfg_args.trained_size(view.width, view.height)
+    tested = view.width / CfgArgs(images=protocol.images).images_reduction / min(protocol.scales)
+    if abs(tested - trained) > SIMILAR * trained:
+        said.append(f"cfg_args: the training's pictures were {trained} px wide, these are {tested:.0f} (--scales)")
+    return said
+
+
+def default_out(given: str, found: io.FoundScene) -> Path:
+    """Where results go: to the folder that was given or trained in, or else beside the file."""
+    if Path(given).is_dir():
+        return Path(given)
+    own = found.path.name == SCENE and found.options is not None
+    return found.path.parent if own else found.path.with_name(f"{found.path.stem}_evaluation")
 
 
 def part_of(scene: Gaussians, ranks: Ranks) -> Gaussians:

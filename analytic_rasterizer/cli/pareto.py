@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 from .. import io
 from ..analysis import pareto, tables
+from ..analysis.memory import check_sizes
 from ..analysis.reference import MAX_DENSITY
-from .arguments import add_scene, count, density, use_machine, writable_folder
+from .arguments import LARGER, add_scales, add_scene, count, density, use_machine, whole_reductions, writable_folder
+from .scenes import say, settle_views
+
+VIEWS = 4  # of those that were found beside the scene: a cameras.json may have hundreds
 
 
 def add_parser(subcommands) -> None:
@@ -23,12 +25,13 @@ def add_parser(subcommands) -> None:
     add_scene(parser)
     add = parser.add_argument
     add("--out", default="pareto", metavar="DIR", help="folder for the results (default: %(default)s)")
-    scales = "1/N of the views' size; a remainder is cut off (default: 1 2 4 8)"
-    add("--scales", nargs="+", type=count, default=[1, 2, 4, 8], metavar="N", help=scales)
+    scales = "reductions of the views: 2 is half the size, a remainder is cut off (default: 1,2,4,8)"
+    add_scales(parser, whole_reductions, scales, (1, 2, 4, 8))
     names = " ".join(method.name for method in pareto.default_methods())
     methods = f"methods; @N renders N x N times the pixels and averages (default: {names})"
     add("--footprints", nargs="+", metavar="NAME[:k=v,..][@N]", help=methods)
-    add("--limit-views", type=count, metavar="N", help="only the first N views")
+    limit = f"only the first N views (default: all of --views, and {VIEWS} spread over those found beside SCENE)"
+    add("--limit-views", type=count, metavar="N", help=limit)
     crop = "only the middle W x H pixels of the picture, at every scale (default: all of it)"
     add("--crop", nargs=2, type=count, metavar=("W", "H"), help=crop)
     add("--rounds", type=count, metavar="N", help="timed rounds (default: 5, with CUDA 20)")
@@ -43,9 +46,23 @@ def run(args) -> None:
     """Runs the measurement and prints a table for every scale."""
     use_machine(args)
     methods = None if args.footprints is None else [pareto.parse_method(text) for text in args.footprints]
-    views = io.load_views(args.views, args.size)[: args.limit_views]
+    found = io.find_scene(args.scene)
+    views, said = settle_views(args, found)
+    if args.limit_views is None and args.views is None and len(views) > VIEWS:
+        views = [views[i * len(views) // VIEWS] for i in range(VIEWS)]
+        said.append(f"{VIEWS} of the views are measured (--limit-views)")
+    views = views[: args.limit_views]
+    pareto.check_given(views, args.scales, methods)
+    check_sizes((view.framed(scale, args.crop) for view in views for scale in args.scales), args.device, LARGER)
     out = writable_folder(args.out)
-    scene = io.load_scene(args.scene).to(args.device)
+    if found.is_dilated:
+        trained = found.training_footprint()
+        said.append(
+            f"trained with {trained.footprint}: {trained.reason}; errors are those against the integral of the "
+            f"Gaussians as they are, which its training did not show: measure what bake makes of it"
+        )
+    scene = io.load_scene(found.path).to(args.device)
+    say(*said)
     results = pareto.run(
         out,
         scene,
@@ -57,7 +74,7 @@ def run(args) -> None:
         rounds=args.rounds,
         max_density=args.max_density,
         cpu_time=args.cpu_time,
-        name=Path(args.scene).stem,
+        name=found.path.stem,
     )
     print(f"{results['gaussians']} Gaussians of SH degree {results['sh_degree']}, {results['machine']}")
     for at_scale in results["scales"]:

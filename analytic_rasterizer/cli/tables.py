@@ -30,7 +30,7 @@ def add_parser(subcommands) -> None:
     add("--preset", choices=tuple(PRESETS), default="3dgs", help="as of `train`; the paper's is 3dgs, the default")
     add("--seed", type=int, metavar="N", help="of everything that is drawn (default: 0)")
     add("--no-lpips", action="store_true", help="leave out LPIPS")
-    add_machine_options(parser, device=None)
+    add_machine_options(parser)
     parser.set_defaults(run=run)
 
 
@@ -39,8 +39,9 @@ def run(args) -> None:
     if args.name is None:
         print("\n\n".join(describe(table) for table in TABLES.values()))
         return
-    if args.data is None or args.out is None:
-        raise ValueError(f"{args.name} needs --data FOLDER and --out DIR")
+    missing = [text for name, text in (("data", "--data FOLDER"), ("out", "--out DIR")) if getattr(args, name) is None]
+    if missing:
+        raise ValueError(f"tables {args.name} needs {' and '.join(missing)}")
     use_machine(args)
     lpips = None
     if not args.no_lpips:

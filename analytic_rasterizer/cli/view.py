@@ -7,8 +7,8 @@ from pathlib import Path
 
 from .. import io, viewer
 from ..footprints import resolve_footprint
-from ..gaussians import Gaussians
-from .arguments import add_machine_options, add_view_options, port, use_machine
+from .arguments import add_files, add_footprint, add_machine_options, add_view_options, port, use_machine
+from .scenes import say, settle_views
 
 
 def add_parser(subcommands) -> None:
@@ -20,19 +20,8 @@ def add_parser(subcommands) -> None:
         + ". With --server this machine renders every frame, with any footprint that the library has. Nothing is sent "
         "elsewhere. Ctrl-C ends.",
     )
-    parser.add_argument("scene", metavar="SCENE", help="3DGS .ply, compressed .ply, .spz, .sog or .splat")
-    parser.add_argument(
-        "--views",
-        metavar="FILE",
-        help="cameras to jump to: 3DGS cameras.json, Blender or nerfstudio transforms.json, or a list of {width, "
-        "height, fx, fy, w2c}",
-    )
-    parser.add_argument(
-        "--footprint",
-        metavar="NAME[:k=v]",
-        help="what the page starts with (default: mip, if the file says that it was trained with an antialiasing "
-        "filter, otherwise the library's, analytic)",
-    )
+    add_files(parser, "cameras to jump to")
+    add_footprint(parser, "what the page starts with")
     parser.add_argument("--port", type=port, metavar="N", help="port to serve on (default: any free one)")
     parser.add_argument("--no-browser", action="store_true", help="print the address and open nothing")
     parser.add_argument(
@@ -45,7 +34,7 @@ def add_parser(subcommands) -> None:
     )
     add_view_options(parser)
     add_machine_options(parser)
-    parser.set_defaults(run=run, device=None)  # so that a device that is given is known
+    parser.set_defaults(run=run)
 
 
 def run(args) -> None:
@@ -59,20 +48,27 @@ def run(args) -> None:
         raise ValueError(f"--export must end in .html, got {args.export}")
     if args.export and args.port is not None:
         raise ValueError("--port is for serving: --export writes a file and ends")
-    footprint = args.footprint
-    if footprint is not None:  # raises before the scene is read
-        footprint = viewer.page_footprint(resolve_footprint(footprint))
-    scene, views = read(args)
-    if footprint is None:
-        footprint = viewer.footprint_of_file(args.scene)
-    name = Path(args.scene).name
-    packed = viewer.pack_scene(scene, views, name=name, footprint=footprint, background=args.background)
+    if args.footprint is not None:  # raises before the scene is read
+        try:
+            viewer.page_footprint(resolve_footprint(args.footprint))
+        except viewer.PageFootprintError as error:
+            raise ValueError(f"{error}; with --server every footprint can be shown") from None
+    found = io.find_scene(args.scene)
+    choice = found.choose_footprint(args.footprint)
+    footprint, reason = viewer.nearest_page_footprint(choice.footprint), choice.reason
+    if footprint != choice.footprint:
+        reason = f"the page cannot draw {choice.footprint} ({reason}), and this is near; --server shows it"
+    views, said = settle_views(args, found, required=False)
+    options = {"footprint": footprint, "background": args.background, "name": found.path.name}
+    packed = viewer.pack_scene(io.load_scene(found.path), views, **options)
+    said.append(f"footprint {footprint}: {reason}")
     if args.export:
         size = viewer.export_page(args.export, packed)
+        say(*said)
         print(f"{args.export}: {packed.meta['count']} Gaussians, {size / 1e6:.1f} MB")
         return
-    del scene  # the packed scene is all that is served
     with viewer.start_server(packed, args.port or 0) as server:
+        say(*said)
         announce(args, packed.meta["count"], packed.meta["footprint"], server.url)
         try:
             server.serve_forever()
@@ -84,27 +80,22 @@ def run_live(args) -> None:
     """Renders for browsers until interrupted."""
     if args.export:
         raise ValueError("--export writes the page that needs no server: leave out --server")
-    footprint = None if args.footprint is None else resolve_footprint(args.footprint)
-    args.device = args.device or "cpu"
+    given = None if args.footprint is None else resolve_footprint(args.footprint)  # raises before the scene is read
+    found = io.find_scene(args.scene)
+    choice = found.choose_footprint(given)
     use_machine(args)
     io.optional_import("viser", "view")  # raises before the scene is read
-    scene, views = read(args)
-    footprint = footprint or viewer.footprint_of_file(args.scene)
-    name = Path(args.scene).name
-    options = {"views": views, "footprint": footprint, "background": args.background, "name": name}
-    with viewer.LiveViewer(args.port or 0, **options) as live:
+    views, said = settle_views(args, found, required=False)
+    scene = io.load_scene(found.path)
+    options = {"views": views, "footprint": choice.footprint, "background": args.background}
+    with viewer.LiveViewer(args.port or 0, name=found.path.name, **options) as live:
         live.update(scene.to(args.device), copy=False)
+        say(*said, f"footprint {choice.footprint}: {choice.reason}")
         announce(args, len(scene.means), live.footprint, live.url)
         try:
             live.wait()
         except KeyboardInterrupt:
             print()
-
-
-def read(args) -> tuple[Gaussians, list[io.View] | None]:
-    """The scene and the views that the arguments name."""
-    views = None if args.views is None else io.load_views(args.views, args.size)
-    return io.load_scene(args.scene), views
 
 
 def announce(args, count: int, footprint: str, url: str) -> None:

@@ -5,18 +5,26 @@ camera with an image size; its axes are OpenCV's (x right, y down, z forward). S
 install analytic_rasterizer[cli]`; they are imported on first use.
 """
 
+from .appearance import BLACK, WHITE, Choice, FoundScene, find_scene, is_dilated
 from .common import SceneError, optional_import, to_image
 from .metadata import SceneMetadata, read_metadata
 from .points import is_scene, load_points
 from .scenes import PLY_COLUMNS, load_scene, save_scene, written_format
+from .video import save_video
 from .views import View, load_views, save_views
 from .writing import save_image, write_bytes, write_json, write_safely, write_text
 
 __all__ = [
+    "BLACK",
     "PLY_COLUMNS",
+    "WHITE",
+    "Choice",
+    "FoundScene",
     "SceneError",
     "SceneMetadata",
     "View",
+    "find_scene",
+    "is_dilated",
     "is_scene",
     "load_points",
     "load_scene",
@@ -25,6 +33,7 @@ __all__ = [
     "read_metadata",
     "save_image",
     "save_scene",
+    "save_video",
     "save_views",
     "to_image",
     "write_bytes",

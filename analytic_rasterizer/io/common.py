@@ -64,7 +64,7 @@ def optional_import(name: str, extra: str = "cli"):
 
 
 def to_image(color: torch.Tensor):
-    """A Pillow image of color (3, H, W): clamped to [0, 1], rounded to 8 bits."""
+    """A Pillow image of color (3, H, W), or (4, H, W) with alpha: clamped to [0, 1], rounded to 8 bits."""
     pixels = color.detach().clamp(0, 1).mul(255).round().to("cpu", torch.uint8)
     return optional_import("PIL.Image").fromarray(pixels.permute(1, 2, 0).contiguous().numpy())
 

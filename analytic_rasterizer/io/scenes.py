@@ -21,6 +21,7 @@ SCALES, ROTATIONS = [f"scale_{i}" for i in range(3)], [f"rot_{i}" for i in range
 PLY_COLUMNS = [*AXES, *BASE_COLOR, "opacity", *SCALES, *ROTATIONS]
 HARMONICS = [3 * ((degree + 1) ** 2 - 1) for degree in range(5)]  # numbers beyond the base colour, by degree
 WRITTEN = {".ply": "ply", ".ply_compressed": "compressed", ".spz": "spz", ".splat": "splat"}
+FILTER_3D = "filter_3D"  # of files of Mip-Splatting and of Analytic-Splatting, which only some of them want applied
 LARGEST_SHIFT = 0.1  # of a Gaussian's size: rounding of positions beyond it is told
 
 
@@ -127,6 +128,9 @@ def _read_ply(path: Path) -> dict[str, np.ndarray]:
             "shs": shs,
         }
     _warn_of_rounding(path, fields["means"], fields["log_scales"])
+    if FILTER_3D in rows.names:
+        fused = "fuse it into the scales and opacities first, as Mip-Splatting's create_fused_ply.py does"
+        warnings.warn(f"{path}: the column {FILTER_3D}, a 3D filter, is not applied: {fused}", stacklevel=4)
     return fields
 
 

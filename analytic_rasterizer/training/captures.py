@@ -150,7 +150,7 @@ def _places(folder: Path) -> list[Path]:
         parents = [(folder / name).parent for name in RECONSTRUCTIONS if "/" in name]
         sparse = next((models[0] for models in map(_models_in, parents) if models), None)
     if sparse is not None:
-        sparse = max(_models_beside(sparse), key=colmap.count_pictures)
+        sparse = max(_models_beside(sparse), key=_count_registered)
     several = [place for place in (sparse, folder / "transforms.json") if place is not None and place.exists()]
     synthetic, metadata = folder / "transforms_train.json", folder / "metadata.json"
     others = several or synthetic.exists()
@@ -162,6 +162,14 @@ def _places(folder: Path) -> list[Path]:
 def _models_beside(model: Path) -> list[Path]:
     """The reconstructions of COLMAP's mapper, which writes one for each part that it could not join: 0, 1, 2, .."""
     return _models_in(model.parent) if model.is_dir() and model.name.isdecimal() else [model]
+
+
+def _count_registered(model: Path) -> int:
+    """How many pictures a reconstruction has; 0 for a broken one, whose error is that of reading it."""
+    try:
+        return colmap.count_pictures(model)
+    except io.SceneError:
+        return 0
 
 
 def _models_in(folder: Path) -> list[Path]:

@@ -300,7 +300,8 @@ class Run:
         scales, opacities = bake_pixel(scene.means, scene.scales, scene.rotations, scene.opacities, cameras)
         baked = self._whole(scene.with_activated(scales, opacities), MIP_SCENE)
         if self.ranks.is_first:
-            write_scene(self.out / MIP_SCENE, baked, "point", self.capture.offset)
+            # Its pixels are in the Gaussians.
+            write_scene(self.out / MIP_SCENE, baked, "point:dilation=0", self.capture.offset)
         return self.out / MIP_SCENE
 
     def start_viewer(self, port: int = 0) -> LiveViewer:
@@ -326,7 +327,10 @@ class Run:
     def describe(self) -> dict[str, Any]:
         """What options.json holds."""
         name = torch.cuda.get_device_name(self.device) if self.device.type == "cuda" else "CPU"
-        return {"source": self.source, "device": name, "torch": torch.__version__, "options": self.options.to_dict()}
+        # What the scene is shown on: a random background is none.
+        background = background_of(self.options, self.capture.background) or self.capture.background
+        described = {"source": self.source, "background": list(background), "device": name}
+        return described | {"torch": torch.__version__, "options": self.options.to_dict()}
 
     def save(self) -> None:
         """Writes the checkpoint. Raises OSError, on all ranks, if that cannot be done."""

@@ -8,7 +8,14 @@ may change. From the command line: `python -m analytic_rasterizer view`.
 
 from .export import export_page
 from .live import LIVE_FOOTPRINTS, LiveViewer
-from .packing import PAGE_FOOTPRINTS, PackedScene, footprint_of_file, pack_scene, page_footprint
+from .packing import (
+    PAGE_FOOTPRINTS,
+    PackedScene,
+    PageFootprintError,
+    nearest_page_footprint,
+    pack_scene,
+    page_footprint,
+)
 from .server import ViewerServer, start_server
 
 __all__ = [
@@ -16,9 +23,10 @@ __all__ = [
     "PAGE_FOOTPRINTS",
     "LiveViewer",
     "PackedScene",
+    "PageFootprintError",
     "ViewerServer",
     "export_page",
-    "footprint_of_file",
+    "nearest_page_footprint",
     "pack_scene",
     "page_footprint",
     "start_server",

@@ -55,10 +55,14 @@ class PackedScene:
         return json.dumps(self.meta, allow_nan=False).encode()
 
 
+class PageFootprintError(ValueError):
+    """A footprint that the page cannot draw."""
+
+
 def page_footprint(footprint: Footprint) -> str:
     """The footprint as the page writes it, such as `box:samples=8`.
 
-    Raises ValueError for a footprint that the page cannot draw.
+    Raises PageFootprintError for a footprint that the page cannot draw.
     """
     if footprint.name == "analytic":  # its option concerns gradients only
         return "analytic"
@@ -67,16 +71,20 @@ def page_footprint(footprint: Footprint) -> str:
         default = resolve_footprint(footprint.name)
         return footprint.name if footprint == default else name
     if name not in PAGE_FOOTPRINTS:
-        raise ValueError(f"footprint must be one that the viewer can draw ({', '.join(PAGE_FOOTPRINTS)}), got {name}")
+        known = ", ".join(PAGE_FOOTPRINTS)
+        raise PageFootprintError(f"footprint must be one that the viewer can draw ({known}), got {name}")
     return name
 
 
-def footprint_of_file(path) -> str | None:
-    """The footprint that the page draws a scene file with: `mip` where it says that pixels are to be integrated.
-
-    None where the file says nothing. `io.read_metadata` has all that it says.
-    """
-    return "mip" if io.read_metadata(path).antialiased else None
+def nearest_page_footprint(footprint: Footprint) -> Footprint:
+    """The footprint itself where the page can draw it, otherwise the nearest that it can (docs/accuracy.md)."""
+    try:
+        page_footprint(footprint)
+        return footprint
+    except PageFootprintError:
+        one_weight = footprint.samples == 1 and footprint.name != "moment"
+        few = footprint.name == "moment" and footprint.samples == 1  # its cell is about as near as four of `box`
+        return resolve_footprint("cumulant" if one_weight else "box:samples=4" if few else "box:samples=16")
 
 
 def pack_scene(

@@ -15,6 +15,8 @@ template <class F> using TilesOf = std::conditional_t<std::is_same_v<F, Adaptive
 /// How far ahead of its use what belongs to a splat is fetched: splats are visited in depth order, which is random in
 /// memory.
 inline constexpr int64_t kAhead = 12;
+/// As many splats as make it worthwhile that another thread places their pairs.
+inline constexpr int64_t kPart = 1024;
 
 /// Asks for what the splats soon to come need: their tiles and offsets first, and where their pairs are written once
 /// those have arrived.
@@ -76,8 +78,8 @@ template <typename T> void count_pairs(cpu::BinParams<T>& p) {
   p.order.reset(new int32_t[p.n]);
   cpu::sort_by_depth(p.depths, p.n, p.threads, p.order.get());
   const int64_t tiles = p.grid.tiles();
-  // Parts only speed things up. Their histograms may not outgrow the splats.
-  p.parts = std::clamp<int64_t>(p.n / std::max<int64_t>(tiles, 1), 1, p.threads);
+  // Parts only speed things up: not where they are small, and their histograms may not outgrow the splats.
+  p.parts = std::clamp<int64_t>(p.n / std::max(tiles, kPart), 1, p.threads);
   p.cursors.reset(new int64_t[p.parts * tiles]);
   cpu::parallel_for(p.parts, p.threads, [&](int64_t part) {
     int64_t* count = p.cursors.get() + part * tiles;

@@ -138,8 +138,8 @@ AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* color
 }
 
 template <class F, typename T> void blend(const cpu::BlendParams<T>& p) {
-  cpu::parallel_for(p.grid.tiles(), p.threads, [&](int64_t tile) {
-    T* colors = p.scratch + omp_get_thread_num() * int64_t(p.channels.count) * kTilePixels;
+  cpu::parallel_for(p.grid.tiles(), p.threads, [&](int64_t tile, int thread) {
+    T* colors = p.scratch + thread * int64_t(p.channels.count) * kTilePixels;
     visit_tile<F, AdaptiveBoxes, T>(p.lists.tile_samples, tile, [&](auto pixels, const auto* adapter) {
       blend_tile<decltype(pixels), T>(p, tile, colors, adapter);
     });

@@ -229,9 +229,8 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
 }
 
 template <class F, typename T> void blend_vjp(const cpu::BlendVjpParams<T>& p) {
-  cpu::parallel_for(p.grid.tiles(), p.threads, [&](int64_t tile) {
-    const int64_t thread = omp_get_thread_num();
-    T* gradient = p.scratch + thread * p.channels.count * kTilePixels;
+  cpu::parallel_for(p.grid.tiles(), p.threads, [&](int64_t tile, int thread) {
+    T* gradient = p.scratch + thread * int64_t(p.channels.count) * kTilePixels;
     T* replay_memory = p.replay ? p.replay + thread * cpu::kReplayNumbers : nullptr;
     visit_tile<F, AdaptiveBoxesVjp, T>(p.lists.tile_samples, tile, [&](auto pixels, const auto* adapter) {
       blend_vjp_tile<decltype(pixels), T>(p, tile, gradient, replay_memory, adapter);

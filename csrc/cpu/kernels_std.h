@@ -2,8 +2,6 @@
 // so that what these headers instantiate stays within the baseline instruction set.
 #pragma once
 
-#include <omp.h>
-
 #include <algorithm>
 #include <cmath>
 #include <cstdint>

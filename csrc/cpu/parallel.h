@@ -1,18 +1,32 @@
-// OpenMP loops. Results never depend on the number of threads: every item writes places of its own.
+// Loops whose items several threads share. Results never depend on the number of threads: every item writes places of
+// its own.
 #pragma once
 
-#include <omp.h>
-
 #include <cstdint>
+#include <type_traits>
 
 #include "core/platform.h"
 
 namespace ar::cpu {
 
-/// body(item) for item in [0, items), in any order, on at most `threads` threads. body must not throw.
+/// Calls run(body, item, thread) for every item in [0, items): see parallel_for.
+using RunItem = void (*)(const void* body, int64_t item, int thread);
+void run_items(int64_t items, int threads, RunItem run, const void* body);
+
+/// body(item), or body(item, thread), for item in [0, items), in any order, on at most `threads` threads: the calling
+/// one, whose number is 0, and others that are there for all loops (parallel.cpp). Items that run at the same time have
+/// different numbers, all below `threads`. Where body throws, items may be left out, and the exception is thrown here.
+/// Loops may be nested, and begun by several threads at once.
 template <class Body> void parallel_for(int64_t items, int threads, const Body& body) {
-#pragma omp parallel for schedule(dynamic) num_threads(threads) if (items > 1 && threads > 1)
-  for (int64_t item = 0; item < items; ++item) body(item);
+  const RunItem run = [](const void* pointer, int64_t item, [[maybe_unused]] int thread) {
+    const Body& body = *static_cast<const Body*>(pointer);
+    if constexpr (std::is_invocable_v<const Body&, int64_t, int>) {
+      body(item, thread);
+    } else {
+      body(item);
+    }
+  };
+  run_items(items, threads, run, &body);
 }
 
 /// Bounds of part `p` of `parts` near-equal parts of [0, n).

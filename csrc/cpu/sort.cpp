@@ -24,8 +24,9 @@ uint64_t depth_key(double depth) {
   return key;
 }
 
-/// As many numbers as make it worthwhile that another thread adds them up, and kinds of items that are placed together.
-constexpr int64_t kSumBlock = 4096, kKindBlock = 256;
+/// As many numbers as make it worthwhile that another thread adds them up, or sorts them, and kinds of items that are
+/// placed together.
+constexpr int64_t kSumBlock = 4096, kSortBlock = 2048, kKindBlock = 256;
 
 }  // namespace
 
@@ -46,6 +47,7 @@ int64_t sum_before(int64_t* numbers, int64_t n, int threads) {
 }
 
 int64_t place_items(int64_t* counts, int64_t parts, int64_t kinds, int threads, int64_t* firsts) {
+  threads = int(std::clamp<int64_t>(parts * kinds / kSumBlock, 1, threads));
   // A block of kinds in one part after the other: neighbours in memory.
   const int64_t blocks = (kinds + kKindBlock - 1) / kKindBlock;
   const auto kinds_of = [&](int64_t b) { return Part{b * kKindBlock, std::min((b + 1) * kKindBlock, kinds)}; };
@@ -81,7 +83,7 @@ template <typename T> void sort_by_depth(const T* depths, int64_t n, int threads
     Key key;
     int32_t index;
   };
-  const int64_t parts = threads;
+  const int64_t parts = std::clamp<int64_t>(n / kSortBlock, 1, threads);
   const std::unique_ptr<Entry[]> memory(new Entry[2 * n]);  // not a vector, which one thread would fill with zeros
   Entry *from = memory.get(), *to = from + n;
   std::vector<int64_t> cursors(parts * kBuckets), firsts(kBuckets);

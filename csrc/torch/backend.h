@@ -216,8 +216,8 @@ class Backend {
   virtual double lap() = 0;
 };
 
-/// Threads of a loop on the CPU: as many as torch's, but one in a forked child. fork() leaves the threads of OpenMP's
-/// pool behind, and libgomp would wait for them forever.
+/// Threads of a loop on the CPU: as many as torch's, but no more than the CPU quota of the container. Torch counts all
+/// cores, and those who use up their quota are stopped until the next period.
 int thread_count();
 
 /// For tensors like `like`; makes its device the current one while it lives.

@@ -4,11 +4,8 @@
 // floating type; lists and state fit each other, the splats and the image; `count` of inspect exceeds every id. The
 // contents of lists were made by an earlier stage and are not checked.
 #include <ATen/ops/arange.h>
-#include <ATen/ops/zeros_like.h>
+#include <ATen/ops/empty_like.h>
 #include <ATen/Parallel.h>
-#if defined(__unix__) || defined(__APPLE__)
-#include <pthread.h>
-#endif
 #if defined(__linux__)
 #include <sys/mman.h>
 #endif
@@ -17,16 +14,13 @@
 #include <chrono>
 #include <utility>
 
+#include "cpu/parallel.h"
+#include "cpu/quota.h"
 #include "cpu/stages.h"
 #include "torch/views.h"
 
 namespace ar::ops {
 namespace {
-
-bool is_forked = false;
-#if defined(__unix__) || defined(__APPLE__)
-[[maybe_unused]] const int kWatchesForks = pthread_atfork(nullptr, nullptr, [] { is_forked = true; });
-#endif
 
 /// at::empty, in huge pages where Linux gives them to those who ask. What belongs to splats and pairs is visited in an
 /// order that is random in memory, and most of it is new memory in every pass: fewer pages are fewer misses and faults.
@@ -232,7 +226,7 @@ template <typename T> class CpuBackend final : public Backend {
       stages.blend_vjp(p);
       return out;
     }
-    out.dL_dchannels = at::zeros_like(channels.rows);
+    out.dL_dchannels = make_zeros_like(channels.rows);
     const Tensor channel_sums = make_buffer({pairs, std::min<int64_t>(count, cpu::kWindow)}, floats_);
     p.channel_sums = pointer<T>(channel_sums);
     p.channel_stride = channel_sums.size(1);
@@ -324,6 +318,18 @@ template <typename T> class CpuBackend final : public Backend {
     return camera_grads;
   }
 
+  /// at::zeros_like on the threads of the other loops: those of torch spin while they wait for each other.
+  static Tensor make_zeros_like(const Tensor& contiguous) {
+    const Tensor out = at::empty_like(contiguous);
+    T* const numbers = pointer<T>(out);
+    const int64_t n = out.numel(), parts = cpu::chunks_of(n);
+    cpu::parallel_for(parts, thread_count(), [&](int64_t p) {
+      const cpu::Part part = cpu::part_of(n, parts, p);
+      std::fill(numbers + part.begin, numbers + part.end, T(0));
+    });
+    return out;
+  }
+
   Tensor make_scratch(int threads, int64_t channels) const {
     return at::empty({threads, channels * kTile * kTile}, floats_);
   }
@@ -334,7 +340,10 @@ template <typename T> class CpuBackend final : public Backend {
 
 }  // namespace
 
-int thread_count() { return is_forked ? 1 : at::get_num_threads(); }
+int thread_count() {
+  static const int quota = cpu::cpu_quota();
+  return std::min(at::get_num_threads(), quota);
+}
 
 std::unique_ptr<Backend> make_cpu_backend(const Tensor& like) {
   const at::TensorOptions options = like.options().requires_grad(std::nullopt);

@@ -234,6 +234,16 @@ TEST_P(StagesTest, AnyNumberOfChannels) {
   }
 }
 
+void expect_same_bits(const Rendered<float>& a, const Rendered<float>& b) {
+  const auto same = [](const std::vector<float>& a, const std::vector<float>& b) {
+    return a.size() == b.size() && (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(float)) == 0);
+  };
+  EXPECT_EQ(a.radii, b.radii);
+  EXPECT_TRUE(same(a.image, b.image));
+  EXPECT_TRUE(same(a.grads, b.grads));
+  EXPECT_TRUE(same(a.dL_dchannels, b.dL_dchannels));
+}
+
 TEST_P(StagesTest, ThreadsChangeNoBit) {
   // Two chunks of Gaussians, of which one in eight is in front of the camera; two windows of channels.
   Scene<float> scenes[] = {make_scene<float>(5000, 50, 35),
@@ -244,16 +254,18 @@ TEST_P(StagesTest, ThreadsChangeNoBit) {
   for (const Scene<float>& scene : scenes) {
     const Rendered<float> one = render(GetParam(), scene, 1);
     for (const int threads : kSanitized ? std::vector{7} : std::vector{2, 7}) {
-      const Rendered<float> many = render(GetParam(), scene, threads);
-      EXPECT_EQ(many.radii, one.radii);
-      const auto same = [](const std::vector<float>& a, const std::vector<float>& b) {
-        return a.size() == b.size() && (a.empty() || std::memcmp(a.data(), b.data(), a.size() * sizeof(float)) == 0);
-      };
-      EXPECT_TRUE(same(many.image, one.image));
-      EXPECT_TRUE(same(many.grads, one.grads));
-      EXPECT_TRUE(same(many.dL_dchannels, one.dL_dchannels));
+      expect_same_bits(render(GetParam(), scene, threads), one);
     }
   }
+}
+
+// So many splats that their pairs are placed in several parts.
+TEST(ManySplats, ThreadsChangeNoBit) {
+  const Footprint& footprint = footprints().front();
+  const Scene<float> scene = make_scene<float>(6000, 50, 35);
+  const Rendered<float> one = render(footprint, scene, 1);
+  EXPECT_GT(std::count_if(one.radii.begin(), one.radii.end(), [](int radius) { return radius > 0; }), 3000);
+  for (const int threads : {2, 7}) expect_same_bits(render(footprint, scene, threads), one);
 }
 
 // Worst case: float rounds a mean by 4 eps W = 1.6e-5 px, which changes log alpha by at most 3.4/0.3 px

@@ -1,0 +1,243 @@
+"""How a scene wants to be seen: its footprint, views, size and background, from its file and from what lies around it.
+
+Every command asks here. A scene comes from a training of this package, whose folder holds options.json and
+cameras.json; from the program of 3DGS, whose model folder holds cfg_args and cameras.json; or alone.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..camera import View
+from ..filters import PIXEL_VARIANCE
+from ..footprints import ENVIRONMENT_VARIABLE, Footprint, chosen_footprint, resolve_footprint
+from .common import SceneError
+from .metadata import SceneMetadata, read_metadata
+from .models import CFG_ARGS, CfgArgs, latest_ply, model_root, read_cfg_args
+from .views import load_views
+
+SCENE, OPTIONS, CAMERAS = "scene.ply", "options.json", "cameras.json"  # of the folder of a training
+BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+UNMARKED = resolve_footprint("point")  # what a file wants that says nothing: 3DGS trains with it
+ANTIALIASED = resolve_footprint("mip")  # and one that says only that pixels are to be integrated
+
+
+@dataclass(frozen=True)
+class Choice:
+    """A footprint, and why it was chosen."""
+
+    footprint: Footprint
+    reason: str
+
+
+@dataclass(frozen=True)
+class FoundScene:
+    """A scene, and what its file and its folders say.
+
+    Attributes:
+        path: The file of the Gaussians.
+        metadata: What this file says.
+        options: options.json of a training of this package, beside it; None where there is none.
+        cfg_args: What cfg_args of 3DGS says, beside it or in the folder of the model; None where there is none.
+        model: That folder.
+        cameras: cameras.json, beside it or in the folder of the model; None where there is none.
+    """
+
+    path: Path
+    metadata: SceneMetadata
+    options: dict[str, Any] | None = None
+    cfg_args: CfgArgs | None = None
+    model: Path | None = None
+    cameras: Path | None = None
+
+    @property
+    def is_trained_here(self) -> bool:
+        """Whether the training of options.json wrote this file: by its name, and by what it says of its footprint.
+
+        Another scene may have been copied over it, whose training had nothing to do with these options.
+        """
+        if self.options is None or self.path.name != SCENE:
+            return False
+        trained = resolve_footprint(self.options["options"]["footprint"])
+        if self.metadata.footprint is not None:
+            return resolve_footprint(self.metadata.footprint) == trained
+        # Trainings before files named their footprint; these marked whether pixels are integrated.
+        return "background" not in self.options and bool(self.metadata.antialiased) == (trained.name != UNMARKED.name)
+
+    @property
+    def trained_with(self) -> Choice | None:
+        """The footprint that the scene was trained with, or baked for, and who says so. None where nothing does."""
+        if self.metadata.footprint is not None:
+            return Choice(resolve_footprint(self.metadata.footprint), f"{self.path.name} says so")
+        if self.is_trained_here:
+            trained = self.options["options"]["footprint"]
+            return Choice(resolve_footprint(trained), f"{OPTIONS} beside {self.path.name} says so")
+        if self.metadata.antialiased:
+            reason = f"{self.path.name} says that it was trained with an antialiasing filter, and not which"
+            return Choice(ANTIALIASED, reason)
+        return None
+
+    @property
+    def is_dilated(self) -> bool:
+        """Whether the scene was trained with the dilation of `point`, as far as known: `bake` is for such scenes."""
+        trained = self.trained_with
+        return trained is None or is_dilated(trained.footprint)
+
+    @property
+    def background(self) -> tuple[tuple[float, float, float], str] | None:
+        """The colour behind the scene in its training, and who says so; None where nothing does."""
+        if self.options is not None:
+            color = self.options.get("background")
+            if color is None:  # of a training before options.json said it
+                color = {"black": BLACK, "white": WHITE}.get(self.options["options"].get("background"))
+            if color is not None:
+                return tuple(map(float, color)), OPTIONS
+        if self.cfg_args is not None and self.cfg_args.white_background is not None:
+            return (WHITE if self.cfg_args.white_background else BLACK), CFG_ARGS
+        return None
+
+    def trained_view(self, view: View) -> View:
+        """A view of `cameras` with pixels as large as in the training's finest pictures."""
+        if self.options is not None:
+            return view.scaled(1 / self._finest)
+        return view if self.cfg_args is None else self.cfg_args.trained_view(view)
+
+    @property
+    def size_reason(self) -> str:
+        """What says that the training's pictures were smaller than `cameras` states; "" where nothing does."""
+        if self.options is not None:
+            return f"{OPTIONS}: scales from {self._finest}" if self._finest > 1 else ""
+        said = "" if self.cfg_args is None else self.cfg_args.size_in_words
+        return said and f"{CFG_ARGS}: {said}"
+
+    @property
+    def _finest(self) -> int:
+        return min(self.options["options"]["scales"])
+
+    def load_views(self, path=None, size: tuple[int, int] | None = None, trained_size: bool = True) -> list[View]:
+        """The views of a file, by default of `cameras`, in the frame of the scene. Those of `cameras` have the size of
+        the training's pictures.
+
+        Args:
+            path: Another file of views.
+            size: As in `load_views`.
+            trained_size: False leaves the views as the file has them.
+
+        Raises:
+            SceneError: There is no file of views, or it is not one.
+        """
+        if path is None and self.cameras is None:
+            where = self.path.parent if self.model is None else self.model
+            raise SceneError(f"{self.path}: no views: there is no {CAMERAS} in {where}; give a file of views (--views)")
+        views = load_views(self.cameras if path is None else path, size)
+        if self.path.suffix.lower() != ".splat":  # which holds no offset, and is beside views of its own frame
+            views = [view.in_frame(self.metadata.offset) for view in views]
+        own = path is None or self.is_cameras(path)
+        return [self.trained_view(view) for view in views] if own and trained_size else views
+
+    def is_cameras(self, path) -> bool:
+        """Whether a file of views is `cameras`."""
+        return self.cameras is not None and Path(path).samefile(self.cameras)
+
+    def training_footprint(self, given: str | Footprint | None = None) -> Choice:
+        """What the scene was trained with: `given`, else what is said, else `point`, with which 3DGS trains.
+
+        Raises ValueError where `given` is no footprint.
+        """
+        if given is not None:
+            return Choice(resolve_footprint(given), "as given")
+        return self.trained_with or Choice(UNMARKED, f"{self.path.name} names none, and 3DGS trains with it")
+
+    def choose_footprint(self, given: str | Footprint | None = None) -> Choice:
+        """How to show the scene: `given`, else the choice of the process (the environment variable), else
+        `training_footprint`. The reason says where the scene should be baked.
+
+        Raises:
+            ValueError: `given` or the environment variable holds no footprint.
+        """
+        choice, chosen = self.training_footprint(given), chosen_footprint()
+        if given is None and chosen is not None:
+            choice = Choice(chosen, f"{ENVIRONMENT_VARIABLE} says so")
+        return Choice(choice.footprint, choice.reason + self._bake_hint(choice.footprint))
+
+    def _bake_hint(self, footprint: Footprint) -> str:
+        """What to do about a scene that was trained with `point`; "" for others."""
+        command = f"bake {self.path} --out FILE"
+        if not self.is_dilated:
+            return ""
+        if is_dilated(footprint):
+            return f"; right at the size of the training, for others: {command}"
+        known = "" if self.trained_with else f"{self.path.name} names no footprint: if 3DGS trained it, "
+        return f"; {known}its Gaussians are too thin for {footprint.name}, so first: {command}"
+
+
+def is_dilated(footprint: Footprint) -> bool:
+    """Whether a footprint adds a dilation that can be baked: one as wide as a pixel, or more."""
+    return footprint.name == UNMARKED.name and footprint.option >= PIXEL_VARIANCE
+
+
+def find_scene(path) -> FoundScene:
+    """Finds a scene, and what is said about it.
+
+    Args:
+        path: A file of Gaussians; the folder of a training of this package; or the folder of a model of 3DGS, of which
+            the last iteration is taken.
+
+    Raises:
+        SceneError: There is no scene.
+    """
+    given = Path(path)
+    path = _file_in(given) if given.is_dir() else given
+    if not path.exists():
+        raise SceneError(f"{path}: no such file or folder")
+    metadata, root = read_metadata(path), model_root(path)
+    folders = [path.parent, *([] if root is None else [root])]
+    cameras, cfg_args = (
+        next((folder / name for folder in folders if (folder / name).is_file()), None) for name in (CAMERAS, CFG_ARGS)
+    )
+    return FoundScene(
+        path,
+        metadata,
+        options=_read_options(path.parent / OPTIONS),
+        cfg_args=None if cfg_args is None else read_cfg_args(cfg_args),
+        model=root,
+        cameras=cameras,
+    )
+
+
+def _file_in(folder: Path) -> Path:
+    """The scene that a folder stands for."""
+    own, model = folder / SCENE, latest_ply(folder)
+    if own.is_file() and model is not None:
+        raise SceneError(f"{folder}: holds {SCENE} and {model.relative_to(folder)}; name one of them")
+    if own.is_file():
+        return own
+    if model is not None:
+        return model
+    raise SceneError(
+        f"{folder}: a folder without a scene: expected {SCENE} with {OPTIONS}, which `train` writes, or "
+        "point_cloud/iteration_N/point_cloud.ply of 3DGS"
+    )
+
+
+def _read_options(path: Path) -> dict[str, Any] | None:
+    """What a training wrote of itself; None where there is nothing, or the options.json of another program."""
+    if not path.is_file():
+        return None
+    try:
+        described = json.loads(path.read_text(encoding="utf-8-sig"))
+        options = described["options"]
+        resolve_footprint(options["footprint"])
+        scales, color = options["scales"], described.get("background", BLACK)
+        good = bool(scales) and all(type(scale) is int and scale >= 1 for scale in scales)
+        if not good or len(color) != 3 or not all(0 <= value <= 1 and math.isfinite(value) for value in color):
+            raise ValueError
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        warnings.warn(f"{path}: ignored, it is not what `train` writes", stacklevel=3)
+        return None
+    return described
