@@ -144,6 +144,7 @@ class Shard(ShardedTrainer):
     """A `ShardedTrainer` that is given the Gaussians of its rank alone, so that nobody has to hold all of them."""
 
     def __init__(self, options, start: Gaussians, pictures, background, device, ranks: Ranks):
+        self.counts = ranks.exchange(len(start.means))
         Trainer.__init__(self, options, start, pictures, background, device, ranks)
 
 

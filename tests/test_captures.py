@@ -1136,3 +1136,16 @@ def test_random_points_of_a_far_nerf_synthetic_scene_are_where_it_is(tmp_path):
     torch.testing.assert_close(in_world, expected, rtol=0, atol=1e-5)
     for item, expected in zip(found.train, circle(10)):
         torch.testing.assert_close(item.view.w2c, expected.w2c, rtol=0, atol=0.1)
+
+
+@pytest.mark.parametrize("background", [None, captures.WHITE, captures.BLACK])
+def test_pictures_without_alpha_stay_as_they_are_stored(background):
+    """They are not computed; pictures of which one pixel is not opaque are."""
+    rgba = torch.randint(0, 256, (7, 9, 4), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    rgba[:, :, 3] = 255
+    computed = rgba.clone()
+    computed[0, 0, 3] = 254
+    for downsampling in ("box", "bicubic", "blender"):
+        kept, other = (pictures.reduce(picture, 1, background, downsampling) for picture in (rgba, computed))
+        assert torch.equal(kept, rgba.permute(2, 0, 1)[: 4 if background is None else 3]) and kept.is_contiguous()
+        assert torch.equal(kept[:, 1:], other[:, 1:]) and torch.equal(kept[:, 0, 1:], other[:, 0, 1:])

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import shutil
 from dataclasses import replace
 
 import pytest
@@ -330,3 +331,16 @@ def test_a_disk_too_full_for_the_checkpoint_does_not_cost_the_scene(orbit, tmp_p
     with pytest.raises(OSError, match=r"checkpoint\.pt"):
         run.train()
     assert io.load_scene(tmp_path / files.SCENE).count == run.count()
+
+
+@pytest.mark.parametrize("density", ["absgrad", "none"])
+def test_pictures_with_nothing_in_them_are_said(orbit, tmp_path, density):
+    """The Gaussians fade."""
+    for picture in (orbit / "images").iterdir():
+        pixels = torch.zeros(3, 32, 32)
+        (tmp_path / "scene" / "images").mkdir(parents=True, exist_ok=True)
+        io.to_image(pixels).save(tmp_path / "scene" / "images" / picture.name)
+    shutil.copytree(orbit / "sparse", tmp_path / "scene" / "sparse")
+    run = make_run(tmp_path / "scene", tmp_path / "out", density=density, iterations=400, opacity_weight=1.0)
+    with pytest.raises(RuntimeError, match="there is nothing in the pictures, each of which has one colour"):
+        run.train()

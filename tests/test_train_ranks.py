@@ -113,6 +113,7 @@ def work(rank, world, folder):
     if rank == 2:
         (folder / "metrics.json").write_text(json.dumps(metrics))
     redistribute(run.trainer, folder)
+    outside_of_float32(run, folder)
     not_finite(run, folder)
     dist.barrier()
     dist.destroy_process_group()
@@ -182,6 +183,25 @@ def state_rows(trainer):
     """Parameters and moments of this rank."""
     rows = [field.detach().clone() for field in trainer.gaussians]
     return rows + [trainer.optimizer.state[f][m].clone() for f in trainer.gaussians for m in MOMENTS]
+
+
+def outside_of_float32(run, folder):
+    """Gaussians of one rank that go, and then all of its that are most of what there is; what each rank says of it."""
+    trainer, broken = run.trainer, run.ranks.rank == 1
+    before, own, said = trainer.count, len(trainer.gaussians.means), []
+    with torch.no_grad():
+        trainer.gaussians.means[: 3 if broken else 0] = math.nan
+    trainer.check()
+    said += [before - trainer.count, own - len(trainer.gaussians.means), trainer.dropped, trainer.warnings[-1]]
+    with torch.no_grad():
+        trainer.gaussians.shs[: own if run.ranks.rank else 0] = math.inf
+    try:
+        trainer.check()
+    except FloatingPointError as error:
+        said.append(str(error))
+    with torch.no_grad():
+        trainer.gaussians.shs.clamp_(-1, 1)
+    (folder / f"outside-{run.ranks.rank}.json").write_text(json.dumps(said))
 
 
 def not_finite(run, folder):
@@ -340,6 +360,15 @@ def test_moved_rows_keep_their_order(made):
 def test_a_loss_that_is_not_finite_on_one_rank_ends_all(made):
     found = {(made / f"not-finite-{rank}.txt").read_text() for rank in range(WORLD)}
     assert found == {f"the loss of step {STEPS + WORLD} is nan; lower learning rates may help"}
+
+
+def test_gaussians_outside_of_float32_on_one_rank_are_those_of_all(made):
+    of_ranks = [json.loads((made / f"outside-{rank}.json").read_text()) for rank in range(WORLD)]
+    assert [lost for lost, *_ in of_ranks] == [3] * WORLD and [own for _, own, *_ in of_ranks] == [0, 3, 0]
+    assert all(said[2] == 3 and said[3:] == of_ranks[0][3:] for said in of_ranks)
+    _, _, _, warning, error = of_ranks[0]
+    assert warning.startswith("3 of ") and "means outside of float32" in warning
+    assert "shs outside of float32" in error and error.endswith("a lower --color-rate may help")
 
 
 def test_a_rank_that_does_not_answer_is_named_as_a_time_out(made):

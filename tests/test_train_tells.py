@@ -400,3 +400,13 @@ def test_lengths_that_a_training_cannot_go_on_to(scene, tmp_path, capsys, option
 def test_another_length_is_for_a_training_that_is_resumed(scene, tmp_path):
     with pytest.raises(ValueError, match="iterations and seconds of Run are for resume"):
         make_run(scene, tmp_path / "out", more={"iterations": 5})
+
+
+def test_options_of_a_capture_that_says_it_itself_are_errors(scene, tmp_path, capsys):
+    for option, message in (
+        ("--images", "where its pictures are"),
+        ("--test-every", "which pictures are for the test"),
+    ):
+        assert train(scene, tmp_path / "out", option, "7", "--iterations", 1) == 2
+        assert re.search(rf"error: {option} has no effect: .* itself says {message}", capsys.readouterr().err)
+        assert not (tmp_path / "out").exists()

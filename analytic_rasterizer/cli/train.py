@@ -157,7 +157,8 @@ def run_on(ranks: Ranks, args) -> bool:
         raise ValueError("--watch is for one process, got torchrun")
     if args.watch:
         io.optional_import("viser", "view")  # raises before the pictures are read
-    checkpoint, chosen = Path(args.out) / CHECKPOINT, list(given)
+    checkpoint = Path(args.out) / CHECKPOINT
+    chosen = [*given, *(name for name in ("images", "test_every") if getattr(args, name) is not None)]
     # Mapped: of a large file little is needed here.
     stored = TrainingOptions.from_dict(read_checkpoint(checkpoint, mapped=True)["options"]) if args.resume else None
     length = {name: given[name] for name in ("iterations", "seconds") if stored is not None and name in given}

@@ -17,7 +17,7 @@ RADIUS_FACTOR = 1.1  # [3DGS]
 SEEN_SHARE = 0.5  # of the distance of what cameras see: the least extent
 OUTLYING = 10  # times as far from the middle as every other camera
 MOST_OUTLIERS = 5  # at most one in so many cameras is an outlier
-MOST_VIEWS, MOST_POINTS = 256, 4096  # of which a median is taken
+MOST_VIEWS, MOST_POINTS = 64, 2048  # of which a median is taken
 ROUNDING = 1e-9  # of coordinates: cameras no further apart are at one place
 
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
+from ..density import FixedDensity
+from ..distributed.ranks import Ranks
 from ..gaussians import Gaussians
 from ..io.scenes import numbers_of
 from .model import render
-
-if TYPE_CHECKING:
-    from .trainer import Trainer
+from .options import TrainingOptions
+from .pictures import Pictures
+from .schedule import Progress
 
 FAINTEST = 1 / 255  # the rasterizer draws nothing of a lower opacity
 MOST_BROKEN = 0.5  # of the Gaussians: a training that loses more at once diverges
@@ -25,6 +27,28 @@ OPTION_OF = {
     "logit_opacities": "opacity_rate",
     "shs": "color_rate",
 }
+
+
+class Trainer(Protocol):
+    """What is looked at here of a `training.Trainer`."""
+
+    options: TrainingOptions
+    pictures: Pictures
+    ranks: Ranks
+    density: FixedDensity
+    progress: Progress
+    gaussians: Gaussians
+    count: int
+    extent: float
+    last: tuple[Tensor, Tensor] | None
+    dropped: int
+    warnings: list[str]
+
+    def keep(self, kept: Tensor) -> None: ...
+
+    def take_losses(self) -> list[float]: ...
+
+    def scene(self) -> Gaussians: ...
 
 
 def finite_rows(gaussians: Gaussians) -> Tensor:
@@ -85,7 +109,7 @@ def check_visible(trainer: Trainer) -> None:
         options = ["opacity_rate"] + (["opacity_weight"] if trainer.options.regularizers[0] else [])
         raise RuntimeError(
             f"all {count:,} Gaussians are transparent after step {step:,} (opacities below 1/255), so that nothing can "
-            f"be learned any more; a lower {' or '.join(map(flag, options))} may help"
+            f"be learned any more; a lower {' or '.join(map(flag, options))} may help{_about_pictures(trainer)}"
         )
     if trainer.ranks.world == 1 and trainer.last is not None and not _any_shown(trainer):
         raise RuntimeError(
@@ -129,7 +153,16 @@ def _causes(trainer: Trainer) -> str:
         f"{opacity:,} were pruned for opacities below {options.prune_opacity:g} ({flag('prune_opacity')}, "
         f"{flag('reset_every')}, {flag('opacity_rate')}), {size:,} for scales above "
         f"{options.prune_above * extent:.3g}, {options.prune_above:g} extents of the capture ({flag('prune_above')})"
+        f"{_about_pictures(trainer)}"
     )
+
+
+def _about_pictures(trainer: Trainer) -> str:
+    """What is wrong with the pictures, if nothing is in any of them."""
+    pictures = trainer.pictures
+    truths = (pictures.truth(min(pictures.colors), view) for view in range(len(pictures.views)))
+    empty = all(bool((truth == truth[:, :1, :1]).all()) for truth in truths)
+    return "; there is nothing in the pictures, each of which has one colour" if empty else ""
 
 
 def flag(name: str) -> str:

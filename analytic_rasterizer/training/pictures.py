@@ -211,6 +211,8 @@ def reduce(
     (a = -0.5) of 4 scales' width, as Pillow does. Colours count by their alpha. With "blender" they do not: straight
     colours and alpha are averaged apart and then composited, as the files of the multi-scale Blender set were made.
     """
+    if scale == 1 and bool((rgba[:, :, 3] == 255).all()):  # most photographs: what follows would give the same
+        return rgba[:, :, : 4 if background is None else 3].permute(2, 0, 1).contiguous()
     full = rgba.permute(2, 0, 1).float() / 255
     if downsampling != "blender":
         full[:3] *= full[3:]
@@ -218,7 +220,7 @@ def reduce(
         size = full.shape[1] // scale, full.shape[2] // scale
         full = functional.interpolate(full[None], size, mode="bicubic", antialias=True)[0].clamp(0, 1)
         full[:3] = torch.minimum(full[:3], full[3:])  # the kernel overshoots, and not in all channels alike
-    else:
+    elif scale > 1:
         full = functional.avg_pool2d(full, scale)
     color, alpha = full.split([3, 1])
     if downsampling == "blender":

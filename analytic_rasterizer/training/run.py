@@ -42,7 +42,7 @@ from .pictures import Pictures, load_pictures
 from .reports import Display, TensorBoard, describe
 from .schedule import Clock, describe_change
 from .sharded import ShardedTrainer, shards_of
-from .start import capture_arguments, first_gaussians, of_length, source_of, stored_offset
+from .start import capture_arguments, check_source, first_gaussians, of_length, source_of, stored_offset
 from .trainer import Trainer, background_of
 
 if TYPE_CHECKING:
@@ -129,6 +129,7 @@ class Run:
         self.source["offset"] = self.capture.offset
         self.notes = list(self.capture.notes)
         if state is None:  # raises before the pictures are read
+            check_source(Path(scene), self.capture, self.source, chosen)
             start, self.points_found = first_gaussians(self.options, self.capture, points, chosen)
             if points is None and self.capture.points is None and self.capture.starts_in_view:
                 self.notes.append(

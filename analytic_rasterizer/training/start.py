@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Collection
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from .. import io
 from ..gaussians import Gaussians
-from .captures import IMAGES, LENS_CHOICES, MISSING_CHOICES, TEST_PERIOD, Capture
+from .captures import IMAGES, LENS_CHOICES, MISSING_CHOICES, TEST_PERIOD, Capture, load_capture
 from .health import FAINTEST
 from .options import TrainingOptions
 from .placement import focus_of
@@ -54,6 +56,24 @@ def capture_arguments(source: dict[str, Any]) -> dict[str, Any]:
     arguments = {"images": source["images"], "test_every": source["test_every"]}
     arguments |= {name: source[name] for name in ("cameras", "lens", "missing") if name in source}
     return arguments | ({"offset": tuple(source["offset"] or (0.0, 0.0, 0.0))} if "offset" in source else {})
+
+
+def check_source(folder: Path, capture: Capture, source: dict[str, Any], chosen: Collection[str]) -> None:
+    """Raises ValueError if `images` or `test_every` are among the options `chosen`, and change nothing in the capture.
+
+    Args:
+        folder: Of the capture.
+        source: As it was loaded with.
+    """
+    files = [path for item in (*capture.train, *capture.test) for path in item.files.values()]
+    if "images" in chosen and not any(path.is_relative_to(folder / source["images"]) for path in files):
+        raise ValueError(f"--images has no effect: {folder} itself says where its pictures are, as in {files[0]}")
+    if "test_every" in chosen:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # which have been said
+            without = load_capture(folder, **capture_arguments(source | {"test_every": 0}))
+        if without.test:
+            raise ValueError(f"--test-every has no effect: {folder} itself says which pictures are for the test")
 
 
 def of_length(
