@@ -97,7 +97,7 @@ def run(args) -> None:
         scaled = [view.scaled(1 / scale) for view in views]
         of_scale = []
         for view, color, row in renderer.pictures(scaled):
-            pictures.save(view.name, color, renderer.outputs(view) if args.alpha or args.depth else None)
+            pictures.write(view.name, color, renderer.outputs(view) if args.alpha or args.depth else None)
             of_scale.append(row)
         rows += of_scale if args.path is None else []
         rows.append(mean_of(of_scale))
@@ -172,7 +172,7 @@ class Pictures:
         self.depth_folder = writable_folder(folder / "depth") if depth else None
         self.nearest: float | None = None  # of the first picture that shows something: white in all of them
 
-    def save(self, name: str, color: torch.Tensor, outputs) -> None:
+    def write(self, name: str, color: torch.Tensor, outputs) -> None:
         if self.alpha:  # colours in PNG files are not multiplied by alpha
             color = torch.cat([normalized(color, outputs.alpha), outputs.alpha])
         io.save_image(self.folder / f"{name}.png", color)
