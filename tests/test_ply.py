@@ -27,6 +27,7 @@ def table(columns, count=5):
 BESIDE = [(("uchar", "red8"), 200), (("int", "id"), -5), (("double", "time"), 1e300)]
 LISTS = [(("uchar", "float", "weights"), [0.25, 0.5])]
 
+CHUNKS = Element("chunk", [("float", "a")], [[0.5], [0.25]])
 FILES = {
     "nothing else": lambda c, r: ply(vertices(c, r)),
     "floats behind": lambda c, r: ply(vertices(c, r), CAMERA),
@@ -65,6 +66,8 @@ FILES = {
     "old line ends": lambda c, r: ply(vertices(c, r), newline="\r"),
     "one other line end": lambda c, r: ply(vertices(c, r)).replace(b"end_header\n", b"end_header\r\n"),
     "spaces": lambda c, r: ply(vertices(c, r)).replace(b"property float x", b"  property   float\tx  "),
+    "a byte order mark": lambda c, r: b"\xef\xbb\xbf" + ply(vertices(c, r)),
+    "other chunks before": lambda c, r: ply(CHUNKS, vertices(c, r)),
     "bytes behind": lambda c, r: ply(vertices(c, r), after=b"\0" * 9),
 }  # fmt: skip
 

@@ -74,7 +74,7 @@ def parse_header(start: bytes) -> Header:
 
     Lines may end as on any system. Text of comments that is not UTF-8 is replaced.
     """
-    if not re.match(rb"ply[ \t]*(\r|\n|\Z)", start):
+    if not re.match(rb"(\xef\xbb\xbf)?ply[ \t]*(\r|\n|\Z)", start):  # editors put a byte order mark in front
         raise SceneError("not a PLY file: it does not begin with 'ply'")
     end = _END.search(start)
     if end is None:
