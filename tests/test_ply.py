@@ -283,6 +283,19 @@ def test_gaussians_that_are_not_finite_are_left_out(tmp_path, layout, column, va
         io.load_scene(tmp_path / "a.ply")
 
 
+@pytest.mark.parametrize(
+    "word", ["nan", "-NaN", "-nan(ind)", "nan(0x8000)", "1.#QNAN", "-1.#IND00", "inf", "-1.#INF000", "1e999"]
+)
+def test_words_of_text_that_are_no_finite_number(tmp_path, word):
+    """Programs write them as their system does."""
+    rows = table(SCENE_COLUMNS)
+    whole = ply(vertices(SCENE_COLUMNS, rows), layout="ascii")
+    header, _, body = whole.partition(b"end_header\n")
+    (tmp_path / "a.ply").write_bytes(header + b"end_header\n" + word.encode() + body[body.index(b" ") :])
+    with pytest.warns(UserWarning, match=r"a\.ply: 1 of 5 Gaussians are left out: means of 1 are not finite"):
+        assert torch.equal(io.load_scene(tmp_path / "a.ply").means, torch.from_numpy(rows[1:, :3].copy()))
+
+
 @pytest.mark.parametrize("column", ["x", "green"])
 def test_points_that_are_not_finite_are_left_out(tmp_path, column):
     rows = table(POINT_COLUMNS)
