@@ -73,10 +73,9 @@ def run(args) -> None:
     use_machine(args)
     found = io.find_scene(args.scene)
     choice = found.choose_footprint(given)
-    chosen_background = args.background
+    if args.alpha:
+        args.background = io.BLACK  # whose picture is that without a background
     views, said = settle_views(args, found)
-    if args.alpha and chosen_background is not None:
-        raise ValueError("--alpha leaves the background out: give --background or --alpha")
     check_sizes((view.scaled(1 / scale) for view in views for scale in args.scales), args.device, LARGER)
     if film:
         check_writable_file(args.out)
@@ -86,7 +85,7 @@ def run(args) -> None:
     if args.path is not None:
         views = path_of(args, scene, views)
     say(*said, f"footprint {choice.footprint}: {choice.reason}")
-    renderer = Renderer(scene, choice.footprint, (0.0, 0.0, 0.0) if args.alpha else args.background, args.device)
+    renderer = Renderer(scene, choice.footprint, args.background, args.device)
     if film:
         save_film(args, renderer, [view.scaled(1 / args.scales[0]) for view in views])
         return
@@ -120,6 +119,8 @@ def check_options(args) -> Footprint | None:
             raise ValueError(f"--{wrong[0]} is for pictures: give --out DIR, got {args.out}")
         if len(args.scales) > 1:
             raise ValueError(f"a film has one size: give one number to --scales, got {len(args.scales)}")
+    if args.alpha and args.background is not None:
+        raise ValueError("--alpha leaves the background out: give --background or --alpha")
     if args.samples is not None and args.footprint is None:
         raise ValueError("--samples is an option of a footprint, which --footprint names: --footprint box --samples 4")
     options = {} if args.samples is None else {"samples": args.samples}
