@@ -128,6 +128,7 @@ CHOICES = {
         "point_cloud_mip.ply", None, None, "point:dilation=0.0", "point_cloud_mip.ply says so",
     ),
     "without dilation": ({"a.ply": None}, "a.ply", None, "point:dilation=0", "point:dilation=0.0", "too thin"),
+    "a name with spaces": ({"a b.ply": None}, "a b.ply", None, None, UNMARKED, "a b.ply' --out FILE"),
     "a model": ({DEEP: None}, "MODEL", None, None, UNMARKED, "point_cloud.ply names none"),
     "a baked model": ({DEEP: MOMENT}, DEEP, None, None, "moment:samples=4", "point_cloud.ply says so"),
 }  # fmt: skip
@@ -254,6 +255,24 @@ def test_views_are_in_the_frame_of_the_scene(tmp_path):
     for path in (None, tmp_path / "world.json"):
         for view, expected in zip(found.load_views(path), here):
             torch.testing.assert_close(view.w2c, expected.w2c, rtol=0, atol=1e-8)  # float64 at 4.2e6: 1e-9
+
+
+@pytest.mark.parametrize("scene", ["../iteration_30000/point_cloud.ply", "..", "link.ply", "cut/../../iteration_30000"])
+def test_a_model_is_found_through_dots_and_links(tmp_path, monkeypatch, scene):
+    write(tmp_path, {DEEP: None, "MODEL/cameras.json": (64, 48), "MODEL/cfg_args": WHITE_CFG})
+    here = tmp_path / "MODEL" / "point_cloud" / "iteration_7"
+    (here / "cut").mkdir(parents=True)
+    (here / "link.ply").symlink_to(tmp_path / DEEP)
+    monkeypatch.chdir(here)
+    found = io.find_scene(scene)
+    assert found.cameras is not None and found.cameras.samefile(tmp_path / "MODEL" / "cameras.json")
+    assert found.background[0] == io.WHITE
+
+
+def test_a_link_elsewhere_leads_to_its_model(tmp_path):
+    write(tmp_path, {DEEP: None, "MODEL/cameras.json": (64, 48)})
+    (tmp_path / "link.ply").symlink_to(tmp_path / DEEP)
+    assert io.find_scene(tmp_path / "link.ply").cameras.samefile(tmp_path / "MODEL" / "cameras.json")
 
 
 def test_the_last_iteration_is_a_number(tmp_path):

@@ -246,6 +246,12 @@ def test_a_film_has_one_size(files, capsys):
     assert "a film has one size, and the views have several: give --path views" in capsys.readouterr().err
 
 
+def test_without_a_background_none_is_said(files, capsys):
+    (files / "cfg_args").write_text("Namespace(white_background=True)")
+    assert render(files, "--out", files / "out") == 0 and "background white" in capsys.readouterr().err
+    assert render(files, "--alpha", "--out", files / "out") == 0 and "; background" not in capsys.readouterr().err
+
+
 def test_alpha_and_depth(files):
     out = files / "out"
     assert render(files, "--alpha", "--depth", "--out", out, "--scales", "1,0.5") == 0

@@ -108,6 +108,14 @@ def test_render_in_a_process(files):
     assert [line.split()[0] for line in done.stdout.splitlines()] == [*("view", "front", "off_centre", "mean")]
 
 
+def test_a_closed_stderr_changes_no_result(files, capsys, monkeypatch):
+    monkeypatch.setattr("sys.stderr", None)
+    assert cli.main(arguments(files)) == 0
+    assert capsys.readouterr().out.startswith("view ")
+    assert cli.main(["render", "nosuch", "--out", "a"]) == 2
+    assert capsys.readouterr().out == ""
+
+
 def test_size_for_views_that_state_none(files):
     frame = {
         "file_path": "a",
@@ -203,6 +211,7 @@ end_header
         (None, ["--out", "film.gif"], "--out must be a folder, or a film that ends in .mp4, got film.gif"),
         (None, ["--out", "film.mp4", "--depth"], "--depth is for pictures: give --out DIR, got film.mp4"),
         (None, ["--out", "film.mp4", "--scales", "1,2"], "a film has one size: give one number to --scales, got 2"),
+        (None, ["--out", ""], "expected the name of a folder for the results, got ''"),
         (None, ["--threads", "0"], "must be a positive whole number, got 0"),
         (None, ["--size", "3", "-3"], "must be a positive whole number, got -3"),
         (None, ["--device", "abacus"], "argument --device: invalid choice: 'abacus'"),
@@ -230,6 +239,7 @@ def test_errors_are_one_line(files, capsys, prepare, extra, message):
             ["view", "a.ply", "--footprint", "moment"],
             "; with --server every footprint can be shown",
         ),
+        (["view", "a.ply", "--export", ""], "--export must end in .html, got"),
     ],
 )
 def test_wrong_commands_are_one_line(tmp_path, capsys, args, message):

@@ -109,6 +109,22 @@ def test_a_splat_by_hand(tmp_path):
         assert io.load_scene(tmp_path / "a.splat").count == 1
 
 
+@pytest.mark.parametrize("name", ["a.ply", "a.compressed.ply", "a.spz"])
+def test_a_file_of_another_format_is_no_splat(tmp_path, name):
+    """Where its size is that of whole rows, it would be read as numbers of no meaning."""
+    io.save_scene(tmp_path / name, random_scene(degree=0))
+    content = (tmp_path / name).read_bytes()
+    (tmp_path / "b.splat").write_bytes(content + bytes(-len(content) % 32))
+    with pytest.raises(io.SceneError, match=rf"b\.splat: a {(tmp_path / name).suffix}, and no \.splat: rename it"):
+        io.load_scene(tmp_path / "b.splat")
+
+
+def test_a_folder_is_no_file_of_a_scene(tmp_path):
+    (tmp_path / "a.ply").mkdir()
+    with pytest.raises(io.SceneError, match=r"a\.ply: expected a file of a scene, got a folder"):
+        io.load_scene(tmp_path / "a.ply")
+
+
 def test_a_splat_round_trip(tmp_path):
     scene = random_scene(degree=0)
     io.save_scene(tmp_path / "a.splat", scene)

@@ -27,6 +27,7 @@ def table(columns, count=5):
 BESIDE = [(("uchar", "red8"), 200), (("int", "id"), -5), (("double", "time"), 1e300)]
 LISTS = [(("uchar", "float", "weights"), [0.25, 0.5])]
 
+CHUNKS = Element("chunk", [("float", "a")], [[0.5], [0.25]])
 FILES = {
     "nothing else": lambda c, r: ply(vertices(c, r)),
     "floats behind": lambda c, r: ply(vertices(c, r), CAMERA),
@@ -65,6 +66,8 @@ FILES = {
     "old line ends": lambda c, r: ply(vertices(c, r), newline="\r"),
     "one other line end": lambda c, r: ply(vertices(c, r)).replace(b"end_header\n", b"end_header\r\n"),
     "spaces": lambda c, r: ply(vertices(c, r)).replace(b"property float x", b"  property   float\tx  "),
+    "a byte order mark": lambda c, r: b"\xef\xbb\xbf" + ply(vertices(c, r)),
+    "other chunks before": lambda c, r: ply(CHUNKS, vertices(c, r)),
     "bytes behind": lambda c, r: ply(vertices(c, r), after=b"\0" * 9),
 }  # fmt: skip
 
@@ -278,6 +281,19 @@ def test_gaussians_that_are_not_finite_are_left_out(tmp_path, layout, column, va
     (tmp_path / "a.ply").write_bytes(ply(vertices(SCENE_COLUMNS, rows), layout=layout))
     with pytest.raises(io.SceneError, match=f"{named} must be finite, got 5 of 5 rows not"):
         io.load_scene(tmp_path / "a.ply")
+
+
+@pytest.mark.parametrize(
+    "word", ["nan", "-NaN", "-nan(ind)", "nan(0x8000)", "1.#QNAN", "-1.#IND00", "inf", "-1.#INF000", "1e999"]
+)
+def test_words_of_text_that_are_no_finite_number(tmp_path, word):
+    """Programs write them as their system does."""
+    rows = table(SCENE_COLUMNS)
+    whole = ply(vertices(SCENE_COLUMNS, rows), layout="ascii")
+    header, _, body = whole.partition(b"end_header\n")
+    (tmp_path / "a.ply").write_bytes(header + b"end_header\n" + word.encode() + body[body.index(b" ") :])
+    with pytest.warns(UserWarning, match=r"a\.ply: 1 of 5 Gaussians are left out: means of 1 are not finite"):
+        assert torch.equal(io.load_scene(tmp_path / "a.ply").means, torch.from_numpy(rows[1:, :3].copy()))
 
 
 @pytest.mark.parametrize("column", ["x", "green"])

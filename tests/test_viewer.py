@@ -241,7 +241,12 @@ def test_without_the_token_nothing_is_served(server, path):
 )
 def test_nothing_but_the_listed_files_is_served(server, name):
     assert ask(server, f"/{server.token}/{name}")[0] == 404
-    assert ask(server, f"/{server.token}")[0] == 404
+
+
+def test_an_address_without_its_last_slash_leads_to_the_page(server):
+    status, headers, body = ask(server, f"/{server.token}")
+    assert (status, headers["Location"], body) == (302, f"/{server.token}/", b"")
+    assert ask(server, f"/{server.token[:-1]}")[0] == 403
 
 
 def test_other_methods_are_refused(server):

@@ -38,6 +38,12 @@ def figure(path):
     tables.save_figure(tables.new_figure(3, 2)[0], path.parent, path.stem)
 
 
+def film(path):
+    """One whose pictures the writer takes all before it writes them: it fails at its end."""
+    pytest.importorskip("imageio_ffmpeg", reason="needs the video extra")
+    io.save_video(path, torch.rand(3, 3, 64, 64), (64, 64))
+
+
 WRITERS = {
     "a.ply": lambda path: io.save_scene(path, scene()),
     "a.compressed.ply": lambda path: io.save_scene(path, scene()),
@@ -46,6 +52,7 @@ WRITERS = {
     "views.json": lambda path: io.save_views(path, views()),
     "picture.png": lambda path: io.save_image(path, torch.rand(3, 64, 64)),
     "picture.jpg": lambda path: io.save_image(path, image.effect_noise((300, 300), 90), quality=95),
+    "film.mp4": film,
     "results.json": lambda path: io.write_json(path, list(range(1000))),
     "page.html": lambda path: viewer.export_page(path, viewer.pack_scene(scene(), footprint="point")),
     "checkpoint.pt": lambda path: files.write_checkpoint(path, {"a": torch.rand(5000)}),

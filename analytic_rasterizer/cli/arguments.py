@@ -9,6 +9,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable
+from io import StringIO
 from pathlib import Path
 
 import torch
@@ -70,6 +71,8 @@ def run_command(parse: Callable[[], argparse.Namespace]) -> int:
 
     Warnings are one line on stderr too, without the place in the code that Python names.
     """
+    if sys.stderr is None:  # closed, as for a service: without a place, print takes stdout, and libraries fail
+        sys.stderr = StringIO()
     usual = warnings.formatwarning
     warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
     try:
@@ -165,6 +168,8 @@ def use_machine(args) -> None:
 
 def writable_folder(path: str) -> Path:
     """The folder, made if it is missing; OSError before any work is done when it cannot be used."""
+    if path == "":  # of a variable of the shell that is not set, mostly
+        raise ValueError("expected the name of a folder for the results, got ''; this folder is '.'")
     folder = results_folder(path)
     try:
         with tempfile.TemporaryFile(dir=folder):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 from dataclasses import asdict
 from pathlib import Path
 
@@ -82,5 +83,5 @@ def run(args) -> None:
             return
         io.write_text(args.json, text)
     if gain is not None:
-        print(f"{gain.to_text()}\n\nwhat follows is for the baked scene: bake {args.scene} --out FILE\n")
+        print(f"{gain.to_text()}\n\nwhat follows is for the baked scene: bake {shlex.quote(args.scene)} --out FILE\n")
     print(report.to_text())

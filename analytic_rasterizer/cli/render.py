@@ -73,10 +73,9 @@ def run(args) -> None:
     use_machine(args)
     found = io.find_scene(args.scene)
     choice = found.choose_footprint(given)
-    chosen_background = args.background
+    if args.alpha:
+        args.background = io.BLACK  # whose picture is that without a background
     views, said = settle_views(args, found)
-    if args.alpha and chosen_background is not None:
-        raise ValueError("--alpha leaves the background out: give --background or --alpha")
     check_sizes((view.scaled(1 / scale) for view in views for scale in args.scales), args.device, LARGER)
     if film:
         check_writable_file(args.out)
@@ -86,7 +85,7 @@ def run(args) -> None:
     if args.path is not None:
         views = path_of(args, scene, views)
     say(*said, f"footprint {choice.footprint}: {choice.reason}")
-    renderer = Renderer(scene, choice.footprint, (0.0, 0.0, 0.0) if args.alpha else args.background, args.device)
+    renderer = Renderer(scene, choice.footprint, args.background, args.device)
     if film:
         save_film(args, renderer, [view.scaled(1 / args.scales[0]) for view in views])
         return
@@ -97,7 +96,7 @@ def run(args) -> None:
         scaled = [view.scaled(1 / scale) for view in views]
         of_scale = []
         for view, color, row in renderer.pictures(scaled):
-            pictures.save(view.name, color, renderer.outputs(view) if args.alpha or args.depth else None)
+            pictures.write(view.name, color, renderer.outputs(view) if args.alpha or args.depth else None)
             of_scale.append(row)
         rows += of_scale if args.path is None else []
         rows.append(mean_of(of_scale))
@@ -120,6 +119,8 @@ def check_options(args) -> Footprint | None:
             raise ValueError(f"--{wrong[0]} is for pictures: give --out DIR, got {args.out}")
         if len(args.scales) > 1:
             raise ValueError(f"a film has one size: give one number to --scales, got {len(args.scales)}")
+    if args.alpha and args.background is not None:
+        raise ValueError("--alpha leaves the background out: give --background or --alpha")
     if args.samples is not None and args.footprint is None:
         raise ValueError("--samples is an option of a footprint, which --footprint names: --footprint box --samples 4")
     options = {} if args.samples is None else {"samples": args.samples}
@@ -172,7 +173,7 @@ class Pictures:
         self.depth_folder = writable_folder(folder / "depth") if depth else None
         self.nearest: float | None = None  # of the first picture that shows something: white in all of them
 
-    def save(self, name: str, color: torch.Tensor, outputs) -> None:
+    def write(self, name: str, color: torch.Tensor, outputs) -> None:
         if self.alpha:  # colours in PNG files are not multiplied by alpha
             color = torch.cat([normalized(color, outputs.alpha), outputs.alpha])
         io.save_image(self.folder / f"{name}.png", color)

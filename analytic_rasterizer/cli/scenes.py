@@ -29,7 +29,7 @@ def settle_views(args, found: FoundScene, required: bool = True) -> tuple[list[V
     if required or args.views is not None or found.cameras is not None:
         views = found.load_views(args.views, args.size)
         if args.views is None:
-            said.append(f"{len(views)} views of {found.cameras}, {sizes_in_words(views)}")
+            said.append(f"{len(views)} view{'s' * (len(views) != 1)} of {found.cameras}, {sizes_in_words(views)}")
         if found.size_reason and (args.views is None or found.is_cameras(args.views)):
             said.append(f"the size of the training ({found.size_reason})")
     if args.background is None:

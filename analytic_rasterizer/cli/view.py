@@ -44,9 +44,9 @@ def run(args) -> None:
         return
     if args.threads is not None or args.device is not None:
         raise ValueError("--device and --threads are for --server: otherwise the browser draws")
-    if args.export and Path(args.export).suffix.lower() != ".html":
+    if args.export is not None and Path(args.export).suffix.lower() != ".html":
         raise ValueError(f"--export must end in .html, got {args.export}")
-    if args.export and args.port is not None:
+    if args.export is not None and args.port is not None:
         raise ValueError("--port is for serving: --export writes a file and ends")
     if args.footprint is not None:  # raises before the scene is read
         try:
@@ -62,7 +62,7 @@ def run(args) -> None:
     options = {"footprint": footprint, "background": args.background, "name": found.path.name}
     packed = viewer.pack_scene(io.load_scene(found.path), views, **options)
     said.append(f"footprint {footprint}: {reason}")
-    if args.export:
+    if args.export is not None:
         size = viewer.export_page(args.export, packed)
         say(*said)
         print(f"{args.export}: {packed.meta['count']} Gaussians, {size / 1e6:.1f} MB")
@@ -78,7 +78,7 @@ def run(args) -> None:
 
 def run_live(args) -> None:
     """Renders for browsers until interrupted."""
-    if args.export:
+    if args.export is not None:
         raise ValueError("--export writes the page that needs no server: leave out --server")
     given = None if args.footprint is None else resolve_footprint(args.footprint)  # raises before the scene is read
     found = io.find_scene(args.scene)

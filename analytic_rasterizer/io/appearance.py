@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -167,7 +168,7 @@ class FoundScene:
 
     def _bake_hint(self, footprint: Footprint) -> str:
         """What to do about a scene that was trained with `point`; "" for others."""
-        command = f"bake {self.path} --out FILE"
+        command = f"bake {shlex.quote(str(self.path))} --out FILE"
         if not self.is_dilated:
             return ""
         if is_dilated(footprint):

@@ -46,6 +46,8 @@ def scene_file(path) -> tuple[Path, str]:
     Raises SceneError where the file is not there, or has another suffix.
     """
     path = Path(path)
+    if path.is_dir():
+        raise SceneError(f"{path}: expected a file of a scene, got a folder")
     if not path.is_file():
         raise SceneError(f"{path}: no such file")
     suffix = path.suffix.lower()

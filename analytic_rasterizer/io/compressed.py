@@ -16,6 +16,7 @@ from .common import SceneError, naming, unreadable
 from .with_gsply import data_of, fields_of, gsply
 
 PER_CHUNK = 256
+PLAIN = "xyz"  # of vertices that are not packed, whatever chunks the file has
 AXES, CHANNELS = "xyz", "rgb"
 LIMITS = [f"{end}_{of}{axis}" for of in ("", "scale_") for end in ("min", "max") for axis in AXES]
 COLOR_LIMITS = [f"{end}_{channel}" for end in ("min", "max") for channel in CHANNELS]  # 0 and 1 in earlier files
@@ -25,7 +26,8 @@ LOWEST_LOG_SCALE = -20.0  # of a file: smaller scales cannot be seen, and would 
 
 def is_compressed(header: ply.Header) -> bool:
     """Whether a .ply with this header is compressed."""
-    return header.element("chunk") is not None and header.element("vertex") is not None
+    vertices = header.element("vertex")
+    return header.element("chunk") is not None and vertices is not None and not set(PLAIN) <= set(vertices.names)
 
 
 def read_compressed(path: Path) -> dict[str, np.ndarray]:

@@ -120,10 +120,14 @@ def _fits(name: str, value: Any) -> bool:
 
 
 def model_root(file: Path) -> Path | None:
-    """The folder of the model that a file MODEL/point_cloud/iteration_N/NAME belongs to, or None."""
-    folder = file.absolute().parent
-    if ITERATION.fullmatch(folder.name) and folder.parent.name == "point_cloud":
-        return folder.parent.parent
+    """The folder of the model that a file MODEL/point_cloud/iteration_N/NAME belongs to, or None.
+
+    Where the path does not look so, that of the file that it leads to may: through "..", or a symbolic link.
+    """
+    for path in (file.absolute(), file.resolve()):
+        folder = path.parent
+        if ITERATION.fullmatch(folder.name) and folder.parent.name == "point_cloud":
+            return folder.parent.parent
     return None
 
 

@@ -30,6 +30,8 @@ ROWS_AT_ONCE = 4096
 MOST_DIGITS = 18  # of a number of rows, so that it is a sensible integer
 
 _END = re.compile(rb"[\r\n][ \t]*end_header[ \t]*(\r\n|\n|\r|\Z)")
+_NO_NUMBER = re.compile(rb"nan\([^\s()]*\)|1\.#(?:(INF)|IND|[QS]NAN)\d*", re.IGNORECASE)
+"""How C on Windows, and others, write NaN and infinity."""
 
 
 class Property(NamedTuple):
@@ -74,7 +76,7 @@ def parse_header(start: bytes) -> Header:
 
     Lines may end as on any system. Text of comments that is not UTF-8 is replaced.
     """
-    if not re.match(rb"ply[ \t]*(\r|\n|\Z)", start):
+    if not re.match(rb"(\xef\xbb\xbf)?ply[ \t]*(\r|\n|\Z)", start):  # editors put a byte order mark in front
         raise SceneError("not a PLY file: it does not begin with 'ply'")
     end = _END.search(start)
     if end is None:
@@ -239,7 +241,8 @@ class _Text:
     """Rows as lines of words."""
 
     def __init__(self, content: bytes, header: Header):
-        self.lines = [line for line in content[header.size :].splitlines() if line.strip()]
+        rows = _NO_NUMBER.sub(lambda found: b"inf" if found[1] else b"nan", content[header.size :])
+        self.lines = [line for line in rows.splitlines() if line.strip()]
         self.next = 0
 
     def skip(self, element: Element) -> None:

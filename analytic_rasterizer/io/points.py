@@ -11,6 +11,7 @@ from torch import Tensor
 
 from . import ply
 from .common import FORMATS, SceneError, naming
+from .compressed import is_compressed
 
 AXES, COLORS = ("x", "y", "z"), ("red", "green", "blue")
 
@@ -95,7 +96,7 @@ def is_scene(path) -> bool:
     header = ply.read_header(path)
     vertices = header.element("vertex")
     names = set(vertices.names) if vertices else set()
-    return names >= SCALES_AND_MORE or header.element("chunk") is not None
+    return names >= SCALES_AND_MORE or is_compressed(header)
 
 
 SCALES_AND_MORE = {"opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))}

@@ -13,6 +13,8 @@ import numpy as np
 from .common import SceneError
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rotations", "u1", 4)])
+OTHERS = {b"ply\n": ".ply", b"ply\r": ".ply", b"\x1f\x8b\x08": ".spz", b"NGSP": ".spz", b"PK\x03\x04": ".sog"}
+"""How files of other formats begin, which would be read as numbers where their size is a multiple of a row's."""
 SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic
 
 
@@ -24,6 +26,8 @@ def read_splat(path) -> dict[str, np.ndarray]:
     Raises SceneError, which names the file, for a size that is no multiple of 32 bytes, and OSError.
     """
     content = Path(path).read_bytes()
+    if other := next((name for start, name in OTHERS.items() if content.startswith(start)), None):
+        raise SceneError(f"{path}: a {other}, and no .splat: rename it")
     if len(content) % ROW.itemsize:
         raise SceneError(f"{path}: cut short: expected a multiple of {ROW.itemsize} bytes, got {len(content)}")
     rows = np.frombuffer(content, ROW)

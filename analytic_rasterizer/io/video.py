@@ -46,14 +46,26 @@ def save_video(path, pictures: Iterable[torch.Tensor], size: tuple[int, int], fp
     def write(temporary: Path) -> None:
         options = ["-crf", str(QUALITY), "-movflags", "+faststart"]
         writer = ffmpeg.write_frames(
-            str(temporary), (width, height), fps=fps, quality=None, macro_block_size=1, output_params=options
+            str(temporary),
+            (width, height),
+            fps=fps,
+            quality=None,
+            macro_block_size=1,
+            ffmpeg_log_level="quiet",
+            output_params=options,
         )
         writer.send(None)  # starts the program
+        sent = 0
         try:
             for frame in frames():
                 writer.send(frame)
+                sent += 1
         finally:
             writer.close()
+        # The program ends without a word to us where the disk is full at the end, and leaves a film that does not play.
+        complete, _ = ffmpeg.count_frames_and_secs(str(temporary))
+        if complete != sent:
+            raise RuntimeError(f"{complete} of {sent} pictures are in the film")
 
     try:
         write_safely(path, write)

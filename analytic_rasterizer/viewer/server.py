@@ -76,8 +76,11 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         if not secrets.compare_digest(token.encode(), self.server.token.encode()):
             self._refuse(403, "Open the address that the command printed: it holds a key.")
             return
+        if not slash:  # as people copy the address
+            self._send(302, b"", "text/plain; charset=utf-8", with_body, {"Location": f"/{token}/"})
+            return
         # A fixed table of names: no path ever reaches the file system.
-        if not slash or name not in self.server.files:
+        if name not in self.server.files:
             self._refuse(404, "There is no such file.")
             return
         content, kind = self.server.files[name]
@@ -86,7 +89,9 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def _refuse(self, status: int, reason: str) -> None:
         self._send(status, f"{reason}\n".encode(), "text/plain; charset=utf-8", self.command != "HEAD")
 
-    def _send(self, status: int, content: bytes, kind: str, with_body: bool) -> None:
+    def _send(
+        self, status: int, content: bytes, kind: str, with_body: bool, headers: dict[str, str] | None = None
+    ) -> None:
         policy = content_security_policy(script="'self'", style="'self'", connect="'self'", worker="'self'")
         self.send_response(status)
         self.send_header("Content-Type", kind)
@@ -96,6 +101,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         self.send_header("Referrer-Policy", "no-referrer")
         self.send_header("X-Content-Type-Options", "nosniff")
         self.send_header("Cache-Control", "no-store")
+        for name, value in (headers or {}).items():
+            self.send_header(name, value)
         self.end_headers()
         if not with_body:
             return
