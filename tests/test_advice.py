@@ -43,7 +43,9 @@ def function():
     ar.rasterize_gaussians(*(SCENE.get(name) for name in names), SETTINGS)
 
 
-@pytest.mark.parametrize("call", [library(), library(effects=ar.Effects(alpha=True)), function], ids=["library", "effects", "function"])
+@pytest.mark.parametrize(
+    "call", [library(), library(effects=ar.Effects(alpha=True)), function], ids=["library", "effects", "function"]
+)
 def test_a_program_that_only_renders_is_told_once(fresh, call):
     (warning,) = told(call)
     assert warning.category is UserWarning

@@ -202,11 +202,23 @@ def read_rows(path, names: Sequence[str]) -> tuple[Header, dict[str, Rows]]:
     return header, found
 
 
-def to_bytes(element: str, names: Sequence[str], values: np.ndarray, comments: Sequence[str] = ()) -> bytes:
-    """A .ply with one element, of float32 properties with these names, (rows, names)."""
+def write(path: Path, element: str, columns: dict[str, np.ndarray], comments: Sequence[str] = ()) -> None:
+    """Writes a .ply with one element, of float32 properties. Raises OSError.
+
+    Args:
+        columns: The numbers of each property by its name, (rows,) each.
+    """
+    count = len(next(iter(columns.values())))
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
-    lines += [f"element {element} {len(values)}", *(f"property float {name}" for name in names), "end_header", ""]
-    return "\n".join(lines).encode() + values.astype("<f4", copy=False).tobytes()
+    lines += [f"element {element} {count}", *(f"property float {name}" for name in columns), "end_header", ""]
+    with path.open("wb") as file:
+        file.write("\n".join(lines).encode())
+        rows = np.empty((min(count, ROWS_AT_ONCE), len(columns)), "<f4")
+        for start in range(0, count, ROWS_AT_ONCE):  # so that no copy of all rows is made
+            part = rows[: count - start]
+            for i, column in enumerate(columns.values()):
+                part[:, i] = column[start : start + ROWS_AT_ONCE]
+            file.write(part)
 
 
 def with_comments(content: bytes, comments: Sequence[str]) -> bytes:

@@ -191,8 +191,8 @@ def save_scene(path, scene: Gaussians, metadata: SceneMetadata | None = None) ->
     fields = scene._replace(logit_opacities=torch.where(logits.isinf(), kept, logits))
     fields = {name: field.numpy() for name, field in fields._asdict().items()}
     if kind == "ply":
-        content = _ply(fields, metadata.lines())
-        write_safely(path, lambda temporary: temporary.write_bytes(content))
+        columns, comments = _columns(fields), metadata.lines()
+        write_safely(path, lambda temporary: ply.write(temporary, "vertex", columns, comments))
         return
     fields["rotations"] = _unit(fields["rotations"])
     if kind == "compressed":
@@ -225,13 +225,15 @@ def _check(scene: Gaussians, kind: str) -> None:
             raise SceneError(f"{name} must be finite, got {count - int(good.sum())} of {count} rows not")
 
 
-def _ply(fields: dict[str, np.ndarray], comments: list[str]) -> bytes:
-    """The content of a .ply as 3DGS writes it, without normals."""
+def _columns(fields: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The columns of a .ply as 3DGS writes it, without normals: views of the fields."""
     shs = fields["shs"]
-    rest = shs[:, 1:].transpose(0, 2, 1).reshape(len(shs), 3 * (shs.shape[1] - 1))
-    names = [*AXES, *BASE_COLOR, *(f"f_rest_{i}" for i in range(rest.shape[1])), "opacity", *SCALES, *ROTATIONS]
-    columns = [fields["means"], shs[:, 0], rest, fields["logit_opacities"], fields["log_scales"], fields["rotations"]]
-    return ply.to_bytes("vertex", names, np.concatenate(columns, 1), comments)
+    # All bands of red come first, then those of green, then those of blue.
+    rest = [shs[:, band, color] for color in range(3) for band in range(1, shs.shape[1])]
+    columns = dict(zip(AXES, fields["means"].T)) | dict(zip(BASE_COLOR, shs[:, 0].T))
+    columns |= {f"f_rest_{i}": column for i, column in enumerate(rest)}
+    columns["opacity"] = fields["logit_opacities"][:, 0]
+    return columns | dict(zip(SCALES, fields["log_scales"].T)) | dict(zip(ROTATIONS, fields["rotations"].T))
 
 
 def _unit(rotations: np.ndarray) -> np.ndarray:
