@@ -227,10 +227,14 @@ SAFE = re.compile(r"temporary|\bio\.write_|self\.save\(|/proc/self/clear_refs")
 
 
 def test_every_writer_of_the_package_is_safe():
-    """A line that writes a file is within `write_safely`, whose writers call their path `temporary`."""
+    """A line that writes a file is within `write_safely`, whose writers call their path `temporary`.
+
+    The log of a training, which grows line by line, is the one file that is opened to be added to.
+    """
+    log = 'with self.path.open("a", encoding="utf-8") as file:'
     found = []
     for path in [*(ROOT / "analytic_rasterizer").rglob("*.py"), *(ROOT / "examples").rglob("*.py")]:
         for number, line in enumerate(path.read_text().splitlines(), 1):
-            if DIRECT.search(line) and not SAFE.search(line):
+            if DIRECT.search(line) and not SAFE.search(line) and line.strip() != log:
                 found.append(f"{path.relative_to(ROOT)}:{number}: {line.strip()}")
     assert found == []

@@ -202,16 +202,17 @@ def read_rows(path, names: Sequence[str]) -> tuple[Header, dict[str, Rows]]:
     return header, found
 
 
-def write(path: Path, element: str, columns: dict[str, np.ndarray], comments: Sequence[str] = ()) -> None:
-    """Writes a .ply with one element, of float32 properties. Raises OSError.
+def write(temporary: Path, element: str, columns: dict[str, np.ndarray], comments: Sequence[str] = ()) -> None:
+    """Writes a .ply with one element, of float32 properties, for `write_safely`. Raises OSError.
 
     Args:
+        temporary: The file to write.
         columns: The numbers of each property by its name, (rows,) each.
     """
     count = len(next(iter(columns.values())))
     lines = ["ply", "format binary_little_endian 1.0", *(f"comment {comment}" for comment in comments)]
     lines += [f"element {element} {count}", *(f"property float {name}" for name in columns), "end_header", ""]
-    with path.open("wb") as file:
+    with temporary.open("wb") as file:
         file.write("\n".join(lines).encode())
         rows = np.empty((min(count, ROWS_AT_ONCE), len(columns)), "<f4")
         for start in range(0, count, ROWS_AT_ONCE):  # so that no copy of all rows is made
