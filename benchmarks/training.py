@@ -33,7 +33,7 @@ from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import describe_machine
 from analytic_rasterizer.training import Trainer, TrainingOptions, evaluate, load_capture, load_pictures
 from analytic_rasterizer.training.files import write_json
-from analytic_rasterizer.training.options import PRESETS, preset_values
+from analytic_rasterizer.training.options import DOWNSAMPLINGS, PRESETS, preset_values
 from analytic_rasterizer.training.schedule import Clock
 from analytic_rasterizer.training.trainer import background_of, starting_gaussians
 
@@ -85,7 +85,10 @@ def main() -> int:
         return 2
     scales = args.common["scales"]
     background = background_of(TrainingOptions(**args.common), capture.background)
-    train, test = (load_pictures(items, scales, background, args.device) for items in (capture.train, capture.test))
+    train, test = (
+        load_pictures(items, scales, background, args.device, args.downsampling)
+        for items in (capture.train, capture.test)
+    )
     print(f"{args.scene}, {len(train.views)} pictures, {len(test.views)} for the test, {describe_machine(args.device)}")
     report = {"machine": describe_machine(args.device), "torch": torch.__version__, "scene": str(args.scene)}
     report["runs"] = runs = []
@@ -107,6 +110,7 @@ def parse_arguments() -> argparse.Namespace:
     add("--more", type=Path, metavar="FILE.json", help="further variants")
     add("--seeds", type=int, nargs="+", default=[0])
     add("--scales", default="1,2,4,8", help="(default: %(default)s)")
+    add("--downsampling", choices=DOWNSAMPLINGS, default=TrainingOptions.downsampling, help="(default: %(default)s)")
     add("--footprint", default=TrainingOptions.footprint)
     add("--iterations", type=int, default=7000)
     add("--seconds", type=float, default=0.0, help="instead of iterations")
@@ -115,7 +119,8 @@ def parse_arguments() -> argparse.Namespace:
     add("--device", choices=("cpu", "cuda"), default="cuda" if has_cuda() else "cpu")
     add("--json", type=Path, metavar="FILE", help="every run")
     args = parser.parse_args()
-    args.common = {name: getattr(args, name) for name in ("footprint", "iterations", "seconds", "random_points")}
+    given = ("footprint", "iterations", "seconds", "random_points", "downsampling")
+    args.common = {name: getattr(args, name) for name in given}
     args.common["scales"] = tuple(int(scale) for scale in args.scales.split(","))
     return args
 

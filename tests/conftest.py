@@ -153,3 +153,26 @@ def plant():
 @pytest.fixture(scope="session")
 def hqgarden():
     return shared_scene("hqgarden_lod1_sh0")
+
+
+@pytest.fixture(scope="module")
+def synthetic(tmp_path_factory):
+    """The folder of a capture in the files of NeRF-synthetic."""
+    from capture_files import circle, write_nerf_synthetic  # which needs Pillow
+
+    folder = tmp_path_factory.mktemp("synthetic")
+    write_nerf_synthetic(folder, circle(10), circle(3))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """The folder of a capture in the files of COLMAP, whose sizes do not halve evenly."""
+    from capture_files import circle, g, write_colmap, write_pictures
+
+    folder = tmp_path_factory.mktemp("capture")
+    views = circle(9, (35, 33))
+    points, colors = g.random_points(60, seed=5)
+    write_pictures(folder / "photographs", views, opaque=True)
+    write_colmap(folder / "sparse" / "0", views, points, (255 * colors).to(torch.uint8))
+    return folder

@@ -31,9 +31,7 @@ from capture_files import (  # noqa: E402
     circle,
     looking_at_origin,
     truth_gaussians,
-    write_colmap,
     write_nerf_synthetic,
-    write_pictures,
 )
 
 from analytic_rasterizer import training  # noqa: E402
@@ -48,28 +46,6 @@ from analytic_rasterizer.training import (  # noqa: E402
 )
 from analytic_rasterizer.training import model as g  # noqa: E402
 from analytic_rasterizer.training.evaluation import evaluate, psnr  # noqa: E402
-
-# ------------------------------------------------------------------------------------ captures
-
-
-@pytest.fixture(scope="module")
-def synthetic(tmp_path_factory):
-    """A scene in the files of NeRF-synthetic."""
-    folder = tmp_path_factory.mktemp("synthetic")
-    write_nerf_synthetic(folder, circle(10), circle(3))
-    return folder
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    """A scene in the files of COLMAP, whose sizes do not halve evenly."""
-    folder = tmp_path_factory.mktemp("capture")
-    views = circle(9, (35, 33))
-    points, colors = g.random_points(60, seed=5)
-    write_pictures(folder / "photographs", views, opaque=True)
-    write_colmap(folder / "sparse" / "0", views, points, (255 * colors).to(torch.uint8))
-    return folder
-
 
 # -------------------------------------------------------------------------------------- errors
 
