@@ -613,6 +613,17 @@ def far(folder, place=(5e5, 4.2e6, 120.0), writer=write_colmap) -> None:
     write(folder, views=views, writer=lambda folder, views, _, *rest: writer(folder, views, points, *rest))
 
 
+def smaller(folder, factor) -> None:
+    """The capture in larger units."""
+    views = [replace(view, name=f"small_{view.name}", w2c=view.w2c.clone()) for view in circle(9, SIZE)]
+    for view in views:
+        view.w2c[:3, 3] *= factor
+    write(folder, views=views)
+    write_colmap(folder / "other", views, POINTS * factor, COLORS)
+    shutil.rmtree(folder / "sparse" / "0")
+    (folder / "other").rename(folder / "sparse" / "0")
+
+
 def of_two_sizes(folder) -> None:
     """A camera per picture, some upright, all with their own lens."""
     views = circle(9, (48, 32))
@@ -744,6 +755,11 @@ FOUND = {
         lambda f: [write(f), (f / "sparse" / "0" / "points3D.bin").write_bytes(struct.pack("<Q", 0))],
         IN_VIEW,
     ),
+    "a capture in kilometres": (
+        lambda f: smaller(f, 1e-2),
+        {"warns": r"points are 0\.0\d+ from their cameras.*nearer than 0\.2 nothing is drawn.*model_transformer"},
+    ),
+    "a capture just large enough": (lambda f: smaller(f, 0.1), {"notes": ()}),
     "empty points as text": (
         lambda f: [write(f, writer=write_colmap_text), change_text(f, "points3D", lambda text: b"# none\n")],
         IN_VIEW,
@@ -758,6 +774,14 @@ FOUND = {
         "training needs at least 2 pictures, got 1 of 2, .*; --test-every 0 trains with all",
     ),
     "masks": (masked, {"masks": 9, "warns": "the masks of 9 pictures are ignored"}),
+    **{
+        f"masks in {name}": (
+            lambda f, name=name: masked(f, name),
+            {"masks": 9, "warns": "the masks of 9 pictures are ignored"},
+        )
+        for name in ("Masks", "images/masks", "images_mask", "dynamic-MASKS/cam0")
+    },
+    "pictures that are no masks": (lambda f: masked(f, "unmasked"), {"masks": 0}),
     "masks of a transforms.json": (
         lambda f: [masked(f), beside(f), shutil.rmtree(f / "sparse")],
         {"masks": 9, "warns": "the masks of 9 pictures are ignored"},

@@ -8,8 +8,9 @@ from pathlib import Path
 import torch
 
 from .. import io
+from ..effects import NEAR
 from . import colmap
-from .extent import OUTLYING, is_one_pose, outliers_of
+from .extent import OUTLYING, is_one_pose, outliers_of, seen_distance
 from .layouts import BLACK, WHITE, Capture, Photograph, has_splits, read_layout
 from .lenses import window_of
 from .placement import offset_of
@@ -52,8 +53,8 @@ def load_capture(
         offset: What to take off all positions, so that they are those of a scene with this offset. None: what
             `offset_of` finds, which is nothing unless coordinates are far from zero.
 
-    Warns of masks, which are ignored, and of photographs that are left out because their cameras are far from all
-    others.
+    Warns of masks, which are ignored, of photographs that are left out because their cameras are far from all others,
+    and of points so near to the cameras that they are not drawn.
 
     Raises:
         io.SceneError: No such layout; missing pictures; no pictures to train with; all cameras with one pose; a lens
@@ -76,6 +77,7 @@ def load_capture(
             f"{folder}: the masks of {capture.masks} pictures are ignored, all of their pixels count", stacklevel=2
         )
     photographs = [*capture.train, *capture.test]
+    _warn_of_near(folder, photographs, capture.points)
     distorted = [item for item in photographs if item.lens is not None]
     if distorted and lens == "refuse":
         raise io.SceneError(
@@ -219,6 +221,19 @@ def without_outliers(folder: Path, capture: Capture) -> Capture:
     kept = [item for place, item in enumerate(items) if place not in outliers]
     count = sum(place not in outliers for place in range(len(capture.train)))
     return capture._replace(train=kept[:count], test=kept[count:])
+
+
+def _warn_of_near(
+    folder: Path, photographs: list[Photograph], points: tuple[torch.Tensor, torch.Tensor] | None
+) -> None:
+    """Warns where most of what cameras see is behind the near plane, as in a capture of too large a unit."""
+    seen = 0.0 if points is None else seen_distance([item.view for item in photographs], points[0])
+    if 0 < seen <= NEAR:
+        warnings.warn(
+            f"{folder}: most points are {seen:.2g} from their cameras or less, and nearer than {NEAR:g} nothing is "
+            f"drawn: scale the capture up, with COLMAP's model_transformer for example",
+            stacklevel=3,
+        )
 
 
 def _about_lenses(distorted: list[Photograph], number: int) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +24,7 @@ from . import colmap
 from .lenses import RATIONAL, Lens, lens_of, window_of
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-MASK_FOLDERS = ("masks", "mask")
+MASK_FOLDER = re.compile(r"([^a-z]|^)masks?([^a-z]|$)", re.IGNORECASE)  # as in Masks, or dynamic_masks
 
 
 class Photograph(NamedTuple):
@@ -85,7 +86,7 @@ def reconstruction(folder: Path, sparse: Path, images: str, test_every: int) -> 
         _check_lens(item.lens, item.view, f"{sparse}/cameras: {item.camera}")
         items.append(Photograph(item.view, {1: files.find(item.name)}, item.lens))
     points = colmap.load_points(sparse)
-    masks = _count_masks(folder)
+    masks = _count_masks(folder, folder / images)
     return Capture(
         *_split(folder, items, test_every),
         BLACK,
@@ -243,6 +244,7 @@ def _count_pictures(folder: Path) -> int:
     return sum(path.suffix.lower() in PICTURE_SUFFIXES for path in folder.rglob("*"))
 
 
-def _count_masks(folder: Path) -> int:
-    """How many masks are beside the pictures."""
-    return next((_count_pictures(folder / name) for name in MASK_FOLDERS if (folder / name).is_dir()), 0)
+def _count_masks(*folders: Path) -> int:
+    """How many masks are beside the pictures: in the fullest folder of masks right below one of `folders`."""
+    below = {path for folder in folders if folder.is_dir() for path in folder.iterdir()} - set(folders)
+    return max((_count_pictures(path) for path in below if MASK_FOLDER.search(path.name) and path.is_dir()), default=0)
