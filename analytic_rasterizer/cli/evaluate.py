@@ -13,6 +13,7 @@ from ..io.models import DIVISORS, CfgArgs
 from ..training import TrainingOptions, evaluate, load_capture, load_lpips, load_pictures, save_pictures
 from ..training.captures import IMAGES, TEST_PERIOD, Capture
 from ..training.evaluation import LPIPS_WEIGHTS, MEASURES
+from ..training.extent import seen_distance
 from ..training.files import OPTIONS, SCENE, write_json
 from ..training.options import check_scales
 from ..training.trainer import background_of
@@ -133,6 +134,8 @@ def run_on(ranks: Ranks, args) -> None:
         raise io.SceneError(f"{protocol.data}: there are no test pictures")
     background = background_for(found, protocol, capture, args.background)
     scene = part_of(io.load_scene(found.path), ranks).to(args.device)
+    if not seen_distance([item.view for item in capture.test], scene.means.cpu()):
+        tell(f"warning: no test picture shows any Gaussian of {found.path}: was it trained on {protocol.data}?")
     pictures = load_pictures(
         capture.test, protocol.scales, background, args.device, options.downsampling, on_host=ranks.world > 1
     )

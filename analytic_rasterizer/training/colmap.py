@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 import struct
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -155,8 +156,10 @@ def load_points(folder: Path) -> tuple[Tensor, Tensor] | None:
     if not rows:
         return None
     points = torch.from_numpy(np.array(rows, dtype=np.float64))
-    if not points.isfinite().all():
-        raise io.SceneError(f"{folder}/points3D: points must be finite")
+    finite = points.float().isfinite().all(1)
+    if not finite.all():
+        warnings.warn(f"{path}: {int((~finite).sum())} of {len(rows)} points are not finite and left out", stacklevel=3)
+        points = points[finite]
     return points[:, :3].contiguous(), points[:, 3:].float() / 255
 
 

@@ -63,7 +63,7 @@ def outliers_of(views: Sequence[View], points: Tensor | None = None) -> dict[int
 
     The distance is that from the middle, the median of all cameras. An outlier is OUTLYING times as far from it as
     every camera that is none, and as what the cameras see. At most a fifth of the cameras are outliers, but one may
-    always be among three.
+    always be among three; where there are points, and the far cameras show none of them, fewer than half are.
 
     Args:
         points: As of `extent_of`.
@@ -74,11 +74,14 @@ def outliers_of(views: Sequence[View], points: Tensor | None = None) -> dict[int
     middle = places.median(0).values
     distances, order = (places - middle).norm(dim=1).sort()
     # The reach of the cameras that are certainly none, then that of each one more.
-    first = len(views) - max(len(views) // MOST_OUTLIERS, 1)
+    few = len(views) - max(len(views) // MOST_OUTLIERS, 1)
+    first = few if points is None else min(few, len(views) // 2 + 1)
     least = max(0.0 if points is None else seen_distance(views, points), ROUNDING * middle.abs().max().item())
     for i in range(first, len(views)):
         if distances[i] > OUTLYING * max(distances[i - 1].item(), least):
-            return {order[j].item(): distances[j].item() for j in range(i, len(views))}
+            far = order[i:].tolist()
+            if i >= few or all(seen_distance([views[view]], points) == 0 for view in far):
+                return dict(zip(far, distances[i:].tolist()))
     return {}
 
 

@@ -13,6 +13,7 @@ import torch
 from .. import io
 from ..gaussians import Gaussians
 from .captures import IMAGES, LENS_CHOICES, MISSING_CHOICES, TEST_PERIOD, Capture, load_capture
+from .extent import seen_distance
 from .health import FAINTEST
 from .options import TrainingOptions
 from .placement import focus_of
@@ -113,6 +114,7 @@ def first_gaussians(
     Gaussians are those of a scene, or random.
 
     Raises:
+        io.SceneError: No picture shows any of the points.
         ValueError: A scene without Gaussians, or with more than `max_gaussians`; what `starting_gaussians` raises; an
             option among those `given` that has no effect.
     """
@@ -142,4 +144,9 @@ def first_gaussians(
         # The cube of NeRF-synthetic scenes is about the world's zero, which is far from this one.
         focus, _ = focus_of(views)
         start = start._replace(means=start.means + (0.0 if focus is None else focus.float()))
+    if found is not None and not seen_distance(views, start.means):
+        source = "the capture" if points is None else points
+        raise io.SceneError(
+            f"no picture shows any of the {len(found[0])} points of {source}: the cameras must see them"
+        )
     return start, None if found is None else len(found[0])

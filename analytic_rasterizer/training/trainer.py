@@ -419,7 +419,8 @@ def starting_gaussians(
             rows = torch.randperm(len(means), generator=generator, device="cpu")[:limit].sort().values
             means, colors = means[rows], colors[rows]
     if len(means) < 2:
-        raise io.SceneError(f"training needs at least 2 points to start from, got {len(means)}")
+        because = " (max_gaussians)" if limit < 2 else ""
+        raise io.SceneError(f"training needs at least 2 points to start from, got {len(means)}{because}")
     # Distances are those of the positions as they are given, float64 too.
     colors, first = colors.to(means.dtype), (options.sh_degree, options.initial_opacity, options.initial_scale)
     return Gaussians.from_points(means, colors, *first).map(Tensor.float)
