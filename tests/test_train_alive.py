@@ -9,14 +9,14 @@ from dataclasses import replace
 import pytest
 import torch
 
-pytest.importorskip("PIL.Image", reason="needs the train extra")
+image = pytest.importorskip("PIL.Image", reason="needs the train extra")
 pytest.importorskip("tqdm", reason="needs the train extra")
 pytest.importorskip("scipy", reason="needs the train extra")
 
-from capture_files import circle, tripod, truth_gaussians, write_colmap, write_nerf_synthetic, write_pictures
+from capture_files import circle, tripod, truth_gaussians, write_colmap, write_nerf_synthetic, write_pictures  # noqa: E402
 
-from analytic_rasterizer import cli, io, training
-from analytic_rasterizer.training import TrainingOptions, extent, extent_of, files
+from analytic_rasterizer import cli, io, training  # noqa: E402
+from analytic_rasterizer.training import TrainingOptions, extent, extent_of, files  # noqa: E402
 
 QUICK = {"sh_degree": 0, "footprint": "box:samples=1", "max_gaussians": 400}
 FAR = 1e5  # of a camera with a wrong pose
@@ -113,6 +113,14 @@ def test_evaluation_on_the_capture_of_another_world_is_told(tmp_path, capsys):
         arguments = ["evaluate", tmp_path / f"{name}.ply", "--data", folder, "--lpips", "none", "--device", "cpu"]
         assert cli.main([*map(str, arguments)]) == 0
         assert ("no test picture shows any Gaussian" in capsys.readouterr().err) == told
+
+
+def test_photographs_of_one_colour_are_told(tmp_path):
+    folder = write_capture(tmp_path / "data", circle(6))
+    for path in (folder / "images").iterdir():
+        image.new("RGB", image.open(path).size).save(path)
+    with pytest.warns(UserWarning, match="all 5 photographs are of one colour"):
+        training.Run(folder, tmp_path / "out", TrainingOptions(iterations=10, **QUICK))
 
 
 def test_cameras_of_two_distances_are_no_outliers():

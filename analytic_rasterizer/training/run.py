@@ -139,6 +139,11 @@ class Run:
             start, self.points_found = Gaussians(**state["gaussians"]), None
         background = background_of(self.options, self.capture.background)
         pictures = self._load(self.capture.train, background)
+        finest = pictures.colors[min(self.options.scales)]
+        if all(torch.equal(picture, picture[:, :1, :1].expand_as(picture)) for picture in finest):
+            warnings.warn(
+                f"{scene}: all {len(finest)} photographs are of one colour, nothing can be learned", stacklevel=2
+            )
         if ranks.world == 1:
             self.trainer = Trainer(self.options, start, pictures, background, self.device)
         else:
