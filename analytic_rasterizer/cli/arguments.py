@@ -16,6 +16,7 @@ import torch
 
 from .. import _C
 from ..filters import PIXEL_VARIANCE
+from ..io.common import BACKGROUNDS
 from ..training.files import results_folder
 from .launch import report
 
@@ -23,7 +24,6 @@ from .launch import report
 # (ImportError), a device out of memory or absent (RuntimeError, MemoryError), a training that
 # diverges (FloatingPointError).
 USER_ERRORS = (ValueError, TypeError, OSError, ImportError, RuntimeError, MemoryError, FloatingPointError)
-COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 VIEWS = "3DGS cameras.json, Blender or nerfstudio transforms.json, or a list of {width, height, fx, fy, w2c}"
 LARGER = "larger numbers in --scales make them smaller"
 METAVARS = {int: "N", float: "X", str: "NAME", tuple: "N,N,.."}
@@ -217,11 +217,11 @@ def _numbers(kind, accepts, expected: str):
 
 def color(text: str) -> tuple[float, float, float]:
     """An argparse type: a colour by its name, or as R,G,B."""
-    if text in COLORS:
-        return COLORS[text]
+    if text in BACKGROUNDS:
+        return BACKGROUNDS[text]
     parts = text.split(",")
     if len(parts) != 3 or not all(_is_number(part) and 0 <= float(part) <= 1 for part in parts):
-        expected = f"{', '.join(COLORS)} or three numbers from 0 to 1, as R,G,B"
+        expected = f"{', '.join(BACKGROUNDS)} or three numbers from 0 to 1, as R,G,B"
         raise argparse.ArgumentTypeError(f"must be {expected}, got {text}")
     return tuple(map(float, parts))
 

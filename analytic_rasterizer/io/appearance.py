@@ -17,13 +17,12 @@ from typing import Any
 from ..camera import View
 from ..filters import PIXEL_VARIANCE
 from ..footprints import ENVIRONMENT_VARIABLE, Footprint, chosen_footprint, resolve_footprint
-from .common import SceneError
+from .common import BACKGROUNDS, BLACK, WHITE, SceneError
 from .metadata import SceneMetadata, read_metadata
 from .models import CFG_ARGS, CfgArgs, latest_ply, model_root, read_cfg_args
 from .views import load_views
 
 SCENE, OPTIONS, CAMERAS = "scene.ply", "options.json", "cameras.json"  # of the folder of a training
-BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 UNMARKED = resolve_footprint("point")  # what a file wants that says nothing: 3DGS trains with it
 ANTIALIASED = resolve_footprint("mip")  # and one that says only that pixels are to be integrated
 
@@ -95,7 +94,7 @@ class FoundScene:
         if self.options is not None:
             color = self.options.get("background")
             if color is None:  # of a training before options.json said it
-                color = {"black": BLACK, "white": WHITE}.get(self.options["options"].get("background"))
+                color = BACKGROUNDS.get(self.options["options"].get("background"))
             if color is not None:
                 return tuple(map(float, color)), OPTIONS
         if self.cfg_args is not None and self.cfg_args.white_background is not None:

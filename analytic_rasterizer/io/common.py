@@ -10,6 +10,10 @@ from typing import Any
 
 import torch
 
+BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
+BACKGROUNDS = {"black": BLACK, "white": WHITE}
+"""Backgrounds that have a name."""
+
 
 class SceneError(ValueError):
     """A scene or views file that cannot be used; the message names the file and what is wrong."""

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ..gaussians import HIGHEST_LOGIT, Gaussians
+from ..gaussians import HIGHEST_LOGIT, SH_C0, Gaussians
 from . import ply, sog, splat, spz
 from .common import SceneError, first_line, naming, scene_file
 from .compressed import is_compressed, read_compressed, to_compressed
@@ -114,7 +114,7 @@ def _read_ply(path: Path) -> dict[str, np.ndarray]:
             raise SceneError(f"expected 0, 9, 24, 45 or 72 f_rest properties (SH degree 0 to 4), got {count}")
         shs = np.empty((len(rows), 1 + count // 3, 3), np.float32)
         if colored:
-            shs[:, 0] = (read_colors(rows) - 0.5) / splat.SH_C0
+            shs[:, 0] = (read_colors(rows) - 0.5) / SH_C0
         else:
             shs[:, 0] = rows.columns(BASE_COLOR, np.float32)
         # All bands of red come first, then those of green, then those of blue.

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from ..gaussians import SH_C0
 from .common import SceneError
 
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("rotations", "u1", 4)])
 OTHERS = {b"ply\n": ".ply", b"ply\r": ".ply", b"\x1f\x8b\x08": ".spz", b"NGSP": ".spz", b"PK\x03\x04": ".sog"}
 """How files of other formats begin, which would be read as numbers where their size is a multiple of a row's."""
-SH_C0 = 0.28209479177387814  # value of the constant spherical harmonic
 
 
 def read_splat(path) -> dict[str, np.ndarray]:

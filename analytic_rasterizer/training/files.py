@@ -11,11 +11,12 @@ import torch
 
 from .. import io
 from ..gaussians import Gaussians
+from ..io.appearance import CAMERAS, OPTIONS, SCENE  # noqa: F401  (the names by which commands find them)
 from ..io.writing import as_json, write_json, write_safely, write_text
 
-CHECKPOINT, SCENE, CAMERAS = "checkpoint.pt", "scene.ply", "cameras.json"
+CHECKPOINT = "checkpoint.pt"
 MIP_SCENE = "point_cloud_mip.ply"
-OPTIONS, METRICS, LOG = "options.json", "metrics.json", "log.jsonl"
+METRICS, LOG = "metrics.json", "log.jsonl"
 CHECKPOINT_FORMAT = 3
 
 

@@ -17,13 +17,12 @@ import torch
 from torch import Tensor
 
 from .. import io
-from ..io import load_points
+from ..io import BLACK, WHITE, load_points
 from ..io.pictures import PICTURE_SUFFIXES, PictureFiles
 from ..io.views import checked_pixels, checked_pose, checked_positive, distortion_of, read_views
 from . import colmap
 from .lenses import RATIONAL, Lens, lens_of, window_of
 
-BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 MASK_FOLDER = re.compile(r"([^a-z]|^)masks?([^a-z]|$)", re.IGNORECASE)  # as in Masks, or dynamic_masks
 
 

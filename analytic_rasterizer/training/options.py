@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 from ..checks import check_value as _check
 from ..checks import plain_value as _plain
 from ..footprints import resolve_footprint
+from ..io.common import BACKGROUNDS
 
 DOWNSAMPLINGS = ("box", "bicubic", "blender")
 DENSITIES = ("3dgs", "absgrad", "mcmc", "none")
-BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 RANDOM_BACKGROUND = "random"
 
 
