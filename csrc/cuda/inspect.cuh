@@ -4,7 +4,7 @@
 #include <algorithm>
 
 #include "core/inspect.h"
-#include "cuda/composite.cuh"
+#include "cuda/tile.cuh"
 #include "cuda/launch.cuh"
 
 namespace ar::cuda {
@@ -20,10 +20,8 @@ __global__ void __launch_bounds__(kInspectThreads<kSide>) inspect_kernel(const I
   constexpr int kThreads = kInspectThreads<kSide>;
   __shared__ Stage<F, 0, kThreads> stage;
   __shared__ int32_t ids[kThreads];
-  const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int tile = int(blockIdx.x), subtile = int(threadIdx.x) / 32 * (kSide < kTile ? 2 : 1);
   const int lane = lane_id();
-  if (!has_samples<F::kSamples>(params.lists, tile)) return;
   const TileList list = list_of(params.lists, params.grid, tile);
   const Vec2<float> p = pixel_of<F>(subtile, lane);
   const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
@@ -31,7 +29,7 @@ __global__ void __launch_bounds__(kInspectThreads<kSide>) inspect_kernel(const I
   PixelSummary<float, F> pixel;
   pixel.start(inside);
   for (int k = 0; k < list.count && __syncthreads_or(pixel.open()); k += kThreads) {
-    const int count = stage.load(splats, {}, list, k, list.count);
+    const int count = stage.load(params.splats, {}, list, k, list.count);
     if (int(threadIdx.x) < count) ids[threadIdx.x] = list.splat(k + threadIdx.x);
     __syncthreads();
     for (int first = 0; first < count; first += 32) {

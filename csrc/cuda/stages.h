@@ -131,53 +131,18 @@ struct TileLists {
   int stride;                   ///< 1, or 2 with slots
   const int64_t* tile_offsets;  ///< [tiles + 1]; the list of a patch is that of its first tile
   const Counts* counts;
-  int64_t n, capacity;
-  const int32_t* tile_samples;  ///< [tiles] samples in use, or null: all
-};
-
-struct ChooseParams {
-  const float* splats;
-  TileLists lists;
-  TileGrid grid;
-  const float* background;
-  int background_count;  ///< channels that it has; those missing are black
-  FootprintOptions options;
-  int32_t* tile_samples;  ///< [tiles]
-};
-
-/// The parts of a tile's list that are blended side by side where many channels meet few tiles. They are not those of
-/// ListCut.
-struct Segments {
-  int count;             ///< of each tile; 1: the list is walked as one, and there is nothing else here
-  int samples;           ///< the most that a lane has
-  float* transmittance;  ///< [tiles, count, samples, kTile^2] in front of a segment, where the sample is still open
-  float* sums;           ///< [tiles, count, kChannelGroup, kTile^2] what a segment adds to the channels of a group
-  float* shown;  ///< [tiles, count, samples, kTile^2] the product of that, per sample, with the pixel's gradient
-
-  AR_HD float* transmittance_at(int tile, int segment, int sample) const {
-    return transmittance + plane(tile, segment, samples, sample);
-  }
-  AR_HD float* sum_at(int tile, int segment, int channel) const {
-    return sums + plane(tile, segment, kChannelGroup, channel);
-  }
-  AR_HD float* shown_at(int tile, int segment, int sample) const {
-    return shown + plane(tile, segment, samples, sample);
-  }
-
-  AR_HD int64_t plane(int tile, int segment, int width, int k) const {
-    return ((int64_t(tile) * count + segment) * width + k) * (kTile * kTile);
-  }
+  int64_t n, capacity;  ///< splats; pairs that there is room for
 };
 
 struct BlendParams : ar::BlendParams<float> {
   TileLists lists;
   ChunkPlan plan;
+  ListCut cut;
   int32_t* tile_open;   ///< [tiles] whether the tile is one of the open ones
-  int32_t* open_tiles;  ///< [kSampleClasses, tiles]
+  int32_t* open_tiles;  ///< [tiles]
   CheckpointLayout layout;
   float* checkpoints;     ///< [planes, kTile^2], a number of each lane; of samples that move, of each pixel of a tile
   uint32_t* reach_words;  ///< [max_reach_words], or null where no list may be cut
-  Segments segments;      ///< for more than kFewChannels channels
 };
 
 struct InspectParams : ar::InspectParams<float> {
@@ -190,16 +155,15 @@ struct BlendVjpParams : ar::BlendVjpParams<float> {
   const TileChunk* chunk_order;
   const CutList* cut_lists;
   const PlanState* plan;
+  ListCut cut;
   int64_t max_chunks;
-  int32_t* chunks_taken;  ///< [kSampleClasses] set to zero by blend_vjp; chunks of a class that warps have begun with
+  int32_t* chunks_taken;  ///< [1] chunks that warps have begun with; blend_vjp sets it to zero
   float* checkpoints;     ///< as in BlendParams; of lists that are cut, blend_vjp leaves most of them
   float* pair_grads;      ///< [max(capacity, n), kPairGradWidth] by slot, or by splat if there are too many pairs
   float* channel_sums;    ///< [max(capacity, n), channel_group] likewise, for more than kFewChannels channels; or null
   MeanSums mean_sums;
-  Segments segments;    ///< as in BlendParams
   float* adjoint_maps;  ///< [max_adjoint_maps]
   float* group_sums;    ///< [max_group_sums]
-  int64_t max_group_sums;
 };
 
 /// Sums over the pairs of every splat.
@@ -266,37 +230,22 @@ void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream);
 void row_grads(const RowGradsParams& p, cudaStream_t stream);
 void sum_channels(const SumChannelsParams& p, cudaStream_t stream);
 
-// Blending. `footprint` is a place in the registry (blend.cu, blend_vjp.cu).
+// Blending (dispatch.cu). `footprint` is a position in the registry. dispatch.h says what memory it takes.
 
-/// How the kernels for so many channels have lists cut. They walk the whole list of a tile, and need no checkpoints of
-/// channels, with reference footprints and those whose samples move, and with others where there are more than
-/// kFewChannels.
-ListCut list_cut(int footprint, int64_t channels, int64_t capacity, TileGrid grid);
-/// Planes of a float per pixel of a tile in BlendParams::checkpoints of a footprint whose samples move, for a backward
-/// pass. None for the others.
-int64_t max_state_planes(int footprint, int64_t capacity);
-/// Numbers in BlendParams::reach_words, and in BlendVjpParams::adjoint_maps and group_sums, which only lists need that
-/// are cut.
-int64_t max_reach_words(const ListCut& cut, TileGrid grid);
-int64_t max_adjoint_maps(int samples, const ListCut& cut, TileGrid grid);
-int64_t max_group_sums(int footprint, const ListCut& cut, TileGrid grid);
-/// Segments of each tile's list that many channels are blended in.
-int list_segments(int footprint, int64_t channels, TileGrid grid);
-/// Samples of a pixel that a lane has: all, unless they are spread over lanes.
-int samples_of_lane(int footprint, TileGrid grid);
-/// Channels that a group-less blending is compiled for: 3 in the splats themselves, or 4 in rows.
-constexpr int compiled_channels(bool in_splats) { return in_splats ? 3 : kFewChannels; }
-/// Only for a footprint that chooses.
-void choose_samples(const ChooseParams& p, cudaStream_t stream);
-/// Without p.channels.data the three colours in the splats. `in_chunks`: only where lists have several segments,
-/// parameters to blend the splats' three colours with as for a backward pass; their transmittance, last and alpha are
-/// those of `p`.
-void blend(int footprint, const BlendParams& p, const BlendParams* in_chunks, cudaStream_t stream);
-/// Width of the group that the first of `left` channels are in, where there are more than kFewChannels in all.
-int channel_group(int footprint, int left);
-/// The group of channels that begins with `first`; 0 where they are few.
+/// Without p.channels.data it blends the three colours in the splats.
+void blend(int footprint, const BlendParams& p, cudaStream_t stream);
+/// The group of channels that begins with `first`; 0 where there are no more than kFewChannels.
 void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream);
 void inspect(int footprint, const InspectParams& p, cudaStream_t stream);
+/// Numbers in BlendVjpParams::group_sums.
+int64_t max_group_sums(int footprint, int64_t channels, const ListCut& cut, TileGrid grid);
+// The families: still/blend.cu, still/blend_vjp.cu and so on.
+void blend_still(int footprint, const BlendParams& p, cudaStream_t stream);
+void blend_vjp_still(int footprint, const BlendVjpParams& p, cudaStream_t stream);
+void blend_moment(int footprint, const BlendParams& p, cudaStream_t stream);
+void blend_vjp_moment(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream);
+void blend_channels(int footprint, const BlendParams& p, cudaStream_t stream);
+void blend_vjp_channels(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream);
 
 // One weight per element (weight.cu).
 void weight(int footprint, const WeightParams<float>& p, cudaStream_t stream);

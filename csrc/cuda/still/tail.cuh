@@ -1,9 +1,11 @@
-// The four kernels of blend that finish the tiles that blend_front has left open, as described in blend.cuh.
+// The four kernels that finish the tiles that blend_front has left open; front.cuh has an overview and launches them.
+// They read the tail of the plan, `tile_open` and `open_tiles`, and write checkpoints, then the images.
 #pragma once
 
-#include "cuda/blend_output.cuh"
-#include "cuda/blend_stage.cuh"
+#include "cuda/still/output.cuh"
+#include "cuda/still/stage.cuh"
 #include "cuda/launch.cuh"
+#include "cuda/tuning.h"
 
 namespace ar::cuda {
 
@@ -18,35 +20,38 @@ __device__ void pass_all(BlendStage<F, C>& stage, int count, Vec2<float> p, floa
   });
 }
 
-/// Calls visit(chunk, list of its tile, end of the chunk in it) for the tail chunks, with S samples, of the open tiles.
-/// Blocks share them.
-template <int S, class Visit>
+/// Calls visit(chunk, list of its tile, end of the chunk in the list) for the tail chunks of the open tiles. Blocks share
+/// them.
+template <class Visit>
 __device__ __forceinline__ void for_each_tail_chunk(const BlendParams& params, Visit&& visit) {
   const int items = params.plan.state->counts.tail;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const TileChunk tail = params.plan.tail[item];
-    if (!has_samples<S>(params.lists, tail.tile) || !params.tile_open[tail.tile]) continue;
+    if (!params.tile_open[tail.tile]) continue;
     const TileList list = list_of(params.lists, params.grid, tail.tile);
-    const int end = min(list.count, (tail.chunk + 1) * chunk_length(S));
+    const int end = min(list.count, (tail.chunk + 1) * kChunkChunkLength);
     visit(tail, list, end);
   }
 }
 
-/// Writes the transmittance of each tail chunk alone.
 template <class F>
-__global__ void __launch_bounds__(kBlendThreads, kTailThroughBlocks<F>) tail_through_kernel(const BlendParams params) {
+inline constexpr int kThroughBlocks =
+    blocks_per_sm(tail_through_blocks(F::kSamples, F::kExpensive, sizeof(TileSplat<F, 0>)), kBlendThreads);
+
+/// Writes to the checkpoints what each tail chunk alone lets through.
+template <class F>
+__global__ void __launch_bounds__(kBlendThreads, kThroughBlocks<F>) tail_through_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
-  constexpr int S = F::kSamples, kLength = chunk_length(S);
+  constexpr int S = F::kSamples;
   __shared__ BlendStage<F, 0> stage;
-  const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
-  const Vec2<float> p = place_of<F>(threadIdx.x / 32, lane_id());
-  for_each_tail_chunk<S>(params, [&](const TileChunk& tail, const TileList& list, int end) {
+  const Vec2<float> p = position_of<F>(threadIdx.x / 32, lane_id());
+  for_each_tail_chunk(params, [&](const TileChunk& tail, const TileList& list, int end) {
     float transmittance[S];
 #pragma unroll
     for (int s = 0; s < S; ++s) transmittance[s] = 1;
-    for (int k = tail.chunk * kLength; k < end; k += stage.kBatch) {
+    for (int k = tail.chunk * kChunkLength; k < end; k += stage.kBatch) {
       __syncthreads();
-      const int count = stage.load(splats, params.channels, list, k, end);
+      const int count = stage.load(params.splats, params.channels, list, k, end);
       __syncthreads();
       pass_all<F>(stage, count, p, transmittance);
     }
@@ -56,29 +61,29 @@ __global__ void __launch_bounds__(kBlendThreads, kTailThroughBlocks<F>) tail_thr
   });
 }
 
-/// A sample with less transmittance than this would be stopped by the next splat that it meets, since alpha is at least
-/// kAlphaMin, and so it may count as stopped already. The margin above kTransmittanceMin is for the rounding of
-/// products of chunks, which differs from that of single splats.
+/// A sample with less transmittance than this is stopped by the next splat that it meets, since alpha is at least
+/// kAlphaMin, and so it may count as stopped already. The margin above kTransmittanceMin covers the rounding of products
+/// of chunks, which differs from the rounding splat by splat.
 inline constexpr float kNearlyStopped = float(kTransmittanceMin * (1 + kAlphaMin / 2));
 
-__device__ inline int chunks_of(const BlendParams& params, int tile, int length) {
-  return int((params.lists.tile_offsets[tile + 1] - params.lists.tile_offsets[tile] + length - 1) / length);
+__device__ inline int chunks_of(const BlendParams& params, int tile) {
+  const int64_t* pairs = params.lists.tile_offsets + tile;
+  return int((pairs[1] - pairs[0] + kChunkLength - 1) / kChunkLength);
 }
 
-/// The kernels that go through all tail chunks of a tile have a pixel per lane, and a block for each 32 pixels: those
-/// of a long list are spread over several multiprocessors, as one alone reads too slowly. A part of a tile is 32
-/// pixels.
+/// The kernels that go through all tail chunks of a tile have a pixel per lane and a block per part of 32 pixels, so that
+/// several multiprocessors read the checkpoints of a tile.
 inline constexpr int kTailParts = kTilePixels / 32;
 
-/// Turns the transmittance of each chunk into that in front of the chunk, negative where a sample has stopped before.
-/// Blocks share the parts of the open tiles.
+/// Turns what each chunk lets through into the transmittance at its begin, negative where a sample has stopped before.
+/// Blocks share the parts of the open tiles. `S`: samples of a lane.
 template <int S> __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
-  constexpr int kBatch = 32;
-  const int items = params.plan.state->counts.open_tiles[sample_class(S)] * S * kTailParts;
+  constexpr int kBatch = kTailLoads;
+  const int items = params.plan.state->counts.open_tiles * S * kTailParts;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
-    const int tile = open_tiles<S>(params)[item / (S * kTailParts)], s = item / kTailParts % S;
-    const int chunks = chunks_of(params, tile, chunk_length(S)), front = front_of<S>(params);
+    const int tile = params.open_tiles[item / (S * kTailParts)], s = item / kTailParts % S;
+    const int chunks = chunks_of(params, tile, kChunkChunkLength), front = front_of(params);
     const TransmittancePlanes<S> planes(params, tile, item % kTailParts * 32 + lane_id());
     float transmittance = planes.at(front - 1, s), next[kBatch];
     const auto load = [&](int first) {
@@ -92,7 +97,7 @@ template <int S> __global__ void __launch_bounds__(32) tail_scan_kernel(const Bl
       float through[kBatch];
 #pragma unroll
       for (int k = 0; k < kBatch; ++k) through[k] = next[k];
-      load(first + kBatch);  // before the stores, behind which loads would wait
+      load(first + kBatch);  // before the stores, after which loads would wait
 #pragma unroll
       for (int k = 0; k < kBatch; ++k) {
         if (first + k >= chunks) break;
@@ -104,16 +109,15 @@ template <int S> __global__ void __launch_bounds__(32) tail_scan_kernel(const Bl
   }
 }
 
-/// Writes the channels of each tail chunk and the transmittance at its end, which is zero where the sample had stopped
-/// before the chunk.
+/// Writes to the checkpoints the channels of each tail chunk and the transmittance at its end, zero where the sample had
+/// stopped before the chunk.
 template <class F, int C, bool kKeep>
-__global__ void __launch_bounds__(kBlendThreads, kTailBlendBlocks<F>) tail_blend_kernel(const BlendParams params) {
+__global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(tail_blend_blocks(F::kSamples), kBlendThreads)) tail_blend_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
-  constexpr int S = F::kSamples, kLength = chunk_length(S), kSets = kKeep ? S : 1;
+  constexpr int S = F::kSamples, kSets = kKeep ? S : 1;
   __shared__ BlendStage<F, C> stage;
-  const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
-  const Vec2<float> p = place_of<F>(threadIdx.x / 32, lane_id());
-  for_each_tail_chunk<S>(params, [&](const TileChunk& tail, const TileList& list, int end) {
+  const Vec2<float> p = position_of<F>(threadIdx.x / 32, lane_id());
+  for_each_tail_chunk(params, [&](const TileChunk& tail, const TileList& list, int end) {
     const PixelCheckpoints<S, C, kKeep> checkpoints(params, tail.tile, int(threadIdx.x));
     PixelState<S, C, kSets> state;
     state.start(false);
@@ -124,9 +128,9 @@ __global__ void __launch_bounds__(kBlendThreads, kTailBlendBlocks<F>) tail_blend
       started[s] = transmittance > 0;
       if (started[s]) state.transmittance[s] = transmittance;
     }
-    int k = tail.chunk * kLength;
+    int k = tail.chunk * kChunkLength;
     while (k < end && __syncthreads_or(state.open())) {
-      const int count = stage.load(splats, params.channels, list, k, end);
+      const int count = stage.load(params.splats, params.channels, list, k, end);
       __syncthreads();
       composite_all<F>(stage, count, k, p, state);
       k += count;
@@ -147,8 +151,7 @@ __global__ void __launch_bounds__(kBlendThreads, kTailBlendBlocks<F>) tail_blend
   });
 }
 
-/// Warps of a block that share the tail chunks of a part, since one alone waits for memory most of the time.
-inline constexpr int kTailSumWarps = 4, kTailSumThreads = 32 * kTailSumWarps;
+inline constexpr int kTailSumThreads = 32 * kTailSumWarps;
 
 /// The tail chunks [first, end) of a warp.
 struct TailShare {
@@ -161,20 +164,21 @@ struct TailShare {
   }
 };
 
-/// Adds the chunks of the open tiles. Blocks share the parts of the tiles. The order of the sum depends on the number
-/// of tail chunks alone, so that the picture is the same with and without a backward pass.
-template <class F, int C, bool kKeep>
+/// Adds up the chunks of the open tiles, whose parts blocks share, and writes their pixels. The order of the sum depends
+/// on the number of tail chunks alone, so that the picture has the same bits with and without a backward pass.
+/// `Samples`: LaneSamples of what a lane blends; the kernel is the same for all footprints that share it.
+template <class Samples, int C, bool kKeep>
 __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
-  constexpr int S = F::kSamples, kBatch = kKeep ? 16 : 32;  // chunks that are loaded together, into registers
+  constexpr int S = Samples::kSamples, kBatch = kKeep ? kTailLoadsKept : kTailLoads;
   __shared__ float sums[kTailSumWarps][C][32], lasts[kTailSumWarps][32];
   const int warp = int(threadIdx.x) / 32, lane = lane_id();
   const Values<C> background = background_of<C>(params);
-  const int items = params.plan.state->counts.open_tiles[sample_class(S)] * kTailParts;
+  const int items = params.plan.state->counts.open_tiles * kTailParts;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
-    const int tile = open_tiles<S>(params)[item / kTailParts], part = item % kTailParts;
+    const int tile = params.open_tiles[item / kTailParts], part = item % kTailParts;
     const PixelCheckpoints<S, C, kKeep> checkpoints(params, tile, part * 32 + lane);
-    TailShare share(front_of<S>(params), chunks_of(params, tile, chunk_length(S)));
+    TailShare share(front_of(params), chunks_of(params, tile, kChunkChunkLength));
     if (warp == 0) share.first = checkpoints.first_chunk;
     Values<C> total = {};
     float transmittance[S];
@@ -210,21 +214,18 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
       }
       transmittance[s] = last;
       if constexpr (kKeep) {
-        Values<C> behind = times(abs(last), background);
+        Values<C> farther = times(abs(last), background);
         for (int w = kTailSumWarps - 1; w > warp; --w) {
 #pragma unroll
-          for (int c = 0; c < C; ++c) behind.v[c] += sums[w][c][lane];
+          for (int c = 0; c < C; ++c) farther.v[c] += sums[w][c][lane];
         }
-        accumulate_behind<kBatch>(checkpoints, share.first, share.end, s, behind);
+        accumulate_farther<kBatch>(checkpoints, share.first, share.end, s, farther);
       }
       __syncthreads();  // before the next sums
     }
     const TileList list = list_of(params.lists, params.grid, tile);
-    if (warp == 0) store_pixel<F>(params, Pixel(list, params.grid, pixel_of<F>(part, lane)), total, transmittance);
+    if (warp == 0) store_pixel<Samples>(params, Pixel(list, params.grid, pixel_of<Samples>(part, lane)), total, transmittance);
   }
 }
-
-/// Blocks of the kernels of the tail, which share the work.
-inline constexpr int kTailBlocks = kManyBlocks;
 
 }  // namespace ar::cuda

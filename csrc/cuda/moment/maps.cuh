@@ -1,28 +1,27 @@
-// Segments of lists (cut_lists.cuh), and what goes through them backwards, for footprints whose samples move.
+// Kernels segment_maps and chain_maps: the first two steps of the backward pass through lists that are cut, for
+// footprints whose samples move. blend_vjp_moment (blend_vjp.cu) launches them before segment_vjp_kernel.
 //
-// A block has a segment of a tile's list, so that long lists are differentiated side by side. What the
-// samples carry from splat to splat on the way back goes through a segment as an affine map. So one kernel finds the
-// map of every segment, from front to back, and another chains them from the last segment to the first. Then that of
-// blend_moving_segments.cuh has the sums, each segment from what it gets from behind.
+// What a sample carries from splat to splat on the way back (Adjoint) goes through a segment as an affine map. So the
+// segments of a list can be differentiated side by side: segment_maps finds the map of each segment, front to back, and
+// chain_maps applies them from the last segment to the first. They read the checkpoints and `last` of blend and write
+// adjoint_maps, where segment_vjp_kernel finds what each segment gets from the farther ones, and checkpoints.
 #pragma once
 
 #include <algorithm>
 
-#include "cuda/blend_moving_grads.cuh"
-#include "cuda/cut_lists.cuh"
 #include "cuda/launch.cuh"
+#include "cuda/moment/vjp_grads.cuh"
 
 namespace ar::cuda {
 
-/// What a sample carries from a splat to the one in front of it: the gradient-weighted colour behind, and the gradient
-/// with respect to its place, in kMoveGradUnit of the footprint.
+/// What a sample carries from a splat to the splat before it.
 struct Adjoint {
-  float behind;
-  Vec2<float> dL_dplace;
+  float behind;           ///< gradient-weighted colour of everything farther
+  Vec2<float> dL_dplace;  ///< gradient with respect to the sample's position, times kMoveGradUnit of the footprint
 };
 
-/// How that goes through a segment: the image of zero, and what a change of each of the three numbers adds. A change of
-/// the place does not reach `behind`.
+/// How an Adjoint goes through a segment: the image of zero, and what a change of each of the three numbers adds. A
+/// change of the position does not reach `behind`.
 struct SegmentMap {
   static constexpr int kNumbers = 10;
   Adjoint of_zero, by_behind;
@@ -38,8 +37,8 @@ struct SegmentMap {
   }
 };
 
-/// Where the maps of a pixel's sample are. In place of `of_zero` of a segment is, in the end, what its front gives to
-/// the segment before.
+/// The maps of a pixel's sample in adjoint_maps. chain_maps replaces `of_zero` of a segment by the Adjoint before it.
+/// `kTilePixels`: pixels of a tile.
 template <class F, int kTilePixels> struct MapMemory {
   static constexpr int kPlane = F::kSamples * kTilePixels;
   float* first;  ///< of the sample
@@ -67,30 +66,21 @@ template <class F, int kTilePixels> struct MapMemory {
   }
 };
 
-/// Groups of a segment for each warp of its block (blend_moving_segments.cuh). With one cell, whose tiles of 8x8 pixels
-/// have two groups, a block of one warp would take too long; in tiles of 4x4 pixels fewer warps were slower.
-inline constexpr int kMostGroupsOfWarp = 2;
+/// How samples are shared out for segments in tiles of kSide x kSide pixels. There are many segments with small splats,
+/// so that few pixels per warp are best.
 template <class F, int kSide>
-inline constexpr int kGroupsOfWarp = F::kSamples == 1 || kSide < kMovingTile ? 1 : kMostGroupsOfWarp;
-
-/// Samples shared out for segments, of which there are many, with small splats: few pixels per warp. A single sample
-/// has a lane, so that none is idle.
-template <class F, int kSide>
-using SegmentLayout = std::conditional_t<(F::kSamples <= 4 || kSide < kMovingTile),
-                                         CellLayout<1, kLanesForSamples<F>, kSide>, CellLayout<2, 8, kSide>>;
-/// The same, whose groups are taken, by fewer warps.
-template <class F, int kSide, class Cells = SegmentLayout<F, kSide>>
-using TakenLayout = CellLayout<Cells::kCells, Cells::kLanes, kSide, Cells::kGroups / kGroupsOfWarp<F, kSide>, true>;
-
-/// Samples shared out for the maps of segments, which no lanes add up: with many cells a sample to a lane, so that a
-/// warp has few pixels and passes over more splats; and in small blocks, since warps do not have equally much to do.
+using SegmentLayout = std::conditional_t<(F::kSamples <= 4 || kSide < kMovingTile), CellLayout<1, F::kSamples, kSide>,
+                                         CellLayout<2, 8, kSide>>;
+/// The same for maps, which no lanes add up: with many cells a lane per sample, so that a warp has few pixels and passes
+/// over more splats; in small blocks, since warps do not have equally much to do.
 template <class F, int kSide>
 using MapLayout = std::conditional_t<(F::kSamples > 4), CellLayout<1, 16, kSide, 4>, SegmentLayout<F, kSide>>;
 
-/// A block per segment of kSegment pairs and part of a tile: the maps of its samples, and the checkpoints within it.
-/// Not for the first segments of tiles, whose maps nobody needs and whose checkpoints blend has left.
+/// A block per segment of kSegment pairs and part of a tile: writes the maps of its samples, and the checkpoints within
+/// the segment. Not for the first segments of lists: nobody needs their maps, and blend has stored their checkpoints.
+/// For the C channels from `first` on.
 template <class F, int C, int kSide, int kSegment, class Layout = MapLayout<F, kSide>>
-__global__ void __launch_bounds__(Layout::kThreads, 1024 / Layout::kThreads)
+__global__ void __launch_bounds__(Layout::kThreads, blocks_per_sm(kMapThreads / Layout::kThreads, Layout::kThreads))
     segment_maps_kernel(const BlendVjpParams params, int first) {
   wait_for_earlier_kernels();
   using Samples = MovingSamples<F, Layout, true>;
@@ -101,7 +91,6 @@ __global__ void __launch_bounds__(Layout::kThreads, 1024 / Layout::kThreads)
   if (segment.tile < 0 || segment.index == 0) return;
   const TileList list = list_of(params.lists, params.grid, segment.tile);
   const StatePlaces places(params.lists, list, params.grid, segment.tile);
-  const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const Vec2<float> p = Layout::pixel();
   const Pixel pixel(list, params.grid, p);
   const SampleGrad<F, C> grad(params, pixel, first);
@@ -123,9 +112,9 @@ __global__ void __launch_bounds__(Layout::kThreads, 1024 / Layout::kThreads)
     const int count = min(kBatch, min(last.warp, stop) - k);  // of what this warp needs
     const int32_t next_id = stage.splat_of(list, k + kBatch, stop);
     __syncthreads();  // all have read the last batch
-    stage.load(splats, params.channels, first, list, id);
+    stage.load(params.splats, params.channels, first, list, id);
     __syncthreads();
-    if (next_id >= 0) prefetch(splats + next_id);  // so that the next batch need not wait for memory
+    if (next_id >= 0) prefetch_splat(params.splats, next_id);  // so that the next batch need not wait for memory
     id = next_id;
     for (int from = 0; from < count; from += kStateChunk) {
       if (first == 0 && k + from > begin) samples.store(checkpoint_at(k + from), k + from, last.samples);
@@ -160,7 +149,7 @@ __global__ void __launch_bounds__(Layout::kThreads, 1024 / Layout::kThreads)
                       {divide(samples.transmittance[i], before[i]), m.of_behind},
                       {m.of_place.xx, m.of_place.yx},
                       {m.of_place.xy, m.of_place.yy}};
-    // Behind the segment with a sample's last splat is the background.
+    // After the segment with a sample's last splat there is only the background.
     if (last.samples[i] <= end) map.of_zero = map({grad.through, {0, 0}});
     const MapMemory<F, Layout::kTilePixels> memory(params.adjoint_maps, Layout::first_sample() + i,
                                                    Layout::pixel_number());
@@ -168,32 +157,31 @@ __global__ void __launch_bounds__(Layout::kThreads, 1024 / Layout::kThreads)
   }
 }
 
-/// A thread per sample of a tile whose list is cut: from the maps of its segments to what each gets from behind.
+/// A thread per sample of a tile whose list is cut: applies the maps of its segments, from the last to the first.
 template <class F, int kSide, int kSegment>
 __global__ void __launch_bounds__(kSide* kSide) chain_maps_kernel(const BlendVjpParams params) {
   wait_for_earlier_kernels();
   constexpr int S = F::kSamples, kPixels = kSide * kSide;
   const int place = int(blockIdx.x) / S, t = int(blockIdx.x) % S * kPixels + int(threadIdx.x);
   const int number = t / S, sample = t % S;
-  if (blockIdx.x == 0 && threadIdx.x == 0) params.chunks_taken[0] = 0;  // segment_vjp_kernel has begun none
+  if (blockIdx.x == 0 && threadIdx.x == 0) *params.chunks_taken = 0;  // for segment_vjp_kernel
   if (place >= params.plan->counts.cut_lists) return;
   const CutList cut = params.cut_lists[place];
   const TileList list = list_of(params.lists, params.grid, cut.tile);
   const Pixel pixel(list, params.grid, {float(number % kSide), float(number / kSide)});
   if (!pixel.inside) return;
-  // The map of the segment with the last splat of the sample already is what its front gives.
+  // Of the segment with the sample's last splat segment_maps has written the Adjoint itself.
   int segment = (params.last[sample * pixel.image + pixel.index] - 1) / kSegment;
   if (segment <= 1) return;
   const int64_t first = cut.first;
   const MapMemory<F, kPixels> memory(params.adjoint_maps, sample, number);
   Adjoint adjoint = memory.adjoint(first + segment);
-  constexpr int kAhead = 8;  // segments whose maps are read at once, since each of them waits for memory
-  for (; segment > 1; segment -= kAhead) {
-    SegmentMap maps[kAhead];
+  for (; segment > 1; segment -= kMapsAhead) {
+    SegmentMap maps[kMapsAhead];
 #pragma unroll
-    for (int i = 0; i < kAhead; ++i) maps[i] = memory.map(first + max(segment - 1 - i, 1));
+    for (int i = 0; i < kMapsAhead; ++i) maps[i] = memory.map(first + max(segment - 1 - i, 1));
 #pragma unroll
-    for (int i = 0; i < kAhead; ++i) {
+    for (int i = 0; i < kMapsAhead; ++i) {
       if (segment - 1 - i < 1) return;
       adjoint = maps[i](adjoint);
       memory.put(first + segment - 1 - i, adjoint);

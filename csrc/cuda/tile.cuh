@@ -1,16 +1,16 @@
-// What the kernels of blend and blend_vjp share: pixels, lists of tiles, and splats staged for a tile.
+// A library for all kernels of blending: which pixels a lane has, the list of a tile, which pixels a splat reaches, and
+// the splats that a block copies to shared memory (stages). It launches nothing.
 //
-// A tile's 16x16 pixels are eight subtiles of 8x4, a warp of lanes each: subtile b at column b % 2 and row b / 2, lane
-// l at column l % 8 and row l / 8 of it. With a Spread (core/footprint/contract.h) a lane has one sample instead, the
-// lanes of a pixel are neighbours, and there are fewer pixels; "a lane's pixel" is then the one of its sample. A splat
-// is tested against the subtiles once per tile; warps skip those that do not reach them.
+// A tile of 16x16 pixels consists of eight subtiles of 8x4 pixels, and a warp has a subtile: subtile b is in column
+// b % 2 and row b / 2 of the tile, and lane l has the pixel in column l % 8 and row l / 8 of the subtile. For a Spread
+// (core/footprint/contract.h) a lane has a sample instead: the samples of a pixel are in neighbouring lanes, and the
+// tile has fewer pixels. Each splat is tested against the subtiles once, and warps skip splats that do not reach them.
 #pragma once
 
 #include <type_traits>
 
 #include "core/bin.h"
 #include "core/blend.h"
-#include "cuda/side_streams.h"
 #include "cuda/stages.h"
 #include "cuda/warp.cuh"
 
@@ -20,25 +20,30 @@ inline constexpr int kTilePixels = kTile * kTile;
 inline constexpr int kSubtiles = 8;
 inline constexpr int kBlendThreads = 32 * kSubtiles;
 
-/// Pixels of a subtile side by side, and one below the other. There are fewer where their samples are spread over lanes
-/// (Spread of contract.h), so that all 256 lanes of a block have one.
+/// Columns and rows of pixels of a subtile. A Spread has fewer: 256 lanes are 256 samples.
 template <class F> inline constexpr int kSubtileWide = 8 >> (kTileBits - spread_tile_bits(F::kLanes, true));
 template <class F> inline constexpr int kSubtileHigh = kSubtileWide<F> / 2;
 
-/// A lane's pixel of subtile b, relative to the tile's first.
+/// How many samples of a pixel a lane has, and how many lanes have samples of one pixel: all that kernels know of a
+/// footprint that do not evaluate it.
+template <int S, int kLanesOfPixel> struct LaneSamples {
+  static constexpr int kSamples = S, kLanes = kLanesOfPixel;
+};
+
+/// A lane's pixel of subtile b, relative to the tile's first pixel.
 template <class F> __device__ Vec2<float> pixel_of(int b, int lane) {
   constexpr int kWide = kSubtileWide<F>, kHigh = kSubtileHigh<F>;
   static_assert(F::kLanes * kWide * kHigh == 32);
   const int pixel = lane / F::kLanes;
   return {float((b & 1) * kWide + pixel % kWide), float((b >> 1) * kHigh + pixel / kWide)};
 }
-/// Where a lane's sample of subtile b is, relative to the tile's first pixel; that of subtile 0 is at `of_first`. Blend
-/// and blend_vjp must find the same place to the bit, so both come here: one addition, of a whole number.
-template <class F> __device__ Vec2<float> place_in(int b, Vec2<float> of_first) {
+/// The position of a lane's sample in subtile b, from the tile's first pixel, where `of_first` is its position in subtile
+/// 0. Blend and blend_vjp both call this, because alpha must have the same bits in both: one addition of a whole number.
+template <class F> __device__ Vec2<float> position_in(int b, Vec2<float> of_first) {
   return {of_first.x + float((b & 1) * kSubtileWide<F>), of_first.y + float((b >> 1) * kSubtileHigh<F>)};
 }
-/// The same by the lane's number. Where a lane has all samples of a pixel, it is the pixel.
-template <class F> __device__ Vec2<float> place_of(int b, int lane) {
+/// The same by the lane's number. Where a lane has all samples of a pixel, it is the position of the pixel.
+template <class F> __device__ Vec2<float> position_of(int b, int lane) {
   Vec2<float> of_first = pixel_of<F>(0, lane);
   if constexpr (F::kLanes > 1) {
     Vec2<float> node = {0, 0};
@@ -48,21 +53,30 @@ template <class F> __device__ Vec2<float> place_of(int b, int lane) {
     }
     of_first = of_first + node;
   }
-  return place_in<F>(b, of_first);
+  return position_in<F>(b, of_first);
+}
+
+/// Splat `id` of those that `project` wrote: `splats` are rows of kSplatWidth numbers. All kernels of blending read
+/// splats through this function.
+template <class F> __device__ Splat<F, float> load_splat(const float* splats, int32_t id) {
+  return reinterpret_cast<const Splat<F, float>*>(splats)[id];
+}
+__device__ inline void prefetch_splat(const float* splats, int32_t id) {
+  prefetch(splats + int64_t(id) * kSplatWidth);
 }
 
 /// A tile and its list of splats, front to back.
 struct TileList {
-  int x0, y0;
-  const int32_t* pairs;
+  int x0, y0;            ///< first pixel of the tile
+  const int32_t* pairs;  ///< [count, stride] splats, and their slots where stride is 2
   int stride, count;
-  bool of_patch;  ///< the list is that of a patch: it has splats that do not reach this tile
+  bool of_patch;  ///< the list is that of a patch, and has splats that do not reach this tile
 
   __device__ int32_t splat(int k) const { return pairs[int64_t(k) * stride]; }
   __device__ int32_t slot(int k) const { return pairs[int64_t(k) * stride + 1]; }
 };
 
-/// Where a tile is among those that share a list.
+/// A tile among the tiles of its patch, which share a list.
 struct TileInPatch {
   int first_tile;  ///< of the patch
   int tiles;       ///< of the patch, as far as it is in the image
@@ -91,9 +105,9 @@ __device__ inline TileList list_of(const TileLists& lists, TileGrid grid, int ti
   return list;
 }
 
-/// Which boxes of kWide x kHigh pixels a splat reaches. Some that it passes closely may be among them; only where
-/// weights are expensive, exact extents are worth what they cost. There are kColumns boxes side by side and kRows of
-/// these one below the other, the first pixel at (x0, y0). Box b is at column b % kColumns and row b / kColumns.
+/// Which boxes of kWide x kHigh pixels a splat reaches: bit b for the box in column b % kColumns and row b / kColumns of
+/// kColumns x kRows boxes whose first pixel is at (x0, y0). A box that the splat passes closely may be among them; only
+/// for footprints with expensive weights exact extents are worth their cost.
 template <int kWide, int kHigh, int kColumns, int kRows, class F>
 __device__ uint32_t reached_boxes(const Splat<F, float>& splat, int x0, int y0) {
   static_assert(kColumns * kRows <= 32);
@@ -131,7 +145,7 @@ __device__ uint32_t reached_boxes(const Splat<F, float>& splat, int x0, int y0) 
   return reached;
 }
 
-/// Bit b: the splat reaches subtile b, or passes it closely.
+/// Bit b: the splat reaches subtile b of a tile at (x0, y0), or passes it closely.
 template <class F> __device__ uint32_t subtile_reach(const Splat<F, float>& splat, int x0, int y0) {
   return reached_boxes<kSubtileWide<F>, kSubtileHigh<F>, 2, 4, F>(splat, x0, y0);
 }
@@ -152,8 +166,8 @@ template <int C> struct Values {
 };
 template <> struct Values<0> {};
 
-/// Adds what a splat contributes in the S samples of a lane. composite(s) composites it into sample s and returns what
-/// blend_sample does. A branch around a single addition becomes a predicate, which costs nothing.
+/// Adds to `sums` what a splat contributes in the S samples of a lane. composite(s) composites the splat into sample s
+/// and returns what blend_sample returns. A branch around a single addition becomes a predicate, which costs nothing.
 template <int S, int C, class Composite>
 __device__ __forceinline__ void add_samples(Values<C>& sums, const Values<C>& channels, Composite&& composite) {
   float contribution = 0;
@@ -187,7 +201,8 @@ template <class F, int C> struct alignas(16) TileSplat {
 template <class F, int C>
 using TileSplatRef = std::conditional_t<sizeof(TileSplat<F, C>) <= 112, const TileSplat<F, C>, const TileSplat<F, C>&>;
 
-/// The channels of a splat: three lie in it; of more, those that there are in rows from `first` on, and zeros.
+/// The channels of splat `id`: three lie in the splat; else C channels of its row from `first` on, and zeros beyond the
+/// last channel.
 template <int C, class F>
 __device__ Values<C> channels_of(const Channels<float>& channels, const Splat<F, float>& splat, int32_t id,
                                  int first = 0) {
@@ -208,9 +223,9 @@ __device__ Values<C> channels_of(const Channels<float>& channels, const Splat<F,
   }
 }
 
-/// For each warp of a block a list of up to kMost staged splats that reach its pixels, which costs less per splat than
-/// to look for the next bit of a mask. A list holds the numbers of splats times kUnit, and is read kAhead entries at a
-/// time: where kUnit is the size of a splat, an entry is its place in memory.
+/// For each of kWarps warps of a block a list of up to kMost staged splats that reach its pixels. To walk a list costs
+/// less per splat than to find the next bit of a mask. An entry is the number of a splat times kUnit: with kUnit = the
+/// size of a splat it is an offset in memory. kAhead entries are read at a time.
 template <class EntryType, int kUnit, int kAhead, int kWarps, int kMost> struct ReachLists {
   using Entry = EntryType;
   struct alignas(kAhead * sizeof(Entry)) Entries {
@@ -218,12 +233,13 @@ template <class EntryType, int kUnit, int kAhead, int kWarps, int kMost> struct 
   };
   alignas(Entries) Entry of_warps[kWarps][kMost];
 
-  /// Lists those of the staged splats [from, to) that reach this warp's pixels, and returns how many there are. Bit w
-  /// of reach[k]: splat k reaches those of warp w; all up to the next multiple of 32 are read. All lanes must call it.
+  /// Lists the staged splats in [from, to) that reach this warp's pixels, and returns their number. Bit w of reach[k]
+  /// says that splat k reaches the pixels of warp w; `reach` is read up to the next multiple of 32. All lanes must call
+  /// it.
   template <class Bits> __device__ int list(const Bits* reach, int from, int to) {
     return list(reach, from, to, int(threadIdx.x) / 32);
   }
-  /// Those whose bit `number` is set.
+  /// The same for the splats whose bit `number` is set.
   template <class Bits> __device__ int list(const Bits* reach, int from, int to, int number) {
     const int warp = threadIdx.x / 32;
     int n = 0;
@@ -238,12 +254,12 @@ template <class EntryType, int kUnit, int kAhead, int kWarps, int kMost> struct 
   }
   /// The number of a listed splat.
   __device__ static int number_of(Entry entry) { return int(entry) / kUnit; }
-  /// The splat itself, which is staged in `splats`.
+  /// The staged splat of an entry.
   template <class Splat> __device__ static const Splat& splat_of(const Splat* splats, Entry entry) {
     static_assert(sizeof(Splat) % kUnit == 0);
     return *reinterpret_cast<const Splat*>(reinterpret_cast<const char*>(splats) + entry * (sizeof(Splat) / kUnit));
   }
-  /// Calls visit(entry) for those in [from, to) of the list of this warp; `from` is a multiple of kAhead.
+  /// Calls visit(entry) for the entries [from, to) of this warp's list; `from` is a multiple of kAhead.
   template <class Visit> __device__ __forceinline__ void for_each(int from, int to, Visit&& visit) const {
     const Entry* list = of_warps[threadIdx.x / 32];
     int k = from;
@@ -264,20 +280,20 @@ template <class F> __device__ auto tile_terms(const Splat<F, float>& splat, cons
   return F::terms(splat.shape, splat.opacity, {float(list.x0) - splat.mean.x, float(list.y0) - splat.mean.y});
 }
 
-/// Up to kBatch splats of a tile that a block works on together, a thread for each.
+/// Up to kBatch splats of a tile, with C channels, that a block works on together. A thread loads one splat.
 template <class F, int C, int kBatch> struct Stage {
   TileSplat<F, C> splats[kBatch];
   uint8_t reach[kBatch];
 
-  /// Loads splats [k, k + kBatch) of the list; returns how many there are before `end`.
-  __device__ int load(const Splat<F, float>* splats_in, const Channels<float>& channels, const TileList& list, int k,
-                      int end) {
+  /// Loads splats [k, k + kBatch) of the list, and returns how many there are before `end`. `splats_in`: rows of
+  /// kSplatWidth numbers.
+  __device__ int load(const float* splats_in, const Channels<float>& channels, const TileList& list, int k, int end) {
     const int t = threadIdx.x;
     if (kBatch == kBlendThreads || t < kBatch) {
       uint32_t bits = 0;
       if (k + t < end) {
         const int32_t id = list.splat(k + t);
-        const Splat<F, float> splat = splats_in[id];
+        const Splat<F, float> splat = load_splat<F>(splats_in, id);
         bits = subtile_reach<F>(splat, list.x0, list.y0);
         if (bits) splats[t] = {tile_terms(splat, list), channels_of<C>(channels, splat, id)};
       }
@@ -286,7 +302,7 @@ template <class F, int C, int kBatch> struct Stage {
     return min(end - k, kBatch);
   }
 
-  /// Of the splats [k, k + 32), those that reach a subtile, in the order of take_first. All lanes must call it.
+  /// The splats in [k, k + 32) that reach a subtile, in the order of take_first. All lanes must call it.
   __device__ uint32_t reached(int k, int subtile) const {
     return __ballot_sync(kAllLanes, reach[k + 31 - lane_id()] >> subtile & 1);
   }
@@ -294,37 +310,21 @@ template <class F, int C, int kBatch> struct Stage {
   __device__ uint32_t reached(int k) const { return reached(k, threadIdx.x / 32); }
 };
 
-/// A sample at the end of a chunk, kept for a backward pass.
+/// A sample at the end of a chunk, stored for the backward pass.
 template <int C> struct alignas(C == 3 ? 16 : 4) Checkpoint {
   Values<C> channels;
   float transmittance;  ///< negated where the sample has stopped
 };
 
-/// Whether a tile is blended with S samples.
-template <int S> __device__ bool has_samples(const TileLists& lists, int tile) {
-  return !lists.tile_samples || lists.tile_samples[tile] == S;
+/// The tile of chunk number `chunk` of blend_vjp, where a chunk is the whole list of a tile; -1 if there is no such
+/// chunk. Where lists are cut, the segments have the first numbers, and the lists that are not cut follow.
+__device__ inline int listed_tile(const BlendVjpParams& params, int chunk) {
+  return chunk < params.plan->counts.chunks ? params.chunk_order[chunk].tile : -1;
 }
 
-/// Place in the plan's order of tiles of block `block` of a kernel for tiles with S samples; -1 if there is none.
-template <int S, class Params> __device__ int tile_place(const Params& params, int block) {
-  if (!params.lists.tile_samples) return block;
-  const SampleParts& tiles = params.plan.state->counts.tiles;
-  const int place = tiles.first[sample_class(S)] + block;
-  return place < tiles.first[sample_class(S) + 1] ? place : -1;
-}
-
-/// The tile of block `block` of a kernel of blend_vjp for tiles with S samples whose lists are walked as a whole; -1 if
-/// there is none. Where lists are cut, blocks are numbered with the segments of those first, then the lists that are
-/// not.
-template <int S> __device__ int listed_tile(const BlendVjpParams& params, int block) {
-  const SampleParts& tiles = params.plan->counts.chunks;  // a chunk is a tile's whole list
-  const int place = tiles.first[sample_class(S)] + block;
-  return place < tiles.first[sample_class(S) + 1] ? params.chunk_order[place].tile : -1;
-}
-
-/// The numbers of a pixel's samples, and of its image.
+/// A pixel of the image.
 struct Pixel {
-  int64_t index, image;  ///< of the pixel, and how many there are
+  int64_t index, image;  ///< number of the pixel, and of all pixels
   bool inside;
 
   __device__ Pixel(const TileList& list, TileGrid grid, Vec2<float> p) {
@@ -338,7 +338,7 @@ struct Pixel {
 /// The share of one sample in its pixel.
 template <class F> inline constexpr float kSampleShare = 1.0f / (F::kSamples * F::kLanes);
 
-/// Place of sample s of this lane's pixel in an array of [samples, H, W].
+/// Index of sample s of this lane's pixel in an array of [samples, H, W].
 template <class F> __device__ int64_t sample_index(int64_t image, int64_t pixel, int s) {
   return (F::kLanes > 1 ? lane_id() % F::kLanes : s) * image + pixel;
 }
@@ -346,13 +346,13 @@ template <class F> __device__ int64_t sample_index(const Pixel& pixel, int s) {
   return sample_index<F>(pixel.image, pixel.index, s);
 }
 
-/// The sum over the lanes that a pixel's samples are spread over.
+/// The sum over the lanes that hold a pixel's samples.
 template <class F> __device__ float sum_of_pixel(float x) {
 #pragma unroll
   for (int offset = F::kLanes / 2; offset > 0; offset /= 2) x += __shfl_xor_sync(kAllLanes, x, offset);
   return x;
 }
-/// Whether a lane writes what its pixel has once.
+/// Whether this lane writes what belongs to the whole pixel.
 template <class F> __device__ bool writes_pixel(int lane) { return lane % F::kLanes == 0; }
 
 /// The gradient with respect to a channel of one of a pixel's samples.
@@ -371,8 +371,8 @@ __device__ inline void clear_pair(const BlendVjpParams& params, int64_t row) {
 /// Threads that clear_pair_together takes for a pair.
 inline constexpr int kClearThreads = kChannelGroup / 4;
 
-/// The same by kClearThreads neighbouring threads, all of which must call it, for a pair that has a row of channel_sums
-/// too, of kWidth numbers. That of pair_grads is cleared with `shapes`.
+/// The same by kClearThreads neighbouring threads, all of which must call it: clears the row of pair_grads, if `shapes`,
+/// and the row of kWidth channel_sums, if there are any.
 template <int kWidth> __device__ void clear_pair_together(const BlendVjpParams& params, int64_t row, bool shapes) {
   const int q = threadIdx.x % kClearThreads;
   const float4 zero = {0, 0, 0, 0};
@@ -380,7 +380,7 @@ template <int kWidth> __device__ void clear_pair_together(const BlendVjpParams& 
   if (params.channel_sums && q < kWidth / 4) reinterpret_cast<float4*>(params.channel_sums + row * kWidth)[q] = zero;
 }
 
-/// Sums gradients of a splat in row `row` of pairs, or of splats, where all tiles add to it.
+/// Writes a gradient sum into row `row`: of the pair; or, `of_patch`, of the splat, to whose row all tiles add.
 __device__ inline void put_sum(float* rows, int width, bool of_patch, int32_t row, int column, float x) {
   float* place = rows + int64_t(row) * width + column;
   if (of_patch) {
@@ -388,45 +388,6 @@ __device__ inline void put_sum(float* rows, int width, bool of_patch, int32_t ro
   } else {
     *place = x;
   }
-}
-
-/// log2 of the side of the tiles that F has [px].
-template <class F> constexpr int tile_bits_of(bool small_image) {
-  return F::kMoves ? moving_tile_bits(F::kSamples, small_image) : spread_tile_bits(spread_lanes<F>(), small_image);
-}
-/// Calls `visit` with the side of the grid's tiles, one of those that F has, as a constant.
-template <class F, class Visit> void with_tile_side(TileGrid grid, Visit&& visit) {
-  constexpr int kLarge = 1 << tile_bits_of<F>(false), kSmall = 1 << tile_bits_of<F>(true);
-  if constexpr (kLarge != kSmall) {
-    if (grid.side() == kLarge) return visit(std::integral_constant<int, kLarge>());
-  }
-  visit(std::integral_constant<int, kSmall>());
-}
-
-/// Calls f with what F, whose samples do not move, is blended as in tiles of this grid: F::Spread, or F itself.
-template <class F, class Function> void with_lanes(TileGrid grid, Function&& f) {
-  with_tile_side<F>(grid, [&](auto side) {
-    using Blended = std::conditional_t<(side < kTile), typename F::Spread, F>;
-    f(Blended{});
-  });
-}
-
-/// Calls f(F{}, stream) for the footprint F of every kind of tile: where samples are chosen those of Boxes, side by
-/// side, as a few tiles of many samples would else keep the device waiting.
-template <class F, class Boxes, class Function> void for_each_tile_footprint(cudaStream_t stream, Function&& f) {
-  if constexpr (std::is_same_v<F, Adaptive>) {
-    const SideStreams<3> sides(stream);
-    int k = 0;
-    for_each_footprint(Boxes{}, [&](auto tile_footprint) { f(tile_footprint, sides.stream(k++)); });
-  } else {
-    f(PixelsOf<F>{}, stream);
-  }
-}
-
-/// Calls f(F{}, stream) for the pixels of the footprint at place `footprint` of the registry.
-template <class Boxes, class Function> void visit_tile_footprints(int footprint, cudaStream_t stream, Function&& f) {
-  visit_footprint(footprint, Footprints{},
-                  [&](auto chosen) { for_each_tile_footprint<decltype(chosen), Boxes>(stream, f); });
 }
 
 }  // namespace ar::cuda

@@ -1,16 +1,17 @@
-// The sums of pairs in blend_vjp for footprints whose samples move: each warp of a block leaves those of its pixels,
-// in shared memory or, of some segments, in BlendVjpParams::group_sums; they are added up and written.
+// A library for the backward kernels of footprints whose samples move: the sums over pixels that make the gradient of a
+// pair. Each warp writes the sums of its pixels to shared memory or, for some segments, to BlendVjpParams::group_sums;
+// write_pairs adds up the warps and writes rows of pair_grads and channel_sums.
 #pragma once
 
 #include <algorithm>
 
-#include "cuda/blend_moving.cuh"
+#include "cuda/moment/cells.cuh"
 
 namespace ar::cuda {
 
 static_assert(kStateChunk == 32, "a warp's chunk is a mask of 32 bits");
 
-/// write_pairs() for kUsed sums of each pair: a constant, so that to divide by it costs little.
+/// write_pairs() for kUsed sums of each pair, a constant so that divisions by it cost little.
 template <int kUsed, int C, int kThreads, class Total>
 __device__ void write_sums(const BlendVjpParams& params, int first, bool with_shape, const TileList& list,
                            const int32_t* rows, int count, Total&& total) {
@@ -36,9 +37,9 @@ __device__ void write_sums(const BlendVjpParams& params, int first, bool with_sh
   }
 }
 
-/// Writes the sums total(j, v) of the first `count` pairs of a batch, with those for MeanSums if with_means. `first`:
-/// the first of the channels; the kernels of those before have left their shares of the six other sums. `with_shape`:
-/// these sums and MeanSums too. `rows`: of the pairs' sums.
+/// Writes the sums total(j, v) of the first `count` pairs of a batch: C channels from `first` on, with_shape the six
+/// sums of PairGrad, and with_means MeanSums. To the six sums it adds what the kernels of earlier channels have written.
+/// `rows`: [count] row of each pair.
 template <int C, int kThreads, class Total>
 __device__ void write_pairs(const BlendVjpParams& params, int first, bool with_means, bool with_shape,
                             const TileList& list, const int32_t* rows, int count, Total&& total) {
@@ -50,11 +51,11 @@ __device__ void write_pairs(const BlendVjpParams& params, int first, bool with_m
   }
 }
 
-/// What a block keeps in shared memory. Sums of a pair: PairGrad, C channels, MeanSums.
+/// What a block of moving_vjp_kernel keeps in shared memory. Sums of a pair: PairGrad, C channels, MeanSums.
 template <class F, int C, class Layout> struct MovingVjpShared {
   static constexpr int kMeans = 6 + C, kSums = kMeans + 2;
-  /// Splats that a block takes between barriers: two chunks with one cell of a lane. With more cells one, which leaves
-  /// more shared memory for the places of samples.
+  /// Splats between barriers: two chunks with one cell of a lane; with more cells one, which leaves more shared memory
+  /// for the positions of samples.
   static constexpr int kBatch = Layout::kCells == 1 ? 2 * kStateChunk : kStateChunk, kChunks = kBatch / kStateChunk;
   MovingStage<F, C, Layout, kBatch> stage;
   float sums[Layout::kWarps][kBatch][kSums];  ///< of a warp's pixels
@@ -63,15 +64,15 @@ template <class F, int C, class Layout> struct MovingVjpShared {
   Mat2<float> mean_maps[kBatch];
   int last[Layout::kWarps];  ///< of LastSplats
 
-  /// Loads the batch that begins with pair k0, `id` = stage.splat_of(), with channels from `first` on and with_means
-  /// what MeanSums need. All threads must call it.
-  __device__ void load(const Splat<F, float>* splats, const BlendVjpParams& params, int first, const TileList& list,
+  /// Loads the batch that begins with pair k0, `id` = stage.splat_of(), with channels from `first` on, and with_means
+  /// also what MeanSums need. All threads must call it.
+  __device__ void load(const float* splats, const BlendVjpParams& params, int first, const TileList& list,
                        int k0, int32_t id, bool with_means) {
-    stage.load(splats, params.channels, first, list, id);
+    stage.load(params.splats, params.channels, first, list, id);
     if (id >= 0) {
       const int t = threadIdx.x;
       rows[t] = list.slot(k0 + t);
-      if (with_means) mean_maps[t] = F::mean_map(splats[id].shape);
+      if (with_means) mean_maps[t] = F::mean_map(load_splat<F>(splats, id).shape);
     }
   }
   /// Value v of the sums of all warps for pair j.
@@ -85,11 +86,11 @@ template <class F, int C, class Layout> struct MovingVjpShared {
   }
 };
 
-/// Which of the sums of a pair a lane has after put_warp_sums. Of few channels every lane has one.
+/// The number of the sum that a lane has after put_warp_sums.
 template <int C> __device__ int sum_of_lane() { return summed_value<(C <= kFewChannels) ? 6 + C : 8>(lane_id()); }
 
-/// Sums PairGrad and `channels` over a warp. `sums` is where the block has sum sum_of_lane() of the pair. All
-/// lanes must call it.
+/// Sums PairGrad and `channels` over a warp into `sums`, the address of sum sum_of_lane() of the pair. All lanes must
+/// call it.
 template <int C> __device__ void put_warp_sums(const PairGrad<float>& grad, const Values<C>& channels, float* sums) {
   const ShapeGrad<float>& shape = grad.shape;
   const float of_shape[6] = {shape.offset.x, shape.offset.y, shape.shape.xx,
@@ -111,8 +112,8 @@ template <int C> __device__ void put_warp_sums(const PairGrad<float>& grad, cons
   }
 }
 
-/// Sums MeanSums over a warp, where each lane has ShapeGrad::offset summed over its samples. `sums` is where
-/// MovingVjpShared has those of the pair. All lanes must call it.
+/// Sums MeanSums over a warp into sums[0] and sums[1]; `offset`: ShapeGrad::offset summed over the lane's samples. All
+/// lanes must call it.
 template <class Layout>
 __device__ void put_warp_means(const BlendVjpParams& params, const Mat2<float>& mean_map, Vec2<float> offset,
                                float* sums) {

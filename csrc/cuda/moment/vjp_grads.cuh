@@ -1,16 +1,16 @@
-// What the kernels of blend_vjp for footprints whose samples move read of a lane's pixel: the gradient with respect to
-// its samples, and where the last splats are that were composited into them.
+// A library for the backward kernels of footprints whose samples move: what they read for a lane's pixel. That is the
+// gradient of the image (dL_dimage, dL_dalpha), and `last` of blend: how far into the list each sample has composited.
 #pragma once
 
-#include "cuda/blend_moving.cuh"
+#include "cuda/moment/cells.cuh"
 
 namespace ar::cuda {
 
 /// The gradient with respect to a sample of a lane's pixel.
 template <class F, int C> struct SampleGrad {
   Values<C> channels;  ///< from `first` on
-  float through = 0;   ///< what the background gives
-  /// Several kernels have the channels, and this one, the first, adds those of the others to the gradient of alpha.
+  float through = 0;   ///< scalar product with the background
+  /// Whether this kernel, the first of several groups of channels, adds the others' share of the gradient of alpha.
   bool with_others;
 
   __device__ SampleGrad(const BlendVjpParams& params, const Pixel& pixel, int first)
@@ -29,7 +29,7 @@ template <class F, int C> struct SampleGrad {
     if (first == 0 && params.dL_dalpha && pixel.inside) through -= kSampleShare<F> * params.dL_dalpha[pixel.index];
   }
 
-  /// Its scalar product with the colour of a splat, `id()`.
+  /// The scalar product with the channels of splat id().
   template <class Id>
   __device__ float times(const Values<C>& color, const BlendVjpParams& params, const Pixel& pixel, Id&& id) const {
     float product = channels.v[0] * color.v[0];
@@ -44,8 +44,8 @@ template <class F, int C> struct SampleGrad {
   }
 };
 
-/// The place behind the last splat that was composited, in its tile's list: into each of a lane's samples, and into any
-/// of its warp.
+/// The number of pairs of the tile's list up to the last splat that was composited: into each of a lane's samples, and
+/// into any sample of its warp.
 template <class F, class Layout> struct SamplesLast {
   int samples[Layout::kCells], warp = 0;
 
@@ -60,7 +60,7 @@ template <class F, class Layout> struct SamplesLast {
     warp = warp_max(warp);
   }
 };
-/// And into any of its block.
+/// The same, and into any sample of its block.
 template <class F, class Layout> struct LastSplats : SamplesLast<F, Layout> {
   using SamplesLast<F, Layout>::warp;
   int block = 0;

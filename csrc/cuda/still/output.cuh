@@ -1,29 +1,24 @@
-// What the kernels of blend for up to four channels leave in memory: a list of the tiles that are still open,
-// checkpoints at the ends of chunks, and finished pixels.
+// A library for the forward kernels of footprints whose samples stay (front.cuh, tail.cuh): what they store. That is
+// checkpoints at the ends of chunks, for the tail and for the backward pass, and the finished pixels of the images.
 #pragma once
 
-#include "cuda/composite.cuh"
+#include "cuda/tile.cuh"
 
 namespace ar::cuda {
 
-/// List of the tiles with S samples that blend_front left open.
-template <int S> __device__ int32_t* open_tiles(const BlendParams& params) {
-  return params.open_tiles + sample_class(S) * params.grid.tiles();
+/// Chunks of the front of each tile.
+__device__ inline int front_of(const BlendParams& params) {
+  return front_chunks(params.grid, params.lists.counts->pairs, params.plan.blocks_at_once);
 }
 
-/// Chunks of the front of a tile with S samples.
-template <int S> __device__ int front_of(const BlendParams& params) {
-  return front_chunks(params.grid, params.lists.counts->pairs, S);
-}
-
-/// Checkpoints of a pixel of a tile, with the layout of CheckpointLayout.
+/// The checkpoints of a pixel of a tile, in the layout of CheckpointLayout.
 template <int S, int C, bool kKeep> struct PixelCheckpoints {
   float* base;  ///< of the tile's first plane
   int first_chunk, pixel;
 
   __device__ PixelCheckpoints(const BlendParams& params, int tile, int pixel)
       : base(params.checkpoints + int64_t(params.plan.tile_planes[tile]) * kTilePixels),
-        first_chunk(kKeep ? 0 : front_of<S>(params) - 1),
+        first_chunk(kKeep ? 0 : front_of(params) - 1),
         pixel(pixel) {}
 
   __device__ Checkpoint<C>& kept(int chunk, int s) const {
@@ -58,8 +53,8 @@ template <int S, int C, bool kKeep> struct PixelCheckpoints {
   }
 };
 
-/// A pixel's transmittance in the checkpoints, with or without a backward pass: for kernels that are compiled once for
-/// any number of channels.
+/// The transmittance of a pixel in the checkpoints, with or without a backward pass: for kernels that are compiled once
+/// for any number of channels.
 template <int S> struct TransmittancePlanes {
   float* base;
   int first_chunk;
@@ -68,7 +63,7 @@ template <int S> struct TransmittancePlanes {
   __device__ TransmittancePlanes(const BlendParams& params, int tile, int pixel) {
     const CheckpointLayout layout = params.layout;
     const int of_sample = layout.keep ? layout.channels + 1 : 1;
-    first_chunk = layout.first_chunk(front_of<S>(params));
+    first_chunk = layout.first_chunk(front_of(params));
     chunk_stride = int64_t(layout.planes(S)) * kTilePixels;
     sample_stride = int64_t(of_sample) * kTilePixels;
     base =
@@ -86,21 +81,22 @@ template <int C> __device__ Values<C> background_of(const BlendParams& params) {
   return background;
 }
 
-/// Writes a pixel whose samples are complete. `total` is the sum of their channels. All lanes of a warp must call it.
-template <class F, int C>
+/// Writes a pixel whose samples are complete to the images; `total`: the sum of their channels. `Samples`: a footprint or
+/// LaneSamples. All lanes of a warp must call it.
+template <class Samples, int C>
 __device__ void store_pixel(const BlendParams& params, Pixel pixel, Values<C> total,
-                            const float (&transmittance)[F::kSamples]) {
+                            const float (&transmittance)[Samples::kSamples]) {
   float through = 0;
 #pragma unroll
-  for (int s = 0; s < F::kSamples; ++s) {
+  for (int s = 0; s < Samples::kSamples; ++s) {
     through += abs(transmittance[s]);
-    if (params.transmittance && pixel.inside) params.transmittance[sample_index<F>(pixel, s)] = abs(transmittance[s]);
+    if (params.transmittance && pixel.inside) params.transmittance[sample_index<Samples>(pixel, s)] = abs(transmittance[s]);
   }
-  through = sum_of_pixel<F>(through);
+  through = sum_of_pixel<Samples>(through);
 #pragma unroll
-  for (int c = 0; c < C; ++c) total.v[c] = sum_of_pixel<F>(total.v[c]);
-  if (!pixel.inside || !writes_pixel<F>(lane_id())) return;
-  const float scale = kSampleShare<F>;
+  for (int c = 0; c < C; ++c) total.v[c] = sum_of_pixel<Samples>(total.v[c]);
+  if (!pixel.inside || !writes_pixel<Samples>(lane_id())) return;
+  const float scale = kSampleShare<Samples>;
 #pragma unroll
   for (int c = 0; c < C; ++c) {
     if (C > 3 && c >= params.channels.count) break;
@@ -114,13 +110,13 @@ template <class F> __device__ void store_last(const BlendParams& params, Pixel p
   for (int s = 0; s < F::kSamples; ++s) params.last[sample_index<F>(pixel, s)] = last[s];
 }
 
-/// Turns the checkpoints of a sample's chunks [first, end), which hold the channels of the chunk itself, into the
-/// channels of everything behind the chunk, from which blend_vjp starts. `behind`: the channels of what is behind all
-/// of them. These are sums of positive terms, which do not cancel. kBatch: chunks that are loaded before the first
-/// store, so that the loads wait for memory together.
+/// The checkpoints of a sample's chunks [first, end) hold the channels of the chunk itself. Turns each into the channels
+/// of everything farther than the chunk, where blend_vjp starts: sums of positive terms, which do not cancel.
+/// `farther`: the channels of what is farther than all of them. kBatch chunks are loaded before the first store, so that
+/// the loads wait for memory together.
 template <int kBatch, int S, int C>
-__device__ void accumulate_behind(const PixelCheckpoints<S, C, true>& checkpoints, int first, int end, int s,
-                                  Values<C> behind) {
+__device__ void accumulate_farther(const PixelCheckpoints<S, C, true>& checkpoints, int first, int end, int s,
+                                  Values<C> farther) {
   for (int last = end - 1; last >= first; last -= kBatch) {
     Values<C> own[kBatch];
 #pragma unroll
@@ -130,8 +126,8 @@ __device__ void accumulate_behind(const PixelCheckpoints<S, C, true>& checkpoint
 #pragma unroll
     for (int k = 0; k < kBatch; ++k) {
       if (last - k < first) continue;
-      checkpoints.kept(last - k, s).channels = behind;
-      behind += own[k];
+      checkpoints.kept(last - k, s).channels = farther;
+      farther += own[k];
     }
   }
 }

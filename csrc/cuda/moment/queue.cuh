@@ -1,19 +1,16 @@
-// Blending of pixels that look ahead in their lists (blend_listed.cuh), for footprints whose samples move.
-//
-// Each pixel of a warp has a queue of the splats that reach it, and takes the next ones when it has composited those
-// before, wherever in the tile's list they are: it does not wait for splats that reach only its neighbours. Several
-// lanes have the same sample. Where the last pixels of a picture would be waited for, the warps of a block share the
-// samples of one.
+// A library for listed_blend_kernel (listed.cuh): pixels that look ahead in their lists, for footprints whose samples
+// move. Each pixel of a warp has a queue of the splats that reach it, filled from the bits that filter_kernel wrote, and
+// does not wait for splats that reach only its neighbours. Several lanes have the same sample: each tests another
+// splat, and the first splat that shows is composited. In the longest lists the warps of a block share the samples of
+// one pixel.
 #pragma once
 
-#include "cuda/blend_moving.cuh"
-#include "cuda/cut_lists.cuh"
+#include "cuda/moment/cells.cuh"
 
 namespace ar::cuda {
 
-/// A warp of kPixelsOfWarp pixels, or one pixel for the kWarpsOfPixel warps of a block, each with its own samples. Of
-/// the lanes of a warp a sample has several, kAhead, which are neighbours. The last lanes may be left over, and have
-/// none, and so may the last warp.
+/// A warp has kPixelsOfWarp pixels; or the kWarpsOfPixel warps of a block have one pixel, each warp other samples of it.
+/// A sample has kAhead neighbouring lanes.
 template <class F, int kSide, int kPixelsOfWarp, int kWarpsOfPixel = 1>
 struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, false, kWarpsOfPixel> {
   using Base = CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, false, kWarpsOfPixel>;
@@ -21,14 +18,13 @@ struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, fal
   static constexpr int kOfWarp = (F::kSamples + kWarpsOfPixel - 1) / kWarpsOfPixel, kAhead = Base::kLanes / kOfWarp;
   static_assert(kAhead > 0 && (Base::kLanes % kOfWarp == 0 || Base::kLanes == 32));
   static_assert(kWarpsOfPixel == 1 || kPixelsOfWarp == 1);
-  /// Places for staged splats: 32, and some behind them, which hold none, as the lanes of a sample look at kAhead at
-  /// once.
+  /// Staged splats: 32, and empty ones up to a multiple of kAhead, as the lanes of a sample test kAhead at once.
   static constexpr int kPlaces = (32 + kAhead - 1) / kAhead * kAhead;
   __device__ static int first_sample() {
     const int of_warp = lane_id() % Base::kLanes / kAhead;
     return of_warp < kOfWarp ? int(threadIdx.x) / 32 % kWarpsOfPixel * kOfWarp + of_warp : F::kSamples;
   }
-  /// This lane's place among those of its sample.
+  /// This lane's number among the lanes of its sample.
   __device__ static int ahead() { return lane_id() % kAhead; }
   __device__ static bool owns() { return ahead() == 0; }
   /// The lanes of this lane's sample, and the first of them.
@@ -57,22 +53,22 @@ struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, fal
   }
 };
 
-/// Where the bits of a pixel of a tile of kSide x kSide pixels are: that of pair k is bit k % 32 of word k / 32.
-/// `first`: of the segments of the tile's list.
+/// The index in reach_words of the bits of a pixel, in tiles of kSide x kSide pixels. The bit of pair k is bit k % 32 of
+/// the pixel's word k / 32. `first`: number of the first segment of the tile's list.
 template <class F, int kSide> __device__ int64_t pixel_words(int first, const TileList& list, int pixel_number) {
   constexpr int kPixels = kSide * kSide, kSegment = moving_segment(F::kSamples, kSide);
   const int segments = (list.count + kSegment - 1) / kSegment;
   return (int64_t(first) * kPixels + pixel_number * segments) * (kSegment / 32);
 }
 
-/// The checkpoints of a lane's samples that blend has still to leave, of a list that is cut into segments of kSegment
-/// pairs: one in front of each segment, and all within the first one. Those within the others are left by
-/// segment_maps_kernel, which goes through them side by side, where here every sample would wait for them.
+/// The checkpoints of a lane's samples that are still to be stored, for a list that is cut into segments of kSegment
+/// pairs: one before each segment, and all within the first. segment_maps_kernel stores the checkpoints within the other
+/// segments, side by side; here every sample would wait for them.
 template <int kSegment> struct CheckpointsAhead {
-  int pair;   ///< the next one is in front of this pair
-  float* to;  ///< and there
+  int pair;   ///< the next checkpoint is before this pair
+  float* to;  ///< its address
 
-  /// Leaves `samples` in those up to pair k.
+  /// Stores `samples` in the checkpoints up to pair k.
   template <class Samples> __device__ void store_up_to(int k, const Samples& samples) {
 #pragma unroll 1
     while (pair <= k) {
@@ -84,26 +80,22 @@ template <int kSegment> struct CheckpointsAhead {
   }
 };
 
-/// Places in the queues of a warp.
-inline constexpr int kQueued = 1024;
-
-/// For each pixel of a warp, the pairs that reach it, front to back: a queue, which is filled from the bits of
-/// filter_kernel.
+/// For each pixel of a warp a queue of the pairs that reach it, front to back, filled from the bits of filter_kernel.
 template <class Layout> struct PairQueues {
-  using Bits = uint16_t;                                  ///< what a lane takes at a time
-  static constexpr int kBits = 16;                        ///< of pairs that follow each other
-  static constexpr int kAtOnce = kBits * Layout::kLanes;  ///< pairs of which a pixel's lanes take the bits at a time
+  using Bits = uint16_t;                                  ///< what a lane reads at a time
+  static constexpr int kBits = 16;                        ///< for adjacent pairs
+  static constexpr int kAtOnce = kBits * Layout::kLanes;  ///< pairs whose bits a pixel's lanes read at a time
   static constexpr uint32_t kRoom = 2 * kAtOnce;
   using Memory = int32_t[Layout::kPixels][kRoom];
   static_assert(sizeof(Memory) == kQueued * sizeof(int32_t));
 
   int32_t* pairs;               ///< of this lane's pixel
-  const Bits* words;            ///< of this lane, from those that are read next on
-  int lane;                     ///< among those of the pixel
+  const Bits* words;            ///< of this lane, from the next word on
+  int lane;                     ///< number of this lane among the lanes of the pixel
   int count;                    ///< pairs of the list; 0 when no more are wanted
-  int next = 0;                 ///< the pair whose bit is the first that the pixel's lanes take next
+  int next = 0;                 ///< first pair whose bit has not been read
   uint32_t begin = 0, end = 0;  ///< of the pairs in the queue, counted from the first that was ever in it
-  uint32_t bits;                ///< that this lane takes next
+  uint32_t bits;                ///< of this lane, the next to enter the queue
 
   /// `reach_words`: of the pixel. All lanes must call it.
   __device__ PairQueues(Memory& memory, const uint32_t* reach_words, int count)
@@ -114,7 +106,7 @@ template <class Layout> struct PairQueues {
   }
   /// Whether any of the pairs from `next` on are this lane's.
   __device__ bool has_bits() const { return next + kBits * lane < count; }
-  /// Takes bits until more pairs than kAtOnce are queued, if there are so many. All lanes must call it.
+  /// Reads bits until more pairs than kAtOnce are queued, if there are so many. All lanes must call it.
   __device__ void fill() {
     __syncwarp();  // all have read what they took
     const auto wanted = [&] { return next < count && end - begin <= kRoom - kAtOnce; };
@@ -122,16 +114,16 @@ template <class Layout> struct PairQueues {
       uint32_t mine = wants ? bits : 0;
       const int before = next + kBits * lane - 1;
       const int found = __popc(mine);
-      int behind = found;  // of the pixel's lanes up to this one
+      int up_to = found;  // pairs of the pixel's lanes up to this one
 #pragma unroll
       for (int offset = 1; offset < Layout::kLanes; offset *= 2) {
-        const int of_lanes_before = shuffle_up(behind, offset);
-        if (lane >= offset) behind += of_lanes_before;
+        const int of_lanes_before = shuffle_up(up_to, offset);
+        if (lane >= offset) up_to += of_lanes_before;
       }
-      uint32_t place = end + uint32_t(behind - found);
-      for (; mine != 0; mine &= mine - 1) pairs[place++ % kRoom] = before + __ffs(int(mine));
-      end += uint32_t(shuffle(behind, lane_id() | (Layout::kLanes - 1)));
-      // The bits behind these are read straight into their place, so that nothing waits for them before they are taken.
+      uint32_t to = end + uint32_t(up_to - found);
+      for (; mine != 0; mine &= mine - 1) pairs[to++ % kRoom] = before + __ffs(int(mine));
+      end += uint32_t(shuffle(up_to, lane_id() | (Layout::kLanes - 1)));
+      // The next bits are read straight into their register, so that nothing waits for them before they are used.
       next += wants ? kAtOnce : 0;
       bits = wants ? 0 : bits;
       if (wants && has_bits()) bits = words[next / kBits];
@@ -148,38 +140,37 @@ template <class Layout> struct PairQueues {
   }
 };
 
-/// The splats that each pixel of a warp is about to composite, and the queues that they come from.
+/// The splats that each pixel of a warp is about to composite, and the queues that they come from, in shared memory.
 template <class F, int C, int kPlaces> struct QueuedStage {
   TileSplat<F, C> splats[kPlaces];
   int32_t pairs[kPlaces];
   int32_t queues[kQueued];
 };
 
-/// Splats of a list on their way from memory into QueuedStage: the next ones of the pixel of this lane, which has one
-/// of them.
+/// The next splats of the pixel of this lane on their way from memory into QueuedStage. The lane has one of them.
 template <class F, int C, class Layout> struct QueuedSplats {
-  const Splat<F, float>* splats_in;
+  const float* splats_in;
   const Channels<float>& channels_in;
   const TileList& list;
   int first_channel;
-  int n = 0, next_n = 0;  ///< of the pixel: splats that are read, and those behind
+  int n = 0, next_n = 0;  ///< of the pixel: splats that are read, and the ones after them
   int pair, next_pair;
-  int32_t next_id = 0;  ///< of any splat, where there is none behind
+  int32_t next_id = 0;  ///< of any splat, where there is no next one
   Splat<F, float> splat;
   Values<C> channels;
 
   __device__ QueuedSplats(const BlendParams& params, const TileList& list, int first_channel)
-      : splats_in(reinterpret_cast<const Splat<F, float>*>(params.splats)),
+      : splats_in(params.splats),
         channels_in(params.channels),
         list(list),
         first_channel(first_channel) {}
 
-  /// Reads the splats that were next, and takes the pairs behind them from the queue.
+  /// Reads the splats that were next, and takes the pairs after them from the queue.
   template <class Queues> __device__ void advance(Queues& queues) {
     n = next_n;
     pair = next_pair;
     // By all lanes, and so straight into the registers: the compiler would wait to copy what only some lanes read.
-    splat = splats_in[next_id];
+    splat = load_splat<F>(splats_in, next_id);
     channels = channels_of<C>(channels_in, splat, next_id, first_channel);
     take_next(queues);
   }
@@ -191,12 +182,11 @@ template <class F, int C, class Layout> struct QueuedSplats {
     }
     queues.begin += uint32_t(next_n);
   }
-  /// Puts the splat that was read into the stage. `light`: what the steps before have left of it.
+  /// Puts the splat that was read into the stage. `light`: the transmittance after the steps before.
   ///
-  /// Every listed splat has a level above 0, and no `x_given_y` is negative, so that the comparison is never true.
-  /// Without it nothing would need these two, which are read together with numbers that are needed: the compiler would
-  /// use their registers for something else, and for that wait until the splat has arrived. And without `light` it
-  /// would compare, and wait, in front of the steps.
+  /// The comparison is never true, since a listed splat has a level above 0 and no negative x_given_y. It keeps the
+  /// registers of these two numbers in use: the compiler would else use them for something else, and wait for that until
+  /// the splat has arrived. `light` keeps the compiler from comparing, and waiting, before the steps.
   template <class Stage> __device__ void put(Stage& stage, int lane, float light) const {
     if (lane >= n || splat.level + splat.shape.x_given_y <= min(light, 0.0f)) return;
     stage.splats[lane_id()] = {cell_terms(splat, list), channels};
@@ -204,10 +194,9 @@ template <class F, int C, class Layout> struct QueuedSplats {
   }
 };
 
-/// Composites the staged splats of each pixel, `n` of this lane's, from first_staged on. Most splats that reach a pixel
-/// do not show in a sample, since they are small: the lanes of a sample look at as many splats at once, and composite
-/// the first that shows. Then those behind it are looked at again, since the node has moved. All lanes must call
-/// it.
+/// Composites the staged splats of each pixel, n of this lane's pixel from first_staged on. Most splats that reach a
+/// pixel are small and do not show in a sample: the lanes of a sample test kAhead splats at once, composite the first
+/// that shows, and test the later ones again, since the node has moved. All lanes must call it.
 template <class F, class Layout, bool kKeep, class Stage, class Blend, class Checkpoints>
 __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& blend, Checkpoints& checkpoints) {
   constexpr int kAhead = Layout::kAhead;
@@ -215,17 +204,17 @@ __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& 
   const int own = lane_id(), first_lane = Layout::first_sharer();
   float& transmittance = blend.samples.transmittance[0];
   Vec2<float>& place = blend.samples.place[0];
-  int taken = first_staged + Layout::ahead();  // this lane's, whether there is one or not
-  int left = n;                                // splats from that of the sample's first lane on
+  int taken = first_staged + Layout::ahead();  // the splat of this lane, if there is one
+  int left = n;                                // splats from the one of the sample's first lane on
   auto splat = stage.splats[taken];
   int pair = stage.pairs[taken];
-  // Lanes of the sample with a splat, none behind which has been composited.
+  // Lanes of the sample with a splat that may still be composited.
   const auto lanes_with_splats = [&] {
     const int count = min(left, kAhead);
     return transmittance > 0 && count > 0 ? kAllLanes >> (32 - count) << first_lane : 0u;
   };
   uint32_t live = lanes_with_splats();
-  // Lanes with a pair in front of which there is a checkpoint to be left.
+  // Lanes with a pair before which a checkpoint is to be stored.
   const auto lanes_at_checkpoint = [&] { return kKeep ? __ballot_sync(kAllLanes, pair >= checkpoints.pair) : 0u; };
   uint32_t at_checkpoint = lanes_at_checkpoint();
   while (true) {
@@ -235,18 +224,18 @@ __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& 
     const uint32_t all_hits = __ballot_sync(kAllLanes, hit), hits = all_hits & Layout::sharers();
     if (kOnce && all_hits == 0) break;
     const int first = __ffs(int(hits)) - 1;  // the lane whose splat is composited, if there is one
-    float behind = transmittance;
+    float left_over = transmittance;
     Vec2<float> moved = place;
-    const Blended<float> b = blend_placed_sample<F>(splat.terms, z, raw, UnitCell<F::kSide>(), behind, moved);
+    const Blended<float> b = blend_placed_sample<F>(splat.terms, z, raw, UnitCell<F::kSide>(), left_over, moved);
     if (first == own) blend.add(b, splat.channels, pair);
     if (kKeep && (hits & -hits & at_checkpoint) != 0)
       checkpoints.store_up_to(stage.pairs[taken - own + first], blend.samples);
-    behind = shuffle(behind, first);
+    left_over = shuffle(left_over, first);
     moved = {shuffle(moved.x, first), shuffle(moved.y, first)};
     if (hits != 0) {
-      transmittance = behind;
+      transmittance = left_over;
       place = moved;
-      live = behind > 0 ? live & (kAllLanes - 1) << first : 0;
+      live = left_over > 0 ? live & (kAllLanes - 1) << first : 0;
     }
     if constexpr (!kOnce) {
       if (hits == 0 || live == 0) {
@@ -263,8 +252,8 @@ __device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& 
   }
 }
 
-/// Blends the pixels of a warp by looking ahead, as Layout shares them out; C channels from `first` on.
-/// `first_segment`: of the list.
+/// Blends the pixels of a warp, as Layout shares them out, by queues; C channels from `first` on. `first_segment`: the
+/// number of the list's first segment. `kKeep`, `kSegment`: for a backward pass with segments of so many pairs.
 template <class F, int C, class Layout, bool kKeep, int kSegment, class Stage>
 __device__ void blend_queued(const BlendParams& params, int first, int tile, const TileList& list, int first_segment,
                              Stage& stage) {
@@ -278,7 +267,7 @@ __device__ void blend_queued(const BlendParams& params, int first, int tile, con
   const int64_t words = pixel_words<F, Layout::kSide>(first_segment, list, Layout::pixel_number());
   Queues queues(reinterpret_cast<typename Queues::Memory&>(stage.queues), params.reach_words + words,
                 pixel.inside ? list.count : 0);
-  // While splats are composited, those behind them are read, and before that which ones these are.
+  // While splats are composited, the next ones are read, and the numbers of the ones after those.
   QueuedSplats<F, C, Layout> next(params, list, first);
   next.take_next(queues);
   queues.fill();

@@ -1,35 +1,32 @@
-// Kernels of blend for footprints whose samples move, for lists that are cut (cut_lists.cuh): a list for each pixel.
+// Kernels filter and listed_blend: the forward pass of footprints whose samples move, for lists that are cut
+// (cut_lists.h). blend_moment (blend.cu) launches them before moving_blend.
 //
-// In a small image of a large scene a tile of 8x8 pixels may have hundreds of thousands of splats, most of them smaller
-// than a pixel. What takes the time is the longest sequence of splats that some sample meets one after the other. So
-// the list of a tile is first filtered, all parts of it side by side, into a bit for each splat and pixel: whether it
-// reaches it. Then each warp walks the splats of a few neighbouring pixels, and waits for no other. It takes those
-// that reach any of them 32 at a time. Each lane goes through those of its own pixel alone, so that in one step the
-// pixels of a warp composite different splats. With one cell, and in the longest lists with more, each pixel takes
-// its own splats and many lanes have the same sample (blend_queued.cuh).
+// In a small image of a large scene a tile may have hundreds of thousands of splats, most of them smaller than a pixel.
+// The time is that of the longest sequence of splats that some sample meets. So filter_kernel first tests all pairs of a
+// list side by side, and writes a bit for each pair and pixel (reach_words). Then listed_blend_kernel has a warp for a
+// few neighbouring pixels: either each pixel takes its own splats from a queue (queue.cuh), or the warp walks the splats
+// that reach any of its pixels, and each lane composites only the ones of its own pixel.
 #pragma once
 
-#include "cuda/blend_queued.cuh"
 #include "cuda/launch.cuh"
+#include "cuda/moment/queue.cuh"
 
 namespace ar::cuda {
 
-/// Pairs of a tile's list that a block of filter_kernel looks at at a time.
-inline constexpr int kFilterPiece = 256, kFilterWords = kFilterPiece / 32;
-/// Pairs whose bits a warp takes at once: a word for each lane.
+inline constexpr int kFilterWords = kFilterPiece / 32;
+/// Pairs whose bits a warp reads at once: a word for each lane.
 inline constexpr int kListedBatch = 32 * 32;
 
-/// A warp of kPixelsOfWarp pixels, a sample for each lane. The more pixels a warp has, the fewer steps it takes for
-/// each of them, and the more of them wait for the longest list.
+/// A warp has kPixelsOfWarp pixels, and each lane a sample. With more pixels a warp takes fewer steps for each, and more
+/// pixels wait for the longest list.
 template <class F, int kSide, int kPixelsOfWarp, int kWarps>
 struct SampleLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarps> {};
 
-/// Bit x: the span holds x0 + x, of a row of a tile of kSide pixels that begins at x0. The differences are exact
-/// wherever they decide.
+/// Bit x: the span holds pixel x0 + x of a row of kSide pixels. The differences are exact wherever they decide.
 template <int kSide> __device__ uint32_t row_bits(const Span<float>& span, float x0) {
   const int first = int(std::ceil(min(max(span.lo - x0, 0.0f), float(kSide))));
-  const int behind = int(std::floor(min(max(span.hi - x0, -1.0f), float(kSide - 1)))) + 1;
-  return ((1u << behind) - 1) & ~((1u << first) - 1);
+  const int end = int(std::floor(min(max(span.hi - x0, -1.0f), float(kSide - 1)))) + 1;
+  return ((1u << end) - 1) & ~((1u << first) - 1);
 }
 
 /// The bits of a warp with lanes and bits exchanged: bit b of lane l becomes bit l of lane b. In step s lanes whose
@@ -45,14 +42,13 @@ __device__ inline uint32_t transpose_bits(uint32_t bits) {
   return bits;
 }
 
-/// A thread per pair of a list that is cut: which pixels its splat reaches.
+/// A thread per pair of a list that is cut: writes to reach_words which pixels of the tile its splat reaches.
 template <class F, int kSide> __global__ void __launch_bounds__(kFilterPiece) filter_kernel(const BlendParams params) {
   wait_for_earlier_kernels();  // first: moving_blend_kernel, which does not wait, reads the plan
   let_next_kernel_begin();
   constexpr int kRowsOfWord = 32 / kSide, kPixels = kSide * kSide, kWords = (kPixels + 31) / 32;
   constexpr int kPieces = moving_segment(F::kSamples, kSide) / kFilterPiece;  // of a segment
   __shared__ uint32_t words[kPixels][kFilterWords];
-  const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const PlanState& plan = *params.plan.state;
   for (int number = blockIdx.x; number < plan.counts.segments * kPieces; number += gridDim.x) {
     const ListSegment segment(plan, params.plan.chunk_order, number / kPieces);
@@ -60,7 +56,7 @@ template <class F, int kSide> __global__ void __launch_bounds__(kFilterPiece) fi
     const int piece = segment.index * kPieces + number % kPieces, k = piece * kFilterPiece + int(threadIdx.x);
     uint32_t reach[kWords] = {};  // a bit per pixel
     if (k < list.count) {
-      const Support<float> support = support_of(splats[list.splat(k)]);
+      const Support<float> support = support_of(load_splat<F>(params.splats, list.splat(k)));
 #pragma unroll
       for (int row = 0; row < kSide; ++row) {
         const float y = float(list.y0 + row);
@@ -83,42 +79,42 @@ template <class F, int kSide> __global__ void __launch_bounds__(kFilterPiece) fi
   }
 }
 
-/// What a warp of up to kMostPixels pixels keeps of the splats that it is about to composite.
+/// The splats that a warp of up to kMostPixels pixels is about to composite, in shared memory.
 template <class F, int C, int kMostPixels> struct ListedStage {
   TileSplat<F, C> splats[32];
   int32_t ids[kListedBatch];
-  uint16_t places[kListedBatch];    ///< of the pairs in the batch
+  uint16_t numbers[kListedBatch];   ///< of the pairs in the batch
   uint32_t words[kMostPixels][32];  ///< the batch's bits of each pixel
 
-  /// Takes the pairs of a batch that begins at k, of which each lane has the word of bits of each pixel in `words`, in
-  /// order. Returns how many reach any pixel. All lanes must call it.
-  template <class Layout> __device__ int take(const Splat<F, float>* splats_in, const TileList& list, int k) {
+  /// Lists the pairs of a batch that reach any pixel, from `words`, and returns their number. The batch begins at pair k.
+  /// All lanes must call it.
+  template <class Layout> __device__ int collect(const float* splats_in, const TileList& list, int k) {
     const int lane = lane_id();
     uint32_t word = 0;
 #pragma unroll
     for (int i = 0; i < Layout::kPixels; ++i) word |= words[i][lane];
-    const int count = __popc(word), behind = warp_inclusive_sum(count);  // of the words up to this lane's
-    int to = behind - count;
-    for (; word != 0; word &= word - 1) places[to++] = uint16_t(32 * lane + __ffs(word) - 1);
-    const int all = __shfl_sync(kAllLanes, behind, 31);
+    const int count = __popc(word), up_to = warp_inclusive_sum(count);  // of the words up to this lane's
+    int to = up_to - count;
+    for (; word != 0; word &= word - 1) numbers[to++] = uint16_t(32 * lane + __ffs(word) - 1);
+    const int all = __shfl_sync(kAllLanes, up_to, 31);
     __syncwarp();
 #pragma unroll 4
     for (int i = lane; i < all; i += 32) {
-      const int32_t id = list.splat(k + places[i]);
+      const int32_t id = list.splat(k + numbers[i]);
       ids[i] = id;
-      prefetch(splats_in + id);
+      prefetch_splat(splats_in, id);
     }
     return all;
   }
 
-  /// Of the pairs [from, from + 32) of those that were taken, `count` in all, those that reach this lane's pixel, in
-  /// the order of take_first. All lanes must call it.
+  /// Which of the collected pairs in [from, from + 32), `count` in all, reach this lane's pixel, in the order of
+  /// take_first. All lanes must call it.
   template <class Layout> __device__ uint32_t reached(int from, int count) const {
-    const int lane = 31 - lane_id(), place = from + lane < count ? places[from + lane] : 0;
+    const int lane = 31 - lane_id(), number = from + lane < count ? numbers[from + lane] : 0;
     uint32_t mine = 0;
 #pragma unroll
     for (int i = 0; i < Layout::kPixels; ++i) {
-      const bool reaches = from + lane < count && (words[i][place / 32] >> (place % 32) & 1);
+      const bool reaches = from + lane < count && (words[i][number / 32] >> (number % 32) & 1);
       const uint32_t reached = __ballot_sync(kAllLanes, reaches);
       if (lane_id() / Layout::kLanes == i) mine = reached;
     }
@@ -126,12 +122,12 @@ template <class F, int C, int kMostPixels> struct ListedStage {
   }
 };
 
-/// Blends the pixels of a warp, as Layout shares them out; C channels from `first` on. `first_segment`: of the list.
+/// Blends the pixels of a warp, as Layout shares them out, by walking the splats that reach any of them; C channels from
+/// `first` on. `first_segment`: the number of the list's first segment. `kKeep`, `kSegment`: as in blend_queued.
 template <class F, int C, class Layout, bool kKeep, int kSegment, class Stage>
 __device__ void blend_listed(const BlendParams& params, int first, int tile, const TileList& list, int first_segment,
                              Stage& stage) {
   constexpr int kPixels = Layout::kPixels;
-  const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int lane = lane_id();
   const StatePlaces places(params.lists, list, params.grid, tile);
   const Vec2<float> p = Layout::pixel();
@@ -157,12 +153,12 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
       stage.words[i][lane] = open & kFirst << (i * Layout::kLanes) ? words[i] : 0u;
     }
     read_words(k0 + kListedBatch);  // so that the next batch need not wait for memory
-    const int count = stage.template take<Layout>(splats, list, k0);
+    const int count = stage.template collect<Layout>(params.splats, list, k0);
     for (int from = 0; from < count && open; from += 32) {
       __syncwarp();  // all have read the splats before
       if (from + lane < count) {
         const int32_t id = stage.ids[from + lane];
-        const Splat<F, float> splat = splats[id];
+        const Splat<F, float> splat = load_splat<F>(params.splats, id);
         stage.splats[lane] = {cell_terms(splat, list), channels_of<C>(params.channels, splat, id, first)};
       }
       uint32_t left = stage.template reached<Layout>(from, count);
@@ -171,16 +167,16 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
       // Each step waits for the one before. The next splat, which need not, is read meanwhile.
       int j = __clz(int(left)) % 32;
       TileSplat<F, C> splat = stage.splats[j];
-      int k = k0 + stage.places[from + j];
+      int k = k0 + stage.numbers[from + j];
       while (left != 0) {
         left ^= 1u << (31 - j);
         j = __clz(int(left)) % 32;
         const TileSplat<F, C> next = stage.splats[j];
-        const int next_place = stage.places[from + j];
+        const int next_number = stage.numbers[from + j];
         if (kKeep) checkpoints.store_up_to(k, blend.samples);
         blend.add(splat, k + 1, blend.last);
         splat = next;
-        k = k0 + next_place;
+        k = k0 + next_number;
       }
       open = __ballot_sync(kAllLanes, blend.samples.open());
     }
@@ -189,44 +185,34 @@ __device__ void blend_listed(const BlendParams& params, int first, int tile, con
   blend.write(params, first, pixel);
 }
 
-/// Blocks of filter_kernel where not all lists are cut, and warps of listed_blend_kernel in large images: as many as
-/// leave most of a large device to the kernel that is to begin beside them, which only does when all of them have
-/// begun. In small images with tiles of 4x4 pixels that kernel has so little to do that lists need not leave it
-/// anything.
-inline constexpr int kFilterBlocks = 264, kWarpsBeside = 1024;
-/// In small images, for so many of the longest lists each warp has one task.
-inline constexpr int kLongestAtOnce = 128;
+template <class F> inline constexpr int kListedWarps = listed_warps(F::kSamples);
 
-/// Warps of a block of listed_blend_kernel. They share a pixel of the longest lists, so that a sample has 32, 32, 10 or
-/// 8 lanes with 1, 4, 9 or 16 samples.
-template <class F> inline constexpr int kListedWarps = F::kSamples == 1 ? 1 : 4;
-
-/// How the pixels of a tile are shared out among warps. Which of these layouts is quickest was measured
+/// How the pixels of a tile are shared out among warps. The quickest of these layouts was found by measurement
 /// (docs/performance-log.md, "`moment`: a queue for each pixel" and "`moment`: small tiles, and pixels of four warps").
 template <class F, int kSide> struct ListedLayouts {
   static constexpr int kWarps = kListedWarps<F>;
   using Longest = AheadLayout<F, kSide, 1, kWarps>;
-  /// Other lists, of which there are none with more than four samples. With one, lanes look ahead in these too.
+  /// Other lists: with one sample they have queues too, with four they are walked, with more there are none.
   static constexpr bool kAhead = F::kSamples == 1, kWalked = F::kSamples == 4;
   using Ahead = AheadLayout<F, kSide, 2>;
   using Long = SampleLayout<F, kSide, 2, kWarps>;  ///< from kLongList pairs on
   using Short = SampleLayout<F, kSide, kWalked ? 8 : 2, kWarps>;
-  /// Blocks of a list; of one that is short, the first of them have its pixels. With more than four samples kOfOthers
-  /// only says how many more blocks there are.
+  /// Blocks of a list. The first blocks of a short list have its pixels.
   static constexpr int kOfLongest = Longest::kBlocks, kOfOthers = Long::kBlocks;
   static_assert(kOfLongest % kOfOthers == 0 && kOfOthers % Short::kBlocks == 0);
 
-  /// How many are launched: a multiple of those that one of the longest lists takes, so that a block is at the same
-  /// place in every tile that it goes on to.
-  static unsigned blocks(const ListCut& cut, TileGrid grid) {
+  /// Blocks to launch: a multiple of the blocks of one of the longest lists, so that a block has the same pixels in every
+  /// tile that it goes on to. In small images moving_blend has little to do, and they need not leave it any room.
+  static unsigned blocks(const ListCut& cut, TileGrid grid, int multiprocessors) {
     const int64_t longest = std::min(cut.max_lists, kLongestAtOnce), lists = cut.max_lists;
-    const int64_t wanted = is_small_image(grid) ? longest * kOfLongest + lists * kOfOthers : kWarpsBeside / kWarps;
+    const int64_t wanted = is_small_image(grid) ? longest * kOfLongest + lists * kOfOthers
+                                               : kListedWarpsOfSm * multiprocessors / kWarps;
     const int64_t blocks = std::min(wanted, lists * kOfLongest);
     return unsigned((blocks + kOfLongest - 1) / kOfLongest * kOfLongest);
   }
 };
 
-/// What a warp keeps of the splats that it is about to composite.
+/// The splats that a warp is about to composite, in shared memory.
 template <class F, int C, int kSide> union WarpStage {
   using Layouts = ListedLayouts<F, kSide>;
   QueuedStage<F, C, Layouts::Longest::kPlaces> queued;
@@ -234,7 +220,7 @@ template <class F, int C, int kSide> union WarpStage {
 };
 
 /// A warp per few pixels of a tile whose list is cut, or a block per pixel of the longest lists, which come first.
-/// `kSegment`: pairs of a segment in the backward pass.
+/// Blends the C channels from `first` on. `kKeep`: stores checkpoints and `last`; `kSegment`: pairs of a segment.
 template <class F, int C, int kSide, bool kKeep, int kSegment = moving_segment(F::kSamples, kSide)>
 __global__ void __launch_bounds__(32 * kListedWarps<F>) listed_blend_kernel(const BlendParams params, int first) {
   let_next_kernel_begin();  // so that moving_blend_kernel does not wait for filter_kernel either

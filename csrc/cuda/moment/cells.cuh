@@ -1,30 +1,25 @@
-// Kernel of blend for footprints whose samples move: a block per tile, a lane per few samples of a pixel.
-//
-// What a splat does to a sample depends on where the sample is when they meet, so that the chunks of a list cannot be
-// blended side by side as in blend.cuh: a block walks its whole list. What fills the device instead is that samples are
-// spread over lanes and that tiles are small where there are several. It also wastes less: the fewer pixels a warp has,
-// the fewer splats pass through it that touch only some of them. Lists that are cut, which cut_lists.cuh decides, have
-// the kernels of blend_listed.cuh in its place.
+// A library for the kernels of footprints whose samples move (moment/): how the samples, or cells, of a tile are shared
+// out among lanes, the state of a lane's samples and its checkpoints, the splats that a block stages, and compositing a
+// splat into a pixel. It launches nothing.
 #pragma once
 
-#include "cuda/composite.cuh"
-#include "cuda/launch.cuh"
+#include "cuda/moment/cut_lists.h"
+#include "cuda/tile.cuh"
+#include "cuda/tuning.h"
 
 namespace ar::cuda {
 
-/// Channels that are blended at once, where there are more than lie in the rows of pairs.
-inline constexpr int kMovingChannels = 8;
-
-/// The group of pixels that the calling warp works on, with a layout in which warps take one group after the other
-/// (kTaken of CellLayout, blend_moving_segments.cuh).
+/// The group of pixels that the calling warp works on, with a layout whose groups are claimed (kTaken of CellLayout,
+/// vjp_segments.cuh).
 __device__ inline int& taken_group() {
   __shared__ int groups[32];
   return groups[threadIdx.x / 32];
 }
 
-/// How the samples of a tile of kSide x kSide pixels are shared out: kCells to a lane, those of a pixel to kLanes
-/// neighbours, a power of two, of which the last may have fewer, or none. The pixels of a warp, a group, are a
-/// rectangle. A tile's groups are spread over kBlocks blocks of kWarps warps, of which kWarpsOfGroup share a group.
+/// How the samples of a tile of kSide x kSide pixels are shared out. Each lane has kCells cells. The cells of one pixel
+/// are in kLanes neighbouring lanes (a power of two). The pixels of a warp, a group, are a rectangle. The groups of a
+/// tile are spread over kBlocks blocks of kWarps warps; kWarpsOfGroup warps share a group. kTaken: a warp claims one
+/// group after the other, instead of having one.
 template <int kCellsOfLane, int kLanesOfPixel, int kSideOfTile = kMovingTile,
           int kWarpsOfBlock = kLanesOfPixel * kSideOfTile * kSideOfTile / 32, bool kTaken = false,
           int kWarpsOfGroup = 1>
@@ -44,7 +39,7 @@ struct CellLayout {
     if constexpr (kTaken) return taken_group();
     return (int(blockIdx.x) % kBlocks * kWarps + int(threadIdx.x) / 32) / kWarpsOfGroup;
   }
-  /// The place of the group's pixel i among the tile's, row by row, whatever the layout.
+  /// The number of the group's pixel i in the tile, row by row, whatever the layout.
   __device__ static int pixel_number(int i) {
     const int g = group();
     return (g / kColumns * kHigh + i / kWide) * kSide + g % kColumns * kWide + i % kWide;
@@ -57,11 +52,11 @@ struct CellLayout {
   }
   /// The first of this thread's samples of its pixel.
   __device__ static int first_sample() { return lane_id() % kLanes * kCells; }
-  /// Whether no other lane has the samples too, or this is the one of them that writes.
+  /// Whether this lane writes its samples: AheadLayout has the same sample in several lanes.
   __device__ static bool owns() { return true; }
 
-  /// Bit w: the splat reaches the pixels of warp w of this block, or of group w if they are taken, or passes them
-  /// closely. The tile begins at (x0, y0).
+  /// Bit w: the splat reaches the pixels of warp w of this block (of group w with kTaken), or passes them closely. The
+  /// tile begins at (x0, y0).
   template <class F> __device__ static uint32_t block_reach(const Splat<F, float>& splat, int x0, int y0) {
     constexpr int kOfBlock = kGroups / kBlocks;
     static_assert(kOfBlock % kColumns == 0);
@@ -79,7 +74,7 @@ struct CellLayout {
   }
 };
 
-/// Where the checkpoints of a tile's samples are: the one in front of pair i spacing, i > 0, is number first + i - 1.
+/// Where the checkpoints of a tile's samples are: the checkpoint before pair i spacing, i > 0, has number first + i - 1.
 /// The tiles of a patch share the room of its list equally.
 struct StatePlaces {
   int64_t first;
@@ -93,11 +88,11 @@ struct StatePlaces {
     first = lists.tile_offsets[of_patch.first_tile] / kStateChunk + int64_t(of_patch.index) * room;
     spacing = ((list.count - 1) / (room + 1) / kStateChunk + 1) * kStateChunk;
   }
-  /// The number of the checkpoint in front of chunk k / kStateChunk, where every chunk but the first has one.
+  /// The number of the checkpoint before chunk k / kStateChunk, where every chunk but the first has one.
   __device__ int64_t of_chunk_at(int k) const { return first + k / kStateChunk - 1; }
 };
 
-/// What the cells of a tile need of a splat: lengths are in edges of cells.
+/// The terms of a splat for the cells of a tile: lengths are in edges of cells.
 template <class F> __device__ auto cell_terms(const Splat<F, float>& splat, const TileList& list) {
   auto terms = tile_terms(splat, list);
   terms.w = 1.0f / F::kSide * terms.w;
@@ -107,14 +102,14 @@ template <class F> __device__ auto cell_terms(const Splat<F, float>& splat, cons
 /// Whether the samples of a pixel are neighbours in a checkpoint of a list that is not cut.
 template <class Layout> inline constexpr bool kSamplesTogether = Layout::kSide < kMovingTile;
 
-/// A lane's samples on their way through a list. `kTogether`: the samples of a pixel are neighbours in a checkpoint, as
-/// they are among the lanes of warps with few pixels; else the pixels of a sample are.
+/// The state of a lane's samples on their way through a list. `kTogether`: in a checkpoint the samples of a pixel are
+/// neighbours, as among the lanes of warps with few pixels; else the pixels of a sample are.
 template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> struct MovingSamples {
   static constexpr int kCells = Layout::kCells;
   float transmittance[kCells];
-  Vec2<float> place[kCells];  ///< of the node in its cell
+  Vec2<float> place[kCells];  ///< position of the node in its cell
 
-  /// In front of all splats.
+  /// Before all splats.
   __device__ explicit MovingSamples(bool inside) {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
@@ -133,7 +128,7 @@ template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> stru
   static constexpr int kCheckpoint = state_planes(F::kSamples) * Layout::kTilePixels;  ///< numbers of a checkpoint
   static constexpr int kPlane =
       kTogether ? F::kSamples * Layout::kTilePixels : Layout::kTilePixels;  ///< from a plane to the next
-  /// Where a checkpoint has sample i of this pixel: its transmittance, and its place in the two planes behind.
+  /// The index in a checkpoint of the transmittance of sample i of this pixel; its position is in the next two planes.
   __device__ static int in_checkpoint(int i) {
     const int sample = Layout::first_sample() + i, pixel = Layout::pixel_number();
     return kTogether ? pixel * F::kSamples + sample : 3 * sample * Layout::kTilePixels + pixel;
@@ -141,12 +136,12 @@ template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> stru
   __device__ void store(float* checkpoint) const {
     store(checkpoint, [](int) { return true; });
   }
-  /// Only those samples that load() reads from a checkpoint in front of pair k.
+  /// Only the samples that load() reads from a checkpoint before pair k.
   __device__ void store(float* checkpoint, int k, const int (&last)[kCells]) const {
     store(checkpoint, [&](int i) { return k < last[i]; });
   }
-  /// In front of pair k, where `checkpoint` is, unless k is 0. Samples that have composited their last splat, `last`
-  /// pairs from the first, may have no checkpoint there, and need none.
+  /// The state before pair k, which `checkpoint` has unless k is 0. Samples that have composited their last splat before
+  /// (last[i] <= k) may have no checkpoint there, and need none.
   __device__ void load(const float* checkpoint, int k, const int (&last)[kCells]) {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
@@ -172,10 +167,10 @@ template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> stru
   }
 };
 
-/// Where the cells of a lane are, in edges of cells from the centre of the tile's first pixel. How whitened coordinates
-/// are rounded does not depend on the layout, so that one kernel finds again what another has composited.
+/// Where the cells of a lane are, in edges of cells from the centre of the tile's first pixel. The rounding of whitened
+/// coordinates does not depend on the layout, so that a backward kernel finds what a forward kernel has composited.
 template <class F, class Layout> struct CellCorners {
-  /// Cells are numbered row by row, so that cells i and i + kColumns are in one column; all may be in one row.
+  /// Cells are numbered row by row: cells i and i + kColumns are in one column, and all may be in one row.
   static constexpr int kColumns = Layout::kCells < F::kSide ? Layout::kCells : F::kSide;
   static constexpr int kRows = F::kSide % Layout::kCells == 0 ? 1 : Layout::kCells;
   float left[kColumns], top[kRows];
@@ -189,22 +184,21 @@ template <class F, class Layout> struct CellCorners {
     for (int i = 0; i < kRows; ++i) top[i] = corner.y + float((Layout::first_sample() + i) / F::kSide);
   }
 
-  /// Whitened coordinates of the node of cell i, which is at `place` in it.
+  /// Whitened coordinates of the node of cell i, at position `place` in the cell.
   template <class Terms> __device__ Vec2<float> node(const Terms& terms, int i, Vec2<float> place) const {
     const Vec2<float> row = F::whitened_row(terms, top[i % kRows]);
     return F::whitened_node(terms, row, Vec2<float>{left[i % kColumns] + place.x, place.y});
   }
 };
 
-/// Entries of a list of the splats that reach a warp that are read at a time: several, if a lane has few samples.
-template <class Layout> inline constexpr int kListAhead = Layout::kCells <= 2 ? 4 : 1;
+template <class Layout> inline constexpr int kListAhead = list_ahead(Layout::kCells);
 
-/// Up to kBatch splats of a tile that a block works on together, and lists of up to kListed of these that reach each
-/// warp's pixels. `kPlaces`: entries of lists are places in memory, else numbers of splats.
-template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kPlaces = false> struct MovingStage {
+/// Up to kBatch splats of a tile, with C channels, that a block works on together, and for each warp a list of up to
+/// kListed of them that reach its pixels. `kOffsets`: entries of lists are offsets in memory, else numbers of splats.
+template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kOffsets = false> struct MovingStage {
   static_assert(kBatch % 32 == 0);
   using Lists =
-      ReachLists<uint32_t, kPlaces ? sizeof(TileSplat<F, C>) : 1, kListAhead<Layout>, Layout::kWarps, kListed>;
+      ReachLists<uint32_t, kOffsets ? sizeof(TileSplat<F, C>) : 1, kListAhead<Layout>, Layout::kWarps, kListed>;
   TileSplat<F, C> splats[kBatch];
   uint32_t reach[kBatch];
   Lists lists;
@@ -216,33 +210,34 @@ template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kPlac
     return t < kBatch && k + t < end ? list.splat(k + t) : -1;
   }
   /// Loads the splats, `id` = splat_of(), with channels from `first` on.
-  __device__ void load(const Splat<F, float>* splats_in, const Channels<float>& channels, int first,
+  __device__ void load(const float* splats_in, const Channels<float>& channels, int first,
                        const TileList& list, int32_t id) {
     if (threadIdx.x < kBatch) load_one(int(threadIdx.x), splats_in, channels, first, list, id);
   }
-  /// Loads splat `id` in place t, or none if it is -1.
-  __device__ void load_one(int t, const Splat<F, float>* splats_in, const Channels<float>& channels, int first,
+  /// Loads splat `id` at index t, or none if it is -1.
+  __device__ void load_one(int t, const float* splats_in, const Channels<float>& channels, int first,
                            const TileList& list, int32_t id) {
     uint32_t bits = 0;
     if (id >= 0) {
-      const Splat<F, float> splat = splats_in[id];
+      const Splat<F, float> splat = load_splat<F>(splats_in, id);
       bits = Layout::template block_reach<F>(splat, list.x0, list.y0);
       if (bits) splats[t] = {cell_terms(splat, list), channels_of<C>(channels, splat, id, first)};
     }
     reach[t] = bits;
   }
 
-  /// Of the splats [k, k + 32), those that reach this warp's pixels, in the order of take_first. All must call it.
+  /// The splats in [k, k + 32) that reach this warp's pixels, in the order of take_first. All lanes must call it.
   __device__ uint32_t reached(int k) const {
     return __ballot_sync(kAllLanes, reach[k + 31 - lane_id()] >> (threadIdx.x / 32) & 1);
   }
 };
 
-/// A lane's share of blending a pixel. kKeep: what the backward pass needs is kept.
+/// A lane's share of blending a pixel with C channels. kKeep: for a backward pass it also finds `last`.
 template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTogether<Layout>> struct MovingBlend {
   static constexpr int kCells = Layout::kCells;
-  /// Whether the warp asks if any of its samples shows a splat before it composites it. That pays where a lane has
-  /// several cells and a warp so few pixels that often none does, but not with kKeep, which takes more registers.
+  /// Whether the warp votes on whether any of its samples shows a splat before it composites the splat. That pays where
+  /// a lane has several cells and a warp so few pixels that often none shows it, but not with kKeep, which takes more
+  /// registers.
   static constexpr bool kVotes = !kKeep && kCells > 1 && Layout::kPixels <= 8;
   MovingSamples<F, Layout, kTogether> samples;
   CellCorners<F, Layout> corners;
@@ -257,32 +252,32 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTog
     if (b.mask) sums.add(b.if_shown, channels);
     if (kKeep) last[0] = b.mask ? k + 1 : last[0];
   }
-  /// Composites a splat into the samples; shown[i] becomes `place` where it was composited into sample i, if kKeep.
+  /// Composites a splat into the samples; with kKeep shown[i] becomes `index` where it was composited into sample i.
   /// With kVotes all lanes must call it.
-  __device__ void add(TileSplatRef<F, C>& splat, int place, int (&shown)[kCells]) {
-    struct Look {
+  __device__ void add(TileSplatRef<F, C>& splat, int index, int (&shown)[kCells]) {
+    struct Seen {
       Vec2<float> z;
       float raw;
     };
-    const auto look = [&](int i) {
+    const auto see = [&](int i) {
       const Vec2<float> z = corners.node(splat.terms, i, samples.place[i]);
-      return Look{z, exp2(F::log_alpha(splat.terms, z))};
+      return Seen{z, exp2(F::log_alpha(splat.terms, z))};
     };
-    [[maybe_unused]] Look looks[kCells] = {};
+    [[maybe_unused]] Seen seen[kCells] = {};
     if constexpr (kVotes) {
       bool shows = false;
 #pragma unroll
       for (int i = 0; i < kCells; ++i) {
-        looks[i] = look(i);
-        shows |= (looks[i].raw >= float(kAlphaMin)) & (samples.transmittance[i] > 0);
+        seen[i] = see(i);
+        shows |= (seen[i].raw >= float(kAlphaMin)) & (samples.transmittance[i] > 0);
       }
       if (!__any_sync(kAllLanes, shows)) return;
     }
     add_samples<kCells>(sums, splat.channels, [&](int i) {
-      const auto [z, raw] = kVotes ? looks[i] : look(i);
+      const auto [z, raw] = kVotes ? seen[i] : see(i);
       const Blended<float> b =
           blend_placed_sample<F>(splat.terms, z, raw, UnitCell<F::kSide>(), samples.transmittance[i], samples.place[i]);
-      if (kKeep) shown[i] = b.mask ? place : shown[i];
+      if (kKeep) shown[i] = b.mask ? index : shown[i];
       return b;
     });
   }
@@ -313,88 +308,5 @@ template <class F, int C, class Layout, bool kKeep, bool kTogether = kSamplesTog
     if (first == 0 && params.alpha) params.alpha[pixel.index] = 1 - scale * through;
   }
 };
-
-/// Composites those of the staged splats [from, to) that reach the warp's pixels; the first that is staged is pair k0.
-template <class F, int C, class Layout, bool kKeep, class Stage>
-__device__ void blend_staged(Stage& stage, int from, int to, int k0, MovingBlend<F, C, Layout, kKeep>& blend) {
-  constexpr int kBetweenVotes = 16, kCells = Layout::kCells;
-  const int listed = stage.lists.list(stage.reach, from, to);
-  int shown[kCells];  // the entry of the last that was composited into each sample
-#pragma unroll
-  for (int i = 0; i < kCells; ++i) shown[i] = -1;
-  for (int n = 0; n < listed; n += kBetweenVotes) {
-    if (!__any_sync(kAllLanes, blend.samples.open())) break;
-    stage.lists.for_each(n, min(listed, n + kBetweenVotes), [&](uint32_t entry) {
-      TileSplatRef<F, C> splat = Stage::Lists::splat_of(stage.splats, entry);
-      blend.add(splat, int(entry), shown);
-    });
-  }
-#pragma unroll
-  for (int i = 0; kKeep && i < kCells; ++i)
-    if (shown[i] >= 0) blend.last[i] = k0 + Stage::Lists::number_of(uint32_t(shown[i])) + 1;
-  __syncwarp();  // all have read the list
-}
-
-/// A block per tile, which returns at once if the tile's list is cut, and one more that only waits
-/// (begin_beside_earlier_kernels). Blends the C channels from `first` on; with three, registers are bounded so that an
-/// SM holds 1024 threads. `beside`: the kernels for lists that are cut were launched just before, and may still run.
-template <class F, int C, class Layout, bool kKeep>
-__global__ void __launch_bounds__(Layout::kThreads, C == 3 ? 1024 / Layout::kThreads : 1)
-    moving_blend_kernel(const BlendParams params, int first, bool beside) {
-  if (begin_beside_earlier_kernels(beside)) return;
-  constexpr int kBatch = Layout::kThreads < 256 ? Layout::kThreads : 256;
-  constexpr int kListed = kKeep ? kStateChunk : kBatch;
-  // Where a lane has many samples whose last splats have to be kept, lists would take too many registers.
-  constexpr bool kLists = !kKeep || Layout::kCells <= 2;
-  using Stage = MovingStage<F, C, Layout, kBatch, kListed, true>;
-  __shared__ Stage stage;
-  const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
-  const int tile = params.plan.tile_order[blockIdx.x];
-  const bool is_cut = int(blockIdx.x) < params.plan.state->counts.cut_lists;
-  const TileList list = list_of(params.lists, params.grid, tile);
-  // With too many pairs no list is cut. The compiler needs fewer registers if both are asked here.
-  if (is_cut && !list.of_patch) return;
-  const StatePlaces places(params.lists, list, params.grid, tile);
-  const Vec2<float> p = Layout::pixel();
-  const Pixel pixel(list, params.grid, p);
-  MovingBlend<F, C, Layout, kKeep> blend(p, pixel.inside);
-  int32_t id = stage.splat_of(list, 0, list.count);
-  for (int k = 0; k < list.count && __syncthreads_or(blend.samples.open()); k += kBatch) {
-    const int count = min(list.count - k, kBatch);
-    const int32_t next_id = stage.splat_of(list, k + kBatch, list.count);
-    stage.load(splats, params.channels, first, list, id);
-    __syncthreads();
-    if (next_id >= 0) prefetch(splats + next_id);  // so that the next batch need not wait for memory
-    id = next_id;
-    for (int from = 0; from < count; from += kListed) {
-      if (kKeep && !__any_sync(kAllLanes, blend.samples.open())) break;  // no checkpoint is needed
-      if (kKeep && k + from > 0 && (k + from) % places.spacing == 0)
-        blend.samples.store(params.checkpoints +
-                            (places.first + (k + from) / places.spacing - 1) * blend.samples.kCheckpoint);
-      if constexpr (kLists) {
-        blend_staged(stage, from, min(count, from + kListed), k, blend);
-      } else {
-        for (uint32_t left = stage.reached(from); left != 0;) {
-          const int j = from + take_first(left);
-          TileSplatRef<F, C> splat = stage.splats[j];
-          blend.add(splat, k + j + 1, blend.last);
-        }
-      }
-    }
-  }
-  blend.write(params, first, pixel);
-}
-
-/// Lanes of a pixel where each sample has one: a power of two.
-template <class F> inline constexpr int kLanesForSamples = F::kSamples == 9 ? 16 : F::kSamples;
-
-/// Samples shared out so that there is least to do, forwards and backwards, in tiles of the size of moving_grid(), for
-/// lists that are not cut. Where cuts_all_lists(), these are only those of frames with more pairs than room.
-template <class F, bool kBackward, int kSide>
-using EvenLayout =
-    std::conditional_t<F::kSamples == 1 || (kSide < kMovingTile), CellLayout<1, kLanesForSamples<F>, kSide>,
-                       std::conditional_t<F::kSamples == 4, CellLayout<2, 2>,
-                                          std::conditional_t<F::kSamples == 9 && !kBackward, CellLayout<5, 2>,
-                                                             CellLayout<(F::kSamples + 3) / 4, 4>>>>;
 
 }  // namespace ar::cuda

@@ -1,45 +1,44 @@
-// Kernel of blend for any number of channels, in groups of 32 or, for a last one of up to 8, of 8: a block per tile and
-// group walks the whole list, a pixel per lane. The weights are computed again for every group, which costs less than
-// keeping them. Reference footprints (`erf`, `exact`) use this kernel for few channels too, because their weights are
-// slow anyway, and have groups of 32 only.
+// Kernel blend_groups: the forward pass for any number of channels, in groups of 32 or, for a last group of up to 8, of 8.
+// A block per tile and group walks the whole list, with a pixel (or a sample of a Spread) per lane. It reads lists,
+// splats and rows of channels, and writes images, and for a backward pass transmittance and `last`. blend_channels
+// (channels/blend.cu) launches it: for footprints whose samples stay, with more than four channels; and for reference
+// footprints always, whose weights are slow anyway. Each group computes the weights again, which costs less than to
+// store them.
 #pragma once
 
-#include "cuda/composite.cuh"
+#include "cuda/dispatch.h"
 #include "cuda/launch.cuh"
+#include "cuda/tile.cuh"
+#include "cuda/tuning.h"
 
 namespace ar::cuda {
-
-/// Channels that the group is compiled for in which the first of `left` channels are blended.
-template <class F> constexpr int group_width(int left) {
-  return F::kReference || F::kMoves || left > kSmallGroup ? kChannelGroup : kSmallGroup;
-}
 
 /// An eighth of the channels of a splat in a group of C.
 template <int C> struct alignas(C / 2) Eighth {
   float v[C / 8];
 };
 
-/// How the lanes of a warp share the channels of its pixels. Weights belong to a pixel, and a lane has one. But what is
-/// summed over channels or pixels is shared out differently, so that a channel read from shared memory serves four
-/// pixels: a lane has a quarter of the channels of the four pixels in its column. At place i of its pixels is the pixel
-/// of lane l ^ 8 i, which is its own for i = 0, and of its two eighths of the channels the first is number l / 4.
+/// How the lanes of a warp share the C channels of its pixels. Each lane computes the weights of its own pixel. But sums
+/// over channels or pixels are shared out differently, so that a channel read from shared memory serves four pixels: a
+/// lane has a quarter of the channels of the four pixels in its column. Pixel i of lane l is the own pixel of lane l ^ 8 i
+/// (i = 0: of itself), and the lane has the eighths l / 4 and l / 4 ^ 1 of the channels.
 template <int C> struct ChannelShare {
   static constexpr int kPixels = 4, kOwn = C / 4, kHalf = C / 8;
 
   float v[kPixels][kOwn];
 
-  /// The lane whose own pixel is at place i here.
+  /// The lane whose own pixel is pixel i here.
   __device__ static int lane_of(int i) { return lane_id() ^ 8 * i; }
-  /// Place in the group of this lane's channel k.
+  /// The index in the group of this lane's channel k.
   __device__ static int channel(int k) { return (lane_id() / 4 ^ k / kHalf) * kHalf + k % kHalf; }
 
-  /// A number of every lane's own pixel, for the pixels of this lane.
+  /// From a number per lane, of its own pixel, to the numbers of this lane's pixels.
   __device__ static void spread(float own, float (&of_pixels)[kPixels]) {
     of_pixels[0] = own;
 #pragma unroll
     for (int i = 1; i < kPixels; ++i) of_pixels[i] = __shfl_xor_sync(kAllLanes, own, 8 * i);
   }
-  /// Sums what four lanes have of each pixel, for this lane's own.
+  /// Sums over the four lanes that share a pixel, for this lane's own pixel.
   __device__ static float gather(const float (&parts)[kPixels]) {
     float sum = parts[0];
 #pragma unroll
@@ -64,7 +63,7 @@ template <int C> struct ChannelShare {
       for (int k = 0; k < kOwn; ++k) v[i][k] = madd(contributions[i], own[k], v[i][k]);
     }
   }
-  /// Adds up what the lanes of a pixel have, where its samples are spread over so many lanes. All of them get the sum.
+  /// Adds up the kLanes lanes that have the samples of a pixel. Each gets the sum.
   template <int kLanes> __device__ void add_lanes() {
     static_assert(kLanes == 1 || kLanes == 4 || kLanes == 16);
     if constexpr (kLanes > 1) {  // four neighbours have the same channels
@@ -80,7 +79,7 @@ template <int C> struct ChannelShare {
       }
     }
   }
-  /// Adds what the lane has whose number differs from this one's by `offset`, beginning with its channel `first`.
+  /// Adds the channels of the lane whose number differs by `offset`, beginning with its channel `first`.
   __device__ void add_from_lane(int offset, int first) {
 #pragma unroll
     for (int i = 0; i < kPixels; ++i) {
@@ -107,8 +106,8 @@ template <int C> struct ChannelShare {
     read(splat, own);
     return dot(own);
   }
-  /// The sum over all pixels times their weights, `weight` being that of this lane's own: a lane gets that of channel
-  /// summed_channel(). Lanes trade the halves that the other will sum; the first one they have sorted out already.
+  /// The sum over all pixels times their weights (`weight`: of this lane's own pixel). The lane gets the sum of channel
+  /// summed_channel(). Lanes trade halves of the channels; the first trade has no choice to make.
   __device__ float weighted_sum(float weight) const {
     static_assert(kOwn == 2 || kOwn == 8);
     float weights[kPixels], sums[kOwn];
@@ -138,7 +137,7 @@ template <int C> struct ChannelShare {
     }
     return sums[0];
   }
-  /// The channel of whose sum this lane gets a copy, and whether it is the only or first one that does.
+  /// The channel whose sum this lane gets, and whether it is the first lane that gets it.
   __device__ static int summed_channel() { return lane_id() / (32 / C); }
   __device__ static bool has_sum() { return lane_id() % (32 / C) == 0; }
 };
@@ -170,15 +169,10 @@ template <int kBatch, int C> struct GroupChannels {
   }
 };
 
-inline constexpr int kGroupBatch = 128;
-
-/// Blocks that a multiprocessor should hold at once. It limits the registers of a thread.
 template <class F, int C>
-inline constexpr int kGroupBlocks = F::kSamples > 4    ? 1
-                                    : F::kSamples > 1  ? 2
-                                    : C == kSmallGroup ? 5
-                                                       : 4;
+inline constexpr int kGroupBlocks = blocks_per_sm(group_blocks(F::kSamples, C == kSmallGroup), kBlendThreads);
 
+/// Groups of C channels: block (tile, g) has the channels from first_group + g C on. `F`: what a lane blends.
 template <class F, int C>
 __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
     blend_groups_kernel(const BlendParams params, int first_group) {
@@ -187,13 +181,10 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   using Share = ChannelShare<C>;
   __shared__ Stage<F, 0, kGroupBatch> stage;
   __shared__ GroupChannels<kGroupBatch, C> staged;
-  const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
-  const int place = tile_place<S>(params, int(blockIdx.x));
-  if (place < 0) return;
   const int first = first_group + int(blockIdx.y) * C, lane = lane_id();
-  const int tile = params.plan.tile_order[place];
+  const int tile = params.plan.tile_order[blockIdx.x];
   const TileList list = list_of(params.lists, params.grid, tile);
-  const Vec2<float> p = place_of<F>(threadIdx.x / 32, lane);
+  const Vec2<float> p = position_of<F>(threadIdx.x / 32, lane);
   const Pixel pixel(list, params.grid, pixel_of<F>(threadIdx.x / 32, lane));
   float transmittance[S];
   Share sums = {};
@@ -207,7 +198,7 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
     return any;
   };
   for (int k = 0; k < list.count && __syncthreads_or(open()); k += kGroupBatch) {
-    const int count = stage.load(splats, params.channels, list, k, list.count);
+    const int count = stage.load(params.splats, params.channels, list, k, list.count);
     if (int(threadIdx.x) < count) staged.ids[threadIdx.x] = list.splat(k + threadIdx.x);
     __syncthreads();
     staged.load(params.channels, first, count, stage.reach);
@@ -259,13 +250,13 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
   }
 }
 
-/// The three colours in the splats are channels like others here.
+/// The parameters, with the three colours in the splats as rows of channels.
 template <class Params> Params with_channels(Params p) {
   if (!p.channels.data) p.channels = {p.splats + kSplatColor, kSplatWidth, nullptr, 3};
   return p;
 }
 
-template <class F> void blend_groups(const BlendParams& p, cudaStream_t stream) {
+template <class F> void launch_blend_groups(const BlendParams& p, cudaStream_t stream) {
   const unsigned tiles = unsigned(p.grid.tiles());
   int first = 0;
   while (first < p.channels.count && group_width<F>(p.channels.count - first) == kChannelGroup) first += kChannelGroup;

@@ -1,15 +1,16 @@
-// How the kernels of blend for up to four channels composite: what a pixel carries from splat to splat, and the splats
-// that a block stages for its pixels.
+// A library for the forward kernels of footprints whose samples stay (front.cuh, tail.cuh): the state that a pixel
+// carries from splat to splat, the splats that a block stages, and how a batch of them is composited.
 #pragma once
 
 #include <type_traits>
 
-#include "cuda/composite.cuh"
+#include "cuda/tile.cuh"
+#include "cuda/tuning.h"
 
 namespace ar::cuda {
 
-/// What compositing carries from splat to splat, for one pixel with S samples and C channels. kSets is the number of
-/// sets of channels: one for all samples, or one per sample where checkpoints need it.
+/// What compositing carries from splat to splat in a lane with S samples and C channels. kSets sets of channels: one for
+/// all samples, or one per sample where checkpoints need it.
 template <int S, int C, int kSets> struct PixelState {
   float transmittance[S];
   Values<C> channels[kSets];
@@ -41,15 +42,15 @@ template <int S, int C, int kSets> struct PixelState {
 /// The splats that a block blends together, and lists of those that reach each warp's pixels.
 template <class F, int C> struct BlendStage : Stage<F, C, kBlendThreads> {
   static constexpr int kBatch = kBlendThreads;
-  /// With one sample, where little else is done for a splat, a list holds places in memory, and is read four at a time.
-  /// With more it holds the splats' numbers.
-  static constexpr bool kPlaces = F::kSamples == 1;
-  using Lists = std::conditional_t<kPlaces, ReachLists<uint32_t, sizeof(TileSplat<F, C>), 4, kSubtiles, kBatch>,
+  /// With one sample, where little else is done for a splat, a list holds offsets in memory and is read four at a time.
+  /// With more samples it holds numbers of splats.
+  static constexpr bool kOffsets = F::kSamples == 1;
+  using Lists = std::conditional_t<kOffsets, ReachLists<uint32_t, sizeof(TileSplat<F, C>), 4, kSubtiles, kBatch>,
                                    ReachLists<uint8_t, 1, 1, kSubtiles, kBatch>>;
   Lists lists;
 
-  /// Lists those of the `count` staged splats that reach this warp's pixels, and returns how many there are. All lanes
-  /// must call it.
+  /// Lists the staged splats, `count` of them, that reach this warp's pixels, and returns the length of the list. All
+  /// lanes must call it.
   __device__ int list_reached(int count) { return lists.list(this->reach, 0, count); }
   /// Calls visit(splat, entry) for the splats [from, to) of the list.
   template <class Visit> __device__ __forceinline__ void for_each_listed(int from, int to, Visit&& visit) const {
@@ -57,13 +58,13 @@ template <class F, int C> struct BlendStage : Stage<F, C, kBlendThreads> {
   }
 };
 
-/// Composites a splat into a pixel; last[s] becomes `place` where it was composited into sample s.
+/// Composites a splat into a pixel; last[s] becomes `index` where it was composited into sample s.
 template <class F, int C, int kSets>
-__device__ __forceinline__ void composite(const TileSplat<F, C>& splat, Vec2<float> p, int place,
+__device__ __forceinline__ void composite(const TileSplat<F, C>& splat, Vec2<float> p, int index,
                                           PixelState<F::kSamples, C, kSets>& state, int (&last)[F::kSamples]) {
   const auto composite_sample = [&](int s) {
     const Blended<float> b = blend_sample(F::alpha(splat.terms, p, s), state.transmittance[s]);
-    last[s] = b.mask ? place : last[s];
+    last[s] = b.mask ? index : last[s];
     return b;
   };
   if constexpr (kSets == 1) {
@@ -77,35 +78,24 @@ __device__ __forceinline__ void composite(const TileSplat<F, C>& splat, Vec2<flo
   }
 }
 
-/// Composites the staged splats into a pixel; `index` is the place of the first of them in the tile's list.
+/// Composites the staged splats into a pixel; `index`: the number of the first of them in the tile's list.
 template <class F, int C, int kSets>
 __device__ void composite_all(BlendStage<F, C>& stage, int count, int index, Vec2<float> p,
                               PixelState<F::kSamples, C, kSets>& state) {
   using Stage = BlendStage<F, C>;
-  constexpr int kBetweenVotes = 16;
   const int reached = stage.list_reached(count);
-  int entries[] = {-1};  // of the last splat of this batch, where lists hold places
+  int entries[] = {-1};  // of the last splat of this batch that was composited, with kOffsets
   for (int from = 0; from < reached; from += kBetweenVotes) {
     if (!__any_sync(kAllLanes, state.open())) break;
     stage.for_each_listed(from, min(reached, from + kBetweenVotes), [&](TileSplatRef<F, C> splat, auto entry) {
-      if constexpr (Stage::kPlaces) {
+      if constexpr (Stage::kOffsets) {
         composite<F>(splat, p, int(entry), state, entries);
       } else {
         composite<F>(splat, p, index + int(entry) + 1, state, state.last);
       }
     });
   }
-  if (Stage::kPlaces && entries[0] >= 0) state.last[0] = index + Stage::Lists::number_of(uint32_t(entries[0])) + 1;
+  if (Stage::kOffsets && entries[0] >= 0) state.last[0] = index + Stage::Lists::number_of(uint32_t(entries[0])) + 1;
 }
-
-/// Blocks of blend_front and tail_blend that a streaming multiprocessor should hold at once. It limits the registers of
-/// a thread.
-template <class F, int C>
-inline constexpr int kFrontBlocks = F::kSamples > 1                                 ? 1
-                                    : F::kExpensive || sizeof(TileSplat<F, C>) > 96 ? 4
-                                                                                    : 5;
-template <class F> inline constexpr int kTailBlendBlocks = F::kSamples > 4 ? 1 : F::kSamples > 1 ? 3 : 4;
-/// Of tail_through.
-template <class F> inline constexpr int kTailThroughBlocks = F::kSamples > 1 ? 3 : kFrontBlocks<F, 0>;
 
 }  // namespace ar::cuda

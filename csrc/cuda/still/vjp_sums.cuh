@@ -1,8 +1,8 @@
-// The splats that a warp of blend_vjp goes through, for up to four channels, and how their sums over all lanes are
-// made.
+// A library for the kernel of blend_vjp of footprints whose samples stay (still/vjp.cuh): the splats of a batch that a
+// warp walks, and how their sums over all lanes are made in shared memory.
 #pragma once
 
-#include "cuda/blend_vjp_layout.cuh"
+#include "cuda/still/vjp_pixels.cuh"
 
 namespace ar::cuda {
 
@@ -60,7 +60,7 @@ struct PairSums {
 template <class F, int C> struct alignas(16) ListedSplat {
   typename F::template Terms<float> terms;
   Values<C> channels;
-  uint32_t reach_and_place;  ///< bits 0 to 7: the subtiles; from bit 27 on: its place in the batch
+  uint32_t reach_and_index;  ///< bits 0 to 7: the subtiles; from bit 27 on: its index in the batch
   int32_t row;               ///< of its sums
 };
 /// In use: copied to registers, unless it has too many numbers.
@@ -68,13 +68,12 @@ template <class F, int C>
 using ListedSplatRef =
     std::conditional_t<sizeof(TileSplat<F, C>) <= 112, const ListedSplat<F, C>, const ListedSplat<F, C>&>;
 
-/// Those splats of a batch in blend_vjp, back to front, and what each of the warps that share them sums.
-template <class F, int C, int kGroup> struct VjpGroup {
+/// What a warp keeps in shared memory of a batch: its splats, back to front, and their sums.
+template <class F, int C> struct VjpBatch {
   struct Nothing {};
-  alignas(16) int subtile_last[kSubtiles];  ///< behind the last pair that was composited into a pixel of each subtile
+  alignas(16) int subtile_last[kSubtiles];  ///< pairs up to the last that was composited into a pixel of each subtile
   ListedSplat<F, C> splats[32];
   std::conditional_t<kHoldsSamples<F, C>, PairSums, Nothing> pair_sums;
-  float sums[kGroup > 1 ? kGroup : 1][kGroup > 1 ? 32 : 1][6 + C];
 };
 
 }  // namespace ar::cuda
