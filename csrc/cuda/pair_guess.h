@@ -1,6 +1,5 @@
-// How much room a frame gets for its pairs before the device has counted them. bin (torch/backend_cuda.cpp) asks before
-// each frame; the device writes the number of pairs into host memory later (PairFeedback), and the next frame reads it.
-// Host code only.
+// Room for the pairs of a frame before the device has counted them. Host code: torch/backend_cuda.cpp asks before it
+// bins a frame. The device writes the number of pairs into host memory later, where the next frame reads it.
 #pragma once
 
 #include <algorithm>
@@ -11,20 +10,19 @@
 
 namespace ar::cuda {
 
-/// When the host waits for the device to count the pairs of a frame.
+/// Whether the host waits until the device has counted the pairs of a frame.
 enum class Counting {
-  kNever,     ///< the room is 0 where nothing is known
-  kIfNeeded,  ///< while too few frames are known for a guess
+  kNever,     ///< no room where nothing is known
+  kIfNeeded,  ///< while few frames are known
   kAlways,
 };
 
-/// Remembers the frames of similar images (ImageClass). A frame with more pairs than room is slow, not wrong. So the
-/// first frames are counted; later ones get the pairs of the largest frame so far and a reserve. More Gaussians or more
-/// tiles than ever seen enlarge the room in proportion; fewer of them leave it as it is. There is always room for a
-/// pair of every Gaussian, which EmitParams needs.
+/// A guess from earlier frames of a class of images. Too little room is slow, not wrong. The first frames are counted;
+/// later frames get the room of the largest frame so far and a reserve. More Gaussians or tiles than ever seen enlarge
+/// it in proportion. EmitParams needs room for a pair of every Gaussian.
 class PairGuess {
  public:
-  /// Room for the pairs of frame `frame`, at most `most`; 0: count them.
+  /// Room for frame `frame`, at most `most`; 0: count its pairs.
   int64_t capacity(uint32_t frame, int64_t gaussians, int64_t tiles, int64_t most, Counting counting) {
     if (largest_.gaussians < 0 || counting == Counting::kAlways) return 0;
     if (counting == Counting::kIfNeeded && to_count_ > 0) return 0;
@@ -34,13 +32,12 @@ class PairGuess {
     return recent_[frame % kRecent].room;
   }
 
-  /// The pairs of a frame for which the host has waited.
   void counted(int64_t gaussians, int64_t tiles, int64_t pairs) {
     learn({gaussians, tiles, pairs});
     if (to_count_ > 0) --to_count_;
   }
 
-  /// The pairs of a frame that was not counted, which the device has reported some frames later.
+  /// What the device has reported of an earlier frame that was not counted.
   void reported(uint32_t frame, int64_t pairs) {
     Frame& of = recent_[frame % kRecent];
     const bool known = of.room > 0 && of.frame == frame;
@@ -49,7 +46,7 @@ class PairGuess {
     learn(size);
     if (!known) return;
     if (pairs > of.room) to_count_ = kRecountedFrames;
-    of.room = 0;  // a second report of the frame is no news
+    of.room = 0;  // once
   }
 
  private:
@@ -61,7 +58,7 @@ class PairGuess {
     Size size;
     int64_t room;
   };
-  /// Frames that are remembered until the device reports them.
+  /// Frames that may wait for their report.
   static constexpr int kRecent = 16;
 
   static double growth(int64_t now, int64_t most) {
@@ -73,16 +70,16 @@ class PairGuess {
     largest_.pairs = std::max(largest_.pairs, size.pairs);
   }
 
-  Size largest_ = {-1, 0};  ///< the most of each, of whatever frame; -1: none is known
+  Size largest_ = {-1, 0};  ///< of all frames, each number by itself; -1: no frame
   int to_count_ = kCountedFrames;
   Frame recent_[kRecent] = {};
 };
 
-/// Images that share a guess: those of a device whose numbers of tiles lie between the same two powers of two. A
-/// collection of photos may have a size per photo, and has few classes.
+/// Images that share a guess: those with numbers of tiles between two powers of two. A collection of photos may have a
+/// size per photo, and has few classes.
 struct ImageClass {
   int device = -1, tile_bits = 0;
-  int octave = 0;  ///< of the number of tiles: the bits that it needs
+  int octave = 0;  ///< bits of the number of tiles
 
   ImageClass() = default;
   ImageClass(int device, TileGrid grid) : device(device), tile_bits(grid.tile_bits) {
@@ -93,23 +90,21 @@ struct ImageClass {
   }
 };
 
-/// The guesses of the classes of images used last, each with a word of host memory. The device writes the number of a
-/// frame and its pairs there when it gets to it; nobody waits. A slot may have been given to another class by then: the
-/// frame's number tells.
+/// The guesses of the classes used last, each with a word that the device writes. A word may arrive when its slot has
+/// another class, which the number of the frame tells.
 class PairGuesses {
  public:
   static constexpr int kSlots = 64;
 
-  /// `words`: [kSlots] in memory that the host reads and devices write.
+  /// `words`: [kSlots] in host memory that devices can write.
   explicit PairGuesses(uint64_t* words) : words_(words) { std::fill(words_, words_ + kSlots, uint64_t(0)); }
 
-  /// A frame on its way.
   struct Frame {
     int slot;
     uint32_t number;
     int64_t tiles;
-    int64_t capacity;  ///< room for its pairs; 0: count them
-    uint64_t* word;    ///< where the device writes number << 32 | pairs
+    int64_t capacity;  ///< as of PairGuess
+    uint64_t* word;    ///< for the device to write number << 32 | pairs
   };
 
   /// `most`: pairs that the frame can have, at least as many as Gaussians.
@@ -117,10 +112,10 @@ class PairGuesses {
     const int slot = slot_of({device, grid});
     Slot& s = slots_[slot];
     s.used = ++uses_;
-    if (++frame_ == 0) ++frame_;  // 0: the device has written nothing yet
+    if (++frame_ == 0) ++frame_;  // 0: nothing is written yet
     const uint64_t word = *const_cast<const volatile uint64_t*>(words_ + slot);
     const auto written = uint32_t(word >> 32);
-    // A difference, because the numbers of frames wrap around.
+    // Numbers of frames wrap around.
     if (written != 0 && int32_t(written - s.first_frame) >= 0) s.guess.reported(written, int64_t(word & 0xffffffff));
     const int64_t tiles = grid.tiles();
     const bool is_forced = forced_ > 0 && counting != Counting::kAlways;
@@ -129,14 +124,12 @@ class PairGuesses {
     return {slot, frame_, tiles, capacity, words_ + slot};
   }
 
-  /// The pairs of a frame for which the host has waited.
   void counted(const Frame& frame, int64_t gaussians, int64_t pairs) {
     Slot& s = slots_[frame.slot];
     if (int32_t(frame.number - s.first_frame) >= 0) s.guess.counted(gaussians, frame.tiles, pairs);
   }
 
-  /// For tests: frames that need not be counted get this room from now on, or room for a pair of each Gaussian if that
-  /// is more. 0: guesses again. Both forget all frames so far.
+  /// For tests: room for so many pairs, or one of each Gaussian, where a frame need not be counted; 0: guesses, anew.
   void force(int64_t capacity) {
     forced_ = capacity;
     for (Slot& s : slots_) s = Slot{};
@@ -150,7 +143,7 @@ class PairGuesses {
     PairGuess guess;
   };
 
-  /// The slot of a class of images, or else the least recently used slot, emptied.
+  /// The slot of a class, or the least recently used slot, emptied.
   int slot_of(const ImageClass& images) {
     int oldest = 0;
     for (int k = 0; k < kSlots; ++k) {

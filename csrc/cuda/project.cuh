@@ -1,19 +1,21 @@
-// Kernels of project, project_rows and shape_rows: a thread per Gaussian, or per row.
+// Three kernels from Gaussians to splats; project.cu launches them. `project` reads Gaussians, and writes splats and
+// what bin reads. `project_rows` reads Gaussians, and writes public rows (mean, covariance, opacity, depth, colour),
+// which the caller may keep or send to another rank. `shape_rows` reads such rows, and writes splats and what bin
+// reads. The rest is shared with project_vjp.cuh.
 #pragma once
 
 #include "cuda/launch.cuh"
 #include "cuda/sh_rows.cuh"
 #include "cuda/splat_tiles.cuh"
+#include "cuda/tuning.h"
 
 namespace ar::cuda {
 
-inline constexpr int kProjectThreads = 128;
-
 __device__ inline uint32_t depth_key(float depth) {
-  return __float_as_uint(depth + 0.0f) + kDepthKeyOffset;  // of -0 too
+  return __float_as_uint(depth + 0.0f) + kDepthKeyOffset;  // + 0: -0 becomes 0
 }
 
-/// What bin needs of splat i.
+/// What bin reads of splat i. Params: ProjectParams or ShapeRowsParams; below too.
 template <class Params>
 __device__ void write_tiles(const Params& params, int64_t i, const SplatTiles& tiles, float depth) {
   const bool any = tiles.count > 0;
@@ -22,14 +24,14 @@ __device__ void write_tiles(const Params& params, int64_t i, const SplatTiles& t
   if (any) params.tiles[i] = tiles;
 }
 
-/// Zeros for what count_depths counts. The first block alone: the others have enough to do.
+/// Zeros for count_depths to add to. By the first block alone.
 template <class Params> __device__ void clear_counts(const Params& params) {
   if (blockIdx.x > 0) return;
   for (int k = threadIdx.x; k < kDepthHistogramWords; k += kProjectThreads) params.depth_histograms[k] = 0;
   if (threadIdx.x == 0) *params.counts = {};
 }
 
-/// Of the lanes in `lanes`, those whose row has a number that is not finite or too large. A warp reads a row together.
+/// Those of `lanes` whose row of channels has a number that is not finite or too large. A warp reads a row together.
 __device__ inline uint32_t rows_not_finite(const Channels<float>& channels, int64_t first, uint32_t lanes) {
   uint32_t found = 0;
   for (uint32_t left = __brev(lanes); left != 0;) {
@@ -42,8 +44,7 @@ __device__ inline uint32_t rows_not_finite(const Channels<float>& channels, int6
   return found;
 }
 
-/// A camera in shared memory, from where it is read where it is used, so that it takes no registers. Shared variables
-/// may not have initialisers, as its members do.
+/// A camera in shared memory, which takes no registers. As bytes, because shared variables may not have initialisers.
 template <class Cam> struct SharedCamera {
   alignas(16) char memory[sizeof(Cam)];
 
@@ -56,10 +57,8 @@ template <class Cam> struct SharedCamera {
   }
 };
 
-/// The most blocks of project_kernel, four times as many as an H200 has room for. More Gaussians than they have threads
-/// are taken in turns, so that the camera is loaded once for several of them.
-inline constexpr unsigned kProjectBlocks = 132 * 32;
-
+/// A thread per Gaussian, for several ones where there are more Gaussians than threads.
+/// Cam: Camera<float> or FullCamera<float>.
 template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_kernel(const ProjectParams params) {
   wait_for_earlier_kernels();
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
@@ -78,11 +77,11 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
     if (i < g.n && may_be_visible(camera, g, i, params.bounds, mean))
       radius = project_shape(camera, g, i, mean, params.footprint, splat, depth, &support);
     const uint32_t lit = __ballot_sync(kAllLanes, splat.level > 0);
-    __syncwarp();  // all lanes have read the rows of the Gaussians before
+    __syncwarp();  // all lanes have read the rows of earlier Gaussians
     if (g.shs && lit) rows.begin_load(g.shs + (i - lane_id()) * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
     uint32_t not_finite = 0;
     if (params.given.data) not_finite = rows_not_finite(params.given, i - lane_id(), lit);
-    // While the harmonics are on their way.
+    // During the copies.
     SplatTiles tiles = {};
     if (splat.level > 0) tiles = splat_tiles_of(support, params.grid);
     wait_for_copies();
@@ -103,6 +102,7 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
   }
 }
 
+/// A thread per Gaussian. Cam: Camera<float> or FullCamera<float>.
 template <class Cam>
 __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const ProjectRowsParams params) {
   wait_for_earlier_kernels();
@@ -143,6 +143,7 @@ __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const Pro
   if (params.rows.colors) params.rows.colors[i] = splat.color;
 }
 
+/// A thread per row.
 __global__ void __launch_bounds__(kProjectThreads) shape_rows_kernel(const ShapeRowsParams params) {
   wait_for_earlier_kernels();
   clear_counts(params);

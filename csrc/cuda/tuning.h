@@ -1,13 +1,12 @@
-// A library: the numbers of csrc/cuda that were chosen by measuring, each with what it trades. Kernels, their launches
-// and the guess of pairs read them. Nothing here needs CUDA's headers, so that tests on the host read them too.
+// A library of numbers: what was chosen by measuring, each with what it trades, and the launch bounds. Kernels,
+// launches and pair_guess.h read them. Nothing here needs CUDA's headers.
 #pragma once
 
 namespace ar::cuda {
 
 // Devices
 
-/// Threads that a multiprocessor can hold at once. `architecture`: ten times the compute capability and a zero, as in
-/// __CUDA_ARCH__. Of an unknown device, the least.
+/// Threads that a multiprocessor can hold, by __CUDA_ARCH__; of an unknown device the least.
 constexpr int resident_threads(int architecture) {
   switch (architecture) {
     case 800:
@@ -24,109 +23,88 @@ constexpr int resident_threads(int architecture) {
     case 1210:
       return 1536;
     default:
-      return 1024;  // 7.5
+      return 1024;  // 750
   }
 }
 #if defined(__CUDA_ARCH__)
 inline constexpr int kArchitecture = __CUDA_ARCH__;
 #else
-inline constexpr int kArchitecture = 900;  // the host reads no launch bound
+inline constexpr int kArchitecture = 900;  // the host needs none
 #endif
-/// The second number of __launch_bounds__: blocks of so many threads that a multiprocessor should hold at once, of
-/// those `wanted` as many as fit. More blocks hide more latency; each thread gets fewer registers.
+/// The second launch bound: the blocks `wanted` on a multiprocessor, or what fits. More blocks hide more latency, and
+/// leave fewer registers to a thread.
 constexpr int blocks_per_sm(int wanted, int threads, int architecture = kArchitecture) {
   const int fit = resident_threads(architecture) / threads;
   return fit < 1 ? 1 : fit < wanted ? fit : wanted;
 }
 
-// Room for pairs (pair_guess.h)
+// Room for pairs: pair_guess.h
 
-/// Frames of a class of images whose pairs are counted before the host guesses: more of them see more views, and in
-/// each the host waits for the device.
-inline constexpr int kCountedFrames = 32;
-/// The same after a frame with more pairs than room.
-inline constexpr int kRecountedFrames = 8;
-/// Room for each pair of the largest frame so far: more memory, against frames whose tiles share lists.
+/// Frames that are counted at first, and after a frame with too many pairs: each waits, and shows another view.
+inline constexpr int kCountedFrames = 32, kRecountedFrames = 8;
+/// Memory for each pair of the largest frame so far, against frames with too many.
 inline constexpr double kRoomPerPair = 1.25;
-/// Room for each Gaussian at least. With exactly 1, splats on the borders of patches would leave no patch but the whole
-/// image.
+/// With just 1, splats on the borders of patches would leave only the whole image as a patch.
 inline constexpr double kRoomPerGaussian = 1.125;
-/// Room in any case, for scenes so small that a new view may have many times the pairs.
+/// For small scenes, whose views differ most.
 inline constexpr int kReservedRoom = 1 << 16;
 
-// Projection (project.cuh, project_vjp.cuh)
+// Projection: project.cuh, project_vjp.cuh
 
-/// Threads of the kernels with a thread per Gaussian or row. Their shared memory, with the harmonics of every thread,
-/// grows with them.
+/// Shared memory of a block, against a camera to load for each.
 inline constexpr int kProjectThreads = 128;
-/// Blocks of `project` on each multiprocessor, four times as many as fit. A block loads the camera once, for all of its
-/// Gaussians; more blocks share the Gaussians more evenly.
+/// Four times what fits: a block loads the camera once; more blocks share the Gaussians more evenly.
 inline constexpr int kProjectBlocksPerSm = 32;
-/// Blocks of project_vjp on a multiprocessor. With six a thread would have 80 registers, and spill.
-inline constexpr int kProjectVjpBlocks = 5;
-/// The same for a camera with a lens, which needs more registers.
-inline constexpr int kFullProjectVjpBlocks = 1;
-/// A splat with more pairs than this is summed by its whole warp. Below, 32 splats side by side keep more lanes busy.
+/// With six a thread would have 80 registers, and spill. The full camera needs all registers.
+inline constexpr int kProjectVjpBlocks = 5, kFullProjectVjpBlocks = 1;
+/// A warp sums splats with more pairs together: all lanes work, but on one splat after the other.
 inline constexpr int kManyPairs = 64;
-/// Rows of pair gradients that a lane loads before it waits for the first: registers, against latency.
+/// Rows that a lane loads at once: registers, against waiting.
 inline constexpr int kRowsAtOnce = 4;
-/// zero_culled_grads runs beside blend_vjp, which computes while this kernel waits for memory. So it has few blocks, of
-/// few threads and registers: all of its blocks on a multiprocessor displace at most one of blend_vjp.
+/// `zero_culled_grads` waits for memory while blend_vjp computes beside it. It displaces at most one block of
+/// blend_vjp on a multiprocessor.
 inline constexpr int kZeroThreads = 128, kZeroBlocksPerSm = 1;
-/// Blocks of it that could be on a multiprocessor at once: this limits its registers alone.
-inline constexpr int kZeroResidentBlocks = 16;
-/// Threads of a block of sum_channels, and lanes of each splat. More lanes would idle, as most splats have few pairs;
-/// fewer would take longer over the others.
+/// Limits the registers of zero_culled_grads; so many blocks never run.
+inline constexpr int kZeroBlocks = 16;
+/// Lanes for each splat: most splats have few pairs, and more lanes would idle.
 inline constexpr int kSumThreads = 256, kSumLanes = 8;
-/// Rows that a lane of sum_channels loads before it waits for the first.
-inline constexpr int kSumRowsAtOnce = 4;
-/// The threads of a block share a splat where each lane would otherwise load this many times kSumRowsAtOnce rows.
-inline constexpr int kSumManyLoads = 16;
+/// Rows that a lane loads at once, and loads from which a block sums a splat together.
+inline constexpr int kSumRowsAtOnce = 4, kSumManyLoads = 16;
 
-// Binning (bin.cuh)
+// Binning: bin.cuh
 
-/// Threads of a block of count_depths, and blocks on each multiprocessor. A block has a histogram of its own, and adds
-/// it to that of all in the end: fewer blocks add less often.
+/// A block adds its histogram to that of all: fewer blocks add less often.
 inline constexpr int kCountThreads = 1024, kCountBlocksPerSm = 1;
-/// Keys that a thread of count_depths loads before it waits for the first.
+/// Keys that a thread loads at once: registers, against waiting.
 inline constexpr int kCountAtOnce = 4;
-/// Blocks of emit_pairs that a multiprocessor should hold at once: five fit into its shared memory.
+/// Limits a thread to 48 registers.
 inline constexpr int kEmitBlocks = 5;
-/// Blocks of emit_long_pairs on each multiprocessor: enough to spread the few long splats, and few that find none.
+/// Enough for a view with many long splats; the others end at once.
 inline constexpr int kLongBlocksPerSm = 4;
-/// Tiles of a block of tile_offsets, and lanes that search for the first pair of each: more lanes need fewer steps.
+/// Tiles of a block, and lanes that search for each: more lanes take fewer steps.
 inline constexpr int kOffsetTiles = 16, kOffsetLanes = 8;
-/// Most bits of a digit in the sort by tile. Digits of eight bits save passes, digits of seven have fewer counts; no
-/// sort needs more passes than the number of its last tile has such digits.
+/// Bits of a digit, and digits, at most. A longer digit saves passes; a pass gets slower.
 inline constexpr int kTileDigitBits = 8, kTileDigits = 4;
 
-// Sorts (sort.cuh)
+// Sorts: sort.cuh
 
-/// A pass of a sort by digits of kBits bits.
+/// A pass by digits of kBits bits.
 template <int kBits> struct SortTuning {
   static constexpr bool kLong = kBits > 8;
-  /// Threads of a block: at least one for each value of a digit.
-  static constexpr int kThreads = kLong ? 512 : 256;
-  /// Items of a thread: more items mean fewer blocks that wait for earlier ones, and more registers.
-  static constexpr int kItems = kLong ? 10 : 12;
-  /// Blocks on a multiprocessor at once: this limits the registers of a thread.
-  static constexpr int kBlocks = kLong ? 2 : 3;
+  static constexpr int kThreads = kLong ? 512 : 256;  ///< at least one for each value of a digit
+  static constexpr int kItems = kLong ? 10 : 12;      ///< of a thread: fewer blocks, against registers
+  static constexpr int kBlocks = kLong ? 2 : 3;       ///< on a multiprocessor: against registers
 };
-/// Counts of earlier blocks that a thread loads before it waits for the first.
+/// Counts of earlier blocks that a thread loads at once.
 inline constexpr int kLookBackAtOnce = 8;
 
-// Training (ssim.cu, adam.cu, activations.cu, weight.cu)
+// Training: ssim.cu, adam.cu, activations.cu, weight.cu
 
-/// Threads of a block of ssim, which has this many pixels, times kSsimRun.
-inline constexpr int kSsimThreads = 256;
-/// Columns of pixels of a block of ssim.
-inline constexpr int kSsimColumns = 32;
-/// Neighbouring window sums that a thread makes from values in registers: more sums read less of shared memory. Doubles
-/// would need too many registers.
+inline constexpr int kSsimThreads = 256, kSsimColumns = 32;
+/// Neighbouring sums of a thread: fewer loads from shared memory, against registers, of which doubles take two.
 template <typename T> inline constexpr int kSsimRun = sizeof(T) == 4 ? 4 : 1;
-/// Threads of a block of adam; each loads kAdamBytes of every array at once.
+/// A thread loads kAdamBytes of each array at once.
 inline constexpr int kAdamThreads = 256, kAdamBytes = 16;
-/// Threads of the kernels with a thread per Gaussian, and of those with a thread per weight.
 inline constexpr int kActivateThreads = 256, kWeightThreads = 128;
 
 }  // namespace ar::cuda
