@@ -1,5 +1,5 @@
-// Launches the kernels of project.cuh and project_vjp.cuh for torch/backend_cuda.cpp, each for the type of the camera.
-// What they read and write is declared in stages.h.
+// Launches the kernels of project.cuh and project_vjp.cuh for torch/backend_cuda.cpp, each for the type of the camera;
+// stages.h declares what they read and write.
 #include <algorithm>
 #include <mutex>
 #include <set>
@@ -22,9 +22,8 @@ void launch_rows(void (*plain)(Params), void (*full)(Params), const Params& p, c
   launch_rows(p.camera.lens ? full : plain, p, p.gaussians.n, stream, most_blocks);
 }
 
-/// All kernels on a multiprocessor share one division of its memory into cache and shared memory. Blocks of blend_vjp,
-/// who need much shared memory, cannot begin beside a kernel that got much cache. Once per device: the memory of the
-/// process grew with every call.
+/// All kernels on a multiprocessor share one division of its memory into cache and shared memory: blend_vjp, with much
+/// shared memory, cannot begin beside a kernel with much cache. Once per device, as every call takes memory.
 void let_blend_vjp_begin_beside_zero_culled_grads() {
   static std::mutex mutex;
   static std::set<int> devices;

@@ -1,7 +1,7 @@
 // Three kernels from Gaussians to splats; project.cu launches them. `project` reads Gaussians, and writes splats and
 // what bin reads. `project_rows` reads Gaussians, and writes public rows (mean, covariance, opacity, depth, colour),
 // which the caller may keep or send to another rank. `shape_rows` reads such rows, and writes splats and what bin
-// reads. The rest is shared with project_vjp.cuh.
+// reads.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -15,7 +15,7 @@ __device__ inline uint32_t depth_key(float depth) {
   return __float_as_uint(depth + 0.0f) + kDepthKeyOffset;  // + 0: -0 becomes 0
 }
 
-/// What bin reads of splat i. Params: ProjectParams or ShapeRowsParams; below too.
+/// For bin. Params: ProjectParams or ShapeRowsParams.
 template <class Params>
 __device__ void write_tiles(const Params& params, int64_t i, const SplatTiles& tiles, float depth) {
   const bool any = tiles.count > 0;
@@ -24,14 +24,14 @@ __device__ void write_tiles(const Params& params, int64_t i, const SplatTiles& t
   if (any) params.tiles[i] = tiles;
 }
 
-/// Zeros for count_depths to add to. By the first block alone.
+/// For count_depths. By the first block alone.
 template <class Params> __device__ void clear_counts(const Params& params) {
   if (blockIdx.x > 0) return;
   for (int k = threadIdx.x; k < kDepthHistogramWords; k += kProjectThreads) params.depth_histograms[k] = 0;
   if (threadIdx.x == 0) *params.counts = {};
 }
 
-/// Those of `lanes` whose row of channels has a number that is not finite or too large. A warp reads a row together.
+/// Those of `lanes` whose row has a number that is not finite or too large. A warp reads a row together.
 __device__ inline uint32_t rows_not_finite(const Channels<float>& channels, int64_t first, uint32_t lanes) {
   uint32_t found = 0;
   for (uint32_t left = __brev(lanes); left != 0;) {
@@ -44,7 +44,7 @@ __device__ inline uint32_t rows_not_finite(const Channels<float>& channels, int6
   return found;
 }
 
-/// A camera in shared memory, which takes no registers. As bytes, because shared variables may not have initialisers.
+/// A camera that takes no registers. As bytes, because shared variables may not have initialisers.
 template <class Cam> struct SharedCamera {
   alignas(16) char memory[sizeof(Cam)];
 
@@ -57,8 +57,7 @@ template <class Cam> struct SharedCamera {
   }
 };
 
-/// A thread per Gaussian, for several ones where there are more Gaussians than threads.
-/// Cam: Camera<float> or FullCamera<float>.
+// Cam: Camera<float> or FullCamera<float>. A thread has a Gaussian; in `project` it may have several.
 template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_kernel(const ProjectParams params) {
   wait_for_earlier_kernels();
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
@@ -102,7 +101,6 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
   }
 }
 
-/// A thread per Gaussian. Cam: Camera<float> or FullCamera<float>.
 template <class Cam>
 __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const ProjectRowsParams params) {
   wait_for_earlier_kernels();
@@ -143,7 +141,6 @@ __global__ void __launch_bounds__(kProjectThreads) project_rows_kernel(const Pro
   if (params.rows.colors) params.rows.colors[i] = splat.color;
 }
 
-/// A thread per row.
 __global__ void __launch_bounds__(kProjectThreads) shape_rows_kernel(const ShapeRowsParams params) {
   wait_for_earlier_kernels();
   clear_counts(params);

@@ -1,7 +1,7 @@
-// The kernels of the backward pass from splats to Gaussians; project.cu launches them. project_vjp reads the gradients
-// of pairs that blend_vjp wrote, and writes the gradients of Gaussians, but for groups of 32 without pairs:
-// zero_culled_grads writes zeros there, beside blend_vjp. With public rows, row_grads writes the gradients of rows, and
-// project_rows_vjp reads them, perhaps on another rank. sum_channels writes the gradients of further channels.
+// The kernels from gradients of pairs, which blend_vjp wrote, to gradients of Gaussians; project.cu launches them. The
+// zeros of Gaussians without pairs are of zero_culled_grads, beside blend_vjp, the others of project_vjp. For public
+// rows, row_grads writes gradients of rows, from which project_rows_vjp, perhaps on another rank, makes those of
+// Gaussians. Gradients of further channels are of sum_channels.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -9,22 +9,20 @@
 
 namespace ar::cuda {
 
-/// Gaussians of a warp of project_vjp and of zero_culled_grads, adjacent in memory. If none of them has pairs, the
-/// second kernel writes their gradients, else the first.
+/// Gaussians of a warp, adjacent in memory. If none has pairs, zero_culled_grads writes their gradients, else
+/// project_vjp.
 inline constexpr int kGradRows = 32;
 static_assert(kProjectThreads % kGradRows == 0 && kZeroThreads % kGradRows == 0);
 static_assert(warps_of(kGradRows) == 1 && warps_of(kGradRows + 1) == 2);
 
-/// Lanes of a warp whose Gaussians have pairs.
 __device__ inline uint32_t lanes_with_pairs(int pairs) { return __ballot_sync(kAllLanes, pairs > 0); }
-/// Gaussians from `first` on in its group.
 __device__ inline int rows_of_group(int64_t first, int64_t n) { return int(min(int64_t(kGradRows), n - first)); }
 
 /// The sum of rows of pair gradients.
 struct SplatSums {
   float value[kPairGradWidth];
 
-  /// Adds `count` rows, of which kRows at most are loaded at once.
+  /// Adds up to kRows rows, loaded at once: [count, kPairGradWidth].
   template <int kRows> __device__ void add(const float* rows, int count) {
     constexpr int kQuads = kPairGradWidth / 4;
     const float4* quads = reinterpret_cast<const float4*>(rows);
@@ -95,7 +93,7 @@ __device__ inline void zero_grads_of_warp(const Gaussians<float>& g, const Gauss
   if (out.shs) zero_rows(&out.shs[first * g.sh_stride].x, 3 * g.sh_stride * n);
 }
 
-/// `rows` as a view in which the first row has index `first`. Its beginning is an address of no array.
+/// `rows` as a view in which the first row has index `first`.
 template <class Row> __device__ const Row* view_from(const float* rows, int64_t first) {
   return reinterpret_cast<const Row*>(reinterpret_cast<uintptr_t>(rows) - uintptr_t(first) * sizeof(Row));
 }
@@ -104,8 +102,7 @@ template <class Row> __device__ const Row* view_from(const float* rows, int64_t 
 struct GaussianRows {
   float means[kGradRows * 3], shapes[kGradRows * 7], opacities[kGradRows];
 
-  /// Begins to load the Gaussians of `lanes`; `first` is that of lane 0. Returns views with the same indices, to read
-  /// after wait_for_copies().
+  /// Begins to load the Gaussians of `lanes`, from `first` on. Returns views, to read after wait_for_copies().
   __device__ Gaussians<float> begin_load(const Gaussians<float>& g, int64_t first, uint32_t lanes) {
     Gaussians<float> out = g;
     copy_rows_async<3>(means, &g.means[first].x, lanes);
@@ -136,13 +133,13 @@ __device__ inline void store_warp_sums(const CameraGrad<float>& grad, float* to)
   }
 }
 
-/// The source of project_vjp: gradients of pairs.
+/// The source of project_vjp.
 struct FromPairs {
-  /// Whether zero_culled_grads writes the zeros of a group without pairs.
+  /// Whether zero_culled_grads writes zeros.
   static constexpr bool kZeroed = true;
   const ProjectVjpParams& params;
 
-  /// Of Gaussian i; count: 0 without gradient.
+  /// count: 0 without gradient.
   __device__ PairRange range(int64_t i) const { return params.sums.ranges[i]; }
   /// All lanes must call it.
   __device__ SplatSums sum(int64_t i, PairRange range) const { return sum_pairs(params.sums, i, range); }
@@ -169,7 +166,7 @@ struct FromPairs {
   }
 };
 
-/// The source of project_rows_vjp: gradients of public rows.
+/// The source of project_rows_vjp.
 struct FromRows {
   static constexpr bool kZeroed = false;
   const ProjectRowsVjpParams& params;
@@ -192,14 +189,14 @@ struct FromRows {
   }
 };
 
-/// Added gradients whose coefficients of harmonics are made in shared memory, and added from there.
+/// Coefficients of harmonics are made in shared memory, and added from there.
 struct StagedGrads : AddedGrads<float> {
   static constexpr bool kAddShs = false;
 };
 
 template <class Cam> inline constexpr int kVjpBlocks = Cam::kFull ? kFullProjectVjpBlocks : kProjectVjpBlocks;
 
-/// Cam: Camera or FullCamera. From: FromPairs or FromRows. Out: GaussianGrads or StagedGrads.
+/// Cam: Camera<float> or FullCamera<float>. From: FromPairs or FromRows. Out: GaussianGrads<float> or StagedGrads.
 template <class Cam, class From, class Params, class Out>
 __device__ void project_vjp_body(const Params& params, const From& from, const Out& out) {
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
@@ -248,7 +245,7 @@ __device__ void project_vjp_body(const Params& params, const From& from, const O
   }
 }
 
-/// A thread per Gaussian. Cam: Camera<float> or FullCamera<float>; here and below.
+/// A thread per Gaussian.
 template <class Cam>
 __global__ void __launch_bounds__(kProjectThreads, blocks_per_sm(kVjpBlocks<Cam>, kProjectThreads))
     project_vjp_kernel(const ProjectVjpParams params) {
@@ -268,7 +265,7 @@ __global__ void __launch_bounds__(kProjectThreads, blocks_per_sm(kVjpBlocks<Cam>
   project_vjp_body<Cam>(params, FromRows{params}, StagedGrads{{params.grads}});
 }
 
-/// Writes zeros for each group of kGradRows Gaussians without pairs. A warp has every so many groups.
+/// A warp has several groups.
 __global__ void __launch_bounds__(kZeroThreads, blocks_per_sm(kZeroBlocks, kZeroThreads))
     zero_culled_grads_kernel(const ZeroGradsParams params) {
   wait_for_earlier_kernels();
@@ -283,7 +280,7 @@ __global__ void __launch_bounds__(kZeroThreads, blocks_per_sm(kZeroBlocks, kZero
   }
 }
 
-/// Sums the pairs of a row, and writes the gradient of the row, packed or in columns. A thread per row.
+/// A thread per row.
 __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGradsParams params) {
   wait_for_earlier_kernels();
   __shared__ float packed_rows[kProjectThreads * kPackedGradWidthAbsolute];
@@ -317,7 +314,7 @@ __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGra
   if (params.absolute) params.absolute[i] = sums.mean_sums();
 }
 
-/// Sums channels that are columns of pair_grads. A thread per splat.
+/// For channels that are columns of pair_grads. A thread per splat.
 __global__ void __launch_bounds__(kProjectThreads) sum_few_channels_kernel(const SumChannelsParams params) {
   wait_for_earlier_kernels();
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x, n = params.sums.n;
@@ -331,9 +328,8 @@ __global__ void __launch_bounds__(kProjectThreads) sum_few_channels_kernel(const
   }
 }
 
-/// Sums the rows of channel_sums [pairs, C], kSumLanes lanes for each splat, or a block for a splat with many pairs. A
-/// lane has four channels.
-/// C: channels of a group, kSmallGroup or kChannelGroup.
+/// For groups of C channels; channel_sums: [max(capacity, n), C]. A splat has kSumLanes lanes, with many pairs a block;
+/// a lane has four channels.
 template <int C> __global__ void __launch_bounds__(kSumThreads) sum_channels_kernel(const SumChannelsParams params) {
   wait_for_earlier_kernels();
   constexpr int kQuads = C / 4, kRows = kSumLanes / kQuads, kSplats = kSumThreads / kSumLanes;
