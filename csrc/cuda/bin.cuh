@@ -1,7 +1,7 @@
-// The kernels of bin besides sorting (sort.cuh) and planning (plan.cuh); bin.cu launches them. The first, count_depths,
-// reads what project or shape_rows wrote: it counts pairs, and the digits of depth keys. The kernels emit_pairs and
-// emit_long_pairs read splats by depth, and write a pair for each tile that a splat touches. When pairs are sorted by
-// tile, tile_offsets finds the first pair of each tile.
+// The kernels of bin but sorting (sort.cuh) and planning (plan.cuh); bin.cu launches them. From what project or
+// shape_rows wrote, count_depths counts pairs, and digits of depth keys. By depth, emit_pairs and emit_long_pairs write
+// a pair for each tile that a splat touches. When pairs are sorted by tile, tile_offsets finds the first pair of each
+// tile.
 #pragma once
 
 #include <type_traits>
@@ -28,7 +28,7 @@ __device__ inline int64_t add_to_count(int64_t& count, int64_t more) {
 }
 
 /// Numbers the slots of a warp's kRows x 32 splats, from counts.pairs on, and counts them there. All lanes must call
-/// it. `ranges`: of the lane's first splat; the others follow at a distance of `stride`.
+/// it. `ranges`: of the lane's first splat; the next is `stride` later.
 template <int kRows>
 __device__ void number_slots(const int (&pairs_of)[kRows], PairRange* ranges, int64_t stride, Counts& counts) {
   int64_t before[kRows], all = 0;
@@ -48,8 +48,8 @@ __device__ void number_slots(const int (&pairs_of)[kRows], PairRange* ranges, in
   }
 }
 
-/// Adds up splats with pairs, their pairs, and the digits of their depth keys. Sets the memory of later kernels to
-/// zero. keys, ranges: [n]; `first` is written with slots. histograms: [kDepthPasses, 2^kDepthBits].
+/// Counts splats with pairs, pairs, and digits of depth keys. Zeroes memory for later kernels.
+/// keys, ranges: [n]. histograms: [kDepthPasses, 2^kDepthBits].
 __global__ void __launch_bounds__(kCountThreads)
     count_depths_kernel(const uint32_t* keys, PairRange* ranges, bool with_slots, int64_t n, uint32_t* histograms,
                         Counts* counts, const ZeroedMemory other_scratch, const ZeroedMemory of_tiles) {
@@ -94,7 +94,6 @@ __global__ void __launch_bounds__(kCountThreads)
   }
 }
 
-/// Calls run(kernel, arguments...) for each pass.
 template <class Run> void for_each_depth_pass(const DepthSort& p, const DepthScratch& scratch, Run&& run) {
   const int64_t* count = &p.counts->splats;
   run(sort_pass_kernel<kDepthBits, int32_t, true>, scratch, 0, true, count, p.n, p.keys[0], p.keys[1], p.order[0],
@@ -118,7 +117,6 @@ struct TileDigits {
   }
   __device__ int bins() const { return 1 << bits; }
   __device__ uint32_t of(uint32_t tile, int pass) const { return tile >> (pass * bits) & (bins() - 1); }
-  /// Calls run(bits), a constant.
   template <class Run> auto with_bits(Run&& run) const {
     constexpr std::integral_constant<int, kMostBits> most = {};
     constexpr std::integral_constant<int, kMostBits - 1> fewer = {};
@@ -131,7 +129,7 @@ class PairWriter {
  public:
   static constexpr int kMostCounts = TileDigits::kMostPasses << TileDigits::kMostBits;
 
-  /// `counts`: [kMostCounts] in shared memory. All threads must call it; __syncthreads() before write().
+  /// `counts`: [kMostCounts], shared. All threads must call it; __syncthreads() before write().
   __device__ PairWriter(const EmitParams& params, const TileDigits& digits, uint32_t* counts)
       : params_(params), digits_(digits), counts_(counts) {
     for (int b = threadIdx.x; b < digits.passes * digits.bins(); b += kEmitThreads) counts[b] = 0;
@@ -159,7 +157,7 @@ class PairWriter {
   uint32_t* counts_;
 };
 
-/// A pair of a splat with few tiles: lane of the splat, and bit of its mask.
+/// Lane of a splat with few tiles, and bit of its mask.
 struct MaskedPair {
   static constexpr int kBits = 8 * sizeof(TileMask);
   uint16_t value;
@@ -172,10 +170,9 @@ struct MaskedPairs {
   MaskedPair of[32 * kManyTiles];
 };
 
-/// The mask of a splat with few tiles, else 0.
 __device__ inline TileMask few_tiles(const SplatTiles& tiles) { return tiles.count <= kManyTiles ? tiles.mask : 0; }
 
-/// Sums the pairs of earlier blocks, from `status` [blocks] as in sort.cuh. All lanes of a warp must call it.
+/// The pairs of earlier blocks, from `status` [blocks] as in sort.cuh. All lanes must call it.
 __device__ inline uint32_t look_back(const uint32_t* status, int block) {
   uint32_t sum = 0;
   for (int last = block - 1; last >= 0; last -= 32) {
@@ -195,8 +192,8 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
 /// Words of EmitParams::status: blocks that have begun, long splats, the count of each block.
 inline constexpr int kTickets = 0, kLongSplats = 1, kOfBlocks = 2;
 
-/// Writes pairs in the order of depth, those of a splat by rows of tiles. Of long splats, whose tiles are not among
-/// 8x8, it only lists the positions.
+/// In the order of depth; the pairs of a splat by rows of tiles. Of long splats, whose tiles are not among 8x8, it
+/// lists the positions alone.
 __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmitThreads))
     emit_pairs_kernel(const EmitParams params, const TileDigits digits) {
   wait_for_earlier_kernels();
@@ -205,7 +202,6 @@ __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmit
   __shared__ uint32_t block_id, before_block;
   __shared__ MaskedPairs stages[kEmitRows][kWarps];
   const int64_t n = params.counts->splats;
-  // Tickets give the blocks that stay the first splats.
   if (params.counts->in_patches(params.capacity) || int64_t(blockIdx.x) * kEmitSplats >= n) return;
   uint32_t* published = params.status + kOfBlocks;
   if (threadIdx.x == 0) block_id = atomicAdd(&params.status[kTickets], 1);
@@ -213,7 +209,7 @@ __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmit
   __syncthreads();
   int32_t ids[kEmitRows];
   SplatTiles touched[kEmitRows] = {};
-  int32_t slots[kEmitRows] = {};  // first slots
+  int32_t slots[kEmitRows] = {};
 #pragma unroll
   for (int row = 0; row < kEmitRows; ++row) {
     const int64_t r = int64_t(block_id) * kEmitSplats + row * kEmitThreads + threadIdx.x;
@@ -226,7 +222,7 @@ __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmit
       if (params.slot_pairs) slots[row] = params.ranges[ids[row]].first;
     }
   }
-  uint32_t before[kEmitRows], sum = 0;  // pairs
+  uint32_t before[kEmitRows], sum = 0;
 #pragma unroll
   for (int row = 0; row < kEmitRows; ++row) {
     uint32_t of_row;
@@ -235,8 +231,8 @@ __global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmit
   }
   if (threadIdx.x == 0) write_status(published + block_id, (block_id == 0 ? kUpToBlock : kOfBlock) | sum);
 
-  // While earlier blocks count, the tiles are listed in shared memory, from where neighbouring lanes write to
-  // neighbouring addresses.
+  // While earlier blocks count, the tiles are listed in shared memory; then neighbouring lanes write to neighbouring
+  // addresses.
   const int warp = threadIdx.x / 32;
   int up_to[kEmitRows];  // listed by lanes up to this one
 #pragma unroll
@@ -321,8 +317,8 @@ struct BoxOfTiles {
   }
 };
 
-/// Writes the pairs of patches where there is no room for those of tiles. The slot of a pair is its splat: all patches
-/// add to one row. One block takes milliseconds per million splats, in rare frames.
+/// Pairs of patches, where there is no room for all pairs of tiles. Their slots are the splats, to whose rows all
+/// patches add. Slow, with one block, but rare.
 __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& writer) {
   constexpr int kWarps = kEmitThreads / 32;
   const TileGrid grid = params.grid;
@@ -366,8 +362,8 @@ __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& wr
   }
 }
 
-/// Writes the pairs of long splats, a warp for each splat, or those of patches. The nearest splats are often long, and
-/// would all be in a few blocks of emit_pairs.
+/// A warp for each long splat; or one block for the pairs of patches. The nearest splats are often long, and would all
+/// be in a few blocks of emit_pairs.
 __global__ void __launch_bounds__(kEmitThreads)
     emit_long_pairs_kernel(const EmitParams params, const TileDigits digits) {
   wait_for_earlier_kernels();
@@ -406,8 +402,7 @@ __global__ void __launch_bounds__(kEmitThreads)
   writer.finish();
 }
 
-/// Finds the first pair of each tile, and reports the number of pairs to the host.
-/// tiles: [counts->listed]. tile_offsets: [tile_count + 1].
+/// Also reports the number of pairs to the host. tiles: [counts->listed]. tile_offsets: [tile_count + 1].
 __global__ void __launch_bounds__(kOffsetTiles* kOffsetLanes)
     tile_offsets_kernel(const uint32_t* tiles, const Counts* counts, int64_t tile_count, int64_t* tile_offsets,
                         PairFeedback feedback) {

@@ -14,34 +14,32 @@
 
 namespace ar::cuda {
 
-/// Devices of which answers are kept.
+/// The answers of more devices are not kept.
 inline constexpr int kMaxDevices = 64;
 
-/// Waits until the earlier kernels of the stream have ended.
 __device__ inline void wait_for_earlier_kernels() {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
   asm volatile("griddepcontrol.wait;" ::: "memory");
 #endif
 }
 
-/// Lets the next kernel of the stream begin when all blocks of this kernel have called it or ended.
+/// The next kernel may begin when all blocks have called this or ended.
 __device__ inline void let_next_kernel_begin() {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
   asm volatile("griddepcontrol.launch_dependents;" ::: "memory");
 #endif
 }
 
-/// Replaces wait_for_earlier_kernels(). With `beside` the kernel runs while the kernel ahead of it does, whose results
-/// it must not need. The last block, of which this returns true, does no work: it ends after the kernel ahead, because
-/// the next kernel waits for this kernel alone.
+/// Replaces wait_for_earlier_kernels() for kernel B. Returns true for the last block, which does no work: it ends after
+/// kernel A, because the next kernel waits for B alone.
 __device__ inline bool begin_beside_earlier_kernels(bool beside) {
   const bool is_last = blockIdx.x == gridDim.x - 1;
   if (!beside || is_last) wait_for_earlier_kernels();
   return is_last;
 }
 
-/// Whether kernels may begin early on the current device. Its driver must allow that in graphs too, and the code must
-/// wait: code compiled at load time for older devices does not. `kernel` is any, as all have the same devices.
+/// Whether kernels may begin early on the current device. Drivers must allow it in graphs too. Code that is compiled at
+/// load time for older devices does not wait; `kernel` stands for all.
 inline bool may_begin_early(const void* kernel) {
   constexpr int kGraphsMayHoldIt = 12030;  // CUDA of the driver
   enum : signed char { kNotAsked, kNo, kYes };
@@ -64,11 +62,11 @@ struct LaunchShape {
   dim3 blocks;
   unsigned threads;
   size_t shared_bytes = 0;  ///< of dynamic_shared()
-  /// If not null, recorded when all blocks have begun; or earlier, so that no result may depend on it.
+  /// If not null, recorded when all blocks have begun, or earlier: no result may depend on it.
   cudaEvent_t begun = nullptr;
 };
 
-/// An attribute of the current device, which is asked once; 0 on errors. Safe from several threads.
+/// Of the current device, which is asked once, by any thread; 0 on errors.
 template <cudaDeviceAttr kAttribute> int device_attribute() {
   static std::atomic<int> answers[kMaxDevices];  // 0: not asked
   int device = 0, answer = 0;
@@ -82,19 +80,17 @@ template <cudaDeviceAttr kAttribute> int device_attribute() {
 
 inline unsigned multiprocessors() { return unsigned(std::max(device_attribute<cudaDevAttrMultiProcessorCount>(), 1)); }
 
-/// That a block may have.
 inline size_t max_shared_bytes() { return size_t(device_attribute<cudaDevAttrMaxSharedMemoryPerBlockOptin>()); }
 
-/// That each of so many blocks on a multiprocessor may have.
+/// For each of so many blocks on a multiprocessor.
 inline size_t shared_bytes_of_blocks(int blocks) {
   const int all = device_attribute<cudaDevAttrMaxSharedMemoryPerMultiprocessor>();
-  const int reserved = device_attribute<cudaDevAttrReservedSharedMemoryPerBlock>();  // by the system, of each block
+  const int reserved = device_attribute<cudaDevAttrReservedSharedMemoryPerBlock>();  // of each block
   const size_t own = std::max(all / blocks - reserved, 0);
   return std::min(own, max_shared_bytes());
 }
 
-/// Makes a launch record an event when all of its blocks have begun, as far as CUDA can. False if the toolkit is older;
-/// may_begin_early() asks the driver.
+/// Makes a launch record an event when its blocks have begun; false if the toolkit is older than that.
 inline bool set_begun_event([[maybe_unused]] cudaLaunchAttribute& attribute, [[maybe_unused]] cudaEvent_t event) {
 #if CUDART_VERSION >= 12030
   attribute.id = cudaLaunchAttributeLaunchCompletionEvent;
@@ -105,7 +101,7 @@ inline bool set_begun_event([[maybe_unused]] cudaLaunchAttribute& attribute, [[m
 #endif
 }
 
-/// Errors are kept for cudaGetLastError.
+/// cudaGetLastError() tells of errors.
 template <class... Params, class... Arguments>
 void launch(void (*kernel)(Params...), const LaunchShape& shape, cudaStream_t stream, Arguments&&... arguments) {
   constexpr size_t kUnasked = 48 * 1024;  // bytes that every kernel may have

@@ -10,7 +10,7 @@
 
 namespace ar::cuda {
 
-/// Whether the host waits until the device has counted the pairs of a frame.
+/// Whether the host waits for the count.
 enum class Counting {
   kNever,     ///< no room where nothing is known
   kIfNeeded,  ///< while few frames are known
@@ -75,8 +75,7 @@ class PairGuess {
   Frame recent_[kRecent] = {};
 };
 
-/// Images that share a guess: those with numbers of tiles between two powers of two. A collection of photos may have a
-/// size per photo, and has few classes.
+/// Images that share a guess: numbers of tiles between two powers of two. Photos of many sizes have few classes.
 struct ImageClass {
   int device = -1, tile_bits = 0;
   int octave = 0;  ///< bits of the number of tiles
@@ -90,8 +89,8 @@ struct ImageClass {
   }
 };
 
-/// The guesses of the classes used last, each with a word that the device writes. A word may arrive when its slot has
-/// another class, which the number of the frame tells.
+/// The guesses of the classes used last, each with a word that the device writes. A slot may have another class by
+/// then: the number of the frame tells.
 class PairGuesses {
  public:
   static constexpr int kSlots = 64;
@@ -129,7 +128,7 @@ class PairGuesses {
     if (int32_t(frame.number - s.first_frame) >= 0) s.guess.counted(gaussians, frame.tiles, pairs);
   }
 
-  /// For tests: room for so many pairs, or one of each Gaussian, where a frame need not be counted; 0: guesses, anew.
+  /// For tests: room for so many pairs, and one of each Gaussian; 0: guesses, anew.
   void force(int64_t capacity) {
     forced_ = capacity;
     for (Slot& s : slots_) s = Slot{};

@@ -1,7 +1,6 @@
-// Three kernels from Gaussians to splats; project.cu launches them. `project` reads Gaussians, and writes splats and
-// what bin reads. `project_rows` reads Gaussians, and writes public rows (mean, covariance, opacity, depth, colour),
-// which the caller may keep or send to another rank. `shape_rows` reads such rows, and writes splats and what bin
-// reads.
+// Three kernels from Gaussians to splats; project.cu launches them. `project` writes the splats of Gaussians, and what
+// bin reads. `project_rows` writes public rows (mean, covariance, opacity, depth, colour), to keep or to send to
+// another rank. `shape_rows` reads public rows, and writes splats and what bin reads.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -15,7 +14,7 @@ __device__ inline uint32_t depth_key(float depth) {
   return __float_as_uint(depth + 0.0f) + kDepthKeyOffset;  // + 0: -0 becomes 0
 }
 
-/// For bin. Params: ProjectParams or ShapeRowsParams.
+/// What bin reads. Params: ProjectParams or ShapeRowsParams.
 template <class Params>
 __device__ void write_tiles(const Params& params, int64_t i, const SplatTiles& tiles, float depth) {
   const bool any = tiles.count > 0;
@@ -24,7 +23,7 @@ __device__ void write_tiles(const Params& params, int64_t i, const SplatTiles& t
   if (any) params.tiles[i] = tiles;
 }
 
-/// For count_depths. By the first block alone.
+/// What count_depths adds to. By the first block alone.
 template <class Params> __device__ void clear_counts(const Params& params) {
   if (blockIdx.x > 0) return;
   for (int k = threadIdx.x; k < kDepthHistogramWords; k += kProjectThreads) params.depth_histograms[k] = 0;

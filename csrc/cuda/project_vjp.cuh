@@ -1,7 +1,7 @@
-// The kernels from gradients of pairs, which blend_vjp wrote, to gradients of Gaussians; project.cu launches them. The
-// zeros of Gaussians without pairs are of zero_culled_grads, beside blend_vjp, the others of project_vjp. For public
-// rows, row_grads writes gradients of rows, from which project_rows_vjp, perhaps on another rank, makes those of
-// Gaussians. Gradients of further channels are of sum_channels.
+// The kernels of the backward pass after blend_vjp; project.cu launches them. `project_vjp` reads gradients of pairs,
+// and writes gradients of Gaussians; `zero_culled_grads` writes zeros for Gaussians without pairs, beside blend_vjp.
+// For public rows, `row_grads` writes gradients of rows, and `project_rows_vjp` reads these, perhaps on another rank.
+// And `sum_channels` writes gradients of further channels.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -18,7 +18,6 @@ static_assert(warps_of(kGradRows) == 1 && warps_of(kGradRows + 1) == 2);
 __device__ inline uint32_t lanes_with_pairs(int pairs) { return __ballot_sync(kAllLanes, pairs > 0); }
 __device__ inline int rows_of_group(int64_t first, int64_t n) { return int(min(int64_t(kGradRows), n - first)); }
 
-/// The sum of rows of pair gradients.
 struct SplatSums {
   float value[kPairGradWidth];
 
@@ -73,7 +72,7 @@ __device__ inline SplatSums sum_pairs(const PairSumsView& pairs, int64_t i, Pair
   return sums;
 }
 
-/// Nobody reads these zeros soon: they should leave the cache first.
+/// Streaming, as nobody reads zeros soon.
 __device__ inline void zero_rows(float* to, int count) {
   if (count % 4 == 0 && reinterpret_cast<uintptr_t>(to) % 16 == 0) {
     for (int e = lane_id(); e < count / 4; e += 32) store_streaming(reinterpret_cast<float4*>(to) + e, {0, 0, 0, 0});
@@ -98,7 +97,7 @@ template <class Row> __device__ const Row* view_from(const float* rows, int64_t 
   return reinterpret_cast<const Row*>(reinterpret_cast<uintptr_t>(rows) - uintptr_t(first) * sizeof(Row));
 }
 
-/// A warp's Gaussians in shared memory, without colours.
+/// In shared memory, without colours.
 struct GaussianRows {
   float means[kGradRows * 3], shapes[kGradRows * 7], opacities[kGradRows];
 
@@ -189,7 +188,7 @@ struct FromRows {
   }
 };
 
-/// Coefficients of harmonics are made in shared memory, and added from there.
+/// Coefficients are made in shared memory, then added.
 struct StagedGrads : AddedGrads<float> {
   static constexpr bool kAddShs = false;
 };

@@ -1,5 +1,4 @@
-// A library for project.cuh and project_vjp.cuh: coefficients of spherical harmonics, copied between memory and the
-// shared memory of a warp.
+// A library for project.cuh and project_vjp.cuh: coefficients of harmonics between memory and a warp's shared memory.
 #pragma once
 
 #include "core/sh.h"
@@ -7,8 +6,8 @@
 
 namespace ar::cuda {
 
-/// Rows of coefficients up to kDegree, one for each lane. A row has an odd number of quads, 13 or 19, so that lanes
-/// that access quads are on different banks.
+/// Coefficients up to kDegree, a row per lane. Rows have an odd number of quads, 13 or 19, so that lanes access
+/// different banks.
 template <int kDegree> struct ShRows {
   static constexpr int kCount = sh_count(kDegree), kStride = ((3 * kCount + 3) / 4 | 1) * 4;
   alignas(16) float value[32][kStride];
@@ -59,7 +58,7 @@ template <int kDegree> struct ShRows {
   __device__ Vec3<float>* row() { return reinterpret_cast<Vec3<float>*>(value[lane_id()]); }
 
  private:
-  /// Most scenes have coefficients of degree 3 without gaps. Of their quads, kSteps x 32 are kRowsOfStep rows.
+  /// Of degree 3 without gaps, as in most scenes.
   static constexpr int kPacked = sh_count(3), kQuads = 3 * kPacked / 4, kSteps = 3, kRowsOfStep = kSteps * 32 / kQuads;
   static_assert(kRowsOfStep * kQuads == kSteps * 32);
 

@@ -7,8 +7,8 @@
 
 namespace ar::cuda {
 
-/// Work on stream(k) starts after earlier work of the caller's stream; later work there waits for it. kCount: streams.
-/// Each thread, device and kCount has separate streams, so that a fork does not wait for another.
+/// Work on stream(k) starts after earlier work of the caller's stream; later work there waits for it. Threads and
+/// devices have separate streams, and each kCount, their number, has.
 template <int kCount> class SideStreams {
  public:
   explicit SideStreams(cudaStream_t caller) : own_(of_this_thread()), caller_(caller) {
@@ -24,8 +24,7 @@ template <int kCount> class SideStreams {
   }
   /// For LaunchShape::begun of a kernel on a side stream.
   cudaEvent_t begun() const { return own_.begun; }
-  /// Later kernels of the caller's stream come to the device after the blocks of that kernel, which would otherwise
-  /// wait for room.
+  /// Later kernels of the caller's stream come after the blocks of that kernel, which would wait for room.
   void wait_until_begun() const { cudaStreamWaitEvent(caller_, own_.begun, 0); }
   /// The caller's for k = 0, then the side streams, cyclically.
   cudaStream_t stream(int k) const { return k == 0 ? caller_ : own_.streams[(k - 1) % kCount]; }

@@ -1,6 +1,6 @@
-// A library for bin.cu: the pass of a stable radix sort whose number of items only the device knows. The host would
-// have to wait for it to call a library's sort. The method is "Onesweep" of Adinets and Merrill (2022): a histogram for
-// all digits, then a pass per digit, in which a block looks back at what earlier blocks have published.
+// A library for bin.cu: a pass of a stable radix sort whose number of items only the device knows; for a library's sort
+// the host would wait. It is "Onesweep" of Adinets and Merrill (2022): one histogram for all digits, then a pass per
+// digit, in which a block looks back at what earlier blocks have published.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -21,8 +21,7 @@ template <int kBits> struct Digits : SortTuning<kBits> {
 /// The key of no item, left out by the first pass.
 inline constexpr uint32_t kNoKey = 0xffffffff;
 
-// A block publishes one word, which arrives at once: a count, and whether all blocks up to this one are in it. Zero is
-// nothing yet.
+// A block publishes a word: a count, and whether it includes all earlier blocks. Zero is nothing yet.
 inline constexpr uint32_t kOfBlock = 1u << 30, kUpToBlock = 2u << 30, kCountMask = kOfBlock - 1;
 inline constexpr int64_t kMaxSortItems = kCountMask;
 
@@ -43,7 +42,7 @@ __device__ inline void write_status(uint32_t* status, uint32_t value) {
 #endif
 }
 
-/// Scratch of a sort of `capacity` items by `passes` digits of kBits bits. Zero before use.
+/// Zero before use.
 template <int kBits> struct SortScratch {
   static constexpr int kBins = Digits<kBits>::kBins;
   int passes;
@@ -80,8 +79,8 @@ template <int kBits, int kPasses> __device__ void count_digits(uint32_t key, boo
   }
 }
 
-/// Items of earlier blocks with a digit. `status`: this block's word; that of the block before is `width` words
-/// earlier.
+/// Items of earlier blocks with a digit. `status`: the word of this block, `width` words after that of the block
+/// before.
 __device__ inline uint32_t sum_of_earlier(const uint32_t* status, int64_t block, int width) {
   if (block == 0) return 0;
   uint32_t sum = 0;
@@ -129,7 +128,7 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads,
   constexpr int kBins = D::kBins, kItems = D::kItems;
   auto& shared = *reinterpret_cast<SortShared<kBits, Value>*>(dynamic_shared());
   const int t = threadIdx.x, lane = lane_id(), warp = t / 32;
-  const bool has_digit = t < kBins;  // digit t
+  const bool has_digit = t < kBins;
   if (t == 0) shared.block = atomicAdd(&scratch.tickets[pass], 1);
   const uint32_t of_all = has_digit ? scratch.histograms[pass * kBins + t] : 0;
   const int64_t items = *count, n = kFirst ? capacity : items;
@@ -153,7 +152,7 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads,
   for (int i = 0; i < kItems; ++i) keys[i] = whole || first + 32 * i < n ? keys_in[first + 32 * i] : kNoKey;
 #pragma unroll
   for (int i = 0; i < kItems; ++i) {
-    // Later passes count keys past the end too: they get the last positions of the last block.
+    // Later passes count keys past the end too: they come last.
     if (!kFirst || keys[i] != kNoKey) atomicAdd(&counts[D::of(keys[i], pass)], 1);
   }
   [[maybe_unused]] Value values[kItems];
@@ -173,7 +172,7 @@ __global__ void __launch_bounds__(Digits<kBits>::kThreads,
     for (int w = 0; w < D::kWarps; ++w) mine += shared.counts[w][t];
     write_status(status, (block == 0 ? kUpToBlock : kOfBlock) | mine);
   }
-  uint64_t all;  // two sums in one
+  uint64_t all;
   const uint64_t before = sum_before<D::kWarps>(uint64_t(of_all) << 32 | mine, uint64_t(0), all);
   const auto in_block = uint32_t(before), in_all = uint32_t(before >> 32);
   if (has_digit) {

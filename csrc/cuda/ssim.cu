@@ -1,10 +1,9 @@
-// The similarity of two images, the loss l1 + SSIM, and their adjoint, for torch/training_cuda.cpp. Three kernels: ssim
-// reads two images, and writes similarities, partial derivatives and sums of each block; loss adds the sums up in the
-// order of blocks; ssim_vjp reads the partial derivatives, and writes the gradient of the image.
+// The similarity of two images, a loss made of it and l1, and the adjoint, for torch/training_cuda.cpp. Three kernels:
+// `ssim` reads images, and writes similarities, partial derivatives and sums of blocks. `loss` adds these sums up in
+// order. And `ssim_vjp` makes the gradient of the image from partial derivatives.
 //
-// A block of ssim and ssim_vjp has a tile of pixels. It copies what the windows of the tile reach to shared memory, and
-// sums along rows, then along columns. A thread makes kSsimRun neighbouring sums from values in registers: else the
-// kernels would wait for shared memory.
+// A block has a tile of pixels: it copies what windows reach to shared memory, sums along rows, then along columns. A
+// thread makes kSsimRun neighbouring sums from registers, to load less from shared memory.
 #include "core/ssim.h"
 
 #include "cuda/launch.cuh"
@@ -18,10 +17,10 @@ namespace {
 constexpr int kThreads = kSsimThreads;
 constexpr int kReach = 2 * kSsimRadius;
 
-/// Sizes of the tile of a block, and of its rows in shared memory. T: float or double, in this file.
+/// The tile of a block. T: float or double, in this file.
 template <typename T> struct Tile {
   static constexpr int kColumns = kSsimColumns;
-  static constexpr int kRun = kSsimRun<T>;  ///< pixels of a thread, one below the other
+  static constexpr int kRun = kSsimRun<T>;  ///< pixels of a thread, in a column
   static constexpr int kRows = kThreads / kColumns * kRun;
   static constexpr int kReadColumns = kColumns + kReach, kReadRows = kRows + kReach;
   // The remainder by four is three: threads with runs of four in neighbouring rows read from different banks.
@@ -29,13 +28,11 @@ template <typename T> struct Tile {
   static constexpr int kSumPitch = kColumns + 1;
 };
 
-/// Shared memory: what windows read of kImages images, and kSums sums along rows.
 template <typename T, int kImages, int kSums> struct Shared {
   T read[kImages][Tile<T>::kReadRows * Tile<T>::kReadPitch];
   T sums[kSums][Tile<T>::kReadRows * Tile<T>::kSumPitch];
 };
 
-/// The tile of a block: plane, first row and first column.
 struct Position {
   int64_t plane;
   int top, left;
@@ -64,7 +61,7 @@ __device__ void for_each_read(Position position, int height, int width, const Co
 /// Calls body(index in Shared::read, index in Shared::sums) for every run of sums along rows.
 template <typename T, class Body> __device__ void for_each_run(const Body& body) {
   using Tile = Tile<T>;
-  constexpr int kRuns = Tile::kColumns / Tile::kRun;  // of a row
+  constexpr int kRuns = Tile::kColumns / Tile::kRun;
   for (int i = threadIdx.x; i < Tile::kReadRows * kRuns; i += kThreads) {
     const int row = i / kRuns, column = i % kRuns * Tile::kRun;
     body(row * Tile::kReadPitch + column, row * Tile::kSumPitch + column);
@@ -77,7 +74,7 @@ template <typename T, int kRun> __device__ void sum_run(const T (&v)[kRun + kRea
   for (int j = 0; j < kRun; ++j) out[j] = window_sum<T>([&](int k) { return v[j + kSsimRadius + k]; });
 }
 
-/// The window sums of this thread's pixels, from sums along rows.
+/// From sums along rows.
 template <typename T> __device__ void sum_columns(const T* along_rows, T (&out)[Tile<T>::kRun]) {
   using Tile = Tile<T>;
   const int column = threadIdx.x % Tile::kColumns, row = threadIdx.x / Tile::kColumns * Tile::kRun;
@@ -99,7 +96,7 @@ __device__ void for_each_pixel(Position position, int height, int width, const B
   }
 }
 
-/// Sums both values over the block, for the first thread.
+/// For the first thread.
 template <typename T> __device__ void sum_block(T& a, T& b) {
   constexpr int kWarps = kThreads / 32;
   __shared__ T of_warps[kWarps][2];
@@ -185,7 +182,7 @@ __global__ void __launch_bounds__(kThreads) ssim_kernel(const SsimParams<T, Targ
   }
 }
 
-/// One block adds up block_sums [blocks, 2], and writes the loss.
+/// One block. block_sums: [blocks, 2].
 template <typename T, typename Target>
 __global__ void loss_kernel(const SsimParams<T, Target> p, const T* block_sums, int64_t blocks) {
   wait_for_earlier_kernels();

@@ -1,6 +1,6 @@
-// The functions of a training step besides rendering, for torch/training_cuda.cpp; ssim.cu, activations.cu and adam.cu
-// have them. Pointers are views of device memory. Every function enqueues kernels on a stream, and does not wait. Bits
-// do not depend on the order in which blocks run. T: float or double.
+// What torch/training_cuda.cpp calls for a training step besides rendering: ssim.cu, activations.cu, adam.cu. Pointers
+// are views of device memory. Functions enqueue kernels on a stream, and do not wait. Bits do not depend on the order
+// of blocks. T: float or double.
 #pragma once
 
 #include <cuda_runtime_api.h>

@@ -1,5 +1,5 @@
-// A library of device functions for the kernels: sums, votes and searches over the lanes of a warp, and copies to
-// shared memory. Unless a comment says otherwise, all lanes of a warp must call a function.
+// A library for all kernels: sums, votes and searches over the lanes of a warp, which all lanes must call, and loads,
+// stores and copies, which single lanes may call.
 #pragma once
 
 #include <cstdint>
@@ -103,7 +103,7 @@ __device__ inline uint32_t lanes_that_agree(uint32_t bits, uint32_t mask) {
   return bits & mask ? set : ~set;
 #endif
 }
-/// Lanes with the same number, below 2^kBits.
+/// Lanes with the same number < 2^kBits.
 template <int kBits> __device__ uint32_t lanes_alike(uint32_t number) {
   uint32_t lanes = kAllLanes;
 #pragma unroll
@@ -111,8 +111,8 @@ template <int kBits> __device__ uint32_t lanes_alike(uint32_t number) {
   return lanes;
 }
 
-/// The first k of [0, n) for which before(k) is false; it is false from there on. Each group of kLanes lanes searches
-/// for its own k, a step among kLanes + 1 parts.
+/// The first k of [0, n) for which before(k) is false, if it is false from there on. For each group of kLanes lanes,
+/// which divides the range by kLanes + 1 in a step.
 template <int kLanes, class Before> __device__ int partition_point(int n, Before&& before) {
   const int lane = lane_id() % kLanes, group = lane_id() - lane;
   int found = 0;
@@ -126,7 +126,7 @@ template <int kLanes, class Before> __device__ int partition_point(int n, Before
   return found;
 }
 
-/// Shared memory of the size that the launch gives (LaunchShape).
+/// LaunchShape::shared_bytes of them.
 #if defined(__CUDACC__)
 __device__ inline float4* dynamic_shared() {
   extern __shared__ float4 memory[];
@@ -136,15 +136,15 @@ __device__ inline float4* dynamic_shared() {
 float4* dynamic_shared();  // in tests on the host
 #endif
 
-/// Removes the first number of a set, and returns it. Number j < 32 is bit 31 - j, as the highest bit takes one slow
-/// instruction to find, and the lowest two. For single lanes too.
+/// Removes and returns the first number of a set. Number j < 32 is bit 31 - j: the lowest bit would take one more slow
+/// instruction to find.
 __device__ inline int take_first(uint32_t& set) {
   const int first = __clz(int(set));
   set ^= 1u << (31 - first);
   return first;
 }
 
-/// For numbers that nobody reads soon. For single lanes too.
+/// Of what nobody reads soon.
 __device__ inline void store_streaming(float4* to, const float4& value) {
 #if defined(__CUDA_ARCH__)
   __stcs(to, value);
@@ -153,14 +153,14 @@ __device__ inline void store_streaming(float4* to, const float4& value) {
 #endif
 }
 
-/// For single lanes too.
+///
 __device__ inline void prefetch([[maybe_unused]] const void* address) {
 #if defined(__CUDA_ARCH__)
   asm volatile("prefetch.global.L1 [%0];" ::"l"(address));
 #endif
 }
 
-/// Begins to copy a number to shared memory, for all lanes to read after wait_for_copies(). For single lanes too.
+/// Begins to copy a number to shared memory, for all lanes to read after wait_for_copies().
 __device__ inline void copy_async(float* to, const float* from) {
 #if __CUDA_ARCH__ >= 800
   const auto address = uint32_t(__cvta_generic_to_shared(to));
