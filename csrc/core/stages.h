@@ -96,8 +96,8 @@ enum class MeanSums : int32_t {
 
 /// Gradients with respect to the members of Gaussians, which are overwritten. Null where not wanted.
 template <typename T> struct GaussianGrads {
-  static constexpr bool kAdd = false;     ///< whether gradients are added to those that are there,
-  static constexpr bool kAddShs = false;  ///< and whether the row of coefficients is that project_vjp gets
+  /// Whether gradients are added to these arrays, and coefficients to the `dL_dsh` that project_vjp gets.
+  static constexpr bool kAdd = false, kAddShs = false;
   Vec3<T>* means;
   Vec3<T>* scales;
   Vec4<T>* rotations;
