@@ -178,12 +178,6 @@ AR_HD void write_packed(const PackedRows<T>& to, int64_t i, const ProjectedGauss
   to.ids[place] = int32_t(i);
 }
 
-/// Whether `dL_dsh` of Gaussian i are coefficients to which others are added; else they are overwritten.
-template <class Out, typename T>
-AR_HD bool adds_to(const Gaussians<T>& g, const Out& out, int64_t i, const Vec3<T>* dL_dsh) {
-  return Out::kAdd && dL_dsh == out.shs + i * g.sh_stride;
-}
-
 /// Writes the gradient of the colour's parameters and returns the gradient with respect to the vector from the camera
 /// to the mean. `sh` are the coefficients, `dL_dsh` takes their gradient, or is null; they may be the same memory.
 template <class Cam, typename T, class Out>
@@ -202,12 +196,11 @@ AR_HD Vec3<T> splat_color_vjp(const Cam& camera, const Gaussians<T>& g, const Ou
   AR_UNROLL
   for (int k = 0; k < kCount; ++k) weight[k] = k < used ? dot(free, sh[k]) : T(0);
   if (dL_dsh) {
-    const bool adds = adds_to(g, out, i, dL_dsh);
     AR_UNROLL
     for (int k = 0; k < kCount; ++k) {
-      if (k < used) dL_dsh[k] = adds ? dL_dsh[k] + basis[k] * free : basis[k] * free;
+      if (k < used) dL_dsh[k] = Out::kAddShs ? dL_dsh[k] + basis[k] * free : basis[k] * free;
     }
-    for (int k = used; k < g.sh_stride && !adds; ++k) dL_dsh[k] = {T(0), T(0), T(0)};
+    for (int k = used; k < g.sh_stride && !Out::kAddShs; ++k) dL_dsh[k] = {T(0), T(0), T(0)};
   }
   if (g.sh_degree == 0) return {T(0), T(0), T(0)};
   const Vec3<T> dL_dunit = sh_basis_vjp<Cam::kShDegree>(g.sh_degree, d.unit, weight);
@@ -382,7 +375,7 @@ template <typename T, class Out>
 AR_HD void zero_grads(const Gaussians<T>& g, int64_t i, const Out& out, Vec3<T>* dL_dsh) {
   const Vec3<T> zero = {T(0), T(0), T(0)};
   if constexpr (Out::kAdd) {
-    for (int k = 0; dL_dsh && !adds_to(g, out, i, dL_dsh) && k < g.sh_stride; ++k) dL_dsh[k] = zero;
+    for (int k = 0; dL_dsh && !Out::kAddShs && k < g.sh_stride; ++k) dL_dsh[k] = zero;
     return;
   }
   if (out.means) out.means[i] = zero;

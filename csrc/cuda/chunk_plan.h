@@ -128,7 +128,7 @@ struct ChunkPlan {
   int32_t* tile_planes;    ///< [tiles] first plane of a tile's checkpoints, if it has any
   TileChunk* tail;         ///< [counts.tail] chunks behind the front ones, or null where chunks are whole lists
   CutList* cut_lists;      ///< [counts.cut_lists] in the order of their tiles in tile_order, or null
-  int blocks_at_once;      ///< kBlocksOfSm for each multiprocessor of the device
+  int blocks_at_once;      ///< kBlocksPerSm for each multiprocessor of the device
 };
 
 }  // namespace ar::cuda

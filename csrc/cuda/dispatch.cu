@@ -44,7 +44,7 @@ void blend(int footprint, const BlendParams& p, cudaStream_t stream) {
 
 void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream) {
   const int width = channel_group(footprint, p.channels.count - first);
-  launch(clear_sums_kernel, {kBlocksOfSm * multiprocessors(), kClearThreads}, stream, p, first, width);
+  launch(clear_sums_kernel, {kBlocksPerSm * multiprocessors(), kClearThreads}, stream, p, first, width);
   switch (family(footprint, p.channels.count)) {
     case Family::kStill: return blend_vjp_still(footprint, p, stream);
     case Family::kMoment: return blend_vjp_moment(footprint, p, first, stream);

@@ -24,7 +24,7 @@ template <class F, int C, int kSide> void launch_group(const BlendParams& p, int
 
 template <class F, int kSide> void launch_blend(const BlendParams& p, cudaStream_t stream) {
   const int64_t pieces = int64_t(p.cut.max_segments) * moving_segment(F::kSamples, kSide) / kFilterPiece;
-  const int64_t most = kFilterBlocksOfSm * multiprocessors();
+  const int64_t most = kFilterBlocksPerSm * multiprocessors();
   const auto blocks = unsigned(cuts_all_lists(p.grid) ? pieces : std::min(pieces, most));
   if (blocks > 0) launch(filter_kernel<F, kSide>, {blocks, kFilterPiece}, stream, p);
   if (!p.channels.data) return launch_group<F, 3, kSide>(p, 0, stream);

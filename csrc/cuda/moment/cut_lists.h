@@ -39,7 +39,7 @@ inline ListCut moving_list_cut(int samples, int64_t capacity, TileGrid grid, int
   const int64_t segments = capacity / length;
   if (cuts_all_lists(grid)) return {true, 0, 1, length, int(segments + tiles), tiles, longest_list(samples)};
   if (capacity < kLongList) return {true};
-  ListCut cut = {true, kLongList, kListBlocksOfSm * multiprocessors, length};
+  ListCut cut = {true, kLongList, kListBlocksPerSm * multiprocessors, length};
   cut.longest_from = longest_list(samples);
   cut.max_segments = int(cut.segment_limit(capacity));
   cut.max_lists = std::min(cut.max_segments / (kLongList / length), tiles);

@@ -206,7 +206,7 @@ template <class F, int kSide> struct ListedLayouts {
   static unsigned blocks(const ListCut& cut, TileGrid grid, int multiprocessors) {
     const int64_t longest = std::min(cut.max_lists, kLongestAtOnce), lists = cut.max_lists;
     const int64_t wanted = is_small_image(grid) ? longest * kOfLongest + lists * kOfOthers
-                                               : kListedWarpsOfSm * multiprocessors / kWarps;
+                                               : kListedWarpsPerSm * multiprocessors / kWarps;
     const int64_t blocks = std::min(wanted, lists * kOfLongest);
     return unsigned((blocks + kOfLongest - 1) / kOfLongest * kOfLongest);
   }

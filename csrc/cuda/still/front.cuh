@@ -90,7 +90,7 @@ __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front
 
 template <class F, int C, bool kKeep> void launch_blend(const BlendParams& p, cudaStream_t stream) {
   constexpr int S = F::kSamples;
-  const unsigned blocks = kBlocksOfSm * multiprocessors();  // of the tail, which share its work
+  const unsigned blocks = kBlocksPerSm * multiprocessors();  // of the tail, which share its work
   const LaunchShape of_chunks = {blocks, kBlendThreads}, of_parts = {blocks, 32}, of_sums = {blocks, kTailSumThreads};
   launch(blend_front_kernel<F, C, kKeep>, {unsigned(p.grid.tiles()), kBlendThreads}, stream, p);
   launch(tail_through_kernel<F>, of_chunks, stream, p);

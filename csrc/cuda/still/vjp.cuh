@@ -64,7 +64,7 @@ __global__ void __launch_bounds__(32 * vjp_warps(F::kSamples), kVjpBlocks<F, C>)
 
 template <class F, int C, Sums kSums> void launch_blend_vjp(const BlendVjpParams& p, cudaStream_t stream) {
   constexpr int kWarps = vjp_warps(F::kSamples);
-  const unsigned blocks = std::min(blocks_of(p.max_chunks, kWarps), kVjpBlocksOfSm * multiprocessors());
+  const unsigned blocks = std::min(blocks_of(p.max_chunks, kWarps), kVjpBlocksPerSm * multiprocessors());
   launch(blend_vjp_kernel<F, C, kSums>, {blocks, 32 * kWarps, sizeof(VjpShared<F, C>)}, stream, p);
 }
 template <class F, int C> void launch_blend_vjp_few(const BlendVjpParams& p, cudaStream_t stream) {
