@@ -34,6 +34,23 @@ def option_values(name: str) -> tuple:
     return tuple(_value_of(v["value"]) for v in _VARIANTS[name] if v["value"] is not None)
 
 
+def footprint_variants() -> tuple[str, ...]:
+    """Every footprint, and one that takes samples with every number of them: "point", ..., "box:samples=16"."""
+    return tuple(
+        f"{name}:samples={variant['samples']}" if variant["option"] == "samples" else name
+        for name, variants in _VARIANTS.items()
+        for variant in (variants if variants[0]["option"] == "samples" else variants[:1])
+    )
+
+
+def sampled_footprints() -> tuple[str, ...]:
+    """The footprints that take samples, with every number of them, the fewest first. With more samples each comes nearer
+    to the integral over the pixel.
+    """
+    sampled = [name for name in footprint_variants() if ":" in name]
+    return tuple(sorted(sampled, key=lambda name: resolve_footprint(name).samples))
+
+
 def _default_options(name: str) -> dict[str, Any]:
     default = next(v for v in _VARIANTS[name] if v["is_default"])
     if default["option"] is None:
@@ -55,8 +72,8 @@ class Footprint:
         name: One of `FOOTPRINTS`.
         options: Every option of that footprint, as a tuple of (name, value) pairs.
         key: Name under which it is registered (csrc/core/footprint/registry.h): "box4".
-        option: The number that it takes at run time: dilation, variance or tolerance; 0 where there is none.
-        samples: The most samples that a pixel has.
+        option: The number that it takes at run time: dilation or variance; 0 where there is none.
+        samples: Samples of a pixel.
     """
 
     name: str
@@ -80,20 +97,31 @@ def _number(name: str, value: Any) -> float:
     return number
 
 
+_GONE = {"adaptive": "take box with 16 samples or moment with 4"}  # footprints of earlier versions, and what to take
+
+
+def _nearest(option: str, value: Any, values: tuple) -> str:
+    """Of an option whose values are numbers: a hint at those next to a number that is none of them, else ""."""
+    try:
+        number = float(value)
+        below, above = [v for v in values if v < number], [v for v in values if v > number]
+    except (TypeError, ValueError):
+        return ""
+    nearest = [str(v) for v in (*sorted(below)[-1:], *sorted(above)[:1])]
+    return f"; nearest: {option}={' or '.join(nearest)}" if nearest else ""
+
+
 def resolve_footprint(name: str | Footprint, **options: Any) -> Footprint:
     """Settles a footprint's options.
 
     Args:
-        name: One of `FOOTPRINTS`, optionally followed by options: `"box:samples=8"`,
+        name: One of `FOOTPRINTS`, optionally followed by options: `"box:samples=16"`,
             `"point:dilation=0"`. Or a `Footprint`.
         **options: The same as keywords; they win over those in `name`.
             point: `dilation` (px^2 added to the covariance, default 0.3).
             mip: `variance` (px^2, default 0.1).
             analytic: `frame_gradient`, `"frozen"` (default) or `"paper"`.
-            box: `samples`, 1, 2, 4 (default), 8 or 16.
-            moment: `samples`, 1, 4 (default), 9 or 16.
-            adaptive: `tolerance`, of the image, in units of colour (default 1/255): `box` with 1, 4, 8 or 16
-                samples, chosen for every tile of 16x16 pixels.
+            box, moment: `samples`, 1, 4 (default) or 16.
 
     Raises:
         ValueError: Unknown name, unknown option, or a value outside its domain.
@@ -106,7 +134,8 @@ def resolve_footprint(name: str | Footprint, **options: Any) -> Footprint:
         raise ValueError(f"footprint must be one of {', '.join(FOOTPRINTS)}, got {name!r}")
     name, _, text = name.partition(":")
     if name not in FOOTPRINTS:
-        raise ValueError(f"footprint must be one of {', '.join(FOOTPRINTS)}, got {name!r}")
+        instead = f"; {_GONE[name]}" if name in _GONE else ""
+        raise ValueError(f"footprint must be one of {', '.join(FOOTPRINTS)}, got {name!r}{instead}")
     settled = dict(OPTIONS.get(name, {}))
     given = dict(item.partition("=")[::2] for item in text.split(",")) if text else {}
     given.update(options)
@@ -124,7 +153,8 @@ def resolve_footprint(name: str | Footprint, **options: Any) -> Footprint:
             variant = _VARIANTS[name][[str(v) for v in values].index(str(value))]
             settled[option] = _value_of(variant["value"])
         else:
-            raise ValueError(f"{option} must be one of {', '.join(map(str, values))}, got {value!r}")
+            known = ", ".join(map(str, values))
+            raise ValueError(f"{option} must be one of {known}, got {value!r}{_nearest(option, value, values)}")
     return Footprint(name, tuple(settled.items()), variant["key"], number, variant["samples"])
 
 

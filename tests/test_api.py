@@ -114,7 +114,7 @@ def test_settings_look_like_those_of_3dgs_2023():
     assert all(p.default is inspect.Parameter.empty for p in inspect.signature(Settings).parameters.values())
 
 
-@pytest.mark.parametrize("extra", [{}, {"footprint": "box", "samples": 8}], ids=["plain", "box"])
+@pytest.mark.parametrize("extra", [{}, {"footprint": "box", "samples": 16}], ids=["plain", "box"])
 def test_settings_are_a_tuple(extra):
     fields = CAMERA.fields()
     by_keyword = Settings(**fields, **extra)
@@ -135,7 +135,7 @@ def test_settings_are_equal_where_footprint_and_effects_are_too():
     variants = [
         settings,
         settings._replace(footprint="box", samples=4),
-        settings._replace(footprint="box", samples=8),
+        settings._replace(footprint="box", samples=16),
         settings._replace(effects=ar.Effects(alpha=True)),
         settings._replace(effects=ar.Effects(filter_3d=torch.ones(3))),
         settings._replace(effects="auto"),
@@ -161,7 +161,7 @@ def test_missing_and_unknown_fields():
         Settings(**fields, samples=4)  # an option without its footprint
 
 
-BOX8 = {"footprint": "box", "samples": 8}
+BOX8 = {"footprint": "box", "samples": 16}
 
 
 def assert_same_footprint(settings, expected):
@@ -215,7 +215,7 @@ def test_settings_without_footprint_follow_the_default():
         name_of(v): render(scene32(), CAMERA.settings(torch.float32, footprint=v[0], **v[1]))[0] for v in RENDERED
     }
     assert torch.equal(render(scene32(), settings)[0], expected["analytic-frozen"])
-    ar.set_default_footprint("box", samples=2)
+    ar.set_default_footprint("box", samples=1)
     assert torch.equal(render(scene32(), settings)[0], expected["box-2"])
     ar.set_default_footprint("point:dilation=0")
     assert str(ar.get_default_footprint()).startswith("point")
@@ -231,9 +231,9 @@ def test_settings_without_footprint_follow_the_default():
 
 def test_environment_variable(monkeypatch):
     variable = "ANALYTIC_RASTERIZER_FOOTPRINT"
-    monkeypatch.setenv(variable, "box:samples=2")
-    assert str(ar.get_default_footprint()) == "box:samples=2"
-    assert_same_footprint(CAMERA.settings(torch.float32), CAMERA.settings(torch.float32, footprint="box", samples=2))
+    monkeypatch.setenv(variable, "box:samples=1")
+    assert str(ar.get_default_footprint()) == "box:samples=1"
+    assert_same_footprint(CAMERA.settings(torch.float32), CAMERA.settings(torch.float32, footprint="box", samples=1))
     ar.set_default_footprint("mip")  # the call wins over the variable
     assert ar.get_default_footprint().name == "mip"
     ar.set_default_footprint(None)
@@ -736,7 +736,7 @@ def test_settings_of_another_class_are_named(device):
 
 def test_footprints_are_taken_where_their_names_are():
     """So that a program can put the default back that it found."""
-    box = ar.resolve_footprint("box:samples=8")
+    box = ar.resolve_footprint("box:samples=16")
     assert ar.resolve_footprint(box) == box and ar.resolve_footprint(box, samples=2).samples == 2
     found = ar.get_default_footprint()
     try:
@@ -747,7 +747,7 @@ def test_footprints_are_taken_where_their_names_are():
     finally:
         ar.set_default_footprint(None)
     offset, cov2d = torch.zeros(2), torch.tensor([0.5, 0.1, 0.4])
-    assert torch.equal(ar.footprint_weight(offset, cov2d, box), ar.footprint_weight(offset, cov2d, "box:samples=8"))
+    assert torch.equal(ar.footprint_weight(offset, cov2d, box), ar.footprint_weight(offset, cov2d, "box:samples=16"))
     with pytest.raises(ValueError, match="name must be a footprint where options are given, got None with samples"):
         ar.set_default_footprint(None, samples=4)
 

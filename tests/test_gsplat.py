@@ -511,13 +511,13 @@ def test_the_footprint_is_gsplats_filter_unless_one_was_chosen(device, monkeypat
     classic, antialiased = image(eps2d=0.2), image(eps2d=0.2, rasterize_mode="antialiased")
     assert torch.equal(classic, image(footprint="point:dilation=0.2"))
     assert torch.equal(antialiased, image(footprint="mip:variance=0.2"))
-    box = image(footprint=ar.resolve_footprint("box", samples=8))
+    box = image(footprint=ar.resolve_footprint("box", samples=16))
     assert not torch.equal(box, classic) and not torch.equal(antialiased, classic)
-    monkeypatch.setenv("ANALYTIC_RASTERIZER_FOOTPRINT", "box:samples=8")
+    monkeypatch.setenv("ANALYTIC_RASTERIZER_FOOTPRINT", "box:samples=16")
     assert torch.equal(image(), box) and torch.equal(image(footprint="point:dilation=0.2"), classic)
     monkeypatch.delenv("ANALYTIC_RASTERIZER_FOOTPRINT")
     try:
-        ar.set_default_footprint("box", samples=8)
+        ar.set_default_footprint("box", samples=16)
         assert torch.equal(image(), box)
     finally:
         ar.set_default_footprint(None)

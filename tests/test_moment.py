@@ -113,4 +113,4 @@ def test_samples_are_named_in_errors():
         with pytest.raises(ValueError, match=rf"samples must be one of 1, 4, 9, 16, got '?{wrong}"):
             ar.resolve_footprint("moment", samples=wrong)
     assert ar.resolve_footprint("moment").samples == 4
-    assert math.isqrt(ar.resolve_footprint("moment:samples=9").samples) == 3
+    assert math.isqrt(ar.resolve_footprint("moment:samples=16").samples) == 3

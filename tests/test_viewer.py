@@ -67,7 +67,7 @@ def ask(server, path, method="GET", host=None):
 @pytest.mark.parametrize("degree, numbers", [(0, 4), (1, 12), (2, 28), (3, 48)])
 def test_packed_numbers(degree, numbers):
     scene = make_scene(7, degree)
-    packed = viewer.pack_scene(scene, [make_view()], name="a scene", footprint="box:samples=8", background=(1, 0.5, 0))
+    packed = viewer.pack_scene(scene, [make_view()], name="a scene", footprint="box:samples=16", background=(1, 0.5, 0))
     geometry = np.frombuffer(packed.geometry, "<f4").reshape(7, 12)
     np.testing.assert_array_equal(geometry[:, :3], scene.means)
     np.testing.assert_array_equal(geometry[:, 3:4], scene.opacities)
@@ -81,7 +81,7 @@ def test_packed_numbers(degree, numbers):
     assert not harmonics[:, used:].any()
     meta = json.loads(packed.meta_json())
     assert (meta["name"], meta["count"], meta["sh_degree"]) == ("a scene", 7, degree)
-    assert (meta["footprint"], meta["background"]) == ("box:samples=8", [1.0, 0.5, 0.0])
+    assert (meta["footprint"], meta["background"]) == ("box:samples=16", [1.0, 0.5, 0.0])
 
 
 def test_packed_views():

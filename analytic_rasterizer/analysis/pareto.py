@@ -22,7 +22,7 @@ from ..footprints import resolve_footprint
 from ..gaussians import Gaussians
 from ..io import optional_import, write_text
 from . import tables, timing
-from .reference import EXACT, RMSE_SHARE, UNFILTERED, Refined, footprint_variants, image_errors, refine, supersampled
+from .reference import EXACT, RMSE_SHARE, UNFILTERED, Refined, image_errors, refine, supersampled
 
 BASE = "box:samples=1"  # times on the CPU are ratios to this
 SECOND_ESTIMATE = "box:samples=16"  # another way to the reference's limit
@@ -47,8 +47,7 @@ class Method:
     def has_single_weight(self) -> bool:
         """Whether every splat has one weight per pixel, so that the best such method is `exact`."""
         spec = resolve_footprint(self.footprint)
-        takes_many = spec.name == "adaptive" or dict(spec.options).get("samples", 1) > 1
-        return self.supersampling == 1 and not takes_many
+        return self.supersampling == 1 and spec.samples == 1
 
 
 def parse_method(text: str) -> Method:

@@ -17,7 +17,6 @@ STYLES = {  # colour and marker
     "cumulant": ("#2b8a3e", "^"),
     "box": ("#1c7ed6", "v"),
     "moment": ("#0c8599", "p"),
-    "adaptive": ("#7048e8", "P"),
     "erf": ("#e599b8", "d"),
     "exact": ("#000000", "*"),
 }

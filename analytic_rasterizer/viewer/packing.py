@@ -17,9 +17,7 @@ PAGE_FOOTPRINTS = (
     "analytic",
     "cumulant",
     "box:samples=1",
-    "box:samples=2",
     "box:samples=4",
-    "box:samples=8",
     "box:samples=16",
 )
 """What the page can draw. The options of `point` and `mip` may have any value."""
@@ -60,7 +58,7 @@ class PageFootprintError(ValueError):
 
 
 def page_footprint(footprint: Footprint) -> str:
-    """The footprint as the page writes it, such as `box:samples=8`.
+    """The footprint as the page writes it, such as `box:samples=4`.
 
     Raises PageFootprintError for a footprint that the page cannot draw.
     """

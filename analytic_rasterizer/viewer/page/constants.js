@@ -24,9 +24,7 @@ export const MINIMAX = [
 
 // Half of the nodes of the footprint box [px]; the other half is opposite. box_node of csrc/core/footprint/gaussian.h.
 export const HALF_NODES = {
-  2: [[0.25, 0.25]],
   4: [[-0.12083, -0.36226], [0.36226, -0.12083]],
-  8: [[0.23261, 0.40079], [0.39744, 0.06586], [0.31083, -0.35497], [0.06179, -0.14672]],
   16: [
     [0.26975, -0.14597], [0.14427, -0.43939], [0.062, -0.14646], [0.18749, 0.1472],
     [0.43551, -0.31294], [0.39499, 0.06396], [0.10473, 0.3564], [0.39573, 0.39912],
@@ -35,8 +33,7 @@ export const HALF_NODES = {
 
 /// Variance of each Gaussian of the footprint box [px^2]: kBoxVariance of csrc/core/footprint/gaussian.h.
 export function boxVariance(samples) {
-  if (samples === 1) return CONSTANTS.kPixelVariance;
-  return samples === 2 ? CONSTANTS.kPixelVariance / 4 : 1 / (24 * samples);
+  return samples === 1 ? CONSTANTS.kPixelVariance : 1 / (24 * samples);
 }
 
 /// All nodes of the footprint box [px].
@@ -56,9 +53,7 @@ export const FOOTPRINTS = [
   ['analytic', 'analytic'],
   ['cumulant', 'cumulant'],
   ['box:samples=1', 'box, 1 sample'],
-  ['box:samples=2', 'box, 2 samples'],
   ['box:samples=4', 'box, 4 samples'],
-  ['box:samples=8', 'box, 8 samples'],
   ['box:samples=16', 'box, 16 samples'],
 ];
 
@@ -72,7 +67,7 @@ export function parseFootprint(name) {
   if (expected === undefined || !valid) throw new Error(`There is no footprint '${name}'.`);
   if (kind === 'box') {
     const samples = key === '' ? 4 : number;
-    if (samples !== 1 && !(samples in HALF_NODES)) throw new Error(`box has 1, 2, 4, 8 or 16 samples, not ${value}.`);
+    if (samples !== 1 && !(samples in HALF_NODES)) throw new Error(`box has 1, 4 or 16 samples, not ${value}.`);
     return { name, kind, samples, variance: boxVariance(samples) };
   }
   const fixed = kind === 'cumulant' ? CONSTANTS.kPixelVariance : 0;
