@@ -44,8 +44,9 @@ def footprint_variants() -> tuple[str, ...]:
 
 
 def sampled_footprints() -> tuple[str, ...]:
-    """The footprints that take samples, with every number of them, the fewest first. With more samples each comes nearer
-    to the integral over the pixel.
+    """The footprints that take samples, with every number of them, the fewest first.
+
+    With more samples each comes nearer to the integral over the pixel.
     """
     sampled = [name for name in footprint_variants() if ":" in name]
     return tuple(sorted(sampled, key=lambda name: resolve_footprint(name).samples))

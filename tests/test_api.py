@@ -161,7 +161,7 @@ def test_missing_and_unknown_fields():
         Settings(**fields, samples=4)  # an option without its footprint
 
 
-BOX8 = {"footprint": "box", "samples": 16}
+BOX16 = {"footprint": "box", "samples": 16}
 
 
 def assert_same_footprint(settings, expected):
@@ -181,7 +181,7 @@ def assert_same_footprint(settings, expected):
     ids=["_replace", "copy", "deepcopy", "pickle", "rebuilt"],
 )
 def test_copies_keep_the_footprint(how):
-    settings = CAMERA.settings(torch.float32, **BOX8)
+    settings = CAMERA.settings(torch.float32, **BOX16)
     duplicate = how(settings)
     assert type(duplicate) is Settings
     assert duplicate._fields == FIELDS
@@ -190,7 +190,7 @@ def test_copies_keep_the_footprint(how):
 
 
 def test_replace():
-    settings = CAMERA.settings(torch.float32, **BOX8)
+    settings = CAMERA.settings(torch.float32, **BOX16)
     smaller = settings._replace(image_height=10)
     assert smaller.image_height == 10
     assert settings.image_height == 37
@@ -216,7 +216,7 @@ def test_settings_without_footprint_follow_the_default():
     }
     assert torch.equal(render(scene32(), settings)[0], expected["analytic-frozen"])
     ar.set_default_footprint("box", samples=1)
-    assert torch.equal(render(scene32(), settings)[0], expected["box-2"])
+    assert torch.equal(render(scene32(), settings)[0], expected["box-1"])
     ar.set_default_footprint("point:dilation=0")
     assert str(ar.get_default_footprint()).startswith("point")
     assert torch.equal(render(scene32(), settings)[0], expected["point-0.0"])
@@ -737,7 +737,7 @@ def test_settings_of_another_class_are_named(device):
 def test_footprints_are_taken_where_their_names_are():
     """So that a program can put the default back that it found."""
     box = ar.resolve_footprint("box:samples=16")
-    assert ar.resolve_footprint(box) == box and ar.resolve_footprint(box, samples=2).samples == 2
+    assert ar.resolve_footprint(box) == box and ar.resolve_footprint(box, samples=1).samples == 1
     found = ar.get_default_footprint()
     try:
         ar.set_default_footprint(box)
@@ -757,7 +757,13 @@ def test_footprints_are_taken_where_their_names_are():
     [
         ({"footprint": "gauss"}, r"footprint must .*got 'gauss'"),
         ({"footprint": ""}, r"footprint must .*got ''"),
-        ({"footprint": "box", "samples": 3}, r"samples must .*got 3"),
+        ({"footprint": "adaptive"}, r"footprint must .*got 'adaptive'; take box with 16 samples or moment with 4$"),
+        ({"footprint": "box", "samples": 3}, r"samples must be one of 1, 4, 16, got 3; nearest: samples=1 or 4$"),
+        ({"footprint": "box:samples=8"}, r"samples must be one of 1, 4, 16, got '8'; nearest: samples=4 or 16$"),
+        ({"footprint": "moment:samples=9"}, r"samples must be one of 1, 4, 16, got '9'; nearest: samples=4 or 16$"),
+        ({"footprint": "moment:samples=99"}, r"got '99'; nearest: samples=16$"),
+        ({"footprint": "moment:samples=four"}, r"got 'four'$"),
+        ({"footprint": "moment:samples=nan"}, r"got 'nan'$"),
         ({"footprint": "box:samples=0"}, r"samples must .*got '?0"),
         ({"footprint": "box:sample=4"}, r"'sample'"),
         ({"footprint": "box:4"}, r"'4'"),

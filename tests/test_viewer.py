@@ -16,7 +16,7 @@ from processes import DEADLINE
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C, cli, io, viewer
-from analytic_rasterizer.analysis.reference import footprint_variants
+from analytic_rasterizer.footprints import footprint_variants
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.viewer import pages
 
@@ -146,7 +146,7 @@ def test_names_of_footprints(given, name):
     assert viewer.page_footprint(ar.resolve_footprint(given)) == name
 
 
-@pytest.mark.parametrize("name", ["adaptive", "erf", "exact"])
+@pytest.mark.parametrize("name", ["moment", "erf", "exact"])
 def test_footprints_that_the_page_cannot_draw_are_refused(name):
     with pytest.raises(ValueError, match="viewer can draw"):
         viewer.pack_scene(make_scene(), footprint=name)

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import torch
 
-from ..footprints import footprint_weight
+from ..footprints import footprint_variants, footprint_weight
 from ..io import optional_import, write_text
 from . import tables
 from .reference import EXACT

@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 
 from ..camera import View
-from ..footprints import resolve_footprint
+from ..footprints import footprint_variants, resolve_footprint
 from ..gaussians import Gaussians
 from ..io import optional_import, write_text
 from . import tables, timing
