@@ -21,6 +21,21 @@ for _variant in _C.footprints():
 FOOTPRINTS = tuple(_VARIANTS)
 """Public names of the footprints, in the order of the registry: those of csrc/core/footprint/registry.h."""
 
+# The footprints that the library means where nobody names one. No other module names a footprint
+# (tests/test_footprint_names.py); docs/footprints.md says why these are recommended.
+PAPER = "analytic"  # the default, for parity with Analytic-Splatting
+PAPER_GRADIENT = f"{PAPER}:frame_gradient=paper"
+DILATED = "point"  # of 3DGS: what most repositories render with, and most files were trained with
+UNFILTERED = f"{DILATED}:dilation=0"  # samples without a filter, also for Gaussians that hold the pixel already
+COMPENSATED = "mip"  # of Mip-Splatting, and of the modes that others call antialiased
+RECOMMENDED = "moment:samples=4"  # for training, and for scenes that were baked
+FASTEST = "box:samples=1"  # that integrates over the pixel
+FOUR_SAMPLES = "box:samples=4"
+SIXTEEN_SAMPLES = "box:samples=16"
+EXACT = "exact"  # the weight without an error
+NEAREST_TO_EXACT = "cumulant"  # of the footprints with one weight for a splat and a pixel
+TURNED = "erf"  # the window of PAPER with the exact CDF
+
 REFERENCE_FOOTPRINTS = tuple(name for name, variants in _VARIANTS.items() if variants[0]["reference"])
 """Footprints that are meant to compare others with, and are slow."""
 
@@ -159,8 +174,13 @@ def resolve_footprint(name: str | Footprint, **options: Any) -> Footprint:
     return Footprint(name, tuple(settled.items()), variant["key"], number, variant["samples"])
 
 
-_ANALYTIC = resolve_footprint("analytic")
+_PAPER = resolve_footprint(PAPER)
 _default: Footprint | None = None
+
+
+def stated(footprint: Footprint) -> dict[str, Any]:
+    """What the header of a footprint states: see describe() in csrc/torch/ops.cpp."""
+    return next(v for v in _VARIANTS[footprint.name] if v["key"] == footprint.key)
 
 
 def set_default_footprint(name: str | Footprint | None, **options: Any) -> None:
@@ -202,7 +222,7 @@ def get_default_footprint() -> Footprint:
     Raises:
         ValueError: The environment variable holds no footprint.
     """
-    return chosen_footprint() or _ANALYTIC
+    return chosen_footprint() or _PAPER
 
 
 def check_device(device: torch.device) -> None:
@@ -215,7 +235,7 @@ def check_device(device: torch.device) -> None:
 
 
 def footprint_weight(
-    offset: torch.Tensor, cov2d: torch.Tensor, footprint: str | Footprint = "analytic", **options: Any
+    offset: torch.Tensor, cov2d: torch.Tensor, footprint: str | Footprint = PAPER, **options: Any
 ) -> torch.Tensor:
     """Weight I(d, Sigma) of a splat of peak 1 in one pixel. Differentiable.
 

@@ -10,13 +10,11 @@ from typing import Any, NamedTuple
 import torch
 
 from ..camera import View
-from ..footprints import resolve_footprint
+from ..footprints import UNFILTERED, resolve_footprint
 from ..gaussians import Gaussians
 from ..io import optional_import
 from ..rasterizer import GaussianRasterizer
 
-UNFILTERED = "point:dilation=0"  # samples of the scene itself, without any filter
-EXACT = "exact"  # the footprint whose weight has no error
 RMSE_SHARE = 0.1  # a reference is refined until it changes by at most this share of the smallest error
 MAX_DENSITY = 64  # samples along a pixel's side beyond which a reference is not refined
 MAX_PIXELS = 2**23  # of one render of unfiltered samples; more pixels are split over several renders
