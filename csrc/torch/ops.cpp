@@ -99,16 +99,23 @@ TORCH_LIBRARY_IMPL(analytic_rasterizer, CUDA, m) { register_kernels(m); }
 #endif
 
 /// What Python knows of a footprint: all of it from its header.
-pybind11::dict describe(const char* key, const char* name, Option option, int samples, bool reference) {
+template <class F> pybind11::dict describe() {
+  constexpr Option option = F::kOption;
+  const auto or_none = [](const char* text) -> pybind11::object {
+    if (text) return pybind11::str(text);
+    return pybind11::none();
+  };
   pybind11::dict d;
-  d["key"] = key;
-  d["name"] = name;
-  d["option"] = option.name ? pybind11::cast(option.name) : pybind11::none();
-  d["value"] = option.value ? pybind11::cast(option.value) : pybind11::none();
+  d["key"] = key_of<F>();
+  d["name"] = F::kName;
+  d["option"] = or_none(option.name);
+  d["value"] = or_none(option.value);
   d["number"] = option.number;
   d["is_default"] = option.is_default;
-  d["samples"] = samples;
-  d["reference"] = reference;
+  d["samples"] = F::kSamples;
+  d["reference"] = F::kReference;
+  d["page"] = or_none(F::kPage);
+  d["variance"] = F::support_variance({option.number});
   return d;
 }
 
@@ -188,10 +195,7 @@ PYBIND11_MODULE(_C, m) {
       "footprints",
       [] {
         std::vector<pybind11::dict> all;
-        ar::for_each_footprint(ar::Footprints{}, [&](auto f) {
-          using F = decltype(f);
-          all.push_back(ar::ops::describe(ar::key_of<F>(), F::kName, F::kOption, F::kSamples, F::kReference));
-        });
+        ar::for_each_footprint(ar::Footprints{}, [&](auto f) { all.push_back(ar::ops::describe<decltype(f)>()); });
         return all;
       },
       "What the headers say of every footprint, in the order of the registry.");
