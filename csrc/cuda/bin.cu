@@ -77,7 +77,7 @@ void plan_chunks(const TileLists& lists, TileGrid grid, int samples, const ListC
                  const ChunkPlan& plan, cudaStream_t stream) {
   const LaunchShape shape = {blocks_of(grid.tiles(), kPlanThreads), kPlanThreads};
   const LaunchShape counters = {PlanState::kCounters, kCountWorkThreads};
-  launch(count_work_kernel, counters, stream, lists, grid.tiles(), samples, cut, plan.state);
+  launch(count_work_kernel, counters, stream, lists, grid.tiles(), cut, plan.state);
   launch(plan_kernel, shape, stream, lists, grid, samples, cut, layout, plan);
 }
 

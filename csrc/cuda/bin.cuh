@@ -8,8 +8,8 @@
 
 #include "core/bin.h"
 #include "cuda/launch.cuh"
+#include "cuda/params.h"
 #include "cuda/sort.cuh"
-#include "cuda/stages.h"
 #include "cuda/tuning.h"
 
 namespace ar::cuda {

@@ -18,9 +18,9 @@ inline constexpr int kNoList = 1 << 30;
 
 /// Chunks of a tile that blend goes through one after the other, which reads no pair after the point where all pixels
 /// have stopped. The remaining chunks are blended side by side, which takes more work. Few tiles cannot fill the device
-/// (`blocks_at_once`: the blocks that it works on at once), so that their front is short. Else the front is so long that
-/// fewer than blocks_at_once tiles have a tail: only a tile whose list is longer than a block's share of all pairs, which
-/// would keep its block busy when the others have ended. `pairs`: of the whole image.
+/// (`blocks_at_once`: the blocks that it works on at once), so that their front is short. Else the front is so long
+/// that fewer than blocks_at_once tiles have a tail: only a tile whose list is longer than a block's share of all
+/// pairs, which would keep its block busy when the others have ended. `pairs`: of the whole image.
 AR_HD int front_chunks(TileGrid grid, int64_t pairs, int blocks_at_once) {
   constexpr int64_t kMost = 1 << 30;  // with more, tiles share lists, which have no chunks
   if (2 * grid.tiles() <= blocks_at_once) return kShortFront;
@@ -66,7 +66,7 @@ struct PlanCounts {
   /// Lists that are cut, which are the first of ChunkPlan::tile_order, and their segments, the first of chunk_order.
   int32_t cut_lists, segments;
   int32_t longest_lists;  ///< the first of those that are cut: of ListCut::longest_from pairs or more
-  int32_t open_tiles;  ///< tiles that have an open sample and more pairs after their front chunks
+  int32_t open_tiles;     ///< tiles that have an open sample and more pairs after their front chunks
 };
 
 /// Tiles and chunks by the class of their length, a power of two.

@@ -1,14 +1,14 @@
-// Entry points of blending for csrc/torch: blend(), blend_vjp() and inspect() choose the family of kernels by the table of
-// dispatch.h.
+// Entry points of blending for csrc/torch: blend(), blend_vjp() and inspect() choose the family of kernels by the table
+// of dispatch.h.
 #include "cuda/dispatch.h"
 #include "cuda/inspect.cuh"
 #include "cuda/launch.cuh"
-#include "cuda/stages.h"
+#include "cuda/params.h"
 
 namespace ar::cuda {
 namespace {
 
-constexpr int kClearThreads = 256;
+constexpr int kClearBlock = 256;
 
 /// Before the backward kernels: no chunk has been claimed; and where there are more pairs than room, sets the rows of
 /// splats to zero, to which all tiles add: pair_grads [n, kPairGradWidth], once for all groups of channels, and
@@ -34,21 +34,29 @@ Family family(int footprint, int channels) {
 
 }  // namespace
 
+int multiprocessors_of_device() { return int(multiprocessors()); }
+
 void blend(int footprint, const BlendParams& p, cudaStream_t stream) {
   switch (family(footprint, p.channels.count)) {
-    case Family::kStill: return blend_still(footprint, p, stream);
-    case Family::kMoment: return blend_moment(footprint, p, stream);
-    case Family::kChannels: return blend_channels(footprint, p, stream);
+    case Family::kStill:
+      return blend_still(footprint, p, stream);
+    case Family::kMoment:
+      return blend_moment(footprint, p, stream);
+    case Family::kChannels:
+      return blend_channels(footprint, p, stream);
   }
 }
 
 void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream) {
   const int width = channel_group(footprint, p.channels.count - first);
-  launch(clear_sums_kernel, {kBlocksPerSm * multiprocessors(), kClearThreads}, stream, p, first, width);
+  launch(clear_sums_kernel, {kBlocksPerSm * multiprocessors(), kClearBlock}, stream, p, first, width);
   switch (family(footprint, p.channels.count)) {
-    case Family::kStill: return blend_vjp_still(footprint, p, stream);
-    case Family::kMoment: return blend_vjp_moment(footprint, p, first, stream);
-    case Family::kChannels: return blend_vjp_channels(footprint, p, first, stream);
+    case Family::kStill:
+      return blend_vjp_still(footprint, p, stream);
+    case Family::kMoment:
+      return blend_vjp_moment(footprint, p, first, stream);
+    case Family::kChannels:
+      return blend_vjp_channels(footprint, p, first, stream);
   }
 }
 

@@ -1,6 +1,6 @@
-// The table of blending: which family of kernels blends a footprint, in tiles of which size, and what memory that takes.
-// The functions of csrc/torch ask it for sizes, dispatch.cu asks it for the family. A test compares Route::forward and
-// Route::backward with the kernels that are launched.
+// The table of blending: which family of kernels blends a footprint, in tiles of which size, and what memory that
+// takes. The functions of csrc/torch ask it for sizes, dispatch.cu asks it for the family. A test compares
+// Route::forward and Route::backward with the kernels that are launched.
 //
 // | footprint                          | channels | tiles                          | family    |
 // |------------------------------------|----------|--------------------------------|-----------|
@@ -25,8 +25,8 @@
 #include <type_traits>
 
 #include "core/footprint/registry.h"
-#include "cuda/chunk_plan.h"
 #include "cuda/moment/cut_lists.h"
+#include "cuda/params.h"
 
 namespace ar::cuda {
 
@@ -58,7 +58,7 @@ template <class Function> void visit_pixels(int footprint, Function&& f) {
 
 template <class F> constexpr Family family_of(int64_t channels) {
   if (F::kMoves) return Family::kMoment;
-  return F::kReference || channels > kFewChannels ? Family::kChannels : Family::kStill;
+  return F::kGeneric || channels > kFewChannels ? Family::kChannels : Family::kStill;
 }
 
 /// How a footprint is blended with so many channels.
@@ -86,7 +86,8 @@ inline Route route_of(int footprint, int64_t channels, int64_t capacity, TileGri
       route.forward = {"moving_blend_kernel"};
       route.backward = {"moving_vjp_kernel"};
       if (cuts) route.forward = {"filter_kernel", "listed_blend_kernel", "moving_blend_kernel"};
-      if (cuts) route.backward = {"segment_maps_kernel", "chain_maps_kernel", "segment_vjp_kernel", "moving_vjp_kernel"};
+      if (cuts)
+        route.backward = {"segment_maps_kernel", "chain_maps_kernel", "segment_vjp_kernel", "moving_vjp_kernel"};
     } else {
       with_lanes<F>(grid, [&](auto of_lane) { route.samples_of_lane = decltype(of_lane)::kSamples; });
       if (route.family == Family::kChannels) {
@@ -105,12 +106,21 @@ inline Route route_of(int footprint, int64_t channels, int64_t capacity, TileGri
 /// Channels of the group that begins with the first of `left` channels, where there are more than kFewChannels, or the
 /// footprint is a reference.
 template <class F> constexpr int group_width(int left) {
-  return F::kReference || F::kMoves || left > kSmallGroup ? kChannelGroup : kSmallGroup;
+  return F::kGeneric || F::kMoves || left > kSmallGroup ? kChannelGroup : kSmallGroup;
 }
 inline int channel_group(int footprint, int left) {
   int width = 0;
   visit_pixels(footprint, [&](auto f) { width = group_width<decltype(f)>(left); });
   return width;
+}
+
+/// Numbers in BlendParams::reach_words and BlendVjpParams::adjoint_maps, of footprints whose samples move; 0 where no
+/// list is cut. max_group_sums() of params.h is the third.
+inline int64_t max_reach_words(const ListCut& cut, TileGrid grid) {
+  return int64_t(cut.max_segments) * (cut.segment / 32) * grid.side() * grid.side();
+}
+inline int64_t max_adjoint_maps(int samples, const ListCut& cut, TileGrid grid) {
+  return int64_t(cut.max_segments) * kMapNumbers * samples * grid.side() * grid.side();
 }
 
 /// Channels that still/ and moment/ are compiled for: 3 in the splats, or up to 4 in rows.

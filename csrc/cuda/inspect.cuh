@@ -5,8 +5,8 @@
 #include <algorithm>
 
 #include "core/inspect.h"
-#include "cuda/tile.cuh"
 #include "cuda/launch.cuh"
+#include "cuda/tile.cuh"
 
 namespace ar::cuda {
 

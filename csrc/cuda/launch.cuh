@@ -12,6 +12,8 @@
 #include <atomic>
 #include <utility>
 
+#include "cuda/launch_log.h"
+
 namespace ar::cuda {
 
 /// The answers of more devices are not kept.
@@ -104,6 +106,8 @@ inline bool set_begun_event([[maybe_unused]] cudaLaunchAttribute& attribute, [[m
 /// cudaGetLastError() tells of errors.
 template <class... Params, class... Arguments>
 void launch(void (*kernel)(Params...), const LaunchShape& shape, cudaStream_t stream, Arguments&&... arguments) {
+  if (const auto observe = launch_observer.load(std::memory_order_relaxed))
+    observe(reinterpret_cast<const void*>(kernel));
   constexpr size_t kUnasked = 48 * 1024;  // bytes that every kernel may have
   if (shape.shared_bytes > kUnasked)
     cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, int(shape.shared_bytes));

@@ -2,7 +2,7 @@
 #pragma once
 
 #include "cuda/launch.cuh"
-#include "cuda/stages.h"
+#include "cuda/params.h"
 #include "cuda/warp.cuh"
 
 namespace ar::cuda {

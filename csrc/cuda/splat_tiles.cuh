@@ -2,7 +2,7 @@
 #pragma once
 
 #include "core/bin.h"
-#include "cuda/stages.h"
+#include "cuda/params.h"
 
 namespace ar::cuda {
 

@@ -11,7 +11,7 @@
 
 #include "core/bin.h"
 #include "core/blend.h"
-#include "cuda/stages.h"
+#include "cuda/params.h"
 #include "cuda/warp.cuh"
 
 namespace ar::cuda {
@@ -37,8 +37,9 @@ template <class F> __device__ Vec2<float> pixel_of(int b, int lane) {
   const int pixel = lane / F::kLanes;
   return {float((b & 1) * kWide + pixel % kWide), float((b >> 1) * kHigh + pixel / kWide)};
 }
-/// The position of a lane's sample in subtile b, from the tile's first pixel, where `of_first` is its position in subtile
-/// 0. Blend and blend_vjp both call this, because alpha must have the same bits in both: one addition of a whole number.
+/// The position of a lane's sample in subtile b, from the tile's first pixel, where `of_first` is its position in
+/// subtile 0. Blend and blend_vjp both call this, because alpha must have the same bits in both: one addition of a
+/// whole number.
 template <class F> __device__ Vec2<float> position_in(int b, Vec2<float> of_first) {
   return {of_first.x + float((b & 1) * kSubtileWide<F>), of_first.y + float((b >> 1) * kSubtileHigh<F>)};
 }
@@ -61,9 +62,7 @@ template <class F> __device__ Vec2<float> position_of(int b, int lane) {
 template <class F> __device__ Splat<F, float> load_splat(const float* splats, int32_t id) {
   return reinterpret_cast<const Splat<F, float>*>(splats)[id];
 }
-__device__ inline void prefetch_splat(const float* splats, int32_t id) {
-  prefetch(splats + int64_t(id) * kSplatWidth);
-}
+__device__ inline void prefetch_splat(const float* splats, int32_t id) { prefetch(splats + int64_t(id) * kSplatWidth); }
 
 /// A tile and its list of splats, front to back.
 struct TileList {
@@ -105,9 +104,9 @@ __device__ inline TileList list_of(const TileLists& lists, TileGrid grid, int ti
   return list;
 }
 
-/// Which boxes of kWide x kHigh pixels a splat reaches: bit b for the box in column b % kColumns and row b / kColumns of
-/// kColumns x kRows boxes whose first pixel is at (x0, y0). A box that the splat passes closely may be among them; only
-/// for footprints with expensive weights exact extents are worth their cost.
+/// Which boxes of kWide x kHigh pixels a splat reaches: bit b for the box in column b % kColumns and row b / kColumns
+/// of kColumns x kRows boxes whose first pixel is at (x0, y0). A box that the splat passes closely may be among them;
+/// only for footprints with expensive weights exact extents are worth their cost.
 template <int kWide, int kHigh, int kColumns, int kRows, class F>
 __device__ uint32_t reached_boxes(const Splat<F, float>& splat, int x0, int y0) {
   static_assert(kColumns * kRows <= 32);
@@ -371,8 +370,8 @@ __device__ inline void clear_pair(const BlendVjpParams& params, int64_t row) {
 /// Threads that clear_pair_together takes for a pair.
 inline constexpr int kClearThreads = kChannelGroup / 4;
 
-/// The same by kClearThreads neighbouring threads, all of which must call it: clears the row of pair_grads, if `shapes`,
-/// and the row of kWidth channel_sums, if there are any.
+/// The same by kClearThreads neighbouring threads, all of which must call it: clears the row of pair_grads, if
+/// `shapes`, and the row of kWidth channel_sums, if there are any.
 template <int kWidth> __device__ void clear_pair_together(const BlendVjpParams& params, int64_t row, bool shapes) {
   const int q = threadIdx.x % kClearThreads;
   const float4 zero = {0, 0, 0, 0};

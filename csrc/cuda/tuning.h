@@ -188,8 +188,8 @@ constexpr int listed_warps(int samples) { return samples == 1 ? 1 : 4; }
 /// Pairs in the queues of a warp.
 inline constexpr int kQueued = 1024;
 
-/// Threads of the backward kernels that a multiprocessor should hold: more threads have fewer registers, but waiting for
-/// the samples' earlier positions costs more than a few numbers in memory. `segments`: of cut lists.
+/// Threads of the backward kernels that a multiprocessor should hold: more threads have fewer registers, but waiting
+/// for the samples' earlier positions costs more than a few numbers in memory. `segments`: of cut lists.
 constexpr int moving_vjp_threads(int channels, int cells_of_lane, bool segments) {
   return channels > 3 ? 512 : cells_of_lane > 2 && !segments ? 768 : 1024;
 }
@@ -200,11 +200,13 @@ inline constexpr int kMostInShared = 8;
 /// Groups of a segment for each warp of its block. With one cell, whose tiles of 8x8 pixels have two groups, a block of
 /// one warp would take too long; in tiles of 4x4 pixels fewer warps were slower.
 inline constexpr int kMostGroupsOfWarp = 2;
-constexpr int groups_of_warp(int samples, bool small_tiles) { return samples == 1 || small_tiles ? 1 : kMostGroupsOfWarp; }
+constexpr int groups_of_warp(int samples, bool small_tiles) {
+  return samples == 1 || small_tiles ? 1 : kMostGroupsOfWarp;
+}
 /// Segments whose maps chain_maps reads at once, since each of them waits for memory.
 inline constexpr int kMapsAhead = 8;
-/// Groups of a tile up to which their sums are added up in shared memory; with more groups they would leave room for too
-/// few blocks, and are in BlendVjpParams::group_sums. Pairs between two barriers in either case.
+/// Groups of a tile up to which their sums are added up in shared memory; with more groups they would leave room for
+/// too few blocks, and are in BlendVjpParams::group_sums. Pairs between two barriers in either case.
 inline constexpr int kMostSumsInside = 2;
 constexpr int segment_batch(bool sums_inside) { return sums_inside ? 64 : 128; }
 

@@ -4,7 +4,7 @@
 
 #include "core/weight.h"
 #include "cuda/launch.cuh"
-#include "cuda/stages.h"
+#include "cuda/params.h"
 #include "cuda/tuning.h"
 #include "cuda/warp.cuh"
 

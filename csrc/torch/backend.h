@@ -22,7 +22,7 @@ struct SplatTensors {
   Tensor splats;  ///< (n, kSplatWidth) SplatRow
   Tensor ids;     ///< (n,) int32, CPU: the Gaussian of each, ascending
   Tensor depths;  ///< (n,) CPU
-  Tensor counts;  ///< (4,) int64, CUDA: the numbers of Counts (csrc/cuda/stages.h), which `project` sets to zero
+  Tensor counts;  ///< (4,) int64, CUDA: the numbers of Counts (csrc/cuda/params.h), which `project` sets to zero
   Tensor ranges;  ///< (n, 2) int32, CUDA: first slot, for a backward pass, and number of pairs of each
   Tensor memory;  ///< bytes, CUDA: SplatMemory (cuda_views.h)
 };
@@ -35,7 +35,7 @@ struct ListTensors {
   Tensor tile_offsets;   ///< (tiles + 1,) int64, first pair of each tile; of a patch, where tiles share lists
   Tensor splat_offsets;  ///< CPU: (n + 1,) int64 into positions; CUDA: (n, 2) int32 first slot and number of slots
   Tensor positions;      ///< CPU: (N,) int64 places in `pairs` of each splat's pairs
-  Tensor counts;         ///< CUDA: the numbers of Counts (csrc/cuda/stages.h)
+  Tensor counts;         ///< CUDA: the numbers of Counts (csrc/cuda/params.h)
 
   static constexpr size_t kMembers = 7;
   template <class Visit> void each(Visit&& visit) {

@@ -178,6 +178,11 @@ constexpr const char* kBuiltFor = "analytic_rasterizer was built for torch " AR_
 
 #if defined(AR_WITH_CUDA)
 void force_pair_capacity(int64_t capacity);
+void record_kernels(bool on);
+std::vector<std::string> launched_kernels();
+std::pair<std::vector<std::string>, std::vector<std::string>> blend_route(const std::string& key, int64_t channels,
+                                                                          int64_t width, int64_t height,
+                                                                          int64_t capacity);
 #endif
 }  // namespace ar::ops
 
@@ -188,6 +193,12 @@ PYBIND11_MODULE(_C, m) {
   m.attr("has_cuda") = true;
   m.def("force_pair_capacity", &ar::ops::force_pair_capacity,
         "For tests: room for so many pairs on CUDA, whatever comes; 0 to guess anew, from the frames that follow.");
+  m.def("record_kernels", &ar::ops::record_kernels,
+        "For tests: record launches from now on, beginning with none; or not.");
+  m.def("launched_kernels", &ar::ops::launched_kernels, "For tests: mangled names of the kernels that were recorded.");
+  m.def("blend_route", &ar::ops::blend_route,
+        "For tests: kernels that blend (key, channels, width, height, room for pairs) forward and backward, by "
+        "dispatch.h.");
 #else
   m.attr("has_cuda") = false;
 #endif

@@ -7,9 +7,8 @@ void blend_vjp_channels(int footprint, const BlendVjpParams& p, int first, cudaS
   visit_pixels(footprint, [&](auto f) {
     using F = decltype(f);
     if constexpr (!F::kMoves) {
-      with_lanes<F>(p.grid, [&](auto of_lane) {
-        launch_blend_groups_vjp<decltype(of_lane)>(with_channels(p), first, stream);
-      });
+      with_lanes<F>(p.grid,
+                    [&](auto of_lane) { launch_blend_groups_vjp<decltype(of_lane)>(with_channels(p), first, stream); });
     }
   });
 }

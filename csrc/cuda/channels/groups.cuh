@@ -1,9 +1,9 @@
-// Kernel blend_groups: the forward pass for any number of channels, in groups of 32 or, for a last group of up to 8, of 8.
-// A block per tile and group walks the whole list, with a pixel (or a sample of a Spread) per lane. It reads lists,
-// splats and rows of channels, and writes images, and for a backward pass transmittance and `last`. blend_channels
-// (channels/blend.cu) launches it: for footprints whose samples stay, with more than four channels; and for reference
-// footprints always, whose weights are slow anyway. Each group computes the weights again, which costs less than to
-// store them.
+// Kernel blend_groups: the forward pass for any number of channels, in groups of 32 or, for a last group of up to 8,
+// of 8. A block per tile and group walks the whole list, with a pixel (or a sample of a Spread) per lane. It reads
+// lists, splats and rows of channels, and writes images, and for a backward pass transmittance and `last`.
+// blend_channels (channels/blend.cu) launches it: for footprints whose samples stay, with more than four channels; and
+// for reference footprints always, whose weights are slow anyway. Each group computes the weights again, which costs
+// less than to store them.
 #pragma once
 
 #include "cuda/dispatch.h"
@@ -18,10 +18,10 @@ template <int C> struct alignas(C / 2) Eighth {
   float v[C / 8];
 };
 
-/// How the lanes of a warp share the C channels of its pixels. Each lane computes the weights of its own pixel. But sums
-/// over channels or pixels are shared out differently, so that a channel read from shared memory serves four pixels: a
-/// lane has a quarter of the channels of the four pixels in its column. Pixel i of lane l is the own pixel of lane l ^ 8 i
-/// (i = 0: of itself), and the lane has the eighths l / 4 and l / 4 ^ 1 of the channels.
+/// How the lanes of a warp share the C channels of its pixels. Each lane computes the weights of its own pixel. But
+/// sums over channels or pixels are shared out differently, so that a channel read from shared memory serves four
+/// pixels: a lane has a quarter of the channels of the four pixels in its column. Pixel i of lane l is the own pixel of
+/// lane l ^ 8 i (i = 0: of itself), and the lane has the eighths l / 4 and l / 4 ^ 1 of the channels.
 template <int C> struct ChannelShare {
   static constexpr int kPixels = 4, kOwn = C / 4, kHalf = C / 8;
 
@@ -264,7 +264,7 @@ template <class F> void launch_blend_groups(const BlendParams& p, cudaStream_t s
     const dim3 blocks(tiles, unsigned(first / kChannelGroup));
     launch(blend_groups_kernel<F, kChannelGroup>, {blocks, kBlendThreads}, stream, p, 0);
   }
-  if constexpr (!F::kReference) {
+  if constexpr (!F::kGeneric) {
     if (first < p.channels.count) launch(blend_groups_kernel<F, kSmallGroup>, {tiles, kBlendThreads}, stream, p, first);
   }
 }

@@ -3,9 +3,9 @@
 // channels as in groups.cuh. It reads `last`, `transmittance` and the gradient of the image, and writes rows of
 // pair_grads and channel_sums. blend_vjp_channels (channels/blend_vjp.cu) launches it.
 //
-// dL/dalpha is linear in the gradient of the image: each group adds its share to the sums of a pair, which a single block
-// owns. Only MeanSums need all channels at once: where they are wanted, the first group makes all sums of shapes, and
-// reads the channels of the other groups from memory.
+// dL/dalpha is linear in the gradient of the image: each group adds its share to the sums of a pair, which a single
+// block owns. Only MeanSums need all channels at once: where they are wanted, the first group makes all sums of shapes,
+// and reads the channels of the other groups from memory.
 #pragma once
 
 #include "cuda/channels/groups.cuh"
@@ -44,8 +44,8 @@ __device__ ChannelShare<C> share_of_gradient(const BlendVjpParams& params, const
   return g;
 }
 
-/// A block per tile, for channels [first, first + C). `F`: what a lane blends; `kWithShape`: makes the sums of shapes too,
-/// else only those of channels.
+/// A block per tile, for channels [first, first + C). `F`: what a lane blends; `kWithShape`: makes the sums of shapes
+/// too, else only those of channels.
 template <class F, int C, bool kWithShape>
 __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
     blend_groups_vjp_kernel(const BlendVjpParams params, int first) {
@@ -180,7 +180,6 @@ __global__ void __launch_bounds__(kBlendThreads, kGroupBlocks<F, C>)
             means = mean_sums_of(params.mean_sums, size, transform_transposed(shared.mean_maps[j], offset));
             if (!writes_pixel<F>(lane)) means = {0, 0};
           }
-          shape = F::collect(splat.terms, shape, weighted);
           const float values[kShapeSums] = {shape.offset.x, shape.offset.y, shape.shape.xx, shape.shape.xy,
                                             shape.shape.yy, weighted,       means.x,        means.y};
           const float sum = sum_values(values);
@@ -229,7 +228,7 @@ template <class F> void launch_blend_groups_vjp(const BlendVjpParams& p, int fir
     if (with_shape) return launch_group(channels, std::true_type());
     launch_group(channels, std::false_type());
   };
-  if constexpr (!F::kReference) {
+  if constexpr (!F::kGeneric) {
     if (group_width<F>(p.channels.count - first) == kSmallGroup)
       return launch_width(std::integral_constant<int, kSmallGroup>());
   }

@@ -74,8 +74,15 @@ struct CellLayout {
   }
 };
 
-/// Where the checkpoints of a tile's samples are: the checkpoint before pair i spacing, i > 0, has number first + i - 1.
-/// The tiles of a patch share the room of its list equally.
+/// How samples are shared out in tiles of kSide x kSide pixels for lists that are not cut, so that there is least to
+/// do, forward and backward. Where cuts_all_lists(), such lists are only those of frames with more pairs than room.
+template <class F, int kSide>
+using EvenLayout =
+    std::conditional_t<F::kSamples == 1 || (kSide < kMovingTile), CellLayout<1, F::kSamples, kSide>,
+                       std::conditional_t<F::kSamples == 4, CellLayout<2, 2>, CellLayout<(F::kSamples + 3) / 4, 4>>>;
+
+/// Where the checkpoints of a tile's samples are: the checkpoint before pair i spacing, i > 0, has number first + i
+/// - 1. The tiles of a patch share the room of its list equally.
 struct StatePlaces {
   int64_t first;
   int spacing;  ///< a multiple of kStateChunk
@@ -140,8 +147,8 @@ template <class F, class Layout, bool kTogether = kSamplesTogether<Layout>> stru
   __device__ void store(float* checkpoint, int k, const int (&last)[kCells]) const {
     store(checkpoint, [&](int i) { return k < last[i]; });
   }
-  /// The state before pair k, which `checkpoint` has unless k is 0. Samples that have composited their last splat before
-  /// (last[i] <= k) may have no checkpoint there, and need none.
+  /// The state before pair k, which `checkpoint` has unless k is 0. Samples that have composited their last splat
+  /// before (last[i] <= k) may have no checkpoint there, and need none.
   __device__ void load(const float* checkpoint, int k, const int (&last)[kCells]) {
 #pragma unroll
     for (int i = 0; i < kCells; ++i) {
@@ -210,8 +217,8 @@ template <class F, int C, class Layout, int kBatch, int kListed = 32, bool kOffs
     return t < kBatch && k + t < end ? list.splat(k + t) : -1;
   }
   /// Loads the splats, `id` = splat_of(), with channels from `first` on.
-  __device__ void load(const float* splats_in, const Channels<float>& channels, int first,
-                       const TileList& list, int32_t id) {
+  __device__ void load(const float* splats_in, const Channels<float>& channels, int first, const TileList& list,
+                       int32_t id) {
     if (threadIdx.x < kBatch) load_one(int(threadIdx.x), splats_in, channels, first, list, id);
   }
   /// Loads splat `id` at index t, or none if it is -1.

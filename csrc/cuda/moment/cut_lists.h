@@ -1,6 +1,7 @@
-// For footprints whose samples move: which lists are cut into segments that are worked on side by side, and how a kernel
-// finds its segment. moving_list_cut() is the rule; route_of() (dispatch.h) calls it on the host, once for a pass, and
-// plan_chunks (plan.cuh) applies it and writes the segments into the chunk plan. ListSegment reads one of them there.
+// For footprints whose samples move: which lists are cut into segments that are worked on side by side, and how a
+// kernel finds its segment. moving_list_cut() is the rule; route_of() (dispatch.h) calls it on the host, once for a
+// pass, and plan_chunks (plan.cuh) applies it and writes the segments into the chunk plan. ListSegment reads one of
+// them there.
 #pragma once
 
 #include <algorithm>
@@ -28,8 +29,8 @@ struct ListSegment {
 /// Pairs of a segment where `samples` samples move, in tiles of side x side pixels.
 AR_HD constexpr int moving_segment(int samples, int side) { return segment_length(samples, side < kMovingTile); }
 
-/// Whether all lists are cut: in small images, whose few tiles have long lists, so that the time is that of the longest.
-/// Not with tiles of 4x4 pixels, of which there are four times as many, with shorter lists.
+/// Whether all lists are cut: in small images, whose few tiles have long lists, so that the time is that of the
+/// longest. Not with tiles of 4x4 pixels, of which there are four times as many, with shorter lists.
 inline bool cuts_all_lists(TileGrid grid) { return is_small_image(grid) && grid.tile_bits >= kMovingTileBits; }
 
 /// How lists are cut, where there is room for `capacity` pairs. In large images only lists are cut that a block would

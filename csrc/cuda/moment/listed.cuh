@@ -2,10 +2,10 @@
 // (cut_lists.h). blend_moment (blend.cu) launches them before moving_blend.
 //
 // In a small image of a large scene a tile may have hundreds of thousands of splats, most of them smaller than a pixel.
-// The time is that of the longest sequence of splats that some sample meets. So filter_kernel first tests all pairs of a
-// list side by side, and writes a bit for each pair and pixel (reach_words). Then listed_blend_kernel has a warp for a
-// few neighbouring pixels: either each pixel takes its own splats from a queue (queue.cuh), or the warp walks the splats
-// that reach any of its pixels, and each lane composites only the ones of its own pixel.
+// The time is that of the longest sequence of splats that some sample meets. So filter_kernel first tests all pairs of
+// a list side by side, and writes a bit for each pair and pixel (reach_words). Then listed_blend_kernel has a warp for
+// a few neighbouring pixels: either each pixel takes its own splats from a queue (queue.cuh), or the warp walks the
+// splats that reach any of its pixels, and each lane composites only the ones of its own pixel.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -17,8 +17,8 @@ inline constexpr int kFilterWords = kFilterPiece / 32;
 /// Pairs whose bits a warp reads at once: a word for each lane.
 inline constexpr int kListedBatch = 32 * 32;
 
-/// A warp has kPixelsOfWarp pixels, and each lane a sample. With more pixels a warp takes fewer steps for each, and more
-/// pixels wait for the longest list.
+/// A warp has kPixelsOfWarp pixels, and each lane a sample. With more pixels a warp takes fewer steps for each, and
+/// more pixels wait for the longest list.
 template <class F, int kSide, int kPixelsOfWarp, int kWarps>
 struct SampleLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarps> {};
 
@@ -86,8 +86,8 @@ template <class F, int C, int kMostPixels> struct ListedStage {
   uint16_t numbers[kListedBatch];   ///< of the pairs in the batch
   uint32_t words[kMostPixels][32];  ///< the batch's bits of each pixel
 
-  /// Lists the pairs of a batch that reach any pixel, from `words`, and returns their number. The batch begins at pair k.
-  /// All lanes must call it.
+  /// Lists the pairs of a batch that reach any pixel, from `words`, and returns their number. The batch begins at pair
+  /// k. All lanes must call it.
   template <class Layout> __device__ int collect(const float* splats_in, const TileList& list, int k) {
     const int lane = lane_id();
     uint32_t word = 0;
@@ -122,8 +122,8 @@ template <class F, int C, int kMostPixels> struct ListedStage {
   }
 };
 
-/// Blends the pixels of a warp, as Layout shares them out, by walking the splats that reach any of them; C channels from
-/// `first` on. `first_segment`: the number of the list's first segment. `kKeep`, `kSegment`: as in blend_queued.
+/// Blends the pixels of a warp, as Layout shares them out, by walking the splats that reach any of them; C channels
+/// from `first` on. `first_segment`: the number of the list's first segment. `kKeep`, `kSegment`: as in blend_queued.
 template <class F, int C, class Layout, bool kKeep, int kSegment, class Stage>
 __device__ void blend_listed(const BlendParams& params, int first, int tile, const TileList& list, int first_segment,
                              Stage& stage) {
@@ -201,12 +201,12 @@ template <class F, int kSide> struct ListedLayouts {
   static constexpr int kOfLongest = Longest::kBlocks, kOfOthers = Long::kBlocks;
   static_assert(kOfLongest % kOfOthers == 0 && kOfOthers % Short::kBlocks == 0);
 
-  /// Blocks to launch: a multiple of the blocks of one of the longest lists, so that a block has the same pixels in every
-  /// tile that it goes on to. In small images moving_blend has little to do, and they need not leave it any room.
+  /// Blocks to launch: a multiple of the blocks of one of the longest lists, so that a block has the same pixels in
+  /// every tile that it goes on to. In small images moving_blend has little to do, and they need not leave it any room.
   static unsigned blocks(const ListCut& cut, TileGrid grid, int multiprocessors) {
     const int64_t longest = std::min(cut.max_lists, kLongestAtOnce), lists = cut.max_lists;
-    const int64_t wanted = is_small_image(grid) ? longest * kOfLongest + lists * kOfOthers
-                                               : kListedWarpsPerSm * multiprocessors / kWarps;
+    const int64_t wanted =
+        is_small_image(grid) ? longest * kOfLongest + lists * kOfOthers : kListedWarpsPerSm * multiprocessors / kWarps;
     const int64_t blocks = std::min(wanted, lists * kOfLongest);
     return unsigned((blocks + kOfLongest - 1) / kOfLongest * kOfLongest);
   }

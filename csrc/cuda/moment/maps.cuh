@@ -23,7 +23,7 @@ struct Adjoint {
 /// How an Adjoint goes through a segment: the image of zero, and what a change of each of the three numbers adds. A
 /// change of the position does not reach `behind`.
 struct SegmentMap {
-  static constexpr int kNumbers = 10;
+  static constexpr int kNumbers = kMapNumbers;
   Adjoint of_zero, by_behind;
   Vec2<float> by_x, by_y;
 
@@ -71,8 +71,8 @@ template <class F, int kTilePixels> struct MapMemory {
 template <class F, int kSide>
 using SegmentLayout = std::conditional_t<(F::kSamples <= 4 || kSide < kMovingTile), CellLayout<1, F::kSamples, kSide>,
                                          CellLayout<2, 8, kSide>>;
-/// The same for maps, which no lanes add up: with many cells a lane per sample, so that a warp has few pixels and passes
-/// over more splats; in small blocks, since warps do not have equally much to do.
+/// The same for maps, which no lanes add up: with many cells a lane per sample, so that a warp has few pixels and
+/// passes over more splats; in small blocks, since warps do not have equally much to do.
 template <class F, int kSide>
 using MapLayout = std::conditional_t<(F::kSamples > 4), CellLayout<1, 16, kSide, 4>, SegmentLayout<F, kSide>>;
 

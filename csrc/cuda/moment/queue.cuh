@@ -1,6 +1,6 @@
 // A library for listed_blend_kernel (listed.cuh): pixels that look ahead in their lists, for footprints whose samples
-// move. Each pixel of a warp has a queue of the splats that reach it, filled from the bits that filter_kernel wrote, and
-// does not wait for splats that reach only its neighbours. Several lanes have the same sample: each tests another
+// move. Each pixel of a warp has a queue of the splats that reach it, filled from the bits that filter_kernel wrote,
+// and does not wait for splats that reach only its neighbours. Several lanes have the same sample: each tests another
 // splat, and the first splat that shows is composited. In the longest lists the warps of a block share the samples of
 // one pixel.
 #pragma once
@@ -9,8 +9,8 @@
 
 namespace ar::cuda {
 
-/// A warp has kPixelsOfWarp pixels; or the kWarpsOfPixel warps of a block have one pixel, each warp other samples of it.
-/// A sample has kAhead neighbouring lanes.
+/// A warp has kPixelsOfWarp pixels; or the kWarpsOfPixel warps of a block have one pixel, each warp other samples of
+/// it. A sample has kAhead neighbouring lanes.
 template <class F, int kSide, int kPixelsOfWarp, int kWarpsOfPixel = 1>
 struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, false, kWarpsOfPixel> {
   using Base = CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, false, kWarpsOfPixel>;
@@ -53,8 +53,8 @@ struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, fal
   }
 };
 
-/// The index in reach_words of the bits of a pixel, in tiles of kSide x kSide pixels. The bit of pair k is bit k % 32 of
-/// the pixel's word k / 32. `first`: number of the first segment of the tile's list.
+/// The index in reach_words of the bits of a pixel, in tiles of kSide x kSide pixels. The bit of pair k is bit k % 32
+/// of the pixel's word k / 32. `first`: number of the first segment of the tile's list.
 template <class F, int kSide> __device__ int64_t pixel_words(int first, const TileList& list, int pixel_number) {
   constexpr int kPixels = kSide * kSide, kSegment = moving_segment(F::kSamples, kSide);
   const int segments = (list.count + kSegment - 1) / kSegment;
@@ -62,8 +62,8 @@ template <class F, int kSide> __device__ int64_t pixel_words(int first, const Ti
 }
 
 /// The checkpoints of a lane's samples that are still to be stored, for a list that is cut into segments of kSegment
-/// pairs: one before each segment, and all within the first. segment_maps_kernel stores the checkpoints within the other
-/// segments, side by side; here every sample would wait for them.
+/// pairs: one before each segment, and all within the first. segment_maps_kernel stores the checkpoints within the
+/// other segments, side by side; here every sample would wait for them.
 template <int kSegment> struct CheckpointsAhead {
   int pair;   ///< the next checkpoint is before this pair
   float* to;  ///< its address
@@ -160,10 +160,7 @@ template <class F, int C, class Layout> struct QueuedSplats {
   Values<C> channels;
 
   __device__ QueuedSplats(const BlendParams& params, const TileList& list, int first_channel)
-      : splats_in(params.splats),
-        channels_in(params.channels),
-        list(list),
-        first_channel(first_channel) {}
+      : splats_in(params.splats), channels_in(params.channels), list(list), first_channel(first_channel) {}
 
   /// Reads the splats that were next, and takes the pairs after them from the queue.
   template <class Queues> __device__ void advance(Queues& queues) {
@@ -185,8 +182,8 @@ template <class F, int C, class Layout> struct QueuedSplats {
   /// Puts the splat that was read into the stage. `light`: the transmittance after the steps before.
   ///
   /// The comparison is never true, since a listed splat has a level above 0 and no negative x_given_y. It keeps the
-  /// registers of these two numbers in use: the compiler would else use them for something else, and wait for that until
-  /// the splat has arrived. `light` keeps the compiler from comparing, and waiting, before the steps.
+  /// registers of these two numbers in use: the compiler would else use them for something else, and wait for that
+  /// until the splat has arrived. `light` keeps the compiler from comparing, and waiting, before the steps.
   template <class Stage> __device__ void put(Stage& stage, int lane, float light) const {
     if (lane >= n || splat.level + splat.shape.x_given_y <= min(light, 0.0f)) return;
     stage.splats[lane_id()] = {cell_terms(splat, list), channels};

@@ -3,7 +3,8 @@
 // each segment back to front, and writes rows of pair_grads and channel_sums.
 //
 // The samples of neighbouring pixels are a group, which a warp takes through a segment. Groups do not have equally much
-// to do: in some all pixels have closed, or no splat is there. So a warp claims the next group when it is done with one.
+// to do: in some all pixels have closed, or no splat is there. So a warp claims the next group when it is done with
+// one.
 #pragma once
 
 #include <algorithm>
@@ -43,8 +44,8 @@ template <class F, int C, class Layout, int kSegment> struct SegmentVjpShared {
 
   /// Loads the batch of pairs [k0, k1), with channels from `first` on, and with_means also what MeanSums need. All
   /// threads must call it.
-  __device__ void load(const float* splats, const BlendVjpParams& params, int first, const TileList& list,
-                       int k0, int k1, bool with_means) {
+  __device__ void load(const float* splats, const BlendVjpParams& params, int first, const TileList& list, int k0,
+                       int k1, bool with_means) {
     for (int t = threadIdx.x; t < kBatch; t += Layout::kThreads) {
       const int32_t id = k0 + t < k1 ? list.splat(k0 + t) : -1;
       stage.load_one(t, splats, params.channels, first, list, id);
@@ -100,8 +101,8 @@ __device__ void group_vjp(const BlendVjpParams& params, int first, int in_shared
   const SamplesLast<F, Layout> lasts(params.last, pixel);
   const int (&last)[kCells] = lasts.samples;
   const SampleGrad<F, C> grad(params, pixel, first);
-  // A sample's Adjoint after the batch is that of the background, of the next segment's map, or of the next batch, which
-  // stored it in the part of this segment's own map that nobody needs any more.
+  // A sample's Adjoint after the batch is that of the background, of the next segment's map, or of the next batch,
+  // which stored it in the part of this segment's own map that nobody needs any more.
   constexpr int kCarried = 3;
   const auto map_of = [&](int i) {
     return MapMemory<F, Layout::kTilePixels>(params.adjoint_maps, Layout::first_sample() + i, Layout::pixel_number());
@@ -196,8 +197,8 @@ template <class F, int C, class Layout, int kSegment> int64_t group_sums_of(int6
   return segment_vjp_blocks<C, Layout>(segments) * Layout::kGroups * int64_t(sizeof(Sums) / sizeof(float));
 }
 
-/// Launches segment_vjp_kernel with as much of EarlierPositions in shared memory as leaves room for kMovingVjpBlocks on a
-/// multiprocessor.
+/// Launches segment_vjp_kernel with as much of EarlierPositions in shared memory as leaves room for kMovingVjpBlocks on
+/// a multiprocessor.
 template <class F, int C, class Layout, int kSegment>
 void launch_segment_vjp_kernel(const BlendVjpParams& p, int segments, int first, cudaStream_t stream) {
   constexpr size_t kShared = sizeof(SegmentVjpShared<F, C, Layout, kSegment>);

@@ -38,8 +38,8 @@ __device__ void write_sums(const BlendVjpParams& params, int first, bool with_sh
 }
 
 /// Writes the sums total(j, v) of the first `count` pairs of a batch: C channels from `first` on, with_shape the six
-/// sums of PairGrad, and with_means MeanSums. To the six sums it adds what the kernels of earlier channels have written.
-/// `rows`: [count] row of each pair.
+/// sums of PairGrad, and with_means MeanSums. To the six sums it adds what the kernels of earlier channels have
+/// written. `rows`: [count] row of each pair.
 template <int C, int kThreads, class Total>
 __device__ void write_pairs(const BlendVjpParams& params, int first, bool with_means, bool with_shape,
                             const TileList& list, const int32_t* rows, int count, Total&& total) {
@@ -66,8 +66,8 @@ template <class F, int C, class Layout> struct MovingVjpShared {
 
   /// Loads the batch that begins with pair k0, `id` = stage.splat_of(), with channels from `first` on, and with_means
   /// also what MeanSums need. All threads must call it.
-  __device__ void load(const float* splats, const BlendVjpParams& params, int first, const TileList& list,
-                       int k0, int32_t id, bool with_means) {
+  __device__ void load(const float* splats, const BlendVjpParams& params, int first, const TileList& list, int k0,
+                       int32_t id, bool with_means) {
     stage.load(params.splats, params.channels, first, list, id);
     if (id >= 0) {
       const int t = threadIdx.x;

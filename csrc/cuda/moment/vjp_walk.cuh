@@ -1,15 +1,15 @@
-// Kernel moving_vjp: the backward pass of footprints whose samples move, for lists that are not cut. A block per tile, a
-// lane per few cells of a pixel, back to front; blend_vjp_moment (blend_vjp.cu) launches it. It reads the checkpoints
-// and `last` of blend and writes rows of pair_grads and channel_sums. vjp_segments.cuh has the kernel for lists that are
-// cut, and uses replay_chunk and chunk_vjp of this file.
+// Kernel moving_vjp: the backward pass of footprints whose samples move, for lists that are not cut. A block per tile,
+// a lane per few cells of a pixel, back to front; blend_vjp_moment (blend_vjp.cu) launches it. It reads the checkpoints
+// and `last` of blend and writes rows of pair_grads and channel_sums. vjp_segments.cuh has the kernel for lists that
+// are cut, and uses replay_chunk and chunk_vjp of this file.
 //
-// The state of a sample before a splat does not follow from the state after it, since the displacement depends on itself
-// through alpha. So a warp composites each chunk of 32 splats once more from the checkpoint before it, stores where the
-// samples were before each splat, and then walks back over the splats that its pixels show.
+// The state of a sample before a splat does not follow from the state after it, since the displacement depends on
+// itself through alpha. So a warp composites each chunk of 32 splats once more from the checkpoint before it, stores
+// where the samples were before each splat, and then walks back over the splats that its pixels show.
 //
-// dL/dalpha is linear in the gradient of the image: with many channels each kernel adds the share of its channels to the
-// six sums of a pair, which a single block owns. Only MeanSums need all channels at once: where they are wanted, the
-// first kernel makes all sums, and reads the channels of the others from memory.
+// dL/dalpha is linear in the gradient of the image: with many channels each kernel adds the share of its channels to
+// the six sums of a pair, which a single block owns. Only MeanSums need all channels at once: where they are wanted,
+// the first kernel makes all sums, and reads the channels of the others from memory.
 #pragma once
 
 #include <algorithm>
@@ -127,7 +127,7 @@ __device__ uint32_t replay_chunk(Stage& stage, int from, int k0, const CellCorne
 }
 
 /// Takes a lane's samples and their Adjoint from after pair j of the batch that begins with pair k0 to before it, where
-/// the samples are at `positions`. Returns the sums over the samples, before F::collect. `g_color`: the scalar product of
+/// the samples are at `positions`. Returns the sums over the samples. `g_color`: the scalar product of
 /// the splat's channels and the gradient.
 template <class F, int C, class Layout, class Samples>
 __device__ MovingBlendGrad<float> walk_back(TileSplatRef<F, C>& splat, int k0, int j, float g_color,
@@ -146,9 +146,9 @@ __device__ MovingBlendGrad<float> walk_back(TileSplatRef<F, C>& splat, int k0, i
   return sums;
 }
 
-/// Takes a warp's samples from after the chunk of 32 pairs that begins at staged splat `from` to before it, and writes to
-/// `sums` the sums of the splats that replay_chunk() has returned, `shown`. `k0`: the pair that is staged first. Returns
-/// which pairs of the chunk have sums. All lanes must call it.
+/// Takes a warp's samples from after the chunk of 32 pairs that begins at staged splat `from` to before it, and writes
+/// to `sums` the sums of the splats that replay_chunk() has returned, `shown`. `k0`: the pair that is staged first.
+/// Returns which pairs of the chunk have sums. All lanes must call it.
 template <class F, int C, class Layout, class Shared, class Samples>
 __device__ uint32_t chunk_vjp(const BlendVjpParams& params, Shared& shared, float (*sums)[Shared::kSums],
                               const TileList& list, int k0, int from, uint32_t shown, const Pixel& pixel,
@@ -167,7 +167,7 @@ __device__ uint32_t chunk_vjp(const BlendVjpParams& params, Shared& shared, floa
     const auto [contribution, of_splat] =
         walk_back<F, C, Layout>(splat, k0, j, g_color, corners, last, positions, samples, adjoint);
     if (with_means) put_warp_means<Layout>(params, shared.mean_maps[j], of_splat.sums.offset, sums[j] + Shared::kMeans);
-    const PairGrad<float> of_pair = {F::collect(splat.terms, of_splat.sums, of_splat.weighted), of_splat.weighted};
+    const PairGrad<float> of_pair = {of_splat.sums, of_splat.weighted};
     put_warp_sums(of_pair, times(contribution, grad.channels), sums[j] + own_sum);
   }
   return warp_or(shown >> lane_id() & 1 ? 1u << (listed[lane_id()] - from) : 0u);
@@ -261,8 +261,8 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingVjpBlocks<C, Layout, 
   }
 }
 
-/// Launches moving_vjp_kernel with as much of EarlierPositions in shared memory as leaves room for kMovingVjpBlocks on a
-/// multiprocessor.
+/// Launches moving_vjp_kernel with as much of EarlierPositions in shared memory as leaves room for kMovingVjpBlocks on
+/// a multiprocessor.
 template <class F, int C, class Layout>
 void launch_moving_vjp_kernel(const BlendVjpParams& p, unsigned blocks, int first, cudaStream_t stream) {
   constexpr size_t kShared = sizeof(MovingVjpShared<F, C, Layout>);

@@ -36,8 +36,8 @@ inline constexpr int kMovingBlocks = blocks_per_sm(std::max(moving_threads(C) / 
 
 /// A block per tile, which returns at once if the tile's list is cut, and one block more that only waits
 /// (begin_beside_earlier_kernels). Blends the C channels from `first` on. `beside`: the kernels for lists that are cut
-/// were launched just before, and may still run. `F`: the footprint, `Layout`: a CellLayout, `kKeep`: stores checkpoints
-/// and `last` for a backward pass.
+/// were launched just before, and may still run. `F`: the footprint, `Layout`: a CellLayout, `kKeep`: stores
+/// checkpoints and `last` for a backward pass.
 template <class F, int C, class Layout, bool kKeep>
 __global__ void __launch_bounds__(Layout::kThreads, kMovingBlocks<Layout, C>)
     moving_blend_kernel(const BlendParams params, int first, bool beside) {
@@ -83,12 +83,5 @@ __global__ void __launch_bounds__(Layout::kThreads, kMovingBlocks<Layout, C>)
   }
   blend.write(params, first, pixel);
 }
-
-/// How samples are shared out in tiles of kSide x kSide pixels for lists that are not cut, so that there is least to do,
-/// forward and backward. Where cuts_all_lists(), such lists are only those of frames with more pairs than room.
-template <class F, int kSide>
-using EvenLayout = std::conditional_t<
-    F::kSamples == 1 || (kSide < kMovingTile), CellLayout<1, F::kSamples, kSide>,
-    std::conditional_t<F::kSamples == 4, CellLayout<2, 2>, CellLayout<(F::kSamples + 3) / 4, 4>>>;
 
 }  // namespace ar::cuda

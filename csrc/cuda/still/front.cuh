@@ -28,8 +28,8 @@ template <class F, int C>
 inline constexpr int kFrontBlocks =
     blocks_per_sm(front_blocks(F::kSamples, F::kExpensive, sizeof(TileSplat<F, C>)), kBlendThreads);
 
-/// A block per tile. `F`: what a lane blends, `C`: channels, 3 in the splats or up to 4 in rows; `kKeep`: stores what the
-/// backward pass needs.
+/// A block per tile. `F`: what a lane blends, `C`: channels, 3 in the splats or up to 4 in rows; `kKeep`: stores what
+/// the backward pass needs.
 template <class F, int C, bool kKeep>
 __global__ void __launch_bounds__(kBlendThreads, kFrontBlocks<F, C>) blend_front_kernel(const BlendParams params) {
   wait_for_earlier_kernels();

@@ -81,8 +81,8 @@ template <int C> __device__ Values<C> background_of(const BlendParams& params) {
   return background;
 }
 
-/// Writes a pixel whose samples are complete to the images; `total`: the sum of their channels. `Samples`: a footprint or
-/// LaneSamples. All lanes of a warp must call it.
+/// Writes a pixel whose samples are complete to the images; `total`: the sum of their channels. `Samples`: a footprint
+/// or LaneSamples. All lanes of a warp must call it.
 template <class Samples, int C>
 __device__ void store_pixel(const BlendParams& params, Pixel pixel, Values<C> total,
                             const float (&transmittance)[Samples::kSamples]) {
@@ -90,7 +90,8 @@ __device__ void store_pixel(const BlendParams& params, Pixel pixel, Values<C> to
 #pragma unroll
   for (int s = 0; s < Samples::kSamples; ++s) {
     through += abs(transmittance[s]);
-    if (params.transmittance && pixel.inside) params.transmittance[sample_index<Samples>(pixel, s)] = abs(transmittance[s]);
+    if (params.transmittance && pixel.inside)
+      params.transmittance[sample_index<Samples>(pixel, s)] = abs(transmittance[s]);
   }
   through = sum_of_pixel<Samples>(through);
 #pragma unroll
@@ -110,13 +111,13 @@ template <class F> __device__ void store_last(const BlendParams& params, Pixel p
   for (int s = 0; s < F::kSamples; ++s) params.last[sample_index<F>(pixel, s)] = last[s];
 }
 
-/// The checkpoints of a sample's chunks [first, end) hold the channels of the chunk itself. Turns each into the channels
-/// of everything farther than the chunk, where blend_vjp starts: sums of positive terms, which do not cancel.
-/// `farther`: the channels of what is farther than all of them. kBatch chunks are loaded before the first store, so that
-/// the loads wait for memory together.
+/// The checkpoints of a sample's chunks [first, end) hold the channels of the chunk itself. Turns each into the
+/// channels of everything farther than the chunk, where blend_vjp starts: sums of positive terms, which do not cancel.
+/// `farther`: the channels of what is farther than all of them. kBatch chunks are loaded before the first store, so
+/// that the loads wait for memory together.
 template <int kBatch, int S, int C>
 __device__ void accumulate_farther(const PixelCheckpoints<S, C, true>& checkpoints, int first, int end, int s,
-                                  Values<C> farther) {
+                                   Values<C> farther) {
   for (int last = end - 1; last >= first; last -= kBatch) {
     Values<C> own[kBatch];
 #pragma unroll

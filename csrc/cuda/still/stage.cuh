@@ -9,8 +9,8 @@
 
 namespace ar::cuda {
 
-/// What compositing carries from splat to splat in a lane with S samples and C channels. kSets sets of channels: one for
-/// all samples, or one per sample where checkpoints need it.
+/// What compositing carries from splat to splat in a lane with S samples and C channels. kSets sets of channels: one
+/// for all samples, or one per sample where checkpoints need it.
 template <int S, int C, int kSets> struct PixelState {
   float transmittance[S];
   Values<C> channels[kSets];

@@ -2,9 +2,9 @@
 // They read the tail of the plan, `tile_open` and `open_tiles`, and write checkpoints, then the images.
 #pragma once
 
+#include "cuda/launch.cuh"
 #include "cuda/still/output.cuh"
 #include "cuda/still/stage.cuh"
-#include "cuda/launch.cuh"
 #include "cuda/tuning.h"
 
 namespace ar::cuda {
@@ -20,16 +20,15 @@ __device__ void pass_all(BlendStage<F, C>& stage, int count, Vec2<float> p, floa
   });
 }
 
-/// Calls visit(chunk, list of its tile, end of the chunk in the list) for the tail chunks of the open tiles. Blocks share
-/// them.
-template <class Visit>
-__device__ __forceinline__ void for_each_tail_chunk(const BlendParams& params, Visit&& visit) {
+/// Calls visit(chunk, list of its tile, end of the chunk in the list) for the tail chunks of the open tiles. Blocks
+/// share them.
+template <class Visit> __device__ __forceinline__ void for_each_tail_chunk(const BlendParams& params, Visit&& visit) {
   const int items = params.plan.state->counts.tail;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const TileChunk tail = params.plan.tail[item];
     if (!params.tile_open[tail.tile]) continue;
     const TileList list = list_of(params.lists, params.grid, tail.tile);
-    const int end = min(list.count, (tail.chunk + 1) * kChunkChunkLength);
+    const int end = min(list.count, (tail.chunk + 1) * kChunkLength);
     visit(tail, list, end);
   }
 }
@@ -62,8 +61,8 @@ __global__ void __launch_bounds__(kBlendThreads, kThroughBlocks<F>) tail_through
 }
 
 /// A sample with less transmittance than this is stopped by the next splat that it meets, since alpha is at least
-/// kAlphaMin, and so it may count as stopped already. The margin above kTransmittanceMin covers the rounding of products
-/// of chunks, which differs from the rounding splat by splat.
+/// kAlphaMin, and so it may count as stopped already. The margin above kTransmittanceMin covers the rounding of
+/// products of chunks, which differs from the rounding splat by splat.
 inline constexpr float kNearlyStopped = float(kTransmittanceMin * (1 + kAlphaMin / 2));
 
 __device__ inline int chunks_of(const BlendParams& params, int tile) {
@@ -71,8 +70,8 @@ __device__ inline int chunks_of(const BlendParams& params, int tile) {
   return int((pairs[1] - pairs[0] + kChunkLength - 1) / kChunkLength);
 }
 
-/// The kernels that go through all tail chunks of a tile have a pixel per lane and a block per part of 32 pixels, so that
-/// several multiprocessors read the checkpoints of a tile.
+/// The kernels that go through all tail chunks of a tile have a pixel per lane and a block per part of 32 pixels, so
+/// that several multiprocessors read the checkpoints of a tile.
 inline constexpr int kTailParts = kTilePixels / 32;
 
 /// Turns what each chunk lets through into the transmittance at its begin, negative where a sample has stopped before.
@@ -83,7 +82,7 @@ template <int S> __global__ void __launch_bounds__(32) tail_scan_kernel(const Bl
   const int items = params.plan.state->counts.open_tiles * S * kTailParts;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const int tile = params.open_tiles[item / (S * kTailParts)], s = item / kTailParts % S;
-    const int chunks = chunks_of(params, tile, kChunkChunkLength), front = front_of(params);
+    const int chunks = chunks_of(params, tile), front = front_of(params);
     const TransmittancePlanes<S> planes(params, tile, item % kTailParts * 32 + lane_id());
     float transmittance = planes.at(front - 1, s), next[kBatch];
     const auto load = [&](int first) {
@@ -109,10 +108,11 @@ template <int S> __global__ void __launch_bounds__(32) tail_scan_kernel(const Bl
   }
 }
 
-/// Writes to the checkpoints the channels of each tail chunk and the transmittance at its end, zero where the sample had
-/// stopped before the chunk.
+/// Writes to the checkpoints the channels of each tail chunk and the transmittance at its end, zero where the sample
+/// had stopped before the chunk.
 template <class F, int C, bool kKeep>
-__global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(tail_blend_blocks(F::kSamples), kBlendThreads)) tail_blend_kernel(const BlendParams params) {
+__global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(tail_blend_blocks(F::kSamples), kBlendThreads))
+    tail_blend_kernel(const BlendParams params) {
   wait_for_earlier_kernels();
   constexpr int S = F::kSamples, kSets = kKeep ? S : 1;
   __shared__ BlendStage<F, C> stage;
@@ -164,8 +164,8 @@ struct TailShare {
   }
 };
 
-/// Adds up the chunks of the open tiles, whose parts blocks share, and writes their pixels. The order of the sum depends
-/// on the number of tail chunks alone, so that the picture has the same bits with and without a backward pass.
+/// Adds up the chunks of the open tiles, whose parts blocks share, and writes their pixels. The order of the sum
+/// depends on the number of tail chunks alone, so that the picture has the same bits with and without a backward pass.
 /// `Samples`: LaneSamples of what a lane blends; the kernel is the same for all footprints that share it.
 template <class Samples, int C, bool kKeep>
 __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendParams params) {
@@ -178,7 +178,7 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
     const int tile = params.open_tiles[item / kTailParts], part = item % kTailParts;
     const PixelCheckpoints<S, C, kKeep> checkpoints(params, tile, part * 32 + lane);
-    TailShare share(front_of(params), chunks_of(params, tile, kChunkChunkLength));
+    TailShare share(front_of(params), chunks_of(params, tile));
     if (warp == 0) share.first = checkpoints.first_chunk;
     Values<C> total = {};
     float transmittance[S];
@@ -224,7 +224,8 @@ __global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendPa
       __syncthreads();  // before the next sums
     }
     const TileList list = list_of(params.lists, params.grid, tile);
-    if (warp == 0) store_pixel<Samples>(params, Pixel(list, params.grid, pixel_of<Samples>(part, lane)), total, transmittance);
+    if (warp == 0)
+      store_pixel<Samples>(params, Pixel(list, params.grid, pixel_of<Samples>(part, lane)), total, transmittance);
   }
 }
 

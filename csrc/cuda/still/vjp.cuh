@@ -35,9 +35,9 @@ __device__ __forceinline__ void blend_chunk_vjp(const BlendVjpParams& params, in
 }
 
 template <class F, int C>
-inline constexpr int kVjpBlocks = blocks_per_sm(vjp_blocks(F::kSamples, kHoldsPixels<F, C>, kHoldsSamples<F, C>,
-                                                           sizeof(TileSplat<F, C>)),
-                                                32 * vjp_warps(F::kSamples));
+inline constexpr int kVjpBlocks =
+    blocks_per_sm(vjp_blocks(F::kSamples, kHoldsPixels<F, C>, kHoldsSamples<F, C>, sizeof(TileSplat<F, C>)),
+                  32 * vjp_warps(F::kSamples));
 
 /// What a block keeps in dynamic shared memory.
 template <class F, int C> struct VjpShared {

@@ -7,9 +7,9 @@
 
 namespace ar::cuda {
 
-/// Whether each lane keeps its eight pixels in registers: with one sample and three channels, unless the splat needs too
-/// many registers. A visit of a subtile then neither waits for shared memory nor spends instructions on it, which is
-/// worth more than the warps that fit on a multiprocessor less.
+/// Whether each lane keeps its eight pixels in registers: with one sample and three channels, unless the splat needs
+/// too many registers. A visit of a subtile then neither waits for shared memory nor spends instructions on it, which
+/// is worth more than the warps that fit on a multiprocessor less.
 template <class F, int C>
 inline constexpr bool kHoldsPixels = F::kSamples == 1 && C == 3 && sizeof(TileSplat<F, C>) <= 112;
 

@@ -1,5 +1,5 @@
-// A warp of blend_vjp for footprints whose samples stay: its chunk, the state of the pixels after the chunk, and the way
-// back to front through the pairs. The kernel in still/vjp.cuh calls it. It reads the lists, splats, checkpoints,
+// A warp of blend_vjp for footprints whose samples stay: its chunk, the state of the pixels after the chunk, and the
+// way back to front through the pairs. The kernel in still/vjp.cuh calls it. It reads the lists, splats, checkpoints,
 // `last`, `transmittance` and the gradient of the image, and writes rows of BlendVjpParams::pair_grads.
 #pragma once
 
@@ -56,7 +56,8 @@ __device__ __forceinline__ int find_last(const BlendVjpParams& params, const Vjp
 }
 
 /// Sets the pixels and their samples to their state after the chunk. `final`: no pixel has composited a later splat, so
-/// that only the background follows; else the state is in `checkpoints`, [samples, kTilePixels] at the end of the chunk.
+/// that only the background follows; else the state is in `checkpoints`, [samples, kTilePixels] at the end of the
+/// chunk.
 template <class F, int C>
 __device__ __forceinline__ void start_pixels(const BlendVjpParams& params, const VjpChunk& chunk,
                                              const Checkpoint<C>* checkpoints, bool final, LanePixels<F, C>& pixels) {
@@ -195,15 +196,15 @@ template <class F, int C, Sums kSums> class ChunkWalk {
       add_pixel<kKind>(splat, at, m, b, p, shape, weighted, channels, means);
     });
     const int32_t row = splat.row;
-    put_grads(splat.terms, row, shape, weighted, channels, to);
+    put_grads(row, shape, weighted, channels, to);
     if constexpr (kMeans) {
       const float total = warp_sum_of_two(means.x, means.y);
       if (lane_ % 16 == 0) put(row, kPairMeans + lane_ / 16, total);
     }
   }
 
-  /// Takes the lane's pixel of subtile b, at p, from after a splat to before it, and adds to the lane's sums: `shape`
-  /// before F::collect, `means` of MeanSums. `at`: the splat's index in the tile's list, by reference because the
+  /// Takes the lane's pixel of subtile b, at p, from after a splat to before it, and adds to the lane's sums: `shape`,
+  /// and `means` of MeanSums. `at`: the splat's index in the tile's list, by reference because the
   /// compiler else turns comparisons with it around.
   template <MeanSums kKind>
   __device__ void add_pixel(const SplatInUse& splat, const int& at, const Mat2<float>& mean_map, int b, Vec2<float> p,
@@ -245,9 +246,8 @@ template <class F, int C, Sums kSums> class ChunkWalk {
 
   /// Adds the lanes' sums up and writes them to the pair's row, or leaves them at `to` for sum_pairs().
   template <class To>
-  __device__ __forceinline__ void put_grads(const typename F::template Terms<float>& terms, int32_t row,
-                                            ShapeGrad<float> sums, float weighted, const Values<C>& channels, To& to) {
-    const ShapeGrad<float> shape = F::collect(terms, sums, weighted);
+  __device__ __forceinline__ void put_grads(int32_t row, ShapeGrad<float> shape, float weighted,
+                                            const Values<C>& channels, To& to) {
     float values[kSumCount] = {shape.offset.x, shape.offset.y, shape.shape.xx,
                                shape.shape.xy, shape.shape.yy, weighted};
 #pragma unroll
@@ -289,7 +289,7 @@ template <class F, int C, Sums kSums> class ChunkWalk {
   Pixels& pixels_;
   Batch& batch_;
   const int lane_ = lane_id();
-  const Vec2<float> p0_ = position_of<F>(0, lane_);                      ///< of the lane's sample in subtile 0
+  const Vec2<float> p0_ = position_of<F>(0, lane_);                   ///< of the lane's sample in subtile 0
   const uint32_t subtile_bit_ = lane_ < kSubtiles ? 1u << lane_ : 0;  ///< of subtile number `lane`
   const int value_ = summed_value<kSumCount>(lane_);                  ///< that sum_values leaves here
   float* const sums_ = params_.pair_grads + (value_ == 9 ? kPairFourthChannel : value_);  ///< of row 0

@@ -58,6 +58,9 @@ struct alignas(8) SlotPair {
   int32_t splat, slot;
 };
 
+/// Numbers of a SegmentMap (moment/maps.cuh): an affine map of three numbers, two of which do not reach the first.
+inline constexpr int kMapNumbers = 10;
+
 /// Pairs between the checkpoints of a footprint whose samples move, and the planes of one of them, a float per pixel of
 /// a tile: transmittance and place of each sample.
 inline constexpr int kStateChunk = 32;
@@ -237,6 +240,8 @@ void blend(int footprint, const BlendParams& p, cudaStream_t stream);
 /// The group of channels that begins with `first`; 0 where there are no more than kFewChannels.
 void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream);
 void inspect(int footprint, const InspectParams& p, cudaStream_t stream);
+/// Multiprocessors of the current device, for route_of().
+int multiprocessors_of_device();
 /// Numbers in BlendVjpParams::group_sums.
 int64_t max_group_sums(int footprint, int64_t channels, const ListCut& cut, TileGrid grid);
 // The families: still/blend.cu, still/blend_vjp.cu and so on.
