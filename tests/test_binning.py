@@ -254,9 +254,7 @@ def test_depths_that_differ_in_the_last_bit(device):
         assert first.tolist() == [2, 1, 0], dtype
 
 
-@pytest.mark.parametrize(
-    "samples, large, small", [(1, 16, 8), (4, 8, 8), (16, 8, 4)], ids=["1", "4", "16"]
-)
+@pytest.mark.parametrize("samples, large, small", [(1, 16, 8), (4, 8, 8), (16, 8, 4)], ids=["1", "4", "16"])
 def test_tiles_of_moving_samples_depend_on_the_image(samples, large, small):
     """On CUDA: an image is large from 4096 tiles of 8x8 px on. On the CPU all tiles have 16x16 px."""
     key = resolve_footprint("moment", samples=samples).key
