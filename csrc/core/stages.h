@@ -37,11 +37,11 @@ AR_HD bool is_small_image(TileGrid grid) {
 }
 /// The tiles on CUDA where `samples` samples of a pixel move. With one of them in a large image, blending a splat in a
 /// pixel costs so little that tiles are worth being large: fewer pairs have to be listed, and fetched by a block. With
-/// nine or more in a small image, where most splats are smaller than a tile, tiles are small: their lists are shorter,
+/// sixteen in a small image, where most splats are smaller than a tile, tiles are small: their lists are shorter,
 /// and a splat reaches more of a block's samples.
 AR_HD constexpr int moving_tile_bits(int samples, bool small_image) {
   if (samples == 1 && !small_image) return kTileBits;
-  return samples >= 9 && small_image ? kMovingTileBits - 1 : kMovingTileBits;
+  return samples == 16 && small_image ? kMovingTileBits - 1 : kMovingTileBits;
 }
 /// The tiles on CUDA where the samples of a pixel may be spread over so many lanes (Spread of contract.h). A tile whose
 /// samples are has 256 of them: 8x8 pixels with 4 samples, 4x4 with 16. Sixteen samples are spread in every image. Four
