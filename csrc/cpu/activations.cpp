@@ -1,4 +1,4 @@
-// What is done for every Gaussian by itself: activations, their adjoint, and what density control observes.
+// activate, activate_vjp and observe of training.h. Threads share chunks of Gaussians.
 #include "core/activations.h"
 
 #include <algorithm>
@@ -10,9 +10,8 @@
 namespace ar::cpu {
 namespace {
 
-constexpr int64_t kGaussians = 4096;  ///< per work item
+constexpr int64_t kGaussians = 4096;
 
-/// body(i) for every Gaussian.
 template <class Body> void for_each_gaussian(int64_t n, int threads, const Body& body) {
   parallel_for((n + kGaussians - 1) / kGaussians, threads, [&](int64_t item) {
     for (int64_t i = item * kGaussians; i < std::min(n, (item + 1) * kGaussians); ++i) body(i);

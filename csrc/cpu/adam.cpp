@@ -1,3 +1,4 @@
+// adam of training.h: a step on several tensors at once. Threads share chunks of numbers.
 #include "core/adam.h"
 
 #include <algorithm>
@@ -8,10 +9,10 @@
 namespace ar::cpu {
 namespace {
 
-constexpr int64_t kNumbers = 16384;  ///< per work item
+constexpr int64_t kNumbers = 16384;
 
 template <typename T> void update(const AdamTensor<T>& t, T rate, int64_t begin, int64_t end) {
-  // The op has made sure that nothing overlaps; with this and a rule of its own the loop is vectorised.
+  // A local rule, and pointers that the op has found not to overlap, let the compiler vectorise the loop.
   const AdamRule<T> rule = t.rule;
   const T* __restrict grad = t.grad;
   T* __restrict param = t.param, * __restrict exp_avg = t.exp_avg, * __restrict exp_avg_sq = t.exp_avg_sq;

@@ -1,4 +1,5 @@
-// Loops of bin: a stable counting sort of pairs by tile, over splats in depth order.
+// Loops of bin: a stable counting sort of pairs by tile, over splats by depth. count_pairs() writes offsets. The caller
+// allocates pairs and positions, which scatter_pairs() writes.
 #pragma once
 
 #include <algorithm>
@@ -9,14 +10,12 @@
 
 namespace ar::AR_ISA {
 
-/// How far ahead of its use what belongs to a splat is fetched: splats are visited in depth order, which is random in
-/// memory.
+/// Splats from prefetch to use.
 inline constexpr int64_t kAhead = 12;
-/// As many splats as make it worthwhile that another thread places their pairs.
+/// Splats that are worth another thread.
 inline constexpr int64_t kPart = 1024;
 
-/// Asks for what the splats soon to come need: their tiles and offsets first, and where their pairs are written once
-/// those have arrived.
+/// Tiles and offsets of a splat, and of an earlier one what its offset points to.
 template <typename T> AR_HD void prefetch_pairs_of(const cpu::BinParams<T>& p, int64_t k, int64_t end) {
   if (k + 2 * kAhead < end) {
     const int32_t j = p.order[k + 2 * kAhead];
@@ -26,7 +25,6 @@ template <typename T> AR_HD void prefetch_pairs_of(const cpu::BinParams<T>& p, i
   if (p.positions && k + kAhead < end) __builtin_prefetch(p.positions + p.splat_offsets[p.order[k + kAhead]], 1);
 }
 
-/// Finds the tiles of all splats, in their order in memory, and counts those of each.
 template <class F, typename T> void find_tiles_of(cpu::BinParams<T>& p) {
   const auto* splats = reinterpret_cast<const Splat<F, T>*>(p.splats);
   for_each_chunk(p.n, p.threads, [&](int64_t, int64_t begin, int64_t end) {
@@ -61,21 +59,20 @@ void for_each_pair_of(const cpu::BinParams<T>& p, int64_t part_index, const Visi
     }
   }
 }
-/// visit(splat index, tile) for the pairs of one part of the splats, in depth order.
+/// visit(splat, tile) for pairs of a part of the splats.
 template <typename T, class Visit>
 void for_each_pair(const cpu::BinParams<T>& p, int64_t part_index, const Visit& visit) {
   visit_footprint(p.footprint, Footprints{},
                   [&](auto f) AR_HD_LAMBDA { for_each_pair_of<PixelsOf<decltype(f)>>(p, part_index, visit); });
 }
 
-/// Finds the tiles of splats, sorts these by depth, counts the pairs of each tile, and turns the counts into places.
 template <typename T> void count_pairs(cpu::BinParams<T>& p) {
   p.tiles.reset(new cpu::SplatTiles[p.n]);
   visit_footprint(p.footprint, Footprints{}, [&](auto f) AR_HD_LAMBDA { find_tiles_of<PixelsOf<decltype(f)>>(p); });
   p.order.reset(new int32_t[p.n]);
   cpu::sort_by_depth(p.depths, p.n, p.threads, p.order.get());
   const int64_t tiles = p.grid.tiles();
-  // Parts only speed things up: not where they are small, and their histograms may not outgrow the splats.
+  // A part has kPart splats or more, and no more tiles than splats.
   p.parts = std::clamp<int64_t>(p.n / std::max(tiles, kPart), 1, p.threads);
   p.cursors.reset(new int64_t[p.parts * tiles]);
   cpu::parallel_for(p.parts, p.threads, [&](int64_t part) {
@@ -92,16 +89,16 @@ template <typename T> void scatter_pairs(cpu::BinParams<T>& p) {
   cpu::parallel_for(p.parts, p.threads, [&](int64_t part) {
     int64_t* cursor = p.cursors.get() + part * tiles;
     int32_t current = -1;
-    int64_t next = 0;  // place in positions: a splat's pairs come one after the other
+    int64_t next = 0;  // Index in positions.
     for_each_pair(p, part, [&](int32_t j, int64_t tile) {
-      const int64_t place = cursor[tile]++;
-      p.pairs[place] = j;
+      const int64_t pair = cursor[tile]++;
+      p.pairs[pair] = j;
       if (!p.positions) return;
       if (j != current) {
         current = j;
         next = p.splat_offsets[j];
       }
-      p.positions[next++] = place;
+      p.positions[next++] = pair;
     });
   });
 }

@@ -1,5 +1,5 @@
-// Loop of blend. Threads share the tiles; within a tile a step of the loop is a splat, and a pack of lanes is a block
-// of the tile's pixels.
+// Loop of blend. Threads share tiles. In a tile a step is a splat, and a pack is a block of pixels (tile.h). Writes
+// images and, for a backward pass, transmittance and last.
 #pragma once
 
 #include <cmath>
@@ -11,7 +11,7 @@
 
 namespace ar::AR_ISA {
 
-/// The packs of a tile with an open sample.
+/// Packs with an open sample.
 template <int kSamples, typename T> PackSet<T> find_open(const T (&transmittance)[kSamples][kTilePixels]) {
   using V = typename LanesOf<T>::Type;
   PackSet<T> open = {};
@@ -23,7 +23,7 @@ template <int kSamples, typename T> PackSet<T> find_open(const T (&transmittance
   return open;
 }
 
-/// `colors`: room for the channels of a tile.
+/// `colors`: scratch.
 template <class P, typename T> AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* colors) {
   using V = typename LanesOf<T>::Type;
   constexpr int kCount = LanesOf<T>::kCount, kSamples = P::kSamples;
@@ -37,9 +37,9 @@ template <class P, typename T> AR_ONE_COPY void blend_tile(const cpu::BlendParam
   Places moving;
   std::fill_n(colors, channels * kTilePixels, T(0));
   for (int s = 0; s < kSamples; ++s) {
-    std::fill_n(transmittance[s], kTilePixels, T(-1));  // outside the image
-    for_each_run<T>(view, p.grid, [&](int place, int64_t, int count) AR_HD_LAMBDA {
-      std::fill_n(transmittance[s] + place, count, T(1));
+    std::fill_n(transmittance[s], kTilePixels, T(-1));  // Outside the image.
+    for_each_run<T>(view, p.grid, [&](int first, int64_t, int count) AR_HD_LAMBDA {
+      std::fill_n(transmittance[s] + first, count, T(1));
     });
   }
   const int32_t* pairs = p.lists.pairs;
@@ -61,13 +61,13 @@ template <class P, typename T> AR_ONE_COPY void blend_tile(const cpu::BlendParam
       const IndexOf<V> index(int32_t(first + i - begin + 1));
       for_each_pack(batch[i].reach, open, [&](int pixel) AR_HD_LAMBDA {
         const Vec2<V> at = {load(of_tile.x + pixel, V()), load(of_tile.y + pixel, V())};
-        V contribution(T(-0.0));  // the compiler knows that -0 + x is x
+        V contribution(T(-0.0));  // The compiler knows that -0 + x is x.
         if constexpr (P::kMoves) {
           const Vec2<V> z = P::whitened(terms, at, 0);
           bool hit = false;
           for (int group_first = 0; group_first < kSamples; group_first += Places::kGroup) {
             typename Places::Group group;
-            // With one sample, to branch on what has just been found takes longer than to composite in vain.
+            // With one sample, compositing in vain is faster than this branch.
             if (!moving.look(terms, z, group_first, pixel, group) && kSamples > 1) continue;
             hit = true;
             AR_UNROLL
@@ -112,7 +112,7 @@ template <class P, typename T> AR_ONE_COPY void blend_tile(const cpu::BlendParam
     }
   }
   const int64_t size = int64_t(p.grid.width) * p.grid.height;
-  alignas(64) T through[kTilePixels] = {};  // mean transmittance of the samples
+  alignas(64) T through[kTilePixels] = {};  // Mean transmittance.
   for (int s = 0; s < kSamples; ++s) {
     for (int i = 0; i < kTilePixels; ++i) {
       transmittance[s][i] = std::abs(transmittance[s][i]);

@@ -1,4 +1,5 @@
-// Loop of blend_vjp: like that of blend, from the last splat to the first.
+// Loop of blend_vjp: as blend.h, from the last splat of a tile to the first. Writes gradients per pair, which
+// project.h, rows.h and sum_channels.h add up. A call is for a window of channels.
 #pragma once
 
 #include "core/blend.h"
@@ -8,7 +9,7 @@
 
 namespace ar::AR_ISA {
 
-/// The gradient of a tile, per sample, with respect to the channels [first, first + count).
+/// The gradient of a tile, per sample, for channels [first, first + count).
 template <typename T>
 void load_gradient(const cpu::BlendVjpParams<T>& p, const TileView& view, int first, int count, T samples, T* to) {
   constexpr int kCount = LanesOf<T>::kCount;
@@ -22,8 +23,7 @@ void load_gradient(const cpu::BlendVjpParams<T>& p, const TileView& view, int fi
   }
 }
 
-/// The product of what a pack of pixels has as gradient and what a splat shows, over `count` channels. Channels behind
-/// the third whose gradient is zero change no bit.
+/// Gradient times what a splat shows. Channels after the third change no bit if their gradient is zero.
 template <class V, typename T> AR_HD V dot_channels(const T* gradient, const T* shown, int count) {
   constexpr int kCount = LanesOf<T>::kCount;
   const auto term = [&](int c, V sum) { return madd(load(gradient + c * kCount, V()), V(shown[c]), sum); };
@@ -31,7 +31,7 @@ template <class V, typename T> AR_HD V dot_channels(const T* gradient, const T* 
   if (count < 3) return count == 2 ? term(0, term(1, zero)) : term(0, zero);
   const V colors = term(0, term(1, load(gradient + 2 * kCount, V()) * V(shown[2])));
   if (count == 3) return colors;
-  V sums[4] = {zero, zero, zero, zero};  // as many as hide the latency of a madd
+  V sums[4] = {zero, zero, zero, zero};  // Four hide the latency of madd.
   int c = 3;
   for (; c + 4 <= count; c += 4) {
     AR_UNROLL
@@ -41,7 +41,7 @@ template <class V, typename T> AR_HD V dot_channels(const T* gradient, const T* 
   return colors + ((sums[0] + sums[1]) + (sums[2] + sums[3]));
 }
 
-/// `gradient`: room for the channels of a tile. `replay_memory`: null unless samples move.
+/// `gradient`: scratch. `replay_memory`: null unless samples move.
 template <class P, typename T>
 AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T* gradient, T* replay_memory) {
   using V = typename LanesOf<T>::Type;
@@ -50,7 +50,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
   const TilePixels<T>& of_tile = kTilePixelsOf<T>;
   const int64_t size = int64_t(p.grid.width) * p.grid.height;
   const Vec2<T> size_px = {T(p.grid.width), T(p.grid.height)};
-  // What a pair shows enters dL/dalpha with all channels, the sums only with the window's.
+  // dL/dalpha needs all channels, the sums only the window's.
   const bool with_shape = p.pair_grads != nullptr, with_means = with_shape && p.pair_means;
   const int loaded = with_shape ? p.channels.count : p.count, window = with_shape ? p.first : 0, count = p.count;
   const bool three = count == 3;
@@ -71,7 +71,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
       store(behind_all + i, sum);
     }
     if (p.dL_dalpha) {
-      // Alpha is what hides the background: a channel with a background of -1 and no splats' colours.
+      // Alpha is a channel of black splats on a background of -1.
       alignas(64) T dL_dalpha[kTilePixels] = {};
       load_tile<T>(view, p.grid, p.dL_dalpha, dL_dalpha);
       for (int i = 0; i < kTilePixels; ++i) behind_all[i] -= dL_dalpha[i] / T(kSamples);
@@ -98,13 +98,13 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
   for (int64_t k = begin + tile_last; k < end; ++k) write_zeros(k);
   TilePairs<P, T> dL_dplaces = {};
   Replay<P, T> replay({p, view, last, pack_last, begin, tile_last, replay_memory});
-  // Of the pairs with the same k / kBatch. Where samples move the replay knows the pixels: no batch is needed.
+  // Pairs of the same k / kBatch. The replay needs no batch: it knows the pixels.
   TileSplat<P, T> batch[P::kMoves ? 1 : kBatch];
   const auto prefetch_before = [&](int32_t k) {
     if (k >= kPrefetch) prefetch_splat(p.splats, pairs[begin + k - kPrefetch]);
   };
   for (int32_t k = tile_last - 1; k >= 0; --k) {
-    const int32_t j = pairs[begin + k], place = P::kMoves ? 0 : k % kBatch;
+    const int32_t j = pairs[begin + k], in_batch = P::kMoves ? 0 : k % kBatch;
     if constexpr (P::kMoves) {
       replay.enter(k);
       if (!replay.has(k)) {
@@ -114,13 +114,13 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
       prefetch_before(k);
       batch[0].splat = splat_at<P>(p.splats, j);
       batch[0].terms = terms_in_tile<P>(batch[0].splat, view);
-    } else if (place == kBatch - 1 || k == tile_last - 1) {
-      for (int32_t i = place; i >= 0; --i) {
-        prefetch_before(k - place + i);
-        batch[i] = tile_splat<P>(p.splats, pairs[begin + k - place + i], view);
+    } else if (in_batch == kBatch - 1 || k == tile_last - 1) {
+      for (int32_t i = in_batch; i >= 0; --i) {
+        prefetch_before(k - in_batch + i);
+        batch[i] = tile_splat<P>(p.splats, pairs[begin + k - in_batch + i], view);
       }
     }
-    const TileSplat<P, T>& prepared = batch[place];
+    const TileSplat<P, T>& prepared = batch[in_batch];
     const auto& terms = prepared.terms;
     const T* shown = p.channels.row(j);
     const V zero = V(T(0));
@@ -128,7 +128,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
     ShapeGrad<V> shape = {{zero, zero}, {zero, zero, zero}};
     V weighted = zero;
     const Vec3<V> splat_color = three_channels<V>(shown, loaded == 3);
-    Vec3<V> color = {zero, zero, zero};  // sums of three channels
+    Vec3<V> color = {zero, zero, zero};
     alignas(64) T sums[cpu::kWindow * kCount];
     if (!three) std::fill_n(sums, count * kCount, T(0));
     Vec2<V> mean_sums = {zero, zero};
@@ -181,7 +181,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
           contribution = contribution + grad.contribution;
           weighted = weighted + grad.of_alpha.weighted;
           P::add_alpha_vjp(terms, at, s, grad.of_alpha, shape);
-          // Again for the pixel alone: to ask for it must not change the other sums by a bit.
+          // Again, so that mean sums change no bit of the others.
           if (with_means) P::add_alpha_vjp(terms, at, s, grad.of_alpha, of_pixel);
         }
       }
@@ -201,7 +201,7 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
     if constexpr (P::kMoves) {
       while (replay.has(k)) visit(replay.pixel());
     } else {
-      for_each_pack(prepared.reach, pack_last.behind(index), visit);
+      for_each_pack(prepared.reach, pack_last.from(index), visit);
     }
     const V parts[] = {shape.offset.x, shape.offset.y, shape.shape.xx, shape.shape.xy,
                        shape.shape.yy, weighted,       color.x,        color.y};

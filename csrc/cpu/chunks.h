@@ -1,4 +1,5 @@
-// Loops over chunks of Gaussians, splats or weights, which threads take one after the other.
+// Loops over chunks of Gaussians, splats or weights, which threads share. A library for project.h, rows.h, bin.h,
+// weight.h and sum_channels.h.
 #pragma once
 
 #include <algorithm>
@@ -9,7 +10,7 @@
 
 namespace ar::AR_ISA {
 
-/// body(chunk, begin, end) for all chunks of [0, n).
+/// body(chunk, begin, end) for every chunk of [0, n).
 template <class Body> void for_each_chunk(int64_t n, int threads, const Body& body) {
   cpu::parallel_for(cpu::chunks_of(n), threads,
                     [&](int64_t chunk) { body(chunk, chunk * cpu::kChunk, std::min(n, (chunk + 1) * cpu::kChunk)); });

@@ -1,4 +1,5 @@
-// Which instruction set the CPU path runs on.
+// Chooses the instruction set, once per process, and fills tables of stages (stages.h) with functions of kernels_*.cpp.
+// csrc/torch/backend_cpu.cpp calls stages_of() for a table.
 #include <cstdlib>
 #include <cstring>
 #include <vector>
@@ -33,7 +34,6 @@ extern template void set_projection_and_bin<float>(cpu::Stages<float>&);
 namespace cpu {
 namespace {
 
-/// One table per footprint of the registry.
 template <class Make> auto make_tables(const Make& make) {
   std::vector<decltype(make(0))> tables;
   for_each_footprint(Footprints{}, [&](auto) { tables.push_back(make(int(tables.size()))); });
@@ -66,8 +66,8 @@ const Stages<float>& avx512_stages(int footprint) {
 }
 #endif
 
-/// The best supported set, or a worse one that the environment asks for. An unknown or unsupported
-/// request changes nothing: a variable left over from another machine must not break a program.
+/// The best supported set, or that of the environment. An unsupported request changes nothing: a variable from another
+/// machine must break no program.
 const InstructionSet& choose() {
   const char* wanted = std::getenv("ANALYTIC_RASTERIZER_ISA");
   for (const InstructionSet& set : instruction_sets()) {

@@ -1,4 +1,5 @@
-// Loop of inspect: statistics of every pixel (core/inspect.h), and of every Gaussian over all pixels.
+// Loop of inspect: walks lists as blend does, and writes statistics of pixels (core/inspect.h) and Gaussians. Threads
+// share tiles and add with atomics.
 #pragma once
 
 #include <cmath>
@@ -10,7 +11,7 @@
 
 namespace ar::AR_ISA {
 
-/// `bits` of a float that is not negative: they have its order.
+/// Bits of floats >= 0 have their order.
 inline void atomic_max(int32_t* bits, float value) {
   int32_t wanted, seen = __atomic_load_n(bits, __ATOMIC_RELAXED);
   std::memcpy(&wanted, &value, sizeof wanted);

@@ -1,8 +1,5 @@
-// The instruction set that a translation unit of the CPU path is compiled for.
-//
-// kernels_*.cpp define AR_ISA (a namespace) and AR_LANES (floats per register) after switching the
-// target with a pragma, then include the loops. Everything compiled for an instruction set lives in
-// its namespace: the linker must never merge code for a newer set into the path of an older one.
+// The instruction set of a translation unit. kernels_*.cpp switch the target, define AR_ISA (a namespace) and AR_LANES
+// (floats per register), and include the loops. The linker cannot merge code of two sets, which have two namespaces.
 #pragma once
 
 #if !defined(AR_ISA) || !defined(AR_LANES)
@@ -13,7 +10,7 @@
 #include <immintrin.h>
 #endif
 
-// One copy of a large function, whatever its callers pass.
+// One copy for all callers.
 #if defined(__clang__)
 #define AR_ONE_COPY __attribute__((noinline))
 #else

@@ -1,8 +1,5 @@
-// Fills the table of stages with the functions of one instruction set: kernels_*.cpp include this.
-//
-// These are the stages that are compiled for every instruction set. Blending works on packs of pixels; projection and
-// bin are scalar code, which gains from fused multiply-add and rounding instructions. kernels_all.h has the other
-// stages, which are compiled for the baseline only.
+// The stages that every instruction set has. kernels_*.cpp include it, and dispatch.cpp fills tables with it. Blending
+// works on packs. Projection and bin are scalar, and gain from fused multiply-add and rounding instructions.
 #pragma once
 
 #include "core/footprint/registry.h"
@@ -13,7 +10,7 @@
 
 namespace ar::AR_ISA {
 
-/// Blending; of reference footprints, which nobody waits for, only if `kReferences`.
+/// kReferences: also of reference footprints, whose speed does not matter.
 template <typename T, bool kReferences> void set_blend_stages(int footprint, cpu::Stages<T>& stages) {
   visit_footprint(footprint, Footprints{}, [&](auto f) {
     using F = decltype(f);

@@ -1,5 +1,5 @@
-// All stages, also those that are not worth compiling for several instruction sets: kernels_baseline.cpp and
-// kernels_double.cpp include this.
+// All stages, for kernels_baseline.cpp and kernels_double.cpp. Some are not worth compiling for several instruction
+// sets.
 #pragma once
 
 #include "cpu/inspect.h"

@@ -1,4 +1,4 @@
-// The CPU path for AVX2.
+// Compiles the loops of kernels.h for AVX2, in packs of 8 floats. dispatch.cpp uses them.
 #if defined(__x86_64__)
 #include "cpu/kernels_std.h"
 

@@ -1,4 +1,4 @@
-// The CPU path for AVX-512.
+// Compiles the loops of kernels.h for AVX-512, in packs of 16 floats. dispatch.cpp uses them.
 #if defined(__x86_64__)
 #include "cpu/kernels_std.h"
 

@@ -1,4 +1,4 @@
-// The CPU path for every machine, in packs of four.
+// Compiles the loops of kernels_all.h for every machine, in packs of 4 floats. dispatch.cpp uses them.
 #include "cpu/kernels_std.h"
 
 #define AR_ISA baseline

@@ -1,4 +1,4 @@
-// The CPU path in double precision, one pixel at a time.
+// Compiles the loops of kernels_all.h in double, a pixel at a time. dispatch.cpp uses them for tests and gradcheck.
 #include "cpu/kernels_std.h"
 
 #define AR_ISA double_precision

@@ -1,5 +1,5 @@
-// The standard headers that the loops use. kernels_*.cpp include them before they switch the target,
-// so that what these headers instantiate stays within the baseline instruction set.
+// The standard headers of the loops. kernels_*.cpp include it before they switch the target, so that standard templates
+// are compiled for the baseline.
 #pragma once
 
 #include <algorithm>

@@ -1,8 +1,5 @@
-// Packs of float lanes: the value type V of the per-pixel formulas on the CPU.
-//
-// Built on the vector extensions of GCC and Clang, with intrinsics where those lack an operation.
-// The width is that of the instruction set this translation unit is compiled for; the type lives in
-// that instruction set's namespace, so two widths never meet.
+// Packs of float lanes: the type V of formulas per pixel, a library for blend.h and others. They are vectors of GCC and
+// Clang, with intrinsics for missing operations. Each instruction set has its width and its namespace.
 #pragma once
 
 #include "core/constants.h"
@@ -11,7 +8,6 @@
 
 namespace ar::AR_ISA {
 
-// The scalar forms stay visible beside the packs'.
 using ar::abs;
 using ar::erfc;
 using ar::exp2;
@@ -21,7 +17,6 @@ using ar::min;
 using ar::select;
 using ar::sqrt;
 
-/// kLanes 32-bit integers.
 struct PackIndex {
   typedef int32_t Raw __attribute__((vector_size(4 * kLanes)));
   Raw v;
@@ -37,7 +32,7 @@ struct PackIndex {
   AR_HD void store(int32_t* p) const { __builtin_memcpy(p, &v, sizeof v); }
 };
 
-/// All bits of a lane set or clear.
+/// A lane has all bits set or clear.
 struct PackMask {
   PackIndex::Raw v;
 
@@ -109,16 +104,16 @@ AR_HD uint32_t bits(bool m) { return m; }
 AR_HD Pack abs(Pack a) { return Pack((Pack::Raw)((PackIndex::Raw)a.v & 0x7fffffff)); }
 AR_HD Pack minus_abs(Pack a) { return Pack((Pack::Raw)((PackIndex::Raw)a.v | INT32_MIN)); }
 
-/// 2^n times 1 + f p(f); `shifted` holds the integer n in its low bits.
+/// p * 2^n, with n in the low bits of `shifted`.
 AR_HD Pack scale_by_power(Pack p, Pack shifted) {
   return Pack((Pack::Raw)((PackIndex::Raw)p.v + ((PackIndex::Raw)shifted.v << 23)));
 }
 
-/// Adding 1.5 * 2^23 rounds to an integer, which then sits in the low bits of the sum.
+/// 1.5 * 2^23. Adding it leaves a rounded integer in the low bits.
 inline constexpr float kRound = 12582912.0f;
 
-/// 2^x to 3e-7 relative for x in [-126, 127]; clamped below, so that it never underflows
-/// (tests/cpp/pack_test.cpp). x = n + f, |f| <= 1/2; minimax polynomial of relative error 1.1e-7.
+/// 2^x to 3e-7 relative (tests/cpp/pack_test.cpp) for x in [-126, 127], clamped below. x = n + f with |f| <= 1/2. The
+/// minimax polynomial has an error of 1.1e-7.
 AR_HD Pack exp2(Pack x) {
   const Pack clamped = max(x, Pack(-126.0f)), shifted = clamped + Pack(kRound);
   const Pack f = clamped - (shifted - Pack(kRound));
@@ -131,9 +126,8 @@ AR_HD Pack exp2(Pack x) {
   return scale_by_power(p, shifted);
 }
 
-/// Complement of the error function. For |x| <= 9 within 1e-6 + 1.5e-7 x^2 relative (tests/cpp/pack_test.cpp);
-/// beyond, where it is below 1e-36, positive. For x >= 0 exp(-x^2) t p(t), t = 1 / (1 + 0.4 x), with a
-/// polynomial fitted to 1.3e-7 relative.
+/// Complement of the error function. |x| <= 9: error of 1e-6 + 1.5e-7 x^2 relative (tests/cpp/pack_test.cpp). Beyond it
+/// is only positive. x >= 0: exp(-x^2) t p(t), t = 1 / (1 + 0.4 x). The polynomial has an error of 1.3e-7.
 AR_HD Pack erfc(Pack x) {
   const Pack one(1.0f), distance = abs(x), t = one / madd(Pack(0.4f), distance, one);
   Pack p(5.0272588e-2f);
@@ -150,13 +144,12 @@ AR_HD Pack erfc(Pack x) {
 }
 
 #if AR_LANES == 16
-/// The upper lanes added to the lower.
 AR_HD __m256 eight_lanes(Pack a) { return _mm256_add_ps(_mm512_castps512_ps256(a.v), _mm512_extractf32x8_ps(a.v, 1)); }
 #elif AR_LANES == 8
 AR_HD __m256 eight_lanes(Pack a) { return a.v; }
 #endif
 
-/// Sum of the lanes, in a fixed order.
+/// In a fixed order.
 AR_HD float sum(Pack a) {
 #if AR_LANES >= 8
   const __m256 half = eight_lanes(a);
@@ -170,11 +163,10 @@ AR_HD float sum(Pack a) {
 AR_HD float sum(float a) { return a; }
 AR_HD double sum(double a) { return a; }
 
-/// sum() of eight, with the same bits: where packs are wide the sums share their instructions.
+/// sum() of eight packs, to the bit. Wide packs share instructions.
 AR_HD void sum_lanes(const Pack (&packs)[8], float (&sums)[8]) {
 #if AR_LANES >= 8
-  // As in sum(): first the halves of a pack, then what is two lanes away, then neighbours. Every step halves the
-  // number of registers.
+  // In the order of sum(). Each step halves the registers.
   __m256 halves[4], pairs[2];
   for (int i = 0; i < 4; ++i) {
     const __m256 a = eight_lanes(packs[i]), b = eight_lanes(packs[i + 4]);
@@ -194,8 +186,7 @@ AR_HD void sum_lanes(const double (&packs)[8], double (&sums)[8]) {
   for (int i = 0; i < 8; ++i) sums[i] = packs[i];
 }
 
-/// The lanes a scalar type is processed in: packs of floats, doubles one by one (they serve tests
-/// and gradcheck, where speed does not matter).
+/// Doubles come one by one: they are for tests and gradcheck.
 template <typename T> struct LanesOf;
 template <> struct LanesOf<float> {
   using Type = Pack;
@@ -210,8 +201,7 @@ AR_HD Pack load(const float* p, Pack) { return Pack::load(p); }
 AR_HD double load(const double* p, double) { return *p; }
 AR_HD void store(float* p, Pack v) { v.store(p); }
 AR_HD void store(double* p, double v) { *p = v; }
-/// How many numbers store_lanes takes for the lanes whose bit is set: none for none; else as many, where there is an
-/// instruction that puts them one behind the other, or all.
+/// Numbers that store_lanes() needs. AVX-512 compresses lanes, others store all or none.
 AR_HD int lanes_stored(uint32_t lanes, Pack) {
 #if AR_LANES == 16
   return __builtin_popcount(lanes);
@@ -219,7 +209,7 @@ AR_HD int lanes_stored(uint32_t lanes, Pack) {
   return lanes != 0 ? kLanes : 0;
 #endif
 }
-/// Stores the lanes whose bit is set; writes kLanes numbers, whatever it takes.
+/// Stores lanes whose bit is set. Writes kLanes numbers.
 AR_HD void store_lanes(float* p, [[maybe_unused]] uint32_t lanes, Pack v) {
 #if AR_LANES == 16
   store(p, Pack((Pack::Raw)_mm512_maskz_compress_ps(__mmask16(lanes), v.v)));
@@ -227,7 +217,7 @@ AR_HD void store_lanes(float* p, [[maybe_unused]] uint32_t lanes, Pack v) {
   store(p, v);
 #endif
 }
-/// The same lanes, of which there is one or more, and those that were left out as in `otherwise`; reads kLanes numbers.
+/// Loads such lanes, and others from memory or `otherwise`. Reads kLanes numbers.
 AR_HD Pack load_lanes(const float* p, [[maybe_unused]] uint32_t lanes, [[maybe_unused]] Pack otherwise) {
 #if AR_LANES == 16
   return Pack((Pack::Raw)_mm512_mask_expand_ps(otherwise.v, __mmask16(lanes), load(p, Pack()).v));

@@ -1,6 +1,6 @@
-// The threads that loops share. OpenMP is not used: an OpenMP loop ends when every thread of its team has come, and the
-// first ones spin until then. On a busy machine they take the time that the last one needs to get there. Here the
-// calling thread takes items itself, and helpers take others. A loop waits only for helpers that have begun an item.
+// The threads of parallel_for() (parallel.h). A loop of OpenMP ends when every thread has arrived, and on a busy
+// machine threads that spin delay the late ones. Here the calling thread runs items, helpers run others, and a loop
+// waits only for helpers that have begun.
 #include "cpu/parallel.h"
 
 #if defined(__unix__) || defined(__APPLE__)
@@ -19,11 +19,9 @@
 namespace ar::cpu {
 namespace {
 
-/// For so long a thread looks for what it waits for before it sleeps: the next loop of a picture mostly begins sooner,
-/// and to wake a thread up takes about as long.
+/// Threads spin this long before they sleep. The next loop mostly begins sooner, and to wake a thread takes as long.
 constexpr std::chrono::microseconds kPatience(100);
 
-/// Whether `there()` became true while the thread had patience.
 template <class There> bool spin_until(const There& there) {
   const auto end = std::chrono::steady_clock::now() + kPatience;
   do {
@@ -37,98 +35,94 @@ template <class There> bool spin_until(const There& there) {
   return there();
 }
 
-/// Four fields in one number: seats that are free, helpers that have joined, helpers that are inside, and whether the
-/// calling thread sleeps until the last helper has left.
+/// Four fields: helpers inside, helpers that joined, free seats, and whether the calling thread sleeps.
 using Seats = uint64_t;
 constexpr Seats kInside = 1, kJoined = Seats(1) << 16, kFree = Seats(1) << 32, kAwaited = Seats(1) << 48;
 constexpr int kMostThreads = 0x7fff;
 constexpr int count(Seats seats, Seats what) { return int(seats / what & 0xffff); }
 
-/// A loop, in memory that is never freed: a helper may look at it when it is over.
+/// Never freed: a late helper may read it.
 struct Loop {
   int64_t items;
   RunItem run;
   const void* body;
-  std::exception_ptr error;                  ///< what an item has thrown
-  alignas(64) std::atomic<int64_t> next{0};  ///< the first item that nobody has taken
+  std::exception_ptr error;                  ///< Of an item.
+  alignas(64) std::atomic<int64_t> next{0};  ///< Item that no thread has claimed.
 };
 
-/// The helpers are never ended: at the end of the process they sleep.
+/// Its helpers never end. Up to kLoops loops have helpers at a time.
 class Pool {
  public:
-  /// Runs all items. As many loops as there are places have helpers at the same time.
   void run(int64_t items, int helpers, RunItem run, const void* body) {
-    const int place = take_place();
-    if (place == kPlaces) {
+    const int slot = claim_loop();
+    if (slot == kLoops) {
       for (int64_t item = 0; item < items; ++item) run(body, item, 0);
       return;
     }
-    Loop& loop = loops_[place];
+    Loop& loop = loops_[slot];
     loop.items = items;
     loop.run = run;
     loop.body = body;
     loop.next.store(0, std::memory_order_relaxed);
     start(helpers);
-    seats_[place] = Seats(helpers) * kFree;
+    seats_[slot] = Seats(helpers) * kFree;
     wake(helpers);
-    take_items(loop, 0);
-    close(place);
-    await_helpers(place);
+    work_on(loop, 0);
+    close(slot);
+    await_helpers(slot);
     const std::exception_ptr error = std::exchange(loop.error, nullptr);
-    is_taken_[place] = false;
+    is_claimed_[slot] = false;
     if (error) std::rethrow_exception(error);
   }
 
  private:
-  static constexpr int kPlaces = 8;
+  static constexpr int kLoops = 8;
 
-  int take_place() {
-    int place = 0;
-    while (place < kPlaces && is_taken_[place].exchange(true)) ++place;
-    return place;
+  int claim_loop() {
+    int slot = 0;
+    while (slot < kLoops && is_claimed_[slot].exchange(true)) ++slot;
+    return slot;
   }
 
-  /// Has `count` helpers, or as many as the system allows.
   void start(int count) {
     if (started_ >= count) return;
     const std::lock_guard lock(mutex_);
     try {
       for (; started_ < count; ++started_) std::thread([this] { help(); }).detach();
-    } catch (const std::exception&) {  // then those that there are do more
+    } catch (const std::exception&) {  // The system allows no more.
     }
   }
 
-  /// Wakes those that are needed beside those that are awake.
   void wake(int helpers) {
     int sleepers = std::min<int>(helpers - looking_, asleep_);
     if (sleepers <= 0) return;
-    { const std::lock_guard lock(mutex_); }  // nobody is between looking and falling asleep
+    { const std::lock_guard lock(mutex_); }  // No helper is about to fall asleep.
     for (; sleepers > 0; --sleepers) wake_.notify_one();
   }
 
-  void await_helpers(int place) {
-    const auto have_left = [&] { return count(seats_[place], kInside) == 0; };
+  void await_helpers(int slot) {
+    const auto have_left = [&] { return count(seats_[slot], kInside) == 0; };
     if (spin_until(have_left)) return;
-    seats_[place] |= kAwaited;
+    seats_[slot] |= kAwaited;
     std::unique_lock lock(mutex_);
     left_.wait(lock, have_left);
   }
 
   [[noreturn]] void help() {
     for (;;) {
-      int place, thread;
+      int slot, thread;
       ++looking_;
-      const bool is_there = spin_until([&] { return join(place, thread); });
+      const bool is_there = spin_until([&] { return join(slot, thread); });
       --looking_;
       if (!is_there) {
         std::unique_lock lock(mutex_);
         ++asleep_;
-        wake_.wait(lock, [&] { return join(place, thread); });
+        wake_.wait(lock, [&] { return join(slot, thread); });
         --asleep_;
       }
-      take_items(loops_[place], thread);
-      close(place);
-      const Seats seats = seats_[place].fetch_sub(kInside);
+      work_on(loops_[slot], thread);
+      close(slot);
+      const Seats seats = seats_[slot].fetch_sub(kInside);
       if (count(seats, kInside) == 1 && (seats & kAwaited)) {
         {
           const std::lock_guard lock(mutex_);
@@ -138,12 +132,12 @@ class Pool {
     }
   }
 
-  /// Takes a free seat, if there is one.
-  bool join(int& place, int& thread) {
-    for (place = 0; place < kPlaces; ++place) {
-      Seats seats = seats_[place].load();
+  /// Claims a free seat.
+  bool join(int& slot, int& thread) {
+    for (slot = 0; slot < kLoops; ++slot) {
+      Seats seats = seats_[slot].load();
       while (count(seats, kFree)) {
-        if (!seats_[place].compare_exchange_weak(seats, seats - kFree + kJoined + kInside)) continue;
+        if (!seats_[slot].compare_exchange_weak(seats, seats - kFree + kJoined + kInside)) continue;
         thread = count(seats, kJoined) + 1;
         return true;
       }
@@ -151,12 +145,12 @@ class Pool {
     return false;
   }
 
-  /// Lets nobody else join.
-  void close(int place) {
-    if (count(seats_[place], kFree)) seats_[place] &= ~(0xffff * kFree);
+  /// No other helper may join.
+  void close(int slot) {
+    if (count(seats_[slot], kFree)) seats_[slot] &= ~(0xffff * kFree);
   }
 
-  void take_items(Loop& loop, int thread) {
+  void work_on(Loop& loop, int thread) {
     try {
       for (;;) {
         const int64_t item = loop.next.fetch_add(1, std::memory_order_relaxed);
@@ -169,10 +163,10 @@ class Pool {
     }
   }
 
-  alignas(64) std::atomic<Seats> seats_[kPlaces] = {};
+  alignas(64) std::atomic<Seats> seats_[kLoops] = {};
   alignas(64) std::atomic<int> started_{0}, looking_{0}, asleep_{0};
-  std::atomic<bool> is_taken_[kPlaces] = {};
-  Loop loops_[kPlaces];
+  std::atomic<bool> is_claimed_[kLoops] = {};
+  Loop loops_[kLoops];
   std::mutex mutex_;
   std::condition_variable wake_, left_;
 };
@@ -180,7 +174,7 @@ class Pool {
 std::atomic<Pool*> the_pool{nullptr};
 
 #if defined(__unix__) || defined(__APPLE__)
-// A forked child has none of the helpers. It makes a pool of its own; that of the parent may have been in use.
+// A forked child has no helpers. It makes a new pool, since the parent's may be in use.
 [[maybe_unused]] const int kWatchesForks = pthread_atfork(nullptr, nullptr, [] { the_pool = nullptr; });
 #endif
 

@@ -1,5 +1,5 @@
-// Loops whose items several threads share. Results never depend on the number of threads: every item writes places of
-// its own.
+// Loops whose items threads share: a library for the CPU path. Every item writes to its own memory, so that results do
+// not depend on the number of threads.
 #pragma once
 
 #include <cstdint>
@@ -9,14 +9,12 @@
 
 namespace ar::cpu {
 
-/// Calls run(body, item, thread) for every item in [0, items): see parallel_for.
 using RunItem = void (*)(const void* body, int64_t item, int thread);
 void run_items(int64_t items, int threads, RunItem run, const void* body);
 
-/// body(item), or body(item, thread), for item in [0, items), in any order, on at most `threads` threads: the calling
-/// one, whose number is 0, and others that are there for all loops (parallel.cpp). Items that run at the same time have
-/// different numbers, all below `threads`. Where body throws, items may be left out, and the exception is thrown here.
-/// Loops may be nested, and begun by several threads at once.
+/// body(item) or body(item, thread) for item in [0, items), in any order, on at most `threads` threads, numbered from
+/// 0. If body throws, items may be skipped, and the exception is thrown here. Loops may be nested, and begun by several
+/// threads at once.
 template <class Body> void parallel_for(int64_t items, int threads, const Body& body) {
   const RunItem run = [](const void* pointer, int64_t item, [[maybe_unused]] int thread) {
     const Body& body = *static_cast<const Body*>(pointer);
@@ -29,7 +27,7 @@ template <class Body> void parallel_for(int64_t items, int threads, const Body& 
   run_items(items, threads, run, &body);
 }
 
-/// Bounds of part `p` of `parts` near-equal parts of [0, n).
+/// Part `p` of `parts` near-equal parts of [0, n).
 struct Part {
   int64_t begin, end;
 };

@@ -1,4 +1,4 @@
-// Prefetching of rows that are read in an order that is random in memory.
+// Prefetches rows that are read at random in memory. A library for tile.h and project.h.
 #pragma once
 
 #include "core/stages.h"
@@ -6,13 +6,12 @@
 
 namespace ar::AR_ISA {
 
-/// Asks for a row of `width` numbers, which may lie in two lines of the cache.
+/// The row may lie in two cache lines.
 template <typename T> AR_HD void prefetch_row(const T* row, int64_t width) {
   __builtin_prefetch(row);
   __builtin_prefetch(row + width - 1);
 }
 
-/// Asks for row j of `splats`.
 template <typename T> AR_HD void prefetch_splat(const T* splats, int32_t j) {
   prefetch_row(splats + int64_t(j) * kSplatWidth, kSplatWidth);
 }

@@ -1,4 +1,4 @@
-// Loops of project and project_vjp, over chunks of Gaussians; Cam is Camera or FullCamera.
+// Loops of project, project_rows and their adjoints, over Gaussians (core/project.h). Cam: Camera or FullCamera.
 #pragma once
 
 #include <algorithm>
@@ -16,7 +16,6 @@ template <typename T> AR_HD bool all_finite(const T* row, int count) {
   return true;
 }
 
-/// Coefficients of Gaussian i, or null.
 template <class Vec> AR_HD Vec* coefficients_of(Vec* shs, int stride, int64_t i) {
   return shs ? shs + i * stride : nullptr;
 }
@@ -62,7 +61,7 @@ template <template <typename> class Cam, typename T> void project(const cpu::Pro
   });
 }
 
-/// The radii are those of project(), without colours those of Gaussians whose colours are finite.
+/// Radii as of project(). Without colours, these count as finite.
 template <template <typename> class Cam, typename T> void project_rows(const cpu::ProjectRowsParams<T>& p) {
   const Gaussians<T>& g = p.gaussians;
   for_each_chunk(g.n, p.threads, [&](int64_t, int64_t begin, int64_t end) {
@@ -96,7 +95,7 @@ template <template <typename> class Cam, typename T> void project_rows(const cpu
   });
 }
 
-/// So many positions before the sums of a pair are read, they are asked for. The pairs of a splat lie in as many tiles.
+/// Pairs from prefetch to use. Those of a splat are in many tiles.
 inline constexpr int64_t kPairsAhead = 16;
 
 template <template <typename> class Cam, typename T> void project_vjp(const cpu::ProjectVjpParams<T>& p) {

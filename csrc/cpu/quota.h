@@ -1,12 +1,12 @@
-// The CPU quota of a container, which the number of cores does not tell.
+// The CPU quota of a container, which is not its number of cores. thread_count() of csrc/torch reads it once.
 #pragma once
 
 #include <string>
 
 namespace ar::cpu {
 
-/// So many CPUs, rounded up, the control groups of this process give it: the least of its own group and of those that
-/// this one is in. INT_MAX where there is no limit, or no such groups. `root` comes before the paths of /proc and /sys.
+/// The least quota of the process's control group and the groups above, rounded up. INT_MAX: no limit. `root`: prefix
+/// of /proc and /sys, for tests.
 int cpu_quota(const std::string& root = "");
 
 }  // namespace ar::cpu

@@ -1,5 +1,5 @@
-// The samples of a tile that move: their state while the tile is composited, in the forward pass, and composited once
-// more for the backward pass, which logs the state in front of every splat.
+// Samples that move. TilePlaces is their state in a tile, for blend.h. Replay composites a tile again for blend_vjp.h
+// and logs alphas and positions, since earlier positions do not follow from later ones.
 #pragma once
 
 #include <algorithm>
@@ -10,7 +10,7 @@
 
 namespace ar::AR_ISA {
 
-/// Two numbers for every sample of a tile. Nothing, unless P moves.
+/// Two numbers per sample of a tile. Empty unless P moves.
 template <class P, typename T, bool kMoves = P::kMoves> struct TilePairs {};
 template <class P, typename T> struct TilePairs<P, T, true> {
   using V = typename LanesOf<T>::Type;
@@ -23,8 +23,7 @@ template <class P, typename T> struct TilePairs<P, T, true> {
   }
 };
 
-/// Where the samples of a tile are, from the centres of their pixels [px], and where they may be. Nothing, unless P
-/// moves.
+/// Positions of samples [px], from the centres of their pixels, and their cells. Empty unless P moves.
 template <class P, typename T, bool kMoves = P::kMoves> struct TilePlaces {};
 template <class P, typename T> struct TilePlaces<P, T, true> {
   using V = typename LanesOf<T>::Type;
@@ -41,22 +40,22 @@ template <class P, typename T> struct TilePlaces<P, T, true> {
   }
 
   AR_HD Bounds<V> bounds(int s) const {
-    // With one group loops over samples are unrolled, so that s is a constant, and so are the bounds.
+    // With one group the loops are unrolled, and bounds are constants.
     const Bounds<T> cell = kSamples == kGroup ? P::template cell<T>(s) : cells[s];
     return {{V(cell.lo.x), V(cell.lo.y)}, {V(cell.hi.x), V(cell.hi.y)}};
   }
 
-  /// Samples that are composited together, one behind the other: as many as have their numbers in registers.
+  /// Samples in registers together.
   static constexpr int kGroup = kSamples % 4 == 0 ? 4 : 1;
 
-  /// The samples of a group in a pack of pixels.
+  /// A group in a pack of pixels.
   struct Group {
-    Vec2<V> z[kGroup];    ///< whitened coordinates
-    V log_alpha[kGroup];  ///< to base 2
+    Vec2<V> z[kGroup];    ///< Whitened coordinates.
+    V log_alpha[kGroup];  ///< To base 2.
   };
 
-  /// Looks at the samples from `first` on of the pixels with the whitened coordinates z. Whether alpha may reach its
-  /// minimum anywhere: no exponential is needed where it does not.
+  /// Computes the group of sample `first` for whitened pixels z. False if no alpha reaches its minimum: then no
+  /// exponential is needed.
   template <class Terms> AR_HD bool look(const Terms& terms, Vec2<V> z, int first, int pixel, Group& group) const {
     V most = V(T(kLogAlphaMin - 1));
     AR_UNROLL
@@ -69,24 +68,21 @@ template <class P, typename T> struct TilePlaces<P, T, true> {
   }
 };
 
-/// A tile on the way back.
 template <class P, typename T> struct ReplayTile {
   const cpu::BlendVjpParams<T>& params;
   const TileView& view;
-  const int32_t (&last)[P::kSamples][kTilePixels];  ///< pairs up to the last one composited
-  const LastPairs<T>& pack_last;                    ///< the largest of them in a pack
-  int64_t begin;                                    ///< of the tile's pairs
+  const int32_t (&last)[P::kSamples][kTilePixels];  ///< Pairs up to the last composited.
+  const LastPairs<T>& pack_last;                    ///< The largest of a pack.
+  int64_t begin;                                    ///< First pair.
   int32_t count;
-  T* memory;  ///< cpu::kReplayNumbers numbers
+  T* memory;  ///< [cpu::kReplayNumbers].
 };
 
-/// The alphas of every pair of a tile's list and the places of the samples in front of it, from the last pair to the
-/// first. Nothing, unless P moves.
+/// Alphas, and positions before each pair, from the last pair of a tile to the first. Empty unless P moves.
 ///
-/// The places cannot be computed from those behind the pair, so the list is composited once more, and alphas and places
-/// are logged where a pair was composited: the walk back looks at nothing else, and needs no exponentials. Where the
-/// log is full it begins anew; the pairs before are composited again, from the nearest of a few states kept on the way,
-/// when the walk gets there. So memory does not depend on the list, and a list that fits the log is composited once.
+/// The tile is composited into a log, so that the walk back needs no exponentials. A full log begins anew. When the
+/// walk reaches earlier pairs, they are composited again from the nearest of kStates states. So memory does not depend
+/// on the list, and a list that fits the log is composited once.
 template <class P, typename T, bool kMoves = P::kMoves> class Replay {
   using V = typename LanesOf<T>::Type;
   using Places = TilePlaces<P, T>;
@@ -95,18 +91,18 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
  public:
   static constexpr int kGroup = Places::kGroup;
 
-  /// What the log has of a pair in a group of samples of a pack of pixels.
+  /// A group in a pack of pixels, as the log has it.
   struct Found {
-    int first;              ///< sample of the group
-    const uint32_t* lanes;  ///< [kGroup] where the pair was composited
-    const T* numbers;       ///< of the next sample
+    int first;              ///< Sample.
+    const uint32_t* lanes;  ///< [kGroup] where the pair was composited.
+    const T* numbers;       ///< Of the next sample.
 
-    /// opacity * I of the next sample of the group, zero where the pair was not composited, and its place in front of
-    /// the pair, where it was; elsewhere `rest`.
-    AR_HD void read(int j, Vec2<V> rest, V& raw, Vec2<V>& place) {
+    /// opacity * I and position of the next sample. Zero and `otherwise` where the pair was not composited.
+    AR_HD void read(int j, Vec2<V> otherwise, V& raw, Vec2<V>& place) {
       const int stored = lanes_stored(lanes[j], V());
       raw = load_lanes(numbers, lanes[j], V(T(0)));
-      place = {load_lanes(numbers + stored, lanes[j], rest.x), load_lanes(numbers + 2 * stored, lanes[j], rest.y)};
+      place = {load_lanes(numbers + stored, lanes[j], otherwise.x),
+               load_lanes(numbers + 2 * stored, lanes[j], otherwise.y)};
       numbers += 3 * stored;
     }
   };
@@ -116,7 +112,7 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
     if (tile.count > 0) composite(0, tile.count, true);
   }
 
-  /// Makes take() give what pair k found: for every k from the last to the first.
+  /// For every k, from the last pair to the first, before take().
   void enter(int32_t k) {
     if (k >= first_) return;
     const int32_t kept = k / spacing_;
@@ -126,13 +122,13 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
 
   AR_HD Bounds<V> bounds(int s) const { return samples_.bounds(s); }
 
-  /// Whether there is anything to take of pair k, for which enter() was called.
+  /// Whether take() has more of pair k.
   AR_HD bool has(int32_t k) const { return entries_ != 0 && end_[-entries_].pair == k; }
 
-  /// The first pixel of the pack that take() is about, where has(k).
+  /// First of the pack of take().
   AR_HD int pixel() const { return end_[-entries_].pixel; }
 
-  /// A group of samples of this pack that the pair was composited into. The groups of a pack come one after the other.
+  /// A group into which the pair was composited. Groups of a pack follow each other.
   AR_HD Found take() {
     const Entry& entry = end_[-entries_--];
     for (const uint32_t lanes : entry.lanes) top_ -= 3 * lanes_stored(lanes, V());
@@ -146,8 +142,8 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
     uint32_t lanes[kGroup];
   };
   using States = TilePairs<P, T>;
-  static constexpr int32_t kStates = 16;      ///< kept on the way
-  static constexpr int32_t kMinSpacing = 64;  ///< pairs between them
+  static constexpr int32_t kStates = 16;
+  static constexpr int32_t kMinSpacing = 64;  ///< Pairs between states.
   static constexpr int64_t kBytes = cpu::kReplayNumbers * int64_t(sizeof(T));
   static constexpr int64_t kPacksOfPair = kTilePixels / kCount;
   static constexpr int64_t kBytesOfPair =
@@ -157,8 +153,7 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
   std::byte* memory() const { return reinterpret_cast<std::byte*>(tile_.memory); }
   States* kept_states() const { return reinterpret_cast<States*>(memory()); }
 
-  /// The log. From its start, for every sample: the lanes of opacity * I and of the coordinates of its place. From its
-  /// end the entries.
+  /// The log has numbers from its start, and entries from its end.
   void clear_log() {
     top_ = reinterpret_cast<T*>(kept_states() + kStates);
     end_ = reinterpret_cast<Entry*>(memory() + kBytes);
@@ -168,7 +163,7 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
     return reinterpret_cast<std::byte*>(end_ - entries_) - reinterpret_cast<std::byte*>(top_) < kBytesOfPair;
   }
 
-  /// From the states in front of pair `from` to those behind pair `to` - 1.
+  /// Composites pairs [from, to).
   void composite(int32_t from, int32_t to, bool keep) {
     const cpu::BlendVjpParams<T>& p = tile_.params;
     const TileView& view = tile_.view;
@@ -178,7 +173,7 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
     TileSplat<P, T> batch[kBatch];
     for (int32_t first = from; first < to; first += kBatch) {
       const int count = std::min(kBatch, to - first);
-      const PackSet<T> open = tile_.pack_last.behind(IndexOf<V>(first));
+      const PackSet<T> open = tile_.pack_last.from(IndexOf<V>(first));
       for (int i = 0; i < count; ++i) {
         if (first + i + kPrefetch < to) prefetch_splat(p.splats, pairs[first + i + kPrefetch]);
         batch[i] = tile_splat<P>(p.splats, pairs[first + i], view);
@@ -191,7 +186,6 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
     }
   }
 
-  /// Composites pair k, and logs what it finds.
   AR_HD void find(const TileSplat<P, T>& splat, int32_t k, const PackSet<T>& open) {
     const auto& terms = splat.terms;
     T* top = top_;
@@ -235,7 +229,7 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
   ReplayTile<P, T> tile_;
   TilePlaces<P, T> samples_;
   int32_t spacing_;
-  int32_t first_;  ///< pair that the log begins with
+  int32_t first_;  ///< Pair of the log.
   T* top_;
   Entry* end_;
   int64_t entries_ = 0;

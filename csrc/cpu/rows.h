@@ -1,5 +1,5 @@
-// Loops over the rows of the public stages (ProjectedRows): from rows to splats, and from the sums of a splat's pairs
-// to the gradient with respect to its row.
+// Loops over public rows (ProjectedRows, PackedRow). shape_rows() makes splats of rows. row_grads() adds up the pairs
+// of a splat and writes the gradient of its row.
 #pragma once
 
 #include "cpu/project.h"

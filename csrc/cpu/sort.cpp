@@ -1,3 +1,4 @@
+// sort.h on several threads. Each thread has a part of the numbers.
 #include "cpu/sort.h"
 
 #include <algorithm>
@@ -12,7 +13,7 @@
 namespace ar::cpu {
 namespace {
 
-/// Unsigned integers in the order of positive floats.
+/// Unsigned integers in the order of floats >= 0.
 uint32_t depth_key(float depth) {
   uint32_t key;
   std::memcpy(&key, &depth, sizeof key);
@@ -24,8 +25,7 @@ uint64_t depth_key(double depth) {
   return key;
 }
 
-/// As many numbers as make it worthwhile that another thread adds them up, or sorts them, and kinds of items that are
-/// placed together.
+/// Numbers that are worth another thread, and kinds per item.
 constexpr int64_t kSumBlock = 4096, kSortBlock = 2048, kKindBlock = 256;
 
 }  // namespace
@@ -48,7 +48,6 @@ int64_t sum_before(int64_t* numbers, int64_t n, int threads) {
 
 int64_t place_items(int64_t* counts, int64_t parts, int64_t kinds, int threads, int64_t* firsts) {
   threads = int(std::clamp<int64_t>(parts * kinds / kSumBlock, 1, threads));
-  // A block of kinds in one part after the other: neighbours in memory.
   const int64_t blocks = (kinds + kKindBlock - 1) / kKindBlock;
   const auto kinds_of = [&](int64_t b) { return Part{b * kKindBlock, std::min((b + 1) * kKindBlock, kinds)}; };
   parallel_for(blocks, threads, [&](int64_t b) {
@@ -65,17 +64,17 @@ int64_t place_items(int64_t* counts, int64_t parts, int64_t kinds, int threads, 
     std::copy(firsts + block.begin, firsts + block.end, next);
     for (int64_t p = 0; p < parts; ++p) {
       for (int64_t k = block.begin; k < block.end; ++k) {
-        int64_t& place = next[k - block.begin];
+        int64_t& first = next[k - block.begin];
         const int64_t count = counts[p * kinds + k];
-        counts[p * kinds + k] = place;
-        place += count;
+        counts[p * kinds + k] = first;
+        first += count;
       }
     }
   });
   return all;
 }
 
-/// LSD radix sort with a histogram per part: stable, so the result does not depend on their number.
+/// LSD radix sort with a histogram per part. It is stable, so that parts do not matter.
 template <typename T> void sort_by_depth(const T* depths, int64_t n, int threads, int32_t* order) {
   using Key = decltype(depth_key(T()));
   constexpr int kBits = 11, kBuckets = 1 << kBits;
@@ -84,7 +83,7 @@ template <typename T> void sort_by_depth(const T* depths, int64_t n, int threads
     int32_t index;
   };
   const int64_t parts = std::clamp<int64_t>(n / kSortBlock, 1, threads);
-  const std::unique_ptr<Entry[]> memory(new Entry[2 * n]);  // not a vector, which one thread would fill with zeros
+  const std::unique_ptr<Entry[]> memory(new Entry[2 * n]);  // A vector would be filled with zeros.
   Entry *from = memory.get(), *to = from + n;
   std::vector<int64_t> cursors(parts * kBuckets), firsts(kBuckets);
   std::vector<Key> set_in_all(parts), set_in_any(parts);
@@ -100,13 +99,13 @@ template <typename T> void sort_by_depth(const T* depths, int64_t n, int threads
     set_in_all[p] = common;
     set_in_any[p] = any;
   });
-  Key common = ~Key(0), any = 0;  // bits set in every key, in any key
+  Key common = ~Key(0), any = 0;
   for (int64_t p = 0; p < parts; ++p) {
     common &= set_in_all[p];
     any |= set_in_any[p];
   }
   for (int shift = 0; shift < int(8 * sizeof(Key)); shift += kBits) {
-    if ((((any ^ common) >> shift) & (kBuckets - 1)) == 0) continue;  // all keys agree on this digit
+    if ((((any ^ common) >> shift) & (kBuckets - 1)) == 0) continue;  // All keys agree.
     parallel_for(parts, threads, [&](int64_t p) {
       int64_t* count = &cursors[p * kBuckets];
       std::fill(count, count + kBuckets, 0);

@@ -1,3 +1,5 @@
+// ssim and ssim_vjp of training.h, in blocks of pixels (core/ssim.h). Window sums go along rows, then along columns.
+// Sums of blocks are added in order, so that threads change no bit.
 #include "core/ssim.h"
 
 #include <algorithm>
@@ -9,17 +11,15 @@
 namespace ar::cpu {
 namespace {
 
-/// Pixels of an image that are one work item: so few columns that the rows under the window stay in the cache, and so
-/// many rows that those read twice, at the border to the next item, do not matter.
+/// Pixels of a block: few columns, for the cache, and many rows, since two blocks read those at a border.
 constexpr int kColumns = 128, kRows = 64;
 
-/// Part of a plane.
+/// Pixels [top, bottom) x [left, right) of a plane.
 struct Block {
   int64_t plane;
-  int top, left, bottom, right;  ///< its pixels are in [top, bottom) x [left, right)
+  int top, left, bottom, right;
 };
 
-/// The blocks of all planes, numbered.
 class Blocks {
  public:
   template <class Params>
@@ -39,40 +39,37 @@ class Blocks {
   int64_t down_, across_, count_;
 };
 
-/// Window sums of kImages images over a block, whose rows pass from the top to the bottom. Only as many rows are kept
-/// as the window covers. All columns are computed, also where the block is narrower.
+/// Window sums of kImages images over a block, row by row.
 template <typename T, int kImages> struct RollingWindow {
-  T row[kImages][kColumns + 2 * kSsimRadius];  ///< of the images, from kSsimRadius in front of the block
-  T sums[kImages][kColumns];                   ///< of a pixel's window
+  T row[kImages][kColumns + 2 * kSsimRadius];  ///< kSsimRadius pixels more on both sides.
+  T sums[kImages][kColumns];
 
-  /// Takes `row` as row y of the images.
+  /// `row` is row y.
   void push(int y) {
     for (int m = 0; m < kImages; ++m) {
       const T* in = row[m] + kSsimRadius;
-      T* __restrict__ out = along_rows_[place(y)][m];
+      T* __restrict__ out = along_rows_[slot(y)][m];
       for (int x = 0; x < kColumns; ++x) out[x] = window_sum<T>([&](int k) AR_HD_LAMBDA { return in[x + k]; });
-      std::copy(out, out + kColumns, along_rows_[place(y) + kSsimWindow][m]);
+      std::copy(out, out + kColumns, along_rows_[slot(y) + kSsimWindow][m]);
     }
   }
-  /// Makes `sums` of row y, when the rows under its window have been pushed last.
+  /// Sums of row y, after the last row under its windows was pushed.
   void sum(int y) {
     for (int m = 0; m < kImages; ++m) {
-      const auto* in = along_rows_ + place(y - kSsimRadius) + kSsimRadius;
+      const auto* in = along_rows_ + slot(y - kSsimRadius) + kSsimRadius;
       T* __restrict__ out = sums[m];
       for (int x = 0; x < kColumns; ++x) out[x] = window_sum<T>([&](int k) AR_HD_LAMBDA { return in[k][m][x]; });
     }
   }
 
  private:
-  static int place(int y) { return (y + 2 * kSsimWindow) % kSsimWindow; }
+  static int slot(int y) { return (y + 2 * kSsimWindow) % kSsimWindow; }
 
-  /// Sums along the rows. Every row is there twice, so that the rows under a window follow each other wherever it
-  /// begins.
+  /// Each row is there twice, so that rows under a window are adjacent.
   T along_rows_[2 * kSsimWindow][kImages][kColumns];
 };
 
-/// visit(y, is_inside) for the rows of a block and those that its windows reach; then, from the first row on whose
-/// window is complete, finish(row of the block).
+/// visit(y, is_inside) for rows under a block's windows; finish(y) for rows whose windows are complete.
 template <class Visit, class Finish>
 void for_each_row(const Block& block, int height, const Visit& visit, const Finish& finish) {
   for (int y = block.top - kSsimRadius; y < block.bottom + kSsimRadius; ++y) {
@@ -81,7 +78,7 @@ void for_each_row(const Block& block, int height, const Visit& visit, const Fini
   }
 }
 
-/// A row of a block and what its windows reach; zeros outside the image.
+/// Zeros outside the image.
 template <typename T, typename Value> void copy_row(const Value* image_row, const Block& block, int width, T* out) {
   const int first = block.left - kSsimRadius;
   const int begin = std::max(first, 0), end = std::min(block.left + kColumns + kSsimRadius, width);
@@ -90,7 +87,6 @@ template <typename T, typename Value> void copy_row(const Value* image_row, cons
   std::fill(out + (end - first), out + kColumns + 2 * kSsimRadius, T(0));
 }
 
-/// Sums of |x - y| and of the similarity.
 struct Sums {
   double l1, ssim;
 };

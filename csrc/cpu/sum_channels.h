@@ -1,4 +1,5 @@
-// Loop of sum_channels: adds the gradients of channels, which blend_vjp made per pair, up per splat.
+// Loop of sum_channels: adds up, per splat, the gradients of channels that blend_vjp made per pair. Runs after each
+// window of channels.
 #pragma once
 
 #include "cpu/project.h"

@@ -1,5 +1,5 @@
-// The loops of a training step besides rendering, in float and double: loss, activations, optimiser and what density
-// control observes. They are compiled once, for the baseline instruction set. Bits do not depend on `threads`.
+// The loops of a training step besides rendering, in float and double, for csrc/torch/training_cpu.cpp: ssim.cpp,
+// activations.cpp and adam.cpp. Compiled once, for the baseline. Bits do not depend on `threads`.
 #pragma once
 
 #include "core/activations.h"
@@ -17,7 +17,7 @@ template <typename T> void activate_vjp(const ActivateVjpParams<T>& p, int threa
 
 template <typename T> void observe(const ObserveParams<T>& p, int threads);
 
-/// p.first_item need not be set.
+/// Sets p.first_item.
 template <typename T> void adam(AdamParams<T> p, int threads);
 
 }  // namespace ar::cpu

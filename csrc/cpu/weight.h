@@ -1,4 +1,5 @@
-// Loops of footprint_weight and its adjoint.
+// Loops of footprint_weight and its adjoint: a weight per pair of covariance and offset (core/weight.h). Threads share
+// chunks of them.
 #pragma once
 
 #include "core/weight.h"

@@ -1,5 +1,5 @@
-// The arguments of the ops, each named once, in the order of its schema: `each` of a struct lists them for the schema
-// and for reading them off the dispatcher's stack (boxing.h), and for the names in snapshots.
+// The arguments of the ops, a struct per op. `each` lists them in the order of the schema. boxing.h makes schemas of it
+// and reads the dispatcher's stack with it. check() (checks.h) brings tensors into the form that kernels read.
 #pragma once
 
 #include <string>
@@ -10,14 +10,14 @@
 
 namespace ar::ops {
 
-/// A tensor, or what takes its place, for every tensor of a scene and a camera as 3DGS names them.
+/// Named as in 3DGS.
 template <class Optional> struct SceneTensors {
   Tensor means3D;
   Optional means2D;
   Tensor opacities;
   Optional shs, colors_precomp, scales, rotations, cov3D_precomp;
   Tensor viewmatrix, projmatrix, campos;
-  Optional lens;  ///< of a full camera
+  Optional lens;  ///< Of a full camera.
 
   template <class Visit> void each_tensor(Visit&& visit) {
     visit("means3D", means3D);
@@ -34,10 +34,8 @@ template <class Optional> struct SceneTensors {
     visit("lens", lens);
   }
 };
-/// The first of them are of the Gaussians, the others of the camera.
 inline constexpr size_t kGaussianTensors = 8, kCameraTensors = 4, kSceneTensors = kGaussianTensors + kCameraTensors;
 
-/// How a camera renders, besides its tensors.
 template <class Tangent> struct CameraNumbers {
   int64_t image_height = 0, image_width = 0;
   Tangent tanfovx = {}, tanfovy = {};
@@ -54,8 +52,7 @@ template <class Tangent> struct CameraNumbers {
   }
 };
 
-/// A scene and a camera, whose tangents are a double each; or several cameras, with a std::vector<double> and tensors
-/// that have a dimension more. check() (checks.h) brings the tensors into the form the kernels read.
+/// Tangent: double, or std::vector<double> for several cameras, whose tensors have one more dimension.
 template <class Tangent> struct SceneArguments : SceneTensors<OptionalTensor>, CameraNumbers<Tangent> {
   int64_t count() const { return means3D.size(0); }
 
@@ -66,14 +63,13 @@ template <class Tangent> struct SceneArguments : SceneTensors<OptionalTensor>, C
 };
 using Inputs = SceneArguments<double>;
 
-/// Gradients with respect to the tensors of Inputs; undefined where nobody wants one.
+/// Undefined where not wanted.
 struct Grads : SceneTensors<Tensor> {
-  MeanSums mean_sums = MeanSums::kNone;  ///< that means2D holds
-  bool with_camera = false;              ///< one of the camera's tensors wants a gradient
-  bool add = false;                      ///< those of the Gaussians are added to what is there
+  MeanSums mean_sums = MeanSums::kNone;  ///< In means2D.
+  bool with_camera = false;
+  bool add = false;  ///< Only for Gaussians.
 };
 
-/// A footprint by its key, and the number of its option.
 struct FootprintArguments {
   std::string footprint;
   double option = 0;
@@ -84,13 +80,12 @@ struct FootprintArguments {
   }
 };
 
-/// Arguments of `rasterize`.
 struct RasterizeArguments : Inputs, FootprintArguments {
-  Tensor bg;  ///< (C,) of C colour channels
+  Tensor bg;  ///< (C,).
   ImageSwitches images = {};
   bool keep = false, debug = false;
-  std::string means2d_z = "zero";  ///< third column of the gradient with respect to means2D: "sum_abs", "sum_norm"
-  OptionalTensor features;         ///< (P, K) further channels beside three colours, blended on zero
+  std::string means2d_z = "zero";  ///< Column 2 of the gradient of means2D: "zero", "sum_abs", "sum_norm".
+  OptionalTensor features;         ///< (P, K), blended on zero after three colours.
 
   template <class Visit> void each(Visit&& visit) {
     Inputs::each(visit);
@@ -104,8 +99,7 @@ struct RasterizeArguments : Inputs, FootprintArguments {
   }
 };
 
-/// Arguments of `project`: of one or several cameras, in C numbers each of the tangents and in tensors of shape
-/// (C, 4, 4), (C, 4, 4), (C, 3), (C, kLensWidth). It has no means2D, which is an output.
+/// Tensors of C cameras: (C, 4, 4), (C, 4, 4), (C, 3), (C, kLensWidth). means2D is a result.
 struct ProjectArguments : SceneArguments<std::vector<double>>, FootprintArguments {
   template <class Visit> void each(Visit&& visit) {
     SceneArguments::each([&](std::string_view name, auto& value) {
@@ -115,8 +109,8 @@ struct ProjectArguments : SceneArguments<std::vector<double>>, FootprintArgument
   }
 };
 
-/// Which rows of packed rows belong to C cameras: `counts[c]` from `firsts[c]` on.
-struct PackedPlaces {
+/// Camera c has counts[c] packed rows, from firsts[c] on.
+struct PackedRanges {
   std::vector<int64_t> firsts, counts;
 
   template <class Visit> void each(Visit&& visit) {
@@ -125,7 +119,6 @@ struct PackedPlaces {
   }
 };
 
-/// What the arguments of `bin`, `blend` and `inspect` have in common.
 struct ImageArguments : FootprintArguments {
   int64_t image_height = 0, image_width = 0;
 
@@ -136,10 +129,9 @@ struct ImageArguments : FootprintArguments {
   }
 };
 
-/// Arguments of `bin`: the rows that `project` made for C cameras, camera after camera.
 struct BinArguments : ImageArguments {
   Tensor means2d, cov2d, dets, opacities, depths;
-  Tensor row_splits;  ///< (C + 1,) int64 on the CPU, first row of each camera
+  Tensor row_splits;  ///< (C + 1,) int64 on the CPU: first row of each camera.
   bool keep = true;
 
   template <class Visit> void each(Visit&& visit) {
@@ -154,12 +146,11 @@ struct BinArguments : ImageArguments {
   }
 };
 
-/// Arguments of `blend`.
 struct BlendArguments : ImageArguments {
   Tensor means2d, cov2d, opacities, features, background;
-  OptionalTensor means2d_abs;  ///< its values are ignored; its gradient is the sum over pixels of |dL/dmeans2d|
+  OptionalTensor means2d_abs;  ///< Only for its gradient, sums over pixels of |dL/dmeans2d|.
   Tensor dets, row_splits;
-  std::vector<Tensor> lists;  ///< of `bin`
+  std::vector<Tensor> lists;  ///< Of `bin`.
   bool keep = false;
 
   template <class Visit> void each(Visit&& visit) {
@@ -177,11 +168,9 @@ struct BlendArguments : ImageArguments {
   }
 };
 
-/// Arguments of `inspect`: what every pixel shows of the Gaussians that `lists` of rasterize hold, and how much of each
-/// Gaussian is seen.
 struct InspectArguments : ImageArguments {
-  std::vector<Tensor> saved;
-  Tensor depths;  ///< (P,) of all Gaussians. Only P is read, which as a number would be fixed for a compiled program
+  std::vector<Tensor> saved;  ///< Of `rasterize`.
+  Tensor depths;              ///< (P,), for P, which torch.compile would fix if it was a number.
   int64_t count() const { return depths.size(0); }
 
   template <class Visit> void each(Visit&& visit) {
@@ -191,7 +180,6 @@ struct InspectArguments : ImageArguments {
   }
 };
 
-/// Arguments of `footprint_weight`.
 struct WeightArguments : FootprintArguments {
   Tensor offset, cov2d;
 
@@ -202,10 +190,9 @@ struct WeightArguments : FootprintArguments {
   }
 };
 
-/// Arguments of `ssim_map`: the similarity of every pixel of `image` and `target` (core/ssim.h).
 struct SsimArguments {
-  Tensor image;   ///< (..., H, W)
-  Tensor target;  ///< the same, of the image's dtype or uint8; has no gradient
+  Tensor image;   ///< (..., H, W).
+  Tensor target;  ///< The same, or uint8. Has no gradient.
   bool keep = false;
 
   template <class Visit> void each(Visit&& visit) {
@@ -215,7 +202,7 @@ struct SsimArguments {
   }
 };
 
-/// Arguments of `l1_ssim`: l1_weight * (mean of |image - target|) + ssim_weight * (mean similarity) + constant.
+/// l1_weight * (mean |image - target|) + ssim_weight * (mean similarity) + constant.
 struct L1SsimArguments : SsimArguments {
   double l1_weight = 0, ssim_weight = 0, constant = 0;
 
@@ -229,7 +216,6 @@ struct L1SsimArguments : SsimArguments {
   }
 };
 
-/// Arguments of `activate`: parameters of Gaussians as a training optimises them (core/activations.h).
 struct ActivateArguments {
   Tensor log_scales, quats, logit_opacities;
 
@@ -240,12 +226,10 @@ struct ActivateArguments {
   }
 };
 
-/// Arguments of `picture_gradients`: a scene by the parameters that a training optimises, a plain or a full camera, and
-/// what the picture should be.
 struct PictureArguments : CameraNumbers<double>, FootprintArguments {
   Tensor means, log_scales, quats, logit_opacities, shs;
-  int64_t mean_columns = 0;  ///< of the gradient with respect to means2D, 3 or 4; 0: none is wanted
-  Tensor target, dL_dloss;   ///< as of `l1_ssim`; ()
+  int64_t mean_columns = 0;  ///< Of the gradient of means2D: 3, 4, or 0 for none.
+  Tensor target, dL_dloss;   ///< As of `l1_ssim`.
   double ssim_weight = 0;
   Tensor bg, viewmatrix, projmatrix, campos;
   OptionalTensor lens;
@@ -270,24 +254,22 @@ struct PictureArguments : CameraNumbers<double>, FootprintArguments {
   }
 };
 
-/// Tensors that an op writes to, marked in its schema by a letter that no other argument has.
+/// An op writes to them. The schema marks each by its own letter.
 template <char kLetter> struct WrittenTensors : std::vector<Tensor> {};
-
-/// A tensor that an op writes to, likewise.
 template <char kLetter> struct WrittenTensor : Tensor {};
 
-/// So that autograd notices where a backward pass still needs the values of before. Inference tensors have no version.
+/// So that autograd refuses a backward pass that needs the old values. Inference tensors have no version.
 inline void note_written(const Tensor& t) {
   if (!t.is_inference()) t.unsafeGetTensorImpl()->bump_version();
 }
 
-/// Arguments of `observe_`: a picture's gradients and radii, and the sums that they are added to (core/density.h).
+/// See core/density.h.
 struct ObserveArguments {
-  WrittenTensor<'a'> gradient_sums;  ///< (P,)
-  WrittenTensor<'b'> views;          ///< (P,) int32
-  Tensor gradients;                  ///< (P, 3) or (P, 4), with respect to means2D
-  Tensor radii;                      ///< (P,) int32
-  int64_t first_column = 0;          ///< of the two columns of `gradients` that are looked at
+  WrittenTensor<'a'> gradient_sums;
+  WrittenTensor<'b'> views;
+  Tensor gradients;  ///< (P, 3) or (P, 4), of means2D.
+  Tensor radii;
+  int64_t first_column = 0;  ///< Two columns of `gradients` are read.
 
   template <class Visit> void each(Visit&& visit) {
     visit("gradient_sums", gradient_sums);
@@ -298,19 +280,18 @@ struct ObserveArguments {
   }
 };
 
-/// Arguments of `adam_`: a step on several tensors (core/adam.h). The lists have a member for each of them.
+/// A step on several tensors (core/adam.h).
 struct AdamArguments {
-  WrittenTensors<'a'> params;  ///< of any strides, as all others
+  WrittenTensors<'a'> params;  ///< Any strides, as all others.
   std::vector<Tensor> grads;
   WrittenTensors<'b'> exp_avgs;
   WrittenTensors<'c'> exp_avg_sqs;
   std::vector<double> rates;
-  std::vector<int64_t> steps;  ///< 1 for the first
+  std::vector<int64_t> steps;  ///< 1 for the first.
   double beta1 = 0, beta2 = 0, eps = 0;
-  OptionalTensor rows;  ///< (P,) bool or uint8
+  OptionalTensor rows;  ///< (P,) bool or uint8.
   bool bias_correction = true;
-  /// The first numbers of every row, along the first dimension, that have a learning rate of their own, and that rate;
-  /// 0: none. Empty lists: none at all.
+  /// The first heads[i] numbers of a row have the rate head_rates[i].
   std::vector<int64_t> heads;
   std::vector<double> head_rates;
 
@@ -331,15 +312,14 @@ struct AdamArguments {
   }
 };
 
-/// Arguments of `pack_rows_`: what `project` takes, which Gaussians have rows, and where. What does not fit the room is
-/// left out.
+/// Rows from `room` on are not written.
 struct PackArguments : ProjectArguments {
-  WrittenTensor<'a'> rows;   ///< (room, kPackedWidth)
-  WrittenTensor<'b'> radii;  ///< (room,) int32
-  WrittenTensor<'c'> ids;    ///< (room,) int32
-  Tensor ends;               ///< (C, P) int32, of `count_rows`
-  Tensor firsts;             ///< (C,) int64 on the device, place of each camera's first row
-  int64_t first_id = 0;      ///< what ids in `rows` begin with
+  WrittenTensor<'a'> rows;   ///< (room, kPackedWidth).
+  WrittenTensor<'b'> radii;  ///< (room,) int32.
+  WrittenTensor<'c'> ids;    ///< (room,) int32.
+  Tensor ends;               ///< (C, P) int32, of `count_rows`.
+  Tensor firsts;             ///< (C,) int64: each camera's first row.
+  int64_t first_id = 0;      ///< PackedRow::id of Gaussian 0.
 
   template <class Visit> void each(Visit&& visit) {
     visit("rows", rows);
@@ -352,25 +332,23 @@ struct PackArguments : ProjectArguments {
   }
 };
 
-/// Arguments of `pack_rows_vjp`.
-struct PackVjpArguments : ProjectArguments, PackedPlaces {
-  Tensor dL_drows;          ///< (n, kPackedGradWidth or more)
-  Tensor ids;               ///< (n,) int32, of `pack_rows_`
-  std::vector<bool> needs;  ///< of ProjectArguments' tensors
+struct PackVjpArguments : ProjectArguments, PackedRanges {
+  Tensor dL_drows;          ///< (n, kPackedGradWidth or more).
+  Tensor ids;               ///< (n,) int32, of `pack_rows_`.
+  std::vector<bool> needs;  ///< Of ProjectArguments.
 
   template <class Visit> void each(Visit&& visit) {
     visit("dL_drows", dL_drows);
     ProjectArguments::each(visit);
     visit("ids", ids);
-    PackedPlaces::each(visit);
+    PackedRanges::each(visit);
     visit("needs", needs);
   }
 };
 
-/// Arguments of `blend_rows`: packed rows of one camera, in the order of their Gaussians, and what `bin` and `blend`
-/// take besides.
+/// Rows of one camera, Gaussians ascending.
 struct BlendRowsArguments : ImageArguments {
-  Tensor rows, background;  ///< (n, kPackedWidth), (3,)
+  Tensor rows, background;  ///< (n, kPackedWidth), (3,).
   bool keep = false;
 
   template <class Visit> void each(Visit&& visit) {
@@ -381,12 +359,10 @@ struct BlendRowsArguments : ImageArguments {
   }
 };
 
-/// Arguments of `blend_rows_vjp_`.
 struct BlendRowsVjpArguments : ImageArguments {
-  /// (n, kPackedGradWidth), or (n, kPackedGradWidthAbsolute) where sums of absolute gradients are wanted. It may lie in
-  /// the memory of the splats in `saved`, which are then no more.
+  /// (n, kPackedGradWidth), or (n, kPackedGradWidthAbsolute). May lie in the memory of the splats in `saved`.
   WrittenTensor<'a'> dL_drows;
-  OptionalTensor dL_dimage, dL_dalpha;  ///< (3, H, W), (H, W)
+  OptionalTensor dL_dimage, dL_dalpha;  ///< (3, H, W), (H, W).
   Tensor background;
   std::vector<Tensor> saved;
   bool needs_background = false;
@@ -402,11 +378,10 @@ struct BlendRowsVjpArguments : ImageArguments {
   }
 };
 
-/// The name in a declaration `name` or `name=default`.
+/// Of a declaration `name=default`.
 inline std::string_view name_of(std::string_view declaration) { return declaration.substr(0, declaration.find('=')); }
 
-/// Arguments of the adjoint of an op: the gradient with respect to its differentiable outputs, its own arguments, what
-/// it saved, and which of its tensor arguments want a gradient.
+/// Of an op's adjoint. `needs`: which tensors of `of_op` want a gradient.
 template <class Arguments> struct VjpArguments {
   std::vector<OptionalTensor> dL_doutputs;
   Arguments of_op;
@@ -415,7 +390,7 @@ template <class Arguments> struct VjpArguments {
 
   template <class Visit> void each(Visit&& visit) {
     visit("dL_doutputs", dL_doutputs);
-    // Nothing without a default may follow something that has one.
+    // No defaults, since arguments without one follow.
     of_op.each([&](std::string_view declaration, auto& value) { visit(name_of(declaration), value); });
     visit("saved", saved);
     visit("needs", needs);

@@ -1,6 +1,5 @@
-// Under torch.autocast the ops compute in float32, as those of torch's own operators do that need it: arguments of 16
-// bits are cast first. The cast is torch's, and differentiable, so that gradients have 16 bits where the arguments had.
-// Without autocast the dispatcher never comes here.
+// Under torch.autocast the ops compute in float32: this kernel, which the dispatcher then calls first, casts arguments
+// of 16 bits. The cast is torch's and differentiable, so that gradients have the dtype of the arguments.
 #include <torch/library.h>
 
 #include "torch/boxing.h"
@@ -24,7 +23,7 @@ template <c10::DispatchKey kAutocast> void in_float32(const c10::OperatorHandle&
   op.callBoxed(stack);
 }
 
-/// The ops that write to none of their arguments; adjoints get what those have cast.
+/// The ops that write to no argument. Adjoints get arguments that have been cast.
 template <c10::DispatchKey kAutocast> void register_casts(torch::Library& m) {
   for (const char* name : {"rasterize", "rasterize_timed", "project", "count_rows", "bin", "blend", "inspect",
                            "footprint_weight", "ssim_map", "l1_ssim", "activate"})

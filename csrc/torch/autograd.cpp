@@ -1,10 +1,6 @@
-// One autograd node for all differentiable ops, on every device. In C++: registered from Python it took longer than the
-// launches of a small scene.
-//
-// An op `name` is differentiable if there is an op `name_vjp` whose arguments are VjpArguments of the op's: the
-// gradient with respect to every differentiable output, the op's own arguments, what it saved, and which tensors want a
-// gradient. Differentiable outputs are those in front of the first that holds integers, or that is the last list,
-// `saved`. The adjoints themselves have no derivative and say so.
+// The autograd node of all differentiable ops. In C++, because a node from Python takes longer than the launches of a
+// small scene. The node of `name` calls `name_vjp` with VjpArguments. Differentiable outputs come first: up to the
+// first of integers, or to the last list, `saved`. Adjoints have no derivative.
 #include <torch/csrc/autograd/autograd_not_implemented_fallback.h>
 #include <torch/csrc/autograd/custom_function.h>
 #include <torch/library.h>
@@ -20,13 +16,13 @@ using torch::autograd::AutogradContext;
 using torch::autograd::variable_list;
 using torch::jit::Stack;
 
-/// What the schemas of an op and of its adjoint say, found once.
+/// What the schemas say, as indices of arguments.
 struct Op {
   c10::OperatorHandle forward, vjp;
-  std::vector<size_t> tensors;  ///< places of the arguments that are tensors
-  std::vector<size_t> lists;    ///< and of those that are lists of them, which have no gradient
+  std::vector<size_t> tensors;
+  std::vector<size_t> lists;  ///< Of tensors, without gradient.
   size_t arguments, outputs;
-  std::optional<size_t> keep;  ///< place of the argument that asks for the state that the adjoint needs
+  std::optional<size_t> keep;  ///< Makes the op save what its adjoint needs.
 
   explicit Op(const c10::OperatorHandle& op)
       : forward(op),
@@ -49,18 +45,16 @@ struct Op {
 bool is_given(const IValue& value) { return value.isTensor() && value.toTensor().defined(); }
 
 struct Node : torch::autograd::Function<Node> {
-  /// Makes the node of an op that has run with `arguments` and left `results`. Returns all tensors of the results in a
-  /// row; `sizes` says how many each of them has. `tensors` are the arguments that are tensors, but for those that are
-  /// missing.
+  /// The node of an op that has run. Returns the tensors of all results; result k has sizes[k].
   static variable_list forward(AutogradContext* ctx, at::TensorList tensors, const Op* op, const Stack* arguments,
                                const Stack* results, std::vector<int64_t>* sizes) {
-    Stack others = *arguments;  // those that are no tensors; tensors are kept as autograd wants them
+    Stack others = *arguments;  // Without tensors, which autograd saves.
     std::vector<bool> given;
     for (const size_t i : op->tensors) {
       given.push_back(is_given(others[i]));
       others[i] = IValue();
     }
-    variable_list listed;  // kept with the tensors, so that they are freed as soon as the adjoint has run
+    variable_list listed;  // Autograd frees them when the adjoint has run.
     for (const size_t i : op->lists) {
       const std::vector<Tensor> list = others[i].toTensorVector();
       listed.insert(listed.end(), list.begin(), list.end());
@@ -79,7 +73,7 @@ struct Node : torch::autograd::Function<Node> {
       sizes->push_back(int64_t(list.size()));
       out.insert(out.end(), list.begin(), list.end());
     }
-    ctx->set_materialize_grads(false);  // no zeros of the size of everything that is saved
+    ctx->set_materialize_grads(false);  // No zeros for saved tensors.
     ctx->mark_non_differentiable({out.begin() + differentiable, out.end()});
     variable_list saved(tensors.begin(), tensors.end());
     if (op->saves()) saved.insert(saved.end(), out.end() - sizes->back(), out.end());
@@ -87,7 +81,7 @@ struct Node : torch::autograd::Function<Node> {
     saved.insert(saved.end(), listed.begin(), listed.end());
     ctx->save_for_backward(std::move(saved));
     ctx->saved_data["own"] = own;
-    ctx->saved_data["op"] = int64_t(reinterpret_cast<intptr_t>(op));  // lives for ever
+    ctx->saved_data["op"] = int64_t(reinterpret_cast<intptr_t>(op));  // Never freed.
     ctx->saved_data["arguments"] = c10::ivalue::Tuple::create(std::move(others));
     ctx->saved_data["given"] = given;
     ctx->saved_data["differentiable"] = int64_t(differentiable);
@@ -99,11 +93,11 @@ struct Node : torch::autograd::Function<Node> {
     const auto given = ctx->saved_data["given"].toBoolList();
     const size_t differentiable = size_t(ctx->saved_data["differentiable"].toInt());
     const variable_list saved = ctx->get_saved_variables();
-    std::vector<size_t> places;  // of the given tensors among all
+    std::vector<size_t> given_at;  // In op->tensors.
     for (size_t k = 0; k < given.size(); ++k) {
-      if (given[k]) places.push_back(k);
+      if (given[k]) given_at.push_back(k);
     }
-    variable_list grads(places.size() + 4);  // op, arguments, results and sizes have none
+    variable_list grads(given_at.size() + 4);  // Four arguments of forward() have no gradient.
     bool any = false;
     c10::List<OptionalTensor> gradients;
     for (size_t k = 0; k < differentiable; ++k) {
@@ -115,12 +109,12 @@ struct Node : torch::autograd::Function<Node> {
     const auto arguments = ctx->saved_data["arguments"].toTuple();
     for (const IValue& value : arguments->elements()) stack.push_back(value);
     std::vector<bool> needs(given.size(), false);
-    for (size_t k = 0; k < places.size(); ++k) {
-      stack[1 + op->tensors[places[k]]] = saved[k];
-      needs[places[k]] = ctx->needs_input_grad(k);
+    for (size_t k = 0; k < given_at.size(); ++k) {
+      stack[1 + op->tensors[given_at[k]]] = saved[k];
+      needs[given_at[k]] = ctx->needs_input_grad(k);
     }
     auto end = saved.begin() + ctx->saved_data["own"].toInt();
-    stack.push_back(c10::List<Tensor>(std::vector<Tensor>(saved.begin() + int64_t(places.size()), end)));
+    stack.push_back(c10::List<Tensor>(std::vector<Tensor>(saved.begin() + int64_t(given_at.size()), end)));
     for (const size_t i : op->lists) {
       const auto first = end;
       end += stack[1 + i].toInt();
@@ -129,17 +123,16 @@ struct Node : torch::autograd::Function<Node> {
     stack.push_back(needs);
     op->vjp.callBoxed(stack);
     const std::vector<Tensor> out = stack[0].toTensorVector();
-    for (size_t k = 0; k < places.size(); ++k) {
-      if (!needs[places[k]]) continue;
-      const Tensor& grad = out[places[k]];
-      // An op takes a matrix as (1, 4, 4) too.
+    for (size_t k = 0; k < given_at.size(); ++k) {
+      if (!needs[given_at[k]]) continue;
+      const Tensor& grad = out[given_at[k]];
+      // A matrix may be (1, 4, 4).
       grads[k] = grad.dim() == saved[k].dim() ? grad : grad.view_as(saved[k]);
     }
     return grads;
   }
 };
 
-/// Whether autograd will ask for the gradient of something.
 bool wants_gradient(const Op& op, const Stack& stack, size_t first) {
   if (!at::GradMode::is_enabled()) return false;
   for (const size_t i : op.tensors) {
@@ -151,7 +144,7 @@ bool wants_gradient(const Op& op, const Stack& stack, size_t first) {
 
 std::atomic<bool> any_required = false;
 
-/// Raises under torch.func.grad, vjp and jacrev, in which torch allows no nodes that are made in C++.
+/// torch.func allows no C++ nodes.
 void refuse_transforms(const Op& op) {
   TORCH_CHECK_NOT_IMPLEMENTED(
       !c10::impl::tls_is_dispatch_key_included(c10::DispatchKey::FuncTorchDynamicLayerBackMode),
@@ -159,7 +152,7 @@ void refuse_transforms(const Op& op) {
       " has no derivative in torch.func (grad, vjp, jacrev); it has one in torch.autograd (backward, grad)");
 }
 
-/// Raises if a tensor has a tangent: the ops have no derivative in forward mode, so that it would be dropped silently.
+/// Forward mode would drop tangents silently.
 void refuse_tangents(const Op& op, const Stack& stack, size_t first) {
   for (const size_t i : op.tensors) {
     const IValue& value = stack[first + i];
@@ -170,7 +163,7 @@ void refuse_tangents(const Op& op, const Stack& stack, size_t first) {
 }
 
 void differentiate(const c10::OperatorHandle& handle, Stack* stack) {
-  // One entry per op for ever: looked up by name of the schema, which the dispatcher keeps at one place.
+  // Never freed. A schema keeps its address.
   static auto* ops = new std::unordered_map<const c10::FunctionSchema*, std::unique_ptr<Op>>;
   static auto* mutex = new std::mutex;
   const Op* op = nullptr;
@@ -196,7 +189,7 @@ void differentiate(const c10::OperatorHandle& handle, Stack* stack) {
   for (const size_t i : op->tensors) {
     if (is_given(arguments[i])) tensors.push_back(arguments[i].toTensor());
   }
-  // The op runs before its node is made, so that a device has work meanwhile.
+  // Before the node is made, so that the device has work meanwhile.
   Stack results = arguments;
   {
     const at::AutoDispatchBelowADInplaceOrView guard;

@@ -1,13 +1,16 @@
-// What a device must be able to do: a stage per function. The ops (rasterize.cpp, stages.cpp) are written once for all
-// devices. They check the arguments and allocate what is the same everywhere; a backend allocates the rest, sets the
-// parameters of its stages (core/stages.h) and launches them.
+// Backend: what a device can do, a function per stage, and the tensors between stages. The ops (rasterize.cpp,
+// stages.cpp, packed.cpp) check arguments, allocate what all devices share, and call it. backend_cpu.cpp and
+// backend_cuda.cpp allocate everything else and run the stages (core/stages.h).
 #pragma once
 
 #include <ATen/Context.h>
 #include <ATen/ops/empty.h>
 
+#include <algorithm>
 #include <array>
 #include <memory>
+#include <string>
+#include <string_view>
 #include <vector>
 
 #include "core/stages.h"
@@ -16,28 +19,28 @@
 
 namespace ar::ops {
 
-/// Splats on their way from `project` to `bin`. On the CPU there is a row for every Gaussian that may be seen; on CUDA
-/// one for every Gaussian, so that nothing has to be counted.
+/// From `project` to `bin`. CPU: Gaussians that may be seen. CUDA: all, so that none must be counted.
 struct SplatTensors {
-  Tensor splats;  ///< (n, kSplatWidth) SplatRow
-  Tensor ids;     ///< (n,) int32, CPU: the Gaussian of each, ascending
-  Tensor depths;  ///< (n,) CPU
-  Tensor counts;  ///< (4,) int64, CUDA: the numbers of Counts (csrc/cuda/params.h), which `project` sets to zero
-  Tensor ranges;  ///< (n, 2) int32, CUDA: first slot, for a backward pass, and number of pairs of each
-  Tensor memory;  ///< bytes, CUDA: SplatMemory (cuda_views.h)
+  Tensor splats;       ///< (n, kSplatWidth).
+  Tensor ids, depths;  ///< CPU: (n,), ids ascending.
+  // CUDA:
+  Tensor counts;  ///< Counts, zero.
+  Tensor ranges;  ///< (n, kRangeWidth) PairRange.
+  Tensor memory;  ///< SplatMemory (cuda_views.h).
 };
 
-/// Splats by tile, front to back: what `bin` makes and `blend` reads. Members that a device does not use are empty.
+/// Splats by tile, front to back: from `bin` to `blend`. Members that a device does not use are empty.
 struct ListTensors {
-  Tensor splats;  ///< (n, kSplatWidth)
-  Tensor ids;     ///< (n,) int32; CPU: the Gaussian of each splat; CUDA: splats in the order of depth
-  Tensor pairs;   ///< CPU: (N,) int32 splats; CUDA: (room, 2) splats and slots, or (room, 1) without a backward pass
-  Tensor tile_offsets;   ///< (tiles + 1,) int64, first pair of each tile; of a patch, where tiles share lists
-  Tensor splat_offsets;  ///< CPU: (n + 1,) int64 into positions; CUDA: (n, 2) int32 first slot and number of slots
-  Tensor positions;      ///< CPU: (N,) int64 places in `pairs` of each splat's pairs
-  Tensor counts;         ///< CUDA: the numbers of Counts (csrc/cuda/params.h)
+  Tensor splats;         ///< (n, kSplatWidth).
+  Tensor ids;            ///< (n,) int32. CPU: Gaussians. CUDA: splats by depth.
+  Tensor pairs;          ///< int32. CPU: (N,) splats. CUDA: (room, kPairWidth), or (room, 1) without keep.
+  Tensor tile_offsets;   ///< (tiles + 1,) int64 first pair of a tile, or of a patch where tiles share lists.
+  Tensor splat_offsets;  ///< CPU: (n + 1,) int64 into positions. CUDA: (n, kRangeWidth) int32 PairRange.
+  Tensor positions;      ///< CPU: (N,) int64 indices of pairs, by splat.
+  Tensor counts;         ///< CUDA: (kCountsWidth,) int64 Counts.
 
   static constexpr size_t kMembers = 7;
+  static constexpr int64_t kPairWidth = 2, kRangeWidth = 2, kCountsWidth = 4;
   template <class Visit> void each(Visit&& visit) {
     visit("splats", splats);
     visit("ids", ids);
@@ -49,14 +52,15 @@ struct ListTensors {
   }
 };
 
-/// What `blend` leaves for its adjoint.
+/// What `blend` saves for its adjoint.
 struct BlendState {
-  Tensor transmittance;  ///< (samples, H, W)
-  Tensor last;           ///< (samples, H, W) int32
-  Tensor checkpoints;    ///< CUDA: state of every pixel between chunks of long lists
-  Tensor chunks;         ///< CUDA: (m, 3) int32: the plan's counts, then tile, chunk and plane of every chunk
+  Tensor transmittance;  ///< (samples, H, W).
+  Tensor last;           ///< (samples, H, W) int32.
+  Tensor checkpoints;    ///< CUDA: state of pixels between chunks of long lists.
+  Tensor chunks;         ///< CUDA: (m, kChunkWidth) int32, the plan (cuda_views.h).
 
   static constexpr size_t kMembers = 4;
+  static constexpr int64_t kChunkWidth = 3;
   template <class Visit> void each(Visit&& visit) {
     visit("transmittance", transmittance);
     visit("last", last);
@@ -65,7 +69,38 @@ struct BlendState {
   }
 };
 
-/// The members of a struct above as a list of tensors, for an op to return, and back.
+/// What `row_grads` reads of packed rows.
+struct KeptRows {
+  Tensor covs;       ///< (n, kCovWidth): cov2d and its determinant.
+  Tensor opacities;  ///< (n,).
+
+  static constexpr size_t kMembers = 2;
+  static constexpr int64_t kCovWidth = 4;
+  template <class Visit> void each(Visit&& visit) {
+    visit("covs", covs);
+    visit("opacities", opacities);
+  }
+};
+
+/// What `inspect` writes, in the order of the op's result.
+struct SummaryTensors {
+  Tensor median, dominant;              ///< (H, W) int32.
+  Tensor touched, in_front, dominated;  ///< (count,) int32.
+  Tensor largest;                       ///< (count,) float32. Kernels compare its bits as int32.
+  Tensor total;                         ///< (count,) int64.
+
+  template <class Visit> void each(Visit&& visit) {
+    visit("median", median);
+    visit("dominant", dominant);
+    visit("touched", touched);
+    visit("largest", largest);
+    visit("total", total);
+    visit("in_front", in_front);
+    visit("dominated", dominated);
+  }
+};
+
+/// To a list and back. Python has names and widths from _C.
 template <class Members> void append_to(std::vector<Tensor>& list, Members members) {
   members.each([&](const char*, Tensor& t) { list.push_back(t); });
 }
@@ -75,72 +110,57 @@ template <class Members> Members from_list(const std::vector<Tensor>& list, size
   return members;
 }
 
-/// Sums over the pairs of every splat, as `blend_vjp` leaves them for `project_vjp` or `row_grads`.
+/// From `blend_vjp` to `project_vjp` or `row_grads`.
 struct PairSums {
-  Tensor pairs;  ///< CPU: (N, 6), or (N, 9) with the three colours; CUDA: (room, kPairGradWidth)
-  Tensor means;  ///< (N, 2) MeanSums, if they are wanted
-  /// Like ChannelTensors::rows; undefined where the pairs hold the three colours, or all that `project` made.
-  Tensor dL_dchannels;
+  Tensor pairs;         ///< CPU: (N, kPairNumbers), plus 3 for colours. CUDA: (room, kPairGradWidth).
+  Tensor means;         ///< (N, 2) MeanSums, if wanted.
+  Tensor dL_dchannels;  ///< Like ChannelTensors::rows. Undefined if `pairs` has all channels.
 };
 
-/// The public form of splats (ProjectedRows in core/stages.h), or gradients with respect to it.
+/// Public rows (ProjectedRows in core/stages.h), or their gradient.
 struct RowTensors {
   Tensor means2d, cov2d, dets, opacities, depths, colors;
-  Tensor absolute;  ///< of a gradient (n, 2): sums over pixels of |dL/dmeans2d|, if PairSums has them
-  /// In the place of all others (n, kPackedWidth) PackedRow, or of a gradient (n, kPackedGradWidth or more).
-  Tensor packed;
-  Tensor kept_covs, kept_opacities;  ///< (n, 4), (n,): all that row_grads reads of packed rows
+  Tensor absolute;  ///< Of a gradient: (n, 2) sums of |dL/dmeans2d|.
+  Tensor packed;    ///< PackedRow or its gradient, instead of all others.
+  KeptRows kept;
 
-  /// Those that every splat has.
   std::array<Tensor*, 5> numbers() { return {&means2d, &cov2d, &dets, &opacities, &depths}; }
 };
 
-/// Where `project_rows` leaves packed rows (PackedRows in core/stages.h).
+/// Where `pack_rows` writes packed rows (PackedRows in core/stages.h).
 struct PackedTensors {
-  Tensor rows;        ///< (room, kPackedWidth)
-  Tensor radii, ids;  ///< (room,) int32
-  Tensor ends;        ///< (P,) int32
-  Tensor first;       ///< () int64
+  Tensor rows;        ///< (room, kPackedWidth).
+  Tensor radii, ids;  ///< (room,) int32.
+  Tensor ends;        ///< (P,) int32.
+  Tensor first;       ///< () int64.
   int64_t first_id;
 };
 
-/// What `inspect` finds, in the order in which the op returns it.
-struct SummaryTensors {
-  Tensor median, dominant;         ///< (H, W) int32
-  Tensor touched, largest, total;  ///< (count,) int32, float32 whose bits are raised as int32, int64
-  Tensor in_front, dominated;      ///< (count,) int32
-};
-
-/// One weight per element, or its adjoint.
 struct WeightTensors {
-  Tensor offset, cov2d;
-  Tensor weight;                             ///< written
-  Tensor dL_dweight, dL_doffset, dL_dcov2d;  ///< of the adjoint, which reads the first
+  Tensor offset, cov2d, weight;
+  Tensor dL_dweight, dL_doffset, dL_dcov2d;
 };
 
-/// The chosen footprint.
 struct FootprintSpec {
   FootprintChoice choice;
-  int samples;  ///< of a pixel
-  bool moves;   ///< samples carry a state besides their transmittance
-  int lanes;    ///< over which a pixel's samples may be spread on CUDA
+  int samples;  ///< Per pixel.
+  bool moves;   ///< Samples have a position as state.
+  int lanes;    ///< Of CUDA, for a pixel's samples.
 };
-
-/// The footprint of this key and number. Raises ValueError if there is none.
+/// Raises ValueError if there is none.
 FootprintSpec find_footprint(const std::string& key, double option);
 
-/// The tiles of an image: on CUDA those of samples that move or are spread over lanes may be smaller.
+/// On CUDA some footprints have small tiles (cuda/dispatch.h).
 TileGrid grid_of(const FootprintSpec& footprint, int64_t width, int64_t height, bool cuda);
 
 /// What all stages of a pass share.
 struct Pass {
   FootprintSpec footprint;
   TileGrid grid;
-  bool keep = false;   ///< what a backward pass needs
-  bool debug = false;  ///< wait for every stage, so that the stage that failed is the one that raises
-  bool exact;          ///< count pairs before room is made for them, whatever earlier frames had
+  bool keep = false;   ///< For a backward pass.
+  bool debug = false;  ///< Wait for every stage, so that the right one raises.
+  bool exact;          ///< Count pairs. Else CUDA guesses by earlier frames.
 
-  /// For tensors like `like`.
   template <class Arguments>
   Pass(const Arguments& a, const Tensor& like)
       : footprint(find_footprint(a.footprint, a.option)),
@@ -148,7 +168,7 @@ struct Pass {
         exact(at::globalContext().deterministicAlgorithms()) {}
 };
 
-/// With pass.keep, room for the members of BlendState that are the same on every device.
+/// Memory for the members of BlendState that all devices have.
 inline BlendState make_state(const Pass& pass, const Tensor& like) {
   if (!pass.keep) return {};
   const std::vector<int64_t> planes = {pass.footprint.samples, pass.grid.height, pass.grid.width};
@@ -162,56 +182,79 @@ class Backend {
  public:
   virtual ~Backend() = default;
 
+  /// Whether `blend` or `inspect` writes all of this output, by its name in kImageSwitches or SummaryTensors.
+  virtual bool writes(std::string_view output) const = 0;
+
   // Forward.
-  /// Splats of every Gaussian that may be seen. Writes `radii` (P,) int32, and into `channels` the columns it makes.
+  /// Writes radii (P,) int32, and its columns of `channels`.
   virtual SplatTensors project(const Inputs& in, const Pass& pass, const ChannelTensors& channels,
                                const Tensor& radii) = 0;
-  /// Writes the public rows of all Gaussians (P, ...) and radii; rows of those with radius 0 are undefined. Without
-  /// rows it writes only radii, which are not zero for colours that are not finite.
+  /// Writes radii, and rows (P, ...) where the radius is not 0. Without `rows`, radii ignore colours.
   virtual void project_rows(const Inputs& in, const Pass& pass, const RowTensors& rows, const Tensor& radii) = 0;
-  /// The same in packed rows, of those Gaussians alone that have a radius.
   virtual void pack_rows(const Inputs& in, const Pass& pass, const PackedTensors& packed) = 0;
-  /// Splats from public rows. Writes `kept_covs` and `kept_opacities` if they are given.
+  /// Writes rows.kept if it is given.
   virtual SplatTensors shape_rows(const RowTensors& rows, const Pass& pass) = 0;
-  /// Lists by tile and depth.
   virtual ListTensors bin(const SplatTensors& splats, const Pass& pass) = 0;
-  /// Whether there was no room for a list of each tile, which with Pass::exact there is but for more pairs than a list
-  /// can have. Waits for the device.
+  /// Waits for the device.
   virtual bool tiles_share_lists(const ListTensors&) { return false; }
-  /// Writes `image` and, with pass.keep, the tensors of make_state; makes the others of `state`.
+  /// Writes `image` and what make_state() made, and makes the other members of `state`.
   virtual void blend(const ListTensors& lists, const Pass& pass, const ChannelTensors& channels,
                      const ImageTensors& image, BlendState& state) = 0;
+  /// Writes median and dominant. The other members are zero before.
   virtual void inspect(const ListTensors& lists, const Pass& pass, const SummaryTensors& summary) = 0;
 
   // Backward.
-  /// Before blend_vjp, and beside it where the device can: zeros in `grads` for what project_vjp, which must follow,
-  /// leaves out.
+  /// Zeros where project_vjp, which must follow, writes nothing. May run beside blend_vjp.
   virtual void zero_culled_grads(const Inputs&, const ListTensors&, const Pass&, const Grads&) {}
   virtual PairSums blend_vjp(const ListTensors& lists, const BlendState& state, const Pass& pass,
                              const ChannelTensors& channels, const ImageTensors& dL_dimage, MeanSums mean_sums) = 0;
-  /// Writes `grads`; returns sums of the camera's gradient, (parts, kCameraGradWidth), if it is wanted.
+  /// Writes `grads`. Returns parts of the camera's gradient, (parts, kCameraGradWidth).
   virtual Tensor project_vjp(const Inputs& in, const ListTensors& lists, const Pass& pass, const PairSums& sums,
                              const ChannelTensors& channels, const Grads& grads) = 0;
-  /// The same from the gradient of public rows; `rows` (P,) int32 has the row of each Gaussian, or -1. Adds to `grads`
-  /// if grads.add.
+  /// The same from gradients of public rows. `rows` (P,) int32: row of each Gaussian, or -1. Adds if grads.add.
   virtual Tensor project_rows_vjp(const Inputs& in, const Tensor& rows, const RowTensors& dL_drows,
                                   const Grads& grads) = 0;
-  /// Writes the gradient with respect to means2d, cov2d and opacities of public rows, and `absolute`.
+  /// Writes dL_drows.
   virtual void row_grads(const RowTensors& rows, const ListTensors& lists, const Pass& pass, const PairSums& sums,
                          const RowTensors& dL_drows) = 0;
 
-  /// One weight per element; where dL_dweight is given the adjoint instead.
+  /// With dL_dweight the adjoint.
   virtual void weight(const WeightTensors& tensors, const FootprintSpec& footprint) = 0;
 
-  /// Time since the last call on the device's clock [s]; waits for the device.
+  /// Seconds of the device since the last call. Waits for the device.
   virtual double lap() = 0;
 };
 
-/// Threads of a loop on the CPU: as many as torch's, but no more than the CPU quota of the container. Torch counts all
-/// cores, and those who use up their quota are stopped until the next period.
+/// For tests: an output that ops refuse.
+inline std::string& withheld_output() {
+  static std::string name;
+  return name;
+}
+
+/// Raises if the device does not write an output, whose memory would reach the caller as it was allocated.
+inline void check_output(const Backend& backend, std::string_view name, const Tensor& like) {
+  TORCH_CHECK_NOT_IMPLEMENTED(backend.writes(name) && name != withheld_output(), name, " cannot be made on ",
+                              at::DeviceTypeName(like.device().type(), /*lower_case=*/true), " yet");
+}
+
+/// Memory for what `blend` writes.
+inline ImageTensors make_images(const Backend& backend, const ChannelTensors& channels, const ImageSwitches& wanted,
+                                TileGrid grid) {
+  const at::TensorOptions options = channels.background.options();
+  ImageTensors out;
+  for (size_t k = 0; k < kImageCount; ++k) {
+    if (!wanted[k]) continue;
+    check_output(backend, name_of(kImageSwitches[k]), channels.background);
+    out.others[k] = at::empty({grid.height, grid.width}, options);
+  }
+  out.color = at::empty({channels.color_channels, grid.height, grid.width}, options);
+  return out;
+}
+
+/// Torch's number, but at most the container's CPU quota: a process that has used up its quota is stopped.
 int thread_count();
 
-/// For tensors like `like`; makes its device the current one while it lives.
+/// The device of `like` is the current one while the backend lives.
 std::unique_ptr<Backend> make_cpu_backend(const Tensor& like);
 std::unique_ptr<Backend> make_cuda_backend(const Tensor& like);
 inline std::unique_ptr<Backend> make_backend(const Tensor& like) {

@@ -1,8 +1,5 @@
-// The stages on CPU tensors, in float32 and float64.
-//
-// Arguments have been checked (checks.h). What is relied on here: tensors are contiguous, on the CPU and of one
-// floating type; lists and state fit each other, the splats and the image; `count` of inspect exceeds every id. The
-// contents of lists were made by an earlier stage and are not checked.
+// Backend for CPU tensors of float32 or float64: allocates, and calls the stages of csrc/cpu. Tensors are checked:
+// contiguous, of one type, and of sizes that fit; ids of inspect are in range. The contents of lists are trusted.
 #include <ATen/ops/arange.h>
 #include <ATen/ops/empty_like.h>
 #include <ATen/ops/zeros.h>
@@ -23,16 +20,15 @@
 namespace ar::ops {
 namespace {
 
-/// at::empty, in huge pages where Linux gives them to those who ask. What belongs to splats and pairs is visited in an
-/// order that is random in memory, and most of it is new memory in every pass: fewer pages are fewer misses and faults.
+/// at::empty in huge pages, for fewer faults and misses: splats and pairs are new memory in every pass, visited in
+/// random order.
 Tensor make_buffer(at::IntArrayRef sizes, const at::TensorOptions& options) {
   const Tensor buffer = at::empty(sizes, options);
 #if defined(__linux__)
   constexpr uintptr_t kHugePage = uintptr_t(1) << 21;
   const uintptr_t begin = reinterpret_cast<uintptr_t>(buffer.data_ptr()), end = begin + buffer.nbytes();
   const uintptr_t first = (begin + kHugePage - 1) & ~(kHugePage - 1), last = end & ~(kHugePage - 1);
-  // Only what the buffer fills: no neighbour changes, and no page is more than what is written. May fail: then nothing
-  // changes.
+  // Only pages that the buffer fills. May fail.
   if (first < last) madvise(reinterpret_cast<void*>(first), last - first, MADV_HUGEPAGE);
 #endif
   return buffer;
@@ -68,13 +64,19 @@ template <typename T> Channels<T> channels_of(const ChannelTensors& channels, co
   return out;
 }
 
-/// Tiles of an image of 268 million pixels: to write numbers for more of them takes a second or longer.
+/// To number more takes a second.
 constexpr int64_t kManyTiles = int64_t(1) << 20;
 
 template <typename T> class CpuBackend final : public Backend {
  public:
   explicit CpuBackend(const at::TensorOptions& options)
       : floats_(options), ints_(options.dtype(at::kInt)), longs_(options.dtype(at::kLong)) {}
+
+  bool writes(std::string_view output) const override {
+    static constexpr std::string_view kOutputs[] = {"alpha",   "depth",   "inverse_depth", "median",   "dominant",
+                                                    "touched", "largest", "total",         "in_front", "dominated"};
+    return std::find(std::begin(kOutputs), std::end(kOutputs), output) != std::end(kOutputs);
+  }
 
   SplatTensors project(const Inputs& in, const Pass& pass, const ChannelTensors& channels,
                        const Tensor& radii) override {
@@ -132,7 +134,7 @@ template <typename T> class CpuBackend final : public Backend {
 
   ListTensors bin(const SplatTensors& splats, const Pass& pass) override {
     const TileGrid grid = pass.grid;
-    // An image that cannot be made raises here, before numbers are written for every one of its tiles.
+    // If there is no memory for the image, raise before tiles are numbered.
     if (grid.tiles() > kManyTiles) at::empty({grid.height, grid.width}, floats_);
     const int64_t n = splats.ids.size(0);
     const cpu::Stages<T>& stages = stages_of(pass.footprint);
@@ -187,7 +189,7 @@ template <typename T> class CpuBackend final : public Backend {
   PairSums blend_vjp(const ListTensors& lists, const BlendState& state, const Pass& pass,
                      const ChannelTensors& channels, const ImageTensors& dL_dimage, MeanSums mean_sums) override {
     const int64_t pairs = lists.pairs.numel(), count = channels.count;
-    const bool own = !channels.rows.defined();  // the colours in the splats, whose sums stay with the pairs
+    const bool own = !channels.rows.defined();  // Sums of the colours in the splats stay with the pairs.
     PairSums out;
     out.pairs = make_buffer({pairs, cpu::kPairNumbers + (own ? 3 : 0)}, floats_);
     if (mean_sums != MeanSums::kNone) out.means = at::empty({pairs, 2}, floats_);
@@ -255,7 +257,7 @@ template <typename T> class CpuBackend final : public Backend {
     p.add = grads.add;
     p.threads = thread_count();
     const Tensor camera_grads = make_camera_grads(p, grads);
-    cpu::stages_of<T>(0).of(p.camera).project_rows_vjp(p);  // the same whatever the footprint
+    cpu::stages_of<T>(0).of(p.camera).project_rows_vjp(p);  // The same for every footprint.
     return camera_grads;
   }
 
@@ -287,7 +289,7 @@ template <typename T> class CpuBackend final : public Backend {
     return cpu::stages_of<T>(footprint.choice.index);
   }
 
-  /// What project_vjp and row_grads read of the sums.
+  /// For project_vjp and row_grads.
   template <class Params> static void set_pair_sums(Params& p, const ListTensors& lists, const PairSums& sums) {
     p.pairs = splat_pairs_of(lists);
     p.threads = thread_count();
@@ -296,7 +298,6 @@ template <typename T> class CpuBackend final : public Backend {
     p.pair_means = const_pointer<Vec2<T>>(sums.means);
   }
 
-  /// Room for the camera's gradient, zero, if it is wanted.
   template <class Params> Tensor make_camera_grads(Params& p, const Grads& grads) const {
     if (!grads.with_camera) return Tensor();
     const Tensor camera_grads = at::zeros({cpu::chunks_of(p.gaussians.n), kCameraGradWidth}, floats_);
@@ -304,7 +305,7 @@ template <typename T> class CpuBackend final : public Backend {
     return camera_grads;
   }
 
-  /// at::zeros_like on the threads of the other loops: those of torch spin while they wait for each other.
+  /// Not by torch, whose threads spin while they wait for each other.
   static Tensor make_zeros_like(const Tensor& contiguous) {
     const Tensor out = at::empty_like(contiguous);
     T* const numbers = pointer<T>(out);

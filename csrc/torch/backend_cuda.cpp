@@ -1,8 +1,6 @@
-// The stages on CUDA tensors, in float32. Nothing here waits for the device but the count of pairs, where
-// counting_of() and pair_guess.h ask for it, tiles_share_lists(), lap(), and stages with debug.
-//
-// Arguments have been checked (checks.h). What is relied on here: tensors are contiguous and on one device; lists and
-// state fit each other, the splats and the image.
+// Backend for CUDA tensors of float32: allocates, and launches the stages of csrc/cuda. Tensors are checked:
+// contiguous, on one device, and of sizes that fit. The host waits for the device in tiles_share_lists() and lap(),
+// with debug, and for the count of pairs where counting_of() or pair_guess.h asks for it.
 #include <ATen/Dispatch.h>
 #include <ATen/ops/zeros.h>
 #include <c10/cuda/CUDAException.h>
@@ -30,6 +28,12 @@ class CudaBackend final : public Backend {
         ints_(floats_.dtype(at::kInt)),
         longs_(floats_.dtype(at::kLong)),
         bytes_(floats_.dtype(at::kByte)) {}
+
+  bool writes(std::string_view output) const override {
+    static constexpr std::string_view kOutputs[] = {"alpha",   "depth",   "inverse_depth", "median",   "dominant",
+                                                    "touched", "largest", "total",         "in_front", "dominated"};
+    return std::find(std::begin(kOutputs), std::end(kOutputs), output) != std::end(kOutputs);
+  }
 
   SplatTensors project(const Inputs& in, const Pass& pass, const ChannelTensors& channels,
                        const Tensor& radii) override {
@@ -77,7 +81,6 @@ class CudaBackend final : public Backend {
     const FootprintSpec& footprint = pass.footprint;
     if (pass.debug) check_stage("project", true);
     const int64_t n = splats.splats.size(0);
-    // An image that cannot be made raises here, before anything is counted for it.
     TORCH_CHECK_VALUE(grid.tiles() < std::numeric_limits<int32_t>::max(),
                       "the image has too many tiles: ", grid.tiles());
     const cuda::Counting counting = counting_of(pass, n, stream_);
@@ -132,7 +135,7 @@ class CudaBackend final : public Backend {
     emit.order = by_depth.order[0];
     emit.ranges = by_depth.ranges;
     emit.splat_tiles = memory.tiles;
-    emit.long_splats = reinterpret_cast<int32_t*>(memory.keys[0]);  // nobody needs keys any more
+    emit.long_splats = reinterpret_cast<int32_t*>(memory.keys[0]);  // Keys are not needed any more.
     emit.long_places = reinterpret_cast<int32_t*>(memory.keys[1]);
     emit.status = reinterpret_cast<uint32_t*>(memory.emit_scratch);
     out.tile_offsets = at::empty({grid.tiles() + 1}, longs_);
@@ -184,8 +187,8 @@ class CudaBackend final : public Backend {
     p.ranges = const_structs_of<cuda::PairRange>(lists.splat_offsets);
     if (p.gaussians.n == 0) return;
     side_.emplace(stream_);
-    // blend_vjp comes after its blocks, since those of blend_vjp stay where they are placed until no work is left. In a
-    // captured graph only kernels could wait for that, and what comes next may be none.
+    // Blocks of blend_vjp must start later: they stay until no work is left. In a captured graph only a kernel can wait
+    // for that, and the next node may be none.
     const bool ordered = !is_capturing(stream_);
     cuda::zero_culled_grads(p, side_->stream(1), ordered ? side_->begun() : nullptr);
     if (ordered) side_->wait_until_begun();
@@ -204,7 +207,7 @@ class CudaBackend final : public Backend {
     out.pairs = at::empty({rows, cuda::kPairGradWidth}, floats_);
     if (mean_sums != MeanSums::kNone) out.means = out.pairs.narrow(1, cuda::kPairMeans, 2);
     ImageTensors gradient = dL_dimage;
-    if (!channels.rows.defined() && !gradient.color.defined())  // the kernels for three colours look for no null
+    if (!channels.rows.defined() && !gradient.color.defined())  // Here kernels take no null.
       gradient.color = at::zeros({3, pass.grid.height, pass.grid.width}, floats_);
     cuda::BlendVjpParams p = {};
     set_blend<float>(p, lists, pass, channels, gradient, state);
@@ -241,7 +244,7 @@ class CudaBackend final : public Backend {
     };
     Tensor channel_sums;
     if (!few) {
-      channel_sums = at::empty({rows, width_of(0)}, floats_);  // no later group is wider
+      channel_sums = at::empty({rows, width_of(0)}, floats_);  // No later group is wider.
       sum.channel_sums = p.channel_sums = pointer<float>(channel_sums);
     }
     for (; sum.first < count; sum.first += sum.width) {
@@ -307,18 +310,17 @@ class CudaBackend final : public Backend {
   double lap() override { return laps_.next(stream_); }
 
  private:
-  /// Ends what runs beside the caller's stream. An exception before it does so too, with this backend's end.
+  /// The caller's stream waits for the side stream. After an exception the destructor does this.
   void join() { side_.reset(); }
 
-  /// Raises what a launch left behind; with `wait` waits for the stage to end first.
+  /// Raises the error of a launch or, with `wait`, of the stage.
   void check_stage(const char* stage, bool wait) const {
     cudaError_t error = cudaGetLastError();
     if (wait && error == cudaSuccess) error = cudaStreamSynchronize(stream_);
     TORCH_CHECK(error == cudaSuccess, "CUDA error in ", stage, ": ", cudaGetErrorString(error));
   }
 
-  /// Plans the blending: sets the members of `p` and `state` that belong to the plan. Returns memory that its kernels
-  /// need while they run.
+  /// Sets the plan in `p` and `state`. Returns memory that must live until blend is launched.
   Tensor make_plan(cuda::BlendParams& p, const Pass& pass, const cuda::Route& route, BlendState& state) const {
     const cuda::ListCut& cut = route.cut;
     const int64_t tiles = pass.grid.tiles(), capacity = p.lists.capacity;
@@ -329,7 +331,7 @@ class CudaBackend final : public Backend {
                                : pass.keep && route.family == cuda::Family::kMoment
                                    ? capacity / cuda::kStateChunk * cuda::state_planes(samples)
                                    : 0;
-    const int side = cut.whole ? pass.grid.side() : kTile;  // in chunks a plane has a number of each of 256 lanes
+    const int side = cut.whole ? pass.grid.side() : kTile;  // Of chunks a plane has a number per lane of 256.
     state.checkpoints = at::empty({max_planes * side * side}, floats_);
     state.chunks = at::empty({kPlanRows + chunks + tiles + cut.max_lists, kChunkWidth}, ints_);
     const auto [memory, parts] = make_memory<PlanMemory>(bytes_, tiles, cut.whole ? 0 : chunks);
@@ -342,17 +344,15 @@ class CudaBackend final : public Backend {
   }
 
   SplatTensors make_splats(int64_t n) const {
-    // The sorts count in 30 bits.
     TORCH_CHECK_VALUE(n <= cuda::max_items(), "CUDA takes at most ", cuda::max_items(), " Gaussians, got ", n);
     SplatTensors out;
     out.splats = at::empty({n, kSplatWidth}, floats_);
     out.ranges = at::empty({n, 2}, ints_);
     out.memory = at::empty({SplatMemory(Tensor(), n).bytes}, bytes_);
-    // Set to zero by the kernel that makes the first splat.
+    // A kernel clears them, if there is one.
     out.counts = n > 0 ? at::empty({kCountsWidth}, longs_) : at::zeros({kCountsWidth}, longs_);
     return out;
   }
-  /// Sets what bin will read of `splats`.
   template <class Params> static void set_for_bin(Params& p, const SplatTensors& splats) {
     const SplatMemory memory(splats.memory, splats.splats.size(0));
     p.keys = memory.keys[0];
@@ -362,7 +362,6 @@ class CudaBackend final : public Backend {
     p.depth_histograms = reinterpret_cast<uint32_t*>(memory.depth_scratch);
   }
 
-  /// Room for the camera's gradient, if it is wanted.
   template <class Params> Tensor make_camera_grads(Params& p, const Grads& grads) const {
     if (!grads.with_camera) return Tensor();
     const Tensor camera_grads = at::empty({cuda::warps_of(p.gaussians.n), kCameraGradWidth}, floats_);
@@ -370,7 +369,7 @@ class CudaBackend final : public Backend {
     return camera_grads;
   }
 
-  /// Emits pairs of a splat, or of a splat and its slot, into the member `to`, and sorts them by tile.
+  /// Writes pairs to the member `to` and sorts them by tile. Value: SlotPair or int32_t.
   template <class Value>
   void make_pairs(cuda::EmitParams emit, Value* cuda::EmitParams::* to, cuda::PairFeedback feedback,
                   const PairMemory& memory, ListTensors& out, bool debug) const {
@@ -405,7 +404,7 @@ class CudaBackend final : public Backend {
 
 std::unique_ptr<Backend> make_cuda_backend(const Tensor& like) { return std::make_unique<CudaBackend>(like); }
 
-/// For tests: room for so many pairs in every frame, and for one of each Gaussian; 0: guesses again, from the start.
+/// For tests: room for this many pairs, at least one per Gaussian; 0: guess anew.
 void force_pair_capacity(int64_t capacity) {
   SharedGuesses::instance().use([&](cuda::PairGuesses& g) { g.force(capacity); });
 }

@@ -1,4 +1,5 @@
-// The arguments of an op as the dispatcher has them: as text in its schema, and as values on its stack.
+// The structs of arguments.h as torch's dispatcher has arguments: as text in a schema, and as values on a stack.
+// ops.cpp uses both to register ops. take() reads the values of a call.
 #pragma once
 
 #include <ATen/core/ivalue.h>
@@ -14,7 +15,6 @@ namespace ar::ops {
 
 using c10::IValue;
 
-/// The type of an argument in a schema.
 template <class Value> std::string type_in_schema(const Value&) { return c10::getTypePtr<Value>()->str(); }
 template <char kLetter> std::string type_in_schema(const WrittenTensors<kLetter>&) {
   return std::string("Tensor(") + kLetter + "!)[]";
@@ -34,7 +34,7 @@ template <class Arguments> std::string schema_of() {
 }
 
 template <class Value> void assign(const IValue& from, Value& to) { to = from.to<Value>(); }
-/// A tensor that autograd left undefined is one that is missing.
+/// Autograd passes a missing tensor as an undefined one.
 inline void assign(const IValue& from, OptionalTensor& to) {
   to = from.isTensor() && from.toTensor().defined() ? OptionalTensor(from.toTensor()) : std::nullopt;
 }
@@ -49,7 +49,7 @@ template <char kLetter> void assign(const IValue& from, WrittenTensor<kLetter>& 
   static_cast<Tensor&>(to) = from.toTensor();
 }
 
-/// Takes an op's arguments off the dispatcher's stack.
+/// Takes an op's arguments off the stack.
 template <class Arguments> Arguments take(torch::jit::Stack& stack) {
   Arguments arguments;
   size_t count = 0;

@@ -1,11 +1,10 @@
-// Ops as Python calls them where every microsecond counts.
+// The class Call of _C, by which rasterizer.py and training/trainer.py call ops (call.cpp). ops.cpp adds it.
 #pragma once
 
 #include <pybind11/pybind11.h>
 
 namespace ar::ops {
 
-/// Adds the class Call to the module.
 void define_call(pybind11::module_& m);
 
 }  // namespace ar::ops

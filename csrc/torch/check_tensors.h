@@ -1,4 +1,5 @@
-// The shapes, dtypes and devices of tensors, with one wording of the messages for the checks of all ops.
+// Checks of shapes, dtypes and devices: a library for checks.cpp, training_checks.cpp and packed.cpp, so that messages
+// have one wording. A wrong dtype raises TypeError, anything else ValueError.
 #pragma once
 
 #include <algorithm>
@@ -19,32 +20,30 @@ inline std::string text_of(at::IntArrayRef sizes) {
 }
 inline std::string shape_of(const Tensor& t) { return text_of(t.sizes()); }
 
-/// What to do with numbers of 16 bits, for the end of a message; nothing for others.
+/// The end of a message about a dtype: what to do with 16 bits.
 inline const char* way_out_of(at::ScalarType type) {
   const bool is_half = type == at::kHalf || type == at::kBFloat16;
   return is_half ? ": call .float() on it, or use torch.autocast, under which this happens by itself" : "";
 }
 
-/// dtype float32 or float64.
 inline void check_floating(const Tensor& t, const char* name) {
   TORCH_CHECK_TYPE(t.scalar_type() == at::kFloat || t.scalar_type() == at::kDouble, name,
                    " must have dtype float32 or float64, got ", t.scalar_type(), way_out_of(t.scalar_type()));
 }
 
-/// `expected`: what makes the text of the shape in the message.
 template <class... Text> void check_shape(bool ok, const Tensor& t, const char* name, const Text&... expected) {
   TORCH_CHECK_VALUE(ok, name, " must have shape ", expected..., ", got ", shape_of(t));
 }
 
-/// Shape (count, rest...), written as `expected` in the message.
-inline void check_rows(const Tensor& t, const char* name, int64_t count, std::initializer_list<int64_t> rest,
+/// Shape (count, row...), written as `expected` in the message.
+inline void check_rows(const Tensor& t, const char* name, int64_t count, std::initializer_list<int64_t> row,
                        const char* expected) {
-  const bool ok = t.dim() == int64_t(1 + rest.size()) && t.size(0) == count &&
-                  std::equal(rest.begin(), rest.end(), t.sizes().begin() + 1);
+  const bool ok = t.dim() == int64_t(1 + row.size()) && t.size(0) == count &&
+                  std::equal(row.begin(), row.end(), t.sizes().begin() + 1);
   check_shape(ok, t, name, expected, " with ", expected[1], " = ", count);
 }
 
-/// What other tensors must match. Afterwards they are contiguous.
+/// The tensor that others must match in dtype and device. The checked tensors become contiguous.
 struct Like {
   const Tensor& tensor;
   const char* name;
@@ -55,17 +54,17 @@ struct Like {
     TORCH_CHECK_VALUE(t.device() == tensor.device(), t_name, " must be on the device of ", name, ", ", tensor.device(),
                       ", got ", t.device());
   }
-  /// Type, and a row for each of this tensor: check_rows.
-  void check_rows_of(Tensor& t, const char* t_name, std::initializer_list<int64_t> rest, const char* expected) const {
+  /// As many rows as `tensor`.
+  void check_rows_of(Tensor& t, const char* t_name, std::initializer_list<int64_t> row, const char* expected) const {
     check_type(t, t_name);
-    check_rows(t, t_name, tensor.size(0), rest, expected);
+    check_rows(t, t_name, tensor.size(0), row, expected);
     t = t.contiguous();
   }
-  void check_rows_of(OptionalTensor& t, const char* t_name, std::initializer_list<int64_t> rest,
+  void check_rows_of(OptionalTensor& t, const char* t_name, std::initializer_list<int64_t> row,
                      const char* expected) const {
-    if (t) check_rows_of(*t, t_name, rest, expected);
+    if (t) check_rows_of(*t, t_name, row, expected);
   }
-  /// Type, a row for each of this tensor, and 1 to `most` columns; `rows` and `columns`: their letters in the message.
+  /// As many rows as `tensor`, and 1 to `most` columns. The message calls their numbers `rows` and `columns`.
   void check_channels(Tensor& t, const char* t_name, char rows, char columns, int64_t most) const {
     check_type(t, t_name);
     const bool ok = t.dim() == 2 && t.size(0) == tensor.size(0) && t.size(1) >= 1 && t.size(1) <= most;
@@ -73,7 +72,6 @@ struct Like {
                 " from 1 to ", most);
     t = t.contiguous();
   }
-  /// Type, and the shape (4, 4).
   void check_matrix(Tensor& t, const char* t_name) const {
     check_type(t, t_name);
     const bool ok = (t.dim() == 2 || (t.dim() == 3 && t.size(0) == 1)) && t.size(-1) == 4 && t.size(-2) == 4;
@@ -81,7 +79,6 @@ struct Like {
     if (t.dim() == 3) t = t.reshape({4, 4});
     t = t.contiguous();
   }
-  /// Type, and the shape (size,).
   void check_vector(Tensor& t, const char* t_name, int64_t size) const {
     check_type(t, t_name);
     const bool ok = t.numel() == size && (t.dim() == 1 || (t.dim() == 2 && t.size(0) == 1));

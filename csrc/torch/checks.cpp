@@ -1,3 +1,5 @@
+// checks.h for the rendering ops, and find_footprint(). check_tensors.h words the messages. training_checks.cpp has the
+// other ops.
 #include "torch/checks.h"
 
 #include <ATen/Dispatch.h>
@@ -15,23 +17,22 @@ namespace ar::ops {
 namespace {
 
 void check_positive(double value, const char* name) {
-  // As a float, too: what is zero or infinite there makes the projection so.
+  // As a float, which the projection computes with.
   TORCH_CHECK_VALUE(std::isfinite(float(value)) && float(value) > 0, name, " must be positive and finite, got ", value);
 }
 
-/// Raises for the first number of `t` that is not valid; (row, column, ...) says where it is.
+/// The message says the first invalid number and its index.
 void check_values(const Tensor& t, const char* name, const Tensor& valid, const char* expected) {
   if (valid.all().item<bool>()) return;
-  int64_t place = valid.logical_not().reshape(-1).nonzero()[0].item<int64_t>();
-  const double value = t.reshape(-1)[place].item<double>();
+  int64_t position = valid.logical_not().reshape(-1).nonzero()[0].item<int64_t>();
+  const double value = t.reshape(-1)[position].item<double>();
   std::string index = t.dim() == 1 ? ",)" : ")";
-  for (int64_t d = t.dim() - 1; d >= 0; place /= t.size(d), --d)
-    index = (d > 0 ? ", " : "(") + std::to_string(place % t.size(d)) + index;
+  for (int64_t d = t.dim() - 1; d >= 0; position /= t.size(d), --d)
+    index = (d > 0 ? ", " : "(") + std::to_string(position % t.size(d)) + index;
   TORCH_CHECK_VALUE(false, name, " must ", expected, ", got ", value, " at ", index);
 }
 
-/// Whether a few numbers on the CPU, such as those of a camera, are finite. Torch's functions would take a third of the
-/// time of rendering a small picture for them. False where another way has to find out.
+/// Whether these are finite numbers of a camera. at::isfinite takes a third of the time of a small picture for them.
 bool are_few_and_finite(const Tensor& t) {
   constexpr int64_t kFew = 64;
   if (!t.is_cpu() || !t.is_contiguous() || t.numel() > kFew) return false;
@@ -45,7 +46,6 @@ void check_finite(const Tensor& t, const char* name) {
   if (!are_few_and_finite(t)) check_values(t, name, at::isfinite(t), "be finite");
 }
 
-/// Device and precision of the tensors that all others must match.
 void check_device(const Tensor& t, const char* name) {
   check_floating(t, name);
   if (!t.is_cuda()) return;
@@ -53,7 +53,6 @@ void check_device(const Tensor& t, const char* name) {
                    " must have dtype float32 on CUDA, got Double; float64 runs on the CPU");
 }
 
-/// What `bin` and `blend` take of the rows of `project`.
 void check_projected(Tensor& means2d, Tensor& cov2d, Tensor& opacities, Tensor& dets, const Tensor& row_splits) {
   check_device(means2d, "means2d");
   check_shape(means2d.dim() == 2 && means2d.size(1) == 2, means2d, "means2d", "(N, 2)");
@@ -73,13 +72,13 @@ void check_projected(Tensor& means2d, Tensor& cov2d, Tensor& opacities, Tensor& 
   TORCH_CHECK_VALUE(rises_to(row_splits, n), "row_splits must rise from 0 to the number of rows, ", n);
 }
 
-/// Raises for a number that no Gaussian should have. Without debug such a Gaussian is culled, or taken as it is.
+/// Without debug such Gaussians are culled, or rendered.
 void check_gaussians(Inputs in) {
-  size_t place = 0;
+  size_t k = 0;
   in.each_tensor([&](const char* name, const OptionalTensor& t) {
-    const bool is_read = place != 1 && place < kGaussianTensors;  // nobody reads means2D
+    const bool is_read = k != 1 && k < kGaussianTensors;  // 1: means2D.
     if (t && is_read) check_finite(*t, name);
-    ++place;
+    ++k;
   });
   check_values(in.opacities, "opacities", in.opacities.ge(0).logical_and(in.opacities.le(1)), "be in [0, 1]");
   if (in.scales) check_values(*in.scales, "scales", in.scales->ge(0), "not be negative");
@@ -123,7 +122,7 @@ void check_row_count(int64_t rows, const char* name) {
 }
 
 void check_image_size(int64_t height, int64_t width) {
-  // float32 counts pixels exactly up to 2^24; 2^20 leaves four bits for where in the pixel.
+  // Of the 24 bits of float32, 20 are for the pixel and 4 for the position in it.
   constexpr int64_t kMax = int64_t(1) << 20;
   TORCH_CHECK_VALUE(height >= 1 && height <= kMax, "image_height must be in [1, ", kMax, "], got ", height);
   TORCH_CHECK_VALUE(width >= 1 && width <= kMax, "image_width must be in [1, ", kMax, "], got ", width);
@@ -145,7 +144,7 @@ void check(Inputs& in) {
   }
   const int64_t columns = in.means2D && in.means2D->dim() == 2 && in.means2D->size(1) == 4 ? 4 : 3;
   like.check_rows_of(in.means2D, "means2D", {columns}, "(P, 3) or (P, 4)");
-  const bool with_lens = in.lens || in.sh_degree < 0;  // what no camera has is told of the one that has most
+  const bool with_lens = in.lens || in.sh_degree < 0;
   const int degrees = with_lens ? FullCamera<float>::kShDegree : Camera<float>::kShDegree;
   TORCH_CHECK_VALUE(in.sh_degree >= 0 && in.sh_degree <= degrees, "sh_degree must be 0 to ", degrees, ", got ",
                     in.sh_degree);
@@ -153,7 +152,7 @@ void check(Inputs& in) {
     const int64_t needed = sh_count(int(in.sh_degree));
     const bool ok = in.shs->dim() == 3 && in.shs->size(0) == p && in.shs->size(1) >= needed && in.shs->size(2) == 3;
     check_shape(ok, *in.shs, "shs", "(P, M, 3) with P = ", p, " and M >= ", needed, " for sh_degree ", in.sh_degree);
-    // The kernels address the rows of the 32 Gaussians of a warp in 32 bits.
+    // Kernels address the rows of a warp's 32 Gaussians in 32 bits.
     constexpr int64_t kMostCoefficients = int64_t(1) << 20;
     TORCH_CHECK_VALUE(in.shs->size(1) <= kMostCoefficients, "shs must have at most ", kMostCoefficients,
                       " coefficients per Gaussian, got shape ", shape_of(*in.shs));
@@ -188,7 +187,7 @@ void check_values(const Inputs& in, bool debug) {
   check_finite(in.viewmatrix, "viewmatrix");
   check_finite(in.projmatrix, "projmatrix");
   check_finite(in.campos, "campos");
-  // Up to far, which may be infinite.
+  // Only up to `far`, which may be infinite.
   if (in.lens) check_finite(in.lens->narrow(0, 0, offsetof(Lens<float>, far) / sizeof(float)), "lens");
 }
 
@@ -281,12 +280,12 @@ void check(BlendArguments& a, const Pass& pass) {
 void check(InspectArguments& a, const ListTensors& lists, const Pass& pass) {
   check_device(lists.splats, "splats");
   check_image_size(a.image_height, a.image_width);
-  constexpr int64_t kMostPixels = int64_t(1) << 31;  // a Gaussian's pixels are counted in 32 bits with a sign
+  constexpr int64_t kMostPixels = int64_t(1) << 31;  // `touched` is int32.
   TORCH_CHECK_VALUE(a.image_height * a.image_width < kMostPixels,
                     "gaussian_stats and dominant Gaussians need an image of fewer than ", kMostPixels, " pixels, got ",
                     a.image_height, " x ", a.image_width);
   check_lists(lists, lists.splats, pass);
-  // The ids of a CPU's lists index the results; on CUDA the splats themselves do.
+  // The results are indexed by ids on the CPU and by splats on CUDA.
   const int64_t n = lists.splats.size(0);
   const bool by_id = !lists.splats.is_cuda() && n > 0;
   TORCH_CHECK_VALUE(!by_id || lists.ids.min().item<int64_t>() >= 0, "ids must not be negative");
@@ -307,13 +306,13 @@ void check(WeightArguments& a) {
   a.cov2d = a.cov2d.contiguous();
 }
 
-Tensor gradient_of(const std::vector<OptionalTensor>& dL_doutputs, size_t place, const char* name, const Tensor& like,
+Tensor gradient_of(const std::vector<OptionalTensor>& dL_doutputs, size_t output, const char* name, const Tensor& like,
                    at::IntArrayRef sizes) {
-  if (place >= dL_doutputs.size() || !dL_doutputs[place]) return Tensor();
-  const Tensor& gradient = *dL_doutputs[place];
+  if (output >= dL_doutputs.size() || !dL_doutputs[output]) return Tensor();
+  const Tensor& gradient = *dL_doutputs[output];
   Like{like, "the arguments"}.check_type(gradient, name);
   TORCH_CHECK_VALUE(gradient.sizes() == sizes, name, " must have shape ", text_of(sizes), ", got ", shape_of(gradient));
-  return gradient.resolve_neg().contiguous();  // the dispatcher resolves no tensor in a list of optional ones
+  return gradient.resolve_neg().contiguous();  // The dispatcher resolves none in a list of optional tensors.
 }
 
 Tensor only_gradient_of(const std::vector<OptionalTensor>& dL_doutputs, const std::string& output, const Tensor& like,

@@ -1,4 +1,4 @@
-// What the CUDA backend keeps from one frame, or one stage, to the next.
+// What backend_cuda.cpp keeps between frames and stages. Guesses of how many pairs a frame has, and a clock.
 #pragma once
 
 #include <ATen/ops/empty.h>
@@ -12,11 +12,11 @@
 
 namespace ar::ops {
 
-/// The guesses of all image sizes, for all threads.
+/// One for all image sizes and threads.
 class SharedGuesses {
  public:
   static SharedGuesses& instance() {
-    static auto* guesses = new SharedGuesses;  // outlives the CUDA context
+    static auto* guesses = new SharedGuesses;  // Never freed: it outlives the CUDA context.
     return *guesses;
   }
   template <class Use> auto use(Use&& use) {
@@ -40,8 +40,8 @@ inline bool is_capturing(cudaStream_t stream) {
   return status != cudaStreamCaptureStatusNone;
 }
 
-/// From so many Gaussians on, frames of samples that move are always counted for a backward pass: their checkpoints
-/// take hundreds of bytes per pair that there is room for, and to wait for the count takes little of such a frame.
+/// From here on, frames of samples that move are always counted for a backward pass. Room for a pair takes hundreds of
+/// bytes of checkpoints, and waiting for the count takes little of such a frame.
 inline constexpr int64_t kCountedGaussians = 1 << 23;
 
 inline cuda::Counting counting_of(const Pass& pass, int64_t gaussians, cudaStream_t stream) {
@@ -51,7 +51,7 @@ inline cuda::Counting counting_of(const Pass& pass, int64_t gaussians, cudaStrea
   return many ? cuda::Counting::kAlways : cuda::Counting::kIfNeeded;
 }
 
-/// A pair of events, made when the first time is asked for.
+/// Seconds between calls of next().
 class Laps {
  public:
   Laps() = default;

@@ -1,4 +1,6 @@
-// Tensors as structs of the CUDA kernels, and checks of what the kernels read without looking.
+// Tensors as structs of the CUDA kernels: a library for backend_cuda.cpp. SplatMemory, PairMemory and PlanMemory put
+// several arrays into one tensor, since a tensor costs the host microseconds. The checks are of sizes that checks.h
+// cannot know.
 #pragma once
 
 #include <utility>
@@ -8,7 +10,7 @@
 
 namespace ar::ops {
 
-/// What the kernels keep in a tensor of int32.
+/// Structs in a tensor of int32.
 template <class Element> Element* structs_of(const Tensor& t) {
   return reinterpret_cast<Element*>(pointer<int32_t>(t));
 }
@@ -19,7 +21,7 @@ inline const cuda::Counts* counts_of(const ListTensors& lists) {
   return reinterpret_cast<const cuda::Counts*>(const_pointer<int64_t>(lists.counts));
 }
 
-/// Hands out parts of a piece of memory, one after the other; of a null pointer to learn how much they take.
+/// Hands out parts of memory in order. Without memory it counts bytes.
 class MemoryParts {
  public:
   explicit MemoryParts(const Tensor& memory)
@@ -33,29 +35,28 @@ class MemoryParts {
   int64_t bytes() const { return bytes_; }
 
  private:
-  /// As tensors are. A warp whose 128 bytes begin elsewhere than a line of the cache does reads two lines.
+  /// As tensors are: 128 bytes of a warp in two cache lines are two reads.
   static constexpr int64_t kAlignment = 512;
 
   std::byte* begin_;
   int64_t bytes_ = 0;
 };
 
-/// Memory for Parts(memory, arguments...), and those parts of it. In one piece, because the host spends a few
-/// microseconds on every tensor.
+/// Memory for Parts(memory, arguments...), and its parts.
 template <class Parts, class... Arguments>
 std::pair<Tensor, Parts> make_memory(const at::TensorOptions& bytes, const Arguments&... arguments) {
   const Tensor memory = at::empty({Parts(Tensor(), arguments...).bytes}, bytes);
   return {memory, Parts(memory, arguments...)};
 }
 
-/// What `project` and `shape_rows` leave for bin beside the splats, and memory that bin needs for n of them.
+/// What `project` and `shape_rows` write for bin, and bin's own memory.
 struct SplatMemory {
   std::byte *depth_scratch, *emit_scratch;
-  cuda::ZeroedMemory to_clear = {};  ///< both, but for the histograms, which are clear already
-  uint32_t* keys[2];                 ///< in the order of depth, and room for them
-  int32_t* order;                    ///< room for an order
+  cuda::ZeroedMemory to_clear = {};  ///< Both, without the histograms, which are clear.
+  uint32_t* keys[2];                 ///< Of depth, and a second buffer.
+  int32_t* order;                    ///< A second buffer.
   cuda::SplatTiles* tiles;
-  int64_t bytes;  ///< of all
+  int64_t bytes;
 
   SplatMemory(const Tensor& memory, int64_t n) {
     MemoryParts parts(memory);
@@ -71,12 +72,12 @@ struct SplatMemory {
   }
 };
 
-/// Pairs while they are sorted by tile, but for the result.
+/// Pairs while they are sorted by tile, without the result.
 struct PairMemory {
   cuda::ZeroedMemory scratch;
   uint32_t* tiles[2];
-  std::byte* values;  ///< SlotPair, or int32_t without a backward pass
-  int64_t bytes;      ///< of all
+  std::byte* values;  ///< SlotPair, or int32_t without a backward pass.
+  int64_t bytes;
 
   PairMemory(const Tensor& memory, int64_t capacity, TileGrid grid, bool with_slots) {
     MemoryParts parts(memory);
@@ -88,11 +89,11 @@ struct PairMemory {
   }
 };
 
-/// What the kernels of blend need while they run, of lists that are cut into up to `chunks` chunks.
+/// Memory of blend while it runs, for up to `chunks` chunks.
 struct PlanMemory {
   cuda::TileChunk* tail;
   int32_t *tile_order, *tile_planes, *tile_open, *open_tiles;
-  int64_t bytes;  ///< of all
+  int64_t bytes;
 
   PlanMemory(const Tensor& memory, int64_t tiles, int64_t chunks) {
     MemoryParts parts(memory);
@@ -110,10 +111,13 @@ struct PlanMemory {
   }
 };
 
-inline constexpr int64_t kCountsWidth = sizeof(cuda::Counts) / sizeof(int64_t);
+inline constexpr int64_t kCountsWidth = ListTensors::kCountsWidth, kChunkWidth = BlendState::kChunkWidth;
+static_assert(sizeof(cuda::Counts) == kCountsWidth * sizeof(int64_t));
+static_assert(sizeof(cuda::SlotPair) == ListTensors::kPairWidth * sizeof(int32_t));
+static_assert(sizeof(cuda::PairRange) == ListTensors::kRangeWidth * sizeof(int32_t));
+static_assert(sizeof(cuda::TileChunk) == kChunkWidth * sizeof(int32_t));
 
-/// BlendState::chunks begins with the PlanState, in whole rows; TileChunks follow, and CutLists where lists are cut.
-inline constexpr int64_t kChunkWidth = sizeof(cuda::TileChunk) / sizeof(int32_t);
+/// BlendState::chunks: the PlanState in whole rows, then TileChunks, then CutLists.
 inline constexpr int64_t kPlanRows = (sizeof(cuda::PlanState) / sizeof(int32_t) + kChunkWidth - 1) / kChunkWidth;
 
 inline cuda::TileLists tile_lists_of(const ListTensors& lists) {
@@ -137,24 +141,23 @@ inline cuda::PairSumsView pair_sums_of(const ListTensors& lists, const Tensor& p
   return out;
 }
 
-/// Without `data` the three colours in the splats.
+/// Null `data`: the three colours in the splats.
 inline Channels<float> channels_of(const ChannelTensors& channels) {
   Channels<float> out = {};
   out.count = int(channels.count);
   if (!channels.rows.defined()) return out;
-  // A row per Gaussian is one per splat here. Without rows there are no pairs that could read one.
+  // Row i is that of splat i: every Gaussian has one. No pair reads kNoRow.
   static const float kNoRow = 0;
   out.data = channels.rows.numel() ? const_pointer<float>(channels.rows) : &kNoRow;
   out.stride = channels.count;
   return out;
 }
 
-/// What the kernels read without looking: checks.h does not know their sizes.
 inline void check_counts(const ListTensors& lists) {
   TORCH_CHECK_VALUE(lists.counts.numel() == kCountsWidth, "counts must be what bin returned, got shape ",
                     lists.counts.sizes());
 }
-/// How `blend` and `blend_vjp` go about it: the same for both, since lists and channels are.
+/// The same for `blend` and `blend_vjp`.
 inline cuda::Route route_of(const ListTensors& lists, const Pass& pass, int64_t channels) {
   return cuda::route_of(pass.footprint.choice.index, channels, lists.pairs.size(0), pass.grid,
                         cuda::multiprocessors_of_device());
@@ -162,7 +165,6 @@ inline cuda::Route route_of(const ListTensors& lists, const Pass& pass, int64_t 
 inline int64_t max_chunks(const Tensor& chunks, const cuda::ListCut& cut) {
   return chunks.size(0) - kPlanRows - cut.max_lists;
 }
-/// Sets what lies in BlendState::chunks.
 inline void set_plan(cuda::BlendParams& p, const Tensor& chunks, const cuda::ListCut& cut) {
   p.plan.state = structs_of<cuda::PlanState>(chunks);
   p.plan.chunk_order = structs_of<cuda::TileChunk>(chunks) + kPlanRows;
@@ -176,7 +178,6 @@ inline void set_plan(cuda::BlendVjpParams& p, const Tensor& chunks, const cuda::
 }
 inline void check_plan(const BlendState& state, const cuda::ListCut& cut, TileGrid grid) {
   const Tensor& chunks = state.chunks;
-  // Of whole lists it is known how many rows there are.
   const int64_t rows = kPlanRows + (cut.whole ? cut.max_segments + grid.tiles() + cut.max_lists : 0);
   TORCH_CHECK_VALUE(chunks.dim() == 2 && (cut.whole ? chunks.size(0) == rows : chunks.size(0) >= rows) &&
                         chunks.size(1) == kChunkWidth && chunks.scalar_type() == at::kInt &&

@@ -1,8 +1,6 @@
-// What is blended and the images that are made of it: their names, their memory, and the views that kernels get of
-// both.
+// The images of a rendering, and the channels that they are blended from. Ops choose the channels. make_images()
+// (backend.h) allocates images. Backends call set_images() for the pointers that kernels get.
 #pragma once
-
-#include <ATen/ops/empty.h>
 
 #include <array>
 
@@ -11,48 +9,36 @@
 
 namespace ar::ops {
 
-/// The images that `rasterize` can make besides the colours, in the order of its switches and of its result `images`.
-/// Python reads their names (_C.IMAGES).
+/// Images besides the colours, in the order of `rasterize`. Backend::writes() says which a device makes. Python reads
+/// _C.IMAGES.
 enum ImageIndex : size_t { kAlpha, kDepth, kInverseDepth, kImageCount };
 inline constexpr std::array<const char*, kImageCount> kImageSwitches = {"alpha=False", "depth=False",
                                                                         "inverse_depth=False"};
-/// Which of them are wanted.
 using ImageSwitches = std::array<bool, kImageCount>;
 
-/// Images, or gradients with respect to them; those are undefined where they are zero.
+/// Images, or their gradients. Undefined: not wanted, or zero.
 struct ImageTensors {
-  Tensor color;                            ///< (C, H, W) of C colour channels, which features are too
-  std::array<Tensor, kImageCount> others;  ///< (H, W); undefined where nobody wants them
+  Tensor color;                            ///< (C, H, W), with features.
+  std::array<Tensor, kImageCount> others;  ///< (H, W).
 };
 
-/// What is blended: a row of channels for every splat or Gaussian.
+/// A row of channels per Gaussian, or else per splat. The first `color_channels` make one image, the others one each.
 struct ChannelTensors {
-  Tensor rows;             ///< (m, count) contiguous; undefined: the three colours in the splats
-  bool by_gaussian;        ///< a row per Gaussian; else per splat
-  int64_t count;           ///< of channels
-  int64_t color_channels;  ///< the first ones; each of the others makes an image of its own
-  Tensor background;       ///< (count,)
-  Tensor given;            ///< (m, k) those of `rows` that the caller gave; undefined: none
-  int first_given = 0;     ///< their first column
-  /// Columns of `rows` that `project` fills, -1 where it does not (ChannelRows in core/stages.h).
+  Tensor rows;  ///< (m, count). Undefined: the three colours in the splats.
+  bool by_gaussian;
+  int64_t count;
+  int64_t color_channels;
+  Tensor background;    ///< (count,).
+  Tensor given;         ///< (m, k): the caller's columns of `rows`, if any.
+  int first_given = 0;  ///< Their first.
+  /// Columns that `project` fills (ChannelRows in core/stages.h), or -1.
   int color = -1, depth = -1, inverse_depth = -1;
 
   bool made_by_projection() const { return color >= 0 || depth >= 0 || inverse_depth >= 0; }
-  /// The projection makes all of them, and nobody else looks at their gradient.
+  /// Then only project_vjp reads the gradient of `rows`.
   bool only_made_by_projection() const { return made_by_projection() && !given.defined(); }
 };
 
-inline ImageTensors make_images(const ChannelTensors& channels, const ImageSwitches& wanted, TileGrid grid) {
-  const at::TensorOptions options = channels.background.options();
-  ImageTensors out;
-  out.color = at::empty({channels.color_channels, grid.height, grid.width}, options);
-  for (size_t k = 0; k < kImageCount; ++k) {
-    if (wanted[k]) out.others[k] = at::empty({grid.height, grid.width}, options);
-  }
-  return out;
-}
-
-/// The image of every channel.
 template <typename T> Planes<T> planes_of(const ImageTensors& image, const ChannelTensors& channels) {
   const auto plane = [](const Tensor& t) { return const_cast<T*>(const_pointer<std::remove_const_t<T>>(t)); };
   Planes<T> planes = {};
@@ -76,7 +62,7 @@ void set_images(BlendVjpParams<T>& p, const ImageTensors& dL_dimage, const Chann
   p.dL_dalpha = const_pointer<T>(dL_dimage.others[kAlpha]);
 }
 
-/// The rows that `project` fills, or with a const T the gradient with respect to them in `rows`.
+/// What `project` fills, or for a const T its gradient.
 template <typename T> ChannelRows<T> channel_rows(const Tensor& rows, const ChannelTensors& channels) {
   if (!channels.made_by_projection()) return {nullptr, 0, -1, -1, -1};
   return {const_cast<T*>(const_pointer<std::remove_const_t<T>>(rows)), rows.defined() ? rows.size(1) : 0,

@@ -1,5 +1,5 @@
-// For tests: records the names of the kernels that are launched. tests/every_kernel.py compares them with the names in
-// the library, and a test of csrc/cuda/dispatch.h with the table there, which blend_route() reads.
+// For tests: records names of launched kernels. tests/every_kernel.py compares them with those of the library, and with
+// blend_route(), which reads the table of csrc/cuda/dispatch.h.
 #include <cuda_runtime_api.h>
 
 #include <mutex>
@@ -27,14 +27,14 @@ void observe(const void* kernel) {
 
 }  // namespace
 
-/// From now on launches are recorded, beginning with none, or not.
+/// Forgets what was recorded, and begins or stops recording.
 void record_kernels(bool on) {
   const std::lock_guard lock(mutex);
   kernels().clear();
   cuda::launch_observer = on ? observe : nullptr;
 }
 
-/// Mangled names of the kernels that were recorded.
+/// Mangled names.
 std::vector<std::string> launched_kernels() {
   const std::lock_guard lock(mutex);
   std::vector<std::string> names;
@@ -48,8 +48,7 @@ std::vector<std::string> launched_kernels() {
   return names;
 }
 
-/// The names of the kernels that blend a footprint forward and backward by the table of dispatch.h, in an image of this
-/// size with room for so many pairs.
+/// Kernels that blend forward and backward, with room for `capacity` pairs.
 std::pair<std::vector<std::string>, std::vector<std::string>> blend_route(const std::string& key, int64_t channels,
                                                                           int64_t width, int64_t height,
                                                                           int64_t capacity) {

@@ -1,4 +1,5 @@
-// The ops: their schemas, their kernels for both devices, and the Python module that loads them.
+// Registers the ops of ops.h with torch: schemas, and one kernel for all devices. And the Python module _C, which loads
+// them and has names and sizes for Python to read.
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 #include <torch/library.h>
@@ -12,6 +13,7 @@
 #include "core/camera.h"
 #include "core/footprint/registry.h"
 #include "core/sh.h"
+#include "core/ssim.h"
 #include "cpu/stages.h"
 #include "torch/backend.h"
 #include "torch/call.h"
@@ -22,8 +24,8 @@ namespace {
 
 using torch::jit::Stack;
 
-/// Calls `work`. What it fails to allocate on the CPU raises torch.OutOfMemoryError, as it does on CUDA: vectors throw
-/// std::bad_alloc, and torch's allocator an error that only its message tells from others.
+/// A failed allocation on the CPU raises torch.OutOfMemoryError, as on CUDA. Torch's allocator throws an error that
+/// only its message tells from others.
 template <class Work> auto with_memory_errors(const Work& work) {
   try {
     return work();
@@ -37,7 +39,7 @@ template <class Work> auto with_memory_errors(const Work& work) {
   }
 }
 
-/// An op: a function of ops.h between the arguments on the dispatcher's stack and the results there.
+/// A function of ops.h as a kernel of torch.
 template <class A, Results (*kRun)(A)> struct Op {
   using Arguments = A;
   static void kernel(const c10::OperatorHandle&, Stack* stack) {
@@ -46,7 +48,7 @@ template <class A, Results (*kRun)(A)> struct Op {
   }
 };
 
-/// Calls visit(op, name, results) for every op.
+/// visit(op, name, results) for every op.
 template <class Visit> void each_op(const Visit& visit) {
   const char *rasterized = "Tensor color, Tensor[] images, Tensor radii, Tensor[] saved",
              *timed = "Tensor color, Tensor[] images, Tensor radii, Tensor[] saved, Tensor seconds",
@@ -98,7 +100,6 @@ TORCH_LIBRARY_IMPL(analytic_rasterizer, CPU, m) { register_kernels(m); }
 TORCH_LIBRARY_IMPL(analytic_rasterizer, CUDA, m) { register_kernels(m); }
 #endif
 
-/// What Python knows of a footprint: all of it from its header.
 template <class F> pybind11::dict describe() {
   constexpr Option option = F::kOption;
   const auto or_none = [](const char* text) -> pybind11::object {
@@ -131,20 +132,20 @@ std::vector<std::string> image_names() {
   return names;
 }
 
-/// Name and size of the members of Lens, in order.
+/// (name, size) of the members of Lens.
 std::vector<std::pair<std::string, int>> lens_members() {
   std::vector<std::pair<std::string, int>> members;
   for (const LensMember& member : kLensMembers) members.emplace_back(member.name, member.size);
   return members;
 }
 
-/// Columns as Python indexes them: a number, or a slice of several.
+/// As Python indexes them.
 pybind11::object columns_at(int64_t first, int64_t count) {
   if (count == 1) return pybind11::int_(first);
   return pybind11::slice(first, first + count, 1);
 }
 
-/// The columns of PackedRow, by the members of Python's Splats.
+/// Columns of PackedRow, by members of Python's Splats.
 pybind11::dict row_columns() {
   using Row = PackedRow<float>;
   pybind11::dict columns;
@@ -161,7 +162,19 @@ pybind11::dict row_columns() {
   return columns;
 }
 
-/// The columns of the gradient with respect to PackedRow that Python reads.
+/// Numbers in a row of the tensors that ops save, on CUDA where devices differ.
+pybind11::dict saved_widths() {
+  pybind11::dict widths;
+  widths["splats"] = kSplatWidth;
+  widths["pairs"] = ListTensors::kPairWidth;
+  widths["splat_offsets"] = ListTensors::kRangeWidth;
+  widths["counts"] = ListTensors::kCountsWidth;
+  widths["chunks"] = BlendState::kChunkWidth;
+  widths["covs"] = KeptRows::kCovWidth;
+  widths["partials"] = kSsimPartials;
+  return widths;
+}
+
 pybind11::dict row_grad_columns() {
   pybind11::dict columns;
   columns["means2d"] = columns_at(kPackedMean, 2);
@@ -171,7 +184,7 @@ pybind11::dict row_grad_columns() {
 
 #define AR_QUOTED(text) #text
 #define AR_TEXT(macro) AR_QUOTED(macro)
-/// installation.py finds it in the file of the extension where that cannot be loaded, with another torch for example.
+/// installation.py searches the file for it if another torch does not load the extension.
 constexpr const char* kBuiltFor = "analytic_rasterizer was built for torch " AR_TEXT(AR_TORCH);
 
 }  // namespace
@@ -217,6 +230,13 @@ PYBIND11_MODULE(_C, m) {
   m.attr("IMAGES") = ar::ops::image_names();
   m.attr("LENS") = ar::ops::lens_members();
   m.attr("LISTS") = ar::ops::member_names<ar::ops::ListTensors>();
+  m.attr("STATE") = ar::ops::member_names<ar::ops::BlendState>();
+  m.attr("KEPT_ROWS") = ar::ops::member_names<ar::ops::KeptRows>();
+  m.attr("SUMMARY") = ar::ops::member_names<ar::ops::SummaryTensors>();
+  m.attr("WIDTHS") = ar::ops::saved_widths();
+  m.def(
+      "withhold_output", [](const std::string& name) { ar::ops::withheld_output() = name; },
+      "For tests: ops refuse this output as if no device made it; an empty name refuses none.");
   m.attr("TILE") = ar::kTile;
   m.def(
       "tile_size",
@@ -224,7 +244,6 @@ PYBIND11_MODULE(_C, m) {
         return ar::ops::grid_of(ar::ops::find_footprint(footprint, option), width, height, cuda).side();
       },
       "Edge of the tiles that a footprint is binned for in an image [px].");
-  m.attr("SPLAT_WIDTH") = ar::kSplatWidth;
   m.attr("ROW_WIDTH") = ar::kPackedWidth;
   m.attr("ROW_COLUMNS") = ar::ops::row_columns();
   m.attr("ROW_GRAD_WIDTHS") = std::make_pair(ar::kPackedGradWidth, ar::kPackedGradWidthAbsolute);

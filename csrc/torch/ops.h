@@ -1,6 +1,6 @@
-// The ops, each written once for every device: the pass in rasterize.cpp, its stages in stages.cpp, what a training
-// step has besides in training.cpp, a picture of a training from end to end in picture.cpp. Registered with torch in
-// ops.cpp, made differentiable in autograd.cpp, and given float32 under autocast in autocast.cpp.
+// The ops, each for all devices. The pass is in rasterize.cpp, stages in stages.cpp, rows for several ranks in
+// packed.cpp, and a training step in training.cpp and picture.cpp. They are registered in ops.cpp, made differentiable
+// in autograd.cpp and cast to float32 in autocast.cpp. Comments list results in the order of the schema.
 #pragma once
 
 #include <vector>
@@ -9,70 +9,65 @@
 
 namespace ar::ops {
 
-/// What an op returns, in the order of its schema (ops.cpp). `saved` is for its adjoint.
+/// `saved` is for the adjoint, which returns a gradient per tensor argument, empty if not wanted.
 using Results = std::vector<IValue>;
 
-/// color (C + K, H, W) of C colours and K features; images: those of kImageSwitches that are asked for, (H, W); radii
-/// (P,) int32; saved.
+/// color (C + K, H, W): colours and features; images (H, W), if wanted; radii (P,) int32; saved.
 Results rasterize(RasterizeArguments a);
-/// The same, and the seconds that project, bin and blend took, (3,) float64. Saves the lists without `keep` too. Waits
-/// for the device.
+/// The same; seconds (3,) float64 of project, bin and blend. Always saves the lists.
 Results rasterize_timed(RasterizeArguments a);
-/// gradients, as from every adjoint: a tensor for every tensor among the op's arguments, empty where none is wanted.
 Results rasterize_vjp(VjpArguments<RasterizeArguments> a);
 
-/// means2d, cov2d, opacities, depths, colors (N, ...): rows, camera after camera; radii, gaussian_ids, camera_ids (N,)
-/// int32; row_splits (C + 1,) int64 on the CPU; saved: dets (N,), gaussian_ids, row_splits.
+/// Rows, camera after camera: means2d, cov2d, opacities, depths, colors; radii, gaussian_ids, camera_ids, int32;
+/// row_splits (C + 1,) int64 on the CPU; saved: dets, gaussian_ids, row_splits.
 Results project(ProjectArguments a);
 Results project_vjp(VjpArguments<ProjectArguments> a);
 
-/// What several ranks do in the place of `project`, `bin` and `blend`: rows of splats in one piece, which travel
-/// (packed.cpp). `ends` (C, P) int32: how many Gaussians up to each one have a row of each camera. Waits for no device.
+/// ends (C, P) int32: how many Gaussians up to each one have a row.
 Results count_rows(ProjectArguments a);
-/// Nothing: writes to rows, radii and ids.
+/// Writes rows, radii, ids.
 Results pack_rows(PackArguments a);
 Results pack_rows_vjp(PackVjpArguments a);
-/// image (3, H, W), alpha (H, W), saved: with `keep` ListTensors, BlendState, and what row_grads reads of the rows.
+/// image (3, H, W), alpha (H, W), saved: with `keep` ListTensors, BlendState and KeptRows.
 Results blend_rows(BlendRowsArguments a);
-/// dL_dbackground (3,), empty where it is not wanted; writes dL_drows.
+/// dL_dbackground (3,) or empty. Writes dL_drows.
 Results blend_rows_vjp(BlendRowsVjpArguments a);
 
-/// lists: ListTensors of camera after camera.
+/// ListTensors, camera after camera.
 Results bin(BinArguments a);
 
-/// image (C, K, H, W), alpha (C, H, W), saved: BlendState of camera after camera.
+/// image (C, K, H, W), alpha (C, H, W), saved: BlendState, camera after camera.
 Results blend(BlendArguments a);
 Results blend_vjp(VjpArguments<BlendArguments> a);
 
-/// summary: SummaryTensors.
+/// SummaryTensors.
 Results inspect(InspectArguments a);
 
-/// weight
 Results footprint_weight(WeightArguments a);
 Results footprint_weight_vjp(VjpArguments<WeightArguments> a);
 
-/// map (..., H, W), saved: with `keep` the derivatives of the similarity, (kSsimPartials, ..., H, W).
+/// map (..., H, W), saved: with `keep` (kSsimPartials, ..., H, W) derivatives.
 Results ssim_map(SsimArguments a);
 Results ssim_map_vjp(VjpArguments<SsimArguments> a);
-/// loss (), saved: as from ssim_map.
+/// loss (), saved: the same.
 Results l1_ssim(L1SsimArguments a);
 Results l1_ssim_vjp(VjpArguments<L1SsimArguments> a);
 
-/// scales (N, 3), rotations (N, 4), opacities (N, 1)
+/// scales (N, 3), rotations (N, 4), opacities (N, 1).
 Results activate(ActivateArguments a);
 Results activate_vjp(VjpArguments<ActivateArguments> a);
 
-/// loss (), image (3, H, W), radii (P,) int32, gradients: with respect to means, log_scales, quats, logit_opacities,
-/// shs and, with mean_columns, means2D.
+/// loss (), image (3, H, W), radii (P,) int32, gradients: of means, log_scales, quats, logit_opacities, shs and, with
+/// mean_columns, means2D.
 Results picture_gradients(PictureArguments a);
 
-/// Nothing: writes to gradient_sums and views.
+/// Writes gradient_sums, views.
 Results observe(ObserveArguments a);
 
-/// Nothing: writes to params, exp_avgs and exp_avg_sqs.
+/// Writes params, exp_avgs, exp_avg_sqs.
 Results adam(AdamArguments a);
 
-/// Whether an op of this process has been called for which autograd will ask a gradient.
+/// Whether autograd may have asked this process for a gradient.
 bool gradient_was_required();
 
 }  // namespace ar::ops

@@ -1,6 +1,6 @@
-// What several ranks do in the place of the stages: a splat in one piece (PackedRow), which is made where its Gaussian
-// is, travels, and is binned and blended where its camera is; and the way back. In two steps, of which the first counts
-// the rows for all cameras without waiting for the device: before their number is known there is no room for them.
+// The ops of rendering over several ranks. On the rank of the Gaussians, count_rows and pack_rows_ make PackedRows,
+// which Python sends. On the rank of the camera, blend_rows bins and blends. The adjoints, blend_rows_vjp_ and
+// pack_rows_vjp, lead back. Rows of all cameras are counted before memory is allocated, without waiting.
 #include <ATen/ops/cumsum.h>
 #include <ATen/ops/zeros.h>
 
@@ -14,14 +14,13 @@
 namespace ar::ops {
 namespace {
 
-/// Of a matrix of rows, their gradients, or what belongs to them.
 void check_matrix_of(const Tensor& t, const char* name, const Tensor& like, int64_t width) {
   TORCH_CHECK_VALUE(t.dim() == 2 && t.size(1) == width && t.is_contiguous() && t.device() == like.device() &&
                         t.scalar_type() == like.scalar_type(),
                     name, " must be a contiguous matrix of ", width, " columns, of the dtype and device of the others");
   check_row_count(t.size(0), name);
 }
-/// Of PackedRows, which are read in pieces of 16 bytes.
+/// PackedRows are read 16 bytes at a time.
 void check_packed_rows(const Tensor& rows, const Tensor& like) {
   check_matrix_of(rows, "rows", like, kPackedWidth);
   TORCH_CHECK_VALUE(reinterpret_cast<uintptr_t>(rows.const_data_ptr()) % 16 == 0,
@@ -34,10 +33,10 @@ void check_ints(const Tensor& t, const char* name, at::ScalarType dtype, const s
                     name, " must be contiguous ", dtype == at::kInt ? "int32" : "int64", " of shape ", text_of(sizes),
                     " on the device of the others, got shape ", shape_of(t));
 }
-void check_places(const PackedPlaces& places, int64_t cameras, int64_t rows) {
-  bool ok = int64_t(places.firsts.size()) == cameras && int64_t(places.counts.size()) == cameras;
+void check_ranges(const PackedRanges& ranges, int64_t cameras, int64_t rows) {
+  bool ok = int64_t(ranges.firsts.size()) == cameras && int64_t(ranges.counts.size()) == cameras;
   for (int64_t c = 0; ok && c < cameras; ++c) {
-    const int64_t first = places.firsts[c], count = places.counts[c];
+    const int64_t first = ranges.firsts[c], count = ranges.counts[c];
     ok = first >= 0 && count >= 0 && first <= rows && count <= rows - first;
   }
   TORCH_CHECK_VALUE(ok, "firsts and counts must be places of ", cameras, " cameras among ", rows, " rows");
@@ -63,20 +62,20 @@ Tensor checked_background(const Tensor& background) {
   return background.contiguous();
 }
 
-/// What `blend_rows` leaves for its adjoint.
+/// What `blend_rows` saves for its adjoint.
 struct SavedRows {
-  static constexpr size_t kMembers = ListTensors::kMembers + BlendState::kMembers + 2;
+  static constexpr size_t kStateFirst = ListTensors::kMembers, kKeptFirst = kStateFirst + BlendState::kMembers;
+  static constexpr size_t kMembers = kKeptFirst + KeptRows::kMembers;
   ListTensors lists;
   BlendState state;
-  RowTensors kept;
+  RowTensors rows;  ///< `kept` alone.
 
   explicit SavedRows(const std::vector<Tensor>& list) {
     TORCH_CHECK_VALUE(list.size() == kMembers, "saved must be what blend_rows saved with keep=True, got ", list.size(),
                       " tensors");
     lists = from_list<ListTensors>(list, 0);
-    state = from_list<BlendState>(list, ListTensors::kMembers);
-    kept.kept_covs = list[kMembers - 2];
-    kept.kept_opacities = list[kMembers - 1];
+    state = from_list<BlendState>(list, kStateFirst);
+    rows.kept = from_list<KeptRows>(list, kKeptFirst);
   }
 };
 
@@ -126,13 +125,13 @@ Results pack_rows_vjp(PackVjpArguments a) {
   const int64_t cameras = check_cameras(a), rows = a.ids.numel(), count = a.count();
   check_packed_gradient(a.dL_drows, a.means3D);
   check_ints(a.ids, "ids", at::kInt, {a.dL_drows.size(0)}, a.means3D);
-  check_places(a, cameras, rows);
+  check_ranges(a, cameras, rows);
   TORCH_CHECK_VALUE(may_be_rows_of(a.ids, count), "ids must be what pack_rows_ wrote");
   RowTensors dL_drows;
   dL_drows.packed = a.dL_drows;
   return {gradients_of(a, a.needs, [&](int64_t c, const Inputs& in, const Grads& grads) {
-    const Tensor places = places_of(a.ids.slice(0, a.firsts[c], a.firsts[c] + a.counts[c]), count, a.firsts[c]);
-    return make_backend(in.means3D)->project_rows_vjp(in, places, dL_drows, grads);
+    const Tensor row_of = row_of_gaussians(a.ids.slice(0, a.firsts[c], a.firsts[c] + a.counts[c]), count, a.firsts[c]);
+    return make_backend(in.means3D)->project_rows_vjp(in, row_of, dL_drows, grads);
   })};
 }
 
@@ -147,21 +146,20 @@ Results blend_rows(BlendRowsArguments a) {
   RowTensors rows;
   rows.packed = a.rows;
   if (a.keep) {
-    rows.kept_covs = at::empty({a.rows.size(0), 4}, a.rows.options());
-    rows.kept_opacities = at::empty({a.rows.size(0)}, a.rows.options());
+    rows.kept.covs = at::empty({a.rows.size(0), KeptRows::kCovWidth}, a.rows.options());
+    rows.kept.opacities = at::empty({a.rows.size(0)}, a.rows.options());
   }
   const ListTensors lists = backend->bin(backend->shape_rows(rows, pass), pass);
   ImageSwitches wanted = {};
   wanted[kAlpha] = true;
-  const ImageTensors image = make_images(channels, wanted, pass.grid);
+  const ImageTensors image = make_images(*backend, channels, wanted, pass.grid);
   BlendState state = make_state(pass, a.rows);
   backend->blend(lists, pass, channels, image, state);
   std::vector<Tensor> saved;
   if (a.keep) {
     append_to(saved, lists);
     append_to(saved, state);
-    saved.push_back(rows.kept_covs);
-    saved.push_back(rows.kept_opacities);
+    append_to(saved, rows.kept);
   }
   return {image.color, image.others[kAlpha], saved};
 }
@@ -174,11 +172,11 @@ Results blend_rows_vjp(BlendRowsVjpArguments a) {
   check_saved(saved.lists, saved.state, like, pass);
   const int64_t n = saved.lists.splats.size(0);
   check_packed_gradient(a.dL_drows, like);
-  check_matrix_of(saved.kept.kept_covs, "saved", like, 4);
-  check_matrix_of(saved.kept.kept_opacities.unsqueeze(-1), "saved", like, 1);
-  TORCH_CHECK_VALUE(
-      a.dL_drows.size(0) == n && saved.kept.kept_covs.size(0) == n && saved.kept.kept_opacities.numel() == n,
-      "dL_drows must have a row for each of ", n, " splats");
+  const KeptRows& kept = saved.rows.kept;
+  check_matrix_of(kept.covs, "saved", like, KeptRows::kCovWidth);
+  check_matrix_of(kept.opacities.unsqueeze(-1), "saved", like, 1);
+  TORCH_CHECK_VALUE(a.dL_drows.size(0) == n && kept.covs.size(0) == n && kept.opacities.numel() == n,
+                    "dL_drows must have a row for each of ", n, " splats");
   const std::vector<OptionalTensor> given = {a.dL_dimage, a.dL_dalpha};
   ImageTensors gradient;
   gradient.color = gradient_of(given, 0, "dL_dimage", like, {3, a.image_height, a.image_width});
@@ -192,7 +190,7 @@ Results blend_rows_vjp(BlendRowsVjpArguments a) {
                                            absolute ? MeanSums::kAbsolute : MeanSums::kNone);
   RowTensors dL_drows;
   dL_drows.packed = a.dL_drows;
-  backend->row_grads(saved.kept, saved.lists, pass, sums, dL_drows);
+  backend->row_grads(saved.rows, saved.lists, pass, sums, dL_drows);
   note_written(a.dL_drows);
   return {or_empty(background, like)};
 }

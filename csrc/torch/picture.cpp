@@ -1,12 +1,12 @@
-// A picture of a training from end to end: activations, rendering and loss, and back to the parameters. The same
-// kernels in the same order as the ops that autograd joins, and so the same bits, without what autograd costs the host.
+// The op picture_gradients: activations, rendering and loss of a training's picture, and the gradients of the
+// parameters. It calls the ops that autograd would call, in the same order and with the same bits, and saves the host
+// the cost of autograd.
 #include "torch/checks.h"
 #include "torch/ops.h"
 
 namespace ar::ops {
 namespace {
 
-/// The scene as it is rendered, with activated parameters.
 RasterizeArguments scene_of(const PictureArguments& a, const Results& activated) {
   RasterizeArguments scene;
   scene.means3D = a.means;
@@ -43,8 +43,8 @@ Results picture_gradients(PictureArguments a) {
   const Results compared = l1_ssim(comparison);
 
   const Results dL_dimage = l1_ssim_vjp({{a.dL_dloss}, comparison, compared[1].toTensorVector(), {true, false}});
-  std::vector<bool> needs(kSceneTensors + 2, false);  // of the tensors among the op's arguments, bg and features too
-  for (const size_t place : {0, 2, 3, 5, 6}) needs[place] = true;  // means3D, opacities, shs, scales, rotations
+  std::vector<bool> needs(kSceneTensors + 2, false);       // The last two: bg, features.
+  for (const size_t k : {0, 2, 3, 5, 6}) needs[k] = true;  // means3D, opacities, shs, scales, rotations.
   needs[1] = a.mean_columns > 0;
   const std::vector<Tensor> of_scene =
       rasterize_vjp({{dL_dimage[0].toTensorVector()[0]}, scene, rendered[3].toTensorVector(), needs})[0]

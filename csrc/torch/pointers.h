@@ -1,4 +1,4 @@
-// Pointers into tensors, typed as what the kernels read there. Null where a tensor is missing or empty.
+// Typed pointers into tensors: a library for views.h and its like. A missing or empty tensor gives null.
 #pragma once
 
 #include <ATen/core/Tensor.h>
@@ -10,7 +10,7 @@ namespace ar::ops {
 using at::Tensor;
 using OptionalTensor = std::optional<Tensor>;
 
-/// The scalars that an Element consists of: T of a Vec2<T>, and any other type itself.
+/// The scalar type of an Element: T of a Vec2<T>, else the type itself.
 template <class Element> struct ScalarIn {
   using Type = Element;
 };

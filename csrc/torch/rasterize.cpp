@@ -1,6 +1,5 @@
-// The pass, written once for both devices: check, project, bin, blend; and its adjoint: blend_vjp, project_vjp. What
-// the devices do differently is behind Backend (backend.h). The structs of tensors (ChannelTensors, ListTensors, ...)
-// are in backend.h and images.h.
+// The ops `rasterize` and `rasterize_timed` (check, project, bin, blend), `rasterize_vjp` (blend_vjp, project_vjp) and
+// `inspect`, which reads what rasterize saved. They call a Backend (backend.h) stage by stage.
 #include <ATen/ops/constant_pad_nd.h>
 #include <ATen/ops/empty_like.h>
 #include <ATen/ops/tensor.h>
@@ -17,9 +16,8 @@
 namespace ar::ops {
 namespace {
 
-/// Which channels are blended, in this order: the colours, the features, depth and inverse depth, as far as they are
-/// asked for. Three colours alone lie in the splats; everything else needs a row of channels per Gaussian. `made`:
-/// these rows as the forward pass saved them; if it is undefined, memory for them is allocated.
+/// What is blended: colours, features, depth, inverse depth. Three colours alone lie in the splats. Anything else needs
+/// rows: `made`, which the forward pass saved, or new ones.
 ChannelTensors channels_of(const RasterizeArguments& a, const Tensor& made) {
   const int64_t colors = a.bg.size(0), depths = int64_t(a.images[kDepth]) + int64_t(a.images[kInverseDepth]);
   const bool three = colors == 3;
@@ -46,17 +44,15 @@ ChannelTensors channels_of(const RasterizeArguments& a, const Tensor& made) {
   return out;
 }
 
-/// Which sums over pixels the further columns of the gradient with respect to means2D hold.
 MeanSums mean_sums_of(const RasterizeArguments& a) {
   if (a.means2D->size(1) == 4) return MeanSums::kAbsolute;
   return a.means2d_z == "sum_abs" ? MeanSums::kAbsolute : a.means2d_z == "sum_norm" ? MeanSums::kNorm : MeanSums::kNone;
 }
 
-/// Everything that the adjoint of a rasterization needs.
 struct Saved {
   ListTensors lists;
   BlendState state;
-  Tensor channels;  ///< the rows that the projection made, or empty
+  Tensor channels;  ///< Rows that the projection made, or empty.
 
   explicit Saved(const std::vector<Tensor>& list) {
     TORCH_CHECK_VALUE(list.size() == ListTensors::kMembers + BlendState::kMembers + 1,
@@ -66,12 +62,12 @@ struct Saved {
     channels = list.back();
   }
 
-  /// Raises unless this was saved for the Gaussians of `a`, and with the rows of channels that `needed` has.
+  /// Raises unless this was saved for these Gaussians and channels.
   void check_scene(const RasterizeArguments& a, const ChannelTensors& needed) const {
     const Tensor& ids = lists.ids;
     const int64_t p = a.count();
     const int32_t* numbers = ids.is_cpu() ? const_pointer<int32_t>(ids) : nullptr;
-    // On the CPU ids ascend; on CUDA, where the device would have to be waited for, every Gaussian has a splat.
+    // Ids ascend on the CPU. On CUDA, where reading waits, every Gaussian has a splat.
     const bool same_gaussians =
         ids.is_cuda() ? ids.numel() == p : !numbers || (numbers[0] >= 0 && numbers[ids.numel() - 1] < p);
     TORCH_CHECK_VALUE(same_gaussians, "saved must be what the forward pass saved for the same ", p, " Gaussians");
@@ -84,8 +80,7 @@ struct Saved {
   }
 };
 
-/// The forward pass. `exact`: of Pass. With `seconds`, four times [s] are appended to it: of what comes before, of
-/// project, bin and blend.
+/// Appends four times to `seconds`, if given: before project, and of project, bin and blend.
 Results run(RasterizeArguments a, std::vector<double>* seconds, bool exact = false) {
   const Snapshot snapshot(a, a.debug, "snapshot_fw.dump");
   return snapshot.guard([&] {
@@ -106,11 +101,11 @@ Results run(RasterizeArguments a, std::vector<double>* seconds, bool exact = fal
     lap();
     const ListTensors lists = backend->bin(splats, pass);
     lap();
-    const ImageTensors image = make_images(channels, a.images, pass.grid);
+    const ImageTensors image = make_images(*backend, channels, a.images, pass.grid);
     BlendState state = make_state(pass, a.means3D);
     backend->blend(lists, pass, channels, image, state);
     lap();
-    if (seconds && !pass.exact && backend->tiles_share_lists(lists)) {  // the caller wants to see one for each tile
+    if (seconds && !pass.exact && backend->tiles_share_lists(lists)) {  // The caller wants a list for each tile.
       seconds->clear();
       return run(a, seconds, true);
     }
@@ -134,7 +129,7 @@ Results rasterize(RasterizeArguments a) { return run(std::move(a), nullptr); }
 Results rasterize_timed(RasterizeArguments a) {
   std::vector<double> seconds;
   Results results = run(std::move(a), &seconds);
-  results.push_back(at::tensor({seconds[1], seconds[2], seconds[3]}, at::kDouble));  // the first is of what came before
+  results.push_back(at::tensor({seconds[1], seconds[2], seconds[3]}, at::kDouble));
   return results;
 }
 
@@ -156,17 +151,16 @@ Results rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
     ImageTensors dL_dimage;
     dL_dimage.color =
         gradient_of(arguments.dL_doutputs, 0, "dL_dcolor", a.means3D, {channels.color_channels, height, width});
-    size_t place = 1;
+    size_t output = 1;
     for (size_t k = 0; k < kImageCount; ++k) {
       const std::string name = "dL_d" + std::string(name_of(kImageSwitches[k]));
       if (a.images[k])
-        dL_dimage.others[k] = gradient_of(arguments.dL_doutputs, place++, name.c_str(), a.means3D, {height, width});
+        dL_dimage.others[k] = gradient_of(arguments.dL_doutputs, output++, name.c_str(), a.means3D, {height, width});
     }
 
     const MeanSums mean_sums = needs[1] && a.means2D ? mean_sums_of(a) : MeanSums::kNone;
-    // Memory for the gradients is asked for before blend_vjp: they may be written beside it, and what it gives back
-    // when it returns is still in use on the device. And before the backend, which at its end waits for what it has
-    // begun.
+    // Before blend_vjp, beside which zero_culled_grads writes them: the device still uses memory that blend_vjp frees.
+    // And before the backend, whose destructor waits for zero_culled_grads.
     Grads grads = make_grads(a, needs);
     grads.mean_sums = mean_sums;
     const std::unique_ptr<Backend> backend = make_backend(a.means3D);
@@ -191,8 +185,10 @@ Results inspect(InspectArguments a) {
   const ListTensors lists = Saved(a.saved).lists;
   const Pass pass(a, lists.splats);
   check(a, lists, pass);
+  const std::unique_ptr<Backend> backend = make_backend(lists.splats);
   const at::TensorOptions options = lists.splats.options(), ints = options.dtype(at::kInt);
   SummaryTensors summary;
+  summary.each([&](const char* name, Tensor&) { check_output(*backend, name, lists.splats); });
   summary.median = at::empty({a.image_height, a.image_width}, ints);
   summary.dominant = at::empty_like(summary.median);
   summary.touched = at::zeros({a.count()}, ints);
@@ -200,9 +196,10 @@ Results inspect(InspectArguments a) {
   summary.total = at::zeros({a.count()}, options.dtype(at::kLong));
   summary.in_front = at::zeros({a.count()}, ints);
   summary.dominated = at::zeros({a.count()}, ints);
-  make_backend(lists.splats)->inspect(lists, pass, summary);
-  return {std::vector<Tensor>{summary.median, summary.dominant, summary.touched, summary.largest, summary.total,
-                              summary.in_front, summary.dominated}};
+  backend->inspect(lists, pass, summary);
+  std::vector<Tensor> out;
+  append_to(out, summary);
+  return {out};
 }
 
 }  // namespace ar::ops

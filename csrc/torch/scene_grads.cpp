@@ -1,3 +1,5 @@
+// scene_grads.h. Backends write the gradients of Gaussians. Those of the camera are summed here, from parts that a
+// backend returns.
 #include "torch/scene_grads.h"
 
 #include <ATen/ops/aminmax.h>
@@ -17,7 +19,6 @@
 namespace ar::ops {
 namespace {
 
-/// Whether one of the camera's tensors wants a gradient.
 bool needs_camera(const std::vector<bool>& needs) {
   const auto first = needs.begin() + kGaussianTensors, last = first + kCameraTensors;
   return std::find(first, last, true) != last;
@@ -39,7 +40,7 @@ Grads make_grads(const Inputs& in, const std::vector<bool>& needs) {
   make(grads.means2D, in.means2D, needs[1]);
   make(grads.opacities, in.opacities, needs[2]);
   make(grads.shs, in.shs, needs[3]);
-  // Channels of the caller's own have theirs from blend_vjp.
+  // Other colours are the caller's channels, whose gradient comes from blend_vjp.
   if (in.colors_precomp && in.colors_precomp->size(1) == 3) make(grads.colors_precomp, in.colors_precomp, needs[4]);
   make(grads.scales, in.scales, needs[5]);
   make(grads.rotations, in.rotations, needs[6]);
@@ -49,11 +50,11 @@ Grads make_grads(const Inputs& in, const std::vector<bool>& needs) {
 }
 
 void set_camera_grads(const Tensor& parts, const std::vector<bool>& needs, Grads& grads) {
-  // In double and always in the same order.
+  // In double, and always in the same order.
   const Tensor sum = parts.sum(0, false, at::kDouble).to(parts.scalar_type());
   // Rows of CameraGrad.
   const auto rows = [&](int64_t first, int64_t count) { return sum.narrow(0, first, 4 * count).view({count, 4}); };
-  const auto matrix = [&](Tensor first, Tensor last) {  // with rows of zeros between
+  const auto matrix = [&](Tensor first, Tensor last) {  // Rows of zeros fill the middle.
     return at::cat({first, at::zeros({4 - first.size(0) - last.size(0), 4}, sum.options()), last}).t().contiguous();
   };
   if (needs[8]) grads.viewmatrix = matrix(rows(0, 3), rows(12, 0));
@@ -105,17 +106,16 @@ bool may_be_rows_of(const Tensor& ids, int64_t count) {
   return least.item<int64_t>() >= 0 && most.item<int64_t>() < count;
 }
 
-Tensor places_of(const Tensor& ids, int64_t count, int64_t first) {
-  const Tensor places = at::full({count + 1}, -1, ids.options());  // the last one takes what has no place
-  places.index_put_({ids.to(at::kLong).clamp(-1, count)}, at::arange(first, first + ids.numel(), ids.options()));
-  return places.slice(0, 0, count);
+Tensor row_of_gaussians(const Tensor& ids, int64_t count, int64_t first) {
+  const Tensor rows = at::full({count + 1}, -1, ids.options());  // The last is for ids that are out of range.
+  rows.index_put_({ids.to(at::kLong).clamp(-1, count)}, at::arange(first, first + ids.numel(), ids.options()));
+  return rows.slice(0, 0, count);
 }
 
 Tensor background_grad(const Tensor& dL_dimage, const Tensor& background, const BlendState& state, TileGrid grid) {
   if (!dL_dimage.defined()) return at::zeros_like(background);
   const Tensor dL_dcolor = dL_dimage.narrow(0, 0, background.size(0));
-  // The longer axis first, then the other: of a single channel torch would divide 2^15 or more terms among its threads,
-  // and the bits of their sum would depend on how many these are.
+  // One axis at a time. Torch divides sums of 2^15 terms among its threads, whose number would change bits.
   const int64_t longer = grid.height > grid.width ? 1 : 2;
   return dL_dcolor.mul(state.transmittance.mean(0)).sum(longer).sum(1);
 }

@@ -1,4 +1,4 @@
-// Files of the arguments of an op that failed.
+// Writes the arguments of a failed op to a file, for settings with debug=True. `rasterize` and its adjoint use it.
 #pragma once
 
 #include <torch/csrc/jit/serialization/pickle.h>
@@ -12,8 +12,7 @@
 
 namespace ar::ops {
 
-/// Copies the arguments of an op before it runs, if it is being debugged, and writes them to a file if it fails: after
-/// an error the device may give nothing back.
+/// Copies the arguments before the op runs, because after an error a device may give nothing back.
 class Snapshot {
  public:
   template <class Arguments> Snapshot(Arguments& arguments, bool debug, const char* path) : path_(path) {
@@ -23,7 +22,7 @@ class Snapshot {
       copy_->insert(std::string(name_of(declaration)), copy_of(value));
     });
   }
-  /// Runs `work`; where it throws, writes the file first.
+
   template <class Work> auto guard(const Work& work) const {
     try {
       return work();

@@ -1,5 +1,5 @@
-// The stages of the pass as ops of their own, for one or several cameras: project, bin, blend. And the weight of a
-// footprint by itself.
+// The stages as separate ops, for one or several cameras: project, bin, blend, with adjoints. And footprint_weight.
+// They call a Backend (backend.h) camera by camera and return rows or lists camera after camera.
 #include <ATen/ops/cat.h>
 #include <ATen/ops/full_like.h>
 #include <ATen/ops/stack.h>
@@ -17,16 +17,14 @@
 namespace ar::ops {
 namespace {
 
-/// The rows of camera `c` in a tensor that holds those of camera after camera.
+/// The rows of camera `c`.
 Tensor rows_of(const Tensor& t, const Tensor& row_splits, int64_t c) {
   const int64_t* splits = row_splits.const_data_ptr<int64_t>();
   return t.slice(0, splits[c], splits[c + 1]);
 }
 
-/// Camera after camera in one tensor.
 Tensor join(const std::vector<Tensor>& parts) { return parts.size() == 1 ? parts[0] : at::cat(parts); }
 
-/// Room for `n` public rows.
 RowTensors make_rows(int64_t n, bool with_colors, const at::TensorOptions& options) {
   RowTensors rows;
   rows.means2d = at::empty({n, 2}, options);
@@ -38,7 +36,6 @@ RowTensors make_rows(int64_t n, bool with_colors, const at::TensorOptions& optio
   return rows;
 }
 
-/// What one camera has of a blending.
 struct CameraPart {
   ListTensors lists;
   RowTensors rows;
@@ -65,7 +62,7 @@ Results project(ProjectArguments a) {
   const at::TensorOptions options = a.means3D.options(), ints = options.dtype(at::kInt);
   const Tensor row_splits = at::zeros({cameras + 1}, at::kLong);
   int64_t* splits = row_splits.data_ptr<int64_t>();
-  std::array<std::vector<Tensor>, 9> parts;  // of every camera: the results that are rows, and dets
+  std::array<std::vector<Tensor>, 9> parts;  // Per camera: the eight results that are rows, and dets.
   const auto add = [&](const RowTensors& r, const Tensor& radii, const Tensor& ids, const Tensor& camera_ids) {
     const Tensor rows[] = {r.means2d, r.cov2d, r.opacities, r.depths, r.colors, radii, ids, camera_ids, r.dets};
     for (size_t k = 0; k < parts.size(); ++k) parts[k].push_back(rows[k]);
@@ -92,7 +89,7 @@ Results project(ProjectArguments a) {
   Results out;
   for (size_t k = 0; k < 8; ++k) out.push_back(join(parts[k]));
   out.push_back(row_splits);
-  // The ids again for the adjoint, which takes what was saved.
+  // Clones, because results of an op must not share memory.
   out.push_back(std::vector<Tensor>{join(parts[8]), out[6].toTensor().clone(), row_splits.clone()});
   return out;
 }
@@ -109,8 +106,8 @@ Results project_vjp(VjpArguments<ProjectArguments> arguments) {
   TORCH_CHECK_VALUE(are_splits && ids.dim() == 1 && ids.scalar_type() == at::kInt && may_be_rows_of(ids, count),
                     "saved must be what project saved for the same arguments");
   const auto options = a.means3D.options();
-  const auto gradient = [&](size_t place, const char* name, std::vector<int64_t> sizes) {
-    const Tensor given = gradient_of(arguments.dL_doutputs, place, name, a.means3D, sizes);
+  const auto gradient = [&](size_t output, const char* name, std::vector<int64_t> sizes) {
+    const Tensor given = gradient_of(arguments.dL_doutputs, output, name, a.means3D, sizes);
     return given.defined() ? given : at::zeros(sizes, options);
   };
   RowTensors dL_drows;
@@ -121,7 +118,7 @@ Results project_vjp(VjpArguments<ProjectArguments> arguments) {
   if (a.shs || a.colors_precomp) dL_drows.colors = gradient(4, "dL_dcolors", {n, 3});
   return {gradients_of(a, arguments.needs, [&](int64_t c, const Inputs& in, const Grads& grads) {
     const int64_t first = splits[c].item<int64_t>(), last = splits[c + 1].item<int64_t>();
-    const Tensor rows = places_of(ids.slice(0, first, last), count, first);
+    const Tensor rows = row_of_gaussians(ids.slice(0, first, last), count, first);
     return make_backend(in.means3D)->project_rows_vjp(in, rows, dL_drows, grads);
   })};
 }
@@ -151,7 +148,7 @@ Results blend(BlendArguments a) {
     const CameraPart part(a, c);
     ImageSwitches wanted = {};
     wanted[kAlpha] = true;
-    const ImageTensors image = make_images(part.channels, wanted, pass.grid);
+    const ImageTensors image = make_images(*backend, part.channels, wanted, pass.grid);
     BlendState state = make_state(pass, a.means2d);
     backend->blend(part.lists, pass, part.channels, image, state);
     images.push_back(image.color);
@@ -179,7 +176,7 @@ Results blend_vjp(VjpArguments<BlendArguments> arguments) {
   const std::unique_ptr<Backend> backend = make_backend(a.means2d);
   const auto options = a.means2d.options();
   const bool absolute = needs[5] && a.means2d_abs;
-  // With respect to means2d, cov2d, opacities, features, background and means2d_abs.
+  // The last is for means2d_abs.
   const Tensor like[] = {a.means2d, a.cov2d, a.opacities, a.features, a.background, a.means2d};
   const bool wanted[] = {needs[0], needs[1], needs[2], needs[3], needs[4], absolute};
   std::array<std::vector<Tensor>, 6> parts;
@@ -207,8 +204,9 @@ Results blend_vjp(VjpArguments<BlendArguments> arguments) {
   std::vector<Tensor> out;
   for (size_t k = 0; k < parts.size(); ++k)
     out.push_back(!wanted[k] ? at::empty({0}, options) : parts[k].empty() ? at::zeros_like(like[k]) : join(parts[k]));
-  out.push_back(needs[6] ? at::zeros_like(a.dets) : at::empty({0}, options));  // what depends on dets is in cov2d's
-  out.push_back(at::empty({0}, options));                                      // row_splits
+  // The gradient through dets is in that of cov2d. The last is for row_splits.
+  out.push_back(needs[6] ? at::zeros_like(a.dets) : at::empty({0}, options));
+  out.push_back(at::empty({0}, options));
   return {out};
 }
 

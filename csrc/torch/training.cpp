@@ -1,5 +1,5 @@
-// What a training step has besides rendering, as ops: the loss, the activations, what density control observes, and the
-// optimiser.
+// The ops of a training step besides rendering: loss, activations, density control (observe_) and optimiser, with
+// adjoints. They check, allocate, and call the device's TrainingKernels (training.h).
 #include "torch/training.h"
 
 #include "torch/checks.h"
@@ -8,7 +8,7 @@
 namespace ar::ops {
 namespace {
 
-/// The images, checked, and room for `partials` if they are wanted.
+/// Checks the images. Allocates `partials` if wanted.
 SsimTensors make_ssim(SsimArguments& a, bool keep) {
   check(a);
   SsimTensors t;
@@ -26,7 +26,7 @@ std::vector<Tensor> saved_of(const SsimTensors& t) {
   return t.partials.defined() ? std::vector<Tensor>{t.partials} : std::vector<Tensor>{};
 }
 
-/// The images, checked, what was saved for them, and room for the gradient.
+/// Checks images and `saved`. Allocates the gradient.
 SsimTensors make_ssim_vjp(SsimArguments& a, const std::vector<Tensor>& saved, const std::vector<bool>& needs) {
   SsimTensors t = make_ssim(a, false);
   check_needs(needs, 2);
@@ -39,7 +39,6 @@ SsimTensors make_ssim_vjp(SsimArguments& a, const std::vector<Tensor>& saved, co
   return t;
 }
 
-/// Runs the adjoint. Returns the gradient with respect to image, and none with respect to target.
 Results run_ssim_vjp(const SsimTensors& t) {
   training_kernels(t.image).ssim_vjp(t);
   return {std::vector<Tensor>{t.dL_dimage, at::empty({0}, t.image.options())}};
@@ -91,11 +90,11 @@ Results activate_vjp(VjpArguments<ActivateArguments> arguments) {
   check(a);
   check_needs(arguments.needs, 3);
   const auto options = a.log_scales.options();
-  const auto gradient = [&](size_t place, const char* name, const Tensor& of) {
-    return gradient_of(arguments.dL_doutputs, place, name, a.log_scales, of.sizes());
+  const auto gradient = [&](size_t output, const char* name, const Tensor& of) {
+    return gradient_of(arguments.dL_doutputs, output, name, a.log_scales, of.sizes());
   };
-  const auto room = [&](size_t place, const Tensor& like) {
-    return arguments.needs[place] ? at::empty(like.sizes(), options) : at::empty({0}, options);
+  const auto room = [&](size_t argument, const Tensor& like) {
+    return arguments.needs[argument] ? at::empty(like.sizes(), options) : at::empty({0}, options);
   };
   ActivateTensors t = {a.log_scales, a.quats, a.logit_opacities};
   t.dL_dscales = gradient(0, "dL_dscales", a.log_scales);
@@ -120,7 +119,7 @@ Results adam(AdamArguments a) {
   check(a);
   if (a.params.empty()) return {};
   const std::initializer_list<std::vector<Tensor>*> written = {&a.params, &a.exp_avgs, &a.exp_avg_sqs};
-  // Kernels take contiguous tensors. In the place of others they get copies, which are copied back.
+  // Kernels take contiguous tensors: of others they get copies, which are copied back.
   std::vector<std::pair<Tensor, Tensor>> copied;
   for (std::vector<Tensor>* list : written) {
     for (Tensor& t : *list) {

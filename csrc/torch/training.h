@@ -1,5 +1,6 @@
-// What the ops of a training step besides rendering (training.cpp) ask of a device, and their tensors as the parameters
-// of its kernels. Tensors have been checked and are contiguous; members that are undefined are not there or not wanted.
+// TrainingKernels: what the ops of training.cpp ask of a device, and parameters of kernels from tensors.
+// training_cpu.cpp and training_cuda.cpp implement it. Tensors are checked and contiguous, or undefined: absent or not
+// wanted.
 #pragma once
 
 #include <cmath>
@@ -12,20 +13,18 @@
 
 namespace ar::ops {
 
-/// Of the similarity of images: the map or the loss, and their adjoint, which reads `partials` and one of the
-/// gradients.
+/// Either of map and loss, or either of dL_dmap and dL_dloss.
 struct SsimTensors {
-  Tensor image;   ///< (..., H, W)
-  Tensor target;  ///< (..., H, W), of the image's dtype or uint8
+  Tensor image;   ///< (..., H, W), as all but loss and partials.
+  Tensor target;  ///< May be uint8.
   LossWeights<double> weights = {};
-  Tensor map;                ///< (..., H, W)
-  Tensor loss;               ///< ()
-  Tensor partials;           ///< (kSsimPartials, ..., H, W)
-  Tensor dL_dmap, dL_dloss;  ///< like map and loss
-  Tensor dL_dimage;          ///< (..., H, W)
+  Tensor map;
+  Tensor loss;      ///< ().
+  Tensor partials;  ///< (kSsimPartials, ..., H, W).
+  Tensor dL_dmap, dL_dloss;
+  Tensor dL_dimage;
 };
 
-/// Of the activations and their adjoint.
 struct ActivateTensors {
   Tensor log_scales, quats, logit_opacities;
   Tensor scales, rotations, opacities;
@@ -33,7 +32,7 @@ struct ActivateTensors {
   Tensor dL_dlog_scales, dL_dquats, dL_dlogit_opacities;
 };
 
-/// The kernels of a device. They run on its current stream.
+/// They run on the device's current stream.
 class TrainingKernels {
  public:
   virtual ~TrainingKernels() = default;
@@ -53,7 +52,7 @@ inline const TrainingKernels& training_kernels([[maybe_unused]] const Tensor& li
   return cpu_training_kernels();
 }
 
-/// visit(T(), Target()) for the scalars of image and target.
+/// visit(T(), Target()) for the dtypes of image and target.
 template <class Visit> void visit_scalars(const SsimTensors& t, const Visit& visit) {
   const bool is_double = t.image.scalar_type() == at::kDouble, is_uint8 = t.target.scalar_type() == at::kByte;
   if (is_double && is_uint8) visit(double(), uint8_t());
@@ -62,7 +61,7 @@ template <class Visit> void visit_scalars(const SsimTensors& t, const Visit& vis
   if (!is_double && !is_uint8) visit(float(), float());
 }
 
-/// What the parameters of ssim and of its adjoint have in common.
+/// For ssim and its adjoint.
 template <typename T, typename Target, class Params> void set_images(Params& p, const SsimTensors& t) {
   p.height = int(t.image.size(-2));
   p.width = int(t.image.size(-1));
@@ -91,13 +90,13 @@ template <typename T, typename Target> SsimVjpParams<T, Target> ssim_vjp_params(
   return p;
 }
 
-/// visit(T()) for the scalar of the parameters.
+/// visit(T()) for the dtype.
 template <class Visit> void visit_scalar(const Tensor& parameters, const Visit& visit) {
   if (parameters.scalar_type() == at::kDouble) return visit(double());
   visit(float());
 }
 
-/// What the parameters of activate and of its adjoint have in common.
+/// For activate and its adjoint.
 template <typename T, class Params> void set_parameters(Params& p, const ActivateTensors& t) {
   p.n = t.log_scales.size(0);
   p.log_scales = const_pointer<Vec3<T>>(t.log_scales);
@@ -138,7 +137,7 @@ template <typename T> ObserveParams<T> observe_params(const ObserveArguments& a)
   return p;
 }
 
-/// For the tensor at place i. Powers in double precision, since 1 - beta2^step is small at first.
+/// For tensor i. Powers in double, since 1 - beta2^step is small at first.
 template <typename T> AdamRule<T> adam_rule(const AdamArguments& a, size_t i) {
   AdamRule<T> rule = {};
   rule.beta1 = T(a.beta1);
@@ -154,7 +153,6 @@ template <typename T> AdamRule<T> adam_rule(const AdamArguments& a, size_t i) {
   return rule;
 }
 
-/// The tensor at place i.
 template <typename T> AdamTensor<T> adam_tensor(const AdamArguments& a, size_t i) {
   AdamTensor<T> t = {};
   t.n = a.params[i].numel();
@@ -172,10 +170,10 @@ template <typename T> AdamTensor<T> adam_tensor(const AdamArguments& a, size_t i
   return t;
 }
 
-/// run(AdamParams<T>) for as many tensors at once as there is room for; those without numbers are left out.
+/// run(AdamParams<T>) for up to kAdamTensors tensors at once. Empty ones are skipped.
 template <typename T, class Run> void for_adam_tensors(const AdamArguments& a, const Run& run) {
   AdamParams<T> p = {};
-  // Of dtype bool or uint8, both of one byte.
+  // bool or uint8, both of one byte.
   p.rows = a.rows ? static_cast<const uint8_t*>(a.rows->const_data_ptr()) : nullptr;
   for (size_t i = 0; i < a.params.size(); ++i) {
     if (a.params[i].numel() == 0) continue;

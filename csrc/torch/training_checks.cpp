@@ -1,4 +1,5 @@
-// What the ops of a training step accept.
+// checks.h for the ops of training.cpp and picture.cpp. Ops that write to their arguments refuse tensors that share
+// memory.
 #include <ATen/MemoryOverlap.h>
 
 #include <cmath>
@@ -10,7 +11,7 @@
 namespace ar::ops {
 namespace {
 
-/// The dimensions along which a tensor has more than one number: their sizes, and their strides in bytes.
+/// (size, stride in bytes) of the dimensions with more than one number.
 std::vector<std::pair<int64_t, int64_t>> extents_of(const Tensor& t) {
   std::vector<std::pair<int64_t, int64_t>> extents;
   for (int64_t d = 0; d < t.dim(); ++d) {
@@ -19,12 +20,11 @@ std::vector<std::pair<int64_t, int64_t>> extents_of(const Tensor& t) {
   return extents;
 }
 
-/// Whether two numbers of a tensor may share memory, as those of an expanded one do: unless every step along a
-/// dimension is longer than all that lies within the dimensions of smaller steps.
+/// As in an expanded tensor. Not if each stride exceeds what lies within the dimensions of smaller strides.
 bool may_overlap_itself(const Tensor& t) {
   auto extents = extents_of(t);
   std::sort(extents.begin(), extents.end(), [](const auto& x, const auto& y) { return x.second < y.second; });
-  int64_t last = 0;  // byte at which the last number begins, of those within the smaller steps
+  int64_t last = 0;  // Byte of the last number within the smaller strides.
   for (const auto& [size, stride] : extents) {
     if (stride <= last) return true;
     last += (size - 1) * stride;
@@ -32,15 +32,15 @@ bool may_overlap_itself(const Tensor& t) {
   return false;
 }
 
-/// Bytes from the first number of a tensor to behind its last one, of which others may lie in between.
+/// Bytes from the start of the first number to the end of the last.
 int64_t span_of(const Tensor& t) {
   int64_t last = 0;
   for (const auto& [size, stride] : extents_of(t)) last += (size - 1) * stride;
   return last + t.element_size();
 }
 
-/// Whether the numbers of two tensors alternate in memory without sharing any, as columns of one matrix do: divided by
-/// some stride, the addresses of the two leave remainders that lie in intervals apart from each other.
+/// Whether two tensors alternate in memory, as columns of a matrix do: modulo a stride, their addresses are disjoint
+/// intervals.
 bool are_interleaved(const Tensor& a, const Tensor& b) {
   const auto extents_a = extents_of(a), extents_b = extents_of(b);
   const int64_t distance = static_cast<const char*>(b.const_data_ptr()) - static_cast<const char*>(a.const_data_ptr());
@@ -57,7 +57,7 @@ bool are_interleaved(const Tensor& a, const Tensor& b) {
          std::any_of(extents_b.begin(), extents_b.end(), by_stride);
 }
 
-/// Raises where memory that is written is also that of another tensor: what comes out would depend on the order.
+/// If written memory belonged to two tensors, the result would depend on the order.
 void check_overlaps(const AdamArguments& a) {
   struct Range {
     const char *begin, *end;
@@ -79,7 +79,7 @@ void check_overlaps(const AdamArguments& a) {
   add(a.grads, false);
   std::sort(ranges.begin(), ranges.end(), [](const Range& x, const Range& y) { return x.begin < y.begin; });
   bool apart = true;
-  const char *end = nullptr, *written_end = nullptr;  // of those that begin earlier
+  const char *end = nullptr, *written_end = nullptr;  // Of earlier ranges.
   for (const Range& range : ranges) {
     apart = apart && range.begin >= (range.written ? end : written_end);
     end = std::max(end, range.end);
@@ -94,7 +94,6 @@ void check_overlaps(const AdamArguments& a) {
   }
 }
 
-/// Numbers as those of what a target is compared with, or bytes.
 void check_target_type(const Tensor& target, const Like& like) {
   const Tensor& other = like.tensor;
   TORCH_CHECK_TYPE(target.scalar_type() == other.scalar_type() || target.scalar_type() == at::kByte,
@@ -112,7 +111,7 @@ void check(SsimArguments& a) {
   check_target_type(target, {image, "image"});
   check_shape(image.dim() == 3 || image.dim() == 4, image, "image", "(C, H, W) or (B, C, H, W)");
   check_shape(target.sizes() == image.sizes(), target, "target", "that of image, ", shape_of(image));
-  // The mean over nothing is not a number.
+  // The mean over nothing is NaN.
   TORCH_CHECK_VALUE(image.numel() > 0, "image must have at least one pixel, got shape ", shape_of(image));
   constexpr int64_t kMax = int64_t(1) << 30;
   const int64_t planes = image.numel() / (image.size(-1) * image.size(-2));

@@ -1,4 +1,5 @@
-// The loss, the activations, the optimiser and what density control observes, on CPU tensors.
+// TrainingKernels (training.h) for CPU tensors, float32 or float64. Calls the loops of cpu/training.h on thread_count()
+// threads.
 #include "cpu/training.h"
 #include "torch/backend.h"
 #include "torch/training.h"

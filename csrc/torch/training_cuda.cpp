@@ -1,5 +1,5 @@
-// The loss, the activations, the optimiser and what density control observes, on CUDA tensors. Nothing here waits for
-// the device.
+// TrainingKernels (training.h) for CUDA tensors, float32 or float64. Launches the kernels of cuda/training.h. Never
+// waits for the device.
 #include <ATen/ops/empty.h>
 #include <c10/cuda/CUDAException.h>
 #include <c10/cuda/CUDAGuard.h>
@@ -11,14 +11,13 @@
 namespace ar::ops {
 namespace {
 
-/// launch(stream) on the device of `like`; raises what the launch left behind.
+/// launch(stream) on the device of `like`. Raises the launch's error.
 template <class Launch> void on_stream(const Tensor& like, const Launch& launch) {
   const c10::cuda::CUDAGuard guard(like.device());
   launch(cudaStream_t(c10::cuda::getCurrentCUDAStream()));
   C10_CUDA_KERNEL_LAUNCH_CHECK();
 }
 
-/// Blocks that the kernels for an image run in.
 template <typename T, class Params> int64_t count_blocks(const Params& p) {
   const int64_t blocks = cuda::ssim_blocks<T>(p.planes, p.height, p.width), most = (int64_t(1) << 31) - 1;
   TORCH_CHECK_VALUE(blocks <= most, "image must have at most ", most, " blocks of pixels, got ", blocks);

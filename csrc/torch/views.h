@@ -1,4 +1,5 @@
-// Tensors as the parameters of stages, for what these have in common on every device. Images are in images.h.
+// Tensors as parameters of stages (core/stages.h), as far as all devices share them: a library for backend_cpu.cpp and
+// backend_cuda.cpp. images.h has those of images, cuda_views.h those of CUDA.
 #pragma once
 
 #include "core/camera.h"
@@ -20,7 +21,7 @@ template <typename T> CameraView<T> camera_of(const Inputs& in) {
   return c;
 }
 
-/// Whether colors_precomp are the three colours of the splats; else they are channels of the caller's.
+/// Whether colors_precomp are colours of splats, and not channels.
 inline bool has_colors(const Inputs& in) { return in.colors_precomp && in.colors_precomp->size(1) == 3; }
 
 template <typename T> Gaussians<T> gaussians_of(const Inputs& in) {
@@ -54,7 +55,7 @@ template <typename T> GaussianGrads<T> grads_of(const Inputs& in, const Grads& g
   return out;
 }
 
-/// For reading or for writing. Members that are undefined become null.
+/// For reading or writing.
 template <typename T> ProjectedRows<T> projected_rows_of(const RowTensors& rows) {
   ProjectedRows<T> out;
   out.means2d = const_cast<Vec2<T>*>(const_pointer<Vec2<T>>(rows.means2d));
@@ -97,7 +98,7 @@ template <typename T> PackedRows<T> packed_rows_of(const PackedTensors& packed) 
   return out;
 }
 
-/// What `project` and `project_rows` have in common.
+/// For `project` and `project_rows`.
 template <typename T, class Params>
 void set_projection(Params& p, const Inputs& in, const Pass& pass, const Tensor& radii) {
   p.camera = camera_of<T>(in);
@@ -106,7 +107,7 @@ void set_projection(Params& p, const Inputs& in, const Pass& pass, const Tensor&
   p.bounds = cull_bounds<T>(pass.footprint.choice);
   p.radii = pointer<int32_t>(radii);
 }
-/// What `project` has besides.
+/// For `project` alone.
 template <typename T> void set_channels(ProjectParams<T>& p, const ChannelTensors& channels) {
   p.channels = channel_rows<T>(channels.rows, channels);
   if (!channels.given.defined()) return;
@@ -115,7 +116,7 @@ template <typename T> void set_channels(ProjectParams<T>& p, const ChannelTensor
   p.given.count = int(p.given.stride);
 }
 
-/// What `project_vjp` and `project_rows_vjp` have in common.
+/// For `project_vjp` and `project_rows_vjp`.
 template <typename T, class Params> void set_projection_vjp(Params& p, const Inputs& in, const Grads& grads) {
   p.camera = camera_of<T>(in);
   p.gaussians = gaussians_of<T>(in);
@@ -134,8 +135,8 @@ void set_shape_rows(ShapeRowsParams<T>& p, const RowTensors& rows, const Pass& p
   p.grid = pass.grid;
   p.splats = pointer<T>(splats);
   p.packed = reinterpret_cast<const PackedRow<T>*>(const_pointer<T>(rows.packed));
-  p.kept_covs = pointer<T>(rows.kept_covs);
-  p.kept_opacities = pointer<T>(rows.kept_opacities);
+  p.kept_covs = pointer<T>(rows.kept.covs);
+  p.kept_opacities = pointer<T>(rows.kept.opacities);
 }
 
 template <typename T>
@@ -143,8 +144,8 @@ void set_row_grads(RowGradsParams<T>& p, const RowTensors& rows, const Pass& pas
   p.n = row_count(dL_drows);
   p.rows = projected_rows_of<T>(rows);
   p.footprint = pass.footprint.choice;
-  p.kept_covs = const_pointer<T>(rows.kept_covs);
-  p.kept_opacities = const_pointer<T>(rows.kept_opacities);
+  p.kept_covs = const_pointer<T>(rows.kept.covs);
+  p.kept_opacities = const_pointer<T>(rows.kept.opacities);
   p.packed = pointer<T>(dL_drows.packed);
   p.packed_width = dL_drows.packed.defined() ? int(dL_drows.packed.size(1)) : 0;
   p.dL_dmeans2d = pointer<Vec2<T>>(dL_drows.means2d);
@@ -153,7 +154,7 @@ void set_row_grads(RowGradsParams<T>& p, const RowTensors& rows, const Pass& pas
   p.absolute = pointer<Vec2<T>>(dL_drows.absolute);
 }
 
-/// Of `blend`, which writes `image` and `state`, or of its adjoint, which reads them: there `image` is a gradient.
+/// For `blend`, which writes `image` and `state`, and its adjoint, which reads them: there `image` is a gradient.
 template <typename T, class Params>
 void set_blend(Params& p, const ListTensors& lists, const Pass& pass, const ChannelTensors& channels,
                const ImageTensors& image, const BlendState& state) {
