@@ -143,8 +143,8 @@ template <typename T, class Visit> AR_HD void for_each_tile_row(const Support<T>
   for (int row = tile_rows.first; row <= tile_rows.last; ++row) visit(row, tile_columns_of(s, grid, rows, row));
 }
 
-/// The bits of a depth >= 0 as an unsigned integer: integers have the order of the depths, by which bin sorts. -0 counts
-/// as 0.
+/// The bits of a depth >= 0 as an unsigned integer: integers have the order of the depths, by which bin sorts. -0
+/// counts as 0.
 template <typename T> AR_HD auto depth_bits(T depth) {
   std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t> bits;
   const T without_sign = depth + T(0);
