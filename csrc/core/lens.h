@@ -15,9 +15,7 @@ template <typename T> struct Lens {
   Vec3<T> shift, turn;   ///< of the camera while the shutter is open: world units and radians along its axes
   Vec2<T> screen;        ///< of the picture meanwhile [px]
   T near, far;           ///< camera-space z between which Gaussians are drawn; without gradient
-  T parallel;            ///< 1 for an orthographic camera, else 0; without gradient
-
-  AR_HD bool orthographic() const { return parallel != T(0); }
+  T model;               ///< index in CameraModels (core/camera/models.h); without gradient
 
   AR_HD bool moves() const {
     return shift.x != T(0) || shift.y != T(0) || shift.z != T(0) || turn.x != T(0) || turn.y != T(0) ||
@@ -31,7 +29,7 @@ struct LensMember {
 };
 inline constexpr LensMember kLensMembers[] = {
     {"tan_half_fov", 2}, {"center", 2}, {"aperture", 1}, {"focus", 1}, {"shift", 3},
-    {"turn", 3},         {"screen", 2}, {"near", 1},     {"far", 1},   {"parallel", 1},
+    {"turn", 3},         {"screen", 2}, {"near", 1},     {"far", 1},   {"model", 1},
 };
 inline constexpr int kLensWidth = [] {
   int width = 0;

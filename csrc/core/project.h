@@ -47,7 +47,7 @@ AR_HD bool may_be_visible(const Cam& camera, const Gaussians<T>& g, int64_t i, C
     const Blur<T> blur = blur_of(camera, p.view);
     variance += blur.streak.x * blur.streak.x + blur.streak.y * blur.streak.y + blur.variance;
   }
-  const T stretch = largest_stretch(camera, p.view.z);
+  const T stretch = largest_stretch(camera, p.view);
   const T sigma = approx_sqrt(largest_zoom2(camera) * stretch * stretch * largest * largest + variance);
   const T level = bounds.level + (opacity > T(1) ? T(2) * std::log(opacity) : T(0));
   const T reach = T(2) + T(kReachMargin) * sigma * approx_sqrt(level);
@@ -100,7 +100,7 @@ AR_HD bool project_gaussian(const Cam& camera, const Gaussians<T>& g, int64_t i,
       !(within(factors.scale.x, kMaxScale) && within(factors.scale.y, kMaxScale) && within(factors.scale.z, kMaxScale)))
     return false;
   const SeenCov<T> seen = seen_covariance(camera, g, i, mean.view, factors);
-  out = {mean.pixel, seen.cov, seen.amp * g.opacities[i], mean.view.z};
+  out = {mean.pixel, seen.cov, seen.amp * g.opacities[i], depth_at(camera, mean.view)};
   // The opacity before the blur: a large blur must not bring back what is degenerate.
   return is_drawable(out) && !(g.opacities[i] > T(kMaxOpacity));
 }
@@ -324,7 +324,7 @@ AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
   const ProjectedGrad<T> projected = grad_of(seen.cov, seen.amp * g.opacities[i]);
   const SplatGrad<T>& grad = projected.splat;
   JacobianGrad<T> dL_djacobian;
-  Vec3<T> dL_dview = {T(0), T(0), shown.depth};
+  Vec3<T> dL_dview = depth_vjp(camera, mean.view, shown.depth);
   bool has_blur = false;
   if constexpr (Cam::kFull) {
     const Blur<T> blur = blur_of(camera, mean.view);
@@ -340,20 +340,13 @@ AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
   dL_dview += jacobian_vjp(camera, factors.jacobian, mean.view, dL_djacobian);
   Vec3<T> dL_dmean = project_mean_vjp(camera, mean, grad.dL_dmean, dL_dview);
   const Vec3<T> dL_ddirection = splat_color_vjp(camera, g, out, i, sh, dL_dsh, shown.color);
-  bool same_direction = false;  // for all means
   if constexpr (Cam::kFull) {
-    same_direction = camera.lens.orthographic();
     if (camera_grad) {
-      add_project_mean_vjp(camera, mean, g.means[i], grad.dL_dmean, dL_dview, *camera_grad);
-      add_jacobian_vjp(camera, factors.jacobian, mean.view, dL_djacobian, *camera_grad);
-      if (same_direction) {
-        add_xyz(camera_grad->view_z, dL_ddirection);
-      } else {
-        camera_grad->position += T(-1) * dL_ddirection;
-      }
+      add_camera_vjp(camera, g.means[i], mean, grad.dL_dmean, dL_dview, factors.jacobian, dL_djacobian, dL_ddirection,
+                     *camera_grad);
     }
   }
-  if (!same_direction) dL_dmean += dL_ddirection;
+  ray_vjp(camera, dL_ddirection, dL_dmean);
   if (out.means) put(out, out.means[i], dL_dmean);
   if (out.opacities) put(out, out.opacities[i], projected.weighted / g.opacities[i]);
   if (out.means2d) {

@@ -113,7 +113,7 @@ constexpr Field kCameraFields[] = {{"view_x", 0, 4},  {"view_y", 4, 4},    {"vie
                                    {"clip_y", 16, 4}, {"clip_w", 20, 4},   {"position", 24, 3}, {"tan", 27, 2},
                                    {"center", 29, 2}, {"aperture", 31, 1}, {"focus", 32, 1},    {"shift", 33, 3},
                                    {"turn", 36, 3},   {"screen", 39, 2}};
-constexpr int kFirstFixed = 41;  ///< near, far and parallel have no gradient
+constexpr int kFirstFixed = 41;  ///< near, far and model have no gradient
 
 enum Effect { kOffCenter = 1, kDefocus = 2, kShift = 4, kTurn = 8, kScreen = 16, kAllEffects = 31 };
 
@@ -123,7 +123,7 @@ template <typename T> View<T> random_view(Random& random, int effects, bool orth
   if (orthographic) {
     view.test = {64, 48, 2, {0.3, -0.4, 0.7}, {0.1, -0.2}, true};
     view.lens = plain_lens<T>(view.test.tan_x, view.test.tan_y);
-    view.lens.parallel = T(1);
+    view.lens.model = T(kCameraModel<Orthographic>);
   }
   const auto normal = [&](double size) { return T(size * random.normal()); };
   if (effects & kOffCenter) view.lens.center = {normal(0.5), normal(0.5)};
@@ -526,7 +526,7 @@ void expect_nothing_kept_that_may_not_be_visible(const Footprint& f, const Funct
     if (trial % 2) by = {random.log_uniform(0.1, 10), random.log_uniform(0.1, 10), random.log_uniform(0.1, 10)};
     const View<float> stretched = of_stretched_world(at, by);
     const auto camera = stretched.template load<Cam>();
-    const double z = random.log_uniform(0.15, 100), scale = at.lens.orthographic() ? 4 : z,
+    const double z = random.log_uniform(0.15, 100), scale = at.lens.model == kCameraModel<Orthographic> ? 4 : z,
                  size = scale * random.log_uniform(1e-4, 3);
     const auto length = [&] { return float(size * random.log_uniform(0.01, 1) * (random.below(2) ? 1 : -1)); };
     Parameters<float> p = {};

@@ -1,0 +1,39 @@
+// Every camera model that the library knows. A new model is a header and an entry of the list here.
+#pragma once
+
+#include <type_traits>
+
+#include "core/camera/orthographic.h"
+#include "core/camera/pinhole.h"
+
+namespace ar {
+
+template <class... M> struct CameraModelList {};
+
+/// Lens::model is an index of this list.
+using CameraModels = CameraModelList<Pinhole, Orthographic>;
+
+/// The index of a model.
+template <class Model, class... M> constexpr int index_of_model(CameraModelList<M...>) {
+  int index = 0;
+  ((std::is_same_v<Model, M> ? true : (++index, false)) || ...);
+  return index;
+}
+template <class Model> inline constexpr int kCameraModel = index_of_model<Model>(CameraModels());
+
+/// Calls visit(M()) for the model whose index is `model`; for the last one where it is none.
+template <int kIndex = 0, typename T, class Visit, class M, class... Later>
+AR_HD auto visit_model_at(T model, CameraModelList<M, Later...>, Visit&& visit) {
+  if constexpr (sizeof...(Later) > 0) {
+    if (model != T(kIndex)) return visit_model_at<kIndex + 1>(model, CameraModelList<Later...>(), visit);
+  }
+  return visit(M());
+}
+
+/// Calls visit(M()) for the model of a camera. All threads have the same camera, and take the same branch.
+template <typename T, class Visit> AR_HD auto visit_model(const Camera<T>&, Visit&& visit) { return visit(Pinhole()); }
+template <typename T, class Visit> AR_HD auto visit_model(const FullCamera<T>& camera, Visit&& visit) {
+  return visit_model_at(camera.lens.model, CameraModels(), visit);
+}
+
+}  // namespace ar
