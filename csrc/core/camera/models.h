@@ -13,6 +13,9 @@ template <class... M> struct CameraModelList {};
 /// Lens::model is an index of this list.
 using CameraModels = CameraModelList<Pinhole, Orthographic>;
 
+template <class... M> constexpr int count_of_models(CameraModelList<M...>) { return sizeof...(M); }
+inline constexpr int kCameraModels = count_of_models(CameraModels());
+
 /// The index of a model.
 template <class Model, class... M> constexpr int index_of_model(CameraModelList<M...>) {
   int index = 0;
