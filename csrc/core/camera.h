@@ -1,9 +1,9 @@
-// From a mean in the world to its pixel, with the Jacobian there, and the adjoints of both: what project.h,
-// covariance.h and blur.h ask of a camera, whatever its model. The models are in core/camera/.
+// What project.h, covariance.h and blur.h ask of a camera with any model: a mean's pixel, the Jacobian there, the blur,
+// and the adjoints. The models are in core/camera/.
 //
-// Every function is compiled for two types. Camera is the pinhole of 3DGS, so that a plain rendering neither reads nor
-// computes anything for models and effects. FullCamera has every model and every effect as branches that all threads
-// take alike, and not a type for every combination: projecting takes a small part of a frame.
+// Every function is compiled for two types. Camera is the pinhole of 3DGS, without a cost for models and effects.
+// FullCamera has all models and effects as branches, which all threads take alike: projecting takes a small part of a
+// frame, so that one type for every combination would not pay.
 #pragma once
 
 #include "core/defocus.h"
@@ -32,7 +32,6 @@ template <typename T> AR_HD FullCamera<T> load_full_camera(const CameraView<T>& 
   const Lens<T> lens = *reinterpret_cast<const Lens<T>*>(c.lens);
   return {load_camera(c, lens.tan_half_fov), lens};
 }
-/// The one or the other, by type.
 template <class Cam, typename T> AR_HD Cam load_camera_as(const CameraView<T>& c) {
   if constexpr (Cam::kFull) {
     return load_full_camera(c);
@@ -50,7 +49,7 @@ template <class Cam, typename T> AR_HD ProjectedMean<T> project_mean(const Cam& 
   return p;
 }
 
-/// Gradient with respect to the mean. Adds to dL_dview what the model's map gives.
+/// Gradient with respect to the mean. Adds to dL_dview the share of the model's map.
 template <class Cam, typename T>
 AR_HD Vec3<T> project_mean_vjp(const Cam& camera, const ProjectedMean<T>& p, Vec2<T> dL_dpixel, Vec3<T>& dL_dview) {
   const Vec3<T> by_map =
@@ -60,39 +59,36 @@ AR_HD Vec3<T> project_mean_vjp(const Cam& camera, const ProjectedMean<T>& p, Vec
 template <class Cam, typename T> AR_HD Jacobian<T> make_jacobian(const Cam& camera, Vec3<T> view) {
   return visit_model(camera, [&](auto model) AR_HD_LAMBDA { return model.jacobian(camera, view); });
 }
-/// Gradient with respect to the camera-space mean.
 template <class Cam, typename T>
 AR_HD Vec3<T> jacobian_vjp(const Cam& camera, const Jacobian<T>& j, Vec3<T> view, const JacobianGrad<T>& grad) {
   return visit_model(camera, [&](auto model) AR_HD_LAMBDA { return model.jacobian_vjp(camera, j, view, grad); });
 }
 
-/// No smaller than |W|^2, W the upper left 3x3 of the view: no eigenvalue of W W^T is larger than the largest sum of a
-/// row of its absolute values. 1 for a rotation, but for rounding.
+/// An upper bound of |W|^2, W the upper left 3x3 of the view: the largest sum of a row of |W W^T|. About 1 for a
+/// rotation.
 template <typename T> AR_HD T largest_zoom2(const Camera<T>& camera) {
   const Vec3<T> x = xyz(camera.view_x), y = xyz(camera.view_y), z = xyz(camera.view_z);
   const T xy = abs(dot(x, y)), xz = abs(dot(x, z)), yz = abs(dot(y, z));
   return max(dot(x, x) + xy + xz, max(xy + dot(y, y) + yz, xz + yz + dot(z, z)));
 }
 
-/// No smaller than the norm of the Jacobian of a mean at `view`, camera units to px, but for rounding.
+/// But for rounding.
 template <class Cam, typename T> AR_HD T largest_stretch(const Cam& camera, Vec3<T> view) {
   return visit_model(camera, [&](auto model) AR_HD_LAMBDA { return model.largest_stretch(camera, view); });
 }
 
-/// The depth of what is at `view`.
 template <class Cam, typename T> AR_HD T depth_at(const Cam& camera, Vec3<T> view) {
   return visit_model(camera, [&](auto model) AR_HD_LAMBDA { return model.depth(view); });
 }
 template <class Cam, typename T> AR_HD Vec3<T> depth_vjp(const Cam& camera, Vec3<T> view, T dL_ddepth) {
   return visit_model(camera, [&](auto model) AR_HD_LAMBDA { return model.depth_vjp(view, dL_ddepth); });
 }
-/// The depth of a mean in the world.
 template <class Cam, typename T> AR_HD T depth_of(const Cam& camera, Vec3<T> mean) {
   return depth_at(
       camera, Vec3<T>{apply_row(camera.view_x, mean), apply_row(camera.view_y, mean), apply_row(camera.view_z, mean)});
 }
 
-/// From where a Gaussian is seen, and 1 / the length of what was normalised.
+/// A unit vector, and 1 / the length of the vector that was normalised.
 template <typename T> struct Direction {
   Vec3<T> unit;
   T inv_length;
@@ -102,13 +98,13 @@ template <class Cam, typename T> AR_HD Direction<T> view_direction(const Cam& ca
   const T inv = quotient(T(1), sqrt(dot(d, d)));
   return {inv * d, inv};
 }
-/// Adds the gradient with respect to the mean, from that with respect to the vector that was normalised.
+/// `dL_dray`: before the ray was normalised.
 template <class Cam, typename T> AR_HD void ray_vjp(const Cam& camera, Vec3<T> dL_dray, Vec3<T>& dL_dmean) {
   visit_model(camera, [&](auto model) AR_HD_LAMBDA { model.ray_vjp(dL_dray, dL_dmean); });
 }
 
-/// Adds the gradient with respect to the camera of what project_mean, make_jacobian and view_direction make of a mean.
-/// dL_dview is that of project_mean_vjp, in which those of the others are.
+/// Adds the gradient of project_mean, make_jacobian and view_direction with respect to the camera. dL_dview: after
+/// project_mean_vjp.
 template <typename T>
 AR_HD void add_camera_vjp(const FullCamera<T>& camera, Vec3<T> mean, const ProjectedMean<T>& p, Vec2<T> dL_dpixel,
                           Vec3<T> dL_dview, const Jacobian<T>& j, const JacobianGrad<T>& dL_djacobian, Vec3<T> dL_dray,
@@ -123,20 +119,20 @@ AR_HD void add_camera_vjp(const FullCamera<T>& camera, Vec3<T> mean, const Proje
   });
 }
 
-/// What the lens and the shutter add to the covariance of what is at `view`.
+/// What the lens and the shutter add to the covariance of a Gaussian at `view`.
 template <typename T> AR_HD Blur<T> blur_of(const FullCamera<T>& camera, Vec3<T> view) {
   const Lens<T>& lens = camera.lens;
   return {lens.moves() ? motion_streak(camera, view) : Vec2<T>{T(0), T(0)},
           lens.aperture != T(0) ? defocus_variance(camera, view) : T(0)};
 }
 
-/// Gradient of blur_of with respect to `view`; adds the one with respect to the camera to `to`, if not null.
+/// Gradient of blur_of with respect to `view`; adds that with respect to the camera to `to`, if not null.
 template <typename T>
 AR_HD Vec3<T> blur_vjp(const FullCamera<T>& camera, Vec3<T> view, const Blur<T>& dL_dblur, CameraGrad<T>* to) {
   Vec3<T> by_view = {T(0), T(0), T(0)};
   Lens<T> by_lens = {};
   Vec2<T> by_focal = {T(0), T(0)};
-  if (camera.lens.aperture != T(0))  // without one the focus may be anything
+  if (camera.lens.aperture != T(0))  // else the focus may be any number
     defocus_variance_vjp(camera, view, dL_dblur.variance, by_view, by_lens, by_focal);
   motion_streak_vjp(camera, view, dL_dblur.streak, by_view, by_lens, by_focal);
   if (to) {

@@ -1,5 +1,5 @@
-// Defocus. A point becomes a disc of diameter D, for which the camera's model has a formula. The disc has the variance
-// D^2 / 16 along every axis (docs/numerics.md, "Lens and shutter").
+// Defocus, for blur_of() in camera.h. A point becomes a disc of diameter D, which the camera's model gives. The
+// variance of the disc is D^2 / 16 along every axis (docs/numerics.md, "Lens and shutter").
 #pragma once
 
 #include "core/camera/models.h"

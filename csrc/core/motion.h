@@ -1,7 +1,6 @@
-// Motion blur. What moves by u px in the image while the shutter is open becomes a streak: a segment of length |u|,
-// which has the variance |u|^2 / 12 along u. In camera space a point p moves by w = -shift - turn x p, where shift and
-// turn are those of the camera; the camera's model says how fast its image moves (docs/numerics.md, "Lens and
-// shutter").
+// Motion blur, for blur_of() in camera.h. A point that moves by u px during the exposure becomes a segment of length
+// |u|, whose variance along u is |u|^2 / 12. In camera space the point p moves by w = -shift - turn x p (of the
+// camera); the camera's model gives u (docs/numerics.md, "Lens and shutter").
 #pragma once
 
 #include "core/camera/models.h"

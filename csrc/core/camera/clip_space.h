@@ -1,5 +1,5 @@
-// The map of the models of 3DGS's matrices, by clip space: pixels are x/w and y/w, with x, y and w linear in the mean.
-// pinhole.h and orthographic.h inherit it. A matrix may move the principal point, and scale.
+// The map through clip space, which pinhole.h and orthographic.h inherit: a matrix of the caller's makes x, y and w
+// from the mean, and x/w and y/w are the position in the image.
 #pragma once
 
 #include "core/camera/contract.h"
@@ -15,7 +15,7 @@ struct ClipSpaceMap {
     return in_range(camera, p.view.z) && p.clip_w > T(0);
   }
 
-  /// The matrix maps the mean itself, so that nothing is added to the gradient with respect to camera space.
+  /// The matrix maps the mean itself: dL_dview gets nothing.
   template <typename T>
   AR_HD static Vec3<T> map_vjp(const Camera<T>& camera, const ProjectedMean<T>& p, Vec2<T> dL_dpixel, Vec3<T>&) {
     const Vec3<T> g = clip_vjp(camera, p, dL_dpixel);

@@ -1,4 +1,4 @@
-// Every camera model that the library knows. A new model is a header and an entry of the list here.
+// The list of camera models. A new model is a header and an entry here.
 #pragma once
 
 #include <type_traits>
@@ -10,13 +10,12 @@ namespace ar {
 
 template <class... M> struct CameraModelList {};
 
-/// Lens::model is an index of this list.
+/// Lens::model is an index in this list.
 using CameraModels = CameraModelList<Pinhole, Orthographic>;
 
 template <class... M> constexpr int count_of_models(CameraModelList<M...>) { return sizeof...(M); }
 inline constexpr int kCameraModels = count_of_models(CameraModels());
 
-/// The index of a model.
 template <class Model, class... M> constexpr int index_of_model(CameraModelList<M...>) {
   int index = 0;
   ((std::is_same_v<Model, M> ? true : (++index, false)) || ...);
@@ -24,7 +23,7 @@ template <class Model, class... M> constexpr int index_of_model(CameraModelList<
 }
 template <class Model> inline constexpr int kCameraModel = index_of_model<Model>(CameraModels());
 
-/// Calls visit(M()) for the model whose index is `model`; for the last one where it is none.
+/// Calls visit(M()) for the model with index `model`, or for the last model if there is none.
 template <int kIndex = 0, typename T, class Visit, class M, class... Later>
 AR_HD auto visit_model_at(T model, CameraModelList<M, Later...>, Visit&& visit) {
   if constexpr (sizeof...(Later) > 0) {
@@ -33,7 +32,7 @@ AR_HD auto visit_model_at(T model, CameraModelList<M, Later...>, Visit&& visit) 
   return visit(M());
 }
 
-/// Calls visit(M()) for the model of a camera. All threads have the same camera, and take the same branch.
+/// Calls visit(M()) for the model of a camera.
 template <typename T, class Visit> AR_HD auto visit_model(const Camera<T>&, Visit&& visit) { return visit(Pinhole()); }
 template <typename T, class Visit> AR_HD auto visit_model(const FullCamera<T>& camera, Visit&& visit) {
   return visit_model_at(camera.lens.model, CameraModels(), visit);

@@ -1,5 +1,5 @@
-// The pinhole, the only model of a plain camera: everything in the core that assumes f/z. In the Jacobian x/z and y/z
-// are clamped to the camera's limit, as in 3DGS, so that splats beside the image do not grow without bound.
+// The pinhole, the model of a plain camera, with all formulas that assume f/z. As in 3DGS the Jacobian clamps x/z and
+// y/z, so that splats beside the image do not grow without bound. core/camera.h calls it.
 #pragma once
 
 #include "core/camera/clip_space.h"
@@ -27,7 +27,7 @@ struct Pinhole : ClipSpaceMap, CameraModelDefaults {
                                     const JacobianGrad<T>& grad) {
     const Vec2<T> by_ratio = ratio_vjp(camera, view, grad);
     Vec3<T> g = {T(0), T(0), -quotient(grad.log_size, view.z)};
-    // Where the ratio is clamped it is constant: its gradient is zero, in z too.
+    // A clamped ratio is constant, in z too.
     if (!j.clamped_x) {
       g.x += quotient(by_ratio.x, view.z);
       g.z -= quotient(by_ratio.x * j.ratio_x, view.z);
@@ -87,7 +87,7 @@ struct Pinhole : ClipSpaceMap, CameraModelDefaults {
   }
 
  private:
-  /// x/z and y/z around which they are clamped.
+  /// The middle of the clamp of x/z and y/z.
   template <typename T> AR_HD static Vec2<T> clamp_center(const Camera<T>&) { return {T(0), T(0)}; }
   template <typename T> AR_HD static Vec2<T> clamp_center(const FullCamera<T>& camera) { return camera.lens.center; }
   /// The largest |x/z| and |y/z| after the clamp.
@@ -95,7 +95,7 @@ struct Pinhole : ClipSpaceMap, CameraModelDefaults {
   template <typename T> AR_HD static Vec2<T> largest_ratio(const FullCamera<T>& camera) {
     return {camera.limit.x + abs(camera.lens.center.x), camera.limit.y + abs(camera.lens.center.y)};
   }
-  /// Gradients with respect to the clamped ratios.
+  /// With respect to the clamped ratios.
   template <typename T>
   AR_HD static Vec2<T> ratio_vjp(const Camera<T>& camera, Vec3<T> view, const JacobianGrad<T>& grad) {
     const Vec3<T> axis = xyz(camera.view_z);
