@@ -17,14 +17,14 @@ import torch
 from .autocast import way_out_of, widened
 from .checks import check_tensors
 from .effects import Effects
-from .footprints import resolve_footprint
+from .footprints import DILATED, resolve_footprint
 from .outputs import depths
 from .rotations import rotation_matrices
 from .settings import GaussianRasterizationSettings
 
 VARIANCE = 0.2  # of the filter, in squares of the finest sampling interval
 PIXEL_VARIANCE = 1 / 12  # of the square pixel along an axis, in squares of its width
-DILATION = resolve_footprint("point").option  # px^2, that of 3DGS
+DILATION = resolve_footprint(DILATED).option  # px^2, that of 3DGS
 MARGIN = 0.15  # of the image around it in which a Gaussian still counts as seen
 
 

@@ -21,6 +21,21 @@ for _variant in _C.footprints():
 FOOTPRINTS = tuple(_VARIANTS)
 """Public names of the footprints, in the order of the registry: those of csrc/core/footprint/registry.h."""
 
+# The footprints that the library means where nobody names one. No other module names a footprint
+# (tests/test_footprint_names.py); docs/footprints.md says why these are recommended.
+PAPER = "analytic"  # the default, for parity with Analytic-Splatting
+PAPER_GRADIENT = f"{PAPER}:frame_gradient=paper"
+DILATED = "point"  # of 3DGS: what most repositories render with, and most files were trained with
+UNFILTERED = f"{DILATED}:dilation=0"  # samples without a filter, also for Gaussians that hold the pixel already
+COMPENSATED = "mip"  # of Mip-Splatting, and of the modes that others call antialiased
+RECOMMENDED = "moment:samples=4"  # for training, and for scenes that were baked
+FASTEST = "box:samples=1"  # that integrates over the pixel
+FOUR_SAMPLES = "box:samples=4"
+SIXTEEN_SAMPLES = "box:samples=16"
+EXACT = "exact"  # the weight without an error
+NEAREST_TO_EXACT = "cumulant"  # of the footprints with one weight for a splat and a pixel
+TURNED = "erf"  # the window of PAPER with the exact CDF
+
 REFERENCE_FOOTPRINTS = tuple(name for name, variants in _VARIANTS.items() if variants[0]["reference"])
 """Footprints that are meant to compare others with, and are slow."""
 
@@ -32,6 +47,24 @@ def _value_of(text: str) -> int | str:
 def option_values(name: str) -> tuple:
     """The values that the option of a footprint may have; empty where it is a number, or where there is no option."""
     return tuple(_value_of(v["value"]) for v in _VARIANTS[name] if v["value"] is not None)
+
+
+def footprint_variants() -> tuple[str, ...]:
+    """Every footprint, and one that takes samples with every number of them: "point", ..., "box:samples=16"."""
+    return tuple(
+        f"{name}:samples={variant['samples']}" if variant["option"] == "samples" else name
+        for name, variants in _VARIANTS.items()
+        for variant in (variants if variants[0]["option"] == "samples" else variants[:1])
+    )
+
+
+def sampled_footprints() -> tuple[str, ...]:
+    """The footprints that take samples, with every number of them, the fewest first.
+
+    With more samples each comes nearer to the integral over the pixel.
+    """
+    sampled = [name for name in footprint_variants() if ":" in name]
+    return tuple(sorted(sampled, key=lambda name: resolve_footprint(name).samples))
 
 
 def _default_options(name: str) -> dict[str, Any]:
@@ -55,8 +88,8 @@ class Footprint:
         name: One of `FOOTPRINTS`.
         options: Every option of that footprint, as a tuple of (name, value) pairs.
         key: Name under which it is registered (csrc/core/footprint/registry.h): "box4".
-        option: The number that it takes at run time: dilation, variance or tolerance; 0 where there is none.
-        samples: The most samples that a pixel has.
+        option: The number that it takes at run time: dilation or variance; 0 where there is none.
+        samples: Samples of a pixel.
     """
 
     name: str
@@ -80,20 +113,31 @@ def _number(name: str, value: Any) -> float:
     return number
 
 
+_GONE = {"adaptive": "take box with 16 samples or moment with 4"}  # footprints of earlier versions, and what to take
+
+
+def _nearest(option: str, value: Any, values: tuple) -> str:
+    """Of an option whose values are numbers: a hint at those next to a number that is none of them, else ""."""
+    try:
+        number = float(value)
+        below, above = [v for v in values if v < number], [v for v in values if v > number]
+    except (TypeError, ValueError):
+        return ""
+    nearest = [str(v) for v in (*sorted(below)[-1:], *sorted(above)[:1])]
+    return f"; nearest: {option}={' or '.join(nearest)}" if nearest else ""
+
+
 def resolve_footprint(name: str | Footprint, **options: Any) -> Footprint:
     """Settles a footprint's options.
 
     Args:
-        name: One of `FOOTPRINTS`, optionally followed by options: `"box:samples=8"`,
+        name: One of `FOOTPRINTS`, optionally followed by options: `"box:samples=16"`,
             `"point:dilation=0"`. Or a `Footprint`.
         **options: The same as keywords; they win over those in `name`.
             point: `dilation` (px^2 added to the covariance, default 0.3).
             mip: `variance` (px^2, default 0.1).
             analytic: `frame_gradient`, `"frozen"` (default) or `"paper"`.
-            box: `samples`, 1, 2, 4 (default), 8 or 16.
-            moment: `samples`, 1, 4 (default), 9 or 16.
-            adaptive: `tolerance`, of the image, in units of colour (default 1/255): `box` with 1, 4, 8 or 16
-                samples, chosen for every tile of 16x16 pixels.
+            box, moment: `samples`, 1, 4 (default) or 16.
 
     Raises:
         ValueError: Unknown name, unknown option, or a value outside its domain.
@@ -106,7 +150,8 @@ def resolve_footprint(name: str | Footprint, **options: Any) -> Footprint:
         raise ValueError(f"footprint must be one of {', '.join(FOOTPRINTS)}, got {name!r}")
     name, _, text = name.partition(":")
     if name not in FOOTPRINTS:
-        raise ValueError(f"footprint must be one of {', '.join(FOOTPRINTS)}, got {name!r}")
+        instead = f"; {_GONE[name]}" if name in _GONE else ""
+        raise ValueError(f"footprint must be one of {', '.join(FOOTPRINTS)}, got {name!r}{instead}")
     settled = dict(OPTIONS.get(name, {}))
     given = dict(item.partition("=")[::2] for item in text.split(",")) if text else {}
     given.update(options)
@@ -124,12 +169,18 @@ def resolve_footprint(name: str | Footprint, **options: Any) -> Footprint:
             variant = _VARIANTS[name][[str(v) for v in values].index(str(value))]
             settled[option] = _value_of(variant["value"])
         else:
-            raise ValueError(f"{option} must be one of {', '.join(map(str, values))}, got {value!r}")
+            known = ", ".join(map(str, values))
+            raise ValueError(f"{option} must be one of {known}, got {value!r}{_nearest(option, value, values)}")
     return Footprint(name, tuple(settled.items()), variant["key"], number, variant["samples"])
 
 
-_ANALYTIC = resolve_footprint("analytic")
+_PAPER = resolve_footprint(PAPER)
 _default: Footprint | None = None
+
+
+def stated(footprint: Footprint) -> dict[str, Any]:
+    """What the header of a footprint states: see describe() in csrc/torch/ops.cpp."""
+    return next(v for v in _VARIANTS[footprint.name] if v["key"] == footprint.key)
 
 
 def set_default_footprint(name: str | Footprint | None, **options: Any) -> None:
@@ -171,7 +222,7 @@ def get_default_footprint() -> Footprint:
     Raises:
         ValueError: The environment variable holds no footprint.
     """
-    return chosen_footprint() or _ANALYTIC
+    return chosen_footprint() or _PAPER
 
 
 def check_device(device: torch.device) -> None:
@@ -184,7 +235,7 @@ def check_device(device: torch.device) -> None:
 
 
 def footprint_weight(
-    offset: torch.Tensor, cov2d: torch.Tensor, footprint: str | Footprint = "analytic", **options: Any
+    offset: torch.Tensor, cov2d: torch.Tensor, footprint: str | Footprint = PAPER, **options: Any
 ) -> torch.Tensor:
     """Weight I(d, Sigma) of a splat of peak 1 in one pixel. Differentiable.
 

@@ -46,7 +46,6 @@ def _lists(like: torch.Tensor, rows: int, a, keep: bool, ids=None) -> list[torch
         like.new_empty((rows, 2), **ints) if on_cuda else like.new_empty(rows + 1 if keep else 0, **longs),
         like.new_empty(pairs if keep and not on_cuda else 0, **longs),
         like.new_empty(context.new_dynamic_size() if on_cuda else 0, **longs),
-        like.new_empty(tiles if a.footprint == "adaptive" else 0, **ints),
     ]
 
 

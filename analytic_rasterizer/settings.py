@@ -89,7 +89,7 @@ class GaussianRasterizationSettings(_Fields):
             On failure write the arguments to snapshot_fw.dump or snapshot_bw.dump and re-raise. On CUDA wait for every
             stage, so that the stage that failed is the one that raises, and check that the camera is finite, which is
             not checked there otherwise.
-        footprint: One of `FOOTPRINTS`, optionally with options (`"box:samples=8"`). None: the default at
+        footprint: One of `FOOTPRINTS`, optionally with options (`"box:samples=16"`). None: the default at
             the time of rendering, see `set_default_footprint`, of which a program that trains nothing is warned once.
         effects: What the rendering has beyond three colours of a pinhole camera, see `Effects`; None: nothing. "auto":
             spherical harmonics only up to the degree above which they change no colour by more than 1/255. That degree

@@ -232,34 +232,23 @@ def _same_filter(a: GaussianRasterizationSettings, b: GaussianRasterizationSetti
     return one.device == other.device and one.shape == other.shape and torch.equal(one, other)
 
 
-def list_tiles(splats: Splats, *, background: torch.Tensor | None = None, keep: bool = True) -> TileLists:
+def list_tiles(splats: Splats, *, keep: bool = True) -> TileLists:
     """Lists the splats of every tile, in the order of depth. Without gradient. Splats of equal depth keep their order.
 
     Args:
         splats: What `project` returned.
-        background: (3,) colour that `adaptive` takes to lie behind the splats; None: black. Other footprints do not
-            read it.
         keep: Whether to make what the backward pass of `blend` needs, too.
 
     Returns:
         `TileLists` of all cameras.
-
-    Raises:
-        TypeError: background is no tensor, or has another dtype than the splats.
-        ValueError: The footprint is `adaptive`, which chooses samples by colours, and the splats have none; or
-            background has a wrong shape or device.
     """
     s = splats
-    if background is not None:
-        check_tensors(s.means2d.device, background=background)
     tensors = torch.ops.analytic_rasterizer.bin(
         means2d=s.means2d.detach(),
         cov2d=s.cov2d.detach(),
         dets=s.dets,
         opacities=s.opacities.detach(),
         depths=s.depths.detach(),
-        colors=s.colors.detach() if len(s.colors) == len(s.means2d) else None,
-        background=background,
         row_splits=s.row_splits,
         keep=keep,
         **s.size,
@@ -338,9 +327,8 @@ class Stages(NamedTuple):
         pairs: (N,) int32, the splat of each of the N (tile, splat) pairs, by tile, then front to back.
         tile_offsets: (tiles + 1,) int64, first pair of each tile, tiles row by row. Tiles have 16x16 px. On CUDA those
             of `moment` have 8x8, except with one cell in images of 4096 or more tiles of 8x8 px, where they have 16x16,
-            and with 9 and 16 cells in smaller ones, where they have 4x4; those of `box` with 16 samples have 4x4, and
+            and with 16 cells in smaller ones, where they have 4x4; those of `box` with 16 samples have 4x4, and
             with 4 in images of fewer than 4096 tiles of 16x16 px 8x8.
-        tile_samples: (tiles,) int32, samples of each tile where the footprint chooses them (`adaptive`), else empty.
         seconds: Time of each stage, s: "project", "list_tiles", "blend".
     """
 
@@ -351,7 +339,6 @@ class Stages(NamedTuple):
     means2d: torch.Tensor
     pairs: torch.Tensor
     tile_offsets: torch.Tensor
-    tile_samples: torch.Tensor
     seconds: dict[str, float]
 
 
@@ -402,4 +389,4 @@ def render_stages(
     z = depths(means3D, settings.viewmatrix)[ids.long()]
     times = dict(zip(("project", "list_tiles", "blend"), seconds.tolist()))
     means2d = splats[:, :2].clone()
-    return Stages(color, radii, ids, z, means2d, pairs, lists["tile_offsets"], lists["tile_samples"], times)
+    return Stages(color, radii, ids, z, means2d, pairs, lists["tile_offsets"], times)

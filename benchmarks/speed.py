@@ -46,7 +46,7 @@ from analytic_rasterizer.analysis.tables import format_table
 from analytic_rasterizer.analysis.timing import Case, event_seconds, seconds_of
 from analytic_rasterizer.gaussians import Gaussians
 
-FOOTPRINTS = ["box:samples=1", "point", "mip", "cumulant", "analytic", "box:samples=2", "box:samples=4"]
+FOOTPRINTS = ["box:samples=1", "point", "mip", "cumulant", "analytic", "box:samples=4"]
 STAGES = ("project", "list_tiles", "blend")
 HOST = ("host op", "host rasterizer", "host f+b")
 

@@ -23,8 +23,8 @@ from analytic_rasterizer.analysis.tables import markdown_table
 from analytic_rasterizer.analysis.timing import describe_machine
 
 FOOTPRINTS = ["box:samples=1", "mip", "point", "cumulant", "analytic"]
-FOOTPRINTS += [f"box:samples={samples}" for samples in (2, 4, 8, 16)]
-FOOTPRINTS += [f"moment:samples={cells}" for cells in (1, 4, 9, 16)] + ["adaptive"]
+FOOTPRINTS += [f"box:samples={samples}" for samples in (4, 16)]
+FOOTPRINTS += [f"moment:samples={cells}" for cells in (1, 4, 16)]
 SH_DEGREE = 3
 
 

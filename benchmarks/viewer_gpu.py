@@ -38,7 +38,8 @@ import numpy as np
 
 MODULES = ("constants.js", "logistic.js", "shaders.js")
 EXTRACT = """
-import { CONSTANTS, FOOTPRINTS, boxNodes, parseFootprint } from './constants.js';
+import { readFileSync } from 'fs';
+import { CONSTANTS, nodesOf } from './constants.js';
 import { windowTable } from './logistic.js';
 import {
   ADD, FULL_SCREEN, SPLATS_PER_INSTANCE, SPLATS_PER_ROW, drawFragmentShader, drawVertexShader, projectShader,
@@ -47,9 +48,8 @@ import {
 
 const DEGREES = [0, 1, 2, 3];
 const footprints = {}, projections = {};
-for (const [name] of FOOTPRINTS) {
-  const { kind, samples, variance } = parseFootprint(name);
-  const nodes = kind === 'box' ? boxNodes(samples) : [[0, 0]];
+for (const { name, kind, samples, variance } of JSON.parse(readFileSync('footprints.json', 'utf8'))) {
+  const nodes = nodesOf(samples);
   const passes = atOnce => Array.from({ length: Math.ceil(nodes.length / atOnce) },
     (_, k) => drawFragmentShader(kind, nodes.slice(k * atOnce, (k + 1) * atOnce)));
   footprints[name] = {
@@ -185,12 +185,13 @@ def is_prepared(path: str) -> bool:
 
 def extract_shaders() -> dict:
     """The sources and numbers of the page, by its own modules."""
-    from analytic_rasterizer.viewer import pages
+    from analytic_rasterizer.viewer import packing, pages
 
     with tempfile.TemporaryDirectory() as folder:
         for name in MODULES:
             (Path(folder) / name).write_text(pages.page_file(name))
         (Path(folder) / "package.json").write_text('{"type": "module"}')
+        (Path(folder) / "footprints.json").write_text(json.dumps(packing.PAGE_ENTRIES))
         (Path(folder) / "extract.js").write_text(EXTRACT)
         try:
             done = subprocess.run(["node", "extract.js"], cwd=folder, capture_output=True, text=True, check=True)

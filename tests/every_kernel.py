@@ -49,7 +49,7 @@ class Image(NamedTuple):
 # 512x512 pixels are 4096 tiles of 8x8: enough for the kernels of large images of `moment`. Those of `box` with four
 # samples need 1024x1024, and only they are given so many. Lists of thousands of splats have chunks
 # behind the front, and several segments; those of kLongList pairs or more (csrc/cuda/cut_lists.cuh) are cut in large
-# images too, and alone in small ones with 9 and 16 cells, and have a layout of their own. Where Gaussians are opaque,
+# images too, and alone in small ones with 16 cells, and have a layout of their own. Where Gaussians are opaque,
 # pixels close (so little light is left that 3DGS stops) before their lists end.
 # test_every_kernel_has_images_that_need_it in test_benchmarks.py asserts all this.
 IMAGES = {

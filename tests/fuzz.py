@@ -149,8 +149,6 @@ def check(seed, device="cpu", dtype=torch.float32):
 
 def check_properties(seed, device, dtype):
     camera, effects, variant, scene, broken, discoloured = random_case(seed)
-    if device == "cuda" and variant[0] == "adaptive":
-        return
     footprint, options = variant
     where = f"seed {seed}, {name_of(variant)}, {device}, {dtype}, {effects}"
     settings = camera.settings(dtype, device, footprint=footprint, effects=effects, **options)

@@ -585,11 +585,7 @@ class Report:
 
 
 def measure(case, variant, device, dtype=torch.float32):
-    """Renders a case in `dtype` and compares with float64 on the CPU, for the same float32 numbers.
-
-    Where `adaptive` takes another number of samples for a tile in float32, its estimate being at a limit, the pixels
-    of that tile are not compared; those of the other tiles are.
-    """
+    """Renders a case in `dtype` and compares with float64 on the CPU, for the same float32 numbers."""
     import scenes
 
     camera, scene = case.build()
@@ -599,12 +595,7 @@ def measure(case, variant, device, dtype=torch.float32):
     a = settings_of(camera, dtype, like, variant, device, case.effects)
     b = settings_of(camera, torch.float64, like, variant, effects=case.effects)
     g = torch.Generator().manual_seed(1)
-    clear, same = clear_pixels(b, exact, case.margin), torch.ones((), dtype=torch.bool)
-    if variant[0] == "adaptive":
-        same = pixels_of_tiles(
-            scenes.tile_samples(a, ours).cpu() == scenes.tile_samples(b, exact), camera.image_height, camera.image_width
-        )
-        clear = clear & same
+    clear = clear_pixels(b, exact, case.margin)
     loss = rand(g, 3, camera.image_height, camera.image_width, low=-1.0) * clear
     color, _, grads = run(a, ours, loss)
     expected, _, wanted = run(b, exact, loss)
@@ -628,7 +619,7 @@ def measure(case, variant, device, dtype=torch.float32):
     error = {name: rows(grads[name] - wanted[name]) for name in wanted}
     # A flipped contribution: 1/255 of the difference of two colours, if not a splat stopped at T = 1e-4.
     in_pixels = torch.where(clear, operations * (moved_image + eps * image_size), 2 / 255 * image_size)
-    tolerance["image"], error["image"] = in_pixels, (color - expected).abs().amax(0) * same
+    tolerance["image"], error["image"] = in_pixels, (color - expected).abs().amax(0)
     image_error = (error["image"][clear].max().item() if clear.any() else 0.0) / image_size
     if variant[0] == "analytic":
         spread = sigma_px(exact) / camera.image_width
@@ -641,13 +632,6 @@ def measure(case, variant, device, dtype=torch.float32):
     name = f"{case.name}, {variant}, {device}, {dtype}"
     unclear = 1 - clear.double().mean().item()
     return Report(name, finite, unclear, error, tolerance, size, image_error)
-
-
-def pixels_of_tiles(values, height, width):
-    """(height, width) of what each pixel's tile has in `values` (tile rows, tile columns)."""
-    from analytic_rasterizer import TILE
-
-    return values.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
 
 
 def sigma_px(scene):

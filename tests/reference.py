@@ -31,7 +31,6 @@ DEFAULT_OPTIONS = {
     "cumulant": {},
     "box": {"samples": 4},
     "moment": {"samples": 4},
-    "adaptive": {"tolerance": 1 / 255},
     "erf": {},
     "exact": {},
 }
@@ -184,9 +183,7 @@ def rotated_window(offset, cov2d, frame_gradient="paper", window=logistic_window
 def box_nodes(samples):
     """Nodes (S, 2) [px] of the `box` footprint, from the numerics notes."""
     half = {
-        2: [(0.25, 0.25)],
         4: [(-0.12083, -0.36226), (0.36226, -0.12083)],
-        8: [(0.23261, 0.40079), (0.39744, 0.06586), (0.31083, -0.35497), (0.06179, -0.14672)],
         16: [
             (0.26975, -0.14597), (0.14427, -0.43939), (0.06200, -0.14646), (0.18749, 0.14720),
             (0.43551, -0.31294), (0.39499, 0.06396), (0.10473, 0.35640), (0.39573, 0.39912),
@@ -199,8 +196,8 @@ def box_nodes(samples):
 
 
 def box_variance(samples):
-    """Variance [px^2] of each of the S small Gaussians: 1/12, 1/48, then 1/(24 S)."""
-    return {1: 1 / 12, 2: 1 / 48}.get(samples, 1 / (24 * samples))
+    """Variance [px^2] of each of the S small Gaussians: 1/12 of one, else 1/(24 S)."""
+    return 1 / 12 if samples == 1 else 1 / (24 * samples)
 
 
 def cell_nodes(samples):
@@ -229,12 +226,8 @@ def sample_weights(offset, cov2d, footprint, moved=None, **options):
     """Weights (S, ...) of the samples that are composited on their own; S = 1 for all but `box` and `moment`.
 
     `moved` (S, ..., 2) is what moved_nodes() says, by default nothing.
-
-    `adaptive` by itself, without a tile, is `box` with 16 samples.
     """
     options = settled(footprint, options)
-    if footprint == "adaptive":
-        footprint, options = "box", {"samples": 16}
     if footprint == "point":
         return gaussian(offset, add_variance(cov2d, options["dilation"]))[None]
     if footprint == "mip":
@@ -492,7 +485,7 @@ class Rendered(NamedTuple):
     `margin` is the smallest relative distance of any alpha or transmittance that was compared with
     a threshold from that threshold: finite differences and float32 are meaningful only well inside
     it. `pixel_margin` (H, W) is the same per pixel. `offsets` maps a Gaussian to its (H, W, 2)
-    offsets, whose gradient (kept) is minus the gradient of the mean, pixel by pixel; several for `adaptive`.
+    offsets, whose gradient (kept) is minus the gradient of the mean, pixel by pixel.
     """
 
     color: torch.Tensor
@@ -513,7 +506,6 @@ def radius_covariance(cov2d, footprint, **options):
         "cumulant": 1 / 12,
         "box": 1 / 12,
         "moment": 1 / 12,
-        "adaptive": 1 / 12,
         "erf": 0.0,
         "exact": 1 / 12,
     }[footprint]
@@ -544,17 +536,11 @@ def render(
 ):
     """Render P Gaussians; arguments as the library's rasterizer takes them, all float64.
 
-    `adaptive` takes `tile_samples`, what was chosen for every tile.
-
     means2D (P, 2 or more) or None: its value is ignored, its gradient is dL/d(mean in px) * (W, H)
     / 2.
     """
     height, width = settings.image_height, settings.image_width
     half = torch.tensor([width / 2, height / 2], dtype=torch.float64)
-    if footprint == "adaptive":
-        scene = {"shs": shs, "colors_precomp": colors_precomp, "scales": scales, "rotations": rotations}
-        scene |= {"means3D": means3D, "means2D": means2D, "opacities": opacities, "cov3D_precomp": cov3D_precomp}
-        return render_adaptive(settings, scene, options["tile_samples"], keep_offsets)
     if cov3D_precomp is None:
         covariance = covariance_3d(scales, rotations, settings.scale_modifier)
     else:
@@ -601,7 +587,7 @@ def render(
         offset = pixels - means2d[i]
         if keep_offsets and offset.requires_grad:
             offset.retain_grad()
-            offsets[i] = [offset]
+            offsets[i] = offset
         response = opacities[i] * sample_weights(offset, cov2d[i], footprint, moved=moved, **options)
         keep_away(response, ALPHA_MIN, ~stopped)
         keep_away(response, ALPHA_MAX, ~stopped)
@@ -626,71 +612,6 @@ def render(
     return Rendered(color, radii.int(), projection, pixel_margin.min().item(), pixel_margin, offsets)
 
 
-TILE = 16
-# docs/numerics.md, "Samples of a tile": limits of the estimate for 1, 4 and 8 samples.
-SAMPLE_LIMITS = {
-    0.25 / 255: (6.26e-5, 2.66e-4, 4.32e-4),
-    0.5 / 255: (1.51e-4, 4.27e-4, 1.50e-3),
-    1 / 255: (2.62e-4, 7.31e-4, 3.10e-3),
-    2 / 255: (3.63e-4, 2.79e-3, 3.98e-3),
-    4 / 255: (8.85e-4, 3.98e-3, 6.48e-3),
-}
-
-
-def tile_estimates(projection, opacities, colors, bg, grid, lists):
-    """Estimated error of a single sample per pixel, up to a factor, for each of rows x columns tiles.
-
-    `lists`: for every tile, row by row, the Gaussians that it lists, front to back.
-    """
-    means2d, cov2d, _ = projection
-    rows, columns = grid
-    fine, pixel, window = (add_variance(cov2d, v) for v in (box_variance(8), 1 / 12, TILE**2 / 12))
-    root = torch.sqrt(determinant(cov2d))
-    detail = opacities * root * determinant(fine) ** -1.5 * box_variance(8) * (fine[:, 0] + fine[:, 2])
-    level = (2 * torch.log(255 * opacities * root / torch.sqrt(determinant(pixel)))).clamp(min=0)
-    ring = torch.sqrt(level * (pixel[:, 0] + pixel[:, 2]) / 2) / (opacities * root)
-    edge = 0.03 / 255**2 * ring.clamp(max=1e4)
-    estimates = torch.zeros(rows * columns, dtype=torch.float64)
-    for tile, ids in enumerate(lists):
-        center = torch.tensor([tile % columns, tile // columns]).double() * TILE + (TILE - 1) / 2
-        distance = quadratic(center - means2d[ids], window[ids])
-        share = opacities[ids] * root[ids] / torch.sqrt(determinant(window[ids])) * torch.exp(-distance / 2)
-        share = share.clamp(max=ALPHA_MAX)
-        behind = torch.cumprod(1 - share, 0)
-        through = torch.cat([torch.ones(1).double(), behind])
-        count = int((through[:-1] >= 0.03).sum())
-        through, share, ids = through[: count + 1], share[:count], ids[:count]
-        passed = share * detail[ids] / (1 - share) ** 2
-        front = torch.cumsum(passed, 0) - passed
-        weight = through[:-1] ** 2 * share * (detail[ids] * front + edge[ids])
-        mean = ((through[:-1] * share)[:, None] * colors[ids]).sum(0) + through[-1] * bg
-        estimates[tile] = torch.sqrt((weight[:, None] * (colors[ids] - mean) ** 2).sum(0).mean())
-    return estimates.reshape(rows, columns)
-
-
-def render_adaptive(settings, scene, tile_samples, keep_offsets):
-    """render() of `adaptive`: each tile as `box` with its number of samples (rows, columns)."""
-    height, width = settings.image_height, settings.image_width
-    each = tile_samples.repeat_interleave(TILE, 0).repeat_interleave(TILE, 1)[:height, :width]
-    whole = None
-    for samples in each.unique().tolist():
-        part = render(settings, **scene, footprint="box", samples=samples, keep_offsets=keep_offsets)
-        own = each == samples
-        if whole is None:
-            whole = part
-            continue
-        pixel_margin = torch.where(own, part.pixel_margin, whole.pixel_margin)
-        whole = Rendered(
-            torch.where(own, part.color, whole.color),
-            torch.maximum(part.radii, whole.radii),
-            whole.projection,
-            pixel_margin.min().item(),
-            pixel_margin,
-            {i: whole.offsets.get(i, []) + part.offsets.get(i, []) for i in {*whole.offsets, *part.offsets}},
-        )
-    return whole
-
-
 def absolute_gradient(rendered, count, settings):
     """Columns 2:4 of a (P, 4) means2D gradient: sum over pixels of |dL/d(mean)| * (W, H) / 2."""
     return _sum_over_pixels(rendered, count, settings, torch.abs)
@@ -704,8 +625,7 @@ def norm_gradient(rendered, count, settings):
 def _sum_over_pixels(rendered, count, settings, of_pixel):
     out = torch.zeros(count, 2, dtype=torch.float64)
     scale = torch.tensor([settings.image_width / 2, settings.image_height / 2])
-    for i, of_samples in rendered.offsets.items():
-        for offset in of_samples:  # no pixel has a gradient in more than one
-            if offset.grad is not None:
-                out[i] += of_pixel(offset.grad * scale).sum((0, 1))
+    for i, offset in rendered.offsets.items():
+        if offset.grad is not None:
+            out[i] += of_pixel(offset.grad * scale).sum((0, 1))
     return out

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 
 import torch
 
-import analytic_rasterizer as ar
 from analytic_rasterizer import FOOTPRINTS
 from analytic_rasterizer.footprints import REFERENCE_FOOTPRINTS
 
@@ -14,9 +13,8 @@ OPTIONS = {
     "point": [{}, {"dilation": 0.0}],
     "mip": [{}, {"variance": 0.25}],
     "analytic": [{"frame_gradient": "frozen"}, {"frame_gradient": "paper"}],
-    "box": [{"samples": samples} for samples in (1, 2, 4, 8, 16)],
-    "moment": [{"samples": samples} for samples in (1, 4, 9, 16)],
-    "adaptive": [{"tolerance": 1 / 255}],
+    "box": [{"samples": samples} for samples in (1, 4, 16)],
+    "moment": [{"samples": samples} for samples in (1, 4, 16)],
 }
 # Every registered footprint with these: a new one is tested without a change here.
 VARIANTS = [(footprint, options) for footprint in FOOTPRINTS for options in OPTIONS.get(footprint, [{}])]
@@ -30,8 +28,8 @@ KINDS = [
     if footprint not in REFERENCE_FOOTPRINTS
 ]
 # One of each path through the rasterizer, for tests where the formula of the weight does not matter: one sample per
-# pixel with a conic and with eigenvectors, several samples, samples that move, a number of samples per tile.
-PATHS = [("cumulant", {}), ("analytic", {}), ("box", {"samples": 4}), ("moment", {"samples": 4}), ("adaptive", {})]
+# pixel with a conic and with eigenvectors, several samples, samples that move.
+PATHS = [("cumulant", {}), ("analytic", {}), ("box", {"samples": 4}), ("moment", {"samples": 4})]
 
 
 def name_of(variant):
@@ -241,12 +239,6 @@ def to(named, device):
 def settings_to(settings, device):
     """ar.GaussianRasterizationSettings with their tensors on another device."""
     return settings._replace(**to(settings._asdict(), device))
-
-
-def tile_samples(settings, scene):
-    """What `adaptive` chooses (tile rows, tile columns)."""
-    stages = ar.render_stages(settings, **{name: value for name, value in scene.items() if name != "means2D"})
-    return stages.tile_samples.reshape(-(-settings.image_height // ar._C.TILE), -1).cpu()
 
 
 def leaves(scene):

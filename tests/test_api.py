@@ -114,7 +114,7 @@ def test_settings_look_like_those_of_3dgs_2023():
     assert all(p.default is inspect.Parameter.empty for p in inspect.signature(Settings).parameters.values())
 
 
-@pytest.mark.parametrize("extra", [{}, {"footprint": "box", "samples": 8}], ids=["plain", "box"])
+@pytest.mark.parametrize("extra", [{}, {"footprint": "box", "samples": 16}], ids=["plain", "box"])
 def test_settings_are_a_tuple(extra):
     fields = CAMERA.fields()
     by_keyword = Settings(**fields, **extra)
@@ -135,7 +135,7 @@ def test_settings_are_equal_where_footprint_and_effects_are_too():
     variants = [
         settings,
         settings._replace(footprint="box", samples=4),
-        settings._replace(footprint="box", samples=8),
+        settings._replace(footprint="box", samples=16),
         settings._replace(effects=ar.Effects(alpha=True)),
         settings._replace(effects=ar.Effects(filter_3d=torch.ones(3))),
         settings._replace(effects="auto"),
@@ -161,7 +161,7 @@ def test_missing_and_unknown_fields():
         Settings(**fields, samples=4)  # an option without its footprint
 
 
-BOX8 = {"footprint": "box", "samples": 8}
+BOX16 = {"footprint": "box", "samples": 16}
 
 
 def assert_same_footprint(settings, expected):
@@ -181,7 +181,7 @@ def assert_same_footprint(settings, expected):
     ids=["_replace", "copy", "deepcopy", "pickle", "rebuilt"],
 )
 def test_copies_keep_the_footprint(how):
-    settings = CAMERA.settings(torch.float32, **BOX8)
+    settings = CAMERA.settings(torch.float32, **BOX16)
     duplicate = how(settings)
     assert type(duplicate) is Settings
     assert duplicate._fields == FIELDS
@@ -190,7 +190,7 @@ def test_copies_keep_the_footprint(how):
 
 
 def test_replace():
-    settings = CAMERA.settings(torch.float32, **BOX8)
+    settings = CAMERA.settings(torch.float32, **BOX16)
     smaller = settings._replace(image_height=10)
     assert smaller.image_height == 10
     assert settings.image_height == 37
@@ -215,8 +215,8 @@ def test_settings_without_footprint_follow_the_default():
         name_of(v): render(scene32(), CAMERA.settings(torch.float32, footprint=v[0], **v[1]))[0] for v in RENDERED
     }
     assert torch.equal(render(scene32(), settings)[0], expected["analytic-frozen"])
-    ar.set_default_footprint("box", samples=2)
-    assert torch.equal(render(scene32(), settings)[0], expected["box-2"])
+    ar.set_default_footprint("box", samples=1)
+    assert torch.equal(render(scene32(), settings)[0], expected["box-1"])
     ar.set_default_footprint("point:dilation=0")
     assert str(ar.get_default_footprint()).startswith("point")
     assert torch.equal(render(scene32(), settings)[0], expected["point-0.0"])
@@ -231,9 +231,9 @@ def test_settings_without_footprint_follow_the_default():
 
 def test_environment_variable(monkeypatch):
     variable = "ANALYTIC_RASTERIZER_FOOTPRINT"
-    monkeypatch.setenv(variable, "box:samples=2")
-    assert str(ar.get_default_footprint()) == "box:samples=2"
-    assert_same_footprint(CAMERA.settings(torch.float32), CAMERA.settings(torch.float32, footprint="box", samples=2))
+    monkeypatch.setenv(variable, "box:samples=1")
+    assert str(ar.get_default_footprint()) == "box:samples=1"
+    assert_same_footprint(CAMERA.settings(torch.float32), CAMERA.settings(torch.float32, footprint="box", samples=1))
     ar.set_default_footprint("mip")  # the call wins over the variable
     assert ar.get_default_footprint().name == "mip"
     ar.set_default_footprint(None)
@@ -736,8 +736,8 @@ def test_settings_of_another_class_are_named(device):
 
 def test_footprints_are_taken_where_their_names_are():
     """So that a program can put the default back that it found."""
-    box = ar.resolve_footprint("box:samples=8")
-    assert ar.resolve_footprint(box) == box and ar.resolve_footprint(box, samples=2).samples == 2
+    box = ar.resolve_footprint("box:samples=16")
+    assert ar.resolve_footprint(box) == box and ar.resolve_footprint(box, samples=1).samples == 1
     found = ar.get_default_footprint()
     try:
         ar.set_default_footprint(box)
@@ -747,7 +747,7 @@ def test_footprints_are_taken_where_their_names_are():
     finally:
         ar.set_default_footprint(None)
     offset, cov2d = torch.zeros(2), torch.tensor([0.5, 0.1, 0.4])
-    assert torch.equal(ar.footprint_weight(offset, cov2d, box), ar.footprint_weight(offset, cov2d, "box:samples=8"))
+    assert torch.equal(ar.footprint_weight(offset, cov2d, box), ar.footprint_weight(offset, cov2d, "box:samples=16"))
     with pytest.raises(ValueError, match="name must be a footprint where options are given, got None with samples"):
         ar.set_default_footprint(None, samples=4)
 
@@ -757,7 +757,13 @@ def test_footprints_are_taken_where_their_names_are():
     [
         ({"footprint": "gauss"}, r"footprint must .*got 'gauss'"),
         ({"footprint": ""}, r"footprint must .*got ''"),
-        ({"footprint": "box", "samples": 3}, r"samples must .*got 3"),
+        ({"footprint": "adaptive"}, r"footprint must .*got 'adaptive'; take box with 16 samples or moment with 4$"),
+        ({"footprint": "box", "samples": 3}, r"samples must be one of 1, 4, 16, got 3; nearest: samples=1 or 4$"),
+        ({"footprint": "box:samples=8"}, r"samples must be one of 1, 4, 16, got '8'; nearest: samples=4 or 16$"),
+        ({"footprint": "moment:samples=9"}, r"samples must be one of 1, 4, 16, got '9'; nearest: samples=4 or 16$"),
+        ({"footprint": "moment:samples=99"}, r"got '99'; nearest: samples=16$"),
+        ({"footprint": "moment:samples=four"}, r"got 'four'$"),
+        ({"footprint": "moment:samples=nan"}, r"got 'nan'$"),
         ({"footprint": "box:samples=0"}, r"samples must .*got '?0"),
         ({"footprint": "box:sample=4"}, r"'sample'"),
         ({"footprint": "box:4"}, r"'4'"),

@@ -67,7 +67,7 @@ def write(folder, contents):
 
 
 MOMENT, BOX, MARKED, POINT = (
-    {"footprint": "moment:samples=4"}, {"footprint": "box:samples=8"}, {"antialiased": True}, {"footprint": "point"}
+    {"footprint": "moment:samples=4"}, {"footprint": "box:samples=16"}, {"antialiased": True}, {"footprint": "point"}
 )  # fmt: skip
 OF_MOMENT = {"background": [0, 0, 0], "footprint": "moment:samples=4"}
 # Files, SCENE, the environment, --footprint, and what is chosen with a part of the reason.
@@ -79,22 +79,22 @@ CHOICES = {
     "an empty environment": ({"a.ply": MOMENT}, "a.ply", "", None, "moment:samples=4", "a.ply says so"),
     "thin Gaussians": ({"a.ply": None}, "a.ply", "moment", None, "moment:samples=4", "too thin for moment, so first"),
     "thin by the tag": ({"a.ply": POINT}, "a.ply", None, "box", "box:samples=4", "its Gaussians are too thin"),
-    "own tag": ({"a.ply": BOX}, "a.ply", None, None, "box:samples=8", "a.ply says so"),
+    "own tag": ({"a.ply": BOX}, "a.ply", None, None, "box:samples=16", "a.ply says so"),
     "own tag of point": ({"a.ply": POINT}, "a.ply", None, None, UNMARKED, "a.ply says so; right at the size of"),
     "tag of others": ({"a.ply": MARKED}, "a.ply", None, None, MIP, "antialiasing filter, and not which"),
-    "beside an unbaked one": ({"a.ply": None, "b.ply": BOX}, "b.ply", None, None, "box:samples=8", "b.ply says so"),
-    "compressed": ({"a.compressed.ply": BOX}, "a.compressed.ply", None, None, "box:samples=8", "says so"),
-    "spz": ({"a.spz": BOX}, "a.spz", None, None, "box:samples=8", "a.spz says so"),
+    "beside an unbaked one": ({"a.ply": None, "b.ply": BOX}, "b.ply", None, None, "box:samples=16", "b.ply says so"),
+    "compressed": ({"a.compressed.ply": BOX}, "a.compressed.ply", None, None, "box:samples=16", "says so"),
+    "spz": ({"a.spz": BOX}, "a.spz", None, None, "box:samples=16", "a.spz says so"),
     "unmarked spz": ({"a.spz": None}, "a.spz", None, None, UNMARKED, "a.spz names none"),
     "flag of spz": ({"a.spz": MARKED}, "a.spz", None, None, MIP, "antialiasing filter, and not which"),
-    "suffix in capitals": ({"a.PLY": BOX}, "a.PLY", None, None, "box:samples=8", "says so"),
+    "suffix in capitals": ({"a.PLY": BOX}, "a.PLY", None, None, "box:samples=16", "says so"),
     "a training": (
         {"scene.ply": MOMENT, "options.json": options_json("moment", background=[1, 1, 1])},
         ".", None, None, "moment:samples=4", "scene.ply says so",
     ),
     "a training before tags": (
-        {"scene.ply": MARKED, "options.json": options_json("box:samples=2")},
-        "scene.ply", None, None, "box:samples=2", "options.json beside scene.ply says so",
+        {"scene.ply": MARKED, "options.json": options_json("box:samples=1")},
+        "scene.ply", None, None, "box:samples=1", "options.json beside scene.ply says so",
     ),
     "point, before tags": (
         {"scene.ply": None, "options.json": options_json("point:dilation=0.1")},
@@ -118,7 +118,7 @@ CHOICES = {
     ),
     "a baked one over it": (
         {"scene.ply": BOX, "options.json": options_json("point", background=[0, 0, 0])},
-        "scene.ply", None, None, "box:samples=8", "scene.ply says so",
+        "scene.ply", None, None, "box:samples=16", "scene.ply says so",
     ),
     "options of another program": (
         {"scene.ply": MARKED, "options.json": "[3]"}, "scene.ply", None, None, MIP, "and not which",
@@ -148,7 +148,7 @@ def test_footprint_of_a_scene(tmp_path, monkeypatch, case):
     assert "\n" not in choice.reason
 
 
-@pytest.mark.parametrize("footprint", ["moment:samples=9", "box:samples=1", "mip:variance=0.2", "point:dilation=0.1"])
+@pytest.mark.parametrize("footprint", ["moment:samples=16", "box:samples=1", "mip:variance=0.2", "point:dilation=0.1"])
 @pytest.mark.parametrize(
     "first, second", [("a.ply", "b.spz"), ("a.spz", "b.compressed.ply"), ("a.compressed.ply", "b.ply")]
 )

@@ -58,9 +58,9 @@ def function(given):
 
 def stages(given):
     features, behind = given.pop("features"), given.pop("behind")
-    settings = settings_with(given, footprint="adaptive")
+    settings = settings_with(given, footprint="box:samples=16")
     splats = ar.project(settings, **{k: v for k, v in given.items() if k != "means2D"})
-    lists = ar.list_tiles(splats, background=behind.detach())
+    lists = ar.list_tiles(splats)
     features = features[splats.gaussian_ids.long()]
     return (*ar.blend(splats, lists, features, behind), splats.means2d, splats.cov2d)
 

@@ -57,7 +57,7 @@ def stages(scene, variant, dtype=torch.float64, device="cpu"):
 
 def tile_size(variant, device):
     """Tiles on CUDA of samples that move, or that are spread over lanes, are smaller in an image as small as this."""
-    smaller = {("moment", 1): 8, ("moment", 4): 8, ("moment", 9): 4, ("moment", 16): 4, ("box", 4): 8, ("box", 16): 4}
+    smaller = {("moment", 1): 8, ("moment", 4): 8, ("moment", 16): 4, ("box", 4): 8, ("box", 16): 4}
     return smaller.get((variant[0], variant[1].get("samples")), ar.TILE) if device == "cuda" else ar.TILE
 
 

@@ -57,10 +57,7 @@ def render_both(scene, settings, variant, dtype, device):
     exact = scenes.leaves(scene)
     fields = {name: getattr(settings, name).detach().cpu().double().requires_grad_() for name in CAMERA_INPUTS}
     theirs = settings._replace(bg=settings.bg.cpu().double(), **fields)
-    kwargs = dict(options)
-    if footprint == "adaptive":
-        kwargs["tile_samples"] = torch.full((2, 3), 16)
-    expected = reference.render(theirs, **exact, footprint=footprint, **kwargs)
+    expected = reference.render(theirs, **exact, footprint=footprint, **options)
     return (image, expected), (leaves, exact), fields, radii
 
 
@@ -68,8 +65,6 @@ def render_both(scene, settings, variant, dtype, device):
 @pytest.mark.parametrize("name", EFFECTS)
 def test_matches_the_reference(device, best, variant, name):
     """The image, and the gradient by everything, against autograd through the plain formulas."""
-    if variant[0] == "adaptive":
-        variant = ("adaptive", {"tolerance": 1e-9})  # 16 samples everywhere
     scene = scenes.random_scene(21, 24, degree=1, sigma=(0.02, 0.4))
     scene["shs"] = scene["shs"] * 0.3  # colours away from the clamp at zero
     settings, camera = settings_of(EFFECTS[name], *variant, dtype=best, device=device)
@@ -112,8 +107,6 @@ def test_gradcheck_of_the_pose_and_the_focal_lengths(variant, orthographic):
     footprint, options = variant
     if footprint == "analytic":
         options = {"frame_gradient": "paper"}
-    if footprint == "adaptive":
-        options = {"tolerance": 1e-9}
     scene = scenes.smooth_scene(40, degree=1)
     scene["shs"] = scene["shs"] * 0.3
     scale = 1 if not orthographic else 1 / 4
@@ -458,7 +451,7 @@ def test_blur_keeps_the_light(device, best):
     assert all(abs(t / total[0] - 1) < 0.02 for t in total), total
 
 
-@pytest.mark.parametrize("footprint", [name for name, _ in KINDS if name != "adaptive"])
+@pytest.mark.parametrize("footprint", [name for name, _ in KINDS])
 @pytest.mark.parametrize("ratio", [1e2, 1e4])
 def test_blurred_needles_have_gradients_in_float32(device, footprint, ratio):
     """Against float64, with streaks along and across needles and a lens nearly in focus."""
@@ -507,16 +500,13 @@ def test_harmonics_match_scipy(degree):
 def test_degree_four(device, best, variant):
     """Colours and gradients against the reference; and a scene of fewer coefficients says what is missing."""
     footprint, options = variant
-    if footprint == "adaptive":
-        options = {"tolerance": 1e-9}
     scene = scenes.random_scene(19, 20, degree=4, sigma=(0.1, 0.4))
     scene["shs"][:, 1:] *= 0.3
     camera = Camera(image_height=27, image_width=35, sh_degree=4)
     settings = camera.settings(best, device, footprint=footprint, **options)
     leaves, exact = scenes.leaves(scenes.to(scenes.cast(scene, best), device)), scenes.leaves(scene)
     image, _ = ar.GaussianRasterizer(settings)(**leaves)
-    kwargs = {"tile_samples": torch.full((2, 3), 16)} if footprint == "adaptive" else options
-    expected = reference.render(camera.settings(), **exact, footprint=footprint, **kwargs)
+    expected = reference.render(camera.settings(), **exact, footprint=footprint, **options)
     clear = expected.pixel_margin > (1e-4 if best == torch.float32 else 1e-9)
     assert ((image.detach().cpu() - expected.color.detach()).abs() * clear).max() < (
         2e-5 if best == torch.float32 else 1e-10

@@ -27,8 +27,8 @@ FOOTPRINT_ARGUMENTS = {
     "default": ([], {"footprint": "point"}),  # what a file wants that says nothing
     "point": (["--footprint", "point"], {"footprint": "point"}),
     "dilation": (["--footprint", "point:dilation=0"], {"footprint": "point", "dilation": 0.0}),
-    "box": (["--footprint", "box:samples=2"], {"footprint": "box", "samples": 2}),
-    "samples": (["--footprint", "box", "--samples", "8"], {"footprint": "box", "samples": 8}),
+    "box": (["--footprint", "box:samples=1"], {"footprint": "box", "samples": 1}),
+    "samples": (["--footprint", "box", "--samples", "16"], {"footprint": "box", "samples": 16}),
 }
 
 

@@ -114,7 +114,7 @@ def test_other_gaussians_do_not_change_a_gradient_by_a_bit(device, variant):
 # --- instruction sets --------------------------------------------------------------------------
 #
 # float64 runs the baseline's code at every level: not a bit differs. In float32 what is done once per Gaussian (radii,
-# means, depths, lists, the choice of `adaptive`) is scalar code without contraction: not a bit differs either. What is
+# means, depths, lists) is scalar code without contraction: not a bit differs either. What is
 # done per pixel runs on packs. AVX2 and AVX-512 fuse multiply and add, the baseline does not; so the image has the same
 # bits on both of them and is rounded otherwise on the baseline. Gradients are sums over the lanes of a pack and differ
 # between all three.

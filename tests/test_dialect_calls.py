@@ -143,7 +143,7 @@ def test_settings_of_a_class_of_the_program_in_the_function(name):
 
 
 def test_settings_of_a_class_of_the_program_may_have_footprint_and_effects():
-    own = types.SimpleNamespace(**fields_of("gs2023"), footprint="box:samples=8", effects=ar.Effects(alpha=True))
+    own = types.SimpleNamespace(**fields_of("gs2023"), footprint="box:samples=16", effects=ar.Effects(alpha=True))
     made = drop_in.GaussianRasterizer(own)(**arguments_of("gs2023"))
     keywords = {"footprint": own.footprint, "effects": own.effects}
     assert_same(made[:2], render("gs2023", **keywords)[:2])

@@ -261,11 +261,11 @@ def test_the_filter_is_theirs_unless_the_user_chose_one(name, monkeypatch):
     color = render(name)[0]
     monkeypatch.setenv("ANALYTIC_RASTERIZER_FOOTPRINT", "cumulant")
     assert str(settings.footprint_in_use()) == "cumulant"
-    ar.set_default_footprint("box", samples=2)
-    assert str(settings.footprint_in_use()) == "box:samples=2"
+    ar.set_default_footprint("box", samples=1)
+    assert str(settings.footprint_in_use()) == "box:samples=1"
     assert str(settings_of(name, footprint="mip").footprint_in_use()) == "mip:variance=0.1"
     at = 2 if name == "lightgaussian_count" else 0
-    assert torch.equal(render(name)[at], plain(footprint="box:samples=2")[0])
+    assert torch.equal(render(name)[at], plain(footprint="box:samples=1")[0])
     assert not torch.equal(render(name)[at], color)
     # Settings of the library never have the filter of a dialect.
     ar.set_default_footprint(None)
@@ -372,8 +372,8 @@ def test_names_of_other_algorithms():
 @pytest.mark.parametrize("name", ORIGINALS)
 def test_settings_are_a_tuple_that_can_be_copied(name):
     fields = fields_of(name)
-    settings = settings_of(name, footprint="box:samples=2")
-    by_position = type(settings)(*fields.values(), footprint="box", samples=2)
+    settings = settings_of(name, footprint="box:samples=1")
+    by_position = type(settings)(*fields.values(), footprint="box", samples=1)
     copies = [
         copy.copy(settings),
         copy.deepcopy(settings),
@@ -384,7 +384,7 @@ def test_settings_are_a_tuple_that_can_be_copied(name):
     ]
     for same in copies:
         assert type(same) is type(settings) and same._fields == settings._fields == tuple(fields)
-        assert str(same.footprint) == "box:samples=2" and len(same) == len(fields)
+        assert str(same.footprint) == "box:samples=1" and len(same) == len(fields)
         assert same.image_height == same[0] == 30 and same.sh_degree == 1
         assert torch.equal(same.viewmatrix, settings.viewmatrix)
     assert settings._replace(image_height=7).image_height == 7

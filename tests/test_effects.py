@@ -51,8 +51,6 @@ def test_channels_are_colors_three_at_a_time(device, best, variant, channels):
     scene = scenes.cast(colored(scenes.random_scene(3, 50), channels), best)
     bg = torch.linspace(0.1, 0.9, channels, dtype=best)
     settings = with_bg(CAMERA.settings(best, footprint=footprint, **options), bg)
-    if footprint == "adaptive":  # chosen by the first three channels
-        settings = settings._replace(footprint="adaptive:tolerance=1e-9")
     inputs = scenes.leaves(scenes.to(scene, device))
     color, radii = ar.GaussianRasterizer(scenes.settings_to(settings, device))(**inputs)
     assert color.shape == (channels, 29, 37)
@@ -80,12 +78,9 @@ def test_outputs_match_the_reference(device, best, variant):
     assert torch.equal(radii, plain[1])
     assert (color - plain[0]).abs().max() <= (1e-6 if device == "cuda" else 0)  # one is ready for a backward pass
     settings = CAMERA.settings(footprint=footprint, **options)
-    kwargs = dict(options)
-    if footprint == "adaptive":
-        kwargs["tile_samples"] = scenes.tile_samples(scenes.settings_to(settings, "cpu"), scene)
     geometry = {k: v for k, v in scene.items() if k != "shs"}
     expected = reference.render(
-        settings, **geometry, colors_precomp=torch.where(z[:, None] > 0.2, colors, 1), footprint=footprint, **kwargs
+        settings, **geometry, colors_precomp=torch.where(z[:, None] > 0.2, colors, 1), footprint=footprint, **options
     ).color
     # Rounding of the dtype times what adds up in a pixel; depths here are below 8.
     bound = {torch.float64: 1e-11, torch.float32: 2e-5}[best]
@@ -138,8 +133,6 @@ def test_gradients_add_up_over_the_groups(device, best, variant):
     footprint, options = variant
     scene = scenes.cast(colored(scenes.random_scene(9, 60), 7), best)
     settings = with_bg(CAMERA.settings(best, footprint=footprint, **options), torch.linspace(0, 1, 7, dtype=best))
-    if footprint == "adaptive":
-        settings = settings._replace(footprint="adaptive:tolerance=1e-9")
     g = torch.rand(7, 29, 37, generator=torch.Generator().manual_seed(2), dtype=best)
     whole = scenes.leaves(scenes.to(scene, device))
     ar.GaussianRasterizer(scenes.settings_to(settings, device))(**whole)[0].backward(g.to(device))
@@ -171,8 +164,6 @@ def test_gradients_of_alpha(device, best, variant, count):
     camera = Camera(image_height=21, image_width=23)
     g = torch.rand(1, 21, 23, generator=torch.Generator().manual_seed(4), dtype=best).to(device)
     leaves = scenes.leaves(scenes.to(scene, device))
-    if footprint == "adaptive":  # would look at the background
-        options = {"tolerance": 1e-9}
     settings = camera.settings(best, device, footprint=footprint, **options)
     _, _, outputs = ar.GaussianRasterizer(settings._replace(effects=ar.Effects(alpha=True)))(**leaves)
     (outputs.alpha * g).sum().backward()
@@ -328,8 +319,6 @@ def test_looks_match_the_weights(device, best, variant):
     scene["colors_precomp"] = torch.eye(count, dtype=best)
     looks = ar.Effects(median_depth=True, dominant_index=True, gaussian_stats=True)
     settings = CAMERA.settings(best, device, footprint=footprint, effects=looks, **options)
-    if footprint == "adaptive":  # chosen by colours: the same for all
-        settings = settings._replace(footprint="adaptive:tolerance=1e-9")
     settings = with_bg(settings, torch.zeros(count, dtype=best, device=device))
     weights, _, outputs = ar.GaussianRasterizer(settings)(**scenes.to(scene, device))
     weights, eps = weights.cpu(), 32 * torch.finfo(best).eps

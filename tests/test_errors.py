@@ -163,7 +163,7 @@ def test_the_truth_has_no_error_and_cases_cover_the_footprints():
     for row in errors.footprint_errors(["exact"], samples=8):
         assert row["weight_max"] == row["offset_max"] == row["cov2d_max"] == 0
     named = {case.partition(":")[0] for case in errors.all_cases()}
-    assert named == set(ar.FOOTPRINTS) - {"exact", "adaptive"}
+    assert named == set(ar.FOOTPRINTS) - {"exact"}
 
 
 # ---------------------------------------------------------------------------------- reporting

@@ -83,9 +83,9 @@ def test_what_is_given_is_measured(photographs, scene, tmp_path):
 
 
 def test_the_file_says_its_footprint(photographs, scene, tmp_path):
-    io.save_scene(tmp_path / "b.ply", io.load_scene(scene), io.SceneMetadata(footprint="moment:samples=9"))
+    io.save_scene(tmp_path / "b.ply", io.load_scene(scene), io.SceneMetadata(footprint="moment:samples=16"))
     assert cli.main(["evaluate", str(tmp_path / "b.ply"), "--data", str(photographs), *QUIET]) == 0
-    assert list(evaluation(tmp_path / "b_evaluation")["results"]) == ["moment:samples=9"]
+    assert list(evaluation(tmp_path / "b_evaluation")["results"]) == ["moment:samples=16"]
 
 
 def model_of(scene, tmp_path, **values):
@@ -161,8 +161,8 @@ def test_a_scene_beside_a_training_is_tested_as_the_training(tmp_path, capsys):
     out = tmp_path / "out"
     train = ["train", str(tmp_path / "capture"), "--out", str(out), "--iterations", "2", "--random-points", "40"]
     assert cli.main([*train, "--scales", "2", "--sh-degree", "0", "--no-evaluate", "--device", "cpu"]) == 0
-    io.save_scene(out / "b.ply", io.load_scene(out / "scene.ply"), io.SceneMetadata(footprint="box:samples=2"))
-    for given, folder, footprint in (("", out, "moment:samples=4"), ("b.ply", out / "b_evaluation", "box:samples=2")):
+    io.save_scene(out / "b.ply", io.load_scene(out / "scene.ply"), io.SceneMetadata(footprint="box:samples=1"))
+    for given, folder, footprint in (("", out, "moment:samples=4"), ("b.ply", out / "b_evaluation", "box:samples=1")):
         assert cli.main(["evaluate", str(out / given), *QUIET]) == 0
         found = evaluation(folder)
         assert list(found["results"]) == [footprint] and list(found["results"][footprint]) == ["2", "mean"]

@@ -180,7 +180,7 @@ def record(kind, content):
     return struct.pack("<II", kind, len(content)) + content
 
 
-OURS = record(0x41520001, b"analytic_rasterizer footprint moment:samples=9\nanalytic_rasterizer offset 1.5 -2.0 3.0")
+OURS = record(0x41520001, b"analytic_rasterizer footprint moment:samples=16\nanalytic_rasterizer offset 1.5 -2.0 3.0")
 
 
 @pytest.mark.parametrize("version", [2, 3, 4])
@@ -193,7 +193,7 @@ def test_an_spz_by_hand(tmp_path, version, degree, flags, records):
     close(io.load_scene(tmp_path / "a.Spz"), scene, turned=1e-2 if version == 2 else 1e-4)
     metadata = io.read_metadata(tmp_path / "a.Spz")
     assert metadata.antialiased is bool(flags & 1)
-    assert metadata.footprint == ("moment:samples=9" if records else None)
+    assert metadata.footprint == ("moment:samples=16" if records else None)
     assert metadata.offset == ((1.5, -2.0, 3.0) if records else None)
 
 
@@ -400,7 +400,7 @@ def test_compressed_scenes_that_cannot_be_read(tmp_path, change, message):
 HOLDING = ["a.ply", "a.compressed.ply", "a.spz"]
 METADATA = {
     "nothing": io.SceneMetadata(),
-    "trained with moment": io.SceneMetadata(footprint="moment:samples=9"),
+    "trained with moment": io.SceneMetadata(footprint="moment:samples=16"),
     "a default": io.SceneMetadata(footprint="box"),
     "as of 3DGS": io.SceneMetadata(footprint="point"),
     "another dilation": io.SceneMetadata(footprint="point:dilation=0.1"),

@@ -18,7 +18,7 @@ from analytic_rasterizer.relocation import compute_relocation
 
 WIDTH, HEIGHT = 45, 37
 NEAR, FAR = 0.01, 1e10
-RENDERED = [variant for variant in scenes.KINDS if variant[0] != "adaptive"]
+RENDERED = scenes.KINDS
 BOTH_LAYOUTS = pytest.mark.parametrize("packed", [False, True], ids=["dense", "packed"])
 
 
@@ -511,34 +511,17 @@ def test_the_footprint_is_gsplats_filter_unless_one_was_chosen(device, monkeypat
     classic, antialiased = image(eps2d=0.2), image(eps2d=0.2, rasterize_mode="antialiased")
     assert torch.equal(classic, image(footprint="point:dilation=0.2"))
     assert torch.equal(antialiased, image(footprint="mip:variance=0.2"))
-    box = image(footprint=ar.resolve_footprint("box", samples=8))
+    box = image(footprint=ar.resolve_footprint("box", samples=16))
     assert not torch.equal(box, classic) and not torch.equal(antialiased, classic)
-    monkeypatch.setenv("ANALYTIC_RASTERIZER_FOOTPRINT", "box:samples=8")
+    monkeypatch.setenv("ANALYTIC_RASTERIZER_FOOTPRINT", "box:samples=16")
     assert torch.equal(image(), box) and torch.equal(image(footprint="point:dilation=0.2"), classic)
     monkeypatch.delenv("ANALYTIC_RASTERIZER_FOOTPRINT")
     try:
-        ar.set_default_footprint("box", samples=8)
+        ar.set_default_footprint("box", samples=16)
         assert torch.equal(image(), box)
     finally:
         ar.set_default_footprint(None)
     assert torch.equal(image(eps2d=0.2), classic)
-
-
-@each_precision
-@pytest.mark.parametrize("channels", [1, 3, 5])
-def test_adaptive_chooses_by_the_first_channels(device, dtype, channels):
-    """As the rasterizer does; with other colours it chooses otherwise."""
-    scene, cameras = scene_of(dtype, device), cameras_of(dtype, device)
-    scene["colors"] = weights((len(scene["means"]), channels), dtype, device)
-    images, *_ = render(scene, cameras, footprint="adaptive")
-    background = torch.zeros(channels, dtype=dtype, device=device)
-    for camera in range(2):
-        view, K = cameras["viewmats"][camera], cameras["Ks"][camera]
-        color, *_ = drop_in(scene, view, K, None, "adaptive", background=background)
-        assert (images[camera] - color.permute(1, 2, 0)).abs().max() <= tolerance(dtype)
-    if dtype == torch.float64:
-        dark, *_ = render(scene | {"colors": scene["colors"] / 100}, cameras, footprint="adaptive")
-        assert (100 * dark - images).abs().max() > 1e-4
 
 
 def test_meta_of_other_footprints_has_the_variance_of_a_pixel(device, best):

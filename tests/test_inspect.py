@@ -93,7 +93,7 @@ def test_recommendation_is_within_the_tolerance_of_everything_on(device, sizes, 
 def test_splats_larger_than_a_pixel_need_one_sample(device, clock):
     found = ar.inspect_scene(random_scene(device, sizes="large"), settings(device))
     assert found.footprint == "box:samples=1" and not find(found, "footprint").needed
-    assert all(view.narrow == 0 and view.tile_shares[1] == 1 for view in found.views)
+    assert all(view.narrow == 0 for view in found.views)
     costs = {candidate.footprint: candidate.cost for candidate in found.candidates}
     assert (costs["box:samples=1"], costs["moment:samples=1"]) == (1, 2)
 
@@ -104,7 +104,7 @@ def test_moment_is_tried_and_measured_against(device):
     assert planner.REFERENCE == "moment:samples=16"
     found = ar.inspect_scene(random_scene(device, sizes="fine", count=4000), settings(device), TOLERANCE, rounds=1)
     rms = {candidate.footprint: candidate.rms for candidate in found.candidates}
-    assert {f"moment:samples={n}" for n in (1, 4, 9, 16)} <= set(rms)
+    assert set(rms) == {f"{name}:samples={n}" for name in ("box", "moment") for n in (1, 4, 16)}
     assert rms["moment:samples=4"] < min(rms["box:samples=4"], rms["box:samples=1"])
 
 
@@ -113,11 +113,7 @@ def test_splats_finer_than_a_pixel_need_more(device, clock):
     found = ar.inspect_scene(scene, settings(device))
     assert found.footprint != "box:samples=1" and find(found, "footprint").needed
     assert find(found, "footprint").change > TOLERANCE
-    for view, camera in zip(found.views, settings(device)):
-        assert view.narrow > 0.5 and sum(view.sigmas) == view.shown
-        adaptive = camera._replace(footprint="adaptive")
-        assert torch.equal(view.tile_samples, scenes.tile_samples(adaptive, scene.arguments()))
-        assert sum(view.tile_shares.values()) == pytest.approx(1)
+    assert all(view.narrow > 0.5 and sum(view.sigmas) == view.shown for view in found.views)
 
 
 @pytest.mark.parametrize(("bands", "degree"), [("none", None), ("tiny", 0), ("falling", None), ("large", None)])
@@ -234,7 +230,6 @@ def test_report_in_words_and_json(device):
         "footprint": found.footprint, "sh_degree": 0, "filter_3d": False, "orthographic": False, "off_center": False,
     }  # fmt: skip
     assert [finding["name"] for finding in data["findings"]] == [finding.name for finding in found.findings]
-    assert data["views"][0]["tile_shares"].keys() == {"1", "4", "8", "16"}
     assert find(found, "outputs").cost > 0
     assert ar.plan(scene, views, TOLERANCE, views) == found.effects
 

@@ -84,8 +84,6 @@ def test_hard_case_against_the_reference(case, variant):
     camera, scene = case.build()
     settings = hard_cases.settings_of(camera, torch.float64, torch.float64, variant, effects=case.effects)
     footprint, options = variant
-    if footprint == "adaptive":
-        options = {"tile_samples": scenes.tile_samples(settings, scene)}
     ours, theirs = scenes.leaves(scene), scenes.leaves(scene)
     color, _ = ar.GaussianRasterizer(settings)(**ours)
     expected = reference.render(settings, **theirs, footprint=footprint, **options)
@@ -200,9 +198,9 @@ def weight_in_40_digits(offset, cov2d, footprint, options):
         return gaussian(x, y, mp.mpf(options.get("dilation", 0.3)), False)
     if footprint == "mip":
         return gaussian(x, y, mp.mpf(options.get("variance", 0.1)))
-    if footprint in ("box", "adaptive"):
-        samples = options.get("samples", 16)
-        v = {1: mp.mpf(1) / 12, 2: mp.mpf(1) / 48}.get(samples, mp.mpf(1) / (24 * samples))
+    if footprint == "box":
+        samples = options["samples"]
+        v = mp.mpf(1) / (12 if samples == 1 else 24 * samples)
         nodes = reference.box_nodes(samples).tolist()
         return sum(gaussian(x + mp.mpf(a), y + mp.mpf(b), v) for a, b in nodes) / samples
     if footprint == "moment":
@@ -464,7 +462,7 @@ def test_debug_names_the_bad_number(device, name, index, value, expectation, tmp
     """Tensor, first index and value; without debug nothing is raised, and the image is finite."""
     monkeypatch.chdir(tmp_path)
     camera, scene = visible(torch.float32, device, name in ("colors_precomp", "cov3D_precomp"))
-    settings = camera.settings(torch.float32, device, footprint="box", samples=2)
+    settings = camera.settings(torch.float32, device, footprint="box", samples=1)
     ar.GaussianRasterizer(settings._replace(debug=True))(**scene)
     scene[name][index] = value
     if name != "opacities":

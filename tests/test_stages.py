@@ -12,7 +12,7 @@ from scenes import Camera, name_of
 import analytic_rasterizer as ar
 
 CAMERA = Camera(image_width=27, image_height=21, bg=(0.1, 0.3, 0.2))
-RENDERED = [variant for variant in scenes.KINDS if variant[0] != "adaptive"]
+RENDERED = scenes.KINDS
 
 
 def scene_of(dtype, device, seed=3, count=30, degree=1):
@@ -48,13 +48,13 @@ def weighted_sums(images):
 
 
 @each_precision
-@pytest.mark.parametrize("variant", [*RENDERED, ("adaptive", {})], ids=name_of)
+@pytest.mark.parametrize("variant", RENDERED, ids=name_of)
 def test_stages_make_the_picture_of_the_rasterizer(device, dtype, variant):
     settings = settings_of(dtype, device, variant)
     scene, again = (scenes.leaves(scene_of(dtype, device)) for _ in range(2))
     color, radii = ar.GaussianRasterizer(settings)(means2D=None, **scene)
     splats = ar.project(settings, **again)
-    image, alpha = ar.blend(splats, ar.list_tiles(splats, background=settings.bg), background=settings.bg)
+    image, alpha = ar.blend(splats, ar.list_tiles(splats), background=settings.bg)
     assert image.shape == (1, 3, 21, 27) and alpha.shape == (1, 1, 21, 27)
     assert (image[0] - color).abs().max() <= tolerances(dtype)[0]
     assert torch.equal(radii[splats.gaussian_ids.long()], splats.radii) and len(splats.radii) == (radii > 0).sum()
@@ -453,7 +453,7 @@ def test_what_is_no_tensor_and_no_camera_is_named():
     splats = ar.project(settings_of(torch.float32, "cpu"), **scene_of(torch.float32, "cpu"))
     lists = ar.list_tiles(splats)
     with pytest.raises(TypeError, match="background must be a tensor, got list"):
-        ar.list_tiles(splats, background=[0, 0, 0])
+        ar.blend(splats, lists, background=[0, 0, 0])
     with pytest.raises(TypeError, match="means2d_abs must be a tensor, got list"):
         ar.blend(splats, lists, means2d_abs=[0, 0])
     for camera in (-1, 1):

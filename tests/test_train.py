@@ -443,7 +443,7 @@ def picture_arguments(device, **changed):
     view = circle(1)[0]
     gaussians = truth_gaussians().to(device).map(torch.Tensor.detach)
     camera = camera_arguments(
-        view.settings(sh_degree=0, footprint="box:samples=2", device=device), gaussians.means, None
+        view.settings(sh_degree=0, footprint="box:samples=1", device=device), gaussians.means, None
     )
     names = ("means", "log_scales", "quats", "logit_opacities", "shs")
     target = torch.full((3, view.height, view.width), 100, dtype=torch.uint8, device=device)

@@ -6,6 +6,8 @@ import hashlib
 import http.client
 import json
 import re
+import shutil
+import subprocess
 import threading
 
 import numpy as np
@@ -16,7 +18,7 @@ from processes import DEADLINE
 
 import analytic_rasterizer as ar
 from analytic_rasterizer import _C, cli, io, viewer
-from analytic_rasterizer.analysis.reference import footprint_variants
+from analytic_rasterizer.footprints import footprint_variants
 from analytic_rasterizer.gaussians import Gaussians
 from analytic_rasterizer.viewer import pages
 
@@ -67,7 +69,7 @@ def ask(server, path, method="GET", host=None):
 @pytest.mark.parametrize("degree, numbers", [(0, 4), (1, 12), (2, 28), (3, 48)])
 def test_packed_numbers(degree, numbers):
     scene = make_scene(7, degree)
-    packed = viewer.pack_scene(scene, [make_view()], name="a scene", footprint="box:samples=8", background=(1, 0.5, 0))
+    packed = viewer.pack_scene(scene, [make_view()], name="a scene", footprint="box:samples=16", background=(1, 0.5, 0))
     geometry = np.frombuffer(packed.geometry, "<f4").reshape(7, 12)
     np.testing.assert_array_equal(geometry[:, :3], scene.means)
     np.testing.assert_array_equal(geometry[:, 3:4], scene.opacities)
@@ -81,7 +83,7 @@ def test_packed_numbers(degree, numbers):
     assert not harmonics[:, used:].any()
     meta = json.loads(packed.meta_json())
     assert (meta["name"], meta["count"], meta["sh_degree"]) == ("a scene", 7, degree)
-    assert (meta["footprint"], meta["background"]) == ("box:samples=8", [1.0, 0.5, 0.0])
+    assert (meta["footprint"], meta["background"]) == ("box:samples=16", [1.0, 0.5, 0.0])
 
 
 def test_packed_views():
@@ -146,7 +148,7 @@ def test_names_of_footprints(given, name):
     assert viewer.page_footprint(ar.resolve_footprint(given)) == name
 
 
-@pytest.mark.parametrize("name", ["adaptive", "erf", "exact"])
+@pytest.mark.parametrize("name", ["moment", "erf", "exact"])
 def test_footprints_that_the_page_cannot_draw_are_refused(name):
     with pytest.raises(ValueError, match="viewer can draw"):
         viewer.pack_scene(make_scene(), footprint=name)
@@ -423,7 +425,7 @@ def test_nodes_are_those_of_the_headers():
     block = re.search(r"HALF_NODES = (\{.*?\});", text, re.DOTALL)[1]
     ours = json.loads(re.sub(r",(\s*[\]}])", r"\1", re.sub(r"(\d+):", r'"\1":', block)))
     source = header("footprint/gaussian.h")
-    assert set(ours) == {"2", "4", "8", "16"}
+    assert set(ours) == {"4", "16"}
     for samples, nodes in ours.items():
         listed = re.search(rf"kNodes{samples}\[\] = \{{(.*?)\}};", source, re.DOTALL)[1]
         theirs = [[float(x), float(y)] for x, y in re.findall(r"\{(-?[\d.]+), (-?[\d.]+)\}", listed)]
@@ -443,13 +445,46 @@ def test_polynomials_are_those_of_the_headers():
         assert float(value) in {float(v) for v in re.findall(r"x \* T\((?:\d \* )?(\d\.\d+)\)", cumulant)}, value
 
 
-def test_default_options_are_those_of_the_library():
-    text = pages.page_file("constants.js")
-    point, mip = re.search(r"DEFAULT_VARIANCE = \{ point: ([\d.]+), mip: ([\d.]+) \}", text).groups()
-    assert ar.resolve_footprint("point").option == float(point)
-    assert ar.resolve_footprint("mip").option == float(mip)
-    block = re.search(r"FOOTPRINTS = \[(.*?)\n\];", text, re.DOTALL)[1]
-    assert tuple(re.findall(r"\['([^']+)',", block)) == viewer.PAGE_FOOTPRINTS
+PARSE = """
+import { readFileSync } from 'fs';
+import { parseFootprint } from './constants.js';
+const { known, names } = JSON.parse(readFileSync('names.json', 'utf8'));
+const parsed = name => { try { return parseFootprint(name, known); } catch (error) { return error.message; } };
+console.log(JSON.stringify(names.map(parsed)));
+"""
+
+
+def test_the_page_finds_footprints_by_name(tmp_path):
+    """As the library does, among those that it is handed."""
+    if shutil.which("node") is None:
+        pytest.skip("needs node")
+    known = viewer.pack_scene(make_scene()).meta["footprints"]
+    right = [*viewer.PAGE_FOOTPRINTS, "box", "point:dilation=0.5", "mip:variance=0"]
+    wrong = ["box:samples=8", "mip:dilation=1", "mip:variance=-1", "mip:variance=", "analytic:=1", "exact", "", "x:y=1"]
+    (tmp_path / "constants.js").write_text(pages.page_file("constants.js"))
+    (tmp_path / "package.json").write_text('{"type": "module"}')
+    (tmp_path / "names.json").write_text(json.dumps({"known": known, "names": right + wrong}))
+    (tmp_path / "parse.js").write_text(PARSE)
+    done = subprocess.run(["node", "parse.js"], cwd=tmp_path, capture_output=True, text=True, check=True)
+    parsed = json.loads(done.stdout)
+    for name, found in zip(right, parsed):
+        footprint = ar.resolve_footprint(name)
+        assert viewer.page_footprint(footprint).split("=")[0] == found["name"].split("=")[0]
+        assert found["samples"] == footprint.samples
+        if found["option"] is not None:
+            assert found["variance"] == footprint.option
+    assert parsed[len(right) :] == [f"There is no footprint '{name}'." for name in wrong]
+
+
+def test_the_page_has_the_formulas_that_headers_name():
+    """A formula is a key of KINDS in shaders.js, and pages offer every footprint whose header names one."""
+    block = pages.page_file("shaders.js").split("const KINDS = {")[1].split("\n};")[0]
+    kinds = set(re.findall(r"^  (\w+): ", block, re.MULTILINE))
+    entries = viewer.pack_scene(make_scene()).meta["footprints"]
+    assert kinds == {entry["kind"] for entry in entries}
+    stated = {variant["name"] for variant in _C.footprints() if variant["page"] is not None}
+    assert {entry["family"] for entry in entries} == stated
+    assert {entry["samples"] for entry in entries} - {1} == {4, 16}  # those of HALF_NODES
 
 
 @pytest.mark.parametrize("name", JAVASCRIPT)

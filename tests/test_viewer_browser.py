@@ -361,10 +361,10 @@ def test_a_picture_whose_context_is_lost_is_drawn_again(browser):
               await drawn;
               return said;
             }""",
-            ["box:samples=8", view.width, view.height],
+            ["box:samples=16", view.width, view.height],
         )
         assert said == "There is no picture: the graphics device was lost since."
-        assert_same(pixels(page, view.width, view.height), rendered(scene, view, "box:samples=8"))
+        assert_same(pixels(page, view.width, view.height), rendered(scene, view, "box:samples=16"))
         assert page.is_hidden("#message")
 
 
@@ -488,13 +488,13 @@ def test_keys_choose_footprints_comparison_and_resolution(controls):
 
 
 def test_fields_work_like_keys(controls):
-    controls.select_option("#footprint", "box:samples=2")
+    controls.select_option("#footprint", "box:samples=1")
     controls.select_option("#compare", "mip")
     controls.check("input[value=difference]")
     controls.fill("#resolution", "2")
     wait_for(controls, "() => location.hash.includes('reduce=4')")
     found = address(controls)
-    assert (found["footprint"], found["compare"], found["mode"]) == ("box:samples=2", "mip", "difference")
+    assert (found["footprint"], found["compare"], found["mode"]) == ("box:samples=1", "mip", "difference")
 
 
 def test_the_divider_moves_by_keys_and_mouse(controls):

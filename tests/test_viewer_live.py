@@ -67,8 +67,8 @@ def test_a_snapshot_waits_for_the_stream_that_fills_it(device):
 def test_every_footprint_can_be_chosen():
     chosen = [ar.resolve_footprint(name) for name in viewer.LIVE_FOOTPRINTS]
     assert {footprint.name for footprint in chosen} == set(ar.FOOTPRINTS)
-    assert {f.samples for f in chosen if f.name == "box"} == {1, 2, 4, 8, 16}
-    assert {f.samples for f in chosen if f.name == "moment"} == {1, 4, 9, 16}
+    assert {f.samples for f in chosen if f.name == "box"} == {1, 4, 16}
+    assert {f.samples for f in chosen if f.name == "moment"} == {1, 4, 16}
     assert len(set(chosen)) == len(chosen)
 
 
@@ -290,7 +290,7 @@ def test_controls_change_the_picture(live_viewer):
     with connected(live_viewer.url) as browser:
         browser.wait_for(lambda: browser.frames)
         browser.move()
-        for footprint in ("adaptive", "moment:samples=4", "exact"):
+        for footprint in ("box:samples=16", "moment:samples=4", "exact"):
             browser.choose("Footprint", footprint)
             browser.wait_for_picture(expected_frame(scene, seen(), footprint))
         browser.choose("Background", [255, 0, 51])
@@ -594,12 +594,12 @@ def test_the_command_serves_and_ends(monkeypatch, tmp_path, capsys):
 
     monkeypatch.setattr(viewer.LiveViewer, "wait", interrupted)
     command = ["view", str(tmp_path / "scene.ply"), "--server", "--views", str(tmp_path / "views.json")]
-    assert cli.main([*command, "--footprint", "adaptive", "--background", "0", "0.5", "1"]) == 0
+    assert cli.main([*command, "--footprint", "box:samples=16", "--background", "0", "0.5", "1"]) == 0
     assert cli.main([*command, "--no-browser", "--footprint", "moment"]) == 0
     assert len(opened) == 1 and opened[0].startswith("http://127.0.0.1:")
     assert opened[0] in capsys.readouterr().out
     assert started == [
-        ("adaptive", (0.0, 0.5, 1.0), ["one", "two"]),
+        ("box:samples=16", (0.0, 0.5, 1.0), ["one", "two"]),
         ("moment:samples=4", (0.0, 0.0, 0.0), ["one", "two"]),
     ]
 

@@ -147,7 +147,7 @@ def test_the_plain_path_makes_no_effects(device, monkeypatch):
 COLOR, SAMPLE = 3 * 4, 4 + 4
 SPLAT, NUMBERS = 48, 3 * 4
 GRADIENTS = 4 * (3 + 3 + 1 + 12 + 3 + 4)
-SAMPLES = {"box": 4, "moment": 4, "adaptive": 16}  # per pixel that there is room for
+SAMPLES = {"box": 4, "moment": 4}
 
 
 @each_path

@@ -10,12 +10,11 @@ import torch
 
 from ..camera import View
 from ..filters import bake_dilation
-from ..footprints import Footprint
+from ..footprints import RECOMMENDED, Footprint
 from ..gaussians import Gaussians
 from ..rasterizer import GaussianRasterizer
 from . import tables
 
-BAKED_FOR = "moment:samples=4"
 REDUCTIONS = (1, 2, 4, 8)
 SMALLEST = 8  # px: smaller pictures say nothing
 LARGEST_PSNR = 300.0  # dB
@@ -29,7 +28,7 @@ class BakeGain:
         footprint: What the scene was trained with.
         reductions: 1 is the size of the views, 2 half of it.
         unbaked: Of the scene as it is, with this footprint; at reduction 1 these are the pictures of the training.
-        baked: Of the baked scene, with BAKED_FOR.
+        baked: Of the baked scene, with RECOMMENDED.
     """
 
     footprint: str
@@ -42,7 +41,7 @@ class BakeGain:
         header = ["PSNR [dB]", *("1" if n == 1 else f"1/{n}" for n in self.reductions)]
         rows = [
             [f"as it is, {self.footprint}", *(_decibels(value) for value in self.unbaked)],
-            [f"baked, {BAKED_FOR}", *(_decibels(value) for value in self.baked)],
+            [f"baked, {RECOMMENDED}", *(_decibels(value) for value in self.baked)],
         ]
         return (
             f"how near pictures come to what the training showed: {self.footprint} at the size of these views, "
@@ -96,7 +95,7 @@ def bake_gain(
             framed = view.framed(n)
             truth = torch.nn.functional.avg_pool2d(shown[None], n)[0]
             unbaked = truth if n == 1 else picture(scene, framed, footprint)
-            for kind, found in (("unbaked", unbaked), ("baked", picture(baked, framed, BAKED_FOR))):
+            for kind, found in (("unbaked", unbaked), ("baked", picture(baked, framed, RECOMMENDED))):
                 errors[kind][i] += (found - truth).square().sum().item()
             counts[i] += truth.numel()
     psnr = {kind: tuple(map(_psnr, of_kind, counts)) for kind, of_kind in errors.items()}

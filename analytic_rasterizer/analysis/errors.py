@@ -17,10 +17,9 @@ from pathlib import Path
 
 import torch
 
-from ..footprints import footprint_weight
+from ..footprints import EXACT, PAPER_GRADIENT, TURNED, UNFILTERED, footprint_variants, footprint_weight
 from ..io import optional_import, write_text
 from . import tables
-from .reference import EXACT, footprint_variants
 
 PAPER_SIGMAS = (0.3, 6.6)  # px, the range of [AS, Sec. 2.4]
 SIGMAS = (0.02, 20.0)  # px, ours
@@ -32,7 +31,6 @@ MONTE_CARLO = 65536  # samples in a pixel, as in the paper
 ROTATION_SAMPLES = 64  # splats of one standard deviation, each integrated by Monte Carlo
 THRESHOLDS = (1e-2, 1e-3, 1e-4)
 TABLE_SIGMAS = (0.02, 0.05, 0.1, 0.2, 0.3, 0.5, 1.0, 2.0, 5.0)
-PAPER_GRADIENT = "analytic:frame_gradient=paper"
 GRADIENTS = {"offset": "dI/d offset", "cov2d": "dI/d covariance"}
 
 
@@ -70,9 +68,8 @@ def run(out, samples: int = SAMPLES, monte_carlo: int = MONTE_CARLO) -> dict:
 
 def all_cases() -> list[str]:
     """Every footprint that has a weight of its own, with the options that change the weight or its gradient."""
-    # `exact` is the truth, and `adaptive` takes the weights of `box`, for whole tiles.
-    cases = [case for case in footprint_variants() if case not in (EXACT, "adaptive")]
-    return [*cases, "point:dilation=0", PAPER_GRADIENT]
+    cases = [case for case in footprint_variants() if case != EXACT]  # that is the truth
+    return [*cases, UNFILTERED, PAPER_GRADIENT]
 
 
 def logistic_cdf(x: torch.Tensor) -> torch.Tensor:
@@ -112,14 +109,14 @@ def rotation_errors(samples: int, monte_carlo: int, sigmas: int = 40) -> list[di
     rows = []
     for sigma in _log_uniform(PAPER_SIGMAS, sigmas):
         offset, cov2d = _splats(unit, sigma, blur=0.0)
-        turned, exact = (footprint_weight(offset, cov2d, name) for name in ("erf", EXACT))
+        turned, exact = (footprint_weight(offset, cov2d, name) for name in (TURNED, EXACT))
         square = footprint_weight(offset, cov2d / 2, EXACT)
         standard_error = ((square - exact**2).clamp_min(0) / monte_carlo).sqrt()
         sampled = torch.empty_like(exact)
         for i, conic in enumerate(_matrix(cov2d).inverse()):
             d = offset[i] + torch.rand(monte_carlo, 2, generator=random, dtype=torch.float64) - 0.5
             sampled[i] = torch.exp(-(d @ conic * d).sum(1) / 2).mean()
-        row = {"sigma": sigma} | _max_rms("exact", turned - exact) | _max_rms("monte_carlo", turned - sampled)
+        row = {"sigma": sigma} | _max_rms(EXACT, turned - exact) | _max_rms("monte_carlo", turned - sampled)
         row |= _max_rms("references", sampled - exact) | {"standard_error_rms": _rms(standard_error)}
         rows.append(row | {"z_rms": _rms((sampled - exact) / standard_error)})
     return rows
@@ -208,7 +205,7 @@ def summarize(results: dict, samples: int, monte_carlo: int) -> str:
     low, high = PAPER_SIGMAS
     of_rotation = []
     for row in rotation[:: max(1, len(rotation) // 8)]:
-        errors = [_max_rms_text(row, name) for name in ("exact", "monte_carlo", "references")]
+        errors = [_max_rms_text(row, name) for name in (EXACT, "monte_carlo", "references")]
         of_rotation.append([f"{row['sigma']:.2f}", *errors, f"{row['z_rms']:.2f}"])
     header = ["sigma [px]", "against exact, max / RMS", f"against {monte_carlo} samples", "the two references", "z"]
     footprints, weights = _by_footprint(results["footprints"])
@@ -273,10 +270,10 @@ def _figures(results: dict) -> dict:
     rotation = {"turned pixel - exact": "exact_", "turned pixel - Monte Carlo": "monte_carlo_"}
     rotation |= {"Monte Carlo - exact": "references_", "standard error of Monte Carlo": "standard_error_"}
     rotation["(Monte Carlo - exact) / standard error"] = "z_"
-    styles = [tables.style(name) for name in ("analytic", "mip", "point", "exact", "cumulant")]
 
     def lines(kind: str, prefixes: dict[str, str]) -> list[tuple]:
-        return [(label, results[kind], prefix, style) for (label, prefix), style in zip(prefixes.items(), styles)]
+        named = enumerate(prefixes.items())
+        return [(label, results[kind], prefix, tables.line_style(i)) for i, (label, prefix) in named]
 
     footprints, weights = _by_footprint(results["footprints"])
     of_weight = [(name, rows, "weight_", tables.style(name)) for name, rows in weights.items()]

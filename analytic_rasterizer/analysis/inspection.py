@@ -6,16 +6,13 @@ from dataclasses import asdict, dataclass
 
 import torch
 
-from .._C import TILE
 from ..effects import Effects
-from ..io import optional_import, write_safely
+from ..io import write_safely
 from . import tables
 
 NARROW = 0.5  # px
 BINS = tuple(2.0 ** (i / 4) for i in range(-40, 41))  # edges of the histogram of standard deviations, px
-TILE_SAMPLES = (1, 4, 8, 16)  # what `adaptive` chooses from
 DRAWN = 8  # views in the histogram
-MAPS = 2  # views whose tiles are drawn
 
 
 @dataclass(frozen=True)
@@ -54,12 +51,6 @@ class ViewReport:
     finer: float | None  # share of those seen in training that are sampled FINER times as finely; None: no training
     finest: float | None  # largest ratio of sampling intervals, training over this view; None: as above, or no such
     rms: float  # of the recommendation against everything switched on, in units of colour
-    tile_samples: torch.Tensor  # (rows, columns) int32 on the CPU, samples that `adaptive` takes at the tolerance
-
-    @property
-    def tile_shares(self) -> dict[int, float]:
-        """Share of the tiles by the number of samples that they need."""
-        return {samples: share(self.tile_samples == samples) for samples in TILE_SAMPLES}
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,14 +69,11 @@ class SceneReport:
     shown: torch.Tensor  # (P,) bool, on the scene's device: touches a tile of some view; the others change no pixel
 
     def to_json(self) -> dict:
-        """Everything as numbers, strings, lists and dicts; for the tensors shares and counts."""
+        """Everything as numbers, strings, lists and dicts; for the mask `shown` its count."""
         data = asdict(self)
         effects = data.pop("effects")
         data["recommendation"] = {"footprint": data.pop("footprint"), "filter_3d": effects["filter_3d"] is not None}
         data["recommendation"] |= {name: effects[name] for name in ("sh_degree", "orthographic", "off_center")}
-        for view, fields in zip(self.views, data["views"]):
-            del fields["tile_samples"]
-            fields["tile_shares"] = {str(samples): value for samples, value in view.tile_shares.items()}
         return data | {"shown": int(self.shown.sum()), "sigma_edges": list(BINS)}
 
     def to_text(self) -> str:
@@ -95,12 +83,10 @@ class SceneReport:
             [f.name, shown[f.needed], in_255(f.change), f.kind, _ratio(f.cost), f.recommendation] for f in self.findings
         ]
         tried = [[c.footprint, in_255(c.rms), shown[c.fits], _ratio(c.cost)] for c in self.candidates]
-        header = ["view", "size", "shown", "< 1/2 px", "RMS [1/255]"]
-        header += [f"{n} sample{'s' * (n > 1)}" for n in TILE_SAMPLES] + ["finer than trained", "at most"]
+        header = ["view", "size", "shown", "< 1/2 px", "RMS [1/255]", "finer than trained", "at most"]
         views = [
-            [v.name, f"{v.width}x{v.height}", v.shown, percent(v.narrow), in_255(v.rms)]
-            + [percent(value) for value in (*v.tile_shares.values(), v.finer)]
-            + [_ratio(v.finest)]
+            [v.name, f"{v.width}x{v.height}", v.shown]
+            + [percent(v.narrow), in_255(v.rms), percent(v.finer), _ratio(v.finest)]
             for v in self.views
         ]
         options = [f"sh_degree={self.effects.sh_degree}"] if self.effects.sh_degree is not None else []
@@ -117,13 +103,12 @@ class SceneReport:
         ])  # fmt: skip
 
     def save_picture(self, path) -> None:
-        """Writes a histogram of standard deviations in the image, beside maps of samples per tile.
+        """Writes a histogram of standard deviations in the image.
 
         Raises ImportError without matplotlib, OSError where the file cannot be written, ValueError for a suffix that
         matplotlib does not know.
         """
-        maps = self.views[:MAPS]
-        figure, axes = tables.new_figure(5 + 5 * len(maps), 3.8, 1 + len(maps))
+        figure, axes = tables.new_figure(7, 3.8)
         ax, occupied = axes[0, 0], [BINS.index(NARROW)]
         for view in self.views[:DRAWN]:
             ax.stairs([100 * count / max(1, view.shown) for count in view.sigmas], BINS, label=view.name, linewidth=1.4)
@@ -134,19 +119,6 @@ class SceneReport:
         ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}" if value >= 1 else f"1/{1 / value:g}")
         ax.set(xlabel="smaller standard deviation in the image [px]", ylabel="Gaussians shown [%]")
         ax.legend(frameon=False, fontsize=8)
-        colors = [tables.style(f"box:samples={samples}")["color"] for samples in TILE_SAMPLES]
-        palette = optional_import("matplotlib.colors", "analysis").ListedColormap(colors)
-        for ax, view in zip(axes[0, 1:], maps):
-            rows, columns = view.tile_samples.shape
-            index = torch.bucketize(view.tile_samples, torch.tensor(TILE_SAMPLES, device="cpu")).numpy()
-            extent = (0, TILE * columns, TILE * rows, 0)
-            ax.imshow(index, palette, vmin=-0.5, vmax=3.5, extent=extent, interpolation="nearest")
-            ax.set(xlim=(0, view.width), ylim=(view.height, 0), xlabel="px")
-            ax.grid(False)
-            ax.set_title(f"{view.name}: samples per tile", fontsize=10)
-            for color, (samples, value) in zip(colors, view.tile_shares.items()):
-                ax.plot([], [], "s", color=color, label=f"{samples}: {percent(value)}")
-            ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=4, frameon=False, fontsize=8)
         write_safely(path, lambda temporary: figure.savefig(temporary, dpi=140))
 
 

@@ -18,14 +18,22 @@ from pathlib import Path
 import torch
 
 from ..camera import View
-from ..footprints import resolve_footprint
+from ..footprints import (
+    DILATED,
+    EXACT,
+    FASTEST,
+    SIXTEEN_SAMPLES,
+    UNFILTERED,
+    footprint_variants,
+    resolve_footprint,
+)
 from ..gaussians import Gaussians
 from ..io import optional_import, write_text
 from . import tables, timing
-from .reference import EXACT, RMSE_SHARE, UNFILTERED, Refined, footprint_variants, image_errors, refine, supersampled
+from .reference import RMSE_SHARE, Refined, image_errors, refine, supersampled
 
-BASE = "box:samples=1"  # times on the CPU are ratios to this
-SECOND_ESTIMATE = "box:samples=16"  # another way to the reference's limit
+BASE = FASTEST  # times on the CPU are ratios to this
+SECOND_ESTIMATE = SIXTEEN_SAMPLES  # another way to the reference's limit
 MAX_FILTERED_PIXELS = 2**25  # of a picture of SECOND_ESTIMATE, which is rendered in one piece
 SUPERSAMPLING = (2, 3, 4)
 SSIM_WINDOW = 11  # px; smaller pictures have no SSIM
@@ -47,8 +55,7 @@ class Method:
     def has_single_weight(self) -> bool:
         """Whether every splat has one weight per pixel, so that the best such method is `exact`."""
         spec = resolve_footprint(self.footprint)
-        takes_many = spec.name == "adaptive" or dict(spec.options).get("samples", 1) > 1
-        return self.supersampling == 1 and not takes_many
+        return self.supersampling == 1 and spec.samples == 1
 
 
 def parse_method(text: str) -> Method:
@@ -62,7 +69,7 @@ def parse_method(text: str) -> Method:
 
 def default_methods() -> list[Method]:
     """Every footprint with every number of samples, and supersampled `point`, which is 3DGS-SS."""
-    supersampled_points = [Method(point, n) for point in ("point", UNFILTERED) for n in SUPERSAMPLING]
+    supersampled_points = [Method(point, n) for point in (DILATED, UNFILTERED) for n in SUPERSAMPLING]
     return [Method(name) for name in footprint_variants()] + supersampled_points
 
 

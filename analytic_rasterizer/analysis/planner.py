@@ -15,10 +15,11 @@ from functools import partial, reduce
 
 import torch
 
-from .._C import FRUSTUM_CLAMP, TILE
+from .._C import FRUSTUM_CLAMP
 from ..camera import View, is_off_center, is_orthographic
 from ..effects import NEAR, Effects
 from ..filters import apply_3d_filter, compute_3d_filter, sampling_interval
+from ..footprints import sampled_footprints
 from ..gaussians import Gaussians
 from ..outputs import depths
 from ..rasterizer import GaussianRasterizer
@@ -26,12 +27,10 @@ from ..settings import GaussianRasterizationSettings
 from ..sh import needed_sh_degree, sh_band_bounds
 from ..stages import Splats, Stages, project, render_stages
 from . import timing
-from .inspection import BINS, NARROW, TILE_SAMPLES, Candidate, Finding, SceneReport, ViewReport, in_255, percent, share
+from .inspection import BINS, NARROW, Candidate, Finding, SceneReport, ViewReport, in_255, percent, share
 
-REFERENCE = "moment:samples=16"
-BASE = "box:samples=1"
-ADAPTIVE = (8, 4, 2, 1)  # in tolerances of the plan: on two trained scenes its RMS is at most a quarter of its own
-LADDER = (BASE, "moment:samples=1", "box:samples=4", "moment:samples=4", "box:samples=8", "box:samples=16")
+LADDER = sampled_footprints()  # what is tried
+BASE, REFERENCE = LADDER[0], LADDER[-1]  # the cheapest, and what the others are compared with
 SH_SHARE = 0.5  # of the tolerance, at most, for the harmonics left out
 FILTER_SHARE = 0.25  # of the tolerance: below it the 3D filter is left out
 FINER = 1.1  # a view calls for the 3D filter if it samples so many times as finely as in training
@@ -90,8 +89,7 @@ def inspect_scene(
     if rounds is not None and not (isinstance(rounds, int) and rounds >= 1):
         raise ValueError(f"rounds must be a positive whole number, got {rounds!r}")
     survey = _survey(scene, cameras, tolerance, training)
-    adaptive = (f"adaptive:tolerance={k * tolerance:.4g}" for k in ADAPTIVE)
-    rms = {footprint: [] for footprint in [*LADDER, *adaptive, "moment:samples=9", REFERENCE]}
+    rms = {footprint: [] for footprint in LADDER}
     fitting, seen = list(rms), []  # footprints within the tolerance so far; what each view shows
     shown = on_image = torch.zeros(len(scene.means), dtype=torch.bool, device=scene.means.device)
     top_band = 0.0  # what the last band of the harmonics changes
@@ -119,7 +117,7 @@ def inspect_scene(
     reports = []
     for i, camera in enumerate(cameras):
         name = getattr(views[i], "name", f"view_{i:03d}")
-        reports.append(_view_report(scene, survey, i, name, camera, seen[i], rms[footprint][i], tolerance))
+        reports.append(_view_report(scene, survey, i, name, camera, seen[i], rms[footprint][i]))
     costs = _effect_costs(scene, timed, footprint, survey.effects, shown, rounds)
     findings = (
         _footprint_finding(candidates, footprint, reports),
@@ -257,12 +255,10 @@ def _effect_costs(scene: Gaussians, cameras, footprint, effects: Effects, shown,
 
 def _footprint_finding(candidates: dict[str, Candidate], footprint: str, views: list[ViewReport]) -> Finding:
     narrow = sum(v.narrow * v.shown for v in views) / max(1, sum(v.shown for v in views))
-    tiles = torch.cat([v.tile_samples.flatten() for v in views])
-    shares = ", ".join(f"{n} for {percent(share(tiles == n))}" for n in TILE_SAMPLES)
     best = candidates[footprint]
     reason = (
-        f"{percent(narrow)} of the splats have a standard deviation below {NARROW:g} px; samples that tiles need: "
-        f"{shares}; every view is within {in_255(best.rms)}/255 of everything on"
+        f"{percent(narrow)} of the splats have a standard deviation below {NARROW:g} px; every view is within "
+        f"{in_255(best.rms)}/255 of everything on"
     )
     return Finding("footprint", footprint != BASE, candidates[BASE].rms, "measured", best.cost, footprint, reason)
 
@@ -331,9 +327,8 @@ def _smaller_sigmas(splats: Splats) -> torch.Tensor:
     return torch.where(largest > 0, (splats.dets / largest).sqrt(), 0)
 
 
-def _view_report(scene, survey: _Survey, i: int, name: str, camera, shown, rms: float, tolerance: float) -> ViewReport:
-    settings, gaussians = _prepare(scene, camera, f"adaptive:tolerance={tolerance}", survey.effects)
-    tile_samples = render_stages(settings, **gaussians).tile_samples
+def _view_report(scene, survey: _Survey, i: int, name: str, camera, shown, rms: float) -> ViewReport:
+    settings, gaussians = _prepare(scene, camera, BASE, survey.effects)
     names = ("means3D", "opacities", "scales", "rotations")
     sigmas = _smaller_sigmas(project(settings, **{name: gaussians[name][shown] for name in names}))
     bins = torch.bucketize(sigmas, sigmas.new_tensor(BINS[1:-1]))
@@ -348,5 +343,4 @@ def _view_report(scene, survey: _Survey, i: int, name: str, camera, shown, rms: 
         finer=None if ratio is None else share(ratio > FINER),
         finest=None if ratio is None or not len(ratio) else ratio.max().item(),
         rms=rms,
-        tile_samples=tile_samples.reshape(-(-camera.image_height // TILE), -1).cpu(),
     )

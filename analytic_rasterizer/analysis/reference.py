@@ -10,25 +10,14 @@ from typing import Any, NamedTuple
 import torch
 
 from ..camera import View
-from ..footprints import FOOTPRINTS, option_values, resolve_footprint
+from ..footprints import UNFILTERED, resolve_footprint
 from ..gaussians import Gaussians
 from ..io import optional_import
 from ..rasterizer import GaussianRasterizer
 
-UNFILTERED = "point:dilation=0"  # samples of the scene itself, without any filter
-EXACT = "exact"  # the footprint whose weight has no error
 RMSE_SHARE = 0.1  # a reference is refined until it changes by at most this share of the smallest error
 MAX_DENSITY = 64  # samples along a pixel's side beyond which a reference is not refined
 MAX_PIXELS = 2**23  # of one render of unfiltered samples; more pixels are split over several renders
-
-
-def footprint_variants() -> list[str]:
-    """Every footprint, and one that takes samples with every number of them: "point", ..., "box:samples=16"."""
-    variants = []
-    for name in FOOTPRINTS:
-        takes_samples = "samples" in dict(resolve_footprint(name).options)
-        variants += [f"{name}:samples={n}" for n in option_values(name)] if takes_samples else [name]
-    return variants
 
 
 def supersampled(

@@ -7,34 +7,40 @@ import math
 from io import StringIO
 from pathlib import Path
 
-from ..footprints import resolve_footprint
+from ..footprints import FOOTPRINTS, resolve_footprint
 from ..io import optional_import, write_safely, write_text
 
-STYLES = {  # colour and marker
-    "point": ("#7a7f87", "o"),
-    "mip": ("#e08214", "s"),
-    "analytic": ("#c2255c", "D"),
-    "cumulant": ("#2b8a3e", "^"),
-    "box": ("#1c7ed6", "v"),
-    "moment": ("#0c8599", "p"),
-    "adaptive": ("#7048e8", "P"),
-    "erf": ("#e599b8", "d"),
-    "exact": ("#000000", "*"),
-}
-OTHER_STYLE = ("#495057", "h")  # of footprints that are not listed
+PALETTE = (  # colours and markers, of the footprints in the order of the registry
+    ("#7a7f87", "o"),
+    ("#e08214", "s"),
+    ("#c2255c", "D"),
+    ("#2b8a3e", "^"),
+    ("#1c7ed6", "v"),
+    ("#0c8599", "p"),
+    ("#e599b8", "d"),
+    ("#000000", "*"),
+    ("#7048e8", "P"),
+    ("#495057", "h"),
+)
+
+
+def line_style(place: int) -> dict:
+    """Keywords of matplotlib for a line, by its place among those of a figure: color, marker and linestyle."""
+    color, marker = PALETTE[place % len(PALETTE)]
+    return {"color": color, "marker": marker, "linestyle": "-"}
 
 
 def style(footprint: str) -> dict:
-    """Keywords of matplotlib for a footprint with its options: color, marker and linestyle.
+    """The same for a footprint with its options.
 
     More samples are darker; options other than the defaults are darker and dashed.
     """
     spec = resolve_footprint(footprint)
     samples = dict(spec.options).get("samples")
-    color, marker = STYLES.get(spec.name, OTHER_STYLE)
+    found = line_style(FOOTPRINTS.index(spec.name))
     is_default = samples is not None or spec == resolve_footprint(spec.name)
-    color = _shade(color, math.log2(samples) / 4 - 0.5 if samples else 0.0 if is_default else 0.5)
-    return {"color": color, "marker": marker, "linestyle": "-" if is_default else "--"}
+    shade = math.log2(samples) / 4 - 0.5 if samples else 0.0 if is_default else 0.5
+    return found | {"color": _shade(found["color"], shade), "linestyle": "-" if is_default else "--"}
 
 
 def _shade(color: str, darker: float) -> str:

@@ -6,6 +6,7 @@ import torch
 
 from .. import io
 from ..filters import bake_dilation, sampling_interval
+from ..footprints import DILATED, RECOMMENDED
 from .arguments import (
     add_files,
     add_footprint,
@@ -18,8 +19,6 @@ from .arguments import (
     use_machine,
 )
 from .scenes import say, sizes_in_words
-
-BAKED_FOR = "moment:samples=4"  # what the result says of itself
 
 
 def add_parser(subcommands) -> None:
@@ -67,7 +66,7 @@ def run(args) -> None:
     say(f"trained with {trained.footprint}: {trained.reason}")
     gaussians = scene.means, scene.scales, scene.rotations, scene.opacities
     scales, opacities = bake_dilation(*gaussians, cameras, args.dilation or trained.footprint.option)
-    metadata = io.SceneMetadata(footprint=BAKED_FOR, offset=found.metadata.offset)
+    metadata = io.SceneMetadata(footprint=RECOMMENDED, offset=found.metadata.offset)
     io.save_scene(args.out, scene.with_activated(scales, opacities), metadata)
     reason = f" ({found.size_reason})" if not given and found.size_reason else ""
     pictures = f"{len(views)} pictures of {sizes_in_words(views)}{reason}"
@@ -77,7 +76,7 @@ def run(args) -> None:
 def check_is_dilated(found: io.FoundScene, trained: io.Choice) -> None:
     """Raises SceneError for a scene whose training added no dilation."""
     footprint = trained.footprint
-    if footprint.name != "point":
+    if footprint.name != DILATED:
         raise io.SceneError(
             f"{found.path}: no dilation to bake: it says that pixels are to be integrated (footprint {footprint}); "
             "--footprint point is for a scene that was trained with 3DGS all the same"

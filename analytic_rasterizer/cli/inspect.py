@@ -44,7 +44,7 @@ def add_parser(subcommands) -> None:
     views = "look at no more than N views, evenly spread over the file (default: %(default)s)"
     add("--max-views", type=count, default=8, metavar="N", help=views)
     add("--json", metavar="FILE", help="write the findings as JSON; - prints them instead of the text")
-    picture = "plot what the views show, as .png, .svg or .pdf: sizes of splats, and samples per tile"
+    picture = "plot what the views show, as .png, .svg or .pdf: sizes of splats"
     add("--picture", metavar="FILE", help=picture)
     parser.set_defaults(run=run)
 

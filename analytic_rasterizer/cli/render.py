@@ -52,7 +52,7 @@ def add_parser(subcommands) -> None:
     add = parser.add_argument
     add("--out", required=True, metavar="OUT", help="folder for the pictures, or FILE.mp4 for a film (extra 'video')")
     add_footprint(parser)
-    samples = "of --footprint: samples of a pixel, 1, 2, 4, 8 or 16 of box, 1, 4, 9 or 16 of moment"
+    samples = "of --footprint: samples of a pixel, 1, 4 or 16 of box and moment"
     add("--samples", type=int, metavar="N", help=samples)
     path = "orbit: a circle around the scene; views: a smooth path through the views, in their order"
     add("--path", choices=PATHS, help=path)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from .. import io
 from ..distributed.ranks import Ranks
-from ..footprints import resolve_footprint
+from ..footprints import DILATED, resolve_footprint
 from ..training import Run, TrainingOptions
 from ..training.captures import IMAGES, LENS_CHOICES, MISSING_CHOICES, TEST_PERIOD
 from ..training.files import CHECKPOINT, SCENE, read_checkpoint
@@ -175,7 +175,7 @@ def run_on(ranks: Ranks, args) -> bool:
             raise ValueError(f"{named}: a resumed training keeps the options of its checkpoint")
     elif checkpoint.exists():
         raise ValueError(f"{checkpoint} exists: go on with --resume, or choose another --out")
-    if args.export and resolve_footprint((stored or options).footprint).name == "point":
+    if args.export and resolve_footprint((stored or options).footprint).name == DILATED:
         raise ValueError("--export mip is for footprints that integrate over pixels, got point")
     age = process_age()  # most of it is the import of torch
     training = Run(

@@ -12,7 +12,7 @@ import torch
 from .. import _C
 from ..checks import check_tensors
 from ..effects import Effects, Outputs
-from ..footprints import Footprint, chosen_footprint, resolve_footprint
+from ..footprints import PAPER, Footprint, chosen_footprint, resolve_footprint
 from ..rasterizer import NOTHING, render
 from ..rasterizer import GaussianRasterizer as LibraryRasterizer
 from ..settings import GaussianRasterizationSettings as LibrarySettings
@@ -134,7 +134,7 @@ class GaussianRasterizationSettings(LibrarySettings):
 
     def own_footprint(self) -> Footprint:
         """The footprint to render with where the user chose none."""
-        return _resolved(self._own_filter() or "analytic")
+        return _resolved(self._own_filter() or PAPER)
 
     def _own_filter(self) -> str | None:
         of_2023 = type(self) is GaussianRasterizationSettings

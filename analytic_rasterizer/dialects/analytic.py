@@ -4,6 +4,7 @@ Repositories: lzhnb/Analytic-Splatting; `--dense` densifies by that column. Its 
 dialect has to be chosen.
 """
 
+from ..footprints import PAPER
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer, rasterize_gaussians
 
@@ -15,5 +16,5 @@ class GaussianRasterizationSettings(Settings):
 
     dialect = "analytic"
     repositories = ("Analytic-Splatting",)
-    filter = "analytic"
+    filter = PAPER
     means2d_z = "sum_norm"

@@ -7,6 +7,7 @@ blended like a colour on zero. Its settings are those of 3DGS 2023: the dialect 
 
 from ..checks import check_tensors
 from ..effects import Effects
+from ..footprints import DILATED
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
 from ._base import forward_like, given, rasterize_gaussians
@@ -20,7 +21,7 @@ class GaussianRasterizationSettings(Settings):
     dialect = "depth"
     repositories = ("4DGaussians", "Deformable-3D-Gaussians", "Deformable-3DGS")
     inferred_from_arguments = ("means2D_densify",)
-    filter = "point"
+    filter = DILATED
     outputs = Effects(depth=True)
 
     def render(

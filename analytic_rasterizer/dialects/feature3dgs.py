@@ -4,6 +4,7 @@ Repositories: ShijieZhou-UCLA/feature-3dgs. `semantic_feature` (P, 1, K) holds a
 """
 
 from ..effects import Effects
+from ..footprints import DILATED
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
 from ._base import feature_rows, forward_like, render_by, with_channels
@@ -17,7 +18,7 @@ class GaussianRasterizationSettings(Settings):
     dialect = "feature3dgs"
     repositories = ("Feature 3DGS",)
     inferred_from_arguments = ("semantic_feature",)
-    filter = "point"
+    filter = DILATED
     outputs = Effects(depth=True)
 
     def render(

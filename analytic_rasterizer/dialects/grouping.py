@@ -3,6 +3,7 @@
 Repositories: lkeab/gaussian-grouping. `sh_objs` (P, 1, 16) holds the identity of each Gaussian, as features.
 """
 
+from ..footprints import DILATED
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
 from ._base import feature_rows, forward_like, given, render_by, with_channels
@@ -18,7 +19,7 @@ class GaussianRasterizationSettings(Settings):
     dialect = "grouping"
     repositories = ("Gaussian Grouping",)
     inferred_from_arguments = ("sh_objs",)
-    filter = "point"
+    filter = DILATED
 
     def render(
         self,

@@ -6,7 +6,7 @@ unless the user chose the footprint `point`, which becomes `mip` with the same v
 """
 
 from ..effects import Effects
-from ..footprints import Footprint
+from ..footprints import COMPENSATED, DILATED, Footprint
 from ._base import FIELDS, GaussianRasterizer, _resolved, rasterize_gaussians
 from ._base import GaussianRasterizationSettings as Settings
 
@@ -25,8 +25,8 @@ class GaussianRasterizationSettings(Settings):
 
     def footprint_in_use(self) -> Footprint:
         footprint = super().footprint_in_use()
-        if self.antialiasing and footprint.name == "point":
-            return _resolved("mip", variance=footprint.option)
+        if self.antialiasing and footprint.name == DILATED:
+            return _resolved(COMPENSATED, variance=footprint.option)
         return footprint
 
     def returned(self, color, radii, outputs):

@@ -4,6 +4,7 @@ Repositories: minghanqin/LangSplat. `include_feature` says whether the features 
 image is zero.
 """
 
+from ..footprints import DILATED
 from ._base import FIELDS, forward_like, render_by, with_channels
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer as Rasterizer
@@ -18,7 +19,7 @@ class GaussianRasterizationSettings(Settings):
     repositories = ("LangSplat",)
     fields = (*FIELDS, "include_feature")
     inferred_from = ("include_feature",)
-    filter = "point"
+    filter = DILATED
 
     def render(
         self,

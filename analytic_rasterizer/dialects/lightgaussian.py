@@ -5,6 +5,7 @@ Deviates: a score is the sum of the Gaussian's weights in those pixels, which fa
 """
 
 from ..effects import Effects
+from ..footprints import DILATED
 from ..rasterizer import NOTHING
 from ._base import FIELDS, GaussianRasterizer, rasterize_gaussians
 from ._base import GaussianRasterizationSettings as Settings
@@ -21,7 +22,7 @@ class GaussianRasterizationSettings(Settings):
     repositories = ("LightGaussian",)
     fields = (*FIELDS, "f_count")
     inferred_from = ("f_count",)
-    filter = "point"
+    filter = DILATED
 
     @property
     def outputs(self) -> Effects:

@@ -7,6 +7,7 @@ pixel's light is left; it has no gradient, and is 15 where more gets through.
 import torch
 
 from ..effects import Effects
+from ..footprints import DILATED
 from ._base import FIELDS, GaussianRasterizer, rasterize_gaussians
 from ._base import GaussianRasterizationSettings as Settings
 
@@ -22,7 +23,7 @@ class GaussianRasterizationSettings(Settings):
     repositories = ("SplaTAM", "Dynamic3DGaussians")
     fields = tuple(name for name in FIELDS if name != "debug")
     inferred_without = ("debug",)
-    filter = "point"
+    filter = DILATED
     outputs = Effects(median_depth=True)
     debug = False
 

@@ -4,6 +4,7 @@ Repositories: ubc-vision/3dgs-mcmc. Its settings are those of 3DGS 2023, so this
 Deviates: `is_used`, which the repository does not read, is 1 for every Gaussian that was not culled.
 """
 
+from ..footprints import DILATED
 from ..relocation import compute_relocation
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer, rasterize_gaussians
@@ -16,7 +17,7 @@ class GaussianRasterizationSettings(Settings):
 
     dialect = "mcmc"
     repositories = ("3dgs-mcmc",)
-    filter = "point"
+    filter = DILATED
 
     def returned(self, color, radii, outputs):
         return color, radii, (radii > 0).int()

@@ -12,6 +12,7 @@ import torch
 
 from ..autocast import widened, widened_settings
 from ..effects import Effects
+from ..footprints import DILATED
 from ..outputs import depths
 from ..rasterizer import render
 from ..rotations import rotation_matrices
@@ -27,7 +28,7 @@ class GaussianRasterizationSettings(Settings):
 
     dialect = "mini"
     repositories = ()  # the repository imports it by the name of its own module
-    filter = "point"
+    filter = DILATED
     outputs = Effects(gaussian_stats=True)
 
     def returned(self, color, radii, outputs):

@@ -12,7 +12,7 @@ import torch
 
 from ..autocast import widened
 from ..checks import check_tensors
-from ..footprints import Footprint
+from ..footprints import COMPENSATED, Footprint
 from ._base import FIELDS, GaussianRasterizer, _resolved, rasterize_gaussians
 from ._base import GaussianRasterizationSettings as Settings
 from ._later import LaterFlags
@@ -38,11 +38,11 @@ class GaussianRasterizationSettings(Settings):
     fields = (*FIELDS[:4], "kernel_size", "subpixel_offset", *FIELDS[4:])
     optional = {"subpixel_offset": None}  # noqa: RUF012
     inferred_from = ("kernel_size", "subpixel_offset")
-    filter = "mip"
+    filter = COMPENSATED
     means2d_z = "sum_abs"
 
     def own_footprint(self) -> Footprint:
-        return _resolved("mip", variance=float(self.kernel_size))
+        return _resolved(COMPENSATED, variance=float(self.kernel_size))
 
     def render(self, *arguments, **further) -> tuple:
         """As 3DGS 2023. `subpixel_offset` moves the centres of the pixels, all of them alike.

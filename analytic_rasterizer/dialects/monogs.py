@@ -11,6 +11,7 @@ import torch
 from ..autocast import widened
 from ..checks import check_tensors
 from ..effects import Effects
+from ..footprints import DILATED
 from ..rotations import product
 from ._base import FIELDS, forward_like, render_by
 from ._base import GaussianRasterizationSettings as Settings
@@ -51,7 +52,7 @@ class GaussianRasterizationSettings(Settings):
     repositories = ("MonoGS", "NoPoSplat")
     fields = (*FIELDS[:8], "projmatrix_raw", *FIELDS[8:])
     inferred_from = ("projmatrix_raw",)
-    filter = "point"
+    filter = DILATED
     outputs = Effects(depth=True, alpha=True, gaussian_stats=True)
 
     def render(

@@ -4,6 +4,7 @@ Repositories: city-super/Scaffold-GS, Octree-GS. Every dialect has `visible_filt
 models were trained with. Its settings are those of 3DGS 2023, so it has to be chosen.
 """
 
+from ..footprints import DILATED
 from ._base import GaussianRasterizationSettings as Settings
 from ._base import GaussianRasterizer, rasterize_gaussians
 
@@ -15,4 +16,4 @@ class GaussianRasterizationSettings(Settings):
 
     dialect = "scaffold"
     repositories = ("Scaffold-GS", "Octree-GS")
-    filter = "point"
+    filter = DILATED

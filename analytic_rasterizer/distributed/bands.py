@@ -116,7 +116,7 @@ def rasterize_bands(
         camera = camera_arguments(settings, means3D, shs)
         camera = {name: value[None] if torch.is_tensor(value) else value for name, value in camera.items()}
         facts["settings"] = digest_of([([0], camera)], means2d_abs)
-        return (shard, absolute, _touched(shard, settings.bg)), facts, None
+        return (shard, absolute, _touched(shard)), facts, None
 
     if world == 1:
         (shard, absolute, _), *_ = make()
@@ -140,7 +140,7 @@ def rasterize_bands(
     if shard.means2d.requires_grad:
         shard.means2d.retain_grad()
     bg = settings.bg
-    lists = list_tiles(own, background=bg.detach(), keep=torch.is_grad_enabled())
+    lists = list_tiles(own, keep=torch.is_grad_enabled())
     images, alphas = blend(own, lists, background=bg, means2d_abs=of_means)
     first, end = rows[rank]
     image, alpha = images[0, :, first:end], alphas[0, :, first:end]
@@ -163,10 +163,10 @@ class _Touched:
     side: int
 
 
-def _touched(splats: Splats, background: torch.Tensor) -> _Touched:
+def _touched(splats: Splats) -> _Touched:
     """By the lists of `list_tiles`, so that no splat is missed, whatever the footprint."""
     for _ in range(_ATTEMPTS):
-        lists = list_tiles(splats, background=background.detach(), keep=False).of_camera()
+        lists = list_tiles(splats, keep=False).of_camera()
         pairs, offsets = lists["pairs"], lists["tile_offsets"]
         if not pairs.is_cuda or int(lists["counts"][0]) <= len(pairs):
             break  # on CUDA there may have been more pairs than were expected, and then tiles share lists

@@ -171,7 +171,7 @@ def _of_one_rank(
         if splats.means2d.requires_grad:
             splats.means2d.retain_grad()
         bg = cameras[camera].bg
-        lists = list_tiles(splats, background=bg.detach(), keep=torch.is_grad_enabled())
+        lists = list_tiles(splats, keep=torch.is_grad_enabled())
         image, alpha = blend(splats, lists, background=bg, means2d_abs=absolute[camera] if means2d_abs else None)
         renderings.append(Rendering(camera, image[0], alpha[0], splats))
     own = tuple(OwnSplats(s.means2d, s.radii, s.gaussian_ids, s.width, s.height) for s in shard)

@@ -16,15 +16,22 @@ from typing import Any
 
 from ..camera import View
 from ..filters import PIXEL_VARIANCE
-from ..footprints import ENVIRONMENT_VARIABLE, Footprint, chosen_footprint, resolve_footprint
+from ..footprints import (
+    COMPENSATED,
+    DILATED,
+    ENVIRONMENT_VARIABLE,
+    Footprint,
+    chosen_footprint,
+    resolve_footprint,
+)
 from .common import BACKGROUNDS, BLACK, WHITE, SceneError
 from .metadata import SceneMetadata, read_metadata
 from .models import CFG_ARGS, CfgArgs, latest_ply, model_root, read_cfg_args
 from .views import load_views
 
 SCENE, OPTIONS, CAMERAS = "scene.ply", "options.json", "cameras.json"  # of the folder of a training
-UNMARKED = resolve_footprint("point")  # what a file wants that says nothing: 3DGS trains with it
-ANTIALIASED = resolve_footprint("mip")  # and one that says only that pixels are to be integrated
+UNMARKED = resolve_footprint(DILATED)  # what a file wants that says nothing: 3DGS trains with it
+ANTIALIASED = resolve_footprint(COMPENSATED)  # and one that says only that pixels are to be integrated
 
 
 @dataclass(frozen=True)

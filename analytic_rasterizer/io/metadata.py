@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from ..footprints import resolve_footprint
+from ..footprints import COMPENSATED, DILATED, resolve_footprint
 from . import ply, sog, spz
 from .common import first_line, scene_file
 
@@ -54,7 +54,7 @@ class SceneMetadata:
             found = replace(found, offset=offset)
         if found.footprint is not None:
             footprint = resolve_footprint(found.footprint)
-            found = replace(found, footprint=str(footprint), antialiased=footprint.name != "point")
+            found = replace(found, footprint=str(footprint), antialiased=footprint.name != DILATED)
         return found
 
     def lines(self) -> list[str]:
@@ -70,7 +70,7 @@ class SceneMetadata:
         """What is lost with a file that holds no metadata, in words. `point` is what is assumed of such a file."""
         lost = []
         if self.antialiased:
-            chosen = self.footprint or "mip"
+            chosen = self.footprint or COMPENSATED
             lost.append(f"the footprint (give --footprint {chosen} where it is rendered)")
         if self.offset is not None and any(self.offset):
             lost.append(f"the offset {self.offset} of its positions")

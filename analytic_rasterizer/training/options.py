@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from ..checks import check_value as _check
 from ..checks import plain_value as _plain
-from ..footprints import resolve_footprint
+from ..footprints import RECOMMENDED, resolve_footprint
 from ..io.common import BACKGROUNDS
 
 DOWNSAMPLINGS = ("box", "bicubic", "blender")
@@ -151,7 +151,7 @@ class TrainingOptions:
         ValueError: A value outside its range, naming the option.
     """
 
-    footprint: str = "moment:samples=4"
+    footprint: str = RECOMMENDED
     scales: tuple[int, ...] = (1,)
     scale_repeats: tuple[int, ...] = ()
     downsampling: str = "box"

@@ -16,6 +16,7 @@ import torch
 from .. import io
 from ..distributed.ranks import ALONE, Ranks
 from ..filters import bake_pixel
+from ..footprints import UNFILTERED
 from ..gaussians import Gaussians
 from .captures import Photograph, load_capture
 from .evaluation import evaluate, psnr
@@ -306,7 +307,7 @@ class Run:
         baked = self._whole(scene.with_activated(scales, opacities), MIP_SCENE)
         if self.ranks.is_first:
             # Its pixels are in the Gaussians.
-            write_scene(self.out / MIP_SCENE, baked, "point:dilation=0", self.capture.offset)
+            write_scene(self.out / MIP_SCENE, baked, UNFILTERED, self.capture.offset)
         return self.out / MIP_SCENE
 
     def start_viewer(self, port: int = 0) -> LiveViewer:

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from .. import io
-from ..footprints import FOOTPRINTS, OPTIONS, option_values
+from ..footprints import footprint_variants
 from ..gaussians import Gaussians
 from ..rasterizer import GaussianRasterizer
 
@@ -26,15 +26,7 @@ LARGEST_SIDE = 8192
 """Pixels of a frame along one side, at most."""
 
 
-def _footprint_choices() -> tuple[str, ...]:
-    choices = []
-    for name in FOOTPRINTS:
-        by_samples = "samples" in OPTIONS.get(name, {})
-        choices += [f"{name}:samples={n}" for n in option_values(name)] if by_samples else [name]
-    return tuple(choices)
-
-
-LIVE_FOOTPRINTS = _footprint_choices()
+LIVE_FOOTPRINTS = footprint_variants()
 """The footprints that can be chosen in a live viewer: all of them, with every number of samples."""
 
 

@@ -4,25 +4,45 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 
 from .. import io
-from ..footprints import Footprint, get_default_footprint, resolve_footprint
+from ..footprints import (
+    DILATED,
+    NEAREST_TO_EXACT,
+    PAPER,
+    Footprint,
+    footprint_variants,
+    get_default_footprint,
+    resolve_footprint,
+    sampled_footprints,
+    stated,
+)
 from ..gaussians import Gaussians
 
-PAGE_FOOTPRINTS = (
-    "point",
-    "mip",
-    "analytic",
-    "cumulant",
-    "box:samples=1",
-    "box:samples=2",
-    "box:samples=4",
-    "box:samples=8",
-    "box:samples=16",
-)
-"""What the page can draw. The options of `point` and `mip` may have any value."""
+
+def _page_entry(name: str) -> dict[str, Any]:
+    """What the page needs to draw a footprint; see `PackedScene.meta`."""
+    footprint = resolve_footprint(name)
+    of_header, samples = stated(footprint), footprint.samples
+    text = f"{footprint.name}, {samples} sample{'s' * (samples > 1)}" if ":" in name else name
+    return {
+        "name": name,
+        "text": text,
+        "family": footprint.name,
+        "is_default": of_header["is_default"],
+        "kind": of_header["page"],
+        "samples": samples,
+        "variance": of_header["variance"],
+        "option": of_header["option"] if of_header["value"] is None else None,
+    }
+
+
+PAGE_ENTRIES = tuple(entry for name in footprint_variants() if (entry := _page_entry(name))["kind"] is not None)
+PAGE_FOOTPRINTS = tuple(entry["name"] for entry in PAGE_ENTRIES)
+"""What the page can draw. Options that are numbers may have any value."""
 
 MAX_SH_DEGREE = 3
 GEOMETRY_WIDTH = 12
@@ -39,7 +59,10 @@ class PackedScene:
     Attributes:
         meta: JSON: name, count, sh_degree, footprint, background, views (each with name, width, height, fx, fy, cx,
             cy in pixels and the 16 numbers of w2c by rows), center and radius (of most of the Gaussians, world units),
-            and up (a unit vector).
+            and up (a unit vector). `footprints` is what the page offers: name, text for people, family (the name
+            without options) and whether it is the family's default, kind (kPage of its header), samples, variance of
+            its Gaussians [px^2], and the name of its option where that is another variance. `compared` are two of
+            their names, what the key C compares with.
         geometry: float32, little endian, 12 numbers per Gaussian: mean, opacity, scales, 0, unit quaternion (w, x, y,
             z).
         harmonics: float16, little endian. Per Gaussian the coefficients of spherical harmonics, each as (r, g, b),
@@ -60,20 +83,17 @@ class PageFootprintError(ValueError):
 
 
 def page_footprint(footprint: Footprint) -> str:
-    """The footprint as the page writes it, such as `box:samples=8`.
+    """The footprint as the page writes it, such as `box:samples=4`.
 
     Raises PageFootprintError for a footprint that the page cannot draw.
     """
-    if footprint.name == "analytic":  # its option concerns gradients only
-        return "analytic"
-    name = str(footprint)
-    if footprint.name in ("point", "mip"):
-        default = resolve_footprint(footprint.name)
-        return footprint.name if footprint == default else name
-    if name not in PAGE_FOOTPRINTS:
+    if stated(footprint)["page"] is None:
         known = ", ".join(PAGE_FOOTPRINTS)
-        raise PageFootprintError(f"footprint must be one that the viewer can draw ({known}), got {name}")
-    return name
+        raise PageFootprintError(f"footprint must be one that the viewer can draw ({known}), got {footprint}")
+    if str(footprint) in PAGE_FOOTPRINTS:
+        return str(footprint)
+    is_number = stated(footprint)["value"] is None  # other options concern gradients only
+    return str(footprint) if is_number and footprint != resolve_footprint(footprint.name) else footprint.name
 
 
 def nearest_page_footprint(footprint: Footprint) -> Footprint:
@@ -82,9 +102,11 @@ def nearest_page_footprint(footprint: Footprint) -> Footprint:
         page_footprint(footprint)
         return footprint
     except PageFootprintError:
-        one_weight = footprint.samples == 1 and footprint.name != "moment"
-        few = footprint.name == "moment" and footprint.samples == 1  # its cell is about as near as four of `box`
-        return resolve_footprint("cumulant" if one_weight else "box:samples=4" if few else "box:samples=16")
+        if str(footprint) not in sampled_footprints():
+            return resolve_footprint(NEAREST_TO_EXACT)
+        # As many samples that move are as near as more that do not.
+        drawn = [resolve_footprint(name) for name in sampled_footprints() if name in PAGE_FOOTPRINTS]
+        return next((other for other in drawn if other.samples > footprint.samples), drawn[-1])
 
 
 def pack_scene(
@@ -137,6 +159,8 @@ def pack_scene(
         "count": count,
         "sh_degree": scene.sh_degree,
         "footprint": chosen_name,
+        "footprints": list(PAGE_ENTRIES),
+        "compared": [DILATED, PAPER],
         "background": [float(value) for value in background],
         "views": [_view_entry(view) for view in views],
         "center": center.tolist(),

@@ -174,12 +174,6 @@ AR_HD void write_packed(const PackedRows<T>& to, int64_t i, const ProjectedGauss
   to.ids[place] = int32_t(i);
 }
 
-/// Whether gradients are added to `dL_dsh`. Memory of a kernel's own is overwritten.
-template <class Out, typename T>
-AR_HD bool adds_to(const Gaussians<T>& g, const Out& out, int64_t i, const Vec3<T>* dL_dsh) {
-  return Out::kAdd && dL_dsh == out.shs + i * g.sh_stride;
-}
-
 /// Writes the gradient of the colour's parameters, and returns the gradient with respect to the model's ray. `dL_dsh`,
 /// the gradient of the coefficients `sh`, may be null or the same memory as `sh`.
 template <class Cam, typename T, class Out>
@@ -198,12 +192,11 @@ AR_HD Vec3<T> splat_color_vjp(const Cam& camera, const Gaussians<T>& g, const Ou
   AR_UNROLL
   for (int k = 0; k < kCount; ++k) weight[k] = k < used ? dot(free, sh[k]) : T(0);
   if (dL_dsh) {
-    const bool adds = adds_to(g, out, i, dL_dsh);
     AR_UNROLL
     for (int k = 0; k < kCount; ++k) {
-      if (k < used) dL_dsh[k] = adds ? dL_dsh[k] + basis[k] * free : basis[k] * free;
+      if (k < used) dL_dsh[k] = Out::kAddShs ? dL_dsh[k] + basis[k] * free : basis[k] * free;
     }
-    for (int k = used; k < g.sh_stride && !adds; ++k) dL_dsh[k] = {T(0), T(0), T(0)};
+    for (int k = used; k < g.sh_stride && !Out::kAddShs; ++k) dL_dsh[k] = {T(0), T(0), T(0)};
   }
   if (g.sh_degree == 0) return {T(0), T(0), T(0)};
   const Vec3<T> dL_dunit = sh_basis_vjp<Cam::kShDegree>(g.sh_degree, d.unit, weight);
@@ -363,7 +356,7 @@ template <typename T, class Out>
 AR_HD void zero_grads(const Gaussians<T>& g, int64_t i, const Out& out, Vec3<T>* dL_dsh) {
   const Vec3<T> zero = {T(0), T(0), T(0)};
   if constexpr (Out::kAdd) {
-    for (int k = 0; dL_dsh && !adds_to(g, out, i, dL_dsh) && k < g.sh_stride; ++k) dL_dsh[k] = zero;
+    for (int k = 0; dL_dsh && !Out::kAddShs && k < g.sh_stride; ++k) dL_dsh[k] = zero;
     return;
   }
   if (out.means) out.means[i] = zero;

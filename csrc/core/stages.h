@@ -96,7 +96,8 @@ enum class MeanSums : int32_t {
 
 /// Gradients with respect to the members of Gaussians, which are overwritten. Null where not wanted.
 template <typename T> struct GaussianGrads {
-  static constexpr bool kAdd = false;
+  /// Whether gradients are added to these arrays, and coefficients to the `dL_dsh` that project_vjp gets.
+  static constexpr bool kAdd = false, kAddShs = false;
   Vec3<T>* means;
   Vec3<T>* scales;
   Vec4<T>* rotations;
@@ -112,7 +113,7 @@ template <typename T> struct GaussianGrads {
 
 /// The same, to which the gradients of another camera are added. There is no means2d.
 template <typename T> struct AddedGrads : GaussianGrads<T> {
-  static constexpr bool kAdd = true;
+  static constexpr bool kAdd = true, kAddShs = true;
 };
 
 /// A column of a table: an Element in every row.

@@ -49,7 +49,7 @@ AR_HD WeightGrad<T> weight_vjp(Sym2<T> entries, Vec2<T> d, FootprintOptions opti
     F::add_alpha_vjp(terms, d, s, AlphaGrad<T>{g, g * w}, sums);
     weighted += g * w;
   }
-  const SplatGrad<T> grad = F::prepare_vjp(cov, shape, F::collect(terms, sums, weighted), weighted, options);
+  const SplatGrad<T> grad = F::prepare_vjp(cov, shape, sums, weighted, options);
   const Sym2<T> dL_dcov = cov_grad(cov, grad);
   return {{-grad.dL_dmean.x, -grad.dL_dmean.y}, {dL_dcov.xx, T(2) * dL_dcov.xy, dL_dcov.yy}};
 }

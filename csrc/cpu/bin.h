@@ -9,9 +9,6 @@
 
 namespace ar::AR_ISA {
 
-/// What the loops over splats and tiles are compiled for.
-template <class F> using TilesOf = std::conditional_t<std::is_same_v<F, Adaptive>, Adaptive, PixelsOf<F>>;
-
 /// How far ahead of its use what belongs to a splat is fetched: splats are visited in depth order, which is random in
 /// memory.
 inline constexpr int64_t kAhead = 12;
@@ -68,13 +65,13 @@ void for_each_pair_of(const cpu::BinParams<T>& p, int64_t part_index, const Visi
 template <typename T, class Visit>
 void for_each_pair(const cpu::BinParams<T>& p, int64_t part_index, const Visit& visit) {
   visit_footprint(p.footprint, Footprints{},
-                  [&](auto f) AR_HD_LAMBDA { for_each_pair_of<TilesOf<decltype(f)>>(p, part_index, visit); });
+                  [&](auto f) AR_HD_LAMBDA { for_each_pair_of<PixelsOf<decltype(f)>>(p, part_index, visit); });
 }
 
 /// Finds the tiles of splats, sorts these by depth, counts the pairs of each tile, and turns the counts into places.
 template <typename T> void count_pairs(cpu::BinParams<T>& p) {
   p.tiles.reset(new cpu::SplatTiles[p.n]);
-  visit_footprint(p.footprint, Footprints{}, [&](auto f) AR_HD_LAMBDA { find_tiles_of<TilesOf<decltype(f)>>(p); });
+  visit_footprint(p.footprint, Footprints{}, [&](auto f) AR_HD_LAMBDA { find_tiles_of<PixelsOf<decltype(f)>>(p); });
   p.order.reset(new int32_t[p.n]);
   cpu::sort_by_depth(p.depths, p.n, p.threads, p.order.get());
   const int64_t tiles = p.grid.tiles();

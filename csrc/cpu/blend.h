@@ -23,9 +23,8 @@ template <int kSamples, typename T> PackSet<T> find_open(const T (&transmittance
   return open;
 }
 
-/// `colors`: room for the channels of a tile. `adapter`: null where rows hold P's shape.
-template <class P, typename T>
-AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* colors, const RowAdapter<P, T>* adapter) {
+/// `colors`: room for the channels of a tile.
+template <class P, typename T> AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* colors) {
   using V = typename LanesOf<T>::Type;
   constexpr int kCount = LanesOf<T>::kCount, kSamples = P::kSamples;
   const TileView view(p.grid, tile);
@@ -53,7 +52,7 @@ AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* color
     for (int i = 0; i < count; ++i) {
       const int64_t ahead = first + i + kPrefetch;
       if (ahead < end) prefetch_splat(p.splats, pairs[ahead]);
-      batch[i] = tile_splat(p.splats, pairs[first + i], adapter, view);
+      batch[i] = tile_splat<P>(p.splats, pairs[first + i], view);
     }
     for (int i = 0; i < count; ++i) {
       const auto& terms = batch[i].terms;
@@ -137,12 +136,9 @@ AR_ONE_COPY void blend_tile(const cpu::BlendParams<T>& p, int64_t tile, T* color
   }
 }
 
-template <class F, typename T> void blend(const cpu::BlendParams<T>& p) {
+template <class P, typename T> void blend(const cpu::BlendParams<T>& p) {
   cpu::parallel_for(p.grid.tiles(), p.threads, [&](int64_t tile, int thread) {
-    T* colors = p.scratch + thread * int64_t(p.channels.count) * kTilePixels;
-    visit_tile<F, AdaptiveBoxes, T>(p.lists.tile_samples, tile, [&](auto pixels, const auto* adapter) {
-      blend_tile<decltype(pixels), T>(p, tile, colors, adapter);
-    });
+    blend_tile<P, T>(p, tile, p.scratch + thread * int64_t(p.channels.count) * kTilePixels);
   });
 }
 

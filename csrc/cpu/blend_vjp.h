@@ -41,11 +41,9 @@ template <class V, typename T> AR_HD V dot_channels(const T* gradient, const T* 
   return colors + ((sums[0] + sums[1]) + (sums[2] + sums[3]));
 }
 
-/// `gradient`: room for the channels of a tile. `replay_memory`: null unless samples move. `adapter`: null where rows
-/// hold P's shape.
+/// `gradient`: room for the channels of a tile. `replay_memory`: null unless samples move.
 template <class P, typename T>
-AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T* gradient, T* replay_memory,
-                                const RowAdapter<P, T>* adapter) {
+AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T* gradient, T* replay_memory) {
   using V = typename LanesOf<T>::Type;
   constexpr int kCount = LanesOf<T>::kCount, kSamples = P::kSamples;
   const TileView view(p.grid, tile);
@@ -114,12 +112,12 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
         continue;
       }
       prefetch_before(k);
-      batch[0].splat = splat_at(p.splats, j, adapter);
+      batch[0].splat = splat_at<P>(p.splats, j);
       batch[0].terms = terms_in_tile<P>(batch[0].splat, view);
     } else if (place == kBatch - 1 || k == tile_last - 1) {
       for (int32_t i = place; i >= 0; --i) {
         prefetch_before(k - place + i);
-        batch[i] = tile_splat(p.splats, pairs[begin + k - place + i], adapter, view);
+        batch[i] = tile_splat<P>(p.splats, pairs[begin + k - place + i], view);
       }
     }
     const TileSplat<P, T>& prepared = batch[place];
@@ -219,22 +217,17 @@ AR_ONE_COPY void blend_vjp_tile(const cpu::BlendVjpParams<T>& p, int64_t tile, T
       for (int c = 0; c < count; ++c) channel_sums[c] = sum(load(sums + c * kCount, V()));
     }
     if (!with_shape) continue;
-    const ShapeGrad<T> total = {{offset_x, offset_y}, {xx, xy, yy}};
-    const auto& row = reinterpret_cast<const SplatRow<T>*>(p.splats)[j];
     auto* pair = reinterpret_cast<PairGrad<T>*>(p.pair_grads + (begin + k) * p.pair_stride);
-    *pair = {adapter ? adapter->collect(row, total, total_weighted) : P::collect(terms, total, total_weighted),
-             total_weighted};
+    *pair = {{{offset_x, offset_y}, {xx, xy, yy}}, total_weighted};
     if (with_means) p.pair_means[begin + k] = {sum(mean_sums.x), sum(mean_sums.y)};
   }
 }
 
-template <class F, typename T> void blend_vjp(const cpu::BlendVjpParams<T>& p) {
+template <class P, typename T> void blend_vjp(const cpu::BlendVjpParams<T>& p) {
   cpu::parallel_for(p.grid.tiles(), p.threads, [&](int64_t tile, int thread) {
     T* gradient = p.scratch + thread * int64_t(p.channels.count) * kTilePixels;
     T* replay_memory = p.replay ? p.replay + thread * cpu::kReplayNumbers : nullptr;
-    visit_tile<F, AdaptiveBoxesVjp, T>(p.lists.tile_samples, tile, [&](auto pixels, const auto* adapter) {
-      blend_vjp_tile<decltype(pixels), T>(p, tile, gradient, replay_memory, adapter);
-    });
+    blend_vjp_tile<P, T>(p, tile, gradient, replay_memory);
   });
 }
 

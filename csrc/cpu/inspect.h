@@ -18,14 +18,13 @@ inline void atomic_max(int32_t* bits, float value) {
   }
 }
 
-template <class P, typename T>
-AR_ONE_COPY void inspect_tile(const cpu::InspectParams<T>& p, int64_t tile, const RowAdapter<P, T>* adapter) {
+template <class P, typename T> AR_ONE_COPY void inspect_tile(const cpu::InspectParams<T>& p, int64_t tile) {
   const TileView view(p.grid, tile);
   PixelSummary<T, P> pixels[kTilePixels];
   for (int i = 0; i < kTilePixels; ++i) pixels[i].start(i % kTile < view.columns && i / kTile < view.rows);
   for (int64_t k = p.lists.tile_offsets[tile]; k < p.lists.tile_offsets[tile + 1]; ++k) {
     const int32_t j = p.lists.pairs[k], id = p.ids[j];
-    const Splat<P, T> splat = splat_at(p.splats, j, adapter);
+    const Splat<P, T>& splat = splat_at<P>(p.splats, j);
     const Support<T> support = support_of(splat);
     const auto terms = P::terms(splat.shape, splat.opacity, {T(view.x0) - splat.mean.x, T(view.y0) - splat.mean.y});
     int32_t touched = 0, in_front = 0;
@@ -61,12 +60,8 @@ AR_ONE_COPY void inspect_tile(const cpu::InspectParams<T>& p, int64_t tile, cons
   }
 }
 
-template <class F, typename T> void inspect(const cpu::InspectParams<T>& p) {
-  cpu::parallel_for(p.grid.tiles(), p.threads, [&](int64_t tile) {
-    visit_tile<F, AdaptiveBoxes, T>(p.lists.tile_samples, tile, [&](auto pixels, const auto* adapter) {
-      inspect_tile<decltype(pixels), T>(p, tile, adapter);
-    });
-  });
+template <class P, typename T> void inspect(const cpu::InspectParams<T>& p) {
+  cpu::parallel_for(p.grid.tiles(), p.threads, [&](int64_t tile) { inspect_tile<P, T>(p, tile); });
 }
 
 }  // namespace ar::AR_ISA

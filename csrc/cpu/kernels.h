@@ -18,8 +18,8 @@ template <typename T, bool kReferences> void set_blend_stages(int footprint, cpu
   visit_footprint(footprint, Footprints{}, [&](auto f) {
     using F = decltype(f);
     if constexpr (kReferences || !F::kReference) {
-      stages.blend = blend<TilesOf<F>, T>;
-      stages.blend_vjp = blend_vjp<TilesOf<F>, T>;
+      stages.blend = blend<PixelsOf<F>, T>;
+      stages.blend_vjp = blend_vjp<PixelsOf<F>, T>;
     }
   });
 }

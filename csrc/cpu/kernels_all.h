@@ -2,7 +2,6 @@
 // kernels_double.cpp include this.
 #pragma once
 
-#include "cpu/choose_samples.h"
 #include "cpu/inspect.h"
 #include "cpu/kernels.h"
 #include "cpu/rows.h"
@@ -29,8 +28,7 @@ template <typename T> cpu::Stages<T> all_stages(int footprint) {
     using F = decltype(f);
     stages.samples = F::kSamples;
     stages.moves = F::kMoves;
-    if constexpr (std::is_same_v<F, Adaptive>) stages.choose_samples = choose_samples<T>;
-    stages.inspect = inspect<TilesOf<F>, T>;
+    stages.inspect = inspect<PixelsOf<F>, T>;
     stages.weight = weight<F, T>;
     stages.weight_vjp = weight_vjp<F, T>;
   });

@@ -52,7 +52,6 @@ template <template <typename> class Cam, typename T> void project(const cpu::Pro
           p.radii[i] = 0;
         } else {
           if (p.channels.data) write_channels(p.channels, i, splat.color, depth);
-          if (given_colors(p)) splat.color = first_channels(p.given.row(int32_t(i)), p.given.count);
         }
       }
       splats[j] = splat;

@@ -47,7 +47,7 @@ template <class P, typename T> struct TilePlaces<P, T, true> {
   }
 
   /// Samples that are composited together, one behind the other: as many as have their numbers in registers.
-  static constexpr int kGroup = kSamples % 4 == 0 ? 4 : kSamples % 3 == 0 ? 3 : 1;
+  static constexpr int kGroup = kSamples % 4 == 0 ? 4 : 1;
 
   /// The samples of a group in a pack of pixels.
   struct Group {
@@ -181,7 +181,7 @@ template <class P, typename T, bool kMoves = P::kMoves> class Replay {
       const PackSet<T> open = tile_.pack_last.behind(IndexOf<V>(first));
       for (int i = 0; i < count; ++i) {
         if (first + i + kPrefetch < to) prefetch_splat(p.splats, pairs[first + i + kPrefetch]);
-        batch[i] = tile_splat<P, T>(p.splats, pairs[first + i], nullptr, view);
+        batch[i] = tile_splat<P>(p.splats, pairs[first + i], view);
       }
       for (int32_t k = first; k < first + count; ++k) {
         if (keep && k % spacing_ == 0) kept_states()[k / spacing_] = samples_.places;

@@ -78,18 +78,6 @@ template <typename T> struct BinParams {
 struct TileLists {
   const int32_t* pairs;
   const int64_t* tile_offsets;
-  const int32_t* tile_samples;  ///< [tiles] samples in use, or null: all
-};
-
-template <typename T> struct ChooseSamplesParams {
-  const T* splats;
-  TileLists lists;
-  TileGrid grid;
-  int threads;
-  const T* background;  ///< [background_count], of which the first three count; those that lack are zero
-  int background_count;
-  double tolerance;
-  int32_t* tile_samples;  ///< [tiles]
 };
 
 template <typename T> struct BlendParams : ar::BlendParams<T> {
@@ -177,7 +165,7 @@ template <typename T> struct CameraStages {
   void (*project_rows_vjp)(const ProjectRowsVjpParams<T>&);
 };
 
-/// The stages of a footprint. Only the last five depend on it; choose_samples is null where all tiles have the same.
+/// The stages of a footprint. Only the last five depend on it.
 template <typename T> struct Stages {
   int samples;
   bool moves;  ///< samples carry a state besides their transmittance
@@ -187,7 +175,6 @@ template <typename T> struct Stages {
   void (*count_pairs)(BinParams<T>&);
   void (*scatter_pairs)(BinParams<T>&);
   void (*sum_channels)(const SumChannelsParams<T>&);
-  void (*choose_samples)(const ChooseSamplesParams<T>&);
   void (*blend)(const BlendParams<T>&);
   void (*blend_vjp)(const BlendVjpParams<T>&);
   void (*inspect)(const InspectParams<T>&);

@@ -154,28 +154,9 @@ template <class P, typename T> AR_HD PackSet<T> reach_of(const Splat<P, T>& spla
   return reached;
 }
 
-/// How a tile of `adaptive` reads rows whose shape is not P's, so that the loops are compiled for P only. `collect` as
-/// of a footprint, from the row. Called once per pair, through pointers.
-template <class P, typename T> struct RowAdapter {
-  typename P::template Shape<T> (*shape)(const SplatRow<T>& row);
-  ShapeGrad<T> (*collect)(const SplatRow<T>& row, const ShapeGrad<T>& sums, T weighted);
-};
-template <class Box, typename T> typename PixelsOf<Box>::template Shape<T> box_shape(const SplatRow<T>& row) {
-  const auto shape = shape_of<Box>(row);
-  return Box::gaussian(shape);
-}
-template <class Box, typename T>
-ShapeGrad<T> collect_box(const SplatRow<T>& row, const ShapeGrad<T>& sums, T weighted) {
-  return Box::collect(Box::terms(shape_of<Box>(row), row.opacity), sums, weighted);
-}
-template <class Box, typename T>
-inline constexpr RowAdapter<PixelsOf<Box>, T> kAdapter = {box_shape<Box, T>, collect_box<Box, T>};
-
-/// Row j of `splats`, as P reads it.
-template <class P, typename T> AR_HD Splat<P, T> splat_at(const T* splats, int32_t j, const RowAdapter<P, T>* adapter) {
-  Splat<P, T> splat = reinterpret_cast<const Splat<P, T>*>(splats)[j];
-  if (adapter) splat.shape = adapter->shape(reinterpret_cast<const SplatRow<T>*>(splats)[j]);
-  return splat;
+/// Row j of `splats`.
+template <class P, typename T> AR_HD const Splat<P, T>& splat_at(const T* splats, int32_t j) {
+  return reinterpret_cast<const Splat<P, T>*>(splats)[j];
 }
 
 /// So many pairs before a splat is read, its row is asked for.
@@ -196,9 +177,8 @@ template <class P, typename T> struct TileSplat {
   decltype(P::terms(splat.shape, T(1), Vec2<T>{})) terms;
   PackSet<T> reach;
 };
-template <class P, typename T>
-AR_HD TileSplat<P, T> tile_splat(const T* splats, int32_t j, const RowAdapter<P, T>* adapter, const TileView& view) {
-  const Splat<P, T> splat = splat_at(splats, j, adapter);
+template <class P, typename T> AR_HD TileSplat<P, T> tile_splat(const T* splats, int32_t j, const TileView& view) {
+  const Splat<P, T>& splat = splat_at<P>(splats, j);
   return {splat, terms_in_tile<P>(splat, view), reach_of(splat, view)};
 }
 
@@ -216,19 +196,5 @@ template <typename T> struct LastPairs {
     return packs;
   }
 };
-
-/// visit(P{}, adapter) for what footprint F blends a tile with: its own pixels, or for `adaptive` those of the samples
-/// that were chosen. Boxes are the lists of adaptive.h.
-template <class F, class Boxes, typename T, class Visit>
-void visit_tile(const int32_t* tile_samples, int64_t tile, const Visit& visit) {
-  if constexpr (std::is_same_v<F, Adaptive>) {
-    visit_samples(tile_samples[tile], Boxes{}, [&](auto box) {
-      using Box = decltype(box);
-      visit(PixelsOf<Box>{}, &kAdapter<Box, T>);
-    });
-  } else {
-    visit(PixelsOf<F>{}, static_cast<const RowAdapter<PixelsOf<F>, T>*>(nullptr));
-  }
-}
 
 }  // namespace ar::AR_ISA

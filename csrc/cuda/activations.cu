@@ -1,15 +1,18 @@
-// Activations, their adjoint, and what density control observes: a thread per Gaussian.
+// Activations of parameters, their adjoint, and what density control observes, for torch/training_cuda.cpp. Three
+// kernels with a thread per Gaussian; core/activations.h and core/density.h say what they read and write.
 #include "core/activations.h"
 #include "core/density.h"
 
 #include "cuda/launch.cuh"
 #include "cuda/training.h"
+#include "cuda/tuning.h"
 
 namespace ar::cuda {
 namespace {
 
-constexpr int kThreads = 256;
+constexpr int kThreads = kActivateThreads;
 
+// T: float or double. Arrays have a row for each of p.n Gaussians.
 template <typename T> __global__ void activate_kernel(const ActivateParams<T> p) {
   wait_for_earlier_kernels();
   const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;

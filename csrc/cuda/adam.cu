@@ -1,17 +1,19 @@
-// A step of Adam on several tensors: a block updates a part of one of them, a thread 16 bytes of each of its arrays.
+// A step of Adam on several tensors at once, for torch/training_cuda.cpp. One kernel reads gradients, and updates
+// parameters and moments: a block has a part of one tensor.
 #include "core/adam.h"
 
 #include "cuda/launch.cuh"
 #include "cuda/training.h"
+#include "cuda/tuning.h"
 
 namespace ar::cuda {
 namespace {
 
-constexpr int kThreads = 256;
+constexpr int kThreads = kAdamThreads;
 
-/// Numbers that are read and written together.
-template <typename T> struct alignas(16) Packed {
-  static constexpr int kWidth = 16 / sizeof(T);
+/// Numbers that a thread loads at once. T: float or double, in this file.
+template <typename T> struct alignas(kAdamBytes) Packed {
+  static constexpr int kWidth = kAdamBytes / sizeof(T);
   T values[kWidth];
 };
 
@@ -29,7 +31,7 @@ template <typename T> __device__ void update_one(const AdamParams<T>& p, const A
   ar::adam(t.rule, rate, t.grad[i], t.param[i], t.exp_avg[i], t.exp_avg_sq[i]);
 }
 
-/// Numbers [i, i + kWidth), for which there is memory.
+/// Numbers [i, i + kWidth).
 template <typename T> __device__ void update_packed(const AdamParams<T>& p, const AdamTensor<T>& t, int64_t i) {
   constexpr int kWidth = Packed<T>::kWidth;
   bool chosen[kWidth], any = false;
@@ -57,6 +59,7 @@ template <typename T> __device__ void update_packed(const AdamParams<T>& p, cons
   packed(t.exp_avg_sq + i) = exp_avg_sq;
 }
 
+/// Arrays have the shapes of AdamTensor. Those that are not aligned to Packed are updated one number at a time.
 template <typename T> __global__ void __launch_bounds__(kThreads) adam_kernel(const __grid_constant__ AdamParams<T> p) {
   wait_for_earlier_kernels();
   const AdamPart part = part_of_item(p, blockIdx.x, kBlockNumbers<T>);

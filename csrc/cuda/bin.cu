@@ -1,4 +1,5 @@
-// Launches of bin: sorts, pairs, and the plan of the blending work.
+// Launches the kernels of bin.cuh, sort.cuh and plan.cuh for torch/backend_cuda.cpp. What they read and write is
+// declared in stages.h.
 #include <algorithm>
 
 #include "cuda/bin.cuh"
@@ -9,7 +10,7 @@ namespace ar::cuda {
 namespace {
 
 template <int kBits, class Value> LaunchShape sort_shape(int64_t blocks) {
-  // What a block may have on devices of compute capability 7.5, less a little for the kernel's static variables.
+  // What a block has on devices of 7.5, less static variables.
   static_assert(sizeof(SortShared<kBits, Value>) <= 63 * 1024);
   return {unsigned(blocks), Digits<kBits>::kThreads, sizeof(SortShared<kBits, Value>)};
 }
@@ -25,7 +26,7 @@ void sort_values(const TileSort<Value>& p, TileGrid grid, uint32_t* memory, cuda
              p.values[1 - pass % 2]);
     }
   });
-  launch(tile_offsets_kernel, {blocks_of(grid.tiles() + 1, kRangeTiles), kRangeTiles * kRangeLanes}, stream,
+  launch(tile_offsets_kernel, {blocks_of(grid.tiles() + 1, kOffsetTiles), kOffsetTiles * kOffsetLanes}, stream,
          p.tiles[digits.passes % 2], p.counts, grid.tiles(), p.tile_offsets, p.feedback);
 }
 
@@ -33,7 +34,6 @@ void sort_values(const TileSort<Value>& p, TileGrid grid, uint32_t* memory, cuda
 
 int64_t max_items() { return kMaxSortItems; }
 
-/// Bytes of so many words, rounded up so that what follows is aligned.
 static int64_t aligned_bytes(int64_t words) { return (words * int64_t(sizeof(uint32_t)) + 15) / 16 * 16; }
 
 int64_t depth_sort_scratch(int64_t n) { return aligned_bytes(DepthScratch::words(n, kDepthPasses)); }
@@ -45,10 +45,11 @@ int64_t tile_sort_scratch(int64_t capacity, TileGrid grid) {
 
 int tile_sort_result(TileGrid grid) { return TileDigits(grid).passes % 2; }
 
-void count_depths(const DepthSort& p, void* memory, ZeroedMemory rest, ZeroedMemory of_tiles, cudaStream_t stream) {
+void count_depths(const DepthSort& p, void* memory, ZeroedMemory other_scratch, ZeroedMemory of_tiles,
+                  cudaStream_t stream) {
   const DepthScratch scratch(static_cast<uint32_t*>(memory), p.n, kDepthPasses);
-  launch(count_depths_kernel, {kCountBlocks, kCountThreads}, stream, p.keys[0], p.ranges, p.with_slots, p.n,
-         scratch.histograms, p.counts, rest, of_tiles);
+  launch(count_depths_kernel, {multiprocessors() * kCountBlocksPerSm, kCountThreads}, stream, p.keys[0], p.ranges,
+         p.with_slots, p.n, scratch.histograms, p.counts, other_scratch, of_tiles);
 }
 
 void sort_by_depth(const DepthSort& p, void* memory, cudaStream_t stream) {
@@ -62,7 +63,7 @@ void emit_pairs(const EmitParams& p, cudaStream_t stream) {
   if (p.n == 0) return;
   const TileDigits digits(p.grid);
   launch(emit_pairs_kernel, {blocks_of(p.n, kEmitSplats), kEmitThreads}, stream, p, digits);
-  launch(emit_long_pairs_kernel, {kLongBlocks, kEmitThreads}, stream, p, digits);
+  launch(emit_long_pairs_kernel, {multiprocessors() * kLongBlocksPerSm, kEmitThreads}, stream, p, digits);
 }
 
 void sort_by_tile(const TileSort<int32_t>& p, TileGrid grid, void* scratch, cudaStream_t stream) {
@@ -76,7 +77,7 @@ void plan_chunks(const TileLists& lists, TileGrid grid, int samples, const ListC
                  const ChunkPlan& plan, cudaStream_t stream) {
   const LaunchShape shape = {blocks_of(grid.tiles(), kPlanThreads), kPlanThreads};
   const LaunchShape counters = {PlanState::kCounters, kCountWorkThreads};
-  launch(count_work_kernel, counters, stream, lists, grid.tiles(), samples, cut, plan.state);
+  launch(count_work_kernel, counters, stream, lists, grid.tiles(), cut, plan.state);
   launch(plan_kernel, shape, stream, lists, grid, samples, cut, layout, plan);
 }
 

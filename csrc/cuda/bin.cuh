@@ -1,38 +1,37 @@
-// Kernels of bin that sort splats by depth, write the pairs of each, and find those of each tile.
+// The kernels of bin but sorting (sort.cuh) and planning (plan.cuh); bin.cu launches them. From what project or
+// shape_rows wrote, count_depths counts pairs, and digits of depth keys. By depth, emit_pairs and emit_long_pairs write
+// a pair for each tile that a splat touches. When pairs are sorted by tile, tile_offsets finds the first pair of each
+// tile.
 #pragma once
 
 #include <type_traits>
 
 #include "core/bin.h"
 #include "cuda/launch.cuh"
+#include "cuda/params.h"
 #include "cuda/sort.cuh"
-#include "cuda/stages.h"
+#include "cuda/tuning.h"
 
 namespace ar::cuda {
 
 using DepthScratch = SortScratch<kDepthBits>;
 static_assert(kCulledKey == kNoKey);
-inline constexpr int kCountThreads = 1024, kCountBlocks = 132;
-/// Keys of a thread of count_depths whose loads wait together.
-inline constexpr int kCountAtOnce = 4;
 
-/// Sets memory to zero. Called by all threads of a grid, of which this is one.
 __device__ inline void set_to_zero(const ZeroedMemory& memory, int64_t thread, int64_t threads) {
   auto* pieces = static_cast<uint4*>(memory.data);
   const int64_t count = memory.bytes / int64_t(sizeof(uint4));
   for (int64_t k = thread; k < count; k += threads) pieces[k] = {0, 0, 0, 0};
 }
 
-/// Adds to a count and returns what it was.
 __device__ inline int64_t add_to_count(int64_t& count, int64_t more) {
   return int64_t(atomicAdd(reinterpret_cast<unsigned long long*>(&count), static_cast<unsigned long long>(more)));
 }
 
-/// Hands out the slots of rows of 32 splats, from counts.pairs on, of which a warp thereby takes its part. All lanes
-/// must call it.
+/// Numbers the slots of a warp's kRows x 32 splats, from counts.pairs on, and counts them there. All lanes must call
+/// it. `ranges`: of the lane's first splat; the next is `stride` later.
 template <int kRows>
-__device__ void take_slots(const int (&pairs_of)[kRows], PairRange* ranges, int64_t stride, Counts& counts) {
-  int64_t before[kRows], all = 0;  // of the pairs of these rows
+__device__ void number_slots(const int (&pairs_of)[kRows], PairRange* ranges, int64_t stride, Counts& counts) {
+  int64_t before[kRows], all = 0;
 #pragma unroll
   for (int k = 0; k < kRows; ++k) {
     const int64_t up_to = warp_inclusive_sum(int64_t(pairs_of[k]));
@@ -49,17 +48,17 @@ __device__ void take_slots(const int (&pairs_of)[kRows], PairRange* ranges, int6
   }
 }
 
-/// Histograms of all digits of the depth keys of splats with pairs; how many of these there are, and how many pairs.
-/// With slots hands these out, in ranges[].first. Also sets to zero what the kernels behind this one count in.
+/// Counts splats with pairs, pairs, and digits of depth keys. Zeroes memory for later kernels.
+/// keys, ranges: [n]. histograms: [kDepthPasses, 2^kDepthBits].
 __global__ void __launch_bounds__(kCountThreads)
     count_depths_kernel(const uint32_t* keys, PairRange* ranges, bool with_slots, int64_t n, uint32_t* histograms,
-                        Counts* counts, const ZeroedMemory rest, const ZeroedMemory of_tiles) {
+                        Counts* counts, const ZeroedMemory other_scratch, const ZeroedMemory of_tiles) {
   wait_for_earlier_kernels();
   __shared__ uint32_t local[kDepthHistogramWords];
   for (int b = threadIdx.x; b < kDepthHistogramWords; b += kCountThreads) local[b] = 0;
   const int64_t thread = int64_t(blockIdx.x) * kCountThreads + threadIdx.x;
   const int64_t stride = int64_t(gridDim.x) * kCountThreads, rounded = (n + 31) / 32 * 32;
-  set_to_zero(rest, thread, stride);
+  set_to_zero(other_scratch, thread, stride);
   set_to_zero(of_tiles, thread, stride);
   __syncthreads();
   int64_t pairs = 0, splats = 0;
@@ -80,7 +79,7 @@ __global__ void __launch_bounds__(kCountThreads)
       if (!with_slots) pairs += pairs_of[k];
       splats += valid;
     }
-    if (with_slots) take_slots(pairs_of, ranges + from, stride, *counts);
+    if (with_slots) number_slots(pairs_of, ranges + from, stride, *counts);
   }
   __syncthreads();
   for (int b = threadIdx.x; b < kDepthHistogramWords; b += kCountThreads) {
@@ -95,7 +94,6 @@ __global__ void __launch_bounds__(kCountThreads)
   }
 }
 
-/// Calls run(kernel, arguments...) for the passes of a sort by depth, in order.
 template <class Run> void for_each_depth_pass(const DepthSort& p, const DepthScratch& scratch, Run&& run) {
   const int64_t* count = &p.counts->splats;
   run(sort_pass_kernel<kDepthBits, int32_t, true>, scratch, 0, true, count, p.n, p.keys[0], p.keys[1], p.order[0],
@@ -107,9 +105,9 @@ template <class Run> void for_each_depth_pass(const DepthSort& p, const DepthScr
   }
 }
 
-/// The digits by which pairs are sorted by tile: as few and as short ones as the number of the last tile has.
+/// Digits of the sort by tile: as few, then as short, as the number of the last tile allows.
 struct TileDigits {
-  static constexpr int kMostBits = 8, kMostPasses = 4;
+  static constexpr int kMostBits = kTileDigitBits, kMostPasses = kTileDigits;
   int passes = 1, bits = kMostBits - 1;
 
   explicit TileDigits(TileGrid grid) {
@@ -119,7 +117,6 @@ struct TileDigits {
   }
   __device__ int bins() const { return 1 << bits; }
   __device__ uint32_t of(uint32_t tile, int pass) const { return tile >> (pass * bits) & (bins() - 1); }
-  /// Calls run(bits) with a constant.
   template <class Run> auto with_bits(Run&& run) const {
     constexpr std::integral_constant<int, kMostBits> most = {};
     constexpr std::integral_constant<int, kMostBits - 1> fewer = {};
@@ -132,22 +129,21 @@ class PairWriter {
  public:
   static constexpr int kMostCounts = TileDigits::kMostPasses << TileDigits::kMostBits;
 
-  /// `counts`: [kMostCounts] in shared memory. Of all threads, which may call write() after the next __syncthreads().
+  /// `counts`: [kMostCounts], shared. All threads must call it; __syncthreads() before write().
   __device__ PairWriter(const EmitParams& params, const TileDigits& digits, uint32_t* counts)
       : params_(params), digits_(digits), counts_(counts) {
     for (int b = threadIdx.x; b < digits.passes * digits.bins(); b += kEmitThreads) counts[b] = 0;
   }
-  /// `slot` is of no use where slots are not asked for.
-  __device__ void write(int64_t place, uint32_t tile, int32_t splat, int32_t slot) {
-    params_.tiles[place] = tile;
+  __device__ void write(int64_t position, uint32_t tile, int32_t splat, int32_t slot) {
+    params_.tiles[position] = tile;
     if (params_.slot_pairs) {
-      params_.slot_pairs[place] = {splat, slot};
+      params_.slot_pairs[position] = {splat, slot};
     } else {
-      params_.splat_pairs[place] = splat;
+      params_.splat_pairs[position] = splat;
     }
     for (int d = 0; d < digits_.passes; ++d) atomicAdd(&counts_[d * digits_.bins() + digits_.of(tile, d)], 1);
   }
-  /// Of all threads.
+  /// All threads must call it.
   __device__ void finish() {
     __syncthreads();
     for (int b = threadIdx.x; b < digits_.passes * digits_.bins(); b += kEmitThreads) {
@@ -161,7 +157,7 @@ class PairWriter {
   uint32_t* counts_;
 };
 
-/// A pair of a splat with few tiles: the lane that has the splat, and the bit of its mask.
+/// Lane of a splat with few tiles, and bit of its mask.
 struct MaskedPair {
   static constexpr int kBits = 8 * sizeof(TileMask);
   uint16_t value;
@@ -170,15 +166,13 @@ struct MaskedPair {
   __device__ int row() const { return value % kBits / 8; }
   __device__ int column() const { return value % 8; }
 };
-/// The pairs of a warp's splats with few tiles, one splat after the other.
 struct MaskedPairs {
   MaskedPair of[32 * kManyTiles];
 };
 
-/// The mask of a splat of at most kManyTiles tiles, or 0.
 __device__ inline TileMask few_tiles(const SplatTiles& tiles) { return tiles.count <= kManyTiles ? tiles.mask : 0; }
 
-/// Sum of what the blocks before this one published, for all lanes of a warp.
+/// The pairs of earlier blocks, from `status` [blocks] as in sort.cuh. All lanes must call it.
 __device__ inline uint32_t look_back(const uint32_t* status, int block) {
   uint32_t sum = 0;
   for (int last = block - 1; last >= 0; last -= 32) {
@@ -195,19 +189,19 @@ __device__ inline uint32_t look_back(const uint32_t* status, int block) {
   return sum;
 }
 
-/// Words of EmitParams::status: a ticket for each block, how many splats are long, and what each block publishes.
+/// Words of EmitParams::status: blocks that have begun, long splats, the count of each block.
 inline constexpr int kTickets = 0, kLongSplats = 1, kOfBlocks = 2;
 
-/// Pairs in the order of depth, a splat's by rows of tiles; and the histograms of the digits of their tiles. Long
-/// splats, whose tiles are not among 8x8, are left to emit_long_pairs. Five blocks fit on a multiprocessor.
-__global__ void __launch_bounds__(kEmitThreads, 5) emit_pairs_kernel(const EmitParams params, const TileDigits digits) {
+/// In the order of depth; the pairs of a splat by rows of tiles. Of long splats, whose tiles are not among 8x8, it
+/// lists the positions alone.
+__global__ void __launch_bounds__(kEmitThreads, blocks_per_sm(kEmitBlocks, kEmitThreads))
+    emit_pairs_kernel(const EmitParams params, const TileDigits digits) {
   wait_for_earlier_kernels();
   constexpr int kWarps = kEmitThreads / 32;
   __shared__ uint32_t digit_counts[PairWriter::kMostCounts];
   __shared__ uint32_t block_id, before_block;
   __shared__ MaskedPairs stages[kEmitRows][kWarps];
   const int64_t n = params.counts->splats;
-  // As many blocks stay as have splats, whichever of them they get.
   if (params.counts->in_patches(params.capacity) || int64_t(blockIdx.x) * kEmitSplats >= n) return;
   uint32_t* published = params.status + kOfBlocks;
   if (threadIdx.x == 0) block_id = atomicAdd(&params.status[kTickets], 1);
@@ -215,7 +209,7 @@ __global__ void __launch_bounds__(kEmitThreads, 5) emit_pairs_kernel(const EmitP
   __syncthreads();
   int32_t ids[kEmitRows];
   SplatTiles touched[kEmitRows] = {};
-  int32_t slots[kEmitRows] = {};  // the first of each splat
+  int32_t slots[kEmitRows] = {};
 #pragma unroll
   for (int row = 0; row < kEmitRows; ++row) {
     const int64_t r = int64_t(block_id) * kEmitSplats + row * kEmitThreads + threadIdx.x;
@@ -228,7 +222,7 @@ __global__ void __launch_bounds__(kEmitThreads, 5) emit_pairs_kernel(const EmitP
       if (params.slot_pairs) slots[row] = params.ranges[ids[row]].first;
     }
   }
-  uint32_t before[kEmitRows], sum = 0;  // of the pairs of the block
+  uint32_t before[kEmitRows], sum = 0;
 #pragma unroll
   for (int row = 0; row < kEmitRows; ++row) {
     uint32_t of_row;
@@ -237,10 +231,10 @@ __global__ void __launch_bounds__(kEmitThreads, 5) emit_pairs_kernel(const EmitP
   }
   if (threadIdx.x == 0) write_status(published + block_id, (block_id == 0 ? kUpToBlock : kOfBlock) | sum);
 
-  // Tiles are found before their places are known, while the blocks before get to publish theirs; and written by
-  // neighbouring lanes to neighbouring places.
+  // While earlier blocks count, the tiles are listed in shared memory; then neighbouring lanes write to neighbouring
+  // addresses.
   const int warp = threadIdx.x / 32;
-  int up_to[kEmitRows];  // pairs in the stage, of the lanes up to this one
+  int up_to[kEmitRows];  // listed by lanes up to this one
 #pragma unroll
   for (int row = 0; row < kEmitRows; ++row) {
     const TileMask mask = few_tiles(touched[row]);
@@ -269,7 +263,7 @@ __global__ void __launch_bounds__(kEmitThreads, 5) emit_pairs_kernel(const EmitP
     const SplatTiles& of_splat = touched[row];
     const int own = few_tiles(of_splat) ? of_splat.count : 0, first = up_to[row] - own, all = shuffle(up_to[row], 31);
     const auto begin = int32_t(before_block + before[row]);
-    const int32_t to_slot = slots[row] - begin;  // from a pair's place
+    const int32_t to_slot = slots[row] - begin;
     if (of_splat.count > 0 && of_splat.mask == 0) {
       const uint32_t at = atomicAdd(&params.status[kLongSplats], 1);
       params.long_splats[at] = ids[row];
@@ -278,30 +272,30 @@ __global__ void __launch_bounds__(kEmitThreads, 5) emit_pairs_kernel(const EmitP
     for (int from = 0; from < all; from += 32) {
       const int k = from + lane_id();
       const MaskedPair pair = k < all ? stages[row][warp].of[k] : MaskedPair{};
-      const int32_t place = shuffle(begin - first, pair.lane()) + k, id = shuffle(ids[row], pair.lane());
+      const int32_t position = shuffle(begin - first, pair.lane()) + k, id = shuffle(ids[row], pair.lane());
       const int32_t tile = shuffle(of_splat.first, pair.lane()) + pair.row() * columns + pair.column();
-      const int32_t slot = place + shuffle(to_slot, pair.lane());
-      if (k < all) writer.write(place, uint32_t(tile), id, slot);
+      const int32_t slot = position + shuffle(to_slot, pair.lane());
+      if (k < all) writer.write(position, uint32_t(tile), id, slot);
     }
     for (uint32_t many = __brev(__ballot_sync(kAllLanes, of_splat.count > own && of_splat.mask != 0)); many != 0;) {
       const int source = take_first(many);
       const int32_t id = shuffle(ids[row], source), slot_from = shuffle(to_slot, source);
       const int32_t tile = shuffle(of_splat.first, source) + lane_id() / 8 * columns + lane_id() % 8;
       const TileMask mask = shuffle(of_splat.mask, source);
-      int32_t first_place = shuffle(begin, source);
+      int32_t next = shuffle(begin, source);
 #pragma unroll
       for (int from = 0; from < MaskedPair::kBits; from += 32) {
         const auto bits = uint32_t(mask >> from), lane = 1u << lane_id();
-        const int32_t place = first_place + __popc(bits & (lane - 1));
-        if (bits & lane) writer.write(place, uint32_t(tile + from / 8 * columns), id, place + slot_from);
-        first_place += __popc(bits);
+        const int32_t position = next + __popc(bits & (lane - 1));
+        if (bits & lane) writer.write(position, uint32_t(tile + from / 8 * columns), id, position + slot_from);
+        next += __popc(bits);
       }
     }
   }
   writer.finish();
 }
 
-/// The tiles that a splat may touch: those of its bounding box, and of a pixel around it for rounding.
+/// The tiles of a splat's bounding box, and of a pixel around it for rounding.
 struct BoxOfTiles {
   Range rows = {0, -1}, columns = {0, -1};
 
@@ -309,7 +303,6 @@ struct BoxOfTiles {
   __device__ BoxOfTiles(const Support<float>& support, TileGrid grid)
       : rows(of_pixels(support.mean.y, support.half_height + support.reach, grid.height, grid)),
         columns(of_pixels(support.mean.x, support.half_width + support.reach, grid.width, grid)) {}
-  /// The same in patches of 2^bits x 2^bits tiles.
   __device__ BoxOfTiles in_patches(int bits) const {
     BoxOfTiles patches;
     patches.rows = {rows.first >> bits, rows.last >> bits};
@@ -324,18 +317,15 @@ struct BoxOfTiles {
   }
 };
 
-/// If there is no room for the pairs of splats and tiles: those of splats and patches, in the order of depth, by one
-/// block. The slot of such a pair is its splat, whose row all patches add to. One block takes some milliseconds per
-/// million splats, but only in the rare frame that was not foreseen: the alternative is that the host waits in every
-/// frame.
+/// Pairs of patches, where there is no room for all pairs of tiles. Their slots are the splats, to whose rows all
+/// patches add. Slow, with one block, but rare.
 __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& writer) {
   constexpr int kWarps = kEmitThreads / 32;
   const TileGrid grid = params.grid;
   const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
   const int64_t n = params.counts->splats, n_rounded = (n + kEmitThreads - 1) / kEmitThreads * kEmitThreads;
   const auto tiles_of_splat = [&](int32_t id) { return BoxOfTiles(support_of(splats[id], params.footprint), grid); };
-  // The smallest patches of 2^1 to 2^kSizes tiles that there is room for; or one, the whole image, where a splat has
-  // one pair at most.
+  // The smallest patches that fit, of 2^1 to 2^kSizes tiles a side. The whole image always fits.
   constexpr int kSizes = 8;
   int64_t of_sizes[kSizes] = {};
 #pragma unroll 4
@@ -354,16 +344,16 @@ __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& wr
   }
 
   const int64_t columns = grid.columns();
-  int64_t before = 0;  // of the pairs of earlier splats
+  int64_t before = 0;
   for (int64_t r = threadIdx.x; r < n_rounded; r += kEmitThreads) {
     const int32_t id = r < n ? params.order[r] : -1;
     const BoxOfTiles patches = id >= 0 ? tiles_of_splat(id).in_patches(bits) : BoxOfTiles();
     int64_t all;
-    int64_t place = before + sum_before<kWarps>(patches.count(), int64_t(0), all);
+    int64_t position = before + sum_before<kWarps>(patches.count(), int64_t(0), all);
     before += all;
     for (int64_t row = patches.rows.first; row <= patches.rows.last; ++row) {
-      for (int64_t column = patches.columns.first; column <= patches.columns.last; ++column, ++place)
-        writer.write(place, uint32_t((row << bits) * columns + (column << bits)), id, id);
+      for (int64_t column = patches.columns.first; column <= patches.columns.last; ++column, ++position)
+        writer.write(position, uint32_t((row << bits) * columns + (column << bits)), id, id);
     }
   }
   if (threadIdx.x == 0) {
@@ -372,11 +362,8 @@ __device__ inline void emit_patch_pairs(const EmitParams& params, PairWriter& wr
   }
 }
 
-/// Blocks of emit_long_pairs, which share the long splats.
-inline constexpr int kLongBlocks = 132 * 4;
-
-/// The pairs of long splats, a warp for each. The nearest splats are often long, so that some blocks of emit_pairs
-/// would have hundreds of them. Also says how many pairs there are in lists.
+/// A warp for each long splat; or one block for the pairs of patches. The nearest splats are often long, and would all
+/// be in a few blocks of emit_pairs.
 __global__ void __launch_bounds__(kEmitThreads)
     emit_long_pairs_kernel(const EmitParams params, const TileDigits digits) {
   wait_for_earlier_kernels();
@@ -396,8 +383,8 @@ __global__ void __launch_bounds__(kEmitThreads)
   const auto* splats = reinterpret_cast<const SplatRow<float>*>(params.splats);
   for (int k = first + threadIdx.x / 32; k < count; k += int(gridDim.x) * kWarps) {
     const int32_t id = params.long_splats[k];
-    int32_t place = params.long_places[k];
-    const int32_t to_slot = params.slot_pairs ? params.ranges[id].first - place : 0;
+    int32_t next = params.long_places[k];
+    const int32_t to_slot = params.slot_pairs ? params.ranges[id].first - next : 0;
     const Support<float> support = support_of(splats[id], params.footprint);
     const Range rows = clamp_range(rows_of(support), params.grid.height), tile_rows = tiles_of(rows, params.grid);
     for (int top = tile_rows.first; top <= tile_rows.last; top += 32) {
@@ -405,29 +392,26 @@ __global__ void __launch_bounds__(kEmitThreads)
       const Range tiles = y <= tile_rows.last ? tile_columns_of(support, params.grid, rows, y) : Range{0, -1};
       const int width = tiles.last - tiles.first + 1;
       const int widths = warp_inclusive_sum(width);
-      int32_t mine = place + widths - width;
+      int32_t position = next + widths - width;
       const int row = y * int(params.grid.columns());
-      for (int column = tiles.first; column <= tiles.last; ++column, ++mine)
-        writer.write(mine, uint32_t(row + column), id, mine + to_slot);
-      place += shuffle(widths, 31);
+      for (int column = tiles.first; column <= tiles.last; ++column, ++position)
+        writer.write(position, uint32_t(row + column), id, position + to_slot);
+      next += shuffle(widths, 31);
     }
   }
   writer.finish();
 }
 
-/// Tiles of a block, and the lanes that look for the first pair of each.
-inline constexpr int kRangeTiles = 16, kRangeLanes = 8;
-
-/// Each tile finds its first pair. Tells the host how many pairs there are.
-__global__ void __launch_bounds__(kRangeTiles* kRangeLanes)
+/// Also reports the number of pairs to the host. tiles: [counts->listed]. tile_offsets: [tile_count + 1].
+__global__ void __launch_bounds__(kOffsetTiles* kOffsetLanes)
     tile_offsets_kernel(const uint32_t* tiles, const Counts* counts, int64_t tile_count, int64_t* tile_offsets,
                         PairFeedback feedback) {
   wait_for_earlier_kernels();
   if (blockIdx.x == 0 && threadIdx.x == 0 && feedback.word)
     *feedback.word = uint64_t(feedback.frame) << 32 | min(uint64_t(counts->pairs), uint64_t(0xffffffff));
-  const int64_t tile = int64_t(blockIdx.x) * kRangeTiles + threadIdx.x / kRangeLanes;
-  const int first = partition_point<kRangeLanes>(int(counts->listed), [&](int k) { return tiles[k] < tile; });
-  if (tile <= tile_count && threadIdx.x % kRangeLanes == 0) tile_offsets[tile] = first;
+  const int64_t tile = int64_t(blockIdx.x) * kOffsetTiles + threadIdx.x / kOffsetLanes;
+  const int first = partition_point<kOffsetLanes>(int(counts->listed), [&](int k) { return tiles[k] < tile; });
+  if (tile <= tile_count && threadIdx.x % kOffsetLanes == 0) tile_offsets[tile] = first;
 }
 
 }  // namespace ar::cuda

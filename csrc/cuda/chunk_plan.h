@@ -5,38 +5,34 @@
 #include <cstdint>
 
 #include "core/stages.h"
+#include "cuda/tuning.h"
 
 namespace ar::cuda {
 
-/// Pairs of a tile that blend_vjp takes as one piece of work, and between which blend leaves checkpoints. Checkpoints
-/// hold every sample, so many samples get longer chunks.
-inline constexpr int chunk_length(int samples) { return samples <= 4 ? 256 : 64 * samples; }
+/// Pairs of a chunk: what blend_vjp works on as one piece, and between which blend stores checkpoints.
+inline constexpr int kChunkLength = 256;
 /// Length of a chunk that holds any list.
 inline constexpr int kWholeList = 1 << 30;
 /// More pairs than a list has.
 inline constexpr int kNoList = 1 << 30;
 
-/// Blocks that a large device works on side by side, about: eight for each of its 132 multiprocessors.
-inline constexpr int kManyBlocks = 1056;
-
-/// Chunks of a tile that blend goes through one after the other, which reads no pair behind the point where all pixels
-/// have stopped. `pairs` are those of the whole image, `samples` those that a lane has. The remaining chunks are
-/// blended side by side, which takes more work. Few tiles cannot fill the device, so their front is short. Else it is
-/// so long that fewer than kManyBlocks tiles have a tail: those whose list is longer than a block's share of all pairs,
-/// and would keep it busy when the others have ended.
-AR_HD int front_chunks(TileGrid grid, int64_t pairs, int samples) {
+/// Chunks of a tile that blend goes through one after the other, which reads no pair after the point where all pixels
+/// have stopped. The remaining chunks are blended side by side, which takes more work. Few tiles cannot fill the device
+/// (`blocks_at_once`: the blocks that it works on at once), so that their front is short. Else the front is so long
+/// that fewer than blocks_at_once tiles have a tail: only a tile whose list is longer than a block's share of all
+/// pairs, which would keep its block busy when the others have ended. `pairs`: of the whole image.
+AR_HD int front_chunks(TileGrid grid, int64_t pairs, int blocks_at_once) {
   constexpr int64_t kMost = 1 << 30;  // with more, tiles share lists, which have no chunks
-  int front = 256;
-  if (2 * grid.tiles() > kManyBlocks) {
-    const int share = int(pairs < kMost ? pairs : kMost) / kManyBlocks;
-    for (front = 2048; front < share;) front *= 2;
-  }
-  return front > chunk_length(samples) ? front / chunk_length(samples) : 1;
+  if (2 * grid.tiles() <= blocks_at_once) return kShortFront;
+  const int share = int(pairs < kMost ? pairs : kMost) / blocks_at_once;
+  int front = kLongFront * kChunkLength;
+  while (front < share) front *= 2;
+  return front / kChunkLength;
 }
 
 /// How plan_chunks cuts the lists of tiles into chunks.
 struct ListCut {
-  bool whole;  ///< a chunk is a whole list, unless that is long; else it has chunk_length pairs, and no list is long
+  bool whole;  ///< a chunk is a whole list, unless that is long; else it has kChunkLength pairs, and no list is long
   /// Long lists are cut into chunks of `segment` pairs, called segments, that are worked on side by side. Lists are
   /// long from long_from() pairs on, which `at_least` and `shares` decide; with at_least 0 all are.
   int at_least = 0, shares = 1, segment = 0;
@@ -49,9 +45,8 @@ struct ListCut {
   /// longest of them are cut. It does not depend on how much memory there is, so that the same lists are always cut in
   /// the same way.
   AR_HD int64_t segment_limit(int64_t pairs) const {
-    constexpr int kAlways = 4096, kPairsForEach = 4;  // in addition those of one pair in four
     if (at_least == 0) return max_segments;
-    const int64_t all = pairs / segment + pairs / at_least, few = kAlways + pairs / segment / kPairsForEach;
+    const int64_t all = pairs / segment + pairs / at_least, few = kSegments + pairs / segment / kPairsPerSegmented;
     return all < few ? all : few;
   }
   /// The number of pairs from which on a list is long, where there are `pairs` in all: at_least, doubled until it is no
@@ -63,35 +58,21 @@ struct ListCut {
   }
 };
 
-/// 1, 2 and 3, 4 to 7, 8 to 15, or 16 samples.
-inline constexpr int kSampleClasses = 5;
-AR_HD constexpr int sample_class(int samples) {
-  int c = 0;
-  for (; samples > 1; samples /= 2) ++c;
-  return c;
-}
-
-/// Where the work of a plan is by sample_class: [first[c], first[c + 1]).
-struct SampleParts {
-  int32_t first[kSampleClasses + 1];
-};
-
 /// What plan_chunks and blend count.
 struct PlanCounts {
-  int32_t planes, tail;       ///< planes of checkpoints; chunks behind the front ones
-  SampleParts tiles, chunks;  ///< of the plan's orders
+  int32_t planes;  ///< of checkpoints
+  int32_t chunks;  ///< in ChunkPlan::chunk_order
+  int32_t tail;    ///< chunks after the front ones
   /// Lists that are cut, which are the first of ChunkPlan::tile_order, and their segments, the first of chunk_order.
   int32_t cut_lists, segments;
   int32_t longest_lists;  ///< the first of those that are cut: of ListCut::longest_from pairs or more
-  /// Tiles that the front chunks left with an open sample and pairs, by sample_class: those of different samples are
-  /// blended side by side.
-  int32_t open_tiles[kSampleClasses];
+  int32_t open_tiles;     ///< tiles that have an open sample and more pairs after their front chunks
 };
 
-/// Tiles and chunks of each class of work.
-inline constexpr int kLengthClasses = 33, kWorkClasses = kSampleClasses * kLengthClasses;
+/// Tiles and chunks by the class of their length, a power of two.
+inline constexpr int kLengthClasses = 33;
 struct WorkSizes {
-  int32_t tiles[kWorkClasses], chunks[kWorkClasses];
+  int32_t tiles[kLengthClasses], chunks[kLengthClasses];
 };
 /// The counts stay for blend_vjp, the rest is scratch of plan_chunks.
 struct PlanState {
@@ -130,12 +111,10 @@ struct CheckpointLayout {
   }
   /// No fewer planes than plan_chunks makes of `pairs` pairs, or of fewer, where no tile has more than `samples`. A
   /// tile of x chunks of pairs, rounded up to less than x + 1, has no more than that many planes where it has a tail,
-  /// as no more than kManyBlocks tiles do; and no more than x where it has none.
-  int64_t max_planes(TileGrid grid, int samples, int64_t pairs, bool chosen) const {
-    // Chosen samples: those with the most planes per pair. For a backward pass all from 4 on have the same.
-    const int densest = chosen && !keep ? 4 : samples;
-    const int64_t full = pairs / chunk_length(densest) * planes(densest) + planes(densest) + planes(samples);
-    const int64_t with_tail = grid.tiles() < kManyBlocks ? grid.tiles() : kManyBlocks;
+  /// as no more than blocks_at_once tiles do; and no more than x where it has none.
+  int64_t max_planes(TileGrid grid, int samples, int64_t pairs, int blocks_at_once) const {
+    const int64_t full = (pairs / kChunkLength + 2) * planes(samples);
+    const int64_t with_tail = grid.tiles() < blocks_at_once ? grid.tiles() : blocks_at_once;
     const int64_t rounding = with_tail * planes(samples);
     return full + (rounding < full ? rounding : full);
   }
@@ -144,11 +123,12 @@ struct CheckpointLayout {
 /// How the lists are cut into chunks, and in which order work is begun; made by plan_chunks.
 struct ChunkPlan {
   PlanState* state;
-  TileChunk* chunk_order;  ///< [chunks] by samples, longest first
-  int32_t* tile_order;     ///< [tiles] by samples, longest first
+  TileChunk* chunk_order;  ///< [chunks] longest first
+  int32_t* tile_order;     ///< [tiles] longest list first
   int32_t* tile_planes;    ///< [tiles] first plane of a tile's checkpoints, if it has any
   TileChunk* tail;         ///< [counts.tail] chunks behind the front ones, or null where chunks are whole lists
   CutList* cut_lists;      ///< [counts.cut_lists] in the order of their tiles in tile_order, or null
+  int blocks_at_once;      ///< kBlocksPerSm for each multiprocessor of the device
 };
 
 }  // namespace ar::cuda

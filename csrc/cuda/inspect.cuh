@@ -1,29 +1,27 @@
-// Kernel of inspect: statistics of every pixel (core/inspect.h), and of every Gaussian over all pixels.
+// The kernel of inspect, and its launch for blend.cu. It walks the lists of splats as blending does, and writes
+// statistics of every pixel and of every Gaussian (core/inspect.h).
 #pragma once
 
 #include <algorithm>
 
 #include "core/inspect.h"
-#include "cuda/composite.cuh"
 #include "cuda/launch.cuh"
+#include "cuda/tile.cuh"
 
 namespace ar::cuda {
 
-/// Threads for a tile of kSide x kSide pixels.
 template <int kSide> inline constexpr int kInspectThreads = std::max(32, kSide* kSide);
 
-/// A block per tile of kSide x kSide pixels, a warp per subtile. Of the subtiles of a large tile a small one has those
-/// in the first column of the upper half; the smallest has a part of one.
+/// A block per tile of kSide x kSide pixels, a warp per subtile. A small tile has the subtiles of the first column of a
+/// large one; the smallest has a part of one subtile. F: the footprint.
 template <class F, int kSide>
 __global__ void __launch_bounds__(kInspectThreads<kSide>) inspect_kernel(const InspectParams params) {
   wait_for_earlier_kernels();
   constexpr int kThreads = kInspectThreads<kSide>;
   __shared__ Stage<F, 0, kThreads> stage;
   __shared__ int32_t ids[kThreads];
-  const auto* splats = reinterpret_cast<const Splat<F, float>*>(params.splats);
   const int tile = int(blockIdx.x), subtile = int(threadIdx.x) / 32 * (kSide < kTile ? 2 : 1);
   const int lane = lane_id();
-  if (!has_samples<F::kSamples>(params.lists, tile)) return;
   const TileList list = list_of(params.lists, params.grid, tile);
   const Vec2<float> p = pixel_of<F>(subtile, lane);
   const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
@@ -31,7 +29,7 @@ __global__ void __launch_bounds__(kInspectThreads<kSide>) inspect_kernel(const I
   PixelSummary<float, F> pixel;
   pixel.start(inside);
   for (int k = 0; k < list.count && __syncthreads_or(pixel.open()); k += kThreads) {
-    const int count = stage.load(splats, {}, list, k, list.count);
+    const int count = stage.load(params.splats, {}, list, k, list.count);
     if (int(threadIdx.x) < count) ids[threadIdx.x] = list.splat(k + threadIdx.x);
     __syncthreads();
     for (int first = 0; first < count; first += 32) {
@@ -42,7 +40,7 @@ __global__ void __launch_bounds__(kInspectThreads<kSide>) inspect_kernel(const I
         if (touched == 0) continue;
         const int in_front = __popc(__ballot_sync(kAllLanes, shown.in_front));
         const int64_t units = warp_sum(weight_units(shown.weight));
-        const int largest = warp_max(__float_as_int(shown.weight));  // not negative: the bits have its order
+        const int largest = warp_max(__float_as_int(shown.weight));  // its bits have its order
         if (lane == 0) {
           atomicAdd(&params.touched[id], touched);
           if (in_front) atomicAdd(&params.in_front[id], in_front);

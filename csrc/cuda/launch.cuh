@@ -1,13 +1,9 @@
-// How the host launches kernels, and how kernels begin.
+// A library: how every .cu launches its kernels, how every kernel begins, and what the host asks a device.
 //
-// A kernel may be put on the device while the one before it on the stream ends (programmatic stream serialization),
-// which saves 1 to 2 us for each. So that it touches nothing before then, every kernel but one begins by
-// wait_for_earlier_kernels(): all of its threads, since the next kernel waits for this one alone.
-//
-// The exception is a kernel that works beside the one before it, B beside A. A calls let_next_kernel_begin(), so that B
-// is put on the device when all blocks of A are, and B does not wait. What B reads has to be complete by then. So of
-// the kernels in front of B, one waits before it lets the next begin: all before that one have ended when any after it
-// begins. And B ends after A, for the kernel behind B waits for B alone (begin_beside_earlier_kernels).
+// A kernel may be on the device before earlier kernels of its stream have ended (programmatic dependent launch), which
+// saves 1 to 2 us. So every thread of a kernel first calls wait_for_earlier_kernels(). The exception is a kernel B that
+// runs beside the kernel A before it: A calls let_next_kernel_begin(), and B begin_beside_earlier_kernels(). What B
+// reads was written before a kernel, A or earlier, that waits first and then lets the next kernel begin.
 #pragma once
 
 #include <cuda_runtime.h>
@@ -16,41 +12,42 @@
 #include <atomic>
 #include <utility>
 
+#include "cuda/launch_log.h"
+
 namespace ar::cuda {
 
-/// Waits until the kernels before this one on its stream have ended and their results can be read.
+/// The answers of more devices are not kept.
+inline constexpr int kMaxDevices = 64;
+
 __device__ inline void wait_for_earlier_kernels() {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
   asm volatile("griddepcontrol.wait;" ::: "memory");
 #endif
 }
 
-/// Lets the next kernel on the stream begin beside this one, as soon as all blocks of this one have come here or ended.
-/// At wait_for_earlier_kernels() it waits until this one has ended all the same.
+/// The next kernel may begin when all blocks have called this or ended.
 __device__ inline void let_next_kernel_begin() {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
   asm volatile("griddepcontrol.launch_dependents;" ::: "memory");
 #endif
 }
 
-/// In the place of wait_for_earlier_kernels(): with `beside` this kernel runs while the one before it does, and those
-/// that have let that one begin. It must not need their results. As the next kernel waits for this one alone, its last
-/// block has nothing to do but to end after the kernel before: returns whether this is that block.
+/// Replaces wait_for_earlier_kernels() for kernel B. Returns true for the last block, which does no work: it ends after
+/// kernel A, because the next kernel waits for B alone.
 __device__ inline bool begin_beside_earlier_kernels(bool beside) {
   const bool is_last = blockIdx.x == gridDim.x - 1;
   if (!beside || is_last) wait_for_earlier_kernels();
   return is_last;
 }
 
-/// Whether kernels may be put on the current device before those ahead of them have ended. The device has to be able
-/// to, its driver also while a graph is captured, and the code has to wait: what is compiled at load time from code for
-/// older devices does not. All kernels are compiled for the same devices, so that `kernel` stands for all.
+/// Whether kernels may begin early on the current device. Drivers must allow it in graphs too. Code that is compiled at
+/// load time for older devices does not wait; `kernel` stands for all.
 inline bool may_begin_early(const void* kernel) {
-  constexpr int kDevices = 64, kGraphsMayHoldIt = 12030;  // version of the driver's CUDA
+  constexpr int kGraphsMayHoldIt = 12030;  // CUDA of the driver
   enum : signed char { kNotAsked, kNo, kYes };
-  static std::atomic<signed char> answers[kDevices];
+  static std::atomic<signed char> answers[kMaxDevices];
   int device = 0;
-  if (cudaGetDevice(&device) != cudaSuccess || device >= kDevices) return false;
+  if (cudaGetDevice(&device) != cudaSuccess || device >= kMaxDevices) return false;
   if (answers[device] == kNotAsked) {
     cudaFuncAttributes code;
     int driver = 0;
@@ -63,45 +60,39 @@ inline bool may_begin_early(const void* kernel) {
 
 inline unsigned blocks_of(int64_t n, int threads) { return unsigned((n + threads - 1) / threads); }
 
-/// Blocks, the threads of each, and bytes of dynamic_shared().
 struct LaunchShape {
   dim3 blocks;
   unsigned threads;
-  size_t shared_bytes = 0;
-  /// If not null: recorded when all blocks have begun, as far as the driver can tell, or where kernels may not begin
-  /// early, when what is ahead of them on the stream has ended. Only order on the device may depend on it, no result.
+  size_t shared_bytes = 0;  ///< of dynamic_shared()
+  /// If not null, recorded when all blocks have begun, or earlier: no result may depend on it.
   cudaEvent_t begun = nullptr;
 };
 
-/// Multiprocessors of the current device.
-inline unsigned multiprocessors() {
-  int device = 0, count = 1;
-  cudaGetDevice(&device);
-  cudaDeviceGetAttribute(&count, cudaDevAttrMultiProcessorCount, device);
-  return unsigned(count);
+/// Of the current device, which is asked once, by any thread; 0 on errors.
+template <cudaDeviceAttr kAttribute> int device_attribute() {
+  static std::atomic<int> answers[kMaxDevices];  // 0: not asked
+  int device = 0, answer = 0;
+  if (cudaGetDevice(&device) != cudaSuccess) return 0;
+  const bool remembers = device < kMaxDevices;
+  if (remembers) answer = answers[device];
+  if (answer == 0 && cudaDeviceGetAttribute(&answer, kAttribute, device) == cudaSuccess && remembers)
+    answers[device] = answer;
+  return answer;
 }
 
-/// Bytes of shared memory that a block may have on the current device.
-inline size_t max_shared_bytes() {
-  int device = 0, bytes = 0;
-  cudaGetDevice(&device);
-  cudaDeviceGetAttribute(&bytes, cudaDevAttrMaxSharedMemoryPerBlockOptin, device);
-  return size_t(bytes);
-}
+inline unsigned multiprocessors() { return unsigned(std::max(device_attribute<cudaDevAttrMultiProcessorCount>(), 1)); }
 
-/// Bytes of shared memory that each of so many blocks may have that are on a multiprocessor of the current device at
-/// once.
+inline size_t max_shared_bytes() { return size_t(device_attribute<cudaDevAttrMaxSharedMemoryPerBlockOptin>()); }
+
+/// For each of so many blocks on a multiprocessor.
 inline size_t shared_bytes_of_blocks(int blocks) {
-  int device = 0, all = 0, reserved = 0;
-  cudaGetDevice(&device);
-  cudaDeviceGetAttribute(&all, cudaDevAttrMaxSharedMemoryPerMultiprocessor, device);
-  cudaDeviceGetAttribute(&reserved, cudaDevAttrReservedSharedMemoryPerBlock, device);  // by the system, of each block
+  const int all = device_attribute<cudaDevAttrMaxSharedMemoryPerMultiprocessor>();
+  const int reserved = device_attribute<cudaDevAttrReservedSharedMemoryPerBlock>();  // of each block
   const size_t own = std::max(all / blocks - reserved, 0);
   return std::min(own, max_shared_bytes());
 }
 
-/// Makes an attribute by which a launch records an event when all of its blocks have begun. False where the toolkit is
-/// older than that. (CUDA promises no more than to try; the driver has to be as new, which may_begin_early() asks.)
+/// Makes a launch record an event when its blocks have begun; false if the toolkit is older than that.
 inline bool set_begun_event([[maybe_unused]] cudaLaunchAttribute& attribute, [[maybe_unused]] cudaEvent_t event) {
 #if CUDART_VERSION >= 12030
   attribute.id = cudaLaunchAttributeLaunchCompletionEvent;
@@ -112,10 +103,12 @@ inline bool set_begun_event([[maybe_unused]] cudaLaunchAttribute& attribute, [[m
 #endif
 }
 
-/// Launches `kernel`. An error is left for cudaGetLastError.
+/// cudaGetLastError() tells of errors.
 template <class... Params, class... Arguments>
 void launch(void (*kernel)(Params...), const LaunchShape& shape, cudaStream_t stream, Arguments&&... arguments) {
-  constexpr size_t kUnasked = 48 * 1024;  // bytes of shared memory that every kernel may have
+  if (const auto observe = launch_observer.load(std::memory_order_relaxed))
+    observe(reinterpret_cast<const void*>(kernel));
+  constexpr size_t kUnasked = 48 * 1024;  // bytes that every kernel may have
   if (shape.shared_bytes > kUnasked)
     cudaFuncSetAttribute(kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, int(shape.shared_bytes));
   const bool early = may_begin_early(reinterpret_cast<const void*>(kernel));

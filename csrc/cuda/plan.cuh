@@ -2,7 +2,7 @@
 #pragma once
 
 #include "cuda/launch.cuh"
-#include "cuda/stages.h"
+#include "cuda/params.h"
 #include "cuda/warp.cuh"
 
 namespace ar::cuda {
@@ -11,12 +11,9 @@ inline constexpr int kCountWorkThreads = 1024, kPlanThreads = 256;
 /// Tiles of a thread of count_work whose loads wait together.
 inline constexpr int kTilesAtOnce = 2;
 
-/// The class of a piece of work. Work is handed out by samples, and of those longest first, so that no block starts on
-/// a long piece when the others are done. Lengths are classed by powers of two; within a class the order does not
-/// matter.
-__device__ inline int work_class(int samples, int length) {
-  return sample_class(samples) * kLengthClasses + __clz(length);
-}
+/// The class of a piece of work by its length, between powers of two; longer work has a lower class. Work is handed out
+/// by class, so that no block starts on a long piece when the others are done. The order within a class is arbitrary.
+__device__ inline int work_class(int length) { return __clz(length); }
 
 /// Takes a place of the class `of` where `wanted`. Lanes of one class go together: atomics to one place are slow. All
 /// lanes must call it.
@@ -30,66 +27,64 @@ __device__ inline int take_place(int32_t* next, int of, bool wanted) {
 
 /// The list of a tile, and how it is cut.
 struct PlannedTile {
-  int samples, n;  ///< pairs
-  int length;      ///< of a chunk
-  bool is_long;    ///< as ListCut means it
+  int n;         ///< pairs
+  int length;    ///< pairs of a chunk
+  bool is_long;  ///< as ListCut::long_from decides
 
-  __device__ PlannedTile(const TileLists& lists, int64_t tile, int most_samples, const ListCut& cut) {
+  __device__ PlannedTile(const TileLists& lists, int64_t tile, const ListCut& cut) {
     const bool in_patches = lists.counts->in_patches(lists.capacity);
     n = in_patches ? 1 : int(lists.tile_offsets[tile + 1] - lists.tile_offsets[tile]);
-    samples = lists.tile_samples ? lists.tile_samples[tile] : most_samples;
     is_long = cut.max_segments > 0 && !in_patches && n >= cut.long_from(lists.counts->pairs);
-    length = is_long ? cut.segment : cut.whole ? kWholeList : chunk_length(samples);
+    length = is_long ? cut.segment : cut.whole ? kWholeList : kChunkLength;
   }
   /// The last segment of a long list is one of them, however long it is.
   __device__ int full() const { return (is_long ? n + length - 1 : n) / length; }
   __device__ int rest() const { return is_long ? 0 : n % length; }
   /// The class of the full chunks. Segments have that of their list, whose order they keep.
-  __device__ int full_class() const { return work_class(samples, is_long ? n : length); }
+  __device__ int full_class() const { return work_class(is_long ? n : length); }
 };
 
 /// Counts the work of each class, in as many parts as there are blocks, and begins the counts of the plan.
 __global__ void __launch_bounds__(kCountWorkThreads)
-    count_work_kernel(const TileLists lists, int64_t tiles, int most_samples, ListCut cut, PlanState* state) {
+    count_work_kernel(const TileLists lists, int64_t tiles, ListCut cut, PlanState* state) {
   wait_for_earlier_kernels();
-  static_assert(kWorkClasses < kCountWorkThreads);
+  static_assert(kLengthClasses < kCountWorkThreads);
   __shared__ WorkSizes sizes;
   const int c = threadIdx.x;
-  if (c < kWorkClasses) sizes.tiles[c] = sizes.chunks[c] = 0;
+  if (c < kLengthClasses) sizes.tiles[c] = sizes.chunks[c] = 0;
   __syncthreads();
   const int64_t stride = int64_t(gridDim.x) * kCountWorkThreads;
   for (int64_t first = blockIdx.x * kCountWorkThreads + threadIdx.x; first < tiles; first += kTilesAtOnce * stride) {
-    const auto planned = [&](int64_t tile) { return PlannedTile(lists, min(tile, tiles - 1), most_samples, cut); };
+    const auto planned = [&](int64_t tile) { return PlannedTile(lists, min(tile, tiles - 1), cut); };
     const PlannedTile at_once[kTilesAtOnce] = {planned(first), planned(first + stride)};
 #pragma unroll
     for (int k = 0; k < kTilesAtOnce; ++k) {
       if (first + k * stride >= tiles) break;
       const PlannedTile& tile = at_once[k];
       const int full = tile.full(), rest = tile.rest();
-      atomicAdd(&sizes.tiles[work_class(tile.samples, tile.n)], 1);
+      atomicAdd(&sizes.tiles[work_class(tile.n)], 1);
       if (full > 0) atomicAdd(&sizes.chunks[tile.full_class()], full);
-      if (rest > 0) atomicAdd(&sizes.chunks[work_class(tile.samples, rest)], 1);
+      if (rest > 0) atomicAdd(&sizes.chunks[work_class(rest)], 1);
     }
   }
   __syncthreads();
-  if (c < kWorkClasses) {
+  if (c < kLengthClasses) {
     WorkSizes& counted = state->counted[blockIdx.x];
     counted.tiles[c] = sizes.tiles[c], counted.chunks[c] = sizes.chunks[c];
   }
   if (blockIdx.x != 0) return;
   PlanCounts& counts = state->counts;
-  if (c < kWorkClasses) state->placed.tiles[c] = state->placed.chunks[c] = 0;
-  if (c < kSampleClasses) counts.open_tiles[c] = 0;
-  if (c == 0) counts.planes = counts.tail = 0;
+  if (c < kLengthClasses) state->placed.tiles[c] = state->placed.chunks[c] = 0;
+  if (c == 0) counts.planes = counts.tail = counts.open_tiles = 0;
 }
 
 /// What was counted of the class whose number is that of this thread; `of(sizes)`: the sizes meant.
 template <class Of> __device__ int size_of_class(const PlanState& state, Of&& of) {
-  static_assert(kWorkClasses < kPlanThreads);
+  static_assert(kLengthClasses < kPlanThreads);
   const int c = threadIdx.x;
   int size = 0;
 #pragma unroll
-  for (int k = 0; k < PlanState::kCounters; ++k) size += c < kWorkClasses ? of(state.counted[k])[c] : 0;
+  for (int k = 0; k < PlanState::kCounters; ++k) size += c < kLengthClasses ? of(state.counted[k])[c] : 0;
   return size;
 }
 
@@ -104,7 +99,7 @@ struct CutClasses {
     const int64_t pairs = tile_lists.counts->pairs;
     if (cut.max_segments == 0 || tile_lists.counts->in_patches(tile_lists.capacity)) return;
     constexpr int kWarps = kPlanThreads / 32;
-    const int of_length = int(threadIdx.x) % kLengthClasses;
+    const int of_length = threadIdx.x;  // of threads beyond the classes both sizes are 0
     const bool are_long = of_length <= __clz(cut.long_from(pairs));
     int all;
     const int up_to = counted + sum_before<kWarps>(are_long ? counted : 0, 0, all);
@@ -116,14 +111,14 @@ struct CutClasses {
   }
 };
 
-/// Where the work of each class begins, from the size of this thread's. One block also writes where the work of each
-/// number of samples begins. Of all threads of a block; afterwards they must wait.
-__device__ inline void find_begins(int size, int32_t (&begins)[kWorkClasses], SampleParts& parts) {
+/// Writes to shared memory where the work of each class begins, from the size of this thread's class. Returns the size
+/// of all classes. All threads of a block must call it, and afterwards wait for each other.
+__device__ inline int find_begins(int size, int32_t (&begins)[kLengthClasses]) {
   const int c = threadIdx.x;
   int all;
   const int first = sum_before<kPlanThreads / 32>(size, 0, all);
-  if (c < kWorkClasses) begins[c] = first;
-  if (blockIdx.x == 0 && c <= kWorkClasses && c % kLengthClasses == 0) parts.first[c / kLengthClasses] = first;
+  if (c < kLengthClasses) begins[c] = first;
+  return all;
 }
 
 /// A tile's chunks [begin, end) and their places in a list of chunks, from `place` on.
@@ -147,7 +142,7 @@ __device__ inline void write_run(TileChunk* list, const ChunkRun& run, const Til
 
 /// Places come from atomics: which tile gets which differs from run to run, and changes no result.
 __global__ void __launch_bounds__(kPlanThreads)
-    plan_kernel(const TileLists lists, TileGrid grid, int most_samples, ListCut cut, CheckpointLayout layout,
+    plan_kernel(const TileLists lists, TileGrid grid, int samples, ListCut cut, CheckpointLayout layout,
                 const ChunkPlan plan) {
   wait_for_earlier_kernels();
   __shared__ WorkSizes begins;
@@ -156,14 +151,14 @@ __global__ void __launch_bounds__(kPlanThreads)
   const int64_t i = int64_t(blockIdx.x) * kPlanThreads + threadIdx.x;
   const bool valid = i < grid.tiles();
   const auto tile = int32_t(valid ? i : 0);
-  const PlannedTile planned(lists, tile, most_samples, cut);
-  const int samples = planned.samples, full = valid ? planned.full() : 0, rest = valid ? planned.rest() : 0;
-  const int chunks = full + (rest > 0), front = front_chunks(grid, lists.counts->pairs, samples);
+  const PlannedTile planned(lists, tile, cut);
+  const int full = valid ? planned.full() : 0, rest = valid ? planned.rest() : 0;
+  const int chunks = full + (rest > 0), front = front_chunks(grid, lists.counts->pairs, plan.blocks_at_once);
   const int tail = cut.whole ? 0 : max(chunks - front, 0);
   const int planes = valid && !cut.whole ? layout.tile_planes(front, samples, chunks) : 0;
   // All atomics first: they wait together.
-  const int full_class = planned.full_class(), rest_class = work_class(samples, rest);
-  const int tile_class = work_class(samples, planned.n);
+  const int full_class = planned.full_class(), rest_class = work_class(rest);
+  const int tile_class = work_class(planned.n);
   const int plane = planes > 0 ? atomicAdd(&counts.planes, planes) : 0;
   const int full_place = full > 0 ? atomicAdd(&placed.chunks[full_class], full) : 0;
   const int tail_place = tail > 0 ? atomicAdd(&counts.tail, tail) : 0;
@@ -172,8 +167,8 @@ __global__ void __launch_bounds__(kPlanThreads)
   const int tiles_of_class = size_of_class(*plan.state, [](auto& sizes) { return sizes.tiles; });
   const int chunks_of_class = size_of_class(*plan.state, [](auto& sizes) { return sizes.chunks; });
   const CutClasses cut_classes(cut, lists, tiles_of_class, chunks_of_class);
-  find_begins(tiles_of_class, begins.tiles, counts.tiles);
-  find_begins(cut_classes.chunks_of_class, begins.chunks, counts.chunks);
+  find_begins(tiles_of_class, begins.tiles);
+  const int all_chunks = find_begins(cut_classes.chunks_of_class, begins.chunks);
   __syncthreads();
   const int of_chunk = layout.planes(samples);
   const TileChunk first = {tile, 0, plane - layout.first_chunk(front) * of_chunk};
@@ -188,7 +183,7 @@ __global__ void __launch_bounds__(kPlanThreads)
   }
   if (i == 0) {
     counts.cut_lists = cut_classes.lists, counts.longest_lists = cut_classes.longest;
-    counts.segments = cut_classes.segments;
+    counts.segments = cut_classes.segments, counts.chunks = all_chunks;
   }
   write_run(plan.chunk_order, run, first, of_chunk);
   if (rest > 0) plan.chunk_order[begins.chunks[rest_class] + rest_place] = {tile, full, first.plane + full * of_chunk};

@@ -1,4 +1,5 @@
-// Launches of the projection, for every camera type and whatever the footprint.
+// Launches the kernels of project.cuh and project_vjp.cuh for torch/backend_cuda.cpp, each for the type of the camera;
+// stages.h declares what they read and write.
 #include <algorithm>
 #include <mutex>
 #include <set>
@@ -9,22 +10,20 @@
 namespace ar::cuda {
 namespace {
 
-/// With a thread for each of n rows, but no more than `most_blocks`.
+/// A thread for each of n rows, in at most `most_blocks` blocks.
 template <class Params>
 void launch_rows(void (*kernel)(Params), const Params& p, int64_t n, cudaStream_t stream, unsigned most_blocks = ~0u) {
   if (n > 0) launch(kernel, {std::min(blocks_of(n, kProjectThreads), most_blocks), kProjectThreads}, stream, p);
 }
 
-/// The kernel for the camera: `plain` or `full`.
 template <class Params>
 void launch_rows(void (*plain)(Params), void (*full)(Params), const Params& p, cudaStream_t stream,
                  unsigned most_blocks = ~0u) {
   launch_rows(p.camera.lens ? full : plain, p, p.gaussians.n, stream, most_blocks);
 }
 
-/// All kernels on a multiprocessor share one division of its memory into cache and shared memory. While it runs one
-/// that got much cache, no block of blend_vjp begins there, which needs much shared memory. This is asked for once on
-/// each device: when it was asked for at every launch, the memory of the process grew with every launch.
+/// All kernels on a multiprocessor share one division of its memory into cache and shared memory: blend_vjp, with much
+/// shared memory, cannot begin beside a kernel with much cache. Once per device, as every call takes memory.
 void let_blend_vjp_begin_beside_zero_culled_grads() {
   static std::mutex mutex;
   static std::set<int> devices;
@@ -42,7 +41,7 @@ using Full = FullCamera<float>;
 }  // namespace
 
 void project(const ProjectParams& p, cudaStream_t stream) {
-  launch_rows(project_kernel<Plain>, project_kernel<Full>, p, stream, kProjectBlocks);
+  launch_rows(project_kernel<Plain>, project_kernel<Full>, p, stream, multiprocessors() * kProjectBlocksPerSm);
 }
 void project_rows(const ProjectRowsParams& p, cudaStream_t stream) {
   launch_rows(project_rows_kernel<Plain>, project_rows_kernel<Full>, p, stream);
@@ -52,7 +51,7 @@ void project_vjp(const ProjectVjpParams& p, cudaStream_t stream) {
 }
 void zero_culled_grads(const ZeroGradsParams& p, cudaStream_t stream, cudaEvent_t begun) {
   let_blend_vjp_begin_beside_zero_culled_grads();
-  launch(zero_culled_grads_kernel, {kZeroBlocks, kZeroThreads, 0, begun}, stream, p);
+  launch(zero_culled_grads_kernel, {multiprocessors() * kZeroBlocksPerSm, kZeroThreads, 0, begun}, stream, p);
 }
 void project_rows_vjp(const ProjectRowsVjpParams& p, cudaStream_t stream) {
   if (p.add) return launch_rows(add_project_rows_vjp_kernel<Plain>, add_project_rows_vjp_kernel<Full>, p, stream);

@@ -1,19 +1,20 @@
-// Kernels of project, project_rows and shape_rows: a thread per Gaussian, or per row.
+// Three kernels from Gaussians to splats; project.cu launches them. `project` writes the splats of Gaussians, and what
+// bin reads. `project_rows` writes public rows (mean, covariance, opacity, depth, colour), to keep or to send to
+// another rank. `shape_rows` reads public rows, and writes splats and what bin reads.
 #pragma once
 
 #include "cuda/launch.cuh"
 #include "cuda/sh_rows.cuh"
 #include "cuda/splat_tiles.cuh"
+#include "cuda/tuning.h"
 
 namespace ar::cuda {
 
-inline constexpr int kProjectThreads = 128;
-
 __device__ inline uint32_t depth_key(float depth) {
-  return __float_as_uint(depth + 0.0f) + kDepthKeyOffset;  // of -0 too
+  return __float_as_uint(depth + 0.0f) + kDepthKeyOffset;  // + 0: -0 becomes 0
 }
 
-/// What bin needs of splat i.
+/// What bin reads. Params: ProjectParams or ShapeRowsParams.
 template <class Params>
 __device__ void write_tiles(const Params& params, int64_t i, const SplatTiles& tiles, float depth) {
   const bool any = tiles.count > 0;
@@ -22,14 +23,14 @@ __device__ void write_tiles(const Params& params, int64_t i, const SplatTiles& t
   if (any) params.tiles[i] = tiles;
 }
 
-/// Zeros for what count_depths counts. The first block alone: the others have enough to do.
+/// What count_depths adds to. By the first block alone.
 template <class Params> __device__ void clear_counts(const Params& params) {
   if (blockIdx.x > 0) return;
   for (int k = threadIdx.x; k < kDepthHistogramWords; k += kProjectThreads) params.depth_histograms[k] = 0;
   if (threadIdx.x == 0) *params.counts = {};
 }
 
-/// Of the lanes in `lanes`, those whose row has a number that is not finite or too large. A warp reads a row together.
+/// Those of `lanes` whose row has a number that is not finite or too large. A warp reads a row together.
 __device__ inline uint32_t rows_not_finite(const Channels<float>& channels, int64_t first, uint32_t lanes) {
   uint32_t found = 0;
   for (uint32_t left = __brev(lanes); left != 0;) {
@@ -42,8 +43,7 @@ __device__ inline uint32_t rows_not_finite(const Channels<float>& channels, int6
   return found;
 }
 
-/// A camera in shared memory, from where it is read where it is used, so that it takes no registers. Shared variables
-/// may not have initialisers, as its members do.
+/// A camera that takes no registers. As bytes, because shared variables may not have initialisers.
 template <class Cam> struct SharedCamera {
   alignas(16) char memory[sizeof(Cam)];
 
@@ -56,10 +56,7 @@ template <class Cam> struct SharedCamera {
   }
 };
 
-/// The most blocks of project_kernel, four times as many as an H200 has room for. More Gaussians than they have threads
-/// are taken in turns, so that the camera is loaded once for several of them.
-inline constexpr unsigned kProjectBlocks = 132 * 32;
-
+// Cam: Camera<float> or FullCamera<float>. A thread has a Gaussian; in `project` it may have several.
 template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_kernel(const ProjectParams params) {
   wait_for_earlier_kernels();
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
@@ -78,11 +75,11 @@ template <class Cam> __global__ void __launch_bounds__(kProjectThreads) project_
     if (i < g.n && may_be_visible(camera, g, i, params.bounds, mean))
       radius = project_shape(camera, g, i, mean, params.footprint, splat, depth, &support);
     const uint32_t lit = __ballot_sync(kAllLanes, splat.level > 0);
-    __syncwarp();  // all lanes have read the rows of the Gaussians before
+    __syncwarp();  // all lanes have read the rows of earlier Gaussians
     if (g.shs && lit) rows.begin_load(g.shs + (i - lane_id()) * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
     uint32_t not_finite = 0;
     if (params.given.data) not_finite = rows_not_finite(params.given, i - lane_id(), lit);
-    // While the harmonics are on their way.
+    // During the copies.
     SplatTiles tiles = {};
     if (splat.level > 0) tiles = splat_tiles_of(support, params.grid);
     wait_for_copies();

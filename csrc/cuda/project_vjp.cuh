@@ -1,5 +1,7 @@
-// Kernels of project_vjp, project_rows_vjp and row_grads, a thread per Gaussian or row; of zero_culled_grads; and of
-// sum_channels.
+// The kernels of the backward pass after blend_vjp; project.cu launches them. `project_vjp` reads gradients of pairs,
+// and writes gradients of Gaussians; `zero_culled_grads` writes zeros for Gaussians without pairs, beside blend_vjp.
+// For public rows, `row_grads` writes gradients of rows, and `project_rows_vjp` reads these, perhaps on another rank.
+// And `sum_channels` writes gradients of further channels.
 #pragma once
 
 #include "cuda/launch.cuh"
@@ -7,11 +9,19 @@
 
 namespace ar::cuda {
 
-/// A row of pair gradients, summed for one splat.
+/// Gaussians of a warp, adjacent in memory. If none has pairs, zero_culled_grads writes their gradients, else
+/// project_vjp.
+inline constexpr int kGradRows = 32;
+static_assert(kProjectThreads % kGradRows == 0 && kZeroThreads % kGradRows == 0);
+static_assert(warps_of(kGradRows) == 1 && warps_of(kGradRows + 1) == 2);
+
+__device__ inline uint32_t lanes_with_pairs(int pairs) { return __ballot_sync(kAllLanes, pairs > 0); }
+__device__ inline int rows_of_group(int64_t first, int64_t n) { return int(min(int64_t(kGradRows), n - first)); }
+
 struct SplatSums {
   float value[kPairGradWidth];
 
-  /// Adds the first `count` of kRows rows, whose loads wait together.
+  /// Adds up to kRows rows, loaded at once: [count, kPairGradWidth].
   template <int kRows> __device__ void add(const float* rows, int count) {
     constexpr int kQuads = kPairGradWidth / 4;
     const float4* quads = reinterpret_cast<const float4*>(rows);
@@ -37,12 +47,7 @@ struct SplatSums {
   }
 };
 
-/// A splat with more pairs than this is summed by its whole warp.
-inline constexpr int kManyPairs = 64;
-/// Rows that a lane loads before it waits for the first of them.
-inline constexpr int kRowsAtOnce = 4;
-
-/// Sums the pairs of each lane's splat i, always in the same order. All lanes must call it.
+/// Sums the pairs of each lane's splat i, in a fixed order. All lanes must call it.
 __device__ inline SplatSums sum_pairs(const PairSumsView& pairs, int64_t i, PairRange range) {
   SplatSums sums = {};
   const auto row = [&](int64_t k) { return pairs.pair_grads + k * kPairGradWidth; };
@@ -67,8 +72,7 @@ __device__ inline SplatSums sum_pairs(const PairSumsView& pairs, int64_t i, Pair
   return sums;
 }
 
-/// Zeros, with neighbouring lanes at neighbouring addresses. Nobody reads them soon, so that they should leave the
-/// cache first.
+/// Streaming, as nobody reads zeros soon.
 __device__ inline void zero_rows(float* to, int count) {
   if (count % 4 == 0 && reinterpret_cast<uintptr_t>(to) % 16 == 0) {
     for (int e = lane_id(); e < count / 4; e += 32) store_streaming(reinterpret_cast<float4*>(to) + e, {0, 0, 0, 0});
@@ -88,18 +92,16 @@ __device__ inline void zero_grads_of_warp(const Gaussians<float>& g, const Gauss
   if (out.shs) zero_rows(&out.shs[first * g.sh_stride].x, 3 * g.sh_stride * n);
 }
 
-/// `rows` as a view in which the first row has index `first`. No such array begins in memory, so that the address is
-/// worked out as a number.
+/// `rows` as a view in which the first row has index `first`.
 template <class Row> __device__ const Row* view_from(const float* rows, int64_t first) {
   return reinterpret_cast<const Row*>(reinterpret_cast<uintptr_t>(rows) - uintptr_t(first) * sizeof(Row));
 }
 
-/// A warp's Gaussians in shared memory, all but their colours.
+/// In shared memory, without colours.
 struct GaussianRows {
-  float means[32 * 3], shapes[32 * 7], opacities[32];
+  float means[kGradRows * 3], shapes[kGradRows * 7], opacities[kGradRows];
 
-  /// Begins to load those of the lanes in `lanes`. `first` is lane 0's. Returns views in which they have the same
-  /// indices, to be read after wait_for_copies().
+  /// Begins to load the Gaussians of `lanes`, from `first` on. Returns views, to read after wait_for_copies().
   __device__ Gaussians<float> begin_load(const Gaussians<float>& g, int64_t first, uint32_t lanes) {
     Gaussians<float> out = g;
     copy_rows_async<3>(means, &g.means[first].x, lanes);
@@ -110,7 +112,7 @@ struct GaussianRows {
       copy_rows_async<6>(shapes, &g.cov3ds[first].xx, lanes);
       out.cov3ds = view_from<Sym3<float>>(shapes, first);
     } else {
-      float* rotations = shapes + 32 * 3;
+      float* rotations = shapes + kGradRows * 3;
       copy_rows_async<3>(shapes, &g.scales[first].x, lanes);
       copy_rows_async<4>(rotations, &g.rotations[first].x, lanes);
       out.scales = view_from<Vec3<float>>(shapes, first);
@@ -120,7 +122,7 @@ struct GaussianRows {
   }
 };
 
-/// Sums of the lanes' gradients, one number after the other.
+/// to: [kCameraGradWidth].
 __device__ inline void store_warp_sums(const CameraGrad<float>& grad, float* to) {
   const float* values = &grad.view_x.x;
 #pragma unroll
@@ -130,17 +132,17 @@ __device__ inline void store_warp_sums(const CameraGrad<float>& grad, float* to)
   }
 }
 
-/// What project_vjp starts from: sums over pairs.
+/// The source of project_vjp.
 struct FromPairs {
-  /// Whether another kernel writes the zeros of a warp without pairs.
+  /// Whether zero_culled_grads writes zeros.
   static constexpr bool kZeroed = true;
   const ProjectVjpParams& params;
 
-  /// What is known of Gaussian i before its gradient is asked for. count: 0 if it has none.
+  /// count: 0 without gradient.
   __device__ PairRange range(int64_t i) const { return params.sums.ranges[i]; }
-  /// What the lanes of a warp must find together.
+  /// All lanes must call it.
   __device__ SplatSums sum(int64_t i, PairRange range) const { return sum_pairs(params.sums, i, range); }
-  /// Calls use(gradient with respect to the splat as a function of it, what it shows, MeanSums). range.count > 0.
+  /// Calls use(function from splat to gradient, ShownGrad, MeanSums), if range.count > 0.
   template <class Cam, class Use>
   __device__ void visit(const Cam& camera, const Gaussians<float>& g, int64_t i, PairRange, const SplatSums& sums,
                         Use&& use) const {
@@ -163,7 +165,7 @@ struct FromPairs {
   }
 };
 
-/// What project_rows_vjp starts from: gradients with respect to public rows.
+/// The source of project_rows_vjp.
 struct FromRows {
   static constexpr bool kZeroed = false;
   const ProjectRowsVjpParams& params;
@@ -186,9 +188,14 @@ struct FromRows {
   }
 };
 
-/// Blocks that a multiprocessor holds at once. With one more a thread would have 80 registers and spill others.
-inline constexpr int kProjectVjpBlocks = 5;
+/// Coefficients are made in shared memory, then added.
+struct StagedGrads : AddedGrads<float> {
+  static constexpr bool kAddShs = false;
+};
 
+template <class Cam> inline constexpr int kVjpBlocks = Cam::kFull ? kFullProjectVjpBlocks : kProjectVjpBlocks;
+
+/// Cam: Camera<float> or FullCamera<float>. From: FromPairs or FromRows. Out: GaussianGrads<float> or StagedGrads.
 template <class Cam, class From, class Params, class Out>
 __device__ void project_vjp_body(const Params& params, const From& from, const Out& out) {
   __shared__ ShRows<Cam::kShDegree> sh_rows[kProjectThreads / 32];
@@ -196,26 +203,26 @@ __device__ void project_vjp_body(const Params& params, const From& from, const O
   __shared__ SharedCamera<Cam> shared_camera;
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
   const int lane = lane_id(), warp = threadIdx.x / 32;
-  const int64_t first = i - lane;  // of the warp
+  const int64_t first = i - lane;
   const PairRange range = i < params.gaussians.n ? from.range(i) : PairRange{0, 0};
   const Cam& camera = shared_camera.load(params.camera);
   if (first >= params.gaussians.n) return;
-  const uint32_t lit = __ballot_sync(kAllLanes, range.count > 0);
-  const int n = int(min(int64_t(32), params.gaussians.n - first));
-  float* camera_grads = params.camera_grads ? params.camera_grads + first / 32 * kCameraGradWidth : nullptr;
+  const uint32_t lit = lanes_with_pairs(range.count);
+  const int n = rows_of_group(first, params.gaussians.n);
+  float* camera_grads = params.camera_grads ? params.camera_grads + first / kGradRows * kCameraGradWidth : nullptr;
   if (lit == 0) {
     if (!Out::kAdd && !From::kZeroed) zero_grads_of_warp(params.gaussians, out, first, n);
     if (Cam::kFull && camera_grads) zero_rows(camera_grads, kCameraGradWidth);
     return;
   }
-  // All that is read is asked for before any of it is waited for.
+  // All loads begin before the first wait.
   Gaussians<float> g = gaussian_rows[warp].begin_load(params.gaussians, first, lit);
   ShRows<Cam::kShDegree>& rows = sh_rows[warp];
   if (g.shs) rows.begin_load(g.shs + first * g.sh_stride, g.sh_stride, sh_count(g.sh_degree), lit);
   const auto sums = from.sum(i, range);
   wait_for_copies();
   Vec3<float>* dL_dsh = out.shs ? rows.row() : nullptr;
-  g.sh_stride = min(g.sh_stride, rows.kCount);  // of what is in `rows`
+  g.sh_stride = min(g.sh_stride, rows.kCount);  // in shared memory
   CameraGrad<float> camera_grad = {};
   if (range.count > 0) {
     from.visit(camera, g, i, range, sums, [&](const auto& grad_of, const ShownGrad<float>& shown, Vec2<float> means) {
@@ -237,31 +244,28 @@ __device__ void project_vjp_body(const Params& params, const From& from, const O
   }
 }
 
+/// A thread per Gaussian.
 template <class Cam>
-__global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kProjectVjpBlocks)
+__global__ void __launch_bounds__(kProjectThreads, blocks_per_sm(kVjpBlocks<Cam>, kProjectThreads))
     project_vjp_kernel(const ProjectVjpParams params) {
   wait_for_earlier_kernels();
   project_vjp_body<Cam>(params, FromPairs{params}, params.grads);
 }
 template <class Cam>
-__global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kProjectVjpBlocks)
+__global__ void __launch_bounds__(kProjectThreads, blocks_per_sm(kVjpBlocks<Cam>, kProjectThreads))
     project_rows_vjp_kernel(const ProjectRowsVjpParams params) {
   wait_for_earlier_kernels();
   project_vjp_body<Cam>(params, FromRows{params}, params.grads);
 }
 template <class Cam>
-__global__ void __launch_bounds__(kProjectThreads, Cam::kFull ? 1 : kProjectVjpBlocks)
+__global__ void __launch_bounds__(kProjectThreads, blocks_per_sm(kVjpBlocks<Cam>, kProjectThreads))
     add_project_rows_vjp_kernel(const ProjectRowsVjpParams params) {
   wait_for_earlier_kernels();
-  project_vjp_body<Cam>(params, FromRows{params}, AddedGrads<float>{params.grads});
+  project_vjp_body<Cam>(params, FromRows{params}, StagedGrads{{params.grads}});
 }
 
-/// Blocks of zero_culled_grads_kernel: one for each of the 132 multiprocessors of an H200. So few, of so few threads
-/// and registers, take the place of no more than one block of blend_vjp, which is bound by its instructions while this
-/// waits for memory.
-inline constexpr int kZeroBlocks = 132, kZeroThreads = 128, kZeroBlocksThatFit = 16;
-
-__global__ void __launch_bounds__(kZeroThreads, kZeroBlocksThatFit)
+/// A warp has several groups.
+__global__ void __launch_bounds__(kZeroThreads, blocks_per_sm(kZeroBlocks, kZeroThreads))
     zero_culled_grads_kernel(const ZeroGradsParams params) {
   wait_for_earlier_kernels();
   const int64_t n = params.gaussians.n, step = int64_t(gridDim.x) * kZeroThreads;
@@ -269,12 +273,13 @@ __global__ void __launch_bounds__(kZeroThreads, kZeroBlocksThatFit)
   int64_t first = int64_t(blockIdx.x) * kZeroThreads + threadIdx.x - lane_id();
   int count = count_of(first + lane_id());
   for (; first < n; first += step) {
-    const bool any = __any_sync(kAllLanes, count > 0);
-    count = count_of(first + step + lane_id());  // the next one's, so that it arrives during the stores
-    if (!any) zero_grads_of_warp(params.gaussians, params.grads, first, int(min(int64_t(32), n - first)));
+    const uint32_t lit = lanes_with_pairs(count);
+    count = count_of(first + step + lane_id());  // of the next group, to arrive during the stores
+    if (lit == 0) zero_grads_of_warp(params.gaussians, params.grads, first, rows_of_group(first, n));
   }
 }
 
+/// A thread per row.
 __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGradsParams params) {
   wait_for_earlier_kernels();
   __shared__ float packed_rows[kProjectThreads * kPackedGradWidthAbsolute];
@@ -291,7 +296,7 @@ __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGra
     dL_dcov = cov_grad(cov, grad.splat);
     dL_dopacity = grad.weighted / params.opacity(i);
   }
-  if (params.packed) {  // the rows of a block, with neighbouring threads at neighbouring addresses
+  if (params.packed) {  // neighbouring threads at neighbouring addresses
     const int width = params.packed_width;
     write_packed_grad(packed_rows + threadIdx.x * width, width, dL_dmean, {dL_dcov.xx, 2 * dL_dcov.xy, dL_dcov.yy},
                       dL_dopacity, sums.color(), sums.mean_sums());
@@ -308,7 +313,7 @@ __global__ void __launch_bounds__(kProjectThreads) row_grads_kernel(const RowGra
   if (params.absolute) params.absolute[i] = sums.mean_sums();
 }
 
-/// Channels that lie in the rows of pairs: a thread per splat.
+/// For channels that are columns of pair_grads. A thread per splat.
 __global__ void __launch_bounds__(kProjectThreads) sum_few_channels_kernel(const SumChannelsParams params) {
   wait_for_earlier_kernels();
   const int64_t i = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x, n = params.sums.n;
@@ -322,16 +327,12 @@ __global__ void __launch_bounds__(kProjectThreads) sum_few_channels_kernel(const
   }
 }
 
-/// Threads of a block of sum_channels, and lanes that a splat has there.
-inline constexpr int kSumThreads = 256, kSumLanes = 8;
-
-/// A group of C channels. A lane reads four channels of a row at once, so that the lanes of a splat read 32 / C rows
-/// together; many splats side by side, because a splat has few pairs and would wait for memory most of the time. The
-/// threads of a block share the splats with many pairs.
+/// For groups of C channels; channel_sums: [max(capacity, n), C]. A splat has kSumLanes lanes, with many pairs a block;
+/// a lane has four channels.
 template <int C> __global__ void __launch_bounds__(kSumThreads) sum_channels_kernel(const SumChannelsParams params) {
   wait_for_earlier_kernels();
   constexpr int kQuads = C / 4, kRows = kSumLanes / kQuads, kSplats = kSumThreads / kSumLanes;
-  constexpr int kAhead = 4, kMany = 16 * kAhead * kRows;
+  constexpr int kAhead = kSumRowsAtOnce, kMany = kSumManyLoads * kAhead * kRows;
   static_assert(kRows > 0);
   __shared__ PairRange ranges[kSplats];
   __shared__ float4 parts[kSumThreads / 32][kQuads];
@@ -340,7 +341,7 @@ template <int C> __global__ void __launch_bounds__(kSumThreads) sum_channels_ker
   PairRange range = i < n ? params.sums.ranges[i] : PairRange{0, 0};
   if (params.sums.by_splat() && range.count > 0) range = {int32_t(i), 1};
   const auto add = [](float4& to, const float4& v) { to.x += v.x, to.y += v.y, to.z += v.z, to.w += v.w; };
-  // This lane's channels of the rows `row`, `row` + step, ... of a splat.
+  // Of rows `row`, `row` + step, ...
   const auto sum_rows = [&](const PairRange& of_splat, int row, int step) {
     const auto* quads = reinterpret_cast<const float4*>(params.channel_sums) + int64_t(of_splat.first) * kQuads + quad;
     float4 sum = {0, 0, 0, 0};
@@ -356,7 +357,7 @@ template <int C> __global__ void __launch_bounds__(kSumThreads) sum_channels_ker
     }
     return sum;
   };
-  // Adds up what `lanes` lanes beside each other have of the same channels.
+  // Over `lanes` adjacent lanes.
   const auto sum_lanes = [&](float4& sum, int lanes) {
     for (int offset = kQuads; offset < lanes; offset *= 2) {
       add(sum, {__shfl_xor_sync(kAllLanes, sum.x, offset), __shfl_xor_sync(kAllLanes, sum.y, offset),

@@ -1,4 +1,4 @@
-// Rows of spherical harmonics between memory and the threads of a warp.
+// A library for project.cuh and project_vjp.cuh: coefficients of harmonics between memory and a warp's shared memory.
 #pragma once
 
 #include "core/sh.h"
@@ -6,15 +6,14 @@
 
 namespace ar::cuda {
 
-/// Rows of spherical harmonics, up to kDegree, of a warp's Gaussians. Rows go between here and memory with
-/// neighbouring lanes at neighbouring addresses. A row is an odd number of quads, 13 or 19, so that lanes that access
-/// four numbers at once are on different banks.
+/// Coefficients up to kDegree, a row per lane. Rows have an odd number of quads, 13 or 19, so that lanes access
+/// different banks.
 template <int kDegree> struct ShRows {
   static constexpr int kCount = sh_count(kDegree), kStride = ((3 * kCount + 3) / 4 | 1) * 4;
   alignas(16) float value[32][kStride];
 
-  /// Begins to load `count` coefficients of the rows of the lanes in `lanes`; base is lane 0's row. They are here after
-  /// wait_for_copies().
+  /// Begins to load `count` coefficients for each of `lanes`, to read after wait_for_copies(). `base`: [32, stride] of
+  /// the warp.
   __device__ void begin_load(const Vec3<float>* base, int stride, int count, uint32_t lanes) {
     if (stride == kPacked && count == kPacked && in_quads(base)) return begin_load_packed(base, lanes);
     const float* from = &base->x + lane_id();
@@ -29,8 +28,7 @@ template <int kDegree> struct ShRows {
       }
     }
   }
-  /// Stores rows [0, rows) of `stride` coefficients, or adds them to those that are there. Longer rows than these hold
-  /// coefficients without influence.
+  /// Writes `rows` rows to `base` [rows, stride]; kAdd: adds them. Coefficients that are not here count as zero.
   template <bool kAdd> __device__ void store(Vec3<float>* base, int stride, int rows) const {
     __syncwarp();
     if (stride == kPacked && in_quads(base)) {
@@ -60,7 +58,7 @@ template <int kDegree> struct ShRows {
   __device__ Vec3<float>* row() { return reinterpret_cast<Vec3<float>*>(value[lane_id()]); }
 
  private:
-  /// Coefficients of degree 3 without gaps, as most scenes have them, in quads: kRowsOfStep rows in every kSteps.
+  /// Of degree 3 without gaps, as in most scenes.
   static constexpr int kPacked = sh_count(3), kQuads = 3 * kPacked / 4, kSteps = 3, kRowsOfStep = kSteps * 32 / kQuads;
   static_assert(kRowsOfStep * kQuads == kSteps * 32);
 
@@ -70,7 +68,7 @@ template <int kDegree> struct ShRows {
   __device__ float4* quad(int row, int k) { return reinterpret_cast<float4*>(value[row]) + k; }
   __device__ const float4* quad(int row, int k) const { return reinterpret_cast<const float4*>(value[row]) + k; }
 
-  /// All lanes copy, from offsets that are known when this is compiled.
+  /// With offsets that the compiler knows.
   __device__ void begin_load_packed(const Vec3<float>* base, uint32_t lanes) {
     const auto* from = reinterpret_cast<const float4*>(base) + lane_id();
 #pragma unroll

@@ -1,4 +1,4 @@
-// Streams beside the caller's, for kernels that need not wait for each other.
+// A library for the CUDA backend and blend: streams for kernels that run beside those of the caller's stream.
 #pragma once
 
 #include <cuda_runtime_api.h>
@@ -7,9 +7,8 @@
 
 namespace ar::cuda {
 
-/// Work on `stream(k)` runs side by side while this lives, after all that was on the caller's stream before; what
-/// follows there waits for it. Each thread has streams of its own. Those of another kCount are others, so that a fork
-/// of one does not wait for what runs on the other's.
+/// Work on stream(k) starts after earlier work of the caller's stream; later work there waits for it. Threads and
+/// devices have separate streams, and each kCount, their number, has.
 template <int kCount> class SideStreams {
  public:
   explicit SideStreams(cudaStream_t caller) : own_(of_this_thread()), caller_(caller) {
@@ -17,19 +16,17 @@ template <int kCount> class SideStreams {
     for (cudaStream_t side : own_.streams) cudaStreamWaitEvent(side, own_.fork, 0);
   }
   SideStreams(const SideStreams&) = delete;
-  /// What follows on the caller's stream waits for what the others have been given.
   ~SideStreams() {
     for (int k = 0; k < kCount; ++k) {
       cudaEventRecord(own_.events[k], own_.streams[k]);
       cudaStreamWaitEvent(caller_, own_.events[k], 0);
     }
   }
-  /// An event for a kernel on one of the others to record when its blocks have begun (`LaunchShape::begun`).
+  /// For LaunchShape::begun of a kernel on a side stream.
   cudaEvent_t begun() const { return own_.begun; }
-  /// What the caller's stream is given from now on waits for that event: its kernels are placed on the device behind
-  /// the blocks of that one, which would else wait until theirs leave room. No result depends on it.
+  /// Later kernels of the caller's stream come after the blocks of that kernel, which would wait for room.
   void wait_until_begun() const { cudaStreamWaitEvent(caller_, own_.begun, 0); }
-  /// The caller's for k = 0, then the others in turn.
+  /// The caller's for k = 0, then the side streams, cyclically.
   cudaStream_t stream(int k) const { return k == 0 ? caller_ : own_.streams[(k - 1) % kCount]; }
 
  private:
@@ -38,7 +35,7 @@ template <int kCount> class SideStreams {
     cudaEvent_t fork, begun, events[kCount];
 
     Own() {
-      // Allowed while a graph is captured too: nothing here is part of it.
+      // While a graph is captured too, as nothing here is part of it.
       cudaStreamCaptureMode mode = cudaStreamCaptureModeRelaxed;
       cudaThreadExchangeStreamCaptureMode(&mode);
       for (cudaEvent_t* event : {&fork, &begun}) cudaEventCreateWithFlags(event, cudaEventDisableTiming);

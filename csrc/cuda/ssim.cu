@@ -1,82 +1,80 @@
-// The similarity of two images, the loss made of it, and their adjoint: one kernel each, and one that sums the sums of
-// the blocks in their order.
+// The similarity of two images, a loss made of it and l1, and the adjoint, for torch/training_cuda.cpp. Three kernels:
+// `ssim` reads images, and writes similarities, partial derivatives and sums of blocks. `loss` adds these sums up in
+// order. And `ssim_vjp` makes the gradient of the image from partial derivatives.
 //
-// A block has the pixels of a tile. It copies the tile with what the windows reach into shared memory, makes the window
-// sums along the rows, and from those the sums along the columns. In both steps a thread makes kRun neighbouring sums
-// from values that it reads once into registers: the kernels would otherwise wait for shared memory.
+// A block has a tile of pixels: it copies what windows reach to shared memory, sums along rows, then along columns. A
+// thread makes kSsimRun neighbouring sums from registers, to load less from shared memory.
 #include "core/ssim.h"
 
 #include "cuda/launch.cuh"
 #include "cuda/training.h"
+#include "cuda/tuning.h"
 #include "cuda/warp.cuh"
 
 namespace ar::cuda {
 namespace {
 
-constexpr int kThreads = 256;
+constexpr int kThreads = kSsimThreads;
 constexpr int kReach = 2 * kSsimRadius;
 
-/// The tile of a block, and where its numbers are in shared memory.
+/// The tile of a block. T: float or double, in this file.
 template <typename T> struct Tile {
-  static constexpr int kColumns = 32;
-  static constexpr int kRun = sizeof(T) == 4 ? 4 : 1;  ///< pixels of a thread, one below the other
+  static constexpr int kColumns = kSsimColumns;
+  static constexpr int kRun = kSsimRun<T>;  ///< pixels of a thread, in a column
   static constexpr int kRows = kThreads / kColumns * kRun;
   static constexpr int kReadColumns = kColumns + kReach, kReadRows = kRows + kReach;
-  // Odd, and with a remainder by four of three: threads that read runs of four in neighbouring rows hit different
-  // banks.
+  // The remainder by four is three: threads with runs of four in neighbouring rows read from different banks.
   static constexpr int kReadPitch = kReadColumns + 1;
   static constexpr int kSumPitch = kColumns + 1;
 };
 
-/// What the windows of a tile read, of kImages images, and its window sums along the rows.
 template <typename T, int kImages, int kSums> struct Shared {
   T read[kImages][Tile<T>::kReadRows * Tile<T>::kReadPitch];
   T sums[kSums][Tile<T>::kReadRows * Tile<T>::kSumPitch];
 };
 
-/// A block's tile: plane, and first row and column.
-struct Place {
+struct Position {
   int64_t plane;
   int top, left;
 };
 
 __host__ __device__ inline int tiles_along(int size, int tile) { return (size - 1) / tile + 1; }
 
-template <typename T> __device__ Place place_of(int block, int height, int width) {
+template <typename T> __device__ Position position_of(int block, int height, int width) {
   using Tile = Tile<T>;
   const int across = tiles_along(width, Tile::kColumns), down = tiles_along(height, Tile::kRows);
   return {block / across / down, block / across % down * Tile::kRows, block % across * Tile::kColumns};
 }
 
-/// copy(place in shared memory, pixel of the plane) for all that the windows of the tile read, which is outside the
-/// image where the pixel is -1.
-template <typename T, class Copy> __device__ void for_each_read(Place place, int height, int width, const Copy& copy) {
+/// Calls copy(index in Shared::read, pixel of the plane or -1 outside the image) for what the windows of a tile read.
+template <typename T, class Copy>
+__device__ void for_each_read(Position position, int height, int width, const Copy& copy) {
   using Tile = Tile<T>;
   for (int i = threadIdx.x; i < Tile::kReadRows * Tile::kReadColumns; i += kThreads) {
     const int row = i / Tile::kReadColumns, column = i % Tile::kReadColumns;
-    const int y = place.top + row - kSsimRadius, x = place.left + column - kSsimRadius;
+    const int y = position.top + row - kSsimRadius, x = position.left + column - kSsimRadius;
     const bool inside = y >= 0 && y < height && x >= 0 && x < width;
     copy(row * Tile::kReadPitch + column, inside ? int64_t(y) * width + x : -1);
   }
 }
 
-/// body(place of the first value read, place of the first sum) for every run of sums along the rows of a tile.
+/// Calls body(index in Shared::read, index in Shared::sums) for every run of sums along rows.
 template <typename T, class Body> __device__ void for_each_run(const Body& body) {
   using Tile = Tile<T>;
-  constexpr int kRuns = Tile::kColumns / Tile::kRun;  // of a row
+  constexpr int kRuns = Tile::kColumns / Tile::kRun;
   for (int i = threadIdx.x; i < Tile::kReadRows * kRuns; i += kThreads) {
     const int row = i / kRuns, column = i % kRuns * Tile::kRun;
     body(row * Tile::kReadPitch + column, row * Tile::kSumPitch + column);
   }
 }
 
-/// The window sums of a run of values: out[j] of the eleven from v[j] on.
+/// out[j] is the window sum of the eleven values from v[j] on.
 template <typename T, int kRun> __device__ void sum_run(const T (&v)[kRun + kReach], T (&out)[kRun]) {
 #pragma unroll
   for (int j = 0; j < kRun; ++j) out[j] = window_sum<T>([&](int k) { return v[j + kSsimRadius + k]; });
 }
 
-/// The window sums of the pixels of this thread, from those along the rows.
+/// From sums along rows.
 template <typename T> __device__ void sum_columns(const T* along_rows, T (&out)[Tile<T>::kRun]) {
   using Tile = Tile<T>;
   const int column = threadIdx.x % Tile::kColumns, row = threadIdx.x / Tile::kColumns * Tile::kRun;
@@ -86,18 +84,19 @@ template <typename T> __device__ void sum_columns(const T* along_rows, T (&out)[
   sum_run<T, Tile::kRun>(v, out);
 }
 
-/// body(j, pixel of the plane) for the pixels of this thread that are in the image.
-template <typename T, class Body> __device__ void for_each_pixel(Place place, int height, int width, const Body& body) {
+/// Calls body(j, pixel of the plane) for each pixel j of this thread in the image.
+template <typename T, class Body>
+__device__ void for_each_pixel(Position position, int height, int width, const Body& body) {
   using Tile = Tile<T>;
-  const int x = place.left + threadIdx.x % Tile::kColumns;
-  const int top = place.top + threadIdx.x / Tile::kColumns * Tile::kRun;
+  const int x = position.left + threadIdx.x % Tile::kColumns;
+  const int top = position.top + threadIdx.x / Tile::kColumns * Tile::kRun;
 #pragma unroll
   for (int j = 0; j < Tile::kRun; ++j) {
     if (x < width && top + j < height) body(j, int64_t(top + j) * width + x);
   }
 }
 
-/// The sums of both values over the block, in its first thread.
+/// For the first thread.
 template <typename T> __device__ void sum_block(T& a, T& b) {
   constexpr int kWarps = kThreads / 32;
   __shared__ T of_warps[kWarps][2];
@@ -115,18 +114,19 @@ template <typename T> __device__ void sum_block(T& a, T& b) {
   }
 }
 
-/// block_sums: sums of |x - y| and of the similarity, of each block; or null.
+/// image, target, map: [planes, height, width]; partials: [kSsimPartials, planes, height, width]. block_sums: [blocks,
+/// 2] for sums of |x - y| and of the similarity. The last three may be null. Target: T or uint8_t.
 template <typename T, typename Target>
 __global__ void __launch_bounds__(kThreads) ssim_kernel(const SsimParams<T, Target> p, T* block_sums) {
   wait_for_earlier_kernels();
   constexpr int kRun = Tile<T>::kRun;
   __shared__ Shared<T, 2, kSsimMoments> shared;
-  const Place place = place_of<T>(int(blockIdx.x), p.height, p.width);
-  const int64_t plane = place.plane * p.height * p.width;
+  const Position position = position_of<T>(int(blockIdx.x), p.height, p.width);
+  const int64_t plane = position.plane * p.height * p.width;
   const T* image = p.image + plane;
   const Target* target = p.target + plane;
 
-  for_each_read<T>(place, p.height, p.width, [&](int to, int64_t pixel) {
+  for_each_read<T>(position, p.height, p.width, [&](int to, int64_t pixel) {
     shared.read[0][to] = pixel < 0 ? T(0) : image[pixel];
     shared.read[1][to] = pixel < 0 ? T(0) : pixel_value<T>(target[pixel]);
   });
@@ -161,7 +161,7 @@ __global__ void __launch_bounds__(kThreads) ssim_kernel(const SsimParams<T, Targ
   for (int m = 0; m < kSsimMoments; ++m) sum_columns<T>(shared.sums[m], sums[m]);
 
   T l1_sum = T(0), ssim_sum = T(0);
-  for_each_pixel<T>(place, p.height, p.width, [&](int j, int64_t pixel) {
+  for_each_pixel<T>(position, p.height, p.width, [&](int j, int64_t pixel) {
     T moments[kSsimMoments];
 #pragma unroll
     for (int m = 0; m < kSsimMoments; ++m) moments[m] = sums[m][j];
@@ -182,7 +182,7 @@ __global__ void __launch_bounds__(kThreads) ssim_kernel(const SsimParams<T, Targ
   }
 }
 
-/// One block: the loss from the sums of all blocks.
+/// One block. block_sums: [blocks, 2].
 template <typename T, typename Target>
 __global__ void loss_kernel(const SsimParams<T, Target> p, const T* block_sums, int64_t blocks) {
   wait_for_earlier_kernels();
@@ -195,15 +195,16 @@ __global__ void loss_kernel(const SsimParams<T, Target> p, const T* block_sums, 
   if (threadIdx.x == 0) *p.loss = combined_loss(p, l1_sum, ssim_sum);
 }
 
+/// As ssim_kernel; dL_dmap, dL_dimage: [planes, height, width].
 template <typename T, typename Target>
 __global__ void __launch_bounds__(kThreads) ssim_vjp_kernel(const SsimVjpParams<T, Target> p) {
   wait_for_earlier_kernels();
   constexpr int kRun = Tile<T>::kRun;
   __shared__ Shared<T, kSsimPartials, kSsimPartials> shared;
-  const Place place = place_of<T>(int(blockIdx.x), p.height, p.width);
-  const int64_t plane = place.plane * p.height * p.width;
+  const Position position = position_of<T>(int(blockIdx.x), p.height, p.width);
+  const int64_t plane = position.plane * p.height * p.width;
 
-  for_each_read<T>(place, p.height, p.width, [&](int to, int64_t pixel) {
+  for_each_read<T>(position, p.height, p.width, [&](int to, int64_t pixel) {
     const T scale = p.dL_dmap && pixel >= 0 ? p.dL_dmap[plane + pixel] : T(1);
 #pragma unroll
     for (int k = 0; k < kSsimPartials; ++k)
@@ -227,7 +228,7 @@ __global__ void __launch_bounds__(kThreads) ssim_vjp_kernel(const SsimVjpParams<
   for (int m = 0; m < kSsimPartials; ++m) sum_columns<T>(shared.sums[m], sums[m]);
 
   const LossWeights<T> weights = pixel_weights(p);
-  for_each_pixel<T>(place, p.height, p.width, [&](int j, int64_t pixel) {
+  for_each_pixel<T>(position, p.height, p.width, [&](int j, int64_t pixel) {
     T partials[kSsimPartials];
 #pragma unroll
     for (int k = 0; k < kSsimPartials; ++k) partials[k] = sums[k][j];

@@ -1,6 +1,6 @@
-// The launches of a training step besides rendering, in float and double: loss, activations, optimiser and what density
-// control observes. All pointers are views of device memory. Every function enqueues work on a stream and returns; none
-// waits for the device, and bits do not depend on the order in which blocks run.
+// What torch/training_cuda.cpp calls for a training step besides rendering: ssim.cu, activations.cu, adam.cu. Pointers
+// are views of device memory. Functions enqueue kernels on a stream, and do not wait. Bits do not depend on the order
+// of blocks. T: float or double.
 #pragma once
 
 #include <cuda_runtime_api.h>
@@ -12,9 +12,10 @@
 
 namespace ar::cuda {
 
-/// Blocks that an image is divided into: ssim takes room for two sums of each, if there is a loss. Fewer than 2^31.
+/// Tiles of an image, fewer than 2^31.
 template <typename T> int64_t ssim_blocks(int64_t planes, int height, int width);
 
+/// block_sums: [ssim_blocks, 2], scratch for the loss. Target: T or uint8_t.
 template <typename T, typename Target> void ssim(const SsimParams<T, Target>& p, T* block_sums, cudaStream_t stream);
 template <typename T, typename Target> void ssim_vjp(const SsimVjpParams<T, Target>& p, cudaStream_t stream);
 
@@ -23,7 +24,7 @@ template <typename T> void activate_vjp(const ActivateVjpParams<T>& p, cudaStrea
 
 template <typename T> void observe(const ObserveParams<T>& p, cudaStream_t stream);
 
-/// p.first_item need not be set; at least one tensor, and fewer than 2^40 numbers.
+/// At least one tensor, and fewer than 2^40 numbers. Sets p.first_item.
 template <typename T> void adam(AdamParams<T> p, cudaStream_t stream);
 
 }  // namespace ar::cuda

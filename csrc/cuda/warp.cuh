@@ -1,4 +1,5 @@
-// What all kernels use of a warp.
+// A library for all kernels: sums, votes and searches over the lanes of a warp, which all lanes must call, and loads,
+// stores and copies, which single lanes may call.
 #pragma once
 
 #include <cstdint>
@@ -9,7 +10,7 @@ inline constexpr uint32_t kAllLanes = 0xffffffff;
 
 __device__ inline int lane_id() { return threadIdx.x % 32; }
 
-/// Sum over the lanes, in every lane, in a fixed order.
+/// In every lane; in a fixed order.
 template <typename T> __device__ T warp_sum(T v) {
 #pragma unroll
   for (int offset = 16; offset > 0; offset /= 2) v += __shfl_xor_sync(kAllLanes, v, offset);
@@ -19,8 +20,7 @@ template <typename T> __device__ T warp_sum(T v) {
 template <typename T> __device__ T shuffle(T v, int lane) { return __shfl_sync(kAllLanes, v, lane); }
 template <typename T> __device__ T shuffle_up(T v, int offset) { return __shfl_up_sync(kAllLanes, v, offset); }
 
-/// Sums two values over the lanes, with 5 shuffles instead of 10 and the same bits as warp_sum: lanes below 16 get the
-/// sum of x, the others that of y.
+/// Lanes below 16 get the sum of x, the others of y: 5 shuffles instead of 10, and the bits of warp_sum.
 __device__ inline float warp_sum_of_two(float x, float y) {
   const bool upper = lane_id() & 16;
   const float keep = upper ? y : x, give = upper ? x : y;
@@ -30,7 +30,7 @@ __device__ inline float warp_sum_of_two(float x, float y) {
   return sum;
 }
 
-/// Sum of the lanes up to and with this one. `T` has a + that need not commute, and the two functions above.
+/// Over the lanes up to this one. T has shuffle(), shuffle_up() and a + that need not commute.
 template <typename T> __device__ T warp_inclusive_sum(T v) {
 #pragma unroll
   for (int offset = 1; offset < 32; offset *= 2) {
@@ -40,8 +40,7 @@ template <typename T> __device__ T warp_inclusive_sum(T v) {
   return v;
 }
 
-/// Sum over the threads before this one, of kWarps warps; `all`: of all of them. Several are a whole block, all of
-/// whose threads must call it. `zero` + v is v.
+/// Over the threads before this one, of a block of kWarps warps or of one warp. `all`: over all. `zero` + v is v.
 template <int kWarps, typename T> __device__ T sum_before(T own, T zero, T& all) {
   const T up_to = warp_inclusive_sum(own);
   T before = shuffle_up(up_to, 1);
@@ -52,7 +51,7 @@ template <int kWarps, typename T> __device__ T sum_before(T own, T zero, T& all)
   } else {
     __shared__ T warps[kWarps];
     const int warp = threadIdx.x / 32;
-    __syncthreads();  // the last call's reading
+    __syncthreads();  // an earlier call may still read
     if (lane_id() == 31) warps[warp] = up_to;
     __syncthreads();
     T front = zero;
@@ -75,7 +74,6 @@ __device__ inline int warp_max(int v) {
 #endif
 }
 
-/// The bits that any lane has.
 __device__ inline uint32_t warp_or(uint32_t bits) {
 #if __CUDA_ARCH__ >= 800
   return __reduce_or_sync(kAllLanes, bits);
@@ -85,8 +83,7 @@ __device__ inline uint32_t warp_or(uint32_t bits) {
 #endif
 }
 
-/// The lanes whose `bits` agree with this lane's in those of `mask`, a single bit. Written out because the compiler
-/// takes seven instructions for it.
+/// Lanes whose `bits` agree with this lane's in `mask`, a single bit. The compiler would need seven instructions.
 __device__ inline uint32_t lanes_that_agree(uint32_t bits, uint32_t mask) {
 #if defined(__CUDA_ARCH__)
   uint32_t lanes;
@@ -106,7 +103,7 @@ __device__ inline uint32_t lanes_that_agree(uint32_t bits, uint32_t mask) {
   return bits & mask ? set : ~set;
 #endif
 }
-/// The lanes with the same number below 2^kBits.
+/// Lanes with the same number < 2^kBits.
 template <int kBits> __device__ uint32_t lanes_alike(uint32_t number) {
   uint32_t lanes = kAllLanes;
 #pragma unroll
@@ -114,8 +111,8 @@ template <int kBits> __device__ uint32_t lanes_alike(uint32_t number) {
   return lanes;
 }
 
-/// How many of [0, n), from the front, `before` holds for, if it holds for none behind those. Each group of kLanes
-/// lanes looks for its own, in every step among kLanes + 1 times fewer. All lanes of a warp must call it.
+/// The first k of [0, n) for which before(k) is false, if it is false from there on. For each group of kLanes lanes,
+/// which divides the range by kLanes + 1 in a step.
 template <int kLanes, class Before> __device__ int partition_point(int n, Before&& before) {
   const int lane = lane_id() % kLanes, group = lane_id() - lane;
   int found = 0;
@@ -129,25 +126,25 @@ template <int kLanes, class Before> __device__ int partition_point(int n, Before
   return found;
 }
 
-/// The shared memory of a block whose size its launch gives.
+/// LaunchShape::shared_bytes of them.
 #if defined(__CUDACC__)
 __device__ inline float4* dynamic_shared() {
   extern __shared__ float4 memory[];
   return memory;
 }
 #else
-float4* dynamic_shared();  // of a test that runs kernels on the host
+float4* dynamic_shared();  // in tests on the host
 #endif
 
-/// Takes the first out of a set of numbers below 32, of which j is bit 31 - j, and returns it: the highest bit is found
-/// with one slow instruction, the lowest with two.
+/// Removes and returns the first number of a set. Number j < 32 is bit 31 - j: the lowest bit would take one more slow
+/// instruction to find.
 __device__ inline int take_first(uint32_t& set) {
   const int first = __clz(int(set));
   set ^= 1u << (31 - first);
   return first;
 }
 
-/// Stores what nobody reads soon.
+/// Of what nobody reads soon.
 __device__ inline void store_streaming(float4* to, const float4& value) {
 #if defined(__CUDA_ARCH__)
   __stcs(to, value);
@@ -156,14 +153,14 @@ __device__ inline void store_streaming(float4* to, const float4& value) {
 #endif
 }
 
-/// Asks for the line of memory that holds `*address`.
+///
 __device__ inline void prefetch([[maybe_unused]] const void* address) {
 #if defined(__CUDA_ARCH__)
   asm volatile("prefetch.global.L1 [%0];" ::"l"(address));
 #endif
 }
 
-/// Begins to copy a number from global to shared memory. All lanes see it after wait_for_copies().
+/// Begins to copy a number to shared memory, for all lanes to read after wait_for_copies().
 __device__ inline void copy_async(float* to, const float* from) {
 #if __CUDA_ARCH__ >= 800
   const auto address = uint32_t(__cvta_generic_to_shared(to));
@@ -172,8 +169,7 @@ __device__ inline void copy_async(float* to, const float* from) {
   *to = *from;
 #endif
 }
-/// The same for rows of kWidth numbers, those of the lanes in `lanes`, with neighbouring lanes at neighbouring
-/// addresses.
+/// Rows of kWidth numbers, one for each of `lanes`. Neighbouring lanes copy neighbouring numbers.
 template <int kWidth> __device__ void copy_rows_async(float* to, const float* from, uint32_t lanes) {
 #pragma unroll
   for (int k = 0; k < kWidth; ++k) {
@@ -181,8 +177,7 @@ template <int kWidth> __device__ void copy_rows_async(float* to, const float* fr
     if (lanes >> e / kWidth & 1) copy_async(to + e, from + e);
   }
 }
-/// A place in shared memory to which quads are copied. The address is worked out once; the empty statement keeps the
-/// compiler from doing so again for every copy.
+/// An address in shared memory. The empty statement keeps the compiler from computing it again for every copy.
 class CopyTarget {
  public:
   __device__ explicit CopyTarget(float4* to) {
@@ -193,7 +188,7 @@ class CopyTarget {
     to_ = to;
 #endif
   }
-  /// As copy_async(to + offset, from), but four numbers at once, past the cache of the multiprocessor.
+  /// Begins to copy a quad, past the cache of the multiprocessor.
   __device__ void copy(int offset, const float4* from) const {
 #if __CUDA_ARCH__ >= 800
     constexpr int kBytes = sizeof(float4);
@@ -210,7 +205,6 @@ class CopyTarget {
   float4* to_;
 #endif
 };
-/// Waits for all copies that the lanes of this warp have begun.
 __device__ inline void wait_for_copies() {
 #if __CUDA_ARCH__ >= 800
   asm volatile("cp.async.wait_all;" ::: "memory");
@@ -218,11 +212,11 @@ __device__ inline void wait_for_copies() {
   __syncwarp();
 }
 
-/// What was read from memory before this is read again after it, instead of being kept in registers.
+/// The compiler keeps no loads from before this in registers.
 __device__ inline void forget_loads() { asm volatile("" ::: "memory"); }
 
-/// Sums N = 8, 9 or 10 values over the lanes with 9 or 12 shuffles instead of 5 N: lanes trade the halves that the
-/// other will sum. A lane l gets the sum of value summed_value<N>(l).
+/// Sums N = 8, 9 or 10 values over the lanes, with 9 or 12 shuffles instead of 5 N: two lanes exchange halves of their
+/// values. Lane l gets the sum of value summed_value<N>(l).
 template <int N> __device__ float sum_values(const float (&v)[N]) {
   static_assert(N >= 8 && N <= 10);
   const int lane = lane_id();
@@ -250,11 +244,10 @@ template <int N> __device__ float sum_values(const float (&v)[N]) {
   return sum + __shfl_xor_sync(kAllLanes, sum, 1);
 }
 
-/// Which of N values a lane has after sum_values. Lanes that have the same one have the same bits.
+/// Lanes with the same value have the same bits.
 template <int N> __device__ int summed_value(int lane) {
   return N > 8 && lane & 2 ? (N > 9 && lane & 16 ? 9 : 8) : lane / 4;
 }
-/// Whether it is the first lane that has the value.
 template <int N> __device__ bool has_value_first(int lane) {
   return lane % 4 == 0 || (N > 8 && lane == 2) || (N > 9 && lane == 18);
 }

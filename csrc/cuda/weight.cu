@@ -1,4 +1,4 @@
-// Launches of footprint_weight and its adjoint.
+// Launches the kernels of weight.cuh for torch/stages.cpp.
 #include "core/footprint/registry.h"
 #include "cuda/launch.cuh"
 #include "cuda/weight.cuh"

@@ -1,15 +1,16 @@
-// Kernels of footprint_weight and its adjoint: a thread per element.
+// The kernels of footprint_weight and its adjoint, which read covariances and offsets, and write the weights of one
+// footprint, or gradients. A thread per element; weight.cu launches them.
 #pragma once
 
 #include "core/weight.h"
 #include "cuda/launch.cuh"
-#include "cuda/stages.h"
+#include "cuda/params.h"
+#include "cuda/tuning.h"
 #include "cuda/warp.cuh"
 
 namespace ar::cuda {
 
-inline constexpr int kWeightThreads = 128;
-
+// F: the footprint. T: float or double. All arrays: [n].
 template <class F, typename T> __global__ void weight_kernel(const WeightParams<T> params) {
   wait_for_earlier_kernels();
   const int64_t i = int64_t(blockIdx.x) * kWeightThreads + threadIdx.x;

@@ -139,8 +139,7 @@ struct ImageArguments : FootprintArguments {
 /// Arguments of `bin`: the rows that `project` made for C cameras, camera after camera.
 struct BinArguments : ImageArguments {
   Tensor means2d, cov2d, dets, opacities, depths;
-  OptionalTensor colors, background;  ///< (N, 3), (3,): what `adaptive` chooses samples by
-  Tensor row_splits;                  ///< (C + 1,) int64 on the CPU, first row of each camera
+  Tensor row_splits;  ///< (C + 1,) int64 on the CPU, first row of each camera
   bool keep = true;
 
   template <class Visit> void each(Visit&& visit) {
@@ -149,8 +148,6 @@ struct BinArguments : ImageArguments {
     visit("dets", dets);
     visit("opacities", opacities);
     visit("depths", depths);
-    visit("colors", colors);
-    visit("background", background);
     visit("row_splits", row_splits);
     ImageArguments::each(visit);
     visit("keep=True", keep);

@@ -5,7 +5,6 @@
 
 #include <ATen/Context.h>
 #include <ATen/ops/empty.h>
-#include <ATen/ops/zeros.h>
 
 #include <array>
 #include <memory>
@@ -23,7 +22,7 @@ struct SplatTensors {
   Tensor splats;  ///< (n, kSplatWidth) SplatRow
   Tensor ids;     ///< (n,) int32, CPU: the Gaussian of each, ascending
   Tensor depths;  ///< (n,) CPU
-  Tensor counts;  ///< (4,) int64, CUDA: the numbers of Counts (csrc/cuda/stages.h), which `project` sets to zero
+  Tensor counts;  ///< (4,) int64, CUDA: the numbers of Counts (csrc/cuda/params.h), which `project` sets to zero
   Tensor ranges;  ///< (n, 2) int32, CUDA: first slot, for a backward pass, and number of pairs of each
   Tensor memory;  ///< bytes, CUDA: SplatMemory (cuda_views.h)
 };
@@ -36,10 +35,9 @@ struct ListTensors {
   Tensor tile_offsets;   ///< (tiles + 1,) int64, first pair of each tile; of a patch, where tiles share lists
   Tensor splat_offsets;  ///< CPU: (n + 1,) int64 into positions; CUDA: (n, 2) int32 first slot and number of slots
   Tensor positions;      ///< CPU: (N,) int64 places in `pairs` of each splat's pairs
-  Tensor counts;         ///< CUDA: the numbers of Counts (csrc/cuda/stages.h)
-  Tensor tile_samples;   ///< (tiles,) int32, samples of each tile, where they are chosen
+  Tensor counts;         ///< CUDA: the numbers of Counts (csrc/cuda/params.h)
 
-  static constexpr size_t kMembers = 8;
+  static constexpr size_t kMembers = 7;
   template <class Visit> void each(Visit&& visit) {
     visit("splats", splats);
     visit("ids", ids);
@@ -48,7 +46,6 @@ struct ListTensors {
     visit("splat_offsets", splat_offsets);
     visit("positions", positions);
     visit("counts", counts);
-    visit("tile_samples", tile_samples);
   }
 };
 
@@ -124,8 +121,7 @@ struct WeightTensors {
 /// The chosen footprint.
 struct FootprintSpec {
   FootprintChoice choice;
-  int samples;  ///< the most that a pixel has
-  bool chosen;  ///< per tile
+  int samples;  ///< of a pixel
   bool moves;   ///< samples carry a state besides their transmittance
   int lanes;    ///< over which a pixel's samples may be spread on CUDA
 };
@@ -155,15 +151,10 @@ struct Pass {
 /// With pass.keep, room for the members of BlendState that are the same on every device.
 inline BlendState make_state(const Pass& pass, const Tensor& like) {
   if (!pass.keep) return {};
-  const FootprintSpec& footprint = pass.footprint;
-  const std::vector<int64_t> planes = {footprint.samples, pass.grid.height, pass.grid.width};
-  // Where samples are chosen not every tile writes all planes.
-  const auto make = [&](const at::TensorOptions& o) {
-    return footprint.chosen ? at::zeros(planes, o) : at::empty(planes, o);
-  };
+  const std::vector<int64_t> planes = {pass.footprint.samples, pass.grid.height, pass.grid.width};
   BlendState state;
-  state.transmittance = make(like.options());
-  state.last = make(like.options().dtype(at::kInt));
+  state.transmittance = at::empty(planes, like.options());
+  state.last = at::empty(planes, like.options().dtype(at::kInt));
   return state;
 }
 
@@ -182,8 +173,8 @@ class Backend {
   virtual void pack_rows(const Inputs& in, const Pass& pass, const PackedTensors& packed) = 0;
   /// Splats from public rows. Writes `kept_covs` and `kept_opacities` if they are given.
   virtual SplatTensors shape_rows(const RowTensors& rows, const Pass& pass) = 0;
-  /// Lists by tile and depth, and samples per tile, for which the first three channels of `background` are looked at.
-  virtual ListTensors bin(const SplatTensors& splats, const Pass& pass, const Tensor& background) = 0;
+  /// Lists by tile and depth.
+  virtual ListTensors bin(const SplatTensors& splats, const Pass& pass) = 0;
   /// Whether there was no room for a list of each tile, which with Pass::exact there is but for more pairs than a list
   /// can have. Waits for the device.
   virtual bool tiles_share_lists(const ListTensors&) { return false; }

@@ -5,6 +5,7 @@
 // contents of lists were made by an earlier stage and are not checked.
 #include <ATen/ops/arange.h>
 #include <ATen/ops/empty_like.h>
+#include <ATen/ops/zeros.h>
 #include <ATen/Parallel.h>
 #if defined(__linux__)
 #include <sys/mman.h>
@@ -41,7 +42,6 @@ cpu::TileLists tile_lists_of(const ListTensors& lists) {
   cpu::TileLists out;
   out.pairs = const_pointer<int32_t>(lists.pairs);
   out.tile_offsets = const_pointer<int64_t>(lists.tile_offsets);
-  out.tile_samples = const_pointer<int32_t>(lists.tile_samples);
   return out;
 }
 
@@ -130,13 +130,12 @@ template <typename T> class CpuBackend final : public Backend {
     return out;
   }
 
-  ListTensors bin(const SplatTensors& splats, const Pass& pass, const Tensor& background) override {
+  ListTensors bin(const SplatTensors& splats, const Pass& pass) override {
     const TileGrid grid = pass.grid;
-    const FootprintSpec& footprint = pass.footprint;
     // An image that cannot be made raises here, before numbers are written for every one of its tiles.
-    if (grid.tiles() > kManyTiles) at::empty({background.numel(), grid.height, grid.width}, floats_);
+    if (grid.tiles() > kManyTiles) at::empty({grid.height, grid.width}, floats_);
     const int64_t n = splats.ids.size(0);
-    const cpu::Stages<T>& stages = stages_of(footprint);
+    const cpu::Stages<T>& stages = stages_of(pass.footprint);
     ListTensors out;
     out.splats = splats.splats;
     out.ids = splats.ids;
@@ -146,7 +145,7 @@ template <typename T> class CpuBackend final : public Backend {
     p.splats = const_pointer<T>(splats.splats);
     p.depths = const_pointer<T>(splats.depths);
     p.n = n;
-    p.footprint = footprint.choice.index;
+    p.footprint = pass.footprint.choice.index;
     p.grid = grid;
     p.threads = thread_count();
     p.tile_offsets = pointer<int64_t>(out.tile_offsets);
@@ -159,19 +158,6 @@ template <typename T> class CpuBackend final : public Backend {
     p.positions = pointer<int64_t>(out.positions);
     stages.scatter_pairs(p);
     out.counts = at::empty({0}, longs_);
-    out.tile_samples = at::empty({footprint.chosen ? grid.tiles() : 0}, ints_);
-    if (footprint.chosen) {
-      cpu::ChooseSamplesParams<T> choice = {};
-      choice.splats = p.splats;
-      choice.lists = tile_lists_of(out);
-      choice.grid = grid;
-      choice.threads = p.threads;
-      choice.background = const_pointer<T>(background);
-      choice.background_count = int(background.numel());
-      choice.tolerance = footprint.choice.options.number;
-      choice.tile_samples = pointer<int32_t>(out.tile_samples);
-      stages.choose_samples(choice);
-    }
     return out;
   }
 

@@ -71,13 +71,13 @@ class CudaBackend final : public Backend {
     return out;
   }
 
-  ListTensors bin(const SplatTensors& splats, const Pass& pass, const Tensor& background) override {
+  ListTensors bin(const SplatTensors& splats, const Pass& pass) override {
     const TileGrid grid = pass.grid;
     const FootprintSpec& footprint = pass.footprint;
     if (pass.debug) check_stage("project", true);
     const int64_t n = splats.splats.size(0);
     // An image that cannot be made raises here, before anything is counted for it.
-    TORCH_CHECK_VALUE(grid.tiles() < std::numeric_limits<int32_t>::max() / cuda::kSampleClasses,
+    TORCH_CHECK_VALUE(grid.tiles() < std::numeric_limits<int32_t>::max(),
                       "the image has too many tiles: ", grid.tiles());
     const cuda::Counting counting = counting_of(pass, n, stream_);
     const int64_t most = std::clamp<int64_t>(n, 1, cuda::max_items() / grid.tiles() + 1) * grid.tiles();
@@ -141,20 +141,6 @@ class CudaBackend final : public Backend {
     } else {
       make_pairs<int32_t>(emit, &cuda::EmitParams::splat_pairs, {frame.word, frame.number}, pairs, out, pass.debug);
     }
-
-    out.tile_samples = at::empty({footprint.chosen ? grid.tiles() : 0}, ints_);
-    if (footprint.chosen) {
-      cuda::ChooseParams p = {};
-      p.splats = emit.splats;
-      p.tile_samples = pointer<int32_t>(out.tile_samples);
-      p.lists = tile_lists_of(out);
-      p.grid = grid;
-      p.background = const_pointer<float>(background);
-      p.background_count = int(background.numel());
-      p.options = footprint.choice.options;
-      cuda::choose_samples(p, stream_);
-      check_stage("choose_samples", pass.debug);
-    }
     return out;
   }
 
@@ -165,45 +151,19 @@ class CudaBackend final : public Backend {
   void blend(const ListTensors& lists, const Pass& pass, const ChannelTensors& channels, const ImageTensors& image,
              BlendState& state) override {
     check_counts(lists);
-    const TileGrid grid = pass.grid;
-    const FootprintSpec& footprint = pass.footprint;
     cuda::BlendParams p = {};
     set_blend<float>(p, lists, pass, channels, image, state);
     p.channels = channels_of(channels);
     p.lists = tile_lists_of(lists);
-
     p.layout = {cuda::compiled_channels(!channels.rows.defined()), pass.keep};
-    const cuda::ListCut cut = list_cut_of(lists, pass, channels.count);
-    const Tensor plan = make_plan(p, pass, cut, state);
+    const cuda::Route route = route_of(lists, pass, channels.count);
+    p.cut = route.cut;
+    const Tensor plan = make_plan(p, pass, route, state);
     Tensor reach;
-    const int64_t reach_words = cuda::max_reach_words(cut, grid);
+    const int64_t reach_words = cuda::max_reach_words(p.cut, pass.grid);
     if (reach_words > 0) reach = at::empty({reach_words}, ints_);
     p.reach_words = structs_of<uint32_t>(reach);
-    p.segments.count = cuda::list_segments(footprint.choice.index, channels.count, grid);
-    if (p.segments.count == 1) {
-      cuda::blend(footprint.choice.index, p, nullptr, stream_);
-      check_stage("blend", pass.debug);
-      return;
-    }
-    // First the three colours in the splats, into an image that nobody looks at, for what segments need: transmittance
-    // and last splat of every sample.
-    Pass first_pass = pass;
-    first_pass.keep = true;
-    BlendState first_state = pass.keep ? state : make_state(first_pass, lists.splats);
-    p.transmittance = pointer<float>(first_state.transmittance);
-    p.last = pointer<int32_t>(first_state.last);
-    const Tensor first_image = at::empty({3, grid.height, grid.width}, floats_);
-    cuda::BlendParams in_chunks = p;
-    in_chunks.channels = {nullptr, 0, nullptr, 3};
-    in_chunks.image = {pointer<float>(first_image), 3, {}};
-    in_chunks.layout = {3, true};
-    const Tensor first_plan = make_plan(in_chunks, first_pass, {false}, first_state);
-    const Tensor sums = segment_planes(p.segments, grid, cuda::kChannelGroup);
-    p.segments.samples = cuda::samples_of_lane(footprint.choice.index, grid);
-    state.checkpoints = segment_planes(p.segments, grid, p.segments.samples);
-    p.segments.sums = pointer<float>(sums);
-    p.segments.transmittance = pointer<float>(state.checkpoints);
-    cuda::blend(footprint.choice.index, p, &in_chunks, stream_);
+    cuda::blend(pass.footprint.choice.index, p, stream_);
     check_stage("blend", pass.debug);
   }
 
@@ -235,7 +195,7 @@ class CudaBackend final : public Backend {
   PairSums blend_vjp(const ListTensors& lists, const BlendState& state, const Pass& pass,
                      const ChannelTensors& channels, const ImageTensors& dL_dimage, MeanSums mean_sums) override {
     check_counts(lists);
-    const cuda::ListCut cut = list_cut_of(lists, pass, channels.count);
+    const cuda::ListCut cut = route_of(lists, pass, channels.count).cut;
     check_plan(state, cut, pass.grid);
     const int64_t n = lists.ids.numel(), rows = std::max(lists.pairs.size(0), n);
     const int count = int(channels.count);
@@ -249,19 +209,11 @@ class CudaBackend final : public Backend {
     set_blend<float>(p, lists, pass, channels, gradient, state);
     p.channels = channels_of(channels);
     p.lists = tile_lists_of(lists);
+    p.cut = cut;
     set_plan(p, state.chunks, cut);
-    const Tensor chunks_taken = at::empty({cuda::kSampleClasses}, ints_);
+    const Tensor chunks_taken = at::empty({1}, ints_);
     p.chunks_taken = pointer<int32_t>(chunks_taken);
     p.checkpoints = pointer<float>(state.checkpoints);
-    p.segments.count = cuda::list_segments(pass.footprint.choice.index, count, pass.grid);
-    p.segments.samples = cuda::samples_of_lane(pass.footprint.choice.index, pass.grid);
-    p.segments.transmittance = p.checkpoints;
-    Tensor shown;
-    if (p.segments.count > 1) {
-      check_segments(p.segments, pass.grid, state);
-      shown = segment_planes(p.segments, pass.grid, p.segments.samples);
-      p.segments.shown = pointer<float>(shown);
-    }
     p.pair_grads = pointer<float>(out.pairs);
     p.mean_sums = mean_sums;
     Tensor maps;
@@ -269,8 +221,9 @@ class CudaBackend final : public Backend {
     if (numbers > 0) maps = at::empty({numbers}, floats_);
     p.adjoint_maps = pointer<float>(maps);
     Tensor group_sums;
-    p.max_group_sums = cuda::max_group_sums(pass.footprint.choice.index, cut, pass.grid);
-    if (p.max_group_sums > 0) group_sums = at::empty({p.max_group_sums}, floats_);
+    const int64_t sums =
+        cuda::max_group_sums(pass.footprint.choice.index, channels.rows.defined() ? count : 3, cut, pass.grid);
+    if (sums > 0) group_sums = at::empty({sums}, floats_);
     p.group_sums = pointer<float>(group_sums);
 
     cuda::SumChannelsParams sum = {};
@@ -363,21 +316,18 @@ class CudaBackend final : public Backend {
     TORCH_CHECK(error == cudaSuccess, "CUDA error in ", stage, ": ", cudaGetErrorString(error));
   }
 
-  /// Planes of every segment of every tile.
-  Tensor segment_planes(const cuda::Segments& segments, TileGrid grid, int64_t planes) const {
-    return at::empty({grid.tiles() * segments.count * planes * kTile * kTile}, floats_);
-  }
-
-  /// Plans the blending of lists that are cut so: sets the members of `p` and `state` that belong to it. Returns memory
-  /// that its kernels need while they run.
-  Tensor make_plan(cuda::BlendParams& p, const Pass& pass, const cuda::ListCut& cut, BlendState& state) const {
-    const FootprintSpec& footprint = pass.footprint;
+  /// Plans the blending: sets the members of `p` and `state` that belong to the plan. Returns memory that its kernels
+  /// need while they run.
+  Tensor make_plan(cuda::BlendParams& p, const Pass& pass, const cuda::Route& route, BlendState& state) const {
+    const cuda::ListCut& cut = route.cut;
     const int64_t tiles = pass.grid.tiles(), capacity = p.lists.capacity;
-    const int samples = cuda::samples_of_lane(footprint.choice.index, pass.grid);
-    const int64_t chunks = cut.whole ? cut.max_segments : capacity / cuda::chunk_length(footprint.chosen ? 1 : samples);
-    const int64_t max_planes = !cut.whole  ? p.layout.max_planes(pass.grid, samples, capacity, footprint.chosen)
-                               : pass.keep ? cuda::max_state_planes(footprint.choice.index, capacity)
-                                           : 0;
+    const int samples = route.samples_of_lane;
+    p.plan.blocks_at_once = cuda::kBlocksPerSm * cuda::multiprocessors_of_device();
+    const int64_t chunks = cut.whole ? cut.max_segments : capacity / cuda::kChunkLength;
+    const int64_t max_planes = !cut.whole ? p.layout.max_planes(pass.grid, samples, capacity, p.plan.blocks_at_once)
+                               : pass.keep && route.family == cuda::Family::kMoment
+                                   ? capacity / cuda::kStateChunk * cuda::state_planes(samples)
+                                   : 0;
     const int side = cut.whole ? pass.grid.side() : kTile;  // in chunks a plane has a number of each of 256 lanes
     state.checkpoints = at::empty({max_planes * side * side}, floats_);
     state.chunks = at::empty({kPlanRows + chunks + tiles + cut.max_lists, kChunkWidth}, ints_);

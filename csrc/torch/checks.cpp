@@ -100,7 +100,6 @@ FootprintSpec find_footprint(const std::string& key, double option) {
   spec.choice = {index, {option}};
   visit_footprint(index, Footprints{}, [&](auto f) {
     spec.samples = decltype(f)::kSamples;
-    spec.chosen = std::is_same_v<decltype(f), Adaptive>;
     spec.moves = decltype(f)::kMoves;
     spec.lanes = spread_lanes<decltype(f)>();
   });
@@ -252,9 +251,6 @@ void check(BinArguments& a) {
   check_projected(a.means2d, a.cov2d, a.opacities, a.dets, a.row_splits);
   const Like like{a.means2d, "means2d"};
   like.check_rows_of(a.depths, "depths", {}, "(N,)");
-  like.check_rows_of(a.colors, "colors", {3}, "(N, 3)");
-  if (!a.background) a.background = at::zeros({3}, a.means2d.options());
-  like.check_vector(*a.background, "background", 3);
   check_image_size(a.image_height, a.image_width);
 }
 
@@ -337,8 +333,7 @@ void check_lists(const ListTensors& lists, const Tensor& like, const Pass& pass)
   const Tensor &splats = lists.splats, &pairs = lists.pairs;
   const int64_t n = splats.dim() == 2 ? splats.size(0) : -1;
   bool ok = n >= 0 && splats.size(1) == kSplatWidth && splats.scalar_type() == like.scalar_type() &&
-            lists.ids.numel() == n && lists.tile_offsets.numel() == grid.tiles() + 1 &&
-            lists.tile_samples.numel() == (pass.footprint.chosen ? grid.tiles() : 0);
+            lists.ids.numel() == n && lists.tile_offsets.numel() == grid.tiles() + 1;
   if (like.is_cuda()) {
     ok = ok && pairs.dim() == 2 && pairs.size(0) >= 1 && (pairs.size(1) == 1 || pairs.size(1) == 2);
   } else {
@@ -351,9 +346,9 @@ void check_lists(const ListTensors& lists, const Tensor& like, const Pass& pass)
   };
   ok = ok && fits(splats, like.scalar_type()) && fits(lists.ids, at::kInt) && fits(pairs, at::kInt) &&
        fits(lists.tile_offsets, at::kLong) && fits(lists.positions, at::kLong) && fits(lists.counts, at::kLong) &&
-       fits(lists.tile_samples, at::kInt) && fits(lists.splat_offsets, like.is_cuda() ? at::kInt : at::kLong);
+       fits(lists.splat_offsets, like.is_cuda() ? at::kInt : at::kLong);
   TORCH_CHECK_VALUE(ok,
-                    "splats ... tile_samples must be what the forward pass saved for the same arguments, got splats of "
+                    "splats ... counts must be what the forward pass saved for the same arguments, got splats of "
                     "shape ",
                     shape_of(splats), " and tile_offsets of shape ", shape_of(lists.tile_offsets));
 }

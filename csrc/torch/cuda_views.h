@@ -3,7 +3,7 @@
 
 #include <utility>
 
-#include "cuda/stages.h"
+#include "cuda/dispatch.h"
 #include "torch/backend.h"
 
 namespace ar::ops {
@@ -98,7 +98,7 @@ struct PlanMemory {
     MemoryParts parts(memory);
     tail = parts.take<cuda::TileChunk>(chunks + 1);
     for (int32_t** t : {&tile_order, &tile_planes, &tile_open}) *t = parts.take<int32_t>(tiles);
-    open_tiles = parts.take<int32_t>(cuda::kSampleClasses * tiles);
+    open_tiles = parts.take<int32_t>(tiles);
     bytes = parts.bytes();
   }
   void set(cuda::BlendParams& p) const {
@@ -124,7 +124,6 @@ inline cuda::TileLists tile_lists_of(const ListTensors& lists) {
   out.counts = counts_of(lists);
   out.n = lists.ids.numel();
   out.capacity = lists.pairs.size(0);
-  out.tile_samples = const_pointer<int32_t>(lists.tile_samples);
   return out;
 }
 
@@ -155,9 +154,10 @@ inline void check_counts(const ListTensors& lists) {
   TORCH_CHECK_VALUE(lists.counts.numel() == kCountsWidth, "counts must be what bin returned, got shape ",
                     lists.counts.sizes());
 }
-/// How lists are cut for `blend` and `blend_vjp`.
-inline cuda::ListCut list_cut_of(const ListTensors& lists, const Pass& pass, int64_t channels) {
-  return cuda::list_cut(pass.footprint.choice.index, channels, tile_lists_of(lists).capacity, pass.grid);
+/// How `blend` and `blend_vjp` go about it: the same for both, since lists and channels are.
+inline cuda::Route route_of(const ListTensors& lists, const Pass& pass, int64_t channels) {
+  return cuda::route_of(pass.footprint.choice.index, channels, lists.pairs.size(0), pass.grid,
+                        cuda::multiprocessors_of_device());
 }
 inline int64_t max_chunks(const Tensor& chunks, const cuda::ListCut& cut) {
   return chunks.size(0) - kPlanRows - cut.max_lists;
@@ -183,10 +183,4 @@ inline void check_plan(const BlendState& state, const cuda::ListCut& cut, TileGr
                         state.checkpoints.scalar_type() == at::kFloat,
                     "chunks and checkpoints must be what blend saved, got shape ", chunks.sizes());
 }
-inline void check_segments(const cuda::Segments& segments, TileGrid grid, const BlendState& state) {
-  const int64_t numbers = grid.tiles() * segments.count * segments.samples * kTile * kTile;
-  TORCH_CHECK_VALUE(state.checkpoints.numel() == numbers, "checkpoints must be what blend saved, got shape ",
-                    state.checkpoints.sizes());
-}
-
 }  // namespace ar::ops

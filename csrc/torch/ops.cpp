@@ -99,16 +99,23 @@ TORCH_LIBRARY_IMPL(analytic_rasterizer, CUDA, m) { register_kernels(m); }
 #endif
 
 /// What Python knows of a footprint: all of it from its header.
-pybind11::dict describe(const char* key, const char* name, Option option, int samples, bool reference) {
+template <class F> pybind11::dict describe() {
+  constexpr Option option = F::kOption;
+  const auto or_none = [](const char* text) -> pybind11::object {
+    if (text) return pybind11::str(text);
+    return pybind11::none();
+  };
   pybind11::dict d;
-  d["key"] = key;
-  d["name"] = name;
-  d["option"] = option.name ? pybind11::cast(option.name) : pybind11::none();
-  d["value"] = option.value ? pybind11::cast(option.value) : pybind11::none();
+  d["key"] = key_of<F>();
+  d["name"] = F::kName;
+  d["option"] = or_none(option.name);
+  d["value"] = or_none(option.value);
   d["number"] = option.number;
   d["is_default"] = option.is_default;
-  d["samples"] = samples;
-  d["reference"] = reference;
+  d["samples"] = F::kSamples;
+  d["reference"] = F::kReference;
+  d["page"] = or_none(F::kPage);
+  d["variance"] = F::support_variance({option.number});
   return d;
 }
 
@@ -174,6 +181,11 @@ constexpr const char* kBuiltFor = "analytic_rasterizer was built for torch " AR_
 
 #if defined(AR_WITH_CUDA)
 void force_pair_capacity(int64_t capacity);
+void record_kernels(bool on);
+std::vector<std::string> launched_kernels();
+std::pair<std::vector<std::string>, std::vector<std::string>> blend_route(const std::string& key, int64_t channels,
+                                                                          int64_t width, int64_t height,
+                                                                          int64_t capacity);
 #endif
 }  // namespace ar::ops
 
@@ -184,6 +196,12 @@ PYBIND11_MODULE(_C, m) {
   m.attr("has_cuda") = true;
   m.def("force_pair_capacity", &ar::ops::force_pair_capacity,
         "For tests: room for so many pairs on CUDA, whatever comes; 0 to guess anew, from the frames that follow.");
+  m.def("record_kernels", &ar::ops::record_kernels,
+        "For tests: record launches from now on, beginning with none; or not.");
+  m.def("launched_kernels", &ar::ops::launched_kernels, "For tests: mangled names of the kernels that were recorded.");
+  m.def("blend_route", &ar::ops::blend_route,
+        "For tests: kernels that blend (key, channels, width, height, room for pairs) forward and backward, by "
+        "dispatch.h.");
 #else
   m.attr("has_cuda") = false;
 #endif
@@ -191,10 +209,7 @@ PYBIND11_MODULE(_C, m) {
       "footprints",
       [] {
         std::vector<pybind11::dict> all;
-        ar::for_each_footprint(ar::Footprints{}, [&](auto f) {
-          using F = decltype(f);
-          all.push_back(ar::ops::describe(ar::key_of<F>(), F::kName, F::kOption, F::kSamples, F::kReference));
-        });
+        ar::for_each_footprint(ar::Footprints{}, [&](auto f) { all.push_back(ar::ops::describe<decltype(f)>()); });
         return all;
       },
       "What the headers say of every footprint, in the order of the registry.");

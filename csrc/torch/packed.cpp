@@ -150,7 +150,7 @@ Results blend_rows(BlendRowsArguments a) {
     rows.kept_covs = at::empty({a.rows.size(0), 4}, a.rows.options());
     rows.kept_opacities = at::empty({a.rows.size(0)}, a.rows.options());
   }
-  const ListTensors lists = backend->bin(backend->shape_rows(rows, pass), pass, channels.background);
+  const ListTensors lists = backend->bin(backend->shape_rows(rows, pass), pass);
   ImageSwitches wanted = {};
   wanted[kAlpha] = true;
   const ImageTensors image = make_images(channels, wanted, pass.grid);
@@ -185,8 +185,7 @@ Results blend_rows_vjp(BlendRowsVjpArguments a) {
   gradient.others[kAlpha] = gradient_of(given, 1, "dL_dalpha", like, {a.image_height, a.image_width});
   const ChannelTensors channels = own_colors(checked_background(a.background));
   Tensor background;
-  if (a.needs_background)
-    background = background_grad(gradient.color, channels.background, saved.state, saved.lists, pass.grid);
+  if (a.needs_background) background = background_grad(gradient.color, channels.background, saved.state, pass.grid);
   const std::unique_ptr<Backend> backend = make_backend(like);
   const bool absolute = a.dL_drows.size(1) == kPackedGradWidthAbsolute;
   const PairSums sums = backend->blend_vjp(saved.lists, saved.state, pass, channels, gradient,

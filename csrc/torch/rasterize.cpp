@@ -4,6 +4,7 @@
 #include <ATen/ops/constant_pad_nd.h>
 #include <ATen/ops/empty_like.h>
 #include <ATen/ops/tensor.h>
+#include <ATen/ops/zeros.h>
 
 #include <vector>
 
@@ -103,7 +104,7 @@ Results run(RasterizeArguments a, std::vector<double>* seconds, bool exact = fal
     lap();
     const SplatTensors splats = backend->project(a, pass, channels, radii);
     lap();
-    const ListTensors lists = backend->bin(splats, pass, channels.background);
+    const ListTensors lists = backend->bin(splats, pass);
     lap();
     const ImageTensors image = make_images(channels, a.images, pass.grid);
     BlendState state = make_state(pass, a.means3D);
@@ -178,7 +179,7 @@ Results rasterize_vjp(VjpArguments<RasterizeArguments> arguments) {
       Tensor& grad = a.features ? features : grads.colors_precomp;
       grad = sums.dL_dchannels.narrow(1, channels.first_given, channels.given.size(1)).contiguous();
     }
-    if (needs[kSceneTensors]) background = background_grad(dL_dimage.color, a.bg, saved.state, saved.lists, pass.grid);
+    if (needs[kSceneTensors]) background = background_grad(dL_dimage.color, a.bg, saved.state, pass.grid);
     std::vector<Tensor> list = list_of(grads, a.means3D);
     list.push_back(or_empty(background, a.means3D));
     list.push_back(or_empty(features, a.means3D));

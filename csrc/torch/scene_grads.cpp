@@ -6,7 +6,7 @@
 #include <ATen/ops/empty_like.h>
 #include <ATen/ops/full.h>
 #include <ATen/ops/stack.h>
-#include <ATen/ops/where.h>
+#include <ATen/ops/zeros.h>
 #include <ATen/ops/zeros_like.h>
 
 #include <algorithm>
@@ -16,20 +16,6 @@
 
 namespace ar::ops {
 namespace {
-
-/// Mean transmittance of every pixel's samples, (H, W). A tile of `adaptive` uses the first of them only.
-Tensor mean_transmittance(const BlendState& state, const ListTensors& lists, TileGrid grid) {
-  if (lists.tile_samples.numel() == 0) return state.transmittance.mean(0);
-  const Tensor samples = lists.tile_samples.view({grid.rows(), grid.columns()})
-                             .repeat_interleave(kTile, 0)
-                             .repeat_interleave(kTile, 1)
-                             .slice(0, 0, grid.height)
-                             .slice(1, 0, grid.width);
-  const Tensor number = at::arange(state.transmittance.size(0), samples.options()).view({-1, 1, 1});
-  return at::where(number.lt(samples), state.transmittance, at::zeros({}, state.transmittance.options()))
-      .sum(0)
-      .div(samples);
-}
 
 /// Whether one of the camera's tensors wants a gradient.
 bool needs_camera(const std::vector<bool>& needs) {
@@ -125,14 +111,13 @@ Tensor places_of(const Tensor& ids, int64_t count, int64_t first) {
   return places.slice(0, 0, count);
 }
 
-Tensor background_grad(const Tensor& dL_dimage, const Tensor& background, const BlendState& state,
-                       const ListTensors& lists, TileGrid grid) {
+Tensor background_grad(const Tensor& dL_dimage, const Tensor& background, const BlendState& state, TileGrid grid) {
   if (!dL_dimage.defined()) return at::zeros_like(background);
   const Tensor dL_dcolor = dL_dimage.narrow(0, 0, background.size(0));
   // The longer axis first, then the other: of a single channel torch would divide 2^15 or more terms among its threads,
   // and the bits of their sum would depend on how many these are.
   const int64_t longer = grid.height > grid.width ? 1 : 2;
-  return dL_dcolor.mul(mean_transmittance(state, lists, grid)).sum(longer).sum(1);
+  return dL_dcolor.mul(state.transmittance.mean(0)).sum(longer).sum(1);
 }
 
 }  // namespace ar::ops

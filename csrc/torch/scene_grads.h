@@ -38,7 +38,6 @@ Tensor places_of(const Tensor& ids, int64_t count, int64_t first);
 
 /// Gradient with respect to a background, whose channels are the first of the image's: it shows through what no splat
 /// covers. Zero where there is no gradient with respect to the image.
-Tensor background_grad(const Tensor& dL_dimage, const Tensor& background, const BlendState& state,
-                       const ListTensors& lists, TileGrid grid);
+Tensor background_grad(const Tensor& dL_dimage, const Tensor& background, const BlendState& state, TileGrid grid);
 
 }  // namespace ar::ops

@@ -3,6 +3,7 @@
 #include <ATen/ops/cat.h>
 #include <ATen/ops/full_like.h>
 #include <ATen/ops/stack.h>
+#include <ATen/ops/zeros.h>
 #include <ATen/ops/zeros_like.h>
 
 #include <algorithm>
@@ -129,15 +130,12 @@ Results bin(BinArguments a) {
   Pass pass(a, a.means2d);
   pass.keep = a.keep;
   check(a);
-  TORCH_CHECK_VALUE(!pass.footprint.chosen || a.colors,
-                    "colors must be given for the footprint adaptive, which chooses samples by them, got None");
   const std::unique_ptr<Backend> backend = make_backend(a.means2d);
   std::vector<Tensor> out;
   for (int64_t c = 0; c + 1 < a.row_splits.size(0); ++c) {
-    RowTensors rows = {a.means2d, a.cov2d, a.dets, a.opacities, a.depths, a.colors ? *a.colors : Tensor()};
+    RowTensors rows = {a.means2d, a.cov2d, a.dets, a.opacities, a.depths, Tensor()};
     for (Tensor* t : rows.numbers()) *t = rows_of(*t, a.row_splits, c);
-    if (a.colors) rows.colors = rows_of(rows.colors, a.row_splits, c);
-    append_to(out, backend->bin(backend->shape_rows(rows, pass), pass, *a.background));
+    append_to(out, backend->bin(backend->shape_rows(rows, pass), pass));
   }
   return {out};
 }
@@ -202,8 +200,7 @@ Results blend_vjp(VjpArguments<BlendArguments> arguments) {
     if (absolute) rows.absolute = at::empty({n, 2}, options);
     backend->row_grads(part.rows, part.lists, pass, sums, rows);
     Tensor background;
-    if (needs[4])
-      background = background_grad(gradient.color, part.channels.background, state, part.lists, pass.grid).unsqueeze(0);
+    if (needs[4]) background = background_grad(gradient.color, part.channels.background, state, pass.grid).unsqueeze(0);
     const Tensor grads[] = {rows.means2d, rows.cov2d, rows.opacities, sums.dL_dchannels, background, rows.absolute};
     for (size_t k = 0; k < parts.size(); ++k) parts[k].push_back(grads[k]);
   }

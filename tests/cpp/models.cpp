@@ -54,9 +54,6 @@ template <class F, class P, typename T> Model<T> make_model() {
       return grad;
     }
   };
-  m.collect = [](const SplatRow<T>& row, ShapeGrad<T> sums, T weighted) {
-    return P::collect(terms_of<P>(row), sums, weighted);
-  };
   m.prepare_vjp = [](Cov2d<T> cov, const SplatRow<T>& row, ShapeGrad<T> sums, T weighted, FootprintOptions options) {
     return F::prepare_vjp(cov, shape_of<F>(row), sums, weighted, options);
   };
@@ -70,8 +67,7 @@ const std::vector<Footprint>& footprints() {
     std::vector<Footprint> list;
     for_each_footprint(Footprints{}, [&](auto f) {
       using F = decltype(f);
-      // A tile of `adaptive` reads the rows of Adaptive itself: here all tiles have the most samples.
-      using P = std::conditional_t<std::is_same_v<F, Adaptive>, F, PixelsOf<F>>;
+      using P = PixelsOf<F>;
       Footprint one;
       one.name = key_of<F>();
       one.index = int(list.size());
@@ -80,7 +76,7 @@ const std::vector<Footprint>& footprints() {
       one.move_reach = 0;
       if constexpr (F::kMoves) one.move_reach = F::kMoveReach;
       one.extra_level = F::kExtraLevel;
-      one.options = {std::is_same_v<F, Adaptive> ? 0 : F::kOption.number};
+      one.options = {F::kOption.number};
       one.support_variance = [](FootprintOptions options) { return F::support_variance(options); };
       one.node = [](int sample) {
         if constexpr (F::kMoves) {

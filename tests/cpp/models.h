@@ -27,7 +27,6 @@ template <typename T> struct Model {
   Vec2<T> (*move)(const SplatRow<T>& row, Vec2<T> d, int s, T alpha, Vec2<T> moved);
   MoveGrad<T> (*alpha_and_move_vjp)(const SplatRow<T>& row, Vec2<T> d, int s, T alpha, bool free, T dL_dalpha,
                                     Vec2<T> moved, Vec2<T>& dL_dmoved);
-  ShapeGrad<T> (*collect)(const SplatRow<T>& row, ShapeGrad<T> sums, T weighted);
   SplatGrad<T> (*prepare_vjp)(Cov2d<T> cov, const SplatRow<T>& row, ShapeGrad<T> sums, T weighted,
                               FootprintOptions options);
 };
@@ -36,7 +35,7 @@ struct Footprint {
   std::string name;  ///< key, with letters and digits only
   int index, samples;
   double reach, move_reach, extra_level;
-  FootprintOptions options;  ///< the public default; of `adaptive` no tolerance: as many samples as there may be
+  FootprintOptions options;  ///< the public default
   double (*support_variance)(FootprintOptions options);
   Vec2<double> (*node)(int sample);  ///< of the footprints that take alpha at nodes; else the pixel's centre
   Model<float> in_float;

@@ -2,6 +2,7 @@
 
 #include <gtest/gtest.h>
 
+#include <random>
 #include <vector>
 
 namespace ar::cuda {
@@ -9,18 +10,20 @@ namespace {
 
 constexpr int64_t kMost = (int64_t(1) << 30) - 1;
 
-/// Renders frames of one image size with a device that is `lag` frames behind, as long as the host does not wait for
-/// it.
+constexpr TileGrid kGrid = {640, 480};
+
+/// Renders frames with a device that ends each of them two frames later, as long as the host does not wait for it.
 class Renderer {
  public:
-  explicit Renderer(int width = 640, int lag = 2) : width_(width), lag_(lag) {}
-
   /// Room for a frame with so many pairs; 0 if they were counted.
   int64_t frame(int64_t gaussians, int64_t pairs, Counting counting = Counting::kIfNeeded) {
-    const PairGuesses::Frame frame = guesses.begin(0, {width_, 480}, gaussians, kMost, counting);
+    return frame(kGrid, gaussians, pairs, counting);
+  }
+  int64_t frame(TileGrid grid, int64_t gaussians, int64_t pairs, Counting counting = Counting::kIfNeeded) {
+    const PairGuesses::Frame frame = guesses.begin(0, grid, gaussians, kMost, counting);
     queue_.push_back({frame, pairs});
     if (frame.capacity == 0) guesses.counted(frame, gaussians, pairs);
-    while (queue_.size() > size_t(frame.capacity == 0 ? 0 : lag_)) write_next();
+    while (queue_.size() > (frame.capacity == 0 ? 0 : kLag)) write_next();
     return frame.capacity;
   }
   /// Frames that are counted until one is guessed.
@@ -42,13 +45,13 @@ class Renderer {
     *queue_.front().frame.word = uint64_t(queue_.front().frame.number) << 32 | uint64_t(queue_.front().pairs);
     queue_.erase(queue_.begin());
   }
-  int width_, lag_;
+  static constexpr size_t kLag = 2;
   std::vector<Queued> queue_;
 };
 
 TEST(PairGuessTest, CountsTheFirstFramesAndThenLeavesAReserve) {
   Renderer renderer;
-  EXPECT_EQ(renderer.count_frames(1000, 1000000), PairGuess::kCountedFrames);
+  EXPECT_EQ(renderer.count_frames(1000, 1000000), kCountedFrames);
   const int64_t room = renderer.frame(1000, 1000000);
   EXPECT_GE(room, 1250000);
   EXPECT_LE(room, 1250000 + (1 << 16));
@@ -72,11 +75,11 @@ TEST(PairGuessTest, CountsAgainAfterAnOverflowAndOnlyThen) {
   for (int k = 0; k < 100; ++k) {
     const int64_t next = renderer.frame(1000, 10 * room);
     counted += next == 0;
-    if (counted == PairGuess::kRecountedFrames && next > 0) {
+    if (counted == kRecountedFrames && next > 0) {
       EXPECT_GE(next, 12 * room);
     }
   }
-  EXPECT_EQ(counted, PairGuess::kRecountedFrames);
+  EXPECT_EQ(counted, kRecountedFrames);
 }
 
 TEST(PairGuessTest, GuessesWhateverTheNumberOfGaussians) {
@@ -99,7 +102,7 @@ TEST(PairGuessTest, GrowsInProportionOnlyUntilTheDeviceHasSpoken) {
 
 TEST(PairGuessTest, WaitsOnlyWhereItMay) {
   Renderer renderer;
-  EXPECT_EQ(renderer.guesses.begin(0, {640, 480}, 1000, kMost, Counting::kNever).capacity, 0) << "nothing is known";
+  EXPECT_EQ(renderer.guesses.begin(0, kGrid, 1000, kMost, Counting::kNever).capacity, 0) << "nothing is known";
   renderer.frame(1000, 1000000);
   EXPECT_GE(renderer.frame(1000, 1000000, Counting::kNever), 1250000);
   EXPECT_EQ(renderer.frame(1000, 1000000), 0);
@@ -114,38 +117,84 @@ TEST(PairGuessTest, ALargerFrameThatIsCountedAnywayIsNoReasonToCountOthers) {
 
 TEST(PairGuessTest, NeverExceedsTheMost) {
   Renderer renderer;
-  for (int frame = 0; frame < 2 * PairGuess::kCountedFrames; ++frame)
-    EXPECT_LE(renderer.guesses.begin(0, {640, 480}, 10, 1 << 20, Counting::kIfNeeded).capacity, 1 << 20);
+  for (int frame = 0; frame < 2 * kCountedFrames; ++frame)
+    EXPECT_LE(renderer.guesses.begin(0, kGrid, 10, 1 << 20, Counting::kIfNeeded).capacity, 1 << 20);
   renderer.count_frames(10, (int64_t(1) << 32) - 1);
-  EXPECT_EQ(renderer.guesses.begin(0, {640, 480}, 10, 1 << 20, Counting::kNever).capacity, 1 << 20);
+  EXPECT_EQ(renderer.guesses.begin(0, kGrid, 10, 1 << 20, Counting::kNever).capacity, 1 << 20);
 }
 
+/// Photos that all differ in size, with as many pairs as their tiles and their views make.
+TEST(PairGuessTest, WaitsInFewFramesOfACollectionWithASizePerPhoto) {
+  constexpr int kPhotos = 200, kGaussians = 500000, kSizeClasses = 2;  // 2508 to 7500 tiles
+  struct Photo {
+    TileGrid grid;
+    int64_t pairs;
+  };
+  std::mt19937 bits(5);
+  std::vector<Photo> photos;
+  for (int k = 0; k < kPhotos; ++k) {
+    const TileGrid grid = {900 + int(bits() % 700), 700 + int(bits() % 500)};
+    photos.push_back({grid, grid.tiles() * int64_t(400 + bits() % 400)});
+  }
+  Renderer renderer;
+  int waits[3] = {}, overflows = 0;
+  for (int& of_round : waits) {
+    for (const Photo& photo : photos) {
+      const int64_t room = renderer.frame(photo.grid, kGaussians, photo.pairs);
+      of_round += room == 0;
+      overflows += room > 0 && room < photo.pairs;
+      EXPECT_LE(room, 4 * (photo.pairs + kGaussians));
+    }
+  }
+  EXPECT_LE(overflows, 2);
+  EXPECT_LE(waits[0] + waits[1], kSizeClasses * kCountedFrames + overflows * kRecountedFrames);
+  EXPECT_EQ(waits[2], 0);
+}
+
+TEST(PairGuessTest, GrowsInProportionToTheTilesUntilTheDeviceHasSpoken) {
+  const TileGrid small = {16 * 40, 16 * 30}, large = {16 * 50, 16 * 40};  // 1200 and 2000 tiles
+  Renderer renderer;
+  while (renderer.frame(small, 1000, 1200000) == 0) {}
+  EXPECT_GE(renderer.frame(large, 1000, 1300000), 2500000);
+  for (int k = 0; k < 3; ++k) renderer.frame(large, 1000, 1300000);
+  EXPECT_LE(renderer.frame(large, 1000, 1300000), 1700000);
+}
+
+TEST(PairGuessTest, CountsAnewForImagesOfAnotherClassOfSizes) {
+  Renderer renderer;
+  renderer.count_frames(1000, 1000000);
+  EXPECT_EQ(renderer.frame({320, 240}, 1000, 10), 0) << "a preview does not get the room of the picture";
+  EXPECT_EQ(renderer.frame({1280, 960}, 1000, 10), 0);
+  EXPECT_GT(renderer.frame({672, 448}, 1000, 1000000), 0) << "nearly the same size";
+}
+
+/// A key of its own for each device.
 TEST(PairGuessTest, KeepsTheSizesUsedLast) {
   Renderer renderer;
   renderer.count_frames(1000, 1000000);
-  for (int width = 1; width < PairGuesses::kSlots; ++width)
-    renderer.guesses.begin(0, {width, 480}, 10, kMost, Counting::kIfNeeded);
+  for (int device = 1; device < PairGuesses::kSlots; ++device)
+    renderer.guesses.begin(device, kGrid, 10, kMost, Counting::kIfNeeded);
   EXPECT_GT(renderer.frame(1000, 1000000), 0) << "there was a slot for each";
-  for (int width = 1; width <= PairGuesses::kSlots; ++width)
-    renderer.guesses.begin(0, {width, 480}, 10, kMost, Counting::kIfNeeded);
+  for (int device = 1; device <= PairGuesses::kSlots; ++device)
+    renderer.guesses.begin(device, kGrid, 10, kMost, Counting::kIfNeeded);
   EXPECT_EQ(renderer.frame(1000, 1000000), 0) << "its slot was given away";
 }
 
-TEST(PairGuessTest, AWriteThatComesLateIsNotOfTheSlotsNewSize) {
+TEST(PairGuessTest, AWriteThatComesLateIsNotOfTheSlotsNewDevice) {
   Renderer renderer;
   renderer.frame(1000, 1000000);
-  const PairGuesses::Frame late = renderer.guesses.begin(0, {640, 480}, 1000, kMost, Counting::kNever);
-  for (int width = 1; width <= PairGuesses::kSlots; ++width)
-    renderer.guesses.begin(0, {width, 480}, 10, kMost, Counting::kIfNeeded);
-  int next = -1;  // the size that has the slot now
-  for (int width = 1; width <= PairGuesses::kSlots; ++width) {
-    const PairGuesses::Frame frame = renderer.guesses.begin(0, {width, 480}, 10, kMost, Counting::kIfNeeded);
-    if (frame.slot == late.slot) next = width;
+  const PairGuesses::Frame late = renderer.guesses.begin(0, kGrid, 1000, kMost, Counting::kNever);
+  for (int device = 1; device <= PairGuesses::kSlots; ++device)
+    renderer.guesses.begin(device, kGrid, 10, kMost, Counting::kIfNeeded);
+  int next = -1;  // the device that has the slot now
+  for (int device = 1; device <= PairGuesses::kSlots; ++device) {
+    const PairGuesses::Frame frame = renderer.guesses.begin(device, kGrid, 10, kMost, Counting::kIfNeeded);
+    if (frame.slot == late.slot) next = device;
     renderer.guesses.counted(frame, 10, 100);
   }
   ASSERT_GT(next, 0);
   *late.word = uint64_t(late.number) << 32 | 900000000;
-  EXPECT_LE(renderer.guesses.begin(0, {next, 480}, 10, kMost, Counting::kNever).capacity, 200000);
+  EXPECT_LE(renderer.guesses.begin(next, kGrid, 10, kMost, Counting::kNever).capacity, 200000);
 }
 
 TEST(PairGuessTest, HasRoomForAPairOfEveryGaussian) {

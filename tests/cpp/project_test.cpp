@@ -165,7 +165,7 @@ template <class Cam> struct Loss {
         const Footprint& paper = footprint_named("analytic_paper");
         one.shape.xy = paper.in_double.sums(splat, d, gs).shape.xy / (gap * r.x * r.y);
       }
-      add(f.in_double.collect(splat, one, weighted), sums.shape);
+      add(one, sums.shape);
       sums.weighted += weighted;
     }
     Parameters<double> out = {};

@@ -64,12 +64,11 @@ template <typename T> struct GradArrays {
 /// Splats by tile, as `bin` leaves them.
 template <typename T> struct Lists {
   std::vector<T> splats, depths;
-  std::vector<int32_t> ids, pairs, samples;
+  std::vector<int32_t> ids, pairs;
   std::vector<int64_t> tile_offsets, splat_offsets, positions;
 
   /// Fills the lists from splats, ids and depths.
-  void bin(const cpu::Stages<T>& stages, FootprintChoice footprint, TileGrid grid, const T* background, int count,
-           int threads) {
+  void bin(const cpu::Stages<T>& stages, FootprintChoice footprint, TileGrid grid, int threads) {
     tile_offsets.resize(grid.tiles() + 1);
     splat_offsets.assign(ids.size() + 1, 0);
     cpu::BinParams<T> p = {};
@@ -87,25 +86,9 @@ template <typename T> struct Lists {
     p.pairs = pairs.data();
     p.positions = positions.data();
     stages.scatter_pairs(p);
-    if (!stages.choose_samples) return;
-    // Without a tolerance, as many as there may be.
-    samples.assign(grid.tiles(), stages.samples);
-    if (!(footprint.options.number > 0)) return;
-    cpu::ChooseSamplesParams<T> choice = {};
-    choice.splats = splats.data();
-    choice.lists = view();
-    choice.grid = grid;
-    choice.threads = threads;
-    choice.background = background;
-    choice.background_count = count;
-    choice.tolerance = footprint.options.number;
-    choice.tile_samples = samples.data();
-    stages.choose_samples(choice);
   }
 
-  cpu::TileLists view() const {
-    return {pairs.data(), tile_offsets.data(), samples.empty() ? nullptr : samples.data()};
-  }
+  cpu::TileLists view() const { return {pairs.data(), tile_offsets.data()}; }
   cpu::SplatPairs splat_pairs() const {
     return {int64_t(ids.size()), ids.data(), splat_offsets.data(), positions.data()};
   }
@@ -257,7 +240,7 @@ template <typename T> Rendered<T> run_stages(const cpu::Stages<T>& stages, const
   project.ids = lists.ids.data();
   of_camera.project(project);
 
-  lists.bin(stages, pass.footprint, grid, pass.background, pass.count, pass.threads);
+  lists.bin(stages, pass.footprint, grid, pass.threads);
   out.pairs = int64_t(lists.pairs.size());
   const bool own = !pass.has_channels();
   const Channels<T> channels = channels_of(lists, own, rows.data(), pass.count, true);

@@ -175,7 +175,7 @@ Rendered<double> render_plainly(const Footprint& f, const Scene<double>& scene) 
     for (size_t k = 0; k < order.size(); ++k) {
       const int i = order[k];
       sums[i].weighted += of_pixel[k].weighted;
-      add(model.collect(splats[i], of_pixel[k].shape, of_pixel[k].weighted), sums[i].shape);
+      add(of_pixel[k].shape, sums[i].shape);
       const Vec2<double> by_mean = transform_transposed(model.mean_map(splats[i]), of_pixel[k].shape.offset);
       absolute[i] = absolute[i] + Vec2<double>{std::abs(by_mean.x), std::abs(by_mean.y)};
     }
@@ -523,7 +523,7 @@ template <typename T> Rows<T> project_rows(const Footprint& f, const Scene<T>& s
   return rows;
 }
 
-template <typename T> Lists<T> bin_rows(const Footprint& f, Rows<T>& rows, TileGrid grid, const T* background) {
+template <typename T> Lists<T> bin_rows(const Footprint& f, Rows<T>& rows, TileGrid grid) {
   const auto& stages = cpu::stages_of<T>(f.index);
   Lists<T> lists;
   const int64_t n = int64_t(rows.radii.size());
@@ -539,7 +539,7 @@ template <typename T> Lists<T> bin_rows(const Footprint& f, Rows<T>& rows, TileG
   p.threads = 1;
   p.splats = lists.splats.data();
   stages.shape_rows(p);
-  lists.bin(stages, f.choice(), grid, background, 3, 1);
+  lists.bin(stages, f.choice(), grid, 1);
   return lists;
 }
 
@@ -586,7 +586,7 @@ TEST_P(RowsTest, AreThePassInOne) {
     if (rows.radii[i] == 0) rows.dets[i] = -1;  // what is left undefined must not matter
   }
   const auto& stages = cpu::stages_of<double>(f.index);
-  const Lists<double> lists = bin_rows(f, rows, grid, scene.background.data());
+  const Lists<double> lists = bin_rows(f, rows, grid);
   const Channels<double> channels = channels_of<double>(lists, false, &rows.colors[0].x, 3, false);
   const Image<double> image = blend(stages, lists, grid, channels, scene.background.data(), 1);
   EXPECT_EQ(image.image, expected.image);
@@ -628,7 +628,7 @@ struct RowsLoss {
 
   double operator()(Rows<double> rows) const {
     const auto& stages = cpu::stages_of<double>(f.index);
-    const Lists<double> lists = bin_rows(f, rows, grid, scene.background.data());
+    const Lists<double> lists = bin_rows(f, rows, grid);
     const auto image =
         blend(stages, lists, grid, channels_of<double>(lists, true, nullptr, 3, false), scene.background.data(), 1);
     return std::inner_product(image.image.begin(), image.image.end(), scene.dL_dimage.begin(), 0.0);
@@ -648,7 +648,7 @@ TEST_P(RowsTest, GradientsMatchDifferences) {
     rows.dets[i] = c.xx * c.yy - c.xy * c.xy;
   }
   const auto& stages = cpu::stages_of<double>(f.index);
-  const Lists<double> lists = bin_rows(f, rows, loss.grid, scene.background.data());
+  const Lists<double> lists = bin_rows(f, rows, loss.grid);
   const auto channels = channels_of<double>(lists, true, nullptr, 3, false);
   const auto image = blend(stages, lists, loss.grid, channels, scene.background.data(), 1);
   const Sums<double> sums = blend_vjp<double>(stages, lists, loss.grid, channels, true, n, image,
@@ -723,7 +723,7 @@ TEST_P(RowsTest, AnyNumbersAreSafe) {
       for (int i = 0; i < 60; ++i) {
         if (rows.radii[i] == 0) rows.dets[i] = nan;
       }
-      const Lists<float> lists = bin_rows(f, rows, grid, scene.background.data());
+      const Lists<float> lists = bin_rows(f, rows, grid);
       const auto image =
           blend(stages, lists, grid, channels_of<float>(lists, true, nullptr, 3, false), scene.background.data(), 1);
       for (const float x : image.image) ASSERT_TRUE(std::isfinite(x)) << member << " " << bad;

@@ -12,7 +12,7 @@ import torch
 from ..._C import MAX_CHANNELS
 from ...autocast import way_out_of
 from ...effects import MAX_SH_DEGREE
-from ...footprints import Footprint, chosen_footprint, resolve_footprint
+from ...footprints import COMPENSATED, DILATED, Footprint, chosen_footprint, resolve_footprint
 from ...settings import one_number, whole_number
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -153,5 +153,5 @@ def settle_footprint(footprint: str | Footprint | None, rasterize_mode: str, eps
     if (chosen := chosen_footprint()) is not None:
         return chosen
     if rasterize_mode == "classic":
-        return resolve_footprint("point", dilation=eps2d)
-    return resolve_footprint("mip", variance=eps2d)
+        return resolve_footprint(DILATED, dilation=eps2d)
+    return resolve_footprint(COMPENSATED, variance=eps2d)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 
 from ..._C import ALPHA_MIN
-from ...footprints import Footprint
+from ...footprints import COMPENSATED, DILATED, Footprint
 from ...stages import Splats
 from .arguments import Sizes
 
@@ -46,13 +46,13 @@ def measure(splats: Splats, footprint: Footprint, radius_clip: float) -> Measure
     pixel is half a pixel further away, so that alpha is below 1/255 there also where the weight is an integral over
     the pixel.
     """
-    variance = footprint.option if footprint.name in ("point", "mip") else _PIXEL_VARIANCE
+    variance = footprint.option if footprint.name in (DILATED, COMPENSATED) else _PIXEL_VARIANCE
     xx, xy, yy = splats.cov2d.unbind(1)
     det = splats.dets + variance * (xx + yy) + variance**2  # without the cancellation of computing it from entries
     xx, yy = xx + variance, yy + variance
     conics = torch.stack([yy / det, -xy / det, xx / det], 1)
     opacities = splats.opacities
-    if footprint.name == "mip":
+    if footprint.name == COMPENSATED:
         opacities = opacities * (splats.dets / det).sqrt()
     extent = (2 * (opacities / ALPHA_MIN).log()).clamp(min=0).sqrt().clamp(max=_EXTENT)
     rx, ry = ((extent * v.sqrt()).ceil().clamp(max=_LARGEST_RADIUS) for v in (xx, yy))

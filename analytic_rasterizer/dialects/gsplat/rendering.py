@@ -361,9 +361,6 @@ def _blend(
     splats: Splats, features: torch.Tensor, backgrounds: torch.Tensor | None, absolute: torch.Tensor | None
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Images (B * C, H, W, K) and alphas (B * C, H, W, 1)."""
-    if splats.footprint == "adaptive":  # it chooses samples by the first three channels
-        three = features.detach()[:, :3]
-        splats = dataclasses.replace(splats, colors=torch.nn.functional.pad(three, (0, 3 - three.shape[1])))
     lists = list_tiles(splats, keep=torch.is_grad_enabled())
     images, alphas = blend(splats, lists, features, backgrounds, means2d_abs=absolute)
     return images.permute(0, 2, 3, 1).contiguous(), alphas.permute(0, 2, 3, 1).contiguous()

@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ...footprints import COMPENSATED, DILATED, FOUR_SAMPLES, PAPER, RECOMMENDED
 from ..captures import RECONSTRUCTIONS
 
 FOUR_SCALES = (1, 2, 4, 8)
@@ -36,15 +37,15 @@ class Row(NamedTuple):
 
 
 ROWS = (
-    Row("3dgs", "3DGS", {"footprint": "point"}),
-    Row("3dgs-ss", "3DGS-SS", {"footprint": "point", "supersampling": 2}),
-    Row("mip-splatting", "Mip-Splatting", {"footprint": "mip", "filter_3d": True}),
-    Row("analytic", "Ours", {"footprint": "analytic"}),
-    Row("analytic-filter", "Ours + 3D filter", {"footprint": "analytic", "filter_3d": True}),
-    Row("box", "", {"footprint": "box:samples=4"}),
-    Row("box-filter", "", {"footprint": "box:samples=4", "filter_3d": True}),
-    Row("moment", "", {"footprint": "moment:samples=4"}),
-    Row("moment-filter", "", {"footprint": "moment:samples=4", "filter_3d": True}),
+    Row("3dgs", "3DGS", {"footprint": DILATED}),
+    Row("3dgs-ss", "3DGS-SS", {"footprint": DILATED, "supersampling": 2}),
+    Row("mip-splatting", "Mip-Splatting", {"footprint": COMPENSATED, "filter_3d": True}),
+    Row("analytic", "Ours", {"footprint": PAPER}),
+    Row("analytic-filter", "Ours + 3D filter", {"footprint": PAPER, "filter_3d": True}),
+    Row("box", "", {"footprint": FOUR_SAMPLES}),
+    Row("box-filter", "", {"footprint": FOUR_SAMPLES, "filter_3d": True}),
+    Row("moment", "", {"footprint": RECOMMENDED}),
+    Row("moment-filter", "", {"footprint": RECOMMENDED, "filter_3d": True}),
 )
 STARRED_ROWS = tuple(
     Row(f"{row.name}-bicubic", f"{row.published}*" if row.published else "", row.options, bicubic=True)

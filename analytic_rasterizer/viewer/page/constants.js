@@ -22,60 +22,32 @@ export const MINIMAX = [
   0.9999999227245566, -0.4999924984750279, 0.16654815152216923, -0.041001278881188354, 0.006771038053309816,
 ];
 
-// Half of the nodes of the footprint box [px]; the other half is opposite. box_node of csrc/core/footprint/gaussian.h.
+// Half of the nodes of pixels with several samples [px]; the other half is opposite. box_node of
+// csrc/core/footprint/gaussian.h.
 export const HALF_NODES = {
-  2: [[0.25, 0.25]],
   4: [[-0.12083, -0.36226], [0.36226, -0.12083]],
-  8: [[0.23261, 0.40079], [0.39744, 0.06586], [0.31083, -0.35497], [0.06179, -0.14672]],
   16: [
     [0.26975, -0.14597], [0.14427, -0.43939], [0.062, -0.14646], [0.18749, 0.1472],
     [0.43551, -0.31294], [0.39499, 0.06396], [0.10473, 0.3564], [0.39573, 0.39912],
   ],
 };
 
-/// Variance of each Gaussian of the footprint box [px^2]: kBoxVariance of csrc/core/footprint/gaussian.h.
-export function boxVariance(samples) {
-  if (samples === 1) return CONSTANTS.kPixelVariance;
-  return samples === 2 ? CONSTANTS.kPixelVariance / 4 : 1 / (24 * samples);
-}
-
-/// All nodes of the footprint box [px].
-export function boxNodes(samples) {
+/// The nodes of a pixel [px].
+export function nodesOf(samples) {
   if (samples === 1) return [[0, 0]];
   const half = HALF_NODES[samples];
   return [...half, ...half.map(([x, y]) => [-x, -y])];
 }
 
-// Added to the footprint's covariance by default [px^2]: the options of csrc/core/footprint/point.h and mip.h.
-export const DEFAULT_VARIANCE = { point: 0.3, mip: 0.1 };
-
-// What the page offers, with the name that people read.
-export const FOOTPRINTS = [
-  ['point', 'point (sampled)'],
-  ['mip', 'mip (blurred)'],
-  ['analytic', 'analytic'],
-  ['cumulant', 'cumulant'],
-  ['box:samples=1', 'box, 1 sample'],
-  ['box:samples=2', 'box, 2 samples'],
-  ['box:samples=4', 'box, 4 samples'],
-  ['box:samples=8', 'box, 8 samples'],
-  ['box:samples=16', 'box, 16 samples'],
-];
-
-/// A footprint by its name, such as 'box:samples=4': {name, kind, samples, variance}. Throws for an unknown one.
-export function parseFootprint(name) {
-  const [kind, option] = name.split(':');
-  const [key, value] = (option ?? '').split('=');
-  const expected = { point: 'dilation', mip: 'variance', box: 'samples', analytic: '', cumulant: '' }[kind];
-  const number = Number(value);
-  const valid = key === '' || (key === expected && value !== '' && Number.isFinite(number) && number >= 0);
-  if (expected === undefined || !valid) throw new Error(`There is no footprint '${name}'.`);
-  if (kind === 'box') {
-    const samples = key === '' ? 4 : number;
-    if (samples !== 1 && !(samples in HALF_NODES)) throw new Error(`box has 1, 2, 4, 8 or 16 samples, not ${value}.`);
-    return { name, kind, samples, variance: boxVariance(samples) };
+/// A footprint by its name, 'FAMILY' or 'FAMILY:OPTION=VALUE', as an entry of `known`: `footprints` of the scene
+/// (viewer/packing.py). Where the option is a variance it may have any value. Throws for an unknown name.
+export function parseFootprint(name, known) {
+  const found = known.find(entry => entry.name === name || (entry.family === name && entry.is_default));
+  if (found) return found;
+  const [family, option = ''] = name.split(':'), [key, value = ''] = option.split('=');
+  const variable = known.find(entry => entry.family === family && entry.option === key), variance = Number(value);
+  if (!variable || value === '' || !Number.isFinite(variance) || variance < 0) {
+    throw new Error(`There is no footprint '${name}'.`);
   }
-  const fixed = kind === 'cumulant' ? CONSTANTS.kPixelVariance : 0;
-  const variance = kind in DEFAULT_VARIANCE ? (key === '' ? DEFAULT_VARIANCE[kind] : number) : fixed;
-  return { name, kind, samples: 1, variance };
+  return { ...variable, name, variance };
 }

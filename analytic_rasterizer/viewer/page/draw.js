@@ -1,6 +1,6 @@
 // Draws the projected splats into pictures of half floats, and shows pictures on the canvas.
 
-import { boxNodes } from './constants.js';
+import { nodesOf } from './constants.js';
 import { bindTextures, createFramebuffer, createProgram, createTexture, fillTexture } from './gl.js';
 import { LAST_HALF, ROWS_PER_UNIT, windowTable } from './logistic.js';
 import { Projection } from './project.js';
@@ -82,7 +82,7 @@ export class Renderer {
   /// column) limits what is drawn [px].
   render(name, camera, footprint, settled, span = [0, camera.width]) {
     const gl = this.gl, { width, height } = camera;
-    const nodes = footprint.kind === 'box' ? boxNodes(footprint.samples) : [[0, 0]];
+    const nodes = nodesOf(footprint.samples);
     this.projection.project(camera, footprint);
     gl.viewport(0, 0, width, height);
     gl.enable(gl.SCISSOR_TEST);

@@ -1,7 +1,5 @@
 // The controls: what the user does becomes calls of the viewer, and what the viewer shows becomes text.
 
-import { FOOTPRINTS } from './constants.js';
-
 const element = id => document.getElementById(id);
 const DIVISORS = [1, 2, 4, 8];
 const COMPARISONS = ['off', 'split', 'difference'];
@@ -56,9 +54,9 @@ export class Interface {
     document.title = `${meta.name} - Gaussian splats, integrated over the pixel`;
     const count = meta.count.toLocaleString('en');
     element('scene-facts').textContent = `${count} Gaussians, spherical harmonics of degree ${meta.sh_degree}`;
-    const known = FOOTPRINTS.map(([name]) => name);
-    const all = known.includes(meta.footprint) ? FOOTPRINTS : [[meta.footprint, meta.footprint], ...FOOTPRINTS];
-    const options = () => all.map(([name, text]) => new Option(text, name));
+    const known = meta.footprints.some(({ name }) => name === meta.footprint);
+    const all = known ? meta.footprints : [{ name: meta.footprint, text: meta.footprint }, ...meta.footprints];
+    const options = () => all.map(({ name, text }) => new Option(text, name));
     element('footprint').replaceChildren(...options());
     element('compare').replaceChildren(new Option('nothing', ''), ...options());
     element('view').replaceChildren(...meta.views.map((view, k) => new Option(view.name, k)));
@@ -153,8 +151,9 @@ export class Interface {
       else viewer.orbit(-x, -y);
       return true;
     }
-    if (/^[1-9]$/.test(key) && key <= FOOTPRINTS.length) {
-      viewer.change({ footprint: FOOTPRINTS[key - 1][0] });
+    const { footprints, compared } = viewer.scene.meta;
+    if (/^[1-9]$/.test(key) && key <= footprints.length) {
+      viewer.change({ footprint: footprints[key - 1].name });
       return true;
     }
     const actions = {
@@ -166,7 +165,7 @@ export class Interface {
       c: () => {
         const now = state.compare === null ? 'off' : state.mode;
         const next = COMPARISONS[(COMPARISONS.indexOf(now) + 1) % COMPARISONS.length];
-        const other = state.footprint === 'point' ? 'analytic' : 'point';
+        const other = compared.find(name => name !== state.footprint);
         viewer.change(next === 'off' ? { compare: null } : { compare: state.compare ?? other, mode: next });
       },
       z: () => viewer.change({ divisor: DIVISORS[(DIVISORS.indexOf(state.divisor) + 1) % DIVISORS.length] }),

@@ -1,7 +1,7 @@
 // The viewer: its state, the loop that draws when something has changed, and the hooks for automation.
 
 import { Camera, add, between, depthAt, times } from './camera.js';
-import { CONSTANTS, FOOTPRINTS, parseFootprint } from './constants.js';
+import { CONSTANTS, parseFootprint } from './constants.js';
 import { Renderer } from './draw.js';
 import { Interface, READING_TIME, announce, hideFailure, showFailure } from './interface.js';
 import { loadScene, startSorter } from './load.js';
@@ -173,6 +173,11 @@ class Viewer {
     });
   }
 
+  /// What the page draws a footprint by. Throws for an unknown name.
+  footprint(name) {
+    return parseFootprint(name, this.scene.meta.footprints);
+  }
+
   // ------------------------------------------------------------------ the address
 
   /// Takes pose, footprints and resolution from the address, where it has them.
@@ -180,7 +185,7 @@ class Viewer {
     const given = new URLSearchParams(location.hash.slice(1)), { state } = this;
     const valid = name => {
       try {
-        return name !== null && parseFootprint(name) !== null;
+        return name !== null && this.footprint(name) !== null;
       } catch {
         return false;
       }
@@ -311,13 +316,14 @@ class Viewer {
     }, error => showFailure(error.message));
   }
 
-  /// Draws the state. While the camera moves, `box` has one sample.
+  /// Draws the state. While the camera moves, a pixel has one sample.
   drawFrame(coarse) {
     const { footprint, compare, mode, divisor, divider } = this.state, { renderer } = this;
     const pinhole = this.pinhole(divisor);
     const chosen = name => {
-      const wanted = parseFootprint(name);
-      return coarse && wanted.kind === 'box' ? parseFootprint('box:samples=1') : wanted;
+      const wanted = this.footprint(name);
+      if (!coarse || wanted.samples === 1) return wanted;
+      return this.scene.meta.footprints.find(({ family, samples }) => family === wanted.family && samples === 1);
     };
     const split = compare !== null && mode === 'split', column = Math.ceil(divider * pinhole.width);
     renderer.render('left', pinhole, chosen(footprint), !coarse, split ? [0, column] : undefined);
@@ -369,7 +375,7 @@ class Viewer {
     if (!(Number.isInteger(k) && k >= 0 && k < views.length)) {
       throw new Error(`view must be a whole number from 0 to ${views.length - 1}, got ${k}.`);
     }
-    const parsed = parseFootprint(footprint);
+    const parsed = this.footprint(footprint);
     this.camera.setView(k);
     const pinhole = this.camera.pinhole(width ?? views[k].width, height ?? views[k].height, true, true);
     this.canvas.width = pinhole.width;
@@ -408,13 +414,13 @@ class Viewer {
   /// Times every footprint in turn, `rounds` times. Milliseconds per frame: the median and every round.
   async bench(pinhole, rounds) {
     const { gl } = this.renderer, info = gl.getExtension('WEBGL_debug_renderer_info');
-    const times = Object.fromEntries(FOOTPRINTS.map(([name]) => [name, []]));
+    const { footprints } = this.scene.meta, times = Object.fromEntries(footprints.map(({ name }) => [name, []]));
     for (let round = -1; round < rounds; ++round) {  // the first compiles shaders and is not counted
-      for (const [name] of FOOTPRINTS) {
+      for (const footprint of footprints) {
         const start = performance.now();
-        this.renderer.render('left', pinhole, parseFootprint(name), false);
+        this.renderer.render('left', pinhole, footprint, false);
         this.renderer.finish('left');
-        if (round >= 0) times[name].push(performance.now() - start);
+        if (round >= 0) times[footprint.name].push(performance.now() - start);
       }
       await new Promise(resolve => setTimeout(resolve));
     }

@@ -5,7 +5,7 @@
 // wrong. Offsets are floor(gl_FragCoord) - mean, not interpolated, which is exact. There are no `precise` qualifiers in
 // GLSL ES 3.00; the forms stay positive however a compiler rounds them. docs/viewer.md says how close the result is.
 
-import { CONSTANTS, MINIMAX, boxNodes } from './constants.js';
+import { CONSTANTS, MINIMAX, nodesOf } from './constants.js';
 import { FLAT_FROM, LAST_HALF, ROWS_PER_UNIT } from './logistic.js';
 
 // Splats of one instance of the draw call. One instance per splat is eight times slower without a GPU.
@@ -105,13 +105,13 @@ export function projectShader(kind, degree) {
   float blurredX = xx + uVariance, blurredDet = det + uVariance * (xx + yy) + uVariance * uVariance;
   float across = sqrt(blurredX / blurredDet), slope = -across * (xy / blurredX);
   whitening = vec4(inversesqrt(blurredX), 0.0, slope, across);
-  float amplitude = ${kind === 'point' ? '1.0' : 'sqrt(det / blurredDet)'};
+  float amplitude = ${kind === 'gaussian' ? '1.0' : 'sqrt(det / blurredDet)'};
   peak = log2(opacity * amplitude);
   level = 2.0 * log(opacity * amplitude / kAlphaMin);`;
-  const cumulant = `${gaussian}
+  const cumulants = `${gaussian}
   vec2 conic = vec2(dot(whitening.xz, whitening.xz), dot(whitening.yw, whitening.yw));
   level += dot(conic, conic) / 124.0;`;
-  const analytic = `
+  const turned = `
   float dx = xx - yy, dy = 2.0 * xy, gap = length(vec2(dx, dy)), major = 0.5 * (xx + yy + gap);
   float s1 = max(sqrt(major), kMinSigma), s2 = max(sqrt(det / max(major, 1e-30)), kMinSigma);
   vec2 axis = vec2(1.0, 0.0);
@@ -138,7 +138,7 @@ uniform float uVariance;
 layout(location = 0) out uvec4 outMean;
 layout(location = 1) out uvec4 outWhitening;
 layout(location = 2) out uvec4 outColor;
-${kind === 'analytic' ? WINDOW_TOP : ''}${harmonics(degree)}
+${kind === 'window' ? WINDOW_TOP : ''}${harmonics(degree)}
 void main() {
   ivec2 pixel = ivec2(gl_FragCoord.xy);
   int i = pixel.x + pixel.y * ${SPLATS_PER_ROW};
@@ -169,7 +169,7 @@ void main() {
   if (!(det < kMaxDet && xx < 1e18 && yy < 1e18)) return;
   vec4 whitening;
   float peak, level;
-${{ analytic, cumulant }[kind] ?? gaussian}
+${{ window: turned, cumulants }[kind] ?? gaussian}
   if (!(level > 0.0 && level < 1e6)) return;
 
   ivec2 at = ivec2((i % uHarmonicsPerRow) * ${texelsOfHarmonics(degree)}, i / uHarmonicsPerRow);
@@ -188,10 +188,9 @@ const GAUSSIAN = {
   alpha: 'vec2 z = vec2(dot(fW.xy, d), dot(fW.zw, d)); return exp2(fPeak - dot(z, z));',
 };
 const KINDS = {
-  point: GAUSSIAN,
-  mip: GAUSSIAN,
-  box: GAUSSIAN,
-  cumulant: {
+  gaussian: GAUSSIAN,
+  compensated: GAUSSIAN,
+  cumulants: {
     varyings: ['vec4 fW', 'vec4 fX', 'vec4 fY', 'float fPeak'],  // fX, fY: c4, c6, linear, cap
     functions: {
       vertex: `
@@ -218,7 +217,7 @@ float cumulantConstant(float t, float unit, float scale) {
   vec2 h = vec2(P.x * (P.x * (fX.x - fX.y * P.x) - fX.z), P.y * (P.y * (fY.x - fY.y * P.y) - fY.z));
   return exp2(fPeak - dot(z, z) - h.y - h.x);`,
   },
-  analytic: {
+  window: {
     varyings: ['vec4 fW', 'vec2 fFlat', 'vec4 fU', 'vec4 fV', 'float fPeak'],
     functions: { vertex: WINDOW_COEFFICIENTS, fragment: WINDOW_POLYNOMIAL },
     set: `vec2 u = W.xy, v = W.zw;
@@ -237,8 +236,8 @@ const declare = (kind, direction) =>
 
 /// Draws splats as the parallelograms W^-1 [-s, s]^2 around their ellipses.
 export function drawVertexShader(kind, samples) {
-  const reach = Math.max(...boxNodes(samples).flat().map(Math.abs));
-  const ellipse = kind === 'analytic'
+  const reach = Math.max(...nodesOf(samples).flat().map(Math.abs));
+  const ellipse = kind === 'window'
     ? 'vec2 r = vec2(length(W.xy), length(W.zw)), shrink = inversesqrt(1.0 + kPixelVariance * r * r);\n' +
       '  vec4 E = vec4(W.xy * shrink.x, W.zw * shrink.y);'
     : 'vec4 E = W;';

@@ -11,7 +11,14 @@
 //   kName                what users call it: "box"
 //   kKey                 its own key: "box4". Footprints of one name differ in an option. Default: the name
 //   kOption              the option that users may set, see Option. Default: none
-//   kReference           true: meant to compare others with; compiled for one instruction set. Default: false
+//   kReference           true: meant to compare others with; the CPU compiles it for one instruction set. Default:
+//   false kGeneric             true: CUDA blends it with the kernels for any number of channels alone, which exist for
+//   every
+//                        footprint. They are slower, but it adds no kernels for four channels or fewer. Default: false
+//   kPage                the formula by which the viewer's page draws it (viewer/page/shaders.js): "gaussian" with a
+//   peak
+//                        of 1, "compensated" with the mass of the splat, "cumulants" or "window"; for the first three
+//                        with the variance that support_variance() states. Default: null, the page cannot draw it
 //   kExpensive           true: CUDA kernels would rather find out exactly which pixels a splat reaches than work out
 //                        weights in vain. Default: false
 //   Pixels               a type with the same Shape, terms, alpha, adjoint, ellipse and samples, for which blending is
@@ -43,8 +50,6 @@
 //   terms(Shape<T>, opacity, Vec2<T> origin) -> Terms<T>
 //                                        numbers that all pixels share. origin = a point of the tile - mean [px]; it is
 //                                        zero unless given
-//   collect(Terms<T>, ShapeGrad<T> sums, weighted) -> ShapeGrad<T>
-//                                        what is added up over tiles, linear in the sums. Default: the sums themselves
 //
 // Once per pixel and sample, with p = pixel centre - that point of the tile [px] and s the number of the sample:
 //
@@ -124,8 +129,8 @@ template <class... F> struct FootprintList {};
 /// Numbers of a footprint's Shape.
 inline constexpr int kShapeWidth = 5;
 
-/// The number that a footprint takes at run time: `dilation` of point, `variance` of mip [px^2], `tolerance` of
-/// adaptive. What changes the code of a pixel is a template parameter instead.
+/// The number that a footprint takes at run time: `dilation` of point, `variance` of mip [px^2]. What changes the code
+/// of a pixel is a template parameter instead.
 struct FootprintOptions {
   double number;
 };
@@ -205,15 +210,12 @@ struct FootprintDefaults {
   using Spread = void;  // none
   static constexpr int kLanes = 1;
   static constexpr std::nullptr_t kKey = nullptr;  // the name
+  static constexpr const char* kPage = nullptr;    // none
   static constexpr Option kOption = {};
-  static constexpr bool kReference = false, kExpensive = false;
+  static constexpr bool kReference = false, kGeneric = false, kExpensive = false;
   static constexpr int kSamples = 1;
   static constexpr double kReach = 0, kExtraLevel = 0;
   static constexpr bool kMoves = false;
-
-  template <class Terms, typename T> AR_HD static ShapeGrad<T> collect(const Terms&, const ShapeGrad<T>& sums, T) {
-    return sums;
-  }
 };
 
 /// What blending is compiled for.

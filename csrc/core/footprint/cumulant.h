@@ -53,7 +53,7 @@ template <typename T> struct CumulantAxis {
 };
 
 struct Cumulant : FootprintDefaults {
-  static constexpr const char* kName = "cumulant";
+  static constexpr const char *kName = "cumulant", *kPage = "cumulants";
   static constexpr bool kExpensive = true;
   static constexpr double kExtraLevel = 2.4;  // see level(): both a and c are at most 12
   static constexpr double kOrder4 = 1.0 / 2880;

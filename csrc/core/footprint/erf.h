@@ -12,7 +12,7 @@ namespace ar {
 struct Erf : FootprintDefaults {
   static constexpr const char* kName = "erf";
   static constexpr bool kExpensive = true;
-  static constexpr bool kReference = true;
+  static constexpr bool kReference = true, kGeneric = true;
   static constexpr double kExtraLevel = 2 * box_excess(1 / kPixelVariance);
 
   /// Standard deviations below this [px] are raised to it, so that their reciprocals stay finite.

@@ -18,7 +18,7 @@ namespace ar {
 struct Exact : FootprintDefaults {
   static constexpr const char* kName = "exact";
   static constexpr bool kExpensive = true;
-  static constexpr bool kReference = true;
+  static constexpr bool kReference = true, kGeneric = true;
   static constexpr double kExtraLevel = 2 * box_excess(1 / kPixelVariance);
 
   template <typename T> struct Shape {

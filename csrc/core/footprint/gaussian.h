@@ -1,4 +1,4 @@
-// What the footprints that are Gaussians themselves share: point, mip, box, moment and adaptive, and in part cumulant.
+// What the footprints that are Gaussians themselves share: point, mip, box and moment, and in part cumulant.
 //
 // A Gaussian is kept as a whitening matrix w with w^T w = (Sigma + v I)^-1, so that the exponent is
 // -|w d|^2 / 2. Unlike the conic form a dx^2 + 2 b dx dy + c dy^2 it cannot turn positive, and it
@@ -67,26 +67,20 @@ template <typename T> AR_HD SplatGrad<T> gaussian_vjp(const Lower2<T>& w, ShapeG
 }
 
 /// Variance of each of the S Gaussians of the box footprint [px^2].
-template <int S>
-inline constexpr double kBoxVariance = S == 1   ? kPixelVariance
-                                       : S == 2 ? kPixelVariance / 4
-                                                : 1.0 / (24 * S);
+template <int S> inline constexpr double kBoxVariance = S == 1 ? kPixelVariance : 1.0 / (24 * S);
 
-/// Node s of the box footprint with S samples [px]. The mixture of the Gaussians at the nodes has the mean of the pixel
-/// and, except for two samples, its covariance. From 4 samples on the nodes were found by a search on trained and
-/// random scenes (docs/numerics.md, "Nodes").
+/// Node s of the box footprint with S samples [px]. The mixture of the Gaussians at the nodes has the mean and the
+/// covariance of the pixel. Beyond one sample the nodes were found by a search on trained and random scenes
+/// (docs/numerics.md, "Nodes").
 template <int S> AR_HD constexpr Vec2<double> box_node(int s) {
-  constexpr Vec2<double> kNodes2[] = {{0.25, 0.25}};
   constexpr Vec2<double> kNodes4[] = {{-0.12083, -0.36226}, {0.36226, -0.12083}};
-  constexpr Vec2<double> kNodes8[] = {{0.23261, 0.40079}, {0.39744, 0.06586}, {0.31083, -0.35497}, {0.06179, -0.14672}};
   constexpr Vec2<double> kNodes16[] = {{0.26975, -0.14597}, {0.14427, -0.43939}, {0.06200, -0.14646},
                                        {0.18749, 0.14720},  {0.43551, -0.31294}, {0.39499, 0.06396},
                                        {0.10473, 0.35640},  {0.39573, 0.39912}};
-  static_assert(S == 1 || S == 2 || S == 4 || S == 8 || S == 16, "box has 1, 2, 4, 8 or 16 samples");
+  static_assert(S == 1 || S == 4 || S == 16, "box has 1, 4 or 16 samples");
   if (S == 1) return {0, 0};
   // Node s + S / 2 is the negative of node s, so only the first half is listed.
-  const int k = s % (S / 2 > 0 ? S / 2 : 1);
-  const Vec2<double> n = S == 2 ? kNodes2[k % 1] : S == 4 ? kNodes4[k % 2] : S == 8 ? kNodes8[k % 4] : kNodes16[k % 8];
+  const Vec2<double> n = S == 4 ? kNodes4[s % 2] : kNodes16[s % 8];
   return s < S / 2 ? n : Vec2<double>{-n.x, -n.y};
 }
 
@@ -107,7 +101,7 @@ template <int S> struct GaussianSample;
 template <int S> struct GaussianPixels : FootprintDefaults {
   static constexpr int kSamples = S;
   static constexpr double kReach = box_reach<S>();
-  using Spread = std::conditional_t<S == 4 || S == 16, GaussianSample<S>, void>;
+  using Spread = std::conditional_t<S == 1, void, GaussianSample<S>>;
   template <typename T> using Shape = GaussianShape<T>;
 
   template <typename T> struct Terms {
@@ -169,6 +163,7 @@ template <int S> struct GaussianSample : GaussianPixels<1> {
 /// Footprints that prepare a GaussianPixels<S>. kCompensated: the amplitude keeps the mass of the splat.
 template <int S, bool kCompensated> struct GaussianFootprint : GaussianPixels<S> {
   using Pixels = GaussianPixels<S>;
+  static constexpr const char* kPage = kCompensated ? "compensated" : "gaussian";
   template <typename T> using Shape = GaussianShape<T>;
 
   template <typename T> AR_HD static Shape<T> prepare_with(Cov2d<T> cov, T variance) {

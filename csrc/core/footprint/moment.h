@@ -13,18 +13,19 @@ template <int S> struct MomentKey {
 };
 
 /// n x n cells, S = n^2. In front of the first splat each is a Gaussian of the cell's variance at the cell's centre,
-/// like a sample of `box`. `Pixels` is reset, because that of the base class has nodes that do not move.
+/// like a sample of `box`. `Pixels` and `kPage` are reset, because nodes of the base class do not move.
 template <int S> struct Moment : GaussianFootprint<1, true> {
   using Pixels = void;
+  static constexpr const char* kPage = nullptr;
   using Gaussian = GaussianFootprint<1, true>;
-  static_assert(S == 1 || S == 4 || S == 9 || S == 16, "moment has 1, 4, 9 or 16 samples");
+  static_assert(S == 1 || S == 4 || S == 16, "moment has 1, 4 or 16 samples");
 
   static constexpr const char* kName = "moment";
   static constexpr const char* kKey = MomentKey<S>::kText;
   static constexpr Option kOption = {"samples", MomentKey<S>::kText + 6, 0, S == 4};
-  static constexpr int kSamples = S, kSide = S == 1 ? 1 : S == 4 ? 2 : S == 9 ? 3 : 4;  ///< cells along an edge
-  static constexpr double kVariance = kPixelVariance / S;                               ///< of a cell [px^2]
-  static constexpr double kReach = 0.5;                                                 ///< nodes stay in their cells
+  static constexpr int kSamples = S, kSide = S == 1 ? 1 : S == 4 ? 2 : 4;  ///< cells along an edge
+  static constexpr double kVariance = kPixelVariance / S;                  ///< of a cell [px^2]
+  static constexpr double kReach = 0.5;                                    ///< nodes stay in their cells
 
   static constexpr bool kMoves = true;
   static constexpr double kMoveReach = 0.5 / kSide;

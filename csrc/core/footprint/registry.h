@@ -6,7 +6,6 @@
 #include <string_view>
 #include <type_traits>
 
-#include "core/footprint/adaptive.h"
 #include "core/footprint/analytic.h"
 #include "core/footprint/box.h"
 #include "core/footprint/cumulant.h"
@@ -18,9 +17,8 @@
 
 namespace ar {
 
-using Footprints =
-    FootprintList<Point, Mip, Analytic<FrameGradient::kFrozen>, Analytic<FrameGradient::kPaper>, Cumulant, Box<1>,
-                  Box<2>, Box<4>, Box<8>, Box<16>, Moment<1>, Moment<4>, Moment<9>, Moment<16>, Adaptive, Erf, Exact>;
+using Footprints = FootprintList<Point, Mip, Analytic<FrameGradient::kFrozen>, Analytic<FrameGradient::kPaper>,
+                                 Cumulant, Box<1>, Box<4>, Box<16>, Moment<1>, Moment<4>, Moment<16>, Erf, Exact>;
 
 /// The key of a footprint: its kKey, or without one its name.
 template <class F> constexpr const char* key_of() {
@@ -40,11 +38,6 @@ template <class Function, class... F> AR_HD void for_each_footprint(FootprintLis
 template <class Function, class... F> AR_HD void visit_footprint(int index, FootprintList<F...>, Function&& f) {
   int place = 0;
   ((index == place++ ? (f(F{}), true) : false) || ...);
-}
-
-/// Calls f(F{}) for the footprint of the list that has so many samples.
-template <class Function, class... F> AR_HD void visit_samples(int samples, FootprintList<F...>, Function&& f) {
-  ((samples == F::kSamples ? (f(F{}), true) : false) || ...);
 }
 
 /// Place in the registry of the footprint whose key is `key`; -1 if there is none.

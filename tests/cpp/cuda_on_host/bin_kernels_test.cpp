@@ -395,7 +395,7 @@ TEST(BinKernels, FirstPairsOfTiles) {
         expected.push_back(std::lower_bound(tiles.begin(), tiles.end(), uint32_t(tile)) - tiles.begin());
       const Counts counts = {pairs + 7, pairs, pairs};
       uint64_t word = 0;
-      cuda_on_host::launch(tile_count / kRangeTiles + 1, kRangeTiles * kRangeLanes,
+      cuda_on_host::launch(tile_count / kOffsetTiles + 1, kOffsetTiles * kOffsetLanes,
                            [&] { tile_offsets_kernel(tiles.data(), &counts, tile_count, offsets.data(), {&word, 3}); });
       EXPECT_EQ(offsets, expected) << tile_count << " tiles, " << pairs << " pairs";
       EXPECT_EQ(word, uint64_t(3) << 32 | uint64_t(pairs + 7));

@@ -10,6 +10,7 @@
 #include <ucontext.h>
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 #include <cstdint>
 #include <cstring>
@@ -185,13 +186,20 @@ alignas(16) inline float4 dynamic_memory[1 << 13];
 inline float4* dynamic_shared() { return dynamic_memory; }
 }  // namespace ar::cuda
 
-// What launches ask about the device: that of an H200.
+// What launches ask about the devices, which are H200s.
+namespace cuda_on_host {
+inline int device = 0;  ///< the current one
+inline std::atomic<int> attributes_asked = 0;
+}  // namespace cuda_on_host
 extern "C" inline cudaError_t cudaGetDevice(int* device) {
-  *device = 0;
+  *device = cuda_on_host::device;
   return cudaSuccess;
 }
 extern "C" inline cudaError_t cudaDeviceGetAttribute(int* value, cudaDeviceAttr attribute, int) {
-  *value = attribute == cudaDevAttrMaxSharedMemoryPerBlockOptin ? 227 * 1024 : 0;
+  ++cuda_on_host::attributes_asked;
+  *value = attribute == cudaDevAttrMaxSharedMemoryPerBlockOptin ? 227 * 1024
+           : attribute == cudaDevAttrMultiProcessorCount        ? 132
+                                                                : 0;
   return cudaSuccess;
 }
 

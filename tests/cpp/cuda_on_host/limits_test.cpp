@@ -3,7 +3,7 @@
 
 #include <limits>
 
-#include "cuda/stages.h"
+#include "cuda/params.h"
 
 namespace ar::cuda {
 namespace {

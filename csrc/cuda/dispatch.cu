@@ -1,0 +1,67 @@
+// Entry points of blending for csrc/torch: blend(), blend_vjp() and inspect() choose the family of kernels by the table
+// of dispatch.h.
+#include "cuda/dispatch.h"
+#include "cuda/inspect.cuh"
+#include "cuda/launch.cuh"
+#include "cuda/params.h"
+
+namespace ar::cuda {
+namespace {
+
+constexpr int kClearBlock = 256;
+
+/// Before the backward kernels: no chunk has been claimed; and where there are more pairs than room, sets the rows of
+/// splats to zero, to which all tiles add: pair_grads [n, kPairGradWidth], once for all groups of channels, and
+/// channel_sums [n, width] for the group of `width` channels from `first` on.
+__global__ void clear_sums_kernel(const BlendVjpParams params, int first, int width) {
+  wait_for_earlier_kernels();
+  if (blockIdx.x == 0 && threadIdx.x == 0) *params.chunks_taken = 0;
+  if (!params.lists.counts->in_patches(params.lists.capacity)) return;
+  const auto clear = [&](float* to, int numbers_of_row) {
+    const int64_t n = params.lists.n * numbers_of_row;
+    for (int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x; i < n; i += int64_t(gridDim.x) * blockDim.x)
+      to[i] = 0;
+  };
+  if (first == 0) clear(params.pair_grads, kPairGradWidth);
+  if (params.channel_sums) clear(params.channel_sums, width);
+}
+
+Family family(int footprint, int channels) {
+  Family found = Family::kStill;
+  visit_pixels(footprint, [&](auto f) { found = family_of<decltype(f)>(channels); });
+  return found;
+}
+
+}  // namespace
+
+int multiprocessors_of_device() { return int(multiprocessors()); }
+
+void blend(int footprint, const BlendParams& p, cudaStream_t stream) {
+  switch (family(footprint, p.channels.count)) {
+    case Family::kStill:
+      return blend_still(footprint, p, stream);
+    case Family::kMoment:
+      return blend_moment(footprint, p, stream);
+    case Family::kChannels:
+      return blend_channels(footprint, p, stream);
+  }
+}
+
+void blend_vjp(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream) {
+  const int width = channel_group(footprint, p.channels.count - first);
+  launch(clear_sums_kernel, {kBlocksPerSm * multiprocessors(), kClearBlock}, stream, p, first, width);
+  switch (family(footprint, p.channels.count)) {
+    case Family::kStill:
+      return blend_vjp_still(footprint, p, stream);
+    case Family::kMoment:
+      return blend_vjp_moment(footprint, p, first, stream);
+    case Family::kChannels:
+      return blend_vjp_channels(footprint, p, first, stream);
+  }
+}
+
+void inspect(int footprint, const InspectParams& p, cudaStream_t stream) {
+  visit_pixels(footprint, [&](auto f) { launch_inspect<decltype(f)>(p, stream); });
+}
+
+}  // namespace ar::cuda

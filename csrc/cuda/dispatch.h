@@ -1,0 +1,129 @@
+// The table of blending: which family of kernels blends a footprint, in tiles of which size, and what memory that
+// takes. The functions of csrc/torch ask it for sizes, dispatch.cu asks it for the family. A test compares
+// Route::forward and Route::backward with the kernels that are launched.
+//
+// | footprint                          | channels | tiles                          | family    |
+// |------------------------------------|----------|--------------------------------|-----------|
+// | point, mip, box 1, cumulant,       | up to 4  | 16x16, a lane per pixel        | still/    |
+// |   analytic                         |          |                                |           |
+// | box 4, kSpreadImageTiles or more   | up to 4  | 16x16, four samples in a lane  | still/    |
+// | box 4, fewer tiles                 | up to 4  | 8x8, a lane per sample         | still/    |
+// | box 16                             | up to 4  | 4x4, a lane per sample         | still/    |
+// | all of these                       | more     | the same                       | channels/ |
+// | references: erf, exact, and        | any      | 16x16, a lane per pixel        | channels/ |
+// |   analytic with frame "paper"      |          |                                |           |
+// | moment 1                           | any      | 16x16; 8x8 in small images     | moment/   |
+// | moment 4                           | any      | 8x8                            | moment/   |
+// | moment 16                          | any      | 8x8; 4x4 in small images       | moment/   |
+//
+// still/ blends a tile's list in chunks of 256 pairs; moment/ and channels/ walk the whole list, but where moment/ cuts
+// long lists into segments (moment/cut_lists.h). More than 4 channels are blended in groups.
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <type_traits>
+
+#include "core/footprint/registry.h"
+#include "cuda/moment/cut_lists.h"
+#include "cuda/params.h"
+
+namespace ar::cuda {
+
+enum class Family { kStill, kMoment, kChannels };
+
+/// log2 of the side of the tiles of a footprint F [px].
+template <class F> constexpr int tile_bits_of(bool small_image) {
+  return F::kMoves ? moving_tile_bits(F::kSamples, small_image) : spread_tile_bits(spread_lanes<F>(), small_image);
+}
+/// Calls visit with the side of the grid's tiles as a constant, one of the sides that F has.
+template <class F, class Visit> void with_tile_side(TileGrid grid, Visit&& visit) {
+  constexpr int kLarge = 1 << tile_bits_of<F>(false), kSmall = 1 << tile_bits_of<F>(true);
+  if constexpr (kLarge != kSmall) {
+    if (grid.side() == kLarge) return visit(std::integral_constant<int, kLarge>());
+  }
+  visit(std::integral_constant<int, kSmall>());
+}
+/// Calls f with what a lane blends of F, a footprint of still samples, in tiles of this grid: F::Spread or F itself.
+template <class F, class Function> void with_lanes(TileGrid grid, Function&& f) {
+  with_tile_side<F>(grid, [&](auto side) {
+    using OfLane = std::conditional_t<(side < kTile), typename F::Spread, F>;
+    f(OfLane{});
+  });
+}
+/// Calls f(F{}) for what blending is compiled for of the footprint at position `footprint` of the registry.
+template <class Function> void visit_pixels(int footprint, Function&& f) {
+  visit_footprint(footprint, Footprints{}, [&](auto chosen) { f(PixelsOf<decltype(chosen)>{}); });
+}
+
+template <class F> constexpr Family family_of(int64_t channels) {
+  if (F::kMoves) return Family::kMoment;
+  return F::kGeneric || channels > kFewChannels ? Family::kChannels : Family::kStill;
+}
+
+/// How a footprint is blended with so many channels.
+struct Route {
+  Family family;
+  int samples;          ///< of a pixel
+  int samples_of_lane;  ///< fewer where they are spread over lanes
+  ListCut cut;
+  /// Names of the kernels of blend and blend_vjp, in the order of their launches, but for those of all families.
+  std::array<const char*, 5> forward;
+  std::array<const char*, 4> backward;
+};
+
+/// `footprint`: position in the registry; `capacity`: pairs that there is room for.
+inline Route route_of(int footprint, int64_t channels, int64_t capacity, TileGrid grid, int multiprocessors) {
+  Route route = {};
+  visit_pixels(footprint, [&](auto f) {
+    using F = decltype(f);
+    route.family = family_of<F>(channels);
+    route.samples = route.samples_of_lane = F::kSamples;
+    route.cut = {route.family != Family::kStill};
+    if constexpr (F::kMoves) {
+      route.cut = moving_list_cut(F::kSamples, capacity, grid, multiprocessors);
+      const bool cuts = route.cut.max_segments > 0;
+      route.forward = {"moving_blend_kernel"};
+      route.backward = {"moving_vjp_kernel"};
+      if (cuts) route.forward = {"filter_kernel", "listed_blend_kernel", "moving_blend_kernel"};
+      if (cuts)
+        route.backward = {"segment_maps_kernel", "chain_maps_kernel", "segment_vjp_kernel", "moving_vjp_kernel"};
+    } else {
+      with_lanes<F>(grid, [&](auto of_lane) { route.samples_of_lane = decltype(of_lane)::kSamples; });
+      if (route.family == Family::kChannels) {
+        route.forward = {"blend_groups_kernel"};
+        route.backward = {"blend_groups_vjp_kernel"};
+      } else {
+        route.forward = {"blend_front_kernel", "tail_through_kernel", "tail_scan_kernel", "tail_blend_kernel",
+                         "tail_sum_kernel"};
+        route.backward = {"blend_vjp_kernel"};
+      }
+    }
+  });
+  return route;
+}
+
+/// Channels of the group that begins with the first of `left` channels, where there are more than kFewChannels, or the
+/// footprint is a reference.
+template <class F> constexpr int group_width(int left) {
+  return F::kGeneric || F::kMoves || left > kSmallGroup ? kChannelGroup : kSmallGroup;
+}
+inline int channel_group(int footprint, int left) {
+  int width = 0;
+  visit_pixels(footprint, [&](auto f) { width = group_width<decltype(f)>(left); });
+  return width;
+}
+
+/// Numbers in BlendParams::reach_words and BlendVjpParams::adjoint_maps, of footprints whose samples move; 0 where no
+/// list is cut. max_group_sums() of params.h is the third.
+inline int64_t max_reach_words(const ListCut& cut, TileGrid grid) {
+  return int64_t(cut.max_segments) * (cut.segment / 32) * grid.side() * grid.side();
+}
+inline int64_t max_adjoint_maps(int samples, const ListCut& cut, TileGrid grid) {
+  return int64_t(cut.max_segments) * kMapNumbers * samples * grid.side() * grid.side();
+}
+
+/// Channels that still/ and moment/ are compiled for: 3 in the splats, or up to 4 in rows.
+constexpr int compiled_channels(bool in_splats) { return in_splats ? 3 : kFewChannels; }
+
+}  // namespace ar::cuda

@@ -1,0 +1,12 @@
+// For tests: what launch() (launch.cuh) calls with every kernel that it launches, while csrc/torch/kernels_cuda.cpp
+// records them.
+#pragma once
+
+#include <atomic>
+
+namespace ar::cuda {
+
+/// Null where nobody records. `kernel`: the host's address of a kernel.
+inline std::atomic<void (*)(const void* kernel)> launch_observer = nullptr;
+
+}  // namespace ar::cuda

@@ -1,0 +1,47 @@
+// Launches the forward kernels of footprints whose samples move. dispatch.cu calls blend_moment().
+#include "cuda/dispatch.h"
+#include "cuda/moment/listed.cuh"
+#include "cuda/moment/walk.cuh"
+
+namespace ar::cuda {
+namespace {
+
+/// C channels from `first` on, in tiles of kSide x kSide pixels. The kernel for lists that are cut is launched first,
+/// because the longest of them may outlast everything else, and the kernel for the other lists begins beside it.
+template <class F, int C, int kSide, bool kKeep>
+void launch_kernels(const BlendParams& p, int first, cudaStream_t stream) {
+  using Layout = EvenLayout<F, kSide>;
+  const ListCut& cut = p.cut;
+  const unsigned blocks = cut.max_lists > 0 ? ListedLayouts<F, kSide>::blocks(cut, p.grid, multiprocessors()) : 0;
+  if (blocks > 0) launch(listed_blend_kernel<F, C, kSide, kKeep>, {blocks, 32 * kListedWarps<F>}, stream, p, first);
+  const LaunchShape tiles = {unsigned(p.grid.tiles() + 1), Layout::kThreads};
+  launch(moving_blend_kernel<F, C, Layout, kKeep>, tiles, stream, p, first, blocks > 0);
+}
+template <class F, int C, int kSide> void launch_group(const BlendParams& p, int first, cudaStream_t stream) {
+  if (p.transmittance && first == 0) return launch_kernels<F, C, kSide, true>(p, first, stream);
+  launch_kernels<F, C, kSide, false>(p, first, stream);
+}
+
+template <class F, int kSide> void launch_blend(const BlendParams& p, cudaStream_t stream) {
+  const int64_t pieces = int64_t(p.cut.max_segments) * moving_segment(F::kSamples, kSide) / kFilterPiece;
+  const int64_t most = kFilterBlocksPerSm * multiprocessors();
+  const auto blocks = unsigned(cuts_all_lists(p.grid) ? pieces : std::min(pieces, most));
+  if (blocks > 0) launch(filter_kernel<F, kSide>, {blocks, kFilterPiece}, stream, p);
+  if (!p.channels.data) return launch_group<F, 3, kSide>(p, 0, stream);
+  if (p.channels.count <= kFewChannels) return launch_group<F, kFewChannels, kSide>(p, 0, stream);
+  for (int first = 0; first < p.channels.count; first += kMovingChannels)
+    launch_group<F, kMovingChannels, kSide>(p, first, stream);
+}
+
+}  // namespace
+
+void blend_moment(int footprint, const BlendParams& p, cudaStream_t stream) {
+  visit_pixels(footprint, [&](auto f) {
+    using F = decltype(f);
+    if constexpr (F::kMoves) {
+      with_tile_side<F>(p.grid, [&](auto side) { launch_blend<F, decltype(side)::value>(p, stream); });
+    }
+  });
+}
+
+}  // namespace ar::cuda

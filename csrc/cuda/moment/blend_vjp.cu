@@ -1,0 +1,61 @@
+// Launches the backward kernels of footprints whose samples move. dispatch.cu calls blend_vjp_moment() and csrc/torch
+// calls max_group_sums().
+#include "cuda/dispatch.h"
+#include "cuda/moment/vjp_segments.cuh"
+
+namespace ar::cuda {
+namespace {
+
+/// C channels from `first` on, in tiles of kSide x kSide pixels.
+template <class F, int C, int kSide> void launch_group(const BlendVjpParams& p, int first, cudaStream_t stream) {
+  constexpr int kSegment = moving_segment(F::kSamples, kSide);
+  if (p.cut.max_segments > 0) {
+    using Maps = MapLayout<F, kSide>;
+    const auto segments = unsigned(p.cut.max_segments), lists = unsigned(p.cut.max_lists);
+    const LaunchShape maps = {segments * Maps::kBlocks, Maps::kThreads};
+    launch(segment_maps_kernel<F, C, kSide, kSegment>, maps, stream, p, first);
+    launch(chain_maps_kernel<F, kSide, kSegment>, {lists * F::kSamples, kSide * kSide}, stream, p);
+    launch_segment_vjp_kernel<F, C, ClaimedLayout<F, kSide>, kSegment>(p, p.cut.max_segments, first, stream);
+  }
+  launch_moving_vjp_kernel<F, C, EvenLayout<F, kSide>>(p, unsigned(p.grid.tiles()), first, stream);
+}
+
+/// The group of channels that begins with `first_of_group`; 0 where they are few.
+template <class F, int kSide> void launch_blend_vjp(const BlendVjpParams& p, int first_of_group, cudaStream_t stream) {
+  if (!p.channels.data) return launch_group<F, 3, kSide>(p, 0, stream);
+  if (p.channels.count <= kFewChannels) return launch_group<F, kFewChannels, kSide>(p, 0, stream);
+  const int end = std::min(first_of_group + kChannelGroup, p.channels.count);
+  for (int first = first_of_group; first < end; first += kMovingChannels)
+    launch_group<F, kMovingChannels, kSide>(p, first, stream);
+}
+
+}  // namespace
+
+int64_t max_group_sums(int footprint, int64_t channels, const ListCut& cut, TileGrid grid) {
+  int64_t numbers = 0;
+  visit_pixels(footprint, [&](auto f) {
+    using F = decltype(f);
+    if constexpr (F::kMoves) {
+      if (cut.max_segments == 0) return;
+      with_tile_side<F>(grid, [&](auto side) {
+        constexpr int kSide = decltype(side)::value, kSegment = moving_segment(F::kSamples, kSide);
+        using Layout = ClaimedLayout<F, kSide>;
+        numbers = channels == 3              ? group_sums_of<F, 3, Layout, kSegment>(cut.max_segments)
+                  : channels <= kFewChannels ? group_sums_of<F, kFewChannels, Layout, kSegment>(cut.max_segments)
+                                             : group_sums_of<F, kMovingChannels, Layout, kSegment>(cut.max_segments);
+      });
+    }
+  });
+  return numbers;
+}
+
+void blend_vjp_moment(int footprint, const BlendVjpParams& p, int first, cudaStream_t stream) {
+  visit_pixels(footprint, [&](auto f) {
+    using F = decltype(f);
+    if constexpr (F::kMoves) {
+      with_tile_side<F>(p.grid, [&](auto side) { launch_blend_vjp<F, decltype(side)::value>(p, first, stream); });
+    }
+  });
+}
+
+}  // namespace ar::cuda

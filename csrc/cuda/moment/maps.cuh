@@ -1,0 +1,192 @@
+// Kernels segment_maps and chain_maps: the first two steps of the backward pass through lists that are cut, for
+// footprints whose samples move. blend_vjp_moment (blend_vjp.cu) launches them before segment_vjp_kernel.
+//
+// What a sample carries from splat to splat on the way back (Adjoint) goes through a segment as an affine map. So the
+// segments of a list can be differentiated side by side: segment_maps finds the map of each segment, front to back, and
+// chain_maps applies them from the last segment to the first. They read the checkpoints and `last` of blend and write
+// adjoint_maps, where segment_vjp_kernel finds what each segment gets from the farther ones, and checkpoints.
+#pragma once
+
+#include <algorithm>
+
+#include "cuda/launch.cuh"
+#include "cuda/moment/vjp_grads.cuh"
+
+namespace ar::cuda {
+
+/// What a sample carries from a splat to the splat before it.
+struct Adjoint {
+  float behind;           ///< gradient-weighted colour of everything farther
+  Vec2<float> dL_dplace;  ///< gradient with respect to the sample's position, times kMoveGradUnit of the footprint
+};
+
+/// How an Adjoint goes through a segment: the image of zero, and what a change of each of the three numbers adds. A
+/// change of the position does not reach `behind`.
+struct SegmentMap {
+  static constexpr int kNumbers = kMapNumbers;
+  Adjoint of_zero, by_behind;
+  Vec2<float> by_x, by_y;
+
+  __device__ Adjoint operator()(const Adjoint& a) const {
+    const auto place = [&](float zero, float behind, float x, float y) {
+      return madd(y, a.dL_dplace.y, madd(x, a.dL_dplace.x, madd(behind, a.behind, zero)));
+    };
+    return {madd(by_behind.behind, a.behind, of_zero.behind),
+            {place(of_zero.dL_dplace.x, by_behind.dL_dplace.x, by_x.x, by_y.x),
+             place(of_zero.dL_dplace.y, by_behind.dL_dplace.y, by_x.y, by_y.y)}};
+  }
+};
+
+/// The maps of a pixel's sample in adjoint_maps. chain_maps replaces `of_zero` of a segment by the Adjoint before it.
+/// `kTilePixels`: pixels of a tile.
+template <class F, int kTilePixels> struct MapMemory {
+  static constexpr int kPlane = F::kSamples * kTilePixels;
+  float* first;  ///< of the sample
+
+  __device__ MapMemory(float* maps, int sample, int pixel_number) : first(maps + pixel_number * F::kSamples + sample) {}
+  __device__ float& at(int64_t piece, int number) const {
+    return first[(piece * SegmentMap::kNumbers + number) * kPlane];
+  }
+  __device__ Adjoint adjoint(int64_t piece, int number = 0) const {
+    return {at(piece, number), {at(piece, number + 1), at(piece, number + 2)}};
+  }
+  __device__ SegmentMap map(int64_t piece) const {
+    return {adjoint(piece), adjoint(piece, 3), {at(piece, 6), at(piece, 7)}, {at(piece, 8), at(piece, 9)}};
+  }
+  __device__ void put(int64_t piece, const Adjoint& a, int number = 0) const {
+    at(piece, number) = a.behind;
+    at(piece, number + 1) = a.dL_dplace.x;
+    at(piece, number + 2) = a.dL_dplace.y;
+  }
+  __device__ void put(int64_t piece, const SegmentMap& m) const {
+    put(piece, m.of_zero);
+    put(piece, m.by_behind, 3);
+    at(piece, 6) = m.by_x.x, at(piece, 7) = m.by_x.y;
+    at(piece, 8) = m.by_y.x, at(piece, 9) = m.by_y.y;
+  }
+};
+
+/// How samples are shared out for segments in tiles of kSide x kSide pixels. There are many segments with small splats,
+/// so that few pixels per warp are best.
+template <class F, int kSide>
+using SegmentLayout = std::conditional_t<(F::kSamples <= 4 || kSide < kMovingTile), CellLayout<1, F::kSamples, kSide>,
+                                         CellLayout<2, 8, kSide>>;
+/// The same for maps, which no lanes add up: with many cells a lane per sample, so that a warp has few pixels and
+/// passes over more splats; in small blocks, since warps do not have equally much to do.
+template <class F, int kSide>
+using MapLayout = std::conditional_t<(F::kSamples > 4), CellLayout<1, 16, kSide, 4>, SegmentLayout<F, kSide>>;
+
+/// A block per segment of kSegment pairs and part of a tile: writes the maps of its samples, and the checkpoints within
+/// the segment. Not for the first segments of lists: nobody needs their maps, and blend has stored their checkpoints.
+/// For the C channels from `first` on.
+template <class F, int C, int kSide, int kSegment, class Layout = MapLayout<F, kSide>>
+__global__ void __launch_bounds__(Layout::kThreads, blocks_per_sm(kMapThreads / Layout::kThreads, Layout::kThreads))
+    segment_maps_kernel(const BlendVjpParams params, int first) {
+  wait_for_earlier_kernels();
+  using Samples = MovingSamples<F, Layout, true>;
+  constexpr int kCells = Layout::kCells, kBatch = std::min(Layout::kThreads, 256);
+  __shared__ MovingStage<F, C, Layout, kBatch> stage;
+  __shared__ int last_of_warps[Layout::kWarps];
+  const ListSegment segment(*params.plan, params.chunk_order, int(blockIdx.x) / Layout::kBlocks);
+  if (segment.tile < 0 || segment.index == 0) return;
+  const TileList list = list_of(params.lists, params.grid, segment.tile);
+  const StatePlaces places(params.lists, list, params.grid, segment.tile);
+  const Vec2<float> p = Layout::pixel();
+  const Pixel pixel(list, params.grid, p);
+  const SampleGrad<F, C> grad(params, pixel, first);
+  const CellCorners<F, Layout> corners(p);
+  Samples samples(pixel.inside);
+  const LastSplats<F, Layout> last(params.last, pixel, last_of_warps);
+  const int begin = segment.index * kSegment, end = begin + kSegment, stop = min(last.block, end);
+  const auto checkpoint_at = [&](int k) { return params.checkpoints + places.of_chunk_at(k) * Samples::kCheckpoint; };
+  samples.load(checkpoint_at(begin), begin, last.samples);
+  AdjointMap<float> maps[kCells];
+  float before[kCells];  // the transmittance
+#pragma unroll
+  for (int i = 0; i < kCells; ++i) {
+    maps[i] = {0, {0, 0}, {0, 0}, {1, 0, 0, 1}};
+    before[i] = samples.transmittance[i];
+  }
+  int32_t id = stage.splat_of(list, begin, stop);
+  for (int k = begin; k < stop; k += kBatch) {
+    const int count = min(kBatch, min(last.warp, stop) - k);  // of what this warp needs
+    const int32_t next_id = stage.splat_of(list, k + kBatch, stop);
+    __syncthreads();  // all have read the last batch
+    stage.load(params.splats, params.channels, first, list, id);
+    __syncthreads();
+    if (next_id >= 0) prefetch_splat(params.splats, next_id);  // so that the next batch need not wait for memory
+    id = next_id;
+    for (int from = 0; from < count; from += kStateChunk) {
+      if (first == 0 && k + from > begin) samples.store(checkpoint_at(k + from), k + from, last.samples);
+      const int listed = stage.lists.list(stage.reach, from, from + kStateChunk);
+      stage.lists.for_each(0, listed, [&](uint32_t j) {
+        TileSplatRef<F, C> splat = stage.splats[j];
+        Vec2<float> z[kCells];
+        float raw[kCells];
+        bool mask[kCells], any = false;
+#pragma unroll
+        for (int i = 0; i < kCells; ++i) {
+          z[i] = corners.node(splat.terms, i, samples.place[i]);
+          raw[i] = exp2(F::log_alpha(splat.terms, z[i]));
+          mask[i] = raw[i] >= float(kAlphaMin) && k + int(j) < last.samples[i];
+          any |= mask[i];
+        }
+        if (!__any_sync(kAllLanes, any)) return;
+        const float g_color = grad.times(splat.channels, params, pixel, [&] { return list.splat(k + j); });
+#pragma unroll
+        for (int i = 0; i < kCells; ++i)
+          map_placed_sample<F>(splat.terms, z[i], raw[i], mask[i], UnitCell<F::kSide>(), g_color,
+                               samples.transmittance[i], samples.place[i], maps[i]);
+      });
+      __syncwarp();  // all have read the list
+    }
+  }
+#pragma unroll
+  for (int i = 0; i < kCells; ++i) {
+    if (last.samples[i] <= begin) continue;
+    const AdjointMap<float>& m = maps[i];
+    SegmentMap map = {{divide(m.color, before[i]), m.of_color},
+                      {divide(samples.transmittance[i], before[i]), m.of_behind},
+                      {m.of_place.xx, m.of_place.yx},
+                      {m.of_place.xy, m.of_place.yy}};
+    // After the segment with a sample's last splat there is only the background.
+    if (last.samples[i] <= end) map.of_zero = map({grad.through, {0, 0}});
+    const MapMemory<F, Layout::kTilePixels> memory(params.adjoint_maps, Layout::first_sample() + i,
+                                                   Layout::pixel_number());
+    memory.put(segment.number, map);
+  }
+}
+
+/// A thread per sample of a tile whose list is cut: applies the maps of its segments, from the last to the first.
+template <class F, int kSide, int kSegment>
+__global__ void __launch_bounds__(kSide* kSide) chain_maps_kernel(const BlendVjpParams params) {
+  wait_for_earlier_kernels();
+  constexpr int S = F::kSamples, kPixels = kSide * kSide;
+  const int place = int(blockIdx.x) / S, t = int(blockIdx.x) % S * kPixels + int(threadIdx.x);
+  const int number = t / S, sample = t % S;
+  if (blockIdx.x == 0 && threadIdx.x == 0) *params.chunks_taken = 0;  // for segment_vjp_kernel
+  if (place >= params.plan->counts.cut_lists) return;
+  const CutList cut = params.cut_lists[place];
+  const TileList list = list_of(params.lists, params.grid, cut.tile);
+  const Pixel pixel(list, params.grid, {float(number % kSide), float(number / kSide)});
+  if (!pixel.inside) return;
+  // Of the segment with the sample's last splat segment_maps has written the Adjoint itself.
+  int segment = (params.last[sample * pixel.image + pixel.index] - 1) / kSegment;
+  if (segment <= 1) return;
+  const int64_t first = cut.first;
+  const MapMemory<F, kPixels> memory(params.adjoint_maps, sample, number);
+  Adjoint adjoint = memory.adjoint(first + segment);
+  for (; segment > 1; segment -= kMapsAhead) {
+    SegmentMap maps[kMapsAhead];
+#pragma unroll
+    for (int i = 0; i < kMapsAhead; ++i) maps[i] = memory.map(first + max(segment - 1 - i, 1));
+#pragma unroll
+    for (int i = 0; i < kMapsAhead; ++i) {
+      if (segment - 1 - i < 1) return;
+      adjoint = maps[i](adjoint);
+      memory.put(first + segment - 1 - i, adjoint);
+    }
+  }
+}
+
+}  // namespace ar::cuda

@@ -1,0 +1,291 @@
+// A library for listed_blend_kernel (listed.cuh): pixels that look ahead in their lists, for footprints whose samples
+// move. Each pixel of a warp has a queue of the splats that reach it, filled from the bits that filter_kernel wrote,
+// and does not wait for splats that reach only its neighbours. Several lanes have the same sample: each tests another
+// splat, and the first splat that shows is composited. In the longest lists the warps of a block share the samples of
+// one pixel.
+#pragma once
+
+#include "cuda/moment/cells.cuh"
+
+namespace ar::cuda {
+
+/// A warp has kPixelsOfWarp pixels; or the kWarpsOfPixel warps of a block have one pixel, each warp other samples of
+/// it. A sample has kAhead neighbouring lanes.
+template <class F, int kSide, int kPixelsOfWarp, int kWarpsOfPixel = 1>
+struct AheadLayout : CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, false, kWarpsOfPixel> {
+  using Base = CellLayout<1, 32 / kPixelsOfWarp, kSide, kWarpsOfPixel, false, kWarpsOfPixel>;
+  /// Samples that a warp has of a pixel, and lanes of a sample.
+  static constexpr int kOfWarp = (F::kSamples + kWarpsOfPixel - 1) / kWarpsOfPixel, kAhead = Base::kLanes / kOfWarp;
+  static_assert(kAhead > 0 && (Base::kLanes % kOfWarp == 0 || Base::kLanes == 32));
+  static_assert(kWarpsOfPixel == 1 || kPixelsOfWarp == 1);
+  /// Staged splats: 32, and empty ones up to a multiple of kAhead, as the lanes of a sample test kAhead at once.
+  static constexpr int kPlaces = (32 + kAhead - 1) / kAhead * kAhead;
+  __device__ static int first_sample() {
+    const int of_warp = lane_id() % Base::kLanes / kAhead;
+    return of_warp < kOfWarp ? int(threadIdx.x) / 32 % kWarpsOfPixel * kOfWarp + of_warp : F::kSamples;
+  }
+  /// This lane's number among the lanes of its sample.
+  __device__ static int ahead() { return lane_id() % kAhead; }
+  __device__ static bool owns() { return ahead() == 0; }
+  /// The lanes of this lane's sample, and the first of them.
+  __device__ static uint32_t sharers() { return (kAllLanes >> (32 - kAhead)) << first_sharer(); }
+  __device__ static int first_sharer() { return lane_id() / kAhead * kAhead; }
+  /// The sum over the lanes of a pixel, in each of them. All threads must call it.
+  __device__ static float sum_lanes(float x) {
+    x = Base::sum_lanes(x);
+    if constexpr (kWarpsOfPixel > 1) {
+      __shared__ float of_warp[kWarpsOfPixel];
+      __syncthreads();  // all have read the last sum
+      if (lane_id() == 0) of_warp[threadIdx.x / 32] = x;
+      __syncthreads();
+      x = of_warp[0];
+#pragma unroll
+      for (int warp = 1; warp < kWarpsOfPixel; ++warp) x += of_warp[warp];
+    }
+    return x;
+  }
+  /// The largest x of these lanes. All lanes must call it.
+  __device__ static int max_of_sharers(int x) {
+#pragma unroll
+    for (int offset = 1; offset < kAhead; offset *= 2)
+      x = max(x, shuffle(x, first_sharer() + (ahead() + offset) % kAhead));
+    return x;
+  }
+};
+
+/// The index in reach_words of the bits of a pixel, in tiles of kSide x kSide pixels. The bit of pair k is bit k % 32
+/// of the pixel's word k / 32. `first`: number of the first segment of the tile's list.
+template <class F, int kSide> __device__ int64_t pixel_words(int first, const TileList& list, int pixel_number) {
+  constexpr int kPixels = kSide * kSide, kSegment = moving_segment(F::kSamples, kSide);
+  const int segments = (list.count + kSegment - 1) / kSegment;
+  return (int64_t(first) * kPixels + pixel_number * segments) * (kSegment / 32);
+}
+
+/// The checkpoints of a lane's samples that are still to be stored, for a list that is cut into segments of kSegment
+/// pairs: one before each segment, and all within the first. segment_maps_kernel stores the checkpoints within the
+/// other segments, side by side; here every sample would wait for them.
+template <int kSegment> struct CheckpointsAhead {
+  int pair;   ///< the next checkpoint is before this pair
+  float* to;  ///< its address
+
+  /// Stores `samples` in the checkpoints up to pair k.
+  template <class Samples> __device__ void store_up_to(int k, const Samples& samples) {
+#pragma unroll 1
+    while (pair <= k) {
+      samples.store(to);
+      const int chunks = pair < kSegment ? 1 : kSegment / kStateChunk;
+      pair += chunks * kStateChunk;
+      to += chunks * Samples::kCheckpoint;
+    }
+  }
+};
+
+/// For each pixel of a warp a queue of the pairs that reach it, front to back, filled from the bits of filter_kernel.
+template <class Layout> struct PairQueues {
+  using Bits = uint16_t;                                  ///< what a lane reads at a time
+  static constexpr int kBits = 16;                        ///< for adjacent pairs
+  static constexpr int kAtOnce = kBits * Layout::kLanes;  ///< pairs whose bits a pixel's lanes read at a time
+  static constexpr uint32_t kRoom = 2 * kAtOnce;
+  using Memory = int32_t[Layout::kPixels][kRoom];
+  static_assert(sizeof(Memory) == kQueued * sizeof(int32_t));
+
+  int32_t* pairs;               ///< of this lane's pixel
+  const Bits* words;            ///< of this lane, from the next word on
+  int lane;                     ///< number of this lane among the lanes of the pixel
+  int count;                    ///< pairs of the list; 0 when no more are wanted
+  int next = 0;                 ///< first pair whose bit has not been read
+  uint32_t begin = 0, end = 0;  ///< of the pairs in the queue, counted from the first that was ever in it
+  uint32_t bits;                ///< of this lane, the next to enter the queue
+
+  /// `reach_words`: of the pixel. All lanes must call it.
+  __device__ PairQueues(Memory& memory, const uint32_t* reach_words, int count)
+      : pairs(memory[lane_id() / Layout::kLanes]), lane(lane_id() % Layout::kLanes), count(count) {
+    words = reinterpret_cast<const Bits*>(reach_words) + lane;
+    bits = has_bits() ? words[0] : 0u;
+    fill();
+  }
+  /// Whether any of the pairs from `next` on are this lane's.
+  __device__ bool has_bits() const { return next + kBits * lane < count; }
+  /// Reads bits until more pairs than kAtOnce are queued, if there are so many. All lanes must call it.
+  __device__ void fill() {
+    __syncwarp();  // all have read what they took
+    const auto wanted = [&] { return next < count && end - begin <= kRoom - kAtOnce; };
+    for (bool wants; __any_sync(kAllLanes, wants = wanted());) {
+      uint32_t mine = wants ? bits : 0;
+      const int before = next + kBits * lane - 1;
+      const int found = __popc(mine);
+      int up_to = found;  // pairs of the pixel's lanes up to this one
+#pragma unroll
+      for (int offset = 1; offset < Layout::kLanes; offset *= 2) {
+        const int of_lanes_before = shuffle_up(up_to, offset);
+        if (lane >= offset) up_to += of_lanes_before;
+      }
+      uint32_t to = end + uint32_t(up_to - found);
+      for (; mine != 0; mine &= mine - 1) pairs[to++ % kRoom] = before + __ffs(int(mine));
+      end += uint32_t(shuffle(up_to, lane_id() | (Layout::kLanes - 1)));
+      // The next bits are read straight into their register, so that nothing waits for them before they are used.
+      next += wants ? kAtOnce : 0;
+      bits = wants ? 0 : bits;
+      if (wants && has_bits()) bits = words[next / kBits];
+    }
+    __syncwarp();
+  }
+  /// How many there are for the lanes of the pixel, one each, and this lane's.
+  __device__ int ready() const { return min(int(end - begin), Layout::kLanes); }
+  __device__ int pair() const { return pairs[(begin + uint32_t(lane)) % kRoom]; }
+  /// Drops the pairs of the pixel, and all that follow.
+  __device__ void close() {
+    count = 0;
+    begin = end;
+  }
+};
+
+/// The splats that each pixel of a warp is about to composite, and the queues that they come from, in shared memory.
+template <class F, int C, int kPlaces> struct QueuedStage {
+  TileSplat<F, C> splats[kPlaces];
+  int32_t pairs[kPlaces];
+  int32_t queues[kQueued];
+};
+
+/// The next splats of the pixel of this lane on their way from memory into QueuedStage. The lane has one of them.
+template <class F, int C, class Layout> struct QueuedSplats {
+  const float* splats_in;
+  const Channels<float>& channels_in;
+  const TileList& list;
+  int first_channel;
+  int n = 0, next_n = 0;  ///< of the pixel: splats that are read, and the ones after them
+  int pair, next_pair;
+  int32_t next_id = 0;  ///< of any splat, where there is no next one
+  Splat<F, float> splat;
+  Values<C> channels;
+
+  __device__ QueuedSplats(const BlendParams& params, const TileList& list, int first_channel)
+      : splats_in(params.splats), channels_in(params.channels), list(list), first_channel(first_channel) {}
+
+  /// Reads the splats that were next, and takes the pairs after them from the queue.
+  template <class Queues> __device__ void advance(Queues& queues) {
+    n = next_n;
+    pair = next_pair;
+    // By all lanes, and so straight into the registers: the compiler would wait to copy what only some lanes read.
+    splat = load_splat<F>(splats_in, next_id);
+    channels = channels_of<C>(channels_in, splat, next_id, first_channel);
+    take_next(queues);
+  }
+  template <class Queues> __device__ void take_next(Queues& queues) {
+    next_n = queues.ready();
+    if (queues.lane < next_n) {
+      next_pair = queues.pair();
+      next_id = list.splat(next_pair);
+    }
+    queues.begin += uint32_t(next_n);
+  }
+  /// Puts the splat that was read into the stage. `light`: the transmittance after the steps before.
+  ///
+  /// The comparison is never true, since a listed splat has a level above 0 and no negative x_given_y. It keeps the
+  /// registers of these two numbers in use: the compiler would else use them for something else, and wait for that
+  /// until the splat has arrived. `light` keeps the compiler from comparing, and waiting, before the steps.
+  template <class Stage> __device__ void put(Stage& stage, int lane, float light) const {
+    if (lane >= n || splat.level + splat.shape.x_given_y <= min(light, 0.0f)) return;
+    stage.splats[lane_id()] = {cell_terms(splat, list), channels};
+    stage.pairs[lane_id()] = pair;
+  }
+};
+
+/// Composites the staged splats of each pixel, n of this lane's pixel from first_staged on. Most splats that reach a
+/// pixel are small and do not show in a sample: the lanes of a sample test kAhead splats at once, composite the first
+/// that shows, and test the later ones again, since the node has moved. All lanes must call it.
+template <class F, class Layout, bool kKeep, class Stage, class Blend, class Checkpoints>
+__device__ void blend_ahead(const Stage& stage, int first_staged, int n, Blend& blend, Checkpoints& checkpoints) {
+  constexpr int kAhead = Layout::kAhead;
+  constexpr bool kOnce = kAhead == Layout::kLanes;  // a sample has a lane for each of the staged splats
+  const int own = lane_id(), first_lane = Layout::first_sharer();
+  float& transmittance = blend.samples.transmittance[0];
+  Vec2<float>& place = blend.samples.place[0];
+  int taken = first_staged + Layout::ahead();  // the splat of this lane, if there is one
+  int left = n;                                // splats from the one of the sample's first lane on
+  auto splat = stage.splats[taken];
+  int pair = stage.pairs[taken];
+  // Lanes of the sample with a splat that may still be composited.
+  const auto lanes_with_splats = [&] {
+    const int count = min(left, kAhead);
+    return transmittance > 0 && count > 0 ? kAllLanes >> (32 - count) << first_lane : 0u;
+  };
+  uint32_t live = lanes_with_splats();
+  // Lanes with a pair before which a checkpoint is to be stored.
+  const auto lanes_at_checkpoint = [&] { return kKeep ? __ballot_sync(kAllLanes, pair >= checkpoints.pair) : 0u; };
+  uint32_t at_checkpoint = lanes_at_checkpoint();
+  while (true) {
+    const Vec2<float> z = blend.corners.node(splat.terms, 0, place);
+    const float raw = exp2(F::log_alpha(splat.terms, z));
+    const bool hit = (live >> own & 1) != 0 && raw >= float(kAlphaMin);
+    const uint32_t all_hits = __ballot_sync(kAllLanes, hit), hits = all_hits & Layout::sharers();
+    if (kOnce && all_hits == 0) break;
+    const int first = __ffs(int(hits)) - 1;  // the lane whose splat is composited, if there is one
+    float left_over = transmittance;
+    Vec2<float> moved = place;
+    const Blended<float> b = blend_placed_sample<F>(splat.terms, z, raw, UnitCell<F::kSide>(), left_over, moved);
+    if (first == own) blend.add(b, splat.channels, pair);
+    if (kKeep && (hits & -hits & at_checkpoint) != 0)
+      checkpoints.store_up_to(stage.pairs[taken - own + first], blend.samples);
+    left_over = shuffle(left_over, first);
+    moved = {shuffle(moved.x, first), shuffle(moved.y, first)};
+    if (hits != 0) {
+      transmittance = left_over;
+      place = moved;
+      live = left_over > 0 ? live & (kAllLanes - 1) << first : 0;
+    }
+    if constexpr (!kOnce) {
+      if (hits == 0 || live == 0) {
+        taken += kAhead, left -= kAhead;
+        live = lanes_with_splats();
+        if (live != 0) {
+          splat = stage.splats[taken];
+          pair = stage.pairs[taken];
+        }
+      }
+      if (!__any_sync(kAllLanes, live != 0)) break;
+      at_checkpoint = lanes_at_checkpoint();
+    }
+  }
+}
+
+/// Blends the pixels of a warp, as Layout shares them out, by queues; C channels from `first` on. `first_segment`: the
+/// number of the list's first segment. `kKeep`, `kSegment`: for a backward pass with segments of so many pairs.
+template <class F, int C, class Layout, bool kKeep, int kSegment, class Stage>
+__device__ void blend_queued(const BlendParams& params, int first, int tile, const TileList& list, int first_segment,
+                             Stage& stage) {
+  constexpr int kLanes = Layout::kLanes;
+  const StatePlaces places(params.lists, list, params.grid, tile);
+  const Vec2<float> p = Layout::pixel();
+  const Pixel pixel(list, params.grid, p);
+  MovingBlend<F, C, Layout, kKeep, true> blend(p, pixel.inside);
+  CheckpointsAhead<kSegment> checkpoints = {kStateChunk, params.checkpoints + places.first * blend.samples.kCheckpoint};
+  using Queues = PairQueues<Layout>;
+  const int64_t words = pixel_words<F, Layout::kSide>(first_segment, list, Layout::pixel_number());
+  Queues queues(reinterpret_cast<typename Queues::Memory&>(stage.queues), params.reach_words + words,
+                pixel.inside ? list.count : 0);
+  // While splats are composited, the next ones are read, and the numbers of the ones after those.
+  QueuedSplats<F, C, Layout> next(params, list, first);
+  next.take_next(queues);
+  queues.fill();
+  if (list.count > 0) next.advance(queues);  // of an empty scene there is no splat that all lanes could read
+  const int first_staged = lane_id() / kLanes * kLanes;
+  const uint32_t lanes_of_pixel = (kAllLanes >> (32 - kLanes)) << (lane_id() / kLanes * kLanes);
+  while (__any_sync(kAllLanes, next.n > 0)) {
+    next.put(stage, queues.lane, blend.samples.transmittance[0]);
+    const int n = next.n;
+    queues.fill();
+    next.advance(queues);
+    __syncwarp();
+    blend_ahead<F, Layout, kKeep>(stage, first_staged, n, blend, checkpoints);
+    if (!(__ballot_sync(kAllLanes, blend.samples.open()) & lanes_of_pixel)) {
+      queues.close();
+      next.n = next.next_n = 0;
+    }
+    __syncwarp();  // all have read the splats
+  }
+  if constexpr (kKeep) blend.last[0] = Layout::max_of_sharers(blend.last[0]);
+  blend.write(params, first, pixel);
+}
+
+}  // namespace ar::cuda

@@ -1,0 +1,78 @@
+// A library for the backward kernels of footprints whose samples move: what they read for a lane's pixel. That is the
+// gradient of the image (dL_dimage, dL_dalpha), and `last` of blend: how far into the list each sample has composited.
+#pragma once
+
+#include "cuda/moment/cells.cuh"
+
+namespace ar::cuda {
+
+/// The gradient with respect to a sample of a lane's pixel.
+template <class F, int C> struct SampleGrad {
+  Values<C> channels;  ///< from `first` on
+  float through = 0;   ///< scalar product with the background
+  /// Whether this kernel, the first of several groups of channels, adds the others' share of the gradient of alpha.
+  bool with_others;
+
+  __device__ SampleGrad(const BlendVjpParams& params, const Pixel& pixel, int first)
+      : with_others(C > kFewChannels && params.mean_sums != MeanSums::kNone && params.channels.count > C &&
+                    first == 0) {
+#pragma unroll
+    for (int c = 0; c < C; ++c) {
+      channels.v[c] = sample_gradient<F>(params, pixel, first + c);
+      if (first + c < params.channels.count) through += channels.v[c] * params.background[first + c];
+    }
+    if (with_others) {
+      for (int c = C; c < params.channels.count; ++c)
+        through += sample_gradient<F>(params, pixel, c) * params.background[c];
+    }
+    // Alpha is 1 - transmittance: its gradient acts like one more channel whose background is -1.
+    if (first == 0 && params.dL_dalpha && pixel.inside) through -= kSampleShare<F> * params.dL_dalpha[pixel.index];
+  }
+
+  /// The scalar product with the channels of splat id().
+  template <class Id>
+  __device__ float times(const Values<C>& color, const BlendVjpParams& params, const Pixel& pixel, Id&& id) const {
+    float product = channels.v[0] * color.v[0];
+#pragma unroll
+    for (int c = 1; c < C; ++c) product = madd(channels.v[c], color.v[c], product);
+    if (with_others) {
+      const float* row = params.channels.row(id());
+      for (int c = C; c < params.channels.count; ++c)
+        product = madd(sample_gradient<F>(params, pixel, c), row[c], product);
+    }
+    return product;
+  }
+};
+
+/// The number of pairs of the tile's list up to the last splat that was composited: into each of a lane's samples, and
+/// into any sample of its warp.
+template <class F, class Layout> struct SamplesLast {
+  int samples[Layout::kCells], warp = 0;
+
+  /// All lanes must call it.
+  __device__ SamplesLast(const int32_t* last, const Pixel& pixel) {
+#pragma unroll
+    for (int i = 0; i < Layout::kCells; ++i) {
+      const int sample = Layout::first_sample() + i;
+      samples[i] = pixel.inside && sample < F::kSamples ? last[sample * pixel.image + pixel.index] : 0;
+      warp = max(warp, samples[i]);
+    }
+    warp = warp_max(warp);
+  }
+};
+/// The same, and into any sample of its block.
+template <class F, class Layout> struct LastSplats : SamplesLast<F, Layout> {
+  using SamplesLast<F, Layout>::warp;
+  int block = 0;
+
+  /// `of_warps`: in shared memory. All threads of a block must call it.
+  __device__ LastSplats(const int32_t* last, const Pixel& pixel, int (&of_warps)[Layout::kWarps])
+      : SamplesLast<F, Layout>(last, pixel) {
+    if (lane_id() == 0) of_warps[threadIdx.x / 32] = warp;
+    __syncthreads();
+#pragma unroll
+    for (int w = 0; w < Layout::kWarps; ++w) block = max(block, of_warps[w]);
+  }
+};
+
+}  // namespace ar::cuda

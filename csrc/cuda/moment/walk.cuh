@@ -1,0 +1,87 @@
+// Kernel moving_blend: the forward pass of footprints whose samples move, for the lists that are not cut. A block per
+// tile walks its whole list, because what a splat does to a sample depends on where the sample is when they meet. The
+// device is filled by spreading samples over lanes and by small tiles. It reads lists, splats and the plan, and writes
+// images, and for a backward pass transmittance, `last` and checkpoints. blend_moment (launch.cuh) launches it; lists
+// that are cut have the kernels of listed.cuh.
+#pragma once
+
+#include "cuda/launch.cuh"
+#include "cuda/moment/cells.cuh"
+
+namespace ar::cuda {
+
+/// Composites the staged splats in [from, to) that reach the warp's pixels; the first that is staged is pair k0.
+template <class F, int C, class Layout, bool kKeep, class Stage>
+__device__ void blend_staged(Stage& stage, int from, int to, int k0, MovingBlend<F, C, Layout, kKeep>& blend) {
+  constexpr int kCells = Layout::kCells;
+  const int listed = stage.lists.list(stage.reach, from, to);
+  int shown[kCells];  // the entry of the last that was composited into each sample
+#pragma unroll
+  for (int i = 0; i < kCells; ++i) shown[i] = -1;
+  for (int n = 0; n < listed; n += kBetweenVotes) {
+    if (!__any_sync(kAllLanes, blend.samples.open())) break;
+    stage.lists.for_each(n, min(listed, n + kBetweenVotes), [&](uint32_t entry) {
+      TileSplatRef<F, C> splat = Stage::Lists::splat_of(stage.splats, entry);
+      blend.add(splat, int(entry), shown);
+    });
+  }
+#pragma unroll
+  for (int i = 0; kKeep && i < kCells; ++i)
+    if (shown[i] >= 0) blend.last[i] = k0 + Stage::Lists::number_of(uint32_t(shown[i])) + 1;
+  __syncwarp();  // all have read the list
+}
+
+template <class Layout, int C>
+inline constexpr int kMovingBlocks = blocks_per_sm(std::max(moving_threads(C) / Layout::kThreads, 1), Layout::kThreads);
+
+/// A block per tile, which returns at once if the tile's list is cut, and one block more that only waits
+/// (begin_beside_earlier_kernels). Blends the C channels from `first` on. `beside`: the kernels for lists that are cut
+/// were launched just before, and may still run. `F`: the footprint, `Layout`: a CellLayout, `kKeep`: stores
+/// checkpoints and `last` for a backward pass.
+template <class F, int C, class Layout, bool kKeep>
+__global__ void __launch_bounds__(Layout::kThreads, kMovingBlocks<Layout, C>)
+    moving_blend_kernel(const BlendParams params, int first, bool beside) {
+  if (begin_beside_earlier_kernels(beside)) return;
+  constexpr int kBatch = Layout::kThreads < 256 ? Layout::kThreads : 256;
+  constexpr int kListed = kKeep ? kStateChunk : kBatch;
+  // Where a lane has many samples whose last splats have to be kept, lists would take too many registers.
+  constexpr bool kLists = !kKeep || Layout::kCells <= 2;
+  using Stage = MovingStage<F, C, Layout, kBatch, kListed, true>;
+  __shared__ Stage stage;
+  const int tile = params.plan.tile_order[blockIdx.x];
+  const bool is_cut = int(blockIdx.x) < params.plan.state->counts.cut_lists;
+  const TileList list = list_of(params.lists, params.grid, tile);
+  // With too many pairs no list is cut. The compiler needs fewer registers if both are asked here.
+  if (is_cut && !list.of_patch) return;
+  const StatePlaces places(params.lists, list, params.grid, tile);
+  const Vec2<float> p = Layout::pixel();
+  const Pixel pixel(list, params.grid, p);
+  MovingBlend<F, C, Layout, kKeep> blend(p, pixel.inside);
+  int32_t id = stage.splat_of(list, 0, list.count);
+  for (int k = 0; k < list.count && __syncthreads_or(blend.samples.open()); k += kBatch) {
+    const int count = min(list.count - k, kBatch);
+    const int32_t next_id = stage.splat_of(list, k + kBatch, list.count);
+    stage.load(params.splats, params.channels, first, list, id);
+    __syncthreads();
+    if (next_id >= 0) prefetch_splat(params.splats, next_id);  // so that the next batch need not wait for memory
+    id = next_id;
+    for (int from = 0; from < count; from += kListed) {
+      if (kKeep && !__any_sync(kAllLanes, blend.samples.open())) break;  // no checkpoint is needed
+      if (kKeep && k + from > 0 && (k + from) % places.spacing == 0)
+        blend.samples.store(params.checkpoints +
+                            (places.first + (k + from) / places.spacing - 1) * blend.samples.kCheckpoint);
+      if constexpr (kLists) {
+        blend_staged(stage, from, min(count, from + kListed), k, blend);
+      } else {
+        for (uint32_t left = stage.reached(from); left != 0;) {
+          const int j = from + take_first(left);
+          TileSplatRef<F, C> splat = stage.splats[j];
+          blend.add(splat, k + j + 1, blend.last);
+        }
+      }
+    }
+  }
+  blend.write(params, first, pixel);
+}
+
+}  // namespace ar::cuda

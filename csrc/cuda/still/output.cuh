@@ -1,0 +1,136 @@
+// A library for the forward kernels of footprints whose samples stay (front.cuh, tail.cuh): what they store. That is
+// checkpoints at the ends of chunks, for the tail and for the backward pass, and the finished pixels of the images.
+#pragma once
+
+#include "cuda/tile.cuh"
+
+namespace ar::cuda {
+
+/// Chunks of the front of each tile.
+__device__ inline int front_of(const BlendParams& params) {
+  return front_chunks(params.grid, params.lists.counts->pairs, params.plan.blocks_at_once);
+}
+
+/// The checkpoints of a pixel of a tile, in the layout of CheckpointLayout.
+template <int S, int C, bool kKeep> struct PixelCheckpoints {
+  float* base;  ///< of the tile's first plane
+  int first_chunk, pixel;
+
+  __device__ PixelCheckpoints(const BlendParams& params, int tile, int pixel)
+      : base(params.checkpoints + int64_t(params.plan.tile_planes[tile]) * kTilePixels),
+        first_chunk(kKeep ? 0 : front_of(params) - 1),
+        pixel(pixel) {}
+
+  __device__ Checkpoint<C>& kept(int chunk, int s) const {
+    return reinterpret_cast<Checkpoint<C>*>(base)[(int64_t(chunk) * S + s) * kTilePixels + pixel];
+  }
+  /// Plane k of a chunk without a backward pass: transmittance of every sample, then the channels.
+  __device__ float& plane(int chunk, int k) const {
+    return base[(int64_t(chunk - first_chunk) * (S + C) + k) * kTilePixels + pixel];
+  }
+
+  __device__ float& transmittance(int chunk, int s) const {
+    if constexpr (kKeep) {
+      return kept(chunk, s).transmittance;
+    } else {
+      return plane(chunk, s);
+    }
+  }
+  /// Channels of a sample or, without a backward pass, of all.
+  __device__ Values<C> channels(int chunk, int s) const {
+    if constexpr (kKeep) {
+      return kept(chunk, s).channels;
+    } else {
+      Values<C> values;
+#pragma unroll
+      for (int c = 0; c < C; ++c) values.v[c] = plane(chunk, S + c);
+      return values;
+    }
+  }
+  __device__ void set_total(int chunk, const Values<C>& values) const {
+#pragma unroll
+    for (int c = 0; c < C; ++c) plane(chunk, S + c) = values.v[c];
+  }
+};
+
+/// The transmittance of a pixel in the checkpoints, with or without a backward pass: for kernels that are compiled once
+/// for any number of channels.
+template <int S> struct TransmittancePlanes {
+  float* base;
+  int first_chunk;
+  int64_t chunk_stride, sample_stride;
+
+  __device__ TransmittancePlanes(const BlendParams& params, int tile, int pixel) {
+    const CheckpointLayout layout = params.layout;
+    const int of_sample = layout.keep ? layout.channels + 1 : 1;
+    first_chunk = layout.first_chunk(front_of(params));
+    chunk_stride = int64_t(layout.planes(S)) * kTilePixels;
+    sample_stride = int64_t(of_sample) * kTilePixels;
+    base =
+        params.checkpoints + int64_t(params.plan.tile_planes[tile]) * kTilePixels + pixel * of_sample + of_sample - 1;
+  }
+  __device__ float& at(int chunk, int s) const {
+    return base[(chunk - first_chunk) * chunk_stride + s * sample_stride];
+  }
+};
+
+template <int C> __device__ Values<C> background_of(const BlendParams& params) {
+  Values<C> background;
+#pragma unroll
+  for (int c = 0; c < C; ++c) background.v[c] = C == 3 || c < params.channels.count ? params.background[c] : 0;
+  return background;
+}
+
+/// Writes a pixel whose samples are complete to the images; `total`: the sum of their channels. `Samples`: a footprint
+/// or LaneSamples. All lanes of a warp must call it.
+template <class Samples, int C>
+__device__ void store_pixel(const BlendParams& params, Pixel pixel, Values<C> total,
+                            const float (&transmittance)[Samples::kSamples]) {
+  float through = 0;
+#pragma unroll
+  for (int s = 0; s < Samples::kSamples; ++s) {
+    through += abs(transmittance[s]);
+    if (params.transmittance && pixel.inside)
+      params.transmittance[sample_index<Samples>(pixel, s)] = abs(transmittance[s]);
+  }
+  through = sum_of_pixel<Samples>(through);
+#pragma unroll
+  for (int c = 0; c < C; ++c) total.v[c] = sum_of_pixel<Samples>(total.v[c]);
+  if (!pixel.inside || !writes_pixel<Samples>(lane_id())) return;
+  const float scale = kSampleShare<Samples>;
+#pragma unroll
+  for (int c = 0; c < C; ++c) {
+    if (C > 3 && c >= params.channels.count) break;
+    params.image.plane(c, pixel.image)[pixel.index] = scale * total.v[c] + scale * through * params.background[c];
+  }
+  if (params.alpha) params.alpha[pixel.index] = 1 - scale * through;
+}
+template <class F> __device__ void store_last(const BlendParams& params, Pixel pixel, const int (&last)[F::kSamples]) {
+  if (!pixel.inside) return;
+#pragma unroll
+  for (int s = 0; s < F::kSamples; ++s) params.last[sample_index<F>(pixel, s)] = last[s];
+}
+
+/// The checkpoints of a sample's chunks [first, end) hold the channels of the chunk itself. Turns each into the
+/// channels of everything farther than the chunk, where blend_vjp starts: sums of positive terms, which do not cancel.
+/// `farther`: the channels of what is farther than all of them. kBatch chunks are loaded before the first store, so
+/// that the loads wait for memory together.
+template <int kBatch, int S, int C>
+__device__ void accumulate_farther(const PixelCheckpoints<S, C, true>& checkpoints, int first, int end, int s,
+                                   Values<C> farther) {
+  for (int last = end - 1; last >= first; last -= kBatch) {
+    Values<C> own[kBatch];
+#pragma unroll
+    for (int k = 0; k < kBatch; ++k) {
+      if (last - k >= first) own[k] = checkpoints.kept(last - k, s).channels;
+    }
+#pragma unroll
+    for (int k = 0; k < kBatch; ++k) {
+      if (last - k < first) continue;
+      checkpoints.kept(last - k, s).channels = farther;
+      farther += own[k];
+    }
+  }
+}
+
+}  // namespace ar::cuda

@@ -1,0 +1,232 @@
+// The four kernels that finish the tiles that blend_front has left open; front.cuh has an overview and launches them.
+// They read the tail of the plan, `tile_open` and `open_tiles`, and write checkpoints, then the images.
+#pragma once
+
+#include "cuda/launch.cuh"
+#include "cuda/still/output.cuh"
+#include "cuda/still/stage.cuh"
+#include "cuda/tuning.h"
+
+namespace ar::cuda {
+
+/// Multiplies the transmittance by what the splats in shared memory let through, without a threshold at which to stop.
+template <class F, int C>
+__device__ void pass_all(BlendStage<F, C>& stage, int count, Vec2<float> p, float (&transmittance)[F::kSamples]) {
+  const int reached = stage.list_reached(count);
+  stage.for_each_listed(0, reached, [&](TileSplatRef<F, C> splat, auto) {
+#pragma unroll
+    for (int s = 0; s < F::kSamples; ++s)
+      transmittance[s] -= transmittance[s] * effective_alpha(F::alpha(splat.terms, p, s));
+  });
+}
+
+/// Calls visit(chunk, list of its tile, end of the chunk in the list) for the tail chunks of the open tiles. Blocks
+/// share them.
+template <class Visit> __device__ __forceinline__ void for_each_tail_chunk(const BlendParams& params, Visit&& visit) {
+  const int items = params.plan.state->counts.tail;
+  for (int item = blockIdx.x; item < items; item += gridDim.x) {
+    const TileChunk tail = params.plan.tail[item];
+    if (!params.tile_open[tail.tile]) continue;
+    const TileList list = list_of(params.lists, params.grid, tail.tile);
+    const int end = min(list.count, (tail.chunk + 1) * kChunkLength);
+    visit(tail, list, end);
+  }
+}
+
+template <class F>
+inline constexpr int kThroughBlocks =
+    blocks_per_sm(tail_through_blocks(F::kSamples, F::kExpensive, sizeof(TileSplat<F, 0>)), kBlendThreads);
+
+/// Writes to the checkpoints what each tail chunk alone lets through.
+template <class F>
+__global__ void __launch_bounds__(kBlendThreads, kThroughBlocks<F>) tail_through_kernel(const BlendParams params) {
+  wait_for_earlier_kernels();
+  constexpr int S = F::kSamples;
+  __shared__ BlendStage<F, 0> stage;
+  const Vec2<float> p = position_of<F>(threadIdx.x / 32, lane_id());
+  for_each_tail_chunk(params, [&](const TileChunk& tail, const TileList& list, int end) {
+    float transmittance[S];
+#pragma unroll
+    for (int s = 0; s < S; ++s) transmittance[s] = 1;
+    for (int k = tail.chunk * kChunkLength; k < end; k += stage.kBatch) {
+      __syncthreads();
+      const int count = stage.load(params.splats, params.channels, list, k, end);
+      __syncthreads();
+      pass_all<F>(stage, count, p, transmittance);
+    }
+    const TransmittancePlanes<S> planes(params, tail.tile, int(threadIdx.x));
+#pragma unroll
+    for (int s = 0; s < S; ++s) planes.at(tail.chunk, s) = transmittance[s];
+  });
+}
+
+/// A sample with less transmittance than this is stopped by the next splat that it meets, since alpha is at least
+/// kAlphaMin, and so it may count as stopped already. The margin above kTransmittanceMin covers the rounding of
+/// products of chunks, which differs from the rounding splat by splat.
+inline constexpr float kNearlyStopped = float(kTransmittanceMin * (1 + kAlphaMin / 2));
+
+__device__ inline int chunks_of(const BlendParams& params, int tile) {
+  const int64_t* pairs = params.lists.tile_offsets + tile;
+  return int((pairs[1] - pairs[0] + kChunkLength - 1) / kChunkLength);
+}
+
+/// The kernels that go through all tail chunks of a tile have a pixel per lane and a block per part of 32 pixels, so
+/// that several multiprocessors read the checkpoints of a tile.
+inline constexpr int kTailParts = kTilePixels / 32;
+
+/// Turns what each chunk lets through into the transmittance at its begin, negative where a sample has stopped before.
+/// Blocks share the parts of the open tiles. `S`: samples of a lane.
+template <int S> __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params) {
+  wait_for_earlier_kernels();
+  constexpr int kBatch = kTailLoads;
+  const int items = params.plan.state->counts.open_tiles * S * kTailParts;
+  for (int item = blockIdx.x; item < items; item += gridDim.x) {
+    const int tile = params.open_tiles[item / (S * kTailParts)], s = item / kTailParts % S;
+    const int chunks = chunks_of(params, tile), front = front_of(params);
+    const TransmittancePlanes<S> planes(params, tile, item % kTailParts * 32 + lane_id());
+    float transmittance = planes.at(front - 1, s), next[kBatch];
+    const auto load = [&](int first) {
+#pragma unroll
+      for (int k = 0; k < kBatch; ++k) {
+        if (first + k < chunks) next[k] = planes.at(first + k, s);
+      }
+    };
+    load(front);
+    for (int first = front; first < chunks; first += kBatch) {
+      float through[kBatch];
+#pragma unroll
+      for (int k = 0; k < kBatch; ++k) through[k] = next[k];
+      load(first + kBatch);  // before the stores, after which loads would wait
+#pragma unroll
+      for (int k = 0; k < kBatch; ++k) {
+        if (first + k >= chunks) break;
+        planes.at(first + k, s) = transmittance;
+        if (transmittance > 0) transmittance *= through[k];
+        if (transmittance < kNearlyStopped) transmittance = -abs(transmittance);
+      }
+    }
+  }
+}
+
+/// Writes to the checkpoints the channels of each tail chunk and the transmittance at its end, zero where the sample
+/// had stopped before the chunk.
+template <class F, int C, bool kKeep>
+__global__ void __launch_bounds__(kBlendThreads, blocks_per_sm(tail_blend_blocks(F::kSamples), kBlendThreads))
+    tail_blend_kernel(const BlendParams params) {
+  wait_for_earlier_kernels();
+  constexpr int S = F::kSamples, kSets = kKeep ? S : 1;
+  __shared__ BlendStage<F, C> stage;
+  const Vec2<float> p = position_of<F>(threadIdx.x / 32, lane_id());
+  for_each_tail_chunk(params, [&](const TileChunk& tail, const TileList& list, int end) {
+    const PixelCheckpoints<S, C, kKeep> checkpoints(params, tail.tile, int(threadIdx.x));
+    PixelState<S, C, kSets> state;
+    state.start(false);
+    bool started[S];
+#pragma unroll
+    for (int s = 0; s < S; ++s) {
+      const float transmittance = checkpoints.transmittance(tail.chunk, s);
+      started[s] = transmittance > 0;
+      if (started[s]) state.transmittance[s] = transmittance;
+    }
+    int k = tail.chunk * kChunkLength;
+    while (k < end && __syncthreads_or(state.open())) {
+      const int count = stage.load(params.splats, params.channels, list, k, end);
+      __syncthreads();
+      composite_all<F>(stage, count, k, p, state);
+      k += count;
+    }
+    const Pixel pixel(list, params.grid, pixel_of<F>(threadIdx.x / 32, lane_id()));
+#pragma unroll
+    for (int s = 0; s < S; ++s) {
+      const float transmittance = started[s] ? state.transmittance[s] : 0;
+      if constexpr (kKeep) {
+        checkpoints.kept(tail.chunk, s) = {state.channels[s], transmittance};
+        if (pixel.inside && state.last[s] > 0) atomicMax(&params.last[sample_index<F>(pixel, s)], state.last[s]);
+      } else {
+        checkpoints.transmittance(tail.chunk, s) = transmittance;
+      }
+    }
+    if constexpr (!kKeep) checkpoints.set_total(tail.chunk, state.channels[0]);
+    __syncthreads();
+  });
+}
+
+inline constexpr int kTailSumThreads = 32 * kTailSumWarps;
+
+/// The tail chunks [first, end) of a warp.
+struct TailShare {
+  int first, end;
+
+  __device__ TailShare(int front, int chunks) {
+    const int share = (chunks - front + kTailSumWarps - 1) / kTailSumWarps;
+    first = min(front + int(threadIdx.x / 32) * share, chunks);
+    end = min(first + share, chunks);
+  }
+};
+
+/// Adds up the chunks of the open tiles, whose parts blocks share, and writes their pixels. The order of the sum
+/// depends on the number of tail chunks alone, so that the picture has the same bits with and without a backward pass.
+/// `Samples`: LaneSamples of what a lane blends; the kernel is the same for all footprints that share it.
+template <class Samples, int C, bool kKeep>
+__global__ void __launch_bounds__(kTailSumThreads) tail_sum_kernel(const BlendParams params) {
+  wait_for_earlier_kernels();
+  constexpr int S = Samples::kSamples, kBatch = kKeep ? kTailLoadsKept : kTailLoads;
+  __shared__ float sums[kTailSumWarps][C][32], lasts[kTailSumWarps][32];
+  const int warp = int(threadIdx.x) / 32, lane = lane_id();
+  const Values<C> background = background_of<C>(params);
+  const int items = params.plan.state->counts.open_tiles * kTailParts;
+  for (int item = blockIdx.x; item < items; item += gridDim.x) {
+    const int tile = params.open_tiles[item / kTailParts], part = item % kTailParts;
+    const PixelCheckpoints<S, C, kKeep> checkpoints(params, tile, part * 32 + lane);
+    TailShare share(front_of(params), chunks_of(params, tile));
+    if (warp == 0) share.first = checkpoints.first_chunk;
+    Values<C> total = {};
+    float transmittance[S];
+#pragma unroll
+    for (int s = 0; s < S; ++s) {
+      const bool has_channels = kKeep || s == 0;
+      Values<C> sum = {};
+      float last = 0;  // at the end of the last of these chunks that the sample reached
+      for (int first = share.first; first < share.end; first += kBatch) {
+        Values<C> own[kBatch];
+        float ends[kBatch];
+#pragma unroll
+        for (int k = 0; k < kBatch; ++k) {
+          ends[k] = 0;
+          if (first + k >= share.end) continue;
+          if (has_channels) own[k] = checkpoints.channels(first + k, s);
+          ends[k] = checkpoints.transmittance(first + k, s);
+        }
+#pragma unroll
+        for (int k = 0; k < kBatch; ++k) {
+          if (has_channels && first + k < share.end) sum += own[k];
+          if (ends[k] != 0) last = ends[k];
+        }
+      }
+      lasts[warp][lane] = last;
+#pragma unroll
+      for (int c = 0; c < C; ++c) sums[warp][c][lane] = sum.v[c];
+      __syncthreads();
+      for (int w = 0; w < kTailSumWarps; ++w) {
+        if (lasts[w][lane] != 0) last = lasts[w][lane];
+#pragma unroll
+        for (int c = 0; c < C; ++c) total.v[c] += sums[w][c][lane];
+      }
+      transmittance[s] = last;
+      if constexpr (kKeep) {
+        Values<C> farther = times(abs(last), background);
+        for (int w = kTailSumWarps - 1; w > warp; --w) {
+#pragma unroll
+          for (int c = 0; c < C; ++c) farther.v[c] += sums[w][c][lane];
+        }
+        accumulate_farther<kBatch>(checkpoints, share.first, share.end, s, farther);
+      }
+      __syncthreads();  // before the next sums
+    }
+    const TileList list = list_of(params.lists, params.grid, tile);
+    if (warp == 0)
+      store_pixel<Samples>(params, Pixel(list, params.grid, pixel_of<Samples>(part, lane)), total, transmittance);
+  }
+}
+
+}  // namespace ar::cuda

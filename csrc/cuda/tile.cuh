@@ -1,0 +1,392 @@
+// A library for all kernels of blending: which pixels a lane has, the list of a tile, which pixels a splat reaches, and
+// the splats that a block copies to shared memory (stages). It launches nothing.
+//
+// A tile of 16x16 pixels consists of eight subtiles of 8x4 pixels, and a warp has a subtile: subtile b is in column
+// b % 2 and row b / 2 of the tile, and lane l has the pixel in column l % 8 and row l / 8 of the subtile. For a Spread
+// (core/footprint/contract.h) a lane has a sample instead: the samples of a pixel are in neighbouring lanes, and the
+// tile has fewer pixels. Each splat is tested against the subtiles once, and warps skip splats that do not reach them.
+#pragma once
+
+#include <type_traits>
+
+#include "core/bin.h"
+#include "core/blend.h"
+#include "cuda/params.h"
+#include "cuda/warp.cuh"
+
+namespace ar::cuda {
+
+inline constexpr int kTilePixels = kTile * kTile;
+inline constexpr int kSubtiles = 8;
+inline constexpr int kBlendThreads = 32 * kSubtiles;
+
+/// Columns and rows of pixels of a subtile. A Spread has fewer: 256 lanes are 256 samples.
+template <class F> inline constexpr int kSubtileWide = 8 >> (kTileBits - spread_tile_bits(F::kLanes, true));
+template <class F> inline constexpr int kSubtileHigh = kSubtileWide<F> / 2;
+
+/// How many samples of a pixel a lane has, and how many lanes have samples of one pixel: all that kernels know of a
+/// footprint that do not evaluate it.
+template <int S, int kLanesOfPixel> struct LaneSamples {
+  static constexpr int kSamples = S, kLanes = kLanesOfPixel;
+};
+
+/// A lane's pixel of subtile b, relative to the tile's first pixel.
+template <class F> __device__ Vec2<float> pixel_of(int b, int lane) {
+  constexpr int kWide = kSubtileWide<F>, kHigh = kSubtileHigh<F>;
+  static_assert(F::kLanes * kWide * kHigh == 32);
+  const int pixel = lane / F::kLanes;
+  return {float((b & 1) * kWide + pixel % kWide), float((b >> 1) * kHigh + pixel / kWide)};
+}
+/// The position of a lane's sample in subtile b, from the tile's first pixel, where `of_first` is its position in
+/// subtile 0. Blend and blend_vjp both call this, because alpha must have the same bits in both: one addition of a
+/// whole number.
+template <class F> __device__ Vec2<float> position_in(int b, Vec2<float> of_first) {
+  return {of_first.x + float((b & 1) * kSubtileWide<F>), of_first.y + float((b >> 1) * kSubtileHigh<F>)};
+}
+/// The same by the lane's number. Where a lane has all samples of a pixel, it is the position of the pixel.
+template <class F> __device__ Vec2<float> position_of(int b, int lane) {
+  Vec2<float> of_first = pixel_of<F>(0, lane);
+  if constexpr (F::kLanes > 1) {
+    Vec2<float> node = {0, 0};
+#pragma unroll
+    for (int s = 0; s < F::kLanes; ++s) {
+      if (lane % F::kLanes == s) node = {float(F::node(s).x), float(F::node(s).y)};
+    }
+    of_first = of_first + node;
+  }
+  return position_in<F>(b, of_first);
+}
+
+/// Splat `id` of those that `project` wrote: `splats` are rows of kSplatWidth numbers. All kernels of blending read
+/// splats through this function.
+template <class F> __device__ Splat<F, float> load_splat(const float* splats, int32_t id) {
+  return reinterpret_cast<const Splat<F, float>*>(splats)[id];
+}
+__device__ inline void prefetch_splat(const float* splats, int32_t id) { prefetch(splats + int64_t(id) * kSplatWidth); }
+
+/// A tile and its list of splats, front to back.
+struct TileList {
+  int x0, y0;            ///< first pixel of the tile
+  const int32_t* pairs;  ///< [count, stride] splats, and their slots where stride is 2
+  int stride, count;
+  bool of_patch;  ///< the list is that of a patch, and has splats that do not reach this tile
+
+  __device__ int32_t splat(int k) const { return pairs[int64_t(k) * stride]; }
+  __device__ int32_t slot(int k) const { return pairs[int64_t(k) * stride + 1]; }
+};
+
+/// A tile among the tiles of its patch, which share a list.
+struct TileInPatch {
+  int first_tile;  ///< of the patch
+  int tiles;       ///< of the patch, as far as it is in the image
+  int index;       ///< of the tile among these
+
+  __device__ TileInPatch(const TileLists& lists, TileGrid grid, int tile) {
+    const int bits = int(lists.counts->patch_bits), side = 1 << bits, columns = grid.columns();
+    const int row = tile / columns, column = tile % columns;
+    const int first_row = row >> bits << bits, first_column = column >> bits << bits;
+    const int width = min(side, columns - first_column);
+    first_tile = first_row * columns + first_column;
+    tiles = width * min(side, grid.rows() - first_row);
+    index = (row - first_row) * width + column - first_column;
+  }
+};
+
+__device__ inline TileList list_of(const TileLists& lists, TileGrid grid, int tile) {
+  TileList list;
+  list.x0 = tile % grid.columns() << grid.tile_bits;
+  list.y0 = tile / grid.columns() << grid.tile_bits;
+  list.of_patch = lists.counts->in_patches(lists.capacity);
+  list.stride = lists.stride;
+  const int64_t* offsets = lists.tile_offsets + (list.of_patch ? TileInPatch(lists, grid, tile).first_tile : tile);
+  list.pairs = lists.pairs + offsets[0] * lists.stride;
+  list.count = int(offsets[1] - offsets[0]);
+  return list;
+}
+
+/// Which boxes of kWide x kHigh pixels a splat reaches: bit b for the box in column b % kColumns and row b / kColumns
+/// of kColumns x kRows boxes whose first pixel is at (x0, y0). A box that the splat passes closely may be among them;
+/// only for footprints with expensive weights exact extents are worth their cost.
+template <int kWide, int kHigh, int kColumns, int kRows, class F>
+__device__ uint32_t reached_boxes(const Splat<F, float>& splat, int x0, int y0) {
+  static_assert(kColumns * kRows <= 32);
+  uint32_t reached = 0;
+  if constexpr (F::kExpensive) {
+    const Support<float> support = support_of(splat);
+#pragma unroll
+    for (int row = 0; row < kRows; ++row) {
+      const float y = float(y0 + row * kHigh);
+      const Span<float> span = columns_of(support, y, y + float(kHigh - 1));
+#pragma unroll
+      for (int column = 0; column < kColumns; ++column) {
+        const float x = float(x0 + column * kWide);
+        reached |= uint32_t(span.lo <= x + float(kWide - 1) && span.hi >= x) << (row * kColumns + column);
+      }
+    }
+  } else {
+    const Mat2<float> w = F::ellipse(splat.shape);
+    const Vec2<float> middle = {0.5f * (kWide - 1), 0.5f * (kHigh - 1)};  // of a box, from its first pixel
+    const Vec2<float> first = {float(x0) - splat.mean.x, float(y0) - splat.mean.y};
+    const float distance = float(max(kWide * kColumns, kHigh * kRows)) + max(abs(first.x), abs(first.y));
+    const BoxReach<float> box =
+        make_box_reach(w, splat.level, {middle.x + float(F::kReach), middle.y + float(F::kReach)}, distance);
+#pragma unroll
+    for (int row = 0; row < kRows; ++row) {
+      const Vec2<float> z = transform(w, Vec2<float>{first.x + middle.x, first.y + (middle.y + float(row * kHigh))});
+#pragma unroll
+      for (int column = 0; column < kColumns; ++column) {
+        const float right = float(column * kWide);
+        const Vec2<float> center = {madd(w.xx, right, z.x), madd(w.yx, right, z.y)};
+        reached |= uint32_t(reaches_box(box, center)) << (row * kColumns + column);
+      }
+    }
+  }
+  return reached;
+}
+
+/// Bit b: the splat reaches subtile b of a tile at (x0, y0), or passes it closely.
+template <class F> __device__ uint32_t subtile_reach(const Splat<F, float>& splat, int x0, int y0) {
+  return reached_boxes<kSubtileWide<F>, kSubtileHigh<F>, 2, 4, F>(splat, x0, y0);
+}
+
+/// Values of C channels.
+template <int C> struct Values {
+  float v[C];
+
+  __device__ void add(float weight, const Values& other) {
+#pragma unroll
+    for (int c = 0; c < C; ++c) v[c] = madd(weight, other.v[c], v[c]);
+  }
+  __device__ Values& operator+=(const Values& other) {
+#pragma unroll
+    for (int c = 0; c < C; ++c) v[c] += other.v[c];
+    return *this;
+  }
+};
+template <> struct Values<0> {};
+
+/// Adds to `sums` what a splat contributes in the S samples of a lane. composite(s) composites the splat into sample s
+/// and returns what blend_sample returns. A branch around a single addition becomes a predicate, which costs nothing.
+template <int S, int C, class Composite>
+__device__ __forceinline__ void add_samples(Values<C>& sums, const Values<C>& channels, Composite&& composite) {
+  float contribution = 0;
+#pragma unroll
+  for (int s = 0; s < S; ++s) {
+    const Blended<float> b = composite(s);
+    if constexpr (S == 1) {
+      if (b.mask) sums.add(b.if_shown, channels);
+    } else if (s == 0) {
+      contribution = b.contribution;
+    } else if (b.mask) {
+      contribution += b.if_shown;
+    }
+  }
+  if (S > 1) sums.add(contribution, channels);
+}
+template <int C> __device__ Values<C> times(float scale, const Values<C>& values) {
+  Values<C> scaled;
+#pragma unroll
+  for (int c = 0; c < C; ++c) scaled.v[c] = scale * values.v[c];
+  return scaled;
+}
+
+/// What the pixels of a tile need of a splat: its terms, and C channels.
+template <class F, int C> struct alignas(16) TileSplat {
+  typename F::template Terms<float> terms;
+  Values<C> channels;
+};
+
+/// A staged splat in use: copied to registers, unless it has too many numbers.
+template <class F, int C>
+using TileSplatRef = std::conditional_t<sizeof(TileSplat<F, C>) <= 112, const TileSplat<F, C>, const TileSplat<F, C>&>;
+
+/// The channels of splat `id`: three lie in the splat; else C channels of its row from `first` on, and zeros beyond the
+/// last channel.
+template <int C, class F>
+__device__ Values<C> channels_of(const Channels<float>& channels, const Splat<F, float>& splat, int32_t id,
+                                 int first = 0) {
+  if constexpr (C == 0) {
+    return {};
+  } else if constexpr (C == 3) {
+    return {{splat.color.x, splat.color.y, splat.color.z}};
+  } else {
+    const float* row = channels.row(id) + first;
+    if (C == 4 && channels.count == 4 && reinterpret_cast<uintptr_t>(channels.data) % 16 == 0) {
+      const float4 v = *reinterpret_cast<const float4*>(row);
+      return {{v.x, v.y, v.z, v.w}};
+    }
+    Values<C> values;
+#pragma unroll
+    for (int c = 0; c < C; ++c) values.v[c] = first + c < channels.count ? row[c] : 0;
+    return values;
+  }
+}
+
+/// For each of kWarps warps of a block a list of up to kMost staged splats that reach its pixels. To walk a list costs
+/// less per splat than to find the next bit of a mask. An entry is the number of a splat times kUnit: with kUnit = the
+/// size of a splat it is an offset in memory. kAhead entries are read at a time.
+template <class EntryType, int kUnit, int kAhead, int kWarps, int kMost> struct ReachLists {
+  using Entry = EntryType;
+  struct alignas(kAhead * sizeof(Entry)) Entries {
+    Entry of[kAhead];
+  };
+  alignas(Entries) Entry of_warps[kWarps][kMost];
+
+  /// Lists the staged splats in [from, to) that reach this warp's pixels, and returns their number. Bit w of reach[k]
+  /// says that splat k reaches the pixels of warp w; `reach` is read up to the next multiple of 32. All lanes must call
+  /// it.
+  template <class Bits> __device__ int list(const Bits* reach, int from, int to) {
+    return list(reach, from, to, int(threadIdx.x) / 32);
+  }
+  /// The same for the splats whose bit `number` is set.
+  template <class Bits> __device__ int list(const Bits* reach, int from, int to, int number) {
+    const int warp = threadIdx.x / 32;
+    int n = 0;
+    for (int k = from; k < to; k += 32) {
+      const bool reached = reach[k + lane_id()] >> number & 1;
+      const uint32_t all = __ballot_sync(kAllLanes, reached);
+      if (reached) of_warps[warp][n + __popc(all & ((1u << lane_id()) - 1))] = Entry((k + lane_id()) * kUnit);
+      n += __popc(all);
+    }
+    __syncwarp();
+    return n;
+  }
+  /// The number of a listed splat.
+  __device__ static int number_of(Entry entry) { return int(entry) / kUnit; }
+  /// The staged splat of an entry.
+  template <class Splat> __device__ static const Splat& splat_of(const Splat* splats, Entry entry) {
+    static_assert(sizeof(Splat) % kUnit == 0);
+    return *reinterpret_cast<const Splat*>(reinterpret_cast<const char*>(splats) + entry * (sizeof(Splat) / kUnit));
+  }
+  /// Calls visit(entry) for the entries [from, to) of this warp's list; `from` is a multiple of kAhead.
+  template <class Visit> __device__ __forceinline__ void for_each(int from, int to, Visit&& visit) const {
+    const Entry* list = of_warps[threadIdx.x / 32];
+    int k = from;
+    if constexpr (kAhead > 1) {
+#pragma unroll 1
+      for (; k + kAhead <= to; k += kAhead) {
+        const Entries entries = *reinterpret_cast<const Entries*>(list + k);
+#pragma unroll
+        for (int i = 0; i < kAhead; ++i) visit(entries.of[i]);
+      }
+    }
+#pragma unroll 1
+    for (; k < to; ++k) visit(list[k]);
+  }
+};
+
+template <class F> __device__ auto tile_terms(const Splat<F, float>& splat, const TileList& list) {
+  return F::terms(splat.shape, splat.opacity, {float(list.x0) - splat.mean.x, float(list.y0) - splat.mean.y});
+}
+
+/// Up to kBatch splats of a tile, with C channels, that a block works on together. A thread loads one splat.
+template <class F, int C, int kBatch> struct Stage {
+  TileSplat<F, C> splats[kBatch];
+  uint8_t reach[kBatch];
+
+  /// Loads splats [k, k + kBatch) of the list, and returns how many there are before `end`. `splats_in`: rows of
+  /// kSplatWidth numbers.
+  __device__ int load(const float* splats_in, const Channels<float>& channels, const TileList& list, int k, int end) {
+    const int t = threadIdx.x;
+    if (kBatch == kBlendThreads || t < kBatch) {
+      uint32_t bits = 0;
+      if (k + t < end) {
+        const int32_t id = list.splat(k + t);
+        const Splat<F, float> splat = load_splat<F>(splats_in, id);
+        bits = subtile_reach<F>(splat, list.x0, list.y0);
+        if (bits) splats[t] = {tile_terms(splat, list), channels_of<C>(channels, splat, id)};
+      }
+      reach[t] = uint8_t(bits);
+    }
+    return min(end - k, kBatch);
+  }
+
+  /// The splats in [k, k + 32) that reach a subtile, in the order of take_first. All lanes must call it.
+  __device__ uint32_t reached(int k, int subtile) const {
+    return __ballot_sync(kAllLanes, reach[k + 31 - lane_id()] >> subtile & 1);
+  }
+  /// The same for this warp's subtile.
+  __device__ uint32_t reached(int k) const { return reached(k, threadIdx.x / 32); }
+};
+
+/// A sample at the end of a chunk, stored for the backward pass.
+template <int C> struct alignas(C == 3 ? 16 : 4) Checkpoint {
+  Values<C> channels;
+  float transmittance;  ///< negated where the sample has stopped
+};
+
+/// The tile of chunk number `chunk` of blend_vjp, where a chunk is the whole list of a tile; -1 if there is no such
+/// chunk. Where lists are cut, the segments have the first numbers, and the lists that are not cut follow.
+__device__ inline int listed_tile(const BlendVjpParams& params, int chunk) {
+  return chunk < params.plan->counts.chunks ? params.chunk_order[chunk].tile : -1;
+}
+
+/// A pixel of the image.
+struct Pixel {
+  int64_t index, image;  ///< number of the pixel, and of all pixels
+  bool inside;
+
+  __device__ Pixel(const TileList& list, TileGrid grid, Vec2<float> p) {
+    const int x = list.x0 + int(p.x), y = list.y0 + int(p.y);
+    inside = x < grid.width && y < grid.height;
+    index = int64_t(y) * grid.width + x;
+    image = int64_t(grid.width) * grid.height;
+  }
+};
+
+/// The share of one sample in its pixel.
+template <class F> inline constexpr float kSampleShare = 1.0f / (F::kSamples * F::kLanes);
+
+/// Index of sample s of this lane's pixel in an array of [samples, H, W].
+template <class F> __device__ int64_t sample_index(int64_t image, int64_t pixel, int s) {
+  return (F::kLanes > 1 ? lane_id() % F::kLanes : s) * image + pixel;
+}
+template <class F> __device__ int64_t sample_index(const Pixel& pixel, int s) {
+  return sample_index<F>(pixel.image, pixel.index, s);
+}
+
+/// The sum over the lanes that hold a pixel's samples.
+template <class F> __device__ float sum_of_pixel(float x) {
+#pragma unroll
+  for (int offset = F::kLanes / 2; offset > 0; offset /= 2) x += __shfl_xor_sync(kAllLanes, x, offset);
+  return x;
+}
+/// Whether this lane writes what belongs to the whole pixel.
+template <class F> __device__ bool writes_pixel(int lane) { return lane % F::kLanes == 0; }
+
+/// The gradient with respect to a channel of one of a pixel's samples.
+template <class F> __device__ float sample_gradient(const BlendVjpParams& params, const Pixel& pixel, int channel) {
+  const float* plane = channel < params.channels.count ? params.dL_dimage.plane(channel, pixel.image) : nullptr;
+  return pixel.inside && plane ? kSampleShare<F> * plane[pixel.index] : 0.0f;
+}
+
+/// Zeros for a pair that no sample composites, in `row` of pair_grads: by one thread.
+__device__ inline void clear_pair(const BlendVjpParams& params, int64_t row) {
+  auto* numbers = reinterpret_cast<float4*>(params.pair_grads + row * kPairGradWidth);
+#pragma unroll
+  for (int q = 0; q < kPairGradWidth / 4; ++q) numbers[q] = {0, 0, 0, 0};
+}
+
+/// Threads that clear_pair_together takes for a pair.
+inline constexpr int kClearThreads = kChannelGroup / 4;
+
+/// The same by kClearThreads neighbouring threads, all of which must call it: clears the row of pair_grads, if
+/// `shapes`, and the row of kWidth channel_sums, if there are any.
+template <int kWidth> __device__ void clear_pair_together(const BlendVjpParams& params, int64_t row, bool shapes) {
+  const int q = threadIdx.x % kClearThreads;
+  const float4 zero = {0, 0, 0, 0};
+  if (shapes && q < kPairGradWidth / 4) reinterpret_cast<float4*>(params.pair_grads + row * kPairGradWidth)[q] = zero;
+  if (params.channel_sums && q < kWidth / 4) reinterpret_cast<float4*>(params.channel_sums + row * kWidth)[q] = zero;
+}
+
+/// Writes a gradient sum into row `row`: of the pair; or, `of_patch`, of the splat, to whose row all tiles add.
+__device__ inline void put_sum(float* rows, int width, bool of_patch, int32_t row, int column, float x) {
+  float* place = rows + int64_t(row) * width + column;
+  if (of_patch) {
+    atomicAdd(place, x);
+  } else {
+    *place = x;
+  }
+}
+
+}  // namespace ar::cuda
