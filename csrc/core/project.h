@@ -229,7 +229,7 @@ template <typename T> AR_HD bool given_colors(const ProjectParams<T>& p) {
   return p.given.data && !(p.channels.data && p.channels.color >= 0);
 }
 
-/// The first three channels of a row, as a colour for `adaptive`.
+/// The first three channels of a row, filled up with zeros.
 template <typename T> AR_HD Vec3<T> first_channels(const T* row, int count) {
   return {row[0], count > 1 ? row[1] : T(0), count > 2 ? row[2] : T(0)};
 }
