@@ -41,7 +41,7 @@ def test_the_cuda_ops_compile(tmp_path):
 def test_kernels_begin_by_waiting():
     """They are launched before those ahead of them have ended (csrc/cuda/launch.cuh). One works beside those that let
     it begin, the first of which must have waited before."""
-    texts = [path.read_text() for path in sorted((ROOT / "csrc" / "cuda").glob("*.cu*"))]
+    texts = [path.read_text() for path in sorted((ROOT / "csrc" / "cuda").rglob("*.cu*"))]
     kernels = [kernel for text in texts for kernel in re.split(r"\b__global__\b", text)[1:]]
     begins = {}
     for kernel in kernels:

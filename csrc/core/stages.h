@@ -34,11 +34,11 @@ AR_HD bool is_small_image(TileGrid grid) {
   return TileGrid{grid.width, grid.height, kMovingTileBits}.tiles() < kSmallImageTiles;
 }
 /// The tiles on CUDA if samples move. With one sample in a large image blending is so cheap that fewer pairs, in larger
-/// tiles, pay. With many samples in a small image, where most splats are smaller than a tile, shorter lists of smaller
-/// tiles pay.
+/// tiles, pay. With sixteen samples in a small image, where most splats are smaller than a tile, shorter lists of
+/// smaller tiles pay.
 AR_HD constexpr int moving_tile_bits(int samples, bool small_image) {
   if (samples == 1 && !small_image) return kTileBits;
-  return samples >= 9 && small_image ? kMovingTileBits - 1 : kMovingTileBits;
+  return samples == 16 && small_image ? kMovingTileBits - 1 : kMovingTileBits;
 }
 /// The tiles on CUDA if samples of a pixel may be spread over lanes (Spread of footprint/contract.h). Such a tile has
 /// 256 samples: 8x8 pixels with 4 samples, 4x4 pixels with 16. Four samples are spread in small images only, which have

@@ -94,7 +94,7 @@ template <class F, int C, bool kKeep> void launch_blend(const BlendParams& p, cu
   const LaunchShape of_chunks = {blocks, kBlendThreads}, of_parts = {blocks, 32}, of_sums = {blocks, kTailSumThreads};
   launch(blend_front_kernel<F, C, kKeep>, {unsigned(p.grid.tiles()), kBlendThreads}, stream, p);
   launch(tail_through_kernel<F>, of_chunks, stream, p);
-  launch(tail_scan_kernel<S>, of_parts, stream, p);
+  launch(tail_scan_kernel, of_parts, stream, p, S);
   launch(tail_blend_kernel<F, C, kKeep>, of_chunks, stream, p);
   launch(tail_sum_kernel<LaneSamples<S, F::kLanes>, C, kKeep>, of_sums, stream, p);
 }

@@ -55,16 +55,17 @@ template <int S, int C, bool kKeep> struct PixelCheckpoints {
 
 /// The transmittance of a pixel in the checkpoints, with or without a backward pass: for kernels that are compiled once
 /// for any number of channels.
-template <int S> struct TransmittancePlanes {
+struct TransmittancePlanes {
   float* base;
   int first_chunk;
   int64_t chunk_stride, sample_stride;
 
-  __device__ TransmittancePlanes(const BlendParams& params, int tile, int pixel) {
+  /// `samples`: of a lane.
+  __device__ TransmittancePlanes(const BlendParams& params, int samples, int tile, int pixel) {
     const CheckpointLayout layout = params.layout;
     const int of_sample = layout.keep ? layout.channels + 1 : 1;
     first_chunk = layout.first_chunk(front_of(params));
-    chunk_stride = int64_t(layout.planes(S)) * kTilePixels;
+    chunk_stride = int64_t(layout.planes(samples)) * kTilePixels;
     sample_stride = int64_t(of_sample) * kTilePixels;
     base =
         params.checkpoints + int64_t(params.plan.tile_planes[tile]) * kTilePixels + pixel * of_sample + of_sample - 1;

@@ -54,7 +54,7 @@ __global__ void __launch_bounds__(kBlendThreads, kThroughBlocks<F>) tail_through
       __syncthreads();
       pass_all<F>(stage, count, p, transmittance);
     }
-    const TransmittancePlanes<S> planes(params, tail.tile, int(threadIdx.x));
+    const TransmittancePlanes planes(params, S, tail.tile, int(threadIdx.x));
 #pragma unroll
     for (int s = 0; s < S; ++s) planes.at(tail.chunk, s) = transmittance[s];
   });
@@ -75,15 +75,15 @@ __device__ inline int chunks_of(const BlendParams& params, int tile) {
 inline constexpr int kTailParts = kTilePixels / 32;
 
 /// Turns what each chunk lets through into the transmittance at its begin, negative where a sample has stopped before.
-/// Blocks share the parts of the open tiles. `S`: samples of a lane.
-template <int S> __global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params) {
+/// Blocks share the parts of the open tiles. `samples`: of a lane.
+__global__ void __launch_bounds__(32) tail_scan_kernel(const BlendParams params, int samples) {
   wait_for_earlier_kernels();
   constexpr int kBatch = kTailLoads;
-  const int items = params.plan.state->counts.open_tiles * S * kTailParts;
+  const int items = params.plan.state->counts.open_tiles * samples * kTailParts;
   for (int item = blockIdx.x; item < items; item += gridDim.x) {
-    const int tile = params.open_tiles[item / (S * kTailParts)], s = item / kTailParts % S;
+    const int tile = params.open_tiles[item / (samples * kTailParts)], s = item / kTailParts % samples;
     const int chunks = chunks_of(params, tile), front = front_of(params);
-    const TransmittancePlanes<S> planes(params, tile, item % kTailParts * 32 + lane_id());
+    const TransmittancePlanes planes(params, samples, tile, item % kTailParts * 32 + lane_id());
     float transmittance = planes.at(front - 1, s), next[kBatch];
     const auto load = [&](int first) {
 #pragma unroll
