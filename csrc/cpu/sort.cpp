@@ -2,28 +2,16 @@
 #include "cpu/sort.h"
 
 #include <algorithm>
-#include <cstring>
 #include <memory>
 #include <numeric>
 #include <utility>
 #include <vector>
 
+#include "core/bin.h"
 #include "cpu/parallel.h"
 
 namespace ar::cpu {
 namespace {
-
-/// Unsigned integers in the order of floats >= 0.
-uint32_t depth_key(float depth) {
-  uint32_t key;
-  std::memcpy(&key, &depth, sizeof key);
-  return key;
-}
-uint64_t depth_key(double depth) {
-  uint64_t key;
-  std::memcpy(&key, &depth, sizeof key);
-  return key;
-}
 
 /// Numbers that are worth another thread, and kinds per item.
 constexpr int64_t kSumBlock = 4096, kSortBlock = 2048, kKindBlock = 256;
@@ -76,7 +64,7 @@ int64_t place_items(int64_t* counts, int64_t parts, int64_t kinds, int threads, 
 
 /// LSD radix sort with a histogram per part. It is stable, so that parts do not matter.
 template <typename T> void sort_by_depth(const T* depths, int64_t n, int threads, int32_t* order) {
-  using Key = decltype(depth_key(T()));
+  using Key = decltype(depth_bits(T()));
   constexpr int kBits = 11, kBuckets = 1 << kBits;
   struct Entry {
     Key key;
@@ -91,7 +79,7 @@ template <typename T> void sort_by_depth(const T* depths, int64_t n, int threads
     Key common = ~Key(0), any = 0;
     const Part part = part_of(n, parts, p);
     for (int64_t i = part.begin; i < part.end; ++i) {
-      const Key key = depth_key(depths[i]);
+      const Key key = depth_bits(depths[i]);
       common &= key;
       any |= key;
       from[i] = {key, int32_t(i)};

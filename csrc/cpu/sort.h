@@ -5,7 +5,7 @@
 
 namespace ar::cpu {
 
-/// Sets order [n] to the indices of `depths` (>= 0) in ascending order. Ties keep their order.
+/// Sets order [n] to the indices of `depths` (>= 0, with -0 = 0) in ascending order. Ties keep their order.
 template <typename T> void sort_by_depth(const T* depths, int64_t n, int threads, int32_t* order);
 
 /// Replaces numbers by sums of earlier ones. Returns the sum of all.

@@ -139,6 +139,9 @@ std::vector<std::pair<std::string, int>> lens_members() {
   return members;
 }
 
+/// In the order of their numbers.
+template <class... M> std::vector<std::string> names_of(CameraModelList<M...>) { return {M::kName...}; }
+
 /// As Python indexes them.
 pybind11::object columns_at(int64_t first, int64_t count) {
   if (count == 1) return pybind11::int_(first);
@@ -229,6 +232,7 @@ PYBIND11_MODULE(_C, m) {
   m.def("instruction_set", &ar::cpu::instruction_set, "Instruction set that the CPU path runs on.");
   m.attr("IMAGES") = ar::ops::image_names();
   m.attr("LENS") = ar::ops::lens_members();
+  m.attr("CAMERA_MODELS") = ar::ops::names_of(ar::CameraModels());
   m.attr("LISTS") = ar::ops::member_names<ar::ops::ListTensors>();
   m.attr("STATE") = ar::ops::member_names<ar::ops::BlendState>();
   m.attr("KEPT_ROWS") = ar::ops::member_names<ar::ops::KeptRows>();
