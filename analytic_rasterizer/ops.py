@@ -1,6 +1,7 @@
 """Fake kernels of the operators: shapes and dtypes of what they return, for tracing (torch.compile, torch.export).
 
-The operators' schemas, kernels and gradients are in csrc/torch.
+The operators' schemas, kernels and gradients are in csrc/torch. Names, their order, and widths of rows are read from
+there: from the schemas and from `_C`.
 """
 
 from __future__ import annotations
@@ -14,11 +15,20 @@ from . import _C
 _SAMPLES = {footprint["key"]: footprint["samples"] for footprint in _C.footprints()}
 
 
+def _arguments(name: str) -> list[torch.Argument]:
+    """The arguments of an op, by its schema."""
+    return getattr(torch.ops.analytic_rasterizer, name).default._schema.arguments
+
+
+def _is_tensor(type_: torch.Type) -> bool:
+    """Whether an argument is a tensor, or an optional one."""
+    return str(type_) in ("Tensor", "Optional[Tensor]")
+
+
 def _register(name: str):
     """Registers a fake kernel that takes the op's arguments as a namespace."""
-    op = getattr(torch.ops.analytic_rasterizer, name).default
-    names = [argument.name for argument in op._schema.arguments]
-    defaults = {argument.name: argument.default_value for argument in op._schema.arguments}
+    names = [argument.name for argument in _arguments(name)]
+    defaults = {argument.name: argument.default_value for argument in _arguments(name)}
 
     def register(kernel):
         @torch.library.register_fake(f"analytic_rasterizer::{name}")
@@ -30,39 +40,53 @@ def _register(name: str):
     return register
 
 
-def _lists(like: torch.Tensor, rows: int, a, keep: bool, ids=None) -> list[torch.Tensor]:
-    """What `list_tiles` makes of `rows` splats of one camera: ListTensors of csrc/torch/backend.h."""
+def _in_order(names: list[str], tensors: dict[str, torch.Tensor]) -> list[torch.Tensor]:
+    """The tensors in the order of `names`, which are those of a struct of csrc/torch."""
+    return [tensors[name] for name in names]
+
+
+def _lists(like: torch.Tensor, rows: int, a, keep: bool) -> list[torch.Tensor]:
+    """What `bin` makes of `rows` splats of one camera: ListTensors of csrc/torch/backend.h."""
     context = torch.library.get_ctx()
     on_cuda = like.device.type == "cuda"
     side = _C.tile_size(a.footprint, a.option, a.image_width, a.image_height, on_cuda)
     tiles = -(-a.image_height // side) * -(-a.image_width // side)
-    pairs = context.new_dynamic_size()
+    pairs, width = context.new_dynamic_size(), _C.WIDTHS
     ints, longs = {"dtype": torch.int32}, {"dtype": torch.int64}
-    return [
-        like.new_empty(rows, _C.SPLAT_WIDTH),
-        like.new_empty(rows, **ints),
-        like.new_empty((pairs, 2 if keep else 1) if on_cuda else (pairs,), **ints),
-        like.new_empty(tiles + 1, **longs),
-        like.new_empty((rows, 2), **ints) if on_cuda else like.new_empty(rows + 1 if keep else 0, **longs),
-        like.new_empty(pairs if keep and not on_cuda else 0, **longs),
-        like.new_empty(context.new_dynamic_size() if on_cuda else 0, **longs),
-    ]
+    tensors = {
+        "splats": like.new_empty(rows, width["splats"]),
+        "ids": like.new_empty(rows, **ints),
+        "tile_offsets": like.new_empty(tiles + 1, **longs),
+    }
+    if on_cuda:
+        tensors |= {
+            "pairs": like.new_empty(pairs, width["pairs"] if keep else 1, **ints),
+            "splat_offsets": like.new_empty(rows, width["splat_offsets"], **ints),
+            "positions": like.new_empty(0, **longs),
+            "counts": like.new_empty(width["counts"], **longs),
+        }
+    else:
+        tensors |= {
+            "pairs": like.new_empty(pairs, **ints),
+            "splat_offsets": like.new_empty(rows + 1 if keep else 0, **longs),
+            "positions": like.new_empty(pairs if keep else 0, **longs),
+            "counts": like.new_empty(0, **longs),
+        }
+    return _in_order(_C.LISTS, tensors)
 
 
 def _state(like: torch.Tensor, a) -> list[torch.Tensor]:
-    """What `blend` leaves for its adjoint: BlendState of csrc/torch/backend.h."""
+    """What `blend` saves for its adjoint: BlendState of csrc/torch/backend.h."""
     planes = _SAMPLES.get(a.footprint, 1), a.image_height, a.image_width
     ints = {"dtype": torch.int32}
-    if like.device.type != "cuda":
-        return [like.new_empty(planes), like.new_empty(planes, **ints), like.new_empty(0), like.new_empty(0, **ints)]
-    context = torch.library.get_ctx()
-    checkpoints, chunks = context.new_dynamic_size(), context.new_dynamic_size()
-    return [
-        like.new_empty(planes),
-        like.new_empty(planes, **ints),
-        like.new_empty(checkpoints),
-        like.new_empty(chunks, 3, **ints),
-    ]
+    tensors = {"transmittance": like.new_empty(planes), "last": like.new_empty(planes, **ints)}
+    if like.device.type == "cuda":
+        context = torch.library.get_ctx()
+        tensors["checkpoints"] = like.new_empty(context.new_dynamic_size())
+        tensors["chunks"] = like.new_empty(context.new_dynamic_size(), _C.WIDTHS["chunks"], **ints)
+    else:
+        tensors |= {"checkpoints": like.new_empty(0), "chunks": like.new_empty(0, **ints)}
+    return _in_order(_C.STATE, tensors)
 
 
 def _channels(a) -> int:
@@ -119,14 +143,15 @@ def _(a):
 
 @_register("pack_rows_vjp")
 def _(a):
-    return _scene_gradients(a)
+    return _gradients(a, "project")
 
 
 @_register("blend_rows")
 def _(a):
     n, size, saved = a.rows.shape[0], (a.image_height, a.image_width), []
     if a.keep:
-        saved = [*_lists(a.rows, n, a, True), *_state(a.rows, a), a.rows.new_empty(n, 4), a.rows.new_empty(n)]
+        kept = {"covs": a.rows.new_empty(n, _C.WIDTHS["covs"]), "opacities": a.rows.new_empty(n)}
+        saved = [*_lists(a.rows, n, a, True), *_state(a.rows, a), *_in_order(_C.KEPT_ROWS, kept)]
     return a.rows.new_empty(3, *size), a.rows.new_empty(size), saved
 
 
@@ -154,49 +179,40 @@ def _(a):
     )
 
 
-def _gradients(a, tensors) -> list[torch.Tensor]:
-    """One like each of the tensors that want a gradient, and an empty one for the others."""
+def _gradients(a, op: str) -> list[torch.Tensor]:
+    """What the adjoint of `op` returns: a gradient for each of its tensors, empty for those that want none."""
+    tensors = [getattr(a, argument.name) for argument in _arguments(op) if _is_tensor(argument.type)]
     like = tensors[0]
     return [like.new_empty(t.shape if need and t is not None else 0) for t, need in zip(tensors, a.needs)]
 
 
-def _scene_gradients(a) -> list[torch.Tensor]:
-    """Of the Gaussians and, with a lens, of the cameras."""
-    camera = (a.viewmatrix, a.projmatrix, a.campos, a.lens) if a.lens is not None else (None,) * 4
-    gaussians = (a.means3D, a.opacities, a.shs, a.colors_precomp, a.scales, a.rotations, a.cov3D_precomp)
-    return _gradients(a, (*gaussians, *camera))
-
-
 @_register("rasterize_vjp")
 def _(a):
-    camera = (a.viewmatrix.reshape(4, 4), a.projmatrix.reshape(4, 4), a.campos.reshape(3), a.lens)
-    camera = camera if a.lens is not None else (None,) * 4
-    gaussians = (a.means3D, a.means2D, a.opacities, a.shs, a.colors_precomp, a.scales, a.rotations, a.cov3D_precomp)
-    return _gradients(a, (*gaussians, *camera, a.bg.reshape(-1), a.features))
+    for name, dims in {"viewmatrix": 2, "projmatrix": 2, "campos": 1, "bg": 1}.items():  # may have one more, of size 1
+        tensor = getattr(a, name)
+        setattr(a, name, tensor.reshape(tensor.shape[-dims:]))
+    return _gradients(a, "rasterize")
 
 
 @_register("project_vjp")
 def _(a):
-    return _scene_gradients(a)
+    return _gradients(a, "project")
 
 
 @_register("blend_vjp")
 def _(a):
-    tensors = (a.means2d, a.cov2d, a.opacities, a.features, a.background, a.means2d_abs)
-    return _gradients(a, (*tensors, a.dets, None))
+    return _gradients(a, "blend")
 
 
 @_register("inspect")
 def _(a):
-    (splats, ids), count = a.saved[:2], a.depths.shape[0]
-    image = [ids.new_empty(a.image_height, a.image_width) for _ in range(2)]
-    return [
-        *image,
-        ids.new_empty(count),
-        splats.new_empty(count, dtype=torch.float32),
-        ids.new_empty(count, dtype=torch.int64),
-        *(ids.new_empty(count) for _ in range(2)),
-    ]
+    saved, count = dict(zip(_C.LISTS, a.saved)), a.depths.shape[0]
+    ids, image = saved["ids"], (a.image_height, a.image_width)
+    tensors = {name: ids.new_empty(image) for name in ("median", "dominant")}
+    tensors |= {name: ids.new_empty(count) for name in ("touched", "in_front", "dominated")}
+    tensors["largest"] = saved["splats"].new_empty(count, dtype=torch.float32)
+    tensors["total"] = ids.new_empty(count, dtype=torch.int64)
+    return _in_order(_C.SUMMARY, tensors)
 
 
 @_register("footprint_weight")
@@ -210,8 +226,8 @@ def _(a):
 
 
 def _partials(a) -> list[torch.Tensor]:
-    """What ssim_map and l1_ssim leave for their adjoints: kSsimPartials planes of csrc/core/ssim.h."""
-    return [a.image.new_empty(3, *a.image.shape)] if a.keep else []
+    """What ssim_map and l1_ssim save for their adjoints: derivatives of csrc/core/ssim.h."""
+    return [a.image.new_empty(_C.WIDTHS["partials"], *a.image.shape)] if a.keep else []
 
 
 @_register("ssim_map")
@@ -226,12 +242,12 @@ def _(a):
 
 @_register("ssim_map_vjp")
 def _(a):
-    return _gradients(a, (a.image, a.target))
+    return _gradients(a, "ssim_map")
 
 
 @_register("l1_ssim_vjp")
 def _(a):
-    return _gradients(a, (a.image, a.target))
+    return _gradients(a, "l1_ssim")
 
 
 @_register("activate")
@@ -241,7 +257,7 @@ def _(a):
 
 @_register("activate_vjp")
 def _(a):
-    return _gradients(a, (a.log_scales, a.quats, a.logit_opacities))
+    return _gradients(a, "activate")
 
 
 @_register("picture_gradients")

@@ -75,16 +75,17 @@ def summaries(
         size: Height and width of the image, px.
         footprint, option: Key and number of the footprint that it was rendered with.
     """
-    median, dominant, pixels, largest, total, in_front, dominated = torch.ops.analytic_rasterizer.inspect(
-        saved, z, *size, footprint, option
-    )
+    summary = dict(zip(_C.SUMMARY, torch.ops.analytic_rasterizer.inspect(saved, z, *size, footprint, option)))
     outputs = {}
     if effects.median_depth:
+        median = summary["median"]
         of_pixel = z[median.clamp_min(0).long()] if z.shape[0] else z.new_zeros(median.shape)
         outputs["median_depth"] = of_pixel.masked_fill(median < 0, 0)[None]
     if effects.dominant_index:
-        outputs["dominant_index"] = dominant[None]
+        outputs["dominant_index"] = summary["dominant"][None]
     if effects.gaussian_stats:
-        sums = (total.double() * _C.WEIGHT_UNIT).to(z.dtype)
-        outputs["gaussian_stats"] = GaussianStats(pixels, largest, sums, in_front, dominated)
+        sums = (summary["total"].double() * _C.WEIGHT_UNIT).to(z.dtype)
+        outputs["gaussian_stats"] = GaussianStats(
+            summary["touched"], summary["largest"], sums, summary["in_front"], summary["dominated"]
+        )
     return outputs

@@ -16,6 +16,8 @@ import torch
 import torch.utils._pytree
 from conftest import each_precision, run_python
 from scenes import PATHS, RENDERED, Camera, name_of
+from torch._subclasses import FakeTensorMode
+from torch.fx.experimental.symbolic_shapes import ShapeEnv
 from torch.utils._python_dispatch import TorchDispatchMode
 
 import analytic_rasterizer as ar
@@ -989,6 +991,35 @@ def test_opcheck(op, device, name):
     if repeats and name in DISPATCHED:
         checks = (*checks, "test_aot_dispatch_dynamic")
     torch.library.opcheck(function, arguments, test_utils=checks)
+
+
+def traced(op):
+    """(dtype, number of dimensions) of the tensors in the last result of an op's fake kernel, and the tensors."""
+    function, arguments = calls(("box", {"samples": 4}), "cpu", False)[op]
+    with FakeTensorMode(shape_env=ShapeEnv(), allow_non_fake_inputs=True) as mode:
+        fake = torch.utils._pytree.tree_map(lambda v: mode.from_tensor(v) if torch.is_tensor(v) else v, arguments)
+        results = function(*fake)
+    tensors = results[-1] if isinstance(results, tuple) else results
+    return [(t.dtype, t.dim()) for t in tensors], tensors
+
+
+@pytest.mark.parametrize("op, names", [("bin", "LISTS"), ("blend", "STATE"), ("inspect", "SUMMARY")])
+def test_tracing_has_the_order_of_tensors_from_the_extension(op, names, monkeypatch):
+    """In C++ alone: what a struct there gains, loses or moves is no change in Python."""
+    before, count = traced(op)[0], len(getattr(_C, names))
+    monkeypatch.setattr(_C, names, getattr(_C, names)[::-1])
+    reversed_ = [member for first in range(0, len(before), count) for member in before[first : first + count][::-1]]
+    assert traced(op)[0] == reversed_ != before
+
+
+def test_tracing_has_widths_of_rows_from_the_extension(monkeypatch):
+    monkeypatch.setitem(_C.WIDTHS, "splats", 17)
+    assert traced("bin")[1][_C.LISTS.index("splats")].shape[1] == 17
+    monkeypatch.setitem(_C.WIDTHS, "partials", 5)
+    image = torch.rand(3, 9, 8)
+    with FakeTensorMode(allow_non_fake_inputs=True) as mode:
+        _, saved = torch.ops.analytic_rasterizer.ssim_map(mode.from_tensor(image), mode.from_tensor(image), True)
+    assert saved[0].shape == (5, 3, 9, 8)
 
 
 def test_opcheck_of_bin_in_a_large_image(device):
