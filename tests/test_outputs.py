@@ -13,7 +13,7 @@ from analytic_rasterizer import _C
 from analytic_rasterizer.losses import l1_ssim, ssim
 
 VARIANTS = [*PATHS, ("box", {"samples": 16}), ("moment", {"samples": 16}), *((f, {}) for f in REFERENCE_FOOTPRINTS)]
-IMAGES = ar.Effects(**dict.fromkeys(("alpha", "depth", "inverse_depth"), True))
+IMAGES = ar.Effects(**dict.fromkeys(_C.IMAGES, True))
 EVERYTHING = replace(IMAGES, median_depth=True, dominant_index=True, gaussian_stats=True)
 HANDED_ON = ("saved", "lists")
 """Results that ops make for each other. On CUDA they have room that nothing is written to."""
