@@ -354,6 +354,31 @@ def test_long_lists_of_moving_samples_in_large_images(samples, channels):
     assert_identical(run(scene, settings, "cuda"), run(scene, settings, "cuda"))
 
 
+@pytest.mark.parametrize("variant", RENDERED, ids=name_of)
+@pytest.mark.parametrize("size", [40, 1040])
+def test_the_backward_pass_composites_what_the_forward_pass_did(variant, size):
+    """Both passes compute alphas, which have to be the same bits: a splat that one composites and the other does not
+    would add 1/255 of a pixel. The gradient of a colour is how much its splat shows, which pictures of it alone say."""
+    camera = replace(CAMERA, image_height=size, image_width=size, bg=(0.0, 0.0, 0.0))
+    scene = scenes.cast(scenes.random_scene(3, 60, opacity=(0.01, 0.9), sigma=(0.01, 0.2)), torch.float32, "cuda")
+    del scene["shs"], scene["means2D"]
+    rasterizer = ar.GaussianRasterizer(settings_for(variant, camera, "cuda"))
+    means2d = torch.zeros_like(scene["means3D"])
+    colors = torch.ones(60, 3, device="cuda", requires_grad=True)
+    rasterizer(means2D=means2d, colors_precomp=colors, **scene)[0][0].double().sum().backward()
+    shown = []
+    for first in range(0, 60, 3):
+        alone = torch.zeros(60, 3, device="cuda")
+        alone[first : first + 3] = torch.eye(3, device="cuda")
+        with torch.no_grad():
+            image = rasterizer(means2D=means2d, colors_precomp=alone, **scene)[0]
+        shown += image.double().sum((1, 2)).tolist()
+    difference = colors.grad[:, 0].double().cpu() - torch.tensor(shown)
+    assert max(shown) > 1
+    # Rounding: a few thousand additions of float32 at most, each of a part of the sum.
+    assert (difference.abs() <= 1e-5 * torch.tensor(shown) + 1e-5).all()
+
+
 def launched_kernels(run):
     """(what run() returns, the kernels of blending that it launches, without their template arguments)."""
     _C.record_kernels(True)
