@@ -38,18 +38,33 @@ def test_the_cuda_ops_compile(tmp_path):
     assert done.returncode == 0, done.stderr[-4000:]
 
 
+def kernels_of(folder):
+    """(name without "_kernel", body) of every kernel in a folder of csrc/cuda, and in the folders below it."""
+    texts = [path.read_text() for path in sorted((ROOT / "csrc" / "cuda" / folder).rglob("*.cu*"))]
+    kernels = [kernel for text in texts for kernel in re.split(r"\b__global__\b", text)[1:]]
+    return [(re.search(r"\b(\w+)_kernel\(", kernel)[1], kernel[kernel.index("{") + 1 :]) for kernel in kernels]
+
+
 def test_kernels_begin_by_waiting():
     """They are launched before those ahead of them have ended (csrc/cuda/launch.cuh). One works beside those that let
     it begin, the first of which must have waited before."""
-    texts = [path.read_text() for path in sorted((ROOT / "csrc" / "cuda").rglob("*.cu*"))]
-    kernels = [kernel for text in texts for kernel in re.split(r"\b__global__\b", text)[1:]]
     begins = {}
-    for kernel in kernels:
-        lines = re.sub(r" *//.*", "", kernel[kernel.index("{") + 1 :]).split("\n")
-        begins[re.search(r"\b(\w+)_kernel\(", kernel)[1]] = [line.strip() for line in lines if line.strip()][:2]
+    kernels = kernels_of("")
+    for name, body in kernels:
+        lines = re.sub(r" *//.*", "", body).split("\n")
+        begins[name] = [line.strip() for line in lines if line.strip()][:2]
     assert len(begins) == len(kernels) > 30
     wait, let_begin = "wait_for_earlier_kernels();", "let_next_kernel_begin();"
     assert begins.pop("filter") == [wait, let_begin]
     assert begins.pop("listed_blend") == [let_begin, wait]
     assert begins.pop("moving_blend")[0] == "if (begin_beside_earlier_kernels(beside)) return;"
     assert [name for name, lines in begins.items() if lines[0] != wait or let_begin in lines] == []
+
+
+def test_the_table_of_dispatch_names_the_kernels_of_the_three_families():
+    """Route::forward and Route::backward of csrc/cuda/dispatch.h; tests/cpp/cuda_on_host/dispatch_test.cpp tests the
+    rest of the table."""
+    table = (ROOT / "csrc" / "cuda" / "dispatch.h").read_text()
+    named = re.findall(r'"(\w+)_kernel"', table)
+    assert len(named) > 10
+    assert set(named) == {name for family in ("still", "moment", "channels") for name, _ in kernels_of(family)}

@@ -9,8 +9,8 @@
 #include <gtest/gtest.h>
 
 #include "cuda/bin.cuh"
-#include "cuda/tile.cuh"
 #include "cuda/splat_tiles.cuh"
+#include "cuda/tile.cuh"
 
 namespace ar::cuda {
 namespace {

@@ -16,6 +16,8 @@ namespace {
 constexpr int kWidth = 27, kHeight = 21;
 /// Pixels in a row and in a column of an image that has no other part, and of one in which fronts are long.
 constexpr int kSmallSide[] = {kWidth, kHeight}, kLargeSide[] = {400, 400};
+/// Blocks that the device works on at once.
+constexpr int kManyBlocks = kBlocksPerSm * cuda_on_host::kMultiprocessors;
 
 /// `count` random splats, all of which every tile lists. They are up to `beyond` px off the image.
 template <class F> std::vector<Splat<F, float>> make_splats(int count, float most_opaque, float beyond) {
@@ -55,10 +57,10 @@ template <class F> Image expected_image(const std::vector<Splat<F, float>>& spla
     list.x0 = x / side * side, list.y0 = y / side * side;
     double color[3] = {}, through = 0;
     for (int s = 0; s < S; ++s) {
-      const Vec2<float> place = place_in_tile<F>(x - list.x0, y - list.y0, s);
+      const Vec2<float> position = position_in_tile<F>(x - list.x0, y - list.y0, s);
       float transmittance = 1;
       for (size_t k = 0; k < splats.size(); ++k) {
-        const float raw = F::alpha(tile_terms(splats[k], list), place, sample_number<F>(s));
+        const float raw = F::alpha(tile_terms(splats[k], list), position, sample_number<F>(s));
         const Blended<float> b = blend_sample(raw, transmittance);
         if (!b.mask) continue;
         const Vec3<float>& c = splats[k].color;
@@ -76,11 +78,11 @@ template <class F> Image expected_image(const std::vector<Splat<F, float>>& spla
 
 /// What the kernels make. Only the first tiles have lists.
 template <class F, bool kKeep> Image blended_image(const std::vector<Splat<F, float>>& splats, const int (&sides)[2]) {
-  constexpr int S = F::kSamples, kLength = chunk_length(S);
+  constexpr int S = F::kSamples;
   const TileGrid grid = grid_for<F>(sides[0], sides[1]);
   Image out(sides, kPixelSamples<F>);
-  const int tiles = int(grid.tiles()), count = int(splats.size()), chunks = (count + kLength - 1) / kLength;
-  std::vector<int32_t> pairs, order, planes(tiles), open(tiles), open_tiles(kSampleClasses * tiles);
+  const int tiles = int(grid.tiles()), count = int(splats.size()), chunks = (count + kChunkLength - 1) / kChunkLength;
+  std::vector<int32_t> pairs, order, planes(tiles), open(tiles), open_tiles(tiles);
   std::vector<int64_t> offsets = {0};
   std::vector<TileChunk> tail;
   PlanState state = {};
@@ -94,7 +96,7 @@ template <class F, bool kKeep> Image blended_image(const std::vector<Splat<F, fl
     }
     offsets.push_back(int64_t(pairs.size()));
   }
-  const int front = front_chunks(grid, int64_t(pairs.size()), S);
+  const int front = front_chunks(grid, int64_t(pairs.size()), kManyBlocks);
   for (int tile : order) {
     planes[tile] = state.counts.planes;
     state.counts.planes += p.layout.tile_planes(front, S, chunks);
@@ -115,14 +117,15 @@ template <class F, bool kKeep> Image blended_image(const std::vector<Splat<F, fl
   p.plan.tile_order = order.data();
   p.plan.tile_planes = planes.data();
   p.plan.tail = tail.data();
+  p.plan.blocks_at_once = kManyBlocks;
   p.tile_open = open.data();
   p.open_tiles = open_tiles.data();
   p.checkpoints = checkpoints.data();
   cuda_on_host::launch(int(order.size()), kBlendThreads, [&] { blend_front_kernel<F, 3, kKeep>(p); });
   cuda_on_host::launch(3, kBlendThreads, [&] { tail_through_kernel<F>(p); });
-  cuda_on_host::launch(3, 32, [&] { tail_scan_kernel<S>(p); });
+  cuda_on_host::launch(3, 32, [&] { tail_scan_kernel(p, S); });
   cuda_on_host::launch(3, kBlendThreads, [&] { tail_blend_kernel<F, 3, kKeep>(p); });
-  cuda_on_host::launch(3, kTailSumThreads, [&] { tail_sum_kernel<F, 3, kKeep>(p); });
+  cuda_on_host::launch(3, kTailSumThreads, [&] { tail_sum_kernel<LaneSamples<S, F::kLanes>, 3, kKeep>(p); });
   return out;
 }
 
@@ -143,41 +146,38 @@ void expect_blended(int count, float most_opaque, bool exact, float beyond = 4, 
 }
 
 template <class F> void expect_front_and_tail() {
-  constexpr int kLength = chunk_length(F::kSamples);
   // Samples stop, in the front.
-  expect_blended<F, true>(kLength - 3, 0.9f, true);
-  expect_blended<F, false>(kLength - 3, 0.9f, true);
+  expect_blended<F, true>(kChunkLength - 3, 0.9f, true);
+  expect_blended<F, false>(kChunkLength - 3, 0.9f, true);
   expect_blended<F, true>(5, 0.9f, true);
   // None stops, so that no rounding decides where, and the tail has all the other chunks.
-  expect_blended<F, true>(3 * kLength + 70, 0.02f, false);
-  expect_blended<F, false>(3 * kLength + 70, 0.02f, false);
+  expect_blended<F, true>(3 * kChunkLength + 70, 0.02f, false);
+  expect_blended<F, false>(3 * kChunkLength + 70, 0.02f, false);
 }
 
 TEST(BlendKernels, OneSample) { expect_front_and_tail<GaussianPixels<1>>(); }
 TEST(BlendKernels, ManyChunks) {
   using F = GaussianPixels<1>;
-  constexpr int kCount = 70 * chunk_length(1) + 1;
+  constexpr int kCount = 70 * kChunkLength + 1;
   expect_blended<F, true>(kCount, 0.02f, false, 80);
   expect_blended<F, false>(kCount, 0.02f, false, 80);
 }
 TEST(BlendKernels, FrontsOfSeveralChunks) {
   const auto expect_long_front = [](auto f) {
     using F = decltype(f);
-    constexpr int kLength = chunk_length(F::kSamples);
     const TileGrid grid = grid_for<F>(kLargeSide[0], kLargeSide[1]);
-    const int front = front_chunks(grid, 0, F::kSamples) * kLength;
-    ASSERT_GT(front, kLength);
-    for (const int count : {front - 3, front + 2 * kLength + 70}) {
+    const int front = front_chunks(grid, 0, kManyBlocks) * kChunkLength;
+    ASSERT_GT(front, kChunkLength);
+    for (const int count : {front - 3, front + 2 * kChunkLength + 70}) {
       expect_blended<F, true>(count, 0.02f, false, 80, kLargeSide);
       expect_blended<F, false>(count, 0.02f, false, 80, kLargeSide);
     }
   };
   expect_long_front(GaussianPixels<1>());
-  expect_long_front(GaussianPixels<2>());
+  expect_long_front(GaussianPixels<4>());
   expect_long_front(GaussianSample<4>());
 }
-TEST(BlendKernels, TwoSamples) { expect_front_and_tail<GaussianPixels<2>>(); }
-TEST(BlendKernels, EightSamples) { expect_blended<GaussianPixels<8>, true>(40, 0.9f, true); }
+TEST(BlendKernels, FourSamplesInALane) { expect_front_and_tail<GaussianPixels<4>>(); }
 TEST(BlendKernels, SamplesSpreadOverLanes) {
   expect_front_and_tail<GaussianSample<4>>();
   expect_front_and_tail<GaussianSample<16>>();

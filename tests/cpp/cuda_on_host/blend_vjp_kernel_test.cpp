@@ -14,7 +14,6 @@ namespace ar::cuda {
 namespace {
 
 constexpr int kWidth = 4 * kTile - 3, kHeight = 3 * kTile - 5, kPixels = kWidth * kHeight;
-constexpr int kOthers = 2;  ///< chunks in front of those of the kernel's samples
 
 std::vector<float> random_numbers(std::mt19937& bits, size_t count, float low, float high) {
   std::vector<float> numbers(count);
@@ -32,14 +31,11 @@ template <int S> struct ProjectedFor<GaussianPixels<S>> {
 template <int S> struct ProjectedFor<GaussianSample<S>> {
   using Footprint = Box<S>;
 };
-template <int S> struct ProjectedFor<AdaptiveBoxVjp<S>> {
-  using Footprint = Adaptive;
-};
 
 /// Random inputs of the kernel for C channels. The state that a forward pass would have left is random too. `overflow`:
 /// all tiles share one list, of one chunk, and add to a row per splat.
 template <class F, int C> struct Scene {
-  static constexpr int S = F::kSamples, kLength = chunk_length(S);
+  static constexpr int S = F::kSamples;
   static constexpr TileGrid kGrid = grid_for<F>(kWidth, kHeight);
 
   std::vector<Splat<F, float>> splats;
@@ -55,18 +51,17 @@ template <class F, int C> struct Scene {
 
   Scene(MeanSums mean_sums, bool overflow) {
     std::mt19937 bits(7);
-    const int count = overflow ? 40 : kLength + 60, tiles = int(kGrid.tiles());
+    const int count = overflow ? 40 : kChunkLength + 60, tiles = int(kGrid.tiles());
     using Projected = typename ProjectedFor<F>::Footprint;
     const auto prepare = [](const Cov2d<float>& cov) { return Projected::prepare(cov, {}); };
     for (const auto& splat : random_splats<Projected>(bits, count, kGrid, -1, 3, 0.9f, prepare))
       splats.push_back({splat.mean, splat.shape, splat.opacity, splat.level, splat.color});
-    for (int k = 0; k < kOthers; ++k) chunks.push_back({k, 0, 0});
     int planes = 0;
     for (int tile = 0; tile < tiles; ++tile) {
-      const int length = overflow ? count : tile % 4 == 1 ? kLength + 10 + tile : 5 * tile % 37;
+      const int length = overflow ? count : tile % 4 == 1 ? kChunkLength + 10 + tile : 5 * tile % 37;
       for (int k = 0; k < length; ++k) pairs.push_back({(k + tile) % count, int32_t(pairs.size())});
       offsets.push_back(int64_t(pairs.size()));
-      for (int chunk = 0; chunk * kLength < length; ++chunk, planes += (C + 1) * S) {
+      for (int chunk = 0; chunk * kChunkLength < length; ++chunk, planes += (C + 1) * S) {
         chunks.push_back({tile, chunk, planes});
       }
     }
@@ -109,32 +104,30 @@ template <class F, int C> struct Scene {
     return C != 3 ? channels[size_t(splat) * C + c] : c == 0 ? color.x : c == 1 ? color.y : color.z;
   }
 
-  /// Runs `blocks` blocks, or those that it takes where warps share a chunk, for chunks [first, end) and adds to
-  /// `sums`. Returns how often a warp asked for a chunk.
+  /// Runs `blocks` blocks for chunks [first, end) and adds to `sums`. Returns how often a warp asked for a chunk.
   template <Sums kSums> int run(int blocks, int first, int end, std::vector<float>& sums) {
-    if (!kTakesChunks<F, kSums>) blocks = end - first;
-    for (int c = 0; c <= kSampleClasses; ++c) plan.counts.chunks.first[c] = c > sample_class(S) ? end : first;
-    int32_t taken[kSampleClasses] = {};
-    params.chunks_taken = taken;
+    static_assert(sizeof(VjpShared<F, C>) <= sizeof dynamic_memory);
+    plan.counts.chunks = end;
+    int32_t taken = first;
+    params.chunks_taken = &taken;
     params.pair_grads = sums.data();
     for (float4& numbers : dynamic_memory) numbers = {NAN, NAN, NAN, NAN};
-    cuda_on_host::launch(blocks, 32 * kVjpWarps<F, kSums>, [&] { blend_vjp_kernel<F, C, kSums>(params); });
-    return taken[sample_class(S)];
+    cuda_on_host::launch(blocks, 32 * vjp_warps(S), [&] { blend_vjp_kernel<F, C, kSums>(params); });
+    return taken - first;
   }
 };
 
 template <class F, Sums kSums> void expect_the_same_from_few_warps(bool overflow) {
   SCOPED_TRACE(testing::Message() << F::kSamples << " samples, Sums " << int(kSums) << ", overflow " << overflow);
-  static_assert(kTakesChunks<F, kSums>);
-  constexpr int kBlocks = 2, kWarps = kBlocks * kVjpWarps<F, kSums>;
+  constexpr int kBlocks = 2, kWarps = kBlocks * vjp_warps(F::kSamples);
   constexpr int kColumns = kSums == Sums::kGrads ? kPairMeans : kPairMeans + 2;
   Scene<F, 3> scene(kSums == Sums::kGrads ? MeanSums::kNone : MeanSums::kNorm, overflow);
   const int end = int(scene.chunks.size());
-  ASSERT_GT(end - kOthers, kWarps);
+  ASSERT_GT(end, kWarps);
   const size_t numbers = size_t(scene.rows) * kPairGradWidth;
   // A warp for every chunk: a row of a pair is written by one of them and 0 in the others.
   std::vector<double> expected(numbers), size(numbers);
-  for (int chunk = kOthers; chunk < end; ++chunk) {
+  for (int chunk = 0; chunk < end; ++chunk) {
     std::vector<float> sums(numbers);
     scene.template run<kSums>(1, chunk, chunk + 1, sums);
     for (size_t i = 0; i < numbers; ++i) expected[i] += sums[i], size[i] += std::abs(sums[i]);
@@ -142,7 +135,7 @@ template <class F, Sums kSums> void expect_the_same_from_few_warps(bool overflow
   ASSERT_GT(*std::max_element(size.begin(), size.end()), 0);
   std::vector<float> sums(numbers, overflow ? 0 : NAN);
   // Every chunk once, and every warp once more, to find that none is left.
-  EXPECT_EQ(scene.template run<kSums>(kBlocks, kOthers, end, sums), end - kOthers + kWarps);
+  EXPECT_EQ(scene.template run<kSums>(kBlocks, 0, end, sums), end + kWarps);
   for (size_t i = 0; i < numbers; ++i) {
     if (int(i % kPairGradWidth) >= kColumns) continue;
     // What tiles add to a row is added in another order: a rounding for each of them.
@@ -181,20 +174,17 @@ template <class F> struct ListedTerms {
 ///
 /// Each sample's terms are worked out by themselves, in the order of the kernel's operations as far as it is theirs, by
 /// numbers that bound their errors. What adding them does to the kernel's sums is counted in Rounded::summed(): in a
-/// lane those over S samples and eight pixels; then those over 32 lanes, in five steps, and over the warps that share a
-/// chunk. collect() comes between the two and is linear. So its roundings for a lane are no larger than those for the
-/// lane's terms one by one, and what was rounded in its arguments goes through it with these.
+/// lane those over S samples and eight pixels; then those over 32 lanes, in five steps.
 template <class F, int C> std::vector<Sum> expected_sums(const Scene<F, C>& scene) {
-  constexpr int S = F::kSamples, kLength = chunk_length(S);
-  constexpr int kInLane = (kSubtiles + 1) * S, kAcross = 5 + kVjpGroup<F, Sums::kGrads>;
+  constexpr int kInLane = (kSubtiles + 1) * F::kSamples, kAcross = 5;
   constexpr TileGrid kGrid = Scene<F, C>::kGrid;
   constexpr int kAll = kPixelSamples<F>, kSide = 1 << kGrid.tile_bits;
   const Vec2<Rounded> image_size = {double(kWidth), double(kHeight)};
   std::vector<Sum> out(size_t(scene.rows) * kPairGradWidth);
-  for (size_t item = kOthers; item < scene.chunks.size(); ++item) {
+  for (size_t item = 0; item < scene.chunks.size(); ++item) {
     const auto [tile, chunk, plane] = scene.chunks[item];
-    const int x0 = tile % kGrid.columns() * kSide, y0 = tile / kGrid.columns() * kSide, begin = chunk * kLength;
-    const int end = std::min(int(scene.offsets[tile + 1] - scene.offsets[tile]), begin + kLength);
+    const int x0 = tile % kGrid.columns() * kSide, y0 = tile / kGrid.columns() * kSide, begin = chunk * kChunkLength;
+    const int end = std::min(int(scene.offsets[tile + 1] - scene.offsets[tile]), begin + kChunkLength);
     std::vector<ListedTerms<F>> listed;
     for (int k = begin; k < end; ++k) {
       const auto& [id, row] = scene.pairs[scene.offsets[tile] + k];
@@ -219,8 +209,8 @@ template <class F, int C> std::vector<Sum> expected_sums(const Scene<F, C>& scen
       Rounded g[C], transmittance[kAll], behind[kAll];
       for (int c = 0; c < C; ++c) g[c] = scale * scene.dL_dimage[c * kPixels + i];
       for (int s = 0; s < kAll; ++s) {
-        const int place = sample_number<F>(s) * kTilePixels + lane_place<F>(x, y, s);
-        const float* checkpoint = &scene.checkpoints[size_t(plane) * kTilePixels + place * (C + 1)];
+        const int sample = sample_number<F>(s) * kTilePixels + lane_of_sample<F>(x, y, s);
+        const float* checkpoint = &scene.checkpoints[size_t(plane) * kTilePixels + sample * (C + 1)];
         const Rounded at_end = scene.transmittance[s * kPixels + i];
         const float* colors = final ? scene.background.data() : checkpoint;
         transmittance[s] = final ? at_end : Rounded(checkpoint[C]);
@@ -240,31 +230,22 @@ template <class F, int C> std::vector<Sum> expected_sums(const Scene<F, C>& scen
         bool shown = false;
         for (int s = 0; s < kAll; ++s) {
           const int number = sample_number<F>(s);
-          const Vec2<float> in_place = place_in_tile<F>(x, y, s);
-          const float in_float = F::alpha(listed_splat.in_float, in_place, number);
+          const Vec2<float> position = position_in_tile<F>(x, y, s);
+          const float in_float = F::alpha(listed_splat.in_float, position, number);
           if (in_float < float(kAlphaMin) || k >= scene.last[s * kPixels + i]) continue;
           shown = true;
-          const Vec2<Rounded> at = {double(in_place.x), double(in_place.y)};
+          const Vec2<Rounded> at = {double(position.x), double(position.y)};
           const Rounded raw = F::alpha(terms, at, number);
           const auto grad = blend_sample_vjp<Rounded>({true}, raw, g_color, transmittance[s], behind[s]);
           ShapeGrad<Rounded> of_sample = {};
           F::add_alpha_vjp(terms, at, number, grad.of_alpha, of_sample);
           F::add_alpha_vjp(terms, at, number, grad.of_alpha, of_pixel);
-          const auto in_lane = [](Rounded number) { return number.summed(kInLane); };
-          const Rounded weighted = in_lane(grad.of_alpha.weighted);
-          const ShapeGrad<Rounded> shape =
-              F::collect(terms,
-                         ShapeGrad<Rounded>{
-                             {in_lane(of_sample.offset.x), in_lane(of_sample.offset.y)},
-                             {in_lane(of_sample.shape.xx), in_lane(of_sample.shape.xy), in_lane(of_sample.shape.yy)}},
-                         weighted);
-          const Rounded values[] = {shape.offset.x, shape.offset.y, shape.shape.xx,
-                                    shape.shape.xy, shape.shape.yy, weighted};
-          for (int v = 0; v < kPairChannels; ++v) sums[v].add(values[v].summed(kAcross));
-          for (int c = 0; c < C; ++c) {
-            const Rounded of_channel = in_lane(grad.contribution * g[c]);
-            sums[c == 3 ? kPairFourthChannel : kPairChannels + c].add(of_channel.summed(kAcross));
-          }
+          const Rounded values[] = {of_sample.offset.x, of_sample.offset.y, of_sample.shape.xx,
+                                    of_sample.shape.xy, of_sample.shape.yy, grad.of_alpha.weighted};
+          const auto summed = [&](Rounded term) { return term.summed(kInLane).summed(kAcross); };
+          for (int v = 0; v < kPairChannels; ++v) sums[v].add(summed(values[v]));
+          for (int c = 0; c < C; ++c)
+            sums[c == 3 ? kPairFourthChannel : kPairChannels + c].add(summed(grad.contribution * g[c]));
         }
         if (!shown || scene.params.mean_sums == MeanSums::kNone) continue;
         const Vec2<Rounded> means = mean_sums_of(scene.params.mean_sums, image_size,
@@ -283,13 +264,10 @@ template <class F, int C> void expect_sums_of_pixels(MeanSums mean_sums) {
   Scene<F, C> scene(mean_sums, false);
   std::vector<float> sums(size_t(scene.rows) * kPairGradWidth, NAN);
   const int end = int(scene.chunks.size());
-  if constexpr (kVjpGroup<F, Sums::kGrads> > 1) {  // as blend_vjp_few
-    scene.template run<Sums::kGrads>(2, kOthers, end, sums);
-    if (with_means) scene.template run<Sums::kMeans>(2, kOthers, end, sums);
-  } else if (with_means) {
-    scene.template run<Sums::kBoth>(2, kOthers, end, sums);
+  if (with_means) {
+    scene.template run<Sums::kBoth>(2, 0, end, sums);
   } else {
-    scene.template run<Sums::kGrads>(2, kOthers, end, sums);
+    scene.template run<Sums::kGrads>(2, 0, end, sums);
   }
   const std::vector<Sum> expected = expected_sums(scene);
   int compared = 0;
@@ -310,14 +288,12 @@ template <class F, int C> struct Kernel {
   static constexpr int kChannels = C;
 };
 template <class K> class BlendVjpSums : public testing::Test {};
-/// What a warp holds and shares out differs among them (blend_vjp_layout.cuh), and what it sums.
+/// What a lane has in registers (still/vjp_pixels.cuh) differs among them, and what it sums.
 using Kernels =
-    testing::Types<Kernel<GaussianPixels<1>, 3>, Kernel<GaussianPixels<1>, 4>, Kernel<GaussianPixels<2>, 3>,
-                   Kernel<GaussianPixels<4>, 3>, Kernel<GaussianPixels<4>, 4>, Kernel<GaussianPixels<8>, 3>,
-                   Kernel<GaussianSample<4>, 3>, Kernel<GaussianSample<16>, 3>, Kernel<GaussianSample<4>, 4>,
-                   Kernel<AdaptiveBoxVjp<1>, 3>, Kernel<AdaptiveBoxVjp<1>, 4>, Kernel<AdaptiveBoxVjp<4>, 3>,
-                   Kernel<Cumulant, 3>, Kernel<Cumulant, 4>, Kernel<Analytic<FrameGradient::kFrozen>, 3>,
-                   Kernel<Analytic<FrameGradient::kFrozen>, 4>>;
+    testing::Types<Kernel<GaussianPixels<1>, 3>, Kernel<GaussianPixels<1>, 4>, Kernel<GaussianPixels<4>, 3>,
+                   Kernel<GaussianPixels<4>, 4>, Kernel<GaussianSample<4>, 3>, Kernel<GaussianSample<4>, 4>,
+                   Kernel<GaussianSample<16>, 3>, Kernel<Cumulant, 3>, Kernel<Cumulant, 4>,
+                   Kernel<Analytic<FrameGradient::kFrozen>, 3>, Kernel<Analytic<FrameGradient::kFrozen>, 4>>;
 TYPED_TEST_SUITE(BlendVjpSums, Kernels);
 
 TYPED_TEST(BlendVjpSums, AreThoseOfThePixels) {
@@ -326,11 +302,11 @@ TYPED_TEST(BlendVjpSums, AreThoseOfThePixels) {
     expect_sums_of_pixels<F, TypeParam::kChannels>(mean_sums);
 }
 
-template <class F, int C> void expect_places_of_blend() {
+template <class F, int C> void expect_positions_of_blend() {
   for (int lane = 0; lane < 32; ++lane) {
     uint32_t visited = 0;
-    visit_subtiles<F, C>(0xff, place_of<F>(0, lane), [&](int b, Vec2<float> p) {
-      const Vec2<float> expected = place_of<F>(b, lane);
+    visit_subtiles<F, C>(0xff, position_of<F>(0, lane), [&](int b, Vec2<float> p) {
+      const Vec2<float> expected = position_of<F>(b, lane);
       EXPECT_EQ(p.x, expected.x) << b << " " << lane;
       EXPECT_EQ(p.y, expected.y) << b << " " << lane;
       visited |= 1u << b;
@@ -338,14 +314,16 @@ template <class F, int C> void expect_places_of_blend() {
     EXPECT_EQ(visited, 0xff);
   }
 }
-TEST(BlendVjpPlaces, AreThoseOfBlendToTheBit) {
-  expect_places_of_blend<GaussianPixels<1>, 3>();
-  expect_places_of_blend<GaussianSample<4>, 3>();
-  expect_places_of_blend<GaussianSample<4>, 4>();
-  expect_places_of_blend<GaussianSample<16>, 3>();
-  expect_places_of_blend<GaussianSample<16>, 4>();
-  expect_places_of_blend<AdaptiveBoxVjp<4>, 3>();
-  expect_places_of_blend<AdaptiveBoxVjp<4>, 4>();
+TEST(BlendVjpPositions, AreThoseOfBlendToTheBit) {
+  expect_positions_of_blend<GaussianPixels<1>, 3>();
+  expect_positions_of_blend<GaussianSample<4>, 3>();
+  expect_positions_of_blend<GaussianSample<4>, 4>();
+  expect_positions_of_blend<GaussianSample<16>, 3>();
+  expect_positions_of_blend<GaussianSample<16>, 4>();
+  // In one loop over the subtiles, where they have no code of their own.
+  static_assert(!kUnrollsSubtiles<GaussianPixels<4>, 4> && !kUnrollsSubtiles<Cumulant, 4>);
+  expect_positions_of_blend<GaussianPixels<4>, 4>();
+  expect_positions_of_blend<Cumulant, 4>();
 }
 
 template <class F> class BlendVjpKernel : public testing::Test {};

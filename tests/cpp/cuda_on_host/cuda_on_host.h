@@ -189,6 +189,7 @@ inline float4* dynamic_shared() { return dynamic_memory; }
 // What launches ask about the devices, which are H200s.
 namespace cuda_on_host {
 inline int device = 0;  ///< the current one
+inline constexpr int kMultiprocessors = 132;
 inline std::atomic<int> attributes_asked = 0;
 }  // namespace cuda_on_host
 extern "C" inline cudaError_t cudaGetDevice(int* device) {
@@ -198,7 +199,7 @@ extern "C" inline cudaError_t cudaGetDevice(int* device) {
 extern "C" inline cudaError_t cudaDeviceGetAttribute(int* value, cudaDeviceAttr attribute, int) {
   ++cuda_on_host::attributes_asked;
   *value = attribute == cudaDevAttrMaxSharedMemoryPerBlockOptin ? 227 * 1024
-           : attribute == cudaDevAttrMultiProcessorCount        ? 132
+           : attribute == cudaDevAttrMultiProcessorCount        ? cuda_on_host::kMultiprocessors
                                                                 : 0;
   return cudaSuccess;
 }

@@ -1,6 +1,6 @@
 // The kernels for groups of channels, run on the host: they give what compositing pixel by pixel in float64 gives, in
-// either direction, and the same in groups of 8 and of 32, for lists as a whole, in segments, and of all splats. Sums
-// over the pairs of a splat.
+// either direction, and the same in groups of 8 and of 32, for lists of tiles and for a list of all splats. Sums over
+// the pairs of a splat.
 #include "cuda_on_host.h"
 // After it: kernels.
 #include <gtest/gtest.h>
@@ -57,12 +57,10 @@ struct Results {
 struct Way {
   int width = kSmallGroup;  ///< of a group of no more than kSmallGroup channels
   MeanSums mean_sums = MeanSums::kNone;
-  int segments = 1;
   bool overflow = false;  ///< there is no room for a list of each tile
 };
 
 template <class F> struct Run {
-  static constexpr int S = F::kSamples;
   static constexpr TileGrid kGrid = Scene<F>::kGrid;
 
   const Scene<F>& scene;
@@ -77,8 +75,7 @@ template <class F> struct Run {
   Counts counts = scene.counts;
   std::vector<int32_t> order;
   std::vector<TileChunk> chunks;
-  std::vector<float> checkpoints, transmittances, sums, shown, pair_grads, channel_sums;
-  std::vector<int32_t> planes;
+  std::vector<float> pair_grads, channel_sums;
 
   Run(const Scene<F>& scene, Way way) : scene(scene), way(way) {
     out.image.resize(scene.channels * kPixels);
@@ -88,7 +85,7 @@ template <class F> struct Run {
     out.shapes.assign(count, std::vector<float>(kShapeSums));
     out.channels.assign(count, std::vector<float>(scene.channels));
     for (int tile = 0; tile < tiles; ++tile) order.push_back(tile), chunks.push_back({tile, 0, 0});
-    for (int c = 0; c <= kSampleClasses; ++c) state.counts.chunks.first[c] = c > sample_class(S) ? tiles : 0;
+    state.counts.chunks = tiles;
     blend.grid = vjp.grid = kGrid;
     blend.splats = vjp.splats = &scene.splats[0].mean.x;
     blend.channels = vjp.channels = {scene.rows.data(), scene.channels, nullptr, scene.channels};
@@ -108,7 +105,6 @@ template <class F> struct Run {
     vjp.chunk_order = chunks.data();
     vjp.mean_sums = way.mean_sums;
     forward();
-    if (way.segments > 1) in_segments();
     backward();
   }
 
@@ -133,57 +129,12 @@ template <class F> struct Run {
     });
   }
 
-  /// Blends again, in segments: `last` is known, and so is the transmittance between chunks.
-  void in_segments() {
-    const int length = chunk_length(S), of_tile = (count + length - 1) / length;
-    checkpoints.assign(size_t(tiles) * of_tile * S * 4 * kTilePixels, NAN);
-    BlendParams cut = blend;
-    cut.layout = {3, true};
-    cut.checkpoints = checkpoints.data();
-    for (int tile = 0; tile < tiles; ++tile) planes.push_back(tile * of_tile * S * 4);
-    cut.plan.tile_planes = planes.data();
-    for (int tile = 0; tile < tiles; ++tile) {
-      for (int t = 0; t < kTilePixels; ++t) {
-        const TileList list = list_of(blend.lists, kGrid, tile);
-        const Vec2<float> p = place_of<F>(t / 32, t % 32);
-        for (int s = 0; s < S; ++s) {
-          float transmittance = 1;
-          for (int k = 0; k < count; ++k) {
-            const Splat<F, float>& splat = scene.splats[k];
-            const float raw =
-                subtile_reach<F>(splat, list.x0, list.y0) >> t / 32 & 1 ? F::alpha(tile_terms(splat, list), p, s) : 0;
-            blend_sample(raw, transmittance);
-            if ((k + 1) % length > 0) continue;
-            auto* kept = reinterpret_cast<Checkpoint<3>*>(&checkpoints[size_t(planes[tile]) * kTilePixels]);
-            kept[(k / length * S + s) * kTilePixels + t].transmittance = transmittance;
-          }
-        }
-      }
-    }
-    const size_t all = size_t(tiles) * way.segments * kTilePixels;
-    transmittances.assign(all * S, NAN);
-    shown.assign(all * S, NAN);
-    sums.assign(all * kChannelGroup, NAN);
-    blend.segments = {way.segments, S, transmittances.data(), sums.data(), shown.data()};
-    vjp.segments = blend.segments;
-    out.image.assign(out.image.size(), NAN);
-    for_each_group([&](auto width, int first) {
-      cuda_on_host::launch(tiles * way.segments, kBlendThreads,
-                           [&] { segment_blend_kernel<F, width()>(blend, cut, first); });
-      cuda_on_host::launch(tiles, kTilePixels, [&] { segment_sum_kernel<F>(blend, first, width()); });
-    });
-  }
-
-  template <int C, int kShapeGroups> void backward(int first) {
-    const int blocks = tiles * way.segments;
-    for (int i = 0; way.segments > 1 && i < kShapeGroups; ++i)
-      cuda_on_host::launch(blocks, kBlendThreads, [&] { segment_shown_kernel<F, C>(vjp, first + i * C, i > 0); });
-    static_assert(sizeof(GroupVjpShared<F, C, kShapeGroups>) <= sizeof dynamic_memory);
-    cuda_on_host::launch(blocks, kBlendThreads, [&] { blend_groups_vjp_kernel<F, C, kShapeGroups>(vjp, first); });
+  template <int C, bool kWithShape> void backward(int first) {
+    static_assert(sizeof(GroupVjpShared<F, C>) <= sizeof dynamic_memory);
+    cuda_on_host::launch(tiles, kBlendThreads, [&] { blend_groups_vjp_kernel<F, C, kWithShape>(vjp, first); });
   }
 
   void backward() {
-    vjp.segments.count = way.segments;
     const size_t rows = way.overflow ? count : scene.pairs.size();
     // With a row for each splat all tiles add to it; otherwise every row must be written.
     const float start = way.overflow ? 0 : NAN;
@@ -193,15 +144,10 @@ template <class F> struct Run {
     vjp.pair_grads = pair_grads.data();
     for_each_group([&](auto width, int first) {
       if (way.overflow) channel_sums.assign(rows * width(), 0);
-      switch (shape_groups<F>(vjp, first)) {
-        case 0:
-          backward<width(), 0>(first);
-          break;
-        case 1:
-          backward<width(), 1>(first);
-          break;
-        default:
-          if constexpr (width() == kChannelGroup) backward<width(), 2>(first);
+      if (way.mean_sums == MeanSums::kNone || first == 0) {
+        backward<width(), true>(first);
+      } else {
+        backward<width(), false>(first);
       }
       for (size_t row = 0; row < rows; ++row) {
         const int c_end = std::min(scene.channels - first, int(width()));
@@ -245,7 +191,7 @@ template <class F> Results reference(const Scene<F>& scene, MeanSums mean_sums) 
       const auto terms = terms_of(k);
       for (int s = 0; s < S; ++s) {
         const Blended<double> b =
-            blend_sample(F::alpha(terms, sample_place<F>(p, s), sample_number<F>(s)), transmittance[s]);
+            blend_sample(F::alpha(terms, sample_position<F>(p, s), sample_number<F>(s)), transmittance[s]);
         hits[k][s] = b.mask;
         for (int c = 0; c < scene.channels; ++c) image[c] += b.contribution * scene.rows[k * scene.channels + c] / S;
       }
@@ -265,9 +211,9 @@ template <class F> Results reference(const Scene<F>& scene, MeanSums mean_sums) 
         g_color += scene.dL_dimage[c * kPixels + i] / double(S) * scene.rows[k * scene.channels + c];
       ShapeGrad<double> sums = {{0, 0}, {0, 0, 0}};
       for (int s = 0; s < S; ++s) {
-        const double alpha = F::alpha(terms, sample_place<F>(p, s), sample_number<F>(s));
+        const double alpha = F::alpha(terms, sample_position<F>(p, s), sample_number<F>(s));
         const BlendGrad<double> grad = blend_sample_vjp(bool(hits[k][s]), alpha, g_color, transmittance[s], behind[s]);
-        F::add_alpha_vjp(terms, sample_place<F>(p, s), sample_number<F>(s), grad.of_alpha, sums);
+        F::add_alpha_vjp(terms, sample_position<F>(p, s), sample_number<F>(s), grad.of_alpha, sums);
         contribution += grad.contribution;
         weighted += grad.of_alpha.weighted;
       }
@@ -277,7 +223,6 @@ template <class F> Results reference(const Scene<F>& scene, MeanSums mean_sums) 
         const Vec2<double> size = {kWidth, kHeight};
         means = mean_sums_of(mean_sums, size, transform_transposed(F::mean_map(shape_of(k)), sums.offset));
       }
-      sums = F::collect(terms, sums, weighted);
       const double values[] = {sums.offset.x, sums.offset.y, sums.shape.xx, sums.shape.xy,
                                sums.shape.yy, weighted,      means.x,       means.y};
       for (int v = 0; v < kShapeSums; ++v) shapes[k][v] += values[v];
@@ -334,15 +279,15 @@ TYPED_TEST(GroupKernels, GiveTheSameBitsOfImagesInGroupsOf8AndOf32) {
   expect_near(of_8, of_32);
 }
 
-TYPED_TEST(GroupKernels, GiveTheSameInSegments) {
+TYPED_TEST(GroupKernels, GiveWhatCompositingGivesInSeveralBatches) {
   using F = TypeParam;
   const Scene<F> scene(262, F::kSamples > 1 ? 40 : 72, 0.05f, -0.8f);
-  Way whole, segments;
-  if (F::kSamples > 1) whole.mean_sums = segments.mean_sums = MeanSums::kNorm;
-  segments.segments = 2;
-  const Results results = Run<F>(scene, whole).out;
-  EXPECT_GT(*std::max_element(results.last.begin(), results.last.end()), chunk_length(F::kSamples));
-  expect_near(Run<F>(scene, segments).out, results);
+  ASSERT_GT(scene.splats.size(), 2 * kGroupBatch);
+  Way way;
+  if (F::kSamples > 1) way.mean_sums = MeanSums::kNorm;
+  const Results results = Run<F>(scene, way).out;
+  EXPECT_GT(*std::max_element(results.last.begin(), results.last.end()), 2 * kGroupBatch);
+  expect_near(results, reference(scene, way.mean_sums));
 }
 
 TYPED_TEST(GroupKernels, GiveTheSameWithARowForEverySplat) {

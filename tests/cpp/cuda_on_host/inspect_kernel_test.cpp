@@ -3,6 +3,7 @@
 // After it: kernels.
 #include <gtest/gtest.h>
 
+#include "cuda/dispatch.h"
 #include "cuda/inspect.cuh"
 #include "random_splats.h"
 

@@ -12,12 +12,12 @@ TEST(Launch, AsksEachDeviceOnceHowManyMultiprocessorsItHas) {
   for (int round = 0; round < 3; ++round) {
     for (const int device : {5, 9}) {
       cuda_on_host::device = device;
-      EXPECT_EQ(multiprocessors(), 132u);
+      EXPECT_EQ(multiprocessors(), unsigned(cuda_on_host::kMultiprocessors));
     }
   }
   EXPECT_EQ(cuda_on_host::attributes_asked - before, 2);
   cuda_on_host::device = kMaxDevices;  // one that is not remembered
-  for (int round = 0; round < 2; ++round) EXPECT_EQ(multiprocessors(), 132u);
+  for (int round = 0; round < 2; ++round) EXPECT_EQ(multiprocessors(), unsigned(cuda_on_host::kMultiprocessors));
   EXPECT_EQ(cuda_on_host::attributes_asked - before, 4);
   cuda_on_host::device = 0;
 }

@@ -9,6 +9,7 @@
 #include "cuda/moment/maps.cuh"
 #include "cuda/moment/vjp_segments.cuh"
 #include "cuda/moment/vjp_walk.cuh"
+#include "cuda/moment/walk.cuh"
 #include "cuda/plan.cuh"
 #include "random_splats.h"
 
@@ -69,8 +70,9 @@ struct Plan {
     view.tile_order = order.data();
     view.tile_planes = planes.data();
     view.cut_lists = lists.data();
+    view.blocks_at_once = kBlocksPerSm * cuda_on_host::kMultiprocessors;
     cuda_on_host::launch(PlanState::kCounters, kCountWorkThreads,
-                         [&] { count_work_kernel(scene.lists, scene.grid.tiles(), F::kSamples, cut, &state); });
+                         [&] { count_work_kernel(scene.lists, scene.grid.tiles(), cut, &state); });
     cuda_on_host::launch(1, kPlanThreads,
                          [&] { plan_kernel(scene.lists, scene.grid, F::kSamples, cut, {kColors, true}, view); });
   }
@@ -144,8 +146,8 @@ Results run(Scene<F>& scene, int long_from = 0, int longest_from = longest_list(
   vjp.chunk_order = plan_back.chunks.data();
   vjp.cut_lists = plan_back.lists.data();
   vjp.checkpoints = checkpoints.data();
-  int32_t segments_taken = -1;  // chain_maps_kernel has to set it to zero
-  vjp.chunks_taken = &segments_taken;
+  int32_t segments_claimed = -1;  // chain_maps_kernel has to set it to zero
+  vjp.chunks_taken = &segments_claimed;
   vjp.pair_grads = out.pair_grads.data();
   vjp.mean_sums = MeanSums::kNorm;
   if constexpr (kSegment > 0) {
@@ -156,18 +158,18 @@ Results run(Scene<F>& scene, int long_from = 0, int longest_from = longest_list(
     cuda_on_host::launch(segments * Maps::kBlocks, Maps::kThreads,
                          [&] { segment_maps_kernel<F, kColors, kSide, kSegment>(vjp, 0); });
     cuda_on_host::launch(tiles * S, kSide * kSide, [&] { chain_maps_kernel<F, kSide, kSegment>(vjp); });
-    using Layout = TakenLayout<F, kSide>;
+    using Layout = ClaimedLayout<F, kSide>;
     using Shared = SegmentVjpShared<F, kColors, Layout, kSegment>;
-    constexpr int kBlocks = 3, kInShared = PlacesInFront<Layout>::kUnit;  // fewer blocks than segments
-    static_assert(sizeof(Shared) + kInShared * PlacesInFront<Layout>::kBytes <= sizeof dynamic_memory);
+    constexpr int kBlocks = 3, kInShared = EarlierPositions<Layout>::kUnit;  // fewer blocks than segments
+    static_assert(sizeof(Shared) + kInShared * EarlierPositions<Layout>::kBytes <= sizeof dynamic_memory);
     std::vector<typename Shared::SumsOfGroup> group_sums(kBlocks * Layout::kGroups);
     vjp.group_sums = &group_sums[0][0][0];
     cuda_on_host::launch(kBlocks, Layout::kThreads,
                          [&] { segment_vjp_kernel<F, kColors, Layout, kSegment>(vjp, 0, kInShared); });
   }
-  // Some of the places of a chunk in shared memory, the others not.
-  constexpr int kInShared = PlacesInFront<Backward>::kUnit;
-  static_assert(sizeof(MovingVjpShared<F, kColors, Backward>) + kInShared * PlacesInFront<Backward>::kBytes <=
+  // Some positions of a chunk in shared memory, the others not.
+  constexpr int kInShared = EarlierPositions<Backward>::kUnit;
+  static_assert(sizeof(MovingVjpShared<F, kColors, Backward>) + kInShared * EarlierPositions<Backward>::kBytes <=
                 sizeof dynamic_memory);
   cuda_on_host::launch(tiles, Backward::kThreads, [&] { moving_vjp_kernel<F, kColors, Backward>(vjp, 0, kInShared); });
   return out;
@@ -225,27 +227,26 @@ template <class F> void expect_composited(const Scene<F>& scene, const Results& 
 }
 
 template <class F> class MovingKernels : public testing::Test {};
-using Moments = testing::Types<Moment<1>, Moment<4>, Moment<9>, Moment<16>>;
+using Moments = testing::Types<Moment<1>, Moment<4>, Moment<16>>;
 TYPED_TEST_SUITE(MovingKernels, Moments);
 
 TYPED_TEST(MovingKernels, AgreeWhateverTheLayouts) {
   using F = TypeParam;
   using Fine = CellLayout<F::kSamples <= 4 ? 1 : 2, 8>;
-  using Forward = EvenLayout<F, false, kMovingTile>;
-  using Backward = EvenLayout<F, true, kMovingTile>;
+  using Even = EvenLayout<F, kMovingTile>;
   Scene<F> scene(150, 150, 0.95f);
   const Results fine = run<F, Fine, Fine>(scene);
   expect_composited(scene, fine);
-  expect_same(run<F, Forward, Backward>(scene), fine);
-  expect_same(run<F, Fine, Backward>(scene), fine);
+  expect_same(run<F, Even, Even>(scene), fine);
+  expect_same(run<F, Fine, Even>(scene), fine);
 }
 
 /// Tiles of kFine pixels a side, and of twice as many.
 template <class F, int kFine> void expect_same_in_other_tiles(TileGrid fine_grid, TileGrid coarse_grid) {
   constexpr int kCoarse = 2 * kFine;
   Scene<F> fine(150, 150, 0.95f, fine_grid), coarse(150, 150, 0.95f, coarse_grid);
-  const Results a = run<F, EvenLayout<F, false, kFine>, EvenLayout<F, true, kFine>>(fine);
-  const Results b = run<F, EvenLayout<F, false, kCoarse>, EvenLayout<F, true, kCoarse>>(coarse);
+  const Results a = run<F, EvenLayout<F, kFine>, EvenLayout<F, kFine>>(fine);
+  const Results b = run<F, EvenLayout<F, kCoarse>, EvenLayout<F, kCoarse>>(coarse);
   EXPECT_EQ(a.last, b.last);
   for (size_t i = 0; i < a.transmittance.size(); ++i)
     ASSERT_NEAR(a.transmittance[i], b.transmittance[i], kRounding) << i;
@@ -258,7 +259,6 @@ template <class F, int kFine> void expect_same_in_other_tiles(TileGrid fine_grid
 constexpr TileGrid kLargeTiles = {kWidth, kHeight}, kSmallTiles = {kWidth, kHeight, kMovingTileBits - 1};
 TEST(MovingKernelsInOtherTiles, Agree) {
   expect_same_in_other_tiles<Moment<1>, kMovingTile>(kGrid, kLargeTiles);
-  expect_same_in_other_tiles<Moment<9>, kMovingTile / 2>(kSmallTiles, kGrid);
   expect_same_in_other_tiles<Moment<16>, kMovingTile / 2>(kSmallTiles, kGrid);
 }
 
@@ -268,7 +268,6 @@ TEST(MovingKernelsInOtherTiles, AreForTheNumberOfCellsAndTheImage) {
   EXPECT_EQ(moving_grid(1, 512, 512).side(), kTile);
   EXPECT_EQ(moving_grid(1, 512, 504).side(), kMovingTile);
   EXPECT_EQ(moving_grid(4, 512, 504).side(), kMovingTile);
-  EXPECT_EQ(moving_grid(9, 512, 504).side(), kMovingTile / 2);
   EXPECT_EQ(moving_grid(16, 512, 512).side(), kMovingTile);
   EXPECT_EQ(moving_grid(16, 512, 504).side(), kMovingTile / 2);
 }
@@ -276,18 +275,17 @@ TEST(MovingKernelsInOtherTiles, AreForTheNumberOfCellsAndTheImage) {
 /// A list of several batches of pairs and segments, in which some samples stay open, and some stop in the midst: as a
 /// whole, and cut.
 template <class F, int kSide> void expect_same_if_cut(TileGrid grid) {
-  using Forward = EvenLayout<F, false, kSide>;
-  using Backward = EvenLayout<F, true, kSide>;
+  using Even = EvenLayout<F, kSide>;
   Scene<F> scene(1100, 70, 0.1f, grid);
-  const Results whole = run<F, Forward, Backward>(scene);
+  const Results whole = run<F, Even, Even>(scene);
   EXPECT_GT(*std::max_element(whole.last.begin(), whole.last.end()), std::max(kListedBatch, kQueued));
-  const Results short_lists = run<F, Forward, Backward, 64>(scene);
+  const Results short_lists = run<F, Even, Even, 64>(scene);
   expect_same(short_lists, whole);
-  expect_same(run<F, Forward, Backward, moving_segment(F::kSamples, kSide)>(scene), whole);
+  expect_same(run<F, Even, Even, moving_segment(F::kSamples, kSide)>(scene), whole);
   // The long list alone, beside others that are not cut.
-  expect_same(run<F, Forward, Backward, 64>(scene, 1024), whole);
+  expect_same(run<F, Even, Even, 64>(scene, 1024), whole);
   if (longest_list(F::kSamples) == 0) return;  // all were among the longest
-  const Results a_long_list = run<F, Forward, Backward, 64>(scene, 0, 512);
+  const Results a_long_list = run<F, Even, Even, 64>(scene, 0, 512);
   // Colours are added up by other lanes.
   for (size_t i = 0; i < a_long_list.image.size(); ++i)
     ASSERT_NEAR(a_long_list.image[i], short_lists.image[i], kRounding) << i;
@@ -298,7 +296,6 @@ template <class F, int kSide> void expect_same_if_cut(TileGrid grid) {
 TYPED_TEST(MovingKernels, AgreeInListsOfPixelsAndSegments) { expect_same_if_cut<TypeParam, kMovingTile>(kGrid); }
 TEST(MovingKernelsInOtherTiles, AgreeInListsOfPixelsAndSegments) {
   expect_same_if_cut<Moment<1>, kTile>(kLargeTiles);
-  expect_same_if_cut<Moment<9>, kMovingTile / 2>(kSmallTiles);
   expect_same_if_cut<Moment<16>, kMovingTile / 2>(kSmallTiles);
 }
 
@@ -319,19 +316,18 @@ template <class F> void expect_checkpoints_apart(const Scene<F>& scene) {
 
 /// The larger a patch, the fewer checkpoints has each of its tiles: some, two, and one.
 template <class F, int kSide> void expect_same_if_tiles_share_lists(TileGrid grid) {
-  using Forward = EvenLayout<F, false, kSide>;
-  using Backward = EvenLayout<F, true, kSide>;
+  using Even = EvenLayout<F, kSide>;
   for (const auto& [count, patch_bits] : {std::pair(701, 1), {700, 2}, {300, 20}}) {
     SCOPED_TRACE(testing::Message() << count << " splats, patches of 4^" << patch_bits << " tiles");
     Scene<F> scene(count, count, 0.02f, grid);
-    const Results own = run<F, Forward, Backward>(scene);
+    const Results own = run<F, Even, Even>(scene);
     EXPECT_GT(*std::max_element(own.last.begin(), own.last.end()), count * 9 / 10);
     const std::vector<double> expected = sums_of_splats(scene, own);
     Scene<F> shared = scene;
     share_lists(shared.pairs, shared.offsets, shared.counts, shared.grid, patch_bits);
     shared.lists = lists_of(shared.pairs, shared.offsets, shared.counts);
     expect_checkpoints_apart(shared);
-    const Results results = run<F, Forward, Backward>(shared);
+    const Results results = run<F, Even, Even>(shared);
     EXPECT_EQ(results.last, own.last);
     EXPECT_EQ(results.transmittance, own.transmittance);
     for (size_t i = 0; i < own.image.size(); ++i) ASSERT_NEAR(results.image[i], own.image[i], kRounding) << i;
@@ -345,17 +341,15 @@ TYPED_TEST(MovingKernels, AgreeWhereTilesShareLists) {
 }
 TEST(MovingKernelsInOtherTiles, AgreeWhereTilesShareLists) {
   expect_same_if_tiles_share_lists<Moment<1>, kTile>(kLargeTiles);
-  expect_same_if_tiles_share_lists<Moment<9>, kMovingTile / 2>(kSmallTiles);
   expect_same_if_tiles_share_lists<Moment<16>, kMovingTile / 2>(kSmallTiles);
 }
 
 /// Nothing is read of splats that are not there, which AddressSanitizer would see.
 TYPED_TEST(MovingKernels, ShowTheBackgroundOfAnEmptyScene) {
   using F = TypeParam;
-  using Forward = EvenLayout<F, false, kMovingTile>;
-  using Backward = EvenLayout<F, true, kMovingTile>;
+  using Even = EvenLayout<F, kMovingTile>;
   Scene<F> scene(0, 0, 0.95f);
-  for (const Results& r : {run<F, Forward, Backward>(scene), run<F, Forward, Backward, 64>(scene)}) {
+  for (const Results& r : {run<F, Even, Even>(scene), run<F, Even, Even, 64>(scene)}) {
     for (int i = 0; i < kColors * kPixels; ++i) ASSERT_EQ(r.image[i], scene.background[i / kPixels]);
   }
 }

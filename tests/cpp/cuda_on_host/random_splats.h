@@ -21,24 +21,24 @@ template <class F> constexpr TileGrid grid_for(int width, int height) {
   return {width, height, spread_tile_bits(F::kLanes, true)};
 }
 
-/// Where F takes sample s of the pixel at p, but for rounding, and its number there.
-template <class F, class V> Vec2<V> sample_place(Vec2<V> p, int s) {
+/// The position of sample s of the pixel at p, but for rounding, and the number that F has for it there.
+template <class F, class V> Vec2<V> sample_position(Vec2<V> p, int s) {
   if constexpr (F::kLanes > 1) return {p.x + V(float(F::node(s).x)), p.y + V(float(F::node(s).y))};
   return p;
 }
 template <class F> int sample_number(int s) { return F::kLanes > 1 ? 0 : s; }
 
-/// The place in a tile, of kTilePixels, of the lane that has sample s of the tile's pixel (x, y).
-template <class F> int lane_place(int x, int y, int s) {
+/// The number among the kTilePixels lanes of a tile of the lane that has sample s of the tile's pixel (x, y).
+template <class F> int lane_of_sample(int x, int y, int s) {
   constexpr int kWide = kSubtileWide<F>, kHigh = kSubtileHigh<F>;
   const int pixel = y % kHigh * kWide + x % kWide;
   return (y / kHigh * 2 + x / kWide) * 32 + pixel * F::kLanes + (F::kLanes > 1 ? s : 0);
 }
 
-/// Where the kernels take sample s of the tile's pixel (x, y), to the bit.
-template <class F> Vec2<float> place_in_tile(int x, int y, int s) {
-  const int place = lane_place<F>(x, y, s);
-  return place_of<F>(place / 32, place % 32);
+/// The position of sample s of the tile's pixel (x, y), with the bits that it has in the kernels.
+template <class F> Vec2<float> position_in_tile(int x, int y, int s) {
+  const int lane = lane_of_sample<F>(x, y, s);
+  return position_of<F>(lane / 32, lane % 32);
 }
 
 /// Splats anywhere in an image and up to `beyond` px off it, with standard deviations along axes in any direction, of
