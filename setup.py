@@ -67,9 +67,11 @@ if WITH_CUDA and not torch.cuda.is_available():
 
 SOURCES = [str(p.relative_to(ROOT)) for d in ("cpu", "torch") for p in sorted(ROOT.glob(f"csrc/{d}/*.cpp"))]
 if WITH_CUDA:
-    # The kernels of blending are in folders and take longest: they begin first, so that no core waits for them at the end.
-    kernels = sorted(ROOT.glob("csrc/cuda/**/*.cu"), key=lambda p: (-len(p.relative_to(ROOT).parts), p))
-    SOURCES = [str(p.relative_to(ROOT)) for p in kernels] + SOURCES
+    # Those that take longest begin first, so that no core waits for them at the end.
+    slow = ["moment/blend_vjp", "moment/blend", "still/blend", "still/blend_vjp", "project", "channels/blend_vjp"]
+    kernels = {str(p.relative_to(ROOT)) for p in ROOT.glob("csrc/cuda/**/*.cu")}
+    first = [source for name in slow if (source := f"csrc/cuda/{name}.cu") in kernels]
+    SOURCES = [*first, *SOURCES, *sorted(kernels - set(first))]
 else:
     SOURCES = [source for source in SOURCES if not source.endswith("_cuda.cpp")]
 
