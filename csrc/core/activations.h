@@ -51,7 +51,7 @@ template <typename T> AR_HD Vec4<T> rotation_of(Vec4<T> q) {
 template <typename T> AR_HD Vec4<T> rotation_of_vjp(Vec4<T> q, Vec4<T> g) {
   const T norm = sqrt(dot(q, q)), length = max(norm, T(kMinQuaternionLength));
   const Vec4<T> r = {q.x / length, q.y / length, q.z / length, q.w / length};
-  // Otherwise the divisor is constant.
+  // A shorter quaternion has a constant divisor.
   const T along = norm < T(kMinQuaternionLength) ? T(0) : dot(r, g);
   return {(g.x - along * r.x) / length, (g.y - along * r.y) / length, (g.z - along * r.z) / length,
           (g.w - along * r.w) / length};

@@ -43,14 +43,14 @@ struct AdamPart {
   int64_t begin, end;
 };
 
-/// Work items of `numbers` numbers. Returns how many.
+/// Makes work items of `numbers` numbers, and returns how many.
 template <typename T> int64_t divide_work(AdamParams<T>& p, int64_t numbers) {
   p.first_item[0] = 0;
   for (int k = 0; k < p.count; ++k) p.first_item[k + 1] = p.first_item[k] + (p.tensors[k].n + numbers - 1) / numbers;
   return p.first_item[p.count];
 }
 
-/// Of divide_work(p, numbers).
+/// An item of divide_work(p, numbers).
 template <typename T> AR_HD AdamPart part_of_item(const AdamParams<T>& p, int64_t item, int64_t numbers) {
   int k = 0;
   while (item >= p.first_item[k + 1]) ++k;

@@ -15,7 +15,7 @@ template <typename T> struct Support {
   T half_width, half_height;  ///< of the bounding box, without reach [px]
   T tip;                      ///< y - mean.y at the rightmost point
   T slope;                    ///< of the centres of chords: x - mean.x = slope (y - mean.y)
-  T inv_a;  ///< 1/a, a = |column 1 of w|^2; half a chord at y is sqrt((level - (det (y - mean.y))^2 / a) / a)
+  T inv_a;  ///< half chord at y: sqrt((level - (det (y - mean.y))^2 / a) / a), a = |column 1 of w|^2 = 1 / inv_a
   T det2;
 };
 
@@ -65,8 +65,7 @@ template <typename T> AR_HD Span<T> rows_of(const Support<T>& s) {
   return {s.mean.y - half, s.mean.y + half};
 }
 
-/// Exact extent in x of the part of the support with y in [y0, y1]: at the tips of the ellipse or, if these are
-/// outside, at the nearer edge of the band.
+/// Exact extent in x of the part with y in [y0, y1].
 template <typename T> AR_HD Span<T> columns_of(const Support<T>& s, T y0, T y1) {
   const T height = s.half_height, zero = T(0);
   const T lo = max(y0 - (s.mean.y + s.reach), -height), hi = min(y1 - (s.mean.y - s.reach), height);
@@ -78,15 +77,15 @@ template <typename T> AR_HD Span<T> columns_of(const Support<T>& s, T y0, T y1) 
           select(hi < lo, -far, s.mean.x + s.slope * right + half_right + s.reach)};
 }
 
-/// A test whether a support reaches boxes of one size, without division and root. In z = w (x - mean) the ellipse is a
-/// circle, compared with a bounding box of the box of pixels. It may say yes if the ellipse passes closely.
+/// Whether a support reaches boxes of one size, without division and root. In z = w (x - mean) the ellipse is a circle,
+/// compared with a bounding box of the box of pixels. It may say yes if the ellipse passes closely.
 template <typename T> struct BoxReach {
   Vec2<T> half;  ///< of the box in z
   T level;
 };
 
-/// `half`: half the size of the boxes, with the reach of samples [px]. `distance`: the largest in x or y from a box's
-/// centre to the mean [px]. Rounding of z grows with it and with w, for thin splats beyond kLevelSlack.
+/// `half`: of the boxes, with the reach of samples [px]. `distance`: the largest in x or y from a box's centre to the
+/// mean [px]. Rounding of z grows with it and with w, for thin splats beyond kLevelSlack.
 template <typename T> AR_HD BoxReach<T> make_box_reach(const Mat2<T>& w, T level, Vec2<T> half, T distance) {
   const T margin = T(kBoxRounding) * distance, x = half.x + margin, y = half.y + margin;
   return {{abs(w.xx) * x + abs(w.xy) * y, abs(w.yx) * x + abs(w.yy) * y}, level + T(kLevelSlack)};
@@ -121,7 +120,7 @@ AR_HD Range tiles_of(Range pixels, TileGrid grid) {
                                      : Range{0, -1};
 }
 
-/// Tile columns that the support touches. `rows`: its rows of pixels.
+/// `rows`: pixel rows of the support.
 template <typename T> AR_HD Range tile_columns_of(const Support<T>& s, TileGrid grid, Range rows, int tile_row) {
   const int top = tile_row << grid.tile_bits, bottom = top + grid.side() - 1;
   const T y0 = T(max(top, rows.first)), y1 = T(min(bottom, rows.last));
@@ -134,7 +133,7 @@ template <typename T, class Visit> AR_HD void for_each_tile_row(const Support<T>
   for (int row = tile_rows.first; row <= tile_rows.last; ++row) visit(row, tile_columns_of(s, grid, rows, row));
 }
 
-/// For sorting: as unsigned integers the bits of depths >= 0 have the order of the depths. -0 counts as 0.
+/// As unsigned integers the bits of depths >= 0 sort as the depths do. -0 counts as 0.
 template <typename T> AR_HD auto depth_bits(T depth) {
   std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t> bits;
   const T without_sign = depth + T(0);

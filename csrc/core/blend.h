@@ -13,7 +13,7 @@
 
 namespace ar {
 
-// A sample that stops negates its transmittance, and no later splat changes it.
+// A sample that stops negates T, and no later splat changes it.
 
 template <class V> AR_HD V effective_alpha(V raw) {
   using T = ScalarOf<V>;
@@ -46,7 +46,7 @@ template <class V> AR_HD Blended<V> blend_sample(V raw, V& transmittance) {
   }
 }
 
-/// What a sample that moves (kMoves of footprint/contract.h) carries besides T. Zero before the first splat.
+/// Of a sample that moves (kMoves of footprint/contract.h), besides T. Zero before the first splat.
 template <class V, bool kMoves> struct SampleState {};
 template <class V> struct SampleState<V, true> {
   Vec2<V> moved;  ///< displacement from the sample's node [px]
@@ -69,7 +69,7 @@ AR_HD Blended<V> blend_sample(const Terms& terms, Vec2<V> p, int s, V& transmitt
   }
 }
 
-/// For a sample that moves, by its position `place` within `cell` (Bounds or UnitCell) and its whitened coordinates z.
+/// By the position `place` of a sample that moves, within `cell` (Bounds or UnitCell), and its whitened coordinates z.
 template <class P, class Terms, class V, class Cell>
 AR_HD Blended<V> blend_placed_sample(const Terms& terms, Vec2<V> z, V raw, const Cell& cell, V& transmittance,
                                      Vec2<V>& place) {
@@ -80,8 +80,8 @@ AR_HD Blended<V> blend_placed_sample(const Terms& terms, Vec2<V> z, V raw, const
   return blended;
 }
 
-/// Repeats blend_placed_sample in the backward pass, and returns the mask. `before`: the splat is
-/// not later than the last one composited, so kTransmittanceMin need not be tested.
+/// Repeats blend_placed_sample in the backward pass, and returns the mask. `before`: not later than the last splat
+/// composited, so kTransmittanceMin need not be tested.
 template <class P, class Terms, class V, class Cell>
 AR_HD MaskOf<V> replay_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> before, const Cell& cell,
                                      V& transmittance, Vec2<V>& place) {
@@ -102,7 +102,7 @@ template <class V> struct BlendGrad {
 ///
 /// `g_color` is the dot product of the pixel's gradient and the splat's colour. `behind` (B of docs/numerics.md) is
 /// that product for all later splats and the background, seen through this splat alone. `transmittance` and `behind`
-/// are read as after the splat, written as before it. A total minus a prefix would cancel in deep stacks.
+/// are read as after the splat, written as before it.
 template <class V> AR_HD BlendGrad<V> blend_sample_vjp(MaskOf<V> mask, V raw, V g_color, V& transmittance, V& behind) {
   using T = ScalarOf<V>;
   const V zero = V(T(0)), cap = V(T(kAlphaMax));
@@ -126,8 +126,8 @@ template <class V> AR_HD MovingBlendGrad<V> no_moving_blend_grad() {
   return {zero, {zero, {{zero, zero}, {zero, zero, zero}}}};
 }
 
-/// Adjoint of blend_placed_sample, added to `sums`. `raw` is zero outside the mask, `place` is before the splat,
-/// dL_dplace in the unit kMoveGradUnit of P.
+/// Adjoint of blend_placed_sample. `raw` is zero outside the mask, `place` is before the splat, dL_dplace in the unit
+/// kMoveGradUnit.
 template <class P, class Terms, class V, class Cell>
 AR_HD void add_placed_sample_vjp(const Terms& terms, Vec2<V> z, V raw, const Cell& cell, V g_color, Vec2<V> place,
                                  V& transmittance, V& behind, Vec2<V>& dL_dplace, MovingBlendGrad<V>& sums) {
@@ -142,8 +142,7 @@ AR_HD void add_placed_sample_vjp(const Terms& terms, Vec2<V> z, V raw, const Cel
                                sums.of_splat);
 }
 
-/// How a segment of a list changes `behind` and dL_dplace of add_placed_sample_vjp (docs/numerics.md, "Adjoint of
-/// moving nodes"):
+/// How a segment of a list changes `behind` and dL_dplace (docs/numerics.md, "Adjoint of moving nodes"):
 ///   behind before = (color + T after * behind after) / T before,
 ///   dL_dplace before = of_color + of_behind * behind after + of_place * dL_dplace after.
 template <class V> struct AdjointMap {
@@ -159,7 +158,7 @@ AR_HD void map_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> mas
   using T = ScalarOf<V>;
   const V cap = V(T(kAlphaMax)), zero = V(T(0)), alpha = select(mask, min(raw, cap), zero);
   const MoveSlope<V> slope = P::move_in_with_slope(terms, z, alpha, raw <= cap, cell, place);
-  // B and l after this splat give B + alpha (g - B) and J^T l + T (g - B) dalpha before it, which enter the old map.
+  // Before the splat are B + alpha (g - B) and J^T l + T (g - B) dalpha, which enter the old map.
   const Vec2<V> of_alpha = {transmittance * slope.alpha.x, transmittance * slope.alpha.y};
   Mat2<V>& m = map.of_place;
   const Vec2<V> of_difference = {madd(m.xx, of_alpha.x, madd(m.xy, of_alpha.y, alpha * map.of_behind.x)),

@@ -23,7 +23,7 @@ AR_HD BlurredCov<T> blurred(const Factors<T>& f, const Gaussians<T>& g, int64_t 
   return {streaked, blur(streaked, by.variance), {dot(y, weighted), -dot(x, weighted)}};
 }
 
-/// For the footprint, with a factor of the opacity.
+/// What the footprint gets, and a factor of the opacity.
 template <typename T> struct SeenCov {
   Cov2d<T> cov;
   T amp;
@@ -44,7 +44,7 @@ AR_HD SeenCov<T> seen_covariance(const Cam& camera, const Gaussians<T>& g, int64
   return {f.cov, T(1)};
 }
 
-/// a b may overflow.
+/// 1 / sqrt(a b), where a b may overflow.
 template <typename T> AR_HD T inverse_root(T a, T b) { return T(1) / (sqrt(a) * sqrt(b)); }
 
 template <class B, typename T> struct BlurContext {
@@ -54,7 +54,7 @@ template <class B, typename T> struct BlurContext {
 };
 template <typename T> struct BlurContext<NoBlur, T> {};
 
-/// Of the logarithm of the amplitude by Sigma.
+/// Gradient of the logarithm of the amplitude by Sigma.
 template <typename T> AR_HD Sym2<T> blur_amp_grad(const Cov2d<T>& c, T variance, const BlurredCov<T>& cov) {
   const T inv = inverse_root(c.det, cov.streaked.det), x = inv * cov.adj_streak.x, y = inv * cov.adj_streak.y;
   return Sym2<T>{T(0.5) * x * x, T(0.5) * x * y, T(0.5) * y * y} + log_amp_grad(cov.streaked, variance);

@@ -115,7 +115,7 @@ AR_HD void add_camera_vjp(const FullCamera<T>& camera, Vec3<T> mean, const Proje
   });
 }
 
-/// Of a Gaussian at `view`.
+/// The blur of a Gaussian at `view`.
 template <typename T> AR_HD Blur<T> blur_of(const FullCamera<T>& camera, Vec3<T> view) {
   const Lens<T>& lens = camera.lens;
   return {lens.moves() ? motion_streak(camera, view) : Vec2<T>{T(0), T(0)},

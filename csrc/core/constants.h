@@ -1,4 +1,4 @@
-// Constants that the whole pipeline shares, most of them of 3DGS. Tests and the viewer's page compare with them.
+// Constants that the whole pipeline shares, most of them of 3DGS. The viewer's page has copies, which a test compares.
 #pragma once
 
 namespace ar {

@@ -14,9 +14,9 @@ template <typename T> struct UnitQuaternion {
 /// Deviates: 3DGS expects unit quaternions.
 template <typename T> AR_HD UnitQuaternion<T> normalize_quaternion(Vec4<T> q) {
   // Vec4 (x, y, z, w) is the quaternion (w, x, y, z). Dividing by the largest keeps squares in range, the power of two
-  // the division.
+  // keeps the division in range.
   const T largest = max(max(abs(q.x), abs(q.y)), max(abs(q.z), abs(q.w)));
-  // max() may drop a NaN, not the sum.
+  // max() may drop a NaN; the sum does not.
   if (abs(q.x) + abs(q.y) + abs(q.z) + abs(q.w) == T(0)) return {T(1), T(0), T(0), T(0), T(0)};
   const T power = inverse_power_of_two(largest), scaled = power * largest;
   const T w = quotient(power * q.x, scaled), x = quotient(power * q.y, scaled), y = quotient(power * q.z, scaled),
@@ -32,7 +32,7 @@ template <typename T> AR_HD Mat3<T> rotation_matrix(UnitQuaternion<T> q) {
            {two * (q.x * q.z - q.w * q.y), two * (q.y * q.z + q.w * q.x), one - two * (q.x * q.x + q.y * q.y)}}};
 }
 
-/// By the stored quaternion, from the gradient by a turn R <- R exp([turn]x).
+/// Gradient by the stored quaternion, from that by a turn R <- R exp([turn]x).
 template <typename T> AR_HD Vec4<T> rotation_vjp(UnitQuaternion<T> q, Vec3<T> dL_dturn) {
   const Vec3<T> raw = (T(2) * q.inv_norm) * dL_dturn;
   const T limit = T(kMaxQuaternionGrad);

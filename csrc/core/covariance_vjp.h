@@ -93,8 +93,8 @@ AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, co
   const Vec3<T> ex = g.xx * qx + g.xy * qy, ey = g.xy * qx + g.yy * qy;
   h.diagonal += mul(qx, ex) + mul(qy, ey);
   if (grad.frame == GradFrame::kAxes) {
-    // (w t_k).(w t_l) = t_k . M^-1 t_l is known without w. For a thin needle within a window its factor g.yy is large:
-    // products of w would leave eps (s1/s2)^2 of it.
+    // t_k . M^-1 t_l is known without w. For a thin needle within a window its factor g.yy is large: products of w
+    // would leave eps (s1/s2)^2 of it.
     const T c = m.cov.det > T(0) ? quotient(g.yy, m.cov.det) : T(0);
     const Vec3<T> rx = (g.xx - g.yy) * qx + g.xy * qy, ry = g.xy * qx;
     h.off += shifted_products(qx, rx) + shifted_products(qy, ry) - c * mul(square, shifted_products(n, n));

@@ -40,7 +40,7 @@ AR_HD int32_t select(bool m, int32_t a, int32_t b) { return m ? a : b; }
 
 template <typename T> AR_HD T min(T a, T b) { return b < a ? b : a; }
 template <typename T> AR_HD T max(T a, T b) { return a < b ? b : a; }
-/// NaN stays NaN.
+/// One instruction where there is one that keeps NaN.
 AR_HD float min(float a, float b) {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
   float y;
@@ -89,7 +89,7 @@ AR_HD float saturated_madd(float a, float b, float c) {
 }
 AR_HD double saturated_madd(double a, double b, double c) { return min(max(madd(a, b, c), 0.0), 1.0); }
 
-/// On a device: as integers, the bits of numbers outside [0, 1], and of -0, are larger.
+/// On a device one comparison: the bits of numbers outside [0, 1], and of -0, are larger integers.
 AR_HD bool in_unit_interval(float x) {
 #if defined(__CUDA_ARCH__)
   return __float_as_uint(x) <= __float_as_uint(1.0f);

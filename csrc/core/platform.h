@@ -11,7 +11,7 @@
 #define AR_HD_LAMBDA __attribute__((always_inline))
 #endif
 
-/// The body should see the index as a constant.
+/// Before a loop whose body should see the index as a constant.
 #if defined(__CUDA_ARCH__)
 #define AR_UNROLL _Pragma("unroll")
 #elif defined(__CUDACC__)

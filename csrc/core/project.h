@@ -67,15 +67,14 @@ template <typename T> struct ProjectedGaussian {
   T depth;
 };
 
-/// False: no covariance, or derived numbers would overflow a float.
+/// False if the matrix is no covariance, or derived numbers would overflow a float.
 template <typename T> AR_HD bool is_drawable(const ProjectedGaussian<T>& p) {
   const Cov2d<T>& cov = p.cov;
   return cov.det >= T(0) && cov.det < T(kMaxDet) && cov.xx >= T(0) && cov.yy >= T(0) && within(cov.xx, 1e18) &&
          within(cov.yy, 1e18) && !(p.opacity > T(kMaxOpacity));
 }
 
-/// Reads row i, whose numbers may be any. False if project_gaussian would cull such a Gaussian, or if the depth is
-/// negative or NaN.
+/// Reads row i, whose numbers may be any. False if such a Gaussian would be culled, or the depth is negative or NaN.
 template <typename T> AR_HD bool read_row(const ProjectedRows<T>& rows, int64_t i, ProjectedGaussian<T>& out) {
   const Sym2<T> c = rows.cov2d[i];
   out = {rows.means2d[i], {c.xx, c.xy, c.yy, rows.dets[i]}, rows.opacities[i], rows.depths[i]};
@@ -159,7 +158,7 @@ AR_HD bool splat_color(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
   return finite;
 }
 
-/// Writes the row of Gaussian i if there is room. Radius 0: the row touches no pixel.
+/// Writes row i if there is room. Radius 0: it touches no pixel.
 template <typename T>
 AR_HD void write_packed(const PackedRows<T>& to, int64_t i, const ProjectedGaussian<T>& p, Vec3<T> color, int radius) {
   const int64_t place = *to.first + to.ends[i] - 1;
@@ -334,7 +333,6 @@ AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
   }
 }
 
-/// Writes the sums for density control into means2d.
 template <typename T> AR_HD void write_mean_sums(const GaussianGrads<T>& out, int64_t i, Vec2<T> size, Vec2<T> sums) {
   if (!out.means2d || out.mean_sums == MeanSums::kNone) return;
   T* row = out.means2d + i * out.means2d_stride;

@@ -11,7 +11,7 @@ namespace ar {
 
 inline constexpr int kSsimRadius = 5, kSsimWindow = 2 * kSsimRadius + 1;
 
-/// Against 0 / 0.
+/// They keep quotients from 0 / 0.
 inline constexpr double kSsimC1 = 0.01 * 0.01, kSsimC2 = 0.03 * 0.03;
 
 /// The sum along one axis; at(k) is the value k pixels from the centre. The window is separable and symmetric, so this
@@ -26,11 +26,11 @@ template <typename T, class At> AR_HD T window_sum(const At& at) {
   return sum;
 }
 
-/// Of image x and target y.
+/// Window sums of image x and target y.
 inline constexpr int kSsimMoments = 5;
 enum SsimMoment { kMomentX, kMomentY, kMomentXX, kMomentYY, kMomentXY };
 
-/// At a pixel, with derivatives by window sums of the image.
+/// The similarity at a pixel, and its derivatives by window sums of the image.
 inline constexpr int kSsimPartials = 3;
 enum SsimPartial { kPartialX, kPartialXX, kPartialXY };
 template <typename T> struct Ssim {
@@ -78,7 +78,7 @@ AR_HD T combined_loss(const SsimParams<T, Target>& p, double l1_sum, double ssim
   return T(double(p.weights.l1) * (l1_sum / n) + double(p.weights.ssim) * (ssim_sum / n) + double(p.weights.constant));
 }
 
-/// dL_dmap or dL_dloss is null.
+/// One of dL_dmap and dL_dloss is null.
 template <typename T, typename Target> struct SsimVjpParams {
   int64_t planes;
   int height, width;
@@ -100,11 +100,11 @@ template <typename T, typename Target> AR_HD LossWeights<T> pixel_weights(const 
   return {share * p.weights.l1, share * p.weights.ssim, T(0)};
 }
 
-/// By pixel x. `partials`: their window sums.
+/// Gradient by pixel x. `partials`: their window sums.
 template <typename T> AR_HD T ssim_vjp(T x, T y, const T (&partials)[kSsimPartials], LossWeights<T> weights) {
   const T similarity = partials[kPartialX] + T(2) * x * partials[kPartialXX] + y * partials[kPartialXY];
   const T d = x - y;
-  const T sign = d > T(0) ? T(1) : d < T(0) ? T(-1) : d;  // 0 and NaN stay
+  const T sign = d > T(0) ? T(1) : d < T(0) ? T(-1) : d;  // d: 0 or NaN
   return weights.ssim * similarity + weights.l1 * sign;
 }
 

@@ -39,8 +39,8 @@ AR_HD constexpr int moving_tile_bits(int samples, bool small_image) {
   return samples == 16 && small_image ? kMovingTileBits - 1 : kMovingTileBits;
 }
 /// The tiles on CUDA if samples may be spread over lanes (Spread of footprint/contract.h): 256 samples, 8x8 pixels with
-/// 4 samples or 4x4 with 16. In large images four samples are not spread, because more pairs would cost more than
-/// shorter lists save.
+/// 4 samples or 4x4 with 16. In large images four samples are not spread: the pairs would cost more than shorter lists
+/// save.
 AR_HD constexpr int spread_tile_bits(int lanes, bool small_image) {
   return lanes == 16 ? kTileBits - 2 : lanes == 4 && small_image ? kTileBits - 1 : kTileBits;
 }
@@ -77,8 +77,8 @@ template <typename T> struct Gaussians {
   T scale_modifier;
 };
 
-/// For density control blend_vjp forms two more sums per splat: of positive functions of each pixel's gradient with
-/// respect to the mean, so that opposite signs do not cancel.
+/// Two more sums per splat, for density control: of positive functions of each pixel's gradient with respect to the
+/// mean, so that opposite signs do not cancel.
 enum class MeanSums : int32_t {
   kNone,
   kAbsolute,  ///< |dL/dx| and |dL/dy|, per px
@@ -92,7 +92,7 @@ template <typename T> struct GaussianGrads {
   Vec3<T>* means;
   Vec3<T>* scales;
   Vec4<T>* rotations;
-  Sym3<T>* cov3ds;  ///< off the diagonal: of the number that fills both entries
+  Sym3<T>* cov3ds;  ///< off the diagonal doubled, see Sym2
   T* opacities;
   Vec3<T>* shs;
   Vec3<T>* colors;
@@ -106,7 +106,6 @@ template <typename T> struct AddedGrads : GaussianGrads<T> {
   static constexpr bool kAdd = true, kAddShs = true;
 };
 
-/// A column of a table.
 template <class Element> struct Column {
   Element* first = nullptr;
   int64_t stride = sizeof(Element);  ///< bytes between rows
@@ -119,7 +118,6 @@ template <class Element> struct Column {
   }
 };
 
-/// Numbers in a splat of any footprint, and the index of its colour.
 inline constexpr int kSplatWidth = 12;
 inline constexpr int kSplatColor = 9;
 
@@ -153,10 +151,10 @@ template <typename T> struct Channels {
   AR_HD const T* row(int32_t splat) const { return data + (ids ? ids[splat] : splat) * stride; }
 };
 
-/// A row per Gaussian where `project` writes channels, unless they are three colours.
+/// Where `project` writes a row per Gaussian, unless it is three colours.
 template <typename T> struct ChannelRows {
-  T* data;                          ///< or null
-  int64_t stride;                   ///< numbers between rows
+  T* data;  ///< or null
+  int64_t stride;
   int color, depth, inverse_depth;  ///< first columns; -1: not wanted
 };
 
@@ -207,29 +205,29 @@ template <typename T> struct ProjectedRows {
   Vec3<T>* colors;   ///< or null
 };
 
-/// A row of ProjectedRows that is sent to other ranks.
+/// Sent to other ranks.
 template <typename T> struct alignas(16) PackedRow {
   Vec2<T> mean;
   Sym2<T> cov;
   T opacity, depth;
   Vec3<T> color;
   T det;                                                    ///< negative: touches no pixel
-  std::conditional_t<sizeof(T) == 4, int32_t, int64_t> id;  ///< index of the Gaussian among all ranks
+  std::conditional_t<sizeof(T) == 4, int32_t, int64_t> id;  ///< index among all ranks
 };
 inline constexpr int kPackedWidth = 12, kPackedDepth = 6;
 static_assert(sizeof(PackedRow<float>) == kPackedWidth * sizeof(float));
 static_assert(sizeof(PackedRow<double>) == kPackedWidth * sizeof(double));
 static_assert(offsetof(PackedRow<float>, depth) == kPackedDepth * sizeof(float));
 
-/// Columns of the gradient with respect to a PackedRow. kPackedCov: xy as in GaussianGrads::cov3ds. kPackedAbsolute,
-/// which may be missing: sums over pixels of |dL/dmean|.
+/// Columns of the gradient with respect to a PackedRow. kPackedCov: xy doubled, see Sym2. kPackedAbsolute, optional:
+/// sums over pixels of |dL/dmean|.
 inline constexpr int kPackedMean = 0, kPackedCov = 2, kPackedOpacity = 5, kPackedColor = 6, kPackedAbsolute = 9;
 inline constexpr int kPackedGradWidth = 9, kPackedGradWidthAbsolute = 11;
 
 template <typename T> struct ProjectedRowGrads {
   const int32_t* rows;  ///< [n] row of a Gaussian, or -1
   Column<const Vec2<T>> means2d;
-  Column<const Sym2<T>> cov2d;  ///< xy: of the number that fills both entries
+  Column<const Sym2<T>> cov2d;  ///< xy doubled, see Sym2
   Column<const T> opacities;
   Column<const T> depths;        ///< or null
   Column<const Vec3<T>> colors;  ///< or null
@@ -240,9 +238,9 @@ template <typename T> struct PackedRows {
   PackedRow<T>* rows;    ///< [room] or null
   int64_t room;          ///< rows beyond it are not written
   const int64_t* first;  ///< [1] index of this camera's first row
-  const int32_t* ends;   ///< [gaussians] rows up to and including this Gaussian, also of colours that are not finite
+  const int32_t* ends;   ///< [gaussians] rows up to and including this Gaussian, also where a colour is not finite
   int32_t *radii, *ids;  ///< [room] radius, 0 if the colour is not finite; index of the Gaussian
-  int64_t first_id;      ///< PackedRow::id of Gaussian 0
+  int64_t first_id;      ///< of Gaussian 0
 };
 
 /// From public rows to splats. The numbers may be any; a row that is no splat touches no tile.
@@ -253,21 +251,20 @@ template <typename T> struct ShapeRowsParams {
   TileGrid grid;
   T* splats;                   ///< [n] SplatRow
   const PackedRow<T>* packed;  ///< [n] instead of `rows`, or null
-  /// [n, 4] cov2d and determinants, and [n] opacities, of `packed`, for the adjoint; or null.
+  /// [n, 4] cov2d and determinants, [n] opacities, for the adjoint; or null.
   T *kept_covs, *kept_opacities;
 };
 
-/// From sums of pairs to the gradient with respect to public rows, zero for a row without pairs.
+/// From sums of pairs to the gradient with respect to public rows.
 template <typename T> struct RowGradsParams {
   int64_t n;
   ProjectedRows<T> rows;  ///< read: cov2d, dets, opacities
   FootprintChoice footprint;
   Vec2<T>* dL_dmeans2d;
-  Sym2<T>* dL_dcov2d;  ///< xy: of the number that fills both entries
+  Sym2<T>* dL_dcov2d;  ///< xy doubled, see Sym2
   T* dL_dopacities;
   Vec2<T>* absolute;  ///< [n] sums over pixels of |dL/dmeans2d|, or null
-  // For packed rows, or null: what shape_rows kept, instead of `rows`, and [n, packed_width] gradients, colours
-  // included, instead of the above.
+  // For packed rows, or null: what shape_rows kept, instead of `rows`, and [n, packed_width] gradients.
   const T *kept_covs, *kept_opacities;
   T* packed;
   int packed_width;
@@ -293,7 +290,7 @@ template <typename T> struct BlendParams {
   int32_t* last;     ///< [samples, height, width] pairs of the tile up to the sample's last splat
 };
 
-/// From the pairs of every tile to statistics of pixels and of the n Gaussians.
+/// From the pairs of every tile to statistics of pixels and Gaussians.
 template <typename T> struct InspectParams {
   const T* splats;
   TileGrid grid;
@@ -319,14 +316,12 @@ template <typename T> struct BlendVjpParams {
   const T* dL_dalpha;  ///< [height, width], or null
 };
 
-/// From sums per pair to the gradient with respect to the Gaussians.
 template <typename T> struct ProjectVjpParams {
   CameraView<T> camera;
   Gaussians<T> gaussians;
   FootprintChoice footprint;
   GaussianGrads<T> grads;
-  /// By ProjectParams::channels. `data` is null if three colours were blended: the sums of the pairs have their
-  /// gradients.
+  /// By the rows of ProjectParams::channels. `data` is null if three colours were blended: PairGrads have them.
   ChannelRows<const T> dL_dchannels;
 };
 

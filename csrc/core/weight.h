@@ -14,7 +14,7 @@ template <typename T> struct WeightParams {
   const T* dL_dweights;  ///< vjp only
   T* weights;            ///< forward only
   Vec2<T>* dL_doffsets;  ///< vjp only
-  Sym2<T>* dL_dcovs;     ///< vjp only; xy: of the number that fills both entries
+  Sym2<T>* dL_dcovs;     ///< vjp only; xy doubled, see Sym2
 };
 
 template <typename T> AR_HD Cov2d<T> with_det(Sym2<T> c) {
@@ -32,7 +32,7 @@ template <class F, typename T> AR_HD T weight(Sym2<T> cov, Vec2<T> d, FootprintO
 
 template <typename T> struct WeightGrad {
   Vec2<T> offset;
-  Sym2<T> cov;  ///< xy: of the number that fills both entries
+  Sym2<T> cov;  ///< xy doubled, see Sym2
 };
 
 template <class F, typename T>

@@ -1,43 +1,43 @@
 // The contract of a camera model: the map from camera space to pixels, its Jacobian, and the adjoints of both. A model
 // is a struct of static functions in its own header, and an entry of the list in models.h. core/camera.h, motion.h and
-// defocus.h call the functions; nothing else knows a model.
+// defocus.h call the functions; nothing else knows a model. pinhole.h has all arguments.
 //
 // `camera` is a Camera or a FullCamera. `mean` is a point of the world, `view` or p the same point in camera space.
 // Lengths in the image are in px. add_..._vjp adds the gradient with respect to a FullCamera.
 //
-//   kName                                        the name of the model in Python
+//   kName                               the name of the model in Python
 //
 // The map, after p.view is set:
 //
-//   map(camera, mean, ProjectedMean& p) -> bool  sets p.pixel, and what the adjoint reads; false where the model ends:
-//                                                before the near plane, outside the field of view
-//   map_vjp(camera, p, dL_dpixel, Vec3& dL_dview) -> Vec3
-//                                                adds to dL_dview; returns dL/dmean of a map that reads `mean`
-//   add_map_vjp(camera, p, mean, dL_dpixel, CameraGrad& to)
+//   map(camera, mean, p) -> bool        sets p.pixel, and what the adjoint reads; false where the model ends: before
+//   the
+//                                       near plane, outside the field of view
+//   map_vjp(..., dL_dview) -> Vec3      adds to dL_dview; returns dL/dmean of a map that reads `mean`
+//   add_map_vjp
 //
 // The Jacobian that projects covariances. It may differ from the derivative of the map, as by the clamp of 3DGS.
 //
 //   jacobian(camera, view) -> Jacobian
-//   jacobian_vjp(camera, Jacobian, view, JacobianGrad) -> Vec3 dL/dview
-//   add_jacobian_vjp(camera, Jacobian, view, JacobianGrad, CameraGrad& to)
-//   largest_stretch(camera, view) -> T           an upper bound of its norm in camera space
+//   jacobian_vjp(...) -> Vec3 dL/dview
+//   add_jacobian_vjp
+//   largest_stretch(camera, view)       an upper bound of its norm in camera space
 //
 // Motion and defocus:
 //
-//   velocity(camera, p, w) -> Vec2               in the image, of a point with velocity w in camera space: by the
-//                                                derivative of the map, without clamps
-//   velocity_vjp(camera, p, w, dL_dvelocity, Lens& dL_dlens, Vec2& dL_dfocal) -> VelocityGrad
+//   velocity(camera, p, w) -> Vec2      in the image, of a point with velocity w in camera space: the derivative of the
+//                                       map, without clamps
+//   velocity_vjp(...) -> VelocityGrad
 //
-//   defocus(lens, p) -> T                        signed diameter of the disc of p, over focal length and aperture
-//   defocus_vjp(lens, p, dL_ddefocus, Vec3& dL_dp, Lens& dL_dlens)
+//   defocus(lens, p)                    signed diameter of the disc of p, over focal length and aperture
+//   defocus_vjp
 //
 // In CameraModelDefaults:
 //
-//   depth(view) -> T                             orders splats, and is shown; not negative
-//   depth_vjp(view, dL_ddepth) -> Vec3 dL/dview
+//   depth(view)                         orders splats, and is shown; not negative
+//   depth_vjp(...) -> Vec3 dL/dview
 //
-//   ray(camera, mean) -> Vec3                    the direction of the harmonics, of any length
-//   ray_vjp(dL_dray, Vec3& dL_dmean), add_ray_vjp(dL_dray, CameraGrad& to)
+//   ray(camera, mean) -> Vec3           the direction of the harmonics, of any length
+//   ray_vjp, add_ray_vjp
 #pragma once
 
 #include "core/lens.h"
@@ -58,13 +58,13 @@ template <typename T> AR_HD void add_xyz(Vec4<T>& to, Vec3<T> v) { to = {to.x + 
 /// The plain camera, a pinhole, by value: rows of matrices, loaded once per thread.
 template <typename Scalar> struct Camera {
   static constexpr bool kFull = false;
-  static constexpr int kShDegree = 3;   ///< the largest: coefficients take registers
+  static constexpr int kShDegree = 3;   ///< the largest; coefficients take registers
   Vec4<Scalar> view_x, view_y, view_z;  ///< world to camera
   Vec4<Scalar> clip_x, clip_y, clip_w;  ///< world to clip space
   Vec3<Scalar> position;
   Vec2<Scalar> size;   ///< px
   Vec2<Scalar> focal;  ///< px; of an orthographic camera px per world unit
-  Vec2<Scalar> limit;  ///< of |x/z| and |y/z| in the Jacobian of a pinhole
+  Vec2<Scalar> limit;  ///< of |x/z| and |y/z| in a pinhole's Jacobian
   TileGrid grid;
 };
 
@@ -99,7 +99,7 @@ template <typename T> struct ProjectedMean {
 /// Rows of A = J W, world units to px: J in camera space, W the upper left 3x3 of the view.
 template <typename T> struct Jacobian {
   Vec3<T> x, y;
-  T ratio_x, ratio_y;  ///< of Pinhole: x/z and y/z, clamped
+  T ratio_x, ratio_y;  ///< of Pinhole: clamped x/z and y/z
   bool clamped_x, clamped_y;
 };
 /// `log_size` = x . j.x + y . j.y: by the logarithm of a factor of J.

@@ -87,15 +87,13 @@ struct Pinhole : ClipSpaceMap, CameraModelDefaults {
   }
 
  private:
-  /// Of the clamp.
   template <typename T> AR_HD static Vec2<T> clamp_center(const Camera<T>&) { return {T(0), T(0)}; }
   template <typename T> AR_HD static Vec2<T> clamp_center(const FullCamera<T>& camera) { return camera.lens.center; }
-  /// After the clamp.
+  /// The largest |x/z| and |y/z| after the clamp.
   template <typename T> AR_HD static Vec2<T> largest_ratio(const Camera<T>& camera) { return camera.limit; }
   template <typename T> AR_HD static Vec2<T> largest_ratio(const FullCamera<T>& camera) {
     return {camera.limit.x + abs(camera.lens.center.x), camera.limit.y + abs(camera.lens.center.y)};
   }
-  /// By the clamped ratios.
   template <typename T>
   AR_HD static Vec2<T> ratio_vjp(const Camera<T>& camera, Vec3<T> view, const JacobianGrad<T>& grad) {
     const Vec3<T> axis = xyz(camera.view_z);

@@ -14,7 +14,7 @@ inline constexpr double kLogistic3 = 0.07;
 /// Lower bound of standard deviations [px], so that r^3 fits a float. The weight of a thinner splat is below 2.6e-6.
 inline constexpr double kMinSigma = 1e-6;
 
-/// One axis of a splat's frame, for all pixels. Coordinates along it are t = u/sigma.
+/// One axis of a splat's frame. Coordinates along it are t = u/sigma.
 template <typename T> struct LogisticAxis {
   T half;              // half a pixel, 1/(2 sigma)
   T constant, square;  // f(b) - f(a) = constant + square t^2

@@ -1,79 +1,71 @@
 // The contract of a footprint: the model that turns a projected Gaussian into its weight I in a pixel. A footprint F is
-// a struct of static functions and constants, and a line in registry.h. Nothing else in csrc names it: project.h and
-// the loops of cpu/ and cuda/ call F as a template argument. FootprintDefaults (below) has the defaults.
-// docs/adding-a-footprint.md explains how to write a footprint.
+// a struct of static functions and constants, and a line in registry.h; nothing else in csrc names it. project.h and
+// the loops of cpu/ and cuda/ call F as a template argument. docs/adding-a-footprint.md explains how to write one.
 //
 // T is float or double, V is T or a pack of lanes of T (lanes.h). Sigma is the projected covariance [px^2]. d = pixel
 // centre - projected mean [px]. The node of a sample is its position relative to the pixel centre [px].
 //
-// Constants. Where no default is named, there is none.
+// Constants. FootprintDefaults (below) has their defaults.
 //
-//   kName                the name for users: "box"
-//   kKey                 a unique key: "box4", since footprints of one name differ in an option. Default: the name
-//   kOption              that option. Default: none
-//   kReference           true: only for comparisons; the CPU compiles it for one instruction set. Default: false
-//   kGeneric             true: CUDA has only the slower kernels for any number of channels. Default: false
-//   kExpensive           true: CUDA finds out exactly which pixels a splat reaches. Default: false
-//   kPage                the formula of the viewer's page (viewer/page/shaders.js): "gaussian" with a peak of 1,
-//                        "compensated" with the mass of the splat, "cumulants", or "window". All but "window" use the
-//                        variance of support_variance(). Default: null, the page cannot draw it
-//   Pixels               a type with the same Shape, terms, alpha, adjoint, ellipse and samples. Blending is compiled
-//                        once for all footprints that name this type. Default: F
-//   kSamples             samples of a pixel, each with its own transmittance. Default: 1
-//   Spread               a type for one sample, with the same Shape, ellipse and level. CUDA compiles kernels for it
-//                        where spread_grid() of core/stages.h has small tiles: lane s blends the sample at node(s), and
-//                        p (below) is the position of that sample. Default: void, none
-//   kLanes               of a Spread: the samples of a pixel. Default: 1
-//   kReach               largest |coordinate| of a node [px]. Default: 0
-//   kExtraLevel          no level (below) exceeds 2 ln(255 opacity) + kExtraLevel. Default: 0
+//   kName         the name for users: "box"
+//   kKey          a unique key: "box4", since footprints of one name differ in an option. Default: the name
+//   kOption       that option
+//   kReference    true: for comparisons; the CPU compiles it for one instruction set
+//   kGeneric      true: CUDA has only the slower kernels, for any number of channels
+//   kExpensive    true: CUDA finds out exactly which pixels a splat reaches
+//   kPage         the formula of the viewer's page, a key of KINDS in viewer/page/shaders.js; null: it cannot draw F
+//   Pixels        a type with the same Shape, terms, alpha, adjoint, ellipse and samples. Blending is compiled once for
+//                 all footprints that name this type; void: for F
+//   kSamples      samples of a pixel, each with its own transmittance
+//   Spread        a type for one sample, with the same Shape, ellipse and level. CUDA compiles kernels for it where
+//                 spread_grid() of core/stages.h has small tiles: lane s blends the sample at node(s), and p (below) is
+//                 the position of that sample; void: none
+//   kLanes        of a Spread: the samples of a pixel
+//   kReach        largest |coordinate| of a node [px]
+//   kExtraLevel   no level (below) exceeds 2 ln(255 opacity) + kExtraLevel
 //
-// Once per splat, with cov a Cov2d, options FootprintOptions, and shape a Shape:
+// Once per splat:
 //
 //   support_variance(options)   no ellipse (below) is wider than Sigma widened by this variance [px^2]
 //   radius_variance(options)    added to Sigma for the radius that 3DGS reports [px^2]
 //   Shape<T>                    an aggregate of kShapeWidth numbers T, which the splat carries
-//   prepare(cov, options) -> Shape<T>
-//   ellipse(shape) -> Mat2<T>   the matrix w. A Cholesky factor has the wide axis first
-//   level(shape, opacity) -> T  opacity * I(d + node) < 1/255 where |w (d + node)|^2 > level; everywhere if level <= 0
-//   mean_map(shape) -> Mat2<T>  the matrix m for which dL/dmean = m^T sums.offset [dL/dpx]
-//   prepare_vjp(cov, shape, sums, weighted, options) -> SplatGrad<T>
+//   prepare(cov, options) -> Shape
+//   ellipse(shape) -> Mat2 w    a Cholesky factor has the wide axis first
+//   level(shape, opacity)       opacity * I(d + node) < 1/255 where |w (d + node)|^2 > level; everywhere if level <= 0
+//   mean_map(shape) -> Mat2 m   dL/dmean = m^T sums.offset [dL/dpx]
+//   prepare_vjp(cov, shape, sums, weighted, options) -> SplatGrad
 //                               `sums`: the five sums of ShapeGrad over all pixels and samples, in the coordinates that
 //                               are cheapest for F; `weighted`: the sum of AlphaGrad::weighted
 //
 // Once per tile and splat:
 //
-//   terms(shape, opacity, origin) -> Terms<T>
+//   terms(shape, opacity, origin) -> Terms
 //                               numbers for all pixels. origin = a point of the tile - mean [px]; default: zero
 //
 // Once per pixel and sample s, with p = pixel centre - that point of the tile [px]:
 //
 //   alpha(terms, p, s) -> V     opacity * I
-//   add_alpha_vjp(terms, p, s, AlphaGrad<V>, ShapeGrad<V>& sums)
+//   add_alpha_vjp(terms, p, s, AlphaGrad, ShapeGrad& sums)
 //
-// Samples that move, as in moment.h, have a displacement `moved` from the node [px]. It is zero before the first splat,
-// and every splat that is composited changes it. Then p includes `moved`. Such footprints define:
+// Samples that move have a displacement `moved` from the node [px]. It is zero before the first splat, and every splat
+// that is composited changes it. Then p includes `moved`. Such footprints define more; moment.h has the arguments.
 //
-//   kMoves                      true. Default: false
+//   kMoves                      true
 //   kMoveReach                  largest |coordinate| of a displacement [px]; kReach includes it
-//   node(s) -> Vec2<double>
-//   move(terms, p, s, alpha, moved) -> Vec2<V>
-//                               `moved` after the splat; alpha is 0 if the splat was not composited
-//   alpha_and_move_vjp(terms, p, s, alpha, free, dL_dalpha, moved, dL_dmoved) -> MoveGrad<V>
-//                               the adjoint of both. `free`: alpha is not capped; `moved`: before the splat;
+//   node                        of sample s
+//   move                        `moved` after the splat; alpha is 0 if the splat was not composited
+//   alpha_and_move_vjp          the adjoint of both. `free`: alpha is not capped; `moved`: before the splat;
 //                               dL_dmoved: read as after the splat, written as before it
 //
 // Blending calls them in another form. z are whitened coordinates. `place` is the position of a sample, node +
 // displacement, relative to the pixel centre.
 //
-//   cell(s) -> Bounds<T>        limits of the position of sample s
-//   whitened(terms, p, 0), whitened_row(terms, y) -> Vec2<V>
-//                               z of the point p, and of (0, y)
-//   whitened_node(terms, from, place) -> Vec2<V>
-//                               z of the point at `place` relative to a point with z = `from`
-//   log_alpha(terms, z) -> V    log2(opacity * I)
-//   move_in, add_alpha_and_move_in_vjp
-//                               move and its adjoint, by z and a Bounds or UnitCell. move_in gets a mask (the splat was
-//                               composited) besides alpha; the adjoint adds to sums
+//   cell                        limits of the position of sample s
+//   whitened, whitened_row      z of the point p, and of (0, y)
+//   whitened_node               z of the point at `place` relative to a point with z = `from`
+//   log_alpha                   log2(opacity * I)
+//   move_in                     move by z and a Bounds or UnitCell; a mask says whether the splat was composited
+//   add_alpha_and_move_in_vjp   its adjoint with that of alpha, added to sums
 //   move_in_with_slope          move_in that changes its argument and returns its MoveSlope
 //   kMoveGradUnit               gradients by positions are multiplied by this from splat to splat: the cheapest unit
 //
@@ -88,8 +80,7 @@
 
 namespace ar {
 
-/// Projected covariance [px^2]. det comes from factors: from the entries it would cancel (docs/numerics.md,
-/// "Determinant from factors").
+/// Projected covariance [px^2]. det comes from factors (docs/numerics.md, "Determinant from factors").
 template <typename T> struct Cov2d {
   T xx, xy, yy, det;
 };
@@ -109,12 +100,12 @@ template <class... F> struct FootprintList {};
 
 inline constexpr int kShapeWidth = 5;
 
-/// An option at run time: `dilation` of point, `variance` of mip [px^2]. Other options are template parameters.
+/// At run time: `dilation` of point, `variance` of mip [px^2]. Other options are template parameters.
 struct FootprintOptions {
   double number;
 };
 
-/// A footprint, by its index in the registry.
+/// By its index in the registry.
 struct FootprintChoice {
   int index;
   FootprintOptions options;
@@ -124,7 +115,7 @@ struct FootprintChoice {
 struct Option {
   const char* name = nullptr;   ///< null: no option
   const char* value = nullptr;  ///< selects this footprint; null: a number
-  double number = 0;            ///< default of a number
+  double number = 0;            ///< its default
   bool is_default = true;       ///< used if the option is not given
 };
 
@@ -133,7 +124,7 @@ template <class V> struct AlphaGrad {
   V dL_dalpha, weighted;
 };
 
-/// Sums over pixels, whose meaning add_alpha_vjp and prepare_vjp of a footprint share.
+/// Sums over pixels. add_alpha_vjp and prepare_vjp of a footprint share their meaning.
 template <class V> struct ShapeGrad {
   Vec2<V> offset;
   Sym2<V> shape;
@@ -169,7 +160,7 @@ template <int n> struct UnitCell {
 
 /// What a sample that moves adds to the sums of a splat.
 template <class V> struct MoveGrad {
-  V weighted;  ///< raw dL_draw
+  V weighted;
   ShapeGrad<V> sums;
 };
 
@@ -177,15 +168,15 @@ template <class V> struct MoveGrad {
 template <class V> struct MoveSlope {
   Vec2<V> alpha;             ///< of the splat's alpha, times kMoveGradUnit
   Sym2<V> step;              ///< of the position after the splat: 1 + step
-  MaskOf<V> free_x, free_y;  ///< coordinates that are not clamped
+  MaskOf<V> free_x, free_y;  ///< not clamped
 };
 
 struct FootprintDefaults {
-  using Pixels = void;  // the footprint itself
-  using Spread = void;  // none
+  using Pixels = void;
+  using Spread = void;
   static constexpr int kLanes = 1;
-  static constexpr std::nullptr_t kKey = nullptr;  // the name
-  static constexpr const char* kPage = nullptr;    // none
+  static constexpr std::nullptr_t kKey = nullptr;
+  static constexpr const char* kPage = nullptr;
   static constexpr Option kOption = {};
   static constexpr bool kReference = false, kGeneric = false, kExpensive = false;
   static constexpr int kSamples = 1;
@@ -193,10 +184,9 @@ struct FootprintDefaults {
   static constexpr bool kMoves = false;
 };
 
-/// What blending is compiled for.
 template <class F> using PixelsOf = std::conditional_t<std::is_void_v<typename F::Pixels>, F, typename F::Pixels>;
 
-/// Lanes over which the samples of a pixel may be spread.
+/// Over which the samples of a pixel may be spread.
 template <class F> constexpr int spread_lanes() {
   if constexpr (std::is_void_v<typename F::Spread>) {
     return 1;

@@ -75,7 +75,7 @@ struct Cumulant : FootprintDefaults {
 
   template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& shape) { return wide_first(shape); }
 
-  /// docs/numerics.md, "Support"
+  /// The tests check this bound (docs/numerics.md, "Support").
   template <typename T> AR_HD static T level(const Shape<T>& shape, T opacity) {
     const T a = conic_xx(shape.w), c = conic_yy(shape.w);
     return gaussian_level(shape.amp, opacity) + (a * a + c * c) / T(124);

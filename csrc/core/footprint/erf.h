@@ -60,7 +60,7 @@ struct Erf : FootprintDefaults {
     return V(t.mass) * along(z.x, t.width.x).value * along(z.y, t.width.y).value;
   }
 
-  /// The moments of z = w d over the window.
+  /// Moments of z = w d over the window.
   template <typename T, class V>
   AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> p, int, AlphaGrad<V> grad, ShapeGrad<V>& sums) {
     const Vec2<V> z = transform(t.w, p, t.origin);

@@ -9,9 +9,9 @@ namespace ar {
 /// I = integral of exp(-|w d|^2 / 2) over the pixel. The integral and its adjoint are moments of z = w d, by quadrature
 /// with positive weights. docs/numerics.md, "The exact integral", has the rules and error bounds.
 ///
-/// The wide axis is the image axis with the larger variance, the narrow axis is the other. z.x depends on the wide axis
-/// alone; along it z.y falls at the rate `tilt`. The line z.y = 0 is the ridge. A Gaussian that is
-/// narrow across the ridge is integrated in strips around the points where the pixel's edges cross the ridge.
+/// The wide axis is the image axis with the larger variance. z.x depends on it alone; along it z.y falls at the rate
+/// `tilt`. The line z.y = 0 is the ridge. A Gaussian that is narrow across the ridge is integrated in strips around the
+/// points where the pixel's edges cross the ridge.
 struct Exact : FootprintDefaults {
   static constexpr const char* kName = "exact";
   static constexpr bool kExpensive = true;
@@ -83,7 +83,7 @@ struct Exact : FootprintDefaults {
   }
 
  private:
-  /// Of f = exp(-|z|^2 / 2), f z and f z z^T over the pixel [px^2].
+  /// Integrals of f = exp(-|z|^2 / 2), f z and f z z^T over the pixel [px^2].
   template <class V> struct Moments {
     V value;
     Vec2<V> first;
@@ -117,8 +117,8 @@ struct Exact : FootprintDefaults {
     return blur(cov, T(kPixelVariance));
   }
 
-  /// The edges of the pixel along an axis, relative to its point nearest to the mean [px]: rounding does not move the
-  /// edges that matter.
+  /// The edges of the pixel along an axis, relative to its point nearest to the mean [px], where rounding matters
+  /// least.
   template <class V> struct Edges {
     V begin, end;
     AR_HD V middle() const { return V(ScalarOf<V>(0.5)) * (begin + end); }

@@ -90,8 +90,8 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     return {V(t.node[0].x), madd(V(t.w.yy), y, V(t.node[0].y))};
   }
 
-  /// By whitened coordinates z. `at` is the position or the displacement of the node before the splat, in the unit of
-  /// w^-1; the result is after it. `mask`: the splat was composited; alpha may be nonzero where it was not.
+  /// move() by whitened coordinates z. `at` is the position or displacement of the node, in the unit of w^-1. `mask`:
+  /// the splat was composited; alpha may be nonzero where it was not.
   template <typename T, class V, class Cell>
   AR_HD static Vec2<V> move_in(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> mask, Vec2<V> at, const Cell& cell) {
     const Vec2<V> along = transform_transposed(t.w, z);
@@ -105,8 +105,8 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     }
   }
 
-  /// Adds to `sums` (docs/numerics.md, "Adjoint of moving nodes"; q is v r y). dL_dat is in kMoveGradUnit. alpha and
-  /// `weighted` = alpha dL_dalpha are zero where the splat was not composited.
+  /// alpha_and_move_vjp() by z, added to `sums` (docs/numerics.md, "Adjoint of moving nodes"; q is v r y). dL_dat is in
+  /// kMoveGradUnit. alpha and `weighted` = alpha dL_dalpha are zero where the splat was not composited.
   template <typename T, class V, class Cell>
   AR_HD static void add_alpha_and_move_in_vjp(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> free, V weighted,
                                               Vec2<V> at, const Cell& cell, Vec2<V>& dL_dat, MoveGrad<V>& sums) {
@@ -114,7 +114,7 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     const Vec2<V> next = moved(length, transform_transposed(t.w, z), at);
     const Vec2<V> behind = {select(cell.free_x(next.x), dL_dat.x, zero), select(cell.free_y(next.y), dL_dat.y, zero)};
     const Vec2<V> y = transform(t.w, behind), q = {length * y.x, length * y.y};
-    // dL_dalpha gets v z.y / (1 - alpha)^2, and alpha v z.y / (1 - alpha)^2 = z.q / (1 - alpha) = z.q (1 + r)
+    // alpha v z.y / (1 - alpha)^2 = z.q / (1 - alpha), where 1 / (1 - alpha) = 1 + r
     const V g = select(free, madd(madd(unit, r, unit), madd(z.x, q.x, z.y * q.y), weighted), zero);
     const Vec2<V> offset = {madd(g, z.x, -q.x), madd(g, z.y, -q.y)};
     sums.weighted = sums.weighted + g;
@@ -125,8 +125,8 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     dL_dat = {madd(-V(t.w.xx), offset.x, madd(-V(t.w.yx), offset.y, behind.x)), madd(-V(t.w.yy), offset.y, behind.y)};
   }
 
-  /// Moves `at` as move_in() does. dL_dat of add_alpha_and_move_in_vjp() becomes J^T dL_dat + dL_dalpha
-  /// MoveSlope::alpha, with J the derivative of the position. `free`: alpha is not the cap.
+  /// Moves `at` as move_in() does. With J the derivative of the position, add_alpha_and_move_in_vjp() takes dL_dat to
+  /// J^T dL_dat + dL_dalpha MoveSlope::alpha. `free`: alpha is not capped.
   template <typename T, class V, class Cell>
   AR_HD static MoveSlope<V> move_in_with_slope(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> free, const Cell& cell,
                                                Vec2<V>& at) {
@@ -158,12 +158,12 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     return divide(alpha, madd(-per_step, alpha, per_step));
   }
 
-  /// Before the clamp.
+  /// The position after a splat, before the clamp.
   template <class V> AR_HD static Vec2<V> moved(V length, Vec2<V> along, Vec2<V> at) {
     return {madd(length, along.x, at.x), madd(length, along.y, at.y)};
   }
 
-  /// [px from the pixel's centre]
+  /// In half cells from the pixel's edge -> px from its centre.
   template <typename T> AR_HD static constexpr T edge(int half_cells) { return T(half_cells - kSide) / T(2 * kSide); }
 
   template <typename T, class V> AR_HD static Vec2<V> place(int s) { return {V(node<T>(s).x), V(node<T>(s).y)}; }
