@@ -1,5 +1,5 @@
 // Which pixels and tiles a splat can touch: exact extents of its support ellipse, and a cheaper test for boxes of
-// pixels (docs/numerics.md, "Extents of the support"). project.h culls by the extents, bin lists the tiles, and blend
+// pixels (docs/numerics.md, "Extents of the support"). Projection culls by the extents, bin lists the tiles, and blend
 // tests boxes.
 #pragma once
 

@@ -94,8 +94,8 @@ AR_HD MaskOf<V> replay_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskO
 }
 
 template <class V> struct BlendGrad {
-  V contribution;         ///< T alpha, zero outside the mask
-  AlphaGrad<V> of_alpha;  ///< zero outside the mask and where alpha is capped
+  V contribution;         ///< T alpha
+  AlphaGrad<V> of_alpha;  ///< zero where alpha is capped
 };
 
 /// Adjoint of blend_sample, called from the last splat to the first.
@@ -142,7 +142,8 @@ AR_HD void add_placed_sample_vjp(const Terms& terms, Vec2<V> z, V raw, const Cel
                                sums.of_splat);
 }
 
-/// How a segment of a list changes `behind` and dL_dplace (docs/numerics.md, "Adjoint of moving nodes"):
+/// How a segment of a list changes `behind` and dL_dplace (docs/numerics.md, "Adjoint of moving nodes").
+///
 ///   behind before = (color + T after * behind after) / T before,
 ///   dL_dplace before = of_color + of_behind * behind after + of_place * dL_dplace after.
 template <class V> struct AdjointMap {
@@ -158,7 +159,7 @@ AR_HD void map_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> mas
   using T = ScalarOf<V>;
   const V cap = V(T(kAlphaMax)), zero = V(T(0)), alpha = select(mask, min(raw, cap), zero);
   const MoveSlope<V> slope = P::move_in_with_slope(terms, z, alpha, raw <= cap, cell, place);
-  // Before the splat are B + alpha (g - B) and J^T l + T (g - B) dalpha, which enter the old map.
+  // The `s` of docs/numerics.md is of_difference.
   const Vec2<V> of_alpha = {transmittance * slope.alpha.x, transmittance * slope.alpha.y};
   Mat2<V>& m = map.of_place;
   const Vec2<V> of_difference = {madd(m.xx, of_alpha.x, madd(m.xy, of_alpha.y, alpha * map.of_behind.x)),

@@ -1,7 +1,7 @@
 // What project.h, covariance.h and blur.h ask of a camera with any model: a mean's pixel, the Jacobian there, the blur,
-// and the adjoints. The models are in core/camera/. Every function is compiled for Camera, the pinhole of 3DGS, without
-// a cost for models and effects, and for FullCamera, which has all models and effects as branches: projecting takes a
-// small part of a frame, and all threads branch alike.
+// and the adjoints. The models are in core/camera/. Every function is compiled for two types. Camera is the pinhole of
+// 3DGS. FullCamera has all models and effects as branches, which all threads take alike: projecting is a small part of
+// a frame.
 #pragma once
 
 #include "core/defocus.h"

@@ -1,6 +1,6 @@
-// The adjoint of covariance.h: from the gradient with respect to the covariance in the image to those with respect to
-// scale and rotation, or to a 3D covariance, and to the camera's Jacobian. project.h calls it. Every product is formed
-// in coordinates in which its terms do not cancel (docs/numerics.md, from "Gradient in the turned frame" on).
+// The adjoint of covariance.h: gradients with respect to scale and rotation, or a 3D covariance, and to the camera's
+// Jacobian. The caller is project.h. Every product is formed in coordinates in which its terms do not cancel
+// (docs/numerics.md, from "Gradient in the turned frame" on).
 #pragma once
 
 #include "core/blur.h"

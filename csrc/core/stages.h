@@ -1,5 +1,5 @@
-// Structs that the stages of a frame read and write. csrc/torch fills them by name, the loops of cpu/ and the kernels
-// of cuda/ get them. Pointers are views of host or device memory, never owners. "[n]" is the shape of an array.
+// Structs that the stages of a frame read and write. csrc/torch fills them by name for the loops of cpu/ and the
+// kernels of cuda/. Pointers are views of host or device memory, never owners. "[n]" is the shape of an array.
 //
 //     project -> bin -> blend          forward
 //     blend_vjp -> project_vjp         backward
@@ -32,15 +32,14 @@ struct TileGrid {
 AR_HD bool is_small_image(TileGrid grid) {
   return TileGrid{grid.width, grid.height, kMovingTileBits}.tiles() < kSmallImageTiles;
 }
-/// The tiles on CUDA if samples move. One sample in a large image is so cheap that fewer pairs, in larger tiles, pay.
-/// Sixteen samples in a small image, where most splats are smaller than a tile, want shorter lists.
+/// The tiles on CUDA if samples move. One sample in a large image is so cheap that fewer pairs pay. Sixteen samples in
+/// a small image, where splats are smaller than a tile, want shorter lists.
 AR_HD constexpr int moving_tile_bits(int samples, bool small_image) {
   if (samples == 1 && !small_image) return kTileBits;
   return samples == 16 && small_image ? kMovingTileBits - 1 : kMovingTileBits;
 }
-/// The tiles on CUDA if samples may be spread over lanes (Spread of footprint/contract.h): 256 samples, 8x8 pixels with
-/// 4 samples or 4x4 with 16. In large images four samples are not spread: the pairs would cost more than shorter lists
-/// save.
+/// The tiles on CUDA if samples may be spread over lanes (Spread of footprint/contract.h), 256 samples each. In large
+/// images the pairs of four samples would cost more than shorter lists save.
 AR_HD constexpr int spread_tile_bits(int lanes, bool small_image) {
   return lanes == 16 ? kTileBits - 2 : lanes == 4 && small_image ? kTileBits - 1 : kTileBits;
 }
@@ -62,7 +61,7 @@ template <typename T> struct CameraView {
   const T* lens = nullptr;
 };
 
-/// The scene. Either scales and rotations or cov3ds are null; shs, colors or both are null.
+/// The scene, arrays of [n]. Either scales and rotations or cov3ds are null; shs, colors or both are null.
 template <typename T> struct Gaussians {
   int64_t n;
   const Vec3<T>* means;      ///< world units
@@ -77,8 +76,7 @@ template <typename T> struct Gaussians {
   T scale_modifier;
 };
 
-/// Two more sums per splat, for density control: of positive functions of each pixel's gradient with respect to the
-/// mean, so that opposite signs do not cancel.
+/// Two more sums per splat, for density control: of positive functions of each pixel's dL/dmean, which do not cancel.
 enum class MeanSums : int32_t {
   kNone,
   kAbsolute,  ///< |dL/dx| and |dL/dy|, per px
@@ -264,7 +262,8 @@ template <typename T> struct RowGradsParams {
   Sym2<T>* dL_dcov2d;  ///< xy doubled, see Sym2
   T* dL_dopacities;
   Vec2<T>* absolute;  ///< [n] sums over pixels of |dL/dmeans2d|, or null
-  // For packed rows, or null: what shape_rows kept, instead of `rows`, and [n, packed_width] gradients.
+  // For packed rows, or null: what shape_rows kept, instead of `rows`, and [n, packed_width] gradients, instead of the
+  // above.
   const T *kept_covs, *kept_opacities;
   T* packed;
   int packed_width;
@@ -321,7 +320,7 @@ template <typename T> struct ProjectVjpParams {
   Gaussians<T> gaussians;
   FootprintChoice footprint;
   GaussianGrads<T> grads;
-  /// By the rows of ProjectParams::channels. `data` is null if three colours were blended: PairGrads have them.
+  /// By the rows of ProjectParams::channels. `data` is null if three colours were blended.
   ChannelRows<const T> dL_dchannels;
 };
 

@@ -1,6 +1,6 @@
 // The contract of a camera model: the map from camera space to pixels, its Jacobian, and the adjoints of both. A model
-// is a struct of static functions in its own header, and an entry of the list in models.h. core/camera.h, motion.h and
-// defocus.h call the functions; nothing else knows a model. pinhole.h has all arguments.
+// is a struct of static functions in its own header, and an entry of the list in models.h. Only core/camera.h, motion.h
+// and defocus.h call the functions. Their arguments are those in pinhole.h and clip_space.h.
 //
 // `camera` is a Camera or a FullCamera. `mean` is a point of the world, `view` or p the same point in camera space.
 // Lengths in the image are in px. add_..._vjp adds the gradient with respect to a FullCamera.
@@ -9,9 +9,8 @@
 //
 // The map, after p.view is set:
 //
-//   map(camera, mean, p) -> bool        sets p.pixel, and what the adjoint reads; false where the model ends: before
-//   the
-//                                       near plane, outside the field of view
+//   map(camera, mean, p) -> bool        sets p.pixel, and what the adjoint reads. False before the near plane and
+//                                       outside the field of view
 //   map_vjp(..., dL_dview) -> Vec3      adds to dL_dview; returns dL/dmean of a map that reads `mean`
 //   add_map_vjp
 //
@@ -24,10 +23,9 @@
 //
 // Motion and defocus:
 //
-//   velocity(camera, p, w) -> Vec2      in the image, of a point with velocity w in camera space: the derivative of the
-//                                       map, without clamps
+//   velocity(camera, p, w) -> Vec2      in the image, of a point with velocity w in camera space: by the derivative of
+//                                       the map, without clamps
 //   velocity_vjp(...) -> VelocityGrad
-//
 //   defocus(lens, p)                    signed diameter of the disc of p, over focal length and aperture
 //   defocus_vjp
 //

@@ -25,7 +25,8 @@ template <typename T> struct LogisticAxis {
   }
 };
 
-/// For the derivatives, with x and y as in LogisticValue, t >= 0 and h = half:
+/// For the derivatives of F = sinh y / (cosh x + cosh y), with t >= 0 and h = half.
+///
 ///   dx/dt = linear + 3 kLogistic3 t^2,              dy/dt = square t,
 ///   t dx/dt + h dx/dh = t (dx/dt + spread),         t dy/dt + h dy/dh = y + cube + square t^2
 template <typename T> struct LogisticSlopes {
@@ -37,7 +38,7 @@ template <typename T> struct LogisticSlopes {
   }
 };
 
-/// F = S(t + half) - S(t - half) = (1 - exp(f(a) - f(b))) / ((1 + exp(f(a))) (1 + exp(-f(b)))), a, b = |t| -+ half.
+/// F = S(t + half) - S(t - half), without cancellation. a, b = |t| -+ half.
 template <class V> struct LogisticWindow {
   using T = ScalarOf<V>;
   V lower, upper;  // exp(f(a)), exp(-f(b))
@@ -67,7 +68,6 @@ template <class V> struct LogisticValue {
                       const LogisticSlopes<T>& slopes) {
     const V one = V(T(1)), distance = abs(t), tt = t * t;
     value = f.numerator * inverse;
-    // By F = sinh y / (cosh x + cosh y), x and y the half sum and half difference of f(b) and f(a).
     const V product = f.lower * f.upper;
     const V by_x = value * (f.upper - f.lower) * inverse;
     const V by_y = madd(V(T(4)), product, (f.lower + f.upper) * (one + product)) * inverse * inverse;

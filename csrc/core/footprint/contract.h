@@ -1,6 +1,6 @@
 // The contract of a footprint: the model that turns a projected Gaussian into its weight I in a pixel. A footprint F is
-// a struct of static functions and constants, and a line in registry.h; nothing else in csrc names it. project.h and
-// the loops of cpu/ and cuda/ call F as a template argument. docs/adding-a-footprint.md explains how to write one.
+// a struct of static functions and constants, and a line in registry.h; nothing else in csrc names it. Projection and
+// the loops of cpu/ and cuda/ call F as a template argument. How to write one: docs/adding-a-footprint.md.
 //
 // T is float or double, V is T or a pack of lanes of T (lanes.h). Sigma is the projected covariance [px^2]. d = pixel
 // centre - projected mean [px]. The node of a sample is its position relative to the pixel centre [px].
@@ -32,6 +32,7 @@
 //   prepare(cov, options) -> Shape
 //   ellipse(shape) -> Mat2 w    a Cholesky factor has the wide axis first
 //   level(shape, opacity)       opacity * I(d + node) < 1/255 where |w (d + node)|^2 > level; everywhere if level <= 0
+//
 //   mean_map(shape) -> Mat2 m   dL/dmean = m^T sums.offset [dL/dpx]
 //   prepare_vjp(cov, shape, sums, weighted, options) -> SplatGrad
 //                               `sums`: the five sums of ShapeGrad over all pixels and samples, in the coordinates that
@@ -64,10 +65,11 @@
 //   whitened, whitened_row      z of the point p, and of (0, y)
 //   whitened_node               z of the point at `place` relative to a point with z = `from`
 //   log_alpha                   log2(opacity * I)
+//
 //   move_in                     move by z and a Bounds or UnitCell; a mask says whether the splat was composited
 //   add_alpha_and_move_in_vjp   its adjoint with that of alpha, added to sums
 //   move_in_with_slope          move_in that changes its argument and returns its MoveSlope
-//   kMoveGradUnit               gradients by positions are multiplied by this from splat to splat: the cheapest unit
+//   kMoveGradUnit               unit of gradients by positions between splats: the cheapest
 //
 // With a UnitCell lengths are in edges of cells, and positions are relative to the corner of the cell.
 #pragma once
@@ -119,7 +121,7 @@ struct Option {
   bool is_default = true;       ///< used if the option is not given
 };
 
-/// A footprint uses either member.
+/// `weighted` is alpha dL_dalpha. A footprint uses either.
 template <class V> struct AlphaGrad {
   V dL_dalpha, weighted;
 };

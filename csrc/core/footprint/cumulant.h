@@ -6,9 +6,8 @@
 
 namespace ar {
 
-/// One axis of the correction to the exponent, for the diagonal entry t of the conic:
-///   h(p, t) = P (P (c4 - c6 P) - 6 t k2) + 3 t^2 k0,  P = min(p^2, cap).
-/// The cap is the maximum of the cubic: beyond, the weight would diverge. Weights there are below 2e-6.
+/// One axis of the correction to the exponent, h(p, t) = s(p, t) of docs/numerics.md, "Weights". t is the diagonal
+/// entry of the conic. Weights beyond the cap are below 2e-6.
 template <typename T> struct CumulantAxis {
   T c4, c6, linear, cap;
   T dc4, dc6, dlinear, dconstant;  // by t
@@ -31,7 +30,6 @@ template <typename T> struct CumulantAxis {
     return a;
   }
 
-  /// 3 t^2 k0.
   AR_HD static T constant(T t, T unit = T(1), T scale = T(1)) {
     const T x = t * scale * T(kPixelVariance);
     return unit * scale * scale * T(3) * t * t * (T(1) + x * (T(20.0 / 21) + x * T(0.6975)));

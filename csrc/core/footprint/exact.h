@@ -55,8 +55,7 @@ struct Exact : FootprintDefaults {
 
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& g, T opacity, Vec2<T> origin = {T(0), T(0)}) {
     const T edge = along(g.w), tilt = -slope(g.w) / edge, steep = max(tilt, T(kMinTilt)), tail = T(kTail<T>);
-    // The Gaussian, the crossing and the pixel limit a strip. Along it the integrand varies at the rate sqrt(1 +
-    // tilt^2).
+    // The standard deviation of the integrand along a strip is 1 / sqrt(1 + tilt^2).
     const T length = min(T(2) * min(tail, tail / steep), abs(edge)) * sqrt(T(1) + tilt * tilt);
     const T panels = min(max(T(1), T(1) + length / T(kPanel)), T(kMaxPanels));
     return {g.w, origin, opacity, wide_x(g.w), edge, across(g.w), tilt, tail / steep, int(panels)};

@@ -47,9 +47,8 @@ template <typename T> AR_HD T gaussian_level(T amp, T opacity) {
   return T(2) * std::log(T(1 / kAlphaMin) * opacity * amp);
 }
 
-/// From sums in whitened coordinates z = kBase2 w d: `offset` = sum g I z, `shape` = sum g I z z^T, `weighted` = sum g
-/// I, zero if the amplitude does not depend on Sigma (docs/numerics.md, "Gradients of the weights"). `variance` was
-/// added to Sigma.
+/// From sums in whitened coordinates z = kBase2 w d: `offset` = sum g I z, `shape` = sum g I z z^T. `weighted` is zero
+/// if the amplitude does not depend on Sigma. `variance` was added to Sigma.
 template <typename T> AR_HD SplatGrad<T> gaussian_vjp(const Lower2<T>& w, ShapeGrad<T> sums, T weighted, T variance) {
   const T half = T(0.5 / (kBase2 * kBase2));
   const Sym2<T> white = {half * sums.shape.xx, half * sums.shape.xy, half * sums.shape.yy};

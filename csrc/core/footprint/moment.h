@@ -134,7 +134,7 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     const V length = length_of<T, V, Cell>(alpha), r = V(T(1 / step<Cell>())) * length;
     const Vec2<V> along = transform_transposed(t.w, z), next = moved(length, along, at);
     at = cell.held(length, along, at);
-    // dalpha = -unit alpha along.dat, dr = dalpha / (1 - alpha)^2 = -unit r (1 + r) along.dat
+    // dalpha = -unit alpha along.dat, dr = -unit r (1 + r) along.dat
     const V by_alpha = select(free, -alpha, zero), by_r = select(free, unit * length * (V(T(1)) + r), zero);
     const Vec2<V> steeper = {by_r * along.x, by_r * along.y};
     const V xx = madd(V(t.w.xx), V(t.w.xx), V(t.w.yx) * V(t.w.yx));
