@@ -1,6 +1,5 @@
-// From the parameters that a training optimises to the rasterizer's: exp of scales, quaternions divided by their
-// length, the logistic function of opacities; and the adjoint, which computes the values again. cpu/activations.cpp and
-// cuda/activations.cu run both over the Gaussians.
+// From the parameters that a training optimises to the rasterizer's: exp of scales, unit quaternions, the logistic
+// function of opacities. The adjoint computes the values again. cpu/activations.cpp and cuda/activations.cu run both.
 #pragma once
 
 #include <cmath>
@@ -22,7 +21,7 @@ template <typename T> struct ActivateParams {
   T* opacities;
 };
 
-/// A gradient that is null is zero if it is read, and not wanted if it is written.
+/// Null: zero if it is read, not wanted if it is written.
 template <typename T> struct ActivateVjpParams {
   int64_t n;
   const Vec3<T>* log_scales;
@@ -52,7 +51,7 @@ template <typename T> AR_HD Vec4<T> rotation_of(Vec4<T> q) {
 template <typename T> AR_HD Vec4<T> rotation_of_vjp(Vec4<T> q, Vec4<T> g) {
   const T norm = sqrt(dot(q, q)), length = max(norm, T(kMinQuaternionLength));
   const Vec4<T> r = {q.x / length, q.y / length, q.z / length, q.w / length};
-  // A shorter quaternion is divided by a constant.
+  // A shorter quaternion has a constant divisor.
   const T along = norm < T(kMinQuaternionLength) ? T(0) : dot(r, g);
   return {(g.x - along * r.x) / length, (g.y - along * r.y) / length, (g.z - along * r.z) / length,
           (g.w - along * r.w) / length};

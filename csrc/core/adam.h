@@ -1,5 +1,5 @@
 // A step of Adam [Kingma and Ba 2015, Algorithm 1] for several tensors, each with its own learning rate and count of
-// steps. Epsilon is outside of the root, as in torch.optim.Adam. cpu/adam.cpp and cuda/adam.cu run the work items.
+// steps. Epsilon is outside the root, as in torch.optim.Adam. cpu/adam.cpp and cuda/adam.cu run the work items.
 #pragma once
 
 #include <cmath>
@@ -9,20 +9,20 @@
 
 namespace ar {
 
-/// Tensors of one launch: AdamParams must fit the 4 KiB of a kernel's arguments.
+/// AdamParams must fit the 4 KiB of a kernel's arguments.
 inline constexpr int kAdamTensors = 16;
 
 template <typename T> struct AdamRule {
   T beta1, one_minus_beta1, beta2, one_minus_beta2, eps;
   T rate;        ///< learning rate / (1 - beta1^step)
-  T head_rate;   ///< the same of the `head` of every row
+  T head_rate;   ///< of the `head` of every row
   T root_scale;  ///< 1 / sqrt(1 - beta2^step)
 };
 
 template <typename T> struct AdamTensor {
   int64_t n;         ///< at least 1
   int64_t row_size;  ///< numbers in a row
-  int64_t head;      ///< numbers at the start of a row with another learning rate
+  int64_t head;      ///< first numbers of a row, with another learning rate
   bool aligned;      ///< all pointers are multiples of 16 bytes
   AdamRule<T> rule;
   const T* grad;  ///< [n]
@@ -32,8 +32,8 @@ template <typename T> struct AdamTensor {
 };
 
 template <typename T> struct AdamParams {
-  const uint8_t* rows;  ///< of every tensor; a row is updated where it is not 0; null: all rows
-  int count;            ///< tensors
+  const uint8_t* rows;  ///< of every tensor: a row is updated unless it is 0; null: all rows
+  int count;
   AdamTensor<T> tensors[kAdamTensors];
   int64_t first_item[kAdamTensors + 1];  ///< written by divide_work
 };
@@ -43,14 +43,14 @@ struct AdamPart {
   int64_t begin, end;
 };
 
-/// Divides the tensors into work items of `numbers` numbers, and returns the number of items.
+/// Makes work items of `numbers` numbers, and returns how many.
 template <typename T> int64_t divide_work(AdamParams<T>& p, int64_t numbers) {
   p.first_item[0] = 0;
   for (int k = 0; k < p.count; ++k) p.first_item[k + 1] = p.first_item[k] + (p.tensors[k].n + numbers - 1) / numbers;
   return p.first_item[p.count];
 }
 
-/// A work item of divide_work(p, numbers).
+/// An item of divide_work(p, numbers).
 template <typename T> AR_HD AdamPart part_of_item(const AdamParams<T>& p, int64_t item, int64_t numbers) {
   int k = 0;
   while (item >= p.first_item[k + 1]) ++k;
@@ -58,7 +58,7 @@ template <typename T> AR_HD AdamPart part_of_item(const AdamParams<T>& p, int64_
   return {k, begin, end < n ? end : n};
 }
 
-/// Updates one number. `rate`: rule.rate or rule.head_rate.
+/// `rate`: rule.rate or rule.head_rate.
 template <typename T> AR_HD void adam(const AdamRule<T>& rule, T rate, T grad, T& param, T& exp_avg, T& exp_avg_sq) {
   exp_avg = rule.beta1 * exp_avg + rule.one_minus_beta1 * grad;
   exp_avg_sq = rule.beta2 * exp_avg_sq + rule.one_minus_beta2 * grad * grad;

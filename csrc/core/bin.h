@@ -1,5 +1,6 @@
 // Which pixels and tiles a splat can touch: exact extents of its support ellipse, and a cheaper test for boxes of
-// pixels. project.h culls by the extents, bin lists the tiles, and blend tests boxes.
+// pixels (docs/numerics.md, "Extents of the support"). Projection culls by the extents, bin lists the tiles, and blend
+// tests boxes.
 #pragma once
 
 #include "core/footprint/registry.h"
@@ -7,14 +8,14 @@
 
 namespace ar {
 
-/// The ellipse |w (x - mean)|^2 <= level, grown by `reach` px in x and y so that it covers every sample of a pixel.
+/// The ellipse |w (x - mean)|^2 <= level, grown by `reach` px in x and y to cover every sample of a pixel.
 template <typename T> struct Support {
   Vec2<T> mean;
   T level, reach;
-  T half_width, half_height;  ///< of the ellipse's bounding box, without reach [px]
+  T half_width, half_height;  ///< of the bounding box, without reach [px]
   T tip;                      ///< y - mean.y at the rightmost point
-  T slope;                    ///< of the chord centres: x - mean.x = slope (y - mean.y)
-  T inv_a;                    ///< half chord at y: sqrt((level - (det (y - mean.y))^2 / a) / a), a = |column 1 of w|^2
+  T slope;                    ///< of the centres of chords: x - mean.x = slope (y - mean.y)
+  T inv_a;  ///< half chord at y: sqrt((level - (det (y - mean.y))^2 / a) / a), a = |column 1 of w|^2 = 1 / inv_a
   T det2;
 };
 
@@ -53,19 +54,18 @@ template <typename T> AR_HD Support<T> support_of(const SplatRow<T>& row, int fo
   return make_support(row.mean, w, row.level, reach);
 }
 
-/// A closed interval of pixel coordinates; empty if hi < lo.
+/// Pixel coordinates; empty if hi < lo.
 template <class V> struct Span {
   V lo, hi;
 };
 
-/// The pixel rows that the support reaches, in the image or not.
+/// The rows may lie outside the image.
 template <typename T> AR_HD Span<T> rows_of(const Support<T>& s) {
   const T half = s.half_height + s.reach;
   return {s.mean.y - half, s.mean.y + half};
 }
 
-/// Exact extent in x of the part of the support with y in [y0, y1]. The intersection of an ellipse and a band is
-/// convex: its extremes are at the tips of the ellipse or, if these are outside, at the nearer edge of the band.
+/// Exact extent in x of the part with y in [y0, y1].
 template <typename T> AR_HD Span<T> columns_of(const Support<T>& s, T y0, T y1) {
   const T height = s.half_height, zero = T(0);
   const T lo = max(y0 - (s.mean.y + s.reach), -height), hi = min(y1 - (s.mean.y - s.reach), height);
@@ -77,16 +77,15 @@ template <typename T> AR_HD Span<T> columns_of(const Support<T>& s, T y0, T y1) 
           select(hi < lo, -far, s.mean.x + s.slope * right + half_right + s.reach)};
 }
 
-/// A test whether a support reaches boxes of one size, without division and root. In the coordinates z = w (x - mean)
-/// the ellipse is a circle. The test compares it with a box that surrounds the box of pixels there, so that it may say
-/// yes if the ellipse passes closely.
+/// Whether a support reaches boxes of one size, without division and root. In z = w (x - mean) the ellipse is a circle,
+/// compared with a bounding box of the box of pixels. It may say yes if the ellipse passes closely.
 template <typename T> struct BoxReach {
   Vec2<T> half;  ///< of the box in z
   T level;
 };
 
-/// `half`: half the size of the boxes, with the reach of samples [px]. `distance`: the largest in x or y from a box's
-/// centre to the mean [px]. Rounding of z grows with it and with w, more than kLevelSlack for thin splats.
+/// `half`: of the boxes, with the reach of samples [px]. `distance`: the largest in x or y from a box's centre to the
+/// mean [px]. Rounding of z grows with it and with w, for thin splats beyond kLevelSlack.
 template <typename T> AR_HD BoxReach<T> make_box_reach(const Mat2<T>& w, T level, Vec2<T> half, T distance) {
   const T margin = T(kBoxRounding) * distance, x = half.x + margin, y = half.y + margin;
   return {{abs(w.xx) * x + abs(w.xy) * y, abs(w.yx) * x + abs(w.yy) * y}, level + T(kLevelSlack)};
@@ -97,18 +96,18 @@ template <typename T, class V> AR_HD MaskOf<V> reaches_box(const BoxReach<T>& s,
   return madd(x, x, y * y) <= V(s.level);
 }
 
-/// Integers [first, last]; empty if last < first.
+/// Empty if last < first.
 struct Range {
   int first, last;
 };
 template <typename T> AR_HD Range clamp_range(Span<T> span, int n) {
-  // Clamped before the conversion, which is undefined for a float beyond the range of int.
+  // Before the conversion, which is undefined beyond the range of int.
   const T lo = max(span.lo, T(0)), hi = min(span.hi, T(n - 1));
   if (!(lo <= hi)) return {0, -1};
   return {int(std::ceil(lo)), int(std::floor(hi))};
 }
 
-/// Whether the bounding box of the support contains a pixel centre.
+/// Whether the bounding box contains a pixel centre.
 template <typename T> AR_HD bool touches_image(const Support<T>& s, TileGrid grid) {
   const T half = s.half_width + s.reach;
   const Range rows = clamp_range(rows_of(s), grid.height);
@@ -121,7 +120,7 @@ AR_HD Range tiles_of(Range pixels, TileGrid grid) {
                                      : Range{0, -1};
 }
 
-/// Columns of the tiles that the support touches in a row of tiles. `rows`: its rows of pixels.
+/// `rows`: pixel rows of the support.
 template <typename T> AR_HD Range tile_columns_of(const Support<T>& s, TileGrid grid, Range rows, int tile_row) {
   const int top = tile_row << grid.tile_bits, bottom = top + grid.side() - 1;
   const T y0 = T(max(top, rows.first)), y1 = T(min(bottom, rows.last));
@@ -134,8 +133,7 @@ template <typename T, class Visit> AR_HD void for_each_tile_row(const Support<T>
   for (int row = tile_rows.first; row <= tile_rows.last; ++row) visit(row, tile_columns_of(s, grid, rows, row));
 }
 
-/// The bits of a depth >= 0, by which bin sorts: as unsigned integers they have the order of the depths. -0 counts as
-/// 0.
+/// As unsigned integers the bits of depths >= 0 sort as the depths do. -0 counts as 0.
 template <typename T> AR_HD auto depth_bits(T depth) {
   std::conditional_t<sizeof(T) == 4, uint32_t, uint64_t> bits;
   const T without_sign = depth + T(0);
@@ -144,12 +142,12 @@ template <typename T> AR_HD auto depth_bits(T depth) {
   return bits;
 }
 
-/// Tiles among 8x8: bit 8 r + c is the tile in row r and column c.
+/// Tiles among 8x8: bit 8 r + c is row r, column c.
 using TileMask = uint64_t;
 
 /// The tiles that a support touches. The mask begins at `row` and `column`.
 struct TileBox {
-  TileMask mask;  ///< 0 if the support touches no tile, or tiles outside of these 8x8
+  TileMask mask;  ///< 0 if there is no tile, or one outside these 8x8
   int row, column, count;
 };
 template <typename T> AR_HD TileBox find_tiles(const Support<T>& support, TileGrid grid) {
@@ -157,7 +155,7 @@ template <typename T> AR_HD TileBox find_tiles(const Support<T>& support, TileGr
   const T half = support.half_width + support.reach;
   const Span<T> columns = {support.mean.x - half, support.mean.x + half};
   TileBox found = {0, rows.first, tiles_of(clamp_range(columns, grid.width), grid).first, 0};
-  int begin = 0, end = 0;  // of all columns; by rounding a column may be before `found.column`
+  int begin = 0, end = 0;  // of all columns; by rounding one may be before `found.column`
   for_each_tile_row(support, grid, [&](int, Range range) AR_HD_LAMBDA {
     const int first = range.first - found.column, width = range.last - range.first + 1;
     uint32_t bits = 0;

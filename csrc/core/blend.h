@@ -1,8 +1,8 @@
 // Front-to-back compositing of one splat into one sample, and its adjoint (docs/numerics.md, "Blending and its
 // adjoint"). A library for the loops over pixels and splats in cpu/ and cuda/.
 //
-// T is the transmittance of a sample: the share of light that the splats so far let through. `raw` is opacity * weight
-// of a splat at the sample, before the cap and the threshold that make it alpha. V is a scalar or a pack of lanes.
+// T is the transmittance of a sample. `raw` is opacity * weight, before the cap and the threshold that make it alpha.
+// `mask`: the splat is composited. V is a scalar or a pack of lanes.
 #pragma once
 
 #include <type_traits>
@@ -13,8 +13,7 @@
 
 namespace ar {
 
-// The sign of a transmittance says whether the sample is open. A sample that stops negates its transmittance, and no
-// later splat changes it.
+// A sample that stops negates T, and no later splat changes it.
 
 template <class V> AR_HD V effective_alpha(V raw) {
   using T = ScalarOf<V>;
@@ -22,9 +21,9 @@ template <class V> AR_HD V effective_alpha(V raw) {
 }
 
 template <class V> struct Blended {
-  MaskOf<V> mask;  ///< whether the splat was composited
+  MaskOf<V> mask;
   V contribution;  ///< T alpha; zero outside the mask
-  V if_shown;      ///< T alpha; not to be read outside the mask
+  V if_shown;      ///< T alpha; undefined outside the mask
 };
 
 /// T <- T (1 - alpha). As in 3DGS, a splat that would lower T below kTransmittanceMin stops the sample instead.
@@ -32,7 +31,7 @@ template <class V> AR_HD Blended<V> blend_sample(V raw, V& transmittance) {
   using T = ScalarOf<V>;
   const V zero = V(T(0));
   const MaskOf<V> hit = raw >= V(T(kAlphaMin));
-  // Two forms with the same bits: the first is quicker for a thread of a GPU, the second for packs of lanes.
+  // Two forms with the same bits: the first is quicker for a GPU thread, the second for packs.
   if constexpr (std::is_same_v<MaskOf<V>, bool>) {
     const V if_shown = transmittance * min(raw, V(T(kAlphaMax))), next = transmittance - if_shown;
     const bool mask = hit & (next >= V(T(kTransmittanceMin)));
@@ -47,14 +46,13 @@ template <class V> AR_HD Blended<V> blend_sample(V raw, V& transmittance) {
   }
 }
 
-/// What a sample that moves (kMoves of footprint/contract.h) carries from splat to splat besides its transmittance.
-/// Callers set it to zero before the first splat.
+/// Of a sample that moves (kMoves of footprint/contract.h), besides T. Zero before the first splat.
 template <class V, bool kMoves> struct SampleState {};
 template <class V> struct SampleState<V, true> {
   Vec2<V> moved;  ///< displacement from the sample's node [px]
 };
 
-/// The same for sample s of the pixel at p. P is PixelsOf the footprint.
+/// For sample s of the pixel at p. P is PixelsOf the footprint.
 template <class P, class Terms, class V>
 AR_HD Blended<V> blend_sample(const Terms& terms, Vec2<V> p, int s, V& transmittance,
                               SampleState<V, P::kMoves>& state) {
@@ -71,8 +69,7 @@ AR_HD Blended<V> blend_sample(const Terms& terms, Vec2<V> p, int s, V& transmitt
   }
 }
 
-/// The same for a sample that moves, with its position `place`, which stays within `cell` (Bounds or UnitCell), and its
-/// whitened coordinates z.
+/// By the position `place` of a sample that moves, within `cell` (Bounds or UnitCell), and its whitened coordinates z.
 template <class P, class Terms, class V, class Cell>
 AR_HD Blended<V> blend_placed_sample(const Terms& terms, Vec2<V> z, V raw, const Cell& cell, V& transmittance,
                                      Vec2<V>& place) {
@@ -83,8 +80,8 @@ AR_HD Blended<V> blend_placed_sample(const Terms& terms, Vec2<V> z, V raw, const
   return blended;
 }
 
-/// Repeats blend_placed_sample in the backward pass. `before`: the splat is not later than the last splat that the
-/// forward pass composited, so that kTransmittanceMin need not be tested. Returns whether the splat was composited.
+/// Repeats blend_placed_sample in the backward pass, and returns the mask. `before`: not later than the last splat
+/// composited, so kTransmittanceMin need not be tested.
 template <class P, class Terms, class V, class Cell>
 AR_HD MaskOf<V> replay_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> before, const Cell& cell,
                                      V& transmittance, Vec2<V>& place) {
@@ -97,16 +94,15 @@ AR_HD MaskOf<V> replay_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskO
 }
 
 template <class V> struct BlendGrad {
-  V contribution;         ///< T alpha, zero outside the mask
-  AlphaGrad<V> of_alpha;  ///< zero outside the mask and where alpha is capped
+  V contribution;         ///< T alpha
+  AlphaGrad<V> of_alpha;  ///< zero where alpha is capped
 };
 
-/// Adjoint of blend_sample, called from the last splat to the first. `mask`: the forward pass composited the splat.
+/// Adjoint of blend_sample, called from the last splat to the first.
 ///
-/// `g_color` is the scalar product of the pixel's gradient and the splat's colour. `behind` (B of docs/numerics.md) is
-/// that product for the colour of all later splats and the background, as seen through this splat alone. On entry
-/// `transmittance` and `behind` are as after the splat, on return as before it. The recursion avoids the difference of
-/// the total and a prefix, which cancels in deep stacks.
+/// `g_color` is the dot product of the pixel's gradient and the splat's colour. `behind` (B of docs/numerics.md) is
+/// that product for all later splats and the background, seen through this splat alone. `transmittance` and `behind`
+/// are read as after the splat, written as before it.
 template <class V> AR_HD BlendGrad<V> blend_sample_vjp(MaskOf<V> mask, V raw, V g_color, V& transmittance, V& behind) {
   using T = ScalarOf<V>;
   const V zero = V(T(0)), cap = V(T(kAlphaMax));
@@ -121,17 +117,17 @@ template <class V> AR_HD BlendGrad<V> blend_sample_vjp(MaskOf<V> mask, V raw, V 
 }
 
 template <class V> struct MovingBlendGrad {
-  V contribution;  ///< as in BlendGrad
+  V contribution;
   MoveGrad<V> of_splat;
 };
-/// Zero sums: -0, since the compiler knows that -0 + x is x.
+/// Zeros are -0: the compiler knows that -0 + x is x.
 template <class V> AR_HD MovingBlendGrad<V> no_moving_blend_grad() {
   const V zero = V(ScalarOf<V>(-0.0));
   return {zero, {zero, {{zero, zero}, {zero, zero, zero}}}};
 }
 
-/// Adjoint of blend_placed_sample, added to `sums`. `raw` is zero where the splat was not composited, `place` is the
-/// position before it, and dL_dplace has the unit kMoveGradUnit of P.
+/// Adjoint of blend_placed_sample. `raw` is zero outside the mask, `place` is before the splat, dL_dplace in the unit
+/// kMoveGradUnit.
 template <class P, class Terms, class V, class Cell>
 AR_HD void add_placed_sample_vjp(const Terms& terms, Vec2<V> z, V raw, const Cell& cell, V g_color, Vec2<V> place,
                                  V& transmittance, V& behind, Vec2<V>& dL_dplace, MovingBlendGrad<V>& sums) {
@@ -146,23 +142,24 @@ AR_HD void add_placed_sample_vjp(const Terms& terms, Vec2<V> z, V raw, const Cel
                                sums.of_splat);
 }
 
-/// How a segment of a list changes `behind` and dL_dplace of add_placed_sample_vjp. Before the segment
-///   behind = (color + T after * behind after) / T before,
-///   dL_dplace = of_color + of_behind * (behind after) + of_place (dL_dplace after).
+/// How a segment of a list changes `behind` and dL_dplace (docs/numerics.md, "Adjoint of moving nodes").
+///
+///   behind before = (color + T after * behind after) / T before,
+///   dL_dplace before = of_color + of_behind * behind after + of_place * dL_dplace after.
 template <class V> struct AdjointMap {
   V color;
   Vec2<V> of_color, of_behind;
   Mat2<V> of_place;
 };
 
-/// Appends one splat to the segment. `mask`: the forward pass composited the splat.
+/// Appends one splat to the segment.
 template <class P, class Terms, class V, class Cell>
 AR_HD void map_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> mask, const Cell& cell, V g_color,
                              V& transmittance, Vec2<V>& place, AdjointMap<V>& map) {
   using T = ScalarOf<V>;
   const V cap = V(T(kAlphaMax)), zero = V(T(0)), alpha = select(mask, min(raw, cap), zero);
   const MoveSlope<V> slope = P::move_in_with_slope(terms, z, alpha, raw <= cap, cell, place);
-  // With B and l after this splat, B + alpha (g - B) and J^T l + T (g - B) dalpha before it enter the old map.
+  // The `s` of docs/numerics.md is of_difference.
   const Vec2<V> of_alpha = {transmittance * slope.alpha.x, transmittance * slope.alpha.y};
   Mat2<V>& m = map.of_place;
   const Vec2<V> of_difference = {madd(m.xx, of_alpha.x, madd(m.xy, of_alpha.y, alpha * map.of_behind.x)),
@@ -179,7 +176,7 @@ AR_HD void map_placed_sample(const Terms& terms, Vec2<V> z, V raw, MaskOf<V> mas
        select(slope.free_y, yy, zero)};
 }
 
-/// What a pixel adds to the two sums of `sums`, which is not kNone. dL_dmean: the pixel's share of the gradient [1/px].
+/// What a pixel adds to the two sums. dL_dmean: the pixel's share of the gradient [1/px].
 template <class V, typename T> AR_HD Vec2<V> mean_sums_of(MeanSums sums, Vec2<T> size, Vec2<V> dL_dmean) {
   if (sums == MeanSums::kAbsolute) return {abs(dL_dmean.x), abs(dL_dmean.y)};
   const V x = V(T(0.5) * size.x) * dL_dmean.x, y = V(T(0.5) * size.y) * dL_dmean.y;

@@ -1,5 +1,5 @@
-// Applies the Blur of lens and shutter to a projected Gaussian: adds to its covariance, and lowers its amplitude so
-// that the mass stays the same. project.h calls seen_covariance and its adjoint.
+// Adds the Blur of lens and shutter to a projected covariance, and lowers the amplitude so that the splat keeps its
+// mass. project.h calls seen_covariance and its adjoint.
 #pragma once
 
 #include "core/covariance.h"
@@ -7,24 +7,23 @@
 namespace ar {
 
 template <typename T> struct BlurredCov {
-  Cov2d<T> streaked, all;  ///< Sigma with the streak; with streak and defocus
+  Cov2d<T> streaked, all;  ///< with the streak; with streak and defocus
   Vec2<T> adj_streak;      ///< adj(Sigma) streak
 };
 
-/// Products of adj(Sigma) with the streak are sums of products of the factors: from the entries of Sigma they would
-/// cancel for a needle along the streak.
+/// Sums of products of the factors, since entries of Sigma would cancel for a needle along the streak.
 template <typename T>
 AR_HD BlurredCov<T> blurred(const Factors<T>& f, const Gaussians<T>& g, int64_t i, const Blur<T>& by) {
   const Vec2<T>& b = by.streak;
   const Vec3<T> x = g.cov3ds ? f.jacobian.x : f.row_x, y = g.cov3ds ? f.jacobian.y : f.row_y;
   const Vec3<T> across = b.x * y - b.y * x, weighted = g.cov3ds ? g.cov3ds[i] * across : across;
-  const T gain = dot(across, weighted);  // negative by rounding of the entries of a cov3d
+  const T gain = dot(across, weighted);  // negative by rounding of a cov3d
   const Cov2d<T>& c = f.cov;
   const Cov2d<T> streaked = {c.xx + b.x * b.x, c.xy + b.x * b.y, c.yy + b.y * b.y, c.det + (gain < T(0) ? T(0) : gain)};
   return {streaked, blur(streaked, by.variance), {dot(y, weighted), -dot(x, weighted)}};
 }
 
-/// The covariance that the footprint gets, and a factor of the opacity.
+/// What the footprint gets, and a factor of the opacity.
 template <typename T> struct SeenCov {
   Cov2d<T> cov;
   T amp;
@@ -51,27 +50,26 @@ template <typename T> AR_HD T inverse_root(T a, T b) { return T(1) / (sqrt(a) * 
 template <class B, typename T> struct BlurContext {
   B blur;
   BlurredCov<T> cov;
-  T weighted;  ///< gradient with respect to the logarithm of the amplitude
+  T weighted;  ///< by the logarithm of the amplitude
 };
 template <typename T> struct BlurContext<NoBlur, T> {};
 
-/// Gradient of the logarithm of the amplitude with respect to Sigma.
+/// Gradient of the logarithm of the amplitude by Sigma.
 template <typename T> AR_HD Sym2<T> blur_amp_grad(const Cov2d<T>& c, T variance, const BlurredCov<T>& cov) {
   const T inv = inverse_root(c.det, cov.streaked.det), x = inv * cov.adj_streak.x, y = inv * cov.adj_streak.y;
   return Sym2<T>{T(0.5) * x * x, T(0.5) * x * y, T(0.5) * y * y} + log_amp_grad(cov.streaked, variance);
 }
 
-/// Gradient with respect to the blur. The amplitude depends on it by det Sigma': -Sigma'^-1 b and -tr(Sigma'^-1) / 2
-/// (docs/numerics.md, "Gradient with respect to a blur").
+/// docs/numerics.md, "Gradient with respect to a blur". For a thin needle g.yy may cancel the amplitude, so both
+/// multiply the same numbers.
 template <typename T>
 AR_HD Blur<T> seen_covariance_vjp(const SplatGrad<T>& grad, const BlurContext<Blur<T>, T>& context) {
   const Vec2<T>& b = context.blur.streak;
   const Cov2d<T>& all = context.cov.all;
   const T v = context.blur.variance, u = grad.variance;
   const Vec2<T> adj_b = {context.cov.adj_streak.x + v * b.x, context.cov.adj_streak.y + v * b.y};  // adj(Sigma') b
-  // For a thin needle the footprint's g.yy may cancel the amplitude. w^T w = (Sigma' + u I)^-1 is known without w, so
-  // that both multiply the same numbers. The remainder needs whitened coordinates, as its entries cancel along the
-  // streak.
+  // w^T w = (Sigma' + u I)^-1 is known without w. The remainder needs whitened coordinates, because its entries cancel
+  // along the streak.
   const Cov2d<T> seen = blur(all, u);
   const T across = grad.frame == GradFrame::kPixels ? T(0) : grad.dL_dwhite.yy;
   const T own = across / seen.det, inv = context.weighted / all.det;

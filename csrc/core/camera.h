@@ -1,9 +1,7 @@
 // What project.h, covariance.h and blur.h ask of a camera with any model: a mean's pixel, the Jacobian there, the blur,
-// and the adjoints. The models are in core/camera/.
-//
-// Every function is compiled for two types. Camera is the pinhole of 3DGS, without a cost for models and effects.
-// FullCamera has all models and effects as branches, which all threads take alike: projecting takes a small part of a
-// frame, so that one type for every combination would not pay.
+// and the adjoints. The models are in core/camera/. Every function is compiled for two types. Camera is the pinhole of
+// 3DGS. FullCamera has all models and effects as branches, which all threads take alike: projecting is a small part of
+// a frame.
 #pragma once
 
 #include "core/defocus.h"
@@ -49,7 +47,7 @@ template <class Cam, typename T> AR_HD ProjectedMean<T> project_mean(const Cam& 
   return p;
 }
 
-/// Gradient with respect to the mean. Adds to dL_dview the share of the model's map.
+/// Returns dL/dmean. Adds to dL_dview the share of the model's map.
 template <class Cam, typename T>
 AR_HD Vec3<T> project_mean_vjp(const Cam& camera, const ProjectedMean<T>& p, Vec2<T> dL_dpixel, Vec3<T>& dL_dview) {
   const Vec3<T> by_map =
@@ -64,8 +62,7 @@ AR_HD Vec3<T> jacobian_vjp(const Cam& camera, const Jacobian<T>& j, Vec3<T> view
   return visit_model(camera, [&](auto model) AR_HD_LAMBDA { return model.jacobian_vjp(camera, j, view, grad); });
 }
 
-/// An upper bound of |W|^2, W the upper left 3x3 of the view: the largest sum of a row of |W W^T|. About 1 for a
-/// rotation.
+/// An upper bound of |W|^2, W the upper left 3x3 of the view (docs/numerics.md, "Culling bound").
 template <typename T> AR_HD T largest_zoom2(const Camera<T>& camera) {
   const Vec3<T> x = xyz(camera.view_x), y = xyz(camera.view_y), z = xyz(camera.view_z);
   const T xy = abs(dot(x, y)), xz = abs(dot(x, z)), yz = abs(dot(y, z));
@@ -88,7 +85,7 @@ template <class Cam, typename T> AR_HD T depth_of(const Cam& camera, Vec3<T> mea
       camera, Vec3<T>{apply_row(camera.view_x, mean), apply_row(camera.view_y, mean), apply_row(camera.view_z, mean)});
 }
 
-/// A unit vector, and 1 / the length of the vector that was normalised.
+/// A unit vector, and 1 / its length before.
 template <typename T> struct Direction {
   Vec3<T> unit;
   T inv_length;
@@ -103,8 +100,7 @@ template <class Cam, typename T> AR_HD void ray_vjp(const Cam& camera, Vec3<T> d
   visit_model(camera, [&](auto model) AR_HD_LAMBDA { model.ray_vjp(dL_dray, dL_dmean); });
 }
 
-/// Adds the gradient of project_mean, make_jacobian and view_direction with respect to the camera. dL_dview: after
-/// project_mean_vjp.
+/// Adds the gradient of project_mean, make_jacobian and view_direction. dL_dview: after project_mean_vjp.
 template <typename T>
 AR_HD void add_camera_vjp(const FullCamera<T>& camera, Vec3<T> mean, const ProjectedMean<T>& p, Vec2<T> dL_dpixel,
                           Vec3<T> dL_dview, const Jacobian<T>& j, const JacobianGrad<T>& dL_djacobian, Vec3<T> dL_dray,
@@ -119,14 +115,14 @@ AR_HD void add_camera_vjp(const FullCamera<T>& camera, Vec3<T> mean, const Proje
   });
 }
 
-/// What the lens and the shutter add to the covariance of a Gaussian at `view`.
+/// The blur of a Gaussian at `view`.
 template <typename T> AR_HD Blur<T> blur_of(const FullCamera<T>& camera, Vec3<T> view) {
   const Lens<T>& lens = camera.lens;
   return {lens.moves() ? motion_streak(camera, view) : Vec2<T>{T(0), T(0)},
           lens.aperture != T(0) ? defocus_variance(camera, view) : T(0)};
 }
 
-/// Gradient of blur_of with respect to `view`; adds that with respect to the camera to `to`, if not null.
+/// Returns the gradient with respect to `view`; adds that of the camera to `to`, if not null.
 template <typename T>
 AR_HD Vec3<T> blur_vjp(const FullCamera<T>& camera, Vec3<T> view, const Blur<T>& dL_dblur, CameraGrad<T>* to) {
   Vec3<T> by_view = {T(0), T(0), T(0)};

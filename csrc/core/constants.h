@@ -1,21 +1,21 @@
-// Constants that the whole pipeline shares, most of them of 3DGS.
+// Constants that the whole pipeline shares, most of them of 3DGS. The viewer's page has copies, which a test compares.
 #pragma once
 
 namespace ar {
 
-/// Edge of a square tile [px], and its logarithm to base 2.
+/// Edge of a square tile [px], and its log2.
 inline constexpr int kTileBits = 4, kTile = 1 << kTileBits;
-/// The same on CUDA where samples move; see moving_grid() of stages.h.
+/// On CUDA where samples move; see moving_grid() of stages.h.
 inline constexpr int kMovingTileBits = 3, kMovingTile = 1 << kMovingTileBits;
-/// An image with fewer tiles of this size is small: CUDA has other kernels for samples that move.
+/// An image with fewer such tiles is small: CUDA has other kernels for samples that move.
 inline constexpr int kSmallImageTiles = 4096;
-/// With fewer tiles of 16x16 pixels CUDA spreads four samples of a pixel over lanes (spread_grid() of stages.h).
+/// With fewer tiles of 16x16 pixels CUDA spreads four samples over lanes (spread_grid() of stages.h).
 inline constexpr int kSpreadImageTiles = 4096;
 
-/// A Gaussian is culled unless the camera-space z of its mean exceeds this [world units].
+/// Culled unless the camera-space z of the mean exceeds this [world units].
 inline constexpr double kNear = 0.2;
 
-/// The Jacobian of a pinhole clamps x/z and y/z to this times the tangent of half the field of view.
+/// The Jacobian of a pinhole clamps x/z and y/z to this times tan(fov/2).
 inline constexpr double kFrustumClamp = 1.3;
 
 /// A smaller alpha counts as zero.
@@ -24,48 +24,47 @@ inline constexpr double kAlphaMin = 1.0 / 255.0;
 /// log2(kAlphaMin) - 1e-4: a margin hundreds of times the errors of rounding and exp2.
 inline constexpr double kLogAlphaMin = -7.99445;
 
-/// The cap of alpha.
 inline constexpr double kAlphaMax = 0.99;
 
-/// A sample stops before its transmittance falls below this.
+/// A sample stops before T falls below this.
 inline constexpr double kTransmittanceMin = 1e-4;
 
-/// For the radius that 3DGS reports, half the difference of the eigenvalues is at least the root of this [px^4].
+/// In 3DGS's radius, half the difference of the eigenvalues is at least the root of this [px^4].
 inline constexpr double kRadiusMinGap = 0.1;
 
 /// Variance of the unit pixel along each axis [px^2].
 inline constexpr double kPixelVariance = 1.0 / 12.0;
 
-/// Added to the level of every support ellipse, so that rounding loses no pair, except of needles longer than 280 to
-/// 1000 px (docs/numerics.md, "Support").
+/// Added to every level, so that rounding loses no pair, except of needles longer than 280 to 1000 px
+/// (docs/numerics.md, "Support").
 inline constexpr double kLevelSlack = 1e-2;
 
-/// Ten roundings, for the bound of how far a Gaussian reaches.
+/// Ten roundings: the margin of a Gaussian's reach.
 inline constexpr double kReachMargin = 1 + 2e-6;
 
-/// Five roundings of float32: the error of a whitened coordinate, relative to the sum of its two terms.
+/// Five roundings of float32: the error of a whitened coordinate, relative to the sum of its terms.
 inline constexpr double kBoxRounding = 3e-7;
 
-// Gaussians with numbers beyond these are culled, so that nothing derived from them overflows a float.
+// Gaussians with numbers beyond these are culled: nothing derived overflows a float.
 /// det Sigma [px^4]: standard deviations up to 3e7 px.
 inline constexpr double kMaxDet = 1e30;
 /// World units.
 inline constexpr double kMaxScale = 1e18;
 inline constexpr double kMaxOpacity = 1e6, kMaxColor = 1e12;
 
-/// A negative det Sigma counts as zero up to this share of Sigma_xx Sigma_yy, from the rounding of a cov3d (16 2^-24).
+/// A negative det Sigma counts as zero up to this share of Sigma_xx Sigma_yy: 16 roundings of a cov3d.
 inline constexpr double kSingular = 1e-6;
 
-/// Likewise for an entry of the whitening matrix [1/px]. Only `point` without dilation exceeds it: the ellipses of
-/// other footprints are wider than 1/56 px.
+/// An entry of the whitening matrix [1/px]. Only `point` without dilation exceeds it: other ellipses are wider than
+/// 1/56 px.
 inline constexpr double kMaxWhitening = 1e7;
 
-/// The limit of the gradient with respect to a quaternion q, which grows as 1/|q|, and of 1/|q|.
+/// Limit of the gradient of a quaternion q, which grows as 1/|q|, and of 1/|q|.
 inline constexpr double kMaxQuaternionGrad = 1e38;
 
 inline constexpr int kMaxChannels = 512;
 
-/// Weights are summed as whole numbers of 2^-32, so that the order of pixels changes no bit.
+/// Weights are summed as integers in units of 2^-32, so that the order of pixels changes no bit.
 inline constexpr double kWeightUnit = 1.0 / 4294967296.0;
 
 inline constexpr double kPi = 3.14159265358979323846;

@@ -13,8 +13,8 @@ template <typename T> struct UnitQuaternion {
 
 /// Deviates: 3DGS expects unit quaternions.
 template <typename T> AR_HD UnitQuaternion<T> normalize_quaternion(Vec4<T> q) {
-  // Vec4 (x, y, z, w) is the quaternion (w, x, y, z). The division by the largest keeps squares in range, the power of
-  // two keeps the division in range without rounding.
+  // Vec4 (x, y, z, w) is the quaternion (w, x, y, z). Dividing by the largest keeps squares in range, the power of two
+  // keeps the division in range.
   const T largest = max(max(abs(q.x), abs(q.y)), max(abs(q.z), abs(q.w)));
   // max() may drop a NaN; the sum does not.
   if (abs(q.x) + abs(q.y) + abs(q.z) + abs(q.w) == T(0)) return {T(1), T(0), T(0), T(0), T(0)};
@@ -32,7 +32,7 @@ template <typename T> AR_HD Mat3<T> rotation_matrix(UnitQuaternion<T> q) {
            {two * (q.x * q.z - q.w * q.y), two * (q.y * q.z + q.w * q.x), one - two * (q.x * q.x + q.y * q.y)}}};
 }
 
-/// Gradient with respect to the quaternion as given and stored, from that with respect to a turn R <- R exp([turn]x).
+/// Gradient by the stored quaternion, from that by a turn R <- R exp([turn]x).
 template <typename T> AR_HD Vec4<T> rotation_vjp(UnitQuaternion<T> q, Vec3<T> dL_dturn) {
   const Vec3<T> raw = (T(2) * q.inv_norm) * dL_dturn;
   const T limit = T(kMaxQuaternionGrad);
@@ -41,8 +41,7 @@ template <typename T> AR_HD Vec4<T> rotation_vjp(UnitQuaternion<T> q, Vec3<T> dL
           q.w * t.z + q.x * t.y - q.y * t.x};
 }
 
-/// Sigma = V V^T with V = A R S, of scale and rotation; Sigma = A cov3d A^T, of a 3D covariance, without the members
-/// from `quaternion` to `normal`.
+/// Sigma = V V^T, V = A R S. Of a 3D covariance Sigma = A cov3d A^T, without `quaternion` to `normal`.
 template <typename T> struct Factors {
   Jacobian<T> jacobian;
   UnitQuaternion<T> quaternion;
@@ -70,7 +69,7 @@ AR_HD Factors<T> project_covariance(const Cam& camera, const Gaussians<T>& g, in
     const Sym3<T>& c = g.cov3ds[i];
     const Vec3<T> cx = c * ax, cy = c * ay, n = cross(ax, ay);
     f.cov = {dot(ax, cx), dot(ax, cy), dot(ay, cy), dot(n, adjugate_times(c, n))};
-    // Entries of a needle that were rounded to float.
+    // A needle whose entries were rounded.
     if (f.cov.det < T(0) && f.cov.det >= T(-kSingular) * f.cov.xx * f.cov.yy) f.cov.det = T(0);
   } else {
     f.quaternion = normalize_quaternion(g.rotations[i]);

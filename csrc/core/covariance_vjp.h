@@ -1,6 +1,6 @@
-// The adjoint of covariance.h: from the gradient with respect to the covariance in the image to the gradients with
-// respect to scale and rotation, or to a 3D covariance, which it writes, and to the camera's Jacobian. project.h calls
-// it.
+// The adjoint of covariance.h: gradients with respect to scale and rotation, or a 3D covariance, and to the camera's
+// Jacobian. The caller is project.h. Every product is formed in coordinates in which its terms do not cancel
+// (docs/numerics.md, from "Gradient in the turned frame" on).
 #pragma once
 
 #include "core/blur.h"
@@ -15,23 +15,22 @@ template <class Out, class V> AR_HD void put(const Out&, V& to, V gradient) {
   }
 }
 
-/// The gradient with respect to Sigma = A R S^2 R^T A^T in the coordinates of the columns t_k of A R: H_kl = t_k .
-/// dL/dSigma t_l, and dL/dSigma t_k (docs/numerics.md, "Gradient in the turned frame").
+/// In the coordinates of the columns t_k of A R, Sigma = A R S^2 R^T A^T: H_kl = t_k . dL/dSigma t_l.
 template <typename T> struct TurnedGrad {
   Vec3<T> diagonal, off;       ///< H_kk; H_12, H_20, H_01
-  Vec3<T> x, y;                ///< dL/dSigma t_k, as two rows
-  Vec3<T> scaled_x, scaled_y;  ///< another part of x and y, times s_k
+  Vec3<T> x, y;                ///< rows of dL/dSigma t_k
+  Vec3<T> scaled_x, scaled_y;  ///< more of x and y, times s_k
 };
 
-/// A covariance M = Sigma + c c^T + v I in the coordinates t_k.
+/// M = Sigma + c c^T + v I in the coordinates t_k.
 template <typename T> struct TurnedCov {
   Cov2d<T> cov;
-  Vec3<T> x, y;  ///< adj(M) t_k, as two rows
+  Vec3<T> x, y;  ///< rows of adj(M) t_k
   Vec3<T> c;     ///< c x t_k; zero without blur
   T v;
 };
 
-/// Adds the gradient of weight log sqrt(det M / det(M + v I)): v adj(M) (adj(M) + v) / (2 det det').
+/// Adds the gradient of weight log sqrt(det M / det(M + v I)).
 template <bool kBlurred, typename T>
 AR_HD void add_log_amp_vjp(const Factors<T>& f, const TurnedCov<T>& m, T weight, T v, TurnedGrad<T>& h) {
   if (weight == T(0) || v == T(0)) return;
@@ -54,7 +53,6 @@ AR_HD void add_log_amp_vjp(const Factors<T>& f, const TurnedCov<T>& m, T weight,
   h.y += (l * inv) * ((m.cov.xx + v) * cy - m.cov.xy * cx);
 }
 
-/// Every product is formed in coordinates, whitened or of the factors, in which its terms do not cancel.
 template <class B, typename T>
 AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, const BlurContext<B, T>& context) {
   constexpr bool kBlurred = !std::is_same_v<B, NoBlur>;
@@ -68,7 +66,7 @@ AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, co
     const Vec2<T>& b = context.blur.streak;
     const Cov2d<T>& streaked = context.cov.streaked;
     m.c = b.x * ty - b.y * tx;
-    // log sqrt(det Sigma / det streaked) has the gradient u u^T / 2, u = adj(Sigma) b / sqrt(det Sigma det streaked).
+    // docs/numerics.md, "Gradient through a blur": e_k = t_k . u.
     const T half = T(0.5) * context.weighted, inv = inverse_root(f.cov.det, streaked.det);
     const Vec3<T> e = inv * (b.x * m.x + b.y * m.y);
     h.diagonal += half * mul(e, e);
@@ -83,7 +81,7 @@ AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, co
   const T v = grad.variance;
   Vec3<T> qx, qy;  // w t_k
   if (grad.frame == GradFrame::kTriangular) {
-    // The second row of w subtracts from one row of V its projection on the other: (adj(M) + v) t over a variance.
+    // The second row of w subtracts from a row of V its projection on the other: (adj(M) + v) t over a variance.
     const bool x_first = w.xx != T(0);
     const T along = w.xx + w.xy, across = (x_first ? w.yy : w.yx) * along * along;
     qx = along * (x_first ? tx : ty);
@@ -95,8 +93,8 @@ AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, co
   const Vec3<T> ex = g.xx * qx + g.xy * qy, ey = g.xy * qx + g.yy * qy;
   h.diagonal += mul(qx, ex) + mul(qy, ey);
   if (grad.frame == GradFrame::kAxes) {
-    // (w t_k).(w t_l) = t_k . M^-1 t_l is known without w. Of a thin needle within a window its factor g.yy is large,
-    // and does not change with a turn: products of w would leave eps (s1/s2)^2 of it.
+    // t_k . M^-1 t_l is known without w. For a thin needle within a window its factor g.yy is large: products of w
+    // would leave eps (s1/s2)^2 of it.
     const T c = m.cov.det > T(0) ? quotient(g.yy, m.cov.det) : T(0);
     const Vec3<T> rx = (g.xx - g.yy) * qx + g.xy * qy, ry = g.xy * qx;
     h.off += shifted_products(qx, rx) + shifted_products(qy, ry) - c * mul(square, shifted_products(n, n));
@@ -151,7 +149,6 @@ AR_HD JacobianGrad<T> project_covariance_vjp(const Gaussians<T>& g, const Out& o
   const Vec3<T> by_scale = T(2) * mul(s, h.diagonal);
   if (out.scales) put(out, out.scales[i], g.scale_modifier * by_scale);
   if (out.rotations) {
-    // A turn about one axis mixes the other two by their difference.
     const Vec3<T> gap = {(s.y - s.z) * (s.y + s.z), (s.z - s.x) * (s.z + s.x), (s.x - s.y) * (s.x + s.y)};
     put(out, out.rotations[i], rotation_vjp(f.quaternion, T(2) * mul(gap, h.off)));
   }

@@ -11,11 +11,11 @@ namespace ar {
 
 template <typename T> struct ObserveParams {
   int64_t n;
-  const T* gradients;    ///< [n][stride] with respect to means2D
-  int stride, first;     ///< columns of `gradients`, and the first of the two columns that count
+  const T* gradients;    ///< [n, stride] by means2D
+  int stride, first;     ///< columns of `gradients`, and the first of the two that count
   const int32_t* radii;  ///< [n]
-  T* gradient_sums;      ///< [n] sums of the lengths of gradients
-  int32_t* views;        ///< [n] pictures that show a Gaussian
+  T* gradient_sums;      ///< [n] of the lengths of gradients
+  int32_t* views;        ///< [n] pictures that show it
 };
 
 /// Adds one picture. A Gaussian that it does not show has the gradient zero.

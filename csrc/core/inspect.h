@@ -1,5 +1,5 @@
-// Statistics of a pixel: how much it shows of every splat, the splat it shows most of, and its median splat. The loops
-// of `inspect` (cpu/inspect.h, cuda/inspect.cuh) add them up into InspectParams.
+// Statistics of a pixel: how much it shows of every splat, the splat it shows most of, and its median splat.
+// cpu/inspect.h and cuda/inspect.cuh add them up into InspectParams.
 #pragma once
 
 #include "core/blend.h"
@@ -10,7 +10,7 @@ namespace ar {
 template <typename T> AR_HD int64_t weight_units(T weight) { return int64_t(double(weight) / kWeightUnit + 0.5); }
 
 template <typename T> struct Shown {
-  T weight;       ///< the mean over the samples of transmittance times alpha
+  T weight;       ///< mean of T alpha over the samples
   bool in_front;  ///< weight > 0, and more than half of the light is left after the splat
 };
 
@@ -19,7 +19,7 @@ template <typename T, class P> struct PixelSummary {
   T transmittance[S];
   SampleState<T, P::kMoves> states[S] = {};
   T largest = T(0);
-  int32_t dominant = -1;  ///< the splat of the largest weight, the nearest if several have it
+  int32_t dominant = -1;  ///< the splat of the largest weight, the nearest of equals
   int32_t median = -1;    ///< the first splat after which less than half of the light is left
 
   AR_HD void start(bool inside) {

@@ -1,6 +1,6 @@
-// The functions that formulas may call on a value type V. Here they are for float and double; cpu/pack.h has them for
-// packs of floats. So one formula serves a CUDA thread (V = float), several pixels of the CPU (V = Pack) and a test (V
-// = double). ScalarOf<V> is the type of an element, MaskOf<V> that of a comparison.
+// The functions that formulas may call on a value type V, for float and double. cpu/pack.h has them for packs of
+// floats. So one formula serves a CUDA thread (V = float), several pixels of the CPU (V = Pack) and a test (V =
+// double). ScalarOf<V> is the type of an element, MaskOf<V> of a comparison.
 #pragma once
 
 #include <cfloat>
@@ -40,7 +40,7 @@ AR_HD int32_t select(bool m, int32_t a, int32_t b) { return m ? a : b; }
 
 template <typename T> AR_HD T min(T a, T b) { return b < a ? b : a; }
 template <typename T> AR_HD T max(T a, T b) { return a < b ? b : a; }
-/// One instruction on devices that have one for which NaN stays NaN.
+/// One instruction where there is one that keeps NaN.
 AR_HD float min(float a, float b) {
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 800
   float y;
@@ -60,8 +60,8 @@ AR_HD float max(float a, float b) {
 #endif
 }
 
-/// a * b + c, contracted where there is such an instruction. Elsewhere the build turns contraction off, so that forward
-/// and backward passes round alike.
+/// a * b + c, contracted where there is an instruction. Elsewhere the build turns contraction off, so that forward and
+/// backward passes round alike.
 AR_HD float madd(float a, float b, float c) {
 #if defined(__CUDA_ARCH__) || defined(__FMA__)
   return std::fma(a, b, c);
@@ -77,7 +77,7 @@ AR_HD double madd(double a, double b, double c) {
 #endif
 }
 
-/// madd, clamped to [0, 1]. On a device NaN becomes 0.
+/// Clamped to [0, 1]. On a device NaN becomes 0.
 AR_HD float saturated_madd(float a, float b, float c) {
 #if defined(__CUDA_ARCH__)
   float y;
@@ -89,7 +89,7 @@ AR_HD float saturated_madd(float a, float b, float c) {
 }
 AR_HD double saturated_madd(double a, double b, double c) { return min(max(madd(a, b, c), 0.0), 1.0); }
 
-/// On a device one comparison: the bits of numbers outside of [0, 1], and of -0, are larger integers.
+/// On a device one comparison: the bits of numbers outside [0, 1], and of -0, are larger integers.
 AR_HD bool in_unit_interval(float x) {
 #if defined(__CUDA_ARCH__)
   return __float_as_uint(x) <= __float_as_uint(1.0f);
@@ -116,11 +116,11 @@ AR_HD float exp2(float x) {
 #endif
 }
 AR_HD double exp2(double x) { return std::exp2(x); }
-/// Within 4 ulp while the result is a normal number.
+/// Within 4 ulp for normal results.
 AR_HD float erfc(float x) { return std::erfc(x); }
 AR_HD double erfc(double x) { return std::erfc(x); }
-// On a device sqrt and quotient lack the branch of the compiler's own, for numbers near the ends of the range of
-// floats: around a branch no instruction can be moved.
+// On a device sqrt and quotient lack the compiler's branch for numbers near the ends of the range: no instruction can
+// be moved around a branch.
 
 /// Rounded correctly where x is not below 2^-100.
 AR_HD float sqrt(float x) {
@@ -136,7 +136,7 @@ AR_HD float sqrt(float x) {
 }
 AR_HD double sqrt(double x) { return std::sqrt(x); }
 
-/// a / b, rounded correctly where |b| is in [2^-126, 2^126] and neither a nor the quotient is below 2^-100.
+/// Rounded correctly where |b| is in [2^-126, 2^126] and neither a nor the quotient is below 2^-100.
 AR_HD float quotient(float a, float b) {
 #if defined(__CUDA_ARCH__)
   float approximate;
@@ -152,11 +152,11 @@ AR_HD float quotient(float a, float b) {
 }
 AR_HD double quotient(double a, double b) { return a / b; }
 
-/// The power of two whose product with |x| is in [1, 2), or the nearest one for the tiniest and largest x.
+/// Its product with |x| is in [1, 2), but for the tiniest and largest x.
 template <typename T> AR_HD T inverse_power_of_two(T x) {
   using Bits = std::conditional_t<sizeof(T) == sizeof(uint32_t), uint32_t, uint64_t>;
   static_assert(std::numeric_limits<T>::is_iec559 && sizeof(T) == sizeof(Bits));
-  // Of the field of the exponent: its lowest bit, and its highest value of a finite number.
+  // Of the field of the exponent: its lowest bit, and its highest finite value.
   constexpr Bits lowest = Bits(1) << (std::numeric_limits<T>::digits - 1);
   constexpr Bits field = (~Bits(0) >> 1) & ~(lowest - 1), highest = field - lowest;
   Bits bits;
@@ -167,7 +167,7 @@ template <typename T> AR_HD T inverse_power_of_two(T x) {
   return x;
 }
 
-/// a / b, on a device quicker than quotient() and within 2 ulp, for |b| in [2^-126, 2^126].
+/// On a device within 2 ulp, for |b| in [2^-126, 2^126].
 AR_HD float divide(float a, float b) {
 #if defined(__CUDA_ARCH__)
   float reciprocal;
@@ -191,7 +191,7 @@ AR_HD float approx_sqrt(float x) {
 }
 AR_HD double approx_sqrt(double x) { return std::sqrt(x); }
 
-/// a b - c d within 1.5 ulp, where nothing under- or overflows (Kahan), for determinants of nearly singular matrices.
+/// a b - c d within 1.5 ulp, where nothing under- or overflows (Kahan).
 template <typename T> AR_HD T difference_of_products(T a, T b, T c, T d) {
   const T cd = c * d;
   return std::fma(a, b, -cd) + std::fma(-c, d, cd);
@@ -236,7 +236,7 @@ template <class V> AR_HD V one_minus_exp_ratio(V x) {
   }
 }
 
-/// 1 - exp(-x) for x >= 0, given e = exp(-x), without cancellation.
+/// 1 - exp(-x) without cancellation, for x >= 0 and e = exp(-x).
 template <class V> AR_HD V one_minus_exp(V x, V e) {
   using T = ScalarOf<V>;
   return select(x < V(T(0.5)), x * one_minus_exp_ratio(x), V(T(1)) - e);

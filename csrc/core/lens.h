@@ -1,5 +1,5 @@
-// Only structs. Lens: what a FullCamera has beyond a plain camera; Python fills it by the names in kLensMembers. Blur:
-// what lens and shutter add to a covariance in the image; blur_of() in camera.h makes it, blur.h applies it.
+// Only structs. Lens: what a FullCamera has beyond a Camera; Python fills it by the names in kLensMembers. Blur: what
+// lens and shutter add to a covariance in the image; blur_of() in camera.h makes it, blur.h applies it.
 #pragma once
 
 #include "core/footprint/contract.h"
@@ -11,17 +11,17 @@ template <typename T> struct Lens {
   Vec2<T> tan_half_fov;  ///< orthographic: half the width and height, world units
   Vec2<T> center;        ///< x/z and y/z at the middle of the picture, for the clamp of a pinhole
   T aperture, focus;     ///< world units
-  Vec3<T> shift, turn;   ///< of the camera during the exposure, along its axes: world units, radians
+  Vec3<T> shift, turn;   ///< of the camera during the exposure, along its axes [world units, radians]
   Vec2<T> screen;        ///< of the picture during the exposure [px]
-  T near, far;           ///< limits of camera-space z; without gradient
-  T model;               ///< index in CameraModels (core/camera/models.h); without gradient
+  T near, far;           ///< of camera-space z; no gradient
+  T model;               ///< index in CameraModels (core/camera/models.h); no gradient
 
   AR_HD bool moves() const {
     return shift.x != T(0) || shift.y != T(0) || shift.z != T(0) || turn.x != T(0) || turn.y != T(0) ||
            turn.z != T(0) || screen.x != T(0) || screen.y != T(0);
   }
 };
-/// The members of Lens, in order. Members that Python does not set are zero.
+/// In order. What Python does not set is zero.
 struct LensMember {
   const char* name;
   int size;
@@ -37,10 +37,10 @@ inline constexpr int kLensWidth = [] {
 }();
 static_assert(sizeof(Lens<float>) == kLensWidth * sizeof(float));
 
-/// A blurred Gaussian with a smaller det Sigma [px^4] has no mass, so that nothing derived from it overflows a float.
+/// A blurred Gaussian with a smaller det Sigma [px^4] has no mass: nothing derived overflows a float.
 inline constexpr double kMinBlurredDet = 1e-30;
 
-/// streak streak^T + variance I is added to a projected covariance [px^2].
+/// Adds streak streak^T + variance I to a covariance.
 template <typename T> struct Blur {
   Vec2<T> streak;  ///< [px]
   T variance;      ///< [px^2]

@@ -1,6 +1,5 @@
-// Motion blur, for blur_of() in camera.h. A point that moves by u px during the exposure becomes a segment of length
-// |u|, whose variance along u is |u|^2 / 12. In camera space the point p moves by w = -shift - turn x p (of the
-// camera); the camera's model gives u (docs/numerics.md, "Lens and shutter").
+// Motion blur, for blur_of() in camera.h: a point that moves by u px during the exposure has the variance |u|^2 / 12
+// along u (docs/numerics.md, "Lens and shutter"). The camera's model gives u.
 #pragma once
 
 #include "core/camera/models.h"

@@ -1,13 +1,13 @@
-// Differences of the compilers and devices that the core is built for.
+// Differences of the compilers and devices that the core is built for. Every header of core uses these macros.
 #pragma once
 
 #if defined(__CUDACC__)
 #define AR_HD __host__ __device__ __forceinline__
 #define AR_HD_LAMBDA
 #else
-// Always inlined: otherwise the linker might give a copy compiled for a newer instruction set to code for an older one.
+// Always inlined: the linker might give code for an older instruction set a copy for a newer one.
 #define AR_HD inline __attribute__((always_inline))
-/// The same for a lambda, between its parameters and its body.
+/// For a lambda, between parameters and body.
 #define AR_HD_LAMBDA __attribute__((always_inline))
 #endif
 

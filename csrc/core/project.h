@@ -1,6 +1,6 @@
 // One Gaussian to one splat, and the adjoint: a library for cpu/project.h, cpu/rows.h and cuda/project*.cuh. The camera
-// gives mean, covariance, opacity and depth in the image (project_gaussian), the footprint shape and support
-// (shape_splat), the harmonics the colour (splat_color). project_vjp is the adjoint of all three.
+// gives mean, covariance, opacity and depth (project_gaussian), the footprint shape and support (shape_splat), the
+// harmonics colour (splat_color). project_vjp is the adjoint of all three.
 #pragma once
 
 #include <type_traits>
@@ -11,10 +11,10 @@
 
 namespace ar {
 
-/// How far a Gaussian reaches in the image with a footprint, at most (docs/numerics.md, "Culling bound").
+/// Bounds of a Gaussian's reach with a footprint (docs/numerics.md, "Culling bound").
 template <typename T> struct CullBounds {
   T variance;  ///< that the footprint adds [px^2]
-  T level;     ///< of the support ellipse of an opacity of 1
+  T level;     ///< of the support ellipse at opacity 1
 };
 
 template <typename T> CullBounds<T> cull_bounds(FootprintChoice footprint) {
@@ -28,7 +28,6 @@ template <typename T> CullBounds<T> cull_bounds(FootprintChoice footprint) {
   return bounds;
 }
 
-/// An upper bound of the standard deviations of Gaussian i.
 template <typename T> AR_HD T max_sigma(const Gaussians<T>& g, int64_t i) {
   if (g.cov3ds) return sqrt(g.cov3ds[i].xx + g.cov3ds[i].yy + g.cov3ds[i].zz);
   const Vec3<T> s = g.scales[i];
@@ -68,15 +67,14 @@ template <typename T> struct ProjectedGaussian {
   T depth;
 };
 
-/// False if the matrix is no covariance, or if numbers derived from it would overflow a float.
+/// False if the matrix is no covariance, or derived numbers would overflow a float.
 template <typename T> AR_HD bool is_drawable(const ProjectedGaussian<T>& p) {
   const Cov2d<T>& cov = p.cov;
   return cov.det >= T(0) && cov.det < T(kMaxDet) && cov.xx >= T(0) && cov.yy >= T(0) && within(cov.xx, 1e18) &&
          within(cov.yy, 1e18) && !(p.opacity > T(kMaxOpacity));
 }
 
-/// Reads row i, with any numbers of the caller's. False if project_gaussian would have culled such a Gaussian, or if
-/// its depth is negative or NaN.
+/// Reads row i, whose numbers may be any. False if such a Gaussian would be culled, or the depth is negative or NaN.
 template <typename T> AR_HD bool read_row(const ProjectedRows<T>& rows, int64_t i, ProjectedGaussian<T>& out) {
   const Sym2<T> c = rows.cov2d[i];
   out = {rows.means2d[i], {c.xx, c.xy, c.yy, rows.dets[i]}, rows.opacities[i], rows.depths[i]};
@@ -88,7 +86,7 @@ template <typename T> AR_HD bool read_row(const PackedRow<T>& row, ProjectedGaus
   return within(out.mean.x, 1e9) && within(out.mean.y, 1e9) && out.depth >= T(0) && is_drawable(out);
 }
 
-/// False if Gaussian i is culled: outside of what the camera shows, not finite, or degenerate.
+/// False if Gaussian i is culled: out of sight, not finite, or degenerate.
 template <class Cam, typename T>
 AR_HD bool project_gaussian(const Cam& camera, const Gaussians<T>& g, int64_t i, const ProjectedMean<T>& mean,
                             ProjectedGaussian<T>& out) {
@@ -99,20 +97,19 @@ AR_HD bool project_gaussian(const Cam& camera, const Gaussians<T>& g, int64_t i,
     return false;
   const SeenCov<T> seen = seen_covariance(camera, g, i, mean.view, factors);
   out = {mean.pixel, seen.cov, seen.amp * g.opacities[i], depth_at(camera, mean.view)};
-  // The opacity before the blur: a large blur must not make a degenerate Gaussian valid.
+  // Before the blur: a large blur must not make a degenerate Gaussian valid.
   return is_drawable(out) && !(g.opacities[i] > T(kMaxOpacity));
 }
 
-/// The radius that 3DGS reports [px]: ceil(3 sigma) along the major axis, a little too large for a round splat.
+/// 3DGS's radius [px]: ceil(3 sigma) along the major axis, a little too large for a round splat.
 template <typename T> AR_HD int splat_radius(Cov2d<T> cov, T variance) {
   const T half_gap = max(T(0.5) * eigenvalue_gap(cov), sqrt(T(kRadiusMinGap)));
   const T largest = T(0.5) * (cov.xx + cov.yy) + half_gap + variance;
   return int(min(std::ceil(T(3) * sqrt(largest)), T(1e9)));
 }
 
-/// Writes a splat without its colour, and its support if splat.level > 0. Returns 3DGS's radius, or 0 for a splat that
-/// is culled: outside of the image, or with a shape that overflows. A splat with a radius may touch no tile (level <=
-/// 0).
+/// Writes a splat without its colour, and its support if splat.level > 0. Returns 3DGS's radius, or 0 for a culled
+/// splat (outside the image, or its shape overflows). A splat with a radius may touch no tile.
 template <typename T>
 AR_HD int shape_splat(const ProjectedGaussian<T>& p, FootprintChoice footprint, TileGrid grid, SplatRow<T>& splat,
                       Support<T>* support = nullptr) {
@@ -133,7 +130,7 @@ AR_HD int shape_splat(const ProjectedGaussian<T>& p, FootprintChoice footprint, 
   if (!within(w.xx, kMaxWhitening) || !within(w.xy, kMaxWhitening) || !within(w.yx, kMaxWhitening) ||
       !within(w.yy, kMaxWhitening))
     return 0;
-  if (!within(level, 1e6)) return 0;  // zero, negative or non-finite opacity, zero determinant
+  if (!within(level, 1e6)) return 0;  // opacity <= 0 or not finite, or zero determinant
   const int radius = splat_radius(p.cov, radius_variance);
   const bool on_image = p.mean.x + T(radius) >= T(0) && p.mean.x - T(radius) <= T(grid.width - 1) &&
                         p.mean.y + T(radius) >= T(0) && p.mean.y - T(radius) <= T(grid.height - 1);
@@ -144,7 +141,7 @@ AR_HD int shape_splat(const ProjectedGaussian<T>& p, FootprintChoice footprint, 
   return touches || on_image ? radius : 0;
 }
 
-/// The colour of Gaussian i, whose coefficients are `sh`. False if it is not finite.
+/// `sh`: the coefficients of Gaussian i. False if the colour is not finite.
 template <class Cam, typename T>
 AR_HD bool splat_color(const Cam& camera, const Gaussians<T>& g, int64_t i, const Vec3<T>* sh, Vec3<T>& color) {
   if (g.colors) {
@@ -161,7 +158,7 @@ AR_HD bool splat_color(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
   return finite;
 }
 
-/// Writes the packed row of Gaussian i, if there is room. With radius 0 the row touches no pixel.
+/// Writes row i if there is room. Radius 0: it touches no pixel.
 template <typename T>
 AR_HD void write_packed(const PackedRows<T>& to, int64_t i, const ProjectedGaussian<T>& p, Vec3<T> color, int radius) {
   const int64_t place = *to.first + to.ends[i] - 1;
@@ -174,8 +171,8 @@ AR_HD void write_packed(const PackedRows<T>& to, int64_t i, const ProjectedGauss
   to.ids[place] = int32_t(i);
 }
 
-/// Writes the gradient of the colour's parameters, and returns the gradient with respect to the model's ray. `dL_dsh`,
-/// the gradient of the coefficients `sh`, may be null or the same memory as `sh`.
+/// Writes the gradient of the colour's parameters, returns that of the model's ray. `dL_dsh`, the gradient of the
+/// coefficients `sh`, may be null or the same memory.
 template <class Cam, typename T, class Out>
 AR_HD Vec3<T> splat_color_vjp(const Cam& camera, const Gaussians<T>& g, const Out& out, int64_t i, const Vec3<T>* sh,
                               Vec3<T>* dL_dsh, Vec3<T> dL_dcolor) {
@@ -213,7 +210,7 @@ AR_HD int project_shape(const Cam& camera, const Gaussians<T>& g, int64_t i, con
   return shape_splat(p, footprint, camera.grid, splat, support);
 }
 
-/// Writes a splat with its colour. Culls Gaussian i also if the colour is not finite.
+/// Also culls Gaussian i if its colour is not finite.
 template <class Cam, typename T>
 AR_HD int project(const Cam& camera, const Gaussians<T>& g, int64_t i, FootprintChoice footprint, SplatRow<T>& splat,
                   T& depth) {
@@ -224,12 +221,11 @@ AR_HD int project(const Cam& camera, const Gaussians<T>& g, int64_t i, Footprint
   return 0;
 }
 
-/// Whether the caller's channels replace the colours; otherwise they are features beside colours.
+/// Whether the caller's channels replace colours, or are features beside them.
 template <typename T> AR_HD bool given_colors(const ProjectParams<T>& p) {
   return p.given.data && !(p.channels.data && p.channels.color >= 0);
 }
 
-/// The first three channels of a row, filled up with zeros.
 template <typename T> AR_HD Vec3<T> first_channels(const T* row, int count) {
   return {row[0], count > 1 ? row[1] : T(0), count > 2 ? row[2] : T(0)};
 }
@@ -251,7 +247,7 @@ AR_HD void add_channels_vjp(const ChannelRows<const T>& rows, int64_t i, T depth
 
 template <typename T> struct ProjectedGrad {
   SplatGrad<T> splat;
-  T weighted;  ///< with respect to the logarithm of the opacity
+  T weighted;  ///< by the logarithm of the opacity
 };
 
 template <typename T>
@@ -293,9 +289,8 @@ template <typename T> AR_HD ProjectedGrad<T> projected_grad(const ProjectedRowGr
           opacity * rows.opacities[row]};
 }
 
-/// Writes every gradient of Gaussian i, and adds that of a full camera to `camera_grad`, if not null.
-/// grad_of(covariance, opacity) returns the ProjectedGrad. `sh` and `dL_dsh` as for splat_color_vjp; out.shs is not
-/// touched.
+/// Writes every gradient of Gaussian i but out.shs, and adds that of a full camera to `camera_grad`, if not null.
+/// grad_of(covariance, opacity) returns the ProjectedGrad. `sh` and `dL_dsh` as for splat_color_vjp.
 template <class Cam, typename T, class GradOf, class Out>
 AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, const GradOf& grad_of, ShownGrad<T> shown,
                        const Vec3<T>* sh, Vec3<T>* dL_dsh, const Out& out, CameraGrad<T>* camera_grad = nullptr) {
@@ -310,7 +305,7 @@ AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
   if constexpr (Cam::kFull) {
     const Blur<T> blur = blur_of(camera, mean.view);
     has_blur = blur.any();
-    // Without blur its gradient is zero: the covariance grows with the square of the blur.
+    // A blur of zero has a zero gradient (docs/numerics.md, "Lens and shutter").
     if (has_blur) {
       const BlurContext<Blur<T>, T> context = {blur, blurred(factors, g, i, blur), projected.weighted};
       dL_djacobian = project_covariance_vjp(g, out, i, factors, grad, context);
@@ -338,7 +333,6 @@ AR_HD void project_vjp(const Cam& camera, const Gaussians<T>& g, int64_t i, cons
   }
 }
 
-/// Writes the sums of density control into their columns of means2d.
 template <typename T> AR_HD void write_mean_sums(const GaussianGrads<T>& out, int64_t i, Vec2<T> size, Vec2<T> sums) {
   if (!out.means2d || out.mean_sums == MeanSums::kNone) return;
   T* row = out.means2d + i * out.means2d_stride;
@@ -351,7 +345,7 @@ template <typename T> AR_HD void write_mean_sums(const GaussianGrads<T>& out, in
   }
 }
 
-/// The gradient of a Gaussian that touched no pixel. `dL_dsh` may be null.
+/// For a Gaussian without pixels. `dL_dsh` may be null.
 template <typename T, class Out>
 AR_HD void zero_grads(const Gaussians<T>& g, int64_t i, const Out& out, Vec3<T>* dL_dsh) {
   const Vec3<T> zero = {T(0), T(0), T(0)};

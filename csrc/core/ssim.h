@@ -1,6 +1,6 @@
-// The loss of 3DGS, a combination of the structural similarity of two images [SSIM, Eq. 13] and their mean absolute
-// error; and its adjoint. The window is a Gaussian of 11 x 11 pixels with a standard deviation of 1.5 px; outside the
-// images, whose values are in [0, 1], are zeros. cpu/ssim.cpp and cuda/ssim.cu run over the pixels.
+// The loss of 3DGS, and its adjoint: structural similarity of two images [SSIM, Eq. 13] and their mean absolute error.
+// The window is a Gaussian of 11 x 11 pixels, standard deviation 1.5 px. Images are in [0, 1], with zeros outside.
+// cpu/ssim.cpp and cuda/ssim.cu run over the pixels.
 //
 // [SSIM] Wang et al., Image Quality Assessment: From Error Visibility to Structural Similarity, 2004.
 #pragma once
@@ -14,8 +14,8 @@ inline constexpr int kSsimRadius = 5, kSsimWindow = 2 * kSsimRadius + 1;
 /// They keep quotients from 0 / 0.
 inline constexpr double kSsimC1 = 0.01 * 0.01, kSsimC2 = 0.03 * 0.03;
 
-/// The sum over the window along one axis; at(k) is the value k pixels from its centre. The window is separable and
-/// symmetric, so that this is also the adjoint.
+/// The sum along one axis; at(k) is the value k pixels from the centre. The window is separable and symmetric, so this
+/// is also the adjoint.
 template <typename T, class At> AR_HD T window_sum(const At& at) {
   // exp(-k^2 / (2 * 1.5^2)), normalised
   constexpr double kWeights[] = {0.26601172486179434341, 0.21300553771125369989, 0.10936068950970001069,
@@ -62,12 +62,12 @@ template <typename T> struct LossWeights {
 template <typename T, typename Target> struct SsimParams {
   int64_t planes;
   int height, width;
-  const T* image;        ///< [planes][height][width]
-  const Target* target;  ///< [planes][height][width]
+  const T* image;        ///< [planes, height, width]
+  const Target* target;  ///< [planes, height, width]
   LossWeights<T> weights;
-  T* map;       ///< [planes][height][width] the similarities, or null
+  T* map;       ///< [planes, height, width] or null
   T* loss;      ///< [1] or null
-  T* partials;  ///< [kSsimPartials][planes][height][width] for the adjoint, or null
+  T* partials;  ///< [kSsimPartials, planes, height, width] or null
 
   AR_HD int64_t pixels() const { return planes * height * width; }
 };
@@ -78,7 +78,7 @@ AR_HD T combined_loss(const SsimParams<T, Target>& p, double l1_sum, double ssim
   return T(double(p.weights.l1) * (l1_sum / n) + double(p.weights.ssim) * (ssim_sum / n) + double(p.weights.constant));
 }
 
-/// Reads dL_dmap or dL_dloss, the one that is not null.
+/// One of dL_dmap and dL_dloss is null.
 template <typename T, typename Target> struct SsimVjpParams {
   int64_t planes;
   int height, width;
@@ -86,26 +86,25 @@ template <typename T, typename Target> struct SsimVjpParams {
   const Target* target;
   LossWeights<T> weights;
   const T* partials;
-  const T* dL_dmap;   ///< [planes][height][width] or null
-  const T* dL_dloss;  ///< [1] or null
-  T* dL_dimage;       ///< [planes][height][width]
+  const T* dL_dmap;   ///< [planes, height, width]
+  const T* dL_dloss;  ///< [1]
+  T* dL_dimage;       ///< [planes, height, width]
 
   AR_HD int64_t pixels() const { return planes * height * width; }
 };
 
-/// The gradients with respect to |x - y| and to the similarity, equal in all pixels. The partials include that of a
-/// map.
+/// Gradients by |x - y| and by the similarity, equal in all pixels. Partials include dL_dmap.
 template <typename T, typename Target> AR_HD LossWeights<T> pixel_weights(const SsimVjpParams<T, Target>& p) {
   if (p.dL_dmap) return {T(0), T(1), T(0)};
   const T share = *p.dL_dloss / T(p.pixels());
   return {share * p.weights.l1, share * p.weights.ssim, T(0)};
 }
 
-/// The gradient with respect to pixel x. `partials`: their window sums.
+/// Gradient by pixel x. `partials`: their window sums.
 template <typename T> AR_HD T ssim_vjp(T x, T y, const T (&partials)[kSsimPartials], LossWeights<T> weights) {
   const T similarity = partials[kPartialX] + T(2) * x * partials[kPartialXX] + y * partials[kPartialXY];
   const T d = x - y;
-  const T sign = d > T(0) ? T(1) : d < T(0) ? T(-1) : d;  // 0 stays 0, and NaN stays NaN
+  const T sign = d > T(0) ? T(1) : d < T(0) ? T(-1) : d;  // d: 0 or NaN
   return weights.ssim * similarity + weights.l1 * sign;
 }
 

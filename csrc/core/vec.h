@@ -1,5 +1,5 @@
-// Small vectors and matrices, for all of core. They are aggregates of scalars without padding, so that an array of them
-// is an array of numbers.
+// Small vectors and matrices, for all of core. They are aggregates of scalars without padding: an array of them is an
+// array of numbers.
 #pragma once
 
 #include "core/lanes.h"
@@ -26,8 +26,8 @@ template <typename T> struct Lower2 {
   T xx, yx, yy;
 };
 
-/// Symmetric 2x2. A gradient G means dL = tr(G dSigma): the derivative with respect to the number that fills both
-/// off-diagonal entries is 2 xy.
+/// Symmetric 2x2. A gradient G means dL = tr(G dSigma): the derivative by the number that fills both off-diagonal
+/// entries is 2 xy.
 template <typename T> struct Sym2 {
   T xx, xy, yy;
 };
@@ -80,14 +80,14 @@ template <typename T> AR_HD Mat2<T> operator*(T s, const Mat2<T>& m) {
 template <typename T> AR_HD Lower2<T> operator*(T s, const Lower2<T>& m) { return {s * m.xx, s * m.yx, s * m.yy}; }
 template <typename T> AR_HD Mat2<T> all_of(const Mat2<T>& m) { return m; }
 template <typename T> AR_HD Mat2<T> all_of(const Lower2<T>& m) { return {m.xx, T(0), m.yx, m.yy}; }
-/// m v with scalar m and lanes v.
+/// Scalar m, lanes v.
 template <typename T, class V> AR_HD Vec2<V> transform(const Mat2<T>& m, Vec2<V> v) {
   return {madd(V(m.xx), v.x, V(m.xy) * v.y), madd(V(m.yx), v.x, V(m.yy) * v.y)};
 }
 template <typename T, class V> AR_HD Vec2<V> transform(const Lower2<T>& m, Vec2<V> v) {
   return {V(m.xx) * v.x, madd(V(m.yx), v.x, V(m.yy) * v.y)};
 }
-/// m v + c with scalar m, and c of scalars or lanes.
+/// m v + c; scalar m, c of scalars or lanes.
 template <typename T, class V, class C> AR_HD Vec2<V> transform(const Mat2<T>& m, Vec2<V> v, Vec2<C> c) {
   return {madd(V(m.xx), v.x, madd(V(m.xy), v.y, V(c.x))), madd(V(m.yx), v.x, madd(V(m.yy), v.y, V(c.y)))};
 }

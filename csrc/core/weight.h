@@ -14,14 +14,14 @@ template <typename T> struct WeightParams {
   const T* dL_dweights;  ///< vjp only
   T* weights;            ///< forward only
   Vec2<T>* dL_doffsets;  ///< vjp only
-  Sym2<T>* dL_dcovs;     ///< vjp only; xy: with respect to the number that fills both entries
+  Sym2<T>* dL_dcovs;     ///< vjp only; xy doubled, see Sym2
 };
 
 template <typename T> AR_HD Cov2d<T> with_det(Sym2<T> c) {
   return {c.xx, c.xy, c.yy, difference_of_products(c.xx, c.yy, c.xy, c.xy)};
 }
 
-/// The weight of several samples is their mean. `d` = pixel centre - mean [px].
+/// The mean over the samples. `d` = pixel centre - mean [px].
 template <class F, typename T> AR_HD T weight(Sym2<T> cov, Vec2<T> d, FootprintOptions options) {
   const auto terms = F::terms(F::prepare(with_det(cov), options), T(1));
   T total = T(0);
@@ -32,7 +32,7 @@ template <class F, typename T> AR_HD T weight(Sym2<T> cov, Vec2<T> d, FootprintO
 
 template <typename T> struct WeightGrad {
   Vec2<T> offset;
-  Sym2<T> cov;  ///< xy: with respect to the number that fills both entries
+  Sym2<T> cov;  ///< xy doubled, see Sym2
 };
 
 template <class F, typename T>

@@ -1,5 +1,5 @@
-// The map through clip space, which pinhole.h and orthographic.h inherit: a matrix of the caller's makes x, y and w
-// from the mean, and x/w and y/w are the position in the image.
+// The map through clip space, which pinhole.h and orthographic.h inherit. A matrix of the caller's makes x, y and w
+// from the mean; x/w and y/w are the position in the image.
 #pragma once
 
 #include "core/camera/contract.h"
@@ -31,7 +31,7 @@ struct ClipSpaceMap {
   }
 
  private:
-  /// Gradients with respect to clip-space x, y and w.
+  /// By clip-space x, y and w.
   template <typename T>
   AR_HD static Vec3<T> clip_vjp(const Camera<T>& camera, const ProjectedMean<T>& p, Vec2<T> dL_dpixel) {
     const T gx = quotient(T(0.5) * camera.size.x * dL_dpixel.x, p.clip_w);

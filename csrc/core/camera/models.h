@@ -1,4 +1,4 @@
-// The list of camera models. A new model is a header and an entry here.
+// The list of camera models. A new model is a header and an entry here. camera.h, motion.h and defocus.h visit it.
 #pragma once
 
 #include <type_traits>
@@ -23,7 +23,7 @@ template <class Model, class... M> constexpr int index_of_model(CameraModelList<
 }
 template <class Model> inline constexpr int kCameraModel = index_of_model<Model>(CameraModels());
 
-/// Calls visit(M()) for the model with index `model`, or for the last model if there is none.
+/// Visits the model with this index, or the last model if there is none.
 template <int kIndex = 0, typename T, class Visit, class M, class... Later>
 AR_HD auto visit_model_at(T model, CameraModelList<M, Later...>, Visit&& visit) {
   if constexpr (sizeof...(Later) > 0) {
@@ -32,7 +32,6 @@ AR_HD auto visit_model_at(T model, CameraModelList<M, Later...>, Visit&& visit) 
   return visit(M());
 }
 
-/// Calls visit(M()) for the model of a camera.
 template <typename T, class Visit> AR_HD auto visit_model(const Camera<T>&, Visit&& visit) { return visit(Pinhole()); }
 template <typename T, class Visit> AR_HD auto visit_model(const FullCamera<T>& camera, Visit&& visit) {
   return visit_model_at(camera.lens.model, CameraModels(), visit);

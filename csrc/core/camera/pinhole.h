@@ -57,7 +57,7 @@ struct Pinhole : ClipSpaceMap, CameraModelDefaults {
       to.lens.tan_half_fov.y += j.ratio_y > camera.lens.center.y ? clamp * by_ratio.y : -clamp * by_ratio.y;
     }
   }
-  /// |J| <= f/z |(1, 0, -x/z; 0, 1, -y/z)| <= f/z sqrt(1 + (x/z)^2 + (y/z)^2), with x/z and y/z clamped.
+  /// docs/numerics.md, "Culling bound".
   template <class Cam, typename T> AR_HD static T largest_stretch(const Cam& camera, Vec3<T> view) {
     const Vec2<T> r = largest_ratio(camera);
     return divide(max(camera.focal.x, camera.focal.y), view.z) * approx_sqrt(T(1) + r.x * r.x + r.y * r.y);
@@ -87,7 +87,6 @@ struct Pinhole : ClipSpaceMap, CameraModelDefaults {
   }
 
  private:
-  /// The middle of the clamp of x/z and y/z.
   template <typename T> AR_HD static Vec2<T> clamp_center(const Camera<T>&) { return {T(0), T(0)}; }
   template <typename T> AR_HD static Vec2<T> clamp_center(const FullCamera<T>& camera) { return camera.lens.center; }
   /// The largest |x/z| and |y/z| after the clamp.
@@ -95,7 +94,6 @@ struct Pinhole : ClipSpaceMap, CameraModelDefaults {
   template <typename T> AR_HD static Vec2<T> largest_ratio(const FullCamera<T>& camera) {
     return {camera.limit.x + abs(camera.lens.center.x), camera.limit.y + abs(camera.lens.center.y)};
   }
-  /// With respect to the clamped ratios.
   template <typename T>
   AR_HD static Vec2<T> ratio_vjp(const Camera<T>& camera, Vec3<T> view, const JacobianGrad<T>& grad) {
     const Vec3<T> axis = xyz(camera.view_z);

@@ -1,5 +1,6 @@
 // The footprint `analytic`: the Gaussian integrated over a unit pixel that is turned into its eigenframe, with a
-// logistic approximation of the Gaussian's CDF [AS, Eq. 2-9].
+// logistic approximation of the Gaussian's CDF [AS, Eq. 2-9]. registry.h lists it with both of its gradients. The forms
+// are those of docs/numerics.md, "Logistic window".
 #pragma once
 
 #include "core/footprint/eigenframe.h"
@@ -13,10 +14,10 @@ inline constexpr double kLogistic3 = 0.07;
 /// Lower bound of standard deviations [px], so that r^3 fits a float. The weight of a thinner splat is below 2.6e-6.
 inline constexpr double kMinSigma = 1e-6;
 
-/// Numbers of one axis of a splat's frame, for all pixels. Coordinates along the axis are t = u/sigma.
+/// One axis of a splat's frame. Coordinates along it are t = u/sigma.
 template <typename T> struct LogisticAxis {
   T half;              // half a pixel, 1/(2 sigma)
-  T constant, square;  // f(b) - f(a) = constant + square t^2, see LogisticWindow
+  T constant, square;  // f(b) - f(a) = constant + square t^2
 
   AR_HD static LogisticAxis at(T inv_sigma) {
     const T r = inv_sigma;
@@ -24,10 +25,10 @@ template <typename T> struct LogisticAxis {
   }
 };
 
-/// What the derivatives need besides LogisticAxis. With x and y as in LogisticValue, t >= 0 and h = half:
+/// For the derivatives of F = sinh y / (cosh x + cosh y), with t >= 0 and h = half.
+///
 ///   dx/dt = linear + 3 kLogistic3 t^2,              dy/dt = square t,
 ///   t dx/dt + h dx/dh = t (dx/dt + spread),         t dy/dt + h dy/dh = y + cube + square t^2
-/// (docs/numerics.md, "Logistic window").
 template <typename T> struct LogisticSlopes {
   T linear, spread, cube;
 
@@ -37,9 +38,7 @@ template <typename T> struct LogisticSlopes {
   }
 };
 
-/// F = S(t + half) - S(t - half) along one axis, without cancellation:
-/// F = (1 - exp(f(a) - f(b))) / ((1 + exp(f(a))) (1 + exp(-f(b)))), a, b = |t| -+ half. It is the sinh form of
-/// docs/numerics.md, scaled to stay finite.
+/// F = S(t + half) - S(t - half), without cancellation. a, b = |t| -+ half.
 template <class V> struct LogisticWindow {
   using T = ScalarOf<V>;
   V lower, upper;  // exp(f(a)), exp(-f(b))
@@ -47,7 +46,7 @@ template <class V> struct LogisticWindow {
 
   AR_HD LogisticWindow(V t, const LogisticAxis<T>& axis) {
     const V one = V(T(1)), distance = abs(t);
-    // The clamp keeps products of four such factors finite; F is then below 1e-17.
+    // Keeps products of four such factors finite; F is then below 1e-17.
     lower = exp2(min(logistic_base2(distance - V(axis.half)), V(T(40 * kLog2e))));
     upper = exp2(-logistic_base2(distance + V(axis.half)));
     numerator = one_minus_exp(madd(V(axis.square) * t, t, V(axis.constant)), lower * upper);
@@ -55,11 +54,10 @@ template <class V> struct LogisticWindow {
   }
 
  private:
-  /// f(z) log2(e)
   AR_HD static V logistic_base2(V z) { return z * madd(V(T(kLogistic3 * kLog2e)) * z, z, V(T(kLogistic1 * kLog2e))); }
 };
 
-/// F and its derivatives. `inverse` = 1 / window.denominator.
+/// `inverse` = 1 / window.denominator.
 template <class V> struct LogisticValue {
   using T = ScalarOf<V>;
   V value;     // F
@@ -70,16 +68,14 @@ template <class V> struct LogisticValue {
                       const LogisticSlopes<T>& slopes) {
     const V one = V(T(1)), distance = abs(t), tt = t * t;
     value = f.numerator * inverse;
-    // Derivatives of F = sinh y / (cosh x + cosh y), with x and y the half sum and half difference of f(b) and f(a).
     const V product = f.lower * f.upper;
     const V by_x = value * (f.upper - f.lower) * inverse;
     const V by_y = madd(V(T(4)), product, (f.lower + f.upper) * (one + product)) * inverse * inverse;
     const V dx = madd(V(T(3 * kLogistic3)), tt, V(slopes.linear)), dy = V(axis.square) * distance;
     const V by_distance = madd(by_x, dx, by_y * dy);
     by_t = select(t < V(T(0)), -by_distance, by_distance);
-    // F - y dF/dy, of the order of y^3, cancels for wide splats. There its first term y F (F - y/3), with an error of
-    // y^5/90, is better.
-    const V y = V(T(0.5)) * madd(V(axis.square) * t, t, V(axis.constant));  // as in the window
+    // F - y dF/dy cancels for wide splats. There its first term y F (F - y/3) is better, with an error of y^5/90.
+    const V y = V(T(0.5)) * madd(V(axis.square) * t, t, V(axis.constant));
     const V excess = select(y < V(T(kSmall<T>)), y * value * madd(V(T(-1.0 / 3)), y, value), value - y * by_y);
     by_sigma = excess - madd(by_x, distance * (dx + V(slopes.spread)), by_y * madd(V(axis.square), tt, V(slopes.cube)));
   }
@@ -89,8 +85,8 @@ template <class V> struct LogisticValue {
 };
 
 enum class FrameGradient {
-  kFrozen,  ///< of a fixed frame: finite everywhere (docs/numerics.md, "Frame gradient")
-  kPaper,   ///< the derivative of the formula [AS, Eq. 10-16]: grows like 1/(l1 - l2)
+  kFrozen,  ///< of a fixed frame (docs/numerics.md, "Frame gradient")
+  kPaper,   ///< of the formula [AS, Eq. 10-16]: grows like 1/(l1 - l2)
 };
 
 /// I = 2 pi s1 s2 F(u / s1) F(v / s2), (u, v) = d in the eigenframe of Sigma. |S - CDF| < 4e-4.
@@ -109,7 +105,7 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
   };
   template <typename T> struct Terms {
     LogisticSlopes<T> du, dv;
-    Mat2<T> frame;   ///< rows: the axes over their sigma
+    Mat2<T> frame;   ///< rows: axes over their sigma
     Vec2<T> origin;  ///< in that frame
     T mass;          ///< opacity * 2 pi s1 s2
     LogisticAxis<T> u, v;
@@ -118,8 +114,7 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
   AR_HD static double radius_variance(FootprintOptions) { return 0; }
   AR_HD static double support_variance(FootprintOptions) { return kPixelVariance; }
 
-  /// Deviates: in [AS, Eq. 2] eigenvectors are 0/0 for a diagonal Sigma with S11 > S22, and the smaller eigenvalue is a
-  /// difference.
+  /// Deviates: [AS, Eq. 2] is 0/0 for some covariances (docs/numerics.md, "Eigenframe").
   template <typename T> AR_HD static Shape<T> prepare(Cov2d<T> cov, FootprintOptions) {
     const Eigenframe<T> frame = eigenframe(cov);
     const T s1 = max(frame.sigma.x, T(kMinSigma)), s2 = max(frame.sigma.y, T(kMinSigma));
@@ -131,9 +126,8 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
     return scaled_axes(widened_by_pixel(g.inv_sigma), g.axis);
   }
 
-  /// Along one axis -2 ln(F(u)/F(0)) >= u^2/(sigma^2 + 1/12) - w^4/48 - 0.05, w^2 = 1/(sigma^2 + 1/12), wherever
-  /// F(u)/F(0) > 1/255 (the tests check it). w^4/48 is for the flat top of a narrow Gaussian's window, 0.05 for the
-  /// logistic's tail.
+  /// Along one axis -2 ln(F(u)/F(0)) >= u^2 w^2 - w^4/48 - 0.05, w^2 = 1/(sigma^2 + 1/12), wherever F(u)/F(0) > 1/255.
+  /// The tests check it. w^4/48 is for the flat top of a narrow Gaussian's window, 0.05 for the logistic's tail.
   template <typename T> AR_HD static T level(const Shape<T>& g, T opacity) {
     const Vec2<T> w = widened_by_pixel(g.inv_sigma);
     const T slack = (w.x * w.x * w.x * w.x + w.y * w.y * w.y * w.y) / T(48) + T(0.1);
@@ -154,8 +148,7 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
     return V(t.mass) * (f.numerator * g.numerator) * divide(V(T(1)), f.denominator * g.denominator);
   }
 
-  /// With I = mass F(u/s1) G(v/s2): offset = mass (F' G, F G'); shape = the derivatives by log s1, by the frame, by log
-  /// s2.
+  /// offset: derivatives by u/s1 and v/s2. shape: by log s1, the frame, log s2.
   template <typename T, class V>
   AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> p, int, AlphaGrad<V> grad, ShapeGrad<V>& sums) {
     const Vec2<V> e = transform(t.frame, p, t.origin);
@@ -168,7 +161,7 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
     sums.shape.xx = madd(scaled_g, f.by_sigma, sums.shape.xx);
     sums.shape.yy = madd(scaled_f, g.by_sigma, sums.shape.yy);
     if (kFrame == FrameGradient::kFrozen) {
-      // I_u I_v / I, the derivative with respect to the covariance of u and v with a fixed window.
+      // I_u I_v / I: by the covariance of u and v, with a fixed window.
       sums.shape.xy = madd(scale * f.by_t, g.by_t, sums.shape.xy);
     } else {
       const T ratio = t.u.half / t.v.half;  // s2 / s1
@@ -183,8 +176,7 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
   template <typename T>
   AR_HD static SplatGrad<T> prepare_vjp(Cov2d<T> cov, const Shape<T>& g, ShapeGrad<T> sums, T, FootprintOptions) {
     const Vec2<T> r = g.inv_sigma;
-    // The frame turns by 1/(l1 - l2) per off-diagonal of Sigma. At l1 = l2 the formula has no derivative; zero is
-    // finite.
+    // At l1 = l2 the formula has no derivative; zero is finite.
     const T gap = eigenvalue_gap(cov);
     const T turn = kFrame == FrameGradient::kFrozen ? T(1) : (gap > T(0) ? T(1) / (gap * r.x * r.y) : T(0));
     const Sym2<T> white = {T(0.5) * sums.shape.xx, T(0.5) * sums.shape.xy * turn, T(0.5) * sums.shape.yy};

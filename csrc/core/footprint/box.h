@@ -1,17 +1,17 @@
-// The footprint `box`: the pixel as S small Gaussians, each with its own transmittance.
+// The footprint `box`: the pixel as S equal Gaussians at the nodes of box_node<S>, each with its own transmittance. The
+// pixel's colour is the mean over the samples. registry.h lists it; gaussian.h has what blending calls.
 #pragma once
 
 #include "core/footprint/gaussian.h"
 
 namespace ar {
 
-/// The key of a footprint, "box1" ... "box16", with the number of samples from its fourth character on.
+/// "box1" ... "box16"; the number of samples begins at the fourth character.
 template <int S> struct BoxKey {
   static constexpr char kText[] = {'b', 'o', 'x', S >= 10 ? '1' : char('0' + S), S >= 10 ? char('0' + S % 10) : '\0',
                                    '\0'};
 };
 
-/// S equal Gaussians at the nodes of box_node<S>. The pixel's colour is the mean over the samples.
 template <int S> struct Box : GaussianFootprint<S, true> {
   static constexpr const char* kName = "box";
   static constexpr const char* kKey = BoxKey<S>::kText;

@@ -1,21 +1,19 @@
 // The footprint `cumulant`: the axis-aligned unit pixel through its cumulants, with one exponential, smooth in Sigma
-// and without eigenvectors (docs/numerics.md, "Weights").
+// and without eigenvectors (docs/numerics.md, "Weights"). registry.h lists it.
 #pragma once
 
 #include "core/footprint/gaussian.h"
 
 namespace ar {
 
-/// One axis of the correction to the exponent, for the diagonal entry t of the conic: a cubic
-///   h(p, t) = P (P (c4 - c6 P) - 6 t k2) + 3 t^2 k0,  P = min(p^2, cap),
-/// from the fourth and sixth cumulant of the box. P is capped at the maximum of the cubic: beyond, the truncated series
-/// would fall and the weight diverge. Weights there are below 2e-6.
+/// One axis of the correction to the exponent, h(p, t) = s(p, t) of docs/numerics.md, "Weights". t is the diagonal
+/// entry of the conic. Weights beyond the cap are below 2e-6.
 template <typename T> struct CumulantAxis {
   T c4, c6, linear, cap;
-  T dc4, dc6, dlinear, dconstant;  // derivatives with respect to t
+  T dc4, dc6, dlinear, dconstant;  // by t
 
-  /// Coefficients of `unit` times h, for p and t in coordinates in which the conic is divided by `scale`
-  /// (docs/numerics.md, "Units of the exponent").
+  /// Of `unit` times h, for p and t in coordinates in which the conic is divided by `scale` (docs/numerics.md, "Units
+  /// of the exponent").
   AR_HD static CumulantAxis at(T t, T unit = T(1), T scale = T(1)) {
     const T dx = scale * T(kPixelVariance), x = t * dx;
     const bool floored = T(1) - x < T(1e-6);
@@ -32,14 +30,13 @@ template <typename T> struct CumulantAxis {
     return a;
   }
 
-  /// 3 t^2 k0.
   AR_HD static T constant(T t, T unit = T(1), T scale = T(1)) {
     const T x = t * scale * T(kPixelVariance);
     return unit * scale * scale * T(3) * t * t * (T(1) + x * (T(20.0 / 21) + x * T(0.6975)));
   }
 
   template <class V> AR_HD V capped(V p) const { return min(p * p, V(cap)); }
-  /// v less the part of h that depends on p, where P = capped(p).
+  /// v less the part of h that depends on p. P = capped(p).
   template <class V> AR_HD V subtract_from(V v, V P) const { return madd(-P, inner(P), v); }
   /// Half of dh/dp.
   template <class V> AR_HD V half_by_p(V p, V P) const { return p * madd(P, madd(V(-c6), P, quartic(P)), inner(P)); }
@@ -61,7 +58,7 @@ struct Cumulant : FootprintDefaults {
 
   template <typename T> struct Terms {
     Lower2<T> w;           ///< whitening matrix times kBase2
-    CumulantAxis<T> x, y;  ///< of the exponent to base 2, with the conic w^T w
+    CumulantAxis<T> x, y;  ///< of the exponent to base 2
     Vec2<T> origin;        ///< whitened
     T log_peak;            ///< log2(opacity * amp) less the constants of x and y
   };
@@ -76,7 +73,7 @@ struct Cumulant : FootprintDefaults {
 
   template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& shape) { return wide_first(shape); }
 
-  /// The correction adds at most (a^2 + c^2)/124 to the level (docs/numerics.md, "Support").
+  /// The tests check this bound (docs/numerics.md, "Support").
   template <typename T> AR_HD static T level(const Shape<T>& shape, T opacity) {
     const T a = conic_xx(shape.w), c = conic_yy(shape.w);
     return gaussian_level(shape.amp, opacity) + (a * a + c * c) / T(124);
@@ -97,8 +94,7 @@ struct Cumulant : FootprintDefaults {
     return exp2(t.x.subtract_from(t.y.subtract_from(gaussian, t.y.capped(p.y)), t.x.capped(p.x)));
   }
 
-  /// With -log2 I = |z|^2 + h(p_x, a) + h(p_y, c), z = w d, p = w^T z, e = w dh/dp / 2 and E = dw w^-1:
-  /// -d log2 I / 2 = -(z + e).w dmu + tr(E (z z^T + e z^T + z e^T + w diag(dh/da, dh/dc) w^T)).
+  /// z + e and the matrix of docs/numerics.md, "Gradients of the weights", to base 2.
   template <typename T, class V>
   AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> pixel, int, AlphaGrad<V> grad, ShapeGrad<V>& sums) {
     const Lower2<T>& w = t.w;

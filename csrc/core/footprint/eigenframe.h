@@ -1,4 +1,5 @@
-// A library for analytic.h and erf.h, whose windows are along the axes of a splat: the eigenframe of its covariance.
+// A library for analytic.h and erf.h, whose windows are along the axes of a splat. It finds the eigenframe of a
+// covariance, and scales its axes.
 #pragma once
 
 #include "core/footprint/contract.h"
@@ -11,8 +12,7 @@ template <typename T> struct Eigenframe {
   Vec2<T> axis;
 };
 
-/// By the larger of sine and cosine of the half angle, and det / l1: without 0/0 for diagonal covariances and without a
-/// difference of eigenvalues (docs/numerics.md, "Eigenframe").
+/// Without 0/0 for diagonal covariances and a difference of eigenvalues (docs/numerics.md, "Eigenframe").
 template <typename T> AR_HD Eigenframe<T> eigenframe(Cov2d<T> cov) {
   const T dx = cov.xx - cov.yy, dy = T(2) * cov.xy;
   const T gap = eigenvalue_gap(cov);
@@ -28,12 +28,12 @@ template <typename T> AR_HD Eigenframe<T> eigenframe(Cov2d<T> cov) {
   return {{sqrt(major), sqrt(max(cov.det / major, T(0)))}, axis};
 }
 
-/// The matrix whose rows are the axes, the major one first, times `scale`.
+/// Rows: the axes, the major one first, times `scale`.
 template <typename T> AR_HD Mat2<T> scaled_axes(Vec2<T> scale, Vec2<T> axis) {
   return {scale.x * axis.x, scale.x * axis.y, -scale.y * axis.y, scale.y * axis.x};
 }
 
-/// 1 / sqrt(sigma^2 + 1/12) along both axes, from 1 / sigma: reciprocal deviations of the splat convolved with a pixel.
+/// 1 / sqrt(sigma^2 + 1/12) from 1 / sigma, along both axes.
 template <typename T> AR_HD Vec2<T> widened_by_pixel(Vec2<T> inv_sigma) {
   const auto widened = [](T r) { return r / sqrt(T(1) + T(kPixelVariance) * r * r); };
   return {widened(inv_sigma.x), widened(inv_sigma.y)};

@@ -1,5 +1,5 @@
 // The footprint `erf`, a reference: the window of `analytic` with the exact normal distribution instead of the
-// logistic.
+// logistic. registry.h lists it.
 #pragma once
 
 #include "core/footprint/eigenframe.h"
@@ -8,15 +8,15 @@
 
 namespace ar {
 
-/// I = 2 pi s1 s2 [Phi]_u [Phi]_v, [Phi]_u = Phi((u + 1/2) / s1) - Phi((u - 1/2) / s1), (u, v) = d in
-/// the eigenframe of Sigma. The adjoint holds the frame fixed, as that of `analytic` does by default.
+/// I = 2 pi s1 s2 [Phi]_u [Phi]_v, [Phi]_u = Phi((u + 1/2) / s1) - Phi((u - 1/2) / s1), (u, v) = d in the eigenframe of
+/// Sigma. The adjoint holds the frame fixed.
 struct Erf : FootprintDefaults {
   static constexpr const char* kName = "erf";
   static constexpr bool kExpensive = true;
   static constexpr bool kReference = true, kGeneric = true;
   static constexpr double kExtraLevel = 2 * box_excess(1 / kPixelVariance);
 
-  /// Lower bound of standard deviations [px], for finite reciprocals.
+  /// For finite reciprocals [px].
   static constexpr double kMinSigma = 1e-9;
 
   template <typename T> struct Shape {
@@ -45,7 +45,6 @@ struct Erf : FootprintDefaults {
     return scaled_axes(widened_by_pixel(g.inv_sigma), g.axis);
   }
 
-  /// See box_excess(), which holds along either axis.
   template <typename T> AR_HD static T level(const Shape<T>& g, T opacity) {
     const Vec2<T> w = widened_by_pixel(g.inv_sigma);
     return gaussian_level(w.x * w.y * g.area, opacity) + box_excess(w.x * w.x) + box_excess(w.y * w.y);
@@ -61,7 +60,7 @@ struct Erf : FootprintDefaults {
     return V(t.mass) * along(z.x, t.width.x).value * along(z.y, t.width.y).value;
   }
 
-  /// The moments of z = w d over the window: sums as those of `point`.
+  /// Moments of z = w d over the window.
   template <typename T, class V>
   AR_HD static void add_alpha_vjp(const Terms<T>& t, Vec2<V> p, int, AlphaGrad<V> grad, ShapeGrad<V>& sums) {
     const Vec2<V> z = transform(t.w, p, t.origin);

@@ -1,4 +1,4 @@
-// The footprint `exact`, a reference: the integral of a Gaussian over the axis-aligned unit pixel.
+// The footprint `exact`, a reference: the integral of a Gaussian over the axis-aligned unit pixel. registry.h lists it.
 #pragma once
 
 #include "core/footprint/gaussian.h"
@@ -6,13 +6,12 @@
 
 namespace ar {
 
-/// I = integral of exp(-|w d|^2 / 2) over the pixel. The integral and its adjoint are moments of z = w d over the
-/// pixel, by quadrature with positive weights (docs/numerics.md, "The exact integral").
+/// I = integral of exp(-|w d|^2 / 2) over the pixel. The integral and its adjoint are moments of z = w d, by quadrature
+/// with positive weights. docs/numerics.md, "The exact integral", has the rules and error bounds.
 ///
-/// The wide axis is the image axis with the larger variance, the narrow axis is the other. z.x depends on the wide axis
-/// alone; along it z.y falls at the rate `tilt`. The line z.y = 0 is the ridge of the Gaussian. If the standard
-/// deviation across the ridge is at least half a pixel, a product rule integrates both axes. Otherwise the narrow axis
-/// is integrated in closed form, and the wide axis in strips around the points where the pixel's edges cross the ridge.
+/// The wide axis is the image axis with the larger variance. z.x depends on it alone; along it z.y falls at the rate
+/// `tilt`. The line z.y = 0 is the ridge. A Gaussian that is narrow across the ridge is integrated in strips around the
+/// points where the pixel's edges cross the ridge.
 struct Exact : FootprintDefaults {
   static constexpr const char* kName = "exact";
   static constexpr bool kExpensive = true;
@@ -20,8 +19,8 @@ struct Exact : FootprintDefaults {
   static constexpr double kExtraLevel = 2 * box_excess(1 / kPixelVariance);
 
   template <typename T> struct Shape {
-    Mat2<T> w;  ///< of whiten_wide_first(), with the sign of the first row that makes tilt >= 0
-    T amp;      ///< amplitude of the Gaussian with covariance Sigma + I/12, a bound of the weight
+    Mat2<T> w;  ///< of whiten_wide_first(), its first row signed so that tilt >= 0
+    T amp;      ///< of the Gaussian with covariance Sigma + I/12, a bound of the weight
   };
 
   template <typename T> struct Terms {
@@ -30,8 +29,8 @@ struct Exact : FootprintDefaults {
     T opacity;
     bool wide_x;
     T along, across, tilt;  ///< dz.x per pixel along the wide axis, dz.y along the other; -dz.y / dz.x
-    T crossing;             ///< half the width in z.x of the strip where an edge crosses the ridge z.y = 0
-    int panels;             ///< of such a strip
+    T crossing;             ///< half the width in z.x of a strip
+    int panels;             ///< of a strip
   };
 
   AR_HD static double radius_variance(FootprintOptions) { return kPixelVariance; }
@@ -49,7 +48,6 @@ struct Exact : FootprintDefaults {
   /// Ellipse of Sigma + I/12.
   template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& g) { return whiten_wide_first(widened(g)); }
 
-  /// See box_excess().
   template <typename T> AR_HD static T level(const Shape<T>& g, T opacity) {
     const Cov2d<T> wide = widened(g);
     return gaussian_level(g.amp, opacity) + box_excess(wide.yy / wide.det) + box_excess(wide.xx / wide.det);
@@ -57,8 +55,7 @@ struct Exact : FootprintDefaults {
 
   template <typename T> AR_HD static Terms<T> terms(const Shape<T>& g, T opacity, Vec2<T> origin = {T(0), T(0)}) {
     const T edge = along(g.w), tilt = -slope(g.w) / edge, steep = max(tilt, T(kMinTilt)), tail = T(kTail<T>);
-    // The Gaussian, the crossing and the pixel limit a strip. The integrand varies along it at the rate sqrt(1 +
-    // tilt^2).
+    // The standard deviation of the integrand along a strip is 1 / sqrt(1 + tilt^2).
     const T length = min(T(2) * min(tail, tail / steep), abs(edge)) * sqrt(T(1) + tilt * tilt);
     const T panels = min(max(T(1), T(1) + length / T(kPanel)), T(kMaxPanels));
     return {g.w, origin, opacity, wide_x(g.w), edge, across(g.w), tilt, tail / steep, int(panels)};
@@ -85,7 +82,7 @@ struct Exact : FootprintDefaults {
   }
 
  private:
-  /// Integrals over the pixel [px^2] of f = exp(-|z|^2 / 2), f z and f z z^T.
+  /// Integrals of f = exp(-|z|^2 / 2), f z and f z z^T over the pixel [px^2].
   template <class V> struct Moments {
     V value;
     Vec2<V> first;
@@ -94,16 +91,16 @@ struct Exact : FootprintDefaults {
 
   /// Standard deviations beyond which the Gaussian counts as zero: exp(-z^2 / 2) is 2e-11 and 5e-32.
   template <typename T> static constexpr double kTail = sizeof(T) == 4 ? 7 : 12;
-  /// Longest panel for kManyNodes, in standard deviations of the integrand along it.
+  /// Longest panel for kManyNodes, in standard deviations of the integrand.
   static constexpr double kPanel = 3.3;
   /// 1 + 2 kTail sqrt(2) / kPanel.
   static constexpr int kMaxPanels = 11;
-  /// Keeps the crossings of a ridge along the axis finite: it moves none by more than kTail * this.
+  /// Keeps crossings finite, and moves none by more than kTail * this.
   static constexpr double kMinTilt = 1e-6;
 
   template <typename T> AR_HD static T square(T x) { return x * x; }
 
-  // The parts of w: one entry of its first row is zero.
+  // One entry of the first row of w is zero.
   template <typename T> AR_HD static bool wide_x(const Mat2<T>& w) { return w.xx != T(0); }
   template <typename T> AR_HD static T along(const Mat2<T>& w) { return w.xx + w.xy; }
   template <typename T> AR_HD static T across(const Mat2<T>& w) { return wide_x(w) ? w.yy : w.yx; }
@@ -119,14 +116,14 @@ struct Exact : FootprintDefaults {
     return blur(cov, T(kPixelVariance));
   }
 
-  /// The edges of the pixel along an axis, relative to its point nearest to the mean [px]: rounding then does not move
-  /// the edges that matter, for Gaussians of any size and distance.
+  /// The edges of the pixel along an axis, relative to its point nearest to the mean [px], where rounding matters
+  /// least.
   template <class V> struct Edges {
     V begin, end;
     AR_HD V middle() const { return V(ScalarOf<V>(0.5)) * (begin + end); }
   };
   template <class V> struct Pixel {
-    Vec2<V> z;  ///< whitened coordinates of the point nearest to the mean
+    Vec2<V> z;  ///< of the point nearest to the mean
     Edges<V> wide, narrow;
   };
 
@@ -165,7 +162,7 @@ struct Exact : FootprintDefaults {
   template <typename T, class V> AR_HD static Moments<V> by_strips(const Terms<T>& t, const Pixel<V>& pixel) {
     const V zero = V(T(0)), tail = V(T(kTail<T>)), crossing = V(t.crossing);
     const V along = V(t.along), across = V(t.across), scale = V(T(1) / max(t.tilt, T(kMinTilt)));
-    // Steps in z.x to two edges of the pixel, and to the crossings of the ridge with the other two.
+    // Steps in z.x to two edges of the pixel, and to the crossings of the ridge with the others.
     const V edge = along * pixel.wide.begin, opposite = along * pixel.wide.end;
     const V first = min(edge, opposite), last = max(edge, opposite);
     const V enters = madd(across, pixel.narrow.begin, pixel.z.y) * scale;
@@ -179,7 +176,7 @@ struct Exact : FootprintDefaults {
     add_strip(t, pixel, begin, inside, m);
     add_strip(t, pixel, outside, end, m);
     if (t.across > T(2 * kTail<T>)) {
-      // Between the strips the pixel covers all of the ridge's width.
+      // Between the strips the pixel covers the ridge's width.
       const V from = pixel.z.x + inside, to = pixel.z.x + outside;
       const NormalMoments<V> ridge = abs(t.along) <= T(0.5)
                                          ? short_interval_moments(V(T(0.5)) * (from + to), outside - inside)
@@ -196,7 +193,6 @@ struct Exact : FootprintDefaults {
             {area * m.second.xx, area * m.second.xy, area * m.second.yy}};
   }
 
-  /// Adds the part between two steps.
   template <typename T, class V>
   AR_HD static void add_strip(const Terms<T>& t, const Pixel<V>& pixel, V from, V to, Moments<V>& m) {
     using Rule = GaussLegendre<kManyNodes<T>, T>;

@@ -1,7 +1,6 @@
-// A library for the footprints that are Gaussians: point, mip, box and moment, and in part cumulant and exact.
-//
-// A Gaussian is stored as a whitening matrix w with w^T w = (Sigma + v I)^-1. Unlike the conic form, the exponent
-// -|w d|^2 / 2 cannot become positive, and does not cancel for long needles (docs/numerics.md, "Whitening").
+// A library for the footprints that are Gaussians: point, mip, box and moment, and in part cumulant and exact. A
+// Gaussian is stored as a whitening matrix w with w^T w = (Sigma + v I)^-1. The exponent -|w d|^2 / 2 cannot become
+// positive, and does not cancel for long needles as the conic form does (docs/numerics.md, "Whitening").
 #pragma once
 
 #include "core/footprint/contract.h"
@@ -11,12 +10,12 @@ namespace ar {
 template <typename T> struct GaussianShape {
   Lower2<T> w;  ///< whitening matrix [1/px]
   T amp;        ///< peak: sqrt(det Sigma / det Sigma'), 1 without compensation
-  T x_given_y;  ///< standard deviation of x given y if y is the wide axis, else zero [px]; for wide_first()
+  T x_given_y;  ///< if y is the wide axis, standard deviation of x given y [px], else zero; for wide_first()
 };
 
 /// A Cholesky factor of c^-1, x first.
 template <typename T> AR_HD Lower2<T> whiten(Cov2d<T> c) {
-  const T across = sqrt(quotient(c.xx, c.det));  // 1 / std. dev. of y given x
+  const T across = sqrt(quotient(c.xx, c.det));  // 1 / standard deviation of y given x
   return {quotient(T(1), sqrt(c.xx)), -across * quotient(c.xy, c.xx), across};
 }
 /// With the wide axis first.
@@ -26,14 +25,12 @@ template <typename T> AR_HD Mat2<T> whiten_wide_first(Cov2d<T> c) {
   return {T(0), w.xx, w.yy, w.yx};
 }
 
-/// x_given_y may be an approximation: it is a factor of all entries of wide_first(), so that its error scales the
-/// ellipse, within kLevelSlack, and does not turn it.
+/// An approximate x_given_y scales the ellipse, within kLevelSlack, and does not turn it.
 template <typename T> AR_HD GaussianShape<T> gaussian_shape(Cov2d<T> c, T amp) {
   return {whiten(c), amp, c.xx >= c.yy ? T(0) : approx_sqrt(divide(c.det, c.yy))};
 }
 
-/// whiten_wide_first() of the shape's covariance, for BoxReach (bin.h): in these coordinates a box of pixels fills more
-/// of its bounding box (docs/numerics.md, "Whitening").
+/// For BoxReach (bin.h), where the bounding box of a box of pixels is smaller in these coordinates.
 template <typename T> AR_HD Mat2<T> wide_first(const GaussianShape<T>& shape) {
   const Lower2<T>& w = shape.w;
   const bool wide_x = shape.x_given_y == T(0);
@@ -42,18 +39,17 @@ template <typename T> AR_HD Mat2<T> wide_first(const GaussianShape<T>& shape) {
           wide_x ? w.yx : madd(w.xx, w.xx, w.yx * w.yx) * shape.x_given_y, wide_x ? w.yy : w.yx * across};
 }
 
-/// Exponents have base 2: kBase2^2 = log2(e) / 2 turns |w d|^2 into -log2 of the Gaussian.
+/// kBase2^2 = log2(e) / 2 turns |w d|^2 into -log2 of the Gaussian.
 inline constexpr double kBase2 = 0.84932180028801904272;
 
-/// Level outside which amp * opacity * exp(-|w d|^2 / 2) < 1/255.
+/// Beyond it amp * opacity * exp(-|w d|^2 / 2) < 1/255.
 template <typename T> AR_HD T gaussian_level(T amp, T opacity) {
   return T(2) * std::log(T(1 / kAlphaMin) * opacity * amp);
 }
 
-/// Gradient from sums in whitened coordinates z = kBase2 w d: `offset` = sum g I z, `shape` = sum g I z z^T, and
-/// `weighted` = sum g I, zero if the amplitude does not depend on Sigma. `variance` was added to Sigma.
+/// From sums in whitened coordinates z = kBase2 w d: `offset` = sum g I z, `shape` = sum g I z z^T. `weighted` is zero
+/// if the amplitude does not depend on Sigma. `variance` was added to Sigma.
 template <typename T> AR_HD SplatGrad<T> gaussian_vjp(const Lower2<T>& w, ShapeGrad<T> sums, T weighted, T variance) {
-  // With kBase2 = 1: d log I = z.w dmu + tr(z z^T w dSigma w^T)/2 + d log amp
   const T half = T(0.5 / (kBase2 * kBase2));
   const Sym2<T> white = {half * sums.shape.xx, half * sums.shape.xy, half * sums.shape.yy};
   return {transform_transposed(T(1 / kBase2) * w, sums.offset),
@@ -64,11 +60,10 @@ template <typename T> AR_HD SplatGrad<T> gaussian_vjp(const Lower2<T>& w, ShapeG
           GradFrame::kTriangular};
 }
 
-/// Variance of each of the S Gaussians of the box footprint [px^2].
+/// Of each of the S Gaussians of `box` [px^2].
 template <int S> inline constexpr double kBoxVariance = S == 1 ? kPixelVariance : 1.0 / (24 * S);
 
-/// Node s of `box` with S samples [px]. The mixture of the Gaussians at the nodes has the mean and covariance of the
-/// pixel. The nodes were found by a search on trained and random scenes (docs/numerics.md, "Nodes").
+/// Node s of `box` [px]. The mixture has the mean and covariance of the pixel (docs/numerics.md, "Nodes").
 template <int S> AR_HD constexpr Vec2<double> box_node(int s) {
   constexpr Vec2<double> kNodes4[] = {{-0.12083, -0.36226}, {0.36226, -0.12083}};
   constexpr Vec2<double> kNodes16[] = {{0.26975, -0.14597}, {0.14427, -0.43939}, {0.06200, -0.14646},
@@ -76,7 +71,6 @@ template <int S> AR_HD constexpr Vec2<double> box_node(int s) {
                                        {0.10473, 0.35640},  {0.39573, 0.39912}};
   static_assert(S == 1 || S == 4 || S == 16, "box has 1, 4 or 16 samples");
   if (S == 1) return {0, 0};
-  // Node s + S / 2 is the negative of node s.
   const Vec2<double> n = S == 4 ? kNodes4[s % 2] : kNodes16[s % 8];
   return s < S / 2 ? n : Vec2<double>{-n.x, -n.y};
 }
@@ -92,7 +86,7 @@ template <int S> constexpr double box_reach() {
 
 template <int S> struct GaussianSample;
 
-/// S Gaussians instead of a pixel: the code of blending for all footprints that are Gaussians, with any variance.
+/// Blending of all footprints that are S Gaussians, with any variance.
 template <int S> struct GaussianPixels : FootprintDefaults {
   static constexpr int kSamples = S;
   static constexpr double kReach = box_reach<S>();
@@ -102,7 +96,7 @@ template <int S> struct GaussianPixels : FootprintDefaults {
   template <typename T> struct Terms {
     Lower2<T> w;      ///< whitening matrix times kBase2
     T log_peak;       ///< log2(opacity * amp)
-    Vec2<T> node[S];  ///< of each sample, whitened, relative to the mean
+    Vec2<T> node[S];  ///< whitened, relative to the mean
   };
 
   template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& shape) { return wide_first(shape); }
@@ -124,11 +118,11 @@ template <int S> struct GaussianPixels : FootprintDefaults {
 
   template <typename T, class V> AR_HD static Vec2<V> whitened(const Terms<T>& t, Vec2<V> p, int s) {
     if (S == 1) return transform(t.w, p, t.node[0]);
-    const Vec2<V> z = transform(t.w, p);  // shared by the samples
+    const Vec2<V> z = transform(t.w, p);  // for all samples
     return {z.x + V(t.node[s].x), z.y + V(t.node[s].y)};
   }
 
-  /// log2 of alpha. z.y takes longer to compute, and is added last.
+  /// z.y takes longer to compute, and is added last.
   template <typename T, class V> AR_HD static V log_alpha(const Terms<T>& t, Vec2<V> z) {
     return madd(-z.y, z.y, madd(-z.x, z.x, V(t.log_peak)));
   }
@@ -148,14 +142,14 @@ template <int S> struct GaussianPixels : FootprintDefaults {
   template <typename T> AR_HD static Mat2<T> mean_map(const Shape<T>& shape) { return all_of(T(1 / kBase2) * shape.w); }
 };
 
-/// One of the S Gaussians of GaussianPixels<S>, at p, for its own lane.
+/// One of S Gaussians, at p, for its own lane.
 template <int S> struct GaussianSample : GaussianPixels<1> {
   static constexpr int kLanes = S;
   static constexpr double kReach = box_reach<S>();
   AR_HD static constexpr Vec2<double> node(int s) { return box_node<S>(s); }
 };
 
-/// Base of footprints with GaussianPixels<S>. kCompensated: the amplitude keeps the mass of the splat.
+/// kCompensated: the amplitude keeps the mass of the splat.
 template <int S, bool kCompensated> struct GaussianFootprint : GaussianPixels<S> {
   using Pixels = GaussianPixels<S>;
   static constexpr const char* kPage = kCompensated ? "compensated" : "gaussian";

@@ -1,19 +1,20 @@
 // The footprint `moment`: the pixel as S equal square cells, each with its own transmittance. A splat is evaluated at
-// the centroid of the light that earlier splats have left in the cell (docs/numerics.md, "Moving nodes").
+// the centroid of the light that earlier splats have left in the cell (docs/numerics.md, "Moving nodes"). registry.h
+// lists it, and blend.h calls the functions of samples that move.
 #pragma once
 
 #include "core/footprint/gaussian.h"
 
 namespace ar {
 
-/// The key of a footprint, "moment1" ... "moment16", with the number of cells from its seventh character on.
+/// "moment1" ... "moment16"; the number of cells begins at the seventh character.
 template <int S> struct MomentKey {
   static constexpr char kText[] = {
       'm', 'o', 'm', 'e', 'n', 't', S >= 10 ? '1' : char('0' + S), S >= 10 ? char('0' + S % 10) : '\0', '\0'};
 };
 
-/// n x n cells, S = n^2. Before the first splat a cell is a Gaussian of the cell's variance at its centre, like a
-/// sample of `box`. `Pixels` and `kPage` are reset, because nodes of the base class do not move.
+/// n x n cells, S = n^2. Before the first splat a cell is a Gaussian at its centre. `Pixels` and `kPage` are reset,
+/// because nodes of the base class do not move.
 template <int S> struct Moment : GaussianFootprint<1, true> {
   using Pixels = void;
   static constexpr const char* kPage = nullptr;
@@ -24,17 +25,17 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   static constexpr const char* kKey = MomentKey<S>::kText;
   static constexpr Option kOption = {"samples", MomentKey<S>::kText + 6, 0, S == 4};
   static constexpr int kSamples = S, kSide = S == 1 ? 1 : S == 4 ? 2 : 4;  ///< cells along an edge
-  static constexpr double kVariance = kPixelVariance / S;                  ///< of a cell [px^2]
+  static constexpr double kVariance = kPixelVariance / S;                  ///< [px^2]
   static constexpr double kReach = 0.5;                                    ///< nodes stay in their cells
 
   static constexpr bool kMoves = true;
   static constexpr double kMoveReach = 0.5 / kSide;
-  static constexpr double kMoveGradUnit = kBase2 * kBase2;  ///< z has kBase2 as a factor, and so have the sums
+  static constexpr double kMoveGradUnit = kBase2 * kBase2;  ///< both z and the sums have kBase2 as a factor
 
   AR_HD static double radius_variance(FootprintOptions) { return kPixelVariance; }
   AR_HD static double support_variance(FootprintOptions) { return kVariance; }
 
-  /// Centre of a cell [px from the pixel's centre]. One rounding, so that T is as good as double.
+  /// Centre of a cell [px]. One rounding, so that T is as good as double.
   template <typename T = double> AR_HD static constexpr Vec2<T> node(int s) {
     return {edge<T>(2 * (s % kSide) + 1), edge<T>(2 * (s / kSide) + 1)};
   }
@@ -89,12 +90,12 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     return {V(t.node[0].x), madd(V(t.w.yy), y, V(t.node[0].y))};
   }
 
-  /// move() with whitened coordinates z. `at` is the position or the displacement of the node, in the unit of w^-1. It
-  /// returns the same after the splat, clamped by `cell`. alpha is as if the splat was composited; `mask`: it was.
+  /// move() by whitened coordinates z. `at` is the position or displacement of the node, in the unit of w^-1. `mask`:
+  /// the splat was composited; alpha may be nonzero where it was not.
   template <typename T, class V, class Cell>
   AR_HD static Vec2<V> move_in(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> mask, Vec2<V> at, const Cell& cell) {
     const Vec2<V> along = transform_transposed(t.w, z);
-    // Two forms with the same bits: a thread of a GPU skips instructions at no cost.
+    // Two forms with the same bits: a GPU thread skips instructions at no cost.
     if constexpr (std::is_same_v<MaskOf<V>, bool>) {
       const V length = length_of<T, V, Cell>(alpha);
       if (mask) at = cell.held(length, along, at);
@@ -104,9 +105,8 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     }
   }
 
-  /// alpha_and_move_vjp() likewise, added to `sums` (docs/numerics.md, "Adjoint of moving nodes", with q for v r y).
-  /// dL_dat is in kMoveGradUnit. `weighted` is alpha dL_dalpha; both are zero where the splat was not composited. A
-  /// coordinate that move_in() has clamped is constant.
+  /// alpha_and_move_vjp() by z, added to `sums` (docs/numerics.md, "Adjoint of moving nodes"; q is v r y). dL_dat is in
+  /// kMoveGradUnit. alpha and `weighted` = alpha dL_dalpha are zero where the splat was not composited.
   template <typename T, class V, class Cell>
   AR_HD static void add_alpha_and_move_in_vjp(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> free, V weighted,
                                               Vec2<V> at, const Cell& cell, Vec2<V>& dL_dat, MoveGrad<V>& sums) {
@@ -125,9 +125,8 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     dL_dat = {madd(-V(t.w.xx), offset.x, madd(-V(t.w.yx), offset.y, behind.x)), madd(-V(t.w.yy), offset.y, behind.y)};
   }
 
-  /// Moves `at` as move_in() does. With J the derivative of the position after with respect to the position before,
-  /// dL_dat of add_alpha_and_move_in_vjp() before is J^T (dL_dat after) + dL_dalpha MoveSlope::alpha. `free`: alpha is
-  /// not the cap.
+  /// Moves `at` as move_in() does. With J the derivative of the position, add_alpha_and_move_in_vjp() takes dL_dat to
+  /// J^T dL_dat + dL_dalpha MoveSlope::alpha. `free`: alpha is not capped.
   template <typename T, class V, class Cell>
   AR_HD static MoveSlope<V> move_in_with_slope(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> free, const Cell& cell,
                                                Vec2<V>& at) {
@@ -135,7 +134,7 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     const V length = length_of<T, V, Cell>(alpha), r = V(T(1 / step<Cell>())) * length;
     const Vec2<V> along = transform_transposed(t.w, z), next = moved(length, along, at);
     at = cell.held(length, along, at);
-    // dalpha = -unit alpha along.dat, dr = dalpha / (1 - alpha)^2 = -unit r (1 + r) along.dat
+    // dalpha = -unit alpha along.dat, dr = -unit r (1 + r) along.dat
     const V by_alpha = select(free, -alpha, zero), by_r = select(free, unit * length * (V(T(1)) + r), zero);
     const Vec2<V> steeper = {by_r * along.x, by_r * along.y};
     const V xx = madd(V(t.w.xx), V(t.w.xx), V(t.w.yx) * V(t.w.yx));
@@ -148,23 +147,23 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
   }
 
  private:
-  /// Variance of a cell in the unit of length of `Cell`.
+  /// In the unit of length of `Cell`.
   template <class Cell> static constexpr double variance() { return kVariance * Cell::kUnits * Cell::kUnits; }
   /// v / kBase2^2, since (Sigma + v I)^-1 d = w^T z / kBase2^2.
   template <class Cell> static constexpr double step() { return variance<Cell>() / kMoveGradUnit; }
-  /// step() alpha / (1 - alpha), with the factor in the divisor, where it is free on a device. Without fused
-  /// multiply-adds the divisor is rounded twice, an error of up to 1 / (1 - kAlphaMax) = 100 roundings, 6e-6 in float.
+  /// step() alpha / (1 - alpha). In the divisor the factor is free on a device. Without fused multiply-adds it is
+  /// rounded twice, an error of up to 1 / (1 - kAlphaMax) = 100 roundings, 6e-6 in float.
   template <typename T, class V, class Cell> AR_HD static V length_of(V alpha) {
     const V per_step = V(T(1 / step<Cell>()));
     return divide(alpha, madd(-per_step, alpha, per_step));
   }
 
-  /// at + v r (Sigma + v I)^-1 d, before the clamp.
+  /// The position after a splat, before the clamp.
   template <class V> AR_HD static Vec2<V> moved(V length, Vec2<V> along, Vec2<V> at) {
     return {madd(length, along.x, at.x), madd(length, along.y, at.y)};
   }
 
-  /// `half_cells` half cells from the pixel's edge [px from its centre].
+  /// In half cells from the pixel's edge -> px from its centre.
   template <typename T> AR_HD static constexpr T edge(int half_cells) { return T(half_cells - kSide) / T(2 * kSide); }
 
   template <typename T, class V> AR_HD static Vec2<V> place(int s) { return {V(node<T>(s).x), V(node<T>(s).y)}; }

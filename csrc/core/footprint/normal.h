@@ -1,18 +1,19 @@
-// A library for erf.h and exact.h: Gauss-Legendre rules, and moments of the normal density over an interval.
+// A library for erf.h and exact.h: Gauss-Legendre rules, and moments of the normal density over an interval. The
+// footprints sum these moments over the pixel.
 #pragma once
 
 #include "core/footprint/contract.h"
 
 namespace ar {
 
-/// Gauss-Legendre rule with N nodes on [-1/2, 1/2] and weights that add up to 1. Its error for exp(-x^2 / (2 s^2)) is
-/// at most (N!)^3 / ((2N + 1) ((2N)!)^2 2^N s^(2N)).
+/// Gauss-Legendre rule with N nodes on [-1/2, 1/2]; the weights add up to 1. Its error for exp(-x^2 / (2 s^2)) is at
+/// most (N!)^3 / ((2N + 1) ((2N)!)^2 2^N s^(2N)).
 template <int N, typename T> struct GaussLegendre {
   AR_HD static constexpr T node(int i) { return i < N / 2 ? -positive(N / 2 - 1 - i).x : positive(i - N / 2).x; }
   AR_HD static constexpr T weight(int i) { return i < N / 2 ? positive(N / 2 - 1 - i).y : positive(i - N / 2).y; }
 
  private:
-  /// Half of the node and of the weight on [-1, 1], from the centre outwards.
+  /// Half of the node and weight on [-1, 1], from the centre outwards.
   AR_HD static constexpr Vec2<T> positive(int i) {
     static_assert(N == 4 || N == 6 || N == 8 || N == 12, "rules of 4, 6, 8 and 12 nodes");
     if constexpr (N == 4) {
@@ -42,26 +43,25 @@ template <int N, typename T> struct GaussLegendre {
   }
 };
 
-/// Nodes for an interval of at most half a standard deviation (few), or of up to 3.3 (many).
+/// For an interval of at most half a standard deviation (few), or up to 3.3 (many).
 template <typename T> inline constexpr int kFewNodes = sizeof(T) == 4 ? 4 : 6;
 template <typename T> inline constexpr int kManyNodes = sizeof(T) == 4 ? 8 : 12;
 
-/// exp(-z^2 / 2).
 template <class V> AR_HD V normal(V z) {
   using T = ScalarOf<V>;
   return exp2(V(T(-0.5 * kLog2e)) * z * z);
 }
 
-/// Integrals of exp(-z^2 / 2), z exp(-z^2 / 2) and z^2 exp(-z^2 / 2) over an interval.
+/// Integrals of f = exp(-z^2 / 2), z f and z^2 f over an interval.
 template <class V> struct NormalMoments {
   V value, first, second;
 };
 
-/// Over [a, b], in closed form. The differences lose digits if b - a < 1/2.
+/// Closed form. The differences lose digits if b - a < 1/2.
 template <class V> AR_HD NormalMoments<V> interval_moments(V a, V b) {
   using T = ScalarOf<V>;
   const V zero = V(T(0)), root_half = V(T(0.70710678118654752440)), root_half_pi = V(T(1.2533141373155002512));
-  // Mirrored to the side where both values of erfc are small.
+  // To the side where both values of erfc are small.
   const MaskOf<V> mirrored = a + b < zero;
   const V lo = select(mirrored, -b, a), hi = select(mirrored, -a, b);
   const V at_lo = normal(lo), at_hi = normal(hi), first = at_lo - at_hi;
@@ -69,7 +69,7 @@ template <class V> AR_HD NormalMoments<V> interval_moments(V a, V b) {
   return {value, select(mirrored, -first, first), max(madd(lo, at_lo, value - hi * at_hi), zero)};
 }
 
-/// Over [z - width / 2, z + width / 2] with width <= 1/2, by quadrature.
+/// By quadrature, for width <= 1/2.
 template <class V> AR_HD NormalMoments<V> short_interval_moments(V z, V width) {
   using T = ScalarOf<V>;
   using Rule = GaussLegendre<kFewNodes<T>, T>;
@@ -83,17 +83,15 @@ template <class V> AR_HD NormalMoments<V> short_interval_moments(V z, V width) {
   return m;
 }
 
-/// Gradient from the sums of g f z and g f z z^T over a pixel, f = exp(-|z|^2 / 2), z = w d:
-/// df = f (z . w dmean + tr(z z^T w dSigma w^T) / 2).
+/// From the sums of g f z and g f z z^T over a pixel, f = exp(-|z|^2 / 2) (docs/numerics.md, "Gradients of the
+/// weights").
 template <typename T> AR_HD SplatGrad<T> moments_vjp(const Mat2<T>& w, const ShapeGrad<T>& sums, GradFrame frame) {
   const Sym2<T> half = {T(0.5) * sums.shape.xx, T(0.5) * sums.shape.xy, T(0.5) * sums.shape.yy};
   return {transform_transposed(w, sums.offset), w, half, T(0), T(0), frame};
 }
 
-/// Along one axis, a bound of how much the integral over the pixel raises the level of the Gaussian with variance
-/// 1/t = sigma^2 + 1/12. At sigma = 0 the ratio of the two densities is largest at the pixel's edge:
-/// 2 ln(sqrt(2 pi / 12) exp(3/2)) = 2.353 < 144/61. A convolution of both with the splat cannot raise it. The tests
-/// check that it falls as t^2.
+/// Along one axis, how much the pixel may raise the level of the Gaussian with variance 1/t = sigma^2 + 1/12
+/// (docs/numerics.md, "Support"). 144/61 is safe for all sizes; the tests check that the excess falls as t^2.
 template <typename T> AR_HD constexpr T box_excess(T t) { return t * t / T(61); }
 
 }  // namespace ar

@@ -1,4 +1,5 @@
-// The list of footprints. A new footprint is a header and an entry here.
+// The list of footprints. A new footprint is a header and an entry here. Python, the loops of cpu/ and the kernels of
+// cuda/ get every footprint from it.
 #pragma once
 
 #include <cstddef>
@@ -28,12 +29,11 @@ template <class F> constexpr const char* key_of() {
   }
 }
 
-/// Calls f(F{}) for every footprint of the list.
 template <class Function, class... F> AR_HD void for_each_footprint(FootprintList<F...>, Function&& f) {
   (f(F{}), ...);
 }
 
-/// Calls f(F{}) for the footprint with this index in the list.
+/// Calls f(F{}) for the footprint at this index.
 template <class Function, class... F> AR_HD void visit_footprint(int index, FootprintList<F...>, Function&& f) {
   int place = 0;
   ((index == place++ ? (f(F{}), true) : false) || ...);
