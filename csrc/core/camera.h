@@ -122,7 +122,7 @@ template <typename T> AR_HD Blur<T> blur_of(const FullCamera<T>& camera, Vec3<T>
           lens.aperture != T(0) ? defocus_variance(camera, view) : T(0)};
 }
 
-/// Returns the gradient with respect to `view`; adds that of the camera to `to`, if not null.
+/// Returns the gradient by `view`; adds that by the camera to `to`, if not null.
 template <typename T>
 AR_HD Vec3<T> blur_vjp(const FullCamera<T>& camera, Vec3<T> view, const Blur<T>& dL_dblur, CameraGrad<T>* to) {
   Vec3<T> by_view = {T(0), T(0), T(0)};

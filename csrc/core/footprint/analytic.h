@@ -121,7 +121,6 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
     return {{T(1) / s1, T(1) / s2}, frame.axis, T(2 * kPi) * s1 * s2};
   }
 
-  /// Ellipse of Sigma + I/12.
   template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& g) {
     return scaled_axes(widened_by_pixel(g.inv_sigma), g.axis);
   }

@@ -3,7 +3,7 @@
 // the loops of cpu/ and cuda/ call F as a template argument. How to write one: docs/adding-a-footprint.md.
 //
 // T is float or double, V is T or a pack of lanes of T (lanes.h). Sigma is the projected covariance [px^2]. d = pixel
-// centre - projected mean [px]. The node of a sample is its position relative to the pixel centre [px].
+// centre - projected mean [px].  The node of a sample is its position relative to the pixel centre [px].
 //
 // Constants. FootprintDefaults (below) has their defaults.
 //
@@ -48,8 +48,8 @@
 //   alpha(terms, p, s) -> V     opacity * I
 //   add_alpha_vjp(terms, p, s, AlphaGrad, ShapeGrad& sums)
 //
-// Samples that move have a displacement `moved` from the node [px]. It is zero before the first splat, and every splat
-// that is composited changes it. Then p includes `moved`. Such footprints define more; moment.h has the arguments.
+// Samples that move have a displacement `moved` from the node [px], which every composited splat changes. Then p
+// includes `moved`. Such footprints define more; moment.h has the arguments.
 //
 //   kMoves                      true
 //   kMoveReach                  largest |coordinate| of a displacement [px]; kReach includes it
@@ -70,8 +70,6 @@
 //   add_alpha_and_move_in_vjp   its adjoint with that of alpha, added to sums
 //   move_in_with_slope          move_in that changes its argument and returns its MoveSlope
 //   kMoveGradUnit               unit of gradients by positions between splats: the cheapest
-//
-// With a UnitCell lengths are in edges of cells, and positions are relative to the corner of the cell.
 #pragma once
 
 #include <cstddef>
@@ -150,7 +148,8 @@ template <class V> struct Bounds {
   AR_HD MaskOf<V> free_y(V y) const { return (y >= lo.y) & (y <= hi.y); }
 };
 
-/// The cell is [0, 1] x [0, 1], with n units of length per pixel. On a device the clamp is free.
+/// The cell is [0, 1] x [0, 1]: positions are from its corner, in edges of cells, n per pixel. On a device the clamp is
+/// free.
 template <int n> struct UnitCell {
   static constexpr int kUnits = n;
   template <class V> AR_HD Vec2<V> held(V length, Vec2<V> along, Vec2<V> at) const {
@@ -166,7 +165,7 @@ template <class V> struct MoveGrad {
   ShapeGrad<V> sums;
 };
 
-/// Derivatives with respect to the position before a splat.
+/// Derivatives by the position before a splat.
 template <class V> struct MoveSlope {
   Vec2<V> alpha;             ///< of the splat's alpha, times kMoveGradUnit
   Sym2<V> step;              ///< of the position after the splat: 1 + step
@@ -215,7 +214,7 @@ template <typename T> struct SplatGrad {
   GradFrame frame;
 };
 
-/// Gradient of log amp with respect to Sigma, without cancellation (docs/numerics.md, "Gradient of an amplitude").
+/// Gradient of log amp by Sigma, without cancellation (docs/numerics.md, "Gradient of an amplitude").
 template <typename T> AR_HD Sym2<T> log_amp_grad(Cov2d<T> c, T v) {
   const T scale = quotient(T(0.5) * v, blur(c, v).det), square = c.xy * c.xy;
   return {scale * quotient(c.yy * (c.yy + v) + square, c.det), -scale * (quotient(c.xy, c.det) * (c.xx + c.yy + v)),

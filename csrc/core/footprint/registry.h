@@ -33,7 +33,6 @@ template <class Function, class... F> AR_HD void for_each_footprint(FootprintLis
   (f(F{}), ...);
 }
 
-/// Calls f(F{}) for the footprint at this index.
 template <class Function, class... F> AR_HD void visit_footprint(int index, FootprintList<F...>, Function&& f) {
   int place = 0;
   ((index == place++ ? (f(F{}), true) : false) || ...);
