@@ -46,7 +46,7 @@ template <class V> AR_HD Blended<V> blend_sample(V raw, V& transmittance) {
   }
 }
 
-/// Of a sample that moves (kMoves), besides T. Zero before the first splat.
+/// What a sample that moves (kMoves) carries besides T. Zero before the first splat.
 template <class V, bool kMoves> struct SampleState {};
 template <class V> struct SampleState<V, true> {
   Vec2<V> moved;  ///< displacement from the sample's node [px]

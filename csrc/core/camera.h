@@ -69,7 +69,7 @@ template <typename T> AR_HD T largest_zoom2(const Camera<T>& camera) {
   return max(dot(x, x) + xy + xz, max(xy + dot(y, y) + yz, xz + yz + dot(z, z)));
 }
 
-/// But for rounding.
+/// An upper bound, but for rounding.
 template <class Cam, typename T> AR_HD T largest_stretch(const Cam& camera, Vec3<T> view) {
   return visit_model(camera, [&](auto model) AR_HD_LAMBDA { return model.largest_stretch(camera, view); });
 }

@@ -6,7 +6,6 @@
 
 namespace ar {
 
-/// kLensWidth scalars.
 template <typename T> struct Lens {
   Vec2<T> tan_half_fov;  ///< orthographic: half the width and height, world units
   Vec2<T> center;        ///< x/z and y/z at the middle of the picture, for the clamp of a pinhole

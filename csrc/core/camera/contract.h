@@ -72,7 +72,6 @@ template <typename Scalar> struct FullCamera : Camera<Scalar> {
   Lens<Scalar> lens;
 };
 
-/// kCameraGradWidth scalars.
 template <typename T> struct CameraGrad {
   Vec4<T> view_x, view_y, view_z, clip_x, clip_y, clip_w;
   Vec3<T> position;

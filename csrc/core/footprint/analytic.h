@@ -1,6 +1,6 @@
 // The footprint `analytic`: the Gaussian integrated over a unit pixel that is turned into its eigenframe, with a
-// logistic approximation of the Gaussian's CDF [AS, Eq. 2-9]. registry.h lists it with both of its gradients. The forms
-// are those of docs/numerics.md, "Logistic window".
+// logistic approximation of the Gaussian's CDF [AS, Eq. 2-9]. registry.h lists it. The forms are those of
+// docs/numerics.md, "Logistic window".
 #pragma once
 
 #include "core/footprint/eigenframe.h"

@@ -3,7 +3,7 @@
 // the loops of cpu/ and cuda/ call F as a template argument. How to write one: docs/adding-a-footprint.md.
 //
 // T is float or double, V is T or a pack of lanes of T (lanes.h). Sigma is the projected covariance [px^2]. d = pixel
-// centre - projected mean [px].  The node of a sample is its position relative to the pixel centre [px].
+// centre - projected mean [px]. The node of a sample is its position relative to the pixel centre [px].
 //
 // Constants. FootprintDefaults (below) has their defaults.
 //
@@ -13,7 +13,8 @@
 //   kReference    true: for comparisons; the CPU compiles it for one instruction set
 //   kGeneric      true: CUDA has only the slower kernels, for any number of channels
 //   kExpensive    true: CUDA finds out exactly which pixels a splat reaches
-//   kPage         the formula of the viewer's page, a key of KINDS in viewer/page/shaders.js; null: it cannot draw F
+//   kPage         the formula of the viewer's page, a key of KINDS in viewer/page/shaders.js, with the variance of
+//                 support_variance(); null: the page cannot draw F
 //   Pixels        a type with the same Shape, terms, alpha, adjoint, ellipse and samples. Blending is compiled once for
 //                 all footprints that name this type; void: for F
 //   kSamples      samples of a pixel, each with its own transmittance
@@ -90,7 +91,6 @@ template <typename T> AR_HD Cov2d<T> blur(Cov2d<T> c, T v) {
   return {c.xx + v, c.xy, c.yy + v, c.det + v * (c.xx + c.yy) + v * v};
 }
 
-/// Difference of the eigenvalues.
 template <typename T> AR_HD T eigenvalue_gap(Cov2d<T> c) {
   const T dx = c.xx - c.yy, dy = T(2) * c.xy;
   return sqrt(dx * dx + dy * dy);

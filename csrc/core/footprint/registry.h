@@ -1,5 +1,5 @@
-// The list of footprints. A new footprint is a header and an entry here. Python, the loops of cpu/ and the kernels of
-// cuda/ get every footprint from it.
+// The list of footprints. A new footprint is a header and an entry here. Python, cpu/ and cuda/ get every footprint
+// from it.
 #pragma once
 
 #include <cstddef>
