@@ -85,7 +85,7 @@ template <typename T> struct BoxReach {
 };
 
 /// `half`: of the boxes, with the reach of samples [px]. `distance`: the largest in x or y from a box's centre to the
-/// mean [px]. Rounding of z grows with it and with w, for thin splats beyond kLevelSlack.
+/// mean [px]. The margin covers rounding of z.
 template <typename T> AR_HD BoxReach<T> make_box_reach(const Mat2<T>& w, T level, Vec2<T> half, T distance) {
   const T margin = T(kBoxRounding) * distance, x = half.x + margin, y = half.y + margin;
   return {{abs(w.xx) * x + abs(w.xy) * y, abs(w.yx) * x + abs(w.yy) * y}, level + T(kLevelSlack)};

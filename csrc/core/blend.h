@@ -1,5 +1,5 @@
 // Front-to-back compositing of one splat into one sample, and its adjoint (docs/numerics.md, "Blending and its
-// adjoint"). A library for the loops over pixels and splats in cpu/ and cuda/.
+// adjoint"). A library for the loops of cpu/ and cuda/.
 //
 // T is the transmittance of a sample. `raw` is opacity * weight, before the cap and the threshold that make it alpha.
 // `mask`: the splat is composited. V is a scalar or a pack of lanes.
@@ -46,7 +46,7 @@ template <class V> AR_HD Blended<V> blend_sample(V raw, V& transmittance) {
   }
 }
 
-/// Of a sample that moves (kMoves of footprint/contract.h), besides T. Zero before the first splat.
+/// What a sample that moves (kMoves) carries besides T. Zero before the first splat.
 template <class V, bool kMoves> struct SampleState {};
 template <class V> struct SampleState<V, true> {
   Vec2<V> moved;  ///< displacement from the sample's node [px]
@@ -133,7 +133,7 @@ AR_HD void add_placed_sample_vjp(const Terms& terms, Vec2<V> z, V raw, const Cel
                                  V& transmittance, V& behind, Vec2<V>& dL_dplace, MovingBlendGrad<V>& sums) {
   using T = ScalarOf<V>;
   const V cap = V(T(kAlphaMax)), alpha = min(raw, cap);
-  const V contribution = transmittance * odds(alpha);  // T after = (1 - alpha) T before
+  const V contribution = transmittance * odds(alpha);
   transmittance = transmittance + contribution;
   const V difference = g_color - behind;
   behind = madd(alpha, difference, behind);

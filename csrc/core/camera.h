@@ -69,7 +69,7 @@ template <typename T> AR_HD T largest_zoom2(const Camera<T>& camera) {
   return max(dot(x, x) + xy + xz, max(xy + dot(y, y) + yz, xz + yz + dot(z, z)));
 }
 
-/// But for rounding.
+/// An upper bound, but for rounding.
 template <class Cam, typename T> AR_HD T largest_stretch(const Cam& camera, Vec3<T> view) {
   return visit_model(camera, [&](auto model) AR_HD_LAMBDA { return model.largest_stretch(camera, view); });
 }
@@ -122,7 +122,7 @@ template <typename T> AR_HD Blur<T> blur_of(const FullCamera<T>& camera, Vec3<T>
           lens.aperture != T(0) ? defocus_variance(camera, view) : T(0)};
 }
 
-/// Returns the gradient with respect to `view`; adds that of the camera to `to`, if not null.
+/// Returns the gradient by `view`; adds that by the camera to `to`, if not null.
 template <typename T>
 AR_HD Vec3<T> blur_vjp(const FullCamera<T>& camera, Vec3<T> view, const Blur<T>& dL_dblur, CameraGrad<T>* to) {
   Vec3<T> by_view = {T(0), T(0), T(0)};

@@ -5,11 +5,11 @@ namespace ar {
 
 /// Edge of a square tile [px], and its log2.
 inline constexpr int kTileBits = 4, kTile = 1 << kTileBits;
-/// On CUDA where samples move; see moving_grid() of stages.h.
+/// On CUDA where samples move: see moving_grid().
 inline constexpr int kMovingTileBits = 3, kMovingTile = 1 << kMovingTileBits;
 /// An image with fewer such tiles is small: CUDA has other kernels for samples that move.
 inline constexpr int kSmallImageTiles = 4096;
-/// With fewer tiles of 16x16 pixels CUDA spreads four samples over lanes (spread_grid() of stages.h).
+/// With fewer tiles of 16x16 pixels CUDA spreads four samples over lanes (spread_grid()).
 inline constexpr int kSpreadImageTiles = 4096;
 
 /// Culled unless the camera-space z of the mean exceeds this [world units].

@@ -1,6 +1,6 @@
-// The adjoint of covariance.h: gradients with respect to scale and rotation, or a 3D covariance, and to the camera's
-// Jacobian. The caller is project.h. Every product is formed in coordinates in which its terms do not cancel
-// (docs/numerics.md, from "Gradient in the turned frame" on).
+// The adjoint of covariance.h: gradients by scale and rotation, or a 3D covariance, and by the camera's Jacobian. The
+// caller is project.h. Every product is formed in coordinates in which its terms do not cancel (docs/numerics.md, from
+// "Gradient in the turned frame" on).
 #pragma once
 
 #include "core/blur.h"
@@ -81,7 +81,7 @@ AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, co
   const T v = grad.variance;
   Vec3<T> qx, qy;  // w t_k
   if (grad.frame == GradFrame::kTriangular) {
-    // The second row of w subtracts from a row of V its projection on the other: (adj(M) + v) t over a variance.
+    // "Cholesky factors" of docs/numerics.md, "Gradient in whitened coordinates".
     const bool x_first = w.xx != T(0);
     const T along = w.xx + w.xy, across = (x_first ? w.yy : w.yx) * along * along;
     qx = along * (x_first ? tx : ty);
@@ -93,8 +93,7 @@ AR_HD TurnedGrad<T> turned_vjp(const Factors<T>& f, const SplatGrad<T>& grad, co
   const Vec3<T> ex = g.xx * qx + g.xy * qy, ey = g.xy * qx + g.yy * qy;
   h.diagonal += mul(qx, ex) + mul(qy, ey);
   if (grad.frame == GradFrame::kAxes) {
-    // t_k . M^-1 t_l is known without w. For a thin needle within a window its factor g.yy is large: products of w
-    // would leave eps (s1/s2)^2 of it.
+    // "Eigenframes" of the same section: of g.yy, products of w would leave eps (s1/s2)^2.
     const T c = m.cov.det > T(0) ? quotient(g.yy, m.cov.det) : T(0);
     const Vec3<T> rx = (g.xx - g.yy) * qx + g.xy * qy, ry = g.xy * qx;
     h.off += shifted_products(qx, rx) + shifted_products(qy, ry) - c * mul(square, shifted_products(n, n));

@@ -6,7 +6,6 @@
 
 namespace ar {
 
-/// kLensWidth scalars.
 template <typename T> struct Lens {
   Vec2<T> tan_half_fov;  ///< orthographic: half the width and height, world units
   Vec2<T> center;        ///< x/z and y/z at the middle of the picture, for the clamp of a pinhole
@@ -14,7 +13,7 @@ template <typename T> struct Lens {
   Vec3<T> shift, turn;   ///< of the camera during the exposure, along its axes [world units, radians]
   Vec2<T> screen;        ///< of the picture during the exposure [px]
   T near, far;           ///< of camera-space z; no gradient
-  T model;               ///< index in CameraModels (core/camera/models.h); no gradient
+  T model;               ///< index in CameraModels; no gradient
 
   AR_HD bool moves() const {
     return shift.x != T(0) || shift.y != T(0) || shift.z != T(0) || turn.x != T(0) || turn.y != T(0) ||

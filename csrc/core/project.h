@@ -101,7 +101,7 @@ AR_HD bool project_gaussian(const Cam& camera, const Gaussians<T>& g, int64_t i,
   return is_drawable(out) && !(g.opacities[i] > T(kMaxOpacity));
 }
 
-/// 3DGS's radius [px]: ceil(3 sigma) along the major axis, a little too large for a round splat.
+/// 3DGS's radius [px]: ceil(3 sigma) along the major axis.
 template <typename T> AR_HD int splat_radius(Cov2d<T> cov, T variance) {
   const T half_gap = max(T(0.5) * eigenvalue_gap(cov), sqrt(T(kRadiusMinGap)));
   const T largest = T(0.5) * (cov.xx + cov.yy) + half_gap + variance;

@@ -5,7 +5,8 @@
 //     blend_vjp -> project_vjp         backward
 //
 // Conventions. Camera space is OpenCV's: x right, y down, z forward. 3DGS stores matrices transposed: element (r, c) of
-// the matrix that acts on column vectors is at [4 c + r]. Pixel centres are at integers: px = ((ndc + 1) W - 1) / 2.
+// the matrix that acts on column vectors is at [4 c + r]. Pixel centres are at integers: px = ((ndc + 1) W - 1) / 2. A
+// gradient by x is dL/dx.
 #pragma once
 
 #include <cstddef>
@@ -32,14 +33,14 @@ struct TileGrid {
 AR_HD bool is_small_image(TileGrid grid) {
   return TileGrid{grid.width, grid.height, kMovingTileBits}.tiles() < kSmallImageTiles;
 }
-/// The tiles on CUDA if samples move. One sample in a large image is so cheap that fewer pairs pay. Sixteen samples in
-/// a small image, where splats are smaller than a tile, want shorter lists.
+/// The tiles on CUDA if samples move. One sample in a large image is so cheap that larger tiles with fewer pairs pay.
+/// In a small image, where splats are smaller than a tile, sixteen samples want shorter lists.
 AR_HD constexpr int moving_tile_bits(int samples, bool small_image) {
   if (samples == 1 && !small_image) return kTileBits;
   return samples == 16 && small_image ? kMovingTileBits - 1 : kMovingTileBits;
 }
-/// The tiles on CUDA if samples may be spread over lanes (Spread of footprint/contract.h), 256 samples each. In large
-/// images the pairs of four samples would cost more than shorter lists save.
+/// The tiles on CUDA if samples may be spread over lanes (Spread), 256 samples each. Four samples are not spread in
+/// large images: more pairs would cost more than shorter lists save.
 AR_HD constexpr int spread_tile_bits(int lanes, bool small_image) {
   return lanes == 16 ? kTileBits - 2 : lanes == 4 && small_image ? kTileBits - 1 : kTileBits;
 }
@@ -83,7 +84,7 @@ enum class MeanSums : int32_t {
   kNorm,      ///< length, in the units of GaussianGrads::means2d; the second sum is zero
 };
 
-/// Gradients with respect to the members of Gaussians; null: not wanted.
+/// Gradients by the members of Gaussians; null: not wanted.
 template <typename T> struct GaussianGrads {
   /// Whether gradients are added to these arrays, and to the `dL_dsh` that project_vjp gets.
   static constexpr bool kAdd = false, kAddShs = false;
@@ -217,8 +218,8 @@ static_assert(sizeof(PackedRow<float>) == kPackedWidth * sizeof(float));
 static_assert(sizeof(PackedRow<double>) == kPackedWidth * sizeof(double));
 static_assert(offsetof(PackedRow<float>, depth) == kPackedDepth * sizeof(float));
 
-/// Columns of the gradient with respect to a PackedRow. kPackedCov: xy doubled, see Sym2. kPackedAbsolute, optional:
-/// sums over pixels of |dL/dmean|.
+/// Columns of the gradient by a PackedRow. kPackedCov: xy doubled, see Sym2. kPackedAbsolute, optional: sums over
+/// pixels of |dL/dmean|.
 inline constexpr int kPackedMean = 0, kPackedCov = 2, kPackedOpacity = 5, kPackedColor = 6, kPackedAbsolute = 9;
 inline constexpr int kPackedGradWidth = 9, kPackedGradWidthAbsolute = 11;
 
@@ -253,7 +254,7 @@ template <typename T> struct ShapeRowsParams {
   T *kept_covs, *kept_opacities;
 };
 
-/// From sums of pairs to the gradient with respect to public rows.
+/// From sums of pairs to the gradient by public rows.
 template <typename T> struct RowGradsParams {
   int64_t n;
   ProjectedRows<T> rows;  ///< read: cov2d, dets, opacities
@@ -303,7 +304,7 @@ template <typename T> struct InspectParams {
   int32_t* dominated;  ///< [n] pixels with this `dominant`
 };
 
-/// From the gradient with respect to an image to a PairGrad per pair.
+/// From the gradient by an image to a PairGrad per pair.
 template <typename T> struct BlendVjpParams {
   TileGrid grid;
   const T* splats;

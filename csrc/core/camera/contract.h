@@ -3,7 +3,7 @@
 // and defocus.h call the functions. Their arguments are those in pinhole.h and clip_space.h.
 //
 // `camera` is a Camera or a FullCamera. `mean` is a point of the world, `view` or p the same point in camera space.
-// Lengths in the image are in px. add_..._vjp adds the gradient with respect to a FullCamera.
+// Lengths in the image are in px. add_..._vjp adds the gradient by a FullCamera.
 //
 //   kName                               the name of the model in Python
 //
@@ -47,7 +47,7 @@ template <typename T> AR_HD Vec4<T> matrix_row(const T* m, int r) { return {m[r]
 
 template <typename T> AR_HD Vec3<T> xyz(Vec4<T> v) { return {v.x, v.y, v.z}; }
 template <typename T> AR_HD T apply_row(Vec4<T> row, Vec3<T> p) { return dot(xyz(row), p) + row.w; }
-/// Adds the gradient with respect to the row.
+/// Adds the gradient by the row.
 template <typename T> AR_HD void add_row_vjp(Vec4<T>& to, T dL_dvalue, Vec3<T> p) {
   to = {to.x + dL_dvalue * p.x, to.y + dL_dvalue * p.y, to.z + dL_dvalue * p.z, to.w + dL_dvalue};
 }
@@ -72,7 +72,6 @@ template <typename Scalar> struct FullCamera : Camera<Scalar> {
   Lens<Scalar> lens;
 };
 
-/// kCameraGradWidth scalars.
 template <typename T> struct CameraGrad {
   Vec4<T> view_x, view_y, view_z, clip_x, clip_y, clip_w;
   Vec3<T> position;

@@ -1,6 +1,6 @@
 // The footprint `analytic`: the Gaussian integrated over a unit pixel that is turned into its eigenframe, with a
-// logistic approximation of the Gaussian's CDF [AS, Eq. 2-9]. registry.h lists it with both of its gradients. The forms
-// are those of docs/numerics.md, "Logistic window".
+// logistic approximation of the Gaussian's CDF [AS, Eq. 2-9]. registry.h lists it. The forms are those of
+// docs/numerics.md, "Logistic window".
 #pragma once
 
 #include "core/footprint/eigenframe.h"
@@ -121,7 +121,6 @@ template <FrameGradient kFrame> struct Analytic : FootprintDefaults {
     return {{T(1) / s1, T(1) / s2}, frame.axis, T(2 * kPi) * s1 * s2};
   }
 
-  /// Ellipse of Sigma + I/12.
   template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& g) {
     return scaled_axes(widened_by_pixel(g.inv_sigma), g.axis);
   }

@@ -6,7 +6,7 @@
 
 namespace ar {
 
-/// "box1" ... "box16"; the number of samples begins at the fourth character.
+/// "box1" ... "box16"; the samples begin at the fourth character.
 template <int S> struct BoxKey {
   static constexpr char kText[] = {'b', 'o', 'x', S >= 10 ? '1' : char('0' + S), S >= 10 ? char('0' + S % 10) : '\0',
                                    '\0'};

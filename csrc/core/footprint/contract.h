@@ -13,7 +13,8 @@
 //   kReference    true: for comparisons; the CPU compiles it for one instruction set
 //   kGeneric      true: CUDA has only the slower kernels, for any number of channels
 //   kExpensive    true: CUDA finds out exactly which pixels a splat reaches
-//   kPage         the formula of the viewer's page, a key of KINDS in viewer/page/shaders.js; null: it cannot draw F
+//   kPage         the formula of the viewer's page, a key of KINDS in viewer/page/shaders.js, with the variance of
+//                 support_variance(); null: the page cannot draw F
 //   Pixels        a type with the same Shape, terms, alpha, adjoint, ellipse and samples. Blending is compiled once for
 //                 all footprints that name this type; void: for F
 //   kSamples      samples of a pixel, each with its own transmittance
@@ -48,8 +49,8 @@
 //   alpha(terms, p, s) -> V     opacity * I
 //   add_alpha_vjp(terms, p, s, AlphaGrad, ShapeGrad& sums)
 //
-// Samples that move have a displacement `moved` from the node [px]. It is zero before the first splat, and every splat
-// that is composited changes it. Then p includes `moved`. Such footprints define more; moment.h has the arguments.
+// Samples that move have a displacement `moved` from the node [px], which every composited splat changes. Then p
+// includes `moved`. Such footprints define more; moment.h has the arguments.
 //
 //   kMoves                      true
 //   kMoveReach                  largest |coordinate| of a displacement [px]; kReach includes it
@@ -70,8 +71,6 @@
 //   add_alpha_and_move_in_vjp   its adjoint with that of alpha, added to sums
 //   move_in_with_slope          move_in that changes its argument and returns its MoveSlope
 //   kMoveGradUnit               unit of gradients by positions between splats: the cheapest
-//
-// With a UnitCell lengths are in edges of cells, and positions are relative to the corner of the cell.
 #pragma once
 
 #include <cstddef>
@@ -92,7 +91,6 @@ template <typename T> AR_HD Cov2d<T> blur(Cov2d<T> c, T v) {
   return {c.xx + v, c.xy, c.yy + v, c.det + v * (c.xx + c.yy) + v * v};
 }
 
-/// Difference of the eigenvalues.
 template <typename T> AR_HD T eigenvalue_gap(Cov2d<T> c) {
   const T dx = c.xx - c.yy, dy = T(2) * c.xy;
   return sqrt(dx * dx + dy * dy);
@@ -150,7 +148,8 @@ template <class V> struct Bounds {
   AR_HD MaskOf<V> free_y(V y) const { return (y >= lo.y) & (y <= hi.y); }
 };
 
-/// The cell is [0, 1] x [0, 1], with n units of length per pixel. On a device the clamp is free.
+/// The cell is [0, 1] x [0, 1]: positions are from its corner, in edges of cells, n per pixel. On a device the clamp is
+/// free.
 template <int n> struct UnitCell {
   static constexpr int kUnits = n;
   template <class V> AR_HD Vec2<V> held(V length, Vec2<V> along, Vec2<V> at) const {
@@ -166,7 +165,7 @@ template <class V> struct MoveGrad {
   ShapeGrad<V> sums;
 };
 
-/// Derivatives with respect to the position before a splat.
+/// Derivatives by the position before a splat.
 template <class V> struct MoveSlope {
   Vec2<V> alpha;             ///< of the splat's alpha, times kMoveGradUnit
   Sym2<V> step;              ///< of the position after the splat: 1 + step
@@ -215,7 +214,7 @@ template <typename T> struct SplatGrad {
   GradFrame frame;
 };
 
-/// Gradient of log amp with respect to Sigma, without cancellation (docs/numerics.md, "Gradient of an amplitude").
+/// Gradient of log amp by Sigma, without cancellation (docs/numerics.md, "Gradient of an amplitude").
 template <typename T> AR_HD Sym2<T> log_amp_grad(Cov2d<T> c, T v) {
   const T scale = quotient(T(0.5) * v, blur(c, v).det), square = c.xy * c.xy;
   return {scale * quotient(c.yy * (c.yy + v) + square, c.det), -scale * (quotient(c.xy, c.det) * (c.xx + c.yy + v)),

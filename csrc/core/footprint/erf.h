@@ -8,8 +8,8 @@
 
 namespace ar {
 
-/// I = 2 pi s1 s2 [Phi]_u [Phi]_v, [Phi]_u = Phi((u + 1/2) / s1) - Phi((u - 1/2) / s1), (u, v) = d in the eigenframe of
-/// Sigma. The adjoint holds the frame fixed.
+/// I = 2 pi s1 s2 [Phi]_u [Phi]_v, with Phi over the window of each axis (docs/numerics.md, "The rotated window"). The
+/// adjoint holds the frame fixed.
 struct Erf : FootprintDefaults {
   static constexpr const char* kName = "erf";
   static constexpr bool kExpensive = true;
@@ -40,7 +40,6 @@ struct Erf : FootprintDefaults {
     return {{T(1) / s1, T(1) / s2}, frame.axis, s1 * s2};
   }
 
-  /// Ellipse of Sigma + I/12.
   template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& g) {
     return scaled_axes(widened_by_pixel(g.inv_sigma), g.axis);
   }

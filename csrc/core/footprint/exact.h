@@ -45,7 +45,6 @@ struct Exact : FootprintDefaults {
     return {w, sqrt(cov.det / blur(cov, T(kPixelVariance)).det)};
   }
 
-  /// Ellipse of Sigma + I/12.
   template <typename T> AR_HD static Mat2<T> ellipse(const Shape<T>& g) { return whiten_wide_first(widened(g)); }
 
   template <typename T> AR_HD static T level(const Shape<T>& g, T opacity) {

@@ -118,7 +118,7 @@ template <int S> struct GaussianPixels : FootprintDefaults {
 
   template <typename T, class V> AR_HD static Vec2<V> whitened(const Terms<T>& t, Vec2<V> p, int s) {
     if (S == 1) return transform(t.w, p, t.node[0]);
-    const Vec2<V> z = transform(t.w, p);  // for all samples
+    const Vec2<V> z = transform(t.w, p);
     return {z.x + V(t.node[s].x), z.y + V(t.node[s].y)};
   }
 

@@ -7,7 +7,7 @@
 
 namespace ar {
 
-/// "moment1" ... "moment16"; the number of cells begins at the seventh character.
+/// "moment1" ... "moment16"; the cells begin at the seventh character.
 template <int S> struct MomentKey {
   static constexpr char kText[] = {
       'm', 'o', 'm', 'e', 'n', 't', S >= 10 ? '1' : char('0' + S), S >= 10 ? char('0' + S % 10) : '\0', '\0'};
@@ -105,8 +105,8 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     }
   }
 
-  /// alpha_and_move_vjp() by z, added to `sums` (docs/numerics.md, "Adjoint of moving nodes"; q is v r y). dL_dat is in
-  /// kMoveGradUnit. alpha and `weighted` = alpha dL_dalpha are zero where the splat was not composited.
+  /// alpha_and_move_vjp() by z, added to `sums`. q is the v r y of docs/numerics.md. dL_dat is in kMoveGradUnit. alpha
+  /// and `weighted` = alpha dL_dalpha are zero where the splat was not composited.
   template <typename T, class V, class Cell>
   AR_HD static void add_alpha_and_move_in_vjp(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> free, V weighted,
                                               Vec2<V> at, const Cell& cell, Vec2<V>& dL_dat, MoveGrad<V>& sums) {
@@ -125,8 +125,8 @@ template <int S> struct Moment : GaussianFootprint<1, true> {
     dL_dat = {madd(-V(t.w.xx), offset.x, madd(-V(t.w.yx), offset.y, behind.x)), madd(-V(t.w.yy), offset.y, behind.y)};
   }
 
-  /// Moves `at` as move_in() does. With J the derivative of the position, add_alpha_and_move_in_vjp() takes dL_dat to
-  /// J^T dL_dat + dL_dalpha MoveSlope::alpha. `free`: alpha is not capped.
+  /// Moves `at` as move_in() does. Returns J and dalpha of docs/numerics.md, "Adjoint of moving nodes". `free`: alpha
+  /// is not capped.
   template <typename T, class V, class Cell>
   AR_HD static MoveSlope<V> move_in_with_slope(const Terms<T>& t, Vec2<V> z, V alpha, MaskOf<V> free, const Cell& cell,
                                                Vec2<V>& at) {

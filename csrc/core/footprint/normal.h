@@ -91,7 +91,7 @@ template <typename T> AR_HD SplatGrad<T> moments_vjp(const Mat2<T>& w, const Sha
 }
 
 /// Along one axis, how much the pixel may raise the level of the Gaussian with variance 1/t = sigma^2 + 1/12
-/// (docs/numerics.md, "Support"). 144/61 is safe for all sizes; the tests check that the excess falls as t^2.
+/// (docs/numerics.md, "Support"). The tests check that it falls as t^2.
 template <typename T> AR_HD constexpr T box_excess(T t) { return t * t / T(61); }
 
 }  // namespace ar

@@ -1,5 +1,5 @@
-// The list of footprints. A new footprint is a header and an entry here. Python, the loops of cpu/ and the kernels of
-// cuda/ get every footprint from it.
+// The list of footprints. A new footprint is a header and an entry here. Python, cpu/ and cuda/ get every footprint
+// from it.
 #pragma once
 
 #include <cstddef>
@@ -33,7 +33,6 @@ template <class Function, class... F> AR_HD void for_each_footprint(FootprintLis
   (f(F{}), ...);
 }
 
-/// Calls f(F{}) for the footprint at this index.
 template <class Function, class... F> AR_HD void visit_footprint(int index, FootprintList<F...>, Function&& f) {
   int place = 0;
   ((index == place++ ? (f(F{}), true) : false) || ...);
